@@ -2,6 +2,7 @@
 
 use core::net::Ipv4Addr;
 
+pub use super::keys::{ControllerKey, ExchangeKey, NetworkKey, PortKey, RecipeKey};
 use super::{ExchangeError, Network, StateValueError};
 use crate::command::ParseError;
 use crate::device::LayoutError;
@@ -93,108 +94,6 @@ pub enum Place {
         /// Index into [`GatewayConfig::safe_values`](super::GatewayConfig::safe_values).
         entry: u16,
     },
-}
-
-/// A key of the controller's section.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-#[non_exhaustive]
-pub enum ControllerKey {
-    /// Its address.
-    Address,
-    /// Its dialect.
-    Dialect,
-    /// Its command, state and Modbus ports.
-    Ports,
-    /// The recipe link.
-    RecipeLink,
-}
-
-/// A key of the board's own address.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-#[non_exhaustive]
-pub enum NetworkKey {
-    /// Address and prefix.
-    Address,
-    /// The router.
-    Router,
-    /// The name server.
-    Dns,
-}
-
-/// A key of a recipe.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-#[non_exhaustive]
-pub enum RecipeKey {
-    /// The recipe as a whole.
-    Whole,
-    /// Its name.
-    Name,
-    /// What makes a port send it.
-    Send,
-}
-
-/// A key of an exchange.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-#[non_exhaustive]
-pub enum ExchangeKey {
-    /// The exchange as a whole.
-    Whole,
-    /// The slave or other peer.
-    Peer,
-    /// The addresses and the fields of registers or coils.
-    Registers,
-    /// Its period.
-    Every,
-    /// The bit that triggers it.
-    Rising,
-    /// How long its reply may take.
-    Timeout,
-    /// How long the line rests after it.
-    Pause,
-    /// The request.
-    Request,
-    /// The reply.
-    Reply,
-    /// The refusal.
-    Refusal,
-}
-
-/// A key of a port.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-#[non_exhaustive]
-pub enum PortKey {
-    /// Its name.
-    Name,
-    /// Its recipe.
-    Recipe,
-    /// Its cycle.
-    Cycle,
-    /// Its timeout.
-    Timeout,
-    /// Its safe values.
-    OnTimeout,
-    /// When its outputs are stale.
-    StaleAfter,
-    /// A serial line's speed.
-    Baud,
-    /// A serial line's stop bits.
-    StopBits,
-    /// A serial line's idle gap.
-    IdleGap,
-    /// A serial line's turnaround.
-    Turnaround,
-    /// Whether a serial line gives back what is sent on it.
-    Echo,
-    /// A CAN bus's speed.
-    Bitrate,
-    /// The address to listen on.
-    Listen,
-    /// The variables of its health.
-    Health,
-    /// Whether it starts with safe values.
-    SafeAtStart,
-    /// When it sends without a change.
-    Refresh,
 }
 
 /// A list with a limited number of entries: of a configuration, or of the engine that runs it.

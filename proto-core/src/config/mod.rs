@@ -22,6 +22,7 @@ mod exchange;
 mod fields;
 #[cfg(feature = "image")]
 pub mod image;
+mod keys;
 mod line_budget;
 mod listen;
 mod network;

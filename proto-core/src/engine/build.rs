@@ -1,11 +1,11 @@
 //! Builds an engine from a configuration.
 
-use core::fmt;
 use core::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use heapless::Vec;
 
 use super::bits::MAX_SHARES;
+use super::build_error::{BuildError, one_too_many};
 use super::codecs::{can_codec, index_of, stream_codec, stream_layout};
 use super::command_link::CommandLink;
 use super::command_tables::{MAX_COMMAND_BYTES, MAX_COMMAND_FIELDS};
@@ -19,7 +19,7 @@ use super::line_timing::LineTiming;
 use super::links::Links;
 use super::modbus_link::{MAX_POLL_BLOCKS, ModbusLink};
 use super::outbox::EdgeQueue;
-use super::plan::{Plan, PlanError, Source, WayUp, sent_by, shown_by, uplinks};
+use super::plan::{Plan, Source, WayUp, sent_by, shown_by, uplinks};
 use super::port_health::PortsHealth;
 use super::sender::Sender;
 use super::state_link::StateLink;
@@ -29,89 +29,16 @@ use super::uplink::{Uplink, UplinkSetup};
 use super::user::{Bindings, InputBind, InputTo, OutputBind};
 use super::{Ask, Engine};
 use crate::config::{
-    Bus, ConfigError, ConfigView, Counted, FieldSpec, InputBinding, MIN_CYCLE, OutputBinding, Parts, Port,
-    Recipe, SendOn, Span, listen_address,
+    Bus, ConfigView, Counted, FieldSpec, InputBinding, MIN_CYCLE, OutputBinding, Parts, Port, Recipe, SendOn,
+    Span, listen_address,
 };
-use crate::device::LayoutError;
 use crate::image::{GroupId, InputSet, MAX_GROUPS};
 use crate::link::LinkTimings;
-use crate::recipe::PartError;
 use crate::recipe::model::Framing;
 use crate::sysvar::{Direction, SysVar, VarBit};
 use crate::time::{Duration, Instant};
 use crate::wire::dialect::Dialect;
 use crate::wire::scalar::ScalarType;
-
-/// Why an engine cannot run a configuration.
-#[derive(Debug, Clone, Copy, PartialEq)]
-#[non_exhaustive]
-pub enum BuildError {
-    /// The configuration is invalid.
-    Config(ConfigError),
-    /// A variable has no way.
-    Plan(PlanError),
-    /// A recipe's part is invalid.
-    Part {
-        /// Index of the recipe.
-        recipe: u8,
-        /// The part.
-        part: Direction,
-        /// What is wrong.
-        error: PartError,
-    },
-    /// A device's frame cannot be laid out.
-    Layout {
-        /// Index of the recipe.
-        recipe: u8,
-        /// The part.
-        part: Direction,
-        /// Index of the CAN frame; 0 in a stream recipe.
-        frame: u8,
-        /// What is wrong.
-        error: LayoutError,
-    },
-    /// There is no dialect of the configured name.
-    UnknownDialect,
-    /// The configuration needs more entries than this engine has room for.
-    TooMany {
-        /// The list.
-        what: Counted,
-        /// Number of entries that the configuration needs; if only building it shows that, one more
-        /// than there is room for.
-        needed: usize,
-        /// Number of entries there is room for.
-        room: usize,
-    },
-}
-
-impl fmt::Display for BuildError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Config(error) => error.fmt(f),
-            Self::Plan(error) => error.fmt(f),
-            Self::Part { recipe, part, error } => {
-                let part = if *part == Direction::Input { "input" } else { "output" };
-                write!(f, "recipe {}, {part} part: {error}", recipe.saturating_add(1))
-            }
-            Self::Layout { recipe, part, frame, error } => {
-                let part = if *part == Direction::Input { "input" } else { "output" };
-                let (recipe, frame) = (recipe.saturating_add(1), frame.saturating_add(1));
-                write!(f, "recipe {recipe}, {part} part, frame {frame}: {error}")
-            }
-            Self::UnknownDialect => write!(f, "unknown dialect; there are {:?}", Dialect::NAMES),
-            Self::TooMany { what, needed, room } => {
-                write!(f, "too many {what}: {needed} are needed; this gateway has room for {room}")
-            }
-        }
-    }
-}
-
-impl core::error::Error for BuildError {}
-
-/// There was no room for another entry.
-pub(super) fn one_too_many(what: Counted, room: usize) -> BuildError {
-    BuildError::TooMany { what, needed: room.saturating_add(1), room }
-}
 
 /// Groups are assigned in order: field frames first.
 pub(super) struct Groups(u8);

@@ -1,7 +1,7 @@
 //! The layouts of a port's recipe, from the configuration. Those of devices' frames are made in
 //! `device_port`.
 
-use super::build::BuildError;
+use super::build_error::BuildError;
 use super::field_port::Codec;
 use crate::config::{CanFramePart, ConfigView, FieldSpec, Recipe, StreamPart};
 use crate::recipe::model::{Framing, Rules};

@@ -5,7 +5,7 @@
 
 use heapless::Vec;
 
-use super::build::{BuildError, one_too_many};
+use super::build_error::{BuildError, one_too_many};
 use super::command_link::CommandLink;
 use super::counters::{add, bump};
 use super::field_output::Downward;

@@ -6,7 +6,7 @@
 use heapless::{Vec, VecView};
 
 use super::Engine;
-use super::build::{BuildError, one_too_many};
+use super::build_error::{BuildError, one_too_many};
 use super::device_port::DeviceFormat;
 use super::line::{Line, PeerCounters, PeerState, Talks, Times, is_looked_at};
 use super::user::{InputBind, InputTo};

@@ -12,8 +12,10 @@
 //! Errors of a device or of the controller are counted and skipped. They are never an error of the
 //! run loop, and nothing is applied in part.
 
+mod awaited;
 mod bits;
 mod build;
+mod build_error;
 mod clock;
 mod codecs;
 mod command_link;
@@ -40,6 +42,7 @@ mod plan;
 mod port_health;
 mod questions;
 mod rejection;
+mod requests;
 mod sender;
 mod served;
 mod session;
@@ -55,7 +58,7 @@ mod uplink;
 mod user;
 mod whole_port;
 
-pub use build::BuildError;
+pub use build_error::BuildError;
 pub use clock::ASLEEP;
 pub use counters::{LinkCounters, PortCounters};
 pub use io::{BusState, Endpoint, Input, LinkId, LinkKind, Output, PortId, PortState, ReplyCode, Transport};

@@ -6,7 +6,8 @@
 use heapless::Vec;
 
 use super::Engine;
-use super::build::{BuildError, Groups, one_too_many};
+use super::build::Groups;
+use super::build_error::{BuildError, one_too_many};
 use super::io::PortState;
 use super::state_link::Kept;
 use super::user::wrapping_count;

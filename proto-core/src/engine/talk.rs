@@ -4,116 +4,28 @@
 //! and requests. Which exchange is next is the line's business ([`super::line`]); ports without
 //! exchanges do not come here.
 
+use super::awaited::{Awaited, Heard};
 use super::command_link::CommandLink;
 use super::counters::{add, bump};
-use super::device_port::{DeviceCodec, DeviceFormat, better, elements, judge_can, probe};
-use super::exchanges::{Asks, InputFormat, Item, View};
+use super::device_port::{DeviceCodec, DeviceFormat, elements, judge_can};
+use super::exchanges::{Asks, Item, View};
 use super::field_output::Downward;
 use super::field_port::{Accepted, Codec, FieldPort, Frames, came, keep};
 use super::io::{Output, PortId};
 use super::line::{Flight, Line, Phase, Talks};
 use super::rejection::Rejection;
-use super::sender::{DIGEST_SEED, Sender, digest};
+use super::requests::Maker;
 use super::store::Store;
 use super::tap::{Tap, TapPlace};
-use super::user::{InputBind, OutputBind, number_of};
-use super::whole_port::{self, Reader};
+use super::user::{InputBind, OutputBind};
+use super::whole_port::Reader;
 use super::{Engine, OUTPUT_BUFFER, find_port};
-use crate::config::OutputBinding;
 use crate::device::{Found, Probe};
 use crate::image::Image;
-use crate::modbus::rtu::{self, Expected, MAX_ADU, REFUSAL_LEN};
+use crate::modbus::rtu::MAX_ADU;
 use crate::schedule::Row;
-use crate::sysvar::SysVar;
 use crate::time::Instant;
 use crate::wire::can::{CanFrame, MAX_CAN_DATA};
-use crate::wire::scalar::Scalar;
-
-/// What a received frame is.
-enum Heard<'i> {
-    /// The awaited reply; the data of a Modbus frame, or the frame.
-    Reply(Option<&'i InputFormat>),
-    /// The device refuses the request.
-    Refusal,
-    /// A frame that comes unasked, and its place in the store.
-    Unasked(&'i DeviceFormat, usize),
-}
-
-/// What may come now.
-#[derive(Clone, Copy)]
-struct Awaited<'i> {
-    /// The frames of the recipe's part.
-    formats: &'i [DeviceFormat],
-    first_frame: u8,
-    items: &'i [Item],
-    flight: Option<Flight>,
-    bindings: &'i [InputBind],
-}
-
-impl<'i> Awaited<'i> {
-    fn asked(&self) -> Option<&'i Item> {
-        self.items.get(usize::from(self.flight?.exchange))
-    }
-
-    fn expected(&self) -> Option<Expected> {
-        self.flight?.expected
-    }
-
-    /// The reply and the refusal that a device's own frames are.
-    fn answers(&self) -> impl Iterator<Item = &'i DeviceFormat> {
-        let item = self.asked().filter(|item| matches!(item.asks, Asks::Frame | Asks::Remote { .. }));
-        let reply = |item: &'i Item| item.reply.iter().map(|reply| &reply.format).chain(&item.refusal);
-        item.into_iter().flat_map(reply)
-    }
-
-    fn unasked(&self) -> impl Iterator<Item = (&'i DeviceFormat, usize)> {
-        let part = (usize::from(self.first_frame)..).zip(self.formats).map(|(slot, format)| (format, slot));
-        let others = self.items.iter().filter(|item| matches!(item.asks, Asks::Nothing));
-        let others = others.filter_map(|item| item.reply.as_ref());
-        part.chain(others.map(|reply| (&reply.format, usize::from(reply.slot))))
-    }
-
-    /// What bytes of a line are.
-    fn probe(&self, bytes: &[u8]) -> Probe {
-        let mut best = match self.expected() {
-            Some(expected) => match expected.probe(bytes) {
-                rtu::Probe::No => Probe::No(1),
-                rtu::Probe::Partial => Probe::Partial(1),
-                rtu::Probe::Reply(len) => Probe::Frame(len),
-                rtu::Probe::Refused(_) => Probe::Frame(REFUSAL_LEN),
-                rtu::Probe::Wrong => Probe::Wrong(expected.len_of(bytes)),
-            },
-            None => Probe::No(1),
-        };
-        for format in self.answers().chain(self.unasked().map(|(format, _)| format)) {
-            best = better(best, probe(format, self.bindings, bytes));
-        }
-        best
-    }
-
-    /// What a frame of a line is that [`Self::probe`] has found.
-    fn heard(&self, frame: &[u8]) -> Option<Heard<'i>> {
-        let is = |format: &DeviceFormat| matches!(probe(format, self.bindings, frame), Probe::Frame(len) if len == frame.len());
-        if let Some(expected) = self.expected() {
-            match expected.probe(frame) {
-                rtu::Probe::Reply(_) => return Some(Heard::Reply(self.asked()?.reply.as_ref())),
-                rtu::Probe::Refused(_) => return Some(Heard::Refusal),
-                _ => {}
-            }
-        }
-        self.answer(is).or_else(|| {
-            let (format, slot) = self.unasked().find(|(format, _)| is(format))?;
-            Some(Heard::Unasked(format, slot))
-        })
-    }
-
-    fn answer(&self, is: impl Fn(&DeviceFormat) -> bool) -> Option<Heard<'i>> {
-        let found = self.answers().find(|answer| is(answer))?;
-        let reply = self.asked()?.reply.as_ref();
-        let reply = reply.filter(|reply| core::ptr::eq(&reply.format, found));
-        Some(reply.map_or(Heard::Refusal, |reply| Heard::Reply(Some(reply))))
-    }
-}
 
 impl FieldPort {
     /// The conversation, if the recipe has exchanges.
@@ -450,129 +362,6 @@ fn note_answer(talks: &mut Talks<'_>, flight: Flight, refusal: Option<u8>) {
             bump(&mut peer.counters.refused);
             peer.counters.refusal = code;
         }
-    }
-}
-
-/// Makes the frames of requests.
-struct Maker<'a> {
-    image: &'a Image,
-    bindings: &'a [OutputBind],
-    codec: &'a DeviceCodec,
-    sender: &'a Sender,
-    reply: super::io::ReplyCode,
-    now: Instant,
-}
-
-impl Maker<'_> {
-    /// Looks at values and bits that ask, and makes the next request. Returns its exchange and its
-    /// length in `out`.
-    fn next(
-        &self,
-        line: &mut Line,
-        items: &mut [Item],
-        talks: &mut Talks<'_>,
-        is_busy: bool,
-        out: &mut [u8],
-    ) -> Option<(u8, usize)> {
-        let now = self.now;
-        if line.looks.as_mut().is_some_and(|grid| grid.due(now).is_some()) {
-            for (nth, item) in items.iter_mut().enumerate() {
-                if self.is_wanted(item, out) {
-                    line.request(talks, nth, now);
-                }
-            }
-        }
-        if is_busy || !line.may_ask() {
-            return None;
-        }
-        // Each exchange that has no values yet is passed over once.
-        for _ in 0..=items.len() {
-            let flight = line.next(talks, now)?;
-            let item = items.get(usize::from(flight.exchange))?;
-            let peer = talks.rows.get(usize::from(flight.exchange)).map_or(0, Row::peer);
-            let peer = talks.peers.get_mut(usize::from(peer))?;
-            let Some(len) = self.make(item, out) else {
-                bump(&mut peer.counters.unprepared);
-                continue;
-            };
-            bump(&mut peer.counters.requests);
-            let expected = match item.asks {
-                Asks::Rtu { operation, .. } => Expected::of(&operation, out.get(..len).unwrap_or(&[])),
-                _ => None,
-            };
-            line.handed_over(flight, expected, len);
-            return Some((flight.exchange, len));
-        }
-        None
-    }
-
-    /// Whether a value of the request has changed, or its bit has risen.
-    fn is_wanted(&self, item: &mut Item, out: &mut [u8]) -> bool {
-        let mut is_wanted = false;
-        if item.on_change
-            && let Some(len) = self.make(item, out)
-        {
-            let hash = digest(DIGEST_SEED, out.get(..len).unwrap_or(&[]));
-            is_wanted = item.digest != Some(hash);
-            item.digest = Some(hash);
-        }
-        if let Some((var, bit)) = item.rising
-            && self.image.is_known(var)
-        {
-            let on = is_set(self.image, var, bit);
-            is_wanted |= on && item.last_bit == Some(false);
-            item.last_bit = Some(on);
-        }
-        is_wanted
-    }
-
-    /// Writes a request to the front of `out`; `None` if a value of it is unknown or stale.
-    fn make(&self, item: &Item, out: &mut [u8]) -> Option<usize> {
-        let fields = item.request.as_ref().map_or(&[][..], |format| format.bindings.of(self.bindings));
-        if !fields.iter().all(|field| may_send(self.sender, self.image, field, self.now)) {
-            return None;
-        }
-        let number = |nth: usize| {
-            let field = fields.get(nth);
-            field.map_or(f64::NAN, |field| number_of(field, self.image, self.sender.frames_sent, self.reply))
-        };
-        match (item.asks, &item.request) {
-            (Asks::Rtu { slave, operation }, format) => {
-                operation.encode(slave, out.first_chunk_mut::<MAX_ADU>()?, |data| {
-                    format.as_ref().is_none_or(|format| {
-                        let codec = self.codec;
-                        let elements = fields.iter().map(OutputBind::element);
-                        let text =
-                            |nth: usize, out: &mut [u8]| codec.write_text(format, nth, self.image, out);
-                        let len = format.layout.encode_with(elements, number, text, data);
-                        len == Some(data.len())
-                    })
-                })
-            }
-            (Asks::Frame, Some(format)) => {
-                whole_port::encode(self.codec, format, self.bindings, self.image, number, out)
-            }
-            (Asks::Remote { .. }, _) => Some(0),
-            _ => None,
-        }
-    }
-}
-
-/// Whether a field's value is known, and fresh unless the recipe holds.
-pub(super) fn may_send(sender: &Sender, image: &Image, field: &OutputBind, now: Instant) -> bool {
-    match field.from {
-        OutputBinding::Variable { var, .. } | OutputBinding::Bit { var, .. } => {
-            image.known_since(var).is_some_and(|at| sender.is_fresh(at, now))
-        }
-        OutputBinding::State { .. } => sender.may_show(image, now),
-        _ => true,
-    }
-}
-
-fn is_set(image: &Image, var: SysVar, bit: u8) -> bool {
-    match image.value(var) {
-        Scalar::Byte(bits) => bits.checked_shr(u32::from(bit)).is_some_and(|bits| bits & 1 == 1),
-        _ => false,
     }
 }
 

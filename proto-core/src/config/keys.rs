@@ -1,0 +1,103 @@
+//! The keys of a configuration that a mistake can be at.
+
+/// A key of the controller's section.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[non_exhaustive]
+pub enum ControllerKey {
+    /// Its address.
+    Address,
+    /// Its dialect.
+    Dialect,
+    /// Its command, state and Modbus ports.
+    Ports,
+    /// The recipe link.
+    RecipeLink,
+}
+
+/// A key of the board's own address.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[non_exhaustive]
+pub enum NetworkKey {
+    /// Address and prefix.
+    Address,
+    /// The router.
+    Router,
+    /// The name server.
+    Dns,
+}
+
+/// A key of a recipe.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[non_exhaustive]
+pub enum RecipeKey {
+    /// The recipe as a whole.
+    Whole,
+    /// Its name.
+    Name,
+    /// What makes a port send it.
+    Send,
+}
+
+/// A key of an exchange.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[non_exhaustive]
+pub enum ExchangeKey {
+    /// The exchange as a whole.
+    Whole,
+    /// The slave or other peer.
+    Peer,
+    /// The addresses and the fields of registers or coils.
+    Registers,
+    /// Its period.
+    Every,
+    /// The bit that triggers it.
+    Rising,
+    /// How long its reply may take.
+    Timeout,
+    /// How long the line rests after it.
+    Pause,
+    /// The request.
+    Request,
+    /// The reply.
+    Reply,
+    /// The refusal.
+    Refusal,
+}
+
+/// A key of a port.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[non_exhaustive]
+pub enum PortKey {
+    /// Its name.
+    Name,
+    /// Its recipe.
+    Recipe,
+    /// Its cycle.
+    Cycle,
+    /// Its timeout.
+    Timeout,
+    /// Its safe values.
+    OnTimeout,
+    /// When its outputs are stale.
+    StaleAfter,
+    /// A serial line's speed.
+    Baud,
+    /// A serial line's stop bits.
+    StopBits,
+    /// A serial line's idle gap.
+    IdleGap,
+    /// A serial line's turnaround.
+    Turnaround,
+    /// Whether a serial line gives back what is sent on it.
+    Echo,
+    /// A CAN bus's speed.
+    Bitrate,
+    /// The address to listen on.
+    Listen,
+    /// The variables of its health.
+    Health,
+    /// Whether it starts with safe values.
+    SafeAtStart,
+    /// When it sends without a change.
+    Refresh,
+}

@@ -1,0 +1,97 @@
+//! What may come on a port with exchanges, and what a frame that came is.
+//!
+//! In: the request on its way, and the frames that come unasked. Out: the frame's part in it. Applies
+//! nothing.
+
+use super::device_port::{DeviceFormat, better, probe};
+use super::exchanges::{Asks, InputFormat, Item};
+use super::line::Flight;
+use super::user::InputBind;
+use crate::device::Probe;
+use crate::modbus::rtu::{self, Expected, REFUSAL_LEN};
+
+/// What a received frame is.
+pub(super) enum Heard<'i> {
+    /// The awaited reply; the data of a Modbus frame, or the frame.
+    Reply(Option<&'i InputFormat>),
+    /// The device refuses the request.
+    Refusal,
+    /// A frame that comes unasked, and its place in the store.
+    Unasked(&'i DeviceFormat, usize),
+}
+
+/// What may come now.
+#[derive(Clone, Copy)]
+pub(super) struct Awaited<'i> {
+    /// The frames of the recipe's part.
+    pub formats: &'i [DeviceFormat],
+    pub first_frame: u8,
+    pub items: &'i [Item],
+    pub flight: Option<Flight>,
+    pub bindings: &'i [InputBind],
+}
+
+impl<'i> Awaited<'i> {
+    pub(super) fn asked(&self) -> Option<&'i Item> {
+        self.items.get(usize::from(self.flight?.exchange))
+    }
+
+    pub(super) fn expected(&self) -> Option<Expected> {
+        self.flight?.expected
+    }
+
+    /// The reply and the refusal that a device's own frames are.
+    pub(super) fn answers(&self) -> impl Iterator<Item = &'i DeviceFormat> {
+        let item = self.asked().filter(|item| matches!(item.asks, Asks::Frame | Asks::Remote { .. }));
+        let reply = |item: &'i Item| item.reply.iter().map(|reply| &reply.format).chain(&item.refusal);
+        item.into_iter().flat_map(reply)
+    }
+
+    pub(super) fn unasked(&self) -> impl Iterator<Item = (&'i DeviceFormat, usize)> {
+        let part = (usize::from(self.first_frame)..).zip(self.formats).map(|(slot, format)| (format, slot));
+        let others = self.items.iter().filter(|item| matches!(item.asks, Asks::Nothing));
+        let others = others.filter_map(|item| item.reply.as_ref());
+        part.chain(others.map(|reply| (&reply.format, usize::from(reply.slot))))
+    }
+
+    /// What bytes of a line are.
+    pub(super) fn probe(&self, bytes: &[u8]) -> Probe {
+        let mut best = match self.expected() {
+            Some(expected) => match expected.probe(bytes) {
+                rtu::Probe::No => Probe::No(1),
+                rtu::Probe::Partial => Probe::Partial(1),
+                rtu::Probe::Reply(len) => Probe::Frame(len),
+                rtu::Probe::Refused(_) => Probe::Frame(REFUSAL_LEN),
+                rtu::Probe::Wrong => Probe::Wrong(expected.len_of(bytes)),
+            },
+            None => Probe::No(1),
+        };
+        for format in self.answers().chain(self.unasked().map(|(format, _)| format)) {
+            best = better(best, probe(format, self.bindings, bytes));
+        }
+        best
+    }
+
+    /// What a frame of a line is that [`Self::probe`] has found.
+    pub(super) fn heard(&self, frame: &[u8]) -> Option<Heard<'i>> {
+        let is = |format: &DeviceFormat| matches!(probe(format, self.bindings, frame), Probe::Frame(len) if len == frame.len());
+        if let Some(expected) = self.expected() {
+            match expected.probe(frame) {
+                rtu::Probe::Reply(_) => return Some(Heard::Reply(self.asked()?.reply.as_ref())),
+                rtu::Probe::Refused(_) => return Some(Heard::Refusal),
+                _ => {}
+            }
+        }
+        self.answer(is).or_else(|| {
+            let (format, slot) = self.unasked().find(|(format, _)| is(format))?;
+            Some(Heard::Unasked(format, slot))
+        })
+    }
+
+    pub(super) fn answer(&self, is: impl Fn(&DeviceFormat) -> bool) -> Option<Heard<'i>> {
+        let found = self.answers().find(|answer| is(answer))?;
+        let reply = self.asked()?.reply.as_ref();
+        let reply = reply.filter(|reply| core::ptr::eq(&reply.format, found));
+        Some(reply.map_or(Heard::Refusal, |reply| Heard::Reply(Some(reply))))
+    }
+}

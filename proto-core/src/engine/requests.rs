@@ -1,0 +1,143 @@
+//! The requests of exchanges: which is next, and its bytes.
+//!
+//! In: the image, the exchanges of a port, its line. Out: a request, unless a value of it is unknown or
+//! stale.
+
+use super::counters::bump;
+use super::device_port::DeviceCodec;
+use super::exchanges::{Asks, Item};
+use super::io::ReplyCode;
+use super::line::{Line, Talks};
+use super::sender::{DIGEST_SEED, Sender, digest};
+use super::user::{OutputBind, number_of};
+use super::whole_port;
+use crate::config::OutputBinding;
+use crate::image::Image;
+use crate::modbus::rtu::{Expected, MAX_ADU};
+use crate::schedule::Row;
+use crate::sysvar::SysVar;
+use crate::time::Instant;
+use crate::wire::scalar::Scalar;
+
+/// Makes the frames of requests.
+pub(super) struct Maker<'a> {
+    pub image: &'a Image,
+    pub bindings: &'a [OutputBind],
+    pub codec: &'a DeviceCodec,
+    pub sender: &'a Sender,
+    pub reply: ReplyCode,
+    pub now: Instant,
+}
+
+impl Maker<'_> {
+    /// Looks at values and bits that ask, and makes the next request. Returns its exchange and its
+    /// length in `out`.
+    pub(super) fn next(
+        &self,
+        line: &mut Line,
+        items: &mut [Item],
+        talks: &mut Talks<'_>,
+        is_busy: bool,
+        out: &mut [u8],
+    ) -> Option<(u8, usize)> {
+        let now = self.now;
+        if line.looks.as_mut().is_some_and(|grid| grid.due(now).is_some()) {
+            for (nth, item) in items.iter_mut().enumerate() {
+                if self.is_wanted(item, out) {
+                    line.request(talks, nth, now);
+                }
+            }
+        }
+        if is_busy || !line.may_ask() {
+            return None;
+        }
+        // Each exchange that has no values yet is passed over once.
+        for _ in 0..=items.len() {
+            let flight = line.next(talks, now)?;
+            let item = items.get(usize::from(flight.exchange))?;
+            let peer = talks.rows.get(usize::from(flight.exchange)).map_or(0, Row::peer);
+            let peer = talks.peers.get_mut(usize::from(peer))?;
+            let Some(len) = self.make(item, out) else {
+                bump(&mut peer.counters.unprepared);
+                continue;
+            };
+            bump(&mut peer.counters.requests);
+            let expected = match item.asks {
+                Asks::Rtu { operation, .. } => Expected::of(&operation, out.get(..len).unwrap_or(&[])),
+                _ => None,
+            };
+            line.handed_over(flight, expected, len);
+            return Some((flight.exchange, len));
+        }
+        None
+    }
+
+    /// Whether a value of the request has changed, or its bit has risen.
+    fn is_wanted(&self, item: &mut Item, out: &mut [u8]) -> bool {
+        let mut is_wanted = false;
+        if item.on_change
+            && let Some(len) = self.make(item, out)
+        {
+            let hash = digest(DIGEST_SEED, out.get(..len).unwrap_or(&[]));
+            is_wanted = item.digest != Some(hash);
+            item.digest = Some(hash);
+        }
+        if let Some((var, bit)) = item.rising
+            && self.image.is_known(var)
+        {
+            let on = is_set(self.image, var, bit);
+            is_wanted |= on && item.last_bit == Some(false);
+            item.last_bit = Some(on);
+        }
+        is_wanted
+    }
+
+    /// Writes a request to the front of `out`; `None` if a value of it is unknown or stale.
+    fn make(&self, item: &Item, out: &mut [u8]) -> Option<usize> {
+        let fields = item.request.as_ref().map_or(&[][..], |format| format.bindings.of(self.bindings));
+        if !fields.iter().all(|field| may_send(self.sender, self.image, field, self.now)) {
+            return None;
+        }
+        let number = |nth: usize| {
+            let field = fields.get(nth);
+            field.map_or(f64::NAN, |field| number_of(field, self.image, self.sender.frames_sent, self.reply))
+        };
+        match (item.asks, &item.request) {
+            (Asks::Rtu { slave, operation }, format) => {
+                operation.encode(slave, out.first_chunk_mut::<MAX_ADU>()?, |data| {
+                    format.as_ref().is_none_or(|format| {
+                        let codec = self.codec;
+                        let elements = fields.iter().map(OutputBind::element);
+                        let text =
+                            |nth: usize, out: &mut [u8]| codec.write_text(format, nth, self.image, out);
+                        let len = format.layout.encode_with(elements, number, text, data);
+                        len == Some(data.len())
+                    })
+                })
+            }
+            (Asks::Frame, Some(format)) => {
+                whole_port::encode(self.codec, format, self.bindings, self.image, number, out)
+            }
+            (Asks::Remote { .. }, _) => Some(0),
+            _ => None,
+        }
+    }
+}
+
+/// Whether a field's value is known, and fresh unless the recipe holds.
+pub(super) fn may_send(sender: &Sender, image: &Image, field: &OutputBind, now: Instant) -> bool {
+    match field.from {
+        OutputBinding::Variable { var, .. } | OutputBinding::Bit { var, .. } => {
+            image.known_since(var).is_some_and(|at| sender.is_fresh(at, now))
+        }
+        OutputBinding::State { .. } => sender.may_show(image, now),
+        _ => true,
+    }
+}
+
+fn is_set(image: &Image, var: SysVar, bit: u8) -> bool {
+    match image.value(var) {
+        Scalar::Byte(bits) => bits.checked_shr(u32::from(bit)).is_some_and(|bits| bits & 1 == 1),
+        _ => false,
+    }
+}
