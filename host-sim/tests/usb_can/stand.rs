@@ -168,6 +168,15 @@ impl Cell {
         self.port(state, |port| port["device"]["bus"] == state)
     }
 
+    /// Waits until the bus is active and this many restarts were reported. The gateway may see the interface's
+    /// state before it reads the frame that reports the restart.
+    #[track_caller]
+    pub(crate) fn restarted(&self, times: u64) {
+        self.port("restarted", |port| {
+            port["device"]["bus"] == "active" && port["device"]["restarts"].as_u64() == Some(times)
+        });
+    }
+
     /// The hand sends its grip until the controller has it.
     #[track_caller]
     pub(crate) fn grips(&self, adapter: &Adapter, grip: u16) {
