@@ -116,6 +116,12 @@ pub struct LinkCounters {
 }
 
 impl PortCounters {
+    /// A frame of so many bytes was handed over.
+    pub(super) fn sent(&mut self, len: usize) {
+        bump(&mut self.frames_out);
+        add(&mut self.bytes_out, len);
+    }
+
     /// Frames that were rejected; those for other nodes of a CAN bus are not.
     pub(super) fn rejected(&self) -> u32 {
         let all = [

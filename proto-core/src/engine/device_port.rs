@@ -7,7 +7,7 @@ use heapless::Vec;
 
 use super::build_error::{BuildError, one_too_many};
 use super::command_link::CommandLink;
-use super::counters::{add, bump};
+use super::counters::bump;
 use super::field_output::Downward;
 use super::field_port::{Accepted, Codec, FieldPort, Frames, came, keep};
 use super::line::Line;
@@ -15,14 +15,14 @@ use super::rejection::Rejection;
 use super::sender::{DIGEST_SEED, digest};
 use super::store::Store;
 use super::tap::Tap;
-use super::user::{InputBind, InputTo, OutputBind, Written, number_of};
-use super::whole_port::{self, MAX_TEXTS, Reader, TextBind, texts_of};
+use super::user::{InputBind, InputTo, OutputBind, Written};
+use super::whole_port::{MAX_TEXTS, Outgoing, Reader, TextBind, texts_of};
 use crate::config::{CanFramePart, ConfigView, Counted, DeviceFrame, Parts, Recipe, Rs485, Span};
 use crate::device::{Cutter, Element, Encoding, Escape, Found, FrameLayout, Framer, Overflow, Probe};
 use crate::image::{Image, bind_to_variable};
 use crate::sysvar::{Direction, SysVar};
 use crate::time::Instant;
-use crate::wire::can::{CanFrame, CanId, MAX_CAN_DATA};
+use crate::wire::can::{CanFrame, CanId};
 use crate::wire::scalar::Scalar;
 
 /// Maximum number of frames of one port with a device's own frames, both ways together.
@@ -215,12 +215,11 @@ impl FieldPort {
                 inputs,
                 texts,
                 reader: Some(Reader::Search(framer)),
-                skipped_bytes,
                 ..
-            }) => Some((formats.get(..usize::from(*inputs)).unwrap_or(&[]), texts, framer, skipped_bytes)),
+            }) => Some((formats.get(..usize::from(*inputs)).unwrap_or(&[]), texts, framer)),
             _ => None,
         };
-        let Some((formats, texts, framer, noise_bytes)) = framer else { return accepted };
+        let Some((formats, texts, framer)) = framer else { return accepted };
         let (reply, counters) = (&mut self.reply, &mut self.counters);
         let mut frames = Frames::new((self.id, self.mode), reply, counters, bindings, store, commands);
         let effort = formats
@@ -252,16 +251,26 @@ impl FieldPort {
             }
         }
         *rest = left;
+        self.note_skipped(bytes, tap, now);
+        self.sender.frames_accepted(accepted.frames, usable, &mut self.counters, now);
+        accepted
+    }
+
+    /// Counts what the search for frames has skipped, in these bytes or those held before.
+    pub(super) fn note_skipped<const TAP: usize>(&mut self, bytes: &[u8], tap: &mut Tap<TAP>, now: Instant) {
+        let Codec::Device(DeviceCodec { reader: Some(Reader::Search(framer)), skipped_bytes, .. }) =
+            &mut self.codec
+        else {
+            return;
+        };
         let stats = framer.stats();
         self.counters.resync_bytes = stats.skipped_bytes;
         // The bytes of a frame with a wrong checksum were reported as that.
-        let noise = stats.noise_bytes.wrapping_sub(*noise_bytes);
+        let noise = stats.noise_bytes.wrapping_sub(*skipped_bytes);
         if noise > 0 {
-            *noise_bytes = stats.noise_bytes;
+            *skipped_bytes = stats.noise_bytes;
             self.no_frame(bytes, noise as usize, tap, now);
         }
-        self.sender.frames_accepted(accepted.frames, usable, &mut self.counters, now);
-        accepted
     }
 
     /// A frame from the bus; see [`FieldPort::can`].
@@ -306,14 +315,8 @@ impl FieldPort {
         let Codec::Device(device) = &self.codec else { return None };
         let nth = self.sender.next_can;
         let (frames_sent, reply) = (self.sender.frames_sent, self.reply);
-        let encode = |format: &DeviceFormat, out: &mut [u8]| {
-            let all = bindings;
-            let bindings = format.bindings.of(all);
-            let number = |nth: usize| {
-                bindings.get(nth).map_or(f64::NAN, |binding| number_of(binding, image, frames_sent, reply))
-            };
-            whole_port::encode(device, format, all, image, number, out)
-        };
+        let outgoing = Outgoing { image, bindings, texts: &device.texts, frames_sent, reply };
+        let encode = |format: &DeviceFormat, out: &mut [u8]| outgoing.encode(format, device.escape, out);
         let formats = device.output();
         if nth == 0 && self.sender.sends_changes() {
             let mut hash = DIGEST_SEED;
@@ -334,15 +337,10 @@ impl FieldPort {
         let frame = out.get(..len).unwrap_or(&[]);
         let downward = match device.reader {
             Some(_) => Downward::Bytes(len),
-            None => Downward::Can(CanFrame::filled(format.id, len.min(MAX_CAN_DATA) as u8, |data| {
-                for (slot, &byte) in data.iter_mut().zip(frame) {
-                    *slot = byte;
-                }
-            })),
+            None => Downward::Can(CanFrame::cut(format.id, frame)),
         };
         let is_last = nth.saturating_add(1) >= formats.len();
-        bump(&mut self.counters.frames_out);
-        add(&mut self.counters.bytes_out, len);
+        self.counters.sent(len);
         if is_last {
             self.sender.handed_over();
         } else {

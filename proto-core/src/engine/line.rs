@@ -119,6 +119,14 @@ pub(super) struct Talks<'a> {
     pub peers: &'a mut [PeerState],
 }
 
+impl Talks<'_> {
+    /// The peer that a request is to.
+    pub(super) fn peer_of(&mut self, flight: Flight) -> Option<&mut PeerState> {
+        let peer = self.rows.get(usize::from(flight.exchange)).map_or(0, Row::peer);
+        self.peers.get_mut(usize::from(peer))
+    }
+}
+
 impl Line {
     pub(super) fn new(exchanges: Span, peers: Span, looks: Option<Grid>, has_echo: bool) -> Self {
         Self {
@@ -250,8 +258,7 @@ impl Line {
         times: Times,
         now: Instant,
     ) -> bool {
-        let peer = talks.rows.get(usize::from(flight.exchange)).map_or(0, Row::peer);
-        let Some(peer) = talks.peers.get_mut(usize::from(peer)) else { return true };
+        let Some(peer) = talks.peer_of(flight) else { return true };
         let counters = &mut peer.counters;
         let counter = match failure {
             Failure::Timeout => &mut counters.timeouts,
@@ -290,10 +297,8 @@ impl Line {
 
     /// What has begun is not continued: the device is gone, or the gateway slept.
     pub(super) fn abandon(&mut self, talks: &mut Talks<'_>, now: Instant) {
-        if let Some(flight) = self.flight().or(match self.phase {
-            Phase::Repeat(flight) => Some(flight),
-            _ => None,
-        }) && flight.taken.was_requested()
+        if let Phase::Repeat(flight) | Phase::Sending(flight) | Phase::Waiting(flight) = self.phase
+            && flight.taken.was_requested()
         {
             self.turns(talks, |turns| turns.request(usize::from(flight.exchange), now));
         }

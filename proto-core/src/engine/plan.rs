@@ -343,13 +343,12 @@ pub(super) fn sent_by<'a>(config: ConfigView<'a>, recipe: &'a Recipe) -> impl It
     fields.flat_map(FieldSpec::variables).chain(trigger)
 }
 
-/// The variables that a recipe's outputs show, and those whose bits trigger them.
+/// The variables that a recipe's outputs show, those of its exchanges too, and those whose bits
+/// trigger them.
 pub(super) fn shown_by<'a>(config: ConfigView<'a>, recipe: &'a Recipe) -> impl Iterator<Item = SysVar> + 'a {
-    let trigger = match recipe.send {
-        SendOn::Rising { var, .. } => Some(var),
-        _ => None,
-    };
-    let asks = config.exchanges_of(recipe).iter().filter_map(|exchange| Some(exchange.when.rising?.0));
-    let fields = config.fields_of(recipe, Direction::Output).flat_map(|(_, _, field)| field.variables());
-    fields.chain(trigger).chain(asks)
+    let exchanges = config.exchanges_of(recipe).iter();
+    let requests = exchanges.clone().filter_map(move |exchange| exchange.fields(config, Direction::Output));
+    let fields = requests.flat_map(move |span| span.of(config.fields)).flat_map(FieldSpec::variables);
+    let asks = exchanges.filter_map(|exchange| Some(exchange.when.rising?.0));
+    sent_by(config, recipe).chain(fields).chain(asks)
 }

@@ -9,15 +9,12 @@ use super::exchanges::{Asks, Item};
 use super::io::ReplyCode;
 use super::line::{Line, Talks};
 use super::sender::{DIGEST_SEED, Sender, digest};
-use super::user::{OutputBind, number_of};
-use super::whole_port;
+use super::user::OutputBind;
+use super::whole_port::Outgoing;
 use crate::config::OutputBinding;
 use crate::image::Image;
 use crate::modbus::rtu::{Expected, MAX_ADU};
-use crate::schedule::Row;
-use crate::sysvar::SysVar;
 use crate::time::Instant;
-use crate::wire::scalar::Scalar;
 
 /// Makes the frames of requests.
 pub(super) struct Maker<'a> {
@@ -55,8 +52,7 @@ impl Maker<'_> {
         for _ in 0..=items.len() {
             let flight = line.next(talks, now)?;
             let item = items.get(usize::from(flight.exchange))?;
-            let peer = talks.rows.get(usize::from(flight.exchange)).map_or(0, Row::peer);
-            let peer = talks.peers.get_mut(usize::from(peer))?;
+            let peer = talks.peer_of(flight)?;
             let Some(len) = self.make(item, out) else {
                 bump(&mut peer.counters.unprepared);
                 continue;
@@ -85,7 +81,7 @@ impl Maker<'_> {
         if let Some((var, bit)) = item.rising
             && self.image.is_known(var)
         {
-            let on = is_set(self.image, var, bit);
+            let on = self.image.bit(var, bit) == 1.0;
             is_wanted |= on && item.last_bit == Some(false);
             item.last_bit = Some(on);
         }
@@ -98,26 +94,16 @@ impl Maker<'_> {
         if !fields.iter().all(|field| may_send(self.sender, self.image, field, self.now)) {
             return None;
         }
-        let number = |nth: usize| {
-            let field = fields.get(nth);
-            field.map_or(f64::NAN, |field| number_of(field, self.image, self.sender.frames_sent, self.reply))
-        };
+        let (frames_sent, reply) = (self.sender.frames_sent, self.reply);
+        let texts = &self.codec.texts;
+        let outgoing = Outgoing { image: self.image, bindings: self.bindings, texts, frames_sent, reply };
         match (item.asks, &item.request) {
             (Asks::Rtu { slave, operation }, format) => {
                 operation.encode(slave, out.first_chunk_mut::<MAX_ADU>()?, |data| {
-                    format.as_ref().is_none_or(|format| {
-                        let codec = self.codec;
-                        let elements = fields.iter().map(OutputBind::element);
-                        let text =
-                            |nth: usize, out: &mut [u8]| codec.write_text(format, nth, self.image, out);
-                        let len = format.layout.encode_with(elements, number, text, data);
-                        len == Some(data.len())
-                    })
+                    format.as_ref().is_none_or(|format| outgoing.write(format, data) == Some(data.len()))
                 })
             }
-            (Asks::Frame, Some(format)) => {
-                whole_port::encode(self.codec, format, self.bindings, self.image, number, out)
-            }
+            (Asks::Frame, Some(format)) => outgoing.encode(format, self.codec.escape, out),
             (Asks::Remote { .. }, _) => Some(0),
             _ => None,
         }
@@ -132,12 +118,5 @@ pub(super) fn may_send(sender: &Sender, image: &Image, field: &OutputBind, now: 
         }
         OutputBinding::State { .. } => sender.may_show(image, now),
         _ => true,
-    }
-}
-
-fn is_set(image: &Image, var: SysVar, bit: u8) -> bool {
-    match image.value(var) {
-        Scalar::Byte(bits) => bits.checked_shr(u32::from(bit)).is_some_and(|bits| bits & 1 == 1),
-        _ => false,
     }
 }

@@ -7,9 +7,7 @@ use super::latency::Since;
 use crate::config::{OnStale, SendOn};
 use crate::image::{ExtraSet, GroupId, Image, MAX_GROUPS, VarSet};
 use crate::schedule::Grid;
-use crate::sysvar::SysVar;
 use crate::time::{Duration, Instant};
-use crate::wire::scalar::Scalar;
 
 /// A set of the image's groups.
 #[derive(Debug, Clone, Copy, Default)]
@@ -156,6 +154,12 @@ impl Sender {
         self.frames_sent = self.frames_sent.wrapping_add(1);
     }
 
+    /// A frame that is not of the output part was handed over; the line is held until it has left.
+    pub(super) fn handed_over_beside(&mut self) {
+        self.hold();
+        self.frames_sent = self.frames_sent.wrapping_add(1);
+    }
+
     /// Nothing is sent this time.
     pub(super) fn dismiss(&mut self) {
         self.due = false;
@@ -201,7 +205,7 @@ impl Sender {
         if !image.is_known(var) {
             return;
         }
-        let on = bit_of(image, var, bit);
+        let on = image.bit(var, bit) == 1.0;
         if on && self.last_bit == Some(false) && usable {
             self.raise(counters, Since::at(now));
         }
@@ -256,10 +260,3 @@ pub(super) fn digest(seed: u64, bytes: &[u8]) -> u64 {
 
 /// Initial value of a digest.
 pub(super) const DIGEST_SEED: u64 = 0xCBF2_9CE4_8422_2325;
-
-fn bit_of(image: &Image, var: SysVar, bit: u8) -> bool {
-    match image.value(var) {
-        Scalar::Byte(bits) => bits.checked_shr(u32::from(bit)).is_some_and(|bits| bits & 1 == 1),
-        _ => false,
-    }
-}

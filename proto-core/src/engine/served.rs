@@ -14,8 +14,8 @@ use super::requests::may_send;
 use super::sender::Sender;
 use super::store::Store;
 use super::tap::Tap;
-use super::user::{InputBind, OutputBind, number_of};
-use super::whole_port::{Reader, TextBind, write_text};
+use super::user::{InputBind, OutputBind};
+use super::whole_port::{Outgoing, Reader, TextBind};
 use crate::modbus::rtu::{MAX_ADU, Table};
 use crate::modbus::server::RegisterBank;
 use crate::modbus::{Coils, Exception, Registers};
@@ -55,15 +55,9 @@ impl<const PORTS: usize> Blocks<'_, PORTS> {
         if !fields.iter().all(|field| may_send(self.sender, image, field, self.now)) {
             return Err(Exception::DeviceFailure);
         }
-        let number = |nth: usize| {
-            let field = fields.get(nth);
-            field.map_or(f64::NAN, |field| {
-                number_of(field, image, self.sender.frames_sent, *self.frames.reply)
-            })
-        };
-        let text = |nth: usize, out: &mut [u8]| write_text(self.texts, format, nth, image, out);
-        let elements = fields.iter().map(OutputBind::element);
-        let len = format.layout.encode_with(elements, number, text, out).ok_or(Exception::DeviceFailure)?;
+        let (frames_sent, reply) = (self.sender.frames_sent, *self.frames.reply);
+        let outgoing = Outgoing { image, bindings: self.outputs, texts: self.texts, frames_sent, reply };
+        let len = outgoing.write(format, out).ok_or(Exception::DeviceFailure)?;
         out.get(..len).ok_or(Exception::DeviceFailure)
     }
 
@@ -255,10 +249,8 @@ impl FieldPort {
             return None;
         };
         let len = if may_send { slave.take_kept(out)? } else { return None };
-        self.sender.hold();
-        self.sender.frames_sent = self.sender.frames_sent.wrapping_add(1);
-        bump(&mut self.counters.frames_out);
-        super::counters::add(&mut self.counters.bytes_out, len);
+        self.sender.handed_over_beside();
+        self.counters.sent(len);
         Some(len)
     }
 

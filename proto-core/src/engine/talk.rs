@@ -6,7 +6,7 @@
 
 use super::awaited::{Awaited, Heard};
 use super::command_link::CommandLink;
-use super::counters::{add, bump};
+use super::counters::{PortCounters, add, bump};
 use super::device_port::{DeviceCodec, DeviceFormat, elements, judge_can};
 use super::exchanges::{Asks, Item, View};
 use super::field_output::Downward;
@@ -23,9 +23,8 @@ use super::{Engine, OUTPUT_BUFFER, find_port};
 use crate::device::{Found, Probe};
 use crate::image::Image;
 use crate::modbus::rtu::MAX_ADU;
-use crate::schedule::Row;
 use crate::time::Instant;
-use crate::wire::can::{CanFrame, MAX_CAN_DATA};
+use crate::wire::can::CanFrame;
 
 impl FieldPort {
     /// The conversation, if the recipe has exchanges.
@@ -96,7 +95,6 @@ impl FieldPort {
             inputs,
             texts,
             reader: Some(Reader::Search(framer)),
-            skipped_bytes: noise_bytes,
             line: Some(line),
             ..
         }) = &mut self.codec
@@ -145,10 +143,7 @@ impl FieldPort {
                     {
                         let is_refused = matches!(heard, Some(Heard::Refusal));
                         let code = frame.get(2).copied().unwrap_or(0);
-                        note_answer(&mut talks, flight, is_refused.then_some(code));
-                        if is_refused {
-                            bump(&mut frames.counters.refused);
-                        }
+                        note_answer(&mut talks, frames.counters, flight, is_refused.then_some(code));
                         if matches!(line.phase, Phase::Waiting(_)) {
                             self.sender.sent();
                         }
@@ -172,14 +167,7 @@ impl FieldPort {
             }
         }
         *rest = left;
-        let stats = framer.stats();
-        self.counters.resync_bytes = stats.skipped_bytes;
-        // The bytes of a frame with a wrong checksum were reported as that.
-        let noise = stats.noise_bytes.wrapping_sub(*noise_bytes);
-        if noise > 0 {
-            *noise_bytes = stats.noise_bytes;
-            self.no_frame(bytes, noise as usize, tap, now);
-        }
+        self.note_skipped(bytes, tap, now);
         self.sender.frames_accepted(accepted.frames, usable, &mut self.counters, now);
         accepted
     }
@@ -225,10 +213,7 @@ impl FieldPort {
                 _ => Err(Rejection::Refused),
             };
             let is_refused = verdict == Err(Rejection::Refused);
-            note_answer(&mut talks, flight, is_refused.then_some(0));
-            if is_refused {
-                bump(&mut frames.counters.refused);
-            }
+            note_answer(&mut talks, frames.counters, flight, is_refused.then_some(0));
             line.answered(&mut talks, flight, item.times, now);
             return verdict;
         }
@@ -272,10 +257,8 @@ impl FieldPort {
         codec.line = Some(line);
         let (item, len) = request?;
         self.note_partial();
-        self.sender.hold();
-        bump(&mut self.counters.frames_out);
-        add(&mut self.counters.bytes_out, len);
-        self.sender.frames_sent = self.sender.frames_sent.wrapping_add(1);
+        self.sender.handed_over_beside();
+        self.counters.sent(len);
         if !is_on_can {
             return Some(Downward::Bytes(len));
         }
@@ -285,11 +268,7 @@ impl FieldPort {
         }
         let frame = out.get(..len).unwrap_or(&[]);
         let id = item.request.as_ref()?.id;
-        Some(Downward::Can(CanFrame::filled(id, len.min(MAX_CAN_DATA) as u8, |data| {
-            for (slot, &byte) in data.iter_mut().zip(frame) {
-                *slot = byte;
-            }
-        })))
+        Some(Downward::Can(CanFrame::cut(id, frame)))
     }
 
     /// The request has left.
@@ -352,10 +331,12 @@ fn view_item<'v>(view: &'v mut View<'_>, line: &Line, nth: u8) -> Option<&'v Ite
     view.of(line).0.get(usize::from(nth))
 }
 
-/// Counts an answer at its peer; a refusal comes with its code.
-fn note_answer(talks: &mut Talks<'_>, flight: Flight, refusal: Option<u8>) {
-    let peer = talks.rows.get(usize::from(flight.exchange)).map_or(0, Row::peer);
-    let Some(peer) = talks.peers.get_mut(usize::from(peer)) else { return };
+/// Counts an answer at its port and peer; a refusal comes with its code.
+fn note_answer(talks: &mut Talks<'_>, counters: &mut PortCounters, flight: Flight, refusal: Option<u8>) {
+    if refusal.is_some() {
+        bump(&mut counters.refused);
+    }
+    let Some(peer) = talks.peer_of(flight) else { return };
     match refusal {
         None => bump(&mut peer.counters.replies),
         Some(code) => {

@@ -10,12 +10,13 @@ use super::command_link::CommandLink;
 use super::counters::add;
 use super::device_port::{DeviceCodec, DeviceFormat, elements};
 use super::field_port::{Accepted, Codec, FieldPort, Frames, came, keep};
+use super::io::ReplyCode;
 use super::rejection::Rejection;
 use super::store::Store;
 use super::tap::Tap;
-use super::user::{InputBind, OutputBind};
+use super::user::{InputBind, OutputBind, number_of};
 use crate::config::{ConfigView, FieldSpec, Span, Words};
-use crate::device::{ByteOrder, Cutter, FrameLayout, Framer, Piece, Probe};
+use crate::device::{ByteOrder, Cutter, Escape, FrameLayout, Framer, Piece, Probe};
 use crate::image::{Image, bind_to_variable};
 use crate::modbus::rtu::Slave;
 use crate::sysvar::{Direction, SysVar};
@@ -148,30 +149,6 @@ impl TextBind {
         }
         Some(written)
     }
-}
-
-impl DeviceCodec {
-    /// Writes the text of an output frame's `nth` element.
-    pub(super) fn write_text(
-        &self,
-        format: &DeviceFormat,
-        nth: usize,
-        image: &Image,
-        out: &mut [u8],
-    ) -> Option<usize> {
-        write_text(&self.texts, format, nth, image, out)
-    }
-}
-
-/// Writes the text of an output frame's `nth` element.
-pub(super) fn write_text(
-    texts: &[TextBind],
-    format: &DeviceFormat,
-    nth: usize,
-    image: &Image,
-    out: &mut [u8],
-) -> Option<usize> {
-    texts_in(texts, format.bindings, Direction::Output).find(|(at, _)| *at == nth)?.1.write(image, out)
 }
 
 /// The texts among some bindings, with their places in them.
@@ -355,20 +332,43 @@ impl FieldPort {
     }
 }
 
-/// The number and the texts of an output frame's elements, for its layout.
-pub(super) fn encode(
-    codec: &DeviceCodec,
-    format: &DeviceFormat,
-    bindings: &[OutputBind],
-    image: &Image,
-    number: impl FnMut(usize) -> f64,
-    out: &mut [u8],
-) -> Option<usize> {
-    let elements = format.bindings.of(bindings).iter().map(OutputBind::element);
-    let text = |nth: usize, out: &mut [u8]| codec.write_text(format, nth, image, out);
-    let len = format.layout.encode_with(elements, number, text, out)?;
-    match codec.escape {
-        Some(escape) => escape.stuff(len, out),
-        None => Some(len),
+/// What output frames are made from.
+#[derive(Clone, Copy)]
+pub(super) struct Outgoing<'a> {
+    pub image: &'a Image,
+    /// The bindings of all ports.
+    pub bindings: &'a [OutputBind],
+    pub texts: &'a [TextBind],
+    pub frames_sent: u32,
+    pub reply: ReplyCode,
+}
+
+impl Outgoing<'_> {
+    /// Writes an output frame, without escape bytes, to the front of `out`.
+    pub(super) fn write(&self, format: &DeviceFormat, out: &mut [u8]) -> Option<usize> {
+        let fields = format.bindings.of(self.bindings);
+        let number = |nth: usize| {
+            let field = fields.get(nth);
+            field.map_or(f64::NAN, |field| number_of(field, self.image, self.frames_sent, self.reply))
+        };
+        let text = |nth: usize, out: &mut [u8]| {
+            let mut texts = texts_in(self.texts, format.bindings, Direction::Output);
+            texts.find(|(at, _)| *at == nth)?.1.write(self.image, out)
+        };
+        format.layout.encode_with(fields.iter().map(OutputBind::element), number, text, out)
+    }
+
+    /// The same with escape bytes, if there are any.
+    pub(super) fn encode(
+        &self,
+        format: &DeviceFormat,
+        escape: Option<Escape>,
+        out: &mut [u8],
+    ) -> Option<usize> {
+        let len = self.write(format, out)?;
+        match escape {
+            Some(escape) => escape.stuff(len, out),
+            None => Some(len),
+        }
     }
 }

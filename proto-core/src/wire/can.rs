@@ -85,6 +85,16 @@ impl CanFrame {
         Self { id, remote: false, len, data }
     }
 
+    /// A data frame of the first [`MAX_CAN_DATA`] of these bytes. The caller has checked that the id
+    /// is valid.
+    pub(crate) fn cut(id: CanId, bytes: &[u8]) -> Self {
+        Self::filled(id, bytes.len().min(MAX_CAN_DATA) as u8, |data| {
+            for (slot, &byte) in data.iter_mut().zip(bytes) {
+                *slot = byte;
+            }
+        })
+    }
+
     /// The frame's id.
     pub const fn id(&self) -> CanId {
         self.id
