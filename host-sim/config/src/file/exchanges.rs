@@ -136,7 +136,7 @@ fn read_frame(item: &Item<'_>, key: &str, direction: Direction, is_can: bool) ->
     let own = if is_can { &CAN_KEYS } else { &STREAM_KEYS };
     let recipe = if is_can { "a CAN recipe" } else { "a stream recipe" };
     table.check_keys_nearly(&[&own[..], remote].concat(), &format!(" of a {key} in {recipe}"))?;
-    let mut part = FilePart::of_exchange(&table);
+    let mut part = FilePart::new(&table);
     let mut frame = FileFrame::new(table.spot.clone());
     if is_can {
         let id = table.required("id", "the frame's CAN id")?;
@@ -170,8 +170,8 @@ fn check_refusal(table: &Reader<'_>, part: &FilePart) -> Result<()> {
 }
 
 impl FilePart {
-    /// A frame of an exchange, still without its fields.
-    pub(super) fn of_exchange(table: &Reader<'_>) -> Self {
+    /// A part, or the frame of an exchange, still without anything but its place.
+    pub(super) fn new(table: &Reader<'_>) -> Self {
         Self {
             spot: table.spot.clone(),
             head: Vec::new(),

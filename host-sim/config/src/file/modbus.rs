@@ -255,7 +255,7 @@ impl<'a> List<'a> {
             true => coils::read(&item, direction)?,
             false => read_registers(table, &item, direction)?,
         };
-        let mut part = FilePart::of_exchange(table);
+        let mut part = FilePart::new(table);
         part.spot = item.spot.clone();
         let count = u16::try_from(count).unwrap_or(u16::MAX);
         part.frames.push(FileFrame::of_fields(item.spot.clone(), fields));

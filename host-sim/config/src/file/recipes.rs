@@ -379,16 +379,8 @@ fn read_part(item: &Item<'_>, rules: Rules, is_can: bool, flavour: Flavour) -> R
     };
     table.check_keys(&[own, frame_keys, sending_keys].concat(), when)?;
 
-    let mut part = FilePart {
-        spot: table.spot.clone(),
-        head: Vec::new(),
-        tail: Vec::new(),
-        head_spot: None,
-        tail_spot: None,
-        frames: Vec::new(),
-        sending: bindings::read_sending(&table)?,
-        framing: framings::read_part(&table)?,
-    };
+    let (sending, framing) = (bindings::read_sending(&table)?, framings::read_part(&table)?);
+    let mut part = FilePart { sending, framing, ..FilePart::new(&table) };
     if is_can {
         for frame in table.any_tables("frame")? {
             let frame_keys = device::frame_keys(&frame, rules.mode, flavour)?;

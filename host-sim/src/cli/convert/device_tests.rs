@@ -100,13 +100,10 @@ fn frames_of_exchanges_are_whole() {
         (13, TalkPart::Request, &["3"], "00 06 00 F0 00 03 C8 29"),
     ] {
         let part = exchange_part("modbus-line.toml", number, talk);
-        let values: Vec<String> = values.iter().map(|value| (*value).to_owned()).collect();
-        let mut out = Vec::new();
-        encode_values(&part, None, &values, &mut out).unwrap();
-        let found = String::from_utf8(out).unwrap();
-        assert_eq!(found.trim_end(), bytes, "exchange {number}");
+        let found = from_values(&part, None, values).unwrap();
+        assert_eq!(found, bytes, "exchange {number}");
         let (values, notes) = decoded(&part, &found);
-        assert_eq!((encoded(&part, &values).unwrap(), notes.as_str()), (found, ""), "{values}");
+        assert_eq!((encoded(&part, &values).unwrap(), notes.as_str()), (found + "\n", ""), "{values}");
         let needs_values =
             matches!((number, talk), (1, TalkPart::Reply | TalkPart::Refusal) | (2 | 13, TalkPart::Request));
         assert_eq!(part.is_constant(), !needs_values, "{values}");
@@ -162,11 +159,9 @@ fn the_worked_bytes_of_conversations_are_right() {
         let recipes = parse_recipes(Text { name: title, toml: &toml }, &[]).unwrap();
         for &(number, talk, values) in frames {
             let part = Part::choose_exchange(&recipes, None, Some(number), Some(talk)).unwrap();
-            let values: Vec<_> = values.split_whitespace().map(str::to_owned).collect();
-            let mut out = Vec::new();
-            encode_values(&part, None, &values, &mut out).unwrap();
-            let bytes = String::from_utf8(out).unwrap();
-            assert!(text.contains(&format!("`{}`", bytes.trim_end())), "{title}, {number}: {bytes}");
+            let values: Vec<_> = values.split_whitespace().collect();
+            let bytes = from_values(&part, None, &values).unwrap();
+            assert!(text.contains(&format!("`{bytes}`")), "{title}, {number}: {bytes}");
         }
     }
 }
@@ -228,30 +223,23 @@ fn the_panels_frames_keep_time_and_interface() {
 
 #[test]
 fn a_field_that_is_used_twice_is_one_value() {
-    let toml = r#"
-[controller]
-address = "a"
-[[recipe]]
-name = "r"
-kind = "stream"
-mode = "user"
-[recipe.input]
+    let part = input_part(
+        r#"
 head = [1]
 tail = [13]
 fields = [
     { name = "order", type = "byte", bits = "4..7", to = "WordInputReg[1]", commands = { 1 = "stop" } },
     { name = "raw", type = "hex", until = "," },
 ]
-"#;
-    let recipes = parse_recipes(Text { name: "test.toml", toml }, &[]).unwrap();
-    let part = Part::choose(&recipes, None, None).unwrap();
+"#,
+    );
     assert_eq!(from_values(&part, None, &["3", "0x1F"]).unwrap(), "01 30 31 46 2C 0D");
     // A field with the name of the key for bytes is a field.
     assert_eq!(decoded(&part, "01 30 31 46 2C 0D").0, "order=3 raw=31\n");
 }
 
-/// A part with these keys, and with a text `code` behind other fields.
-fn text_part(keys: &str, fields: &str) -> Part {
+/// The input part of a stream recipe, with these keys.
+fn input_part(keys: &str) -> Part {
     let toml = format!(
         r#"
 [controller]
@@ -262,11 +250,16 @@ kind = "stream"
 mode = "user"
 [recipe.input]
 {keys}
-fields = [{fields}{{ name = "code", type = "text", to = "WordInputReg[1..4]" }}]
 "#
     );
     let recipes = parse_recipes(Text { name: "test.toml", toml: &toml }, &[]).unwrap();
     Part::choose(&recipes, None, None).unwrap()
+}
+
+/// One with these keys, and with a text `code` behind other fields.
+fn text_part(keys: &str, fields: &str) -> Part {
+    let code = "{ name = \"code\", type = \"text\", to = \"WordInputReg[1..4]\" }";
+    input_part(&format!("{keys}\nfields = [{fields}{code}]"))
 }
 
 #[test]
