@@ -172,9 +172,12 @@ impl<'a> ExchangeCheck<'a> {
     pub(super) fn check(&self) -> Check {
         check_pool(self.at(0, Key::Whole), self.recipe.exchanges, self.config.exchanges.len())?;
         let exchanges = self.config.exchanges_of(self.recipe);
+        if exchanges.is_empty() {
+            return Ok(());
+        }
         let mut parts = [Direction::Input, Direction::Output].into_iter();
         let mut part = |part| self.recipe.stream_part(part).is_some_and(StreamPart::is_cut);
-        if !exchanges.is_empty() && parts.any(&mut part) {
+        if parts.any(&mut part) {
             return self.refuse(0, Key::Whole, ExchangeError::CutParts);
         }
         let (mut peers, mut count) = ([false; 256], 0_usize);
@@ -395,7 +398,7 @@ impl<'a> ExchangeCheck<'a> {
     fn place_of(&self, nth: u8, part: Direction, fields: &[FieldSpec], error: LayoutError) -> Place {
         let recipe = self.index;
         let earlier = self.config.exchanges_of(self.recipe).iter().take(usize::from(nth));
-        let before = earlier.filter(|exchange| exchange.fields(self.config, part).is_some()).count();
+        let before = earlier.filter(|exchange| exchange.fields(self.config.frames, part).is_some()).count();
         let frame = self.recipe.part_frames(part).count().saturating_add(before) as u8;
         match super::device::field_of(fields, error) {
             Some(field) => Place::Field { recipe, part, frame, field },

@@ -39,12 +39,13 @@ impl<'a> RecipeCheck<'a> {
         }
         // UDP needs the least of a stream recipe; it does not take user-defined recipes (D16).
         let framing = if self.recipe.mode == Mode::User { Framing::Bytes } else { Framing::Datagram };
+        let is_device = self.config.is_device(self.recipe);
         for part in [Direction::Input, Direction::Output] {
             for (frame, span) in self.config.frames_of(self.recipe, part) {
                 let place = Place::Frame { recipe: self.index, part, frame };
                 check_pool(place, span, self.config.fields.len())?;
             }
-            if self.config.is_device(self.recipe) {
+            if is_device {
                 self.check_framing(part)?;
                 self.check_device_frames(part)?;
             } else if let Err(error) = check_layout(self.config, self.recipe, part, framing) {
@@ -457,17 +458,13 @@ fn check_output(place: Place, ty: ScalarType, from: OutputBinding) -> Check {
     }
 }
 
-/// Compiles one part, if the recipe has it, only to find its mistakes.
+/// Compiles one part of a recipe that is no device's, if it has it, only to find its mistakes.
 pub(super) fn check_layout(
     config: ConfigView<'_>,
     recipe: &Recipe,
     part: Direction,
     framing: Framing,
 ) -> Result<(), PartError> {
-    // A device's frames are laid out when the recipe is checked, the same for every line.
-    if config.is_device(recipe) {
-        return Ok(());
-    }
     let rules = Rules { mode: recipe.mode, direction: part };
     let fields = |span: Span| span.of(config.fields).iter().filter_map(FieldSpec::field);
     match &recipe.parts {

@@ -162,7 +162,9 @@ impl<'c> ConfigView<'c> {
             || recipe.repeats_ids()
             || [Direction::Input, Direction::Output].into_iter().any(|part| {
                 recipe.stream_part(part).is_some_and(StreamPart::is_cut)
-                    || self.fields_of(recipe, part).any(|(_, _, field)| field.is_device())
+                    || recipe
+                        .part_frames(part)
+                        .any(|span| span.of(self.fields).iter().any(FieldSpec::is_device))
             })
     }
 }

@@ -3,6 +3,7 @@
 //! Plain data: nothing here has been checked. A recipe has a range of the configuration's exchanges
 //! beside its parts; their frames are ranges of the same list of fields.
 
+use super::walk::Frames;
 use super::{ConfigView, Delimiter, Recipe, Span};
 use crate::modbus::rtu::Operation;
 use crate::sysvar::{Direction, SysVar};
@@ -134,7 +135,7 @@ impl Exchange {
 
     /// The fields that come from the device (input) or go to it (output); `None` if it has no such
     /// frame. A refusal only tells that the device refuses.
-    pub(crate) fn fields(&self, config: ConfigView<'_>, part: Direction) -> Option<Span> {
+    pub(crate) fn fields(&self, frames: &[FrameSpec], part: Direction) -> Option<Span> {
         let span = match (self.talk, part) {
             (Talk::Rtu { read, .. }, Direction::Input) => read,
             (Talk::Rtu { written, .. }, Direction::Output) => written,
@@ -142,7 +143,7 @@ impl Exchange {
             (Talk::Served { read, .. }, Direction::Output) => read,
             (Talk::Frames { reply: nth, .. }, Direction::Input)
             | (Talk::Frames { request: nth, .. }, Direction::Output) => {
-                return Some(config.frames.get(usize::from(nth?))?.fields);
+                return Some(frames.get(usize::from(nth?))?.fields);
             }
         };
         (span.len > 0).then_some(span)
@@ -157,14 +158,9 @@ impl<'c> ConfigView<'c> {
 
     /// The ranges of the fields of one part of `recipe`, with the frame's number: 0 in a stream, else
     /// that of the CAN frame, and behind these the frames of the exchanges, counted on.
-    pub(crate) fn frames_of(
-        self,
-        recipe: &'c Recipe,
-        part: Direction,
-    ) -> impl Iterator<Item = (u8, Span)> + 'c {
+    pub(crate) fn frames_of(self, recipe: &'c Recipe, part: Direction) -> Frames<'c> {
         let exchanges = self.exchanges_of(recipe).iter();
-        let spans = exchanges.filter_map(move |exchange| exchange.fields(self, part));
-        (0..).zip(recipe.part_frames(part).chain(spans))
+        Frames { parts: recipe.part_frames(part), exchanges, frames: self.frames, part, count: 0 }
     }
 
     /// Whether frames come from the device (input), or go to it (output).

@@ -83,7 +83,7 @@ impl ConfigView<'_> {
         let with_reply = self
             .exchanges_of(recipe)
             .iter()
-            .filter(|exchange| exchange.fields(self, Direction::Input).is_some());
+            .filter(|exchange| exchange.fields(self.frames, Direction::Input).is_some());
         with_reply.filter_map(|exchange| exchange.when.every).max()
     }
 

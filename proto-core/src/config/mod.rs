@@ -34,6 +34,7 @@ mod source;
 mod told_apart;
 mod validate;
 mod view;
+mod walk;
 
 pub use ask::{Ask, AskFrame, Coil};
 pub use budget::{PartBudget, Warning, can_frame_time};

@@ -5,6 +5,7 @@
 
 use heapless::{String, Vec};
 
+use super::walk::{PartFrames, Variables};
 use super::{Delimiter, Name, PortValue, StateValue};
 use crate::device::{Boundary, ByteOrder, Checksum, Encoding, Escape, Length, Overflow, Text};
 use crate::recipe::model::{Field, MAX_CAN_IDS, Mode};
@@ -41,15 +42,13 @@ impl Recipe {
     }
 
     /// The field ranges of one part: one for a stream part, one for each CAN frame.
-    pub(crate) fn part_frames(&self, part: Direction) -> impl Iterator<Item = Span> + '_ {
-        let (stream, can) = match (&self.parts, part) {
-            (Parts::Stream { input, .. }, Direction::Input) => (input.as_ref(), None),
-            (Parts::Stream { output, .. }, Direction::Output) => (output.as_ref(), None),
-            (Parts::Can { input, .. }, Direction::Input) => (None, Some(input)),
-            (Parts::Can { output, .. }, Direction::Output) => (None, Some(output)),
+    pub(crate) fn part_frames(&self, part: Direction) -> PartFrames<'_> {
+        let can: &[CanFramePart] = match (&self.parts, part) {
+            (Parts::Stream { .. }, _) => &[],
+            (Parts::Can { input, .. }, Direction::Input) => input,
+            (Parts::Can { output, .. }, Direction::Output) => output,
         };
-        let can = can.into_iter().flatten().map(|frame| frame.fields);
-        stream.map(|part| part.fields).into_iter().chain(can)
+        PartFrames { stream: self.stream_part(part).map(|part| part.fields), can: can.iter() }
     }
 
     /// One part of a stream recipe.
@@ -234,8 +233,14 @@ pub struct Words {
 impl Words {
     /// The variables, in order.
     pub fn iter(self) -> impl Iterator<Item = SysVar> + Clone {
+        let (first, end) = self.ordinals();
+        (first..end).filter_map(SysVar::from_ordinal)
+    }
+
+    /// The ordinals of the first one, and of the first behind them.
+    const fn ordinals(self) -> (usize, usize) {
         let first = self.first.ordinal();
-        (first..first.saturating_add(usize::from(self.count))).filter_map(SysVar::from_ordinal)
+        (first, first.saturating_add(self.count as usize))
     }
 
     /// Maximum number of characters.
@@ -295,12 +300,25 @@ impl FieldSpec {
 
     /// All system variables that the field is bound to.
     pub fn variables(&self) -> impl Iterator<Item = SysVar> + Clone + use<> {
+        self.all_variables()
+    }
+
+    pub(super) fn all_variables(&self) -> Variables {
         let (words, others) = match *self {
             Self::TextInput { to, length_to, count_to, .. } => (to, [length_to, count_to]),
             Self::TextOutput { from, length_from, .. } => (Some(from), [length_from, None]),
             _ => (None, [self.variable(), None]),
         };
-        words.into_iter().flat_map(Words::iter).chain(others.into_iter().flatten())
+        Variables { words: words.map_or((0, 0), Words::ordinals), others }
+    }
+
+    /// Whether the variable is one of [`Self::variables`].
+    pub(crate) fn is_bound_to(&self, var: SysVar) -> bool {
+        match *self {
+            Self::System(own) => own == var,
+            Self::TextInput { .. } | Self::TextOutput { .. } => self.variables().any(|bound| bound == var),
+            _ => self.variable() == Some(var),
+        }
     }
 }
 

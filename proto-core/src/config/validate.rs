@@ -12,8 +12,8 @@ use super::rules::{
     check_time, fail, is_marked, mark,
 };
 use super::{
-    Bus, ConfigView, FieldSpec, MAX_ALL_FIELDS, MAX_COMMANDS, MAX_EXCHANGES, MAX_PORTS, MAX_RECIPES,
-    MAX_SAFE_VALUES, Parts, Port, PortHealth, Recipe, SafeValue, SendOn,
+    Bus, ConfigView, MAX_ALL_FIELDS, MAX_COMMANDS, MAX_EXCHANGES, MAX_PORTS, MAX_RECIPES, MAX_SAFE_VALUES,
+    Parts, Port, PortHealth, Recipe, SafeValue, SendOn,
 };
 use crate::image::BitSet;
 use crate::recipe::model::{Framing, Mode};
@@ -160,6 +160,10 @@ impl<'c> ConfigView<'c> {
     /// A byte stream needs a head or a tail to find frames by (D18); everything else is valid on
     /// any line and was checked with the recipe.
     fn check_framing(&self, port: u8, index: u8, recipe: &Recipe) -> Check {
+        // A device's frames are laid out when the recipe is checked, the same for every line.
+        if self.is_device(recipe) {
+            return Ok(());
+        }
         for part in [Direction::Input, Direction::Output] {
             if let Err(error) = check_layout(*self, recipe, part, Framing::Bytes) {
                 let place = Place::Port { port, key: PortKey::Recipe };
@@ -193,22 +197,10 @@ impl<'c> ConfigView<'c> {
     /// Each variable has one owner, or its bits have.
     fn check_owners(&self) -> Check {
         let mut owners = [None; INPUT_COUNT];
+        let has_bits = self.fields.iter().any(|field| field.bit().is_some());
         for (index, port, recipe) in self.field_ports() {
-            let place = Place::Port { port: index, key: PortKey::Recipe };
-            for (other, _, earlier) in self.field_ports().take_while(|(other, ..)| *other < index) {
-                for bit in self.bits_written_by(recipe) {
-                    if self.bits_written_by(earlier).any(|before| before == bit) {
-                        return fail(place, Kind::BitOwnedTwice { bit, other });
-                    }
-                    if self.written_by(earlier).any(|before| before == bit.var) {
-                        return fail(place, Kind::OwnedAndShared { bit, other });
-                    }
-                }
-                for bit in self.bits_written_by(earlier) {
-                    if self.written_by(recipe).any(|var| var == bit.var) {
-                        return fail(place, Kind::OwnedAndShared { bit, other });
-                    }
-                }
+            if has_bits {
+                self.check_bit_owners(index, recipe)?;
             }
             for var in self.written_by(recipe) {
                 // An input variable's ordinal is below INPUT_COUNT; others are refused earlier.
@@ -228,6 +220,28 @@ impl<'c> ConfigView<'c> {
                     Some(Some(other)) => return fail(place, Kind::OwnedTwice { var, other: *other }),
                     Some(owner) => *owner = Some(index),
                     None => {}
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// No earlier port writes a bit that the port writes, or its variable, or a bit of a variable that
+    /// the port writes.
+    fn check_bit_owners(&self, index: u8, recipe: &Recipe) -> Check {
+        let place = Place::Port { port: index, key: PortKey::Recipe };
+        for (other, _, earlier) in self.field_ports().take_while(|(other, ..)| *other < index) {
+            for bit in self.bits_written_by(recipe) {
+                if self.bits_written_by(earlier).any(|before| before == bit) {
+                    return fail(place, Kind::BitOwnedTwice { bit, other });
+                }
+                if self.carries(earlier, Direction::Input, bit.var) {
+                    return fail(place, Kind::OwnedAndShared { bit, other });
+                }
+            }
+            for bit in self.bits_written_by(earlier) {
+                if self.carries(recipe, Direction::Input, bit.var) {
+                    return fail(place, Kind::OwnedAndShared { bit, other });
                 }
             }
         }
@@ -296,9 +310,7 @@ impl<'c> ConfigView<'c> {
 
     /// Whether a way up carries `var` in its input part, or shows it in its output part.
     fn carried(&self, part: Direction, var: SysVar) -> bool {
-        self.upstream_recipes()
-            .flat_map(|(_, recipe)| self.fields_of(recipe, part))
-            .any(|(_, _, spec)| *spec == FieldSpec::System(var))
+        self.upstream_recipes().any(|(_, recipe)| self.carries(recipe, part, var))
     }
 
     fn check_safe_values(&self) -> Check {
@@ -313,7 +325,7 @@ impl<'c> ConfigView<'c> {
                     continue;
                 }
                 let owns = |(port, _, recipe): (u8, &Port, &Recipe)| {
-                    port == index && self.written_by(recipe).any(|written| written == var)
+                    port == index && self.carries(recipe, Direction::Input, var)
                 };
                 if !self.field_ports().any(owns) {
                     return fail(place, Kind::NotOwned { var });

@@ -6,6 +6,7 @@
 use heapless::VecView;
 
 use super::network::Network;
+use super::walk::{FrameFields, FrameVariables, Variables};
 use super::{
     CommandEntry, ControllerLink, Exchange, FieldSpec, FrameSpec, OutputBinding, Port, Recipe, SafeValue,
 };
@@ -75,14 +76,24 @@ impl<'c> ConfigView<'c> {
         recipe: &'c Recipe,
         part: Direction,
     ) -> impl Iterator<Item = (u8, u8, &'c FieldSpec)> {
-        self.frames_of(recipe, part).flat_map(move |(frame, span)| {
-            (0..).zip(span.of(self.fields)).map(move |(index, field)| (frame, index, field))
-        })
+        self.frame_fields(recipe, part)
+    }
+
+    fn frame_fields(self, recipe: &'c Recipe, part: Direction) -> FrameFields<'c> {
+        let frames = self.frames_of(recipe, part);
+        FrameFields { frames, pool: self.fields, fields: [].iter(), frame: 0, count: 0 }
     }
 
     /// The input variables that a field port writes as a whole.
     pub fn written_by(self, recipe: &'c Recipe) -> impl Iterator<Item = SysVar> + 'c {
-        self.fields_of(recipe, Direction::Input).flat_map(|(_, _, field)| field.variables())
+        let fields = self.frame_fields(recipe, Direction::Input);
+        FrameVariables { fields, variables: Variables::NONE }
+    }
+
+    /// Whether a field of one part of `recipe` is bound to the variable.
+    pub(crate) fn carries(self, recipe: &'c Recipe, part: Direction, var: SysVar) -> bool {
+        let mut frames = self.frames_of(recipe, part);
+        frames.any(|(_, span)| span.of(self.fields).iter().any(|field| field.is_bound_to(var)))
     }
 
     /// The input variables that a field port owns: those that its frames write, and those of its
@@ -105,7 +116,9 @@ impl<'c> ConfigView<'c> {
 
     /// Whether a field port writes the variable.
     pub(super) fn is_owned(self, var: SysVar) -> bool {
-        self.field_ports().any(|(_, port, recipe)| self.owned_by(port, recipe).any(|owned| owned == var))
+        self.field_ports().any(|(_, port, recipe)| {
+            self.carries(recipe, Direction::Input, var) || port.health.iter().any(|(_, own)| own == var)
+        })
     }
 }
 

@@ -4,8 +4,10 @@ use core::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use heapless::Vec;
 
+use super::Engine;
 use super::bits::MAX_SHARES;
 use super::build_error::{BuildError, one_too_many};
+use super::clock::Clock;
 use super::codecs::{can_codec, index_of, stream_codec, stream_layout};
 use super::command_link::CommandLink;
 use super::command_tables::{MAX_COMMAND_BYTES, MAX_COMMAND_FIELDS};
@@ -27,7 +29,6 @@ use super::store::{InputFrame, MAX_INPUT_FRAMES, SafeBytes, Store};
 use super::tap::Tap;
 use super::uplink::{Uplink, UplinkSetup};
 use super::user::{Bindings, InputBind, InputTo, OutputBind};
-use super::{Ask, Engine};
 use crate::config::{
     Bus, ConfigView, Counted, FieldSpec, InputBinding, MIN_CYCLE, OutputBinding, Parts, Port, Recipe, SendOn,
     Span, listen_address,
@@ -65,17 +66,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             safe_values: Vec::new(),
             links: Links::new(),
             health: PortsHealth::new(),
-            timer_at: Instant::ZERO,
-            is_armed: false,
-            now: Instant::ZERO,
-            is_late: false,
-            announced: Instant::ZERO,
-            beat_at: Instant::ZERO,
-            sleeps: 0,
-            is_deaf: false,
-            deaf_until: Instant::ZERO,
-            // The first call asks every port and link, because `timer_at` has come.
-            ask: Ask::NONE,
+            clock: Clock::START,
             tap: Tap::new(),
             exchanges: Exchanges::new(),
         }
@@ -120,16 +111,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             safe_values,
             links,
             health,
-            timer_at,
-            is_armed,
-            now,
-            is_late,
-            announced,
-            beat_at,
-            sleeps,
-            is_deaf,
-            deaf_until,
-            ask,
+            clock,
             exchanges,
             // A tap that listens continues.
             tap: _,
@@ -147,21 +129,16 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         modbus.clear();
         recipes.clear();
         health.clear();
-        *timer_at = Instant::ZERO;
-        *is_armed = false;
-        *now = Instant::ZERO;
-        *is_late = false;
-        *announced = Instant::ZERO;
-        *beat_at = Instant::ZERO;
-        *sleeps = 0;
-        *is_deaf = false;
-        *deaf_until = Instant::ZERO;
-        *ask = Ask::NONE;
+        *clock = Clock::START;
     }
 
     fn build(&mut self, config: ConfigView<'_>) -> Result<(), BuildError> {
         config.validate().map_err(BuildError::Config)?;
-        let plan = Plan::new(config).map_err(BuildError::Plan)?;
+        // One copy of the plan, where `map_err` would make two.
+        let plan = match Plan::new(config) {
+            Ok(plan) => plan,
+            Err(error) => return Err(BuildError::Plan(error)),
+        };
         let dialect = Dialect::named(&config.controller.dialect).ok_or(BuildError::UnknownDialect)?;
         self.check_room(config)?;
         // As long as the configuration's, which is as long as the engine's.
@@ -172,6 +149,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
         for (index, port, recipe) in config.field_ports() {
             self.add_port(config, index, port, recipe, dialect)?;
+            self.add_codec(config, port, recipe)?;
         }
         let mut groups = Groups(self.store.frames.len() as u8);
         for (id, recipe) in uplinks(config) {
@@ -244,20 +222,6 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         recipe: &Recipe,
         dialect: Dialect,
     ) -> Result<(), BuildError> {
-        // Validation has refused recipes that the bus cannot carry.
-        let mut codec = match &recipe.parts {
-            _ if config.is_device(recipe) => {
-                let inputs = self.bindings.inputs.len() as u16;
-                let outputs = self.bindings.outputs.len() as u16;
-                let line = match &port.bus {
-                    Bus::Rs485(line) => Some(line),
-                    _ => None,
-                };
-                Codec::Device(DeviceCodec::new(config, port.recipe, recipe, [inputs, outputs], line)?)
-            }
-            Parts::Stream { input, output } => stream_codec(config, port.recipe, recipe, [input, output])?,
-            Parts::Can { input, output } => can_codec(config, port.recipe, recipe, [input, output])?,
-        };
         let line = match &port.bus {
             Bus::Rs485(settings) => LineTiming::new(settings),
             _ => LineTiming::none(),
@@ -269,7 +233,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let mut next_binding = self.bindings.inputs.len() as u16;
         let parts = recipe.part_frames(Direction::Input).map(|_| true);
         let replies = config.exchanges_of(recipe).iter().filter_map(|exchange| {
-            exchange.fields(config, Direction::Input)?;
+            exchange.fields(config.frames, Direction::Input)?;
             Some(exchange.when.every.is_some() || exchange.when.is_never())
         });
         let frames = config.frames_of(recipe, Direction::Input).zip(parts.chain(replies));
@@ -344,17 +308,6 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             self.bindings.outputs.push(OutputBind::new(ty, from, element)).map_err(|_| full())?;
             outputs.len = outputs.len.saturating_add(1);
         }
-        if recipe.exchanges.len > 0
-            && let Codec::Device(device) = &mut codec
-        {
-            let of_parts = device.fields();
-            let places = Places {
-                inputs: inputs.start.saturating_add(of_parts.0),
-                outputs: outputs.start.saturating_add(of_parts.1),
-                slot: first_frame.saturating_add(device.inputs),
-            };
-            device.line = Some(self.add_exchanges(config, port, recipe, places)?);
-        }
         self.store.watches_bits |= matches!(recipe.send, SendOn::Rising { .. });
         let has_output = recipe.part_frames(Direction::Output).next().is_some();
         let mut sender = Sender::new(recipe.send, recipe.on_stale, port.stale_after, port.cycle, has_output);
@@ -363,7 +316,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             id: PortId(index),
             name: port.name.clone(),
             recipe: port.recipe,
-            codec,
+            // Those of the recipe follow.
+            codec: Codec::Can { input: None, output: None },
             mode: recipe.mode,
             line,
             partial_until: Instant::NEVER,
@@ -379,6 +333,45 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         };
         self.ports.push(port).map_err(|_| one_too_many(Counted::FieldPorts, PORTS))?;
         self.store.edges.push(EdgeQueue::default()).map_err(|_| one_too_many(Counted::FieldPorts, PORTS))
+    }
+
+    /// Lays out the frames of the port that was added last. In its place: a codec is large, and each
+    /// time that it is passed on it is copied.
+    #[inline(never)]
+    fn add_codec(&mut self, config: ConfigView<'_>, port: &Port, recipe: &Recipe) -> Result<(), BuildError> {
+        let Some(own) = self.ports.last_mut() else { return Ok(()) };
+        // Validation has refused recipes that the bus cannot carry.
+        match &recipe.parts {
+            _ if config.is_device(recipe) => {
+                let line = match &port.bus {
+                    Bus::Rs485(line) => Some(line),
+                    _ => None,
+                };
+                let bindings = [own.inputs.start, own.outputs.start];
+                own.codec = Codec::Device(DeviceCodec::new(config, port.recipe, recipe, bindings, line)?);
+            }
+            Parts::Stream { input, output } => {
+                stream_codec(config, port.recipe, recipe, [input, output], &mut own.codec)?;
+            }
+            Parts::Can { input, output } => {
+                can_codec(config, port.recipe, recipe, [input, output], &mut own.codec)?;
+            }
+        }
+        let Codec::Device(device) = &own.codec else { return Ok(()) };
+        if recipe.exchanges.len == 0 {
+            return Ok(());
+        }
+        let of_parts = device.fields();
+        let places = Places {
+            inputs: own.inputs.start.saturating_add(of_parts.0),
+            outputs: own.outputs.start.saturating_add(of_parts.1),
+            slot: own.first_frame.saturating_add(device.inputs),
+        };
+        let line = self.add_exchanges(config, port, recipe, places)?;
+        if let Some(FieldPort { codec: Codec::Device(device), .. }) = self.ports.last_mut() {
+            device.line = Some(line);
+        }
+        Ok(())
     }
 
     #[inline(never)]

@@ -3,11 +3,11 @@
 //! In: the instant of each call. Out: everything whose time has come, and when the engine has to be
 //! called again. Does not know what the deadlines are for.
 
+use super::Engine;
 use super::counters::{add, bump};
 use super::field_port::FieldPort;
 use super::store::Overdue;
 use super::user::silence_commands;
-use super::{Ask, Engine};
 use crate::time::{Duration, Instant};
 
 /// If two calls of the engine are further apart than this, the gateway was asleep: stopped,
@@ -25,14 +25,74 @@ const DEAF: Duration = Duration::from_millis(50);
 /// The clock's last instant. [`Instant::NEVER`] is after it, so that "no deadline" never comes.
 const LAST: Instant = Instant::from_micros(u64::MAX - 1);
 
+/// What every call looks at. In one place, because an engine is so large that the address of each of
+/// its fields is worked out anew.
+#[derive(Debug, Clone)]
+pub(super) struct Clock {
+    /// Nothing depends on the clock before this. It may be earlier than needed, never later.
+    pub timer_at: Instant,
+    /// `timer_at` was computed after the clock was last checked.
+    pub is_armed: bool,
+    /// The newest instant of a call.
+    pub now: Instant,
+    /// A deadline has come and its tick has not been reported. Expired data may still wait, so
+    /// nothing is sent before that tick.
+    pub is_late: bool,
+    /// The instant of the newest [`super::Output::Sleep`]; it stays while its tick is not reported.
+    pub announced: Instant,
+    /// The engine asks to be called by then, because calls further apart than [`ASLEEP`] mean
+    /// sleep.
+    pub beat_at: Instant,
+    /// Number of times that the gateway slept.
+    pub sleeps: u32,
+    /// Input from field ports is discarded, because it waited while the gateway slept.
+    pub is_deaf: bool,
+    pub deaf_until: Instant,
+    /// The ports and links that [`Engine::poll_output`] asks before it sleeps.
+    pub ask: Ask,
+}
+
+impl Clock {
+    /// Before the first call, which asks every port and link, because `timer_at` has come.
+    pub(super) const START: Self = Self {
+        timer_at: Instant::ZERO,
+        is_armed: false,
+        now: Instant::ZERO,
+        is_late: false,
+        announced: Instant::ZERO,
+        beat_at: Instant::ZERO,
+        sleeps: 0,
+        is_deaf: false,
+        deaf_until: Instant::ZERO,
+        ask: Ask::NONE,
+    };
+}
+
+/// The ports and links that may have an output. One that had none is not asked again until
+/// something happens to it, a deadline comes, or the next beat.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Ask {
+    /// Links that may send.
+    pub links: bool,
+    /// Links that may be opened or closed.
+    pub actions: bool,
+    /// Ports that may send.
+    pub ports: bool,
+}
+
+impl Ask {
+    pub(super) const ALL: Self = Self { links: true, actions: true, ports: true };
+    pub(super) const NONE: Self = Self { links: false, actions: false, ports: false };
+}
+
 impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize, const EXCHANGES: usize>
     Engine<PORTS, UPLINKS, FIELDS, TAP, EXCHANGES>
 {
     /// The deadlines up to `now` pass.
     pub(super) fn tick(&mut self, now: Instant) {
-        (self.is_late, self.announced) = (false, Instant::NEVER);
-        self.is_deaf &= now < self.deaf_until;
-        if now >= self.timer_at {
+        (self.clock.is_late, self.clock.announced) = (false, Instant::NEVER);
+        self.clock.is_deaf &= now < self.clock.deaf_until;
+        if now >= self.clock.timer_at {
             self.advance(now);
         }
     }
@@ -42,7 +102,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     pub fn deadline(&self) -> Instant {
         let ports = self.ports.iter().map(FieldPort::deadline);
         let ports = ports.min().unwrap_or(Instant::NEVER);
-        let hears_at = if self.is_deaf { self.deaf_until } else { Instant::NEVER };
+        let hears_at = if self.clock.is_deaf { self.clock.deaf_until } else { Instant::NEVER };
         let own = ports.min(self.links.deadline()).min(self.store.deadline()).min(hears_at);
         if self.exchanges.is_used() { own.min(self.talk_deadline()) } else { own }
     }
@@ -51,71 +111,84 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     pub(super) fn present(&mut self, now: Instant) -> Instant {
         let now = self.forward(now);
         self.store.now = now;
-        if now >= self.beat_at {
+        if now >= self.clock.beat_at {
             // A configured engine is called at every beat; before the first call nothing was late.
-            if self.now != Instant::ZERO && now.saturating_since(self.now) > ASLEEP {
+            if self.clock.now != Instant::ZERO && now.saturating_since(self.clock.now) > ASLEEP {
                 self.wake(now);
             }
-            self.beat_at = now + HEARTBEAT;
-            self.ask = Ask::ALL;
+            self.clock.beat_at = now + HEARTBEAT;
+            self.clock.ask = Ask::ALL;
         }
-        self.now = now;
+        self.clock.now = now;
         now
     }
 
     /// `now`, but no earlier than the previous call, and no later than the clock's last instant.
     pub(super) fn forward(&self, now: Instant) -> Instant {
-        if now < self.now || now > LAST { self.clamped(now) } else { now }
+        if now < self.clock.now || now > LAST { self.clamped(now) } else { now }
     }
 
     #[cold]
     fn clamped(&self, now: Instant) -> Instant {
-        now.min(LAST).max(self.now)
+        now.min(LAST).max(self.clock.now)
     }
 
     /// The gateway itself slept: the age of everything that waits is unknown. Overdue safe values
     /// go first, no command is sent, and every connection is opened again.
     #[cold]
     fn wake(&mut self, now: Instant) {
-        self.sleeps = self.sleeps.wrapping_add(1);
+        self.clock.sleeps = self.clock.sleeps.wrapping_add(1);
         // Before deadlines pass: one of them may be to open a link that has been down.
         self.links.slept(&mut self.store);
-        self.is_deaf = true;
+        self.clock.is_deaf = true;
         self.advance(now);
         self.ports.iter_mut().for_each(|port| port.slept(&mut self.tap, now));
         self.talk_slept();
-        self.deaf_until = now + DEAF;
-        self.arm(self.deaf_until);
+        self.clock.deaf_until = now + DEAF;
+        self.arm(self.clock.deaf_until);
     }
 
     /// Something depends on the clock from `at` on. If it is due already, it is handled before the
     /// engine sleeps, or at the tick that is late.
     pub(super) fn arm(&mut self, at: Instant) {
-        if at > self.now {
-            self.timer_at = self.timer_at.min(at);
+        if at > self.clock.now {
+            self.clock.timer_at = self.clock.timer_at.min(at);
         }
     }
 
     /// Handles everything that depends on the clock.
     fn advance(&mut self, now: Instant) {
         // At one instant the clock is checked once: what is done now is due later.
-        self.timer_at = now + Duration::from_micros(1);
-        self.ask = Ask::ALL;
-        self.is_armed = false;
+        self.clock.timer_at = now + Duration::from_micros(1);
+        self.clock.ask = Ask::ALL;
+        self.clock.is_armed = false;
         self.expire_frames(now);
-        for index in 0..self.ports.len() {
-            if let Some(port) = self.ports.get_mut(index)
-                && port.advance(&mut self.tap, now)
-            {
-                let id = port.id;
-                self.port_silent(id, now);
-            }
+        let mut is_ended = false;
+        for port in &mut self.ports {
+            is_ended |= port.advance(&mut self.tap, now);
+        }
+        if is_ended {
+            self.read_ended(now);
         }
         if self.exchanges.is_used() {
             self.advance_talk(now);
         }
         self.links.advance(&mut self.store);
         self.carry_results();
+    }
+
+    /// Reads the frames that silence has ended, of all ports that have one.
+    #[cold]
+    #[inline(never)]
+    fn read_ended(&mut self, now: Instant) {
+        for index in 0..self.ports.len() {
+            if let Some(port) = self.ports.get(index)
+                && now >= port.partial_until
+            {
+                let id = port.id;
+                self.port_silent(id, now);
+            }
+        }
     }
 
     fn expire_frames(&mut self, now: Instant) {

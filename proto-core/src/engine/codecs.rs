@@ -8,22 +8,24 @@ use crate::recipe::model::{Framing, Rules};
 use crate::recipe::{CanLayout, Deframer, StreamLayout};
 use crate::sysvar::Direction;
 
-/// The layouts of a stream recipe.
+/// The layouts of a stream recipe, in the place of the port's.
 #[inline(never)]
 pub(super) fn stream_codec(
     config: ConfigView<'_>,
     index: u8,
     recipe: &Recipe,
     [input, output]: [&Option<StreamPart>; 2],
-) -> Result<Codec, BuildError> {
+    codec: &mut Codec,
+) -> Result<(), BuildError> {
     let layout = |part: &Option<StreamPart>, direction| {
         stream_layout(config, index, recipe, part.as_ref(), direction, Framing::Bytes)
     };
-    Ok(Codec::Stream {
-        input: layout(input, Direction::Input)?,
-        output: layout(output, Direction::Output)?,
-        deframer: Deframer::new(),
-    })
+    *codec = Codec::Stream { input: None, output: None, deframer: Deframer::new() };
+    if let Codec::Stream { input: own_input, output: own_output, .. } = codec {
+        *own_input = layout(input, Direction::Input)?;
+        *own_output = layout(output, Direction::Output)?;
+    }
+    Ok(())
 }
 
 /// The layout of one part, if there is one.
@@ -38,19 +40,22 @@ pub(super) fn stream_layout(
     let Some(part) = part else { return Ok(None) };
     let rules = Rules { mode: recipe.mode, direction };
     let fields = part.fields.of(config.fields).iter().filter_map(FieldSpec::field);
-    StreamLayout::new(rules, &part.head, &part.tail, fields, framing)
-        .map(Some)
-        .map_err(|error| BuildError::Part { recipe: index, part: direction, error })
+    // One copy of the layout, where `map` and `map_err` would make two.
+    match StreamLayout::new(rules, &part.head, &part.tail, fields, framing) {
+        Ok(layout) => Ok(Some(layout)),
+        Err(error) => Err(BuildError::Part { recipe: index, part: direction, error }),
+    }
 }
 
-/// The layouts of a CAN recipe.
+/// The layouts of a CAN recipe, in the place of the port's.
 #[inline(never)]
 pub(super) fn can_codec(
     config: ConfigView<'_>,
     index: u8,
     recipe: &Recipe,
     [input, output]: [&[CanFramePart]; 2],
-) -> Result<Codec, BuildError> {
+    codec: &mut Codec,
+) -> Result<(), BuildError> {
     let layout = |frames: &[CanFramePart], direction| {
         if frames.is_empty() {
             return Ok(None);
@@ -59,11 +64,17 @@ pub(super) fn can_codec(
             let fields = frame.fields.of(config.fields).iter().filter_map(FieldSpec::field);
             (frame.id, fields)
         });
-        CanLayout::new(Rules { mode: recipe.mode, direction }, frames)
-            .map(Some)
-            .map_err(|error| BuildError::Part { recipe: index, part: direction, error })
+        match CanLayout::new(Rules { mode: recipe.mode, direction }, frames) {
+            Ok(layout) => Ok(Some(layout)),
+            Err(error) => Err(BuildError::Part { recipe: index, part: direction, error }),
+        }
     };
-    Ok(Codec::Can { input: layout(input, Direction::Input)?, output: layout(output, Direction::Output)? })
+    *codec = Codec::Can { input: None, output: None };
+    if let Codec::Can { input: own_input, output: own_output } = codec {
+        *own_input = layout(input, Direction::Input)?;
+        *own_output = layout(output, Direction::Output)?;
+    }
+    Ok(())
 }
 
 /// The index of a recipe.

@@ -74,6 +74,7 @@ pub use tap::{MAX_TAPPED, TAP_OVERHEAD, Tap, TapDirection, TapPlace, TapRecord, 
 
 use heapless::Vec;
 
+use clock::{Ask, Clock};
 use counters::add;
 use exchanges::Exchanges;
 use field_output::Downward;
@@ -106,7 +107,10 @@ const _: () = assert!(INPUT_BUFFER >= LEN && INPUT_BUFFER > MAX_STREAM_FRAME);
 /// devices over all ports; 0 costs nothing. The defaults are the maximum of a file.
 ///
 /// `Engine<4, 1, 128, 0, 0>` takes less than 38 KiB.
+// In this order, because an engine is larger than what one instruction reaches: what every call looks at
+// comes first, what only some configurations have comes last.
 #[derive(Debug, Clone)]
+#[repr(C)]
 pub struct Engine<
     const PORTS: usize = 8,
     const UPLINKS: usize = 4,
@@ -114,52 +118,15 @@ pub struct Engine<
     const TAP: usize = 0,
     const EXCHANGES: usize = MAX_EXCHANGES,
 > {
+    clock: Clock,
+    links: Links<UPLINKS>,
     store: Store<PORTS>,
     ports: Vec<FieldPort, PORTS>,
     bindings: Bindings<FIELDS>,
     safe_values: Vec<SafeBytes, MAX_SAFE_VALUES>,
-    links: Links<UPLINKS>,
     health: PortsHealth,
-    /// Nothing depends on the clock before this. It may be earlier than needed, never later.
-    timer_at: Instant,
-    /// `timer_at` was computed after the clock was last checked.
-    is_armed: bool,
-    /// The newest instant of a call.
-    now: Instant,
-    /// A deadline has come and its tick has not been reported. Expired data may still wait, so
-    /// nothing is sent before that tick.
-    is_late: bool,
-    /// The instant of the newest [`Output::Sleep`]; it stays while its tick is not reported.
-    announced: Instant,
-    /// The engine asks to be called by then, because calls further apart than [`ASLEEP`] mean
-    /// sleep.
-    beat_at: Instant,
-    /// Number of times that the gateway slept.
-    sleeps: u32,
-    /// Input from field ports is discarded, because it waited while the gateway slept.
-    is_deaf: bool,
-    deaf_until: Instant,
-    /// The ports and links that [`Engine::poll_output`] asks before it sleeps.
-    ask: Ask,
-    tap: Tap<TAP>,
     exchanges: Exchanges<EXCHANGES>,
-}
-
-/// The ports and links that may have an output. One that had none is not asked again until
-/// something happens to it, a deadline comes, or the next beat.
-#[derive(Debug, Clone, Copy)]
-struct Ask {
-    /// Links that may send.
-    links: bool,
-    /// Links that may be opened or closed.
-    actions: bool,
-    /// Ports that may send.
-    ports: bool,
-}
-
-impl Ask {
-    const ALL: Self = Self { links: true, actions: true, ports: true };
-    const NONE: Self = Self { links: false, actions: false, ports: false };
+    tap: Tap<TAP>,
 }
 
 impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize, const EXCHANGES: usize>
@@ -175,7 +142,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     /// Inputs for a port or link that the configuration does not have are ignored.
     pub fn handle(&mut self, now: Instant, input: Input<'_>) {
         let now = self.present(now);
-        self.is_late = now >= self.announced;
+        self.clock.is_late = now >= self.clock.announced;
         // Any input may set an earlier deadline; one that becomes later is noticed in time.
         match input {
             Input::PortBytes { port, bytes } => self.port_bytes(port, bytes, now),
@@ -203,12 +170,12 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[inline(never)]
     pub fn poll_output<'b>(&mut self, now: Instant, buf: &'b mut [u8; OUTPUT_BUFFER]) -> Output<'b> {
         let now = self.forward(now);
-        if now >= self.timer_at {
+        if now >= self.clock.timer_at {
             self.ask_all();
         }
-        if self.ask.links && !self.is_late {
+        if self.clock.ask.links && !self.clock.is_late {
             // To send a command, a connection may have to be closed first.
-            self.ask.actions |= !self.links.command.is_empty();
+            self.clock.ask.actions |= !self.links.command.is_empty();
             self.store.now = now;
             let upward = self.links.next_upward(&mut self.store, &mut buf[..]);
             self.carry_outcomes();
@@ -219,9 +186,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 return Output::LinkSend { link, bytes };
             }
             // Commands that stop the robot are checked in every call, even before their deadline.
-            self.ask.links = self.links.has_stops();
+            self.clock.ask.links = self.links.has_stops();
         }
-        if self.ask.actions {
+        if self.clock.ask.actions {
             if let Some((link, action)) = self.links.next_action() {
                 return match action {
                     LinkAction::Open => {
@@ -230,9 +197,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                     LinkAction::Close => Output::LinkClose { link },
                 };
             }
-            self.ask.actions = false;
+            self.clock.ask.actions = false;
         }
-        if self.ask.ports && !self.is_late {
+        if self.clock.ask.ports && !self.clock.is_late {
             match self.next_downward(&mut buf[..], now) {
                 Some((port, Downward::Bytes(len))) => {
                     let bytes = buf.get(..len).unwrap_or(&[]);
@@ -245,11 +212,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 }
                 // On its own, so that nothing else pays for its registers.
                 None if self.exchanges.is_used() => return self.poll_request(now, buf),
-                None => self.ask.ports = false,
+                None => self.clock.ask.ports = false,
             }
         }
         debug_assert!(
-            self.is_late || self.all_are_silent(&mut buf[..], now),
+            self.clock.is_late || self.all_are_silent(&mut buf[..], now),
             "a port or link that was not asked has an output"
         );
         self.poll_sleep()
@@ -258,7 +225,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     // On its own, so that what is asked is read only once, behind it.
     #[inline(never)]
     fn ask_all(&mut self) {
-        self.ask = Ask::ALL;
+        self.clock.ask = Ask::ALL;
     }
 
     /// The next request to a device, or sleep.
@@ -268,7 +235,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         if let Some(request) = self.next_request(&mut buf[..], now) {
             return self.request_output(request, buf, now);
         }
-        self.ask.ports = false;
+        self.clock.ask.ports = false;
         debug_assert!(self.all_are_silent(&mut buf[..], now), "a port that was asked has an output");
         self.poll_sleep()
     }
@@ -276,17 +243,17 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     /// Nothing is to be done until the next deadline or beat.
     #[inline(always)]
     fn poll_sleep<'b>(&mut self) -> Output<'b> {
-        if !self.is_armed {
-            self.is_armed = true;
-            self.timer_at = self.deadline();
+        if !self.clock.is_armed {
+            self.clock.is_armed = true;
+            self.clock.timer_at = self.deadline();
         }
-        let beat_at = if self.ports.is_empty() { Instant::NEVER } else { self.beat_at };
-        let until = self.timer_at.min(beat_at);
+        let beat_at = if self.ports.is_empty() { Instant::NEVER } else { self.clock.beat_at };
+        let until = self.clock.timer_at.min(beat_at);
         if until == Instant::NEVER {
             return Output::Sleep { until };
         }
-        self.announced = self.announced.min(until);
-        Output::Sleep { until: self.announced }
+        self.clock.announced = self.clock.announced.min(until);
+        Output::Sleep { until: self.clock.announced }
     }
 
     /// Whether ports and links that are not asked really have no output.
@@ -304,7 +271,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             return;
         }
         if let Some(port) = find_port(&mut self.ports, id) {
-            if self.is_deaf {
+            if self.clock.is_deaf {
                 return port.discard(bytes, None, &mut self.tap, now);
             }
             port.heard(bytes, now);
@@ -314,7 +281,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             let (store, command) = (&mut self.store, self.links.command.first_mut());
             let Some(port) = find_port(&mut self.ports, id) else { return };
             let accepted = port.frames(&mut rest, &self.bindings.inputs, store, command, &mut self.tap);
-            self.ask.ports |= port.sender.is_due();
+            self.clock.ask.ports |= port.sender.is_due();
             let deadline = port.deadline();
             self.arm(deadline);
             self.after_field(id, &accepted, now);
@@ -328,7 +295,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[cold]
     #[inline(never)]
     fn port_silent(&mut self, id: PortId, now: Instant) {
-        if self.is_deaf {
+        if self.clock.is_deaf {
             // Nobody knows how long it has waited.
             if let Some(port) = find_port(&mut self.ports, id) {
                 port.discard_partial(&mut self.tap, now);
@@ -363,7 +330,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     fn plain_can(&mut self, id: PortId, frame: &CanFrame, now: Instant) {
         let (store, command) = (&mut self.store, self.links.command.first_mut());
         let Some(port) = find_port(&mut self.ports, id) else { return };
-        if self.is_deaf {
+        if self.clock.is_deaf {
             return port.discard(frame.data(), Some(frame.id()), &mut self.tap, now);
         }
         let accepted = port.can(frame, &self.bindings.inputs, store, command, &mut self.tap);
@@ -371,7 +338,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             // Most are for other nodes of the bus.
             return;
         }
-        self.ask.ports |= port.sender.is_due();
+        self.clock.ask.ports |= port.sender.is_due();
         let deadline = port.deadline();
         self.arm(deadline);
         self.after_field(id, &accepted, now);
@@ -396,13 +363,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     fn port_up(&mut self, id: PortId) {
         self.change_port(id, FieldPort::up);
         self.talk_begins(id);
-        self.tell_alive(self.now);
+        self.tell_alive(self.clock.now);
     }
 
     #[cold]
     fn port_down(&mut self, id: PortId, now: Instant) {
         let Some(port) = find_port(&mut self.ports, id) else { return };
-        self.ask = Ask::ALL;
+        self.clock.ask = Ask::ALL;
         port.down(&self.bindings.inputs, self.links.command.first_mut(), &mut self.tap, now);
         self.talk_ends(id);
         self.drop_forgotten(now);
@@ -412,7 +379,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[cold]
     fn port_bus(&mut self, id: PortId, state: BusState, now: Instant) {
         let Some(port) = find_port(&mut self.ports, id) else { return };
-        self.ask = Ask::ALL;
+        self.clock.ask = Ask::ALL;
         let was_off = port.bus == BusState::BusOff;
         port.bus_state(state, &self.bindings.inputs, self.links.command.first_mut(), now);
         let deadline = port.deadline();
@@ -442,14 +409,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[inline(never)]
     fn link_sent(&mut self, link: LinkId) {
         let deadline = self.links.sent(link);
-        self.ask.links = true;
+        self.clock.ask.links = true;
         self.arm(deadline);
     }
 
     #[inline(never)]
     fn link_acked(&mut self, link: LinkId, left: u32) {
         self.links.acked(link, left, &mut self.store);
-        self.ask.links = true;
+        self.clock.ask.links = true;
         self.arm(self.links.deadline_of(link));
     }
 
@@ -485,14 +452,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 
     /// Something happened on a link that may change its deadline, or close it.
     fn arm_link(&mut self, link: LinkId) {
-        (self.ask.links, self.ask.actions) = (true, true);
+        (self.clock.ask.links, self.clock.ask.actions) = (true, true);
         self.arm(self.links.deadline_of(link));
     }
 
     fn change_port(&mut self, id: PortId, change: impl FnOnce(&mut FieldPort)) {
         if let Some(port) = find_port(&mut self.ports, id) {
             change(port);
-            self.ask.ports = true;
+            self.clock.ask.ports = true;
             let deadline = port.deadline();
             self.arm(deadline);
         }
@@ -521,7 +488,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         if accepted.frames == 0 {
             return;
         }
-        self.ask.links = true;
+        self.clock.ask.links = true;
         let mut deadline = self.store.deadline();
         if deadline <= now {
             self.expire_waiting();
@@ -565,7 +532,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[inline(never)]
     fn check_triggers(&mut self) {
         self.show_health(self.store.now);
-        self.ask.ports = true;
+        self.clock.ask.ports = true;
         let mut first = Instant::NEVER;
         for port in &mut self.ports {
             let usable = port.is_usable();

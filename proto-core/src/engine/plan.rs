@@ -263,7 +263,7 @@ impl Plan {
 
     fn find_way_up(&mut self, config: ConfigView<'_>, var: SysVar, port: PortId) -> Result<(), PlanError> {
         let way = uplinks(config)
-            .find(|&(_, recipe)| inputs_of(config, recipe).any(|v| v == var))
+            .find(|&(_, recipe)| config.carries(recipe, Direction::Input, var))
             .map(|(link, _)| WayUp::Recipe(link))
             .or_else(|| is_exact_modbus(var).then_some(WayUp::Modbus))
             .ok_or(PlanError::NoWayUp { var, port })?;
@@ -280,11 +280,7 @@ impl Plan {
             return Some(Source::Field(owner));
         }
         uplinks(config)
-            .find(|(_, recipe)| {
-                config
-                    .fields_of(recipe, Direction::Output)
-                    .any(|(_, _, field)| field.variables().any(|shown| shown == var))
-            })
+            .find(|&(_, recipe)| config.carries(recipe, Direction::Output, var))
             .map(|(link, _)| Source::Recipe(link))
             .or_else(|| is_exact_modbus(var).then_some(Source::Modbus))
             .or_else(|| var.stream().map(|_| Source::State))
@@ -323,7 +319,7 @@ fn is_one_frame(config: ConfigView<'_>, link: &Recipe) -> bool {
     config.field_ports().any(|(_, port, recipe)| {
         config.frames_of(recipe, Direction::Input).any(|(_, fields)| {
             let fields = fields.of(config.fields);
-            let brings = |var| fields.iter().flat_map(FieldSpec::variables).any(|brought| brought == var);
+            let brings = |var| fields.iter().any(|field| field.is_bound_to(var));
             let safe = |var| port.on_timeout.of(config.safe_values).iter().any(|safe| safe.var == var);
             let mut vars = inputs_of(config, link).peekable();
             let first_is_safe = vars.peek().is_some_and(|&var| safe(var));
@@ -347,7 +343,8 @@ pub(super) fn sent_by<'a>(config: ConfigView<'a>, recipe: &'a Recipe) -> impl It
 /// trigger them.
 pub(super) fn shown_by<'a>(config: ConfigView<'a>, recipe: &'a Recipe) -> impl Iterator<Item = SysVar> + 'a {
     let exchanges = config.exchanges_of(recipe).iter();
-    let requests = exchanges.clone().filter_map(move |exchange| exchange.fields(config, Direction::Output));
+    let requests =
+        exchanges.clone().filter_map(move |exchange| exchange.fields(config.frames, Direction::Output));
     let fields = requests.flat_map(move |span| span.of(config.fields)).flat_map(FieldSpec::variables);
     let asks = exchanges.filter_map(|exchange| Some(exchange.when.rising?.0));
     sent_by(config, recipe).chain(fields).chain(asks)

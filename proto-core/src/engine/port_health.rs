@@ -262,7 +262,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
         if !news.is_empty() {
             self.store.tell(&news);
-            self.ask.links = true;
+            self.clock.ask.links = true;
         }
     }
 }

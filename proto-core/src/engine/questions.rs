@@ -56,7 +56,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     /// How often the gateway itself slept: it was not called for longer than [`super::ASLEEP`], so waiting
     /// input was discarded. Wraps.
     pub fn sleeps(&self) -> u32 {
-        self.sleeps
+        self.clock.sleeps
     }
 
     /// A snapshot of the whole gateway at `now`.
@@ -70,7 +70,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             bits: &self.store.bits,
             links: self.links.view(),
             latency: &self.store.latency,
-            sleeps: self.sleeps,
+            sleeps: self.clock.sleeps,
             peers: self.exchanges.peers(),
         }
     }

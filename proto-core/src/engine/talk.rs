@@ -379,7 +379,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         if port.line().is_none() {
             return false;
         }
-        if self.is_deaf {
+        if self.clock.is_deaf {
             port.discard(bytes, None, &mut self.tap, now);
             return true;
         }
@@ -411,7 +411,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         if port.line().is_none() {
             return false;
         }
-        if self.is_deaf {
+        if self.clock.is_deaf {
             port.discard(frame.data(), Some(frame.id()), &mut self.tap, now);
             return true;
         }
@@ -432,7 +432,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 
     /// The line may be free, or wait for something else.
     fn after_talk(&mut self, id: PortId) {
-        self.ask.ports = true;
+        self.clock.ask.ports = true;
         if let Some(port) = find_port(&mut self.ports, id) {
             port.note_partial();
             // Each by itself: what is due already must not hide the other.
@@ -445,7 +445,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[inline(never)]
     pub(super) fn talk_sent(&mut self, id: PortId) {
         if let Some(port) = find_port(&mut self.ports, id) {
-            port.talk_sent(self.exchanges.view(), self.now);
+            port.talk_sent(self.exchanges.view(), self.clock.now);
             self.after_talk(id);
         }
     }
@@ -453,7 +453,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     /// The device is there.
     pub(super) fn talk_begins(&mut self, id: PortId) {
         if let Some(port) = find_port(&mut self.ports, id) {
-            port.begin_talk(self.exchanges.view(), self.now);
+            port.begin_talk(self.exchanges.view(), self.clock.now);
             self.after_talk(id);
         }
     }
@@ -461,14 +461,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     /// The device is gone.
     pub(super) fn talk_ends(&mut self, id: PortId) {
         if let Some(port) = find_port(&mut self.ports, id) {
-            port.abandon_talk(self.exchanges.view(), self.now);
+            port.abandon_talk(self.exchanges.view(), self.clock.now);
         }
     }
 
     /// The gateway slept.
     pub(super) fn talk_slept(&mut self) {
         for port in &mut self.ports {
-            port.abandon_talk(self.exchanges.view(), self.now);
+            port.abandon_talk(self.exchanges.view(), self.clock.now);
         }
     }
 
@@ -490,7 +490,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.show_health(now);
         let (store, command) = (&mut self.store, self.links.command.first_mut());
         let Some(port) = find_port(&mut self.ports, id) else { return };
-        if self.is_deaf {
+        if self.clock.is_deaf {
             return port.discard_partial(&mut self.tap, now);
         }
         let bindings = (&self.bindings.inputs[..], &self.bindings.outputs[..]);
@@ -502,7 +502,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[cold]
     #[inline(never)]
     pub(super) fn talk_deadline(&self) -> Instant {
-        if self.is_deaf {
+        if self.clock.is_deaf {
             return Instant::NEVER;
         }
         self.ports.iter().map(FieldPort::talk_deadline).min().unwrap_or(Instant::NEVER)
@@ -512,7 +512,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[cold]
     #[inline(never)]
     pub(super) fn next_request(&mut self, out: &mut [u8], now: Instant) -> Option<(PortId, Downward)> {
-        if self.is_deaf {
+        if self.clock.is_deaf {
             return None;
         }
         if self.ports.iter().any(|port| port.line().is_some_and(|line| line.is_free(now))) {

@@ -19,6 +19,7 @@ use core::fmt;
 
 use crc::{CRC_32_ISO_HDLC, Crc};
 use heapless::VecView;
+use postcard::Deserializer;
 use serde::de::DeserializeOwned;
 
 use super::error::Counted;
@@ -235,7 +236,16 @@ fn items<T: DeserializeOwned + Into<Today>, Today>(
         return Err(ImageError::TooMany { what, needed, room });
     }
     for _ in 0..needed {
-        all.push(item::<T>(rest)?.into()).map_err(|_| ImageError::Contents)?;
+        // Not by `item`: each result that is passed on is copied, and recipes are large.
+        let mut reader = Deserializer::from_bytes(rest);
+        let pushed = match T::deserialize(&mut reader) {
+            Ok(item) => all.push(item.into()).is_ok(),
+            Err(_) => false,
+        };
+        match reader.finalize() {
+            Ok(behind) if pushed => *rest = behind,
+            _ => return Err(ImageError::Contents),
+        }
     }
     Ok(())
 }
