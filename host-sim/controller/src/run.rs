@@ -4,6 +4,7 @@ use proto_core::time::{Duration, Instant};
 use proto_core::wire::dialect::{FinishNotice, Motion};
 use proto_core::wire::scalar::Scalar;
 
+use super::events::Happened;
 use super::faults::Link;
 use super::machine::{Effect, ErrorId};
 use super::motion::Braking;
@@ -116,11 +117,14 @@ impl Controller {
             Effect::ProgramEnded => {
                 self.arm.settle(now);
                 self.arm_shown = None;
-                self.program_is_over(now);
+                self.program_is_over(now, None);
             }
             Effect::ShutDown => {
-                self.server.close_all(&mut self.outputs);
-                self.running = None;
+                self.close_all_clients();
+                if let Some(running) = self.running.take() {
+                    self.runs.ends_by("shutdown");
+                    self.run_over(now, running.name(), None);
+                }
                 self.outputs.push_back(ControllerOutput::Shutdown);
                 self.is_shut_down = true;
             }
@@ -132,16 +136,20 @@ impl Controller {
         &mut self,
         now: Instant,
         script: &Script,
-        conn: ConnId,
+        started_by: Option<ConnId>,
+        by: &'static str,
     ) -> Result<(), ErrorId> {
         for port in &mut self.ports {
             port.forget_received();
         }
         match Program::start(script, now) {
             Ok(program) => {
-                self.running = Some(Running { program, activity: Activity::None, started_by: Some(conn) });
+                self.running = Some(Running { program, activity: Activity::None, started_by });
                 self.machine.program_started();
                 self.counters.programs_started += 1;
+                let run = self.runs.begin(self.time_s(now));
+                let program = || script.name().to_owned();
+                self.happened(now, || Happened::ProgramStarted { run, program: program(), by });
                 Ok(())
             }
             Err(error) => {
@@ -215,21 +223,23 @@ impl Controller {
                     }
                 }
                 Progress::Ended(end) => {
-                    if let End::Failed(message) = end {
+                    if let End::Failed(message) = &end {
                         self.counters.programs_failed += 1;
                         let message = format!("{}: {message}", running.name());
                         self.machine.fail(ErrorId::ProgramFailed, message);
                     }
                     self.machine.program_ended();
-                    self.program_is_over(now);
+                    self.program_is_over(now, Some(&end));
+                    self.settle(now);
                     return;
                 }
             }
         }
     }
 
-    fn program_is_over(&mut self, now: Instant) {
+    fn program_is_over(&mut self, now: Instant, end: Option<&End>) {
         let Some(running) = self.running.take() else { return };
+        self.run_over(now, running.name(), end);
         self.variables = running.variables();
         for port in &mut self.ports {
             port.forget_received();
@@ -287,10 +297,15 @@ impl Controller {
                 Err(error) => Answer::Error(format!("{name}: {error}")),
             }),
             Call::Set { name, value } => Some(match name.parse() {
-                Ok(target) => match self.registers.set_by_program(target, *value) {
-                    Ok(()) => Answer::Done,
-                    Err(error) => Answer::Error(error.to_string()),
-                },
+                Ok(target) => {
+                    let before = self.recorder.before(&self.registers);
+                    let result = self.registers.set_by_program(target, *value);
+                    self.note_writes(now, before, "program");
+                    match result {
+                        Ok(()) => Answer::Done,
+                        Err(error) => Answer::Error(error.to_string()),
+                    }
+                }
                 Err(error) => Answer::Error(format!("{name}: {error}")),
             }),
             Call::MoveJ { target, speed_rad_s } => {
@@ -328,6 +343,8 @@ impl Controller {
             }
             Call::Log(line) => {
                 tracing::info!(target: "program", "{line}");
+                let program = self.program_name().unwrap_or_default().to_owned();
+                self.happened(now, || Happened::Log { program, text: line.clone() });
                 if self.log.len() >= MAX_LOG {
                     self.log.pop_front();
                 }
@@ -345,7 +362,7 @@ impl Controller {
         None
     }
 
-    fn port_named(&self, name: &str) -> Result<usize, String> {
+    pub(super) fn port_named(&self, name: &str) -> Result<usize, String> {
         self.ports.iter().position(|port| port.name() == name).ok_or_else(|| {
             let names: Vec<_> = self.ports.iter().map(|port| port.name()).collect();
             format!("there is no port {name}; there are {}", names.join(", "))
@@ -379,6 +396,8 @@ impl Controller {
         self.counters.missed_state_packets += missed;
         let mut bytes = self.registers.packet(self.dialect.global_speed);
         self.faults.spoiled().put_in_packet(&mut bytes);
+        self.faults.freeze_packet(&mut bytes);
+        self.faults.spoil_bytes(Link::State, &mut bytes[..]);
         if self.faults.mutes(Link::State) {
             self.counters.state.muted += 1;
             return;

@@ -169,6 +169,20 @@ impl Port {
         }
     }
 
+    pub(super) fn cycle(&self) -> Duration {
+        self.cycle
+    }
+
+    /// Sets the cycle, from the next output on.
+    pub(super) fn set_cycle(&mut self, now: Instant, epoch: Instant, cycle: Duration) {
+        self.cycle = cycle.max(MIN_CYCLE);
+        if self.grid.is_some() {
+            let mut grid = Grid::starting_at(epoch, self.cycle);
+            grid.due(now);
+            self.grid = Some(grid);
+        }
+    }
+
     /// Everything handed over was sent.
     pub(super) fn sent(&mut self) {
         if self.transmitter == Transmitter::Sending {

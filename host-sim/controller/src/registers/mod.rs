@@ -121,6 +121,11 @@ impl Registers {
         result
     }
 
+    /// The analog outputs of cabinet and tool, in counts.
+    pub fn analog_outputs(&self) -> ([u16; 8], [u16; 2]) {
+        (self.analog_out, self.tool_out)
+    }
+
     /// A system variable's value.
     pub fn var(&self, var: SysVar) -> Scalar {
         let bytes = self.image.get(var.image_offset()..).unwrap_or(&[]);
