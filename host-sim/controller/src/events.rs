@@ -227,6 +227,8 @@ impl std::fmt::Display for Happened {
 #[derive(Debug, Default)]
 pub(super) struct Recorder {
     on: bool,
+    /// Maximum number of kept events, of writes and of all others each.
+    max: usize,
     next: u64,
     kept: VecDeque<Event>,
     /// Writes are kept apart, so that a fast recipe does not displace everything else.
@@ -270,7 +272,7 @@ impl Recorder {
     fn keep(&mut self, time_s: f64, what: Happened) {
         self.next += 1;
         let kept = if matches!(what, Happened::Write { .. }) { &mut self.writes } else { &mut self.kept };
-        if kept.len() >= MAX_EVENTS
+        if kept.len() >= self.max
             && let Some(oldest) = kept.pop_front()
         {
             self.dropped = self.dropped.max(oldest.number);
@@ -287,7 +289,12 @@ impl Recorder {
 impl Controller {
     /// Keeps events from now on, for [`Self::events_since`].
     pub fn record_events(&mut self) {
-        self.recorder.on = true;
+        self.record_newest_events(MAX_EVENTS);
+    }
+
+    /// The same, with another number of events that are kept: writes, and all others.
+    pub fn record_newest_events(&mut self, max: usize) {
+        (self.recorder.on, self.recorder.max) = (true, max.max(1));
     }
 
     /// The kept events with this number or a later one, oldest first.
@@ -455,5 +462,5 @@ pub(super) fn snake(name: &str) -> String {
     text
 }
 
-/// Maximum number of kept events, of writes and of all others each.
+/// Number of events that [`Controller::record_events`] keeps, of writes and of all others each.
 pub const MAX_EVENTS: usize = 20_000;

@@ -10,8 +10,10 @@ use proto_core::wire::can::CanFrame;
 use proto_core::wire::state::StatePacket;
 use recipe_config::file::{Text, parse_controller};
 use recipe_config::{InitialTarget, SimConfig};
+use serde_json::Value;
 
 use super::faults::Link;
+use super::operations::{Operation, Refused};
 use super::{BuildError, ConnId, Controller, ControllerInput, ControllerOutput};
 
 /// A simulated controller with its clients and devices, on a virtual clock. It opens no socket and never
@@ -254,6 +256,17 @@ impl TestController {
         if let Err(error) = self.controller.force(target(name), value) {
             panic!("{name} = {value}: {error}");
         }
+    }
+
+    /// Carries out an operation, given as JSON (docs/control.md section 2), and returns its result.
+    ///
+    /// # Errors
+    /// [`Refused`]: why it was refused; nothing changed.
+    pub fn operate(&mut self, operation: &str) -> Result<Value, Refused> {
+        let object = serde_json::from_str(operation).map_err(|error| Refused(error.to_string()))?;
+        let result = self.controller.operate(self.now, &Operation::from_json(object)?);
+        self.drain();
+        result
     }
 
     /// Whether the controller was shut down by the command `shutdown`.

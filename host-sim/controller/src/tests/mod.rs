@@ -5,6 +5,7 @@ mod commands;
 mod examples;
 mod faults;
 mod modbus;
+mod operations;
 mod ports;
 mod programs;
 mod room;
