@@ -18,6 +18,7 @@
 mod build;
 mod counters;
 mod faults;
+mod functions;
 mod io;
 pub mod machine;
 pub mod motion;
@@ -36,7 +37,7 @@ use proto_core::time::{Duration, Instant};
 use proto_core::wire::dialect::Dialect;
 
 pub use build::BuildError;
-use build::{mode, start_values};
+use build::{check_functions, mode, start_values};
 pub use counters::{Counters, ServerCounters};
 use faults::Faults;
 pub use faults::{CommandClients, Link};
@@ -105,6 +106,7 @@ impl Controller {
                 .map_err(|error| BuildError::Program { program: program.name.clone(), error })?;
             scripts.push(script);
         }
+        check_functions(config)?;
         let (registers, arm) = start_values(config)?;
         Ok(Self {
             machine: Machine::new(config.robot.power, mode(config)),

@@ -61,6 +61,7 @@ impl Controller {
             self.settle(now);
         }
         self.settle(now);
+        self.carry_out_functions(now);
         self.refresh(now);
         if self.running.is_some() {
             self.drive_program(now);
@@ -132,14 +133,14 @@ impl Controller {
         &mut self,
         now: Instant,
         script: &Script,
-        conn: ConnId,
+        started_by: Option<ConnId>,
     ) -> Result<(), ErrorId> {
         for port in &mut self.ports {
             port.forget_received();
         }
         match Program::start(script, now) {
             Ok(program) => {
-                self.running = Some(Running { program, activity: Activity::None, started_by: Some(conn) });
+                self.running = Some(Running { program, activity: Activity::None, started_by });
                 self.machine.program_started();
                 self.counters.programs_started += 1;
                 Ok(())
@@ -184,6 +185,7 @@ impl Controller {
             speed_percent: machine.speed_percent().round() as u8,
             drives_on: machine.drives_on(),
         });
+        self.show_states();
         let stale = match self.arm_shown {
             None => true,
             Some(shown) => {

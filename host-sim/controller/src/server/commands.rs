@@ -164,7 +164,7 @@ impl Controller {
     fn carry_out(&mut self, now: Instant, conn: ConnId, command: Command) {
         match command {
             Command::Run { program, speed } => {
-                let outcome = match self.run(now, conn, &program, speed) {
+                let outcome = match self.run(now, Some(conn), &program, speed) {
                     Ok(()) => Outcome::Success,
                     Err(_) => Outcome::Fail,
                 };
@@ -214,7 +214,13 @@ impl Controller {
     }
 
     /// The command `run`. The program is looked up first, so that a missing one is reported in every state.
-    fn run(&mut self, now: Instant, conn: ConnId, name: &str, speed: Option<Percent>) -> Result<(), ErrorId> {
+    pub(crate) fn run(
+        &mut self,
+        now: Instant,
+        asked_by: Option<ConnId>,
+        name: &str,
+        speed: Option<Percent>,
+    ) -> Result<(), ErrorId> {
         let Some(script) = self.script_named(name) else {
             self.machine.fail(ErrorId::NoSuchProgram, format!("run: there is no program {name}"));
             return Err(ErrorId::NoSuchProgram);
@@ -223,7 +229,7 @@ impl Controller {
         if speed.is_some() {
             self.machine.set_speed(speed)?;
         }
-        self.start_program(now, &script, conn)
+        self.start_program(now, &script, asked_by)
     }
 
     /// The program with this name, or with the last part of this path.

@@ -4,6 +4,7 @@ mod any_order;
 mod commands;
 mod examples;
 mod faults;
+mod functions;
 mod modbus;
 mod ports;
 mod programs;
