@@ -7,7 +7,7 @@ use proto_core::wire::scalar::Scalar;
 use super::faults::Link;
 use super::machine::{Effect, ErrorId};
 use super::motion::Braking;
-use super::ports::{Listening, Outgoing};
+use super::ports::{Handed, Listening, Outgoing};
 use super::program::{Answer, Call, End, Program, Progress, Script, Variables};
 use super::registers::Status;
 use super::{ConnId, Controller, ControllerOutput, MAX_LOG};
@@ -261,11 +261,8 @@ impl Controller {
             Call::Send { port, id, values } => {
                 if let Activity::Sending { port } = activity {
                     let port = self.ports.get(port)?;
-                    return match (port.is_busy(), port.is_up()) {
-                        (true, _) => None,
-                        (false, true) => Some(Answer::Done),
-                        (false, false) => Some(Answer::Error(format!("{} was disconnected", port.name()))),
-                    };
+                    // A port that goes down drops its frame.
+                    return (!port.is_busy()).then(|| Answer::Bit(port.is_up()));
                 }
                 let nth = match self.port_named(port) {
                     Ok(nth) => nth,
@@ -277,7 +274,8 @@ impl Controller {
                     return None;
                 }
                 match port.send(*id, values) {
-                    Ok(()) => self.begin_activity(Activity::Sending { port: nth }),
+                    Ok(Handed::Over) => self.begin_activity(Activity::Sending { port: nth }),
+                    Ok(Handed::NotReady) => Some(Answer::Bit(false)),
                     Err(message) => Some(Answer::Error(message)),
                 }
             }

@@ -210,14 +210,14 @@ fn register(mut engine: Engine, link: &Arc<Link>) -> Engine {
     });
 
     let l = with();
-    engine.register_fn("comm_send", move |port: &str, values: Array| -> Outcome<()> {
+    engine.register_fn("comm_send", move |port: &str, values: Array| -> Outcome<bool> {
         let values = numbers(&values)?;
-        l.call(Call::Send { port: port.to_owned(), id: None, values }).map(|_| ())
+        l.call(Call::Send { port: port.to_owned(), id: None, values }).map(was_sent)
     });
     let l = with();
-    engine.register_fn("comm_send", move |port: &str, id: INT, values: Array| -> Outcome<()> {
+    engine.register_fn("comm_send", move |port: &str, id: INT, values: Array| -> Outcome<bool> {
         let values = numbers(&values)?;
-        l.call(Call::Send { port: port.to_owned(), id: Some(id), values }).map(|_| ())
+        l.call(Call::Send { port: port.to_owned(), id: Some(id), values }).map(was_sent)
     });
 
     let l = with();
@@ -271,6 +271,11 @@ fn register(mut engine: Engine, link: &Arc<Link>) -> Engine {
     engine.register_fn("sleep", |_: FLOAT| -> Outcome<()> { Err("sleep: use wait_ms".into()) });
     engine.register_fn("timestamp", || -> Outcome<()> { Err("timestamp: programs have no clock".into()) });
     engine
+}
+
+/// What `comm_send` returns (D28).
+fn was_sent(answer: Answer) -> bool {
+    answer != Answer::Bit(false)
 }
 
 /// An error that a script cannot catch.

@@ -38,7 +38,8 @@ pub enum Call {
         /// The port's name.
         port: String,
     },
-    /// Send a frame of the port's user recipe.
+    /// Send a frame of the port's user recipe. [`Answer::Bit`] says whether the port was ready and has sent it;
+    /// [`Answer::Done`] is true.
     Send {
         /// The port's name.
         port: String,
@@ -91,7 +92,7 @@ pub enum Answer {
     },
     /// An item's value.
     Value(Scalar),
-    /// A bit's value.
+    /// A bit's value, or whether a frame was sent.
     Bit(bool),
     /// It failed; the program may catch the error.
     Error(String),
