@@ -20,6 +20,7 @@ mod counters;
 mod faults;
 mod functions;
 mod io;
+mod items;
 pub mod machine;
 pub mod motion;
 mod ports;

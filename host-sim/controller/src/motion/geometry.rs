@@ -1,7 +1,11 @@
-//! Forward kinematics: joints to frames, poses and twists.
+//! Forward kinematics: joints to frames, poses and twists. The way back is in `inverse`.
 //!
 //! Trigonometry is from libm, not from the system, so that poses, and with them the traces of soak runs, are
 //! identical on every machine.
+
+mod inverse;
+
+pub(super) use inverse::{Branch, length};
 
 /// Number of joints.
 pub(super) const JOINTS: usize = 6;

@@ -12,7 +12,7 @@ use proto_core::wire::state::ProgramState;
 
 use super::Link;
 use crate::machine::{ErrorId, Progress, Transition};
-use crate::program::Script;
+use crate::program;
 use crate::{ConnId, Controller, ControllerOutput};
 
 /// A connection of port 2000.
@@ -221,7 +221,7 @@ impl Controller {
         name: &str,
         speed: Option<Percent>,
     ) -> Result<(), ErrorId> {
-        let Some(script) = self.script_named(name) else {
+        let Some(script) = program::named(&self.scripts, name).cloned() else {
             self.machine.fail(ErrorId::NoSuchProgram, format!("run: there is no program {name}"));
             return Err(ErrorId::NoSuchProgram);
         };
@@ -230,13 +230,6 @@ impl Controller {
             self.machine.set_speed(speed)?;
         }
         self.start_program(now, &script, asked_by)
-    }
-
-    /// The program with this name, or with the last part of this path.
-    fn script_named(&self, name: &str) -> Option<Script> {
-        let base = name.rsplit('/').next().unwrap_or(name);
-        let by = |wanted: &str| self.scripts.iter().find(|script| script.name() == wanted);
-        by(name).or_else(|| by(base)).cloned()
     }
 
     pub(crate) fn send_finish_notice(&mut self, now: Instant, conn: ConnId) {

@@ -9,6 +9,7 @@ mod modbus;
 mod ports;
 mod programs;
 mod room;
+mod scripts;
 mod slices;
 mod stream;
 mod when_done;
