@@ -8,6 +8,83 @@ use recipe_config::{InitialTarget, ShownState, TargetError};
 
 use super::Controller;
 use super::program::Answer;
+use super::registers::PacketItem;
+
+/// An item of this name cannot be read, or cannot have this value.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ItemError {
+    /// The name.
+    pub name: String,
+    /// What is wrong.
+    pub reason: String,
+}
+
+impl std::fmt::Display for ItemError {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}: {}", self.name, self.reason)
+    }
+}
+
+impl std::error::Error for ItemError {}
+
+/// Items by name, for tests.
+impl Controller {
+    /// An item's value: a system variable, an input or output, a state such as `running`, or an item of the
+    /// state packet such as `drive_error[2]` (proto-core/docs/wire/state.md section 2), as the packet shows it
+    /// without [`Self::spoil`]. A bit and a state are 0 or 1.
+    ///
+    /// # Errors
+    /// [`ItemError`] if there is no such item.
+    pub fn item(&self, name: &str) -> Result<f64, ItemError> {
+        if name.parse::<InitialTarget>().is_err()
+            && let Some(item) = PacketItem::named(name)
+        {
+            return Ok(item.read(&self.registers.packet(self.dialect.global_speed)));
+        }
+        match self.read_item(name) {
+            Ok(Answer::Bit(on)) => Ok(f64::from(u8::from(on))),
+            Ok(Answer::Value(value)) => Ok(value.as_f64()),
+            Ok(_) => Ok(0.0),
+            Err(reason) => Err(ItemError {
+                name: name.to_owned(),
+                reason: reason.strip_prefix(&format!("{name}: ")).unwrap_or(&reason).to_owned(),
+            }),
+        }
+    }
+
+    /// Sets an item. A system variable, an input or an output is set as by [`Self::force`], for everyone. An
+    /// item of the state packet, reserved ones as well, has this value in packets, and in `get` of a program,
+    /// until [`Self::release_item`] or a restart; other interfaces show what the model has.
+    ///
+    /// # Errors
+    /// [`ItemError`] if there is no such item, or it cannot have the value; nothing changed.
+    pub fn force_item(&mut self, name: &str, value: f64) -> Result<(), ItemError> {
+        let wrong = |reason: String| ItemError { name: name.to_owned(), reason };
+        match name.parse::<InitialTarget>() {
+            Ok(target) => self.force(target, value).map_err(|error| wrong(error.to_string())),
+            Err(error) => {
+                let item = PacketItem::named(name).ok_or_else(|| {
+                    wrong(format!("{error}; and items of the state packet, such as drive_error[1]"))
+                })?;
+                let forced = self.registers.force_in_packet(item, value);
+                forced.map_err(|error| wrong(error.to_string()))
+            }
+        }
+    }
+
+    /// Ends [`Self::force_item`] for an item of the state packet: the model's value is shown again.
+    ///
+    /// # Errors
+    /// [`ItemError`] if the packet has no such item.
+    pub fn release_item(&mut self, name: &str) -> Result<(), ItemError> {
+        let item = PacketItem::named(name).ok_or_else(|| ItemError {
+            name: name.to_owned(),
+            reason: "the state packet has no such item".to_owned(),
+        })?;
+        self.registers.release_in_packet(item);
+        Ok(())
+    }
+}
 
 impl Controller {
     /// The value of an item. A bit and a state are bits, everything else is a number.

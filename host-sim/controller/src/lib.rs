@@ -43,6 +43,7 @@ pub use counters::{Counters, ServerCounters};
 use faults::Faults;
 pub use faults::{CommandClients, Link};
 pub use io::{ConnId, ControllerInput, ControllerOutput};
+pub use items::ItemError;
 use machine::Machine;
 use motion::Arm;
 use ports::Port;

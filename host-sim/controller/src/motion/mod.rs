@@ -11,6 +11,7 @@
 mod clock;
 mod geometry;
 mod line;
+mod loads;
 
 use std::f64::consts::{FRAC_PI_2, FRAC_PI_4};
 
@@ -21,6 +22,7 @@ pub use geometry::Frame;
 use geometry::{JOINTS, Twist};
 use line::Line;
 pub use line::MAX_SPEED_M_S;
+pub use loads::{Loads, Payload};
 
 /// The arm's motion.
 #[derive(Debug, Clone)]

@@ -8,6 +8,7 @@
 //! `DigitalOutputCommand[1]` and `DigitalSignalStatus[4]`: the second always follows the first.
 
 mod bank;
+mod forced;
 mod functional;
 mod packet;
 
@@ -17,6 +18,8 @@ use proto_core::sysvar::{Direction, IMAGE_BYTES, SysVar, VarBit};
 use proto_core::wire::scalar::Scalar;
 
 use super::motion::{ArmState, Frame};
+use forced::Forced;
+pub(crate) use forced::PacketItem;
 use functional::Functional;
 
 use recipe_config::{AnalogInput, BitGroup, InitialTarget};
@@ -62,6 +65,7 @@ pub struct Registers {
     target: ArmState,
     status: Status,
     functional: Functional,
+    forced: Forced,
 }
 
 /// Why an item was not set.
@@ -106,6 +110,7 @@ impl Default for Registers {
             target: ArmState::default(),
             status: Status::default(),
             functional: Functional::default(),
+            forced: Forced::default(),
         }
     }
 }
@@ -300,8 +305,13 @@ impl Registers {
 
     /// The payload, from `RobotState[26]`, in kg.
     pub fn payload_kg(&self) -> f64 {
-        let bytes = self.image.get(PLACES.payload..).and_then(|bytes| bytes.first_chunk());
-        bytes.map_or(0.0, |bytes| f64::from(f32::from_le_bytes(*bytes)))
+        self.payload()[0]
+    }
+
+    /// The payload's mass in kg and centre in m, from `RobotState[26..29]`.
+    fn payload(&self) -> [f64; 4] {
+        let [mass, x, y, z, ..] = self.vector(PLACES.payload).map(f64::from);
+        [mass, x, y, z]
     }
 
     /// Sets the arm's state, actual and commanded.

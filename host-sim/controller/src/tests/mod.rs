@@ -6,6 +6,7 @@ mod examples;
 mod faults;
 mod functions;
 mod modbus;
+mod packet;
 mod ports;
 mod programs;
 mod room;
