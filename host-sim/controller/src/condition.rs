@@ -9,7 +9,7 @@ use serde_json::{Map, Value};
 
 use super::Controller;
 use super::events::{KINDS, snake};
-use super::operations::{Mode, Number, Refused, target};
+use super::operations::{Mode, Number, Refused};
 
 /// What is waited for: everything that it names.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -50,7 +50,7 @@ fn given<'de, D: Deserializer<'de>>(from: D) -> Result<Option<Option<String>>, D
 }
 
 impl Condition {
-    /// Whether it can ever hold.
+    /// Whether it can ever hold, but for the names of items, which [`Controller::holds`] knows.
     ///
     /// # Errors
     /// What it names wrongly.
@@ -64,9 +64,6 @@ impl Condition {
         known("robot", &self.robot, &ROBOT_STATES)?;
         known("program_state", &self.program_state, &PROGRAM_STATES)?;
         known("safety", &self.safety, &SAFETY_STATES)?;
-        for name in self.items.keys() {
-            target(name)?;
-        }
         for (key, addresses, count) in [("coil", &self.coil, COILS), ("register", &self.register, HOLDING)] {
             for text in addresses.keys() {
                 address(key, text, count)?;
@@ -93,7 +90,7 @@ impl Controller {
     /// Whether the condition holds now; an event counts if its number is `since` or later.
     ///
     /// # Errors
-    /// As [`Condition::check`].
+    /// As [`Condition::check`], or an item that does not exist.
     pub fn holds(&self, condition: &Condition, since: u64) -> Result<bool, Refused> {
         condition.check()?;
         let is = |name: &Option<String>, now: &str| name.as_ref().is_none_or(|name| *name == snake(now));
@@ -107,7 +104,7 @@ impl Controller {
             return Ok(false);
         }
         for (name, value) in &condition.items {
-            if self.registers.value(target(name)?) != value.value() {
+            if self.item(name).map_err(|error| Refused(error.to_string()))? != value.value() {
                 return Ok(false);
             }
         }

@@ -20,7 +20,9 @@ mod condition;
 mod counters;
 mod events;
 mod faults;
+mod functions;
 mod io;
+mod items;
 pub mod machine;
 pub mod motion;
 pub mod operations;
@@ -42,7 +44,7 @@ use proto_core::time::{Duration, Instant};
 use proto_core::wire::dialect::Dialect;
 
 pub use build::BuildError;
-use build::{mode, start_values};
+use build::{check_functions, mode, start_values};
 pub use condition::Condition;
 pub use counters::{Counters, ServerCounters};
 use events::Recorder;
@@ -50,6 +52,7 @@ pub use events::{Event, Happened, KINDS, MAX_EVENTS};
 use faults::Faults;
 pub use faults::{CommandClients, Link};
 pub use io::{ConnId, ControllerInput, ControllerOutput};
+pub use items::ItemError;
 use machine::Machine;
 use motion::Arm;
 use ports::Port;
@@ -122,6 +125,7 @@ impl Controller {
                 .map_err(|error| BuildError::Program { program: program.name.clone(), error })?;
             scripts.push(script);
         }
+        check_functions(config)?;
         let (registers, arm) = start_values(config)?;
         Ok(Self {
             machine: Machine::new(config.robot.power, mode(config)),

@@ -2,17 +2,15 @@
 
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::dialect::{FinishNotice, Motion};
-use proto_core::wire::scalar::Scalar;
 
 use super::events::Happened;
 use super::faults::Link;
 use super::machine::{Effect, ErrorId};
 use super::motion::Braking;
-use super::ports::{Listening, Outgoing};
-use super::program::{Answer, Call, End, Program, Progress, Script, Variables};
+use super::ports::{Handed, Listening, Outgoing};
+use super::program::{Answer, Call, End, Program, Progress, Script, Variables, shortened};
 use super::registers::Status;
 use super::{ConnId, Controller, ControllerOutput, MAX_LOG};
-use recipe_config::InitialTarget;
 
 /// The program that has not ended.
 #[derive(Debug)]
@@ -62,6 +60,7 @@ impl Controller {
             self.settle(now);
         }
         self.settle(now);
+        self.carry_out_functions(now);
         self.refresh(now);
         if self.running.is_some() {
             self.drive_program(now);
@@ -142,7 +141,7 @@ impl Controller {
         for port in &mut self.ports {
             port.forget_received();
         }
-        match Program::start(script, now) {
+        match Program::start_with(script, &self.scripts, now) {
             Ok(program) => {
                 self.running = Some(Running { program, activity: Activity::None, started_by });
                 self.machine.program_started();
@@ -192,6 +191,7 @@ impl Controller {
             speed_percent: machine.speed_percent().round() as u8,
             drives_on: machine.drives_on(),
         });
+        self.show_states();
         let stale = match self.arm_shown {
             None => true,
             Some(shown) => {
@@ -225,7 +225,7 @@ impl Controller {
                 Progress::Ended(end) => {
                     if let End::Failed(message) = &end {
                         self.counters.programs_failed += 1;
-                        let message = format!("{}: {message}", running.name());
+                        let message = format!("{}: {message}", shortened(running.name(), MAX_NAME));
                         self.machine.fail(ErrorId::ProgramFailed, message);
                     }
                     self.machine.program_ended();
@@ -255,7 +255,7 @@ impl Controller {
     fn serve(&mut self, now: Instant, call: &Call) -> Option<Answer> {
         let activity = self.running.as_ref().map_or(Activity::None, |running| running.activity);
         match call {
-            Call::Receive { port } => {
+            Call::Receive { port, limit } => {
                 let port = match self.port_named(port) {
                     Ok(nth) => self.ports.get_mut(nth)?,
                     Err(message) => return Some(Answer::Error(message)),
@@ -263,17 +263,17 @@ impl Controller {
                 if let Err(message) = port.check_receive() {
                     return Some(Answer::Error(message));
                 }
-                let frame = port.next_received()?;
-                Some(Answer::Frame { id: frame.id, values: frame.values })
+                match (port.next_received(), limit) {
+                    (Some(frame), _) => Some(Answer::Frame { id: frame.id, values: frame.values }),
+                    (None, Some(limit)) => self.wait(now, activity, *limit),
+                    (None, None) => None,
+                }
             }
             Call::Send { port, id, values } => {
                 if let Activity::Sending { port } = activity {
                     let port = self.ports.get(port)?;
-                    return match (port.is_busy(), port.is_up()) {
-                        (true, _) => None,
-                        (false, true) => Some(Answer::Done),
-                        (false, false) => Some(Answer::Error(format!("{} was disconnected", port.name()))),
-                    };
+                    // A port that goes down drops its frame.
+                    return (!port.is_busy()).then(|| Answer::Bit(port.is_up()));
                 }
                 let nth = match self.port_named(port) {
                     Ok(nth) => nth,
@@ -285,17 +285,12 @@ impl Controller {
                     return None;
                 }
                 match port.send(*id, values) {
-                    Ok(()) => self.begin_activity(Activity::Sending { port: nth }),
+                    Ok(Handed::Over) => self.begin_activity(Activity::Sending { port: nth }),
+                    Ok(Handed::NotReady) => Some(Answer::Bit(false)),
                     Err(message) => Some(Answer::Error(message)),
                 }
             }
-            Call::Get { name } => Some(match name.parse() {
-                Ok(InitialTarget::Var(var)) => Answer::Value(self.registers.var(var)),
-                Ok(InitialTarget::Bit { group, index }) => Answer::Bit(self.registers.bit(group, index)),
-                Ok(target @ InitialTarget::VarBit(_)) => Answer::Bit(self.registers.value(target) != 0.0),
-                Ok(target) => Answer::Value(Scalar::Double(self.registers.value(target))),
-                Err(error) => Answer::Error(format!("{name}: {error}")),
-            }),
+            Call::Get { name } => Some(self.read_item(name).unwrap_or_else(Answer::Error)),
             Call::Set { name, value } => Some(match name.parse() {
                 Ok(target) => {
                     let before = self.recorder.before(&self.registers);
@@ -308,11 +303,10 @@ impl Controller {
                 }
                 Err(error) => Answer::Error(format!("{name}: {error}")),
             }),
-            Call::MoveJ { target, speed_rad_s } => {
+            Call::MoveJ { .. } | Call::MoveL { .. } => {
                 if activity != Activity::Moving {
-                    let started = self.arm.move_to(now, *target, *speed_rad_s, self.machine.rate());
-                    if let Err(error) = started {
-                        return Some(Answer::Error(format!("movej: {error}")));
+                    if let Err(message) = self.start_move(now, call) {
+                        return Some(Answer::Error(message));
                     }
                     self.begin_activity(Activity::Moving);
                 }
@@ -323,17 +317,7 @@ impl Controller {
                 self.arm.settle(now);
                 Some(Answer::Done)
             }
-            Call::Wait(time) => {
-                let until = match activity {
-                    Activity::Waiting { until } => until,
-                    _ => now + *time,
-                };
-                if now >= until {
-                    Some(Answer::Done)
-                } else {
-                    self.begin_activity(Activity::Waiting { until })
-                }
-            }
+            Call::Wait(time) => self.wait(now, activity, *time),
             Call::GiveWay { until } => {
                 if now >= *until {
                     Some(Answer::Done)
@@ -352,6 +336,30 @@ impl Controller {
                 Some(Answer::Done)
             }
         }
+    }
+
+    /// Waits for this time since the call was first handled.
+    fn wait(&mut self, now: Instant, activity: Activity, time: Duration) -> Option<Answer> {
+        let until = match activity {
+            Activity::Waiting { until } => until,
+            _ => now + time,
+        };
+        if now >= until { Some(Answer::Done) } else { self.begin_activity(Activity::Waiting { until }) }
+    }
+
+    /// Starts the move of a call.
+    fn start_move(&mut self, now: Instant, call: &Call) -> Result<(), String> {
+        let rate = self.machine.rate();
+        let (function, started) = match *call {
+            Call::MoveJ { target, speed_rad_s } => {
+                ("movej", self.arm.move_to(now, target, speed_rad_s, rate))
+            }
+            Call::MoveL { pose, speed_m_s } => {
+                ("movel", self.arm.move_along(now, pose, speed_m_s, &self.registers.tool(), rate))
+            }
+            _ => return Ok(()),
+        };
+        started.map_err(|error| format!("{function}: {error}"))
     }
 
     /// Notes what the call waits for, and returns no answer.
@@ -411,5 +419,7 @@ impl Controller {
     }
 }
 
+/// Maximum length of a program's name in the error that it ended with, in bytes.
+const MAX_NAME: usize = 64;
 /// Interval at which the arm's state is updated.
 const SERVO_CYCLE: Duration = Duration::from_millis(1);

@@ -29,7 +29,7 @@ use receive::Received;
 use recipe::Parts;
 pub use recipe::RecipeError;
 use recipe_config::{SimBus, SimConfig, SimPort};
-pub(crate) use send::Outgoing;
+pub(crate) use send::{Handed, Outgoing};
 
 /// A recipe port.
 #[derive(Debug)]

@@ -18,7 +18,7 @@ use super::Link;
 use crate::events::Happened;
 use crate::machine::{ErrorId, Progress, Transition};
 use crate::operations::cause_of;
-use crate::program::Script;
+use crate::program;
 use crate::{ConnId, Controller, ControllerOutput};
 
 /// A connection of port 2000.
@@ -186,7 +186,7 @@ impl Controller {
     fn carry_out(&mut self, now: Instant, conn: ConnId, command: Command) {
         match command {
             Command::Run { program, speed } => {
-                let outcome = match self.run(now, conn, &program, speed) {
+                let outcome = match self.run(now, Some(conn), &program, speed) {
                     Ok(()) => Outcome::Success,
                     Err(_) => Outcome::Fail,
                 };
@@ -237,8 +237,14 @@ impl Controller {
     }
 
     /// The command `run`. The program is looked up first, so that a missing one is reported in every state.
-    fn run(&mut self, now: Instant, conn: ConnId, name: &str, speed: Option<Percent>) -> Result<(), ErrorId> {
-        let Some(script) = self.script_named(name) else {
+    pub(crate) fn run(
+        &mut self,
+        now: Instant,
+        asked_by: Option<ConnId>,
+        name: &str,
+        speed: Option<Percent>,
+    ) -> Result<(), ErrorId> {
+        let Some(script) = program::named(&self.scripts, name).cloned() else {
             self.machine.fail(ErrorId::NoSuchProgram, format!("run: there is no program {name}"));
             return Err(ErrorId::NoSuchProgram);
         };
@@ -246,14 +252,8 @@ impl Controller {
         if speed.is_some() {
             self.machine.set_speed(speed)?;
         }
-        self.start_program(now, &script, Some(conn), "command")
-    }
-
-    /// The program with this name, or with the last part of this path.
-    pub(crate) fn script_named(&self, name: &str) -> Option<Script> {
-        let base = name.rsplit('/').next().unwrap_or(name);
-        let by = |wanted: &str| self.scripts.iter().find(|script| script.name() == wanted);
-        by(name).or_else(|| by(base)).cloned()
+        let by = if asked_by.is_some() { "command" } else { "function" };
+        self.start_program(now, &script, asked_by, by)
     }
 
     pub(crate) fn send_finish_notice(&mut self, now: Instant, conn: ConnId) {

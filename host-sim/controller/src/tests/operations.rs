@@ -195,7 +195,7 @@ fn all_items_are_set_or_none() {
     let mut cell = recording(&SimConfig::default());
     let before = cell.controller.newest_event();
     let why = refusal(&mut cell, &json!({ "do": "set", "items": { "DI[1]": 1, "WordInputReg[2]": 65_536 } }));
-    assert_eq!(why, "WordInputReg[2] cannot be 65536");
+    assert_eq!(why, "WordInputReg[2]: cannot be 65536");
     let why = refusal(&mut cell, &json!({ "do": "set", "items": { "AI_V[1]": 1, "DI[99]": 1 } }));
     assert_eq!(why, "DI[99]: there is only DI[1..16]");
     assert_eq!((cell.value("DI[1]"), cell.value("AI_V[1]")), (0.0, 0.0));
