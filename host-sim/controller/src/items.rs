@@ -66,8 +66,11 @@ impl Controller {
                 wrong(error.strip_prefix(&format!("{name} ")).unwrap_or(&error).to_owned())
             }),
             Err(error) => {
-                let item = PacketItem::named(name).ok_or_else(|| {
-                    wrong(format!("{error}; and items of the state packet, such as drive_error[1]"))
+                let item = PacketItem::named(name).ok_or_else(|| match error {
+                    TargetError::Variable(_) => {
+                        wrong(format!("{error}; and items of the state packet, such as drive_error[1]"))
+                    }
+                    _ => wrong(error.to_string()),
                 })?;
                 let forced = self.registers.force_in_packet(item, value);
                 forced.map_err(|error| wrong(error.to_string()))
