@@ -7,11 +7,15 @@
 
 mod device;
 pub mod file;
+mod functions;
 mod sim;
 mod target;
 
 pub use device::{AnyRecipe, DeviceField, DeviceRecipe, ExchangeKind, FrameEnds, NamedExchange, NamedFrame};
 pub use file::function_name;
+pub use functions::{
+    FUNCTION_INPUTS, FUNCTION_OUTPUTS, Function, FunctionInput, FunctionOutput, Functions, ShownState,
+};
 pub use sim::{
     AnalogInput, BitGroup, CommandClients, Initial, InitialTarget, Listen, Power, Robot, RobotMode, SimBus,
     SimCanFrame, SimConfig, SimField, SimParts, SimPort, SimProgram, SimRecipe, SimStreamPart,

@@ -9,6 +9,8 @@ use proto_core::sysvar::{SysVar, VarBit};
 use proto_core::time::Duration;
 use proto_core::wire::can::CanId;
 
+use super::Functions;
+
 /// A whole controller file.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct SimConfig {
@@ -18,6 +20,8 @@ pub struct SimConfig {
     pub robot: Robot,
     /// Values at the start, in file order.
     pub initial: Vec<Initial>,
+    /// What functional inputs do and functional outputs show.
+    pub functions: Functions,
     /// Every recipe, in file order.
     pub recipes: Vec<SimRecipe>,
     /// Every recipe port, in file order.
@@ -193,6 +197,23 @@ impl BitGroup {
             Self::Fdi | Self::Fdo => 8,
             Self::ToolDi | Self::ToolDo | Self::ToolButton => 2,
         }
+    }
+
+    /// The bit of a system variable that holds `index`, from 1; `None` for the buttons and for an index that
+    /// is not there. Of an output it is the command's bit.
+    pub fn var_bit(self, index: u8) -> Option<VarBit> {
+        let nth = index.checked_sub(1).filter(|_| index <= self.count())?;
+        let byte = u32::from(nth / 8);
+        let (group, index) = match self {
+            Self::Di => ("DigitalSignalStatus", 1 + byte),
+            Self::Do => ("DigitalOutputCommand", 1 + byte),
+            Self::Fdi => ("DigitalSignalStatus", 7),
+            Self::Fdo => ("DigitalSignalStatus", 8),
+            Self::ToolDi => ("DigitalSignalStatus", 3),
+            Self::ToolDo => ("DigitalOutputCommand", 3),
+            Self::ToolButton => return None,
+        };
+        SysVar::named(group, index).ok().map(|var| VarBit { var, bit: nth % 8 })
     }
 }
 

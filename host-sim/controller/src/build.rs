@@ -7,7 +7,7 @@ use super::motion::{self, Arm};
 use super::ports::RecipeError;
 use super::program::ScriptError;
 use super::registers::Registers;
-use recipe_config::{InitialTarget, RobotMode, SimConfig};
+use recipe_config::{Function, Functions, InitialTarget, RobotMode, SimConfig};
 
 /// Why a configuration is refused.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -34,6 +34,13 @@ pub enum BuildError {
         /// The reason.
         error: ScriptError,
     },
+    /// A function has an item or a program that it cannot have.
+    Function {
+        /// The item, or `start`.
+        item: String,
+        /// The reason.
+        reason: String,
+    },
     /// An initial value is out of range.
     Initial {
         /// The target.
@@ -54,6 +61,7 @@ impl std::fmt::Display for BuildError {
                 write!(f, "port {port}: another port is the UDP server already")
             }
             Self::Program { program, error } => write!(f, "program {program}: {error}"),
+            Self::Function { item, reason } => write!(f, "functions: {item}: {reason}"),
             Self::Initial { target, reason } => write!(f, "{target}: {reason}"),
         }
     }
@@ -64,6 +72,9 @@ impl std::error::Error for BuildError {}
 /// The registers and the arm with the configuration's initial values.
 pub(super) fn start_values(config: &SimConfig) -> Result<(Registers, Arm), BuildError> {
     let mut registers = Registers::default();
+    for output in &config.functions.outputs {
+        registers.show_state(output.item, false);
+    }
     let mut joints = motion::HOME;
     let mut pose = [None; 6];
     for initial in &config.initial {
@@ -84,9 +95,33 @@ pub(super) fn start_values(config: &SimConfig) -> Result<(Registers, Arm), Build
             _ => {}
         }
     }
+    // An input that is on at the start has no edge.
+    registers.take_risen();
     let mut arm = Arm::at(joints);
     arm.calibrate(pose, &registers.tool());
     Ok((registers, arm))
+}
+
+/// Checks the functions, which a file's reader has checked already.
+pub(super) fn check_functions(config: &SimConfig) -> Result<(), BuildError> {
+    let Functions { inputs, outputs, start } = &config.functions;
+    let wrong = |item: &dyn std::fmt::Display, reason: &str| {
+        Err(BuildError::Function { item: item.to_string(), reason: reason.to_owned() })
+    };
+    if let Some(input) = inputs.iter().find(|input| !input.item.triggers_functions()) {
+        return wrong(&input.item, "it cannot trigger a function");
+    }
+    if let Some(output) = outputs.iter().find(|output| !output.item.shows_states()) {
+        return wrong(&output.item, "it cannot show a state");
+    }
+    let starts = inputs.iter().any(|input| input.function == Function::Start);
+    match start {
+        None if starts => wrong(&"start", "no program to start"),
+        Some(name) if !config.programs.iter().any(|program| program.name == *name) => {
+            wrong(&"start", &format!("there is no program {name}"))
+        }
+        _ => Ok(()),
+    }
 }
 
 pub(super) fn mode(config: &SimConfig) -> OperationMode {

@@ -5,10 +5,13 @@
 use proto_core::modbus::Exception;
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::dialect::Dialect;
-use proto_core::wire::state::OperationMode;
+use proto_core::wire::state::{LEN, OperationMode};
+use serde::{Deserialize, Serialize};
 
 use super::build::{mode, start_values};
+use super::events::Happened;
 use super::machine::Machine;
+use super::random::Random;
 use super::registers::SetError;
 use super::spoiled::{NoSuchFloat, Spoiled};
 use super::{Controller, ControllerOutput, RecipeError};
@@ -16,7 +19,8 @@ pub use recipe_config::CommandClients;
 use recipe_config::InitialTarget;
 
 /// One of the controller's TCP servers.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Link {
     /// Port 2000.
     Command,
@@ -24,6 +28,16 @@ pub enum Link {
     State,
     /// Modbus.
     Modbus,
+}
+
+impl std::fmt::Display for Link {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Command => "command",
+            Self::State => "state",
+            Self::Modbus => "modbus",
+        })
+    }
 }
 
 /// The present faults.
@@ -36,6 +50,10 @@ pub(super) struct Faults {
     muted_ports: Vec<usize>,
     exception: Option<Exception>,
     state_cut: Option<usize>,
+    garbage: [bool; 3],
+    /// The packet that is sent again and again; `Some(None)` until the first one.
+    frozen: Option<Option<Box<[u8; LEN]>>>,
+    random: Random,
     /// Additional time of transitions that commands begin.
     transitions: Duration,
     spoiled: Spoiled,
@@ -75,6 +93,62 @@ impl Faults {
         &self.spoiled
     }
 
+    pub(super) fn is_garbage(&self, link: Link) -> bool {
+        self.garbage[link as usize]
+    }
+
+    pub(super) fn set_garbage(&mut self, link: Link, on: bool) {
+        self.garbage[link as usize] = on;
+    }
+
+    /// Replaces what is sent by random bytes, if the fault demands it.
+    pub(super) fn spoil_bytes(&mut self, link: Link, bytes: &mut [u8]) {
+        if self.is_garbage(link) {
+            self.random.fill(bytes);
+        }
+    }
+
+    pub(super) fn is_frozen(&self) -> bool {
+        self.frozen.is_some()
+    }
+
+    pub(super) fn freeze(&mut self, on: bool) {
+        self.frozen = on.then_some(None);
+    }
+
+    /// Replaces a packet by the frozen one.
+    pub(super) fn freeze_packet(&mut self, packet: &mut Box<[u8; LEN]>) {
+        if let Some(frozen) = &mut self.frozen {
+            packet.clone_from(frozen.get_or_insert_with(|| packet.clone()));
+        }
+    }
+
+    pub(super) fn transitions(&self) -> Duration {
+        self.transitions
+    }
+
+    /// Ends all faults of a server.
+    pub(super) fn heal_server(&mut self, link: Link) {
+        let nth = link as usize;
+        (self.muted[nth], self.refused[nth], self.garbage[nth]) = (false, false, false);
+        self.delay[nth] = Duration::ZERO;
+        match link {
+            Link::State => (self.frozen, self.state_cut) = (None, None),
+            Link::Modbus => self.exception = None,
+            Link::Command => {}
+        }
+    }
+
+    /// Ends all faults but those of the configuration.
+    pub(super) fn heal_all(&mut self) {
+        let (command_clients, random) = (self.command_clients, self.random.clone());
+        *self = Self { random, ..Self::new(command_clients) };
+    }
+
+    pub(super) fn seed(&mut self, seed: u64) {
+        self.random = Random::seeded(seed);
+    }
+
     pub(super) fn take_state_cut(&mut self) -> Option<usize> {
         self.state_cut.take()
     }
@@ -109,7 +183,7 @@ impl Controller {
 
     /// Closes all connections of the server.
     pub fn disconnect(&mut self, link: Link) {
-        self.server.close_link(link, &mut self.outputs);
+        self.close_clients(link);
     }
 
     /// Delays every answer of the server from now on. Without effect on the state stream, which has no
@@ -180,16 +254,20 @@ impl Controller {
     /// initial values and otherwise 0, and the robot boots to power off (docs/simulated-controller.md section
     /// 1). Faults stay.
     pub fn restart(&mut self, now: Instant) {
-        self.server.close_all(&mut self.outputs);
-        self.running = None;
+        self.close_all_clients();
+        if let Some(running) = self.running.take() {
+            self.runs.ends_by("restart");
+            self.run_over(now, running.name(), None);
+        }
+        self.runs.forget();
         self.variables.clear();
         for port in 0..self.ports.len() {
             self.close_port(port);
         }
-        let epoch = self.epoch.unwrap_or(now);
-        for port in &mut self.ports {
+        for nth in 0..self.ports.len() {
+            let epoch = self.port_epoch(nth, now);
             // A serial line or bus still exists, and so does the address of the UDP server.
-            if port.is_up() {
+            if let Some(port) = self.ports.get_mut(nth).filter(|port| port.is_up()) {
                 port.went_down();
                 port.came_up(now, epoch);
             }
@@ -202,6 +280,7 @@ impl Controller {
         }
         self.machine = Machine::booting(now, mode(&self.config));
         self.machine.delay_transitions(self.faults.transitions);
+        self.happened(now, || Happened::Started);
     }
 }
 
@@ -256,7 +335,7 @@ impl Controller {
         port: usize,
         recipe: Option<usize>,
     ) -> Result<(), RecipeError> {
-        let epoch = self.epoch.unwrap_or(now);
+        let epoch = self.port_epoch(port, now);
         let (Some(own), Some(place)) = (self.ports.get_mut(port), self.config.ports.get_mut(port)) else {
             return Ok(());
         };
@@ -275,12 +354,14 @@ impl Controller {
 
     /// Presses the emergency stop: the program ends, and the robot is disabled.
     pub fn emergency_stop(&mut self, now: Instant) {
+        self.runs.ends_by("emergency_stop");
         let effect = self.machine.emergency_stop(now);
         self.apply(now, effect);
     }
 
     /// Causes a protective stop, as an open door does: the program ends, and the robot is disabled.
     pub fn protective_stop(&mut self, now: Instant) {
+        self.runs.ends_by("protective_stop");
         let effect = self.machine.protective_stop(now);
         self.apply(now, effect);
     }

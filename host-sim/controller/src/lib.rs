@@ -16,16 +16,24 @@
 //! and faults for tests in `faults`.
 
 mod build;
+mod condition;
 mod counters;
+mod events;
 mod faults;
+mod functions;
 mod io;
+mod items;
 pub mod machine;
 pub mod motion;
+pub mod operations;
 mod ports;
 pub mod program;
+mod random;
 pub mod registers;
 mod run;
+mod runs;
 mod server;
+mod snapshot;
 mod spoiled;
 mod test_controller;
 
@@ -36,19 +44,26 @@ use proto_core::time::{Duration, Instant};
 use proto_core::wire::dialect::Dialect;
 
 pub use build::BuildError;
-use build::{mode, start_values};
+use build::{check_functions, mode, start_values};
+pub use condition::Condition;
 pub use counters::{Counters, ServerCounters};
+use events::Recorder;
+pub use events::{Event, Happened, KINDS, MAX_EVENTS};
 use faults::Faults;
 pub use faults::{CommandClients, Link};
 pub use io::{ConnId, ControllerInput, ControllerOutput};
+pub use items::ItemError;
 use machine::Machine;
 use motion::Arm;
 use ports::Port;
 pub use ports::{MAX_INBOX, MAX_UDP_CLIENTS, PortCounters, RecipeError};
 use program::{Script, Variables};
+use random::Random;
 use recipe_config::SimConfig;
 use registers::Registers;
 use run::Running;
+use runs::Runs;
+pub use runs::{Outcome, Run};
 use server::Server;
 pub use server::{MAX_COMMAND_CONNECTIONS, MAX_MODBUS_CONNECTIONS, MAX_ORDERS, MAX_STATE_CONNECTIONS};
 
@@ -75,7 +90,12 @@ pub struct Controller {
     state_grid: Grid,
     /// The origin of all grids: the first instant of a call.
     epoch: Option<Instant>,
+    /// The ports' phases against the origin of the grids.
+    phases: Vec<Duration>,
+    state_phase: Duration,
     faults: Faults,
+    recorder: Recorder,
+    runs: Runs,
     counters: Counters,
     outputs: VecDeque<ControllerOutput>,
     /// After `shutdown()` on port 2000.
@@ -105,6 +125,7 @@ impl Controller {
                 .map_err(|error| BuildError::Program { program: program.name.clone(), error })?;
             scripts.push(script);
         }
+        check_functions(config)?;
         let (registers, arm) = start_values(config)?;
         Ok(Self {
             machine: Machine::new(config.robot.power, mode(config)),
@@ -121,11 +142,30 @@ impl Controller {
             server: Server::default(),
             state_grid: Grid::starting_at(Instant::ZERO, STATE_PERIOD),
             epoch: None,
+            phases: Vec::new(),
+            state_phase: Duration::ZERO,
             faults: Faults::new(config.robot.command_clients),
+            recorder: Recorder::default(),
+            runs: Runs::default(),
             counters: Counters::default(),
             outputs: VecDeque::new(),
             is_shut_down: false,
         })
+    }
+
+    /// Lets a seed choose the phases of the state stream and of the ports' cycles, and what random faults
+    /// send. To be called before anything else.
+    pub fn seed(&mut self, seed: u64) {
+        let mut random = Random::seeded(seed);
+        self.faults.seed(random.next());
+        self.state_phase = Duration::from_micros(random.below(STATE_PERIOD.as_micros()));
+        let phase = |port: &Port| Duration::from_micros(random.below(port.cycle().as_micros()));
+        self.phases = self.ports.iter().map(phase).collect();
+    }
+
+    /// The origin of a port's grid.
+    fn port_epoch(&self, port: usize, now: Instant) -> Instant {
+        self.epoch.unwrap_or(now) + self.phases.get(port).copied().unwrap_or(Duration::ZERO)
     }
 
     /// Handles one input. Call [`Self::poll_output`] until it returns [`ControllerOutput::Sleep`] after it.
@@ -136,13 +176,14 @@ impl Controller {
             return;
         }
         self.advance(now);
+        let before = self.writer_of(&input).and_then(|_| self.recorder.before(&self.registers));
         match input {
             ControllerInput::CommandOpened { conn, from } => self.opened(now, Link::Command, conn, from),
             ControllerInput::StateOpened { conn, from } => self.opened(now, Link::State, conn, from),
             ControllerInput::ModbusOpened { conn, from } => self.opened(now, Link::Modbus, conn, from),
-            ControllerInput::CommandClosed { conn } => self.closed(Link::Command, conn),
-            ControllerInput::StateClosed { conn } => self.closed(Link::State, conn),
-            ControllerInput::ModbusClosed { conn } => self.closed(Link::Modbus, conn),
+            ControllerInput::CommandClosed { conn } => self.closed(now, Link::Command, conn),
+            ControllerInput::StateClosed { conn } => self.closed(now, Link::State, conn),
+            ControllerInput::ModbusClosed { conn } => self.closed(now, Link::Modbus, conn),
             ControllerInput::CommandBytes { conn, bytes } => self.command_bytes(now, conn, bytes),
             ControllerInput::ModbusBytes { conn, bytes } => self.modbus_bytes(now, conn, bytes),
             ControllerInput::Udp2011 { peer, bytes } => self.udp_bytes(now, peer, bytes),
@@ -152,7 +193,7 @@ impl Controller {
                 }
             }
             ControllerInput::PortUp { port } => {
-                let epoch = self.epoch.unwrap_or(now);
+                let epoch = self.port_epoch(port, now);
                 if let Some(port) = self.ports.get_mut(port) {
                     port.came_up(now, epoch);
                 }
@@ -181,7 +222,26 @@ impl Controller {
             }
             ControllerInput::Tick => {}
         }
+        if before.is_some()
+            && let Some(by) = self.writer_of(&input).map(str::to_owned)
+        {
+            self.note_writes(now, before, &by);
+        }
         // `poll_output` does the rest.
+    }
+
+    /// Who writes registers by this input, if it can.
+    fn writer_of(&self, input: &ControllerInput<'_>) -> Option<&str> {
+        match *input {
+            ControllerInput::ModbusBytes { .. } => Some("modbus"),
+            ControllerInput::Udp2011 { .. } => {
+                self.ports.iter().find(|port| port.is_udp_server()).map(Port::name)
+            }
+            ControllerInput::PortBytes { port, .. } | ControllerInput::PortCan { port, .. } => {
+                self.ports.get(port).map(Port::name)
+            }
+            _ => None,
+        }
     }
 
     /// The next task for the caller; [`ControllerOutput::Sleep`] if there is none.
@@ -237,12 +297,14 @@ impl Controller {
 
     /// The first call sets the origin of all grids.
     fn begin(&mut self, now: Instant) {
+        self.recorder.set_now(now);
         if self.epoch.is_none() {
             self.epoch = Some(now);
-            self.state_grid = Grid::starting_at(now + STATE_PERIOD, STATE_PERIOD);
-            for port in &mut self.ports {
-                if port.is_udp_server() {
-                    port.came_up(now, now);
+            self.state_grid = Grid::starting_at(now + STATE_PERIOD + self.state_phase, STATE_PERIOD);
+            for nth in 0..self.ports.len() {
+                let epoch = self.port_epoch(nth, now);
+                if let Some(port) = self.ports.get_mut(nth).filter(|port| port.is_udp_server()) {
+                    port.came_up(now, epoch);
                 }
             }
         }

@@ -2,16 +2,15 @@
 
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::dialect::{FinishNotice, Motion};
-use proto_core::wire::scalar::Scalar;
 
+use super::events::Happened;
 use super::faults::Link;
 use super::machine::{Effect, ErrorId};
 use super::motion::Braking;
-use super::ports::{Listening, Outgoing};
-use super::program::{Answer, Call, End, Program, Progress, Script, Variables};
+use super::ports::{Handed, Listening, Outgoing};
+use super::program::{Answer, Call, End, Program, Progress, Script, Variables, shortened};
 use super::registers::Status;
 use super::{ConnId, Controller, ControllerOutput, MAX_LOG};
-use recipe_config::InitialTarget;
 
 /// The program that has not ended.
 #[derive(Debug)]
@@ -61,6 +60,7 @@ impl Controller {
             self.settle(now);
         }
         self.settle(now);
+        self.carry_out_functions(now);
         self.refresh(now);
         if self.running.is_some() {
             self.drive_program(now);
@@ -116,11 +116,14 @@ impl Controller {
             Effect::ProgramEnded => {
                 self.arm.settle(now);
                 self.arm_shown = None;
-                self.program_is_over(now);
+                self.program_is_over(now, None);
             }
             Effect::ShutDown => {
-                self.server.close_all(&mut self.outputs);
-                self.running = None;
+                self.close_all_clients();
+                if let Some(running) = self.running.take() {
+                    self.runs.ends_by("shutdown");
+                    self.run_over(now, running.name(), None);
+                }
                 self.outputs.push_back(ControllerOutput::Shutdown);
                 self.is_shut_down = true;
             }
@@ -132,16 +135,20 @@ impl Controller {
         &mut self,
         now: Instant,
         script: &Script,
-        conn: ConnId,
+        started_by: Option<ConnId>,
+        by: &'static str,
     ) -> Result<(), ErrorId> {
         for port in &mut self.ports {
             port.forget_received();
         }
-        match Program::start(script, now) {
+        match Program::start_with(script, &self.scripts, now) {
             Ok(program) => {
-                self.running = Some(Running { program, activity: Activity::None, started_by: Some(conn) });
+                self.running = Some(Running { program, activity: Activity::None, started_by });
                 self.machine.program_started();
                 self.counters.programs_started += 1;
+                let run = self.runs.begin(self.time_s(now));
+                let program = || script.name().to_owned();
+                self.happened(now, || Happened::ProgramStarted { run, program: program(), by });
                 Ok(())
             }
             Err(error) => {
@@ -184,6 +191,7 @@ impl Controller {
             speed_percent: machine.speed_percent().round() as u8,
             drives_on: machine.drives_on(),
         });
+        self.show_states();
         let stale = match self.arm_shown {
             None => true,
             Some(shown) => {
@@ -215,21 +223,23 @@ impl Controller {
                     }
                 }
                 Progress::Ended(end) => {
-                    if let End::Failed(message) = end {
+                    if let End::Failed(message) = &end {
                         self.counters.programs_failed += 1;
-                        let message = format!("{}: {message}", running.name());
+                        let message = format!("{}: {message}", shortened(running.name(), MAX_NAME));
                         self.machine.fail(ErrorId::ProgramFailed, message);
                     }
                     self.machine.program_ended();
-                    self.program_is_over(now);
+                    self.program_is_over(now, Some(&end));
+                    self.settle(now);
                     return;
                 }
             }
         }
     }
 
-    fn program_is_over(&mut self, now: Instant) {
+    fn program_is_over(&mut self, now: Instant, end: Option<&End>) {
         let Some(running) = self.running.take() else { return };
+        self.run_over(now, running.name(), end);
         self.variables = running.variables();
         for port in &mut self.ports {
             port.forget_received();
@@ -245,7 +255,7 @@ impl Controller {
     fn serve(&mut self, now: Instant, call: &Call) -> Option<Answer> {
         let activity = self.running.as_ref().map_or(Activity::None, |running| running.activity);
         match call {
-            Call::Receive { port } => {
+            Call::Receive { port, limit } => {
                 let port = match self.port_named(port) {
                     Ok(nth) => self.ports.get_mut(nth)?,
                     Err(message) => return Some(Answer::Error(message)),
@@ -253,17 +263,17 @@ impl Controller {
                 if let Err(message) = port.check_receive() {
                     return Some(Answer::Error(message));
                 }
-                let frame = port.next_received()?;
-                Some(Answer::Frame { id: frame.id, values: frame.values })
+                match (port.next_received(), limit) {
+                    (Some(frame), _) => Some(Answer::Frame { id: frame.id, values: frame.values }),
+                    (None, Some(limit)) => self.wait(now, activity, *limit),
+                    (None, None) => None,
+                }
             }
             Call::Send { port, id, values } => {
                 if let Activity::Sending { port } = activity {
                     let port = self.ports.get(port)?;
-                    return match (port.is_busy(), port.is_up()) {
-                        (true, _) => None,
-                        (false, true) => Some(Answer::Done),
-                        (false, false) => Some(Answer::Error(format!("{} was disconnected", port.name()))),
-                    };
+                    // A port that goes down drops its frame.
+                    return (!port.is_busy()).then(|| Answer::Bit(port.is_up()));
                 }
                 let nth = match self.port_named(port) {
                     Ok(nth) => nth,
@@ -275,29 +285,28 @@ impl Controller {
                     return None;
                 }
                 match port.send(*id, values) {
-                    Ok(()) => self.begin_activity(Activity::Sending { port: nth }),
+                    Ok(Handed::Over) => self.begin_activity(Activity::Sending { port: nth }),
+                    Ok(Handed::NotReady) => Some(Answer::Bit(false)),
                     Err(message) => Some(Answer::Error(message)),
                 }
             }
-            Call::Get { name } => Some(match name.parse() {
-                Ok(InitialTarget::Var(var)) => Answer::Value(self.registers.var(var)),
-                Ok(InitialTarget::Bit { group, index }) => Answer::Bit(self.registers.bit(group, index)),
-                Ok(target @ InitialTarget::VarBit(_)) => Answer::Bit(self.registers.value(target) != 0.0),
-                Ok(target) => Answer::Value(Scalar::Double(self.registers.value(target))),
-                Err(error) => Answer::Error(format!("{name}: {error}")),
-            }),
+            Call::Get { name } => Some(self.read_item(name).unwrap_or_else(Answer::Error)),
             Call::Set { name, value } => Some(match name.parse() {
-                Ok(target) => match self.registers.set_by_program(target, *value) {
-                    Ok(()) => Answer::Done,
-                    Err(error) => Answer::Error(error.to_string()),
-                },
+                Ok(target) => {
+                    let before = self.recorder.before(&self.registers);
+                    let result = self.registers.set_by_program(target, *value);
+                    self.note_writes(now, before, "program");
+                    match result {
+                        Ok(()) => Answer::Done,
+                        Err(error) => Answer::Error(error.to_string()),
+                    }
+                }
                 Err(error) => Answer::Error(format!("{name}: {error}")),
             }),
-            Call::MoveJ { target, speed_rad_s } => {
+            Call::MoveJ { .. } | Call::MoveL { .. } => {
                 if activity != Activity::Moving {
-                    let started = self.arm.move_to(now, *target, *speed_rad_s, self.machine.rate());
-                    if let Err(error) = started {
-                        return Some(Answer::Error(format!("movej: {error}")));
+                    if let Err(message) = self.start_move(now, call) {
+                        return Some(Answer::Error(message));
                     }
                     self.begin_activity(Activity::Moving);
                 }
@@ -308,17 +317,7 @@ impl Controller {
                 self.arm.settle(now);
                 Some(Answer::Done)
             }
-            Call::Wait(time) => {
-                let until = match activity {
-                    Activity::Waiting { until } => until,
-                    _ => now + *time,
-                };
-                if now >= until {
-                    Some(Answer::Done)
-                } else {
-                    self.begin_activity(Activity::Waiting { until })
-                }
-            }
+            Call::Wait(time) => self.wait(now, activity, *time),
             Call::GiveWay { until } => {
                 if now >= *until {
                     Some(Answer::Done)
@@ -328,6 +327,8 @@ impl Controller {
             }
             Call::Log(line) => {
                 tracing::info!(target: "program", "{line}");
+                let program = self.program_name().unwrap_or_default().to_owned();
+                self.happened(now, || Happened::Log { program, text: line.clone() });
                 if self.log.len() >= MAX_LOG {
                     self.log.pop_front();
                 }
@@ -335,6 +336,30 @@ impl Controller {
                 Some(Answer::Done)
             }
         }
+    }
+
+    /// Waits for this time since the call was first handled.
+    fn wait(&mut self, now: Instant, activity: Activity, time: Duration) -> Option<Answer> {
+        let until = match activity {
+            Activity::Waiting { until } => until,
+            _ => now + time,
+        };
+        if now >= until { Some(Answer::Done) } else { self.begin_activity(Activity::Waiting { until }) }
+    }
+
+    /// Starts the move of a call.
+    fn start_move(&mut self, now: Instant, call: &Call) -> Result<(), String> {
+        let rate = self.machine.rate();
+        let (function, started) = match *call {
+            Call::MoveJ { target, speed_rad_s } => {
+                ("movej", self.arm.move_to(now, target, speed_rad_s, rate))
+            }
+            Call::MoveL { pose, speed_m_s } => {
+                ("movel", self.arm.move_along(now, pose, speed_m_s, &self.registers.tool(), rate))
+            }
+            _ => return Ok(()),
+        };
+        started.map_err(|error| format!("{function}: {error}"))
     }
 
     /// Notes what the call waits for, and returns no answer.
@@ -345,7 +370,7 @@ impl Controller {
         None
     }
 
-    fn port_named(&self, name: &str) -> Result<usize, String> {
+    pub(super) fn port_named(&self, name: &str) -> Result<usize, String> {
         self.ports.iter().position(|port| port.name() == name).ok_or_else(|| {
             let names: Vec<_> = self.ports.iter().map(|port| port.name()).collect();
             format!("there is no port {name}; there are {}", names.join(", "))
@@ -379,6 +404,8 @@ impl Controller {
         self.counters.missed_state_packets += missed;
         let mut bytes = self.registers.packet(self.dialect.global_speed);
         self.faults.spoiled().put_in_packet(&mut bytes);
+        self.faults.freeze_packet(&mut bytes);
+        self.faults.spoil_bytes(Link::State, &mut bytes[..]);
         if self.faults.mutes(Link::State) {
             self.counters.state.muted += 1;
             return;
@@ -392,5 +419,7 @@ impl Controller {
     }
 }
 
+/// Maximum length of a program's name in the error that it ended with, in bytes.
+const MAX_NAME: usize = 64;
 /// Interval at which the arm's state is updated.
 const SERVO_CYCLE: Duration = Duration::from_millis(1);

@@ -9,7 +9,14 @@ use recipe_config::{AnalogInput, InitialTarget};
 
 /// The items, and the values that are sent instead.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Spoiled(Vec<(Item, f32)>);
+pub(super) struct Spoiled(Vec<Instead>);
+
+#[derive(Debug, Clone)]
+struct Instead {
+    name: String,
+    item: Item,
+    value: f32,
+}
 
 /// Where an item is sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -40,16 +47,21 @@ impl Spoiled {
     /// Sends `instead` for the item of this name from now on.
     pub(super) fn spoil(&mut self, name: &str, instead: f32) -> Result<(), NoSuchFloat> {
         let item = find(name)?;
-        self.0.retain(|other| other.0 != item);
-        self.0.push((item, instead));
+        self.0.retain(|other| other.item != item);
+        self.0.push(Instead { name: name.to_owned(), item, value: instead });
         Ok(())
     }
 
     /// Sends its value again.
     pub(super) fn heal(&mut self, name: &str) -> Result<(), NoSuchFloat> {
         let item = find(name)?;
-        self.0.retain(|other| other.0 != item);
+        self.0.retain(|other| other.item != item);
         Ok(())
+    }
+
+    /// The items by name, and what is sent instead.
+    pub(super) fn items(&self) -> impl Iterator<Item = (&str, f32)> {
+        self.0.iter().map(|instead| (instead.name.as_str(), instead.value))
     }
 
     /// The process image for recipes' frames; `None` if it is unchanged.
@@ -67,10 +79,10 @@ impl Spoiled {
     }
 
     fn put(&self, bytes: &mut [u8], place: impl Fn(Item) -> Option<usize>) {
-        for &(item, instead) in &self.0 {
-            let bytes = place(item).and_then(|offset| bytes.get_mut(offset..offset + 4));
+        for instead in &self.0 {
+            let bytes = place(instead.item).and_then(|offset| bytes.get_mut(offset..offset + 4));
             if let Some(bytes) = bytes {
-                bytes.copy_from_slice(&instead.to_le_bytes());
+                bytes.copy_from_slice(&instead.value.to_le_bytes());
             }
         }
     }

@@ -8,10 +8,12 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::can::CanFrame;
 use proto_core::wire::state::StatePacket;
+use recipe_config::SimConfig;
 use recipe_config::file::{Text, parse_controller};
-use recipe_config::{InitialTarget, SimConfig};
+use serde_json::Value;
 
 use super::faults::Link;
+use super::operations::{Operation, Refused};
 use super::{BuildError, ConnId, Controller, ControllerInput, ControllerOutput};
 
 /// A simulated controller with its clients and devices, on a virtual clock. It opens no socket and never
@@ -234,26 +236,39 @@ impl TestController {
         std::mem::take(&mut self.sent)
     }
 
-    /// The value of a system variable or an input or output, such as `FloatInputReg[3]` or `DO[1]`. A bit is
-    /// 0.0 or 1.0; other units are those of the item (docs/configuration.md section 5).
+    /// The value of a system variable or an input or output, such as `FloatInputReg[3]` or `DO[1]`, of a state
+    /// such as `running`, or of an item of the state packet such as `drive_error[2]`
+    /// ([`Controller::item`]). A bit is 0.0 or 1.0; other units are those of the item (docs/configuration.md
+    /// section 5).
     ///
     /// # Panics
     /// If there is no such item.
     #[track_caller]
     pub fn value(&self, name: &str) -> f64 {
-        self.controller.registers().value(target(name))
+        self.controller.item(name).unwrap_or_else(|error| panic!("{error}"))
     }
 
-    /// Sets a system variable or an input or output, as outside wiring would. Name and unit are as in
-    /// [`Self::value`].
+    /// Sets a system variable or an input or output, as outside wiring would, or an item of the state packet
+    /// ([`Controller::force_item`]). Name and unit are as in [`Self::value`].
     ///
     /// # Panics
     /// If there is no such item, or the value is out of its range.
     #[track_caller]
     pub fn set_value(&mut self, name: &str, value: f64) {
-        if let Err(error) = self.controller.force(target(name), value) {
-            panic!("{name} = {value}: {error}");
+        if let Err(error) = self.controller.force_item(name, value) {
+            panic!("{error} (to be set to {value})");
         }
+    }
+
+    /// Carries out an operation, given as JSON (docs/control.md section 2), and returns its result.
+    ///
+    /// # Errors
+    /// [`Refused`]: why it was refused; nothing changed.
+    pub fn operate(&mut self, operation: &str) -> Result<Value, Refused> {
+        let object = serde_json::from_str(operation).map_err(|error| Refused(error.to_string()))?;
+        let result = self.controller.operate(self.now, &Operation::from_json(object)?);
+        self.drain();
+        result
     }
 
     /// Whether the controller was shut down by the command `shutdown`.
@@ -307,13 +322,6 @@ impl TestController {
             }
         }
     }
-}
-
-/// # Panics
-/// If there is no such item.
-#[track_caller]
-fn target(name: &str) -> InitialTarget {
-    name.parse().unwrap_or_else(|error| panic!("{error}"))
 }
 
 /// The clients' address.

@@ -13,7 +13,10 @@ use proto_core::wire::can::CanId;
 
 use super::{Overrides, conversation, frame, plan, text};
 use recipe_config::file::{self, Config, FileError};
-use recipe_config::{AnyRecipe, SimBus, SimConfig, SimField, SimParts, SimPort, SimRecipe, SimStreamPart};
+use recipe_config::{
+    AnyRecipe, Function, Functions, ShownState, SimBus, SimConfig, SimField, SimParts, SimPort, SimRecipe,
+    SimStreamPart,
+};
 use recipe_controller::{BuildError, Controller};
 
 /// Arguments of `check`.
@@ -71,6 +74,7 @@ fn check_build(path: &Path, overrides: &[String], config: &SimConfig) -> Result<
     Err(match &error {
         BuildError::Program { program, error } => at(&["program", program, "script"], error),
         BuildError::Initial { target, reason } => at(&["initial", &target.to_string()], reason),
+        BuildError::Function { reason, .. } => at(&["functions"], reason),
         BuildError::Port { port, error } => at(&["port", port, "recipe"], error),
         BuildError::SecondUdpServer { port } => at(&["port", port], &error),
         BuildError::Dialect(_) => at(&["robot", "dialect"], &error),
@@ -169,7 +173,24 @@ fn controller(config: &SimConfig) -> String {
         let names: Vec<_> = config.programs.iter().map(|program| program.name.as_str()).collect();
         report += &format!("\nprograms: {}\n", names.join(", "));
     }
+    report += &show_functions(&config.functions);
     report
+}
+
+/// What functional inputs do and functional outputs show.
+fn show_functions(functions: &Functions) -> String {
+    let mut report = String::new();
+    for input in &functions.inputs {
+        let name = Function::ALL.iter().find(|known| known.1 == input.function).map_or("", |known| known.0);
+        let program = functions.start.as_deref().filter(|_| input.function == Function::Start);
+        report += &format!("  {} -> {name}", input.item);
+        report += &program.map_or_else(|| "\n".to_owned(), |program| format!(" {program}\n"));
+    }
+    for output in &functions.outputs {
+        let name = ShownState::ALL.iter().find(|known| known.1 == output.state).map_or("", |known| known.0);
+        report += &format!("  {name} -> {}\n", output.item);
+    }
+    if report.is_empty() { report } else { format!("\nfunctions\n{report}") }
 }
 
 /// What to set on the controller's pendant for the gateway's recipe links.

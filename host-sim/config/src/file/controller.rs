@@ -6,29 +6,34 @@ use proto_core::recipe::model::{Framing, Mode};
 use proto_core::wire::scalar::Scalar;
 
 use super::document::Document;
+use super::functions;
 use super::lines::{LINE_KEYS, read_bitrate, read_cycle, read_line};
 use super::reader::{Item, Reader, Result, Spot};
 use super::recipes::{self, FileRecipe, Flavour};
 use crate::TargetError;
+use crate::functions::Functions;
 use crate::sim::{
     CommandClients, Initial, InitialTarget, Listen, Power, Robot, RobotMode, SimBus, SimConfig, SimPort,
     SimProgram,
 };
 
 /// The top-level keys of a controller file.
-pub(super) const KEYS: [&str; 6] = ["listen", "robot", "initial", "recipe", "port", "program"];
+pub(super) const KEYS: [&str; 7] = ["listen", "robot", "initial", "functions", "recipe", "port", "program"];
 
 /// Reads the whole file and checks it.
 pub(super) fn read(document: &Document) -> Result<SimConfig> {
     let root = Reader::root(document, &KEYS)?;
     let recipes = recipes::read_all(&root, Flavour::Controller)?;
+    let programs = read_programs(&root)?;
+    let functions = functions::read(&root, &programs)?;
     Ok(SimConfig {
         listen: read_listen(&root)?,
         robot: read_robot(&root)?,
-        initial: read_initial(&root)?,
+        initial: read_initial(&root, &functions)?,
+        functions,
         recipes: recipes.iter().map(FileRecipe::to_sim).collect(),
         ports: read_ports(&root, &recipes)?,
-        programs: read_programs(&root)?,
+        programs,
     })
 }
 
@@ -89,7 +94,7 @@ fn read_robot(root: &Reader<'_>) -> Result<Robot> {
     Ok(robot)
 }
 
-fn read_initial(root: &Reader<'_>) -> Result<Vec<Initial>> {
+fn read_initial(root: &Reader<'_>, functions: &Functions) -> Result<Vec<Initial>> {
     let mut initial: Vec<Initial> = Vec::new();
     let Some(item) = root.optional("initial") else { return Ok(initial) };
     for (name, key_spot, item) in item.any_table()?.entries() {
@@ -97,6 +102,10 @@ fn read_initial(root: &Reader<'_>) -> Result<Vec<Initial>> {
             name.parse().map_err(|error: TargetError| key_spot.error(root.document, error.to_string()))?;
         if initial.iter().any(|before| before.target == target) {
             return Err(key_spot.error(root.document, format!("{target} already has an initial value")));
+        }
+        if functions.state_of(target).is_some() {
+            let message = format!("{target} shows a state (functions.outputs); it takes no initial value");
+            return Err(key_spot.error(root.document, message));
         }
         initial.push(Initial { target, value: read_value(target, &item)? });
     }

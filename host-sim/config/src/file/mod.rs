@@ -13,6 +13,7 @@ mod encoding;
 mod error;
 mod exchanges;
 mod framings;
+mod functions;
 mod gateway;
 mod lines;
 mod modbus;
@@ -42,7 +43,7 @@ pub enum Config {
     /// For the gateway.
     Gateway(Box<GatewayConfig>),
     /// For the simulated controller.
-    Controller(SimConfig),
+    Controller(Box<SimConfig>),
 }
 
 /// A configuration text and its name in messages.
@@ -94,7 +95,7 @@ pub fn parse(text: Text<'_>, overrides: &[String]) -> Result<Config> {
     let document = Document::parse(text.name, text.toml, overrides)?;
     match kind_of(&document)? {
         Flavour::Gateway => gateway::read(&document).map(Config::Gateway),
-        Flavour::Controller => controller::read(&document).map(Config::Controller),
+        Flavour::Controller => controller::read(&document).map(|config| Config::Controller(Box::new(config))),
     }
 }
 

@@ -3,8 +3,8 @@
 use proto_core::config::{FieldSpec, OutputBinding, SafeValue};
 use proto_core::sysvar::{SysVar, VarBit};
 use proto_core::wire::scalar::{Scalar, ScalarType};
-use recipe_config::InitialTarget;
 use recipe_config::file::{Text, parse_controller, parse_gateway};
+use recipe_config::{Function, InitialTarget, ShownState};
 
 /// Two panels on one byte.
 const PANELS: &str = r#"
@@ -127,4 +127,41 @@ fn an_output_field_shows_a_bit() {
         let error = with(&field.replace("DigitalOutputCommand[1].0\"", to)).unwrap_err().to_string();
         assert!(error.contains(said), "{error}");
     }
+}
+
+#[test]
+fn functions_of_inputs_and_states_of_outputs_are_read() {
+    let toml = r#"
+        [functions]
+        start = "a.jspf"
+        inputs = { "FDI[1]" = "start", "__BitInputReg_2.7" = "stop", "ToolButton[2]" = "reset" }
+        outputs = { "FDO[8]" = "running", "BitOutputReg[1].0" = "error" }
+        [robot]
+        [[program]]
+        name = "a.jspf"
+        script = ""
+    "#;
+    let text = Text { name: "robot.toml", toml };
+    let overrides = ["functions.inputs.FDI[2]=enable", "functions.outputs.BitOutputReg[2].1=remote"];
+    let config = parse_controller(text, &overrides.map(str::to_owned)).unwrap();
+    let inputs: Vec<_> =
+        config.functions.inputs.iter().map(|input| (input.item.to_string(), input.function)).collect();
+    let item = |name: &str| name.to_owned();
+    assert_eq!(
+        inputs,
+        [
+            (item("FDI[1]"), Function::Start),
+            (item("BitInputReg[2].7"), Function::Stop),
+            (item("ToolButton[2]"), Function::Reset),
+            (item("FDI[2]"), Function::Enable),
+        ]
+    );
+    let state = |name: &str| config.functions.state_of(name.parse().unwrap());
+    assert_eq!(state("DigitalSignalStatus[8].7"), Some(ShownState::Running));
+    assert_eq!(state("BitOutputReg[1].0"), Some(ShownState::Error));
+    assert_eq!(state("BitOutputReg[2].1"), Some(ShownState::Remote));
+    assert_eq!((state("FDO[1]"), state("BitOutputReg[1]")), (None, None));
+    assert_eq!(config.functions.start.as_deref(), Some("a.jspf"));
+    let none = parse_controller(Text { name: "robot.toml", toml: "[robot]" }, &[]).unwrap();
+    assert_eq!(none.functions, recipe_config::Functions::default(), "empty unless configured");
 }

@@ -10,6 +10,13 @@ use super::{
 };
 use crate::motion::Braking;
 
+/// Who starts a program.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Starter {
+    Client,
+    Pendant,
+}
+
 impl Machine {
     /// The command `speed(V)`; `None` if V is out of range.
     ///
@@ -31,9 +38,21 @@ impl Machine {
     /// # Errors
     /// The error that was recorded.
     pub fn check_run(&mut self) -> Result<(), ErrorId> {
+        self.check_start(Starter::Client)
+    }
+
+    /// The same at the pendant, where a program can be started in manual mode too.
+    ///
+    /// # Errors
+    /// The error that was recorded.
+    pub fn check_run_at_pendant(&mut self) -> Result<(), ErrorId> {
+        self.check_start(Starter::Pendant)
+    }
+
+    fn check_start(&mut self, by: Starter) -> Result<(), ErrorId> {
         let why = if self.robot != Robot::Enabled {
             "run: the robot is not enabled"
-        } else if self.mode == OperationMode::Manual {
+        } else if self.mode == OperationMode::Manual && by == Starter::Client {
             "run: the robot is in manual mode"
         } else if self.stopped_by_safety() {
             "run: a safety stop is active"

@@ -32,6 +32,8 @@ pub struct Machine {
     collision_axis: Option<u8>,
     error: Option<ErrorEntry>,
     robot_error: Option<ErrorId>,
+    /// Errors and acknowledgements (`None`) since [`Machine::take_errors`].
+    new_errors: Vec<Option<ErrorEntry>>,
     /// Transitions so far, of power and drives, and of the program.
     begun: Begun,
     /// Additional time of every transition that a command begins.
@@ -107,6 +109,7 @@ impl Machine {
             collision_axis: None,
             error: None,
             robot_error: None,
+            new_errors: Vec::new(),
             begun: Begun::default(),
             delay: Duration::ZERO,
         }
@@ -286,7 +289,35 @@ impl Machine {
         if !id.is_refusal() {
             self.robot_error = Some(id);
         }
-        self.error = Some(ErrorEntry { id, message: message.into() });
+        let error = ErrorEntry { id, message: message.into() };
+        self.error = Some(error.clone());
+        self.note_error(Some(error));
+    }
+
+    /// Raises an error of any number, as the robot itself does.
+    pub fn raise(&mut self, code: u32, message: impl Into<String>) {
+        self.fail(ErrorId::Raised(code), message);
+    }
+
+    /// Acknowledges the error, as on the pendant.
+    pub fn clear_error(&mut self) {
+        if self.error.take().is_some() || self.robot_error.is_some() {
+            self.robot_error = None;
+            self.note_error(None);
+        }
+    }
+
+    /// The errors, and `None` for each acknowledgement, since the last call; the newest
+    /// [`MAX_NEW_ERRORS`].
+    pub(crate) fn take_errors(&mut self) -> Vec<Option<ErrorEntry>> {
+        std::mem::take(&mut self.new_errors)
+    }
+
+    fn note_error(&mut self, error: Option<ErrorEntry>) {
+        if self.new_errors.len() >= MAX_NEW_ERRORS {
+            self.new_errors.remove(0);
+        }
+        self.new_errors.push(error);
     }
 
     /// Changes the operation mode, as a key switch would.
@@ -307,6 +338,8 @@ const POWER_OFF: Duration = Duration::from_millis(200);
 const ENABLE: Duration = Duration::from_millis(200);
 const DISABLE: Duration = Duration::from_millis(100);
 const SHUT_DOWN: Duration = Duration::from_millis(100);
+/// Maximum number of errors that wait to be told.
+const MAX_NEW_ERRORS: usize = 64;
 /// Minimum duration of a pause and a stop; an arm in motion makes it longer.
 const PAUSE: Duration = Duration::from_millis(20);
 const STOP: Duration = Duration::from_millis(20);

@@ -46,6 +46,12 @@ impl Machine {
         self.collision_axis = None;
     }
 
+    /// Clears a stop, as [`Self::clear_stop`] does, and the errors.
+    pub fn reset(&mut self, now: Instant) {
+        self.clear_stop(now);
+        self.clear_error();
+    }
+
     fn safety_stop(&mut self, now: Instant, shown: SafetyState, id: ErrorId, message: &str) -> Effect {
         self.safety = Safety::Stopped(shown);
         self.fail(id, message);

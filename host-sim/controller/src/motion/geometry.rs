@@ -1,7 +1,11 @@
-//! Forward kinematics: joints to frames, poses and twists.
+//! Forward kinematics: joints to frames, poses and twists. The way back is in `inverse`.
 //!
 //! Trigonometry is from libm, not from the system, so that poses, and with them the traces of soak runs, are
 //! identical on every machine.
+
+mod inverse;
+
+pub(super) use inverse::{Branch, length};
 
 /// Number of joints.
 pub(super) const JOINTS: usize = 6;
@@ -59,8 +63,27 @@ impl Frame {
     }
 
     /// A vector given in this frame's axes, rotated to the parent's.
-    fn rotated(&self, vector: &[f64; 3]) -> [f64; 3] {
+    pub(super) fn rotated(&self, vector: &[f64; 3]) -> [f64; 3] {
         self.rotation.map(|row| row.iter().zip(vector).map(|(a, b)| a * b).sum())
+    }
+
+    /// Without rotation, at this place.
+    pub(super) fn at(origin: [f64; 3]) -> Self {
+        Self { origin, ..Self::IDENTITY }
+    }
+
+    /// With another origin and no rotation, both in the parent's axes.
+    pub(super) fn shifted(&self, way: [f64; 3]) -> Self {
+        Self::at([0, 1, 2].map(|nth| self.origin[nth] + way[nth]))
+    }
+
+    /// The base and the end of each link at joint positions `q`; the last is the flange.
+    pub(super) fn along(q: &[f64; JOINTS]) -> [Self; JOINTS + 1] {
+        let mut frames = [Self::IDENTITY; JOINTS + 1];
+        for (nth, (&angle, link)) in q.iter().zip(&LINKS).enumerate() {
+            frames[nth + 1] = frames[nth].then(&link.at(angle));
+        }
+        frames
     }
 
     /// The flange at joint positions `q`.

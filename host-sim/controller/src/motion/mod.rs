@@ -10,6 +10,8 @@
 
 mod clock;
 mod geometry;
+mod line;
+mod loads;
 
 use std::f64::consts::{FRAC_PI_2, FRAC_PI_4};
 
@@ -18,6 +20,9 @@ use proto_core::time::Instant;
 use clock::PathClock;
 pub use geometry::Frame;
 use geometry::{JOINTS, Twist};
+use line::Line;
+pub use line::MAX_SPEED_M_S;
+pub use loads::{Loads, Payload};
 
 /// The arm's motion.
 #[derive(Debug, Clone)]
@@ -26,6 +31,8 @@ pub struct Arm {
     origin: [f64; JOINTS],
     /// Joint travel of the present move, rad.
     travel: [f64; JOINTS],
+    /// The present move, if it is a line; then there is no travel.
+    line: Option<Box<Line>>,
     /// Duration of the present move at full rate, s; 0 if there is none.
     length_s: f64,
     clock: PathClock,
@@ -49,6 +56,31 @@ pub enum MoveError {
         /// The speed asked for, rad/s.
         speed_rad_s: f64,
     },
+    /// The speed of a line is not within (0, [`MAX_SPEED_M_S`]].
+    LineSpeed {
+        /// The speed asked for, m/s.
+        speed_m_s: f64,
+    },
+    /// The pose has a value that is not finite.
+    Pose,
+    /// The arm does not reach a point of the line.
+    OutOfReach {
+        /// The point's distance from the start of the line, m.
+        way_m: f64,
+    },
+    /// A joint would have to jump: the line leads through a singular pose, where the wrist or the elbow is
+    /// straight.
+    Singular {
+        /// The point's distance from the start of the line, m.
+        way_m: f64,
+    },
+    /// A joint would be faster than [`MAX_SPEED_RAD_S`].
+    JointSpeed {
+        /// 1-based.
+        joint: usize,
+        /// Its speed on the line, rad/s.
+        speed_rad_s: f64,
+    },
 }
 
 impl std::fmt::Display for MoveError {
@@ -59,6 +91,19 @@ impl std::fmt::Display for MoveError {
             }
             Self::Speed { speed_rad_s } => {
                 write!(f, "speed {speed_rad_s} rad/s is not within (0, {MAX_SPEED_RAD_S:.4}]")
+            }
+            Self::LineSpeed { speed_m_s } => {
+                write!(f, "speed {speed_m_s} m/s is not within (0, {MAX_SPEED_M_S}]")
+            }
+            Self::Pose => f.write_str("the pose is not finite"),
+            Self::OutOfReach { way_m } => {
+                write!(f, "the arm does not reach the line {way_m:.3} m from its start")
+            }
+            Self::Singular { way_m } => {
+                write!(f, "a joint would jump {way_m:.3} m from the start: wrist or elbow is straight there")
+            }
+            Self::JointSpeed { joint, speed_rad_s } => {
+                write!(f, "joint {joint} would need {speed_rad_s:.3} rad/s; it has {MAX_SPEED_RAD_S:.4}")
             }
         }
     }
@@ -104,6 +149,7 @@ impl Arm {
         Self {
             origin: joints,
             travel: [0.0; JOINTS],
+            line: None,
             length_s: 0.0,
             clock: PathClock::stopped(),
             pose_offset: [0.0; 6],
@@ -152,6 +198,32 @@ impl Arm {
         Ok(())
     }
 
+    /// Starts a straight line of the TCP to `pose` (X, Y, Z in m, Rx, Ry, Rz in rad), at rest at both ends, the
+    /// TCP no faster than `speed_m_s`.
+    ///
+    /// # Errors
+    /// [`MoveError`]: nothing changed.
+    pub fn move_along(
+        &mut self,
+        now: Instant,
+        pose: [f64; 6],
+        speed_m_s: f64,
+        tool: &Frame,
+        rate: f64,
+    ) -> Result<(), MoveError> {
+        if pose.iter().any(|item| !item.is_finite()) {
+            return Err(MoveError::Pose);
+        }
+        let computed = std::array::from_fn(|nth| pose[nth] - self.pose_offset[nth]);
+        let from = self.joints(now).0;
+        let line = Line::plan(&from, &Frame::from_pose(&computed), tool, speed_m_s)?;
+        self.settle(now);
+        self.length_s = line.length_s;
+        self.line = Some(Box::new(line));
+        self.clock = PathClock::running(now, rate);
+        Ok(())
+    }
+
     /// Continues the present move at this fraction of its planned speed; 0 stops it.
     pub fn set_rate(&mut self, now: Instant, rate: f64, braking: Braking) {
         self.clock.set_rate(now, rate, braking);
@@ -161,6 +233,7 @@ impl Arm {
     pub fn settle(&mut self, now: Instant) {
         self.origin = self.joints(now).0;
         self.travel = [0.0; JOINTS];
+        self.line = None;
         self.length_s = 0.0;
         self.clock = PathClock::stopped();
     }
@@ -219,14 +292,25 @@ impl Arm {
         }
         let path = self.clock.at(now);
         let x = path.position_s / self.length_s;
+        if let Some(line) = &self.line {
+            if x >= 1.0 {
+                return (line.end(), qd, qdd);
+            }
+            let [q, first, second] = line.at(x);
+            let (dx, ddx) = (path.rate / self.length_s, path.rate_change / self.length_s);
+            for nth in 0..JOINTS {
+                qd[nth] = first[nth] * dx;
+                qdd[nth] = second[nth] * dx * dx + first[nth] * ddx;
+            }
+            return (q, qd, qdd);
+        }
         if x >= 1.0 {
             for (q, travel) in q.iter_mut().zip(&self.travel) {
                 *q += travel;
             }
             return (q, qd, qdd);
         }
-        // The quintic with zero speed and acceleration at both ends.
-        let s = x * x * x * (10.0 + x * (6.0 * x - 15.0));
+        let s = quintic(x);
         let ds = 30.0 * x * x * (1.0 - x) * (1.0 - x) / self.length_s;
         let dds = 60.0 * x * (1.0 - x) * (1.0 - 2.0 * x) / (self.length_s * self.length_s);
         for nth in 0..JOINTS {
@@ -236,6 +320,12 @@ impl Arm {
         }
         (q, qd, qdd)
     }
+}
+
+/// The quintic from 0 to 1 with zero speed and acceleration at both ends.
+fn quintic(x: f64) -> f64 {
+    let x = x.clamp(0.0, 1.0);
+    x * x * x * (10.0 + x * (6.0 * x - 15.0))
 }
 
 /// A plausible torque: gravity on the three pitching joints, inertia and viscous friction.

@@ -120,3 +120,120 @@ fn poses_survive_conversion_to_frames_and_back() {
         assert!((there - back).abs() < 1e-12, "{there} {back}");
     }
 }
+
+/// In front of the base, so that lines lead in all directions.
+const WORK: [f64; 6] = [0.3, -1.2, 1.9, 0.7, 1.5, -0.1];
+
+#[test]
+fn a_line_is_straight_and_as_fast_as_asked() {
+    let tool = Frame::from_pose(&[0.0, 0.02, 0.1, 0.1, 0.0, 0.3]);
+    let mut arm = Arm::at(WORK);
+    let begin = observe(&arm, ms(0)).pose.map(f64::from);
+    let way = [0.15, -0.2, 0.1];
+    let mut target = begin;
+    for (item, way) in target.iter_mut().zip(way) {
+        *item += way;
+    }
+    target[5] += 0.6;
+    arm.move_along(ms(0), target, 0.25, &tool, 1.0).unwrap();
+    let end = arm.arrival().unwrap();
+    let length = way.iter().map(|item| item * item).sum::<f64>().sqrt();
+    let mut fastest = 0.0_f64;
+    for at in (0..=end.as_micros()).step_by(5_000).chain([end.as_micros()]) {
+        let state = observe(&arm, Instant::from_micros(at));
+        let gone: [f64; 3] = std::array::from_fn(|nth| f64::from(state.pose[nth]) - begin[nth]);
+        let along: f64 = gone.iter().zip(way).map(|(a, b)| a * b).sum::<f64>() / length;
+        let aside: f64 = (gone.iter().map(|item| item * item).sum::<f64>() - along * along).max(0.0).sqrt();
+        assert!(aside < 1e-3 * length, "{aside} m beside the line at {at} µs");
+        let speed = state.tcp_velocity[..3].iter().map(|item| f64::from(*item).powi(2)).sum::<f64>().sqrt();
+        fastest = fastest.max(speed);
+        assert!(state.acceleration.iter().all(|item| item.abs() <= 12.1), "{state:?}");
+    }
+    assert!((0.249..0.2501).contains(&fastest), "{fastest} m/s");
+    let state = observe(&arm, end);
+    for (there, wanted) in state.pose.iter().zip(target) {
+        assert!((f64::from(*there) - wanted).abs() < 1e-5, "{:?} {target:?}", state.pose);
+    }
+    assert_eq!((state.velocity, state.acceleration), ([0.0; 7], [0.0; 7]));
+    arm.settle(end);
+    assert_eq!(observe(&arm, end + proto_core::time::Duration::from_secs(9)), state);
+}
+
+#[test]
+fn speeds_on_a_line_are_the_derivatives_of_its_positions() {
+    for at in [150_u64, 390, 430, 465, 700, 930] {
+        let mut arm = Arm::at(WORK);
+        let mut target = observe(&arm, ms(0)).pose.map(f64::from);
+        target[0] += 0.2;
+        target[2] -= 0.1;
+        target[4] += 0.4;
+        let tool = Frame::from_pose(&[0.0, 0.02, 0.1, 0.1, 0.0, 0.3]);
+        arm.move_along(ms(0), target, 0.3, &tool, 1.0).unwrap();
+        if at > 400 {
+            arm.set_rate(ms(400), 0.3, Braking::Normal);
+        }
+        let (before, state, after) =
+            (observe(&arm, ms(at - 1)), observe(&arm, ms(at)), observe(&arm, ms(at + 1)));
+        for nth in 0..6 {
+            let speed = (after.position[nth] - before.position[nth]) / 0.002;
+            assert!((speed - state.velocity[nth]).abs() < 1e-3, "{nth} at {at}: {speed} {state:?}");
+            let acceleration = (after.velocity[nth] - before.velocity[nth]) / 0.002;
+            let difference = (acceleration - state.acceleration[nth]).abs();
+            assert!(difference < 0.02 + 0.02 * acceleration.abs(), "{nth} at {at}: {acceleration} {state:?}");
+        }
+    }
+}
+
+#[test]
+fn a_line_that_cannot_be_followed_is_refused() {
+    let tool = Frame::IDENTITY;
+    let mut arm = Arm::at(WORK);
+    let here = arm.observe(ms(0), &tool, 0.0).pose.map(f64::from);
+    let to = |nth: usize, by: f64| {
+        let mut pose = here;
+        pose[nth] += by;
+        pose
+    };
+    let mut refused = |pose, speed| arm.move_along(ms(0), pose, speed, &tool, 1.0).unwrap_err();
+    let far = refused(to(0, 3.0), 0.5);
+    assert!(matches!(far, MoveError::OutOfReach { way_m } if (0.05..1.5).contains(&way_m)), "{far}");
+    for speed in [0.0, -1.0, 2.1, f64::NAN] {
+        assert!(matches!(refused(to(0, 0.1), speed), MoveError::LineSpeed { .. }), "{speed}");
+    }
+    assert_eq!(refused(to(3, f64::INFINITY), 0.1), MoveError::Pose);
+    assert_eq!(observe(&arm, ms(500)), observe(&Arm::at(WORK), ms(0)), "nothing has changed");
+
+    // Joint 5 straight: joints 4 and 6 turn about the same axis.
+    let mut straight = WORK;
+    straight[4] = 0.0;
+    let mut arm = Arm::at(straight);
+    let mut pose = arm.observe(ms(0), &tool, 0.0).pose.map(f64::from);
+    pose[2] += 0.05;
+    assert_eq!(arm.move_along(ms(0), pose, 0.1, &tool, 1.0), Err(MoveError::Singular { way_m: 0.0 }));
+    // Near it, joints become too fast.
+    straight[4] = 0.02;
+    let mut arm = Arm::at(straight);
+    let mut pose = arm.observe(ms(0), &tool, 0.0).pose.map(f64::from);
+    pose[3] += 0.8;
+    pose[4] += 0.8;
+    let fast = arm.move_along(ms(0), pose, 1.0, &tool, 1.0).unwrap_err();
+    assert!(matches!(fast, MoveError::JointSpeed { .. } | MoveError::Singular { .. }), "{fast}");
+    // A joint at the end of its range.
+    let mut wound = WORK;
+    wound[5] = JOINT_RANGE_RAD - 0.01;
+    let mut arm = Arm::at(wound);
+    let turns: Vec<_> = [0.5, -0.5]
+        .map(|by| {
+            let flange = arm.observe(ms(0), &tool, 0.0).pose.map(f64::from);
+            let pose =
+                Frame::from_pose(&flange).then(&Frame::from_pose(&[0.0, 0.0, 0.0, 0.0, 0.0, by])).pose();
+            arm.clone().move_along(ms(0), pose, 0.5, &tool, 1.0).err()
+        })
+        .into();
+    assert!(matches!(turns[0], Some(MoveError::JointRange { joint: 6, .. })), "{turns:?}");
+    assert_eq!(turns[1], None);
+    // A line to where the arm is takes no time.
+    let here = arm.observe(ms(0), &tool, 0.0).pose.map(f64::from);
+    arm.move_along(ms(0), here, 0.5, &tool, 1.0).unwrap();
+    assert!(arm.arrival().unwrap() < ms(50), "{:?}", arm.arrival());
+}

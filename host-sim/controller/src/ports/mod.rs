@@ -29,7 +29,7 @@ use receive::Received;
 use recipe::Parts;
 pub use recipe::RecipeError;
 use recipe_config::{SimBus, SimConfig, SimPort};
-pub(crate) use send::Outgoing;
+pub(crate) use send::{Handed, Outgoing};
 
 /// A recipe port.
 #[derive(Debug)]
@@ -166,6 +166,20 @@ impl Port {
         self.deframer.discard();
         if let Medium::UdpServer(clients) = &mut self.medium {
             clients.clear();
+        }
+    }
+
+    pub(super) fn cycle(&self) -> Duration {
+        self.cycle
+    }
+
+    /// Sets the cycle, from the next output on.
+    pub(super) fn set_cycle(&mut self, now: Instant, epoch: Instant, cycle: Duration) {
+        self.cycle = cycle.max(MIN_CYCLE);
+        if self.grid.is_some() {
+            let mut grid = Grid::starting_at(epoch, self.cycle);
+            grid.due(now);
+            self.grid = Some(grid);
         }
     }
 

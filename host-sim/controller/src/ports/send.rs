@@ -20,6 +20,15 @@ pub(crate) enum Outgoing {
     Datagram { peer: SocketAddr, bytes: Vec<u8> },
 }
 
+/// What a port did with a program's frame (D28).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Handed {
+    /// It sends the frame.
+    Over,
+    /// It is not connected, and dropped the frame.
+    NotReady,
+}
+
 impl Port {
     /// Whether a program's frame was not yet sent.
     pub(crate) fn is_busy(&self) -> bool {
@@ -27,14 +36,14 @@ impl Port {
     }
 
     /// Queues a program's frame. It was sent when [`Self::is_busy`] is false again.
-    pub(crate) fn send(&mut self, id: Option<i64>, values: &[f64]) -> Result<(), String> {
+    ///
+    /// # Errors
+    /// What is wrong with the recipe, the id or the values, whether the port is connected or not.
+    pub(crate) fn send(&mut self, id: Option<i64>, values: &[f64]) -> Result<Handed, String> {
         let name = &self.name;
         let Some((Mode::User, parts)) = &self.recipe else {
             return Err(format!("{name} has no user-defined recipe"));
         };
-        if !self.up {
-            return Err(format!("{name} is not connected"));
-        }
         let outgoing = match (parts, id) {
             (Parts::Stream { output: Some(layout), .. }, None) => {
                 let values = typed(name, values, layout.fields().map(|placed| placed.field.ty()))?;
@@ -58,8 +67,11 @@ impl Port {
             }
             _ => return Err(format!("{name}: the recipe has no output part")),
         };
+        if !self.up {
+            return Ok(Handed::NotReady);
+        }
         self.transmitter = Transmitter::Waiting(outgoing);
-        Ok(())
+        Ok(Handed::Over)
     }
 
     /// When the next frame is due.

@@ -4,13 +4,15 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 use std::sync::mpsc::{Receiver, SyncSender};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use proto_core::time::{Duration, Instant};
-use proto_core::wire::can::CanId;
-use proto_core::wire::scalar::Scalar;
+use proto_core::time::Instant;
 use rhai::debugger::{DebuggerCommand, DebuggerEvent};
-use rhai::{AST, ASTNode, Array, Dynamic, Engine, EvalAltResult, Expr, FLOAT, INT, Position, Scope, Stmt};
+use rhai::{ASTNode, Array, Dynamic, Engine, EvalAltResult, Expr, Position, Scope, Stmt};
 
-use super::{Answer, CALL_OPERATIONS, Call, End, Progress, SLICE, SLICE_OPERATIONS, Variables, script};
+use super::text::described;
+use super::{
+    Answer, CALL_OPERATIONS, Call, End, MAX_NESTED, Progress, SLICE, SLICE_OPERATIONS, Script, Variables,
+    calls, script,
+};
 
 /// An answer with the model's time.
 #[derive(Debug)]
@@ -24,6 +26,10 @@ pub(super) struct Link {
     events: SyncSender<Progress>,
     answers: Mutex<Receiver<Stamped>>,
     variables: Arc<Mutex<Variables>>,
+    /// What a script can call by name.
+    scripts: Vec<Script>,
+    /// The scripts that were called and have not returned, outermost first.
+    called: Mutex<Vec<String>>,
     /// When the present slice began, in the model's time, µs.
     slice_began: AtomicU64,
     /// Operations used in this slice.
@@ -39,24 +45,21 @@ pub(super) struct Link {
     over: AtomicBool,
 }
 
-type Outcome<T> = Result<T, Box<EvalAltResult>>;
+pub(super) type Outcome<T> = Result<T, Box<EvalAltResult>>;
 
 /// Runs the script to its end and reports how it ended.
-pub(super) fn run(link: Link, ast: &AST) {
+pub(super) fn run(link: Link, script: &Script) {
     let link = Arc::new(link);
-    let engine = register(script::engine(), &link);
+    let mut engine = script::engine();
+    watch(&mut engine, &link);
+    calls::register(&mut engine, &link);
     let mut scope = Scope::new();
-    let result = engine.run_ast_with_scope(&mut scope, ast);
+    let result = engine.run_ast_with_scope(&mut scope, &script.ast());
     link.show(&scope);
     let end = match result {
         Ok(()) => End::Finished,
-        Err(error) => match *error {
-            EvalAltResult::ErrorTerminated(token, place) if token.is_string() => {
-                End::Failed(one_line(&format!("{token} ({place})")))
-            }
-            EvalAltResult::ErrorTerminated(..) => End::Aborted,
-            other => End::Failed(one_line(&other.to_string())),
-        },
+        Err(error) if is_abort(&error) => End::Aborted,
+        Err(error) => End::Failed(described(*error)),
     };
     // Fails only if the model is gone.
     let _ = link.events.send(Progress::Ended(end));
@@ -67,12 +70,15 @@ impl Link {
         events: SyncSender<Progress>,
         answers: Receiver<Stamped>,
         variables: Arc<Mutex<Variables>>,
+        scripts: Vec<Script>,
         now: Instant,
     ) -> Self {
         Self {
             events,
             answers: Mutex::new(answers),
             variables,
+            scripts,
+            called: Mutex::new(Vec::new()),
             slice_began: AtomicU64::new(now.as_micros()),
             spent: AtomicU64::new(0),
             charge: AtomicU64::new(1),
@@ -83,11 +89,44 @@ impl Link {
     }
 
     /// Hands control to the model until it answers.
-    fn call(&self, call: Call) -> Outcome<Answer> {
+    pub(super) fn call(&self, call: Call) -> Outcome<Answer> {
         self.spend(CALL_OPERATIONS)?;
         let answer = self.exchange(call)?;
         self.stale.store(true, Relaxed);
         Ok(answer)
+    }
+
+    /// Runs another script to its end, with variables of its own.
+    pub(super) fn run_other(&self, engine: &Engine, name: &str) -> Outcome<()> {
+        self.spend(CALL_OPERATIONS)?;
+        let Some(script) = script::named(&self.scripts, name) else {
+            let names: Vec<_> = self.scripts.iter().map(Script::name).collect();
+            return Err(format!("call: there is no program {name}; there are {}", names.join(", ")).into());
+        };
+        {
+            let mut called = self.called.lock().unwrap_or_else(PoisonError::into_inner);
+            if called.len() >= MAX_NESTED {
+                let text = format!("call: {name} would be called by more than {MAX_NESTED} other programs");
+                return Err(text.into());
+            }
+            called.push(script.name().to_owned());
+        }
+        let mut scope = Scope::new();
+        let result = engine.run_ast_with_scope(&mut scope, &script.ast());
+        self.show(&scope);
+        self.called.lock().unwrap_or_else(PoisonError::into_inner).pop();
+        self.stale.store(true, Relaxed);
+        let Err(error) = result else { return Ok(()) };
+        if is_abort(&error) {
+            return Err(error);
+        }
+        let can_be_caught = error.is_catchable();
+        let text = format!("in {}: {}", script.name(), described(*error));
+        if can_be_caught {
+            Err(text.into())
+        } else {
+            Err(Box::new(EvalAltResult::ErrorTerminated(text.into(), Position::NONE)))
+        }
     }
 
     /// Counts operations. At the end of the slice the script waits for the next one.
@@ -129,7 +168,7 @@ impl Link {
 
     /// Ends a script whose variables are too large in total. The interpreter limits single values only, and
     /// does not check all limits when an item is added.
-    fn weigh(&self, scope: &Scope<'_>) -> Outcome<()> {
+    fn weigh(&self, scope: &Scope<'_>, place: Position) -> Outcome<()> {
         if self.weigh_in.load(Relaxed) > 0 {
             return Ok(());
         }
@@ -143,26 +182,26 @@ impl Link {
             return Ok(());
         }
         let token = Dynamic::from(format!("more than {MAX_WEIGHT} items in the variables"));
-        Err(Box::new(EvalAltResult::ErrorTerminated(token, Position::NONE)))
+        Err(Box::new(EvalAltResult::ErrorTerminated(token, place)))
     }
 
     fn show(&self, scope: &Scope<'_>) {
+        let called = self.called.lock().unwrap_or_else(PoisonError::into_inner).last().cloned();
         let mut variables = self.variables.lock().unwrap_or_else(PoisonError::into_inner);
         let mut room = MAX_SHOWN;
         for (name, _, value) in scope.iter_raw() {
             let value = shown(value, &mut room);
-            if variables.len() < MAX_SHOWN || variables.contains_key(name) {
-                variables.insert(name.to_owned(), value);
+            let name = called.as_ref().map_or_else(|| name.to_owned(), |script| format!("{script}: {name}"));
+            if variables.len() < MAX_SHOWN || variables.contains_key(&name) {
+                variables.insert(name, value);
             }
         }
     }
 }
 
-/// Registers the robot's functions, the bounds on work, and the publication of variables.
-fn register(mut engine: Engine, link: &Arc<Link>) -> Engine {
-    let with = || Arc::clone(link);
-
-    let l = with();
+/// Registers the bounds on work, and the publication of variables.
+fn watch(engine: &mut Engine, link: &Arc<Link>) {
+    let l = Arc::clone(link);
     // Called for each operation.
     engine.on_progress(move |_| {
         if l.over.load(Relaxed) {
@@ -173,11 +212,11 @@ fn register(mut engine: Engine, link: &Arc<Link>) -> Engine {
     });
 
     // Variables are published after a call has returned and before the next one.
-    let l = with();
+    let l = Arc::clone(link);
     #[expect(deprecated, reason = "marked so by its authors only because it may change")]
     engine.register_debugger(
         |_, debugger| debugger,
-        move |mut context, event, node, _, _| {
+        move |mut context, event, node, _, place| {
             // A function's exit is reported with a scope that is not the caller's.
             if matches!(event, DebuggerEvent::Start | DebuggerEvent::Step) {
                 let name = match node {
@@ -186,91 +225,14 @@ fn register(mut engine: Engine, link: &Arc<Link>) -> Engine {
                     }
                     _ => "",
                 };
-                l.weigh(context.scope_mut())?;
-                if l.stale.swap(false, Relaxed) || CALLS.contains(&name) {
+                l.weigh(context.scope_mut(), place)?;
+                if l.stale.swap(false, Relaxed) || calls::NAMES.contains(&name) {
                     l.show(context.scope_mut());
                 }
             }
             Ok(DebuggerCommand::StepInto)
         },
     );
-
-    let l = with();
-    engine.register_fn("comm_recv", move |port: &str| -> Outcome<Array> {
-        match l.call(Call::Receive { port: port.to_owned() })? {
-            Answer::Frame { id, values } => {
-                let id = id.map(|id| match id {
-                    CanId::Standard(id) => Dynamic::from(INT::from(id)),
-                    CanId::Extended(id) => Dynamic::from(INT::from(id)),
-                });
-                Ok(id.into_iter().chain(values.into_iter().map(dynamic)).collect())
-            }
-            _ => Ok(Array::new()),
-        }
-    });
-
-    let l = with();
-    engine.register_fn("comm_send", move |port: &str, values: Array| -> Outcome<()> {
-        let values = numbers(&values)?;
-        l.call(Call::Send { port: port.to_owned(), id: None, values }).map(|_| ())
-    });
-    let l = with();
-    engine.register_fn("comm_send", move |port: &str, id: INT, values: Array| -> Outcome<()> {
-        let values = numbers(&values)?;
-        l.call(Call::Send { port: port.to_owned(), id: Some(id), values }).map(|_| ())
-    });
-
-    let l = with();
-    engine.register_fn("get", move |name: &str| -> Outcome<Dynamic> {
-        Ok(match l.call(Call::Get { name: name.to_owned() })? {
-            Answer::Value(value) => dynamic(value),
-            Answer::Bit(on) => Dynamic::from(on),
-            _ => Dynamic::UNIT,
-        })
-    });
-    let l = with();
-    engine.register_fn("set", move |name: &str, value: Dynamic| -> Outcome<()> {
-        let value = number(&value)?;
-        l.call(Call::Set { name: name.to_owned(), value }).map(|_| ())
-    });
-
-    let l = with();
-    engine.register_fn("movej", move |target: Array, speed: Dynamic| -> Outcome<()> {
-        let numbers = numbers(&target)?;
-        let Ok(target) = <[f64; 6]>::try_from(numbers.as_slice()) else {
-            return Err(format!("movej takes 6 joint positions, not {}", numbers.len()).into());
-        };
-        l.call(Call::MoveJ { target, speed_rad_s: number(&speed)? }).map(|_| ())
-    });
-
-    let l = with();
-    engine.register_fn("wait_ms", move |time: Dynamic| -> Outcome<()> {
-        let ms = number(&time)?;
-        if !(0.0..=MAX_WAIT_MS).contains(&ms) {
-            return Err(format!("wait_ms takes 0 to {MAX_WAIT_MS} ms, not {ms}").into());
-        }
-        l.call(Call::Wait(Duration::from_micros((ms * 1_000.0).round() as u64))).map(|_| ())
-    });
-
-    let l = with();
-    engine.register_fn("log", move |value: Dynamic| -> Outcome<()> {
-        l.call(Call::Log(one_line(&value.to_string()))).map(|_| ())
-    });
-    // `print` and `debug` cannot fail: see `Link::over`.
-    let l = with();
-    engine.on_print(move |text| {
-        let _ = l.call(Call::Log(one_line(text)));
-    });
-    let l = with();
-    engine.on_debug(move |text, _, _| {
-        let _ = l.call(Call::Log(one_line(text)));
-    });
-
-    // The interpreter's own functions would block the model, or read the machine's clock.
-    engine.register_fn("sleep", |_: INT| -> Outcome<()> { Err("sleep: use wait_ms".into()) });
-    engine.register_fn("sleep", |_: FLOAT| -> Outcome<()> { Err("sleep: use wait_ms".into()) });
-    engine.register_fn("timestamp", || -> Outcome<()> { Err("timestamp: programs have no clock".into()) });
-    engine
 }
 
 /// An error that a script cannot catch.
@@ -278,25 +240,12 @@ fn terminated() -> Box<EvalAltResult> {
     Box::new(EvalAltResult::ErrorTerminated(Dynamic::UNIT, Position::NONE))
 }
 
-fn number(value: &Dynamic) -> Outcome<f64> {
-    if let Ok(whole) = value.as_int() {
-        return Ok(whole as f64);
-    }
-    if let Ok(on) = value.as_bool() {
-        return Ok(f64::from(u8::from(on)));
-    }
-    value.as_float().map_err(|_| format!("a number is needed here, not {value}").into())
-}
-
-fn numbers(values: &[Dynamic]) -> Outcome<Vec<f64>> {
-    values.iter().map(number).collect()
-}
-
-fn dynamic(value: Scalar) -> Dynamic {
-    match value {
-        Scalar::Float(_) | Scalar::Double(_) => Dynamic::from(value.as_f64() as FLOAT),
-        // Every integer type of a recipe fits.
-        _ => Dynamic::from(value.as_f64() as INT),
+/// Whether the model has ended the script. Other errors that cannot be caught have a text.
+fn is_abort(error: &EvalAltResult) -> bool {
+    match error {
+        EvalAltResult::ErrorTerminated(token, _) => !token.is_string(),
+        EvalAltResult::ErrorInFunctionCall(_, _, inner, _) => is_abort(inner),
+        _ => false,
     }
 }
 
@@ -353,24 +302,11 @@ fn weight(value: &Dynamic, limit: usize) -> usize {
     sum.min(limit)
 }
 
-/// The text on one line, not too long for a reply.
-fn one_line(text: &str) -> String {
-    let mut line: String =
-        text.chars().map(|c| if c.is_control() { ' ' } else { c }).take(MAX_LINE).collect();
-    line.truncate(line.trim_end().len());
-    line
-}
-
-/// Functions that call the model.
-const CALLS: [&str; 7] = ["comm_recv", "comm_send", "get", "set", "movej", "wait_ms", "log"];
 /// Maximum number of items in all variables.
 const MAX_WEIGHT: usize = 65_536;
 /// Operations between two checks of it.
 const WEIGH_EVERY: u64 = 1_000;
 /// Number of items that can be copied in the time of one operation.
 const ITEMS_AN_OPERATION: usize = 16;
-const MAX_WAIT_MS: f64 = 1e9;
-/// Maximum length of a log line or error text, in characters.
-const MAX_LINE: usize = 200;
 /// Maximum number of variables and items in statistics.
 const MAX_SHOWN: usize = 1_024;

@@ -13,8 +13,10 @@
 //!
 //! The bounds are at the end of this file. A program that exceeds one ends with an error.
 
+mod calls;
 mod link;
 mod script;
+mod text;
 
 use std::collections::BTreeMap;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
@@ -25,7 +27,9 @@ use proto_core::time::{Duration, Instant};
 use proto_core::wire::can::CanId;
 use proto_core::wire::scalar::Scalar;
 
+pub(super) use script::named;
 pub use script::{Script, ScriptError};
+pub(super) use text::shortened;
 
 /// A program's variables by name: numbers, booleans, strings, arrays and maps of them.
 pub type Variables = BTreeMap<String, serde_json::Value>;
@@ -37,8 +41,11 @@ pub enum Call {
     Receive {
         /// The port's name.
         port: String,
+        /// How long at most; then [`Answer::Done`] says that none came.
+        limit: Option<Duration>,
     },
-    /// Send a frame of the port's user recipe.
+    /// Send a frame of the port's user recipe. [`Answer::Bit`] says whether the port was ready and has sent it;
+    /// [`Answer::Done`] is true.
     Send {
         /// The port's name.
         port: String,
@@ -66,6 +73,13 @@ pub enum Call {
         /// rad/s.
         speed_rad_s: f64,
     },
+    /// Move the TCP on a straight line, and wait for the end of the move.
+    MoveL {
+        /// X, Y, Z in m, Rx, Ry, Rz in rad, in the base frame.
+        pose: [f64; 6],
+        /// m/s.
+        speed_m_s: f64,
+    },
     /// Wait for this time.
     Wait(Duration),
     /// Write a line to the log.
@@ -91,7 +105,7 @@ pub enum Answer {
     },
     /// An item's value.
     Value(Scalar),
-    /// A bit's value.
+    /// A bit's value, or whether a frame was sent.
     Bit(bool),
     /// It failed; the program may catch the error.
     Error(String),
@@ -137,15 +151,23 @@ impl Program {
     /// # Errors
     /// If the operating system cannot create a thread.
     pub fn start(script: &Script, now: Instant) -> std::io::Result<Self> {
+        Self::start_with(script, &[], now)
+    }
+
+    /// The same with further scripts, which this one can call by their names.
+    ///
+    /// # Errors
+    /// If the operating system cannot create a thread.
+    pub fn start_with(script: &Script, scripts: &[Script], now: Instant) -> std::io::Result<Self> {
         let (answers, answers_end) = sync_channel(0);
         let (events_end, events) = sync_channel(0);
         let variables = Arc::new(Mutex::new(Variables::new()));
-        let link = link::Link::new(events_end, answers_end, Arc::clone(&variables), now);
-        let ast = script.ast();
+        let link = link::Link::new(events_end, answers_end, Arc::clone(&variables), scripts.to_vec(), now);
+        let own = script.clone();
         let thread = std::thread::Builder::new()
             .name(format!("program {}", script.name()))
             .stack_size(STACK_BYTES)
-            .spawn(move || link::run(link, &ast))?;
+            .spawn(move || link::run(link, &own))?;
         let mut program = Self {
             name: script.name().to_owned(),
             progress: Progress::Ended(End::Aborted),
@@ -220,7 +242,10 @@ const MAX_VARIABLES: usize = 128;
 const MAX_CALLS: usize = 24;
 /// Maximum depth of expressions.
 const MAX_DEPTH: usize = 32;
-const STACK_BYTES: usize = 8 << 20;
+/// Maximum number of programs that have called one another and not returned.
+const MAX_NESTED: usize = 8;
+/// Each of the nested programs may use its depth of function calls.
+const STACK_BYTES: usize = (1 + MAX_NESTED) * (8 << 20);
 
 #[cfg(test)]
 mod tests;

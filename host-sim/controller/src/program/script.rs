@@ -2,8 +2,9 @@
 
 use std::fmt;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 
-use rhai::{AST, Engine, OptimizationLevel};
+use rhai::{AST, Engine, OptimizationLevel, Token};
 
 use super::{MAX_CALLS, MAX_DEPTH, MAX_ITEMS, MAX_STRING, MAX_VARIABLES};
 
@@ -63,6 +64,13 @@ impl Script {
     }
 }
 
+/// The script with this name, or with the last part of this path.
+pub(crate) fn named<'a>(scripts: &'a [Script], name: &str) -> Option<&'a Script> {
+    let base = name.rsplit('/').next().unwrap_or(name);
+    let by = |wanted: &str| scripts.iter().find(|script| script.name() == wanted);
+    by(name).or_else(|| by(base))
+}
+
 /// An interpreter with all bounds set, and without functions that read a clock or wait.
 pub(super) fn engine() -> Engine {
     let mut engine = Engine::new();
@@ -75,5 +83,20 @@ pub(super) fn engine() -> Engine {
         .set_max_call_levels(MAX_CALLS)
         .set_max_expr_depths(MAX_DEPTH, MAX_DEPTH)
         .disable_symbol("eval");
+    let after_dot = AtomicBool::new(false);
+    #[expect(deprecated, reason = "marked so by its authors only because it may change")]
+    engine.on_parse_token(move |token, _, _| {
+        let is_method = after_dot.swap(matches!(token, Token::Period | Token::Elvis), Relaxed);
+        match &token {
+            Token::Identifier(name) | Token::Reserved(name) if name.as_str() == "call" && !is_method => {
+                Token::Identifier(Box::new(CALL_PROGRAM.into()))
+            }
+            _ => token,
+        }
+    });
     engine
 }
+
+/// The function `call` in a compiled script. The interpreter keeps the name `call` for function pointers, whose
+/// method it remains.
+pub(super) const CALL_PROGRAM: &str = "call_program";

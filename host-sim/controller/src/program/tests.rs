@@ -49,7 +49,7 @@ fn each_call_waits_for_its_answer() {
         log(`${get("DI[1]")}`);
         "#,
     );
-    assert_eq!(call(&program), Call::Receive { port: "rs485".to_owned() });
+    assert_eq!(call(&program), Call::Receive { port: "rs485".to_owned(), limit: None });
     assert!(program.variables().is_empty());
     let values = vec![Scalar::Byte(1), Scalar::Char(-2), Scalar::Float(0.5)];
     program.answer(NOW, Answer::Frame { id: None, values });

@@ -8,6 +8,8 @@
 //! `DigitalOutputCommand[1]` and `DigitalSignalStatus[4]`: the second always follows the first.
 
 mod bank;
+mod forced;
+mod functional;
 mod packet;
 
 use std::sync::LazyLock;
@@ -16,6 +18,10 @@ use proto_core::sysvar::{Direction, IMAGE_BYTES, SysVar, VarBit};
 use proto_core::wire::scalar::Scalar;
 
 use super::motion::{ArmState, Frame};
+use forced::Forced;
+pub(crate) use forced::PacketItem;
+use functional::Functional;
+
 use recipe_config::{AnalogInput, BitGroup, InitialTarget};
 
 /// The codes of the state machines.
@@ -58,6 +64,8 @@ pub struct Registers {
     arm: ArmState,
     target: ArmState,
     status: Status,
+    functional: Functional,
+    forced: Forced,
 }
 
 /// Why an item was not set.
@@ -66,6 +74,8 @@ pub struct Registers {
 pub enum SetError {
     /// Programs cannot write the item.
     ReadOnly(InitialTarget),
+    /// The output shows a state of the controller.
+    ShowsState(InitialTarget),
     /// The value is out of range.
     Value {
         /// The item.
@@ -79,6 +89,7 @@ impl std::fmt::Display for SetError {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::ReadOnly(target) => write!(f, "a program cannot write {target}"),
+            Self::ShowsState(target) => write!(f, "{target} shows a state; nothing else can write it"),
             Self::Value { target, value } => write!(f, "{target} cannot be {value}"),
         }
     }
@@ -98,6 +109,8 @@ impl Default for Registers {
             arm: ArmState::default(),
             target: ArmState::default(),
             status: Status::default(),
+            functional: Functional::default(),
+            forced: Forced::default(),
         }
     }
 }
@@ -111,14 +124,22 @@ impl Registers {
     /// Lets `write` change the image, and then updates the variables that depend on others.
     pub fn write_inputs<R>(&mut self, write: impl FnOnce(&mut [u8; IMAGE_BYTES]) -> R) -> R {
         let force_before = self.vector(PLACES.force_end);
+        let inputs_before = self.functional_inputs();
         let result = write(&mut self.image);
         self.follow();
+        self.note_edges(inputs_before);
+        self.keep_shown();
         let force = self.vector(PLACES.force_end);
         if force != force_before {
             let tool = self.tool();
             self.set_vector(PLACES.flange_force, tool.wrench_in_parent(force.map(f64::from)));
         }
         result
+    }
+
+    /// The analog outputs of cabinet and tool, in counts.
+    pub fn analog_outputs(&self) -> ([u16; 8], [u16; 2]) {
+        (self.analog_out, self.tool_out)
     }
 
     /// A system variable's value.
@@ -170,10 +191,16 @@ impl Registers {
 
     /// Sets any item: for initial values, and for inputs that a test drives.
     ///
+    /// Bits of a whole byte that show a state keep showing it.
+    ///
     /// # Errors
-    /// [`SetError::Value`] if the value is out of range; nothing changed.
+    /// [`SetError::Value`] if the value is out of range, [`SetError::ShowsState`] if the item shows a state;
+    /// nothing changed.
     pub fn force(&mut self, target: InitialTarget, value: f64) -> Result<(), SetError> {
         let wrong = SetError::Value { target, value };
+        if self.shows_state(target) {
+            return Err(SetError::ShowsState(target));
+        }
         match target {
             InitialTarget::Var(var) => {
                 let scalar = match Scalar::from_f64(var.ty(), value).map_err(|_| wrong.clone())? {
@@ -218,7 +245,7 @@ impl Registers {
                             set_bit(byte, nth % 8, on);
                         }
                     }),
-                    None => set_bit(&mut self.buttons, nth, on),
+                    None => self.set_button(nth, on),
                 }
             }
             InitialTarget::Analog { group, index } => {
@@ -283,8 +310,13 @@ impl Registers {
 
     /// The payload, from `RobotState[26]`, in kg.
     pub fn payload_kg(&self) -> f64 {
-        let bytes = self.image.get(PLACES.payload..).and_then(|bytes| bytes.first_chunk());
-        bytes.map_or(0.0, |bytes| f64::from(f32::from_le_bytes(*bytes)))
+        self.payload()[0]
+    }
+
+    /// The payload's mass in kg and centre in m, from `RobotState[26..29]`.
+    fn payload(&self) -> [f64; 4] {
+        let [mass, x, y, z, ..] = self.vector(PLACES.payload).map(f64::from);
+        [mass, x, y, z]
     }
 
     /// Sets the arm's state, actual and commanded.
@@ -340,6 +372,8 @@ struct Places {
     tool: usize,
     payload: usize,
     robot_state: usize,
+    functional_inputs: [usize; functional::INPUTS.len()],
+    functional_outputs: [usize; functional::OUTPUTS.len()],
 }
 
 static PLACES: LazyLock<Places> = LazyLock::new(|| {
@@ -355,6 +389,8 @@ static PLACES: LazyLock<Places> = LazyLock::new(|| {
         tool: offset("RobotState", 20),
         payload: offset("RobotState", 26),
         robot_state: offset("RobotState", 1),
+        functional_inputs: functional::offsets(functional::INPUTS),
+        functional_outputs: functional::offsets(functional::OUTPUTS),
     }
 });
 
@@ -378,16 +414,7 @@ fn command_of(var: SysVar) -> Option<SysVar> {
 
 /// The byte variable that holds bit `nth` (from 0) of the group; `None` for the buttons.
 fn byte_of(group: BitGroup, nth: u8) -> Option<SysVar> {
-    let byte = u32::from(nth / 8);
-    match group {
-        BitGroup::Di => named("DigitalSignalStatus", 1 + byte),
-        BitGroup::Do => named("DigitalOutputCommand", 1 + byte),
-        BitGroup::Fdi => named("DigitalSignalStatus", 7),
-        BitGroup::Fdo => named("DigitalSignalStatus", 8),
-        BitGroup::ToolDi => named("DigitalSignalStatus", 3),
-        BitGroup::ToolDo => named("DigitalOutputCommand", 3),
-        BitGroup::ToolButton => None,
-    }
+    group.var_bit(nth + 1).map(|bit| bit.var)
 }
 
 fn set_bit(byte: &mut u8, nth: u8, on: bool) {

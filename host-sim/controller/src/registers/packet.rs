@@ -2,16 +2,19 @@
 
 use proto_core::modbus::map::unscaled;
 use proto_core::sysvar::SysVar;
+use proto_core::wire::scalar::ScalarError;
 use proto_core::wire::state::{LEN, StatePacket};
 
 use super::bank::{COUNTS_PER_MA, COUNTS_PER_V};
-use super::{PLACES, Registers};
+use super::{PLACES, PacketItem, Registers};
+use crate::motion::{Loads, Payload};
 
 impl Registers {
     /// The state packet of 1468 bytes. `global_speed` is the offset of the global speed, if the dialect has
     /// one.
     pub fn packet(&self, global_speed: Option<u16>) -> Box<[u8; LEN]> {
         let (arm, target, status) = (&self.arm, &self.target, &self.status);
+        let loads = self.loads();
         let mut packet = StatePacket {
             joint_position: arm.position,
             joint_velocity: arm.velocity,
@@ -29,7 +32,9 @@ impl Registers {
             target_tcp_pose: target.pose,
             target_tcp_velocity: target.tcp_velocity,
             target_tcp_acceleration: target.tcp_acceleration,
+            theoretical_flange_force: loads.flange.map(|item| item as f32),
             base_force: self.vector(PLACES.force_base),
+            theoretical_base_force: loads.base.map(|item| item as f32),
             analog_inputs: self.analog_in,
             tool_analog_inputs: self.tool_in,
             tool_analog_outputs: self.tool_out.map(|counts| unscaled(counts, COUNTS_PER_V)),
@@ -53,7 +58,26 @@ impl Registers {
         if let Some(place) = global_speed.and_then(|offset| bytes.get_mut(usize::from(offset))) {
             *place = status.speed_percent;
         }
+        self.forced.put(&mut bytes);
         bytes
+    }
+
+    /// What the arm and its payload weigh in the present position and motion.
+    fn loads(&self) -> Loads {
+        let [mass_kg, centre_m @ ..] = self.payload();
+        let [x, y, z, ..] = self.arm.tcp_acceleration.map(f64::from);
+        let [q1, q2, q3, q4, q5, q6, _] = self.arm.position.map(f64::from);
+        Loads::of(&[q1, q2, q3, q4, q5, q6], [x, y, z], &Payload { mass_kg, centre_m })
+    }
+
+    /// Shows this value in packets from now on, whatever the model shows there.
+    pub(crate) fn force_in_packet(&mut self, item: PacketItem, value: f64) -> Result<(), ScalarError> {
+        self.forced.set(item, value)
+    }
+
+    /// Ends [`Self::force_in_packet`].
+    pub(crate) fn release_in_packet(&mut self, item: PacketItem) {
+        self.forced.release(item);
     }
 
     /// Writes every system variable that is in the packet.

@@ -6,13 +6,19 @@
 
 use std::collections::VecDeque;
 
-use proto_core::command::{Action, CommandServer, Outcome, Percent, Reply, Request, ServerEvent, StateCodes};
+use proto_core::command::{
+    Action, CommandServer, MAX_COMMAND, Outcome, Percent, Reply, Request, ServerEvent, StateCodes,
+    UnknownCommand,
+};
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::dialect::Dialect;
 use proto_core::wire::state::ProgramState;
 
 use super::Link;
+use crate::events::Happened;
 use crate::machine::{ErrorId, Progress, Transition};
-use crate::program::Script;
+use crate::operations::cause_of;
+use crate::program;
 use crate::{ConnId, Controller, ControllerOutput};
 
 /// A connection of port 2000.
@@ -20,9 +26,14 @@ use crate::{ConnId, Controller, ControllerOutput};
 pub(super) struct Session {
     parser: CommandServer,
     /// Commands that wait until the one before is answered.
-    waiting: VecDeque<Command>,
+    waiting: VecDeque<(Command, Text)>,
     pending: Option<Pending>,
+    /// The command that is being carried out.
+    current: Text,
 }
+
+/// A command's text, for events; `None` while nobody records them.
+type Text = Option<String>;
 
 /// A command that is answered at the end of its transition.
 #[derive(Debug, Clone, Copy)]
@@ -84,8 +95,9 @@ impl Controller {
         while let Some(session) = self.server.command.get_mut(&conn)
             && let Some(event) = session.parser.receive(now, &mut rest)
         {
+            let text = self.recorder.is_on().then(|| text_of(&event, &self.dialect));
             let command = event.into();
-            self.queue(now, conn, command);
+            self.queue(now, conn, command, text);
         }
     }
 
@@ -99,31 +111,36 @@ impl Controller {
             while let Some(session) = self.server.command.get_mut(&conn)
                 && let Some(event) = session.parser.poll(now)
             {
+                let text = self.recorder.is_on().then(|| text_of(&event, &self.dialect));
                 let command = event.into();
-                self.queue(now, conn, command);
+                self.queue(now, conn, command, text);
             }
         }
     }
 
-    fn queue(&mut self, now: Instant, conn: ConnId, command: Command) {
+    fn queue(&mut self, now: Instant, conn: ConnId, command: Command, text: Text) {
         self.counters.command.requests += 1;
+        if let Some(text) = &text {
+            self.happened(now, || Happened::Command { client: conn.0, text: text.clone() });
+        }
         if command != Command::Unknown {
             self.server.places.active(now, conn);
         }
         let Some(session) = self.server.command.get_mut(&conn) else { return };
         if session.waiting.len() >= MAX_ORDERS {
             self.counters.command.violations += 1;
-            self.closed(Link::Command, conn);
+            self.closed(now, Link::Command, conn);
             self.outputs.push_back(ControllerOutput::Close { conn });
             return;
         }
-        session.waiting.push_back(command);
+        session.waiting.push_back((command, text));
         self.settle(now);
     }
 
     /// Answers commands whose transitions have ended, and carries out those that waited. To be called after
     /// every change of the state machines.
     pub(crate) fn settle(&mut self, now: Instant) {
+        self.note_states(now);
         while let Some((conn, step)) = self.next_step(now) {
             match step {
                 Step::CarryOut(command) => self.carry_out(now, conn, command),
@@ -144,6 +161,7 @@ impl Controller {
                     self.reply(now, conn, &Reply::Did { action, outcome });
                 }
             }
+            self.note_states(now);
         }
     }
 
@@ -158,13 +176,17 @@ impl Controller {
             }
         }
         let mut free = self.server.command.iter_mut().filter(|(_, session)| session.pending.is_none());
-        free.find_map(|(&conn, session)| Some((conn, Step::CarryOut(session.waiting.pop_front()?))))
+        free.find_map(|(&conn, session)| {
+            let (command, text) = session.waiting.pop_front()?;
+            session.current = text;
+            Some((conn, Step::CarryOut(command)))
+        })
     }
 
     fn carry_out(&mut self, now: Instant, conn: ConnId, command: Command) {
         match command {
             Command::Run { program, speed } => {
-                let outcome = match self.run(now, conn, &program, speed) {
+                let outcome = match self.run(now, Some(conn), &program, speed) {
                     Ok(()) => Outcome::Success,
                     Err(_) => Outcome::Fail,
                 };
@@ -180,6 +202,7 @@ impl Controller {
             }
             Command::Do(action) => match self.machine.act(now, action) {
                 Ok((effect, transition)) => {
+                    self.runs.ends_by(cause_of(action));
                     self.apply(now, effect);
                     if let Some(session) = self.server.command.get_mut(&conn) {
                         session.pending = Some(Pending { transition, until: now + MAX_TRANSITION });
@@ -214,8 +237,14 @@ impl Controller {
     }
 
     /// The command `run`. The program is looked up first, so that a missing one is reported in every state.
-    fn run(&mut self, now: Instant, conn: ConnId, name: &str, speed: Option<Percent>) -> Result<(), ErrorId> {
-        let Some(script) = self.script_named(name) else {
+    pub(crate) fn run(
+        &mut self,
+        now: Instant,
+        asked_by: Option<ConnId>,
+        name: &str,
+        speed: Option<Percent>,
+    ) -> Result<(), ErrorId> {
+        let Some(script) = program::named(&self.scripts, name).cloned() else {
             self.machine.fail(ErrorId::NoSuchProgram, format!("run: there is no program {name}"));
             return Err(ErrorId::NoSuchProgram);
         };
@@ -223,14 +252,8 @@ impl Controller {
         if speed.is_some() {
             self.machine.set_speed(speed)?;
         }
-        self.start_program(now, &script, conn)
-    }
-
-    /// The program with this name, or with the last part of this path.
-    fn script_named(&self, name: &str) -> Option<Script> {
-        let base = name.rsplit('/').next().unwrap_or(name);
-        let by = |wanted: &str| self.scripts.iter().find(|script| script.name() == wanted);
-        by(name).or_else(|| by(base)).cloned()
+        let by = if asked_by.is_some() { "command" } else { "function" };
+        self.start_program(now, &script, asked_by, by)
     }
 
     pub(crate) fn send_finish_notice(&mut self, now: Instant, conn: ConnId) {
@@ -250,9 +273,29 @@ impl Controller {
         self.counters.command.refusals += u64::from(refused);
         let mut out = [0; MAX_REPLY];
         if let Ok(len) = reply.encode(&self.dialect, &mut out) {
+            if self.recorder.is_on() {
+                let text = String::from_utf8_lossy(out.get(..len).unwrap_or(&[])).trim_end().to_owned();
+                let current = self.server.command.get(&conn).and_then(|session| session.current.clone());
+                let to = current.filter(|_| *reply != Reply::ScriptFinish);
+                self.happened(now, || Happened::Reply { client: conn.0, text, to });
+            }
             self.send(now, Link::Command, conn, out.get(..len).unwrap_or(&[]).to_vec());
         }
     }
+}
+
+/// A command as text, without its terminator.
+fn text_of(event: &ServerEvent<'_>, dialect: &Dialect) -> String {
+    let mut out = [0; MAX_COMMAND];
+    let bytes = match event {
+        ServerEvent::Request(request) => {
+            let len = request.encode(dialect, &mut out).unwrap_or(0);
+            out.get(..len).unwrap_or(&[])
+        }
+        ServerEvent::Unknown(UnknownCommand::Text(bytes)) => bytes,
+        ServerEvent::Unknown(_) => return "(too long)".to_owned(),
+    };
+    String::from_utf8_lossy(bytes).trim_end().to_owned()
 }
 
 /// The command of a longer transition is answered with fail; the transition continues.

@@ -50,7 +50,8 @@ impl Server {
         commands.chain(self.delayed.iter().map(|delayed| delayed.0)).min()
     }
 
-    pub(super) fn close_link(&mut self, link: Link, outputs: &mut VecDeque<ControllerOutput>) {
+    /// Closes all connections of a server, and returns them.
+    fn close_link(&mut self, link: Link, outputs: &mut VecDeque<ControllerOutput>) -> Vec<ConnId> {
         let conns: Vec<ConnId> = match link {
             Link::Command => std::mem::take(&mut self.command).into_keys().collect(),
             Link::State => std::mem::take(&mut self.state).into_iter().collect(),
@@ -58,13 +59,8 @@ impl Server {
         };
         self.delayed.retain(|delayed| !conns.contains(&delayed.1));
         conns.iter().for_each(|&conn| self.places.closed(conn));
-        outputs.extend(conns.into_iter().map(|conn| ControllerOutput::Close { conn }));
-    }
-
-    pub(super) fn close_all(&mut self, outputs: &mut VecDeque<ControllerOutput>) {
-        for link in [Link::Command, Link::State, Link::Modbus] {
-            self.close_link(link, outputs);
-        }
+        outputs.extend(conns.iter().map(|&conn| ControllerOutput::Close { conn }));
+        conns
     }
 
     /// The number of a server's connections.
@@ -107,6 +103,22 @@ impl Controller {
             }
         }
         self.counters.of(link).opened += 1;
+        self.client_event(now, link, conn, true);
+    }
+
+    /// Closes all connections of a server.
+    pub(super) fn close_clients(&mut self, link: Link) {
+        let now = self.recorder.now();
+        for conn in self.server.close_link(link, &mut self.outputs) {
+            self.client_event(now, link, conn, false);
+        }
+    }
+
+    /// Closes all connections of all servers.
+    pub(super) fn close_all_clients(&mut self) {
+        for link in [Link::Command, Link::State, Link::Modbus] {
+            self.close_clients(link);
+        }
     }
 
     /// Whether one more client is accepted. Another one may be disconnected for it.
@@ -116,7 +128,7 @@ impl Controller {
             (Link::Command, CommandClients::RefuseSecond) => return open == 0,
             (Link::Command, CommandClients::DropFirst) => {
                 self.counters.command.displaced += open as u64;
-                self.server.close_link(link, &mut self.outputs);
+                self.close_clients(link);
                 return true;
             }
             _ => {}
@@ -131,22 +143,19 @@ impl Controller {
         }
         let Some(displaced) = self.server.places.to_displace(now, link, from, max) else { return false };
         self.counters.of(link).displaced += 1;
-        self.closed(link, displaced);
+        self.closed(now, link, displaced);
         self.outputs.push_back(ControllerOutput::Close { conn: displaced });
         true
     }
 
-    pub(super) fn closed(&mut self, link: Link, conn: ConnId) {
-        match link {
-            Link::Command => {
-                self.server.command.remove(&conn);
-            }
-            Link::State => {
-                self.server.state.remove(&conn);
-            }
-            Link::Modbus => {
-                self.server.modbus.remove(&conn);
-            }
+    pub(super) fn closed(&mut self, now: Instant, link: Link, conn: ConnId) {
+        let was_open = match link {
+            Link::Command => self.server.command.remove(&conn).is_some(),
+            Link::State => self.server.state.remove(&conn),
+            Link::Modbus => self.server.modbus.remove(&conn).is_some(),
+        };
+        if was_open {
+            self.client_event(now, link, conn, false);
         }
         self.server.delayed.retain(|delayed| delayed.1 != conn);
         self.server.places.closed(conn);
@@ -177,7 +186,7 @@ impl Controller {
         }
         if violated {
             self.counters.modbus.violations += 1;
-            self.closed(Link::Modbus, conn);
+            self.closed(now, Link::Modbus, conn);
             self.outputs.push_back(ControllerOutput::Close { conn });
         }
     }
@@ -208,10 +217,11 @@ impl Controller {
         for &conn in &self.server.state {
             self.outputs.push_back(ControllerOutput::Send { conn, bytes: bytes.to_vec() });
         }
-        self.server.close_link(Link::State, &mut self.outputs);
+        self.close_clients(Link::State);
     }
 
-    fn send(&mut self, now: Instant, link: Link, conn: ConnId, bytes: Vec<u8>) {
+    fn send(&mut self, now: Instant, link: Link, conn: ConnId, mut bytes: Vec<u8>) {
+        self.faults.spoil_bytes(link, &mut bytes);
         let counters = self.counters.of(link);
         if self.faults.mutes(link) {
             counters.muted += 1;

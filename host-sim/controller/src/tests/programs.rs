@@ -239,18 +239,36 @@ fn sends_wait_for_the_line_and_report_errors() {
     }
 }
 
+/// D28: true when the frame was sent, false when the port is not ready.
 #[test]
-fn a_port_that_goes_down_fails_the_send() {
+fn a_send_says_whether_the_port_was_ready() {
     let script = r#"
-        try { comm_send("p", [0, 1]); } catch (e) { log(e); }
-        try { comm_send("p", [0, 1]); } catch (e) { log(e); }
+        let sent = [comm_send("p", [0, 1])];
+        sent.push(comm_send("p", [0, 2]));
+        sent.push(comm_send("p", [0, 3]));
+        for values in [[1], [1, 256]] {
+            try { comm_send("p", values); } catch (e) { sent.push(e); }
+        }
+        comm_recv("p");
+        sent.push(comm_send("p", [0, 4]));
+        comm_recv("p");
     "#;
     let (mut cell, _) = runs(user_port(), script);
+    let sent = |cell: &TestController| cell.controller.program_variables()["sent"].clone();
+    cell.run(Duration::from_micros(800));
     cell.input(ControllerInput::PortDown { port: 0 });
+    let wrong = ["p: the frame has 2 fields, 1 values were given", "p: 256 does not fit in a byte (0..=255)"];
     assert_eq!(
-        cell.controller.program_log().collect::<Vec<_>>(),
-        ["p was disconnected", "p is not connected"]
+        sent(&cell),
+        serde_json::json!([true, false, false, wrong[0], wrong[1]]),
+        "the second is lost on the line; a wrong frame is an error, ready or not"
     );
+    cell.input(ControllerInput::PortUp { port: 0 });
+    cell.port_bytes(0, &frame([0, 0, 0]));
+    cell.run_ms(5);
+    assert_eq!(sent(&cell)[5], true);
+    assert_eq!(cell.sent.len(), 3);
+    assert_eq!(cell.controller.machine().error(), None);
 }
 
 #[test]

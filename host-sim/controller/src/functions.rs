@@ -1,0 +1,86 @@
+//! Functions of functional inputs, and states on functional outputs (D27, docs/simulated-controller.md
+//! section 7).
+//!
+//! An input's rising edge does what its command on port 2000 would do, and nobody is answered. Several edges at
+//! one instant are carried out in the order of [`Function::ALL`].
+
+use proto_core::command::Action;
+use proto_core::time::Instant;
+use proto_core::wire::state::{OperationMode, ProgramState, RobotState, SafetyState};
+use recipe_config::{Function, FunctionInput, InitialTarget, ShownState};
+
+use super::Controller;
+use super::machine::{ErrorId, Machine};
+use super::operations::cause_of;
+
+impl Controller {
+    /// Carries out the functions of the inputs that have risen.
+    pub(super) fn carry_out_functions(&mut self, now: Instant) {
+        let Some(risen) = self.registers.take_risen() else { return };
+        let inputs = &self.config.functions.inputs;
+        let due: Vec<FunctionInput> = Function::ALL
+            .iter()
+            .flat_map(|&(_, function)| inputs.iter().filter(move |input| input.function == function))
+            .filter(|input| risen.has(input.item))
+            .copied()
+            .collect();
+        for FunctionInput { item, function } in due {
+            if self.carry_out_function(now, function).is_err() {
+                self.name_input(item);
+            }
+            self.settle(now);
+        }
+    }
+
+    fn carry_out_function(&mut self, now: Instant, function: Function) -> Result<(), ErrorId> {
+        let action = match function {
+            Function::Start => {
+                let program = self.config.functions.start.clone().unwrap_or_default();
+                return self.run(now, None, &program, None);
+            }
+            Function::Reset => {
+                self.machine.reset(now);
+                return Ok(());
+            }
+            Function::Stop => Action::Stop,
+            Function::Pause => Action::Pause,
+            Function::Resume => Action::Resume,
+            Function::Enable => Action::Enable,
+            Function::Disable => Action::Disable,
+        };
+        let (effect, _) = self.machine.act(now, action)?;
+        self.runs.ends_by(cause_of(action));
+        self.apply(now, effect);
+        Ok(())
+    }
+
+    /// Adds the input to the error of the function that was refused.
+    fn name_input(&mut self, item: InitialTarget) {
+        if let Some(error) = self.machine.error() {
+            let (id, message) = (error.id, format!("{item}: {}", error.message));
+            self.machine.fail(id, message);
+        }
+    }
+
+    /// Shows the present states in their outputs.
+    pub(super) fn show_states(&mut self) {
+        for output in &self.config.functions.outputs {
+            self.registers.show_state(output.item, self.machine.is_in(output.state));
+        }
+    }
+}
+
+impl Machine {
+    /// Whether the state holds now.
+    pub fn is_in(&self, state: ShownState) -> bool {
+        match state {
+            ShownState::Powered => matches!(self.robot(), RobotState::Disable | RobotState::Enable),
+            ShownState::Enabled => self.robot() == RobotState::Enable,
+            ShownState::Running => self.program() == ProgramState::Running,
+            ShownState::Paused => self.program() == ProgramState::Paused,
+            ShownState::Error => self.robot_error().is_some(),
+            ShownState::EmergencyStop => self.safety() == SafetyState::Stop0,
+            ShownState::Remote => self.mode() != OperationMode::Manual,
+        }
+    }
+}

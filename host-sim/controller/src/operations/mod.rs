@@ -1,0 +1,294 @@
+//! Operations at run time (docs/control.md section 2): what a person at the pendant, a cable that breaks, or a
+//! test does to the controller.
+//!
+//! In: an [`Operation`], as JSON by serde. Out: its result as JSON, or why it was refused; a refused operation
+//! has changed nothing. The way it came in is its caller's.
+
+mod carry_out;
+mod fault;
+
+use std::collections::BTreeMap;
+
+use proto_core::wire::state::OperationMode;
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
+
+use super::condition::Condition;
+use super::events::KINDS;
+use super::faults::Link;
+pub(crate) use carry_out::cause_of;
+pub use fault::{Fault, Kind, NoNumber, Spoil};
+
+/// An operation. In JSON its name is the value of `do`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "do", rename_all = "snake_case", deny_unknown_fields)]
+#[non_exhaustive]
+pub enum Operation {
+    /// The state (docs/control.md section 3).
+    State {},
+    /// The values of these items.
+    Get {
+        /// Their names.
+        items: Vec<String>,
+    },
+    /// The counters of `--stats`.
+    Counters {},
+    /// The programs' names.
+    Programs {},
+    /// The kept events.
+    Events {
+        /// From this number on.
+        #[serde(default)]
+        since: u64,
+        /// Only these kinds; all if it is empty.
+        #[serde(default)]
+        kinds: Vec<String>,
+        /// At most so many.
+        #[serde(default = "default_max")]
+        max: usize,
+    },
+    /// Each event from now on, to the caller. [`Controller::operate`] refuses it: the caller follows.
+    Follow {
+        /// Only these kinds; all if it is empty.
+        #[serde(default)]
+        kinds: Vec<String>,
+    },
+    /// Sets items: all of them, or none.
+    Set {
+        /// Name and value of each.
+        items: BTreeMap<String, Number>,
+    },
+    /// Turns the key.
+    Mode {
+        /// The mode.
+        mode: Mode,
+    },
+    /// Presses the emergency stop.
+    EmergencyStop {},
+    /// Opens a safety door.
+    ProtectiveStop {},
+    /// Makes the arm collide.
+    Collide {
+        /// The axis, 1 to 6.
+        axis: u8,
+    },
+    /// Releases and acknowledges a stop.
+    Clear {},
+    /// Somebody enters or leaves a zone of reduced speed.
+    Reduced {
+        /// Whether somebody is in it.
+        on: bool,
+    },
+    /// Shows an error.
+    RaiseError {
+        /// Its number; not 0.
+        code: u32,
+        /// Its text.
+        #[serde(default)]
+        text: String,
+    },
+    /// Acknowledges the shown error.
+    ClearError {},
+    /// The pendant's button.
+    PowerOn {},
+    /// The pendant's button.
+    PowerOff {},
+    /// The pendant's button.
+    Enable {},
+    /// The pendant's button.
+    Disable {},
+    /// Starts a program.
+    Run {
+        /// Its name.
+        program: String,
+        /// The speed; the present one if it is absent.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        speed_percent: Option<f32>,
+    },
+    /// Stops the program.
+    Stop {},
+    /// Pauses the program.
+    Pause {},
+    /// Lets the program go on.
+    Resume {},
+    /// Adds or replaces a program.
+    Upload {
+        /// Its name.
+        program: String,
+        /// Its text.
+        script: String,
+    },
+    /// Removes a program.
+    Remove {
+        /// Its name.
+        program: String,
+    },
+    /// Assigns a recipe to a port.
+    Recipe {
+        /// The port's name.
+        port: String,
+        /// The recipe's name; `None` for no recipe.
+        recipe: Option<String>,
+    },
+    /// Sets a port's cycle.
+    Cycle {
+        /// The port's name.
+        port: String,
+        /// Milliseconds, at least 4.
+        ms: f64,
+    },
+    /// Switches the controller off and on.
+    Restart {
+        /// The registers after it.
+        #[serde(default)]
+        registers: AfterRestart,
+    },
+    /// Begins a fault.
+    Fault(Fault),
+    /// Ends faults: all that are on this server, port or item, or all.
+    Heal {
+        /// The server.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        server: Option<Link>,
+        /// The port's name.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        port: Option<String>,
+        /// The item's name.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        item: Option<String>,
+        /// The longer transitions.
+        #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+        transitions: bool,
+    },
+    /// Moves a stepped clock. [`Controller::operate`] refuses it: the clock is the caller's.
+    Advance {
+        /// By so many seconds.
+        seconds: f64,
+    },
+    /// Waits. [`Controller::operate`] refuses it: the clock is the caller's.
+    Wait {
+        /// For this.
+        until: Condition,
+        /// For so many seconds at most.
+        #[serde(default = "default_timeout")]
+        timeout_s: f64,
+    },
+}
+
+/// The value of an item: a number, or a bit as a bool.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(untagged, expecting = "a number, true or false")]
+pub enum Number {
+    /// A bit.
+    Bit(bool),
+    /// A number.
+    Number(f64),
+}
+
+impl Number {
+    /// As a number.
+    pub fn value(self) -> f64 {
+        match self {
+            Self::Bit(on) => f64::from(u8::from(on)),
+            Self::Number(number) => number,
+        }
+    }
+}
+
+/// The operation mode.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Mode {
+    /// From the pendant.
+    Manual,
+    /// Programs started on the pendant.
+    Auto,
+    /// Commands from port 2000.
+    Remote,
+}
+
+impl From<Mode> for OperationMode {
+    fn from(mode: Mode) -> Self {
+        match mode {
+            Mode::Manual => Self::Manual,
+            Mode::Auto => Self::Auto,
+            Mode::Remote => Self::Remote,
+        }
+    }
+}
+
+/// The registers after a restart.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum AfterRestart {
+    /// The file's initial values.
+    #[default]
+    Initial,
+    /// 0.
+    Cleared,
+}
+
+/// Why an operation was refused: one line. Nothing has changed.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Refused(pub String);
+
+impl std::fmt::Display for Refused {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+impl std::error::Error for Refused {}
+
+type Done = Result<Value, Refused>;
+
+fn refused<T>(why: impl Into<String>) -> Result<T, Refused> {
+    Err(Refused(why.into()))
+}
+
+impl Operation {
+    /// From a JSON object whose `do` is the operation's name.
+    ///
+    /// # Errors
+    /// [`Refused`]: what is wrong, and what is allowed.
+    pub fn from_json(object: Map<String, Value>) -> Result<Self, Refused> {
+        if !object.contains_key("do") {
+            return refused("`do` is missing: it names the operation, such as \"state\"");
+        }
+        Self::deserialize(Value::Object(object)).map_err(|error| Refused(error.to_string()))
+    }
+
+    /// Whether it only reads or waits.
+    pub const fn is_reading(&self) -> bool {
+        matches!(
+            self,
+            Self::State {}
+                | Self::Get { .. }
+                | Self::Counters {}
+                | Self::Programs {}
+                | Self::Events { .. }
+                | Self::Follow { .. }
+                | Self::Advance { .. }
+                | Self::Wait { .. }
+        )
+    }
+}
+
+/// Whether all kinds exist.
+///
+/// # Errors
+/// The first that does not, with those that do.
+pub fn check_kinds(kinds: &[String]) -> Result<(), Refused> {
+    match kinds.iter().find(|kind| !KINDS.contains(&kind.as_str())) {
+        Some(wrong) => refused(format!("kinds: there are no events {wrong}; there are {}", KINDS.join(", "))),
+        None => Ok(()),
+    }
+}
+
+const fn default_max() -> usize {
+    1_000
+}
+
+const fn default_timeout() -> f64 {
+    5.0
+}
