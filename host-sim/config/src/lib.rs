@@ -10,7 +10,9 @@ pub mod file;
 mod sim;
 mod target;
 
-pub use device::{AnyRecipe, DeviceField, DeviceRecipe, ExchangeKind, FrameEnds, NamedExchange, NamedFrame};
+pub use device::{
+    AnyRecipe, DeviceField, DeviceRecipe, ExchangeKind, FieldCommands, FrameEnds, NamedExchange, NamedFrame,
+};
 pub use file::function_name;
 pub use sim::{
     AnalogInput, BitGroup, CommandClients, Initial, InitialTarget, Listen, Power, Robot, RobotMode, SimBus,

@@ -582,11 +582,13 @@ impl FileRecipe {
 impl FileField {
     fn named(&self) -> DeviceField {
         let repeats = matches!(self.kind, FileFieldKind::UserInput { again: true, .. });
-        let picks_commands =
-            matches!(self.kind, FileFieldKind::UserInput { to: FileInput::Commands { .. }, .. });
+        let commands = match &self.kind {
+            FileFieldKind::UserInput { to: FileInput::Commands(commands), .. } => Some(commands.named()),
+            _ => None,
+        };
         let of_port = self.port_named().map(|(_, name, _)| name.to_owned());
         let (name, spec) = (self.name(), self.spec());
-        DeviceField { name, spec, repeats, picks_commands, is_coil: false, of_port }
+        DeviceField { name, spec, repeats, commands, is_coil: false, of_port }
     }
 
     /// What the field is, without a table of commands.
