@@ -17,6 +17,7 @@ use super::bindings::{self, FileInput, FileOutput};
 use super::encoding::{self, OpenNumber, Order, refuse};
 use super::exchanges::FileExchange;
 use super::framings;
+use super::names::meant_checksum;
 use super::reader::{Item, Reader, Result};
 use super::recipes::{FileField, FileFieldKind, FileFrame, FilePart, FileRecipe, Flavour, Written};
 use super::rtu_frames;
@@ -289,8 +290,12 @@ fn read_text<'a>(item: &Item<'a>) -> Result<impl Iterator<Item = u8> + use<'a>> 
 /// Reads the checksum of a frame and puts it at its place among the fields.
 pub(super) fn read_checksum(frame: &Reader<'_>, head: usize, fields: &mut Vec<FileField>) -> Result<()> {
     let Some(item) = frame.optional("checksum") else { return Ok(()) };
-    if item.as_string().is_some() {
-        return Err(item.error("expected a table, such as { kind = \"crc16-modbus\" }, found a string"));
+    if let Some(name) = item.as_string() {
+        let known: Vec<_> = Algorithm::names().collect();
+        let meant = if known.contains(&name) { String::new() } else { meant_checksum(name, &known) };
+        return Err(item.error(format!(
+            "expected a table, such as {{ kind = \"crc16-modbus\" }}, found a string{meant}"
+        )));
     }
     let table = item.any_table()?;
     let algorithm = read_algorithm(&table)?;
@@ -338,11 +343,11 @@ fn read_algorithm(table: &Reader<'_>) -> Result<Algorithm> {
     let name = kind.string()?;
     if name != "crc" {
         let algorithm = Algorithm::named(name).ok_or_else(|| {
-            let known: Vec<_> = Algorithm::names().map(|name| format!("{name:?}")).collect();
-            kind.error(format!(
-                "{name:?} is unknown; allowed: {}, \"crc\" (with its parameters)",
-                known.join(", ")
-            ))
+            let known: Vec<_> = Algorithm::names().collect();
+            let shown: Vec<_> = known.iter().map(|name| format!("{name:?}")).collect();
+            let meant = meant_checksum(name, &known);
+            let shown = shown.join(", ");
+            kind.error(format!("{name:?} is unknown; allowed: {shown}, \"crc\" (with its parameters){meant}"))
         })?;
         table.check_keys(&PLACE, &format!(" with kind = {name:?}"))?;
         return Ok(algorithm);

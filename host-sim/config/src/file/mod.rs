@@ -16,6 +16,7 @@ mod framings;
 mod gateway;
 mod lines;
 mod modbus;
+mod names;
 mod network;
 mod reader;
 mod recipes;
