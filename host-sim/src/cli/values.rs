@@ -67,7 +67,10 @@ pub(super) fn show_times(config: &GatewayConfig, port: &Port) -> String {
                 format!(": {}{others}", show_safe_values(safe))
             }
         };
-        report += &format!("  timeout  {} without a frame{what}\n", port.timeout);
+        report += &match port.timeout {
+            Port::NEVER => "  timeout  never: all values hold\n".to_owned(),
+            timeout => format!("  timeout  {timeout} without a frame{what}\n"),
+        };
     }
     let shown =
         view.fields_of(recipe, Direction::Output).any(|(_, _, field)| field.variables().next().is_some());
@@ -185,6 +188,12 @@ mod tests {
             level,
             "  commands\n    order  is 1  stop\n  timeout  250 ms without a frame: all values hold\n"
         );
+    }
+
+    #[test]
+    fn a_port_that_is_never_overdue_says_so() {
+        let shown = shown("to = \"WordInputReg[2]\"", "timeout_ms = \"never\"");
+        assert_eq!(shown, "  timeout  never: all values hold\n");
     }
 
     #[test]
