@@ -84,9 +84,13 @@ fn rows(frame: &NamedFrame, laid_out: &DeviceFrame, part: Direction) -> Vec<Row>
                 };
                 add(place, "padding", what);
             }
-            FieldSpec::TextInput { text, to, .. } => {
-                let to = to.map(|words| format!(" -> {}", show_words(words)));
-                add(place, &field.name, show_text(&text) + to.as_deref().unwrap_or(""));
+            FieldSpec::TextInput { text, to, ignored, .. } => {
+                let to = to.map_or(String::new(), |words| format!(" -> {}", show_words(words)));
+                let ignored: Vec<_> =
+                    ignored.iter().map(|text| format!("{:?}", String::from_utf8_lossy(text))).collect();
+                let but =
+                    if ignored.is_empty() { String::new() } else { format!(", but {}", ignored.join(", ")) };
+                add(place, &field.name, format!("{}{to}{but}", show_text(&text)));
             }
             FieldSpec::TextOutput { text, from, .. } => {
                 add(place, &field.name, format!("{} <- {}", show_text(&text), show_words(from)));

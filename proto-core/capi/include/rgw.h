@@ -380,6 +380,8 @@ typedef struct rgw_port_counters {
   uint32_t masked;
   // Accepted frames whose alive counter is not the next one: frames between are missing.
   uint32_t counter_jumps;
+  // Frames with a text that is ignored, such as that of a scanner that read nothing.
+  uint32_t ignored;
   // Bit values replaced by newer ones because the queue of edges was full.
   uint32_t edges_lost;
   // Values dropped before they were written: older than the port's timeout, or waiting for a link
