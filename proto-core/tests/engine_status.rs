@@ -125,6 +125,41 @@ fn the_newest_rejection_is_kept_with_its_bytes() {
 }
 
 #[test]
+fn a_foreign_id_is_kept_as_long_as_it_may_be_the_one_that_was_meant() {
+    let mut rig = cell();
+    let port = proto_core::engine::PortId(1);
+    let rejection = |rig: &Rig| {
+        let status = rig.engine.status(rig.now);
+        status.ports().find(|port| port.name == "port1").unwrap().last_rejection.copied()
+    };
+    let id = |rig: &Rig| rejection(rig).and_then(|last| last.can_id);
+    for nth in 6..20 {
+        rig.run(MS(10));
+        rig.can(port, nth, &[nth as u8, 2]);
+        let seen = rejection(&rig).unwrap();
+        assert_eq!((seen.can_id, seen.at), (Some(CanId::Standard(nth)), rig.now), "the newest");
+        assert_eq!((seen.why, seen.bytes()), (Rejection::ForeignId, &[nth as u8, 2][..]));
+    }
+    assert_eq!(rig.counters(port).rejected_id, 14);
+    // The recipe's id comes, so the others are those of other nodes.
+    rig.can(port, 5, &[1, 2]);
+    rig.can(port, 30, &[1, 2]);
+    assert_eq!(id(&rig), Some(CanId::Standard(19)));
+    assert_eq!(rig.counters(port).rejected_id, 15, "it is counted");
+}
+
+#[test]
+fn a_foreign_id_displaces_nothing_else() {
+    let mut rig = cell();
+    let port = proto_core::engine::PortId(1);
+    rig.can(port, 5, &[1, 2, 3]);
+    rig.can(port, 30, &[1, 2]);
+    let status = rig.engine.status(rig.now);
+    let last = status.ports().find(|port| port.name == "port1").unwrap().last_rejection.copied();
+    assert_eq!(last.map(|last| last.why), Some(Rejection::WrongLength));
+}
+
+#[test]
 fn the_controller_says_its_mode_and_states_when_it_has_a_state_link() {
     let mut rig = cell();
     let status = rig.engine.status(rig.now);

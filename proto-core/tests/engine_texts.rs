@@ -4,9 +4,10 @@ mod rig;
 
 use proto_core::config::*;
 use proto_core::device::{
-    Algorithm, Boundary, ByteOrder, Checksum, Counts, Encoding, Escape, Length, Overflow, Text, TextWidth,
+    Algorithm, Boundary, ByteOrder, Checksum, Counts, Encoding, Escape, Ignored, Length, Overflow, Text,
+    TextWidth,
 };
-use proto_core::engine::{PortId, Rejection};
+use proto_core::engine::{PortId, PortState, Rejection};
 use proto_core::recipe::model::Mode;
 use proto_core::wire::scalar::ScalarType as T;
 use rig::*;
@@ -21,6 +22,7 @@ fn code_to(width: TextWidth) -> FieldSpec {
         to: Some(words("WordInputReg[1]", 8)),
         length_to: Some(var("WordInputReg[9]")),
         count_to: Some(var("WordInputReg[10]")),
+        ignored: Ignored::NONE,
     }
 }
 
@@ -168,6 +170,65 @@ fn noread_is_not_a_code_of_five_letters() {
         rig.run(MS(60));
         assert_eq!(shown(&rig), registers(b"12345", 1));
     }
+}
+
+/// A scanner that says when it read nothing, with a safe value after 100 ms.
+fn telling(cell: &mut Cell) -> PortId {
+    let mut field = code_to(TextWidth::Rest);
+    let FieldSpec::TextInput { ignored, .. } = &mut field else { unreachable!() };
+    *ignored = Ignored::new(&[b"NOREAD", b"?"]).unwrap();
+    let port = device(cell, &SCANNER, &[field], &[]);
+    cell.safe("WordInputReg[9]", 99.0);
+    port
+}
+
+#[test]
+fn an_ignored_text_changes_nothing_and_shows_that_the_device_is_there() {
+    let mut cell = Cell::new();
+    let port = telling(&mut cell);
+    let mut rig = cell.rig();
+    rig.run(MS(10));
+    let state = |rig: &Rig| rig.engine.status(rig.now).ports().next().unwrap().state;
+    for nth in 1..=5 {
+        rig.bytes(port, if nth == 3 { b"?\r\n" } else { b"NOREAD\r\n" });
+        assert_eq!((state(&rig), rig.counters(port).ignored), (PortState::Working, nth));
+        rig.run(MS(60));
+    }
+    assert!(!rig.engine.image().is_known(var("WordInputReg[1]")), "nothing was read yet");
+    assert_eq!(rig.take_written(), []);
+    rig.bytes(port, b"4711\r\n");
+    rig.run(MS(60));
+    let _ = rig.take_written();
+    for _ in 0..5 {
+        rig.bytes(port, b"NOREAD\r\n");
+        rig.run(MS(60));
+    }
+    assert_eq!((shown(&rig), rig.take_written()), (registers(b"4711", 1), vec![]));
+    let counters = rig.counters(port);
+    assert_eq!((counters.frames_in, counters.ignored, counters.timeouts), (1, 10, 0));
+    // Another text is a code, also one that begins so.
+    rig.bytes(port, b"NOREADS\r\n");
+    assert_eq!(shown(&rig), registers(b"NOREADS", 2));
+}
+
+#[test]
+fn a_device_that_falls_silent_after_an_ignored_text_is_overdue() {
+    let mut cell = Cell::new();
+    let port = telling(&mut cell);
+    let mut rig = cell.rig();
+    rig.run(MS(10));
+    rig.bytes(port, b"4711\r\n");
+    rig.run(MS(60));
+    rig.bytes(port, b"NOREAD\r\n");
+    rig.run(MS(99));
+    assert_eq!((rig.counters(port).timeouts, rig.map.registers[16]), (0, 4));
+    rig.run(MS(20));
+    assert_eq!((rig.counters(port).timeouts, rig.map.registers[16]), (1, 99));
+    // It is there again; its values are still the safe ones.
+    rig.bytes(port, b"NOREAD\r\n");
+    rig.run(MS(20));
+    let state = rig.engine.status(rig.now).ports().next().unwrap().state;
+    assert_eq!((state, rig.map.registers[16]), (PortState::Working, 99));
 }
 
 #[test]
@@ -335,6 +396,7 @@ fn what_cannot_be_is_refused_with_its_place() {
         to: Some(words(first, count)),
         length_to: None,
         count_to: None,
+        ignored: Ignored::NONE,
     };
     assert_eq!(check(&SCANNER, &[text(32, "WordInputReg[1]")]), Ok(()));
     for (framed, field, message) in [

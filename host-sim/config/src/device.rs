@@ -1,6 +1,6 @@
 //! A recipe with a device's own frames, with the names of its fields, for tools that show frames.
 
-use proto_core::config::{DeviceFrame, FieldSpec};
+use proto_core::config::{CommandWhen, DeviceFrame, FieldSpec};
 use proto_core::device::{Boundary, Carrier, Escape, LayoutError};
 use proto_core::modbus::rtu::Operation;
 use proto_core::sysvar::Direction;
@@ -123,7 +123,8 @@ pub struct NamedFrame {
     pub fields: Vec<DeviceField>,
 }
 
-/// A field of a device's frame. Tables of commands are left out: the field is unused instead.
+/// A field of a device's frame. Its `spec` has no table of commands: the field is unused there, and
+/// `commands` has them.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DeviceField {
     /// Name; empty for what needs none.
@@ -132,12 +133,21 @@ pub struct DeviceField {
     pub spec: FieldSpec,
     /// It is a second use of the bytes of the field before, under the same name.
     pub repeats: bool,
-    /// Its value picks a command.
-    pub picks_commands: bool,
+    /// The commands that its values pick.
+    pub commands: Option<FieldCommands>,
     /// It is the coil of Modbus function 5, which is FF for 1.
     pub is_coil: bool,
     /// The port whose health it shows, if that is not the port that sends it.
     pub of_port: Option<String>,
+}
+
+/// The commands that the values of a field pick.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct FieldCommands {
+    /// When a value takes effect.
+    pub when: CommandWhen,
+    /// First and last value, and the command; an empty one is that of idle values.
+    pub entries: Vec<(i64, i64, String)>,
 }
 
 impl NamedFrame {

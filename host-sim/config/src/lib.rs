@@ -11,7 +11,9 @@ mod functions;
 mod sim;
 mod target;
 
-pub use device::{AnyRecipe, DeviceField, DeviceRecipe, ExchangeKind, FrameEnds, NamedExchange, NamedFrame};
+pub use device::{
+    AnyRecipe, DeviceField, DeviceRecipe, ExchangeKind, FieldCommands, FrameEnds, NamedExchange, NamedFrame,
+};
 pub use file::function_name;
 pub use functions::{
     FUNCTION_INPUTS, FUNCTION_OUTPUTS, Function, FunctionInput, FunctionOutput, Functions, ShownState,

@@ -11,11 +11,11 @@ use proto_core::sysvar::{Direction, SysVar};
 use proto_core::time::Duration;
 use proto_core::wire::can::CanId;
 
-use super::{Overrides, conversation, frame, plan, text};
+use super::{Overrides, conversation, frame, plan, text, values};
 use recipe_config::file::{self, Config, FileError};
 use recipe_config::{
-    AnyRecipe, Function, Functions, ShownState, SimBus, SimConfig, SimField, SimParts, SimPort, SimRecipe,
-    SimStreamPart,
+    AnyRecipe, DeviceRecipe, Function, Functions, ShownState, SimBus, SimConfig, SimField, SimParts, SimPort,
+    SimRecipe, SimStreamPart,
 };
 use recipe_controller::{BuildError, Controller};
 
@@ -39,7 +39,10 @@ pub(super) fn run(args: &CheckArgs, out: &mut dyn Write) -> Result<(), String> {
     .map_err(|error| error.to_string())?;
     let name = args.file.display();
     let report = match &config {
-        Config::Gateway(config) => format!("{name}: a valid gateway file\n\n{}", gateway(config, &recipes)),
+        Config::Gateway(config) => {
+            let frames = file::load_frames(&args.file, overrides).map_err(|error| error.to_string())?;
+            format!("{name}: a valid gateway file\n\n{}", gateway(config, &recipes, &frames))
+        }
         Config::Controller(config) => format!("{name}: a valid controller file\n\n{}", controller(config)),
     };
     write!(out, "{report}").map_err(|error| error.to_string())
@@ -83,7 +86,7 @@ fn check_build(path: &Path, overrides: &[String], config: &SimConfig) -> Result<
 }
 
 /// The report on a gateway file.
-fn gateway(config: &GatewayConfig, recipes: &[AnyRecipe]) -> String {
+fn gateway(config: &GatewayConfig, recipes: &[AnyRecipe], frames: &[Option<DeviceRecipe>]) -> String {
     let link = &config.controller;
     let mut report = format!(
         "controller {} ({}): command {}, state {}, Modbus {}\n",
@@ -105,18 +108,21 @@ fn gateway(config: &GatewayConfig, recipes: &[AnyRecipe]) -> String {
             Bus::UdpListen { listen } => format!("the controller's UDP client sends to {listen}"),
         };
         report += &format!("\nport {}: {bus}, recipe {name}\n", port.name);
+        let frames = frames.get(usize::from(port.recipe)).and_then(Option::as_ref);
         // On a field port input comes from the devices, on a listening port from the controller.
         for part in [Direction::Input, Direction::Output] {
             if let Some(budget) = config.view().budget(port, part) {
                 report += &show_budget(part, budget, port.cycle);
-                if let Some(AnyRecipe::Device(recipe)) = recipe {
+                if let Some(recipe) = frames {
                     report += &frame::show(recipe, part);
                 }
             }
         }
-        if let Some(AnyRecipe::Device(recipe)) = recipe {
+        if let Some(recipe) = frames {
             report += &conversation::show(config, port, recipe);
+            report += &values::show_commands(recipe);
         }
+        report += &values::show_times(config, port);
         if port.safe_at_start {
             report += "  safe values from the start until the device speaks\n";
         }

@@ -9,7 +9,7 @@ use proto_core::sysvar::Direction;
 use proto_core::wire::scalar::ScalarType;
 use recipe_config::{DeviceField, DeviceRecipe, FrameEnds, NamedFrame};
 
-use super::text;
+use super::{scale, text};
 
 /// One line of the picture.
 struct Row {
@@ -84,9 +84,13 @@ fn rows(frame: &NamedFrame, laid_out: &DeviceFrame, part: Direction) -> Vec<Row>
                 };
                 add(place, "padding", what);
             }
-            FieldSpec::TextInput { text, to, .. } => {
-                let to = to.map(|words| format!(" -> {}", show_words(words)));
-                add(place, &field.name, show_text(&text) + to.as_deref().unwrap_or(""));
+            FieldSpec::TextInput { text, to, ignored, .. } => {
+                let to = to.map_or(String::new(), |words| format!(" -> {}", show_words(words)));
+                let ignored: Vec<_> =
+                    ignored.iter().map(|text| format!("{:?}", String::from_utf8_lossy(text))).collect();
+                let but =
+                    if ignored.is_empty() { String::new() } else { format!(", but {}", ignored.join(", ")) };
+                add(place, &field.name, format!("{}{to}{but}", show_text(&text)));
             }
             FieldSpec::TextOutput { text, from, .. } => {
                 add(place, &field.name, format!("{} <- {}", show_text(&text), show_words(from)));
@@ -97,7 +101,7 @@ fn rows(frame: &NamedFrame, laid_out: &DeviceFrame, part: Direction) -> Vec<Row>
             }
             spec => {
                 let Some(encoding) = spec.element().and_then(|element| element.encoding()) else { continue };
-                let uses = if field.picks_commands { " -> commands".to_owned() } else { show_use(field) };
+                let uses = if field.commands.is_some() { " -> commands".to_owned() } else { show_use(field) };
                 add(place, &field.name, show_encoding(&encoding) + uses.as_str());
             }
         }
@@ -208,18 +212,20 @@ fn show_use(field: &DeviceField) -> String {
     }
     match (*spec, spec.variable()) {
         (FieldSpec::Fixed { value, .. }, _) => format!(" = {value}"),
-        (FieldSpec::UserInput { .. } | FieldSpec::DeviceInput { .. }, Some(var)) => format!(" -> {var}"),
-        (_, Some(var)) => format!(" <- {var}"),
+        (FieldSpec::UserInput { to, .. } | FieldSpec::DeviceInput { to, .. }, Some(var)) => {
+            format!(" -> {var}{}", scale::of_input(spec, &to))
+        }
+        (_, Some(var)) => format!(" <- {var}{}", scale::of_output(spec)),
         (FieldSpec::UserOutput { from, .. } | FieldSpec::DeviceOutput { from, .. }, None) => match from {
             OutputBinding::Constant(value) => format!(" = {value}"),
             OutputBinding::Counter => " <- counter".into(),
             OutputBinding::CounterTo { max } => format!(" <- counter, 0..{max}"),
             OutputBinding::Reply => " <- reply".into(),
-            OutputBinding::State { value, .. } => format!(" <- {value}"),
-            OutputBinding::Port { value, .. } => match &field.of_port {
-                Some(port) => format!(" <- {} of port {port}", value.name()),
-                None => format!(" <- {} of the port", value.name()),
-            },
+            OutputBinding::State { value, .. } => format!(" <- {value}{}", scale::of_output(spec)),
+            OutputBinding::Port { value, .. } => {
+                let of = field.of_port.as_ref().map_or("the port".to_owned(), |port| format!("port {port}"));
+                format!(" <- {} of {of}{}", value.name(), scale::of_output(spec))
+            }
             OutputBinding::Variable { .. } | OutputBinding::Bit { .. } => String::new(),
         },
         _ => String::new(),

@@ -13,8 +13,10 @@ mod image;
 mod log;
 mod new;
 mod plan;
+mod scale;
 mod soak;
 mod text;
+mod values;
 
 use std::io::{self, Write};
 use std::path::PathBuf;

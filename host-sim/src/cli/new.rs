@@ -83,7 +83,7 @@ fn nearest(name: &str) -> Vec<&'static str> {
     if !found.is_empty() && !wanted.is_empty() {
         return found;
     }
-    let distances = ALL.iter().map(|template| (distance(&wanted, template.name), template.name));
+    let distances = ALL.iter().map(|template| (strsim::levenshtein(&wanted, template.name), template.name));
     let best = distances.clone().map(|(distance, _)| distance).min().unwrap_or(usize::MAX);
     if best > wanted.len() / 2 {
         return Vec::new();
@@ -91,34 +91,9 @@ fn nearest(name: &str) -> Vec<&'static str> {
     distances.filter(|(distance, _)| *distance == best).map(|(_, name)| name).collect()
 }
 
-/// The number of characters to insert, remove or replace until `a` is `b` (Levenshtein).
-fn distance(a: &str, b: &str) -> usize {
-    let b: Vec<char> = b.chars().collect();
-    // The distances of what was read of `a` to each beginning of `b`.
-    let mut row: Vec<usize> = (0..=b.len()).collect();
-    for (read, a) in a.chars().enumerate() {
-        let mut diagonal = row[0];
-        row[0] = read + 1;
-        for (at, &b) in b.iter().enumerate() {
-            let replaced = diagonal + usize::from(a != b);
-            diagonal = row[at + 1];
-            row[at + 1] = replaced.min(row[at] + 1).min(diagonal + 1);
-        }
-    }
-    row[b.len()]
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn distances_count_inserted_removed_and_replaced_characters() {
-        assert_eq!(distance("", "abc"), 3);
-        assert_eq!(distance("abc", ""), 3);
-        assert_eq!(distance("kitten", "sitting"), 3);
-        assert_eq!(distance("robotic-ft300", "robotiq-ft300"), 1);
-    }
 
     #[test]
     fn near_names_are_those_that_contain_it_or_else_the_closest() {

@@ -27,7 +27,7 @@
 #define RGW_MAX_EXCHANGES 16
 
 // Memory for a gateway, in bytes: enough on every machine.
-#define RGW_GATEWAY_SIZE 49152
+#define RGW_GATEWAY_SIZE 50176
 
 // Number of the link to port 2000.
 #define RGW_LINK_COMMAND 0
@@ -380,6 +380,8 @@ typedef struct rgw_port_counters {
   uint32_t masked;
   // Accepted frames whose alive counter is not the next one: frames between are missing.
   uint32_t counter_jumps;
+  // Frames with a text that is ignored, such as that of a scanner that read nothing.
+  uint32_t ignored;
   // Bit values replaced by newer ones because the queue of edges was full.
   uint32_t edges_lost;
   // Values dropped before they were written: older than the port's timeout, or waiting for a link

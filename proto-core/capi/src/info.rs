@@ -75,6 +75,8 @@ pub struct PortCounters {
     pub masked: u32,
     /// Accepted frames whose alive counter is not the next one: frames between are missing.
     pub counter_jumps: u32,
+    /// Frames with a text that is ignored, such as that of a scanner that read nothing.
+    pub ignored: u32,
     /// Bit values replaced by newer ones because the queue of edges was full.
     pub edges_lost: u32,
     /// Values dropped before they were written: older than the port's timeout, or waiting for a link
@@ -156,7 +158,7 @@ impl From<&engine::PortCounters> for PortCounters {
                 rejected_not_finite rejected_out_of_range rejected_id rejected_length rejected_remote
                 rejected_checksum rejected_unreadable rejected_other_device rejected_counter
                 rejected_no_input
-                tail_mismatches resync_bytes discarded_bytes asleep masked counter_jumps
+                tail_mismatches resync_bytes discarded_bytes asleep masked counter_jumps ignored
                 edges_lost values_expired undelivered withheld
                 skipped_cycles stale_cycles unanswered refused timeouts downs bus_offs
                 commands commands_dropped commands_unknown commands_based

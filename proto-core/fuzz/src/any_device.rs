@@ -7,8 +7,8 @@ use proto_core::config::{
     OutputBinding, Parts, PortValue, Span, StateValue, StreamPart, Talk, Words,
 };
 use proto_core::device::{
-    Algorithm, Bits, Boundary, ByteOrder, Checksum, Counts, Encoding, Escape, Kind, Length, Overflow, Text,
-    TextWidth,
+    Algorithm, Bits, Boundary, ByteOrder, Checksum, Counts, Encoding, Escape, Ignored, Kind, Length,
+    Overflow, Text, TextWidth,
 };
 use proto_core::modbus::rtu::{Operation, Table};
 use proto_core::recipe::model::Mode;
@@ -185,7 +185,7 @@ fn text(input: &mut Source<'_>, direction: Direction, width: TextWidth) -> Field
     match direction {
         Direction::Input => {
             let to = Some(words(input, direction, 2));
-            FieldSpec::TextInput { text, to, length_to: None, count_to: None }
+            FieldSpec::TextInput { text, to, length_to: None, count_to: None, ignored: Ignored::NONE }
         }
         Direction::Output => {
             FieldSpec::TextOutput { text, from: words(input, direction, 2), length_from: None }

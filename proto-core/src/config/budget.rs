@@ -5,7 +5,7 @@
 
 use core::fmt;
 
-use super::{Bus, ConfigView, FieldSpec, Parity, Parts, Port, Recipe, Rs485, Span};
+use super::{Bus, ConfigView, Exchange, FieldSpec, Parity, Parts, Port, Recipe, Rs485, Span};
 use crate::modbus::rtu::{Echo, Slave, Timing};
 use crate::sysvar::{Direction, SysVar};
 use crate::time::Duration;
@@ -109,7 +109,8 @@ impl<'c> ConfigView<'c> {
 
     /// What is valid but may not do what was intended.
     pub fn warnings(self) -> impl Iterator<Item = Warning> + 'c {
-        self.slow_ports().chain(self.exchanges()).chain(self.read_back()).chain(self.unused_recipes())
+        let lines = self.slow_ports().chain(self.exchanges());
+        lines.chain(self.advice()).chain(self.read_back()).chain(self.unused_recipes())
     }
 
     fn slow_ports(self) -> impl Iterator<Item = Warning> + 'c {
@@ -146,6 +147,12 @@ impl<'c> ConfigView<'c> {
         (0..)
             .zip(self.recipes)
             .filter_map(move |(recipe, _)| (!is_used(recipe)).then_some(Warning::Unused { recipe }))
+    }
+
+    /// Whether the gateway answers the recipe's exchanges as a slave.
+    fn is_slave(self, recipe: u8) -> bool {
+        let recipe = self.recipes.get(usize::from(recipe));
+        recipe.is_some_and(|recipe| self.exchanges_of(recipe).iter().any(Exchange::is_served))
     }
 
     /// `warning` with the names of its recipes and ports.
@@ -185,6 +192,33 @@ pub enum Warning {
         timeout: Duration,
         /// The longest period.
         every: Duration,
+    },
+    /// The address of an exchange or block of Modbus looks like a manual's number, such as 40005, which
+    /// counts from 40001.
+    ManualAddress {
+        /// The recipe.
+        recipe: u8,
+        /// Index of the exchange in the recipe.
+        exchange: u8,
+        /// The address as it is configured.
+        number: u16,
+        /// The address on the line, if it is such a number.
+        address: u16,
+    },
+    /// A bit stops the robot only when it changes to 1.
+    StopOnEdge {
+        /// The recipe.
+        recipe: u8,
+        /// Index of the command.
+        entry: u16,
+    },
+    /// Commands of a device that nobody asks are forgotten by a short silence: the next value picks
+    /// none.
+    ForgetsBase {
+        /// The port.
+        port: u8,
+        /// Its timeout.
+        timeout: Duration,
     },
     /// A way up carries a variable that no port writes: it is read back from the state stream and
     /// sent on, so for 100 ms a change made by somebody else can be undone.
@@ -232,6 +266,35 @@ impl fmt::Display for DescribedWarning<'_> {
                      so it is sent back to back and cycles are skipped"
                 )
             }
+            Warning::ManualAddress { recipe, exchange, number, address } => {
+                let (name, nth) = (recipe_name(recipe), u16::from(exchange).saturating_add(1));
+                let exchange = match self.config.is_slave(recipe) {
+                    true => "block",
+                    false => "exchange",
+                };
+                write!(
+                    f,
+                    "recipe {name:?}, {exchange} {nth}: {number} looks like the number of a manual that counts from \
+                     {}; if it is, write {address}, the address on the line",
+                    u32::from(number).saturating_sub(u32::from(address))
+                )
+            }
+            Warning::StopOnEdge { recipe, entry } => {
+                let command = self.config.commands.get(usize::from(entry));
+                let text = command.map_or("", |command| command.text.as_str());
+                write!(
+                    f,
+                    "recipe {:?}: {text:?} is given only when its bit changes, so a button that is held at the start \
+                     or after a silence stops nothing; commands = {{ level = {text:?} }} stops as long as the bit is 1",
+                    recipe_name(recipe)
+                )
+            }
+            Warning::ForgetsBase { port, timeout } => write!(
+                f,
+                "port {:?}: after {timeout} without a frame, the next value picks no command; for a device that \
+                 sends less often set a longer timeout_ms, for one that sends only changes base = \"keep\" as well",
+                port_name(port)
+            ),
             Warning::ReadBack { recipe, var } => write!(
                 f,
                 "recipe {:?} carries {var}, which no port writes: it is read back from the controller and sent on, \

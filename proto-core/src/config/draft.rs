@@ -362,7 +362,7 @@ impl<'a, B> PortBuilder<'a, B> {
     }
 
     /// The timeout: after this long without an accepted frame the port's inputs take their safe
-    /// values.
+    /// values; [`Port::NEVER`](super::Port::NEVER) for a device that sends only events.
     pub fn timeout(mut self, timeout: Duration) -> Self {
         self.timeout = Some(timeout);
         self

@@ -8,6 +8,7 @@
 
 mod add;
 mod add_exchange;
+mod advice;
 mod ask;
 mod budget;
 mod builder;

@@ -21,7 +21,8 @@ pub struct Port {
     pub recipe: u8,
     /// How often the output part is sent; at least 4 ms.
     pub cycle: Duration,
-    /// After this long without an accepted frame the port's inputs take their safe values.
+    /// After this long without an accepted frame the port's inputs take their safe values;
+    /// [`Port::NEVER`] for a device that sends only events.
     pub timeout: Duration,
     /// The safe values that inputs take then; inputs without a safe value hold.
     pub on_timeout: Span,
@@ -36,6 +37,10 @@ pub struct Port {
 }
 
 impl Port {
+    /// The timeout of a port that is never overdue: it works from the start, and its values hold. A
+    /// hundred years, so that instants behind it can still be told from no instant at all.
+    pub const NEVER: Duration = Duration::from_secs(100 * 365 * 86_400);
+
     /// A port with the file's defaults: a cycle of 4 ms, a timeout of 100 ms, stale after 500 ms, and
     /// inputs that hold, also at the start.
     pub const fn new(name: Name, bus: Bus, recipe: u8) -> Self {

@@ -7,7 +7,7 @@ use heapless::{String, Vec};
 
 use super::walk::{PartFrames, Variables};
 use super::{Delimiter, Name, PortValue, StateValue};
-use crate::device::{Boundary, ByteOrder, Checksum, Encoding, Escape, Length, Overflow, Text};
+use crate::device::{Boundary, ByteOrder, Checksum, Encoding, Escape, Ignored, Length, Overflow, Text};
 use crate::recipe::model::{Field, MAX_CAN_IDS, Mode};
 use crate::sysvar::{Direction, SysVar, VarBit};
 use crate::wire::can::CanId;
@@ -203,6 +203,8 @@ pub enum FieldSpec {
         length_to: Option<SysVar>,
         /// The variable that counts the frames accepted, so that the same text twice is seen.
         count_to: Option<SysVar>,
+        /// A frame with one of these shows that the device is there; nothing of it is taken.
+        ignored: Ignored,
     },
     /// A text of a device's output frame.
     TextOutput {

@@ -134,7 +134,9 @@ impl<'c> ConfigView<'c> {
             }
         }
         check_cycle(port.cycle).map_err(|kind| ConfigError { place: at(PortKey::Cycle), kind })?;
-        check_time(at(PortKey::Timeout), port.timeout, MAX_TIME)?;
+        if port.timeout != Port::NEVER {
+            check_time(at(PortKey::Timeout), port.timeout, MAX_TIME)?;
+        }
         check_time(at(PortKey::StaleAfter), port.stale_after, MAX_TIME)?;
         check_pool(at(PortKey::OnTimeout), port.on_timeout, self.safe_values.len())?;
         if port.safe_at_start && port.on_timeout.len == 0 {

@@ -56,6 +56,7 @@ mod cutter;
 mod encoding;
 mod escape;
 mod framer;
+mod ignored;
 mod layout;
 mod order;
 mod text;
@@ -65,6 +66,7 @@ pub use cutter::{Boundary, Cutter, Piece};
 pub use encoding::{Bits, Digits, Encoding, Kind, MAX_DIGITS, Overflow, Unreadable, Width};
 pub use escape::Escape;
 pub use framer::{Found, Framer, FramerStats};
+pub use ignored::{Ignored, MAX_IGNORED};
 pub use layout::{
     Carrier, Checksum, DataId, Element, FrameLayout, LayoutError, MAX_CHECKSUM, MAX_DATA_ID, Part, Place,
     Probe,

@@ -256,7 +256,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 bindings,
                 overdue_at: if port.safe_at_start { Instant::ZERO } else { Instant::NEVER },
                 timeout: port.timeout,
-                is_expected,
+                is_expected: is_expected && port.timeout != Port::NEVER,
             };
             let group = GroupId(self.store.frames.len() as u8);
             self.store
@@ -451,6 +451,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let owners = writes.iter().flat_map(|var| plan.owners(var));
         let timeouts =
             owners.filter_map(|port| config.ports.get(usize::from(port.0))).map(|port| port.timeout);
+        // A port whose values are never too old has no say in it.
+        let timeouts = timeouts.filter(|timeout| *timeout != Port::NEVER);
         let patience = timeouts.min().unwrap_or(PATIENCE).max(PATIENCE);
         let uplink = Uplink::new(UplinkSetup {
             id,

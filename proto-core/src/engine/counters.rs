@@ -49,6 +49,8 @@ pub struct PortCounters {
     pub masked: u32,
     /// Accepted frames whose alive counter is not the next one: frames between are missing.
     pub counter_jumps: u32,
+    /// Frames with a text that is ignored, such as that of a scanner that read nothing.
+    pub ignored: u32,
     /// Bit values replaced by newer ones because the queue of edges was full.
     pub edges_lost: u32,
     /// Values dropped before they were written: older than the port's timeout, or waiting for a

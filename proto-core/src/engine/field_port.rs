@@ -251,13 +251,21 @@ impl FieldPort {
         let mut accepted = Accepted::default();
         let verdict = self.take_can(frame, bindings, store, commands, &mut accepted);
         tap.record(|| came(self.id, now, verdict, Some(frame.id()), [frame.data(), &[], &[]]));
-        // On a shared bus, frames for others are no news.
         if let Err(why) = verdict
-            && (why != Rejection::ForeignId || self.last_rejection.is_none())
+            && self.is_news(why)
         {
             keep(&mut self.last_rejection, why, Some(frame.id()), frame.data(), now);
         }
         accepted
+    }
+
+    /// Whether a rejected CAN frame is worth keeping. On a shared bus, frames for others are not, unless
+    /// none of the recipe's ids has ever come: then the id may be the one that was meant.
+    #[inline]
+    pub(super) fn is_news(&self, why: Rejection) -> bool {
+        let may_be_meant =
+            |last: &LastRejection| self.counters.frames_in == 0 && last.why == Rejection::ForeignId;
+        why != Rejection::ForeignId || self.last_rejection.as_ref().is_none_or(may_be_meant)
     }
 
     #[inline(always)]

@@ -177,7 +177,15 @@ impl<const PORTS: usize> Store<PORTS> {
         set
     }
 
-    /// The same, on its own, where it matters less.
+    /// A frame came and says nothing: its values stay as they are, and it is not overdue.
+    #[cold]
+    pub(super) fn not_overdue(&mut self, nth: usize) {
+        let Some(frame) = self.frames.get_mut(nth) else { return };
+        frame.overdue_at = self.now + frame.timeout;
+        self.next_overdue = Stamp::at(self.next_overdue.get().min(frame.overdue_at));
+    }
+
+    /// [`Self::accepted`], on its own, where it matters less.
     #[inline(never)]
     pub(super) fn accepted_apart(&mut self, nth: usize, counters: &mut PortCounters) -> InputSet {
         self.accepted(nth, counters)

@@ -419,9 +419,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let (inputs, view) = (&self.bindings.inputs, self.exchanges.view());
         let verdict = port.talk_frame(frame, inputs, store, command, view, &mut accepted);
         self.tap.record(|| came(id, now, verdict, Some(frame.id()), [frame.data(), &[], &[]]));
-        // On a shared bus, frames for others are no news.
         if let Err(why) = verdict
-            && (why != Rejection::ForeignId || port.last_rejection.is_none())
+            && port.is_news(why)
         {
             keep(&mut port.last_rejection, why, Some(frame.id()), frame.data(), now);
         }

@@ -16,7 +16,7 @@ use super::store::Store;
 use super::tap::Tap;
 use super::user::{InputBind, OutputBind, number_of};
 use crate::config::{ConfigView, FieldSpec, Span, Words};
-use crate::device::{ByteOrder, Cutter, Escape, FrameLayout, Framer, Piece, Probe};
+use crate::device::{ByteOrder, Cutter, Escape, FrameLayout, Framer, Ignored, Piece, Probe};
 use crate::image::{Image, bind_to_variable};
 use crate::modbus::rtu::Slave;
 use crate::sysvar::{Direction, SysVar};
@@ -77,6 +77,7 @@ pub(super) struct TextBind {
     pub words: Option<Words>,
     pub length: Option<SysVar>,
     pub count: Option<SysVar>,
+    pub ignored: Ignored,
 }
 
 /// The texts of a recipe, whose bindings begin at these places.
@@ -89,12 +90,16 @@ pub(super) fn texts_of(
     for (direction, start) in [Direction::Input, Direction::Output].into_iter().zip(starts) {
         let fields = config.fields_of(recipe, direction).map(|(_, _, field)| field);
         for (binding, field) in (start..).zip(fields.filter(|field| field.element().is_some())) {
-            let (words, length, count) = match *field {
-                FieldSpec::TextInput { to, length_to, count_to, .. } => (to, length_to, count_to),
-                FieldSpec::TextOutput { from, length_from, .. } => (Some(from), length_from, None),
+            let (words, length, count, ignored) = match *field {
+                FieldSpec::TextInput { to, length_to, count_to, ignored, .. } => {
+                    (to, length_to, count_to, ignored)
+                }
+                FieldSpec::TextOutput { from, length_from, .. } => {
+                    (Some(from), length_from, None, Ignored::NONE)
+                }
                 _ => continue,
             };
-            texts.push(TextBind { direction, binding, words, length, count }).ok()?;
+            texts.push(TextBind { direction, binding, words, length, count, ignored }).ok()?;
         }
     }
     Some(texts)
@@ -180,6 +185,17 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
             }
         }
         Ok(())
+    }
+
+    /// Whether one of the texts of an input frame says that there is nothing to say.
+    pub(super) fn is_ignored(&self, texts: &[TextBind], format: &DeviceFormat, frame: &[u8]) -> bool {
+        let bindings = format.bindings.of(self.bindings);
+        let mut may_be =
+            texts_in(texts, format.bindings, Direction::Input).filter(|(_, text)| !text.ignored.is_empty());
+        may_be.any(|(at, text)| {
+            let found = format.layout.text(elements(bindings), frame, at);
+            found.is_some_and(|found| text.ignored.has(found))
+        })
     }
 
     /// Puts all texts of an input frame into their variables.

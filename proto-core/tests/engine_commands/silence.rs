@@ -2,7 +2,7 @@
 
 use super::*;
 use proto_core::engine::{BusState, Input, PortState};
-use proto_core::time::Duration;
+use proto_core::time::{Duration, Instant};
 use proto_core::wire::scalar::ScalarType as T;
 
 /// A port that is overdue after 200 ms, with a safe value.
@@ -147,4 +147,37 @@ fn every_other_reason_is_told_too() {
     rig.input(Input::Tick);
     let texts: Vec<_> = NotGiven::ALL.map(NotGiven::text).to_vec();
     assert!(texts.iter().all(|text| texts.iter().filter(|other| *other == text).count() == 1));
+}
+
+#[test]
+fn a_port_that_is_never_overdue_works_from_the_start_and_forgets_nothing() {
+    let mut cell = Cell::new();
+    let table = cell.commands(&[(1, "run(pick.jspf)")]);
+    let lamp = InputBinding::Variable { var: var("WordInputReg[1]"), scale: 1.0, offset: 0.0 };
+    let order = InputBinding::Commands { table, when: CommandWhen::Change };
+    let port = panel(&mut cell, &[user_in(T::Byte, order), user_in(T::Byte, lamp)]);
+    cell.last_port().timeout = Port::NEVER;
+    cell.0.validate().unwrap();
+    let mut rig = cell.rig();
+    rig.run(MS(1_000));
+    let overdue = |rig: &Rig| rig.engine.status(rig.now).ports().next().unwrap().overdue;
+    assert_eq!((state(&rig), overdue(&rig)), (PortState::Working, 0), "nothing came, and nothing is missed");
+    rig.bytes(port, &[0xA5, 0, 9]);
+    rig.run(MS(20_000));
+    assert_eq!((state(&rig), overdue(&rig), rig.counters(port).timeouts), (PortState::Working, 0, 0));
+    assert_eq!(rig.map.registers[8], 9);
+    rig.bytes(port, &[0xA5, 1, 9]);
+    assert_eq!(sent(&mut rig, LinkId::COMMAND), ["run(pick.jspf)"], "the base is that of the frame before");
+}
+
+#[test]
+fn never_is_no_instant_of_its_own() {
+    let fifty_years = Instant::from_micros(50 * 365 * 86_400_000_000);
+    assert!(fifty_years + Port::NEVER < Instant::NEVER);
+    let mut cell = Cell::new();
+    panel(&mut cell, &[user_in(T::Byte, InputBinding::Unused)]);
+    for (timeout, is_valid) in [(Port::NEVER, true), (Duration::MAX, false), (MS(3_600_001), false)] {
+        cell.last_port().timeout = timeout;
+        assert_eq!(cell.0.validate().is_ok(), is_valid, "{timeout}");
+    }
 }

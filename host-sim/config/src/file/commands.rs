@@ -6,6 +6,7 @@
 use proto_core::config::CommandWhen;
 
 use super::reader::{Item, Reader, Result, Spot};
+use crate::device::FieldCommands;
 
 /// The keys of a field that belong to its commands.
 pub(super) const KEYS: [&str; 3] = ["when", "base", "idle"];
@@ -14,6 +15,14 @@ pub(super) const KEYS: [&str; 3] = ["when", "base", "idle"];
 pub(super) struct FileCommands {
     pub(super) entries: Vec<FileCommand>,
     pub(super) when: CommandWhen,
+}
+
+impl FileCommands {
+    /// The same without places, for tools that show them.
+    pub(super) fn named(&self) -> FieldCommands {
+        let entries = self.entries.iter().map(|entry| (entry.first, entry.last, entry.text.clone()));
+        FieldCommands { when: self.when, entries: entries.collect() }
+    }
 }
 
 /// What a range of values picks.

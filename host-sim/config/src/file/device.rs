@@ -17,6 +17,7 @@ use super::bindings::{self, FileInput, FileOutput};
 use super::encoding::{self, OpenNumber, Order, refuse};
 use super::exchanges::FileExchange;
 use super::framings;
+use super::names::meant_checksum;
 use super::reader::{Item, Reader, Result};
 use super::recipes::{FileField, FileFieldKind, FileFrame, FilePart, FileRecipe, Flavour, Written};
 use super::rtu_frames;
@@ -338,11 +339,11 @@ fn read_algorithm(table: &Reader<'_>) -> Result<Algorithm> {
     let name = kind.string()?;
     if name != "crc" {
         let algorithm = Algorithm::named(name).ok_or_else(|| {
-            let known: Vec<_> = Algorithm::names().map(|name| format!("{name:?}")).collect();
-            kind.error(format!(
-                "{name:?} is unknown; allowed: {}, \"crc\" (with its parameters)",
-                known.join(", ")
-            ))
+            let known: Vec<_> = Algorithm::names().collect();
+            let shown: Vec<_> = known.iter().map(|name| format!("{name:?}")).collect();
+            let meant = meant_checksum(name, &known);
+            let shown = shown.join(", ");
+            kind.error(format!("{name:?} is unknown; allowed: {shown}, \"crc\" (with its parameters){meant}"))
         })?;
         table.check_keys(&PLACE, &format!(" with kind = {name:?}"))?;
         return Ok(algorithm);
@@ -582,11 +583,13 @@ impl FileRecipe {
 impl FileField {
     fn named(&self) -> DeviceField {
         let repeats = matches!(self.kind, FileFieldKind::UserInput { again: true, .. });
-        let picks_commands =
-            matches!(self.kind, FileFieldKind::UserInput { to: FileInput::Commands { .. }, .. });
+        let commands = match &self.kind {
+            FileFieldKind::UserInput { to: FileInput::Commands(commands), .. } => Some(commands.named()),
+            _ => None,
+        };
         let of_port = self.port_named().map(|(_, name, _)| name.to_owned());
         let (name, spec) = (self.name(), self.spec());
-        DeviceField { name, spec, repeats, picks_commands, is_coil: false, of_port }
+        DeviceField { name, spec, repeats, commands, is_coil: false, of_port }
     }
 
     /// What the field is, without a table of commands.

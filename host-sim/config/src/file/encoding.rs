@@ -5,6 +5,7 @@
 use proto_core::device::{Bits, ByteOrder, Digits, Encoding, Kind, MAX_DIGITS, Width};
 use proto_core::wire::scalar::ScalarType;
 
+use super::names::meant_type;
 use super::reader::{Item, Reader, Result};
 
 /// The keys that say how a field is written.
@@ -93,12 +94,22 @@ pub(super) fn read_plain_type(field: &Reader<'_>) -> Result<ScalarType> {
         );
     }
     let types: Vec<_> = ScalarType::ALL.into_iter().map(|ty| (ty.name(), ty)).collect();
-    item.choice(&types)
+    choose(&item, &types)
 }
 
 fn read_type(field: &Reader<'_>) -> Result<Type> {
     let scalars = ScalarType::ALL.into_iter().map(|ty| (ty.name(), Type::Scalar(ty)));
-    read_type_item(field)?.choice(&scalars.chain(OWN_TYPES).collect::<Vec<_>>())
+    choose(&read_type_item(field)?, &scalars.chain(OWN_TYPES).collect::<Vec<_>>())
+}
+
+fn choose<T: Clone>(item: &Item<'_>, types: &[(&str, T)]) -> Result<T> {
+    item.choice(types).map_err(|mut error| {
+        if let Some(text) = item.as_string() {
+            let names: Vec<_> = types.iter().map(|(name, _)| *name).collect();
+            error.message += &meant_type(text, &names);
+        }
+        error
+    })
 }
 
 fn read_type_item<'a>(field: &Reader<'a>) -> Result<Item<'a>> {

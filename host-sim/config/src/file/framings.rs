@@ -3,7 +3,9 @@
 //! In: the tables of a part and of its fields. Out: the configuration's own types.
 
 use proto_core::config::{FieldSpec, Words};
-use proto_core::device::{Boundary, ByteOrder, Counts, Encoding, Escape, Length, MAX_TEXT, Text, TextWidth};
+use proto_core::device::{
+    Boundary, ByteOrder, Counts, Encoding, Escape, Ignored, Length, MAX_IGNORED, MAX_TEXT, Text, TextWidth,
+};
 use proto_core::sysvar::{Direction, SysVar, VarRange};
 
 use super::encoding::refuse;
@@ -12,14 +14,15 @@ use super::reader::{Item, Reader, Result};
 /// The keys of a stream part.
 pub(super) const PART_KEYS: [&str; 2] = ["framing", "escape"];
 /// The keys of a text and of a length, beside those that other fields have.
-pub(super) const FIELD_KEYS: [&str; 7] =
-    ["length_to", "count_to", "length_from", "order", "length", "counts", "plus"];
+pub(super) const FIELD_KEYS: [&str; 8] =
+    ["length_to", "count_to", "length_from", "order", "ignore", "length", "counts", "plus"];
 /// Those of a text.
-pub(super) const TEXT_KEYS: [&str; 4] = ["length_to", "count_to", "length_from", "order"];
+pub(super) const TEXT_KEYS: [&str; 5] = ["length_to", "count_to", "length_from", "order", "ignore"];
 /// The keys of a length, beside those that say how it is written.
 pub(super) const LENGTH_KEYS: [&str; 5] = ["name", "type", "length", "counts", "plus"];
 
-const TEXT_IN: [&str; 9] = ["name", "type", "width", "until", "fill", "order", "to", "length_to", "count_to"];
+const TEXT_IN: [&str; 10] =
+    ["name", "type", "width", "until", "fill", "order", "to", "length_to", "count_to", "ignore"];
 const TEXT_OUT: [&str; 8] = ["name", "type", "width", "until", "fill", "order", "from", "length_from"];
 
 /// `framing` and `escape` of a stream part.
@@ -74,6 +77,36 @@ pub(super) fn read_text(field: &Reader<'_>, direction: Direction) -> Result<Fiel
         to: to.map(|item| read_words(&item, order)).transpose()?,
         length_to: var("length_to")?,
         count_to: var("count_to")?,
+        ignored: field.optional("ignore").map_or(Ok(Ignored::NONE), |item| read_ignored(&item, width))?,
+    })
+}
+
+/// `ignore = ["NOREAD"]`: texts that a field of this width can have.
+fn read_ignored(item: &Item<'_>, width: TextWidth) -> Result<Ignored> {
+    let items = item.array("of texts, such as [\"NOREAD\"]")?;
+    let mut texts = Vec::new();
+    for item in &items {
+        let text = item.string()?;
+        if let Some(c) = text.chars().find(|c| !c.is_ascii()) {
+            return Err(item.error(format!("{c:?} is not ASCII; allowed: characters of one byte, 0..=127")));
+        }
+        match width {
+            _ if text.is_empty() => return Err(item.error("a text of no characters")),
+            TextWidth::Fixed(width) if text.len() > usize::from(width) => {
+                let len = text.len();
+                return Err(item.error(format!(
+                    "{len} characters, but the field has {width}: a frame with this text has another length and is \
+                     rejected; without width a field takes texts of any length"
+                )));
+            }
+            _ => texts.push(text.as_bytes()),
+        }
+    }
+    Ignored::new(&texts).ok_or_else(|| {
+        item.error(format!(
+            "too long; allowed: {} characters in one text, each further text takes one more",
+            MAX_IGNORED - 1
+        ))
     })
 }
 

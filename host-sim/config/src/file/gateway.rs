@@ -307,7 +307,15 @@ impl<'a> Builder<'a> {
         port.cycle = read_cycle(table)?;
         for (key, time) in [("timeout_ms", &mut port.timeout), ("stale_after_ms", &mut port.stale_after)] {
             if let Some(item) = table.optional(key) {
-                *time = item.time(1e3)?;
+                *time = match item.as_string() {
+                    Some("never") if key == "timeout_ms" => Port::NEVER,
+                    Some(_) if key == "timeout_ms" => {
+                        return Err(
+                            item.error("expected a number or \"never\", for a device that sends only events")
+                        );
+                    }
+                    _ => item.time(1e3)?,
+                };
             }
         }
         port.on_timeout = self.add_safe_values(table)?;

@@ -17,6 +17,7 @@ mod functions;
 mod gateway;
 mod lines;
 mod modbus;
+mod names;
 mod network;
 mod reader;
 mod recipes;
@@ -26,16 +27,17 @@ mod sources;
 use std::path::Path;
 
 use proto_core::config::GatewayConfig;
+use proto_core::recipe::model::Mode;
 use proto_core::wire::dialect::Dialect;
 
 pub use error::{FileError, Source};
 pub use modbus::function_name;
 
-use super::device::AnyRecipe;
+use super::device::{AnyRecipe, DeviceRecipe};
 use super::sim::SimConfig;
 use document::Document;
 use reader::{Item, Reader, Result};
-use recipes::Flavour;
+use recipes::{FileRecipe, Flavour};
 
 /// A file of either kind.
 #[derive(Debug, Clone, PartialEq)]
@@ -87,6 +89,20 @@ pub fn load_recipes(path: &Path, overrides: &[String]) -> Result<Vec<AnyRecipe>>
     with_text(path, |text| parse_recipes(text, overrides))
 }
 
+/// Reads the recipes of a file of either kind as frames with the names and bindings of their fields,
+/// those too that the controller can have; `None` for a recipe of system variables.
+///
+/// # Errors
+/// The first mistake in any of the recipes, with its place.
+pub fn load_frames(path: &Path, overrides: &[String]) -> Result<Vec<Option<DeviceRecipe>>> {
+    let read = |text: Text<'_>| {
+        let recipes = read_recipes(text, overrides)?;
+        let framed = |recipe: &FileRecipe| (recipe.mode == Mode::User).then(|| recipe.to_device());
+        Ok(recipes.iter().map(framed).collect())
+    };
+    with_text(path, read)
+}
+
 /// Same as [`load`], from a text.
 ///
 /// # Errors
@@ -132,6 +148,10 @@ pub fn parse_controller(text: Text<'_>, overrides: &[String]) -> Result<SimConfi
 /// # Errors
 /// The first mistake in any of the recipes, with its place.
 pub fn parse_recipes(text: Text<'_>, overrides: &[String]) -> Result<Vec<AnyRecipe>> {
+    Ok(read_recipes(text, overrides)?.iter().map(FileRecipe::named).collect())
+}
+
+fn read_recipes(text: Text<'_>, overrides: &[String]) -> Result<Vec<FileRecipe>> {
     let document = Document::parse(text.name, text.toml, overrides)?;
     let flavour = kind_of(&document)?;
     let keys: &[&str] = match flavour {
@@ -139,7 +159,7 @@ pub fn parse_recipes(text: Text<'_>, overrides: &[String]) -> Result<Vec<AnyReci
         Flavour::Controller => &controller::KEYS,
     };
     let root = Reader::root(&document, keys)?;
-    Ok(recipes::read_all(&root, flavour)?.iter().map(recipes::FileRecipe::named).collect())
+    recipes::read_all(&root, flavour)
 }
 
 /// A mistake found after the file was read, at the place of `key` (names; an item of an array by

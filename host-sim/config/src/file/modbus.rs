@@ -6,7 +6,7 @@
 
 use proto_core::config::{DeviceFrame, ExchangeError, ExchangeKey};
 use proto_core::device::Carrier;
-use proto_core::modbus::rtu::{BROADCAST, MAX_ADDRESS, Operation};
+use proto_core::modbus::rtu::{self, BROADCAST, MAX_ADDRESS, Operation};
 use proto_core::sysvar::Direction;
 
 use super::coils;
@@ -58,6 +58,18 @@ enum Table {
     InputRegisters,
 }
 
+impl Table {
+    /// As the protocol has it.
+    fn on_line(self) -> rtu::Table {
+        match self {
+            Self::Coils => rtu::Table::Coils,
+            Self::DiscreteInputs => rtu::Table::DiscreteInputs,
+            Self::HoldingRegisters => rtu::Table::HoldingRegisters,
+            Self::InputRegisters => rtu::Table::InputRegisters,
+        }
+    }
+}
+
 const TABLES: [(&str, Table); 4] = [
     ("coils", Table::Coils),
     ("discrete-inputs", Table::DiscreteInputs),
@@ -102,7 +114,7 @@ fn read_exchange(table: &Reader<'_>) -> Result<FileExchange> {
     if function != Function::ReadWriteRegisters {
         refuse(table, &["write_address"], "allowed only for read-write-registers, which has two addresses")?;
     }
-    let address = |key, what| table.required(key, what)?.integer::<u16>(0..=0xFFFF);
+    let address = |key, what| read_first(&table.required(key, what)?, function.table());
     let first = address("address", "the first register or coil, counted from 0 as on the line")?;
     let write_first = match function {
         Function::ReadWriteRegisters => address("write_address", "the first register that is written")?,
@@ -156,7 +168,7 @@ fn read_block(table: &Reader<'_>, peer: u8) -> Result<FileExchange> {
     let holds = table.required("table", "coils, discrete-inputs, holding-registers or input-registers")?;
     let holds = holds.choice_nearly(&TABLES)?;
     let first = table.required("address", "the first register or coil, counted from 0 as on the line")?;
-    let first = first.integer(0..=0xFFFF)?;
+    let first = read_first(&first, holds)?;
     let direction = direction_of(table, holds)?;
     let is_coils = matches!(holds, Table::Coils | Table::DiscreteInputs);
     let list = List::read(table, "fields", direction, is_coils)?;
@@ -188,6 +200,17 @@ fn read_block(table: &Reader<'_>, peer: u8) -> Result<FileExchange> {
         is_can: false,
         remote: false,
         timing: AskTiming::NEVER,
+    })
+}
+
+/// The address of the first register or coil. Manuals' numbers of six digits are no addresses.
+fn read_first(item: &Item<'_>, table: Table) -> Result<u16> {
+    item.integer(0..=0xFFFF).map_err(|mut error| {
+        let number = item.as_integer().and_then(|number| u32::try_from(number).ok());
+        if let Some(address) = number.and_then(|number| table.on_line().address_of_number(number)) {
+            error.message += &format!("; on the line, what a manual calls so has the address {address}");
+        }
+        error
     })
 }
 
@@ -324,6 +347,19 @@ fn check(
 }
 
 impl Function {
+    /// What it reads or writes.
+    fn table(self) -> Table {
+        match self {
+            Self::ReadCoils | Self::WriteCoil | Self::WriteCoils => Table::Coils,
+            Self::ReadDiscreteInputs => Table::DiscreteInputs,
+            Self::ReadInputRegisters => Table::InputRegisters,
+            Self::ReadHoldingRegisters
+            | Self::WriteRegister
+            | Self::WriteRegisters
+            | Self::ReadWriteRegisters => Table::HoldingRegisters,
+        }
+    }
+
     fn of_coils(self) -> bool {
         matches!(self, Self::ReadCoils | Self::ReadDiscreteInputs | Self::WriteCoil | Self::WriteCoils)
     }

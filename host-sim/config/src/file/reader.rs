@@ -4,6 +4,7 @@ use std::ops::RangeInclusive;
 
 use super::document::{At, Document, Node, Table, Value};
 use super::error::FileError;
+use super::names::did_you_mean;
 use proto_core::time::Duration;
 
 pub(super) type Result<T> = std::result::Result<T, FileError>;
@@ -58,11 +59,11 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// Same as [`Self::check_keys`]; says as well which of them is the nearest.
+    /// Same as [`Self::check_keys`]; says as well which of them was probably meant.
     pub(super) fn check_keys_nearly(&self, allowed: &[&str], when: &str) -> Result<()> {
         self.check_keys(allowed, when).map_err(|mut error| {
             let key = error.key.rsplit('.').next().unwrap_or("");
-            error.message += &nearest(key, allowed.iter().copied());
+            error.message += &did_you_mean(key, allowed.iter().copied());
             error
         })
     }
@@ -135,11 +136,11 @@ impl<'a> Item<'a> {
         }
     }
 
-    /// One of several strings; says as well which of them is the nearest.
+    /// One of several strings; says as well which of them was probably meant.
     pub(super) fn choice_nearly<T: Clone>(&self, choices: &[(&str, T)]) -> Result<T> {
         self.choice(choices).map_err(|mut error| {
             if let Some(text) = self.as_string() {
-                error.message += &nearest(text, choices.iter().map(|(name, _)| *name));
+                error.message += &did_you_mean(text, choices.iter().map(|(name, _)| *name));
             }
             error
         })
@@ -280,31 +281,6 @@ impl<'a> Item<'a> {
             None => Err(self.error(format!("{text:?} is unknown; allowed: {}", allowed()))),
         }
     }
-}
-
-/// The name that was probably meant, as the end of a message.
-pub(super) fn nearest<'n>(given: &str, names: impl Iterator<Item = &'n str>) -> String {
-    let near = names.map(|name| (distance(given, name), name)).min();
-    match near {
-        Some((changes, name)) if changes <= 1 + given.chars().count() / 4 => format!("; nearest: {name:?}"),
-        _ => String::new(),
-    }
-}
-
-/// How many characters must be added, removed or replaced.
-fn distance(one: &str, other: &str) -> usize {
-    let other: Vec<char> = other.chars().collect();
-    let mut row: Vec<usize> = (0..=other.len()).collect();
-    for (nth, a) in one.chars().enumerate() {
-        let mut before = row[0];
-        row[0] = nth + 1;
-        for (at, b) in other.iter().enumerate() {
-            let replaced = before + usize::from(a != *b);
-            before = row[at + 1];
-            row[at + 1] = replaced.min(before + 1).min(row[at] + 1);
-        }
-    }
-    row.last().copied().unwrap_or(0)
 }
 
 fn join(parent: &str, key: &str) -> String {

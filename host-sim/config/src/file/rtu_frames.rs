@@ -53,15 +53,9 @@ impl Frame {
     }
 
     fn push(&mut self, name: &str, spec: FieldSpec) {
-        let (repeats, picks_commands, is_coil) = (false, false, false);
-        self.0.push(DeviceField {
-            name: name.to_owned(),
-            spec,
-            repeats,
-            picks_commands,
-            is_coil,
-            of_port: None,
-        });
+        let name = name.to_owned();
+        let field = DeviceField { name, spec, repeats: false, commands: None, is_coil: false, of_port: None };
+        self.0.push(field);
     }
 
     fn byte(&mut self, name: &str, value: u8) {

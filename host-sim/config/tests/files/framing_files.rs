@@ -1,7 +1,7 @@
 //! What the keys of texts, lengths, framings and escapes mean in the configuration.
 
 use proto_core::config::{FieldSpec, GatewayConfig, Parts, StreamPart, Words};
-use proto_core::device::{Boundary, ByteOrder, Counts, Encoding, Escape, Length, Text, TextWidth};
+use proto_core::device::{Boundary, ByteOrder, Counts, Encoding, Escape, Ignored, Length, Text, TextWidth};
 use proto_core::sysvar::SysVar;
 use proto_core::wire::scalar::ScalarType;
 use recipe_config::file;
@@ -42,6 +42,7 @@ fn a_scanner_in_four_lines() {
         to: Some(Words { first: var("WordInputReg[1]"), count: 8, order: ByteOrder::Big }),
         length_to: Some(var("WordInputReg[9]")),
         count_to: Some(var("WordInputReg[10]")),
+        ignored: Ignored::NONE,
     };
     assert_eq!(config.fields, [expected]);
 }
@@ -56,6 +57,7 @@ fn texts_have_widths_ends_and_orders() {
         to,
         length_to: None,
         count_to: None,
+        ignored: Ignored::NONE,
     };
     let words = Words { first: var("WordInputReg[3]"), count: 1, order: ByteOrder::Little };
     assert_eq!(
@@ -116,5 +118,24 @@ fn mistakes_are_told_where_they_are() {
     ] {
         let error = input(keys, field).unwrap_err();
         assert!(error.contains(message), "{keys}, {field}: {error}");
+    }
+}
+
+#[test]
+fn ignored_texts_are_those_that_the_field_can_have() {
+    let field =
+        |keys: &str| input("tail = [13]\nframing = \"tail\"", &format!("{{ type = \"text\", {keys} }}"));
+    let config = field("ignore = [\"NOREAD\", \"?\"]").unwrap();
+    let [FieldSpec::TextInput { ignored, .. }] = config.fields[..] else { panic!("{:?}", config.fields) };
+    assert_eq!(ignored, Ignored::new(&[b"NOREAD", b"?"]).unwrap());
+    for (keys, said) in [
+        ("ignore = \"NOREAD\"", "expected an array of texts, such as [\"NOREAD\"], found a string"),
+        ("ignore = [\"\"]", "a text of no characters"),
+        ("ignore = [\"é\"]", "is not ASCII"),
+        ("width = 5, ignore = [\"NOREAD\"]", "6 characters, but the field has 5"),
+        ("ignore = [\"NO READ AT ALL\"]", "too long; allowed: 13 characters in one text"),
+    ] {
+        let error = field(keys).unwrap_err().to_string();
+        assert!(error.contains("ignore") && error.contains(said), "{keys}: {error}");
     }
 }

@@ -1,5 +1,6 @@
 //! Configuration files as people write them: the examples, those of the documents, wrong and damaged ones.
 
+mod advice;
 mod bits;
 mod counter_files;
 mod damaged_files;

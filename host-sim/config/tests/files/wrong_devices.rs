@@ -25,6 +25,9 @@ const CASES: &[Case] = &[
     controller("bits in a controller's file", "{ name = \"input1\", type = \"byte\" }", "{ name = \"input1\", type = \"byte\", bits = 1 }"),
     controller("padding in a controller's file", "{ name = \"input1\", type = \"byte\" }", "{ pad = 1 }"),
     controller("a device's type in a controller's file", "{ name = \"input1\", type = \"byte\" }", "{ name = \"input1\", type = \"uint24\" }"),
+    // Names of others.
+    device("a type of another language", "{ name = \"fixed\", type = \"byte\"", "{ name = \"fixed\", type = \"int16\""),
+    device("a checksum as its catalogue spells it", "kind = \"crc16-", "kind = \"CRC-16/"),
     // Orders.
     device("an unknown order", "endian = \"big\"", "endian = \"middle\""),
     device("an unknown order of words", "word_order = \"low-first\"", "word_order = \"low\""),

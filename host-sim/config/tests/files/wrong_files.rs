@@ -61,6 +61,8 @@ const CASES: &[Case] = &[
     gateway("a link without a recipe", "{ udp = 2011, recipe = \"up\" }", "{ udp = 2011 }"),
     gateway("a link to no recipe", "recipe = \"up\" }", "recipe = \"upp\" }"),
     gateway("a link with a CAN recipe", "recipe = \"up\" }", "recipe = \"orders\" }"),
+    gateway("a timeout in words", "on_timeout = ", "timeout_ms = \"soon\"\non_timeout = "),
+    gateway("staleness without an end", "on_timeout = ", "stale_after_ms = \"never\"\non_timeout = "),
     // [[recipe]]
     gateway("a recipe without a name", "name = \"system\"\n", ""),
     gateway("a recipe with an empty name", "name = \"system\"\n", "name = \"\"\n"),

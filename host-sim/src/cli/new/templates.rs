@@ -27,6 +27,7 @@ macro_rules! templates {
 pub(super) const ALL: &[Template] = templates![
     "advantech-adam-4017",
     "and-balance",
+    "blink-pkp-2400",
     "bota-rokubi",
     "datalogic-quickscan",
     "delta-ms300",

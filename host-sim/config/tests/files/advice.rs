@@ -1,0 +1,131 @@
+//! What is valid and often a mistake is warned of; what is meant so is not.
+
+use recipe_config::file::{self, Text};
+
+/// The warnings of a gateway file with this recipe on one port.
+#[track_caller]
+fn warnings(recipe: &str, port: &str) -> Vec<String> {
+    let toml = format!(
+        "[controller]\naddress = \"10.0.0.2\"\n[[recipe]]\nname = \"r\"\nmode = \"user\"\n{recipe}\n\
+         [[port]]\nname = \"p\"\nrecipe = \"r\"\n{port}\n"
+    );
+    let config = file::parse_gateway(Text { name: "test.toml", toml: &toml }, &[]).unwrap();
+    let view = config.view();
+    view.warnings().map(|warning| view.describe_warning(warning).to_string()).collect()
+}
+
+fn read(function: &str, address: u32) -> String {
+    format!(
+        "kind = \"modbus-rtu\"\n[[recipe.exchange]]\nslave = 1\nevery_ms = 50\nfunction = \"{function}\"\n\
+         address = {address}\nread = [{{ name = \"a\", type = \"word\", to = \"WordInputReg[1]\" }}]"
+    )
+}
+
+const MODBUS: &str = "bus = \"modbus-rtu\"";
+
+#[test]
+fn numbers_of_a_manual_are_no_addresses() {
+    let told = |number, first, address| {
+        format!(
+            "recipe \"r\", exchange 1: {number} looks like the number of a manual that counts from {first}; if it is, \
+             write {address}, the address on the line"
+        )
+    };
+    assert_eq!(warnings(&read("read-holding-registers", 40_005), MODBUS), [told(40_005, 40_001, 4)]);
+    assert_eq!(warnings(&read("read-input-registers", 30_001), MODBUS), [told(30_001, 30_001, 0)]);
+    for (function, address) in [
+        ("read-holding-registers", 4),
+        ("read-holding-registers", 30_001),
+        ("read-input-registers", 40_001),
+        ("read-holding-registers", 0xFFFF),
+    ] {
+        assert_eq!(warnings(&read(function, address), MODBUS), [""; 0], "{function} {address}");
+    }
+    let block = "kind = \"modbus-rtu-slave\"\naddress = 5\n[[recipe.block]]\ntable = \"input-registers\"\n\
+                 address = 30011\nfields = [{ name = \"x\", type = \"word\", from = \"WordOutputReg[1]\" }]";
+    let told = warnings(block, "bus = \"modbus-rtu-slave\"");
+    assert!(
+        told[0].starts_with("recipe \"r\", block 1: 30011 ") && told[0].contains("write 10,"),
+        "{told:?}"
+    );
+}
+
+#[test]
+fn both_addresses_of_a_function_are_looked_at() {
+    let exchange = "kind = \"modbus-rtu\"\n[[recipe.exchange]]\nslave = 1\nevery_ms = 50\n\
+                    function = 23\naddress = 40003\nwrite_address = 40101\n\
+                    read = [{ name = \"a\", type = \"word\", to = \"WordInputReg[1]\" }]\n\
+                    write = [{ name = \"b\", type = \"word\", value = 1 }]";
+    let told = warnings(exchange, MODBUS);
+    assert!(told.len() == 2 && told[0].contains("write 2,") && told[1].contains("write 100,"), "{told:?}");
+}
+
+/// A line whose frames have a byte with these keys.
+fn byte(keys: &str) -> String {
+    format!(
+        "kind = \"stream\"\n[recipe.input]\nhead = [1]\nfields = [{{ name = \"a\", type = \"byte\", {keys} }}]"
+    )
+}
+
+const SECOND: &str = "bus = \"rs485\"\ntimeout_ms = 1000";
+
+#[test]
+fn a_stop_on_an_edge_is_told() {
+    for (keys, stop) in [
+        ("bits = 1, commands = { rising = \"stop\" }", "stop"),
+        ("bits = 1, commands = { rising = \"pause\", falling = \"resume\" }, base = \"keep\"", "pause"),
+        ("bits = 1, commands = { 1 = \"poweroff\" }", "poweroff"),
+    ] {
+        let told = warnings(&byte(keys), SECOND);
+        let said = format!("commands = {{ level = \"{stop}\" }} stops as long as the bit is 1");
+        assert!(told.len() == 1 && told[0].ends_with(&said), "{keys}: {told:?}");
+    }
+    for keys in [
+        "bits = 1, commands = { level = \"stop\" }",
+        "bits = 1, commands = { falling = \"stop\" }",
+        "bits = 1, commands = { rising = \"resume\" }",
+        "commands = { 1 = \"stop\" }",
+    ] {
+        assert_eq!(warnings(&byte(keys), SECOND), [""; 0], "{keys}");
+    }
+}
+
+#[test]
+fn a_short_timeout_that_forgets_the_base_is_told() {
+    let first = "bus = \"rs485\"";
+    let commands = byte("commands = { 1 = \"resume\" }");
+    let told = warnings(&commands, first);
+    assert_eq!(
+        told,
+        [
+            "port \"p\": after 100 ms without a frame, the next value picks no command; for a device that sends less \
+          often set a longer timeout_ms, for one that sends only changes base = \"keep\" as well"
+        ]
+    );
+    assert_eq!(warnings(&commands, "bus = \"rs485\"\ntimeout_ms = 249").len(), 1);
+    assert_eq!(warnings(&commands, "bus = \"rs485\"\ntimeout_ms = 250"), [""; 0]);
+    assert_eq!(warnings(&byte("commands = { 1 = \"resume\" }, base = \"keep\""), first), [""; 0]);
+    assert_eq!(warnings(&byte("commands = { 1 = \"resume\" }, when = \"frame\""), first), [""; 0]);
+    // What is asked comes as often as it is asked.
+    let asked = read("read-holding-registers", 4)
+        .replace("to = \"WordInputReg[1]\"", "commands = { 1 = \"resume\" }");
+    assert_eq!(warnings(&asked, MODBUS), [""; 0]);
+}
+
+#[test]
+fn numbers_of_six_digits_are_refused_with_their_address() {
+    for (function, number, address) in
+        [("read-holding-registers", 400_005, 4), ("read-input-registers", 365_536, 65_535)]
+    {
+        let toml = format!(
+            "[controller]\naddress = \"10.0.0.2\"\n[[recipe]]\nname = \"r\"\n{}\n",
+            read(function, number)
+        );
+        let error =
+            file::parse_gateway(Text { name: "test.toml", toml: &toml }, &[]).unwrap_err().to_string();
+        let said = format!(
+            "{number} is out of range; allowed: 0..=65535; on the line, what a manual calls so has the address {address}"
+        );
+        assert!(error.ends_with(&said), "{error}");
+    }
+}

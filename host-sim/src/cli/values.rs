@@ -1,0 +1,205 @@
+//! What becomes of a port's values, as `check` shows it: commands, and what happens when nothing comes.
+//!
+//! In: a checked configuration and the names of its fields. Out: aligned lines below the frames of a port.
+
+use proto_core::config::{CommandWhen, GatewayConfig, OnStale, Port, SafeValue};
+use proto_core::sysvar::{Direction, SysVar};
+use recipe_config::{DeviceRecipe, ExchangeKind, FieldCommands, NamedFrame};
+
+use super::text;
+
+/// A line for each command, or range of values that is idle.
+pub(super) fn show_commands(recipe: &DeviceRecipe) -> String {
+    let asked = recipe.exchanges.iter().flat_map(|exchange| match exchange.kind {
+        // What the master writes; the reply repeats it.
+        ExchangeKind::Slave(_) => exchange.request.as_ref(),
+        _ => exchange.reply.as_ref(),
+    });
+    let frames = recipe.part(Direction::Input).iter().chain(asked);
+    let rows: Vec<_> = frames.flat_map(rows_of).collect();
+    let width = |column: fn(&[String; 3]) -> &String| {
+        rows.iter().map(|row| column(row).chars().count()).max().unwrap_or(0)
+    };
+    let (names, values) = (width(|row| &row[0]), width(|row| &row[1]));
+    let line =
+        |[name, value, command]: &[String; 3]| format!("    {name:names$}  {value:values$}  {command}\n");
+    let lines: String = rows.iter().map(line).collect();
+    if lines.is_empty() { lines } else { format!("  commands\n{lines}") }
+}
+
+/// Field, values and command.
+fn rows_of(frame: &NamedFrame) -> impl Iterator<Item = [String; 3]> {
+    let fields = frame.fields.iter().filter_map(|field| Some((&field.name, field.commands.as_ref()?)));
+    fields.flat_map(|(name, commands)| {
+        commands.entries.iter().map(|(first, last, command)| {
+            let values = if first == last { first.to_string() } else { format!("{first}..{last}") };
+            let command = if command.is_empty() { "none, idle" } else { command };
+            [name.clone(), format!("{} {values}", verb(commands)), command.to_owned()]
+        })
+    })
+}
+
+fn verb(commands: &FieldCommands) -> &'static str {
+    match commands.when {
+        CommandWhen::Change => "becomes",
+        CommandWhen::Kept => "becomes, even over a silence,",
+        CommandWhen::Frame => "is",
+    }
+}
+
+/// What happens to inputs without frames, and to an output without a source. A listening port has neither.
+pub(super) fn show_times(config: &GatewayConfig, port: &Port) -> String {
+    let view = config.view();
+    let Some(recipe) = config.recipes.get(usize::from(port.recipe)).filter(|_| port.bus.is_field()) else {
+        return String::new();
+    };
+    let written: Vec<SysVar> =
+        view.written_by(recipe).chain(view.bits_written_by(recipe).map(|bit| bit.var)).collect();
+    let mut report = String::new();
+    if view.fields_of(recipe, Direction::Input).next().is_some() {
+        let safe = port.on_timeout.of(&config.safe_values);
+        let what = match (safe, written.is_empty()) {
+            ([], true) => String::new(),
+            ([], false) => ": all values hold".to_owned(),
+            (safe, _) => {
+                let bits = view.bits_written_by(recipe).count() + view.written_by(recipe).count();
+                let others = if safe.len() < bits { "; others hold" } else { "" };
+                format!(": {}{others}", show_safe_values(safe))
+            }
+        };
+        report += &match port.timeout {
+            Port::NEVER => "  timeout  never: all values hold\n".to_owned(),
+            timeout => format!("  timeout  {timeout} without a frame{what}\n"),
+        };
+    }
+    let shown =
+        view.fields_of(recipe, Direction::Output).any(|(_, _, field)| field.variables().next().is_some());
+    if shown {
+        let what = match recipe.on_stale {
+            OnStale::Hold => "the last values are sent",
+            OnStale::Stop => "nothing is sent",
+        };
+        report += &format!("  stale    {} without a source: {what}\n", port.stale_after);
+    }
+    report
+}
+
+/// `ForceEnd[1..6] = 0, BitInputReg[3].0,1 = 0`: neighbours and bits with the same value together.
+fn show_safe_values(safe: &[SafeValue]) -> String {
+    let mut runs: Vec<(SysVar, SysVar, Vec<u32>, String)> = Vec::new();
+    for value in safe {
+        let bit = (!value.is_whole()).then(|| value.mask.trailing_zeros());
+        let number = match bit {
+            Some(_) => u8::from(value.value.as_f64() != 0.0).to_string(),
+            None => text::show_scalar(value.value),
+        };
+        match runs.last_mut() {
+            Some((first, _, bits, same)) if *same == number && *first == value.var && !bits.is_empty() => {
+                bits.extend(bit);
+            }
+            Some((_, last, bits, same))
+                if *same == number
+                    && bit.is_none()
+                    && bits.is_empty()
+                    && last.group() == value.var.group()
+                    && last.ordinal() + 1 == value.var.ordinal() =>
+            {
+                *last = value.var;
+            }
+            _ => runs.push((value.var, value.var, bit.into_iter().collect(), number)),
+        }
+    }
+    let show = |(first, last, bits, number): &(SysVar, SysVar, Vec<u32>, String)| {
+        let bits: Vec<_> = bits.iter().map(u32::to_string).collect();
+        match bits.is_empty() {
+            false => format!("{first}.{} = {number}", bits.join(",")),
+            true if first == last => format!("{first} = {number}"),
+            true => format!("{}[{}..{}] = {number}", first.group(), first.index(), last.index()),
+        }
+    };
+    runs.iter().map(show).collect::<Vec<_>>().join(", ")
+}
+
+#[cfg(test)]
+mod tests {
+    use proto_core::sysvar::VarBit;
+    use proto_core::wire::scalar::Scalar;
+
+    use super::*;
+
+    fn var(name: &str) -> SysVar {
+        SysVar::parse(name).unwrap()
+    }
+
+    fn bit(name: &str, on: bool) -> SafeValue {
+        SafeValue::bit(VarBit::parse(name).unwrap().unwrap(), on)
+    }
+
+    #[test]
+    fn neighbours_and_bits_with_the_same_safe_value_stand_together() {
+        let float = |name: &str, value| SafeValue::new(var(name), Scalar::Float(value));
+        let safe = [
+            float("ForceEnd[1]", 0.0),
+            float("ForceEnd[2]", 0.0),
+            float("ForceEnd[3]", 1.5),
+            float("ForceEnd[5]", 1.5),
+            bit("BitInputReg[3].0", false),
+            bit("BitInputReg[3].7", false),
+            bit("BitInputReg[3].4", true),
+            bit("BitInputReg[4].4", true),
+        ];
+        assert_eq!(
+            show_safe_values(&safe),
+            "ForceEnd[1..2] = 0, ForceEnd[3] = 1.5, ForceEnd[5] = 1.5, BitInputReg[3].0,7 = 0, \
+             BitInputReg[3].4 = 1, BitInputReg[4].4 = 1"
+        );
+    }
+
+    /// What a port with these keys shows, with a field for three commands and one for a variable.
+    #[track_caller]
+    fn shown(field: &str, port: &str) -> String {
+        let toml = format!(
+            "[controller]\naddress = \"a\"\n[[recipe]]\nname = \"r\"\nkind = \"stream\"\nmode = \"user\"\n\
+             [recipe.input]\nhead = [1]\nfields = [{{ name = \"order\", type = \"byte\", {field} }},\n\
+             {{ name = \"part\", type = \"word\", to = \"WordInputReg[1]\" }}]\n\
+             [[port]]\nname = \"p\"\nbus = \"rs485\"\nrecipe = \"r\"\n{port}"
+        );
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("test.toml");
+        std::fs::write(&path, toml).unwrap();
+        let config = recipe_config::file::load_gateway(&path, &[]).unwrap();
+        let frames = recipe_config::file::load_frames(&path, &[]).unwrap();
+        [show_commands(frames[0].as_ref().unwrap()), show_times(&config, &config.ports[0])].concat()
+    }
+
+    #[test]
+    fn commands_have_their_values_and_when_they_act() {
+        let values = "commands = { \"1..100\" = \"speed({value})\", 200 = \"stop\" }";
+        let safe = "on_timeout = { \"WordInputReg[1]\" = 7 }";
+        assert_eq!(
+            shown(&format!("{values}, idle = 255"), safe),
+            "  commands\n    order  becomes 1..100  speed({value})\n    order  becomes 200     stop\n    \
+             order  becomes 255     none, idle\n  timeout  100 ms without a frame: WordInputReg[1] = 7\n"
+        );
+        let kept = shown(&format!("{values}, base = \"keep\""), "");
+        assert!(kept.contains("order  becomes, even over a silence, 200     stop\n"), "{kept}");
+        let level = shown("bits = 3, commands = { level = \"stop\" }", "timeout_ms = 250");
+        assert_eq!(
+            level,
+            "  commands\n    order  is 1  stop\n  timeout  250 ms without a frame: all values hold\n"
+        );
+    }
+
+    #[test]
+    fn a_port_that_is_never_overdue_says_so() {
+        let shown = shown("to = \"WordInputReg[2]\"", "timeout_ms = \"never\"");
+        assert_eq!(shown, "  timeout  never: all values hold\n");
+    }
+
+    #[test]
+    fn values_without_a_safe_value_hold() {
+        let two = "to = \"WordInputReg[2]\"";
+        let shown = shown(two, "on_timeout = { \"WordInputReg[2]\" = 0 }");
+        assert_eq!(shown, "  timeout  100 ms without a frame: WordInputReg[2] = 0; others hold\n");
+    }
+}

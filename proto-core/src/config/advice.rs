@@ -1,0 +1,164 @@
+//! Warnings about what is valid and works, but often is a mistake of somebody who is new to it: an
+//! address as manuals count it, a stop that acts only on an edge, commands that silence forgets.
+//!
+//! In: a configuration. Out: [`Warning`]s. Nothing is refused here.
+
+use super::{
+    CommandEntry, CommandWhen, ConfigView, Exchange, FieldSpec, InputBinding, Port, Recipe, Span, Talk,
+    Warning,
+};
+use crate::command::Request;
+use crate::device::Kind;
+use crate::modbus::rtu::{Operation, Table};
+use crate::sysvar::Direction;
+use crate::time::Duration;
+
+/// A device that sends by itself rarely sends more often than 10 times a second and is then supervised
+/// more closely than this; one that sends when something happens is silent for longer.
+const SHORT_TIMEOUT: Duration = Duration::from_millis(250);
+
+impl Table {
+    /// The address on the line of what many manuals call by this number, such as 4 for holding register
+    /// 40005. `None` if the number is not one of those.
+    pub const fn address_of_number(self, number: u32) -> Option<u16> {
+        let (of_five, of_six) = match self {
+            // Those of coils have no digit in front.
+            Self::Coils => return None,
+            Self::DiscreteInputs => (10_001, 100_001),
+            Self::InputRegisters => (30_001, 300_001),
+            Self::HoldingRegisters => (40_001, 400_001),
+        };
+        match (number.checked_sub(of_six), number.checked_sub(of_five)) {
+            (Some(address), _) if address <= 0xFFFF => Some(address as u16),
+            (_, Some(address)) if address < 9_999 => Some(address as u16),
+            _ => None,
+        }
+    }
+}
+
+impl<'c> ConfigView<'c> {
+    /// What often is a mistake.
+    pub(super) fn advice(self) -> impl Iterator<Item = Warning> + 'c {
+        self.manual_addresses().chain(self.stops_on_edges()).chain(self.forgotten_bases())
+    }
+
+    /// Addresses of Modbus that look like the numbers of a manual.
+    fn manual_addresses(self) -> impl Iterator<Item = Warning> + 'c {
+        (0..).zip(self.recipes).flat_map(move |(recipe, of)| {
+            (0..).zip(self.exchanges_of(of)).flat_map(move |(exchange, asked)| {
+                addresses(asked).into_iter().flatten().filter_map(move |(table, number)| {
+                    let address = table.address_of_number(u32::from(number))?;
+                    Some(Warning::ManualAddress { recipe, exchange, number, address })
+                })
+            })
+        })
+    }
+
+    /// Bits whose stop is picked by an edge alone.
+    fn stops_on_edges(self) -> impl Iterator<Item = Warning> + 'c {
+        (0..).zip(self.recipes).flat_map(move |(recipe, of)| {
+            self.command_fields(of).flat_map(move |(field, table, when)| {
+                let entries = (table.start..).zip(table.of(self.commands));
+                let is_edge = is_bit(field) && when != CommandWhen::Frame;
+                let stops = entries.filter(move |(_, command)| is_edge && command.has(1) && stops(command));
+                stops.map(move |(entry, _)| Warning::StopOnEdge { recipe, entry })
+            })
+        })
+    }
+
+    /// Ports whose commands are forgotten by a silence that is short for a device that sends when
+    /// something happens.
+    fn forgotten_bases(self) -> impl Iterator<Item = Warning> + 'c {
+        let of = move |port: &'c Port| self.recipes.get(usize::from(port.recipe));
+        let ports = (0..).zip(self.ports).filter(|(_, port)| port.bus.is_field());
+        ports.filter_map(move |(port, config)| {
+            let timeout = config.timeout;
+            let forgets = self.unasked(of(config)?).any(|span| {
+                span.of(self.fields).iter().filter_map(commands).any(|(_, when)| when == CommandWhen::Change)
+            });
+            (forgets && timeout < SHORT_TIMEOUT).then_some(Warning::ForgetsBase { port, timeout })
+        })
+    }
+
+    /// The fields of a recipe that pick commands.
+    fn command_fields(
+        self,
+        recipe: &'c Recipe,
+    ) -> impl Iterator<Item = (&'c FieldSpec, Span, CommandWhen)> + 'c {
+        self.fields_of(recipe, Direction::Input).filter_map(|(_, _, field)| {
+            let (table, when) = commands(field)?;
+            Some((field, table, when))
+        })
+    }
+
+    /// The fields of the frames that come without a request of a known period.
+    fn unasked(self, recipe: &'c Recipe) -> impl Iterator<Item = Span> + 'c {
+        let exchanges = self.exchanges_of(recipe).iter().filter(|exchange| exchange.when.every.is_none());
+        let unasked = exchanges.filter_map(move |exchange| exchange.fields(self, Direction::Input));
+        recipe.part_frames(Direction::Input).chain(unasked)
+    }
+}
+
+/// The addresses of an exchange, each with its table.
+const fn addresses(exchange: &Exchange) -> [Option<(Table, u16)>; 2] {
+    let operation = match exchange.talk {
+        Talk::Rtu { operation, .. } | Talk::Served { operation, .. } => operation,
+        Talk::Frames { .. } => return [None, None],
+    };
+    let (table, address, _) = operation.place();
+    let written = match operation {
+        Operation::ReadWriteRegisters { write_address, .. } => Some((table, write_address)),
+        _ => None,
+    };
+    [Some((table, address)), written]
+}
+
+const fn commands(field: &FieldSpec) -> Option<(Span, CommandWhen)> {
+    match *field {
+        FieldSpec::UserInput { to: InputBinding::Commands { table, when }, .. }
+        | FieldSpec::DeviceInput { to: InputBinding::Commands { table, when }, .. } => Some((table, when)),
+        _ => None,
+    }
+}
+
+const fn is_bit(field: &FieldSpec) -> bool {
+    match field {
+        FieldSpec::DeviceInput { encoding, .. } => match encoding.kind {
+            Kind::Bits(bits) => bits.count == 1,
+            _ => false,
+        },
+        _ => false,
+    }
+}
+
+fn stops(command: &CommandEntry) -> bool {
+    Request::parse(command.text.as_bytes()).is_ok_and(|request| request.keyword().is_urgent())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_of_manuals_have_an_address() {
+        use Table::*;
+        for (table, number, address) in [
+            (HoldingRegisters, 40_001, Some(0)),
+            (HoldingRegisters, 40_005, Some(4)),
+            (HoldingRegisters, 49_999, Some(9_998)),
+            (HoldingRegisters, 50_000, None),
+            (HoldingRegisters, 40_000, None),
+            (HoldingRegisters, 400_005, Some(4)),
+            (HoldingRegisters, 465_536, Some(65_535)),
+            (HoldingRegisters, 465_537, None),
+            (HoldingRegisters, 30_001, None),
+            (InputRegisters, 30_001, Some(0)),
+            (InputRegisters, 300_001, Some(0)),
+            (DiscreteInputs, 10_010, Some(9)),
+            (Coils, 10_010, None),
+            (InputRegisters, 0, None),
+        ] {
+            assert_eq!(table.address_of_number(number), address, "{table:?} {number}");
+        }
+    }
+}

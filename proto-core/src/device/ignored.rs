@@ -1,0 +1,85 @@
+//! Texts that say that there is nothing to say, such as a scanner's `NOREAD`.
+//!
+//! In: a few short texts. Out: whether a text is one of them. They are kept in as many bytes as other
+//! fields have anyway.
+
+/// Bytes of all texts of a field, each with one byte more for its length.
+pub const MAX_IGNORED: usize = 14;
+
+/// The texts of a field that are ignored.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct Ignored {
+    /// One text behind the other, each behind its length; zeros behind the last.
+    bytes: [u8; MAX_IGNORED],
+}
+
+impl Ignored {
+    /// No text is.
+    pub const NONE: Self = Self { bytes: [0; MAX_IGNORED] };
+
+    /// These are; `None` if there is no room for them, or one of them is empty.
+    pub fn new(texts: &[&[u8]]) -> Option<Self> {
+        let mut ignored = Self::NONE;
+        let mut free = ignored.bytes.iter_mut();
+        for text in texts {
+            let len = u8::try_from(text.len()).ok().filter(|&len| len > 0)?;
+            for &byte in core::iter::once(&len).chain(text.iter()) {
+                *free.next()? = byte;
+            }
+        }
+        Some(ignored)
+    }
+
+    /// The texts, in order.
+    pub fn iter(&self) -> impl Iterator<Item = &[u8]> {
+        let mut rest = &self.bytes[..];
+        core::iter::from_fn(move || {
+            let (&len, behind) = rest.split_first().filter(|(len, _)| **len > 0)?;
+            let text = behind.get(..usize::from(len))?;
+            rest = behind.get(usize::from(len)..)?;
+            Some(text)
+        })
+    }
+
+    /// Whether this text is one of them.
+    pub fn has(&self, text: &[u8]) -> bool {
+        self.iter().any(|ignored| ignored == text)
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        *self == Self::NONE
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn texts_are_kept_as_long_as_there_is_room() {
+        let two = Ignored::new(&[b"NOREAD", b"ERROR"]).unwrap();
+        assert!(two.has(b"NOREAD") && two.has(b"ERROR"));
+        assert!(!two.has(b"NOREA") && !two.has(b"NOREADERROR") && !two.has(b""));
+        assert!(two.iter().eq([&b"NOREAD"[..], b"ERROR"]));
+        assert!(Ignored::NONE.is_empty() && !Ignored::NONE.has(b""));
+        assert_eq!(Ignored::new(&[]), Some(Ignored::NONE));
+        assert!(Ignored::new(&[b"0123456789ABC"]).is_some_and(|one| one.has(b"0123456789ABC")));
+        assert_eq!(Ignored::new(&[b"0123456789ABCD"]), None);
+        assert_eq!(Ignored::new(&[b"NOREAD", b"ERRORS!"]), None);
+        assert_eq!(Ignored::new(&[b"NOREAD", b""]), None);
+    }
+
+    #[test]
+    fn bytes_of_a_wrong_image_do_no_harm() {
+        for first in 0..=u8::MAX {
+            let mut ignored = Ignored { bytes: [first; MAX_IGNORED] };
+            assert!(ignored.iter().count() <= MAX_IGNORED / 2 + 1);
+            ignored.bytes = [0; MAX_IGNORED];
+            ignored.bytes[MAX_IGNORED - 1] = first;
+            assert!(ignored.is_empty() || ignored.iter().count() <= 1);
+        }
+    }
+}
