@@ -14,7 +14,7 @@ use crate::config::{
     Bus, ConfigView, Counted, DeviceFrame, Exchange, FieldSpec, FrameSpec, Port, Recipe, Span, Talk,
 };
 use crate::device::{Carrier, LayoutError};
-use crate::modbus::rtu::{Operation, Table};
+use crate::modbus::rtu::{BROADCAST, Operation, Table, Timing};
 use crate::schedule::{Grid, Peer, Row};
 use crate::sysvar::{Direction, SysVar};
 use crate::time::{Duration, Instant};
@@ -270,7 +270,11 @@ impl Formats<'_> {
         match exchange.talk {
             Talk::Rtu { operation, written, read } => {
                 item.asks = Asks::Rtu { slave: exchange.peer, operation };
-                item.times.is_answered = exchange.peer != crate::modbus::rtu::BROADCAST;
+                item.times.is_answered = exchange.peer != BROADCAST;
+                if !item.times.is_answered {
+                    // The slaves carry it out, and nobody says when they have.
+                    item.times.pause = exchange.pause + Timing::TURNAROUND;
+                }
                 item.request = self.data_out(written)?;
                 item.reply = self.data_in(read)?;
             }

@@ -244,6 +244,14 @@ impl<P: AsRef<Peer> + AsMut<Peer>> Turns<'_, P> {
         }
     }
 
+    /// The peer of a row is asked nothing before this: a reply to an earlier request may still come.
+    pub(crate) fn hold(&mut self, nth: usize, not_before: Instant) {
+        let Some(which) = self.rows.get(nth).map(|row| row.peer) else { return };
+        if let Some(peer) = self.peers.get_mut(usize::from(which)).map(AsMut::as_mut) {
+            peer.not_before = peer.not_before.max(not_before);
+        }
+    }
+
     /// The peer has not answered, the last time to a request whose sending ended at `sent`.
     pub(crate) fn failed(&mut self, nth: usize, taken: Taken, now: Instant, sent: Instant) {
         let Some(row) = self.rows.get_mut(nth) else { return };
