@@ -122,6 +122,13 @@ pub(super) struct Talks<'a> {
     pub peers: &'a mut [PeerState],
 }
 
+impl Flight {
+    /// Whether something wanted it beside its period.
+    pub(super) const fn was_requested(&self) -> bool {
+        self.taken.was_requested()
+    }
+}
+
 impl Talks<'_> {
     /// The peer that a request is to.
     pub(super) fn peer_of(&mut self, flight: Flight) -> Option<&mut PeerState> {

@@ -320,7 +320,7 @@ impl FieldPort {
         let Some(line) = self.line_mut() else { return };
         let (items, mut talks) = view.of(line);
         for item in items {
-            (item.digest, item.last_bit) = (None, None);
+            (item.digest, item.last_bit, item.is_owed) = (None, None, false);
         }
         line.begin(&mut talks, now);
         line.looks = line.looks.map(|grid| crate::schedule::Grid::starting_at(now, grid.period()));

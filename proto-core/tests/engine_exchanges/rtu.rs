@@ -261,12 +261,13 @@ fn a_late_reply_that_comes_while_the_request_is_repeated_holds_others_back_too()
     });
     table.iter_mut().for_each(|exchange| exchange.timeout = MS(30));
     let port = talking(&mut cell, &table);
-    for delay in 1..55 {
+    let variables = ["WordInputReg[1]", "WordInputReg[2]"].map(var);
+    for delay in (1..55).step_by(2) {
         let mut rig = cell.rig();
         rig.reports_sent = false;
         // Requests take 5 ms to leave. Until the first change the slave is prompt.
         let (begin, mut coming) = (rig.now, Vec::new());
-        while rig.now < begin + MS(3_000) {
+        while rig.now < begin + MS(1_500) {
             for request in rig.sent_to(port) {
                 let left = rig.now + MS(5);
                 let delay = if rig.now < begin + MS(300) { 1 } else { delay };
@@ -280,7 +281,7 @@ fn a_late_reply_that_comes_while_the_request_is_repeated_holds_others_back_too()
                 rig.input(Input::Tick);
                 continue;
             }
-            let values = [1, 2].map(|nth| rig.engine.image().value(var(&format!("WordInputReg[{nth}]"))));
+            let values = variables.map(|var| rig.engine.image().value(var));
             for (value, right) in values.into_iter().zip([101.0, 102.0]) {
                 assert!([0.0, right].contains(&value.as_f64()), "{value} at a delay of {delay} ms");
             }
@@ -367,4 +368,54 @@ fn what_a_slave_is_asked_at_its_start_comes_first_and_in_order() {
         // It is away, and comes back at another moment in each round.
         line.run(MS(700 + round * 333), |request| if request[0] == 4 { None } else { done(request) });
     }
+}
+
+#[test]
+fn what_is_asked_at_the_start_waits_until_its_values_are_fresh() {
+    let start = AskWhen { start: true, ..AskWhen::NEVER };
+    for when in [start, AskWhen { change: true, ..start }] {
+        let mut cell = Cell::new();
+        let lamp = writes(&mut cell, 4, &["WordOutputReg[1]"], when);
+        let poll = reads(&mut cell, 4, &["WordInputReg[1]"], AskWhen::every(MS(50)));
+        let port = talking(&mut cell, &[lamp, poll]);
+        cell.last_recipe().on_stale = OnStale::Stop;
+        cell.last_port().stale_after = MS(200);
+        let mut line = Line::new(&cell, port);
+        let done = |request: &[u8]| {
+            let reply = if request[1] == 16 { with_crc(&request[..6]) } else { registers(4, &[1]) };
+            Some((MS(1), reply))
+        };
+        let count = |asked: &[(Instant, Vec<u8>)]| asked.iter().filter(|(_, sent)| sent[1] == 16).count();
+        assert_eq!(count(&line.run(MS(3_000), done)), 1);
+        // The slave loses its power, and the controller falls silent before the slave is back.
+        line.run(MS(400), |_| None);
+        line.rig.modbus_answers = false;
+        line.run(MS(600), |_| None);
+        assert_eq!(count(&line.run(MS(3_000), done)), 0, "its value is stale");
+        line.rig.modbus_answers = true;
+        assert_eq!(count(&line.run(MS(8_000), done)), 1, "the same value as before");
+    }
+}
+
+#[test]
+fn a_slow_slave_that_is_dead_does_not_hide_a_fast_one() {
+    let mut cell = Cell::new();
+    let rows: Vec<_> = [(1, 5, 8), (2, 10, 50), (3, 400, 50)]
+        .into_iter()
+        .map(|(slave, timeout, every)| {
+            let poll =
+                reads(&mut cell, slave, &[&format!("WordInputReg[{slave}]")], AskWhen::every(MS(every)));
+            Exchange { timeout: MS(timeout), retries: 0, ..poll }
+        })
+        .collect();
+    let port = talking(&mut cell, &rows);
+    let mut line = Line::new(&cell, port);
+    // There is no gap in which a timeout of the dead ones fits.
+    let answer = |request: &[u8]| (request[0] == 1).then(|| (MS(1), registers(1, &[1])));
+    line.run(MS(60_000), answer);
+    let asked = line.run(MS(60_000), answer);
+    let times: Vec<_> = asked.iter().filter(|(_, sent)| sent[0] == 2).map(|(at, _)| *at).collect();
+    let waits = times.windows(2).map(|pair| pair[1].saturating_since(pair[0])).max().unwrap();
+    // It waits for 64 timeouts, and as long again for a gap; the other's timeout may come between.
+    assert!(waits < MS(2 * 640 + 500), "{waits:?}");
 }
