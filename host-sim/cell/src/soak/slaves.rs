@@ -279,12 +279,7 @@ impl Bank {
         }
     }
 
-    fn get(
-        &self,
-        places: &BTreeMap<u16, u16>,
-        address: u16,
-        count: usize,
-    ) -> Result<Vec<u16>, Exception> {
+    fn get(&self, places: &BTreeMap<u16, u16>, address: u16, count: usize) -> Result<Vec<u16>, Exception> {
         self.read.set(Some((address, count as u16)));
         if self.refuses {
             return Err(Exception::DeviceBusy);

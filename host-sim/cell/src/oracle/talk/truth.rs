@@ -310,20 +310,14 @@ impl Truth {
 
     /// Checks that a slave has the controller's values, if they have been the same since before `since`.
     /// `None` if they have not, or nobody can know.
-    pub(super) fn is_told(
-        &self,
-        port: usize,
-        row: &RowSpec,
-        since: Instant,
-    ) -> Option<Result<(), Wrong>> {
+    pub(super) fn is_told(&self, port: usize, row: &RowSpec, since: Instant) -> Option<Result<(), Wrong>> {
         let line = self.lines.get(&port)?;
         let address = row.written?;
         if line.forgot.contains(&row.slave) {
             return None;
         }
-        let there = |nth: u16| {
-            line.memory.get(&(row.slave, row.writes_coils(), address + nth)).copied().unwrap_or(0)
-        };
+        let there =
+            |nth: u16| line.memory.get(&(row.slave, row.writes_coils(), address + nth)).copied().unwrap_or(0);
         let len = row.request.as_ref()?.payload;
         let count = if row.writes_coils() { row.count } else { (len / 2) as u16 };
         let values: Vec<u16> = (0..count).map(there).collect();
@@ -337,7 +331,8 @@ impl Truth {
             }
             let place = data.get(place)?;
             if !agrees(field, var, raw, place) {
-                wrong = Some(format!("{}: {var} is {}, but the slave has {place:?}", name(row), show(var, raw)));
+                wrong =
+                    Some(format!("{}: {var} is {}, but the slave has {place:?}", name(row), show(var, raw)));
             }
         }
         Some(wrong.map_or(Ok(()), |what| Err((Invariant::Told, what))))
