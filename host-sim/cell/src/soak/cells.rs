@@ -119,7 +119,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cell_with_exchanges_is_refused() {
+    fn a_cell_with_devices_that_are_asked_in_their_own_frames_is_refused() {
         let mut config = Scenario::all().unwrap().remove(0).gateway;
         assert_eq!(unmodelled(&config), None);
         let talk = Talk::Frames { request: None, reply: None, refusal: None };
