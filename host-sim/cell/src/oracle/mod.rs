@@ -254,6 +254,8 @@ impl Oracle {
                 let watch = &mut self.ports[usize::from(port.0)];
                 watch.down.is_up = true;
                 watch.talk.begin(now);
+                // What rises from now on asks.
+                self.talk_values_changed();
             }
             Input::PortDown { port } => {
                 let nth = usize::from(port.0);

@@ -322,7 +322,7 @@ impl Bank {
         if !all.clone().all(|at| places.contains_key(&at)) {
             return Err(Exception::IllegalDataAddress);
         }
-        all.zip(&values).for_each(|(at, value)| drop(places.insert(at, *value)));
+        places.extend(all.zip(values.iter().copied()));
         self.wrote = Some(Done::Wrote { coils, address, values });
         Ok(())
     }

@@ -104,10 +104,6 @@ impl TalkWatch {
         self.leaving = false;
     }
 
-    pub(super) fn flight(&self) -> Option<&Flight> {
-        self.flight.as_ref()
-    }
-
     /// Whether nothing is on its way or about to be repeated.
     fn is_free(&self) -> bool {
         self.flight.is_none() && self.repeat.is_none() && !self.leaving

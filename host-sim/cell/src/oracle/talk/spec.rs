@@ -31,7 +31,6 @@ pub(in crate::oracle) struct RowSpec {
     /// The first register or coil that is written.
     pub written: Option<u16>,
     pub every: Option<Duration>,
-    pub on_start: bool,
     pub on_change: bool,
     pub rising: Option<(SysVar, u8)>,
     pub timeout: Duration,
@@ -78,7 +77,6 @@ impl TalkSpec {
                 count: 0,
                 written: None,
                 every: exchange.when.every,
-                on_start: exchange.when.start,
                 on_change: exchange.when.change,
                 rising: exchange.when.rising,
                 timeout: exchange.timeout,
