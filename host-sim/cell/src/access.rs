@@ -168,6 +168,7 @@ impl Cell {
 
     /// Sends as the device on the line, after its previous transmission.
     pub fn send(&mut self, line: LineId, bytes: &[u8]) {
+        self.line_garbled(line);
         self.transmit(line, End::Device, bytes);
     }
 

@@ -22,6 +22,46 @@ pub trait Device<M> {
         let _ = now;
         Vec::new()
     }
+
+    /// What it did as slaves of a Modbus line since the last call, in order. The model compares the
+    /// gateway's values with it.
+    fn take_done(&mut self) -> Vec<SlaveDone> {
+        Vec::new()
+    }
+}
+
+/// What a slave of a Modbus line did.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct SlaveDone {
+    /// Its address.
+    pub slave: u8,
+    /// What it did.
+    pub what: Done,
+}
+
+/// What a slave does.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Done {
+    /// It made a reply, which may be changed or lost before it leaves.
+    Answered {
+        /// The first register or coil that was asked for or written.
+        address: u16,
+        /// How many.
+        count: u16,
+        /// The whole frame.
+        reply: Vec<u8>,
+    },
+    /// It took values, from a request to itself or to all.
+    Wrote {
+        /// Coils, else holding registers.
+        coils: bool,
+        /// The first one.
+        address: u16,
+        /// The registers, or 0 and 1 for coils.
+        values: Vec<u16>,
+    },
+    /// It lost its power, and with it everything that was written.
+    Forgot,
 }
 
 /// Sends at a rate: the n-th message is `make(n)` and leaves at `start + n * 1 s / rate`, rounded down

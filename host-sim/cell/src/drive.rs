@@ -33,6 +33,7 @@ impl Cell {
 
     /// Handles everything that is due now, once.
     fn step(&mut self) {
+        self.show_controller();
         if let Some(due) = self.queue.pop_due(self.now) {
             self.carry_out(due);
             return;
@@ -58,7 +59,9 @@ impl Cell {
         for nth in 0..self.lines.len() {
             let now = self.now;
             let device = self.lines[nth].device.as_mut().filter(|device| device.deadline() <= now);
-            for bytes in device.map_or_else(Vec::new, |device| device.poll(now)) {
+            let Some(sent) = device.map(|device| device.poll(now)) else { continue };
+            self.slaves_did(LineId(nth));
+            for bytes in sent {
                 self.transmit(LineId(nth), End::Device, &bytes);
             }
         }
@@ -202,7 +205,15 @@ impl Cell {
             _ => {}
         }
         self.controller.handle(now, input);
+        self.show_controller();
         self.drain_controller();
+    }
+
+    /// The model sees the controller's registers, if it needs them.
+    fn show_controller(&mut self) {
+        if let Some(oracle) = self.oracle.as_mut().filter(|oracle| oracle.wants_controller()) {
+            oracle.sees_controller(self.controller.registers().image(), self.now);
+        }
     }
 
     fn drain_controller(&mut self) {

@@ -20,7 +20,12 @@ impl Cell {
         let now = self.now;
         let line = &mut self.lines[id.0];
         let owner = line.owner;
+        let garbled = line.counters.garbled_bytes;
         let arrives = line.deliver(now, &mut chunk);
+        if !arrives || line.counters.garbled_bytes != garbled {
+            self.line_garbled(id);
+        }
+        let line = &mut self.lines[id.0];
         match chunk.from {
             End::Device if !arrives => {}
             End::Device if let Chunking::Gathered(every) = line.chunking => {
@@ -37,6 +42,7 @@ impl Cell {
                 if arrives {
                     line.hear(now, &chunk.bytes, chunk.is_first);
                     answers = line.device.as_mut().map_or_else(Vec::new, |d| d.receive(now, &chunk.bytes));
+                    self.slaves_did(id);
                 }
                 if chunk.is_last {
                     self.port_sent(owner);
@@ -45,6 +51,23 @@ impl Cell {
                     self.transmit(id, End::Device, &answer);
                 }
             }
+        }
+    }
+
+    /// The model is told what the slaves of a line did.
+    pub(super) fn slaves_did(&mut self, id: LineId) {
+        let line = &mut self.lines[id.0];
+        let (AnyPort::Gateway(port), Some(device)) = (line.owner, &mut line.device) else { return };
+        let done = device.take_done();
+        if let Some(oracle) = &mut self.oracle {
+            done.into_iter().for_each(|done| oracle.slave_did(usize::from(port.0), done, self.now));
+        }
+    }
+
+    /// The model is told that bytes of a line are not those that were sent.
+    pub(super) fn line_garbled(&mut self, id: LineId) {
+        if let (AnyPort::Gateway(port), Some(oracle)) = (self.lines[id.0].owner, &mut self.oracle) {
+            oracle.line_garbled(usize::from(port.0), self.now);
         }
     }
 

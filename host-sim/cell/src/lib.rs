@@ -59,7 +59,7 @@ use proto_core::engine::{BuildError as EngineError, Engine, LinkId, PortId};
 use proto_core::time::{Duration, Instant};
 
 pub use can::{BusCounters, CanBus};
-pub use device::{Device, Responder, Talker};
+pub use device::{Device, Done, Responder, SlaveDone, Talker};
 pub use injector::{FaultInjector, FaultKind};
 pub use line::{Chunking, Line, LineCounters, MAX_HEARD, Wiring};
 pub use network::{Network, Way};

@@ -14,7 +14,7 @@ use crate::config::{
     Bus, ConfigView, Counted, DeviceFrame, Exchange, FieldSpec, FrameSpec, Port, Recipe, Span, Talk,
 };
 use crate::device::{Carrier, LayoutError};
-use crate::modbus::rtu::{Operation, Table};
+use crate::modbus::rtu::{BROADCAST, Operation, Table, Timing};
 use crate::schedule::{Grid, Peer, Row};
 use crate::sysvar::{Direction, SysVar};
 use crate::time::{Duration, Instant};
@@ -56,6 +56,8 @@ pub(super) struct Item {
     /// The newest request, to tell a change.
     pub digest: Option<u64>,
     pub last_bit: Option<bool>,
+    /// It was to be asked, and a value of it was unknown or stale.
+    pub is_owed: bool,
     /// Where a block that a master writes is kept, so that the master can read it.
     pub pieces: Span,
     /// A master has written it.
@@ -264,13 +266,18 @@ impl Formats<'_> {
             rising: exchange.when.rising,
             digest: None,
             last_bit: None,
+            is_owed: false,
             pieces: Span::default(),
             is_written: false,
         };
         match exchange.talk {
             Talk::Rtu { operation, written, read } => {
                 item.asks = Asks::Rtu { slave: exchange.peer, operation };
-                item.times.is_answered = exchange.peer != crate::modbus::rtu::BROADCAST;
+                item.times.is_answered = exchange.peer != BROADCAST;
+                if !item.times.is_answered {
+                    // The slaves carry it out, and nobody says when they have.
+                    item.times.pause = exchange.pause + Timing::TURNAROUND;
+                }
                 item.request = self.data_out(written)?;
                 item.reply = self.data_in(read)?;
             }
@@ -329,7 +336,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let frames = [part_frames(Direction::Input), part_frames(Direction::Output)];
         let refusals = self.bindings.inputs.as_mut_view();
         let mut formats = Formats { config, recipe: port.recipe, places, frames, refusals };
-        let looks = exchanges.iter().any(|exchange| is_looked_at(&exchange.when));
+        // One that is asked at the start may have to wait for its values.
+        let may_wait =
+            |exchange: &Exchange| exchange.when.start && exchange.fields(config, Direction::Output).is_some();
+        let looks = exchanges.iter().any(|exchange| is_looked_at(&exchange.when) || may_wait(exchange));
         let looks = looks.then(|| Grid::starting_at(Instant::ZERO, port.cycle));
         let line_of = match &port.bus {
             Bus::Rs485(line) => Some(line),

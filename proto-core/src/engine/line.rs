@@ -105,6 +105,9 @@ pub(super) struct Line {
     look_at: Instant,
     /// When the newest request left.
     sent: Instant,
+    /// The exchange and its timeout of a repetition that is still leaving, although a late reply to the
+    /// request before has ended it.
+    late: Option<(u8, Duration)>,
     /// Own bytes are heard.
     pub has_echo: bool,
     /// So many bytes of the echo are still to come.
@@ -117,6 +120,13 @@ pub(super) struct Line {
 pub(super) struct Talks<'a> {
     pub rows: &'a mut [Row],
     pub peers: &'a mut [PeerState],
+}
+
+impl Flight {
+    /// Whether something wanted it beside its period.
+    pub(super) const fn was_requested(&self) -> bool {
+        self.taken.was_requested()
+    }
 }
 
 impl Talks<'_> {
@@ -137,6 +147,7 @@ impl Line {
             looks,
             look_at: Instant::ZERO,
             sent: Instant::ZERO,
+            late: None,
             has_echo,
             echo: 0,
             hears_unasked: false,
@@ -202,7 +213,17 @@ impl Line {
     }
 
     /// It has left. Returns whether the line now waits for the reply.
-    pub(super) fn sent(&mut self, times: impl FnOnce(u8) -> Option<Times>, now: Instant) -> bool {
+    pub(super) fn sent(
+        &mut self,
+        talks: &mut Talks<'_>,
+        times: impl FnOnce(u8) -> Option<Times>,
+        line: &LineTiming,
+        now: Instant,
+    ) -> bool {
+        if let Some((exchange, timeout)) = self.late.take() {
+            let not_before = now + timeout.saturating_mul(2);
+            self.turns(talks, |turns| turns.hold(usize::from(exchange), not_before));
+        }
         let Phase::Sending(flight) = self.phase else { return false };
         self.sent = now;
         let times = times(flight.exchange);
@@ -211,7 +232,8 @@ impl Line {
         self.phase = if is_answered {
             Phase::Waiting(Flight { until: until(|times| times.timeout), ..flight })
         } else {
-            resting(until(|times| times.pause), now)
+            // Own bytes are not heard: the silence behind them is kept here.
+            resting(until(|times| times.pause).max(now + line.turnaround), now)
         };
         self.look_at = now;
         is_answered
@@ -230,6 +252,9 @@ impl Line {
         // still to come, and must not be taken for one to another exchange.
         let late = flight.timed_out;
         let not_before = if late { self.sent + times.timeout.saturating_mul(2) } else { Instant::ZERO };
+        if late && matches!(self.phase, Phase::Sending(_)) {
+            self.late = Some((flight.exchange, times.timeout));
+        }
         self.turns(talks, |turns| turns.answered(usize::from(flight.exchange), now, not_before));
         self.rest(times.pause, now);
     }
@@ -303,6 +328,7 @@ impl Line {
             self.turns(talks, |turns| turns.request(usize::from(flight.exchange), now));
         }
         self.phase = Phase::Idle;
+        self.late = None;
         self.look_at = now;
         self.echo = 0;
     }

@@ -55,6 +55,9 @@ impl Maker<'_> {
             let peer = talks.peer_of(flight)?;
             let Some(len) = self.make(item, out) else {
                 bump(&mut peer.counters.unprepared);
+                if let Some(item) = items.get_mut(usize::from(flight.exchange)) {
+                    item.is_owed |= flight.was_requested();
+                }
                 continue;
             };
             bump(&mut peer.counters.requests);
@@ -68,14 +71,15 @@ impl Maker<'_> {
         None
     }
 
-    /// Whether a value of the request has changed, or its bit has risen.
+    /// Whether a value of the request has changed, or its bit has risen, or it waited for its values.
     fn is_wanted(&self, item: &mut Item, out: &mut [u8]) -> bool {
-        let mut is_wanted = false;
+        let mut is_wanted = item.is_owed && self.make(item, out).is_some();
+        item.is_owed &= !is_wanted;
         if item.on_change
             && let Some(len) = self.make(item, out)
         {
             let hash = digest(DIGEST_SEED, out.get(..len).unwrap_or(&[]));
-            is_wanted = item.digest != Some(hash);
+            is_wanted |= item.digest != Some(hash);
             item.digest = Some(hash);
         }
         if let Some((var, bit)) = item.rising

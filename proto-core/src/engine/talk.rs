@@ -273,12 +273,12 @@ impl FieldPort {
 
     /// The request has left.
     fn talk_sent(&mut self, mut view: View<'_>, now: Instant) {
-        let is_on_can = self.is_on_can();
+        let (timing, is_on_can) = (self.line, self.is_on_can());
         let Some(line) = self.line_mut() else { return };
-        let (items, _) = view.of(line);
+        let (items, mut talks) = view.of(line);
         let times = |nth: u8| items.get(usize::from(nth)).map(|item| item.times);
         // A bus is free for others while a reply is awaited.
-        if line.sent(times, now) && !is_on_can {
+        if line.sent(&mut talks, times, &timing, now) && !is_on_can {
             self.sender.hold();
         }
     }
@@ -320,7 +320,7 @@ impl FieldPort {
         let Some(line) = self.line_mut() else { return };
         let (items, mut talks) = view.of(line);
         for item in items {
-            (item.digest, item.last_bit) = (None, None);
+            (item.digest, item.last_bit, item.is_owed) = (None, None, false);
         }
         line.begin(&mut talks, now);
         line.looks = line.looks.map(|grid| crate::schedule::Grid::starting_at(now, grid.period()));

@@ -157,6 +157,9 @@ impl<P: AsRef<Peer> + AsMut<Peer>> Turns<'_, P> {
     /// The row to take now, or when to look again.
     pub(crate) fn choose(&mut self, now: Instant) -> Result<usize, Instant> {
         let (mut requested, mut due, mut probe) = (First::NONE, First::NONE, First::NONE);
+        // Each peer that is down has a wait of its own: the one that may be asked first is not always the
+        // one that has waited too long first.
+        let mut overdue = First::NONE;
         let (mut look_again, mut next_due) = (Instant::NEVER, Instant::NEVER);
         let is_opening = self.rows.iter().any(|row| row.opens);
         for (nth, row) in self.rows.iter().enumerate() {
@@ -173,18 +176,20 @@ impl<P: AsRef<Peer> + AsMut<Peer>> Turns<'_, P> {
                         next_due = next_due.min(at);
                     }
                 }
-                Presence::Down => probe.consider((at, row.taken), nth),
+                Presence::Down => {
+                    probe.consider((at, row.taken), nth);
+                    overdue.consider((at + peer.wait, row.taken), nth);
+                }
                 _ if row.requested.is_some() => requested.consider((wanted, row.taken), nth),
                 _ => due.consider((row.end_of_period(), row.taken), nth),
             }
         }
         let probe = probe.nth.and_then(|nth| {
             let row = self.rows.get(nth)?;
-            let wait = self.peers.get(usize::from(row.peer))?.as_ref().wait;
-            Some((nth, probe.key.0 + wait, now + row.cost <= next_due))
+            Some((nth, now + row.cost <= next_due))
         });
-        let overdue = probe.filter(|(_, nevertheless, _)| *nevertheless <= now).map(|(nth, ..)| nth);
-        let periodic = overdue.or(due.nth);
+        let nevertheless = overdue.key.0;
+        let periodic = overdue.nth.filter(|_| nevertheless <= now).or(due.nth);
         if let Some(nth) = requested.nth
             && (*self.run < REQUESTED_RUN || periodic.is_none())
         {
@@ -193,8 +198,8 @@ impl<P: AsRef<Peer> + AsMut<Peer>> Turns<'_, P> {
         }
         *self.run = 0;
         match (periodic, probe) {
-            (Some(nth), _) | (None, Some((nth, _, true))) => Ok(nth),
-            (None, Some((_, nevertheless, false))) => Err(look_again.min(nevertheless)),
+            (Some(nth), _) | (None, Some((nth, true))) => Ok(nth),
+            (None, Some((_, false))) => Err(look_again.min(nevertheless)),
             (None, None) => Err(look_again),
         }
     }
@@ -241,6 +246,14 @@ impl<P: AsRef<Peer> + AsMut<Peer>> Turns<'_, P> {
                 // What went by in the meantime is not missed.
                 *grid = Grid::starting_at(grid.next().max(now), grid.period());
             }
+        }
+    }
+
+    /// The peer of a row is asked nothing before this: a reply to an earlier request may still come.
+    pub(crate) fn hold(&mut self, nth: usize, not_before: Instant) {
+        let Some(which) = self.rows.get(nth).map(|row| row.peer) else { return };
+        if let Some(peer) = self.peers.get_mut(usize::from(which)).map(AsMut::as_mut) {
+            peer.not_before = peer.not_before.max(not_before);
         }
     }
 

@@ -251,3 +251,19 @@ fn a_frame_on_its_way_still_is_when_a_node_does_not_answer() {
     }
     assert!(rig.counters(port).unanswered > 0);
 }
+
+#[test]
+fn the_line_is_silent_between_requests_that_nobody_answers() {
+    let mut cell = Cell::new();
+    let table = [0x51, 0x52].map(|letter| {
+        let request = frame(&mut cell, None, &[], b"\r", vec![fixed(letter)]);
+        asks(request, None, None, AskWhen::every(MS(20)))
+    });
+    let port = talking(&mut cell, &table);
+    let Bus::Rs485(settings) = &mut cell.last_port().bus else { panic!() };
+    settings.turnaround = MS(3);
+    let mut line = Line::new(&cell, port);
+    let asked = line.run(MS(200), |_| None);
+    let rests: Vec<_> = asked.windows(2).map(|pair| pair[1].0.saturating_since(pair[0].0)).collect();
+    assert!(rests.len() > 15 && rests.iter().all(|rest| *rest >= MS(3)), "{rests:?}");
+}

@@ -17,6 +17,19 @@ fn scale() -> Line {
     Line::new(&cell, port)
 }
 
+/// Writes 3 to register 1.
+fn sets_mode(cell: &mut Cell, slave: u8, when: AskWhen) -> Exchange {
+    let order = proto_core::device::ByteOrder::Big;
+    let word = proto_core::device::Encoding::scalar(proto_core::wire::scalar::ScalarType::Word);
+    let written = cell.fields([FieldSpec::DeviceOutput {
+        encoding: proto_core::device::Encoding { order, ..word },
+        overflow: proto_core::device::Overflow::Usual,
+        from: OutputBinding::Constant(3.0),
+    }]);
+    let operation = Operation::WriteRegister { address: 1 };
+    Exchange::new(slave, Talk::Rtu { operation, written, read: Span::default() }, when)
+}
+
 #[test]
 fn a_register_is_read_each_period_and_reaches_the_robot() {
     let mut line = scale();
@@ -122,22 +135,7 @@ fn a_changed_value_is_written_once_and_not_before_it_is_known() {
 #[test]
 fn what_is_asked_at_the_start_is_asked_again_when_the_slave_or_the_port_is_back() {
     let mut cell = Cell::new();
-    let start = AskWhen { start: true, ..AskWhen::NEVER };
-    let mode = Exchange {
-        talk: Talk::Rtu {
-            operation: Operation::WriteRegister { address: 1 },
-            written: cell.fields([FieldSpec::DeviceOutput {
-                encoding: proto_core::device::Encoding {
-                    order: proto_core::device::ByteOrder::Big,
-                    ..proto_core::device::Encoding::scalar(proto_core::wire::scalar::ScalarType::Word)
-                },
-                overflow: proto_core::device::Overflow::Usual,
-                from: OutputBinding::Constant(3.0),
-            }]),
-            read: Span::default(),
-        },
-        ..writes(&mut Cell::new(), 4, &[], start)
-    };
+    let mode = sets_mode(&mut cell, 4, AskWhen { start: true, ..AskWhen::NEVER });
     let poll = reads(&mut cell, 4, &["WordInputReg[1]"], AskWhen::every(MS(50)));
     let port = talking(&mut cell, &[mode, poll]);
     let mut line = Line::new(&cell, port);
@@ -252,6 +250,66 @@ fn a_late_reply_is_not_taken_for_another_exchange() {
 }
 
 #[test]
+fn a_late_reply_that_comes_while_the_request_is_repeated_holds_others_back_too() {
+    let mut cell = Cell::new();
+    let mut table = [1, 2].map(|address| {
+        let name = format!("WordInputReg[{address}]");
+        let mut exchange = reads(&mut cell, 5, &[&name], AskWhen::every(MS(40)));
+        let Talk::Rtu { operation, .. } = &mut exchange.talk else { panic!() };
+        *operation = Operation::ReadHoldingRegisters { address, count: 1 };
+        exchange
+    });
+    table.iter_mut().for_each(|exchange| exchange.timeout = MS(30));
+    let port = talking(&mut cell, &table);
+    let variables = ["WordInputReg[1]", "WordInputReg[2]"].map(var);
+    for delay in (1..55).step_by(2) {
+        let mut rig = cell.rig();
+        rig.reports_sent = false;
+        // Requests take 5 ms to leave. Until the first change the slave is prompt.
+        let (begin, mut coming) = (rig.now, Vec::new());
+        while rig.now < begin + MS(1_500) {
+            for request in rig.sent_to(port) {
+                let left = rig.now + MS(5);
+                let delay = if rig.now < begin + MS(300) { 1 } else { delay };
+                coming.push((left, None));
+                coming.push((left + MS(delay), Some(registers(5, &[u16::from(request[3]) + 100]))));
+            }
+            coming.sort_by_key(|(at, _)| *at);
+            let next = coming.first().map_or(Instant::NEVER, |(at, _)| *at);
+            rig.now = rig.now.max(next.min(rig.wake));
+            if next > rig.now {
+                rig.input(Input::Tick);
+                continue;
+            }
+            let values = variables.map(|var| rig.engine.image().value(var));
+            for (value, right) in values.into_iter().zip([101.0, 102.0]) {
+                assert!([0.0, right].contains(&value.as_f64()), "{value} at a delay of {delay} ms");
+            }
+            match coming.remove(0).1 {
+                None => rig.input(Input::PortSent { port }),
+                Some(reply) => rig.bytes(port, &reply),
+            }
+        }
+    }
+}
+
+#[test]
+fn nothing_is_sent_for_a_while_after_a_request_to_all() {
+    let mut cell = Cell::new();
+    let shift = sets_mode(&mut cell, 0, AskWhen::every(MS(300)));
+    let poll = reads(&mut cell, 4, &["WordInputReg[1]"], AskWhen::every(MS(20)));
+    let port = talking(&mut cell, &[shift, poll]);
+    let mut line = Line::new(&cell, port);
+    let asked = line.run(MS(2_000), |request| (request[0] == 4).then(|| (MS(2), registers(4, &[1]))));
+    let rests: Vec<Duration> = asked
+        .windows(2)
+        .filter(|pair| pair[0].1[0] == 0)
+        .map(|pair| pair[1].0.saturating_since(pair[0].0))
+        .collect();
+    assert!(rests.len() > 5 && rests.iter().all(|rest| (MS(100)..MS(102)).contains(rest)), "{rests:?}");
+}
+
+#[test]
 fn a_value_that_is_asked_once_is_not_missed_later() {
     let mut cell = Cell::new();
     let start = AskWhen { start: true, ..AskWhen::NEVER };
@@ -310,4 +368,54 @@ fn what_a_slave_is_asked_at_its_start_comes_first_and_in_order() {
         // It is away, and comes back at another moment in each round.
         line.run(MS(700 + round * 333), |request| if request[0] == 4 { None } else { done(request) });
     }
+}
+
+#[test]
+fn what_is_asked_at_the_start_waits_until_its_values_are_fresh() {
+    let start = AskWhen { start: true, ..AskWhen::NEVER };
+    for when in [start, AskWhen { change: true, ..start }] {
+        let mut cell = Cell::new();
+        let lamp = writes(&mut cell, 4, &["WordOutputReg[1]"], when);
+        let poll = reads(&mut cell, 4, &["WordInputReg[1]"], AskWhen::every(MS(50)));
+        let port = talking(&mut cell, &[lamp, poll]);
+        cell.last_recipe().on_stale = OnStale::Stop;
+        cell.last_port().stale_after = MS(200);
+        let mut line = Line::new(&cell, port);
+        let done = |request: &[u8]| {
+            let reply = if request[1] == 16 { with_crc(&request[..6]) } else { registers(4, &[1]) };
+            Some((MS(1), reply))
+        };
+        let count = |asked: &[(Instant, Vec<u8>)]| asked.iter().filter(|(_, sent)| sent[1] == 16).count();
+        assert_eq!(count(&line.run(MS(3_000), done)), 1);
+        // The slave loses its power, and the controller falls silent before the slave is back.
+        line.run(MS(400), |_| None);
+        line.rig.modbus_answers = false;
+        line.run(MS(600), |_| None);
+        assert_eq!(count(&line.run(MS(3_000), done)), 0, "its value is stale");
+        line.rig.modbus_answers = true;
+        assert_eq!(count(&line.run(MS(8_000), done)), 1, "the same value as before");
+    }
+}
+
+#[test]
+fn a_slow_slave_that_is_dead_does_not_hide_a_fast_one() {
+    let mut cell = Cell::new();
+    let rows: Vec<_> = [(1, 5, 8), (2, 10, 50), (3, 400, 50)]
+        .into_iter()
+        .map(|(slave, timeout, every)| {
+            let poll =
+                reads(&mut cell, slave, &[&format!("WordInputReg[{slave}]")], AskWhen::every(MS(every)));
+            Exchange { timeout: MS(timeout), retries: 0, ..poll }
+        })
+        .collect();
+    let port = talking(&mut cell, &rows);
+    let mut line = Line::new(&cell, port);
+    // There is no gap in which a timeout of the dead ones fits.
+    let answer = |request: &[u8]| (request[0] == 1).then(|| (MS(1), registers(1, &[1])));
+    line.run(MS(60_000), answer);
+    let asked = line.run(MS(60_000), answer);
+    let times: Vec<_> = asked.iter().filter(|(_, sent)| sent[0] == 2).map(|(at, _)| *at).collect();
+    let waits = times.windows(2).map(|pair| pair[1].saturating_since(pair[0])).max().unwrap();
+    // It waits for 64 timeouts, and as long again for a gap; the other's timeout may come between.
+    assert!(waits < MS(2 * 640 + 500), "{waits:?}");
 }

@@ -142,10 +142,8 @@ fn crc_of(crc: &Crc, bytes: &[u8]) -> u32 {
 
 /// Why a configuration cannot be judged, if it cannot.
 pub(crate) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
-    if !config.exchanges.is_empty() {
-        return Some(
-            "a soak cannot judge exchanges: it has no devices that answer, and is no master of slaves",
-        );
+    if let Some(reason) = super::talk::spec::unmodelled(config) {
+        return Some(reason);
     }
     let varies = config.fields.iter().any(|field| match field {
         FieldSpec::TextInput { .. } | FieldSpec::TextOutput { .. } | FieldSpec::Length(_) => true,

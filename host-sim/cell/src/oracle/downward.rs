@@ -121,7 +121,19 @@ impl Downward {
             _ => None,
         };
         let fields = port.outputs.iter().flat_map(|frame| &frame.fields).filter_map(shown);
-        for var in fields.chain(trigger) {
+        self.may_show_all(spec, port, up, fields.chain(trigger), now)
+    }
+
+    /// Whether these values are known and, if the recipe requires it, not stale.
+    pub(super) fn may_show_all(
+        &self,
+        spec: &Spec,
+        port: &PortSpec,
+        up: &Upward,
+        vars: impl Iterator<Item = SysVar>,
+        now: Instant,
+    ) -> Result<(), Wrong> {
+        for var in vars {
             if up.known(var).unreadable {
                 return Err((Invariant::Unreadable, format!("{var} is unreadable")));
             }
@@ -136,6 +148,13 @@ impl Downward {
             }
         }
         Ok(())
+    }
+
+    /// A request of so many bytes was handed over.
+    pub(super) fn asked(&mut self, len: usize) {
+        self.frames_out = self.frames_out.wrapping_add(1);
+        self.bytes_out = self.bytes_out.wrapping_add(len as u32);
+        self.cycles = self.cycles.wrapping_add(1);
     }
 
     /// Checks a frame that the engine hands over; `id` is that of a CAN frame.
@@ -231,7 +250,7 @@ impl Downward {
     }
 
     /// Whether the payload has the present values.
-    fn agrees(&self, frame: &Frame, up: &Upward, payload: &[u8]) -> bool {
+    pub(super) fn agrees(&self, frame: &Frame, up: &Upward, payload: &[u8]) -> bool {
         if let Some(device) = &frame.device {
             let whole = [&frame.head[..], payload, &frame.tail].concat();
             return device.sum_is_right(&whole) != Some(false)

@@ -98,6 +98,31 @@ impl LineWatch {
         self.cut(frame).iter().map(|payload| judge(port.mode, frame, 0, payload)).collect()
     }
 
+    /// Drops the first byte that is held: nothing begins with it.
+    pub(super) fn drop_one(&mut self) {
+        self.held.remove(0);
+        self.dropped += 1;
+        self.missing.0 = self.missing.0.and_then(|missing| missing.checked_sub(1));
+    }
+
+    /// Drops the first byte of a frame of `len` bytes with a wrong checksum; returns whether a frame was
+    /// expected there.
+    pub(super) fn drop_wrong(&mut self, len: usize) -> bool {
+        let is_expected = self.missing.0 == Some(0);
+        if is_expected {
+            self.missing.0 = Some(len);
+        }
+        self.drop_one();
+        is_expected
+    }
+
+    /// Takes a frame of `len` bytes.
+    pub(super) fn take_front(&mut self, len: usize) -> Vec<u8> {
+        self.frame_bytes += len as u64;
+        self.missing = Missing::default();
+        self.held.drain(..len).collect()
+    }
+
     /// Removes complete frames of a device from the held bytes.
     fn cut_device(&mut self, frame: &Frame, device: &DeviceSpec) -> Vec<Verdict> {
         let mut found = Vec::new();
@@ -175,6 +200,18 @@ pub(super) fn can(port: &PortSpec, received: &CanFrame) -> Result<Verdict, Refus
         Seen::Other | Seen::Nothing => Verdict::OtherDevice,
         Seen::WrongChecksum => Verdict::WrongChecksum,
     })
+}
+
+/// Judges the data of a reply.
+pub(super) fn judge_data(frame: &Frame, nth: usize, data: &[u8]) -> Verdict {
+    match &frame.device {
+        None => judge(Mode::User, frame, nth, data),
+        Some(device) => match device.see(&frame.fields, data) {
+            Seen::Ours => judge_device(frame, nth, data),
+            Seen::Other | Seen::Nothing => Verdict::OtherDevice,
+            Seen::WrongChecksum => Verdict::WrongChecksum,
+        },
+    }
 }
 
 /// The fields are judged one after the other: the first that cannot be used rejects the frame.

@@ -28,6 +28,9 @@ impl Oracle {
             watch.line.tick(port, now);
             watch.down.tick(port, now);
         }
+        for nth in 0..self.ports.len() {
+            self.talk_tick(nth, now);
+        }
         if now >= self.rewrite_at {
             self.write_refused_again();
         }
@@ -41,6 +44,8 @@ impl Oracle {
         for watch in &mut self.ports {
             watch.down.slept();
             watch.line.discard();
+            watch.talk.abandon();
+            watch.talk.disturbed_at = now + DISCARD_AFTER_SLEEP;
         }
         self.discards_until = Some(now + DISCARD_AFTER_SLEEP);
     }
@@ -92,6 +97,7 @@ impl Oracle {
 
     /// Shown values may have changed: looks for rising bits that trigger a port.
     pub(super) fn values_changed(&mut self) {
+        self.talk_values_changed();
         if !self.spec.has_triggers {
             return;
         }
@@ -105,6 +111,15 @@ impl Oracle {
         let watch = &mut self.ports[nth];
         watch.counters.bytes_in = watch.counters.bytes_in.wrapping_add(bytes.len() as u32);
         watch.down.heard = now;
+        if port.talk.is_some() {
+            watch.line.heard = now;
+            if self.discards_until.is_none() {
+                return self.talk_bytes(nth, bytes, now);
+            }
+            watch.counters.asleep += 1;
+            watch.line.discarded += bytes.len() as u64;
+            return;
+        }
         if self.discards_until.is_some() {
             watch.counters.asleep += 1;
             if !port.inputs.is_empty() {
@@ -235,6 +250,11 @@ impl Oracle {
     ) {
         let nth = usize::from(port.0);
         self.frames[nth].1 += 1;
+        if self.spec.ports[nth].talk.is_some() {
+            let result = self.talk_send(nth, bytes, now);
+            let invariants = [Invariant::Known, Invariant::Age, Invariant::Shown, Invariant::Line];
+            return self.judge(now, &invariants, result);
+        }
         let result = self.ports[nth].down.check(&self.spec, nth, &self.up, id, bytes, now);
         let invariants = [
             Invariant::Known,
@@ -469,7 +489,7 @@ impl Oracle {
     /// Compares the engine's counters with the model's.
     pub(super) fn count(&mut self, nth: usize, engine: &Engine) -> Result<(), Wrong> {
         let Some(actual) = engine.port_counters(PortId(nth as u8)) else { return Ok(()) };
-        let PortWatch { line, down, counters } = &self.ports[nth];
+        let PortWatch { line, down, counters, talk } = &self.ports[nth];
         let up = self.up.counted[nth];
         let commands = self.commands.counted[nth];
         let mut expected = *counters;
@@ -480,6 +500,8 @@ impl Oracle {
         expected.bytes_out = down.bytes_out;
         expected.skipped_cycles = down.skipped;
         expected.stale_cycles = down.stale;
+        expected.unanswered = talk.unanswered;
+        expected.refused = talk.refused;
         expected.edges_lost = up.edges_lost;
         expected.values_expired = up.values_expired;
         expected.undelivered = up.undelivered;
@@ -497,7 +519,8 @@ impl Oracle {
         }
         let accounted = line.frame_bytes + line.dropped + line.discarded + line.held.len() as u64;
         let spec = &self.spec.ports[nth];
-        if !spec.is_can && !spec.inputs.is_empty() && accounted as u32 != actual.bytes_in {
+        let reads = !spec.inputs.is_empty() || spec.talk.is_some();
+        if !spec.is_can && reads && accounted as u32 != actual.bytes_in {
             let what =
                 format!("port {nth} received {} bytes, {accounted} are accounted for", actual.bytes_in);
             return Err((Invariant::Bytes, what));

@@ -65,6 +65,14 @@ pub enum Invariant {
     Work,
     /// Every queue is bounded.
     Memory,
+    /// What a slave of a line answered is taken, and only that; what reaches the controller was held there.
+    Held,
+    /// What a slave takes was asked for, and is what the controller had, together and not long ago.
+    Carried,
+    /// The slaves of a line are asked as often as their periods say, and looked for while they are silent.
+    Periods,
+    /// A slave that answers soon has the controller's values.
+    Told,
     /// Nothing panics.
     NoPanic,
 }
@@ -103,6 +111,10 @@ impl Invariant {
             Self::Destination => "destination",
             Self::Work => "bounded-work",
             Self::Memory => "bounded-memory",
+            Self::Held => "held-by-slave",
+            Self::Carried => "slave-is-told-right",
+            Self::Periods => "periods-are-kept",
+            Self::Told => "slave-is-told",
             Self::NoPanic => "no-panic",
         }
     }
@@ -132,7 +144,7 @@ impl std::fmt::Display for Violation {
     }
 }
 
-pub(super) const ALL: [Invariant; 31] = [
+pub(super) const ALL: [Invariant; 35] = [
     Invariant::Sent,
     Invariant::InTime,
     Invariant::FirstFrame,
@@ -163,5 +175,9 @@ pub(super) const ALL: [Invariant; 31] = [
     Invariant::Destination,
     Invariant::Work,
     Invariant::Memory,
+    Invariant::Held,
+    Invariant::Carried,
+    Invariant::Periods,
+    Invariant::Told,
     Invariant::NoPanic,
 ];

@@ -21,6 +21,7 @@ mod robot;
 mod safe;
 mod spec;
 mod stream;
+mod talk;
 mod upward;
 mod wire;
 
@@ -39,6 +40,8 @@ pub use invariant::{Invariant, Violation};
 pub(super) use robot::Path;
 use robot::Robot;
 use spec::Spec;
+use talk::line::TalkWatch;
+use talk::truth::Truth;
 use upward::{Upward, Wrong};
 pub(super) use wire::inputs_of;
 use wire::{Controller, Map, Modbus, Safe};
@@ -49,6 +52,7 @@ struct PortWatch {
     line: LineWatch,
     down: Downward,
     counters: PortCounters,
+    talk: TalkWatch,
 }
 
 /// The model's state of one recipe link, or of the state link.
@@ -96,6 +100,7 @@ pub(super) struct Oracle {
     commands: Commands,
     controller: Controller,
     robot: Robot,
+    truth: Truth,
     /// When the engine was called last.
     called_at: Option<Instant>,
     /// When the engine asked to be called, and whether another input came first at that time.
@@ -121,7 +126,8 @@ pub(super) struct Oracle {
 impl Oracle {
     pub(super) fn new(config: &GatewayConfig) -> Self {
         let spec = Spec::new(config);
-        let parts: usize = spec.ports.iter().map(|port| port.outputs.len()).sum();
+        let of_port = |port: &spec::PortSpec| port.outputs.len() + usize::from(port.talk.is_some());
+        let parts: usize = spec.ports.iter().map(of_port).sum();
         Self {
             map: Map::new(&spec),
             up: Upward::new(&spec),
@@ -133,6 +139,7 @@ impl Oracle {
             commands: Commands::default(),
             controller: Controller::new(),
             robot: Robot::default(),
+            truth: Truth::new(&spec),
             called_at: None,
             announced: Instant::NEVER,
             is_late: false,
@@ -158,7 +165,9 @@ impl Oracle {
         self.called_at = Some(now);
         self.announced = announced;
         for port in engine.field_ports() {
-            self.ports[usize::from(port.0)].down.is_up = true;
+            let watch = &mut self.ports[usize::from(port.0)];
+            watch.down.is_up = true;
+            watch.talk.begin(now);
         }
     }
 
@@ -234,8 +243,20 @@ impl Oracle {
         match *input {
             Input::PortBytes { port, bytes } => self.port_bytes(usize::from(port.0), bytes, now),
             Input::PortCan { port, frame } => self.port_can(usize::from(port.0), &frame, now),
-            Input::PortSent { port } => self.ports[usize::from(port.0)].down.sent(),
-            Input::PortUp { port } => self.ports[usize::from(port.0)].down.is_up = true,
+            Input::PortSent { port } => {
+                let nth = usize::from(port.0);
+                self.ports[nth].down.sent();
+                if let Some(talk) = &self.spec.ports[nth].talk {
+                    self.ports[nth].talk.left(talk, now);
+                }
+            }
+            Input::PortUp { port } => {
+                let watch = &mut self.ports[usize::from(port.0)];
+                watch.down.is_up = true;
+                watch.talk.begin(now);
+                // What rises from now on asks.
+                self.talk_values_changed();
+            }
             Input::PortDown { port } => {
                 let nth = usize::from(port.0);
                 let watch = &mut self.ports[nth];
@@ -243,6 +264,7 @@ impl Oracle {
                 watch.down.is_up = false;
                 watch.down.reset();
                 watch.line.discard();
+                watch.talk.gone();
                 self.forget_commands(nth, None, now);
             }
             Input::PortBus { port, state } => {

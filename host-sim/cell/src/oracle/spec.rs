@@ -12,6 +12,7 @@ use proto_core::wire::can::CanId;
 
 use super::bits::{self, Share};
 use super::device::DeviceSpec;
+use super::talk::spec::TalkSpec;
 
 /// A value as on the wire; unused bytes are 0.
 pub(super) type Raw = [u8; 4];
@@ -64,6 +65,18 @@ pub(super) struct PortSpec {
     pub send: SendOn,
     pub idle_gap: Duration,
     pub turnaround: Duration,
+    /// What is asked on a Modbus line. The replies are behind the other inputs.
+    pub talk: Option<TalkSpec>,
+}
+
+impl PortSpec {
+    /// The variables that its frames show, and its requests.
+    fn shown(&self) -> impl Iterator<Item = SysVar> {
+        let fields = self.outputs.iter().flat_map(|frame| &frame.fields).filter_map(shown);
+        let rows = self.talk.iter().flat_map(|talk| &talk.rows);
+        let asked = rows.flat_map(|row| row.shown().chain(row.rising.map(|(var, _)| var)));
+        fields.chain(asked)
+    }
 }
 
 /// A recipe link.
@@ -167,8 +180,7 @@ impl Spec {
                 SendOn::Rising { var, .. } => Some(var),
                 _ => None,
             };
-            let fields = port.outputs.iter().flat_map(|frame| &frame.fields);
-            for var in fields.filter_map(shown).chain(trigger) {
+            for var in port.shown().chain(trigger) {
                 let from_link =
                     links.iter().any(|link| link.output.as_ref().is_some_and(|down| down.shows(var)));
                 origin[var.ordinal()] = Some(if owned[var.ordinal()].is_some() {
@@ -271,7 +283,7 @@ pub(super) fn shown(field: &FieldSpec) -> Option<SysVar> {
 }
 
 /// The size of a plain recipe's field.
-fn size(field: &FieldSpec) -> usize {
+pub(super) fn size(field: &FieldSpec) -> usize {
     match field {
         FieldSpec::System(var) => var.size(),
         FieldSpec::UserInput { ty, .. } | FieldSpec::UserOutput { ty, .. } => ty.size(),
@@ -283,7 +295,7 @@ fn by_modbus(var: SysVar) -> bool {
     matches!(var.modbus(), Some(ModbusPlace::Coils { .. } | ModbusPlace::Register { .. }))
 }
 
-fn frame(head: &[u8], tail: &[u8], id: Option<CanId>, fields: &[FieldSpec]) -> Frame {
+pub(super) fn frame(head: &[u8], tail: &[u8], id: Option<CanId>, fields: &[FieldSpec]) -> Frame {
     let device = DeviceSpec::new(head.len(), fields);
     let payload = device.as_ref().map_or_else(|| fields.iter().map(size).sum(), |device| device.len);
     Frame { head: head.to_vec(), tail: tail.to_vec(), id, fields: fields.to_vec(), payload, device }
@@ -306,13 +318,18 @@ fn frames(config: &GatewayConfig, recipe: &Recipe, direction: Direction) -> Vec<
 
 fn port_spec(config: &GatewayConfig, port: &proto_core::config::Port) -> PortSpec {
     let recipe = &config.recipes[usize::from(port.recipe)];
+    let mut inputs = frames(config, recipe, Direction::Input);
+    let mut talk = None;
     let (idle_gap, turnaround) = match port.bus {
         Bus::Rs485(line) => {
             // 3.5 characters: a start bit, eight bits, parity, stop bits (D19).
             let parity = u64::from(line.parity != proto_core::config::Parity::None);
             let half_bits = 7 * (9 + parity + u64::from(line.stop_bits));
             let characters = (half_bits * 1_000_000).div_ceil(2 * u64::from(line.baud));
-            (line.idle_gap.max(Duration::from_micros(characters)), line.turnaround)
+            let characters = Duration::from_micros(characters);
+            let silence = line.turnaround.max(characters);
+            talk = TalkSpec::new(config, recipe, (&line, silence), &mut inputs);
+            (line.idle_gap.max(characters), line.turnaround)
         }
         _ => (Duration::MAX, Duration::ZERO),
     };
@@ -320,7 +337,7 @@ fn port_spec(config: &GatewayConfig, port: &proto_core::config::Port) -> PortSpe
         is_field: port.bus.is_field(),
         is_can: matches!(port.bus, Bus::Can { .. }),
         mode: recipe.mode,
-        inputs: frames(config, recipe, Direction::Input),
+        inputs,
         outputs: frames(config, recipe, Direction::Output),
         timeout: port.timeout,
         stale_after: port.stale_after,
@@ -329,6 +346,7 @@ fn port_spec(config: &GatewayConfig, port: &proto_core::config::Port) -> PortSpe
         send: recipe.send,
         idle_gap,
         turnaround,
+        talk,
     }
 }
 

@@ -43,7 +43,7 @@ macro_rules! embedded {
 
 /// A seed selects by position, so the order must not change. Controllers of examples that have field ports
 /// of their own are replaced, since no device would be connected to them.
-const EMBEDDED: [Embedded; 12] = [
+const EMBEDDED: [Embedded; 13] = [
     embedded!("/../configs/", "rs485-system", "can-hand"),
     embedded!("/../configs/", "udp-server", "udp-server"),
     embedded!("/../configs/", "client", "client"),
@@ -56,6 +56,7 @@ const EMBEDDED: [Embedded; 12] = [
     embedded!("/src/soak/cells/", "orders", "orders"),
     embedded!("/src/soak/cells/", "witness", "witness"),
     embedded!("/src/soak/cells/", "panels", "panels"),
+    embedded!("/src/soak/cells/", "modbus-line", "modbus-line"),
 ];
 
 impl Scenario {
@@ -118,7 +119,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cell_with_exchanges_is_refused() {
+    fn a_cell_with_devices_that_are_asked_in_their_own_frames_is_refused() {
         let mut config = Scenario::all().unwrap().remove(0).gateway;
         assert_eq!(unmodelled(&config), None);
         let talk = Talk::Frames { request: None, reply: None, refusal: None };

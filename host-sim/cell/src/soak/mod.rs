@@ -9,6 +9,7 @@ mod batch;
 mod cells;
 mod random_device;
 mod show;
+mod slaves;
 mod world;
 
 use std::collections::BTreeMap;
@@ -23,6 +24,7 @@ pub use show::show_trace;
 
 use crate::{Cell, CellError, Chunking, FaultInjector, FaultKind, Invariant, Rng, Violation, Wiring};
 use random_device::RandomDevice;
+use slaves::Slaves;
 use world::World;
 
 /// How many faults are injected.
@@ -187,7 +189,9 @@ impl Soak {
 fn attach_devices(cell: &mut Cell, config: &GatewayConfig, level: Level, rng: &mut Rng) {
     for port in &config.ports {
         let mut rng = rng.fork();
-        let device = RandomDevice::new(config, port, cell.now(), rng.fork());
+        let seed = rng.fork();
+        let device = RandomDevice::new(config, port, cell.now(), seed.clone());
+        let slaves = Slaves::new(config, port, cell.now(), seed);
         match port.bus {
             Bus::Rs485(_) => {
                 let line = cell.line_of(&port.name);
@@ -202,6 +206,8 @@ fn attach_devices(cell: &mut Cell, config: &GatewayConfig, level: Level, rng: &m
                 }
                 if let Some(device) = device {
                     cell.attach(line, device);
+                } else if let Some(slaves) = slaves {
+                    cell.attach(line, slaves);
                 }
             }
             Bus::Can { .. } => {

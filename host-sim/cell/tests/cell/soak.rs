@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use proto_core::time::Duration;
+use recipe_cell::Invariant;
 use recipe_cell::soak::{Batch, Level, Scenario, Soak, Total};
 
 fn soaked(level: Level, seed: u64, span: Duration, jobs: usize) -> Total {
@@ -21,7 +22,7 @@ fn soaked(level: Level, seed: u64, span: Duration, jobs: usize) -> Total {
 /// The hashes of these runs on every machine. Only a change of what the engine, the controller or the cell
 /// does, or when, may change them; then enter the new ones here.
 const HASHES: [(Level, u64); 2] =
-    [(Level::None, 0x3C4D_2F47_D383_FBB6), (Level::Harsh, 0x63D9_79BA_D246_1B5B)];
+    [(Level::None, 0xDD5E_B098_CC10_812A), (Level::Harsh, 0x1E9E_4BC1_CB0D_4669)];
 
 #[test]
 fn a_seed_means_the_same_trace_on_every_machine() {
@@ -36,16 +37,18 @@ fn the_number_of_threads_changes_nothing() {
     assert_eq!(one, soaked(Level::Harsh, 8, span, 3));
     assert_eq!(one.span, span);
     assert!(one.cells.len() > 9 && one.writes > 500, "{one:?}");
-    // Commands and safe values are checked in longer runs of the cell that has most of them.
-    let scenario = Scenario::named("orders").unwrap().unwrap();
+    // Commands and safe values, and slaves, are checked in longer runs of the cells that have most of them.
     let mut checks = one.checks.clone();
-    for seed in 1..=3 {
-        let mut orders = Soak::new(&scenario, seed, Level::Harsh).unwrap();
-        orders.run_to(Duration::from_secs(180));
-        let report = orders.report();
-        assert_eq!(report.violation, None);
-        for (what, count) in report.checks {
-            *checks.entry(what).or_default() += count;
+    for (name, seeds, seconds) in [("orders", 1..=3, 180), ("modbus-line", 1..=2, 60)] {
+        let scenario = Scenario::named(name).unwrap().unwrap();
+        for seed in seeds {
+            let mut soak = Soak::new(&scenario, seed, Level::Harsh).unwrap();
+            soak.run_to(Duration::from_secs(seconds));
+            let report = soak.report();
+            assert_eq!(report.violation, None);
+            for (what, count) in report.checks {
+                *checks.entry(what).or_default() += count;
+            }
         }
     }
     let never: Vec<_> =
@@ -64,4 +67,22 @@ fn how_a_run_is_cut_changes_nothing() {
         soak.report()
     };
     assert_eq!(run(12_000), run(75));
+}
+
+#[test]
+fn slaves_of_a_line_are_judged_at_their_registers_and_at_the_robot() {
+    let scenario = Scenario::named("modbus-line").unwrap().unwrap();
+    for level in [Level::None, Level::Harsh] {
+        let mut soak = Soak::new(&scenario, 11, level).unwrap();
+        soak.run_to(Duration::from_secs(120));
+        let report = soak.report();
+        assert_eq!(report.violation, None);
+        let looked_at = |invariant| report.checks[&invariant];
+        assert!(looked_at(Invariant::Held) > 3_000, "{report:?}");
+        assert!(looked_at(Invariant::Carried) > 200, "{report:?}");
+        assert!(looked_at(Invariant::Periods) > 5_000, "{report:?}");
+        assert!(looked_at(Invariant::Told) > 10, "{report:?}");
+        let (_, received, sent) = report.ports[0];
+        assert!(received > 1_000 && sent > received, "{report:?}");
+    }
 }

@@ -168,8 +168,18 @@ impl Robot {
         self.stalls.back().is_some_and(|(_, to)| *to == now)
     }
 
+    /// Whether the gateway is not called at present.
+    pub(super) fn is_stalled(&self, now: Instant) -> bool {
+        self.stalls.back().is_some_and(|(from, to)| *from <= now && now <= *to)
+    }
+
+    /// Since when all paths that carry values have worked.
+    pub(super) fn all_sound_since(&self) -> Option<Instant> {
+        self.all_sound_since
+    }
+
     /// For how long the gateway was not called since `since`.
-    fn stalled_since(&self, since: Instant, now: Instant) -> Duration {
+    pub(super) fn stalled_since(&self, since: Instant, now: Instant) -> Duration {
         let part = |&(from, to): &(Instant, Instant)| to.min(now).saturating_since(from.max(since));
         self.stalls.iter().map(part).fold(Duration::ZERO, |sum, part| sum + part)
     }
@@ -332,6 +342,34 @@ impl Oracle {
         self.checks[Invariant::Overtaken as usize] += u64::from(transmission.command.is_some());
         let result = self.robot.judge(transmission, slowest, now);
         self.judge(now, &[], result);
+        let result = self.were_held(transmission, slowest, now);
+        self.judge(now, &[], result);
+    }
+
+    /// Checks that the slaves of a line have held the values of a transmission that arrives.
+    fn were_held(
+        &mut self,
+        transmission: &Transmission,
+        slowest: Duration,
+        now: Instant,
+    ) -> Result<(), Wrong> {
+        let stalled = self.robot.stalled_since(transmission.sent_at, now).min(USER_TIMEOUT);
+        let way = transmission.not_after + transmission.slowest.max(slowest) + ALLOWANCE + stalled;
+        for &(var, raw, carried) in &transmission.values {
+            let (Carried::Of { timeout, .. }, Some(owned)) = (carried, self.spec.owned[var.ordinal()]) else {
+                continue;
+            };
+            let Some(talk) = &self.spec.ports[owned.port].talk else { continue };
+            self.checks[Invariant::Held as usize] += 1;
+            // A reply was made at most so long before it is taken.
+            let taken = talk.rows.iter().find(|row| row.reply == Some(owned.frame));
+            let asked =
+                taken.map_or(Duration::ZERO, |row| row.timeout.saturating_mul(u64::from(row.retries) + 3));
+            let stalled = self.robot.stalled_since(now - timeout, now);
+            let since = now - (timeout + way + asked + stalled);
+            self.truth.was_held(owned.port, (var, raw), since, now)?;
+        }
+        Ok(())
     }
 
     /// A fault began or ended on a path, or on all of them.

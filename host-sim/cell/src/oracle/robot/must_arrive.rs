@@ -105,7 +105,7 @@ impl Oracle {
         if self.violation.is_some() {
             return;
         }
-        self.remembered = self.controller.size() + self.commands.len() + self.robot.len();
+        self.remembered = self.controller.size() + self.commands.len() + self.robot.len() + self.truth.len();
         for path in paths {
             if self.robot.conns.insert(path.link, path.conn) != Some(path.conn) {
                 self.robot.sound.remove(&path.link);
@@ -128,6 +128,7 @@ impl Oracle {
             self.checks[Invariant::SafeArrives as usize] += *result.as_ref().unwrap_or(&1);
             self.judge(now, &[], result.map(drop));
         }
+        self.survey_talks(now);
     }
 }
 

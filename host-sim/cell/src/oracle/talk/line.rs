@@ -1,0 +1,342 @@
+//! The conversation on one line: the request on its way, its reply, and who is asked when
+//! (proto-core/docs/wire/modbus-rtu.md sections 4 and 5).
+//!
+//! It does not predict which request is next: it says which ones may be sent, which must not, and how
+//! long none may be.
+
+use std::collections::BTreeMap;
+
+use proto_core::time::{Duration, Instant};
+
+use super::spec::{RowSpec, Seen, TalkSpec};
+use crate::oracle::Invariant;
+use crate::oracle::spec::PortSpec;
+use crate::oracle::upward::Wrong;
+
+/// The model of one line.
+#[derive(Debug, Clone, Default)]
+pub(in crate::oracle) struct TalkWatch {
+    flight: Option<Flight>,
+    /// A request that was handed over has not left.
+    leaving: bool,
+    /// The newest request has failed, and may be repeated.
+    repeat: Option<Flight>,
+    /// An exchange ended while its repetition was leaving; until then, its slave is not asked for others.
+    held_by: Option<usize>,
+    free_at: Instant,
+    slaves: BTreeMap<u8, SlaveWatch>,
+    /// When each exchange was asked last, without repetitions.
+    asked: BTreeMap<usize, Instant>,
+    /// Exchanges that a rising bit wants.
+    risen: BTreeMap<usize, bool>,
+    last_bits: BTreeMap<usize, bool>,
+    pub unanswered: u32,
+    pub refused: u32,
+    /// When the port came up.
+    pub began: Instant,
+    /// When something last went wrong: a slave that was up failed, or the gateway did not run.
+    pub disturbed_at: Instant,
+}
+
+/// A request on its way.
+#[derive(Debug, Clone)]
+pub(in crate::oracle) struct Flight {
+    pub row: usize,
+    pub request: Vec<u8>,
+    /// When the first of its repetitions was handed over.
+    pub began: Instant,
+    sent: Option<Instant>,
+    repeated: u8,
+    timed_out: bool,
+    is_wrong: bool,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+enum Presence {
+    #[default]
+    Unknown,
+    Up,
+    Down,
+}
+
+/// What is known of a slave.
+#[derive(Debug, Clone, Default)]
+struct SlaveWatch {
+    presence: Presence,
+    since: Instant,
+    /// It is not asked before this, or only for this exchange.
+    held_until: Instant,
+    held_for: usize,
+    failures: u32,
+    /// It is down, and not asked before this.
+    not_before: Instant,
+    asked: Instant,
+    /// Its newest answer to each exchange is a refusal.
+    refuses: BTreeMap<usize, bool>,
+}
+
+impl TalkWatch {
+    /// The device of the port is there, perhaps another one.
+    pub(in crate::oracle) fn begin(&mut self, now: Instant) {
+        self.abandon();
+        self.slaves.clear();
+        self.asked.clear();
+        self.risen.clear();
+        self.last_bits.clear();
+        (self.began, self.disturbed_at) = (now, now);
+    }
+
+    /// What has begun is not continued.
+    pub(in crate::oracle) fn abandon(&mut self) {
+        let flight = self.flight.take().or(self.repeat.take());
+        if let Some(row) = flight.map(|flight| flight.row)
+            && self.risen.contains_key(&row)
+        {
+            self.risen.insert(row, true);
+        }
+        (self.repeat, self.held_by) = (None, None);
+        self.free_at = Instant::ZERO;
+    }
+
+    /// The port is gone.
+    pub(in crate::oracle) fn gone(&mut self) {
+        self.abandon();
+        self.leaving = false;
+    }
+
+    /// Whether nothing is on its way or about to be repeated.
+    fn is_free(&self) -> bool {
+        self.flight.is_none() && self.repeat.is_none() && !self.leaving
+    }
+
+    /// Bits that ask have changed.
+    pub(super) fn watch(&mut self, talk: &TalkSpec, bit: impl Fn(&RowSpec) -> Option<bool>) {
+        for (nth, row) in talk.rows.iter().enumerate().filter(|(_, row)| row.rising.is_some()) {
+            let Some(on) = bit(row) else { continue };
+            let before = self.last_bits.insert(nth, on);
+            if on && before == Some(false) {
+                self.risen.insert(nth, true);
+            }
+        }
+    }
+
+    /// A request was handed over: checks that it may be sent now.
+    pub(super) fn hands_over(
+        &mut self,
+        port: &PortSpec,
+        talk: &TalkSpec,
+        (row, request): (usize, &[u8]),
+        heard: Instant,
+        now: Instant,
+    ) -> Result<(), Wrong> {
+        let spec = &talk.rows[row];
+        let wrong = |what: &str| Err((Invariant::Line, format!("{}: {what}", name(spec))));
+        if self.leaving || self.flight.is_some() {
+            return wrong("asked while another request is on its way");
+        }
+        if now < heard + port.turnaround {
+            return wrong("asked before the line was silent for long enough");
+        }
+        if now < self.free_at {
+            return wrong("asked before the pause of the exchange before it was over");
+        }
+        let repeated = self.repeat.take().filter(|failed| failed.row == row);
+        let is_wanted = spec.rising.is_none()
+            || spec.every.is_some()
+            || repeated.is_some()
+            || self.risen.insert(row, false) == Some(true);
+        if !is_wanted {
+            let what = format!("{}: asked although its bit has not risen", name(spec));
+            return Err((Invariant::Cycle, what));
+        }
+        let slave = self.slaves.entry(spec.slave).or_default();
+        if now < slave.held_until && slave.held_for != row {
+            let left = slave.held_until.saturating_since(now);
+            let what = format!("asked {left} before the replies to another exchange with it are over");
+            return wrong(&what);
+        }
+        if slave.presence == Presence::Down && now < slave.not_before {
+            let what = format!(
+                "{}: asked {} before a slave that does not answer may be asked",
+                name(spec),
+                slave.not_before.saturating_since(now)
+            );
+            return Err((Invariant::Periods, what));
+        }
+        slave.asked = now;
+        let began = repeated.as_ref().map_or(now, |failed| failed.began);
+        if repeated.is_none() {
+            self.asked.insert(row, now);
+        }
+        let repeats = repeated.as_ref().map_or(0, |failed| failed.repeated + 1);
+        self.flight = Some(Flight {
+            row,
+            request: request.to_vec(),
+            began,
+            sent: None,
+            repeated: repeats,
+            timed_out: repeated.is_some_and(|failed| failed.timed_out),
+            is_wrong: false,
+        });
+        self.leaving = true;
+        Ok(())
+    }
+
+    /// The request has left.
+    pub(in crate::oracle) fn left(&mut self, talk: &TalkSpec, now: Instant) {
+        self.leaving = false;
+        if let Some(row) = self.held_by.take() {
+            let spec = &talk.rows[row];
+            self.hold(spec.slave, row, now + spec.timeout.saturating_mul(2));
+        }
+        let Some(flight) = self.flight.as_mut().filter(|flight| flight.sent.is_none()) else { return };
+        let spec = &talk.rows[flight.row];
+        if spec.slave == 0 {
+            self.flight = None;
+            self.free_at = now + spec.pause + AFTER_BROADCAST;
+        } else {
+            flight.sent = Some(now);
+        }
+    }
+
+    /// What the bytes that are held begin with.
+    pub(super) fn see(&self, talk: &TalkSpec, bytes: &[u8]) -> Seen {
+        match &self.flight {
+            Some(flight) => talk.rows[flight.row].see(&flight.request, bytes),
+            None => Seen::No,
+        }
+    }
+
+    pub(super) fn heard_wrong(&mut self) {
+        if let Some(flight) = &mut self.flight {
+            flight.is_wrong = true;
+        }
+    }
+
+    /// The slave has answered.
+    pub(super) fn answered(&mut self, talk: &TalkSpec, is_refusal: bool, now: Instant) -> Option<Flight> {
+        let flight = self.flight.take()?;
+        let spec = &talk.rows[flight.row];
+        self.refused = self.refused.wrapping_add(u32::from(is_refusal));
+        self.free_at = now + spec.pause;
+        let slave = self.slaves.entry(spec.slave).or_default();
+        if slave.presence != Presence::Up {
+            (slave.presence, slave.since) = (Presence::Up, now);
+        }
+        slave.failures = 0;
+        slave.refuses.insert(flight.row, is_refusal);
+        if flight.timed_out {
+            match flight.sent {
+                Some(sent) => self.hold(spec.slave, flight.row, sent + spec.timeout.saturating_mul(2)),
+                None => self.held_by = Some(flight.row),
+            }
+        }
+        Some(flight)
+    }
+
+    fn hold(&mut self, slave: u8, row: usize, until: Instant) {
+        let slave = self.slaves.entry(slave).or_default();
+        (slave.held_until, slave.held_for) = (until, row);
+    }
+
+    /// A deadline may have passed: replies that have not come fail. Returns whether the slave is given up.
+    pub(super) fn tick(&mut self, talk: &TalkSpec, heard: Instant, now: Instant) -> Option<u8> {
+        let flight = self.flight.as_ref()?;
+        let spec = &talk.rows[flight.row];
+        let until = flight.sent? + spec.timeout;
+        let ends = if flight.is_wrong { until.min(heard + talk.silence) } else { until };
+        if now < ends {
+            return None;
+        }
+        let mut flight = self.flight.take()?;
+        flight.timed_out |= !flight.is_wrong;
+        let slave = self.slaves.entry(spec.slave).or_default();
+        if slave.presence != Presence::Down {
+            self.disturbed_at = self.disturbed_at.max(now);
+        }
+        if slave.presence == Presence::Up && flight.repeated < spec.retries {
+            self.repeat = Some(flight);
+            return None;
+        }
+        self.unanswered = self.unanswered.wrapping_add(1);
+        self.free_at = now + spec.pause;
+        if slave.presence != Presence::Down {
+            (slave.presence, slave.since) = (Presence::Down, now);
+        }
+        slave.failures += 1;
+        let wait = spec.timeout.saturating_mul(1 << slave.failures.min(6)).min(LONGEST_WAIT);
+        slave.not_before = (now + wait).max(flight.sent? + spec.timeout.saturating_mul(2));
+        if self.risen.contains_key(&flight.row) {
+            self.risen.insert(flight.row, true);
+        }
+        Some(spec.slave)
+    }
+
+    /// Checks that the line has not been idle although a period has ended, that every period has its turn,
+    /// and that slaves that are down are looked for. `stalled` is for how long the gateway was not called
+    /// since an instant. Returns the number of checks.
+    pub(super) fn keeps_periods(
+        &self,
+        port: &PortSpec,
+        talk: &TalkSpec,
+        heard: Instant,
+        stalled: impl Fn(Instant) -> Duration,
+        now: Instant,
+    ) -> Result<u64, Wrong> {
+        let mut checked = 0;
+        let free = self.free_at.max(heard + port.turnaround).max(self.disturbed_at);
+        for (nth, row) in talk.rows.iter().enumerate() {
+            let (Some(every), Some(&asked), None) = (row.every, self.asked.get(&nth), &row.request) else {
+                continue;
+            };
+            let Some(slave) = self.slaves.get(&row.slave) else { continue };
+            if slave.presence != Presence::Up {
+                continue;
+            }
+            checked += 1;
+            let due = (asked + every).max(free).max(slave.held_until).max(slave.since);
+            let idle = now.saturating_since(due);
+            if self.is_free() && idle > IDLE + stalled(due) {
+                let what = format!("{}: its period has ended, and the line is free for {idle}", name(row));
+                return Err((Invariant::Periods, what));
+            }
+            let from = asked.max(slave.since).max(self.disturbed_at).max(slave.held_until);
+            let waits = now.saturating_since(from);
+            if waits > every.saturating_mul(2) + talk.all_costs + stalled(from) {
+                let what = format!("{}: not asked for {waits}", name(row));
+                return Err((Invariant::Periods, what));
+            }
+        }
+        for (&number, slave) in self.slaves.iter().filter(|(_, slave)| slave.presence == Presence::Down) {
+            checked += 1;
+            let timeouts = talk.rows_of(number).map(|(_, row)| row.timeout);
+            let wait = timeouts.max().unwrap_or_default().saturating_mul(64).min(LONGEST_WAIT);
+            let from = slave.asked.max(self.began);
+            let waits = now.saturating_since(from);
+            if waits > wait.saturating_mul(2) + talk.all_costs.saturating_mul(2) + stalled(from) {
+                return Err((Invariant::Periods, format!("slave {number} is not looked for since {waits}")));
+            }
+        }
+        Ok(checked)
+    }
+
+    /// Since when the exchange could be carried out without any failure on the line; `None` if it cannot.
+    pub(super) fn could_ask(&self, talk: &TalkSpec, row: usize) -> Option<Instant> {
+        let slave = self.slaves.get(&talk.rows[row].slave)?;
+        let is_refused = slave.refuses.get(&row).copied().unwrap_or(false);
+        let is_up = slave.presence == Presence::Up && !is_refused;
+        is_up.then(|| slave.since.max(self.disturbed_at).max(slave.held_until).max(self.began))
+    }
+}
+
+/// The exchange in words.
+pub(super) fn name(row: &RowSpec) -> String {
+    format!("slave {}, function {} at {}", row.slave, row.function, row.address)
+}
+
+/// After a request to all slaves, nothing is sent for this long.
+const AFTER_BROADCAST: Duration = Duration::from_millis(100);
+/// A free line with something to do is not left idle for longer.
+const IDLE: Duration = Duration::from_millis(5);
+/// A slave that does not answer is asked again after this at the latest, if the line has a gap.
+const LONGEST_WAIT: Duration = Duration::from_secs(30);

@@ -1,0 +1,430 @@
+//! What slaves and controller really had, whatever the gateway thinks: the other half of each value's way.
+//!
+//! In: what the slaves of a line did, the controller's registers at each step, what the gateway asked and
+//! took. Out: violations. Knows nothing of timeouts and repetitions.
+
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+
+use proto_core::config::{FieldSpec, OutputBinding};
+use proto_core::device::{Encoding, Overflow};
+use proto_core::sysvar::{ModbusPlace, SysVar};
+use proto_core::time::{Duration, Instant};
+
+use super::line::{Flight, name};
+use super::spec::{RowSpec, TalkSpec};
+use crate::oracle::device;
+use crate::oracle::field::{Verdict, as_number, show};
+use crate::oracle::spec::{Origin, PortSpec, Raw, Spec};
+use crate::oracle::upward::Wrong;
+use crate::oracle::{Invariant, field};
+use crate::{Done, SlaveDone};
+
+/// Slaves and controller.
+#[derive(Debug, Clone, Default)]
+pub(in crate::oracle) struct Truth {
+    lines: BTreeMap<usize, LineTruth>,
+    /// The values that the controller had, each with when it came, for variables that slaves are told.
+    had: BTreeMap<usize, VecDeque<(Instant, Raw)>>,
+    told: Vec<SysVar>,
+}
+
+/// The slaves of one line.
+#[derive(Debug, Clone, Default)]
+struct LineTruth {
+    answers: VecDeque<Answer>,
+    /// Requests of the gateway that write, and which slaves have carried them out.
+    requests: VecDeque<(Instant, usize, Vec<u16>, BTreeSet<u8>)>,
+    /// What was written to each slave: coils or registers, and where.
+    memory: BTreeMap<(u8, bool, u16), u16>,
+    /// Slaves that have forgotten what was written, and have not missed a request since.
+    forgot: BTreeSet<u8>,
+    /// The values that each variable had at its slave.
+    held: BTreeMap<usize, VecDeque<(Instant, Raw)>>,
+    /// When bytes were last changed on the line, or sent by nobody's slave.
+    garbled: Option<Instant>,
+}
+
+#[derive(Debug, Clone)]
+struct Answer {
+    at: Instant,
+    slave: u8,
+    place: (u16, u16),
+    reply: Vec<u8>,
+}
+
+impl Truth {
+    pub(in crate::oracle) fn new(spec: &Spec) -> Self {
+        let rows = spec.ports.iter().filter_map(|port| port.talk.as_ref()).flat_map(|talk| &talk.rows);
+        let mut told: Vec<SysVar> = rows.flat_map(RowSpec::shown).collect();
+        told.sort_by_key(|var| var.ordinal());
+        told.dedup();
+        Self { lines: BTreeMap::new(), had: BTreeMap::new(), told }
+    }
+
+    /// Whether the controller's registers are needed.
+    pub(in crate::oracle) fn wants_controller(&self) -> bool {
+        !self.told.is_empty()
+    }
+
+    /// The controller's variables as they are now.
+    pub(in crate::oracle) fn sees_controller(&mut self, image: &[u8], now: Instant) {
+        for var in &self.told {
+            let at = var.image_offset();
+            let mut raw = Raw::default();
+            raw[..var.size()].copy_from_slice(&image[at..at + var.size()]);
+            let had = self.had.entry(var.ordinal()).or_default();
+            if had.back().is_none_or(|newest| newest.1 != raw) {
+                had.push_back((now, raw));
+            }
+            while had.len() > 1 && now.saturating_since(had[1].0) > REMEMBERED {
+                had.pop_front();
+            }
+        }
+    }
+
+    pub(in crate::oracle) fn garbled(&mut self, port: usize, now: Instant) {
+        self.lines.entry(port).or_default().garbled = Some(now);
+    }
+
+    /// A request to a slave has failed for good: the gateway knows that the slave was away.
+    pub(super) fn missed(&mut self, port: usize, slave: u8) {
+        if let Some(line) = self.lines.get_mut(&port) {
+            line.forgot.remove(&slave);
+        }
+    }
+
+    /// The gateway asks.
+    pub(super) fn asks(&mut self, port: usize, row: usize, spec: &RowSpec, request: &[u8], now: Instant) {
+        if spec.written.is_none() {
+            return;
+        }
+        let values = spec.values_of(&spec.data_of(request));
+        let requests = &mut self.lines.entry(port).or_default().requests;
+        requests.push_back((now, row, values, BTreeSet::new()));
+        if requests.len() > REQUESTS {
+            requests.pop_front();
+        }
+    }
+
+    /// Whether something happened on the line that a CRC may not show.
+    fn is_excused(&self, port: usize, since: Instant) -> bool {
+        let line = self.lines.get(&port);
+        line.and_then(|line| line.garbled).is_some_and(|at| at + GARBLED >= since)
+    }
+
+    /// A slave did something. Returns which invariants were looked at.
+    pub(super) fn done(
+        &mut self,
+        spec: &Spec,
+        nth: usize,
+        done: SlaveDone,
+        stalled: impl Fn(Instant) -> Duration,
+        now: Instant,
+    ) -> (u64, Result<(), Wrong>) {
+        let port = &spec.ports[nth];
+        let Some(talk) = &port.talk else { return (0, Ok(())) };
+        let slave = done.slave;
+        match done.what {
+            Done::Forgot => {
+                let line = self.lines.entry(nth).or_default();
+                line.memory.retain(|(of, ..), _| *of != slave);
+                line.forgot.insert(slave);
+                (0, Ok(()))
+            }
+            Done::Answered { address, count, reply } => {
+                for (_, row) in talk.rows_of(slave).filter(|(_, row)| {
+                    row.function == reply[1] && (row.address, row.count) == (address, count)
+                }) {
+                    for (var, raw) in values_of(port, row, &reply) {
+                        self.holds(nth, var, raw, now);
+                    }
+                }
+                let answers = &mut self.lines.entry(nth).or_default().answers;
+                answers.push_back(Answer { at: now, slave, place: (address, count), reply });
+                if answers.len() > ANSWERS {
+                    answers.pop_front();
+                }
+                (0, Ok(()))
+            }
+            Done::Wrote { coils, address, values } => {
+                let result = self.wrote(spec, (nth, talk), (slave, coils, address), &values, stalled, now);
+                let line = self.lines.entry(nth).or_default();
+                for (at, value) in (address..).zip(values) {
+                    line.memory.insert((slave, coils, at), value);
+                }
+                (1, result)
+            }
+        }
+    }
+
+    fn holds(&mut self, port: usize, var: SysVar, raw: Raw, now: Instant) {
+        let held = self.lines.entry(port).or_default().held.entry(var.ordinal()).or_default();
+        held.push_back((now, raw));
+        while held.front().is_some_and(|(at, _)| now.saturating_since(*at) > REMEMBERED) {
+            held.pop_front();
+        }
+    }
+
+    /// A slave has carried out a write: the gateway must have asked for it just now, with values that the
+    /// controller had together, and not long ago.
+    fn wrote(
+        &mut self,
+        spec: &Spec,
+        (nth, talk): (usize, &TalkSpec),
+        (slave, coils, address): (u8, bool, u16),
+        values: &[u16],
+        stalled: impl Fn(Instant) -> Duration,
+        now: Instant,
+    ) -> Result<(), Wrong> {
+        let is_excused = self.is_excused(nth, now);
+        let line = self.lines.entry(nth).or_default();
+        let is_it = |(at, row, asked, by): &&mut (Instant, usize, Vec<u16>, BTreeSet<u8>)| {
+            let row = &talk.rows[*row];
+            let is_to_it = row.slave == slave || row.slave == 0;
+            let is_there = row.written == Some(address) && row.writes_coils() == coils;
+            let is_now = now.saturating_since(*at) <= ON_THE_LINE;
+            is_to_it && is_there && asked == values && is_now && !by.contains(&slave)
+        };
+        let Some((at, row, _, by)) = line.requests.iter_mut().rev().find(is_it) else {
+            let what = format!("slave {slave} took {values:?} at {address}, which nobody asked for just now");
+            return if is_excused { Ok(()) } else { Err((Invariant::Carried, what)) };
+        };
+        by.insert(slave);
+        let (at, row) = (*at, &talk.rows[*row]);
+        self.were_had(spec, &spec.ports[nth], row, values, at, stalled(at))
+    }
+
+    /// Checks that the controller had the values of a request together, at most as long before it as is
+    /// promised.
+    fn were_had(
+        &self,
+        spec: &Spec,
+        port: &PortSpec,
+        row: &RowSpec,
+        values: &[u16],
+        asked: Instant,
+        stalled: Duration,
+    ) -> Result<(), Wrong> {
+        if row.request.is_none() {
+            return Ok(());
+        }
+        let data = row.data_from(values);
+        // Without a limit, a value must have been there at any time that is remembered.
+        let lag = match port.stops_when_stale {
+            true => port.stale_after + way_of(spec, row) + stalled.min(STALL) + STALL,
+            false => REMEMBERED,
+        };
+        let from = asked - lag;
+        let mut together = vec![(from, asked)];
+        for field in fields(row) {
+            let (Some(var), Some(place)) = (crate::oracle::spec::shown(field.0), data.get(field.1.clone()))
+            else {
+                continue;
+            };
+            let spans = self.spans(var, asked, |raw| agrees(field.0, var, raw, place));
+            let spans: Vec<_> =
+                spans.into_iter().filter(|(since, until)| *since <= asked && *until >= from).collect();
+            if spans.is_empty() {
+                let what = format!(
+                    "{}: {var} was written as {place:?}, which the controller has not had for {lag}",
+                    name(row)
+                );
+                return Err((Invariant::Carried, what));
+            }
+            let both = together.iter().flat_map(|one| {
+                spans.iter().map(|other| (one.0.max(other.0), one.1.min(other.1))).filter(|(a, b)| a <= b)
+            });
+            together = both.collect();
+        }
+        if together.is_empty() && come_together(spec, row) {
+            let what = format!("{}: the controller never had {values:?} together", name(row));
+            return Err((Invariant::Carried, what));
+        }
+        Ok(())
+    }
+
+    /// When the controller had values of a variable for which `is_it` is true.
+    fn spans(&self, var: SysVar, now: Instant, is_it: impl Fn(Raw) -> bool) -> Vec<(Instant, Instant)> {
+        let Some(had) = self.had.get(&var.ordinal()) else { return Vec::new() };
+        let ends = had.iter().skip(1).map(|(at, _)| *at).chain([now.max(Instant::ZERO)]);
+        let spans = had.iter().zip(ends).filter(|((_, raw), _)| is_it(*raw));
+        spans.map(|((since, _), until)| (*since, until)).collect()
+    }
+
+    /// The gateway has taken a reply: its slave must have made it, for this question, since it was asked.
+    pub(super) fn taken(
+        &mut self,
+        port: (usize, &PortSpec),
+        row: &RowSpec,
+        flight: &Flight,
+        (reply, began): (&[u8], Instant),
+        now: Instant,
+    ) -> Result<(), Wrong> {
+        let (nth, spec) = port;
+        let place = match row.written {
+            Some(written) if row.reply.is_none() => (written, row.count),
+            _ => (row.address, row.count),
+        };
+        let is_it = |answer: &&Answer| {
+            answer.at >= flight.began
+                && answer.slave == row.slave
+                && answer.reply == reply
+                && answer.place == place
+        };
+        let line = self.lines.entry(nth).or_default();
+        if line.answers.iter().any(|answer| is_it(&answer)) {
+            return Ok(());
+        }
+        // Two timeouts after the port came up, nothing can be left of what was asked before.
+        let settled = began + row.timeout.saturating_mul(4);
+        if self.is_excused(nth, flight.began) || now < settled {
+            for (var, raw) in values_of(spec, row, reply) {
+                self.holds(nth, var, raw, now);
+            }
+            return Ok(());
+        }
+        let what = format!("{}: {reply:02x?} was taken, which its slave did not answer to that", name(row));
+        Err((Invariant::Held, what))
+    }
+
+    /// A value of a slave reaches the controller: the slave must have held it since then.
+    pub(in crate::oracle) fn was_held(
+        &self,
+        port: usize,
+        (var, raw): (SysVar, Raw),
+        since: Instant,
+        now: Instant,
+    ) -> Result<(), Wrong> {
+        let held = self.lines.get(&port).and_then(|line| line.held.get(&var.ordinal()));
+        let mut held = held.into_iter().flatten();
+        if held.any(|(at, value)| *value == raw && *at >= since) {
+            return Ok(());
+        }
+        let what = format!(
+            "{var} = {} reaches the controller; its slave has not held that for {}",
+            show(var, raw),
+            now.saturating_since(since)
+        );
+        Err((Invariant::Held, what))
+    }
+
+    /// Checks that a slave has the controller's values, if they have been the same since before `since`.
+    /// `None` if they have not, or nobody can know.
+    pub(super) fn is_told(&self, port: usize, row: &RowSpec, since: Instant) -> Option<Result<(), Wrong>> {
+        let line = self.lines.get(&port)?;
+        let address = row.written?;
+        if line.forgot.contains(&row.slave) {
+            return None;
+        }
+        let there =
+            |nth: u16| line.memory.get(&(row.slave, row.writes_coils(), address + nth)).copied().unwrap_or(0);
+        let len = row.request.as_ref()?.payload;
+        let count = if row.writes_coils() { row.count } else { (len / 2) as u16 };
+        let values: Vec<u16> = (0..count).map(there).collect();
+        let data = row.data_from(&values);
+        let mut wrong = None;
+        for (field, place) in fields(row) {
+            let Some(var) = crate::oracle::spec::shown(field) else { continue };
+            let (at, raw) = *self.had.get(&var.ordinal())?.back()?;
+            if at > since {
+                return None;
+            }
+            let place = data.get(place)?;
+            if !agrees(field, var, raw, place) {
+                wrong =
+                    Some(format!("{}: {var} is {}, but the slave has {place:?}", name(row), show(var, raw)));
+            }
+        }
+        Some(wrong.map_or(Ok(()), |what| Err((Invariant::Told, what))))
+    }
+
+    /// Size of what is kept.
+    pub(in crate::oracle) fn len(&self) -> usize {
+        let of_line = |line: &LineTruth| {
+            line.answers.len() + line.requests.len() + line.held.values().map(VecDeque::len).sum::<usize>()
+        };
+        self.lines.values().map(of_line).sum::<usize>() + self.had.values().map(VecDeque::len).sum::<usize>()
+    }
+}
+
+/// The fields of a request and their places in its data.
+fn fields(row: &RowSpec) -> Vec<(&FieldSpec, std::ops::Range<usize>)> {
+    let Some(request) = &row.request else { return Vec::new() };
+    match &request.device {
+        Some(device) => request.fields.iter().zip(device.places.iter().cloned()).collect(),
+        None => {
+            let mut at = 0;
+            let places = request.fields.iter().map(|field| {
+                let len = crate::oracle::spec::size(field);
+                at += len;
+                at - len..at
+            });
+            request.fields.iter().zip(places).collect()
+        }
+    }
+}
+
+/// Whether a field with these bytes shows this value of its variable.
+fn agrees(field: &FieldSpec, var: SysVar, raw: Raw, bytes: &[u8]) -> bool {
+    let (encoding, overflow, from) = match *field {
+        FieldSpec::DeviceOutput { encoding, overflow, from } => (encoding, overflow, from),
+        FieldSpec::UserOutput { ty, from } => (Encoding::scalar(ty), Overflow::Usual, from),
+        _ => return true,
+    };
+    let number = match from {
+        OutputBinding::Variable { scale, offset, .. } => {
+            as_number(var, raw) * f64::from(scale) + f64::from(offset)
+        }
+        OutputBinding::Bit { bit, .. } => f64::from(raw[0] >> bit & 1),
+        _ => return true,
+    };
+    device::read(&encoding, bytes) == Some(device::shown_as(&encoding, overflow, number))
+}
+
+/// The values of variables in a reply; none in a refusal.
+fn values_of(port: &PortSpec, row: &RowSpec, reply: &[u8]) -> Vec<(SysVar, Raw)> {
+    let (Some(nth), false) = (row.reply, reply[1] & 0x80 != 0) else { return Vec::new() };
+    let data = &reply[3..reply.len() - 2];
+    match field::judge_data(&port.inputs[nth], nth, data) {
+        Verdict::Accepted(accepted) => accepted.values,
+        _ => Vec::new(),
+    }
+}
+
+/// How long a value is on its way from the controller to the gateway at most.
+fn way_of(spec: &Spec, row: &RowSpec) -> Duration {
+    let is_polled = row.shown().all(|var| spec.origin[var.ordinal()] == Some(Origin::Modbus));
+    if is_polled { POLLED } else { STREAMED }
+}
+
+/// Whether one poll brings all values of a request.
+fn come_together(spec: &Spec, row: &RowSpec) -> bool {
+    let places: Option<Vec<u16>> = row
+        .shown()
+        .map(|var| match (spec.origin[var.ordinal()], var.modbus()) {
+            (Some(Origin::Modbus), Some(ModbusPlace::Register { address })) => Some(address),
+            _ => None,
+        })
+        .collect();
+    places.is_some_and(|places| {
+        let (low, high) = (places.iter().min(), places.iter().max());
+        low.zip(high).is_some_and(|(low, high)| high - low <= TOGETHER)
+    })
+}
+
+/// A request is carried out within this time after it was handed over.
+const ON_THE_LINE: Duration = Duration::from_millis(250);
+/// A poll is given up after this time.
+const POLLED: Duration = Duration::from_millis(500);
+/// More than data of a stream can be late.
+const STREAMED: Duration = Duration::from_secs(10);
+/// A longer stall of the gateway is sleep.
+const STALL: Duration = Duration::from_millis(500);
+/// Registers that are at most this far apart come with one poll.
+const TOGETHER: u16 = 16;
+/// For so long after bytes were changed on a line, what looks right may be wrong.
+const GARBLED: Duration = Duration::from_secs(1);
+/// For how long values are remembered.
+const REMEMBERED: Duration = Duration::from_secs(60);
+const ANSWERS: usize = 256;
+const REQUESTS: usize = 64;
