@@ -134,18 +134,22 @@ fn a_foreign_id_is_kept_as_long_as_it_may_be_the_one_that_was_meant() {
     };
     let id = |rig: &Rig| rejection(rig).and_then(|last| last.can_id);
     for nth in 6..20 {
-        rig.run(MS(10));
+        rig.run(MS(100));
         rig.can(port, nth, &[nth as u8, 2]);
         let seen = rejection(&rig).unwrap();
         assert_eq!((seen.can_id, seen.at), (Some(CanId::Standard(nth)), rig.now), "the newest");
         assert_eq!((seen.why, seen.bytes()), (Rejection::ForeignId, &[nth as u8, 2][..]));
     }
     assert_eq!(rig.counters(port).rejected_id, 14);
+    // Not each of a busy bus.
+    rig.run(MS(99));
+    rig.can(port, 20, &[1, 2]);
+    assert_eq!(id(&rig), Some(CanId::Standard(19)));
     // The recipe's id comes, so the others are those of other nodes.
     rig.can(port, 5, &[1, 2]);
     rig.can(port, 30, &[1, 2]);
     assert_eq!(id(&rig), Some(CanId::Standard(19)));
-    assert_eq!(rig.counters(port).rejected_id, 15, "it is counted");
+    assert_eq!(rig.counters(port).rejected_id, 16, "it is counted");
 }
 
 #[test]

@@ -94,7 +94,7 @@ impl<'c> ConfigView<'c> {
     /// The fields of the frames that come without a request of a known period.
     fn unasked(self, recipe: &'c Recipe) -> impl Iterator<Item = Span> + 'c {
         let exchanges = self.exchanges_of(recipe).iter().filter(|exchange| exchange.when.every.is_none());
-        let unasked = exchanges.filter_map(move |exchange| exchange.fields(self, Direction::Input));
+        let unasked = exchanges.filter_map(move |exchange| exchange.fields(self.frames, Direction::Input));
         recipe.part_frames(Direction::Input).chain(unasked)
     }
 }

@@ -337,8 +337,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let refusals = self.bindings.inputs.as_mut_view();
         let mut formats = Formats { config, recipe: port.recipe, places, frames, refusals };
         // One that is asked at the start may have to wait for its values.
-        let may_wait =
-            |exchange: &Exchange| exchange.when.start && exchange.fields(config, Direction::Output).is_some();
+        let may_wait = |exchange: &Exchange| {
+            exchange.when.start && exchange.fields(config.frames, Direction::Output).is_some()
+        };
         let looks = exchanges.iter().any(|exchange| is_looked_at(&exchange.when) || may_wait(exchange));
         let looks = looks.then(|| Grid::starting_at(Instant::ZERO, port.cycle));
         let line_of = match &port.bus {

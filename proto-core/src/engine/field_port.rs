@@ -22,7 +22,7 @@ use crate::recipe::StreamLayout;
 use crate::recipe::model::Mode;
 use crate::recipe::{Applied, ValueError, Values};
 use crate::recipe::{CanLayout, CanReject};
-use crate::time::Instant;
+use crate::time::{Duration, Instant};
 use crate::wire::can::{CanFrame, CanId};
 use crate::wire::scalar::Scalar;
 
@@ -252,7 +252,7 @@ impl FieldPort {
         let verdict = self.take_can(frame, bindings, store, commands, &mut accepted);
         tap.record(|| came(self.id, now, verdict, Some(frame.id()), [frame.data(), &[], &[]]));
         if let Err(why) = verdict
-            && self.is_news(why)
+            && self.is_news(why, now)
         {
             keep(&mut self.last_rejection, why, Some(frame.id()), frame.data(), now);
         }
@@ -260,11 +260,15 @@ impl FieldPort {
     }
 
     /// Whether a rejected CAN frame is worth keeping. On a shared bus, frames for others are not, unless
-    /// none of the recipe's ids has ever come: then the id may be the one that was meant.
+    /// none of the recipe's ids has ever come: then the id may be the one that was meant. A busy bus shows one
+    /// each 100 ms, because keeping a frame takes longer than rejecting it.
     #[inline]
-    pub(super) fn is_news(&self, why: Rejection) -> bool {
-        let may_be_meant =
-            |last: &LastRejection| self.counters.frames_in == 0 && last.why == Rejection::ForeignId;
+    pub(super) fn is_news(&self, why: Rejection, now: Instant) -> bool {
+        let may_be_meant = |last: &LastRejection| {
+            self.counters.frames_in == 0
+                && last.why == Rejection::ForeignId
+                && now.saturating_since(last.at) >= FOREIGN_PAUSE
+        };
         why != Rejection::ForeignId || self.last_rejection.as_ref().is_none_or(may_be_meant)
     }
 
@@ -583,3 +587,6 @@ pub(super) fn fields_before(layout: &CanLayout, index: usize) -> usize {
     let before = layout.frames().take(index);
     before.fold(0, |sum, frame| sum.saturating_add(frame.fields().count()))
 }
+
+/// Time between two kept frames of ids that no recipe has.
+const FOREIGN_PAUSE: Duration = Duration::from_millis(100);

@@ -75,6 +75,12 @@ enum Turn {
     Bits(SysVar, u8),
 }
 
+/// The same, with its request.
+enum Beside {
+    Bits(Option<(usize, Asked)>),
+    Whole(InputSet),
+}
+
 /// What goes first when both a write and a poll are due.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum First {
@@ -292,36 +298,46 @@ impl ModbusLink {
         store: &mut Store<PORTS>,
         out: &mut [u8],
     ) -> Option<(usize, Asked)> {
-        if store.bits.is_used {
-            return self.write_beside_bits(store, out);
-        }
         // Once more: a set that is handed over does not stay in registers.
-        let pending = store.outbox.dirty().and(&self.writes);
+        let mut pending = store.outbox.dirty().and(&self.writes);
+        if store.bits.is_used {
+            match self.beside_bits(store, out) {
+                Beside::Bits(sent) => return sent,
+                Beside::Whole(whole) => pending = whole,
+            }
+        }
         let first = pending.iter().find(|var| var.ordinal() >= self.cursor).or(pending.iter().next())?;
-        self.write_whole(first, &pending, store, out)
+        let sent = self.write_whole(first, &pending, store, out);
+        if store.bits.is_used {
+            self.offer_the_rest(sent.as_ref(), store);
+        }
+        sent
     }
 
-    /// The same where bits have owners.
+    /// Where bits have owners: a request for some of them, or the whole variables whose turn it is.
     #[cold]
     #[inline(never)]
-    fn write_beside_bits<const PORTS: usize>(
-        &mut self,
-        store: &mut Store<PORTS>,
-        out: &mut [u8],
-    ) -> Option<(usize, Asked)> {
+    fn beside_bits<const PORTS: usize>(&mut self, store: &mut Store<PORTS>, out: &mut [u8]) -> Beside {
         let pending = store.outbox.dirty().and(&self.writes);
-        match self.bits_turn(&pending, store)? {
-            Turn::Bits(var, mask) => self.write_bits(var, mask, store, out),
-            Turn::Whole(var) => {
+        match self.bits_turn(&pending, store) {
+            Some(Turn::Bits(var, mask)) => Beside::Bits(self.write_bits(var, mask, store, out)),
+            Some(Turn::Whole(var)) => {
                 self.bit_cursor = 0;
-                let sent = self.write_whole(var, &pending.minus(&store.bits.bytes), store, out);
-                if !store.outbox.dirty().and(&self.writes).is_empty()
-                    && let Some((_, Asked::Write { born, .. })) = sent
-                {
-                    self.offered = born;
-                }
-                sent
+                self.cursor = var.ordinal();
+                Beside::Whole(pending.minus(&store.bits.bytes))
             }
+            None => Beside::Bits(None),
+        }
+    }
+
+    /// What waits beside a request counts as offered with it.
+    #[cold]
+    #[inline(never)]
+    fn offer_the_rest<const PORTS: usize>(&mut self, sent: Option<&(usize, Asked)>, store: &Store<PORTS>) {
+        if !store.outbox.dirty().and(&self.writes).is_empty()
+            && let Some(&(_, Asked::Write { born, .. })) = sent
+        {
+            self.offered = born;
         }
     }
 

@@ -420,7 +420,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let verdict = port.talk_frame(frame, inputs, store, command, view, &mut accepted);
         self.tap.record(|| came(id, now, verdict, Some(frame.id()), [frame.data(), &[], &[]]));
         if let Err(why) = verdict
-            && port.is_news(why)
+            && port.is_news(why, now)
         {
             keep(&mut port.last_rejection, why, Some(frame.id()), frame.data(), now);
         }
