@@ -8,7 +8,7 @@ use proto_core::wire::dialect::Dialect;
 use proto_core::wire::state::OperationMode;
 
 use super::build::{mode, start_values};
-use super::machine::Machine;
+use super::machine::{Machine, SafetyHold};
 use super::registers::SetError;
 use super::spoiled::{NoSuchFloat, Spoiled};
 use super::{Controller, ControllerOutput, RecipeError};
@@ -294,6 +294,17 @@ impl Controller {
     /// Removes and acknowledges the cause of a stop: the safety state recovers.
     pub fn clear_stop(&mut self, now: Instant) {
         self.machine.clear_stop(now);
+    }
+
+    /// Lets the safety controller stop working: the program ends, and the robot is disabled.
+    pub fn hold_safety(&mut self, now: Instant, hold: SafetyHold) {
+        let effect = self.machine.hold_safety(now, hold);
+        self.apply(now, effect);
+    }
+
+    /// Ends [`Self::hold_safety`].
+    pub fn release_safety(&mut self) {
+        self.machine.release_safety();
     }
 
     /// Reduces the speed, as a person in a safety zone does.

@@ -49,7 +49,7 @@ use motion::Arm;
 use ports::Port;
 pub use ports::{MAX_INBOX, MAX_UDP_CLIENTS, PortCounters, RecipeError};
 use program::{Script, Variables};
-use recipe_config::SimConfig;
+use recipe_config::{Power, SimConfig};
 use registers::Registers;
 use run::Running;
 use server::Server;
@@ -243,6 +243,9 @@ impl Controller {
     fn begin(&mut self, now: Instant) {
         if self.epoch.is_none() {
             self.epoch = Some(now);
+            if self.config.robot.power == Power::Boot {
+                self.machine = Machine::booting(now, self.machine.mode());
+            }
             self.state_grid = Grid::starting_at(now + STATE_PERIOD, STATE_PERIOD);
             for port in &mut self.ports {
                 if port.is_udp_server() {

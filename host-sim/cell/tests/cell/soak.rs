@@ -21,7 +21,7 @@ fn soaked(level: Level, seed: u64, span: Duration, jobs: usize) -> Total {
 /// The hashes of these runs on every machine. Only a change of what the engine, the controller or the cell
 /// does, or when, may change them; then enter the new ones here.
 const HASHES: [(Level, u64); 2] =
-    [(Level::None, 0x3C4D_2F47_D383_FBB6), (Level::Harsh, 0x63D9_79BA_D246_1B5B)];
+    [(Level::None, 0xA348_CD74_5E85_779B), (Level::Harsh, 0xB6FF_8DE8_E945_F152)];
 
 #[test]
 fn a_seed_means_the_same_trace_on_every_machine() {

@@ -10,6 +10,7 @@ mod packet;
 mod ports;
 mod programs;
 mod room;
+mod safety;
 mod scripts;
 mod slices;
 mod stream;
@@ -27,7 +28,7 @@ use proto_core::wire::scalar::ScalarType;
 use super::test_controller::CLIENT_ADDRESS;
 use super::*;
 use recipe_config::{
-    Initial, InitialTarget, Power, SimBus, SimCanFrame, SimField, SimParts, SimPort, SimProgram, SimRecipe,
+    Initial, InitialTarget, SimBus, SimCanFrame, SimField, SimParts, SimPort, SimProgram, SimRecipe,
     SimStreamPart,
 };
 
