@@ -5,6 +5,7 @@ mod commands;
 mod examples;
 mod faults;
 mod functions;
+mod interface;
 mod modbus;
 mod packet;
 mod ports;
