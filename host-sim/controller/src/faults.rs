@@ -237,7 +237,8 @@ impl Controller {
     /// Sets the value of an input or of any other item.
     ///
     /// # Errors
-    /// [`SetError::Value`] if the value is out of range; nothing changed.
+    /// [`SetError::Value`] if the value is out of range, [`SetError::ShowsState`] if the output shows a state;
+    /// nothing changed.
     pub fn force(&mut self, target: InitialTarget, value: f64) -> Result<(), SetError> {
         self.registers.force(target, value)?;
         // The tool's frame decides where the TCP is.
