@@ -13,7 +13,7 @@
 //!
 //! Registers and IO are in [`registers`], the states and the commands that each allows in [`machine`], the
 //! arm's position in [`motion`], scripts in [`program`], recipe ports in `ports`, connections in `server`,
-//! and faults for tests in `faults`.
+//! functions of inputs in `functions`, items by their names in `items`, and faults for tests in `faults`.
 
 mod build;
 mod counters;
