@@ -79,6 +79,8 @@ impl Default for Robot {
 /// How far the robot is powered up at the start.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Power {
+    /// The controller was just switched on: it boots to powered off.
+    Boot,
     /// Powered off.
     Off,
     /// Powered on, not enabled.

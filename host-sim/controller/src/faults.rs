@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use super::build::{mode, start_values};
 use super::events::Happened;
-use super::machine::Machine;
+use super::machine::{Machine, SafetyHold};
 use super::random::Random;
 use super::registers::SetError;
 use super::spoiled::{NoSuchFloat, Spoiled};
@@ -316,7 +316,8 @@ impl Controller {
     /// Sets the value of an input or of any other item.
     ///
     /// # Errors
-    /// [`SetError::Value`] if the value is out of range; nothing changed.
+    /// [`SetError::Value`] if the value is out of range, [`SetError::ShowsState`] if the output shows a state;
+    /// nothing changed.
     pub fn force(&mut self, target: InitialTarget, value: f64) -> Result<(), SetError> {
         self.registers.force(target, value)?;
         // The tool's frame decides where the TCP is.
@@ -375,6 +376,18 @@ impl Controller {
     /// Removes and acknowledges the cause of a stop: the safety state recovers.
     pub fn clear_stop(&mut self, now: Instant) {
         self.machine.clear_stop(now);
+    }
+
+    /// Lets the safety controller stop working: the program ends, and the robot is disabled.
+    pub fn hold_safety(&mut self, now: Instant, hold: SafetyHold) {
+        self.runs.ends_by("safety");
+        let effect = self.machine.hold_safety(now, hold);
+        self.apply(now, effect);
+    }
+
+    /// Ends [`Self::hold_safety`].
+    pub fn release_safety(&mut self) {
+        self.machine.release_safety();
     }
 
     /// Reduces the speed, as a person in a safety zone does.

@@ -13,7 +13,7 @@
 //!
 //! Registers and IO are in [`registers`], the states and the commands that each allows in [`machine`], the
 //! arm's position in [`motion`], scripts in [`program`], recipe ports in `ports`, connections in `server`,
-//! and faults for tests in `faults`.
+//! functions of inputs in `functions`, items by their names in `items`, and faults for tests in `faults`.
 
 mod build;
 mod condition;
@@ -59,7 +59,7 @@ use ports::Port;
 pub use ports::{MAX_INBOX, MAX_UDP_CLIENTS, PortCounters, RecipeError};
 use program::{Script, Variables};
 use random::Random;
-use recipe_config::SimConfig;
+use recipe_config::{Power, SimConfig};
 use registers::Registers;
 use run::Running;
 use runs::Runs;
@@ -300,6 +300,9 @@ impl Controller {
         self.recorder.set_now(now);
         if self.epoch.is_none() {
             self.epoch = Some(now);
+            if self.config.robot.power == Power::Boot {
+                self.machine = Machine::booting(now, self.machine.mode());
+            }
             self.state_grid = Grid::starting_at(now + STATE_PERIOD + self.state_phase, STATE_PERIOD);
             for nth in 0..self.ports.len() {
                 let epoch = self.port_epoch(nth, now);

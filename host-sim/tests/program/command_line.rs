@@ -53,6 +53,20 @@ fn check_says_how_full_lines_are_which_way_variables_go_and_what_goes_on_the_pen
 }
 
 #[test]
+fn check_says_what_functional_inputs_do() {
+    let set = [
+        "functions.start=echo.jspf",
+        "functions.inputs.FDI[1]=start",
+        "functions.inputs.BitInputReg[1].0=stop",
+        "functions.outputs.FDO[1]=running",
+    ];
+    let report = checked("rs485-user-controller.toml", &set.map(|key| ["--set", key]).concat());
+    let functions =
+        "functions\n  FDI[1] -> start echo.jspf\n  BitInputReg[1].0 -> stop\n  running -> FDO[1]\n";
+    assert!(report.ends_with(&format!("programs: echo.jspf\n\n{functions}")), "{report}");
+}
+
+#[test]
 fn check_draws_the_frames_of_a_device() {
     insta::assert_snapshot!("check_gripper", checked("gripper.toml", &[]));
     insta::assert_snapshot!("check_modbus_line", checked("modbus-line.toml", &[]));

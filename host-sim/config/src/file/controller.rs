@@ -75,7 +75,12 @@ fn read_robot(root: &Reader<'_>) -> Result<Robot> {
         robot.dialect = super::known_dialect(&item, item.string()?)?.to_owned();
     }
     if let Some(item) = table.optional("power") {
-        robot.power = item.choice(&[("off", Power::Off), ("on", Power::On), ("enabled", Power::Enabled)])?;
+        robot.power = item.choice(&[
+            ("boot", Power::Boot),
+            ("off", Power::Off),
+            ("on", Power::On),
+            ("enabled", Power::Enabled),
+        ])?;
     }
     if let Some(item) = table.optional("mode") {
         robot.mode = item.choice(&[

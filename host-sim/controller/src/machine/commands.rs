@@ -6,7 +6,7 @@ use proto_core::wire::state::{OperationMode, RobotState};
 
 use super::{
     DISABLE, ENABLE, Effect, ErrorId, Machine, PAUSE, POWER_OFF, POWER_ON, Program, Robot, SHUT_DOWN, STOP,
-    Safety, Transition,
+    Transition,
 };
 use crate::motion::Braking;
 
@@ -51,17 +51,17 @@ impl Machine {
 
     fn check_start(&mut self, by: Starter) -> Result<(), ErrorId> {
         let why = if self.robot != Robot::Enabled {
-            "run: the robot is not enabled"
+            "the robot is not enabled"
         } else if self.mode == OperationMode::Manual && by == Starter::Client {
-            "run: the robot is in manual mode"
-        } else if self.stopped_by_safety() {
-            "run: a safety stop is active"
+            "the robot is in manual mode"
+        } else if let Some(why) = self.safety_forbids() {
+            why
         } else if self.program != Program::Stopped {
-            "run: a program is already running"
+            "a program is already running"
         } else {
             return Ok(());
         };
-        Err(self.refuse(ErrorId::WrongState, why))
+        Err(self.refuse(ErrorId::WrongState, &format!("run: {why}")))
     }
 
     /// A command that is answered with success or fail: begins its transition.
@@ -71,7 +71,9 @@ impl Machine {
     pub fn act(&mut self, now: Instant, action: Action) -> Result<(Effect, Transition), ErrorId> {
         let effect = match self.begin(now, action) {
             Ok(effect) => effect,
-            Err(why) => return Err(self.refuse(ErrorId::WrongState, why)),
+            Err(why) => {
+                return Err(self.refuse(ErrorId::WrongState, &format!("{}: {why}", action.word())));
+            }
         };
         Ok((effect, Transition { action, begun: self.begun }))
     }
@@ -82,11 +84,12 @@ impl Machine {
         let after = |length: Duration| begins + length;
         match action {
             Action::PowerOn => match self.robot {
+                Robot::Off if self.safety_forbids_power() => Err("the safety controller does not work"),
                 Robot::Off => {
                     self.begin_robot(Robot::PoweringOn { until: after(POWER_ON) });
                     Ok(Effect::None)
                 }
-                _ => Err("poweron: the robot is not powered off"),
+                _ => Err("the robot is not powered off"),
             },
             Action::PowerOff => match self.robot {
                 // Allowed during every transition, which must not keep the power on.
@@ -102,50 +105,54 @@ impl Machine {
                     self.begin_robot(Robot::PoweringOff { shown, until: after(POWER_OFF) });
                     Ok(self.abort(after(STOP), Braking::Hard))
                 }
-                _ => Err("poweroff: the robot is not powered, or is losing power"),
+                _ => Err("the robot is not powered, or is losing power"),
             },
             Action::Enable => match self.robot {
-                Robot::Disabled if self.stopped_by_safety() => Err("enable: a safety stop is active"),
                 Robot::Disabled => {
+                    if let Some(why) = self.safety_forbids() {
+                        return Err(why);
+                    }
                     self.begin_robot(Robot::Enabling { until: after(ENABLE) });
                     Ok(Effect::None)
                 }
-                _ => Err("enable: the robot is not powered on, or already enabled"),
+                _ => Err("the robot is not powered on, or already enabled"),
             },
             Action::Disable => match self.robot {
                 Robot::Enabling { .. } | Robot::Enabled => {
                     self.begin_robot(Robot::Disabling { shown: self.robot(), until: after(DISABLE) });
                     Ok(self.abort(after(STOP), Braking::Hard))
                 }
-                _ => Err("disable: the robot is not enabled"),
+                _ => Err("the robot is not enabled"),
             },
             Action::Stop => match self.program {
                 Program::Running | Program::Pausing { .. } | Program::Paused => {
                     Ok(self.abort(after(STOP), Braking::Normal))
                 }
-                Program::Stopped | Program::Stopping { .. } => Err("stop: no program is running"),
+                Program::Stopped | Program::Stopping { .. } => Err("no program is running"),
             },
             Action::Pause => match self.program {
                 Program::Running => {
                     self.begin_program(Program::Pausing { until: after(PAUSE) });
                     Ok(Effect::Hold)
                 }
-                _ => Err("pause: no program is running"),
+                _ => Err("no program is running"),
             },
             Action::Resume => match self.program {
-                Program::Paused if self.stopped_by_safety() => Err("resume: a safety stop is active"),
                 Program::Paused => {
+                    if let Some(why) = self.safety_forbids() {
+                        return Err(why);
+                    }
                     self.begin_program(Program::Running);
                     Ok(Effect::Continue)
                 }
-                _ => Err("resume: no program is paused"),
+                _ => Err("no program is paused"),
             },
             Action::Shutdown => match self.robot {
                 Robot::Off => {
                     self.begin_robot(Robot::ShuttingDown { until: now + SHUT_DOWN });
                     Ok(Effect::None)
                 }
-                _ => Err("shutdown: the robot is not powered off"),
+                _ => Err("the robot is not powered off"),
             },
         }
     }
@@ -153,7 +160,7 @@ impl Machine {
     /// Records that an accepted command is answered with fail. If a safety stop was the cause, its error
     /// stays.
     pub fn not_completed(&mut self, action: Action, why: &str) {
-        if !matches!(self.safety, Safety::Stopped(_)) {
+        if !self.safety_has_acted() {
             self.fail(ErrorId::NotCompleted, format!("{}: {why}", action.word()));
         }
     }

@@ -22,6 +22,8 @@ pub enum ErrorId {
     ProtectiveStop,
     /// The arm has collided.
     Collision,
+    /// The safety controller has failed.
+    SafetyFailure,
     /// An operation at run time has raised it; the number is the operation's.
     Raised(u32),
 }
@@ -38,6 +40,7 @@ impl ErrorId {
             Self::EmergencyStop => 0x3001,
             Self::ProtectiveStop => 0x3002,
             Self::Collision => 0x3003,
+            Self::SafetyFailure => 0x3004,
             Self::Raised(code) => code,
         }
     }

@@ -18,6 +18,8 @@ use proto_core::wire::state::{OperationMode, ProgramState, RobotState, SafetySta
 
 use super::motion::Braking;
 pub use errors::{ErrorEntry, ErrorId};
+pub use safety::SafetyHold;
+use safety::Stop;
 use transition::Begun;
 pub use transition::{Progress, Transition};
 
@@ -27,6 +29,10 @@ pub struct Machine {
     robot: Robot,
     program: Program,
     safety: Safety,
+    /// A person is in a zone of reduced speed.
+    is_reduced: bool,
+    /// Why the safety controller does not work.
+    hold: Option<SafetyHold>,
     mode: OperationMode,
     speed_percent: f32,
     collision_axis: Option<u8>,
@@ -85,17 +91,18 @@ enum Program {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Safety {
     Run,
-    Reduced,
-    Stopped(SafetyState),
+    Stopped(Stop),
     Recovering { until: Instant },
 }
 
 pub use recipe_config::Power;
 
 impl Machine {
-    /// A controller that has booted.
+    /// A controller that has booted, or with [`Power::Boot`] one that waits for [`Self::booting`].
     pub fn new(power: Power, mode: OperationMode) -> Self {
         let robot = match power {
+            // The first call sets the time, by `booting`.
+            Power::Boot => Robot::Booting { shown: BOOT[0].0, until: Instant::NEVER },
             Power::Off => Robot::Off,
             Power::On => Robot::Disabled,
             Power::Enabled => Robot::Enabled,
@@ -104,6 +111,8 @@ impl Machine {
             robot,
             program: Program::Stopped,
             safety: Safety::Run,
+            is_reduced: false,
+            hold: None,
             mode,
             speed_percent: 100.0,
             collision_axis: None,
@@ -149,12 +158,13 @@ impl Machine {
     /// Safety state.
     pub fn safety(&self) -> SafetyState {
         match (self.safety, self.robot) {
-            (Safety::Stopped(state), _) => state,
+            (Safety::Stopped(stop), _) => stop.state(),
+            _ if self.hold.is_some() => self.hold.map_or(SafetyState::Fail, SafetyHold::state),
             (_, Robot::Booting { shown: RobotState::Start, .. }) => SafetyState::Boot,
             (_, Robot::Booting { .. }) => SafetyState::Init,
             _ if self.robot() == RobotState::PowerOff => SafetyState::PowerOff,
+            (Safety::Run, _) if self.is_reduced => SafetyState::Reduce,
             (Safety::Run, _) => SafetyState::Run,
-            (Safety::Reduced, _) => SafetyState::Reduce,
             (Safety::Recovering { .. }, _) => SafetyState::Recovery,
         }
     }
@@ -191,7 +201,7 @@ impl Machine {
 
     /// The present speed as a fraction of the planned speed.
     pub fn rate(&self) -> f64 {
-        let reduced = if self.safety == Safety::Reduced { REDUCED_RATE } else { 1.0 };
+        let reduced = if self.is_reduced { REDUCED_RATE } else { 1.0 };
         f64::from(self.speed_percent) / 100.0 * reduced
     }
 
@@ -239,7 +249,7 @@ impl Machine {
         };
         let safety = match self.safety {
             Safety::Recovering { until } => Some(until),
-            Safety::Run | Safety::Reduced | Safety::Stopped(_) => None,
+            Safety::Run | Safety::Stopped(_) => None,
         };
         [robot, program, safety].into_iter().flatten().min()
     }

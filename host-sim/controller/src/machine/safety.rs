@@ -2,33 +2,92 @@
 
 use proto_core::time::Instant;
 use proto_core::wire::state::SafetyState;
+use serde::{Deserialize, Serialize};
 
 use super::{DISABLE, Effect, ErrorId, Machine, PAUSE, Program, RECOVER, Robot, STOP, Safety};
 use crate::motion::Braking;
 
-impl Machine {
-    /// Reduced speed on or off, as a safety zone requests it.
-    pub fn set_reduced(&mut self, reduced: bool) {
-        match (self.safety, reduced) {
-            (Safety::Run, true) => self.safety = Safety::Reduced,
-            (Safety::Reduced, false) => self.safety = Safety::Run,
-            _ => {}
+/// A stop, the weakest first.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Stop {
+    /// The arm stops on its path.
+    Collision,
+    Protective,
+    Emergency,
+}
+
+impl Stop {
+    pub(super) fn state(self) -> SafetyState {
+        match self {
+            Self::Collision => SafetyState::Stop2,
+            Self::Protective => SafetyState::Stop1,
+            Self::Emergency => SafetyState::Stop0,
         }
+    }
+}
+
+/// A state in which the safety controller does not watch the robot, so that the robot must not move.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum SafetyHold {
+    /// SS_WAIT.
+    Wait,
+    /// SS_CONFIG: its parameters are being changed.
+    Config,
+    /// SS_MODEL.
+    Model,
+    /// SS_UPDATE: its firmware is being updated. The power cannot be switched on.
+    Update,
+    /// SS_FAIL: it has failed. The power cannot be switched on.
+    Fail,
+}
+
+impl SafetyHold {
+    /// The state that clients see.
+    pub fn state(self) -> SafetyState {
+        match self {
+            Self::Wait => SafetyState::Wait,
+            Self::Config => SafetyState::Config,
+            Self::Model => SafetyState::Model,
+            Self::Update => SafetyState::Update,
+            Self::Fail => SafetyState::Fail,
+        }
+    }
+}
+
+impl Machine {
+    /// Reduced speed on or off, as a safety zone requests it. During a stop it is noted, and holds after it.
+    pub fn set_reduced(&mut self, reduced: bool) {
+        self.is_reduced = reduced;
+    }
+
+    /// The safety controller stops working: the program ends, and the drives are switched off.
+    pub fn hold_safety(&mut self, now: Instant, hold: SafetyHold) -> Effect {
+        self.hold = Some(hold);
+        if hold == SafetyHold::Fail {
+            self.fail(ErrorId::SafetyFailure, "the safety controller has failed");
+        }
+        self.drop_drives(now)
+    }
+
+    /// The safety controller works again. A stop remains.
+    pub fn release_safety(&mut self) {
+        self.hold = None;
     }
 
     /// The emergency stop is pressed: the program ends, and the drives are switched off.
     pub fn emergency_stop(&mut self, now: Instant) -> Effect {
-        self.safety_stop(now, SafetyState::Stop0, ErrorId::EmergencyStop, "emergency stop")
+        self.safety_stop(now, Stop::Emergency, ErrorId::EmergencyStop, "emergency stop")
     }
 
     /// A protective stop: the program ends, and the drives are switched off.
     pub fn protective_stop(&mut self, now: Instant) -> Effect {
-        self.safety_stop(now, SafetyState::Stop1, ErrorId::ProtectiveStop, "protective stop")
+        self.safety_stop(now, Stop::Protective, ErrorId::ProtectiveStop, "protective stop")
     }
 
     /// The arm has collided on this axis: it stops on its path, and the program is paused.
     pub fn collide(&mut self, now: Instant, axis: u8) -> Effect {
-        self.safety = Safety::Stopped(SafetyState::Stop2);
+        self.show_stop(Stop::Collision);
         self.collision_axis = Some(axis);
         self.fail(ErrorId::Collision, format!("collision on axis {axis}"));
         if self.program == Program::Running {
@@ -52,16 +111,43 @@ impl Machine {
         self.clear_error();
     }
 
-    fn safety_stop(&mut self, now: Instant, shown: SafetyState, id: ErrorId, message: &str) -> Effect {
-        self.safety = Safety::Stopped(shown);
+    fn safety_stop(&mut self, now: Instant, stop: Stop, id: ErrorId, message: &str) -> Effect {
+        self.show_stop(stop);
         self.fail(id, message);
+        self.drop_drives(now)
+    }
+
+    /// A stop never replaces a stronger one.
+    fn show_stop(&mut self, stop: Stop) {
+        self.safety = match self.safety {
+            Safety::Stopped(present) => Safety::Stopped(present.max(stop)),
+            Safety::Run | Safety::Recovering { .. } => Safety::Stopped(stop),
+        };
+    }
+
+    fn drop_drives(&mut self, now: Instant) -> Effect {
         if matches!(self.robot, Robot::Enabled | Robot::Enabling { .. }) {
             self.begin_robot(Robot::Disabling { shown: self.robot(), until: now + DISABLE });
         }
         self.abort(now + STOP, Braking::Hard)
     }
 
-    pub(super) fn stopped_by_safety(&self) -> bool {
-        !matches!(self.safety, Safety::Run | Safety::Reduced)
+    /// Why the robot must not move; `None` if it may.
+    pub(super) fn safety_forbids(&self) -> Option<&'static str> {
+        match (self.safety, self.hold) {
+            (Safety::Stopped(_) | Safety::Recovering { .. }, _) => Some("a safety stop is active"),
+            (Safety::Run, Some(_)) => Some("the safety controller does not work"),
+            (Safety::Run, None) => None,
+        }
+    }
+
+    /// Whether the safety controller keeps the power off.
+    pub(super) fn safety_forbids_power(&self) -> bool {
+        matches!(self.hold, Some(SafetyHold::Update | SafetyHold::Fail))
+    }
+
+    /// Whether a cause for what happens to the program and the drives is shown already.
+    pub(super) fn safety_has_acted(&self) -> bool {
+        matches!(self.safety, Safety::Stopped(_)) || self.hold == Some(SafetyHold::Fail)
     }
 }

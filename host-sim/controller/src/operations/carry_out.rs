@@ -55,6 +55,8 @@ impl Controller {
                 self.collide(now, *axis);
             }
             Operation::Clear {} => self.clear_stop(now),
+            Operation::Hold { safety: Some(hold) } => self.hold_safety(now, *hold),
+            Operation::Hold { safety: None } => self.release_safety(),
             Operation::Reduced { on: true } => self.enter_reduced(now),
             Operation::Reduced { on: false } => self.leave_reduced(now),
             Operation::RaiseError { code: 0, .. } => return refused("code: 0 means that there is no error"),

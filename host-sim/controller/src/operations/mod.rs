@@ -16,6 +16,7 @@ use serde_json::{Map, Value};
 use super::condition::Condition;
 use super::events::KINDS;
 use super::faults::Link;
+use super::machine::SafetyHold;
 pub(crate) use carry_out::cause_of;
 pub use fault::{Fault, Kind, NoNumber, Spoil};
 
@@ -74,6 +75,11 @@ pub enum Operation {
     },
     /// Releases and acknowledges a stop.
     Clear {},
+    /// The safety controller stops watching the robot, or goes on.
+    Hold {
+        /// Why it does not watch; `None`: it does again.
+        safety: Option<SafetyHold>,
+    },
     /// Somebody enters or leaves a zone of reduced speed.
     Reduced {
         /// Whether somebody is in it.

@@ -106,7 +106,8 @@ impl Link {
         {
             let mut called = self.called.lock().unwrap_or_else(PoisonError::into_inner);
             if called.len() >= MAX_NESTED {
-                let text = format!("call: {name} would be called by more than {MAX_NESTED} other programs");
+                let text =
+                    format!("call: {name}: more than {MAX_NESTED} programs would wait for one another");
                 return Err(text.into());
             }
             called.push(script.name().to_owned());

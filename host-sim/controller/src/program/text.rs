@@ -2,6 +2,8 @@
 
 use rhai::{EvalAltResult, Position};
 
+use super::script::CALL_PROGRAM;
+
 /// The text on one line, not too long for the log.
 pub(super) fn one_line(text: &str) -> String {
     let mut line: String =
@@ -32,7 +34,7 @@ pub(super) fn described(error: EvalAltResult) -> String {
     let place = error.take_position();
     let text = match &error {
         EvalAltResult::ErrorTerminated(token, _) => token.to_string(),
-        other => other.to_string(),
+        other => other.to_string().replace(CALL_PROGRAM, "call"),
     };
     let place = format!(" ({}{}{more})", shown(place), places.concat());
     format!("{}{place}", shortened(&text, MAX_ERROR.saturating_sub(place.len())))

@@ -123,14 +123,14 @@ impl Registers {
 
     /// Lets `write` change the image, and then updates the variables that depend on others.
     pub fn write_inputs<R>(&mut self, write: impl FnOnce(&mut [u8; IMAGE_BYTES]) -> R) -> R {
-        let force_before = self.vector(PLACES.force_end);
+        let before = (self.vector(PLACES.force_end), self.vector(PLACES.tool));
         let inputs_before = self.functional_inputs();
         let result = write(&mut self.image);
         self.follow();
         self.note_edges(inputs_before);
         self.keep_shown();
         let force = self.vector(PLACES.force_end);
-        if force != force_before {
+        if (force, self.vector(PLACES.tool)) != before {
             let tool = self.tool();
             self.set_vector(PLACES.flange_force, tool.wrench_in_parent(force.map(f64::from)));
         }

@@ -3,7 +3,10 @@
 use proptest::prelude::*;
 use proto_core::command::Action;
 use proto_core::modbus::Exception;
+use proto_core::wire::state::SafetyState;
+use recipe_config::{Function, FunctionInput, FunctionOutput, ShownState};
 
+use super::machine::SafetyHold;
 use super::*;
 use ScalarType::{Byte, Float};
 
@@ -37,6 +40,7 @@ fn text() -> impl Strategy<Value = Vec<u8>> {
                 "run(a)",
                 "run(b)",
                 "run(c)",
+                "run(d)",
                 "run(x)",
                 "(",
             ]
@@ -112,6 +116,20 @@ fn everything() -> SimConfig {
     ] {
         config = with_program(config, name, script);
     }
+    config = with_program(
+        config,
+        "d",
+        "loop { let p = []; for n in 8..14 { p.push(get(`RobotState[${n}]`)); } p[2] += 0.05; \
+         try { movel(p, 1.5); } catch { movej([0.3, -1.2, 1.9, 0.7, 1.5, -0.1], 3); } \
+         if comm_recv(\"line\", 0.02).is_empty() { call(\"c\"); } }",
+    );
+    config.functions.start = Some("d".to_owned());
+    for ((_, function), nth) in Function::ALL.into_iter().zip(1..) {
+        config.functions.inputs.push(FunctionInput { item: target(&format!("FDI[{nth}]")), function });
+    }
+    for ((_, state), nth) in ShownState::ALL.into_iter().zip(1..) {
+        config.functions.outputs.push(FunctionOutput { item: target(&format!("FDO[{nth}]")), state });
+    }
     config
 }
 
@@ -158,7 +176,7 @@ fn apply(cell: &mut TestController, step: Step) {
         Step::Knob(nth) => {
             let link = [Link::Command, Link::State, Link::Modbus][usize::from(nth) % 3];
             let c = &mut cell.controller;
-            match nth % 20 {
+            match nth % 25 {
                 0 => c.mute(link),
                 1 => c.unmute(link),
                 2 => c.refuse(link),
@@ -182,6 +200,16 @@ fn apply(cell: &mut TestController, step: Step) {
                 17 if nth > 128 => drop(c.spoil("RobotState[8]", f32::NAN)),
                 17 => drop(c.heal("RobotState[8]")),
                 18 => c.restart_cleared(now),
+                19 | 20 => {
+                    let input = target(&format!("FDI[{}]", nth / 25 % 7 + 1));
+                    c.force(input, 1.0).unwrap();
+                    c.force(input, 0.0).unwrap();
+                }
+                21 if nth > 128 => c.release_safety(),
+                21 => c.hold_safety(now, if nth > 60 { SafetyHold::Fail } else { SafetyHold::Config }),
+                22 if nth > 128 => c.enter_reduced(now),
+                22 => c.leave_reduced(now),
+                23 => c.force_item("drive_error[3]", nth.into()).unwrap(),
                 _ => {
                     let _ = c.assign_recipe(now, 5, (nth > 128).then_some(1));
                 }
@@ -196,7 +224,9 @@ proptest! {
 
     #[test]
     fn nothing_that_happens_breaks_the_controller(steps in proptest::collection::vec(step(), 1..120)) {
-        let mut cell = robot(&everything());
+        let config = everything();
+        let outputs = config.functions.outputs.clone();
+        let mut cell = robot(&config);
         cell.run_ms(1);
         for (kind, nth) in [(0, 0), (1, 0), (2, 0)] {
             apply(&mut cell, Step::Open(kind, nth));
@@ -206,6 +236,13 @@ proptest! {
             let machine = cell.controller.machine();
             let runs = machine.program() != proto_core::wire::state::ProgramState::Stopped;
             prop_assert_eq!(runs, cell.controller.program_name().is_some());
+            let may_move = matches!(machine.safety(), SafetyState::Run | SafetyState::Reduce);
+            prop_assert!(may_move || !machine.program_runs(), "{:?}", machine);
+            for output in &outputs {
+                // The controller does nothing any more after a shutdown.
+                let shown = cell.controller.registers().value(output.item) == 1.0;
+                prop_assert!(cell.shut_down || shown == machine.is_in(output.state), "{:?}", output);
+            }
             let arm = cell.controller.registers().arm();
             prop_assert!(arm.position.iter().chain(&arm.pose).chain(&arm.torque).all(|item| item.is_finite()));
             cell.packets.clear();

@@ -5,12 +5,14 @@ mod commands;
 mod examples;
 mod faults;
 mod functions;
+mod interface;
 mod modbus;
 mod operations;
 mod packet;
 mod ports;
 mod programs;
 mod room;
+mod safety;
 mod scripts;
 mod slices;
 mod stream;
@@ -28,7 +30,7 @@ use proto_core::wire::scalar::ScalarType;
 use super::test_controller::CLIENT_ADDRESS;
 use super::*;
 use recipe_config::{
-    Initial, InitialTarget, Power, SimBus, SimCanFrame, SimField, SimParts, SimPort, SimProgram, SimRecipe,
+    Initial, InitialTarget, SimBus, SimCanFrame, SimField, SimParts, SimPort, SimProgram, SimRecipe,
     SimStreamPart,
 };
 

@@ -112,6 +112,7 @@ fn what_has_stopped_a_program_is_told() {
         (json!({ "do": "power_off" }), "power_off"),
         (json!({ "do": "emergency_stop" }), "emergency_stop"),
         (json!({ "do": "protective_stop" }), "protective_stop"),
+        (json!({ "do": "hold", "safety": "config" }), "safety"),
     ];
     for (cause, reason) in causes {
         let mut cell = recording(&with_waiting_program());

@@ -115,6 +115,48 @@ fn a_line_is_followed_and_waits_for_its_arrival() {
     }
 }
 
+#[test]
+fn a_line_ends_at_the_shown_pose_wherever_the_base_is() {
+    // The configured pose shifts the base frame.
+    let joints = [0.3, -1.2, 1.9, 0.7, 1.5, -0.1];
+    let mut config = SimConfig::default();
+    for (nth, value) in (1..).zip(joints) {
+        config = with_initial(config, &[(&format!("RobotState[{nth}]"), value)]);
+    }
+    let pose = [1.5, -0.25, 0.75, 0.5, -0.5, 2.0];
+    for (nth, value) in (8..).zip(pose) {
+        config = with_initial(config, &[(&format!("RobotState[{nth}]"), value)]);
+    }
+    let (mut cell, c) = runs(config, "movel([1.4, -0.2, 0.8, 0.7, -0.6, 2.1], 0.5);");
+    cell.run_ms(3_000);
+    assert_eq!(
+        (cell.ask(c, "isprogfinish").as_str(), cell.ask(c, "getlasterror").as_str()),
+        ("1", "0:no error\n")
+    );
+    for (nth, wanted) in (8..).zip([1.4, -0.2, 0.8, 0.7, -0.6, 2.1]) {
+        let there = cell.value(&format!("RobotState[{nth}]"));
+        // Shifted angles may be a whole turn away.
+        let apart = if nth < 11 { there - wanted } else { (there - wanted).sin() };
+        assert!(apart.abs() < 1e-5, "RobotState[{nth}] is {there}, not {wanted}");
+    }
+}
+
+#[test]
+fn every_error_of_the_interpreter_has_its_place() {
+    for (script, end) in [
+        ("fn f(x) { f(x + 1) } f(0);", "Stack overflow (line 1, position 22)"),
+        ("let a = []; loop { a.push(1); }", "too large (line 1, position 22)"),
+        ("let a = \"x\"; loop { a += a; }", "too large (line 1, position 23)"),
+        ("let x = y;", "Variable not found: y (line 1, position 9)"),
+        ("1 / 0", "Division by zero: 1 / 0 (line 1, position 3)"),
+        ("throw;", "Runtime error (line 1, position 1)"),
+        ("call(5);", "Function not found: call (i64) (line 1, position 1)"),
+    ] {
+        let error = error_of(SimConfig::default(), script);
+        assert!(error.ends_with(end), "{error}");
+    }
+}
+
 fn with_others(main: &str) -> (TestController, ConnId) {
     let mut config =
         with_program(SimConfig::default(), "inner.jspf", "let x = [1];\nlet inside = 5; log(x[3]);");
