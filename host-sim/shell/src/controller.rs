@@ -6,6 +6,7 @@ mod outward;
 mod servers;
 mod stats;
 mod stepping;
+mod telling;
 
 use std::cell::{Cell, RefCell};
 use std::collections::{BTreeMap, VecDeque};
@@ -20,9 +21,10 @@ use tokio::sync::Notify;
 use tokio::task::JoinSet;
 use tracing::{error, info, warn};
 
+use super::events_file::Writer;
 use super::host::{self, Handle, Shell};
 use super::tcp::{Accepted, Connection};
-use super::{RunOptions, StartError};
+use super::{EventsFile, RunOptions, StartError};
 use control::ControlClient;
 use recipe_config::SimConfig;
 use recipe_controller::operations::Operation;
@@ -46,6 +48,8 @@ pub struct ControllerOptions {
     pub pace: Pace,
     /// Chooses the phases of the state stream and of the ports' cycles; `None`: all are 0.
     pub seed: Option<u64>,
+    /// The file for events.
+    pub events: Option<EventsFile>,
 }
 
 /// Runs the simulated controller until Ctrl-C, SIGTERM or SIGHUP, or until it is shut down over port 2000.
@@ -145,6 +149,9 @@ struct ControllerShell {
     kernel_sends: RefCell<BTreeMap<usize, Instant>>,
     /// Number of events so far.
     activity: Cell<u64>,
+    /// Number of the newest event that was told.
+    told: Cell<u64>,
+    events_file: Option<Writer>,
     control_clients: RefCell<Vec<Rc<ControlClient>>>,
     ended: Notify,
     counters: Cell<ShellCounters>,
@@ -275,9 +282,7 @@ impl ControllerShell {
             error!(%error, "cannot set the timer");
         }
         self.check_waits();
-        for client in self.control_clients.borrow().iter() {
-            client.tell();
-        }
+        self.tell_events();
     }
 
     fn carry_out(&self, output: ControllerOutput) {

@@ -10,7 +10,7 @@ use super::{Overrides, check, wrong};
 use recipe_device::bind::Bind;
 use recipe_shell::controller::{ControllerOptions, MAX_FACTOR, MIN_FACTOR, Pace};
 use recipe_shell::out::print_stderr;
-use recipe_shell::{self as shell, ReadyFile, RunOptions, Scheduling, StartError};
+use recipe_shell::{self as shell, EventsFile, ReadyFile, RunOptions, Scheduling, StartError};
 
 /// Arguments of `controller` and `gateway`.
 #[derive(Debug, Args)]
@@ -49,13 +49,19 @@ pub(super) struct ControllerRun {
     /// it all phases are 0
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
+    /// Write every event as a line of JSON to this file; an events file of an earlier run is replaced
+    #[arg(long, value_name = "FILE")]
+    events: Option<PathBuf>,
 }
 
 impl Run {
     pub(super) fn gateway(self) -> ExitCode {
-        match check::load_gateway(&self.config, &self.overrides.set) {
-            Ok(config) => finished(self.options().and_then(|options| shell::gateway::run(*config, options))),
-            Err(error) => wrong(error),
+        let loaded = check::load_gateway(&self.config, &self.overrides.set);
+        // Even if the file is wrong, a ready file of a killed run is removed.
+        match (self.options(), loaded) {
+            (Ok(options), Ok(config)) => finished(shell::gateway::run(*config, options)),
+            (_, Err(error)) => wrong(error),
+            (Err(error), _) => finished(Err(error)),
         }
     }
 
@@ -68,17 +74,18 @@ impl Run {
 
 impl ControllerRun {
     pub(super) fn controller(self) -> ExitCode {
-        match check::load_controller(&self.run.config, &self.run.overrides.set) {
-            Ok(config) => {
-                finished(self.options().and_then(|options| shell::controller::run(config, options)))
-            }
-            Err(error) => wrong(error),
+        let loaded = check::load_controller(&self.run.config, &self.run.overrides.set);
+        match (self.options(), loaded) {
+            (Ok(options), Ok(config)) => finished(shell::controller::run(config, options)),
+            (_, Err(error)) => wrong(error),
+            (Err(error), _) => finished(Err(error)),
         }
     }
 
     fn options(self) -> Result<ControllerOptions, StartError> {
-        let Self { run, time: pace, seed } = self;
-        Ok(ControllerOptions { run: run.options()?, pace, seed })
+        let Self { run, time: pace, seed, events } = self;
+        let events = events.map(EventsFile::at).transpose()?;
+        Ok(ControllerOptions { run: run.options()?, pace, seed, events })
     }
 }
 

@@ -10,7 +10,7 @@ use tokio::sync::Notify;
 use tokio::task::JoinSet;
 
 use super::{ControllerOptions, ControllerShell, Outward, Running};
-use crate::{StartError, udp};
+use crate::{EventsFile, StartError, udp};
 use recipe_config::{SimBus, SimConfig, SimParts};
 use recipe_controller::{Controller, ControllerInput, Link};
 use recipe_device::bind::Bind;
@@ -61,6 +61,8 @@ impl Running {
         }
         let is_kernel_can = |device: &Option<Port>| device.as_ref().is_some_and(Port::is_kernel_can);
         let kernel_can = (0..devices.len()).filter(|&nth| is_kernel_can(&devices[nth])).collect();
+        // The last that can fail: an earlier run's file is kept if this one cannot start.
+        let events_file = options.events.as_ref().map(EventsFile::create).transpose()?;
         let ready = json!({
             "command": command_at,
             "state": state_at,
@@ -88,6 +90,8 @@ impl Running {
             kernel_can,
             kernel_sends: RefCell::default(),
             activity: Cell::new(0),
+            told: Cell::new(0),
+            events_file,
             control_clients: RefCell::default(),
             ended: Notify::new(),
             counters: Cell::default(),

@@ -114,7 +114,7 @@ fn scenario(seed: Option<u64>) -> Seen {
     robot.programs.push(SimProgram { name: "p".to_owned(), script: PROGRAM.to_owned() });
     let binds = vec![format!("rs485=pty:{}", link.display()).parse().unwrap()];
     let run = RunOptions { binds, ..RunOptions::default() };
-    let options = ControllerOptions { pace: Pace::Stepped, seed, run };
+    let options = ControllerOptions { pace: Pace::Stepped, seed, run, ..ControllerOptions::default() };
     let handle = start_with(robot, options).unwrap();
     let mut control = Control::of(&handle);
     let mut line =
