@@ -3,6 +3,7 @@
 mod control;
 mod open;
 mod outward;
+mod playing;
 mod servers;
 mod stats;
 mod stepping;
@@ -28,6 +29,7 @@ use super::{EventsFile, RunOptions, StartError};
 use control::ControlClient;
 use recipe_config::SimConfig;
 use recipe_controller::operations::Operation;
+use recipe_controller::timeline::Timeline;
 use recipe_controller::{ConnId, Controller, ControllerInput, ControllerOutput, Link};
 use recipe_device::bind::Bind;
 use recipe_device::exchange::{PortEvent, PortTx};
@@ -50,6 +52,8 @@ pub struct ControllerOptions {
     pub seed: Option<u64>,
     /// The file for events.
     pub events: Option<EventsFile>,
+    /// Operations at given times and under conditions.
+    pub timeline: Option<Timeline>,
 }
 
 /// Runs the simulated controller until Ctrl-C, SIGTERM or SIGHUP, or until it is shut down over port 2000.
@@ -149,6 +153,10 @@ struct ControllerShell {
     kernel_sends: RefCell<BTreeMap<usize, Instant>>,
     /// Number of events so far.
     activity: Cell<u64>,
+    timeline: RefCell<Option<Timeline>>,
+    timeline_alarm: Alarm,
+    /// A step of the timeline is being done.
+    is_playing: Cell<bool>,
     /// Number of the newest event that was told.
     told: Cell<u64>,
     events_file: Option<Writer>,
@@ -281,6 +289,7 @@ impl ControllerShell {
         if let Err(error) = self.timer.arm(until) {
             error!(%error, "cannot set the timer");
         }
+        self.play(now);
         self.check_waits();
         self.tell_events();
     }

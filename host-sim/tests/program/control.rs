@@ -96,3 +96,42 @@ fn a_ready_file_of_a_killed_run_is_gone_even_if_the_next_one_cannot_start() {
         assert!(!ready.exists(), "{wrong:?}");
     }
 }
+
+#[test]
+fn a_timeline_acts_by_itself_and_a_wrong_one_starts_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let (file, events) = (folder.path().join("steps.toml"), folder.path().join("events.jsonl"));
+    let steps = "[[step]]\nat_s = 0.2\ndo = \"set\"\nitems = { \"DI[3]\" = 1 }\n\
+                 [[step]]\nwhen = { items = { \"DI[3]\" = 1 } }\nafter_s = 0.1\ndo = \"emergency_stop\"\n\
+                 [[step]]\nwhen = { safety = \"stop0\" }\ndo = \"stop\"\n";
+    std::fs::write(&file, steps).unwrap();
+    let timeline = format!("--timeline={}", file.display());
+    let options = [timeline.as_str(), &format!("--events={}", events.display()), "--time=factor=5"];
+    let robot = BINARY.controller(&example("udp-server-controller.toml"), &options);
+    robot.stats("the emergency stop", |stats| stats["safety"] != 5);
+    let refused =
+        recipe_test_kit::until("the warning", || robot.log("a step of the timeline was refused").pop());
+    assert!(refused.contains("step=3"), "{refused}");
+    robot.end();
+    let text = std::fs::read_to_string(&events).unwrap();
+    let done: Vec<Value> = text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let of = |kind: &str| done.iter().filter(|event| event["event"] == kind).collect::<Vec<_>>();
+    let operations = of("operation");
+    assert_eq!(
+        (&operations[0]["do"], &operations[1]["do"]),
+        (&"set".into(), &"emergency_stop".into()),
+        "{text}"
+    );
+    let times = [&operations[0], &operations[1]].map(|event| event["time_s"].as_f64().unwrap());
+    assert!(times[0] >= 0.2 && times[1] >= times[0] + 0.1, "{times:?}");
+    let refused = of("refused");
+    assert!(refused.len() == 1 && refused[0]["do"] == "stop" && refused[0]["error"].is_string(), "{text}");
+
+    std::fs::write(&file, steps.replace("DI[3]\" = 1 }\n[[", "DI[99]\" = 1 }\n[[")).unwrap();
+    let mut command = BINARY.run("controller", &example("udp-server-controller.toml"));
+    let output = command.args(recipe_test_kit::free_servers()).arg(timeline).output().unwrap();
+    let message = String::from_utf8(output.stderr).unwrap();
+    let place = format!("{}:4:11: step[1].items.DI[99]: DI[99]: ", file.display());
+    assert!(output.status.code() == Some(2) && message.starts_with(&place), "{message}");
+    assert!(output.stdout.is_empty());
+}
