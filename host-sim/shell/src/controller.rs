@@ -289,7 +289,7 @@ impl ControllerShell {
         if let Err(error) = self.timer.arm(until) {
             error!(%error, "cannot set the timer");
         }
-        self.play(now);
+        self.play();
         self.check_waits();
         self.tell_events();
     }
