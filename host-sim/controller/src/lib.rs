@@ -36,6 +36,8 @@ mod server;
 mod snapshot;
 mod spoiled;
 mod test_controller;
+pub mod timeline;
+mod unmet;
 
 use std::collections::VecDeque;
 

@@ -4,6 +4,7 @@
 //! data to the state machine, and carries out its outputs. It does not know protocols.
 
 pub mod controller;
+mod events_file;
 pub mod gateway;
 mod host;
 mod link;
@@ -16,11 +17,13 @@ mod udp;
 use std::fmt;
 use std::time::Duration;
 
+pub use events_file::EventsFile;
 pub use host::Handle;
 pub use ready::ReadyFile;
 pub use signals::Signals;
 
 use recipe_device::bind::Bind;
+pub use recipe_net::realtime::Scheduling;
 
 /// Options of a run beside its file.
 #[derive(Debug, Clone, Default)]
@@ -31,6 +34,8 @@ pub struct RunOptions {
     pub ready: Option<ReadyFile>,
     /// Interval at which a line of counters is printed.
     pub stats: Option<Duration>,
+    /// The scheduling of the run's thread.
+    pub scheduling: Scheduling,
 }
 
 /// Why a run could not start or continue: one message. Nothing is left behind.

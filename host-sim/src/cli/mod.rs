@@ -12,7 +12,9 @@ mod frame;
 mod image;
 mod log;
 mod new;
+mod pendant;
 mod plan;
+mod run;
 mod scale;
 mod soak;
 mod text;
@@ -21,16 +23,13 @@ mod values;
 use std::io::{self, Write};
 use std::path::PathBuf;
 use std::process::ExitCode;
-use std::time::Duration;
 
-use clap::{Args, Parser, Subcommand, ValueEnum};
+use clap::{Args, CommandFactory, Parser, Subcommand, ValueEnum};
 use proto_core::sysvar::Direction;
 
 use codec::TalkPart;
 use recipe_config::file;
-use recipe_device::bind::Bind;
 use recipe_shell::out::{Out, Printed, print_stderr};
-use recipe_shell::{self as shell, ReadyFile, RunOptions, StartError};
 
 /// The arguments of `host-sim`.
 #[derive(Debug, Parser)]
@@ -58,6 +57,8 @@ Examples:
                                                  a gateway file for a known device
   host-sim check cell.toml                       check the file; what to set on the pendant
   host-sim controller -c robot.toml --bind rs485=pty:run/rs485
+  host-sim pendant --ready run/ready.json set DI[3]=1
+                                                 act on the controller while it runs
   host-sim gateway -c cell.toml --bind rs485-1=serial:/dev/ttyUSB0
   host-sim encode cell.toml --part input 1       the frame that switches DO1 on
   host-sim decode cell.toml --part input FF FF 01 EE EE
@@ -72,10 +73,13 @@ enum Command {
     Demo,
     /// Run the simulated controller
     #[command(after_help = CONTROLLER_EXAMPLES)]
-    Controller(Run),
+    Controller(run::ControllerRun),
     /// Run the gateway
     #[command(after_help = GATEWAY_EXAMPLES)]
-    Gateway(Run),
+    Gateway(run::Run),
+    /// Act on a running controller: press its buttons, set inputs, begin faults, watch its state
+    #[command(after_help = pendant::EXAMPLES)]
+    Pendant(pendant::PendantArgs),
     /// List known field devices; print or write a gateway file for one
     #[command(after_help = new::EXAMPLES)]
     New(new::NewArgs),
@@ -94,6 +98,12 @@ enum Command {
     /// Decode frames to values
     #[command(after_help = DECODE_EXAMPLES)]
     Decode(DecodeArgs),
+    /// Print the completions for a shell
+    #[command(after_help = COMPLETIONS_EXAMPLES)]
+    Completions {
+        /// The shell
+        shell: Shell,
+    },
 }
 
 const DEMO_EXAMPLES: &str = "\
@@ -105,6 +115,8 @@ Examples:
   host-sim controller -c robot.toml
   host-sim controller -c robot.toml --bind rs485=pty:run/rs485 --bind can=slcan-tcp:127.0.0.1:3333
   host-sim controller -c robot.toml --set listen.modbus=1502 --ready run/ready.json --stats 1s
+  host-sim controller -c robot.toml --time stepped --seed 1 --events events.jsonl
+  host-sim controller -c robot.toml --time factor=20 --timeline steps.toml
 
 Once everything is listening, a line `ready {json}` on stdout gives the actual addresses.";
 
@@ -139,6 +151,12 @@ Examples:
       host-sim encode can.toml --part output
   host-sim encode line.toml --exchange 2 --part request";
 
+const COMPLETIONS_EXAMPLES: &str = "\
+Examples:
+  host-sim completions bash > ~/.local/share/bash-completion/completions/host-sim
+  host-sim completions zsh > ~/.zfunc/_host-sim
+  host-sim completions fish > ~/.config/fish/completions/host-sim.fish";
+
 const DECODE_EXAMPLES: &str = "\
 Frames are hex bytes (FF FF 01 EE EE, FFFF01EEEE); for a CAN recipe, what
 candump prints:
@@ -151,27 +169,6 @@ Examples:
   host-sim decode cell.toml --part input FF FF 01 EE EE
   candump -L can0 | host-sim decode can.toml --part output
   host-sim decode line.toml --exchange 2 --part reply 09 04 02 03 E8 58 4F";
-
-/// Arguments of `controller` and `gateway`.
-#[derive(Debug, Args)]
-struct Run {
-    /// The configuration file
-    #[arg(short, long, value_name = "FILE")]
-    config: PathBuf,
-    #[command(flatten)]
-    overrides: Overrides,
-    /// Bind a port to a device: pty:PATH, pty-paced:PATH, serial:/dev/ttyUSB0, tcp:HOST:PORT,
-    /// tcp-listen:HOST:PORT; socketcan:vcan0, slcan-pty:PATH, slcan-tcp:HOST:PORT[,PATH], the last two
-    /// also as slcan-pty-unpaced and slcan-tcp-unpaced
-    #[arg(long, value_name = "NAME=DEVICE")]
-    bind: Vec<Bind>,
-    /// Write the actual addresses to this file once everything is listening; removed at the end
-    #[arg(long, value_name = "FILE")]
-    ready: Option<PathBuf>,
-    /// Print a line of counters at this interval, such as 1s or 200ms, until stdout is closed
-    #[arg(long, value_name = "TIME", value_parser = parse_time)]
-    stats: Option<Duration>,
-}
 
 /// `--set`, for commands that read a file.
 #[derive(Debug, Args)]
@@ -198,6 +195,23 @@ struct Which {
     exchange: Option<usize>,
     #[command(flatten)]
     overrides: Overrides,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum Shell {
+    Bash,
+    Zsh,
+    Fish,
+}
+
+impl From<Shell> for clap_complete::Shell {
+    fn from(shell: Shell) -> Self {
+        match shell {
+            Shell::Bash => Self::Bash,
+            Shell::Zsh => Self::Zsh,
+            Shell::Fish => Self::Fish,
+        }
+    }
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
@@ -262,6 +276,14 @@ pub fn main() -> ExitCode {
         Command::Demo => return crate::demo::run(),
         Command::Controller(run) => return run.controller(),
         Command::Gateway(run) => return run.gateway(),
+        Command::Pendant(args) => return pendant::run(args),
+        Command::Completions { shell } => {
+            let mut script = Vec::new();
+            let shell = clap_complete::Shell::from(shell);
+            clap_complete::generate(shell, &mut Cli::command(), "host-sim", &mut script);
+            let _ = out.write_all(&script);
+            Ok(())
+        }
         Command::Soak(args) => {
             let code = soak::run(&args, &mut out);
             return out.finish(|_| code);
@@ -295,39 +317,6 @@ type Outcome = Result<(), String>;
 fn wrong(message: impl std::fmt::Display) -> ExitCode {
     print_stderr(message);
     ExitCode::from(2)
-}
-
-impl Run {
-    fn controller(self) -> ExitCode {
-        match check::load_controller(&self.config, &self.overrides.set) {
-            Ok(config) => {
-                finished(self.options().and_then(|options| shell::controller::run(config, options)))
-            }
-            Err(error) => wrong(error),
-        }
-    }
-
-    fn gateway(self) -> ExitCode {
-        match check::load_gateway(&self.config, &self.overrides.set) {
-            Ok(config) => finished(self.options().and_then(|options| shell::gateway::run(*config, options))),
-            Err(error) => wrong(error),
-        }
-    }
-
-    fn options(self) -> Result<RunOptions, StartError> {
-        let ready = self.ready.map(ReadyFile::at).transpose()?;
-        Ok(RunOptions { binds: self.bind, ready, stats: self.stats })
-    }
-}
-
-fn finished(result: Result<(), StartError>) -> ExitCode {
-    match result {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            print_stderr(&error);
-            ExitCode::from(error.exit_code())
-        }
-    }
 }
 
 fn encode(args: &EncodeArgs, out: &mut dyn Write) -> Outcome {
@@ -381,41 +370,12 @@ impl Which {
     }
 }
 
-/// A time such as `1s`, `200ms` or `2m`.
-fn parse_time(text: &str) -> Result<Duration, String> {
-    let refused = || format!("{text:?} is not a time; write 1s, 200ms or 2m");
-    let digits = text.len() - text.trim_start_matches(|c: char| c.is_ascii_digit() || c == '.').len();
-    let (number, unit) = text.split_at(digits);
-    let number: f64 = number.parse().map_err(|_| refused())?;
-    let seconds = match unit {
-        "ms" => number / 1e3,
-        "s" => number,
-        "m" => number * 60.0,
-        _ => return Err(refused()),
-    };
-    match Duration::try_from_secs_f64(seconds) {
-        Ok(time) if time >= Duration::from_millis(1) => Ok(time),
-        _ => Err(refused()),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
     fn the_command_line_is_consistent() {
-        use clap::CommandFactory;
         Cli::command().debug_assert();
-    }
-
-    #[test]
-    fn times_need_a_unit() {
-        assert_eq!(parse_time("200ms"), Ok(Duration::from_millis(200)));
-        assert_eq!(parse_time("1.5s"), Ok(Duration::from_millis(1500)));
-        assert_eq!(parse_time("2m"), Ok(Duration::from_secs(120)));
-        for wrong in ["", "1", "s", "1h", "0s", "-1s", "1e9s"] {
-            assert!(parse_time(wrong).is_err(), "{wrong:?}");
-        }
     }
 }
