@@ -242,7 +242,7 @@ impl Controller {
 }
 
 /// A whole number without a fraction, as registers and bits are.
-fn number(value: f64) -> Value {
+pub(crate) fn number(value: f64) -> Value {
     let is_whole = value.fract() == 0.0 && value.abs() < 9e15;
     if is_whole { json!(value as i64) } else { json!(value) }
 }

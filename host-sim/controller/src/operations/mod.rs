@@ -17,7 +17,7 @@ use super::condition::Condition;
 use super::events::KINDS;
 use super::faults::Link;
 use super::machine::SafetyHold;
-pub(crate) use carry_out::cause_of;
+pub(crate) use carry_out::{cause_of, number};
 pub use fault::{Fault, Kind, NoNumber, Spoil};
 
 /// An operation. In JSON its name is the value of `do`.
