@@ -1,0 +1,80 @@
+"""One command over port 2000 (proto-core/docs/wire/command.md)."""
+
+from __future__ import annotations
+
+import re
+import select
+import socket
+import time as clock
+from typing import TYPE_CHECKING
+
+from .errors import WaitTimeout
+
+if TYPE_CHECKING:
+    from .controller import Controller
+
+#: Replies that are complete with their last character. Nothing else ends a reply but silence or a line's end.
+_WHOLE = re.compile(
+    rb"run (start|success|fail)|set (success|fail|speed [0-9.]+%)|[a-z]+ (success|fail)|unknown command"
+)
+#: A reply comes in one piece. This silence ends one of another form, in seconds of the machine's time.
+_SILENCE_S = 0.02
+#: In a stepped clock's time nothing is on the way when an operation has been answered; the system needs this long at most.
+_DELIVERY_S = 5.0
+
+
+def exchange(robot: Controller, text: str, timeout: float) -> str:
+    """Sends ``text`` and returns the reply without its end."""
+    if any(end in text for end in "\r\n\0"):
+        raise ValueError("one command at a time is allowed, without an end of line")
+    if robot._factor is None:
+        return _stepped(robot, text, timeout)
+    deadline = clock.monotonic() + timeout / robot._factor + 0.5
+    with socket.create_connection(robot.command_address, timeout=10) as connection:
+        connection.sendall(text.encode() + b"\r\n")
+        return _reply(connection, deadline, text)
+
+
+def _stepped(robot: Controller, text: str, timeout: float) -> str:
+    """The same; the clock is moved to the very instant of the reply, so that a repeated run is the same."""
+    mark = robot.mark()
+    with socket.create_connection(robot.command_address, timeout=10) as connection:
+        connection.sendall(text.encode() + b"\r\n")
+        # The clock has stood until the command has arrived.
+        robot.advance(0)
+        asked = [event for event in robot.events("command", since=mark)]
+        client = asked[-1]["client"] if asked else None
+        answered = any(event["client"] == client for event in robot.events("reply", since=mark))
+        if not answered and not _has_data(connection):
+            until = {"event": "reply"} if client is None else {"event": "reply", "client": client}
+            try:
+                robot.wait(event=until, timeout=timeout)
+            except WaitTimeout:
+                if not _has_data(connection):
+                    raise TimeoutError(f"{text}: no reply within {timeout} s") from None
+        return _reply(connection, clock.monotonic() + _DELIVERY_S, text)
+
+
+def _has_data(connection: socket.socket) -> bool:
+    return bool(select.select([connection], [], [], 0)[0])
+
+
+def _reply(connection: socket.socket, deadline: float, text: str) -> str:
+    received = b""
+    while True:
+        left = deadline - clock.monotonic()
+        if received:
+            left = min(left, _SILENCE_S)
+        if left <= 0 or not select.select([connection], [], [], left)[0]:
+            if received:
+                break
+            raise TimeoutError(f"{text}: no reply in time")
+        piece = connection.recv(4096)
+        if not piece:
+            if received:
+                break
+            raise ConnectionError(f"{text}: the connection was closed without a reply")
+        received += piece
+        if received.endswith((b"\n", b"\r")) or _WHOLE.fullmatch(received):
+            break
+    return received.decode("utf-8", "replace").strip("\r\n\0")
