@@ -14,8 +14,9 @@ import pathlib
 import re
 import subprocess
 import sys
-import tomllib
 import zipfile
+
+import tomllib
 
 HERE = pathlib.Path(__file__).resolve().parent
 ROOT = HERE.parent.parent

@@ -72,7 +72,12 @@ def test_shutdown_is_no_failure():
 
 
 def test_it_ends_with_a_killed_test():
-    code = "import duco_sim, os, signal; robot = duco_sim.Controller(); print(robot.pid, robot.folder, flush=True); os.kill(os.getpid(), signal.SIGKILL)"
+    code = """
+import duco_sim, os, signal
+robot = duco_sim.Controller()
+print(robot.pid, robot.folder, flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
     printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.split()
     assert wait_for_end(int(printed[0]))
 
@@ -230,7 +235,10 @@ def test_what_never_happens_is_told():
 
 def test_threads_do_not_hold_up_each_other():
     with duco_sim.Controller() as robot:
-        threads = [threading.Thread(target=lambda nth=nth: robot.wait(items={f"DI[{nth}]": 1}, timeout=30)) for nth in range(1, 9)]
+        threads = [
+            threading.Thread(target=lambda nth=nth: robot.wait(items={f"DI[{nth}]": 1}, timeout=30))
+            for nth in range(1, 9)
+        ]
         for thread in threads:
             thread.start()
         for nth in range(1, 9):

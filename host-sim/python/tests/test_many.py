@@ -23,9 +23,9 @@ def test_many_at_once(duco_controller_factory, record_property):
     starts = [1000 * robot.start_s for robot in robots]
     memory = [resident_kib(robot.pid) / 1024 for robot in robots]
     text = (
-        f"{CONTROLLERS} controllers at once: start {statistics.median(starts):.0f} ms (median), {max(starts):.0f} ms (max), "
-        f"{1000 * alone:.0f} ms alone; resident memory of each {statistics.median(memory):.1f} MiB (median), "
-        f"{max(memory):.1f} MiB (max)"
+        f"{CONTROLLERS} controllers at once: start {statistics.median(starts):.0f} ms (median), "
+        f"{max(starts):.0f} ms (max), {1000 * alone:.0f} ms alone; resident memory of each "
+        f"{statistics.median(memory):.1f} MiB (median), {max(memory):.1f} MiB (max)"
     )
     record_property("many", text)
     print(f"\n{text}")

@@ -42,7 +42,7 @@ def test_settings():
 
 
 def test_a_timeline_of_steps(tmp_path):
-    steps = [{"at_s": 0.5, "do": "set", "items": {"DI[3]": True}}, {"when": {"program": "a\"b"}, "do": "clear"}]
+    steps = [{"at_s": 0.5, "do": "set", "items": {"DI[3]": True}}, {"when": {"program": 'a"b'}, "do": "clear"}]
     path = pathlib.Path(timeline.timeline_file(steps, tmp_path))
     tomllib = pytest.importorskip("tomllib")
     assert tomllib.loads(path.read_text()) == {"step": steps}

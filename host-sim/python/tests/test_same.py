@@ -19,9 +19,10 @@ def one_run(seed):
         def scale(request):
             return b"\xff\xff\x2a\x00\xee\xee"
 
-        with socket.create_connection(robot.state_address, timeout=10) as stream, clients.Modbus(
-            robot.modbus_address
-        ) as modbus:
+        with (
+            socket.create_connection(robot.state_address, timeout=10) as stream,
+            clients.Modbus(robot.modbus_address) as modbus,
+        ):
             robot.advance(0.25)
             modbus.write_register(8, 1)
             robot.command("run(weigh.jspf)")

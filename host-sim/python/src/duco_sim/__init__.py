@@ -10,7 +10,8 @@
 
 :class:`Controller` runs the program ``host-sim``, which is part of this package, on free ports of this machine.
 :class:`Gateway` runs its recipe gateway. Both end with the ``with`` block and leave nothing behind. Under pytest the
-fixtures ``duco_controller``, ``duco_controller_factory`` and ``recipe_gateway`` do the same (:mod:`duco_sim.pytest_plugin`).
+fixtures ``duco_controller``, ``duco_controller_factory`` and ``recipe_gateway`` do the same
+(:mod:`duco_sim.pytest_plugin`).
 
 Nothing but the standard library is needed.
 """

@@ -21,7 +21,9 @@ def host_sim() -> Path:
     named = os.environ.get(VARIABLE)
     path = Path(named) if named else Path(__file__).with_name("bin") / "host-sim"
     if not os.access(path, os.X_OK):
-        raise DucoSimError(f"there is no program {path}; install the wheel of duco-sim, or name host-sim in ${VARIABLE}")
+        raise DucoSimError(
+            f"there is no program {path}; install the wheel of duco-sim, or name host-sim in ${VARIABLE}"
+        )
     return path
 
 

@@ -38,8 +38,8 @@ class Controller:
     :param time: ``"real"``; ``"factor=20"``, whose clock runs 20 times as fast as the machine's; or ``"stepped"``,
         whose clock moves only by :meth:`advance`, :meth:`wait`, :meth:`finish` and :meth:`command`.
     :param seed: chooses the phases of state stream and ports against the start. 0 is for none: all phases are 0.
-    :param ports: what recipe ports are bound to, by name, as ``--bind`` takes it. ``"pty"``, ``"pty-paced"``, ``"tcp"``,
-        ``"slcan"`` and ``"slcan-unpaced"`` choose a path or port by themselves. Without it a port of ``rs485`` is a
+    :param ports: what recipe ports are bound to, by name, as ``--bind`` takes it. ``"pty"``, ``"pty-paced"``,
+        ``"tcp"``, ``"slcan"`` and ``"slcan-unpaced"`` choose a path or port by themselves. Without it a port of ``rs485`` is a
         pseudoterminal, and a port of ``can`` a bus that speaks slcan.
     :param set: keys of the file that are overridden, such as ``{"robot.power": "off"}``, as ``--set`` takes them.
     :param timeline: operations at given times or under conditions (docs/control.md section 6): the path of a file, its
@@ -73,7 +73,8 @@ class Controller:
         arguments = [
             *process.settings({**listen, **(set or {})}),
             *process.bind_arguments(self._devices_of),
-            *("--time", time, "--seed", str(seed), "--events", str(self._events_file)),
+            *("--time", time, "--events", str(self._events_file)),
+            *(["--seed", str(seed)] if seed else []),
             *(["-" + "v" * verbose] if verbose else []),
         ]
         if timeline is not None:
@@ -149,11 +150,11 @@ class Controller:
 
     @property
     def udp2011_address(self) -> Address:
-        """UDP port 2011's. Raises :class:`~duco_sim.DucoSimError` if the file has no port with ``bus = "udp-server"``."""
+        """UDP port 2011's. Raises :class:`~duco_sim.DucoSimError` if no port of the file has ``bus = "udp-server"``."""
         return self._address("udp2011")
 
     def port(self, name: str) -> Port:
-        """A recipe port, from the device's side. Raises :class:`~duco_sim.DucoSimError` if there is none of this name."""
+        """A recipe port, from the device's side. Raises :class:`~duco_sim.DucoSimError` if there is none."""
         places: Mapping[str, str] = self._ready.get("ports", {})
         if name not in places and name not in self._devices_of:
             raise DucoSimError(f"there is no port {name}; there are {', '.join(sorted(places)) or 'none'}")
@@ -281,7 +282,7 @@ class Controller:
         """Lets a paused program go on."""
         self._control.call("resume")
 
-    def upload(self, name: str, script: Union[str, "os.PathLike[str]"]) -> None:
+    def upload(self, name: str, script: Union[str, os.PathLike[str]]) -> None:
         """Adds or replaces a program: its text, or the path of a file with it.
 
         Raises :class:`~duco_sim.Refused` with the place of a mistake, and while the program runs.
@@ -377,8 +378,8 @@ class Controller:
         return self._fault({"server": server, **kind})
 
     def fault_port(self, port: str, *, mute: bool = False, disconnect: bool = False) -> Fault:
-        """Begins a fault of a recipe port: it sends nothing (``mute``), or a TCP client port's connection is closed, once
-        (``disconnect``)."""
+        """Begins a fault of a recipe port: it sends nothing (``mute``), or the connection of a TCP client port is
+        closed, once (``disconnect``)."""
         return self._fault({"port": port, **faults.of_server(mute, None, False, disconnect, False, None, False, None)})
 
     def spoil(self, item: str, value: float) -> Fault:
@@ -502,7 +503,7 @@ class Controller:
     def close(self) -> None:
         """Ends it and removes its files. The second time it does nothing.
 
-        Raises :class:`~duco_sim.ProcessError` if ``host-sim`` has failed, and what devices and :meth:`when` have raised.
+        Raises :class:`~duco_sim.ProcessError` if ``host-sim`` has failed, and what devices and :meth:`when` raised.
         """
         with self._lock:
             if not self._is_open:

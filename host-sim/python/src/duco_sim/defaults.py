@@ -84,7 +84,7 @@ set("WordOutputReg[2]", values[0]);
 '''
 
 #: A gateway with one device on a serial line: what it sends switches DO1 to DO8, and it gets the TCP's position.
-GATEWAY_FILE = '''\
+GATEWAY_FILE = """\
 [controller]
 address = "127.0.0.1"
 
@@ -109,4 +109,4 @@ recipe = "station"
 cycle_ms = 20
 timeout_ms = 200
 on_timeout = { "DigitalOutputCommand[1]" = 0 }
-'''
+"""

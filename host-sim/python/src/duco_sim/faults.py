@@ -9,8 +9,8 @@ from typing import Any, Callable, Dict, Mapping, Optional, Type
 class Fault:
     """A fault that has begun. It ends with :meth:`heal`, or with the ``with`` block that it is used in.
 
-        with robot.fault("command", delay=0.5):
-            ...
+    with robot.fault("command", delay=0.5):
+        ...
     """
 
     def __init__(self, told: Mapping[str, Any], heal: Callable[[Mapping[str, Any]], None]) -> None:

@@ -84,7 +84,9 @@ class Gateway:
 
     def wait_up(self, timeout: float = 5.0) -> Stats:
         """Waits until all links to the controller are up."""
-        return self.wait(lambda stats: all(link["state"] in ("up", "shared") for link in stats["links"].values()), timeout)
+        return self.wait(
+            lambda stats: all(link["state"] in ("up", "shared") for link in stats["links"].values()), timeout
+        )
 
     @property
     def log(self) -> str:
@@ -166,7 +168,11 @@ class Gateway:
 
 
 def _keys(controller: Controller) -> Dict[str, object]:
-    ports = {"command": controller.command_address, "state": controller.state_address, "modbus": controller.modbus_address}
+    ports = {
+        "command": controller.command_address,
+        "state": controller.state_address,
+        "modbus": controller.modbus_address,
+    }
     keys: Dict[str, object] = {f"controller.ports.{name}": address.port for name, address in ports.items()}
     keys["controller.address"] = controller.command_address.host
     try:

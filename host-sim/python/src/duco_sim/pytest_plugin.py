@@ -25,8 +25,12 @@ _RUNS = pytest.StashKey[List[Tuple[str, Run]]]()
 
 def pytest_configure(config: pytest.Config) -> None:
     """Registers the markers."""
-    config.addinivalue_line("markers", "duco(**arguments): arguments of duco_sim.Controller for the fixture duco_controller")
-    config.addinivalue_line("markers", "recipe_gateway(**arguments): arguments of duco_sim.Gateway for the fixture recipe_gateway")
+    config.addinivalue_line(
+        "markers", "duco(**arguments): arguments of duco_sim.Controller for the fixture duco_controller"
+    )
+    config.addinivalue_line(
+        "markers", "recipe_gateway(**arguments): arguments of duco_sim.Gateway for the fixture recipe_gateway"
+    )
 
 
 @pytest.fixture
@@ -55,7 +59,7 @@ def duco_controller(duco_controller_factory: Callable[..., Controller]) -> Contr
 
 @pytest.fixture
 def recipe_gateway(request: pytest.FixtureRequest, duco_controller: Controller) -> Iterator[Gateway]:
-    """A gateway that is connected to ``duco_controller``, with the arguments that the markers ``recipe_gateway`` give."""
+    """A gateway in front of ``duco_controller``, with the arguments that the markers ``recipe_gateway`` give."""
     gateway = Gateway(**{"controller": duco_controller, **_marked(request, "recipe_gateway")})
     _runs(request).append(("gateway", gateway))
     yield gateway

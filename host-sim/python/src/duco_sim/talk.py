@@ -19,7 +19,7 @@ _WHOLE = re.compile(
 )
 #: A reply comes in one piece. This silence ends one of another form, in seconds of the machine's time.
 _SILENCE_S = 0.02
-#: In a stepped clock's time nothing is on the way when an operation has been answered; the system needs this long at most.
+#: What has left at an instant of a stepped clock is received within this time, in seconds of the machine's.
 _DELIVERY_S = 5.0
 
 

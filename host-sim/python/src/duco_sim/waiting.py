@@ -12,7 +12,7 @@ from .ports import Owner
 from .records import Event, Events
 
 #: How the controller's answer begins when what was waited for has not come.
-_TIMEOUT = "timeout"
+_TIMEOUT = "not within "
 #: How often events that may have been missed are looked for, in seconds of the machine's time.
 _LOOK_S = 0.05
 
@@ -74,7 +74,7 @@ class Clock:
         try:
             self._control.call_within(within, "wait", until=dict(until), timeout_s=timeout)
         except Refused as refused:
-            if _TIMEOUT in refused.why:
+            if refused.why.startswith(_TIMEOUT):
                 raise WaitTimeout(refused.operation, refused.why) from None
             raise
 
