@@ -39,8 +39,8 @@ class Controller:
         whose clock moves only by :meth:`advance`, :meth:`wait`, :meth:`finish` and :meth:`command`.
     :param seed: chooses the phases of state stream and ports against the start. 0 is for none: all phases are 0.
     :param ports: what recipe ports are bound to, by name, as ``--bind`` takes it. ``"pty"``, ``"pty-paced"``,
-        ``"tcp"``, ``"slcan"`` and ``"slcan-unpaced"`` choose a path or port by themselves. Without it a port of ``rs485`` is a
-        pseudoterminal, and a port of ``can`` a bus that speaks slcan.
+        ``"tcp"``, ``"slcan"`` and ``"slcan-unpaced"`` choose a path or port by themselves. Without it a port of
+        ``rs485`` is a pseudoterminal, and a port of ``can`` a bus that speaks slcan.
     :param set: keys of the file that are overridden, such as ``{"robot.power": "off"}``, as ``--set`` takes them.
     :param timeline: operations at given times or under conditions (docs/control.md section 6): the path of a file, its
         text, or a list of steps such as ``{"when": {"program": "pick.jspf"}, "after_s": 0.2, "do": "emergency_stop"}``.
