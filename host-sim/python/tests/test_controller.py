@@ -30,13 +30,19 @@ def test_nothing_is_left_behind():
         robot.state
 
 
-def test_a_wrong_file_says_where(tmp_path):
+def test_a_wrong_file_says_where(tmp_path, monkeypatch):
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(temporary))
     path = tmp_path / "robot.toml"
     path.write_text("[robot]\npower = 3\n")
     with pytest.raises(duco_sim.ProcessError, match=r"robot\.toml:2:9"):
         duco_sim.Controller(path)
     with pytest.raises(duco_sim.ProcessError, match="cannot be read"):
         duco_sim.Controller(tmp_path / "none.toml")
+    with pytest.raises(TypeError, match="timeline"):
+        duco_sim.Controller(timeline=[{"at_s": None}])
+    assert list(temporary.iterdir()) == []
 
 
 def test_a_file_by_path_and_by_text(tmp_path):

@@ -39,6 +39,7 @@ def one_run(seed):
                 robot.advance(0.3)
             robot.command("enable")
             packets = clients.receive(stream, clients.PACKET_BYTES * 5)
+        robot.advance(0)
         return robot.event_log() or "no events", packets
 
 

@@ -64,22 +64,23 @@ class Controller:
         self.time = time
         """How its clock runs, as it was given."""
         self._factor = factor_of(time)
-        self.folder = process.new_folder()
+        with process.new_folder() as folder:
+            path, text = process.configuration(config, CONTROLLER_FILE, folder)
+            listen = {"listen.address": "127.0.0.1", **{f"listen.{server}": 0 for server in _SERVERS}}
+            self._devices_of = process.binds(ports or {}, process.buses(text), folder)
+            self._events_file = folder / "events.jsonl"
+            arguments = [
+                *process.settings({**listen, **(set or {})}),
+                *process.bind_arguments(self._devices_of),
+                *("--time", time, "--events", str(self._events_file)),
+                *(["--seed", str(seed)] if seed else []),
+                *(["-" + "v" * verbose] if verbose else []),
+            ]
+            if timeline is not None:
+                arguments += ["--timeline", timeline_file(timeline, folder)]
+            self._process = process.Process("controller", path, arguments, folder)
+        self.folder = folder
         """A folder for this run's files. It is removed at the end."""
-        path, text = process.configuration(config, CONTROLLER_FILE, self.folder)
-        listen = {"listen.address": "127.0.0.1", **{f"listen.{server}": 0 for server in _SERVERS}}
-        self._devices_of = process.binds(ports or {}, process.buses(text), self.folder)
-        self._events_file = self.folder / "events.jsonl"
-        arguments = [
-            *process.settings({**listen, **(set or {})}),
-            *process.bind_arguments(self._devices_of),
-            *("--time", time, "--events", str(self._events_file)),
-            *(["--seed", str(seed)] if seed else []),
-            *(["-" + "v" * verbose] if verbose else []),
-        ]
-        if timeline is not None:
-            arguments += ["--timeline", timeline_file(timeline, self.folder)]
-        self._process = process.Process("controller", path, arguments, self.folder)
         ready = self._process.ready
         control = process.address_of(ready, "control")
         if control is None:
@@ -395,9 +396,16 @@ class Controller:
         """Power, enable, stop and pause take so many seconds longer."""
         return self._fault({"transitions": seconds})
 
-    def heal(self, server: Optional[str] = None, *, port: Optional[str] = None, item: Optional[str] = None) -> None:
-        """Ends the faults of a server, a port or an item; without any of them, all faults."""
-        chosen = {"server": server, "port": port, "item": item}
+    def heal(
+        self,
+        server: Optional[str] = None,
+        *,
+        port: Optional[str] = None,
+        item: Optional[str] = None,
+        transitions: bool = False,
+    ) -> None:
+        """Ends the faults of a server, a port or an item, or slow transitions; without any of them, all faults."""
+        chosen = {"server": server, "port": port, "item": item, "transitions": transitions or None}
         self._control.call("heal", **{key: value for key, value in chosen.items() if value is not None})
 
     # Time.
@@ -574,14 +582,10 @@ class Controller:
         if not self._is_open:
             return
         key = faults.key_of(told)
-        others = [fault for fault in self.state.faults if faults.key_of(fault) == key and not _same(fault, told)]
+        others = faults.others_at(key, told, self.state.faults)
         self._control.call("heal", **key)
         for fault in others:
             self._control.call("fault", **fault)
-
-
-def _same(fault: Mapping[str, Any], told: Mapping[str, Any]) -> bool:
-    return fault.get("kind") == told.get("kind")
 
 
 # What is pressed, by what is wanted and what is the case, and the state that is waited for.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from types import TracebackType
-from typing import Any, Callable, Dict, Mapping, Optional, Type
+from typing import Any, Callable, Dict, Iterable, List, Mapping, Optional, Type
 
 
 class Fault:
@@ -73,3 +73,10 @@ def key_of(told: Mapping[str, Any]) -> Dict[str, Any]:
         if key in told:
             return {key: told[key]}
     return {"transitions": True}
+
+
+def others_at(
+    key: Mapping[str, Any], told: Mapping[str, Any], present: Iterable[Mapping[str, Any]]
+) -> List[Mapping[str, Any]]:
+    """The present faults with this key, without the one that was told."""
+    return [fault for fault in present if key_of(fault) == key and fault.get("kind") != told.get("kind")]

@@ -39,16 +39,17 @@ class Gateway:
         stats_interval: str = "50ms",
         verbose: int = 1,
     ) -> None:
-        self.folder = process.new_folder()
+        with process.new_folder() as folder:
+            path, text = process.configuration(config, GATEWAY_FILE, folder)
+            self._devices_of = process.binds(ports or {}, process.buses(text), folder)
+            arguments = [
+                *process.settings({**(_keys(controller) if controller else {}), **(set or {})}),
+                *process.bind_arguments(self._devices_of),
+                *(["-" + "v" * verbose] if verbose else []),
+            ]
+            self._process = process.Process("gateway", path, arguments, folder, stats_interval)
+        self.folder = folder
         """A folder for this run's files. It is removed at the end."""
-        path, text = process.configuration(config, GATEWAY_FILE, self.folder)
-        self._devices_of = process.binds(ports or {}, process.buses(text), self.folder)
-        arguments = [
-            *process.settings({**(_keys(controller) if controller else {}), **(set or {})}),
-            *process.bind_arguments(self._devices_of),
-            *(["-" + "v" * verbose] if verbose else []),
-        ]
-        self._process = process.Process("gateway", path, arguments, self.folder, stats_interval)
         self._owner = Owner(stepped=False)
         self._changed = threading.Condition()
         self._stats: Optional[Stats] = None

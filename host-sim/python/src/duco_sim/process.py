@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import json
 import os
@@ -14,7 +15,7 @@ import tempfile
 import time
 import weakref
 from pathlib import Path
-from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple, Union
+from typing import Any, Dict, Iterator, List, Mapping, Optional, Sequence, Tuple, Union
 
 from .binary import host_sim
 from .errors import ProcessError
@@ -53,7 +54,6 @@ class Process:
                     argv, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, bufsize=0, close_fds=True
                 )
         except OSError as error:
-            shutil.rmtree(folder, ignore_errors=True)
             raise ProcessError(f"{argv[0]} cannot be started: {error}") from error
         assert self.popen.stdout is not None
         self.stdout = self.popen.stdout
@@ -82,17 +82,13 @@ class Process:
         """Ends it and removes its folder. Returns what was wrong with how it ended."""
         if not self._end.alive:
             return None
-        # It may have been about to end, as after `shutdown`.
         by_itself = self.popen.poll()
-        log = self.log
-        outcome = self._end.peek() and _stop(self.popen)
-        text = log()
+        code = _stop(self.popen)
+        log = self.log()
         self._end()
-        if by_itself not in (None, 0):
-            return with_log(f"host-sim ended by itself with {_code(by_itself)}", text)
-        if outcome not in (None, 0):
-            return with_log(f"host-sim did not end as it should: {_code(outcome)}", text)
-        return None
+        if by_itself is not None and by_itself != 0:
+            return with_log(f"host-sim ended by itself with {_code(by_itself)}", log)
+        return with_log(f"host-sim did not end as it should: {_code(code)}", log) if code != 0 else None
 
     def _ready(self) -> Dict[str, Any]:
         deadline = self.began + START_LIMIT_S
@@ -115,9 +111,15 @@ class Process:
                 received += piece
 
 
-def new_folder() -> Path:
-    """A new folder that only this user can read."""
-    return Path(tempfile.mkdtemp(prefix="duco-sim-"))
+@contextlib.contextmanager
+def new_folder() -> Iterator[Path]:
+    """A new folder that only this user can read; it is removed again if the block fails."""
+    folder = Path(tempfile.mkdtemp(prefix="duco-sim-"))
+    try:
+        yield folder
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
 
 
 def configuration(config: Config, default: str, folder: Path) -> Tuple[str, str]:

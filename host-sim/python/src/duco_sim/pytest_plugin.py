@@ -71,7 +71,7 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, Any, None]:
     """Adds to the report of a failed test what its controllers and gateways tell."""
     outcome = yield
     report: pytest.TestReport = outcome.get_result()
-    if report.failed and report.when == "call":
+    if report.failed and report.when != "teardown":  # they have ended by then
         for name, run in item.stash.get(_RUNS, []):
             report.sections.extend((f"duco_sim: {name}: {title}", text) for title, text in run.report().items() if text)
 

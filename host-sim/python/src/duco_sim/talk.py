@@ -38,6 +38,13 @@ def exchange(robot: Controller, text: str, timeout: float) -> str:
 def _stepped(robot: Controller, text: str, timeout: float) -> str:
     """The same; the clock is moved to the very instant of the reply, so that a repeated run is the same."""
     mark = robot.mark()
+    reply = _stepped_reply(robot, text, timeout, mark)
+    # What comes next finds the connection closed.
+    robot.advance(0)
+    return reply
+
+
+def _stepped_reply(robot: Controller, text: str, timeout: float, mark: int) -> str:
     with socket.create_connection(robot.command_address, timeout=10) as connection:
         connection.sendall(text.encode() + b"\r\n")
         # The clock has stood until the command has arrived.
