@@ -39,12 +39,14 @@ pub struct Listen {
     pub modbus: u16,
     /// UDP recipe server, 2011.
     pub udp2011: u16,
+    /// Control socket, any free port; always at 127.0.0.1.
+    pub control: u16,
 }
 
 impl Default for Listen {
     fn default() -> Self {
         let address = IpAddr::V4(Ipv4Addr::LOCALHOST);
-        Self { address, command: 2000, state: 2001, modbus: 502, udp2011: 2011 }
+        Self { address, command: 2000, state: 2001, modbus: 502, udp2011: 2011, control: 0 }
     }
 }
 

@@ -34,6 +34,7 @@ mod server;
 mod snapshot;
 mod spoiled;
 mod test_controller;
+mod unmet;
 
 use std::collections::VecDeque;
 

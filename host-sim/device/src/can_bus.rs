@@ -22,9 +22,10 @@ use super::exchange::{Backlog, PortEvent, PortTx};
 use super::pty::Pty;
 use super::stream::{self, ByteStream, accept};
 use super::wire::{Full, NodeId, Pacing, Transmitted, Wire};
+use recipe_net::clock::Clock;
 use recipe_net::fairness::{arrival_time, yield_fairly};
 use recipe_net::tcp_options;
-use recipe_net::timer::{Timer, now};
+use recipe_net::timer::now;
 
 /// A bus; a clone is the same bus.
 #[derive(Debug, Clone)]
@@ -37,6 +38,7 @@ struct Shared {
     wire: RefCell<Wire>,
     nodes: RefCell<Vec<Rc<NodeState>>>,
     deadline_moved: Notify,
+    clock: Clock,
     /// For the counter of dropped frames.
     tx: Rc<PortTx>,
 }
@@ -63,12 +65,15 @@ pub struct Sent {
 }
 
 impl CanBus {
-    /// A bus without nodes. Frames that they drop are counted at `tx`.
-    pub fn new(pacing: Pacing, tx: Rc<PortTx>) -> Self {
+    /// A bus without nodes. Frames that they drop are counted at `tx`; they take their time on `clock`.
+    pub fn new(pacing: Pacing, tx: Rc<PortTx>, clock: Clock) -> Self {
         let wire = RefCell::new(Wire::new(pacing));
-        Self {
-            shared: Rc::new(Shared { wire, nodes: RefCell::default(), deadline_moved: Notify::new(), tx }),
-        }
+        let (nodes, deadline_moved) = (RefCell::default(), Notify::new());
+        Self { shared: Rc::new(Shared { wire, nodes, deadline_moved, clock, tx }) }
+    }
+
+    fn now(&self) -> Instant {
+        self.shared.clock.now()
     }
 
     /// Adds a node that receives all frames.
@@ -89,16 +94,16 @@ impl CanBus {
     /// Advances the bus with the clock until dropped.
     ///
     /// # Errors
-    /// As [`Timer::new`] and [`Timer::expired`].
+    /// As [`Clock::alarm`] and [`Alarm::expired`](recipe_net::clock::Alarm::expired).
     pub async fn run(&self) -> io::Result<()> {
-        let timer = Timer::new()?;
+        let timer = self.shared.clock.alarm()?;
         loop {
             let deadline = self.shared.wire.borrow().deadline();
             timer.arm(deadline)?;
             tokio::select! {
                 expired = timer.expired() => {
                     expired?;
-                    self.advance(now());
+                    self.advance(self.now());
                 }
                 () = self.shared.deadline_moved.notified() => {}
             }
@@ -223,6 +228,8 @@ pub(super) struct CanPort {
     bitrate: u32,
     pacing: Pacing,
     tx: Rc<PortTx>,
+    /// The clock of the bus.
+    pub(super) clock: Clock,
 }
 
 impl CanPort {
@@ -244,7 +251,7 @@ impl CanPort {
             Pace::AtOnce => Pacing::AtOnce,
             Pace::BitRate => Pacing::Bitrate(bitrate),
         };
-        Ok(Self { pty, listener, bitrate, pacing, tx })
+        Ok(Self { pty, listener, bitrate, pacing, tx, clock: Clock::real() })
     }
 
     /// If there are a listener and a terminal, the listener's address: the terminal's link is in the
@@ -258,8 +265,8 @@ impl CanPort {
     }
 
     pub(super) async fn run(self, mut events: impl FnMut(PortEvent<'_>)) -> io::Result<()> {
-        let Self { pty, listener, bitrate, pacing, tx } = self;
-        let bus = CanBus::new(pacing, Rc::clone(&tx));
+        let Self { pty, listener, bitrate, pacing, tx, clock } = self;
+        let bus = CanBus::new(pacing, Rc::clone(&tx), clock);
         let node = bus.join();
         tx.count(|counters| counters.ups += 1);
         events(PortEvent::Up);
@@ -315,7 +322,7 @@ fn hand_over(node: &Node, tx: &PortTx) {
     while !node.is_full() {
         let Some(frame) = tx.frames.borrow_mut().pop_front() else { return };
         // It cannot fail: there is room.
-        let _ = node.send(now(), frame);
+        let _ = node.send(node.bus.now(), frame);
     }
 }
 
@@ -353,7 +360,7 @@ async fn serve_all(listener: TcpListener, bus: &CanBus, bitrate: u32, tx: &Rc<Po
 }
 
 /// Serves one client until its connection fails.
-async fn serve(io: &impl ByteStream, node: &Node, bitrate: u32, tx: &PortTx) -> io::Error {
+async fn serve<D: ByteStream>(io: &D, node: &Node, bitrate: u32, tx: &PortTx) -> io::Error {
     let mut channel = Channel::new(bitrate);
     node.set_receiving(false);
     let mut out = Vec::new();
@@ -390,6 +397,15 @@ async fn serve(io: &impl ByteStream, node: &Node, bitrate: u32, tx: &PortTx) -> 
                 }
                 Ok(())
             }
+            () = tx.looked.notified(), if D::LATE && room && unread.is_empty() => match io.try_read(&mut buf[..most]) {
+                Ok(0) => Err(io::ErrorKind::UnexpectedEof.into()),
+                Ok(count) => {
+                    unread = 0..count;
+                    is_old = false;
+                    Ok(())
+                }
+                Err(error) => Err(error),
+            },
             ready = io.writable(), if !out.is_empty() => ready,
             () = tokio::time::sleep(CLIENT_POLL), if io.may_hold_unread() => Ok(()),
         };
@@ -422,6 +438,9 @@ fn execute_commands(
     unread: &mut Range<usize>,
     out: &mut Vec<u8>,
 ) {
+    // A clock that stands cannot be late.
+    let is_real = !node.bus.shared.clock.runs_apart();
+    let arrived = if is_real { arrival_time() } else { node.bus.now() };
     while !Range::is_empty(unread) && !node.is_full() {
         let mut bytes = &buf[unread.clone()];
         if let Some(reaction) = channel.receive(&mut bytes) {
@@ -429,14 +448,14 @@ fn execute_commands(
             match (reaction.frame, old) {
                 (Some(_), Some(tx)) => tx.count(|counters| counters.dropped += 1),
                 // It cannot fail: there is room.
-                (Some(frame), None) => drop(node.send(arrival_time(), frame)),
+                (Some(frame), None) => drop(node.send(arrived, frame)),
                 (None, _) => {}
             }
         }
         unread.start = unread.end - bytes.len();
     }
     // Frames read late may already have been transmitted.
-    node.bus.advance(now());
+    node.bus.advance(node.bus.now());
     let is_receiving = channel.state() != ChannelState::Closed;
     if node.state.is_receiving.get() != is_receiving {
         node.set_receiving(is_receiving);

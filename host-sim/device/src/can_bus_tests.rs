@@ -38,7 +38,7 @@ fn exchange(stream: &mut TcpStream, text: &[u8], answer: &[u8]) -> impl Future<O
 }
 
 fn bus(pacing: Pacing) -> CanBus {
-    CanBus::new(pacing, Rc::default())
+    CanBus::new(pacing, Rc::default(), Clock::real())
 }
 
 /// The next frame received at a node.

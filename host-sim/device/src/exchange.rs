@@ -45,9 +45,16 @@ pub struct PortTx {
     /// Data read before this instant may have waited while the process slept.
     stale_until: Cell<Instant>,
     pub(super) slept: Notify,
+    pub(super) looked: Notify,
 }
 
 impl PortTx {
+    /// Makes a serial line or an slcan terminal look for received bytes now: the kernel passes on a
+    /// terminal's bytes later, unless they are asked for.
+    pub fn look(&self) {
+        self.looked.notify_one();
+    }
+
     /// The process slept until now, so the age of data waiting in the device is unknown. The port's owner
     /// discards everything for [`STALE`]; no old data may be left then.
     pub fn note_sleep(&self, now: Instant) {

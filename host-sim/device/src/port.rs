@@ -14,6 +14,7 @@ use super::can_bus::CanPort;
 use super::exchange::{PortEvent, PortTx};
 use super::serial::SerialPort;
 use super::socketcan::KernelCan;
+use recipe_net::clock::Clock;
 
 /// A port's bus and its settings, from the configuration.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -78,6 +79,23 @@ impl Port {
         if let Driver::Kernel(can) = &mut self.driver {
             can.listen_to(ids);
         }
+    }
+
+    /// Lets transmissions take their time on this clock, not on the machine's. Without effect on a CAN
+    /// interface of the kernel.
+    #[must_use]
+    pub fn on_clock(mut self, clock: &Clock) -> Self {
+        match &mut self.driver {
+            Driver::Serial(serial) => serial.clock = clock.clone(),
+            Driver::Can(can) => can.clock = clock.clone(),
+            Driver::Kernel(_) => {}
+        }
+        self
+    }
+
+    /// Whether the kernel says when something has left, not the clock of [`Self::on_clock`].
+    pub fn is_kernel_can(&self) -> bool {
+        matches!(self.driver, Driver::Kernel(_))
     }
 
     /// The handle to send with.

@@ -20,10 +20,11 @@ use super::exchange::{Backlog, PortEvent, PortTx};
 use super::pty::Pty;
 use super::stream::{self, ByteStream, accept};
 use recipe_net::backoff::Backoff;
+use recipe_net::clock::{Alarm, Clock};
 use recipe_net::connect::connect;
 use recipe_net::fairness::yield_fairly;
 use recipe_net::tcp_options;
-use recipe_net::timer::{Timer, now};
+use recipe_net::timer::now;
 
 /// A serial port's device.
 #[derive(Debug)]
@@ -31,6 +32,8 @@ pub(super) struct SerialPort {
     source: Source,
     settings: Rs485,
     tx: Rc<PortTx>,
+    /// The clock of the line: when its last bit has left.
+    pub(super) clock: Clock,
 }
 
 #[derive(Debug)]
@@ -58,7 +61,7 @@ impl SerialPort {
                 return Err(io::Error::new(io::ErrorKind::InvalidInput, what));
             }
         };
-        Ok(Self { source, settings, tx })
+        Ok(Self { source, settings, tx, clock: Clock::real() })
     }
 
     pub(super) fn place(&self) -> String {
@@ -71,8 +74,8 @@ impl SerialPort {
     }
 
     pub(super) async fn run(self, mut events: impl FnMut(PortEvent<'_>)) -> io::Result<()> {
-        let Self { source, settings, tx } = self;
-        let mut sender = Sender::new(settings, Rc::clone(&tx))?;
+        let Self { source, settings, tx, clock } = self;
+        let mut sender = Sender::new(settings, Rc::clone(&tx), clock)?;
         match source {
             Source::Pty(pty, pace) => {
                 sender.paced = pace == Pace::BitRate;
@@ -164,8 +167,8 @@ fn open_serial(path: &str, settings: Rs485) -> io::Result<SerialStream> {
 }
 
 /// Moves bytes in both directions until the device fails.
-async fn pump(
-    device: &impl ByteStream,
+async fn pump<D: ByteStream>(
+    device: &D,
     sender: &mut Sender,
     events: &mut impl FnMut(PortEvent<'_>),
 ) -> io::Error {
@@ -197,6 +200,7 @@ async fn pump(
                 discard_backlog(device, &sender.tx, &mut buf, events);
                 Ok(())
             }
+            () = sender.tx.looked.notified(), if D::LATE => look(device, &sender.tx, &mut buf[..most], events),
             () = sender.tx.wake.notified(), if !sender.sending => sender.begin(device, events),
             expired = sender.timer.expired(), if sender.sending && !sender.blocked => {
                 expired.and_then(|()| sender.advance(device, events))
@@ -212,6 +216,27 @@ async fn pump(
         if let Err(error) = done {
             return error;
         }
+    }
+}
+
+/// Reports what can be read now.
+fn look(
+    device: &impl ByteStream,
+    tx: &PortTx,
+    buf: &mut [u8],
+    events: &mut impl FnMut(PortEvent<'_>),
+) -> io::Result<()> {
+    match device.try_read(buf) {
+        Ok(0) => Err(io::ErrorKind::UnexpectedEof.into()),
+        Ok(count) => {
+            tx.count(|counters| counters.bytes_in += count as u64);
+            events(PortEvent::Bytes(buf.get(..count).unwrap_or(buf)));
+            Ok(())
+        }
+        Err(error) if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::Interrupted) => {
+            Ok(())
+        }
+        Err(error) => Err(error),
     }
 }
 
@@ -235,7 +260,8 @@ fn discard_backlog(
 struct Sender {
     tx: Rc<PortTx>,
     settings: Rs485,
-    timer: Timer,
+    clock: Clock,
+    timer: Alarm,
     paced: bool,
     bytes: Vec<u8>,
     written: usize,
@@ -245,11 +271,12 @@ struct Sender {
 }
 
 impl Sender {
-    fn new(settings: Rs485, tx: Rc<PortTx>) -> io::Result<Self> {
+    fn new(settings: Rs485, tx: Rc<PortTx>, clock: Clock) -> io::Result<Self> {
         Ok(Self {
             tx,
             settings,
-            timer: Timer::new()?,
+            timer: clock.alarm()?,
+            clock,
             paced: false,
             bytes: Vec::new(),
             written: 0,
@@ -268,6 +295,8 @@ impl Sender {
     fn down(&mut self, events: &mut impl FnMut(PortEvent<'_>)) {
         self.sending = false;
         self.blocked = false;
+        // Disarming cannot fail. A deadline that nobody waits for would keep a stepped clock from moving.
+        let _ = self.timer.arm(Instant::NEVER);
         events(PortEvent::Down);
     }
 
@@ -279,7 +308,7 @@ impl Sender {
             return Ok(());
         }
         self.written = 0;
-        self.start = now();
+        self.start = self.clock.now();
         self.sending = true;
         self.advance(device, events)
     }
@@ -290,7 +319,7 @@ impl Sender {
         device: &impl ByteStream,
         events: &mut impl FnMut(PortEvent<'_>),
     ) -> io::Result<()> {
-        let at = now();
+        let at = self.clock.now();
         let end = self.start + self.settings.time_on_line(self.bytes.len());
         let due = match self.paced {
             true => bytes_in(&self.settings, at.saturating_since(self.start)).min(self.bytes.len()),

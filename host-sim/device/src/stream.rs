@@ -22,6 +22,8 @@ use recipe_net::timer::now;
 pub(super) trait ByteStream {
     /// Whether bytes that cannot be written at once are lost, as on a line, instead of waiting.
     const LOSSY: bool;
+    /// Whether the system may pass on received bytes late, unless they are asked for.
+    const LATE: bool = false;
 
     /// Waits for bytes. Cancel safe.
     async fn receive(&self, buf: &mut [u8]) -> io::Result<usize>;
@@ -51,6 +53,7 @@ pub(super) trait ByteStream {
 
 impl ByteStream for Pty {
     const LOSSY: bool = true;
+    const LATE: bool = true;
 
     async fn receive(&self, buf: &mut [u8]) -> io::Result<usize> {
         loop {

@@ -28,6 +28,11 @@ pub async fn yield_fairly() {
     yield_now().await;
 }
 
+/// Whether a task waits in [`yield_fairly`], because it has more to do at once.
+pub fn is_anyone_busy() -> bool {
+    WAITING.get() > 0
+}
+
 struct Waiting;
 
 impl Waiting {

@@ -8,6 +8,7 @@ compile_error!(
 );
 
 pub mod backoff;
+pub mod clock;
 pub mod connect;
 pub mod fairness;
 pub mod log_limit;

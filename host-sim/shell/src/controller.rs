@@ -1,9 +1,11 @@
 //! The simulated controller on real sockets and devices.
 
+mod control;
 mod open;
 mod outward;
 mod servers;
 mod stats;
+mod stepping;
 
 use std::cell::{Cell, RefCell};
 use std::collections::{BTreeMap, VecDeque};
@@ -21,22 +23,39 @@ use tracing::{error, info, warn};
 use super::host::{self, Handle, Shell};
 use super::tcp::{Accepted, Connection};
 use super::{RunOptions, StartError};
+use control::ControlClient;
 use recipe_config::SimConfig;
+use recipe_controller::operations::Operation;
 use recipe_controller::{ConnId, Controller, ControllerInput, ControllerOutput, Link};
 use recipe_device::bind::Bind;
 use recipe_device::exchange::{PortEvent, PortTx};
 use recipe_device::port::Port;
+use recipe_net::clock::{Alarm, Clock};
+pub use recipe_net::clock::{MAX_FACTOR, MIN_FACTOR, Pace};
 use recipe_net::log_limit::LogLimit;
-use recipe_net::realtime::{self, Scheduling};
-use recipe_net::timer::{Timer, now};
+use recipe_net::realtime;
+use recipe_net::timer::now;
+use stepping::Waiting;
+
+/// Options of a controller's run beside its file.
+#[derive(Debug, Clone, Default)]
+pub struct ControllerOptions {
+    /// Those of any run.
+    pub run: RunOptions,
+    /// How its clock runs.
+    pub pace: Pace,
+    /// Chooses the phases of the state stream and of the ports' cycles; `None`: all are 0.
+    pub seed: Option<u64>,
+}
 
 /// Runs the simulated controller until Ctrl-C, SIGTERM or SIGHUP, or until it is shut down over port 2000.
 ///
 /// # Errors
 /// The reason why it could not start; nothing is left behind then.
-pub fn run(config: SimConfig, options: RunOptions) -> Result<(), StartError> {
-    let handle = spawn(config, options.binds.clone(), Scheduling::FifoIfAllowed)?;
-    host::foreground(handle, &options)
+pub fn run(config: SimConfig, options: ControllerOptions) -> Result<(), StartError> {
+    let run = options.run.clone();
+    let handle = spawn(config, options)?;
+    host::foreground(handle, &run)
 }
 
 /// Starts a simulated controller on a thread of its own and returns when everything is listening. Dropping
@@ -45,12 +64,24 @@ pub fn run(config: SimConfig, options: RunOptions) -> Result<(), StartError> {
 /// # Errors
 /// The reason why it could not start; nothing is left behind then.
 pub fn start(config: SimConfig, binds: Vec<Bind>) -> Result<Handle, StartError> {
-    spawn(config, binds, Scheduling::Ordinary)
+    start_with(
+        config,
+        ControllerOptions { run: RunOptions { binds, ..RunOptions::default() }, ..Default::default() },
+    )
 }
 
-fn spawn(config: SimConfig, binds: Vec<Bind>, scheduling: Scheduling) -> Result<Handle, StartError> {
+/// Same, with options. Those for a run in the foreground have no effect.
+///
+/// # Errors
+/// The reason why it could not start; nothing is left behind then.
+pub fn start_with(config: SimConfig, options: ControllerOptions) -> Result<Handle, StartError> {
+    spawn(config, options)
+}
+
+fn spawn(config: SimConfig, options: ControllerOptions) -> Result<Handle, StartError> {
     host::start("controller", async move || {
-        let running = Running::open(config, &binds).await?;
+        let scheduling = options.run.scheduling;
+        let running = Running::open(config, options).await?;
         info!(scheduling = %realtime::apply(scheduling), "the simulated controller is running");
         Ok(running)
     })
@@ -101,7 +132,20 @@ struct ControllerShell {
     /// Closed connections that are still sending.
     lingering: RefCell<VecDeque<Rc<Connection>>>,
     busy: Cell<bool>,
-    timer: Timer,
+    /// The controller's clock. Log limits and timeouts of sockets are in the machine's time.
+    clock: Clock,
+    timer: Alarm,
+    /// Who waits for an instant or a condition.
+    waits: RefCell<Vec<Waiting>>,
+    /// Somebody waits now.
+    moved: Notify,
+    /// The ports that are CAN interfaces of the kernel.
+    kernel_can: Vec<usize>,
+    /// Since when frames wait at CAN interfaces of the kernel, by the port's number.
+    kernel_sends: RefCell<BTreeMap<usize, Instant>>,
+    /// Number of events so far.
+    activity: Cell<u64>,
+    control_clients: RefCell<Vec<Rc<ControlClient>>>,
     ended: Notify,
     counters: Cell<ShellCounters>,
     refusal_log: LogLimit,
@@ -153,7 +197,11 @@ struct ShellCounters {
 impl ControllerShell {
     /// Runs a port's device and reports its events to the controller.
     async fn drive(self: Rc<Self>, port: usize, device: Port) {
+        let is_kernel_can = device.is_kernel_can();
         let ended = device.run(|event| {
+            if is_kernel_can && !matches!(event, PortEvent::Frame { .. }) {
+                self.kernel_sends.borrow_mut().remove(&port);
+            }
             self.input(match event {
                 PortEvent::Up => ControllerInput::PortUp { port },
                 PortEvent::Down => ControllerInput::PortDown { port },
@@ -184,9 +232,23 @@ impl ControllerShell {
 
     /// Reports an event to the controller and carries out its outputs.
     fn input(&self, input: ControllerInput<'_>) {
-        let now = now();
+        let now = self.clock.now();
+        self.note_activity();
         self.controller.borrow_mut().handle(now, input);
         self.drain(now);
+    }
+
+    /// Carries out an operation, with its outputs.
+    fn operate(&self, operation: &Operation) -> Result<Value, String> {
+        let now = self.clock.now();
+        self.note_activity();
+        let done = self.controller.borrow_mut().operate(now, operation);
+        self.drain(now);
+        done.map_err(|refused| refused.to_string())
+    }
+
+    fn note_activity(&self) {
+        self.activity.set(self.activity.get().wrapping_add(1));
     }
 
     fn drain(&self, now: Instant) {
@@ -205,16 +267,20 @@ impl ControllerShell {
                 };
                 self.controller.borrow_mut().handle(now, input);
             } else {
-                self.carry_out(output, now);
+                self.carry_out(output);
             }
         };
         self.busy.set(false);
         if let Err(error) = self.timer.arm(until) {
             error!(%error, "cannot set the timer");
         }
+        self.check_waits();
+        for client in self.control_clients.borrow().iter() {
+            client.tell();
+        }
     }
 
-    fn carry_out(&self, output: ControllerOutput, now: Instant) {
+    fn carry_out(&self, output: ControllerOutput) {
         match output {
             ControllerOutput::Send { conn, bytes } => self.send(conn, &bytes),
             ControllerOutput::Close { conn } => {
@@ -222,12 +288,15 @@ impl ControllerShell {
                     self.close(client.connection);
                 }
             }
-            ControllerOutput::StatePacket { bytes } => self.send_state(&bytes[..], now),
+            ControllerOutput::StatePacket { bytes } => self.send_state(&bytes[..], now()),
             ControllerOutput::UdpSend { peer, bytes } => self.send_datagram(peer, &bytes),
             ControllerOutput::PortSend { port, bytes } => self.send_port(port, &bytes),
             ControllerOutput::PortSendCan { port, frame } => {
                 if let Some(Outward::Device(tx)) = self.ports.get(port) {
                     tx.send_frame(frame);
+                    if self.kernel_can.contains(&port) {
+                        self.kernel_sends.borrow_mut().entry(port).or_insert_with(now);
+                    }
                 }
             }
             ControllerOutput::PortClose { port } => {

@@ -63,7 +63,7 @@ fn is_closed(stream: &mut StdStream) -> bool {
 fn inside(config: SimConfig, test: impl AsyncFnOnce(&Rc<ControllerShell>, &Value)) {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
     LocalSet::new().block_on(&runtime, async {
-        let running = Running::open(config, &[]).await.unwrap();
+        let running = Running::open(config, ControllerOptions::default()).await.unwrap();
         let (shell, ready) = (Rc::clone(&running.shell), running.ready.clone());
         tokio::select! {
             ended = running.run() => panic!("{ended:?}"),
@@ -199,7 +199,7 @@ fn of_too_many_closed_connections_that_still_send_the_oldest_is_aborted() {
             // Unread answers, until some wait in this process.
             let connection = Rc::clone(&shell.connections.borrow()[&conn].connection);
             while connection.send(&[0; 4_096]) == Accepted::All {}
-            shell.carry_out(ControllerOutput::Close { conn }, now());
+            shell.carry_out(ControllerOutput::Close { conn });
         }
         assert_eq!(shell.lingering.borrow().len(), MAX_LINGERING);
         assert_eq!(shell.counters.get().cut_answers, 3);

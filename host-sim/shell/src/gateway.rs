@@ -310,7 +310,7 @@ fn lift(outer: &mut Value, key: &str) {
 /// # Errors
 /// The reason why it could not start; nothing is left behind then.
 pub fn run(config: GatewayConfig, options: RunOptions) -> Result<(), StartError> {
-    let handle = spawn(config, options.binds.clone(), Scheduling::FifoIfAllowed)?;
+    let handle = spawn(config, options.binds.clone(), options.scheduling)?;
     host::foreground(handle, &options)
 }
 

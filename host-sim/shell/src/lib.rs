@@ -21,6 +21,7 @@ pub use ready::ReadyFile;
 pub use signals::Signals;
 
 use recipe_device::bind::Bind;
+pub use recipe_net::realtime::Scheduling;
 
 /// Options of a run beside its file.
 #[derive(Debug, Clone, Default)]
@@ -31,6 +32,8 @@ pub struct RunOptions {
     pub ready: Option<ReadyFile>,
     /// Interval at which a line of counters is printed.
     pub stats: Option<Duration>,
+    /// The scheduling of the run's thread.
+    pub scheduling: Scheduling,
 }
 
 /// Why a run could not start or continue: one message. Nothing is left behind.

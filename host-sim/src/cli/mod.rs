@@ -13,22 +13,20 @@ mod image;
 mod log;
 mod new;
 mod plan;
+mod run;
 mod soak;
 mod text;
 
 use std::io::{self, Write};
 use std::path::PathBuf;
 use std::process::ExitCode;
-use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use proto_core::sysvar::Direction;
 
 use codec::TalkPart;
 use recipe_config::file;
-use recipe_device::bind::Bind;
 use recipe_shell::out::{Out, Printed, print_stderr};
-use recipe_shell::{self as shell, ReadyFile, RunOptions, StartError};
 
 /// The arguments of `host-sim`.
 #[derive(Debug, Parser)]
@@ -70,10 +68,10 @@ enum Command {
     Demo,
     /// Run the simulated controller
     #[command(after_help = CONTROLLER_EXAMPLES)]
-    Controller(Run),
+    Controller(run::ControllerRun),
     /// Run the gateway
     #[command(after_help = GATEWAY_EXAMPLES)]
-    Gateway(Run),
+    Gateway(run::Run),
     /// List known field devices; print or write a gateway file for one
     #[command(after_help = new::EXAMPLES)]
     New(new::NewArgs),
@@ -149,27 +147,6 @@ Examples:
   host-sim decode cell.toml --part input FF FF 01 EE EE
   candump -L can0 | host-sim decode can.toml --part output
   host-sim decode line.toml --exchange 2 --part reply 09 04 02 03 E8 58 4F";
-
-/// Arguments of `controller` and `gateway`.
-#[derive(Debug, Args)]
-struct Run {
-    /// The configuration file
-    #[arg(short, long, value_name = "FILE")]
-    config: PathBuf,
-    #[command(flatten)]
-    overrides: Overrides,
-    /// Bind a port to a device: pty:PATH, pty-paced:PATH, serial:/dev/ttyUSB0, tcp:HOST:PORT,
-    /// tcp-listen:HOST:PORT; socketcan:vcan0, slcan-pty:PATH, slcan-tcp:HOST:PORT[,PATH], the last two
-    /// also as slcan-pty-unpaced and slcan-tcp-unpaced
-    #[arg(long, value_name = "NAME=DEVICE")]
-    bind: Vec<Bind>,
-    /// Write the actual addresses to this file once everything is listening; removed at the end
-    #[arg(long, value_name = "FILE")]
-    ready: Option<PathBuf>,
-    /// Print a line of counters at this interval, such as 1s or 200ms, until stdout is closed
-    #[arg(long, value_name = "TIME", value_parser = parse_time)]
-    stats: Option<Duration>,
-}
 
 /// `--set`, for commands that read a file.
 #[derive(Debug, Args)]
@@ -295,39 +272,6 @@ fn wrong(message: impl std::fmt::Display) -> ExitCode {
     ExitCode::from(2)
 }
 
-impl Run {
-    fn controller(self) -> ExitCode {
-        match check::load_controller(&self.config, &self.overrides.set) {
-            Ok(config) => {
-                finished(self.options().and_then(|options| shell::controller::run(config, options)))
-            }
-            Err(error) => wrong(error),
-        }
-    }
-
-    fn gateway(self) -> ExitCode {
-        match check::load_gateway(&self.config, &self.overrides.set) {
-            Ok(config) => finished(self.options().and_then(|options| shell::gateway::run(*config, options))),
-            Err(error) => wrong(error),
-        }
-    }
-
-    fn options(self) -> Result<RunOptions, StartError> {
-        let ready = self.ready.map(ReadyFile::at).transpose()?;
-        Ok(RunOptions { binds: self.bind, ready, stats: self.stats })
-    }
-}
-
-fn finished(result: Result<(), StartError>) -> ExitCode {
-    match result {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            print_stderr(&error);
-            ExitCode::from(error.exit_code())
-        }
-    }
-}
-
 fn encode(args: &EncodeArgs, out: &mut dyn Write) -> Outcome {
     let part = args.which.part()?;
     if args.values.is_empty() && !(args.which.is_of_exchange() && part.is_constant()) {
@@ -379,24 +323,6 @@ impl Which {
     }
 }
 
-/// A time such as `1s`, `200ms` or `2m`.
-fn parse_time(text: &str) -> Result<Duration, String> {
-    let refused = || format!("{text:?} is not a time; write 1s, 200ms or 2m");
-    let digits = text.len() - text.trim_start_matches(|c: char| c.is_ascii_digit() || c == '.').len();
-    let (number, unit) = text.split_at(digits);
-    let number: f64 = number.parse().map_err(|_| refused())?;
-    let seconds = match unit {
-        "ms" => number / 1e3,
-        "s" => number,
-        "m" => number * 60.0,
-        _ => return Err(refused()),
-    };
-    match Duration::try_from_secs_f64(seconds) {
-        Ok(time) if time >= Duration::from_millis(1) => Ok(time),
-        _ => Err(refused()),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -405,15 +331,5 @@ mod tests {
     fn the_command_line_is_consistent() {
         use clap::CommandFactory;
         Cli::command().debug_assert();
-    }
-
-    #[test]
-    fn times_need_a_unit() {
-        assert_eq!(parse_time("200ms"), Ok(Duration::from_millis(200)));
-        assert_eq!(parse_time("1.5s"), Ok(Duration::from_millis(1500)));
-        assert_eq!(parse_time("2m"), Ok(Duration::from_secs(120)));
-        for wrong in ["", "1", "s", "1h", "0s", "-1s", "1e9s"] {
-            assert!(parse_time(wrong).is_err(), "{wrong:?}");
-        }
     }
 }

@@ -35,7 +35,7 @@ pub(super) fn read(document: &Document) -> Result<SimConfig> {
 fn read_listen(root: &Reader<'_>) -> Result<Listen> {
     let mut listen = Listen::default();
     let Some(item) = root.optional("listen") else { return Ok(listen) };
-    let table = item.table(&["address", "command", "state", "modbus", "udp2011"])?;
+    let table = item.table(&["address", "command", "state", "modbus", "udp2011", "control"])?;
     if let Some(item) = table.optional("address") {
         let text = item.string()?;
         listen.address = text.parse::<IpAddr>().map_err(|_| {
@@ -47,12 +47,18 @@ fn read_listen(root: &Reader<'_>) -> Result<Listen> {
         ("state", &mut listen.state),
         ("modbus", &mut listen.modbus),
         ("udp2011", &mut listen.udp2011),
+        ("control", &mut listen.control),
     ] {
         if let Some(item) = table.optional(key) {
             *target = item.integer(0..=65_535)?;
         }
     }
-    let tcp = [("command", listen.command), ("state", listen.state), ("modbus", listen.modbus)];
+    let tcp = [
+        ("command", listen.command),
+        ("state", listen.state),
+        ("modbus", listen.modbus),
+        ("control", listen.control),
+    ];
     for (nth, (key, port)) in tcp.iter().enumerate() {
         if let Some((other, _)) = tcp.iter().take(nth).find(|(_, before)| *port != 0 && before == port) {
             let message = format!("port {port} is already used by {other}");

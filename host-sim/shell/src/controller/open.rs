@@ -1,7 +1,7 @@
 //! Opening the controller's devices, listening sockets and tasks.
 
 use std::cell::{Cell, RefCell};
-use std::net::SocketAddr;
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::rc::Rc;
 
 use serde_json::json;
@@ -9,28 +9,35 @@ use tokio::net::{TcpListener, UdpSocket};
 use tokio::sync::Notify;
 use tokio::task::JoinSet;
 
-use super::{ControllerShell, Outward, Running};
+use super::{ControllerOptions, ControllerShell, Outward, Running};
 use crate::{StartError, udp};
 use recipe_config::{SimBus, SimConfig, SimParts};
 use recipe_controller::{Controller, ControllerInput, Link};
 use recipe_device::bind::Bind;
 use recipe_device::port::{Port, PortBus};
+use recipe_net::clock::Clock;
 use recipe_net::log_limit::LogLimit;
-use recipe_net::timer::Timer;
 
 impl Running {
-    pub(super) async fn open(config: SimConfig, binds: &[Bind]) -> Result<Self, StartError> {
-        let controller = Controller::new(&config).map_err(|error| StartError::new(error.to_string()))?;
-        let devices = open_devices(&config, binds).await?;
+    pub(super) async fn open(config: SimConfig, options: ControllerOptions) -> Result<Self, StartError> {
+        let mut controller = Controller::new(&config).map_err(|error| StartError::new(error.to_string()))?;
+        if let Some(seed) = options.seed {
+            controller.seed(seed);
+        }
+        controller.record_events();
+        let clock = Clock::new(options.pace);
+        let devices = open_devices(&config, &options.run.binds, &clock).await?;
         let address = config.listen.address;
-        let listen = async |key: &str, port: u16| {
+        let listen = async |key: &str, address: IpAddr, port: u16| {
             let listener = TcpListener::bind((address, port)).await;
             let local = listener.and_then(|listener| Ok((listener.local_addr()?, listener)));
             local.map_err(|error| not_listening(key, SocketAddr::new(address, port), &error))
         };
-        let (command_at, command) = listen("command", config.listen.command).await?;
-        let (state_at, state) = listen("state", config.listen.state).await?;
-        let (modbus_at, modbus) = listen("modbus", config.listen.modbus).await?;
+        let (command_at, command) = listen("command", address, config.listen.command).await?;
+        let (state_at, state) = listen("state", address, config.listen.state).await?;
+        let (modbus_at, modbus) = listen("modbus", address, config.listen.modbus).await?;
+        let loopback = IpAddr::V4(Ipv4Addr::LOCALHOST);
+        let (control_at, control) = listen("control", loopback, config.listen.control).await?;
         let udp_wanted = SocketAddr::new(address, config.listen.udp2011);
         let udp = UdpSocket::bind(udp_wanted).await;
         let (udp, udp_at) = udp
@@ -52,11 +59,14 @@ impl Running {
             ports.push(outward);
             places.insert(port.name.clone(), json!(place));
         }
+        let is_kernel_can = |device: &Option<Port>| device.as_ref().is_some_and(Port::is_kernel_can);
+        let kernel_can = (0..devices.len()).filter(|&nth| is_kernel_can(&devices[nth])).collect();
         let ready = json!({
             "command": command_at,
             "state": state_at,
             "modbus": modbus_at,
             "udp2011": udp_at,
+            "control": control_at,
             "ports": places,
         });
         let shell = Rc::new(ControllerShell {
@@ -69,8 +79,16 @@ impl Running {
             reports: RefCell::default(),
             lingering: RefCell::default(),
             busy: Cell::new(false),
-            timer: Timer::new()
+            timer: clock
+                .alarm()
                 .map_err(|error| StartError::new(format!("cannot create a timer: {error}")))?,
+            clock,
+            waits: RefCell::default(),
+            moved: Notify::new(),
+            kernel_can,
+            kernel_sends: RefCell::default(),
+            activity: Cell::new(0),
+            control_clients: RefCell::default(),
             ended: Notify::new(),
             counters: Cell::default(),
             refusal_log: LogLimit::default(),
@@ -81,7 +99,11 @@ impl Running {
         tasks.spawn_local(Rc::clone(&shell).serve(Link::State, state));
         tasks.spawn_local(Rc::clone(&shell).serve(Link::Modbus, modbus));
         tasks.spawn_local(Rc::clone(&shell).serve_udp());
+        tasks.spawn_local(Rc::clone(&shell).serve_control(control));
         tasks.spawn_local(Rc::clone(&shell).keep_time());
+        if shell.clock.is_stepped() {
+            tasks.spawn_local(Rc::clone(&shell).keep_stepping());
+        }
         for (index, (port, device)) in config.ports.into_iter().zip(devices).enumerate() {
             let shell = Rc::clone(&shell);
             match (port.bus, device) {
@@ -97,7 +119,11 @@ impl Running {
 }
 
 /// Opens the devices; `None` for a port that needs none.
-async fn open_devices(config: &SimConfig, binds: &[Bind]) -> Result<Vec<Option<Port>>, StartError> {
+async fn open_devices(
+    config: &SimConfig,
+    binds: &[Bind],
+    clock: &Clock,
+) -> Result<Vec<Option<Port>>, StartError> {
     for (index, bind) in binds.iter().enumerate() {
         let refused = |why: &str| Err(StartError::new(format!("--bind {bind}: {why}")));
         match config.ports.iter().find(|port| port.name == bind.port) {
@@ -115,7 +141,7 @@ async fn open_devices(config: &SimConfig, binds: &[Bind]) -> Result<Vec<Option<P
     for port in &config.ports {
         devices.push(match bus_of(&port.bus) {
             Some(bus) => {
-                let mut device = open_device(&port.name, bus, binds).await?;
+                let mut device = open_device(&port.name, bus, binds).await?.on_clock(clock);
                 let recipe = port.recipe.and_then(|recipe| config.recipes.get(recipe));
                 if let Some(SimParts::Can { input, output }) = recipe.map(|recipe| &recipe.parts) {
                     device.listen_to(input.iter().chain(output).map(|frame| frame.id).collect());

@@ -5,7 +5,6 @@ use proto_core::wire::scalar::Scalar;
 use serde_json::{Value, json};
 
 use super::{ControllerShell, Outward};
-use recipe_net::timer::now;
 
 impl ControllerShell {
     /// One line of statistics.
@@ -26,7 +25,7 @@ impl ControllerShell {
                     }
                 }
             }
-            stats.insert("time_us".to_owned(), json!(now().as_micros()));
+            stats.insert("time_us".to_owned(), json!(self.clock.now().as_micros()));
             stats.insert("connections".to_owned(), json!(self.counters.get()));
             stats.insert("mode".to_owned(), json!(machine.mode().code()));
             stats.insert("robot".to_owned(), json!(machine.robot().code()));

@@ -1,0 +1,148 @@
+//! `host-sim controller` and `host-sim gateway`: options, and the way from a file to a run.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::time::Duration;
+
+use clap::Args;
+
+use super::{Overrides, check, wrong};
+use recipe_device::bind::Bind;
+use recipe_shell::controller::{ControllerOptions, MAX_FACTOR, MIN_FACTOR, Pace};
+use recipe_shell::out::print_stderr;
+use recipe_shell::{self as shell, ReadyFile, RunOptions, Scheduling, StartError};
+
+/// Arguments of `controller` and `gateway`.
+#[derive(Debug, Args)]
+pub(super) struct Run {
+    /// The configuration file
+    #[arg(short, long, value_name = "FILE")]
+    config: PathBuf,
+    #[command(flatten)]
+    overrides: Overrides,
+    /// Bind a port to a device: pty:PATH, pty-paced:PATH, serial:/dev/ttyUSB0, tcp:HOST:PORT,
+    /// tcp-listen:HOST:PORT; socketcan:vcan0, slcan-pty:PATH, slcan-tcp:HOST:PORT[,PATH], the last two
+    /// also as slcan-pty-unpaced and slcan-tcp-unpaced
+    #[arg(long, value_name = "NAME=DEVICE")]
+    bind: Vec<Bind>,
+    /// Write the actual addresses to this file once everything is listening; removed at the end
+    #[arg(long, value_name = "FILE")]
+    ready: Option<PathBuf>,
+    /// Print a line of counters at this interval, such as 1s or 200ms, until stdout is closed
+    #[arg(long, value_name = "TIME", value_parser = parse_time)]
+    stats: Option<Duration>,
+    /// Do not ask the system for real-time scheduling (SCHED_FIFO)
+    #[arg(long)]
+    no_realtime: bool,
+}
+
+/// Arguments of `controller`.
+#[derive(Debug, Args)]
+pub(super) struct ControllerRun {
+    #[command(flatten)]
+    run: Run,
+    /// How the controller's clock runs: real; factor=N, so many times as fast as the machine's, such as 20 or
+    /// 0.5; stepped, only by `advance` and `wait` at the control socket
+    #[arg(long, value_name = "real|stepped|factor=N", default_value = "real", value_parser = parse_pace)]
+    time: Pace,
+    /// Choose the phases of the state stream and of the ports' cycles, and what random faults send; without
+    /// it all phases are 0
+    #[arg(long, value_name = "N")]
+    seed: Option<u64>,
+}
+
+impl Run {
+    pub(super) fn gateway(self) -> ExitCode {
+        match check::load_gateway(&self.config, &self.overrides.set) {
+            Ok(config) => finished(self.options().and_then(|options| shell::gateway::run(*config, options))),
+            Err(error) => wrong(error),
+        }
+    }
+
+    fn options(self) -> Result<RunOptions, StartError> {
+        let ready = self.ready.map(ReadyFile::at).transpose()?;
+        let scheduling = if self.no_realtime { Scheduling::Ordinary } else { Scheduling::FifoIfAllowed };
+        Ok(RunOptions { binds: self.bind, ready, stats: self.stats, scheduling })
+    }
+}
+
+impl ControllerRun {
+    pub(super) fn controller(self) -> ExitCode {
+        match check::load_controller(&self.run.config, &self.run.overrides.set) {
+            Ok(config) => {
+                finished(self.options().and_then(|options| shell::controller::run(config, options)))
+            }
+            Err(error) => wrong(error),
+        }
+    }
+
+    fn options(self) -> Result<ControllerOptions, StartError> {
+        let Self { run, time: pace, seed } = self;
+        Ok(ControllerOptions { run: run.options()?, pace, seed })
+    }
+}
+
+fn finished(result: Result<(), StartError>) -> ExitCode {
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            print_stderr(&error);
+            ExitCode::from(error.exit_code())
+        }
+    }
+}
+
+/// A time such as `1s`, `200ms` or `2m`.
+pub(super) fn parse_time(text: &str) -> Result<Duration, String> {
+    let refused = || format!("{text:?} is not a time; write 1s, 200ms or 2m");
+    let digits = text.len() - text.trim_start_matches(|c: char| c.is_ascii_digit() || c == '.').len();
+    let (number, unit) = text.split_at(digits);
+    let number: f64 = number.parse().map_err(|_| refused())?;
+    let seconds = match unit {
+        "ms" => number / 1e3,
+        "s" => number,
+        "m" => number * 60.0,
+        _ => return Err(refused()),
+    };
+    match Duration::try_from_secs_f64(seconds) {
+        Ok(time) if time >= Duration::from_millis(1) => Ok(time),
+        _ => Err(refused()),
+    }
+}
+
+/// How a clock runs.
+fn parse_pace(text: &str) -> Result<Pace, String> {
+    match (text, text.strip_prefix("factor=")) {
+        ("real", _) => Ok(Pace::Real),
+        ("stepped", _) => Ok(Pace::Stepped),
+        (_, Some(factor)) => match factor.parse() {
+            Ok(factor) if (MIN_FACTOR..=MAX_FACTOR).contains(&factor) => Ok(Pace::Factor(factor)),
+            _ => Err(format!("factor: {factor} is not within {MIN_FACTOR} to {MAX_FACTOR}")),
+        },
+        _ => Err(format!("{text:?} is not real, stepped or factor=N")),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn times_need_a_unit() {
+        assert_eq!(parse_time("200ms"), Ok(Duration::from_millis(200)));
+        assert_eq!(parse_time("1.5s"), Ok(Duration::from_millis(1500)));
+        assert_eq!(parse_time("2m"), Ok(Duration::from_secs(120)));
+        for wrong in ["", "1", "s", "1h", "0s", "-1s", "1e9s"] {
+            assert!(parse_time(wrong).is_err(), "{wrong:?}");
+        }
+    }
+
+    #[test]
+    fn a_clock_is_real_stepped_or_has_a_factor() {
+        assert_eq!(parse_pace("stepped"), Ok(Pace::Stepped));
+        assert_eq!(parse_pace("factor=0.5"), Ok(Pace::Factor(0.5)));
+        for wrong in ["", "Real", "20", "factor=", "factor=0", "factor=-1", "factor=nan", "factor=1e9"] {
+            assert!(parse_pace(wrong).is_err(), "{wrong:?}");
+        }
+    }
+}
