@@ -31,7 +31,7 @@ def test_emergency_stop(robot):
     robot.wait(items={"DO[1]": 1})
     robot.estop()
     assert robot.finish().reason == "emergency_stop"
-    assert (robot.state.safety, robot.state.robot) == ("stop0", "disable")
+    robot.wait(safety="stop0", robot="disable")
     assert robot.command("enable") == "enable fail"
     robot.clear()
     robot.wait(safety="run")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import threading
 from pathlib import Path
@@ -68,11 +69,10 @@ class Controller:
             path, text = process.configuration(config, CONTROLLER_FILE, folder)
             listen = {"listen.address": "127.0.0.1", **{f"listen.{server}": 0 for server in _SERVERS}}
             self._devices_of = process.binds(ports or {}, process.buses(text), folder)
-            self._events_file = folder / "events.jsonl"
             arguments = [
                 *process.settings({**listen, **(set or {})}),
                 *process.bind_arguments(self._devices_of),
-                *("--time", time, "--events", str(self._events_file)),
+                *("--time", time),
                 *(["--seed", str(seed)] if seed else []),
                 *(["-" + "v" * verbose] if verbose else []),
             ]
@@ -151,7 +151,7 @@ class Controller:
 
     @property
     def udp2011_address(self) -> Address:
-        """UDP port 2011's. Raises :class:`~duco_sim.DucoSimError` if no port of the file has ``bus = "udp-server"``."""
+        """UDP port 2011's; it only answers if a port of the file has ``bus = "udp-server"``."""
         return self._address("udp2011")
 
     def port(self, name: str) -> Port:
@@ -212,11 +212,8 @@ class Controller:
         return self._clock.mark()
 
     def event_log(self) -> str:
-        """All events since the start as lines of JSON. Two runs that are the same have the same text."""
-        try:
-            return self._events_file.read_text(encoding="utf-8")
-        except OSError:
-            return ""
+        """All events that are kept as lines of JSON. Two runs that are the same have the same text."""
+        return "".join(json.dumps(event.told, sort_keys=True) + "\n" for event in self.events())
 
     def counters(self) -> Dict[str, Any]:
         """The counters that ``host-sim controller --stats`` prints (docs/devices.md section 4)."""
@@ -570,7 +567,7 @@ class Controller:
     def _address(self, server: str) -> Address:
         address = process.address_of(self._ready, server)
         if address is None:
-            raise DucoSimError(f"there is no server {server}: the file has no port for it")
+            raise DucoSimError(f"this host-sim has no server {server}")
         return address
 
     def _fault(self, told: Dict[str, Any]) -> Fault:

@@ -169,15 +169,11 @@ class Gateway:
 
 
 def _keys(controller: Controller) -> Dict[str, object]:
-    ports = {
+    addresses = {
         "command": controller.command_address,
         "state": controller.state_address,
         "modbus": controller.modbus_address,
+        "udp2011": controller.udp2011_address,
     }
-    keys: Dict[str, object] = {f"controller.ports.{name}": address.port for name, address in ports.items()}
-    keys["controller.address"] = controller.command_address.host
-    try:
-        keys["controller.ports.udp2011"] = controller.udp2011_address.port
-    except DucoSimError:
-        pass
-    return keys
+    ports: Dict[str, object] = {f"controller.ports.{name}": address.port for name, address in addresses.items()}
+    return {"controller.address": controller.command_address.host, **ports}
