@@ -22,6 +22,8 @@ class Control:
 
     def __init__(self, address: Address) -> None:
         self.address = address
+        self.answered_s = 0.0
+        """The controller's time at the newest answer, in seconds. A stepped clock is still there."""
         self._lock = threading.Lock()
         self._idle: List[_Connection] = []
         self._room = threading.Semaphore(MAX_CONNECTIONS)
@@ -50,6 +52,7 @@ class Control:
                 connection.close()
                 raise
             self._give_back(connection)
+        self.answered_s = float(answer.get("time_s", 0.0))
         if answer.get("ok") is not True:
             raise Refused(do, str(answer.get("error", answer)))
         return answer.get("result")

@@ -410,7 +410,7 @@ class Controller:
     @property
     def time_s(self) -> float:
         """The controller's time since its start, in seconds."""
-        return self.state.time_s
+        return self._clock.now_s()
 
     def advance(self, seconds: float) -> None:
         """Lets ``seconds`` pass on the controller's clock. A stepped clock moves by so much; others are waited for."""

@@ -27,7 +27,8 @@ class Clock:
 
     def now_s(self) -> float:
         """The controller's time since its start, in seconds."""
-        return float(self._control.call("state")["time_s"])
+        self._control.call("get", items=[])
+        return self._control.answered_s
 
     def events(self, kinds: Sequence[str], since: int) -> Events:
         """The kept events from number ``since`` on."""
@@ -106,7 +107,8 @@ class Clock:
         deadline = self.now_s() + timeout
         limit = self._slice_us() / 1e6 if self.factor is None else _LOOK_S * self.factor
         while True:
-            left = deadline - self.now_s()
+            # Each piece ends with an answer.
+            left = deadline - self._control.answered_s
             try:
                 return wait_once(max(0.0, min(left, limit)))
             except WaitTimeout:
