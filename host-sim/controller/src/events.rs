@@ -148,6 +148,14 @@ pub enum Happened {
         #[serde(flatten)]
         operation: Value,
     },
+    /// An operation of a timeline was refused.
+    Refused {
+        /// The operation, as it was given.
+        #[serde(flatten)]
+        operation: Value,
+        /// Why.
+        error: String,
+    },
 }
 
 impl Happened {
@@ -171,12 +179,13 @@ impl Happened {
             Self::ErrorCleared => "error_cleared",
             Self::Write { .. } => "write",
             Self::Operation { .. } => "operation",
+            Self::Refused { .. } => "refused",
         }
     }
 }
 
 /// All kinds of events.
-pub const KINDS: [&str; 17] = [
+pub const KINDS: [&str; 18] = [
     "started",
     "connected",
     "disconnected",
@@ -194,6 +203,7 @@ pub const KINDS: [&str; 17] = [
     "error_cleared",
     "write",
     "operation",
+    "refused",
 ];
 
 /// What happened, in words.
@@ -219,6 +229,7 @@ impl std::fmt::Display for Happened {
             Self::ErrorCleared => write!(f, "the error was cleared"),
             Self::Write { item, value, was, by } => write!(f, "{item}: {was} -> {value} by {by}"),
             Self::Operation { operation } => write!(f, "done: {operation}"),
+            Self::Refused { operation, error } => write!(f, "refused: {operation}: {error}"),
         }
     }
 }
@@ -336,6 +347,14 @@ impl Controller {
     pub(super) fn operation_done(&mut self, now: Instant, operation: &Operation) {
         self.happened(now, || Happened::Operation {
             operation: serde_json::to_value(operation).unwrap_or(Value::Null),
+        });
+    }
+
+    /// Tells of an operation that nobody gets an answer to, and that was refused.
+    pub fn note_refused(&mut self, now: Instant, operation: &Operation, error: &str) {
+        self.happened(now, || Happened::Refused {
+            operation: serde_json::to_value(operation).unwrap_or(Value::Null),
+            error: error.to_owned(),
         });
     }
 

@@ -34,6 +34,7 @@ mod server;
 mod snapshot;
 mod spoiled;
 mod test_controller;
+pub mod timeline;
 mod unmet;
 
 use std::collections::VecDeque;

@@ -3,9 +3,11 @@
 mod control;
 mod open;
 mod outward;
+mod playing;
 mod servers;
 mod stats;
 mod stepping;
+mod telling;
 
 use std::cell::{Cell, RefCell};
 use std::collections::{BTreeMap, VecDeque};
@@ -20,12 +22,14 @@ use tokio::sync::Notify;
 use tokio::task::JoinSet;
 use tracing::{error, info, warn};
 
+use super::events_file::Writer;
 use super::host::{self, Handle, Shell};
 use super::tcp::{Accepted, Connection};
-use super::{RunOptions, StartError};
+use super::{EventsFile, RunOptions, StartError};
 use control::ControlClient;
 use recipe_config::SimConfig;
 use recipe_controller::operations::Operation;
+use recipe_controller::timeline::Timeline;
 use recipe_controller::{ConnId, Controller, ControllerInput, ControllerOutput, Link};
 use recipe_device::bind::Bind;
 use recipe_device::exchange::{PortEvent, PortTx};
@@ -46,6 +50,10 @@ pub struct ControllerOptions {
     pub pace: Pace,
     /// Chooses the phases of the state stream and of the ports' cycles; `None`: all are 0.
     pub seed: Option<u64>,
+    /// The file for events.
+    pub events: Option<EventsFile>,
+    /// Operations at given times and under conditions.
+    pub timeline: Option<Timeline>,
 }
 
 /// Runs the simulated controller until Ctrl-C, SIGTERM or SIGHUP, or until it is shut down over port 2000.
@@ -145,6 +153,13 @@ struct ControllerShell {
     kernel_sends: RefCell<BTreeMap<usize, Instant>>,
     /// Number of events so far.
     activity: Cell<u64>,
+    timeline: RefCell<Option<Timeline>>,
+    timeline_alarm: Alarm,
+    /// A step of the timeline is being done.
+    is_playing: Cell<bool>,
+    /// Number of the newest event that was told.
+    told: Cell<u64>,
+    events_file: Option<Writer>,
     control_clients: RefCell<Vec<Rc<ControlClient>>>,
     ended: Notify,
     counters: Cell<ShellCounters>,
@@ -274,10 +289,9 @@ impl ControllerShell {
         if let Err(error) = self.timer.arm(until) {
             error!(%error, "cannot set the timer");
         }
+        self.play(now);
         self.check_waits();
-        for client in self.control_clients.borrow().iter() {
-            client.tell();
-        }
+        self.tell_events();
     }
 
     fn carry_out(&self, output: ControllerOutput) {

@@ -4,6 +4,7 @@
 //! data to the state machine, and carries out its outputs. It does not know protocols.
 
 pub mod controller;
+mod events_file;
 pub mod gateway;
 mod host;
 mod link;
@@ -16,6 +17,7 @@ mod udp;
 use std::fmt;
 use std::time::Duration;
 
+pub use events_file::EventsFile;
 pub use host::Handle;
 pub use ready::ReadyFile;
 pub use signals::Signals;

@@ -1,6 +1,7 @@
 //! `--ready FILE`: a file with all addresses, which exists while they are open.
 //!
-//! It is created atomically and removed at the end. An existing file is replaced only if it is a ready file.
+//! It is created atomically and removed at the end. A ready file that an earlier run has left is removed before
+//! anything is opened, so that whoever waits for the file never reads an old one; any other file stays.
 
 use std::fs;
 use std::io;
@@ -18,13 +19,15 @@ pub struct ReadyFile {
 }
 
 impl ReadyFile {
-    /// The file at `path`, which is not written yet.
+    /// The file at `path`, which is not written yet. One that an earlier run has left is removed.
     ///
     /// # Errors
     /// If another kind of file is there, or it could not be written.
     pub fn at(path: PathBuf) -> Result<Self, StartError> {
         let file = Self { path };
-        file.is_free()?;
+        if !file.is_free()? {
+            fs::remove_file(&file.path).map_err(|error| file.refused(error))?;
+        }
         // Reports a folder without write permission before anything is started.
         if file.folder().is_dir() {
             Beside::file(&file.path, b"").map_err(|error| file.refused(error))?;
@@ -155,11 +158,13 @@ mod tests {
     }
 
     #[test]
-    fn a_file_left_by_a_killed_run_is_replaced() {
+    fn a_file_left_by_a_killed_run_is_removed_at_once() {
         let (_folder, path) = place();
         for left in [format!("{}\n", ready()), json!({ "ports": {} }).to_string(), String::new()] {
             fs::write(&path, left).unwrap();
-            let written = ReadyFile::at(path.clone()).unwrap().write(&ready()).unwrap();
+            let file = ReadyFile::at(path.clone()).unwrap();
+            assert!(!path.exists(), "nobody reads the old one");
+            let written = file.write(&ready()).unwrap();
             assert_eq!(fs::read_to_string(&path).unwrap(), format!("{}\n", ready()));
             drop(written);
             assert!(!path.exists());

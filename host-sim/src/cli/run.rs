@@ -1,16 +1,18 @@
 //! `host-sim controller` and `host-sim gateway`: options, and the way from a file to a run.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::Args;
 
 use super::{Overrides, check, wrong};
+use recipe_config::SimConfig;
+use recipe_controller::timeline::Timeline;
 use recipe_device::bind::Bind;
 use recipe_shell::controller::{ControllerOptions, MAX_FACTOR, MIN_FACTOR, Pace};
 use recipe_shell::out::print_stderr;
-use recipe_shell::{self as shell, ReadyFile, RunOptions, Scheduling, StartError};
+use recipe_shell::{self as shell, EventsFile, ReadyFile, RunOptions, Scheduling, StartError};
 
 /// Arguments of `controller` and `gateway`.
 #[derive(Debug, Args)]
@@ -49,13 +51,22 @@ pub(super) struct ControllerRun {
     /// it all phases are 0
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
+    /// Write every event as a line of JSON to this file; an events file of an earlier run is replaced
+    #[arg(long, value_name = "FILE")]
+    events: Option<PathBuf>,
+    /// Do the operations of this file at their times and under their conditions
+    #[arg(long, value_name = "FILE")]
+    timeline: Option<PathBuf>,
 }
 
 impl Run {
     pub(super) fn gateway(self) -> ExitCode {
-        match check::load_gateway(&self.config, &self.overrides.set) {
-            Ok(config) => finished(self.options().and_then(|options| shell::gateway::run(*config, options))),
-            Err(error) => wrong(error),
+        let loaded = check::load_gateway(&self.config, &self.overrides.set);
+        // Even if the file is wrong, a ready file of a killed run is removed.
+        match (self.options(), loaded) {
+            (Ok(options), Ok(config)) => finished(shell::gateway::run(*config, options)),
+            (_, Err(error)) => wrong(error),
+            (Err(error), _) => finished(Err(error)),
         }
     }
 
@@ -68,18 +79,31 @@ impl Run {
 
 impl ControllerRun {
     pub(super) fn controller(self) -> ExitCode {
-        match check::load_controller(&self.run.config, &self.run.overrides.set) {
-            Ok(config) => {
-                finished(self.options().and_then(|options| shell::controller::run(config, options)))
+        let loaded = check::load_controller(&self.run.config, &self.run.overrides.set);
+        let loaded = loaded.map_err(|error| error.to_string()).and_then(|config| {
+            let timeline = self.timeline.as_deref().map(|path| read_timeline(path, &config)).transpose()?;
+            Ok((config, timeline))
+        });
+        match (self.options(), loaded) {
+            (Ok(options), Ok((config, timeline))) => {
+                finished(shell::controller::run(config, ControllerOptions { timeline, ..options }))
             }
-            Err(error) => wrong(error),
+            (_, Err(error)) => wrong(error),
+            (Err(error), _) => finished(Err(error)),
         }
     }
 
     fn options(self) -> Result<ControllerOptions, StartError> {
-        let Self { run, time: pace, seed } = self;
-        Ok(ControllerOptions { run: run.options()?, pace, seed })
+        let Self { run, time: pace, seed, events, timeline: _ } = self;
+        let events = events.map(EventsFile::at).transpose()?;
+        Ok(ControllerOptions { run: run.options()?, pace, seed, events, timeline: None })
     }
+}
+
+fn read_timeline(path: &Path, config: &SimConfig) -> Result<Timeline, String> {
+    let name = path.display().to_string();
+    let text = std::fs::read_to_string(path).map_err(|error| format!("{name}: cannot be read: {error}"))?;
+    Timeline::parse(&name, &text, config).map_err(|error| error.to_string())
 }
 
 fn finished(result: Result<(), StartError>) -> ExitCode {

@@ -1,6 +1,7 @@
 //! The program as users and scripts run it.
 
 mod command_line;
+mod control;
 mod output;
 mod processes;
 mod rejections;

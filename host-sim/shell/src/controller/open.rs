@@ -10,7 +10,7 @@ use tokio::sync::Notify;
 use tokio::task::JoinSet;
 
 use super::{ControllerOptions, ControllerShell, Outward, Running};
-use crate::{StartError, udp};
+use crate::{EventsFile, StartError, udp};
 use recipe_config::{SimBus, SimConfig, SimParts};
 use recipe_controller::{Controller, ControllerInput, Link};
 use recipe_device::bind::Bind;
@@ -61,6 +61,11 @@ impl Running {
         }
         let is_kernel_can = |device: &Option<Port>| device.as_ref().is_some_and(Port::is_kernel_can);
         let kernel_can = (0..devices.len()).filter(|&nth| is_kernel_can(&devices[nth])).collect();
+        let alarm =
+            || clock.alarm().map_err(|error| StartError::new(format!("cannot create a timer: {error}")));
+        let (timer, timeline_alarm) = (alarm()?, alarm()?);
+        // The last that can fail: an earlier run's file is kept if this one cannot start.
+        let events_file = options.events.as_ref().map(EventsFile::create).transpose()?;
         let ready = json!({
             "command": command_at,
             "state": state_at,
@@ -79,15 +84,18 @@ impl Running {
             reports: RefCell::default(),
             lingering: RefCell::default(),
             busy: Cell::new(false),
-            timer: clock
-                .alarm()
-                .map_err(|error| StartError::new(format!("cannot create a timer: {error}")))?,
+            timer,
             clock,
             waits: RefCell::default(),
             moved: Notify::new(),
             kernel_can,
             kernel_sends: RefCell::default(),
             activity: Cell::new(0),
+            timeline: RefCell::new(options.timeline),
+            timeline_alarm,
+            is_playing: Cell::new(false),
+            told: Cell::new(0),
+            events_file,
             control_clients: RefCell::default(),
             ended: Notify::new(),
             counters: Cell::default(),
@@ -101,6 +109,7 @@ impl Running {
         tasks.spawn_local(Rc::clone(&shell).serve_udp());
         tasks.spawn_local(Rc::clone(&shell).serve_control(control));
         tasks.spawn_local(Rc::clone(&shell).keep_time());
+        tasks.spawn_local(Rc::clone(&shell).keep_timeline());
         if shell.clock.is_stepped() {
             tasks.spawn_local(Rc::clone(&shell).keep_stepping());
         }

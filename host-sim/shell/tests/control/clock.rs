@@ -10,6 +10,7 @@ use serde_json::{Value, json};
 
 use super::kit::{Control, config, connect, start};
 use recipe_config::SimProgram;
+use recipe_controller::timeline::Timeline;
 use recipe_shell::controller::{ControllerOptions, Pace, start_with};
 use recipe_shell::{Handle, RunOptions};
 use recipe_test_kit::until;
@@ -114,7 +115,7 @@ fn scenario(seed: Option<u64>) -> Seen {
     robot.programs.push(SimProgram { name: "p".to_owned(), script: PROGRAM.to_owned() });
     let binds = vec![format!("rs485=pty:{}", link.display()).parse().unwrap()];
     let run = RunOptions { binds, ..RunOptions::default() };
-    let options = ControllerOptions { pace: Pace::Stepped, seed, run };
+    let options = ControllerOptions { pace: Pace::Stepped, seed, run, ..ControllerOptions::default() };
     let handle = start_with(robot, options).unwrap();
     let mut control = Control::of(&handle);
     let mut line =
@@ -187,4 +188,24 @@ fn a_client_that_reads_nothing_does_not_stop_the_clock() {
     let _deaf = accepted(&handle, &mut control, "state");
     control.done(json!({ "do": "advance", "seconds": 60 }));
     assert_eq!(control.time_s(), 60.0);
+}
+
+#[test]
+fn a_timeline_steps_with_the_clock() {
+    let robot = config(FILE);
+    let steps = "[[step]]\nat_s = 0.1234\ndo = \"set\"\nitems = { \"DI[1]\" = 1 }\n\
+                 [[step]]\nwhen = { items = { \"DI[1]\" = 1 } }\nafter_s = 0.25\nrepeat = true\n\
+                 do = \"set\"\nitems = { \"DI[1]\" = 0, \"DI[2]\" = 1 }\n";
+    let timeline = Some(Timeline::parse("steps.toml", steps, &robot).unwrap());
+    let options = ControllerOptions { pace: Pace::Stepped, timeline, ..ControllerOptions::default() };
+    let handle = start_with(robot, options).unwrap();
+    let mut control = Control::of(&handle);
+    control.done(json!({ "do": "wait", "until": { "items": { "DI[1]": 1 } }, "timeout_s": 10 }));
+    assert_eq!(control.time_s(), 0.1234);
+    control.done(json!({ "do": "wait", "until": { "items": { "DI[2]": 1 } }, "timeout_s": 10 }));
+    assert_eq!(control.time_s(), 0.3734);
+    control.done(json!({ "do": "advance", "seconds": 1 }));
+    control.done(json!({ "do": "set", "items": { "DI[1]": 1 } }));
+    control.done(json!({ "do": "wait", "until": { "items": { "DI[1]": 0 } }, "timeout_s": 10 }));
+    assert_eq!(control.time_s(), 1.6234);
 }

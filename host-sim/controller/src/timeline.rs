@@ -1,0 +1,118 @@
+//! Timelines: operations at given times and when conditions begin to hold (docs/control.md section 6).
+//!
+//! In: a file's text, then the time and the controller after each change. Out: the operations that are due,
+//! and the next deadline. Does not carry them out, and does not know clocks.
+
+mod file;
+
+use std::collections::VecDeque;
+
+use proto_core::time::{Duration, Instant};
+
+use super::Controller;
+use super::condition::Condition;
+use super::operations::Operation;
+
+/// A timeline that runs. Call [`Self::observe`] after each change of the controller, then [`Self::due`] until it
+/// returns `None`, and again at [`Self::deadline`].
+#[derive(Debug, Clone)]
+pub struct Timeline {
+    steps: Vec<Step>,
+    /// The first instant of a call.
+    began: Option<Instant>,
+}
+
+/// A step of a timeline.
+#[derive(Debug, Clone)]
+struct Step {
+    trigger: Trigger,
+    operation: Operation,
+    /// When it is to be done, earliest first.
+    due: VecDeque<Instant>,
+    /// When it was last done.
+    done: Option<Instant>,
+}
+
+#[derive(Debug, Clone)]
+enum Trigger {
+    At(Duration),
+    When {
+        condition: Condition,
+        after: Duration,
+        repeat: bool,
+        /// Whether the condition held at the last call.
+        held: bool,
+        /// Number of the first event that counts.
+        since: u64,
+    },
+    /// It was due, and will not be again.
+    Over,
+}
+
+impl Timeline {
+    /// Notes which conditions have begun to hold.
+    pub fn observe(&mut self, now: Instant, controller: &Controller) {
+        let began = *self.began.get_or_insert(now);
+        for step in &mut self.steps {
+            match &mut step.trigger {
+                Trigger::At(time) => {
+                    step.due.push_back(began + *time);
+                    step.trigger = Trigger::Over;
+                }
+                Trigger::When { condition, after, repeat, held, since } => {
+                    // A wrong condition was refused when the file was read.
+                    let holds = controller.holds(condition, *since) == Ok(true);
+                    if !std::mem::replace(held, holds) && holds {
+                        if step.due.len() < MAX_DUE {
+                            // A step whose operation brings about its own condition lets time pass.
+                            let again = step.done.map_or(now, |done| done + MIN_INTERVAL);
+                            step.due.push_back((now + *after).max(again));
+                        }
+                        if condition.event.is_some() {
+                            // The next such event makes it hold again.
+                            (*since, *held) = (controller.newest_event() + 1, false);
+                        }
+                        if !*repeat {
+                            step.trigger = Trigger::Over;
+                        }
+                    }
+                }
+                Trigger::Over => {}
+            }
+        }
+    }
+
+    /// The next operation that is due, in the order of the file, with the number of its step, from 1.
+    pub fn due(&mut self, now: Instant) -> Option<(usize, Operation)> {
+        let mut steps = self.steps.iter_mut().zip(1..);
+        let (step, number) = steps.find(|(step, _)| step.due.front().is_some_and(|due| *due <= now))?;
+        step.due.pop_front();
+        step.done = Some(now);
+        Some((number, step.operation.clone()))
+    }
+
+    /// When a step is due; [`Instant::NEVER`] if none waits for a time.
+    pub fn deadline(&self) -> Instant {
+        let due = self.steps.iter().filter_map(|step| step.due.front());
+        due.min().copied().unwrap_or(Instant::NEVER)
+    }
+
+    /// Number of steps.
+    pub fn len(&self) -> usize {
+        self.steps.len()
+    }
+
+    /// Whether there are no steps.
+    pub fn is_empty(&self) -> bool {
+        self.steps.is_empty()
+    }
+}
+
+/// A repeated step that waits for `after_s` so often already misses further times.
+const MAX_DUE: usize = 1_000;
+/// The least time between two times of the same step.
+const MIN_INTERVAL: Duration = Duration::from_millis(1);
+
+#[cfg(test)]
+#[path = "timeline_tests.rs"]
+mod tests;

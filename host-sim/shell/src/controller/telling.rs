@@ -1,0 +1,35 @@
+//! Telling what happens: in the log, in the events file and to the clients that follow.
+
+use tracing::{Level, enabled, info, trace};
+
+use super::ControllerShell;
+use recipe_controller::Happened;
+
+impl ControllerShell {
+    /// Tells the events since the last call.
+    pub(super) fn tell_events(&self) {
+        for client in self.control_clients.borrow().iter() {
+            client.tell();
+        }
+        let controller = self.controller.borrow();
+        let newest = controller.newest_event();
+        let told = self.told.replace(newest);
+        let in_words = enabled!(target: "controller", Level::INFO);
+        if newest == told || !in_words && self.events_file.is_none() {
+            return;
+        }
+        for event in controller.events_since(told + 1) {
+            if let Some(file) = &self.events_file
+                && let Ok(line) = serde_json::to_string(event)
+            {
+                file.write(&line);
+            }
+            let (time_s, what) = (event.time_s, &event.what);
+            match what {
+                // A fast recipe writes hundreds of times per second.
+                Happened::Write { .. } => trace!(target: "controller", time_s, "{what}"),
+                _ => info!(target: "controller", time_s, "{what}"),
+            }
+        }
+    }
+}

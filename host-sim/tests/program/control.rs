@@ -1,0 +1,137 @@
+//! The simulated controller as a program: its counters, its events, and the commands that act on it.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use rustix::process::Signal;
+use serde_json::Value;
+
+use super::BINARY;
+use recipe_test_kit::{HostSim, example, repository};
+
+/// Every key of an object and of what is in it, but for names from the file and of variables.
+fn keys(value: &Value, into: &mut BTreeSet<String>) {
+    let Some(object) = value.as_object() else { return };
+    for (key, value) in object {
+        into.insert(key.clone());
+        match (key.as_str(), value.as_object()) {
+            ("registers" | "variables", _) => {}
+            ("ports", Some(ports)) => ports.values().for_each(|port| keys(port, into)),
+            _ => keys(value, into),
+        }
+    }
+}
+
+/// The words that a page shows as code.
+fn documented(page: &Path) -> BTreeSet<String> {
+    let text = std::fs::read_to_string(page).unwrap();
+    let code = text.split('`').skip(1).step_by(2);
+    let words = code.flat_map(|code| code.split(|c: char| !c.is_alphanumeric() && c != '_'));
+    words.map(str::to_owned).collect()
+}
+
+#[test]
+fn every_counter_of_the_controller_is_documented() {
+    let folder = tempfile::tempdir().unwrap();
+    let documented = documented(&repository().join("docs/devices.md"));
+    for (file, device) in [
+        ("rs485-system-controller.toml", "rs485=pty"),
+        ("can-system-controller.toml", "can=slcan-pty"),
+        ("udp-server-controller.toml", ""),
+        ("client-controller.toml", ""),
+    ] {
+        let bind = format!("--bind={device}:{}", folder.path().join("line").display());
+        let bind: &[&str] = if device.is_empty() { &[] } else { &[&bind] };
+        let robot = BINARY.controller(&example(file), bind);
+        let mut found = BTreeSet::new();
+        keys(&robot.fresh(), &mut found);
+        assert!(found.len() > 50, "{found:?}");
+        let missing: Vec<_> = found.difference(&documented).collect();
+        assert!(missing.is_empty(), "{file}: docs/devices.md section 4 does not name {missing:?}");
+        robot.end();
+    }
+}
+
+#[test]
+fn the_events_file_holds_every_event_and_the_log_tells_them_in_words() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("events.jsonl");
+    let events = format!("--events={}", file.display());
+    let robot = BINARY.controller(&example("udp-server-controller.toml"), &[&events, "-v"]);
+    robot.command("speed(50)", "set success");
+    robot.command("state", "6:0:5:2");
+    robot.ended_by(Signal::TERM);
+    let text = std::fs::read_to_string(&file).unwrap();
+    let events: Vec<Value> = text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    assert!(events.iter().zip(1..).all(|(event, nth)| event["n"] == nth), "{text}");
+    let kinds: BTreeSet<_> = events.iter().map(|event| event["event"].as_str().unwrap()).collect();
+    for kind in ["started", "connected", "command", "reply", "speed"] {
+        assert!(kinds.contains(kind), "{kind}: {text}");
+    }
+    // The next run replaces it; a wrong file stays and nothing is started.
+    let robot = BINARY
+        .controller(&example("udp-server-controller.toml"), &[&format!("--events={}", file.display()), "-v"]);
+    robot.command("speed(50)", "set success");
+    let said = recipe_test_kit::until("the words", || robot.log("speed: 100 % -> 50 %").pop());
+    assert!(said.contains("INFO controller:") && said.contains("time_s="), "{said}");
+    robot.end();
+    assert!(std::fs::read_to_string(&file).unwrap().len() < text.len());
+}
+
+#[test]
+fn a_ready_file_of_a_killed_run_is_gone_even_if_the_next_one_cannot_start() {
+    let folder = tempfile::tempdir().unwrap();
+    let ready = folder.path().join("ready.json");
+    let controller = |extra: &[&str]| {
+        let mut command = BINARY.run("controller", &example("udp-server-controller.toml"));
+        command.args(recipe_test_kit::free_servers()).arg("--ready").arg(&ready).args(extra);
+        command
+    };
+    for wrong in [["--set=listen.command=x"], ["--bind=wrong=pty:x"]] {
+        let mut first = HostSim::start(&mut controller(&[]));
+        first.kill();
+        assert!(ready.exists());
+        let output = controller(&wrong).output().unwrap();
+        assert_eq!(output.status.code(), Some(2), "{wrong:?}");
+        assert!(!ready.exists(), "{wrong:?}");
+    }
+}
+
+#[test]
+fn a_timeline_acts_by_itself_and_a_wrong_one_starts_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let (file, events) = (folder.path().join("steps.toml"), folder.path().join("events.jsonl"));
+    let steps = "[[step]]\nat_s = 0.2\ndo = \"set\"\nitems = { \"DI[3]\" = 1 }\n\
+                 [[step]]\nwhen = { items = { \"DI[3]\" = 1 } }\nafter_s = 0.1\ndo = \"emergency_stop\"\n\
+                 [[step]]\nwhen = { safety = \"stop0\" }\ndo = \"stop\"\n";
+    std::fs::write(&file, steps).unwrap();
+    let timeline = format!("--timeline={}", file.display());
+    let options = [timeline.as_str(), &format!("--events={}", events.display()), "--time=factor=5"];
+    let robot = BINARY.controller(&example("udp-server-controller.toml"), &options);
+    robot.stats("the emergency stop", |stats| stats["safety"] != 5);
+    let refused =
+        recipe_test_kit::until("the warning", || robot.log("a step of the timeline was refused").pop());
+    assert!(refused.contains("step=3"), "{refused}");
+    robot.end();
+    let text = std::fs::read_to_string(&events).unwrap();
+    let done: Vec<Value> = text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let of = |kind: &str| done.iter().filter(|event| event["event"] == kind).collect::<Vec<_>>();
+    let operations = of("operation");
+    assert_eq!(
+        (&operations[0]["do"], &operations[1]["do"]),
+        (&"set".into(), &"emergency_stop".into()),
+        "{text}"
+    );
+    let times = [&operations[0], &operations[1]].map(|event| event["time_s"].as_f64().unwrap());
+    assert!(times[0] >= 0.2 && times[1] >= times[0] + 0.1, "{times:?}");
+    let refused = of("refused");
+    assert!(refused.len() == 1 && refused[0]["do"] == "stop" && refused[0]["error"].is_string(), "{text}");
+
+    std::fs::write(&file, steps.replace("DI[3]\" = 1 }\n[[", "DI[99]\" = 1 }\n[[")).unwrap();
+    let mut command = BINARY.run("controller", &example("udp-server-controller.toml"));
+    let output = command.args(recipe_test_kit::free_servers()).arg(timeline).output().unwrap();
+    let message = String::from_utf8(output.stderr).unwrap();
+    let place = format!("{}:4:11: step[1].items.DI[99]: DI[99]: ", file.display());
+    assert!(output.status.code() == Some(2) && message.starts_with(&place), "{message}");
+    assert!(output.stdout.is_empty());
+}
