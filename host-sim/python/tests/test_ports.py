@@ -64,10 +64,10 @@ def test_a_device_that_answers(time):
         robot.run("weigh.jspf")
         assert robot.finish().outcome == "finished"
         assert robot.word_output[2] == 10000
-        robot.upload("twice.jspf", 'comm_send("rs485", [2]); wait_ms(100); comm_send("rs485", [3]);')
+        robot.upload("twice.jspf", 'comm_send("rs485", [2]); wait_ms(5000); comm_send("rs485", [3]);')
         robot.run("twice.jspf")
         robot.finish()
-        robot.advance(0.1)
+        robot.advance(1.0)
         requests = scale.wait_requests(3)
         assert requests == [b"\xff\xff%c\xfe\xfe" % command for command in (1, 2, 3)]
         assert scale.exchanges[1][1] is None

@@ -8,7 +8,7 @@ import clients
 import duco_sim
 
 #: More of them by hand: DUCO_SIM_RUNS=1000.
-RUNS = int(os.environ.get("DUCO_SIM_RUNS", "50"))
+RUNS = int(os.environ.get("DUCO_SIM_RUNS", "30"))
 
 
 def one_run(seed):
