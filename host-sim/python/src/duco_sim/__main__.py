@@ -1,0 +1,5 @@
+"""``python -m duco_sim``: the same as ``host-sim``."""
+
+from .binary import main
+
+main()
