@@ -49,8 +49,8 @@ impl Controller {
             Operation::EmergencyStop {} => self.emergency_stop(now),
             Operation::ProtectiveStop {} => self.protective_stop(now),
             Operation::Collide { axis } => {
-                if !(1..=6).contains(axis) {
-                    return refused(format!("axis: {axis} is not within 1 to 6"));
+                if !matches!(axis, 1..=6 | 11..=16 | 20) {
+                    return refused(format!("axis: {axis} is none; there are 1 to 6, 11 to 16 and 20"));
                 }
                 self.collide(now, *axis);
             }

@@ -70,7 +70,7 @@ pub enum Operation {
     ProtectiveStop {},
     /// Makes the arm collide.
     Collide {
-        /// The axis, 1 to 6.
+        /// The joint, 1 to 6; 11 to 16: an axis of the base's force sensor; 20: the end's force sensor.
         axis: u8,
     },
     /// Releases and acknowledges a stop.
