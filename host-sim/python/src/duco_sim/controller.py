@@ -316,7 +316,7 @@ class Controller:
         self._control.call("protective_stop")
 
     def collide(self, axis: int = 1) -> None:
-        """Makes the arm collide, at axis 1 to 6: the program pauses."""
+        """Makes the arm collide: the program pauses. Joint 1 to 6, or sensor 11 to 16 (base) or 20 (end)."""
         self._control.call("collide", axis=axis)
 
     def clear(self) -> None:

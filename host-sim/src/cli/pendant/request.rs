@@ -43,7 +43,7 @@ pub(in crate::cli) enum Act {
     ProtectiveStop,
     /// Make the arm collide
     Collide {
-        /// The axis, 1 to 6
+        /// The joint, 1 to 6, or a sensor: 11 to 16 in the base, 20 at the end
         axis: u8,
     },
     /// Release the stop and acknowledge it; the robot stays disabled
