@@ -240,3 +240,19 @@ fn completions_know_the_commands() {
         assert!(output.status.success() && script.contains("emergency-stop"), "{shell}");
     }
 }
+
+#[test]
+fn real_time_scheduling_is_asked_for_unless_it_is_not_wanted() {
+    let file = example("udp-server-controller.toml");
+    let scheduling = |extra: &[&str]| {
+        let robot = BINARY.controller(&file, &[&["-v"], extra].concat());
+        let said =
+            recipe_test_kit::until("the line", || robot.log("the simulated controller is running").pop());
+        robot.end();
+        said
+    };
+    let asked = scheduling(&[]);
+    assert!(asked.contains("SCHED_FIFO"), "granted or refused: {asked}");
+    let ordinary = scheduling(&["--no-realtime"]);
+    assert!(ordinary.contains("scheduling=ordinary scheduling") && !ordinary.contains("FIFO"), "{ordinary}");
+}
