@@ -21,7 +21,8 @@ pub(super) use request::Act;
 use socket::Socket;
 
 pub(super) const EXAMPLES: &str = "\
-The address is that of `control` in the controller's `ready` line.
+The address is that of `control` in the controller's `ready` line. In zsh, names with
+brackets need quotes: 'DI[3]=1'.
 
 Examples:
   host-sim controller -c robot.toml --ready run/ready.json &

@@ -7,6 +7,10 @@ use rustix::process::Signal;
 use serde_json::Value;
 
 use super::BINARY;
+use clap::CommandFactory;
+use host_sim::cli::Cli;
+use recipe_controller::KINDS;
+use recipe_controller::operations::Operation;
 use recipe_test_kit::{HostSim, example, repository};
 
 /// Every key of an object and of what is in it, but for names from the file and of variables.
@@ -238,5 +242,42 @@ fn completions_know_the_commands() {
         let output = BINARY.command().args(["completions", shell]).output().unwrap();
         let script = String::from_utf8(output.stdout).unwrap();
         assert!(output.status.success() && script.contains("emergency-stop"), "{shell}");
+    }
+}
+
+#[test]
+fn real_time_scheduling_is_asked_for_unless_it_is_not_wanted() {
+    let file = example("udp-server-controller.toml");
+    let scheduling = |extra: &[&str]| {
+        let robot = BINARY.controller(&file, &[&["-v"], extra].concat());
+        let said =
+            recipe_test_kit::until("the line", || robot.log("the simulated controller is running").pop());
+        robot.end();
+        said
+    };
+    let asked = scheduling(&[]);
+    assert!(asked.contains("SCHED_FIFO"), "granted or refused: {asked}");
+    let ordinary = scheduling(&["--no-realtime"]);
+    assert!(ordinary.contains("scheduling=ordinary scheduling") && !ordinary.contains("FIFO"), "{ordinary}");
+}
+
+#[test]
+fn every_operation_and_event_is_documented_and_has_its_command() {
+    let documented = documented(&repository().join("docs/control.md"));
+    let unknown = serde_json::json!({ "do": "?" });
+    let error = Operation::from_json(unknown.as_object().unwrap().clone()).unwrap_err().to_string();
+    // "unknown variant `?`, expected one of `state`, `get`, ..."
+    let operations: Vec<&str> = error.split('`').skip(3).step_by(2).collect();
+    assert!(operations.len() > 30, "{error}");
+    let cli = Cli::command();
+    let pendant = cli.find_subcommand("pendant").unwrap();
+    for operation in operations {
+        assert!(documented.contains(operation), "docs/control.md does not name {operation}");
+        // Following is an option of `events`.
+        let command = if operation == "follow" { "events".to_owned() } else { operation.replace('_', "-") };
+        assert!(pendant.find_subcommand(&command).is_some(), "host-sim pendant has no {command}");
+    }
+    for kind in KINDS {
+        assert!(documented.contains(kind), "docs/control.md does not name the event {kind}");
     }
 }
