@@ -323,6 +323,11 @@ class Controller:
         """Releases and acknowledges a stop. ``wait(safety="run")`` waits until the robot is ready again, 0.2 s."""
         self._control.call("clear")
 
+    def hold_safety(self, safety: Optional[str]) -> None:
+        """The safety controller stops watching, which ends the program: ``"wait"``, ``"config"``, ``"model"``,
+        ``"update"`` or ``"fail"``; ``None``: it watches again."""
+        self._control.call("hold", safety=safety)
+
     def reduced(self, on: bool) -> None:
         """Somebody enters (``True``) or leaves (``False``) the zone of reduced speed."""
         self._control.call("reduced", on=on)

@@ -26,6 +26,8 @@ impl ControllerShell {
             }
             let (time_s, what) = (event.time_s, &event.what);
             match what {
+                // The program itself has logged it.
+                Happened::Log { .. } => {}
                 // A fast recipe writes hundreds of times per second.
                 Happened::Write { .. } => trace!(target: "controller", time_s, "{what}"),
                 _ => info!(target: "controller", time_s, "{what}"),

@@ -48,6 +48,11 @@ pub(in crate::cli) enum Act {
     },
     /// Release the stop and acknowledge it; the robot stays disabled
     Clear,
+    /// The safety controller stops watching the robot, which ends the program, or goes on
+    Hold {
+        /// Why it does not watch
+        safety: HoldName,
+    },
     /// Somebody enters or leaves the zone of reduced speed
     Reduced {
         /// Whether somebody is in it
@@ -173,6 +178,36 @@ pub(in crate::cli) enum Act {
     },
 }
 
+/// What the safety controller does in place of watching.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(in crate::cli) enum HoldName {
+    /// SS_WAIT
+    Wait,
+    /// SS_CONFIG: its parameters are being changed
+    Config,
+    /// SS_MODEL
+    Model,
+    /// SS_UPDATE: its firmware is being updated
+    Update,
+    /// SS_FAIL: it has failed
+    Fail,
+    /// It watches again
+    None,
+}
+
+impl HoldName {
+    fn state(self) -> Option<&'static str> {
+        match self {
+            Self::Wait => Some("wait"),
+            Self::Config => Some("config"),
+            Self::Model => Some("model"),
+            Self::Update => Some("update"),
+            Self::Fail => Some("fail"),
+            Self::None => None,
+        }
+    }
+}
+
 #[derive(Debug, Clone, Copy, ValueEnum)]
 pub(in crate::cli) enum ModeName {
     Manual,
@@ -287,6 +322,7 @@ impl Act {
             Self::ProtectiveStop => bare("protective_stop"),
             Self::Collide { axis } => json!({ "do": "collide", "axis": axis }),
             Self::Clear => bare("clear"),
+            Self::Hold { safety } => json!({ "do": "hold", "safety": safety.state() }),
             Self::Reduced { on } => json!({ "do": "reduced", "on": *on == Switch::On }),
             Self::RaiseError { code, text } => json!({ "do": "raise_error", "code": code, "text": text }),
             Self::ClearError => bare("clear_error"),
