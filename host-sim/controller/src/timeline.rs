@@ -37,7 +37,7 @@ struct Step {
 enum Trigger {
     At(Duration),
     When {
-        condition: Condition,
+        condition: Box<Condition>,
         after: Duration,
         repeat: bool,
         /// Whether the condition held at the last call.

@@ -161,6 +161,7 @@ struct ControllerShell {
     told: Cell<u64>,
     events_file: Option<Writer>,
     control_clients: RefCell<Vec<Rc<ControlClient>>>,
+    refused_control_clients: Cell<usize>,
     ended: Notify,
     counters: Cell<ShellCounters>,
     refusal_log: LogLimit,
@@ -289,7 +290,7 @@ impl ControllerShell {
         if let Err(error) = self.timer.arm(until) {
             error!(%error, "cannot set the timer");
         }
-        self.play(now);
+        self.play();
         self.check_waits();
         self.tell_events();
     }

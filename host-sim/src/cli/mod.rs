@@ -12,6 +12,7 @@ mod frame;
 mod image;
 mod log;
 mod new;
+mod pendant;
 mod plan;
 mod run;
 mod soak;
@@ -21,7 +22,7 @@ use std::io::{self, Write};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use clap::{Args, Parser, Subcommand, ValueEnum};
+use clap::{Args, CommandFactory, Parser, Subcommand, ValueEnum};
 use proto_core::sysvar::Direction;
 
 use codec::TalkPart;
@@ -54,6 +55,8 @@ Examples:
                                                  a gateway file for a known device
   host-sim check cell.toml                       check the file; what to set on the pendant
   host-sim controller -c robot.toml --bind rs485=pty:run/rs485
+  host-sim pendant --ready run/ready.json set DI[3]=1
+                                                 act on the controller while it runs
   host-sim gateway -c cell.toml --bind rs485-1=serial:/dev/ttyUSB0
   host-sim encode cell.toml --part input 1       the frame that switches DO1 on
   host-sim decode cell.toml --part input FF FF 01 EE EE
@@ -72,6 +75,9 @@ enum Command {
     /// Run the gateway
     #[command(after_help = GATEWAY_EXAMPLES)]
     Gateway(run::Run),
+    /// Act on a running controller: press its buttons, set inputs, begin faults, watch its state
+    #[command(after_help = pendant::EXAMPLES)]
+    Pendant(pendant::PendantArgs),
     /// List known field devices; print or write a gateway file for one
     #[command(after_help = new::EXAMPLES)]
     New(new::NewArgs),
@@ -90,6 +96,12 @@ enum Command {
     /// Decode frames to values
     #[command(after_help = DECODE_EXAMPLES)]
     Decode(DecodeArgs),
+    /// Print the completions for a shell
+    #[command(after_help = COMPLETIONS_EXAMPLES)]
+    Completions {
+        /// The shell
+        shell: Shell,
+    },
 }
 
 const DEMO_EXAMPLES: &str = "\
@@ -101,6 +113,8 @@ Examples:
   host-sim controller -c robot.toml
   host-sim controller -c robot.toml --bind rs485=pty:run/rs485 --bind can=slcan-tcp:127.0.0.1:3333
   host-sim controller -c robot.toml --set listen.modbus=1502 --ready run/ready.json --stats 1s
+  host-sim controller -c robot.toml --time stepped --seed 1 --events events.jsonl
+  host-sim controller -c robot.toml --time factor=20 --timeline steps.toml
 
 Once everything is listening, a line `ready {json}` on stdout gives the actual addresses.";
 
@@ -134,6 +148,12 @@ Examples:
   host-sim decode can.toml --part output --log bus.log |
       host-sim encode can.toml --part output
   host-sim encode line.toml --exchange 2 --part request";
+
+const COMPLETIONS_EXAMPLES: &str = "\
+Examples:
+  host-sim completions bash > ~/.local/share/bash-completion/completions/host-sim
+  host-sim completions zsh > ~/.zfunc/_host-sim
+  host-sim completions fish > ~/.config/fish/completions/host-sim.fish";
 
 const DECODE_EXAMPLES: &str = "\
 Frames are hex bytes (FF FF 01 EE EE, FFFF01EEEE); for a CAN recipe, what
@@ -173,6 +193,23 @@ struct Which {
     exchange: Option<usize>,
     #[command(flatten)]
     overrides: Overrides,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum Shell {
+    Bash,
+    Zsh,
+    Fish,
+}
+
+impl From<Shell> for clap_complete::Shell {
+    fn from(shell: Shell) -> Self {
+        match shell {
+            Shell::Bash => Self::Bash,
+            Shell::Zsh => Self::Zsh,
+            Shell::Fish => Self::Fish,
+        }
+    }
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
@@ -237,6 +274,14 @@ pub fn main() -> ExitCode {
         Command::Demo => return crate::demo::run(),
         Command::Controller(run) => return run.controller(),
         Command::Gateway(run) => return run.gateway(),
+        Command::Pendant(args) => return pendant::run(args),
+        Command::Completions { shell } => {
+            let mut script = Vec::new();
+            let shell = clap_complete::Shell::from(shell);
+            clap_complete::generate(shell, &mut Cli::command(), "host-sim", &mut script);
+            let _ = out.write_all(&script);
+            Ok(())
+        }
         Command::Soak(args) => {
             let code = soak::run(&args, &mut out);
             return out.finish(|_| code);
@@ -329,7 +374,6 @@ mod tests {
 
     #[test]
     fn the_command_line_is_consistent() {
-        use clap::CommandFactory;
         Cli::command().debug_assert();
     }
 }

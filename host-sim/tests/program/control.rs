@@ -7,6 +7,10 @@ use rustix::process::Signal;
 use serde_json::Value;
 
 use super::BINARY;
+use clap::CommandFactory;
+use host_sim::cli::Cli;
+use recipe_controller::KINDS;
+use recipe_controller::operations::Operation;
 use recipe_test_kit::{HostSim, example, repository};
 
 /// Every key of an object and of what is in it, but for names from the file and of variables.
@@ -134,4 +138,146 @@ fn a_timeline_acts_by_itself_and_a_wrong_one_starts_nothing() {
     let place = format!("{}:4:11: step[1].items.DI[99]: DI[99]: ", file.display());
     assert!(output.status.code() == Some(2) && message.starts_with(&place), "{message}");
     assert!(output.stdout.is_empty());
+}
+
+/// `host-sim pendant`, told the address by the environment.
+fn pendant(robot: &HostSim, line: &str) -> (Option<i32>, String, String) {
+    let mut command = BINARY.command();
+    command.env("HOST_SIM_CONTROL", robot.ready["control"].as_str().unwrap());
+    let output = command.arg("pendant").args(line.split(' ')).output().unwrap();
+    let text = |bytes| String::from_utf8(bytes).unwrap();
+    (output.status.code(), text(output.stdout), text(output.stderr))
+}
+
+#[track_caller]
+fn done(robot: &HostSim, line: &str) -> String {
+    let (code, out, err) = pendant(robot, line);
+    assert_eq!((code, err.as_str()), (Some(0), ""), "{line}: {out}");
+    out
+}
+
+#[test]
+fn the_pendant_acts_on_a_running_controller() {
+    let folder = tempfile::tempdir().unwrap();
+    let script = folder.path().join("pick.jspf");
+    std::fs::write(&script, "wait_ms(300); set(\"DO[1]\", true); log(\"done\");").unwrap();
+    let robot = BINARY.controller(&example("udp-server-controller.toml"), &["--time=stepped"]);
+    assert_eq!(done(&robot, "set DI[3]=1 WordInputReg[2]=on"), "done at 0.0 s\n");
+    assert_eq!(
+        done(&robot, "get DI[3] WordInputReg[2] AI_V[1]"),
+        "AI_V[1]          0\nDI[3]            1\nWordInputReg[2]  1\n"
+    );
+    done(&robot, &format!("upload {}", script.display()));
+    assert_eq!(done(&robot, "programs"), "pick.jspf\n");
+    done(&robot, "run pick.jspf --speed 30");
+    assert_eq!(done(&robot, "advance 0.1"), "done at 0.1 s\n");
+    assert!(done(&robot, "state").contains("\nprogram   pick.jspf, running\nspeed     30.0 %\n"));
+    assert_eq!(done(&robot, "wait program=none DO[1]=1"), "done at 0.3 s\n");
+    let state = done(&robot, "state");
+    assert!(
+        state.contains("\nlast run  pick.jspf, run 1, finished\n") && state.ends_with("\nlog       done\n"),
+        "{state}"
+    );
+    done(&robot, "fault command delay 0.5");
+    done(&robot, "fault item RobotState[8] nan");
+    let state = done(&robot, "state");
+    assert!(state.contains("\nfault     kind=delay seconds=0.5 server=command\n"), "{state}");
+    assert!(state.contains("\nfault     item=RobotState[8] kind=spoil value=nan\n"), "{state}");
+    done(&robot, "heal");
+    assert!(!done(&robot, "state").contains("fault"));
+    let events = done(&robot, "events --kind log,program_started");
+    assert_eq!(
+        events,
+        "   0.000000  program_started by=pendant program=pick.jspf run=1\n   0.300000  log             program=pick.jspf text=done\n"
+    );
+    let json: Value = serde_json::from_str(&done(&robot, "--json wait mode=remote")).unwrap();
+    assert_eq!((&json["ok"], &json["result"], &json["time_s"]), (&true.into(), &Value::Null, &0.3.into()));
+    assert!(done(&robot, "counters").contains("programs_started  "));
+
+    for (line, code, why) in [
+        ("wait mode=auto --timeout 0.5", 1, "not within 0.5 s: mode is remote, not auto\n"),
+        ("set DI[17]=1", 1, "DI[17]: "),
+        ("resume", 1, ""),
+        ("set DI[1]", 2, "\"DI[1]\": no '='; write NAME=VALUE, such as DI[3]=1\n"),
+        ("fault command delay", 2, "delay needs seconds\n"),
+        ("estop", 2, "error: unrecognized subcommand 'estop'\n"),
+        ("--to 127.0.0.1:1 state", 2, "127.0.0.1:1: nobody is there: "),
+        ("--ready /dev/null state", 2, "--ready /dev/null: this is not the ready file of a controller\n"),
+        ("--to= state", 2, "which controller? give --to ADDRESS or --ready FILE, or set HOST_SIM_CONTROL\n"),
+    ] {
+        let (exit, out, err) = pendant(&robot, line);
+        assert_eq!((exit, out.as_str()), (Some(code), ""), "{line}: {err}");
+        assert!(err.starts_with(why) && !err.is_empty(), "{line}: {err}");
+    }
+    robot.end();
+}
+
+#[test]
+fn the_pendant_follows_events_until_the_controller_ends() {
+    let robot = BINARY.controller(&example("udp-server-controller.toml"), &[]);
+    let port = robot.at("control").port().to_string();
+    let mut command = BINARY.command();
+    let mut follower = recipe_test_kit::Process::start(command.args([
+        "pendant",
+        "--to",
+        &port,
+        "events",
+        "-f",
+        "--kind=mode",
+    ]));
+    let mode = recipe_test_kit::until("the event", || {
+        done(&robot, "mode auto");
+        done(&robot, "mode remote");
+        follower.lines().first().cloned()
+    });
+    assert!(mode.contains("  mode            mode="), "{mode}");
+    robot.end();
+    assert_eq!(follower.ended().code(), Some(2));
+    assert!(follower.all_errors().contains("the controller has closed the connection"));
+}
+
+#[test]
+fn completions_know_the_commands() {
+    for shell in ["bash", "zsh", "fish"] {
+        let output = BINARY.command().args(["completions", shell]).output().unwrap();
+        let script = String::from_utf8(output.stdout).unwrap();
+        assert!(output.status.success() && script.contains("emergency-stop"), "{shell}");
+    }
+}
+
+#[test]
+fn real_time_scheduling_is_asked_for_unless_it_is_not_wanted() {
+    let file = example("udp-server-controller.toml");
+    let scheduling = |extra: &[&str]| {
+        let robot = BINARY.controller(&file, &[&["-v"], extra].concat());
+        let said =
+            recipe_test_kit::until("the line", || robot.log("the simulated controller is running").pop());
+        robot.end();
+        said
+    };
+    let asked = scheduling(&[]);
+    assert!(asked.contains("SCHED_FIFO"), "granted or refused: {asked}");
+    let ordinary = scheduling(&["--no-realtime"]);
+    assert!(ordinary.contains("scheduling=ordinary scheduling") && !ordinary.contains("FIFO"), "{ordinary}");
+}
+
+#[test]
+fn every_operation_and_event_is_documented_and_has_its_command() {
+    let documented = documented(&repository().join("docs/control.md"));
+    let unknown = serde_json::json!({ "do": "?" });
+    let error = Operation::from_json(unknown.as_object().unwrap().clone()).unwrap_err().to_string();
+    // "unknown variant `?`, expected one of `state`, `get`, ..."
+    let operations: Vec<&str> = error.split('`').skip(3).step_by(2).collect();
+    assert!(operations.len() > 30, "{error}");
+    let cli = Cli::command();
+    let pendant = cli.find_subcommand("pendant").unwrap();
+    for operation in operations {
+        assert!(documented.contains(operation), "docs/control.md does not name {operation}");
+        // Following is an option of `events`.
+        let command = if operation == "follow" { "events".to_owned() } else { operation.replace('_', "-") };
+        assert!(pendant.find_subcommand(&command).is_some(), "host-sim pendant has no {command}");
+    }
+    for kind in KINDS {
+        assert!(documented.contains(kind), "docs/control.md does not name the event {kind}");
+    }
 }

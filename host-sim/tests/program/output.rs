@@ -1,7 +1,7 @@
 //! Every command with output that cannot be written: to a full disk, or to a reader that closes the pipe.
 
 use std::fs::File;
-use std::io::{BufRead, BufReader, Read};
+use std::io::{BufRead, BufReader, Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::mpsc::channel;
@@ -42,11 +42,31 @@ fn command_lines(folder: &Path) -> Vec<Vec<String>> {
         line(&[&soak[..], &["--replay", "9@2.5", "--trace"]].concat()),
         line(&["encode", &gateway, "--part", "input", "1"]),
         line(&["decode", &gateway, "--part", "input", "FFFF01EEEE", "FFFF01EEEE"]),
+        line(&["pendant", "--to", &control_socket(), "programs"]),
+        line(&["completions", "bash"]),
         line(&["help"]),
         line(&["--help"]),
         line(&["check", "--help"]),
         line(&["--version"]),
     ]
+}
+
+/// A control socket that answers every client once; it serves until the tests end.
+fn control_socket() -> String {
+    let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = listener.local_addr().unwrap().to_string();
+    std::thread::spawn(move || {
+        for stream in listener.incoming().map_while(Result::ok) {
+            let mut read = BufReader::new(stream);
+            let asked = read.read_line(&mut String::new());
+            if asked.is_ok() {
+                // The client may be gone.
+                let _ =
+                    read.get_mut().write_all(b"{\"ok\":true,\"time_s\":0.0,\"result\":[\"pick.jspf\"]}\n");
+            }
+        }
+    });
+    address
 }
 
 /// Whether it prints `ready` and statistics until a signal ends it.

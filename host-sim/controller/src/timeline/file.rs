@@ -100,7 +100,7 @@ impl File<'_> {
                     Some(other) => return Err(wrong("repeat", &format!("{other} is not true or false"))),
                 };
                 let after = after_s.map_or(Ok(Duration::ZERO), |after| seconds("after_s", after))?;
-                Trigger::When { condition, after, repeat, held: false, since: 0 }
+                Trigger::When { condition: Box::new(condition), after, repeat, held: false, since: 0 }
             }
             (Some(_), Some(_)) => return Err(wrong("when", "a step has either `at_s` or `when`, not both")),
             (None, None) => {

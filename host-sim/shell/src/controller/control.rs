@@ -11,7 +11,7 @@ use std::time::Duration as StdDuration;
 use proto_core::time::Instant;
 use serde::Serialize;
 use serde_json::Value;
-use tokio::io::{AsyncBufReadExt, BufReader};
+use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
 use tokio::net::tcp::{OwnedReadHalf, OwnedWriteHalf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Notify;
@@ -100,21 +100,8 @@ impl ControllerShell {
             match listener.accept().await {
                 Ok((stream, peer)) => {
                     self.note_activity();
-                    let shell = Rc::clone(&self);
-                    let client = Rc::new(ControlClient::default());
-                    let is_full = self.control_clients.borrow().len() >= MAX_CLIENTS;
-                    if is_full {
-                        client.push(
-                            &self.answer(None, Err(format!("there are {MAX_CLIENTS} clients already"))),
-                        );
-                    } else {
-                        self.control_clients.borrow_mut().push(Rc::clone(&client));
-                    }
-                    spawn_local(async move {
-                        let ended = shell.talk(stream, &client, is_full).await;
-                        shell.control_clients.borrow_mut().retain(|other| !Rc::ptr_eq(other, &client));
-                        debug!(%peer, ?ended, "control client disconnected");
-                    });
+                    debug!(%peer, "control client connected");
+                    Rc::clone(&self).welcome(stream);
                     yield_fairly().await;
                 }
                 Err(error) => {
@@ -128,43 +115,67 @@ impl ControllerShell {
         }
     }
 
-    /// Talks with a client until it leaves. One that is refused is only told why.
-    async fn talk(&self, stream: TcpStream, client: &ControlClient, is_refused: bool) -> io::Result<()> {
-        tcp_options::enable_keepalive(&stream);
-        let (read, write) = stream.into_split();
-        if is_refused {
+    fn welcome(self: Rc<Self>, stream: TcpStream) {
+        let client = Rc::new(ControlClient::default());
+        if self.control_clients.borrow().len() < MAX_CLIENTS {
+            self.control_clients.borrow_mut().push(Rc::clone(&client));
+        } else if self.refused_control_clients.get() < MAX_CLIENTS {
+            client.push(&self.answer(None, Err(format!("there are {MAX_CLIENTS} clients already"))));
             client.has_ended.set(true);
+            self.refused_control_clients.set(self.refused_control_clients.get() + 1);
+        } else {
+            return;
         }
-        let writing = self.write(client, &write);
+        let is_refused = client.has_ended.get();
+        spawn_local(async move {
+            let ended = self.talk(stream, &client).await;
+            debug!(?ended, "control client disconnected");
+            self.control_clients.borrow_mut().retain(|other| !Rc::ptr_eq(other, &client));
+            if is_refused {
+                self.refused_control_clients.set(self.refused_control_clients.get() - 1);
+            }
+        });
+    }
+
+    /// Talks with a client until it leaves.
+    async fn talk(&self, stream: TcpStream, client: &ControlClient) -> io::Result<()> {
+        tcp_options::enable_keepalive(&stream);
+        let (read, mut write) = stream.into_split();
+        let mut read = BufReader::new(read);
         let reading = async {
-            if !is_refused {
-                self.carry_out_lines(client, BufReader::new(read)).await?;
+            if !client.has_ended.get() {
+                self.carry_out_lines(client, &mut read).await?;
             }
             client.has_ended.set(true);
             client.wake.notify_one();
-            if client.follows.borrow().is_none() {
-                tokio::time::sleep(LINGER).await;
-                return Err(io::ErrorKind::TimedOut.into());
+            if client.follows.borrow().is_some() {
+                return std::future::pending().await;
             }
-            std::future::pending::<io::Result<()>>().await
+            tokio::time::sleep(LINGER).await;
+            io::Result::Err(io::ErrorKind::TimedOut.into())
         };
         tokio::select! {
-            ended = writing => ended,
-            ended = reading => ended,
+            ended = self.write(client, &write) => ended?,
+            ended = reading => ended?,
         }
+        // Closing with unread requests would reset the connection, and drop answers that wait at the client.
+        write.shutdown().await?;
+        let all_read = async { while read.read(&mut [0; 4_096]).await.is_ok_and(|count| count > 0) {} };
+        let _ = tokio::time::timeout(LINGER, all_read).await;
+        Ok(())
     }
 
     async fn carry_out_lines(
         &self,
         client: &ControlClient,
-        mut read: BufReader<OwnedReadHalf>,
+        read: &mut BufReader<OwnedReadHalf>,
     ) -> io::Result<()> {
         let mut line = Vec::new();
         loop {
             while client.out.borrow().len() > MAX_UNREAD {
                 client.written.notified().await;
             }
-            let request = match next_line(&mut read, &mut line).await? {
+            let request = match next_line(read, &mut line).await? {
                 Line::End => return Ok(()),
                 Line::TooLong => Err(format!("the line is longer than {MAX_LINE} bytes")),
                 Line::Whole => match serde_json::from_slice(&line) {
@@ -301,11 +312,11 @@ async fn next_line(read: &mut BufReader<OwnedReadHalf>, line: &mut Vec<u8>) -> i
     }
 }
 
-/// Maximum number of clients.
+/// Maximum number of clients, and of those that are told so.
 pub(super) const MAX_CLIENTS: usize = 16;
 /// Maximum length of a request, in bytes.
 pub(super) const MAX_LINE: usize = 1 << 20;
 /// With more bytes waiting, a client is not read, and no events are added for it.
 const MAX_UNREAD: usize = 256 << 10;
-/// How long a client that makes no more requests may take to read its answers.
-const LINGER: StdDuration = StdDuration::from_secs(5);
+/// How long a client that makes no more requests may take to read its answers, and then to close.
+const LINGER: StdDuration = StdDuration::from_secs(2);

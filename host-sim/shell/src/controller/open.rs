@@ -97,6 +97,7 @@ impl Running {
             told: Cell::new(0),
             events_file,
             control_clients: RefCell::default(),
+            refused_control_clients: Cell::new(0),
             ended: Notify::new(),
             counters: Cell::default(),
             refusal_log: LogLimit::default(),

@@ -10,12 +10,13 @@ use recipe_controller::ControllerInput;
 
 impl ControllerShell {
     /// Does the steps that are due, after each change of the controller.
-    pub(super) fn play(&self, now: Instant) {
+    pub(super) fn play(&self) {
         // A step that is being done changes the controller too.
         if self.timeline.borrow().is_none() || self.is_playing.replace(true) {
             return;
         }
         let deadline = loop {
+            let now = self.clock.now();
             let next = self.timeline.borrow_mut().as_mut().and_then(|timeline| {
                 timeline.observe(now, &self.controller.borrow());
                 timeline.due(now)

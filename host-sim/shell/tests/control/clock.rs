@@ -209,3 +209,35 @@ fn a_timeline_steps_with_the_clock() {
     control.done(json!({ "do": "wait", "until": { "items": { "DI[1]": 0 } }, "timeout_s": 10 }));
     assert_eq!(control.time_s(), 1.6234);
 }
+
+#[test]
+fn frames_on_a_bus_take_their_time_on_the_stepped_clock() {
+    let run =
+        RunOptions { binds: vec!["can=slcan-tcp:127.0.0.1:0".parse().unwrap()], ..RunOptions::default() };
+    let options = ControllerOptions { pace: Pace::Stepped, run, ..ControllerOptions::default() };
+    let handle = start_with(config("can-system-controller.toml"), options).unwrap();
+    let (mut control, mut bus) = (Control::of(&handle), connect(&handle, "ports/can"));
+    bus.write_all(b"S6\rO\r").unwrap();
+    bus.read_exact(&mut [0; 2]).unwrap();
+    let sent = |control: &mut Control, seconds: f64| {
+        let frames = |control: &mut Control| {
+            let counters = control.done(json!({ "do": "counters" }));
+            counters["ports"]["can"]["frames_out"].as_u64().unwrap()
+        };
+        let before = frames(control);
+        control.done(json!({ "do": "advance", "seconds": seconds }));
+        frames(control) - before
+    };
+    sent(&mut control, 0.001);
+
+    let each = sent(&mut control, 0.004);
+    assert!(each > 0);
+    assert_eq!(sent(&mut control, 0.4), 100 * each);
+    // A frame of 1 byte takes 0.11 to 0.13 ms at 500 kbit/s.
+    bus.write_all(b"t001101\r").unwrap();
+    let begin = control.time_s();
+    let on = json!({ "items": { "DO[1]": 1 } });
+    control.done(json!({ "do": "wait", "until": on, "timeout_s": 1 }));
+    let took = control.time_s() - begin;
+    assert!((0.000_1..0.001).contains(&took), "{took}");
+}
