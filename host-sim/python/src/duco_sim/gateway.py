@@ -50,6 +50,7 @@ class Gateway:
             self._process = process.Process("gateway", path, arguments, folder, stats_interval)
         self.folder = folder
         """A folder for this run's files. It is removed at the end."""
+        self._process.discards_output = False
         self._owner = Owner(stepped=False)
         self._changed = threading.Condition()
         self._stats: Optional[Stats] = None

@@ -47,6 +47,8 @@ class Process:
         # Many run beside each other, and none of them may keep the processor from the tests.
         always = ["--no-realtime", "--stats", stats_interval]
         argv = [str(host_sim()), command, "-c", config, *always, *arguments]
+        #: Whether nobody reads what it prints.
+        self.discards_output = True
         self.began = time.monotonic()
         try:
             with open(self._log, "wb") as log:
@@ -83,12 +85,22 @@ class Process:
         if not self._end.alive:
             return None
         by_itself = self.popen.poll()
+        if self.discards_output:
+            self._discard_output()
         code = _stop(self.popen)
         log = self.log()
         self._end()
         if by_itself is not None and by_itself != 0:
             return with_log(f"host-sim ended by itself with {_code(by_itself)}", log)
         return with_log(f"host-sim did not end as it should: {_code(code)}", log) if code != 0 else None
+
+    def _discard_output(self) -> None:
+        # It would wait for a moment for the lines to be read that it could not print.
+        descriptor = self.stdout.fileno()
+        os.set_blocking(descriptor, False)
+        with contextlib.suppress(OSError):
+            while os.read(descriptor, 1 << 16):
+                pass
 
     def _ready(self) -> Dict[str, Any]:
         deadline = self.began + START_LIMIT_S
