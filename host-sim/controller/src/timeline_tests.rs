@@ -209,3 +209,26 @@ fn mistakes_have_file_line_column_and_key() {
     let both = "[[step]]\nwhen = { mode = \"auto\" }\nat_s = 1\ndo = \"clear\"\n";
     assert_refused(both, "t.toml:2:8: step[1].when: a step has either `at_s` or `when`, not both");
 }
+
+#[test]
+fn a_damaged_file_is_refused_or_read_and_nothing_else() {
+    let text = "[[step]]\nat_s = 2.5\ndo = \"set\"\nitems = { \"DI[3]\" = 1 }\n[[step]]\n\
+                when = { coil = { \"192\" = 1 } }\nrepeat = true\ndo = \"fault\"\nserver = \"command\"\n\
+                kind = \"delay\"\nseconds = 0.5\n";
+    let config = SimConfig::default();
+    let (mut refused, mut read) = (0, 0);
+    let mut parse = |text: &str| match Timeline::parse("t.toml", text, &config) {
+        Ok(_) => read += 1,
+        Err(error) => {
+            assert!(error.to_string().starts_with("t.toml:"), "{error}");
+            refused += 1;
+        }
+    };
+    for at in 0..text.len() {
+        parse(&text[..at]);
+        for piece in ["", "[", "9", "\"", "{", "-", "\u{e9}", "nan", "= "] {
+            parse(&format!("{}{piece}{}", &text[..at], &text[at + 1..]));
+        }
+    }
+    assert!(refused > 1_000 && read > 50, "{refused} refused, {read} read");
+}

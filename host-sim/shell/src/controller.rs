@@ -37,7 +37,7 @@ use recipe_device::port::Port;
 use recipe_net::clock::{Alarm, Clock};
 pub use recipe_net::clock::{MAX_FACTOR, MIN_FACTOR, Pace};
 use recipe_net::log_limit::LogLimit;
-use recipe_net::realtime;
+use recipe_net::realtime::{self, Scheduling};
 use recipe_net::timer::now;
 use stepping::Waiting;
 
@@ -88,7 +88,11 @@ pub fn start_with(config: SimConfig, options: ControllerOptions) -> Result<Handl
 
 fn spawn(config: SimConfig, options: ControllerOptions) -> Result<Handle, StartError> {
     host::start("controller", async move || {
-        let scheduling = options.run.scheduling;
+        let scheduling = match options.pace {
+            // It would look for input with priority over the clients that it waits for.
+            Pace::Stepped => Scheduling::Ordinary,
+            Pace::Real | Pace::Factor(_) => options.run.scheduling,
+        };
         let running = Running::open(config, options).await?;
         info!(scheduling = %realtime::apply(scheduling), "the simulated controller is running");
         Ok(running)

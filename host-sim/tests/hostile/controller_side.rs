@@ -39,6 +39,7 @@ pub(crate) fn everything(process: &HostSim) -> Vec<Attack> {
         attack::hoard(process.at("state"), 10),
         attack::pour(process.at("command"), 1, b"getlasterror\n"),
         attack::pour(process.at("modbus"), 1, READ_WORDS),
+        attack::pour(process.at("control"), 1, b"{\"do\":\"programs\"}\n"),
         attack::never_read(process.at("modbus"), 20, READ_WORDS),
         attack::never_read(process.at("command"), 10, b"state\n"),
         attack::drip(process.at("command"), 5, b"run(a", Duration::from_secs(1)),
@@ -73,6 +74,20 @@ fn a_port_scan_of_every_server() {
     let servers = ["command", "state", "modbus", "ports/rs485", "ports/can"];
     let attacks = servers.map(|server| attack::scan(scene.process.at(server))).into();
     scene.survives(attacks);
+}
+
+#[test]
+fn requests_without_end_at_the_control_socket() {
+    let scene = robot();
+    let control = scene.process.at("control");
+    scene.survives(vec![
+        attack::scan(control),
+        attack::hoard(control, 4),
+        attack::pour(control, 2, b"{\"do\":\"state\"}\n"),
+        attack::pour(control, 1, b"GET / HTTP/1.1\r\n"),
+        attack::never_read(control, 4, b"{\"do\":\"events\"}\n"),
+        attack::drip(control, 2, b"{\"do\":", Duration::from_secs(1)),
+    ]);
 }
 
 #[test]

@@ -257,8 +257,13 @@ fn real_time_scheduling_is_asked_for_unless_it_is_not_wanted() {
     };
     let asked = scheduling(&[]);
     assert!(asked.contains("SCHED_FIFO"), "granted or refused: {asked}");
-    let ordinary = scheduling(&["--no-realtime"]);
-    assert!(ordinary.contains("scheduling=ordinary scheduling") && !ordinary.contains("FIFO"), "{ordinary}");
+    for option in ["--no-realtime", "--time=stepped"] {
+        let ordinary = scheduling(&[option]);
+        assert!(
+            ordinary.contains("scheduling=ordinary scheduling") && !ordinary.contains("FIFO"),
+            "{ordinary}"
+        );
+    }
 }
 
 #[test]

@@ -23,7 +23,7 @@ from .records import Address
 
 #: How long a program may take to start and to end, in seconds of the machine's time.
 START_LIMIT_S = 20.0
-END_LIMIT_S = 5.0
+END_LIMIT_S = 10.0
 #: With it, the program notices that nobody reads its output any more: it ends if its test was killed.
 STATS_INTERVAL = "1s"
 
@@ -85,22 +85,12 @@ class Process:
         if not self._end.alive:
             return None
         by_itself = self.popen.poll()
-        if self.discards_output:
-            self._discard_output()
-        code = _stop(self.popen)
+        code = _stop(self.popen, self.discards_output)
         log = self.log()
         self._end()
         if by_itself is not None and by_itself != 0:
             return with_log(f"host-sim ended by itself with {_code(by_itself)}", log)
         return with_log(f"host-sim did not end as it should: {_code(code)}", log) if code != 0 else None
-
-    def _discard_output(self) -> None:
-        # It would wait for a moment for the lines to be read that it could not print.
-        descriptor = self.stdout.fileno()
-        os.set_blocking(descriptor, False)
-        with contextlib.suppress(OSError):
-            while os.read(descriptor, 1 << 16):
-                pass
 
     def _ready(self) -> Dict[str, Any]:
         deadline = self.began + START_LIMIT_S
@@ -232,11 +222,14 @@ def _code(code: Optional[int]) -> str:
     return f"exit code {code}"
 
 
-def _stop(popen: subprocess.Popen[bytes]) -> Optional[int]:
+def _stop(popen: subprocess.Popen[bytes], discards_output: bool) -> Optional[int]:
     """Ends it with SIGTERM, and if that does not help with SIGKILL."""
     if popen.poll() is None:
         popen.terminate()
         try:
+            if discards_output and popen.stdout is not None:
+                # It would wait for a moment for somebody to read the lines that did not fit in the pipe.
+                _read_to_the_end(popen.stdout.fileno(), time.monotonic() + END_LIMIT_S)
             popen.wait(END_LIMIT_S)
         except subprocess.TimeoutExpired:
             popen.kill()
@@ -244,8 +237,16 @@ def _stop(popen: subprocess.Popen[bytes]) -> Optional[int]:
     return popen.returncode
 
 
+def _read_to_the_end(descriptor: int, deadline: float) -> None:
+    with selectors.DefaultSelector() as selector:
+        selector.register(descriptor, selectors.EVENT_READ)
+        while selector.select(max(0.0, deadline - time.monotonic())):
+            if not os.read(descriptor, 1 << 16):
+                return
+
+
 def _end(popen: subprocess.Popen[bytes], folder: Path) -> None:
-    _stop(popen)
+    _stop(popen, False)
     if popen.stdout is not None:
         popen.stdout.close()
     shutil.rmtree(folder, ignore_errors=True)
