@@ -224,10 +224,10 @@ def test_a_wrong_time():
 
 def test_something_happens_meanwhile():
     with duco_sim.Controller(time="factor=20") as robot:
-        robot.di[1] = True
+        robot.upload("long.jspf", 'set("DO[1]", 1); wait_ms(600000);')
         robot.when(robot.estop, items={"DO[1]": 1}, after=0.05)
-        assert robot.command("run(pick.jspf)") == "run start"
-        assert robot.finish().reason == "emergency_stop"
+        assert robot.command("run(long.jspf)") == "run start"
+        assert robot.finish(timeout=700).reason == "emergency_stop"
 
 
 def test_what_never_happens_is_told():
