@@ -22,7 +22,7 @@ fn soaked(level: Level, seed: u64, span: Duration, jobs: usize) -> Total {
 /// The hashes of these runs on every machine. Only a change of what the engine, the controller or the cell
 /// does, or when, may change them; then enter the new ones here.
 const HASHES: [(Level, u64); 2] =
-    [(Level::None, 0xDD5E_B098_CC10_812A), (Level::Harsh, 0x1E9E_4BC1_CB0D_4669)];
+    [(Level::None, 0x6096_0D62_2DC4_C8BF), (Level::Harsh, 0x3A20_27DF_52C7_222A)];
 
 #[test]
 fn a_seed_means_the_same_trace_on_every_machine() {
