@@ -5,6 +5,7 @@ mod control;
 mod output;
 mod processes;
 mod rejections;
+mod service;
 mod soak;
 
 use recipe_test_kit::Binary;
