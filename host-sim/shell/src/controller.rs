@@ -94,7 +94,9 @@ fn spawn(config: SimConfig, options: ControllerOptions) -> Result<Handle, StartE
             Pace::Real | Pace::Factor(_) => options.run.scheduling,
         };
         let running = Running::open(config, options).await?;
-        info!(scheduling = %realtime::apply(scheduling), "the simulated controller is running");
+        // Not as an argument of the log, which is not evaluated unless it is printed.
+        let scheduling = realtime::apply(scheduling);
+        info!(%scheduling, "the simulated controller is running");
         Ok(running)
     })
 }

@@ -325,7 +325,9 @@ pub fn start(config: GatewayConfig, binds: Vec<Bind>) -> Result<Handle, StartErr
 fn spawn(config: GatewayConfig, binds: Vec<Bind>, scheduling: Scheduling) -> Result<Handle, StartError> {
     host::start("gateway", async move || {
         let gateway = Gateway::open(&config, &binds).await?;
-        info!(scheduling = %realtime::apply(scheduling), "the gateway is running");
+        // Not as an argument of the log, which is not evaluated unless it is printed.
+        let scheduling = realtime::apply(scheduling);
+        info!(%scheduling, "the gateway is running");
         Ok(gateway)
     })
 }

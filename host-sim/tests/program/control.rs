@@ -11,6 +11,7 @@ use clap::CommandFactory;
 use host_sim::cli::Cli;
 use recipe_controller::KINDS;
 use recipe_controller::operations::Operation;
+use recipe_net::realtime::{self, Scheduling};
 use recipe_test_kit::{HostSim, example, repository};
 
 /// Every key of an object and of what is in it, but for names from the file and of variables.
@@ -265,6 +266,40 @@ fn real_time_scheduling_is_asked_for_unless_it_is_not_wanted() {
         );
     }
 }
+
+/// The log's own words do not show what the thread got: it was once asked for only where they were printed.
+#[test]
+fn the_threads_that_move_data_have_real_time_scheduling_where_it_is_allowed() {
+    let is_allowed = std::thread::spawn(|| realtime::apply(Scheduling::FifoIfAllowed).word() == "fifo");
+    let is_allowed = is_allowed.join().unwrap();
+    let is_fifo = |program: &HostSim, thread: &str| {
+        let tasks = std::fs::read_dir(format!("/proc/{}/task", program.pid().as_raw_pid())).unwrap();
+        let read = |task: &Path, file: &str| std::fs::read_to_string(task.join(file)).unwrap_or_default();
+        let tasks = tasks.map(|task| task.unwrap().path());
+        let named = tasks.filter(|task| read(task, "comm").trim() == thread).collect::<Vec<_>>();
+        let [task] = &named[..] else { panic!("one thread is called {thread}: {named:?}") };
+        let stat = read(task, "stat");
+        // Behind the name in parentheses, which is the second field, the 41st is the policy.
+        let policy = stat.rsplit_once(") ").and_then(|(_, rest)| rest.split(' ').nth(38)).unwrap();
+        policy == SCHED_FIFO
+    };
+    let robot = BINARY.controller(&example("udp-server-controller.toml"), &[]);
+    assert_eq!(is_fifo(&robot, "controller"), is_allowed);
+    let folder = tempfile::tempdir().unwrap();
+    let line = format!("--bind=force=pty:{}", folder.path().join("line").display());
+    for (extra, expected) in [(&[][..], is_allowed), (&["--no-realtime"][..], false)] {
+        let mut command = BINARY.run("gateway", &example("force-sensor.toml"));
+        let gateway =
+            HostSim::start(command.args(["--set", "controller.address=127.0.0.1", &line]).args(extra));
+        assert_eq!(is_fifo(&gateway, "gateway"), expected, "{extra:?}");
+        assert!(!is_fifo(&gateway, "host-sim"), "the console and the signals may wait");
+        gateway.end();
+    }
+    robot.end();
+}
+
+/// The number of the policy in `/proc`.
+const SCHED_FIFO: &str = "1";
 
 #[test]
 fn every_operation_and_event_is_documented_and_has_its_command() {
