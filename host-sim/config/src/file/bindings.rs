@@ -1,13 +1,14 @@
 //! The bindings of fields and the triggers of output parts in a gateway file.
 
 use proto_core::config::{InputBinding, OnStale, OutputBinding, SendOn};
-use proto_core::device::Encoding;
+use proto_core::device::{Encoding, Overflow};
 use proto_core::sysvar::{SysVar, VarBit};
 
 use super::commands::{self, FileCommands};
 use super::encoding::refuse;
 use super::reader::{Item, Reader, Result, Spot};
 use super::sources;
+use crate::keys::field::COUNTER_TABLE;
 
 /// The binding of an input field.
 pub(super) enum FileInput {
@@ -58,8 +59,13 @@ pub(super) struct Sending {
     pub(super) send_spot: Option<Spot>,
 }
 
+/// The words of `on_stale`.
+pub(crate) const ON_STALES: [(&str, OnStale); 2] = [("hold", OnStale::Hold), ("stop", OnStale::Stop)];
+/// The words of `overflow`.
+pub(crate) const OVERFLOWS: [(&str, Overflow); 1] = [("wrap", Overflow::Wrap)];
+
 pub(super) fn read_on_stale(item: &Item<'_>) -> Result<OnStale> {
-    item.choice(&[("hold", OnStale::Hold), ("stop", OnStale::Stop)])
+    item.choice(&ON_STALES)
 }
 
 pub(super) fn read_sending(part: &Reader<'_>) -> Result<Sending> {
@@ -110,7 +116,7 @@ pub(super) fn read_input(field: &Reader<'_>) -> Result<(FileInput, Option<FileIn
         refuse(field, &["scale", "offset"], "allowed only together with to")?;
     }
     if commands.is_none() {
-        refuse(field, &commands::KEYS, "allowed only together with commands")?;
+        refuse(field, &["when", "base", "idle"], "allowed only together with commands")?;
     }
     let to = to.map(|to| read_to(field, &to)).transpose()?;
     let commands = commands.map(|item| commands::read(field, &item).map(FileInput::Commands)).transpose()?;
@@ -150,7 +156,7 @@ pub(super) fn read_counter(field: &Reader<'_>, encoding: &Encoding) -> Result<Op
             false => Ok(None),
         };
     }
-    let max = item.table(&["max"])?.required("max", "the highest number of the counter")?;
+    let max = item.table(&COUNTER_TABLE)?.required("max", "the highest number of the counter")?;
     max.integer(1..=i64::from(high)).map(Some)
 }
 

@@ -13,7 +13,7 @@ use proto_core::recipe::model::{MAX_CAN_IDS, MAX_DELIMITER, MAX_STREAM_FRAME, Mo
 use proto_core::sysvar::Direction;
 use proto_core::wire::scalar::ScalarType;
 
-use super::bindings::{self, FileInput, FileOutput};
+use super::bindings::{self, FileInput, FileOutput, OVERFLOWS};
 use super::encoding::{self, OpenNumber, Order, refuse};
 use super::exchanges::FileExchange;
 use super::framings;
@@ -22,13 +22,43 @@ use super::reader::{Item, Reader, Result};
 use super::recipes::{FileField, FileFieldKind, FileFrame, FilePart, FileRecipe, Flavour, Written};
 use super::rtu_frames;
 use crate::device::{DeviceField, DeviceRecipe, ExchangeKind, FrameEnds, NamedExchange, NamedFrame};
+use crate::keys::field::{self, FILL, OVERFLOW, PAD};
+use crate::keys::recipe::{OF_FRAME, OF_STREAM};
+use crate::keys::{Key, device, names};
 
-/// The keys of a CAN frame.
-const FRAME_KEYS: [&str; 3] = ["endian", "word_order", "checksum"];
-/// The keys of a stream part.
-const STREAM_KEYS: [&str; 5] = ["endian", "word_order", "checksum", "framing", "escape"];
-/// The keys of a field or what stands in its place, beside those that say how it is written.
-const FIELD_KEYS: [&str; 6] = ["equals", "overflow", "counter", "pad", "fill", "text"];
+/// The keys of a field or what stands in its place, which no controller's recipe has.
+const OWN_KEYS: [&str; 22] = [
+    "equals",
+    "overflow",
+    "counter",
+    "pad",
+    "fill",
+    "text",
+    "length_to",
+    "count_to",
+    "length_from",
+    "order",
+    "ignore",
+    "length",
+    "counts",
+    "plus",
+    "endian",
+    "word_order",
+    "bits",
+    "signed",
+    "new",
+    "width",
+    "until",
+    "decimals",
+];
+
+/// The words of `order` of a checksum.
+pub(crate) const CHECKSUM_ORDERS: [(&str, ByteOrder); 2] =
+    [("little", ByteOrder::Little), ("big", ByteOrder::Big)];
+/// The words of `as`, and whether they are digits.
+pub(crate) const CHECKSUM_FORMS: [(&str, bool); 2] = [("bytes", false), ("hex", true)];
+/// The words of `data_id_at`, and whether the bytes are behind the frame's.
+pub(crate) const DATA_ID_PLACES: [(&str, bool); 2] = [("start", false), ("end", true)];
 
 /// Why recipes of this kind have no frames of devices; `None` if they may.
 fn why_plain(mode: Mode, flavour: Flavour) -> Option<&'static str> {
@@ -47,32 +77,24 @@ fn why_plain(mode: Mode, flavour: Flavour) -> Option<&'static str> {
 
 /// The keys of a stream part or a CAN frame, beside those of any recipe; refuses them where there
 /// are none.
-pub(super) fn frame_keys(
-    table: &Reader<'_>,
-    mode: Mode,
-    flavour: Flavour,
-) -> Result<&'static [&'static str]> {
-    own_keys(&FRAME_KEYS, table, mode, flavour)
+pub(super) fn frame_keys(table: &Reader<'_>, mode: Mode, flavour: Flavour) -> Result<&'static [Key]> {
+    own_keys(OF_FRAME, table, mode, flavour)
 }
 
 /// The same for a stream part.
-pub(super) fn stream_keys(
-    table: &Reader<'_>,
-    mode: Mode,
-    flavour: Flavour,
-) -> Result<&'static [&'static str]> {
-    own_keys(&STREAM_KEYS, table, mode, flavour)
+pub(super) fn stream_keys(table: &Reader<'_>, mode: Mode, flavour: Flavour) -> Result<&'static [Key]> {
+    own_keys(OF_STREAM, table, mode, flavour)
 }
 
 fn own_keys(
-    keys: &'static [&'static str],
+    keys: &'static [Key],
     table: &Reader<'_>,
     mode: Mode,
     flavour: Flavour,
-) -> Result<&'static [&'static str]> {
+) -> Result<&'static [Key]> {
     match why_plain(mode, flavour) {
         None => Ok(keys),
-        Some(why) => refuse(table, keys, why).map(|()| -> &[&str] { &[] }),
+        Some(why) => refuse(table, &names(keys.iter()), why).map(|()| -> &[Key] { &[] }),
     }
 }
 
@@ -80,7 +102,11 @@ fn own_keys(
 pub(super) fn refuse_in_can_part(part: &Reader<'_>, mode: Mode, flavour: Flavour) -> Result<()> {
     stream_keys(part, mode, flavour)?;
     refuse(part, &framings::PART_KEYS, "a CAN bus tells frames apart itself")?;
-    refuse(part, &FRAME_KEYS, "in a CAN recipe each frame has its own; write it below the frame's id")
+    refuse(
+        part,
+        &names(OF_FRAME.iter()),
+        "in a CAN recipe each frame has its own; write it below the frame's id",
+    )
 }
 
 /// What the fields of one frame have in common, while they are read.
@@ -111,16 +137,16 @@ impl FieldReader {
             Direction::Output => " in an output field",
         };
         if let Some(why) = why_plain(Mode::User, self.flavour) {
-            refuse(&table, &[&FIELD_KEYS[..], &framings::FIELD_KEYS, &encoding::KEYS].concat(), why)?;
-            table.check_keys(&["name", "type"], when)?;
+            refuse(&table, &OWN_KEYS, why)?;
+            table.check_keys(&[field::PLAIN.common], when)?;
             push(self.read_plain(&table)?);
             return Ok(());
         }
         if let Some(pad) = table.optional("pad") {
-            table.check_keys(&["pad", "fill"], " in padding")?;
-            let fill = table.optional("fill").map_or(Ok(0), |item| item.integer(0..=255))?;
+            table.check_keys(&[field::PADDING], " in padding")?;
+            let fill = table.integer_or(&FILL)?;
             self.open = None;
-            push(FileFieldKind::Padding { len: pad.integer(1..=255)?, fill });
+            push(FileFieldKind::Padding { len: pad.integer(PAD.integers())?, fill });
             return Ok(());
         }
         if table.optional("type").and_then(|item| item.as_string()) == Some("text") {
@@ -131,16 +157,16 @@ impl FieldReader {
         }
         refuse(&table, &framings::TEXT_KEYS, "allowed only together with type = \"text\"")?;
         if table.optional("length").is_some() {
-            table.check_keys(&[&framings::LENGTH_KEYS[..], &encoding::KEYS].concat(), " in a length")?;
+            table.check_keys(&[field::LENGTHS, field::WRITTEN], " in a length")?;
             let encoding = encoding::read(&table, self.order, &mut self.open)?;
             let name = table.optional("name").map(|item| item.string().map(str::to_owned)).transpose()?;
             push(FileFieldKind::Device { name, spec: framings::read_length(&table, encoding)? });
             return Ok(());
         }
-        refuse(&table, &["counts", "plus"], "allowed only together with length = true")?;
+        refuse(&table, &framings::LENGTH_KEYS, "allowed only together with length = true")?;
         refuse(&table, &["fill"], "allowed only together with pad, or with type = \"text\" and width")?;
         if let Some(text) = table.optional("text") {
-            table.check_keys(&["text"], " in a text")?;
+            table.check_keys(&[field::CONSTANT_TEXT], " in a text")?;
             self.open = None;
             for byte in read_text(&text)? {
                 let encoding = Encoding::scalar(ScalarType::Byte);
@@ -149,7 +175,7 @@ impl FieldReader {
             return Ok(());
         }
         let bound = binding_keys(&table, self.direction)?;
-        table.check_keys(&[&["name", "type"], bound, &["overflow"], &encoding::KEYS].concat(), when)?;
+        table.check_keys(&[field::NAMED, bound, &[OVERFLOW], field::WRITTEN], when)?;
         match table.optional("equals") {
             Some(equals) => {
                 refuse_bindings(&table)?;
@@ -186,23 +212,21 @@ impl FieldReader {
         if table.optional(key).is_none() {
             refuse(table, &["overflow"], &format!("allowed only together with {key}"))?;
         }
-        let overflow = table
-            .optional("overflow")
-            .map_or(Ok(Overflow::Usual), |item| item.choice(&[("wrap", Overflow::Wrap)]))?;
+        let overflow = table.word(&OVERFLOW, &OVERFLOWS)?.unwrap_or(Overflow::Usual);
         bind(table, self.direction, name, Written { encoding, overflow }, push)
     }
 }
 
 /// The keys of what a value is for; refuses those of the other direction.
-pub(super) fn binding_keys(table: &Reader<'_>, direction: Direction) -> Result<&'static [&'static str]> {
+pub(super) fn binding_keys(table: &Reader<'_>, direction: Direction) -> Result<&'static [Key]> {
     match direction {
         Direction::Input => {
             refuse(table, &["value"], "an input field has equals = 9 for a constant")?;
-            Ok(&["to", "commands", "when", "base", "idle", "scale", "offset", "equals", "counter"])
+            Ok(field::BOUND_IN)
         }
         Direction::Output => {
             refuse(table, &["equals"], "an output field has value = 9 for a constant")?;
-            Ok(&["from", "value", "scale", "offset", "counter"])
+            Ok(field::BOUND_OUT)
         }
     }
 }
@@ -300,12 +324,8 @@ pub(super) fn read_checksum(frame: &Reader<'_>, head: usize, fields: &mut Vec<Fi
         let (first, last) = read_covered(&item)?;
         sum = sum.over(first, last);
     }
-    if let Some(item) = table.optional("order") {
-        sum.order = item.choice(&[("little", ByteOrder::Little), ("big", ByteOrder::Big)])?;
-    }
-    if let Some(item) = table.optional("as") {
-        sum.text = item.choice(&[("bytes", false), ("hex", true)])?;
-    }
+    sum.order = table.word(&device::ORDER, &CHECKSUM_ORDERS)?.unwrap_or(sum.order);
+    sum.text = table.word_or(&device::AS, &CHECKSUM_FORMS)?;
     sum.data_id = read_data_id(&table)?;
     let nth = match table.optional("at") {
         Some(item) => find_place(&item, head, fields)?,
@@ -329,12 +349,10 @@ fn read_data_id(table: &Reader<'_>) -> Result<DataId> {
     };
     let id = DataId::new(&bytes).filter(|id| !id.bytes().is_empty());
     let id = id.ok_or_else(|| item.error(format!("{} bytes; allowed: 1 to {MAX_DATA_ID}", bytes.len())))?;
-    let place = table.optional("data_id_at").map(|item| item.choice(&[("start", false), ("end", true)]));
-    Ok(if place.transpose()? == Some(true) { id.behind() } else { id })
+    Ok(if table.word_or(&device::DATA_ID_AT, &DATA_ID_PLACES)? { id.behind() } else { id })
 }
 
 fn read_algorithm(table: &Reader<'_>) -> Result<Algorithm> {
-    const PLACE: [&str; 7] = ["kind", "over", "at", "order", "as", "data_id", "data_id_at"];
     let kind = table.required("kind", "the algorithm, such as \"crc16-modbus\"")?;
     let name = kind.string()?;
     if name != "crc" {
@@ -345,24 +363,22 @@ fn read_algorithm(table: &Reader<'_>) -> Result<Algorithm> {
             let shown = shown.join(", ");
             kind.error(format!("{name:?} is unknown; allowed: {shown}, \"crc\" (with its parameters){meant}"))
         })?;
-        table.check_keys(&PLACE, &format!(" with kind = {name:?}"))?;
+        table.check(&device::CHECKSUM_TABLE)?;
         return Ok(algorithm);
     }
-    let parameters = ["width", "poly", "init", "xorout", "refin", "refout"];
-    table.check_keys(&[&PLACE[..], &parameters].concat(), " with kind = \"crc\"")?;
-    let width: u8 = table.required("width", "the number of bits, 1..=32")?.integer(1..=32)?;
+    table.check(&device::CHECKSUM_TABLE)?;
+    let width: u8 = table.integer_needed(&device::WIDTH, "the number of bits, 1..=32")?;
     let most = i64::from(u32::MAX >> (32 - u32::from(width)));
     let number = |key| table.optional(key).map_or(Ok(0), |item| item.integer(0..=most));
-    let flag = |key, default| table.optional(key).map_or(Ok(default), |item| item.bool());
     table.required("poly", "the polynomial without its highest term, such as 0x1021")?;
-    let refin = flag("refin", false)?;
+    let refin = table.flag(&device::REFIN)?;
     Ok(Algorithm::Crc(Crc {
         width,
         poly: number("poly")?,
         init: number("init")?,
         xorout: number("xorout")?,
         refin,
-        refout: flag("refout", refin)?,
+        refout: table.optional("refout").map_or(Ok(refin), |item| item.bool())?,
     }))
 }
 
