@@ -10,6 +10,7 @@ mod example_files;
 mod exchange_files;
 mod framing_files;
 mod golden_images;
+mod schema_files;
 mod wrong_devices;
 mod wrong_exchanges;
 mod wrong_files;
