@@ -8,6 +8,7 @@ mod check;
 mod codec;
 mod conversation;
 mod convert;
+mod export;
 mod frame;
 mod image;
 mod log;
@@ -86,6 +87,9 @@ enum Command {
     /// Check a file; print the bus budget, the way of each variable and what to set on the pendant
     #[command(after_help = CHECK_EXAMPLES)]
     Check(check::CheckArgs),
+    /// Print what other tools read: the JSON Schema of a file
+    #[command(after_help = export::EXAMPLES)]
+    Export(export::ExportArgs),
     /// Write the configuration image for a board
     #[command(after_help = IMAGE_EXAMPLES)]
     Image(image::ImageArgs),
@@ -290,6 +294,7 @@ pub fn main() -> ExitCode {
         }
         Command::New(args) => new::run(&args, &mut out),
         Command::Check(args) => check::run(&args, &mut out),
+        Command::Export(args) => export::run(&args, &mut out),
         Command::Image(args) => image::run(&args, &mut out),
         Command::Encode(args) => encode(&args, &mut out),
         Command::Decode(args) => decode(&args, &mut out),

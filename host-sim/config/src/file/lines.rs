@@ -24,11 +24,12 @@ pub(super) fn read_rtu_line(port: &Reader<'_>, is_master: bool) -> Result<Rs485>
 }
 
 fn read_characters(port: &Reader<'_>) -> Result<Rs485> {
-    let mut line = Rs485::default();
-    line.baud = port.integer_or(&BAUD)?;
-    line.parity = port.word_or(&PARITY, &PARITIES)?;
-    line.stop_bits = port.integer_or(&STOP_BITS)?;
-    Ok(line)
+    Ok(Rs485 {
+        baud: port.integer_or(&BAUD)?,
+        parity: port.word_or(&PARITY, &PARITIES)?,
+        stop_bits: port.integer_or(&STOP_BITS)?,
+        ..Rs485::default()
+    })
 }
 
 fn read_times(port: &Reader<'_>, mut line: Rs485) -> Result<Rs485> {

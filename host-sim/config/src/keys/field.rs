@@ -28,8 +28,8 @@ pub(crate) const PLAIN_TYPE: Key =
     Key { shape: Shape::Words(|| ScalarType::ALL.iter().map(|ty| ty.name()).collect()), ..TYPE };
 const TEXT_TYPE: Key = Key { shape: Shape::Words(|| vec!["text"]), ..TYPE };
 
-const OWN_ENDIAN: Key = ENDIAN.absent("of the part").tells("the byte order of this field");
-const OWN_WORD_ORDER: Key = WORD_ORDER.absent("of the part").tells("the word order of this field");
+const OWN_ENDIAN: Key = ENDIAN.absent("of the part").is("the byte order of this field");
+const OWN_WORD_ORDER: Key = WORD_ORDER.absent("of the part").is("the order of its words");
 /// Some bits of a number.
 pub const BITS: Key = Key::new(
     "bits",
@@ -89,14 +89,14 @@ const SCALE_OUT: Key = Key { beside: &["from"], ..SCALE_IN };
 const OFFSET_OUT: Key = Key { beside: &["from"], ..OFFSET_IN };
 /// Where a value comes from.
 pub const FROM: Key =
-    Key::text_of("from", Text::Source).tells("output: a variable, a bit, or another of the sources above");
+    Key::text_of("from", Text::Source).tells("output: a variable, a bit, or another of the sources below");
 /// A constant that is sent.
 pub const VALUE: Key = Key::new("value", Shape::Number(Limits::Any)).tells("output: a constant");
 
 /// What values pick.
 pub const COMMANDS: Key =
     Key::new("commands", Shape::Map(&Shape::Text(Text::Length(1, MAX_COMMAND_TEXT)), 1))
-        .tells("input: commands by values, ranges of values, or `rising`, `falling` and `level`, as above");
+        .tells("input: commands by values, ranges of values, or `rising`, `falling` and `level`, as below");
 /// When a value acts.
 pub const WHEN: Key = Key::words("when", words!(WHENS)).or_word("change").beside(&["commands"]).tells(
     "`\"change\"`: the value acts if it differs from the previous frame; `\"frame\"`: with every frame",
@@ -124,7 +124,6 @@ pub const FILL: Key =
     Key::integer("fill", 0, 255).or(0).beside(&["pad"]).is("with `pad`: the bytes that are sent");
 /// Constant bytes.
 pub const TEXT: Key = Key::text_of("text", Text::Length(1, usize::MAX))
-    .required()
     .tells("instead of a field, `{ text = \"ST,\" }`: constant bytes of ASCII");
 
 /// The width of a text.
@@ -171,8 +170,7 @@ pub const LENGTH_FROM: Key = Key::text_of("length_from", Text::Variable).tells(
 );
 
 /// The length of a frame.
-pub const LENGTH: Key =
-    Key::new("length", Shape::Bool).required().tells("`true`: the field is the length of the frame");
+pub const LENGTH: Key = Key::new("length", Shape::Bool).tells("`true`: the field is the length of the frame");
 /// What it counts.
 pub const COUNTS: Key = Key::words("counts", words!(ALL_COUNTS)).or_word("rest").beside(&["length"]).tells(
     "`\"rest\"`: everything behind it, checksum and tail included; `\"frame\"`: the whole frame; `\"fields\"`: the \
@@ -279,6 +277,8 @@ pub const COIL_OUT: Table = Table::of("coil that is written", &[])
 
 const GOES_UP: &[When] = &[When::Has(&["to", "commands", "equals", "length_to", "count_to"])];
 
+const COIL_GOES_UP: &[When] = &[When::Has(&["to", "commands"])];
+
 /// A field in a block that is read or written by its master.
 pub const IN_BLOCK: Table = Table::of("field of a block", &[]).rules(RULES).cases(&[
     Case { when: IS_PAD, keys: &[PADDING] },
@@ -294,6 +294,6 @@ pub const IN_BLOCK: Table = Table::of("field of a block", &[]).rules(RULES).case
 pub const COIL_IN_BLOCK: Table = Table::of("coil of a block", &[]).at(" of a coil").rules(RULES).cases(&[
     Case { when: IS_PAD, keys: &[COIL_PADDING] },
     Case { when: IS_CONSTANT, keys: &[&[NAME_IF_ANY, EQUALS]] },
-    Case { when: GOES_UP, keys: &[COIL, VALUE_IN] },
+    Case { when: COIL_GOES_UP, keys: &[COIL, VALUE_IN] },
     Case { when: &[], keys: &[COIL, BOUND_OUT] },
 ]);

@@ -78,7 +78,6 @@ pub const DOCUMENTED: &[(&str, &[&[Key]])] = &[
         &[
             exchange::OF_MODBUS.common,
             &[exchange::WRITE_ADDRESS, exchange::READ, exchange::WRITE, device::WORD_ORDER_OF_REGISTERS],
-            exchange::TIMING,
         ],
     ),
     ("block", &[exchange::BLOCK.common, &[exchange::BLOCK_FIELDS]]),

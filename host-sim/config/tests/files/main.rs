@@ -6,6 +6,7 @@ mod counter_files;
 mod damaged_files;
 mod device_files;
 mod document_examples;
+mod documented_keys;
 mod example_files;
 mod exchange_files;
 mod framing_files;

@@ -52,6 +52,9 @@ const CASES: &[Case] = &[
     gateway("a controller with a name and no name server", "[controller]\naddress = \"192.168.12.138\"", "[network]\naddress = \"192.168.12.20/24\"\n[controller]\naddress = \"robot.cell\""),
     // [controller]
     gateway("no address", "address = \"192.168.12.138\"", ""),
+    gateway("an address with a number beyond 255", "192.168.12.138", "300.1.1.1"),
+    gateway("an address of three numbers", "192.168.12.138", "192.168.12"),
+    gateway("two ports of one link", "[controller]", "[controller]\nports = { udp2011 = 2012 }"),
     gateway("an address with a port", "192.168.12.138", "192.168.12.138:2000"),
     gateway("an unknown key of the controller", "address =", "adress ="),
     gateway("an unknown dialect", "[controller]", "[controller]\ndialect = \"v9\""),
@@ -250,6 +253,7 @@ const CASES: &[Case] = &[
     controller("a user recipe on UDP", "bus = \"udp-server\"\nrecipe = \"system\"", "bus = \"udp-server\"\nrecipe = \"bytes\""),
     controller("two UDP servers", "bus = \"udp-client\"\nto = \"127.0.0.1:50000\"", "bus = \"udp-server\""),
     controller("a client without a target", "to = \"127.0.0.1:50000\"\n", ""),
+    controller("a target whose address is none", "127.0.0.1:50000", "127.0.0.1.1:50000"),
     controller("a target without a port", "to = \"127.0.0.1:50000\"", "to = \"127.0.0.1\""),
     controller("a program without a script", "script = \"comm_recv(\\\"rs485\\\")\"\n", ""),
     controller("a program that run cannot name", "name = \"echo.jspf\"", "name = \"echo,50\""),
