@@ -112,7 +112,10 @@ impl Schema {
                     properties.insert(key.name.into(), value);
                 }
                 Some(before) if *before == value => {}
-                Some(before) => *before = json!({ "description": describe(key) }),
+                Some(before) => {
+                    *before = either(before, &value);
+                    before["description"] = json!(describe(key));
+                }
             }
         }
         // A common key stands for all cases, which may only narrow it.
@@ -161,6 +164,23 @@ impl Schema {
             value["else"] = rest;
         }
         Some(value)
+    }
+}
+
+/// What two cases of a key have in common: what it is, as far as an editor must know it.
+fn either(one: &Value, other: &Value) -> Value {
+    let kind = |value: &Value| match value.get("$ref") {
+        Some(_) => json!("object"),
+        None => value.get("type").cloned().unwrap_or(Value::Null),
+    };
+    match (kind(one), kind(other)) {
+        (kind, same) if kind != same || kind.is_null() => json!({}),
+        (kind, _) if kind == "object" => json!({ "type": kind, "additionalProperties": true }),
+        (kind, _) if kind == "array" => {
+            let item = |list: &Value| list.get("items").cloned().unwrap_or(json!({}));
+            json!({ "type": kind, "items": either(&item(one), &item(other)) })
+        }
+        (kind, _) => json!({ "type": kind }),
     }
 }
 

@@ -18,7 +18,7 @@ use proto_core::wire::scalar::Scalar;
 
 use super::bindings::FileInput;
 use super::commands::FileCommand;
-use super::document::Document;
+use super::document::{At, Document};
 use super::lines::{key_name, read_bitrate, read_cycle, read_line, read_rtu_line};
 use super::network::{self, check_ipv4};
 use super::reader::{Item, Reader, Result, Spot};
@@ -415,14 +415,18 @@ fn read_controller(table: &Reader<'_>, recipes: &[FileRecipe]) -> Result<Control
     if let Some(item) = table.optional("recipe_link") {
         let table = item.table(&keys::gateway::RECIPE_LINK)?;
         if let Some(port) = table.integer(&LINK_UDP)? {
-            // The other one would lose without a word.
-            if let Some(item) = udp_item.filter(|_| port != udp_port) {
-                return Err(item.error(format!(
-                    "{udp_port} does not count beside controller.recipe_link.udp = {port}; write the port in one of \
-                     the two"
-                )));
+            let is_set = |spot: &Spot| matches!(spot.at, At::Override(_));
+            let link_is_set = table.optional(LINK_UDP.name).is_some_and(|item| is_set(&item.spot));
+            match udp_item.filter(|_| port != udp_port) {
+                // What is set for this run counts.
+                Some(item) if is_set(&item.spot) && !link_is_set => {}
+                Some(item) if is_set(&item.spot) == link_is_set => {
+                    return Err(item.error(format!(
+                        "{udp_port} is not the port of controller.recipe_link.udp, {port}; write it in one of the two"
+                    )));
+                }
+                _ => udp_port = port,
             }
-            udp_port = port;
         }
         let recipe = table.required("recipe", "the recipe that the controller's UDP 2011 port is set to")?;
         let recipe = recipes::find(recipes, &recipe)? as u8;

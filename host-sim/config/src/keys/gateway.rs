@@ -21,7 +21,7 @@ pub(crate) const MODBUS: Key = server("modbus", 502, "Modbus TCP");
 pub(crate) const UDP2011: Key = server(
     "udp2011",
     2011,
-    "the UDP server of recipes. Refused beside another `recipe_link.udp`, which counts",
+    "the UDP server of recipes. Refused if `recipe_link.udp` is another one, unless one of the two is given with `--set`",
 );
 
 const fn server(name: &'static str, port: i64, text: &'static str) -> Key {

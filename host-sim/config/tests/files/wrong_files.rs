@@ -375,6 +375,22 @@ fn overrides_change_what_they_name() {
 }
 
 #[test]
+fn a_port_that_is_set_counts_for_the_recipe_link() {
+    let port = |sets: &[&str]| {
+        let sets: Vec<String> = sets.iter().map(|&set| set.to_owned()).collect();
+        let config = parse_gateway(Text { name: "cell.toml", toml: GATEWAY }, &sets)?;
+        Ok(config.controller.recipe_link.unwrap().udp_port)
+    };
+    let (of_link, of_ports) = ("controller.recipe_link.udp=2012", "controller.ports.udp2011=2013");
+    assert_eq!(port(&[]), Ok(2011));
+    assert_eq!(port(&[of_link]), Ok(2012));
+    assert_eq!(port(&[of_ports]), Ok(2013), "not lost against that of the file");
+    let both: Result<u16, recipe_config::file::FileError> = port(&[of_link, of_ports]);
+    let message = both.unwrap_err().to_string();
+    assert!(message.contains("is not the port of controller.recipe_link.udp, 2012"), "{message}");
+}
+
+#[test]
 fn the_other_kind_of_file_is_recognised() {
     let error = parse_gateway(Text { name: "robot.toml", toml: CONTROLLER }, &[]).unwrap_err().to_string();
     insta::assert_snapshot!(error, @"robot.toml: this is a controller file, not a gateway file; run it with host-sim controller -c FILE");
