@@ -134,8 +134,11 @@ const CHECK_EXAMPLES: &str = "\
 Examples:
   host-sim check cell.toml
   host-sim check cell.toml --set port.rs485-1.baud=9600
+  host-sim check cell.toml --same-bus can-1,can-2
+  host-sim check cell.toml --json
 
-If something is wrong: exit code 2 and one message with file, line, column and key.";
+If something is wrong: exit code 2 and one message with file, line, column and key.
+With --json it is on stdout: {\"ok\": false, \"errors\": [...]}.";
 
 const IMAGE_EXAMPLES: &str = "\
 Examples:
@@ -293,7 +296,11 @@ pub fn main() -> ExitCode {
             return out.finish(|_| code);
         }
         Command::New(args) => new::run(&args, &mut out),
-        Command::Check(args) => check::run(&args, &mut out),
+        Command::Check(args) => match check::run(&args, &mut out) {
+            Err(check::Wrong::Printed) => return out.finish(|_| ExitCode::from(2)),
+            Err(check::Wrong::Said(message)) => Err(message),
+            Ok(()) => Ok(()),
+        },
         Command::Export(args) => export::run(&args, &mut out),
         Command::Image(args) => image::run(&args, &mut out),
         Command::Encode(args) => encode(&args, &mut out),

@@ -129,7 +129,9 @@ impl Document {
             let next = match &node.value {
                 Value::Table(table) => table.get(key).map(|entry| &entry.node),
                 Value::Array(items) => {
-                    items.iter().find(|item| name_of(item).is_some_and(|name| name == *key))
+                    let named = items.iter().find(|item| name_of(item).is_some_and(|name| name == *key));
+                    let number = || key.parse::<usize>().ok()?.checked_sub(1);
+                    named.or_else(|| items.get(number()?))
                 }
                 _ => None,
             };
