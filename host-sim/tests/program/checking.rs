@@ -168,3 +168,31 @@ fn the_schema_is_printed() {
     }
     assert_eq!(json(&["export", "schema"]), json(&["export", "schema", "gateway"]));
 }
+
+/// The keys of a value, at any depth.
+fn keys(value: &Value, all: &mut std::collections::BTreeSet<String>) {
+    match value {
+        Value::Object(object) => {
+            for (key, value) in object {
+                all.insert(key.clone());
+                keys(value, all);
+            }
+        }
+        Value::Array(items) => items.iter().for_each(|item| keys(item, all)),
+        _ => {}
+    }
+}
+
+#[test]
+fn every_key_of_the_json_is_documented() {
+    let page = std::fs::read_to_string(recipe_test_kit::repository().join("docs/checking.md")).unwrap();
+    let mut all = std::collections::BTreeSet::new();
+    for file in examples() {
+        keys(&json(&["check", file.to_str().unwrap(), "--json"]).1, &mut all);
+    }
+    let file = path("rs485-system.toml");
+    keys(&json(&["check", &file, "--json", "--set", "port.rs485-1.baud=1"]).1, &mut all);
+    keys(&json(&["check", &file, "--json", "--set", "network.address=192.168.12.20/24"]).1, &mut all);
+    let missing: Vec<_> = all.iter().filter(|key| !page.contains(&format!("`{key}`"))).collect();
+    assert!(all.len() > 60 && missing.is_empty(), "{} keys; not in docs/checking.md: {missing:?}", all.len());
+}

@@ -4,6 +4,7 @@
 //! [`FileError`]; the keys are those of docs/configuration.md.
 
 pub(crate) mod bindings;
+pub(crate) mod checksums;
 mod coils;
 pub(crate) mod commands;
 pub(crate) mod controller;

@@ -13,6 +13,7 @@ use proto_core::wire::can::CanId;
 use proto_core::wire::scalar::ScalarType;
 
 use super::bindings::{self, FileInput, FileOutput};
+use super::checksums;
 use super::device::{self, FieldReader};
 use super::encoding::refuse;
 use super::exchanges::{self, FileExchange};
@@ -457,7 +458,7 @@ pub(super) fn read_fields(
             (Mode::User, None) => reader.read(&item, &mut fields)?,
         }
     }
-    device::read_checksum(table, head, &mut fields)?;
+    checksums::read_checksum(table, head, &mut fields)?;
     Ok(fields)
 }
 

@@ -3,7 +3,7 @@
 use proto_core::device::{Algorithm, MAX_DATA_ID};
 
 use super::{Case, Key, Shape, Table, Text, When, words};
-use crate::file::device::{CHECKSUM_FORMS, CHECKSUM_ORDERS, DATA_ID_PLACES};
+use crate::file::checksums::{CHECKSUM_FORMS, CHECKSUM_ORDERS, DATA_ID_PLACES};
 use crate::file::encoding::{ORDERS, WORD_ORDERS};
 use crate::file::framings::{ESCAPES, FRAMINGS};
 
