@@ -6,6 +6,7 @@ use proto_core::sysvar::{SysVar, VarBit};
 
 use super::commands::{self, FileCommands};
 use super::encoding::refuse;
+use super::names::meant_variable;
 use super::reader::{Item, Reader, Result, Spot};
 use super::sources;
 use crate::keys::field::COUNTER_TABLE;
@@ -105,7 +106,8 @@ pub(super) fn read_rising(item: &Item<'_>, text: &str, others: &str) -> Result<(
             item.error(format!("{text:?} names no bit; write for example \"rising:BitOutputReg[3].0\""))
         );
     };
-    let var = SysVar::parse(name).map_err(|error| item.error(format!("{name:?}: {error}")))?;
+    let var = SysVar::parse(name)
+        .map_err(|error| item.error(format!("{name:?}: {error}{}", meant_variable(name))))?;
     Ok((var, bit))
 }
 
@@ -136,7 +138,9 @@ fn read_to(field: &Reader<'_>, to: &Item<'_>) -> Result<FileInput> {
             &["scale", "offset"],
             "not allowed for a bit: it is off for 0 and on for any other value",
         )?;
-        return bit.map(FileInput::Bit).map_err(|error| to.error(format!("{name:?}: {error}")));
+        return bit
+            .map(FileInput::Bit)
+            .map_err(|error| to.error(format!("{name:?}: {error}{}", meant_variable(name))));
     }
     let (scale, offset) = read_scale(field)?;
     Ok(FileInput::Variable { var: read_var(to)?, scale, offset })
@@ -181,8 +185,8 @@ pub(super) fn read_output(field: &Reader<'_>) -> Result<FileOutput> {
             name => match VarBit::parse(name) {
                 Some(bit) => {
                     refuse(field, &["scale", "offset"], "not allowed for a bit: it is 0 or 1")?;
-                    let VarBit { var, bit } =
-                        bit.map_err(|error| from.error(format!("{name:?}: {error}")))?;
+                    let VarBit { var, bit } = bit
+                        .map_err(|error| from.error(format!("{name:?}: {error}{}", meant_variable(name))))?;
                     return Ok(FileOutput::Bound(OutputBinding::Bit { var, bit }));
                 }
                 None => {
@@ -204,7 +208,7 @@ pub(super) fn read_output(field: &Reader<'_>) -> Result<FileOutput> {
 
 fn read_var(item: &Item<'_>) -> Result<SysVar> {
     let name = item.string()?;
-    SysVar::parse(name).map_err(|error| item.error(format!("{name:?}: {error}")))
+    SysVar::parse(name).map_err(|error| item.error(format!("{name:?}: {error}{}", meant_variable(name))))
 }
 
 fn read_scale(field: &Reader<'_>) -> Result<(f32, f32)> {

@@ -9,6 +9,7 @@ use proto_core::device::{
 use proto_core::sysvar::{Direction, SysVar, VarRange};
 
 use super::encoding::refuse;
+use super::names::meant_variable;
 use super::reader::{Item, Reader, Result};
 use crate::keys::device::{ESCAPE, FRAMING};
 use crate::keys::field::{COUNTS as COUNTS_KEY, PLUS, TEXT_IN, TEXT_ORDER, TEXT_OUT, TEXT_WIDTH};
@@ -138,12 +139,13 @@ fn one_character(item: &Item<'_>) -> Result<u8> {
 
 fn read_var(item: &Item<'_>) -> Result<SysVar> {
     let name = item.string()?;
-    SysVar::parse(name).map_err(|error| item.error(format!("{name:?}: {error}")))
+    SysVar::parse(name).map_err(|error| item.error(format!("{name:?}: {error}{}", meant_variable(name))))
 }
 
 fn read_words(item: &Item<'_>, order: ByteOrder) -> Result<Words> {
     let name = item.string()?;
-    let range = VarRange::parse(name).map_err(|error| item.error(format!("{name:?}: {error}")))?;
+    let range = VarRange::parse(name)
+        .map_err(|error| item.error(format!("{name:?}: {error}{}", meant_variable(name))))?;
     let mut vars = range.iter();
     let count = vars.len() as u8;
     let first = vars.next().ok_or_else(|| item.error("names no variable"))?;

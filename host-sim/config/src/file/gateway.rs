@@ -20,6 +20,7 @@ use super::bindings::FileInput;
 use super::commands::FileCommand;
 use super::document::{At, Document};
 use super::lines::{key_name, read_bitrate, read_cycle, read_line, read_rtu_line};
+use super::names::meant_variable;
 use super::network::{self, check_ipv4};
 use super::reader::{Item, Reader, Result, Spot};
 use super::recipes::{self, FileField, FileRecipe, Flavour, RecipeKind};
@@ -326,7 +327,8 @@ impl<'a> Builder<'a> {
             let value = match VarBit::parse(name) {
                 Some(bit) => self.safe_bit(bit, &key_spot, &item)?,
                 None => {
-                    let var = SysVar::parse(name).map_err(|error| self.error(&key_spot, error))?;
+                    let var = SysVar::parse(name)
+                        .map_err(|error| self.error(&key_spot, format!("{error}{}", meant_variable(name))))?;
                     let value =
                         Scalar::from_f64(var.ty(), item.number()?).map_err(|error| item.error(error))?;
                     SafeValue::new(var, value)

@@ -19,7 +19,7 @@ use super::encoding::refuse;
 use super::exchanges::{self, FileExchange};
 use super::framings;
 use super::modbus;
-use super::names::did_you_mean;
+use super::names::{did_you_mean, meant_variable};
 use super::reader::{Item, Reader, Result, Spot};
 use crate::device::AnyRecipe;
 use crate::keys;
@@ -435,8 +435,8 @@ pub(super) fn read_fields(
     for item in list.array("of fields, such as [\"RobotState[8..13]\"]")? {
         match (rules.mode, item.as_string()) {
             (Mode::Realtime, Some(name)) => {
-                let range =
-                    VarRange::parse(name).map_err(|error| item.error(format!("{name:?}: {error}")))?;
+                let range = VarRange::parse(name)
+                    .map_err(|error| item.error(format!("{name:?}: {error}{}", meant_variable(name))))?;
                 fields.extend(
                     range
                         .iter()

@@ -7,7 +7,7 @@ use proto_core::config::{OutputBinding, PortHealth, PortValue, StateValue};
 use proto_core::sysvar::SysVar;
 
 use super::bindings::FileOutput;
-use super::names::did_you_mean;
+use super::names::{did_you_mean, meant_variable};
 use super::reader::{Item, Result};
 use crate::keys::gateway::HEALTH_TABLE;
 
@@ -82,7 +82,8 @@ pub(super) fn read_health(item: &Item<'_>) -> Result<PortHealth> {
                  FloatInputReg"
             )));
         }
-        let var = SysVar::parse(text).map_err(|error| item.error(format!("{text:?}: {error}")))?;
+        let var = SysVar::parse(text)
+            .map_err(|error| item.error(format!("{text:?}: {error}{}", meant_variable(text))))?;
         health.set(value, var);
     }
     Ok(health)
