@@ -110,7 +110,7 @@ fn read_covered(item: &Item<'_>) -> Result<(u16, Option<u16>)> {
 
 /// The number of fields before the byte that `item` names.
 fn find_place(item: &Item<'_>, head: usize, fields: &[FileField]) -> Result<usize> {
-    let at: usize = item.integer(0..=MAX_STREAM_FRAME as i64 - 1)?;
+    let at: usize = item.integer(device::AT.integers())?;
     // Places between two fields; behind one of varying length no byte has a number.
     let mut places = Vec::new();
     let mut offset = Some(head);

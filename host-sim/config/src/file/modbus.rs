@@ -205,7 +205,7 @@ fn read_block(table: &Reader<'_>, peer: u8) -> Result<FileExchange> {
 
 /// The address of the first register or coil. Manuals' numbers of six digits are no addresses.
 fn read_first(item: &Item<'_>, table: Table) -> Result<u16> {
-    item.integer(0..=0xFFFF).map_err(|mut error| {
+    item.integer(exchange::ADDRESS.integers()).map_err(|mut error| {
         let number = item.as_integer().and_then(|number| u32::try_from(number).ok());
         if let Some(address) = number.and_then(|number| table.on_line().address_of_number(number)) {
             error.message += &format!("; on the line, what a manual calls so has the address {address}");
@@ -338,7 +338,7 @@ fn check(
             return Err(list.item.error(ExchangeError::Count(error)));
         }
         let Some(item) = table.optional(key).or_else(|| table.optional("address")) else { continue };
-        let address: u16 = item.integer(0..=0xFFFF)?;
+        let address: u16 = item.integer(exchange::ADDRESS.integers())?;
         if u32::from(address) + u32::from(list.count) > 0x1_0000 {
             return Err(item.error(ExchangeError::BeyondLast { address, count: list.count }));
         }

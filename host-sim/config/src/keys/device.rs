@@ -1,6 +1,7 @@
 //! Frames of devices: orders of bytes, what tells frames apart, checksums.
 
 use proto_core::device::{Algorithm, MAX_DATA_ID};
+use proto_core::recipe::model::MAX_STREAM_FRAME;
 
 use super::{Case, Key, Shape, Table, Text, When, words};
 use crate::file::checksums::{CHECKSUM_FORMS, CHECKSUM_ORDERS, DATA_ID_PLACES};
@@ -44,7 +45,7 @@ pub const OVER: Key = Key::text_of("over", Text::Pattern("^[0-9]+\\.\\.[0-9]*$")
      the frame; the head counts",
 );
 /// Where it stands.
-pub const AT: Key = Key::integer("at", 0, 511)
+pub const AT: Key = Key::integer("at", 0, MAX_STREAM_FRAME as i64 - 1)
     .absent("behind the fields, before the tail")
     .is("the byte at which it stands, where a field begins or ends");
 /// Its order of bytes.

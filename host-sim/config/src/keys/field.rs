@@ -1,7 +1,7 @@
 //! The fields of user recipes, and what stands in their place.
 
 use proto_core::config::MAX_COMMAND_TEXT;
-use proto_core::device::{MAX_IGNORED, MAX_TEXT};
+use proto_core::device::{MAX_DIGITS, MAX_IGNORED, MAX_TEXT};
 use proto_core::wire::scalar::ScalarType;
 
 use super::device::{ENDIAN, WORD_ORDER};
@@ -47,7 +47,7 @@ pub const NEW: Key = Key::bool("new").beside(&["bits"]).tells(
      number as long as their bits differ. `false`: shares it in another byte order too",
 );
 /// The width of digits.
-pub const WIDTH: Key = Key::integer("width", 1, 16)
+pub const WIDTH: Key = Key::integer("width", 1, MAX_DIGITS as i64)
     .required()
     .tells("bytes of `bcd`, 1..=4; characters of `decimal`, 1..=16, or of `hex`, 1..=8");
 const WIDTH_IF_ANY: Key = Key { need: super::Need::Absent("none"), ..WIDTH };
