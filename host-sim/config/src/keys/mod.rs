@@ -1,7 +1,7 @@
 //! The keys of the files: their types, units, ranges, defaults and meanings, each once.
 //!
 //! The reader takes from here which keys a table has, the ranges of its numbers, its words and its defaults;
-//! [`schema`](crate::schema::schema) and the tables of docs/configuration.md are made from it. What depends on
+//! [`schema`](fn@crate::schema) and the tables of docs/configuration.md are made from it. What depends on
 //! other parts of a file, such as the names of recipes, is the reader's own.
 
 pub mod controller;
