@@ -8,6 +8,8 @@
 mod device;
 pub mod file;
 mod functions;
+pub mod keys;
+mod schema;
 mod sim;
 mod target;
 
@@ -18,6 +20,7 @@ pub use file::function_name;
 pub use functions::{
     FUNCTION_INPUTS, FUNCTION_OUTPUTS, Function, FunctionInput, FunctionOutput, Functions, ShownState,
 };
+pub use schema::{FileKind, schema};
 pub use sim::{
     AnalogInput, BitGroup, CommandClients, Initial, InitialTarget, Listen, Power, Robot, RobotMode, SimBus,
     SimCanFrame, SimConfig, SimField, SimParts, SimPort, SimProgram, SimRecipe, SimStreamPart,

@@ -1,92 +1,142 @@
 //! The exchanges of a recipe as `check` draws them: what is asked when, its bytes, and its time.
 
-use proto_core::config::{AskWhen, Bus, Exchange, GatewayConfig, Port};
+use proto_core::config::{AskWhen, Exchange, GatewayConfig, Port};
 use proto_core::device::Carrier;
 use proto_core::modbus::rtu::{BROADCAST, Operation, Table};
 use proto_core::sysvar::Direction;
-use recipe_config::{DeviceRecipe, ExchangeKind, NamedExchange, NamedFrame, function_name};
+use recipe_config::{DeviceRecipe, ExchangeKind, NamedExchange, function_name};
+use serde::Serialize;
 
-use super::{frame, text};
+use super::frame::{self, Row};
+use super::text;
 
-/// All exchanges of a port's recipe, and how much of the line they take together.
-pub(super) fn show(config: &GatewayConfig, port: &Port, recipe: &DeviceRecipe) -> String {
+/// One exchange, or one block of a slave.
+#[derive(Debug, Serialize)]
+pub(super) struct Talk {
+    /// From 1.
+    number: usize,
+    /// `exchange` or `block`.
+    kind: &'static str,
+    /// Who is asked, and for what.
+    what: String,
+    /// When it is asked.
+    when: String,
+    frames: Vec<TalkFrame>,
+    /// On the line, with silences and pause.
+    takes_us: u64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    without_reply_us: Option<u64>,
+    /// Of the line, if it has a period.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    percent: Option<u64>,
+}
+
+#[derive(Debug, Serialize)]
+struct TalkFrame {
+    /// `request`, `reply` or `refusal`.
+    frame: &'static str,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    id: Option<String>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    bytes: Option<usize>,
+    remote: bool,
+    rows: Vec<Row>,
+}
+
+/// All exchanges of a port's recipe.
+pub(super) fn all(config: &GatewayConfig, port: &Port, recipe: &DeviceRecipe) -> Vec<Talk> {
     let exchanges =
         config.recipes.get(usize::from(port.recipe)).map(|recipe| config.view().exchanges_of(recipe));
-    let mut report = String::new();
-    for (nth, (exchange, named)) in (1..).zip(exchanges.unwrap_or(&[]).iter().zip(&recipe.exchanges)) {
-        report += &show_one(config, port, nth, exchange, named);
-    }
-    if let Some(percent) = config.view().line_share(port) {
-        let what = if matches!(port.bus, Bus::Can { .. }) { "bus" } else { "line" };
-        report += &format!("  all of them with a period take {percent} % of the {what}\n");
-    }
-    report
+    let pairs = exchanges.unwrap_or(&[]).iter().zip(&recipe.exchanges);
+    (1..)
+        .zip(pairs)
+        .map(|(number, (exchange, named))| Talk::new(config, port, number, exchange, named))
+        .collect()
 }
 
-fn show_one(
-    config: &GatewayConfig,
-    port: &Port,
-    nth: usize,
-    exchange: &Exchange,
-    named: &NamedExchange,
-) -> String {
-    let what = match named.kind {
-        ExchangeKind::Slave(_) => "block",
-        _ => "exchange",
-    };
-    let mut report = format!("  {what} {nth}: {}{}\n", show_subject(named), show_when(exchange, named));
-    let budget = config.view().exchange_budget(port, exchange);
-    // A slave receives requests and sends replies.
-    let (asks, answers) = match named.kind {
-        ExchangeKind::Slave(_) => (Direction::Input, Direction::Output),
-        _ => (Direction::Output, Direction::Input),
-    };
-    for (name, frame, part, len) in [
-        ("request", &named.request, asks, Some(budget.request)),
-        ("reply", &named.reply, answers, Some(budget.reply)),
-        // Of Modbus it is always the same.
-        ("refusal", &named.refusal, Direction::Input, None),
-    ] {
-        let Some(frame) = frame.as_ref().filter(|_| name != "refusal" || named.kind == ExchangeKind::Frames)
-        else {
-            continue;
+impl Talk {
+    fn new(
+        config: &GatewayConfig,
+        port: &Port,
+        number: usize,
+        exchange: &Exchange,
+        named: &NamedExchange,
+    ) -> Self {
+        let kind = match named.kind {
+            ExchangeKind::Slave(_) => "block",
+            _ => "exchange",
         };
-        let is_remote = named.remote && name == "request";
-        report += &show_frame(name, frame, part, len, is_remote);
+        let budget = config.view().exchange_budget(port, exchange);
+        // A slave receives requests and sends replies.
+        let (asks, answers) = match named.kind {
+            ExchangeKind::Slave(_) => (Direction::Input, Direction::Output),
+            _ => (Direction::Output, Direction::Input),
+        };
+        let mut frames = Vec::new();
+        for (name, frame, part, len) in [
+            ("request", &named.request, asks, Some(budget.request)),
+            ("reply", &named.reply, answers, Some(budget.reply)),
+            // Of Modbus it is always the same.
+            ("refusal", &named.refusal, Direction::Input, None),
+        ] {
+            let is_shown = name != "refusal" || named.kind == ExchangeKind::Frames;
+            let Some(frame) = frame.as_ref().filter(|_| is_shown) else { continue };
+            let remote = named.remote && name == "request";
+            let carrier = if frame.id.is_some() { Carrier::Can } else { Carrier::Stream };
+            frames.push(TalkFrame {
+                frame: name,
+                id: frame.id.map(text::show_id),
+                bytes: len.filter(|_| !remote),
+                remote,
+                rows: frame::rows(frame, carrier, part),
+            });
+        }
+        let takes_us = budget.time.as_micros();
+        let longest = budget.time_without_reply.as_micros();
+        Self {
+            number,
+            kind,
+            what: subject(named),
+            when: times(exchange, named),
+            frames,
+            takes_us,
+            without_reply_us: (longest > takes_us).then_some(longest),
+            percent: exchange.when.every.map(|every| (takes_us * 100).div_ceil(every.as_micros().max(1))),
+        }
     }
-    let micros = budget.time.as_micros();
-    let own = exchange
-        .when
-        .every
-        .map(|every| format!(", {} % of the time", (micros * 100).div_ceil(every.as_micros().max(1))));
-    let lost = match budget.time_without_reply.as_micros() {
-        longest if longest > micros => format!(", {} without a reply", show_time(longest)),
-        _ => String::new(),
-    };
-    report += &format!("    takes {}{lost}{}\n", show_time(micros), own.unwrap_or_default());
-    report
+
+    /// As text.
+    pub(super) fn show(&self) -> String {
+        let when = if self.when.is_empty() { String::new() } else { format!(", {}", self.when) };
+        let mut report = format!("  {} {}: {}{when}\n", self.kind, self.number, self.what);
+        report.extend(self.frames.iter().map(TalkFrame::show));
+        let lost = self.without_reply_us.map(|longest| format!(", {} without a reply", show_time(longest)));
+        let own = self.percent.map(|percent| format!(", {percent} % of the time"));
+        report += &format!(
+            "    takes {}{}{}\n",
+            show_time(self.takes_us),
+            lost.unwrap_or_default(),
+            own.unwrap_or_default()
+        );
+        report
+    }
 }
 
-fn show_frame(
-    name: &str,
-    frame: &NamedFrame,
-    part: Direction,
-    len: Option<usize>,
-    is_remote: bool,
-) -> String {
-    let id = frame.id.map_or(String::new(), |id| format!(", id {}", text::show_id(id)));
-    let carrier = if frame.id.is_some() { Carrier::Can } else { Carrier::Stream };
-    let size = match len {
-        _ if is_remote => ", remote".to_owned(),
-        Some(1) => ", 1 byte".to_owned(),
-        Some(len) => format!(", {len} bytes"),
-        None => String::new(),
-    };
-    format!("   {name}{id}{size}\n{}", frame::show_bytes(frame, carrier, part))
+impl TalkFrame {
+    fn show(&self) -> String {
+        let id = self.id.as_ref().map_or(String::new(), |id| format!(", id {id}"));
+        let size = match self.bytes {
+            _ if self.remote => ", remote".to_owned(),
+            Some(1) => ", 1 byte".to_owned(),
+            Some(len) => format!(", {len} bytes"),
+            None => String::new(),
+        };
+        format!("   {}{id}{size}\n{}", self.frame, frame::show_rows(&self.rows))
+    }
 }
 
 /// Who is asked, and for what.
-fn show_subject(named: &NamedExchange) -> String {
+fn subject(named: &NamedExchange) -> String {
     let peer = named.peer;
     match &named.kind {
         ExchangeKind::Frames if peer == 0 => "own frames".to_owned(),
@@ -124,7 +174,7 @@ fn show_subject(named: &NamedExchange) -> String {
     }
 }
 
-fn show_when(exchange: &Exchange, named: &NamedExchange) -> String {
+fn times(exchange: &Exchange, named: &NamedExchange) -> String {
     let AskWhen { every, start, change, rising } = exchange.when;
     let mut times = Vec::new();
     times.extend(every.map(|every| format!("every {every}")));
@@ -133,8 +183,8 @@ fn show_when(exchange: &Exchange, named: &NamedExchange) -> String {
     times.extend(rising.map(|(var, bit)| format!("when {var}.{bit} rises")));
     match named.kind {
         ExchangeKind::Slave(_) => String::new(),
-        _ if times.is_empty() => ", comes unasked".to_owned(),
-        _ => format!(", {}", times.join(", ")),
+        _ if times.is_empty() => "comes unasked".to_owned(),
+        _ => times.join(", "),
     }
 }
 

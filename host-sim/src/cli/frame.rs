@@ -8,57 +8,91 @@ use proto_core::device::{
 use proto_core::sysvar::Direction;
 use proto_core::wire::scalar::ScalarType;
 use recipe_config::{DeviceField, DeviceRecipe, FrameEnds, NamedFrame};
+use serde::Serialize;
 
 use super::{scale, text};
 
 /// One line of the picture.
-struct Row {
-    place: String,
+#[derive(Debug, Serialize)]
+pub(super) struct Row {
+    /// `0`, `0..1`, `2..` for a length that varies, or `then` behind that.
+    bytes: String,
     name: String,
-    what: String,
+    is: String,
+}
+
+/// The frames of one part.
+#[derive(Debug, Default, Serialize)]
+pub(super) struct Picture {
+    /// What tells frames apart, if the fields do not.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    ends: Option<&'static str>,
+    frames: Vec<Frame>,
+}
+
+/// One frame.
+#[derive(Debug, Serialize)]
+struct Frame {
+    #[serde(skip_serializing_if = "Option::is_none")]
+    id: Option<String>,
+    rows: Vec<Row>,
 }
 
 /// The frames of one part, a line for each run of bytes.
-pub(super) fn show(recipe: &DeviceRecipe, part: Direction) -> String {
-    let mut report = match recipe.ends(part) {
-        FrameEnds { escape: Some(Escape::Dle), .. } => "    between DLE STX and DLE ETX:\n",
-        FrameEnds { escape: Some(Escape::Slip), .. } => "    with the escape bytes of SLIP:\n",
-        FrameEnds { escape: Some(Escape::Cobs), .. } => "    with the escape bytes of COBS:\n",
-        FrameEnds { boundary: Boundary::Tail, .. } => "    up to each tail:\n",
-        FrameEnds { boundary: Boundary::Silence, .. } => "    between silences of the line:\n",
-        FrameEnds { boundary: Boundary::Fields, .. } => "",
-    }
-    .to_owned();
-    for frame in recipe.part(part) {
-        if let Some(id) = frame.id {
-            report += &format!("    id {}\n", text::show_id(id));
-        }
-        report += &show_bytes(frame, recipe.carrier, part);
-    }
-    report
+pub(super) fn picture(recipe: &DeviceRecipe, part: Direction) -> Picture {
+    let ends = match recipe.ends(part) {
+        FrameEnds { escape: Some(Escape::Dle), .. } => Some("between DLE STX and DLE ETX"),
+        FrameEnds { escape: Some(Escape::Slip), .. } => Some("with the escape bytes of SLIP"),
+        FrameEnds { escape: Some(Escape::Cobs), .. } => Some("with the escape bytes of COBS"),
+        FrameEnds { boundary: Boundary::Tail, .. } => Some("up to each tail"),
+        FrameEnds { boundary: Boundary::Silence, .. } => Some("between silences of the line"),
+        FrameEnds { boundary: Boundary::Fields, .. } => None,
+    };
+    let frame = |frame: &NamedFrame| Frame {
+        id: frame.id.map(text::show_id),
+        rows: rows(frame, recipe.carrier, part),
+    };
+    Picture { ends, frames: recipe.part(part).iter().map(frame).collect() }
 }
 
-/// One frame, a line for each run of bytes.
-pub(super) fn show_bytes(frame: &NamedFrame, carrier: Carrier, part: Direction) -> String {
-    // Cannot fail: reading the file laid out the same frames.
-    let Ok(laid_out) = frame.lay_out(carrier, part) else { return String::new() };
-    let rows = rows(frame, &laid_out, part);
+impl Picture {
+    /// As text.
+    pub(super) fn show(&self) -> String {
+        let mut report = self.ends.map_or_else(String::new, |ends| format!("    {ends}:\n"));
+        for frame in &self.frames {
+            if let Some(id) = &frame.id {
+                report += &format!("    id {id}\n");
+            }
+            report += &show_rows(&frame.rows);
+        }
+        report
+    }
+}
+
+/// Aligned lines.
+pub(super) fn show_rows(rows: &[Row]) -> String {
     let width =
         |column: fn(&Row) -> &String| rows.iter().map(|row| column(row).chars().count()).max().unwrap_or(0);
-    let (places, names) = (width(|row| &row.place), width(|row| &row.name));
-    let show = |Row { place, name, what }: &Row| format!("    {place:places$}  {name:names$}  {what}\n");
+    let (places, names) = (width(|row| &row.bytes), width(|row| &row.name));
+    let show = |Row { bytes, name, is }: &Row| format!("    {bytes:places$}  {name:names$}  {is}\n");
     rows.iter().map(show).collect()
 }
 
-fn rows(frame: &NamedFrame, laid_out: &DeviceFrame, part: Direction) -> Vec<Row> {
+/// A line for each run of bytes of one frame.
+pub(super) fn rows(frame: &NamedFrame, carrier: Carrier, part: Direction) -> Vec<Row> {
+    // Cannot fail: reading the file laid out the same frames.
+    frame.lay_out(carrier, part).map_or_else(|_| Vec::new(), |laid_out| laid_out_rows(frame, &laid_out, part))
+}
+
+fn laid_out_rows(frame: &NamedFrame, laid_out: &DeviceFrame, part: Direction) -> Vec<Row> {
     let mut places = Vec::new();
     laid_out.layout.parts(&laid_out.elements, |_, place| places.push(place));
     // Head, fields with the checksum among them, tail: as below.
     let mut places = places.into_iter();
     let mut rows = Vec::new();
     let mut add = |place: Option<Place>, name: &str, what: String| {
-        let place = place.map(show_place).unwrap_or_default();
-        rows.push(Row { place, name: name.to_owned(), what });
+        let bytes = place.map(show_place).unwrap_or_default();
+        rows.push(Row { bytes, name: name.to_owned(), is: what });
     };
     if !frame.head.is_empty() {
         add(places.next(), "head", text::hex(&frame.head));
@@ -295,7 +329,7 @@ recipe = "reader"
     fn texts_have_their_bytes() {
         let recipes = parse_recipes(Text { name: "reader.toml", toml: READER }, &[]).unwrap();
         let [AnyRecipe::Device(recipe)] = &recipes[..] else { panic!("{recipes:?}") };
-        let shown = show(recipe, Direction::Input);
+        let shown = super::picture(recipe, Direction::Input).show();
         let shown: Vec<_> = shown.lines().map(str::trim).collect();
         assert_eq!(
             shown,
@@ -321,7 +355,7 @@ recipe = "reader"
         );
         let recipes = parse_recipes(Text { name: "test.toml", toml: &toml }, &[]).unwrap();
         let [AnyRecipe::Device(recipe)] = &recipes[..] else { panic!("{recipes:?}") };
-        show(recipe, Direction::Input)
+        super::picture(recipe, Direction::Input).show()
     }
 
     #[test]

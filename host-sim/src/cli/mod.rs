@@ -8,6 +8,7 @@ mod check;
 mod codec;
 mod conversation;
 mod convert;
+mod export;
 mod frame;
 mod image;
 mod log;
@@ -86,6 +87,9 @@ enum Command {
     /// Check a file; print the bus budget, the way of each variable and what to set on the pendant
     #[command(after_help = CHECK_EXAMPLES)]
     Check(check::CheckArgs),
+    /// Print what other tools read: the JSON Schema of a file
+    #[command(after_help = export::EXAMPLES)]
+    Export(export::ExportArgs),
     /// Write the configuration image for a board
     #[command(after_help = IMAGE_EXAMPLES)]
     Image(image::ImageArgs),
@@ -130,8 +134,11 @@ const CHECK_EXAMPLES: &str = "\
 Examples:
   host-sim check cell.toml
   host-sim check cell.toml --set port.rs485-1.baud=9600
+  host-sim check cell.toml --same-bus can-1,can-2
+  host-sim check cell.toml --json
 
-If something is wrong: exit code 2 and one message with file, line, column and key.";
+If something is wrong: exit code 2 and one message with file, line, column and key.
+With --json it is on stdout: {\"ok\": false, \"errors\": [...]}.";
 
 const IMAGE_EXAMPLES: &str = "\
 Examples:
@@ -289,7 +296,12 @@ pub fn main() -> ExitCode {
             return out.finish(|_| code);
         }
         Command::New(args) => new::run(&args, &mut out),
-        Command::Check(args) => check::run(&args, &mut out),
+        Command::Check(args) => match check::run(&args, &mut out) {
+            Err(check::Wrong::Printed) => return out.finish(|_| ExitCode::from(2)),
+            Err(check::Wrong::Said(message)) => Err(message),
+            Ok(()) => Ok(()),
+        },
+        Command::Export(args) => export::run(&args, &mut out),
         Command::Image(args) => image::run(&args, &mut out),
         Command::Encode(args) => encode(&args, &mut out),
         Command::Decode(args) => decode(&args, &mut out),

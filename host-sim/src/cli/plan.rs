@@ -3,14 +3,24 @@
 use proto_core::config::{Bus, FieldSpec, GatewayConfig, InputBinding, OutputBinding, SendOn};
 use proto_core::engine::{LinkId, Plan, PortId, Source, WayUp};
 use proto_core::sysvar::{Direction, ModbusPlace, SysVar, VarBit};
+use serde::Serialize;
 
 const STATE_STREAM: &str = "<- controller: state stream, 10 a second";
 
-/// The ways and sources of all field ports' variables, one line per run of neighbours.
-pub(super) fn show(config: &GatewayConfig) -> String {
+/// The way up or the source of variables of a port.
+#[derive(Debug, Serialize)]
+pub(super) struct Way {
+    port: String,
+    /// Neighbours together: `WordInputReg[1..4]`, `BitInputReg[3].0,1`; or what else goes this way.
+    what: String,
+    /// With an arrow up or down.
+    way: String,
+}
+
+/// The ways and sources of all field ports' variables, one for each run of neighbours.
+pub(super) fn ways(config: &GatewayConfig) -> Vec<Way> {
     // Cannot fail for a valid configuration.
-    let Ok(plan) = Plan::new(config) else { return String::new() };
-    let mut report = String::from("\nways\n");
+    let Ok(plan) = Plan::new(config) else { return Vec::new() };
     let mut lines: Vec<(String, String, String)> = Vec::new();
     for (_, port, recipe) in config.view().field_ports() {
         let up = config.view().written_by(recipe).map(|var| (var, way_up(config, &plan, var)));
@@ -64,14 +74,19 @@ pub(super) fn show(config: &GatewayConfig) -> String {
             lines.push((port.name.to_string(), what, from));
         }
     }
-    let width = |column: fn(&(String, String, String)) -> &String| {
-        lines.iter().map(|line| column(line).chars().count()).max().unwrap_or(0)
-    };
-    let (ports, variables) = (width(|line| &line.0), width(|line| &line.1));
-    for (port, variable, way) in &lines {
-        report += &format!("  {port:ports$}  {variable:variables$}  {way}\n");
+    lines.into_iter().map(|(port, what, way)| Way { port, what, way }).collect()
+}
+
+/// The ways as text.
+pub(super) fn show(ways: &[Way]) -> String {
+    let mut report = String::from("\nways\n");
+    let width =
+        |column: fn(&Way) -> &String| ways.iter().map(|way| column(way).chars().count()).max().unwrap_or(0);
+    let (ports, variables) = (width(|way| &way.port), width(|way| &way.what));
+    for Way { port, what, way } in ways {
+        report += &format!("  {port:ports$}  {what:variables$}  {way}\n");
     }
-    if lines.is_empty() {
+    if ways.is_empty() {
         report += "  no port writes or shows a variable\n";
     }
     report

@@ -4,19 +4,78 @@
 
 use proto_core::config::{CommandWhen, GatewayConfig, OnStale, Port, SafeValue};
 use proto_core::sysvar::{Direction, SysVar};
+use proto_core::time::Duration;
 use recipe_config::{DeviceRecipe, ExchangeKind, FieldCommands, NamedFrame};
+use serde::Serialize;
 
 use super::text;
 
-/// A line for each command, or range of values that is idle.
-pub(super) fn show_commands(recipe: &DeviceRecipe) -> String {
+/// What a value, or a range of values, of a field picks.
+#[derive(Debug, Serialize)]
+pub(super) struct Picks {
+    field: String,
+    /// `becomes`, `is`.
+    when: &'static str,
+    first: i64,
+    last: i64,
+    /// Absent for values that pick nothing.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    command: Option<String>,
+}
+
+/// What becomes of a port's inputs without frames, and of its outputs without a source.
+#[derive(Debug, Serialize)]
+pub(super) struct Times {
+    #[serde(skip_serializing_if = "Option::is_none")]
+    timeout: Option<After>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    stale: Option<After>,
+}
+
+#[derive(Debug, Serialize)]
+struct After {
+    /// Absent if it never comes.
+    #[serde(skip_serializing_if = "Option::is_none", serialize_with = "millis")]
+    after_ms: Option<Duration>,
+    /// What happens then.
+    then: String,
+}
+
+fn millis<S: serde::Serializer>(time: &Option<Duration>, to: S) -> Result<S::Ok, S::Error> {
+    time.map(|time| time.as_micros() as f64 / 1e3).serialize(to)
+}
+
+/// Each command, or range of values that is idle.
+pub(super) fn commands(recipe: &DeviceRecipe) -> Vec<Picks> {
     let asked = recipe.exchanges.iter().flat_map(|exchange| match exchange.kind {
         // What the master writes; the reply repeats it.
         ExchangeKind::Slave(_) => exchange.request.as_ref(),
         _ => exchange.reply.as_ref(),
     });
-    let frames = recipe.part(Direction::Input).iter().chain(asked);
-    let rows: Vec<_> = frames.flat_map(rows_of).collect();
+    recipe.part(Direction::Input).iter().chain(asked).flat_map(picks_of).collect()
+}
+
+fn picks_of(frame: &NamedFrame) -> impl Iterator<Item = Picks> {
+    let fields = frame.fields.iter().filter_map(|field| Some((&field.name, field.commands.as_ref()?)));
+    fields.flat_map(|(name, commands)| {
+        commands.entries.iter().map(|(first, last, command)| Picks {
+            field: name.clone(),
+            when: verb(commands),
+            first: *first,
+            last: *last,
+            command: (!command.is_empty()).then(|| command.clone()),
+        })
+    })
+}
+
+/// A line for each command.
+pub(super) fn show_commands(commands: &[Picks]) -> String {
+    let row = |Picks { field, when, first, last, command }: &Picks| {
+        let values = if first == last { first.to_string() } else { format!("{first}..{last}") };
+        let command = command.as_deref().unwrap_or("none, idle");
+        [field.clone(), format!("{when} {values}"), command.to_owned()]
+    };
+    let rows: Vec<_> = commands.iter().map(row).collect();
     let width = |column: fn(&[String; 3]) -> &String| {
         rows.iter().map(|row| column(row).chars().count()).max().unwrap_or(0)
     };
@@ -25,18 +84,6 @@ pub(super) fn show_commands(recipe: &DeviceRecipe) -> String {
         |[name, value, command]: &[String; 3]| format!("    {name:names$}  {value:values$}  {command}\n");
     let lines: String = rows.iter().map(line).collect();
     if lines.is_empty() { lines } else { format!("  commands\n{lines}") }
-}
-
-/// Field, values and command.
-fn rows_of(frame: &NamedFrame) -> impl Iterator<Item = [String; 3]> {
-    let fields = frame.fields.iter().filter_map(|field| Some((&field.name, field.commands.as_ref()?)));
-    fields.flat_map(|(name, commands)| {
-        commands.entries.iter().map(|(first, last, command)| {
-            let values = if first == last { first.to_string() } else { format!("{first}..{last}") };
-            let command = if command.is_empty() { "none, idle" } else { command };
-            [name.clone(), format!("{} {values}", verb(commands)), command.to_owned()]
-        })
-    })
 }
 
 fn verb(commands: &FieldCommands) -> &'static str {
@@ -48,40 +95,59 @@ fn verb(commands: &FieldCommands) -> &'static str {
 }
 
 /// What happens to inputs without frames, and to an output without a source. A listening port has neither.
-pub(super) fn show_times(config: &GatewayConfig, port: &Port) -> String {
+pub(super) fn times(config: &GatewayConfig, port: &Port) -> Times {
     let view = config.view();
     let Some(recipe) = config.recipes.get(usize::from(port.recipe)).filter(|_| port.bus.is_field()) else {
-        return String::new();
+        return Times::NONE;
     };
     let written: Vec<SysVar> =
         view.written_by(recipe).chain(view.bits_written_by(recipe).map(|bit| bit.var)).collect();
-    let mut report = String::new();
-    if view.fields_of(recipe, Direction::Input).next().is_some() {
+    let has_input = view.fields_of(recipe, Direction::Input).next().is_some();
+    let timeout = has_input.then(|| {
         let safe = port.on_timeout.of(&config.safe_values);
-        let what = match (safe, written.is_empty()) {
+        let then = match (safe, written.is_empty()) {
+            _ if port.timeout == Port::NEVER => "all values hold".to_owned(),
             ([], true) => String::new(),
-            ([], false) => ": all values hold".to_owned(),
+            ([], false) => "all values hold".to_owned(),
             (safe, _) => {
                 let bits = view.bits_written_by(recipe).count() + view.written_by(recipe).count();
                 let others = if safe.len() < bits { "; others hold" } else { "" };
-                format!(": {}{others}", show_safe_values(safe))
+                format!("{}{others}", show_safe_values(safe))
             }
         };
-        report += &match port.timeout {
-            Port::NEVER => "  timeout  never: all values hold\n".to_owned(),
-            timeout => format!("  timeout  {timeout} without a frame{what}\n"),
-        };
-    }
+        After { after_ms: Some(port.timeout).filter(|timeout| *timeout != Port::NEVER), then }
+    });
     let shown =
         view.fields_of(recipe, Direction::Output).any(|(_, _, field)| field.variables().next().is_some());
-    if shown {
-        let what = match recipe.on_stale {
+    let stale = shown.then(|| {
+        let then = match recipe.on_stale {
             OnStale::Hold => "the last values are sent",
             OnStale::Stop => "nothing is sent",
         };
-        report += &format!("  stale    {} without a source: {what}\n", port.stale_after);
+        After { after_ms: Some(port.stale_after), then: then.to_owned() }
+    });
+    Times { timeout, stale }
+}
+
+impl Times {
+    /// Of a port that has none.
+    pub(super) const NONE: Self = Self { timeout: None, stale: None };
+
+    /// As text.
+    pub(super) fn show(&self) -> String {
+        let mut report = String::new();
+        if let Some(After { after_ms, then }) = &self.timeout {
+            let then = if then.is_empty() { String::new() } else { format!(": {then}") };
+            report += &match after_ms {
+                None => format!("  timeout  never{then}\n"),
+                Some(timeout) => format!("  timeout  {timeout} without a frame{then}\n"),
+            };
+        }
+        if let Some(After { after_ms: Some(after), then }) = &self.stale {
+            report += &format!("  stale    {after} without a source: {then}\n");
+        }
+        report
     }
-    report
 }
 
 /// `ForceEnd[1..6] = 0, BitInputReg[3].0,1 = 0`: neighbours and bits with the same value together.
@@ -169,7 +235,8 @@ mod tests {
         std::fs::write(&path, toml).unwrap();
         let config = recipe_config::file::load_gateway(&path, &[]).unwrap();
         let frames = recipe_config::file::load_frames(&path, &[]).unwrap();
-        [show_commands(frames[0].as_ref().unwrap()), show_times(&config, &config.ports[0])].concat()
+        [show_commands(&commands(frames[0].as_ref().unwrap())), times(&config, &config.ports[0]).show()]
+            .concat()
     }
 
     #[test]

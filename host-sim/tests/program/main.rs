@@ -1,5 +1,6 @@
 //! The program as users and scripts run it.
 
+mod checking;
 mod command_line;
 mod control;
 mod output;

@@ -37,6 +37,8 @@ fn command_lines(folder: &Path) -> Vec<Vec<String>> {
         line(&["check", &gateway]),
         line(&["new"]),
         line(&["new", "--device", "robotiq-ft300"]),
+        line(&["check", &gateway, "--json"]),
+        line(&["export", "schema"]),
         line(&["image", &gateway, "-o", &at("cell.img")]),
         line(&[&soak[..], &["--hours", "0.001"]].concat()),
         line(&[&soak[..], &["--replay", "9@2.5", "--trace"]].concat()),

@@ -1,13 +1,15 @@
 //! The bindings of fields and the triggers of output parts in a gateway file.
 
 use proto_core::config::{InputBinding, OnStale, OutputBinding, SendOn};
-use proto_core::device::Encoding;
+use proto_core::device::{Encoding, Overflow};
 use proto_core::sysvar::{SysVar, VarBit};
 
 use super::commands::{self, FileCommands};
 use super::encoding::refuse;
+use super::names::meant_variable;
 use super::reader::{Item, Reader, Result, Spot};
 use super::sources;
+use crate::keys::field::COUNTER_TABLE;
 
 /// The binding of an input field.
 pub(super) enum FileInput {
@@ -58,8 +60,13 @@ pub(super) struct Sending {
     pub(super) send_spot: Option<Spot>,
 }
 
+/// The words of `on_stale`.
+pub(crate) const ON_STALES: [(&str, OnStale); 2] = [("hold", OnStale::Hold), ("stop", OnStale::Stop)];
+/// The words of `overflow`.
+pub(crate) const OVERFLOWS: [(&str, Overflow); 1] = [("wrap", Overflow::Wrap)];
+
 pub(super) fn read_on_stale(item: &Item<'_>) -> Result<OnStale> {
-    item.choice(&[("hold", OnStale::Hold), ("stop", OnStale::Stop)])
+    item.choice(&ON_STALES)
 }
 
 pub(super) fn read_sending(part: &Reader<'_>) -> Result<Sending> {
@@ -99,7 +106,8 @@ pub(super) fn read_rising(item: &Item<'_>, text: &str, others: &str) -> Result<(
             item.error(format!("{text:?} names no bit; write for example \"rising:BitOutputReg[3].0\""))
         );
     };
-    let var = SysVar::parse(name).map_err(|error| item.error(format!("{name:?}: {error}")))?;
+    let var = SysVar::parse(name)
+        .map_err(|error| item.error(format!("{name:?}: {error}{}", meant_variable(name))))?;
     Ok((var, bit))
 }
 
@@ -110,7 +118,7 @@ pub(super) fn read_input(field: &Reader<'_>) -> Result<(FileInput, Option<FileIn
         refuse(field, &["scale", "offset"], "allowed only together with to")?;
     }
     if commands.is_none() {
-        refuse(field, &commands::KEYS, "allowed only together with commands")?;
+        refuse(field, &["when", "base", "idle"], "allowed only together with commands")?;
     }
     let to = to.map(|to| read_to(field, &to)).transpose()?;
     let commands = commands.map(|item| commands::read(field, &item).map(FileInput::Commands)).transpose()?;
@@ -130,7 +138,9 @@ fn read_to(field: &Reader<'_>, to: &Item<'_>) -> Result<FileInput> {
             &["scale", "offset"],
             "not allowed for a bit: it is off for 0 and on for any other value",
         )?;
-        return bit.map(FileInput::Bit).map_err(|error| to.error(format!("{name:?}: {error}")));
+        return bit
+            .map(FileInput::Bit)
+            .map_err(|error| to.error(format!("{name:?}: {error}{}", meant_variable(name))));
     }
     let (scale, offset) = read_scale(field)?;
     Ok(FileInput::Variable { var: read_var(to)?, scale, offset })
@@ -150,7 +160,7 @@ pub(super) fn read_counter(field: &Reader<'_>, encoding: &Encoding) -> Result<Op
             false => Ok(None),
         };
     }
-    let max = item.table(&["max"])?.required("max", "the highest number of the counter")?;
+    let max = item.table(&COUNTER_TABLE)?.required("max", "the highest number of the counter")?;
     max.integer(1..=i64::from(high)).map(Some)
 }
 
@@ -175,8 +185,8 @@ pub(super) fn read_output(field: &Reader<'_>) -> Result<FileOutput> {
             name => match VarBit::parse(name) {
                 Some(bit) => {
                     refuse(field, &["scale", "offset"], "not allowed for a bit: it is 0 or 1")?;
-                    let VarBit { var, bit } =
-                        bit.map_err(|error| from.error(format!("{name:?}: {error}")))?;
+                    let VarBit { var, bit } = bit
+                        .map_err(|error| from.error(format!("{name:?}: {error}{}", meant_variable(name))))?;
                     return Ok(FileOutput::Bound(OutputBinding::Bit { var, bit }));
                 }
                 None => {
@@ -198,7 +208,7 @@ pub(super) fn read_output(field: &Reader<'_>) -> Result<FileOutput> {
 
 fn read_var(item: &Item<'_>) -> Result<SysVar> {
     let name = item.string()?;
-    SysVar::parse(name).map_err(|error| item.error(format!("{name:?}: {error}")))
+    SysVar::parse(name).map_err(|error| item.error(format!("{name:?}: {error}{}", meant_variable(name))))
 }
 
 fn read_scale(field: &Reader<'_>) -> Result<(f32, f32)> {

@@ -11,9 +11,7 @@ use super::device::{bind, binding_keys, read_constant, read_name};
 use super::encoding::refuse;
 use super::reader::{Item, Reader, Result, Spot};
 use super::recipes::{FileField, FileFieldKind, Written};
-
-/// Most coils that one exchange has.
-const MAX_COILS: i64 = 2_000;
+use crate::keys::field::{self, PAD_COILS};
 
 /// Coils, as they are read.
 struct Packer {
@@ -40,14 +38,14 @@ pub(super) fn read(list: &Item<'_>, direction: Direction) -> Result<(Vec<FileFie
 impl Packer {
     fn read(&mut self, table: &Reader<'_>, direction: Direction) -> Result<()> {
         if let Some(pad) = table.optional("pad") {
-            table.check_keys(&["pad"], " in padding of coils, which are sent as 0")?;
-            self.count += pad.integer::<usize>(1..=MAX_COILS)?;
+            table.check_keys(&[field::COIL_PADDING], " in padding of coils, which are sent as 0")?;
+            self.count += pad.integer::<usize>(PAD_COILS.integers())?;
             self.padded = Some(table.spot.clone());
             return Ok(());
         }
         refuse(table, &["type", "bits"], "a coil is one bit; it has no type and no bits")?;
         let keys = binding_keys(table, direction)?;
-        table.check_keys(&[&["name"], keys].concat(), " of a coil")?;
+        table.check_keys(&[field::COIL, keys], field::COIL_IN.place)?;
         let (byte, first) = (self.count / 8, (self.count % 8) as u8);
         self.pad_up_to(byte);
         let kind = Kind::Bits(Bits { bytes: 1, first, count: 1, signed: false });

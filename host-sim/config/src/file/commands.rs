@@ -7,9 +7,13 @@ use proto_core::config::CommandWhen;
 
 use super::reader::{Item, Reader, Result, Spot};
 use crate::device::FieldCommands;
+use crate::keys::field::{IDLE, WHEN};
 
-/// The keys of a field that belong to its commands.
-pub(super) const KEYS: [&str; 3] = ["when", "base", "idle"];
+/// The words of `when`.
+pub(crate) const WHENS: [(&str, CommandWhen); 2] =
+    [("change", CommandWhen::Change), ("frame", CommandWhen::Frame)];
+/// The words of `base`, and whether the base is kept.
+pub(crate) const BASES: [(&str, bool); 2] = [("reset", false), ("keep", true)];
 
 /// What the values of a field pick, and when.
 pub(super) struct FileCommands {
@@ -60,10 +64,7 @@ fn read_values(field: &Reader<'_>, commands: &Item<'_>, table: &Reader<'_>) -> R
     if entries.is_empty() {
         return Err(commands.error("no commands; write for example { 1 = \"run(pick.jspf,50)\" }"));
     }
-    let mut when = match field.optional("when") {
-        Some(item) => item.choice(&[("change", CommandWhen::Change), ("frame", CommandWhen::Frame)])?,
-        None => CommandWhen::Change,
-    };
+    let mut when = field.word_or(&WHEN, &WHENS)?;
     if let Some(item) = keeps_base(field)? {
         if when == CommandWhen::Frame {
             return Err(item.error("allowed only with when = \"change\": each frame picks its command here"));
@@ -71,7 +72,7 @@ fn read_values(field: &Reader<'_>, commands: &Item<'_>, table: &Reader<'_>) -> R
         when = CommandWhen::Kept;
     }
     if let Some(item) = field.optional("idle") {
-        let value = item.integer(i64::from(i32::MIN)..=i64::from(u32::MAX))?;
+        let value = item.integer(IDLE.integers())?;
         entries.push(FileCommand { spot: item.spot, first: value, last: value, text: String::new() });
     }
     Ok(FileCommands { entries, when })
@@ -119,7 +120,7 @@ fn read_bit(field: &Reader<'_>, table: &Reader<'_>, keys: &[BitKey]) -> Result<F
 /// `base`, if the field's base survives silence.
 fn keeps_base<'a>(field: &Reader<'a>) -> Result<Option<Item<'a>>> {
     let Some(item) = field.optional("base") else { return Ok(None) };
-    let keeps = item.choice(&[("reset", false), ("keep", true)])?;
+    let keeps = item.choice(&BASES)?;
     Ok(keeps.then_some(item))
 }
 
@@ -175,7 +176,7 @@ mod tests {
 
     fn field(text: &str) -> std::result::Result<(Entries, CommandWhen), String> {
         let document = Document::parse("field.toml", text, &[]).unwrap();
-        let field = Reader::root(&document, &["bits", "commands", "when", "base", "idle"]).unwrap();
+        let field = Reader::root(&document, &crate::keys::field::INPUT).unwrap();
         let commands = field.optional("commands").unwrap();
         let read = read(&field, &commands).map_err(|error| error.to_string())?;
         let entries = read.entries.into_iter().map(|entry| (entry.first, entry.last, entry.text));

@@ -7,22 +7,22 @@ use proto_core::wire::scalar::Scalar;
 
 use super::document::Document;
 use super::functions;
-use super::lines::{LINE_KEYS, read_bitrate, read_cycle, read_line};
+use super::lines::{read_bitrate, read_cycle, read_line};
+use super::network::check_ipv4;
 use super::reader::{Item, Reader, Result, Spot};
 use super::recipes::{self, FileRecipe, Flavour};
 use crate::TargetError;
 use crate::functions::Functions;
+use crate::keys;
+use crate::keys::controller::{CLIENTS, COMMAND, CONTROL, MODBUS, MODE, POWER, STATE, UDP2011};
 use crate::sim::{
     CommandClients, Initial, InitialTarget, Listen, Power, Robot, RobotMode, SimBus, SimConfig, SimPort,
     SimProgram,
 };
 
-/// The top-level keys of a controller file.
-pub(super) const KEYS: [&str; 7] = ["listen", "robot", "initial", "functions", "recipe", "port", "program"];
-
 /// Reads the whole file and checks it.
 pub(super) fn read(document: &Document) -> Result<SimConfig> {
-    let root = Reader::root(document, &KEYS)?;
+    let root = Reader::root(document, &keys::top::CONTROLLER)?;
     let recipes = recipes::read_all(&root, Flavour::Controller)?;
     let programs = read_programs(&root)?;
     let functions = functions::read(&root, &programs)?;
@@ -40,7 +40,7 @@ pub(super) fn read(document: &Document) -> Result<SimConfig> {
 fn read_listen(root: &Reader<'_>) -> Result<Listen> {
     let mut listen = Listen::default();
     let Some(item) = root.optional("listen") else { return Ok(listen) };
-    let table = item.table(&["address", "command", "state", "modbus", "udp2011", "control"])?;
+    let table = item.table(&keys::controller::LISTEN)?;
     if let Some(item) = table.optional("address") {
         let text = item.string()?;
         listen.address = text.parse::<IpAddr>().map_err(|_| {
@@ -48,15 +48,13 @@ fn read_listen(root: &Reader<'_>) -> Result<Listen> {
         })?;
     }
     for (key, target) in [
-        ("command", &mut listen.command),
-        ("state", &mut listen.state),
-        ("modbus", &mut listen.modbus),
-        ("udp2011", &mut listen.udp2011),
-        ("control", &mut listen.control),
+        (COMMAND, &mut listen.command),
+        (STATE, &mut listen.state),
+        (MODBUS, &mut listen.modbus),
+        (UDP2011, &mut listen.udp2011),
+        (CONTROL, &mut listen.control),
     ] {
-        if let Some(item) = table.optional(key) {
-            *target = item.integer(0..=65_535)?;
-        }
+        *target = table.integer_or(&key)?;
     }
     let tcp = [
         ("command", listen.command),
@@ -73,35 +71,31 @@ fn read_listen(root: &Reader<'_>) -> Result<Listen> {
     Ok(listen)
 }
 
+/// The words of `power`.
+pub(crate) const POWERS: [(&str, Power); 4] =
+    [("boot", Power::Boot), ("off", Power::Off), ("on", Power::On), ("enabled", Power::Enabled)];
+
+/// The words of `mode` of the robot.
+pub(crate) const MODES: [(&str, RobotMode); 3] =
+    [("manual", RobotMode::Manual), ("auto", RobotMode::Auto), ("remote", RobotMode::Remote)];
+
+/// The words of `command_clients`.
+pub(crate) const COMMAND_CLIENTS: [(&str, CommandClients); 3] = [
+    ("many", CommandClients::Many),
+    ("one", CommandClients::RefuseSecond),
+    ("newest", CommandClients::DropFirst),
+];
+
 fn read_robot(root: &Reader<'_>) -> Result<Robot> {
     let mut robot = Robot::default();
     let Some(item) = root.optional("robot") else { return Ok(robot) };
-    let table = item.table(&["dialect", "power", "mode", "command_clients"])?;
+    let table = item.table(&keys::controller::ROBOT)?;
     if let Some(item) = table.optional("dialect") {
         robot.dialect = super::known_dialect(&item, item.string()?)?.to_owned();
     }
-    if let Some(item) = table.optional("power") {
-        robot.power = item.choice(&[
-            ("boot", Power::Boot),
-            ("off", Power::Off),
-            ("on", Power::On),
-            ("enabled", Power::Enabled),
-        ])?;
-    }
-    if let Some(item) = table.optional("mode") {
-        robot.mode = item.choice(&[
-            ("manual", RobotMode::Manual),
-            ("auto", RobotMode::Auto),
-            ("remote", RobotMode::Remote),
-        ])?;
-    }
-    if let Some(item) = table.optional("command_clients") {
-        robot.command_clients = item.choice(&[
-            ("many", CommandClients::Many),
-            ("one", CommandClients::RefuseSecond),
-            ("newest", CommandClients::DropFirst),
-        ])?;
-    }
+    robot.power = table.word_or(&POWER, &POWERS)?;
+    robot.mode = table.word_or(&MODE, &MODES)?;
+    robot.command_clients = table.word_or(&CLIENTS, &COMMAND_CLIENTS)?;
     Ok(robot)
 }
 
@@ -150,8 +144,9 @@ fn read_value(target: InitialTarget, item: &Item<'_>) -> Result<f64> {
     }
 }
 
+/// What a port of a controller is.
 #[derive(Clone, Copy, PartialEq, Eq)]
-enum BusKind {
+pub(crate) enum BusKind {
     Rs485,
     Can,
     UdpServer,
@@ -159,7 +154,8 @@ enum BusKind {
     UdpClient,
 }
 
-const BUSES: [(&str, BusKind); 5] = [
+/// The words of `bus`.
+pub(crate) const BUSES: [(&str, BusKind); 5] = [
     ("rs485", BusKind::Rs485),
     ("can", BusKind::Can),
     ("udp-server", BusKind::UdpServer),
@@ -167,13 +163,11 @@ const BUSES: [(&str, BusKind); 5] = [
     ("udp-client", BusKind::UdpClient),
 ];
 
-/// The keys of a port on any bus.
-const COMMON_KEYS: [&str; 4] = ["name", "bus", "recipe", "cycle_ms"];
-
 fn read_ports(root: &Reader<'_>, recipes: &[FileRecipe]) -> Result<Vec<SimPort>> {
     let mut ports: Vec<SimPort> = Vec::new();
-    let keys = [&COMMON_KEYS[..], &LINE_KEYS, &["bitrate", "to"]].concat();
-    for table in root.tables("port", &keys)? {
+    let tables = root.any_tables("port")?;
+    tables.iter().try_for_each(|table| table.check(&keys::controller::PORT))?;
+    for table in tables {
         let (port, name_spot) = read_port(&table, recipes)?;
         if ports.iter().any(|before| before.name == port.name) {
             let message = format!("there is already a port {:?}; names must differ", port.name);
@@ -194,14 +188,6 @@ fn read_ports(root: &Reader<'_>, recipes: &[FileRecipe]) -> Result<Vec<SimPort>>
 fn read_port(table: &Reader<'_>, recipes: &[FileRecipe]) -> Result<(SimPort, Spot)> {
     let (name, name_spot) = recipes::read_name(table)?;
     let kind = table.required("bus", "rs485, can, udp-server, tcp-client or udp-client")?.choice(&BUSES)?;
-    let own: &[&str] = match kind {
-        BusKind::Rs485 => &LINE_KEYS,
-        BusKind::Can => &["bitrate"],
-        BusKind::UdpServer => &[],
-        BusKind::TcpClient | BusKind::UdpClient => &["to"],
-    };
-    let bus_name = BUSES.iter().find(|(_, bus)| *bus == kind).map_or("", |(name, _)| name);
-    table.check_keys(&[&COMMON_KEYS, own].concat(), &format!(" on bus = {bus_name:?}"))?;
     let bus = match kind {
         BusKind::Rs485 => SimBus::Rs485(read_line(table)?),
         BusKind::Can => SimBus::Can { bitrate: read_bitrate(table)? },
@@ -251,14 +237,20 @@ fn read_to(table: &Reader<'_>) -> Result<String> {
         (!host.is_empty() && port != 0).then_some(port)
     });
     match port {
-        Some(_) => Ok(text.to_owned()),
+        Some(_) => {
+            let host = text.rsplit_once(':').map_or(text, |(host, _)| host);
+            check_ipv4(host).map_err(|message| item.error(message))?;
+            Ok(text.to_owned())
+        }
         None => Err(item.error(format!("{text:?} is not HOST:PORT, such as \"127.0.0.1:50000\""))),
     }
 }
 
 fn read_programs(root: &Reader<'_>) -> Result<Vec<SimProgram>> {
     let mut programs: Vec<SimProgram> = Vec::new();
-    for table in root.tables("program", &["name", "script"])? {
+    let tables = root.any_tables("program")?;
+    tables.iter().try_for_each(|table| table.check(&keys::controller::PROGRAM))?;
+    for table in tables {
         let item = table.required("name", "the name that run(NAME) uses")?;
         let name = item.string()?;
         if name.is_empty() || name.contains([',', '(', ')', '"', '\r', '\n', '\0']) {

@@ -1,34 +1,52 @@
-//! Frames of devices in a gateway file: fields beyond the plain types, and checksums.
+//! Frames of devices in a gateway file: fields beyond the plain types.
 //!
 //! In: the tables of a part and of its fields. Out: [`FileField`]s, and frames that were laid out.
 //! The controller's own recipes have none of these keys, and are refused them with the reason.
 
 use proto_core::config::{Constants, DeviceFrame, FieldSpec, OutputBinding};
-use proto_core::device::{
-    Algorithm, Boundary, ByteOrder, Carrier, Checksum, Crc, DataId, Element, Encoding, LayoutError,
-    MAX_DATA_ID, Overflow, TextWidth,
-};
+use proto_core::device::{Boundary, Carrier, Encoding, LayoutError, Overflow};
 use proto_core::recipe::PartError;
-use proto_core::recipe::model::{MAX_CAN_IDS, MAX_DELIMITER, MAX_STREAM_FRAME, Mode, Rules};
+use proto_core::recipe::model::{MAX_CAN_IDS, MAX_DELIMITER, Mode, Rules};
 use proto_core::sysvar::Direction;
 use proto_core::wire::scalar::ScalarType;
 
-use super::bindings::{self, FileInput, FileOutput};
+use super::bindings::{self, FileInput, FileOutput, OVERFLOWS};
 use super::encoding::{self, OpenNumber, Order, refuse};
 use super::exchanges::FileExchange;
 use super::framings;
-use super::names::meant_checksum;
 use super::reader::{Item, Reader, Result};
 use super::recipes::{FileField, FileFieldKind, FileFrame, FilePart, FileRecipe, Flavour, Written};
 use super::rtu_frames;
 use crate::device::{DeviceField, DeviceRecipe, ExchangeKind, FrameEnds, NamedExchange, NamedFrame};
+use crate::keys::field::{self, FILL, OVERFLOW, PAD};
+use crate::keys::recipe::{OF_FRAME, OF_STREAM};
+use crate::keys::{Key, names};
 
-/// The keys of a CAN frame.
-const FRAME_KEYS: [&str; 3] = ["endian", "word_order", "checksum"];
-/// The keys of a stream part.
-const STREAM_KEYS: [&str; 5] = ["endian", "word_order", "checksum", "framing", "escape"];
-/// The keys of a field or what stands in its place, beside those that say how it is written.
-const FIELD_KEYS: [&str; 6] = ["equals", "overflow", "counter", "pad", "fill", "text"];
+/// The keys of a field or what stands in its place, which no controller's recipe has.
+const OWN_KEYS: [&str; 22] = [
+    "equals",
+    "overflow",
+    "counter",
+    "pad",
+    "fill",
+    "text",
+    "length_to",
+    "count_to",
+    "length_from",
+    "order",
+    "ignore",
+    "length",
+    "counts",
+    "plus",
+    "endian",
+    "word_order",
+    "bits",
+    "signed",
+    "new",
+    "width",
+    "until",
+    "decimals",
+];
 
 /// Why recipes of this kind have no frames of devices; `None` if they may.
 fn why_plain(mode: Mode, flavour: Flavour) -> Option<&'static str> {
@@ -47,32 +65,24 @@ fn why_plain(mode: Mode, flavour: Flavour) -> Option<&'static str> {
 
 /// The keys of a stream part or a CAN frame, beside those of any recipe; refuses them where there
 /// are none.
-pub(super) fn frame_keys(
-    table: &Reader<'_>,
-    mode: Mode,
-    flavour: Flavour,
-) -> Result<&'static [&'static str]> {
-    own_keys(&FRAME_KEYS, table, mode, flavour)
+pub(super) fn frame_keys(table: &Reader<'_>, mode: Mode, flavour: Flavour) -> Result<&'static [Key]> {
+    own_keys(OF_FRAME, table, mode, flavour)
 }
 
 /// The same for a stream part.
-pub(super) fn stream_keys(
-    table: &Reader<'_>,
-    mode: Mode,
-    flavour: Flavour,
-) -> Result<&'static [&'static str]> {
-    own_keys(&STREAM_KEYS, table, mode, flavour)
+pub(super) fn stream_keys(table: &Reader<'_>, mode: Mode, flavour: Flavour) -> Result<&'static [Key]> {
+    own_keys(OF_STREAM, table, mode, flavour)
 }
 
 fn own_keys(
-    keys: &'static [&'static str],
+    keys: &'static [Key],
     table: &Reader<'_>,
     mode: Mode,
     flavour: Flavour,
-) -> Result<&'static [&'static str]> {
+) -> Result<&'static [Key]> {
     match why_plain(mode, flavour) {
         None => Ok(keys),
-        Some(why) => refuse(table, keys, why).map(|()| -> &[&str] { &[] }),
+        Some(why) => refuse(table, &names(keys.iter()), why).map(|()| -> &[Key] { &[] }),
     }
 }
 
@@ -80,7 +90,11 @@ fn own_keys(
 pub(super) fn refuse_in_can_part(part: &Reader<'_>, mode: Mode, flavour: Flavour) -> Result<()> {
     stream_keys(part, mode, flavour)?;
     refuse(part, &framings::PART_KEYS, "a CAN bus tells frames apart itself")?;
-    refuse(part, &FRAME_KEYS, "in a CAN recipe each frame has its own; write it below the frame's id")
+    refuse(
+        part,
+        &names(OF_FRAME.iter()),
+        "in a CAN recipe each frame has its own; write it below the frame's id",
+    )
 }
 
 /// What the fields of one frame have in common, while they are read.
@@ -111,16 +125,16 @@ impl FieldReader {
             Direction::Output => " in an output field",
         };
         if let Some(why) = why_plain(Mode::User, self.flavour) {
-            refuse(&table, &[&FIELD_KEYS[..], &framings::FIELD_KEYS, &encoding::KEYS].concat(), why)?;
-            table.check_keys(&["name", "type"], when)?;
+            refuse(&table, &OWN_KEYS, why)?;
+            table.check_keys(&[field::PLAIN.common], when)?;
             push(self.read_plain(&table)?);
             return Ok(());
         }
         if let Some(pad) = table.optional("pad") {
-            table.check_keys(&["pad", "fill"], " in padding")?;
-            let fill = table.optional("fill").map_or(Ok(0), |item| item.integer(0..=255))?;
+            table.check_keys(&[field::PADDING], " in padding")?;
+            let fill = table.integer_or(&FILL)?;
             self.open = None;
-            push(FileFieldKind::Padding { len: pad.integer(1..=255)?, fill });
+            push(FileFieldKind::Padding { len: pad.integer(PAD.integers())?, fill });
             return Ok(());
         }
         if table.optional("type").and_then(|item| item.as_string()) == Some("text") {
@@ -131,16 +145,16 @@ impl FieldReader {
         }
         refuse(&table, &framings::TEXT_KEYS, "allowed only together with type = \"text\"")?;
         if table.optional("length").is_some() {
-            table.check_keys(&[&framings::LENGTH_KEYS[..], &encoding::KEYS].concat(), " in a length")?;
+            table.check_keys(&[field::LENGTHS, field::WRITTEN], " in a length")?;
             let encoding = encoding::read(&table, self.order, &mut self.open)?;
             let name = table.optional("name").map(|item| item.string().map(str::to_owned)).transpose()?;
             push(FileFieldKind::Device { name, spec: framings::read_length(&table, encoding)? });
             return Ok(());
         }
-        refuse(&table, &["counts", "plus"], "allowed only together with length = true")?;
+        refuse(&table, &framings::LENGTH_KEYS, "allowed only together with length = true")?;
         refuse(&table, &["fill"], "allowed only together with pad, or with type = \"text\" and width")?;
         if let Some(text) = table.optional("text") {
-            table.check_keys(&["text"], " in a text")?;
+            table.check_keys(&[field::CONSTANT_TEXT], " in a text")?;
             self.open = None;
             for byte in read_text(&text)? {
                 let encoding = Encoding::scalar(ScalarType::Byte);
@@ -149,7 +163,7 @@ impl FieldReader {
             return Ok(());
         }
         let bound = binding_keys(&table, self.direction)?;
-        table.check_keys(&[&["name", "type"], bound, &["overflow"], &encoding::KEYS].concat(), when)?;
+        table.check_keys(&[field::NAMED, bound, &[OVERFLOW], field::WRITTEN], when)?;
         match table.optional("equals") {
             Some(equals) => {
                 refuse_bindings(&table)?;
@@ -186,23 +200,21 @@ impl FieldReader {
         if table.optional(key).is_none() {
             refuse(table, &["overflow"], &format!("allowed only together with {key}"))?;
         }
-        let overflow = table
-            .optional("overflow")
-            .map_or(Ok(Overflow::Usual), |item| item.choice(&[("wrap", Overflow::Wrap)]))?;
+        let overflow = table.word(&OVERFLOW, &OVERFLOWS)?.unwrap_or(Overflow::Usual);
         bind(table, self.direction, name, Written { encoding, overflow }, push)
     }
 }
 
 /// The keys of what a value is for; refuses those of the other direction.
-pub(super) fn binding_keys(table: &Reader<'_>, direction: Direction) -> Result<&'static [&'static str]> {
+pub(super) fn binding_keys(table: &Reader<'_>, direction: Direction) -> Result<&'static [Key]> {
     match direction {
         Direction::Input => {
             refuse(table, &["value"], "an input field has equals = 9 for a constant")?;
-            Ok(&["to", "commands", "when", "base", "idle", "scale", "offset", "equals", "counter"])
+            Ok(field::BOUND_IN)
         }
         Direction::Output => {
             refuse(table, &["equals"], "an output field has value = 9 for a constant")?;
-            Ok(&["from", "value", "scale", "offset", "counter"])
+            Ok(field::BOUND_OUT)
         }
     }
 }
@@ -285,137 +297,6 @@ fn read_text<'a>(item: &Item<'a>) -> Result<impl Iterator<Item = u8> + use<'a>> 
         Some(c) => Err(item.error(format!("{c:?} is not ASCII; allowed: characters of one byte, 0..=127"))),
         None => Ok(text.bytes()),
     }
-}
-
-/// Reads the checksum of a frame and puts it at its place among the fields.
-pub(super) fn read_checksum(frame: &Reader<'_>, head: usize, fields: &mut Vec<FileField>) -> Result<()> {
-    let Some(item) = frame.optional("checksum") else { return Ok(()) };
-    if item.as_string().is_some() {
-        return Err(item.error("expected a table, such as { kind = \"crc16-modbus\" }, found a string"));
-    }
-    let table = item.any_table()?;
-    let algorithm = read_algorithm(&table)?;
-    let mut sum = Checksum::standard(algorithm);
-    if let Some(item) = table.optional("over") {
-        let (first, last) = read_covered(&item)?;
-        sum = sum.over(first, last);
-    }
-    if let Some(item) = table.optional("order") {
-        sum.order = item.choice(&[("little", ByteOrder::Little), ("big", ByteOrder::Big)])?;
-    }
-    if let Some(item) = table.optional("as") {
-        sum.text = item.choice(&[("bytes", false), ("hex", true)])?;
-    }
-    sum.data_id = read_data_id(&table)?;
-    let nth = match table.optional("at") {
-        Some(item) => find_place(&item, head, fields)?,
-        None => fields.len(),
-    };
-    fields.insert(nth, FileField { spot: item.spot.clone(), kind: FileFieldKind::Checksum(sum) });
-    Ok(())
-}
-
-/// `data_id = 0x1234`, low byte first, or a list of bytes.
-fn read_data_id(table: &Reader<'_>) -> Result<DataId> {
-    let Some(item) = table.optional("data_id") else {
-        refuse(table, &["data_id_at"], "allowed only together with data_id")?;
-        return Ok(DataId::NONE);
-    };
-    let bytes: Vec<u8> = if item.is_integer() {
-        item.integer::<u16>(0..=0xFFFF)?.to_le_bytes().to_vec()
-    } else {
-        let list = item.array("of bytes, such as [0x34, 0x12], or a number")?;
-        list.iter().map(|item| item.integer(0..=255)).collect::<Result<_>>()?
-    };
-    let id = DataId::new(&bytes).filter(|id| !id.bytes().is_empty());
-    let id = id.ok_or_else(|| item.error(format!("{} bytes; allowed: 1 to {MAX_DATA_ID}", bytes.len())))?;
-    let place = table.optional("data_id_at").map(|item| item.choice(&[("start", false), ("end", true)]));
-    Ok(if place.transpose()? == Some(true) { id.behind() } else { id })
-}
-
-fn read_algorithm(table: &Reader<'_>) -> Result<Algorithm> {
-    const PLACE: [&str; 7] = ["kind", "over", "at", "order", "as", "data_id", "data_id_at"];
-    let kind = table.required("kind", "the algorithm, such as \"crc16-modbus\"")?;
-    let name = kind.string()?;
-    if name != "crc" {
-        let algorithm = Algorithm::named(name).ok_or_else(|| {
-            let known: Vec<_> = Algorithm::names().collect();
-            let shown: Vec<_> = known.iter().map(|name| format!("{name:?}")).collect();
-            let meant = meant_checksum(name, &known);
-            let shown = shown.join(", ");
-            kind.error(format!("{name:?} is unknown; allowed: {shown}, \"crc\" (with its parameters){meant}"))
-        })?;
-        table.check_keys(&PLACE, &format!(" with kind = {name:?}"))?;
-        return Ok(algorithm);
-    }
-    let parameters = ["width", "poly", "init", "xorout", "refin", "refout"];
-    table.check_keys(&[&PLACE[..], &parameters].concat(), " with kind = \"crc\"")?;
-    let width: u8 = table.required("width", "the number of bits, 1..=32")?.integer(1..=32)?;
-    let most = i64::from(u32::MAX >> (32 - u32::from(width)));
-    let number = |key| table.optional(key).map_or(Ok(0), |item| item.integer(0..=most));
-    let flag = |key, default| table.optional(key).map_or(Ok(default), |item| item.bool());
-    table.required("poly", "the polynomial without its highest term, such as 0x1021")?;
-    let refin = flag("refin", false)?;
-    Ok(Algorithm::Crc(Crc {
-        width,
-        poly: number("poly")?,
-        init: number("init")?,
-        xorout: number("xorout")?,
-        refin,
-        refout: flag("refout", refin)?,
-    }))
-}
-
-/// `"1.."` or `"1..7"`: the first byte and the last one.
-fn read_covered(item: &Item<'_>) -> Result<(u16, Option<u16>)> {
-    let text = item.string()?;
-    let number = |text: &str| text.parse::<u16>().ok().filter(|&at| usize::from(at) < MAX_STREAM_FRAME);
-    let range = text.split_once("..").and_then(|(first, last)| {
-        let last = if last.is_empty() { None } else { Some(number(last)?) };
-        Some((number(first)?, last))
-    });
-    match range {
-        Some((first, last)) if last.is_none_or(|last| first <= last) => Ok((first, last)),
-        Some(_) => Err(item.error(format!("{text:?} runs backwards; write the first byte, then the last one"))),
-        None => Err(item.error(format!(
-            "{text:?} is not a range of bytes; write \"1..7\", or \"1..\" for all up to the checksum; byte 0 is \
-             the first of the frame"
-        ))),
-    }
-}
-
-/// The number of fields before the byte that `item` names.
-fn find_place(item: &Item<'_>, head: usize, fields: &[FileField]) -> Result<usize> {
-    let at: usize = item.integer(0..=MAX_STREAM_FRAME as i64 - 1)?;
-    // Places between two fields; behind one of varying length no byte has a number.
-    let mut places = Vec::new();
-    let mut offset = Some(head);
-    for (nth, field) in fields.iter().enumerate() {
-        let element = field.spec().element();
-        let encoding = element.and_then(|element| element.encoding());
-        if encoding.is_some_and(|encoding| encoding.shared) {
-            continue;
-        }
-        places.extend(offset.map(|offset| (offset, nth)));
-        let len = match (element, encoding) {
-            (Some(Element::Padding { len, .. }), _) => Some(usize::from(len)),
-            (Some(Element::Text(text)), _) => match text.width {
-                TextWidth::Fixed(width) => Some(usize::from(width)),
-                TextWidth::Until(_) | TextWidth::Rest => None,
-            },
-            (_, Some(encoding)) => encoding.size(),
-            _ => Some(0),
-        };
-        offset = offset.zip(len).map(|(offset, len)| offset + len);
-    }
-    places.extend(offset.map(|offset| (offset, fields.len())));
-    places.iter().find(|&&(offset, _)| offset == at).map(|&(_, nth)| nth).ok_or_else(|| {
-        let places: Vec<_> = places.iter().map(|(offset, _)| offset.to_string()).collect();
-        item.error(format!(
-            "no field begins or ends at byte {at}; allowed: {}, or no at for the place behind the fields",
-            places.join(", ")
-        ))
-    })
 }
 
 impl FilePart {

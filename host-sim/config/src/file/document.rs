@@ -7,6 +7,7 @@ use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
 use super::error::{FileError, Source};
+use super::names::did_you_mean;
 
 /// The tree, and the texts that it was read from.
 pub(super) struct Document {
@@ -129,7 +130,9 @@ impl Document {
             let next = match &node.value {
                 Value::Table(table) => table.get(key).map(|entry| &entry.node),
                 Value::Array(items) => {
-                    items.iter().find(|item| name_of(item).is_some_and(|name| name == *key))
+                    let named = items.iter().find(|item| name_of(item).is_some_and(|name| name == *key));
+                    let number = || key.parse::<usize>().ok()?.checked_sub(1);
+                    named.or_else(|| items.get(number()?))
                 }
                 _ => None,
             };
@@ -261,10 +264,11 @@ fn insert_into_item(
         .position(|name| name.as_ref() == Some(wanted))
         .or_else(|| by_number().map(|number| number - 1));
     let Some(place) = place else {
+        let meant = did_you_mean(wanted, names.iter().flatten().map(String::as_str));
         let names: Vec<_> = names.into_iter().flatten().map(|name| format!("{name:?}")).collect();
         return Err(match names.len() {
             0 => format!("there is no {key} {wanted:?}; write its number, 1..={}", items.len()),
-            _ => format!("there is no {key} {wanted:?}; there are {}", names.join(", ")),
+            _ => format!("there is no {key} {wanted:?}; there are {}{meant}", names.join(", ")),
         });
     };
     match (&mut items[place], rest) {

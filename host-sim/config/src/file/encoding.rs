@@ -7,14 +7,12 @@ use proto_core::wire::scalar::ScalarType;
 
 use super::names::meant_type;
 use super::reader::{Item, Reader, Result};
-
-/// The keys that say how a field is written.
-pub(super) const KEYS: [&str; 8] =
-    ["endian", "word_order", "bits", "signed", "new", "width", "until", "decimals"];
+use crate::keys::device::{ENDIAN, WORD_ORDER};
+use crate::keys::field::{DECIMALS, SIGNED};
 
 /// The types of fields.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Type {
+pub(crate) enum Type {
     Scalar(ScalarType),
     Uint24,
     Int24,
@@ -26,7 +24,7 @@ pub(super) enum Type {
 }
 
 /// The types that only a device's frames have.
-const OWN_TYPES: [(&str, Type); 9] = [
+pub(crate) const OWN_TYPES: [(&str, Type); 9] = [
     ("uint24", Type::Uint24),
     ("int24", Type::Int24),
     ("bcd", Type::Bcd),
@@ -38,6 +36,11 @@ const OWN_TYPES: [(&str, Type); 9] = [
     ("uint64", Type::Wide(8)),
 ];
 
+/// The words of `endian`, and whether they are big-endian.
+pub(crate) const ORDERS: [(&str, bool); 2] = [("little", false), ("big", true)];
+/// The words of `word_order`, and whether the low word is first.
+pub(crate) const WORD_ORDERS: [(&str, bool); 2] = [("high-first", false), ("low-first", true)];
+
 /// The byte order that a part or a field asks for.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Order {
@@ -48,12 +51,9 @@ pub(super) struct Order {
 impl Order {
     /// The keys `endian` and `word_order` of a part or a field.
     pub(super) fn read(table: &Reader<'_>) -> Result<Self> {
-        let read = |key, choices: [(&str, bool); 2]| {
-            table.optional(key).map(|item| item.choice(&choices)).transpose()
-        };
         Ok(Self {
-            is_big: read("endian", [("little", false), ("big", true)])?,
-            low_word_first: read("word_order", [("high-first", false), ("low-first", true)])?,
+            is_big: table.word(&ENDIAN, &ORDERS)?,
+            low_word_first: table.word(&WORD_ORDER, &WORD_ORDERS)?,
         })
     }
 
@@ -103,12 +103,9 @@ fn read_type(field: &Reader<'_>) -> Result<Type> {
 }
 
 fn choose<T: Clone>(item: &Item<'_>, types: &[(&str, T)]) -> Result<T> {
-    item.choice(types).map_err(|mut error| {
-        if let Some(text) = item.as_string() {
-            let names: Vec<_> = types.iter().map(|(name, _)| *name).collect();
-            error.message += &meant_type(text, &names);
-        }
-        error
+    item.choice_or(types, |text| {
+        let names: Vec<_> = types.iter().map(|(name, _)| *name).collect();
+        meant_type(text, &names)
     })
 }
 
@@ -180,9 +177,9 @@ fn read_kind(field: &Reader<'_>, ty: Type) -> Result<Kind> {
             let width = read_width(field, MAX_DIGITS as i64, ends, "a digit, a sign, a point or a blank")?;
             let decimals = match (field.optional("decimals"), width) {
                 (None, _) => 0,
-                (Some(item), Width::Until(_)) => item.integer(0..=9)?,
+                (Some(item), Width::Until(_)) => item.integer(DECIMALS.integers())?,
                 (Some(item), Width::Fixed(width)) => {
-                    let decimals: u8 = item.integer(0..=9)?;
+                    let decimals: u8 = item.integer(DECIMALS.integers())?;
                     // A sign, a digit and a point stand before the decimals.
                     if decimals > 0 && width < decimals + 3 {
                         let least = decimals + 3;
@@ -259,7 +256,7 @@ fn read_bits(field: &Reader<'_>, item: &Item<'_>, ty: Type) -> Result<Bits> {
             (first, last)
         }
     };
-    let signed = field.optional("signed").map_or(Ok(false), |item| item.bool())?;
+    let signed = field.flag(&SIGNED)?;
     Ok(Bits { bytes, first, count: last - first + 1, signed })
 }
 

@@ -3,7 +3,7 @@
 //! In: the tables of a gateway file's recipe. Out: [`FileExchange`]s, whose frames were laid out. The
 //! frames here are a device's own; those of Modbus are in `modbus`.
 
-use proto_core::config::{AskWhen, ConfigErrorKind, DEFAULT_REPLY_TIMEOUT, ExchangeError, ExchangeKey};
+use proto_core::config::{AskWhen, DEFAULT_REPLY_TIMEOUT, ExchangeError, ExchangeKey};
 use proto_core::device::{Boundary, Carrier};
 use proto_core::recipe::model::{Mode, Rules};
 use proto_core::sysvar::Direction;
@@ -15,6 +15,8 @@ use super::encoding::refuse;
 use super::reader::{Item, Reader, Result, Spot};
 use super::recipes::{self, FileField, FileFieldKind, FileFrame, FilePart, Flavour};
 use crate::device::ExchangeKind;
+use crate::keys::exchange;
+use crate::keys::recipe::OF_FRAME;
 
 /// One exchange, or one block of a slave.
 pub(super) struct FileExchange {
@@ -44,27 +46,21 @@ pub(super) struct AskTiming {
 }
 
 /// The keys of [`AskTiming`].
-pub(super) const TIMING_KEYS: [&str; 5] = ["every_ms", "on", "timeout_ms", "retries", "pause_ms"];
-const KEYS: [&str; 4] = ["peer", "request", "reply", "refusal"];
-const STREAM_KEYS: [&str; 6] = ["head", "tail", "endian", "word_order", "checksum", "fields"];
-const CAN_KEYS: [&str; 6] = ["id", "extended", "endian", "word_order", "checksum", "fields"];
-
-/// The longest times, as the check of the configuration has them.
-const LONGEST: Duration = Duration::from_secs(3_600);
-const LONGEST_PAUSE: Duration = Duration::from_secs(10);
+const TIMING_KEYS: [&str; 5] = ["every_ms", "on", "timeout_ms", "retries", "pause_ms"];
 
 /// The exchanges of a stream or CAN recipe.
 pub(super) fn read_all(recipe: &Reader<'_>, mode: Mode, is_can: bool) -> Result<Vec<FileExchange>> {
     let tables = recipe.any_tables("exchange")?;
-    if let Some(table) = tables.first().filter(|_| mode != Mode::User) {
-        return Err(table.error(ExchangeError::NeedsUser));
+    if let Some(item) = recipe.optional("exchange").filter(|_| mode != Mode::User) {
+        let first = tables.first().map(|table| table.error(ExchangeError::NeedsUser));
+        return Err(first.unwrap_or_else(|| item.error(ExchangeError::NeedsUser)));
     }
     tables.iter().map(|table| read(table, is_can)).collect()
 }
 
 fn read(table: &Reader<'_>, is_can: bool) -> Result<FileExchange> {
-    table.check_keys_nearly(&[&KEYS[..], &TIMING_KEYS].concat(), " of an exchange")?;
-    let peer = table.optional("peer").map_or(Ok(0), |item| item.integer(0..=255))?;
+    table.check(if is_can { &exchange::OF_CAN } else { &exchange::OF_STREAM })?;
+    let peer = table.integer_or(&exchange::PEER)?;
     let frame = |key, direction| {
         table.optional(key).map(|item| read_frame(&item, key, direction, is_can)).transpose()
     };
@@ -132,10 +128,14 @@ pub(super) fn spots(table: &Reader<'_>, own: &[(&str, ExchangeKey)]) -> Vec<(Exc
 fn read_frame(item: &Item<'_>, key: &str, direction: Direction, is_can: bool) -> Result<(FilePart, bool)> {
     let table = item.any_table()?;
     let is_request = direction == Direction::Output;
-    let remote: &[&str] = if is_can && is_request { &["remote"] } else { &[] };
-    let own = if is_can { &CAN_KEYS } else { &STREAM_KEYS };
     let recipe = if is_can { "a CAN recipe" } else { "a stream recipe" };
-    table.check_keys_nearly(&[&own[..], remote].concat(), &format!(" of a {key} in {recipe}"))?;
+    let keys = match (is_can, is_request) {
+        (true, true) => &exchange::CAN_REQUEST,
+        (true, false) => &exchange::CAN_REPLY,
+        (false, true) => &exchange::STREAM_REQUEST,
+        (false, false) => &exchange::STREAM_REPLY,
+    };
+    table.check_keys(&[keys.common, OF_FRAME], &format!(" of a {key} in {recipe}"))?;
     let mut part = FilePart::new(&table);
     let mut frame = FileFrame::new(table.spot.clone());
     if is_can {
@@ -145,7 +145,7 @@ fn read_frame(item: &Item<'_>, key: &str, direction: Direction, is_can: bool) ->
         (part.head, part.head_spot) = recipes::read_bytes(&table, "head")?;
         (part.tail, part.tail_spot) = recipes::read_bytes(&table, "tail")?;
     }
-    if table.optional("remote").map_or(Ok(false), |item| item.bool())? {
+    if table.flag(&exchange::REMOTE)? {
         refuse(&table, &["fields", "checksum", "endian", "word_order"], "a remote request has no data")?;
         part.frames.push(frame);
         return Ok((part, true));
@@ -207,12 +207,7 @@ impl AskTiming {
         Self { when: AskWhen::NEVER, timeout: DEFAULT_REPLY_TIMEOUT, retries: 1, pause: Duration::ZERO };
 
     pub(super) fn read(table: &Reader<'_>) -> Result<Self> {
-        let time = |key, longest| table.optional(key).map(|item| read_time(&item, longest)).transpose();
-        let mut when = AskWhen { every: time("every_ms", LONGEST)?, ..AskWhen::NEVER };
-        let pause = match table.optional("pause_ms") {
-            Some(item) => read_pause(&item)?,
-            None => Duration::ZERO,
-        };
+        let mut when = AskWhen { every: table.time(&exchange::EVERY)?, ..AskWhen::NEVER };
         if let Some(on) = table.optional("on") {
             let list = on.array("such as [\"start\", \"change\"]")?;
             if list.is_empty() {
@@ -224,32 +219,15 @@ impl AskTiming {
         }
         Ok(Self {
             when,
-            timeout: time("timeout_ms", LONGEST)?.unwrap_or(DEFAULT_REPLY_TIMEOUT),
-            retries: table.optional("retries").map_or(Ok(1), |item| item.integer(0..=255))?,
-            pause,
+            timeout: table.time_or(&exchange::TIMEOUT)?,
+            retries: table.integer_or(&exchange::RETRIES)?,
+            pause: table.time_or(&exchange::PAUSE)?,
         })
     }
 
     /// Refuses a request that is never sent.
     pub(super) fn check_asked(&self, table: &Reader<'_>) -> Result<()> {
         if self.when.is_never() { Err(table.error(ExchangeError::Never)) } else { Ok(()) }
-    }
-}
-
-fn read_time(item: &Item<'_>, longest: Duration) -> Result<Duration> {
-    match item.time(1e3)? {
-        Duration::ZERO => Err(item.error(ConfigErrorKind::ZeroTime)),
-        time if time > longest => Err(item.error(ConfigErrorKind::TimeTooLong { time, longest })),
-        time => Ok(time),
-    }
-}
-
-fn read_pause(item: &Item<'_>) -> Result<Duration> {
-    match item.time(1e3)? {
-        time if time > LONGEST_PAUSE => {
-            Err(item.error(ConfigErrorKind::TimeTooLong { time, longest: LONGEST_PAUSE }))
-        }
-        time => Ok(time),
     }
 }
 

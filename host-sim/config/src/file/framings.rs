@@ -4,33 +4,40 @@
 
 use proto_core::config::{FieldSpec, Words};
 use proto_core::device::{
-    Boundary, ByteOrder, Counts, Encoding, Escape, Ignored, Length, MAX_IGNORED, MAX_TEXT, Text, TextWidth,
+    Boundary, ByteOrder, Counts, Encoding, Escape, Ignored, Length, MAX_IGNORED, Text, TextWidth,
 };
 use proto_core::sysvar::{Direction, SysVar, VarRange};
 
 use super::encoding::refuse;
+use super::names::meant_variable;
 use super::reader::{Item, Reader, Result};
+use crate::keys::device::{ESCAPE, FRAMING};
+use crate::keys::field::{COUNTS as COUNTS_KEY, PLUS, TEXT_IN, TEXT_ORDER, TEXT_OUT, TEXT_WIDTH};
 
 /// The keys of a stream part.
 pub(super) const PART_KEYS: [&str; 2] = ["framing", "escape"];
-/// The keys of a text and of a length, beside those that other fields have.
-pub(super) const FIELD_KEYS: [&str; 8] =
-    ["length_to", "count_to", "length_from", "order", "ignore", "length", "counts", "plus"];
-/// Those of a text.
+/// The keys of a text, beside those that other fields have.
 pub(super) const TEXT_KEYS: [&str; 5] = ["length_to", "count_to", "length_from", "order", "ignore"];
-/// The keys of a length, beside those that say how it is written.
-pub(super) const LENGTH_KEYS: [&str; 5] = ["name", "type", "length", "counts", "plus"];
+/// Those of a length.
+pub(super) const LENGTH_KEYS: [&str; 3] = ["length", "counts", "plus"];
 
-const TEXT_IN: [&str; 10] =
-    ["name", "type", "width", "until", "fill", "order", "to", "length_to", "count_to", "ignore"];
-const TEXT_OUT: [&str; 8] = ["name", "type", "width", "until", "fill", "order", "from", "length_from"];
+/// The words of `framing`.
+pub(crate) const FRAMINGS: [(&str, Boundary); 3] =
+    [("fields", Boundary::Fields), ("tail", Boundary::Tail), ("silence", Boundary::Silence)];
+/// The words of `escape`.
+pub(crate) const ESCAPES: [(&str, Escape); 3] =
+    [("dle", Escape::Dle), ("slip", Escape::Slip), ("cobs", Escape::Cobs)];
+/// The words of `order` of a text.
+pub(crate) const TEXT_ORDERS: [(&str, ByteOrder); 2] =
+    [("high-first", ByteOrder::Big), ("low-first", ByteOrder::Little)];
+/// The words of `counts`.
+pub(crate) const COUNTS: [(&str, Counts); 3] =
+    [("rest", Counts::Rest), ("frame", Counts::Frame), ("fields", Counts::Fields)];
 
 /// `framing` and `escape` of a stream part.
 pub(super) fn read_part(part: &Reader<'_>) -> Result<(Boundary, Option<Escape>)> {
-    let framings = [("fields", Boundary::Fields), ("tail", Boundary::Tail), ("silence", Boundary::Silence)];
-    let escapes = [("dle", Escape::Dle), ("slip", Escape::Slip), ("cobs", Escape::Cobs)];
-    let framing = part.optional("framing").map(|item| item.choice(&framings)).transpose()?;
-    let escape = part.optional("escape").map(|item| item.choice(&escapes)).transpose()?;
+    let framing = part.word(&FRAMING, &FRAMINGS)?;
+    let escape = part.word(&ESCAPE, &ESCAPES)?;
     if let (Some(_), Some(item)) = (escape, part.optional("framing")) {
         return Err(item.error("escape bytes tell frames apart already; framing is not needed beside them"));
     }
@@ -42,11 +49,11 @@ pub(super) fn read_part(part: &Reader<'_>) -> Result<(Boundary, Option<Escape>)>
 
 /// A field with `type = "text"`.
 pub(super) fn read_text(field: &Reader<'_>, direction: Direction) -> Result<FieldSpec> {
-    let keys: &[&str] = if direction == Direction::Input { &TEXT_IN } else { &TEXT_OUT };
-    field.check_keys(keys, " in a text")?;
+    let keys = if direction == Direction::Input { TEXT_IN } else { TEXT_OUT };
+    field.check_keys(&[keys], " in a text")?;
     let width = match (field.optional("width"), field.optional("until")) {
         (Some(_), Some(until)) => return Err(until.error("a text takes width or until, not both")),
-        (Some(width), None) => TextWidth::Fixed(width.integer(1..=MAX_TEXT as i64)?),
+        (Some(width), None) => TextWidth::Fixed(width.integer(TEXT_WIDTH.integers())?),
         (None, Some(until)) => TextWidth::Until(one_character(&until)?),
         (None, None) => TextWidth::Rest,
     };
@@ -55,10 +62,7 @@ pub(super) fn read_text(field: &Reader<'_>, direction: Direction) -> Result<Fiel
     }
     let fill = field.optional("fill").map(|item| one_character(&item)).transpose()?;
     let text = Text { width, fill };
-    let order = match field.optional("order") {
-        Some(item) => item.choice(&[("high-first", ByteOrder::Big), ("low-first", ByteOrder::Little)])?,
-        None => ByteOrder::Big,
-    };
+    let order = field.word_or(&TEXT_ORDER, &TEXT_ORDERS)?;
     let var = |key| field.optional(key).map(|item| read_var(&item)).transpose();
     if direction == Direction::Output {
         let from = field.required("from", "the registers of the text, such as \"WordOutputReg[1..8]\"")?;
@@ -119,13 +123,8 @@ pub(super) fn read_length(field: &Reader<'_>, encoding: Encoding) -> Result<Fiel
     if !encoding.is_integer() || encoding.size().is_none() {
         return Err(item.error("a length is an integer in a fixed number of bytes"));
     }
-    let counts = match field.optional("counts") {
-        Some(item) => {
-            item.choice(&[("rest", Counts::Rest), ("frame", Counts::Frame), ("fields", Counts::Fields)])?
-        }
-        None => Counts::Rest,
-    };
-    let plus = field.optional("plus").map_or(Ok(0), |item| item.integer(-128..=127))?;
+    let counts = field.word_or(&COUNTS_KEY, &COUNTS)?;
+    let plus = field.integer_or(&PLUS)?;
     Ok(FieldSpec::Length(Length { encoding, counts, plus }))
 }
 
@@ -140,12 +139,13 @@ fn one_character(item: &Item<'_>) -> Result<u8> {
 
 fn read_var(item: &Item<'_>) -> Result<SysVar> {
     let name = item.string()?;
-    SysVar::parse(name).map_err(|error| item.error(format!("{name:?}: {error}")))
+    SysVar::parse(name).map_err(|error| item.error(format!("{name:?}: {error}{}", meant_variable(name))))
 }
 
 fn read_words(item: &Item<'_>, order: ByteOrder) -> Result<Words> {
     let name = item.string()?;
-    let range = VarRange::parse(name).map_err(|error| item.error(format!("{name:?}: {error}")))?;
+    let range = VarRange::parse(name)
+        .map_err(|error| item.error(format!("{name:?}: {error}{}", meant_variable(name))))?;
     let mut vars = range.iter();
     let count = vars.len() as u8;
     let first = vars.next().ok_or_else(|| item.error("names no variable"))?;

@@ -4,12 +4,13 @@ use super::reader::{Reader, Result};
 use crate::functions::{
     FUNCTION_INPUTS, FUNCTION_OUTPUTS, Function, FunctionInput, FunctionOutput, Functions, ShownState,
 };
+use crate::keys;
 use crate::sim::{InitialTarget, SimProgram};
 use crate::target::TargetError;
 
 pub(super) fn read(root: &Reader<'_>, programs: &[SimProgram]) -> Result<Functions> {
     let Some(item) = root.optional("functions") else { return Ok(Functions::default()) };
-    let table = item.table(&["inputs", "outputs", "start"])?;
+    let table = item.table(&keys::controller::FUNCTIONS)?;
     let inputs = read_table(&table, "inputs", &INPUTS, &Function::ALL)?;
     let outputs = read_table(&table, "outputs", &OUTPUTS, &ShownState::ALL)?;
     let inputs: Vec<_> =
@@ -27,7 +28,7 @@ pub(super) fn read(root: &Reader<'_>, programs: &[SimProgram]) -> Result<Functio
             if names.is_empty() {
                 return Err(item.error("the file has no [[program]] that could be started"));
             }
-            item.choice_nearly(&names)?;
+            item.choice(&names)?;
             Some(item.string()?.to_owned())
         }
     };
@@ -72,7 +73,7 @@ fn read_table<T: Clone>(
         if let Some((before, _)) = all.iter().find(|(before, _)| before.is_same_bit(target)) {
             return wrong(format!("{before} is in this table already, and is the same bit"));
         }
-        all.push((target, item.choice_nearly(choices)?));
+        all.push((target, item.choice(choices)?));
     }
     Ok(all)
 }

@@ -18,23 +18,25 @@ use proto_core::wire::scalar::Scalar;
 
 use super::bindings::FileInput;
 use super::commands::FileCommand;
-use super::document::Document;
-use super::lines::{LINE_KEYS, key_name, read_bitrate, read_cycle, read_line, read_rtu_line};
-use super::network;
+use super::document::{At, Document};
+use super::lines::{key_name, read_bitrate, read_cycle, read_line, read_rtu_line};
+use super::names::meant_variable;
+use super::network::{self, check_ipv4};
 use super::reader::{Item, Reader, Result, Spot};
 use super::recipes::{self, FileField, FileRecipe, Flavour, RecipeKind};
 use super::sources;
-
-/// The top-level keys of a gateway file.
-pub(super) const KEYS: [&str; 4] = ["controller", "network", "recipe", "port"];
+use crate::keys;
+use crate::keys::gateway::{
+    COMMAND, ECHO, LINK_UDP, MODBUS, REFRESH, SAFE_AT_START, STALE_AFTER, STATE, TIMEOUT, UDP2011,
+};
 
 /// Reads the whole file and checks it.
 pub(super) fn read(document: &Document) -> Result<Box<GatewayConfig>> {
-    let root = Reader::root(document, &KEYS)?;
+    let root = Reader::root(document, &keys::top::GATEWAY)?;
     let recipes = recipes::read_all(&root, Flavour::Gateway)?;
     let mut builder = Builder::new(&root, &recipes)?;
-    let port_keys = [&COMMON_KEYS[..], &FIELD_KEYS, &LINE_KEYS, &["echo", "bitrate", "listen"]].concat();
-    let ports = root.tables("port", &port_keys)?;
+    let ports = root.any_tables("port")?;
+    ports.iter().try_for_each(|port| port.check(&keys::gateway::PORT))?;
     // Recipes may name ports.
     builder.port_names =
         ports.iter().filter_map(|port| port.optional("name")?.as_string()).map(str::to_owned).collect();
@@ -47,14 +49,9 @@ pub(super) fn read(document: &Document) -> Result<Box<GatewayConfig>> {
     builder.finish()
 }
 
-/// The keys of a port on any bus.
-const COMMON_KEYS: [&str; 6] = ["name", "bus", "recipe", "cycle_ms", "timeout_ms", "stale_after_ms"];
-
-/// The keys of a field port, on any bus.
-const FIELD_KEYS: [&str; 4] = ["on_timeout", "safe_at_start", "refresh_ms", "health"];
-
+/// What a port of a gateway is.
 #[derive(Clone, Copy, PartialEq, Eq)]
-enum BusKind {
+pub(crate) enum BusKind {
     Rs485,
     ModbusMaster,
     ModbusSlave,
@@ -63,7 +60,8 @@ enum BusKind {
     UdpListen,
 }
 
-const BUSES: [(&str, BusKind); 6] = [
+/// The words of `bus`.
+pub(crate) const BUSES: [(&str, BusKind); 6] = [
     ("rs485", BusKind::Rs485),
     ("modbus-rtu", BusKind::ModbusMaster),
     ("modbus-rtu-slave", BusKind::ModbusSlave),
@@ -116,7 +114,7 @@ impl<'a> Builder<'a> {
                 "controller",
                 "a gateway file needs the controller's address: [controller] address = \"...\"",
             )?
-            .table(&["address", "dialect", "ports", "recipe_link"])?;
+            .table(&keys::gateway::CONTROLLER)?;
         let mut spots = HashMap::new();
         for (key, name) in [
             (ControllerKey::Address, "address"),
@@ -130,7 +128,7 @@ impl<'a> Builder<'a> {
         let controller = read_controller(&table, recipes)?;
         let mut network = None;
         if let Some(item) = root.optional("network") {
-            let table = item.table(&network::KEYS)?;
+            let table = item.table(&keys::gateway::NETWORK)?;
             for (key, name) in
                 [(NetworkKey::Address, "address"), (NetworkKey::Router, "router"), (NetworkKey::Dns, "dns")]
             {
@@ -273,17 +271,6 @@ impl<'a> Builder<'a> {
         let kind = table
             .required("bus", "rs485, modbus-rtu, modbus-rtu-slave, can, tcp-listen or udp-listen")?
             .choice(&BUSES)?;
-        let line_keys = [&LINE_KEYS[..], &["echo"]].concat();
-        let own: &[&str] = match kind {
-            BusKind::Rs485 | BusKind::ModbusMaster | BusKind::ModbusSlave => &line_keys,
-            BusKind::Can => &["bitrate"],
-            BusKind::TcpListen | BusKind::UdpListen => &["listen"],
-        };
-        let is_listening = matches!(kind, BusKind::TcpListen | BusKind::UdpListen);
-        let safe: &[&str] = if is_listening { &[] } else { &FIELD_KEYS };
-        let bus_name = kind.name();
-        table.check_keys(&[&COMMON_KEYS, own, safe].concat(), &format!(" on bus = {bus_name:?}"))?;
-
         let index = self.config.ports.len() as u8;
         if usize::from(index) == MAX_PORTS {
             return Err(table.error(format!("too many ports; at most {MAX_PORTS}")));
@@ -305,26 +292,18 @@ impl<'a> Builder<'a> {
         }
         let mut port = Port::new(bounded(&name), bus, recipe as u8);
         port.cycle = read_cycle(table)?;
-        for (key, time) in [("timeout_ms", &mut port.timeout), ("stale_after_ms", &mut port.stale_after)] {
-            if let Some(item) = table.optional(key) {
-                *time = match item.as_string() {
-                    Some("never") if key == "timeout_ms" => Port::NEVER,
-                    Some(_) if key == "timeout_ms" => {
-                        return Err(
-                            item.error("expected a number or \"never\", for a device that sends only events")
-                        );
-                    }
-                    _ => item.time(1e3)?,
-                };
+        let timeout = table.optional("timeout_ms");
+        port.timeout = match timeout.as_ref().and_then(|item| item.as_string().map(|word| (item, word))) {
+            Some((_, "never")) => Port::NEVER,
+            Some((item, _)) => {
+                return Err(item.error("expected a number or \"never\", for a device that sends only events"));
             }
-        }
+            None => table.time_or(&TIMEOUT)?,
+        };
+        port.stale_after = table.time_or(&STALE_AFTER)?;
         port.on_timeout = self.add_safe_values(table)?;
-        if let Some(item) = table.optional("safe_at_start") {
-            port.safe_at_start = item.bool()?;
-        }
-        if let Some(item) = table.optional("refresh_ms") {
-            port.refresh = Some(item.time(1e3)?);
-        }
+        port.safe_at_start = table.flag(&SAFE_AT_START)?;
+        port.refresh = table.time(&REFRESH)?;
         if let Some(item) = table.optional("health") {
             port.health = sources::read_health(&item)?;
         }
@@ -348,7 +327,8 @@ impl<'a> Builder<'a> {
             let value = match VarBit::parse(name) {
                 Some(bit) => self.safe_bit(bit, &key_spot, &item)?,
                 None => {
-                    let var = SysVar::parse(name).map_err(|error| self.error(&key_spot, error))?;
+                    let var = SysVar::parse(name)
+                        .map_err(|error| self.error(&key_spot, format!("{error}{}", meant_variable(name))))?;
                     let value =
                         Scalar::from_f64(var.ty(), item.number()?).map_err(|error| item.error(error))?;
                     SafeValue::new(var, value)
@@ -421,23 +401,34 @@ fn read_controller(table: &Reader<'_>, recipes: &[FileRecipe]) -> Result<Control
         }
     }
     let mut udp_port = 2011;
+    let mut udp_item = None;
     if let Some(ports) = table.optional("ports") {
-        let ports = ports.table(&["command", "state", "modbus", "udp2011"])?;
+        let ports = ports.table(&keys::gateway::PORTS)?;
         for (key, target) in [
-            ("command", &mut link.command_port),
-            ("state", &mut link.state_port),
-            ("modbus", &mut link.modbus_port),
-            ("udp2011", &mut udp_port),
+            (COMMAND, &mut link.command_port),
+            (STATE, &mut link.state_port),
+            (MODBUS, &mut link.modbus_port),
+            (UDP2011, &mut udp_port),
         ] {
-            if let Some(item) = ports.optional(key) {
-                *target = item.integer(1..=65_535)?;
-            }
+            *target = ports.integer_or(&key)?;
         }
+        udp_item = ports.optional(UDP2011.name);
     }
     if let Some(item) = table.optional("recipe_link") {
-        let table = item.table(&["udp", "recipe"])?;
-        if let Some(item) = table.optional("udp") {
-            udp_port = item.integer(1..=65_535)?;
+        let table = item.table(&keys::gateway::RECIPE_LINK)?;
+        if let Some(port) = table.integer(&LINK_UDP)? {
+            let is_set = |spot: &Spot| matches!(spot.at, At::Override(_));
+            let link_is_set = table.optional(LINK_UDP.name).is_some_and(|item| is_set(&item.spot));
+            match udp_item.filter(|_| port != udp_port) {
+                // What is set for this run counts.
+                Some(item) if is_set(&item.spot) && !link_is_set => {}
+                Some(item) if is_set(&item.spot) == link_is_set => {
+                    return Err(item.error(format!(
+                        "{udp_port} is not the port of controller.recipe_link.udp, {port}; write it in one of the two"
+                    )));
+                }
+                _ => udp_port = port,
+            }
         }
         let recipe = table.required("recipe", "the recipe that the controller's UDP 2011 port is set to")?;
         let recipe = recipes::find(recipes, &recipe)? as u8;
@@ -449,6 +440,7 @@ fn read_controller(table: &Reader<'_>, recipes: &[FileRecipe]) -> Result<Control
 fn read_address(item: &Item<'_>) -> Result<heapless::String<MAX_ADDRESS>> {
     let text = item.string()?;
     check_address(text).map_err(|kind| item.error(format!("{text:?} is {kind}")))?;
+    check_ipv4(text).map_err(|message| item.error(message))?;
     Ok(bounded(text))
 }
 
@@ -464,7 +456,7 @@ fn read_bus(table: &Reader<'_>, kind: BusKind) -> Result<Bus> {
                 BusKind::Rs485 => read_line(table)?,
                 _ => read_rtu_line(table, kind == BusKind::ModbusMaster)?,
             };
-            line.echo = table.optional("echo").map_or(Ok(false), |item| item.bool())?;
+            line.echo = table.flag(&ECHO)?;
             Bus::Rs485(line)
         }
         BusKind::Can => Bus::Can { bitrate: read_bitrate(table)? },

@@ -1,16 +1,20 @@
 //! The keys that ports have in both kinds of files.
 
-use proto_core::config::{Bus, ConfigErrorKind, Parity, PortKey, Rs485, check_bitrate, check_cycle};
+use proto_core::config::{ConfigErrorKind, Parity, PortKey, Rs485, check_bitrate, check_cycle};
 use proto_core::time::Duration;
 
 use super::reader::{Reader, Result};
+use crate::keys::gateway::{BAUD, BITRATE, CYCLE, IDLE_GAP, PARITY, STOP_BITS, TURNAROUND};
 
-/// The keys of a serial line.
-pub(super) const LINE_KEYS: [&str; 5] = ["baud", "parity", "stop_bits", "idle_gap_ms", "turnaround_us"];
+/// The words of `parity`.
+pub(crate) const PARITIES: [(&str, Parity); 3] =
+    [("none", Parity::None), ("even", Parity::Even), ("odd", Parity::Odd)];
 
 /// The settings of a serial line, within their ranges.
 pub(super) fn read_line(port: &Reader<'_>) -> Result<Rs485> {
-    read_times(port, read_characters(port)?)
+    let mut line = read_characters(port)?;
+    (line.idle_gap, line.turnaround) = (port.time_or(&IDLE_GAP)?, port.time_or(&TURNAROUND)?);
+    read_times(port, line)
 }
 
 /// The same of a line of Modbus RTU, which has the standard's silences by default.
@@ -20,39 +24,29 @@ pub(super) fn read_rtu_line(port: &Reader<'_>, is_master: bool) -> Result<Rs485>
 }
 
 fn read_characters(port: &Reader<'_>) -> Result<Rs485> {
-    let mut line = Rs485::default();
-    if let Some(item) = port.optional("baud") {
-        line.baud = item.integer(1_200..=4_000_000)?;
-    }
-    if let Some(item) = port.optional("parity") {
-        line.parity = item.choice(&[("none", Parity::None), ("even", Parity::Even), ("odd", Parity::Odd)])?;
-    }
-    if let Some(item) = port.optional("stop_bits") {
-        line.stop_bits = item.integer(1..=2)?;
-    }
-    Ok(line)
+    Ok(Rs485 {
+        baud: port.integer_or(&BAUD)?,
+        parity: port.word_or(&PARITY, &PARITIES)?,
+        stop_bits: port.integer_or(&STOP_BITS)?,
+        ..Rs485::default()
+    })
 }
 
 fn read_times(port: &Reader<'_>, mut line: Rs485) -> Result<Rs485> {
-    if let Some(item) = port.optional("idle_gap_ms") {
-        line.idle_gap = item.time(1e3)?;
-    }
-    if let Some(item) = port.optional("turnaround_us") {
-        line.turnaround = item.time(1.0)?;
-    }
+    line.idle_gap = port.time(&IDLE_GAP)?.unwrap_or(line.idle_gap);
+    line.turnaround = port.time(&TURNAROUND)?.unwrap_or(line.turnaround);
     line.check().map_err(|(key, kind)| refused(port, key, kind))?;
     Ok(line)
 }
 
 pub(super) fn read_bitrate(port: &Reader<'_>) -> Result<u32> {
-    let bitrate =
-        port.optional("bitrate").map_or(Ok(Bus::BITRATE), |item| item.integer(0..=i64::from(u32::MAX)))?;
+    let bitrate = port.integer_or(&BITRATE)?;
     check_bitrate(bitrate).map_err(|kind| refused(port, PortKey::Bitrate, kind))?;
     Ok(bitrate)
 }
 
 pub(super) fn read_cycle(port: &Reader<'_>) -> Result<Duration> {
-    let cycle = port.optional("cycle_ms").map_or(Ok(Duration::from_millis(4)), |item| item.time(1e3))?;
+    let cycle = port.time_or(&CYCLE)?;
     check_cycle(cycle).map_err(|kind| refused(port, PortKey::Cycle, kind))?;
     Ok(cycle)
 }

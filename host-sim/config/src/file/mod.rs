@@ -3,24 +3,25 @@
 //! In: a file and its `--set` overrides. Out: `GatewayConfig` or `SimConfig`. Every mistake is one
 //! [`FileError`]; the keys are those of docs/configuration.md.
 
-mod bindings;
+pub(crate) mod bindings;
+pub(crate) mod checksums;
 mod coils;
-mod commands;
-mod controller;
-mod device;
+pub(crate) mod commands;
+pub(crate) mod controller;
+pub(crate) mod device;
 mod document;
-mod encoding;
+pub(crate) mod encoding;
 mod error;
 mod exchanges;
-mod framings;
+pub(crate) mod framings;
 mod functions;
-mod gateway;
-mod lines;
-mod modbus;
+pub(crate) mod gateway;
+pub(crate) mod lines;
+pub(crate) mod modbus;
 mod names;
 mod network;
 mod reader;
-mod recipes;
+pub(crate) mod recipes;
 mod rtu_frames;
 mod sources;
 
@@ -34,6 +35,7 @@ pub use error::{FileError, Source};
 pub use modbus::function_name;
 
 use super::device::{AnyRecipe, DeviceRecipe};
+use super::keys;
 use super::sim::SimConfig;
 use document::Document;
 use reader::{Item, Reader, Result};
@@ -154,9 +156,9 @@ pub fn parse_recipes(text: Text<'_>, overrides: &[String]) -> Result<Vec<AnyReci
 fn read_recipes(text: Text<'_>, overrides: &[String]) -> Result<Vec<FileRecipe>> {
     let document = Document::parse(text.name, text.toml, overrides)?;
     let flavour = kind_of(&document)?;
-    let keys: &[&str] = match flavour {
-        Flavour::Gateway => &gateway::KEYS,
-        Flavour::Controller => &controller::KEYS,
+    let keys = match flavour {
+        Flavour::Gateway => &keys::top::GATEWAY,
+        Flavour::Controller => &keys::top::CONTROLLER,
     };
     let root = Reader::root(&document, keys)?;
     recipes::read_all(&root, flavour)
@@ -209,7 +211,8 @@ fn known_dialect<'a>(item: &Item<'_>, name: &'a str) -> Result<&'a str> {
         Some(_) => Ok(name),
         None => {
             let names: Vec<_> = Dialect::NAMES.iter().map(|name| format!("{name:?}")).collect();
-            Err(item.error(format!("there is no dialect {name:?}; there are {}", names.join(", "))))
+            let meant = names::did_you_mean(name, Dialect::NAMES.into_iter());
+            Err(item.error(format!("there is no dialect {name:?}; there are {}{meant}", names.join(", "))))
         }
     }
 }

@@ -6,20 +6,21 @@
 
 use proto_core::config::{DeviceFrame, ExchangeError, ExchangeKey};
 use proto_core::device::Carrier;
-use proto_core::modbus::rtu::{self, BROADCAST, MAX_ADDRESS, Operation};
+use proto_core::modbus::rtu::{self, BROADCAST, Operation};
 use proto_core::sysvar::Direction;
 
 use super::coils;
 use super::device::FieldReader;
 use super::encoding::refuse;
-use super::exchanges::{self, AskTiming, FileExchange, TIMING_KEYS};
+use super::exchanges::{self, AskTiming, FileExchange};
 use super::reader::{Item, Reader, Result};
 use super::recipes::{FileField, FileFrame, FilePart};
 use crate::device::ExchangeKind;
+use crate::keys::{self, exchange};
 
 /// A function that reads or writes one table.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Function {
+pub(crate) enum Function {
     ReadCoils,
     ReadDiscreteInputs,
     ReadHoldingRegisters,
@@ -31,7 +32,8 @@ enum Function {
     ReadWriteRegisters,
 }
 
-const FUNCTIONS: [(&str, i64, Function); 9] = [
+/// The names, the numbers and the functions of `function`.
+pub(crate) const FUNCTIONS: [(&str, i64, Function); 9] = [
     ("read-coils", 1, Function::ReadCoils),
     ("read-discrete-inputs", 2, Function::ReadDiscreteInputs),
     ("read-holding-registers", 3, Function::ReadHoldingRegisters),
@@ -51,7 +53,7 @@ pub fn function_name(operation: &Operation) -> &'static str {
 
 /// What a block of a slave holds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Table {
+pub(crate) enum Table {
     Coils,
     DiscreteInputs,
     HoldingRegisters,
@@ -70,16 +72,13 @@ impl Table {
     }
 }
 
-const TABLES: [(&str, Table); 4] = [
+/// The words of `table`.
+pub(crate) const TABLES: [(&str, Table); 4] = [
     ("coils", Table::Coils),
     ("discrete-inputs", Table::DiscreteInputs),
     ("holding-registers", Table::HoldingRegisters),
     ("input-registers", Table::InputRegisters),
 ];
-
-const MASTER_KEYS: [&str; 7] =
-    ["slave", "function", "address", "write_address", "word_order", "read", "write"];
-const BLOCK_KEYS: [&str; 4] = ["table", "address", "word_order", "fields"];
 
 /// The exchanges of a master.
 pub(super) fn read_master(recipe: &Reader<'_>) -> Result<Vec<FileExchange>> {
@@ -92,8 +91,8 @@ pub(super) fn read_master(recipe: &Reader<'_>) -> Result<Vec<FileExchange>> {
 
 /// The blocks of a slave.
 pub(super) fn read_slave(recipe: &Reader<'_>) -> Result<Vec<FileExchange>> {
-    let address = recipe.required("address", "the gateway's own address on the line, 1..=247")?;
-    let address = address.integer(1..=i64::from(MAX_ADDRESS))?;
+    let address =
+        recipe.integer_needed(&keys::recipe::ADDRESS, "the gateway's own address on the line, 1..=247")?;
     let blocks = recipe.any_tables("block")?;
     if blocks.is_empty() {
         return Err(recipe.error("a recipe of a Modbus slave needs a block, [[recipe.block]]"));
@@ -102,7 +101,8 @@ pub(super) fn read_slave(recipe: &Reader<'_>) -> Result<Vec<FileExchange>> {
 }
 
 fn read_exchange(table: &Reader<'_>) -> Result<FileExchange> {
-    table.check_keys_nearly(&[&MASTER_KEYS[..], &TIMING_KEYS].concat(), " of an exchange of Modbus")?;
+    let all = keys::names(exchange::OF_MODBUS.keys());
+    table.check_names(&all, exchange::OF_MODBUS.place, |_| false)?;
     let slave = table.required("slave", "the slave's address, 1..=247, or 0 to write to all of them")?;
     let function = read_function(table)?;
     if !function.reads() {
@@ -126,7 +126,7 @@ fn read_exchange(table: &Reader<'_>) -> Result<FileExchange> {
     };
     let read = list("read", Direction::Input, function.reads())?;
     let write = list("write", Direction::Output, function.writes())?;
-    let peer = slave.integer(0..=i64::from(MAX_ADDRESS))?;
+    let peer = slave.integer(exchange::SLAVE.integers())?;
     if peer == BROADCAST && function.reads() {
         return Err(slave.error(ExchangeError::BroadcastRead));
     }
@@ -164,9 +164,9 @@ fn read_exchange(table: &Reader<'_>) -> Result<FileExchange> {
 }
 
 fn read_block(table: &Reader<'_>, peer: u8) -> Result<FileExchange> {
-    table.check_keys_nearly(&BLOCK_KEYS, " of a block")?;
+    table.check_names(&keys::names(exchange::BLOCK.keys()), exchange::BLOCK.place, |_| false)?;
     let holds = table.required("table", "coils, discrete-inputs, holding-registers or input-registers")?;
-    let holds = holds.choice_nearly(&TABLES)?;
+    let holds = holds.choice(&TABLES)?;
     let first = table.required("address", "the first register or coil, counted from 0 as on the line")?;
     let first = read_first(&first, holds)?;
     let direction = direction_of(table, holds)?;
@@ -205,7 +205,7 @@ fn read_block(table: &Reader<'_>, peer: u8) -> Result<FileExchange> {
 
 /// The address of the first register or coil. Manuals' numbers of six digits are no addresses.
 fn read_first(item: &Item<'_>, table: Table) -> Result<u16> {
-    item.integer(0..=0xFFFF).map_err(|mut error| {
+    item.integer(exchange::ADDRESS.integers()).map_err(|mut error| {
         let number = item.as_integer().and_then(|number| u32::try_from(number).ok());
         if let Some(address) = number.and_then(|number| table.on_line().address_of_number(number)) {
             error.message += &format!("; on the line, what a manual calls so has the address {address}");
@@ -253,7 +253,7 @@ fn read_function(table: &Reader<'_>) -> Result<Function> {
     let item = table.required("function", "such as \"read-input-registers\", or its number, 4")?;
     let names = FUNCTIONS.map(|(name, _, function)| (name, function));
     if item.as_string().is_some() {
-        return item.choice_nearly(&names);
+        return item.choice(&names);
     }
     let Some(number) = item.as_integer() else { return item.choice(&names) };
     let known = FUNCTIONS.iter().find(|(_, code, _)| *code == number);
@@ -338,7 +338,7 @@ fn check(
             return Err(list.item.error(ExchangeError::Count(error)));
         }
         let Some(item) = table.optional(key).or_else(|| table.optional("address")) else { continue };
-        let address: u16 = item.integer(0..=0xFFFF)?;
+        let address: u16 = item.integer(exchange::ADDRESS.integers())?;
         if u32::from(address) + u32::from(list.count) > 0x1_0000 {
             return Err(item.error(ExchangeError::BeyondLast { address, count: list.count }));
         }

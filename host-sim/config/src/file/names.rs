@@ -2,13 +2,32 @@
 //!
 //! In: what a file has, and the names that are known. Out: the end of a message, empty if nothing is near.
 
+use proto_core::sysvar::SysVar;
+
 /// `; did you mean "x"?` with the name of `names` that is nearest.
 pub(super) fn did_you_mean<'n>(given: &str, names: impl Iterator<Item = &'n str>) -> String {
-    let near = names.map(|name| (strsim::levenshtein(given, name), name)).min();
+    let near = names.map(|name| (distance(given, name), name)).min();
     match near {
-        Some((changes, name)) if changes <= 1 + given.chars().count() / 4 => ask(name),
+        Some((changes, name)) if changes <= 1 + given.chars().count() / 5 => ask(name),
         _ => String::new(),
     }
+}
+
+/// Letters that are wrong, missing, too many, or swapped with the next. A unit that was left out is one mistake.
+fn distance(given: &str, name: &str) -> usize {
+    let whole = strsim::osa_distance(given, name);
+    let bare = name.rsplit_once('_').filter(|(_, unit)| matches!(*unit, "ms" | "us"));
+    bare.map_or(whole, |(bare, _)| whole.min(1 + strsim::osa_distance(given, bare)))
+}
+
+/// The same for the group of a system variable, in a name such as `RobotStat[8]`.
+pub(super) fn meant_variable(given: &str) -> String {
+    let pendant = given.strip_prefix("__").and_then(|rest| Some(rest.rsplit_once('_')?.0));
+    let group = pendant.unwrap_or_else(|| given.split('[').next().unwrap_or(given));
+    if SysVar::all().any(|var| var.group() == group) {
+        return String::new();
+    }
+    did_you_mean(group, SysVar::all().map(SysVar::group))
 }
 
 /// The same for the type of a field.

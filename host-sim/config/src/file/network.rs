@@ -6,9 +6,6 @@ use proto_core::config::Network;
 
 use super::reader::{Item, Reader, Result};
 
-/// The keys of the section.
-pub(super) const KEYS: [&str; 3] = ["address", "router", "dns"];
-
 pub(super) fn read(table: &Reader<'_>) -> Result<Network> {
     let item = table
         .required("address", "the board's IPv4 address and prefix length, such as \"192.168.12.20/24\"")?;
@@ -22,6 +19,19 @@ pub(super) fn read(table: &Reader<'_>) -> Result<Network> {
     })?;
     let optional = |key| table.optional(key).map(|item| host(&item)).transpose();
     Ok(Network { address, prefix, router: optional("router")?, dns: optional("dns")? })
+}
+
+/// Refuses what looks like an IPv4 address and is none: a name service would be asked for it, in vain.
+pub(super) fn check_ipv4(text: &str) -> std::result::Result<(), String> {
+    let last = text.trim_end_matches('.').rsplit('.').next().unwrap_or("");
+    let ends_in_number = !last.is_empty() && last.bytes().all(|byte| byte.is_ascii_digit());
+    if ends_in_number && text.parse::<Ipv4Addr>().is_err() {
+        return Err(format!(
+            "{text:?} is not an IPv4 address, which has four numbers in 0..=255 such as \"192.168.12.138\", and not a \
+             host name, whose last part is no number"
+        ));
+    }
+    Ok(())
 }
 
 fn host(item: &Item<'_>) -> Result<Ipv4Addr> {

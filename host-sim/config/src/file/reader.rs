@@ -5,6 +5,7 @@ use std::ops::RangeInclusive;
 use super::document::{At, Document, Node, Table, Value};
 use super::error::FileError;
 use super::names::did_you_mean;
+use crate::keys::{self, Key, Need};
 use proto_core::time::Duration;
 
 pub(super) type Result<T> = std::result::Result<T, FileError>;
@@ -40,32 +41,51 @@ pub(super) struct Item<'a> {
 }
 
 impl<'a> Reader<'a> {
-    pub(super) fn root(document: &'a Document, allowed: &[&str]) -> Result<Self> {
+    pub(super) fn root(document: &'a Document, table: &keys::Table) -> Result<Self> {
         let spot = Spot { at: At::File(0), key: String::new() };
         let reader = Self { document, spot, table: &document.root };
-        reader.check_keys(allowed, "")?;
+        reader.check(table)?;
         Ok(reader)
     }
 
-    /// Refuses a key that is not in `allowed`; `when` says what the list depends on.
-    pub(super) fn check_keys(&self, allowed: &[&str], when: &str) -> Result<()> {
-        match self.table.entries.iter().find(|entry| !allowed.contains(&entry.key.as_str())) {
-            None => Ok(()),
-            Some(entry) => {
-                let spot = Spot { at: entry.at, key: self.path(&entry.key) };
-                let message = format!("unknown key{when}; allowed: {}", allowed.join(", "));
-                Err(spot.error(self.document, message))
+    /// Refuses a key that the table does not have, or not beside the word of the key that its cases depend on.
+    pub(super) fn check(&self, table: &keys::Table) -> Result<()> {
+        let by = table.by().and_then(|by| Some((by, self.optional(by)?.as_string()?)));
+        match by {
+            Some((by, word)) if is_word(table, by, word) => {
+                let on = if by == "bus" { "on" } else { "with" };
+                let names = keys::names(table.keys_with(by, word));
+                self.check_names(&names, &format!(" {on} {by} = {word:?}"), |key| {
+                    table.keys().any(|known| known.name == key)
+                })
             }
+            _ => self.check_names(&keys::names(table.keys()), table.place, |_| false),
         }
     }
 
-    /// Same as [`Self::check_keys`]; says as well which of them was probably meant.
-    pub(super) fn check_keys_nearly(&self, allowed: &[&str], when: &str) -> Result<()> {
-        self.check_keys(allowed, when).map_err(|mut error| {
-            let key = error.key.rsplit('.').next().unwrap_or("");
-            error.message += &did_you_mean(key, allowed.iter().copied());
-            error
-        })
+    /// Refuses a key that is not in these lists; `when` says what they depend on.
+    pub(super) fn check_keys(&self, allowed: &[&[Key]], when: &str) -> Result<()> {
+        let names = keys::names(allowed.iter().copied().flatten());
+        self.check_names(&names, when, |_| false)
+    }
+
+    /// Refuses a key without one of the names, and says which of them was probably meant. A key that `is_known`
+    /// is none that was misspelled.
+    pub(super) fn check_names(
+        &self,
+        allowed: &[&str],
+        when: &str,
+        is_known: impl Fn(&str) -> bool,
+    ) -> Result<()> {
+        let unknown = self.table.entries.iter().find(|entry| !allowed.contains(&entry.key.as_str()));
+        let Some(entry) = unknown else { return Ok(()) };
+        let spot = Spot { at: entry.at, key: self.path(&entry.key) };
+        let meant = match is_known(&entry.key) {
+            true => String::new(),
+            false => did_you_mean(&entry.key, allowed.iter().copied()),
+        };
+        let message = format!("unknown key{when}; allowed: {}{meant}", allowed.join(", "));
+        Err(spot.error(self.document, message))
     }
 
     /// An error that concerns the whole table.
@@ -96,18 +116,72 @@ impl<'a> Reader<'a> {
         })
     }
 
-    /// The tables of the array `key`, each with its name or its number.
-    pub(super) fn tables(&self, key: &str, allowed: &[&str]) -> Result<Vec<Reader<'a>>> {
-        let readers = self.any_tables(key)?;
-        readers.iter().try_for_each(|reader| reader.check_keys(allowed, ""))?;
-        Ok(readers)
-    }
-
-    /// Same as [`Self::tables`], with any keys.
+    /// The tables of the array `key`, with any keys, each with its name or its number.
     pub(super) fn any_tables(&self, key: &str) -> Result<Vec<Reader<'a>>> {
         let Some(item) = self.optional(key) else { return Ok(Vec::new()) };
         let items = item.array(&format!("of tables, written [[{key}]]"))?;
         items.iter().map(|item| item.named_table(key, &self.spot.key)).collect()
+    }
+
+    /// An integer in the range of its key; `None` if it is absent.
+    pub(super) fn integer<T: TryFrom<i64>>(&self, key: &Key) -> Result<Option<T>> {
+        self.optional(key.name).map(|item| item.integer(key.integers())).transpose()
+    }
+
+    /// An integer in the range of its key, or the key's default.
+    pub(super) fn integer_or<T: TryFrom<i64>>(&self, key: &Key) -> Result<T> {
+        match (self.integer(key)?, key.need) {
+            (Some(value), _) => Ok(value),
+            (None, Need::Integer(value)) => {
+                T::try_from(value).map_err(|_| self.error(format!("{} is missing", key.name)))
+            }
+            (None, _) => Err(self.error(format!("{} is missing", key.name))),
+        }
+    }
+
+    /// An integer that must be there; `what` says what it is.
+    pub(super) fn integer_needed<T: TryFrom<i64>>(&self, key: &Key, what: &str) -> Result<T> {
+        self.required(key.name, what)?.integer(key.integers())
+    }
+
+    /// `true` or `false`; the key's default if it is absent.
+    pub(super) fn flag(&self, key: &Key) -> Result<bool> {
+        match self.optional(key.name) {
+            Some(item) => item.bool(),
+            None => Ok(matches!(key.need, Need::Bool(true))),
+        }
+    }
+
+    /// A time within the limits of its key.
+    pub(super) fn time(&self, key: &Key) -> Result<Option<Duration>> {
+        self.optional(key.name).map(|item| item.time(key)).transpose()
+    }
+
+    /// A time within the limits of its key, or the key's default.
+    pub(super) fn time_or(&self, key: &Key) -> Result<Duration> {
+        match (self.time(key)?, key.need) {
+            (Some(time), _) => Ok(time),
+            (None, Need::Integer(value)) => Ok(keys::time(key, value as f64)),
+            (None, _) => Err(self.error(format!("{} is missing", key.name))),
+        }
+    }
+
+    /// What the word of a key stands for; `None` if it is absent.
+    pub(super) fn word<T: Clone>(&self, key: &Key, choices: &[(&str, T)]) -> Result<Option<T>> {
+        self.optional(key.name).map(|item| item.choice(choices)).transpose()
+    }
+
+    /// What the word of a key stands for, or its default.
+    pub(super) fn word_or<T: Clone>(&self, key: &Key, choices: &[(&str, T)]) -> Result<T> {
+        let default = match key.need {
+            Need::Word(word) => choices.iter().find(|(name, _)| *name == word),
+            _ => None,
+        };
+        match (self.word(key, choices)?, default) {
+            (Some(value), _) => Ok(value),
+            (None, Some((_, value))) => Ok(value.clone()),
+            (None, None) => Err(self.error(format!("{} is missing", key.name))),
+        }
     }
 
     fn path(&self, key: &str) -> String {
@@ -134,16 +208,6 @@ impl<'a> Item<'a> {
             Value::Str(text) => Ok(text),
             _ => Err(self.wrong_kind("a string")),
         }
-    }
-
-    /// One of several strings; says as well which of them was probably meant.
-    pub(super) fn choice_nearly<T: Clone>(&self, choices: &[(&str, T)]) -> Result<T> {
-        self.choice(choices).map_err(|mut error| {
-            if let Some(text) = self.as_string() {
-                error.message += &did_you_mean(text, choices.iter().map(|(name, _)| *name));
-            }
-            error
-        })
     }
 
     /// The string, if it is one.
@@ -215,13 +279,13 @@ impl<'a> Item<'a> {
         }
     }
 
-    /// A span of time in units of `unit_us` µs; fractions are rounded to the microsecond.
-    pub(super) fn time(&self, unit_us: f64) -> Result<Duration> {
-        let value = self.number()?;
-        if value < 0.0 {
-            return Err(self.error(format!("{value} is negative; a time cannot be")));
+    /// A span of time within the limits of its key; fractions are rounded to the microsecond.
+    pub(super) fn time(&self, key: &Key) -> Result<Duration> {
+        let (value, limits) = (self.number()?, key.limits());
+        match keys::time(key, value) {
+            time if limits.take(value) && (limits.take(0.0) || time > Duration::ZERO) => Ok(time),
+            _ => Err(self.error(format!("{value} is out of range; allowed: {limits} {}", key.unit))),
         }
-        Ok(Duration::from_micros((value * unit_us).round() as u64))
     }
 
     pub(super) fn array(&self, hint: &str) -> Result<Vec<Item<'a>>> {
@@ -246,9 +310,10 @@ impl<'a> Item<'a> {
         matches!(self.node.value, Value::Table(_))
     }
 
-    pub(super) fn table(&self, allowed: &[&str]) -> Result<Reader<'a>> {
+    /// A table with the keys of its kind.
+    pub(super) fn table(&self, table: &keys::Table) -> Result<Reader<'a>> {
         let reader = self.any_table()?;
-        reader.check_keys(allowed, "")?;
+        reader.check(table)?;
         Ok(reader)
     }
 
@@ -270,17 +335,32 @@ impl<'a> Item<'a> {
         Ok(Reader { document: self.document, spot, table })
     }
 
-    /// One of several strings.
+    /// One of several strings; says as well which of them was probably meant.
     pub(super) fn choice<T: Clone>(&self, choices: &[(&str, T)]) -> Result<T> {
+        self.choice_or(choices, |text| did_you_mean(text, choices.iter().map(|(name, _)| *name)))
+    }
+
+    /// Same as [`Self::choice`]; `meant` ends the message about a word that is unknown.
+    pub(super) fn choice_or<T: Clone>(
+        &self,
+        choices: &[(&str, T)],
+        meant: impl FnOnce(&str) -> String,
+    ) -> Result<T> {
         let allowed = || choices.iter().map(|(name, _)| format!("{name:?}")).collect::<Vec<_>>().join(", ");
         let Some(text) = self.as_string() else {
             return Err(self.wrong_kind(&format!("one of {}", allowed())));
         };
         match choices.iter().find(|(name, _)| *name == text) {
             Some((_, value)) => Ok(value.clone()),
-            None => Err(self.error(format!("{text:?} is unknown; allowed: {}", allowed()))),
+            None => Err(self.error(format!("{text:?} is unknown; allowed: {}{}", allowed(), meant(text)))),
         }
     }
+}
+
+/// Whether the key takes the word.
+fn is_word(table: &keys::Table, key: &str, word: &str) -> bool {
+    let words = table.common.iter().filter(|known| known.name == key).map(|known| known.shape);
+    words.into_iter().any(|shape| matches!(shape, keys::Shape::Words(words) if words().contains(&word)))
 }
 
 fn join(parent: &str, key: &str) -> String {

@@ -13,13 +13,16 @@ use proto_core::wire::can::CanId;
 use proto_core::wire::scalar::ScalarType;
 
 use super::bindings::{self, FileInput, FileOutput};
+use super::checksums;
 use super::device::{self, FieldReader};
 use super::encoding::refuse;
 use super::exchanges::{self, FileExchange};
 use super::framings;
 use super::modbus;
+use super::names::{did_you_mean, meant_variable};
 use super::reader::{Item, Reader, Result, Spot};
 use crate::device::AnyRecipe;
+use crate::keys;
 use crate::sim::{SimCanFrame, SimField, SimParts, SimRecipe, SimStreamPart};
 
 /// The kind of file: only a gateway's recipes have bindings.
@@ -45,14 +48,15 @@ pub(super) struct FileRecipe {
 
 /// What carries a recipe.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum RecipeKind {
+pub(crate) enum RecipeKind {
     Stream,
     Can,
     ModbusMaster,
     ModbusSlave,
 }
 
-const KINDS: [(&str, RecipeKind); 4] = [
+/// The words of `kind`.
+pub(crate) const KINDS: [(&str, RecipeKind); 4] = [
     ("stream", RecipeKind::Stream),
     ("can", RecipeKind::Can),
     ("modbus-rtu", RecipeKind::ModbusMaster),
@@ -67,18 +71,6 @@ impl RecipeKind {
 
     pub(super) fn is_modbus(self) -> bool {
         matches!(self, Self::ModbusMaster | Self::ModbusSlave)
-    }
-
-    /// The keys of such a recipe.
-    fn keys(self, flavour: Flavour) -> &'static [&'static str] {
-        match (self, flavour) {
-            (Self::Stream | Self::Can, Flavour::Controller) => &["name", "kind", "mode", "input", "output"],
-            (Self::Stream | Self::Can, _) => {
-                &["name", "kind", "mode", "input", "output", "on_stale", "exchange"]
-            }
-            (Self::ModbusMaster, _) => &["name", "kind", "mode", "on_stale", "exchange"],
-            (Self::ModbusSlave, _) => &["name", "kind", "mode", "on_stale", "address", "block"],
-        }
     }
 }
 
@@ -250,7 +242,8 @@ pub(super) fn find(recipes: &[FileRecipe], item: &Item<'_>) -> Result<usize> {
         let names: Vec<_> = recipes.iter().map(|recipe| format!("{:?}", recipe.name)).collect();
         let known =
             if names.is_empty() { "there is none".into() } else { format!("there are {}", names.join(", ")) };
-        item.error(format!("there is no recipe {name:?}; {known}"))
+        let meant = did_you_mean(name, recipes.iter().map(|recipe| recipe.name.as_str()));
+        item.error(format!("there is no recipe {name:?}; {known}{meant}"))
     })
 }
 
@@ -279,12 +272,10 @@ fn check_keys(table: &Reader<'_>, flavour: Flavour) -> Result<()> {
                 &["input", "output"],
                 "a recipe of Modbus has no parts; its fields are in exchanges or blocks",
             )?;
-            table.check_keys(kind.keys(flavour), &format!(" with kind = {:?}", kind.name()))
+            table.check(&keys::recipe::OF_GATEWAY)
         }
-        Some(kind) => table.check_keys(kind.keys(flavour), ""),
-        None => {
-            table.check_keys(&["name", "kind", "mode", "input", "output", "exchange", "address", "block"], "")
-        }
+        _ if flavour == Flavour::Controller => table.check(&keys::recipe::OF_CONTROLLER),
+        _ => table.check(&keys::recipe::OF_GATEWAY),
     }
 }
 
@@ -300,15 +291,17 @@ fn read_kind(table: &Reader<'_>, flavour: Flavour) -> Result<RecipeKind> {
     item.choice(&KINDS[..2])
 }
 
+/// The words of `mode`.
+pub(crate) const MODES: [(&str, Mode); 2] = [("realtime", Mode::Realtime), ("user", Mode::User)];
+
 fn read_mode(table: &Reader<'_>, kind: RecipeKind) -> Result<Mode> {
-    let modes = [("realtime", Mode::Realtime), ("user", Mode::User)];
     if !kind.is_modbus() {
         let item =
             table.required("mode", "\"realtime\" (system variables) or \"user\" (fields of your own)")?;
-        return item.choice(&modes);
+        return item.choice(&MODES);
     }
     match table.optional("mode") {
-        Some(item) => item.choice(&modes[1..]),
+        Some(item) => item.choice(&MODES[1..]),
         None => Ok(Mode::User),
     }
 }
@@ -368,23 +361,23 @@ fn read(table: &Reader<'_>, flavour: Flavour) -> Result<FileRecipe> {
 fn read_part(item: &Item<'_>, rules: Rules, is_can: bool, flavour: Flavour) -> Result<FilePart> {
     let is_gateway_output = flavour == Flavour::Gateway && rules.direction == Direction::Output;
     let table = item.any_table()?;
-    let own: &[&str] = if is_can { &["frame"] } else { &["head", "tail", "fields"] };
-    let sending_keys: &[&str] = if is_gateway_output { &["on_stale", "send"] } else { &[] };
+    let own = if is_can { keys::recipe::CAN_PART.common } else { keys::recipe::REALTIME.common };
+    let sending_keys = if is_gateway_output { keys::recipe::SENDING } else { &[] };
     let when = if is_can { " in a CAN recipe" } else { " in a stream recipe" };
     let frame_keys = if is_can {
         device::refuse_in_can_part(&table, rules.mode, flavour)?;
-        &[]
+        &[][..]
     } else {
         device::stream_keys(&table, rules.mode, flavour)?
     };
-    table.check_keys(&[own, frame_keys, sending_keys].concat(), when)?;
+    table.check_keys(&[own, frame_keys, sending_keys], when)?;
 
     let (sending, framing) = (bindings::read_sending(&table)?, framings::read_part(&table)?);
     let mut part = FilePart { sending, framing, ..FilePart::new(&table) };
     if is_can {
         for frame in table.any_tables("frame")? {
             let frame_keys = device::frame_keys(&frame, rules.mode, flavour)?;
-            frame.check_keys(&[&["id", "extended", "fields"], frame_keys].concat(), "")?;
+            frame.check_keys(&[keys::recipe::CAN_REALTIME.common, frame_keys], "")?;
             let item = frame.required("id", "the frame's CAN id")?;
             let id = read_id(&frame, &item)?;
             let fields = read_fields(&frame, 0, rules, flavour)?;
@@ -402,7 +395,7 @@ fn read_part(item: &Item<'_>, rules: Rules, is_can: bool, flavour: Flavour) -> R
 
 /// 11 bits, or 29 with `extended = true`.
 pub(super) fn read_id(frame: &Reader<'_>, item: &Item<'_>) -> Result<CanId> {
-    let is_extended = frame.optional("extended").map_or(Ok(false), |item| item.bool())?;
+    let is_extended = frame.flag(&keys::recipe::EXTENDED)?;
     let number: i64 = item.integer(i64::MIN..=i64::MAX)?;
     let standard = || u16::try_from(number).ok().map(CanId::Standard);
     let extended = || u32::try_from(number).ok().map(CanId::Extended);
@@ -442,8 +435,8 @@ pub(super) fn read_fields(
     for item in list.array("of fields, such as [\"RobotState[8..13]\"]")? {
         match (rules.mode, item.as_string()) {
             (Mode::Realtime, Some(name)) => {
-                let range =
-                    VarRange::parse(name).map_err(|error| item.error(format!("{name:?}: {error}")))?;
+                let range = VarRange::parse(name)
+                    .map_err(|error| item.error(format!("{name:?}: {error}{}", meant_variable(name))))?;
                 fields.extend(
                     range
                         .iter()
@@ -465,7 +458,7 @@ pub(super) fn read_fields(
             (Mode::User, None) => reader.read(&item, &mut fields)?,
         }
     }
-    device::read_checksum(table, head, &mut fields)?;
+    checksums::read_checksum(table, head, &mut fields)?;
     Ok(fields)
 }
 

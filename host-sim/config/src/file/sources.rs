@@ -7,7 +7,9 @@ use proto_core::config::{OutputBinding, PortHealth, PortValue, StateValue};
 use proto_core::sysvar::SysVar;
 
 use super::bindings::FileOutput;
+use super::names::{did_you_mean, meant_variable};
 use super::reader::{Item, Result};
+use crate::keys::gateway::HEALTH_TABLE;
 
 /// The values of port 2000, which the gateway asks only when a device picks the command.
 const ASKED: [&str; 3] = ["last_error", "state", "isprogfinish"];
@@ -44,8 +46,9 @@ pub(super) fn read(item: &Item<'_>, text: &str, scale: f32, offset: f32) -> Resu
 
 fn read_value(item: &Item<'_>, name: &str) -> Result<PortValue> {
     PortValue::named(name).ok_or_else(|| {
-        let names = PortValue::NAMES.map(|(name, _)| name).join(", ");
-        item.error(format!("{name:?} is not known of a port; allowed: {names}"))
+        let names = PortValue::NAMES.map(|(name, _)| name);
+        let meant = did_you_mean(name, names.into_iter());
+        item.error(format!("{name:?} is not known of a port; allowed: {}{meant}", names.join(", ")))
     })
 }
 
@@ -59,13 +62,16 @@ pub(super) fn of_port(
     let index = ports.iter().position(|port| port == name);
     match index.and_then(|index| u8::try_from(index).ok()) {
         Some(index) => Ok(OutputBinding::Port { port: Some(index), value, scale, offset }),
-        None => Err(format!("there is no port {name:?}; there are {}", ports.join(", "))),
+        None => {
+            let meant = did_you_mean(name, ports.iter().map(String::as_str));
+            Err(format!("there is no port {name:?}; there are {}{meant}", ports.join(", ")))
+        }
     }
 }
 
 /// Reads the variables that tell a port's health.
 pub(super) fn read_health(item: &Item<'_>) -> Result<PortHealth> {
-    let table = item.table(&PortValue::NAMES.map(|(name, _)| name))?;
+    let table = item.table(&HEALTH_TABLE)?;
     let mut health = PortHealth::NONE;
     for (name, value) in PortValue::NAMES {
         let Some(item) = table.optional(name) else { continue };
@@ -76,7 +82,8 @@ pub(super) fn read_health(item: &Item<'_>) -> Result<PortHealth> {
                  FloatInputReg"
             )));
         }
-        let var = SysVar::parse(text).map_err(|error| item.error(format!("{text:?}: {error}")))?;
+        let var = SysVar::parse(text)
+            .map_err(|error| item.error(format!("{text:?}: {error}{}", meant_variable(text))))?;
         health.set(value, var);
     }
     Ok(health)

@@ -52,6 +52,9 @@ const CASES: &[Case] = &[
     gateway("a controller with a name and no name server", "[controller]\naddress = \"192.168.12.138\"", "[network]\naddress = \"192.168.12.20/24\"\n[controller]\naddress = \"robot.cell\""),
     // [controller]
     gateway("no address", "address = \"192.168.12.138\"", ""),
+    gateway("an address with a number beyond 255", "192.168.12.138", "300.1.1.1"),
+    gateway("an address of three numbers", "192.168.12.138", "192.168.12"),
+    gateway("two ports of one link", "[controller]", "[controller]\nports = { udp2011 = 2012 }"),
     gateway("an address with a port", "192.168.12.138", "192.168.12.138:2000"),
     gateway("an unknown key of the controller", "address =", "adress ="),
     gateway("an unknown dialect", "[controller]", "[controller]\ndialect = \"v9\""),
@@ -250,6 +253,7 @@ const CASES: &[Case] = &[
     controller("a user recipe on UDP", "bus = \"udp-server\"\nrecipe = \"system\"", "bus = \"udp-server\"\nrecipe = \"bytes\""),
     controller("two UDP servers", "bus = \"udp-client\"\nto = \"127.0.0.1:50000\"", "bus = \"udp-server\""),
     controller("a client without a target", "to = \"127.0.0.1:50000\"\n", ""),
+    controller("a target whose address is none", "127.0.0.1:50000", "127.0.0.1.1:50000"),
     controller("a target without a port", "to = \"127.0.0.1:50000\"", "to = \"127.0.0.1\""),
     controller("a program without a script", "script = \"comm_recv(\\\"rs485\\\")\"\n", ""),
     controller("a program that run cannot name", "name = \"echo.jspf\"", "name = \"echo,50\""),
@@ -368,6 +372,22 @@ fn overrides_change_what_they_name() {
     assert_ne!(plain.recipes[0], config.recipes[0], "the tail");
     assert_ne!(plain.recipes[2], config.recipes[2], "the id");
     assert_ne!(plain.ports[0], config.ports[0], "the speed");
+}
+
+#[test]
+fn a_port_that_is_set_counts_for_the_recipe_link() {
+    let port = |sets: &[&str]| {
+        let sets: Vec<String> = sets.iter().map(|&set| set.to_owned()).collect();
+        let config = parse_gateway(Text { name: "cell.toml", toml: GATEWAY }, &sets)?;
+        Ok(config.controller.recipe_link.unwrap().udp_port)
+    };
+    let (of_link, of_ports) = ("controller.recipe_link.udp=2012", "controller.ports.udp2011=2013");
+    assert_eq!(port(&[]), Ok(2011));
+    assert_eq!(port(&[of_link]), Ok(2012));
+    assert_eq!(port(&[of_ports]), Ok(2013), "not lost against that of the file");
+    let both: Result<u16, recipe_config::file::FileError> = port(&[of_link, of_ports]);
+    let message = both.unwrap_err().to_string();
+    assert!(message.contains("is not the port of controller.recipe_link.udp, 2012"), "{message}");
 }
 
 #[test]

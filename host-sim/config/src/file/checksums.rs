@@ -1,0 +1,143 @@
+//! `checksum` of a frame in a gateway file.
+//!
+//! In: its table, and the fields of the frame so far. Out: a checksum among the fields, at its place.
+
+use proto_core::device::{Algorithm, ByteOrder, Checksum, Crc, DataId, Element, MAX_DATA_ID, TextWidth};
+use proto_core::recipe::model::MAX_STREAM_FRAME;
+
+use super::encoding::refuse;
+use super::names::meant_checksum;
+use super::reader::{Item, Reader, Result};
+use super::recipes::{FileField, FileFieldKind};
+use crate::keys::device;
+
+/// The words of `order` of a checksum.
+pub(crate) const CHECKSUM_ORDERS: [(&str, ByteOrder); 2] =
+    [("little", ByteOrder::Little), ("big", ByteOrder::Big)];
+/// The words of `as`, and whether they are digits.
+pub(crate) const CHECKSUM_FORMS: [(&str, bool); 2] = [("bytes", false), ("hex", true)];
+/// The words of `data_id_at`, and whether the bytes are behind the frame's.
+pub(crate) const DATA_ID_PLACES: [(&str, bool); 2] = [("start", false), ("end", true)];
+
+/// Reads the checksum of a frame and puts it at its place among the fields.
+pub(super) fn read_checksum(frame: &Reader<'_>, head: usize, fields: &mut Vec<FileField>) -> Result<()> {
+    let Some(item) = frame.optional("checksum") else { return Ok(()) };
+    if item.as_string().is_some() {
+        return Err(item.error("expected a table, such as { kind = \"crc16-modbus\" }, found a string"));
+    }
+    let table = item.any_table()?;
+    let algorithm = read_algorithm(&table)?;
+    let mut sum = Checksum::standard(algorithm);
+    if let Some(item) = table.optional("over") {
+        let (first, last) = read_covered(&item)?;
+        sum = sum.over(first, last);
+    }
+    sum.order = table.word(&device::ORDER, &CHECKSUM_ORDERS)?.unwrap_or(sum.order);
+    sum.text = table.word_or(&device::AS, &CHECKSUM_FORMS)?;
+    sum.data_id = read_data_id(&table)?;
+    let nth = match table.optional("at") {
+        Some(item) => find_place(&item, head, fields)?,
+        None => fields.len(),
+    };
+    fields.insert(nth, FileField { spot: item.spot.clone(), kind: FileFieldKind::Checksum(sum) });
+    Ok(())
+}
+
+/// `data_id = 0x1234`, low byte first, or a list of bytes.
+fn read_data_id(table: &Reader<'_>) -> Result<DataId> {
+    let Some(item) = table.optional("data_id") else {
+        refuse(table, &["data_id_at"], "allowed only together with data_id")?;
+        return Ok(DataId::NONE);
+    };
+    let bytes: Vec<u8> = if item.is_integer() {
+        item.integer::<u16>(0..=0xFFFF)?.to_le_bytes().to_vec()
+    } else {
+        let list = item.array("of bytes, such as [0x34, 0x12], or a number")?;
+        list.iter().map(|item| item.integer(0..=255)).collect::<Result<_>>()?
+    };
+    let id = DataId::new(&bytes).filter(|id| !id.bytes().is_empty());
+    let id = id.ok_or_else(|| item.error(format!("{} bytes; allowed: 1 to {MAX_DATA_ID}", bytes.len())))?;
+    Ok(if table.word_or(&device::DATA_ID_AT, &DATA_ID_PLACES)? { id.behind() } else { id })
+}
+
+fn read_algorithm(table: &Reader<'_>) -> Result<Algorithm> {
+    let kind = table.required("kind", "the algorithm, such as \"crc16-modbus\"")?;
+    let name = kind.string()?;
+    if name != "crc" {
+        let algorithm = Algorithm::named(name).ok_or_else(|| {
+            let known: Vec<_> = Algorithm::names().collect();
+            let shown: Vec<_> = known.iter().map(|name| format!("{name:?}")).collect();
+            let meant = meant_checksum(name, &known);
+            let shown = shown.join(", ");
+            kind.error(format!("{name:?} is unknown; allowed: {shown}, \"crc\" (with its parameters){meant}"))
+        })?;
+        table.check(&device::CHECKSUM_TABLE)?;
+        return Ok(algorithm);
+    }
+    table.check(&device::CHECKSUM_TABLE)?;
+    let width: u8 = table.integer_needed(&device::WIDTH, "the number of bits, 1..=32")?;
+    let most = i64::from(u32::MAX >> (32 - u32::from(width)));
+    let number = |key| table.optional(key).map_or(Ok(0), |item| item.integer(0..=most));
+    table.required("poly", "the polynomial without its highest term, such as 0x1021")?;
+    let refin = table.flag(&device::REFIN)?;
+    Ok(Algorithm::Crc(Crc {
+        width,
+        poly: number("poly")?,
+        init: number("init")?,
+        xorout: number("xorout")?,
+        refin,
+        refout: table.optional("refout").map_or(Ok(refin), |item| item.bool())?,
+    }))
+}
+
+/// `"1.."` or `"1..7"`: the first byte and the last one.
+fn read_covered(item: &Item<'_>) -> Result<(u16, Option<u16>)> {
+    let text = item.string()?;
+    let number = |text: &str| text.parse::<u16>().ok().filter(|&at| usize::from(at) < MAX_STREAM_FRAME);
+    let range = text.split_once("..").and_then(|(first, last)| {
+        let last = if last.is_empty() { None } else { Some(number(last)?) };
+        Some((number(first)?, last))
+    });
+    match range {
+        Some((first, last)) if last.is_none_or(|last| first <= last) => Ok((first, last)),
+        Some(_) => Err(item.error(format!("{text:?} runs backwards; write the first byte, then the last one"))),
+        None => Err(item.error(format!(
+            "{text:?} is not a range of bytes; write \"1..7\", or \"1..\" for all up to the checksum; byte 0 is \
+             the first of the frame"
+        ))),
+    }
+}
+
+/// The number of fields before the byte that `item` names.
+fn find_place(item: &Item<'_>, head: usize, fields: &[FileField]) -> Result<usize> {
+    let at: usize = item.integer(device::AT.integers())?;
+    // Places between two fields; behind one of varying length no byte has a number.
+    let mut places = Vec::new();
+    let mut offset = Some(head);
+    for (nth, field) in fields.iter().enumerate() {
+        let element = field.spec().element();
+        let encoding = element.and_then(|element| element.encoding());
+        if encoding.is_some_and(|encoding| encoding.shared) {
+            continue;
+        }
+        places.extend(offset.map(|offset| (offset, nth)));
+        let len = match (element, encoding) {
+            (Some(Element::Padding { len, .. }), _) => Some(usize::from(len)),
+            (Some(Element::Text(text)), _) => match text.width {
+                TextWidth::Fixed(width) => Some(usize::from(width)),
+                TextWidth::Until(_) | TextWidth::Rest => None,
+            },
+            (_, Some(encoding)) => encoding.size(),
+            _ => Some(0),
+        };
+        offset = offset.zip(len).map(|(offset, len)| offset + len);
+    }
+    places.extend(offset.map(|offset| (offset, fields.len())));
+    places.iter().find(|&&(offset, _)| offset == at).map(|&(_, nth)| nth).ok_or_else(|| {
+        let places: Vec<_> = places.iter().map(|(offset, _)| offset.to_string()).collect();
+        item.error(format!(
+            "no field begins or ends at byte {at}; allowed: {}, or no at for the place behind the fields",
+            places.join(", ")
+        ))
+    })
+}

@@ -1,0 +1,177 @@
+//! `[[recipe.exchange]]` and `[[recipe.block]]`.
+
+use super::device::WORD_ORDER_OF_REGISTERS;
+use super::recipe::{EXTENDED, HEAD, ID, INPUT_FIELDS, OF_FRAME, OUTPUT_FIELDS, TAIL};
+use super::{Case, HOUR_MS, Key, Limits, Need, Shape, Table, Text, When, field, words};
+use crate::file::modbus::{FUNCTIONS, TABLES};
+
+/// The device that is asked.
+pub const PEER: Key = Key::integer("peer", 0, 255).or(0).is(
+    "the device. The exchanges of one device share what is known of it: one that does not answer is asked less often. \
+     At most 32 on a port",
+);
+/// The period.
+pub const EVERY: Key = Key::millis("every_ms", Limits::AboveZero(HOUR_MS)).is("asked with this period");
+/// What triggers it.
+pub const ON: Key = Key::new(
+    "on",
+    Shape::List(&Shape::Text(Text::Pattern("^(start|change|rising:.+)$")), 1, usize::MAX),
+)
+.tells(
+    "`\"start\"`: asked at the start, and each time that the device has come back; `\"change\"`: when a value of the \
+     request has changed; `\"rising:BitOutputReg[3].0\"`: when this bit goes from 0 to 1. The last two are looked at \
+     each `cycle_ms`",
+);
+/// How long a reply may take.
+pub const TIMEOUT: Key = Key::millis("timeout_ms", Limits::AboveZero(HOUR_MS))
+    .or(100)
+    .is("from the end of the request to the end of the reply");
+/// How often a request is repeated.
+pub const RETRIES: Key =
+    Key::integer("retries", 0, 255).or(1).is("how often a request without a good reply is repeated at once");
+/// The rest behind it.
+pub const PAUSE: Key =
+    Key::millis("pause_ms", Limits::Within(0.0, 10_000.0)).or(0).is("how long the line rests after it");
+pub(crate) const TIMING: &[Key] = &[EVERY, ON, TIMEOUT, RETRIES, PAUSE];
+const ASKED: &[&str] = &["request"];
+const TIMING_OF_FRAMES: &[Key] = &[
+    EVERY.beside(ASKED),
+    ON.beside(ASKED),
+    TIMEOUT.beside(ASKED),
+    RETRIES.beside(ASKED),
+    PAUSE.beside(ASKED),
+];
+
+const fn request(table: &'static Table) -> Key {
+    Key::new("request", Shape::Table(table)).tells("the frame that asks. Needs `every_ms` or `on`")
+}
+
+const fn reply(table: &'static Table) -> Key {
+    Key::new("reply", Shape::Table(table))
+        .tells("the frame that answers. Without a `request` it may come at any time")
+}
+
+const fn refusal(table: &'static Table) -> Key {
+    Key::new("refusal", Shape::Table(table))
+        .beside(&["reply"])
+        .tells("what the device sends if it refuses the request; its fields have no `to` and no `commands`")
+}
+
+/// A remote frame of CAN.
+pub const REMOTE: Key = Key::bool("remote").tells("of a request on CAN: it has no data, and no `fields`");
+// A remote request has none.
+const SENT_FIELDS: Key = Key { need: Need::Absent("none"), ..OUTPUT_FIELDS };
+
+pub(crate) const STREAM_REQUEST: Table = frame("stream request", &[HEAD, TAIL, OUTPUT_FIELDS]);
+pub(crate) const STREAM_REPLY: Table = frame("stream reply", &[HEAD, TAIL, INPUT_FIELDS]);
+pub(crate) const CAN_REQUEST: Table = frame("CAN request", &[ID, EXTENDED, SENT_FIELDS, REMOTE]);
+pub(crate) const CAN_REPLY: Table = frame("CAN reply", &[ID, EXTENDED, INPUT_FIELDS]);
+
+const fn frame(name: &'static str, keys: &'static [Key]) -> Table {
+    Table::of(name, keys).cases(&[Case { when: &[], keys: &[OF_FRAME] }])
+}
+
+/// The frames of an exchange.
+pub(crate) const FRAMES: &[Key] = &[request(&STREAM_REQUEST), reply(&STREAM_REPLY), refusal(&STREAM_REPLY)];
+
+/// An exchange of frames on a line.
+pub const OF_STREAM: Table =
+    Table::of("exchange", &[PEER, request(&STREAM_REQUEST), reply(&STREAM_REPLY), refusal(&STREAM_REPLY)])
+        .at(" of an exchange")
+        .cases(&[Case { when: &[], keys: &[TIMING_OF_FRAMES] }]);
+/// An exchange of frames on CAN.
+pub const OF_CAN: Table =
+    Table::of("exchange on CAN", &[PEER, request(&CAN_REQUEST), reply(&CAN_REPLY), refusal(&CAN_REPLY)])
+        .at(" of an exchange")
+        .cases(&[Case { when: &[], keys: &[TIMING_OF_FRAMES] }]);
+
+/// The slave that is asked.
+pub const SLAVE: Key = Key::integer("slave", 0, 247)
+    .required()
+    .tells("1..=247; 0 writes to all slaves, and nobody answers. After it nothing is sent for 100 ms");
+/// What is asked of it.
+pub const FUNCTION: Key = Key::new(
+    "function",
+    Shape::Either(&[Shape::Words(words!(FUNCTIONS)), Shape::Codes(&[1, 2, 3, 4, 5, 6, 15, 16, 23])]),
+)
+.required()
+.tells("a name or a number, see below");
+/// The first register or coil.
+pub const ADDRESS: Key = Key::integer("address", 0, 0xFFFF).required().is(
+    "the first register or coil, as on the line. Manuals that count from 1 call them coil 1, input 10001, input \
+     register 30001 and holding register 40001, which are all 0 here; 40108 is 107",
+);
+/// The first register that is written.
+pub const WRITE_ADDRESS: Key = Key::integer("write_address", 0, 0xFFFF)
+    .required()
+    .is("of function 23: the first register that it writes; `address` is what it reads");
+
+const fn read(item: &'static Shape) -> Key {
+    Key::new("read", Shape::List(item, 0, usize::MAX))
+        .required()
+        .tells("of functions that read: the fields of the reply, as in an input part")
+}
+
+const fn write(item: &'static Shape) -> Key {
+    Key::new("write", Shape::List(item, 0, usize::MAX))
+        .required()
+        .tells("of functions that write: the fields of the request, as in an output part")
+}
+
+pub(crate) const READ: Key = read(&Shape::Table(&field::INPUT));
+pub(crate) const WRITE: Key = write(&Shape::Table(&field::OUTPUT));
+
+/// An exchange of Modbus.
+pub const OF_MODBUS: Table =
+    Table::of("exchange of Modbus", &[SLAVE, FUNCTION, ADDRESS]).at(" of an exchange of Modbus").cases(&[
+        Case {
+            when: &[When::Is("function", &["read-write-registers"], &[23])],
+            keys: &[&[WRITE_ADDRESS, WORD_ORDER_OF_REGISTERS, READ, WRITE], TIMING],
+        },
+        Case {
+            when: &[When::Is("function", &["read-holding-registers", "read-input-registers"], &[3, 4])],
+            keys: &[&[WORD_ORDER_OF_REGISTERS, READ], TIMING],
+        },
+        Case {
+            when: &[When::Is("function", &["write-register", "write-registers"], &[6, 16])],
+            keys: &[&[WORD_ORDER_OF_REGISTERS, WRITE], TIMING],
+        },
+        Case {
+            when: &[When::Is("function", &["read-coils", "read-discrete-inputs"], &[1, 2])],
+            keys: &[&[WORD_ORDER_OF_REGISTERS, read(&Shape::Table(&field::COIL_IN))], TIMING],
+        },
+        Case {
+            when: &[When::Is("function", &["write-coil", "write-coils"], &[5, 15])],
+            keys: &[&[WORD_ORDER_OF_REGISTERS, write(&Shape::Table(&field::COIL_OUT))], TIMING],
+        },
+    ]);
+
+/// What a block holds.
+pub const TABLE: Key = Key::words("table", words!(TABLES)).required();
+pub(crate) const BLOCK_FIELDS: Key = block_fields(&Shape::Table(&field::IN_BLOCK));
+
+const fn block_fields(item: &'static Shape) -> Key {
+    Key::new("fields", Shape::List(item, 0, usize::MAX))
+        .required()
+        .tells("as in `read` and `write` of a master; blocks of a table must not overlap")
+}
+
+const BLOCK_ADDRESS: Key = ADDRESS.is("the first register or coil");
+
+/// A block of a slave.
+pub const BLOCK: Table =
+    Table::of("block", &[TABLE, BLOCK_ADDRESS, WORD_ORDER_OF_REGISTERS]).at(" of a block").cases(&[
+        Case { when: &[When::Is("table", &["holding-registers"], &[])], keys: &[&[BLOCK_FIELDS]] },
+        Case {
+            when: &[When::Is("table", &["input-registers"], &[])],
+            keys: &[&[block_fields(&Shape::Table(&field::OUTPUT))]],
+        },
+        Case {
+            when: &[When::Is("table", &["coils"], &[])],
+            keys: &[&[block_fields(&Shape::Table(&field::COIL_IN_BLOCK))]],
+        },
+        Case {
+            when: &[When::Is("table", &["discrete-inputs"], &[])],
+            keys: &[&[block_fields(&Shape::Table(&field::COIL_OUT))]],
+        },
+    ]);

@@ -1,0 +1,227 @@
+//! `[[recipe]]` of both kinds of files, and its parts.
+
+use proto_core::recipe::model::{MAX_CAN_IDS, MAX_DELIMITER, MAX_FIELDS};
+
+use super::device::{CHECKSUM, ENDIAN, ESCAPE, FRAMING, WORD_ORDER};
+use super::gateway::NAME;
+use super::{Case, Key, Rule, Shape, Table, Text, When, exchange, field, words};
+use crate::file::bindings::ON_STALES;
+use crate::file::recipes::{KINDS, MODES};
+
+const ANY: usize = usize::MAX;
+
+/// What carries a recipe of a gateway.
+pub const KIND: Key = Key::words("kind", words!(KINDS)).required().tells(
+    "`\"stream\"`, `\"can\"`; in gateway files also `\"modbus-rtu\"` and `\"modbus-rtu-slave\"` (section 4)",
+);
+const KIND_OF_CONTROLLER: Key =
+    Key { shape: Shape::Words(|| KINDS.iter().take(2).map(|kind| kind.0).collect()), ..KIND };
+/// Whether the controller or the user says what fields mean.
+pub const MODE: Key = Key::words("mode", words!(MODES)).required().tells(
+    "`\"realtime\"`: fields are system variables; `\"user\"`: fields of your own. Of Modbus always `\"user\"`, and may \
+     be left out",
+);
+// A gateway's recipe of Modbus may leave it out.
+const MODE_OF_ANY: Key = Key { need: super::Need::Absent("required"), ..MODE };
+const MODE_OF_MODBUS: Key = Key { shape: Shape::Words(|| vec!["user"]), ..MODE.or_word("user") };
+
+const fn input(table: &'static Table) -> Key {
+    Key::new("input", Shape::Table(table)).absent("absent").tells("user to robot")
+}
+
+const fn output(table: &'static Table) -> Key {
+    Key::new("output", Shape::Table(table))
+        .absent("absent")
+        .tells("robot to user; at least one of the two, or an exchange")
+}
+
+const fn exchanges(item: &'static Shape, least: usize) -> Key {
+    Key::new("exchange", Shape::List(item, least, ANY)).tells(
+        "what is asked of devices: `[[recipe.exchange]]`, `mode = \"user\"` in gateway files only (section 4)",
+    )
+}
+
+/// What a recipe consists of.
+pub(crate) const PARTS: &[Key] =
+    &[input(&USER_IN), output(&USER_OUT), exchanges(&Shape::Table(&exchange::OF_STREAM), 0)];
+
+/// What is sent while a value is stale.
+pub const ON_STALE: Key = Key::words("on_stale", words!(ON_STALES))
+    .or_word("hold")
+    .tells("`\"hold\"`: keep sending the last values; `\"stop\"`: send nothing");
+/// The same of a recipe with exchanges and without an output part.
+pub const ON_STALE_OF_RECIPE: Key = ON_STALE
+    .tells("of a recipe with exchanges and without an output part: `\"hold\"` or `\"stop\"`, as there");
+/// The address of a slave.
+pub const ADDRESS: Key = Key::integer("address", 1, 247)
+    .required()
+    .is("of `kind = \"modbus-rtu-slave\"`: the gateway's own address on the line");
+/// The blocks of a slave.
+pub const BLOCK: Key = Key::new("block", Shape::List(&Shape::Table(&exchange::BLOCK), 1, ANY))
+    .required()
+    .tells("of `kind = \"modbus-rtu-slave\"`: `[[recipe.block]]` (section 4)");
+
+/// Bytes before the fields.
+pub const HEAD: Key = delimiter("head");
+/// Bytes behind them.
+pub const TAIL: Key = delimiter("tail");
+
+const fn delimiter(name: &'static str) -> Key {
+    Key::new(name, Shape::Bytes(0, MAX_DELIMITER)).absent("`[]`").tells(
+        "0..=8 bytes; on RS-485 and TCP at least one byte in head or tail, unless a checksum or a constant tells where \
+         a frame begins (section 4)",
+    )
+}
+
+/// The fields of a realtime recipe.
+pub const VARIABLES: Key = Key::new("fields", Shape::List(&Shape::Text(Text::Variables), 1, MAX_FIELDS))
+    .required()
+    .tells("1..=128 fields; the whole frame at most 512 bytes, or 8 on CAN");
+
+const fn fields(item: &'static Shape) -> Key {
+    Key { shape: Shape::List(item, 0, ANY), ..VARIABLES }
+}
+
+const PLAIN_FIELDS: Key = fields(&Shape::Table(&field::PLAIN));
+pub(crate) const INPUT_FIELDS: Key = fields(&Shape::Table(&field::INPUT));
+pub(crate) const OUTPUT_FIELDS: Key = fields(&Shape::Table(&field::OUTPUT));
+
+/// When an output part is sent.
+pub const SEND: Key = Key::new(
+    "send",
+    Shape::Text(Text::Pattern("^(period|change|frame|rising:.+)$")),
+)
+.or_word("period")
+.tells(
+    "`\"period\"`: each cycle; `\"change\"`: each cycle in which a value changed; `\"frame\"`: for each accepted input \
+     frame; `\"rising:BitOutputReg[3].0\"`: when that bit goes from 0 to 1. A realtime recipe has `\"period\"` only",
+);
+const SEND_PERIOD: Key = Key { shape: Shape::Words(|| vec!["period"]), ..SEND };
+
+/// The id of a CAN frame.
+pub const ID: Key = Key::integer("id", 0, 0x1FFF_FFFF)
+    .required()
+    .tells("0..=0x7FF, or 0..=0x1FFFFFFF with `extended`; unique in the part, but see section 4");
+/// Whether it has 29 bits.
+pub const EXTENDED: Key = Key::bool("extended").tells("29-bit ids, 0..=0x1FFFFFFF");
+
+/// The device's keys of a stream part.
+pub(crate) const OF_STREAM: &[Key] = &[ENDIAN, WORD_ORDER, CHECKSUM, FRAMING, ESCAPE];
+/// Those of a CAN frame, and of a frame of an exchange.
+pub(crate) const OF_FRAME: &[Key] = &[ENDIAN, WORD_ORDER, CHECKSUM];
+/// How an output part is sent.
+pub(crate) const SENDING: &[Key] = &[ON_STALE, SEND];
+
+const STREAM: &str = " in a stream recipe";
+const CAN: &str = " in a CAN recipe";
+
+const fn always(keys: &'static [&'static [Key]]) -> Case {
+    Case { when: &[], keys }
+}
+
+const PART_RULES: &[Rule] =
+    &[Rule::NotBoth("framing", "escape"), Rule::Needs("framing", &["tail"], &["tail"])];
+
+pub(crate) const REALTIME: Table = Table::of("realtime stream part", &[HEAD, TAIL, VARIABLES]).at(STREAM);
+const REALTIME_OUT: Table =
+    Table::of("realtime stream output", &[HEAD, TAIL, VARIABLES, ON_STALE, SEND_PERIOD]).at(STREAM);
+const PLAIN: Table = Table::of("stream part of a controller", &[HEAD, TAIL, PLAIN_FIELDS]).at(STREAM);
+const USER_IN: Table = Table::of("stream input", &[HEAD, TAIL, INPUT_FIELDS])
+    .at(STREAM)
+    .cases(&[always(&[OF_STREAM])])
+    .rules(PART_RULES);
+const USER_OUT: Table = Table::of("stream output", &[HEAD, TAIL, OUTPUT_FIELDS])
+    .at(STREAM)
+    .cases(&[always(&[OF_STREAM, SENDING])])
+    .rules(PART_RULES);
+
+const fn frames(item: &'static Shape) -> Key {
+    Key::new("frame", Shape::List(item, 1, MAX_CAN_IDS))
+        .required()
+        .tells("of a CAN part: its frames, `[[recipe.input.frame]]`, at most 32")
+}
+
+/// The frames of a CAN part.
+pub const FRAME: Key = frames(&Shape::Table(&CAN_IN));
+
+pub(crate) const CAN_REALTIME: Table = Table::of("realtime CAN frame", &[ID, EXTENDED, VARIABLES]);
+const CAN_PLAIN: Table = Table::of("CAN frame of a controller", &[ID, EXTENDED, PLAIN_FIELDS]);
+const CAN_IN: Table =
+    Table::of("CAN input frame", &[ID, EXTENDED, INPUT_FIELDS]).cases(&[always(&[OF_FRAME])]);
+const CAN_OUT: Table =
+    Table::of("CAN output frame", &[ID, EXTENDED, OUTPUT_FIELDS]).cases(&[always(&[OF_FRAME])]);
+
+pub(crate) const CAN_PART: Table =
+    Table::of("realtime CAN part", &[frames(&Shape::Table(&CAN_REALTIME))]).at(CAN);
+const CAN_PART_OUT: Table =
+    Table::of("realtime CAN output", &[frames(&Shape::Table(&CAN_REALTIME)), ON_STALE, SEND_PERIOD]).at(CAN);
+const CAN_PART_PLAIN: Table =
+    Table::of("CAN part of a controller", &[frames(&Shape::Table(&CAN_PLAIN))]).at(CAN);
+const CAN_PART_IN: Table = Table::of("CAN input", &[FRAME]).at(CAN);
+const CAN_PART_USER_OUT: Table =
+    Table::of("CAN output", &[frames(&Shape::Table(&CAN_OUT)), ON_STALE, SEND]).at(CAN);
+
+/// `[[recipe]]` of a gateway file.
+pub const OF_GATEWAY: Table = Table::of("recipe", &[NAME, KIND, MODE_OF_ANY])
+    .rules(&[Rule::Needs("kind", &["stream", "can"], &["mode"])])
+    .cases(&[
+        Case {
+            when: &[When::Is("kind", &["stream"], &[]), When::Is("mode", &["realtime"], &[])],
+            keys: &[&[input(&REALTIME), output(&REALTIME_OUT)]],
+        },
+        Case {
+            when: &[When::Is("kind", &["stream"], &[]), When::Is("mode", &["user"], &[])],
+            keys: &[&[
+                input(&USER_IN),
+                output(&USER_OUT),
+                ON_STALE_OF_RECIPE,
+                exchanges(&Shape::Table(&exchange::OF_STREAM), 0),
+            ]],
+        },
+        Case {
+            when: &[When::Is("kind", &["can"], &[]), When::Is("mode", &["realtime"], &[])],
+            keys: &[&[input(&CAN_PART), output(&CAN_PART_OUT)]],
+        },
+        Case {
+            when: &[When::Is("kind", &["can"], &[]), When::Is("mode", &["user"], &[])],
+            keys: &[&[
+                input(&CAN_PART_IN),
+                output(&CAN_PART_USER_OUT),
+                ON_STALE_OF_RECIPE,
+                exchanges(&Shape::Table(&exchange::OF_CAN), 0),
+            ]],
+        },
+        Case {
+            when: &[When::Is("kind", &["modbus-rtu"], &[])],
+            keys: &[&[
+                MODE_OF_MODBUS,
+                ON_STALE_OF_RECIPE,
+                exchanges(&Shape::Table(&exchange::OF_MODBUS), 1).required(),
+            ]],
+        },
+        Case {
+            when: &[When::Is("kind", &["modbus-rtu-slave"], &[])],
+            keys: &[&[MODE_OF_MODBUS, ON_STALE_OF_RECIPE, ADDRESS, BLOCK]],
+        },
+    ]);
+
+/// `[[recipe]]` of a controller file.
+pub const OF_CONTROLLER: Table = Table::of("recipe of a controller", &[NAME, KIND_OF_CONTROLLER, MODE])
+    .cases(&[
+        Case {
+            when: &[When::Is("kind", &["stream"], &[]), When::Is("mode", &["realtime"], &[])],
+            keys: &[&[input(&REALTIME), output(&REALTIME)]],
+        },
+        Case {
+            when: &[When::Is("kind", &["stream"], &[]), When::Is("mode", &["user"], &[])],
+            keys: &[&[input(&PLAIN), output(&PLAIN)]],
+        },
+        Case {
+            when: &[When::Is("kind", &["can"], &[]), When::Is("mode", &["realtime"], &[])],
+            keys: &[&[input(&CAN_PART), output(&CAN_PART)]],
+        },
+        Case {
+            when: &[When::Is("kind", &["can"], &[]), When::Is("mode", &["user"], &[])],
+            keys: &[&[input(&CAN_PART_PLAIN), output(&CAN_PART_PLAIN)]],
+        },
+    ]);

@@ -1,0 +1,198 @@
+//! `check --json`, shared buses, and `export schema`.
+
+use std::process::Output;
+
+use recipe_test_kit::{example, examples};
+use serde_json::Value;
+
+use super::BINARY;
+
+fn host_sim(args: &[&str]) -> Output {
+    BINARY.command().args(args).output().unwrap()
+}
+
+fn path(name: &str) -> String {
+    example(name).to_str().unwrap().to_owned()
+}
+
+/// The exit code, and the JSON on stdout.
+#[track_caller]
+fn json(args: &[&str]) -> (Option<i32>, Value) {
+    let output = host_sim(args);
+    assert!(output.stderr.is_empty(), "{}", String::from_utf8_lossy(&output.stderr));
+    (output.status.code(), serde_json::from_slice(&output.stdout).unwrap())
+}
+
+/// Without what is before the file's name in its path.
+fn named(mut report: Value) -> String {
+    if let Some(file) = report.get("file").and_then(Value::as_str) {
+        report["file"] = file.rsplit('/').next().unwrap().into();
+    }
+    for list in ["warnings", "errors"] {
+        for message in report.get_mut(list).and_then(Value::as_array_mut).into_iter().flatten() {
+            if let Some(file) = message.get("file").and_then(Value::as_str) {
+                message["file"] = file.rsplit('/').next().unwrap().into();
+            }
+        }
+    }
+    format!("{report:#}")
+}
+
+#[test]
+fn the_json_has_all_that_the_text_has() {
+    for (snapshot, file) in [
+        ("json_force_sensor", "force-sensor.toml"),
+        ("json_request_response", "request-response.toml"),
+        ("json_can_panel", "can-panel.toml"),
+        ("json_gripper", "gripper.toml"),
+        ("json_can_system_controller", "can-system-controller.toml"),
+    ] {
+        let (code, report) = json(&["check", &path(file), "--json"]);
+        assert_eq!(code, Some(0), "{file}");
+        insta::assert_snapshot!(snapshot, named(report));
+    }
+}
+
+/// Words of a text, without signs.
+fn words(text: &str) -> Vec<String> {
+    let parts = text.split(|c: char| !c.is_alphanumeric() && !matches!(c, '_' | '[' | ']' | '.'));
+    parts.filter(|word| !word.is_empty()).map(|word| word.trim_matches('.').to_owned()).collect()
+}
+
+/// Names of variables, frames, ports and commands in the text are in the JSON too.
+#[test]
+fn no_name_of_the_text_is_missing_in_the_json() {
+    for file in examples() {
+        let file = file.to_str().unwrap();
+        let text = String::from_utf8(host_sim(&["check", file]).stdout).unwrap();
+        let (_, report) = json(&["check", file, "--json"]);
+        let known = words(&report.to_string());
+        for word in
+            words(&text).iter().filter(|word| word.contains(['[', '_', '-']) || word.starts_with("0x"))
+        {
+            assert!(known.contains(word), "{file}: {word:?} is in the text only");
+        }
+        let warnings = report["warnings"].as_array().unwrap();
+        assert_eq!(text.contains("\nwarnings\n"), !warnings.is_empty(), "{file}");
+        for warning in warnings {
+            assert!(text.contains(warning["message"].as_str().unwrap()), "{file}: {warning}");
+            assert!(warning["line"].as_u64().is_some_and(|line| line > 0), "{file}: {warning}");
+        }
+    }
+}
+
+#[test]
+fn a_mistake_is_json_too() {
+    let file = path("rs485-system.toml");
+    let folder = tempfile::tempdir().unwrap();
+    let wrong = folder.path().join("wrong.toml");
+    let text = std::fs::read_to_string(&file).unwrap().replacen("cycle_ms", "cylce_ms", 1);
+    assert!(text.contains("cylce_ms"));
+    std::fs::write(&wrong, text).unwrap();
+    let (code, refused) = json(&["check", wrong.to_str().unwrap(), "--json"]);
+    assert_eq!(code, Some(2));
+    insta::assert_snapshot!("json_wrong_key", named(refused));
+
+    let (code, refused) = json(&["check", &file, "--json", "--set", "port.rs485-1.baud=1"]);
+    assert_eq!(code, Some(2));
+    insta::assert_snapshot!("json_wrong_override", named(refused));
+
+    let (code, refused) = json(&["check", "no-such-file.toml", "--json"]);
+    assert_eq!(code, Some(2));
+    insta::assert_snapshot!("json_no_file", named(refused));
+}
+
+/// Two panels on one CAN bus.
+fn two_panels() -> (tempfile::TempDir, String) {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("panels.toml");
+    let mut text = std::fs::read_to_string(example("can-panel.toml")).unwrap();
+    text = text.replace("\"WordInputReg[4]\"", "\"WordInputReg[4]\", overflow = \"wrap\"");
+    text += "\n[[recipe]]\nname = \"other\"\nkind = \"can\"\nmode = \"user\"\n[[recipe.input.frame]]\nid = 0x182\n\
+             fields = [{ name = \"x\", type = \"dword\" }]\n[[recipe.output.frame]]\nid = 0x201\n\
+             fields = [{ name = \"y\", type = \"word\", value = 1 }]\n\
+             [[port]]\nname = \"can-2\"\nbus = \"can\"\nbitrate = 250000\nrecipe = \"other\"\n";
+    std::fs::write(&file, text).unwrap();
+    let file = file.to_str().unwrap().to_owned();
+    (folder, file)
+}
+
+#[test]
+fn ports_on_one_bus_are_added_up() {
+    let (_folder, file) = two_panels();
+    let (_, alone) = json(&["check", &file, "--json"]);
+    let buses = alone["buses"].as_array().unwrap();
+    assert_eq!(buses.len(), 2, "{alone:#}");
+    assert!(alone["warnings"].as_array().unwrap().is_empty(), "{alone:#}");
+    let load = |bus: &Value, key: &str| bus[key].as_f64().unwrap();
+    let sum: f64 = buses.iter().map(|bus| load(bus, "worst_percent")).sum();
+
+    let (code, together) = json(&["check", &file, "--json", "--same-bus", "can-1,can-2"]);
+    assert_eq!(code, Some(0));
+    let bus = &together["buses"][0];
+    assert_eq!(together["buses"].as_array().unwrap().len(), 1);
+    assert!((load(bus, "worst_percent") - sum).abs() < 0.2, "{bus} {sum}");
+    assert!(load(bus, "average_percent") < load(bus, "worst_percent"));
+    // Both send 0x201.
+    let warnings = together["warnings"].as_array().unwrap();
+    assert_eq!(warnings.len(), 1, "{together:#}");
+    assert!(warnings[0]["message"].as_str().unwrap().contains("both send id 0x201"), "{warnings:?}");
+    assert_eq!(warnings[0]["key"], "port.can-2.bus");
+
+    let (_, full) =
+        json(&["check", &file, "--json", "--same-bus", "can-1,can-2", "--set", "port.can-2.bitrate=20000"]);
+    let said = full["warnings"].to_string();
+    assert!(said.contains("20000 bit/s, but is on one bus with"), "{said}");
+    let (_, full) = json(&["check", &file, "--json", "--set", "port.can-2.bitrate=20000"]);
+    assert!(full["warnings"].to_string().contains("in the worst case of stuffed bits"), "{full:#}");
+
+    for (names, said) in [
+        ("can-1", "write two ports or more"),
+        ("can-1,can-3", "there is no CAN port \"can-3\"; there are: can-1, can-2"),
+        ("can-1,can-1", "is there twice"),
+    ] {
+        let output = host_sim(&["check", &file, "--same-bus", names]);
+        let message = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(2), "{message}");
+        assert!(message.contains(said), "{message}");
+    }
+}
+
+#[test]
+fn the_schema_is_printed() {
+    for (kind, key) in [("gateway", "network"), ("controller", "program")] {
+        let (code, schema) = json(&["export", "schema", kind]);
+        assert_eq!(code, Some(0));
+        assert_eq!(schema["$schema"], "http://json-schema.org/draft-07/schema#");
+        assert!(schema["properties"][key].is_object(), "{kind}");
+    }
+    assert_eq!(json(&["export", "schema"]), json(&["export", "schema", "gateway"]));
+}
+
+/// The keys of a value, at any depth.
+fn keys(value: &Value, all: &mut std::collections::BTreeSet<String>) {
+    match value {
+        Value::Object(object) => {
+            for (key, value) in object {
+                all.insert(key.clone());
+                keys(value, all);
+            }
+        }
+        Value::Array(items) => items.iter().for_each(|item| keys(item, all)),
+        _ => {}
+    }
+}
+
+#[test]
+fn every_key_of_the_json_is_documented() {
+    let page = std::fs::read_to_string(recipe_test_kit::repository().join("docs/checking.md")).unwrap();
+    let mut all = std::collections::BTreeSet::new();
+    for file in examples() {
+        keys(&json(&["check", file.to_str().unwrap(), "--json"]).1, &mut all);
+    }
+    let file = path("rs485-system.toml");
+    keys(&json(&["check", &file, "--json", "--set", "port.rs485-1.baud=1"]).1, &mut all);
+    keys(&json(&["check", &file, "--json", "--set", "network.address=192.168.12.20/24"]).1, &mut all);
+    let missing: Vec<_> = all.iter().filter(|key| !page.contains(&format!("`{key}`"))).collect();
+    assert!(all.len() > 60 && missing.is_empty(), "{} keys; not in docs/checking.md: {missing:?}", all.len());
+}
