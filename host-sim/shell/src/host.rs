@@ -36,6 +36,31 @@ pub struct Handle {
     thread: Option<JoinHandle<Result<(), StartError>>>,
 }
 
+/// Something that runs and can be asked, in the foreground.
+pub(crate) trait Running {
+    /// The actual addresses and paths.
+    fn ready(&self) -> &Value;
+    /// One line of statistics; `None` if there is none at the moment.
+    fn stats(&self) -> Option<Value>;
+    /// Whether it has ended by itself.
+    fn has_ended(&self) -> bool;
+    /// Ends it and waits for it. If it had ended by itself, the reason is the error.
+    fn shutdown(self) -> Result<(), StartError>;
+}
+
+/// Asks a shell for its statistics, from any thread.
+#[derive(Debug, Clone)]
+pub(crate) struct Asker(mpsc::UnboundedSender<Request>);
+
+impl Asker {
+    /// One line of statistics; `None` if the shell has ended.
+    pub(crate) fn stats(&self) -> Option<Value> {
+        let (answer, stats) = blocking::channel();
+        self.0.send(Request::Stats(answer)).ok()?;
+        stats.recv().ok()
+    }
+}
+
 #[derive(Debug)]
 enum Request {
     Stats(blocking::Sender<Value>),
@@ -104,9 +129,11 @@ impl Handle {
 
     /// One line of statistics; `None` if the shell has ended.
     pub fn stats(&self) -> Option<Value> {
-        let (answer, stats) = blocking::channel();
-        self.requests.send(Request::Stats(answer)).ok()?;
-        stats.recv().ok()
+        self.asker().stats()
+    }
+
+    pub(crate) fn asker(&self) -> Asker {
+        Asker(self.requests.clone())
     }
 
     /// Whether the shell has ended by itself.
@@ -128,6 +155,24 @@ impl Handle {
     }
 }
 
+impl Running for Handle {
+    fn ready(&self) -> &Value {
+        self.ready()
+    }
+
+    fn stats(&self) -> Option<Value> {
+        self.stats()
+    }
+
+    fn has_ended(&self) -> bool {
+        self.has_ended()
+    }
+
+    fn shutdown(self) -> Result<(), StartError> {
+        self.shutdown()
+    }
+}
+
 impl Drop for Handle {
     fn drop(&mut self) {
         let _ = self.end();
@@ -139,7 +184,7 @@ fn joined(thread: JoinHandle<Result<(), StartError>>) -> Result<(), StartError> 
 }
 
 /// Prints `ready` and statistics, and ends on a signal.
-pub(super) fn foreground(handle: Handle, options: &RunOptions) -> Result<(), StartError> {
+pub(super) fn foreground(handle: impl Running, options: &RunOptions) -> Result<(), StartError> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let runtime = runtime.map_err(|error| StartError::new(format!("cannot start the runtime: {error}")))?;
     let mut stdout = Stdout::start()
