@@ -12,7 +12,7 @@ use recipe_remote::route::{Operation, Served};
 use serde::Deserialize;
 use serde_json::{Value, json};
 use tokio::sync::oneshot;
-use tracing::info;
+use tracing::{info, warn};
 
 use super::http::{Reply, Request};
 use super::supervisor::{Command, Failed, View, What, left_of};
@@ -116,7 +116,8 @@ impl Server {
         let view = shared.view();
         match done {
             Ok(revision) => {
-                info!(%peer, revision, what = name(operation), "done for a client of the console");
+                // At the level that is shown if nobody asks for another: a person has to see it.
+                warn!(%peer, revision, what = name(operation), "done for a client of the console");
                 let status = if operation == Operation::PutConfig { Status::CREATED } else { Status::OK };
                 let mut shown = revisions(&view);
                 shown["revision"] = json!(revision);
@@ -127,7 +128,7 @@ impl Server {
                 }
             }
             Err(Failed::Refused(refused)) => {
-                info!(%peer, what = name(operation), ?refused, "refused to a client of the console");
+                warn!(%peer, what = name(operation), ?refused, "refused to a client of the console");
                 refusal(refused)
             }
             Err(Failed::Tried(why)) => {

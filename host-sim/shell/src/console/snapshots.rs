@@ -96,9 +96,8 @@ impl Snapshot {
     /// The document `values`.
     pub(super) fn values(&self) -> Option<Rc<str>> {
         let Taken::Gateway(shot) = &self.what else { return None };
-        let make = || {
-            written(|text| Pieces::of(Document::Values).write_all(shot.engine.status(shot.at), text))
-        };
+        let make =
+            || written(|text| Pieces::of(Document::Values).write_all(shot.engine.status(shot.at), text));
         Some(Rc::clone(self.values.get_or_init(|| make().into())))
     }
 
