@@ -4,7 +4,7 @@ use recipe_remote::request::{Head, HeadBuffer, HeadError, MAX_HEAD, Method};
 
 use crate::source::Source;
 
-const LINES: [&str; 24] = [
+const LINES: [&str; 25] = [
     "Host: 127.0.0.1:8480",
     "host:localhost",
     "Host: [::1]:80",
@@ -28,6 +28,7 @@ const LINES: [&str; 24] = [
     "No colon",
     "Blank : before",
     "Tab:\tand blanks \t ",
+    "Two: lines\nfor: some",
     "",
 ];
 const FIRST: [&str; 10] = [

@@ -247,3 +247,30 @@ impl fmt::Display for Label<'_> {
         })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::string::String;
+    use std::vec::Vec;
+
+    #[test]
+    fn buckets_of_a_histogram_count_all_that_is_shorter() {
+        let mut histogram = Histogram::new();
+        for micros in [0, 1, 1, 3, 4, 5_000_000] {
+            histogram.record(Duration::from_micros(micros));
+        }
+        let mut text = String::new();
+        write_histogram(&mut text, "x", &histogram).unwrap();
+        let lines: Vec<&str> = text.lines().collect();
+        assert_eq!(lines[2], "rgw_x_seconds_bucket{le=\"0.000000\"} 1");
+        assert_eq!(lines[3], "rgw_x_seconds_bucket{le=\"0.000001\"} 3");
+        assert_eq!(lines[4], "rgw_x_seconds_bucket{le=\"0.000003\"} 4");
+        assert_eq!(lines[5], "rgw_x_seconds_bucket{le=\"0.000007\"} 5");
+        assert_eq!(lines[24], "rgw_x_seconds_bucket{le=\"4.194303\"} 5");
+        assert_eq!(
+            lines[25..],
+            ["rgw_x_seconds_bucket{le=\"+Inf\"} 6", "rgw_x_seconds_count 6", "rgw_x_seconds_sum 5.000009",]
+        );
+    }
+}

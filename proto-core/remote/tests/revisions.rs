@@ -16,13 +16,13 @@ enum Event {
     RollBack,
     EndsByItself,
     Wait(u64),
-    /// The next output fails.
-    Fail,
+    /// The next output fails, or the one after it.
+    Fail(usize),
     /// The power goes before the next output is carried out, or now if there is none.
     Cut,
 }
 
-const EVENTS: [Event; 11] = [
+const EVENTS: [Event; 12] = [
     Event::Put,
     Event::PutOnOld,
     Event::Apply,
@@ -32,7 +32,8 @@ const EVENTS: [Event; 11] = [
     Event::EndsByItself,
     Event::Wait(2),
     Event::Wait(100),
-    Event::Fail,
+    Event::Fail(1),
+    Event::Fail(2),
     Event::Cut,
 ];
 const TRIAL: Duration = Duration::from_secs(60);
@@ -43,7 +44,8 @@ struct World {
     machine: Revisions,
     store: Stored,
     runs: Option<u32>,
-    fails: bool,
+    /// So many outputs until one fails; 0: none does.
+    fails: usize,
     /// The power goes at the next output.
     is_cut: bool,
     /// Numbers that a person has confirmed; the first one counts as such.
@@ -62,7 +64,7 @@ impl World {
             machine,
             store,
             runs: Some(1),
-            fails: false,
+            fails: 0,
             is_cut: false,
             confirmed: vec![1],
             asked: None,
@@ -100,7 +102,7 @@ impl World {
                 }
             }
             Event::Wait(seconds) => self.now += Duration::from_secs(seconds),
-            Event::Fail => self.fails = true,
+            Event::Fail(nth) => self.fails = nth,
             Event::Cut => self.is_cut = true,
         }
         self.drain();
@@ -120,7 +122,8 @@ impl World {
             if core::mem::take(&mut self.is_cut) {
                 return self.restart();
             }
-            let is_done = !core::mem::take(&mut self.fails);
+            let is_done = self.fails != 1;
+            self.fails = self.fails.saturating_sub(1);
             let result = match output {
                 Output::Store { revision, forget } => {
                     if is_done {
@@ -155,7 +158,7 @@ impl World {
     fn restart(&mut self) {
         self.machine = Revisions::new(self.store.clone()).expect("the store holds the live one");
         self.runs = Some(self.store.live);
-        self.fails = false;
+        self.fails = 0;
     }
 
     fn check(&self) {
@@ -175,7 +178,7 @@ impl World {
 
     /// Nobody asks for anything any more, and nothing fails.
     fn settle(&mut self) {
-        self.fails = false;
+        self.fails = 0;
         for _ in 0..3 {
             self.play(Event::Wait(3_600));
         }
@@ -207,7 +210,7 @@ fn every_sequence(left: usize, world: &World, count: &mut u64) {
 fn every_sequence_of_five_events_ends_with_something_confirmed() {
     let mut count = 0;
     every_sequence(5, &World::new(), &mut count);
-    assert_eq!(count, (0..=5).map(|length| 11_u64.pow(length)).sum());
+    assert_eq!(count, (0..=5).map(|length| 12_u64.pow(length)).sum());
 }
 
 proptest! {
@@ -271,7 +274,7 @@ fn what_does_not_start_is_taken_back_and_what_was_live_is_tried_again() {
     let mut world = World::new();
     world.play(Event::Put);
     world.machine.apply(None, TRIAL).unwrap();
-    world.fails = true;
+    world.fails = 1;
     world.drain();
     assert_eq!((world.runs, world.machine.last()), (Some(1), Some((2, Ended::Failed))));
     // Neither does the live one, for a while.
