@@ -5,4 +5,5 @@ mod described;
 mod endpoints;
 mod hostile;
 mod kit;
+mod options;
 mod pendant;

@@ -25,6 +25,8 @@ pub(super) struct Store {
     folder: Option<Folder>,
     index: Index,
     texts: BTreeMap<u32, Arc<str>>,
+    /// The revision of the file that the process was started with, and the one it replaces; not written yet.
+    started_with: Option<(u32, Option<u32>)>,
 }
 
 #[derive(Debug)]
@@ -60,7 +62,8 @@ impl Store {
     /// The store of a folder, or of this process alone. If the file that the process was started with is
     /// another one than before, a person has changed it: then it becomes the newest revision, and live.
     pub(super) fn open(path: Option<&Path>, file: (&str, &str)) -> Result<Self, StartError> {
-        let mut store = Self { folder: None, index: Index::default(), texts: BTreeMap::new() };
+        let mut store =
+            Self { folder: None, index: Index::default(), texts: BTreeMap::new(), started_with: None };
         if let Some(path) = path {
             let refused = |why: &dyn std::fmt::Display| {
                 StartError::new(format!("--console-state {}: {why}", path.display()))
@@ -83,11 +86,21 @@ impl Store {
             let before = numbers.contains(&store.index.live).then_some(store.index.live);
             let mut index = store.with(number, name, forget);
             (index.live, index.previous, index.file) = (number, before, digest);
-            store
-                .put(number, text, forget, index)
-                .map_err(|error| StartError::new(format!("--console-state: {error}")))?;
+            store.index = index;
+            store.texts.insert(number, text.into());
+            forget.inspect(|forget| drop(store.texts.remove(forget)));
+            store.started_with = Some((number, forget));
         }
         Ok(store)
+    }
+
+    /// Writes the revision of the file that the process was started with. It has proved to run: one that does
+    /// not takes nobody's place.
+    pub(super) fn has_started(&mut self) -> Result<(), StartError> {
+        let Some((number, forget)) = self.started_with.take() else { return Ok(()) };
+        let text = self.texts.get(&number).cloned().unwrap_or_default();
+        let written = self.put(number, &text, forget, self.index.clone());
+        written.map_err(|error| StartError::new(format!("--console-state: {error}")))
     }
 
     /// The machine of these revisions.

@@ -4,7 +4,9 @@ use super::*;
 use recipe_test_kit::names;
 
 fn open(folder: &Path, text: &str) -> Store {
-    Store::open(Some(folder), ("cell.toml", text)).unwrap()
+    let mut store = Store::open(Some(folder), ("cell.toml", text)).unwrap();
+    store.has_started().unwrap();
+    store
 }
 
 fn live(store: &Store) -> &str {
@@ -65,6 +67,18 @@ fn a_change_that_was_cut_off_has_not_happened() {
     let store = open(folder, "ten");
     assert_eq!(store.texts().keys().copied().collect::<Vec<_>>(), [1, 4, 5, 6, 7, 8, 9, 10]);
     assert_eq!((live(&store), store.index.previous), ("ten", Some(1)));
+}
+
+#[test]
+fn a_file_that_did_not_start_takes_nobodys_place() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    drop(open(folder, "one"));
+    let store = Store::open(Some(folder), ("cell.toml", "two")).unwrap();
+    assert_eq!(live(&store), "two");
+    drop(store);
+    let store = open(folder, "one");
+    assert_eq!((live(&store), store.entries().len()), ("one", 1));
 }
 
 #[test]

@@ -241,7 +241,7 @@ impl Supervisor {
         if let Some(folder) = &self.state {
             info!(revision = live, folder = %folder.display(), "running this revision");
         }
-        let started = self.start(live);
+        let started = self.start(live).and_then(|()| self.store.has_started());
         let is_open = started.is_ok();
         self.show();
         let _ = opened.send(started);
