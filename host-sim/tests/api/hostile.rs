@@ -120,12 +120,11 @@ fn slow_and_cut_off_requests_end_in_time() {
     let mut without = TcpStream::connect(cell.console).unwrap();
     let check = "Content-Type: application/toml\r\nContent-Length: 30\r\n\r\nhalf";
     write!(without, "POST /api/v1/check HTTP/1.1\r\nHost: {}\r\n{check}", cell.console).unwrap();
-    let bytes = until("the slow client is refused", || {
+    until("the slow client is refused", || {
         let sent = slow.write_all(b"G").is_ok();
         std::thread::sleep(Duration::from_millis(50));
         (!sent || started.elapsed() > Duration::from_secs(6)).then_some(())
     });
-    let () = bytes;
     for stream in [&mut silent, &mut without] {
         stream.set_read_timeout(Some(PATIENCE)).unwrap();
         let mut answer = String::new();
@@ -146,12 +145,19 @@ fn streams_leave_room_for_requests_and_those_who_do_not_read_are_dropped() {
         stream
     };
     let unread: Vec<_> = (0..4).map(|_| open(cell.console)).collect();
+    for stream in &unread {
+        // As small as the system allows: it fills within a second.
+        rustix::net::sockopt::set_socket_recv_buffer_size(stream, 1).unwrap();
+    }
     until("four streams", || (get(cell.console, "info").json()["console"]["streams"] == 4).then_some(()));
     let refused = request(cell.console, "GET /api/v1/stream", "", "").must_be(503);
     assert!(refused.body.contains("too many streams"), "{}", refused.body);
     get(cell.console, "status").must_be(200);
-    drop(unread);
-    until("they are gone", || (get(cell.console, "info").json()["console"]["streams"] == 0).then_some(()));
+    let info = until("they are dropped", || {
+        let info = get(cell.console, "info").json();
+        (info["console"]["streams"] == 0).then_some(info)
+    });
+    assert_eq!(info["console"]["counters"]["slow_readers"], 4, "{info}");
 }
 
 /// Frames of the panel and answers of the controller, while somebody attacks the console.

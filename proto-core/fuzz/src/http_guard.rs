@@ -23,7 +23,7 @@ struct Given {
 
 pub(crate) fn run(input: &[u8]) {
     let mut input = Source::new(input);
-    let has_key = input.u8() % 8 != 0;
+    let has_key = !input.u8().is_multiple_of(8);
     let mut guard = Guard::new(has_key.then(|| Key::parse(KEY)).flatten(), [7; 32]);
     let mut now = Instant::from_micros(1_000_000);
     let mut given: Vec<Given> = Vec::new();
@@ -58,7 +58,7 @@ pub(crate) fn run(input: &[u8]) {
             _ => (String::new(), true),
         };
         let nth = input.below(given.len());
-        let (key, is_right) = if input.u8() % 4 == 0 { (OTHER, false) } else { (KEY, true) };
+        let (key, is_right) = if input.u8().is_multiple_of(4) { (OTHER, false) } else { (KEY, true) };
         let way = input.u8() % 8;
         let nonce = &given[nth];
         let target = "/api/v1/confirm";
@@ -111,7 +111,7 @@ pub(crate) fn run(input: &[u8]) {
 pub(crate) fn seeds() -> Vec<Vec<u8>> {
     // A request: kind, host, origin, nonce, key, way.
     let request = |kind: u8, key: u8, way: u8| [kind, 9, 9, 0, key, way];
-    let nonce = vec![1, 70];
+    let nonce = [1, 70];
     vec![
         [&nonce[..], &request(100, 1, 1), &request(101, 1, 5), &request(101, 1, 5)].concat(),
         [&nonce[..], &request(101, 1, 0), &[55], &request(101, 1, 5)].concat(),

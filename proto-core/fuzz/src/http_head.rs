@@ -199,7 +199,7 @@ fn reference(text: &str) -> Option<Option<Known<'_>>> {
     };
     let expects = match expect {
         None => false,
-        Some(value) if value.to_ascii_lowercase() == "100-continue" => true,
+        Some(value) if value.eq_ignore_ascii_case("100-continue") => true,
         Some(_) => return Some(None),
     };
     let method = match method {
