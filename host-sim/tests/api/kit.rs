@@ -134,6 +134,17 @@ impl Cell {
         TcpStream::connect(place).unwrap()
     }
 
+    /// The panel switches its outputs, until the controller has them: a gateway that has just started drops
+    /// what comes before its links are up.
+    #[track_caller]
+    pub(crate) fn switch(&self, panel: &mut TcpStream, value: u8) {
+        until(&format!("outputs {value}"), || {
+            panel.write_all(&frame(value)).unwrap();
+            let shown = self.robot.newest()["registers"]["DigitalOutputCommand[1]"].as_u64();
+            (shown == Some(value.into())).then_some(())
+        });
+    }
+
     /// Waits until the controller has this value of the panel's outputs.
     #[track_caller]
     pub(crate) fn outputs_are(&self, value: u64) {

@@ -53,12 +53,12 @@ impl Attempts {
             return;
         }
         let newest = |known: &Address| known.wrong.last().copied();
-        let oldest =
-            self.addresses.iter().enumerate().min_by_key(|(_, known)| newest(known)).map(|(nth, _)| nth);
-        if self.addresses.is_full()
-            && let Some(nth) = oldest
-        {
-            self.addresses.swap_remove(nth);
+        if self.addresses.is_full() {
+            let oldest = self.addresses.iter().map(newest).min();
+            let mut is_gone = false;
+            // One of them, if several are as old.
+            self.addresses
+                .retain(|known| Some(newest(known)) != oldest || core::mem::replace(&mut is_gone, true));
         }
         let mut wrong = Vec::new();
         let _ = wrong.push(now);

@@ -11,7 +11,7 @@ use proto_core::time::Instant;
 use crate::attempts::Attempts;
 use crate::key::{self, Hash, Key, SCHEME, Signed};
 use crate::nonces::{NonceError, NonceText, Nonces};
-use crate::request::{Head, HeadError, Method};
+use crate::request::{Head, HeadError, Method, cut, trim};
 use crate::response::Status;
 use crate::route::{self, Access, BodyType, Operation, RouteError, Served};
 
@@ -281,10 +281,10 @@ impl Guard {
         let Some(shown) = head.authorization else {
             return refuse(Why::WithoutKey, Status::UNAUTHORIZED, "the key is needed");
         };
-        let proof = match shown.split_once(' ') {
+        let proof = match cut(shown, b' ') {
             // Over a network everybody could read it.
             Some((scheme, key)) if scheme.eq_ignore_ascii_case("Bearer") && site.is_loopback() => {
-                Proof::Key(key.trim())
+                Proof::Key(trim(key))
             }
             Some((scheme, fields)) if scheme.eq_ignore_ascii_case(SCHEME) => match Signature::parse(fields) {
                 Some(signature) => Proof::Signature(signature),
@@ -386,8 +386,11 @@ struct Signature<'a> {
 impl<'a> Signature<'a> {
     fn parse(fields: &'a str) -> Option<Self> {
         let (mut nonce, mut body, mut mac) = (None, None, None);
-        for field in fields.split(',') {
-            let (name, value) = field.trim().split_once('=')?;
+        let mut rest = fields;
+        while !rest.is_empty() {
+            let (field, behind) = cut(rest, b',').unwrap_or((rest, ""));
+            rest = behind;
+            let (name, value) = cut(trim(field), b'=')?;
             let place = match name {
                 "nonce" => &mut nonce,
                 "body" => &mut body,

@@ -1,6 +1,6 @@
 //! The table of endpoints: which method and path is which operation, who serves it, and what it asks for.
 
-use crate::request::{Head, Method};
+use crate::request::{Head, Method, cut, trim};
 
 /// What a request asks for (docs/api.md).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -79,8 +79,8 @@ impl BodyType {
 
     /// Whether `Content-Type` names it; parameters such as a charset are not looked at.
     pub fn is(self, content_type: &str) -> bool {
-        let name = content_type.split(';').next().unwrap_or("").trim();
-        name.eq_ignore_ascii_case(self.name())
+        let name = cut(content_type, b';').map_or(content_type, |(name, _)| name);
+        trim(name).eq_ignore_ascii_case(self.name())
     }
 }
 

@@ -8,6 +8,7 @@ use std::rc::Rc;
 use std::time::Duration;
 
 use recipe_remote::response::{Kind, Length, Status};
+use rustix::net::sockopt;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
@@ -28,6 +29,8 @@ pub(super) async fn serve(server: &Rc<Server>, mut stream: TcpStream) -> io::Res
 }
 
 async fn follow(server: &Rc<Server>, stream: TcpStream) -> io::Result<()> {
+    // Waiting events become old: about a second of them is enough.
+    let _ = sockopt::set_socket_send_buffer_size(&stream, SEND_BUFFER);
     let reply = Reply { status: Status::OK, kind: Kind::Events, body: "".into(), fields: Vec::new() };
     let (mut read, mut write) = stream.into_split();
     let send = async {
@@ -74,6 +77,8 @@ async fn follow(server: &Rc<Server>, stream: TcpStream) -> io::Result<()> {
     }
 }
 
+/// Bytes that the system keeps for a client.
+const SEND_BUFFER: usize = 16 << 10;
 /// Maximum number of streams; the other connections are for requests.
 const MAX_STREAMS: usize = 4;
 /// Time between two events.
