@@ -8,6 +8,7 @@ use core::net::IpAddr;
 
 use proto_core::time::Instant;
 
+use crate::address;
 use crate::attempts::Attempts;
 use crate::key::{self, Hash, Key, SCHEME, Signed};
 use crate::nonces::{NonceError, NonceText, Nonces};
@@ -71,10 +72,10 @@ impl Site<'_> {
     /// address; then it may read what we answer, but it cannot choose what the browser says the host is.
     fn is_host(&self, name: &str) -> bool {
         let bare = name.strip_prefix('[').and_then(|name| name.strip_suffix(']')).unwrap_or(name);
-        match bare.parse::<IpAddr>() {
-            Ok(address) => address.to_canonical() == self.local.to_canonical(),
-            Err(_) if name.eq_ignore_ascii_case("localhost") => self.is_loopback(),
-            Err(_) => self.names.iter().any(|own| own.eq_ignore_ascii_case(name)),
+        match address::parse(bare) {
+            Some(address) => address == self.local.to_canonical(),
+            None if name.eq_ignore_ascii_case("localhost") => self.is_loopback(),
+            None => self.names.iter().any(|own| own.eq_ignore_ascii_case(name)),
         }
     }
 }

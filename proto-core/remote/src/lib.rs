@@ -64,6 +64,7 @@
 #[cfg(test)]
 extern crate std;
 
+mod address;
 pub mod attempts;
 pub mod claim;
 pub mod documents;
