@@ -33,7 +33,7 @@ fn what_was_live_is_live_again_unless_the_file_was_changed() {
     // Somebody edits the file.
     let store = open(folder, "three");
     assert_eq!((live(&store), store.index.previous), ("three", Some(2)));
-    assert_eq!(store.entries().iter().map(|entry| entry.from.as_str()).last(), Some("cell.toml"));
+    assert_eq!(store.entries().last().map(|entry| entry.from.as_str()), Some("cell.toml"));
     drop(store);
     assert_eq!(live(&open(folder, "three")), "three");
 }
