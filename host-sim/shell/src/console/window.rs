@@ -110,5 +110,5 @@ impl Window {
 
 /// How long the console waits for a copy.
 const MAX_WAIT: Duration = Duration::from_millis(500);
-/// How long safe values may take: so long they are repeated where nothing shows them (docs/engine.md section 6).
+/// How long safe values may take: so long they are repeated where nothing shows them (proto-core/docs/engine.md section 6).
 pub(crate) const MAX_SAFE: Duration = Duration::from_secs(1);
