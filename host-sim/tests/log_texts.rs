@@ -10,13 +10,14 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// Folders of tests, and the folders of the programs that they run.
-const TESTS: [(&str, &[&str]); 6] = [
+const TESTS: [(&str, &[&str]); 7] = [
     ("firmware/chip/tests", &["firmware/src", "proto-core/src"]),
     ("firmware/tests", &["firmware/src", "proto-core/src"]),
     ("host-sim/tests/scenarios", &["firmware/src", "host-sim", "proto-core/src"]),
     ("host-sim/tests/usb_can", &["host-sim", "proto-core/src"]),
     ("host-sim/tests/socketcan", &["host-sim", "proto-core/src"]),
     ("host-sim/tests/hostile", &["host-sim", "proto-core/src"]),
+    ("host-sim/tests/api", &["host-sim"]),
 ];
 
 /// The beginning of a panic message, which is Rust's.

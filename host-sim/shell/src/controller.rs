@@ -22,6 +22,7 @@ use tokio::sync::Notify;
 use tokio::task::JoinSet;
 use tracing::{error, info, warn};
 
+use super::console::{ConsoleOptions, Consoled};
 use super::events_file::Writer;
 use super::host::{self, Handle, Shell};
 use super::tcp::{Accepted, Connection};
@@ -62,8 +63,12 @@ pub struct ControllerOptions {
 /// The reason why it could not start; nothing is left behind then.
 pub fn run(config: SimConfig, options: ControllerOptions) -> Result<(), StartError> {
     let run = options.run.clone();
+    let bound = run.console.as_ref().map(ConsoleOptions::bind).transpose()?;
     let handle = spawn(config, options)?;
-    host::foreground(handle, &run)
+    match bound {
+        Some(bound) => host::foreground(Consoled::start(bound, handle)?, &run),
+        None => host::foreground(handle, &run),
+    }
 }
 
 /// Starts a simulated controller on a thread of its own and returns when everything is listening. Dropping

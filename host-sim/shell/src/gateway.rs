@@ -7,6 +7,7 @@
 use std::cell::{Cell, RefCell};
 use std::collections::{BTreeMap, BTreeSet};
 use std::rc::Rc;
+use std::sync::Arc;
 
 use proto_core::config::{Bus, GatewayConfig, Parts, Port as PortConfig};
 use proto_core::engine::{Engine, Input, LinkId, LinkKind, OUTPUT_BUFFER, Output, PortId, Transport};
@@ -18,6 +19,8 @@ use tokio::sync::Notify;
 use tokio::task::JoinSet;
 use tracing::{info, trace, warn};
 
+use super::console::window::{MAX_SAFE, Window};
+use super::console::{self, ConfigFile, Supervised};
 use super::host::{self, Handle, Shell};
 use super::link::{self, Endpoint, LinkControl, LinkEvent};
 use super::{RunOptions, StartError};
@@ -35,6 +38,7 @@ struct Gateway {
     ports: Vec<(PortId, Port)>,
     links: Vec<(LinkId, LinkKind, Endpoint)>,
     ready: Value,
+    window: Option<Arc<Window>>,
 }
 
 /// Shared by all tasks of the gateway.
@@ -48,6 +52,8 @@ struct Core {
     /// Links that were told of as missing.
     unreachable: RefCell<BTreeSet<LinkId>>,
     deadline_moved: Notify,
+    /// Another gateway takes its place: its devices are not listened to any more.
+    is_ending: Cell<bool>,
 }
 
 impl Gateway {
@@ -92,13 +98,18 @@ impl Gateway {
             sleeps: Cell::new(0),
             unreachable: RefCell::default(),
             deadline_moved: Notify::new(),
+            is_ending: Cell::new(false),
         });
-        Ok(Self { core, ports, links, ready: json!({ "ports": places }) })
+        Ok(Self { core, ports, links, ready: json!({ "ports": places }), window: None })
     }
 
     async fn drive(self) -> Result<(), StartError> {
-        let Self { core: shared, ports, links, .. } = self;
+        let Self { core: shared, ports, links, window, .. } = self;
         let mut tasks = JoinSet::new();
+        if let Some(window) = window {
+            let core = Rc::clone(&shared);
+            tasks.spawn_local(async move { core.show(&window).await });
+        }
         for (id, port) in ports {
             let core = Rc::clone(&shared);
             tasks.spawn_local(async move {
@@ -164,7 +175,42 @@ impl Core {
         }
     }
 
+    /// Fills a console's window when it asks, and brings the safe values out when it wants to end this gateway.
+    async fn show(&self, window: &Window) -> Result<(), StartError> {
+        loop {
+            tokio::select! {
+                () = window.wanted.notified() => window.fill(|shot| {
+                    shot.engine.clone_from(&self.engine.borrow());
+                    shot.at = now();
+                    shot.devices = Default::default();
+                    for (port, (_, tx)) in &self.ports {
+                        if let Some(counters) = shot.devices.get_mut(usize::from(port.0)) {
+                            *counters = Some(tx.counters());
+                        }
+                    }
+                }),
+                () = window.ending.notified() => {
+                    self.is_ending.set(true);
+                    self.engine.borrow_mut().make_safe();
+                    self.input(Input::Tick);
+                    let is_safe = async {
+                        while !self.engine.borrow().is_safe() {
+                            tokio::time::sleep(SAFE_CHECK).await;
+                        }
+                    };
+                    if tokio::time::timeout(MAX_SAFE, is_safe).await.is_err() {
+                        warn!("the controller does not show all safe values; ending all the same");
+                    }
+                    window.is_safe();
+                }
+            }
+        }
+    }
+
     fn port_event(&self, port: PortId, event: PortEvent<'_>) {
+        if self.is_ending.get() && event != PortEvent::Sent {
+            return;
+        }
         match event {
             PortEvent::Up => self.input(Input::PortUp { port }),
             PortEvent::Down => self.input(Input::PortDown { port }),
@@ -310,8 +356,19 @@ fn lift(outer: &mut Value, key: &str) {
 /// # Errors
 /// The reason why it could not start; nothing is left behind then.
 pub fn run(config: GatewayConfig, options: RunOptions) -> Result<(), StartError> {
-    let handle = spawn(config, options.binds.clone(), options.scheduling)?;
+    let handle = spawn(config, options.binds.clone(), options.scheduling, None)?;
     host::foreground(handle, &options)
+}
+
+/// Same, with a console that can give it another configuration. Without options for a console it has none.
+///
+/// # Errors
+/// The reason why it could not start; nothing is left behind then.
+pub fn run_with_console(file: ConfigFile, options: RunOptions) -> Result<(), StartError> {
+    match &options.console {
+        Some(console) => host::foreground(Supervised::start(file, &options, console)?, &options),
+        None => run(*console::gateway(&file)?, options),
+    }
 }
 
 /// Starts the gateway on a thread of its own; dropping the handle ends it.
@@ -319,18 +376,28 @@ pub fn run(config: GatewayConfig, options: RunOptions) -> Result<(), StartError>
 /// # Errors
 /// The reason why it could not start; nothing is left behind then.
 pub fn start(config: GatewayConfig, binds: Vec<Bind>) -> Result<Handle, StartError> {
-    spawn(config, binds, Scheduling::Ordinary)
+    spawn(config, binds, Scheduling::Ordinary, None)
 }
 
-fn spawn(config: GatewayConfig, binds: Vec<Bind>, scheduling: Scheduling) -> Result<Handle, StartError> {
+/// Starts the gateway; a console looks at it through the window.
+pub(crate) fn spawn(
+    config: GatewayConfig,
+    binds: Vec<Bind>,
+    scheduling: Scheduling,
+    window: Option<Arc<Window>>,
+) -> Result<Handle, StartError> {
     host::start("gateway", async move || {
-        let gateway = Gateway::open(&config, &binds).await?;
+        let mut gateway = Gateway::open(&config, &binds).await?;
+        gateway.window = window;
         // Not as an argument of the log, which is not evaluated unless it is printed.
         let scheduling = realtime::apply(scheduling);
         info!(%scheduling, "the gateway is running");
         Ok(gateway)
     })
 }
+
+/// How often is looked whether the safe values have arrived.
+const SAFE_CHECK: std::time::Duration = std::time::Duration::from_millis(5);
 
 async fn open_port(port: &PortConfig, binds: &[Bind]) -> Result<Port, StartError> {
     let name = port.name.as_str();

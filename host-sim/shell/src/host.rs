@@ -37,6 +37,46 @@ pub struct Handle {
     thread: Option<JoinHandle<Result<(), StartError>>>,
 }
 
+/// Something that runs and can be asked, in the foreground.
+pub(crate) trait Running {
+    /// The actual addresses and paths.
+    fn ready(&self) -> &Value;
+    /// One line of statistics; `None` if there is none at the moment.
+    fn stats(&self) -> Option<Value>;
+    /// Asks the thread that moves the data; `None` if there is none at the moment.
+    fn asker(&self) -> Option<Asker>;
+    /// Whether it has ended by itself.
+    fn has_ended(&self) -> bool;
+    /// Ends it and waits for it. If it had ended by itself, the reason is the error.
+    fn shutdown(self) -> Result<(), StartError>;
+}
+
+/// Asks a shell, from any thread.
+#[derive(Debug, Clone)]
+pub(crate) struct Asker(mpsc::UnboundedSender<Request>);
+
+impl Asker {
+    /// One line of statistics; `None` if the shell has ended.
+    pub(crate) fn stats(&self) -> Option<Value> {
+        let (answer, stats) = blocking::channel();
+        self.0.send(Request::Stats(answer)).ok()?;
+        stats.recv().ok()
+    }
+
+    /// Waits until it answers; false if it has ended.
+    pub(crate) async fn answers(&self) -> bool {
+        let (answer, answered) = oneshot::channel();
+        self.0.send(Request::Ping(answer)).is_ok() && answered.await.is_ok()
+    }
+
+    /// One whose questions come out at the other end.
+    #[cfg(test)]
+    pub(super) fn channel() -> (Self, mpsc::UnboundedReceiver<Request>) {
+        let (requests, inbox) = mpsc::unbounded_channel();
+        (Self(requests), inbox)
+    }
+}
+
 #[derive(Debug)]
 pub(super) enum Request {
     Stats(blocking::Sender<Value>),
@@ -110,9 +150,11 @@ impl Handle {
 
     /// One line of statistics; `None` if the shell has ended.
     pub fn stats(&self) -> Option<Value> {
-        let (answer, stats) = blocking::channel();
-        self.requests.send(Request::Stats(answer)).ok()?;
-        stats.recv().ok()
+        self.asker().stats()
+    }
+
+    pub(crate) fn asker(&self) -> Asker {
+        Asker(self.requests.clone())
     }
 
     /// Whether the shell has ended by itself.
@@ -134,6 +176,28 @@ impl Handle {
     }
 }
 
+impl Running for Handle {
+    fn ready(&self) -> &Value {
+        self.ready()
+    }
+
+    fn stats(&self) -> Option<Value> {
+        self.stats()
+    }
+
+    fn asker(&self) -> Option<Asker> {
+        Some(self.asker())
+    }
+
+    fn has_ended(&self) -> bool {
+        self.has_ended()
+    }
+
+    fn shutdown(self) -> Result<(), StartError> {
+        self.shutdown()
+    }
+}
+
 impl Drop for Handle {
     fn drop(&mut self) {
         let _ = self.end();
@@ -145,7 +209,7 @@ fn joined(thread: JoinHandle<Result<(), StartError>>) -> Result<(), StartError> 
 }
 
 /// Prints `ready` and statistics, and ends on a signal.
-pub(super) fn foreground(handle: Handle, options: &RunOptions) -> Result<(), StartError> {
+pub(super) fn foreground(handle: impl Running, options: &RunOptions) -> Result<(), StartError> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let runtime = runtime.map_err(|error| StartError::new(format!("cannot start the runtime: {error}")))?;
     let mut stdout = Stdout::start()
@@ -158,35 +222,36 @@ pub(super) fn foreground(handle: Handle, options: &RunOptions) -> Result<(), Sta
         stdout.print(format!("ready {}", handle.ready()));
         let service = Service::from_environment();
         service.is_ready();
-        let thread = handle.requests.clone();
-        let mut alive = std::pin::pin!(service.keep_alive(&thread));
         let mut ticks = options.stats.map(tokio::time::interval);
         let mut check = tokio::time::interval(CHECK_INTERVAL);
-        let result = loop {
-            tokio::select! {
-                _ = signals.next() => break Ok(()),
-                () = &mut alive => {}
-                () = tick(&mut ticks) => {
-                    if let Some(mut stats) = handle.stats() {
-                        stats["lost_lines"] = stdout.lost().into();
-                        stdout.print(stats.to_string());
+        let result = {
+            let mut alive = std::pin::pin!(service.keep_alive(|| handle.asker()));
+            loop {
+                tokio::select! {
+                    _ = signals.next() => break Ok(()),
+                    () = &mut alive => {}
+                    () = tick(&mut ticks) => {
+                        if let Some(mut stats) = handle.stats() {
+                            stats["lost_lines"] = stdout.lost().into();
+                            stdout.print(stats.to_string());
+                        }
                     }
-                }
-                Some(failure) = stdout.failures.recv() => match failure {
-                    Failure::Closed if options.stats.is_some() => {
-                        print_stderr("stdout was closed; ended, because nobody reads the statistics");
-                        break Ok(());
-                    }
-                    // Nothing more would be printed.
-                    Failure::Closed => {}
-                    Failure::NotReady(error) => {
-                        break Err(StartError::new(format!("stdout: {error}")).after_start());
-                    }
-                    Failure::Lost(error) => warn!(%error, "cannot write statistics to stdout"),
-                },
-                _ = check.tick() => {
-                    if handle.has_ended() {
-                        break Ok(());
+                    Some(failure) = stdout.failures.recv() => match failure {
+                        Failure::Closed if options.stats.is_some() => {
+                            print_stderr("stdout was closed; ended, because nobody reads the statistics");
+                            break Ok(());
+                        }
+                        // Nothing more would be printed.
+                        Failure::Closed => {}
+                        Failure::NotReady(error) => {
+                            break Err(StartError::new(format!("stdout: {error}")).after_start());
+                        }
+                        Failure::Lost(error) => warn!(%error, "cannot write statistics to stdout"),
+                    },
+                    _ = check.tick() => {
+                        if handle.has_ended() {
+                            break Ok(());
+                        }
                     }
                 }
             }

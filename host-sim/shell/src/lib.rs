@@ -3,6 +3,7 @@
 //! A shell is one thread with a current-thread runtime. It owns all its sockets and devices, reports received
 //! data to the state machine, and carries out its outputs. It does not know protocols.
 
+pub mod console;
 pub mod controller;
 mod events_file;
 pub mod gateway;
@@ -37,6 +38,8 @@ pub struct RunOptions {
     pub stats: Option<Duration>,
     /// The scheduling of the run's thread.
     pub scheduling: Scheduling,
+    /// The console.
+    pub console: Option<console::ConsoleOptions>,
 }
 
 /// Why a run could not start or continue: one message. Nothing is left behind.

@@ -8,10 +8,9 @@
 use std::time::Duration;
 
 use sd_notify::NotifyState;
-use tokio::sync::{mpsc, oneshot};
 use tracing::warn;
 
-use super::host::Request;
+use super::host::Asker;
 
 /// The service manager, from this process's environment.
 pub(super) struct Service {
@@ -35,22 +34,22 @@ impl Service {
     }
 
     /// Says again and again that the run works, as long as its thread answers. Never returns.
-    pub(super) async fn keep_alive(&self, thread: &mpsc::UnboundedSender<Request>) {
+    pub(super) async fn keep_alive(&self, thread: impl Fn() -> Option<Asker>) {
         self.each_beat(thread, || tell(&[NotifyState::Watchdog])).await;
     }
 
-    async fn each_beat(&self, thread: &mpsc::UnboundedSender<Request>, say: impl Fn()) {
+    async fn each_beat(&self, thread: impl Fn() -> Option<Asker>, say: impl Fn()) {
         let Some(patience) = self.patience else { return std::future::pending().await };
         let mut beat = tokio::time::interval(patience / BEATS);
         beat.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         loop {
             beat.tick().await;
-            let (answer, answered) = oneshot::channel();
-            if thread.send(Request::Ping(answer)).is_err() || answered.await.is_err() {
-                // The thread has ended, which is found elsewhere.
-                return std::future::pending().await;
+            // While a configuration is replaced there is none.
+            if let Some(thread) = thread()
+                && thread.answers().await
+            {
+                say();
             }
-            say();
         }
     }
 }
@@ -67,11 +66,12 @@ fn tell(news: &[NotifyState<'_>]) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::host::Request;
     use std::cell::Cell;
 
     #[tokio::test(start_paused = true)]
     async fn a_thread_that_does_not_answer_is_not_said_to_work() {
-        let (thread, mut inbox) = mpsc::unbounded_channel();
+        let (thread, mut inbox) = Asker::channel();
         let service = Service { patience: Some(Duration::from_secs(3)) };
         let said = Cell::new(0);
         let works_for_a_while = async {
@@ -86,7 +86,7 @@ mod tests {
             }
         };
         tokio::select! {
-            () = service.each_beat(&thread, || said.set(said.get() + 1)) => unreachable!("it goes on"),
+            () = service.each_beat(|| Some(thread.clone()), || said.set(said.get() + 1)) => unreachable!("it goes on"),
             () = works_for_a_while => unreachable!("the service is there"),
             () = tokio::time::sleep(Duration::from_secs(60)) => {}
         }
@@ -95,10 +95,10 @@ mod tests {
 
     #[tokio::test(start_paused = true)]
     async fn without_a_watchdog_nothing_is_asked() {
-        let (thread, mut inbox) = mpsc::unbounded_channel();
+        let (thread, mut inbox) = Asker::channel();
         let service = Service { patience: None };
         tokio::select! {
-            () = service.keep_alive(&thread) => unreachable!("it goes on"),
+            () = service.keep_alive(|| Some(thread.clone())) => unreachable!("it goes on"),
             () = tokio::time::sleep(Duration::from_secs(60)) => {}
         }
         assert!(inbox.try_recv().is_err());

@@ -128,7 +128,9 @@ const GATEWAY_EXAMPLES: &str = "\
 Examples:
   host-sim gateway -c cell.toml --bind rs485-1=serial:/dev/ttyUSB0
   host-sim gateway -c cell.toml --bind rs485-1=pty:run/rs485-1 --set controller.address=127.0.0.1
-  host-sim gateway -c cell.toml --set port.rs485-1.baud=9600 --stats 1s";
+  host-sim gateway -c cell.toml --set port.rs485-1.baud=9600 --stats 1s
+  host-sim gateway -c cell.toml --console 127.0.0.1:8480 --console-key console.key --console-state revisions
+      and then: curl http://127.0.0.1:8480/api/v1/status";
 
 const CHECK_EXAMPLES: &str = "\
 Examples:

@@ -1,5 +1,6 @@
 //! `host-sim controller` and `host-sim gateway`: options, and the way from a file to a run.
 
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
@@ -10,6 +11,7 @@ use super::{Overrides, check, wrong};
 use recipe_config::SimConfig;
 use recipe_controller::timeline::Timeline;
 use recipe_device::bind::Bind;
+use recipe_shell::console::{self, ConfigFile, ConsoleOptions};
 use recipe_shell::controller::{ControllerOptions, MAX_FACTOR, MIN_FACTOR, Pace};
 use recipe_shell::out::print_stderr;
 use recipe_shell::{self as shell, EventsFile, ReadyFile, RunOptions, Scheduling, StartError};
@@ -36,6 +38,17 @@ pub(super) struct Run {
     /// Do not ask the system for real-time scheduling (SCHED_FIFO)
     #[arg(long)]
     no_realtime: bool,
+    /// Serve the API at this address (docs/api.md), such as 127.0.0.1:8480; port 0: any
+    #[arg(long, value_name = "ADDRESS:PORT")]
+    console: Option<SocketAddr>,
+    /// The key for changes, and for other machines: 32 hexadecimal digits in a file of mode 0600, such as
+    /// made by `(umask 077; openssl rand -hex 16 > FILE)`
+    #[arg(long, value_name = "FILE", requires = "console")]
+    console_key: Option<PathBuf>,
+    /// Keep the last 8 revisions of the configuration in this folder, and run the live one after a restart,
+    /// unless the file was changed; only for the gateway
+    #[arg(long, value_name = "DIR", requires = "console")]
+    console_state: Option<PathBuf>,
 }
 
 /// Arguments of `controller`.
@@ -62,8 +75,13 @@ pub(super) struct ControllerRun {
 impl Run {
     pub(super) fn gateway(self) -> ExitCode {
         let loaded = check::load_gateway(&self.config, &self.overrides.set);
+        let (path, overrides) = (self.config.clone(), self.overrides.set.clone());
         // Even if the file is wrong, a ready file of a killed run is removed.
         match (self.options(), loaded) {
+            (Ok(options), Ok(_)) if options.console.is_some() => {
+                let file = ConfigFile::read(&path, overrides);
+                finished(file.and_then(|file| shell::gateway::run_with_console(file, options)))
+            }
             (Ok(options), Ok(config)) => finished(shell::gateway::run(*config, options)),
             (_, Err(error)) => wrong(error),
             (Err(error), _) => finished(Err(error)),
@@ -73,7 +91,10 @@ impl Run {
     fn options(self) -> Result<RunOptions, StartError> {
         let ready = self.ready.map(ReadyFile::at).transpose()?;
         let scheduling = if self.no_realtime { Scheduling::Ordinary } else { Scheduling::FifoIfAllowed };
-        Ok(RunOptions { binds: self.bind, ready, stats: self.stats, scheduling })
+        let key = self.console_key.as_deref().map(console::read_key).transpose()?;
+        let state = self.console_state;
+        let console = self.console.map(|address| ConsoleOptions { address, key, state });
+        Ok(RunOptions { binds: self.bind, ready, stats: self.stats, scheduling, console })
     }
 }
 
@@ -95,6 +116,9 @@ impl ControllerRun {
 
     fn options(self) -> Result<ControllerOptions, StartError> {
         let Self { run, time: pace, seed, events, timeline: _ } = self;
+        if run.console_state.is_some() {
+            return Err(StartError::new("--console-state: a simulated controller keeps no revisions"));
+        }
         let events = events.map(EventsFile::at).transpose()?;
         Ok(ControllerOptions { run: run.options()?, pace, seed, events, timeline: None })
     }

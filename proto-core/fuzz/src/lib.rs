@@ -17,6 +17,8 @@ mod command;
 mod deframer;
 mod engine;
 mod framer;
+mod http_guard;
+mod http_head;
 mod image;
 mod modbus;
 mod plain_frame;
@@ -83,6 +85,8 @@ pub const TARGETS: &[Target] = &[
         runs: 4_000,
         longest: 1_000,
     },
+    Target { name: "http_head", run: http_head::run, seeds: http_head::seeds, runs: 8_000, longest: 600 },
+    Target { name: "http_guard", run: http_guard::run, seeds: http_guard::seeds, runs: 1_500, longest: 600 },
     Target { name: "image", run: image::run, seeds: image::seeds, runs: 3_000, longest: 3_000 },
 ];
 

@@ -3,7 +3,7 @@
 //! In: a text such as `speed({value})`, and a value. Out: `speed(40)`, without formatting, which
 //! could panic.
 
-use core::fmt;
+use core::fmt::{self, Write};
 
 use heapless::{String, Vec};
 
@@ -52,12 +52,17 @@ pub struct CommandText<'a> {
 
 impl fmt::Display for CommandText<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let mut rest = self.text;
-        while let Some((before, after)) = rest.split_once(PLACEHOLDER) {
-            write!(f, "{before}{}", self.value)?;
-            rest = after;
+        let mut rest = self.text.chars();
+        loop {
+            if let Some(after) = rest.as_str().strip_prefix(PLACEHOLDER) {
+                write!(f, "{}", self.value)?;
+                rest = after.chars();
+            } else if let Some(c) = rest.next() {
+                f.write_char(c)?;
+            } else {
+                return Ok(());
+            }
         }
-        f.write_str(rest)
     }
 }
 

@@ -1,6 +1,7 @@
 //! What can be asked about a running engine, and the tap.
 
 use super::Engine;
+use super::clock::Ask;
 use super::counters::PortCounters;
 use super::io::{LinkId, PortId, PortState, ReplyCode};
 use super::latency::Latency;
@@ -57,6 +58,21 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     /// input was discarded. Wraps.
     pub fn sleeps(&self) -> u32 {
         self.clock.sleeps
+    }
+
+    /// Prepares the end of the engine: at the next [`super::Input::Tick`] every input frame that is not
+    /// overdue yet becomes so, as if all devices were silent. Values that wait are dropped and safe values go
+    /// out; a port that is never overdue keeps its values. The driver reports nothing more of its ports, and
+    /// ends the engine when [`Self::is_safe`] says so, or after some time.
+    pub fn make_safe(&mut self) {
+        self.store.all_overdue();
+        (self.clock.timer_at, self.clock.ask) = (Instant::ZERO, Ask::ALL);
+    }
+
+    /// Whether the controller is known to have every safe value that was sent to it. Where nothing shows a
+    /// value, it is never known.
+    pub fn is_safe(&self) -> bool {
+        self.store.is_safe()
     }
 
     /// A snapshot of the whole gateway at `now`.

@@ -101,6 +101,9 @@ pub struct PortStatus<'a> {
     /// Counters since the start.
     pub counters: &'a PortCounters,
     peers: &'a [PeerState],
+    /// The instant of the snapshot: ages count from it.
+    #[cfg(feature = "serde")]
+    pub(super) at: Instant,
 }
 
 /// A slave, or another peer that exchanges of a port are with.
@@ -299,6 +302,8 @@ impl<'a> Status<'a> {
             last_rejection: port.last_rejection.as_ref(),
             counters: &port.counters,
             peers,
+            #[cfg(feature = "serde")]
+            at: self.at,
         }
     }
 }

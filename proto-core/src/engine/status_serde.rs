@@ -84,7 +84,7 @@ impl Serialize for Status<'_> {
         let mut map = serializer.serialize_map(None)?;
         map.serialize_entry("time_us", &self.at().as_micros())?;
         map.serialize_entry("sleeps", &self.sleeps())?;
-        map.serialize_entry("ports", &Map(|| self.ports().map(|port| (port.name, At(port, self.at())))))?;
+        map.serialize_entry("ports", &Map(|| self.ports().map(|port| (port.name, port))))?;
         map.serialize_entry("links", &Map(|| self.links().map(|link| (link.name, link))))?;
         if let Some(controller) = self.controller() {
             map.serialize_entry("controller", &controller)?;
@@ -98,9 +98,9 @@ impl Serialize for Status<'_> {
 /// A part of a status, with the instant of the status.
 struct At<T>(T, Instant);
 
-impl Serialize for At<PortStatus<'_>> {
+impl Serialize for PortStatus<'_> {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let Self(port, at) = self;
+        let (port, at) = (self, self.at);
         let mut map = serializer.serialize_map(None)?;
         match port.bus {
             FieldBus::Rs485 => map.serialize_entry("bus", "rs485")?,
@@ -120,10 +120,10 @@ impl Serialize for At<PortStatus<'_>> {
             map.serialize_entry("command", &Text(command))?;
         }
         if let Some(last) = port.last_not_given {
-            map.serialize_entry("last_not_given", &At(last, *at))?;
+            map.serialize_entry("last_not_given", &At(last, at))?;
         }
         if let Some(rejection) = port.last_rejection {
-            map.serialize_entry("last_rejection", &Rejected(rejection, *at))?;
+            map.serialize_entry("last_rejection", &Rejected(rejection, at))?;
         }
         if port.peers().next().is_some() {
             map.serialize_entry("peers", &Map(|| port.peers().map(|peer| (peer.number, peer))))?;

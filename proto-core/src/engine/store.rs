@@ -314,6 +314,19 @@ impl<const PORTS: usize> Store<PORTS> {
         self.next_overdue = Stamp::at(Instant::ZERO);
     }
 
+    /// All frames whose devices are not silent yet are overdue at the next tick.
+    pub(super) fn all_overdue(&mut self) {
+        for frame in self.frames.iter_mut().filter(|frame| frame.overdue_at != Instant::NEVER) {
+            frame.overdue_at = Instant::ZERO;
+        }
+        self.next_overdue = Stamp::at(Instant::ZERO);
+    }
+
+    /// Whether the controller is known to have all safe values.
+    pub(super) fn is_safe(&self) -> bool {
+        self.unconfirmed.is_empty() && self.bits.unconfirmed.is_empty()
+    }
+
     /// The health of ports is checked at this time.
     pub(super) fn check_health_at(&mut self, at: Instant) {
         self.health_at = Stamp::at(at);

@@ -1,5 +1,6 @@
 //! A safe value is repeated until it is known to be there (docs/engine.md section 6).
 
+mod end;
 mod modbus;
 mod output;
 #[path = "../rig/mod.rs"]

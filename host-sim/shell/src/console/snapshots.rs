@@ -1,0 +1,141 @@
+//! What readers are shown: one copy of the engine for all of them, at most ten times a second.
+
+use std::cell::{OnceCell, RefCell};
+use std::rc::Rc;
+
+use proto_core::time::{Duration, Instant};
+use recipe_net::timer::now;
+use recipe_remote::documents::{Document, Pieces};
+use recipe_remote::json;
+use recipe_remote::metrics::Families;
+use serde_json::Value;
+
+use super::Source;
+use super::window::{Shot, Window};
+
+/// The newest snapshot.
+#[derive(Default)]
+pub(super) struct Snapshots {
+    newest: RefCell<Option<Rc<Snapshot>>>,
+    /// Room that the next copy is made in.
+    room: RefCell<Option<Box<Shot>>>,
+    /// Those who ask at the same time get the same copy.
+    turn: tokio::sync::Mutex<()>,
+}
+
+/// State, counters and values at one instant. Each text is made when somebody wants it, and once.
+pub(super) struct Snapshot {
+    taken: Instant,
+    what: Taken,
+    status: OnceCell<Rc<str>>,
+    values: OnceCell<Rc<str>>,
+    metrics: OnceCell<Rc<str>>,
+}
+
+enum Taken {
+    Gateway(Box<Shot>),
+    Controller(Value),
+}
+
+impl Snapshots {
+    /// A snapshot that is young enough; `None` while nothing runs.
+    pub(super) async fn newest(&self, source: &Source) -> Option<Rc<Snapshot>> {
+        let _turn = self.turn.lock().await;
+        if let Some(newest) = self.newest.borrow().as_ref()
+            && now().saturating_since(newest.taken) < MAX_AGE
+        {
+            return Some(Rc::clone(newest));
+        }
+        let what = match source {
+            Source::Gateway { shared, .. } => {
+                let window = shared.window()?;
+                Taken::Gateway(self.copy(&window).await?)
+            }
+            Source::Controller { asker, .. } => {
+                let asker = asker.clone();
+                Taken::Controller(tokio::task::spawn_blocking(move || asker.stats()).await.ok()??)
+            }
+        };
+        let snapshot = Rc::new(Snapshot {
+            taken: now(),
+            what,
+            status: OnceCell::new(),
+            values: OnceCell::new(),
+            metrics: OnceCell::new(),
+        });
+        let before = self.newest.replace(Some(Rc::clone(&snapshot)));
+        // Its room is used again, if no stream is still reading.
+        if let Some(Snapshot { what: Taken::Gateway(shot), .. }) = before.and_then(Rc::into_inner) {
+            self.room.replace(Some(shot));
+        }
+        Some(snapshot)
+    }
+
+    async fn copy(&self, window: &std::sync::Arc<Window>) -> Option<Box<Shot>> {
+        let room = self.room.take().unwrap_or_else(Shot::empty);
+        match window.look(room).await {
+            Ok(shot) => Some(shot),
+            Err(room) => {
+                self.room.replace(room);
+                None
+            }
+        }
+    }
+}
+
+impl Snapshot {
+    /// The document `status`.
+    pub(super) fn status(&self) -> Rc<str> {
+        let make = || match &self.what {
+            Taken::Controller(stats) => stats.to_string(),
+            Taken::Gateway(shot) => status_of(shot),
+        };
+        Rc::clone(self.status.get_or_init(|| make().into()))
+    }
+
+    /// The document `values`.
+    pub(super) fn values(&self) -> Option<Rc<str>> {
+        let Taken::Gateway(shot) = &self.what else { return None };
+        let make =
+            || written(|text| Pieces::of(Document::Values).write_all(shot.engine.status(shot.at), text));
+        Some(Rc::clone(self.values.get_or_init(|| make().into())))
+    }
+
+    /// The metrics.
+    pub(super) fn metrics(&self) -> Option<Rc<str>> {
+        let Taken::Gateway(shot) = &self.what else { return None };
+        let make = || written(|text| Families::new().write_all(shot.engine.status(shot.at), text));
+        Some(Rc::clone(self.metrics.get_or_init(|| make().into())))
+    }
+}
+
+/// The document `status`, with the counters of the devices, which the engine does not know.
+fn status_of(shot: &Shot) -> String {
+    let status = shot.engine.status(shot.at);
+    written(|text| {
+        let _ = Pieces::of(Document::Status).write_all(status, text);
+        text.pop();
+        text.push_str(",\"devices\":{");
+        let mut separator = "";
+        for port in status.ports() {
+            if let Some(counters) = shot.devices.get(usize::from(port.id.0)).and_then(Option::as_ref) {
+                text.push_str(separator);
+                let _ = json::write_text(text, port.name);
+                text.push(':');
+                let _ = json::write(text, counters);
+                separator = ",";
+            }
+        }
+        text.push_str("}}");
+    })
+}
+
+/// The text that is written; a `String` has room for everything.
+fn written<R>(write: impl FnOnce(&mut String) -> R) -> String {
+    let mut text = String::new();
+    let _ = write(&mut text);
+    text
+}
+
+/// The age at which a snapshot is replaced if somebody asks.
+const MAX_AGE: Duration = Duration::from_millis(100);

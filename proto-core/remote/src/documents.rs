@@ -1,0 +1,174 @@
+//! The documents `status` and `values` of a gateway, as JSON in pieces.
+//!
+//! In: a [`Status`] for each piece. Out: text. A piece is at most one port, link or histogram, or
+//! [`VALUES_AT_ONCE`] variables, so that a driver with little memory sends one before it makes the next. Each
+//! piece may be of a later instant than the one before; the document is well-formed all the same. Unknown
+//! values are absent.
+
+use core::fmt::{self, Write};
+
+use proto_core::engine::{Health, Status};
+use proto_core::sysvar::{COUNT, SysVar};
+use serde::Serialize;
+
+use crate::json::{self, JsonError};
+
+/// Number of variables in a piece.
+pub const VALUES_AT_ONCE: usize = 32;
+
+/// A document.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Document {
+    /// Ports, links, the controller's states and latencies.
+    Status,
+    /// The known variables.
+    Values,
+}
+
+/// A document that is being written.
+#[derive(Debug, Clone)]
+pub struct Pieces {
+    next: Step,
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Step {
+    Status,
+    Port(usize),
+    Link(usize),
+    Controller,
+    Latency,
+    Values,
+    /// From this place on. Places, not counts: a variable that becomes known meanwhile moves no other.
+    ValuesFrom {
+        from: usize,
+        is_first: bool,
+    },
+    End,
+}
+
+impl Pieces {
+    /// The beginning of a document.
+    pub const fn of(document: Document) -> Self {
+        let next = match document {
+            Document::Status => Step::Status,
+            Document::Values => Step::Values,
+        };
+        Self { next }
+    }
+
+    /// Writes the next piece, which may be empty; `false` if there is none left.
+    ///
+    /// # Errors
+    /// If `out` has no room. The document cannot be continued then.
+    pub fn write_next(&mut self, status: Status<'_>, out: &mut impl Write) -> Result<bool, JsonError> {
+        self.next = match self.next {
+            Step::Status => {
+                let (time, sleeps) = (status.at().as_micros(), status.sleeps());
+                let health = health_name(status.health());
+                write!(out, "{{\"time_us\":{time},\"sleeps\":{sleeps},\"health\":\"{health}\",\"ports\":{{")?;
+                Step::Port(0)
+            }
+            Step::Port(nth) => match status.ports().nth(nth) {
+                Some(port) => {
+                    entry(out, nth == 0, port.name, &port)?;
+                    Step::Port(nth.saturating_add(1))
+                }
+                None => {
+                    out.write_str("},\"links\":{")?;
+                    Step::Link(0)
+                }
+            },
+            Step::Link(nth) => match status.links().nth(nth) {
+                Some(link) => {
+                    entry(out, nth == 0, link.name, &link)?;
+                    Step::Link(nth.saturating_add(1))
+                }
+                None => {
+                    out.write_char('}')?;
+                    Step::Controller
+                }
+            },
+            Step::Controller => {
+                if let Some(controller) = status.controller() {
+                    out.write_char(',')?;
+                    entry(out, true, "controller", &controller)?;
+                }
+                Step::Latency
+            }
+            Step::Latency => {
+                out.write_char(',')?;
+                entry(out, true, "latency", status.latency())?;
+                out.write_char('}')?;
+                Step::End
+            }
+            Step::Values => {
+                write!(out, "{{\"time_us\":{},\"values\":{{", status.at().as_micros())?;
+                Step::ValuesFrom { from: 0, is_first: true }
+            }
+            Step::ValuesFrom { from, mut is_first } => {
+                let to = from.saturating_add(VALUES_AT_ONCE);
+                let here =
+                    status.variables().filter(|known| (from..to).contains(&place(known.var, known.bit)));
+                for known in here {
+                    entry(out, is_first, known.name(), &known)?;
+                    is_first = false;
+                }
+                match to < PLACES {
+                    true => Step::ValuesFrom { from: to, is_first },
+                    false => {
+                        out.write_str("}}")?;
+                        Step::End
+                    }
+                }
+            }
+            Step::End => return Ok(false),
+        };
+        Ok(true)
+    }
+
+    /// Writes all pieces of one instant.
+    ///
+    /// # Errors
+    /// If `out` has no room.
+    pub fn write_all(mut self, status: Status<'_>, out: &mut impl Write) -> Result<(), JsonError> {
+        while self.write_next(status, out)? {}
+        Ok(())
+    }
+}
+
+/// The place of a variable, or behind all of them of a bit.
+fn place(var: SysVar, bit: Option<u8>) -> usize {
+    match bit {
+        None => var.ordinal(),
+        Some(bit) => var.ordinal().saturating_mul(8).saturating_add(bit.into()).saturating_add(COUNT),
+    }
+}
+
+/// Number of places.
+const PLACES: usize = COUNT * 9;
+
+/// One word for the gateway's condition.
+pub const fn health_name(health: Health) -> &'static str {
+    match health {
+        Health::Idle => "idle",
+        Health::NoController => "no-controller",
+        Health::PortSilent => "port-silent",
+        Health::Running => "running",
+        _ => "unknown",
+    }
+}
+
+fn entry(
+    out: &mut impl Write,
+    is_first: bool,
+    key: impl fmt::Display,
+    value: &impl Serialize,
+) -> Result<(), JsonError> {
+    if !is_first {
+        out.write_char(',')?;
+    }
+    json::write_text(out, key)?;
+    out.write_char(':')?;
+    json::write(out, value)
+}

@@ -1,0 +1,415 @@
+//! Who may do what: hosts, origins, types, lengths and keys are checked here, in this order, before a driver
+//! carries anything out.
+//!
+//! In: the head of a request, the addresses of its connection, the present. Out: the operation, or a refusal.
+//! Does not read bodies; a signed request names the hash of its body, which [`Admitted::is_body`] compares.
+
+use core::net::IpAddr;
+
+use proto_core::time::Instant;
+
+use crate::address;
+use crate::attempts::Attempts;
+use crate::key::{self, Hash, Key, SCHEME, Signed};
+use crate::nonces::{NonceError, NonceText, Nonces};
+use crate::request::{Head, HeadError, Method, cut, trim};
+use crate::response::Status;
+use crate::route::{self, Access, BodyType, Operation, RouteError, Served};
+
+/// Maximum length of a body in bytes.
+pub const MAX_BODY: u64 = 64 << 10;
+
+/// The key, and what has to be remembered about requests with and without it.
+#[derive(Debug, Clone)]
+pub struct Guard {
+    key: Option<Key>,
+    secret: Hash,
+    nonces: Nonces,
+    attempts: Attempts,
+    counters: Counters,
+}
+
+/// Counters of requests. They wrap.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
+#[non_exhaustive]
+pub struct Counters {
+    /// Requests that were carried out.
+    pub admitted: u32,
+    /// Requests that no endpoint takes: path, method, type or length.
+    pub unfit: u32,
+    /// Requests for another host: a name that was made to point here.
+    pub wrong_host: u32,
+    /// Requests of pages of another origin.
+    pub cross_site: u32,
+    /// Requests without the key they need.
+    pub without_key: u32,
+    /// Requests with a wrong key or signature.
+    pub wrong_key: u32,
+    /// Signed requests that were sent before, or too late.
+    pub replayed: u32,
+    /// Requests that were not looked at, after too many wrong keys.
+    pub locked_out: u32,
+}
+
+/// The addresses of a connection.
+#[derive(Debug, Clone, Copy)]
+pub struct Site<'a> {
+    /// This end.
+    pub local: IpAddr,
+    /// The other end.
+    pub peer: IpAddr,
+    /// Names that this server has, in addition to its address and `localhost`.
+    pub names: &'a [&'a str],
+}
+
+impl Site<'_> {
+    /// Whether both ends are on one machine.
+    pub fn is_loopback(&self) -> bool {
+        self.local.to_canonical().is_loopback() && self.peer.to_canonical().is_loopback()
+    }
+
+    /// Whether a request for this host is for us. A page of another site can make its own name point to our
+    /// address; then it may read what we answer, but it cannot choose what the browser says the host is.
+    fn is_host(&self, name: &str) -> bool {
+        let bare = name.strip_prefix('[').and_then(|name| name.strip_suffix(']')).unwrap_or(name);
+        match address::parse(bare) {
+            Some(address) => address == self.local.to_canonical(),
+            None if name.eq_ignore_ascii_case("localhost") => self.is_loopback(),
+            None => self.names.iter().any(|own| own.eq_ignore_ascii_case(name)),
+        }
+    }
+}
+
+/// A request that may be carried out, once its body is there.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Admitted {
+    /// What it asks for.
+    pub operation: Operation,
+    /// Only the head of the response is wanted.
+    pub is_head: bool,
+    /// Length of the body in bytes.
+    pub length: u64,
+    /// The client waits for [`crate::response::CONTINUE`].
+    pub expects_continue: bool,
+    body: Option<Hash>,
+}
+
+impl Admitted {
+    /// Whether a body with this hash is the one that was signed.
+    pub fn is_body(&self, hash: &Hash) -> bool {
+        // No secret: whoever listens sees both.
+        self.body.is_none_or(|signed| signed == *hash)
+    }
+
+    /// Whether [`Admitted::is_body`] has to be asked.
+    pub const fn is_signed(&self) -> bool {
+        self.body.is_some()
+    }
+}
+
+/// Why a request is not carried out.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Refusal {
+    /// The status of the response.
+    pub status: Status,
+    /// For people.
+    pub text: &'static str,
+    /// `Allow`, with 405.
+    pub allow: Option<&'static str>,
+    /// `Retry-After` in seconds, with 429.
+    pub retry_after_s: Option<u64>,
+}
+
+impl Refusal {
+    /// A refusal without further fields.
+    pub const fn new(status: Status, text: &'static str) -> Self {
+        Self { status, text, allow: None, retry_after_s: None }
+    }
+}
+
+impl From<HeadError> for Refusal {
+    fn from(error: HeadError) -> Self {
+        let (status, text) = match error {
+            HeadError::Incomplete => (Status::TIMEOUT, "the request did not arrive in time"),
+            HeadError::TooLong => {
+                (Status::HEAD_TOO_LARGE, "the head is too long; allowed: 2048 bytes, 32 fields")
+            }
+            HeadError::Malformed => (Status::BAD_REQUEST, "not a request of HTTP/1.1"),
+            HeadError::Version => (Status::VERSION, "only HTTP/1.1 is served"),
+            HeadError::NoHost => (Status::BAD_REQUEST, "Host is missing"),
+            HeadError::Repeated => (Status::BAD_REQUEST, "a field that may come once comes twice"),
+            HeadError::NoLength => {
+                (Status::LENGTH_REQUIRED, "a body needs a Content-Length; no encoding is taken")
+            }
+            HeadError::Expectation => (Status::EXPECTATION_FAILED, "Expect may only be 100-continue"),
+        };
+        Self::new(status, text)
+    }
+}
+
+impl Guard {
+    /// A guard with this key; without one nothing can be changed, and nothing is told over a network.
+    /// `secret` is random, and another after each start.
+    pub const fn new(key: Option<Key>, secret: Hash) -> Self {
+        Self { key, secret, nonces: Nonces::new(secret), attempts: Attempts::new(), counters: Counters::NONE }
+    }
+
+    /// Whether there is a key.
+    pub const fn has_key(&self) -> bool {
+        self.key.is_some()
+    }
+
+    /// Sets the key, such as one that a board was given.
+    pub fn set_key(&mut self, key: Option<Key>) {
+        self.key = key;
+    }
+
+    /// Counters since the start.
+    pub const fn counters(&self) -> &Counters {
+        &self.counters
+    }
+
+    /// A nonce for one signed request.
+    pub fn nonce(&mut self, now: Instant) -> NonceText {
+        self.nonces.give(now)
+    }
+
+    /// Decides about a request.
+    ///
+    /// # Errors
+    /// Why it is refused.
+    pub fn admit(
+        &mut self,
+        now: Instant,
+        head: &Head<'_>,
+        site: &Site<'_>,
+        served: Served,
+    ) -> Result<Admitted, Refusal> {
+        let decided = self.decide(now, head, site, served);
+        let counters = &mut self.counters;
+        let counter = match &decided {
+            Ok(_) => &mut counters.admitted,
+            Err((what, _)) => match what {
+                Why::Unfit => &mut counters.unfit,
+                Why::Host => &mut counters.wrong_host,
+                Why::CrossSite => &mut counters.cross_site,
+                Why::WithoutKey => &mut counters.without_key,
+                Why::WrongKey => &mut counters.wrong_key,
+                Why::Replayed => &mut counters.replayed,
+                Why::LockedOut => &mut counters.locked_out,
+            },
+        };
+        *counter = counter.wrapping_add(1);
+        decided.map_err(|(_, refusal)| refusal)
+    }
+
+    fn decide(
+        &mut self,
+        now: Instant,
+        head: &Head<'_>,
+        site: &Site<'_>,
+        served: Served,
+    ) -> Decision<Admitted> {
+        if !site.is_host(head.host_name()) {
+            return refuse(Why::Host, Status::MISDIRECTED, "this server is not that host; use its address");
+        }
+        let route = match route::find(head, served) {
+            Ok(route) => route,
+            Err(RouteError::NotFound) => {
+                return refuse(Why::Unfit, Status::NOT_FOUND, "there is no such path");
+            }
+            Err(RouteError::Method(allow)) => {
+                let refusal = Refusal::new(Status::METHOD_NOT_ALLOWED, "this path has other methods");
+                return Err((Why::Unfit, Refusal { allow: Some(allow), ..refusal }));
+            }
+        };
+        let is_plain_read =
+            matches!(head.method, Method::Get | Method::Head) && route.operation != Operation::Stream;
+        if !is_plain_read && is_cross_site(head) {
+            let text = "only pages of this server may do that";
+            return refuse(Why::CrossSite, Status::FORBIDDEN, text);
+        }
+        if head.length > MAX_BODY || head.length > 0 && route.body == BodyType::None {
+            return refuse(
+                Why::Unfit,
+                Status::TOO_LARGE,
+                "the body is too long; allowed: 65536 bytes, none with GET",
+            );
+        }
+        let is_fit = match head.content_type {
+            Some(content_type) => route.body == BodyType::None || route.body.is(content_type),
+            // Of JSON all may be left out.
+            None => route.body != BodyType::Toml && head.length == 0,
+        };
+        if !is_fit {
+            let text = match route.body {
+                BodyType::Toml => "Content-Type must be application/toml",
+                _ => "Content-Type must be application/json",
+            };
+            return refuse(Why::Unfit, Status::UNSUPPORTED_TYPE, text);
+        }
+        let body = match route.access {
+            Access::Open => None,
+            Access::Read if site.is_loopback() && head.authorization.is_none() => None,
+            Access::Read | Access::Write => self.authorize(now, head, site)?,
+        };
+        Ok(Admitted {
+            operation: route.operation,
+            is_head: head.method == Method::Head,
+            length: head.length,
+            expects_continue: head.expects_continue,
+            body,
+        })
+    }
+
+    /// Checks the key, and returns the hash of the body that was signed.
+    fn authorize(&mut self, now: Instant, head: &Head<'_>, site: &Site<'_>) -> Decision<Option<Hash>> {
+        let peer = site.peer.to_canonical();
+        let Some(key) = &self.key else {
+            return refuse(
+                Why::WithoutKey,
+                Status::FORBIDDEN,
+                "this server has no key: it can only be read, on its own machine",
+            );
+        };
+        if let Some(wait) = self.attempts.must_wait(now, peer) {
+            let refusal = Refusal::new(Status::TOO_MANY, "too many wrong keys; wait");
+            let retry_after_s = Some(wait.as_millis().div_ceil(1_000));
+            return Err((Why::LockedOut, Refusal { retry_after_s, ..refusal }));
+        }
+        let Some(shown) = head.authorization else {
+            return refuse(Why::WithoutKey, Status::UNAUTHORIZED, "the key is needed");
+        };
+        let proof = match cut(shown, b' ') {
+            // Over a network everybody could read it.
+            Some((scheme, key)) if scheme.eq_ignore_ascii_case("Bearer") && site.is_loopback() => {
+                Proof::Key(trim(key))
+            }
+            Some((scheme, fields)) if scheme.eq_ignore_ascii_case(SCHEME) => match Signature::parse(fields) {
+                Some(signature) => Proof::Signature(signature),
+                None => Proof::None,
+            },
+            _ => Proof::None,
+        };
+        let is_right = match &proof {
+            Proof::None => {
+                let text = "Authorization must be Bearer KEY on this machine, or a signature";
+                return refuse(Why::WithoutKey, Status::UNAUTHORIZED, text);
+            }
+            Proof::Key(shown) => key.is(shown, &self.secret),
+            Proof::Signature(signature) => {
+                let Signature { nonce, body, mac } = *signature;
+                let (method, target) = (head.method.name(), head.target);
+                key.verify(&Signed { nonce, method, target, body }, &mac)
+            }
+        };
+        if !is_right {
+            self.attempts.was_wrong(now, peer);
+            return refuse(Why::WrongKey, Status::UNAUTHORIZED, "wrong key");
+        }
+        let Proof::Signature(signature) = proof else { return Ok(None) };
+        match self.nonces.check(now, signature.nonce) {
+            Ok(fresh) => {
+                self.nonces.spend(now, fresh);
+                Ok(key::from_hex(signature.body))
+            }
+            Err(NonceError::Used) => {
+                refuse(Why::Replayed, Status::UNAUTHORIZED, "this nonce was used; take a new one")
+            }
+            Err(NonceError::Old | NonceError::Unknown) => refuse(
+                Why::Replayed,
+                Status::UNAUTHORIZED,
+                "this nonce is not valid any more; take a new one",
+            ),
+        }
+    }
+}
+
+impl Counters {
+    const NONE: Self = Self {
+        admitted: 0,
+        unfit: 0,
+        wrong_host: 0,
+        cross_site: 0,
+        without_key: 0,
+        wrong_key: 0,
+        replayed: 0,
+        locked_out: 0,
+    };
+}
+
+/// Which counter a refusal belongs to.
+#[derive(Debug, Clone, Copy)]
+enum Why {
+    Unfit,
+    Host,
+    CrossSite,
+    WithoutKey,
+    WrongKey,
+    Replayed,
+    LockedOut,
+}
+
+type Decision<T> = Result<T, (Why, Refusal)>;
+
+fn refuse<T>(why: Why, status: Status, text: &'static str) -> Decision<T> {
+    Err((why, Refusal::new(status, text)))
+}
+
+/// Whether a browser says that the request comes from a page of another server.
+fn is_cross_site(head: &Head<'_>) -> bool {
+    let is_ours = |origin: &str| {
+        let authority = origin.strip_prefix("http://").or_else(|| origin.strip_prefix("https://"));
+        authority.is_some_and(|authority| authority.eq_ignore_ascii_case(head.host))
+    };
+    // `none`: a person typed the address.
+    let is_own_page = |site: &str| site == "same-origin" || site == "none";
+    !head.origin.is_none_or(is_ours) || !head.fetch_site.is_none_or(is_own_page)
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Proof<'a> {
+    None,
+    Key(&'a str),
+    Signature(Signature<'a>),
+}
+
+/// `nonce=..., body=..., mac=...`, in any order.
+#[derive(Debug, Clone, Copy)]
+struct Signature<'a> {
+    nonce: &'a str,
+    body: &'a str,
+    mac: Hash,
+}
+
+impl<'a> Signature<'a> {
+    fn parse(fields: &'a str) -> Option<Self> {
+        let (mut nonce, mut body, mut mac) = (None, None, None);
+        let mut rest = fields;
+        while !rest.is_empty() {
+            let (field, behind) = cut(rest, b',').unwrap_or((rest, ""));
+            rest = behind;
+            let (name, value) = cut(trim(field), b'=')?;
+            let place = match name {
+                "nonce" => &mut nonce,
+                "body" => &mut body,
+                "mac" => &mut mac,
+                _ => return None,
+            };
+            if place.replace(value).is_some() {
+                return None;
+            }
+        }
+        let (nonce, body) = (nonce?, body?);
+        // It is compared as bytes, but signed as text: there must be one text for each hash.
+        let is_hash =
+            key::from_hex::<32>(body).is_some() && !body.bytes().any(|byte| byte.is_ascii_uppercase());
+        is_hash.then_some(Self { nonce, body, mac: key::from_hex(mac?)? })
+    }
+}
+
+#[cfg(test)]
+#[path = "guard_tests.rs"]
+mod tests;

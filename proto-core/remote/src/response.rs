@@ -1,0 +1,241 @@
+//! The head of a response, and the frames of a body whose length is not known before its end.
+//!
+//! Every response ends its connection, forbids caching, framing by other pages and guesses at its type.
+
+use core::fmt::{self, Write};
+
+/// A status code.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Status(pub u16);
+
+impl Status {
+    /// 200.
+    pub const OK: Self = Self(200);
+    /// 201: a configuration was stored.
+    pub const CREATED: Self = Self(201);
+    /// 202: it was begun, and its end is shown elsewhere.
+    pub const ACCEPTED: Self = Self(202);
+    /// 304: the client has it already.
+    pub const NOT_MODIFIED: Self = Self(304);
+    /// 400.
+    pub const BAD_REQUEST: Self = Self(400);
+    /// 401: the key is needed, or was wrong.
+    pub const UNAUTHORIZED: Self = Self(401);
+    /// 403: not from this page, or without a key at the server.
+    pub const FORBIDDEN: Self = Self(403);
+    /// 404.
+    pub const NOT_FOUND: Self = Self(404);
+    /// 405, with `Allow`.
+    pub const METHOD_NOT_ALLOWED: Self = Self(405);
+    /// 408: it took too long.
+    pub const TIMEOUT: Self = Self(408);
+    /// 409: not in this state.
+    pub const CONFLICT: Self = Self(409);
+    /// 411: a body without its length.
+    pub const LENGTH_REQUIRED: Self = Self(411);
+    /// 412: `If-Match` names another revision.
+    pub const PRECONDITION_FAILED: Self = Self(412);
+    /// 413: the body is too long.
+    pub const TOO_LARGE: Self = Self(413);
+    /// 415: a body of another type.
+    pub const UNSUPPORTED_TYPE: Self = Self(415);
+    /// 417: an unknown `Expect`.
+    pub const EXPECTATION_FAILED: Self = Self(417);
+    /// 421: this server is not that host.
+    pub const MISDIRECTED: Self = Self(421);
+    /// 422: the body was understood, and is wrong.
+    pub const UNPROCESSABLE: Self = Self(422);
+    /// 428: `If-Match` is needed.
+    pub const PRECONDITION_REQUIRED: Self = Self(428);
+    /// 429, with `Retry-After`.
+    pub const TOO_MANY: Self = Self(429);
+    /// 431: the head is too long.
+    pub const HEAD_TOO_LARGE: Self = Self(431);
+    /// 500: it could not be done, such as for a full disk.
+    pub const INTERNAL: Self = Self(500);
+    /// 503: no room for another connection or stream, or nothing runs at the moment.
+    pub const UNAVAILABLE: Self = Self(503);
+    /// 505: another version than HTTP/1.1.
+    pub const VERSION: Self = Self(505);
+
+    /// The usual words for it.
+    pub const fn reason(self) -> &'static str {
+        match self.0 {
+            200 => "OK",
+            201 => "Created",
+            202 => "Accepted",
+            304 => "Not Modified",
+            400 => "Bad Request",
+            401 => "Unauthorized",
+            403 => "Forbidden",
+            404 => "Not Found",
+            405 => "Method Not Allowed",
+            408 => "Request Timeout",
+            409 => "Conflict",
+            411 => "Length Required",
+            412 => "Precondition Failed",
+            413 => "Content Too Large",
+            415 => "Unsupported Media Type",
+            417 => "Expectation Failed",
+            421 => "Misdirected Request",
+            422 => "Unprocessable Content",
+            428 => "Precondition Required",
+            429 => "Too Many Requests",
+            431 => "Request Header Fields Too Large",
+            503 => "Service Unavailable",
+            505 => "HTTP Version Not Supported",
+            _ => "Internal Server Error",
+        }
+    }
+}
+
+/// The type of a body.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Kind {
+    /// JSON.
+    Json,
+    /// A configuration.
+    Toml,
+    /// OpenMetrics.
+    Metrics,
+    /// Server-sent events.
+    Events,
+    /// The console.
+    Page,
+}
+
+impl Kind {
+    /// The media type.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Json => "application/json",
+            Self::Toml => "application/toml",
+            Self::Metrics => "application/openmetrics-text; version=1.0.0; charset=utf-8",
+            Self::Events => "text/event-stream",
+            Self::Page => "text/html; charset=utf-8",
+        }
+    }
+}
+
+/// How a client learns where the body ends.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Length {
+    /// It has this many bytes.
+    Bytes(u64),
+    /// In chunks ([`write_chunk`]).
+    Chunked,
+    /// It goes on until the connection is closed.
+    Endless,
+}
+
+/// The head of a response.
+#[derive(Clone, Copy)]
+pub struct Response<'a> {
+    status: Status,
+    kind: Kind,
+    length: Length,
+    policy: &'a str,
+    fields: &'a [(&'a str, &'a dyn fmt::Display)],
+}
+
+impl<'a> Response<'a> {
+    /// A response without further fields.
+    pub const fn new(status: Status, kind: Kind, length: Length) -> Self {
+        Self { status, kind, length, policy: NOTHING, fields: &[] }
+    }
+
+    /// Adds fields. Their values must be text without line ends.
+    #[must_use]
+    pub const fn with(self, fields: &'a [(&'a str, &'a dyn fmt::Display)]) -> Self {
+        Self { fields, ..self }
+    }
+
+    /// Sets the `Content-Security-Policy`; without it a browser runs and loads nothing.
+    #[must_use]
+    pub const fn with_policy(self, policy: &'a str) -> Self {
+        Self { policy, ..self }
+    }
+
+    /// Writes the head, up to and with its empty line.
+    ///
+    /// # Errors
+    /// Those of `out`, if it has no room.
+    pub fn write(&self, out: &mut impl Write) -> fmt::Result {
+        write!(out, "HTTP/1.1 {} {}\r\n", self.status.0, self.status.reason())?;
+        write!(out, "Content-Type: {}\r\n", self.kind.name())?;
+        match self.length {
+            Length::Bytes(len) => write!(out, "Content-Length: {len}\r\n")?,
+            Length::Chunked => out.write_str("Transfer-Encoding: chunked\r\n")?,
+            Length::Endless => {}
+        }
+        write!(out, "Content-Security-Policy: {}\r\n", self.policy)?;
+        for (name, value) in self.fields {
+            write!(out, "{name}: {value}\r\n")?;
+        }
+        out.write_str(
+            "Cache-Control: no-store\r\nX-Content-Type-Options: nosniff\r\nReferrer-Policy: no-referrer\r\n\
+             Cross-Origin-Resource-Policy: same-origin\r\nConnection: close\r\n\r\n",
+        )
+    }
+}
+
+/// The policy of everything that is no page.
+const NOTHING: &str = "default-src 'none'; frame-ancestors 'none'";
+
+/// What a client that asked for it gets before it sends its body.
+pub const CONTINUE: &str = "HTTP/1.1 100 Continue\r\n\r\n";
+
+/// Writes a piece of a chunked body. An empty one would end it and is left out.
+///
+/// # Errors
+/// Those of `out`, if it has no room.
+pub fn write_chunk(out: &mut impl Write, piece: &str) -> fmt::Result {
+    match piece.len() {
+        0 => Ok(()),
+        len => write!(out, "{len:x}\r\n{piece}\r\n"),
+    }
+}
+
+/// The end of a chunked body.
+pub const LAST_CHUNK: &str = "0\r\n\r\n";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::string::String;
+
+    #[test]
+    fn a_head_has_one_empty_line_and_forbids_what_browsers_may_guess() {
+        let mut head = String::new();
+        let fields: [(&str, &dyn fmt::Display); 1] = [("Allow", &"GET, HEAD")];
+        Response::new(Status::METHOD_NOT_ALLOWED, Kind::Json, Length::Bytes(7))
+            .with(&fields)
+            .write(&mut head)
+            .unwrap();
+        assert!(head.starts_with("HTTP/1.1 405 Method Not Allowed\r\nContent-Type: application/json\r\n"));
+        assert!(head.ends_with("\r\n\r\n"));
+        assert_eq!(head.matches("\r\n\r\n").count(), 1);
+        for field in [
+            "Content-Length: 7",
+            "Allow: GET, HEAD",
+            "X-Content-Type-Options: nosniff",
+            "Cache-Control: no-store",
+            "Content-Security-Policy: default-src 'none'; frame-ancestors 'none'",
+            "Connection: close",
+        ] {
+            assert!(head.contains(field), "{field}");
+        }
+        assert!(!head.contains("Access-Control"));
+    }
+
+    #[test]
+    fn chunks_have_their_length_in_hexadecimal_and_none_is_empty() {
+        let mut body = String::new();
+        for piece in ["0123456789abcdef", "", "x"] {
+            write_chunk(&mut body, piece).unwrap();
+        }
+        body.push_str(LAST_CHUNK);
+        assert_eq!(body, "10\r\n0123456789abcdef\r\n1\r\nx\r\n0\r\n\r\n");
+    }
+}

@@ -1,0 +1,417 @@
+//! Configurations that are kept, tried, confirmed and taken back.
+//!
+//! In: what people ask for, the results of what the driver did, the present. Out: what the driver has to do
+//! next. Knows neither what a configuration contains nor where it is kept: files on a host, cells of flash on a
+//! board.
+//!
+//! One revision is *live*: it is marked in the store, and runs after a restart. Another one runs only *on
+//! trial*, until it is confirmed, or its time is over, or it fails. So whatever happens to the store, to the
+//! power or to the person who applied it, what runs in the end is something that was confirmed.
+//!
+//! The contract is that of the engine: change it, then call [`Revisions::poll_output`] until it returns
+//! [`Output::Sleep`]. Each other output is carried out, and its result is reported, before the next call.
+
+use heapless::Vec;
+use proto_core::time::{Duration, Instant};
+
+/// Maximum number of revisions that are kept.
+pub const MAX_REVISIONS: usize = 8;
+/// Shortest and longest trial.
+pub const TRIAL: core::ops::RangeInclusive<Duration> = Duration::from_secs(1)..=Duration::from_secs(3600);
+/// How long to wait before a live revision that did not start is started again: the first time, and at most.
+const RETRY: (Duration, Duration) = (Duration::from_secs(1), Duration::from_secs(10));
+
+/// A configuration that is kept.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Revision {
+    /// Its number: higher than that of all before it.
+    pub number: u32,
+    /// The beginning of the hash of its contents: two stores may have the same numbers.
+    pub digest: u32,
+}
+
+/// What a store holds at the start.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Stored {
+    /// All revisions, the oldest first.
+    pub kept: Vec<Revision, MAX_REVISIONS>,
+    /// Number of the live one.
+    pub live: u32,
+    /// Number of the one that was live before.
+    pub previous: Option<u32>,
+}
+
+/// The revisions, and what happens to them.
+#[derive(Debug, Clone)]
+pub struct Revisions {
+    kept: Vec<Revision, MAX_REVISIONS>,
+    live: u32,
+    previous: Option<u32>,
+    waiting: Option<u32>,
+    phase: Phase,
+    last: Option<(u32, Ended)>,
+    /// The phase's output was not returned yet.
+    is_due: bool,
+}
+
+/// What is being done.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Phase {
+    /// The live one runs.
+    Live,
+    /// One is being written.
+    Storing { revision: Revision, forget: Option<u32> },
+    /// One is being started for a trial of this length.
+    StartingTrial { number: u32, trial: Duration },
+    /// It runs until then.
+    Trial { number: u32, until: Instant },
+    /// It was confirmed and is being marked.
+    Confirming { number: u32, until: Instant },
+    /// The one that was live before is being started.
+    Returning { number: u32 },
+    /// It runs and is being marked.
+    Marking { number: u32 },
+    /// The live one is being started.
+    StartingLive { wait: Duration },
+    /// The live one did not start. Nothing runs until then.
+    Down { until: Instant, wait: Duration },
+}
+
+/// How the newest trial ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Ended {
+    /// It was confirmed.
+    Confirmed,
+    /// Nobody confirmed it in time.
+    NotConfirmed,
+    /// Somebody took it back.
+    TakenBack,
+    /// It could not be started, or ended by itself.
+    Failed,
+}
+
+impl Ended {
+    /// One word for people and statistics.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Confirmed => "confirmed",
+            Self::NotConfirmed => "not-confirmed",
+            Self::TakenBack => "taken-back",
+            Self::Failed => "failed",
+        }
+    }
+}
+
+/// What the driver has to do.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Output {
+    /// Keep the configuration that was given with [`Revisions::put`], then remove `forget`. Report
+    /// [`Result::Stored`].
+    Store {
+        /// Its number and digest.
+        revision: Revision,
+        /// One that is not kept any longer.
+        forget: Option<u32>,
+    },
+    /// Bring the safe values out, end what runs, and start this one. Report [`Result::Started`].
+    Run {
+        /// Its number.
+        number: u32,
+    },
+    /// Mark this one as live, and the other as the one before, in one step that a power cut does not divide.
+    /// Report [`Result::Marked`].
+    Mark {
+        /// Number of the live one.
+        live: u32,
+        /// Number of the one before.
+        previous: u32,
+    },
+    /// Nothing until then.
+    Sleep {
+        /// When to call [`Revisions::poll_output`] again.
+        until: Instant,
+    },
+}
+
+/// What came of an [`Output`]; `true` if it was done, `false` if nothing was changed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Result {
+    /// Of [`Output::Store`].
+    Stored(bool),
+    /// Of [`Output::Run`]; `false`: nothing runs now.
+    Started(bool),
+    /// Of [`Output::Mark`].
+    Marked(bool),
+    /// What ran on trial ended by itself.
+    Ended,
+}
+
+/// Why something is not done.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Refused {
+    /// Something else is being done, or nothing runs at the moment.
+    Busy,
+    /// A revision is on trial: confirm it or take it back first.
+    OnTrial,
+    /// No revision is on trial.
+    NotOnTrial,
+    /// The change is based on another revision than the newest: this one.
+    Changed(Revision),
+    /// No stored revision waits, and none was named.
+    NothingWaits,
+    /// There is no such revision.
+    Unknown,
+    /// It runs already.
+    Runs,
+    /// The trial is shorter or longer than allowed.
+    Trial,
+    /// No other revision was live before.
+    NoPrevious,
+}
+
+impl Revisions {
+    /// With what a store holds. The live one runs, or is about to be started by the driver; `None` if the
+    /// store does not hold the live one.
+    pub fn new(stored: Stored) -> Option<Self> {
+        let Stored { kept, live, previous } = stored;
+        let has = |number: u32| kept.iter().any(|revision| revision.number == number);
+        let is_sorted = kept.is_sorted_by(|one, next| one.number < next.number);
+        let previous = previous.filter(|&number| has(number) && number != live);
+        (has(live) && is_sorted).then_some(Self {
+            live,
+            previous,
+            kept,
+            waiting: None,
+            phase: Phase::Live,
+            last: None,
+            is_due: false,
+        })
+    }
+
+    /// All that are kept, the oldest first.
+    pub fn kept(&self) -> &[Revision] {
+        &self.kept
+    }
+
+    /// The one that runs after a restart.
+    pub fn live(&self) -> u32 {
+        self.live
+    }
+
+    /// The one that was live before.
+    pub fn previous(&self) -> Option<u32> {
+        self.previous
+    }
+
+    /// The one that was stored and not applied.
+    pub fn waiting(&self) -> Option<u32> {
+        self.waiting
+    }
+
+    /// The one that runs; `None` while none does.
+    pub fn running(&self) -> Option<u32> {
+        match self.phase {
+            Phase::Live | Phase::Storing { .. } => Some(self.live),
+            Phase::Trial { number, .. } | Phase::Confirming { number, .. } | Phase::Marking { number } => {
+                Some(number)
+            }
+            _ => None,
+        }
+    }
+
+    /// The one on trial, and the end of the trial.
+    pub fn trial(&self) -> Option<(u32, Instant)> {
+        match self.phase {
+            Phase::Trial { number, until } | Phase::Confirming { number, until } => Some((number, until)),
+            _ => None,
+        }
+    }
+
+    /// The newest trial that has ended, and how.
+    pub fn last(&self) -> Option<(u32, Ended)> {
+        self.last
+    }
+
+    /// The revision that a change has to be based on: the one that waits, or else the live one.
+    pub fn base(&self) -> Option<Revision> {
+        self.revision(self.waiting.unwrap_or(self.live))
+    }
+
+    /// The revision of this number.
+    pub fn revision(&self, number: u32) -> Option<Revision> {
+        self.kept.iter().copied().find(|revision| revision.number == number)
+    }
+
+    /// Somebody stores a configuration that was made from `base`. Returns its number; it is kept once the
+    /// store has succeeded.
+    ///
+    /// # Errors
+    /// Why it is not stored.
+    pub fn put(&mut self, base: Revision, digest: u32) -> core::result::Result<u32, Refused> {
+        self.must_rest()?;
+        match self.base() {
+            Some(newest) if newest != base => return Err(Refused::Changed(newest)),
+            None => return Err(Refused::Busy),
+            Some(_) => {}
+        }
+        let newest = self.kept.iter().map(|revision| revision.number).max().unwrap_or(0);
+        let revision = Revision { number: newest.saturating_add(1), digest };
+        let needed = [Some(self.live), self.previous, self.waiting];
+        let unneeded =
+            self.kept.iter().map(|revision| revision.number).find(|&number| !needed.contains(&Some(number)));
+        let forget = unneeded.filter(|_| self.kept.is_full());
+        self.enter(Phase::Storing { revision, forget });
+        Ok(revision.number)
+    }
+
+    /// Somebody applies a revision, or the one that waits. Returns its number.
+    ///
+    /// # Errors
+    /// Why it is not applied.
+    pub fn apply(&mut self, number: Option<u32>, trial: Duration) -> core::result::Result<u32, Refused> {
+        self.must_rest()?;
+        if !TRIAL.contains(&trial) {
+            return Err(Refused::Trial);
+        }
+        let number = number.or(self.waiting).ok_or(Refused::NothingWaits)?;
+        if self.revision(number).is_none() {
+            return Err(Refused::Unknown);
+        }
+        if number == self.live {
+            return Err(Refused::Runs);
+        }
+        if self.waiting == Some(number) {
+            self.waiting = None;
+        }
+        self.enter(Phase::StartingTrial { number, trial });
+        Ok(number)
+    }
+
+    /// Somebody confirms what runs on trial. Returns its number; it is live once it is marked.
+    ///
+    /// # Errors
+    /// Why it is not confirmed.
+    pub fn confirm(&mut self, now: Instant) -> core::result::Result<u32, Refused> {
+        match self.phase {
+            Phase::Trial { number, until } if now < until => {
+                self.enter(Phase::Confirming { number, until });
+                Ok(number)
+            }
+            Phase::Live | Phase::Trial { .. } => Err(Refused::NotOnTrial),
+            _ => Err(Refused::Busy),
+        }
+    }
+
+    /// Somebody takes back what runs on trial, or else what is live. Returns the number of the one that runs
+    /// next.
+    ///
+    /// # Errors
+    /// Why it is not taken back.
+    pub fn roll_back(&mut self) -> core::result::Result<u32, Refused> {
+        match (self.phase, self.previous) {
+            (Phase::Trial { number, .. }, _) => {
+                self.end_trial(number, Ended::TakenBack);
+                Ok(self.live)
+            }
+            (Phase::Live, Some(number)) => {
+                self.enter(Phase::Returning { number });
+                Ok(number)
+            }
+            (Phase::Live, None) => Err(Refused::NoPrevious),
+            _ => Err(Refused::Busy),
+        }
+    }
+
+    /// Reports what came of an output. Anything else than the result that is awaited is ignored.
+    pub fn handle(&mut self, now: Instant, result: Result) {
+        if self.is_due && result != Result::Ended {
+            return;
+        }
+        match (self.phase, result) {
+            (Phase::Storing { revision, forget }, Result::Stored(is_done)) => {
+                if is_done {
+                    self.kept.retain(|kept| Some(kept.number) != forget);
+                    // `forget` made room.
+                    let _ = self.kept.push(revision);
+                    self.waiting = Some(revision.number);
+                }
+                self.enter(Phase::Live);
+            }
+            (Phase::StartingTrial { number, trial }, Result::Started(true)) => {
+                self.enter(Phase::Trial { number, until: now + trial });
+            }
+            (Phase::StartingTrial { number, .. }, Result::Started(false))
+            | (Phase::Trial { number, .. }, Result::Ended) => {
+                self.end_trial(number, Ended::Failed);
+            }
+            (Phase::Confirming { number, .. }, Result::Marked(true)) => {
+                self.last = Some((number, Ended::Confirmed));
+                (self.previous, self.live) = (Some(self.live), number);
+                self.enter(Phase::Live);
+            }
+            (Phase::Confirming { number, until }, Result::Marked(false)) => {
+                self.enter(Phase::Trial { number, until })
+            }
+            (Phase::Returning { number }, Result::Started(true)) => self.enter(Phase::Marking { number }),
+            (Phase::Returning { number }, Result::Started(false)) => self.end_trial(number, Ended::Failed),
+            (Phase::Marking { number }, Result::Marked(true)) => {
+                (self.previous, self.live) = (Some(self.live), number);
+                self.enter(Phase::Live);
+            }
+            // What runs must be what runs after a restart.
+            (Phase::Marking { number }, Result::Marked(false)) => self.end_trial(number, Ended::Failed),
+            (Phase::StartingLive { .. }, Result::Started(true)) => self.enter(Phase::Live),
+            (Phase::StartingLive { wait }, Result::Started(false)) => {
+                self.enter(Phase::Down { until: now + wait, wait })
+            }
+            _ => {}
+        }
+    }
+
+    /// The next thing for the driver to do. Call it again until it is [`Output::Sleep`].
+    pub fn poll_output(&mut self, now: Instant) -> Output {
+        match self.phase {
+            Phase::Trial { number, until } if now >= until => self.end_trial(number, Ended::NotConfirmed),
+            Phase::Down { until, wait } if now >= until => {
+                self.enter(Phase::StartingLive { wait: wait.saturating_mul(2).min(RETRY.1) });
+            }
+            _ => {}
+        }
+        let until = match self.phase {
+            Phase::Trial { until, .. } | Phase::Down { until, .. } => until,
+            _ => Instant::NEVER,
+        };
+        if !core::mem::take(&mut self.is_due) {
+            return Output::Sleep { until };
+        }
+        match self.phase {
+            Phase::Storing { revision, forget } => Output::Store { revision, forget },
+            Phase::StartingTrial { number, .. } | Phase::Returning { number } => Output::Run { number },
+            Phase::StartingLive { .. } => Output::Run { number: self.live },
+            Phase::Confirming { number, .. } | Phase::Marking { number } => {
+                Output::Mark { live: number, previous: self.live }
+            }
+            Phase::Live | Phase::Trial { .. } | Phase::Down { .. } => Output::Sleep { until },
+        }
+    }
+
+    /// Whether something new may begin.
+    fn must_rest(&self) -> core::result::Result<(), Refused> {
+        match self.phase {
+            Phase::Live => Ok(()),
+            Phase::Trial { .. } | Phase::Confirming { .. } => Err(Refused::OnTrial),
+            _ => Err(Refused::Busy),
+        }
+    }
+
+    fn end_trial(&mut self, number: u32, why: Ended) {
+        self.last = Some((number, why));
+        self.enter(Phase::StartingLive { wait: RETRY.0 });
+    }
+
+    fn enter(&mut self, phase: Phase) {
+        self.phase = phase;
+        self.is_due = !matches!(phase, Phase::Live | Phase::Trial { .. } | Phase::Down { .. });
+    }
+}

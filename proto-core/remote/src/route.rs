@@ -1,0 +1,240 @@
+//! The table of endpoints: which method and path is which operation, who serves it, and what it asks for.
+
+use crate::request::{Head, Method, cut, trim};
+
+/// What a request asks for (docs/api.md).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Operation {
+    /// Who and what this is.
+    Info,
+    /// State and counters.
+    Status,
+    /// The known variables.
+    Values,
+    /// State, counters and latencies as OpenMetrics.
+    Metrics,
+    /// The configuration: the running one, or another that is kept.
+    Config,
+    /// The revisions that are kept, and which is running.
+    Revisions,
+    /// Server-sent events.
+    Stream,
+    /// A nonce for one signed request.
+    Nonce,
+    /// Check a configuration without storing it.
+    Check,
+    /// Store a configuration.
+    PutConfig,
+    /// Run a stored configuration, and return to the one before unless it is confirmed.
+    Apply,
+    /// Keep what is running.
+    Confirm,
+    /// Return to the configuration before.
+    Rollback,
+    /// An operation of the simulated controller's pendant.
+    Pendant,
+}
+
+/// What a program serves.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Served {
+    /// The gateway, on a host or a board.
+    Gateway,
+    /// The simulated controller.
+    Controller,
+}
+
+/// What a request needs before it is carried out.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Access {
+    /// Nothing.
+    Open,
+    /// The key, unless client and server are on one machine.
+    Read,
+    /// The key.
+    Write,
+}
+
+/// The type of a body.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum BodyType {
+    /// There is none.
+    None,
+    /// `application/toml`.
+    Toml,
+    /// `application/json`; a request without a body needs no type.
+    Json,
+}
+
+impl BodyType {
+    /// The media type; empty if there is no body.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::None => "",
+            Self::Toml => "application/toml",
+            Self::Json => "application/json",
+        }
+    }
+
+    /// Whether `Content-Type` names it; parameters such as a charset are not looked at.
+    pub fn is(self, content_type: &str) -> bool {
+        let name = cut(content_type, b';').map_or(content_type, |(name, _)| name);
+        trim(name).eq_ignore_ascii_case(self.name())
+    }
+}
+
+/// One endpoint with one method.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Route {
+    /// The path.
+    pub path: &'static str,
+    /// The method; [`Method::Get`] stands for `HEAD` too, but for the stream.
+    pub method: Method,
+    /// What is done.
+    pub operation: Operation,
+    /// What it needs.
+    pub access: Access,
+    /// What its body is.
+    pub body: BodyType,
+    /// Only this program serves it; `None`: all do.
+    pub only: Option<Served>,
+}
+
+/// All endpoints.
+pub const ROUTES: &[Route] = &[
+    route("/api/v1/info", Method::Get, Operation::Info, Access::Read, BodyType::None, None),
+    route("/api/v1/status", Method::Get, Operation::Status, Access::Read, BodyType::None, None),
+    route("/api/v1/values", Method::Get, Operation::Values, Access::Read, BodyType::None, GATEWAY),
+    route("/api/v1/metrics", Method::Get, Operation::Metrics, Access::Read, BodyType::None, GATEWAY),
+    route("/api/v1/config", Method::Get, Operation::Config, Access::Read, BodyType::None, GATEWAY),
+    route("/api/v1/config", Method::Put, Operation::PutConfig, Access::Write, BodyType::Toml, GATEWAY),
+    route("/api/v1/revisions", Method::Get, Operation::Revisions, Access::Read, BodyType::None, GATEWAY),
+    route("/api/v1/stream", Method::Get, Operation::Stream, Access::Read, BodyType::None, None),
+    route("/api/v1/nonce", Method::Get, Operation::Nonce, Access::Open, BodyType::None, None),
+    route("/api/v1/check", Method::Post, Operation::Check, Access::Read, BodyType::Toml, None),
+    route("/api/v1/apply", Method::Post, Operation::Apply, Access::Write, BodyType::Json, GATEWAY),
+    route("/api/v1/confirm", Method::Post, Operation::Confirm, Access::Write, BodyType::Json, GATEWAY),
+    route("/api/v1/rollback", Method::Post, Operation::Rollback, Access::Write, BodyType::Json, GATEWAY),
+    route("/api/v1/pendant", Method::Post, Operation::Pendant, Access::Write, BodyType::Json, CONTROLLER),
+];
+
+const GATEWAY: Option<Served> = Some(Served::Gateway);
+const CONTROLLER: Option<Served> = Some(Served::Controller);
+
+const fn route(
+    path: &'static str,
+    method: Method,
+    operation: Operation,
+    access: Access,
+    body: BodyType,
+    only: Option<Served>,
+) -> Route {
+    Route { path, method, operation, access, body, only }
+}
+
+/// Why there is no route.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RouteError {
+    /// There is no such path.
+    NotFound,
+    /// The path has other methods; this is the value of `Allow`.
+    Method(&'static str),
+}
+
+/// The route of a request.
+///
+/// # Errors
+/// If there is none.
+pub fn find(head: &Head<'_>, served: Served) -> Result<&'static Route, RouteError> {
+    let path = head.path();
+    let here = || {
+        ROUTES.iter().filter(move |route| route.path == path && route.only.is_none_or(|only| only == served))
+    };
+    if let Some(route) = here().find(|route| route.takes(head.method)) {
+        return Ok(route);
+    }
+    let (mut gets, mut changes) = (None, None);
+    for route in here() {
+        match route.method {
+            Method::Get => gets = Some(route.operation == Operation::Stream),
+            other => changes = Some(other),
+        }
+    }
+    Err(match (gets, changes) {
+        (None, None) => RouteError::NotFound,
+        (Some(true), _) => RouteError::Method("GET"),
+        (Some(false), Some(_)) => RouteError::Method("GET, HEAD, PUT"),
+        (Some(false), None) => RouteError::Method("GET, HEAD"),
+        (None, Some(_)) => RouteError::Method("POST"),
+    })
+}
+
+impl Route {
+    /// Whether a request with this method is for it.
+    pub fn takes(&self, method: Method) -> bool {
+        self.method == method
+            || method == Method::Head && self.method == Method::Get && self.operation != Operation::Stream
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::request::HeadBuffer;
+    use std::format;
+    use std::string::String;
+    use std::vec::Vec;
+
+    fn found(method: &str, path: &str, served: Served) -> Result<Operation, RouteError> {
+        let mut buffer = HeadBuffer::new();
+        buffer.push(format!("{method} {path} HTTP/1.1\r\nHost: a\r\n\r\n").as_bytes());
+        find(&buffer.head().unwrap(), served).map(|route| route.operation)
+    }
+
+    #[test]
+    fn every_route_is_found_and_its_other_methods_name_it() {
+        for served in [Served::Gateway, Served::Controller] {
+            for route in ROUTES.iter().filter(|route| route.only.is_none_or(|only| only == served)) {
+                assert_eq!(found(route.method.name(), route.path, served), Ok(route.operation));
+                assert_eq!(
+                    found(route.method.name(), &format!("{}?x=1", route.path), served),
+                    Ok(route.operation)
+                );
+                let all: Vec<_> = ["GET", "HEAD", "POST", "PUT"]
+                    .into_iter()
+                    .filter(|method| found(method, route.path, served).is_ok())
+                    .collect();
+                for other in ["GET", "HEAD", "POST", "PUT", "OPTIONS", "DELETE", "PATCH", "TRACE", "get"] {
+                    if !all.contains(&other) {
+                        let allowed: String = all.join(", ");
+                        match found(other, route.path, served) {
+                            Err(RouteError::Method(allow)) => assert_eq!(allow, allowed, "{}", route.path),
+                            wrong => panic!("{other} {}: {wrong:?}", route.path),
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn other_paths_and_those_of_the_other_program_are_not_there() {
+        for path in
+            ["/api", "/api/v1/", "/api/v1/info/", "/API/v1/info", "/api/v1/%69nfo", "//", "/api/v1/pendant"]
+        {
+            assert_eq!(found("GET", path, Served::Gateway), Err(RouteError::NotFound), "{path}");
+        }
+        assert_eq!(found("PUT", "/api/v1/config", Served::Controller), Err(RouteError::NotFound));
+    }
+
+    #[test]
+    fn whatever_changes_something_is_no_get_and_needs_the_key() {
+        for route in ROUTES {
+            let reads = route.method == Method::Get || route.operation == Operation::Check;
+            assert_eq!(route.access == Access::Write, !reads, "{}", route.path);
+            assert_eq!(route.body == BodyType::None, route.method == Method::Get, "{}", route.path);
+        }
+    }
+}
