@@ -8,6 +8,7 @@ mod check;
 mod codec;
 mod conversation;
 mod convert;
+mod export;
 mod frame;
 mod image;
 mod log;
@@ -89,6 +90,9 @@ enum Command {
     /// Write the configuration image for a board
     #[command(after_help = IMAGE_EXAMPLES)]
     Image(image::ImageArgs),
+    /// Write a CAN database, a dissector for Wireshark, or a map of the variables
+    #[command(after_help = export::EXAMPLES)]
+    Export(export::ExportArgs),
     /// Run cells in virtual time with injected faults, and check everything that the gateway does
     #[command(after_help = soak::EXAMPLES)]
     Soak(soak::SoakArgs),
@@ -290,6 +294,7 @@ pub fn main() -> ExitCode {
         }
         Command::New(args) => new::run(&args, &mut out),
         Command::Check(args) => check::run(&args, &mut out),
+        Command::Export(args) => export::run(&args, &mut out),
         Command::Image(args) => image::run(&args, &mut out),
         Command::Encode(args) => encode(&args, &mut out),
         Command::Decode(args) => decode(&args, &mut out),
