@@ -22,6 +22,7 @@ pub use host::Handle;
 pub use ready::ReadyFile;
 pub use signals::Signals;
 
+use recipe_capture::Watch;
 use recipe_device::bind::Bind;
 pub use recipe_net::realtime::Scheduling;
 
@@ -36,6 +37,10 @@ pub struct RunOptions {
     pub stats: Option<Duration>,
     /// The scheduling of the run's thread.
     pub scheduling: Scheduling,
+    /// What is seen of a gateway, for who has subscribed.
+    pub watch: Watch,
+    /// `ready` goes to stderr: stdout is for a capture.
+    pub stdout_is_taken: bool,
 }
 
 /// Why a run could not start or continue: one message. Nothing is left behind.
