@@ -6,9 +6,15 @@
 
 #![forbid(unsafe_code)]
 
+mod capture_file;
+mod decode;
 pub mod pcapng;
 mod record;
+pub mod recording;
+pub mod replay;
 mod watch;
 
+pub use capture_file::{CaptureFile, Target};
+pub use decode::{Decoder, Topic};
 pub use record::{Cell, CellPort, Epoch, Frame, Record, What, rejection};
 pub use watch::{Arrived, Interest, Next, Subscription, Watch};

@@ -15,6 +15,8 @@ mod log;
 mod new;
 mod pendant;
 mod plan;
+mod record;
+mod replay;
 mod run;
 mod scale;
 mod soak;
@@ -77,7 +79,7 @@ enum Command {
     Controller(run::ControllerRun),
     /// Run the gateway
     #[command(after_help = GATEWAY_EXAMPLES)]
-    Gateway(run::Run),
+    Gateway(run::GatewayRun),
     /// Act on a running controller: press its buttons, set inputs, begin faults, watch its state
     #[command(after_help = pendant::EXAMPLES)]
     Pendant(pendant::PendantArgs),
@@ -93,6 +95,9 @@ enum Command {
     /// Write a CAN database, a dissector for Wireshark, or a map of the variables
     #[command(after_help = export::EXAMPLES)]
     Export(export::ExportArgs),
+    /// Run the engine of a recorded gateway again, in virtual time, and compare what it does
+    #[command(after_help = replay::EXAMPLES)]
+    Replay(replay::ReplayArgs),
     /// Run cells in virtual time with injected faults, and check everything that the gateway does
     #[command(after_help = soak::EXAMPLES)]
     Soak(soak::SoakArgs),
@@ -128,7 +133,12 @@ const GATEWAY_EXAMPLES: &str = "\
 Examples:
   host-sim gateway -c cell.toml --bind rs485-1=serial:/dev/ttyUSB0
   host-sim gateway -c cell.toml --bind rs485-1=pty:run/rs485-1 --set controller.address=127.0.0.1
-  host-sim gateway -c cell.toml --set port.rs485-1.baud=9600 --stats 1s";
+  host-sim gateway -c cell.toml --set port.rs485-1.baud=9600 --stats 1s
+  host-sim gateway -c cell.toml --bind hand=can0 --capture - | wireshark -k -i -
+  host-sim gateway -c cell.toml --bind hand=can0 --record run --record-budget 10GiB
+
+Captures and recordings never delay the gateway: what cannot be written is lost and
+counted. docs/capture.md says what is in them.";
 
 const CHECK_EXAMPLES: &str = "\
 Examples:
@@ -292,6 +302,7 @@ pub fn main() -> ExitCode {
             let code = soak::run(&args, &mut out);
             return out.finish(|_| code);
         }
+        Command::Replay(args) => return replay::run(&args, out),
         Command::New(args) => new::run(&args, &mut out),
         Command::Check(args) => check::run(&args, &mut out),
         Command::Export(args) => export::run(&args, &mut out),

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use clap::Args;
 
+use super::record::WatchArgs;
 use super::{Overrides, check, wrong};
 use recipe_config::SimConfig;
 use recipe_controller::timeline::Timeline;
@@ -38,6 +39,15 @@ pub(super) struct Run {
     no_realtime: bool,
 }
 
+/// Arguments of `gateway`.
+#[derive(Debug, Args)]
+pub(super) struct GatewayRun {
+    #[command(flatten)]
+    run: Run,
+    #[command(flatten)]
+    watch: WatchArgs,
+}
+
 /// Arguments of `controller`.
 #[derive(Debug, Args)]
 pub(super) struct ControllerRun {
@@ -59,21 +69,37 @@ pub(super) struct ControllerRun {
     timeline: Option<PathBuf>,
 }
 
-impl Run {
+impl GatewayRun {
     pub(super) fn gateway(self) -> ExitCode {
-        let loaded = check::load_gateway(&self.config, &self.overrides.set);
+        let Self { run, watch } = self;
+        let (path, overrides) = (run.config.clone(), run.overrides.set.clone());
+        let loaded = check::load_gateway(&path, &overrides);
         // Even if the file is wrong, a ready file of a killed run is removed.
-        match (self.options(), loaded) {
-            (Ok(options), Ok(config)) => finished(shell::gateway::run(*config, options)),
+        match (run.options(), loaded) {
+            (Ok(options), Ok(config)) => {
+                if watch.takes_stdout() && options.stats.is_some() {
+                    return wrong("--stats is for stdout, and so is --capture -; give the capture a file or a pipe");
+                }
+                let options = RunOptions { stdout_is_taken: watch.takes_stdout(), ..options };
+                let watching = match watch.start(&options.watch, &path, &overrides) {
+                    Ok(watching) => watching,
+                    Err(error) => return finished(Err(error)),
+                };
+                let result = shell::gateway::run(*config, options);
+                watching.finish();
+                finished(result)
+            }
             (_, Err(error)) => wrong(error),
             (Err(error), _) => finished(Err(error)),
         }
     }
+}
 
+impl Run {
     fn options(self) -> Result<RunOptions, StartError> {
         let ready = self.ready.map(ReadyFile::at).transpose()?;
         let scheduling = if self.no_realtime { Scheduling::Ordinary } else { Scheduling::FifoIfAllowed };
-        Ok(RunOptions { binds: self.bind, ready, stats: self.stats, scheduling })
+        Ok(RunOptions { binds: self.bind, ready, stats: self.stats, scheduling, ..RunOptions::default() })
     }
 }
 
