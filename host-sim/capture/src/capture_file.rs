@@ -190,7 +190,8 @@ mod tests {
         }
         let notes = folder.path().join("notes");
         fs::write(&notes, "dear diary").unwrap();
-        let error = CaptureFile::start(&Watch::new(), Scope::default(), Target::Path(notes.clone())).unwrap_err();
+        let error =
+            CaptureFile::start(&Watch::new(), Scope::default(), Target::Path(notes.clone())).unwrap_err();
         assert!(error.to_string().contains("is no capture"), "{error}");
         assert_eq!(fs::read_to_string(&notes).unwrap(), "dear diary");
         let folder = Target::Path(folder.path().into());

@@ -43,20 +43,21 @@ impl Decoder {
             let several = |format: &Format| {
                 formats.iter().filter(|other| (other.role, other.id) == (format.role, format.id)).count() > 1
             };
-            let topics = formats.iter().enumerate().filter(|(_, format)| !format.is_remote).map(|(nth, format)| {
-                let mut name = format!("/{}/{}", mangle(&port.name), mangle(&format.role.name()));
-                name += &match format.id {
-                    None => String::new(),
-                    Some(CanId::Standard(id)) => format!("/{id:03X}"),
-                    Some(CanId::Extended(id)) => format!("/{id:08X}"),
-                };
-                // Frames that only their constants tell apart.
-                if several(format) {
-                    name += &format!("/{nth}");
-                }
-                let recipe = recipe.map_or("", |recipe| &recipe.name);
-                Topic::new(name, format!("{recipe} {}", format.role.name()), format)
-            });
+            let topics =
+                formats.iter().enumerate().filter(|(_, format)| !format.is_remote).map(|(nth, format)| {
+                    let mut name = format!("/{}/{}", mangle(&port.name), mangle(&format.role.name()));
+                    name += &match format.id {
+                        None => String::new(),
+                        Some(CanId::Standard(id)) => format!("/{id:03X}"),
+                        Some(CanId::Extended(id)) => format!("/{id:08X}"),
+                    };
+                    // Frames that only their constants tell apart.
+                    if several(format) {
+                        name += &format!("/{nth}");
+                    }
+                    let recipe = recipe.map_or("", |recipe| &recipe.name);
+                    Topic::new(name, format!("{recipe} {}", format.role.name()), format)
+                });
             (port.name.clone(), topics.collect())
         });
         Self { ports: ports.collect() }

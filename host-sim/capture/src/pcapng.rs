@@ -9,7 +9,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use pcap_file::pcapng::blocks::enhanced_packet::{EnhancedPacketBlock, EnhancedPacketOption};
-use pcap_file::pcapng::blocks::interface_description::{InterfaceDescriptionBlock, InterfaceDescriptionOption};
+use pcap_file::pcapng::blocks::interface_description::{
+    InterfaceDescriptionBlock, InterfaceDescriptionOption,
+};
 use pcap_file::pcapng::blocks::section_header::{SectionHeaderBlock, SectionHeaderOption};
 use pcap_file::pcapng::{PcapNgBlock, PcapNgWriter};
 use pcap_file::{DataLink, Endianness};
@@ -103,7 +105,9 @@ impl Pcapng {
                 let link_type = if port.is_can { DataLink::CAN_SOCKETCAN } else { DataLink::USER0 };
                 (port.name.clone(), link_type, port.bit_rate)
             }
-            TapPlace::Link(id) if self.scope.links => (format!("link {}", cell.link(id)?), DataLink::USER0, 0),
+            TapPlace::Link(id) if self.scope.links => {
+                (format!("link {}", cell.link(id)?), DataLink::USER0, 0)
+            }
             TapPlace::Link(_) => return None,
         };
         let known = self.interfaces.iter().position(|known| *known == (name.clone(), link_type));

@@ -28,8 +28,8 @@ use crate::record::{Cell, Frame, Record, What, rejection};
 use crate::watch::{Arrived, Interest, Next, Subscription, Watch};
 use part::Part;
 
-pub use folder::{Folder, run_name};
 pub(crate) use folder::run_of;
+pub use folder::{Folder, run_name};
 
 /// The channel of the engine's calls: each message is one, as the entries of a recording (docs/cortex-m7.md section
 /// 1), with the calls counted in `sequence`.
@@ -153,7 +153,8 @@ impl Recorder {
         let sequence = match what {
             What::Pass(_) => {
                 let gap = u64::from(*lost) + std::mem::take(&mut self.missed);
-                self.passes = self.passes.wrapping_add(u32::try_from(gap).unwrap_or(u32::MAX)).wrapping_add(1);
+                self.passes =
+                    self.passes.wrapping_add(u32::try_from(gap).unwrap_or(u32::MAX)).wrapping_add(1);
                 self.passes
             }
             _ => 0,

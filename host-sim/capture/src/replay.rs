@@ -245,7 +245,12 @@ impl Runner<'_> {
                     let replayed = totals(&**engine);
                     if replayed != *recorded {
                         let hex = |bytes: &[u8]| vec![format!("{bytes:02X?}")];
-                        self.differs(at, "counters and image at the end".into(), hex(recorded), hex(&replayed));
+                        self.differs(
+                            at,
+                            "counters and image at the end".into(),
+                            hex(recorded),
+                            hex(&replayed),
+                        );
                     }
                 }
                 // Those of a call are taken with it.

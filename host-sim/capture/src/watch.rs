@@ -114,12 +114,8 @@ impl Watch {
 
     /// Subscribes. At most `room` records wait to be taken, 1 at least; further ones are missed.
     pub fn subscribe(&self, interest: Interest, room: usize) -> Subscription {
-        let queue = Arc::new(Queue {
-            interest,
-            room: room.max(1),
-            inner: Mutex::default(),
-            arrived: Condvar::new(),
-        });
+        let queue =
+            Arc::new(Queue { interest, room: room.max(1), inner: Mutex::default(), arrived: Condvar::new() });
         let mut state = locked(&self.0.state);
         if let Some(began) = &state.began {
             queue.give(began);
@@ -297,7 +293,10 @@ mod tests {
             assert_eq!(taken(&other), Some((nth, 0)));
         }
         assert_eq!(stalled.missed(), 97);
-        assert_eq!([taken(&stalled), taken(&stalled), taken(&stalled)], [Some((0, 0)), Some((1, 0)), Some((2, 0))]);
+        assert_eq!(
+            [taken(&stalled), taken(&stalled), taken(&stalled)],
+            [Some((0, 0)), Some((1, 0)), Some((2, 0))]
+        );
         watch.give(pass(100));
         assert_eq!(taken(&stalled), Some((100, 97)), "how many are missing is told at the gap");
         assert_eq!(taken(&stalled), None);

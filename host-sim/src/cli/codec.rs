@@ -8,8 +8,8 @@ use proto_core::sysvar::Direction;
 use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::{Scalar, ScalarType};
 
-use recipe_export::unit_of;
 use recipe_config::{AnyRecipe, DeviceRecipe, NamedExchange, NamedFrame, SimField, SimParts, SimRecipe};
+use recipe_export::unit_of;
 
 use super::convert::device::DevicePart;
 

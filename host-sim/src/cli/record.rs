@@ -44,7 +44,12 @@ impl WatchArgs {
     }
 
     /// Begins what was asked for. `file` is what the gateway runs.
-    pub(super) fn start(&self, watch: &Watch, file: &Path, overrides: &[String]) -> Result<Watching, StartError> {
+    pub(super) fn start(
+        &self,
+        watch: &Watch,
+        file: &Path,
+        overrides: &[String],
+    ) -> Result<Watching, StartError> {
         let mut watching = Watching { watch: watch.clone(), capture: None, recording: None };
         if let Some(folder) = &self.record {
             let (budget, file_size) = (self.record_budget, self.record_file);

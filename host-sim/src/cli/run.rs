@@ -78,7 +78,9 @@ impl GatewayRun {
         match (run.options(), loaded) {
             (Ok(options), Ok(config)) => {
                 if watch.takes_stdout() && options.stats.is_some() {
-                    return wrong("--stats is for stdout, and so is --capture -; give the capture a file or a pipe");
+                    return wrong(
+                        "--stats is for stdout, and so is --capture -; give the capture a file or a pipe",
+                    );
                 }
                 let options = RunOptions { stdout_is_taken: watch.takes_stdout(), ..options };
                 let watching = match watch.start(&options.watch, &path, &overrides) {

@@ -87,7 +87,9 @@ fn packets_have_their_port_time_direction_and_verdict() {
     let port = |nth| TapPlace::Port(PortId(nth));
     let rejected = TapVerdict::Rejected(Rejection::Checksum);
     bytes.extend(capture.blocks(&arrived(7, frame(port(0), rejected, None))));
-    bytes.extend(capture.blocks(&arrived(8, frame(port(1), TapVerdict::Taken, Some(CanId::Extended(0x1_0000))))));
+    bytes.extend(
+        capture.blocks(&arrived(8, frame(port(1), TapVerdict::Taken, Some(CanId::Extended(0x1_0000))))),
+    );
     bytes.extend(capture.blocks(&arrived(9, frame(TapPlace::Link(LinkId::MODBUS), TapVerdict::Link, None))));
     let remote = TapVerdict::Rejected(Rejection::Remote);
     bytes.extend(capture.blocks(&arrived(10, frame(port(1), remote, Some(CanId::Standard(0x123))))));

@@ -147,10 +147,14 @@ mod tests {
             fs::write(folder.part(run, part), [0; 100]).unwrap();
         }
         let names = || {
-            let name = |(path, _): (PathBuf, u64)| path.file_name().unwrap().to_str().unwrap()[6..].to_owned();
+            let name =
+                |(path, _): (PathBuf, u64)| path.file_name().unwrap().to_str().unwrap()[6..].to_owned();
             folder.parts().unwrap().into_iter().map(name).collect::<Vec<_>>()
         };
-        assert_eq!(names()[..3], ["01-000000-000.0002.mcap", "01-000000-000.9999.mcap", "01-000000-000.10000.mcap"]);
+        assert_eq!(
+            names()[..3],
+            ["01-000000-000.0002.mcap", "01-000000-000.9999.mcap", "01-000000-000.10000.mcap"]
+        );
         folder.make_room(320).unwrap();
         assert_eq!(names()[0], "01-000000-000.10000.mcap");
         folder.make_room(299).unwrap();

@@ -102,7 +102,8 @@ impl Part {
             }
             None => {
                 let text = schema.to_string();
-                let schema = self.writer.add_schema(title, "jsonschema", text.as_bytes()).map_err(io_error)?;
+                let schema =
+                    self.writer.add_schema(title, "jsonschema", text.as_bytes()).map_err(io_error)?;
                 let none = BTreeMap::new();
                 let channel = self.writer.add_channel(schema, topic, "json", &none).map_err(io_error)?;
                 self.channels.insert(topic.to_owned(), (channel, 0));

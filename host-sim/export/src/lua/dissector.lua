@@ -6,7 +6,6 @@ local f_recipe = ProtoField.string("rgw.recipe", "Recipe")
 local f_port = ProtoField.string("rgw.port", "Port")
 local f_frame = ProtoField.string("rgw.frame", "Frame")
 local f_checksum = ProtoField.bytes("rgw.checksum", "Checksum")
-p.fields = { f_recipe, f_port, f_frame, f_checksum }
 local own = { f_recipe, f_port, f_frame, f_checksum }
 for _, field in ipairs(proto_fields) do own[#own + 1] = field end
 p.fields = own

@@ -52,8 +52,7 @@ impl Tapping {
         let (ring, consumer) = RingBuffer::new(RING);
         let began = Record { at, lost: 0, what: What::Began(Arc::new(cell)) };
         let reader = Reader { watch: watch.clone(), ring: consumer, message: Vec::new() };
-        let reader =
-            std::thread::Builder::new().name("watch".to_owned()).spawn(move || reader.run(began))?;
+        let reader = std::thread::Builder::new().name("watch".to_owned()).spawn(move || reader.run(began))?;
         let mut tapping = Self {
             watch: watch.clone(),
             ring,
