@@ -6,7 +6,7 @@
 
 mod multiplex;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 
 use proto_core::device::{Bits, ByteOrder, Element, Encoding, Kind};
@@ -208,12 +208,16 @@ impl Writer {
                 format!("the frames with id {shown:#X} do not differ in constants; only the first is in");
             self.notes.push(message);
         }
-        let mut scope = Scope { id, receiver, names: Names::default(), in_several: Vec::new() };
-        let all = || formats.iter().flat_map(|format| format.named_values()).map(|(field, _)| field.name());
-        scope.in_several =
-            all().filter(|name| all().filter(|other| other == name).count() > 1).map(str::to_owned).collect();
+        let mut scope = Scope {
+            id,
+            receiver,
+            names: Names::default(),
+            in_several: in_several(formats),
+            done: BTreeSet::new(),
+        };
         match multiplex {
             None => {
+                scope.in_several.clear();
                 for format in formats.iter().take(1) {
                     self.signals(&mut scope, format, "", None, &[])?;
                 }
@@ -265,16 +269,29 @@ impl Writer {
         skipped: &[Shape],
     ) -> Result<(), DbcError> {
         for (field, element) in format.named_values() {
-            let name = match scope.in_several.iter().any(|other| other == field.name()) {
-                true => format!("{}-{}", field.name(), format.role.name()),
-                false => field.name().to_owned(),
-            };
             let Some(shape) = shape(field, element) else {
-                self.notes.push(format!("{name} has no place that a signal can have"));
+                self.notes.push(format!("{} has no place that a signal can have", field.name()));
                 continue;
             };
             if skipped.contains(&Shape { signed: false, ..shape }) {
                 continue;
+            }
+            let (mut name, mut tag, mut below) = (field.name().to_owned(), tag, below);
+            match scope.in_several.get(field.name()) {
+                None => {}
+                // The same in every frame, so it is always there.
+                Some(Several::Same) => {
+                    if !scope.done.insert(name.clone()) {
+                        continue;
+                    }
+                    (tag, below) = ("", None);
+                }
+                Some(Several::Different) => {
+                    // Roles may be the same, numbers are not.
+                    let number = below.map_or(0, |(_, number)| number);
+                    let above = skipped.get(1).and(below).map_or("", |(above, _)| above);
+                    name = format!("{name}-{}-{above}{number}", format.role.name());
+                }
             }
             for (half, shape) in halves(shape) {
                 let identifier = scope.names.add_new(&format!("{name}{half}"))?;
@@ -352,7 +369,31 @@ struct Scope {
     receiver: String,
     names: Names,
     /// Names of fields that more than one of its frames has.
-    in_several: Vec<String>,
+    in_several: BTreeMap<String, Several>,
+    /// Those of them that are there already.
+    done: BTreeSet<String>,
+}
+
+/// A name that more than one frame of a message has.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Several {
+    /// All of them, at the same place.
+    Same,
+    /// Some of them, or at different places.
+    Different,
+}
+
+fn in_several(formats: &[&Format]) -> BTreeMap<String, Several> {
+    let mut shapes: BTreeMap<String, Vec<Option<Shape>>> = BTreeMap::new();
+    for (field, element) in formats.iter().flat_map(|format| format.named_values()) {
+        shapes.entry(field.name().to_owned()).or_default().push(shape(field, element));
+    }
+    let kind = |shapes: &[Option<Shape>]| {
+        let is_same = shapes.len() == formats.len() && shapes.iter().all(|shape| *shape == shapes[0]);
+        if is_same { Several::Same } else { Several::Different }
+    };
+    let several = shapes.into_iter().filter(|(_, shapes)| shapes.len() > 1);
+    several.map(|(name, shapes)| (name, kind(&shapes))).collect()
 }
 
 /// How often a frame is sent.

@@ -1,0 +1,208 @@
+"""Exports, captures and recordings as the tools read them that they are for: cantools, tshark, mcap."""
+
+import json
+import pathlib
+import random
+import re
+import shutil
+import struct
+import subprocess
+import tempfile
+import tomllib
+
+import cantools
+from mcap.reader import make_reader
+
+import cell
+import on_dbc
+from cell import CONFIGS, Failed, Stream, case, check, equal
+
+TEMPLATES = CONFIGS.parent / "templates"
+ROUNDS = 8
+
+
+def host_sim(*arguments):
+    done = subprocess.run([cell.host_sim, *map(str, arguments)], capture_output=True, text=True, timeout=60)
+    if done.returncode or done.stderr:
+        raise Failed(f"host-sim {' '.join(map(str, arguments))}: {done.stderr or done.stdout}")
+    return done.stdout
+
+
+def database(path):
+    # Strict: no signal may be outside of its message, or on top of another.
+    return cantools.database.load_string(host_sim("export", "dbc", path), "dbc", strict=True)
+
+
+def unmangled(identifier):
+    """The name of an identifier (docs/export.md)."""
+    token = re.compile(r"_x([0-9a-f]+)_|_([0-9]+)_|__")
+
+    def name(match):
+        if match[1]:
+            return chr(int(match[1], 16))
+        return f"[{match[2]}]" if match[2] else "-"
+
+    return token.sub(name, identifier)
+
+
+def any_value(signal, chance):
+    if signal.is_float:
+        layout = "<f" if signal.length == 32 else "<d"
+        return struct.unpack(layout, struct.pack(layout, chance.uniform(-1e6, 1e6)))[0]
+    return on_dbc.any_value(signal, chance)
+
+
+@case("CAN databases of every example and template: cantools decodes what encode makes")
+def examples():
+    chance, seen, skipped = random.Random(12), 0, []
+    for path in sorted([*CONFIGS.glob("*.toml"), *TEMPLATES.glob("*.toml")]):
+        config = tomllib.loads(path.read_text())
+        if not any(port["bus"] == "can" for port in config.get("port", [])):
+            continue
+        for message in database(path).messages:
+            recipe, _, rest = message.comment.removeprefix("recipe ").partition(", ")
+            roles = rest.rpartition(", port ")[0].split(", ")
+            if roles not in (["input"], ["output"]):
+                skipped.append(message.name)
+                continue
+            for _ in range(ROUNDS):
+                values = {}
+                for signal in message.signals:
+                    always = re.search(r"always (-?[0-9]+)", signal.comment or "")
+                    values[signal.name] = int(always[1]) if always else any_value(signal, chance)
+                tokens = [f"{unmangled(name)}={value!r}" for name, value in values.items()]
+                arguments = ["--recipe", recipe, "--part", roles[0], "--id", hex(message.frame_id)]
+                line = host_sim("encode", path, *arguments, *tokens)
+                data = bytes.fromhex(line.strip().split("#")[1])
+                decoded = message.decode(data, decode_choices=False, scaling=False)
+                equal({name: decoded[name] for name in values}, values, f"{path.name} {message.name} {data.hex()}")
+                seen += 1
+    check(seen >= 80, f"only {seen} frames were compared")
+    # Those of CANopen, which the case of SDO looks at.
+    check(all(name.startswith(("encoder__", "keypad__")) for name in skipped), f"skipped: {skipped}")
+
+
+@case("a CAN database made of a file that was made of a CAN database: the same values")
+def round_trip():
+    source = cantools.database.load_string(on_dbc.DBC, "dbc")
+    chance = random.Random(2012)
+    with tempfile.TemporaryDirectory(prefix="foreign-") as folder:
+        path = pathlib.Path(folder) / "dbc.toml"
+        port = '\n[[port]]\nname = "bus"\nbus = "can"\nrecipe = "dbc"\n'
+        path.write_text(on_dbc.file(source) + port)
+        made = database(path)
+    equal({m.frame_id for m in made.messages}, {m.frame_id for m in source.messages}, "ids")
+    for _ in range(400):
+        message = chance.choice(source.messages)
+        number, used = chance.choice(on_dbc.frames(message))
+        values = {s.name: number if s.is_multiplexer else on_dbc.any_value(s, chance) for s in used}
+        data = message.encode(values, scaling=False)
+        other = made.get_message_by_frame_id(message.frame_id)
+        equal(other.is_extended_frame, message.is_extended_frame, "extended")
+        found = other.decode(data, decode_choices=False, scaling=False)
+        equal({name: found.get(name) for name in values}, values, f"{message.name} {data.hex()}")
+
+
+@case("a CAN database of CANopen's SDO: replies and refusals told apart by two constants")
+def multiplexed():
+    made = database(CONFIGS / "canopen-encoder.toml")
+    reply = made.get_message_by_frame_id(0x585)
+    errors = reply.decode(bytes.fromhex("4F01100007000000"), decode_choices=False)
+    equal(errors.get("errors"), 7, "the error register")
+    refused = reply.decode(bytes.fromhex("8017100000000206"), decode_choices=False)
+    equal(refused.get("why"), 0x06020000, "why it was refused")
+    request = made.get_message_by_frame_id(0x605)
+    asked = request.decode(bytes.fromhex("2B17100064000000"), decode_choices=False)
+    equal(asked.get("milliseconds__request__1__4119"), 100, "the heartbeat's time")
+    equal(made.get_message_by_frame_id(0x77F).cycle_time, 200, "the cycle of the gateway's heartbeat")
+    equal(made.get_message_by_frame_id(0).cycle_time, 1000, "the period of the start")
+    panel = database(CONFIGS / "can-panel.toml").get_message_by_frame_id(0x181)
+    equal(str(panel.get_signal_by_name("start").choices[1]), "run(pick.jspf,50)", "the name of a value")
+
+
+def tshark(capture, plugin, shown, *fields):
+    if not shutil.which("tshark"):
+        raise Failed("tshark is not installed")
+    arguments = ["tshark", "-n", "-X", f"lua_script:{plugin}", "-r", str(capture), "-Y", shown, "-T", "fields"]
+    for field in fields:
+        arguments += ["-e", field]
+    done = subprocess.run(arguments, capture_output=True, text=True, timeout=60)
+    check(done.returncode == 0 and "Lua: Error" not in done.stderr, done.stderr)
+    return [line.split("\t") for line in done.stdout.splitlines()]
+
+
+@case("a capture of a serial line and of CAN, in tshark with our plugin: fields by name")
+def captured():
+    with tempfile.TemporaryDirectory(prefix="foreign-") as folder:
+        folder = pathlib.Path(folder)
+        # Serial: three good frames, noise, and a wrong tail.
+        capture, plugin = folder / "line.pcapng", folder / "line.lua"
+        with cell.controller("rs485-system-controller.toml", binds={"rs485": "pty:robot"}) as robot:
+            extra = ["--capture", str(capture), "--capture-links"]
+            with cell.gateway("rs485-system.toml", robot, binds={"rs485-1": "tcp-listen:127.0.0.1:0"}, extra=extra) as running:
+                cell.link_is_up(running, "modbus", "state")
+                with Stream(running.address("rs485-1")) as line:
+                    for value in (1, 0, 3):
+                        line.send(bytes([0xFF, 0xFF, value, 0xEE, 0xEE]))
+                    line.send(bytes.fromhex("FF FF 01 EE 00 12 34"))
+                    line.send(bytes([0xFF, 0xFF, 5, 0xEE, 0xEE]))
+                    running.until_stats("four frames", lambda stats: stats["ports"]["rs485-1"]["frames_in"] >= 4)
+                    running.until_stats("the pose", lambda stats: stats["ports"]["rs485-1"]["frames_out"] >= 4)
+        host_sim("export", "lua", CONFIGS / "rs485-system.toml", "-o", plugin)
+        value = "rgw.system.input.DigitalOutputCommand_1_"
+        rows = tshark(capture, plugin, value, "frame.interface_name", "rgw.recipe", "rgw.frame", value)
+        equal(rows, [["rs485-1", "system", "input", str(v)] for v in (1, 0, 3, 5)], "the frames in")
+        rejected = tshark(capture, plugin, "rgw.no_frame", "frame.comment", "frame.packet_flags_direction")
+        check(rejected and rejected[0] == ["rejected: no frame found", "0x00000001"], f"rejected: {rejected}")
+        pose = tshark(capture, plugin, "rgw.system.output.RobotState_8_", "rgw.system.output.RobotState_8_", "frame.packet_flags_direction")
+        check(pose, "no frame of the pose")
+        check(all(abs(float(angle) + 0.5436893) < 1e-6 and way == "0x00000002" for angle, way in pose), f"pose: {pose[:3]}")
+        links = {row[0] for row in tshark(capture, plugin, "frame", "frame.interface_name")}
+        check({"link modbus", "link state"} <= links, f"interfaces: {links}")
+        # CAN.
+        capture, plugin = folder / "can.pcapng", folder / "can.lua"
+        with cell.controller("can-user-controller.toml", binds={"can": "slcan-tcp:127.0.0.1:0"}) as robot:
+            binds = {"hand": "slcan-tcp:127.0.0.1:0"}
+            with cell.gateway("can-hand.toml", robot, binds=binds, extra=["--capture", str(capture)]) as running:
+                with Stream(running.address("hand")) as bus:
+                    bus.send(b"S8\rO\r")
+                    bus.send(b"t502402001027\r")
+                    bus.send(b"t1232AABB\r")
+                    running.until_stats("a frame", lambda stats: stats["ports"]["hand"]["frames_in"] >= 1)
+        host_sim("export", "lua", CONFIGS / "can-hand.toml", "-o", plugin)
+        fields = [f"rgw.hand.input.{name}" for name in ("state", "error", "grip")]
+        equal(tshark(capture, plugin, fields[0], "can.id", *fields), [["1282", "2", "0", "10000"]], "the hand's frame")
+        foreign = tshark(capture, plugin, "can.id == 0x123", "frame.comment")
+        equal(foreign, [["rejected: a CAN id that the recipe does not have"]], "a foreign frame")
+
+
+def messages(path):
+    with open(path, "rb") as file:
+        return [(schema, channel, message) for schema, channel, message in make_reader(file).iter_messages()]
+
+
+@case("a recording as the package mcap reads it: values by name with their schema")
+def recorded():
+    with tempfile.TemporaryDirectory(prefix="foreign-") as folder:
+        with cell.controller("can-user-controller.toml", binds={"can": "slcan-tcp:127.0.0.1:0"}) as robot:
+            binds = {"hand": "slcan-tcp:127.0.0.1:0"}
+            with cell.gateway("can-hand.toml", robot, binds=binds, extra=["--record", folder]) as running:
+                with Stream(running.address("hand")) as bus:
+                    bus.send(b"S8\rO\r")
+                    for state in range(3):
+                        bus.send(b"t50240%d001027\r" % state)
+                    bus.send(b"t5023010010\r")
+                    running.until_stats("three frames", lambda stats: stats["ports"]["hand"]["frames_in"] >= 3)
+        (path,) = pathlib.Path(folder).glob("*.mcap")
+        found = messages(path)
+        of = {topic: [m for _, c, m in found if c.topic == topic] for topic in {c.topic for _, c, _ in found}}
+        values = [json.loads(message.data) for message in of["/hand/input/502"]]
+        equal(values, [{"state": n, "error": 0, "grip": 10000} for n in range(3)], "the hand's frames")
+        (rejected,) = [json.loads(message.data) for message in of["/hand/rejected"]]
+        equal((rejected["why"], rejected["id"]), ("a frame of another length", 0x502), "a short frame")
+        schema = next(s for s, c, _ in found if c.topic == "/hand/input/502")
+        equal(schema.encoding, "jsonschema", "the encoding of the schema")
+        properties = json.loads(schema.data)["properties"]
+        equal(properties["grip"]["type"], "integer", "a property")
+        equal([m.sequence for m in of["/engine"]], list(range(1, len(of["/engine"]) + 1)), "the engine's calls")
+        check("the same to the end" in host_sim("replay", folder), "replay")
