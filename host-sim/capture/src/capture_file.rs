@@ -43,7 +43,9 @@ impl CaptureFile {
         let subscription = watch.subscribe(Interest { frames: true, passes: false }, ROOM);
         let (end, ended) = channel();
         std::thread::Builder::new().name("capture".to_owned()).spawn(move || {
+            // Dropped behind the subscription.
             let _end: std::sync::mpsc::Sender<()> = end;
+            let subscription = subscription;
             let name = match &target {
                 Target::Stdout => "-".to_owned(),
                 Target::Path(path) => path.display().to_string(),

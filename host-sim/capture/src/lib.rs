@@ -12,6 +12,8 @@ pub mod pcapng;
 mod record;
 pub mod recording;
 pub mod replay;
+#[cfg(test)]
+mod test_run;
 mod watch;
 
 pub use capture_file::{CaptureFile, Target};

@@ -15,6 +15,7 @@ mod part;
 use std::io;
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::{Duration, Instant as Deadline};
 
@@ -52,6 +53,7 @@ pub struct RecordOptions {
 #[derive(Debug)]
 pub struct Recording {
     ended: Receiver<()>,
+    failures: Arc<AtomicU64>,
 }
 
 impl Recording {
@@ -63,7 +65,9 @@ impl Recording {
         let folder = Folder::open(&options.folder)?;
         let subscription = watch.subscribe(Interest { frames: true, passes: true }, ROOM);
         let (end, ended) = channel();
+        let failures = Arc::<AtomicU64>::default();
         let recorder = Recorder {
+            failures: Arc::clone(&failures),
             folder,
             options,
             decoder,
@@ -78,7 +82,12 @@ impl Recording {
         };
         let thread = std::thread::Builder::new().name("record".to_owned());
         thread.spawn(move || recorder.run(&subscription, end))?;
-        Ok(Self { ended })
+        Ok(Self { ended, failures })
+    }
+
+    /// Number of times that it could not write.
+    pub fn failures(&self) -> u64 {
+        self.failures.load(Relaxed)
     }
 
     /// Waits until everything is written. Close the watch before.
@@ -88,6 +97,7 @@ impl Recording {
 }
 
 struct Recorder {
+    failures: Arc<AtomicU64>,
     folder: Folder,
     options: RecordOptions,
     decoder: Decoder,
@@ -134,6 +144,7 @@ impl Recorder {
 
     /// What is lost is seen at the gap in the numbers of the engine's calls.
     fn failed(&mut self, error: &io::Error) {
+        self.failures.fetch_add(1, Relaxed);
         self.part = None;
         self.retry_at = Some(Deadline::now() + RETRY_INTERVAL);
         if !std::mem::replace(&mut self.is_failing, true) {

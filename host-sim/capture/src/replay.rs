@@ -240,7 +240,10 @@ impl Runner<'_> {
                     }
                 }
                 Entry::Totals(recorded) => {
-                    let Some(engine) = &self.engine else { continue };
+                    let Some(engine) = &self.engine else {
+                        self.has_headless = true;
+                        continue;
+                    };
                     let at = self.report.span.map_or(Instant::from_micros(0), |(_, last)| last);
                     let replayed = totals(&**engine);
                     if replayed != *recorded {
@@ -315,6 +318,3 @@ fn shown(mut outputs: &[u8]) -> Vec<String> {
     }
     shown
 }
-
-#[cfg(test)]
-mod tests;
