@@ -1,5 +1,6 @@
 //! The program as users and scripts run it.
 
+mod capturing;
 mod command_line;
 mod control;
 mod output;
