@@ -88,21 +88,20 @@ fn a_recording_with_a_controller_is_replayed_with_all_that_its_links_carried() {
     let gateway = BINARY.gateway(&example("can-user.toml"), &robot, &extra);
     let mut bus = TcpStream::connect(gateway.at("ports/can-1")).unwrap();
     std::io::Write::write_all(&mut bus, b"S6\rO\rt00130C2238\r").unwrap();
-    gateway.stats("a register", |stats| stats["links"]["modbus"]["received"].as_u64() > Some(2));
+    gateway.stats("a register", |stats| stats["links"]["modbus"]["received"].as_u64() >= Some(1));
     gateway.end();
     let (code, text) = replay(folder.path());
     assert_eq!(code, Some(0), "{text}");
-    // Another engine: its configuration is another byte.
+    // As if another engine had sent another value to the robot.
     let [path] = &files(folder.path())[..] else { panic!("one file") };
     let mut bytes = std::fs::read(path).unwrap();
-    let sent = b"\x06\x00\x08\x00\x0C";
-    if let Some(at) = bytes.windows(sent.len()).position(|window| window == sent) {
-        bytes[at + 4] = 0x0D;
-        std::fs::write(path, bytes).unwrap();
-        let (code, text) = replay(folder.path());
-        assert_eq!(code, Some(1), "{text}");
-        assert!(text.contains("differs, ") && text.contains("recorded: LinkSend"), "{text}");
-    }
+    let sent = b"\x06\x00\x0C\x00\x22\x00\x38";
+    let at = bytes.windows(sent.len()).position(|window| window == sent).unwrap();
+    bytes[at + 2] = 0x0D;
+    std::fs::write(path, bytes).unwrap();
+    let (code, text) = replay(folder.path());
+    assert_eq!(code, Some(1), "{text}");
+    assert!(text.contains("differs, ") && text.contains("recorded: LinkSend"), "{text}");
 }
 
 #[test]
@@ -177,7 +176,7 @@ fn a_capture_on_stdout_is_for_a_viewer_that_may_go_away() {
     assert_eq!(child.wait().unwrap().code(), Some(0));
     let mut errors = String::new();
     child.stderr.take().unwrap().read_to_string(&mut errors).unwrap();
-    assert!(errors.starts_with("ready {"), "{errors}");
+    assert!(errors.lines().any(|line| line.starts_with("ready {")), "{errors}");
 }
 
 #[test]

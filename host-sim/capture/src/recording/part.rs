@@ -117,8 +117,9 @@ impl Part {
         let before = self.written.load(Relaxed);
         let header = MessageHeader { channel_id, sequence, log_time: time, publish_time: time };
         let result = self.writer.write_to_known_channel(&header, bytes).map_err(io_error);
-        if self.written.load(Relaxed) != before {
-            self.pending = 0;
+        if result.is_ok() && self.written.load(Relaxed) != before {
+            // A whole chunk was written before this message.
+            (self.whole, self.pending) = (self.written.load(Relaxed), 0);
         }
         self.pending += bytes.len() as u64 + MESSAGE_OVERHEAD;
         self.kept(result)
