@@ -9,6 +9,7 @@ mod codec;
 mod conversation;
 mod convert;
 mod export;
+mod extcap;
 mod frame;
 mod image;
 mod log;
@@ -23,8 +24,9 @@ mod soak;
 mod text;
 mod values;
 
+use std::ffi::OsString;
 use std::io::{self, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::{Args, CommandFactory, Parser, Subcommand, ValueEnum};
@@ -95,6 +97,9 @@ enum Command {
     /// Write a CAN database, a dissector for Wireshark, or a map of the variables
     #[command(after_help = export::EXAMPLES)]
     Export(export::ExportArgs),
+    /// Be an interface of Wireshark: a running gateway
+    #[command(after_help = extcap::EXAMPLES)]
+    Extcap(extcap::ExtcapArgs),
     /// Run the engine of a recorded gateway again, in virtual time, and compare what it does
     #[command(after_help = replay::EXAMPLES)]
     Replay(replay::ReplayArgs),
@@ -280,7 +285,7 @@ struct DecodeArgs {
 
 /// Runs the command.
 pub fn main() -> ExitCode {
-    let cli = match Cli::try_parse() {
+    let cli = match Cli::try_parse_from(arguments()) {
         Ok(cli) => cli,
         Err(error) => return not_run(&error),
     };
@@ -302,6 +307,7 @@ pub fn main() -> ExitCode {
             let code = soak::run(&args, &mut out);
             return out.finish(|_| code);
         }
+        Command::Extcap(args) => return extcap::run(&args, out),
         Command::Replay(args) => return replay::run(&args, out),
         Command::New(args) => new::run(&args, &mut out),
         Command::Check(args) => check::run(&args, &mut out),
@@ -314,6 +320,16 @@ pub fn main() -> ExitCode {
         (Printed::Whole, Err(message)) => wrong(message),
         _ => ExitCode::SUCCESS,
     })
+}
+
+/// The arguments; Wireshark starts the program under another name, without the word `extcap`.
+fn arguments() -> Vec<OsString> {
+    let mut arguments: Vec<_> = std::env::args_os().collect();
+    let name = arguments.first().and_then(|program| Path::new(program).file_stem());
+    if name.is_some_and(|name| name == extcap::PROGRAM) {
+        arguments.insert(1, "extcap".into());
+    }
+    arguments
 }
 
 /// Prints help, the version, or an error in the arguments.

@@ -217,3 +217,67 @@ fn what_is_no_recording_is_refused() {
         assert!(code == Some(2) && text.contains(words), "{}: {text}", path.display());
     }
 }
+
+/// A gateway's API that answers once with a capture, in chunks.
+fn api(answer: &'static str) -> (std::net::SocketAddr, std::thread::JoinHandle<String>) {
+    use std::io::Write;
+    let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let at = listener.local_addr().unwrap();
+    let served = std::thread::spawn(move || {
+        let (mut stream, _) = listener.accept().unwrap();
+        let mut request = Vec::new();
+        while !request.ends_with(b"\r\n\r\n") {
+            let mut byte = [0];
+            stream.read_exact(&mut byte).unwrap();
+            request.push(byte[0]);
+        }
+        stream.write_all(answer.as_bytes()).unwrap();
+        String::from_utf8(request).unwrap()
+    });
+    (at, served)
+}
+
+#[test]
+fn wireshark_captures_from_a_running_gateway() {
+    let folder = tempfile::tempdir().unwrap();
+    // As Wireshark calls it: by a link, without the word extcap.
+    let program = folder.path().join("host-sim-extcap");
+    std::os::unix::fs::symlink(BINARY.0, &program).unwrap();
+    let asked = |arguments: &[&str]| {
+        let Output { status, stdout, stderr } = Command::new(&program).args(arguments).output().unwrap();
+        (status.code(), String::from_utf8(stdout).unwrap() + String::from_utf8(stderr).unwrap().as_str())
+    };
+    let (code, text) = asked(&["--extcap-interfaces", "--extcap-version=4.0"]);
+    assert!(code == Some(0) && text.contains("interface {value=rgw}"), "{text}");
+    let (code, text) = asked(&["--extcap-dlts", "--extcap-interface", "rgw"]);
+    assert!(code == Some(0) && text.starts_with("dlt {number=147}{name=USER0}"), "{text}");
+    let (code, text) = asked(&["--extcap-config", "--extcap-interface", "rgw"]);
+    assert!(code == Some(0) && text.contains("{call=--ready}"), "{text}");
+
+    let (ready, fifo) = (folder.path().join("ready.json"), folder.path().join("fifo"));
+    std::fs::write(&fifo, "").unwrap();
+    let (ready, fifo) = (ready.to_str().unwrap(), fifo.to_str().unwrap());
+    let capture =
+        ["--capture", "--extcap-interface", "rgw", "--fifo", fifo, "--ready", ready, "--port", "hand"];
+    for (content, words) in [
+        ("{\"ports\":{}}", "start it with --console"),
+        ("dear diary", "not a ready file"),
+        ("{\"console\":\"127.0.0.1:1\"}", "the gateway at 127.0.0.1:1"),
+    ] {
+        std::fs::write(ready, content).unwrap();
+        let (code, text) = asked(&capture);
+        assert!(code == Some(2) && text.contains(words), "{text}");
+    }
+    let (at, served) =
+        api("HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n4\r\nabcd\r\n2\r\nef\r\n0\r\n\r\n");
+    std::fs::write(ready, format!("{{\"console\":\"{at}\"}}")).unwrap();
+    let (code, text) = asked(&capture);
+    assert_eq!((code, text.as_str()), (Some(0), ""));
+    assert_eq!(std::fs::read_to_string(fifo).unwrap(), "abcdef");
+    assert!(served.join().unwrap().starts_with("GET /api/v1/capture.pcapng?port=hand HTTP/1.1\r\n"));
+    let (at, served) = api("HTTP/1.1 503 Service Unavailable\r\n\r\n");
+    std::fs::write(ready, format!("{{\"console\":\"{at}\"}}")).unwrap();
+    let (code, text) = asked(&capture);
+    assert!(code == Some(2) && text.contains("503"), "{text}");
+    served.join().unwrap();
+}
