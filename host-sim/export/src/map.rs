@@ -184,3 +184,38 @@ fn csv<'r>(rows: impl Iterator<Item = &'r Row>) -> String {
     rows.for_each(|row| text += &line(row));
     text
 }
+
+#[cfg(test)]
+mod tests {
+    use recipe_test_kit::example;
+
+    use super::*;
+
+    #[test]
+    fn every_use_of_a_variable_has_a_row() {
+        let model = Model::load(&example("can-hand.toml"), &[]).unwrap();
+        let text = map(&model, Style::Csv);
+        let rows: Vec<_> = text.lines().collect();
+        assert_eq!(rows[0], HEADINGS.join(","));
+        assert_eq!(
+            rows[1],
+            "WordInputReg[1],register 8,,field,hand,hand,input 0x502,0,state (byte),to WordInputReg[1]"
+        );
+        assert_eq!(
+            rows[2],
+            "WordInputReg[1],register 8,,field,hand,,,,,WordInputReg[1] = 0 while the device is silent"
+        );
+        assert_eq!(
+            rows[4],
+            "WordInputReg[3],register 10,,field,hand,hand,input 0x502,2..3,\"grip (word, little-endian)\",to WordInputReg[3]"
+        );
+        assert_eq!(rows.len(), 1 + 3 + 1 + 6);
+    }
+
+    #[test]
+    fn cells_of_a_table_have_no_bars() {
+        let row = std::array::from_fn(|_| "a|b".to_owned());
+        let text = markdown([&row].into_iter());
+        assert!(text.lines().nth(2).unwrap().starts_with("| a\\|b | a\\|b |"), "{text}");
+    }
+}

@@ -3,6 +3,7 @@
 mod capturing;
 mod command_line;
 mod control;
+mod exporting;
 mod output;
 mod processes;
 mod rejections;
