@@ -70,7 +70,7 @@ impl CaptureFile {
         Ok(Self { ended })
     }
 
-    /// Waits until everything is written, for [`PATIENCE`] at most: whoever reads may have stopped. Close the watch
+    /// Waits until everything is written, for 2 s at most: whoever reads may have stopped. Close the watch
     /// before.
     pub fn finish(self) {
         let _ = self.ended.recv_timeout(PATIENCE);
