@@ -1,8 +1,10 @@
 """Exports, captures and recordings as the tools read them that they are for: cantools, tshark, mcap."""
 
 import csv
+import http.server
 import io
 import json
+import os
 import pathlib
 import random
 import re
@@ -10,6 +12,7 @@ import shutil
 import struct
 import subprocess
 import tempfile
+import threading
 import tomllib
 
 import cantools
@@ -208,6 +211,53 @@ def recorded():
         equal(properties["grip"]["type"], "integer", "a property")
         equal([m.sequence for m in of["/engine"]], list(range(1, len(of["/engine"]) + 1)), "the engine's calls")
         check("the same to the end" in host_sim("replay", folder), "replay")
+
+
+class Api(http.server.BaseHTTPRequestHandler):
+    """A gateway's API that has a capture."""
+
+    protocol_version = "HTTP/1.1"
+    capture = b""
+
+    def do_GET(self):
+        found = self.path == "/api/v1/capture.pcapng"
+        self.send_response(200 if found else 404)
+        self.send_header("Transfer-Encoding", "chunked")
+        self.end_headers()
+        for part in (self.capture[:100], self.capture[100:]):
+            self.wfile.write(b"%x\r\n%s\r\n" % (len(part), part))
+        self.wfile.write(b"0\r\n\r\n")
+
+    def log_message(self, *_):
+        pass
+
+
+# tshark looks for programs in its own folder; here they are in another one with that name.
+EXTCAP = """set -e
+folder=$(tshark -G folders 2>/dev/null | sed -n 's/^\\(Global \\)\\?Extcap path:[[:space:]]*//Ip' | tail -1)
+mount -t tmpfs extcap "$folder"
+ln -s "$1" "$folder/host-sim-extcap"
+tshark -D 2>/dev/null
+tshark -n -X "lua_script:$2" -i rgw -c 3 -T fields -e frame.interface_name -e "$3" 2>/dev/null
+"""
+
+
+@case("tshark lists a running gateway among its interfaces, and captures from it")
+def extcap():
+    frames = [("rs485-1", 1, bytes([0xFF, 0xFF, value, 0xEE, 0xEE])) for value in (1, 0, 3)]
+    Api.capture = capture_of(frames)
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Api) as server, tempfile.TemporaryDirectory() as folder:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        ready, plugin = pathlib.Path(folder) / "ready.json", pathlib.Path(folder) / "cell.lua"
+        ready.write_text(json.dumps({"console": f"127.0.0.1:{server.server_port}"}))
+        host_sim("export", "lua", CONFIGS / "rs485-system.toml", "-o", plugin)
+        field = "rgw.system.input.DigitalOutputCommand_1_"
+        command = ["unshare", "-rm", "sh", "-c", EXTCAP, "sh", cell.host_sim, plugin, field]
+        environment = {**os.environ, "RGW_READY": str(ready), "HOME": folder}
+        done = subprocess.run(command, capture_output=True, text=True, timeout=40, env=environment)
+        server.shutdown()
+    check("rgw (Recipe gateway)" in done.stdout, f"interfaces: {done.stdout} {done.stderr}")
+    equal(done.stdout.splitlines()[-3:], [f"rs485-1\t{value}" for value in (1, 0, 3)], "the packets")
 
 
 def block(kind, body):
