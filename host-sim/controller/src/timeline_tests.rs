@@ -170,7 +170,7 @@ fn mistakes_have_file_line_column_and_key() {
     assert_refused(&step("do = \"clear\"\n  axis = 3"), "t.toml:4:3: step[1].axis: unknown field `axis`");
     assert_refused(
         &step("do = \"collide\"\naxis = 9"),
-        "t.toml:4:1: step[1].axis: axis: 9 is not within 1 to 6",
+        "t.toml:4:1: step[1].axis: axis: 9 is no place of a collision; there are 1 to 6, 11 to 16 and 20",
     );
     assert_refused(
         &step("do = \"mode\"\nmode = \"x\""),

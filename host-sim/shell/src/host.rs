@@ -8,10 +8,11 @@ use std::thread::JoinHandle;
 
 use recipe_capture::Watch;
 use serde_json::Value;
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, oneshot};
 use tokio::task::LocalSet;
 use tracing::warn;
 
+use super::service::Service;
 use super::{RunOptions, Signals, StartError};
 use crate::out::{is_broken_pipe, print_stderr};
 
@@ -39,8 +40,10 @@ pub struct Handle {
 }
 
 #[derive(Debug)]
-enum Request {
+pub(super) enum Request {
     Stats(blocking::Sender<Value>),
+    /// Whether the thread works.
+    Ping(oneshot::Sender<()>),
     Shutdown,
 }
 
@@ -87,6 +90,9 @@ async fn serve(mut inbox: mpsc::UnboundedReceiver<Request>, stats: impl Fn() -> 
         match request {
             Request::Stats(answer) => {
                 let _ = answer.send(stats());
+            }
+            Request::Ping(answer) => {
+                let _ = answer.send(());
             }
             Request::Shutdown => return,
         }
@@ -170,11 +176,16 @@ pub(super) fn foreground(handle: Handle, options: &RunOptions) -> Result<(), Sta
         } else {
             stdout.print(line);
         }
+        let service = Service::from_environment();
+        service.is_ready();
+        let thread = handle.requests.clone();
+        let mut alive = std::pin::pin!(service.keep_alive(&thread));
         let mut ticks = options.stats.map(tokio::time::interval);
         let mut check = tokio::time::interval(CHECK_INTERVAL);
         let result = loop {
             tokio::select! {
                 _ = signals.next() => break Ok(()),
+                () = &mut alive => {}
                 () = tick(&mut ticks) => {
                     if let Some(mut stats) = handle.stats() {
                         stats["lost_lines"] = stdout.lost().into();
@@ -201,6 +212,7 @@ pub(super) fn foreground(handle: Handle, options: &RunOptions) -> Result<(), Sta
             }
         };
         drop(ready);
+        service.is_stopping();
         result.and(handle.shutdown())
     });
     stdout.finish();

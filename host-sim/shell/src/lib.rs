@@ -10,6 +10,7 @@ mod host;
 mod link;
 pub mod out;
 mod ready;
+mod service;
 mod signals;
 mod tcp;
 mod udp;

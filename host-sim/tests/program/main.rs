@@ -7,6 +7,7 @@ mod exporting;
 mod output;
 mod processes;
 mod rejections;
+mod service;
 mod soak;
 
 use recipe_test_kit::Binary;

@@ -303,6 +303,7 @@ pub(crate) fn qmp(socket: &Path, command: &str, arguments: Value) -> Value {
 fn link_status(log: &str, link: Link<'_>) -> LinkStatus {
     let name = match link {
         Link::Command => "command",
+        Link::Urgent => "urgent",
         Link::State => "state",
         Link::Modbus => "modbus",
         Link::Udp2011 => "udp2011",

@@ -182,6 +182,8 @@ fn stop_behind(case: &Case) {
     let plan: Plan<'_> = case.gateway_of(&panel()).robot(&robot).server_at("command", command);
     let mut gateway = plan.start();
     gateway.until_up(Link::Command, 1);
+    // Until it is there, a stop waits for one of the places of the other.
+    gateway.until_up(Link::Urgent, 1);
     let mut panel = gateway.line("device");
     start(&mut panel, &mut *gateway, &robot);
     let begin = Instant::now();

@@ -130,6 +130,8 @@ impl dyn Gateway + '_ {
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Link<'a> {
     Command,
+    /// The connection for commands that stop the robot.
+    Urgent,
     State,
     Modbus,
     /// The controller's UDP 2011 server.

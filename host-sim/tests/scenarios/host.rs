@@ -161,6 +161,7 @@ impl Gateway for HostGateway {
     fn link(&self, link: Link<'_>) -> LinkStatus {
         let name = match link {
             Link::Command => "command",
+            Link::Urgent => "urgent",
             Link::State => "state",
             Link::Modbus => "modbus",
             Link::Udp2011 => "udp2011",

@@ -30,6 +30,8 @@ pub(super) struct Command {
     pub picked: Instant,
     /// For an urgent one: since when it is no longer requested, or since when it waits again.
     since: Instant,
+    /// When it was handed over, of one that is unanswered.
+    sent: Instant,
 }
 
 /// Commands that wait, commands that are unanswered, and counters.
@@ -113,7 +115,7 @@ impl Commands {
             }
             counted.picked += 1;
             let text = plain(entry.text_for(value).as_bytes());
-            let command = Command { place, value, text, picked: now, since: now };
+            let command = Command { place, value, text, picked: now, since: now, sent: Instant::ZERO };
             if command.is_urgent() {
                 urgent.push(command.clone());
                 match self.urgent.iter_mut().find(|other| other.same_kind(&command)) {
@@ -300,8 +302,14 @@ impl Commands {
             next
         };
         self.newest = Some(text);
-        self.unanswered.push((link, command.clone()));
+        self.unanswered.push((link, Command { sent: now, ..command.clone() }));
         Ok(command)
+    }
+
+    /// Until when an urgent command may wait because one like it is unanswered, which is then given up.
+    pub(super) fn waits_until(&self, command: &Command) -> Instant {
+        let alike = self.unanswered.iter().filter(|(_, sent)| sent.text == command.text);
+        alike.map(|(_, sent)| sent.sent + TTL).max().unwrap_or(Instant::ZERO)
     }
 
     fn nobody_picked(&self, shown: &str, text: &str) -> Wrong {

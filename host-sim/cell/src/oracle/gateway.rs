@@ -210,7 +210,7 @@ impl Oracle {
                 let urgent = self.commands.accepted(&self.spec, nth, &frame, commands_up, now);
                 let commands = &self.commands;
                 self.robot.no_longer_asked(|command| commands.is_asked(command), now);
-                self.robot.asked(urgent);
+                self.robot.asked(urgent, |command| commands.waits_until(command));
             }
             self.up.accepted(&self.spec, nth, &frame, now);
             self.values_changed();

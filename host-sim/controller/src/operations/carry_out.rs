@@ -50,7 +50,9 @@ impl Controller {
             Operation::ProtectiveStop {} => self.protective_stop(now),
             Operation::Collide { axis } => {
                 if !matches!(axis, 1..=6 | 11..=16 | 20) {
-                    return refused(format!("axis: {axis} is none; there are 1 to 6, 11 to 16 and 20"));
+                    return refused(format!(
+                        "axis: {axis} is no place of a collision; there are 1 to 6, 11 to 16 and 20"
+                    ));
                 }
                 self.collide(now, *axis);
             }

@@ -48,7 +48,7 @@ pub enum Operation {
         #[serde(default = "default_max")]
         max: usize,
     },
-    /// Each event from now on, to the caller. [`Controller::operate`] refuses it: the caller follows.
+    /// Each event from now on, to the caller. [`Controller::operate`](crate::Controller::operate) refuses it: the caller follows.
     Follow {
         /// Only these kinds; all if it is empty.
         #[serde(default)]
@@ -166,12 +166,12 @@ pub enum Operation {
         #[serde(default, skip_serializing_if = "std::ops::Not::not")]
         transitions: bool,
     },
-    /// Moves a stepped clock. [`Controller::operate`] refuses it: the clock is the caller's.
+    /// Moves a stepped clock. [`Controller::operate`](crate::Controller::operate) refuses it: the clock is the caller's.
     Advance {
         /// By so many seconds.
         seconds: f64,
     },
-    /// Waits. [`Controller::operate`] refuses it: the clock is the caller's.
+    /// Waits. [`Controller::operate`](crate::Controller::operate) refuses it: the clock is the caller's.
     Wait {
         /// For this.
         until: Condition,

@@ -217,7 +217,7 @@ fn wrong_operations_are_refused_with_what_is_allowed() {
         (json!({ "do": "set" }), "missing field `items`"),
         (json!({ "do": "set", "items": { "DI[1]": "on" } }), "a number, true or false"),
         (json!({ "do": "mode", "mode": "remot" }), "expected one of `manual`, `auto`, `remote`"),
-        (json!({ "do": "collide", "axis": 7 }), "7 is none; there are 1 to 6"),
+        (json!({ "do": "collide", "axis": 7 }), "7 is no place of a collision; there are 1 to 6"),
         (json!({ "do": "run", "program": "nothing" }), "there is no program nothing; there are wait.jspf"),
         (json!({ "do": "run", "program": "wait.jspf", "speed_percent": 0 }), "not within (0, 100]"),
         (json!({ "do": "upload", "program": "a", "script": "let x = ;" }), "(line 1, position 9)"),

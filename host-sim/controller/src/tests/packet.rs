@@ -95,11 +95,8 @@ fn drive_errors_and_frames_are_set_by_name() {
         "drive_error[2]: 0.5 is not an integer, but a dword must be"
     );
     assert_eq!(error(&mut cell, "collision", 256.0), "collision: 256 does not fit in a byte (0..=255)");
-    assert_eq!(error(&mut cell, "DI[1]", 2.0), "DI[1]: DI[1] cannot be 2");
-    assert_eq!(
-        error(&mut cell, "DI[17]", 1.0),
-        "DI[17]: there is only DI[1..16]; and items of the state packet, such as drive_error[1]"
-    );
+    assert_eq!(error(&mut cell, "DI[1]", 2.0), "DI[1]: cannot be 2");
+    assert_eq!(error(&mut cell, "DI[17]", 1.0), "DI[17]: there is only DI[1..16]");
     for wrong in ["drive_error[8]", "drive_error", "drive_error[0]", "nothing"] {
         assert!(
             error(&mut cell, wrong, 1.0).ends_with("and items of the state packet, such as drive_error[1]")

@@ -60,6 +60,8 @@ struct InFlightCommand {
 struct StopRequest {
     command: Command,
     has_arrived: bool,
+    /// Until then it may wait behind one like it.
+    not_before: Instant,
 }
 
 /// The transmissions of a connection that have not arrived.
@@ -116,12 +118,13 @@ impl Robot {
     }
 
     /// Devices request to stop the robot.
-    pub(super) fn asked(&mut self, commands: Vec<Command>) {
+    pub(super) fn asked(&mut self, commands: Vec<Command>, waits_until: impl Fn(&Command) -> Instant) {
         for command in commands {
             self.stop_requests.retain(|request| {
                 request.command.place != command.place || request.command.text != command.text
             });
-            self.stop_requests.push(StopRequest { command, has_arrived: false });
+            let not_before = waits_until(&command);
+            self.stop_requests.push(StopRequest { command, has_arrived: false, not_before });
         }
     }
 

@@ -27,9 +27,9 @@ impl Robot {
         let ways = [LinkId::COMMAND, LinkId::URGENT];
         let Some(could) = ways.iter().filter_map(|link| self.sound.get(link)).min() else { return Ok(0) };
         let mut checked = 0;
-        for StopRequest { command, has_arrived } in &self.stop_requests {
+        for StopRequest { command, has_arrived, not_before } in &self.stop_requests {
             checked += 1;
-            let had_a_way = now.saturating_since(command.picked.max(*could));
+            let had_a_way = now.saturating_since(command.picked.max(*could).max(*not_before));
             if !has_arrived && had_a_way > STOP_ARRIVES {
                 let what = format!(
                     "{} is asked for and has not arrived, although a way has worked for {had_a_way}",

@@ -1,0 +1,106 @@
+//! What a run tells the service manager that started it: that it is ready, that it works, that it ends.
+//!
+//! systemd gives a service of `Type=notify` a socket in `NOTIFY_SOCKET`, and one with `WatchdogSec=` the time
+//! within which it must say that it works in `WATCHDOG_USEC`. It says so only when the thread that moves the
+//! robot's data has answered: a run whose main thread alone is alive is restarted. Without a service manager
+//! nothing is done.
+
+use std::time::Duration;
+
+use sd_notify::NotifyState;
+use tokio::sync::{mpsc, oneshot};
+use tracing::warn;
+
+use super::host::Request;
+
+/// The service manager, from this process's environment.
+pub(super) struct Service {
+    /// The run is restarted if nothing is said for this long.
+    patience: Option<Duration>,
+}
+
+impl Service {
+    pub(super) fn from_environment() -> Self {
+        Self { patience: sd_notify::watchdog_enabled() }
+    }
+
+    /// Everything is listening.
+    pub(super) fn is_ready(&self) {
+        tell(&[NotifyState::Ready, NotifyState::Status("running")]);
+    }
+
+    /// The run ends.
+    pub(super) fn is_stopping(&self) {
+        tell(&[NotifyState::Stopping, NotifyState::Status("ending")]);
+    }
+
+    /// Says again and again that the run works, as long as its thread answers. Never returns.
+    pub(super) async fn keep_alive(&self, thread: &mpsc::UnboundedSender<Request>) {
+        self.each_beat(thread, || tell(&[NotifyState::Watchdog])).await;
+    }
+
+    async fn each_beat(&self, thread: &mpsc::UnboundedSender<Request>, say: impl Fn()) {
+        let Some(patience) = self.patience else { return std::future::pending().await };
+        let mut beat = tokio::time::interval(patience / BEATS);
+        beat.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+        loop {
+            beat.tick().await;
+            let (answer, answered) = oneshot::channel();
+            if thread.send(Request::Ping(answer)).is_err() || answered.await.is_err() {
+                // The thread has ended, which is found elsewhere.
+                return std::future::pending().await;
+            }
+            say();
+        }
+    }
+}
+
+/// Times that the service manager is told while it is patient.
+const BEATS: u32 = 3;
+
+fn tell(news: &[NotifyState<'_>]) {
+    if let Err(error) = sd_notify::notify(news) {
+        warn!(%error, "the service manager cannot be told");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::cell::Cell;
+
+    #[tokio::test(start_paused = true)]
+    async fn a_thread_that_does_not_answer_is_not_said_to_work() {
+        let (thread, mut inbox) = mpsc::unbounded_channel();
+        let service = Service { patience: Some(Duration::from_secs(3)) };
+        let said = Cell::new(0);
+        let works_for_a_while = async {
+            let mut held = Vec::new();
+            while let Some(Request::Ping(answer)) = inbox.recv().await {
+                if held.is_empty() && said.get() < 4 {
+                    let _ = answer.send(());
+                } else {
+                    // It hangs.
+                    held.push(answer);
+                }
+            }
+        };
+        tokio::select! {
+            () = service.each_beat(&thread, || said.set(said.get() + 1)) => unreachable!("it goes on"),
+            () = works_for_a_while => unreachable!("the service is there"),
+            () = tokio::time::sleep(Duration::from_secs(60)) => {}
+        }
+        assert_eq!(said.get(), 4);
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn without_a_watchdog_nothing_is_asked() {
+        let (thread, mut inbox) = mpsc::unbounded_channel();
+        let service = Service { patience: None };
+        tokio::select! {
+            () = service.keep_alive(&thread) => unreachable!("it goes on"),
+            () = tokio::time::sleep(Duration::from_secs(60)) => {}
+        }
+        assert!(inbox.try_recv().is_err());
+    }
+}
