@@ -4,13 +4,16 @@
 //! outputs are carried out before anything else is read. So only one call of the engine is between the last
 //! byte of a field frame and the request to the controller.
 
+mod tapping;
+
 use std::cell::{Cell, RefCell};
 use std::collections::{BTreeMap, BTreeSet};
 use std::rc::Rc;
 use std::sync::Arc;
+use std::time::SystemTime;
 
-use proto_core::config::{Bus, GatewayConfig, Parts, Port as PortConfig};
-use proto_core::engine::{Engine, Input, LinkId, LinkKind, OUTPUT_BUFFER, Output, PortId, Transport};
+use proto_core::config::{Bus, GatewayConfig, Parts, Port as PortConfig, image};
+use proto_core::engine::{Input, LinkId, LinkKind, OUTPUT_BUFFER, Output, PortId, Transport};
 use proto_core::sysvar::Direction;
 use proto_core::time::Instant;
 use serde_json::{Value, json};
@@ -24,6 +27,7 @@ use super::console::{self, ConfigFile, Supervised};
 use super::host::{self, Handle, Shell};
 use super::link::{self, Endpoint, LinkControl, LinkEvent};
 use super::{RunOptions, StartError};
+use recipe_capture::{Cell as Watched, Epoch, Watch};
 use recipe_device::bind::Bind;
 use recipe_device::exchange::{PortEvent, PortTx};
 use recipe_device::port::{Port, PortBus};
@@ -31,6 +35,10 @@ use recipe_net::fairness;
 use recipe_net::realtime::{self, Scheduling};
 use recipe_net::tcp_options;
 use recipe_net::timer::{Timer, now};
+use tapping::{TAP, Tapping};
+
+/// The engine with room for a tap.
+pub(crate) type Engine = proto_core::engine::Engine<8, 4, 512, TAP>;
 
 /// A gateway with its ports and links, before it runs.
 struct Gateway {
@@ -44,6 +52,7 @@ struct Gateway {
 /// Shared by all tasks of the gateway.
 struct Core {
     engine: RefCell<Box<Engine>>,
+    tapping: RefCell<Tapping>,
     ports: BTreeMap<PortId, (String, Rc<PortTx>)>,
     links: BTreeMap<LinkId, Rc<LinkControl>>,
     deadline: Cell<Instant>,
@@ -58,7 +67,7 @@ struct Core {
 
 impl Gateway {
     /// Opens devices and listening sockets.
-    async fn open(config: &GatewayConfig, binds: &[Bind]) -> Result<Self, StartError> {
+    async fn open(config: &GatewayConfig, binds: &[Bind], watch: &Watch) -> Result<Self, StartError> {
         let engine: Box<Engine> =
             Box::new(Engine::new(config).map_err(|error| StartError::new(error.to_string()))?);
         let field = || config.view().field_ports().map(|(_, port, _)| port);
@@ -90,7 +99,9 @@ impl Gateway {
                 places.insert(name(*port).to_owned(), json!(endpoint.place()));
             }
         }
+        let tapping = begin_tapping(config, &engine, watch)?;
         let core = Rc::new(Core {
+            tapping: RefCell::new(tapping),
             ports: ports.iter().map(|(id, port)| (*id, (name(*id).to_owned(), port.tx()))).collect(),
             links: links.iter().map(|(id, ..)| (*id, Rc::default())).collect(),
             engine: RefCell::new(engine),
@@ -264,6 +275,8 @@ impl Core {
         let at = now();
         trace!(?input, "in");
         let mut engine = self.engine.borrow_mut();
+        let mut tapping = self.tapping.borrow_mut();
+        tapping.before(engine.tap(), at, input);
         engine.handle(at, input);
         let sleeps = engine.sleeps();
         if self.sleeps.replace(sleeps) != sleeps {
@@ -275,8 +288,10 @@ impl Core {
         let mut buf = [0; OUTPUT_BUFFER];
         loop {
             let output = engine.poll_output(at, &mut buf);
+            tapping.output(output);
             match output {
                 Output::Sleep { until } => {
+                    tapping.behind(engine.tap());
                     if self.deadline.replace(until) != until {
                         self.deadline_moved.notify_one();
                     }
@@ -342,6 +357,23 @@ impl Core {
     }
 }
 
+impl Drop for Core {
+    fn drop(&mut self) {
+        self.tapping.get_mut().end(self.engine.get_mut(), now());
+    }
+}
+
+/// Begins to tell whoever watches.
+fn begin_tapping(config: &GatewayConfig, engine: &Engine, watch: &Watch) -> Result<Tapping, StartError> {
+    let at = now();
+    let cell = Watched::new(config, engine, Epoch { at, wall: SystemTime::now() });
+    let mut bytes = vec![0; image::MAX_IMAGE];
+    let len = image::encode(config, &mut bytes).map_err(|error| StartError::new(error.to_string()))?;
+    bytes.truncate(len);
+    Tapping::begin(watch, cell, at, &bytes)
+        .map_err(|error| StartError::new(format!("cannot start a thread: {error}")))
+}
+
 /// Moves the entries of the inner object `key` to the outer one.
 fn lift(outer: &mut Value, key: &str) {
     if let Some(outer) = outer.as_object_mut()
@@ -351,12 +383,13 @@ fn lift(outer: &mut Value, key: &str) {
     }
 }
 
-/// Runs the gateway until Ctrl-C, SIGTERM or SIGHUP.
+/// Runs the gateway until Ctrl-C, SIGTERM or SIGHUP. Everything that it tells [`RunOptions::watch`] has been
+/// given when this returns.
 ///
 /// # Errors
 /// The reason why it could not start; nothing is left behind then.
 pub fn run(config: GatewayConfig, options: RunOptions) -> Result<(), StartError> {
-    let handle = spawn(config, options.binds.clone(), options.scheduling, None)?;
+    let handle = spawn(config, options.binds.clone(), options.scheduling, &options.watch, None)?;
     host::foreground(handle, &options)
 }
 
@@ -376,7 +409,16 @@ pub fn run_with_console(file: ConfigFile, options: RunOptions) -> Result<(), Sta
 /// # Errors
 /// The reason why it could not start; nothing is left behind then.
 pub fn start(config: GatewayConfig, binds: Vec<Bind>) -> Result<Handle, StartError> {
-    spawn(config, binds, Scheduling::Ordinary, None)
+    start_watched(config, binds, &Watch::new())
+}
+
+/// Same as [`start`], for whoever has subscribed to `watch`, which tells of several gateways one after the
+/// other if it is given again.
+///
+/// # Errors
+/// The reason why it could not start; nothing is left behind then.
+pub fn start_watched(config: GatewayConfig, binds: Vec<Bind>, watch: &Watch) -> Result<Handle, StartError> {
+    spawn(config, binds, Scheduling::Ordinary, watch, None)
 }
 
 /// Starts the gateway; a console looks at it through the window.
@@ -384,16 +426,19 @@ pub(crate) fn spawn(
     config: GatewayConfig,
     binds: Vec<Bind>,
     scheduling: Scheduling,
+    watch: &Watch,
     window: Option<Arc<Window>>,
 ) -> Result<Handle, StartError> {
-    host::start("gateway", async move || {
-        let mut gateway = Gateway::open(&config, &binds).await?;
+    let watched = watch.clone();
+    let handle = host::start("gateway", async move || {
+        let mut gateway = Gateway::open(&config, &binds, &watched).await?;
         gateway.window = window;
         // Not as an argument of the log, which is not evaluated unless it is printed.
         let scheduling = realtime::apply(scheduling);
         info!(%scheduling, "the gateway is running");
         Ok(gateway)
-    })
+    })?;
+    Ok(handle.with_watch(watch.clone()))
 }
 
 /// How often is looked whether the safe values have arrived.

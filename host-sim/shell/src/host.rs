@@ -6,6 +6,7 @@ use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::sync::{Arc, mpsc as blocking};
 use std::thread::JoinHandle;
 
+use recipe_capture::Watch;
 use serde_json::Value;
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::LocalSet;
@@ -34,6 +35,7 @@ pub(super) trait Shell {
 pub struct Handle {
     ready: Value,
     requests: mpsc::UnboundedSender<Request>,
+    watch: Watch,
     thread: Option<JoinHandle<Result<(), StartError>>>,
 }
 
@@ -115,7 +117,7 @@ pub(super) fn start<S: Shell>(
     });
     let thread = thread.map_err(|error| StartError::new(format!("cannot start a thread: {error}")))?;
     match outcome.recv() {
-        Ok(Ok(ready)) => Ok(Handle { ready, requests, thread: Some(thread) }),
+        Ok(Ok(ready)) => Ok(Handle { ready, requests, watch: Watch::new(), thread: Some(thread) }),
         Ok(Err(error)) => Err(error),
         // The thread ended before it sent a result; its own result says why.
         Err(_) => Err(joined(thread).err().unwrap_or_else(|| StartError::new(format!("{name} ended")))),
@@ -155,6 +157,19 @@ impl Handle {
 
     pub(crate) fn asker(&self) -> Asker {
         Asker(self.requests.clone())
+    }
+
+    /// What is seen at the gateway's ports and links, for any number of subscribers; a controller tells
+    /// nothing.
+    pub fn watch(&self) -> &Watch {
+        &self.watch
+    }
+
+    pub(super) fn with_watch(self, watch: Watch) -> Self {
+        // Not by an update: a handle ends its shell when it is dropped.
+        let mut handle = self;
+        handle.watch = watch;
+        handle
     }
 
     /// Whether the shell has ended by itself.
@@ -219,7 +234,12 @@ pub(super) fn foreground(handle: impl Running, options: &RunOptions) -> Result<(
         let refused = |error: io::Error| StartError::new(format!("signals: {error}"));
         let mut signals = Signals::catch().map_err(refused)?;
         let ready = options.ready.as_ref().map(|file| file.write(handle.ready())).transpose()?;
-        stdout.print(format!("ready {}", handle.ready()));
+        let line = format!("ready {}", handle.ready());
+        if options.stdout_is_taken {
+            print_stderr(line);
+        } else {
+            stdout.print(line);
+        }
         let service = Service::from_environment();
         service.is_ready();
         let mut ticks = options.stats.map(tokio::time::interval);

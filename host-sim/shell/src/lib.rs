@@ -24,6 +24,7 @@ pub use host::Handle;
 pub use ready::ReadyFile;
 pub use signals::Signals;
 
+use recipe_capture::Watch;
 use recipe_device::bind::Bind;
 pub use recipe_net::realtime::Scheduling;
 
@@ -40,6 +41,10 @@ pub struct RunOptions {
     pub scheduling: Scheduling,
     /// The console.
     pub console: Option<console::ConsoleOptions>,
+    /// What is seen of a gateway, for who has subscribed.
+    pub watch: Watch,
+    /// `ready` goes to stderr: stdout is for a capture.
+    pub stdout_is_taken: bool,
 }
 
 /// Why a run could not start or continue: one message. Nothing is left behind.

@@ -4,11 +4,12 @@
 
 use proto_core::recipe::model::{Field, Framing, Rules};
 use proto_core::recipe::{CanLayout, StreamLayout};
-use proto_core::sysvar::{Direction, SysVar};
+use proto_core::sysvar::Direction;
 use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::{Scalar, ScalarType};
 
 use recipe_config::{AnyRecipe, DeviceRecipe, NamedExchange, NamedFrame, SimField, SimParts, SimRecipe};
+use recipe_export::unit_of;
 
 use super::convert::device::DevicePart;
 
@@ -252,36 +253,5 @@ impl FrameFields {
             },
         };
         Self { id, fields: fields.iter().map(named).collect() }
-    }
-}
-
-/// The unit of a variable. Rows of poses and forces in the table have two units: for X, Y, Z and for the
-/// rotations.
-fn unit_of(var: SysVar) -> &'static str {
-    match var.unit().split_once(", ") {
-        None => var.unit(),
-        Some((linear, angular)) => {
-            if var.index().saturating_sub(var.span().first) < 3 {
-                linear
-            } else {
-                angular
-            }
-        }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn poses_and_forces_have_two_units() {
-        let unit = |name| unit_of(SysVar::parse(name).unwrap());
-        assert_eq!((unit("RobotState[10]"), unit("RobotState[11]")), ("m", "rad"));
-        assert_eq!((unit("ForceEnd[3]"), unit("ForceEnd[4]")), ("N", "Nm"));
-        assert_eq!(
-            (unit("RobotState[1]"), unit("RobotState[26]"), unit("WordInputReg[1]")),
-            ("rad", "kg", "")
-        );
     }
 }

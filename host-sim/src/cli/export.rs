@@ -1,24 +1,39 @@
-//! `export`: what other tools read.
+//! `export`: what other tools need to read the frames of a file.
 //!
-//! In: the name of a form. Out: its text on stdout.
+//! In: a gateway file or a controller file, or a kind of file. Out: a CAN database, a plugin for Wireshark, a map of
+//! the variables; the schema of that kind.
 
-use std::io::Write;
+use std::fs;
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand, ValueEnum};
 use recipe_config::FileKind;
+use recipe_device::files::{Beside, Identity};
+use recipe_export::{Model, dbc, lua, map};
+use recipe_shell::out::print_stderr;
 
-use super::Outcome;
+use super::{Outcome, Overrides};
 
 /// Arguments of `export`.
 #[derive(Debug, Args)]
 pub(super) struct ExportArgs {
     #[command(subcommand)]
-    form: Form,
+    what: What,
 }
 
 #[derive(Debug, Subcommand)]
-enum Form {
-    /// The JSON Schema of a file, for editors and linters
+enum What {
+    /// A CAN database (DBC) of the file's CAN ports
+    #[command(after_help = DBC_EXAMPLES)]
+    Dbc(DbcArgs),
+    /// A dissector in Lua for Wireshark and tshark
+    #[command(after_help = LUA_EXAMPLES)]
+    Lua(FileArgs),
+    /// A table of all variables: who writes them, in which bytes of which frame
+    #[command(after_help = MAP_EXAMPLES)]
+    Map(MapArgs),
+    /// The JSON Schema of a kind of file, for editors and linters
     #[command(after_help = SCHEMA_EXAMPLES)]
     Schema {
         /// The kind of file
@@ -33,9 +48,77 @@ enum Kind {
     Controller,
 }
 
+#[derive(Debug, Args)]
+struct DbcArgs {
+    #[command(flatten)]
+    file: FileArgs,
+    /// Only the frames of this port; without it, those of all CAN ports
+    #[arg(long, value_name = "NAME")]
+    port: Option<String>,
+}
+
+#[derive(Debug, Args)]
+struct MapArgs {
+    #[command(flatten)]
+    file: FileArgs,
+    /// How the table is written
+    #[arg(long, default_value = "markdown")]
+    format: MapFormat,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum MapFormat {
+    Markdown,
+    Csv,
+}
+
+/// A file, and where to write what is made of it.
+#[derive(Debug, Args)]
+struct FileArgs {
+    /// A gateway file or a controller file
+    file: PathBuf,
+    /// Write to this file instead of to stdout
+    #[arg(short, long, value_name = "OUT")]
+    output: Option<PathBuf>,
+    /// Replace a file that exists; never the input file
+    #[arg(long, requires = "output")]
+    force: bool,
+    #[command(flatten)]
+    overrides: Overrides,
+}
+
 pub(super) const EXAMPLES: &str = "\
 Examples:
-  host-sim export schema > gateway.schema.json";
+  host-sim export dbc cell.toml -o cell.dbc      for cantools, SavvyCAN, BUSMASTER
+  host-sim export lua cell.toml -o cell.lua      for Wireshark
+  host-sim export map cell.toml                  who writes which variable
+  host-sim export schema > gateway.schema.json   for an editor
+
+Names become identifiers of at most 32 characters: thumb-turn is thumb__turn,
+RobotState[8] is RobotState_8_. docs/export.md has the rules.";
+
+const DBC_EXAMPLES: &str = "\
+Examples:
+  host-sim export dbc cell.toml -o cell.dbc
+  candump -L can0 | cantools decode cell.dbc
+  host-sim export dbc cell.toml --port hand
+
+Signals have the values on the bus, as `decode` shows them; what becomes of them is
+in the comments. If two ports have different frames with one id, choose one.";
+
+const LUA_EXAMPLES: &str = "\
+Examples:
+  host-sim export lua cell.toml -o cell.lua
+  tshark -X lua_script:cell.lua -r cell.pcapng -V
+  cp cell.lua ~/.local/lib/wireshark/plugins/
+
+It shows serial frames in captures of `host-sim gateway --capture` and CAN frames in
+any capture.";
+
+const MAP_EXAMPLES: &str = "\
+Examples:
+  host-sim export map cell.toml
+  host-sim export map cell.toml --format csv -o cell.csv";
 
 const SCHEMA_EXAMPLES: &str = "\
 The schema is of draft 7. It knows keys, types, words and ranges; names of recipes,
@@ -49,13 +132,75 @@ An editor with tombi or taplo takes it from the first line of a file:
   #:schema ./gateway.schema.json";
 
 pub(super) fn run(args: &ExportArgs, out: &mut dyn Write) -> Outcome {
-    match args.form {
-        Form::Schema { kind } => {
+    match &args.what {
+        What::Dbc(DbcArgs { file, port }) => {
+            let made = dbc::dbc(&file.model()?, port.as_deref()).map_err(|error| file.wrong(error))?;
+            for note in &made.notes {
+                print_stderr(format_args!("{}: {note}", file.file.display()));
+            }
+            file.write(&made.text, out)
+        }
+        What::Lua(file) => {
+            let text = lua::lua(&file.model()?).map_err(|error| file.wrong(error))?;
+            file.write(&text, out)
+        }
+        What::Map(MapArgs { file, format }) => {
+            let style = match format {
+                MapFormat::Markdown => map::Style::Markdown,
+                MapFormat::Csv => map::Style::Csv,
+            };
+            file.write(&map::map(&file.model()?, style), out)
+        }
+        What::Schema { kind } => {
             let kind = match kind {
                 Kind::Gateway => FileKind::Gateway,
                 Kind::Controller => FileKind::Controller,
             };
             writeln!(out, "{:#}", recipe_config::schema(kind)).map_err(|error| error.to_string())
         }
+    }
+}
+
+impl FileArgs {
+    fn model(&self) -> Result<Model, String> {
+        Model::load(&self.file, &self.overrides.set).map_err(|error| error.to_string())
+    }
+
+    fn wrong(&self, error: impl std::fmt::Display) -> String {
+        format!("{}: {error}", self.file.display())
+    }
+
+    fn write(&self, text: &str, out: &mut dyn Write) -> Outcome {
+        let Some(path) = &self.output else {
+            return out.write_all(text.as_bytes()).map_err(|error| error.to_string());
+        };
+        let name = path.display();
+        self.put(path, text.as_bytes()).map_err(|error| format!("{name}: {error}"))?;
+        writeln!(out, "{name}: {} bytes", text.len()).map_err(|error| error.to_string())
+    }
+
+    fn put(&self, path: &Path, bytes: &[u8]) -> io::Result<()> {
+        let refused = |message: &str| Err(io::Error::new(io::ErrorKind::AlreadyExists, message));
+        let found = match fs::metadata(path) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {
+                return Beside::file(path, bytes)?.0.put_new(path);
+            }
+            found => found?,
+        };
+        if found.is_dir() {
+            return refused("a folder; give the name of a file in it");
+        }
+        if !found.is_file() {
+            // A pipe or a device: nothing is replaced.
+            return fs::File::options().write(true).open(path)?.write_all(bytes);
+        }
+        if Identity::of(&found) == Identity::of(&fs::metadata(&self.file)?) {
+            return refused("this is the file that it is made from; give another name");
+        }
+        if !self.force {
+            return refused("this file exists; give another name or --force");
+        }
+        let place = fs::canonicalize(path)?;
+        Beside::file(&place, bytes)?.0.replace(&place)
     }
 }

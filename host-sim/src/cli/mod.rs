@@ -9,20 +9,24 @@ mod codec;
 mod conversation;
 mod convert;
 mod export;
+mod extcap;
 mod frame;
 mod image;
 mod log;
 mod new;
 mod pendant;
 mod plan;
+mod record;
+mod replay;
 mod run;
 mod scale;
 mod soak;
 mod text;
 mod values;
 
+use std::ffi::OsString;
 use std::io::{self, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::{Args, CommandFactory, Parser, Subcommand, ValueEnum};
@@ -77,7 +81,7 @@ enum Command {
     Controller(run::ControllerRun),
     /// Run the gateway
     #[command(after_help = GATEWAY_EXAMPLES)]
-    Gateway(run::Run),
+    Gateway(run::GatewayRun),
     /// Act on a running controller: press its buttons, set inputs, begin faults, watch its state
     #[command(after_help = pendant::EXAMPLES)]
     Pendant(pendant::PendantArgs),
@@ -87,12 +91,18 @@ enum Command {
     /// Check a file; print the bus budget, the way of each variable and what to set on the pendant
     #[command(after_help = CHECK_EXAMPLES)]
     Check(check::CheckArgs),
-    /// Print what other tools read: the JSON Schema of a file
-    #[command(after_help = export::EXAMPLES)]
-    Export(export::ExportArgs),
     /// Write the configuration image for a board
     #[command(after_help = IMAGE_EXAMPLES)]
     Image(image::ImageArgs),
+    /// Write what other tools read: a CAN database, a dissector for Wireshark, a map, a JSON Schema
+    #[command(after_help = export::EXAMPLES)]
+    Export(export::ExportArgs),
+    /// Be an interface of Wireshark: a running gateway
+    #[command(after_help = extcap::EXAMPLES)]
+    Extcap(extcap::ExtcapArgs),
+    /// Run the engine of a recorded gateway again, in virtual time, and compare what it does
+    #[command(after_help = replay::EXAMPLES)]
+    Replay(replay::ReplayArgs),
     /// Run cells in virtual time with injected faults, and check everything that the gateway does
     #[command(after_help = soak::EXAMPLES)]
     Soak(soak::SoakArgs),
@@ -129,8 +139,13 @@ Examples:
   host-sim gateway -c cell.toml --bind rs485-1=serial:/dev/ttyUSB0
   host-sim gateway -c cell.toml --bind rs485-1=pty:run/rs485-1 --set controller.address=127.0.0.1
   host-sim gateway -c cell.toml --set port.rs485-1.baud=9600 --stats 1s
+  host-sim gateway -c cell.toml --bind hand=can0 --capture - | wireshark -k -i -
+  host-sim gateway -c cell.toml --bind hand=can0 --record run --record-budget 10GiB
   host-sim gateway -c cell.toml --console 127.0.0.1:8480 --console-key console.key --console-state revisions
-      and then: curl http://127.0.0.1:8480/api/v1/status";
+      and then: curl http://127.0.0.1:8480/api/v1/status
+
+Captures and recordings never delay the gateway: what cannot be written is lost and
+counted. docs/capture.md says what is in them.";
 
 const CHECK_EXAMPLES: &str = "\
 Examples:
@@ -275,7 +290,7 @@ struct DecodeArgs {
 
 /// Runs the command.
 pub fn main() -> ExitCode {
-    let cli = match Cli::try_parse() {
+    let cli = match Cli::try_parse_from(arguments()) {
         Ok(cli) => cli,
         Err(error) => return not_run(&error),
     };
@@ -297,6 +312,8 @@ pub fn main() -> ExitCode {
             let code = soak::run(&args, &mut out);
             return out.finish(|_| code);
         }
+        Command::Extcap(args) => return extcap::run(&args, out),
+        Command::Replay(args) => return replay::run(&args, out),
         Command::New(args) => new::run(&args, &mut out),
         Command::Check(args) => match check::run(&args, &mut out) {
             Err(check::Wrong::Printed) => return out.finish(|_| ExitCode::from(2)),
@@ -312,6 +329,16 @@ pub fn main() -> ExitCode {
         (Printed::Whole, Err(message)) => wrong(message),
         _ => ExitCode::SUCCESS,
     })
+}
+
+/// The arguments; Wireshark starts the program under another name, without the word `extcap`.
+fn arguments() -> Vec<OsString> {
+    let mut arguments: Vec<_> = std::env::args_os().collect();
+    let name = arguments.first().and_then(|program| Path::new(program).file_stem());
+    if name.is_some_and(|name| name == extcap::PROGRAM) {
+        arguments.insert(1, "extcap".into());
+    }
+    arguments
 }
 
 /// Prints help, the version, or an error in the arguments.

@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use clap::Args;
 
+use super::record::WatchArgs;
 use super::{Overrides, check, wrong};
 use recipe_config::SimConfig;
 use recipe_controller::timeline::Timeline;
@@ -51,6 +52,15 @@ pub(super) struct Run {
     console_state: Option<PathBuf>,
 }
 
+/// Arguments of `gateway`.
+#[derive(Debug, Args)]
+pub(super) struct GatewayRun {
+    #[command(flatten)]
+    run: Run,
+    #[command(flatten)]
+    watch: WatchArgs,
+}
+
 /// Arguments of `controller`.
 #[derive(Debug, Args)]
 pub(super) struct ControllerRun {
@@ -72,29 +82,47 @@ pub(super) struct ControllerRun {
     timeline: Option<PathBuf>,
 }
 
-impl Run {
+impl GatewayRun {
     pub(super) fn gateway(self) -> ExitCode {
-        let loaded = check::load_gateway(&self.config, &self.overrides.set);
-        let (path, overrides) = (self.config.clone(), self.overrides.set.clone());
+        let Self { run, watch } = self;
+        let (path, overrides) = (run.config.clone(), run.overrides.set.clone());
+        let loaded = check::load_gateway(&path, &overrides);
         // Even if the file is wrong, a ready file of a killed run is removed.
-        match (self.options(), loaded) {
-            (Ok(options), Ok(_)) if options.console.is_some() => {
-                let file = ConfigFile::read(&path, overrides);
-                finished(file.and_then(|file| shell::gateway::run_with_console(file, options)))
+        match (run.options(), loaded) {
+            (Ok(options), Ok(config)) => {
+                if watch.takes_stdout() && options.stats.is_some() {
+                    return wrong(
+                        "--stats is for stdout, and so is --capture -; give the capture a file or a pipe",
+                    );
+                }
+                let options = RunOptions { stdout_is_taken: watch.takes_stdout(), ..options };
+                let watching = match watch.start(&options.watch, &path, &overrides) {
+                    Ok(watching) => watching,
+                    Err(error) => return finished(Err(error)),
+                };
+                let result = match &options.console {
+                    Some(_) => ConfigFile::read(&path, overrides)
+                        .and_then(|file| shell::gateway::run_with_console(file, options)),
+                    None => shell::gateway::run(*config, options),
+                };
+                watching.finish();
+                finished(result)
             }
-            (Ok(options), Ok(config)) => finished(shell::gateway::run(*config, options)),
             (_, Err(error)) => wrong(error),
             (Err(error), _) => finished(Err(error)),
         }
     }
+}
 
+impl Run {
     fn options(self) -> Result<RunOptions, StartError> {
         let ready = self.ready.map(ReadyFile::at).transpose()?;
         let scheduling = if self.no_realtime { Scheduling::Ordinary } else { Scheduling::FifoIfAllowed };
         let key = self.console_key.as_deref().map(console::read_key).transpose()?;
         let state = self.console_state;
         let console = self.console.map(|address| ConsoleOptions { address, key, state });
-        Ok(RunOptions { binds: self.bind, ready, stats: self.stats, scheduling, console })
+        let (binds, stats) = (self.bind, self.stats);
+        Ok(RunOptions { binds, ready, stats, scheduling, console, ..RunOptions::default() })
     }
 }
 

@@ -80,7 +80,7 @@ def initial_pose():
 class Program:
     """A running `host-sim controller` or `host-sim gateway`."""
 
-    def __init__(self, command, config, sets=(), binds=()):
+    def __init__(self, command, config, sets=(), binds=(), extra=()):
         self.folder = tempfile.TemporaryDirectory(prefix="foreign-")
         path = pathlib.Path(self.folder.name)
         ready = path / "ready.json"
@@ -94,6 +94,7 @@ class Program:
                 device = f"{kind}:{path / rest}"
                 self.links.append(path / rest)
             arguments += ["--bind", f"{name}={device}"]
+        arguments += extra
         self.log = open(log_folder / f"{threading.current_thread().name}-{command}.log", "ab")
         self.log.write(("$ " + " ".join(arguments) + "\n").encode())
         self.log.flush()
@@ -169,10 +170,10 @@ def controller(config, sets=(), binds=()):
     return Program("controller", config, [*free, *sets], binds)
 
 
-def gateway(config, robot, sets=(), binds=()):
+def gateway(config, robot, sets=(), binds=(), extra=()):
     """A gateway to a running controller."""
     ports = [f"controller.ports.{name}={robot.address(name)[1]}" for name in ("command", "state", "modbus")]
-    return Program("gateway", config, ["controller.address=127.0.0.1", *ports, *sets], binds)
+    return Program("gateway", config, ["controller.address=127.0.0.1", *ports, *sets], binds, extra)
 
 
 def link_is_up(running, *names):

@@ -23,7 +23,7 @@ import cell  # noqa: E402
 
 MODULES = (
     "on_sockets", "on_habits", "on_modbus", "on_rtu_line", "on_serial", "on_can", "on_canopen", "on_dbc",
-    "on_recipe_sockets", "through_gateway", "on_modbus_ports",
+    "on_export", "on_recipe_sockets", "through_gateway", "on_modbus_ports",
 )
 # A case that hangs in somebody's library ends here.
 CASE_LIMIT = 60

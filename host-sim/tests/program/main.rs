@@ -1,8 +1,10 @@
 //! The program as users and scripts run it.
 
+mod capturing;
 mod checking;
 mod command_line;
 mod control;
+mod exporting;
 mod output;
 mod processes;
 mod rejections;

@@ -4,11 +4,14 @@ use std::fs::File;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
+use std::sync::OnceLock;
 use std::sync::mpsc::channel;
 use std::time::Duration;
 
 use clap::CommandFactory;
 use host_sim::cli::Cli;
+use proto_core::config::image;
+use proto_core::record;
 use recipe_test_kit::{ended, example, free_servers};
 use rustix::process::{Pid, Signal, kill_process};
 
@@ -45,12 +48,34 @@ fn command_lines(folder: &Path) -> Vec<Vec<String>> {
         line(&["encode", &gateway, "--part", "input", "1"]),
         line(&["decode", &gateway, "--part", "input", "FFFF01EEEE", "FFFF01EEEE"]),
         line(&["pendant", "--to", &control_socket(), "programs"]),
+        line(&["export", "map", &gateway]),
+        line(&["export", "dbc", &config("can-hand.toml")]),
+        line(&["export", "lua", &gateway]),
+        line(&["extcap", "--extcap-interfaces"]),
+        line(&["replay", &recording(&gateway)]),
         line(&["completions", "bash"]),
         line(&["help"]),
         line(&["--help"]),
         line(&["check", "--help"]),
         line(&["--version"]),
     ]
+}
+
+/// A plain recording of a gateway that has begun.
+fn recording(gateway: &str) -> String {
+    static MADE: OnceLock<String> = OnceLock::new();
+    MADE.get_or_init(|| make_recording(gateway)).clone()
+}
+
+fn make_recording(gateway: &str) -> String {
+    let config = recipe_test_kit::toml::gateway(&std::fs::read_to_string(gateway).unwrap());
+    let mut image = vec![0; image::MAX_IMAGE];
+    let len = image::encode(&*config, &mut image).unwrap();
+    let mut bytes = record::MAGIC.to_vec();
+    record::Entry::Start { image: &image[..len] }.encode(|piece| bytes.extend_from_slice(piece));
+    let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join("began.rgr");
+    std::fs::write(&path, bytes).unwrap();
+    path.to_str().unwrap().to_owned()
 }
 
 /// A control socket that answers every client once; it serves until the tests end.

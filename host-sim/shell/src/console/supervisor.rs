@@ -13,6 +13,7 @@ use std::thread::JoinHandle;
 use std::time::Duration as StdDuration;
 
 use proto_core::time::{Duration, Instant};
+use recipe_capture::Watch;
 use recipe_device::bind::Bind;
 use recipe_net::realtime::Scheduling;
 use recipe_net::timer::now;
@@ -156,6 +157,7 @@ impl Supervised {
             state: console.state.clone(),
             binds: options.binds.clone(),
             scheduling: options.scheduling,
+            watch: options.watch.clone(),
             put: None,
             failure: None,
         };
@@ -229,6 +231,8 @@ struct Supervisor {
     state: Option<PathBuf>,
     binds: Vec<Bind>,
     scheduling: Scheduling,
+    /// What is seen of each gateway.
+    watch: Watch,
     /// The text that is to be kept, and who sent it.
     put: Option<(String, String)>,
     failure: Option<String>,
@@ -376,7 +380,8 @@ impl Supervisor {
         let config = check::gateway(&name, text, &self.overrides);
         let config = config.map_err(|mistake| StartError::new(format!("{name}: {mistake}")))?;
         let window = Arc::new(Window::new());
-        let handle = gateway::spawn(*config, self.binds.clone(), self.scheduling, Some(Arc::clone(&window)))?;
+        let shown = Some(Arc::clone(&window));
+        let handle = gateway::spawn(*config, self.binds.clone(), self.scheduling, &self.watch, shown)?;
         self.handle = Some((handle, window));
         Ok(())
     }

@@ -7,7 +7,7 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::Duration;
 
-use proto_core::engine::Engine;
+use crate::gateway::Engine;
 use proto_core::time::Instant;
 use recipe_device::exchange::DeviceCounters;
 use tokio::sync::Notify;

@@ -1,0 +1,184 @@
+//! Frames as values by name: what a recording and a live view show.
+//!
+//! In: a frame of a port, and the frames of the file that the gateway runs. Out: which of them it is, and its values
+//! as JSON. Names are those of `recipe_export::names`.
+
+use proto_core::device::{Element, Kind};
+use proto_core::engine::TapDirection;
+use proto_core::sysvar::Direction;
+use proto_core::wire::can::CanId;
+use proto_core::wire::scalar::{Scalar, ScalarType};
+use recipe_export::names::mangle;
+use recipe_export::{Format, Model, describe_use, unit_of};
+use serde_json::{Map, Value, json};
+
+use crate::record::Frame;
+
+/// Knows the frames of a file.
+#[derive(Debug, Clone)]
+pub struct Decoder {
+    ports: Vec<(String, Vec<Topic>)>,
+}
+
+/// Frames of one kind at one port.
+#[derive(Debug, Clone)]
+pub struct Topic {
+    /// Port, part and, on CAN, id: `/rs485__1/input`, `/hand/input/502`.
+    pub name: String,
+    /// The recipe, and what the frame is for.
+    pub title: String,
+    /// A JSON Schema of its values.
+    pub schema: Value,
+    format: Format,
+    /// The name of each element that has one.
+    names: Vec<Option<String>>,
+}
+
+impl Decoder {
+    /// The frames of this file's ports.
+    pub fn new(model: &Model) -> Self {
+        let ports = model.ports.iter().map(|port| {
+            let recipe = model.recipe_of(port);
+            let formats = recipe.map_or(&[][..], |recipe| &recipe.formats);
+            let several = |format: &Format| {
+                formats.iter().filter(|other| (other.role, other.id) == (format.role, format.id)).count() > 1
+            };
+            let topics =
+                formats.iter().enumerate().filter(|(_, format)| !format.is_remote).map(|(nth, format)| {
+                    let mut name = format!("/{}/{}", mangle(&port.name), mangle(&format.role.name()));
+                    name += &match format.id {
+                        None => String::new(),
+                        Some(CanId::Standard(id)) => format!("/{id:03X}"),
+                        Some(CanId::Extended(id)) => format!("/{id:08X}"),
+                    };
+                    // Frames that only their constants tell apart.
+                    if several(format) {
+                        name += &format!("/{nth}");
+                    }
+                    let recipe = recipe.map_or("", |recipe| &recipe.name);
+                    Topic::new(name, format!("{recipe} {}", format.role.name()), format)
+                });
+            (port.name.clone(), topics.collect())
+        });
+        Self { ports: ports.collect() }
+    }
+
+    /// The values of a frame of a port; `None` if it is none that the file has.
+    pub fn decode(&self, port: &str, frame: &Frame) -> Option<(&Topic, Value)> {
+        let direction = match frame.direction {
+            TapDirection::In => Direction::Input,
+            TapDirection::Out => Direction::Output,
+        };
+        let (_, topics) = self.ports.iter().find(|(name, _)| name == port)?;
+        let topics = topics.iter().filter(|topic| topic.format.direction == direction);
+        topics.filter_map(|topic| Some((topic, topic.values(frame)?))).next()
+    }
+}
+
+impl Topic {
+    fn new(name: String, title: String, format: &Format) -> Self {
+        let mut names = vec![None; format.frame.elements.len()];
+        let mut properties = Map::new();
+        for (field, element) in format.named_values() {
+            let identifier = mangle(field.name());
+            let mut property = json!({ "title": field.name(), "type": json_type(element) });
+            let unit = field.system.map_or("", unit_of);
+            let words = [unit.to_owned(), describe_use(field)];
+            let words: Vec<_> = words.into_iter().filter(|word| !word.is_empty()).collect();
+            if !words.is_empty() {
+                property["description"] = words.join("; ").into();
+            }
+            properties.insert(identifier.clone(), property);
+            if let Some(slot) = field.element.and_then(|nth| names.get_mut(nth)) {
+                *slot = Some(identifier);
+            }
+        }
+        let schema = json!({ "type": "object", "title": title, "properties": properties });
+        Self { name, title, schema, format: format.clone(), names }
+    }
+
+    /// The values of a frame, if it is one of these.
+    fn values(&self, frame: &Frame) -> Option<Value> {
+        if frame.len != frame.bytes.len() {
+            return None;
+        }
+        let bytes = self.format.take(frame.can_id, &frame.bytes)?;
+        let (layout, elements) = (&self.format.frame.layout, &self.format.frame.elements);
+        let mut values = Map::new();
+        for (nth, (read, name)) in layout.values(elements, &bytes).zip(&self.names).enumerate() {
+            let Some(name) = name else { continue };
+            let value = match read.ok()? {
+                Some(scalar) => to_json(scalar),
+                None => match elements.get(nth)? {
+                    Element::Fixed { value, .. } => (*value).into(),
+                    _ => match layout.text(elements, &bytes, nth) {
+                        Some(text) => String::from_utf8_lossy(text).into_owned().into(),
+                        None => continue,
+                    },
+                },
+            };
+            values.insert(name.clone(), value);
+        }
+        Some(values.into())
+    }
+}
+
+fn json_type(element: &Element) -> &'static str {
+    match element.encoding().map(|encoding| encoding.kind) {
+        None => "string",
+        Some(Kind::Scalar(ScalarType::Float | ScalarType::Double) | Kind::Decimal(_)) => "number",
+        Some(_) => "integer",
+    }
+}
+
+/// A number; what is infinite or not a number is null.
+fn to_json(scalar: Scalar) -> Value {
+    match scalar {
+        Scalar::Float(_) | Scalar::Double(_) => json!(scalar.as_f64()),
+        // All integers are exact in a binary64.
+        _ => json!(scalar.as_f64() as i64),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proto_core::engine::{PortId, TapPlace, TapVerdict};
+    use recipe_test_kit::example;
+
+    use super::*;
+
+    #[track_caller]
+    fn decoded(file: &str, port: &str, direction: TapDirection, id: Option<u16>, bytes: &[u8]) -> String {
+        let model = Model::load(&example(file), &[]).unwrap();
+        let frame = Frame {
+            place: TapPlace::Port(PortId(0)),
+            direction,
+            verdict: TapVerdict::Taken,
+            can_id: id.map(CanId::Standard),
+            len: bytes.len(),
+            bytes: bytes.into(),
+        };
+        let decoder = Decoder::new(&model);
+        let found = decoder.decode(port, &frame);
+        found.map_or("none".into(), |(topic, values)| format!("{} {values}", topic.name))
+    }
+
+    #[test]
+    fn frames_of_every_kind_have_their_values_by_name() {
+        use TapDirection::{In, Out};
+        assert_eq!(
+            decoded("can-hand.toml", "hand", In, Some(0x502), &[1, 2, 0x10, 0x27]),
+            r#"/hand/input/502 {"error":2,"grip":10000,"state":1}"#
+        );
+        assert_eq!(
+            decoded("can-hand.toml", "hand", Out, Some(0x501), &[1, 2, 3, 4, 5, 6]),
+            r#"/hand/output/501 {"index":3,"little":6,"middle":4,"ring":5,"thumb":1,"thumb__turn":2}"#
+        );
+        assert_eq!(
+            decoded("rs485-system.toml", "rs485-1", In, None, &[0xFF, 0xFF, 1, 0xEE, 0xEE]),
+            r#"/rs485__1/input {"DigitalOutputCommand_1_":1}"#
+        );
+        assert_eq!(decoded("rs485-system.toml", "rs485-1", In, None, &[0xFF, 0xFF, 1, 0xEE]), "none");
+        assert_eq!(decoded("can-hand.toml", "hand", In, Some(0x501), &[1, 2, 3, 4, 5, 6]), "none", "its own");
+    }
+}

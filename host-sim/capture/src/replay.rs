@@ -1,0 +1,320 @@
+//! A recorded run again, in virtual time: the same inputs to another engine, and its outputs compared byte for byte.
+//!
+//! In: a recording ([`crate::recording`]), or the plain one of `proto_core::record`. Out: whether this program's
+//! engine decides the same, and the first place where it does not. An engine has to be run from its start: a
+//! recording whose first part was dropped cannot be replayed, and one with a gap only up to it.
+
+use std::fmt;
+use std::fs::{self, File};
+use std::io::{self, BufReader, Write};
+use std::path::{Path, PathBuf};
+
+use mcap::sans_io::LinearReaderOptions;
+use proto_core::config::GatewayConfig;
+use proto_core::config::image;
+use proto_core::engine::{Engine, Input, OUTPUT_BUFFER, Output};
+use proto_core::record::{Entry, MAGIC, totals};
+use proto_core::time::Instant;
+
+use crate::recording::{ENGINE, Folder, run_of};
+
+/// Why a recording cannot be replayed at all.
+#[derive(Debug)]
+#[non_exhaustive]
+pub enum ReplayError {
+    /// A file cannot be read.
+    Io(PathBuf, io::Error),
+    /// The folder has no recording.
+    Empty(PathBuf),
+    /// It is no recording, or not one of this version.
+    NotARecording(PathBuf),
+    /// The beginning of the run is not there.
+    NoStart(PathBuf),
+    /// The configuration cannot be run by this program.
+    Config(String),
+    /// The plain recording cannot be written.
+    Plain(io::Error),
+}
+
+impl fmt::Display for ReplayError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Io(path, error) => write!(f, "{}: {error}", path.display()),
+            Self::Empty(path) => write!(f, "{}: there is no recording in this folder", path.display()),
+            Self::NotARecording(path) => write!(f, "{}: not a recording of a gateway", path.display()),
+            Self::NoStart(path) => write!(
+                f,
+                "{}: the run does not begin in this recording; its first part was dropped, and without it no engine \
+                 can be run again (a larger --record-budget keeps it longer)",
+                path.display()
+            ),
+            Self::Config(error) => write!(f, "the recorded configuration cannot be run: {error}"),
+            Self::Plain(error) => write!(f, "the plain recording: {error}"),
+        }
+    }
+}
+
+impl std::error::Error for ReplayError {}
+
+/// What came of a replay.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Report {
+    /// Engines that began.
+    pub starts: u64,
+    /// Inputs handed to them.
+    pub inputs: u64,
+    /// Outputs that were compared.
+    pub outputs: u64,
+    /// The first and the last instant.
+    pub span: Option<(Instant, Instant)>,
+    /// Number of files.
+    pub files: usize,
+    /// The recording ends within an entry or a chunk, as that of a killed process does.
+    pub is_cut: bool,
+    /// What ended the replay before the end of the recording.
+    pub stopped: Option<Stopped>,
+}
+
+/// What ends a replay early.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Stopped {
+    /// The engine did something else.
+    Differs(Box<Difference>),
+    /// Calls of the engine are missing.
+    Gap {
+        /// The last instant before it.
+        at: Option<Instant>,
+        /// Number of calls that are missing.
+        missing: u32,
+    },
+}
+
+/// Where two engines differ.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Difference {
+    /// When.
+    pub at: Instant,
+    /// The input, in words.
+    pub input: String,
+    /// What the recorded engine did.
+    pub recorded: Vec<String>,
+    /// What this one does.
+    pub replayed: Vec<String>,
+}
+
+/// Replays a file, or the newest run of a folder. A file that is a part of a run stands for all of it. With
+/// `plain`, the recording is also written there without anything around it, as `proto_core::record::replay` takes it.
+///
+/// # Errors
+/// [`ReplayError`].
+pub fn replay(path: &Path, plain: Option<&mut dyn Write>) -> Result<Report, ReplayError> {
+    let io_error = |error| ReplayError::Io(path.to_owned(), error);
+    let mut runner = Runner { plain, ..Runner::default() };
+    if fs::metadata(path).map_err(io_error)?.is_file() {
+        let bytes = first_bytes(path).map_err(io_error)?;
+        if bytes == MAGIC {
+            let bytes = fs::read(path).map_err(io_error)?;
+            runner.write_plain(&MAGIC)?;
+            runner.report.files = 1;
+            runner.entries(bytes.get(MAGIC.len()..).unwrap_or(&[]))?;
+            return runner.finish(path);
+        }
+    }
+    let parts = parts_of(path).map_err(io_error)?;
+    if parts.is_empty() {
+        return Err(ReplayError::Empty(path.to_owned()));
+    }
+    runner.write_plain(&MAGIC)?;
+    let mut sequence = None;
+    for part in &parts {
+        runner.report.files += 1;
+        if !runner.part(part, &mut sequence)? {
+            break;
+        }
+    }
+    runner.finish(path)
+}
+
+/// The files of a run.
+fn parts_of(path: &Path) -> io::Result<Vec<PathBuf>> {
+    if path.is_dir() {
+        return Folder::open(path)?.newest_run();
+    }
+    let (Some(run), Some(parent)) = (run_of(path), path.parent()) else { return Ok(vec![path.to_owned()]) };
+    let parent = if parent.as_os_str().is_empty() { Path::new(".") } else { parent };
+    let parts = Folder::open(parent)?.parts()?;
+    Ok(parts.into_iter().map(|(path, _)| path).filter(|path| run_of(path).as_deref() == Some(&run)).collect())
+}
+
+fn first_bytes(path: &Path) -> io::Result<Vec<u8>> {
+    use std::io::Read;
+    let mut bytes = Vec::new();
+    File::open(path)?.take(MAGIC.len() as u64).read_to_end(&mut bytes)?;
+    Ok(bytes)
+}
+
+#[derive(Default)]
+struct Runner<'p> {
+    engine: Option<Box<Engine>>,
+    report: Report,
+    plain: Option<&'p mut dyn Write>,
+    /// There are calls of an engine whose start is not in the recording.
+    has_headless: bool,
+}
+
+impl Runner<'_> {
+    /// One file; false if the replay has stopped.
+    fn part(&mut self, path: &Path, sequence: &mut Option<u32>) -> Result<bool, ReplayError> {
+        let file = File::open(path).map_err(|error| ReplayError::Io(path.to_owned(), error))?;
+        // The file of a killed process has no end.
+        let options = LinearReaderOptions::default().with_skip_end_magic(true);
+        let messages = mcap::io::MessageReader::new_with_options(BufReader::new(file), options);
+        for message in messages {
+            let Ok(message) = message else {
+                self.report.is_cut = true;
+                break;
+            };
+            if message.channel.topic != ENGINE {
+                continue;
+            }
+            let missing = match *sequence {
+                Some(last) => message.sequence.wrapping_sub(last).wrapping_sub(1),
+                None => 0,
+            };
+            if missing > 0 {
+                let at = self.report.span.map(|(_, last)| last);
+                self.report.stopped = Some(Stopped::Gap { at, missing });
+                return Ok(false);
+            }
+            *sequence = Some(message.sequence);
+            self.write_plain(&message.data)?;
+            self.entries(&message.data)?;
+            if self.report.stopped.is_some() {
+                return Ok(false);
+            }
+        }
+        Ok(true)
+    }
+
+    fn finish(self, path: &Path) -> Result<Report, ReplayError> {
+        match self {
+            Self { report: Report { starts: 0, .. }, has_headless: true, .. } => {
+                Err(ReplayError::NoStart(path.to_owned()))
+            }
+            Self { report: Report { starts: 0, .. }, .. } => Err(ReplayError::NotARecording(path.to_owned())),
+            Self { report, .. } => Ok(report),
+        }
+    }
+
+    fn write_plain(&mut self, bytes: &[u8]) -> Result<(), ReplayError> {
+        self.plain.as_mut().map_or(Ok(()), |plain| plain.write_all(bytes)).map_err(ReplayError::Plain)
+    }
+
+    /// Runs these entries: a whole recording, or one call of the engine.
+    fn entries(&mut self, bytes: &[u8]) -> Result<(), ReplayError> {
+        let mut rest = bytes;
+        while !rest.is_empty() && self.report.stopped.is_none() {
+            let Some((entry, after)) = Entry::parse(rest) else {
+                self.report.is_cut = true;
+                return Ok(());
+            };
+            rest = after;
+            match entry {
+                Entry::Start { image } => self.start(image)?,
+                Entry::Input { at, input } => {
+                    // Of an engine whose start is not there.
+                    let Some(engine) = &mut self.engine else {
+                        self.has_headless = true;
+                        continue;
+                    };
+                    let recorded = outputs(&mut rest);
+                    let replayed = pass(engine, at, input);
+                    self.report.inputs += 1;
+                    self.report.outputs += count(recorded);
+                    self.report.span = Some((self.report.span.map_or(at, |(first, _)| first), at));
+                    // The recording may end within a call.
+                    let is_cut = rest.is_empty() && replayed.starts_with(recorded) && recorded != replayed;
+                    self.report.is_cut |= is_cut;
+                    if recorded != replayed && !is_cut {
+                        self.differs(at, format!("{input:?}"), shown(recorded), shown(&replayed));
+                    }
+                }
+                Entry::Totals(recorded) => {
+                    let Some(engine) = &self.engine else {
+                        self.has_headless = true;
+                        continue;
+                    };
+                    let at = self.report.span.map_or(Instant::from_micros(0), |(_, last)| last);
+                    let replayed = totals(&**engine);
+                    if replayed != *recorded {
+                        let hex = |bytes: &[u8]| vec![format!("{bytes:02X?}")];
+                        self.differs(
+                            at,
+                            "counters and image at the end".into(),
+                            hex(recorded),
+                            hex(&replayed),
+                        );
+                    }
+                }
+                // Those of a call are taken with it.
+                Entry::Output(_) => {}
+            }
+        }
+        Ok(())
+    }
+
+    fn start(&mut self, image: &[u8]) -> Result<(), ReplayError> {
+        let mut config: Box<GatewayConfig> = Box::default();
+        image::decode_into(image, &mut config).map_err(|error| ReplayError::Config(error.to_string()))?;
+        let engine = Engine::new(&*config).map_err(|error| ReplayError::Config(error.to_string()))?;
+        self.engine = Some(Box::new(engine));
+        self.report.starts += 1;
+        Ok(())
+    }
+
+    fn differs(&mut self, at: Instant, input: String, recorded: Vec<String>, replayed: Vec<String>) {
+        let difference = Difference { at, input, recorded, replayed };
+        self.report.stopped = Some(Stopped::Differs(Box::new(difference)));
+    }
+}
+
+/// The outputs at the front of `rest`, which then begins behind them.
+fn outputs<'a>(rest: &mut &'a [u8]) -> &'a [u8] {
+    let all = *rest;
+    while let Some((Entry::Output(_), after)) = Entry::parse(rest) {
+        *rest = after;
+    }
+    all.get(..all.len() - rest.len()).unwrap_or(all)
+}
+
+/// What an engine does for an input.
+fn pass(engine: &mut Engine, at: Instant, input: Input<'_>) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    let mut buf = [0; OUTPUT_BUFFER];
+    engine.handle(at, input);
+    loop {
+        let output = engine.poll_output(at, &mut buf);
+        Entry::Output(output).encode(|piece| bytes.extend_from_slice(piece));
+        if let Output::Sleep { .. } = output {
+            return bytes;
+        }
+    }
+}
+
+fn count(mut outputs: &[u8]) -> u64 {
+    let mut count = 0;
+    while let Some((_, after)) = Entry::parse(outputs) {
+        count += 1;
+        outputs = after;
+    }
+    count
+}
+
+fn shown(mut outputs: &[u8]) -> Vec<String> {
+    let mut shown = Vec::new();
+    while let Some((Entry::Output(output), after)) = Entry::parse(outputs) {
+        shown.push(format!("{output:02X?}"));
+        outputs = after;
+    }
+    shown
+}

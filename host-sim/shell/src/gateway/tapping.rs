@@ -1,0 +1,279 @@
+//! What goes over ports and links, for whoever watches (`recipe_capture::Watch`).
+//!
+//! In, on the gateway's thread: the engine's tap, and each call of the engine. They are written to a ring of bytes,
+//! which never waits and never allocates: what has no room is lost and counted. While nobody watches, a call costs
+//! one relaxed load. Out, on an ordinary thread: owned records for the subscribers.
+
+use std::io;
+use std::sync::Arc;
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use proto_core::engine::{
+    Engine, Input, LinkId, MAX_TAPPED, Output, PortId, Rejection, Tap, TapDirection, TapPlace, TapRecord,
+    TapVerdict,
+};
+use proto_core::record::{Entry, totals};
+use proto_core::time::Instant;
+use proto_core::wire::can::CanId;
+use recipe_capture::{Cell, Frame, Record, Watch, What};
+use rtrb::{Consumer, Producer, RingBuffer};
+
+/// Bytes of the engine's tap: more than one call of the engine fills. It is emptied after each.
+pub(super) const TAP: usize = 64 << 10;
+
+/// Bytes of the ring between the threads, more than a second of busy ports. Its pages are not there until they
+/// are used.
+const RING: usize = 8 << 20;
+/// Longest message: the passes of an engine are far shorter, its configuration too.
+const MAX_MESSAGE: usize = 128 << 10;
+/// How long the reader sleeps when the ring is empty. The gateway does not wake it: that would be a system call.
+const READ_INTERVAL: Duration = Duration::from_millis(2);
+
+/// The gateway's side.
+#[derive(Debug)]
+pub(super) struct Tapping {
+    watch: Watch,
+    ring: Producer<u8>,
+    /// The message that is being made.
+    message: Vec<u8>,
+    /// The pass that is being recorded has more bytes than a message may have.
+    is_too_long: bool,
+    /// Passes are recorded from the start of the engine on.
+    records_passes: bool,
+    /// Lost since the newest that was kept: frames, passes.
+    lost: [u32; 2],
+    reader: Option<JoinHandle<()>>,
+}
+
+impl Tapping {
+    /// Begins to tell of a gateway, which must not have been called yet.
+    pub(super) fn begin(watch: &Watch, cell: Cell, at: Instant, image: &[u8]) -> io::Result<Self> {
+        let (ring, consumer) = RingBuffer::new(RING);
+        let began = Record { at, lost: 0, what: What::Began(Arc::new(cell)) };
+        let reader = Reader { watch: watch.clone(), ring: consumer, message: Vec::new() };
+        let reader = std::thread::Builder::new().name("watch".to_owned()).spawn(move || reader.run(began))?;
+        let mut tapping = Self {
+            watch: watch.clone(),
+            ring,
+            message: Vec::with_capacity(MAX_MESSAGE),
+            is_too_long: false,
+            records_passes: watch.wanted().passes,
+            lost: [0; 2],
+            reader: Some(reader),
+        };
+        if tapping.records_passes {
+            tapping.head(PASS, at);
+            tapping.entry(&Entry::Start { image });
+            tapping.push(PASS);
+        }
+        Ok(tapping)
+    }
+
+    /// Before the engine is called.
+    #[inline]
+    pub(super) fn before(&mut self, tap: &mut Tap<TAP>, at: Instant, input: Input<'_>) {
+        let wanted = self.watch.wanted();
+        if wanted.frames != tap.is_listening() {
+            tap.listen(wanted.frames);
+        }
+        if self.records_passes {
+            self.records_passes = wanted.passes;
+            self.head(PASS, at);
+            self.entry(&Entry::Input { at, input });
+        }
+    }
+
+    /// What the engine returned.
+    #[inline]
+    pub(super) fn output(&mut self, output: Output<'_>) {
+        if self.records_passes {
+            self.entry(&Entry::Output(output));
+        }
+    }
+
+    /// Behind the call.
+    #[inline]
+    pub(super) fn behind(&mut self, tap: &mut Tap<TAP>) {
+        if self.records_passes {
+            self.push(PASS);
+        }
+        if tap.is_listening() {
+            self.drain(tap);
+        }
+    }
+
+    /// The engine ends: what it became.
+    pub(super) fn end<const P: usize, const U: usize, const F: usize, const E: usize>(
+        &mut self,
+        engine: &Engine<P, U, F, TAP, E>,
+        at: Instant,
+    ) {
+        if self.records_passes {
+            self.head(PASS, at);
+            self.entry(&Entry::Totals(&totals(engine)));
+            self.push(PASS);
+        }
+    }
+
+    #[cold]
+    fn drain(&mut self, tap: &mut Tap<TAP>) {
+        let mut room = [0; MAX_TAPPED];
+        while let Some(record) = tap.next(&mut room) {
+            self.lost[0] = self.lost[0].saturating_add(record.lost);
+            self.frame(&record);
+            self.push(FRAME);
+        }
+    }
+
+    fn frame(&mut self, record: &TapRecord<'_>) {
+        let (kind, place) = match record.place {
+            TapPlace::Port(port) => (0, port.0),
+            TapPlace::Link(link) => (1, link.0),
+        };
+        let direction = u8::from(record.direction == TapDirection::Out);
+        let verdict = match record.verdict {
+            TapVerdict::Rejected(why) => {
+                let nth = Rejection::ALL.iter().position(|other| *other == why).unwrap_or(0);
+                u8::try_from(nth + 2).unwrap_or(u8::MAX)
+            }
+            TapVerdict::Link => 1,
+            _ => 0,
+        };
+        let (has_id, id) = match record.can_id {
+            None => (0, 0),
+            Some(CanId::Standard(id)) => (1, u32::from(id)),
+            Some(CanId::Extended(id)) => (2, id),
+        };
+        self.head(FRAME, record.at);
+        self.put(&[kind, place, direction, verdict, has_id]);
+        self.put(&id.to_le_bytes());
+        self.put(&u32::try_from(record.len).unwrap_or(u32::MAX).to_le_bytes());
+        self.put(record.bytes);
+    }
+
+    fn head(&mut self, kind: u8, at: Instant) {
+        self.message.clear();
+        self.is_too_long = false;
+        let lost = self.lost[usize::from(kind == PASS)];
+        // The length is written when it is known.
+        self.put(&[0; 4]);
+        self.put(&[kind]);
+        self.put(&lost.to_le_bytes());
+        self.put(&at.as_micros().to_le_bytes());
+    }
+
+    fn entry(&mut self, entry: &Entry<'_>) {
+        entry.encode(|bytes| self.put(bytes));
+    }
+
+    /// Appends to the message, whose memory was allocated at the start.
+    fn put(&mut self, bytes: &[u8]) {
+        if self.message.capacity() - self.message.len() >= bytes.len() {
+            self.message.extend_from_slice(bytes);
+        } else {
+            self.is_too_long = true;
+        }
+    }
+
+    /// Hands the message over, or loses it.
+    fn push(&mut self, kind: u8) {
+        let len = u32::try_from(self.message.len()).unwrap_or(0);
+        if let Some(place) = self.message.first_chunk_mut() {
+            *place = len.to_le_bytes();
+        }
+        let lost = &mut self.lost[usize::from(kind == PASS)];
+        let is_kept = !self.is_too_long && self.ring.push_entire_slice(&self.message).is_ok();
+        *lost = if is_kept { 0 } else { lost.saturating_add(1) };
+    }
+}
+
+impl Drop for Tapping {
+    fn drop(&mut self) {
+        // The reader sees that the ring was abandoned, and takes what is in it.
+        let (ring, _) = RingBuffer::new(0);
+        self.ring = ring;
+        if let Some(reader) = self.reader.take() {
+            reader.thread().unpark();
+            let _ = reader.join();
+        }
+    }
+}
+
+/// The other side of the ring, on a thread of its own.
+struct Reader {
+    watch: Watch,
+    ring: Consumer<u8>,
+    message: Vec<u8>,
+}
+
+impl Reader {
+    fn run(mut self, began: Record) {
+        self.watch.read_here();
+        self.watch.give(began);
+        loop {
+            // In this order: what is abandoned gets nothing more.
+            let is_abandoned = self.ring.is_abandoned();
+            while let Some(record) = self.next() {
+                self.watch.give(record);
+            }
+            if is_abandoned {
+                return;
+            }
+            if self.watch.wanted() == recipe_capture::Interest::default() {
+                std::thread::park();
+            } else {
+                std::thread::park_timeout(READ_INTERVAL);
+            }
+        }
+    }
+
+    fn next(&mut self) -> Option<Record> {
+        let mut len = [0; 4];
+        self.ring.pop_entire_slice(&mut len).ok()?;
+        // A message is in the ring as a whole.
+        self.message.resize((u32::from_le_bytes(len) as usize).saturating_sub(len.len()), 0);
+        self.ring.pop_entire_slice(&mut self.message).ok()?;
+        parse(&self.message)
+    }
+}
+
+fn parse(message: &[u8]) -> Option<Record> {
+    let (&kind, rest) = message.split_first()?;
+    let (lost, rest) = rest.split_first_chunk()?;
+    let (at, rest) = rest.split_first_chunk()?;
+    let what = match kind {
+        PASS => What::Pass(rest.into()),
+        _ => {
+            let (&[kind, place, direction, verdict, has_id], rest) = rest.split_first_chunk()?;
+            let (id, rest) = rest.split_first_chunk()?;
+            let (len, bytes) = rest.split_first_chunk()?;
+            let id = u32::from_le_bytes(*id);
+            What::Frame(Frame {
+                place: if kind == 0 { TapPlace::Port(PortId(place)) } else { TapPlace::Link(LinkId(place)) },
+                direction: if direction == 0 { TapDirection::In } else { TapDirection::Out },
+                verdict: match verdict {
+                    0 => TapVerdict::Taken,
+                    1 => TapVerdict::Link,
+                    nth => TapVerdict::Rejected(*Rejection::ALL.get(usize::from(nth) - 2)?),
+                },
+                can_id: match has_id {
+                    0 => None,
+                    1 => Some(CanId::Standard(u16::try_from(id).ok()?)),
+                    _ => Some(CanId::Extended(id)),
+                },
+                len: u32::from_le_bytes(*len) as usize,
+                bytes: bytes.into(),
+            })
+        }
+    };
+    Some(Record { at: Instant::from_micros(u64::from_le_bytes(*at)), lost: u32::from_le_bytes(*lost), what })
+}
+
+/// Kinds of messages.
+const FRAME: u8 = 0;
+const PASS: u8 = 1;
+
+#[cfg(test)]
+#[path = "tapping_tests.rs"]
+mod tests;
