@@ -6,7 +6,7 @@ use proto_core::wire::can::CanFrame;
 use super::due::Due;
 use super::line::{Chunk, Chunking};
 use super::sleep::PortEvent;
-use super::{AnyPort, BusId, Cell, End, LineId};
+use super::{AnyPort, BusId, Cell, End, LineId, SlaveDone};
 use recipe_controller::ControllerInput;
 
 impl Cell {
@@ -42,7 +42,7 @@ impl Cell {
                 if arrives {
                     line.hear(now, &chunk.bytes, chunk.is_first);
                     answers = line.device.as_mut().map_or_else(Vec::new, |d| d.receive(now, &chunk.bytes));
-                    self.slaves_did(id);
+                    self.line_did(id);
                 }
                 if chunk.is_last {
                     self.port_sent(owner);
@@ -54,12 +54,22 @@ impl Cell {
         }
     }
 
-    /// The model is told what the slaves of a line did.
-    pub(super) fn slaves_did(&mut self, id: LineId) {
+    /// The model is told what the devices of a line did.
+    pub(super) fn line_did(&mut self, id: LineId) {
         let line = &mut self.lines[id.0];
-        let (AnyPort::Gateway(port), Some(device)) = (line.owner, &mut line.device) else { return };
-        let done = device.take_done();
-        if let Some(oracle) = &mut self.oracle {
+        let done = line.device.as_mut().map_or_else(Vec::new, |device| device.take_done());
+        self.device_did(self.lines[id.0].owner, done);
+    }
+
+    /// Same, of a bus.
+    pub(super) fn bus_did(&mut self, id: BusId) {
+        let bus = &mut self.buses[id.0];
+        let done = bus.device.as_mut().map_or_else(Vec::new, |device| device.take_done());
+        self.device_did(self.buses[id.0].owner, done);
+    }
+
+    fn device_did(&mut self, owner: AnyPort, done: Vec<SlaveDone>) {
+        if let (AnyPort::Gateway(port), Some(oracle)) = (owner, &mut self.oracle) {
             done.into_iter().for_each(|done| oracle.slave_did(usize::from(port.0), done, self.now));
         }
     }
@@ -101,6 +111,7 @@ impl Cell {
             End::Port => {
                 if let Some(device) = bus.device.as_mut().filter(|_| crossed.arrives) {
                     answers = device.receive(now, &crossed.frame);
+                    self.bus_did(id);
                 }
                 if crossed.was_last {
                     self.port_sent(owner);

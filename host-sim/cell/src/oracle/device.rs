@@ -9,6 +9,8 @@ use proto_core::config::{FieldSpec, GatewayConfig, InputBinding, OutputBinding, 
 use proto_core::device::{Algorithm, Boundary, ByteOrder, Checksum, Crc, Encoding, Kind, Overflow, Width};
 use proto_core::wire::scalar::ScalarType;
 
+use super::spec::Frame;
+
 /// The places of a frame's fields.
 #[derive(Debug, Clone, Default)]
 pub(super) struct DeviceSpec {
@@ -18,6 +20,21 @@ pub(super) struct DeviceSpec {
     sum: Option<(Checksum, Range<usize>, Range<usize>)>,
     /// Bytes of fields and checksum.
     pub len: usize,
+}
+
+/// What bytes are, seen as a frame that begins with the first of them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Look {
+    /// None begins here.
+    No,
+    /// Perhaps one begins here.
+    Begins,
+    /// A frame of so many bytes.
+    Frame(usize),
+    /// One whose checksum is right, and of which a constant is another device's.
+    Other(usize),
+    /// One whose checksum is wrong.
+    Wrong(usize),
 }
 
 /// What a whole frame turns out to be.
@@ -32,11 +49,7 @@ pub(super) enum Seen {
 }
 
 impl DeviceSpec {
-    /// `None` for the fields of a plain recipe.
-    pub(super) fn new(head: usize, fields: &[FieldSpec]) -> Option<Self> {
-        if !fields.iter().any(FieldSpec::is_device) {
-            return None;
-        }
+    pub(super) fn new(head: usize, fields: &[FieldSpec]) -> Self {
         let mut spec = Self::default();
         let (mut at, mut first) = (head, head);
         for field in fields {
@@ -61,16 +74,14 @@ impl DeviceSpec {
             }
         }
         spec.len = at - head;
-        Some(spec)
+        spec
     }
 
     /// What a whole frame with the right head, tail and length is.
     pub(super) fn see(&self, fields: &[FieldSpec], frame: &[u8]) -> Seen {
-        let is_ours = fields.iter().zip(&self.places).all(|(field, place)| match field {
-            FieldSpec::Fixed { encoding, value } => {
-                read(encoding, &frame[place.clone()]) == Some(*value as f64)
-            }
-            _ => true,
+        let is_ours = fields.iter().zip(&self.places).all(|(field, place)| {
+            constant(field)
+                .is_none_or(|(encoding, value)| read(&encoding, &frame[place.clone()]) == Some(value))
         });
         match (self.sum_is_right(frame), is_ours) {
             (None, false) => Seen::Nothing,
@@ -97,6 +108,56 @@ impl DeviceSpec {
             found == bytes
         })
     }
+}
+
+/// What bytes of a line are, seen as this frame.
+pub(super) fn look(frame: &Frame, bytes: &[u8]) -> Look {
+    let seen = bytes.len().min(frame.head.len());
+    if bytes[..seen] != frame.head[..seen] {
+        return Look::No;
+    }
+    let Some(whole) = bytes.get(..frame.len()) else { return Look::Begins };
+    let Some(device) = frame.device.as_ref().filter(|_| whole.ends_with(&frame.tail)) else {
+        return Look::No;
+    };
+    match device.see(&frame.fields, whole) {
+        Seen::Ours => Look::Frame(whole.len()),
+        Seen::Other => Look::Other(whole.len()),
+        Seen::WrongChecksum => Look::Wrong(whole.len()),
+        Seen::Nothing => Look::No,
+    }
+}
+
+/// Whether two frames of the same direction can have the same bytes, so that nobody could tell them apart.
+pub(super) fn can_be_the_same(one: &Frame, other: &Frame) -> bool {
+    let (Some(of_one), Some(of_other)) = (&one.device, &other.device) else { return false };
+    let constants = |frame: &'_ Frame, device: &'_ DeviceSpec| -> Vec<(Range<usize>, Encoding, u64)> {
+        let fields = frame.fields.iter().zip(&device.places);
+        let of = |(field, place): (&FieldSpec, &Range<usize>)| {
+            constant(field).map(|(encoding, value)| (place.clone(), encoding, value.to_bits()))
+        };
+        fields.filter_map(of).collect()
+    };
+    let others = constants(other, of_other);
+    let differ = constants(one, of_one).into_iter().any(|(place, encoding, value)| {
+        others.iter().any(|other| (&other.0, &other.1) == (&place, &encoding) && other.2 != value)
+    });
+    (one.id, &one.head, &one.tail, one.len()) == (other.id, &other.head, &other.tail, other.len()) && !differ
+}
+
+/// The encoding and the number of a field that is the same in every frame.
+fn constant(field: &FieldSpec) -> Option<(Encoding, f64)> {
+    let (encoding, overflow, number) = match *field {
+        FieldSpec::Fixed { encoding, value } => return Some((encoding, value as f64)),
+        FieldSpec::UserOutput { ty, from: OutputBinding::Constant(number) } => {
+            (Encoding::scalar(ty), Overflow::Usual, number)
+        }
+        FieldSpec::DeviceOutput { encoding, overflow, from: OutputBinding::Constant(number) } => {
+            (encoding, overflow, number)
+        }
+        _ => return None,
+    };
+    Some((encoding, shown_as(&encoding, overflow, number)))
 }
 
 fn sum_bytes(sum: &Checksum) -> usize {

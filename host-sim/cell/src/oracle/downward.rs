@@ -40,8 +40,18 @@ pub(super) struct Downward {
 }
 
 impl Downward {
-    fn is_usable(&self) -> bool {
+    pub(super) fn is_usable(&self) -> bool {
         self.is_up && !self.is_bus_off
+    }
+
+    /// Whether what was handed over has not left, or the line is somebody else's.
+    pub(super) fn is_busy(&self) -> bool {
+        self.in_flight
+    }
+
+    /// The line is somebody else's until [`Self::sent`].
+    pub(super) fn hold(&mut self) {
+        self.in_flight = true;
     }
 
     fn may_send(&self, port: &PortSpec, now: Instant) -> bool {
@@ -155,6 +165,7 @@ impl Downward {
         self.frames_out = self.frames_out.wrapping_add(1);
         self.bytes_out = self.bytes_out.wrapping_add(len as u32);
         self.cycles = self.cycles.wrapping_add(1);
+        self.in_flight = true;
     }
 
     /// Checks a frame that the engine hands over; `id` is that of a CAN frame.

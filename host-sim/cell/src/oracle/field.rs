@@ -10,7 +10,7 @@ use proto_core::wire::can::CanFrame;
 use proto_core::wire::scalar::{Scalar, ScalarType};
 
 use super::bits::Coils;
-use super::device::{self, DeviceSpec, Seen};
+use super::device::{self, Look, Seen};
 use super::spec::{Frame, PortSpec, Raw};
 
 /// Whether a frame is accepted.
@@ -92,8 +92,8 @@ impl LineWatch {
         self.heard = now;
         let Some(frame) = port.inputs.first() else { return Vec::new() };
         self.held.extend_from_slice(bytes);
-        if let Some(device) = &frame.device {
-            return self.cut_device(frame, device);
+        if frame.device.is_some() {
+            return self.cut_device(frame);
         }
         self.cut(frame).iter().map(|payload| judge(port.mode, frame, 0, payload)).collect()
     }
@@ -124,34 +124,26 @@ impl LineWatch {
     }
 
     /// Removes complete frames of a device from the held bytes.
-    fn cut_device(&mut self, frame: &Frame, device: &DeviceSpec) -> Vec<Verdict> {
+    fn cut_device(&mut self, frame: &Frame) -> Vec<Verdict> {
         let mut found = Vec::new();
         while !self.held.is_empty() {
-            let seen = self.held.len().min(frame.head.len());
-            let begins = self.held[..seen] == frame.head[..seen];
-            if begins && self.held.len() < frame.len() {
-                break;
-            }
-            let whole = self.held.get(..frame.len()).filter(|whole| begins && whole.ends_with(&frame.tail));
-            let (verdict, taken) = match whole.map_or(Seen::Nothing, |whole| device.see(&frame.fields, whole))
-            {
-                Seen::Ours => (Some(judge_device(frame, 0, &self.held[..frame.len()])), frame.len()),
-                Seen::Other => (Some(Verdict::OtherDevice), frame.len()),
-                Seen::WrongChecksum if self.missing.0 == Some(0) => {
-                    self.missing.0 = Some(frame.len());
-                    (Some(Verdict::WrongChecksum), 1)
+            match device::look(frame, &self.held) {
+                Look::Begins => break,
+                Look::No => self.drop_one(),
+                Look::Wrong(len) => {
+                    if self.drop_wrong(len) {
+                        found.push(Verdict::WrongChecksum);
+                    }
                 }
-                Seen::WrongChecksum | Seen::Nothing => (None, 1),
-            };
-            if taken == 1 {
-                self.dropped += 1;
-                self.missing.0 = self.missing.0.and_then(|missing| missing.checked_sub(1));
-            } else {
-                self.frame_bytes += taken as u64;
-                self.missing = Missing::default();
+                Look::Other(len) => {
+                    self.take_front(len);
+                    found.push(Verdict::OtherDevice);
+                }
+                Look::Frame(len) => {
+                    let whole = self.take_front(len);
+                    found.push(judge_device(frame, 0, &whole));
+                }
             }
-            self.held.drain(..taken);
-            found.extend(verdict);
         }
         found
     }
@@ -188,18 +180,32 @@ pub(super) fn can(port: &PortSpec, received: &CanFrame) -> Result<Verdict, Refus
     if received.is_remote() {
         return Err(Refused::Remote);
     }
-    let nth = port.inputs.iter().position(|frame| frame.id == Some(received.id()));
-    let nth = nth.ok_or(Refused::Id)?;
-    let frame = &port.inputs[nth];
-    if received.data().len() != frame.payload {
-        return Err(Refused::Length);
+    can_of(port.inputs.iter().enumerate(), port.mode, received)
+}
+
+/// The same, with the frames that it may be. Frames with one id are told apart by a constant.
+pub(super) fn can_of<'f>(
+    frames: impl Iterator<Item = (usize, &'f Frame)>,
+    mode: Mode,
+    received: &CanFrame,
+) -> Result<Verdict, Refused> {
+    let mut why = Err(Refused::Id);
+    for (nth, frame) in frames.filter(|(_, frame)| frame.id == Some(received.id())) {
+        let Some(device) = frame.device.as_ref().filter(|_| received.data().len() == frame.payload) else {
+            if frame.device.is_none() && received.data().len() == frame.payload {
+                return Ok(judge(mode, frame, nth, received.data()));
+            }
+            why = why.or(Err(Refused::Length));
+            continue;
+        };
+        why = match (device.see(&frame.fields, received.data()), why) {
+            (Seen::Ours, _) => return Ok(judge_device(frame, nth, received.data())),
+            // Right but for a constant: another device's, whatever the others say.
+            (Seen::Other | Seen::Nothing, _) | (_, Ok(Verdict::OtherDevice)) => Ok(Verdict::OtherDevice),
+            (Seen::WrongChecksum, _) => Ok(Verdict::WrongChecksum),
+        };
     }
-    let Some(device) = &frame.device else { return Ok(judge(port.mode, frame, nth, received.data())) };
-    Ok(match device.see(&frame.fields, received.data()) {
-        Seen::Ours => judge_device(frame, nth, received.data()),
-        Seen::Other | Seen::Nothing => Verdict::OtherDevice,
-        Seen::WrongChecksum => Verdict::WrongChecksum,
-    })
+    why
 }
 
 /// Judges the data of a reply.
@@ -215,7 +221,7 @@ pub(super) fn judge_data(frame: &Frame, nth: usize, data: &[u8]) -> Verdict {
 }
 
 /// The fields are judged one after the other: the first that cannot be used rejects the frame.
-fn judge_device(frame: &Frame, nth: usize, whole: &[u8]) -> Verdict {
+pub(super) fn judge_device(frame: &Frame, nth: usize, whole: &[u8]) -> Verdict {
     let mut accepted = Accepted { frame: nth, ..Accepted::default() };
     let places = frame.device.iter().flat_map(|device| &device.places);
     // Command fields are counted without the checksum, as they are no elements of it.

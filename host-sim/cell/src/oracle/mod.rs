@@ -35,6 +35,7 @@ use proto_core::time::{Duration, Instant};
 use commands::Commands;
 use downward::Downward;
 use field::LineWatch;
+use gateway::Leaving;
 use invariant::ALL;
 pub use invariant::{Invariant, Violation};
 pub(super) use robot::Path;
@@ -167,7 +168,7 @@ impl Oracle {
         for port in engine.field_ports() {
             let watch = &mut self.ports[usize::from(port.0)];
             watch.down.is_up = true;
-            watch.talk.begin(now);
+            watch.talk.begin(self.spec.ports[usize::from(port.0)].talk.as_ref(), now);
         }
     }
 
@@ -243,20 +244,8 @@ impl Oracle {
         match *input {
             Input::PortBytes { port, bytes } => self.port_bytes(usize::from(port.0), bytes, now),
             Input::PortCan { port, frame } => self.port_can(usize::from(port.0), &frame, now),
-            Input::PortSent { port } => {
-                let nth = usize::from(port.0);
-                self.ports[nth].down.sent();
-                if let Some(talk) = &self.spec.ports[nth].talk {
-                    self.ports[nth].talk.left(talk, now);
-                }
-            }
-            Input::PortUp { port } => {
-                let watch = &mut self.ports[usize::from(port.0)];
-                watch.down.is_up = true;
-                watch.talk.begin(now);
-                // What rises from now on asks.
-                self.talk_values_changed();
-            }
+            Input::PortSent { port } => self.port_sent(usize::from(port.0), now),
+            Input::PortUp { port } => self.port_up(usize::from(port.0), now),
             Input::PortDown { port } => {
                 let nth = usize::from(port.0);
                 let watch = &mut self.ports[nth];
@@ -272,11 +261,14 @@ impl Oracle {
                 let watch = &mut self.ports[nth];
                 let is_off = state == BusState::BusOff;
                 let is_news = is_off && !watch.down.is_bus_off;
-                watch.down.is_bus_off = is_off;
+                let was_off = std::mem::replace(&mut watch.down.is_bus_off, is_off);
                 if is_news {
                     watch.counters.bus_offs += 1;
                     watch.down.reset();
+                    watch.talk.gone();
                     self.forget_commands(nth, None, now);
+                } else if was_off && !is_off {
+                    self.begin_talk(nth, now);
                 }
             }
             Input::LinkUp { link } => {
@@ -312,8 +304,13 @@ impl Oracle {
         };
         self.judge(now, &[Invariant::Work], result);
         match *output {
-            Output::PortSend { port, bytes } => self.port_send(port, None, bytes, now),
-            Output::PortSendCan { port, frame } => self.port_send(port, Some(frame.id()), frame.data(), now),
+            Output::PortSend { port, bytes } => {
+                self.port_send(port, &Leaving { id: None, is_remote: false, bytes }, now);
+            }
+            Output::PortSendCan { port, frame } => {
+                let (id, is_remote) = (Some(frame.id()), frame.is_remote());
+                self.port_send(port, &Leaving { id, is_remote, bytes: frame.data() }, now);
+            }
             Output::LinkClose { link } => self.link_lost(link, now),
             Output::LinkSend { link, bytes } => {
                 self.traffic[place(link)].0 += 1;

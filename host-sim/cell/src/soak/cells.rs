@@ -43,7 +43,7 @@ macro_rules! embedded {
 
 /// A seed selects by position, so the order must not change. Controllers of examples that have field ports
 /// of their own are replaced, since no device would be connected to them.
-const EMBEDDED: [Embedded; 13] = [
+const EMBEDDED: [Embedded; 14] = [
     embedded!("/../configs/", "rs485-system", "can-hand"),
     embedded!("/../configs/", "udp-server", "udp-server"),
     embedded!("/../configs/", "client", "client"),
@@ -57,6 +57,7 @@ const EMBEDDED: [Embedded; 13] = [
     embedded!("/src/soak/cells/", "witness", "witness"),
     embedded!("/src/soak/cells/", "panels", "panels"),
     embedded!("/src/soak/cells/", "modbus-line", "modbus-line"),
+    embedded!("/src/soak/cells/", "gripper-line", "gripper-line"),
 ];
 
 impl Scenario {
@@ -105,7 +106,8 @@ impl Scenario {
 
 #[cfg(test)]
 mod tests {
-    use proto_core::config::{AskWhen, Exchange, Talk};
+    use proto_core::config::{AskWhen, Exchange, Span, Talk};
+    use proto_core::modbus::rtu::Operation;
 
     use super::*;
     use crate::Cell;
@@ -119,11 +121,12 @@ mod tests {
     }
 
     #[test]
-    fn a_cell_with_devices_that_are_asked_in_their_own_frames_is_refused() {
+    fn a_cell_that_the_model_does_not_know_is_refused() {
         let mut config = Scenario::all().unwrap().remove(0).gateway;
         assert_eq!(unmodelled(&config), None);
-        let talk = Talk::Frames { request: None, reply: None, refusal: None };
-        config.exchanges.push(Exchange::new(0, talk, AskWhen::NEVER)).unwrap();
-        assert!(unmodelled(&config).unwrap().contains("exchanges"));
+        let operation = Operation::ReadCoils { address: 0, count: 1 };
+        let talk = Talk::Served { operation, written: Span::default(), read: Span::default() };
+        config.exchanges.push(Exchange::new(1, talk, AskWhen::NEVER)).unwrap();
+        assert!(unmodelled(&config).unwrap().contains("slave"));
     }
 }

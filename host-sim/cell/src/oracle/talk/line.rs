@@ -1,10 +1,10 @@
-//! The conversation on one line: the request on its way, its reply, and who is asked when
-//! (proto-core/docs/wire/modbus-rtu.md sections 4 and 5).
+//! The conversation on one line or bus: the request on its way, its reply, and who is asked when
+//! (proto-core/docs/wire/modbus-rtu.md sections 4 and 5, docs/configuration.md section 4, "Conversations").
 //!
 //! It does not predict which request is next: it says which ones may be sent, which must not, and how
 //! long none may be.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use proto_core::time::{Duration, Instant};
 
@@ -30,6 +30,10 @@ pub(in crate::oracle) struct TalkWatch {
     /// Exchanges that a rising bit wants.
     risen: BTreeMap<usize, bool>,
     last_bits: BTreeMap<usize, bool>,
+    /// Exchanges that are to be asked at the start and have not been asked since, by slave.
+    opening: BTreeMap<u8, BTreeSet<usize>>,
+    /// Those of them whose values were unknown or stale meanwhile, so that they may have been passed over.
+    passed: BTreeSet<usize>,
     pub unanswered: u32,
     pub refused: u32,
     /// When the port came up.
@@ -77,12 +81,17 @@ struct SlaveWatch {
 
 impl TalkWatch {
     /// The device of the port is there, perhaps another one.
-    pub(in crate::oracle) fn begin(&mut self, now: Instant) {
+    pub(in crate::oracle) fn begin(&mut self, talk: Option<&TalkSpec>, now: Instant) {
         self.abandon();
         self.slaves.clear();
         self.asked.clear();
         self.risen.clear();
         self.last_bits.clear();
+        self.opening.clear();
+        self.passed.clear();
+        for row in talk.iter().flat_map(|talk| &talk.rows).filter(|row| row.at_start) {
+            self.opening.entry(row.slave).or_default().insert(row.nth);
+        }
         (self.began, self.disturbed_at) = (now, now);
     }
 
@@ -109,6 +118,12 @@ impl TalkWatch {
         self.flight.is_none() && self.repeat.is_none() && !self.leaving
     }
 
+    /// Looks for exchanges that are to be asked at the start and cannot be.
+    pub(super) fn look_at_opening(&mut self, can_ask: impl Fn(usize) -> bool) {
+        let Self { opening, passed, .. } = self;
+        passed.extend(opening.values().flatten().copied().filter(|&row| !can_ask(row)));
+    }
+
     /// Bits that ask have changed.
     pub(super) fn watch(&mut self, talk: &TalkSpec, bit: impl Fn(&RowSpec) -> Option<bool>) {
         for (nth, row) in talk.rows.iter().enumerate().filter(|(_, row)| row.rising.is_some()) {
@@ -126,13 +141,13 @@ impl TalkWatch {
         port: &PortSpec,
         talk: &TalkSpec,
         (row, request): (usize, &[u8]),
-        heard: Instant,
+        (heard, is_busy): (Instant, bool),
         now: Instant,
     ) -> Result<(), Wrong> {
         let spec = &talk.rows[row];
         let wrong = |what: &str| Err((Invariant::Line, format!("{}: {what}", name(spec))));
-        if self.leaving || self.flight.is_some() {
-            return wrong("asked while another request is on its way");
+        if self.leaving || self.flight.is_some() || is_busy {
+            return wrong("asked while another transmission is on its way");
         }
         if now < heard + port.turnaround {
             return wrong("asked before the line was silent for long enough");
@@ -164,6 +179,10 @@ impl TalkWatch {
             return Err((Invariant::Periods, what));
         }
         slave.asked = now;
+        if let Some(first) = self.comes_first(spec.slave, row) {
+            let what = format!("{}: asked before {}, which comes first", name(spec), name(&talk.rows[first]));
+            return Err((Invariant::Cycle, what));
+        }
         let began = repeated.as_ref().map_or(now, |failed| failed.began);
         if repeated.is_none() {
             self.asked.insert(row, now);
@@ -182,8 +201,23 @@ impl TalkWatch {
         Ok(())
     }
 
+    /// What is to be asked at the start of a slave before this exchange, and could be.
+    fn comes_first(&self, slave: u8, row: usize) -> Option<usize> {
+        let opening = self.opening.get(&slave)?;
+        let first = *opening.iter().find(|nth| !self.passed.contains(*nth))?;
+        let is_itself = first == row || opening.contains(&row) && row < first;
+        (!is_itself).then_some(first)
+    }
+
+    fn is_opened(&mut self, slave: u8, row: usize) {
+        self.passed.remove(&row);
+        if let Some(opening) = self.opening.get_mut(&slave) {
+            opening.remove(&row);
+        }
+    }
+
     /// The request has left.
-    pub(in crate::oracle) fn left(&mut self, talk: &TalkSpec, now: Instant) {
+    pub(in crate::oracle) fn left(&mut self, talk: &TalkSpec, turnaround: Duration, now: Instant) {
         self.leaving = false;
         if let Some(row) = self.held_by.take() {
             let spec = &talk.rows[row];
@@ -191,20 +225,31 @@ impl TalkWatch {
         }
         let Some(flight) = self.flight.as_mut().filter(|flight| flight.sent.is_none()) else { return };
         let spec = &talk.rows[flight.row];
-        if spec.slave == 0 {
-            self.flight = None;
-            self.free_at = now + spec.pause + AFTER_BROADCAST;
-        } else {
+        if spec.is_answered() {
             flight.sent = Some(now);
+        } else {
+            let row = flight.row;
+            self.flight = None;
+            self.free_at = now + spec.rest(turnaround);
+            self.is_opened(spec.slave, row);
         }
     }
 
+    /// Whether a reply is awaited to a request that has left.
+    pub(in crate::oracle) fn waits(&self) -> bool {
+        self.flight.as_ref().is_some_and(|flight| flight.sent.is_some())
+    }
+
     /// What the bytes that are held begin with.
-    pub(super) fn see(&self, talk: &TalkSpec, bytes: &[u8]) -> Seen {
-        match &self.flight {
-            Some(flight) => talk.rows[flight.row].see(&flight.request, bytes),
-            None => Seen::No,
-        }
+    pub(super) fn see(&self, port: &PortSpec, talk: &TalkSpec, bytes: &[u8]) -> Seen {
+        let answer =
+            self.flight.as_ref().map_or(Seen::No, |flight| talk.rows[flight.row].see(&flight.request, bytes));
+        answer.or(talk.see_unasked(port, bytes))
+    }
+
+    /// The exchange that a reply is awaited to.
+    pub(super) fn awaits<'t>(&self, talk: &'t TalkSpec) -> Option<&'t RowSpec> {
+        self.flight.as_ref().map(|flight| &talk.rows[flight.row])
     }
 
     pub(super) fn heard_wrong(&mut self) {
@@ -217,6 +262,7 @@ impl TalkWatch {
     pub(super) fn answered(&mut self, talk: &TalkSpec, is_refusal: bool, now: Instant) -> Option<Flight> {
         let flight = self.flight.take()?;
         let spec = &talk.rows[flight.row];
+        self.is_opened(spec.slave, flight.row);
         self.refused = self.refused.wrapping_add(u32::from(is_refusal));
         self.free_at = now + spec.pause;
         let slave = self.slaves.entry(spec.slave).or_default();
@@ -269,6 +315,11 @@ impl TalkWatch {
         if self.risen.contains_key(&flight.row) {
             self.risen.insert(flight.row, true);
         }
+        // It may have lost its power.
+        let at_start = talk.rows_of(spec.slave).filter(|(_, row)| row.at_start).map(|(nth, _)| nth);
+        let at_start: Vec<usize> = at_start.collect();
+        self.passed.retain(|row| !at_start.contains(row));
+        self.opening.entry(spec.slave).or_default().extend(at_start);
         Some(spec.slave)
     }
 
@@ -279,24 +330,28 @@ impl TalkWatch {
         &self,
         port: &PortSpec,
         talk: &TalkSpec,
-        heard: Instant,
+        (heard, is_busy): (Instant, bool),
         stalled: impl Fn(Instant) -> Duration,
         now: Instant,
     ) -> Result<u64, Wrong> {
         let mut checked = 0;
         let free = self.free_at.max(heard + port.turnaround).max(self.disturbed_at);
         for (nth, row) in talk.rows.iter().enumerate() {
-            let (Some(every), Some(&asked), None) = (row.every, self.asked.get(&nth), &row.request) else {
+            let (Some(every), Some(&asked), true) = (row.every, self.asked.get(&nth), row.is_always_ready())
+            else {
                 continue;
             };
             let Some(slave) = self.slaves.get(&row.slave) else { continue };
-            if slave.presence != Presence::Up {
+            // Nothing is known of a device that nobody expects an answer of.
+            let is_mute = slave.presence == Presence::Unknown
+                && talk.rows_of(row.slave).all(|(_, row)| !row.is_answered());
+            if slave.presence != Presence::Up && !is_mute {
                 continue;
             }
             checked += 1;
             let due = (asked + every).max(free).max(slave.held_until).max(slave.since);
             let idle = now.saturating_since(due);
-            if self.is_free() && idle > IDLE + stalled(due) {
+            if self.is_free() && !is_busy && idle > IDLE + stalled(due) {
                 let what = format!("{}: its period has ended, and the line is free for {idle}", name(row));
                 return Err((Invariant::Periods, what));
             }
@@ -331,11 +386,12 @@ impl TalkWatch {
 
 /// The exchange in words.
 pub(super) fn name(row: &RowSpec) -> String {
+    if row.frames.is_some() {
+        return format!("exchange {} with device {}", row.nth + 1, row.slave);
+    }
     format!("slave {}, function {} at {}", row.slave, row.function, row.address)
 }
 
-/// After a request to all slaves, nothing is sent for this long.
-const AFTER_BROADCAST: Duration = Duration::from_millis(100);
 /// A free line with something to do is not left idle for longer.
 const IDLE: Duration = Duration::from_millis(5);
 /// A slave that does not answer is asked again after this at the latest, if the line has a gap.
