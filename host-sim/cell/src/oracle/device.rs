@@ -5,7 +5,7 @@
 
 use std::ops::Range;
 
-use proto_core::config::{FieldSpec, GatewayConfig, InputBinding, OutputBinding, Parts};
+use proto_core::config::{FieldSpec, GatewayConfig, OutputBinding, Parts};
 use proto_core::device::{Algorithm, Boundary, ByteOrder, Checksum, Crc, Encoding, Kind, Overflow, Width};
 use proto_core::wire::scalar::ScalarType;
 
@@ -94,7 +94,9 @@ impl DeviceSpec {
     /// `None` without a checksum.
     pub(super) fn sum_is_right(&self, frame: &[u8]) -> Option<bool> {
         let (sum, place, covered) = self.sum.as_ref()?;
-        let number = checksum(&sum.algorithm, &frame[covered.clone()]);
+        let (id, covered) = (sum.data_id.bytes(), &frame[covered.clone()]);
+        let (before, behind) = if sum.data_id.is_behind() { (&[][..], id) } else { (id, &[][..]) };
+        let number = checksum(&sum.algorithm, &[before, covered, behind].concat());
         let len = if sum.text { place.len() / 2 } else { place.len() };
         let mut bytes = number.to_be_bytes()[4 - len..].to_vec();
         if sum.order == ByteOrder::Little {
@@ -217,33 +219,10 @@ pub(crate) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
             .any(|part| part.framing != Boundary::Fields || part.escape.is_some()),
         Parts::Can { .. } => false,
     });
-    let counts = config.fields.iter().any(|field| {
-        let counts_input = match field {
-            FieldSpec::UserInput { to, .. } | FieldSpec::DeviceInput { to, .. } => {
-                matches!(to, InputBinding::Counter { .. })
-            }
-            _ => false,
-        };
-        counts_input || matches!(field.source(), Some(OutputBinding::CounterTo { .. }))
-    });
-    let has_data_id = config
-        .fields
-        .iter()
-        .any(|field| matches!(field, FieldSpec::Checksum(sum) if !sum.data_id.bytes().is_empty()));
-    let view = config.view();
-    let has_one_id = view.recipes.iter().any(|recipe| match &recipe.parts {
-        Parts::Can { input, output } => [input, output].into_iter().any(|frames| {
-            frames.iter().enumerate().any(|(nth, frame)| frames[..nth].iter().any(|it| it.id == frame.id))
-        }),
-        Parts::Stream { .. } => false,
-    });
-    match (varies || is_cut, counts || has_one_id || has_data_id) {
-        (true, _) => Some("a soak cannot judge texts and frames of varying length"),
-        (_, true) => {
-            Some("a soak cannot judge counters that are checked, CAN frames with one id, and data ids")
-        }
-        _ => super::bits::unmodelled(config),
+    if varies || is_cut {
+        return Some("a soak cannot judge texts and frames of varying length");
     }
+    super::bits::unmodelled(config)
 }
 
 /// Number of bytes of a field. Fields of varying length are refused before a run.

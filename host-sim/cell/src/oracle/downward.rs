@@ -343,7 +343,7 @@ impl Downward {
                 ScalarType::Float => f64::from(self.cycles % (1 << 24)),
                 ScalarType::Dword | ScalarType::Double => f64::from(self.cycles),
             }),
-            OutputBinding::CounterTo { .. } => None,
+            OutputBinding::CounterTo { max } => Some((u64::from(self.cycles) % (u64::from(max) + 1)) as f64),
             OutputBinding::Reply | OutputBinding::State { .. } | OutputBinding::Port { .. } => None,
         }
     }

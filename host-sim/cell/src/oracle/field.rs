@@ -1,6 +1,8 @@
 //! The frames in the bytes that a field port received, and their values: a plain implementation of
 //! proto-core/docs/wire/recipes.md sections 4, 6 and 7.
 
+use std::collections::BTreeMap;
+
 use proto_core::config::{CommandWhen, FieldSpec, InputBinding, Span};
 use proto_core::device::{Encoding, Overflow};
 use proto_core::recipe::model::Mode;
@@ -25,6 +27,8 @@ pub(super) enum Verdict {
     WrongChecksum,
     /// A frame of another device.
     OtherDevice,
+    /// The alive counter is that of the frame before.
+    Repeated,
 }
 
 /// An accepted frame.
@@ -40,7 +44,14 @@ pub(super) struct Accepted {
     /// Values of command fields: the field's index in the frame, its table, when it picks a command, and the
     /// value.
     pub commands: Vec<(usize, Span, CommandWhen, i64)>,
+    /// The alive counters, each with the place of its field.
+    pub counts: Vec<((usize, usize), u32)>,
+    /// How many of them are not the next one.
+    pub jumps: u32,
 }
+
+/// The newest alive counters by frame and field.
+pub(super) type Counts = BTreeMap<(usize, usize), u32>;
 
 /// Why a CAN frame does not match the recipe.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -61,6 +72,8 @@ pub(super) struct LineWatch {
     pub frame_bytes: u64,
     /// How many bytes before the place where a device's next frame is expected; `None` if that is unknown.
     pub missing: Missing,
+    /// The alive counters of the accepted frames.
+    pub counts: Counts,
 }
 
 /// At first, and after silence, a frame is expected to begin at once.
@@ -123,6 +136,28 @@ impl LineWatch {
         self.held.drain(..len).collect()
     }
 
+    /// Judges a whole frame of a device, the port's `nth`.
+    pub(super) fn judge(&mut self, frame: &Frame, nth: usize, whole: &[u8]) -> Verdict {
+        let verdict = judge_device(frame, nth, whole, &self.counts);
+        if let Verdict::Accepted(accepted) = &verdict {
+            // A rejected frame moves no counter.
+            self.counts.extend(accepted.counts.iter().copied());
+        }
+        verdict
+    }
+
+    /// Judges the data of a reply.
+    pub(super) fn judge_data(&mut self, frame: &Frame, nth: usize, data: &[u8]) -> Verdict {
+        match &frame.device {
+            None => judge(Mode::User, frame, nth, data),
+            Some(device) => match device.see(&frame.fields, data) {
+                Seen::Ours => self.judge(frame, nth, data),
+                Seen::Other | Seen::Nothing => Verdict::OtherDevice,
+                Seen::WrongChecksum => Verdict::WrongChecksum,
+            },
+        }
+    }
+
     /// Removes complete frames of a device from the held bytes.
     fn cut_device(&mut self, frame: &Frame) -> Vec<Verdict> {
         let mut found = Vec::new();
@@ -141,7 +176,7 @@ impl LineWatch {
                 }
                 Look::Frame(len) => {
                     let whole = self.take_front(len);
-                    found.push(judge_device(frame, 0, &whole));
+                    found.push(self.judge(frame, 0, &whole));
                 }
             }
         }
@@ -176,17 +211,18 @@ impl LineWatch {
 }
 
 /// Receives a CAN frame.
-pub(super) fn can(port: &PortSpec, received: &CanFrame) -> Result<Verdict, Refused> {
+pub(super) fn can(port: &PortSpec, line: &mut LineWatch, received: &CanFrame) -> Result<Verdict, Refused> {
     if received.is_remote() {
         return Err(Refused::Remote);
     }
-    can_of(port.inputs.iter().enumerate(), port.mode, received)
+    can_of(port.inputs.iter().enumerate(), port.mode, line, received)
 }
 
 /// The same, with the frames that it may be. Frames with one id are told apart by a constant.
 pub(super) fn can_of<'f>(
     frames: impl Iterator<Item = (usize, &'f Frame)>,
     mode: Mode,
+    line: &mut LineWatch,
     received: &CanFrame,
 ) -> Result<Verdict, Refused> {
     let mut why = Err(Refused::Id);
@@ -199,7 +235,7 @@ pub(super) fn can_of<'f>(
             continue;
         };
         why = match (device.see(&frame.fields, received.data()), why) {
-            (Seen::Ours, _) => return Ok(judge_device(frame, nth, received.data())),
+            (Seen::Ours, _) => return Ok(line.judge(frame, nth, received.data())),
             // Right but for a constant: another device's, whatever the others say.
             (Seen::Other | Seen::Nothing, _) | (_, Ok(Verdict::OtherDevice)) => Ok(Verdict::OtherDevice),
             (Seen::WrongChecksum, _) => Ok(Verdict::WrongChecksum),
@@ -208,20 +244,8 @@ pub(super) fn can_of<'f>(
     why
 }
 
-/// Judges the data of a reply.
-pub(super) fn judge_data(frame: &Frame, nth: usize, data: &[u8]) -> Verdict {
-    match &frame.device {
-        None => judge(Mode::User, frame, nth, data),
-        Some(device) => match device.see(&frame.fields, data) {
-            Seen::Ours => judge_device(frame, nth, data),
-            Seen::Other | Seen::Nothing => Verdict::OtherDevice,
-            Seen::WrongChecksum => Verdict::WrongChecksum,
-        },
-    }
-}
-
 /// The fields are judged one after the other: the first that cannot be used rejects the frame.
-pub(super) fn judge_device(frame: &Frame, nth: usize, whole: &[u8]) -> Verdict {
+fn judge_device(frame: &Frame, nth: usize, whole: &[u8], counts: &Counts) -> Verdict {
     let mut accepted = Accepted { frame: nth, ..Accepted::default() };
     let places = frame.device.iter().flat_map(|device| &device.places);
     // Command fields are counted without the checksum, as they are no elements of it.
@@ -254,8 +278,20 @@ pub(super) fn judge_device(frame: &Frame, nth: usize, whole: &[u8]) -> Verdict {
                 accepted.commands.push((at, table, when, number as i64));
             }
             InputBinding::Bit { var, bit } => accepted.bits.push(coil(var, bit, number)),
-            // A configuration with counters is not judged.
-            InputBinding::Unused | InputBinding::Counter { .. } => {}
+            InputBinding::Counter { max } => {
+                let before = counts.get(&(nth, at)).copied();
+                if number > f64::from(max) {
+                    return Verdict::OutOfRange;
+                }
+                let number = number as u32;
+                if before == Some(number) {
+                    return Verdict::Repeated;
+                }
+                let next = |before: u32| if before >= max { 0 } else { before + 1 };
+                accepted.jumps += u32::from(before.is_some_and(|before| next(before) != number));
+                accepted.counts.push(((nth, at), number));
+            }
+            InputBinding::Unused => {}
         }
     }
     Verdict::Accepted(accepted)

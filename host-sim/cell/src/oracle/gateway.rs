@@ -156,7 +156,7 @@ impl Oracle {
         counters.bytes_in = counters.bytes_in.wrapping_add(frame.data().len() as u32);
         if self.discards_until.is_some() {
             counters.asleep += 1;
-            let verdict = field::can(port, frame);
+            let verdict = field::can(port, &mut LineWatch::default(), frame);
             self.waited_in_sleep(verdict.into_iter().collect());
             return;
         }
@@ -167,7 +167,7 @@ impl Oracle {
             counters.rejected_no_input += 1;
             return;
         }
-        let verdict = field::can(port, frame);
+        let verdict = field::can(port, &mut self.ports[nth].line, frame);
         self.take_can(nth, verdict, now);
     }
 
@@ -233,10 +233,15 @@ impl Oracle {
                     counters.rejected_other_device += 1;
                     continue;
                 }
+                Verdict::Repeated => {
+                    counters.rejected_counter += 1;
+                    continue;
+                }
                 Verdict::Accepted(frame) => frame,
             };
             counters.frames_in += 1;
             counters.masked += u32::from(frame.masked);
+            counters.counter_jumps += frame.jumps;
             self.frames[nth].0 += 1;
             frames += 1;
             let commands_up = self.up.is_up(LinkId::COMMAND);

@@ -29,7 +29,7 @@ pub(super) struct RandomDevice {
     templates: Vec<Template>,
     /// The newest values, by template.
     values: Vec<Vec<Scalar>>,
-    /// The port's timeout.
+    /// The port's timeout; if frames with alive counters take turns, the part of it that one has.
     timeout: Duration,
     /// Time of a frame on the line.
     frame_time: Duration,
@@ -63,12 +63,13 @@ impl RandomDevice {
         }
         let frame_time = config.view().budget(port, Direction::Input).map_or(Duration::ZERO, |b| b.time);
         let values = templates.iter().map(Template::zeros).collect();
+        let turns = if templates.iter().any(Template::counts) { templates.len() as u32 } else { 1 };
         let next = start + rng.up_to(port.timeout);
         Some(Self {
             rng,
             templates,
             values,
-            timeout: port.timeout,
+            timeout: Duration::from_micros(port.timeout.as_micros() / u64::from(turns)),
             frame_time,
             behaviour: Behaviour::Steady,
             behaviour_ends: start,
@@ -187,6 +188,10 @@ impl Device<CanFrame> for RandomDevice {
                 0 => data.truncate(self.rng.below(8) as usize),
                 1 => id = CanId::Standard(self.rng.below(0x800) as u16),
                 2 => is_remote = true,
+                _ if self.templates[nth].counts() => {
+                    let at = self.rng.below(data.len() as u64) as usize;
+                    data[at] ^= 1 << self.rng.below(8);
+                }
                 _ => {}
             }
         }

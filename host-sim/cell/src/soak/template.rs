@@ -32,6 +32,8 @@ pub(super) enum Content {
     Constant,
     /// No element of the frame: the layout makes it.
     Checksum,
+    /// A number that goes up with each frame, mostly by one, and from `max` to 0.
+    Counter { max: u32 },
     /// Numbers that sometimes pick commands.
     Commands { ty: ScalarType, values: Vec<i64> },
 }
@@ -77,6 +79,11 @@ impl Template {
         bytes
     }
 
+    /// Whether it has an alive counter.
+    pub(super) fn counts(&self) -> bool {
+        self.fields.iter().any(|content| matches!(content, Content::Counter { .. }))
+    }
+
     /// Whether others can see damage.
     pub(super) fn has_checksum(&self) -> bool {
         self.fields.iter().any(|content| matches!(content, Content::Checksum))
@@ -104,6 +111,8 @@ fn content(config: &GatewayConfig, field: &FieldSpec) -> Content {
         FieldSpec::UserInput { ty, to: InputBinding::Commands { table, .. } } => {
             Content::Commands { ty, values: table.of(&config.commands).iter().flat_map(ends).collect() }
         }
+        FieldSpec::UserInput { to: InputBinding::Counter { max }, .. }
+        | FieldSpec::DeviceInput { to: InputBinding::Counter { max }, .. } => Content::Counter { max },
         FieldSpec::UserInput { ty: ScalarType::Byte, .. } => Content::Bits,
         FieldSpec::UserInput { ty, .. } | FieldSpec::UserOutput { ty, .. } => {
             Content::Number { ty, most: 1e3 }
@@ -134,6 +143,7 @@ fn ends(entry: &CommandEntry) -> impl Iterator<Item = i64> + use<> {
 fn zero(content: &Content) -> Scalar {
     match content {
         Content::Bits | Content::Constant | Content::Checksum => Scalar::Byte(0),
+        Content::Counter { .. } => Scalar::Dword(0),
         Content::Number { ty, .. } | Content::Commands { ty, .. } => number(*ty, 0.0),
     }
 }
@@ -151,6 +161,13 @@ fn number(ty: ScalarType, value: f64) -> Scalar {
 pub(super) fn changed(rng: &mut Rng, content: &Content, before: Scalar) -> Scalar {
     match content {
         Content::Constant | Content::Checksum => before,
+        Content::Counter { max } => match (rng.below(80), before.as_f64() as u32) {
+            (0, before) => Scalar::Dword(before),
+            (1, _) => Scalar::Dword(max + 1),
+            (2 | 3, _) => Scalar::Dword(rng.below(u64::from(*max) + 1) as u32),
+            (_, before) if before >= *max => Scalar::Dword(0),
+            (_, before) => Scalar::Dword(before + 1),
+        },
         Content::Bits => match (rng.below(8), before) {
             (0, _) => Scalar::Byte(rng.next_u64() as u8),
             (1..5, Scalar::Byte(bits)) => Scalar::Byte(bits ^ 1 << rng.below(8)),

@@ -14,7 +14,7 @@ use proto_core::wire::can::CanFrame;
 use self::line::TalkWatch;
 use self::spec::{RowSpec, Seen, TalkSpec};
 use super::device::{Look, look};
-use super::field::{Verdict, judge_data, judge_device};
+use super::field::Verdict;
 use super::gateway::Leaving;
 use super::spec::PortSpec;
 use super::upward::Wrong;
@@ -48,7 +48,7 @@ impl Oracle {
                 }
                 Seen::Unasked(len, frame) => {
                     let whole = watch.line.take_front(len);
-                    verdicts.push(judge_device(&port.inputs[frame], frame, &whole));
+                    verdicts.push(watch.line.judge(&port.inputs[frame], frame, &whole));
                 }
                 Seen::Refusal(len) => {
                     let refusal = watch.line.take_front(len);
@@ -84,7 +84,7 @@ impl Oracle {
         let answers = awaited.into_iter().flat_map(|frames| frames.reply.iter().chain(&frames.refusal));
         let answers = answers.map(|own| (usize::MAX, own));
         let unasked = talk.unasked.iter().map(|&unasked| (unasked, &port.inputs[unasked]));
-        let verdict = super::field::can_of(answers.chain(unasked), port.mode, frame);
+        let verdict = super::field::can_of(answers.chain(unasked), port.mode, &mut watch.line, frame);
         self.take_can(nth, verdict, now);
     }
 
@@ -100,8 +100,8 @@ impl Oracle {
         let row = &talk.rows[flight.row];
         let result = self.truth.taken((nth, port), row, &flight, (reply, began), now);
         let verdict = row.reply.filter(|_| !is_refusal).map(|frame| match row.frames {
-            Some(_) => judge_device(&port.inputs[frame], frame, reply),
-            None => judge_data(&port.inputs[frame], frame, &reply[3..reply.len() - 2]),
+            Some(_) => watch.line.judge(&port.inputs[frame], frame, reply),
+            None => watch.line.judge_data(&port.inputs[frame], frame, &reply[3..reply.len() - 2]),
         });
         self.judge(now, &[Invariant::Held], result);
         verdict

@@ -12,11 +12,11 @@ use proto_core::time::{Duration, Instant};
 
 use super::line::{Flight, name};
 use super::spec::{RowSpec, TalkSpec};
+use crate::oracle::Invariant;
 use crate::oracle::device::{self, Look};
-use crate::oracle::field::{Verdict, as_number, show};
+use crate::oracle::field::{LineWatch, Verdict, as_number, show};
 use crate::oracle::spec::{Origin, PortSpec, Raw, Spec};
 use crate::oracle::upward::Wrong;
-use crate::oracle::{Invariant, field};
 use crate::{Done, SlaveDone};
 
 /// Slaves and controller.
@@ -155,6 +155,9 @@ impl Truth {
                 (0, Ok(()))
             }
             Done::Took { exchange, request } => {
+                if !talk.rows.get(exchange).is_some_and(RowSpec::is_written) {
+                    return (0, Ok(()));
+                }
                 let values: Vec<u16> = request.iter().copied().map(u16::from).collect();
                 let is_it = |row: &RowSpec| row.nth == exchange;
                 let result = self.wrote(spec, (nth, talk), (slave, &is_it), &values, stalled, now);
@@ -423,15 +426,14 @@ fn agrees(field: &FieldSpec, var: SysVar, raw: Raw, bytes: &[u8]) -> bool {
 /// The values of variables in a reply; none in a refusal.
 fn values_of(port: &PortSpec, row: &RowSpec, reply: &[u8]) -> Vec<(SysVar, Raw)> {
     let Some(nth) = row.reply else { return Vec::new() };
-    let frame = &port.inputs[nth];
+    // Alive counters do not matter here: the device knows what it had.
+    let (frame, mut apart) = (&port.inputs[nth], LineWatch::default());
     let verdict = match row.frames {
-        Some(_) if device::look(frame, reply) == Look::Frame(reply.len()) => {
-            field::judge_device(frame, nth, reply)
-        }
+        Some(_) if device::look(frame, reply) == Look::Frame(reply.len()) => apart.judge(frame, nth, reply),
         // A refusal.
         Some(_) => return Vec::new(),
         None if reply[1] & 0x80 != 0 => return Vec::new(),
-        None => field::judge_data(frame, nth, &reply[3..reply.len() - 2]),
+        None => apart.judge_data(frame, nth, &reply[3..reply.len() - 2]),
     };
     match verdict {
         Verdict::Accepted(accepted) => accepted.values,
