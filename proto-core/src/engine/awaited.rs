@@ -3,7 +3,7 @@
 //! In: the request on its way, and the frames that come unasked. Out: the frame's part in it. Applies
 //! nothing.
 
-use super::device_port::{DeviceFormat, better, probe};
+use super::device_port::{DeviceFormat, better, elements, probe};
 use super::exchanges::{Asks, InputFormat, Item};
 use super::line::Flight;
 use super::user::InputBind;
@@ -66,10 +66,25 @@ impl<'i> Awaited<'i> {
             },
             None => Probe::No(1),
         };
-        for format in self.answers().chain(self.unasked().map(|(format, _)| format)) {
+        for format in self.all() {
             best = better(best, probe(format, self.bindings, bytes));
         }
-        best
+        let Probe::Other(_) = best else { return best };
+        // One of ours may begin with what is a shorter frame by chance: a byte that is the same as that of
+        // the shorter one's checksum goes on with a right checksum.
+        let begun = |format: &DeviceFormat| match probe(format, self.bindings, bytes) {
+            Probe::Partial(missing) => {
+                let fields = elements(format.bindings.of(self.bindings));
+                format.layout.agrees(fields, bytes).then_some(missing)
+            }
+            _ => None,
+        };
+        self.all().filter_map(begun).min().map_or(best, Probe::Partial)
+    }
+
+    /// The frames that may come, but for those of Modbus.
+    fn all(&self) -> impl Iterator<Item = &'i DeviceFormat> {
+        self.answers().chain(self.unasked().map(|(format, _)| format))
     }
 
     /// What a frame of a line is that [`Self::probe`] has found.
