@@ -114,6 +114,23 @@ fn a_refusal_that_begins_as_a_shorter_frame_of_another_device_is_taken() {
     assert!(counters.rejected_other_device >= 2 && counters.unanswered == 0, "{counters:?}");
 }
 
+/// A device that repeats what it is told, behind an adapter that does so as well.
+#[test]
+fn an_echo_behind_a_late_reply_is_no_reply() {
+    let mut cell = Cell::new();
+    let both = [0, 1].map(|_| frame(&mut cell, None, b"Q", b"", vec![fixed(1)]));
+    let port = talking(&mut cell, &[asks(both[0], both[1], None, AskWhen::every(MS(50)))]);
+    let Bus::Rs485(settings) = &mut cell.last_port().bus else { panic!() };
+    settings.echo = true;
+    let mut line = Line::new(&cell, port);
+    line.run(MS(220), |request| Some((MS(3), [b"Z\x01", request].concat())));
+    let counters = line.rig.counters(port);
+    assert!(counters.frames_in == 0 && counters.unanswered > 0, "{counters:?}");
+    assert_eq!(counters.resync_bytes, counters.frames_out * 2, "{counters:?}");
+    line.run(MS(2_000), |request| Some((MS(3), [b"Z\x01", request, request].concat())));
+    assert!(line.rig.counters(port).frames_in > 10);
+}
+
 #[test]
 fn a_request_waits_for_a_frame_of_the_part_to_leave_and_the_part_for_the_reply() {
     let mut cell = Cell::new();
