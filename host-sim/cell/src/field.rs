@@ -28,17 +28,14 @@ impl Cell {
         let line = &mut self.lines[id.0];
         match chunk.from {
             End::Device if !arrives => {}
-            End::Device if let Chunking::Gathered(every) = line.chunking => {
-                if line.gathered.is_empty() {
-                    let every = every.as_micros().max(1);
-                    let at = Instant::from_micros(now.as_micros().div_ceil(every) * every);
-                    self.queue.push(at, Due::Gathered { line: id });
-                }
-                line.gathered.append(&mut chunk.bytes);
-            }
-            End::Device => self.port_receives(owner, &chunk.bytes),
+            End::Device => self.hand_on(id, owner, &chunk.bytes),
             End::Port => {
                 let mut answers = Vec::new();
+                if line.settings().echo && line.is_plugged {
+                    // The adapter gives back what the port sends, whether or not it reaches the device.
+                    self.hand_on(id, owner, &chunk.bytes);
+                }
+                let line = &mut self.lines[id.0];
                 if arrives {
                     line.hear(now, &chunk.bytes, chunk.is_first);
                     answers = line.device.as_mut().map_or_else(Vec::new, |d| d.receive(now, &chunk.bytes));
@@ -52,6 +49,18 @@ impl Cell {
                 }
             }
         }
+    }
+
+    /// The port's receiver has got bytes; its driver reports them at once or later.
+    fn hand_on(&mut self, id: LineId, owner: AnyPort, bytes: &[u8]) {
+        let line = &mut self.lines[id.0];
+        let Chunking::Gathered(every) = line.chunking else { return self.port_receives(owner, bytes) };
+        if line.gathered.is_empty() {
+            let every = every.as_micros().max(1);
+            let at = Instant::from_micros(self.now.as_micros().div_ceil(every) * every);
+            self.queue.push(at, Due::Gathered { line: id });
+        }
+        line.gathered.extend_from_slice(bytes);
     }
 
     /// The model is told what the devices of a line did.

@@ -27,8 +27,8 @@ pub(super) struct DeviceSpec {
 pub(super) enum Look {
     /// None begins here.
     No,
-    /// Perhaps one begins here.
-    Begins,
+    /// Perhaps one begins here; whether all constants so far are its own.
+    Begins { is_ours: bool },
     /// A frame of so many bytes.
     Frame(usize),
     /// One whose checksum is right, and of which a constant is another device's.
@@ -79,16 +79,20 @@ impl DeviceSpec {
 
     /// What a whole frame with the right head, tail and length is.
     pub(super) fn see(&self, fields: &[FieldSpec], frame: &[u8]) -> Seen {
-        let is_ours = fields.iter().zip(&self.places).all(|(field, place)| {
-            constant(field)
-                .is_none_or(|(encoding, value)| read(&encoding, &frame[place.clone()]) == Some(value))
-        });
-        match (self.sum_is_right(frame), is_ours) {
+        match (self.sum_is_right(frame), self.agrees(fields, frame)) {
             (None, false) => Seen::Nothing,
             (None | Some(true), true) => Seen::Ours,
             (Some(true), false) => Seen::Other,
             (Some(false), _) => Seen::WrongChecksum,
         }
+    }
+
+    /// Whether the constants that the bytes have completely are those of the frame.
+    fn agrees(&self, fields: &[FieldSpec], bytes: &[u8]) -> bool {
+        fields.iter().zip(&self.places).filter(|(_, place)| place.end <= bytes.len()).all(|(field, place)| {
+            constant(field)
+                .is_none_or(|(encoding, value)| read(&encoding, &bytes[place.clone()]) == Some(value))
+        })
     }
 
     /// `None` without a checksum.
@@ -118,7 +122,10 @@ pub(super) fn look(frame: &Frame, bytes: &[u8]) -> Look {
     if bytes[..seen] != frame.head[..seen] {
         return Look::No;
     }
-    let Some(whole) = bytes.get(..frame.len()) else { return Look::Begins };
+    let Some(whole) = bytes.get(..frame.len()) else {
+        let is_ours = frame.device.as_ref().is_some_and(|device| device.agrees(&frame.fields, bytes));
+        return Look::Begins { is_ours };
+    };
     let Some(device) = frame.device.as_ref().filter(|_| whole.ends_with(&frame.tail)) else {
         return Look::No;
     };

@@ -163,7 +163,7 @@ impl LineWatch {
         let mut found = Vec::new();
         while !self.held.is_empty() {
             match device::look(frame, &self.held) {
-                Look::Begins => break,
+                Look::Begins { .. } => break,
                 Look::No => self.drop_one(),
                 Look::Wrong(len) => {
                     if self.drop_wrong(len) {

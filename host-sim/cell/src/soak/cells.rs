@@ -43,7 +43,7 @@ macro_rules! embedded {
 
 /// A seed selects by position, so the order must not change. Controllers of examples that have field ports
 /// of their own are replaced, since no device would be connected to them.
-const EMBEDDED: [Embedded; 15] = [
+const EMBEDDED: [Embedded; 16] = [
     embedded!("/../configs/", "rs485-system", "can-hand"),
     embedded!("/../configs/", "udp-server", "udp-server"),
     embedded!("/../configs/", "client", "client"),
@@ -59,6 +59,7 @@ const EMBEDDED: [Embedded; 15] = [
     embedded!("/src/soak/cells/", "modbus-line", "modbus-line"),
     embedded!("/src/soak/cells/", "gripper-line", "gripper-line"),
     embedded!("/src/soak/cells/", "can-frames", "can-frames"),
+    embedded!("/src/soak/cells/", "panel-line", "panel-line"),
 ];
 
 impl Scenario {

@@ -203,6 +203,9 @@ impl Peers {
             Behaviour::Losing => return,
             Behaviour::Mistaken => {
                 let other = rng.below(asks.len() as u64) as usize;
+                if other == nth {
+                    return;
+                }
                 let Some(other) = asks[other].reply.as_mut().map(|reply| reply.next(rng)) else { return };
                 if template.begins(&other.bytes) && other.id == made.id {
                     return;

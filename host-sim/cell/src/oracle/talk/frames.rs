@@ -34,22 +34,24 @@ impl Seen {
     pub(super) fn of(look: Look, whole: impl FnOnce(usize) -> Self) -> Self {
         match look {
             Look::No => Self::No,
-            Look::Begins => Self::Begins,
+            Look::Begins { is_ours } => Self::Begins { is_ours },
             Look::Frame(len) => whole(len),
             Look::Other(len) => Self::Other(len),
             Look::Wrong(len) => Self::Wrong(len),
         }
     }
 
-    /// What bytes are that may be one of two frames: a frame is more than the beginning of one, and that
-    /// is more than a wrong checksum. Of equals, the first.
+    /// What bytes are that may be one of two frames: a frame is more than the beginning of one of ours, that
+    /// is more than one of others, and that is more than the beginning of one of others or a wrong
+    /// checksum. Of equals, the first.
     pub(super) fn or(self, other: Self) -> Self {
         let rank = |seen: &Self| match seen {
             Self::No => 0,
             Self::Wrong(_) => 1,
-            Self::Begins => 2,
+            Self::Begins { is_ours: false } => 2,
             Self::Other(_) => 3,
-            Self::Reply(_) | Self::Refusal(_) | Self::Unasked(..) => 4,
+            Self::Begins { is_ours: true } => 4,
+            Self::Echo(_) | Self::Reply(_) | Self::Refusal(_) | Self::Unasked(..) => 5,
         };
         if rank(&other) > rank(&self) { other } else { self }
     }

@@ -34,6 +34,8 @@ pub(in crate::oracle) struct TalkWatch {
     opening: BTreeMap<u8, BTreeSet<usize>>,
     /// Those of them whose values were unknown or stale meanwhile, so that they may have been passed over.
     passed: BTreeSet<usize>,
+    /// The request whose bytes are still to come back.
+    echo: Option<Vec<u8>>,
     pub unanswered: u32,
     pub refused: u32,
     /// When the port came up.
@@ -104,7 +106,7 @@ impl TalkWatch {
             self.risen.insert(row, true);
         }
         (self.repeat, self.held_by) = (None, None);
-        self.free_at = Instant::ZERO;
+        (self.free_at, self.echo) = (Instant::ZERO, None);
     }
 
     /// The port is gone.
@@ -198,7 +200,13 @@ impl TalkWatch {
             is_wrong: false,
         });
         self.leaving = true;
+        self.echo = talk.has_echo.then(|| request.to_vec());
         Ok(())
+    }
+
+    /// The request has come back.
+    pub(super) fn echoed(&mut self) {
+        self.echo = None;
     }
 
     /// What is to be asked at the start of a slave before this exchange, and could be.
@@ -242,8 +250,16 @@ impl TalkWatch {
 
     /// What the bytes that are held begin with.
     pub(super) fn see(&self, port: &PortSpec, talk: &TalkSpec, bytes: &[u8]) -> Seen {
-        let answer =
-            self.flight.as_ref().map_or(Seen::No, |flight| talk.rows[flight.row].see(&flight.request, bytes));
+        let answer = match (&self.echo, &self.flight) {
+            // The reply is looked for behind the echo.
+            (Some(own), _) => match bytes.get(..own.len()) {
+                Some(whole) if whole == own => Seen::Echo(own.len()),
+                None if bytes.first() == own.first() => Seen::Begins { is_ours: true },
+                _ => Seen::No,
+            },
+            (None, Some(flight)) => talk.rows[flight.row].see(&flight.request, bytes),
+            (None, None) => Seen::No,
+        };
         answer.or(talk.see_unasked(port, bytes))
     }
 
@@ -263,6 +279,7 @@ impl TalkWatch {
         let flight = self.flight.take()?;
         let spec = &talk.rows[flight.row];
         self.is_opened(spec.slave, flight.row);
+        self.echo = None;
         self.refused = self.refused.wrapping_add(u32::from(is_refusal));
         self.free_at = now + spec.pause;
         let slave = self.slaves.entry(spec.slave).or_default();
@@ -295,6 +312,7 @@ impl TalkWatch {
             return None;
         }
         let mut flight = self.flight.take()?;
+        self.echo = None;
         flight.timed_out |= !flight.is_wrong;
         let slave = self.slaves.entry(spec.slave).or_default();
         if slave.presence != Presence::Down {

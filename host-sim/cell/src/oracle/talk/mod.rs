@@ -25,17 +25,30 @@ impl Oracle {
     /// Bytes of a line came.
     pub(super) fn talk_bytes(&mut self, nth: usize, bytes: &[u8], now: Instant) {
         self.ports[nth].line.heard = now;
-        self.ports[nth].line.held.extend_from_slice(bytes);
         let mut verdicts = Vec::new();
+        // One by one: a frame that is complete is taken before the next byte is looked at.
+        for &byte in bytes {
+            self.ports[nth].line.held.push(byte);
+            self.talk_held(nth, &mut verdicts, now);
+        }
+        self.take(nth, verdicts, now);
+    }
+
+    /// Looks for frames in the bytes that are held.
+    fn talk_held(&mut self, nth: usize, verdicts: &mut Vec<Verdict>, now: Instant) {
         loop {
             let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
             let Some(talk) = &port.talk else { return };
             if watch.line.held.is_empty() {
-                break;
+                return;
             }
             match watch.talk.see(port, talk, &watch.line.held) {
-                Seen::Begins => break,
+                Seen::Begins { .. } => return,
                 Seen::No => watch.line.drop_one(),
+                Seen::Echo(len) => {
+                    watch.line.take_front(len);
+                    watch.talk.echoed();
+                }
                 Seen::Wrong(len) => {
                     if watch.line.drop_wrong(len) {
                         watch.talk.heard_wrong();
@@ -60,7 +73,6 @@ impl Oracle {
                 }
             }
         }
-        self.take(nth, verdicts, now);
     }
 
     /// A frame came on a bus.

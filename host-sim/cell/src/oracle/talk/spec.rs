@@ -23,6 +23,8 @@ pub(in crate::oracle) struct TalkSpec {
     pub silence: Duration,
     /// Time of all rows if nobody answers, each once.
     pub all_costs: Duration,
+    /// Own bytes come back.
+    pub has_echo: bool,
     /// The input frames of the port that come without being asked for.
     pub unasked: Vec<usize>,
 }
@@ -62,8 +64,12 @@ pub(in crate::oracle) struct RowSpec {
 pub(in crate::oracle) enum Seen {
     /// Not the beginning of what is awaited.
     No,
-    /// Perhaps its beginning.
-    Begins,
+    /// Perhaps its beginning; whether all constants so far are its own.
+    Begins {
+        is_ours: bool,
+    },
+    /// The request itself.
+    Echo(usize),
     Reply(usize),
     Refusal(usize),
     /// A frame that comes unasked: its length, and which input frame of the port it is.
@@ -123,7 +129,8 @@ impl TalkSpec {
             all_costs = all_costs + on_line + row.timeout + row.pause + silence;
             rows.push(row);
         }
-        (!rows.is_empty()).then_some(Self { rows, silence, all_costs, unasked })
+        let has_echo = line.is_some_and(|line| line.echo);
+        (!rows.is_empty()).then_some(Self { rows, silence, all_costs, has_echo, unasked })
     }
 
     /// The exchange of a request; `id` is that of a CAN frame, and `is_remote` says that it has no data.
@@ -328,7 +335,7 @@ impl RowSpec {
         let refusal = [self.slave, self.function | 0x80];
         if bytes.len() >= 2 && bytes[..2] == refusal {
             return match bytes.get(..5) {
-                None => Seen::Begins,
+                None => Seen::Begins { is_ours: true },
                 Some(frame) if is_right(frame) => Seen::Refusal(5),
                 Some(_) => Seen::Wrong(5),
             };
@@ -342,7 +349,7 @@ impl RowSpec {
             return Seen::No;
         }
         match bytes.get(..self.reply_len()) {
-            None => Seen::Begins,
+            None => Seen::Begins { is_ours: true },
             Some(frame) if is_right(frame) => Seen::Reply(frame.len()),
             Some(frame) => Seen::Wrong(frame.len()),
         }
@@ -364,13 +371,6 @@ pub(in crate::oracle) fn unmodelled(config: &GatewayConfig) -> Option<&'static s
         return Some("a soak cannot judge a gateway that is a slave");
     }
     let asks = |port: &&Port| !config.view().exchanges_of(recipe_of(config.view(), port)).is_empty();
-    let has_echo = |port: &Port| match &port.bus {
-        proto_core::config::Bus::Rs485(line) => line.echo,
-        _ => false,
-    };
-    if config.ports.iter().filter(asks).any(has_echo) {
-        return Some("a soak cannot judge a line that echoes");
-    }
     let answers = |port: &Port| recipe_of(config.view(), port).send == proto_core::config::SendOn::Frame;
     if config.ports.iter().filter(asks).any(answers) {
         return Some("a soak cannot judge exchanges beside an output part that is sent for each frame");
