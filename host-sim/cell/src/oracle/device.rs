@@ -312,6 +312,28 @@ pub(super) fn read(encoding: &Encoding, bytes: &[u8]) -> Option<f64> {
     })
 }
 
+/// Whether [`write`] knows how such a field is written.
+pub(super) const fn is_written_by_model(encoding: &Encoding) -> bool {
+    matches!(encoding.kind, Kind::Scalar(_) | Kind::Uint24 | Kind::Int24 | Kind::Bits(_))
+}
+
+/// Writes a number that the field can have into its bytes; other bits of the same bytes stay.
+pub(super) fn write(encoding: &Encoding, number: f64, bytes: &mut [u8]) {
+    let len = bytes.len();
+    let number = match encoding.kind {
+        Kind::Scalar(ScalarType::Float) => u64::from((number as f32).to_bits()),
+        Kind::Scalar(ScalarType::Double) => number.to_bits(),
+        Kind::Bits(bits) => {
+            let mask = ((1_u64 << bits.count) - 1) << bits.first;
+            let before =
+                ordered(encoding.order, bytes).iter().fold(0_u64, |all, &byte| all << 8 | u64::from(byte));
+            before & !mask | ((number as i64).cast_unsigned() << bits.first) & mask
+        }
+        _ => (number as i64).cast_unsigned(),
+    };
+    bytes.copy_from_slice(&ordered(encoding.order, &number.to_be_bytes()[8 - len..]));
+}
+
 /// The number that a field shows for `number`: rounded, and the nearest that it can have or wrapped.
 pub(super) fn shown_as(encoding: &Encoding, overflow: Overflow, number: f64) -> f64 {
     let (low, high) = range(encoding);

@@ -39,6 +39,7 @@ impl Oracle {
         }
         for nth in 0..self.ports.len() {
             self.talk_tick(nth, now);
+            self.served_tick(nth, now);
         }
         if now >= self.rewrite_at {
             self.write_refused_again();
@@ -53,6 +54,7 @@ impl Oracle {
         for (watch, port) in self.ports.iter_mut().zip(&self.spec.ports) {
             watch.down.slept();
             watch.line.discard();
+            watch.line.discarded += watch.served.discard();
             if watch.talk.waits() && !port.is_can {
                 watch.down.sent();
             }
@@ -123,10 +125,13 @@ impl Oracle {
         let watch = &mut self.ports[nth];
         watch.counters.bytes_in = watch.counters.bytes_in.wrapping_add(bytes.len() as u32);
         watch.down.heard = now;
-        if port.talk.is_some() {
+        if port.talk.is_some() || port.served.is_some() {
             watch.line.heard = now;
             if self.discards_until.is_none() {
-                return self.talk_bytes(nth, bytes, now);
+                return match port.served {
+                    Some(_) => self.served_bytes(nth, bytes, now),
+                    None => self.talk_bytes(nth, bytes, now),
+                };
             }
             watch.counters.asleep += 1;
             watch.line.discarded += bytes.len() as u64;
@@ -189,7 +194,9 @@ impl Oracle {
 
     /// A conversation begins anew.
     pub(super) fn begin_talk(&mut self, nth: usize, now: Instant) {
-        self.ports[nth].talk.begin(self.spec.ports[nth].talk.as_ref(), now);
+        let watch = &mut self.ports[nth];
+        watch.line.discarded += watch.served.discard();
+        watch.talk.begin(self.spec.ports[nth].talk.as_ref(), now);
         // What rises from now on asks.
         self.talk_values_changed(now);
     }
@@ -284,6 +291,10 @@ impl Oracle {
         let nth = usize::from(port.0);
         self.frames[nth].1 += 1;
         let spec = &self.spec.ports[nth];
+        if spec.served.is_some() {
+            let result = self.served_send(nth, sent, now);
+            return self.judge(now, &[Invariant::Shown, Invariant::Line, Invariant::Cycle], result);
+        }
         let is_asked = spec.talk.as_ref().is_some_and(|talk| {
             spec.outputs.is_empty() || talk.row_of((sent.id, sent.is_remote), sent.bytes).is_some()
         });
@@ -526,7 +537,7 @@ impl Oracle {
     /// Compares the engine's counters with the model's.
     pub(super) fn count(&mut self, nth: usize, engine: &Engine) -> Result<(), Wrong> {
         let Some(actual) = engine.port_counters(PortId(nth as u8)) else { return Ok(()) };
-        let PortWatch { line, down, counters, talk } = &self.ports[nth];
+        let PortWatch { line, down, counters, talk, .. } = &self.ports[nth];
         let up = self.up.counted[nth];
         let commands = self.commands.counted[nth];
         let mut expected = *counters;
@@ -538,7 +549,7 @@ impl Oracle {
         expected.skipped_cycles = down.skipped;
         expected.stale_cycles = down.stale;
         expected.unanswered = talk.unanswered;
-        expected.refused = talk.refused;
+        expected.refused = counters.refused.wrapping_add(talk.refused);
         expected.edges_lost = up.edges_lost;
         expected.values_expired = up.values_expired;
         expected.undelivered = up.undelivered;
@@ -557,7 +568,7 @@ impl Oracle {
         let accounted = line.frame_bytes + line.dropped + line.discarded + line.held.len() as u64;
         let spec = &self.spec.ports[nth];
         let reads = !spec.inputs.is_empty() || spec.talk.is_some();
-        if !spec.is_can && reads && accounted as u32 != actual.bytes_in {
+        if !spec.is_can && spec.served.is_none() && reads && accounted as u32 != actual.bytes_in {
             let what =
                 format!("port {nth} received {} bytes, {accounted} are accounted for", actual.bytes_in);
             return Err((Invariant::Bytes, what));

@@ -42,6 +42,7 @@ pub(super) use robot::Path;
 use robot::Robot;
 use spec::Spec;
 use talk::line::TalkWatch;
+use talk::served::ServedWatch;
 use talk::truth::Truth;
 use upward::{Upward, Wrong};
 pub(super) use wire::inputs_of;
@@ -54,6 +55,7 @@ struct PortWatch {
     down: Downward,
     counters: PortCounters,
     talk: TalkWatch,
+    served: ServedWatch,
 }
 
 /// The model's state of one recipe link, or of the state link.
@@ -127,7 +129,9 @@ pub(super) struct Oracle {
 impl Oracle {
     pub(super) fn new(config: &GatewayConfig) -> Self {
         let spec = Spec::new(config);
-        let of_port = |port: &spec::PortSpec| port.outputs.len() + usize::from(port.talk.is_some());
+        let of_port = |port: &spec::PortSpec| {
+            port.outputs.len() + usize::from(port.talk.is_some() || port.served.is_some())
+        };
         let parts: usize = spec.ports.iter().map(of_port).sum();
         Self {
             map: Map::new(&spec),
@@ -253,6 +257,7 @@ impl Oracle {
                 watch.down.is_up = false;
                 watch.down.reset();
                 watch.line.discard();
+                watch.line.discarded += watch.served.discard();
                 watch.talk.gone();
                 self.forget_commands(nth, None, now);
             }
@@ -338,6 +343,8 @@ impl Oracle {
                 if !self.is_late {
                     let result = self.ports[nth].down.rest(&self.spec, nth, &self.up, now);
                     self.judge(now, &[Invariant::Cycle], result);
+                    let result = self.served_rests(nth, now);
+                    self.judge(now, &[], result);
                 }
                 let result = self.count(nth, engine);
                 self.judge(now, &[Invariant::Counted, Invariant::Bytes], result);

@@ -12,6 +12,7 @@ use proto_core::wire::can::CanId;
 
 use super::bits::{self, Share};
 use super::device::DeviceSpec;
+use super::talk::served::ServedSpec;
 use super::talk::spec::TalkSpec;
 
 /// A value as on the wire; unused bytes are 0.
@@ -67,6 +68,8 @@ pub(super) struct PortSpec {
     pub turnaround: Duration,
     /// What is asked of slaves or devices. The replies are behind the other inputs.
     pub talk: Option<TalkSpec>,
+    /// What a master on a Modbus line may ask. What it writes is behind the other inputs.
+    pub served: Option<ServedSpec>,
 }
 
 impl PortSpec {
@@ -75,7 +78,7 @@ impl PortSpec {
         let fields = self.outputs.iter().flat_map(|frame| &frame.fields).filter_map(shown);
         let rows = self.talk.iter().flat_map(|talk| &talk.rows);
         let asked = rows.flat_map(|row| row.shown().chain(row.rising.map(|(var, _)| var)));
-        fields.chain(asked)
+        fields.chain(asked).chain(self.served.iter().flat_map(ServedSpec::shown))
     }
 }
 
@@ -329,7 +332,7 @@ fn frames(config: &GatewayConfig, recipe: &Recipe, direction: Direction) -> Vec<
 fn port_spec(config: &GatewayConfig, port: &proto_core::config::Port) -> PortSpec {
     let recipe = &config.recipes[usize::from(port.recipe)];
     let mut inputs = frames(config, recipe, Direction::Input);
-    let mut talk = None;
+    let (mut talk, mut served) = (None, None);
     let (idle_gap, turnaround) = match port.bus {
         Bus::Rs485(line) => {
             // 3.5 characters: a start bit, eight bits, parity, stop bits (D19).
@@ -339,6 +342,7 @@ fn port_spec(config: &GatewayConfig, port: &proto_core::config::Port) -> PortSpe
             let characters = Duration::from_micros(characters);
             let silence = line.turnaround.max(characters);
             talk = TalkSpec::new(config, recipe, (Some(&line), silence), &mut inputs);
+            served = ServedSpec::new(config, recipe, line, &mut inputs);
             (line.idle_gap.max(characters), line.turnaround)
         }
         Bus::Can { .. } => {
@@ -361,6 +365,7 @@ fn port_spec(config: &GatewayConfig, port: &proto_core::config::Port) -> PortSpe
         idle_gap,
         turnaround,
         talk,
+        served,
     }
 }
 

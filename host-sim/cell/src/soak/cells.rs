@@ -108,8 +108,8 @@ impl Scenario {
 
 #[cfg(test)]
 mod tests {
-    use proto_core::config::{AskWhen, Exchange, Span, Talk};
-    use proto_core::modbus::rtu::Operation;
+    use proto_core::config::FieldSpec;
+    use proto_core::device::{Ignored, Text, TextWidth};
 
     use super::*;
     use crate::Cell;
@@ -126,9 +126,10 @@ mod tests {
     fn a_cell_that_the_model_does_not_know_is_refused() {
         let mut config = Scenario::all().unwrap().remove(0).gateway;
         assert_eq!(unmodelled(&config), None);
-        let operation = Operation::ReadCoils { address: 0, count: 1 };
-        let talk = Talk::Served { operation, written: Span::default(), read: Span::default() };
-        config.exchanges.push(Exchange::new(1, talk, AskWhen::NEVER)).unwrap();
-        assert!(unmodelled(&config).unwrap().contains("slave"));
+        let text = Text { width: TextWidth::Fixed(4), fill: None };
+        let ignored = Ignored::NONE;
+        let field = FieldSpec::TextInput { text, to: None, length_to: None, count_to: None, ignored };
+        config.fields.push(field).unwrap();
+        assert!(unmodelled(&config).unwrap().contains("texts"));
     }
 }

@@ -8,6 +8,7 @@
 mod batch;
 mod cells;
 mod peers;
+mod plc;
 mod random_device;
 mod show;
 mod slaves;
@@ -26,6 +27,7 @@ pub use show::show_trace;
 
 use crate::{Cell, CellError, Chunking, FaultInjector, FaultKind, Invariant, Rng, Violation, Wiring};
 use peers::Peers;
+use plc::Plc;
 use random_device::RandomDevice;
 use slaves::Slaves;
 use world::World;
@@ -195,7 +197,8 @@ fn attach_devices(cell: &mut Cell, config: &GatewayConfig, level: Level, rng: &m
         let seed = rng.fork();
         let device = RandomDevice::new(config, port, cell.now(), seed.clone());
         let slaves = Slaves::new(config, port, cell.now(), seed.clone());
-        let peers = Peers::new(config, port, cell.now(), seed);
+        let peers = Peers::new(config, port, cell.now(), seed.clone());
+        let plc = Plc::new(config, port, cell.now(), seed);
         match port.bus {
             Bus::Rs485(_) => {
                 let line = cell.line_of(&port.name);
@@ -214,6 +217,8 @@ fn attach_devices(cell: &mut Cell, config: &GatewayConfig, level: Level, rng: &m
                     cell.attach(line, device);
                 } else if let Some(slaves) = slaves {
                     cell.attach(line, slaves);
+                } else if let Some(plc) = plc {
+                    cell.attach(line, plc);
                 }
             }
             Bus::Can { .. } => {

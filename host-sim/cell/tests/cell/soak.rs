@@ -101,3 +101,18 @@ fn frames_on_a_bus_are_told_apart_and_counted() {
     let node = soak.cell().port("node");
     assert!(node.unanswered > 5 && node.frames_out > 3_000, "{node:?}");
 }
+
+#[test]
+fn a_master_asks_the_gateway_and_lines_echo() {
+    let scenario = Scenario::named("panel-line").unwrap().unwrap();
+    for level in [Level::None, Level::Harsh] {
+        let mut soak = Soak::new(&scenario, 9, level).unwrap();
+        soak.run_to(Duration::from_secs(120));
+        let report = soak.report();
+        assert_eq!(report.violation, None);
+        let looked_at = |invariant| report.checks[&invariant];
+        assert!(looked_at(Invariant::Held) > 1_000 && looked_at(Invariant::Carried) > 500, "{report:?}");
+        let [meters, scale, plc] = &report.ports[..] else { panic!("{report:?}") };
+        assert!(meters.1 > 300 && scale.1 > 300 && plc.1 > 100 && plc.2 > 300, "{report:?}");
+    }
+}

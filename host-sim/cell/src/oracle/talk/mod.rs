@@ -3,6 +3,7 @@
 
 mod frames;
 pub(super) mod line;
+pub(super) mod served;
 pub(super) mod spec;
 #[cfg(test)]
 mod tests;

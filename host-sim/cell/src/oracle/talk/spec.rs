@@ -4,7 +4,7 @@
 //! Written from these pages, independent of the engine's exchanges.
 
 use proto_core::config::{
-    ConfigView, Exchange, FieldSpec, GatewayConfig, OutputBinding, Port, Recipe, Rs485, Talk,
+    Bus, ConfigView, Exchange, FieldSpec, GatewayConfig, OutputBinding, Port, Recipe, Rs485, Talk,
 };
 use proto_core::modbus::rtu::Operation;
 use proto_core::sysvar::SysVar;
@@ -367,8 +367,16 @@ pub(super) fn is_right(frame: &[u8]) -> bool {
 
 /// Why the exchanges of a configuration cannot be judged, if they cannot.
 pub(in crate::oracle) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
-    if config.exchanges.iter().any(|exchange| matches!(exchange.talk, Talk::Served { .. })) {
-        return Some("a soak cannot judge a gateway that is a slave");
+    if let Some(reason) = super::served::unmodelled(config) {
+        return Some(reason);
+    }
+    let serves = |port: &&Port| {
+        let exchanges = config.view().exchanges_of(recipe_of(config.view(), port));
+        exchanges.iter().any(|exchange| matches!(exchange.talk, Talk::Served { .. }))
+    };
+    let has_echo = |port: &Port| matches!(&port.bus, Bus::Rs485(line) if line.echo);
+    if config.ports.iter().filter(serves).any(has_echo) {
+        return Some("a soak cannot judge a gateway that is a slave on a line that echoes");
     }
     let asks = |port: &&Port| !config.view().exchanges_of(recipe_of(config.view(), port)).is_empty();
     let answers = |port: &Port| recipe_of(config.view(), port).send == proto_core::config::SendOn::Frame;

@@ -10,7 +10,7 @@ use super::super::tests::{cell, is_rest};
 use super::super::upward::Carried;
 use super::super::{Invariant, Oracle, inputs_of};
 use crate::tamper::{Forged, Outward};
-use crate::{Cell, Device, Done, SlaveDone, Violation};
+use crate::{Cell, Device, Done, SlaveDone, Talker, Violation};
 
 /// A slave that is read at two places, whose replies look alike, and told two values together.
 const SLAVE: &str = r#"
@@ -104,6 +104,32 @@ bus = "rs485"
 recipe = "line"
 timeout_ms = 1000
 stale_after_ms = 300
+"#;
+
+/// The gateway is a slave, and shows one register.
+const SERVED: &str = r#"
+[controller]
+address = "127.0.0.1"
+
+[[recipe]]
+name = "plc"
+kind = "modbus-rtu-slave"
+address = 5
+
+[[recipe.block]]
+table = "input-registers"
+address = 0
+fields = [{ name = "parts", type = "word", from = "WordOutputReg[1]" }]
+
+[[recipe.block]]
+table = "holding-registers"
+address = 9
+fields = [{ name = "speed", type = "word", to = "WordInputReg[1]" }]
+
+[[port]]
+name = "device"
+bus = "modbus-rtu-slave"
+recipe = "plc"
 "#;
 
 const PORT: PortId = PortId(0);
@@ -396,4 +422,50 @@ fn a_request_with_another_value() {
         _ => None,
     });
     assert_eq!(found, Invariant::Shown);
+}
+
+/// A master that reads and writes by turns for two seconds.
+fn asked_by_a_master(outward: Option<Outward>) -> Cell {
+    let mut cell = cell(SERVED);
+    cell.tamper(None, outward);
+    cell.set_value("WordOutputReg[1]", 7.0);
+    let line = cell.line_of("device");
+    let start = cell.now() + MS(500);
+    cell.attach(
+        line,
+        Talker::new(start, 20, 30, |n| match n % 2 {
+            0 => sealed(&[5, 4, 0, 0, 0, 1]),
+            _ => sealed(&[5, 6, 0, 9, 0, n as u8]),
+        }),
+    );
+    cell.run_ms(2_500);
+    cell
+}
+
+#[test]
+fn a_slave_that_answers_right_is_not_accused() {
+    let cell = asked_by_a_master(None);
+    assert_eq!(cell.violation(), None);
+    assert_eq!((cell.value("WordInputReg[1]"), cell.port("device").frames_out), (29.0, 30));
+}
+
+#[test]
+fn a_slave_that_shows_another_value_says_nothing_or_answers_nobody() {
+    let reply = |output: &Output<'_>| match *output {
+        Output::PortSend { bytes, .. } => Some(bytes.to_vec()),
+        _ => None,
+    };
+    let found = |outward: Outward| asked_by_a_master(Some(outward)).violation().map(|found| found.invariant);
+    let other = found(Box::new(move |_, _, output| {
+        let bytes = reply(output).filter(|bytes| bytes[1] == 4)?;
+        Some(vec![Forged::Port(PORT, sealed(&[5, 4, 2, bytes[3], bytes[4] ^ 1]))])
+    }));
+    assert_eq!(other, Some(Invariant::Shown));
+    let none = found(Box::new(move |_, _, output| reply(output).map(|_| Vec::new())));
+    assert_eq!(none, Some(Invariant::Cycle));
+    let nobody = found(Box::new(|_, input, output| {
+        let has_left = matches!(input, Input::PortSent { .. }) && is_rest(output);
+        has_left.then(|| vec![Forged::Port(PORT, sealed(&[5, 4, 2, 0, 7]))])
+    }));
+    assert_eq!(nobody, Some(Invariant::Cycle));
 }
