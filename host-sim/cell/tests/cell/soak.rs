@@ -22,7 +22,7 @@ fn soaked(level: Level, seed: u64, span: Duration, jobs: usize) -> Total {
 /// The hashes of these runs on every machine. Only a change of what the engine, the controller or the cell
 /// does, or when, may change them; then enter the new ones here.
 const HASHES: [(Level, u64); 2] =
-    [(Level::None, 0x9C9D_A3B4_A23A_FD82), (Level::Harsh, 0x87DB_B98E_3D33_D378)];
+    [(Level::None, 0x30DD_FB31_617A_8C31), (Level::Harsh, 0xF46B_4886_B3E5_25C2)];
 
 #[test]
 fn a_seed_means_the_same_trace_on_every_machine() {
@@ -107,12 +107,12 @@ fn a_master_asks_the_gateway_and_lines_echo() {
     let scenario = Scenario::named("panel-line").unwrap().unwrap();
     for level in [Level::None, Level::Harsh] {
         let mut soak = Soak::new(&scenario, 9, level).unwrap();
-        soak.run_to(Duration::from_secs(120));
+        soak.run_to(Duration::from_secs(60));
         let report = soak.report();
         assert_eq!(report.violation, None);
         let looked_at = |invariant| report.checks[&invariant];
-        assert!(looked_at(Invariant::Held) > 1_000 && looked_at(Invariant::Carried) > 500, "{report:?}");
+        assert!(looked_at(Invariant::Held) > 500 && looked_at(Invariant::Carried) > 200, "{report:?}");
         let [meters, scale, plc] = &report.ports[..] else { panic!("{report:?}") };
-        assert!(meters.1 > 300 && scale.1 > 300 && plc.1 > 100 && plc.2 > 300, "{report:?}");
+        assert!(meters.1 > 100 && scale.1 > 100 && plc.1 > 50 && plc.2 > 100, "{report:?}");
     }
 }

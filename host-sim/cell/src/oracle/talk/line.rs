@@ -380,7 +380,11 @@ impl TalkWatch {
                 return Err((Invariant::Periods, what));
             }
         }
-        for (&number, slave) in self.slaves.iter().filter(|(_, slave)| slave.presence == Presence::Down) {
+        // A request with values is not sent as long as one is unknown or stale.
+        let is_wanted =
+            |number: u8| talk.rows_of(number).any(|(_, row)| row.every.is_some() && row.is_always_ready());
+        let are_down = self.slaves.iter().filter(|(_, slave)| slave.presence == Presence::Down);
+        for (&number, slave) in are_down.filter(|(number, _)| is_wanted(**number)) {
             checked += 1;
             let timeouts = talk.rows_of(number).map(|(_, row)| row.timeout);
             let wait = timeouts.max().unwrap_or_default().saturating_mul(64).min(LONGEST_WAIT);
