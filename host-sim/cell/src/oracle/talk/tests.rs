@@ -317,7 +317,7 @@ fn shown(pairs: &[(u16, u16)]) -> (Oracle, Instant) {
     let mut oracle = Oracle::new(cell.gateway());
     let mut now = cell.now();
     for (one, other) in pairs {
-        now = now + MS(1_000);
+        now += MS(1_000);
         let mut image = cell.controller().registers().image().to_vec();
         for (name, value) in [("WordOutputReg[1]", one), ("WordOutputReg[2]", other)] {
             let at = SysVar::parse(name).unwrap().image_offset();
