@@ -226,6 +226,10 @@ impl Oracle {
         if has_slept {
             self.commands.slept(now);
             self.robot.forget_all(now);
+            // A master's request that waited is not carried out: nobody knows how old it is.
+            for watch in &mut self.ports {
+                watch.line.discarded += watch.served.discard();
+            }
             self.find_lost_links(engine, None, now);
         }
         if is_tick || has_slept {
