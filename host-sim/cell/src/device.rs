@@ -23,17 +23,17 @@ pub trait Device<M> {
         Vec::new()
     }
 
-    /// What it did as slaves of a Modbus line since the last call, in order. The model compares the
+    /// What it did as devices that are asked since the last call, in order. The model compares the
     /// gateway's values with it.
     fn take_done(&mut self) -> Vec<SlaveDone> {
         Vec::new()
     }
 }
 
-/// What a slave of a Modbus line did.
+/// What a device did that is asked: a slave of a Modbus line, or a peer with frames of its own.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SlaveDone {
-    /// Its address.
+    /// Its address or number.
     pub slave: u8,
     /// What it did.
     pub what: Done,
@@ -59,6 +59,21 @@ pub enum Done {
         address: u16,
         /// The registers, or 0 and 1 for coils.
         values: Vec<u16>,
+    },
+    /// It made a frame of its own, which may be changed or lost before it leaves: a reply, or one that
+    /// nobody asked for.
+    Replied {
+        /// The exchange, counted from 0 on the port.
+        exchange: usize,
+        /// The whole frame.
+        frame: Vec<u8>,
+    },
+    /// It took a request of its own frames.
+    Took {
+        /// The exchange, counted from 0 on the port.
+        exchange: usize,
+        /// The whole frame.
+        request: Vec<u8>,
     },
     /// It lost its power, and with it everything that was written.
     Forgot,

@@ -60,7 +60,7 @@ impl Cell {
             let now = self.now;
             let device = self.lines[nth].device.as_mut().filter(|device| device.deadline() <= now);
             let Some(sent) = device.map(|device| device.poll(now)) else { continue };
-            self.slaves_did(LineId(nth));
+            self.line_did(LineId(nth));
             for bytes in sent {
                 self.transmit(LineId(nth), End::Device, &bytes);
             }
@@ -68,7 +68,9 @@ impl Cell {
         for nth in 0..self.buses.len() {
             let now = self.now;
             let device = self.buses[nth].device.as_mut().filter(|device| device.deadline() <= now);
-            for frame in device.map_or_else(Vec::new, |device| device.poll(now)) {
+            let Some(sent) = device.map(|device| device.poll(now)) else { continue };
+            self.bus_did(BusId(nth));
+            for frame in sent {
                 self.transmit_can(BusId(nth), End::Device, frame);
             }
         }

@@ -170,6 +170,7 @@ impl Cell {
     /// The port's adapter is pulled out: its owner is told.
     pub fn unplug(&mut self, line: LineId) {
         self.cut(line);
+        self.lines[line.0].is_plugged = false;
         self.lines[line.0].gathered.clear();
         self.port_input(self.lines[line.0].owner, false);
     }
@@ -177,6 +178,7 @@ impl Cell {
     /// The adapter is back.
     pub fn plug_in(&mut self, line: LineId) {
         self.repair(line);
+        self.lines[line.0].is_plugged = true;
         self.port_input(self.lines[line.0].owner, true);
     }
 

@@ -6,7 +6,7 @@ use proto_core::wire::can::CanFrame;
 use super::due::Due;
 use super::line::{Chunk, Chunking};
 use super::sleep::PortEvent;
-use super::{AnyPort, BusId, Cell, End, LineId};
+use super::{AnyPort, BusId, Cell, End, LineId, SlaveDone};
 use recipe_controller::ControllerInput;
 
 impl Cell {
@@ -28,21 +28,18 @@ impl Cell {
         let line = &mut self.lines[id.0];
         match chunk.from {
             End::Device if !arrives => {}
-            End::Device if let Chunking::Gathered(every) = line.chunking => {
-                if line.gathered.is_empty() {
-                    let every = every.as_micros().max(1);
-                    let at = Instant::from_micros(now.as_micros().div_ceil(every) * every);
-                    self.queue.push(at, Due::Gathered { line: id });
-                }
-                line.gathered.append(&mut chunk.bytes);
-            }
-            End::Device => self.port_receives(owner, &chunk.bytes),
+            End::Device => self.hand_on(id, owner, &chunk.bytes),
             End::Port => {
                 let mut answers = Vec::new();
+                if line.settings().echo && line.is_plugged {
+                    // The adapter gives back what the port sends, whether or not it reaches the device.
+                    self.hand_on(id, owner, &chunk.bytes);
+                }
+                let line = &mut self.lines[id.0];
                 if arrives {
                     line.hear(now, &chunk.bytes, chunk.is_first);
                     answers = line.device.as_mut().map_or_else(Vec::new, |d| d.receive(now, &chunk.bytes));
-                    self.slaves_did(id);
+                    self.line_did(id);
                 }
                 if chunk.is_last {
                     self.port_sent(owner);
@@ -54,12 +51,34 @@ impl Cell {
         }
     }
 
-    /// The model is told what the slaves of a line did.
-    pub(super) fn slaves_did(&mut self, id: LineId) {
+    /// The port's receiver has got bytes; its driver reports them at once or later.
+    fn hand_on(&mut self, id: LineId, owner: AnyPort, bytes: &[u8]) {
         let line = &mut self.lines[id.0];
-        let (AnyPort::Gateway(port), Some(device)) = (line.owner, &mut line.device) else { return };
-        let done = device.take_done();
-        if let Some(oracle) = &mut self.oracle {
+        let Chunking::Gathered(every) = line.chunking else { return self.port_receives(owner, bytes) };
+        if line.gathered.is_empty() {
+            let every = every.as_micros().max(1);
+            let at = Instant::from_micros(self.now.as_micros().div_ceil(every) * every);
+            self.queue.push(at, Due::Gathered { line: id });
+        }
+        line.gathered.extend_from_slice(bytes);
+    }
+
+    /// The model is told what the devices of a line did.
+    pub(super) fn line_did(&mut self, id: LineId) {
+        let line = &mut self.lines[id.0];
+        let done = line.device.as_mut().map_or_else(Vec::new, |device| device.take_done());
+        self.device_did(self.lines[id.0].owner, done);
+    }
+
+    /// Same, of a bus.
+    pub(super) fn bus_did(&mut self, id: BusId) {
+        let bus = &mut self.buses[id.0];
+        let done = bus.device.as_mut().map_or_else(Vec::new, |device| device.take_done());
+        self.device_did(self.buses[id.0].owner, done);
+    }
+
+    fn device_did(&mut self, owner: AnyPort, done: Vec<SlaveDone>) {
+        if let (AnyPort::Gateway(port), Some(oracle)) = (owner, &mut self.oracle) {
             done.into_iter().for_each(|done| oracle.slave_did(usize::from(port.0), done, self.now));
         }
     }
@@ -101,6 +120,7 @@ impl Cell {
             End::Port => {
                 if let Some(device) = bus.device.as_mut().filter(|_| crossed.arrives) {
                     answers = device.receive(now, &crossed.frame);
+                    self.bus_did(id);
                 }
                 if crossed.was_last {
                     self.port_sent(owner);

@@ -63,6 +63,8 @@ pub struct Line {
     /// Counters.
     pub counters: LineCounters,
     pub(super) connected: bool,
+    /// The port's adapter is there.
+    pub(super) is_plugged: bool,
     pub(super) device: Option<Box<dyn Device<Vec<u8>>>>,
     busy_until: [Instant; 2],
     collision: (Instant, Instant),
@@ -105,6 +107,7 @@ impl Line {
             noise_ppm: 0,
             counters: LineCounters::default(),
             connected: true,
+            is_plugged: true,
             device: None,
             busy_until: [Instant::ZERO; 2],
             collision: (Instant::ZERO, Instant::ZERO),

@@ -246,6 +246,23 @@ impl FrameLayout {
         }
     }
 
+    /// Whether all constants that `bytes` has completely are those of this frame, so that its beginning may
+    /// be one of ours.
+    pub(crate) fn agrees(&self, elements: impl IntoIterator<Item: Borrow<Element>>, bytes: &[u8]) -> bool {
+        let mut places = Places::new(self, None);
+        for element in elements {
+            let element = element.borrow();
+            let Ok(place) = places.find(element, bytes) else { break };
+            if let Element::Fixed { encoding, value } = element {
+                let field = bytes.get(place).unwrap_or(&[]);
+                if !encoding.read(field).is_ok_and(|read| read.as_f64() == *value as f64) {
+                    return false;
+                }
+            }
+        }
+        true
+    }
+
     /// Whether the checksum at `at` is right; `None` without one.
     fn checksum_is_right(&self, frame: &[u8], at: usize) -> Option<bool> {
         let sum = self.checksum?;

@@ -3,15 +3,17 @@
 //! In: the request on its way, and the frames that come unasked. Out: the frame's part in it. Applies
 //! nothing.
 
-use super::device_port::{DeviceFormat, better, probe};
+use super::device_port::{DeviceFormat, better, elements, probe};
 use super::exchanges::{Asks, InputFormat, Item};
-use super::line::Flight;
+use super::line::{Flight, OwnRequest};
 use super::user::InputBind;
 use crate::device::Probe;
 use crate::modbus::rtu::{self, Expected, REFUSAL_LEN};
 
 /// What a received frame is.
 pub(super) enum Heard<'i> {
+    /// The echo of the own request.
+    Echo,
     /// The awaited reply; the data of a Modbus frame, or the frame.
     Reply(Option<&'i InputFormat>),
     /// The device refuses the request.
@@ -28,6 +30,8 @@ pub(super) struct Awaited<'i> {
     pub first_frame: u8,
     pub items: &'i [Item],
     pub flight: Option<Flight>,
+    /// The echo of the request comes before its reply.
+    pub echo: Option<OwnRequest>,
     pub bindings: &'i [InputBind],
 }
 
@@ -42,7 +46,8 @@ impl<'i> Awaited<'i> {
 
     /// The reply and the refusal that a device's own frames are.
     pub(super) fn answers(&self) -> impl Iterator<Item = &'i DeviceFormat> {
-        let item = self.asked().filter(|item| matches!(item.asks, Asks::Frame | Asks::Remote { .. }));
+        let item = self.asked().filter(|_| self.echo.is_none());
+        let item = item.filter(|item| matches!(item.asks, Asks::Frame | Asks::Remote { .. }));
         let reply = |item: &'i Item| item.reply.iter().map(|reply| &reply.format).chain(&item.refusal);
         item.into_iter().flat_map(reply)
     }
@@ -56,7 +61,7 @@ impl<'i> Awaited<'i> {
 
     /// What bytes of a line are.
     pub(super) fn probe(&self, bytes: &[u8]) -> Probe {
-        let mut best = match self.expected() {
+        let mut best = match self.expected().filter(|_| self.echo.is_none()) {
             Some(expected) => match expected.probe(bytes) {
                 rtu::Probe::No => Probe::No(1),
                 rtu::Probe::Partial => Probe::Partial(1),
@@ -66,16 +71,38 @@ impl<'i> Awaited<'i> {
             },
             None => Probe::No(1),
         };
-        for format in self.answers().chain(self.unasked().map(|(format, _)| format)) {
+        if let Some(echo) = &self.echo {
+            best = echo.probe(bytes);
+        }
+        for format in self.all() {
             best = better(best, probe(format, self.bindings, bytes));
         }
-        best
+        let Probe::Other(_) = best else { return best };
+        // One of ours may begin with what is a shorter frame by chance: a byte that is the same as that of
+        // the shorter one's checksum goes on with a right checksum.
+        let begun = |format: &DeviceFormat| match probe(format, self.bindings, bytes) {
+            Probe::Partial(missing) => {
+                let fields = elements(format.bindings.of(self.bindings));
+                format.layout.agrees(fields, bytes).then_some(missing)
+            }
+            _ => None,
+        };
+        self.all().filter_map(begun).min().map_or(best, Probe::Partial)
+    }
+
+    /// The frames that may come, but for those of Modbus.
+    fn all(&self) -> impl Iterator<Item = &'i DeviceFormat> {
+        self.answers().chain(self.unasked().map(|(format, _)| format))
     }
 
     /// What a frame of a line is that [`Self::probe`] has found.
     pub(super) fn heard(&self, frame: &[u8]) -> Option<Heard<'i>> {
         let is = |format: &DeviceFormat| matches!(probe(format, self.bindings, frame), Probe::Frame(len) if len == frame.len());
-        if let Some(expected) = self.expected() {
+        if let Some(echo) = &self.echo {
+            if echo.probe(frame) == Probe::Frame(frame.len()) {
+                return Some(Heard::Echo);
+            }
+        } else if let Some(expected) = self.expected() {
             match expected.probe(frame) {
                 rtu::Probe::Reply(_) => return Some(Heard::Reply(self.asked()?.reply.as_ref())),
                 rtu::Probe::Refused(_) => return Some(Heard::Refusal),

@@ -4,7 +4,9 @@
 //! when to look again. Does not know frames.
 
 use super::line_timing::LineTiming;
+use super::sender::{DIGEST_SEED, digest};
 use crate::config::{AskWhen, Span};
+use crate::device::Probe;
 use crate::modbus::rtu::Expected;
 use crate::schedule::{Grid, Peer, Presence, Row, Taken, Turns};
 use crate::time::{Duration, Instant};
@@ -110,10 +112,37 @@ pub(super) struct Line {
     late: Option<(u8, Duration)>,
     /// Own bytes are heard.
     pub has_echo: bool,
-    /// So many bytes of the echo are still to come.
-    pub echo: u16,
+    /// The echo that is still to come.
+    pub echo: Option<OwnRequest>,
     /// Frames come that nobody asked for.
     pub hears_unasked: bool,
+}
+
+/// What tells the echo of a request from other bytes.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct OwnRequest {
+    len: u16,
+    first: u8,
+    hash: u64,
+}
+
+impl OwnRequest {
+    fn new(request: &[u8]) -> Option<Self> {
+        let first = *request.first()?;
+        Some(Self { len: request.len() as u16, first, hash: digest(DIGEST_SEED, request) })
+    }
+
+    /// Whether bytes begin with the echo. Nothing else may come before it: a late reply has been on its way
+    /// when the request was sent.
+    pub(super) fn probe(&self, bytes: &[u8]) -> Probe {
+        let len = usize::from(self.len);
+        match bytes.get(..len) {
+            _ if bytes.first() != Some(&self.first) => Probe::No(1),
+            Some(own) if digest(DIGEST_SEED, own) == self.hash => Probe::Frame(len),
+            Some(_) => Probe::No(len),
+            None => Probe::Partial(len.saturating_sub(bytes.len())),
+        }
+    }
 }
 
 /// The exchanges and peers of one port.
@@ -149,7 +178,7 @@ impl Line {
             sent: Instant::ZERO,
             late: None,
             has_echo,
-            echo: 0,
+            echo: None,
             hears_unasked: false,
         }
     }
@@ -205,9 +234,9 @@ impl Line {
     }
 
     /// The request was handed over.
-    pub(super) fn handed_over(&mut self, flight: Flight, expected: Option<Expected>, len: usize) {
+    pub(super) fn handed_over(&mut self, flight: Flight, expected: Option<Expected>, request: &[u8]) {
         if self.has_echo {
-            self.echo = len as u16;
+            self.echo = OwnRequest::new(request);
         }
         self.phase = Phase::Sending(Flight { expected, is_wrong: false, until: Instant::NEVER, ..flight });
     }
@@ -262,7 +291,7 @@ impl Line {
     fn rest(&mut self, pause: Duration, now: Instant) {
         self.phase = resting(now + pause, now);
         self.look_at = now;
-        self.echo = 0;
+        self.echo = None;
     }
 
     /// Why the request has failed, if it has. A wrong reply has, once the line is silent behind it.
@@ -295,7 +324,7 @@ impl Line {
             let repeated = flight.repeated.saturating_add(1);
             let timed_out = flight.timed_out || failure == Failure::Timeout;
             self.phase = Phase::Repeat(Flight { repeated, timed_out, ..flight });
-            self.echo = 0;
+            self.echo = None;
             return false;
         }
         let sent = self.sent;
@@ -330,7 +359,7 @@ impl Line {
         self.phase = Phase::Idle;
         self.late = None;
         self.look_at = now;
-        self.echo = 0;
+        self.echo = None;
     }
 
     /// The device is there, perhaps another one: what is asked at the start is asked.

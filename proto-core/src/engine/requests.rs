@@ -65,7 +65,7 @@ impl Maker<'_> {
                 Asks::Rtu { operation, .. } => Expected::of(&operation, out.get(..len).unwrap_or(&[])),
                 _ => None,
             };
-            line.handed_over(flight, expected, len);
+            line.handed_over(flight, expected, out.get(..len).unwrap_or(&[]));
             return Some((flight.exchange, len));
         }
         None

@@ -59,14 +59,6 @@ impl FieldPort {
         }
     }
 
-    /// The bytes behind the echo of the own request.
-    fn behind_echo<'b>(&mut self, bytes: &'b [u8]) -> &'b [u8] {
-        let Some(line) = self.line_mut() else { return bytes };
-        let echoed = usize::from(line.echo).min(bytes.len());
-        line.echo = line.echo.saturating_sub(echoed as u16);
-        bytes.get(echoed..).unwrap_or(&[])
-    }
-
     /// Whether the gateway is the slave of a line, which takes its bytes.
     fn hears_master(&mut self, bytes: &[u8], now: Instant) -> bool {
         let Codec::Device(DeviceCodec { reader: Some(Reader::Slave(slave)), .. }) = &mut self.codec else {
@@ -105,8 +97,8 @@ impl FieldPort {
         let (items, mut talks) = view.of(line);
         let mut frames =
             Frames::new((self.id, self.mode), &mut self.reply, &mut self.counters, bindings, store, commands);
-        let mut awaited =
-            Awaited { formats, first_frame: self.first_frame, items, flight: line.flight(), bindings };
+        let (first_frame, flight, echo) = (self.first_frame, line.flight(), line.echo);
+        let mut awaited = Awaited { formats, first_frame, items, flight, echo, bindings };
         let effort = |awaited: &Awaited<'_>| {
             let all = awaited.answers().chain(awaited.unasked().map(|(format, _)| format));
             all.map(|format| format.layout.lengths().1.saturating_add(usize::from(format.bindings.len)))
@@ -116,6 +108,10 @@ impl FieldPort {
             let (frame, verdict) = match found {
                 Found::Frame(frame) => {
                     let heard = awaited.heard(frame);
+                    if let Some(Heard::Echo) = heard {
+                        (line.echo, awaited.echo) = (None, None);
+                        continue;
+                    }
                     let verdict = match &heard {
                         Some(Heard::Reply(Some(reply))) => {
                             let data = match awaited.expected() {
@@ -136,7 +132,7 @@ impl FieldPort {
                         // A write was carried out.
                         Some(Heard::Reply(None)) => Ok(()),
                         Some(Heard::Refusal) => Err(Rejection::Refused),
-                        None => Err(Rejection::NoFrame),
+                        Some(Heard::Echo) | None => Err(Rejection::NoFrame),
                     };
                     if let (Some(Heard::Reply(_) | Heard::Refusal), Some(flight), Some(item)) =
                         (&heard, awaited.flight, awaited.asked())
@@ -157,7 +153,7 @@ impl FieldPort {
                     (frame, frames.rejected(Rejection::Checksum))
                 }
             };
-            awaited.flight = line.flight();
+            (awaited.flight, awaited.echo) = (line.flight(), line.echo);
             tap.record(|| came(self.id, now, verdict, None, [frame, &[], &[]]));
             match verdict {
                 // What is held can hold further frames, so only the rest of the chunk waits.
@@ -196,7 +192,8 @@ impl FieldPort {
             return frames.rejected(Rejection::Remote);
         }
         let flight = line.flight();
-        let awaited = Awaited { formats, first_frame: self.first_frame, items, flight, bindings };
+        let first_frame = self.first_frame;
+        let awaited = Awaited { formats, first_frame, items, flight, echo: None, bindings };
         let is = |format: &DeviceFormat| {
             let fields = elements(format.bindings.of(bindings));
             format.id == frame.id()
@@ -388,7 +385,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             self.after_talk(id);
             return true;
         }
-        let mut rest = port.behind_echo(bytes);
+        let mut rest = bytes;
         loop {
             let (store, command) = (&mut self.store, self.links.command.first_mut());
             let Some(port) = find_port(&mut self.ports, id) else { return true };

@@ -1,7 +1,7 @@
 //! Conversations with frames of a device's own, on lines and on CAN.
 
 use proto_core::config::*;
-use proto_core::device::{ByteOrder, Encoding, Overflow};
+use proto_core::device::{Algorithm, ByteOrder, Checksum, Encoding, Overflow};
 use proto_core::engine::{Input, PortId, Rejection};
 use proto_core::recipe::model::Mode;
 use proto_core::wire::can::{CanFrame, CanId};
@@ -20,6 +20,10 @@ fn fixed(value: i64) -> FieldSpec {
 
 fn byte_to(name: &str) -> FieldSpec {
     FieldSpec::DeviceInput { encoding: byte(), overflow: Overflow::Usual, to: to(name) }
+}
+
+fn byte_to_nothing() -> FieldSpec {
+    FieldSpec::DeviceInput { encoding: byte(), overflow: Overflow::Usual, to: InputBinding::Unused }
 }
 
 /// Adds a frame of an exchange and returns its index.
@@ -80,6 +84,51 @@ fn a_reply_a_refusal_and_what_comes_unasked_are_told_apart() {
     assert!(is_waiting || counters.resync_bytes == resync + 4);
     line.rig.bytes(port, b"E\x09\r");
     assert_eq!(line.rig.map.registers[11], 9);
+}
+
+/// A CRC's frame goes on with a right CRC if the next byte is the CRC's own first one. So a refusal with
+/// this code begins as the reply of another device would be.
+#[test]
+fn a_refusal_that_begins_as_a_shorter_frame_of_another_device_is_taken() {
+    let mut cell = Cell::new();
+    let sum = || FieldSpec::Checksum(Checksum::standard(Algorithm::CRC16_MODBUS).over(1, None));
+    let request = frame(&mut cell, None, b"Q", b"", vec![fixed(1), sum()]);
+    let reply = frame(&mut cell, None, b"A", b"", vec![fixed(0x20), sum()]);
+    let refusal = frame(&mut cell, None, b"A", b"", vec![fixed(0xA0), byte_to_nothing(), sum()]);
+    let table = [asks(request, reply, refusal, AskWhen::every(MS(50)))];
+    let port = talking(&mut cell, &table);
+    let mut line = Line::new(&cell, port);
+    let seal = |bytes: &[u8]| {
+        let crc = Algorithm::CRC16_MODBUS.of([&bytes[1..]]) as u16;
+        [bytes, &crc.to_le_bytes()].concat()
+    };
+    let first = seal(&[b'A', 0xA0])[2];
+    let refused = seal(&[b'A', 0xA0, first]);
+    assert_eq!(refused[..4], seal(&[b'A', 0xA0]));
+    line.run(MS(120), |_| Some((MS(5), refused.clone())));
+    let counters = line.rig.counters(port);
+    assert!(counters.refused >= 2 && counters.unanswered == 0, "{counters:?}");
+    // One of another device is still told apart, when the line goes on.
+    line.run(MS(120), |_| Some((MS(5), [seal(&[b'A', 0x30]), seal(&[b'A', 0x20])].concat())));
+    let counters = line.rig.counters(port);
+    assert!(counters.rejected_other_device >= 2 && counters.unanswered == 0, "{counters:?}");
+}
+
+/// A device that repeats what it is told, behind an adapter that does so as well.
+#[test]
+fn an_echo_behind_a_late_reply_is_no_reply() {
+    let mut cell = Cell::new();
+    let both = [0, 1].map(|_| frame(&mut cell, None, b"Q", b"", vec![fixed(1)]));
+    let port = talking(&mut cell, &[asks(both[0], both[1], None, AskWhen::every(MS(50)))]);
+    let Bus::Rs485(settings) = &mut cell.last_port().bus else { panic!() };
+    settings.echo = true;
+    let mut line = Line::new(&cell, port);
+    line.run(MS(220), |request| Some((MS(3), [b"Z\x01", request].concat())));
+    let counters = line.rig.counters(port);
+    assert!(counters.frames_in == 0 && counters.unanswered > 0, "{counters:?}");
+    assert_eq!(counters.resync_bytes, counters.frames_out * 2, "{counters:?}");
+    line.run(MS(2_000), |request| Some((MS(3), [b"Z\x01", request, request].concat())));
+    assert!(line.rig.counters(port).frames_in > 10);
 }
 
 #[test]

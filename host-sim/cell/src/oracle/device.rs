@@ -5,9 +5,11 @@
 
 use std::ops::Range;
 
-use proto_core::config::{FieldSpec, GatewayConfig, InputBinding, OutputBinding, Parts};
+use proto_core::config::{FieldSpec, GatewayConfig, OutputBinding, Parts};
 use proto_core::device::{Algorithm, Boundary, ByteOrder, Checksum, Crc, Encoding, Kind, Overflow, Width};
 use proto_core::wire::scalar::ScalarType;
+
+use super::spec::Frame;
 
 /// The places of a frame's fields.
 #[derive(Debug, Clone, Default)]
@@ -18,6 +20,21 @@ pub(super) struct DeviceSpec {
     sum: Option<(Checksum, Range<usize>, Range<usize>)>,
     /// Bytes of fields and checksum.
     pub len: usize,
+}
+
+/// What bytes are, seen as a frame that begins with the first of them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Look {
+    /// None begins here.
+    No,
+    /// Perhaps one begins here; whether all constants so far are its own.
+    Begins { is_ours: bool },
+    /// A frame of so many bytes.
+    Frame(usize),
+    /// One whose checksum is right, and of which a constant is another device's.
+    Other(usize),
+    /// One whose checksum is wrong.
+    Wrong(usize),
 }
 
 /// What a whole frame turns out to be.
@@ -32,11 +49,7 @@ pub(super) enum Seen {
 }
 
 impl DeviceSpec {
-    /// `None` for the fields of a plain recipe.
-    pub(super) fn new(head: usize, fields: &[FieldSpec]) -> Option<Self> {
-        if !fields.iter().any(FieldSpec::is_device) {
-            return None;
-        }
+    pub(super) fn new(head: usize, fields: &[FieldSpec]) -> Self {
         let mut spec = Self::default();
         let (mut at, mut first) = (head, head);
         for field in fields {
@@ -61,18 +74,12 @@ impl DeviceSpec {
             }
         }
         spec.len = at - head;
-        Some(spec)
+        spec
     }
 
     /// What a whole frame with the right head, tail and length is.
     pub(super) fn see(&self, fields: &[FieldSpec], frame: &[u8]) -> Seen {
-        let is_ours = fields.iter().zip(&self.places).all(|(field, place)| match field {
-            FieldSpec::Fixed { encoding, value } => {
-                read(encoding, &frame[place.clone()]) == Some(*value as f64)
-            }
-            _ => true,
-        });
-        match (self.sum_is_right(frame), is_ours) {
+        match (self.sum_is_right(frame), self.agrees(fields, frame)) {
             (None, false) => Seen::Nothing,
             (None | Some(true), true) => Seen::Ours,
             (Some(true), false) => Seen::Other,
@@ -80,10 +87,20 @@ impl DeviceSpec {
         }
     }
 
+    /// Whether the constants that the bytes have completely are those of the frame.
+    fn agrees(&self, fields: &[FieldSpec], bytes: &[u8]) -> bool {
+        fields.iter().zip(&self.places).filter(|(_, place)| place.end <= bytes.len()).all(|(field, place)| {
+            constant(field)
+                .is_none_or(|(encoding, value)| read(&encoding, &bytes[place.clone()]) == Some(value))
+        })
+    }
+
     /// `None` without a checksum.
     pub(super) fn sum_is_right(&self, frame: &[u8]) -> Option<bool> {
         let (sum, place, covered) = self.sum.as_ref()?;
-        let number = checksum(&sum.algorithm, &frame[covered.clone()]);
+        let (id, covered) = (sum.data_id.bytes(), &frame[covered.clone()]);
+        let (before, behind) = if sum.data_id.is_behind() { (&[][..], id) } else { (id, &[][..]) };
+        let number = checksum(&sum.algorithm, &[before, covered, behind].concat());
         let len = if sum.text { place.len() / 2 } else { place.len() };
         let mut bytes = number.to_be_bytes()[4 - len..].to_vec();
         if sum.order == ByteOrder::Little {
@@ -97,6 +114,59 @@ impl DeviceSpec {
             found == bytes
         })
     }
+}
+
+/// What bytes of a line are, seen as this frame.
+pub(super) fn look(frame: &Frame, bytes: &[u8]) -> Look {
+    let seen = bytes.len().min(frame.head.len());
+    if bytes[..seen] != frame.head[..seen] {
+        return Look::No;
+    }
+    let Some(whole) = bytes.get(..frame.len()) else {
+        let is_ours = frame.device.as_ref().is_some_and(|device| device.agrees(&frame.fields, bytes));
+        return Look::Begins { is_ours };
+    };
+    let Some(device) = frame.device.as_ref().filter(|_| whole.ends_with(&frame.tail)) else {
+        return Look::No;
+    };
+    match device.see(&frame.fields, whole) {
+        Seen::Ours => Look::Frame(whole.len()),
+        Seen::Other => Look::Other(whole.len()),
+        Seen::WrongChecksum => Look::Wrong(whole.len()),
+        Seen::Nothing => Look::No,
+    }
+}
+
+/// Whether two frames of the same direction can have the same bytes, so that nobody could tell them apart.
+pub(super) fn can_be_the_same(one: &Frame, other: &Frame) -> bool {
+    let (Some(of_one), Some(of_other)) = (&one.device, &other.device) else { return false };
+    let constants = |frame: &'_ Frame, device: &'_ DeviceSpec| -> Vec<(Range<usize>, Encoding, u64)> {
+        let fields = frame.fields.iter().zip(&device.places);
+        let of = |(field, place): (&FieldSpec, &Range<usize>)| {
+            constant(field).map(|(encoding, value)| (place.clone(), encoding, value.to_bits()))
+        };
+        fields.filter_map(of).collect()
+    };
+    let others = constants(other, of_other);
+    let differ = constants(one, of_one).into_iter().any(|(place, encoding, value)| {
+        others.iter().any(|other| (&other.0, &other.1) == (&place, &encoding) && other.2 != value)
+    });
+    (one.id, &one.head, &one.tail, one.len()) == (other.id, &other.head, &other.tail, other.len()) && !differ
+}
+
+/// The encoding and the number of a field that is the same in every frame.
+fn constant(field: &FieldSpec) -> Option<(Encoding, f64)> {
+    let (encoding, overflow, number) = match *field {
+        FieldSpec::Fixed { encoding, value } => return Some((encoding, value as f64)),
+        FieldSpec::UserOutput { ty, from: OutputBinding::Constant(number) } => {
+            (Encoding::scalar(ty), Overflow::Usual, number)
+        }
+        FieldSpec::DeviceOutput { encoding, overflow, from: OutputBinding::Constant(number) } => {
+            (encoding, overflow, number)
+        }
+        _ => return None,
+    };
+    Some((encoding, shown_as(&encoding, overflow, number)))
 }
 
 fn sum_bytes(sum: &Checksum) -> usize {
@@ -156,33 +226,10 @@ pub(crate) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
             .any(|part| part.framing != Boundary::Fields || part.escape.is_some()),
         Parts::Can { .. } => false,
     });
-    let counts = config.fields.iter().any(|field| {
-        let counts_input = match field {
-            FieldSpec::UserInput { to, .. } | FieldSpec::DeviceInput { to, .. } => {
-                matches!(to, InputBinding::Counter { .. })
-            }
-            _ => false,
-        };
-        counts_input || matches!(field.source(), Some(OutputBinding::CounterTo { .. }))
-    });
-    let has_data_id = config
-        .fields
-        .iter()
-        .any(|field| matches!(field, FieldSpec::Checksum(sum) if !sum.data_id.bytes().is_empty()));
-    let view = config.view();
-    let has_one_id = view.recipes.iter().any(|recipe| match &recipe.parts {
-        Parts::Can { input, output } => [input, output].into_iter().any(|frames| {
-            frames.iter().enumerate().any(|(nth, frame)| frames[..nth].iter().any(|it| it.id == frame.id))
-        }),
-        Parts::Stream { .. } => false,
-    });
-    match (varies || is_cut, counts || has_one_id || has_data_id) {
-        (true, _) => Some("a soak cannot judge texts and frames of varying length"),
-        (_, true) => {
-            Some("a soak cannot judge counters that are checked, CAN frames with one id, and data ids")
-        }
-        _ => super::bits::unmodelled(config),
+    if varies || is_cut {
+        return Some("a soak cannot judge texts and frames of varying length");
     }
+    super::bits::unmodelled(config)
 }
 
 /// Number of bytes of a field. Fields of varying length are refused before a run.
@@ -263,6 +310,28 @@ pub(super) fn read(encoding: &Encoding, bytes: &[u8]) -> Option<f64> {
         }
         other => panic!("{other:?} has no model"),
     })
+}
+
+/// Whether [`write`] knows how such a field is written.
+pub(super) const fn is_written_by_model(encoding: &Encoding) -> bool {
+    matches!(encoding.kind, Kind::Scalar(_) | Kind::Uint24 | Kind::Int24 | Kind::Bits(_))
+}
+
+/// Writes a number that the field can have into its bytes; other bits of the same bytes stay.
+pub(super) fn write(encoding: &Encoding, number: f64, bytes: &mut [u8]) {
+    let len = bytes.len();
+    let number = match encoding.kind {
+        Kind::Scalar(ScalarType::Float) => u64::from((number as f32).to_bits()),
+        Kind::Scalar(ScalarType::Double) => number.to_bits(),
+        Kind::Bits(bits) => {
+            let mask = ((1_u64 << bits.count) - 1) << bits.first;
+            let before =
+                ordered(encoding.order, bytes).iter().fold(0_u64, |all, &byte| all << 8 | u64::from(byte));
+            before & !mask | ((number as i64).cast_unsigned() << bits.first) & mask
+        }
+        _ => (number as i64).cast_unsigned(),
+    };
+    bytes.copy_from_slice(&ordered(encoding.order, &number.to_be_bytes()[8 - len..]));
 }
 
 /// The number that a field shows for `number`: rounded, and the nearest that it can have or wrapped.

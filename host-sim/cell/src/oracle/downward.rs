@@ -40,8 +40,18 @@ pub(super) struct Downward {
 }
 
 impl Downward {
-    fn is_usable(&self) -> bool {
+    pub(super) fn is_usable(&self) -> bool {
         self.is_up && !self.is_bus_off
+    }
+
+    /// Whether what was handed over has not left, or the line is somebody else's.
+    pub(super) fn is_busy(&self) -> bool {
+        self.in_flight
+    }
+
+    /// The line is somebody else's until [`Self::sent`].
+    pub(super) fn hold(&mut self) {
+        self.in_flight = true;
     }
 
     fn may_send(&self, port: &PortSpec, now: Instant) -> bool {
@@ -155,6 +165,7 @@ impl Downward {
         self.frames_out = self.frames_out.wrapping_add(1);
         self.bytes_out = self.bytes_out.wrapping_add(len as u32);
         self.cycles = self.cycles.wrapping_add(1);
+        self.in_flight = true;
     }
 
     /// Checks a frame that the engine hands over; `id` is that of a CAN frame.
@@ -290,6 +301,37 @@ impl Downward {
         })
     }
 
+    /// The payload with the present values; `None` if one is not a number.
+    pub(super) fn made(&self, frame: &Frame, up: &Upward) -> Option<Vec<u8>> {
+        let mut bytes = vec![0; frame.payload];
+        let places = frame.device.iter().flat_map(|device| &device.places);
+        for (field, place) in frame.fields.iter().zip(places) {
+            let bytes = &mut bytes[place.clone()];
+            let (encoding, overflow, from) = match *field {
+                FieldSpec::DeviceOutput { encoding, overflow, from } => (encoding, overflow, from),
+                FieldSpec::UserOutput { ty, from } => (Encoding::scalar(ty), Overflow::Usual, from),
+                FieldSpec::Padding { fill, .. } => {
+                    bytes.fill(fill);
+                    continue;
+                }
+                _ => return None,
+            };
+            let number = self.device_number(&encoding, up, from)?;
+            device::write(&encoding, device::shown_as(&encoding, overflow, number), bytes);
+        }
+        Some(bytes)
+    }
+
+    fn device_number(&self, encoding: &Encoding, up: &Upward, from: OutputBinding) -> Option<f64> {
+        match from {
+            OutputBinding::Counter => {
+                let highest = device::range(encoding).1.min(f64::from(u32::MAX));
+                Some(f64::from(self.cycles) % (highest + 1.0))
+            }
+            _ => self.number(up, ScalarType::Double, from),
+        }
+    }
+
     fn device_field_agrees(&self, field: &FieldSpec, up: &Upward, bytes: &[u8]) -> bool {
         let (encoding, overflow, from) = match *field {
             FieldSpec::DeviceOutput { encoding, overflow, from } => (encoding, overflow, from),
@@ -301,16 +343,11 @@ impl Downward {
             FieldSpec::Checksum(_) => return true,
             _ => return false,
         };
-        let number = match from {
-            // Reply codes are not modelled.
-            OutputBinding::Reply => return true,
-            OutputBinding::Counter => {
-                let highest = device::range(&encoding).1.min(f64::from(u32::MAX));
-                Some(f64::from(self.cycles) % (highest + 1.0))
-            }
-            _ => self.number(up, ScalarType::Double, from),
-        };
-        let Some(number) = number else { return false };
+        // Reply codes are not modelled.
+        if from == OutputBinding::Reply {
+            return true;
+        }
+        let Some(number) = self.device_number(&encoding, up, from) else { return false };
         device::read(&encoding, bytes) == Some(device::shown_as(&encoding, overflow, number))
     }
 
@@ -332,7 +369,7 @@ impl Downward {
                 ScalarType::Float => f64::from(self.cycles % (1 << 24)),
                 ScalarType::Dword | ScalarType::Double => f64::from(self.cycles),
             }),
-            OutputBinding::CounterTo { .. } => None,
+            OutputBinding::CounterTo { max } => Some((u64::from(self.cycles) % (u64::from(max) + 1)) as f64),
             OutputBinding::Reply | OutputBinding::State { .. } | OutputBinding::Port { .. } => None,
         }
     }

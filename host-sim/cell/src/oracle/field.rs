@@ -1,6 +1,8 @@
 //! The frames in the bytes that a field port received, and their values: a plain implementation of
 //! proto-core/docs/wire/recipes.md sections 4, 6 and 7.
 
+use std::collections::BTreeMap;
+
 use proto_core::config::{CommandWhen, FieldSpec, InputBinding, Span};
 use proto_core::device::{Encoding, Overflow};
 use proto_core::recipe::model::Mode;
@@ -10,7 +12,7 @@ use proto_core::wire::can::CanFrame;
 use proto_core::wire::scalar::{Scalar, ScalarType};
 
 use super::bits::Coils;
-use super::device::{self, DeviceSpec, Seen};
+use super::device::{self, Look, Seen};
 use super::spec::{Frame, PortSpec, Raw};
 
 /// Whether a frame is accepted.
@@ -25,6 +27,8 @@ pub(super) enum Verdict {
     WrongChecksum,
     /// A frame of another device.
     OtherDevice,
+    /// The alive counter is that of the frame before.
+    Repeated,
 }
 
 /// An accepted frame.
@@ -40,7 +44,14 @@ pub(super) struct Accepted {
     /// Values of command fields: the field's index in the frame, its table, when it picks a command, and the
     /// value.
     pub commands: Vec<(usize, Span, CommandWhen, i64)>,
+    /// The alive counters, each with the place of its field.
+    pub counts: Vec<((usize, usize), u32)>,
+    /// How many of them are not the next one.
+    pub jumps: u32,
 }
+
+/// The newest alive counters by frame and field.
+pub(super) type Counts = BTreeMap<(usize, usize), u32>;
 
 /// Why a CAN frame does not match the recipe.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -61,6 +72,8 @@ pub(super) struct LineWatch {
     pub frame_bytes: u64,
     /// How many bytes before the place where a device's next frame is expected; `None` if that is unknown.
     pub missing: Missing,
+    /// The alive counters of the accepted frames.
+    pub counts: Counts,
 }
 
 /// At first, and after silence, a frame is expected to begin at once.
@@ -92,8 +105,8 @@ impl LineWatch {
         self.heard = now;
         let Some(frame) = port.inputs.first() else { return Vec::new() };
         self.held.extend_from_slice(bytes);
-        if let Some(device) = &frame.device {
-            return self.cut_device(frame, device);
+        if frame.device.is_some() {
+            return self.cut_device(frame);
         }
         self.cut(frame).iter().map(|payload| judge(port.mode, frame, 0, payload)).collect()
     }
@@ -123,35 +136,49 @@ impl LineWatch {
         self.held.drain(..len).collect()
     }
 
+    /// Judges a whole frame of a device, the port's `nth`.
+    pub(super) fn judge(&mut self, frame: &Frame, nth: usize, whole: &[u8]) -> Verdict {
+        let verdict = judge_device(frame, nth, whole, &self.counts);
+        if let Verdict::Accepted(accepted) = &verdict {
+            // A rejected frame moves no counter.
+            self.counts.extend(accepted.counts.iter().copied());
+        }
+        verdict
+    }
+
+    /// Judges the data of a reply.
+    pub(super) fn judge_data(&mut self, frame: &Frame, nth: usize, data: &[u8]) -> Verdict {
+        match &frame.device {
+            None => judge(Mode::User, frame, nth, data),
+            Some(device) => match device.see(&frame.fields, data) {
+                Seen::Ours => self.judge(frame, nth, data),
+                Seen::Other | Seen::Nothing => Verdict::OtherDevice,
+                Seen::WrongChecksum => Verdict::WrongChecksum,
+            },
+        }
+    }
+
     /// Removes complete frames of a device from the held bytes.
-    fn cut_device(&mut self, frame: &Frame, device: &DeviceSpec) -> Vec<Verdict> {
+    fn cut_device(&mut self, frame: &Frame) -> Vec<Verdict> {
         let mut found = Vec::new();
         while !self.held.is_empty() {
-            let seen = self.held.len().min(frame.head.len());
-            let begins = self.held[..seen] == frame.head[..seen];
-            if begins && self.held.len() < frame.len() {
-                break;
-            }
-            let whole = self.held.get(..frame.len()).filter(|whole| begins && whole.ends_with(&frame.tail));
-            let (verdict, taken) = match whole.map_or(Seen::Nothing, |whole| device.see(&frame.fields, whole))
-            {
-                Seen::Ours => (Some(judge_device(frame, 0, &self.held[..frame.len()])), frame.len()),
-                Seen::Other => (Some(Verdict::OtherDevice), frame.len()),
-                Seen::WrongChecksum if self.missing.0 == Some(0) => {
-                    self.missing.0 = Some(frame.len());
-                    (Some(Verdict::WrongChecksum), 1)
+            match device::look(frame, &self.held) {
+                Look::Begins { .. } => break,
+                Look::No => self.drop_one(),
+                Look::Wrong(len) => {
+                    if self.drop_wrong(len) {
+                        found.push(Verdict::WrongChecksum);
+                    }
                 }
-                Seen::WrongChecksum | Seen::Nothing => (None, 1),
-            };
-            if taken == 1 {
-                self.dropped += 1;
-                self.missing.0 = self.missing.0.and_then(|missing| missing.checked_sub(1));
-            } else {
-                self.frame_bytes += taken as u64;
-                self.missing = Missing::default();
+                Look::Other(len) => {
+                    self.take_front(len);
+                    found.push(Verdict::OtherDevice);
+                }
+                Look::Frame(len) => {
+                    let whole = self.take_front(len);
+                    found.push(self.judge(frame, 0, &whole));
+                }
             }
-            self.held.drain(..taken);
-            found.extend(verdict);
         }
         found
     }
@@ -184,38 +211,41 @@ impl LineWatch {
 }
 
 /// Receives a CAN frame.
-pub(super) fn can(port: &PortSpec, received: &CanFrame) -> Result<Verdict, Refused> {
+pub(super) fn can(port: &PortSpec, line: &mut LineWatch, received: &CanFrame) -> Result<Verdict, Refused> {
     if received.is_remote() {
         return Err(Refused::Remote);
     }
-    let nth = port.inputs.iter().position(|frame| frame.id == Some(received.id()));
-    let nth = nth.ok_or(Refused::Id)?;
-    let frame = &port.inputs[nth];
-    if received.data().len() != frame.payload {
-        return Err(Refused::Length);
-    }
-    let Some(device) = &frame.device else { return Ok(judge(port.mode, frame, nth, received.data())) };
-    Ok(match device.see(&frame.fields, received.data()) {
-        Seen::Ours => judge_device(frame, nth, received.data()),
-        Seen::Other | Seen::Nothing => Verdict::OtherDevice,
-        Seen::WrongChecksum => Verdict::WrongChecksum,
-    })
+    can_of(port.inputs.iter().enumerate(), port.mode, line, received)
 }
 
-/// Judges the data of a reply.
-pub(super) fn judge_data(frame: &Frame, nth: usize, data: &[u8]) -> Verdict {
-    match &frame.device {
-        None => judge(Mode::User, frame, nth, data),
-        Some(device) => match device.see(&frame.fields, data) {
-            Seen::Ours => judge_device(frame, nth, data),
-            Seen::Other | Seen::Nothing => Verdict::OtherDevice,
-            Seen::WrongChecksum => Verdict::WrongChecksum,
-        },
+/// The same, with the frames that it may be. Frames with one id are told apart by a constant.
+pub(super) fn can_of<'f>(
+    frames: impl Iterator<Item = (usize, &'f Frame)>,
+    mode: Mode,
+    line: &mut LineWatch,
+    received: &CanFrame,
+) -> Result<Verdict, Refused> {
+    let mut why = Err(Refused::Id);
+    for (nth, frame) in frames.filter(|(_, frame)| frame.id == Some(received.id())) {
+        let Some(device) = frame.device.as_ref().filter(|_| received.data().len() == frame.payload) else {
+            if frame.device.is_none() && received.data().len() == frame.payload {
+                return Ok(judge(mode, frame, nth, received.data()));
+            }
+            why = why.or(Err(Refused::Length));
+            continue;
+        };
+        why = match (device.see(&frame.fields, received.data()), why) {
+            (Seen::Ours, _) => return Ok(line.judge(frame, nth, received.data())),
+            // Right but for a constant: another device's, whatever the others say.
+            (Seen::Other | Seen::Nothing, _) | (_, Ok(Verdict::OtherDevice)) => Ok(Verdict::OtherDevice),
+            (Seen::WrongChecksum, _) => Ok(Verdict::WrongChecksum),
+        };
     }
+    why
 }
 
 /// The fields are judged one after the other: the first that cannot be used rejects the frame.
-fn judge_device(frame: &Frame, nth: usize, whole: &[u8]) -> Verdict {
+fn judge_device(frame: &Frame, nth: usize, whole: &[u8], counts: &Counts) -> Verdict {
     let mut accepted = Accepted { frame: nth, ..Accepted::default() };
     let places = frame.device.iter().flat_map(|device| &device.places);
     // Command fields are counted without the checksum, as they are no elements of it.
@@ -248,8 +278,20 @@ fn judge_device(frame: &Frame, nth: usize, whole: &[u8]) -> Verdict {
                 accepted.commands.push((at, table, when, number as i64));
             }
             InputBinding::Bit { var, bit } => accepted.bits.push(coil(var, bit, number)),
-            // A configuration with counters is not judged.
-            InputBinding::Unused | InputBinding::Counter { .. } => {}
+            InputBinding::Counter { max } => {
+                let before = counts.get(&(nth, at)).copied();
+                if number > f64::from(max) {
+                    return Verdict::OutOfRange;
+                }
+                let number = number as u32;
+                if before == Some(number) {
+                    return Verdict::Repeated;
+                }
+                let next = |before: u32| if before >= max { 0 } else { before + 1 };
+                accepted.jumps += u32::from(before.is_some_and(|before| next(before) != number));
+                accepted.counts.push(((nth, at), number));
+            }
+            InputBinding::Unused => {}
         }
     }
     Verdict::Accepted(accepted)

@@ -4,7 +4,7 @@ use proto_core::engine::{Engine, LinkId, PortId};
 use proto_core::link::LinkState;
 use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
-use proto_core::wire::can::CanFrame;
+use proto_core::wire::can::{CanFrame, CanId};
 
 use super::bits::Coils;
 use super::field::{self, Accepted, LineWatch, Refused, Verdict};
@@ -12,6 +12,15 @@ use super::spec::{Origin, Owned, Raw, shown, written};
 use super::upward::{Wrong, is_gap};
 use super::wire::{Asked, Safe};
 use super::{Invariant, LinkWatch, Oracle, PortWatch, place};
+
+/// What a field port hands over.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Leaving<'a> {
+    /// Of a CAN frame.
+    pub id: Option<CanId>,
+    pub is_remote: bool,
+    pub bytes: &'a [u8],
+}
 
 impl Oracle {
     /// Handles deadlines that have passed.
@@ -21,7 +30,7 @@ impl Oracle {
             self.forget_commands(nth, Some(frame), now);
         }
         if !overdue.is_empty() {
-            self.values_changed();
+            self.values_changed(now);
         }
         self.up.expire(&self.spec, now);
         for (watch, port) in self.ports.iter_mut().zip(&self.spec.ports) {
@@ -30,6 +39,7 @@ impl Oracle {
         }
         for nth in 0..self.ports.len() {
             self.talk_tick(nth, now);
+            self.served_tick(nth, now);
         }
         if now >= self.rewrite_at {
             self.write_refused_again();
@@ -41,9 +51,13 @@ impl Oracle {
 
     /// The gateway slept: frames that had begun are not continued.
     pub(super) fn slept(&mut self, now: Instant) {
-        for watch in &mut self.ports {
+        for (watch, port) in self.ports.iter_mut().zip(&self.spec.ports) {
             watch.down.slept();
             watch.line.discard();
+            watch.line.discarded += watch.served.discard();
+            if watch.talk.waits() && !port.is_can {
+                watch.down.sent();
+            }
             watch.talk.abandon();
             watch.talk.disturbed_at = now + DISCARD_AFTER_SLEEP;
         }
@@ -96,8 +110,8 @@ impl Oracle {
     }
 
     /// Shown values may have changed: looks for rising bits that trigger a port.
-    pub(super) fn values_changed(&mut self) {
-        self.talk_values_changed();
+    pub(super) fn values_changed(&mut self, now: Instant) {
+        self.talk_values_changed(now);
         if !self.spec.has_triggers {
             return;
         }
@@ -111,10 +125,13 @@ impl Oracle {
         let watch = &mut self.ports[nth];
         watch.counters.bytes_in = watch.counters.bytes_in.wrapping_add(bytes.len() as u32);
         watch.down.heard = now;
-        if port.talk.is_some() {
+        if port.talk.is_some() || port.served.is_some() {
             watch.line.heard = now;
             if self.discards_until.is_none() {
-                return self.talk_bytes(nth, bytes, now);
+                return match port.served {
+                    Some(_) => self.served_bytes(nth, bytes, now),
+                    None => self.talk_bytes(nth, bytes, now),
+                };
             }
             watch.counters.asleep += 1;
             watch.line.discarded += bytes.len() as u64;
@@ -144,20 +161,44 @@ impl Oracle {
         counters.bytes_in = counters.bytes_in.wrapping_add(frame.data().len() as u32);
         if self.discards_until.is_some() {
             counters.asleep += 1;
-            let verdict = field::can(port, frame);
+            let verdict = field::can(port, &mut LineWatch::default(), frame);
             self.waited_in_sleep(verdict.into_iter().collect());
             return;
+        }
+        if port.talk.is_some() {
+            return self.talk_can(nth, frame, now);
         }
         if port.inputs.is_empty() {
             counters.rejected_no_input += 1;
             return;
         }
-        match field::can(port, frame) {
+        let verdict = field::can(port, &mut self.ports[nth].line, frame);
+        self.take_can(nth, verdict, now);
+    }
+
+    pub(super) fn take_can(&mut self, nth: usize, verdict: Result<Verdict, Refused>, now: Instant) {
+        let counters = &mut self.ports[nth].counters;
+        match verdict {
             Ok(verdict) => self.take(nth, vec![verdict], now),
             Err(Refused::Remote) => counters.rejected_remote += 1,
             Err(Refused::Id) => counters.rejected_id += 1,
             Err(Refused::Length) => counters.rejected_length += 1,
         }
+    }
+
+    /// The device of a port is there.
+    pub(super) fn port_up(&mut self, nth: usize, now: Instant) {
+        self.ports[nth].down.is_up = true;
+        self.begin_talk(nth, now);
+    }
+
+    /// A conversation begins anew.
+    pub(super) fn begin_talk(&mut self, nth: usize, now: Instant) {
+        let watch = &mut self.ports[nth];
+        watch.line.discarded += watch.served.discard();
+        watch.talk.begin(self.spec.ports[nth].talk.as_ref(), now);
+        // What rises from now on asks.
+        self.talk_values_changed(now);
     }
 
     /// Remembers discarded frames that had waited while the gateway slept.
@@ -199,10 +240,15 @@ impl Oracle {
                     counters.rejected_other_device += 1;
                     continue;
                 }
+                Verdict::Repeated => {
+                    counters.rejected_counter += 1;
+                    continue;
+                }
                 Verdict::Accepted(frame) => frame,
             };
             counters.frames_in += 1;
             counters.masked += u32::from(frame.masked);
+            counters.counter_jumps += frame.jumps;
             self.frames[nth].0 += 1;
             frames += 1;
             let commands_up = self.up.is_up(LinkId::COMMAND);
@@ -213,7 +259,7 @@ impl Oracle {
                 self.robot.asked(urgent, |command| commands.waits_until(command));
             }
             self.up.accepted(&self.spec, nth, &frame, now);
-            self.values_changed();
+            self.values_changed(now);
             newest = Some(frame);
             // The engine does this after each frame if there are triggers, otherwise after all of them.
             if self.spec.has_triggers {
@@ -241,21 +287,23 @@ impl Oracle {
         self.up.expire(&self.spec, now);
     }
 
-    pub(super) fn port_send(
-        &mut self,
-        port: PortId,
-        id: Option<proto_core::wire::can::CanId>,
-        bytes: &[u8],
-        now: Instant,
-    ) {
+    pub(super) fn port_send(&mut self, port: PortId, sent: &Leaving<'_>, now: Instant) {
         let nth = usize::from(port.0);
         self.frames[nth].1 += 1;
-        if self.spec.ports[nth].talk.is_some() {
-            let result = self.talk_send(nth, bytes, now);
+        let spec = &self.spec.ports[nth];
+        if spec.served.is_some() {
+            let result = self.served_send(nth, sent, now);
+            return self.judge(now, &[Invariant::Shown, Invariant::Line, Invariant::Cycle], result);
+        }
+        let is_asked = spec.talk.as_ref().is_some_and(|talk| {
+            spec.outputs.is_empty() || talk.row_of((sent.id, sent.is_remote), sent.bytes).is_some()
+        });
+        if is_asked {
+            let result = self.talk_send(nth, sent, now);
             let invariants = [Invariant::Known, Invariant::Age, Invariant::Shown, Invariant::Line];
             return self.judge(now, &invariants, result);
         }
-        let result = self.ports[nth].down.check(&self.spec, nth, &self.up, id, bytes, now);
+        let result = self.ports[nth].down.check(&self.spec, nth, &self.up, sent.id, sent.bytes, now);
         let invariants = [
             Invariant::Known,
             Invariant::Age,
@@ -282,14 +330,14 @@ impl Oracle {
                     self.refused.extend(refused);
                     self.rewrite_at = self.rewrite_at.min(now + REFUSED_PAUSE);
                 }
-                self.values_changed();
+                self.values_changed(now);
             }
             LinkId::STATE => {
                 self.links[place(link)].line.held.extend_from_slice(bytes);
                 while let Some(packet) = first_packet(&mut self.links[place(link)].line) {
                     if self.links[place(link)].stream.takes(&packet) {
                         self.up.state_packet(&self.spec, &packet, now);
-                        self.values_changed();
+                        self.values_changed(now);
                     }
                 }
             }
@@ -333,7 +381,7 @@ impl Oracle {
                 self.up.received(var, raw, now);
             }
             self.up.doubt_by_witnesses(&self.spec, now);
-            self.values_changed();
+            self.values_changed(now);
         }
     }
 
@@ -489,7 +537,7 @@ impl Oracle {
     /// Compares the engine's counters with the model's.
     pub(super) fn count(&mut self, nth: usize, engine: &Engine) -> Result<(), Wrong> {
         let Some(actual) = engine.port_counters(PortId(nth as u8)) else { return Ok(()) };
-        let PortWatch { line, down, counters, talk } = &self.ports[nth];
+        let PortWatch { line, down, counters, talk, .. } = &self.ports[nth];
         let up = self.up.counted[nth];
         let commands = self.commands.counted[nth];
         let mut expected = *counters;
@@ -501,7 +549,7 @@ impl Oracle {
         expected.skipped_cycles = down.skipped;
         expected.stale_cycles = down.stale;
         expected.unanswered = talk.unanswered;
-        expected.refused = talk.refused;
+        expected.refused = counters.refused.wrapping_add(talk.refused);
         expected.edges_lost = up.edges_lost;
         expected.values_expired = up.values_expired;
         expected.undelivered = up.undelivered;
@@ -520,7 +568,7 @@ impl Oracle {
         let accounted = line.frame_bytes + line.dropped + line.discarded + line.held.len() as u64;
         let spec = &self.spec.ports[nth];
         let reads = !spec.inputs.is_empty() || spec.talk.is_some();
-        if !spec.is_can && reads && accounted as u32 != actual.bytes_in {
+        if !spec.is_can && spec.served.is_none() && reads && accounted as u32 != actual.bytes_in {
             let what =
                 format!("port {nth} received {} bytes, {accounted} are accounted for", actual.bytes_in);
             return Err((Invariant::Bytes, what));

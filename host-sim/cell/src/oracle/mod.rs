@@ -35,12 +35,14 @@ use proto_core::time::{Duration, Instant};
 use commands::Commands;
 use downward::Downward;
 use field::LineWatch;
+use gateway::Leaving;
 use invariant::ALL;
 pub use invariant::{Invariant, Violation};
 pub(super) use robot::Path;
 use robot::Robot;
 use spec::Spec;
 use talk::line::TalkWatch;
+use talk::served::ServedWatch;
 use talk::truth::Truth;
 use upward::{Upward, Wrong};
 pub(super) use wire::inputs_of;
@@ -53,6 +55,7 @@ struct PortWatch {
     down: Downward,
     counters: PortCounters,
     talk: TalkWatch,
+    served: ServedWatch,
 }
 
 /// The model's state of one recipe link, or of the state link.
@@ -126,7 +129,9 @@ pub(super) struct Oracle {
 impl Oracle {
     pub(super) fn new(config: &GatewayConfig) -> Self {
         let spec = Spec::new(config);
-        let of_port = |port: &spec::PortSpec| port.outputs.len() + usize::from(port.talk.is_some());
+        let of_port = |port: &spec::PortSpec| {
+            port.outputs.len() + usize::from(port.talk.is_some() || port.served.is_some())
+        };
         let parts: usize = spec.ports.iter().map(of_port).sum();
         Self {
             map: Map::new(&spec),
@@ -167,7 +172,7 @@ impl Oracle {
         for port in engine.field_ports() {
             let watch = &mut self.ports[usize::from(port.0)];
             watch.down.is_up = true;
-            watch.talk.begin(now);
+            watch.talk.begin(self.spec.ports[usize::from(port.0)].talk.as_ref(), now);
         }
     }
 
@@ -221,6 +226,10 @@ impl Oracle {
         if has_slept {
             self.commands.slept(now);
             self.robot.forget_all(now);
+            // A master's request that waited is not carried out: nobody knows how old it is.
+            for watch in &mut self.ports {
+                watch.line.discarded += watch.served.discard();
+            }
             self.find_lost_links(engine, None, now);
         }
         if is_tick || has_slept {
@@ -243,20 +252,8 @@ impl Oracle {
         match *input {
             Input::PortBytes { port, bytes } => self.port_bytes(usize::from(port.0), bytes, now),
             Input::PortCan { port, frame } => self.port_can(usize::from(port.0), &frame, now),
-            Input::PortSent { port } => {
-                let nth = usize::from(port.0);
-                self.ports[nth].down.sent();
-                if let Some(talk) = &self.spec.ports[nth].talk {
-                    self.ports[nth].talk.left(talk, now);
-                }
-            }
-            Input::PortUp { port } => {
-                let watch = &mut self.ports[usize::from(port.0)];
-                watch.down.is_up = true;
-                watch.talk.begin(now);
-                // What rises from now on asks.
-                self.talk_values_changed();
-            }
+            Input::PortSent { port } => self.port_sent(usize::from(port.0), now),
+            Input::PortUp { port } => self.port_up(usize::from(port.0), now),
             Input::PortDown { port } => {
                 let nth = usize::from(port.0);
                 let watch = &mut self.ports[nth];
@@ -264,6 +261,7 @@ impl Oracle {
                 watch.down.is_up = false;
                 watch.down.reset();
                 watch.line.discard();
+                watch.line.discarded += watch.served.discard();
                 watch.talk.gone();
                 self.forget_commands(nth, None, now);
             }
@@ -272,11 +270,14 @@ impl Oracle {
                 let watch = &mut self.ports[nth];
                 let is_off = state == BusState::BusOff;
                 let is_news = is_off && !watch.down.is_bus_off;
-                watch.down.is_bus_off = is_off;
+                let was_off = std::mem::replace(&mut watch.down.is_bus_off, is_off);
                 if is_news {
                     watch.counters.bus_offs += 1;
                     watch.down.reset();
+                    watch.talk.gone();
                     self.forget_commands(nth, None, now);
+                } else if was_off && !is_off {
+                    self.begin_talk(nth, now);
                 }
             }
             Input::LinkUp { link } => {
@@ -312,8 +313,13 @@ impl Oracle {
         };
         self.judge(now, &[Invariant::Work], result);
         match *output {
-            Output::PortSend { port, bytes } => self.port_send(port, None, bytes, now),
-            Output::PortSendCan { port, frame } => self.port_send(port, Some(frame.id()), frame.data(), now),
+            Output::PortSend { port, bytes } => {
+                self.port_send(port, &Leaving { id: None, is_remote: false, bytes }, now);
+            }
+            Output::PortSendCan { port, frame } => {
+                let (id, is_remote) = (Some(frame.id()), frame.is_remote());
+                self.port_send(port, &Leaving { id, is_remote, bytes: frame.data() }, now);
+            }
             Output::LinkClose { link } => self.link_lost(link, now),
             Output::LinkSend { link, bytes } => {
                 self.traffic[place(link)].0 += 1;
@@ -341,6 +347,8 @@ impl Oracle {
                 if !self.is_late {
                     let result = self.ports[nth].down.rest(&self.spec, nth, &self.up, now);
                     self.judge(now, &[Invariant::Cycle], result);
+                    let result = self.served_rests(nth, now);
+                    self.judge(now, &[], result);
                 }
                 let result = self.count(nth, engine);
                 self.judge(now, &[Invariant::Counted, Invariant::Bytes], result);

@@ -12,6 +12,7 @@ use proto_core::wire::can::CanId;
 
 use super::bits::{self, Share};
 use super::device::DeviceSpec;
+use super::talk::served::ServedSpec;
 use super::talk::spec::TalkSpec;
 
 /// A value as on the wire; unused bytes are 0.
@@ -65,8 +66,10 @@ pub(super) struct PortSpec {
     pub send: SendOn,
     pub idle_gap: Duration,
     pub turnaround: Duration,
-    /// What is asked on a Modbus line. The replies are behind the other inputs.
+    /// What is asked of slaves or devices. The replies are behind the other inputs.
     pub talk: Option<TalkSpec>,
+    /// What a master on a Modbus line may ask. What it writes is behind the other inputs.
+    pub served: Option<ServedSpec>,
 }
 
 impl PortSpec {
@@ -75,7 +78,7 @@ impl PortSpec {
         let fields = self.outputs.iter().flat_map(|frame| &frame.fields).filter_map(shown);
         let rows = self.talk.iter().flat_map(|talk| &talk.rows);
         let asked = rows.flat_map(|row| row.shown().chain(row.rising.map(|(var, _)| var)));
-        fields.chain(asked)
+        fields.chain(asked).chain(self.served.iter().flat_map(ServedSpec::shown))
     }
 }
 
@@ -296,12 +299,22 @@ fn by_modbus(var: SysVar) -> bool {
 }
 
 pub(super) fn frame(head: &[u8], tail: &[u8], id: Option<CanId>, fields: &[FieldSpec]) -> Frame {
+    if fields.iter().any(FieldSpec::is_device) {
+        return device_frame(head, tail, id, fields);
+    }
+    let payload = fields.iter().map(size).sum();
+    Frame { head: head.to_vec(), tail: tail.to_vec(), id, fields: fields.to_vec(), payload, device: None }
+}
+
+/// A frame of a device's recipe, also one that a plain recipe could have.
+pub(super) fn device_frame(head: &[u8], tail: &[u8], id: Option<CanId>, fields: &[FieldSpec]) -> Frame {
     let device = DeviceSpec::new(head.len(), fields);
-    let payload = device.as_ref().map_or_else(|| fields.iter().map(size).sum(), |device| device.len);
-    Frame { head: head.to_vec(), tail: tail.to_vec(), id, fields: fields.to_vec(), payload, device }
+    let (head, tail, fields) = (head.to_vec(), tail.to_vec(), fields.to_vec());
+    Frame { head, tail, id, fields, payload: device.len, device: Some(device) }
 }
 
 fn frames(config: &GatewayConfig, recipe: &Recipe, direction: Direction) -> Vec<Frame> {
+    let frame = if config.view().is_device(recipe) { device_frame } else { frame };
     match (&recipe.parts, direction) {
         (Parts::Stream { input: part, .. }, Direction::Input)
         | (Parts::Stream { output: part, .. }, Direction::Output) => {
@@ -319,7 +332,7 @@ fn frames(config: &GatewayConfig, recipe: &Recipe, direction: Direction) -> Vec<
 fn port_spec(config: &GatewayConfig, port: &proto_core::config::Port) -> PortSpec {
     let recipe = &config.recipes[usize::from(port.recipe)];
     let mut inputs = frames(config, recipe, Direction::Input);
-    let mut talk = None;
+    let (mut talk, mut served) = (None, None);
     let (idle_gap, turnaround) = match port.bus {
         Bus::Rs485(line) => {
             // 3.5 characters: a start bit, eight bits, parity, stop bits (D19).
@@ -328,8 +341,13 @@ fn port_spec(config: &GatewayConfig, port: &proto_core::config::Port) -> PortSpe
             let characters = (half_bits * 1_000_000).div_ceil(2 * u64::from(line.baud));
             let characters = Duration::from_micros(characters);
             let silence = line.turnaround.max(characters);
-            talk = TalkSpec::new(config, recipe, (&line, silence), &mut inputs);
+            talk = TalkSpec::new(config, recipe, (Some(&line), silence), &mut inputs);
+            served = ServedSpec::new(config, recipe, line, &mut inputs);
             (line.idle_gap.max(characters), line.turnaround)
+        }
+        Bus::Can { .. } => {
+            talk = TalkSpec::new(config, recipe, (None, Duration::ZERO), &mut inputs);
+            (Duration::MAX, Duration::ZERO)
         }
         _ => (Duration::MAX, Duration::ZERO),
     };
@@ -347,6 +365,7 @@ fn port_spec(config: &GatewayConfig, port: &proto_core::config::Port) -> PortSpe
         idle_gap,
         turnaround,
         talk,
+        served,
     }
 }
 

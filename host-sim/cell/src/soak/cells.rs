@@ -43,7 +43,7 @@ macro_rules! embedded {
 
 /// A seed selects by position, so the order must not change. Controllers of examples that have field ports
 /// of their own are replaced, since no device would be connected to them.
-const EMBEDDED: [Embedded; 13] = [
+const EMBEDDED: [Embedded; 16] = [
     embedded!("/../configs/", "rs485-system", "can-hand"),
     embedded!("/../configs/", "udp-server", "udp-server"),
     embedded!("/../configs/", "client", "client"),
@@ -57,6 +57,9 @@ const EMBEDDED: [Embedded; 13] = [
     embedded!("/src/soak/cells/", "witness", "witness"),
     embedded!("/src/soak/cells/", "panels", "panels"),
     embedded!("/src/soak/cells/", "modbus-line", "modbus-line"),
+    embedded!("/src/soak/cells/", "gripper-line", "gripper-line"),
+    embedded!("/src/soak/cells/", "can-frames", "can-frames"),
+    embedded!("/src/soak/cells/", "panel-line", "panel-line"),
 ];
 
 impl Scenario {
@@ -105,7 +108,8 @@ impl Scenario {
 
 #[cfg(test)]
 mod tests {
-    use proto_core::config::{AskWhen, Exchange, Talk};
+    use proto_core::config::FieldSpec;
+    use proto_core::device::{Ignored, Text, TextWidth};
 
     use super::*;
     use crate::Cell;
@@ -119,11 +123,13 @@ mod tests {
     }
 
     #[test]
-    fn a_cell_with_devices_that_are_asked_in_their_own_frames_is_refused() {
+    fn a_cell_that_the_model_does_not_know_is_refused() {
         let mut config = Scenario::all().unwrap().remove(0).gateway;
         assert_eq!(unmodelled(&config), None);
-        let talk = Talk::Frames { request: None, reply: None, refusal: None };
-        config.exchanges.push(Exchange::new(0, talk, AskWhen::NEVER)).unwrap();
-        assert!(unmodelled(&config).unwrap().contains("exchanges"));
+        let text = Text { width: TextWidth::Fixed(4), fill: None };
+        let ignored = Ignored::NONE;
+        let field = FieldSpec::TextInput { text, to: None, length_to: None, count_to: None, ignored };
+        config.fields.push(field).unwrap();
+        assert!(unmodelled(&config).unwrap().contains("texts"));
     }
 }

@@ -7,9 +7,12 @@
 
 mod batch;
 mod cells;
+mod peers;
+mod plc;
 mod random_device;
 mod show;
 mod slaves;
+mod template;
 mod world;
 
 use std::collections::BTreeMap;
@@ -23,6 +26,8 @@ pub use cells::Scenario;
 pub use show::show_trace;
 
 use crate::{Cell, CellError, Chunking, FaultInjector, FaultKind, Invariant, Rng, Violation, Wiring};
+use peers::Peers;
+use plc::Plc;
 use random_device::RandomDevice;
 use slaves::Slaves;
 use world::World;
@@ -191,7 +196,9 @@ fn attach_devices(cell: &mut Cell, config: &GatewayConfig, level: Level, rng: &m
         let mut rng = rng.fork();
         let seed = rng.fork();
         let device = RandomDevice::new(config, port, cell.now(), seed.clone());
-        let slaves = Slaves::new(config, port, cell.now(), seed);
+        let slaves = Slaves::new(config, port, cell.now(), seed.clone());
+        let peers = Peers::new(config, port, cell.now(), seed.clone());
+        let plc = Plc::new(config, port, cell.now(), seed);
         match port.bus {
             Bus::Rs485(_) => {
                 let line = cell.line_of(&port.name);
@@ -204,15 +211,21 @@ fn attach_devices(cell: &mut Cell, config: &GatewayConfig, level: Level, rng: &m
                 if level == Level::Harsh && rng.below(4) == 0 {
                     cell.line(line).wiring = Wiring::TwoWire;
                 }
-                if let Some(device) = device {
+                if let Some(peers) = peers {
+                    cell.attach(line, peers);
+                } else if let Some(device) = device {
                     cell.attach(line, device);
                 } else if let Some(slaves) = slaves {
                     cell.attach(line, slaves);
+                } else if let Some(plc) = plc {
+                    cell.attach(line, plc);
                 }
             }
             Bus::Can { .. } => {
                 let bus = cell.bus_of(&port.name);
-                if let Some(device) = device {
+                if let Some(peers) = peers {
+                    cell.attach_can(bus, peers);
+                } else if let Some(device) = device {
                     cell.attach_can(bus, device);
                 }
             }

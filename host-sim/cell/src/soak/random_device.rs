@@ -3,42 +3,14 @@
 //! In: the gateway's configuration and a seed. Out: frames at random times. A device changes its behaviour
 //! every few seconds: steady, hasty, silent, stuck, careless.
 
-use proto_core::config::{
-    Bus, CommandEntry, DeviceFrame, FieldSpec, GatewayConfig, InputBinding, Port, Span,
-};
-use proto_core::device::Carrier;
-use proto_core::sysvar::{Direction, SysVar};
+use proto_core::config::{Bus, GatewayConfig, Port};
+use proto_core::sysvar::Direction;
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::can::{CanFrame, CanId};
-use proto_core::wire::scalar::{Scalar, ScalarType};
+use proto_core::wire::scalar::Scalar;
 
+use super::template::{Content, Template, changed};
 use crate::{Device, Rng};
-
-/// A frame that the device can send.
-#[derive(Debug, Clone)]
-struct Template {
-    head: Vec<u8>,
-    tail: Vec<u8>,
-    id: Option<CanId>,
-    fields: Vec<Content>,
-    /// A device's own frame, whose elements are the fields without the checksum.
-    device: Option<Box<DeviceFrame>>,
-}
-
-/// The kind of values of a field.
-#[derive(Debug, Clone)]
-enum Content {
-    /// Bits, which mostly change one at a time.
-    Bits,
-    /// Numbers of this type, mostly up to `most`, which most bound variables accept.
-    Number { ty: ScalarType, most: f64 },
-    /// A constant, or padding.
-    Constant,
-    /// No element of the frame: the layout makes it.
-    Checksum,
-    /// Numbers that sometimes pick commands.
-    Commands { ty: ScalarType, values: Vec<i64> },
-}
 
 /// How the device behaves for some time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -57,7 +29,7 @@ pub(super) struct RandomDevice {
     templates: Vec<Template>,
     /// The newest values, by template.
     values: Vec<Vec<Scalar>>,
-    /// The port's timeout.
+    /// The port's timeout; if frames with alive counters take turns, the part of it that one has.
     timeout: Duration,
     /// Time of a frame on the line.
     frame_time: Duration,
@@ -76,22 +48,12 @@ impl RandomDevice {
         let mut templates = Vec::new();
         match (&port.bus, &recipe.parts) {
             (Bus::Rs485(_), proto_core::config::Parts::Stream { input: Some(part), .. }) => {
-                let fields = part.fields.of(&config.fields).iter();
-                templates.push(Template {
-                    head: part.head.to_vec(),
-                    tail: part.tail.to_vec(),
-                    id: None,
-                    fields: fields.map(|field| content(config, field)).collect(),
-                    device: device_frame(config, Carrier::Stream, (&part.head, &part.tail), part.fields),
-                });
+                let fields = part.fields.of(&config.fields);
+                templates.push(Template::new(config, None, (&part.head, &part.tail), fields));
             }
             (Bus::Can { .. }, proto_core::config::Parts::Can { input, .. }) => {
-                templates.extend(input.iter().map(|frame| Template {
-                    head: Vec::new(),
-                    tail: Vec::new(),
-                    id: Some(frame.id),
-                    fields: frame.fields.of(&config.fields).iter().map(|f| content(config, f)).collect(),
-                    device: device_frame(config, Carrier::Can, (&[], &[]), frame.fields),
+                templates.extend(input.iter().map(|frame| {
+                    Template::new(config, Some(frame.id), (&[], &[]), frame.fields.of(&config.fields))
                 }));
             }
             _ => return None,
@@ -100,13 +62,14 @@ impl RandomDevice {
             return None;
         }
         let frame_time = config.view().budget(port, Direction::Input).map_or(Duration::ZERO, |b| b.time);
-        let values = templates.iter().map(|template| template.fields.iter().map(zero).collect()).collect();
+        let values = templates.iter().map(Template::zeros).collect();
+        let turns = if templates.iter().any(Template::counts) { templates.len() as u32 } else { 1 };
         let next = start + rng.up_to(port.timeout);
         Some(Self {
             rng,
             templates,
             values,
-            timeout: port.timeout,
+            timeout: Duration::from_micros(port.timeout.as_micros() / u64::from(turns)),
             frame_time,
             behaviour: Behaviour::Steady,
             behaviour_ends: start,
@@ -171,26 +134,6 @@ impl RandomDevice {
         }
         Some(self.nth)
     }
-
-    /// The bytes between head and tail; in a device's own frame, with its checksum.
-    fn payload(&self, nth: usize) -> Vec<u8> {
-        let template = &self.templates[nth];
-        if let Some(device) = &template.device {
-            let elements = template.fields.iter().zip(&self.values[nth]);
-            let elements = elements.filter(|(content, _)| !matches!(content, Content::Checksum));
-            let numbers: Vec<f64> = elements.map(|(_, value)| value.as_f64()).collect();
-            let mut bytes = [0; 512];
-            let len = device.layout.encode(&device.elements, |nth| numbers[nth], &mut bytes);
-            let len = len.unwrap_or(0);
-            let tail = len.saturating_sub(template.tail.len());
-            return bytes.get(template.head.len()..tail).unwrap_or(&[]).to_vec();
-        }
-        let mut bytes = Vec::with_capacity(64);
-        for value in &self.values[nth] {
-            put(*value, &mut bytes);
-        }
-        bytes
-    }
 }
 
 impl Device<Vec<u8>> for RandomDevice {
@@ -202,7 +145,7 @@ impl Device<Vec<u8>> for RandomDevice {
         let Some(nth) = self.step(now) else { return Vec::new() };
         let template = &self.templates[nth];
         let mut frame = template.head.clone();
-        frame.extend(self.payload(nth));
+        frame.extend(template.payload(&self.values[nth]));
         frame.extend(&template.tail);
         if self.behaviour == Behaviour::Careless {
             let rng = &mut self.rng;
@@ -237,7 +180,7 @@ impl Device<CanFrame> for RandomDevice {
 
     fn poll(&mut self, now: Instant) -> Vec<CanFrame> {
         let Some(nth) = self.step(now) else { return Vec::new() };
-        let mut data = self.payload(nth);
+        let mut data = self.templates[nth].payload(&self.values[nth]);
         let mut id = self.templates[nth].id.unwrap_or(CanId::Standard(0));
         let mut is_remote = false;
         if self.behaviour == Behaviour::Careless {
@@ -245,128 +188,14 @@ impl Device<CanFrame> for RandomDevice {
                 0 => data.truncate(self.rng.below(8) as usize),
                 1 => id = CanId::Standard(self.rng.below(0x800) as u16),
                 2 => is_remote = true,
+                _ if self.templates[nth].counts() => {
+                    let at = self.rng.below(data.len() as u64) as usize;
+                    data[at] ^= 1 << self.rng.below(8);
+                }
                 _ => {}
             }
         }
         let frame = if is_remote { CanFrame::remote(id, data.len()) } else { CanFrame::new(id, &data) };
         frame.into_iter().collect()
-    }
-}
-
-/// The frame, if it is a device's own.
-fn device_frame(
-    config: &GatewayConfig,
-    carrier: Carrier,
-    delimiters: (&[u8], &[u8]),
-    fields: Span,
-) -> Option<Box<DeviceFrame>> {
-    let fields = fields.of(&config.fields);
-    let is_device = fields.iter().any(FieldSpec::is_device);
-    // Validation has refused what cannot be laid out.
-    let frame = is_device.then(|| DeviceFrame::new(carrier, Direction::Input, delimiters, fields).ok());
-    frame.flatten().map(Box::new)
-}
-
-fn content(config: &GatewayConfig, field: &FieldSpec) -> Content {
-    let of_var = |var: SysVar| match var.ty() {
-        ScalarType::Byte => Content::Bits,
-        ty => Content::Number { ty, most: 1e4 },
-    };
-    match *field {
-        FieldSpec::System(var) => of_var(var),
-        FieldSpec::UserInput { ty, to: InputBinding::Commands { table, .. } } => {
-            Content::Commands { ty, values: table.of(&config.commands).iter().flat_map(ends).collect() }
-        }
-        FieldSpec::UserInput { ty: ScalarType::Byte, .. } => Content::Bits,
-        FieldSpec::UserInput { ty, .. } | FieldSpec::UserOutput { ty, .. } => {
-            Content::Number { ty, most: 1e3 }
-        }
-        FieldSpec::DeviceInput { to: InputBinding::Commands { table, .. }, .. } => Content::Commands {
-            ty: ScalarType::Double,
-            values: table.of(&config.commands).iter().flat_map(ends).collect(),
-        },
-        FieldSpec::DeviceInput { .. } | FieldSpec::DeviceOutput { .. } => {
-            Content::Number { ty: ScalarType::Double, most: 1e3 }
-        }
-        // Texts and frames of varying length are refused when the scenario is read.
-        FieldSpec::Fixed { .. }
-        | FieldSpec::Padding { .. }
-        | FieldSpec::TextInput { .. }
-        | FieldSpec::TextOutput { .. }
-        | FieldSpec::Length(_) => Content::Constant,
-        FieldSpec::Checksum(_) => Content::Checksum,
-    }
-}
-
-/// The first and the last value of a command.
-fn ends(entry: &CommandEntry) -> impl Iterator<Item = i64> + use<> {
-    let (first, last) = (entry.first, entry.last);
-    [first, last].into_iter().take(if first == last { 1 } else { 2 })
-}
-
-fn zero(content: &Content) -> Scalar {
-    match content {
-        Content::Bits | Content::Constant | Content::Checksum => Scalar::Byte(0),
-        Content::Number { ty, .. } | Content::Commands { ty, .. } => number(*ty, 0.0),
-    }
-}
-
-fn number(ty: ScalarType, value: f64) -> Scalar {
-    let (low, high) = ty.range();
-    let value = value.clamp(low, high);
-    match ty {
-        ScalarType::Float => Scalar::Float(value as f32),
-        ScalarType::Double => Scalar::Double(value),
-        _ => Scalar::from_f64(ty, value.trunc()).unwrap_or(Scalar::Byte(0)),
-    }
-}
-
-fn changed(rng: &mut Rng, content: &Content, before: Scalar) -> Scalar {
-    match content {
-        Content::Constant | Content::Checksum => before,
-        Content::Bits => match (rng.below(8), before) {
-            (0, _) => Scalar::Byte(rng.next_u64() as u8),
-            (1..5, Scalar::Byte(bits)) => Scalar::Byte(bits ^ 1 << rng.below(8)),
-            _ => before,
-        },
-        Content::Number { ty, most } => match rng.below(200) {
-            0 => match ty {
-                ScalarType::Float => Scalar::Float(f32::from_bits(
-                    [0x7FC0_0000, 0x7F80_0000, 0x8000_0000][rng.below(3) as usize],
-                )),
-                ScalarType::Double => {
-                    Scalar::Double([f64::NEG_INFINITY, f64::INFINITY, 1e300][rng.below(3) as usize])
-                }
-                _ => number(*ty, [f64::MAX, f64::MIN][rng.below(2) as usize]),
-            },
-            1..40 => before,
-            _ => {
-                // Multiples of 1/16, which are exact in decimal and in binary: traces are easier to read.
-                let steps = (most * 32.0) as u64;
-                number(*ty, rng.below(steps) as f64 / 16.0 - most)
-            }
-        },
-        Content::Commands { ty, values } => {
-            let picks = rng.below(25) == 0 && !values.is_empty();
-            let value = if picks { values[rng.below(values.len() as u64) as usize] } else { 0 };
-            match rng.below(30) {
-                0 => number(*ty, rng.below(256) as f64),
-                _ => number(*ty, value as f64),
-            }
-        }
-    }
-}
-
-/// Appends a value in little-endian order, independent of proto-core's encoder.
-fn put(value: Scalar, bytes: &mut Vec<u8>) {
-    match value {
-        Scalar::Byte(value) => bytes.push(value),
-        Scalar::Char(value) => bytes.extend(value.to_le_bytes()),
-        Scalar::Word(value) => bytes.extend(value.to_le_bytes()),
-        Scalar::Short(value) => bytes.extend(value.to_le_bytes()),
-        Scalar::Dword(value) => bytes.extend(value.to_le_bytes()),
-        Scalar::Int(value) => bytes.extend(value.to_le_bytes()),
-        Scalar::Float(value) => bytes.extend(value.to_le_bytes()),
-        Scalar::Double(value) => bytes.extend(value.to_le_bytes()),
     }
 }

@@ -363,11 +363,11 @@ impl Oracle {
                 continue;
             };
             let Some(talk) = &self.spec.ports[owned.port].talk else { continue };
+            // Nobody tells what the frames of the input part beside the exchanges had.
+            let Some(row) = talk.rows.iter().find(|row| row.reply == Some(owned.frame)) else { continue };
             self.checks[Invariant::Held as usize] += 1;
             // A reply was made at most so long before it is taken.
-            let taken = talk.rows.iter().find(|row| row.reply == Some(owned.frame));
-            let asked =
-                taken.map_or(Duration::ZERO, |row| row.timeout.saturating_mul(u64::from(row.retries) + 3));
+            let asked = row.timeout.saturating_mul(u64::from(row.retries) + 3);
             let stalled = self.robot.stalled_since(now - timeout, now);
             let since = now - (timeout + way + asked + stalled);
             self.truth.was_held(owned.port, (var, raw), since, now)?;

@@ -1,10 +1,10 @@
-//! The conversation on one line: the request on its way, its reply, and who is asked when
-//! (proto-core/docs/wire/modbus-rtu.md sections 4 and 5).
+//! The conversation on one line or bus: the request on its way, its reply, and who is asked when
+//! (proto-core/docs/wire/modbus-rtu.md sections 4 and 5, docs/configuration.md section 4, "Conversations").
 //!
 //! It does not predict which request is next: it says which ones may be sent, which must not, and how
 //! long none may be.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use proto_core::time::{Duration, Instant};
 
@@ -30,6 +30,14 @@ pub(in crate::oracle) struct TalkWatch {
     /// Exchanges that a rising bit wants.
     risen: BTreeMap<usize, bool>,
     last_bits: BTreeMap<usize, bool>,
+    /// When such a bit rose again before it was asked, newest.
+    rose_at: BTreeMap<usize, Instant>,
+    /// Exchanges that are to be asked at the start and have not been asked since, by slave.
+    opening: BTreeMap<u8, BTreeSet<usize>>,
+    /// Those of them whose values were unknown or stale meanwhile, so that they may have been passed over.
+    passed: BTreeSet<usize>,
+    /// The request whose bytes are still to come back.
+    echo: Option<Vec<u8>>,
     pub unanswered: u32,
     pub refused: u32,
     /// When the port came up.
@@ -77,12 +85,18 @@ struct SlaveWatch {
 
 impl TalkWatch {
     /// The device of the port is there, perhaps another one.
-    pub(in crate::oracle) fn begin(&mut self, now: Instant) {
+    pub(in crate::oracle) fn begin(&mut self, talk: Option<&TalkSpec>, now: Instant) {
         self.abandon();
         self.slaves.clear();
         self.asked.clear();
         self.risen.clear();
         self.last_bits.clear();
+        self.rose_at.clear();
+        self.opening.clear();
+        self.passed.clear();
+        for row in talk.iter().flat_map(|talk| &talk.rows).filter(|row| row.at_start) {
+            self.opening.entry(row.slave).or_default().insert(row.nth);
+        }
         (self.began, self.disturbed_at) = (now, now);
     }
 
@@ -95,7 +109,7 @@ impl TalkWatch {
             self.risen.insert(row, true);
         }
         (self.repeat, self.held_by) = (None, None);
-        self.free_at = Instant::ZERO;
+        (self.free_at, self.echo) = (Instant::ZERO, None);
     }
 
     /// The port is gone.
@@ -109,13 +123,21 @@ impl TalkWatch {
         self.flight.is_none() && self.repeat.is_none() && !self.leaving
     }
 
+    /// Looks for exchanges that are to be asked at the start and cannot be.
+    pub(super) fn look_at_opening(&mut self, can_ask: impl Fn(usize) -> bool) {
+        let Self { opening, passed, .. } = self;
+        passed.extend(opening.values().flatten().copied().filter(|&row| !can_ask(row)));
+    }
+
     /// Bits that ask have changed.
-    pub(super) fn watch(&mut self, talk: &TalkSpec, bit: impl Fn(&RowSpec) -> Option<bool>) {
+    pub(super) fn watch(&mut self, talk: &TalkSpec, bit: impl Fn(&RowSpec) -> Option<bool>, now: Instant) {
         for (nth, row) in talk.rows.iter().enumerate().filter(|(_, row)| row.rising.is_some()) {
             let Some(on) = bit(row) else { continue };
             let before = self.last_bits.insert(nth, on);
             if on && before == Some(false) {
-                self.risen.insert(nth, true);
+                if self.risen.insert(nth, true) == Some(true) {
+                    self.rose_at.insert(nth, now);
+                }
             }
         }
     }
@@ -126,13 +148,13 @@ impl TalkWatch {
         port: &PortSpec,
         talk: &TalkSpec,
         (row, request): (usize, &[u8]),
-        heard: Instant,
+        (heard, is_busy): (Instant, bool),
         now: Instant,
     ) -> Result<(), Wrong> {
         let spec = &talk.rows[row];
         let wrong = |what: &str| Err((Invariant::Line, format!("{}: {what}", name(spec))));
-        if self.leaving || self.flight.is_some() {
-            return wrong("asked while another request is on its way");
+        if self.leaving || self.flight.is_some() || is_busy {
+            return wrong("asked while another transmission is on its way");
         }
         if now < heard + port.turnaround {
             return wrong("asked before the line was silent for long enough");
@@ -141,10 +163,17 @@ impl TalkWatch {
             return wrong("asked before the pause of the exchange before it was over");
         }
         let repeated = self.repeat.take().filter(|failed| failed.row == row);
+        // A second rise shortly before it was asked may be seen after that.
+        let rose_before = self.asked.get(&row).zip(self.rose_at.get(&row));
+        let is_unseen = rose_before.is_some_and(|(&asked, &rose)| rose <= asked && asked < rose + port.cycle);
+        if is_unseen {
+            self.rose_at.remove(&row);
+        }
         let is_wanted = spec.rising.is_none()
             || spec.every.is_some()
             || repeated.is_some()
-            || self.risen.insert(row, false) == Some(true);
+            || self.risen.insert(row, false) == Some(true)
+            || is_unseen;
         if !is_wanted {
             let what = format!("{}: asked although its bit has not risen", name(spec));
             return Err((Invariant::Cycle, what));
@@ -164,6 +193,10 @@ impl TalkWatch {
             return Err((Invariant::Periods, what));
         }
         slave.asked = now;
+        if let Some(first) = self.comes_first(spec.slave, row) {
+            let what = format!("{}: asked before {}, which comes first", name(spec), name(&talk.rows[first]));
+            return Err((Invariant::Cycle, what));
+        }
         let began = repeated.as_ref().map_or(now, |failed| failed.began);
         if repeated.is_none() {
             self.asked.insert(row, now);
@@ -179,11 +212,32 @@ impl TalkWatch {
             is_wrong: false,
         });
         self.leaving = true;
+        self.echo = talk.has_echo.then(|| request.to_vec());
         Ok(())
     }
 
+    /// The request has come back.
+    pub(super) fn echoed(&mut self) {
+        self.echo = None;
+    }
+
+    /// What is to be asked at the start of a slave before this exchange, and could be.
+    fn comes_first(&self, slave: u8, row: usize) -> Option<usize> {
+        let opening = self.opening.get(&slave)?;
+        let first = *opening.iter().find(|nth| !self.passed.contains(*nth))?;
+        let is_itself = first == row || opening.contains(&row) && row < first;
+        (!is_itself).then_some(first)
+    }
+
+    fn is_opened(&mut self, slave: u8, row: usize) {
+        self.passed.remove(&row);
+        if let Some(opening) = self.opening.get_mut(&slave) {
+            opening.remove(&row);
+        }
+    }
+
     /// The request has left.
-    pub(in crate::oracle) fn left(&mut self, talk: &TalkSpec, now: Instant) {
+    pub(in crate::oracle) fn left(&mut self, talk: &TalkSpec, turnaround: Duration, now: Instant) {
         self.leaving = false;
         if let Some(row) = self.held_by.take() {
             let spec = &talk.rows[row];
@@ -191,23 +245,42 @@ impl TalkWatch {
         }
         let Some(flight) = self.flight.as_mut().filter(|flight| flight.sent.is_none()) else { return };
         let spec = &talk.rows[flight.row];
-        if spec.slave == 0 {
-            self.flight = None;
-            self.free_at = now + spec.pause + AFTER_BROADCAST;
-        } else {
+        if spec.is_answered() {
             flight.sent = Some(now);
+        } else {
+            let row = flight.row;
+            self.flight = None;
+            self.free_at = now + spec.rest(turnaround);
+            self.is_opened(spec.slave, row);
         }
     }
 
+    /// Whether a reply is awaited to a request that has left.
+    pub(in crate::oracle) fn waits(&self) -> bool {
+        self.flight.as_ref().is_some_and(|flight| flight.sent.is_some())
+    }
+
     /// What the bytes that are held begin with.
-    pub(super) fn see(&self, talk: &TalkSpec, bytes: &[u8]) -> Seen {
-        match &self.flight {
+    pub(super) fn see(&self, port: &PortSpec, talk: &TalkSpec, bytes: &[u8]) -> Seen {
+        let answer = match (&self.echo, &self.flight) {
+            // The reply is looked for behind the echo.
+            (Some(own), _) => match bytes.get(..own.len()) {
+                Some(whole) if whole == own => Seen::Echo(own.len()),
+                None if bytes.first() == own.first() => Seen::Begins { is_ours: true },
+                _ => Seen::No,
+            },
             // Nobody answers what is for all.
-            Some(flight) if talk.rows[flight.row].slave != 0 => {
+            (None, Some(flight)) if talk.rows[flight.row].is_answered() => {
                 talk.rows[flight.row].see(&flight.request, bytes)
             }
-            _ => Seen::No,
-        }
+            (None, _) => Seen::No,
+        };
+        answer.or(talk.see_unasked(port, bytes))
+    }
+
+    /// The exchange that a reply is awaited to.
+    pub(super) fn awaits<'t>(&self, talk: &'t TalkSpec) -> Option<&'t RowSpec> {
+        self.flight.as_ref().map(|flight| &talk.rows[flight.row])
     }
 
     pub(super) fn heard_wrong(&mut self) {
@@ -220,6 +293,8 @@ impl TalkWatch {
     pub(super) fn answered(&mut self, talk: &TalkSpec, is_refusal: bool, now: Instant) -> Option<Flight> {
         let flight = self.flight.take()?;
         let spec = &talk.rows[flight.row];
+        self.is_opened(spec.slave, flight.row);
+        self.echo = None;
         self.refused = self.refused.wrapping_add(u32::from(is_refusal));
         self.free_at = now + spec.pause;
         let slave = self.slaves.entry(spec.slave).or_default();
@@ -252,6 +327,7 @@ impl TalkWatch {
             return None;
         }
         let mut flight = self.flight.take()?;
+        self.echo = None;
         flight.timed_out |= !flight.is_wrong;
         let slave = self.slaves.entry(spec.slave).or_default();
         if slave.presence != Presence::Down {
@@ -272,6 +348,11 @@ impl TalkWatch {
         if self.risen.contains_key(&flight.row) {
             self.risen.insert(flight.row, true);
         }
+        // It may have lost its power.
+        let at_start = talk.rows_of(spec.slave).filter(|(_, row)| row.at_start).map(|(nth, _)| nth);
+        let at_start: Vec<usize> = at_start.collect();
+        self.passed.retain(|row| !at_start.contains(row));
+        self.opening.entry(spec.slave).or_default().extend(at_start);
         Some(spec.slave)
     }
 
@@ -282,24 +363,28 @@ impl TalkWatch {
         &self,
         port: &PortSpec,
         talk: &TalkSpec,
-        heard: Instant,
+        (heard, is_busy): (Instant, bool),
         stalled: impl Fn(Instant) -> Duration,
         now: Instant,
     ) -> Result<u64, Wrong> {
         let mut checked = 0;
         let free = self.free_at.max(heard + port.turnaround).max(self.disturbed_at);
         for (nth, row) in talk.rows.iter().enumerate() {
-            let (Some(every), Some(&asked), None) = (row.every, self.asked.get(&nth), &row.request) else {
+            let (Some(every), Some(&asked), true) = (row.every, self.asked.get(&nth), row.is_always_ready())
+            else {
                 continue;
             };
             let Some(slave) = self.slaves.get(&row.slave) else { continue };
-            if slave.presence != Presence::Up {
+            // Nothing is known of a device that nobody expects an answer of.
+            let is_mute = slave.presence == Presence::Unknown
+                && talk.rows_of(row.slave).all(|(_, row)| !row.is_answered());
+            if slave.presence != Presence::Up && !is_mute {
                 continue;
             }
             checked += 1;
             let due = (asked + every).max(free).max(slave.held_until).max(slave.since);
             let idle = now.saturating_since(due);
-            if self.is_free() && idle > IDLE + stalled(due) {
+            if self.is_free() && !is_busy && idle > IDLE + stalled(due) {
                 let what = format!("{}: its period has ended, and the line is free for {idle}", name(row));
                 return Err((Invariant::Periods, what));
             }
@@ -310,7 +395,11 @@ impl TalkWatch {
                 return Err((Invariant::Periods, what));
             }
         }
-        for (&number, slave) in self.slaves.iter().filter(|(_, slave)| slave.presence == Presence::Down) {
+        // A request with values is not sent as long as one is unknown or stale.
+        let is_wanted =
+            |number: u8| talk.rows_of(number).any(|(_, row)| row.every.is_some() && row.is_always_ready());
+        let are_down = self.slaves.iter().filter(|(_, slave)| slave.presence == Presence::Down);
+        for (&number, slave) in are_down.filter(|(number, _)| is_wanted(**number)) {
             checked += 1;
             let timeouts = talk.rows_of(number).map(|(_, row)| row.timeout);
             let wait = timeouts.max().unwrap_or_default().saturating_mul(64).min(LONGEST_WAIT);
@@ -334,11 +423,12 @@ impl TalkWatch {
 
 /// The exchange in words.
 pub(super) fn name(row: &RowSpec) -> String {
+    if row.frames.is_some() {
+        return format!("exchange {} with device {}", row.nth + 1, row.slave);
+    }
     format!("slave {}, function {} at {}", row.slave, row.function, row.address)
 }
 
-/// After a request to all slaves, nothing is sent for this long.
-const AFTER_BROADCAST: Duration = Duration::from_millis(100);
 /// A free line with something to do is not left idle for longer.
 const IDLE: Duration = Duration::from_millis(5);
 /// A slave that does not answer is asked again after this at the latest, if the line has a gap.

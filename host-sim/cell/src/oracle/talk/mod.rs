@@ -1,14 +1,23 @@
-//! Conversations with the slaves of a Modbus RTU line: what the gateway asks and takes, and what slaves and
-//! controller really had (docs/cell.md section 4).
+//! Conversations with the slaves of a Modbus RTU line and with devices that have frames of their own: what
+//! the gateway asks and takes, and what devices and controller really had (docs/cell.md section 4).
 
+mod frames;
 pub(super) mod line;
+pub(super) mod served;
 pub(super) mod spec;
+#[cfg(test)]
+mod tests;
 pub(super) mod truth;
 
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::can::CanFrame;
 
-use self::spec::Seen;
-use super::field::judge_data;
+use self::line::TalkWatch;
+use self::spec::{RowSpec, Seen, TalkSpec};
+use super::device::{Look, look};
+use super::field::Verdict;
+use super::gateway::Leaving;
+use super::spec::PortSpec;
 use super::upward::Wrong;
 use super::{Invariant, Oracle};
 use crate::SlaveDone;
@@ -17,65 +26,132 @@ impl Oracle {
     /// Bytes of a line came.
     pub(super) fn talk_bytes(&mut self, nth: usize, bytes: &[u8], now: Instant) {
         self.ports[nth].line.heard = now;
-        self.ports[nth].line.held.extend_from_slice(bytes);
+        let mut verdicts = Vec::new();
+        // One by one: a frame that is complete is taken before the next byte is looked at.
+        for &byte in bytes {
+            self.ports[nth].line.held.push(byte);
+            self.talk_held(nth, &mut verdicts, now);
+        }
+        self.take(nth, verdicts, now);
+    }
+
+    /// Looks for frames in the bytes that are held.
+    fn talk_held(&mut self, nth: usize, verdicts: &mut Vec<Verdict>, now: Instant) {
         loop {
             let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
             let Some(talk) = &port.talk else { return };
             if watch.line.held.is_empty() {
                 return;
             }
-            let taken = match watch.talk.see(talk, &watch.line.held) {
-                Seen::Begins => return,
-                Seen::No => {
-                    watch.line.drop_one();
-                    continue;
+            match watch.talk.see(port, talk, &watch.line.held) {
+                Seen::Begins { .. } => return,
+                Seen::No => watch.line.drop_one(),
+                Seen::Echo(len) => {
+                    watch.line.take_front(len);
+                    watch.talk.echoed();
                 }
                 Seen::Wrong(len) => {
                     if watch.line.drop_wrong(len) {
                         watch.talk.heard_wrong();
-                        watch.counters.rejected_checksum += 1;
+                        verdicts.push(Verdict::WrongChecksum);
                     }
-                    continue;
                 }
-                Seen::Refusal => 5,
-                Seen::Reply(len) => len,
-            };
-            let reply = watch.line.take_front(taken);
-            let is_refusal = reply[1] & 0x80 != 0;
-            let began = watch.talk.began;
-            let Some(flight) = watch.talk.answered(talk, is_refusal, now) else { continue };
-            let row = &talk.rows[flight.row];
-            let result = self.truth.taken((nth, port), row, &flight, (&reply, began), now);
-            let frame = row.reply.filter(|_| !is_refusal);
-            let data = || &reply[3..reply.len() - 2];
-            let verdict = frame.map(|frame| judge_data(&port.inputs[frame], frame, data()));
-            self.judge(now, &[Invariant::Held], result);
-            self.take(nth, verdict.into_iter().collect(), now);
+                Seen::Other(len) => {
+                    watch.line.take_front(len);
+                    verdicts.push(Verdict::OtherDevice);
+                }
+                Seen::Unasked(len, frame) => {
+                    let whole = watch.line.take_front(len);
+                    verdicts.push(watch.line.judge(&port.inputs[frame], frame, &whole));
+                }
+                Seen::Refusal(len) => {
+                    let refusal = watch.line.take_front(len);
+                    self.answered(nth, &refusal, true, now);
+                }
+                Seen::Reply(len) => {
+                    let reply = watch.line.take_front(len);
+                    verdicts.extend(self.answered(nth, &reply, false, now));
+                }
+            }
         }
     }
 
+    /// A frame came on a bus.
+    pub(super) fn talk_can(&mut self, nth: usize, frame: &CanFrame, now: Instant) {
+        let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
+        let Some(talk) = &port.talk else { return };
+        if frame.is_remote() {
+            watch.counters.rejected_remote += 1;
+            return;
+        }
+        let is_it = |own: &super::spec::Frame| {
+            own.id == Some(frame.id()) && look(own, frame.data()) == Look::Frame(frame.data().len())
+        };
+        let awaited = watch.talk.awaits(talk).and_then(|row| row.frames.as_ref());
+        let is_reply = awaited.and_then(|frames| frames.reply.as_ref()).is_some_and(is_it);
+        let is_refusal = awaited.and_then(|frames| frames.refusal.as_ref()).is_some_and(is_it);
+        if is_reply || is_refusal {
+            let verdict = self.answered(nth, frame.data(), !is_reply, now);
+            return self.take(nth, verdict.into_iter().collect(), now);
+        }
+        let answers = awaited.into_iter().flat_map(|frames| frames.reply.iter().chain(&frames.refusal));
+        let answers = answers.map(|own| (usize::MAX, own));
+        let unasked = talk.unasked.iter().map(|&unasked| (unasked, &port.inputs[unasked]));
+        let verdict = super::field::can_of(answers.chain(unasked), port.mode, &mut watch.line, frame);
+        self.take_can(nth, verdict, now);
+    }
+
+    /// A device has answered; returns what becomes of its values.
+    fn answered(&mut self, nth: usize, reply: &[u8], is_refusal: bool, now: Instant) -> Option<Verdict> {
+        let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
+        let talk = port.talk.as_ref()?;
+        let (began, waits) = (watch.talk.began, watch.talk.waits());
+        let flight = watch.talk.answered(talk, is_refusal, now)?;
+        if waits && !port.is_can {
+            watch.down.sent();
+        }
+        let row = &talk.rows[flight.row];
+        let result = self.truth.taken((nth, port), row, &flight, (reply, began), now);
+        let verdict = row.reply.filter(|_| !is_refusal).map(|frame| match row.frames {
+            Some(_) => watch.line.judge(&port.inputs[frame], frame, reply),
+            None => watch.line.judge_data(&port.inputs[frame], frame, &reply[3..reply.len() - 2]),
+        });
+        self.judge(now, &[Invariant::Held], result);
+        verdict
+    }
+
     /// The gateway asks.
-    pub(super) fn talk_send(&mut self, nth: usize, bytes: &[u8], now: Instant) -> Result<(), Wrong> {
+    pub(super) fn talk_send(&mut self, nth: usize, sent: &Leaving<'_>, now: Instant) -> Result<(), Wrong> {
         let port = &self.spec.ports[nth];
         let Some(talk) = &port.talk else { return Ok(()) };
         let (robot, watch) = (&self.robot, &mut self.ports[nth]);
-        if !watch.down.is_up {
+        let bytes = sent.bytes;
+        if !watch.down.is_usable() {
             return Err((Invariant::Line, "asked while the line was gone".to_owned()));
         }
-        let row = talk.row_of(bytes).filter(|_| spec::is_right(bytes));
+        let row = talk.row_of((sent.id, sent.is_remote), bytes);
         let Some(row) = row else {
             return Err((Invariant::Shown, format!("asked {bytes:02x?}, which no exchange asks")));
         };
-        // What is held is too old to be the reply.
-        watch.line.discard();
+        if talk.unasked.is_empty() {
+            // What is held is too old to be the reply.
+            watch.line.discard();
+        }
         let stalled = |since| robot.stalled_since(since, now);
+        let line = (watch.line.heard, watch.down.is_busy());
         self.checks[Invariant::Periods as usize] +=
-            watch.talk.keeps_periods(port, talk, watch.line.heard, stalled, now)?;
-        watch.talk.hands_over(port, talk, (row, bytes), watch.line.heard, now)?;
+            watch.talk.keeps_periods(port, talk, line, stalled, now)?;
+        self.checks[Invariant::Cycle as usize] += 1;
+        look_at_opening(&mut watch.talk, port, |row| {
+            watch.down.may_show_all(&self.spec, port, &self.up, row.shown(), now).is_ok()
+        });
+        watch.talk.hands_over(port, talk, (row, bytes), line, now)?;
         let asked = &talk.rows[row];
         if let Some(request) = &asked.request {
             watch.down.may_show_all(&self.spec, port, &self.up, asked.shown(), now)?;
-            if !watch.down.agrees(request, &self.up, &asked.data_of(bytes)) {
+            let data = asked.data_of(bytes);
+            let payload = if asked.frames.is_some() { request.payload_of(&data) } else { Some(&data[..]) };
+            if !payload.is_some_and(|payload| watch.down.agrees(request, &self.up, payload)) {
                 let what = format!("{}: the request does not have the newest values", line::name(asked));
                 return Err((Invariant::Shown, what));
             }
@@ -85,27 +161,51 @@ impl Oracle {
         Ok(())
     }
 
+    /// What was handed over has left.
+    pub(super) fn port_sent(&mut self, nth: usize, now: Instant) {
+        let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
+        watch.down.sent();
+        if let Some(talk) = &port.talk {
+            watch.talk.left(talk, port.turnaround, now);
+            if watch.talk.waits() && !port.is_can {
+                // The line is the device's until it has answered.
+                watch.down.hold();
+            }
+        }
+    }
+
     /// Replies that have not come in time fail.
     pub(super) fn talk_tick(&mut self, nth: usize, now: Instant) {
         let Some(talk) = &self.spec.ports[nth].talk else { return };
         let watch = &mut self.ports[nth];
+        look_at_opening(&mut watch.talk, &self.spec.ports[nth], |row| {
+            watch.down.may_show_all(&self.spec, &self.spec.ports[nth], &self.up, row.shown(), now).is_ok()
+        });
+        let waited = watch.talk.waits();
         if let Some(slave) = watch.talk.tick(talk, watch.line.heard, now) {
             self.truth.missed(nth, slave);
+        }
+        if waited && !watch.talk.waits() && !self.spec.ports[nth].is_can {
+            watch.down.sent();
         }
     }
 
     /// A value may have changed: looks for bits that ask.
-    pub(super) fn talk_values_changed(&mut self) {
+    pub(super) fn talk_values_changed(&mut self, now: Instant) {
         for (watch, port) in self.ports.iter_mut().zip(&self.spec.ports) {
             let Some(talk) = &port.talk else { continue };
-            watch.talk.watch(talk, |row| {
+            look_at_opening(&mut watch.talk, port, |row| {
+                watch.down.may_show_all(&self.spec, port, &self.up, row.shown(), now).is_ok()
+            });
+            let is_on = |row: &RowSpec| {
                 let (var, bit) = row.rising?;
                 self.up.known(var).value.map(|(raw, _)| raw[0] >> bit & 1 == 1)
-            });
+            };
+            watch.talk.watch(talk, is_on, now);
         }
     }
 
-    /// A slave of a line did something.
+    /// A slave or a device that is asked did something.
     pub(crate) fn slave_did(&mut self, port: usize, done: SlaveDone, now: Instant) {
         if self.violation.is_some() {
             return;
@@ -138,12 +238,13 @@ impl Oracle {
             let port = &self.spec.ports[nth];
             let Some(talk) = &port.talk else { continue };
             let (robot, watch) = (&self.robot, &mut self.ports[nth]);
-            if self.discards_until.is_some() || !watch.down.is_up || robot.is_stalled(now) {
+            if self.discards_until.is_some() || !watch.down.is_usable() || robot.is_stalled(now) {
                 watch.talk.disturbed_at = watch.talk.disturbed_at.max(now);
                 continue;
             }
             let stalled = |since| robot.stalled_since(since, now);
-            let mut result = watch.talk.keeps_periods(port, talk, watch.line.heard, stalled, now);
+            let mut result =
+                watch.talk.keeps_periods(port, talk, (watch.line.heard, watch.down.is_busy()), stalled, now);
             self.checks[Invariant::Periods as usize] += *result.as_ref().unwrap_or(&1);
             let all = robot.all_sound_since();
             for (row, exchange) in talk.rows.iter().enumerate() {
@@ -162,6 +263,12 @@ impl Oracle {
             self.judge(now, &[], result.map(drop));
         }
     }
+}
+
+/// Looks for exchanges that are to be asked at the start, and whose values cannot be shown.
+fn look_at_opening(watch: &mut TalkWatch, port: &PortSpec, can_ask: impl Fn(&RowSpec) -> bool) {
+    let rows = port.talk.as_ref().map_or(&[][..], |talk: &TalkSpec| &talk.rows);
+    watch.look_at_opening(|row| rows.get(row).is_some_and(&can_ask));
 }
 
 /// The controller's values are at a slave this long after they have come to rest, if everything works.

@@ -1,13 +1,19 @@
-//! What is asked on a Modbus RTU line: requests and replies by proto-core/docs/wire/modbus-rtu.md.
+//! What is asked of slaves and devices: requests and replies on a Modbus RTU line by
+//! proto-core/docs/wire/modbus-rtu.md, others by docs/configuration.md section 4.
 //!
-//! Written from that page, independent of the engine's exchanges.
+//! Written from these pages, independent of the engine's exchanges.
 
-use proto_core::config::{ConfigView, FieldSpec, GatewayConfig, Port, Recipe, Rs485, Talk};
+use proto_core::config::{
+    Bus, ConfigView, Exchange, FieldSpec, GatewayConfig, OutputBinding, Port, Recipe, Rs485, Talk,
+};
 use proto_core::modbus::rtu::Operation;
 use proto_core::sysvar::SysVar;
 use proto_core::time::Duration;
+use proto_core::wire::can::CanId;
 
-use crate::oracle::spec::{Frame, frame};
+use super::frames::{FramesSpec, frame_of};
+use crate::oracle::device::{self, look};
+use crate::oracle::spec::{Frame, PortSpec, frame};
 
 /// The conversation of a port.
 #[derive(Debug, Clone)]
@@ -17,13 +23,21 @@ pub(in crate::oracle) struct TalkSpec {
     pub silence: Duration,
     /// Time of all rows if nobody answers, each once.
     pub all_costs: Duration,
+    /// Own bytes come back.
+    pub has_echo: bool,
+    /// The input frames of the port that come without being asked for.
+    pub unasked: Vec<usize>,
 }
 
 /// One exchange.
 #[derive(Debug, Clone)]
 pub(in crate::oracle) struct RowSpec {
-    /// 0: all of them.
+    /// Index among the port's exchanges.
+    pub nth: usize,
+    /// Address of the slave, 0: all of them; or number of the device.
     pub slave: u8,
+    /// Frames of the device's own; `None` on a Modbus line.
+    pub frames: Option<FramesSpec>,
     pub function: u8,
     /// What is read or, by a row that only writes, written.
     pub address: u16,
@@ -31,6 +45,7 @@ pub(in crate::oracle) struct RowSpec {
     /// The first register or coil that is written.
     pub written: Option<u16>,
     pub every: Option<Duration>,
+    pub at_start: bool,
     pub on_change: bool,
     pub rising: Option<(SysVar, u8)>,
     pub timeout: Duration,
@@ -38,7 +53,7 @@ pub(in crate::oracle) struct RowSpec {
     pub pause: Duration,
     /// The input frame of the port that the data of its reply is.
     pub reply: Option<usize>,
-    /// The data of its request.
+    /// The data of its request, or a request of the device's own.
     pub request: Option<Frame>,
     /// Bytes before the data.
     head: Vec<u8>,
@@ -49,11 +64,19 @@ pub(in crate::oracle) struct RowSpec {
 pub(in crate::oracle) enum Seen {
     /// Not the beginning of what is awaited.
     No,
-    /// Perhaps its beginning.
-    Begins,
+    /// Perhaps its beginning; whether all constants so far are its own.
+    Begins {
+        is_ours: bool,
+    },
+    /// The request itself.
+    Echo(usize),
     Reply(usize),
-    Refusal,
-    /// It would be the reply, but its CRC is wrong.
+    Refusal(usize),
+    /// A frame that comes unasked: its length, and which input frame of the port it is.
+    Unasked(usize, usize),
+    /// A frame of another device.
+    Other(usize),
+    /// It would be the reply, but its checksum is wrong.
     Wrong(usize),
 }
 
@@ -62,45 +85,78 @@ impl TalkSpec {
     pub(in crate::oracle) fn new(
         config: &GatewayConfig,
         recipe: &Recipe,
-        (line, silence): (&Rs485, Duration),
+        (line, silence): (Option<&Rs485>, Duration),
         inputs: &mut Vec<Frame>,
     ) -> Option<Self> {
-        let mut rows = Vec::new();
+        let mut rows: Vec<RowSpec> = Vec::new();
         let mut all_costs = Duration::ZERO;
+        let mut unasked: Vec<usize> = (0..inputs.len()).collect();
         for exchange in config.view().exchanges_of(recipe) {
-            let Talk::Rtu { operation, written, read } = exchange.talk else { return None };
-            let data = |fields: &[FieldSpec]| (!fields.is_empty()).then(|| frame(&[], &[], None, fields));
-            let mut row = RowSpec {
-                slave: exchange.peer,
-                function: 0,
-                address: 0,
-                count: 0,
-                written: None,
-                every: exchange.when.every,
-                on_change: exchange.when.change,
-                rising: exchange.when.rising,
-                timeout: exchange.timeout,
-                retries: exchange.retries,
-                pause: exchange.pause,
-                reply: None,
-                request: data(written.of(&config.fields)),
-                head: Vec::new(),
-            };
-            if let Some(reply) = data(read.of(&config.fields)) {
-                row.reply = Some(inputs.len());
-                inputs.push(reply);
+            let mut row = RowSpec::new(rows.len(), exchange);
+            match exchange.talk {
+                Talk::Rtu { operation, written, read } => {
+                    let data =
+                        |fields: &[FieldSpec]| (!fields.is_empty()).then(|| frame(&[], &[], None, fields));
+                    row.request = data(written.of(&config.fields));
+                    if let Some(reply) = data(read.of(&config.fields)) {
+                        row.reply = Some(inputs.len());
+                        inputs.push(reply);
+                    }
+                    row.begin(&operation);
+                }
+                Talk::Frames { request, reply, refusal } => {
+                    let frame = |nth: Option<u8>| frame_of(config, nth?);
+                    let request = frame(request);
+                    let remote =
+                        request.as_ref().filter(|(spec, _)| spec.remote).and_then(|(spec, _)| spec.id);
+                    let is_asked = request.is_some();
+                    row.request = request.filter(|(spec, _)| !spec.remote).map(|(_, request)| request);
+                    let refusal = frame(refusal).map(|(_, refusal)| refusal);
+                    let reply = frame(reply).map(|(_, reply)| reply);
+                    if let Some(reply) = &reply {
+                        row.reply = Some(inputs.len());
+                        if !is_asked {
+                            unasked.push(inputs.len());
+                        }
+                        inputs.push(reply.clone());
+                    }
+                    row.frames = Some(FramesSpec { is_asked, remote, reply, refusal });
+                }
+                Talk::Served { .. } => return None,
             }
-            row.begin(&operation);
             let bytes = row.request_len() + row.reply_len();
-            all_costs = all_costs + line.time_on_line(bytes) + row.timeout + row.pause + silence;
+            let on_line = line.map_or(ON_A_BUS, |line| line.time_on_line(bytes));
+            all_costs = all_costs + on_line + row.timeout + row.pause + silence;
             rows.push(row);
         }
-        (!rows.is_empty()).then_some(Self { rows, silence, all_costs })
+        let has_echo = line.is_some_and(|line| line.echo);
+        (!rows.is_empty()).then_some(Self { rows, silence, all_costs, has_echo, unasked })
     }
 
-    /// The exchange of a request.
-    pub(super) fn row_of(&self, request: &[u8]) -> Option<usize> {
-        self.rows.iter().position(|row| request.starts_with(&row.head) && request.len() == row.request_len())
+    /// The exchange of a request; `id` is that of a CAN frame, and `is_remote` says that it has no data.
+    pub(in crate::oracle) fn row_of(
+        &self,
+        (id, is_remote): (Option<CanId>, bool),
+        request: &[u8],
+    ) -> Option<usize> {
+        self.rows.iter().position(|row| match &row.frames {
+            None => {
+                let is_this = request.starts_with(&row.head) && request.len() == row.request_len();
+                is_this && is_right(request)
+            }
+            Some(frames) if is_remote => id.is_some() && frames.remote == id,
+            Some(_) => row
+                .request
+                .as_ref()
+                .is_some_and(|own| own.id == id && look(own, request) == device::Look::Frame(request.len())),
+        })
+    }
+
+    /// What bytes of a line are that come unasked.
+    pub(super) fn see_unasked(&self, port: &PortSpec, bytes: &[u8]) -> Seen {
+        self.unasked.iter().fold(Seen::No, |seen, &nth| {
+            seen.or(Seen::of(look(&port.inputs[nth], bytes), |len| Seen::Unasked(len, nth)))
+        })
     }
 
     /// The exchanges with a slave, by index.
@@ -110,6 +166,57 @@ impl TalkSpec {
 }
 
 impl RowSpec {
+    fn new(nth: usize, exchange: &Exchange) -> Self {
+        Self {
+            nth,
+            slave: exchange.peer,
+            frames: None,
+            function: 0,
+            address: 0,
+            count: 0,
+            written: None,
+            every: exchange.when.every,
+            at_start: exchange.when.start,
+            on_change: exchange.when.change,
+            rising: exchange.when.rising,
+            timeout: exchange.timeout,
+            retries: exchange.retries,
+            pause: exchange.pause,
+            reply: None,
+            request: None,
+            head: Vec::new(),
+        }
+    }
+
+    /// Whether a reply is expected.
+    pub(super) fn is_answered(&self) -> bool {
+        match &self.frames {
+            Some(frames) => frames.is_asked && frames.reply.is_some(),
+            None => self.slave != 0,
+        }
+    }
+
+    /// How long nothing is sent behind a request that nobody answers, at least.
+    pub(super) fn rest(&self, turnaround: Duration) -> Duration {
+        if self.frames.is_some() { self.pause.max(turnaround) } else { self.pause + AFTER_BROADCAST }
+    }
+
+    /// Whether the device takes values or orders with the request.
+    pub(super) fn is_written(&self) -> bool {
+        self.written.is_some() || self.request.is_some()
+    }
+
+    /// Whether the request can be made at any time: none of its values can be unknown.
+    pub(super) fn is_always_ready(&self) -> bool {
+        let request = self.request.iter().flat_map(|request| &request.fields);
+        request.filter_map(FieldSpec::source).all(|source| {
+            matches!(
+                source,
+                OutputBinding::Constant(_) | OutputBinding::Counter | OutputBinding::CounterTo { .. }
+            )
+        })
+    }
+
     fn begin(&mut self, operation: &Operation) {
         let (function, words, write) = match *operation {
             Operation::ReadCoils { address, count } => (1, vec![address, count], None),
@@ -154,6 +261,9 @@ impl RowSpec {
     }
 
     pub(super) fn request_len(&self) -> usize {
+        if self.frames.is_some() {
+            return self.request.as_ref().map_or(0, Frame::len);
+        }
         self.head.len() + self.data_len() + 2
     }
 
@@ -167,17 +277,27 @@ impl RowSpec {
     }
 
     fn reply_len(&self) -> usize {
+        if let Some(frames) = &self.frames {
+            return frames.reply.as_ref().map_or(0, Frame::len);
+        }
         self.reply_data().map_or(8, |len| len + 5)
     }
 
-    /// The data of a request, as its fields have it: one coil in the lowest bit.
+    /// The data of a request, as its fields have it: one coil in the lowest bit. Of a device's own frame,
+    /// all of it.
     pub(super) fn data_of(&self, request: &[u8]) -> Vec<u8> {
+        if self.frames.is_some() {
+            return request.to_vec();
+        }
         let data = &request[self.head.len()..self.request_len() - 2];
         if self.function == 5 { vec![u8::from(data[0] == 0xFF)] } else { data.to_vec() }
     }
 
-    /// The data that registers or coils with these values are.
+    /// The data that registers or coils with these values are, or bytes.
     pub(super) fn data_from(&self, values: &[u16]) -> Vec<u8> {
+        if self.frames.is_some() {
+            return values.iter().map(|&byte| byte as u8).collect();
+        }
         if !self.is_coils() {
             return values.iter().flat_map(|value| value.to_be_bytes()).collect();
         }
@@ -185,8 +305,11 @@ impl RowSpec {
         values.chunks(8).map(byte).collect()
     }
 
-    /// The registers or coils that a slave takes from this data.
+    /// The registers or coils that a slave takes from this data; of a device's own frame, the bytes.
     pub(super) fn values_of(&self, data: &[u8]) -> Vec<u16> {
+        if self.frames.is_some() {
+            return data.iter().copied().map(u16::from).collect();
+        }
         if !self.is_coils() {
             return data.chunks(2).map(|word| u16::from_be_bytes([word[0], word[1]])).collect();
         }
@@ -206,11 +329,14 @@ impl RowSpec {
 
     /// What the bytes that came are, if they follow this request.
     pub(super) fn see(&self, request: &[u8], bytes: &[u8]) -> Seen {
+        if let Some(frames) = &self.frames {
+            return frames.see(bytes);
+        }
         let refusal = [self.slave, self.function | 0x80];
         if bytes.len() >= 2 && bytes[..2] == refusal {
             return match bytes.get(..5) {
-                None => Seen::Begins,
-                Some(frame) if is_right(frame) => Seen::Refusal,
+                None => Seen::Begins { is_ours: true },
+                Some(frame) if is_right(frame) => Seen::Refusal(5),
                 Some(_) => Seen::Wrong(5),
             };
         }
@@ -223,7 +349,7 @@ impl RowSpec {
             return Seen::No;
         }
         match bytes.get(..self.reply_len()) {
-            None => Seen::Begins,
+            None => Seen::Begins { is_ours: true },
             Some(frame) if is_right(frame) => Seen::Reply(frame.len()),
             Some(frame) => Seen::Wrong(frame.len()),
         }
@@ -241,33 +367,58 @@ pub(super) fn is_right(frame: &[u8]) -> bool {
 
 /// Why the exchanges of a configuration cannot be judged, if they cannot.
 pub(in crate::oracle) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
-    let is_rtu = |talk: &Talk| matches!(talk, Talk::Rtu { .. });
-    if !config.exchanges.iter().all(|exchange| is_rtu(&exchange.talk)) {
-        return Some(
-            "a soak cannot judge exchanges of devices other than Modbus slaves, nor a gateway that is a slave",
-        );
+    if let Some(reason) = super::served::unmodelled(config) {
+        return Some(reason);
+    }
+    let serves = |port: &&Port| {
+        let exchanges = config.view().exchanges_of(recipe_of(config.view(), port));
+        exchanges.iter().any(|exchange| matches!(exchange.talk, Talk::Served { .. }))
+    };
+    let has_echo = |port: &Port| matches!(&port.bus, Bus::Rs485(line) if line.echo);
+    if config.ports.iter().filter(serves).any(has_echo) {
+        return Some("a soak cannot judge a gateway that is a slave on a line that echoes");
     }
     let asks = |port: &&Port| !config.view().exchanges_of(recipe_of(config.view(), port)).is_empty();
-    let has_echo = |port: &Port| match &port.bus {
-        proto_core::config::Bus::Rs485(line) => line.echo,
-        _ => false,
-    };
-    if config.ports.iter().filter(asks).any(has_echo) {
-        return Some("a soak cannot judge a Modbus line that echoes");
+    let answers = |port: &Port| recipe_of(config.view(), port).send == proto_core::config::SendOn::Frame;
+    if config.ports.iter().filter(asks).any(answers) {
+        return Some("a soak cannot judge exchanges beside an output part that is sent for each frame");
     }
     None
 }
 
 /// The same, of what only the laid out requests show.
-pub(in crate::oracle) fn ambiguous(ports: &[crate::oracle::spec::PortSpec]) -> Option<&'static str> {
-    let is_twice = |talk: &TalkSpec| {
-        let rows = &talk.rows;
-        rows.iter().enumerate().any(|(nth, row)| rows[..nth].iter().any(|other| other.head == row.head))
+pub(in crate::oracle) fn ambiguous(ports: &[PortSpec]) -> Option<&'static str> {
+    let is_twice = |port: &PortSpec| {
+        let rows = port.talk.iter().flat_map(|talk| &talk.rows);
+        let requests: Vec<&RowSpec> =
+            rows.filter(|row| row.frames.as_ref().is_none_or(|it| it.is_asked)).collect();
+        let is_same = |one: &RowSpec, other: &RowSpec| match (&one.frames, &other.frames) {
+            (Some(one), Some(other)) if one.remote.is_some() || other.remote.is_some() => {
+                one.remote == other.remote
+            }
+            (Some(_), Some(_)) => match (&one.request, &other.request) {
+                (Some(one), Some(other)) => device::can_be_the_same(one, other),
+                _ => false,
+            },
+            _ => one.head == other.head,
+        };
+        let is_output = |row: &RowSpec| {
+            let own = row.request.as_ref().filter(|_| row.frames.is_some());
+            own.is_some_and(|own| port.outputs.iter().any(|output| device::can_be_the_same(own, output)))
+        };
+        requests
+            .iter()
+            .enumerate()
+            .any(|(nth, row)| is_output(row) || requests[..nth].iter().any(|other| is_same(row, other)))
     };
-    let is_odd = ports.iter().filter_map(|port| port.talk.as_ref()).any(is_twice);
-    is_odd.then_some("a soak cannot judge two exchanges of a line with the same slave, function and place")
+    ports.iter().any(is_twice).then_some("a soak cannot judge two exchanges of a port with the same request")
 }
 
 fn recipe_of<'c>(config: ConfigView<'c>, port: &Port) -> &'c Recipe {
     &config.recipes[usize::from(port.recipe)]
 }
+
+/// After a request to all slaves, nothing is sent for this long.
+const AFTER_BROADCAST: Duration = Duration::from_millis(100);
+/// More than request and reply take on a bus.
+const ON_A_BUS: Duration = Duration::from_millis(20);

@@ -12,11 +12,11 @@ use proto_core::time::{Duration, Instant};
 
 use super::line::{Flight, name};
 use super::spec::{RowSpec, TalkSpec};
-use crate::oracle::device;
-use crate::oracle::field::{Verdict, as_number, show};
+use crate::oracle::Invariant;
+use crate::oracle::device::{self, Look};
+use crate::oracle::field::{LineWatch, Verdict, as_number, show};
 use crate::oracle::spec::{Origin, PortSpec, Raw, Spec};
 use crate::oracle::upward::Wrong;
-use crate::oracle::{Invariant, field};
 use crate::{Done, SlaveDone};
 
 /// Slaves and controller.
@@ -34,6 +34,8 @@ struct LineTruth {
     answers: VecDeque<Answer>,
     /// Requests of the gateway that write, and which slaves have carried them out.
     requests: VecDeque<(Instant, usize, Vec<u16>, BTreeSet<u8>)>,
+    /// The newest request of each exchange that a device took, of frames of its own.
+    took: BTreeMap<usize, Vec<u8>>,
     /// What was written to each slave: coils or registers, and where.
     memory: BTreeMap<(u8, bool, u16), u16>,
     /// Slaves that have forgotten what was written, and have not missed a request since.
@@ -95,7 +97,7 @@ impl Truth {
 
     /// The gateway asks.
     pub(super) fn asks(&mut self, port: usize, row: usize, spec: &RowSpec, request: &[u8], now: Instant) {
-        if spec.written.is_none() {
+        if !spec.is_written() {
             return;
         }
         let values = spec.values_of(&spec.data_of(request));
@@ -128,6 +130,7 @@ impl Truth {
             Done::Forgot => {
                 let line = self.lines.entry(nth).or_default();
                 line.memory.retain(|(of, ..), _| *of != slave);
+                line.took.retain(|row, _| talk.rows.get(*row).is_some_and(|row| row.slave != slave));
                 line.forgot.insert(slave);
                 (0, Ok(()))
             }
@@ -139,21 +142,45 @@ impl Truth {
                         self.holds(nth, var, raw, now);
                     }
                 }
-                let answers = &mut self.lines.entry(nth).or_default().answers;
-                answers.push_back(Answer { at: now, slave, place: (address, count), reply });
-                if answers.len() > ANSWERS {
-                    answers.pop_front();
-                }
+                self.answered(nth, Answer { at: now, slave, place: (address, count), reply });
                 (0, Ok(()))
             }
+            Done::Replied { exchange, frame } => {
+                let Some(row) = talk.rows.get(exchange) else { return (0, Ok(())) };
+                for (var, raw) in values_of(port, row, &frame) {
+                    self.holds(nth, var, raw, now);
+                }
+                let place = (exchange as u16, 0);
+                self.answered(nth, Answer { at: now, slave, place, reply: frame });
+                (0, Ok(()))
+            }
+            Done::Took { exchange, request } => {
+                if !talk.rows.get(exchange).is_some_and(RowSpec::is_written) {
+                    return (0, Ok(()));
+                }
+                let values: Vec<u16> = request.iter().copied().map(u16::from).collect();
+                let is_it = |row: &RowSpec| row.nth == exchange;
+                let result = self.wrote(spec, (nth, talk), (slave, &is_it), &values, stalled, now);
+                self.lines.entry(nth).or_default().took.insert(exchange, request);
+                (1, result)
+            }
             Done::Wrote { coils, address, values } => {
-                let result = self.wrote(spec, (nth, talk), (slave, coils, address), &values, stalled, now);
+                let is_it = |row: &RowSpec| row.written == Some(address) && row.writes_coils() == coils;
+                let result = self.wrote(spec, (nth, talk), (slave, &is_it), &values, stalled, now);
                 let line = self.lines.entry(nth).or_default();
                 for (at, value) in (address..).zip(values) {
                     line.memory.insert((slave, coils, at), value);
                 }
                 (1, result)
             }
+        }
+    }
+
+    fn answered(&mut self, port: usize, answer: Answer) {
+        let answers = &mut self.lines.entry(port).or_default().answers;
+        answers.push_back(answer);
+        if answers.len() > ANSWERS {
+            answers.pop_front();
         }
     }
 
@@ -165,13 +192,13 @@ impl Truth {
         }
     }
 
-    /// A slave has carried out a write: the gateway must have asked for it just now, with values that the
-    /// controller had together, and not long ago.
+    /// A slave has carried out a write of one of these exchanges: the gateway must have asked for it just
+    /// now, with values that the controller had together, and not long ago.
     fn wrote(
         &mut self,
         spec: &Spec,
         (nth, talk): (usize, &TalkSpec),
-        (slave, coils, address): (u8, bool, u16),
+        (slave, is_of): (u8, &dyn Fn(&RowSpec) -> bool),
         values: &[u16],
         stalled: impl Fn(Instant) -> Duration,
         now: Instant,
@@ -181,12 +208,12 @@ impl Truth {
         let is_it = |(at, row, asked, by): &&mut (Instant, usize, Vec<u16>, BTreeSet<u8>)| {
             let row = &talk.rows[*row];
             let is_to_it = row.slave == slave || row.slave == 0;
-            let is_there = row.written == Some(address) && row.writes_coils() == coils;
+            let is_there = is_of(row);
             let is_now = now.saturating_since(*at) <= ON_THE_LINE;
             is_to_it && is_there && asked == values && is_now && !by.contains(&slave)
         };
         let Some((at, row, _, by)) = line.requests.iter_mut().rev().find(is_it) else {
-            let what = format!("slave {slave} took {values:?} at {address}, which nobody asked for just now");
+            let what = format!("device {slave} took {values:?}, which nobody asked for just now");
             return if is_excused { Ok(()) } else { Err((Invariant::Carried, what)) };
         };
         by.insert(slave);
@@ -262,6 +289,7 @@ impl Truth {
     ) -> Result<(), Wrong> {
         let (nth, spec) = port;
         let place = match row.written {
+            _ if row.frames.is_some() => (row.nth as u16, 0),
             Some(written) if row.reply.is_none() => (written, row.count),
             _ => (row.address, row.count),
         };
@@ -312,16 +340,17 @@ impl Truth {
     /// `None` if they have not, or nobody can know.
     pub(super) fn is_told(&self, port: usize, row: &RowSpec, since: Instant) -> Option<Result<(), Wrong>> {
         let line = self.lines.get(&port)?;
-        let address = row.written?;
-        if line.forgot.contains(&row.slave) {
+        if line.forgot.contains(&row.slave) || row.shown().next().is_none() {
             return None;
         }
-        let there =
-            |nth: u16| line.memory.get(&(row.slave, row.writes_coils(), address + nth)).copied().unwrap_or(0);
-        let len = row.request.as_ref()?.payload;
-        let count = if row.writes_coils() { row.count } else { (len / 2) as u16 };
-        let values: Vec<u16> = (0..count).map(there).collect();
-        let data = row.data_from(&values);
+        let data = match (&row.frames, line.took.get(&row.nth)) {
+            (None, _) => line.written(row)?,
+            (Some(_), Some(request)) => request.clone(),
+            (Some(_), None) if row.at_start || row.every.is_some() => {
+                return Some(Err((Invariant::Told, format!("{}: it was never told", name(row)))));
+            }
+            (Some(_), None) => return None,
+        };
         let mut wrong = None;
         for (field, place) in fields(row) {
             let Some(var) = crate::oracle::spec::shown(field) else { continue };
@@ -344,6 +373,19 @@ impl Truth {
             line.answers.len() + line.requests.len() + line.held.values().map(VecDeque::len).sum::<usize>()
         };
         self.lines.values().map(of_line).sum::<usize>() + self.had.values().map(VecDeque::len).sum::<usize>()
+    }
+}
+
+impl LineTruth {
+    /// What a slave has of an exchange that writes, as data of a request.
+    fn written(&self, row: &RowSpec) -> Option<Vec<u8>> {
+        let address = row.written?;
+        let there =
+            |nth: u16| self.memory.get(&(row.slave, row.writes_coils(), address + nth)).copied().unwrap_or(0);
+        let len = row.request.as_ref()?.payload;
+        let count = if row.writes_coils() { row.count } else { (len / 2) as u16 };
+        let values: Vec<u16> = (0..count).map(there).collect();
+        Some(row.data_from(&values))
     }
 }
 
@@ -383,9 +425,17 @@ fn agrees(field: &FieldSpec, var: SysVar, raw: Raw, bytes: &[u8]) -> bool {
 
 /// The values of variables in a reply; none in a refusal.
 fn values_of(port: &PortSpec, row: &RowSpec, reply: &[u8]) -> Vec<(SysVar, Raw)> {
-    let (Some(nth), false) = (row.reply, reply[1] & 0x80 != 0) else { return Vec::new() };
-    let data = &reply[3..reply.len() - 2];
-    match field::judge_data(&port.inputs[nth], nth, data) {
+    let Some(nth) = row.reply else { return Vec::new() };
+    // Alive counters do not matter here: the device knows what it had.
+    let (frame, mut apart) = (&port.inputs[nth], LineWatch::default());
+    let verdict = match row.frames {
+        Some(_) if device::look(frame, reply) == Look::Frame(reply.len()) => apart.judge(frame, nth, reply),
+        // A refusal.
+        Some(_) => return Vec::new(),
+        None if reply[1] & 0x80 != 0 => return Vec::new(),
+        None => apart.judge_data(frame, nth, &reply[3..reply.len() - 2]),
+    };
+    match verdict {
         Verdict::Accepted(accepted) => accepted.values,
         _ => Vec::new(),
     }

@@ -1,0 +1,66 @@
+//! Exchanges of a device's own frames (docs/configuration.md section 4, "Conversations"): the request, what
+//! answers it, and which bytes are which.
+//!
+//! Written from that page, independent of the engine's exchanges.
+
+use proto_core::config::{FrameSpec, GatewayConfig};
+use proto_core::wire::can::CanId;
+
+use super::spec::Seen;
+use crate::oracle::device::{Look, look};
+use crate::oracle::spec::{Frame, device_frame};
+
+/// The frames of one exchange, apart from its request.
+#[derive(Debug, Clone, Default)]
+pub(in crate::oracle) struct FramesSpec {
+    /// Without a request the reply comes unasked.
+    pub is_asked: bool,
+    /// The request is a remote frame with this id.
+    pub remote: Option<CanId>,
+    pub reply: Option<Frame>,
+    pub refusal: Option<Frame>,
+}
+
+impl FramesSpec {
+    /// What the bytes that came are, if they follow the request.
+    pub(super) fn see(&self, bytes: &[u8]) -> Seen {
+        let reply = self.reply.as_ref().map_or(Look::No, |reply| look(reply, bytes));
+        let refusal = self.refusal.as_ref().map_or(Look::No, |refusal| look(refusal, bytes));
+        Seen::of(reply, Seen::Reply).or(Seen::of(refusal, Seen::Refusal))
+    }
+}
+
+impl Seen {
+    pub(super) fn of(look: Look, whole: impl FnOnce(usize) -> Self) -> Self {
+        match look {
+            Look::No => Self::No,
+            Look::Begins { is_ours } => Self::Begins { is_ours },
+            Look::Frame(len) => whole(len),
+            Look::Other(len) => Self::Other(len),
+            Look::Wrong(len) => Self::Wrong(len),
+        }
+    }
+
+    /// What bytes are that may be one of two frames: a frame is more than the beginning of one of ours, that
+    /// is more than one of others, and that is more than the beginning of one of others or a wrong
+    /// checksum. Of equals, the first.
+    pub(super) fn or(self, other: Self) -> Self {
+        let rank = |seen: &Self| match seen {
+            Self::No => 0,
+            Self::Wrong(_) => 1,
+            Self::Begins { is_ours: false } => 2,
+            Self::Other(_) => 3,
+            Self::Begins { is_ours: true } => 4,
+            Self::Echo(_) | Self::Reply(_) | Self::Refusal(_) | Self::Unasked(..) => 5,
+        };
+        if rank(&other) > rank(&self) { other } else { self }
+    }
+}
+
+/// A frame of an exchange.
+pub(super) fn frame_of(config: &GatewayConfig, nth: u8) -> Option<(&FrameSpec, Frame)> {
+    let spec = config.frames.get(usize::from(nth))?;
+    let fields = spec.fields.of(&config.fields);
+    // A remote frame has none.
+    Some((spec, device_frame(&spec.head, &spec.tail, spec.id, fields)))
+}

@@ -1,0 +1,391 @@
+//! A port on which the gateway is a Modbus slave: what a master's requests lead to
+//! (proto-core/docs/wire/modbus-rtu.md section 6 and modbus.md sections 3 to 5, docs/configuration.md
+//! section 4, "Modbus RTU slave").
+//!
+//! Written from these pages, independent of the engine's slave.
+
+use std::collections::BTreeMap;
+
+use proto_core::config::{FieldSpec, GatewayConfig, OutputBinding, Recipe, Rs485, Talk};
+use proto_core::modbus::rtu::Table;
+use proto_core::sysvar::SysVar;
+use proto_core::time::Instant;
+
+use super::spec::is_right;
+use crate::oracle::device::is_written_by_model;
+use crate::oracle::field::Verdict;
+use crate::oracle::gateway::Leaving;
+use crate::oracle::spec::{Frame, device_frame, shown};
+use crate::oracle::upward::Wrong;
+use crate::oracle::{Invariant, Oracle};
+
+/// The slave.
+#[derive(Debug, Clone)]
+pub(in crate::oracle) struct ServedSpec {
+    address: u8,
+    line: Rs485,
+    blocks: Vec<Block>,
+}
+
+/// Registers or coils.
+#[derive(Debug, Clone)]
+struct Block {
+    table: Table,
+    first: u16,
+    count: u16,
+    /// The input frame of the port that a master writes.
+    input: Option<usize>,
+    /// What a master reads.
+    output: Option<Frame>,
+}
+
+/// The model of one such port.
+#[derive(Debug, Clone, Default)]
+pub(in crate::oracle) struct ServedWatch {
+    held: Vec<u8>,
+    /// More came without a silence than a slave can hold.
+    too_many: bool,
+    heard: Instant,
+    /// A reply that has not been sent.
+    kept: Option<Vec<u8>>,
+    /// What masters have written, by block.
+    written: BTreeMap<usize, Vec<u8>>,
+}
+
+/// Why a request is refused.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Exception(u8);
+
+const FUNCTION: Exception = Exception(1);
+const ADDRESS: Exception = Exception(2);
+const VALUE: Exception = Exception(3);
+const FAILURE: Exception = Exception(4);
+
+impl ServedSpec {
+    /// The blocks of a recipe, which are behind its other input frames; `None` without any.
+    pub(in crate::oracle) fn new(
+        config: &GatewayConfig,
+        recipe: &Recipe,
+        line: Rs485,
+        inputs: &mut Vec<Frame>,
+    ) -> Option<Self> {
+        let mut blocks = Vec::new();
+        let exchanges = config.view().exchanges_of(recipe);
+        for exchange in exchanges {
+            let Talk::Served { operation, written, read } = exchange.talk else { return None };
+            let (table, first, count) = operation.place();
+            let frame = |fields: &[FieldSpec]| device_frame(&[], &[], None, fields);
+            let mut block = Block { table, first, count, input: None, output: None };
+            if written.len > 0 {
+                block.input = Some(inputs.len());
+                inputs.push(frame(written.of(&config.fields)));
+            } else {
+                block.output = Some(frame(read.of(&config.fields)));
+            }
+            blocks.push(block);
+        }
+        let address = exchanges.first()?.peer;
+        Some(Self { address, line, blocks })
+    }
+
+    /// The variables that a master reads.
+    pub(in crate::oracle) fn shown(&self) -> impl Iterator<Item = SysVar> {
+        self.blocks
+            .iter()
+            .filter_map(|block| block.output.as_ref())
+            .flat_map(|out| &out.fields)
+            .filter_map(shown)
+    }
+
+    /// The block with this register or coil.
+    fn block_at(&self, table: Table, at: u16) -> Option<(usize, &Block)> {
+        let has = |block: &Block| at.checked_sub(block.first).is_some_and(|nth| nth < block.count);
+        self.blocks.iter().enumerate().find(|(_, block)| block.table == table && has(block))
+    }
+}
+
+impl ServedWatch {
+    fn received(&mut self, spec: &ServedSpec, bytes: &[u8], now: Instant) {
+        // The line goes on: a reply that was not sent is too late.
+        self.kept = None;
+        let began = now - spec.line.time_on_line(bytes.len());
+        if !self.held.is_empty() && began >= self.heard + spec.line.idle_gap {
+            // There was silence before these, so nobody waits for an answer to what came before.
+            self.held.clear();
+            self.too_many = false;
+        }
+        self.heard = now;
+        self.held.extend_from_slice(bytes);
+        self.too_many |= self.held.len() > MOST;
+        self.held.truncate(MOST);
+    }
+
+    /// What has begun is not continued. Returns the number of bytes.
+    pub(in crate::oracle) fn discard(&mut self) -> u64 {
+        (self.kept, self.too_many) = (None, false);
+        std::mem::take(&mut self.held).len() as u64
+    }
+}
+
+impl Oracle {
+    /// Bytes of a master came, or of other slaves.
+    pub(in crate::oracle) fn served_bytes(&mut self, nth: usize, bytes: &[u8], now: Instant) {
+        let Some(spec) = &self.spec.ports[nth].served else { return };
+        self.ports[nth].served.received(spec, bytes, now);
+    }
+
+    /// A request may have ended.
+    pub(in crate::oracle) fn served_tick(&mut self, nth: usize, now: Instant) {
+        let Some(spec) = &self.spec.ports[nth].served else { return };
+        let watch = &mut self.ports[nth].served;
+        if watch.held.is_empty() || now < watch.heard + spec.line.idle_gap {
+            return;
+        }
+        let (own, too_many) = (spec.address, std::mem::take(&mut watch.too_many));
+        let bytes = std::mem::take(&mut watch.held);
+        let (mut rest, mut reply, mut others, mut is_wrong) = (&bytes[..], None, 0, false);
+        while !rest.is_empty() && reply.is_none() {
+            let Some(len) = first_frame(rest) else {
+                is_wrong = true;
+                break;
+            };
+            let (frame, behind) = rest.split_at(len);
+            rest = behind;
+            let pdu = &frame[1..len - 2];
+            match frame[0] {
+                0 if matches!(pdu[0], 5 | 6 | 15 | 16) => drop(self.carry_out(nth, pdu, now)),
+                address if address == own => {
+                    // Behind an earlier request, its master no longer waits.
+                    if rest.is_empty() && !too_many {
+                        reply = Some(self.carry_out(nth, pdu, now));
+                    }
+                }
+                _ => others += 1,
+            }
+        }
+        is_wrong |= too_many && reply.is_none();
+        let counters = &mut self.ports[nth].counters;
+        let is_refused = matches!(reply, Some(Err(_)));
+        match (is_wrong, is_refused) {
+            (true, _) => counters.rejected_checksum += 1,
+            (false, true) => counters.refused += 1,
+            (false, false) => counters.rejected_other_device += u32::from(others > 0 && reply.is_none()),
+        }
+        self.ports[nth].served.kept = reply.map(|answer| {
+            let function = bytes[bytes.len() - last_len(&bytes) + 1];
+            let answer = answer.unwrap_or_else(|Exception(code)| vec![function | 0x80, code]);
+            sealed(&[&[own], &answer[..]].concat())
+        });
+    }
+
+    /// Carries out a request; returns what answers it.
+    fn carry_out(&mut self, nth: usize, pdu: &[u8], now: Instant) -> Result<Vec<u8>, Exception> {
+        let function = pdu[0];
+        let word = |at: usize| Some(u16::from_be_bytes([*pdu.get(at)?, *pdu.get(at + 1)?]));
+        let (table, most) = match function {
+            1 => (Table::Coils, 2_000),
+            2 => (Table::DiscreteInputs, 2_000),
+            3 => (Table::HoldingRegisters, 125),
+            4 => (Table::InputRegisters, 125),
+            5 | 6 => (if function == 5 { Table::Coils } else { Table::HoldingRegisters }, 1),
+            15 => (Table::Coils, 1_968),
+            16 => (Table::HoldingRegisters, 123),
+            _ => return Err(FUNCTION),
+        };
+        let (first, number) = (word(1).ok_or(VALUE)?, word(3).ok_or(VALUE)?);
+        let count = if matches!(function, 5 | 6) { 1 } else { number };
+        let data = match function {
+            15 => usize::from(count.div_ceil(8)),
+            16 => 2 * usize::from(count),
+            _ => 0,
+        };
+        let is_whole = match function {
+            15 | 16 => pdu.len() == 6 + data && usize::from(pdu[5]) == data,
+            5 => pdu.len() == 5 && matches!(number, 0 | 0xFF00),
+            _ => pdu.len() == 5,
+        };
+        if !is_whole || !(1..=most).contains(&count) {
+            return Err(VALUE);
+        }
+        if u32::from(first) + u32::from(count) > 0x1_0000 {
+            return Err(ADDRESS);
+        }
+        match function {
+            1..=4 => {
+                let data = self.read_served(nth, table, (first, count), now)?;
+                Ok([&[function, data.len() as u8], &data[..]].concat())
+            }
+            _ => {
+                let data = match function {
+                    5 => vec![u8::from(number != 0)],
+                    6 => pdu[3..5].to_vec(),
+                    _ => pdu[6..].to_vec(),
+                };
+                self.write_served(nth, table, (first, count), data, now)?;
+                Ok(pdu[..5].to_vec())
+            }
+        }
+    }
+
+    fn read_served(
+        &self,
+        nth: usize,
+        table: Table,
+        (first, count): (u16, u16),
+        now: Instant,
+    ) -> Result<Vec<u8>, Exception> {
+        let spec = self.spec.ports[nth].served.as_ref().ok_or(FAILURE)?;
+        let is_coils = matches!(table, Table::Coils | Table::DiscreteInputs);
+        let bytes = if is_coils { usize::from(count.div_ceil(8)) } else { 2 * usize::from(count) };
+        let mut out = vec![0; bytes];
+        let mut nth_read = 0;
+        while nth_read < count {
+            let at = first + nth_read;
+            let (place, block) = spec.block_at(table, at).ok_or(ADDRESS)?;
+            let data = self.data_of(nth, place, block, now)?;
+            for inside in at - block.first..block.count {
+                if nth_read == count {
+                    break;
+                }
+                let (from, to) = (usize::from(inside), usize::from(nth_read));
+                if is_coils {
+                    out[to / 8] |= (data[from / 8] >> (from % 8) & 1) << (to % 8);
+                } else {
+                    out[2 * to..2 * to + 2].copy_from_slice(&data[2 * from..2 * from + 2]);
+                }
+                nth_read += 1;
+            }
+        }
+        Ok(out)
+    }
+
+    /// What a block shows now.
+    fn data_of(&self, nth: usize, place: usize, block: &Block, now: Instant) -> Result<Vec<u8>, Exception> {
+        let (port, watch) = (&self.spec.ports[nth], &self.ports[nth]);
+        let Some(output) = &block.output else {
+            return watch.served.written.get(&place).cloned().ok_or(FAILURE);
+        };
+        let vars = output.fields.iter().filter_map(shown);
+        watch.down.may_show_all(&self.spec, port, &self.up, vars, now).map_err(|_| FAILURE)?;
+        watch.down.made(output, &self.up).ok_or(FAILURE)
+    }
+
+    fn write_served(
+        &mut self,
+        nth: usize,
+        table: Table,
+        (first, count): (u16, u16),
+        mut data: Vec<u8>,
+        now: Instant,
+    ) -> Result<(), Exception> {
+        let port = &self.spec.ports[nth];
+        let spec = port.served.as_ref().ok_or(FAILURE)?;
+        let is_it = |block: &Block| (block.table, block.first, block.count) == (table, first, count);
+        let found = spec.blocks.iter().enumerate().find(|(_, block)| is_it(block) && block.input.is_some());
+        let (place, frame) = found.and_then(|(at, block)| Some((at, block.input?))).ok_or(ADDRESS)?;
+        if let (Table::Coils, Some(last), left @ 1..) = (table, data.last_mut(), count % 8) {
+            // Bits beyond the last coil mean nothing.
+            *last &= (1 << left) - 1;
+        }
+        let verdict = self.ports[nth].line.judge_data(&port.inputs[frame], frame, &data);
+        let is_taken = matches!(verdict, Verdict::Accepted(_));
+        if is_taken {
+            self.ports[nth].served.written.insert(place, data);
+        }
+        self.take(nth, vec![verdict], now);
+        if is_taken { Ok(()) } else { Err(VALUE) }
+    }
+
+    /// The gateway sends on such a port.
+    pub(in crate::oracle) fn served_send(
+        &mut self,
+        nth: usize,
+        sent: &Leaving<'_>,
+        now: Instant,
+    ) -> Result<(), Wrong> {
+        let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
+        if !watch.down.is_usable() || watch.down.is_busy() {
+            return Err((Invariant::Line, "a reply while the line is gone or busy".to_owned()));
+        }
+        if now < watch.down.heard + port.turnaround {
+            return Err((Invariant::Line, "a reply before the line was silent for long enough".to_owned()));
+        }
+        let Some(kept) = watch.served.kept.take() else {
+            return Err((Invariant::Cycle, format!("{:02x?} answers no request", sent.bytes)));
+        };
+        if kept != sent.bytes {
+            let what = format!("the reply is {:02x?}, not {kept:02x?}", sent.bytes);
+            return Err((Invariant::Shown, what));
+        }
+        watch.down.asked(sent.bytes.len());
+        Ok(())
+    }
+
+    /// Checks that no reply waits although it could be sent.
+    pub(in crate::oracle) fn served_rests(&self, nth: usize, now: Instant) -> Result<(), Wrong> {
+        let (port, watch) = (&self.spec.ports[nth], &self.ports[nth]);
+        let may_send = watch.down.is_usable()
+            && !watch.down.is_busy()
+            && self.discards_until.is_none()
+            && now >= watch.down.heard + port.turnaround;
+        if watch.served.kept.is_some() && may_send {
+            return Err((Invariant::Cycle, "a reply waits although the line is free".to_owned()));
+        }
+        Ok(())
+    }
+}
+
+/// Why the blocks of a configuration cannot be judged, if they cannot.
+pub(super) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
+    let served = config.exchanges.iter().filter_map(|exchange| match exchange.talk {
+        Talk::Served { read, written, .. } => Some([read, written]),
+        _ => None,
+    });
+    let mut fields = served.flatten().flat_map(|span| span.of(&config.fields));
+    let is_odd = |field: &FieldSpec| match *field {
+        FieldSpec::Fixed { .. } => true,
+        FieldSpec::DeviceOutput { encoding, from, .. } => {
+            !is_written_by_model(&encoding) || matches!(from, OutputBinding::Reply)
+        }
+        _ => false,
+    };
+    fields
+        .any(is_odd)
+        .then_some("a soak cannot judge constants, digits and reply codes in the blocks of a slave")
+}
+
+/// The length of the frame at the front of `bytes`: all of them, or what the function says of a request or
+/// a reply.
+fn first_frame(bytes: &[u8]) -> Option<usize> {
+    let counted = |at: usize, more: usize| bytes.get(at).map(|&count| usize::from(count) + more);
+    let (request, reply) = match bytes.get(1)? {
+        1..=4 => (Some(8), counted(2, 5)),
+        5 | 6 => (Some(8), Some(8)),
+        15 | 16 => (counted(6, 9), Some(8)),
+        23 => (counted(10, 13), counted(2, 5)),
+        0x80.. => (None, Some(5)),
+        _ => (None, None),
+    };
+    let lengths = [Some(bytes.len()), request, reply].into_iter().flatten();
+    lengths.filter(|len| *len >= 4).find(|&len| bytes.get(..len).is_some_and(is_right))
+}
+
+/// The length of the last frame.
+fn last_len(bytes: &[u8]) -> usize {
+    let mut rest = bytes;
+    while let Some(len) = first_frame(rest).filter(|len| *len < rest.len()) {
+        rest = &rest[len..];
+    }
+    rest.len()
+}
+
+/// A frame with its CRC.
+fn sealed(bytes: &[u8]) -> Vec<u8> {
+    let crc = bytes.iter().fold(0xFFFF_u16, |crc, &byte| {
+        (0..8).fold(crc ^ u16::from(byte), |crc, _| if crc & 1 == 1 { crc >> 1 ^ 0xA001 } else { crc >> 1 })
+    });
+    [bytes, &crc.to_le_bytes()].concat()
+}
+
+/// Two of the longest frames.
+const MOST: usize = 512;

@@ -1,0 +1,409 @@
+//! Simulated devices with frames of their own, which are asked: all peers of a port, in one device.
+//!
+//! In: the port's exchanges and a seed. Out: replies, most of them right and in time, and frames that
+//! nobody asked for. Each peer changes its behaviour every few seconds: prompt, slow, late, refusing,
+//! dead, or with replies that are damaged, cut short, lost, behind noise, or to another question. None
+//! takes twice its timeout for a reply, which no master could tell from one to the next request.
+
+use proto_core::config::{Bus, DeviceFrame, FieldSpec, GatewayConfig, OutputBinding, Parts, Port, Talk};
+use proto_core::device::{Carrier, Probe};
+use proto_core::sysvar::Direction;
+use proto_core::time::{Duration, Instant};
+use proto_core::wire::can::{CanFrame, CanId};
+use proto_core::wire::scalar::Scalar;
+
+use super::template::{Template, changed};
+use crate::{Device, Done, Rng, SlaveDone};
+
+/// The devices of a line or bus.
+#[derive(Debug)]
+pub(super) struct Peers {
+    rng: Rng,
+    peers: Vec<Peer>,
+    asks: Vec<Ask>,
+    /// Frames that come unasked, those of the port's input part without an exchange.
+    unasked: Vec<(Option<usize>, Sends)>,
+    next_unasked: Instant,
+    /// Bytes that are no request yet.
+    held: Vec<u8>,
+    held_until: Instant,
+    /// Replies that are to leave, and when.
+    leaving: Vec<(Instant, Made)>,
+    done: Vec<SlaveDone>,
+}
+
+#[derive(Debug)]
+struct Peer {
+    number: u8,
+    behaviour: Behaviour,
+    behaviour_ends: Instant,
+}
+
+/// One exchange with a request.
+#[derive(Debug)]
+struct Ask {
+    /// Its index on the port.
+    exchange: usize,
+    peer: usize,
+    request: Request,
+    reply: Option<Sends>,
+    refusal: Option<Sends>,
+    timeout: Duration,
+}
+
+#[derive(Debug)]
+enum Request {
+    Remote(CanId),
+    Frame {
+        id: Option<CanId>,
+        frame: Box<DeviceFrame>,
+        /// Elements that are the same in each request.
+        constants: Vec<(usize, f64)>,
+    },
+}
+
+/// A frame that a device sends, with its newest values.
+#[derive(Debug)]
+struct Sends {
+    template: Template,
+    values: Vec<Scalar>,
+}
+
+/// What leaves.
+#[derive(Debug, Clone)]
+struct Made {
+    id: Option<CanId>,
+    bytes: Vec<u8>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Behaviour {
+    Prompt,
+    Slow,
+    /// Some replies come when they have been given up.
+    Late,
+    /// It refuses what it is asked, if it can.
+    Refusing,
+    /// One bit of some replies is wrong.
+    Damaged,
+    /// Some replies end too early.
+    Short,
+    /// Some replies do not come.
+    Losing,
+    /// Some replies are those to other questions.
+    Mistaken,
+    /// Other bytes come before some replies.
+    Noisy,
+    Dead,
+}
+
+impl Peers {
+    /// The devices of a port; `None` if its recipe has no exchanges of frames.
+    pub(super) fn new(config: &GatewayConfig, port: &Port, start: Instant, mut rng: Rng) -> Option<Self> {
+        let recipe = config.recipes.get(usize::from(port.recipe))?;
+        let is_on_can = matches!(port.bus, Bus::Can { .. });
+        let mut unasked: Vec<(Option<usize>, Sends)> = Vec::new();
+        match &recipe.parts {
+            Parts::Stream { input: Some(part), .. } => {
+                let fields = part.fields.of(&config.fields);
+                unasked.push((None, Sends::new(config, None, (&part.head, &part.tail), fields)));
+            }
+            Parts::Can { input, .. } => unasked.extend(input.iter().map(|part| {
+                (None, Sends::new(config, Some(part.id), (&[], &[]), part.fields.of(&config.fields)))
+            })),
+            Parts::Stream { .. } => {}
+        }
+        let (mut peers, mut asks): (Vec<Peer>, Vec<Ask>) = (Vec::new(), Vec::new());
+        for (exchange, spec) in config.view().exchanges_of(recipe).iter().enumerate() {
+            let Talk::Frames { request, reply, refusal } = spec.talk else { return None };
+            let frame = |nth: Option<u8>| config.frames.get(usize::from(nth?));
+            let sends = |nth: Option<u8>| {
+                let frame = frame(nth)?;
+                let fields = frame.fields.of(&config.fields);
+                Some(Sends::new(config, frame.id, (&frame.head, &frame.tail), fields))
+            };
+            let number = spec.peer;
+            let peer = peers.iter().position(|peer| peer.number == number).unwrap_or(peers.len());
+            if peer == peers.len() {
+                let behaviour_ends = start + Duration::from_secs(5);
+                peers.push(Peer { number, behaviour: Behaviour::Prompt, behaviour_ends });
+            }
+            let (reply, refusal) = (sends(reply), sends(refusal));
+            let Some(request) = frame(request) else {
+                unasked.extend(reply.map(|reply| (Some(exchange), reply)));
+                continue;
+            };
+            let request = match request.id {
+                Some(id) if request.remote => Request::Remote(id),
+                id => {
+                    let delimiters = (&request.head[..], &request.tail[..]);
+                    Request::new(id, delimiters, is_on_can, request.fields.of(&config.fields))?
+                }
+            };
+            asks.push(Ask { exchange, peer, request, reply, refusal, timeout: spec.timeout });
+        }
+        if asks.is_empty() {
+            return None;
+        }
+        let next_unasked = if unasked.is_empty() { Instant::NEVER } else { start + rng.up_to(UNASKED) };
+        Some(Self {
+            rng,
+            peers,
+            asks,
+            unasked,
+            next_unasked,
+            held: Vec::new(),
+            held_until: Instant::NEVER,
+            leaving: Vec::new(),
+            done: Vec::new(),
+        })
+    }
+
+    /// A request came.
+    fn asked(&mut self, nth: usize, request: Vec<u8>, now: Instant) {
+        let Self { rng, peers, asks, leaving, done, .. } = self;
+        let (number, exchange) = (peers[asks[nth].peer].number, asks[nth].exchange);
+        let peer = &mut peers[asks[nth].peer];
+        if now >= peer.behaviour_ends && peer.changes(now, rng) {
+            done.push(SlaveDone { slave: number, what: Done::Forgot });
+        }
+        let behaviour = peer.behaviour;
+        if behaviour == Behaviour::Dead {
+            return;
+        }
+        let refuses = behaviour == Behaviour::Refusing && rng.below(2) == 0;
+        let ask = &mut asks[nth];
+        let timeout = ask.timeout.as_micros();
+        let answer = match &mut ask.refusal {
+            Some(refusal) if refuses => Some(refusal),
+            _ => {
+                done.push(SlaveDone { slave: number, what: Done::Took { exchange, request } });
+                ask.reply.as_mut()
+            }
+        };
+        let Some(answer) = answer else { return };
+        let mut made = answer.next(rng);
+        done.push(SlaveDone { slave: number, what: Done::Replied { exchange, frame: made.bytes.clone() } });
+        let has_checksum = answer.template.has_checksum();
+        let template = answer.template.clone();
+        let delay = match behaviour {
+            Behaviour::Slow => rng.below(timeout * 8 / 10),
+            Behaviour::Late if rng.below(2) == 0 => rng.between(timeout / 2, timeout * 2 - MARGIN),
+            _ => rng.below(3_000),
+        };
+        let happens = rng.below(2) == 0;
+        let len = made.bytes.len() as u64;
+        let is_on_can = made.id.is_some();
+        match behaviour {
+            _ if !happens => {}
+            // Nothing of this happens to frames on a bus, and nobody could see it without a checksum.
+            Behaviour::Damaged | Behaviour::Short | Behaviour::Noisy if is_on_can || !has_checksum => return,
+            Behaviour::Damaged => made.bytes[rng.below(len) as usize] ^= 1 << rng.below(8),
+            Behaviour::Short => made.bytes.truncate(rng.between(1, len - 1) as usize),
+            Behaviour::Losing => return,
+            Behaviour::Mistaken => {
+                let other = rng.below(asks.len() as u64) as usize;
+                if other == nth {
+                    return;
+                }
+                let Some(other) = asks[other].reply.as_mut().map(|reply| reply.next(rng)) else { return };
+                if template.begins(&other.bytes) && other.id == made.id {
+                    return;
+                }
+                made = other;
+            }
+            Behaviour::Noisy => {
+                let more = rng.between(1, 6) as usize;
+                made.bytes = [rng.bytes(more), made.bytes].concat();
+            }
+            _ => {}
+        }
+        if template.begins(&made.bytes) {
+            // A letter in the other case is no damage to a checksum of letters.
+            done.push(SlaveDone {
+                slave: number,
+                what: Done::Replied { exchange, frame: made.bytes.clone() },
+            });
+        }
+        leaving.push((now + Duration::from_micros(delay), made));
+    }
+
+    /// The exchange that bytes are the request of.
+    fn request_of(&self, id: Option<CanId>, bytes: &[u8]) -> Option<usize> {
+        self.asks.iter().position(|ask| ask.request.is(id, bytes))
+    }
+
+    fn deadline(&self) -> Instant {
+        let leaving = self.leaving.iter().map(|(at, _)| *at).min().unwrap_or(Instant::NEVER);
+        leaving.min(self.held_until).min(self.next_unasked)
+    }
+
+    fn poll(&mut self, now: Instant) -> Vec<Made> {
+        if now >= self.held_until {
+            self.held.clear();
+            self.held_until = Instant::NEVER;
+        }
+        let mut leave = Vec::new();
+        while let Some(nth) = self.leaving.iter().position(|(at, _)| *at <= now) {
+            leave.push(self.leaving.remove(nth).1);
+        }
+        if now >= self.next_unasked {
+            let rng = &mut self.rng;
+            self.next_unasked = now + Duration::from_micros(1) + rng.up_to(UNASKED);
+            let nth = rng.below(self.unasked.len() as u64) as usize;
+            let (exchange, sends) = &mut self.unasked[nth];
+            let made = sends.next(rng);
+            if let Some(exchange) = *exchange {
+                let what = Done::Replied { exchange, frame: made.bytes.clone() };
+                self.done.push(SlaveDone { slave: 0, what });
+            }
+            leave.push(made);
+        }
+        leave
+    }
+}
+
+impl Device<Vec<u8>> for Peers {
+    fn receive(&mut self, now: Instant, bytes: &Vec<u8>) -> Vec<Vec<u8>> {
+        self.held.extend_from_slice(bytes);
+        match self.request_of(None, &self.held) {
+            Some(nth) => {
+                let request = std::mem::take(&mut self.held);
+                self.held_until = Instant::NEVER;
+                self.asked(nth, request, now);
+            }
+            None => self.held_until = now + SILENCE,
+        }
+        Vec::new()
+    }
+
+    fn deadline(&self) -> Instant {
+        self.deadline()
+    }
+
+    fn poll(&mut self, now: Instant) -> Vec<Vec<u8>> {
+        self.poll(now).into_iter().map(|made| made.bytes).collect()
+    }
+
+    fn take_done(&mut self) -> Vec<SlaveDone> {
+        std::mem::take(&mut self.done)
+    }
+}
+
+impl Device<CanFrame> for Peers {
+    fn receive(&mut self, now: Instant, frame: &CanFrame) -> Vec<CanFrame> {
+        let nth = match frame.is_remote() {
+            true => self.asks.iter().position(|ask| ask.request.is_remote(frame.id())),
+            false => self.request_of(Some(frame.id()), frame.data()),
+        };
+        if let Some(nth) = nth {
+            self.asked(nth, frame.data().to_vec(), now);
+        }
+        Vec::new()
+    }
+
+    fn deadline(&self) -> Instant {
+        self.deadline()
+    }
+
+    fn poll(&mut self, now: Instant) -> Vec<CanFrame> {
+        let made = self.poll(now).into_iter();
+        made.filter_map(|made| CanFrame::new(made.id.unwrap_or(CanId::Standard(0)), &made.bytes)).collect()
+    }
+
+    fn take_done(&mut self) -> Vec<SlaveDone> {
+        std::mem::take(&mut self.done)
+    }
+}
+
+impl Peer {
+    /// Begins another behaviour; returns whether the device forgets what it was told.
+    fn changes(&mut self, now: Instant, rng: &mut Rng) -> bool {
+        let (behaviour, most) = match rng.below(24) {
+            0..10 => (Behaviour::Prompt, 20_000),
+            10 | 11 => (Behaviour::Slow, 5_000),
+            12 | 13 => (Behaviour::Late, 5_000),
+            14 => (Behaviour::Refusing, 2_000),
+            15 => (Behaviour::Damaged, 5_000),
+            16 => (Behaviour::Short, 3_000),
+            17 => (Behaviour::Losing, 3_000),
+            18 => (Behaviour::Mistaken, 3_000),
+            19 => (Behaviour::Noisy, 3_000),
+            20 | 21 => (Behaviour::Dead, 1_400),
+            22 => (Behaviour::Dead, 10_000),
+            _ => (Behaviour::Dead, 90_000),
+        };
+        let lasts = rng.up_to(Duration::from_millis(most));
+        (self.behaviour, self.behaviour_ends) = (behaviour, now + lasts);
+        behaviour == Behaviour::Dead && lasts > FORGETS_AFTER
+    }
+}
+
+impl Request {
+    fn new(
+        id: Option<CanId>,
+        delimiters: (&[u8], &[u8]),
+        is_on_can: bool,
+        fields: &[FieldSpec],
+    ) -> Option<Self> {
+        let carrier = if is_on_can { Carrier::Can } else { Carrier::Stream };
+        let frame = DeviceFrame::new(carrier, Direction::Output, delimiters, fields).ok()?;
+        let elements = fields.iter().filter(|field| field.element().is_some()).enumerate();
+        let constants = elements.filter_map(|(nth, field)| match field.source() {
+            Some(OutputBinding::Constant(value)) => Some((nth, value)),
+            _ => None,
+        });
+        let constants = constants.collect();
+        Some(Self::Frame { id, frame: Box::new(frame), constants })
+    }
+
+    fn is_remote(&self, id: CanId) -> bool {
+        matches!(self, Self::Remote(own) if *own == id)
+    }
+
+    fn is(&self, from: Option<CanId>, bytes: &[u8]) -> bool {
+        let Self::Frame { id, frame, constants } = self else { return false };
+        let DeviceFrame { elements, layout } = &**frame;
+        if *id != from || layout.probe_whole(elements, bytes) != Probe::Frame(bytes.len()) {
+            return false;
+        }
+        let values: Vec<_> = layout.values(elements, bytes).collect();
+        constants.iter().all(|(nth, constant)| {
+            matches!(values.get(*nth), Some(Ok(Some(value))) if value.as_f64() == *constant)
+        })
+    }
+}
+
+impl Sends {
+    fn new(
+        config: &GatewayConfig,
+        id: Option<CanId>,
+        delimiters: (&[u8], &[u8]),
+        fields: &[FieldSpec],
+    ) -> Self {
+        let template = Template::new(config, id, delimiters, fields);
+        let values = template.zeros();
+        Self { template, values }
+    }
+
+    /// Time goes by: some values change. Returns the frame with them.
+    fn next(&mut self, rng: &mut Rng) -> Made {
+        for (value, content) in self.values.iter_mut().zip(&self.template.fields) {
+            if rng.below(3) == 0 {
+                *value = changed(rng, content, *value);
+            }
+        }
+        Made { id: self.template.id, bytes: self.template.whole(&self.values) }
+    }
+}
+
+/// A reply is at the master this long before twice the timeout, in microseconds: the time of a reply on a
+/// line, of others before it, and in an adapter that gathers bytes.
+const MARGIN: u64 = 45_000;
+/// After this long without power a device has forgotten what it was told. It has been asked often enough
+/// by then that the gateway knows that it was away.
+const FORGETS_AFTER: Duration = Duration::from_millis(1_500);
+/// Longest pause between frames that nobody asked for.
+const UNASKED: Duration = Duration::from_millis(500);
+/// Bytes that are no request after this long never become one.
+const SILENCE: Duration = Duration::from_millis(8);
