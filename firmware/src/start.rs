@@ -8,6 +8,7 @@ use embassy_executor::{SpawnError, SpawnToken, Spawner};
 use embassy_net::{Config, Ipv4Cidr, Runner, Stack, StackResources, StaticConfigV4};
 use embassy_time::{Duration, Timer};
 use firmware::fmt::Text;
+use firmware::kept::{self, Kept, RoleName};
 use firmware::platform::{self, FeedWatchdog as _, StatusLed as _};
 use firmware::tasks::fair::Fair;
 use firmware::tasks::gateway::{Gateway, MAX_LINKS};
@@ -29,6 +30,7 @@ type CanDevice = <Board as platform::Board>::Can;
 type Ethernet = <Board as platform::Board>::Ethernet;
 type Watchdog = <Board as platform::Board>::Watchdog;
 type Led = <Board as platform::Board>::Led;
+type Flash = <Board as platform::Board>::Flash;
 const SERIAL_PORTS: usize = <Board as platform::Board>::SERIAL_PORTS;
 const CAN_PORTS: usize = <Board as platform::Board>::CAN_PORTS;
 const WATCHDOG_PERIOD: Duration = <Board as platform::Board>::WATCHDOG_PERIOD;
@@ -48,8 +50,13 @@ pub(crate) fn start(spawner: Spawner, mut board: Board) -> Tasks {
     static OVERLAY: ConstStaticCell<Overlay> = ConstStaticCell::new(Overlay::ZEROED);
     let overlay = OVERLAY.take();
     let loaded = load(&mut board, GATEWAY.take(), overlay.configuration());
-    let gateway = loaded.as_ref().ok().map(|(gateway, _)| *gateway);
-    let started = loaded.and_then(|(gateway, wiring)| run(&tasks, board, gateway, wiring, overlay.links()));
+    let gateway = loaded.as_ref().ok().map(|loaded| loaded.gateway);
+    let started = loaded.and_then(|loaded| {
+        if let Some((kept, time)) = loaded.trial {
+            tasks.spawn(TaskName::Trial, |pulse| trial(pulse, kept, time));
+        }
+        run(&tasks, board, loaded.gateway, loaded.wiring, overlay.links())
+    });
     tasks.spawn(TaskName::Led, |pulse| status_led(pulse, gateway.filter(|_| started.is_ok()), led));
     if let Err(reason) = started {
         tasks.spawn(TaskName::Refused, |pulse| refused(pulse, reason));
@@ -137,17 +144,85 @@ impl Overlay {
     }
 }
 
+/// A configuration that runs.
+struct Loaded {
+    gateway: &'static Gateway,
+    wiring: Wiring,
+    /// The store, and how long to wait for a confirmation, if the configuration is on trial.
+    trial: Option<(Kept<Flash>, Duration)>,
+}
+
+/// The first configuration that can run: what was put on the board since the last start; of the store the one on
+/// trial, the live one, the one before; or else what was put on the board.
+///
 /// Not inlined, so that its stack frame is free when the tasks run.
 #[inline(never)]
 fn load(
     board: &mut Board,
     gateway: &'static mut Gateway,
     config: &mut GatewayConfig,
-) -> Result<(&'static Gateway, Wiring), Refused> {
-    let bytes = board.configuration().map_err(Refused::Storage)?;
+) -> Result<Loaded, Refused> {
+    let own = board.configuration().map_err(Refused::Storage);
+    let own_can_run = own.and_then(|bytes| configure(bytes, gateway, config));
+    let opened = board.flash().map(Kept::open);
+    let kept = opened.and_then(|opened| opened.inspect_err(|error| error!("{}", Text(error))).ok());
+    let mut why = None;
+    if let Some(mut kept) = kept {
+        if let (Ok(bytes), Ok(())) = (own, own_can_run) {
+            let (image, digest) = whole(bytes);
+            match board.block_on(kept.adopt(digest, image)) {
+                Ok(true) => info!("taken over into the store: a configuration of {} bytes", image.len()),
+                Ok(false) => {}
+                Err(error) => error!("the store: {}", Text(&error)),
+            }
+        }
+        let mut candidates = heapless::Vec::new();
+        if let Err(error) = board.block_on(kept.candidates(&mut candidates)) {
+            error!("the store: {}", Text(&error));
+        }
+        for (revision, role) in candidates {
+            let Some(bytes) = kept.image(revision) else { continue };
+            match configure(bytes, gateway, config) {
+                Ok(()) => {
+                    info!("configuration {} of the store, {}", revision.number, Text(&RoleName(role)));
+                    let wiring = wiring(bytes.len(), gateway, config);
+                    let trial = kept::trial_time(role).map(|time| (kept, time));
+                    return Ok(Loaded { gateway, wiring, trial });
+                }
+                Err(error) => {
+                    error!("configuration {} of the store cannot run: {}", revision.number, Text(&error));
+                    why.get_or_insert(error);
+                }
+            }
+        }
+    }
+    // Again: another one may have been decoded since.
+    match own.and_then(|bytes| configure(bytes, gateway, config).map(|()| bytes)) {
+        Ok(bytes) => {
+            let wiring = wiring(whole(bytes).0.len(), gateway, config);
+            Ok(Loaded { gateway, wiring, trial: None })
+        }
+        // What the store holds says more than an empty place.
+        Err(error) => Err(why.unwrap_or(error)),
+    }
+}
+
+/// The image without what follows it, and its CRC.
+fn whole(bytes: &[u8]) -> (&[u8], u32) {
+    let image = image::image_len(bytes).ok().and_then(|len| bytes.get(..len)).unwrap_or(bytes);
+    let crc = image.get(image::HEADER - 4..).and_then(|rest| rest.first_chunk());
+    (image, crc.map_or(0, |crc| u32::from_le_bytes(*crc)))
+}
+
+/// Not inlined: it is called in three places.
+#[inline(never)]
+fn configure(bytes: &[u8], gateway: &mut Gateway, config: &mut GatewayConfig) -> Result<(), Refused> {
     image::decode_into(bytes, config).map_err(Refused::Image)?;
-    gateway.configure(config).map_err(Refused::Build)?;
-    let gateway: &'static Gateway = gateway;
+    gateway.configure(config).map_err(Refused::Build)
+}
+
+#[inline(never)]
+fn wiring(len: usize, gateway: &Gateway, config: &GatewayConfig) -> Wiring {
     let wiring = Wiring {
         ports: config
             .view()
@@ -159,13 +234,13 @@ fn load(
     };
     info!(
         "configuration: {} bytes; {} field ports, {} links; the engine has {} bytes, its configuration {}",
-        bytes.len(),
+        len,
         wiring.ports.len(),
         wiring.links.len(),
         size_of::<Gateway>(),
         size_of::<GatewayConfig>(),
     );
-    Ok((gateway, wiring))
+    wiring
 }
 
 #[inline(never)]
@@ -308,6 +383,23 @@ async fn status(pulse: &'static Pulse, gateway: &'static Gateway) -> ! {
     pulse.run(pin!(firmware::tasks::status::run(gateway, pulse))).await
 }
 
+/// Goes back to the live configuration when nobody has confirmed this one in time: by a restart, because a
+/// configuration is only changed there.
+#[embassy_executor::task]
+async fn trial(pulse: &'static Pulse, mut kept: Kept<Flash>, time: Duration) -> ! {
+    let waiting = async {
+        pulse.idle(pin!(Timer::after(time))).await;
+        warn!("the configuration was not confirmed in time: back to the live one");
+        if let Err(error) = pulse.idle(pin!(kept.end_trial())).await {
+            error!("the store: {}", Text(&error));
+        }
+        // For the log.
+        pulse.idle(pin!(Timer::after(LAST_WORDS))).await;
+        cortex_m::peripheral::SCB::sys_reset()
+    };
+    pulse.run(pin!(waiting)).await
+}
+
 /// Logs the reason repeatedly, because the log may be read late.
 #[embassy_executor::task]
 async fn refused(pulse: &'static Pulse, reason: Refused) -> ! {
@@ -325,5 +417,7 @@ async fn refused(pulse: &'static Pulse, reason: Refused) -> ! {
 const SOCKETS: usize = MAX_LINKS + 2;
 /// Interval of that log line.
 const REPEAT: Duration = Duration::from_secs(10);
-/// A task for each port and link, and: engine, network, address, status, LED, refused, the board's own.
-const MAX_TASKS: usize = SERIAL_PORTS + CAN_PORTS + MAX_LINKS + 7;
+/// Between the last log line and a restart.
+const LAST_WORDS: Duration = Duration::from_millis(100);
+/// A task for each port and link, and: engine, network, address, status, LED, refused, trial, the board's own.
+const MAX_TASKS: usize = SERIAL_PORTS + CAN_PORTS + MAX_LINKS + 8;

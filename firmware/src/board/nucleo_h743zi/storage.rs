@@ -1,4 +1,4 @@
-//! The configuration image: in the second flash bank, at `_config_start` (memory.x).
+//! The configuration image that a probe has written: in the second flash bank, at `_config_start` (memory.x).
 //!
 //! A flash word that was programmed twice, or not completely because of a power failure, has no valid error
 //! correction code, and reading it is a bus fault. So each flash word of the image is first read once with bus
@@ -15,7 +15,7 @@ unsafe extern "C" {
 }
 
 /// Size of a flash word, the unit of programming and error correction.
-const FLASH_WORD: usize = 32;
+pub(super) const FLASH_WORD: usize = 32;
 
 const _: () = assert!(HEADER <= FLASH_WORD);
 
@@ -61,7 +61,8 @@ fn check(start: usize, len: usize) -> Result<(), StorageError> {
         .try_for_each(|address| if can_read(address) { Ok(()) } else { Err(StorageError::Torn { address }) })
 }
 
-fn can_read(address: usize) -> bool {
+/// Whether the flash word at this address can be read.
+pub(super) fn can_read(address: usize) -> bool {
     const CCR_IGNORE_BUS_FAULTS: u32 = 1 << 8;
     const CFSR_BUS: u32 = 0xBF << 8;
     // SAFETY: during one load from flash all interrupts and faults are masked, so that a bus fault only sets its
