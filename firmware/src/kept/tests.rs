@@ -93,9 +93,7 @@ fn an_image_outside_the_store_is_taken_over_once() {
     let (revision, _) = kept.store.at_start().candidates[0];
     assert_eq!(kept.image(revision), Some(&b"second"[..]));
     // What was changed in the store since then stays.
-    kept.write(|store| {
-        store.mark(Marks { live: Some(1), previous: Some(2), trial: None }).unwrap()
-    });
+    kept.write(|store| store.mark(Marks { live: Some(1), previous: Some(2), trial: None }).unwrap());
     assert!(!block_on(kept.adopt(2, b"second")).unwrap());
     assert_eq!(kept.start(), [(1, Role::Live), (2, Role::Previous)]);
 }

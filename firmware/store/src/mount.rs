@@ -72,22 +72,31 @@ impl Store {
         let mut store = Self { geometry, head: None, end: 0, sequence: 1, index: [None; KEYS] };
         // In the order in which they were begun: of two copies of a record, the later one counts, because the
         // sector of the earlier one is the next to be erased.
-        let mut sectors: heapless::Vec<(u32, u8), 8> = heapless::Vec::new();
-        for sector in 0..geometry.sectors {
-            match SectorHead::parse(&flash.read(Place { sector, word: 0 })) {
-                Some(SectorHead::Known { sequence }) => _ = sectors.push((sequence, sector)),
-                Some(SectorHead::Other { version }) => return Err(MountError::Version { found: version }),
-                None => {}
-            }
-        }
-        sectors.sort_unstable();
-        for (sequence, sector) in sectors {
+        while let Some((sector, sequence)) = store.begun_next(flash)? {
             let end = store.walk(flash, sector);
             store.head = Some((sector, sequence));
             // The word behind may only look blank.
             store.end = end.saturating_add(1);
         }
         Ok(store)
+    }
+
+    /// The sector that was begun next after `head`. (Sorting would be 6 KiB of code.)
+    fn begun_next(&self, flash: &impl Flash) -> Result<Option<(u8, u32)>, MountError> {
+        let mut next: Option<(u8, u32)> = None;
+        for sector in 0..self.geometry.sectors {
+            match SectorHead::parse(&flash.read(Place { sector, word: 0 })) {
+                Some(SectorHead::Known { sequence }) => {
+                    let is_later = self.head.is_none_or(|(_, head)| sequence > head);
+                    if is_later && next.is_none_or(|(_, next)| sequence < next) {
+                        next = Some((sector, sequence));
+                    }
+                }
+                Some(SectorHead::Other { version }) => return Err(MountError::Version { found: version }),
+                None => {}
+            }
+        }
+        Ok(next)
     }
 
     /// Takes the records of a sector into the index; returns the first word behind everything that was written.

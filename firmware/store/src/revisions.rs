@@ -8,7 +8,7 @@ use crate::{Flash, Key, Put, PutError, Store};
 pub const MAX_REVISIONS: usize = 8;
 
 /// A configuration that is kept.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Revision {
     /// Its number: higher than that of all before it.
     pub number: u32,
@@ -119,22 +119,32 @@ pub enum Adoption<'s, 'd> {
 impl Store {
     /// The configurations that are kept, by their numbers.
     pub fn revisions(&self) -> heapless::Vec<Revision, MAX_REVISIONS> {
-        let mut all = heapless::Vec::new();
-        for slot in 0..MAX_REVISIONS as u8 {
-            if let Some(found) = self.find(Key::Image(slot)) {
-                let [a, b, c, d, e, f, g, h] = found.tag.to_le_bytes();
-                let number = u32::from_le_bytes([a, b, c, d]);
-                let digest = u32::from_le_bytes([e, f, g, h]);
-                let _ = all.push(Revision { number, digest, len: found.len, slot });
+        let mut all: heapless::Vec<Revision, MAX_REVISIONS> = heapless::Vec::new();
+        let next = |after: Option<u32>| {
+            let kept = (0..MAX_REVISIONS as u8).filter_map(|slot| self.in_slot(slot));
+            kept.filter(|kept| after.is_none_or(|after| kept.number > after)).min_by_key(|kept| kept.number)
+        };
+        while let Some(revision) = next(all.last().map(|last| last.number)) {
+            if all.push(revision).is_err() {
+                break;
             }
         }
-        all.sort_unstable();
         all
+    }
+
+    fn in_slot(&self, slot: u8) -> Option<Revision> {
+        let found = self.find(Key::Image(slot))?;
+        let [a, b, c, d, e, f, g, h] = found.tag.to_le_bytes();
+        let number = u32::from_le_bytes([a, b, c, d]);
+        let digest = u32::from_le_bytes([e, f, g, h]);
+        Some(Revision { number, digest, len: found.len, slot })
     }
 
     /// The configuration of this number.
     pub fn revision(&self, number: u32) -> Option<Revision> {
-        self.revisions().into_iter().find(|revision| revision.number == number)
+        (0..MAX_REVISIONS as u8)
+            .filter_map(|slot| self.in_slot(slot))
+            .find(|revision| revision.number == number)
     }
 
     /// The image of a configuration, in the beginning of `out`; `None` if it is not kept, or if `out` is too
@@ -147,10 +157,7 @@ impl Store {
     pub fn marks(&self) -> Marks {
         let Some(found) = self.find(Key::Marks) else { return Marks::default() };
         let [live, previous, trial, attempts, low, high, _, _] = found.tag.to_le_bytes();
-        let number = |slot: u8| {
-            let revisions = self.revisions();
-            revisions.iter().find(|revision| revision.slot == slot).map(|revision| revision.number)
-        };
+        let number = |slot: u8| self.in_slot(slot).map(|revision| revision.number);
         let confirm_s = u16::from_le_bytes([low, high]);
         Marks {
             live: number(live),
@@ -196,7 +203,7 @@ impl Store {
         let revisions = self.revisions();
         // One of the same number is replaced.
         let same = revisions.iter().find(|revision| revision.number == number).map(|same| same.number);
-        let free = (0..MAX_REVISIONS as u8).find(|slot| revisions.iter().all(|kept| kept.slot != *slot));
+        let free = (0..MAX_REVISIONS as u8).find(|slot| self.in_slot(*slot).is_none());
         let oldest = || revisions.iter().find(|kept| !is_needed(kept.number)).map(|kept| kept.slot);
         let slot = match same.or(forget) {
             Some(number) if is_needed(number) => return Err(KeepError::Needed { number }),
@@ -211,18 +218,16 @@ impl Store {
     /// before.
     pub fn at_start(&self) -> Start {
         let marks = self.marks();
-        let revisions = self.revisions();
-        let find = |number: u32| revisions.iter().find(|kept| kept.number == number).copied();
         let mut start = Start { marks: None, candidates: heapless::Vec::new() };
         if let Some(trial) = marks.trial {
             let left = trial.attempts.checked_sub(1);
             start.marks = Some(Marks { trial: left.map(|attempts| Trial { attempts, ..trial }), ..marks });
-            if let Some(revision) = find(trial.number).filter(|_| left.is_some()) {
+            if let Some(revision) = self.revision(trial.number).filter(|_| left.is_some()) {
                 let _ = start.candidates.push((revision, Role::Trial { confirm_s: trial.confirm_s }));
             }
         }
         for (number, role) in [(marks.live, Role::Live), (marks.previous, Role::Previous)] {
-            if let Some(revision) = number.and_then(find) {
+            if let Some(revision) = number.and_then(|number| self.revision(number)) {
                 let _ = start.candidates.push((revision, role));
             }
         }

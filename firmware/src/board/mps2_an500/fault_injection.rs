@@ -1,4 +1,5 @@
-//! Fault injection for tests, chosen by the third semihosting argument (`arg=stall`). It exists only in the image
+//! Fault injection for tests, chosen by the third semihosting argument (`arg=stall`; any
+//! other word, such as `none`, for nothing). It exists only in the image
 //! of this emulated board.
 
 use core::future::pending;

@@ -140,9 +140,7 @@ impl StoreFlash for Flash {
         let start = address(found.data);
         // SAFETY: the record lies in one sector. It is not changed while it is borrowed: writing takes `&mut self`.
         // All its words were read when the store was opened, or written and read back since.
-        Some(unsafe {
-            core::slice::from_raw_parts(core::ptr::with_exposed_provenance(start), found.len)
-        })
+        Some(unsafe { core::slice::from_raw_parts(core::ptr::with_exposed_provenance(start), found.len) })
     }
 }
 
