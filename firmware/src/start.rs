@@ -52,8 +52,8 @@ pub(crate) fn start(spawner: Spawner, mut board: Board) -> Tasks {
     let loaded = load(&mut board, GATEWAY.take(), overlay.configuration());
     let gateway = loaded.as_ref().ok().map(|loaded| loaded.gateway);
     let started = loaded.and_then(|loaded| {
-        if let Some((kept, time)) = loaded.trial {
-            tasks.spawn(TaskName::Trial, |pulse| trial(pulse, kept, time));
+        if let Some((kept, work)) = loaded.keeper {
+            tasks.spawn(TaskName::Keeper, |pulse| keeper(pulse, kept, work));
         }
         run(&tasks, board, loaded.gateway, loaded.wiring, overlay.links())
     });
@@ -91,7 +91,13 @@ enum Refused {
     Storage(<Board as platform::Board>::StorageError),
     Image(image::ImageError),
     Build(proto_core::engine::BuildError),
-    NoDevice { port: u8, bus: &'static str, available: usize },
+    NoDevice {
+        port: u8,
+        bus: &'static str,
+        available: usize,
+    },
+    /// The store has no configuration, and the image on the board was taken over and is gone.
+    Empty,
     Ethernet(<Board as platform::Board>::EthernetError),
 }
 
@@ -104,6 +110,7 @@ impl core::fmt::Display for Refused {
             Self::NoDevice { port, bus, available } => {
                 write!(f, "port {}: this board has {available} {bus} ports", port + 1)
             }
+            Self::Empty => f.write_str("the store holds no configuration"),
             Self::Ethernet(error) => error.fmt(f),
         }
     }
@@ -148,12 +155,23 @@ impl Overlay {
 struct Loaded {
     gateway: &'static Gateway,
     wiring: Wiring,
-    /// The store, and how long to wait for a confirmation, if the configuration is on trial.
-    trial: Option<(Kept<Flash>, Duration)>,
+    /// What is to be done with the store while it runs.
+    keeper: Option<(Kept<Flash>, KeeperWork)>,
 }
 
-/// The first configuration that can run: what was put on the board since the last start; of the store the one on
-/// trial, the live one, the one before; or else what was put on the board.
+/// Work of the keeper.
+#[derive(Clone, Copy)]
+enum KeeperWork {
+    /// This image came from outside the store: it becomes the live one.
+    Adopt(&'static [u8]),
+    /// What runs is on trial for this long.
+    Trial(Duration),
+}
+
+/// The first configuration that can run: the image that was put on the board since the last start; of the store
+/// the one on trial, the live one, the one before; or else the image on the board, which was run before.
+///
+/// Nothing is written but the start of a trial, so that the start takes no longer than without a store.
 ///
 /// Not inlined, so that its stack frame is free when the tasks run.
 #[inline(never)]
@@ -162,59 +180,68 @@ fn load(
     gateway: &'static mut Gateway,
     config: &mut GatewayConfig,
 ) -> Result<Loaded, Refused> {
-    let own = board.configuration().map_err(Refused::Storage);
-    let own_can_run = own.and_then(|bytes| configure(bytes, gateway, config));
+    let own = board.configuration().map_err(Refused::Storage).map(whole);
     let opened = board.flash().map(Kept::open);
     let kept = opened.and_then(|opened| opened.inspect_err(|error| error!("{}", Text(error))).ok());
-    let mut why = None;
-    if let Some(mut kept) = kept {
-        if let (Ok(bytes), Ok(())) = (own, own_can_run) {
-            let (image, digest) = whole(bytes);
-            match board.block_on(kept.adopt(digest, image)) {
-                Ok(true) => info!("taken over into the store: a configuration of {} bytes", image.len()),
-                Ok(false) => {}
-                Err(error) => error!("the store: {}", Text(&error)),
+    let Some(mut kept) = kept else {
+        let (image, _) = own?;
+        configure(image, gateway, config)?;
+        let wiring = wiring(image.len(), gateway, config);
+        return Ok(Loaded { gateway, wiring, keeper: None });
+    };
+    let mut why = own.err();
+    if let Ok((image, digest)) = own
+        && !kept.store().is_adopted(digest, image.len())
+    {
+        match configure(image, gateway, config) {
+            Ok(()) => {
+                let wiring = wiring(image.len(), gateway, config);
+                return Ok(Loaded { gateway, wiring, keeper: Some((kept, KeeperWork::Adopt(image))) });
             }
+            Err(error) => why = Some(error),
         }
-        let mut candidates = heapless::Vec::new();
-        if let Err(error) = board.block_on(kept.candidates(&mut candidates)) {
-            error!("the store: {}", Text(&error));
-        }
-        for (revision, role) in candidates {
-            let Some(bytes) = kept.image(revision) else { continue };
-            match configure(bytes, gateway, config) {
-                Ok(()) => {
-                    info!("configuration {} of the store, {}", revision.number, Text(&RoleName(role)));
-                    let wiring = wiring(bytes.len(), gateway, config);
-                    let trial = kept::trial_time(role).map(|time| (kept, time));
-                    return Ok(Loaded { gateway, wiring, trial });
-                }
-                Err(error) => {
-                    error!("configuration {} of the store cannot run: {}", revision.number, Text(&error));
-                    why.get_or_insert(error);
+    }
+    let mut candidates = heapless::Vec::new();
+    if let Err(error) = board.block_on(kept.candidates(&mut candidates)) {
+        error!("the store: {}", Text(&error));
+    }
+    let mut is_first = true;
+    for (revision, role) in candidates {
+        let Some(image) = kept.image(revision) else { continue };
+        match configure(image, gateway, config) {
+            Ok(()) => {
+                info!("configuration {} of the store, {}", revision.number, Text(&RoleName(role)));
+                let wiring = wiring(image.len(), gateway, config);
+                let keeper = kept::trial_time(role).map(|time| (kept, KeeperWork::Trial(time)));
+                return Ok(Loaded { gateway, wiring, keeper });
+            }
+            Err(error) => {
+                error!("configuration {} of the store cannot run: {}", revision.number, Text(&error));
+                // It says more than an empty place.
+                if core::mem::take(&mut is_first) {
+                    why = Some(error);
                 }
             }
         }
     }
-    // Again: another one may have been decoded since.
-    match own.and_then(|bytes| configure(bytes, gateway, config).map(|()| bytes)) {
-        Ok(bytes) => {
-            let wiring = wiring(whole(bytes).0.len(), gateway, config);
-            Ok(Loaded { gateway, wiring, trial: None })
-        }
-        // What the store holds says more than an empty place.
-        Err(error) => Err(why.unwrap_or(error)),
+    // Nothing of the store: the image on the board, although it was taken over.
+    if let Ok((image, _)) = own
+        && configure(image, gateway, config).is_ok()
+    {
+        let wiring = wiring(image.len(), gateway, config);
+        return Ok(Loaded { gateway, wiring, keeper: None });
     }
+    Err(why.unwrap_or(Refused::Empty))
 }
 
 /// The image without what follows it, and its CRC.
-fn whole(bytes: &[u8]) -> (&[u8], u32) {
+fn whole(bytes: &'static [u8]) -> (&'static [u8], u32) {
     let image = image::image_len(bytes).ok().and_then(|len| bytes.get(..len)).unwrap_or(bytes);
     let crc = image.get(image::HEADER - 4..).and_then(|rest| rest.first_chunk());
     (image, crc.map_or(0, |crc| u32::from_le_bytes(*crc)))
 }
 
-/// Not inlined: it is called in three places.
+/// Not inlined: it is called in several places.
 #[inline(never)]
 fn configure(bytes: &[u8], gateway: &mut Gateway, config: &mut GatewayConfig) -> Result<(), Refused> {
     image::decode_into(bytes, config).map_err(Refused::Image)?;
@@ -383,21 +410,34 @@ async fn status(pulse: &'static Pulse, gateway: &'static Gateway) -> ! {
     pulse.run(pin!(firmware::tasks::status::run(gateway, pulse))).await
 }
 
-/// Goes back to the live configuration when nobody has confirmed this one in time: by a restart, because a
-/// configuration is only changed there.
+/// Changes the store while a configuration runs.
 #[embassy_executor::task]
-async fn trial(pulse: &'static Pulse, mut kept: Kept<Flash>, time: Duration) -> ! {
-    let waiting = async {
-        pulse.idle(pin!(Timer::after(time))).await;
-        warn!("the configuration was not confirmed in time: back to the live one");
-        if let Err(error) = pulse.idle(pin!(kept.end_trial())).await {
-            error!("the store: {}", Text(&error));
+async fn keeper(pulse: &'static Pulse, mut kept: Kept<Flash>, work: KeeperWork) -> ! {
+    let keeping = async {
+        match work {
+            KeeperWork::Adopt(image) => {
+                let (image, digest) = whole(image);
+                match pulse.idle(pin!(kept.adopt(digest, image))).await {
+                    Ok(_) => info!("the store has taken over the configuration"),
+                    Err(error) => error!("the store: {}", Text(&error)),
+                }
+            }
+            KeeperWork::Trial(time) => {
+                pulse.idle(pin!(Timer::after(time))).await;
+                warn!("the configuration was not confirmed in time: back to the live one");
+                if let Err(error) = pulse.idle(pin!(kept.end_trial())).await {
+                    error!("the store: {}", Text(&error));
+                }
+                // For the log. A configuration is only changed by a restart.
+                pulse.idle(pin!(Timer::after(LAST_WORDS))).await;
+                cortex_m::peripheral::SCB::sys_reset()
+            }
         }
-        // For the log.
-        pulse.idle(pin!(Timer::after(LAST_WORDS))).await;
-        cortex_m::peripheral::SCB::sys_reset()
+        loop {
+            pulse.idle(pin!(core::future::pending::<()>())).await;
+        }
     };
-    pulse.run(pin!(waiting)).await
+    pulse.run(pin!(keeping)).await
 }
 
 /// Logs the reason repeatedly, because the log may be read late.
@@ -419,5 +459,5 @@ const SOCKETS: usize = MAX_LINKS + 2;
 const REPEAT: Duration = Duration::from_secs(10);
 /// Between the last log line and a restart.
 const LAST_WORDS: Duration = Duration::from_millis(100);
-/// A task for each port and link, and: engine, network, address, status, LED, refused, trial, the board's own.
+/// A task for each port and link, and: engine, network, address, status, LED, refused, keeper, the board's own.
 const MAX_TASKS: usize = SERIAL_PORTS + CAN_PORTS + MAX_LINKS + 8;

@@ -41,8 +41,8 @@ pub enum TaskName {
     Refused,
     /// A task of the board's own.
     Board(u8),
-    /// Waits for the end of a configuration's trial.
-    Trial,
+    /// Changes the store.
+    Keeper,
 }
 
 impl TaskName {
@@ -66,7 +66,7 @@ impl TaskName {
             Self::Board(number) => (15, number),
             Self::Link(LinkKind::Urgent) => (16, 0),
             Self::Link(_) => (17, 0),
-            Self::Trial => (18, 0),
+            Self::Keeper => (18, 0),
         };
         u16::from_be_bytes([kind, number])
     }
@@ -91,7 +91,7 @@ impl TaskName {
             Self::Refused,
             Self::Board(number),
             Self::Link(LinkKind::Urgent),
-            Self::Trial,
+            Self::Keeper,
         ];
         names.into_iter().find(|name| name.code() == code)
     }
@@ -110,7 +110,7 @@ impl fmt::Display for TaskName {
             Self::Led => f.write_str("LED"),
             Self::Refused => f.write_str("refused"),
             Self::Board(number) => write!(f, "board {number}"),
-            Self::Trial => f.write_str("trial"),
+            Self::Keeper => f.write_str("keeper"),
         }
     }
 }

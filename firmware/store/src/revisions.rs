@@ -241,9 +241,7 @@ impl Store {
     /// # Errors
     /// It cannot be written.
     pub fn adopt<'d>(&mut self, digest: u32, image: &'d [u8]) -> Result<Adoption<'_, 'd>, KeepError> {
-        let len = u32::try_from(image.len()).unwrap_or(u32::MAX);
-        let tag = u64::from(digest) << 32 | u64::from(len);
-        if self.find(Key::Adopted).is_some_and(|found| found.tag == tag) {
+        if self.is_adopted(digest, image.len()) {
             return Ok(Adoption::Done);
         }
         let revisions = self.revisions();
@@ -257,8 +255,18 @@ impl Store {
             let marks = Marks { live: Some(same), previous: marks.live, trial: None };
             return Ok(Adoption::Write(self.mark(marks)?));
         }
-        Ok(Adoption::Write(self.put(Key::Adopted, tag, &[])?))
+        Ok(Adoption::Write(self.put(Key::Adopted, adopted(digest, image.len()), &[])?))
     }
+
+    /// Whether this is the image that was taken over last.
+    pub fn is_adopted(&self, digest: u32, len: usize) -> bool {
+        self.find(Key::Adopted).is_some_and(|found| found.tag == adopted(digest, len))
+    }
+}
+
+/// Tells an image that was taken over from others.
+fn adopted(digest: u32, len: usize) -> u64 {
+    u64::from(digest) << 32 | u64::from(u32::try_from(len).unwrap_or(u32::MAX))
 }
 
 const NO_SLOT: u8 = u8::MAX;

@@ -69,16 +69,19 @@ pub(super) fn can_read(address: usize) -> bool {
     // flag. The flag is cleared, and everything else restored.
     unsafe {
         let scb = &*SCB::PTR;
-        scb.cfsr.write(CFSR_BUS);
+        let control = scb.ccr.read();
         asm!("cpsid f");
-        scb.ccr.modify(|ccr| ccr | CCR_IGNORE_BUS_FAULTS);
+        scb.ccr.write(control | CCR_IGNORE_BUS_FAULTS);
         cortex_m::asm::dsb();
         cortex_m::asm::isb();
         core::ptr::with_exposed_provenance::<u32>(address).read_volatile();
         cortex_m::asm::dsb();
+        // No flag was set before: where faults are not ignored they end the program.
         let faults = scb.cfsr.read() & CFSR_BUS;
-        scb.cfsr.write(faults);
-        scb.ccr.modify(|ccr| ccr & !CCR_IGNORE_BUS_FAULTS);
+        if faults != 0 {
+            scb.cfsr.write(faults);
+        }
+        scb.ccr.write(control);
         asm!("cpsie f");
         faults == 0
     }
