@@ -241,6 +241,8 @@ impl Bench {
             }
             if dead.is_possible(change) {
                 dead.carry_out(change);
+                // The word at which the one cut was is left out.
+                assert_eq!(dead.flash.refused, 0);
             }
             totals.refused += dead.flash.refused;
         }

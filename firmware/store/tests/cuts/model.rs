@@ -42,6 +42,8 @@ pub(crate) struct Nor {
     /// Writes to words that only looked blank.
     pub(crate) refused: u32,
     may_rewrite: bool,
+    /// One write of so many goes wrong, and nothing says so.
+    fails_of: Option<u64>,
     seed: u64,
 }
 
@@ -59,6 +61,7 @@ impl Nor {
             writes: 0,
             refused: 0,
             may_rewrite: false,
+            fails_of: None,
             seed: 1,
         }
     }
@@ -78,6 +81,11 @@ impl Nor {
     /// A word that is written twice cannot be read afterwards, and is no mistake of the test.
     pub(crate) fn allow_rewrites(&mut self) {
         self.may_rewrite = true;
+    }
+
+    /// One write of `of` goes wrong from now on.
+    pub(crate) fn wear_out(&mut self, of: u64) {
+        self.fails_of = Some(of);
     }
 
     pub(crate) fn is_off(&self) -> bool {
@@ -158,8 +166,10 @@ impl Nor {
         let (at, is_cut) = (self.at(place), self.is_cut());
         // A word may be whole all the same.
         let is_torn = is_cut && self.chance(8) > 0;
+        let chance = self.chance(u64::MAX);
         match self.states[at] {
             State::Erased if is_torn => self.tear(at, *word),
+            State::Erased if self.fails_of.is_some_and(|of| chance % of == 0) => self.tear(at, *word),
             State::Erased => (self.words[at], self.states[at]) = (*word, State::Written),
             State::LooksBlank => {
                 self.refused += 1;

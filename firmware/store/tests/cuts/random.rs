@@ -47,6 +47,29 @@ fn run(seed: u64, starts: u32) -> (u32, u32) {
 }
 
 #[test]
+fn what_the_flash_does_not_keep_is_written_again() {
+    let (mut done, mut failed) = (0, 0);
+    for torn in TORN {
+        let mut bench = Bench::new(SMALL, torn);
+        bench.flash.wear_out(40);
+        for change in life(300, &[10, 250, 90]) {
+            if !bench.is_possible(&change) {
+                continue;
+            }
+            if bench.attempt(&change) {
+                done += 1;
+                bench.expected = bench.expected.after(&change);
+            } else {
+                failed += 1;
+            }
+            bench.check();
+        }
+    }
+    println!("one write of 40 goes wrong: {done} changes done, {failed} refused");
+    assert!(done > 900 && failed < 100, "{done} {failed}");
+}
+
+#[test]
 fn random_changes_and_cuts() {
     let (mut cuts, mut done) = (0, 0);
     for seed in 0..40 {
