@@ -25,7 +25,7 @@ fn cut_everywhere(name: &str, geometry: Geometry, changes: &[Operation], restart
             if restarts {
                 bench.restart();
             }
-            bench.cut_everywhere(change, changes.get(nth + 1), nth as u64, &mut totals);
+            bench.cut_everywhere(change, changes.get(nth + 1), nth as u64, restarts, &mut totals);
             bench.carry_out(change);
         }
     }
