@@ -55,9 +55,3 @@ fn the_sectors_of_the_chip() {
     let totals = cut_everywhere("STM32H743", SECTORS, &life(24, &[2_000, 400]), true);
     assert!(totals.cuts > 800 && totals.new > 0, "{totals}");
 }
-
-#[test]
-#[ignore = "minutes: every operation with images of 16 KiB; for the figures of docs/store.md"]
-fn the_longest_images() {
-    cut_everywhere("STM32H743, 16 KiB", SECTORS, &life(40, &[16 * 1024]), true);
-}
