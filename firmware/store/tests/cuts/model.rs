@@ -169,7 +169,9 @@ impl Nor {
         let chance = self.chance(u64::MAX);
         match self.states[at] {
             State::Erased if is_torn => self.tear(at, *word),
-            State::Erased if self.fails_of.is_some_and(|of| chance % of == 0) => self.tear(at, *word),
+            State::Erased if self.fails_of.is_some_and(|of| chance.is_multiple_of(of)) => {
+                self.tear(at, *word)
+            }
             State::Erased => (self.words[at], self.states[at]) = (*word, State::Written),
             State::LooksBlank => {
                 self.refused += 1;
