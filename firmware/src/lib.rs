@@ -11,6 +11,7 @@ mod clock;
 pub mod drivers;
 pub mod fmt;
 pub mod identity;
+pub mod kept;
 pub mod platform;
 pub mod tasks;
 

@@ -4,6 +4,7 @@
 //! docs/boards.md.
 
 use core::fmt::{Debug, Display};
+use core::future::Future;
 
 use embassy_net_driver::Driver;
 use embassy_time::Duration;
@@ -11,6 +12,7 @@ use proto_core::config::Rs485;
 
 use crate::drivers::can_port::CanPort;
 use crate::drivers::line::Line;
+use crate::kept::StoreFlash;
 
 /// A board.
 ///
@@ -36,16 +38,27 @@ pub trait Board {
     type Watchdog: FeedWatchdog;
     /// The status LED.
     type Led: StatusLed;
+    /// The flash of the store.
+    type Flash: StoreFlash + 'static;
     /// Why there is no configuration image.
     type StorageError: Debug + Display + Copy;
     /// Why there is no Ethernet.
     type EthernetError: Debug + Display + Copy;
 
-    /// The configuration image; bytes after it are ignored.
+    /// The configuration image that was put on the board from outside, and is taken over into the store; bytes
+    /// after it are ignored.
     ///
     /// # Errors
-    /// There is none, or it cannot be read. The buses then stay silent.
+    /// There is none, or it cannot be read. What the store holds then runs.
     fn configuration(&mut self) -> Result<&'static [u8], Self::StorageError>;
+
+    /// The flash of the store (docs/store.md); called once. `None` if the board has none: it keeps nothing, and
+    /// runs the image above.
+    fn flash(&mut self) -> Option<Self::Flash>;
+
+    /// Waits for the flash during the start, when no task runs yet. A sector may take two seconds, so the watchdog
+    /// is fed meanwhile; each operation of the flash has a time limit.
+    fn block_on<T>(&mut self, operation: impl Future<Output = T>) -> T;
 
     /// The next RS-485 line, with these settings; `None` if there is none left, or if it does not support the
     /// settings, which it logs.

@@ -8,6 +8,7 @@ use embassy_executor::{SpawnError, SpawnToken, Spawner};
 use embassy_net::{Config, Ipv4Cidr, Runner, Stack, StackResources, StaticConfigV4};
 use embassy_time::{Duration, Timer};
 use firmware::fmt::Text;
+use firmware::kept::{self, Kept, RoleName};
 use firmware::platform::{self, FeedWatchdog as _, StatusLed as _};
 use firmware::tasks::fair::Fair;
 use firmware::tasks::gateway::{Gateway, MAX_LINKS};
@@ -29,6 +30,7 @@ type CanDevice = <Board as platform::Board>::Can;
 type Ethernet = <Board as platform::Board>::Ethernet;
 type Watchdog = <Board as platform::Board>::Watchdog;
 type Led = <Board as platform::Board>::Led;
+type Flash = <Board as platform::Board>::Flash;
 const SERIAL_PORTS: usize = <Board as platform::Board>::SERIAL_PORTS;
 const CAN_PORTS: usize = <Board as platform::Board>::CAN_PORTS;
 const WATCHDOG_PERIOD: Duration = <Board as platform::Board>::WATCHDOG_PERIOD;
@@ -48,8 +50,13 @@ pub(crate) fn start(spawner: Spawner, mut board: Board) -> Tasks {
     static OVERLAY: ConstStaticCell<Overlay> = ConstStaticCell::new(Overlay::ZEROED);
     let overlay = OVERLAY.take();
     let loaded = load(&mut board, GATEWAY.take(), overlay.configuration());
-    let gateway = loaded.as_ref().ok().map(|(gateway, _)| *gateway);
-    let started = loaded.and_then(|(gateway, wiring)| run(&tasks, board, gateway, wiring, overlay.links()));
+    let gateway = loaded.as_ref().ok().map(|loaded| loaded.gateway);
+    let started = loaded.and_then(|loaded| {
+        if let Some((kept, work)) = loaded.keeper {
+            tasks.spawn(TaskName::Keeper, |pulse| keeper(pulse, kept, work));
+        }
+        run(&tasks, board, loaded.gateway, loaded.wiring, overlay.links())
+    });
     tasks.spawn(TaskName::Led, |pulse| status_led(pulse, gateway.filter(|_| started.is_ok()), led));
     if let Err(reason) = started {
         tasks.spawn(TaskName::Refused, |pulse| refused(pulse, reason));
@@ -84,7 +91,13 @@ enum Refused {
     Storage(<Board as platform::Board>::StorageError),
     Image(image::ImageError),
     Build(proto_core::engine::BuildError),
-    NoDevice { port: u8, bus: &'static str, available: usize },
+    NoDevice {
+        port: u8,
+        bus: &'static str,
+        available: usize,
+    },
+    /// The store has no configuration, and the image on the board was taken over and is gone.
+    Empty,
     Ethernet(<Board as platform::Board>::EthernetError),
 }
 
@@ -97,6 +110,7 @@ impl core::fmt::Display for Refused {
             Self::NoDevice { port, bus, available } => {
                 write!(f, "port {}: this board has {available} {bus} ports", port + 1)
             }
+            Self::Empty => f.write_str("the store holds no configuration"),
             Self::Ethernet(error) => error.fmt(f),
         }
     }
@@ -137,17 +151,105 @@ impl Overlay {
     }
 }
 
+/// A configuration that runs.
+struct Loaded {
+    gateway: &'static Gateway,
+    wiring: Wiring,
+    /// What is to be done with the store while it runs.
+    keeper: Option<(Kept<Flash>, KeeperWork)>,
+}
+
+/// Work of the keeper.
+#[derive(Clone, Copy)]
+enum KeeperWork {
+    /// This image came from outside the store: it becomes the live one.
+    Adopt(&'static [u8]),
+    /// What runs is on trial for this long.
+    Trial(Duration),
+}
+
+/// The first configuration that can run: the image that was put on the board since the last start; of the store
+/// the one on trial, the live one, the one before; or else the image on the board, which was run before.
+///
+/// Nothing is written but the start of a trial, so that the start takes no longer than without a store.
+///
 /// Not inlined, so that its stack frame is free when the tasks run.
 #[inline(never)]
 fn load(
     board: &mut Board,
     gateway: &'static mut Gateway,
     config: &mut GatewayConfig,
-) -> Result<(&'static Gateway, Wiring), Refused> {
-    let bytes = board.configuration().map_err(Refused::Storage)?;
+) -> Result<Loaded, Refused> {
+    let own = board.configuration().map_err(Refused::Storage).map(whole);
+    let opened = board.flash().map(Kept::open);
+    let kept = opened.and_then(|opened| opened.inspect_err(|error| error!("{}", Text(error))).ok());
+    let Some(mut kept) = kept else {
+        let (image, _) = own?;
+        configure(image, gateway, config)?;
+        let wiring = wiring(image.len(), gateway, config);
+        return Ok(Loaded { gateway, wiring, keeper: None });
+    };
+    let mut why = own.err();
+    if let Ok((image, digest)) = own
+        && !kept.store().is_adopted(digest, image.len())
+    {
+        match configure(image, gateway, config) {
+            Ok(()) => {
+                let wiring = wiring(image.len(), gateway, config);
+                return Ok(Loaded { gateway, wiring, keeper: Some((kept, KeeperWork::Adopt(image))) });
+            }
+            Err(error) => why = Some(error),
+        }
+    }
+    let mut candidates = heapless::Vec::new();
+    if let Err(error) = board.block_on(kept.candidates(&mut candidates)) {
+        error!("the store: {}", Text(&error));
+    }
+    let mut is_first = true;
+    for (revision, role) in candidates {
+        let Some(image) = kept.image(revision) else { continue };
+        match configure(image, gateway, config) {
+            Ok(()) => {
+                info!("configuration {} of the store, {}", revision.number, Text(&RoleName(role)));
+                let wiring = wiring(image.len(), gateway, config);
+                let keeper = kept::trial_time(role).map(|time| (kept, KeeperWork::Trial(time)));
+                return Ok(Loaded { gateway, wiring, keeper });
+            }
+            Err(error) => {
+                error!("configuration {} of the store cannot run: {}", revision.number, Text(&error));
+                // It says more than an empty place.
+                if core::mem::take(&mut is_first) {
+                    why = Some(error);
+                }
+            }
+        }
+    }
+    // Nothing of the store: the image on the board, although it was taken over.
+    if let Ok((image, _)) = own
+        && configure(image, gateway, config).is_ok()
+    {
+        let wiring = wiring(image.len(), gateway, config);
+        return Ok(Loaded { gateway, wiring, keeper: None });
+    }
+    Err(why.unwrap_or(Refused::Empty))
+}
+
+/// The image without what follows it, and its CRC.
+fn whole(bytes: &'static [u8]) -> (&'static [u8], u32) {
+    let image = image::image_len(bytes).ok().and_then(|len| bytes.get(..len)).unwrap_or(bytes);
+    let crc = image.get(image::HEADER - 4..).and_then(|rest| rest.first_chunk());
+    (image, crc.map_or(0, |crc| u32::from_le_bytes(*crc)))
+}
+
+/// Not inlined: it is called in several places.
+#[inline(never)]
+fn configure(bytes: &[u8], gateway: &mut Gateway, config: &mut GatewayConfig) -> Result<(), Refused> {
     image::decode_into(bytes, config).map_err(Refused::Image)?;
-    gateway.configure(config).map_err(Refused::Build)?;
-    let gateway: &'static Gateway = gateway;
+    gateway.configure(config).map_err(Refused::Build)
+}
+
+#[inline(never)]
+fn wiring(len: usize, gateway: &Gateway, config: &GatewayConfig) -> Wiring {
     let wiring = Wiring {
         ports: config
             .view()
@@ -159,13 +261,13 @@ fn load(
     };
     info!(
         "configuration: {} bytes; {} field ports, {} links; the engine has {} bytes, its configuration {}",
-        bytes.len(),
+        len,
         wiring.ports.len(),
         wiring.links.len(),
         size_of::<Gateway>(),
         size_of::<GatewayConfig>(),
     );
-    Ok((gateway, wiring))
+    wiring
 }
 
 #[inline(never)]
@@ -308,6 +410,36 @@ async fn status(pulse: &'static Pulse, gateway: &'static Gateway) -> ! {
     pulse.run(pin!(firmware::tasks::status::run(gateway, pulse))).await
 }
 
+/// Changes the store while a configuration runs.
+#[embassy_executor::task]
+async fn keeper(pulse: &'static Pulse, mut kept: Kept<Flash>, work: KeeperWork) -> ! {
+    let keeping = async {
+        match work {
+            KeeperWork::Adopt(image) => {
+                let (image, digest) = whole(image);
+                match pulse.idle(pin!(kept.adopt(digest, image))).await {
+                    Ok(_) => info!("the store has taken over the configuration"),
+                    Err(error) => error!("the store: {}", Text(&error)),
+                }
+            }
+            KeeperWork::Trial(time) => {
+                pulse.idle(pin!(Timer::after(time))).await;
+                warn!("the configuration was not confirmed in time: back to the live one");
+                if let Err(error) = pulse.idle(pin!(kept.end_trial())).await {
+                    error!("the store: {}", Text(&error));
+                }
+                // For the log. A configuration is only changed by a restart.
+                pulse.idle(pin!(Timer::after(LAST_WORDS))).await;
+                cortex_m::peripheral::SCB::sys_reset()
+            }
+        }
+        loop {
+            pulse.idle(pin!(core::future::pending::<()>())).await;
+        }
+    };
+    pulse.run(pin!(keeping)).await
+}
+
 /// Logs the reason repeatedly, because the log may be read late.
 #[embassy_executor::task]
 async fn refused(pulse: &'static Pulse, reason: Refused) -> ! {
@@ -325,5 +457,7 @@ async fn refused(pulse: &'static Pulse, reason: Refused) -> ! {
 const SOCKETS: usize = MAX_LINKS + 2;
 /// Interval of that log line.
 const REPEAT: Duration = Duration::from_secs(10);
-/// A task for each port and link, and: engine, network, address, status, LED, refused, the board's own.
-const MAX_TASKS: usize = SERIAL_PORTS + CAN_PORTS + MAX_LINKS + 7;
+/// Between the last log line and a restart.
+const LAST_WORDS: Duration = Duration::from_millis(100);
+/// A task for each port and link, and: engine, network, address, status, LED, refused, keeper, the board's own.
+const MAX_TASKS: usize = SERIAL_PORTS + CAN_PORTS + MAX_LINKS + 8;

@@ -11,6 +11,9 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::time::{Duration, Instant};
 
+use embassy_futures::block_on;
+use recipe_store::{Flash, Geometry, Marks, Place, Store, Trial, WORD, Word};
+
 /// A running machine, with the lines of its log.
 struct Machine {
     qemu: Child,
@@ -23,7 +26,19 @@ struct Machine {
 impl Machine {
     /// Starts it with an image (or the name of a missing file), a fault to inject, and more options.
     fn start(image: &Path, fault: &str, options: &[&str]) -> Self {
-        let arguments = format!("enable=on,target=native,arg=firmware,arg={},arg={fault}", image.display());
+        Self::start_with(&format!("arg={},arg={fault}", image.display()), options)
+    }
+
+    /// Starts it with the file of its store.
+    fn with_store(image: &Path, store: &Path) -> Self {
+        Self::start_with(
+            &format!("arg={},arg=none,arg={}", image.display(), store.display()),
+            &["-nic", "user"],
+        )
+    }
+
+    fn start_with(arguments: &str, options: &[&str]) -> Self {
+        let arguments = format!("enable=on,target=native,arg=firmware,{arguments}");
         let monitor = tempfile::tempdir().unwrap();
         let socket = format!("unix:{}/socket,server=on,wait=off", monitor.path().display());
         let mut qemu = Command::new("qemu-system-arm")
@@ -318,6 +333,75 @@ fn a_stack_overflow_and_a_read_of_nothing_fault_and_end_with_102() {
         assert!(!log.contains("panicked"), "{log}");
         assert_eq!(status.code(), Some(102), "{fault}");
     }
+}
+
+/// Flash of three sectors of 128 KiB, as the file of the store.
+struct StoreFile(PathBuf, Vec<u8>);
+
+const STORE_SECTOR: usize = 128 * 1024;
+
+impl StoreFile {
+    fn offset(place: Place) -> usize {
+        usize::from(place.sector) * STORE_SECTOR + usize::from(place.word) * WORD
+    }
+
+    fn read(path: &Path) -> Self {
+        let mut bytes = std::fs::read(path).unwrap();
+        bytes.resize(3 * STORE_SECTOR, 0xFF);
+        Self(path.into(), bytes)
+    }
+
+    fn save(&self) {
+        std::fs::write(&self.0, &self.1).unwrap();
+    }
+}
+
+impl Flash for StoreFile {
+    fn geometry(&self) -> Geometry {
+        Geometry { sectors: 3, words: (STORE_SECTOR / WORD) as u16 }
+    }
+
+    fn read(&self, place: Place) -> Word {
+        *self.1[Self::offset(place)..].first_chunk().unwrap()
+    }
+
+    async fn write(&mut self, place: Place, word: &Word) {
+        self.1[Self::offset(place)..][..WORD].copy_from_slice(word);
+    }
+
+    async fn erase(&mut self, sector: u8) {
+        self.1[usize::from(sector) * STORE_SECTOR..][..STORE_SECTOR].fill(0xFF);
+    }
+}
+
+/// The image is taken over, runs without its file, and gives way to another one on trial, which nobody confirms.
+#[test]
+#[ignore = "needs QEMU and the firmware"]
+fn the_store_keeps_what_runs_and_a_trial_ends() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("cell.store");
+    let image = image(&folder, "force-sensor.toml", &["controller.address=10.0.2.2"]);
+    let taken_over = "the store has taken over the configuration";
+    Machine::with_store(&image, &path).until(taken_over);
+    Machine::with_store(nothing(), &path).until("configuration 1 of the store, the live one");
+
+    let mut file = StoreFile::read(&path);
+    let mut store = Store::mount(&file).unwrap();
+    let bytes = std::fs::read(&image).unwrap();
+    let [live] = store.revisions()[..] else { panic!("one is kept") };
+    assert_eq!((live.number, live.len), (1, bytes.len()));
+    block_on(store.keep(2, 2, &bytes, None).unwrap().carry_out(&mut file)).unwrap();
+    let trial = Some(Trial { number: 2, attempts: 3, confirm_s: 1 });
+    let marks = Marks { live: Some(1), previous: None, trial };
+    block_on(store.mark(marks).unwrap().carry_out(&mut file)).unwrap();
+    file.save();
+    let mut machine = Machine::with_store(nothing(), &path);
+    machine.until("configuration 2 of the store, on trial for 1 s");
+    machine.until("was not confirmed in time");
+    // By a restart of its own.
+    machine.until("configuration 1 of the store, the live one");
+    drop(machine);
+    assert_eq!(Store::mount(&StoreFile::read(&path)).unwrap().marks(), Marks { trial: None, ..marks });
 }
 
 /// The task with the injected fault.

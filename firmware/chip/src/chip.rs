@@ -53,6 +53,8 @@ pub struct Chip {
     pub faults: Vec<(u32, u32)>,
     /// How often the core went to sleep.
     pub waits: u64,
+    /// How often the power was cut.
+    pub power_cuts: u64,
 }
 
 /// Why a run ended early.
@@ -97,9 +99,9 @@ impl Chip {
             resets: Vec::new(),
             faults: Vec::new(),
             waits: 0,
+            power_cuts: 0,
         };
-        let ram = RAM.map(|(_, size, fill)| vec![fill; size as usize]);
-        chip.start(&ram)?;
+        chip.start(&power_on_ram())?;
         Ok(chip)
     }
 
@@ -142,6 +144,20 @@ impl Chip {
     pub fn tear(&mut self, address: u32) -> Result<(), String> {
         self.board.devices.flash.tear(address - FLASH);
         self.close_page(address)
+    }
+
+    /// Programs flash without checks, like a debugger.
+    pub fn load(&mut self, address: u32, bytes: &[u8]) {
+        self.board.devices.flash.load(address - FLASH, bytes);
+        self.engine().write(address, bytes);
+    }
+
+    /// The supply fails and comes back: a new start, with what is in flash.
+    pub fn cut_power(&mut self) {
+        self.power_cuts += 1;
+        self.board.reset(false);
+        self.start(&power_on_ram()).expect("it has started before");
+        self.decoder = self.program.log_reader();
     }
 
     /// Replaces instructions of the program until the next reset.
@@ -210,6 +226,10 @@ impl Chip {
         while self.board.now < end {
             self.board.limit = end;
             self.step(end);
+            if self.board.devices.flash.has_failed() {
+                self.read_log();
+                self.cut_power();
+            }
             self.steps_unread += 1;
             if self.is_asleep
                 || self.steps_unread >= LOG_PERIOD
@@ -356,6 +376,10 @@ impl Chip {
         self.start(&ram).expect("it has started before");
         self.decoder = self.program.log_reader();
     }
+}
+
+fn power_on_ram() -> [Vec<u8>; 2] {
+    RAM.map(|(_, size, fill)| vec![fill; size as usize])
 }
 
 /// The log is read at least once in so many steps.

@@ -1,5 +1,5 @@
-//! The proof that nothing in proto-core panics: an image in which every entry of it that sees what a
-//! device, a peer or a file sent is called with values that the compiler knows nothing about, and
+//! The proof that nothing in proto-core or recipe-store panics: an image in which every entry of theirs that sees
+//! what a device, a peer, a file or flash sent is called with values that the compiler knows nothing about, and
 //! whose panic handler needs a symbol that does not exist. It links only when the optimiser has removed
 //! every panic. `.ci/run` builds it as the firmware is built, and prints how much stack each of these
 //! functions takes (docs/architecture.md section 4).
@@ -14,6 +14,7 @@ mod protocols;
 mod recipes;
 mod rtu;
 mod state;
+mod store;
 mod words;
 mod zeros;
 
@@ -43,6 +44,7 @@ fn exercise() {
     protocols::all();
     rtu::all();
     state::all();
+    store::all();
     zeros::all();
     match VARIANT {
         Variant::Proof | Variant::Shown => {}

@@ -41,6 +41,8 @@ pub enum TaskName {
     Refused,
     /// A task of the board's own.
     Board(u8),
+    /// Changes the store.
+    Keeper,
 }
 
 impl TaskName {
@@ -64,6 +66,7 @@ impl TaskName {
             Self::Board(number) => (15, number),
             Self::Link(LinkKind::Urgent) => (16, 0),
             Self::Link(_) => (17, 0),
+            Self::Keeper => (18, 0),
         };
         u16::from_be_bytes([kind, number])
     }
@@ -88,6 +91,7 @@ impl TaskName {
             Self::Refused,
             Self::Board(number),
             Self::Link(LinkKind::Urgent),
+            Self::Keeper,
         ];
         names.into_iter().find(|name| name.code() == code)
     }
@@ -106,6 +110,7 @@ impl fmt::Display for TaskName {
             Self::Led => f.write_str("LED"),
             Self::Refused => f.write_str("refused"),
             Self::Board(number) => write!(f, "board {number}"),
+            Self::Keeper => f.write_str("keeper"),
         }
     }
 }

@@ -1,7 +1,8 @@
 //! The flash interface and its memory. RM0433, "Embedded Flash memory".
 //!
 //! A flash word has 32 bytes and an ECC. It is programmed as a whole, once after its sector (128 KiB) was
-//! erased. If it is programmed twice or interrupted, the ECC does not match, and reading it is a bus fault.
+//! erased. If it is programmed twice or interrupted, the ECC does not match, and reading it is a bus fault. An
+//! interrupted one may also read as something in between, or look blank and not take a write ([`Torn`]).
 //! Refused: wrong keys, writes with LOCK set or without PG, incomplete flash words, register changes while the
 //! bank is busy, and too few wait states for the clock.
 
@@ -48,6 +49,18 @@ const BANK: u32 = 0x10_0000;
 const ERASE: Picos = 1_000 * MILLI;
 const PROGRAM: Picos = 100 * MICRO;
 
+/// What an interrupted operation leaves of a flash word.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Torn {
+    /// Reading it is a bus fault.
+    #[default]
+    Fault,
+    /// It looks blank. What is programmed there is torn.
+    Blank,
+    /// Some of its bits are programmed, and it can be read.
+    Half,
+}
+
 /// An operation of a bank.
 #[derive(Debug, Clone, PartialEq, Eq)]
 enum Work {
@@ -82,6 +95,13 @@ pub struct Flash {
     cells: Vec<u8>,
     /// Offsets of the flash words whose ECC does not match.
     torn: BTreeSet<u32>,
+    /// Offsets of those that only look blank.
+    only_looks_blank: BTreeSet<u32>,
+    /// What interrupted operations leave.
+    pub leaves: Torn,
+    /// The power fails during the operation of this number ([`Flash::operations`]).
+    pub fails_during: Option<u64>,
+    operations: u64,
     /// Ranges that have changed since [`Flash::take_changed`].
     changed: Vec<(u32, u32)>,
     /// Number of erased sectors.
@@ -96,6 +116,10 @@ impl Flash {
             halves: Default::default(),
             cells: vec![0xFF; 2 * BANK as usize],
             torn: BTreeSet::new(),
+            only_looks_blank: BTreeSet::new(),
+            leaves: Torn::Fault,
+            fails_during: None,
+            operations: 0,
             changed: Vec::new(),
             erases: 0,
         }
@@ -126,16 +150,58 @@ impl Flash {
         std::mem::take(&mut self.changed)
     }
 
-    /// A power failure: tears the flash word being programmed, or the whole sector being erased.
+    /// Number of operations that were begun.
+    pub fn operations(&self) -> u64 {
+        self.operations
+    }
+
+    /// Whether the power fails now, once for each `fails_during`.
+    pub(crate) fn has_failed(&mut self) -> bool {
+        self.fails_during.take_if(|number| *number == self.operations).is_some()
+    }
+
+    /// A power failure: tears the flash word being programmed. Of the sector being erased, some words are as
+    /// before, some erased, and the others torn.
     pub fn lose_power(&mut self) {
-        for half in &mut self.halves {
-            let (first, len) = match half.work.take() {
-                Some(Work::Erase { first, .. }) => (first, SECTOR),
-                Some(Work::Program { address, .. }) => (address, WORD),
-                None => continue,
-            };
-            self.torn.extend((first..first + len).step_by(WORD as usize));
+        for index in 0..self.halves.len() {
+            match self.halves[index].work.take() {
+                Some(Work::Program { address, bytes, .. }) => self.interrupt(address, &bytes),
+                Some(Work::Erase { first, .. }) => {
+                    for address in (first..first + SECTOR).step_by(WORD as usize) {
+                        // Neighbours differ, and each cut differs from the one before.
+                        match (address / WORD + self.operations as u32).wrapping_mul(0x9E37_79B9) >> 30 {
+                            0 => {}
+                            1 => self.blank(address, WORD),
+                            _ => self.interrupt(address, &[0xFF; WORD as usize]),
+                        }
+                    }
+                }
+                None => {}
+            }
         }
+    }
+
+    /// What is left of a word that would have become `bytes`.
+    fn interrupt(&mut self, address: u32, bytes: &[u8; WORD as usize]) {
+        match self.leaves {
+            Torn::Fault => _ = self.torn.insert(address),
+            Torn::Blank => {
+                self.blank(address, WORD);
+                self.only_looks_blank.insert(address);
+            }
+            Torn::Half => {
+                let cells = &mut self.cells[address as usize..][..WORD as usize];
+                for (index, (cell, byte)) in cells.iter_mut().zip(bytes).enumerate() {
+                    *cell = byte | if index % 3 == 0 { 0xA5 } else { 0 };
+                }
+            }
+        }
+    }
+
+    fn blank(&mut self, first: u32, len: u32) {
+        self.cells[first as usize..][..len as usize].fill(0xFF);
+        self.torn.retain(|word| !(first..first + len).contains(word));
+        self.only_looks_blank.retain(|word| !(first..first + len).contains(word));
     }
 
     /// Checks the wait states for this bus clock, at VOS1.
@@ -189,6 +255,7 @@ impl Flash {
             return refuse("the flash word was written before; it is to be erased first");
         }
         half.work = Some(Work::Program { address: word, bytes: content, until: now + PROGRAM });
+        self.operations += 1;
         Ok(())
     }
 
@@ -211,6 +278,7 @@ impl Flash {
             (true, SER) => {
                 let first = BANK * index as u32 + SECTOR * (value >> 8 & 7);
                 self.halves[index].work = Some(Work::Erase { first, until: now + ERASE });
+                self.operations += 1;
                 Ok(())
             }
             _ => refuse("START without SER alone is not modelled"),
@@ -235,12 +303,14 @@ impl Flash {
     fn finish(&mut self, work: Work) {
         match work {
             Work::Erase { first, .. } => {
-                self.cells[first as usize..][..SECTOR as usize].fill(0xFF);
-                self.torn.retain(|word| !(first..first + SECTOR).contains(word));
+                self.blank(first, SECTOR);
                 self.changed.push((first, SECTOR));
                 self.erases += 1;
             }
             Work::Program { address, bytes, .. } => {
+                if self.only_looks_blank.remove(&address) {
+                    self.torn.insert(address);
+                }
                 self.load(address, &bytes);
                 self.changed.push((address, WORD));
             }
@@ -359,6 +429,36 @@ mod tests {
         assert_eq!(flash.deadline(&at(0)), Some(ERASE));
         flash.advance(&at(ERASE)).expect("it is done");
         assert_eq!((flash.torn().count(), flash.erases), (0, 1));
+    }
+
+    #[test]
+    fn a_word_that_only_looks_blank_takes_no_write() {
+        let mut flash = unlocked();
+        flash.leaves = Torn::Blank;
+        flash.fails_during = Some(1);
+        flash.write(SECOND_BANK + CR, 0x32, &at(0)).expect("it is unlocked");
+        program(&mut flash, CONFIG, 0).expect("it is erased");
+        assert!(flash.has_failed() && !flash.has_failed());
+        flash.reset();
+        assert_eq!((flash.torn().count(), flash.cells()[CONFIG as usize]), (0, 0xFF));
+        for key in KEYS {
+            flash.write(SECOND_BANK + KEYR, key, &at(0)).expect("the right keys");
+        }
+        flash.write(SECOND_BANK + CR, 0x32, &at(0)).expect("it is unlocked");
+        program(&mut flash, CONFIG, 0).expect("it looks blank");
+        flash.advance(&at(PROGRAM)).expect("it is done");
+        assert_eq!(flash.torn().collect::<Vec<_>>(), [CONFIG]);
+    }
+
+    #[test]
+    fn an_interrupted_erase_leaves_words_of_every_kind() {
+        let mut flash = unlocked();
+        flash.load(CONFIG, &[0x11; SECTOR as usize]);
+        flash.write(SECOND_BANK + CR, 0x31 & !LOCK | SER | START | 6 << 8, &at(0)).expect("it is unlocked");
+        flash.reset();
+        let words = flash.cells()[CONFIG as usize..].chunks(WORD as usize).take(4_096);
+        let blank = words.filter(|word| word.iter().all(|byte| *byte == 0xFF)).count();
+        assert!((500..2_000).contains(&blank) && (1_500..2_500).contains(&flash.torn().count()), "{blank}");
     }
 
     #[test]

@@ -10,5 +10,6 @@ mod flash;
 mod realtime;
 mod robot;
 mod serial;
+mod store;
 
 use bench::Bench;

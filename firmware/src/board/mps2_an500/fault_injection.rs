@@ -1,5 +1,5 @@
-//! Fault injection for tests, chosen by the third semihosting argument (`arg=stall`). It exists only in the image
-//! of this emulated board.
+//! Fault injection for tests, chosen by the third semihosting argument (`arg=stall`; another word, such as `none`, is
+//! no fault). It exists only in the image of this emulated board.
 
 use core::future::pending;
 use core::hint::{black_box, spin_loop};

@@ -6,12 +6,15 @@
 mod console;
 mod executor;
 mod fault_injection;
+mod flash;
 mod log_output;
 mod registers;
 mod storage;
 mod time;
 mod uart;
 mod watchdog;
+
+use core::future::Future;
 
 use cortex_m::interrupt::InterruptNumber;
 use cortex_m::peripheral::NVIC;
@@ -41,11 +44,21 @@ impl platform::Board for Board {
     type Ethernet = Lan9118<LanRegisters>;
     type Watchdog = Watchdog;
     type Led = Led;
+    type Flash = flash::Flash;
     type StorageError = storage::StorageError;
     type EthernetError = StartError;
 
     fn configuration(&mut self) -> Result<&'static [u8], Self::StorageError> {
         storage::read()
+    }
+
+    fn flash(&mut self) -> Option<flash::Flash> {
+        flash::open()
+    }
+
+    /// The file's operations end at once.
+    fn block_on<T>(&mut self, operation: impl Future<Output = T>) -> T {
+        embassy_futures::block_on(operation)
     }
 
     /// Baud rate and format are not emulated.

@@ -59,7 +59,7 @@ pub(super) fn argument<T>(nth: usize, look: impl FnOnce(&str) -> T) -> Option<T>
 }
 
 /// Maximum length of all arguments together, in bytes.
-const MAX_ARGUMENTS: usize = 512;
+pub(super) const MAX_ARGUMENTS: usize = 512;
 
 /// The host's clock in seconds.
 pub(super) fn host_time() -> u64 {

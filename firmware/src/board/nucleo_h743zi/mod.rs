@@ -5,11 +5,14 @@ mod can;
 mod clocks;
 mod crash_record;
 mod ethernet;
+mod flash;
 mod identity;
 mod leds;
 mod serial;
 mod storage;
 mod watchdog;
+
+use core::future::Future;
 
 use cortex_m::peripheral::Peripherals as Core;
 use defmt_rtt as _;
@@ -42,6 +45,7 @@ pub(crate) struct Board {
     link: Option<Led>,
     status: Option<Led>,
     watchdog: Option<Watchdog>,
+    flash: Option<flash::Flash>,
 }
 
 impl platform::Board for Board {
@@ -54,11 +58,20 @@ impl platform::Board for Board {
     type Ethernet = ethernet::Ethernet;
     type Watchdog = Watchdog;
     type Led = Led;
+    type Flash = flash::Flash;
     type StorageError = storage::StorageError;
     type EthernetError = ethernet::EthernetError;
 
     fn configuration(&mut self) -> Result<&'static [u8], Self::StorageError> {
         storage::read()
+    }
+
+    fn flash(&mut self) -> Option<flash::Flash> {
+        self.flash.take()
+    }
+
+    fn block_on<T>(&mut self, operation: impl Future<Output = T>) -> T {
+        flash::block_on(operation, watchdog::feed_during_start)
     }
 
     fn serial(&mut self, line: &Rs485) -> Option<Self::Serial> {
@@ -133,6 +146,8 @@ fn main() -> ! {
         link: Some(leds.link),
         status: Some(leds.status),
         watchdog: Some(watchdog),
+        // SAFETY: made here and nowhere else.
+        flash: Some(unsafe { flash::Flash::new() }),
     };
     static EXECUTOR: StaticCell<Executor> = StaticCell::new();
     EXECUTOR.init(Executor::new()).run(|spawner| {

@@ -1,4 +1,4 @@
-//! The configuration image: in the second flash bank, at `_config_start` (memory.x).
+//! The configuration image that a probe has written: in the second flash bank, at `_config_start` (memory.x).
 //!
 //! A flash word that was programmed twice, or not completely because of a power failure, has no valid error
 //! correction code, and reading it is a bus fault. So each flash word of the image is first read once with bus
@@ -15,7 +15,7 @@ unsafe extern "C" {
 }
 
 /// Size of a flash word, the unit of programming and error correction.
-const FLASH_WORD: usize = 32;
+pub(super) const FLASH_WORD: usize = 32;
 
 const _: () = assert!(HEADER <= FLASH_WORD);
 
@@ -61,23 +61,27 @@ fn check(start: usize, len: usize) -> Result<(), StorageError> {
         .try_for_each(|address| if can_read(address) { Ok(()) } else { Err(StorageError::Torn { address }) })
 }
 
-fn can_read(address: usize) -> bool {
+/// Whether the flash word at this address can be read.
+pub(super) fn can_read(address: usize) -> bool {
     const CCR_IGNORE_BUS_FAULTS: u32 = 1 << 8;
     const CFSR_BUS: u32 = 0xBF << 8;
     // SAFETY: during one load from flash all interrupts and faults are masked, so that a bus fault only sets its
     // flag. The flag is cleared, and everything else restored.
     unsafe {
         let scb = &*SCB::PTR;
-        scb.cfsr.write(CFSR_BUS);
+        let control = scb.ccr.read();
         asm!("cpsid f");
-        scb.ccr.modify(|ccr| ccr | CCR_IGNORE_BUS_FAULTS);
+        scb.ccr.write(control | CCR_IGNORE_BUS_FAULTS);
         cortex_m::asm::dsb();
         cortex_m::asm::isb();
         core::ptr::with_exposed_provenance::<u32>(address).read_volatile();
         cortex_m::asm::dsb();
+        // No flag was set before: where faults are not ignored they end the program.
         let faults = scb.cfsr.read() & CFSR_BUS;
-        scb.cfsr.write(faults);
-        scb.ccr.modify(|ccr| ccr & !CCR_IGNORE_BUS_FAULTS);
+        if faults != 0 {
+            scb.cfsr.write(faults);
+        }
+        scb.ccr.write(control);
         asm!("cpsie f");
         faults == 0
     }

@@ -41,6 +41,12 @@ impl Watchdog {
     }
 }
 
+/// Feeds it where the start waits for the flash, before the task that feeds it runs.
+pub(super) fn feed_during_start() {
+    IWDG1_REGISTERS.kr().write(|w| w.set_key(Key::RESET));
+    FED.store(millis(), Ordering::Relaxed);
+}
+
 impl FeedWatchdog for Watchdog {
     fn feed(&mut self) {
         self.0.pet();

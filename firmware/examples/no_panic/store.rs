@@ -1,0 +1,71 @@
+//! What a board keeps: flash that may hold anything.
+
+use core::hint::black_box;
+
+use recipe_store::{Adoption, Flash, Geometry, Key, Marks, Place, Put, Step, Store, Trial, Word};
+
+use crate::{any, bytes, room};
+
+/// Flash of a size and contents that the compiler knows nothing about.
+struct Any;
+
+impl Flash for Any {
+    fn geometry(&self) -> Geometry {
+        any(Geometry { sectors: 3, words: 4096 })
+    }
+
+    fn read(&self, place: Place) -> Word {
+        black_box(place);
+        any([0; 32])
+    }
+
+    async fn write(&mut self, place: Place, word: &Word) {
+        black_box((place, word));
+    }
+
+    async fn erase(&mut self, sector: u8) {
+        black_box(sector);
+    }
+}
+
+pub(crate) fn all() {
+    if let Some(mut store) = store_mount() {
+        store_questions(black_box(&store));
+        store_changes(black_box(&mut store));
+    }
+}
+
+#[inline(never)]
+fn store_mount() -> Option<Store> {
+    Store::mount(&Any).ok()
+}
+
+#[inline(never)]
+fn store_questions(store: &Store) {
+    let mut out = [0; 64];
+    black_box(store.get(&Any, any(Key::Image(3)), room(&mut out)));
+    black_box(store.image(&Any, any(7), room(&mut out)));
+    black_box((store.revisions(), store.revision(any(7)), store.marks(), store.at_start()));
+    black_box((store.access_key(&Any), store.counter(any(1)), store.birth_sequence()));
+    black_box(store.is_adopted(any(1), any(2)));
+}
+
+#[inline(never)]
+fn store_changes(store: &mut Store) {
+    let trial = any(Some(Trial { number: 3, attempts: 1, confirm_s: 1 }));
+    let marks = any(Marks { live: Some(1), previous: None, trial });
+    let _ = store.mark(marks).map(store_put);
+    let _ = store.keep(any(1), any(2), bytes(), any(None)).map(store_put);
+    let _ = store.put(any(Key::Counter(1)), any(2), bytes()).map(store_put);
+    let _ = store.set_access_key(any(&[0; 16])).map(store_put);
+    let _ = store.set_counter(any(1), any(2)).map(store_put);
+    let _ = store.set_birth_sequence(any(1)).map(store_put);
+    if let Ok(Adoption::Write(put)) = store.adopt(any(1), bytes()) {
+        store_put(put);
+    }
+}
+
+#[inline(never)]
+fn store_put(mut put: Put<'_, '_>) {
+    while !matches!(black_box(put.next(&Any)), Step::End(_)) {}
+}

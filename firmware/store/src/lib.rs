@@ -1,0 +1,116 @@
+#![no_std]
+#![forbid(unsafe_code)]
+#![cfg_attr(
+    not(test),
+    deny(
+        clippy::indexing_slicing,
+        clippy::unwrap_used,
+        clippy::expect_used,
+        clippy::panic,
+        clippy::arithmetic_side_effects
+    )
+)]
+//! What a board keeps over restarts and power cuts: configurations, a key, counters (docs/store.md).
+//!
+//! In: the words of some sectors of flash, and what is to be kept. Out: which words are to be written and which
+//! sectors erased, and what is kept. Knows neither a chip nor what a configuration contains.
+//!
+//! Made for flash whose words have an error correction code and are written once after an erase. A power cut
+//! leaves the word that was being written in one of three states: it cannot be read, or it reads as something
+//! between old and new, or it looks blank and takes no write. The store keeps what it had before, or has what
+//! was written, whole, in each of them.
+//!
+//! [`Store::mount`] looks at the flash. What changes it is a [`Put`], a state machine: [`Put::next`] says what
+//! to do with the flash, until it ends. So the same code waits for the flash or lets other tasks run meanwhile:
+//! [`Put::carry_out`] is the loop for a [`Flash`] with futures.
+//!
+//! ```
+//! # use recipe_store::{Flash, Geometry, Place, Word};
+//! # struct Ram(Vec<Word>);
+//! # const GEOMETRY: Geometry = Geometry { sectors: 3, words: 1024 };
+//! # impl Ram { fn at(place: Place) -> usize { usize::from(place.sector) * 1024 + usize::from(place.word) } }
+//! # impl Flash for Ram {
+//! #     fn geometry(&self) -> Geometry { GEOMETRY }
+//! #     fn read(&self, place: Place) -> Word { self.0[Self::at(place)] }
+//! #     async fn write(&mut self, place: Place, word: &Word) { self.0[Self::at(place)] = *word; }
+//! #     async fn erase(&mut self, sector: u8) {
+//! #         self.0[usize::from(sector) * 1024..][..1024].fill([0xFF; 32]);
+//! #     }
+//! # }
+//! # let mut flash = Ram(vec![[0; 32]; 3 * 1024]);
+//! use recipe_store::{Marks, Store};
+//!
+//! # embassy_futures::block_on(async {
+//! let mut store = Store::mount(&flash)?;
+//! let image = b"a configuration";
+//! store.keep(1, 0xC0FFEE, image, None)?.carry_out(&mut flash).await?;
+//! store.mark(Marks { live: Some(1), previous: None, trial: None })?.carry_out(&mut flash).await?;
+//!
+//! // After a restart.
+//! let store = Store::mount(&flash)?;
+//! let [(live, _)] = store.at_start().candidates[..] else { panic!("one is live") };
+//! let mut room = [0; 64];
+//! assert_eq!(store.image(&flash, live.number, &mut room), Some(&image[..]));
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! # }).unwrap();
+//! ```
+
+#[cfg(test)]
+extern crate std;
+
+mod mount;
+mod put;
+mod record;
+mod revisions;
+mod values;
+
+use core::future::Future;
+
+pub use mount::{Found, MountError, Store};
+pub use put::{Put, PutError, Step};
+pub use record::{COUNTERS, Key, MAX_DATA};
+pub use revisions::{Adoption, KeepError, MAX_REVISIONS, Marks, Revision, Role, Start, Trial};
+
+/// Number of bytes of a [`Word`].
+pub const WORD: usize = 32;
+/// The unit of writing and of error correction.
+pub type Word = [u8; WORD];
+/// A word after an erase.
+pub const BLANK: Word = [0xFF; WORD];
+
+/// A word of the flash.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Place {
+    /// Number of the sector, from 0. The sectors need not be neighbours.
+    pub sector: u8,
+    /// Number of the word in it, from 0.
+    pub word: u16,
+}
+
+/// How large the flash is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Geometry {
+    /// Number of sectors: at least 2, at most 8. One of them is always free for the next turn.
+    pub sectors: u8,
+    /// Number of words in each: at least 8.
+    pub words: u16,
+}
+
+/// Flash for a [`Store`], and for nothing else.
+///
+/// Writing and erasing may take seconds, so they are futures; whoever has no other task blocks on them. They
+/// report no errors: whatever goes wrong shows when the words are read back.
+pub trait Flash {
+    /// Its size; always the same.
+    fn geometry(&self) -> Geometry;
+
+    /// The bytes of a word; zeros if it cannot be read, because it was torn by a power cut. It never fails: an
+    /// error at one word would make all others unreachable.
+    fn read(&self, place: Place) -> Word;
+
+    /// Writes a word that was not written since its sector was erased.
+    fn write(&mut self, place: Place, word: &Word) -> impl Future<Output = ()>;
+
+    /// Erases a sector.
+    fn erase(&mut self, sector: u8) -> impl Future<Output = ()>;
+}

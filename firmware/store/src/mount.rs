@@ -1,0 +1,197 @@
+//! What the flash holds.
+
+use core::fmt;
+
+use crate::record::{Head, KEYS, Key, SectorHead, digest};
+use crate::{BLANK, Flash, Geometry, Place, WORD, Word};
+
+/// The newest record of each key, and where the next one goes.
+#[derive(Debug, Clone)]
+pub struct Store {
+    pub(crate) geometry: Geometry,
+    /// The sector that is being filled, and its sequence number.
+    pub(crate) head: Option<(u8, u32)>,
+    /// The next word to be written there.
+    pub(crate) end: u16,
+    /// Of the next record.
+    pub(crate) sequence: u32,
+    index: [Option<Found>; KEYS],
+}
+
+/// A record.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Found {
+    /// Its first word of data, at which `len` bytes begin. Valid until the next change of the store.
+    pub data: Place,
+    /// Length of the data in bytes.
+    pub len: usize,
+    /// Its value beside the data.
+    pub tag: u64,
+    pub(crate) sequence: u32,
+}
+
+/// Why there is no store.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum MountError {
+    /// It was written by a newer program. Nothing is changed.
+    Version {
+        /// Its version.
+        found: u32,
+    },
+    /// The flash has fewer than two sectors of eight words, or more than eight sectors.
+    Geometry(Geometry),
+}
+
+impl fmt::Display for MountError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Version { found } => {
+                write!(f, "the store has version {found}; this program reads {}", crate::record::VERSION)
+            }
+            Self::Geometry(Geometry { sectors, words }) => {
+                write!(f, "{sectors} sectors of {words} words are no store")
+            }
+        }
+    }
+}
+
+impl core::error::Error for MountError {}
+
+impl Store {
+    /// Reads the whole flash. One without a store is an empty one. Nothing is written: what a power cut left
+    /// behind is avoided by the next write.
+    ///
+    /// # Errors
+    /// Why there can be no store.
+    pub fn mount(flash: &impl Flash) -> Result<Self, MountError> {
+        let geometry = flash.geometry();
+        if !(2..=8).contains(&geometry.sectors) || geometry.words < 8 {
+            return Err(MountError::Geometry(geometry));
+        }
+        let mut store = Self { geometry, head: None, end: 0, sequence: 1, index: [None; KEYS] };
+        // In the order in which they were begun: of two copies of a record, the later one counts, because the
+        // sector of the earlier one is the next to be erased.
+        while let Some((sector, sequence)) = store.begun_next(flash)? {
+            let end = store.walk(flash, sector);
+            store.head = Some((sector, sequence));
+            // The word behind may only look blank.
+            store.end = end.saturating_add(1);
+        }
+        Ok(store)
+    }
+
+    /// The sector that was begun next after `head`. (Sorting would be 6 KiB of code.)
+    fn begun_next(&self, flash: &impl Flash) -> Result<Option<(u8, u32)>, MountError> {
+        let mut next: Option<(u8, u32)> = None;
+        for sector in 0..self.geometry.sectors {
+            match SectorHead::parse(&flash.read(Place { sector, word: 0 })) {
+                Some(SectorHead::Known { sequence }) => {
+                    let is_later = self.head.is_none_or(|(_, head)| sequence > head);
+                    if is_later && next.is_none_or(|(_, next)| sequence < next) {
+                        next = Some((sector, sequence));
+                    }
+                }
+                Some(SectorHead::Other { version }) => return Err(MountError::Version { found: version }),
+                None => {}
+            }
+        }
+        Ok(next)
+    }
+
+    /// Takes the records of a sector into the index; returns the first word behind everything that was written.
+    fn walk(&mut self, flash: &impl Flash, sector: u8) -> u16 {
+        let (mut word, mut end) = (1, 1);
+        while word < self.geometry.words {
+            let place = Place { sector, word };
+            let bytes = flash.read(place);
+            let head = Head::parse(&bytes).filter(|head| self.has_room(word, head.extent()));
+            if let Some(head) = head {
+                if is_whole(flash, place, &head) {
+                    self.sequence = self.sequence.max(head.sequence.saturating_add(1));
+                    let before = self.index.get(usize::from(head.key)).copied().flatten();
+                    if before.is_none_or(|before| head.sequence >= before.sequence) {
+                        self.enter(place, &head);
+                    }
+                }
+                // Its room is taken, also if it is not whole: what is inside is data and no record.
+                word = word.saturating_add(head.extent());
+                end = word;
+            } else {
+                word = word.saturating_add(1);
+                if bytes != BLANK {
+                    end = word;
+                }
+            }
+        }
+        end
+    }
+
+    /// Whether so many words from `word` on are in a sector.
+    pub(crate) fn has_room(&self, word: u16, extent: u16) -> bool {
+        word.checked_add(extent).is_some_and(|end| end <= self.geometry.words)
+    }
+
+    /// Makes the record at this place the newest of its key.
+    pub(crate) fn enter(&mut self, Place { sector, word }: Place, head: &Head) {
+        if let Some(entry) = self.index.get_mut(usize::from(head.key)) {
+            *entry = Some(Found {
+                data: Place { sector, word: word.saturating_add(1) },
+                len: head.len as usize,
+                tag: head.tag,
+                sequence: head.sequence,
+            });
+        }
+    }
+
+    /// The newest record of the key with this code.
+    pub(crate) fn entry(&self, code: u8) -> Option<Found> {
+        self.index.get(usize::from(code)).copied().flatten()
+    }
+
+    /// The same record, copied to begin at this place.
+    pub(crate) fn moved(&mut self, code: u8, Place { sector, word }: Place) {
+        if let Some(Some(found)) = self.index.get_mut(usize::from(code)) {
+            found.data = Place { sector, word: word.saturating_add(1) };
+        }
+    }
+
+    /// The newest record of a key.
+    pub fn find(&self, key: Key) -> Option<Found> {
+        self.entry(key.code()?)
+    }
+
+    /// Its data, in the beginning of `out`; `None` if there is none, or if `out` is too short.
+    pub fn get<'o>(&self, flash: &impl Flash, key: Key, out: &'o mut [u8]) -> Option<&'o [u8]> {
+        let found = self.find(key)?;
+        let out = out.get_mut(..found.len)?;
+        let mut place = found.data;
+        for part in out.chunks_mut(WORD) {
+            for (byte, read) in part.iter_mut().zip(flash.read(place)) {
+                *byte = read;
+            }
+            place.word = place.word.saturating_add(1);
+        }
+        Some(out)
+    }
+
+    /// Number of words that all records take, and the most that they may take when one of `extent` words is added.
+    ///
+    /// One sector is free, and the new record fits behind what is needed in at least one of the others.
+    pub(crate) fn used(&self, extent: u16) -> (u32, u32) {
+        let used = self.index.iter().flatten().map(|found| u32::from(crate::record::extent(found.len))).sum();
+        let sector = self.geometry.words.saturating_sub(1).saturating_sub(extent);
+        (used, u32::from(sector).saturating_mul(u32::from(self.geometry.sectors).saturating_sub(1)))
+    }
+}
+
+/// Whether data and end belong to the head.
+pub(crate) fn is_whole(flash: &impl Flash, Place { sector, word }: Place, head: &Head) -> bool {
+    let mut digest = digest();
+    let end = word.saturating_add(head.extent()).saturating_sub(1);
+    for word in word.saturating_add(1)..end {
+        digest.update(&flash.read(Place { sector, word }));
+    }
+    let at_end: Word = flash.read(Place { sector, word: end });
+    at_end == head.word() && digest.finalize() == head.sum
+}

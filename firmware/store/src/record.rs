@@ -1,0 +1,190 @@
+//! The words of the store: the heads of sectors and of records.
+//!
+//! A record is a head word, its data in whole words (the last one filled up with zeros), and the head word
+//! again as its end. The end is written last: it says that the power was still there after the data.
+
+use crc::{CRC_32_ISO_HDLC, Crc, Digest, NoTable};
+
+use crate::{WORD, Word};
+
+/// Maximum length of a record's data in bytes: that of a configuration image.
+pub const MAX_DATA: usize = 16 * 1024;
+/// Number of counters.
+pub const COUNTERS: u8 = 4;
+/// Number of keys.
+pub(crate) const KEYS: usize = 16;
+/// Version of the layout.
+pub(crate) const VERSION: u32 = 1;
+
+const SECTOR_MAGIC: [u8; 4] = *b"RGSs";
+const RECORD_MAGIC: [u8; 4] = *b"RGSr";
+
+/// What a record is. The newest record of a key replaces the ones before.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Key {
+    /// A configuration image, in one of eight places.
+    Image(u8),
+    /// Which images are live, before it, and on trial.
+    Marks,
+    /// The key of the API.
+    Access,
+    /// Sparkplug's bdSeq.
+    BirthSequence,
+    /// Which image was taken over from outside the store.
+    Adopted,
+    /// A counter, below [`COUNTERS`].
+    Counter(u8),
+}
+
+impl Key {
+    /// Below [`KEYS`]; `None` if the number of the image or counter is too high.
+    pub(crate) const fn code(self) -> Option<u8> {
+        match self {
+            Self::Image(slot @ 0..8) => Some(slot),
+            Self::Marks => Some(8),
+            Self::Access => Some(9),
+            Self::BirthSequence => Some(10),
+            Self::Adopted => Some(11),
+            Self::Counter(number @ 0..COUNTERS) => Some(12 | number),
+            Self::Image(_) | Self::Counter(_) => None,
+        }
+    }
+}
+
+/// The head of a record.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Head {
+    /// Its key's code.
+    pub(crate) key: u8,
+    /// Higher than that of all records written before; a copy keeps it.
+    pub(crate) sequence: u32,
+    /// Length of the data in bytes.
+    pub(crate) len: u32,
+    /// A value of the key's own. A record with nothing else has no data.
+    pub(crate) tag: u64,
+    /// CRC-32 of the data, filled up to whole words.
+    pub(crate) sum: u32,
+}
+
+impl Head {
+    /// The head in a word; `None` if it is not one.
+    pub(crate) fn parse(word: &Word) -> Option<Self> {
+        let (words, _) = word.as_chunks::<4>();
+        let &[magic, sequence, key, len, low, high, sum, check] = words else { return None };
+        let [key, 0, 0, 0] = key else { return None };
+        let len = u32::from_le_bytes(len);
+        let is_head = magic == RECORD_MAGIC
+            && u32::from_le_bytes(check) == check_of(word)
+            && usize::from(key) < KEYS
+            && len as usize <= MAX_DATA;
+        let tag = u64::from(u32::from_le_bytes(high)) << 32 | u64::from(u32::from_le_bytes(low));
+        is_head.then_some(Self {
+            key,
+            sequence: u32::from_le_bytes(sequence),
+            len,
+            tag,
+            sum: u32::from_le_bytes(sum),
+        })
+    }
+
+    pub(crate) fn word(&self) -> Word {
+        let [a, b, c, d, e, f, g, h] = self.tag.to_le_bytes();
+        finished([
+            RECORD_MAGIC,
+            self.sequence.to_le_bytes(),
+            [self.key, 0, 0, 0],
+            self.len.to_le_bytes(),
+            [a, b, c, d],
+            [e, f, g, h],
+            self.sum.to_le_bytes(),
+        ])
+    }
+
+    /// Number of words of the record.
+    pub(crate) fn extent(&self) -> u16 {
+        extent(self.len as usize)
+    }
+}
+
+/// Number of words of a record with so many bytes of data.
+pub(crate) fn extent(len: usize) -> u16 {
+    u16::try_from(len.div_ceil(WORD)).map_or(u16::MAX, |data| data.saturating_add(2))
+}
+
+/// The head of a sector.
+pub(crate) enum SectorHead {
+    /// Of this layout.
+    Known {
+        /// Higher than that of all sectors that were begun before.
+        sequence: u32,
+    },
+    /// Of another layout.
+    Other {
+        /// Its version.
+        version: u32,
+    },
+}
+
+impl SectorHead {
+    pub(crate) fn parse(word: &Word) -> Option<Self> {
+        let (words, _) = word.as_chunks::<4>();
+        let &[magic, version, sequence, .., check] = words else { return None };
+        if magic != SECTOR_MAGIC || u32::from_le_bytes(check) != check_of(word) {
+            return None;
+        }
+        let sequence = u32::from_le_bytes(sequence);
+        Some(match u32::from_le_bytes(version) {
+            VERSION => Self::Known { sequence },
+            version => Self::Other { version },
+        })
+    }
+
+    pub(crate) fn word(sequence: u32) -> Word {
+        let none = [0; 4];
+        finished([SECTOR_MAGIC, VERSION.to_le_bytes(), sequence.to_le_bytes(), none, none, none, none])
+    }
+}
+
+/// A word of these, with its check.
+fn finished(parts: [[u8; 4]; 7]) -> Word {
+    let mut word = [0; WORD];
+    for (place, byte) in word.iter_mut().zip(parts.as_flattened()) {
+        *place = *byte;
+    }
+    let check = check_of(&word).to_le_bytes();
+    for (place, byte) in word.iter_mut().rev().zip(check.iter().rev()) {
+        *place = *byte;
+    }
+    word
+}
+
+/// CRC of all bytes of a head but the last four.
+fn check_of(word: &Word) -> u32 {
+    CRC.checksum(word.split_last_chunk::<4>().map_or(&[][..], |(before, _)| before))
+}
+
+pub(crate) fn digest() -> Digest<'static, u32, NoTable> {
+    CRC.digest()
+}
+
+/// Part `nth` of the data as a word, filled up with zeros.
+pub(crate) fn part(data: &[u8], nth: u16) -> Word {
+    let mut word = [0; WORD];
+    let rest = data.get(usize::from(nth).saturating_mul(WORD)..).unwrap_or(&[]);
+    for (place, byte) in word.iter_mut().zip(rest) {
+        *place = *byte;
+    }
+    word
+}
+
+/// CRC of the data as it is stored.
+pub(crate) fn sum(data: &[u8]) -> u32 {
+    let mut digest = digest();
+    for nth in 0..extent(data.len()).saturating_sub(2) {
+        digest.update(&part(data, nth));
+    }
+    digest.finalize()
+}
+
+/// Without a table, which would be another KiB of flash for some milliseconds of the start.
+static CRC: Crc<u32, NoTable> = Crc::<u32, NoTable>::new(&CRC_32_ISO_HDLC);

@@ -1,0 +1,46 @@
+//! The small values: the key of the API, Sparkplug's bdSeq, counters.
+
+use crate::{Flash, Key, Put, PutError, Store};
+
+impl Store {
+    /// The key of the API; `None` if the board was not claimed.
+    pub fn access_key(&self, flash: &impl Flash) -> Option<[u8; 16]> {
+        let mut key = [0; 16];
+        let len = self.get(flash, Key::Access, &mut key)?.len();
+        (len == key.len()).then_some(key)
+    }
+
+    /// Keeps the key of the API.
+    ///
+    /// # Errors
+    /// It cannot be kept.
+    pub fn set_access_key<'d>(&mut self, key: &'d [u8; 16]) -> Result<Put<'_, 'd>, PutError> {
+        self.put(Key::Access, 0, key)
+    }
+
+    /// A counter; 0 if it was never set.
+    pub fn counter(&self, number: u8) -> u64 {
+        self.find(Key::Counter(number)).map_or(0, |found| found.tag)
+    }
+
+    /// Keeps the value of a counter.
+    ///
+    /// # Errors
+    /// It cannot be kept, or there is no such counter.
+    pub fn set_counter(&mut self, number: u8, value: u64) -> Result<Put<'_, 'static>, PutError> {
+        self.put(Key::Counter(number), value, &[])
+    }
+
+    /// The bdSeq of the last session; `None` if there was none.
+    pub fn birth_sequence(&self) -> Option<u8> {
+        self.find(Key::BirthSequence).map(|found| found.tag.to_le_bytes()).map(|[low, ..]| low)
+    }
+
+    /// Keeps the bdSeq of the session that begins.
+    ///
+    /// # Errors
+    /// It cannot be kept.
+    pub fn set_birth_sequence(&mut self, value: u8) -> Result<Put<'_, 'static>, PutError> {
+        self.put(Key::BirthSequence, value.into(), &[])
+    }
+}

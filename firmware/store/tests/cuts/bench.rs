@@ -1,0 +1,268 @@
+//! A store on the model, what it has to hold, and changes of it.
+
+use std::collections::BTreeMap;
+use std::fmt;
+
+use embassy_futures::block_on;
+use recipe_store::{Geometry, Marks, Store, Trial};
+
+use crate::model::{Nor, Torn};
+
+/// A change of the store.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Operation {
+    Keep { number: u32, image: Vec<u8> },
+    Mark(Marks),
+    Counter(u8, u64),
+    BirthSequence(u8),
+    Key([u8; 16]),
+}
+
+/// Everything a store holds.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub(crate) struct Contents {
+    images: BTreeMap<u32, (u32, Vec<u8>)>,
+    marks: Marks,
+    counters: [u64; 4],
+    birth: Option<u8>,
+    key: Option<[u8; 16]>,
+}
+
+#[derive(Debug, Default, Clone)]
+pub(crate) struct Totals {
+    pub(crate) cuts: u32,
+    pub(crate) second_cuts: u32,
+    pub(crate) erase_cuts: u32,
+    pub(crate) refused: u32,
+    pub(crate) new: u32,
+}
+
+impl fmt::Display for Totals {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { cuts, second_cuts, erase_cuts, refused, new } = self;
+        write!(
+            f,
+            "{cuts} cuts ({erase_cuts} of changes with an erase), then {new} times the new one; {second_cuts} second \
+             cuts; {refused} writes to words that only looked blank"
+        )
+    }
+}
+
+#[derive(Debug, Clone)]
+pub(crate) struct Bench {
+    pub(crate) flash: Nor,
+    pub(crate) store: Store,
+    pub(crate) expected: Contents,
+}
+
+/// Contents of an image that tell every byte's place and the image's number.
+pub(crate) fn image(number: u32, len: usize) -> Vec<u8> {
+    (0..len as u32)
+        .map(|at| (number.wrapping_mul(2_654_435_761).wrapping_add(at.wrapping_mul(40_503)) >> 13) as u8)
+        .collect()
+}
+
+/// The changes in the life of a board: images of these lengths are kept, tried, confirmed or taken back.
+pub(crate) fn life(changes: usize, lens: &[usize]) -> Vec<Operation> {
+    let (mut all, mut live, mut previous) = (vec![Operation::Key([7; 16])], None, None);
+    let mut lens = lens.iter().cycle();
+    for number in 1.. {
+        let len = *lens.next().expect("it is a cycle");
+        all.push(Operation::Keep { number, image: image(number, len) });
+        let trial =
+            |attempts| Marks { live, previous, trial: Some(Trial { number, attempts, confirm_s: 60 }) };
+        all.extend([Operation::Mark(trial(2)), Operation::Mark(trial(1))]);
+        if number % 3 == 0 {
+            // Taken back.
+            all.push(Operation::Mark(Marks { live, previous, trial: None }));
+        } else {
+            (live, previous) = (Some(number), live);
+            all.push(Operation::Mark(Marks { live, previous, trial: None }));
+        }
+        all.extend([
+            Operation::BirthSequence(number as u8),
+            Operation::Counter(number as u8 % 4, number.into()),
+        ]);
+        if all.len() >= changes {
+            all.truncate(changes);
+            return all;
+        }
+    }
+    unreachable!()
+}
+
+impl Contents {
+    /// What the store says that it holds.
+    pub(crate) fn read(store: &Store, flash: &Nor) -> Self {
+        let mut room = vec![0; recipe_store::MAX_DATA];
+        let images = store.revisions().into_iter().map(|kept| {
+            let image = store.image(flash, kept.number, &mut room).expect("it is kept").to_vec();
+            (kept.number, (kept.digest, image))
+        });
+        Self {
+            images: images.collect(),
+            marks: store.marks(),
+            counters: std::array::from_fn(|number| store.counter(number as u8)),
+            birth: store.birth_sequence(),
+            key: store.access_key(flash),
+        }
+    }
+
+    /// After a change, with what the store has forgotten for it.
+    pub(crate) fn after(&self, change: &Operation) -> Self {
+        let mut new = self.clone();
+        match change {
+            Operation::Keep { number, image } => {
+                if new.images.len() == 8 && !new.images.contains_key(number) {
+                    let Marks { live, previous, trial } = new.marks;
+                    let needed = [live, previous, trial.map(|trial| trial.number)];
+                    let oldest = new.images.keys().copied().find(|number| !needed.contains(&Some(*number)));
+                    new.images.remove(&oldest.expect("three are needed"));
+                }
+                new.images.insert(*number, (!number, image.clone()));
+            }
+            Operation::Mark(marks) => new.marks = *marks,
+            Operation::Counter(number, value) => new.counters[usize::from(*number)] = *value,
+            Operation::BirthSequence(value) => new.birth = Some(*value),
+            Operation::Key(key) => new.key = Some(*key),
+        }
+        new
+    }
+}
+
+impl Bench {
+    pub(crate) fn new(geometry: Geometry, torn: Torn) -> Self {
+        let flash = Nor::new(geometry, torn);
+        let store = Store::mount(&flash).expect("an empty one");
+        Self { flash, store, expected: Contents::default() }
+    }
+
+    #[track_caller]
+    pub(crate) fn restart(&mut self) {
+        self.flash.power();
+        self.store = Store::mount(&self.flash).expect("it always starts");
+    }
+
+    /// Whether it succeeded.
+    pub(crate) fn attempt(&mut self, change: &Operation) -> bool {
+        let (store, flash) = (&mut self.store, &mut self.flash);
+        let done = match change {
+            Operation::Keep { number, image } => {
+                block_on(store.keep(*number, !number, image, None).expect("it is allowed").carry_out(flash))
+            }
+            Operation::Mark(marks) => block_on(store.mark(*marks).expect("all are kept").carry_out(flash)),
+            Operation::Counter(number, value) => {
+                block_on(store.set_counter(*number, *value).expect("there is room").carry_out(flash))
+            }
+            Operation::BirthSequence(value) => {
+                block_on(store.set_birth_sequence(*value).expect("there is room").carry_out(flash))
+            }
+            Operation::Key(key) => {
+                block_on(store.set_access_key(key).expect("there is room").carry_out(flash))
+            }
+        };
+        done.is_ok()
+    }
+
+    #[track_caller]
+    pub(crate) fn check(&self) {
+        assert_eq!(Contents::read(&self.store, &self.flash), self.expected);
+    }
+
+    /// With power: it has to succeed, now and after a restart.
+    #[track_caller]
+    pub(crate) fn carry_out(&mut self, change: &Operation) {
+        assert!(self.attempt(change), "{change:?}");
+        self.expected = self.expected.after(change);
+        self.check();
+        let again = Store::mount(&self.flash).expect("it always starts");
+        assert_eq!(Contents::read(&again, &self.flash), self.expected);
+    }
+
+    /// After a cut: the old or the new, whole, and the images that are marked are kept. Whether it is the new.
+    #[track_caller]
+    pub(crate) fn start_after_cut(&mut self, change: &Operation) -> bool {
+        self.restart();
+        let new = self.expected.after(change);
+        let found = Contents::read(&self.store, &self.flash);
+        let is_new = found == new;
+        if is_new {
+            self.expected = new;
+        }
+        assert_eq!(found, self.expected, "neither old nor new");
+        let candidates = self.store.at_start().candidates;
+        assert_eq!(candidates.is_empty(), self.expected.marks == Marks::default());
+        is_new
+    }
+
+    /// Cuts the power in each operation of a change, and in one of the next change after the restart. `restarts`:
+    /// nothing was written since the last start.
+    #[track_caller]
+    pub(crate) fn cut_everywhere(
+        &self,
+        change: &Operation,
+        next: Option<&Operation>,
+        seed: u64,
+        restarts: bool,
+        totals: &mut Totals,
+    ) {
+        let mut whole = self.clone();
+        assert!(whole.attempt(change));
+        let has_erase = whole.flash.erases > self.flash.erases;
+        let steps = whole.flash.operations() - self.flash.operations();
+        for cut in 0..steps {
+            let mut dead = self.clone();
+            dead.flash.cut_after(cut, seed << 32 | u64::from(cut) << 8 | 0x55);
+            dead.attempt(change);
+            assert!(dead.flash.is_off());
+            totals.cuts += 1;
+            totals.erase_cuts += u32::from(has_erase);
+            totals.new += u32::from(dead.start_after_cut(change));
+            // Once more, in the same change or in the next one, early or late.
+            for (second, turn) in [(0, 0), (1, 1), (cut * 7 % (steps + 3), 0), (cut * 5 % (steps + 3), 1)] {
+                let mut twice = dead.clone();
+                let change = next.filter(|_| turn == 1).unwrap_or(change);
+                if !twice.is_possible(change) {
+                    continue;
+                }
+                twice.flash.cut_after(second, u64::from(cut) << 16 | u64::from(second) << 3 | 5);
+                let is_done = twice.attempt(change);
+                if twice.flash.is_off() {
+                    totals.second_cuts += 1;
+                    twice.start_after_cut(change);
+                } else {
+                    // It was over before.
+                    assert!(is_done);
+                    twice.flash.power();
+                    twice.expected = twice.expected.after(change);
+                }
+                if twice.is_possible(change) {
+                    twice.carry_out(change);
+                }
+                totals.refused += twice.flash.refused;
+            }
+            if dead.is_possible(change) {
+                dead.carry_out(change);
+                // The word at which the one cut was is left out, unless the start before left it out too.
+                assert!(restarts || dead.flash.refused == 0, "{change:?}, cut {cut}");
+            }
+            totals.refused += dead.flash.refused;
+        }
+    }
+
+    /// Whether the store may accept it: what is kept already under this number, and in use, is not replaced, and
+    /// only what is kept is marked.
+    pub(crate) fn is_possible(&self, change: &Operation) -> bool {
+        let Marks { live, previous, trial } = self.expected.marks;
+        match change {
+            Operation::Keep { number, .. } => {
+                ![live, previous, trial.map(|trial| trial.number)].contains(&Some(*number))
+            }
+            Operation::Mark(marks) => [marks.live, marks.previous, marks.trial.map(|trial| trial.number)]
+                .into_iter()
+                .flatten()
+                .all(|number| self.expected.images.contains_key(&number)),
+            _ => true,
+        }
+    }
+}
