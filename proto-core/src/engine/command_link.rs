@@ -8,6 +8,7 @@
 use heapless::{Deque, Vec};
 
 use super::command_tables::{CommandField, Entry, MAX_COMMAND_FIELDS, Picked, Tables, is_asked};
+use super::failed::Failed;
 use super::io::{LinkId, PortId, ReplyCode, Transport};
 use super::not_given::{LastNotGiven, NotGiven};
 use super::outcome::Outcomes;
@@ -55,6 +56,8 @@ pub(super) struct CommandLink {
     picked: [Option<(u16, i64)>; MAX_PORTS],
     /// The newest value of each port that gave no command.
     not_given: [Option<LastNotGiven>; MAX_PORTS],
+    /// The newest command of each port that the controller replied to with a failure.
+    failed: [Option<Failed>; MAX_PORTS],
     /// Results of commands since the engine asked last.
     pub outcomes: Outcomes,
 }
@@ -79,6 +82,7 @@ impl CommandLink {
             way_made_until: Instant::ZERO,
             picked: [None; MAX_PORTS],
             not_given: [None; MAX_PORTS],
+            failed: [None; MAX_PORTS],
             outcomes: Outcomes::new(),
         })
     }
@@ -92,6 +96,31 @@ impl CommandLink {
     /// The newest value of a port that gave no command.
     pub(super) fn not_given_of(&self, port: PortId) -> Option<&LastNotGiven> {
         self.not_given.get(usize::from(port.0))?.as_ref()
+    }
+
+    /// The newest command of a port that failed, and its text.
+    pub(super) fn failed_of(&self, port: PortId) -> Option<(Failed, CommandText<'_>)> {
+        let failed = (*self.failed.get(usize::from(port.0))?)?;
+        let (_, text) = self.tables.entry(failed.entry)?;
+        Some((failed, CommandText { text, value: failed.value }))
+    }
+
+    /// The controller replied that a command has failed.
+    #[cold]
+    #[inline(never)]
+    fn note_failed(&mut self, command: Waiting, now: Instant) {
+        if let Some(failed) = self.failed.get_mut(usize::from(command.port.0)) {
+            *failed = Some(Failed::new(command.entry, command.value, now));
+        }
+    }
+
+    /// What the newest state packet says, and when it came, after a command of this port has failed.
+    #[cold]
+    #[inline(never)]
+    pub(super) fn note_states(&mut self, port: PortId, newest: Option<([u8; 4], Instant)>) {
+        if let Some(Some(failed)) = self.failed.get_mut(usize::from(port.0)) {
+            failed.note_states(newest);
+        }
     }
 
     pub(super) fn transport(&self) -> Transport {
@@ -576,7 +605,12 @@ impl CommandLink {
             match session.step(&mut rest, now) {
                 None => return,
                 Some(Event::Other) => {}
-                Some(Event::Answered(sent, code)) => self.outcomes.push(sent.command, code),
+                Some(Event::Answered(sent, code)) => {
+                    if code == ReplyCode::Fail {
+                        self.note_failed(sent.command, now);
+                    }
+                    self.outcomes.push(sent.command, code);
+                }
                 Some(Event::TimedOut) => {
                     // A late reply would be taken for that of the next command.
                     session.supervisor.give_up(now);

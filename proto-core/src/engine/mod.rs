@@ -25,6 +25,7 @@ mod counters;
 mod counts;
 mod device_port;
 mod exchanges;
+mod failed;
 mod field_output;
 mod field_port;
 mod flight;
@@ -61,6 +62,7 @@ mod whole_port;
 pub use build_error::BuildError;
 pub use clock::ASLEEP;
 pub use counters::{LinkCounters, PortCounters};
+pub use failed::FailedCommand;
 pub use io::{BusState, Endpoint, Input, LinkId, LinkKind, Output, PortId, PortState, ReplyCode, Transport};
 pub use latency::Latency;
 pub use line::PeerCounters;
@@ -476,11 +478,22 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 
     fn carry_outcomes(&mut self) {
         let Some(command) = self.links.command.first_mut() else { return };
+        let mut failed = None;
         command.outcomes.take(|outcome| {
             if let Some(port) = find_port(&mut self.ports, outcome.port) {
                 port.command_ended(outcome);
             }
+            if outcome.code == ReplyCode::Fail {
+                failed = Some(outcome.port);
+            }
         });
+        // A reply ends one command, so one port at most has a new failure.
+        if let Some(port) = failed {
+            let newest = self.links.state.first().and_then(|state| {
+                self.store.image.stamp_of(state.group).map(|at| (state.codes, at))
+            });
+            command.note_states(port, newest);
+        }
     }
 
     /// After a field frame: checks bits that trigger, and frames that wait for their neighbours.
