@@ -4,9 +4,13 @@
 //! outputs are carried out before anything else is read. So only one call of the engine is between the last
 //! byte of a field frame and the request to the controller.
 
+mod doctor;
+mod shown;
+
 use std::cell::{Cell, RefCell};
 use std::collections::{BTreeMap, BTreeSet};
 use std::rc::Rc;
+use std::sync::mpsc::SyncSender;
 
 use proto_core::config::{Bus, GatewayConfig, Parts, Port as PortConfig};
 use proto_core::engine::{Engine, Input, LinkId, LinkKind, OUTPUT_BUFFER, Output, PortId, Transport};
@@ -18,16 +22,20 @@ use tokio::sync::Notify;
 use tokio::task::JoinSet;
 use tracing::{info, trace, warn};
 
+pub use doctor::listen;
+
 use super::host::{self, Handle, Shell};
 use super::link::{self, Endpoint, LinkControl, LinkEvent};
 use super::{RunOptions, StartError};
 use recipe_device::bind::Bind;
 use recipe_device::exchange::{PortEvent, PortTx};
 use recipe_device::port::{Port, PortBus};
+use recipe_doctor::PortRecord;
 use recipe_net::fairness;
 use recipe_net::realtime::{self, Scheduling};
 use recipe_net::tcp_options;
 use recipe_net::timer::{Timer, now};
+use shown::Shown;
 
 /// A gateway with its ports and links, before it runs.
 struct Gateway {
@@ -35,6 +43,19 @@ struct Gateway {
     ports: Vec<(PortId, Port)>,
     links: Vec<(LinkId, LinkKind, Endpoint)>,
     ready: Value,
+    /// Who looks at it once a second, if somebody does.
+    doctor: Option<SyncSender<doctor::Snapshot>>,
+}
+
+/// What the gateway may send.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Voice {
+    /// Everything.
+    Full,
+    /// Nothing, neither to the controller nor to the field.
+    Silent,
+    /// Nothing to the controller; to the field, what ports with exchanges send.
+    Asking,
 }
 
 /// Shared by all tasks of the gateway.
@@ -48,11 +69,19 @@ struct Core {
     /// Links that were told of as missing.
     unreachable: RefCell<BTreeSet<LinkId>>,
     deadline_moved: Notify,
+    voice: Voice,
+    /// Ports with exchanges.
+    asks: BTreeSet<PortId>,
+    started: Instant,
+    /// What came in at each port lately.
+    records: RefCell<Vec<PortRecord>>,
+    /// The newest findings, if somebody looks.
+    told: RefCell<Option<doctor::Told>>,
 }
 
 impl Gateway {
     /// Opens devices and listening sockets.
-    async fn open(config: &GatewayConfig, binds: &[Bind]) -> Result<Self, StartError> {
+    async fn open(config: &GatewayConfig, binds: &[Bind], voice: Voice) -> Result<Self, StartError> {
         let engine: Box<Engine> =
             Box::new(Engine::new(config).map_err(|error| StartError::new(error.to_string()))?);
         let field = || config.view().field_ports().map(|(_, port, _)| port);
@@ -61,12 +90,20 @@ impl Gateway {
             let message = format!("--bind {bind}: there is no such port; there are {}", names.join(", "));
             return Err(StartError::new(message));
         }
-        let mut ports = Vec::new();
+        let (mut ports, mut records) = (Vec::new(), Vec::new());
+        let mut asks = BTreeSet::new();
         for (index, port, recipe) in config.view().field_ports() {
             let mut device = open_port(port, binds).await?;
             if matches!(recipe.parts, Parts::Can { .. }) {
                 let ids = |part| config.view().can_ids(recipe, part);
                 device.listen_to(ids(Direction::Input).chain(ids(Direction::Output)).collect());
+            }
+            let mut record = PortRecord::new(PortId(index));
+            let bind = binds.iter().find(|bind| port.name == bind.port.as_str());
+            record.device = bind.map(|bind| bind.device.to_string()).unwrap_or_default();
+            records.push(record);
+            if recipe.exchanges.len > 0 {
+                asks.insert(PortId(index));
             }
             ports.push((PortId(index), device));
         }
@@ -92,12 +129,17 @@ impl Gateway {
             sleeps: Cell::new(0),
             unreachable: RefCell::default(),
             deadline_moved: Notify::new(),
+            voice,
+            asks,
+            started: now(),
+            records: RefCell::new(records),
+            told: RefCell::default(),
         });
-        Ok(Self { core, ports, links, ready: json!({ "ports": places }) })
+        Ok(Self { core, ports, links, ready: json!({ "ports": places }), doctor: None })
     }
 
     async fn drive(self) -> Result<(), StartError> {
-        let Self { core: shared, ports, links, .. } = self;
+        let Self { core: shared, ports, links, doctor, .. } = self;
         let mut tasks = JoinSet::new();
         for (id, port) in ports {
             let core = Rc::clone(&shared);
@@ -113,9 +155,17 @@ impl Gateway {
             tasks.spawn_local(async move {
                 let is_frame = |datagram: &[u8]| core.engine.borrow().is_frame(id, datagram);
                 let events = |event: LinkEvent<'_>| core.link_event(id, event);
+                if !core.may_open(id) {
+                    link::probe(kind.name(), &endpoint, &control, is_frame).await;
+                    return std::future::pending().await;
+                }
                 link::run(kind.name(), &endpoint, &control, is_frame, events).await;
                 Ok(())
             });
+        }
+        if let Some(doctor) = doctor {
+            let core = Rc::clone(&shared);
+            tasks.spawn_local(async move { core.be_watched(doctor).await });
         }
         tasks.spawn_local(async move { shared.keep_time().await });
         while let Some(ended) = tasks.join_next().await {
@@ -165,6 +215,13 @@ impl Core {
     }
 
     fn port_event(&self, port: PortId, event: PortEvent<'_>) {
+        if let Some(record) = self.records.borrow_mut().iter_mut().find(|record| record.port == port) {
+            match &event {
+                PortEvent::Bytes(bytes) => record.heard(bytes),
+                PortEvent::Frame { frame } => record.frame(frame),
+                _ => {}
+            }
+        }
         match event {
             PortEvent::Up => self.input(Input::PortUp { port }),
             PortEvent::Down => self.input(Input::PortDown { port }),
@@ -216,7 +273,7 @@ impl Core {
     /// Reports one input and carries out all outputs.
     fn input(&self, input: Input<'_>) {
         let at = now();
-        trace!(?input, "in");
+        trace!(input = %Shown(&input), "in");
         let mut engine = self.engine.borrow_mut();
         engine.handle(at, input);
         let sleeps = engine.sleeps();
@@ -236,7 +293,10 @@ impl Core {
                     }
                     return;
                 }
-                _ => trace!(?output, "out"),
+                _ => trace!(output = %Shown(&output), "out"),
+            }
+            if !self.may(&output) {
+                continue;
             }
             match output {
                 Output::PortSend { port, bytes } => self.with_port(port, |tx| tx.send(bytes)),
@@ -247,6 +307,25 @@ impl Core {
                 _ => {}
             }
         }
+    }
+
+    /// Whether an output may be carried out: the one gate for a gateway that only listens.
+    fn may(&self, output: &Output<'_>) -> bool {
+        match (self.voice, output) {
+            (Voice::Full, _) => true,
+            (Voice::Asking, Output::PortSend { port, .. } | Output::PortSendCan { port, .. }) => {
+                self.asks.contains(port)
+            }
+            (_, &Output::LinkOpen { link, .. }) => self.may_open(link),
+            (_, Output::LinkClose { .. }) => true,
+            _ => false,
+        }
+    }
+
+    /// Whether a link may be opened. A gateway that only listens reads the state stream, on which nothing
+    /// is ever sent.
+    fn may_open(&self, link: LinkId) -> bool {
+        self.voice == Voice::Full || link == LinkId::STATE
     }
 
     fn with_port(&self, id: PortId, act: impl FnOnce(&PortTx)) {
@@ -292,6 +371,9 @@ impl Core {
                 lift(shown, "turned_away");
             }
         }
+        if let Some(told) = &*self.told.borrow() {
+            stats["findings"] = doctor::words(told);
+        }
         stats
     }
 }
@@ -310,7 +392,9 @@ fn lift(outer: &mut Value, key: &str) {
 /// # Errors
 /// The reason why it could not start; nothing is left behind then.
 pub fn run(config: GatewayConfig, options: RunOptions) -> Result<(), StartError> {
-    let handle = spawn(config, options.binds.clone(), options.scheduling)?;
+    // Findings are for who reads the log or the statistics.
+    let is_watched = options.stats.is_some() || tracing::enabled!(tracing::Level::INFO);
+    let handle = spawn(config, options.binds.clone(), options.scheduling, is_watched)?;
     host::foreground(handle, &options)
 }
 
@@ -319,12 +403,22 @@ pub fn run(config: GatewayConfig, options: RunOptions) -> Result<(), StartError>
 /// # Errors
 /// The reason why it could not start; nothing is left behind then.
 pub fn start(config: GatewayConfig, binds: Vec<Bind>) -> Result<Handle, StartError> {
-    spawn(config, binds, Scheduling::Ordinary)
+    spawn(config, binds, Scheduling::Ordinary, false)
 }
 
-fn spawn(config: GatewayConfig, binds: Vec<Bind>, scheduling: Scheduling) -> Result<Handle, StartError> {
+fn spawn(
+    config: GatewayConfig,
+    binds: Vec<Bind>,
+    scheduling: Scheduling,
+    is_watched: bool,
+) -> Result<Handle, StartError> {
     host::start("gateway", async move || {
-        let gateway = Gateway::open(&config, &binds).await?;
+        let mut gateway = Gateway::open(&config, &binds, Voice::Full).await?;
+        if is_watched {
+            let (doctor, told) = doctor::start(config)?;
+            gateway.doctor = Some(doctor);
+            gateway.core.told.replace(Some(told));
+        }
         info!(scheduling = %realtime::apply(scheduling), "the gateway is running");
         Ok(gateway)
     })
