@@ -157,7 +157,8 @@ fn refusal(states: &States) -> Option<(Cause, String, &'static str, &'static str
         ));
     }
     match states.safety {
-        SafetyState::Run | SafetyState::Reduce => {}
+        // Without power there is nothing to watch: the robot's own state says it better.
+        SafetyState::Run | SafetyState::Reduce | SafetyState::PowerOff => {}
         SafetyState::Stop0 | SafetyState::Stop1 | SafetyState::Stop2 => {
             return Some((
                 Cause::SafetyStop,

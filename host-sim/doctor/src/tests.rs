@@ -493,7 +493,10 @@ fn a_refused_command_has_its_reason() {
         Cause::Manual,
         &["port panel: run(pick.jspf) refused: the controller is in manual mode"],
     );
-    refused(|packet| packet.robot_state = 4, Cause::PowerOff, &["refused: the arm is powered off"]);
+    for safety in [4, 5] {
+        let off = |packet: &mut StatePacket| (packet.robot_state, packet.safety_state) = (4, safety);
+        refused(off, Cause::PowerOff, &["refused: the arm is powered off"]);
+    }
     refused(|packet| packet.robot_state = 5, Cause::Disabled, &["refused: the arm is not enabled"]);
     refused(|packet| packet.robot_state = 1, Cause::Starting, &["not ready (Initialize)"]);
     refused(|packet| packet.safety_state = 9, Cause::SafetyStop, &["has stopped the robot (Stop0)"]);
@@ -535,6 +538,10 @@ fn every_cause_has_a_name_of_its_own() {
     names.sort_unstable();
     names.dedup();
     assert_eq!(names.len(), Cause::ALL.len());
+    let page = std::fs::read_to_string(recipe_test_kit::repository().join("docs/trouble.md")).unwrap();
+    for name in names {
+        assert!(page.contains(&format!("| `{name}` |")), "docs/trouble.md does not know {name}");
+    }
 }
 
 fn quantity() -> impl Strategy<Value = f32> {

@@ -40,9 +40,8 @@ fn node(port: u16, line: &'static str) -> Feeder {
 #[track_caller]
 fn said(line: &'static str, cause: &str, words: &[&str]) {
     let file = example("can-user.toml");
-    let gateway = HostSim::start(
-        BINARY.run("gateway", &file).args(["-v", "--bind=can-1=slcan-tcp:127.0.0.1:0"]),
-    );
+    let gateway =
+        HostSim::start(BINARY.run("gateway", &file).args(["-v", "--bind=can-1=slcan-tcp:127.0.0.1:0"]));
     let place = gateway.at("ports/can-1");
     let feeder = (!line.is_empty()).then(|| node(place.port(), line));
     logs(&gateway, &[&["port can-1: "], words].concat());

@@ -165,7 +165,11 @@ fn a_trace_has_bytes_as_decode_takes_them() {
     let traced = gateway.log("port 0: 48 AA 00 00 A0 3F").remove(0);
     let bytes = traced.rsplit_once("port 0: ").unwrap().1;
     let mut decode = BINARY.command();
-    decode.arg("decode").arg(&file).args(["--recipe", "force-sensor", "--part", "input"]).args(bytes.split(' '));
+    decode
+        .arg("decode")
+        .arg(&file)
+        .args(["--recipe", "force-sensor", "--part", "input"])
+        .args(bytes.split(' '));
     let output = decode.output().unwrap();
     assert!(output.status.success(), "{bytes}: {}", String::from_utf8_lossy(&output.stderr));
     assert!(String::from_utf8_lossy(&output.stdout).contains("1.25"));

@@ -30,7 +30,10 @@ fn the_controller_is_given_nothing() {
     let (file, line) = (folder.path().join("panel.toml"), folder.path().join("device"));
     // A panel whose values go to Modbus and to UDP, whose order is a command, and whose silence has safe values.
     let panel = toml::panel("1 = \"run(pick.jspf)\", 2 = \"stop\"", 200);
-    let panel = panel.replace("address = \"127.0.0.1\"", "address = \"127.0.0.1\"\nrecipe_link = { udp = 2011, recipe = \"up\" }");
+    let panel = panel.replace(
+        "address = \"127.0.0.1\"",
+        "address = \"127.0.0.1\"\nrecipe_link = { udp = 2011, recipe = \"up\" }",
+    );
     let up = "\n[[recipe]]\nname = \"up\"\nkind = \"stream\"\nmode = \"realtime\"\ninput = { head = [1], tail = [2], \
               fields = [\"DigitalOutputCommand[1]\", \"WordInputReg[1]\"] }\n";
     std::fs::write(&file, panel + up).unwrap();
@@ -50,7 +53,8 @@ fn the_controller_is_given_nothing() {
     datagrams.set_nonblocking(true).unwrap();
     assert!(datagrams.recv(&mut [0; 64]).is_err(), "a datagram");
     // It has connected to the command port at least, and said nothing anywhere.
-    let clients: Vec<_> = std::iter::from_fn(|| given.recv_timeout(Duration::from_millis(500)).ok()).collect();
+    let clients: Vec<_> =
+        std::iter::from_fn(|| given.recv_timeout(Duration::from_millis(500)).ok()).collect();
     assert!(clients.iter().any(|(name, _)| *name == "command"), "{clients:?}\n{findings}");
     assert!(clients.iter().all(|(_, bytes)| bytes.is_empty()), "{clients:?}");
 }
