@@ -74,7 +74,7 @@ impl Bench {
     fn pass(&mut self, ms: u64) -> Vec<Vec<u8>> {
         let mut requests = Vec::new();
         for _ in 0..ms {
-            self.now = self.now + Duration::from_millis(1);
+            self.now += Duration::from_millis(1);
             requests.extend(self.input(Input::Tick));
             if self.now.saturating_since(self.noted) >= Duration::from_millis(1000) {
                 self.noted = self.now;
@@ -309,7 +309,7 @@ fn damaged_frames_among_right_ones() {
 #[test]
 fn seven_data_bits() {
     let mut bench = Bench::example("force-sensor.toml");
-    let odd = |byte: &u8| byte & 0x7F | if (byte & 0x7F).count_ones() % 2 == 0 { 0x80 } else { 0 };
+    let odd = |byte: &u8| byte & 0x7F | if (byte & 0x7F).count_ones().is_multiple_of(2) { 0x80 } else { 0 };
     let frame: Vec<u8> = force(&HEAD, &TAIL, f32::to_le_bytes).iter().map(odd).collect();
     bench.streams(&frame);
     bench.says(Cause::SevenBits, &["8 data bits"]);

@@ -489,9 +489,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         });
         // A reply ends one command, so one port at most has a new failure.
         if let Some(port) = failed {
-            let newest = self.links.state.first().and_then(|state| {
-                self.store.image.stamp_of(state.group).map(|at| (state.codes, at))
-            });
+            let newest = self
+                .links
+                .state
+                .first()
+                .and_then(|state| self.store.image.stamp_of(state.group).map(|at| (state.codes, at)));
             command.note_states(port, newest);
         }
     }
