@@ -8,11 +8,11 @@
 use heapless::{Deque, Vec};
 
 use super::command_tables::{CommandField, Entry, MAX_COMMAND_FIELDS, Picked, Tables, is_asked};
-use super::failed::Failed;
+use super::failed::FailedCommands;
 use super::io::{LinkId, PortId, ReplyCode, Transport};
 use super::not_given::{LastNotGiven, NotGiven};
 use super::outcome::Outcomes;
-use super::session::{Event, Sent, Session};
+use super::session::{Event, Sent, Session, may_go_at};
 use super::stops::{COMMAND_QUEUE, STOP_TTL, Stops, Waiting};
 use crate::command::Keyword;
 use crate::config::{CommandEntry, CommandText, CommandWhen, MAX_PORTS, Span, fill_in};
@@ -54,10 +54,10 @@ pub(super) struct CommandLink {
     way_made_until: Instant,
     /// The newest command that each port's values picked, and the value.
     picked: [Option<(u16, i64)>; MAX_PORTS],
-    /// The newest value of each port that gave no command.
+    /// Likewise the newest value that gave no command.
     not_given: [Option<LastNotGiven>; MAX_PORTS],
-    /// The newest command of each port that the controller replied to with a failure.
-    failed: [Option<Failed>; MAX_PORTS],
+    /// Commands that the controller replied to with a failure.
+    pub failed: FailedCommands,
     /// Results of commands since the engine asked last.
     pub outcomes: Outcomes,
 }
@@ -82,7 +82,7 @@ impl CommandLink {
             way_made_until: Instant::ZERO,
             picked: [None; MAX_PORTS],
             not_given: [None; MAX_PORTS],
-            failed: [None; MAX_PORTS],
+            failed: FailedCommands::NONE,
             outcomes: Outcomes::new(),
         })
     }
@@ -90,37 +90,17 @@ impl CommandLink {
     /// The text of the newest command that a port's values picked.
     pub(super) fn newest_of(&self, port: PortId) -> Option<CommandText<'_>> {
         let (entry, value) = (*self.picked.get(usize::from(port.0))?)?;
+        self.text(entry, value)
+    }
+
+    /// The text that a value picked.
+    pub(super) fn text(&self, entry: u16, value: i64) -> Option<CommandText<'_>> {
         self.tables.entry(entry).map(|(_, text)| CommandText { text, value })
     }
 
     /// The newest value of a port that gave no command.
     pub(super) fn not_given_of(&self, port: PortId) -> Option<&LastNotGiven> {
         self.not_given.get(usize::from(port.0))?.as_ref()
-    }
-
-    /// The newest command of a port that failed, and its text.
-    pub(super) fn failed_of(&self, port: PortId) -> Option<(Failed, CommandText<'_>)> {
-        let failed = (*self.failed.get(usize::from(port.0))?)?;
-        let (_, text) = self.tables.entry(failed.entry)?;
-        Some((failed, CommandText { text, value: failed.value }))
-    }
-
-    /// The controller replied that a command has failed.
-    #[cold]
-    #[inline(never)]
-    fn note_failed(&mut self, command: Waiting, now: Instant) {
-        if let Some(failed) = self.failed.get_mut(usize::from(command.port.0)) {
-            *failed = Some(Failed::new(command.entry, command.value, now));
-        }
-    }
-
-    /// What the newest state packet says, and when it came, after a command of this port has failed.
-    #[cold]
-    #[inline(never)]
-    pub(super) fn note_states(&mut self, port: PortId, newest: Option<([u8; 4], Instant)>) {
-        if let Some(Some(failed)) = self.failed.get_mut(usize::from(port.0)) {
-            failed.note_states(newest);
-        }
     }
 
     pub(super) fn transport(&self) -> Transport {
@@ -606,9 +586,7 @@ impl CommandLink {
                 None => return,
                 Some(Event::Other) => {}
                 Some(Event::Answered(sent, code)) => {
-                    if code == ReplyCode::Fail {
-                        self.note_failed(sent.command, now);
-                    }
+                    self.failed.note(sent.command, code, now);
                     self.outcomes.push(sent.command, code);
                 }
                 Some(Event::TimedOut) => {
@@ -620,11 +598,4 @@ impl CommandLink {
             }
         }
     }
-}
-
-/// When an urgent command may be sent although one of its kind is unanswered.
-fn may_go_at(sessions: [Option<&Session>; 2], keyword: Keyword) -> Instant {
-    let sent = sessions.into_iter().flatten().flat_map(|session| [session.in_flight, session.beside]);
-    let same = sent.flatten().filter(|sent| sent.keyword == keyword);
-    same.map(|sent| sent.at + STOP_TTL).max().unwrap_or(Instant::ZERO)
 }

@@ -1,10 +1,41 @@
 //! Commands that the controller replied to with a failure, and the controller's states at that moment:
 //! a reply of port 2000 says only that it failed.
 
+use super::io::{PortId, ReplyCode};
 use super::status::ControllerStatus;
-use crate::config::CommandText;
+use super::stops::Waiting;
+use crate::config::{CommandText, MAX_PORTS};
 use crate::time::{Duration, Instant};
 use crate::wire::dialect::Dialect;
+
+/// The newest command of each port that failed.
+#[derive(Debug, Clone)]
+pub(super) struct FailedCommands([Option<Failed>; MAX_PORTS]);
+
+impl FailedCommands {
+    pub(super) const NONE: Self = Self([None; MAX_PORTS]);
+
+    pub(super) fn of(&self, port: PortId) -> Option<Failed> {
+        *self.0.get(usize::from(port.0))?
+    }
+
+    /// The controller replied to a command.
+    #[inline]
+    pub(super) fn note(&mut self, command: Waiting, code: ReplyCode, now: Instant) {
+        if code == ReplyCode::Fail
+            && let Some(failed) = self.0.get_mut(usize::from(command.port.0))
+        {
+            *failed = Some(Failed::new(command.entry, command.value, now));
+        }
+    }
+
+    /// What the newest state packet says, and when it came, after a command of this port has failed.
+    pub(super) fn note_states(&mut self, port: PortId, newest: Option<([u8; 4], Instant)>) {
+        if let Some(Some(failed)) = self.0.get_mut(usize::from(port.0)) {
+            failed.note_states(newest);
+        }
+    }
+}
 
 /// A command that failed, as the command link keeps it.
 #[derive(Debug, Clone, Copy)]
@@ -31,12 +62,12 @@ enum Seen {
 }
 
 impl Failed {
-    pub(super) const fn new(entry: u16, value: i64, at: Instant) -> Self {
+    const fn new(entry: u16, value: i64, at: Instant) -> Self {
         Self { at, value, entry, codes: [0; 4], age_us: 0, seen: Seen::Unasked }
     }
 
     /// The newest packet has these codes and came at `at`, if there is one.
-    pub(super) fn note_states(&mut self, newest: Option<([u8; 4], Instant)>) {
+    fn note_states(&mut self, newest: Option<([u8; 4], Instant)>) {
         if self.seen != Seen::Unasked {
             return;
         }

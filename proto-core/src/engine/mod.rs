@@ -476,7 +476,17 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
     }
 
+    #[inline]
     fn carry_outcomes(&mut self) {
+        if self.links.command.first().is_some_and(|command| !command.outcomes.is_empty()) {
+            self.tell_outcomes();
+        }
+    }
+
+    /// On its own, so that passes without commands do not pay for its registers.
+    #[cold]
+    #[inline(never)]
+    fn tell_outcomes(&mut self) {
         let Some(command) = self.links.command.first_mut() else { return };
         let mut failed = None;
         command.outcomes.take(|outcome| {
@@ -489,12 +499,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         });
         // A reply ends one command, so one port at most has a new failure.
         if let Some(port) = failed {
-            let newest = self
-                .links
-                .state
-                .first()
-                .and_then(|state| self.store.image.stamp_of(state.group).map(|at| (state.codes, at)));
-            command.note_states(port, newest);
+            let state = self.links.state.first();
+            let newest = state.and_then(|state| Some((state.codes, self.store.image.stamp_of(state.group)?)));
+            command.failed.note_states(port, newest);
         }
     }
 

@@ -276,7 +276,9 @@ impl<'a> Status<'a> {
     }
 
     fn last_failed(&self, port: PortId) -> Option<FailedCommand<'a>> {
-        let (failed, command) = self.links.command?.failed_of(port)?;
+        let link = self.links.command?;
+        let failed = link.failed.of(port)?;
+        let command = link.text(failed.entry, failed.value)?;
         let state = self.links.state;
         let controller = state.and_then(|link| failed.states(&link.dialect));
         Some(FailedCommand { at: failed.at, command, controller })
