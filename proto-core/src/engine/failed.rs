@@ -10,30 +10,36 @@ use crate::wire::dialect::Dialect;
 
 /// The newest command of each port that failed.
 #[derive(Debug, Clone)]
-pub(super) struct FailedCommands([Option<Failed>; MAX_PORTS]);
+pub(super) struct FailedCommands {
+    newest: [Option<Failed>; MAX_PORTS],
+    /// Of one of them the controller's states are still to be noted.
+    pub is_open: bool,
+}
 
 impl FailedCommands {
-    pub(super) const NONE: Self = Self([None; MAX_PORTS]);
+    pub(super) const NONE: Self = Self { newest: [None; MAX_PORTS], is_open: false };
 
     pub(super) fn of(&self, port: PortId) -> Option<Failed> {
-        *self.0.get(usize::from(port.0))?
+        *self.newest.get(usize::from(port.0))?
     }
 
     /// The controller replied to a command.
     #[inline]
     pub(super) fn note(&mut self, command: Waiting, code: ReplyCode, now: Instant) {
         if code == ReplyCode::Fail
-            && let Some(failed) = self.0.get_mut(usize::from(command.port.0))
+            && let Some(failed) = self.newest.get_mut(usize::from(command.port.0))
         {
             *failed = Some(Failed::new(command.entry, command.value, now));
+            self.is_open = true;
         }
     }
 
-    /// What the newest state packet says, and when it came, after a command of this port has failed.
-    pub(super) fn note_states(&mut self, port: PortId, newest: Option<([u8; 4], Instant)>) {
-        if let Some(Some(failed)) = self.0.get_mut(usize::from(port.0)) {
-            failed.note_states(newest);
-        }
+    /// What the newest state packet says, and when it came.
+    #[cold]
+    #[inline(never)]
+    pub(super) fn note_states(&mut self, newest: Option<([u8; 4], Instant)>) {
+        self.is_open = false;
+        self.newest.iter_mut().flatten().for_each(|failed| failed.note_states(newest));
     }
 }
 

@@ -476,33 +476,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
     }
 
-    #[inline]
     fn carry_outcomes(&mut self) {
-        if self.links.command.first().is_some_and(|command| !command.outcomes.is_empty()) {
-            self.tell_outcomes();
-        }
-    }
-
-    /// On its own, so that passes without commands do not pay for its registers.
-    #[cold]
-    #[inline(never)]
-    fn tell_outcomes(&mut self) {
         let Some(command) = self.links.command.first_mut() else { return };
-        let mut failed = None;
         command.outcomes.take(|outcome| {
             if let Some(port) = find_port(&mut self.ports, outcome.port) {
                 port.command_ended(outcome);
             }
-            if outcome.code == ReplyCode::Fail {
-                failed = Some(outcome.port);
-            }
         });
-        // A reply ends one command, so one port at most has a new failure.
-        if let Some(port) = failed {
-            let state = self.links.state.first();
-            let newest = state.and_then(|state| Some((state.codes, self.store.image.stamp_of(state.group)?)));
-            command.failed.note_states(port, newest);
-        }
     }
 
     /// After a field frame: checks bits that trigger, and frames that wait for their neighbours.

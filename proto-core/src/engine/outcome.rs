@@ -33,10 +33,6 @@ impl Outcomes {
         let _ = self.0.push(Outcome { port: command.port, nth: command.nth, code });
     }
 
-    pub(super) fn is_empty(&self) -> bool {
-        self.0.is_empty()
-    }
-
     /// Hands over all of them, in order.
     pub(super) fn take(&mut self, mut tell: impl FnMut(Outcome)) {
         for &outcome in &self.0 {
