@@ -395,8 +395,7 @@ impl CommandLink {
         if let Some((link, at)) = self.crowded()
             && now >= at
         {
-            // The peer does not answer: a new connection is open sooner than a reply can be
-            // expected.
+            // The peer does not answer: a new connection is open before a reply can be expected.
             if let Some(session) = self.session(link) {
                 session.supervisor.give_up(now);
             }
@@ -473,8 +472,7 @@ impl CommandLink {
         self.ordinary.is_free_beside().then_some(LinkId::COMMAND)
     }
 
-    /// The next urgent command of a kind that is not in flight, or has been for too long: nobody
-    /// knows whether the controller has carried that one out.
+    /// The next urgent command of a kind that is not in flight, or for so long that nobody knows its end.
     fn pop_stop(&mut self, now: Instant) -> Option<(Keyword, Waiting)> {
         let sessions = [Some(&self.ordinary), self.urgent.as_ref()];
         self.stops.pop(|keyword| may_go_at(sessions, keyword) <= now)
