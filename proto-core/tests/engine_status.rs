@@ -210,6 +210,40 @@ fn the_newest_command_of_a_port_is_told_with_its_outcome() {
 }
 
 #[test]
+fn a_command_that_failed_is_told_with_the_controllers_states_at_that_moment() {
+    let mut cell = Cell::new();
+    let table = cell.commands(&[(1, "run(pick.jspf)"), (2, "resume")]);
+    let to = InputBinding::Commands { table, when: CommandWhen::Frame };
+    let fields = cell.fields([user_in(ScalarType::Byte, to)]);
+    let input = cell.part(&[255], &[254], fields);
+    let recipe = cell.recipe(Mode::User, Parts::Stream { input, output: None });
+    let panel = cell.rs485(recipe);
+    // A second port shows a value of the state stream, so that there is a state link.
+    let shown = cell.stream(&[], &["RobotState[8]"]);
+    cell.rs485(shown);
+    let mut rig = cell.rig();
+    rig.run(MS(10));
+    let manual = state_packet(|packet| packet.robot_state = 4);
+    rig.link_bytes(LinkId::STATE, &manual);
+    rig.run(MS(30));
+    rig.bytes(panel, &[255, 1, 254]);
+    assert!(port(&rig.engine.status(rig.now), "port0").last_failed.is_none());
+    rig.link_bytes(LinkId::COMMAND, b"run fail\r\n");
+    // What comes later says nothing about it, nor does what succeeds.
+    rig.link_bytes(LinkId::STATE, &state_packet(|packet| packet.operation_mode = 2));
+    rig.bytes(panel, &[255, 2, 254]);
+    rig.link_bytes(LinkId::COMMAND, b"resume success\r\n");
+    let status = rig.engine.status(rig.now);
+    assert_eq!(port(&status, "port0").reply, ReplyCode::Success);
+    let failed = port(&status, "port0").last_failed.unwrap();
+    assert_eq!(failed.command.to_string(), "run(pick.jspf)");
+    let controller = failed.controller.unwrap();
+    assert_eq!(controller.states.mode, OperationMode::Manual);
+    assert_eq!(controller.states.robot, RobotState::PowerOff);
+    assert_eq!(controller.age, MS(30));
+}
+
+#[test]
 fn links_of_listening_ports_have_the_ports_name() {
     let mut cell = Cell::new();
     let recipe = cell.stream(&["ForceEnd[1..6]"], &[]);

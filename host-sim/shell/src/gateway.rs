@@ -4,12 +4,15 @@
 //! outputs are carried out before anything else is read. So only one call of the engine is between the last
 //! byte of a field frame and the request to the controller.
 
+mod doctor;
+mod shown;
 mod tapping;
 
 use std::cell::{Cell, RefCell};
 use std::collections::{BTreeMap, BTreeSet};
 use std::rc::Rc;
 use std::sync::Arc;
+use std::sync::mpsc::SyncSender;
 use std::time::SystemTime;
 
 use proto_core::config::{Bus, GatewayConfig, Parts, Port as PortConfig, image};
@@ -22,6 +25,8 @@ use tokio::sync::Notify;
 use tokio::task::JoinSet;
 use tracing::{info, trace, warn};
 
+pub use doctor::listen;
+
 use super::console::window::{MAX_SAFE, Window};
 use super::console::{self, ConfigFile, Supervised};
 use super::host::{self, Handle, Shell};
@@ -31,14 +36,34 @@ use recipe_capture::{Cell as Watched, Epoch, Watch};
 use recipe_device::bind::Bind;
 use recipe_device::exchange::{PortEvent, PortTx};
 use recipe_device::port::{Port, PortBus};
+use recipe_doctor::PortRecord;
 use recipe_net::fairness;
 use recipe_net::realtime::{self, Scheduling};
 use recipe_net::tcp_options;
 use recipe_net::timer::{Timer, now};
+use shown::Shown;
 use tapping::{TAP, Tapping};
 
 /// The engine with room for a tap.
 pub(crate) type Engine = proto_core::engine::Engine<8, 4, 512, TAP>;
+
+/// Who looks at a gateway.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Observers {
+    /// Captures and recordings.
+    pub watch: Watch,
+    /// A console.
+    pub window: Option<Arc<Window>>,
+    /// Whoever reads the log or the statistics, where findings are told.
+    pub readers: bool,
+}
+
+impl Observers {
+    pub(crate) fn of(options: &RunOptions) -> Self {
+        let readers = options.stats.is_some() || tracing::enabled!(tracing::Level::INFO);
+        Self { watch: options.watch.clone(), window: None, readers }
+    }
+}
 
 /// A gateway with its ports and links, before it runs.
 struct Gateway {
@@ -47,6 +72,19 @@ struct Gateway {
     links: Vec<(LinkId, LinkKind, Endpoint)>,
     ready: Value,
     window: Option<Arc<Window>>,
+    /// Who looks at it once a second, if somebody does.
+    doctor: Option<SyncSender<doctor::Snapshot>>,
+}
+
+/// What the gateway may send.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Voice {
+    /// Everything.
+    Full,
+    /// Nothing, neither to the controller nor to the field.
+    Silent,
+    /// Nothing to the controller; to the field, what ports with exchanges send.
+    Asking,
 }
 
 /// Shared by all tasks of the gateway.
@@ -63,11 +101,24 @@ struct Core {
     deadline_moved: Notify,
     /// Another gateway takes its place: its devices are not listened to any more.
     is_ending: Cell<bool>,
+    voice: Voice,
+    /// Ports with exchanges.
+    asks: BTreeSet<PortId>,
+    started: Instant,
+    /// What came in at each port lately.
+    records: RefCell<Vec<PortRecord>>,
+    /// The newest findings, if somebody looks.
+    told: RefCell<Option<doctor::Told>>,
 }
 
 impl Gateway {
     /// Opens devices and listening sockets.
-    async fn open(config: &GatewayConfig, binds: &[Bind], watch: &Watch) -> Result<Self, StartError> {
+    async fn open(
+        config: &GatewayConfig,
+        binds: &[Bind],
+        voice: Voice,
+        watch: &Watch,
+    ) -> Result<Self, StartError> {
         let engine: Box<Engine> =
             Box::new(Engine::new(config).map_err(|error| StartError::new(error.to_string()))?);
         let field = || config.view().field_ports().map(|(_, port, _)| port);
@@ -76,12 +127,20 @@ impl Gateway {
             let message = format!("--bind {bind}: there is no such port; there are {}", names.join(", "));
             return Err(StartError::new(message));
         }
-        let mut ports = Vec::new();
+        let (mut ports, mut records) = (Vec::new(), Vec::new());
+        let mut asks = BTreeSet::new();
         for (index, port, recipe) in config.view().field_ports() {
             let mut device = open_port(port, binds).await?;
             if matches!(recipe.parts, Parts::Can { .. }) {
                 let ids = |part| config.view().can_ids(recipe, part);
                 device.listen_to(ids(Direction::Input).chain(ids(Direction::Output)).collect());
+            }
+            let mut record = PortRecord::new(PortId(index));
+            let bind = binds.iter().find(|bind| port.name == bind.port.as_str());
+            record.device = bind.map(|bind| bind.device.to_string()).unwrap_or_default();
+            records.push(record);
+            if recipe.exchanges.len > 0 {
+                asks.insert(PortId(index));
             }
             ports.push((PortId(index), device));
         }
@@ -110,12 +169,17 @@ impl Gateway {
             unreachable: RefCell::default(),
             deadline_moved: Notify::new(),
             is_ending: Cell::new(false),
+            voice,
+            asks,
+            started: now(),
+            records: RefCell::new(records),
+            told: RefCell::default(),
         });
-        Ok(Self { core, ports, links, ready: json!({ "ports": places }), window: None })
+        Ok(Self { core, ports, links, ready: json!({ "ports": places }), window: None, doctor: None })
     }
 
     async fn drive(self) -> Result<(), StartError> {
-        let Self { core: shared, ports, links, window, .. } = self;
+        let Self { core: shared, ports, links, window, doctor, .. } = self;
         let mut tasks = JoinSet::new();
         if let Some(window) = window {
             let core = Rc::clone(&shared);
@@ -135,9 +199,17 @@ impl Gateway {
             tasks.spawn_local(async move {
                 let is_frame = |datagram: &[u8]| core.engine.borrow().is_frame(id, datagram);
                 let events = |event: LinkEvent<'_>| core.link_event(id, event);
+                if !core.may_open(id) {
+                    link::probe(kind.name(), &endpoint, &control, is_frame).await;
+                    return std::future::pending().await;
+                }
                 link::run(kind.name(), &endpoint, &control, is_frame, events).await;
                 Ok(())
             });
+        }
+        if let Some(doctor) = doctor {
+            let core = Rc::clone(&shared);
+            tasks.spawn_local(async move { core.be_watched(doctor).await });
         }
         tasks.spawn_local(async move { shared.keep_time().await });
         while let Some(ended) = tasks.join_next().await {
@@ -222,6 +294,13 @@ impl Core {
         if self.is_ending.get() && event != PortEvent::Sent {
             return;
         }
+        if let Some(record) = self.records.borrow_mut().iter_mut().find(|record| record.port == port) {
+            match &event {
+                PortEvent::Bytes(bytes) => record.heard(bytes),
+                PortEvent::Frame { frame } => record.frame(frame),
+                _ => {}
+            }
+        }
         match event {
             PortEvent::Up => self.input(Input::PortUp { port }),
             PortEvent::Down => self.input(Input::PortDown { port }),
@@ -273,7 +352,7 @@ impl Core {
     /// Reports one input and carries out all outputs.
     fn input(&self, input: Input<'_>) {
         let at = now();
-        trace!(?input, "in");
+        trace!(input = %Shown(&input), "in");
         let mut engine = self.engine.borrow_mut();
         let mut tapping = self.tapping.borrow_mut();
         tapping.before(engine.tap(), at, input);
@@ -297,7 +376,10 @@ impl Core {
                     }
                     return;
                 }
-                _ => trace!(?output, "out"),
+                _ => trace!(output = %Shown(&output), "out"),
+            }
+            if !self.may(&output) {
+                continue;
             }
             match output {
                 Output::PortSend { port, bytes } => self.with_port(port, |tx| tx.send(bytes)),
@@ -308,6 +390,25 @@ impl Core {
                 _ => {}
             }
         }
+    }
+
+    /// Whether an output may be carried out: the one gate for a gateway that only listens.
+    fn may(&self, output: &Output<'_>) -> bool {
+        match (self.voice, output) {
+            (Voice::Full, _) => true,
+            (Voice::Asking, Output::PortSend { port, .. } | Output::PortSendCan { port, .. }) => {
+                self.asks.contains(port)
+            }
+            (_, &Output::LinkOpen { link, .. }) => self.may_open(link),
+            (_, Output::LinkClose { .. }) => true,
+            _ => false,
+        }
+    }
+
+    /// Whether a link may be opened. A gateway that only listens reads the state stream, on which nothing
+    /// is ever sent.
+    fn may_open(&self, link: LinkId) -> bool {
+        self.voice == Voice::Full || link == LinkId::STATE
     }
 
     fn with_port(&self, id: PortId, act: impl FnOnce(&PortTx)) {
@@ -353,6 +454,9 @@ impl Core {
                 lift(shown, "turned_away");
             }
         }
+        if let Some(told) = &*self.told.borrow() {
+            stats["findings"] = doctor::words(told);
+        }
         stats
     }
 }
@@ -389,7 +493,7 @@ fn lift(outer: &mut Value, key: &str) {
 /// # Errors
 /// The reason why it could not start; nothing is left behind then.
 pub fn run(config: GatewayConfig, options: RunOptions) -> Result<(), StartError> {
-    let handle = spawn(config, options.binds.clone(), options.scheduling, &options.watch, None)?;
+    let handle = spawn(config, options.binds.clone(), options.scheduling, Observers::of(&options))?;
     host::foreground(handle, &options)
 }
 
@@ -418,27 +522,33 @@ pub fn start(config: GatewayConfig, binds: Vec<Bind>) -> Result<Handle, StartErr
 /// # Errors
 /// The reason why it could not start; nothing is left behind then.
 pub fn start_watched(config: GatewayConfig, binds: Vec<Bind>, watch: &Watch) -> Result<Handle, StartError> {
-    spawn(config, binds, Scheduling::Ordinary, watch, None)
+    let observers = Observers { watch: watch.clone(), ..Observers::default() };
+    spawn(config, binds, Scheduling::Ordinary, observers)
 }
 
-/// Starts the gateway; a console looks at it through the window.
+/// Starts the gateway, with those who look at it.
 pub(crate) fn spawn(
     config: GatewayConfig,
     binds: Vec<Bind>,
     scheduling: Scheduling,
-    watch: &Watch,
-    window: Option<Arc<Window>>,
+    observers: Observers,
 ) -> Result<Handle, StartError> {
+    let Observers { watch, window, readers } = observers;
     let watched = watch.clone();
     let handle = host::start("gateway", async move || {
-        let mut gateway = Gateway::open(&config, &binds, &watched).await?;
+        let mut gateway = Gateway::open(&config, &binds, Voice::Full, &watched).await?;
         gateway.window = window;
+        if readers {
+            let (doctor, told) = doctor::start(config)?;
+            gateway.doctor = Some(doctor);
+            gateway.core.told.replace(Some(told));
+        }
         // Not as an argument of the log, which is not evaluated unless it is printed.
         let scheduling = realtime::apply(scheduling);
         info!(%scheduling, "the gateway is running");
         Ok(gateway)
     })?;
-    Ok(handle.with_watch(watch.clone()))
+    Ok(handle.with_watch(watch))
 }
 
 /// How often is looked whether the safe values have arrived.

@@ -20,6 +20,9 @@ use tokio::sync::Notify;
 use tokio::time::Instant;
 use tracing::{debug, info, warn};
 
+use recipe_doctor::Reach;
+use recipe_net::connect::connect;
+use recipe_net::fairness::yield_fairly;
 use recipe_net::log_limit::LogLimit;
 use recipe_net::timer::now;
 
@@ -58,6 +61,8 @@ pub(super) struct LinkControl {
     changed: Notify,
     refusals: Cell<Refusals>,
     log_limit: LogLimit,
+    /// How the newest attempt to reach the controller ended, and when; `None` while data comes.
+    reach: RefCell<Option<(Instant, Reach)>>,
 }
 
 /// Counts openings and closings: odd while the link should be open.
@@ -109,6 +114,23 @@ impl LinkControl {
     /// Counters of what was not accepted.
     pub(super) fn refusals(&self) -> Refusals {
         self.refusals.get()
+    }
+
+    /// How an attempt of the last seconds to reach the controller ended.
+    pub(super) fn reach(&self) -> Option<Reach> {
+        let reach = self.reach.borrow();
+        reach.as_ref().filter(|(at, _)| at.elapsed() < REACH_COUNTS).map(|(_, reach)| reach.clone())
+    }
+
+    fn note_reach(&self, reach: Reach) {
+        self.reach.replace(Some((Instant::now(), reach)));
+    }
+
+    /// Something came, so the controller is reached.
+    fn heard(&self) {
+        if self.reach.borrow().is_some() {
+            self.reach.replace(None);
+        }
     }
 
     fn refuse(&self, name: &str, peer: SocketAddr, why: &str, count: impl FnOnce(&mut Refusals)) {
@@ -188,6 +210,12 @@ pub(super) async fn run(
     mut events: impl FnMut(LinkEvent<'_>),
 ) {
     let link = Link { name, control };
+    let mut events = |event: LinkEvent<'_>| {
+        if let LinkEvent::Bytes(_) = event {
+            control.heard();
+        }
+        events(event);
+    };
     loop {
         let session = control.opened().await;
         let result = match endpoint {
@@ -204,7 +232,10 @@ pub(super) async fn run(
         if !control.is_over(session) {
             match result {
                 Ok(()) => info!(link = name, "closed by the controller"),
-                Err(error) => debug!(link = name, %error, "cannot connect"),
+                Err(error) => {
+                    debug!(link = name, %error, "cannot connect");
+                    control.note_reach(reach_of(&error));
+                }
             }
             control.close();
             events(LinkEvent::Down);
@@ -212,7 +243,75 @@ pub(super) async fn run(
     }
 }
 
+/// Tries whether the controller is there, without giving it anything: connects and closes, or waits for
+/// its client. Returns when that is known.
+pub(super) async fn probe(
+    name: &str,
+    endpoint: &Endpoint,
+    control: &LinkControl,
+    is_frame: impl Fn(&[u8]) -> bool,
+) {
+    let link = Link { name, control };
+    let result = match endpoint {
+        Endpoint::Tcp { host, port } => {
+            let connected = tokio::time::timeout(MAX_CONNECT, connect((host.as_str(), *port))).await;
+            match connected {
+                Ok(connected) => connected.map(|_| Reach::Reached),
+                Err(_) => Ok(Reach::NoAnswer),
+            }
+        }
+        Endpoint::Udp { host, port } => {
+            tokio::net::lookup_host((host.as_str(), *port)).await.map(|_| Reach::Untried)
+        }
+        Endpoint::TcpListen { listener, controller } => link.await_client(listener, controller).await,
+        Endpoint::UdpListen { socket, controller } => link.await_frame(socket, controller, is_frame).await,
+    };
+    let reach = result.unwrap_or_else(|error| reach_of(&error));
+    control.reach.replace(Some((Instant::now() + REACH_STAYS, reach)));
+}
+
+/// What an error says of the other end.
+fn reach_of(error: &io::Error) -> Reach {
+    match error.kind() {
+        io::ErrorKind::ConnectionRefused => Reach::Refused,
+        io::ErrorKind::TimedOut => Reach::NoAnswer,
+        io::ErrorKind::NotFound => Reach::NoSuchHost,
+        _ if error.to_string().starts_with("failed to lookup") => Reach::NoSuchHost,
+        _ => Reach::Failed(error.to_string()),
+    }
+}
+
 impl Link<'_> {
+    /// Waits until the controller's client connects.
+    async fn await_client(&self, listener: &TcpListener, controller: &str) -> io::Result<Reach> {
+        let (known, _) = self.look_up(Session::FIRST, controller).await?;
+        loop {
+            let (_, peer) = listener.accept().await?;
+            if self.control.is_controller(self.name, &known, peer) {
+                return Ok(Reach::Reached);
+            }
+            yield_fairly().await;
+        }
+    }
+
+    /// Waits until the controller's client sends a frame.
+    async fn await_frame(
+        &self,
+        socket: &UdpSocket,
+        controller: &str,
+        is_frame: impl Fn(&[u8]) -> bool,
+    ) -> io::Result<Reach> {
+        let (known, _) = self.look_up(Session::FIRST, controller).await?;
+        let mut datagram = [0; 2_048];
+        loop {
+            let (len, peer) = socket.recv_from(&mut datagram).await?;
+            if self.control.is_controller(self.name, &known, peer) && is_frame(&datagram[..len]) {
+                return Ok(Reach::Reached);
+            }
+            yield_fairly().await;
+        }
+    }
+
     /// The result of `opening`; `None` if the session is over, even if both happen together.
     async fn while_open<T>(
         &self,
@@ -238,6 +337,12 @@ impl Link<'_> {
 
 /// The default source addresses of programs on this host.
 const THIS_HOST: [IpAddr; 2] = [IpAddr::V4(Ipv4Addr::LOCALHOST), IpAddr::V6(Ipv6Addr::LOCALHOST)];
+/// How long a controller may take to accept a connection, as for the engine.
+const MAX_CONNECT: Duration = Duration::from_secs(2);
+/// An attempt says something for this long: a link that works is not tried again.
+const REACH_COUNTS: Duration = Duration::from_secs(10);
+/// The only attempt of a probe says something to the end.
+const REACH_STAYS: Duration = Duration::from_secs(365 * 24 * 3_600);
 /// If the name's lookup takes longer, data that waited meanwhile is old.
 const MAX_LOOKUP: Duration = Duration::from_millis(100);
 

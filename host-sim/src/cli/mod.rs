@@ -8,6 +8,7 @@ mod check;
 mod codec;
 mod conversation;
 mod convert;
+mod doctor;
 mod export;
 mod extcap;
 mod frame;
@@ -65,6 +66,8 @@ Examples:
   host-sim pendant --ready run/ready.json set DI[3]=1
                                                  act on the controller while it runs
   host-sim gateway -c cell.toml --bind rs485-1=serial:/dev/ttyUSB0
+  host-sim doctor -c cell.toml --bind rs485-1=serial:/dev/ttyUSB0
+                                                 why does it not work?
   host-sim encode cell.toml --part input 1       the frame that switches DO1 on
   host-sim decode cell.toml --part input FF FF 01 EE EE
 
@@ -82,6 +85,9 @@ enum Command {
     /// Run the gateway
     #[command(after_help = GATEWAY_EXAMPLES)]
     Gateway(run::GatewayRun),
+    /// Listen for some seconds and say what is wrong: ports, devices, links, the controller's mode
+    #[command(after_help = doctor::EXAMPLES)]
+    Doctor(doctor::DoctorArgs),
     /// Act on a running controller: press its buttons, set inputs, begin faults, watch its state
     #[command(after_help = pendant::EXAMPLES)]
     Pendant(pendant::PendantArgs),
@@ -139,6 +145,8 @@ Examples:
   host-sim gateway -c cell.toml --bind rs485-1=serial:/dev/ttyUSB0
   host-sim gateway -c cell.toml --bind rs485-1=pty:run/rs485-1 --set controller.address=127.0.0.1
   host-sim gateway -c cell.toml --set port.rs485-1.baud=9600 --stats 1s
+  host-sim gateway -v -c cell.toml --bind rs485-1=serial:/dev/ttyUSB0
+                                                 -v says in words what is wrong, and when it is over
   host-sim gateway -c cell.toml --bind hand=can0 --capture - | wireshark -k -i -
   host-sim gateway -c cell.toml --bind hand=can0 --record run --record-budget 10GiB
   host-sim gateway -c cell.toml --console 127.0.0.1:8480 --console-key console.key --console-state revisions
@@ -300,6 +308,7 @@ pub fn main() -> ExitCode {
         Command::Demo => return crate::demo::run(),
         Command::Controller(run) => return run.controller(),
         Command::Gateway(run) => return run.gateway(),
+        Command::Doctor(args) => return doctor::run(args),
         Command::Pendant(args) => return pendant::run(args),
         Command::Completions { shell } => {
             let mut script = Vec::new();

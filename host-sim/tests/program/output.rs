@@ -37,6 +37,11 @@ fn command_lines(folder: &Path) -> Vec<Vec<String>> {
         .concat(),
         [line(&["gateway", "-c", &gateway, "--bind", &format!("rs485-1=pty:{}", at("line"))]), run.into()]
             .concat(),
+        // Over UDP nothing is tried, and in so short a time nothing is missed.
+        line(&["doctor", "--for", "10ms", "-c", &config("force-sensor.toml")])
+            .into_iter()
+            .chain([format!("--bind=force=pty:{}", at("line"))])
+            .collect(),
         line(&["check", &gateway]),
         line(&["new"]),
         line(&["new", "--device", "robotiq-ft300"]),

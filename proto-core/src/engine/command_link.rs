@@ -8,10 +8,11 @@
 use heapless::{Deque, Vec};
 
 use super::command_tables::{CommandField, Entry, MAX_COMMAND_FIELDS, Picked, Tables, is_asked};
+use super::failed::FailedCommands;
 use super::io::{LinkId, PortId, ReplyCode, Transport};
 use super::not_given::{LastNotGiven, NotGiven};
 use super::outcome::Outcomes;
-use super::session::{Event, Sent, Session};
+use super::session::{Event, Sent, Session, may_go_at};
 use super::stops::{COMMAND_QUEUE, STOP_TTL, Stops, Waiting};
 use crate::command::Keyword;
 use crate::config::{CommandEntry, CommandText, CommandWhen, MAX_PORTS, Span, fill_in};
@@ -53,8 +54,10 @@ pub(super) struct CommandLink {
     way_made_until: Instant,
     /// The newest command that each port's values picked, and the value.
     picked: [Option<(u16, i64)>; MAX_PORTS],
-    /// The newest value of each port that gave no command.
+    /// Likewise the newest value that gave no command.
     not_given: [Option<LastNotGiven>; MAX_PORTS],
+    /// Commands that the controller replied to with a failure.
+    pub failed: FailedCommands,
     /// Results of commands since the engine asked last.
     pub outcomes: Outcomes,
 }
@@ -79,6 +82,7 @@ impl CommandLink {
             way_made_until: Instant::ZERO,
             picked: [None; MAX_PORTS],
             not_given: [None; MAX_PORTS],
+            failed: FailedCommands::NONE,
             outcomes: Outcomes::new(),
         })
     }
@@ -86,6 +90,11 @@ impl CommandLink {
     /// The text of the newest command that a port's values picked.
     pub(super) fn newest_of(&self, port: PortId) -> Option<CommandText<'_>> {
         let (entry, value) = (*self.picked.get(usize::from(port.0))?)?;
+        self.text(entry, value)
+    }
+
+    /// The text that a value picked.
+    pub(super) fn text(&self, entry: u16, value: i64) -> Option<CommandText<'_>> {
         self.tables.entry(entry).map(|(_, text)| CommandText { text, value })
     }
 
@@ -386,8 +395,7 @@ impl CommandLink {
         if let Some((link, at)) = self.crowded()
             && now >= at
         {
-            // The peer does not answer: a new connection is open sooner than a reply can be
-            // expected.
+            // The peer does not answer: a new connection is open before a reply can be expected.
             if let Some(session) = self.session(link) {
                 session.supervisor.give_up(now);
             }
@@ -464,8 +472,7 @@ impl CommandLink {
         self.ordinary.is_free_beside().then_some(LinkId::COMMAND)
     }
 
-    /// The next urgent command of a kind that is not in flight, or has been for too long: nobody
-    /// knows whether the controller has carried that one out.
+    /// The next urgent command of a kind that is not in flight, or for so long that nobody knows its end.
     fn pop_stop(&mut self, now: Instant) -> Option<(Keyword, Waiting)> {
         let sessions = [Some(&self.ordinary), self.urgent.as_ref()];
         self.stops.pop(|keyword| may_go_at(sessions, keyword) <= now)
@@ -576,7 +583,10 @@ impl CommandLink {
             match session.step(&mut rest, now) {
                 None => return,
                 Some(Event::Other) => {}
-                Some(Event::Answered(sent, code)) => self.outcomes.push(sent.command, code),
+                Some(Event::Answered(sent, code)) => {
+                    self.failed.note(sent.command, code, now);
+                    self.outcomes.push(sent.command, code);
+                }
                 Some(Event::TimedOut) => {
                     // A late reply would be taken for that of the next command.
                     session.supervisor.give_up(now);
@@ -586,11 +596,4 @@ impl CommandLink {
             }
         }
     }
-}
-
-/// When an urgent command may be sent although one of its kind is unanswered.
-fn may_go_at(sessions: [Option<&Session>; 2], keyword: Keyword) -> Instant {
-    let sent = sessions.into_iter().flatten().flat_map(|session| [session.in_flight, session.beside]);
-    let same = sent.flatten().filter(|sent| sent.keyword == keyword);
-    same.map(|sent| sent.at + STOP_TTL).max().unwrap_or(Instant::ZERO)
 }

@@ -176,6 +176,8 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         let now = store.now;
         if let Some(link) = self.command.first_mut() {
             link.advance(now);
+            // Silence completes a reply, too.
+            self.note_failed(store);
         }
         each_connection!(self, link => {
             link.advance(store);
@@ -246,6 +248,18 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         .unwrap_or(false)
     }
 
+    /// Notes the controller's states at commands that have just failed.
+    #[inline]
+    fn note_failed<const PORTS: usize>(&mut self, store: &Store<PORTS>) {
+        if let Some(link) = self.command.first_mut()
+            && link.failed.is_open
+        {
+            let newest = self.state.first();
+            link.failed
+                .note_states(newest.and_then(|link| Some((link.codes, store.image.stamp_of(link.group)?))));
+        }
+    }
+
     /// Reads the bytes; returns the rest if the image is to be checked first.
     pub(super) fn received<'b, const PORTS: usize>(
         &mut self,
@@ -255,6 +269,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
     ) -> &'b [u8] {
         if let LinkId::COMMAND | LinkId::URGENT = id {
             self.command.iter_mut().for_each(|link| link.received(id, bytes, store.now));
+            self.note_failed(store);
             return &[];
         }
         with_connection!(self, id, link => link.received(bytes, store)).unwrap_or(&[])

@@ -5,7 +5,7 @@ use super::counters::{LinkCounters, add, bump};
 use super::flight::Flight;
 use super::io::ReplyCode;
 use super::latency::Since;
-use super::stops::Waiting;
+use super::stops::{STOP_TTL, Waiting};
 use crate::command::{ClientEvent, CommandClient, Keyword, ReplyKind, StartError};
 use crate::link::{LinkTimings, Supervisor};
 use crate::time::{Duration, Instant};
@@ -179,4 +179,11 @@ impl Session {
     pub(super) fn deadline(&self) -> Instant {
         self.client.deadline().unwrap_or(Instant::NEVER).min(self.flight.deadline())
     }
+}
+
+/// When an urgent command may be sent although one of its kind is unanswered.
+pub(super) fn may_go_at(sessions: [Option<&Session>; 2], keyword: Keyword) -> Instant {
+    let sent = sessions.into_iter().flatten().flat_map(|session| [session.in_flight, session.beside]);
+    let same = sent.flatten().filter(|sent| sent.keyword == keyword);
+    same.map(|sent| sent.at + STOP_TTL).max().unwrap_or(Instant::ZERO)
 }

@@ -9,6 +9,7 @@ use core::fmt;
 
 use super::bits::Bits;
 use super::counters::PortCounters;
+use super::failed::FailedCommand;
 use super::field_port::{Codec, FieldPort};
 use super::io::{BusState, PortId, PortState, ReplyCode};
 use super::latency::Latency;
@@ -95,6 +96,8 @@ pub struct PortStatus<'a> {
     pub command: Option<CommandText<'a>>,
     /// The newest value that gave no command, and why.
     pub last_not_given: Option<&'a LastNotGiven>,
+    /// The newest of its commands that the controller replied to with a failure.
+    pub last_failed: Option<FailedCommand<'a>>,
     /// The newest rejection. A CAN frame with an unknown id replaces no other rejection: on a
     /// shared bus it is for another node.
     pub last_rejection: Option<&'a LastRejection>,
@@ -275,6 +278,15 @@ impl<'a> Status<'a> {
         self.ports.get(usize::from(port)).map(|port| port.name.as_str())
     }
 
+    fn last_failed(&self, port: PortId) -> Option<FailedCommand<'a>> {
+        let link = self.links.command?;
+        let failed = link.failed.of(port)?;
+        let command = link.text(failed.entry, failed.value)?;
+        let state = self.links.state;
+        let controller = state.and_then(|link| failed.states(&link.dialect));
+        Some(FailedCommand { at: failed.at, command, controller })
+    }
+
     fn port(&self, index: usize, port: &'a FieldPort) -> PortStatus<'a> {
         let (mut heard_at, mut overdue) = (None, 0_usize);
         for (group, frame) in (0..).zip(self.frames).filter(|(_, frame)| usize::from(frame.port) == index) {
@@ -299,6 +311,7 @@ impl<'a> Status<'a> {
             reply: port.reply,
             command: self.links.command.and_then(|link| link.newest_of(port.id)),
             last_not_given: self.links.command.and_then(|link| link.not_given_of(port.id)),
+            last_failed: self.last_failed(port.id),
             last_rejection: port.last_rejection.as_ref(),
             counters: &port.counters,
             peers,

@@ -3,7 +3,7 @@
 //! ```text
 //! { "time_us", "sleeps",
 //!   "ports": { NAME: { "bus", "bus_state"?, "recipe", "state", "age_ms"?, "overdue", "reply",
-//!                      "command"?, "last_not_given"?, "last_rejection"?,
+//!                      "command"?, "last_not_given"?, "last_failed"?, "last_rejection"?,
 //!                      "peers"?: { NUMBER: { "presence", "missed_periods", "counters" } },
 //!                      "counters" } },
 //!   "links": { NAME: { "kind", "state", "history", "counters" } },
@@ -18,6 +18,7 @@ use core::fmt;
 
 use serde::ser::{Serialize, SerializeMap, Serializer};
 
+use super::failed::FailedCommand;
 use super::links::LinkInfo;
 use super::not_given::LastNotGiven;
 use super::rejection::LastRejection;
@@ -122,6 +123,9 @@ impl Serialize for PortStatus<'_> {
         if let Some(last) = port.last_not_given {
             map.serialize_entry("last_not_given", &At(last, at))?;
         }
+        if let Some(failed) = &port.last_failed {
+            map.serialize_entry("last_failed", &At(failed, at))?;
+        }
         if let Some(rejection) = port.last_rejection {
             map.serialize_entry("last_rejection", &Rejected(rejection, at))?;
         }
@@ -153,6 +157,19 @@ impl Serialize for At<&LastNotGiven> {
         map.serialize_entry("frame", &last.frame)?;
         map.serialize_entry("field", &last.field)?;
         map.serialize_entry("value", &last.value)?;
+        map.end()
+    }
+}
+
+impl Serialize for At<&FailedCommand<'_>> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let &Self(failed, at) = self;
+        let mut map = serializer.serialize_map(None)?;
+        map.serialize_entry("command", &Text(failed.command))?;
+        map.serialize_entry("age_ms", &at.saturating_since(failed.at).as_millis())?;
+        if let Some(controller) = &failed.controller {
+            map.serialize_entry("controller", controller)?;
+        }
         map.end()
     }
 }

@@ -13,7 +13,6 @@ use std::thread::JoinHandle;
 use std::time::Duration as StdDuration;
 
 use proto_core::time::{Duration, Instant};
-use recipe_capture::Watch;
 use recipe_device::bind::Bind;
 use recipe_net::realtime::Scheduling;
 use recipe_net::timer::now;
@@ -26,8 +25,9 @@ use super::check;
 use super::store::{Entry, Store, digest};
 use super::window::Window;
 use super::{Bound, Console, ConsoleOptions, Source};
+use crate::gateway::{self, Observers};
 use crate::host::{Asker, Handle, Running};
-use crate::{RunOptions, StartError, gateway};
+use crate::{RunOptions, StartError};
 
 /// The configuration that a gateway was started with.
 #[derive(Debug, Clone)]
@@ -157,7 +157,7 @@ impl Supervised {
             state: console.state.clone(),
             binds: options.binds.clone(),
             scheduling: options.scheduling,
-            watch: options.watch.clone(),
+            observers: Observers::of(options),
             put: None,
             failure: None,
         };
@@ -231,8 +231,8 @@ struct Supervisor {
     state: Option<PathBuf>,
     binds: Vec<Bind>,
     scheduling: Scheduling,
-    /// What is seen of each gateway.
-    watch: Watch,
+    /// Who looks at each gateway, but for the console.
+    observers: Observers,
     /// The text that is to be kept, and who sent it.
     put: Option<(String, String)>,
     failure: Option<String>,
@@ -380,8 +380,8 @@ impl Supervisor {
         let config = check::gateway(&name, text, &self.overrides);
         let config = config.map_err(|mistake| StartError::new(format!("{name}: {mistake}")))?;
         let window = Arc::new(Window::new());
-        let shown = Some(Arc::clone(&window));
-        let handle = gateway::spawn(*config, self.binds.clone(), self.scheduling, &self.watch, shown)?;
+        let observers = Observers { window: Some(Arc::clone(&window)), ..self.observers.clone() };
+        let handle = gateway::spawn(*config, self.binds.clone(), self.scheduling, observers)?;
         self.handle = Some((handle, window));
         Ok(())
     }

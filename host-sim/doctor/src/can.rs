@@ -1,0 +1,165 @@
+//! Findings about CAN ports: the bus, and ids that no recipe has.
+
+use proto_core::config::{Bus, Parts};
+use proto_core::engine::BusState;
+use proto_core::sysvar::Direction;
+use proto_core::wire::can::CanId;
+
+use crate::finding::{Cause, Finding, Severity};
+use crate::port::Seen;
+use crate::record::SeenId;
+
+/// Looks at the bus and at what came on it.
+pub(crate) fn examine(seen: &Seen<'_>, state: BusState, findings: &mut Vec<Finding>) {
+    match state {
+        BusState::BusOff => {
+            findings.push(bus(seen, Cause::BusOff, "the CAN controller is bus-off"));
+            return;
+        }
+        BusState::Passive => {
+            findings.push(bus(seen, Cause::BusErrors, "the CAN controller is error-passive"))
+        }
+        BusState::Active | BusState::Warning => {}
+    }
+    let recipe_ids: Vec<CanId> = seen.case.config.can_ids(seen.recipe, Direction::Input).collect();
+    if recipe_ids.is_empty() || !seen.is_silent() || seen.counters.frames_in > 0 {
+        return;
+    }
+    let foreign: Vec<&SeenId> =
+        seen.record.ids().iter().filter(|one| !recipe_ids.contains(&one.id)).collect();
+    let counters = &seen.counters;
+    if counters.rejected_length > 0 {
+        findings.extend(length(seen, &recipe_ids));
+    } else if counters.rejected_remote > 0 {
+        findings.push(seen.found(
+            Severity::Fault,
+            Cause::Remote,
+            [
+                format!("{} remote frames", counters.rejected_remote),
+                "frames with data".into(),
+                "Another node asks for the data, and the device does not send it".into(),
+                "Let the device send by itself".into(),
+            ],
+        ));
+    } else if let Some((one, meant)) = other_kind(&foreign, &recipe_ids) {
+        findings.push(seen.found(
+            Severity::Fault,
+            Cause::IdKind,
+            [
+                format!("id {} seen {} times", one.id, one.count()),
+                format!("id {meant}"),
+                "The number is right; one is an id of 11 bits and the other of 29".into(),
+                "Write `extended` of the frame in the recipe as the device has it".into(),
+            ],
+        ));
+    } else if !foreign.is_empty() {
+        findings.push(ids(seen, foreign, &recipe_ids));
+    } else if seen.recipe.exchanges.len == 0 && seen.case.running.as_millis() >= 3_000 {
+        findings.push(nothing(seen, &recipe_ids));
+    }
+}
+
+fn bus(seen: &Seen<'_>, cause: Cause, what: &str) -> Finding {
+    let bitrate = bitrate(seen);
+    seen.found(Severity::Fault, cause, [
+        what.into(),
+        "error-active".into(),
+        "Nobody acknowledges, or the nodes have different bit rates: a wire is open or swapped, a terminator \
+         is missing, or no other node is on"
+            .into(),
+        format!("Check CAN-H and CAN-L, 120 ohm at both ends, and that all nodes have {bitrate} bit/s"),
+    ])
+}
+
+fn bitrate(seen: &Seen<'_>) -> u32 {
+    match seen.port.bus {
+        Bus::Can { bitrate } => bitrate,
+        _ => 0,
+    }
+}
+
+fn words(ids: &[CanId]) -> String {
+    let shown: Vec<_> = ids.iter().take(4).map(CanId::to_string).collect();
+    let more = if ids.len() > 4 { " and others" } else { "" };
+    format!("{}{more}", shown.join(", "))
+}
+
+/// Ids that nobody knows, the most frequent first.
+fn ids(seen: &Seen<'_>, mut foreign: Vec<&SeenId>, recipe_ids: &[CanId]) -> Finding {
+    foreign.sort_by_key(|one| std::cmp::Reverse(one.count()));
+    let shown: Vec<_> =
+        foreign.iter().take(4).map(|one| format!("id {} seen {} times", one.id, one.count())).collect();
+    seen.found(
+        Severity::Fault,
+        Cause::ForeignIds,
+        [
+            shown.join(", "),
+            format!("id {}", words(recipe_ids)),
+            "The device has another number, or the ids of the recipe are another device's".into(),
+            "Set the device's number, or write the id that is seen in the recipe".into(),
+        ],
+    )
+}
+
+/// The same number as an id of the other kind.
+fn other_kind<'a>(foreign: &[&'a SeenId], recipe_ids: &[CanId]) -> Option<(&'a SeenId, CanId)> {
+    let number = |id: CanId| match id {
+        CanId::Standard(id) => u32::from(id),
+        CanId::Extended(id) => id,
+    };
+    foreign.iter().find_map(|one| {
+        let meant = recipe_ids.iter().find(|id| number(**id) == number(one.id))?;
+        Some((*one, *meant))
+    })
+}
+
+/// Frames of the right id and another length.
+fn length(seen: &Seen<'_>, recipe_ids: &[CanId]) -> Option<Finding> {
+    let one = seen.record.ids().iter().find(|one| recipe_ids.contains(&one.id))?;
+    let Parts::Can { input, .. } = &seen.recipe.parts else { return None };
+    let frame = input.iter().find(|frame| frame.id == one.id)?;
+    let fields = frame.fields.of(seen.case.config.fields);
+    let sizes = fields.iter().map(|field| match field {
+        proto_core::config::FieldSpec::System(var) => Some(var.size()),
+        proto_core::config::FieldSpec::UserInput { ty, .. } => Some(ty.size()),
+        _ => None,
+    });
+    let expected = sizes.sum::<Option<usize>>();
+    Some(seen.found(
+        Severity::Fault,
+        Cause::CanLength,
+        [
+            format!("id {} with {} bytes", one.id, one.len),
+            expected.map_or("the length of the recipe".into(), |len| format!("{len} bytes")),
+            "The fields of the recipe are not those of the device".into(),
+            "Correct the fields of this id in the recipe".into(),
+        ],
+    ))
+}
+
+fn nothing(seen: &Seen<'_>, recipe_ids: &[CanId]) -> Finding {
+    let severity = if seen.status.age.is_some() { Severity::Fault } else { Severity::Warning };
+    let seconds = seen.status.age.unwrap_or(seen.case.running).as_millis() / 1000;
+    if seen.record.fd_frames > 0 {
+        return seen.found(
+            Severity::Fault,
+            Cause::CanLength,
+            [
+                format!("{} CAN FD frames", seen.record.fd_frames),
+                "classic CAN frames".into(),
+                "The device sends CAN FD".into(),
+                "Set the device to classic CAN".into(),
+            ],
+        );
+    }
+    seen.found(severity, Cause::NoBytes, [
+        format!("0 frames in {seconds} s"),
+        format!("id {}", words(recipe_ids)),
+        "The device is off or not started, has another bit rate, or a wire is open".into(),
+        format!(
+            "Check the power, CAN-H and CAN-L, and the bit rate ({} bit/s); some devices need a start message, \
+             such as CANopen's",
+            bitrate(seen)
+        ),
+    ])
+}

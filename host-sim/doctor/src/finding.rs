@@ -1,0 +1,237 @@
+//! One finding, and its words.
+
+use std::fmt;
+
+use serde::ser::{Serialize, SerializeMap, Serializer};
+
+/// How much a finding matters.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Severity {
+    /// Nothing may be wrong: something could not be seen.
+    Note,
+    /// It may be meant so: a device that has not spoken yet.
+    Warning,
+    /// It cannot work like this.
+    Fault,
+}
+
+impl Severity {
+    /// One word: `note`, `warning` or `fault`.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Note => "note",
+            Self::Warning => "warning",
+            Self::Fault => "fault",
+        }
+    }
+}
+
+/// What a finding is about.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Place {
+    /// The field port of this name.
+    Port(String),
+    /// The link of this name.
+    Link(String),
+    /// The controller.
+    Controller,
+}
+
+impl fmt::Display for Place {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Port(name) => write!(f, "port {name}"),
+            Self::Link(name) => write!(f, "link {name}"),
+            Self::Controller => f.write_str("controller"),
+        }
+    }
+}
+
+macro_rules! causes {
+    ($($(#[$doc:meta])* $variant:ident = $name:literal,)*) => {
+        /// The likely cause, for programs; people read the words.
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+        #[non_exhaustive]
+        pub enum Cause {
+            $($(#[$doc])* $variant,)*
+        }
+
+        impl Cause {
+            /// All of them.
+            pub const ALL: &[Self] = &[$(Self::$variant),*];
+
+            /// Its name in JSON, such as `head_swapped`.
+            pub const fn name(self) -> &'static str {
+                match self {
+                    $(Self::$variant => $name,)*
+                }
+            }
+        }
+    };
+}
+
+causes! {
+    /// The port's device is not there.
+    DeviceGone = "device_gone",
+    /// Nothing arrives.
+    NoBytes = "no_bytes",
+    /// Bytes arrive, and no frame begins in them: baud rate, parity, or another protocol.
+    NoHead = "no_head",
+    /// The head's bytes come in the other order.
+    HeadSwapped = "head_swapped",
+    /// Frames of the right length begin with other bytes.
+    HeadDiffers = "head_differs",
+    /// Bit 7 is a parity bit.
+    SevenBits = "seven_bits",
+    /// Frames of the right length end with other bytes.
+    TailDiffers = "tail_differs",
+    /// Frames have another number of bytes.
+    LengthDiffers = "length_differs",
+    /// Frames begin and break off.
+    BrokenOff = "broken_off",
+    /// Numbers make sense in the other byte order only.
+    ByteOrder = "byte_order",
+    /// The checksum is right when it is computed otherwise.
+    ChecksumKind = "checksum_kind",
+    /// The checksum is wrong, however it is computed.
+    ChecksumWrong = "checksum_wrong",
+    /// Frames are those of another device.
+    OtherDevice = "other_device",
+    /// A field is not a number, or its value does not fit.
+    BadValue = "bad_value",
+    /// The device's counter stands still.
+    Frozen = "frozen",
+    /// Bytes arrive, and the recipe has no input part.
+    NoInput = "no_input",
+    /// Some frames are damaged.
+    Noise = "noise",
+    /// A slave does not answer.
+    PeerSilent = "peer_silent",
+    /// Another slave answers.
+    PeerOther = "peer_other",
+    /// What is sent is heard.
+    Echo = "echo",
+    /// A slave refuses.
+    PeerRefuses = "peer_refuses",
+    /// The CAN controller has left the bus.
+    BusOff = "bus_off",
+    /// The CAN controller sees many errors.
+    BusErrors = "bus_errors",
+    /// CAN frames have ids that no recipe has.
+    ForeignIds = "foreign_ids",
+    /// The number is right, and the kind of id is not.
+    IdKind = "id_kind",
+    /// CAN frames have another length.
+    CanLength = "can_length",
+    /// Remote frames come in place of data.
+    Remote = "remote",
+    /// The controller's port does not take a connection.
+    Refused = "refused",
+    /// Nobody answers at the controller's address.
+    Unreachable = "unreachable",
+    /// The controller's name cannot be resolved.
+    NoSuchHost = "no_such_host",
+    /// Connected, and nothing comes.
+    LinkSilent = "link_silent",
+    /// What comes is of another protocol or dialect.
+    Dialect = "dialect",
+    /// The controller refuses requests.
+    LinkRefuses = "link_refuses",
+    /// Datagrams are sent and nothing comes back.
+    OneWay = "one_way",
+    /// The controller has not connected to the listening port.
+    NotConnected = "not_connected",
+    /// Somebody else than the controller connects.
+    Stranger = "stranger",
+    /// The controller is in manual mode.
+    Manual = "manual",
+    /// The arm has no power.
+    PowerOff = "power_off",
+    /// The arm is not enabled.
+    Disabled = "disabled",
+    /// The controller is still starting.
+    Starting = "starting",
+    /// The emergency stop or a safety door.
+    SafetyStop = "safety_stop",
+    /// A program runs already.
+    ProgramRuns = "program_runs",
+    /// No program has this name.
+    ProgramName = "program_name",
+    /// A command failed and nothing says why.
+    CommandFailed = "command_failed",
+    /// No reply came to a command.
+    NoReply = "no_reply",
+    /// A command was not sent.
+    NotSent = "not_sent",
+}
+
+/// What is wrong, with the words for people.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Finding {
+    /// How much it matters.
+    pub severity: Severity,
+    /// What it is about.
+    pub place: Place,
+    /// The likely cause, for programs.
+    pub cause: Cause,
+    /// What is seen, such as `175 bytes, 0 frames; first seen AA 48`.
+    pub seen: String,
+    /// What was expected, such as `the head 48 AA`; may be empty.
+    pub expected: String,
+    /// The likely cause in words.
+    pub likely: String,
+    /// What to do.
+    pub remedy: String,
+}
+
+impl fmt::Display for Finding {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}: {}", self.place, self.seen)?;
+        if !self.expected.is_empty() {
+            write!(f, "; expected {}", self.expected)?;
+        }
+        write!(f, ". {}. {}.", self.likely, self.remedy)
+    }
+}
+
+impl Serialize for Finding {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let (kind, name) = match &self.place {
+            Place::Port(name) => ("port", name.as_str()),
+            Place::Link(name) => ("link", name.as_str()),
+            Place::Controller => ("controller", ""),
+        };
+        let mut map = serializer.serialize_map(None)?;
+        map.serialize_entry("severity", self.severity.name())?;
+        map.serialize_entry("place", kind)?;
+        if !name.is_empty() {
+            map.serialize_entry("name", name)?;
+        }
+        map.serialize_entry("cause", self.cause.name())?;
+        map.serialize_entry("seen", &self.seen)?;
+        map.serialize_entry("expected", &self.expected)?;
+        map.serialize_entry("likely", &self.likely)?;
+        map.serialize_entry("remedy", &self.remedy)?;
+        map.serialize_entry("text", &self.to_string())?;
+        map.end()
+    }
+}
+
+/// Makes a finding.
+pub(crate) fn finding(
+    (severity, place, cause): (Severity, &Place, Cause),
+    seen: impl Into<String>,
+    expected: impl Into<String>,
+    likely: impl Into<String>,
+    remedy: impl Into<String>,
+) -> Finding {
+    Finding {
+        severity,
+        place: place.clone(),
+        cause,
+        seen: seen.into(),
+        expected: expected.into(),
+        likely: likely.into(),
+        remedy: remedy.into(),
+    }
+}

@@ -1,0 +1,295 @@
+//! Findings about links: is the controller reached, and does it answer.
+
+use proto_core::config::Parts;
+use proto_core::engine::{LinkInfo, LinkKind, Transport};
+use proto_core::link::LinkState;
+
+use crate::Case;
+use crate::finding::{Cause, Finding, Place, Severity, finding};
+use crate::record::{LinkFacts, Reach};
+
+/// Looks at each link.
+pub(crate) fn examine(case: &Case<'_>, findings: &mut Vec<Finding>) {
+    for info in case.status.links() {
+        // What the second connection to port 2000 lacks, the first carries.
+        if info.kind == LinkKind::Urgent {
+            continue;
+        }
+        let facts = case.links.iter().find(|facts| facts.link == info.id);
+        let place = Place::Link(info.name.to_owned());
+        let link = Link { case, info, facts, place };
+        findings.extend(link.finding());
+        findings.extend(link.strangers());
+    }
+}
+
+struct Link<'a> {
+    case: &'a Case<'a>,
+    info: LinkInfo<'a>,
+    facts: Option<&'a LinkFacts>,
+    place: Place,
+}
+
+impl Link<'_> {
+    fn found(
+        &self,
+        severity: Severity,
+        cause: Cause,
+        [seen, expected, likely, remedy]: [String; 4],
+    ) -> Finding {
+        finding((severity, &self.place, cause), seen, expected, likely, remedy)
+    }
+
+    fn fault(&self, cause: Cause, words: [String; 4]) -> Option<Finding> {
+        Some(self.found(Severity::Fault, cause, words))
+    }
+
+    fn to(&self) -> String {
+        match self.info.endpoint.transport {
+            Transport::Tcp { port } => format!("{} port {port} (TCP)", self.info.endpoint.host),
+            Transport::Udp { port } => format!("{} port {port} (UDP)", self.info.endpoint.host),
+            Transport::TcpListen { local } => format!("{local} (TCP)"),
+            Transport::UdpListen { local } => format!("{local} (UDP)"),
+            _ => self.info.endpoint.host.to_owned(),
+        }
+    }
+
+    /// What the port is for, and where it is switched on.
+    fn service(&self) -> (&'static str, &'static str) {
+        match self.info.kind {
+            LinkKind::Command => ("the command port, usually 2000", "command"),
+            LinkKind::State => ("the state stream, usually 2001", "state"),
+            LinkKind::Modbus => ("the Modbus server, usually 502", "modbus"),
+            _ => ("the recipe server, usually 2011", "udp2011"),
+        }
+    }
+
+    fn is_up(&self) -> bool {
+        matches!(self.info.state, LinkState::Up { .. } | LinkState::Shared)
+    }
+
+    fn finding(&self) -> Option<Finding> {
+        let reach = self.facts.and_then(|facts| facts.reach.as_ref());
+        match self.info.kind {
+            LinkKind::RecipeTcpListen { .. } | LinkKind::RecipeUdpListen { .. } => self.listening(reach),
+            LinkKind::RecipeUdp => self.datagrams(reach),
+            _ if reach == Some(&Reach::Reached) || self.is_up() => self.connected(),
+            _ => self.not_connected(reach),
+        }
+    }
+
+    fn not_connected(&self, reach: Option<&Reach>) -> Option<Finding> {
+        let (what, key) = self.service();
+        let tried = self.info.history.failed_opens;
+        // The first attempt is still under way.
+        if reach.is_none()
+            && tried == 0
+            && self.info.history.losses == 0
+            && self.case.running.as_millis() < 2_000
+        {
+            return None;
+        }
+        let (to, expected) = (self.to(), format!("a connection to {what}"));
+        let host = self.info.endpoint.host;
+        match reach {
+            Some(Reach::Refused) => self.fault(Cause::Refused, [
+                format!("{to} refuses the connection"),
+                expected,
+                "The machine is there and nobody listens at this port: another port number, or the service is off"
+                    .into(),
+                format!("Check controller.ports.{key} of the file, and that the service is on at the pendant"),
+            ]),
+            Some(Reach::NoSuchHost) => self.fault(Cause::NoSuchHost, [
+                format!("the name {host} is not known"),
+                expected,
+                "controller.address is misspelt, or no name server knows it".into(),
+                "Write the controller's IP address".into(),
+            ]),
+            Some(Reach::Failed(error)) => self.fault(Cause::Unreachable, [
+                format!("{to}: {error}"),
+                expected,
+                "The network does not lead there".into(),
+                format!("Try `ping {host}`; check cable, address and mask"),
+            ]),
+            _ => self.fault(Cause::Unreachable, [
+                format!("no answer from {to}"),
+                expected,
+                "controller.address is another machine's or nobody's, a cable is unplugged, or a firewall drops it"
+                    .into(),
+                format!("Try `ping {host}`; check cable, address and mask"),
+            ]),
+        }
+    }
+
+    fn connected(&self) -> Option<Finding> {
+        let counters = self.info.counters;
+        let to = self.to();
+        let (what, key) = self.service();
+        let since = match self.info.state {
+            LinkState::Up { since } => self.case.status.at().saturating_since(since).as_millis(),
+            _ => 0,
+        };
+        let silences = self.info.history.silences;
+        match self.info.kind {
+            LinkKind::State if counters.malformed > 0 && counters.malformed >= counters.received => self
+                .fault(
+                    Cause::Dialect,
+                    [
+                        format!("{to} sends {} bytes that are no state packets", counters.bytes_in),
+                        "packets of 1468 bytes".into(),
+                        "Another port, or a controller version with another packet".into(),
+                        format!("Check controller.ports.{key} and controller.dialect"),
+                    ],
+                ),
+            LinkKind::State if counters.received == 0 && (silences > 0 || since >= 1_500) => self.fault(
+                Cause::LinkSilent,
+                [
+                    format!("{to} is connected; {} bytes, 0 packets", counters.bytes_in),
+                    "ten packets a second".into(),
+                    format!("This is not {what}, or the controller is still starting"),
+                    format!("Check controller.ports.{key}"),
+                ],
+            ),
+            LinkKind::Modbus if counters.refused > 0 && counters.refused >= counters.received => self.fault(
+                Cause::LinkRefuses,
+                [
+                    format!("{to} refuses {} of {} requests", counters.refused, counters.sent),
+                    "answers".into(),
+                    "The controller's Modbus map lacks these registers: another software version".into(),
+                    "Check controller.dialect, and the variables that `host-sim check` sends over Modbus"
+                        .into(),
+                ],
+            ),
+            LinkKind::Modbus if counters.timeouts > 0 && counters.received == 0 => self.fault(
+                Cause::LinkSilent,
+                [
+                    format!("{to} answers none of {} requests", counters.sent),
+                    "answers of a Modbus server".into(),
+                    format!("Something else than {what} listens there"),
+                    format!("Check controller.ports.{key}"),
+                ],
+            ),
+            LinkKind::Command if counters.timeouts > 0 && counters.received == 0 => self.fault(
+                Cause::Dialect,
+                [
+                    format!("{to} replies to none of {} commands", counters.sent),
+                    "a reply to each".into(),
+                    format!("This is not {what}, or the controller wants another end of line"),
+                    format!("Check controller.ports.{key} and controller.dialect"),
+                ],
+            ),
+            _ => None,
+        }
+    }
+
+    /// Whether the recipe of the link to the controller's recipe server has an output part, so that the
+    /// controller sends.
+    fn expects_answers(&self) -> bool {
+        let link = self.case.config.controller.recipe_link;
+        let recipe = link.and_then(|link| self.case.config.recipes.get(usize::from(link.recipe)));
+        matches!(recipe.map(|recipe| &recipe.parts), Some(Parts::Stream { output: Some(_), .. }))
+    }
+
+    fn datagrams(&self, reach: Option<&Reach>) -> Option<Finding> {
+        let counters = self.info.counters;
+        let (to, (what, key)) = (self.to(), self.service());
+        let remedy = format!(
+            "Check controller.ports.{key}, and that the recipe is assigned to the controller's UDP server at the pendant"
+        );
+        match reach {
+            Some(Reach::Refused) => {
+                return self.fault(
+                    Cause::Refused,
+                    [
+                        format!(
+                            "{} sent, {} received; {to} refuses datagrams",
+                            counters.sent, counters.received
+                        ),
+                        format!("{what} of the controller"),
+                        "The machine is there and nobody listens at this UDP port".into(),
+                        remedy,
+                    ],
+                );
+            }
+            Some(Reach::Untried) => {
+                return Some(self.found(
+                    Severity::Note,
+                    Cause::OneWay,
+                    [
+                        format!("{to} was not tried: over UDP that takes a frame"),
+                        String::new(),
+                        "The controller is given nothing here".into(),
+                        "Run the gateway with -v, which tells whether the controller answers".into(),
+                    ],
+                ));
+            }
+            Some(Reach::NoSuchHost | Reach::Failed(_)) if !self.is_up() => return self.not_connected(reach),
+            _ => {}
+        }
+        if counters.received > 0 || counters.sent < MANY_SENT {
+            return None;
+        }
+        let severity = if self.expects_answers() { Severity::Fault } else { Severity::Note };
+        let seen = format!("{} sent, 0 received at {to}", counters.sent);
+        Some(match severity {
+            Severity::Fault => self.found(
+                severity,
+                Cause::OneWay,
+                [
+                    seen,
+                    "the controller's frames: the recipe has an output part".into(),
+                    "Another UDP port than the controller's, no recipe assigned to it, or a firewall".into(),
+                    remedy,
+                ],
+            ),
+            _ => self.found(
+                severity,
+                Cause::OneWay,
+                [
+                    seen,
+                    String::new(),
+                    "The recipe has no output part, so nothing shows whether the controller takes the frames"
+                        .into(),
+                    "An output part with any variable would show it".into(),
+                ],
+            ),
+        })
+    }
+
+    fn listening(&self, reach: Option<&Reach>) -> Option<Finding> {
+        if self.is_up() || reach == Some(&Reach::Reached) || self.case.running.as_millis() < 3_000 {
+            return None;
+        }
+        let seconds = self.case.running.as_millis() / 1000;
+        self.fault(
+            Cause::NotConnected,
+            [
+                format!("nobody has connected to {} for {seconds} s", self.to()),
+                format!("the controller at {}", self.info.endpoint.host),
+                "The controller's recipe client is off or has another address or port".into(),
+                "Enter this machine's address and this port at the pendant; open the port in the firewall"
+                    .into(),
+            ],
+        )
+    }
+
+    fn strangers(&self) -> Option<Finding> {
+        let strangers = self.facts.map_or(0, |facts| facts.strangers);
+        (strangers > 0 && !self.is_up()).then(|| {
+            self.found(
+                Severity::Fault,
+                Cause::Stranger,
+                [
+                    format!("{strangers} connections or datagrams from other addresses"),
+                    format!("the controller at {}", self.info.endpoint.host),
+                    "The controller has another address than the file says, or another machine connects"
+                        .into(),
+                    "Correct controller.address; the log of -v names the peer".into(),
+                ],
+            )
+        })
+    }
+}
+
+/// So many datagrams without an answer are no accident.
+const MANY_SENT: u32 = 50;

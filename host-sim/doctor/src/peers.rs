@@ -1,0 +1,209 @@
+//! Findings about slaves and other peers that a port asks.
+
+use proto_core::config::{Exchange, Talk};
+use proto_core::device::{Algorithm, ByteOrder};
+use proto_core::engine::PeerStatus;
+use proto_core::modbus::Exception;
+use proto_core::schedule::Presence;
+
+use crate::bytes::{Hex, count};
+use crate::finding::{Cause, Finding, Severity};
+use crate::port::Seen;
+
+/// Looks at each peer.
+pub(crate) fn examine(seen: &Seen<'_>, findings: &mut Vec<Finding>) {
+    let exchanges = seen.case.config.exchanges_of(seen.recipe);
+    let is_served = exchanges.iter().any(|exchange| matches!(exchange.talk, Talk::Served { .. }));
+    if is_served {
+        served(seen, exchanges, findings);
+        return;
+    }
+    let is_modbus = exchanges.iter().any(|exchange| matches!(exchange.talk, Talk::Rtu { .. }));
+    for peer in seen.status.peers() {
+        let counters = peer.counters;
+        if peer.presence == Presence::Down && counters.requests >= 2 {
+            findings.push(silent(seen, peer, is_modbus));
+        } else if counters.refused > 0 && counters.refused.saturating_mul(10) > counters.replies {
+            findings.push(refuses(seen, peer, is_modbus));
+        } else if counters.checksums >= 3 && counters.checksums.saturating_mul(10) > counters.replies {
+            findings.push(noise(seen, peer));
+        }
+    }
+}
+
+fn name(peer: PeerStatus, is_modbus: bool) -> String {
+    let word = if is_modbus { "slave" } else { "device" };
+    format!("{word} {}", peer.number)
+}
+
+fn silent(seen: &Seen<'_>, peer: PeerStatus, is_modbus: bool) -> Finding {
+    let who = name(peer, is_modbus);
+    let asked =
+        format!("{who} asked {} times, {} good replies", peer.counters.requests, peer.counters.replies);
+    let bytes = seen.record.bytes();
+    let expected = format!("replies of {who}");
+    let fault = |cause, words| seen.found(Severity::Fault, cause, words);
+    if is_modbus {
+        let frames = rtu_frames(&bytes);
+        // A request that is heard is no reply: eight bytes of a function that only reads.
+        let is_request = |frame: &&[u8]| frame.len() == 8 && (1..=4).contains(&frame[1]) && frame[2] != 3;
+        if frames.iter().any(|frame| frame[0] == peer.number && is_request(frame)) {
+            return fault(
+                Cause::Echo,
+                [
+                    format!("{asked}; the request itself is heard"),
+                    expected,
+                    "The adapter hears what it sends".into(),
+                    "Write echo = true for the port, or switch the adapter's echo off".into(),
+                ],
+            );
+        }
+        let known = |number: u8| seen.status.peers().any(|peer| peer.number == number);
+        if let Some(frame) = frames.iter().find(|frame| !known(frame[0])) {
+            return fault(
+                Cause::PeerOther,
+                [
+                    format!("{asked}; a right frame of slave {} is heard: {}", frame[0], Hex(shown(frame))),
+                    expected,
+                    "The slave has another address".into(),
+                    format!(
+                        "Set the slave's address to {}, or write slave = {} in the recipe",
+                        peer.number, frame[0]
+                    ),
+                ],
+            );
+        }
+    }
+    if peer.counters.checksums > 0 {
+        return noise(seen, peer);
+    }
+    if !bytes.is_empty() && seen.counters.bytes_in > 0 && seen.status.peers().count() == 1 {
+        return fault(
+            Cause::PeerSilent,
+            [
+                format!(
+                    "{asked}; {} heard: {}",
+                    count(seen.counters.bytes_in as usize, "byte"),
+                    Hex(shown(&bytes))
+                ),
+                expected,
+                "Something answers, and no reply is right: baud rate, parity, address or protocol".into(),
+                "Compare the settings of the port with the device's".into(),
+            ],
+        );
+    }
+    fault(
+        Cause::PeerSilent,
+        [
+            format!("{asked}; no byte of it"),
+            expected,
+            "It is off or has another address, baud rate or parity, or the wires A and B are open or swapped"
+                .into(),
+            "Check power, address and line settings of the device".into(),
+        ],
+    )
+}
+
+fn noise(seen: &Seen<'_>, peer: PeerStatus) -> Finding {
+    seen.found(
+        Severity::Fault,
+        Cause::ChecksumWrong,
+        [
+            format!(
+                "{} replies of {} with a wrong checksum, {} good ones",
+                peer.counters.checksums, peer.number, peer.counters.replies
+            ),
+            "replies with a right one".into(),
+            "Bytes are damaged: two slaves with one address, parity, or a bad line".into(),
+            "Check addresses, parity, ground and termination".into(),
+        ],
+    )
+}
+
+fn refuses(seen: &Seen<'_>, peer: PeerStatus, is_modbus: bool) -> Finding {
+    let why = match (is_modbus, peer.counters.refusal) {
+        (true, code) if code > 0 => format!(": {} (code {code})", Exception::from_code(code)),
+        _ => String::new(),
+    };
+    seen.found(
+        Severity::Fault,
+        Cause::PeerRefuses,
+        [
+            format!(
+                "{} refuses {} of {} requests{why}",
+                name(peer, is_modbus),
+                peer.counters.refused,
+                peer.counters.requests
+            ),
+            "answers".into(),
+            "A register address, a count or a function is not the device's".into(),
+            "Compare the exchanges of the recipe with the device's manual; many count registers from 1"
+                .into(),
+        ],
+    )
+}
+
+/// The gateway is the slave.
+fn served(seen: &Seen<'_>, exchanges: &[Exchange], findings: &mut Vec<Finding>) {
+    let Some(own) = exchanges.first().map(|exchange| exchange.peer) else { return };
+    if seen.counters.frames_in > 0 || !seen.is_silent() {
+        return;
+    }
+    let frames_of = seen.record.bytes();
+    let frames = rtu_frames(&frames_of);
+    if let Some(frame) = frames.iter().find(|frame| frame[0] != own && frame[0] != 0) {
+        findings.push(seen.found(
+            Severity::Fault,
+            Cause::PeerOther,
+            [
+                format!("requests to slave {}: {}", frame[0], Hex(shown(frame))),
+                format!("requests to slave {own}"),
+                "The master asks another address".into(),
+                format!("Let the master ask slave {own}, or write slave = {} in the recipe", frame[0]),
+            ],
+        ));
+    }
+}
+
+fn shown(bytes: &[u8]) -> &[u8] {
+    &bytes[..bytes.len().min(12)]
+}
+
+/// Frames of Modbus RTU among bytes: an address, a function and a right checksum around them.
+fn rtu_frames(bytes: &[u8]) -> Vec<&[u8]> {
+    let (mut at, mut frames) = (0, Vec::new());
+    while at + 4 <= bytes.len() {
+        match rtu_len(&bytes[at..]) {
+            Some(len) => {
+                frames.push(&bytes[at..at + len]);
+                at += len;
+            }
+            None => at += 1,
+        }
+    }
+    frames
+}
+
+/// The length of the frame of Modbus RTU at the front.
+fn rtu_len(bytes: &[u8]) -> Option<usize> {
+    let function = *bytes.get(1)?;
+    let is_known = matches!(function & 0x7F, 1..=6 | 15 | 16 | 22 | 23);
+    if !is_known || bytes[0] > 247 {
+        return None;
+    }
+    // What the third byte of a reply says, a request or a short reply, a refusal.
+    let counted = bytes.get(2).map(|count| usize::from(*count) + 5);
+    let lens = [counted, Some(8), Some(5)];
+    lens.into_iter().flatten().find(|&len| {
+        bytes.get(..len).is_some_and(|frame| {
+            let (front, sum) = frame.split_at(len - 2);
+            let right = Algorithm::CRC16_MODBUS.of([front]);
+            let order = Algorithm::CRC16_MODBUS.order();
+            let found = match order {
+                ByteOrder::Little => u16::from_le_bytes([sum[0], sum[1]]),
+                _ => u16::from_be_bytes([sum[0], sum[1]]),
+            };
+            u32::from(found) == right
+        })
+    })
+}

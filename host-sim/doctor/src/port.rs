@@ -1,0 +1,460 @@
+//! Findings about field ports: what comes in, and why it is no frame.
+
+use proto_core::config::{Bus, Parity, Port, Recipe};
+use proto_core::engine::{FieldBus, PortCounters, PortId, PortState, PortStatus, Rejection};
+use proto_core::recipe::model::Mode;
+
+use crate::bytes::{Hex, count, list};
+use crate::finding::{Cause, Finding, Place, Severity, finding};
+use crate::record::{PortRecord, WINDOW};
+use crate::shape::Shape;
+use crate::stream::{self, Fit};
+use crate::{Case, can, checksum, peers};
+
+/// Looks at each field port.
+pub(crate) fn examine(case: &Case<'_>, findings: &mut Vec<Finding>) {
+    for status in case.status.ports() {
+        let found = case.config.field_ports().find(|(index, ..)| PortId(*index) == status.id);
+        let Some((_, port, recipe)) = found else { continue };
+        let empty = PortRecord::new(status.id);
+        let record = case.ports.iter().find(|record| record.port == status.id).unwrap_or(&empty);
+        let seen = Seen {
+            case,
+            port,
+            recipe,
+            place: Place::Port(status.name.to_owned()),
+            counters: since(status.counters, &record.counters_before(case.status.at())),
+            record,
+            status,
+        };
+        seen.examine(findings);
+    }
+}
+
+/// A port and what was seen of it in the window.
+pub(crate) struct Seen<'a> {
+    pub(crate) case: &'a Case<'a>,
+    pub(crate) port: &'a Port,
+    pub(crate) recipe: &'a Recipe,
+    pub(crate) place: Place,
+    pub(crate) status: PortStatus<'a>,
+    pub(crate) record: &'a PortRecord,
+    /// Counted within the window.
+    pub(crate) counters: PortCounters,
+}
+
+/// What was counted between two instants, of the counters that tell something.
+fn since(now: &PortCounters, before: &PortCounters) -> PortCounters {
+    let mut counters = *now;
+    macro_rules! subtract {
+        ($($name:ident)*) => { $(counters.$name = now.$name.wrapping_sub(before.$name);)* };
+    }
+    subtract!(
+        frames_in bytes_in rejected_not_finite rejected_out_of_range rejected_id rejected_length
+        rejected_remote rejected_checksum rejected_unreadable rejected_other_device rejected_counter
+        rejected_no_input tail_mismatches resync_bytes discarded_bytes unanswered refused
+    );
+    counters
+}
+
+impl Seen<'_> {
+    fn examine(&self, findings: &mut Vec<Finding>) {
+        if self.status.state == PortState::Gone {
+            findings.push(self.gone());
+            return;
+        }
+        if let FieldBus::Can { state } = self.status.bus {
+            can::examine(self, state, findings);
+        } else {
+            self.line(findings);
+        }
+        peers::examine(self, findings);
+    }
+
+    /// Makes a finding about the port.
+    pub(crate) fn found(
+        &self,
+        severity: Severity,
+        cause: Cause,
+        [seen, expected, likely, remedy]: [String; 4],
+    ) -> Finding {
+        finding((severity, &self.place, cause), seen, expected, likely, remedy)
+    }
+
+    fn gone(&self) -> Finding {
+        let device = match self.record.device.as_str() {
+            "" => "its device".to_owned(),
+            device => device.to_owned(),
+        };
+        self.found(
+            Severity::Fault,
+            Cause::DeviceGone,
+            [
+                format!("{device} is not there"),
+                String::new(),
+                "The adapter is unplugged, without power, or another program has it".into(),
+                "Plug it in; `ls -l /dev/serial/by-id` shows adapters, `ip link` shows CAN interfaces".into(),
+            ],
+        )
+    }
+
+    /// Whether an input frame is overdue, or has never come.
+    pub(crate) fn is_silent(&self) -> bool {
+        self.status.overdue > 0
+    }
+
+    /// In words, how many bytes and frames came within the window.
+    pub(crate) fn came(&self) -> String {
+        let (bytes, frames) = (self.counters.bytes_in as usize, self.counters.frames_in as usize);
+        format!("{}, {}", count(bytes, "byte"), count(frames, "frame"))
+    }
+
+    fn line(&self, findings: &mut Vec<Finding>) {
+        let counters = &self.counters;
+        if counters.rejected_no_input > 0 {
+            findings.push(self.no_input());
+            return;
+        }
+        let Some(shape) = Shape::of(self.case.config, self.recipe) else { return };
+        if counters.bytes_in == 0 {
+            // A device that is asked is judged by its answers.
+            if self.is_silent() && self.recipe.exchanges.len == 0 && self.case.running >= NOTHING_FOR {
+                findings.push(self.no_bytes(&shape));
+            }
+            return;
+        }
+        let bytes = self.bytes();
+        let frames = shape.frames(&bytes);
+        if let Some((read, swapped)) = stream::other_order(&shape, &frames) {
+            findings.push(self.byte_order(&shape, read, swapped));
+            return;
+        }
+        let found = self.rejected(&shape, &bytes).or_else(|| self.nearest(&shape, &bytes));
+        findings.extend(found);
+    }
+
+    /// The newest bytes; without a record those of the newest rejection.
+    fn bytes(&self) -> Vec<u8> {
+        let bytes = self.record.bytes();
+        match (bytes.is_empty(), self.status.last_rejection) {
+            (true, Some(last)) => last.bytes().to_vec(),
+            _ => bytes,
+        }
+    }
+
+    /// Whether so many of the window's frames were rejected that it is no accident.
+    fn are_many(&self, rejected: u32) -> bool {
+        rejected >= 3 && rejected.saturating_mul(10) > self.counters.frames_in
+            || rejected >= 1 && self.counters.frames_in == 0
+    }
+
+    fn no_bytes(&self, shape: &Shape<'_>) -> Finding {
+        let severity = if self.status.age.is_some() { Severity::Fault } else { Severity::Warning };
+        let seconds = self.status.age.unwrap_or(self.case.running).as_millis() / 1000;
+        let device = match self.record.device.as_str() {
+            "" => String::new(),
+            device => format!(" at {device}"),
+        };
+        let expected = match shape.head {
+            [] => "frames".to_owned(),
+            head => format!("frames that begin with {}", Hex(head)),
+        };
+        self.found(
+            severity,
+            Cause::NoBytes,
+            [
+                format!("0 bytes in {seconds} s{device}"),
+                expected,
+                "The device is off, does not send by itself, or the wires A and B are open or swapped".into(),
+                format!(
+                    "Check the power, the wires and the device's mode of output{}",
+                    if self.record.device.is_empty() { "" } else { "; make sure that this is its adapter" }
+                ),
+            ],
+        )
+    }
+
+    fn no_input(&self) -> Finding {
+        let bytes = self.bytes();
+        self.found(
+            Severity::Warning,
+            Cause::NoInput,
+            [
+                format!("{}; first seen {}", self.came(), Hex(first(&bytes))),
+                "nothing: the recipe has no input part".into(),
+                "The device sends, and nobody listens".into(),
+                "Add [recipe.input] to the recipe, or assign another recipe to the port".into(),
+            ],
+        )
+    }
+
+    /// Frames that were found and rejected.
+    fn rejected(&self, shape: &Shape<'_>, bytes: &[u8]) -> Option<Finding> {
+        let counters = &self.counters;
+        let fault = |cause, words| Some(self.found(Severity::Fault, cause, words));
+        if self.are_many(counters.rejected_checksum) {
+            let whole = self.status.last_rejection.filter(|last| last.why == Rejection::Checksum);
+            let whole = whole.filter(|last| last.len == last.bytes().len()).map(|last| last.bytes().to_vec());
+            let found = checksum::right_one(shape, bytes)
+                .or_else(|| whole.and_then(|frame| checksum::right_one(shape, &frame)));
+            let seen = format!(
+                "{}, {} of them with a wrong checksum",
+                self.came_of(counters.rejected_checksum),
+                counters.rejected_checksum
+            );
+            return match found {
+                Some(right) => fault(
+                    Cause::ChecksumKind,
+                    [
+                        seen,
+                        "the checksum of the recipe".into(),
+                        format!("The checksum is right as {right}"),
+                        "Write that in `checksum` of the recipe".into(),
+                    ],
+                ),
+                None => fault(
+                    Cause::ChecksumWrong,
+                    [
+                        seen,
+                        "the checksum of the recipe".into(),
+                        "Bytes are damaged on the line, or the checksum is of another kind or range".into(),
+                        "Compare with the device's manual: algorithm, first and last byte; check the wires"
+                            .into(),
+                    ],
+                ),
+            };
+        }
+        if self.are_many(counters.rejected_other_device) {
+            return self.other_device(shape);
+        }
+        if self.are_many(counters.rejected_counter) {
+            return fault(
+                Cause::Frozen,
+                [
+                    format!("{} frames with the counter of the frame before", counters.rejected_counter),
+                    "a counter that goes on".into(),
+                    "The device repeats an old frame: its program hangs".into(),
+                    "Restart the device".into(),
+                ],
+            );
+        }
+        let unreadable = counters.rejected_unreadable.wrapping_add(counters.rejected_out_of_range);
+        if self.are_many(unreadable) {
+            let last = self.status.last_rejection;
+            let why = last.map_or("a value does not fit", |last| last.why.text());
+            let of = last.map_or(String::new(), |last| format!(" in {}", Hex(last.bytes())));
+            return fault(
+                Cause::BadValue,
+                [
+                    format!("{unreadable} frames rejected: {why}{of}"),
+                    "values that fit the fields and variables of the recipe".into(),
+                    "A field's type, place or scale is not the device's".into(),
+                    "Compare with `host-sim decode FILE --part input` and the bytes above".into(),
+                ],
+            );
+        }
+        None
+    }
+
+    /// In words, so many frames were found, accepted or not.
+    fn came_of(&self, rejected: u32) -> String {
+        let frames = self.counters.frames_in.wrapping_add(rejected) as usize;
+        format!("{}, {}", count(self.counters.bytes_in as usize, "byte"), count(frames, "frame"))
+    }
+
+    fn other_device(&self, shape: &Shape<'_>) -> Option<Finding> {
+        let last = self.status.last_rejection.filter(|last| last.why == Rejection::OtherDevice);
+        let bytes = last.map(|last| last.bytes()).unwrap_or_default();
+        let differs = shape.constants.iter().find_map(|constant| {
+            let seen = bytes.get(constant.at..constant.at + constant.bytes.len())?;
+            (seen != constant.bytes).then_some((constant, seen))
+        });
+        let (seen, expected) = match differs {
+            Some((constant, seen)) => (
+                format!("{} in byte {}", Hex(seen), constant.at + 1),
+                format!("{} there", Hex(&constant.bytes)),
+            ),
+            None => ("another constant".into(), "that of the recipe".into()),
+        };
+        Some(self.found(
+            Severity::Fault,
+            Cause::OtherDevice,
+            [
+                format!("{} whole frames with {seen}", self.counters.rejected_other_device),
+                expected,
+                "The frames are right and of another device: its address or number is another one".into(),
+                "Set the device's address, or write its number in the recipe".into(),
+            ],
+        ))
+    }
+
+    fn byte_order(&self, shape: &Shape<'_>, read: f64, swapped: f64) -> Finding {
+        let is_little =
+            shape.floats.first().is_some_and(|number| number.order == proto_core::device::ByteOrder::Little);
+        let (own, other) = if is_little { ("little", "big") } else { ("big", "little") };
+        let remedy = if self.recipe.mode == Mode::Realtime {
+            "A realtime recipe is little-endian, as the controller's own: set the device's byte order, or \
+             describe the frame as a user recipe with endian = \"big\""
+                .to_owned()
+        } else {
+            format!("Write endian = \"{other}\" in the part or the field of the recipe")
+        };
+        self.found(
+            Severity::Fault,
+            Cause::ByteOrder,
+            [
+                format!("floats such as {read:e}; with their bytes reversed {swapped}"),
+                format!("{own}-endian floats"),
+                format!("The device sends {other}-endian"),
+                remedy,
+            ],
+        )
+    }
+
+    /// Bytes that are no frame.
+    fn nearest(&self, shape: &Shape<'_>, bytes: &[u8]) -> Option<Finding> {
+        let counters = &self.counters;
+        if counters.frames_in > 0 {
+            return self.noise();
+        }
+        let lost = counters.resync_bytes.wrapping_add(counters.discarded_bytes);
+        if lost == 0 || !self.is_silent() {
+            return None;
+        }
+        let fault = |cause, words| Some(self.found(Severity::Fault, cause, words));
+        let came = self.came();
+        let hex = |bytes: &[u8]| Hex(bytes).to_string();
+        let whole = shape.len.map_or(String::new(), |len| format!("frames of {len} bytes, "));
+        match stream::fit(shape, bytes)? {
+            Fit::HeadSwapped { seen } => fault(
+                Cause::HeadSwapped,
+                [
+                    format!("{came}; first seen {}", hex(&seen)),
+                    format!("the head {}", hex(shape.head)),
+                    "The bytes of the head are swapped".into(),
+                    format!("Write head = {} in the recipe, or change the device", list(&seen)),
+                ],
+            ),
+            Fit::HeadDiffers { seen } => fault(
+                Cause::HeadDiffers,
+                [
+                    format!("{came}; frames begin with {}", hex(&seen)),
+                    format!("the head {}", hex(shape.head)),
+                    "The device's head is another one".into(),
+                    format!("Write head = {} in the recipe, or change the device", list(&seen)),
+                ],
+            ),
+            Fit::SevenBits => fault(
+                Cause::SevenBits,
+                [
+                    format!("{came}; first seen {}", hex(first(bytes))),
+                    format!("the head {}", hex(shape.head)),
+                    "The head is there without bit 7: the device sends 7 data bits and parity".into(),
+                    "Set the device to 8 data bits".into(),
+                ],
+            ),
+            Fit::TailDiffers { seen } => fault(
+                Cause::TailDiffers,
+                [
+                    format!("{came}; frames end with {}", hex(&seen)),
+                    format!("the tail {}", hex(shape.tail)),
+                    "The device's tail is another one, or the fields have another order or types".into(),
+                    format!("Write tail = {} in the recipe, or correct its fields", list(&seen)),
+                ],
+            ),
+            Fit::Length { seen } => {
+                let len = shape.len.unwrap_or(0);
+                let (by, word) = (seen.abs_diff(len), if seen > len { "longer" } else { "shorter" });
+                fault(
+                    Cause::LengthDiffers,
+                    [
+                        format!("{came}; frames of {seen} bytes"),
+                        format!("{whole}head and tail included"),
+                        format!("The device's frame is {} {word}", count(by, "byte")),
+                        "Correct the fields of the recipe: one is missing, too many, or of another type"
+                            .into(),
+                    ],
+                )
+            }
+            Fit::BrokenOff { seen } => fault(
+                Cause::BrokenOff,
+                [
+                    format!("{came}; after the head {} came {seen} bytes, then silence", hex(shape.head)),
+                    format!("{whole}without a pause"),
+                    "The frame is shorter than the recipe says, or the device pauses within it".into(),
+                    "Correct the fields of the recipe, or raise idle_gap_ms of the port".into(),
+                ],
+            ),
+            Fit::NoHead => fault(Cause::NoHead, self.no_head(shape, bytes, came)),
+        }
+    }
+
+    fn no_head(&self, shape: &Shape<'_>, bytes: &[u8], came: String) -> [String; 4] {
+        let high = bytes.iter().filter(|byte| **byte > 0x7F).count() * 100 / bytes.len().max(1);
+        let edge = bytes
+            .iter()
+            .filter(|byte| matches!(**byte, 0x00 | 0xFF | 0x80 | 0xC0 | 0xE0 | 0xF0 | 0xF8 | 0xFC | 0xFE))
+            .count();
+        let edge = edge * 100 / bytes.len().max(1);
+        let settings = match &self.port.bus {
+            Bus::Rs485(line) => {
+                let parity = match line.parity {
+                    Parity::None => "no parity",
+                    Parity::Even => "even parity",
+                    Parity::Odd => "odd parity",
+                };
+                format!(
+                    "{} baud, {parity}, {} stop bit{}",
+                    line.baud,
+                    line.stop_bits,
+                    if line.stop_bits == 1 { "" } else { "s" }
+                )
+            }
+            _ => String::new(),
+        };
+        let likely = if edge >= 60 {
+            "Bytes arrive, no head, and most are runs of equal bits: the baud rate is wrong"
+        } else {
+            "Bytes arrive, no head: baud rate or parity, or another protocol"
+        };
+        [
+            format!("{came}; first seen {}; {high} % of the bytes above 7F", Hex(first(bytes))),
+            match shape.head {
+                [] => format!("the tail {}", Hex(shape.tail)),
+                head => format!("the head {}", Hex(head)),
+            },
+            likely.into(),
+            format!("Compare baud rate, parity and stop bits with the device's; the port has {settings}"),
+        ]
+    }
+
+    /// Frames come, and others are damaged.
+    fn noise(&self) -> Option<Finding> {
+        let counters = &self.counters;
+        let bad = counters.tail_mismatches.max(counters.rejected_checksum).max(counters.rejected_not_finite);
+        let is_much = bad >= 5 && bad.saturating_mul(10) > counters.frames_in;
+        is_much.then(|| {
+            self.found(
+                Severity::Warning,
+                Cause::Noise,
+                [
+                    format!("{} right frames and {bad} damaged ones", counters.frames_in),
+                    "right frames only".into(),
+                    "Bytes are lost or damaged on the line, or the head occurs within the data".into(),
+                    "Check ground, shield and termination of the line; a longer head helps".into(),
+                ],
+            )
+        })
+    }
+}
+
+/// A few bytes to show.
+fn first(bytes: &[u8]) -> &[u8] {
+    &bytes[..bytes.len().min(SHOWN)]
+}
+
+/// Number of bytes that are shown.
+const SHOWN: usize = 12;
+/// Silence that is worth a word.
+const NOTHING_FOR: proto_core::time::Duration = proto_core::time::Duration::from_secs(3);
+const _: () = assert!(NOTHING_FOR.as_micros() < WINDOW.as_micros());

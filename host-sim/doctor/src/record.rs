@@ -1,0 +1,144 @@
+//! What a driver keeps for the doctor: the newest bytes and ids of a port, and facts of a link.
+//!
+//! Everything is bounded, and taking a chunk costs a copy of its bytes.
+
+use std::collections::VecDeque;
+
+use proto_core::engine::{LinkId, PortCounters, PortId};
+use proto_core::time::{Duration, Instant};
+use proto_core::wire::can::{CanFrame, CanId};
+
+/// Number of newest bytes of a port that are kept.
+pub const KEPT: usize = 1024;
+/// Maximum number of ids of a CAN bus that are counted; further ones are left out.
+const MAX_IDS: usize = 64;
+/// Findings are about this much time before now.
+pub const WINDOW: Duration = Duration::from_secs(5);
+
+/// What came in at a field port.
+#[derive(Debug, Clone)]
+pub struct PortRecord {
+    /// The port.
+    pub port: PortId,
+    bytes: VecDeque<u8>,
+    /// Frames of each id in this window and in the one before.
+    ids: Vec<SeenId>,
+    turned_at: Instant,
+    /// Counters at earlier instants, the oldest first.
+    before: VecDeque<(Instant, PortCounters)>,
+    /// CAN FD frames, which no recipe takes.
+    pub fd_frames: u64,
+    /// Where the port is bound to, such as `serial:/dev/ttyUSB0`; may be empty.
+    pub device: String,
+}
+
+/// Frames of an id.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct SeenId {
+    pub(crate) id: CanId,
+    /// Length of the newest.
+    pub(crate) len: usize,
+    now: u32,
+    before: u32,
+}
+
+impl SeenId {
+    pub(crate) fn count(&self) -> u32 {
+        self.now.saturating_add(self.before)
+    }
+}
+
+impl PortRecord {
+    /// An empty record of a port.
+    pub fn new(port: PortId) -> Self {
+        Self {
+            port,
+            bytes: VecDeque::with_capacity(KEPT),
+            ids: Vec::new(),
+            turned_at: Instant::ZERO,
+            before: VecDeque::new(),
+            fd_frames: 0,
+            device: String::new(),
+        }
+    }
+
+    /// Bytes came. The newest [`KEPT`] are kept.
+    pub fn heard(&mut self, bytes: &[u8]) {
+        let bytes = &bytes[bytes.len().saturating_sub(KEPT)..];
+        let excess = (self.bytes.len() + bytes.len()).saturating_sub(KEPT);
+        self.bytes.drain(..excess);
+        self.bytes.extend(bytes);
+    }
+
+    /// A CAN frame came.
+    pub fn frame(&mut self, frame: &CanFrame) {
+        let (id, len) = (frame.id(), frame.data().len());
+        if let Some(seen) = self.ids.iter_mut().find(|seen| seen.id == id) {
+            (seen.now, seen.len) = (seen.now.saturating_add(1), len);
+        } else if self.ids.len() < MAX_IDS {
+            self.ids.push(SeenId { id, len, now: 1, before: 0 });
+        }
+    }
+
+    /// Notes the counters of this instant; to be called about once a second.
+    pub fn note(&mut self, now: Instant, counters: &PortCounters) {
+        self.before.push_back((now, *counters));
+        while self.before.len() >= 2 && now.saturating_since(self.before[1].0) >= WINDOW {
+            self.before.pop_front();
+        }
+        if now.saturating_since(self.turned_at) >= WINDOW {
+            self.turned_at = now;
+            self.ids.retain_mut(|seen| {
+                seen.before = std::mem::take(&mut seen.now);
+                seen.before > 0
+            });
+        }
+    }
+
+    /// The counters at the beginning of the window; zeros if the run is younger.
+    pub(crate) fn counters_before(&self, now: Instant) -> PortCounters {
+        let is_old = |at: Instant| now.saturating_since(at) >= WINDOW;
+        match self.before.front() {
+            Some((at, counters)) if is_old(*at) => *counters,
+            _ => PortCounters::default(),
+        }
+    }
+
+    /// The newest bytes, the oldest first.
+    pub(crate) fn bytes(&self) -> Vec<u8> {
+        self.bytes.iter().copied().collect()
+    }
+
+    pub(crate) fn ids(&self) -> &[SeenId] {
+        &self.ids
+    }
+}
+
+/// What a driver knows of a link beyond the engine's status.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct LinkFacts {
+    /// The link.
+    pub link: LinkId,
+    /// Whether its place was reached, if that was tried.
+    pub reach: Option<Reach>,
+    /// Connections and datagrams from other addresses than the controller's.
+    pub strangers: u64,
+}
+
+/// How an attempt to reach the controller ended.
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Reach {
+    /// A connection was made, or a datagram came.
+    Reached,
+    /// The machine answered that nobody listens there.
+    Refused,
+    /// Nobody answered.
+    NoAnswer,
+    /// The name is not known.
+    NoSuchHost,
+    /// It cannot be tried without sending something.
+    Untried,
+    /// Another error, in the system's words.
+    Failed(String),
+}

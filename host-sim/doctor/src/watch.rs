@@ -1,0 +1,87 @@
+//! When findings begin and end, so that a log has two lines for each and not one a second.
+
+use proto_core::time::{Duration, Instant};
+
+use crate::finding::{Cause, Finding, Place};
+
+/// A finding is told when it was there twice in a row, and its end when it was gone for this long.
+const GONE_FOR: Duration = Duration::from_secs(5);
+/// The same place and cause are told again after this at the earliest.
+const TOLD_AGAIN: Duration = Duration::from_secs(60);
+/// More kinds of findings than a gateway has.
+const MAX_KNOWN: usize = 256;
+
+/// A change that is worth a line.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Change {
+    /// A finding has begun.
+    Begins(Finding),
+    /// It is over.
+    Ends {
+        /// What it was about.
+        place: Place,
+        /// Its cause.
+        cause: Cause,
+    },
+}
+
+/// The findings so far.
+#[derive(Debug, Default)]
+pub struct Watch {
+    known: Vec<Known>,
+}
+
+#[derive(Debug)]
+struct Known {
+    place: Place,
+    cause: Cause,
+    first_at: Instant,
+    newest_at: Instant,
+    told_at: Option<Instant>,
+    is_told: bool,
+}
+
+impl Watch {
+    /// No findings yet.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Takes the findings of this instant; returns what has changed. To be called about once a second.
+    pub fn update(&mut self, now: Instant, findings: &[Finding]) -> Vec<Change> {
+        let mut changes = Vec::new();
+        for finding in findings {
+            let is_same = |known: &&mut Known| known.place == finding.place && known.cause == finding.cause;
+            let Some(known) = self.known.iter_mut().find(is_same) else {
+                if self.known.len() < MAX_KNOWN {
+                    self.known.push(Known {
+                        place: finding.place.clone(),
+                        cause: finding.cause,
+                        first_at: now,
+                        newest_at: now,
+                        told_at: None,
+                        is_told: false,
+                    });
+                }
+                continue;
+            };
+            if now.saturating_since(known.newest_at) >= GONE_FOR {
+                known.first_at = now;
+            }
+            known.newest_at = now;
+            let may_tell = known.told_at.is_none_or(|at| now.saturating_since(at) >= TOLD_AGAIN);
+            if !known.is_told && known.first_at < now && may_tell {
+                (known.is_told, known.told_at) = (true, Some(now));
+                changes.push(Change::Begins(finding.clone()));
+            }
+        }
+        for known in &mut self.known {
+            if known.is_told && now.saturating_since(known.newest_at) >= GONE_FOR {
+                known.is_told = false;
+                changes.push(Change::Ends { place: known.place.clone(), cause: known.cause });
+            }
+        }
+        self.known.retain(|known| now.saturating_since(known.newest_at) < TOLD_AGAIN);
+        changes
+    }
+}

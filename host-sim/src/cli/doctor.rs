@@ -1,0 +1,100 @@
+//! `host-sim doctor`: listens for some seconds as a gateway would, and says what is wrong.
+//!
+//! In: a gateway file, devices, a time. Out: findings in words or as JSON, and an exit code: 0 nothing found,
+//! 1 findings (a note alone is none), 2 a file or an argument is wrong and nothing was started.
+
+use std::io::{self, Write};
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::time::Duration;
+
+use clap::Args;
+use recipe_device::bind::Bind;
+use recipe_doctor::{Finding, Severity};
+use recipe_shell::out::{Printed, print_stderr};
+use serde_json::json;
+
+use super::run::parse_time;
+use super::{Out, Overrides, check, wrong};
+
+pub(super) const EXAMPLES: &str = "\
+The controller is given nothing: no value, no command, no frame. Its state stream is
+read; its other TCP ports are connected to and closed at once. Its UDP server is not
+tried: that would take a frame. End the gateway first: devices have one owner.
+
+Nothing is sent to the field either. Devices that must be asked, such as Modbus slaves,
+stay silent then; --ask sends what the file says on ports with exchanges, writes too.
+
+Examples:
+  host-sim doctor -c cell.toml --bind rs485-1=serial:/dev/ttyUSB0
+  host-sim doctor -c cell.toml --bind line=serial:/dev/ttyUSB0 --ask --for 20s
+  host-sim doctor -c cell.toml --bind can=socketcan:can0 --json
+  host-sim gateway -v -c cell.toml --bind rs485-1=serial:/dev/ttyUSB0
+                                                 the same findings, while the gateway runs
+
+docs/trouble.md has each symptom with its cause and remedy.
+
+Exit codes: 0 nothing found, 1 something found, 2 a file or an argument is wrong and
+nothing was started.";
+
+/// Arguments of `doctor`.
+#[derive(Debug, Args)]
+pub(super) struct DoctorArgs {
+    /// The gateway file
+    #[arg(short, long, value_name = "FILE")]
+    config: PathBuf,
+    #[command(flatten)]
+    overrides: Overrides,
+    /// Bind a port to a device, as for `gateway`
+    #[arg(long, value_name = "NAME=DEVICE")]
+    bind: Vec<Bind>,
+    /// How long to listen, such as 5s or 1m; devices that speak rarely need longer
+    #[arg(long = "for", value_name = "TIME", default_value = "6s", value_parser = parse_time)]
+    time: Duration,
+    /// Send the requests of ports with exchanges, as the gateway does: a device may move
+    #[arg(long)]
+    ask: bool,
+    /// Print a JSON array of findings
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn run(args: DoctorArgs) -> ExitCode {
+    let config = match check::load_gateway(&args.config, &args.overrides.set) {
+        Ok(config) => config,
+        Err(error) => return wrong(error),
+    };
+    let findings = match recipe_shell::gateway::listen(*config, args.bind, args.time, args.ask) {
+        Ok(findings) => findings,
+        Err(error) => {
+            print_stderr(&error);
+            return ExitCode::from(error.exit_code());
+        }
+    };
+    let mut out = Out::new(io::stdout());
+    let printed = if args.json { print_json(&mut out, &findings) } else { print_words(&mut out, &findings) };
+    let is_well = findings.iter().all(|finding| finding.severity == Severity::Note);
+    out.finish(|end| match (end, printed) {
+        (Printed::Whole, Err(error)) => wrong(error),
+        _ => ExitCode::from(u8::from(!is_well)),
+    })
+}
+
+fn print_json(out: &mut dyn Write, findings: &[Finding]) -> io::Result<()> {
+    writeln!(out, "{}", json!(findings))
+}
+
+fn print_words(out: &mut dyn Write, findings: &[Finding]) -> io::Result<()> {
+    if findings.is_empty() {
+        return writeln!(out, "nothing found");
+    }
+    for finding in findings {
+        writeln!(out, "{}: {}: {}", finding.severity.name(), finding.place, finding.seen)?;
+        if !finding.expected.is_empty() {
+            writeln!(out, "  expected  {}", finding.expected)?;
+        }
+        writeln!(out, "  likely    {}", finding.likely)?;
+        writeln!(out, "  remedy    {}", finding.remedy)?;
+    }
+    Ok(())
+}
