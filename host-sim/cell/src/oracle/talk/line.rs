@@ -134,10 +134,8 @@ impl TalkWatch {
         for (nth, row) in talk.rows.iter().enumerate().filter(|(_, row)| row.rising.is_some()) {
             let Some(on) = bit(row) else { continue };
             let before = self.last_bits.insert(nth, on);
-            if on && before == Some(false) {
-                if self.risen.insert(nth, true) == Some(true) {
-                    self.rose_at.insert(nth, now);
-                }
+            if on && before == Some(false) && self.risen.insert(nth, true) == Some(true) {
+                self.rose_at.insert(nth, now);
             }
         }
     }
