@@ -1,7 +1,7 @@
 //! The console's server: the API of docs/api.md over HTTP, for the gateway and the simulated controller.
 //!
 //! It runs on an ordinary thread of its own. Of the thread that runs the engine it only asks for copies
-//! ([`window`]), at most ten times a second for all readers together, and never lets it wait.
+//! (its window), at most ten times a second for all readers together, and never lets it wait.
 
 mod api;
 mod check;
