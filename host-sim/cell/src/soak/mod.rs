@@ -6,6 +6,7 @@
 //! print: `host-sim soak` does.
 
 mod batch;
+mod behaviour;
 mod cells;
 mod peers;
 mod plc;

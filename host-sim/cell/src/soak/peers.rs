@@ -12,6 +12,7 @@ use proto_core::time::{Duration, Instant};
 use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::Scalar;
 
+use super::behaviour::{Behaves, Behaviour, Change};
 use super::template::{Template, changed};
 use crate::{Device, Done, Rng, SlaveDone};
 
@@ -35,8 +36,7 @@ pub(super) struct Peers {
 #[derive(Debug)]
 struct Peer {
     number: u8,
-    behaviour: Behaviour,
-    behaviour_ends: Instant,
+    behaves: Behaves,
 }
 
 /// One exchange with a request.
@@ -76,27 +76,6 @@ struct Made {
     bytes: Vec<u8>,
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Behaviour {
-    Prompt,
-    Slow,
-    /// Some replies come when they have been given up.
-    Late,
-    /// It refuses what it is asked, if it can.
-    Refusing,
-    /// One bit of some replies is wrong.
-    Damaged,
-    /// Some replies end too early.
-    Short,
-    /// Some replies do not come.
-    Losing,
-    /// Some replies are those to other questions.
-    Mistaken,
-    /// Other bytes come before some replies.
-    Noisy,
-    Dead,
-}
-
 impl Peers {
     /// The devices of a port; `None` if its recipe has no exchanges of frames.
     pub(super) fn new(config: &GatewayConfig, port: &Port, start: Instant, mut rng: Rng) -> Option<Self> {
@@ -125,8 +104,7 @@ impl Peers {
             let number = spec.peer;
             let peer = peers.iter().position(|peer| peer.number == number).unwrap_or(peers.len());
             if peer == peers.len() {
-                let behaviour_ends = start + Duration::from_secs(5);
-                peers.push(Peer { number, behaviour: Behaviour::Prompt, behaviour_ends });
+                peers.push(Peer { number, behaves: Behaves::new(start) });
             }
             let (reply, refusal) = (sends(reply), sends(refusal));
             let Some(request) = frame(request) else {
@@ -163,17 +141,16 @@ impl Peers {
     fn asked(&mut self, nth: usize, request: Vec<u8>, now: Instant) {
         let Self { rng, peers, asks, leaving, done, .. } = self;
         let (number, exchange) = (peers[asks[nth].peer].number, asks[nth].exchange);
-        let peer = &mut peers[asks[nth].peer];
-        if now >= peer.behaviour_ends && peer.changes(now, rng) {
+        let behaves = &mut peers[asks[nth].peer].behaves;
+        if behaves.update(now, rng) == Some(Change::Forgets) {
             done.push(SlaveDone { slave: number, what: Done::Forgot });
         }
-        let behaviour = peer.behaviour;
-        if behaviour == Behaviour::Dead {
+        if behaves.like == Behaviour::Dead {
             return;
         }
-        let refuses = behaviour == Behaviour::Refusing && rng.below(2) == 0;
+        let refuses = behaves.like == Behaviour::Refusing && rng.below(2) == 0;
         let ask = &mut asks[nth];
-        let timeout = ask.timeout.as_micros();
+        let timeout = ask.timeout;
         let answer = match &mut ask.refusal {
             Some(refusal) if refuses => Some(refusal),
             _ => {
@@ -186,15 +163,11 @@ impl Peers {
         done.push(SlaveDone { slave: number, what: Done::Replied { exchange, frame: made.bytes.clone() } });
         let has_checksum = answer.template.has_checksum();
         let template = answer.template.clone();
-        let delay = match behaviour {
-            Behaviour::Slow => rng.below(timeout * 8 / 10),
-            Behaviour::Late if rng.below(2) == 0 => rng.between(timeout / 2, timeout * 2 - MARGIN),
-            _ => rng.below(3_000),
-        };
+        let delay = behaves.delay(timeout, rng);
         let happens = rng.below(2) == 0;
         let len = made.bytes.len() as u64;
         let is_on_can = made.id.is_some();
-        match behaviour {
+        match behaves.like {
             _ if !happens => {}
             // Nothing of this happens to frames on a bus, and nobody could see it without a checksum.
             Behaviour::Damaged | Behaviour::Short | Behaviour::Noisy if is_on_can || !has_checksum => return,
@@ -225,7 +198,7 @@ impl Peers {
                 what: Done::Replied { exchange, frame: made.bytes.clone() },
             });
         }
-        leaving.push((now + Duration::from_micros(delay), made));
+        leaving.push((now + delay, made));
     }
 
     /// The exchange that bytes are the request of.
@@ -316,29 +289,6 @@ impl Device<CanFrame> for Peers {
     }
 }
 
-impl Peer {
-    /// Begins another behaviour; returns whether the device forgets what it was told.
-    fn changes(&mut self, now: Instant, rng: &mut Rng) -> bool {
-        let (behaviour, most) = match rng.below(24) {
-            0..10 => (Behaviour::Prompt, 20_000),
-            10 | 11 => (Behaviour::Slow, 5_000),
-            12 | 13 => (Behaviour::Late, 5_000),
-            14 => (Behaviour::Refusing, 2_000),
-            15 => (Behaviour::Damaged, 5_000),
-            16 => (Behaviour::Short, 3_000),
-            17 => (Behaviour::Losing, 3_000),
-            18 => (Behaviour::Mistaken, 3_000),
-            19 => (Behaviour::Noisy, 3_000),
-            20 | 21 => (Behaviour::Dead, 1_400),
-            22 => (Behaviour::Dead, 10_000),
-            _ => (Behaviour::Dead, 90_000),
-        };
-        let lasts = rng.up_to(Duration::from_millis(most));
-        (self.behaviour, self.behaviour_ends) = (behaviour, now + lasts);
-        behaviour == Behaviour::Dead && lasts > FORGETS_AFTER
-    }
-}
-
 impl Request {
     fn new(
         id: Option<CanId>,
@@ -397,12 +347,6 @@ impl Sends {
     }
 }
 
-/// A reply is at the master this long before twice the timeout, in microseconds: the time of a reply on a
-/// line, of others before it, and in an adapter that gathers bytes.
-const MARGIN: u64 = 45_000;
-/// After this long without power a device has forgotten what it was told. It has been asked often enough
-/// by then that the gateway knows that it was away.
-const FORGETS_AFTER: Duration = Duration::from_millis(1_500);
 /// Longest pause between frames that nobody asked for.
 const UNASKED: Duration = Duration::from_millis(500);
 /// Bytes that are no request after this long never become one.

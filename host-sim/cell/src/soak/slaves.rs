@@ -13,6 +13,7 @@ use proto_core::modbus::server::RegisterBank;
 use proto_core::modbus::{Coils, Exception, Registers};
 use proto_core::time::{Duration, Instant};
 
+use super::behaviour::{Behaves, Behaviour, Change};
 use crate::{Device, Done, Rng, SlaveDone};
 
 /// The slaves of a line.
@@ -31,31 +32,9 @@ struct OneSlave {
     timing: Timing,
     slave: Slave,
     bank: Bank,
-    behaviour: Behaviour,
-    behaviour_ends: Instant,
+    behaves: Behaves,
     /// The shortest timeout of its exchanges.
     timeout: Duration,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Behaviour {
-    Prompt,
-    Slow,
-    /// Some replies come when the master has given them up.
-    Late,
-    /// It refuses what it is asked.
-    Refusing,
-    /// One bit of some replies is wrong.
-    Damaged,
-    /// Some replies end too early.
-    Short,
-    /// Some replies do not come.
-    Losing,
-    /// Some replies have another slave's address.
-    Misnamed,
-    /// Other bytes come before some replies.
-    Noisy,
-    Dead,
 }
 
 /// The registers and coils that are asked for; others are refused.
@@ -94,8 +73,7 @@ impl Slaves {
                     timing,
                     slave: Slave::new(timing, Echo::Absent, exchange.peer)?,
                     bank: Bank::default(),
-                    behaviour: Behaviour::Prompt,
-                    behaviour_ends: start + Duration::from_secs(5),
+                    behaves: Behaves::new(start),
                     timeout: exchange.timeout,
                 });
             }
@@ -116,7 +94,7 @@ impl Slaves {
         let slave = &mut self.slaves[nth];
         let address = slave.address;
         slave.bank.change(rng);
-        slave.bank.refuses = slave.behaviour == Behaviour::Refusing && rng.below(2) == 0;
+        slave.bank.refuses = slave.behaves.like == Behaviour::Refusing && rng.below(2) == 0;
         let mut out = [0; MAX_ADU];
         let len = slave.slave.poll(now, &mut slave.bank, &mut out);
         let wrote = slave.bank.wrote.take();
@@ -130,21 +108,16 @@ impl Slaves {
         let (first, count) = place.unwrap_or_default();
         let what = Done::Answered { address: first, count, reply: reply.clone() };
         self.done.push(SlaveDone { slave: address, what });
-        let timeout = slave.timeout.as_micros();
-        let delay = match slave.behaviour {
-            Behaviour::Slow => rng.below(timeout * 8 / 10),
-            Behaviour::Late if rng.below(2) == 0 => rng.between(timeout / 2, timeout * 2 - MARGIN),
-            _ => rng.below(3_000),
-        };
+        let delay = slave.behaves.delay(slave.timeout, rng);
         let happens = rng.below(2) == 0;
-        match slave.behaviour {
+        match slave.behaves.like {
             Behaviour::Damaged if happens => {
                 let at = rng.below(len as u64) as usize;
                 reply[at] ^= 1 << rng.below(8);
             }
             Behaviour::Short if happens => reply.truncate(rng.between(1, len as u64 - 1) as usize),
             Behaviour::Losing if happens => return,
-            Behaviour::Misnamed if happens => {
+            Behaviour::Mistaken if happens => {
                 let other = others[rng.below(others.len() as u64) as usize];
                 let sealed = [&[other], &reply[1..len - 2]].concat();
                 let crc = crc16(&sealed).to_le_bytes();
@@ -160,7 +133,7 @@ impl Slaves {
             }
             _ => {}
         }
-        self.leaving.push((now + Duration::from_micros(delay), reply));
+        self.leaving.push((now + delay, reply));
     }
 }
 
@@ -168,10 +141,14 @@ impl Device<Vec<u8>> for Slaves {
     fn receive(&mut self, now: Instant, bytes: &Vec<u8>) -> Vec<Vec<u8>> {
         for nth in 0..self.slaves.len() {
             let slave = &mut self.slaves[nth];
-            if now >= slave.behaviour_ends && slave.changes(now, &mut self.rng) {
+            let change = slave.behaves.update(now, &mut self.rng);
+            if let Some(change) = change {
+                slave.change(change);
+            }
+            if change == Some(Change::Forgets) {
                 self.done.push(SlaveDone { slave: slave.address, what: Done::Forgot });
             }
-            if slave.behaviour != Behaviour::Dead {
+            if slave.behaves.like != Behaviour::Dead {
                 slave.slave.received(bytes, now);
             }
         }
@@ -203,34 +180,17 @@ impl Device<Vec<u8>> for Slaves {
 }
 
 impl OneSlave {
-    /// Begins another behaviour; returns whether the slave forgets what was written.
-    fn changes(&mut self, now: Instant, rng: &mut Rng) -> bool {
-        let (behaviour, most) = match rng.below(24) {
-            0..10 => (Behaviour::Prompt, 20_000),
-            10 | 11 => (Behaviour::Slow, 5_000),
-            12 | 13 => (Behaviour::Late, 5_000),
-            14 => (Behaviour::Refusing, 2_000),
-            15 => (Behaviour::Damaged, 5_000),
-            16 => (Behaviour::Short, 3_000),
-            17 => (Behaviour::Losing, 3_000),
-            18 => (Behaviour::Misnamed, 3_000),
-            19 => (Behaviour::Noisy, 3_000),
-            20 | 21 => (Behaviour::Dead, 1_400),
-            22 => (Behaviour::Dead, 10_000),
-            _ => (Behaviour::Dead, 90_000),
-        };
-        let lasts = rng.up_to(Duration::from_millis(most));
-        (self.behaviour, self.behaviour_ends) = (behaviour, now + lasts);
-        if behaviour == Behaviour::Dead
-            && let Some(slave) = Slave::new(self.timing, Echo::Absent, self.address)
-        {
+    /// Does what another behaviour means.
+    fn change(&mut self, change: Change) {
+        if change == Change::Alive {
+            return;
+        }
+        if let Some(slave) = Slave::new(self.timing, Echo::Absent, self.address) {
             self.slave = slave;
         }
-        let forgets = behaviour == Behaviour::Dead && lasts > FORGETS_AFTER;
-        if forgets {
+        if change == Change::Forgets {
             self.bank.forget();
         }
-        forgets
     }
 }
 
@@ -361,10 +321,3 @@ fn crc16(bytes: &[u8]) -> u16 {
         (0..8).fold(crc ^ u16::from(byte), |crc, _| if crc & 1 == 1 { crc >> 1 ^ 0xA001 } else { crc >> 1 })
     })
 }
-
-/// A reply is at the master this long before twice the timeout, in microseconds: the time of a reply on a
-/// line, of others before it, and in an adapter that gathers bytes.
-const MARGIN: u64 = 45_000;
-/// After this long without power a slave has forgotten what was written. The master has asked it often
-/// enough by then to know that it was away.
-const FORGETS_AFTER: Duration = Duration::from_millis(1_500);
