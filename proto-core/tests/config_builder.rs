@@ -348,21 +348,25 @@ fn fields_of_devices_are_written_as_their_manuals_have_them() {
 #[test]
 fn requests_to_devices_are_written_as_their_manuals_have_them() {
     let sum = Checksum::standard(Algorithm::Xor8).over(1, Some(2));
-    let fields = only_fields(Recipe::user("r").stream_output(
-        b"#",
-        b"\r",
-        &[
-            OutputField::constant(Encoding::hex(2), 255.0),
-            OutputField::counter(Encoding::decimal_until(b',')),
-            OutputField::reply(Encoding::uint24()),
-            OutputField::variable(Encoding::decimal(8).decimals(2), "RobotState[8]"),
-            OutputField::variable(Encoding::hex_until(b';'), "BitOutputReg[1]"),
-            OutputField::variable(Encoding::bits(Dword, 0..=7).signed(), "WordOutputReg[1]").wrapping(),
-            OutputField::padding(2, 0xFF),
-            OutputField::checksum(sum),
-            OutputField::constant(Double, 0.5),
-        ],
-    ));
+    let fields = only_fields(
+        Recipe::user("r").stream_output(
+            b"#",
+            b"\r",
+            &[
+                OutputField::constant(Encoding::hex(2), 255.0),
+                OutputField::counter(Encoding::decimal_until(b',')),
+                OutputField::reply(Encoding::uint24()),
+                OutputField::variable(Encoding::decimal(8).decimals(2), "RobotState[8]").limited(-1.5, 9.25),
+                OutputField::variable(Encoding::hex_until(b';'), "BitOutputReg[1]")
+                    .mapped(&[(0, 0, 7.0), (1, 9, 8.0)]),
+                OutputField::variable(Byte, "WordOutputReg[2]").scaled(0.5, 0.0).clamped(0.0, 50.0),
+                OutputField::variable(Encoding::bits(Dword, 0..=7).signed(), "WordOutputReg[1]").wrapping(),
+                OutputField::padding(2, 0xFF),
+                OutputField::checksum(sum),
+                OutputField::constant(Double, 0.5),
+            ],
+        ),
+    );
     let from = |name| OutputBinding::Variable { var: var(name), scale: 1.0, offset: 0.0 };
     let value = |encoding, from| FieldSpec::DeviceOutput { encoding, overflow: Overflow::Usual, from };
     let decimals = Kind::Decimal(Digits { width: Width::Fixed(8), decimals: 2 });
@@ -375,7 +379,15 @@ fn requests_to_devices_are_written_as_their_manuals_have_them() {
             value(Encoding::decimal_until(b','), OutputBinding::Counter),
             value(little(Kind::Uint24), OutputBinding::Reply),
             value(little(decimals), from("RobotState[8]")),
+            FieldSpec::Limits(Limits { low: -1.5, high: 9.25, outside: Outside::Refuse }),
             value(little(Kind::Hex(Width::Until(b';'))), from("BitOutputReg[1]")),
+            FieldSpec::Mapped(MapEntry { first: 0, last: 0, sent: 7.0 }),
+            FieldSpec::Mapped(MapEntry { first: 1, last: 9, sent: 8.0 }),
+            FieldSpec::UserOutput {
+                ty: Byte,
+                from: OutputBinding::Variable { var: var("WordOutputReg[2]"), scale: 0.5, offset: 0.0 },
+            },
+            FieldSpec::Limits(Limits { low: 0.0, high: 50.0, outside: Outside::Clamp }),
             FieldSpec::DeviceOutput {
                 encoding: little(signed),
                 overflow: Overflow::Wrap,

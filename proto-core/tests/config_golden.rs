@@ -11,8 +11,8 @@ use proto_core::config::image::{
     ImageError, MAX_IMAGE, OLDEST_VERSION, VERSION, decode, decode_into, encode, image_len,
 };
 use proto_core::config::{
-    BoardAddress, Bus, CommandWhen, FieldSpec, GatewayConfig, InputBinding, OnStale, OutputBinding, Parity,
-    Parts, PortValue, SendOn, Talk,
+    BoardAddress, Bus, CommandWhen, FieldSpec, GatewayConfig, InputBinding, LinkSource, OnStale,
+    OutputBinding, Outside, Parity, Parts, PortValue, SendOn, Talk,
 };
 use proto_core::device::{Algorithm, Boundary, ByteOrder, Counts, Escape, Kind, Overflow, TextWidth, Width};
 use proto_core::modbus::rtu::Operation;
@@ -165,9 +165,11 @@ fn serialized_types_are_those_of_the_version() {
         CommandWhen,
         FieldSpec,
         InputBinding,
+        LinkSource,
         Mode,
         OnStale,
         OutputBinding,
+        Outside,
         Parity,
         Parts,
         PortValue,

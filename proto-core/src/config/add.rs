@@ -236,6 +236,7 @@ impl ConfigMut<'_> {
                 for (nth, field) in fields.iter().enumerate() {
                     let spec = output_spec(field).map_err(|kind| ConfigError { place: at(nth), kind })?;
                     self.push_field(spec);
+                    field.allowed.specs().for_each(|spec| self.push_field(spec));
                 }
             }
             Fields::Specs(fields) => fields.iter().for_each(|&field| self.push_field(field)),
@@ -379,6 +380,7 @@ fn output_spec(field: &OutputField<'_>) -> Result<FieldSpec, Kind> {
             Sends::Health { port, value, scale, offset } => {
                 OutputBinding::Port { port, value, scale, offset }
             }
+            Sends::Link { link, scale, offset } => OutputBinding::Link { link, scale, offset },
         };
         Ok(match plain(encoding, overflow) {
             Some(ty) => FieldSpec::UserOutput { ty, from },

@@ -229,7 +229,8 @@ fn into_register(field: &mut FieldSpec) {
 fn bits_of(fields: &[FieldSpec]) -> u16 {
     let bytes = fields.iter().map(FieldSpec::longest).fold(0, usize::saturating_add);
     let all = bytes.saturating_mul(8);
-    let highest = fields.iter().rev().map_while(bit_of).max();
+    let is_coil = |field: &&FieldSpec| !field.is_of_field_before();
+    let highest = fields.iter().rev().filter(is_coil).map_while(bit_of).max();
     let last = highest.map_or(0, |highest| 7_usize.saturating_sub(usize::from(highest)));
     all.saturating_sub(last) as u16
 }
@@ -249,6 +250,10 @@ fn pack(fields: &mut [FieldSpec]) -> Result<(usize, u16), Refused> {
         let Some(&field) = fields.get(nth) else { break };
         if let FieldSpec::Padding { len, .. } = field {
             count = count.saturating_add(usize::from(len));
+            continue;
+        }
+        if field.is_of_field_before() {
+            put(fields, &mut kept, field);
             continue;
         }
         let (byte, first) = (count / 8, (count % 8) as u8);

@@ -1,5 +1,6 @@
 //! Warnings about what is valid and works, but often is a mistake of somebody who is new to it: an
-//! address as manuals count it, a stop that acts only on an edge, commands that silence forgets.
+//! address as manuals count it, a stop that acts only on an edge, commands that silence forgets, a timeout
+//! that no device can keep.
 //!
 //! In: a configuration. Out: [`Warning`]s. Nothing is refused here.
 
@@ -9,7 +10,7 @@ use super::{
 };
 use crate::command::Request;
 use crate::device::Kind;
-use crate::modbus::rtu::{Operation, Table};
+use crate::modbus::rtu::{BROADCAST, Operation, Table};
 use crate::sysvar::Direction;
 use crate::time::Duration;
 
@@ -39,7 +40,42 @@ impl Table {
 impl<'c> ConfigView<'c> {
     /// What often is a mistake.
     pub(super) fn advice(self) -> impl Iterator<Item = Warning> + 'c {
-        self.manual_addresses().chain(self.stops_on_edges()).chain(self.forgotten_bases())
+        let commands = self.stops_on_edges().chain(self.forgotten_bases());
+        let times = self.short_timeouts().chain(self.lost_peers());
+        self.manual_addresses().chain(commands).chain(times)
+    }
+
+    /// Devices that are told something once, and that nobody asks often enough to see that they were without
+    /// power.
+    fn lost_peers(self) -> impl Iterator<Item = Warning> + 'c {
+        (0..).zip(self.recipes).flat_map(move |(recipe, of)| {
+            let all = self.exchanges_of(of);
+            let told = (0..).zip(all).filter(|(_, one)| {
+                let is_to_all = matches!(one.talk, Talk::Rtu { .. }) && one.peer == BROADCAST;
+                (one.when.start || one.when.change) && !is_to_all
+            });
+            told.filter_map(move |(exchange, one)| {
+                let mut peers = (0..).zip(all).filter(|(_, other)| other.peer == one.peer);
+                let is_asked = peers.clone().any(|(_, other)| other.when.every.is_some());
+                let is_told = |other: &Exchange| other.when.start || other.when.change;
+                let first = peers.find(|(_, other)| is_told(other)).map(|(nth, _)| nth);
+                let is_first = first == Some(exchange);
+                (is_first && !is_asked).then_some(Warning::NeverLookedFor {
+                    recipe,
+                    exchange,
+                    peer: one.peer,
+                })
+            })
+        })
+    }
+
+    /// Ports whose frames need more time on the line than the timeout leaves.
+    fn short_timeouts(self) -> impl Iterator<Item = Warning> + 'c {
+        let ports = (0..).zip(self.ports).filter(|(_, port)| port.bus.is_field());
+        ports.filter_map(move |(port, config)| {
+            let (time, timeout) = (self.budget(config, Direction::Input)?.time, config.timeout);
+            (timeout < time + time).then_some(Warning::ShortTimeout { port, timeout, time })
+        })
     }
 
     /// Addresses of Modbus that look like the numbers of a manual.

@@ -5,7 +5,7 @@
 
 use core::fmt;
 
-use super::{Bus, ConfigView, Exchange, FieldSpec, Parity, Parts, Port, Recipe, Rs485, Span};
+use super::{Bus, ConfigView, Exchange, FieldSpec, Parity, Parts, Port, Recipe, Rs485, Span, Talk};
 use crate::modbus::rtu::{Echo, Slave, Timing};
 use crate::sysvar::{Direction, SysVar};
 use crate::time::Duration;
@@ -58,7 +58,8 @@ fn bits_time(bits: u64, per_second: u32) -> Duration {
 pub struct PartBudget {
     /// Frames: 1 in a stream part.
     pub frames: usize,
-    /// Bytes of all frames, with heads and tails; on CAN, of their data.
+    /// Bytes of all frames at their longest, with heads, tails and all escape bytes that they may need; on CAN, of
+    /// their data.
     pub bytes: usize,
     /// Time of all frames on the line; zero where there is no line.
     pub time: Duration,
@@ -76,6 +77,7 @@ impl<'c> ConfigView<'c> {
                 let part = if part == Direction::Input { input } else { output }.as_ref()?;
                 let bytes =
                     bytes_of(part.fields).saturating_add(part.head.len()).saturating_add(part.tail.len());
+                let bytes = part.escape.map_or(bytes, |escape| escape.longest(bytes));
                 let time = match &port.bus {
                     Bus::Rs485(line) => line.time_on_line(bytes),
                     _ => Duration::ZERO,
@@ -220,6 +222,25 @@ pub enum Warning {
         /// Its timeout.
         timeout: Duration,
     },
+    /// A device is told something at the start or when it changes, and nothing is asked of it with a period:
+    /// nobody notices that it was without power, so it is not told again.
+    NeverLookedFor {
+        /// The recipe.
+        recipe: u8,
+        /// Index of the first such exchange with it.
+        exchange: u8,
+        /// The slave's address, or the number of the device.
+        peer: u8,
+    },
+    /// A port's timeout is shorter than two of its input frames take on the line, one after the other.
+    ShortTimeout {
+        /// The port.
+        port: u8,
+        /// Its timeout.
+        timeout: Duration,
+        /// How long the frames take.
+        time: Duration,
+    },
     /// A way up carries a variable that no port writes: it is read back from the state stream and
     /// sent on, so for 100 ms a change made by somebody else can be undone.
     ReadBack {
@@ -293,6 +314,26 @@ impl fmt::Display for DescribedWarning<'_> {
                 f,
                 "port {:?}: after {timeout} without a frame, the next value picks no command; for a device that \
                  sends less often set a longer timeout_ms, for one that sends only changes base = \"keep\" as well",
+                port_name(port)
+            ),
+            Warning::NeverLookedFor { recipe, exchange, peer } => {
+                let of = self.config.recipes.get(usize::from(recipe));
+                let asked = of.and_then(|of| self.config.exchanges_of(of).get(usize::from(exchange)));
+                let device = match asked.map(|asked| asked.talk) {
+                    Some(Talk::Rtu { .. }) => "slave",
+                    _ => "device",
+                };
+                write!(
+                    f,
+                    "recipe {:?}: no exchange with {device} {peer} has a period, so nobody notices that it was without \
+                     power, and what it was told is not told again; write every_ms in one of them, such as 500",
+                    recipe_name(recipe)
+                )
+            }
+            Warning::ShortTimeout { port, timeout, time } => write!(
+                f,
+                "port {:?}: a frame takes {time} on the line, but the timeout is {timeout}, so one lost frame or a \
+                 short pause makes the port silent; write two periods of the device or more in timeout_ms",
                 port_name(port)
             ),
             Warning::ReadBack { recipe, var } => write!(

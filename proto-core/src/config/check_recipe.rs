@@ -5,8 +5,9 @@ use super::check_exchange::ExchangeCheck;
 use super::device::field_of;
 use super::error::{ConfigError, ConfigErrorKind as Kind, Place, RecipeKey};
 use super::rules::{Check, check_bit, check_new_name, check_pool, fail, is_marked, mark};
+use super::sendable::Behind;
 use super::{
-    CanFramePart, CommandEntry, ConfigView, Constants, DeviceFrame, FieldSpec, InputBinding,
+    CanFramePart, CommandEntry, ConfigView, Constants, DeviceFrame, FieldSpec, InputBinding, LinkSource,
     MAX_COMMAND_TEXT, OutputBinding, Parts, Recipe, SendOn, Span, Words, placeholders,
 };
 use crate::command::Request;
@@ -54,6 +55,9 @@ impl<'a> RecipeCheck<'a> {
             for (frame, field, spec) in self.config.fields_of(self.recipe, part) {
                 let place = Place::Field { recipe: self.index, part, frame, field };
                 self.check_field(place, part, spec)?;
+            }
+            if part == Direction::Output {
+                self.check_sendable()?;
             }
         }
         if self.recipe.mode == Mode::User {
@@ -110,7 +114,9 @@ impl<'a> RecipeCheck<'a> {
                 | FieldSpec::Padding { .. }
                 | FieldSpec::Checksum(_)
                 | FieldSpec::Length(_),
-            ) => Ok(()),
+            )
+            // What they stand behind is checked with the frame.
+            | (Mode::User, Direction::Output, FieldSpec::Limits(_) | FieldSpec::Mapped(_)) => Ok(()),
             (Mode::User, Direction::Input, FieldSpec::TextInput { to, length_to, count_to, .. }) => {
                 let is_input = |var: SysVar| var.direction() == Direction::Input;
                 let vars = to.iter().map(|words| words.first).chain(length_to).chain(count_to);
@@ -126,6 +132,21 @@ impl<'a> RecipeCheck<'a> {
             }
             (mode, part, _) => fail(place, Kind::WrongField { mode, part }),
         }
+    }
+
+    /// What output fields may send.
+    fn check_sendable(&self) -> Check {
+        let (recipe, part) = (self.index, Direction::Output);
+        for (frame, span) in self.config.frames_of(self.recipe, part) {
+            let mut behind = Behind::default();
+            let mut rest = span.of(self.config.fields);
+            let mut field = 0_u8;
+            while let Some((_, after)) = rest.split_first() {
+                behind.check(Place::Field { recipe, part, frame, field }, rest)?;
+                (rest, field) = (after, field.saturating_add(1));
+            }
+        }
+        Ok(())
     }
 
     fn check_input(&self, place: Place, numbers: Numbers, to: InputBinding) -> Check {
@@ -180,6 +201,20 @@ impl<'a> RecipeCheck<'a> {
                 }
                 if value.is_count() && (scale, offset) != (1.0, 0.0) {
                     return fail(place, Kind::ScaledCount);
+                }
+                check_scale(place, scale, offset)
+            }
+            OutputBinding::Link { link, scale, offset } => {
+                let is_there = match link {
+                    LinkSource::RecipeUdp => self.config.controller.recipe_link.is_some(),
+                    LinkSource::Listening(port) => {
+                        let port = self.config.ports.get(usize::from(port));
+                        port.is_some_and(|port| !port.bus.is_field())
+                    }
+                    LinkSource::Command | LinkSource::Urgent | LinkSource::State | LinkSource::Modbus => true,
+                };
+                if !is_there {
+                    return fail(place, Kind::NoLink { link });
                 }
                 check_scale(place, scale, offset)
             }

@@ -55,7 +55,7 @@ impl fmt::Display for CommandText<'_> {
         let mut rest = self.text.chars();
         loop {
             if let Some(after) = rest.as_str().strip_prefix(PLACEHOLDER) {
-                write!(f, "{}", self.value)?;
+                decimal(self.value).iter().rev().try_for_each(|&digit| f.write_char(digit.into()))?;
                 rest = after.chars();
             } else if let Some(c) = rest.next() {
                 f.write_char(c)?;

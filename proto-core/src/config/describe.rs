@@ -8,7 +8,8 @@ use core::fmt;
 use super::error::{
     ConfigError, ConfigErrorKind, ControllerKey, ExchangeKey, NetworkKey, Place, PortKey, RecipeKey,
 };
-use super::{ConfigView, MAX_NAME, Name};
+use super::{ConfigView, LinkSource, MAX_NAME, Name};
+use crate::decimal::Decimal;
 use crate::device::Algorithm;
 use crate::recipe::model::Mode;
 use crate::sysvar::Direction;
@@ -260,10 +261,13 @@ impl fmt::Display for DescribedKind<'_> {
             Kind::NoInputToAnswer => {
                 f.write_str("sent for each input frame, but the recipe has no input part")
             }
-            Kind::BadScale { scale, offset } => write!(
-                f,
-                "scale {scale} and offset {offset} must be finite numbers, and scale not 0: the value would be lost"
-            ),
+            Kind::BadScale { scale, offset } => {
+                let [scale, offset] = [scale, offset].map(Decimal::Single);
+                write!(
+                    f,
+                    "scale {scale} and offset {offset} must be finite numbers, and scale not 0: the value would be lost"
+                )
+            }
             Kind::Constant(error) => error.fmt(f),
             Kind::NeedsInteger { ty } => {
                 write!(f, "needs an integer field (byte, char, word, short, dword, int); this one is a {ty}")
@@ -274,12 +278,13 @@ impl fmt::Display for DescribedKind<'_> {
                 f.write_str("a counter needs a field that has unsigned integers only")
             }
             Kind::Counter { max, high } => {
-                write!(f, "a counter up to {max} does not fit; allowed: 1..={high}")
+                write!(f, "a counter up to {max} does not fit; allowed: 1..={}", Decimal::Double(high))
             }
             Kind::EchoNeedsExchanges => f.write_str(
                 "allowed only with a recipe of exchanges: other frames are not told from their echo",
             ),
             Kind::NotInField { value, low, high } => {
+                let [value, low, high] = [value, low, high].map(Decimal::Double);
                 write!(f, "the field cannot be {value}; allowed: {low}..={high}")
             }
             Kind::NeedsIntegers => f.write_str("needs a field that has integers only"),
@@ -288,6 +293,29 @@ impl fmt::Display for DescribedKind<'_> {
                 let mut names = Algorithm::names();
                 names.try_for_each(|name| write!(f, " {name}"))
             }
+            Kind::NothingToLimit => f.write_str("only an output field with a source has limits or a map"),
+            Kind::LimitsAndWrap => {
+                f.write_str("overflow = \"wrap\" sends any number; min, max and map do not")
+            }
+            Kind::LimitsAndMap => {
+                f.write_str("a map sends nothing but its own numbers; min, max and outside are not for it")
+            }
+            Kind::LimitedCount => f.write_str("a count wraps, so min, max and map are not allowed"),
+            Kind::ScaledMap => {
+                f.write_str("a map takes the values of the source, so scale and offset are not allowed")
+            }
+            Kind::BackwardLimits { low, high } => {
+                let [low, high] = [low, high].map(Decimal::Double);
+                write!(f, "min {low} is above max {high}")
+            }
+            Kind::FractionOfInteger { value } => {
+                write!(f, "{} has a fraction; this field has integers only", Decimal::Double(value))
+            }
+            Kind::TooManyDecimals { value, decimals } => {
+                let value = Decimal::Double(value);
+                write!(f, "{value} has more than the field's {decimals} digits behind the point")
+            }
+            Kind::MappedTwice { value } => write!(f, "an earlier entry already has the value {value}"),
             Kind::OnlyIntegersWrap => f.write_str("only integers wrap; this one may have a fraction"),
             Kind::NotWords { var, count } => {
                 write!(f, "{count} word variables are needed, such as WordInputReg[1]; found: {var}")
@@ -301,6 +329,7 @@ impl fmt::Display for DescribedKind<'_> {
             Kind::EmptyTable => f.write_str("a command table needs at least one command"),
             Kind::CommandValue { value, ty } => {
                 let (low, high) = ty.range();
+                let [low, high] = [low, high].map(Decimal::Double);
                 write!(f, "a {ty} cannot be {value}; allowed: {low}..={high}")
             }
             Kind::DuplicateCommand { value } => write!(f, "an earlier command already has the value {value}"),
@@ -410,6 +439,13 @@ impl fmt::Display for DescribedKind<'_> {
             Kind::StateValue(error) => error.fmt(f),
             Kind::NoFieldPort { port } => {
                 write!(f, "{} is no field port; only field ports have a health", port_name(port))
+            }
+            Kind::NoLink { link: LinkSource::Listening(port) } => {
+                write!(f, "{} is no port to which the controller connects", port_name(port))
+            }
+            Kind::NoLink { link } => {
+                let name = link.name().unwrap_or_default();
+                write!(f, "there is no link {name}; controller.recipe_link makes it")
             }
             Kind::ScaledCount => f.write_str("a count wraps, so scale and offset are not allowed"),
             Kind::NotForHealth { var } => {

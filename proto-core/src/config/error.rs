@@ -3,7 +3,7 @@
 use core::net::Ipv4Addr;
 
 pub use super::keys::{ControllerKey, ExchangeKey, NetworkKey, PortKey, RecipeKey};
-use super::{ExchangeError, Network, StateValueError};
+use super::{ExchangeError, LinkSource, Network, StateValueError};
 use crate::command::ParseError;
 use crate::device::LayoutError;
 use crate::recipe::PartError;
@@ -110,6 +110,8 @@ pub enum Counted {
     CanFrames,
     /// Entries of all command tables.
     Commands,
+    /// Limits of output fields, and entries of their tables.
+    Sendable,
     /// Safe values of all ports.
     SafeValues,
     /// Field ports of an engine.
@@ -154,6 +156,7 @@ impl core::fmt::Display for Counted {
             Self::Fields => "fields in all recipes together",
             Self::CanFrames => "frames in one part",
             Self::Commands => "commands in all recipes together",
+            Self::Sendable => "limits and map entries of output fields on all ports together",
             Self::SafeValues => "safe values on all ports together",
             Self::FieldPorts => "field ports",
             Self::Texts => "texts of one port",
@@ -314,6 +317,40 @@ pub enum ConfigErrorKind {
     NeedsIntegers,
     /// Only integers wrap around.
     OnlyIntegersWrap,
+    /// Limits or an entry of a table stand behind no output field with a source.
+    NothingToLimit,
+    /// A field that wraps has limits or a table.
+    LimitsAndWrap,
+    /// A field has limits twice, or limits and a table.
+    LimitsAndMap,
+    /// A count wraps, and has neither limits nor a table.
+    LimitedCount,
+    /// A table takes the values of the source as they are.
+    ScaledMap,
+    /// The limits of a field run backwards.
+    BackwardLimits {
+        /// The lowest number.
+        low: f64,
+        /// The highest number.
+        high: f64,
+    },
+    /// A number with a fraction, where its field has integers only.
+    FractionOfInteger {
+        /// The number.
+        value: f64,
+    },
+    /// A number with more digits behind the point than its field has.
+    TooManyDecimals {
+        /// The number.
+        value: f64,
+        /// Digits of the field.
+        decimals: u8,
+    },
+    /// An earlier entry of the table has the value.
+    MappedTwice {
+        /// The value.
+        value: i64,
+    },
     /// No checksum has this name.
     UnknownChecksum,
     /// A text, its length or its count needs so many word variables that follow each other.
@@ -534,6 +571,11 @@ pub enum ConfigErrorKind {
     NoFieldPort {
         /// The index.
         port: u8,
+    },
+    /// There is no such link: no UDP server of recipes is configured, or the port does not listen.
+    NoLink {
+        /// The link.
+        link: LinkSource,
     },
     /// Counts have no scale and offset: they wrap.
     ScaledCount,

@@ -5,7 +5,7 @@
 //! the names.
 
 use super::error::ConfigErrorKind as Kind;
-use super::{CommandWhen, FieldSpec, PortValue, StateValue};
+use super::{CommandWhen, FieldSpec, Limits, LinkSource, MapEntry, Outside, PortValue, StateValue};
 use crate::device::{Algorithm, Checksum, Encoding, Kind as EncodingKind, Overflow};
 use crate::sysvar::{ParseError, SysVar, VarRange};
 use crate::wire::can::CanId;
@@ -72,7 +72,9 @@ impl Fields<'_> {
             Self::Inputs(fields) => {
                 (fields.len(), fields.iter().map(InputField::commands_len).fold(0, usize::saturating_add))
             }
-            Self::Outputs(fields) => (fields.len(), 0),
+            Self::Outputs(fields) => {
+                (fields.iter().map(OutputField::specs_len).fold(0, usize::saturating_add), 0)
+            }
             Self::Specs(fields) => (fields.len(), 0),
         }
     }
@@ -309,6 +311,28 @@ impl<'a> InputField<'a> {
 pub struct OutputField<'a> {
     pub(super) on_wire: OnWire<'a>,
     pub(super) sends: Sends<'a>,
+    pub(super) allowed: Allowed<'a>,
+}
+
+/// The numbers that a field may send.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Allowed<'a> {
+    All,
+    Inside(Limits),
+    Mapped(&'a [(i64, i64, f64)]),
+}
+
+impl<'a> Allowed<'a> {
+    /// What stands behind the field.
+    pub(super) fn specs(self) -> impl Iterator<Item = FieldSpec> + use<'a> {
+        let (limits, entries) = match self {
+            Self::All => (None, &[][..]),
+            Self::Inside(limits) => (Some(FieldSpec::Limits(limits)), &[][..]),
+            Self::Mapped(entries) => (None, entries),
+        };
+        let mapped = |&(first, last, sent)| FieldSpec::Mapped(MapEntry { first, last, sent });
+        limits.into_iter().chain(entries.iter().map(mapped))
+    }
 }
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -321,6 +345,7 @@ pub(super) enum Sends<'a> {
     Reply,
     State { value: StateValue, scale: f32, offset: f32 },
     Health { port: Option<u8>, value: PortValue, scale: f32, offset: f32 },
+    Link { link: LinkSource, scale: f32, offset: f32 },
 }
 
 impl<'a> OutputField<'a> {
@@ -356,22 +381,45 @@ impl<'a> OutputField<'a> {
 
     /// So many bytes of this value.
     pub const fn padding(len: u8, fill: u8) -> Self {
-        Self { on_wire: OnWire::Padding { len, fill }, sends: Sends::Constant(0.0) }
+        Self { on_wire: OnWire::Padding { len, fill }, sends: Sends::Constant(0.0), allowed: Allowed::All }
     }
 
     /// The frame's checksum: its name in files, such as `"crc16-modbus"`, or a [`Checksum`].
     pub fn checksum(sum: impl Into<Sum<'a>>) -> Self {
-        Self { on_wire: OnWire::Checksum(sum.into()), sends: Sends::Constant(0.0) }
+        Self { on_wire: OnWire::Checksum(sum.into()), sends: Sends::Constant(0.0), allowed: Allowed::All }
     }
 
     fn new(encoding: impl Into<Encoding>, sends: Sends<'a>) -> Self {
-        Self { on_wire: OnWire::value(encoding), sends }
+        Self { on_wire: OnWire::value(encoding), sends, allowed: Allowed::All }
     }
 
     /// Makes what the field cannot hold wrap around, instead of becoming the nearest number.
     /// Integers only.
     pub fn wrapping(self) -> Self {
         Self { on_wire: self.on_wire.wrapping(), ..self }
+    }
+
+    /// Sends only numbers from `low` to `high`, after scale and offset. With another one the frame is not sent.
+    /// The field is a device's.
+    pub fn limited(self, low: f64, high: f64) -> Self {
+        Self { allowed: Allowed::Inside(Limits { low, high, outside: Outside::Refuse }), ..self }
+    }
+
+    /// As [`Self::limited`], but instead of another number the nearer limit is sent.
+    pub fn clamped(self, low: f64, high: f64) -> Self {
+        Self { allowed: Allowed::Inside(Limits { low, high, outside: Outside::Clamp }), ..self }
+    }
+
+    /// Sends the numbers of a table: first value of the source, last value and what is sent for them, such as
+    /// `(1, 4, 0.0)`. With a value in no entry the frame is not sent. The field is a device's, and takes no
+    /// scale and offset.
+    pub fn mapped(self, entries: &'a [(i64, i64, f64)]) -> Self {
+        Self { allowed: Allowed::Mapped(entries), ..self }
+    }
+
+    /// Number of entries in the configuration.
+    fn specs_len(&self) -> usize {
+        self.allowed.specs().count().saturating_add(1)
     }
 
     /// A value of the controller's state packet, saturated to the field's type. A program takes it
@@ -386,11 +434,17 @@ impl<'a> OutputField<'a> {
         Self::new(encoding, Sends::Health { port, value, scale: 1.0, offset: 0.0 })
     }
 
-    /// Makes the field `value * scale + offset` of a variable, of a value of the state packet or of a
-    /// port's health; counts refuse it. No effect on other fields.
+    /// 1 while a link to the controller is up, otherwise 0.
+    pub fn link_up(encoding: impl Into<Encoding>, link: LinkSource) -> Self {
+        Self::new(encoding, Sends::Link { link, scale: 1.0, offset: 0.0 })
+    }
+
+    /// Makes the field `value * scale + offset` of a variable, of a value of the state packet, of a
+    /// port's health or of a link's state; counts refuse it. No effect on other fields.
     pub fn scaled(mut self, scale: f32, offset: f32) -> Self {
         if let Sends::Variable { scale: own_scale, offset: own_offset, .. }
         | Sends::State { scale: own_scale, offset: own_offset, .. }
+        | Sends::Link { scale: own_scale, offset: own_offset, .. }
         | Sends::Health { scale: own_scale, offset: own_offset, .. } = &mut self.sends
         {
             (*own_scale, *own_offset) = (scale, offset);

@@ -21,6 +21,7 @@ mod draft;
 mod error;
 mod exchange;
 mod fields;
+mod fitting;
 #[cfg(feature = "image")]
 pub mod image;
 mod keys;
@@ -31,6 +32,7 @@ mod port;
 mod recipe;
 mod rules;
 mod safe_value;
+mod sendable;
 mod source;
 mod told_apart;
 mod validate;
@@ -52,6 +54,7 @@ pub use error::{
 };
 pub use exchange::{AskWhen, DEFAULT_REPLY_TIMEOUT, Exchange, FrameSpec, Talk};
 pub use fields::{CanFields, Fields, InputField, OutputField, Sum, Var};
+pub use fitting::Fitting;
 pub use line_budget::ExchangeBudget;
 pub use listen::listen_address;
 pub use network::{BoardAddress, Network};
@@ -63,7 +66,8 @@ pub use recipe::{
 };
 pub use rules::{check_address, check_bit, check_bitrate, check_cycle, check_name};
 pub use safe_value::SafeValue;
-pub use source::{PortHealth, PortValue, StateValue, StateValueError};
+pub use sendable::{Limits, MAX_SENDABLE, MapEntry, Outside, check_sent};
+pub use source::{LinkSource, PortHealth, PortValue, StateValue, StateValueError};
 pub use told_apart::Constants;
 pub(crate) use view::ConfigMut;
 pub use view::ConfigView;

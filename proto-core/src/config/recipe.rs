@@ -6,7 +6,7 @@
 use heapless::{String, Vec};
 
 use super::walk::{PartFrames, Variables};
-use super::{Delimiter, Name, PortValue, StateValue};
+use super::{Delimiter, Limits, LinkSource, MapEntry, Name, PortValue, StateValue};
 use crate::device::{Boundary, ByteOrder, Checksum, Encoding, Escape, Ignored, Length, Overflow, Text};
 use crate::recipe::model::{Field, MAX_CAN_IDS, Mode};
 use crate::sysvar::{Direction, SysVar, VarBit};
@@ -218,6 +218,11 @@ pub enum FieldSpec {
     },
     /// The frame's length stands here.
     Length(Length),
+    /// What the output field before this may send; nothing stands in the frame. Only in frames of devices.
+    Limits(Limits),
+    /// An entry of the table of what the output field before this sends; nothing stands in the frame. Only in
+    /// frames of devices.
+    Mapped(MapEntry),
 }
 
 /// A run of word variables that holds a text, two characters each.
@@ -430,6 +435,16 @@ pub enum OutputBinding {
     CounterTo {
         /// The highest number.
         max: u32,
+    },
+    /// `value * scale + offset`, saturated, of 1 while the link is up and 0 otherwise, also if the
+    /// gateway does not need it.
+    Link {
+        /// The link.
+        link: LinkSource,
+        /// Scale.
+        scale: f32,
+        /// Offset, added after scaling.
+        offset: f32,
     },
 }
 

@@ -172,15 +172,18 @@ pub enum PortValue {
     Age,
     /// Number of rejected frames, wrapping. CAN frames for other nodes do not count.
     Rejected,
+    /// Number of frames with a text that is ignored, such as `NOREAD`, wrapping.
+    Ignored,
 }
 
 impl PortValue {
     /// All of them, with their names in files.
-    pub const NAMES: [(&'static str, Self); 4] = [
+    pub const NAMES: [(&'static str, Self); 5] = [
         ("alive", Self::Alive),
         ("frames", Self::Frames),
         ("age_ms", Self::Age),
         ("rejected", Self::Rejected),
+        ("ignored", Self::Ignored),
     ];
 
     /// The value of this name.
@@ -195,12 +198,52 @@ impl PortValue {
             Self::Frames => "frames",
             Self::Age => "age_ms",
             Self::Rejected => "rejected",
+            Self::Ignored => "ignored",
         }
     }
 
     /// Whether it is a count, which wraps in its field and takes no scale.
     pub const fn is_count(self) -> bool {
-        matches!(self, Self::Frames | Self::Rejected)
+        matches!(self, Self::Frames | Self::Rejected | Self::Ignored)
+    }
+}
+
+/// A link to the controller, of which an output field shows whether it is up.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub enum LinkSource {
+    /// To the command port.
+    Command,
+    /// The second connection to it, for commands that stop the robot.
+    Urgent,
+    /// To the state stream.
+    State,
+    /// To the Modbus server.
+    Modbus,
+    /// To the UDP server of recipes.
+    RecipeUdp,
+    /// The controller's client that connects to the listening port with this index.
+    Listening(u8),
+}
+
+impl LinkSource {
+    /// Those that are no ports, with their names in files and in statistics.
+    pub const NAMES: [(&'static str, Self); 5] = [
+        ("command", Self::Command),
+        ("urgent", Self::Urgent),
+        ("state", Self::State),
+        ("modbus", Self::Modbus),
+        ("udp2011", Self::RecipeUdp),
+    ];
+
+    /// The link of this name; `None` if it can only be that of a port.
+    pub fn named(name: &str) -> Option<Self> {
+        Self::NAMES.iter().find(|(own, _)| *own == name).map(|&(_, link)| link)
+    }
+
+    /// Its name in files; `None` of a listening port, which has its own.
+    pub fn name(self) -> Option<&'static str> {
+        Self::NAMES.iter().find(|(_, link)| *link == self).map(|&(name, _)| name)
     }
 }
 
@@ -216,20 +259,23 @@ pub struct PortHealth {
     pub age: Option<SysVar>,
     /// Gets [`PortValue::Rejected`].
     pub rejected: Option<SysVar>,
+    /// Gets [`PortValue::Ignored`].
+    pub ignored: Option<SysVar>,
 }
 
 impl PortHealth {
     /// No variable.
-    pub const NONE: Self = Self { alive: None, frames: None, age: None, rejected: None };
+    pub const NONE: Self = Self { alive: None, frames: None, age: None, rejected: None, ignored: None };
 
     /// The variables, with what each gets.
     pub fn iter(&self) -> impl Iterator<Item = (PortValue, SysVar)> + use<> {
-        let Self { alive, frames, age, rejected } = *self;
+        let Self { alive, frames, age, rejected, ignored } = *self;
         let all = [
             (PortValue::Alive, alive),
             (PortValue::Frames, frames),
             (PortValue::Age, age),
             (PortValue::Rejected, rejected),
+            (PortValue::Ignored, ignored),
         ];
         all.into_iter().filter_map(|(value, var)| Some((value, var?)))
     }
@@ -241,6 +287,7 @@ impl PortHealth {
             PortValue::Frames => self.frames = Some(var),
             PortValue::Age => self.age = Some(var),
             PortValue::Rejected => self.rejected = Some(var),
+            PortValue::Ignored => self.ignored = Some(var),
         }
     }
 

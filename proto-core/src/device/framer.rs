@@ -28,7 +28,8 @@ pub enum Found<'a> {
     Frame(&'a [u8]),
     /// A frame whose checksum is right and whose constants are another device's.
     Other(&'a [u8]),
-    /// A frame, where one was expected, whose checksum is wrong.
+    /// A frame whose checksum is wrong, and which begins behind all frames that were found before; of a framer of
+    /// replies, where one was expected.
     Wrong(&'a [u8]),
 }
 
@@ -40,7 +41,7 @@ pub struct FramerStats {
     pub frames: u32,
     /// Frames of others.
     pub others: u32,
-    /// Frames with a wrong checksum, where a frame was expected.
+    /// Frames with a wrong checksum, as [`Found::Wrong`] has them.
     pub wrong: u32,
     /// Bytes dropped while looking for a frame.
     pub skipped_bytes: u32,
@@ -58,6 +59,8 @@ pub struct Framer {
     end: u16,
     /// How many bytes from the start a frame is expected to begin; `None` if nobody knows.
     expected: Option<u16>,
+    /// A frame with a wrong checksum is one only where a frame is expected.
+    is_of_replies: bool,
     /// Steps that were paid for; negative after too many.
     credit: i32,
     stats: FramerStats,
@@ -70,6 +73,12 @@ impl Default for Framer {
 }
 
 impl Framer {
+    /// An empty framer of replies: a wrong checksum ends a request, so it is believed only where a frame is expected,
+    /// which is at first, after a [`Self::discard`] and directly behind another frame.
+    pub const fn of_replies() -> Self {
+        Self { is_of_replies: true, ..Self::new() }
+    }
+
     /// An empty framer; the first byte is expected to begin a frame.
     pub const fn new() -> Self {
         let stats = FramerStats {
@@ -80,7 +89,15 @@ impl Framer {
             noise_bytes: 0,
             discarded_bytes: 0,
         };
-        Self { buffer: [0; BUFFER], start: 0, end: 0, expected: Some(0), credit: 0, stats }
+        Self {
+            buffer: [0; BUFFER],
+            start: 0,
+            end: 0,
+            expected: Some(0),
+            is_of_replies: false,
+            credit: 0,
+            stats,
+        }
     }
 
     /// The next frame. Takes bytes from the front of `chunk`. Call it again with the rest until it
@@ -107,7 +124,7 @@ impl Framer {
                         self.stats.others = self.stats.others.wrapping_add(1);
                         return Some(Found::Other(self.take(len)));
                     }
-                    Probe::Wrong(len) if self.expected == Some(0) => {
+                    Probe::Wrong(len) if self.may_be_wrong() => {
                         let at = usize::from(self.start);
                         self.stats.wrong = self.stats.wrong.wrapping_add(1);
                         self.skip(effort, false);
@@ -128,6 +145,14 @@ impl Framer {
                 return None;
             }
             self.hold(chunk, missing);
+        }
+    }
+
+    /// Whether a frame with a wrong checksum may begin at the start: it is not within one that was found.
+    const fn may_be_wrong(&self) -> bool {
+        match self.expected {
+            Some(missing) => missing == 0,
+            None => !self.is_of_replies,
         }
     }
 

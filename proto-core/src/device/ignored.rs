@@ -6,12 +6,15 @@
 /// Bytes of all texts of a field, each with one byte more for its length.
 pub const MAX_IGNORED: usize = 14;
 
+/// Stands for a text of no characters; a length of 0 is the end.
+const EMPTY: u8 = 0xFF;
+
 /// The texts of a field that are ignored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Ignored {
-    /// One text behind the other, each behind its length; zeros behind the last.
+    /// One text behind the other, each behind its length, or [`EMPTY`]; zeros behind the last.
     bytes: [u8; MAX_IGNORED],
 }
 
@@ -19,12 +22,15 @@ impl Ignored {
     /// No text is.
     pub const NONE: Self = Self { bytes: [0; MAX_IGNORED] };
 
-    /// These are; `None` if there is no room for them, or one of them is empty.
+    /// These are; `None` if there is no room for them. A text of no characters may be one of them.
     pub fn new(texts: &[&[u8]]) -> Option<Self> {
         let mut ignored = Self::NONE;
         let mut free = ignored.bytes.iter_mut();
         for text in texts {
-            let len = u8::try_from(text.len()).ok().filter(|&len| len > 0)?;
+            let len = match text.len() {
+                0 => EMPTY,
+                len => u8::try_from(len).ok()?,
+            };
             for &byte in core::iter::once(&len).chain(text.iter()) {
                 *free.next()? = byte;
             }
@@ -37,6 +43,7 @@ impl Ignored {
         let mut rest = &self.bytes[..];
         core::iter::from_fn(move || {
             let (&len, behind) = rest.split_first().filter(|(len, _)| **len > 0)?;
+            let len = if len == EMPTY { 0 } else { len };
             let text = behind.get(..usize::from(len))?;
             rest = behind.get(usize::from(len)..)?;
             Some(text)
@@ -69,14 +76,16 @@ mod tests {
         assert!(Ignored::new(&[b"0123456789ABC"]).is_some_and(|one| one.has(b"0123456789ABC")));
         assert_eq!(Ignored::new(&[b"0123456789ABCD"]), None);
         assert_eq!(Ignored::new(&[b"NOREAD", b"ERRORS!"]), None);
-        assert_eq!(Ignored::new(&[b"NOREAD", b""]), None);
+        let line_without_text = Ignored::new(&[b"NOREAD", b"", b"?"]).unwrap();
+        assert!(line_without_text.iter().eq([&b"NOREAD"[..], b"", b"?"]));
+        assert!(line_without_text.has(b"") && !line_without_text.has(b"NO"));
     }
 
     #[test]
     fn bytes_of_a_wrong_image_do_no_harm() {
         for first in 0..=u8::MAX {
             let mut ignored = Ignored { bytes: [first; MAX_IGNORED] };
-            assert!(ignored.iter().count() <= MAX_IGNORED / 2 + 1);
+            assert!(ignored.iter().count() <= MAX_IGNORED);
             ignored.bytes = [0; MAX_IGNORED];
             ignored.bytes[MAX_IGNORED - 1] = first;
             assert!(ignored.is_empty() || ignored.iter().count() <= 1);

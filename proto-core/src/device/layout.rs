@@ -110,7 +110,7 @@ impl FrameLayout {
             Vec::from_slice(bytes).map_err(|_| LayoutError::DelimiterTooLong { len: bytes.len() })
         };
         let (head, tail) = (delimiter(head)?, delimiter(tail)?);
-        if elements.is_empty() {
+        if elements.is_empty() && head.is_empty() {
             return Err(LayoutError::Empty);
         }
         if elements.len() > MAX_FIELDS {

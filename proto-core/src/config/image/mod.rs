@@ -4,16 +4,20 @@
 //! In: a checked configuration, or bytes from flash or a file. Out: the other. An image of an older
 //! version is migrated. An image that was cut short, damaged in any bit, written for a newer
 //! version, or that holds an invalid configuration is refused with a reason. Bytes after the image
-//! are ignored, because flash is erased in whole sectors.
+//! are ignored, because flash is erased in whole sectors. [`Scan`] reads one without keeping what is in
+//! it, where there is no room for a second configuration.
 //!
 //! **To change a serialized type,** raise [`VERSION`], copy the types as they were into the module
 //! of the old version, with `From` into today's, and give `decode_into` a new first reader. What an
 //! old version reads is never changed afterwards. `tests/golden` has the images that must
 //! remain readable.
 
+mod scan;
 mod v1;
 mod v2;
 mod v3;
+
+pub use scan::Scan;
 
 use core::fmt;
 
@@ -86,12 +90,20 @@ pub enum ImageError {
     Config(ConfigError),
 }
 
+/// Whether a file of text can have the byte.
+const fn is_text(byte: u8) -> bool {
+    matches!(byte, b' '..=b'~' | b'\t' | b'\n' | b'\r')
+}
+
 impl fmt::Display for ImageError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::TooShort { needed, available } => {
                 write!(f, "the image is cut short: {needed} bytes are needed, {available} are there")
             }
+            Self::NotAnImage { found } if found.iter().all(|&byte| is_text(byte)) => f.write_str(
+                "this is text, not a configuration image; `host-sim image FILE -o OUT` makes the image of a TOML file",
+            ),
             Self::NotAnImage { found } => write!(f, "not a configuration image: it begins with {found:02X?}"),
             Self::Version { found } => {
                 write!(f, "the image has version {found}; this program reads {OLDEST_VERSION} to {VERSION}")
@@ -206,15 +218,60 @@ pub fn decode_into<
 
 fn decode_view(bytes: &[u8], mut config: ConfigMut<'_>) -> Result<(), ImageError> {
     let (version, mut rest) = payload(bytes)?;
-    match version {
-        1 => v1::read(&mut rest, &mut config),
-        2 => v2::read(&mut rest, &mut config),
-        _ => v3::read(&mut rest, &mut config),
-    }?;
+    // Also those that an older version does not have.
+    for list in lists(VERSION) {
+        config.clear(*list);
+    }
+    read_head(version, &mut rest, &mut config)?;
+    for list in lists(version) {
+        let room = config.clear(*list);
+        let count = count(&mut rest, *list, room)?;
+        read_entries(version, *list, count, &mut rest, &mut config)?;
+    }
     if !rest.is_empty() {
         return Err(ImageError::Contents);
     }
     config.view().validate().map_err(ImageError::Config)
+}
+
+/// What is in front of the lists: the controller, and the board's address.
+fn read_head(version: u32, rest: &mut &[u8], config: &mut ConfigMut<'_>) -> Result<(), ImageError> {
+    match version {
+        1 => v1::read_head(rest, config),
+        2 => v2::read_head(rest, config),
+        _ => v3::read_head(rest, config),
+    }
+}
+
+/// The lists, in their order. Versions 1 and 2 have the same.
+const fn lists(version: u32) -> &'static [Counted] {
+    match version {
+        1 | 2 => &v2::LISTS,
+        _ => &v3::LISTS,
+    }
+}
+
+/// The number of entries of a list.
+fn count(rest: &mut &[u8], what: Counted, room: usize) -> Result<usize, ImageError> {
+    let needed: usize = item(rest)?;
+    if needed > room {
+        return Err(ImageError::TooMany { what, needed, room });
+    }
+    Ok(needed)
+}
+
+/// The next entries of a list, behind those that are there.
+fn read_entries(
+    version: u32,
+    list: Counted,
+    count: usize,
+    rest: &mut &[u8],
+    config: &mut ConfigMut<'_>,
+) -> Result<(), ImageError> {
+    match version {
+        1 | 2 => v2::read_entries(list, count, rest, config),
+        _ => v3::read_entries(list, count, rest, config),
+    }
 }
 
 fn item<T: DeserializeOwned>(rest: &mut &[u8]) -> Result<T, ImageError> {
@@ -223,19 +280,13 @@ fn item<T: DeserializeOwned>(rest: &mut &[u8]) -> Result<T, ImageError> {
     Ok(item)
 }
 
-/// The number of entries, and the entries, which may be of an older version's type.
+/// So many entries, which may be of an older version's type.
 fn items<T: DeserializeOwned + Into<Today>, Today>(
     rest: &mut &[u8],
-    what: Counted,
+    count: usize,
     all: &mut VecView<Today>,
 ) -> Result<(), ImageError> {
-    all.clear();
-    let needed: usize = item(rest)?;
-    let room = all.capacity();
-    if needed > room {
-        return Err(ImageError::TooMany { what, needed, room });
-    }
-    for _ in 0..needed {
+    for _ in 0..count {
         // Not by `item`: each result that is passed on is copied, and recipes are large.
         let mut reader = Deserializer::from_bytes(rest);
         let pushed = match T::deserialize(&mut reader) {
@@ -248,6 +299,26 @@ fn items<T: DeserializeOwned + Into<Today>, Today>(
         }
     }
     Ok(())
+}
+
+impl ConfigMut<'_> {
+    /// Empties a list; returns how many entries it has room for.
+    fn clear(&mut self, list: Counted) -> usize {
+        fn clear<T>(all: &mut VecView<T>) -> usize {
+            all.clear();
+            all.capacity()
+        }
+        match list {
+            Counted::Recipes => clear(self.recipes),
+            Counted::Ports => clear(self.ports),
+            Counted::Fields => clear(self.fields),
+            Counted::Commands => clear(self.commands),
+            Counted::SafeValues => clear(self.safe_values),
+            Counted::Exchanges => clear(self.exchanges),
+            Counted::ExchangeFrames => clear(self.frames),
+            _ => 0,
+        }
+    }
 }
 
 /// The length of the image whose header is at the start of `bytes`.
@@ -277,6 +348,16 @@ fn header(bytes: &[u8]) -> Result<(u32, u32, u32), ImageError> {
         return Err(ImageError::TooLong { payload: length });
     }
     Ok((version, length, u32::from_le_bytes(crc)))
+}
+
+/// The CRC-32 of an image that is whole and of a version that is read; the configuration in it is not looked at.
+///
+/// # Errors
+/// [`ImageError`] says what is wrong with the image.
+pub fn intact(bytes: &[u8]) -> Result<u32, ImageError> {
+    payload(bytes)?;
+    let (_, _, crc) = header(bytes)?;
+    Ok(crc)
 }
 
 /// The version and the payload.

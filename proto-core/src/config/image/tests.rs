@@ -81,6 +81,46 @@ fn nothing_of_the_previous_configuration_remains() {
     assert_eq!(config, small);
 }
 
+/// Lists that an older version does not have are empty, whatever was there.
+#[test]
+fn nothing_of_a_newer_configuration_remains_in_an_older_one() {
+    let old = include_bytes!("../../../tests/golden/v2/serial.img");
+    let newer = include_bytes!("../../../tests/golden/v3/modbus-master.img");
+    let mut config = decode(newer).unwrap();
+    assert!(!config.exchanges.is_empty());
+    assert_eq!(decode_into(old, &mut config), Ok(()));
+    assert_eq!(Ok(config), decode(old));
+}
+
+/// A whole scan.
+fn scanned(image: &[u8]) -> Result<Scan, ImageError> {
+    let mut scan = Scan::new();
+    while scan.step(image)? {}
+    Ok(scan)
+}
+
+#[test]
+fn a_scan_finds_what_reading_finds_but_for_what_parts_say_together() {
+    let whole = image();
+    let buses: Vec<_> = every_kind().ports.iter().map(|port| port.bus.clone()).collect();
+    assert_eq!(scanned(&whole).unwrap().buses(), buses);
+    for cut in 0..whole.len() {
+        assert_eq!(scanned(&whole[..cut]).err(), decode(&whole[..cut]).err());
+    }
+    for place in HEADER..whole.len() {
+        for change in [1, 0x80, 0xFF] {
+            let mut payload = whole[HEADER..].to_vec();
+            payload[place - HEADER] ^= change;
+            let changed = around(&payload);
+            let read = decode(&changed).err().filter(|error| !matches!(error, ImageError::Config(_)));
+            assert_eq!(scanned(&changed).err(), read, "byte {place}");
+        }
+    }
+    for payload in [&[][..], &[0xFF; 40], &[&whole[HEADER..], &[0]].concat()] {
+        assert_eq!(scanned(&around(payload)).err(), Some(ImageError::Contents));
+    }
+}
+
 /// The image can be read piece by piece or as a whole.
 #[test]
 fn the_payload_is_the_configuration_in_postcard() {
@@ -98,6 +138,14 @@ fn erased_flash_is_no_image() {
         decode(&[0xFF; 256]).unwrap_err().to_string(),
         "not a configuration image: it begins with [FF, FF, FF, FF]"
     );
+}
+
+#[test]
+fn a_file_of_text_is_told_what_makes_an_image_of_it() {
+    let said = "this is text, not a configuration image; `host-sim image FILE -o OUT` makes the image of a TOML file";
+    for toml in ["# Force sensor\n[controller]\naddress = 1", "[controller]\naddress = \"10.0.0.2\""] {
+        assert_eq!(decode(toml.as_bytes()).unwrap_err().to_string(), said);
+    }
 }
 
 /// An image around any payload, with a correct header.

@@ -6,8 +6,8 @@
 use super::{ConfigMut, ImageError, item, v2};
 use crate::config::BoardAddress;
 
-pub(super) fn read(rest: &mut &[u8], config: &mut ConfigMut<'_>) -> Result<(), ImageError> {
+pub(super) fn read_head(rest: &mut &[u8], config: &mut ConfigMut<'_>) -> Result<(), ImageError> {
     *config.controller = item::<v2::ControllerLink>(rest)?.into();
     *config.network = BoardAddress::Dhcp;
-    v2::read_lists(rest, config)
+    Ok(())
 }

@@ -17,19 +17,29 @@ use crate::time::Duration;
 use crate::wire::can::CanId;
 use crate::wire::scalar::{Scalar, ScalarType};
 
-pub(super) fn read(rest: &mut &[u8], config: &mut ConfigMut<'_>) -> Result<(), ImageError> {
+pub(super) fn read_head(rest: &mut &[u8], config: &mut ConfigMut<'_>) -> Result<(), ImageError> {
     *config.controller = item::<ControllerLink>(rest)?.into();
     *config.network = item::<BoardAddress>(rest)?.into();
-    read_lists(rest, config)
+    Ok(())
 }
 
 /// The lists, which version 1 has too.
-pub(super) fn read_lists(rest: &mut &[u8], config: &mut ConfigMut<'_>) -> Result<(), ImageError> {
-    items::<Recipe, _>(rest, Counted::Recipes, config.recipes)?;
-    items::<Port, _>(rest, Counted::Ports, config.ports)?;
-    items::<FieldSpec, _>(rest, Counted::Fields, config.fields)?;
-    items::<CommandEntry, _>(rest, Counted::Commands, config.commands)?;
-    items::<SafeValue, _>(rest, Counted::SafeValues, config.safe_values)
+pub(super) static LISTS: [Counted; 5] =
+    [Counted::Recipes, Counted::Ports, Counted::Fields, Counted::Commands, Counted::SafeValues];
+
+pub(super) fn read_entries(
+    list: Counted,
+    count: usize,
+    rest: &mut &[u8],
+    config: &mut ConfigMut<'_>,
+) -> Result<(), ImageError> {
+    match list {
+        Counted::Recipes => items::<Recipe, _>(rest, count, config.recipes),
+        Counted::Ports => items::<Port, _>(rest, count, config.ports),
+        Counted::Fields => items::<FieldSpec, _>(rest, count, config.fields),
+        Counted::Commands => items::<CommandEntry, _>(rest, count, config.commands),
+        _ => items::<SafeValue, _>(rest, count, config.safe_values),
+    }
 }
 
 #[derive(Deserialize)]

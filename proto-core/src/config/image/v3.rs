@@ -34,14 +34,36 @@ pub(super) fn write<'o>(config: ConfigView<'_>, out: &'o mut [u8]) -> postcard::
     postcard::to_slice(&payload, out)
 }
 
-pub(super) fn read(rest: &mut &[u8], config: &mut ConfigMut<'_>) -> Result<(), ImageError> {
+pub(super) fn read_head(rest: &mut &[u8], config: &mut ConfigMut<'_>) -> Result<(), ImageError> {
     *config.controller = item(rest)?;
     *config.network = item(rest)?;
-    items::<Recipe, _>(rest, Counted::Recipes, config.recipes)?;
-    items::<Port, _>(rest, Counted::Ports, config.ports)?;
-    items::<FieldSpec, _>(rest, Counted::Fields, config.fields)?;
-    items::<CommandEntry, _>(rest, Counted::Commands, config.commands)?;
-    items::<SafeValue, _>(rest, Counted::SafeValues, config.safe_values)?;
-    items::<Exchange, _>(rest, Counted::Exchanges, config.exchanges)?;
-    items::<FrameSpec, _>(rest, Counted::ExchangeFrames, config.frames)
+    Ok(())
+}
+
+/// The lists of [`Payload`].
+pub(super) static LISTS: [Counted; 7] = [
+    Counted::Recipes,
+    Counted::Ports,
+    Counted::Fields,
+    Counted::Commands,
+    Counted::SafeValues,
+    Counted::Exchanges,
+    Counted::ExchangeFrames,
+];
+
+pub(super) fn read_entries(
+    list: Counted,
+    count: usize,
+    rest: &mut &[u8],
+    config: &mut ConfigMut<'_>,
+) -> Result<(), ImageError> {
+    match list {
+        Counted::Recipes => items::<Recipe, _>(rest, count, config.recipes),
+        Counted::Ports => items::<Port, _>(rest, count, config.ports),
+        Counted::Fields => items::<FieldSpec, _>(rest, count, config.fields),
+        Counted::Commands => items::<CommandEntry, _>(rest, count, config.commands),
+        Counted::SafeValues => items::<SafeValue, _>(rest, count, config.safe_values),
+        Counted::Exchanges => items::<Exchange, _>(rest, count, config.exchanges),
+        _ => items::<FrameSpec, _>(rest, count, config.frames),
+    }
 }

@@ -90,6 +90,62 @@ fn a_wrong_checksum_is_told_once_and_the_next_frame_is_taken() {
 }
 
 #[test]
+fn each_broken_frame_counts_whatever_is_between_them() {
+    let mut broken = frame([1, 7]);
+    broken[2] ^= 1;
+    // A line that is turned round gives such a byte before each frame.
+    let stream = [&[0x55][..], &broken, &[0x55, 0x01], &broken, &broken, &[0x55], &frame([1, 2])].concat();
+    let mut framer = Framer::new();
+    let wrong = || Event::Wrong(broken.clone());
+    assert_eq!(run(&mut framer, &[&stream]), [wrong(), wrong(), wrong(), Event::Frame(frame([1, 2]))]);
+    assert_eq!((framer.stats().wrong, framer.stats().noise_bytes), (3, 4));
+    let mut framer = Framer::of_replies();
+    assert_eq!(run(&mut framer, &[&stream]), [Event::Frame(frame([1, 2]))], "a reply is not behind noise");
+    framer.discard();
+    assert_eq!(run(&mut framer, &[&broken]), [wrong()]);
+}
+
+/// All frames of five bytes that begin with the head, and whether their checksum is right: a right one is taken, a
+/// wrong one counts unless it begins within another that counts.
+fn slowly(stream: &[u8]) -> (usize, usize) {
+    let (elements, layout) = small();
+    let (mut right, mut wrong, mut at, mut until) = (0, 0, 0, 0);
+    while let Some(bytes) = stream.get(at..at + 5) {
+        match layout.probe(&elements, bytes) {
+            Probe::Frame(_) => {
+                (right, at) = (right + 1, at + 5);
+                until = at;
+                continue;
+            }
+            Probe::Wrong(_) if at >= until => (wrong, until) = (wrong + 1, at + 5),
+            _ => {}
+        }
+        at += 1;
+    }
+    (right, wrong)
+}
+
+proptest! {
+    #[test]
+    fn in_dense_garbage_all_that_counts_is_counted(
+        pieces in prop::collection::vec((0_u8..4, any::<[u8; 2]>()), 0..200),
+        cut in 1_usize..40,
+    ) {
+        let stream: Vec<u8> = pieces.iter().flat_map(|&(what, values)| match what {
+            0 => vec![0xAA],
+            1 => frame(values),
+            2 => frame([0xAA, values[0]]).split_last().map(|(_, rest)| rest.to_vec()).unwrap_or_default(),
+            _ => vec![0xAA, values[0], 0xAA, values[1], values[0]],
+        }).collect();
+        let mut framer = Framer::new();
+        let chunks: Vec<&[u8]> = stream.chunks(cut).collect();
+        run(&mut framer, &chunks);
+        let stats = framer.stats();
+        prop_assert_eq!((stats.frames as usize, stats.wrong as usize), slowly(&stream));
+    }
+}
+
+#[test]
 fn a_frame_inside_a_broken_one_is_found() {
     // A byte was lost, so the next frame begins where this one should end.
     let stream = [&frame([1, 2])[..4], &frame([3, 4])[..]].concat();

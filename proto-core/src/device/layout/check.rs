@@ -22,7 +22,7 @@ pub enum LayoutError {
         /// Number of bytes.
         len: usize,
     },
-    /// There is no element.
+    /// There is no element, and no head.
     Empty,
     /// There are more than 128 elements.
     TooManyElements,

@@ -67,7 +67,7 @@ impl Element {
         match self.len() {
             _ if self.is_shared() => 0,
             Some(len) => len,
-            None => self.most().saturating_add(1),
+            None => self.most().saturating_add(usize::from(self.until().is_some())),
         }
     }
 

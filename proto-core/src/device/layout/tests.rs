@@ -190,7 +190,9 @@ fn what_cannot_be_laid_out_is_refused() {
         FrameLayout::new(Carrier::Stream, Direction::Output, &[1], &[], elements, None)
             .map(|layout| layout.lengths())
     };
-    assert_eq!(new(&[]), Err(LayoutError::Empty));
+    assert_eq!(new(&[]), Ok((1, 1)), "a head alone");
+    let without_head = FrameLayout::new(Carrier::Stream, Direction::Output, &[], b"\r", &[], None);
+    assert_eq!(without_head.map(|layout| layout.lengths()), Err(LayoutError::Empty));
     assert_eq!(new(&vec![big(ScalarType::Byte); 129]), Err(LayoutError::TooManyElements));
     assert_eq!(new(&vec![big(ScalarType::Double); 64]), Err(LayoutError::TooLong { len: 513, room: 512 }));
     let encoding = Err(LayoutError::Encoding { element: 1 });

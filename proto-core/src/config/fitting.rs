@@ -1,0 +1,147 @@
+//! Which numbers of an input field its variable takes.
+//!
+//! In: a field and its binding. Out: the numbers that fit. A frame with another one is rejected (D22).
+
+use super::{FieldSpec, InputBinding};
+use crate::device::{Encoding, Overflow};
+use crate::image::{bind_to_variable, round};
+use crate::sysvar::SysVar;
+use crate::wire::scalar::{Scalar, ScalarType};
+
+/// The numbers of an input field that fit its variable.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
+pub struct Fitting {
+    /// The variable.
+    pub var: SysVar,
+    /// The smallest number that surely fits, in the field's unit: before scale and offset.
+    pub low: f64,
+    /// The largest number that surely fits.
+    pub high: f64,
+}
+
+/// An input field that writes a variable as a whole and does not wrap.
+struct Written {
+    encoding: Encoding,
+    var: SysVar,
+    scale: f32,
+    offset: f32,
+}
+
+impl FieldSpec {
+    fn written(&self) -> Option<Written> {
+        let (encoding, to) = match *self {
+            Self::UserInput { ty, to } => (Encoding::scalar(ty), to),
+            Self::DeviceInput { encoding, overflow: Overflow::Usual, to } => (encoding, to),
+            _ => return None,
+        };
+        match to {
+            InputBinding::Variable { var, scale, offset } => Some(Written { encoding, var, scale, offset }),
+            _ => None,
+        }
+    }
+
+    /// The numbers of an input field that fit its variable; `None` if all do that the field can have,
+    /// or if it writes none. Of a float variable only huge numbers would not fit: `None`.
+    pub fn fitting(&self) -> Option<Fitting> {
+        let Written { encoding, var, scale, offset } = self.written()?;
+        if matches!(var.ty(), ScalarType::Float | ScalarType::Double) {
+            return None;
+        }
+        let (scale, offset) = (f64::from(scale), f64::from(offset));
+        let (low, high) = encoding.range();
+        let (least, most) = match (var.ty(), var.ty().range()) {
+            (ScalarType::Byte, (least, most)) => (least, most.min(f64::from(var.valid_bits()))),
+            (_, range) => range,
+        };
+        let between = |one: f64, other: f64| (one.min(other), one.max(other));
+        // Of the variable, rounded as the engine rounds.
+        let (first, last) = between((least - 0.5 - offset) / scale, (most + 0.5 - offset) / scale);
+        if first < low && last > high {
+            return None;
+        }
+        // Next to the end, where rounding decides, the number that surely fits.
+        let (first, last) = between((least - offset) / scale, (most - offset) / scale);
+        let (first, last) = match encoding.is_integer() {
+            true => (ceil(first), -ceil(-last)),
+            false => (first, last),
+        };
+        Some(Fitting { var, low: first.max(low), high: last.min(high) })
+    }
+
+    /// Whether an input field's variable takes the number. True for a field that writes none.
+    pub fn takes(&self, value: Scalar) -> bool {
+        self.written().is_none_or(|to| bind_to_variable(to.var, value, to.scale, to.offset).is_some())
+    }
+
+    /// The variable that takes no negative number of an input field that can have them: there is no
+    /// offset, and no negative scale. `None` of another field.
+    pub fn rejects_negative(&self) -> Option<SysVar> {
+        let Written { encoding, var, scale, offset } = self.written()?;
+        let is_signed = encoding.range().0 < 0.0;
+        let is_unsigned = var.ty().range().0 >= 0.0;
+        (is_signed && is_unsigned && scale > 0.0 && offset == 0.0).then_some(var)
+    }
+}
+
+/// The next integer above; `core` has no `ceil`.
+fn ceil(value: f64) -> f64 {
+    let rounded = round(value);
+    if rounded < value { rounded + 1.0 } else { rounded }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn field(ty: ScalarType, var: &str, scale: f32, offset: f32) -> FieldSpec {
+        let var = SysVar::parse(var).unwrap();
+        FieldSpec::UserInput { ty, to: InputBinding::Variable { var, scale, offset } }
+    }
+
+    fn ends(field: FieldSpec) -> Option<(f64, f64)> {
+        field.fitting().map(|fitting| (fitting.low, fitting.high))
+    }
+
+    #[test]
+    fn what_fits_is_what_is_taken() {
+        use ScalarType::{Byte, Char, Double, Float, Int, Short, Word};
+        for (ty, var, scale, offset, fitting) in [
+            (Word, "WordInputReg[1]", 1.0, 0.0, None),
+            (Byte, "WordInputReg[1]", 1.0, 0.0, None),
+            (Double, "FloatInputReg[1]", 1.0, 0.0, None),
+            (Short, "WordInputReg[1]", 1.0, 0.0, Some((0.0, 32_767.0))),
+            (Short, "WordInputReg[1]", 1.0, 32_768.0, None),
+            (Char, "WordInputReg[1]", -2.0, -3.0, Some((-128.0, -2.0))),
+            (Int, "WordInputReg[1]", 10.0, 5.0, Some((0.0, 6_553.0))),
+            (Float, "WordInputReg[1]", 100.0, 32_768.0, Some((-327.68, 327.67))),
+        ] {
+            let field = field(ty, var, scale, offset);
+            assert_eq!(ends(field), fitting, "{ty} to {var}");
+            let (low, high) = fitting.unwrap_or_else(|| ty.range());
+            for value in [low, high].into_iter().filter(|value| value.abs() < 1e30) {
+                let value = Scalar::from_f64(ty, value).unwrap();
+                assert!(field.takes(value), "{ty} to {var}: {value}");
+            }
+        }
+        let force = field(Float, "WordInputReg[1]", 100.0, 32_768.0);
+        assert!(!force.takes(Scalar::Float(400.0)) && !force.takes(Scalar::Float(-400.0)));
+        assert!(!force.takes(Scalar::Float(f32::NAN)));
+    }
+
+    #[test]
+    fn negative_numbers_need_an_offset() {
+        use ScalarType::{Byte, Float, Short, Word};
+        for (ty, var, scale, offset, rejects) in [
+            (Float, "WordInputReg[1]", 1.0, 0.0, true),
+            (Short, "WordInputReg[1]", 100.0, 0.0, true),
+            (Short, "WordInputReg[1]", 1.0, 32_768.0, false),
+            (Short, "WordInputReg[1]", -1.0, 0.0, false),
+            (Float, "FloatInputReg[1]", 1.0, 0.0, false),
+            (Word, "WordInputReg[1]", 1.0, 0.0, false),
+            (Byte, "WordInputReg[1]", 1.0, 0.0, false),
+        ] {
+            assert_eq!(field(ty, var, scale, offset).rejects_negative().is_some(), rejects, "{ty} to {var}");
+        }
+    }
+}

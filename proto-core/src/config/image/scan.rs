@@ -1,0 +1,123 @@
+//! An image is read piece by piece, and nothing of it is kept.
+//!
+//! In: the bytes of an image, again for each piece. Out: the first thing that is wrong with them, or the buses of the
+//! ports. It refuses what `decode_into` refuses, but for what only a whole configuration shows: that its parts fit
+//! together.
+
+use heapless::Vec;
+
+use super::{Counted, HEADER, ImageError, count, header, lists, payload, read_entries, read_head};
+use crate::config::{
+    Bus, GatewayConfig, MAX_ALL_FIELDS, MAX_COMMANDS, MAX_EXCHANGES, MAX_PORTS, MAX_RECIPES, MAX_SAFE_VALUES,
+};
+
+/// How far an image was read. A board looks at one this way that it is only to keep, and lets other work be done
+/// between two steps: a second configuration beside the one that runs has almost 60 KiB.
+///
+/// ```
+/// use proto_core::config::image::{self, Scan};
+/// # use proto_core::config::{GatewayConfig, Port, Recipe};
+/// # let config = GatewayConfig::<1, 1, 1, 0, 0>::builder()
+/// #     .controller("192.168.12.138")
+/// #     .recipe(Recipe::realtime("outputs").stream_input(&[0xFF], &[0xEE], &["DigitalOutputCommand[1]"]))
+/// #     .port(Port::rs485("rs485-1", "outputs"))
+/// #     .build()?;
+/// # let mut bytes = [0; 256];
+/// # let len = image::encode(&config, &mut bytes)?;
+/// # let image = &bytes[..len];
+/// let mut scan = Scan::new();
+/// while scan.step(image)? {
+///     // Others run.
+/// }
+/// assert_eq!(scan.buses().len(), 1);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+#[derive(Debug, Clone, Default)]
+pub struct Scan {
+    /// Bytes of the payload that were read.
+    at: usize,
+    /// Lists that were begun.
+    lists: usize,
+    /// Entries of the newest one that follow.
+    left: usize,
+    buses: Vec<Bus, MAX_PORTS>,
+}
+
+impl Scan {
+    /// Nothing was read yet.
+    pub const fn new() -> Self {
+        Self { at: 0, lists: 0, left: 0, buses: Vec::new() }
+    }
+
+    /// Reads on: the head and its checksum, or a few entries of a list. Returns whether there is more. The bytes must be
+    /// the same each time; if they are not, some step refuses them or what they contain is not known.
+    ///
+    /// # Errors
+    /// [`ImageError`], but never [`ImageError::Config`]. No step must follow.
+    pub fn step(&mut self, bytes: &[u8]) -> Result<bool, ImageError> {
+        let (version, all) = match self.at {
+            0 => payload(bytes)?,
+            _ => unchecked(bytes)?,
+        };
+        let mut rest = all.get(self.at..).ok_or(ImageError::Contents)?;
+        // One entry of each list: what was read before is dropped.
+        let mut one = GatewayConfig::<1, 1, 1, 1, 1, 1>::empty();
+        let mut config = one.view_mut();
+        if self.at == 0 {
+            read_head(version, &mut rest, &mut config)?;
+        }
+        for _ in 0..AT_ONCE {
+            if self.left == 0 {
+                let Some(list) = lists(version).get(self.lists) else { break };
+                self.left = count(&mut rest, *list, room(*list))?;
+                self.lists = self.lists.saturating_add(1);
+                continue;
+            }
+            let Some(list) = lists(version).get(self.lists.saturating_sub(1)) else { break };
+            config.clear(*list);
+            read_entries(version, *list, 1, &mut rest, &mut config)?;
+            self.left = self.left.saturating_sub(1);
+            if *list == Counted::Ports
+                && let Some(port) = config.ports.first()
+            {
+                // There is room for as many as were counted.
+                let _ = self.buses.push(port.bus.clone());
+            }
+        }
+        self.at = all.len().saturating_sub(rest.len());
+        let is_more = self.left > 0 || self.lists < lists(version).len();
+        if !is_more && !rest.is_empty() {
+            return Err(ImageError::Contents);
+        }
+        Ok(is_more)
+    }
+
+    /// The buses of the ports, in their order, once all was read.
+    pub fn buses(&self) -> &[Bus] {
+        &self.buses
+    }
+}
+
+/// Version and payload of an image whose checksum was right before.
+fn unchecked(bytes: &[u8]) -> Result<(u32, &[u8]), ImageError> {
+    let (version, length, _) = header(bytes)?;
+    let needed = HEADER.saturating_add(length as usize);
+    let payload = bytes.get(HEADER..needed);
+    Ok((version, payload.ok_or(ImageError::TooShort { needed, available: bytes.len() })?))
+}
+
+/// Entries that the configuration of a board has room for.
+const fn room(list: Counted) -> usize {
+    match list {
+        Counted::Recipes => MAX_RECIPES,
+        Counted::Ports => MAX_PORTS,
+        Counted::Fields => MAX_ALL_FIELDS,
+        Counted::Commands => MAX_COMMANDS,
+        Counted::SafeValues => MAX_SAFE_VALUES,
+        Counted::Exchanges | Counted::ExchangeFrames => MAX_EXCHANGES,
+        _ => 0,
+    }
+}
+
+/// Entries, or lists, of one step.
+const AT_ONCE: usize = 8;
