@@ -25,6 +25,7 @@ pub use heapless;
 
 pub mod command;
 pub mod config;
+mod decimal;
 pub mod device;
 #[cfg(doc)]
 pub mod docs;

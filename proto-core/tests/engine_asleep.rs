@@ -312,14 +312,48 @@ fn who_may_be_silent_for_longer_is_not_overdue() {
 }
 
 #[test]
+fn a_stop_that_is_asked_for_after_sleep_is_given() {
+    // Of the frames that waited, and of those that came until the next tick, nobody knows the age.
+    for pressed_before in [false, true] {
+        let mut full = Full::new();
+        if pressed_before {
+            full.press(3);
+            full.rig.link_bytes(LinkId::URGENT, b"stop success");
+        }
+        full.sleep(700);
+        full.press(3);
+        full.rig.run(MS(300));
+        assert!(full.rig.sent_on(LinkId::URGENT).is_empty(), "from what was discarded");
+        let based = full.rig.counters(full.panel).commands_based;
+        full.press(3);
+        full.rig.run(MS(20));
+        assert_eq!(full.rig.sent_on(LinkId::URGENT), [b"stop"], "pressed before: {pressed_before}");
+        full.rig.link_bytes(LinkId::URGENT, b"stop success");
+        full.press(3);
+        full.rig.run(MS(300));
+        assert_eq!(full.rig.sent_on(LinkId::URGENT).len(), 0, "once");
+        assert_eq!(full.rig.counters(full.panel).commands_based, based);
+    }
+}
+
+#[test]
+fn a_stop_after_sleep_is_no_order_of_a_device_that_was_gone_or_never_there() {
+    let mut full = Full::new();
+    full.sleep(700);
+    tick(&mut full.rig);
+    full.rig.run(MS(60));
+    full.rig.input(Input::PortDown { port: full.panel });
+    full.rig.input(Input::PortUp { port: full.panel });
+    full.press(3);
+    full.rig.run(MS(200));
+    assert!(full.rig.sent_on(LinkId::URGENT).is_empty());
+    assert_eq!(full.rig.counters(full.panel).commands_based, 1);
+}
+
+#[test]
 fn nothing_is_commanded_from_what_was_asked_before() {
-    // What waits or is under way at the time: a run, a run and a resume, a stop.
-    for (values, expected) in [
-        (&[1][..], ReplyCode::NoReply),
-        (&[1, 2], ReplyCode::NotSent),
-        (&[3], ReplyCode::NoReply),
-        (&[1, 3], ReplyCode::NoReply),
-    ] {
+    // What waits or is under way at the time: a run, a run and a resume.
+    for (values, expected) in [(&[1][..], ReplyCode::NoReply), (&[1, 2], ReplyCode::NotSent)] {
         let mut full = Full::new();
         for &value in values {
             full.press(value);

@@ -7,7 +7,7 @@ use proto_core::device::{Algorithm, Checksum, Encoding, Overflow};
 use proto_core::engine::{PortId, Rejection};
 use proto_core::recipe::PartError;
 use proto_core::recipe::model::Mode;
-use proto_core::sysvar::Direction;
+use proto_core::sysvar::{Direction, ModbusPlace};
 use proto_core::time::Duration;
 use proto_core::wire::can::CanId;
 use proto_core::wire::scalar::{Scalar, ScalarType as T};
@@ -334,5 +334,119 @@ fn a_counter_needs_unsigned_integers() {
     assert_eq!(refused(T::Byte, 0), Some(ConfigErrorKind::Counter { max: 0, high: 255.0 }));
     for ty in [T::Char, T::Float, T::Int] {
         assert_eq!(refused(ty, 14), Some(ConfigErrorKind::Counter { max: 14, high: -1.0 }), "{ty:?}");
+    }
+}
+
+/// Two frames of a cycle: a counter, and a register with what it may send.
+fn limited(allowed: &[FieldSpec]) -> (Rig, PortId) {
+    let mut cell = Cell::new();
+    let from = OutputBinding::Variable { var: var("WordOutputReg[1]"), scale: 0.5, offset: 0.0 };
+    let register = FieldSpec::UserOutput { ty: T::Byte, from };
+    let counter = FieldSpec::UserOutput { ty: T::Byte, from: OutputBinding::Counter };
+    let second = [&[register], allowed].concat();
+    let port = bus(&mut cell, [&[], &[(0x10, vec![counter]), (0x11, second)]]);
+    let rig = cell.rig();
+    (rig, port)
+}
+
+/// What the second frame has with this value of the register, if the cycle is sent.
+fn sends(rig: &mut Rig, port: PortId, register: u16) -> Option<u8> {
+    let ModbusPlace::Register { address } = var("WordOutputReg[1]").modbus().unwrap() else { panic!() };
+    rig.map.registers[usize::from(address)] = register;
+    rig.run(MS(100));
+    rig.can_sent_to(port);
+    rig.run(MS(40));
+    let sent = rig.can_sent_to(port);
+    let [.., first, second] = &sent[..] else {
+        assert_eq!(sent, [], "all frames of a cycle or none");
+        return None;
+    };
+    assert_eq!((first.id(), second.id()), (CanId::Standard(0x10), CanId::Standard(0x11)));
+    Some(second.data()[0])
+}
+
+#[test]
+fn a_number_outside_of_its_limits_is_not_sent_nor_is_its_cycle() {
+    let limits = |outside| [FieldSpec::Limits(Limits { low: 10.0, high: 110.0, outside })];
+    let (mut rig, port) = limited(&limits(Outside::Refuse));
+    rig.run(MS(2_000));
+    let before = rig.counters(port).stale_cycles;
+    assert_eq!(sends(&mut rig, port, 220), Some(110));
+    assert_eq!(rig.counters(port).stale_cycles, before);
+    for (register, sent) in [(222, None), (20, Some(10)), (18, None), (60_000, None), (100, Some(50))] {
+        assert_eq!(sends(&mut rig, port, register), sent, "{register}");
+    }
+    assert!(rig.counters(port).stale_cycles > before + 10);
+    let (mut rig, port) = limited(&limits(Outside::Clamp));
+    rig.run(MS(2_000));
+    for (register, sent) in [(222, 110), (20, 10), (18, 10), (60_000, 110), (100, 50)] {
+        assert_eq!(sends(&mut rig, port, register), Some(sent), "{register}");
+    }
+}
+
+#[test]
+fn a_map_sends_its_own_numbers_and_nothing_else() {
+    let entry = |first, last, sent| FieldSpec::Mapped(MapEntry { first, last, sent });
+    let mut cell = Cell::new();
+    let from = OutputBinding::Variable { var: var("WordOutputReg[1]"), scale: 1.0, offset: 0.0 };
+    let register = FieldSpec::UserOutput { ty: T::Byte, from };
+    let fields = vec![register, entry(0, 0, 9.0), entry(1, 7, 2.0), fixed(0x55)];
+    let counter = FieldSpec::UserOutput { ty: T::Byte, from: OutputBinding::Counter };
+    let port = bus(&mut cell, [&[], &[(0x10, vec![counter]), (0x11, fields)]]);
+    let mut rig = cell.rig();
+    rig.run(MS(2_000));
+    for (register, sent) in [(0, Some(9)), (1, Some(2)), (7, Some(2)), (8, None), (65_535, None)] {
+        assert_eq!(sends(&mut rig, port, register), sent, "{register}");
+    }
+}
+
+#[test]
+fn what_makes_no_sense_behind_a_field_is_refused_with_its_place() {
+    let limits = |low, high| FieldSpec::Limits(Limits { low, high, outside: Outside::Refuse });
+    let entry = |first, last, sent| FieldSpec::Mapped(MapEntry { first, last, sent });
+    let source = |scale| OutputBinding::Variable { var: var("WordOutputReg[1]"), scale, offset: 0.0 };
+    let number = |scale| FieldSpec::UserOutput { ty: T::Byte, from: source(scale) };
+    let decimal = FieldSpec::DeviceOutput {
+        encoding: Encoding::decimal(5).decimals(1),
+        overflow: Overflow::Usual,
+        from: source(1.0),
+    };
+    let wraps = FieldSpec::DeviceOutput { encoding: byte(), overflow: Overflow::Wrap, from: source(1.0) };
+    let counter = FieldSpec::UserOutput { ty: T::Byte, from: OutputBinding::Counter };
+    for (fields, field, said) in [
+        (vec![fixed(1), limits(0.0, 1.0)], 1, "only an output field with a source"),
+        (vec![output(5.0), limits(0.0, 1.0)], 1, "only an output field with a source"),
+        (
+            vec![number(1.0), FieldSpec::Padding { len: 1, fill: 0 }, limits(0.0, 1.0)],
+            2,
+            "only an output field",
+        ),
+        (vec![number(1.0), limits(0.0, 256.0)], 1, "the field cannot be 256; allowed: 0..=255"),
+        (vec![number(1.0), limits(9.0, 8.0)], 1, "min 9 is above max 8"),
+        (vec![number(1.0), limits(0.5, 8.0)], 1, "0.5 has a fraction"),
+        (vec![number(1.0), limits(0.0, 8.0), limits(0.0, 8.0)], 2, "min, max and outside"),
+        (vec![number(1.0), limits(0.0, 8.0), entry(1, 1, 2.0)], 2, "min, max and outside"),
+        (vec![number(1.0), entry(1, 1, 2.0), limits(0.0, 8.0)], 2, "min, max and outside"),
+        (
+            vec![number(1.0), entry(1, 4, 2.0), entry(4, 5, 3.0)],
+            2,
+            "an earlier entry already has the value 4",
+        ),
+        (vec![number(1.0), entry(4, 1, 2.0)], 1, "4..1 contains no value; allowed: 1..4"),
+        (vec![number(1.0), entry(4, 4, 300.0)], 1, "the field cannot be 300"),
+        (vec![number(0.5), entry(4, 4, 3.0)], 1, "scale and offset are not allowed"),
+        (vec![wraps, limits(0.0, 8.0)], 1, "overflow = \"wrap\""),
+        (vec![counter, limits(0.0, 8.0)], 1, "a count wraps"),
+        (vec![decimal, limits(0.0, 8.25)], 1, "8.25 has more than the field's 1 digits"),
+    ] {
+        let mut cell = Cell::new();
+        bus(&mut cell, [&[], &[(0x10, fields.clone())]]);
+        let error = cell.0.view().validate().unwrap_err();
+        assert_eq!(
+            error.place,
+            Place::Field { recipe: 0, part: Direction::Output, frame: 0, field },
+            "{fields:?}"
+        );
+        assert!(error.kind.to_string().contains(said), "{fields:?}: {}", error.kind);
     }
 }

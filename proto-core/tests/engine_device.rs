@@ -43,11 +43,6 @@ fn sum(name: &str) -> FieldSpec {
     FieldSpec::Checksum(Checksum::standard(Algorithm::named(name).unwrap()))
 }
 
-fn with_crc(bytes: &[u8]) -> Vec<u8> {
-    let crc = Algorithm::named("crc16-modbus").unwrap().of([bytes]) as u16;
-    [bytes, &crc.to_le_bytes()].concat()
-}
-
 /// A port with one frame each way, without head and tail.
 fn device(cell: &mut Cell, input: &[FieldSpec], output: &[FieldSpec], send: SendOn) -> PortId {
     let mut part = |fields: &[FieldSpec]| {

@@ -484,6 +484,38 @@ fn kind(cell: &Cell) -> ConfigErrorKind {
 }
 
 #[test]
+fn a_lamp_shows_whether_links_are_up() {
+    let mut cell = Cell::new();
+    let up = |link| OutputBinding::Link { link, scale: 1.0, offset: 0.0 };
+    let inverted = OutputBinding::Link { link: LinkSource::Modbus, scale: -1.0, offset: 1.0 };
+    let fields = [(T::Byte, up(LinkSource::Modbus)), (T::Byte, inverted), (T::Byte, up(LinkSource::Command))];
+    let lamp = lamp(&mut cell, &fields);
+    sensor(&mut cell, "BitInputReg[1]");
+    let mut rig = cell.rig();
+    rig.run(MS(100));
+    assert_eq!(newest(&mut rig, lamp), [1, 0, 0], "nobody picks commands, so there is no such link");
+    rig.input(Input::LinkDown { link: LinkId::MODBUS });
+    let _ = rig.sent_to(lamp);
+    rig.run(MS(8));
+    assert_eq!(newest(&mut rig, lamp), [0, 1, 0]);
+    rig.run(MS(1_000));
+    assert_eq!(newest(&mut rig, lamp), [1, 0, 0]);
+}
+
+#[test]
+fn a_link_that_cannot_be_is_refused() {
+    for (link, expected) in
+        [(LinkSource::RecipeUdp, false), (LinkSource::Listening(0), false), (LinkSource::State, true)]
+    {
+        let mut cell = Cell::new();
+        lamp(&mut cell, &[(T::Byte, OutputBinding::Link { link, scale: 1.0, offset: 0.0 })]);
+        let result = cell.0.validate();
+        let is_it = |error: &ConfigError| error.kind == ConfigErrorKind::NoLink { link };
+        assert_eq!(result.as_ref().is_err_and(is_it), !expected, "{result:?}");
+    }
+}
+
+#[test]
 fn mistakes_are_refused() {
     use ConfigErrorKind as Kind;
     let out = |ty, from| {

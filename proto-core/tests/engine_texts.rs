@@ -9,6 +9,7 @@ use proto_core::device::{
 };
 use proto_core::engine::{PortId, PortState, Rejection};
 use proto_core::recipe::model::Mode;
+use proto_core::sysvar::ModbusPlace;
 use proto_core::wire::scalar::ScalarType as T;
 use rig::*;
 
@@ -34,11 +35,6 @@ fn number(ty: T, to: &str) -> FieldSpec {
 
 fn crc() -> FieldSpec {
     FieldSpec::Checksum(Checksum::standard(Algorithm::named("crc16-modbus").unwrap()))
-}
-
-fn with_crc(bytes: &[u8]) -> Vec<u8> {
-    let crc = Algorithm::named("crc16-modbus").unwrap().of([bytes]) as u16;
-    [bytes, &crc.to_le_bytes()].concat()
 }
 
 struct Frames<'a> {
@@ -176,7 +172,7 @@ fn noread_is_not_a_code_of_five_letters() {
 fn telling(cell: &mut Cell) -> PortId {
     let mut field = code_to(TextWidth::Rest);
     let FieldSpec::TextInput { ignored, .. } = &mut field else { unreachable!() };
-    *ignored = Ignored::new(&[b"NOREAD", b"?"]).unwrap();
+    *ignored = Ignored::new(&[b"NOREAD", b"?", b""]).unwrap();
     let port = device(cell, &SCANNER, &[field], &[]);
     cell.safe("WordInputReg[9]", 99.0);
     port
@@ -190,7 +186,7 @@ fn an_ignored_text_changes_nothing_and_shows_that_the_device_is_there() {
     rig.run(MS(10));
     let state = |rig: &Rig| rig.engine.status(rig.now).ports().next().unwrap().state;
     for nth in 1..=5 {
-        rig.bytes(port, if nth == 3 { b"?\r\n" } else { b"NOREAD\r\n" });
+        rig.bytes(port, [&b"NOREAD\r\n"[..], b"?\r\n", b"\r\n"][nth as usize % 3]);
         assert_eq!((state(&rig), rig.counters(port).ignored), (PortState::Working, nth));
         rig.run(MS(60));
     }
@@ -212,6 +208,26 @@ fn an_ignored_text_changes_nothing_and_shows_that_the_device_is_there() {
 }
 
 #[test]
+fn the_robot_is_told_that_nothing_was_read() {
+    let mut cell = Cell::new();
+    let port = telling(&mut cell);
+    cell.last_port().health.ignored = Some(var("WordInputReg[20]"));
+    cell.last_port().health.frames = Some(var("WordInputReg[21]"));
+    let mut rig = cell.rig();
+    rig.run(MS(10));
+    for _ in 0..3 {
+        rig.bytes(port, b"NOREAD\r\n");
+        rig.run(MS(60));
+    }
+    rig.run(MS(100));
+    let register = |name: &str| {
+        let Some(ModbusPlace::Register { address }) = var(name).modbus() else { panic!() };
+        rig.map.registers[usize::from(address)]
+    };
+    assert_eq!((register("WordInputReg[20]"), register("WordInputReg[21]")), (3, 0));
+}
+
+#[test]
 fn a_device_that_falls_silent_after_an_ignored_text_is_overdue() {
     let mut cell = Cell::new();
     let port = telling(&mut cell);
@@ -229,6 +245,69 @@ fn a_device_that_falls_silent_after_an_ignored_text_is_overdue() {
     rig.run(MS(20));
     let state = rig.engine.status(rig.now).ports().next().unwrap().state;
     assert_eq!((state, rig.map.registers[16]), (PortState::Working, 99));
+}
+
+#[test]
+fn an_ignored_text_keeps_no_code_waiting() {
+    let mut cell = Cell::new();
+    let port = telling(&mut cell);
+    let mut rig = cell.rig();
+    rig.run(MS(10));
+    rig.modbus_answers = false;
+    // The first is on its way, the second waits behind it.
+    rig.bytes(port, b"4711\r\n");
+    rig.run(MS(10));
+    rig.bytes(port, b"4712\r\n");
+    rig.run(MS(60));
+    assert_eq!(rig.counters(port).values_expired, 0);
+    for _ in 0..4 {
+        rig.bytes(port, b"NOREAD\r\n");
+        rig.run(MS(60));
+    }
+    let counters = rig.counters(port);
+    assert_eq!((counters.timeouts, counters.values_expired), (0, 10), "eight registers, length and count");
+    let _ = rig.take_written();
+    rig.modbus_answers = true;
+    for _ in 0..40 {
+        rig.bytes(port, b"NOREAD\r\n");
+        rig.run(MS(60));
+    }
+    assert_eq!(rig.take_written(), [], "it was older than the timeout");
+}
+
+#[test]
+fn nothing_is_written_for_a_device_that_never_said_anything() {
+    let mut cell = Cell::new();
+    let port = telling(&mut cell);
+    let mut rig = cell.rig();
+    rig.run(MS(10));
+    rig.bytes(port, b"NOREAD\r\n");
+    rig.run(MS(1_000));
+    let state = rig.engine.status(rig.now).ports().next().unwrap().state;
+    assert_eq!((state, rig.counters(port).timeouts, rig.take_written()), (PortState::Silent, 1, vec![]));
+    rig.bytes(port, b"4711\r\n");
+    rig.run(MS(1_000));
+    assert_eq!((rig.counters(port).timeouts, rig.map.registers[16]), (2, 99));
+}
+
+#[test]
+fn a_text_that_does_not_fit_meanwhile_is_no_change() {
+    let mut cell = Cell::new();
+    let text = FieldSpec::TextOutput {
+        text: Text { width: TextWidth::Rest, fill: None },
+        from: words("WordOutputReg[1]", 3),
+        length_from: Some(var("WordOutputReg[9]")),
+    };
+    let framed = Frames { head: b"T", tail: b"\r\n", ..PLAIN };
+    let port = device(&mut cell, &framed, &[], &[text]);
+    cell.last_recipe().send = SendOn::Change;
+    let mut rig = cell.rig();
+    let mut sends = |len| {
+        rig.map.registers[48] = len;
+        rig.run(MS(200));
+        rig.sent_to(port).len()
+    };
+    assert_eq!([2, 7, 2, 3, 9, 2].map(&mut sends), [1, 0, 0, 1, 0, 1]);
 }
 
 #[test]

@@ -8,10 +8,10 @@ use proto_core::wire::can::{CanFrame, CanId};
 
 type Image = [u8; IMAGE_BYTES];
 
-const HEAD: [u8; 2] = [0xFF, 0xFF];
-const TAIL: [u8; 2] = [0xFE, 0xFE];
-const PAYLOAD: usize = 24;
-const FRAME: usize = HEAD.len() + PAYLOAD + TAIL.len();
+pub(crate) const HEAD: [u8; 2] = [0xFF, 0xFF];
+pub(crate) const TAIL: [u8; 2] = [0xFE, 0xFE];
+pub(crate) const PAYLOAD: usize = 24;
+pub(crate) const FRAME: usize = HEAD.len() + PAYLOAD + TAIL.len();
 const POSE: &str = "RobotState[8..13]";
 /// Where the pose stands in the image.
 const POSE_PLACE: usize = 289;
@@ -69,6 +69,12 @@ impl Stream {
             }
         }
         Self::carrying(line, random).check()
+    }
+
+    /// The line's bytes, and the sizes of its chunks.
+    #[allow(dead_code, reason = "for other libraries; the benchmarks do not look at them")]
+    pub(crate) fn into_line(self) -> (Vec<u8>, Vec<usize>) {
+        (self.line, self.chunks)
     }
 
     /// As many bytes without a frame.
@@ -289,6 +295,16 @@ impl Can {
         let mut new = Self { layout, frames, places, image: [0; IMAGE_BYTES] };
         assert_eq!((new.decode(), new.decode_bare()), (FRAMES, FRAMES));
         new
+    }
+
+    /// The frames: id and data.
+    #[allow(dead_code, reason = "for other libraries; the benchmarks do not look at them")]
+    pub(crate) fn into_frames(self) -> Vec<(u32, Vec<u8>)> {
+        let parts = |frame: CanFrame| {
+            let CanId::Standard(id) = frame.id() else { unreachable!() };
+            (u32::from(id), frame.data().to_vec())
+        };
+        self.frames.into_iter().map(parts).collect()
     }
 
     #[inline(never)]

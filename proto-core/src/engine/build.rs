@@ -28,10 +28,10 @@ use super::state_link::StateLink;
 use super::store::{InputFrame, MAX_INPUT_FRAMES, SafeBytes, Store};
 use super::tap::Tap;
 use super::uplink::{Uplink, UplinkSetup};
-use super::user::{Bindings, InputBind, InputTo, OutputBind};
+use super::user::{Bindings, InputBind, InputTo, OutputBind, Sendable};
 use crate::config::{
-    Bus, ConfigView, Counted, FieldSpec, InputBinding, MIN_CYCLE, OutputBinding, Parts, Port, Recipe, SendOn,
-    Span, listen_address,
+    Bus, ConfigView, Counted, FieldSpec, InputBinding, MAX_SENDABLE, MIN_CYCLE, OutputBinding, Parts, Port,
+    Recipe, SendOn, Span, listen_address,
 };
 use crate::image::{GroupId, InputSet, MAX_GROUPS};
 use crate::link::LinkTimings;
@@ -62,7 +62,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         Self {
             store: Store::new(),
             ports: Vec::new(),
-            bindings: Bindings { inputs: Vec::new(), outputs: Vec::new() },
+            bindings: Bindings::new(),
             safe_values: Vec::new(),
             links: Links::new(),
             health: PortsHealth::new(),
@@ -121,6 +121,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         ports.clear();
         bindings.inputs.clear();
         bindings.outputs.clear();
+        bindings.sendable.clear();
         safe_values.clear();
         let Links { host, command, state, modbus, recipes } = links;
         host.clear();
@@ -298,6 +299,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
         let mut outputs = Span { start: self.bindings.outputs.len() as u16, len: 0 };
         for (_, _, field) in config.fields_of(recipe, Direction::Output) {
+            if let Some(sendable) = Sendable::new(field) {
+                let done = self.bindings.may_send(sendable);
+                done.ok_or(one_too_many(Counted::Sendable, MAX_SENDABLE))?;
+            }
             let Some(element) = field.element() else { continue };
             // How constants and padding are sent is the element's business.
             let (ty, from) = match *field {
@@ -501,8 +506,12 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         for var in SysVar::all().filter(|&var| plan.source(var) == Some(Source::Modbus)) {
             let before = |other: &SysVar| modbus_address(*other) <= modbus_address(var);
             let place = polled.iter().rposition(before).map_or(0, |last| last.saturating_add(1));
-            // There are as many places as variables.
-            let _ = polled.insert(place.min(polled.len()), var);
+            // `Vec::insert` can panic. There are as many places as variables.
+            let mut moved = var;
+            for behind in polled.iter_mut().skip(place) {
+                core::mem::swap(behind, &mut moved);
+            }
+            let _ = polled.push(moved);
         }
         for &var in &polled {
             let period = periods.get(var.ordinal()).copied().flatten().unwrap_or(MIN_CYCLE);

@@ -6,6 +6,7 @@
 use super::Engine;
 use super::counters::{add, bump};
 use super::field_port::FieldPort;
+use super::io::Output;
 use super::store::Overdue;
 use super::user::silence_commands;
 use crate::time::{Duration, Instant};
@@ -31,14 +32,12 @@ const LAST: Instant = Instant::from_micros(u64::MAX - 1);
 pub(super) struct Clock {
     /// Nothing depends on the clock before this. It may be earlier than needed, never later.
     pub timer_at: Instant,
-    /// `timer_at` was computed after the clock was last checked.
-    pub is_armed: bool,
     /// The newest instant of a call.
     pub now: Instant,
     /// A deadline has come and its tick has not been reported. Expired data may still wait, so
     /// nothing is sent before that tick.
     pub is_late: bool,
-    /// The instant of the newest [`super::Output::Sleep`]; it stays while its tick is not reported.
+    /// The instant of the newest [`Output::Sleep`]; it stays while its tick is not reported.
     pub announced: Instant,
     /// The engine asks to be called by then, because calls further apart than [`ASLEEP`] mean
     /// sleep.
@@ -48,7 +47,7 @@ pub(super) struct Clock {
     /// Input from field ports is discarded, because it waited while the gateway slept.
     pub is_deaf: bool,
     pub deaf_until: Instant,
-    /// The ports and links that [`Engine::poll_output`] asks before it sleeps.
+    /// What [`Engine::poll_output`] asks before it sleeps.
     pub ask: Ask,
 }
 
@@ -56,7 +55,6 @@ impl Clock {
     /// Before the first call, which asks every port and link, because `timer_at` has come.
     pub(super) const START: Self = Self {
         timer_at: Instant::ZERO,
-        is_armed: false,
         now: Instant::ZERO,
         is_late: false,
         announced: Instant::ZERO,
@@ -68,21 +66,57 @@ impl Clock {
     };
 }
 
-/// The ports and links that may have an output. One that had none is not asked again until
-/// something happens to it, a deadline comes, or the next beat.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Ask {
-    /// Links that may send.
-    pub links: bool,
-    /// Links that may be opened or closed.
-    pub actions: bool,
-    /// Ports that may send.
-    pub ports: bool,
+impl Clock {
+    /// Whether a call at `now` finds nothing to do, and the timer is right.
+    #[inline(always)]
+    pub(super) fn is_quiet(&self, now: Instant) -> bool {
+        self.ask == Ask::ARMED && now.max(self.now) < self.timer_at
+    }
 }
 
+/// What has to be asked: ports and links that may have an output, and the timer. One that had no output is not
+/// asked again until something happens to it, a deadline comes, or the next beat.
+// As bits, so that one comparison tells that there is nothing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Ask(u8);
+
 impl Ask {
-    pub(super) const ALL: Self = Self { links: true, actions: true, ports: true };
-    pub(super) const NONE: Self = Self { links: false, actions: false, ports: false };
+    pub(super) const NONE: Self = Self(0);
+    /// Links that may send.
+    pub(super) const LINKS: Self = Self(1);
+    /// Links that may be opened or closed.
+    pub(super) const ACTIONS: Self = Self(2);
+    /// Ports that may send.
+    pub(super) const PORTS: Self = Self(4);
+    /// Not to be asked: `timer_at` was computed since the clock was last checked.
+    // This way round, because an engine without a configuration is all zeros, which take no flash.
+    pub(super) const ARMED: Self = Self(8);
+    /// All ports and links.
+    pub(super) const ALL: Self = Self(7);
+
+    /// Whether it is to be asked.
+    #[inline(always)]
+    pub(super) const fn has(self, what: Self) -> bool {
+        self.0 & what.0 != 0
+    }
+
+    /// It is to be asked, too.
+    #[inline(always)]
+    pub(super) const fn add(&mut self, what: Self) {
+        self.0 |= what.0;
+    }
+
+    /// It was asked.
+    #[inline(always)]
+    pub(super) const fn remove(&mut self, what: Self) {
+        self.0 &= !what.0;
+    }
+
+    /// The same, if it is.
+    #[inline(always)]
+    pub(super) const fn when(self, wanted: bool) -> Self {
+        if wanted { self } else { Self::NONE }
+    }
 }
 
 impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize, const EXCHANGES: usize>
@@ -97,7 +131,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
     }
 
-    /// When the engine has something to do without an input, computed exactly. [`super::Output::Sleep`]
+    /// When the engine has something to do without an input, computed exactly. [`Output::Sleep`]
     /// may be earlier, never later.
     pub fn deadline(&self) -> Instant {
         let ports = self.ports.iter().map(FieldPort::deadline);
@@ -105,6 +139,28 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let hears_at = if self.clock.is_deaf { self.clock.deaf_until } else { Instant::NEVER };
         let own = ports.min(self.links.deadline()).min(self.store.deadline()).min(hears_at);
         if self.exchanges.is_used() { own.min(self.talk_deadline()) } else { own }
+    }
+
+    /// Nothing is to be done until the next deadline or beat.
+    #[inline(always)]
+    pub(super) fn poll_sleep<'b>(&mut self) -> Output<'b> {
+        if !self.clock.ask.has(Ask::ARMED) {
+            self.clock.ask.add(Ask::ARMED);
+            self.clock.timer_at = self.deadline();
+        }
+        self.sleep()
+    }
+
+    /// Until the next deadline or beat; the timer is right.
+    #[inline(always)]
+    pub(super) fn sleep<'b>(&mut self) -> Output<'b> {
+        let beat_at = if self.ports.is_empty() { Instant::NEVER } else { self.clock.beat_at };
+        let until = self.clock.timer_at.min(beat_at);
+        if until == Instant::NEVER {
+            return Output::Sleep { until };
+        }
+        self.clock.announced = self.clock.announced.min(until);
+        Output::Sleep { until: self.clock.announced }
     }
 
     /// The present, and whether the gateway has slept until now.
@@ -117,7 +173,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 self.wake(now);
             }
             self.clock.beat_at = now + HEARTBEAT;
-            self.clock.ask = Ask::ALL;
+            self.clock.ask.add(Ask::ALL);
         }
         self.clock.now = now;
         now
@@ -160,8 +216,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     fn advance(&mut self, now: Instant) {
         // At one instant the clock is checked once: what is done now is due later.
         self.clock.timer_at = now + Duration::from_micros(1);
-        self.clock.ask = Ask::ALL;
-        self.clock.is_armed = false;
+        self.clock.ask.add(Ask::ALL);
+        self.clock.ask.remove(Ask::ARMED);
         self.expire_frames(now);
         let mut is_ended = false;
         for port in &mut self.ports {

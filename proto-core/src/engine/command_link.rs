@@ -111,7 +111,7 @@ impl CommandLink {
     pub(super) fn add_field(&mut self, table: Span, when: CommandWhen, place: (u8, u8)) -> Option<u8> {
         let index = self.fields.len() as u8;
         let names_idle = self.tables.names_idle(table);
-        self.fields.push(CommandField { table, when, last: None, place, names_idle }).ok()?;
+        self.fields.push(CommandField { table, when, last: None, place, woke: false, names_idle }).ok()?;
         Some(index)
     }
 
@@ -129,6 +129,7 @@ impl CommandLink {
         // Only integer fields can be bound to a table.
         let value = value.as_f64() as i64;
         let before = place.last.replace(value);
+        let woke = core::mem::take(&mut place.woke);
         let CommandField { table, when, names_idle, .. } = *place;
         let changed = before.is_some_and(|before| before != value);
         if changed {
@@ -148,7 +149,9 @@ impl CommandLink {
         if len == 0 {
             return Picked::Nothing;
         }
-        if !acts {
+        // The press of a stop button may be among what was discarded after sleep; a stop too many does no harm.
+        let is_held_stop = woke && keyword.is_urgent();
+        if !acts && !is_held_stop {
             self.tell(port, NotGiven::Based, (field, value), now);
             return Picked::Based;
         }
@@ -224,20 +227,18 @@ impl CommandLink {
         }
     }
 
-    /// The field's frame is overdue. A field that keeps its base is taken to have its last value
-    /// still: its device sends only changes. [`Self::drop_forgotten`] follows.
+    /// The field's frame is overdue. [`Self::drop_forgotten`] follows.
     pub(super) fn silent(&mut self, field: u8, now: Instant) {
-        let when = self.fields.get(usize::from(field)).map(|place| place.when);
-        if when != Some(CommandWhen::Kept) {
-            self.forget(field, now);
-        }
+        self.lose_base(field, now, CommandField::silent);
     }
 
-    /// The next value of the field only sets the base. [`Self::drop_forgotten`] follows.
+    /// The field's device is gone. [`Self::drop_forgotten`] follows.
     pub(super) fn forget(&mut self, field: u8, now: Instant) {
-        if let Some(place) = self.fields.get_mut(usize::from(field))
-            && place.last.take().is_some()
-        {
+        self.lose_base(field, now, CommandField::forget);
+    }
+
+    fn lose_base(&mut self, field: u8, now: Instant, lose: impl FnOnce(&mut CommandField) -> bool) {
+        if self.fields.get_mut(usize::from(field)).is_some_and(lose) {
             self.stops.no_longer_asked(field, now);
         }
     }
@@ -321,7 +322,7 @@ impl CommandLink {
         // Of two commands of a kind the newer one is sent again: its result is the one that is
         // shown.
         for sent in [beside, first].into_iter().flatten() {
-            if sent.keyword.is_urgent() && self.is_asked(&sent.command) {
+            if sent.keyword.is_urgent() && is_asked(&self.fields, &sent.command) {
                 self.stops.push_again(sent.keyword, Waiting { since: now, ..sent.command });
             } else {
                 self.outcomes.push(sent.command, ReplyCode::NoReply);
@@ -336,9 +337,10 @@ impl CommandLink {
         self.way_made_until = self.way_made_until.max(at);
     }
 
-    /// The gateway itself slept: commands picked before are dropped.
+    /// The gateway itself slept: commands picked before are dropped. A stop is picked again by the next value, if
+    /// the device still asks for it.
     pub(super) fn slept(&mut self, now: Instant) {
-        self.fields.iter_mut().for_each(|field| field.last = None);
+        self.fields.iter_mut().for_each(CommandField::slept);
         self.drop_queue(NotGiven::Asleep, now);
         for link in [LinkId::COMMAND, LinkId::URGENT] {
             if let Some(session) = self.session(link) {
@@ -560,7 +562,7 @@ impl CommandLink {
             Some(_) => self.stop_may_go_at(),
             None => self.crowded().map_or(Instant::NEVER, |(_, at)| at),
         };
-        goes_at.min(self.stops.deadline(|waiting| self.is_asked(waiting)))
+        goes_at.min(self.stops.deadline(|waiting| is_asked(&self.fields, waiting)))
     }
 
     fn session(&mut self, link: LinkId) -> Option<&mut Session> {
@@ -568,11 +570,6 @@ impl CommandLink {
             LinkId::URGENT => self.urgent.as_mut(),
             _ => Some(&mut self.ordinary),
         }
-    }
-
-    /// Whether the field still has the value that picked the command.
-    fn is_asked(&self, waiting: &Waiting) -> bool {
-        is_asked(&self.fields, waiting)
     }
 
     /// Takes the events in `rest`, or those that the clock has completed.

@@ -24,8 +24,29 @@ pub(super) struct CommandField {
     pub last: Option<i64>,
     /// Index of its input frame, and its index in the frame.
     pub place: (u8, u8),
+    /// The gateway has slept since the value in the previous frame: what changed it may have been discarded.
+    pub woke: bool,
     /// The table names the values that pick nothing; otherwise it is 0.
     pub names_idle: bool,
+}
+
+impl CommandField {
+    /// Its frame is overdue: the next value only sets the base, unless the field keeps it, because its device sends
+    /// only changes. Whether there was one and is none.
+    pub(super) fn silent(&mut self) -> bool {
+        self.when != CommandWhen::Kept && self.last.take().is_some()
+    }
+
+    /// Its device is gone: the next value only sets the base. Whether there was one.
+    pub(super) fn forget(&mut self) -> bool {
+        self.woke = false;
+        self.last.take().is_some()
+    }
+
+    /// The gateway slept: the next value only sets the base, unless it stops the robot.
+    pub(super) fn slept(&mut self) {
+        self.woke |= self.last.take().is_some();
+    }
 }
 
 /// What a field's value leads to.

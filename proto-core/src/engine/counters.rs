@@ -2,7 +2,7 @@
 
 /// Counters of a field port. They wrap after 2^32.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-#[cfg_attr(feature = "serde", derive(serde::Serialize))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(default))]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
 pub struct PortCounters {
@@ -62,7 +62,8 @@ pub struct PortCounters {
     pub withheld: u32,
     /// Cycles in which no output frame could be sent in time (D20).
     pub skipped_cycles: u32,
-    /// Cycles in which no output frame was sent because its sources were stale or unknown.
+    /// Cycles in which no output frame was sent because its sources were stale or unknown, or because a field
+    /// could not have its value.
     pub stale_cycles: u32,
     /// Requests without a good reply, after all repetitions.
     pub unanswered: u32,
@@ -87,7 +88,7 @@ pub struct PortCounters {
 
 /// Counters of a controller link, in addition to [`crate::link::LinkHistory`]. They wrap.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-#[cfg_attr(feature = "serde", derive(serde::Serialize))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(default))]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
 pub struct LinkCounters {
@@ -124,8 +125,9 @@ impl PortCounters {
         add(&mut self.bytes_out, len);
     }
 
-    /// Frames that were rejected; those for other nodes of a CAN bus are not.
-    pub(super) fn rejected(&self) -> u32 {
+    /// Frames that were rejected, for whatever reason. Frames of a CAN bus that are for other nodes are not among them:
+    /// [`Self::rejected_id`] and [`Self::rejected_remote`] count on a bus where all is well. It wraps.
+    pub fn rejected(&self) -> u32 {
         let all = [
             self.rejected_not_finite,
             self.rejected_out_of_range,

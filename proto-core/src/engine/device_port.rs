@@ -9,13 +9,14 @@ use super::build_error::{BuildError, one_too_many};
 use super::command_link::CommandLink;
 use super::counters::bump;
 use super::field_output::Downward;
-use super::field_port::{Accepted, Codec, FieldPort, Frames, came, keep};
+use super::field_port::{Codec, FieldPort, came, keep};
+use super::frames::{Accepted, Frames};
 use super::line::Line;
 use super::rejection::Rejection;
 use super::sender::{DIGEST_SEED, digest};
 use super::store::Store;
 use super::tap::Tap;
-use super::user::{InputBind, InputTo, OutputBind, Written};
+use super::user::{InputBind, InputTo, Outputs, Written};
 use super::whole_port::{MAX_TEXTS, Outgoing, Reader, TextBind, texts_of};
 use crate::config::{CanFramePart, ConfigView, Counted, DeviceFrame, Parts, Recipe, Rs485, Span};
 use crate::device::{Cutter, Element, Encoding, Escape, Found, FrameLayout, Framer, Overflow, Probe};
@@ -158,6 +159,7 @@ impl DeviceCodec {
                 codec.reader = Some(match (slave, cutter) {
                     (Some(slave), _) => Reader::Slave(slave),
                     (None, Some(cutter)) => Reader::Whole { cutter, heard: Instant::ZERO },
+                    (None, None) if recipe.exchanges.len > 0 => Reader::Search(Framer::of_replies()),
                     (None, None) => Reader::Search(Framer::new()),
                 });
                 [&[], &[]]
@@ -308,7 +310,7 @@ impl FieldPort {
     pub(super) fn next_device(
         &mut self,
         image: &Image,
-        bindings: &[OutputBind],
+        bindings: Outputs<'_>,
         out: &mut [u8],
         now: Instant,
     ) -> Option<Downward> {
@@ -318,10 +320,16 @@ impl FieldPort {
         let outgoing = Outgoing { image, bindings, texts: &device.texts, frames_sent, reply };
         let encode = |format: &DeviceFormat, out: &mut [u8]| outgoing.encode(format, device.escape, out);
         let formats = device.output();
-        if nth == 0 && self.sender.sends_changes() {
+        let may_lack_one = formats.len() > 1 && bindings.are_limited(self.outputs);
+        if nth == 0 && (self.sender.sends_changes() || may_lack_one) {
             let mut hash = DIGEST_SEED;
             for format in formats {
-                let len = encode(format, out).unwrap_or(0);
+                let Some(len) = encode(format, out) else {
+                    // What was sent last is still the newest. The frames of a cycle belong together.
+                    bump(&mut self.counters.stale_cycles);
+                    self.sender.dismiss();
+                    return None;
+                };
                 hash = digest(hash, out.get(..len).unwrap_or(&[]));
             }
             if !self.sender.is_news(hash, now) {
@@ -331,6 +339,7 @@ impl FieldPort {
         }
         let Some((format, len)) = formats.get(nth).and_then(|format| Some((format, encode(format, out)?)))
         else {
+            bump(&mut self.counters.stale_cycles);
             self.sender.dismiss();
             return None;
         };

@@ -379,7 +379,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             };
             let cost = on_line(request_len) + exchange.timeout + exchange.pause;
             let when = (exchange.when.every, exchange.when.start);
-            let row = Row::new(peer as u8, when, (cost, exchange.timeout), Instant::ZERO);
+            let row = Row::new(peer as u8, when, (cost, exchange.timeout), Instant::ZERO)
+                .with_reply(item.times.is_answered && !matches!(item.asks, Asks::Nothing));
             self.exchanges.rows.push(row).map_err(|_| full())?;
             self.exchanges.items.push(item).map_err(|_| full())?;
         }

@@ -7,7 +7,7 @@
 use super::counters::{add, bump};
 use super::field_port::{Codec, FieldPort, fields_before};
 use super::sender::{DIGEST_SEED, digest};
-use super::user::{OutputBind, values};
+use super::user::{Outputs, values};
 use crate::image::Image;
 use crate::recipe::model::Mode;
 use crate::time::Instant;
@@ -24,7 +24,7 @@ impl FieldPort {
     pub(super) fn next_output(
         &mut self,
         image: &Image,
-        bindings: &[OutputBind],
+        bindings: Outputs<'_>,
         out: &mut [u8],
         now: Instant,
     ) -> Option<Downward> {
@@ -34,8 +34,8 @@ impl FieldPort {
             return None;
         }
         match self.codec {
-            Codec::Stream { .. } => self.next_stream(image, self.outputs.of(bindings), out, now),
-            Codec::Can { .. } => self.next_can(image, self.outputs.of(bindings), now),
+            Codec::Stream { .. } => self.next_stream(image, bindings.of(self.outputs), out, now),
+            Codec::Can { .. } => self.next_can(image, bindings.of(self.outputs), now),
             Codec::Device(_) => self.next_device(image, bindings, out, now),
         }
     }
@@ -43,7 +43,7 @@ impl FieldPort {
     fn next_stream(
         &mut self,
         image: &Image,
-        bindings: &[OutputBind],
+        bindings: Outputs<'_>,
         out: &mut [u8],
         now: Instant,
     ) -> Option<Downward> {
@@ -54,7 +54,7 @@ impl FieldPort {
         let encoded = match self.mode {
             Mode::Realtime => layout.encode(image.bytes(), out).ok(),
             Mode::User => {
-                let values = values(bindings, image, self.sender.frames_sent, self.reply);
+                let values = values(bindings.binds, image, self.sender.frames_sent, self.reply);
                 layout.encode_values(&values, out).ok()
             }
         };
@@ -74,7 +74,7 @@ impl FieldPort {
         }
     }
 
-    fn next_can(&mut self, image: &Image, bindings: &[OutputBind], now: Instant) -> Option<Downward> {
+    fn next_can(&mut self, image: &Image, bindings: Outputs<'_>, now: Instant) -> Option<Downward> {
         if self.sender.next_can == 0 && !self.can_is_news(image, bindings, now) {
             self.sender.dismiss();
             return None;
@@ -95,14 +95,14 @@ impl FieldPort {
     }
 
     /// The `nth` frame of the cycle, and whether it is the last.
-    fn can_frame(&self, nth: usize, image: &Image, bindings: &[OutputBind]) -> Option<(CanFrame, bool)> {
+    fn can_frame(&self, nth: usize, image: &Image, bindings: Outputs<'_>) -> Option<(CanFrame, bool)> {
         let Codec::Can { output: Some(layout), .. } = &self.codec else { return None };
         let frame = layout.frame(nth)?;
         let is_last = nth.saturating_add(1) >= layout.frame_count();
         let frame = match self.mode {
             Mode::Realtime => frame.encode(image.bytes()),
             Mode::User => {
-                let row = bindings.get(fields_before(layout, nth)..).unwrap_or(&[]);
+                let row = bindings.binds.get(fields_before(layout, nth)..).unwrap_or(&[]);
                 let row = row.get(..frame.fields().count()).unwrap_or(&[]);
                 let values = values(row, image, self.sender.frames_sent, self.reply);
                 frame.encode_values(&values).ok()?
@@ -111,7 +111,7 @@ impl FieldPort {
         Some((frame, is_last))
     }
 
-    fn can_is_news(&mut self, image: &Image, bindings: &[OutputBind], now: Instant) -> bool {
+    fn can_is_news(&mut self, image: &Image, bindings: Outputs<'_>, now: Instant) -> bool {
         if !self.sender.sends_changes() {
             return true;
         }

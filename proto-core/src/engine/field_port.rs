@@ -4,9 +4,9 @@
 //! how values reach the controller.
 
 use super::command_link::CommandLink;
-use super::command_tables::Picked;
 use super::counters::{PortCounters, add, bump};
 use super::device_port::DeviceCodec;
+use super::frames::{Accepted, Frames};
 use super::io::{BusState, PortId, PortState, ReplyCode};
 use super::line_timing::LineTiming;
 use super::outcome::Outcome;
@@ -14,17 +14,14 @@ use super::rejection::{LastRejection, Rejection};
 use super::sender::Sender;
 use super::store::Store;
 use super::tap::{Tap, TapDirection, TapPlace, TapVerdict, Tapped};
-use super::user::{InputBind, InputTo, fit, forget_commands};
+use super::user::{InputBind, forget_commands};
 use crate::config::{Name, Span};
-use crate::image::{ImageBytes, InputSet};
 use crate::recipe::Deframer;
 use crate::recipe::StreamLayout;
 use crate::recipe::model::Mode;
-use crate::recipe::{Applied, ValueError, Values};
 use crate::recipe::{CanLayout, CanReject};
 use crate::time::{Duration, Instant};
 use crate::wire::can::{CanFrame, CanId};
-use crate::wire::scalar::Scalar;
 
 /// The layouts of the port's recipe.
 // With a tag of its own: to find it in the values of a layout takes several instructions, each time.
@@ -61,46 +58,6 @@ pub(super) struct FieldPort {
     pub reply: ReplyCode,
     pub counters: PortCounters,
     pub last_rejection: Option<LastRejection>,
-}
-
-/// The frames that were accepted in one call.
-#[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Accepted {
-    pub frames: u32,
-    /// Those of their variables whose link is up.
-    pub set: InputSet,
-}
-
-/// The operations of a frame's layout, stream or CAN.
-trait InputLayout {
-    fn apply(&self, payload: &[u8], image: &mut ImageBytes) -> Result<Applied, ValueError>;
-    fn check(&self, payload: &[u8]) -> Result<(), ValueError>;
-    fn values<'v>(&'v self, payload: &'v [u8]) -> Values<'v>;
-}
-
-impl InputLayout for StreamLayout {
-    fn apply(&self, payload: &[u8], image: &mut ImageBytes) -> Result<Applied, ValueError> {
-        Self::apply(self, payload, image)
-    }
-    fn check(&self, payload: &[u8]) -> Result<(), ValueError> {
-        Self::check(self, payload)
-    }
-    fn values<'v>(&'v self, payload: &'v [u8]) -> Values<'v> {
-        Self::values(self, payload)
-    }
-}
-
-impl InputLayout for crate::recipe::CanFrameLayout<'_> {
-    #[inline(always)]
-    fn apply(&self, payload: &[u8], image: &mut ImageBytes) -> Result<Applied, ValueError> {
-        Self::apply(self, payload, image)
-    }
-    fn check(&self, payload: &[u8]) -> Result<(), ValueError> {
-        Self::check(self, payload)
-    }
-    fn values<'v>(&'v self, payload: &'v [u8]) -> Values<'v> {
-        Self::values(self, payload)
-    }
 }
 
 impl FieldPort {
@@ -177,6 +134,22 @@ impl FieldPort {
     pub(super) fn heard(&mut self, bytes: &[u8], now: Instant) {
         add(&mut self.counters.bytes_in, bytes.len());
         self.line.heard = now;
+    }
+
+    /// Takes bytes from the line that only continue or begin a frame: nothing but a deadline comes of them. The
+    /// deadline, if it may be earlier than before; [`Instant::NEVER`] if not. `None` if [`Self::frames`] has to read
+    /// them; then nothing was taken.
+    #[inline]
+    pub(super) fn hold(&mut self, bytes: &[u8], now: Instant) -> Option<Instant> {
+        let Codec::Stream { input: Some(layout), deframer, .. } = &mut self.codec else { return None };
+        let had_begun = deframer.pending() > 0;
+        if !deframer.hold(layout, bytes) {
+            return None;
+        }
+        self.heard(bytes, now);
+        self.partial_until = self.line.partial_until(true);
+        // What is heard later only makes deadlines later.
+        Some(if had_begun { Instant::NEVER } else { self.partial_until })
     }
 
     /// Reads the frames in `rest`; stops after the first accepted one if the image is to be checked
@@ -388,6 +361,9 @@ impl FieldPort {
         if !first.is_empty() {
             tap.record(|| came(self.id, now, Err(Rejection::Partial), None, [first, second, &[]]));
             keep(&mut self.last_rejection, Rejection::Partial, None, first, now);
+            if let Some(last) = &mut self.last_rejection {
+                last.append(now, second.len(), second);
+            }
         }
         let dropped = deframer.discard();
         add(&mut self.counters.discarded_bytes, dropped);
@@ -447,138 +423,6 @@ pub(super) fn came<'a>(
 ) -> Tapped<'a> {
     let verdict = verdict.map_or_else(TapVerdict::Rejected, |()| TapVerdict::Taken);
     Tapped { at, place: TapPlace::Port(port), direction: TapDirection::In, verdict, can_id, pieces }
-}
-
-/// The context for applying a frame.
-pub(super) struct Frames<'a, const PORTS: usize> {
-    pub mode: Mode,
-    pub bindings: &'a [InputBind],
-    pub reply: &'a mut ReplyCode,
-    pub counters: &'a mut PortCounters,
-    pub port: PortId,
-    pub store: &'a mut Store<PORTS>,
-    pub commands: Option<&'a mut CommandLink>,
-}
-
-impl<'a, const PORTS: usize> Frames<'a, PORTS> {
-    // The parts of a port one by one: its codec is in use meanwhile.
-    #[inline(always)]
-    pub(super) fn new(
-        (port, mode): (PortId, Mode),
-        reply: &'a mut ReplyCode,
-        counters: &'a mut PortCounters,
-        bindings: &'a [InputBind],
-        store: &'a mut Store<PORTS>,
-        commands: Option<&'a mut CommandLink>,
-    ) -> Self {
-        Self { mode, bindings, reply, counters, port, store, commands }
-    }
-}
-
-impl<const PORTS: usize> Frames<'_, PORTS> {
-    /// Counts a rejection, and is one.
-    pub(super) fn rejected(&mut self, why: Rejection) -> Result<(), Rejection> {
-        let counters = &mut *self.counters;
-        bump(match why {
-            Rejection::NoInput => &mut counters.rejected_no_input,
-            Rejection::Remote => &mut counters.rejected_remote,
-            Rejection::ForeignId => &mut counters.rejected_id,
-            Rejection::WrongLength => &mut counters.rejected_length,
-            Rejection::Checksum => &mut counters.rejected_checksum,
-            Rejection::OtherDevice => &mut counters.rejected_other_device,
-            Rejection::Repeated => &mut counters.rejected_counter,
-            Rejection::Unreadable | Rejection::Escape => &mut counters.rejected_unreadable,
-            Rejection::NotFinite => &mut counters.rejected_not_finite,
-            _ => &mut counters.rejected_out_of_range,
-        });
-        Err(why)
-    }
-
-    /// Applies a frame as a whole or not at all, and counts it in `accepted`.
-    // A result with the set in it would be copied byte by byte: its tag is one byte.
-    fn take(
-        &mut self,
-        layout: &impl InputLayout,
-        payload: &[u8],
-        slot: usize,
-        accepted: &mut Accepted,
-    ) -> Result<(), Rejection> {
-        match self.mode {
-            Mode::Realtime => match layout.apply(payload, self.store.image.bytes_mut()) {
-                Ok(applied) => {
-                    if applied.masked > 0 {
-                        bump(&mut self.counters.masked);
-                    }
-                }
-                Err(_) => return self.rejected(Rejection::NotFinite),
-            },
-            // With a context of its own, so that the other mode's can stay in registers.
-            Mode::User => self.again().take_user(layout, payload, slot)?,
-        }
-        bump(&mut self.counters.frames_in);
-        accepted.frames = accepted.frames.wrapping_add(1);
-        accepted.set = self.store.accepted(slot, self.counters);
-        Ok(())
-    }
-
-    #[inline(always)]
-    fn again(&mut self) -> Frames<'_, PORTS> {
-        let commands = self.commands.as_deref_mut();
-        Frames::new((self.port, self.mode), self.reply, self.counters, self.bindings, self.store, commands)
-    }
-
-    /// Applies the values of a user-defined frame, all or none.
-    #[inline(never)]
-    fn take_user(&mut self, layout: &impl InputLayout, payload: &[u8], slot: usize) -> Result<(), Rejection> {
-        if layout.check(payload).is_err() {
-            return self.rejected(Rejection::NotFinite);
-        }
-        let frame = self.store.frames.get(slot).ok_or(Rejection::NoInput)?;
-        let bindings = frame.bindings.of(self.bindings);
-        if !fit(bindings, layout.values(payload)) {
-            return self.rejected(Rejection::OutOfRange);
-        }
-        for (binding, value) in bindings.iter().zip(layout.values(payload)) {
-            self.apply_user(&binding.to, value);
-        }
-        if let Some(link) = &mut self.commands {
-            link.frame_ends();
-        }
-        Ok(())
-    }
-
-    pub(super) fn apply_user(&mut self, binding: &InputTo, value: Scalar) {
-        match *binding {
-            InputTo::Unused | InputTo::Fixed { .. } | InputTo::Counter(_) => {}
-            InputTo::Variable { .. } => {
-                if let Some((var, value)) = binding.bound(value) {
-                    // It fits: all values were tried before the first was applied.
-                    let _ = self.store.image.set(var, value);
-                }
-            }
-            InputTo::Bits { var, mask } => {
-                let on = if value.as_f64() == 0.0 { 0 } else { mask };
-                self.store.image.set_bits(var, mask, on);
-            }
-            InputTo::Command(field) => {
-                if let Some(link) = &mut self.commands {
-                    let nth = self.counters.commands.wrapping_add(1);
-                    match link.value(field, value, (self.port, nth), self.store.now) {
-                        Picked::Nothing => {}
-                        Picked::Unknown => bump(&mut self.counters.commands_unknown),
-                        Picked::Based => bump(&mut self.counters.commands_based),
-                        Picked::Command { reply, is_dropped } => {
-                            self.counters.commands = nth;
-                            *self.reply = reply;
-                            if is_dropped {
-                                bump(&mut self.counters.commands_dropped);
-                            }
-                        }
-                    }
-                }
-            }
-        }
-    }
 }
 
 /// Number of fields in the part's frames before the `index`-th; the bindings of all frames follow

@@ -13,7 +13,7 @@ use crate::time::{Duration, Instant};
 
 /// Counters of one peer of a line since the start; they wrap.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-#[cfg_attr(feature = "serde", derive(serde::Serialize))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(default))]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
 pub struct PeerCounters {
@@ -156,13 +156,28 @@ impl Flight {
     pub(super) const fn was_requested(&self) -> bool {
         self.taken.was_requested()
     }
+
+    /// Whether its request has been sent before.
+    pub(super) const fn is_repetition(&self) -> bool {
+        self.repeated > 0
+    }
 }
 
 impl Talks<'_> {
     /// The peer that a request is to.
     pub(super) fn peer_of(&mut self, flight: Flight) -> Option<&mut PeerState> {
-        let peer = self.rows.get(usize::from(flight.exchange)).map_or(0, Row::peer);
+        let peer = self.number_of_peer(flight);
         self.peers.get_mut(usize::from(peer))
+    }
+
+    /// Whether no other exchange with a reply is with the peer of a request.
+    fn is_alone(&self, flight: Flight) -> bool {
+        let peer = self.number_of_peer(flight);
+        self.rows.iter().filter(|row| row.peer() == peer && row.is_answered()).nth(1).is_none()
+    }
+
+    fn number_of_peer(&self, flight: Flight) -> u8 {
+        self.rows.get(usize::from(flight.exchange)).map_or(0, Row::peer)
     }
 }
 
@@ -279,7 +294,10 @@ impl Line {
     pub(super) fn answered(&mut self, talks: &mut Talks<'_>, flight: Flight, times: Times, now: Instant) {
         // The reply may be a late one to the first of the requests. Then that to the repetition is
         // still to come, and must not be taken for one to another exchange.
-        let late = flight.timed_out;
+        // If a damaged one was the reason, that costs a peer with a single exchange more than it is worth.
+        // The first one may answer what was asked before the gateway or the port was there.
+        let is_first = talks.peer_of(flight).is_some_and(|peer| peer.is_unknown());
+        let late = flight.timed_out || (flight.repeated > 0 || is_first) && !talks.is_alone(flight);
         let not_before = if late { self.sent + times.timeout.saturating_mul(2) } else { Instant::ZERO };
         if late && matches!(self.phase, Phase::Sending(_)) {
             self.late = Some((flight.exchange, times.timeout));
@@ -327,10 +345,15 @@ impl Line {
             self.echo = None;
             return false;
         }
+        self.give_up(talks, flight, times, now);
+        true
+    }
+
+    /// The request has failed and is not repeated.
+    pub(super) fn give_up(&mut self, talks: &mut Talks<'_>, flight: Flight, times: Times, now: Instant) {
         let sent = self.sent;
         self.turns(talks, |turns| turns.failed(usize::from(flight.exchange), flight.taken, now, sent));
         self.rest(times.pause, now);
-        true
     }
 
     /// The rest of the line is over.
@@ -351,8 +374,11 @@ impl Line {
 
     /// What has begun is not continued: the device is gone, or the gateway slept.
     pub(super) fn abandon(&mut self, talks: &mut Talks<'_>, now: Instant) {
+        // One without a reply is sent once, whether it is heard or not.
+        let is_answered = |exchange: u8| talks.rows.get(usize::from(exchange)).is_some_and(Row::is_answered);
         if let Phase::Repeat(flight) | Phase::Sending(flight) | Phase::Waiting(flight) = self.phase
             && flight.taken.was_requested()
+            && is_answered(flight.exchange)
         {
             self.turns(talks, |turns| turns.request(usize::from(flight.exchange), now));
         }
@@ -389,6 +415,11 @@ impl Line {
 }
 
 impl PeerState {
+    /// Whether it has not been asked since the gateway or the port is there.
+    fn is_unknown(&self) -> bool {
+        self.turn.presence() == Presence::Unknown
+    }
+
     /// Whether it did not answer when it was last asked.
     pub(super) fn is_down(&self) -> bool {
         self.turn.presence() == Presence::Down

@@ -20,6 +20,7 @@ mod clock;
 mod codecs;
 mod command_link;
 mod command_tables;
+mod confirmed;
 mod connection;
 mod counters;
 mod counts;
@@ -29,6 +30,7 @@ mod failed;
 mod field_output;
 mod field_port;
 mod flight;
+mod frames;
 mod io;
 mod latency;
 mod line;
@@ -80,7 +82,8 @@ use clock::{Ask, Clock};
 use counters::add;
 use exchanges::Exchanges;
 use field_output::Downward;
-use field_port::{Accepted, FieldPort};
+use field_port::FieldPort;
+use frames::Accepted;
 use links::Links;
 use port_health::PortsHealth;
 use store::{SafeBytes, Store};
@@ -108,7 +111,7 @@ const _: () = assert!(INPUT_BUFFER >= LEN && INPUT_BUFFER > MAX_STREAM_FRAME);
 /// `TAP` bytes are for the ring of [`Engine::tap`], and `EXCHANGES` is the number of exchanges with
 /// devices over all ports; 0 costs nothing. The defaults are the maximum of a file.
 ///
-/// `Engine<4, 1, 128, 0, 0>` takes less than 38 KiB.
+/// `Engine<4, 1, 128, 0, 0>` takes less than 41 KiB.
 // In this order, because an engine is larger than what one instruction reaches: what every call looks at
 // comes first, what only some configurations have comes last.
 #[derive(Debug, Clone)]
@@ -147,7 +150,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.clock.is_late = now >= self.clock.announced;
         // Any input may set an earlier deadline; one that becomes later is noticed in time.
         match input {
-            Input::PortBytes { port, bytes } => self.port_bytes(port, bytes, now),
+            Input::PortBytes { port, bytes } => {
+                if bytes.len() > SHORT || !self.hold(port, bytes, now) {
+                    self.port_bytes(port, bytes, now);
+                }
+            }
             // By reference: it would be copied for the functions that may see it.
             Input::PortCan { port, ref frame } => self.port_can(port, frame, now),
             Input::PortSent { port } => self.port_sent(port),
@@ -171,13 +178,22 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     // In a driver's loop, the addresses of all that it may need would be worked out before each pass.
     #[inline(never)]
     pub fn poll_output<'b>(&mut self, now: Instant, buf: &'b mut [u8; OUTPUT_BUFFER]) -> Output<'b> {
+        if self.clock.is_quiet(now) {
+            return self.sleep();
+        }
+        self.poll_work(now, buf)
+    }
+
+    /// The next output, if something may have one.
+    #[inline(never)]
+    fn poll_work<'b>(&mut self, now: Instant, buf: &'b mut [u8; OUTPUT_BUFFER]) -> Output<'b> {
         let now = self.forward(now);
         if now >= self.clock.timer_at {
             self.ask_all();
         }
-        if self.clock.ask.links && !self.clock.is_late {
+        if self.clock.ask.has(Ask::LINKS) && !self.clock.is_late {
             // To send a command, a connection may have to be closed first.
-            self.clock.ask.actions |= !self.links.command.is_empty();
+            self.clock.ask.add(Ask::ACTIONS.when(!self.links.command.is_empty()));
             self.store.now = now;
             let upward = self.links.next_upward(&mut self.store, &mut buf[..]);
             self.carry_outcomes();
@@ -188,9 +204,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 return Output::LinkSend { link, bytes };
             }
             // Commands that stop the robot are checked in every call, even before their deadline.
-            self.clock.ask.links = self.links.has_stops();
+            self.clock.ask.remove(Ask::LINKS);
+            self.clock.ask.add(Ask::LINKS.when(self.links.has_stops()));
         }
-        if self.clock.ask.actions {
+        if self.clock.ask.has(Ask::ACTIONS) {
             if let Some((link, action)) = self.links.next_action() {
                 return match action {
                     LinkAction::Open => {
@@ -199,9 +216,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                     LinkAction::Close => Output::LinkClose { link },
                 };
             }
-            self.clock.ask.actions = false;
+            self.clock.ask.remove(Ask::ACTIONS);
         }
-        if self.clock.ask.ports && !self.clock.is_late {
+        if self.clock.ask.has(Ask::PORTS) && !self.clock.is_late {
             match self.next_downward(&mut buf[..], now) {
                 Some((port, Downward::Bytes(len))) => {
                     let bytes = buf.get(..len).unwrap_or(&[]);
@@ -214,7 +231,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 }
                 // On its own, so that nothing else pays for its registers.
                 None if self.exchanges.is_used() => return self.poll_request(now, buf),
-                None => self.clock.ask.ports = false,
+                None => self.clock.ask.remove(Ask::PORTS),
             }
         }
         debug_assert!(
@@ -227,7 +244,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     // On its own, so that what is asked is read only once, behind it.
     #[inline(never)]
     fn ask_all(&mut self) {
-        self.clock.ask = Ask::ALL;
+        self.clock.ask.add(Ask::ALL);
     }
 
     /// The next request to a device, or sleep.
@@ -237,25 +254,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         if let Some(request) = self.next_request(&mut buf[..], now) {
             return self.request_output(request, buf, now);
         }
-        self.clock.ask.ports = false;
+        self.clock.ask.remove(Ask::PORTS);
         debug_assert!(self.all_are_silent(&mut buf[..], now), "a port that was asked has an output");
         self.poll_sleep()
-    }
-
-    /// Nothing is to be done until the next deadline or beat.
-    #[inline(always)]
-    fn poll_sleep<'b>(&mut self) -> Output<'b> {
-        if !self.clock.is_armed {
-            self.clock.is_armed = true;
-            self.clock.timer_at = self.deadline();
-        }
-        let beat_at = if self.ports.is_empty() { Instant::NEVER } else { self.clock.beat_at };
-        let until = self.clock.timer_at.min(beat_at);
-        if until == Instant::NEVER {
-            return Output::Sleep { until };
-        }
-        self.clock.announced = self.clock.announced.min(until);
-        Output::Sleep { until: self.clock.announced }
     }
 
     /// Whether ports and links that are not asked really have no output.
@@ -264,6 +265,19 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             && self.links.next_action().is_none()
             && self.next_downward(out, now).is_none()
             && !(self.exchanges.is_used() && self.next_request(out, now).is_some())
+    }
+
+    /// Takes bytes that only continue or begin a frame, which are most calls of a driver that reports each byte.
+    /// `false` if they have to be looked at; then nothing was taken.
+    #[inline(never)]
+    fn hold(&mut self, id: PortId, bytes: &[u8], now: Instant) -> bool {
+        if self.clock.is_deaf {
+            return false;
+        }
+        let Some(port) = find_port(&mut self.ports, id) else { return false };
+        let Some(deadline) = port.hold(bytes, now) else { return false };
+        self.arm(deadline);
+        true
     }
 
     // Each input has its own function, so that no other pays for the registers it needs.
@@ -283,7 +297,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             let (store, command) = (&mut self.store, self.links.command.first_mut());
             let Some(port) = find_port(&mut self.ports, id) else { return };
             let accepted = port.frames(&mut rest, &self.bindings.inputs, store, command, &mut self.tap);
-            self.clock.ask.ports |= port.sender.is_due();
+            self.clock.ask.add(Ask::PORTS.when(port.sender.is_due()));
             let deadline = port.deadline();
             self.arm(deadline);
             self.after_field(id, &accepted, now);
@@ -340,7 +354,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             // Most are for other nodes of the bus.
             return;
         }
-        self.clock.ask.ports |= port.sender.is_due();
+        self.clock.ask.add(Ask::PORTS.when(port.sender.is_due()));
         let deadline = port.deadline();
         self.arm(deadline);
         self.after_field(id, &accepted, now);
@@ -371,7 +385,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[cold]
     fn port_down(&mut self, id: PortId, now: Instant) {
         let Some(port) = find_port(&mut self.ports, id) else { return };
-        self.clock.ask = Ask::ALL;
+        self.clock.ask.add(Ask::ALL);
         port.down(&self.bindings.inputs, self.links.command.first_mut(), &mut self.tap, now);
         self.talk_ends(id);
         self.drop_forgotten(now);
@@ -381,7 +395,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[cold]
     fn port_bus(&mut self, id: PortId, state: BusState, now: Instant) {
         let Some(port) = find_port(&mut self.ports, id) else { return };
-        self.clock.ask = Ask::ALL;
+        self.clock.ask.add(Ask::ALL);
         let was_off = port.bus == BusState::BusOff;
         port.bus_state(state, &self.bindings.inputs, self.links.command.first_mut(), now);
         let deadline = port.deadline();
@@ -411,14 +425,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[inline(never)]
     fn link_sent(&mut self, link: LinkId) {
         let deadline = self.links.sent(link);
-        self.clock.ask.links = true;
+        self.clock.ask.add(Ask::LINKS);
         self.arm(deadline);
     }
 
     #[inline(never)]
     fn link_acked(&mut self, link: LinkId, left: u32) {
         self.links.acked(link, left, &mut self.store);
-        self.clock.ask.links = true;
+        self.clock.ask.add(Ask::LINKS);
         self.arm(self.links.deadline_of(link));
     }
 
@@ -454,14 +468,15 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 
     /// Something happened on a link that may change its deadline, or close it.
     fn arm_link(&mut self, link: LinkId) {
-        (self.clock.ask.links, self.clock.ask.actions) = (true, true);
+        self.clock.ask.add(Ask::LINKS);
+        self.clock.ask.add(Ask::ACTIONS);
         self.arm(self.links.deadline_of(link));
     }
 
     fn change_port(&mut self, id: PortId, change: impl FnOnce(&mut FieldPort)) {
         if let Some(port) = find_port(&mut self.ports, id) {
             change(port);
-            self.clock.ask.ports = true;
+            self.clock.ask.add(Ask::PORTS);
             let deadline = port.deadline();
             self.arm(deadline);
         }
@@ -490,7 +505,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         if accepted.frames == 0 {
             return;
         }
-        self.clock.ask.links = true;
+        self.clock.ask.add(Ask::LINKS);
         let mut deadline = self.store.deadline();
         if deadline <= now {
             self.expire_waiting();
@@ -534,7 +549,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[inline(never)]
     fn check_triggers(&mut self) {
         self.show_health(self.store.now);
-        self.clock.ask.ports = true;
+        self.clock.ask.add(Ask::PORTS);
         let mut first = Instant::NEVER;
         for port in &mut self.ports {
             let usable = port.is_usable();
@@ -546,7 +561,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 
     /// The next output to the field.
     fn next_downward(&mut self, out: &mut [u8], now: Instant) -> Option<(PortId, Downward)> {
-        let (image, bindings) = (&self.store.image, &self.bindings.outputs);
+        let (image, bindings) = (&self.store.image, self.bindings.outputs());
         for port in &mut self.ports {
             if port.may_send(now)
                 && let Some(downward) = port.next_output(image, bindings, out, now)
@@ -558,6 +573,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         None
     }
 }
+
+/// Bytes that a driver may report before a frame is complete. More are likely to have its end.
+const SHORT: usize = 16;
 
 fn find_port(ports: &mut [FieldPort], id: PortId) -> Option<&mut FieldPort> {
     ports.iter_mut().find(|port| port.id == id)

@@ -5,12 +5,12 @@ use crate::time::Instant;
 /// Why a value gave the controller no command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
-#[cfg_attr(feature = "serde", derive(serde::Serialize), serde(rename_all = "snake_case"))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(rename_all = "snake_case"))]
 #[non_exhaustive]
 pub enum NotGiven {
     /// The value is in no entry of the field's table.
     Unknown,
-    /// The value was the first one after the start, silence or a lost device: it only set the base.
+    /// The value was the first one after the start, silence, sleep or a lost device: it only set the base.
     Based,
     /// The link to port 2000 was down, or was lost while the command waited.
     NoLink,

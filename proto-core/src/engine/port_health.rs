@@ -1,6 +1,7 @@
-//! The health of field ports as values: for output fields, and for variables that tell the robot.
+//! The health of field ports as values: for output fields, and for variables that tell the robot; and for
+//! output fields whether links are up.
 //!
-//! In: the ports' states and counters. Out: extra values of the image just before a frame is made;
+//! In: the ports' states and counters, the states of links. Out: extra values of the image just before a frame is made;
 //! variables, which go up as those of a field frame do. Does not know how they are written.
 
 use heapless::Vec;
@@ -8,11 +9,13 @@ use heapless::Vec;
 use super::Engine;
 use super::build::Groups;
 use super::build_error::{BuildError, one_too_many};
-use super::io::PortState;
+use super::clock::Ask;
+use super::io::{LinkId, PortId, PortState};
 use super::state_link::Kept;
 use super::user::wrapping_count;
-use crate::config::{ConfigView, Counted, MAX_PORTS, OutputBinding, PortValue};
+use crate::config::{ConfigView, Counted, LinkSource, MAX_PORTS, OutputBinding, PortValue};
 use crate::image::{GroupId, InputSet, MAX_EXTRA, MAX_GROUPS, saturate_to_field};
+use crate::link::LinkState;
 use crate::sysvar::SysVar;
 use crate::time::{Duration, Instant};
 use crate::wire::dialect::Dialect;
@@ -31,11 +34,18 @@ const MOST: usize = MAX_PORTS * PortValue::NAMES.len();
 /// A value that an output field shows.
 #[derive(Debug, Clone, Copy)]
 struct Shown {
-    /// Index of the port in the engine.
-    port: u8,
-    value: PortValue,
+    of: Of,
     /// Its place among the image's extra values.
     extra: u8,
+}
+
+/// What it is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Of {
+    /// The health of the port with this index in the engine.
+    Port(u8, PortValue),
+    /// Whether the link is up.
+    Link(LinkId),
 }
 
 /// A value that the robot is told.
@@ -51,7 +61,7 @@ struct Told {
 /// What is shown and told of the ports' health.
 #[derive(Debug, Clone)]
 pub(super) struct PortsHealth {
-    shown: Vec<Shown, MOST>,
+    shown: Vec<Shown, MAX_EXTRA>,
     told: Vec<Told, MOST>,
     /// The group of the variables.
     group: GroupId,
@@ -76,6 +86,17 @@ impl PortsHealth {
     /// Index of the port whose health the variable tells.
     pub(super) fn owner(&self, var: SysVar) -> Option<u8> {
         self.told.iter().find(|told| told.var == var).map(|told| told.port)
+    }
+}
+
+fn id_of(link: LinkSource) -> LinkId {
+    match link {
+        LinkSource::Command => LinkId::COMMAND,
+        LinkSource::Urgent => LinkId::URGENT,
+        LinkSource::State => LinkId::STATE,
+        LinkSource::Modbus => LinkId::MODBUS,
+        LinkSource::RecipeUdp => LinkId::RECIPE_UDP,
+        LinkSource::Listening(port) => LinkId::of_port(PortId(port)),
     }
 }
 
@@ -128,21 +149,27 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                             port.sender.shown_extra.set(binding.extra, true);
                         }
                     }
-                    OutputBinding::Port { port, value, .. } => {
-                        let of = match port {
-                            Some(id) => self.ports.iter().position(|other| other.id.0 == id),
-                            None => Some(index),
+                    OutputBinding::Port { .. } | OutputBinding::Link { .. } => {
+                        let of = match binding.from {
+                            OutputBinding::Link { link, .. } => Of::Link(id_of(link)),
+                            OutputBinding::Port { port, value, .. } => {
+                                let of = match port {
+                                    Some(id) => self.ports.iter().position(|other| other.id.0 == id),
+                                    None => Some(index),
+                                };
+                                // Validation has refused other ports.
+                                Of::Port(of.unwrap_or(index) as u8, value)
+                            }
+                            _ => continue,
                         };
-                        // Validation has refused other ports.
-                        let port = of.unwrap_or(index) as u8;
-                        let is_it = |shown: &&Shown| (shown.port, shown.value) == (port, value);
+                        let is_it = |shown: &&Shown| shown.of == of;
                         let known = self.health.shown.iter().find(is_it).map(|shown| shown.extra);
                         binding.extra = match known {
                             Some(extra) => extra,
                             None => {
                                 let extra = next()?;
-                                // There is room for every value of every port.
-                                let _ = self.health.shown.push(Shown { port, value, extra });
+                                // As many places as there are extra values.
+                                let _ = self.health.shown.push(Shown { of, extra });
                                 extra
                             }
                         };
@@ -188,6 +215,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             PortValue::Alive => u32::from(self.port_state(port.id) == Some(PortState::Working)),
             PortValue::Frames => port.counters.frames_in,
             PortValue::Rejected => port.counters.rejected(),
+            PortValue::Ignored => port.counters.ignored,
             PortValue::Age => {
                 let own = (0..).zip(&self.store.frames).filter(|(_, frame)| frame.port == index);
                 let heard_at = own.filter_map(|(group, _)| self.store.image.stamp_of(GroupId(group))).max();
@@ -198,13 +226,20 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
     }
 
-    /// Sets the extra values that output fields show of the ports' health.
+    fn is_link_up(&self, id: LinkId) -> bool {
+        self.links.infos().any(|link| link.id == id && matches!(link.state, LinkState::Up { .. }))
+    }
+
+    /// Sets the extra values that output fields show of the ports' health, and of links.
     #[cold]
     #[inline(never)]
     pub(super) fn show_health(&mut self, now: Instant) {
         for nth in 0..self.health.shown.len() {
-            let Some(&Shown { port, value, extra }) = self.health.shown.get(nth) else { break };
-            let number = self.health_of(port, value, now);
+            let Some(&Shown { of, extra }) = self.health.shown.get(nth) else { break };
+            let number = match of {
+                Of::Port(port, value) => self.health_of(port, value, now),
+                Of::Link(link) => u32::from(self.is_link_up(link)),
+            };
             self.store.image.receive_extra(extra, f64::from(number));
         }
     }
@@ -262,7 +297,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
         if !news.is_empty() {
             self.store.tell(&news);
-            self.clock.ask.links = true;
+            self.clock.ask.add(Ask::LINKS);
         }
     }
 }

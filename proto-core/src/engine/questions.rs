@@ -66,7 +66,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     /// ends the engine when [`Self::is_safe`] says so, or after some time.
     pub fn make_safe(&mut self) {
         self.store.all_overdue();
-        (self.clock.timer_at, self.clock.ask) = (Instant::ZERO, Ask::ALL);
+        self.clock.timer_at = Instant::ZERO;
+        self.clock.ask.add(Ask::ALL);
     }
 
     /// Whether the controller is known to have every safe value that was sent to it. Where nothing shows a

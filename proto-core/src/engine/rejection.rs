@@ -6,7 +6,7 @@ use crate::wire::can::CanId;
 /// Why a frame, packet or answer was rejected. Nothing of it was applied.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
-#[cfg_attr(feature = "serde", derive(serde::Serialize), serde(rename_all = "snake_case"))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(rename_all = "snake_case"))]
 #[non_exhaustive]
 pub enum Rejection {
     /// Bytes in which no frame begins, or that a wrong tail ends (D19).

@@ -3,13 +3,13 @@
 //! In: the image, the exchanges of a port, its line. Out: a request, unless a value of it is unknown or
 //! stale.
 
-use super::counters::bump;
+use super::counters::{PortCounters, bump};
 use super::device_port::DeviceCodec;
 use super::exchanges::{Asks, Item};
 use super::io::ReplyCode;
 use super::line::{Line, Talks};
 use super::sender::{DIGEST_SEED, Sender, digest};
-use super::user::OutputBind;
+use super::user::{OutputBind, Outputs};
 use super::whole_port::Outgoing;
 use crate::config::OutputBinding;
 use crate::image::Image;
@@ -19,7 +19,7 @@ use crate::time::Instant;
 /// Makes the frames of requests.
 pub(super) struct Maker<'a> {
     pub image: &'a Image,
-    pub bindings: &'a [OutputBind],
+    pub bindings: Outputs<'a>,
     pub codec: &'a DeviceCodec,
     pub sender: &'a Sender,
     pub reply: ReplyCode,
@@ -28,12 +28,13 @@ pub(super) struct Maker<'a> {
 
 impl Maker<'_> {
     /// Looks at values and bits that ask, and makes the next request. Returns its exchange and its
-    /// length in `out`.
+    /// length in `out`. A request that cannot be repeated is counted in `counters`.
     pub(super) fn next(
         &self,
         line: &mut Line,
         items: &mut [Item],
         talks: &mut Talks<'_>,
+        counters: &mut PortCounters,
         is_busy: bool,
         out: &mut [u8],
     ) -> Option<(u8, usize)> {
@@ -45,27 +46,37 @@ impl Maker<'_> {
                 }
             }
         }
-        if is_busy || !line.may_ask() {
-            return None;
-        }
         // Each exchange that has no values yet is passed over once.
         for _ in 0..=items.len() {
+            if is_busy || !line.may_ask() {
+                return None;
+            }
             let flight = line.next(talks, now)?;
             let item = items.get(usize::from(flight.exchange))?;
             let peer = talks.peer_of(flight)?;
             let Some(len) = self.make(item, out) else {
                 bump(&mut peer.counters.unprepared);
-                if let Some(item) = items.get_mut(usize::from(flight.exchange)) {
+                if flight.is_repetition() {
+                    // A late reply to what was sent must not be taken for one to another request.
+                    bump(&mut counters.unanswered);
+                    line.give_up(talks, flight, item.times, now);
+                } else if let Some(item) = items.get_mut(usize::from(flight.exchange)) {
                     item.is_owed |= flight.was_requested();
                 }
                 continue;
             };
             bump(&mut peer.counters.requests);
+            let request = out.get(..len).unwrap_or(&[]);
             let expected = match item.asks {
-                Asks::Rtu { operation, .. } => Expected::of(&operation, out.get(..len).unwrap_or(&[])),
+                Asks::Rtu { operation, .. } => Expected::of(&operation, request),
                 _ => None,
             };
-            line.handed_over(flight, expected, out.get(..len).unwrap_or(&[]));
+            if let Some(item) = items.get_mut(usize::from(flight.exchange)) {
+                // What goes out now is neither owed any more, nor a change.
+                item.is_owed = false;
+                item.digest = item.on_change.then(|| digest(DIGEST_SEED, request));
+            }
+            line.handed_over(flight, expected, request);
             return Some((flight.exchange, len));
         }
         None
@@ -94,7 +105,7 @@ impl Maker<'_> {
 
     /// Writes a request to the front of `out`; `None` if a value of it is unknown or stale.
     fn make(&self, item: &Item, out: &mut [u8]) -> Option<usize> {
-        let fields = item.request.as_ref().map_or(&[][..], |format| format.bindings.of(self.bindings));
+        let fields = item.request.as_ref().map_or(&[][..], |format| format.bindings.of(self.bindings.binds));
         if !fields.iter().all(|field| may_send(self.sender, self.image, field, self.now)) {
             return None;
         }

@@ -8,13 +8,14 @@ use super::command_link::CommandLink;
 use super::counters::bump;
 use super::device_port::DeviceCodec;
 use super::exchanges::{Asks, InputFormat, Item, Piece, View};
-use super::field_port::{Accepted, Codec, FieldPort, Frames, came, keep};
+use super::field_port::{Codec, FieldPort, came, keep};
+use super::frames::{Accepted, Frames};
 use super::rejection::Rejection;
 use super::requests::may_send;
 use super::sender::Sender;
 use super::store::Store;
 use super::tap::Tap;
-use super::user::{InputBind, OutputBind};
+use super::user::{InputBind, Outputs};
 use super::whole_port::{Outgoing, Reader, TextBind};
 use crate::modbus::rtu::{MAX_ADU, Table};
 use crate::modbus::server::RegisterBank;
@@ -29,7 +30,7 @@ struct Blocks<'a, const PORTS: usize> {
     items: &'a mut [Item],
     written: &'a mut [Piece],
     texts: &'a [TextBind],
-    outputs: &'a [OutputBind],
+    outputs: Outputs<'a>,
     sender: &'a Sender,
     frames: Frames<'a, PORTS>,
     accepted: &'a mut Accepted,
@@ -50,7 +51,7 @@ impl<const PORTS: usize> Blocks<'_, PORTS> {
 
     fn data<'o>(&self, item: &Item, out: &'o mut [u8; MAX_DATA]) -> Result<&'o [u8], Exception> {
         let Some(format) = &item.request else { return self.kept(item, out) };
-        let fields = format.bindings.of(self.outputs);
+        let fields = format.bindings.of(self.outputs.binds);
         let image = &self.frames.store.image;
         if !fields.iter().all(|field| may_send(self.sender, image, field, self.now)) {
             return Err(Exception::DeviceFailure);
@@ -184,7 +185,7 @@ impl FieldPort {
     #[inline(never)]
     pub(super) fn serve<const PORTS: usize, const TAP: usize>(
         &mut self,
-        (inputs, outputs): (&[InputBind], &[OutputBind]),
+        (inputs, outputs): (&[InputBind], Outputs<'_>),
         store: &mut Store<PORTS>,
         commands: Option<&mut CommandLink>,
         tap: &mut Tap<TAP>,

@@ -72,6 +72,18 @@ pub enum Health {
     Running,
 }
 
+impl Health {
+    /// One word for it, as in the documents of the API and in Sparkplug.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Idle => "idle",
+            Self::NoController => "no-controller",
+            Self::PortSilent => "port-silent",
+            Self::Running => "running",
+        }
+    }
+}
+
 /// State of a field port.
 #[derive(Debug, Clone, Copy)]
 #[non_exhaustive]
@@ -124,6 +136,11 @@ pub struct PeerStatus {
 }
 
 impl<'a> PortStatus<'a> {
+    /// The same without its peers, of which there may be dozens: for a document that is written in pieces.
+    pub fn without_peers(self) -> Self {
+        Self { peers: &[], ..self }
+    }
+
     /// The peers of the port's exchanges.
     pub fn peers(&self) -> impl Iterator<Item = PeerStatus> + use<'a> {
         self.peers.iter().map(|peer| PeerStatus {

@@ -91,7 +91,7 @@ pub(super) struct Store<const PORTS: usize> {
     pub unconfirmed: InputSet,
     /// When the newest of them was added, and when the newest was confirmed.
     pub unconfirmed_since: Instant,
-    confirmed_at: Instant,
+    pub(super) confirmed_at: Instant,
     /// Variables written through recipe links, which do not answer.
     pub unanswered: InputSet,
     /// Variables that the state stream has brought since their owner fell silent, or at all.
@@ -99,7 +99,7 @@ pub(super) struct Store<const PORTS: usize> {
     /// Variables whose owner fell silent before its last value was handed over.
     pub unsent: InputSet,
     /// When the newest state packet or recipe frame came, which the controller sends steadily.
-    heard_at: Option<Instant>,
+    pub(super) heard_at: Option<Instant>,
     /// Number of gaps in these, wrapping: the controller may have restarted in each.
     pub era: u32,
     /// Variables whose link is up; none of whose bits each has an owner.
@@ -269,8 +269,13 @@ impl<const PORTS: usize> Store<PORTS> {
             self.next_overdue = Stamp::at(next.unwrap_or(Instant::NEVER).min(self.health_at.get()));
             return None;
         };
+        let is_from_start = frame.overdue_at == Instant::ZERO;
         frame.overdue_at = Instant::NEVER;
         let frame = *frame;
+        if !is_from_start && self.image.stamp_of(GroupId(nth as u8)).is_none() {
+            // Its device only said that there is nothing to say: nothing was written yet.
+            return Some(Overdue::Frame(frame, 0));
+        }
         let queue = self.edges.get_mut(usize::from(frame.port))?;
         let mut dropped = 0_usize;
         for var in frame.set.minus(&self.bits.bytes).iter() {
@@ -322,11 +327,6 @@ impl<const PORTS: usize> Store<PORTS> {
         self.next_overdue = Stamp::at(Instant::ZERO);
     }
 
-    /// Whether the controller is known to have all safe values.
-    pub(super) fn is_safe(&self) -> bool {
-        self.unconfirmed.is_empty() && self.bits.unconfirmed.is_empty()
-    }
-
     /// The health of ports is checked at this time.
     pub(super) fn check_health_at(&mut self, at: Instant) {
         self.health_at = Stamp::at(at);
@@ -353,15 +353,28 @@ impl<const PORTS: usize> Store<PORTS> {
         for (nth, frame) in self.frames.iter().enumerate() {
             let bits = self.outbox.dirty().and(&self.bits.bytes).and(&frame.set);
             let bytes = InputSet::BYTES.minus(&self.bits.bytes);
-            let waiting = frame.set.and(&bytes).and(&self.outbox.dirty()).minus(&self.safe);
-            if waiting.is_empty() && bits.is_empty() {
+            let dirty = frame.set.and(&self.outbox.dirty()).minus(&self.safe);
+            let waiting = dirty.and(&bytes);
+            let newest = dirty.minus(&InputSet::BYTES);
+            if dirty.is_empty() && bits.is_empty() {
                 continue;
             }
             let port = usize::from(frame.port);
             if let Some(queue) = self.edges.get_mut(port) {
                 let (mut dropped, mut oldest) = (0, Instant::NEVER);
+                if !newest.is_empty()
+                    && let Some(at) = self.image.stamp_of(GroupId(nth as u8))
+                {
+                    // Frames that say nothing keep the device from being overdue, and its value waiting.
+                    if now.saturating_since(at) > frame.timeout {
+                        dropped = self.outbox.forget(queue, &newest);
+                    } else {
+                        oldest = at;
+                    }
+                }
                 if !waiting.is_empty() {
-                    (dropped, oldest) = self.outbox.expire(queue, &waiting, frame.timeout, now);
+                    let (more, older) = self.outbox.expire(queue, &waiting, frame.timeout, now);
+                    (dropped, oldest) = (dropped.saturating_add(more), oldest.min(older));
                 }
                 if !bits.is_empty() {
                     let (more, older) = self.bits.expire(nth, queue, frame.timeout, now);
@@ -446,159 +459,6 @@ impl<const PORTS: usize> Store<PORTS> {
     pub(super) fn take_lost(&mut self) -> Option<[u32; PORTS]> {
         core::mem::take(&mut self.has_lost).then(|| core::mem::replace(&mut self.lost, [0; PORTS]))
     }
-
-    /// A write of safe values failed: they are written again, if they are still current.
-    pub(super) fn again(&mut self, safe: &InputSet) {
-        let safe = safe.and(&self.safe);
-        self.outbox.again(&safe.minus(&self.bits.bytes));
-        let bytes = safe.and(&self.bits.bytes);
-        if !bytes.is_empty() {
-            self.bits_again(BitSet::all_of(&bytes).and(self.bits.unconfirmed));
-        }
-    }
-
-    /// The same for bits with owners.
-    pub(super) fn bits_again(&mut self, bits: BitSet) {
-        self.bits.again(bits);
-        self.bits_changed();
-    }
-
-    /// The controller has these safe values, as far as they are still current.
-    pub(super) fn confirm(&mut self, safe: &InputSet) {
-        if !safe.and(&self.unconfirmed).and(&self.unanswered).is_empty() {
-            self.confirmed_at = self.now;
-        }
-        self.unconfirmed = self.unconfirmed.minus(safe);
-    }
-
-    /// The controller has these safe values of a byte's bits, as far as they are still current.
-    pub(super) fn confirm_bits(&mut self, var: SysVar, mask: u8) {
-        let bits = BitSet::of(var, mask).and(self.bits.unconfirmed);
-        if !bits.is_empty() && self.unanswered.contains(var) {
-            self.confirmed_at = self.now;
-        }
-        self.bits.unconfirmed = self.bits.unconfirmed.minus(bits);
-        self.bits_changed();
-    }
-
-    /// Compares the safe values of a byte's bits with what the controller shows.
-    pub(super) fn compare_bits(&mut self, var: SysVar, shown: u8, may_confirm: bool, may_doubt: bool) {
-        let (safe, unconfirmed) = (self.bits.safe.byte(var), self.bits.unconfirmed.byte(var));
-        let is_there = !(shown ^ self.image.byte(var));
-        if may_confirm {
-            self.confirm_bits(var, unconfirmed & is_there);
-        }
-        let doubted = BitSet::of(var, safe & !unconfirmed & !is_there);
-        if may_doubt && !doubted.is_empty() && self.unanswered.contains(var) {
-            self.bits.unconfirmed = self.bits.unconfirmed.or(doubted);
-            self.bits_again(doubted);
-        }
-    }
-
-    /// Takes the bits of a byte that the controller shows and of which none of our own has a value.
-    pub(super) fn show_bits(&mut self, var: SysVar, shown: u8) {
-        let live = self.bits.live.byte(var);
-        self.image.set_bits(var, var.valid_bits() & !live, shown);
-        self.bits_changed();
-    }
-
-    /// Whether the controller can have had this other value all along. Later another master has
-    /// written it.
-    pub(super) fn may_doubt(&self) -> bool {
-        self.now < self.confirmed_at + DOUBT
-    }
-
-    /// Outputs that have just arrived show another value than the safe one.
-    pub(super) fn doubt_by_witnesses(&mut self) {
-        if !self.may_doubt() {
-            return;
-        }
-        for var in self.safe.and(&self.bits.bytes).iter() {
-            if let Some(witness) = var.shown_by()
-                && self.image.known_since(witness) == Some(self.now)
-            {
-                self.compare_bits(var, self.image.byte(witness), false, true);
-            }
-        }
-        let whole = InputSet::BYTES.minus(&self.bits.bytes);
-        for var in self.safe.minus(&self.unconfirmed).and(&whole).iter() {
-            if let Some(witness) = var.shown_by()
-                && self.image.known_since(witness) == Some(self.now)
-                && self.image.value(witness) != self.image.value(var)
-            {
-                self.doubt(var);
-            }
-        }
-    }
-
-    /// The controller does not have a safe value that a recipe link has sent.
-    pub(super) fn doubt(&mut self, var: SysVar) {
-        if self.unanswered.contains(var) {
-            self.unconfirmed.insert(var);
-            self.again(&InputSet::from_iter([var]));
-        }
-    }
-
-    /// A state packet or a recipe frame came, which the controller sends steadily.
-    pub(super) fn heard(&mut self) {
-        if !self.is_heard() {
-            self.era = self.era.wrapping_add(1);
-        }
-        self.heard_at = Some(self.now);
-    }
-
-    /// Whether the controller has been there without a gap since the era began.
-    pub(super) fn is_heard(&self) -> bool {
-        !is_gap(self.heard_at, self.now)
-    }
-
-    /// The controller may have restarted: safe values are written once more.
-    pub(super) fn controller_was_away(&mut self) {
-        self.unconfirmed = self.safe;
-        self.bits.unconfirmed = self.bits.safe;
-        self.unconfirmed_since = self.now;
-        let safe = self.safe;
-        self.again(&safe);
-    }
-
-    /// Whether a value that the controller shows now can be the result of the safe values, and not
-    /// older.
-    pub(super) fn may_confirm(&self) -> bool {
-        !self.unconfirmed.is_empty() && self.now >= self.unconfirmed_since + SHOWN_AFTER
-    }
-
-    /// Outputs that show input variables have arrived: they may confirm safe values.
-    pub(super) fn confirm_by_witnesses(&mut self) {
-        if !self.may_confirm() {
-            return;
-        }
-        let since = self.unconfirmed_since + SHOWN_AFTER;
-        for var in self.unconfirmed.and(&InputSet::BYTES).iter() {
-            if let Some(witness) = var.shown_by()
-                && self.image.known_since(witness).is_some_and(|at| at >= since)
-            {
-                if self.bits.bytes.contains(var) {
-                    self.compare_bits(var, self.image.byte(witness), true, false);
-                } else if self.image.value(witness) == self.image.value(var) {
-                    self.confirm(&InputSet::from_iter([var]));
-                }
-            }
-        }
-    }
-}
-
-/// A value shown sooner than this may be older than the safe value.
-const SHOWN_AFTER: Duration = Duration::from_millis(200);
-/// A packet of the state stream may be this late: a stream that is silent for 2 s is reopened.
-const DOUBT: Duration = Duration::from_secs(3);
-
-/// After this long without a state packet or recipe frame the controller may have restarted.
-const AWAY_AFTER: Duration = Duration::from_millis(500);
-
-/// Whether the newest packet or frame is so old, or none ever came, that the controller may have
-/// restarted.
-pub(super) fn is_gap(last: Option<Instant>, now: Instant) -> bool {
-    last.is_none_or(|at| now.saturating_since(at) > AWAY_AFTER)
 }
 
 /// When a value that has waited since `at` has waited longer than `timeout`.

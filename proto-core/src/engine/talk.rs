@@ -5,19 +5,21 @@
 //! exchanges do not come here.
 
 use super::awaited::{Awaited, Heard};
+use super::clock::Ask;
 use super::command_link::CommandLink;
 use super::counters::{PortCounters, add, bump};
 use super::device_port::{DeviceCodec, DeviceFormat, elements, judge_can};
 use super::exchanges::{Asks, Item, View};
 use super::field_output::Downward;
-use super::field_port::{Accepted, Codec, FieldPort, Frames, came, keep};
+use super::field_port::{Codec, FieldPort, came, keep};
+use super::frames::{Accepted, Frames};
 use super::io::{Output, PortId};
 use super::line::{Flight, Line, Phase, Talks};
 use super::rejection::Rejection;
 use super::requests::Maker;
 use super::store::Store;
 use super::tap::{Tap, TapPlace};
-use super::user::{InputBind, OutputBind};
+use super::user::{InputBind, Outputs};
 use super::whole_port::Reader;
 use super::{Engine, OUTPUT_BUFFER, find_port};
 use crate::device::{Found, Probe};
@@ -61,11 +63,22 @@ impl FieldPort {
 
     /// Whether the gateway is the slave of a line, which takes its bytes.
     fn hears_master(&mut self, bytes: &[u8], now: Instant) -> bool {
+        let is_usable = self.is_usable();
         let Codec::Device(DeviceCodec { reader: Some(Reader::Slave(slave)), .. }) = &mut self.codec else {
             return false;
         };
-        slave.received(bytes, now);
+        if is_usable {
+            slave.received(bytes, now);
+        } else {
+            // When the port is back, nobody waits for an answer any more.
+            add(&mut self.counters.discarded_bytes, bytes.len());
+        }
         true
+    }
+
+    /// Whether a request has failed, and the tick that says so is still to come.
+    fn has_failed(&self, now: Instant) -> bool {
+        self.is_usable() && self.line().is_some_and(|line| line.failure(&self.line, now).is_some())
     }
 
     /// Reads the frames in `rest`; stops after the first accepted one if the image is to be checked
@@ -229,7 +242,7 @@ impl FieldPort {
     fn next_request(
         &mut self,
         image: &Image,
-        bindings: &[OutputBind],
+        bindings: Outputs<'_>,
         mut view: View<'_>,
         out: &mut [u8],
         now: Instant,
@@ -243,7 +256,7 @@ impl FieldPort {
         let mut line = codec.line.take()?;
         let (items, mut talks) = view.of(&line);
         let maker = Maker { image, bindings, codec, sender: &self.sender, reply: self.reply, now };
-        let request = maker.next(&mut line, items, &mut talks, is_busy, out);
+        let request = maker.next(&mut line, items, &mut talks, &mut self.counters, is_busy, out);
         let is_on_can = codec.reader.is_none();
         if let (Some(_), Some(Reader::Search(framer))) = (&request, &mut codec.reader)
             && !line.hears_unasked
@@ -428,12 +441,17 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 
     /// The line may be free, or wait for something else.
     fn after_talk(&mut self, id: PortId) {
-        self.clock.ask.ports = true;
+        self.clock.ask.add(Ask::PORTS);
         if let Some(port) = find_port(&mut self.ports, id) {
             port.note_partial();
             // Each by itself: what is due already must not hide the other.
-            let deadlines = [port.deadline(), port.talk_deadline()];
+            let (deadlines, has_failed) =
+                ([port.deadline(), port.talk_deadline()], port.has_failed(self.clock.now));
             deadlines.into_iter().for_each(|at| self.arm(at));
+            if has_failed {
+                // A wrong reply came before the request had left, and the line is silent already.
+                self.clock.timer_at = self.clock.timer_at.min(self.clock.now);
+            }
         }
     }
 
@@ -489,7 +507,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         if self.clock.is_deaf {
             return port.discard_partial(&mut self.tap, now);
         }
-        let bindings = (&self.bindings.inputs[..], &self.bindings.outputs[..]);
+        let bindings = (&self.bindings.inputs[..], self.bindings.outputs());
         let accepted = port.serve(bindings, store, command, &mut self.tap, self.exchanges.view());
         self.after_talk(id);
         self.after_field(id, &accepted, now);
@@ -526,7 +544,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 continue;
             }
             let view = self.exchanges.view();
-            let request = port.next_request(&self.store.image, &self.bindings.outputs, view, out, now);
+            let request = port.next_request(&self.store.image, self.bindings.outputs(), view, out, now);
             found = request.map(|downward| (port.id, downward));
             // What is due already must not hide another port's.
             first = Some(port.talk_deadline()).filter(|at| *at > now).map_or(first, |at| first.min(at));

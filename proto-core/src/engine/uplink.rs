@@ -3,12 +3,13 @@
 //! Whole frames go up, so every variable in them needs a value that its owner sent or that was read
 //! back (docs/engine.md section 5). Frames that come down go into the image.
 
+use super::confirmed::is_gap;
 use super::connection::Connection;
 use super::counters::{LinkCounters, add, bump};
 use super::flight::Flight;
 use super::io::{LinkId, LinkKind, Transport};
 use super::latency::Since;
-use super::store::{Store, is_gap};
+use super::store::Store;
 use crate::config::Name;
 use crate::image::{GroupId, Image, InputSet};
 use crate::link::{LinkTimings, Supervisor};

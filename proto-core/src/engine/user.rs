@@ -4,7 +4,7 @@ use heapless::Vec;
 
 use super::command_link::CommandLink;
 use super::io::ReplyCode;
-use crate::config::OutputBinding;
+use crate::config::{FieldSpec, Limits, MAX_SENDABLE, MapEntry, OutputBinding, Span};
 use crate::device::{Element, Encoding, Length, Overflow, Text, wrap};
 use crate::image::{Image, bind_to_variable, saturate_to_field};
 use crate::recipe::model::MAX_FIELDS;
@@ -147,7 +147,64 @@ pub(super) struct OutputBind {
     pub ty: ScalarType,
     /// The place of its value among the image's extra values, if it is there.
     pub extra: u8,
+    /// Number of the limits or entries that say what it may send, and the first of them.
+    pub sendable: u8,
+    pub first_sendable: u8,
     pub written: Written,
+}
+
+/// What a field may send.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Sendable {
+    Limits(Limits),
+    Entry(MapEntry),
+}
+
+impl Sendable {
+    pub(super) const fn new(field: &FieldSpec) -> Option<Self> {
+        match *field {
+            FieldSpec::Limits(limits) => Some(Self::Limits(limits)),
+            FieldSpec::Mapped(entry) => Some(Self::Entry(entry)),
+            _ => None,
+        }
+    }
+}
+
+/// The output bindings of all ports, and what their fields may send.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Outputs<'a> {
+    pub binds: &'a [OutputBind],
+    pub sendable: &'a [Sendable],
+}
+
+impl<'a> Outputs<'a> {
+    /// The bindings of one frame or port.
+    pub(super) fn of(self, span: Span) -> Self {
+        Self { binds: span.of(self.binds), ..self }
+    }
+
+    /// Whether a field of these may send only some numbers.
+    pub(super) fn are_limited(self, span: Span) -> bool {
+        !self.sendable.is_empty() && span.of(self.binds).iter().any(|bind| bind.sendable > 0)
+    }
+
+    /// The number that is sent for `number`; not a number if none is.
+    #[cold]
+    #[inline(never)]
+    fn sent(self, binding: &OutputBind, number: f64) -> f64 {
+        let allowed = self.sendable.iter().skip(usize::from(binding.first_sendable));
+        let mut sent = f64::NAN;
+        for sendable in allowed.take(usize::from(binding.sendable)) {
+            match sendable {
+                Sendable::Limits(limits) => {
+                    return binding.element().encoding().map_or(sent, |own| limits.apply(&own, number));
+                }
+                Sendable::Entry(entry) if entry.has(number) => sent = entry.sent,
+                Sendable::Entry(_) => {}
+            }
+        }
+        sent
+    }
 }
 
 impl OutputBind {
@@ -157,7 +214,7 @@ impl OutputBind {
             Element::Fixed { value, .. } => OutputBinding::Constant(value as f64),
             _ => from,
         };
-        Self { ty, from, extra: 0, written: Written::new(element) }
+        Self { ty, from, extra: 0, sendable: 0, first_sendable: 0, written: Written::new(element) }
     }
 
     pub(super) fn element(&self) -> Element {
@@ -188,7 +245,9 @@ pub(super) fn values(
             OutputBinding::Port { value, .. } if value.is_count() => {
                 wrapping_count(ty, image.extra(extra) as u32)
             }
-            OutputBinding::State { scale, offset, .. } | OutputBinding::Port { scale, offset, .. } => {
+            OutputBinding::State { scale, offset, .. }
+            | OutputBinding::Port { scale, offset, .. }
+            | OutputBinding::Link { scale, offset, .. } => {
                 saturate_to_field(ty, image.extra(extra), scale, offset)
             }
             OutputBinding::Bit { var, bit } => saturate_to_field(ty, image.bit(var, bit), 1.0, 0.0),
@@ -199,8 +258,19 @@ pub(super) fn values(
     values
 }
 
-/// The number that a device's frame shows for a field; not a number if there is none.
-pub(super) fn number_of(binding: &OutputBind, image: &Image, frames_sent: u32, reply: ReplyCode) -> f64 {
+/// The number that a device's frame shows for a field of these; not a number if there is none.
+pub(super) fn number_of(
+    outputs: Outputs<'_>,
+    binding: &OutputBind,
+    image: &Image,
+    frames_sent: u32,
+    reply: ReplyCode,
+) -> f64 {
+    let number = source_of(binding, image, frames_sent, reply);
+    if binding.sendable == 0 { number } else { outputs.sent(binding, number) }
+}
+
+fn source_of(binding: &OutputBind, image: &Image, frames_sent: u32, reply: ReplyCode) -> f64 {
     match binding.from {
         OutputBinding::Variable { var, scale, offset } => {
             image.value(var).as_f64() * f64::from(scale) + f64::from(offset)
@@ -212,7 +282,9 @@ pub(super) fn number_of(binding: &OutputBind, image: &Image, frames_sent: u32, r
         OutputBinding::Port { value, .. } if value.is_count() => {
             wrapping_number(binding, image.extra(binding.extra))
         }
-        OutputBinding::State { scale, offset, .. } | OutputBinding::Port { scale, offset, .. } => {
+        OutputBinding::State { scale, offset, .. }
+        | OutputBinding::Port { scale, offset, .. }
+        | OutputBinding::Link { scale, offset, .. } => {
             image.extra(binding.extra) * f64::from(scale) + f64::from(offset)
         }
         OutputBinding::Bit { var, bit } => image.bit(var, bit),
@@ -236,6 +308,30 @@ fn counted_to(count: u32, max: u32) -> u32 {
 pub(super) struct Bindings<const FIELDS: usize> {
     pub inputs: Vec<InputBind, FIELDS>,
     pub outputs: Vec<OutputBind, FIELDS>,
+    /// What output fields may send.
+    pub sendable: Vec<Sendable, MAX_SENDABLE>,
+}
+
+impl<const FIELDS: usize> Bindings<FIELDS> {
+    pub(super) const fn new() -> Self {
+        Self { inputs: Vec::new(), outputs: Vec::new(), sendable: Vec::new() }
+    }
+
+    pub(super) fn outputs(&self) -> Outputs<'_> {
+        Outputs { binds: &self.outputs, sendable: &self.sendable }
+    }
+
+    /// The output field that was added last may send this; `None` if there is no room.
+    pub(super) fn may_send(&mut self, sendable: Sendable) -> Option<()> {
+        let first = self.sendable.len() as u8;
+        let field = self.outputs.last_mut()?;
+        self.sendable.push(sendable).ok()?;
+        if field.sendable == 0 {
+            field.first_sendable = first;
+        }
+        field.sendable = field.sendable.saturating_add(1);
+        Some(())
+    }
 }
 
 /// The count in the field's type, wrapping.

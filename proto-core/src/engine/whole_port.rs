@@ -9,12 +9,13 @@ use heapless::Vec;
 use super::command_link::CommandLink;
 use super::counters::add;
 use super::device_port::{DeviceCodec, DeviceFormat, elements};
-use super::field_port::{Accepted, Codec, FieldPort, Frames, came, keep};
+use super::field_port::{Codec, FieldPort, came, keep};
+use super::frames::{Accepted, Frames};
 use super::io::ReplyCode;
 use super::rejection::Rejection;
 use super::store::Store;
 use super::tap::Tap;
-use super::user::{InputBind, OutputBind, number_of};
+use super::user::{InputBind, OutputBind, Outputs, number_of};
 use crate::config::{ConfigView, FieldSpec, Span, Words};
 use crate::device::{ByteOrder, Cutter, Escape, FrameLayout, Framer, Ignored, Piece, Probe};
 use crate::image::{Image, bind_to_variable};
@@ -353,7 +354,7 @@ impl FieldPort {
 pub(super) struct Outgoing<'a> {
     pub image: &'a Image,
     /// The bindings of all ports.
-    pub bindings: &'a [OutputBind],
+    pub bindings: Outputs<'a>,
     pub texts: &'a [TextBind],
     pub frames_sent: u32,
     pub reply: ReplyCode,
@@ -362,10 +363,10 @@ pub(super) struct Outgoing<'a> {
 impl Outgoing<'_> {
     /// Writes an output frame, without escape bytes, to the front of `out`.
     pub(super) fn write(&self, format: &DeviceFormat, out: &mut [u8]) -> Option<usize> {
-        let fields = format.bindings.of(self.bindings);
+        let Outputs { binds: fields, .. } = self.bindings.of(format.bindings);
         let number = |nth: usize| {
-            let field = fields.get(nth);
-            field.map_or(f64::NAN, |field| number_of(field, self.image, self.frames_sent, self.reply))
+            let number = |field| number_of(self.bindings, field, self.image, self.frames_sent, self.reply);
+            fields.get(nth).map_or(f64::NAN, number)
         };
         let text = |nth: usize, out: &mut [u8]| {
             let mut texts = texts_in(self.texts, format.bindings, Direction::Output);

@@ -85,7 +85,7 @@ pub(crate) enum LinkAction {
 
 /// Counters of a link since the start.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-#[cfg_attr(feature = "serde", derive(serde::Serialize))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(default))]
 pub struct LinkHistory {
     /// Times the link came up.
     pub connects: u32,

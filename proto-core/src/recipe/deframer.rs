@@ -89,6 +89,34 @@ impl Deframer {
         self.search(layout, chunk)
     }
 
+    /// Holds a chunk that neither completes a frame nor shows that none has begun, as most chunks of a slow line
+    /// do. `false` if [`Self::next_frame`] has to look at it; then nothing was taken.
+    #[inline]
+    pub(crate) fn hold(&mut self, layout: &StreamLayout, chunk: &[u8]) -> bool {
+        let held = self.pending();
+        let end = held.saturating_add(chunk.len());
+        if self.start != 0 || end >= layout.frame_len() {
+            return false;
+        }
+        // A driver that does not wait reports single bytes.
+        if let [byte] = chunk {
+            if held < layout.head_word().len() && layout.head().get(held) != Some(byte) {
+                return false;
+            }
+            if let Some(place) = self.ring.get_mut(held) {
+                *place = *byte;
+            }
+        } else {
+            let missing = layout.head().get(held..).unwrap_or(&[]);
+            if chunk.is_empty() || !missing.iter().zip(chunk).all(|(expected, byte)| expected == byte) {
+                return false;
+            }
+            self.put(held, chunk);
+        }
+        self.len = end as u16;
+        true
+    }
+
     /// The bytes of a possible frame that are held, in two pieces.
     pub fn held(&self) -> (&[u8], &[u8]) {
         let (start, len) = (usize::from(self.start), self.pending());

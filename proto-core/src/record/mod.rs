@@ -40,6 +40,8 @@ pub enum Entry<'a> {
     },
     /// [`Engine::poll_output`] returned this.
     Output(Output<'a>),
+    /// [`Engine::make_safe`] was called.
+    MakeSafe,
     /// The engine's counters and the contents of its image: see [`totals`].
     Totals(&'a [u8]),
 }
@@ -51,6 +53,7 @@ impl<'a> Entry<'a> {
         let entry = match body.byte()? {
             tag::START => Self::Start { image: body.bytes()? },
             tag::TOTALS => Self::Totals(body.bytes()?),
+            tag::MAKE_SAFE => Self::MakeSafe,
             tag @ 0x10..0x20 => {
                 let at = body.instant()?;
                 Self::Input { at, input: body.input(tag)? }
@@ -66,6 +69,10 @@ impl<'a> Entry<'a> {
         let tail = match *self {
             Self::Start { image } => head.tag(tag::START).len_of(image),
             Self::Totals(totals) => head.tag(tag::TOTALS).len_of(totals),
+            Self::MakeSafe => {
+                head.tag(tag::MAKE_SAFE);
+                &[]
+            }
             Self::Input { at, input } => head.input(at, input),
             Self::Output(output) => head.output(output),
         };
@@ -108,6 +115,7 @@ pub fn totals<
 mod tag {
     pub(super) const START: u8 = 0x01;
     pub(super) const TOTALS: u8 = 0x02;
+    pub(super) const MAKE_SAFE: u8 = 0x03;
 
     pub(super) const PORT_UP: u8 = 0x10;
     pub(super) const PORT_DOWN: u8 = 0x11;

@@ -93,6 +93,10 @@ pub fn replay<
                 replayed.outputs = replayed.outputs.saturating_add(outputs);
             }
             Entry::Output(_) => {}
+            Entry::MakeSafe => {
+                entry.encode(&mut write);
+                engine.make_safe();
+            }
             Entry::Totals(_) => Entry::Totals(&totals(engine)).encode(&mut write),
         }
     }

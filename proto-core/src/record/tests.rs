@@ -52,7 +52,7 @@ fn entries() -> Vec<Entry<'static>> {
         Output::LinkClose { link: LINK },
         Output::LinkSend { link: LINK, bytes: &[0xFF; 128] },
     ];
-    let mut entries = std::vec![Entry::Start { image: &[7; 200] }, Entry::Totals(&[0; 127])];
+    let mut entries = std::vec![Entry::Start { image: &[7; 200] }, Entry::Totals(&[0; 127]), Entry::MakeSafe];
     entries.extend(inputs.into_iter().map(|input| Entry::Input { at: AT, input }));
     entries.extend(outputs.into_iter().map(Entry::Output));
     entries

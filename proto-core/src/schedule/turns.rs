@@ -13,6 +13,10 @@
 //!
 //! What a peer is asked at its start comes before anything else that it is asked, in the order of the
 //! rows: at first, and after each time that it did not answer.
+//!
+//! A row that nobody answers waits while its peer is down, because nothing would tell that it was heard.
+//! Once another row of the peer is answered, the waiting ones of the start go first, and with them begins
+//! what is asked at the start behind them.
 
 use super::Grid;
 use crate::time::{Duration, Instant};
@@ -68,6 +72,8 @@ pub(crate) struct Row {
     /// It is to be asked at the start or because the peer was away, and has not been taken since.
     opens: bool,
     requested: Option<Instant>,
+    /// Whether it has a reply, which says that the peer is there.
+    is_answered: bool,
     /// When it was taken last.
     taken: Instant,
     /// Time on the line if no answer comes.
@@ -129,11 +135,21 @@ impl Row {
     ) -> Self {
         let grid = every.map(|period| Grid::starting_at(now, period));
         let (requested, taken) = (start.then_some(now), Instant::ZERO);
-        Self { peer, grid, start, opens: start, requested, taken, cost, timeout }
+        Self { peer, grid, start, opens: start, requested, is_answered: true, taken, cost, timeout }
+    }
+
+    /// The same, but nobody answers unless `is_answered`.
+    pub(crate) const fn with_reply(mut self, is_answered: bool) -> Self {
+        self.is_answered = is_answered;
+        self
     }
 
     pub(crate) const fn peer(&self) -> u8 {
         self.peer
+    }
+
+    pub(crate) const fn is_answered(&self) -> bool {
+        self.is_answered
     }
 
     /// The line begins anew: what is asked at the start is asked again, and periods begin now.
@@ -167,6 +183,9 @@ impl<P: AsRef<Peer> + AsMut<Peer>> Turns<'_, P> {
                 continue;
             }
             let Some(peer) = self.peers.get(usize::from(row.peer)).map(AsRef::as_ref) else { continue };
+            if !row.is_answered && peer.presence == Presence::Down {
+                continue;
+            }
             let wanted = row.wanted();
             let at = wanted.max(peer.not_before);
             match peer.presence {
@@ -206,9 +225,11 @@ impl<P: AsRef<Peer> + AsMut<Peer>> Turns<'_, P> {
 
     /// Whether another row of the peer is to be asked at its start before this one.
     fn waits_for_opening(&self, nth: usize, row: &Row) -> bool {
-        let mut opening =
-            self.rows.iter().enumerate().filter(|(_, other)| other.opens && other.peer == row.peer);
-        opening.next().is_some_and(|(first, _)| first != nth)
+        let peer = self.peers.get(usize::from(row.peer)).map(AsRef::as_ref);
+        let is_down = peer.is_some_and(|peer| peer.presence == Presence::Down);
+        let comes = |other: &Row| other.opens && other.peer == row.peer && (other.is_answered || !is_down);
+        let first = self.rows.iter().position(comes);
+        first.is_some_and(|first| first != nth)
     }
 
     /// The row is taken: its request is being sent, or there is nothing to send.
@@ -237,6 +258,14 @@ impl<P: AsRef<Peer> + AsMut<Peer>> Turns<'_, P> {
         peer.not_before = not_before;
         if !was_down {
             return;
+        }
+        // The answered one may have gone before one that had to wait.
+        let waited = self.rows.iter().position(|row| row.peer == which && row.opens && !row.is_answered);
+        if waited.is_some_and(|waited| waited < nth)
+            && let Some(row) = self.rows.get_mut(nth).filter(|row| row.start)
+        {
+            row.opens = true;
+            row.requested.get_or_insert(now);
         }
         for (_, row) in self.rows.iter_mut().enumerate().filter(|(at, row)| row.peer == which && *at != nth) {
             if row.start {

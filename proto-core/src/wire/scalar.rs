@@ -4,6 +4,8 @@
 
 use core::fmt;
 
+use crate::decimal::Decimal;
+
 /// A field's data type, with the specification's names.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
@@ -138,9 +140,12 @@ impl fmt::Display for ScalarError {
         match *self {
             Self::OutOfRange { ty, value } => {
                 let (low, high) = ty.range();
+                let [value, low, high] = [value, low, high].map(Decimal::Double);
                 write!(f, "{value} does not fit in a {ty} ({low}..={high})")
             }
-            Self::NotWhole { ty, value } => write!(f, "{value} is not an integer, but a {ty} must be"),
+            Self::NotWhole { ty, value } => {
+                write!(f, "{} is not an integer, but a {ty} must be", Decimal::Double(value))
+            }
         }
     }
 }

@@ -4,6 +4,7 @@ use proto_core::config::*;
 use proto_core::device::{Algorithm, ByteOrder, Checksum, Encoding, Overflow};
 use proto_core::engine::{Input, PortId, Rejection};
 use proto_core::recipe::model::Mode;
+use proto_core::time::Duration;
 use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::ScalarType as T;
 
@@ -114,6 +115,38 @@ fn a_refusal_that_begins_as_a_shorter_frame_of_another_device_is_taken() {
     assert!(counters.rejected_other_device >= 2 && counters.unanswered == 0, "{counters:?}");
 }
 
+/// While a request leaves, a wrong frame is heard; when it has left, the line has been silent behind that frame
+/// for long enough.
+#[test]
+fn a_request_that_failed_while_it_was_leaving_is_repeated_at_once() {
+    let mut cell = Cell::new();
+    let sum = || FieldSpec::Checksum(Checksum::standard(Algorithm::CRC16_MODBUS).over(1, None));
+    let request = frame(&mut cell, None, b"Q", b"", vec![fixed(1), sum()]);
+    let reply = frame(&mut cell, None, b"A", b"", vec![fixed(0x20), byte_to("WordInputReg[1]"), sum()]);
+    let exchange = asks(request, reply, None, AskWhen::every(MS(200)));
+    let port = talking(&mut cell, &[Exchange { timeout: MS(100), ..exchange }]);
+    let mut rig = cell.rig();
+    rig.reports_sent = false;
+    rig.run(MS(1));
+    rig.input(Input::PortSent { port });
+    let seal = |bytes: &[u8]| {
+        let crc = Algorithm::CRC16_MODBUS.of([&bytes[1..]]) as u16;
+        [bytes, &crc.to_le_bytes()].concat()
+    };
+    assert_eq!(rig.sent_to(port), [seal(b"Q\x01")]);
+    rig.bytes(port, &seal(b"A\x20\x07"));
+    rig.run(MS(200));
+    assert_eq!(rig.sent_to(port), [seal(b"Q\x01")], "the next period");
+    let mut wrong = seal(b"A\x20\x08");
+    wrong[2] ^= 1;
+    rig.bytes(port, &wrong);
+    rig.run(MS(10));
+    rig.input(Input::PortSent { port });
+    rig.run(Duration::from_micros(1));
+    assert_eq!(rig.sent_to(port), [seal(b"Q\x01")], "its repetition");
+    assert_eq!(rig.map.registers[8], 7);
+}
+
 /// A device that repeats what it is told, behind an adapter that does so as well.
 #[test]
 fn an_echo_behind_a_late_reply_is_no_reply() {
@@ -129,6 +162,20 @@ fn an_echo_behind_a_late_reply_is_no_reply() {
     assert_eq!(counters.resync_bytes, counters.frames_out * 2, "{counters:?}");
     line.run(MS(2_000), |request| Some((MS(3), [b"Z\x01", request, request].concat())));
     assert!(line.rig.counters(port).frames_in > 10);
+}
+
+#[test]
+fn a_request_and_its_reply_may_be_a_head_alone() {
+    let mut cell = Cell::new();
+    let sum = || vec![FieldSpec::Checksum(Checksum::standard(Algorithm::CRC16_MODBUS))];
+    let request = frame(&mut cell, None, &[1, 3], b"", sum());
+    let reply = frame(&mut cell, None, b"OK", b"\r", vec![]);
+    let port = talking(&mut cell, &[asks(request, reply, None, AskWhen::every(MS(50)))]);
+    let mut line = Line::new(&cell, port);
+    let asked = line.run(MS(220), |_| Some((MS(3), b"OK\r".to_vec())));
+    assert!(asked.len() >= 4 && asked.iter().all(|(_, sent)| *sent == with_crc(&[1, 3])), "{asked:02X?}");
+    let counters = line.rig.counters(port);
+    assert_eq!((counters.frames_in, counters.unanswered), (asked.len() as u32, 0), "{counters:?}");
 }
 
 #[test]

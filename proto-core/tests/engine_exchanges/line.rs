@@ -2,7 +2,7 @@
 #![allow(unreachable_pub, reason = "a module of a test binary")]
 
 use proto_core::config::*;
-use proto_core::device::{Algorithm, ByteOrder, Encoding, Overflow};
+use proto_core::device::{ByteOrder, Encoding, Overflow};
 use proto_core::engine::PortId;
 use proto_core::modbus::rtu::Operation;
 use proto_core::recipe::model::Mode;
@@ -30,11 +30,6 @@ pub fn register_to(name: &str) -> FieldSpec {
 
 pub fn register_from(name: &str) -> FieldSpec {
     FieldSpec::DeviceOutput { encoding: word(), overflow: Overflow::Usual, from: from(name) }
-}
-
-pub fn with_crc(bytes: &[u8]) -> Vec<u8> {
-    let crc = Algorithm::named("crc16-modbus").unwrap().of([bytes]) as u16;
-    [bytes, &crc.to_le_bytes()].concat()
 }
 
 /// A port with these exchanges and without parts.
@@ -77,6 +72,11 @@ pub struct Line {
 impl Line {
     pub fn new(cell: &Cell, port: PortId) -> Self {
         Self { rig: cell.rig(), port, coming: Vec::new() }
+    }
+
+    /// Something comes by itself, so much later.
+    pub fn comes(&mut self, delay: Duration, bytes: &[u8]) {
+        self.coming.push((self.rig.now + delay, bytes.to_vec()));
     }
 
     /// Runs for a time. `answer` says what comes after a request, and how much later. Returns the

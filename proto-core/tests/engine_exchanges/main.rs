@@ -7,3 +7,4 @@ mod properties;
 mod rig;
 mod rtu;
 mod slave;
+mod unconfirmed;

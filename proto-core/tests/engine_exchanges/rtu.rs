@@ -250,7 +250,47 @@ fn a_late_reply_is_not_taken_for_another_exchange() {
 }
 
 #[test]
+fn a_reply_to_what_was_asked_before_the_start_shifts_no_others() {
+    let mut cell = Cell::new();
+    let table = [1, 2].map(|address| {
+        let name = format!("WordInputReg[{address}]");
+        let mut exchange = reads(&mut cell, 5, &[&name], AskWhen::every(MS(40)));
+        let Talk::Rtu { operation, .. } = &mut exchange.talk else { panic!() };
+        *operation = Operation::ReadHoldingRegisters { address, count: 1 };
+        Exchange { timeout: MS(30), ..exchange }
+    });
+    let port = talking(&mut cell, &table);
+    for delay in 1..29 {
+        let mut line = Line::new(&cell, port);
+        // A gateway before this one had asked for the second register. The slave answers in turn.
+        line.comes(MS(delay), &registers(5, &[102]));
+        let asked = line.run(MS(300), |request| Some((MS(29), registers(5, &[u16::from(request[3]) + 100]))));
+        let pause = asked[1].0.saturating_since(asked[0].0);
+        assert!((MS(60)..MS(64)).contains(&pause), "two timeouts: {pause}");
+        for written in line.rig.take_written() {
+            let Written::Registers(address, words) = written else { panic!() };
+            let second = (address..).zip(words).find(|(at, _)| *at == 9);
+            assert!(second.is_none_or(|(_, word)| word == 102), "at a delay of {delay} ms");
+        }
+        assert_eq!(line.rig.map.registers[8..10], [101, 102], "at a delay of {delay} ms");
+    }
+}
+
+#[test]
 fn a_late_reply_that_comes_while_the_request_is_repeated_holds_others_back_too() {
+    replies_come_late(None);
+}
+
+#[test]
+fn a_late_reply_behind_noise_holds_others_back_too() {
+    // The noise reads as a reply with a wrong checksum, so the request is repeated before its reply comes.
+    let mut noise = registers(5, &[1]);
+    noise[3] ^= 0x40;
+    replies_come_late(Some(noise));
+}
+
+/// Two blocks of one slave whose replies look alike come late, behind what else comes.
+fn replies_come_late(noise: Option<Vec<u8>>) {
     let mut cell = Cell::new();
     let mut table = [1, 2].map(|address| {
         let name = format!("WordInputReg[{address}]");
@@ -266,12 +306,17 @@ fn a_late_reply_that_comes_while_the_request_is_repeated_holds_others_back_too()
         let mut rig = cell.rig();
         rig.reports_sent = false;
         // Requests take 5 ms to leave. Until the first change the slave is prompt.
-        let (begin, mut coming) = (rig.now, Vec::new());
+        let (begin, mut coming, mut nth) = (rig.now, Vec::new(), 0);
         while rig.now < begin + MS(1_500) {
             for request in rig.sent_to(port) {
                 let left = rig.now + MS(5);
                 let delay = if rig.now < begin + MS(300) { 1 } else { delay };
                 coming.push((left, None));
+                // Not each time, so that the slave stays there.
+                if let Some(noise) = noise.as_ref().filter(|_| delay > 1 && nth % 3 == 0) {
+                    coming.push((left + MS(1), Some(noise.clone())));
+                }
+                nth += 1;
                 coming.push((left + MS(delay), Some(registers(5, &[u16::from(request[3]) + 100]))));
             }
             coming.sort_by_key(|(at, _)| *at);
@@ -291,6 +336,54 @@ fn a_late_reply_that_comes_while_the_request_is_repeated_holds_others_back_too()
             }
         }
     }
+}
+
+#[test]
+fn a_reply_is_not_taken_for_another_exchange_when_the_repetition_cannot_be_made() {
+    // Two blocks of one slave whose replies look alike. The first request shows a value of the controller.
+    let mut cell = Cell::new();
+    let exchange = |cell: &mut Cell, shown, to, address| {
+        let poll = reads(cell, 5, &[to], AskWhen::every(MS(40)));
+        let Talk::Rtu { read, .. } = poll.talk else { panic!() };
+        let Talk::Rtu { written, .. } = shown else { panic!() };
+        let (read_address, write_address) = (address, address + 0x20);
+        let operation =
+            Operation::ReadWriteRegisters { read_address, read_count: 1, write_address, write_count: 1 };
+        Exchange { timeout: MS(30), retries: 3, talk: Talk::Rtu { operation, written, read }, ..poll }
+    };
+    let shown = writes(&mut cell, 5, &["WordOutputReg[1]"], AskWhen::NEVER).talk;
+    let constant = sets_mode(&mut cell, 5, AskWhen::NEVER).talk;
+    let table = [
+        exchange(&mut cell, shown, "WordInputReg[1]", 1),
+        exchange(&mut cell, constant, "WordInputReg[2]", 2),
+    ];
+    let port = talking(&mut cell, &table);
+    cell.last_recipe().on_stale = OnStale::Stop;
+    cell.last_port().stale_after = MS(100);
+    let answer = |delay: Duration| {
+        move |request: &[u8]| {
+            let reply = [&[5, 23, 2], &(u16::from(request[3]) + 100).to_be_bytes()[..]].concat();
+            Some((delay, with_crc(&reply)))
+        }
+    };
+    let mut given_up = 0;
+    for delay in (31..59).step_by(3) {
+        for offset in (0..40).step_by(5) {
+            let mut line = Line::new(&cell, port);
+            line.run(MS(500 + offset), answer(MS(1)));
+            // The controller falls silent, and then the slave is late.
+            line.rig.modbus_answers = false;
+            line.run(MS(70), answer(MS(1)));
+            for _ in 0..200 {
+                line.run(MS(1), answer(MS(delay)));
+                let values = ["WordInputReg[1]", "WordInputReg[2]"]
+                    .map(|name| line.rig.engine.image().value(var(name)).as_f64());
+                assert_eq!(values, [101.0, 102.0], "{delay} ms, {offset} ms");
+            }
+            given_up += line.rig.counters(port).unanswered;
+        }
+    }
+    assert!(given_up > 0, "a request that is not repeated is one without a reply");
 }
 
 #[test]

@@ -4,7 +4,7 @@ use proptest::collection::vec;
 use proptest::prelude::*;
 use proto_core::config::*;
 use proto_core::device::{Bits, ByteOrder, Encoding, Kind, Overflow};
-use proto_core::engine::{PortId, PortState};
+use proto_core::engine::{Input, PortId, PortState};
 use proto_core::modbus::rtu::Operation;
 use proto_core::sysvar::ModbusPlace;
 use proto_core::time::Duration;
@@ -65,6 +65,24 @@ fn a_master_writes_a_block_and_the_robot_has_it() {
     rig.run(MS(300));
     assert_eq!(rig.map.registers[8], 9);
     assert_eq!(rig.engine.port_state(port), Some(PortState::Silent));
+}
+
+#[test]
+fn a_port_that_is_gone_serves_nothing() {
+    let (mut rig, port) = plc();
+    rig.run(MS(10));
+    rig.input(Input::PortDown { port });
+    rig.run(MS(10));
+    let write = with_crc(&[5, 16, 0, 0, 0, 2, 4, 0, 44, 1, 0]);
+    rig.bytes(port, &write);
+    // Something else has a deadline meanwhile.
+    rig.run(MS(500));
+    assert_eq!(rig.take_written(), []);
+    assert_eq!(rig.counters(port).discarded_bytes, write.len() as u32);
+    rig.input(Input::PortUp { port });
+    rig.run(MS(10));
+    assert_eq!(rig.sent_to(port), Vec::<Vec<u8>>::new());
+    assert_eq!(asks(&mut rig, port, &write[..11]), [with_crc(&write[..6])]);
 }
 
 #[test]

@@ -118,12 +118,12 @@ impl Judge for Facts {
             Input::PortUp { .. } => self.is_up = true,
             Input::PortDown { .. } => {
                 self.is_up = false;
-                self.orders.forget(now);
+                self.orders.gone(now);
             }
             Input::PortBus { state, .. } => {
-                self.is_bus_off = state == BusState::BusOff;
-                if self.is_bus_off {
-                    self.orders.forget(now);
+                let was_off = std::mem::replace(&mut self.is_bus_off, state == BusState::BusOff);
+                if self.is_bus_off && !was_off {
+                    self.orders.gone(now);
                 }
             }
             Input::LinkUp { .. } => self.bits.controller_was_away(now),

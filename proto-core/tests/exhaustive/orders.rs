@@ -49,6 +49,8 @@ struct Asked {
 pub struct Orders {
     /// The field's value in the frame before; none after silence.
     base: Option<u8>,
+    /// The gateway slept after a frame with the field, and none has come since.
+    woke: bool,
     /// How many were picked, and how many of them were not sent.
     pub total: u32,
     pub dropped: u32,
@@ -66,6 +68,7 @@ impl Orders {
     pub fn new() -> Self {
         Self {
             base: None,
+            woke: false,
             total: 0,
             dropped: 0,
             runs: Vec::new(),
@@ -80,7 +83,9 @@ impl Orders {
     /// An accepted frame brought the field.
     pub fn received(&mut self, value: u8, conns: &Conns, now: Instant) {
         let before = self.base.replace(value);
-        if before.is_none_or(|before| before == value) {
+        // What asked for it may have been discarded.
+        let is_held = std::mem::take(&mut self.woke) && value == STOP;
+        if !is_held && before.is_none_or(|before| before == value) {
             return;
         }
         self.not_asked(now);
@@ -106,7 +111,13 @@ impl Orders {
         }
     }
 
-    /// The device is gone, or silent: what it asked for goes with it.
+    /// The device is gone: its next frame says how things are.
+    pub fn gone(&mut self, now: Instant) {
+        self.woke = false;
+        self.forget(now);
+    }
+
+    /// The device is silent: what it asked for goes with it.
     pub fn forget(&mut self, now: Instant) {
         if self.base.take().is_some() {
             self.not_asked(now);
@@ -195,7 +206,7 @@ impl Orders {
 
     /// The gateway was asleep.
     pub fn slept(&mut self) {
-        self.base = None;
+        self.woke |= self.base.take().is_some();
         for asked in std::mem::take(&mut self.asked) {
             self.settle(asked.picked.nth, ReplyCode::NoReply);
         }

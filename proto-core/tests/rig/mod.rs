@@ -4,6 +4,7 @@
 use std::collections::BTreeSet;
 
 use proto_core::config::*;
+use proto_core::device::Algorithm;
 use proto_core::engine::{
     Engine, Input, LinkId, LinkInfo, LinkKind, OUTPUT_BUFFER, Output, PortCounters, PortId,
 };
@@ -21,6 +22,12 @@ pub fn var(name: &str) -> SysVar {
 }
 
 pub const MS: fn(u64) -> Duration = Duration::from_millis;
+
+/// A frame with the CRC of Modbus RTU behind it.
+pub fn with_crc(bytes: &[u8]) -> Vec<u8> {
+    let crc = Algorithm::named("crc16-modbus").unwrap().of([bytes]) as u16;
+    [bytes, &crc.to_le_bytes()].concat()
+}
 
 /// Builds configurations in a few words.
 pub struct Cell(pub GatewayConfig);

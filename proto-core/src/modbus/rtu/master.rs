@@ -401,11 +401,19 @@ impl<const N: usize> Master<N> {
     fn present(&mut self, flight: Flight, now: Instant) {
         let timeout = self.table.get(flight.exchange).map_or(Duration::ZERO, |row| row.timeout);
         // The reply may be a late one to the first of the requests. Then that to the repetition is
-        // still to come, and must not be taken for one to another exchange.
-        let not_before = if flight.timed_out { self.sent + timeout.saturating_mul(2) } else { Instant::ZERO };
+        // still to come, and must not be taken for one to another exchange. If a damaged one was the reason,
+        // that costs a slave with a single exchange more than it is worth.
+        let is_late = flight.timed_out || flight.repeated > 0 && !self.is_alone(flight.exchange);
+        let not_before = if is_late { self.sent + timeout.saturating_mul(2) } else { Instant::ZERO };
         self.turns().answered(flight.exchange, now, not_before);
         self.phase = Phase::Idle;
         self.receiver.end();
+    }
+
+    /// Whether its slave has no other exchange.
+    fn is_alone(&self, exchange: usize) -> bool {
+        let slave = self.slave_of(exchange);
+        self.table.iter().filter(|row| Some(row.slave) == slave).nth(1).is_none()
     }
 
     fn failure(&self, flight: Flight, now: Instant) -> Option<Failure> {
@@ -433,8 +441,8 @@ impl<const N: usize> Master<N> {
         let disturbed = self.receiver.stray() != flight.stray;
         if flight.repeated < retries.max(u8::from(disturbed)) {
             self.count(exchange, |counters| &mut counters.retries);
-            let timed_out = flight.timed_out || failure == Failure::Timeout;
             let repeated = flight.repeated.saturating_add(1);
+            let timed_out = flight.timed_out || failure == Failure::Timeout;
             self.phase = Phase::Repeat(Flight { repeated, timed_out, ..flight });
             return None;
         }
@@ -461,8 +469,12 @@ impl<const N: usize> Master<N> {
     }
 
     fn peer_of(&self, exchange: usize) -> usize {
-        let address = self.table.get(exchange).map(|row| row.slave);
+        let address = self.slave_of(exchange);
         self.slaves.iter().position(|slave| Some(slave.address) == address).unwrap_or(usize::MAX)
+    }
+
+    fn slave_of(&self, exchange: usize) -> Option<u8> {
+        self.table.get(exchange).map(|row| row.slave)
     }
 
     fn count(&mut self, exchange: usize, counter: impl FnOnce(&mut SlaveCounters) -> &mut u32) {
