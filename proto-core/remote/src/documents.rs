@@ -1,17 +1,18 @@
 //! The documents `status` and `values` of a gateway, as JSON in pieces.
 //!
-//! In: a [`Status`] for each piece. Out: text. A piece is at most one port, link or histogram, or
+//! In: a [`Status`] for each piece. Out: text. A piece is at most one port or one of its peers, a link or histogram, or
 //! [`VALUES_AT_ONCE`] variables, so that a driver with little memory sends one before it makes the next. Each
 //! piece may be of a later instant than the one before; the document is well-formed all the same. Unknown
 //! values are absent.
 
 use core::fmt::{self, Write};
 
-use proto_core::engine::{Health, Status};
+use proto_core::engine::Status;
 use proto_core::sysvar::{COUNT, SysVar};
 use serde::Serialize;
 
 use crate::json::{self, JsonError};
+use crate::number::Whole;
 
 /// Number of variables in a piece.
 pub const VALUES_AT_ONCE: usize = 32;
@@ -35,6 +36,11 @@ pub struct Pieces {
 enum Step {
     Status,
     Port(usize),
+    /// Of a port, by their places.
+    Peer {
+        port: usize,
+        nth: usize,
+    },
     Link(usize),
     Controller,
     Latency,
@@ -64,21 +70,44 @@ impl Pieces {
     pub fn write_next(&mut self, status: Status<'_>, out: &mut impl Write) -> Result<bool, JsonError> {
         self.next = match self.next {
             Step::Status => {
-                let (time, sleeps) = (status.at().as_micros(), status.sleeps());
-                let health = health_name(status.health());
+                let (time, sleeps) = (Whole(status.at().as_micros()), status.sleeps());
+                let health = status.health().name();
                 write!(out, "{{\"time_us\":{time},\"sleeps\":{sleeps},\"health\":\"{health}\",\"ports\":{{")?;
                 Step::Port(0)
             }
             Step::Port(nth) => match status.ports().nth(nth) {
                 Some(port) => {
-                    entry(out, nth == 0, port.name, &port)?;
-                    Step::Port(nth.saturating_add(1))
+                    let mut open = Open { out, is_end_held: false };
+                    entry(&mut open, nth == 0, port.name, &port.without_peers())?;
+                    match port.peers().next() {
+                        Some(_) => {
+                            out.write_str(",\"peers\":{")?;
+                            Step::Peer { port: nth, nth: 0 }
+                        }
+                        None => {
+                            out.write_char('}')?;
+                            Step::Port(nth.saturating_add(1))
+                        }
+                    }
                 }
                 None => {
                     out.write_str("},\"links\":{")?;
                     Step::Link(0)
                 }
             },
+            Step::Peer { port, nth } => {
+                let peer = status.ports().nth(port).and_then(|port| port.peers().nth(nth));
+                match peer {
+                    Some(peer) => {
+                        entry(out, nth == 0, peer.number, &peer)?;
+                        Step::Peer { port, nth: nth.saturating_add(1) }
+                    }
+                    None => {
+                        out.write_str("}}")?;
+                        Step::Port(port.saturating_add(1))
+                    }
+                }
+            }
             Step::Link(nth) => match status.links().nth(nth) {
                 Some(link) => {
                     entry(out, nth == 0, link.name, &link)?;
@@ -103,7 +132,7 @@ impl Pieces {
                 Step::End
             }
             Step::Values => {
-                write!(out, "{{\"time_us\":{},\"values\":{{", status.at().as_micros())?;
+                write!(out, "{{\"time_us\":{},\"values\":{{", Whole(status.at().as_micros()))?;
                 Step::ValuesFrom { from: 0, is_first: true }
             }
             Step::ValuesFrom { from, mut is_first } => {
@@ -137,6 +166,30 @@ impl Pieces {
     }
 }
 
+/// Holds the end of an object back, so that more can be added to it.
+struct Open<'w, W> {
+    out: &'w mut W,
+    is_end_held: bool,
+}
+
+impl<W: Write> Write for Open<'_, W> {
+    fn write_str(&mut self, text: &str) -> fmt::Result {
+        if text.is_empty() {
+            return Ok(());
+        }
+        if core::mem::take(&mut self.is_end_held) {
+            self.out.write_char('}')?;
+        }
+        match text.strip_suffix('}') {
+            Some(rest) => {
+                self.is_end_held = true;
+                self.out.write_str(rest)
+            }
+            None => self.out.write_str(text),
+        }
+    }
+}
+
 /// The place of a variable, or behind all of them of a bit.
 fn place(var: SysVar, bit: Option<u8>) -> usize {
     match bit {
@@ -147,17 +200,6 @@ fn place(var: SysVar, bit: Option<u8>) -> usize {
 
 /// Number of places.
 const PLACES: usize = COUNT * 9;
-
-/// One word for the gateway's condition.
-pub const fn health_name(health: Health) -> &'static str {
-    match health {
-        Health::Idle => "idle",
-        Health::NoController => "no-controller",
-        Health::PortSilent => "port-silent",
-        Health::Running => "running",
-        _ => "unknown",
-    }
-}
 
 fn entry(
     out: &mut impl Write,

@@ -18,6 +18,10 @@ use crate::route::{self, Access, BodyType, Operation, RouteError, Served};
 
 /// Maximum length of a body in bytes.
 pub const MAX_BODY: u64 = 64 << 10;
+/// Maximum length of a configuration image in bytes.
+pub const MAX_IMAGE: u64 = 16 << 10;
+/// Maximum length of arguments for a board in bytes.
+pub const MAX_ARGUMENTS: u64 = 256;
 
 /// The key, and what has to be remembered about requests with and without it.
 #[derive(Debug, Clone)]
@@ -225,35 +229,48 @@ impl Guard {
                 return Err((Why::Unfit, Refusal { allow: Some(allow), ..refusal }));
             }
         };
+        if !head.has_only(route.operation.arguments()) {
+            let text = "this path has no such argument, or it comes twice";
+            return refuse(Why::Unfit, Status::BAD_REQUEST, text);
+        }
         let is_plain_read =
-            matches!(head.method, Method::Get | Method::Head) && route.operation != Operation::Stream;
+            matches!(head.method, Method::Get | Method::Head) && !route.operation.is_endless();
         if !is_plain_read && is_cross_site(head) {
             let text = "only pages of this server may do that";
             return refuse(Why::CrossSite, Status::FORBIDDEN, text);
         }
-        if head.length > MAX_BODY || head.length > 0 && route.body == BodyType::None {
-            return refuse(
-                Why::Unfit,
-                Status::TOO_LARGE,
-                "the body is too long; allowed: 65536 bytes, none with GET",
-            );
+        let (most, text) = match (route.body, served) {
+            (BodyType::None, _) => (0, "the body is too long; allowed: none with GET"),
+            (BodyType::Image, _) => (MAX_IMAGE, "the body is too long; allowed: 16384 bytes"),
+            (_, Served::Board) => (MAX_ARGUMENTS, "the body is too long; allowed: 256 bytes"),
+            _ => (MAX_BODY, "the body is too long; allowed: 65536 bytes"),
+        };
+        if head.length > most {
+            return refuse(Why::Unfit, Status::TOO_LARGE, text);
         }
         let is_fit = match head.content_type {
             Some(content_type) => route.body == BodyType::None || route.body.is(content_type),
             // Of JSON all may be left out.
-            None => route.body != BodyType::Toml && head.length == 0,
+            None => matches!(route.body, BodyType::None | BodyType::Json) && head.length == 0,
         };
         if !is_fit {
             let text = match route.body {
                 BodyType::Toml => "Content-Type must be application/toml",
+                BodyType::Image => "Content-Type must be application/octet-stream",
                 _ => "Content-Type must be application/json",
             };
             return refuse(Why::Unfit, Status::UNSUPPORTED_TYPE, text);
         }
         let body = match route.access {
             Access::Open => None,
+            // So that a person finds out that it can be claimed, and how.
+            Access::Read
+                if served == Served::Board && self.key.is_none() && route.operation == Operation::Info =>
+            {
+                None
+            }
             Access::Read if site.is_loopback() && head.authorization.is_none() => None,
-            Access::Read | Access::Write => self.authorize(now, head, site)?,
+            Access::Read | Access::Write => self.authorize(now, head, site, served)?,
         };
         Ok(Admitted {
             operation: route.operation,
@@ -265,14 +282,20 @@ impl Guard {
     }
 
     /// Checks the key, and returns the hash of the body that was signed.
-    fn authorize(&mut self, now: Instant, head: &Head<'_>, site: &Site<'_>) -> Decision<Option<Hash>> {
+    fn authorize(
+        &mut self,
+        now: Instant,
+        head: &Head<'_>,
+        site: &Site<'_>,
+        served: Served,
+    ) -> Decision<Option<Hash>> {
         let peer = site.peer.to_canonical();
         let Some(key) = &self.key else {
-            return refuse(
-                Why::WithoutKey,
-                Status::FORBIDDEN,
-                "this server has no key: it can only be read, on its own machine",
-            );
+            let text = match served {
+                Served::Board => "this board has no key: press its button, then POST claim within 60 s",
+                _ => "this server has no key: it can only be read, on its own machine",
+            };
+            return refuse(Why::WithoutKey, Status::FORBIDDEN, text);
         };
         if let Some(wait) = self.attempts.must_wait(now, peer) {
             let refusal = Refusal::new(Status::TOO_MANY, "too many wrong keys; wait");
@@ -295,7 +318,10 @@ impl Guard {
         };
         let is_right = match &proof {
             Proof::None => {
-                let text = "Authorization must be Bearer KEY on this machine, or a signature";
+                let text = match site.is_loopback() {
+                    true => "Authorization must be Bearer KEY, or a signature",
+                    false => "Authorization must be a signature: over a network a key is never sent",
+                };
                 return refuse(Why::WithoutKey, Status::UNAUTHORIZED, text);
             }
             Proof::Key(shown) => key.is(shown, &self.secret),

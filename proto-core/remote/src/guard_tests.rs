@@ -77,6 +77,9 @@ fn over_a_network_everything_is_signed() {
     let get = "GET /api/v1/status HTTP/1.1\nHost: 10.0.0.5";
     assert_eq!(status(&NETWORK, get), 401);
     assert_eq!(status(&NETWORK, &format!("{get}\nAuthorization: Bearer {KEY}")), 401);
+    let bearer = ask(&mut guard(), at(0), &NETWORK, &format!("{get}\nAuthorization: Bearer {KEY}"));
+    let said = "Authorization must be a signature: over a network a key is never sent";
+    assert_eq!(bearer.err().map(|refusal| refusal.text), Some(said));
     assert_eq!(status(&NETWORK, "GET /api/v1/nonce HTTP/1.1\nHost: 10.0.0.5"), 200);
     let mut guard = guard();
     let request = signed(&mut guard, at(0), "POST", "/api/v1/apply", b"{\"confirm_s\": 60}");
@@ -182,7 +185,7 @@ fn pages_of_other_servers_change_and_follow_nothing() {
     let of = |what: &str, more: &str| {
         status(&LOOPBACK, &format!("{what} HTTP/1.1\nHost: localhost:8480\n{auth}\n{more}"))
     };
-    for request in ["POST /api/v1/confirm", "GET /api/v1/stream"] {
+    for request in ["POST /api/v1/confirm", "GET /api/v1/stream", "GET /api/v1/capture.pcapng"] {
         for more in [
             "Origin: http://evil.test",
             "Origin: null",
@@ -208,6 +211,20 @@ fn pages_of_other_servers_change_and_follow_nothing() {
         status(&LOOPBACK, "OPTIONS /api/v1/confirm HTTP/1.1\nHost: localhost\nOrigin: http://evil.test"),
         405
     );
+}
+
+#[test]
+fn arguments_are_known_and_come_once() {
+    let asked = |target: &str| status(&LOOPBACK, &format!("GET {target} HTTP/1.1\nHost: localhost"));
+    for right in
+        ["info", "info?", "config?revision=1", "stream?frames=1&port=a", "stream?port=a", "log?lines="]
+    {
+        assert_eq!(asked(&format!("/api/v1/{right}")), 200, "{right}");
+    }
+    for wrong in ["info?x=1", "info?&", "log?lines", "log?Lines=1", "log?lines=1&lines=2", "log?lines=1&x=2"]
+    {
+        assert_eq!(asked(&format!("/api/v1/{wrong}")), 400, "{wrong}");
+    }
 }
 
 #[test]

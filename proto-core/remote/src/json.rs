@@ -7,6 +7,8 @@ use core::fmt::{self, Write};
 
 use serde::ser::{self, Impossible, Serialize, Serializer};
 
+use crate::number::{Shortest, Signed, Whole};
+
 /// Why a value was not written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum JsonError {
@@ -119,10 +121,18 @@ impl<'w, W: Write> Items<'w, W> {
     }
 }
 
-macro_rules! displayed {
+macro_rules! whole_numbers {
     ($($method:ident: $type:ty),*) => {
         $(fn $method(self, value: $type) -> Result<(), JsonError> {
-            Ok(write!(self.0, "{value}")?)
+            self.serialize_u64(value.into())
+        })*
+    };
+}
+
+macro_rules! signed_numbers {
+    ($($method:ident: $type:ty),*) => {
+        $(fn $method(self, value: $type) -> Result<(), JsonError> {
+            self.serialize_i64(value.into())
         })*
     };
 }
@@ -138,28 +148,32 @@ impl<'w, W: Write> Serializer for Json<'w, W> {
     type SerializeStruct = Items<'w, W>;
     type SerializeStructVariant = Items<'w, W>;
 
-    displayed!(
-        serialize_bool: bool,
-        serialize_i8: i8,
-        serialize_i16: i16,
-        serialize_i32: i32,
-        serialize_i64: i64,
-        serialize_u8: u8,
-        serialize_u16: u16,
-        serialize_u32: u32,
-        serialize_u64: u64
-    );
+    whole_numbers!(serialize_u8: u8, serialize_u16: u16, serialize_u32: u32);
+
+    fn serialize_u64(self, value: u64) -> Result<(), JsonError> {
+        Ok(write!(self.0, "{}", Whole(value))?)
+    }
+
+    signed_numbers!(serialize_i8: i8, serialize_i16: i16, serialize_i32: i32);
+
+    fn serialize_i64(self, value: i64) -> Result<(), JsonError> {
+        Ok(write!(self.0, "{}", Signed(value))?)
+    }
+
+    fn serialize_bool(self, value: bool) -> Result<(), JsonError> {
+        Ok(self.0.write_str(if value { "true" } else { "false" })?)
+    }
 
     fn serialize_f32(self, value: f32) -> Result<(), JsonError> {
         match value.is_finite() {
-            // With an exponent where it is shorter, unlike `Display`.
-            true => Ok(write!(self.0, "{value:?}")?),
+            true => Ok(write!(self.0, "{}", Shortest(value))?),
             false => self.serialize_unit(),
         }
     }
 
     fn serialize_f64(self, value: f64) -> Result<(), JsonError> {
         match value.is_finite() {
+            // With an exponent where it is shorter, unlike `Display`. No document of a board has such a number.
             true => Ok(write!(self.0, "{value:?}")?),
             false => self.serialize_unit(),
         }
@@ -366,14 +380,20 @@ impl<W: Write> Serializer for Key<'_, W> {
         serialize_i8: i8,
         serialize_i16: i16,
         serialize_i32: i32,
-        serialize_i64: i64,
         serialize_u8: u8,
         serialize_u16: u16,
         serialize_u32: u32,
-        serialize_u64: u64,
         serialize_char: char,
         serialize_str: &str
     );
+
+    fn serialize_i64(self, value: i64) -> Result<(), JsonError> {
+        Ok(write_text(self.0, Signed(value))?)
+    }
+
+    fn serialize_u64(self, value: u64) -> Result<(), JsonError> {
+        Ok(write_text(self.0, Whole(value))?)
+    }
 
     no_keys!(
         serialize_bool(bool) -> (),

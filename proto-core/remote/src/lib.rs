@@ -65,6 +65,7 @@
 extern crate std;
 
 mod address;
+pub mod arguments;
 pub mod attempts;
 pub mod claim;
 pub mod documents;
@@ -74,6 +75,7 @@ pub mod json;
 pub mod key;
 pub mod metrics;
 pub mod nonces;
+pub mod number;
 pub mod request;
 pub mod response;
 pub mod revisions;

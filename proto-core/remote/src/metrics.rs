@@ -6,14 +6,14 @@
 
 use core::fmt::{self, Write};
 
-use proto_core::engine::{PortState, Status};
+use proto_core::engine::{PortState, PortStatus, Status};
 use proto_core::histogram::{BUCKETS, Histogram};
 use proto_core::link::LinkState;
 use proto_core::time::Duration;
 use serde::Serialize;
 
-use crate::documents::health_name;
 use crate::fields;
+use crate::number::Whole;
 
 /// The families that are being written.
 #[derive(Debug, Clone)]
@@ -26,7 +26,8 @@ enum Step {
     Health,
     PortUp,
     PortAge,
-    Rejected,
+    /// Of this port: with all of them it would be the longest piece by far.
+    Rejected(usize),
     PortCounter(usize),
     LinkUp,
     LinkHistory(usize),
@@ -48,14 +49,14 @@ impl Families {
         Self { next: Step::Health }
     }
 
-    /// Writes the next family, which may be empty; `false` if none is left and the text is complete.
+    /// Writes the next family, or a part of one, which may be empty; `false` if none is left and the text is complete.
     ///
     /// # Errors
     /// Those of `out`. The text cannot be continued then.
     pub fn write_next(&mut self, status: Status<'_>, out: &mut impl Write) -> Result<bool, fmt::Error> {
         self.next = match self.next {
             Step::Health => {
-                let health = health_name(status.health());
+                let health = status.health().name();
                 out.write_str("# TYPE rgw_health stateset\n")?;
                 for name in ["running", "port-silent", "no-controller", "idle"] {
                     writeln!(out, "rgw_health{{rgw_health=\"{name}\"}} {}", u8::from(name == health))?;
@@ -82,12 +83,16 @@ impl Families {
                         )?;
                     }
                 }
-                Step::Rejected
+                out.write_str("# TYPE rgw_port_rejected counter\n")?;
+                Step::Rejected(0)
             }
-            Step::Rejected => {
-                rejected(status, out)?;
-                Step::PortCounter(0)
-            }
+            Step::Rejected(nth) => match status.ports().nth(nth) {
+                Some(port) => {
+                    rejected(&port, out)?;
+                    Step::Rejected(nth.saturating_add(1))
+                }
+                None => Step::PortCounter(0),
+            },
             Step::PortCounter(nth) => {
                 let ports = status.ports().map(|port| (port.name, port.counters));
                 match counter(out, "port", nth, ports)? {
@@ -152,23 +157,22 @@ impl Families {
     }
 }
 
-/// All counters of rejections as one family.
-fn rejected(status: Status<'_>, out: &mut impl Write) -> fmt::Result {
-    out.write_str("# TYPE rgw_port_rejected counter\n")?;
-    for port in status.ports() {
-        let mut written = Ok(());
-        fields::each(port.counters, |name, value| {
-            if let Some(reason) = name.strip_prefix(REJECTED)
-                && written.is_ok()
-            {
-                let port = Label(port.name);
-                written =
-                    writeln!(out, "rgw_port_rejected_total{{port=\"{port}\",reason=\"{reason}\"}} {value}");
-            }
-        });
-        written?;
-    }
-    Ok(())
+/// The counters of a port's rejections, which are of one family.
+fn rejected(port: &PortStatus<'_>, out: &mut impl Write) -> fmt::Result {
+    let mut written = Ok(());
+    fields::each(port.counters, |name, value| {
+        if let Some(reason) = name.strip_prefix(REJECTED)
+            && written.is_ok()
+        {
+            let port = Label(port.name);
+            written = writeln!(
+                out,
+                "rgw_port_rejected_total{{port=\"{port}\",reason=\"{reason}\"}} {}",
+                Whole(value)
+            );
+        }
+    });
+    written
 }
 
 /// The family of the `nth` field that is a count; `false` if there is no such field.
@@ -192,7 +196,8 @@ fn counter<'a, C: Serialize + 'a>(
                     written = writeln!(out, "# TYPE rgw_{of}_{name} counter");
                 }
                 if written.is_ok() {
-                    written = writeln!(out, "rgw_{of}_{name}_total{{{of}=\"{}\"}} {value}", Label(label));
+                    let (label, value) = (Label(label), Whole(value));
+                    written = writeln!(out, "rgw_{of}_{name}_total{{{of}=\"{label}\"}} {value}");
                 }
             }
             at = at.saturating_add(1);
@@ -217,9 +222,10 @@ fn write_histogram(out: &mut impl Write, name: &str, histogram: &Histogram) -> f
             )?,
             false => out.write_str("+Inf")?,
         }
-        writeln!(out, "\"}} {count}")?;
+        writeln!(out, "\"}} {}", Whole(count))?;
     }
-    writeln!(out, "rgw_{name}_seconds_count {count}\nrgw_{name}_seconds_sum {}", Seconds(histogram.sum()))
+    let (count, sum) = (Whole(count), Seconds(histogram.sum()));
+    writeln!(out, "rgw_{name}_seconds_count {count}\nrgw_{name}_seconds_sum {sum}")
 }
 
 const REJECTED: &str = "rejected_";
@@ -230,7 +236,7 @@ struct Seconds(Duration);
 impl fmt::Display for Seconds {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let micros = self.0.as_micros();
-        write!(f, "{}.{:06}", micros / 1_000_000, micros % 1_000_000)
+        write!(f, "{}.{:06}", Whole(micros / 1_000_000), (micros % 1_000_000) as u32)
     }
 }
 

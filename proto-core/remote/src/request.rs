@@ -262,6 +262,20 @@ impl<'a> Head<'a> {
         None
     }
 
+    /// Whether each item of the query is one of these arguments with its value, and none comes twice.
+    pub fn has_only(&self, arguments: &[&str]) -> bool {
+        let Some((_, mut rest)) = cut(self.target, b'?') else { return true };
+        while !rest.is_empty() {
+            let (item, behind) = cut(rest, b'&').unwrap_or((rest, ""));
+            let Some((name, _)) = cut(item, b'=') else { return false };
+            if !arguments.contains(&name) || has_item(behind, name) {
+                return false;
+            }
+            rest = behind;
+        }
+        true
+    }
+
     /// `Host` without its port.
     pub fn host_name(&self) -> &'a str {
         // An IPv6 address has colons of its own, in brackets.
@@ -271,6 +285,18 @@ impl<'a> Head<'a> {
         };
         self.host.get(..end).unwrap_or(self.host)
     }
+}
+
+/// Whether a query has an argument of this name.
+fn has_item(mut query: &str, name: &str) -> bool {
+    while !query.is_empty() {
+        let (item, behind) = cut(query, b'&').unwrap_or((query, ""));
+        if cut(item, b'=').is_some_and(|(other, _)| other == name) {
+            return true;
+        }
+        query = behind;
+    }
+    false
 }
 
 /// The lines of a head: each ends with CR LF and has no other control character than tabs.

@@ -1,8 +1,12 @@
 //! The head of a response, and the frames of a body whose length is not known before its end.
 //!
-//! Every response ends its connection, forbids caching, framing by other pages and guesses at its type.
+//! Every response ends its connection, forbids framing by other pages and guesses at its type, and, but for the page
+//! for people, to be kept.
 
 use core::fmt::{self, Write};
+
+use crate::number::Whole;
+use crate::request::{cut, trim};
 
 /// A status code.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -53,6 +57,8 @@ impl Status {
     pub const HEAD_TOO_LARGE: Self = Self(431);
     /// 500: it could not be done, such as for a full disk.
     pub const INTERNAL: Self = Self(500);
+    /// 501: this server cannot do that.
+    pub const NOT_IMPLEMENTED: Self = Self(501);
     /// 503: no room for another connection or stream, or nothing runs at the moment.
     pub const UNAVAILABLE: Self = Self(503);
     /// 505: another version than HTTP/1.1.
@@ -82,6 +88,7 @@ impl Status {
             428 => "Precondition Required",
             429 => "Too Many Requests",
             431 => "Request Header Fields Too Large",
+            501 => "Not Implemented",
             503 => "Service Unavailable",
             505 => "HTTP Version Not Supported",
             _ => "Internal Server Error",
@@ -99,10 +106,16 @@ pub enum Kind {
     Toml,
     /// OpenMetrics.
     Metrics,
+    /// Text for people and tools.
+    Text,
     /// Server-sent events.
     Events,
+    /// A capture.
+    Capture,
     /// The console.
     Page,
+    /// A configuration image.
+    Image,
 }
 
 impl Kind {
@@ -112,8 +125,11 @@ impl Kind {
             Self::Json => "application/json",
             Self::Toml => "application/toml",
             Self::Metrics => "application/openmetrics-text; version=1.0.0; charset=utf-8",
+            Self::Text => "text/plain; charset=utf-8",
             Self::Events => "text/event-stream",
+            Self::Capture => "application/x-pcapng",
             Self::Page => "text/html; charset=utf-8",
+            Self::Image => "application/octet-stream",
         }
     }
 }
@@ -163,20 +179,67 @@ impl<'a> Response<'a> {
     /// Those of `out`, if it has no room.
     pub fn write(&self, out: &mut impl Write) -> fmt::Result {
         write!(out, "HTTP/1.1 {} {}\r\n", self.status.0, self.status.reason())?;
-        write!(out, "Content-Type: {}\r\n", self.kind.name())?;
-        match self.length {
-            Length::Bytes(len) => write!(out, "Content-Length: {len}\r\n")?,
-            Length::Chunked => out.write_str("Transfer-Encoding: chunked\r\n")?,
-            Length::Endless => {}
+        // What the client has already is not described again: its length is not that of this answer.
+        if self.status != Status::NOT_MODIFIED {
+            write!(out, "Content-Type: {}\r\n", self.kind.name())?;
+            match self.length {
+                Length::Bytes(len) => write!(out, "Content-Length: {}\r\n", Whole(len))?,
+                Length::Chunked => out.write_str("Transfer-Encoding: chunked\r\n")?,
+                Length::Endless => {}
+            }
         }
         write!(out, "Content-Security-Policy: {}\r\n", self.policy)?;
         for (name, value) in self.fields {
             write!(out, "{name}: {value}\r\n")?;
         }
+        let keep = if self.kind == Kind::Page { "no-cache" } else { "no-store" };
+        write!(out, "Cache-Control: {keep}\r\n")?;
         out.write_str(
-            "Cache-Control: no-store\r\nX-Content-Type-Options: nosniff\r\nReferrer-Policy: no-referrer\r\n\
+            "X-Content-Type-Options: nosniff\r\nReferrer-Policy: no-referrer\r\n\
              Cross-Origin-Resource-Policy: same-origin\r\nConnection: close\r\n\r\n",
         )
+    }
+}
+
+/// The page for people, a part of the program. A browser keeps it, and asks each time whether it is still the same.
+#[derive(Debug, Clone, Copy)]
+pub struct Page {
+    /// Compressed with gzip.
+    pub bytes: &'static [u8],
+    /// Its `Content-Security-Policy`.
+    pub policy: &'static str,
+    /// Its `ETag`, with the quotes.
+    pub etag: &'static str,
+}
+
+impl Page {
+    /// [`Status::OK`], or [`Status::NOT_MODIFIED`] if `If-None-Match` shows that the client has it: then nothing
+    /// follows the head.
+    pub fn status(&self, if_none_match: Option<&str>) -> Status {
+        let mut rest = if_none_match.unwrap_or("");
+        while !rest.is_empty() {
+            let (tag, behind) = cut(rest, b',').unwrap_or((rest, ""));
+            let tag = trim(tag);
+            if tag.strip_prefix("W/").unwrap_or(tag) == self.etag {
+                return Status::NOT_MODIFIED;
+            }
+            rest = behind;
+        }
+        Status::OK
+    }
+
+    /// Writes the head of an answer with this status.
+    ///
+    /// # Errors
+    /// Those of `out`, if it has no room.
+    pub fn write_head(&self, status: Status, out: &mut impl Write) -> fmt::Result {
+        let fields: [(&str, &dyn fmt::Display); 2] = [("ETag", &self.etag), ("Content-Encoding", &"gzip")];
+        // Of a page that the client has, only which one it is.
+        let fields = if status == Status::NOT_MODIFIED { fields.get(..1) } else { fields.get(..) };
+        Response::new(status, Kind::Page, Length::Bytes(self.bytes.len() as u64))
+            .with_policy(self.policy)
+            .with(fields.unwrap_or(&[]))
+            .write(out)
     }
 }
 
@@ -227,6 +290,39 @@ mod tests {
             assert!(head.contains(field), "{field}");
         }
         assert!(!head.contains("Access-Control"));
+    }
+
+    #[test]
+    fn a_page_that_a_browser_has_is_not_sent_again() {
+        let page = Page { bytes: b"packed", policy: "default-src 'self'", etag: "\"1234abcd\"" };
+        for (shown, status) in [
+            (None, 200),
+            (Some("\"1234abcd\""), 304),
+            (Some("W/\"1234abcd\""), 304),
+            (Some("\"0\",  \"1234abcd\" "), 304),
+            (Some("\"1234abce\""), 200),
+            (Some("1234abcd"), 200),
+            (Some(",,"), 200),
+            (Some(""), 200),
+        ] {
+            assert_eq!(page.status(shown), Status(status), "{shown:?}");
+        }
+        let mut head = String::new();
+        page.write_head(Status::OK, &mut head).unwrap();
+        for field in [
+            "Content-Type: text/html; charset=utf-8",
+            "Content-Length: 6",
+            "Content-Encoding: gzip",
+            "ETag: \"1234abcd\"",
+            "Content-Security-Policy: default-src 'self'\r\n",
+            "Cache-Control: no-cache",
+        ] {
+            assert!(head.contains(field), "{field}: {head}");
+        }
+        head.clear();
+        page.write_head(Status::NOT_MODIFIED, &mut head).unwrap();
+        assert!(head.starts_with("HTTP/1.1 304 ") && head.contains("ETag: \"1234abcd\""), "{head}");
+        assert!(!head.contains("Content-Length") && !head.contains("Content-Encoding"), "{head}");
     }
 
     #[test]

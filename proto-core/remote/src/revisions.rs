@@ -189,6 +189,28 @@ impl Revisions {
         })
     }
 
+    /// Continues a trial that a restart of the whole program has begun: `number` runs, until then. `false` if it
+    /// is not kept, or live.
+    pub fn resume_trial(&mut self, number: u32, until: Instant) -> bool {
+        let is_other = number != self.live && self.revision(number).is_some();
+        if is_other {
+            self.enter(Phase::Trial { number, until });
+        }
+        is_other
+    }
+
+    /// The newest trial that ended before a restart of the whole program, and how.
+    pub fn resume_last(&mut self, last: Option<(u32, Ended)>) {
+        self.last = last;
+    }
+
+    /// Drops the revisions that are kept no longer; the live one and the one before it stay.
+    pub fn keep_only(&mut self, is_kept: impl Fn(u32) -> bool) {
+        let needed = [Some(self.live), self.previous];
+        self.kept.retain(|kept| needed.contains(&Some(kept.number)) || is_kept(kept.number));
+        self.waiting = self.waiting.filter(|number| is_kept(*number));
+    }
+
     /// All that are kept, the oldest first.
     pub fn kept(&self) -> &[Revision] {
         &self.kept

@@ -6,6 +6,8 @@ use crate::request::{Head, Method, cut, trim};
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Operation {
+    /// The page for people.
+    Page,
     /// Who and what this is.
     Info,
     /// State and counters.
@@ -20,6 +22,22 @@ pub enum Operation {
     Revisions,
     /// Server-sent events.
     Stream,
+    /// Frames as a capture (pcapng) that goes on.
+    Capture,
+    /// The JSON Schema of configurations.
+    Schema,
+    /// The CAN database of what runs.
+    ExportDbc,
+    /// The dissector for Wireshark of what runs.
+    ExportLua,
+    /// The table of variables of what runs.
+    ExportMap,
+    /// What is wrong, in words.
+    Doctor,
+    /// The newest lines of the log.
+    Log,
+    /// Everything that can be read, in one document.
+    Bundle,
     /// A nonce for one signed request.
     Nonce,
     /// Check a configuration without storing it.
@@ -32,17 +50,54 @@ pub enum Operation {
     Confirm,
     /// Return to the configuration before.
     Rollback,
+    /// Show which one this is, among several.
+    Identify,
     /// An operation of the simulated controller's pendant.
     Pendant,
+    /// Take this key, after a press of the button.
+    Claim,
+    /// The firmware that runs, the one that is being received, and a trial.
+    Update,
+    /// Take a piece of a firmware.
+    PutUpdate,
+    /// Run the firmware that was received, and return to the one before unless it is confirmed.
+    TryUpdate,
+    /// Keep the firmware that is on trial.
+    ConfirmUpdate,
+    /// Return to the firmware before.
+    EndUpdate,
+}
+
+impl Operation {
+    /// Whether its answer goes on until the client leaves.
+    pub const fn is_endless(self) -> bool {
+        matches!(self, Self::Stream | Self::Capture)
+    }
+
+    /// The arguments that its query may have.
+    pub const fn arguments(self) -> &'static [&'static str] {
+        match self {
+            Self::Config => &["revision"],
+            Self::Stream => &["frames", "port"],
+            Self::Capture | Self::ExportDbc => &["port"],
+            Self::Log => &["lines"],
+            Self::Check => &["image"],
+            Self::PutUpdate => &["offset", "downgrade"],
+            Self::TryUpdate => &["downgrade"],
+            _ => &[],
+        }
+    }
 }
 
 /// What a program serves.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Served {
-    /// The gateway, on a host or a board.
+    /// The gateway on a host.
     Gateway,
     /// The simulated controller.
     Controller,
+    /// The gateway on a board.
+    Board,
 }
 
 /// What a request needs before it is carried out.
@@ -65,6 +120,8 @@ pub enum BodyType {
     Toml,
     /// `application/json`; a request without a body needs no type.
     Json,
+    /// `application/octet-stream`: a configuration image, or a piece of a firmware.
+    Image,
 }
 
 impl BodyType {
@@ -74,6 +131,7 @@ impl BodyType {
             Self::None => "",
             Self::Toml => "application/toml",
             Self::Json => "application/json",
+            Self::Image => "application/octet-stream",
         }
     }
 
@@ -90,7 +148,7 @@ impl BodyType {
 pub struct Route {
     /// The path.
     pub path: &'static str,
-    /// The method; [`Method::Get`] stands for `HEAD` too, but for the stream.
+    /// The method; [`Method::Get`] stands for `HEAD` too, but for answers that go on.
     pub method: Method,
     /// What is done.
     pub operation: Operation,
@@ -98,30 +156,59 @@ pub struct Route {
     pub access: Access,
     /// What its body is.
     pub body: BodyType,
-    /// Only this program serves it; `None`: all do.
-    pub only: Option<Served>,
+    /// Who serves it.
+    pub served: &'static [Served],
 }
 
 /// All endpoints.
 pub const ROUTES: &[Route] = &[
-    route("/api/v1/info", Method::Get, Operation::Info, Access::Read, BodyType::None, None),
-    route("/api/v1/status", Method::Get, Operation::Status, Access::Read, BodyType::None, None),
-    route("/api/v1/values", Method::Get, Operation::Values, Access::Read, BodyType::None, GATEWAY),
-    route("/api/v1/metrics", Method::Get, Operation::Metrics, Access::Read, BodyType::None, GATEWAY),
-    route("/api/v1/config", Method::Get, Operation::Config, Access::Read, BodyType::None, GATEWAY),
+    route("/", Method::Get, Operation::Page, Access::Open, BodyType::None, ALL),
+    route("/api/v1/info", Method::Get, Operation::Info, Access::Read, BodyType::None, ALL),
+    route("/api/v1/status", Method::Get, Operation::Status, Access::Read, BodyType::None, ALL),
+    route("/api/v1/values", Method::Get, Operation::Values, Access::Read, BodyType::None, GATEWAYS),
+    route("/api/v1/metrics", Method::Get, Operation::Metrics, Access::Read, BodyType::None, GATEWAYS),
+    route("/api/v1/config", Method::Get, Operation::Config, Access::Read, BodyType::None, GATEWAYS),
     route("/api/v1/config", Method::Put, Operation::PutConfig, Access::Write, BodyType::Toml, GATEWAY),
-    route("/api/v1/revisions", Method::Get, Operation::Revisions, Access::Read, BodyType::None, GATEWAY),
-    route("/api/v1/stream", Method::Get, Operation::Stream, Access::Read, BodyType::None, None),
-    route("/api/v1/nonce", Method::Get, Operation::Nonce, Access::Open, BodyType::None, None),
-    route("/api/v1/check", Method::Post, Operation::Check, Access::Read, BodyType::Toml, None),
-    route("/api/v1/apply", Method::Post, Operation::Apply, Access::Write, BodyType::Json, GATEWAY),
-    route("/api/v1/confirm", Method::Post, Operation::Confirm, Access::Write, BodyType::Json, GATEWAY),
-    route("/api/v1/rollback", Method::Post, Operation::Rollback, Access::Write, BodyType::Json, GATEWAY),
+    route("/api/v1/config", Method::Put, Operation::PutConfig, Access::Write, BodyType::Image, BOARD),
+    route("/api/v1/revisions", Method::Get, Operation::Revisions, Access::Read, BodyType::None, GATEWAYS),
+    route("/api/v1/stream", Method::Get, Operation::Stream, Access::Read, BodyType::None, ALL),
+    route("/api/v1/capture.pcapng", Method::Get, Operation::Capture, Access::Read, BodyType::None, GATEWAY),
+    route("/api/v1/schema", Method::Get, Operation::Schema, Access::Read, BodyType::None, GATEWAY),
+    route("/api/v1/export/dbc", Method::Get, Operation::ExportDbc, Access::Read, BodyType::None, GATEWAY),
+    route("/api/v1/export/lua", Method::Get, Operation::ExportLua, Access::Read, BodyType::None, GATEWAY),
+    route("/api/v1/export/md", Method::Get, Operation::ExportMap, Access::Read, BodyType::None, GATEWAY),
+    route("/api/v1/doctor", Method::Get, Operation::Doctor, Access::Read, BodyType::None, GATEWAY),
+    route("/api/v1/log", Method::Get, Operation::Log, Access::Read, BodyType::None, ALL),
+    route("/api/v1/bundle", Method::Get, Operation::Bundle, Access::Read, BodyType::None, HOSTS),
+    route("/api/v1/nonce", Method::Get, Operation::Nonce, Access::Open, BodyType::None, ALL),
+    route("/api/v1/check", Method::Post, Operation::Check, Access::Read, BodyType::Toml, HOSTS),
+    route("/api/v1/apply", Method::Post, Operation::Apply, Access::Write, BodyType::Json, GATEWAYS),
+    route("/api/v1/confirm", Method::Post, Operation::Confirm, Access::Write, BodyType::Json, GATEWAYS),
+    route("/api/v1/rollback", Method::Post, Operation::Rollback, Access::Write, BodyType::Json, GATEWAYS),
+    route("/api/v1/identify", Method::Post, Operation::Identify, Access::Write, BodyType::Json, GATEWAYS),
     route("/api/v1/pendant", Method::Post, Operation::Pendant, Access::Write, BodyType::Json, CONTROLLER),
+    route("/api/v1/update", Method::Get, Operation::Update, Access::Read, BodyType::None, GATEWAYS),
+    route("/api/v1/update", Method::Put, Operation::PutUpdate, Access::Write, BodyType::Image, GATEWAYS),
+    route("/api/v1/update/try", Method::Post, Operation::TryUpdate, Access::Write, BodyType::Json, GATEWAYS),
+    route(
+        "/api/v1/update/confirm",
+        Method::Post,
+        Operation::ConfirmUpdate,
+        Access::Write,
+        BodyType::Json,
+        GATEWAYS,
+    ),
+    route("/api/v1/update/back", Method::Post, Operation::EndUpdate, Access::Write, BodyType::Json, GATEWAYS),
+    // There is no key to be shown yet; the button stands for it.
+    route("/api/v1/claim", Method::Post, Operation::Claim, Access::Open, BodyType::Json, BOARD),
 ];
 
-const GATEWAY: Option<Served> = Some(Served::Gateway);
-const CONTROLLER: Option<Served> = Some(Served::Controller);
+const ALL: &[Served] = &[Served::Gateway, Served::Controller, Served::Board];
+const HOSTS: &[Served] = &[Served::Gateway, Served::Controller];
+const GATEWAYS: &[Served] = &[Served::Gateway, Served::Board];
+const GATEWAY: &[Served] = &[Served::Gateway];
+const CONTROLLER: &[Served] = &[Served::Controller];
+const BOARD: &[Served] = &[Served::Board];
 
 const fn route(
     path: &'static str,
@@ -129,9 +216,9 @@ const fn route(
     operation: Operation,
     access: Access,
     body: BodyType,
-    only: Option<Served>,
+    served: &'static [Served],
 ) -> Route {
-    Route { path, method, operation, access, body, only }
+    Route { path, method, operation, access, body, served }
 }
 
 /// Why there is no route.
@@ -149,16 +236,14 @@ pub enum RouteError {
 /// If there is none.
 pub fn find(head: &Head<'_>, served: Served) -> Result<&'static Route, RouteError> {
     let path = head.path();
-    let here = || {
-        ROUTES.iter().filter(move |route| route.path == path && route.only.is_none_or(|only| only == served))
-    };
+    let here = || ROUTES.iter().filter(move |route| route.path == path && route.served.contains(&served));
     if let Some(route) = here().find(|route| route.takes(head.method)) {
         return Ok(route);
     }
     let (mut gets, mut changes) = (None, None);
     for route in here() {
         match route.method {
-            Method::Get => gets = Some(route.operation == Operation::Stream),
+            Method::Get => gets = Some(route.operation.is_endless()),
             other => changes = Some(other),
         }
     }
@@ -175,7 +260,7 @@ impl Route {
     /// Whether a request with this method is for it.
     pub fn takes(&self, method: Method) -> bool {
         self.method == method
-            || method == Method::Head && self.method == Method::Get && self.operation != Operation::Stream
+            || method == Method::Head && self.method == Method::Get && !self.operation.is_endless()
     }
 }
 
@@ -195,8 +280,8 @@ mod tests {
 
     #[test]
     fn every_route_is_found_and_its_other_methods_name_it() {
-        for served in [Served::Gateway, Served::Controller] {
-            for route in ROUTES.iter().filter(|route| route.only.is_none_or(|only| only == served)) {
+        for &served in ALL {
+            for route in ROUTES.iter().filter(|route| route.served.contains(&served)) {
                 assert_eq!(found(route.method.name(), route.path, served), Ok(route.operation));
                 assert_eq!(
                     found(route.method.name(), &format!("{}?x=1", route.path), served),
@@ -227,12 +312,16 @@ mod tests {
             assert_eq!(found("GET", path, Served::Gateway), Err(RouteError::NotFound), "{path}");
         }
         assert_eq!(found("PUT", "/api/v1/config", Served::Controller), Err(RouteError::NotFound));
+        assert_eq!(found("POST", "/api/v1/check", Served::Board), Err(RouteError::NotFound));
+        assert_eq!(found("POST", "/api/v1/claim", Served::Gateway), Err(RouteError::NotFound));
     }
 
     #[test]
     fn whatever_changes_something_is_no_get_and_needs_the_key() {
         for route in ROUTES {
             let reads = route.method == Method::Get || route.operation == Operation::Check;
+            // Without a key there is none to be shown.
+            let reads = reads || route.operation == Operation::Claim;
             assert_eq!(route.access == Access::Write, !reads, "{}", route.path);
             assert_eq!(route.body == BodyType::None, route.method == Method::Get, "{}", route.path);
         }

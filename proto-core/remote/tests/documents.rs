@@ -1,8 +1,8 @@
 //! The documents of a gateway, compared with what serde makes of the same status.
 
-use proto_core::config::{GatewayConfig, Port, Recipe};
+use proto_core::config::{Ask, GatewayConfig, InputField, Port, Recipe};
 use proto_core::engine::{Engine, Input, LinkId, OUTPUT_BUFFER, Output, PortId};
-use proto_core::time::Instant;
+use proto_core::time::{Duration, Instant};
 use recipe_remote::documents::{Document, Pieces};
 use recipe_remote::metrics::Families;
 use serde_json::Value;
@@ -83,6 +83,36 @@ fn a_piece_is_small_and_later_pieces_may_be_of_a_later_instant() {
         serde_json::from_str::<Value>(&text).unwrap_or_else(|error| panic!("{error}: {text}"));
         assert!(longest < 2_048, "a piece of {longest} bytes");
     }
+}
+
+/// A line with twenty slaves: each is a piece of its own.
+#[test]
+fn the_peers_of_a_port_are_pieces_too() {
+    let padding = [InputField::padding(2)];
+    let asks: Vec<_> = (1..=20)
+        .map(|slave| Ask::read_holding_registers(slave, 0, &padding).every(Duration::from_millis(1_000)))
+        .collect();
+    let config: GatewayConfig = GatewayConfig::builder()
+        .controller("127.0.0.1")
+        .recipe(Recipe::user("line").exchanges(&asks))
+        .port(Port::modbus_rtu("line", "line"))
+        .build()
+        .unwrap();
+    let engine = Box::new(<Engine>::new(&config).unwrap());
+    let (mut pieces, mut text, mut longest) = (Pieces::of(Document::Status), String::new(), 0);
+    loop {
+        let mut piece = String::new();
+        if !pieces.write_next(engine.status(at(2_000)), &mut piece).unwrap() {
+            break;
+        }
+        longest = longest.max(piece.len());
+        text += &piece;
+    }
+    let written: Value = serde_json::from_str(&text).unwrap_or_else(|error| panic!("{error}: {text}"));
+    let whole = serde_json::to_value(engine.status(at(2_000))).unwrap();
+    assert_eq!(written["ports"], whole["ports"]);
+    assert_eq!(written["ports"]["line"]["peers"].as_object().unwrap().len(), 20);
+    assert!(longest < 2_048, "a piece of {longest} bytes");
 }
 
 #[test]
