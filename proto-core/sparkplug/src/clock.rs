@@ -1,0 +1,47 @@
+//! UTC, once somebody has told it.
+
+use proto_core::time::Instant;
+
+/// Milliseconds of UTC for instants.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Clock {
+    known: Option<(Instant, u64)>,
+}
+
+impl Clock {
+    /// It is `utc_ms` at this instant. True if it was not known before.
+    pub(crate) fn set(&mut self, at: Instant, utc_ms: u64) -> bool {
+        self.known.replace((at, utc_ms)).is_none()
+    }
+
+    /// Whether UTC is known.
+    pub(crate) const fn is_known(&self) -> bool {
+        self.known.is_some()
+    }
+
+    /// The milliseconds since 1970 at an instant; while UTC is not known, since the instant 0.
+    pub(crate) fn at(&self, instant: Instant) -> u64 {
+        let ms = |from: Instant, to: Instant| to.saturating_since(from).as_millis();
+        match self.known {
+            None => ms(Instant::ZERO, instant),
+            Some((at, utc)) => utc.saturating_add(ms(at, instant)).saturating_sub(ms(instant, at)),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn instants_before_and_after_are_told() {
+        let mut clock = Clock::default();
+        let at = Instant::from_millis;
+        assert_eq!((clock.is_known(), clock.at(at(5_000))), (false, 5_000));
+        assert!(clock.set(at(5_000), 1_700_000_000_000));
+        assert_eq!(clock.at(at(7_000)), 1_700_000_002_000);
+        assert_eq!(clock.at(at(1_000)), 1_699_999_996_000);
+        assert!(!clock.set(at(6_000), 1_700_000_001_500));
+        assert_eq!(clock.at(at(6_000)), 1_700_000_001_500);
+    }
+}

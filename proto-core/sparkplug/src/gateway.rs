@@ -1,0 +1,434 @@
+//! What a gateway tells: a [`Catalog`] of its configuration, and samples of its [`Status`].
+//!
+//! In: a configuration, and a status for each sample. Out: metrics and values. The node has the gateway's own health,
+//! its links, the controller's states, and the controller's variables that field ports send or that are asked for.
+//! Each field port is a device, which is alive while the port works, with the variables that it writes.
+
+use heapless::{String, Vec};
+use proto_core::config::{ConfigView, MAX_PORTS};
+use proto_core::engine::{PortState, Status};
+use proto_core::link::LinkState;
+use proto_core::sysvar::{Direction, SysVar, VarRange};
+use proto_core::time::Duration;
+use proto_core::wire::scalar::{Scalar, ScalarType};
+
+use crate::catalog::{Catalog, MAX_NAME, Metric, Owner, Report};
+use crate::node::Counters;
+use crate::topic::MAX_ID;
+use crate::value::{DataType, Value};
+
+/// Most links of a gateway.
+const MAX_LINKS: usize = 16;
+
+/// A controller's value that is older than this is unknown.
+pub const MAX_AGE: Duration = Duration::from_secs(5);
+
+/// When changes are told, and what is told in addition.
+#[derive(Debug, Clone, Copy)]
+pub struct Rates<'c> {
+    /// The least time between two values of a variable or a state.
+    pub min_interval: Duration,
+    /// Same, for counters and the time since the start, which always change.
+    pub counter_interval: Duration,
+    /// The last one that has a variable counts for it.
+    pub rules: &'c [Rule],
+    /// Variables of the controller that are told though no port sends them.
+    pub values: &'c [VarRange],
+}
+
+/// How some variables are told.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Rule {
+    /// The variables.
+    pub vars: VarRange,
+    /// A number is told when it is further than this from the last one told.
+    pub dead_band: f64,
+    /// The least time between two; `None`: as for all.
+    pub min_interval: Option<Duration>,
+}
+
+/// What a gateway can tell.
+#[derive(Debug, Clone)]
+pub struct GatewayCatalog<'c, const METRICS: usize> {
+    rates: Rates<'c>,
+    version: &'static str,
+    ports: Vec<Port, MAX_PORTS>,
+    links: Vec<Name, MAX_LINKS>,
+    items: Vec<Item, METRICS>,
+    /// Where the items of the node and of each port begin, and where the last ones end.
+    starts: Vec<usize, { MAX_PORTS + 2 }>,
+}
+
+type Name = String<MAX_ID>;
+
+#[derive(Debug, Clone)]
+struct Port {
+    /// Its index in the configuration.
+    index: u8,
+    /// Its name, as a part of a topic.
+    device: Name,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Item {
+    Version,
+    Uptime,
+    Condition,
+    Sleeps,
+    Lost,
+    Refused,
+    /// Of a port, by its number among the devices.
+    Alive(u8),
+    /// Of a link, by its number.
+    Link(u8),
+    Mode,
+    Robot,
+    Program,
+    Safety,
+    State,
+    FramesIn,
+    FramesOut,
+    Rejected,
+    Timeouts,
+    Var(SysVar),
+    Bit(SysVar, u8),
+}
+
+/// There are more metrics than there is room for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct NoRoom;
+
+impl<'c, const METRICS: usize> GatewayCatalog<'c, METRICS> {
+    /// The catalog of a gateway that runs this configuration. `status` is of that gateway, at any time; `version`
+    /// is that of its program.
+    ///
+    /// # Errors
+    /// If there are more metrics than there is room for.
+    pub fn new(
+        config: ConfigView<'_>,
+        status: Status<'_>,
+        rates: Rates<'c>,
+        version: &'static str,
+    ) -> Result<Self, NoRoom> {
+        let mut catalog = Self {
+            rates,
+            version,
+            ports: Vec::new(),
+            links: Vec::new(),
+            items: Vec::new(),
+            starts: Vec::new(),
+        };
+        for (index, port, _) in config.field_ports() {
+            catalog.ports.push(Port { index, device: part_of_topic(&port.name) }).map_err(|_| NoRoom)?;
+        }
+        catalog.begin_owner()?;
+        for item in [Item::Version, Item::Uptime, Item::Condition, Item::Sleeps, Item::Lost, Item::Refused] {
+            catalog.add(item)?;
+        }
+        for nth in (0..).take(catalog.ports.len()) {
+            catalog.add(Item::Alive(nth))?;
+        }
+        for (nth, link) in (0..).zip(status.links()) {
+            catalog.links.push(part_of_topic(link.name)).map_err(|_| NoRoom)?;
+            catalog.add(Item::Link(nth))?;
+        }
+        for item in [Item::Mode, Item::Robot, Item::Program, Item::Safety] {
+            catalog.add(item)?;
+        }
+        for var in SysVar::all().filter(|var| var.direction() == Direction::Output) {
+            let is_sent = config.field_ports().any(|(_, _, recipe)| {
+                let mut fields = config.fields_of(recipe, Direction::Output);
+                fields.any(|(_, _, field)| field.variables().any(|used| used == var))
+            });
+            let is_asked = || rates.values.iter().any(|vars| vars.iter().any(|asked| asked == var));
+            if is_sent || is_asked() {
+                catalog.add(Item::Var(var))?;
+            }
+        }
+        for (_, port, recipe) in config.field_ports() {
+            catalog.begin_owner()?;
+            for item in [Item::State, Item::FramesIn, Item::FramesOut, Item::Rejected, Item::Timeouts] {
+                catalog.add(item)?;
+            }
+            for var in config.owned_by(port, recipe) {
+                catalog.add_once(Item::Var(var))?;
+            }
+            for bit in config.bits_written_by(recipe) {
+                catalog.add_once(Item::Bit(bit.var, bit.bit))?;
+            }
+        }
+        catalog.begin_owner()?;
+        Ok(catalog)
+    }
+
+    /// Puts all values of the gateway into `values`, by their places, and returns the ports that work: bit n is the
+    /// nth device. `uptime` and `node` are the program's.
+    pub fn sample(
+        &self,
+        status: Status<'_>,
+        uptime: Duration,
+        node: &Counters,
+        values: &mut [Option<Value>],
+    ) -> u32 {
+        let mut alive = 0_u32;
+        for (nth, port) in (0_u8..).zip(&self.ports) {
+            let is_alive =
+                status.ports().any(|status| status.id.0 == port.index && status.state == PortState::Working);
+            if is_alive {
+                alive |= 1_u32.checked_shl(nth.into()).unwrap_or(0);
+            }
+        }
+        for (owner, places) in self.owners() {
+            let port = match owner {
+                Owner::Node => None,
+                Owner::Device(nth) => self.ports.get(usize::from(nth)),
+            };
+            let port = port.and_then(|port| status.ports().find(|status| status.id.0 == port.index));
+            for place in places {
+                let (Some(&item), Some(value)) = (self.items.get(place), values.get_mut(place)) else {
+                    break;
+                };
+                *value = match item {
+                    Item::Version => Some(Value::Word(self.version)),
+                    Item::Uptime => Some(Value::UInt64(uptime.as_millis() / 1_000)),
+                    Item::Condition => Some(Value::Word(status.health().name())),
+                    Item::Sleeps => Some(Value::UInt32(status.sleeps())),
+                    Item::Lost => Some(Value::UInt64(node.lost)),
+                    Item::Refused => Some(Value::UInt32(node.refused)),
+                    Item::Alive(nth) => {
+                        Some(Value::Boolean(alive.checked_shr(nth.into()).unwrap_or(0) & 1 != 0))
+                    }
+                    Item::Link(nth) => status.links().nth(nth.into()).map(|link| {
+                        // Another link carries the traffic of a shared one.
+                        Value::Boolean(matches!(link.state, LinkState::Up { .. } | LinkState::Shared))
+                    }),
+                    Item::Mode | Item::Robot | Item::Program | Item::Safety => state_of(status, item),
+                    Item::State => port.map(|port| Value::Word(port.state.name())),
+                    Item::FramesIn => port.map(|port| Value::UInt32(port.counters.frames_in)),
+                    Item::FramesOut => port.map(|port| Value::UInt32(port.counters.frames_out)),
+                    Item::Rejected => port.map(|port| Value::UInt32(port.counters.rejected())),
+                    Item::Timeouts => port.map(|port| Value::UInt32(port.counters.timeouts)),
+                    // Set below, if they are known.
+                    Item::Var(_) | Item::Bit(..) => None,
+                };
+            }
+        }
+        for known in status.variables() {
+            let wanted = match known.bit {
+                None => Item::Var(known.var),
+                Some(bit) => Item::Bit(known.var, bit),
+            };
+            if known.var.direction() == Direction::Output && known.age > MAX_AGE {
+                continue;
+            }
+            let places = self.items.iter().zip(values.iter_mut()).filter(|(item, _)| **item == wanted);
+            for (_, value) in places {
+                *value = Some(match (known.value, known.bit) {
+                    (Scalar::Byte(byte), Some(_)) => Value::Boolean(byte != 0),
+                    (scalar, _) => value_of(scalar),
+                });
+            }
+        }
+        alive
+    }
+
+    /// The number of metrics, which is the length of a sample.
+    pub fn len(&self) -> usize {
+        self.items.len()
+    }
+
+    /// Never: there is always the node's health.
+    pub fn is_empty(&self) -> bool {
+        self.items.is_empty()
+    }
+
+    fn begin_owner(&mut self) -> Result<(), NoRoom> {
+        self.starts.push(self.items.len()).map_err(|_| NoRoom)
+    }
+
+    fn add(&mut self, item: Item) -> Result<(), NoRoom> {
+        self.items.push(item).map_err(|_| NoRoom)
+    }
+
+    /// Adds what the present owner does not have yet.
+    fn add_once(&mut self, item: Item) -> Result<(), NoRoom> {
+        let start = self.starts.last().copied().unwrap_or(0);
+        match self.items.iter().skip(start).any(|known| *known == item) {
+            true => Ok(()),
+            false => self.add(item),
+        }
+    }
+
+    fn owners(&self) -> impl Iterator<Item = (Owner, core::ops::Range<usize>)> {
+        let owners = core::iter::once(Owner::Node).chain((0..).map(Owner::Device));
+        let ranges = self.starts.iter().zip(self.starts.iter().skip(1));
+        owners.zip(ranges.map(|(start, end)| *start..*end))
+    }
+}
+
+impl<const METRICS: usize> Catalog for GatewayCatalog<'_, METRICS> {
+    fn devices(&self) -> usize {
+        self.ports.len()
+    }
+
+    fn device(&self, nth: usize) -> &str {
+        self.ports.get(nth).map_or("", |port| &port.device)
+    }
+
+    fn metrics(&self, owner: Owner) -> usize {
+        let range = self.owners().find(|(other, _)| *other == owner);
+        range.map_or(0, |(_, range)| range.len())
+    }
+
+    fn metric(&self, place: usize) -> Option<Metric<'_>> {
+        let item = *self.items.get(place)?;
+        let is_nodes = self.starts.get(1).is_some_and(|end| place < *end);
+        let plain = |name: &str, data_type, unit, description| Metric {
+            name: joined(&[name]),
+            data_type,
+            unit,
+            range: None,
+            description,
+        };
+        let text = |name, description| plain(name, DataType::String, "", description);
+        let count = |name, description| plain(name, DataType::UInt32, "", description);
+        Some(match item {
+            Item::Version => text("Node Info/Version", "version of the gateway's program"),
+            Item::Uptime => {
+                plain("Node Info/Uptime", DataType::UInt64, "s", "time since the program started")
+            }
+            Item::Condition => text("gateway/health", "the worst present condition"),
+            Item::Sleeps => count("gateway/sleeps", "times that the gateway itself did not run"),
+            Item::Lost => plain("gateway/values_lost", DataType::UInt64, "", "values that were never told"),
+            Item::Refused => count("gateway/commands_refused", "writes by commands, which are never obeyed"),
+            Item::Alive(nth) => Metric {
+                name: joined(&["port/", self.device(nth.into()), "/alive"]),
+                ..plain("", DataType::Boolean, "", "the field port works")
+            },
+            Item::Link(nth) => Metric {
+                name: joined(&["link/", self.links.get(usize::from(nth))?, "/up"]),
+                ..plain("", DataType::Boolean, "", "the link to the controller is up")
+            },
+            Item::Mode => text("controller/mode", "operation mode of the controller"),
+            Item::Robot => text("controller/robot", "robot state of the controller"),
+            Item::Program => text("controller/program", "program state of the controller"),
+            Item::Safety => text("controller/safety", "safety state of the controller"),
+            Item::State => text("state", "health of the field port"),
+            Item::FramesIn => count("frames/in", "frames accepted"),
+            Item::FramesOut => count("frames/out", "frames sent"),
+            Item::Rejected => {
+                count("frames/rejected", "frames rejected, without those for other nodes of a CAN bus")
+            }
+            Item::Timeouts => count("frames/timeouts", "times that a frame became overdue"),
+            Item::Var(var) => {
+                let folder = if is_nodes { "controller/" } else { "" };
+                let mut name = joined(&[folder, var.group(), "/"]);
+                push_number(&mut name, var.index());
+                let data_type = data_type_of(var.ty());
+                let is_float = matches!(data_type, DataType::Float | DataType::Double);
+                let range = Some(var.ty().range()).filter(|_| !is_float);
+                Metric { name, data_type, unit: unit_of(var), range, description: var.span().interface }
+            }
+            Item::Bit(var, bit) => {
+                let mut name = joined(&[var.group(), "/"]);
+                push_number(&mut name, var.index());
+                let _ = name.push('/');
+                push_number(&mut name, bit);
+                Metric { name, ..plain("", DataType::Boolean, "", var.span().interface) }
+            }
+        })
+    }
+
+    fn report(&self, place: usize) -> Report {
+        let usual = Report { dead_band: 0.0, min_interval: self.rates.min_interval };
+        let var = match self.items.get(place) {
+            Some(Item::Var(var)) => *var,
+            Some(Item::Uptime | Item::FramesIn | Item::FramesOut | Item::Rejected | Item::Timeouts) => {
+                return Report { min_interval: self.rates.counter_interval, ..usual };
+            }
+            _ => return usual,
+        };
+        let mut rules = self.rates.rules.iter().rev();
+        let rule = rules.find(|rule| rule.vars.iter().any(|known| known == var));
+        rule.map_or(usual, |rule| Report {
+            dead_band: rule.dead_band,
+            min_interval: rule.min_interval.unwrap_or(usual.min_interval),
+        })
+    }
+}
+
+/// The unit of a variable. A row of two units has three quantities of each, such as a pose.
+fn unit_of(var: SysVar) -> &'static str {
+    match var.unit().split_once(", ") {
+        None => var.unit(),
+        Some((first, _)) if var.index().saturating_sub(var.span().first) < 3 => first,
+        Some((_, second)) => second,
+    }
+}
+
+/// The type of a variable's values.
+const fn data_type_of(ty: ScalarType) -> DataType {
+    match ty {
+        ScalarType::Byte => DataType::UInt8,
+        ScalarType::Word => DataType::UInt16,
+        ScalarType::Dword => DataType::UInt32,
+        ScalarType::Char | ScalarType::Short | ScalarType::Int => DataType::Int64,
+        ScalarType::Float => DataType::Float,
+        ScalarType::Double => DataType::Double,
+    }
+}
+
+/// A value of a variable, of the type above.
+fn value_of(scalar: Scalar) -> Value {
+    match scalar {
+        Scalar::Byte(value) => Value::UInt8(value),
+        Scalar::Word(value) => Value::UInt16(value),
+        Scalar::Dword(value) => Value::UInt32(value),
+        Scalar::Char(value) => Value::Int64(value.into()),
+        Scalar::Short(value) => Value::Int64(value.into()),
+        Scalar::Int(value) => Value::Int64(value.into()),
+        Scalar::Float(value) => Value::Float(value),
+        Scalar::Double(value) => Value::Double(value),
+    }
+}
+
+fn state_of(status: Status<'_>, item: Item) -> Option<Value> {
+    let controller = status.controller().filter(|controller| controller.age <= MAX_AGE)?;
+    let states = controller.states;
+    Some(Value::Word(match item {
+        Item::Mode => states.mode.name(),
+        Item::Robot => states.robot.name(),
+        Item::Program => states.program.name(),
+        _ => states.safety.name(),
+    }))
+}
+
+/// A name with `_` for what topics give a meaning.
+fn part_of_topic(name: &str) -> Name {
+    let mut part = Name::new();
+    for character in name.chars() {
+        let is_reserved = matches!(character, '+' | '/' | '#') || character.is_control();
+        let _ = part.push(if is_reserved { '_' } else { character });
+    }
+    part
+}
+
+fn joined(parts: &[&str]) -> String<MAX_NAME> {
+    let mut name = String::new();
+    for part in parts {
+        let _ = name.push_str(part);
+    }
+    name
+}
+
+/// Appends a number in decimal.
+fn push_number(name: &mut String<MAX_NAME>, number: u8) {
+    let mut rest = number;
+    for power in [100_u8, 10, 1] {
+        let digit = rest.checked_div(power).unwrap_or(0);
+        rest = rest.checked_rem(power).unwrap_or(0);
+        if number >= power || power == 1 {
+            let _ = name.push(char::from(digit.saturating_add(b'0')));
+        }
+    }
+}

@@ -1,0 +1,244 @@
+//! MQTT 3.1.1, as far as an edge node needs it: what it sends, and what it may receive.
+//!
+//! In: what a packet is to hold, and bytes of the peer in any pieces. Out: packets. Subscriptions are at QoS 1 and
+//! publications at QoS 0, so nothing waits for an acknowledgement and QoS 2 is a mistake of the peer.
+
+use crate::bytes::Out;
+
+/// Writes a packet: `body` is called twice.
+pub(crate) fn packet(out: &mut Out<'_>, kind: u8, body: impl Fn(&mut Out<'_>)) {
+    header(out, kind, Out::count(&body));
+    body(out);
+}
+
+/// The beginning of a packet with so many bytes behind it.
+pub(crate) fn header(out: &mut Out<'_>, kind: u8, len: usize) {
+    out.byte(kind);
+    crate::protobuf::varint(out, len as u64);
+}
+
+/// Text or bytes with their length before them.
+pub(crate) fn text(out: &mut Out<'_>, bytes: &[u8]) {
+    // What is longer is refused where it comes from; here it would only be cut.
+    let len = u16::try_from(bytes.len()).unwrap_or(u16::MAX);
+    out.put(&len.to_be_bytes());
+    out.put(bytes.get(..usize::from(len)).unwrap_or_default());
+}
+
+/// Same, of a text that `write` writes; it is called twice.
+pub(crate) fn text_of(out: &mut Out<'_>, write: impl Fn(&mut Out<'_>)) {
+    let len = u16::try_from(Out::count(&write)).unwrap_or(u16::MAX);
+    out.put(&len.to_be_bytes());
+    write(out);
+}
+
+/// The longest body that a packet may have.
+pub(crate) const MAX_BODY: usize = 268_435_455;
+
+/// Kinds of packets, with their flags.
+pub(crate) const CONNECT: u8 = 0x10;
+pub(crate) const PUBLISH: u8 = 0x30;
+pub(crate) const PUBACK: u8 = 0x40;
+pub(crate) const SUBSCRIBE: u8 = 0x82;
+pub(crate) const PINGREQ: u8 = 0xC0;
+pub(crate) const DISCONNECT: u8 = 0xE0;
+
+/// A packet from the peer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Packet<'a> {
+    /// The answer to CONNECT; 0: accepted.
+    ConnAck {
+        /// The code.
+        code: u8,
+    },
+    /// A message.
+    Publish {
+        /// Its topic.
+        topic: &'a str,
+        /// What is in it.
+        payload: &'a [u8],
+        /// The number to acknowledge; `None` at QoS 0.
+        id: Option<u16>,
+    },
+    /// The answer to SUBSCRIBE.
+    SubAck {
+        /// Whether all subscriptions were accepted.
+        is_accepted: bool,
+    },
+    /// The answer to PINGREQ.
+    PingResp,
+}
+
+/// Bytes that an MQTT server may not send to this client.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum ProtocolError {
+    /// A packet with this first byte.
+    Unexpected {
+        /// The byte.
+        first: u8,
+    },
+    /// The length of a packet is not well-formed.
+    Length,
+    /// A packet whose content is too short, too long or no text where text must be.
+    Malformed {
+        /// Its first byte.
+        first: u8,
+    },
+}
+
+/// Received bytes. A publication that is longer than the room is skipped and counted.
+#[derive(Debug, Clone)]
+pub struct Inbox<const ROOM: usize> {
+    buf: [u8; ROOM],
+    len: usize,
+    /// Bytes of the packet that was returned last.
+    used: usize,
+    /// Bytes that are still to be skipped.
+    skip: usize,
+    skipped: u32,
+}
+
+impl<const ROOM: usize> Inbox<ROOM> {
+    /// Empty. `ROOM` is to be at least 16.
+    pub const fn new() -> Self {
+        Self { buf: [0; ROOM], len: 0, used: 0, skip: 0, skipped: 0 }
+    }
+
+    /// Forgets everything but the count of what was skipped.
+    pub fn clear(&mut self) {
+        (self.len, self.used, self.skip) = (0, 0, 0);
+    }
+
+    /// Number of publications that were too long.
+    pub const fn skipped(&self) -> u32 {
+        self.skipped
+    }
+
+    /// Takes as many of the bytes as there is room for, and returns how many. While [`Inbox::next_packet`] is called
+    /// until there is no packet left, there is always room.
+    pub fn push(&mut self, bytes: &[u8]) -> usize {
+        self.drop_used();
+        let skipped = self.skip.min(bytes.len());
+        self.skip = self.skip.saturating_sub(skipped);
+        let wanted = bytes.get(skipped..).unwrap_or_default();
+        let room = self.buf.get_mut(self.len..).unwrap_or_default();
+        let count = room.len().min(wanted.len());
+        for (to, from) in room.iter_mut().zip(wanted) {
+            *to = *from;
+        }
+        self.len = self.len.saturating_add(count);
+        skipped.saturating_add(count)
+    }
+
+    /// The next whole packet.
+    ///
+    /// # Errors
+    /// If the peer does not speak MQTT 3.1.1 as a server. The connection is of no use then.
+    pub fn next_packet(&mut self) -> Result<Option<Packet<'_>>, ProtocolError> {
+        self.drop_used();
+        let bytes = self.buf.get(..self.len).unwrap_or_default();
+        let Some((&first, rest)) = bytes.split_first() else { return Ok(None) };
+        check_first(first)?;
+        let Some((body_len, digits)) = remaining_length(rest)? else { return Ok(None) };
+        let total = body_len.saturating_add(digits).saturating_add(1);
+        if total > ROOM {
+            if first >> 4 != 3 {
+                return Err(ProtocolError::Malformed { first });
+            }
+            self.skipped = self.skipped.saturating_add(1);
+            self.skip = total.saturating_sub(self.len);
+            self.len = 0;
+            return Ok(None);
+        }
+        let start = digits.saturating_add(1);
+        if self.len < total {
+            return Ok(None);
+        }
+        self.used = total;
+        let body = self.buf.get(start..total).unwrap_or_default();
+        parse(first, body).ok_or(ProtocolError::Malformed { first }).map(Some)
+    }
+
+    fn drop_used(&mut self) {
+        let used = core::mem::take(&mut self.used).min(self.len);
+        if used == 0 {
+            return;
+        }
+        self.len = self.len.saturating_sub(used);
+        for to in 0..self.len {
+            let byte = self.buf.get(to.saturating_add(used)).copied().unwrap_or(0);
+            if let Some(place) = self.buf.get_mut(to) {
+                *place = byte;
+            }
+        }
+    }
+}
+
+impl<const ROOM: usize> Default for Inbox<ROOM> {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+fn check_first(first: u8) -> Result<(), ProtocolError> {
+    match first {
+        0x20 | 0x90 | 0xD0 => Ok(()),
+        // Any of retain and duplicate, at QoS 0 or 1.
+        0x30..=0x3F if first & 0b100 == 0 && first & 0b1010 != 0b1000 => Ok(()),
+        _ => Err(ProtocolError::Unexpected { first }),
+    }
+}
+
+/// The length, and the number of bytes that it takes; `None` if they are not all there.
+fn remaining_length(bytes: &[u8]) -> Result<Option<(usize, usize)>, ProtocolError> {
+    let mut len = 0_usize;
+    for (nth, shift) in [0_u32, 7, 14, 21].into_iter().enumerate() {
+        let Some(&byte) = bytes.get(nth) else { return Ok(None) };
+        len |= usize::from(byte & 0x7F).checked_shl(shift).unwrap_or(0);
+        if byte & 0x80 == 0 {
+            return Ok(Some((len, nth.saturating_add(1))));
+        }
+    }
+    Err(ProtocolError::Length)
+}
+
+fn parse(first: u8, body: &[u8]) -> Option<Packet<'_>> {
+    Some(match first {
+        0x20 => match *body {
+            [0 | 1, code] => Packet::ConnAck { code },
+            _ => return None,
+        },
+        0x90 => {
+            let (_, codes) = body.split_at_checked(2)?;
+            if codes.is_empty() || codes.iter().any(|code| !matches!(code, 0..=2 | 0x80)) {
+                return None;
+            }
+            Packet::SubAck { is_accepted: !codes.contains(&0x80) }
+        }
+        0xD0 if body.is_empty() => Packet::PingResp,
+        0x30..=0x3F => {
+            let (len, rest) = word(body)?;
+            let (topic, rest) = rest.split_at_checked(len.into())?;
+            let topic = core::str::from_utf8(topic).ok()?;
+            if topic.is_empty() || topic.contains(['+', '#', '\0']) {
+                return None;
+            }
+            let (id, payload) = match first & 0b10 {
+                0 => (None, rest),
+                _ => word(rest).filter(|(id, _)| *id != 0).map(|(id, rest)| (Some(id), rest))?,
+            };
+            Packet::Publish { topic, payload, id }
+        }
+        _ => return None,
+    })
+}
+
+fn word(bytes: &[u8]) -> Option<(u16, &[u8])> {
+    let (word, rest) = bytes.split_first_chunk()?;
+    Some((u16::from_be_bytes(*word), rest))
+}
+
+#[cfg(test)]
+#[path = "mqtt_tests.rs"]
+mod tests;

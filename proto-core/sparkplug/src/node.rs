@@ -1,0 +1,594 @@
+//! The edge node: sessions, births, data, deaths.
+//!
+//! In: [`Input`]s with the present. Out: [`Output`]s. A session is one connection: CONNECT with the death as its will,
+//! the subscription to commands, births of the node and of each device that is alive, then data by exception. What
+//! changes while there is no session is kept and told later, marked as historical.
+
+mod messages;
+mod poll;
+mod settings;
+
+use heapless::{Deque, Vec};
+use proto_core::time::{Duration, Instant};
+
+use crate::catalog::{Catalog, MAX_DEVICES, Owner};
+use crate::clock::Clock;
+use crate::history::{History, Past};
+use crate::mqtt::{Inbox, Packet, ProtocolError};
+use crate::payload::{self, Asked, HostState};
+use crate::topic::{self, Id, IdError};
+use crate::value::{DataType, Value};
+pub use messages::MAX_METRIC;
+pub use settings::{MAX_TEXT, Settings, Text};
+
+/// The least length of the buffer for [`EdgeNode::poll_output`]. A longer one gives fewer and longer pieces.
+pub const MIN_BUFFER: usize = 768;
+
+/// The longest packet that is received; longer publications are skipped.
+const MAX_PACKET: usize = 512;
+
+/// What happened.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Input<'a> {
+    /// The connection that was asked for is there.
+    Opened,
+    /// It could not be made, or is gone.
+    Closed,
+    /// Bytes of the server.
+    Bytes(&'a [u8]),
+    /// All values at this instant, by the places of the catalog; `None`: unknown. What is missing at the end is
+    /// unknown too.
+    Sample {
+        /// The values.
+        values: &'a [Option<Value>],
+        /// The devices that work: bit n is device n.
+        alive: u32,
+    },
+    /// UTC at this instant.
+    Time {
+        /// Milliseconds since 1970.
+        utc_ms: u64,
+    },
+    /// Die, close the connection and open none any more.
+    End,
+}
+
+/// What is to be done.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Output<'b> {
+    /// Open a connection to the server, and report [`Input::Opened`] or [`Input::Closed`].
+    Open,
+    /// Keep this number where it survives a restart, before the next output is asked for.
+    Keep {
+        /// The number, to be given to [`EdgeNode::new`] after a restart.
+        bd_seq: u8,
+    },
+    /// Send all these bytes before the next output is asked for.
+    Send(&'b [u8]),
+    /// Close the connection; it is not to be reported.
+    Close,
+    /// Nothing until then, or until the next input.
+    Sleep {
+        /// [`Instant::NEVER`] if there is nothing to wait for.
+        until: Instant,
+    },
+}
+
+/// Why a node cannot be made.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum NodeError {
+    /// More metrics than there is room for.
+    Metrics {
+        /// Their number.
+        count: usize,
+        /// The room.
+        room: usize,
+    },
+    /// More devices than [`MAX_DEVICES`].
+    Devices {
+        /// Their number.
+        count: usize,
+    },
+    /// The name of a device cannot be part of a topic.
+    Device {
+        /// The device.
+        nth: usize,
+        /// What is wrong with its name.
+        error: IdError,
+    },
+    /// Two devices have the same name.
+    SameDevice {
+        /// The second one.
+        nth: usize,
+    },
+    /// The catalog has no metric at a place.
+    Metric {
+        /// The place.
+        place: usize,
+    },
+}
+
+/// Why a session ended or did not begin.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Failure {
+    /// There was no connection, or it broke.
+    Closed,
+    /// The server did not answer in time.
+    Silent,
+    /// The server refused CONNECT, with this code of MQTT 3.1.1.
+    Refused {
+        /// 4: wrong user or password, 5: not authorised.
+        code: u8,
+    },
+    /// The server refused the subscription.
+    SubscriptionRefused,
+    /// The server does not speak MQTT 3.1.1.
+    Protocol(ProtocolError),
+    /// The primary host is offline.
+    HostOffline,
+    /// The catalog, or the driver's buffer, does not keep what is written of it.
+    Broken,
+}
+
+/// Counts since the node was made.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[non_exhaustive]
+pub struct Counters {
+    /// Connections that the server accepted.
+    pub sessions: u32,
+    /// Births of the node.
+    pub births: u32,
+    /// Those of them that were asked for.
+    pub rebirths: u32,
+    /// Messages of data.
+    pub data: u64,
+    /// Values that were told late, marked as historical.
+    pub historical: u64,
+    /// Values that were never told, because there was no room to keep them.
+    pub lost: u64,
+    /// Values that wait to be told.
+    pub kept: usize,
+    /// Commands that were not obeyed: metrics that nobody may write.
+    pub refused: u32,
+    /// Messages that nobody could read, or that were too long.
+    pub unreadable: u32,
+    /// Sessions and attempts that failed.
+    pub failures: u32,
+    /// Metrics left out of a birth because they are longer than [`MAX_METRIC`].
+    pub left_out: u32,
+}
+
+/// An edge node with room for so many metrics, and for so many values while nobody listens.
+#[derive(Debug, Clone)]
+pub struct EdgeNode<const METRICS: usize, const HISTORY: usize> {
+    settings: Settings,
+    slots: Vec<Slot, METRICS>,
+    /// Where the metrics of the node and of each device begin, and where the last ones end.
+    starts: Vec<u16, { MAX_DEVICES + 2 }>,
+    history: History<HISTORY>,
+    clock: Clock,
+    /// When the values were sampled.
+    sampled_at: Instant,
+    /// Devices that work, and those that were born in this session.
+    alive: u32,
+    born: u32,
+    device_births: [Option<Instant>; MAX_DEVICES],
+    phase: Phase,
+    inbox: Inbox<MAX_PACKET>,
+    /// Publications to acknowledge.
+    acks: Deque<u16, 8>,
+    seq: u8,
+    bd_seq: Option<u8>,
+    ping_at: Instant,
+    pong_until: Option<Instant>,
+    birth_at: Option<Instant>,
+    is_rebirth_wanted: bool,
+    host: Option<HostState>,
+    /// The connection is of no use.
+    must_close: bool,
+    is_ending: bool,
+    online_since: Option<Instant>,
+    attempts: u32,
+    random: u64,
+    failure: Option<Failure>,
+    counters: Counters,
+}
+
+/// One metric.
+#[derive(Debug, Clone, Copy)]
+struct Slot {
+    data_type: DataType,
+    /// To be told.
+    is_pending: bool,
+    current: Option<Value>,
+    /// The last one told, and when it was sampled.
+    told: Option<Value>,
+    told_at: Option<Instant>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Phase {
+    /// No connection until then.
+    Idle {
+        until: Instant,
+    },
+    Opening {
+        until: Instant,
+    },
+    /// The number of the session is to be kept, then CONNECT is to be sent.
+    Keep,
+    Connect,
+    Connecting {
+        until: Instant,
+    },
+    Subscribe,
+    Subscribing {
+        until: Instant,
+    },
+    /// The primary host is not there.
+    Waiting,
+    Birth(Birth),
+    Online,
+    /// The death of the node is to be sent, then DISCONNECT.
+    Death,
+    Disconnect,
+    Ended,
+}
+
+/// A birth on its way.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Birth {
+    owner: Owner,
+    stage: Stage,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Stage {
+    Head,
+    /// The metric at this place is next, and so many bytes are left.
+    Metrics {
+        next: usize,
+        left: usize,
+    },
+}
+
+impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
+    /// A node without a session. `bd_seq` is what [`Output::Keep`] gave before a restart; `seed` is another one
+    /// for each node, so that they do not all come back at the same time.
+    ///
+    /// # Errors
+    /// If the catalog has too much, or names that cannot be part of a topic.
+    pub fn new(
+        settings: Settings,
+        catalog: &impl Catalog,
+        bd_seq: Option<u8>,
+        seed: u64,
+    ) -> Result<Self, NodeError> {
+        let count = catalog.devices();
+        if count > MAX_DEVICES {
+            return Err(NodeError::Devices { count });
+        }
+        let (mut starts, mut slots) = (Vec::new(), Vec::new());
+        let mut end = 0_usize;
+        for owner in owners(count) {
+            let _ = starts.push(u16::try_from(end).unwrap_or(u16::MAX));
+            end = end.saturating_add(catalog.metrics(owner));
+        }
+        if end > METRICS || end >= usize::from(u16::MAX) {
+            return Err(NodeError::Metrics { count: end, room: METRICS });
+        }
+        let _ = starts.push(u16::try_from(end).unwrap_or(u16::MAX));
+        for nth in 0..count {
+            Id::new(catalog.device(nth)).map_err(|error| NodeError::Device { nth, error })?;
+            if (0..nth).any(|other| catalog.device(other) == catalog.device(nth)) {
+                return Err(NodeError::SameDevice { nth });
+            }
+        }
+        for place in 0..end {
+            let data_type = catalog.metric(place).ok_or(NodeError::Metric { place })?.data_type;
+            let slot = Slot { data_type, is_pending: false, current: None, told: None, told_at: None };
+            let _ = slots.push(slot);
+        }
+        Ok(Self {
+            settings,
+            slots,
+            starts,
+            history: History::new(),
+            clock: Clock::default(),
+            sampled_at: Instant::ZERO,
+            alive: 0,
+            born: 0,
+            device_births: [None; MAX_DEVICES],
+            phase: Phase::Idle { until: Instant::ZERO },
+            inbox: Inbox::new(),
+            acks: Deque::new(),
+            seq: 0,
+            bd_seq,
+            ping_at: Instant::NEVER,
+            pong_until: None,
+            birth_at: None,
+            is_rebirth_wanted: false,
+            host: None,
+            must_close: false,
+            is_ending: false,
+            online_since: None,
+            attempts: 0,
+            random: seed | 1,
+            failure: None,
+            counters: Counters::default(),
+        })
+    }
+
+    /// Takes one input. `now` never goes back; the catalog is always the same.
+    pub fn handle(&mut self, now: Instant, input: Input<'_>, catalog: &impl Catalog) {
+        match input {
+            Input::Opened => {
+                if let Phase::Opening { .. } = self.phase {
+                    self.bd_seq = Some(self.bd_seq.map_or(0, |last| last.wrapping_add(1)));
+                    self.inbox.clear();
+                    self.acks.clear();
+                    (self.host, self.pong_until, self.ping_at) = (None, None, Instant::NEVER);
+                    self.phase = Phase::Keep;
+                }
+            }
+            Input::Closed => {
+                if !matches!(self.phase, Phase::Idle { .. } | Phase::Ended) {
+                    self.note(Failure::Closed);
+                    self.leave_session(now);
+                }
+            }
+            Input::Bytes(bytes) => self.receive(now, bytes),
+            Input::Sample { values, alive } => self.sample(now, values, alive, catalog),
+            Input::Time { utc_ms } => {
+                let is_new = self.clock.set(now, utc_ms);
+                // What was told before has no date.
+                self.is_rebirth_wanted |= is_new && self.is_told();
+            }
+            Input::End => self.is_ending = true,
+        }
+    }
+
+    /// Counts since the node was made.
+    pub fn counters(&self) -> Counters {
+        Counters { lost: self.history.lost(), kept: self.history.len(), ..self.counters }
+    }
+
+    /// Why the last session or attempt failed; `None` while there is a session.
+    pub const fn failure(&self) -> Option<Failure> {
+        self.failure
+    }
+
+    /// Whether the node and its devices were born and data is told.
+    pub const fn is_online(&self) -> bool {
+        matches!(self.phase, Phase::Online)
+    }
+
+    /// Whether it has died as [`Input::End`] asked.
+    pub const fn has_ended(&self) -> bool {
+        matches!(self.phase, Phase::Ended)
+    }
+
+    /// The number of the newest session; `None` before the first.
+    pub const fn bd_seq(&self) -> Option<u8> {
+        self.bd_seq
+    }
+
+    /// Whether what changes is told and not kept.
+    const fn is_told(&self) -> bool {
+        matches!(self.phase, Phase::Birth(_) | Phase::Online)
+    }
+
+    fn sample(&mut self, now: Instant, values: &[Option<Value>], alive: u32, catalog: &impl Catalog) {
+        let is_told = self.is_told();
+        (self.sampled_at, self.alive) = (now, alive);
+        for (index, owner) in (0..).zip(owners(MAX_DEVICES)) {
+            let (Some(&start), Some(&end)) =
+                (self.starts.get(index), self.starts.get(index.saturating_add(1)))
+            else {
+                break;
+            };
+            let is_alive = match owner {
+                Owner::Node => true,
+                Owner::Device(nth) => has(alive, nth),
+            };
+            for place in start..end {
+                let Some(slot) = self.slots.get_mut(usize::from(place)) else { break };
+                let value = values.get(usize::from(place)).copied().flatten().and_then(Value::known);
+                slot.current = value.filter(|value| value.data_type() == slot.data_type);
+                let report = catalog.report(place.into());
+                let is_due = slot.told_at.is_none_or(|at| now.saturating_since(at) >= report.min_interval);
+                slot.is_pending = is_alive && is_due && slot.is_changed(report.dead_band);
+                if slot.is_pending && !is_told {
+                    // The first value is no change.
+                    let is_change = slot.told_at.is_some();
+                    slot.tell(now);
+                    if is_change {
+                        self.history.push(Past { place, value: slot.told, at: now });
+                    }
+                }
+            }
+        }
+    }
+
+    fn receive(&mut self, now: Instant, bytes: &[u8]) {
+        let mut rest = bytes;
+        while !rest.is_empty() && !self.must_close && self.is_connected() {
+            let taken = self.inbox.push(rest);
+            rest = rest.get(taken..).unwrap_or_default();
+            loop {
+                let skipped = self.inbox.skipped();
+                let packet = match self.inbox.next_packet() {
+                    Ok(Some(packet)) => packet,
+                    Ok(None) => {
+                        let skipped = self.inbox.skipped().saturating_sub(skipped);
+                        self.counters.unreadable = self.counters.unreadable.saturating_add(skipped);
+                        break;
+                    }
+                    Err(error) => return self.fail(Failure::Protocol(error)),
+                };
+                let event = match packet {
+                    Packet::ConnAck { code } => Event::Accepted(code),
+                    Packet::SubAck { is_accepted } => Event::Subscribed(is_accepted),
+                    Packet::PingResp => Event::Pong,
+                    Packet::Publish { topic, payload, id } => {
+                        if let Some(id) = id {
+                            // The session ends before the server would send it again.
+                            let _ = self.acks.push_back(id);
+                        }
+                        let Settings { group, node, primary_host, .. } = &self.settings;
+                        if topic::is_command(topic, group, node) {
+                            payload::command(payload).map_or(Event::Unreadable, Event::Command)
+                        } else if primary_host.as_ref().is_some_and(|host| topic::is_state(topic, host)) {
+                            payload::host_state(payload).map_or(Event::Unreadable, Event::Host)
+                        } else {
+                            Event::Unreadable
+                        }
+                    }
+                };
+                self.take(now, event);
+            }
+            if taken == 0 {
+                // There is always room for a whole packet.
+                return self.fail(Failure::Broken);
+            }
+        }
+    }
+
+    fn take(&mut self, now: Instant, event: Event) {
+        let counters = &mut self.counters;
+        match (event, self.phase) {
+            (Event::Accepted(0), Phase::Connecting { .. }) => {
+                counters.sessions = counters.sessions.saturating_add(1);
+                self.ping_at = now + self.settings.ping_interval();
+                self.phase = Phase::Subscribe;
+            }
+            (Event::Accepted(code @ 1..), Phase::Connecting { .. }) => self.fail(Failure::Refused { code }),
+            (Event::Subscribed(true), Phase::Subscribing { .. }) => {
+                self.phase = Phase::Waiting;
+                self.look_for_host();
+            }
+            (Event::Subscribed(false), Phase::Subscribing { .. }) => self.fail(Failure::SubscriptionRefused),
+            (Event::Pong, _) => self.pong_until = None,
+            (Event::Command(asked), _) => {
+                counters.refused = counters.refused.saturating_add(asked.others);
+                self.is_rebirth_wanted |= asked.is_rebirth && self.is_told();
+            }
+            (Event::Host(state), _) => {
+                // An older statement may come late.
+                if self.host.is_none_or(|known| state.timestamp >= known.timestamp) {
+                    self.host = Some(state);
+                    self.look_for_host();
+                }
+            }
+            (Event::Unreadable, _) => counters.unreadable = counters.unreadable.saturating_add(1),
+            // An answer to something that was not asked.
+            (Event::Accepted(_), _) => {
+                self.fail(Failure::Protocol(ProtocolError::Unexpected { first: 0x20 }))
+            }
+            (Event::Subscribed(_), _) => {
+                self.fail(Failure::Protocol(ProtocolError::Unexpected { first: 0x90 }));
+            }
+        }
+    }
+
+    /// Begins to tell when the primary host is there, if one is waited for.
+    fn look_for_host(&mut self) {
+        let is_there = match (&self.settings.primary_host, self.host) {
+            (None, _) => true,
+            (Some(_), host) => host.is_some_and(|host| host.is_online),
+        };
+        match self.phase {
+            Phase::Waiting if is_there => {
+                self.phase = Phase::Birth(Birth { owner: Owner::Node, stage: Stage::Head });
+            }
+            // A packet that was begun is finished first.
+            _ => {}
+        }
+    }
+
+    /// Whether the primary host says that it is not there.
+    fn is_host_gone(&self) -> bool {
+        self.host.is_some_and(|host| !host.is_online)
+    }
+
+    const fn is_connected(&self) -> bool {
+        !matches!(self.phase, Phase::Idle { .. } | Phase::Opening { .. } | Phase::Ended)
+    }
+
+    fn note(&mut self, failure: Failure) {
+        self.failure = Some(failure);
+        self.counters.failures = self.counters.failures.saturating_add(1);
+    }
+
+    fn fail(&mut self, failure: Failure) {
+        self.note(failure);
+        self.must_close = true;
+    }
+
+    /// The session is over.
+    fn leave_session(&mut self, now: Instant) {
+        let was_steady = self.online_since.take().is_some_and(|since| now.saturating_since(since) >= STEADY);
+        self.attempts = if was_steady { 1 } else { self.attempts.saturating_add(1) };
+        self.phase = match self.is_ending {
+            true => Phase::Ended,
+            false => Phase::Idle { until: now + self.pause() },
+        };
+        (self.born, self.is_rebirth_wanted, self.must_close) = (0, false, false);
+        for slot in &mut self.slots {
+            slot.is_pending = false;
+        }
+    }
+
+    /// The pause before the next attempt: longer each time, and random, so that many nodes do not come together.
+    fn pause(&mut self) -> Duration {
+        self.random ^= self.random << 13;
+        self.random ^= self.random >> 7;
+        self.random ^= self.random << 17;
+        let doublings = self.attempts.saturating_sub(1).min(5);
+        let most = FIRST_PAUSE.as_micros().checked_shl(doublings).unwrap_or(0);
+        let random = self.random.checked_rem(most.max(1)).unwrap_or(0);
+        Duration::from_micros((most >> 2).saturating_add(random.saturating_sub(random >> 2)))
+    }
+}
+
+impl Slot {
+    fn is_changed(&self, dead_band: f64) -> bool {
+        match (self.current, self.told) {
+            (Some(current), Some(told)) => current.differs(told, dead_band),
+            (current, told) => current.is_some() != told.is_some(),
+        }
+    }
+
+    /// Its value was told, of this instant.
+    fn tell(&mut self, at: Instant) {
+        (self.told, self.told_at, self.is_pending) = (self.current, Some(at), false);
+    }
+}
+
+/// What a packet says.
+enum Event {
+    Accepted(u8),
+    Subscribed(bool),
+    Pong,
+    Command(Asked),
+    Host(HostState),
+    Unreadable,
+}
+
+/// The node, then so many devices.
+fn owners(devices: usize) -> impl Iterator<Item = Owner> {
+    let devices = u8::try_from(devices).unwrap_or(u8::MAX);
+    core::iter::once(Owner::Node).chain((0..devices).map(Owner::Device))
+}
+
+/// Whether a device is in the set.
+fn has(set: u32, nth: u8) -> bool {
+    set.checked_shr(nth.into()).unwrap_or(0) & 1 != 0
+}
+
+/// How long a session must have lasted for the next attempt to come soon.
+const STEADY: Duration = Duration::from_secs(60);
+/// The longest pause before the first attempt.
+const FIRST_PAUSE: Duration = Duration::from_secs(2);

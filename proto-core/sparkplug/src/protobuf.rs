@@ -1,0 +1,193 @@
+//! The encoding of Protocol Buffers, as far as payloads of Sparkplug B need it.
+//!
+//! In: fields. Out: bytes; and the fields of received bytes, one after the other. The reader is strict: a field
+//! that is cut off or has an unknown form ends it.
+
+use crate::bytes::Out;
+
+/// Writes a number in groups of seven bits.
+pub(crate) fn varint(out: &mut Out<'_>, mut value: u64) {
+    while value > 0x7F {
+        // Only the lowest seven bits count.
+        out.byte((value & 0x7F) as u8 | 0x80);
+        value >>= 7;
+    }
+    out.byte((value & 0x7F) as u8);
+}
+
+fn key(out: &mut Out<'_>, field: u8, form: u8) {
+    varint(out, u64::from(field) << 3 | u64::from(form));
+}
+
+/// A field with a whole number.
+pub(crate) fn number(out: &mut Out<'_>, field: u8, value: u64) {
+    key(out, field, VARINT);
+    varint(out, value);
+}
+
+/// A field with a `float`.
+pub(crate) fn float(out: &mut Out<'_>, field: u8, value: f32) {
+    key(out, field, FIXED32);
+    out.put(&value.to_le_bytes());
+}
+
+/// A field with a `double`.
+pub(crate) fn double(out: &mut Out<'_>, field: u8, value: f64) {
+    key(out, field, FIXED64);
+    out.put(&value.to_le_bytes());
+}
+
+/// A field with text or bytes.
+pub(crate) fn bytes(out: &mut Out<'_>, field: u8, value: &[u8]) {
+    key(out, field, LENGTH);
+    varint(out, value.len() as u64);
+    out.put(value);
+}
+
+/// A field with a message of its own, which `write` writes; it is called twice.
+pub(crate) fn message(out: &mut Out<'_>, field: u8, write: impl Fn(&mut Out<'_>)) {
+    key(out, field, LENGTH);
+    varint(out, Out::count(&write) as u64);
+    write(out);
+}
+
+/// A value of a field.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Field<'a> {
+    /// A whole number.
+    Number(u64),
+    /// Four or eight bytes.
+    Fixed,
+    /// Text, bytes or a message.
+    Bytes(&'a [u8]),
+}
+
+/// Bytes that are no message.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Malformed;
+
+/// The fields of a message, with their numbers. Ends after the first mistake.
+#[derive(Debug, Clone)]
+pub(crate) struct Fields<'a> {
+    rest: &'a [u8],
+}
+
+impl<'a> Fields<'a> {
+    pub(crate) const fn of(message: &'a [u8]) -> Self {
+        Self { rest: message }
+    }
+
+    fn varint(&mut self) -> Result<u64, Malformed> {
+        let mut value = 0_u64;
+        for shift in (0..64).step_by(7) {
+            let (&byte, rest) = self.rest.split_first().ok_or(Malformed)?;
+            self.rest = rest;
+            let bits = u64::from(byte & 0x7F);
+            // The tenth byte has room for one bit.
+            if shift == 63 && bits > 1 {
+                return Err(Malformed);
+            }
+            value |= bits.checked_shl(shift).unwrap_or(0);
+            if byte & 0x80 == 0 {
+                return Ok(value);
+            }
+        }
+        Err(Malformed)
+    }
+
+    fn take(&mut self, len: usize) -> Result<&'a [u8], Malformed> {
+        let (taken, rest) = self.rest.split_at_checked(len).ok_or(Malformed)?;
+        self.rest = rest;
+        Ok(taken)
+    }
+
+    fn field(&mut self) -> Result<(u64, Field<'a>), Malformed> {
+        let key = self.varint()?;
+        let field = match (key & 7) as u8 {
+            VARINT => Field::Number(self.varint()?),
+            FIXED64 => self.take(8).map(|_| Field::Fixed)?,
+            FIXED32 => self.take(4).map(|_| Field::Fixed)?,
+            LENGTH => {
+                let len = usize::try_from(self.varint()?).map_err(|_| Malformed)?;
+                Field::Bytes(self.take(len)?)
+            }
+            _ => return Err(Malformed),
+        };
+        match key >> 3 {
+            0 => Err(Malformed),
+            number => Ok((number, field)),
+        }
+    }
+}
+
+impl<'a> Iterator for Fields<'a> {
+    type Item = Result<(u64, Field<'a>), Malformed>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        if self.rest.is_empty() {
+            return None;
+        }
+        let field = self.field();
+        if field.is_err() {
+            self.rest = &[];
+        }
+        Some(field)
+    }
+}
+
+/// The forms of a value.
+const VARINT: u8 = 0;
+const FIXED64: u8 = 1;
+const LENGTH: u8 = 2;
+const FIXED32: u8 = 5;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::vec::Vec;
+
+    fn written(write: impl Fn(&mut Out<'_>)) -> Vec<u8> {
+        let mut buf = [0xA5; 64];
+        let mut out = Out::new(&mut buf);
+        write(&mut out);
+        let bytes = out.finish().unwrap().to_vec();
+        assert_eq!(bytes.len(), Out::count(&write));
+        bytes
+    }
+
+    #[test]
+    fn fields_have_the_bytes_of_the_specification() {
+        assert_eq!(written(|out| number(out, 1, 150)), [0x08, 0x96, 0x01]);
+        assert_eq!(written(|out| bytes(out, 2, b"testing")), b"\x12\x07testing");
+        assert_eq!(written(|out| message(out, 3, |out| number(out, 1, 150))), [0x1A, 3, 0x08, 0x96, 0x01]);
+        assert_eq!(written(|out| float(out, 12, 1.0)), [0x65, 0, 0, 0x80, 0x3F]);
+        assert_eq!(written(|out| double(out, 13, 1.0)), [0x69, 0, 0, 0, 0, 0, 0, 0xF0, 0x3F]);
+        assert_eq!(written(|out| varint(out, u64::MAX)).len(), 10);
+    }
+
+    #[test]
+    fn what_is_written_is_read_and_mistakes_end_it() {
+        let message = written(|out| {
+            number(out, 1, u64::MAX);
+            bytes(out, 2, b"a");
+            float(out, 12, 0.5);
+            double(out, 13, 0.5);
+        });
+        let fields: Result<Vec<_>, _> = Fields::of(&message).collect();
+        let expected =
+            [(1, Field::Number(u64::MAX)), (2, Field::Bytes(b"a")), (12, Field::Fixed), (13, Field::Fixed)];
+        assert_eq!(fields.unwrap(), expected);
+        for wrong in [
+            &[0x08][..],
+            &[0x0A, 2, 0],
+            &[0x0B],
+            &[0x00, 0],
+            &[0x65, 0, 0],
+            &[0x08, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0x02],
+            &[0x08, 0x80, 0x80, 0x80, 0x80, 0x80, 0x80, 0x80, 0x80, 0x80, 0x80, 0],
+        ] {
+            let mut fields = Fields::of(wrong);
+            assert_eq!((fields.next(), fields.next()), (Some(Err(Malformed)), None), "{wrong:?}");
+        }
+    }
+}

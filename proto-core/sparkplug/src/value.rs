@@ -1,0 +1,120 @@
+//! Values of metrics and their types.
+
+/// Type of a metric, with its code in Sparkplug B.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u8)]
+pub enum DataType {
+    /// Signed, 64 bits.
+    Int64 = 4,
+    /// Unsigned, 8 bits.
+    UInt8 = 5,
+    /// Unsigned, 16 bits.
+    UInt16 = 6,
+    /// Unsigned, 32 bits.
+    UInt32 = 7,
+    /// Unsigned, 64 bits.
+    UInt64 = 8,
+    /// IEEE 754, 32 bits.
+    Float = 9,
+    /// IEEE 754, 64 bits.
+    Double = 10,
+    /// True or false.
+    Boolean = 11,
+    /// UTF-8.
+    String = 12,
+}
+
+/// Value of a metric.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Value {
+    /// Signed, 64 bits.
+    Int64(i64),
+    /// Unsigned, 8 bits.
+    UInt8(u8),
+    /// Unsigned, 16 bits.
+    UInt16(u16),
+    /// Unsigned, 32 bits.
+    UInt32(u32),
+    /// Unsigned, 64 bits.
+    UInt64(u64),
+    /// IEEE 754, 32 bits; if it is no finite number it is sent as unknown.
+    Float(f32),
+    /// IEEE 754, 64 bits; if it is no finite number it is sent as unknown.
+    Double(f64),
+    /// True or false.
+    Boolean(bool),
+    /// One of several words.
+    Word(&'static str),
+}
+
+impl Value {
+    /// Its type.
+    pub const fn data_type(self) -> DataType {
+        match self {
+            Self::Int64(_) => DataType::Int64,
+            Self::UInt8(_) => DataType::UInt8,
+            Self::UInt16(_) => DataType::UInt16,
+            Self::UInt32(_) => DataType::UInt32,
+            Self::UInt64(_) => DataType::UInt64,
+            Self::Float(_) => DataType::Float,
+            Self::Double(_) => DataType::Double,
+            Self::Boolean(_) => DataType::Boolean,
+            Self::Word(_) => DataType::String,
+        }
+    }
+
+    /// The value, unless it is a float that is no finite number.
+    pub(crate) fn known(self) -> Option<Self> {
+        match self {
+            Self::Float(value) if !value.is_finite() => None,
+            Self::Double(value) if !value.is_finite() => None,
+            other => Some(other),
+        }
+    }
+
+    /// Whether it is far enough from another one to be told: more than `dead_band` for numbers.
+    pub(crate) fn differs(self, other: Self, dead_band: f64) -> bool {
+        match (self.number(), other.number()) {
+            (Some(one), Some(two)) if dead_band > 0.0 => (one - two).abs() > dead_band,
+            _ => self != other,
+        }
+    }
+
+    fn number(self) -> Option<f64> {
+        match self {
+            Self::Int64(value) => Some(value as f64),
+            Self::UInt8(value) => Some(value.into()),
+            Self::UInt16(value) => Some(value.into()),
+            Self::UInt32(value) => Some(value.into()),
+            Self::UInt64(value) => Some(value as f64),
+            Self::Float(value) => Some(value.into()),
+            Self::Double(value) => Some(value),
+            Self::Boolean(_) | Self::Word(_) => None,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_dead_band_is_for_numbers_and_does_not_count_itself() {
+        let float = Value::Float;
+        assert!(!float(1.0).differs(float(1.5), 0.5));
+        assert!(float(1.0).differs(float(1.6), 0.5));
+        assert!(float(1.0).differs(float(1.000_001), 0.0));
+        assert!(!float(1.0).differs(float(1.0), 0.0));
+        assert!(Value::Boolean(true).differs(Value::Boolean(false), 9.0));
+        assert!(Value::Word("a").differs(Value::Word("b"), 9.0));
+        // Above 2^53, where doubles have gaps.
+        assert!(Value::UInt64(u64::MAX).differs(Value::UInt64(u64::MAX - 1), 0.0));
+    }
+
+    #[test]
+    fn no_number_is_unknown() {
+        assert_eq!(Value::Float(f32::NAN).known(), None);
+        assert_eq!(Value::Double(f64::INFINITY).known(), None);
+        assert_eq!(Value::Float(0.5).known(), Some(Value::Float(0.5)));
+    }
+}
