@@ -4,7 +4,7 @@
 
 use proto_core::config::{
     AskWhen, Bus, CanFramePart, CommandWhen, Delimiter, Exchange, FieldSpec, FrameSpec, InputBinding,
-    OutputBinding, Parts, PortValue, Span, StateValue, StreamPart, Talk, Words,
+    LinkSource, OutputBinding, Parts, PortValue, Span, StateValue, StreamPart, Talk, Words,
 };
 use proto_core::device::{
     Algorithm, Bits, Boundary, ByteOrder, Checksum, Counts, Encoding, Escape, Ignored, Kind, Length,
@@ -146,10 +146,13 @@ fn from(input: &mut Source<'_>) -> OutputBinding {
         3 => OutputBinding::Bit { var: var(input, any), bit: kind >> 4 & 7 },
         4 => OutputBinding::Port {
             port: (kind & 64 == 0).then_some(kind >> 5 & 1),
-            value: PortValue::NAMES[usize::from(kind >> 3 & 3)].1,
+            value: PortValue::NAMES[usize::from(kind >> 3) % PortValue::NAMES.len()].1,
             scale: 1.0,
             offset: 0.0,
         },
+        5 if (0xE8..0xF0).contains(&kind) => {
+            OutputBinding::Link { link: LinkSource::NAMES[usize::from(kind & 3)].1, scale: 1.0, offset: 0.0 }
+        }
         5 if kind >= 0xF0 => OutputBinding::State { value: StateValue::SPEED, scale: 1.0, offset: 0.0 },
         _ => OutputBinding::Variable { var: var(input, any), scale: 1.0, offset: 0.0 },
     }

@@ -21,7 +21,10 @@ pub(crate) fn run(input: &[u8]) {
     let layout = FrameLayout::new(Carrier::Stream, Direction::Input, head, tail, elements, *checksum);
     let Ok(layout) = layout else { return };
     let how = input.u8();
-    let mut test = Test { framer: Framer::new(), layout, reader: Reader::default(), received: 0, plain };
+    let is_of_replies = how & 1 == 1;
+    let framer = if is_of_replies { Framer::of_replies() } else { Framer::new() };
+    let reader = Reader { is_of_replies, ..Reader::default() };
+    let mut test = Test { framer, layout, reader, received: 0, plain };
     let (mut line, mut piece) = (Vec::new(), Vec::new());
     while !input.is_empty() {
         let op = input.u8();
@@ -63,6 +66,10 @@ struct Reader {
     at: usize,
     /// Where a frame is expected to begin.
     expected: Option<usize>,
+    /// Behind the frames that were found; those with a wrong checksum among them.
+    found_until: usize,
+    /// A frame with a wrong checksum is one only where a frame is expected.
+    is_of_replies: bool,
     skipped: usize,
 }
 
@@ -78,11 +85,11 @@ impl Reader {
                 Seen::Frame(len) | Seen::Other(len) => {
                     found.push((seen, self.line[self.at..self.at + len].to_vec()));
                     self.at += len;
-                    self.expected = Some(self.at);
+                    (self.expected, self.found_until) = (Some(self.at), self.at);
                 }
-                Seen::Wrong(len) if was_expected => {
+                Seen::Wrong(len) if was_expected || !self.is_of_replies && self.at >= self.found_until => {
                     found.push((seen, self.line[self.at..self.at + len].to_vec()));
-                    self.expected = Some(self.at + len);
+                    (self.expected, self.found_until) = (Some(self.at + len), self.at + len);
                     self.at += 1;
                     self.skipped += 1;
                 }

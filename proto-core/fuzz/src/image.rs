@@ -1,7 +1,7 @@
 //! Configuration images: anything that flash can hold (docs/configuration.md section 6).
 
 use proto_core::config::image::{
-    HEADER, ImageError, MAGIC, MAX_IMAGE, VERSION, decode, decode_into, encode, image_len,
+    HEADER, ImageError, MAGIC, MAX_IMAGE, Scan, VERSION, decode, decode_into, encode, image_len,
 };
 use proto_core::config::{ControllerLink, GatewayConfig};
 use proto_core::engine::{BuildError, Engine};
@@ -51,6 +51,9 @@ fn look_at(bytes: &[u8]) {
     // What was there before does not show.
     let mut over = model::cell();
     assert_eq!(decode_into(bytes, &mut over).map(|()| over), read);
+    // A scan finds the same, but for what the parts say together.
+    let found = read.as_ref().err().copied().filter(|error| !matches!(error, ImageError::Config(_)));
+    assert_eq!(scanned(bytes), found);
     match (payload(bytes), &read) {
         (Err(()), Err(ImageError::Contents | ImageError::TooMany { .. } | ImageError::Config(_)) | Ok(_)) => {
             panic!("taken: {read:?}")
@@ -82,6 +85,20 @@ fn look_at(bytes: &[u8]) {
         let engine = Engine::<8, 4, 512>::new(&config);
         assert!(!matches!(engine, Err(BuildError::Config(_))), "{:?}", engine.map(|_| ()));
     }
+}
+
+/// What a scan refuses.
+fn scanned(bytes: &[u8]) -> Option<ImageError> {
+    let mut scan = Scan::new();
+    // A list of each, and a byte of each entry at least.
+    for _ in 0..MAX_IMAGE {
+        match scan.step(bytes) {
+            Ok(true) => {}
+            Ok(false) => return None,
+            Err(error) => return Some(error),
+        }
+    }
+    panic!("it has no end")
 }
 
 /// The controller, and what follows it. Versions 1 and 2 have it in common.
@@ -120,7 +137,7 @@ fn with_header(version: u32, payload: &[u8]) -> Vec<u8> {
 }
 
 /// The CRC-32 of Ethernet and zip, bit by bit.
-fn crc32(bytes: &[u8]) -> u32 {
+pub(crate) fn crc32(bytes: &[u8]) -> u32 {
     let mut crc = u32::MAX;
     for &byte in bytes {
         crc ^= u32::from(byte);

@@ -1,4 +1,5 @@
-//! Fuzz targets of `proto-core` (docs/fuzzing.md).
+//! Fuzz targets of `proto-core`, `recipe-remote`, `recipe-sparkplug`, `recipe-store` and `recipe-update`
+//! (docs/fuzzing.md).
 //!
 //! In: bytes. They are read as a short program: a recipe, operations, received bytes and where they
 //! are cut. Each target runs it on the code and on a slow, obvious reference written from `docs/wire`,
@@ -21,10 +22,13 @@ mod http_guard;
 mod http_head;
 mod image;
 mod modbus;
+mod mqtt;
 mod plain_frame;
 mod recipes;
 mod slcan;
 mod state;
+mod store;
+mod update;
 
 #[path = "../../tests/engine_props/model.rs"]
 mod model;
@@ -87,7 +91,10 @@ pub const TARGETS: &[Target] = &[
     },
     Target { name: "http_head", run: http_head::run, seeds: http_head::seeds, runs: 8_000, longest: 600 },
     Target { name: "http_guard", run: http_guard::run, seeds: http_guard::seeds, runs: 1_500, longest: 600 },
+    Target { name: "mqtt", run: mqtt::run, seeds: mqtt::seeds, runs: 8_000, longest: 600 },
     Target { name: "image", run: image::run, seeds: image::seeds, runs: 3_000, longest: 3_000 },
+    Target { name: "store", run: store::run, seeds: store::seeds, runs: 3_000, longest: 2_000 },
+    Target { name: "update", run: update::run, seeds: update::seeds, runs: 1_000, longest: 1_000 },
 ];
 
 /// The target of this name.
