@@ -24,6 +24,9 @@
 //! to do with the flash, until it ends. So the same code waits for the flash or lets other tasks run meanwhile:
 //! [`Put::carry_out`] is the loop for a [`Flash`] with futures.
 //!
+//! A board whose program can be updated has two places for a store, because flash cannot be read while a sector
+//! of the same bank is erased: [`newest`] says which one counts, a [`Move`] changes the place.
+//!
 //! ```
 //! # use recipe_store::{Flash, Geometry, Place, Word};
 //! # struct Ram(Vec<Word>);
@@ -44,7 +47,7 @@
 //! let mut store = Store::mount(&flash)?;
 //! let image = b"a configuration";
 //! store.keep(1, 0xC0FFEE, image, None)?.carry_out(&mut flash).await?;
-//! store.mark(Marks { live: Some(1), previous: None, trial: None })?.carry_out(&mut flash).await?;
+//! store.mark(Marks { live: Some(1), ..Marks::default() })?.carry_out(&mut flash).await?;
 //!
 //! // After a restart.
 //! let store = Store::mount(&flash)?;
@@ -61,15 +64,19 @@ extern crate std;
 mod mount;
 mod put;
 mod record;
+mod relocate;
 mod revisions;
+mod slots;
 mod values;
 
 use core::future::Future;
 
 pub use mount::{Found, MountError, Store};
 pub use put::{Put, PutError, Step};
-pub use record::{COUNTERS, Key, MAX_DATA};
-pub use revisions::{Adoption, KeepError, MAX_REVISIONS, Marks, Revision, Role, Start, Trial};
+pub use record::{COUNTERS, Key, MAX_DATA, VERSION};
+pub use relocate::{Move, Newest, Side, newest};
+pub use revisions::{Adoption, Ended, KeepError, MAX_REVISIONS, Marks, Revision, Role, Start, Trial};
+pub use slots::{Slot, SlotMarks, SlotTrial};
 
 /// Number of bytes of a [`Word`].
 pub const WORD: usize = 32;
@@ -96,7 +103,7 @@ pub struct Geometry {
     pub words: u16,
 }
 
-/// Flash for a [`Store`], and for nothing else.
+/// Flash for a [`Store`] or for a slot of the firmware, and for nothing else.
 ///
 /// Writing and erasing may take seconds, so they are futures; whoever has no other task blocks on them. They
 /// report no errors: whatever goes wrong shows when the words are read back.

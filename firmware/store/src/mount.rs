@@ -69,7 +69,7 @@ impl Store {
         if !(2..=8).contains(&geometry.sectors) || geometry.words < 8 {
             return Err(MountError::Geometry(geometry));
         }
-        let mut store = Self { geometry, head: None, end: 0, sequence: 1, index: [None; KEYS] };
+        let mut store = Self::empty(geometry, 1);
         // In the order in which they were begun: of two copies of a record, the later one counts, because the
         // sector of the earlier one is the next to be erased.
         while let Some((sector, sequence)) = store.begun_next(flash)? {
@@ -79,6 +79,11 @@ impl Store {
             store.end = end.saturating_add(1);
         }
         Ok(store)
+    }
+
+    /// A store of blank flash, whose next record has this sequence number.
+    pub(crate) fn empty(geometry: Geometry, sequence: u32) -> Self {
+        Self { geometry, head: None, end: 0, sequence, index: [None; KEYS] }
     }
 
     /// The sector that was begun next after `head`. (Sorting would be 6 KiB of code.)

@@ -8,7 +8,7 @@
 use core::fmt;
 
 use crate::mount::is_whole;
-use crate::record::{Head, KEYS, MAX_DATA, SectorHead, extent, part, sum};
+use crate::record::{Head, KEYS, MAX_DATA, SectorHead, part, sum};
 use crate::{BLANK, Flash, Found, Key, Place, Store, Word};
 
 /// A record that is being written. Dropped before it has ended, it leaves the old record or the new one; the
@@ -17,8 +17,14 @@ use crate::{BLANK, Flash, Found, Key, Place, Store, Word};
 #[derive(Debug)]
 pub struct Put<'s, 'd> {
     store: &'s mut Store,
-    head: Head,
     data: &'d [u8],
+    work: Work,
+}
+
+/// What is being written, and how far it is.
+#[derive(Debug)]
+pub(crate) struct Work {
+    head: Head,
     phase: Phase,
     writing: Writing,
     /// The next free word of the sector that is copied into.
@@ -29,6 +35,8 @@ pub struct Put<'s, 'd> {
     turns: u8,
     /// How often something may be written again.
     tries: u8,
+    /// A sector that is blank is not erased again before it is begun.
+    is_erased: bool,
 }
 
 /// What to do next.
@@ -129,21 +137,29 @@ enum Written {
 }
 
 /// Where the data of a record come from.
-#[derive(Clone, Copy)]
-enum Source<'d> {
+pub(crate) enum Source<'d, F> {
     Bytes(&'d [u8]),
-    Flash(Found),
+    Flash(&'d F, Found),
 }
 
-impl Source<'_> {
-    fn part(&self, flash: &impl Flash, nth: u16) -> Word {
+impl<F: Flash> Source<'_, F> {
+    fn part(&self, nth: u16) -> Word {
         match self {
             Self::Bytes(data) => part(data, nth),
-            Self::Flash(Found { data: Place { sector, word }, .. }) => {
+            Self::Flash(flash, Found { data: Place { sector, word }, .. }) => {
                 flash.read(Place { sector: *sector, word: word.saturating_add(nth) })
             }
         }
     }
+}
+
+/// The sector that a record is written to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Into {
+    /// The one that is being filled.
+    Filled,
+    /// The one that is copied into.
+    Next,
 }
 
 impl Store {
@@ -158,83 +174,36 @@ impl Store {
         if data.len() > MAX_DATA {
             return Err(too_long);
         }
-        let (used, available) = self.used(extent(data.len()));
+        let head = Head { key: code, sequence: self.sequence, len, tag, sum: sum(data) };
+        let work = self.begin(head)?;
+        // Also if it fails: its words may be read as a record later.
+        self.sequence = self.sequence.saturating_add(1);
+        Ok(Put { store: self, data, work })
+    }
+
+    /// The work of writing the record with this head, if there is room.
+    pub(crate) fn begin(&self, head: Head) -> Result<Work, PutError> {
+        let (used, available) = self.used(head.extent());
         if used > available {
             return Err(PutError::Full { used, available });
         }
-        let head = Head { key: code, sequence: self.sequence, len, tag, sum: sum(data) };
-        // Also if it fails: its words may be read as a record later.
-        self.sequence = self.sequence.saturating_add(1);
-        let turns = self.geometry.sectors;
-        Ok(Put {
-            store: self,
+        Ok(Work {
             head,
-            data,
             phase: Phase::Place,
             writing: Writing::Head,
             fill: 0,
             copies: [0; KEYS],
-            turns,
+            turns: self.geometry.sectors,
             tries: TRIES,
+            is_erased: false,
         })
     }
 }
 
 impl Put<'_, '_> {
     /// What to do next; called again when that is done, until it is [`Step::End`].
-    pub fn next(&mut self, flash: &impl Flash) -> Step {
-        loop {
-            match self.phase {
-                Phase::Place => self.find_place(),
-                Phase::Append => {
-                    let head = self.head;
-                    match self.write(flash, &head, Source::Bytes(self.data)) {
-                        Written::Step(step) => return step,
-                        Written::At(word) => {
-                            if let Some((sector, _)) = self.store.head {
-                                self.store.enter(Place { sector, word }, &head);
-                            }
-                            self.phase = Phase::End(Ok(()));
-                        }
-                        Written::NoRoom => self.phase = Phase::Place,
-                        Written::Worn => self.phase = Phase::End(Err(PutError::Worn)),
-                    }
-                }
-                Phase::Erase { tries } => {
-                    self.phase = Phase::Erased { tries: tries.saturating_sub(1) };
-                    return Step::Erase(self.next_sector());
-                }
-                Phase::Erased { tries } => {
-                    let sector = self.next_sector();
-                    let is_blank = (0..self.store.geometry.words)
-                        .all(|word| flash.read(Place { sector, word }) == BLANK);
-                    self.fill = 1;
-                    self.phase = match (is_blank, tries) {
-                        (true, _) => Phase::Copy { key: 0 },
-                        (false, 0) => Phase::End(Err(PutError::Sector(sector))),
-                        (false, tries) => Phase::Erase { tries },
-                    };
-                }
-                Phase::Copy { key } => self.copy(flash, key),
-                Phase::Copying { key, head, from } => match self.write(flash, &head, Source::Flash(from)) {
-                    Written::Step(step) => return step,
-                    Written::At(word) => {
-                        if let Some(copy) = self.copies.get_mut(usize::from(key)) {
-                            *copy = word;
-                        }
-                        self.phase = Phase::Copy { key: key.saturating_add(1) };
-                    }
-                    Written::NoRoom | Written::Worn => self.phase = Phase::End(Err(PutError::Worn)),
-                },
-                Phase::Begin => {
-                    let place = Place { sector: self.next_sector(), word: 0 };
-                    self.phase = Phase::Begun;
-                    return Step::Write(place, SectorHead::word(self.next_sequence()));
-                }
-                Phase::Begun => self.begun(flash),
-                Phase::End(result) => return Step::End(result),
-            }
-        }
+    pub fn next<F: Flash>(&mut self, flash: &F) -> Step {
+        self.work.next(self.store, &Source::<F>::Bytes(self.data), flash)
     }
 
     /// Does all steps.
@@ -250,103 +219,160 @@ impl Put<'_, '_> {
             }
         }
     }
+}
 
-    fn find_place(&mut self) {
+impl Work {
+    /// In a flash whose sectors were all erased just now.
+    pub(crate) fn in_erased(self) -> Self {
+        Self { is_erased: true, ..self }
+    }
+
+    /// What to do next with `flash`, of which `store` is.
+    pub(crate) fn next<F: Flash>(
+        &mut self,
+        store: &mut Store,
+        source: &Source<'_, impl Flash>,
+        flash: &F,
+    ) -> Step {
+        loop {
+            match self.phase {
+                Phase::Place => self.find_place(store),
+                Phase::Append => {
+                    let head = self.head;
+                    match self.write(store, flash, &head, source, Into::Filled) {
+                        Written::Step(step) => return step,
+                        Written::At(word) => {
+                            if let Some((sector, _)) = store.head {
+                                store.enter(Place { sector, word }, &head);
+                            }
+                            self.phase = Phase::End(Ok(()));
+                        }
+                        Written::NoRoom => self.phase = Phase::Place,
+                        Written::Worn => self.phase = Phase::End(Err(PutError::Worn)),
+                    }
+                }
+                Phase::Erase { tries } => {
+                    self.phase = Phase::Erased { tries: tries.saturating_sub(1) };
+                    return Step::Erase(next_sector(store));
+                }
+                Phase::Erased { tries } => {
+                    let sector = next_sector(store);
+                    self.fill = 1;
+                    self.phase = match (is_blank(flash, sector), tries) {
+                        (true, _) => Phase::Copy { key: 0 },
+                        (false, 0) => Phase::End(Err(PutError::Sector(sector))),
+                        (false, tries) => Phase::Erase { tries },
+                    };
+                }
+                Phase::Copy { key } => self.copy(store, flash, key),
+                Phase::Copying { key, head, from } => {
+                    match self.write(store, flash, &head, &Source::Flash(flash, from), Into::Next) {
+                        Written::Step(step) => return step,
+                        Written::At(word) => {
+                            if let Some(copy) = self.copies.get_mut(usize::from(key)) {
+                                *copy = word;
+                            }
+                            self.phase = Phase::Copy { key: key.saturating_add(1) };
+                        }
+                        Written::NoRoom | Written::Worn => self.phase = Phase::End(Err(PutError::Worn)),
+                    }
+                }
+                Phase::Begin => {
+                    let place = Place { sector: next_sector(store), word: 0 };
+                    self.phase = Phase::Begun;
+                    return Step::Write(place, SectorHead::word(next_sequence(store)));
+                }
+                Phase::Begun => self.begun(store, flash),
+                Phase::End(result) => return Step::End(result),
+            }
+        }
+    }
+
+    fn find_place(&mut self, store: &Store) {
         self.writing = Writing::Head;
-        self.phase = if self.store.head.is_some() && self.store.has_room(self.store.end, self.head.extent()) {
+        self.phase = if store.head.is_some() && store.has_room(store.end, self.head.extent()) {
             Phase::Append
         } else if let Some(left) = self.turns.checked_sub(1) {
             self.turns = left;
             self.copies = [0; KEYS];
-            Phase::Erase { tries: 2 }
+            if self.is_erased { Phase::Erased { tries: 2 } } else { Phase::Erase { tries: 2 } }
         } else {
             // More was written again than there is room.
             Phase::End(Err(PutError::Worn))
         };
     }
 
-    /// The sector to be begun next.
-    fn next_sector(&self) -> u8 {
-        self.store.head.map_or(0, |(head, _)| self.behind(head))
-    }
-
-    fn next_sequence(&self) -> u32 {
-        self.store.head.map_or(1, |(_, sequence)| sequence.saturating_add(1))
-    }
-
-    fn behind(&self, sector: u8) -> u8 {
-        let next = sector.saturating_add(1);
-        if next < self.store.geometry.sectors { next } else { 0 }
-    }
-
     /// Looks for the next record to be copied, from this key on.
-    fn copy(&mut self, flash: &impl Flash, from: u8) {
-        let old = self.behind(self.next_sector());
+    fn copy(&mut self, store: &Store, flash: &impl Flash, from: u8) {
+        let old = behind(store, next_sector(store));
         let found = (from..KEYS as u8)
-            .find_map(|key| Some((key, self.store.entry(key).filter(|found| found.data.sector == old)?)));
+            .find_map(|key| Some((key, store.entry(key).filter(|found| found.data.sector == old)?)));
         self.writing = Writing::Head;
         self.phase = match found {
-            Some((key, from)) => {
-                let word = Place { word: from.data.word.saturating_sub(1), ..from.data };
-                match Head::parse(&flash.read(word)) {
-                    Some(head) => Phase::Copying { key, head, from },
-                    // It was read at the start, and is not written.
-                    None => Phase::End(Err(PutError::Worn)),
-                }
-            }
+            Some((key, from)) => match head_of(flash, from) {
+                Some(head) => Phase::Copying { key, head, from },
+                // It was read at the start, and is not written.
+                None => Phase::End(Err(PutError::Worn)),
+            },
             None => Phase::Begin,
         };
     }
 
     /// The sector is the one that counts, if its head is there.
-    fn begun(&mut self, flash: &impl Flash) {
-        let (sector, sequence) = (self.next_sector(), self.next_sequence());
+    fn begun(&mut self, store: &mut Store, flash: &impl Flash) {
+        let (sector, sequence) = (next_sector(store), next_sequence(store));
         if flash.read(Place { sector, word: 0 }) != SectorHead::word(sequence) {
             self.phase = Phase::End(Err(PutError::Sector(sector)));
             return;
         }
-        self.store.head = Some((sector, sequence));
-        self.store.end = self.fill;
+        store.head = Some((sector, sequence));
+        store.end = self.fill;
         for (key, word) in (0..).zip(self.copies) {
             if word != 0 {
-                self.store.moved(key, Place { sector, word });
+                store.moved(key, Place { sector, word });
             }
         }
         self.phase = Phase::Place;
     }
 
-    /// The next step of a record, at the end of the sector that is being filled or copied into.
-    fn write(&mut self, flash: &impl Flash, head: &Head, source: Source<'_>) -> Written {
-        let is_copy = matches!(source, Source::Flash(_));
-        let sector = match self.store.head {
-            Some((sector, _)) if !is_copy => sector,
-            _ => self.next_sector(),
+    /// The next step of a record, at the end of a sector.
+    fn write(
+        &mut self,
+        store: &mut Store,
+        flash: &impl Flash,
+        head: &Head,
+        source: &Source<'_, impl Flash>,
+        into: Into,
+    ) -> Written {
+        let sector = match store.head {
+            Some((sector, _)) if into == Into::Filled => sector,
+            _ => next_sector(store),
         };
-        let free = if is_copy { self.fill } else { self.store.end };
         loop {
             match self.writing {
                 Writing::Head => {
-                    if !self.store.has_room(free, head.extent()) {
+                    let free = if into == Into::Next { self.fill } else { store.end };
+                    if !store.has_room(free, head.extent()) {
                         return Written::NoRoom;
                     }
-                    self.set_end(is_copy, free.saturating_add(1));
+                    self.set_end(store, into, free.saturating_add(1));
                     self.writing = Writing::CheckHead { at: free };
                     return Written::Step(Step::Write(Place { sector, word: free }, head.word()));
                 }
                 // Data only behind a head that can be read: without it they could be taken for records.
                 Writing::CheckHead { at } => {
                     if flash.read(Place { sector, word: at }) == head.word() {
-                        self.set_end(is_copy, at.saturating_add(head.extent()));
+                        self.set_end(store, into, at.saturating_add(head.extent()));
                         self.writing = Writing::Data { at, nth: 0 };
-                    } else {
-                        return self.again(flash, head, source);
+                    } else if !self.again() {
+                        return Written::Worn;
                     }
                 }
                 Writing::Data { at, nth } => {
                     let place = Place { sector, word: at.saturating_add(1).saturating_add(nth) };
                     if nth < head.extent().saturating_sub(2) {
                         self.writing = Writing::Data { at, nth: nth.saturating_add(1) };
-                        return Written::Step(Step::Write(place, source.part(flash, nth)));
+                        return Written::Step(Step::Write(place, source.part(nth)));
                     }
                     self.writing = Writing::Check { at };
                     return Written::Step(Step::Write(place, head.word()));
@@ -356,23 +382,50 @@ impl Put<'_, '_> {
                     if flash.read(place) == head.word() && is_whole(flash, place, head) {
                         return Written::At(at);
                     }
-                    return self.again(flash, head, source);
+                    if !self.again() {
+                        return Written::Worn;
+                    }
                 }
             }
         }
     }
 
-    /// The same once more, behind what is there now.
-    fn again(&mut self, flash: &impl Flash, head: &Head, source: Source<'_>) -> Written {
-        let Some(left) = self.tries.checked_sub(1) else { return Written::Worn };
+    /// The same once more, behind what is there now, if it may be.
+    fn again(&mut self) -> bool {
+        let Some(left) = self.tries.checked_sub(1) else { return false };
         self.tries = left;
         self.writing = Writing::Head;
-        self.write(flash, head, source)
+        true
     }
 
-    fn set_end(&mut self, is_copy: bool, word: u16) {
-        *(if is_copy { &mut self.fill } else { &mut self.store.end }) = word;
+    fn set_end(&mut self, store: &mut Store, into: Into, word: u16) {
+        *(if into == Into::Next { &mut self.fill } else { &mut store.end }) = word;
     }
+}
+
+/// Whether all words of a sector look blank.
+pub(crate) fn is_blank(flash: &impl Flash, sector: u8) -> bool {
+    (0..flash.geometry().words).all(|word| flash.read(Place { sector, word }) == BLANK)
+}
+
+/// The head of a record.
+pub(crate) fn head_of(flash: &impl Flash, found: Found) -> Option<Head> {
+    let word = Place { word: found.data.word.saturating_sub(1), ..found.data };
+    Head::parse(&flash.read(word))
+}
+
+/// The sector to be begun next.
+fn next_sector(store: &Store) -> u8 {
+    store.head.map_or(0, |(head, _)| behind(store, head))
+}
+
+fn next_sequence(store: &Store) -> u32 {
+    store.head.map_or(1, |(_, sequence)| sequence.saturating_add(1))
+}
+
+fn behind(store: &Store, sector: u8) -> u8 {
+    let next = sector.saturating_add(1);
+    if next < store.geometry.sectors { next } else { 0 }
 }
 
 /// How often words may read differently than they were written. After a power cut it happens once, where a word

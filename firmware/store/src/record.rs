@@ -12,9 +12,9 @@ pub const MAX_DATA: usize = 16 * 1024;
 /// Number of counters.
 pub const COUNTERS: u8 = 4;
 /// Number of keys.
-pub(crate) const KEYS: usize = 16;
-/// Version of the layout.
-pub(crate) const VERSION: u32 = 1;
+pub(crate) const KEYS: usize = 18;
+/// Version of the layout of the store: another one is not read.
+pub const VERSION: u32 = 1;
 
 const SECTOR_MAGIC: [u8; 4] = *b"RGSs";
 const RECORD_MAGIC: [u8; 4] = *b"RGSr";
@@ -34,6 +34,10 @@ pub enum Key {
     Adopted,
     /// A counter, below [`COUNTERS`].
     Counter(u8),
+    /// Which slots of the firmware are good and on trial.
+    Slots,
+    /// How often the store was moved to another place.
+    Generation,
 }
 
 impl Key {
@@ -46,6 +50,8 @@ impl Key {
             Self::BirthSequence => Some(10),
             Self::Adopted => Some(11),
             Self::Counter(number @ 0..COUNTERS) => Some(12 | number),
+            Self::Slots => Some(16),
+            Self::Generation => Some(17),
             Self::Image(_) | Self::Counter(_) => None,
         }
     }

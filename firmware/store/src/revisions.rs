@@ -35,6 +35,42 @@ pub struct Marks {
     pub previous: Option<u32>,
     /// The one on trial.
     pub trial: Option<Trial>,
+    /// Number of the one whose trial ended last, and how.
+    pub last: Option<(u32, Ended)>,
+}
+
+impl Marks {
+    /// The configurations that it names, whose places are theirs.
+    pub fn numbers(&self) -> [Option<u32>; 4] {
+        let last = self.last.map(|(number, _)| number);
+        [self.live, self.previous, self.trial.map(|trial| trial.number), last]
+    }
+}
+
+/// How a trial ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Ended {
+    /// It was confirmed.
+    Confirmed,
+    /// Nobody confirmed it in time.
+    NotConfirmed,
+    /// Somebody took it back.
+    TakenBack,
+    /// It did not run, or used up its starts.
+    Failed,
+}
+
+impl Ended {
+    const ALL: [Self; 4] = [Self::Confirmed, Self::NotConfirmed, Self::TakenBack, Self::Failed];
+
+    /// Never 0.
+    pub(crate) fn code(self) -> u8 {
+        Self::ALL.iter().position(|ended| *ended == self).map_or(0, |nth| nth as u8).saturating_add(1)
+    }
+
+    pub(crate) fn of_code(code: u8) -> Option<Self> {
+        Self::ALL.get(usize::from(code.checked_sub(1)?)).copied()
+    }
 }
 
 /// A configuration that runs, and is not live.
@@ -54,7 +90,7 @@ pub struct Trial {
 pub enum KeepError {
     /// It cannot be written.
     Put(PutError),
-    /// The one to be forgotten is live, before it, or on trial; or one of this number is.
+    /// A mark names the one to be forgotten, or the one of this number.
     Needed {
         /// Its number.
         number: u32,
@@ -133,7 +169,8 @@ impl Store {
     }
 
     fn in_slot(&self, slot: u8) -> Option<Revision> {
-        let found = self.find(Key::Image(slot))?;
+        // An empty one without a number is a place whose image was forgotten.
+        let found = self.find(Key::Image(slot)).filter(|found| found.len > 0 || found.tag != 0)?;
         let [a, b, c, d, e, f, g, h] = found.tag.to_le_bytes();
         let number = u32::from_le_bytes([a, b, c, d]);
         let digest = u32::from_le_bytes([e, f, g, h]);
@@ -156,13 +193,14 @@ impl Store {
     /// Which configurations are live, before it, and on trial.
     pub fn marks(&self) -> Marks {
         let Some(found) = self.find(Key::Marks) else { return Marks::default() };
-        let [live, previous, trial, attempts, low, high, _, _] = found.tag.to_le_bytes();
+        let [live, previous, trial, attempts, low, high, last, ended] = found.tag.to_le_bytes();
         let number = |slot: u8| self.in_slot(slot).map(|revision| revision.number);
         let confirm_s = u16::from_le_bytes([low, high]);
         Marks {
             live: number(live),
             previous: number(previous),
             trial: number(trial).map(|number| Trial { number, attempts, confirm_s }),
+            last: number(last).zip(Ended::of_code(ended)),
         }
     }
 
@@ -180,13 +218,15 @@ impl Store {
         let (live, previous) = (slot(marks.live)?, slot(marks.previous)?);
         let trial = slot(marks.trial.map(|trial| trial.number))?;
         let (attempts, confirm_s) = marks.trial.map_or((0, 0), |trial| (trial.attempts, trial.confirm_s));
+        let ended_slot = slot(marks.last.map(|(number, _)| number))?;
+        let ended = marks.last.map_or(0, |(_, ended)| ended.code());
         let [low, high] = confirm_s.to_le_bytes();
-        let tag = u64::from_le_bytes([live, previous, trial, attempts, low, high, 0, 0]);
+        let tag = u64::from_le_bytes([live, previous, trial, attempts, low, high, ended_slot, ended]);
         Ok(self.put(Key::Marks, tag, &[])?)
     }
 
     /// Keeps a configuration, in the place of `forget`. Without that it is a free place, or that of the oldest one
-    /// that is neither live, nor the one before, nor on trial.
+    /// that no mark names.
     ///
     /// # Errors
     /// It is not kept, and `forget` is.
@@ -198,7 +238,7 @@ impl Store {
         forget: Option<u32>,
     ) -> Result<Put<'_, 'd>, KeepError> {
         let marks = self.marks();
-        let needed = [marks.live, marks.previous, marks.trial.map(|trial| trial.number)];
+        let needed = marks.numbers();
         let is_needed = |number: u32| needed.contains(&Some(number));
         let revisions = self.revisions();
         // One of the same number is replaced.
@@ -214,6 +254,23 @@ impl Store {
         Ok(self.put(Key::Image(slot), tag, image)?)
     }
 
+    /// Forgets a configuration, for its room: `number`, or the oldest one that no mark names. `None` if there is none.
+    ///
+    /// # Errors
+    /// A mark names it, or that cannot be written.
+    pub fn forget(&mut self, number: Option<u32>) -> Result<Option<Put<'_, 'static>>, KeepError> {
+        let needed = self.marks().numbers();
+        let is_needed = |number: u32| needed.contains(&Some(number));
+        let revisions = self.revisions();
+        let slot = match number {
+            Some(number) if is_needed(number) => return Err(KeepError::Needed { number }),
+            Some(number) => self.revision(number),
+            None => revisions.into_iter().find(|kept| !is_needed(kept.number)),
+        };
+        let Some(Revision { slot, .. }) = slot else { return Ok(None) };
+        Ok(Some(self.put(Key::Image(slot), 0, &[])?))
+    }
+
     /// What is to be run at a start: the configuration on trial while it has starts left, the live one, the one
     /// before.
     pub fn at_start(&self) -> Start {
@@ -221,7 +278,9 @@ impl Store {
         let mut start = Start { marks: None, candidates: heapless::Vec::new() };
         if let Some(trial) = marks.trial {
             let left = trial.attempts.checked_sub(1);
-            start.marks = Some(Marks { trial: left.map(|attempts| Trial { attempts, ..trial }), ..marks });
+            let last = if left.is_some() { marks.last } else { Some((trial.number, Ended::Failed)) };
+            let trial_left = left.map(|attempts| Trial { attempts, ..trial });
+            start.marks = Some(Marks { trial: trial_left, last, ..marks });
             if let Some(revision) = self.revision(trial.number).filter(|_| left.is_some()) {
                 let _ = start.candidates.push((revision, Role::Trial { confirm_s: trial.confirm_s }));
             }
@@ -252,7 +311,7 @@ impl Store {
         };
         let marks = self.marks();
         if marks.live != Some(same) {
-            let marks = Marks { live: Some(same), previous: marks.live, trial: None };
+            let marks = Marks { live: Some(same), previous: marks.live, trial: None, last: marks.last };
             return Ok(Adoption::Write(self.mark(marks)?));
         }
         Ok(Adoption::Write(self.put(Key::Adopted, adopted(digest, image.len()), &[])?))

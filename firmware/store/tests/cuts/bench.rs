@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::fmt;
 
 use embassy_futures::block_on;
-use recipe_store::{Geometry, Marks, Store, Trial};
+use recipe_store::{Ended, Geometry, Marks, Store, Trial};
 
 use crate::model::{Nor, Torn};
 
@@ -65,19 +65,20 @@ pub(crate) fn image(number: u32, len: usize) -> Vec<u8> {
 /// The changes in the life of a board: images of these lengths are kept, tried, confirmed or taken back.
 pub(crate) fn life(changes: usize, lens: &[usize]) -> Vec<Operation> {
     let (mut all, mut live, mut previous) = (vec![Operation::Key([7; 16])], None, None);
+    let mut last = None;
     let mut lens = lens.iter().cycle();
     for number in 1.. {
         let len = *lens.next().expect("it is a cycle");
         all.push(Operation::Keep { number, image: image(number, len) });
         let trial =
-            |attempts| Marks { live, previous, trial: Some(Trial { number, attempts, confirm_s: 60 }) };
+            |attempts| Marks { live, previous, trial: Some(Trial { number, attempts, confirm_s: 60 }), last };
         all.extend([Operation::Mark(trial(2)), Operation::Mark(trial(1))]);
         if number % 3 == 0 {
-            // Taken back.
-            all.push(Operation::Mark(Marks { live, previous, trial: None }));
+            last = Some((number, Ended::TakenBack));
+            all.push(Operation::Mark(Marks { live, previous, trial: None, last }));
         } else {
-            (live, previous) = (Some(number), live);
-            all.push(Operation::Mark(Marks { live, previous, trial: None }));
+            (live, previous, last) = (Some(number), live, Some((number, Ended::Confirmed)));
+            all.push(Operation::Mark(Marks { live, previous, trial: None, last }));
         }
         all.extend([
             Operation::BirthSequence(number as u8),
@@ -89,6 +90,26 @@ pub(crate) fn life(changes: usize, lens: &[usize]) -> Vec<Operation> {
         }
     }
     unreachable!()
+}
+
+impl Operation {
+    /// Whether it succeeded.
+    pub(crate) fn attempt(&self, store: &mut Store, flash: &mut Nor) -> bool {
+        let done = match self {
+            Self::Keep { number, image } => {
+                block_on(store.keep(*number, !number, image, None).expect("it is allowed").carry_out(flash))
+            }
+            Self::Mark(marks) => block_on(store.mark(*marks).expect("all are kept").carry_out(flash)),
+            Self::Counter(number, value) => {
+                block_on(store.set_counter(*number, *value).expect("there is room").carry_out(flash))
+            }
+            Self::BirthSequence(value) => {
+                block_on(store.set_birth_sequence(*value).expect("there is room").carry_out(flash))
+            }
+            Self::Key(key) => block_on(store.set_access_key(key).expect("there is room").carry_out(flash)),
+        };
+        done.is_ok()
+    }
 }
 
 impl Contents {
@@ -114,10 +135,9 @@ impl Contents {
         match change {
             Operation::Keep { number, image } => {
                 if new.images.len() == 8 && !new.images.contains_key(number) {
-                    let Marks { live, previous, trial } = new.marks;
-                    let needed = [live, previous, trial.map(|trial| trial.number)];
+                    let needed = new.marks.numbers();
                     let oldest = new.images.keys().copied().find(|number| !needed.contains(&Some(*number)));
-                    new.images.remove(&oldest.expect("three are needed"));
+                    new.images.remove(&oldest.expect("four are needed"));
                 }
                 new.images.insert(*number, (!number, image.clone()));
             }
@@ -145,23 +165,7 @@ impl Bench {
 
     /// Whether it succeeded.
     pub(crate) fn attempt(&mut self, change: &Operation) -> bool {
-        let (store, flash) = (&mut self.store, &mut self.flash);
-        let done = match change {
-            Operation::Keep { number, image } => {
-                block_on(store.keep(*number, !number, image, None).expect("it is allowed").carry_out(flash))
-            }
-            Operation::Mark(marks) => block_on(store.mark(*marks).expect("all are kept").carry_out(flash)),
-            Operation::Counter(number, value) => {
-                block_on(store.set_counter(*number, *value).expect("there is room").carry_out(flash))
-            }
-            Operation::BirthSequence(value) => {
-                block_on(store.set_birth_sequence(*value).expect("there is room").carry_out(flash))
-            }
-            Operation::Key(key) => {
-                block_on(store.set_access_key(key).expect("there is room").carry_out(flash))
-            }
-        };
-        done.is_ok()
+        change.attempt(&mut self.store, &mut self.flash)
     }
 
     #[track_caller]
@@ -253,15 +257,11 @@ impl Bench {
     /// Whether the store may accept it: what is kept already under this number, and in use, is not replaced, and
     /// only what is kept is marked.
     pub(crate) fn is_possible(&self, change: &Operation) -> bool {
-        let Marks { live, previous, trial } = self.expected.marks;
         match change {
-            Operation::Keep { number, .. } => {
-                ![live, previous, trial.map(|trial| trial.number)].contains(&Some(*number))
+            Operation::Keep { number, .. } => !self.expected.marks.numbers().contains(&Some(*number)),
+            Operation::Mark(marks) => {
+                marks.numbers().into_iter().flatten().all(|number| self.expected.images.contains_key(&number))
             }
-            Operation::Mark(marks) => [marks.live, marks.previous, marks.trial.map(|trial| trial.number)]
-                .into_iter()
-                .flatten()
-                .all(|number| self.expected.images.contains_key(&number)),
             _ => true,
         }
     }

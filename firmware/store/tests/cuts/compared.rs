@@ -7,11 +7,10 @@ use embassy_futures::block_on;
 use embedded_storage_async::nor_flash::{
     ErrorType, NorFlash, NorFlashError, NorFlashErrorKind, ReadNorFlash,
 };
-use recipe_store::{Flash as _, Place, WORD};
+use recipe_store::{Flash as _, Geometry, Place, WORD};
 use sequential_storage::cache::{Cache, Uncached};
 use sequential_storage::map::{MapConfig, MapStorage};
 
-use crate::SECTORS;
 use crate::bench::image;
 use crate::model::{Nor, Torn};
 
@@ -32,6 +31,8 @@ impl ErrorType for Adapter {
     type Error = Off;
 }
 
+/// It needs three.
+const SECTORS: Geometry = Geometry { sectors: 3, words: 4096 };
 const SECTOR: usize = SECTORS.words as usize * WORD;
 
 fn place(at: usize) -> Place {

@@ -4,6 +4,7 @@ mod bench;
 mod compared;
 mod model;
 mod random;
+mod relocate;
 mod room;
 
 use bench::{Bench, Operation, Totals, life};
@@ -11,7 +12,7 @@ use model::TORN;
 use recipe_store::Geometry;
 
 /// Of the STM32H743.
-const SECTORS: Geometry = Geometry { sectors: 3, words: 4096 };
+const SECTORS: Geometry = Geometry { sectors: 2, words: 4096 };
 /// Small, so that sectors are changed all the time.
 const SMALL: Geometry = Geometry { sectors: 3, words: 160 };
 const TWO: Geometry = Geometry { sectors: 2, words: 256 };

@@ -1,0 +1,173 @@
+//! Moves a store to another place of the flash.
+//!
+//! A board with two slots has a place for the store in each bank, and uses the one in the bank that it does not
+//! run from. A move erases the new place, copies all records, and writes the number of the move last: until then
+//! the place before counts, and a move that was cut short is begun anew. The place before is not written.
+
+use crate::mount::MountError;
+use crate::put::{Source, Work, head_of, is_blank};
+use crate::record::{Head, KEYS, sum};
+use crate::{Flash, Found, Key, PutError, Step, Store};
+
+/// One of two places.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Side {
+    /// The first one, which also holds stores that were never moved.
+    First,
+    /// The second one.
+    Second,
+}
+
+/// The store that counts, of two places.
+#[derive(Debug, Clone)]
+pub struct Newest {
+    /// What it holds.
+    pub store: Store,
+    /// Where it is.
+    pub side: Side,
+    /// Whether it may be moved to the other place; not if that one was written by a newer program.
+    pub may_move: bool,
+}
+
+/// Reads both places: the one that was moved to last counts. If that cannot be said, because nothing was ever
+/// moved, it is the first.
+///
+/// # Errors
+/// Neither can be a store: why the first cannot.
+pub fn newest(first: &impl Flash, second: &impl Flash) -> Result<Newest, MountError> {
+    match (Store::mount(first), Store::mount(second)) {
+        (Ok(one), Ok(other)) if one.generation() >= other.generation() => {
+            Ok(Newest { store: one, side: Side::First, may_move: true })
+        }
+        (Ok(_), Ok(store)) => Ok(Newest { store, side: Side::Second, may_move: true }),
+        (Ok(store), Err(_)) => Ok(Newest { store, side: Side::First, may_move: false }),
+        (Err(_), Ok(store)) => Ok(Newest { store, side: Side::Second, may_move: false }),
+        (Err(error), Err(_)) => Err(error),
+    }
+}
+
+/// A store that is being moved. Dropped or cut before it has ended, it leaves the store where it was.
+#[must_use = "nothing is moved until `next` or `carry_out` is called"]
+#[derive(Debug)]
+pub struct Move<'s> {
+    from: &'s Store,
+    to: Store,
+    phase: Phase,
+}
+
+#[derive(Debug)]
+enum Phase {
+    Erase {
+        sector: u8,
+        tries: u8,
+    },
+    Erased {
+        sector: u8,
+        tries: u8,
+    },
+    /// The record of this key, and then those of all later ones.
+    Key(u8),
+    Copying {
+        key: u8,
+        from: Found,
+        work: Work,
+    },
+    Generation(Work),
+    End(Result<(), PutError>),
+}
+
+impl Store {
+    /// How often it was moved.
+    pub fn generation(&self) -> u64 {
+        self.find(Key::Generation).map_or(0, |found| found.tag)
+    }
+
+    /// Begins to move it to another place of the same size. It must not be changed until the move has ended, or
+    /// the changes are not in the new place.
+    pub fn relocate(&self) -> Move<'_> {
+        let to = Self::empty(self.geometry, self.sequence);
+        Move { from: self, to, phase: Phase::Erase { sector: 0, tries: ERASES } }
+    }
+}
+
+impl Move<'_> {
+    /// What to do next in the new place; called again when that is done, until it is [`Step::End`].
+    pub fn next<F: Flash>(&mut self, from: &impl Flash, to: &F) -> Step {
+        loop {
+            match &mut self.phase {
+                Phase::Erase { sector, tries } => {
+                    let (sector, tries) = (*sector, tries.saturating_sub(1));
+                    self.phase = Phase::Erased { sector, tries };
+                    return Step::Erase(sector);
+                }
+                Phase::Erased { sector, tries } => {
+                    let (sector, tries) = (*sector, *tries);
+                    let next = sector.saturating_add(1);
+                    self.phase = if is_blank(to, sector) {
+                        let is_last = next >= self.to.geometry.sectors;
+                        if is_last { Phase::Key(0) } else { Phase::Erase { sector: next, tries: ERASES } }
+                    } else if tries > 0 {
+                        Phase::Erase { sector, tries }
+                    } else {
+                        Phase::End(Err(PutError::Sector(sector)))
+                    };
+                }
+                Phase::Key(first) => {
+                    let first = *first;
+                    self.phase = self.record(from, first).unwrap_or_else(|error| Phase::End(Err(error)));
+                }
+                Phase::Copying { key, from: found, work } => {
+                    match work.next(&mut self.to, &Source::Flash(from, *found), to) {
+                        Step::End(Ok(())) => self.phase = Phase::Key(key.saturating_add(1)),
+                        Step::End(Err(error)) => self.phase = Phase::End(Err(error)),
+                        step => return step,
+                    }
+                }
+                Phase::Generation(work) => match work.next(&mut self.to, &Source::<F>::Bytes(&[]), to) {
+                    Step::End(result) => self.phase = Phase::End(result),
+                    step => return step,
+                },
+                Phase::End(result) => return Step::End(*result),
+            }
+        }
+    }
+
+    /// The first record from this key on, or the number of the move behind all others.
+    fn record(&mut self, from: &impl Flash, first: u8) -> Result<Phase, PutError> {
+        let is_copied = |key: &u8| Key::Generation.code() != Some(*key);
+        let found = (first..KEYS as u8).filter(is_copied).find_map(|key| Some((key, self.from.entry(key)?)));
+        if let Some((key, found)) = found {
+            // It was read at the start, and is not written.
+            let head = head_of(from, found).ok_or(PutError::Worn)?;
+            return Ok(Phase::Copying { key, from: found, work: self.to.begin(head)?.in_erased() });
+        }
+        let key = Key::Generation.code().ok_or(PutError::Key)?;
+        let tag = self.from.generation().saturating_add(1);
+        let head = Head { key, sequence: self.to.sequence, len: 0, tag, sum: sum(&[]) };
+        self.to.sequence = self.to.sequence.saturating_add(1);
+        Ok(Phase::Generation(self.to.begin(head)?.in_erased()))
+    }
+
+    /// The store in its new place, after [`Step::End`] without an error; `None` otherwise.
+    pub fn moved(self) -> Option<Store> {
+        matches!(self.phase, Phase::End(Ok(()))).then_some(self.to)
+    }
+
+    /// Does all steps; returns the store in its new place.
+    ///
+    /// # Errors
+    /// Why it stays where it was.
+    pub async fn carry_out(mut self, from: &impl Flash, to: &mut impl Flash) -> Result<Store, PutError> {
+        loop {
+            match self.next(from, to) {
+                Step::Erase(sector) => to.erase(sector).await,
+                Step::Write(place, word) => to.write(place, &word).await,
+                Step::End(Ok(())) => return self.moved().ok_or(PutError::Worn),
+                Step::End(Err(error)) => return Err(error),
+            }
+        }
+    }
+}
+
+/// How often a sector is erased until it is given up.
+const ERASES: u8 = 2;

@@ -1,0 +1,95 @@
+//! Slots: which of the two places of the firmware is good, and which one is on trial (docs/update.md).
+
+use crate::revisions::Ended;
+use crate::{Key, Put, PutError, Store};
+
+/// A place for a firmware. Each image is linked for one of them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Slot {
+    /// The first one.
+    A,
+    /// The second one.
+    B,
+}
+
+impl Slot {
+    /// Both.
+    pub const ALL: [Self; 2] = [Self::A, Self::B];
+
+    /// The other one.
+    pub fn other(self) -> Self {
+        match self {
+            Self::A => Self::B,
+            Self::B => Self::A,
+        }
+    }
+
+    /// 0 or 1, in that order.
+    pub fn number(self) -> u8 {
+        match self {
+            Self::A => 0,
+            Self::B => 1,
+        }
+    }
+
+    /// The slot of this number; `None` from 2 on.
+    pub fn of_number(number: u8) -> Option<Self> {
+        Self::ALL.get(usize::from(number)).copied()
+    }
+}
+
+/// What the slots are, changed in one step.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct SlotMarks {
+    /// The one that was confirmed last, or was the first.
+    pub good: Option<Slot>,
+    /// The one on trial.
+    pub trial: Option<SlotTrial>,
+    /// The one whose trial ended last, and how.
+    pub last: Option<(Slot, Ended)>,
+}
+
+/// A firmware that runs, and was not confirmed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SlotTrial {
+    /// Where it is.
+    pub slot: Slot,
+    /// How many more starts it has.
+    pub attempts: u8,
+    /// How long it runs until it has to be confirmed, in seconds.
+    pub confirm_s: u16,
+    /// How well the cell did before, in a code of the firmware's own.
+    pub before: u8,
+}
+
+impl Store {
+    /// Which slots are good and on trial; nothing if no one has ever said.
+    pub fn slots(&self) -> SlotMarks {
+        let Some(found) = self.find(Key::Slots) else { return SlotMarks::default() };
+        let [good, trial, attempts, low, high, last, ended, before] = found.tag.to_le_bytes();
+        let confirm_s = u16::from_le_bytes([low, high]);
+        SlotMarks {
+            good: Slot::of_number(good),
+            trial: Slot::of_number(trial).map(|slot| SlotTrial { slot, attempts, confirm_s, before }),
+            last: Slot::of_number(last).zip(Ended::of_code(ended)),
+        }
+    }
+
+    /// Marks slots.
+    ///
+    /// # Errors
+    /// The marks cannot be written; those before count.
+    pub fn mark_slots(&mut self, marks: SlotMarks) -> Result<Put<'_, 'static>, PutError> {
+        let number = |slot: Option<Slot>| slot.map_or(NO_SLOT, Slot::number);
+        let (attempts, confirm_s, before) =
+            marks.trial.map_or((0, 0, 0), |trial| (trial.attempts, trial.confirm_s, trial.before));
+        let [low, high] = confirm_s.to_le_bytes();
+        let trial = number(marks.trial.map(|trial| trial.slot));
+        let last = number(marks.last.map(|(slot, _)| slot));
+        let ended = marks.last.map_or(0, |(_, ended)| ended.code());
+        let tag = [number(marks.good), trial, attempts, low, high, last, ended, before];
+        self.put(Key::Slots, u64::from_le_bytes(tag), &[])
+    }
+}
+
+const NO_SLOT: u8 = u8::MAX;
