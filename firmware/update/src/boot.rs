@@ -1,0 +1,144 @@
+//! Which slot a loader runs, and the marks of a trial (docs/update.md section 4).
+
+use core::fmt;
+
+use recipe_store::{Ended, Slot, SlotMarks, SlotTrial};
+
+use crate::SlotFlash;
+use crate::check::{Bad, Check, header};
+use crate::header::{BoardName, Header, PublicKey};
+
+/// Starts that a trial has: one, and two more after power cuts.
+pub const STARTS: u8 = 3;
+
+/// What a loader has of its board.
+pub trait Machine {
+    /// The flash of a slot.
+    type Flash: SlotFlash;
+
+    /// The flash of this slot.
+    fn flash(&self, slot: Slot) -> &Self::Flash;
+
+    /// Writes marks into the store; whether they are there.
+    fn mark(&mut self, marks: SlotMarks) -> bool;
+
+    /// Is told what was found in a slot that is not run, for a log or a lamp.
+    fn passed_over(&mut self, slot: Slot, why: &dyn fmt::Display);
+}
+
+/// The firmware to be run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Chosen {
+    /// Its slot.
+    pub slot: Slot,
+    /// Its header.
+    pub header: Header,
+    /// Whether it is on trial.
+    pub is_trial: bool,
+}
+
+/// Chooses the slot to be run: the one on trial if it has a start left, which is counted before; the good one; the
+/// other one. `None` if nothing can run. `marks` is `None` if there is no store: nothing is on trial then.
+///
+/// What is not known to be good is checked with its signature, the good one for damage.
+pub fn choose(
+    machine: &mut impl Machine,
+    marks: Option<SlotMarks>,
+    board: &BoardName,
+    key: &PublicKey,
+) -> Option<Chosen> {
+    let mut now = marks.unwrap_or_default();
+    if let Some(trial) = now.trial
+        && let Some(chosen) = on_trial(machine, &mut now, trial, board, key)
+    {
+        return Some(chosen);
+    }
+    if let Some(slot) = now.good {
+        match damage(machine.flash(slot), slot, board) {
+            Ok(header) => return Some(Chosen { slot, header, is_trial: false }),
+            Err(bad) => machine.passed_over(slot, &bad),
+        }
+    }
+    for slot in Slot::ALL.into_iter().filter(|slot| now.good != Some(*slot)) {
+        match origin(machine.flash(slot), slot, board, key) {
+            Ok(header) => {
+                // From now on it is the one to return to.
+                if marks.is_some() {
+                    machine.mark(SlotMarks { good: Some(slot), trial: None, ..now });
+                }
+                return Some(Chosen { slot, header, is_trial: false });
+            }
+            Err(bad) => machine.passed_over(slot, &bad),
+        }
+    }
+    None
+}
+
+/// The slot on trial, if it may be run. If not, the trial is over.
+fn on_trial(
+    machine: &mut impl Machine,
+    now: &mut SlotMarks,
+    trial: SlotTrial,
+    board: &BoardName,
+    key: &PublicKey,
+) -> Option<Chosen> {
+    let slot = trial.slot;
+    let failed = SlotMarks { trial: None, last: Some((slot, Ended::Failed)), ..*now };
+    let Some(attempts) = trial.attempts.checked_sub(1) else {
+        machine.passed_over(slot, &"it has used up its starts");
+        machine.mark(failed);
+        *now = failed;
+        return None;
+    };
+    // Counted before anything of it runs or is read: whatever goes wrong, it ends.
+    let counted = SlotMarks { trial: Some(SlotTrial { attempts, ..trial }), ..*now };
+    if !machine.mark(counted) {
+        machine.passed_over(slot, &"its start cannot be counted");
+        return None;
+    }
+    *now = counted;
+    match origin(machine.flash(slot), slot, board, key) {
+        Ok(header) => Some(Chosen { slot, header, is_trial: true }),
+        Err(bad) => {
+            machine.passed_over(slot, &bad);
+            machine.mark(failed);
+            *now = failed;
+            None
+        }
+    }
+}
+
+/// Checks a slot that is known to be good.
+fn damage(flash: &impl SlotFlash, slot: Slot, board: &BoardName) -> Result<Header, Bad> {
+    let header = header(flash, slot, board)?;
+    Check::damage(header).whole(flash)?;
+    Ok(header)
+}
+
+/// Checks a slot of which nothing is known.
+fn origin(flash: &impl SlotFlash, slot: Slot, board: &BoardName, key: &PublicKey) -> Result<Header, Bad> {
+    let header = header(flash, slot, board)?;
+    // Shorter than the hash of an image, and says whether that matters.
+    header.verify(key).map_err(|_| Bad::Foreign)?;
+    Check::contents(header).whole(flash)?;
+    Ok(header)
+}
+
+/// The marks with this slot on trial: the next start runs it. `before` is kept for the firmware on trial.
+#[must_use]
+pub fn begin_trial(marks: SlotMarks, slot: Slot, confirm_s: u16, before: u8) -> SlotMarks {
+    SlotMarks { trial: Some(SlotTrial { slot, attempts: STARTS, confirm_s, before }), ..marks }
+}
+
+/// The marks after the firmware in this slot was confirmed; `None` if it is not on trial.
+pub fn confirm(marks: SlotMarks, running: Slot) -> Option<SlotMarks> {
+    marks.trial.filter(|trial| trial.slot == running)?;
+    Some(SlotMarks { good: Some(running), trial: None, last: Some((running, Ended::Confirmed)) })
+}
+
+/// The marks after a trial has ended in another way: the next start runs the good slot. `None` if nothing is on
+/// trial.
+pub fn end_trial(marks: SlotMarks, ended: Ended) -> Option<SlotMarks> {
+    let trial = marks.trial?;
+    Some(SlotMarks { trial: None, last: Some((trial.slot, ended)), ..marks })
+}

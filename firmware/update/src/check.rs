@@ -1,0 +1,171 @@
+//! Checks what a slot holds, in pieces.
+
+use core::fmt;
+
+use crc::Digest;
+use recipe_store::{Place, Slot, WORD};
+use salty::Sha512;
+
+use crate::header::{BoardName, CRC, Foreign, HEADER, Header, HeaderError, IMAGE_OFFSET};
+use crate::{FIRST_WORD, SlotFlash, place, size};
+
+/// Why a slot cannot run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Bad {
+    /// It has no header.
+    Header(HeaderError),
+    /// It is linked for the other slot.
+    Slot,
+    /// It is for another board.
+    Board(BoardName),
+    /// The image is longer than the slot.
+    Long {
+        /// Its length in bytes.
+        length: u32,
+        /// The room in bytes.
+        room: u32,
+    },
+    /// A word cannot be read.
+    Torn(Place),
+    /// A bit has changed since it was written.
+    Crc,
+    /// The image is another one than that which was signed.
+    Hash,
+    /// It was signed with another key.
+    Foreign,
+}
+
+impl fmt::Display for Bad {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Header(error) => error.fmt(f),
+            Self::Slot => f.write_str("the firmware is linked for the other slot"),
+            Self::Board(board) => write!(f, "the firmware is for the board {board}"),
+            Self::Long { length, room } => {
+                write!(f, "the firmware has {length} bytes; the slot has room for {room}")
+            }
+            Self::Torn(Place { sector, word }) => {
+                write!(f, "the firmware is damaged: word {word} of sector {sector} cannot be read")
+            }
+            Self::Crc => f.write_str("the firmware is damaged: its CRC differs"),
+            Self::Hash => f.write_str("the firmware is another one than that which was signed"),
+            Self::Foreign => Foreign.fmt(f),
+        }
+    }
+}
+
+impl core::error::Error for Bad {}
+
+/// An image that is being checked.
+pub struct Check {
+    header: Header,
+    /// Words that were read.
+    done: u32,
+    crc: Digest<'static, u32>,
+    hash: Option<Sha512>,
+}
+
+impl fmt::Debug for Check {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Check")
+            .field("header", &self.header)
+            .field("done", &self.done)
+            .finish_non_exhaustive()
+    }
+}
+
+/// The header in the beginning of a slot, for this slot and board.
+///
+/// # Errors
+/// There is none, or it is not for here.
+pub fn header(flash: &impl SlotFlash, slot: Slot, board: &BoardName) -> Result<Header, Bad> {
+    let mut bytes = [0; HEADER];
+    for (part, word) in bytes.as_chunks_mut::<WORD>().0.iter_mut().zip(0..) {
+        let at = Place { sector: 0, word };
+        *part = flash.whole(at).ok_or(Bad::Torn(at))?;
+    }
+    let header = Header::parse(&bytes).map_err(Bad::Header)?;
+    fits(&header, flash, slot, board)?;
+    Ok(header)
+}
+
+/// Whether this header is for this slot and board.
+///
+/// # Errors
+/// It is not, and why.
+pub(crate) fn fits(
+    header: &Header,
+    flash: &impl SlotFlash,
+    slot: Slot,
+    board: &BoardName,
+) -> Result<(), Bad> {
+    let room = size(flash).saturating_sub(IMAGE_OFFSET);
+    if header.parts().board != *board {
+        return Err(Bad::Board(header.parts().board));
+    }
+    if header.slot() != slot {
+        return Err(Bad::Slot);
+    }
+    if header.length() > room {
+        return Err(Bad::Long { length: header.length(), room });
+    }
+    Ok(())
+}
+
+impl Check {
+    /// Looks for damage: each word can be read, and the CRC is right.
+    pub fn damage(header: Header) -> Self {
+        Self { header, done: 0, crc: CRC.digest(), hash: None }
+    }
+
+    /// The same, and compares with the hash that was signed.
+    pub fn contents(header: Header) -> Self {
+        Self { hash: Some(Sha512::new()), ..Self::damage(header) }
+    }
+
+    /// Reads so many more words; `None` if some are left.
+    pub fn step(&mut self, flash: &impl SlotFlash, words: u16) -> Option<Result<(), Bad>> {
+        for _ in 0..words {
+            let read = self.done.saturating_mul(WORD as u32);
+            let left = self.header.length().saturating_sub(read);
+            if left == 0 {
+                break;
+            }
+            // The header was for this slot, so it ends before the slot does.
+            let Some(at) = place(flash, FIRST_WORD.saturating_add(self.done)) else {
+                return Some(Err(Bad::Crc));
+            };
+            let Some(word) = flash.whole(at) else { return Some(Err(Bad::Torn(at))) };
+            let part = word.get(..(left as usize).min(WORD)).unwrap_or(&word);
+            self.crc.update(part);
+            if let Some(hash) = &mut self.hash {
+                hash.update(part);
+            }
+            self.done = self.done.saturating_add(1);
+        }
+        if self.done.saturating_mul(WORD as u32) < self.header.length() {
+            return None;
+        }
+        if self.crc.clone().finalize() != self.header.crc() {
+            return Some(Err(Bad::Crc));
+        }
+        let hash = self.hash.take().map(Sha512::finalize);
+        Some(match hash {
+            Some(hash) if hash != *self.header.hash() => Err(Bad::Hash),
+            _ => Ok(()),
+        })
+    }
+
+    /// All of it.
+    ///
+    /// # Errors
+    /// What is wrong with the image.
+    pub(crate) fn whole(mut self, flash: &impl SlotFlash) -> Result<(), Bad> {
+        loop {
+            if let Some(result) = self.step(flash, u16::MAX) {
+                return result;
+            }
+        }
+    }
+}

@@ -1,0 +1,245 @@
+//! Writes an update into the free slot.
+//!
+//! The header is checked before anything is erased. The image is written word by word and each word is read back;
+//! then its hash is compared; then the header is written, the word with the magic number last. So a slot with a
+//! header is whole, and what was cut short has none.
+
+use core::fmt;
+
+use recipe_store::{Place, SlotMarks, WORD, Word};
+
+use crate::check::{Bad, Check};
+use crate::header::{HEADER, Header, IMAGE_OFFSET};
+use crate::rules::{Downgrade, Refused, Running};
+use crate::{FIRST_WORD, SlotFlash, place};
+
+/// An update that is being received.
+#[derive(Debug)]
+pub struct Receive {
+    header: Header,
+    phase: Phase,
+    /// Bytes of the image that were taken.
+    taken: u32,
+    /// The word that they are collected in.
+    word: Word,
+    /// Number of bytes in it.
+    collected: usize,
+}
+
+/// What to do next.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Step {
+    /// Erase this sector of the slot.
+    Erase(u8),
+    /// Write this word of the slot.
+    Write(Place, Word),
+    /// Give the bytes of the image from here on ([`Receive::take`]).
+    Take {
+        /// Number of bytes that there are.
+        offset: u32,
+    },
+    /// Nothing, but other tasks may be waiting.
+    Again,
+    /// Nothing more: the slot holds the update, or nothing that can run.
+    End(Result<(), ReceiveError>),
+}
+
+/// Why an update is not in its slot.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum ReceiveError {
+    /// A word reads differently than it was written.
+    Worn(Place),
+    /// What was received is not what was signed.
+    Bad(Bad),
+}
+
+impl fmt::Display for ReceiveError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Worn(Place { sector, word }) => {
+                write!(f, "word {word} of sector {sector} does not keep what is written")
+            }
+            Self::Bad(bad) => bad.fmt(f),
+        }
+    }
+}
+
+impl core::error::Error for ReceiveError {}
+
+/// Bytes came that are not the next ones.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Gap {
+    /// Where the next ones begin.
+    pub expected: u32,
+}
+
+impl fmt::Display for Gap {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "the next bytes are those from {} on", self.expected)
+    }
+}
+
+impl core::error::Error for Gap {}
+
+#[derive(Debug)]
+#[allow(clippy::large_enum_variant, reason = "there is no heap")]
+enum Phase {
+    /// From this sector on: the first one has the header.
+    Erase {
+        sector: u8,
+        end: u8,
+    },
+    Fill,
+    /// The collected word was written here.
+    Written(Place),
+    Hash(Check),
+    /// The word of the header of this index in [`ORDER`] is next.
+    Header {
+        nth: usize,
+    },
+    HeaderWritten {
+        nth: usize,
+    },
+    End(Result<(), ReceiveError>),
+}
+
+impl Receive {
+    /// Begins, if the update may be taken. `flash` is the slot that does not run.
+    ///
+    /// The signature is not checked here but by [`Header::verify`], where it delays no cell, and by the loader.
+    ///
+    /// # Errors
+    /// Why it is not taken; nothing was changed.
+    pub fn begin(
+        header: Header,
+        running: &Running,
+        marks: SlotMarks,
+        downgrade: Downgrade,
+        flash: &impl SlotFlash,
+    ) -> Result<Self, Refused> {
+        running.accepts(&header, flash, marks, downgrade)?;
+        let bytes = u32::from(flash.geometry().words).saturating_mul(WORD as u32);
+        let sectors = header.length().saturating_add(IMAGE_OFFSET).div_ceil(bytes.max(1));
+        let end = u8::try_from(sectors).unwrap_or(u8::MAX);
+        Ok(Self { header, phase: Phase::Erase { sector: 0, end }, taken: 0, word: FILL, collected: 0 })
+    }
+
+    /// What is received.
+    pub fn header(&self) -> &Header {
+        &self.header
+    }
+
+    /// Number of bytes of the image that were taken: where a lost connection goes on.
+    pub fn taken(&self) -> u32 {
+        self.taken
+    }
+
+    /// Takes bytes of the image, at most up to the next word, and returns how many. More are taken after
+    /// [`Receive::next`] was followed.
+    ///
+    /// # Errors
+    /// They are not the next ones. Nothing was taken.
+    pub fn take(&mut self, offset: u32, bytes: &[u8]) -> Result<usize, Gap> {
+        if offset != self.taken {
+            return Err(Gap { expected: self.taken });
+        }
+        if !matches!(self.phase, Phase::Fill) || self.is_full() {
+            return Ok(0);
+        }
+        let left = self.header.length().saturating_sub(self.taken);
+        let room = WORD.saturating_sub(self.collected).min(left as usize);
+        let mut count: usize = 0;
+        for (place, byte) in self.word.iter_mut().skip(self.collected).zip(bytes.iter().take(room)) {
+            *place = *byte;
+            count = count.saturating_add(1);
+        }
+        self.collected = self.collected.saturating_add(count);
+        self.taken = self.taken.saturating_add(count as u32);
+        Ok(count)
+    }
+
+    /// Whether the collected word is to be written: it is full, or the last one.
+    fn is_full(&self) -> bool {
+        self.collected == WORD || self.collected > 0 && self.taken == self.header.length()
+    }
+
+    /// What to do next; called again when that is done, until it is [`Step::End`].
+    pub fn next(&mut self, flash: &impl SlotFlash) -> Step {
+        loop {
+            match &mut self.phase {
+                Phase::Erase { sector, end } => {
+                    if sector < end {
+                        let erased = *sector;
+                        *sector = sector.saturating_add(1);
+                        return Step::Erase(erased);
+                    }
+                    self.phase = Phase::Fill;
+                }
+                Phase::Fill => {
+                    if !self.is_full() {
+                        return Step::Take { offset: self.taken };
+                    }
+                    let word = self.taken.saturating_sub(1).checked_div(WORD as u32).unwrap_or(0);
+                    // It was checked that the image has room.
+                    let Some(at) = place(flash, FIRST_WORD.saturating_add(word)) else {
+                        self.phase = Phase::End(Err(ReceiveError::Bad(Bad::Crc)));
+                        continue;
+                    };
+                    self.phase = Phase::Written(at);
+                    return Step::Write(at, self.word);
+                }
+                Phase::Written(at) => {
+                    let at = *at;
+                    self.phase = if flash.whole(at) != Some(self.word) {
+                        Phase::End(Err(ReceiveError::Worn(at)))
+                    } else if self.taken == self.header.length() {
+                        Phase::Hash(Check::contents(self.header))
+                    } else {
+                        (self.word, self.collected) = (FILL, 0);
+                        Phase::Fill
+                    };
+                }
+                Phase::Hash(check) => match check.step(flash, AT_ONCE) {
+                    None => return Step::Again,
+                    Some(Ok(())) => self.phase = Phase::Header { nth: 0 },
+                    Some(Err(bad)) => self.phase = Phase::End(Err(ReceiveError::Bad(bad))),
+                },
+                Phase::Header { nth } => {
+                    let nth = *nth;
+                    let Some((at, word)) = self.header_word(nth) else {
+                        self.phase = Phase::End(Ok(()));
+                        continue;
+                    };
+                    self.phase = Phase::HeaderWritten { nth };
+                    return Step::Write(at, word);
+                }
+                Phase::HeaderWritten { nth } => {
+                    let nth = *nth;
+                    self.phase = match self.header_word(nth) {
+                        Some((at, word)) if flash.whole(at) != Some(word) => {
+                            Phase::End(Err(ReceiveError::Worn(at)))
+                        }
+                        _ => Phase::Header { nth: nth.saturating_add(1) },
+                    };
+                }
+                Phase::End(result) => return Step::End(*result),
+            }
+        }
+    }
+
+    /// The nth word of the header that is written; `None` behind the last.
+    fn header_word(&self, nth: usize) -> Option<(Place, Word)> {
+        let word = *ORDER.get(nth)?;
+        let bytes = self.header.encode();
+        let part = bytes.as_chunks::<WORD>().0.get(usize::from(word))?;
+        Some((Place { sector: 0, word }, *part))
+    }
+}
+
+/// Behind the end of an image.
+const FILL: Word = [0xFF; WORD];
+/// Words of the header as they are written: the one with the magic number last.
+const ORDER: [u16; HEADER / WORD] = [0, 1, 3, 4, 5, 2];
+/// Words that are hashed at a time: 4 KiB, about 0.5 million instructions.
+const AT_ONCE: u16 = 128;

@@ -1,0 +1,137 @@
+//! Which update is refused before anything is erased, and which configurations a firmware on trial may keep.
+
+use core::fmt;
+
+use recipe_store::{Slot, SlotMarks};
+
+use crate::SlotFlash;
+use crate::check::{Bad, fits};
+use crate::header::{BoardName, Formats, Header, Version};
+
+/// The firmware that receives an update.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Running {
+    /// Its board.
+    pub board: BoardName,
+    /// The slot it runs in.
+    pub slot: Slot,
+    /// Its version.
+    pub version: Version,
+    /// The oldest and the newest version of the images in the store that may have to run after the update: the live
+    /// one, the one before it, and the one on trial. `None` if there is none.
+    pub kept: Option<(u32, u32)>,
+}
+
+/// What to do with an older firmware.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Downgrade {
+    /// Refuse it.
+    Refused,
+    /// Take it: somebody has asked for it.
+    Allowed,
+}
+
+/// Why an update is not taken.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Refused {
+    /// It cannot run in the free slot of this board.
+    Bad(Bad),
+    /// It is older than what runs.
+    Older {
+        /// Its version.
+        offered: Version,
+        /// The version that runs.
+        running: Version,
+    },
+    /// It would not read the configurations of this board.
+    Format {
+        /// The version of a configuration that is kept.
+        kept: u32,
+        /// What the update reads.
+        reads: Formats,
+    },
+    /// It would not read the store of this board.
+    Store {
+        /// The version that it reads.
+        offered: u32,
+    },
+    /// A firmware is on trial: the other slot is the way back.
+    OnTrial,
+    /// The running slot is not marked as the good one. There is no loader, or something went wrong.
+    NotGood,
+}
+
+impl fmt::Display for Refused {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Bad(bad) => bad.fmt(f),
+            Self::Older { offered, running } => {
+                write!(
+                    f,
+                    "the firmware {offered} is older than the one that runs, {running}; a downgrade has to be asked for"
+                )
+            }
+            Self::Format { kept, reads: Formats { oldest, newest, .. } } => write!(
+                f,
+                "a configuration of this board has version {kept}; the firmware reads {oldest} to {newest}"
+            ),
+            Self::Store { offered } => write!(
+                f,
+                "the firmware keeps a store of version {offered}; the one of this board has version {}",
+                recipe_store::VERSION
+            ),
+            Self::OnTrial => f.write_str("a firmware is on trial; confirm it or take it back first"),
+            Self::NotGood => f.write_str("the running firmware is not marked as the good one"),
+        }
+    }
+}
+
+impl core::error::Error for Refused {}
+
+impl Running {
+    /// Whether an update may be written into the free slot.
+    ///
+    /// # Errors
+    /// Why not.
+    pub fn accepts(
+        &self,
+        header: &Header,
+        flash: &impl SlotFlash,
+        marks: SlotMarks,
+        downgrade: Downgrade,
+    ) -> Result<(), Refused> {
+        if marks.trial.is_some() {
+            return Err(Refused::OnTrial);
+        }
+        if marks.good != Some(self.slot) {
+            return Err(Refused::NotGood);
+        }
+        fits(header, flash, self.slot.other(), &self.board).map_err(Refused::Bad)?;
+        let (offered, running) = (header.version(), self.version);
+        if offered < running && downgrade == Downgrade::Refused {
+            return Err(Refused::Older { offered, running });
+        }
+        // Also if a downgrade was asked for: nobody asks for silent buses.
+        let reads = header.parts().formats;
+        if let Some((oldest, newest)) = self.kept {
+            for kept in [oldest, newest] {
+                if !reads.reads(kept) {
+                    return Err(Refused::Format { kept, reads });
+                }
+            }
+        }
+        let offered = header.parts().store;
+        if offered != recipe_store::VERSION {
+            return Err(Refused::Store { offered });
+        }
+        Ok(())
+    }
+}
+
+/// Whether a configuration image of this version may be kept. While a firmware is on trial, the one before has to
+/// read it too: otherwise a roll back would leave the board without its configuration.
+pub fn may_keep(version: u32, running: &Formats, before: Option<&Formats>, marks: SlotMarks) -> bool {
+    let is_read_before = before.is_none_or(|before| before.reads(version));
+    running.reads(version) && (marks.trial.is_none() || is_read_before)
+}
