@@ -1,0 +1,152 @@
+//! The flash of slots and stores. RM0433, "Embedded Flash memory".
+//!
+//! A word that a power cut has torn has no valid error correction code, and reading it is a bus fault, so each word
+//! is first read once with bus faults ignored. While a word of the first bank is written the core stands still: the
+//! loader has nothing else to do.
+
+use core::sync::atomic::{Ordering, fence};
+
+use recipe_store::{Flash, Geometry, Place, Side, WORD, Word};
+use recipe_update::{NUCLEO_H743ZI as BOARD, Slot, SlotFlash};
+
+use crate::readable::can_read;
+use crate::register::Register;
+use crate::watchdog;
+
+/// A slot or a place for the store.
+pub(crate) struct Area {
+    /// Address of each sector.
+    sectors: [u32; 5],
+    count: u8,
+}
+
+impl Area {
+    /// # Safety
+    /// Nothing else is made for this slot.
+    pub(crate) unsafe fn slot(slot: Slot) -> Self {
+        let start = BOARD.slot(slot);
+        let sectors = [0, 1, 2, 3, 4].map(|nth: u32| start.saturating_add(nth.saturating_mul(BOARD.sector)));
+        Self { sectors, count: BOARD.slot_sectors }
+    }
+
+    /// # Safety
+    /// Nothing else is made for this place.
+    pub(crate) unsafe fn store(side: Side) -> Self {
+        let [first, second] = BOARD.store(side);
+        Self { sectors: [first, second, second, second, second], count: 2 }
+    }
+
+    /// Address of a word; that of the first for one that there is not.
+    fn address(&self, Place { sector, word }: Place) -> usize {
+        let [first, ..] = self.sectors;
+        let start = self.sectors.get(usize::from(sector)).copied().unwrap_or(first);
+        start as usize + WORD * usize::from(word)
+    }
+}
+
+const _: () = assert!(BOARD.slot_sectors == 5);
+
+impl SlotFlash for Area {
+    fn whole(&self, place: Place) -> Option<Word> {
+        let address = self.address(place);
+        // SAFETY: a word of the flash, which was readable just now; it is not written meanwhile.
+        can_read(address)
+            .then(|| unsafe { core::ptr::with_exposed_provenance::<Word>(address).read_volatile() })
+    }
+}
+
+impl Flash for Area {
+    fn geometry(&self) -> Geometry {
+        Geometry { sectors: self.count, words: (BOARD.sector / WORD as u32) as u16 }
+    }
+
+    fn read(&self, place: Place) -> Word {
+        self.whole(place).unwrap_or([0; WORD])
+    }
+
+    async fn write(&mut self, place: Place, word: &Word) {
+        let address = self.address(place);
+        let bank = Bank::of(address);
+        bank.unlock();
+        bank.control(FASTEST | PROGRAM);
+        barrier();
+        let start = core::ptr::with_exposed_provenance_mut::<u32>(address);
+        for (nth, part) in word.as_chunks().0.iter().enumerate() {
+            // SAFETY: within the word, in flash that is this area's; its bank is unlocked for it.
+            unsafe { start.add(nth).write_volatile(u32::from_le_bytes(*part)) }
+        }
+        barrier();
+        bank.finish();
+    }
+
+    async fn erase(&mut self, sector: u8) {
+        let address = self.address(Place { sector, word: 0 });
+        let bank = Bank::of(address);
+        let number = (address as u32 % BANK) / BOARD.sector;
+        bank.unlock();
+        let control = FASTEST | ERASE_SECTOR | number << 8;
+        bank.control(control);
+        bank.control(control | BEGIN);
+        barrier();
+        bank.finish();
+    }
+}
+
+/// The registers of one of the two banks.
+struct Bank {
+    keys: Register,
+    control: Register,
+    status: Register,
+    clear: Register,
+}
+
+impl Bank {
+    fn of(address: usize) -> Self {
+        let base = FLASH_REGISTERS + if address as u32 & BANK == 0 { 0 } else { 0x100 };
+        // SAFETY: the registers of the flash's banks, which the loader alone uses.
+        let at = |offset: usize| unsafe { Register::at(base + offset) };
+        Self { keys: at(0x04), control: at(0x0C), status: at(0x10), clear: at(0x14) }
+    }
+
+    fn unlock(&self) {
+        watchdog::feed();
+        if self.control.read() & LOCK != 0 {
+            KEYS.into_iter().for_each(|key| self.keys.write(key));
+        }
+        // Flags of reading a torn word would refuse the operation.
+        self.clear.write(ALL_FLAGS);
+    }
+
+    fn control(&self, value: u32) {
+        self.control.write(value);
+    }
+
+    /// Waits for the bank, then locks it. If it never ends, the watchdog does it; if it did not succeed, it shows when
+    /// the word is read.
+    fn finish(&self) {
+        while self.status.read() & BUSY != 0 {}
+        self.clear.write(ALL_FLAGS);
+        self.control.write(FASTEST | LOCK);
+    }
+}
+
+fn barrier() {
+    fence(Ordering::SeqCst);
+    cortex_m::asm::dsb();
+    cortex_m::asm::isb();
+}
+
+const FLASH_REGISTERS: usize = 0x5200_2000;
+/// The bit of an address in the second bank, and the size of a bank.
+const BANK: u32 = 0x10_0000;
+const KEYS: [u32; 2] = [0x4567_0123, 0xCDEF_89AB];
+/// Clears all flags of a bank.
+const ALL_FLAGS: u32 = 0x0FEF_0000;
+const LOCK: u32 = 1;
+const PROGRAM: u32 = 1 << 1;
+const ERASE_SECTOR: u32 = 1 << 2;
+/// 64 bits at a time: the supply is 3.3 V.
+const FASTEST: u32 = 3 << 4;
+const BEGIN: u32 = 1 << 7;
+/// BSY and QW.
+const BUSY: u32 = 1 | 1 << 2;

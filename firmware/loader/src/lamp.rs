@@ -1,0 +1,32 @@
+//! LD3, the red lamp, at PB14: nothing can run.
+
+use crate::register::Register;
+use crate::watchdog;
+
+// SAFETY: registers of RCC and GPIOB, which the loader alone uses.
+const CLOCKS: Register = unsafe { Register::at(0x5802_44E0) };
+// SAFETY: as above.
+const MODE: Register = unsafe { Register::at(0x5802_0400) };
+// SAFETY: as above.
+const SET: Register = unsafe { Register::at(0x5802_0418) };
+
+const GPIOB: u32 = 1 << 1;
+const PIN: u32 = 14;
+const OUTPUT: u32 = 1;
+/// At least a quarter of a second at 64 MHz.
+const QUARTER: u32 = 16_000_000;
+
+/// Blinks once or twice a second for ever: only a probe helps.
+pub(crate) fn blink() -> ! {
+    CLOCKS.write(CLOCKS.read() | GPIOB);
+    // Enabling the clock takes two cycles.
+    CLOCKS.read();
+    MODE.write(MODE.read() & !(3 << (2 * PIN)) | OUTPUT << (2 * PIN));
+    loop {
+        for level in [PIN, PIN + 16] {
+            SET.write(1 << level);
+            watchdog::feed();
+            cortex_m::asm::delay(QUARTER);
+        }
+    }
+}
