@@ -5,7 +5,7 @@
 
 mod bare;
 
-use firmware::tasks::gateway::Engine;
+use firmware::tasks::gateway::SizedEngine as Engine;
 use proto_core::config::GatewayConfig;
 use proto_core::record::replay;
 use semihosting::fs::File;

@@ -4,6 +4,8 @@
 //! Messages below the chosen level are not in the image: the level is chosen at build time by `DEFMT_LOG`, or
 //! by the features `log-off`, `log-error` and `log-warn`.
 //!
+//! Messages from [`info!`](crate::info) on are also kept as text ([`crate::journal`]).
+//!
 //! Only `{}` with arguments after the text has the same meaning in both.
 
 use core::fmt;
@@ -23,19 +25,34 @@ macro_rules! debug {
 /// Logs a normal event.
 #[macro_export]
 macro_rules! info {
-    ($($text_and_values:tt)*) => { $crate::log_at!(info, $($text_and_values)*) };
+    ($($text_and_values:tt)*) => {{
+        $crate::log_at!(info, $($text_and_values)*);
+        $crate::journal::note($crate::journal::Level::Info, ::core::format_args!($($text_and_values)*));
+    }};
 }
 
 /// Logs a fault that the firmware handles.
 #[macro_export]
 macro_rules! warn {
-    ($($text_and_values:tt)*) => { $crate::log_at!(warn, $($text_and_values)*) };
+    ($($text_and_values:tt)*) => {{
+        $crate::log_at!(warn, $($text_and_values)*);
+        $crate::journal::note($crate::journal::Level::Warn, ::core::format_args!($($text_and_values)*));
+    }};
 }
 
 /// Logs why something cannot be done.
 #[macro_export]
 macro_rules! error {
-    ($($text_and_values:tt)*) => { $crate::log_at!(error, $($text_and_values)*) };
+    ($($text_and_values:tt)*) => {{
+        $crate::log_at!(error, $($text_and_values)*);
+        $crate::journal::note($crate::journal::Level::Error, ::core::format_args!($($text_and_values)*));
+    }};
+}
+
+/// Logs what is repeated so often that it would push everything else out of the journal.
+#[macro_export]
+macro_rules! traffic {
+    ($($text_and_values:tt)*) => { $crate::log_at!(info, $($text_and_values)*) };
 }
 
 #[doc(hidden)]

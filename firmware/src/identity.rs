@@ -1,5 +1,9 @@
 //! Addresses and seeds derived from a chip's unique number.
 
+use core::fmt::Write;
+
+use heapless::String;
+
 /// A locally administered unicast Ethernet address.
 pub fn ethernet_address(unique: &[u8]) -> [u8; 6] {
     let [_, _, first, rest @ ..] = hash(unique).to_be_bytes();
@@ -7,6 +11,18 @@ pub fn ethernet_address(unique: &[u8]) -> [u8; 6] {
     // Bit 1: locally administered. Bit 0: multicast.
     [first & !0b11 | 0b10, b, c, d, e, f]
 }
+
+/// The name that a board has in the network: `rgw-` and the last three bytes of its Ethernet address.
+pub fn host_name(address: [u8; 6]) -> String<NAME> {
+    let [.., a, b, c] = address;
+    let mut name = String::new();
+    // It has room for all of them.
+    let _ = write!(name, "rgw-{a:02x}{b:02x}{c:02x}");
+    name
+}
+
+/// Length of a host name.
+pub const NAME: usize = 10;
 
 /// FNV-1a.
 pub fn hash(bytes: &[u8]) -> u64 {
@@ -25,6 +41,11 @@ mod tests {
     fn hash_is_the_published_one() {
         assert_eq!(hash(b""), 0xCBF2_9CE4_8422_2325);
         assert_eq!(hash(b"foobar"), 0x8594_4171_F739_67E8);
+    }
+
+    #[test]
+    fn the_name_is_that_of_the_address() {
+        assert_eq!(host_name([2, 0x11, 0x22, 0x03, 0xAB, 0xFF]), "rgw-03abff");
     }
 
     #[test]

@@ -11,9 +11,11 @@ mod clock;
 pub mod drivers;
 pub mod fmt;
 pub mod identity;
+pub mod journal;
 pub mod kept;
 pub mod platform;
 pub mod tasks;
+pub mod update;
 
 #[cfg(test)]
 extern crate std;

@@ -3,16 +3,64 @@
 //! A board hands out its devices, each once. It knows no protocol. How to add a board, and how to test it, is in
 //! docs/boards.md.
 
-use core::fmt::{Debug, Display};
+use core::fmt::{self, Debug, Display};
 use core::future::Future;
 
 use embassy_net_driver::Driver;
 use embassy_time::Duration;
-use proto_core::config::Rs485;
+use proto_core::config::{Bus, Rs485};
+use recipe_update::SlotFlash;
 
 use crate::drivers::can_port::CanPort;
 use crate::drivers::line::Line;
-use crate::kept::StoreFlash;
+use crate::kept::{Places, StoreFlash};
+use crate::update::Site;
+
+/// Numbers of field ports that a board has.
+#[derive(Debug, Clone, Copy)]
+pub struct Ports {
+    /// RS-485 lines.
+    pub lines: usize,
+    /// CAN buses.
+    pub buses: usize,
+}
+
+/// A configuration has more ports than the board.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct NoDevice {
+    /// The first port that there is none for, from 0.
+    pub port: u8,
+    /// Its bus.
+    pub bus: &'static str,
+    /// How many of them the board has.
+    pub available: usize,
+}
+
+impl Display for NoDevice {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { port, bus, available } = self;
+        write!(f, "port {}: this board has {available} {bus} ports", port.saturating_add(1))
+    }
+}
+
+impl Ports {
+    /// Whether a board with these has one for each of the configuration's ports.
+    ///
+    /// # Errors
+    /// The first that it has none for.
+    pub fn have<'c>(self, wanted: impl Iterator<Item = &'c Bus>) -> Result<(), NoDevice> {
+        let (mut lines, mut buses) = (self.lines, self.buses);
+        for (port, bus) in (0..).zip(wanted) {
+            let (left, bus, available) = match bus {
+                Bus::Rs485(_) => (&mut lines, "RS-485", self.lines),
+                Bus::Can { .. } => (&mut buses, "CAN", self.buses),
+                Bus::TcpListen { .. } | Bus::UdpListen { .. } => continue,
+            };
+            *left = left.checked_sub(1).ok_or(NoDevice { port, bus, available })?;
+        }
+        Ok(())
+    }
+}
 
 /// A board.
 ///
@@ -20,6 +68,8 @@ use crate::kept::StoreFlash;
 /// are called during the start, before any device is used; `ethernet` is called last, so that the field buses
 /// run without a PHY.
 pub trait Board {
+    /// Its name, as updates of its firmware have it.
+    const NAME: &'static str;
     /// Number of RS-485 lines, assigned to the configuration's ports in order.
     const SERIAL_PORTS: usize;
     /// Number of CAN buses, assigned likewise.
@@ -38,8 +88,12 @@ pub trait Board {
     type Watchdog: FeedWatchdog;
     /// The status LED.
     type Led: StatusLed;
+    /// The button that lets the board take a key.
+    type Button: Button + 'static;
     /// The flash of the store.
     type Flash: StoreFlash + 'static;
+    /// The flash of the slot that the program does not run in.
+    type Slot: SlotFlash + 'static;
     /// Why there is no configuration image.
     type StorageError: Debug + Display + Copy;
     /// Why there is no Ethernet.
@@ -54,7 +108,10 @@ pub trait Board {
 
     /// The flash of the store (docs/store.md); called once. `None` if the board has none: it keeps nothing, and
     /// runs the image above.
-    fn flash(&mut self) -> Option<Self::Flash>;
+    fn flash(&mut self) -> Option<Places<Self::Flash>>;
+
+    /// The slots of the firmware (docs/update.md); called once.
+    fn slots(&mut self) -> Site<Self::Slot>;
 
     /// Waits for the flash during the start, when no task runs yet. A sector may take two seconds, so the watchdog
     /// is fed meanwhile; each operation of the flash has a time limit.
@@ -82,6 +139,13 @@ pub trait Board {
     /// A seed for local port numbers, different at each start.
     fn seed(&mut self) -> u64;
 
+    /// Random bytes that nobody can guess, for the console's nonces; `None` if the board cannot make them, and then it
+    /// has no console. Neither the clock nor the chip's number is a source of them.
+    fn random(&mut self) -> Option<[u8; 32]>;
+
+    /// The button; called once.
+    fn button(&mut self) -> Self::Button;
+
     /// Highest stack use so far, in bytes.
     fn stack_used(&self) -> usize;
 }
@@ -90,6 +154,12 @@ pub trait Board {
 pub trait FeedWatchdog {
     /// Restarts the watchdog's period.
     fn feed(&mut self);
+}
+
+/// A button.
+pub trait Button {
+    /// Whether it is pressed at the moment. Asked twenty times a second.
+    fn is_pressed(&mut self) -> bool;
 }
 
 /// An LED.

@@ -5,20 +5,26 @@
 use core::pin::pin;
 
 use embassy_executor::{SpawnError, SpawnToken, Spawner};
-use embassy_net::{Config, Ipv4Cidr, Runner, Stack, StackResources, StaticConfigV4};
+use embassy_net::{Config, DhcpConfig, Ipv4Cidr, Runner, Stack, StackResources, StaticConfigV4};
+use embassy_net_driver::{Driver as _, HardwareAddress};
 use embassy_time::{Duration, Timer};
 use firmware::fmt::Text;
-use firmware::kept::{self, Kept, RoleName};
-use firmware::platform::{self, FeedWatchdog as _, StatusLed as _};
+use firmware::identity;
+use firmware::kept::{self, EndedName, Kept, RoleName};
+use firmware::platform::{self, FeedWatchdog as _, NoDevice, Ports, StatusLed as _};
+use firmware::tasks::console::{self, CONNECTIONS, Console};
 use firmware::tasks::fair::Fair;
 use firmware::tasks::gateway::{Gateway, MAX_LINKS};
+use firmware::tasks::keeper::{self, Desk};
 use firmware::tasks::led::Condition;
 use firmware::tasks::link::{Buffers, Endpoint};
 use firmware::tasks::watchdog::{Pulse, TaskName};
 use firmware::tasks::{can, led, link, serial, watchdog};
+use firmware::update::{Site, Updates};
 use firmware::{error, info, warn};
 use proto_core::config::{Bus, GatewayConfig, Network, image};
 use proto_core::engine::{LinkId, LinkKind, PortId};
+use recipe_store::Role;
 use static_cell::{ConstStaticCell, StaticCell};
 
 use crate::board::Board;
@@ -31,12 +37,16 @@ type Ethernet = <Board as platform::Board>::Ethernet;
 type Watchdog = <Board as platform::Board>::Watchdog;
 type Led = <Board as platform::Board>::Led;
 type Flash = <Board as platform::Board>::Flash;
+type BoardSlot = <Board as platform::Board>::Slot;
+type BoardButton = <Board as platform::Board>::Button;
 const SERIAL_PORTS: usize = <Board as platform::Board>::SERIAL_PORTS;
 const CAN_PORTS: usize = <Board as platform::Board>::CAN_PORTS;
+const PORTS: Ports = Ports { lines: SERIAL_PORTS, buses: CAN_PORTS };
 const WATCHDOG_PERIOD: Duration = <Board as platform::Board>::WATCHDOG_PERIOD;
 
 /// Starts the tasks of the configuration, and returns what a board needs to start tasks of its own.
-/// Without a configuration that can run, the buses stay silent and the log says why.
+/// Without a configuration that can run, the buses stay silent and the log says why; the console is there all the
+/// same, to give the board another one.
 pub(crate) fn start(spawner: Spawner, mut board: Board) -> Tasks {
     info!("recipe gateway {}", env!("CARGO_PKG_VERSION"));
     let mut led = board.led();
@@ -48,20 +58,64 @@ pub(crate) fn start(spawner: Spawner, mut board: Board) -> Tasks {
     // Both are all zeros, so they take no flash, and are not built on the stack.
     static GATEWAY: ConstStaticCell<Gateway> = ConstStaticCell::new(Gateway::idle());
     static OVERLAY: ConstStaticCell<Overlay> = ConstStaticCell::new(Overlay::ZEROED);
-    let overlay = OVERLAY.take();
-    let loaded = load(&mut board, GATEWAY.take(), overlay.configuration());
-    let gateway = loaded.as_ref().ok().map(|loaded| loaded.gateway);
-    let started = loaded.and_then(|loaded| {
-        if let Some((kept, work)) = loaded.keeper {
-            tasks.spawn(TaskName::Keeper, |pulse| keeper(pulse, kept, work));
-        }
-        run(&tasks, board, loaded.gateway, loaded.wiring, overlay.links())
-    });
-    tasks.spawn(TaskName::Led, |pulse| status_led(pulse, gateway.filter(|_| started.is_ok()), led));
-    if let Err(reason) = started {
+    let (gateway, overlay) = (GATEWAY.take(), OVERLAY.take());
+    let mut kept = open_store(&mut board);
+    let mut work = keeper::Work::default();
+    let mut failure = None;
+    let config = overlay.configuration();
+    let loaded = load(&mut board, kept.as_deref_mut(), gateway, config, &mut work, &mut failure);
+    let mut wiring = Wiring { ports: heapless::Vec::new(), links: heapless::Vec::new(), network: None };
+    if let Ok(len) = loaded {
+        wire(len, gateway, config, &mut wiring);
+    }
+    let gateway: &'static Gateway = gateway;
+    let key = kept.as_ref().and_then(|kept| kept.access_key());
+    let slots = board.slots();
+    let desk = kept.and_then(|kept| open_desk(&tasks, gateway, kept, slots, work, failure));
+    let ran = loaded.and_then(|_| run_ports(&tasks, &mut board, gateway, &wiring));
+    if ran.is_err() {
+        wiring.links.clear();
+    }
+    let connected = connect(&tasks, &mut board, gateway, desk, key, &wiring, overlay.links());
+    let console = connected.as_ref().ok().copied().flatten();
+    let refused_why = ran.err().or(connected.err());
+    let shown = Shown { gateway: refused_why.is_none().then_some(gateway), console };
+    tasks.spawn(TaskName::Led, |pulse| status_led(pulse, shown, led));
+    if let Some(reason) = refused_why {
         tasks.spawn(TaskName::Refused, |pulse| refused(pulse, reason));
     }
     tasks
+}
+
+/// Reads the store; `None` if the board has none, or none that this program may use.
+#[inline(never)]
+fn open_store(board: &mut Board) -> Option<&'static mut Kept<Flash>> {
+    static KEPT: StaticCell<Kept<Flash>> = StaticCell::new();
+    let places = board.flash()?;
+    let kept = Kept::open(places).inspect_err(|error| error!("{}", Text(error))).ok()?;
+    Some(KEPT.init(kept))
+}
+
+/// Starts the keeper.
+#[inline(never)]
+fn open_desk(
+    tasks: &Tasks,
+    gateway: &'static Gateway,
+    kept: &'static mut Kept<Flash>,
+    slots: Site<BoardSlot>,
+    work: keeper::Work<'static>,
+    failure: Option<Refused>,
+) -> Option<&'static Desk> {
+    static UPDATES: StaticCell<Updates<BoardSlot>> = StaticCell::new();
+    let updates = UPDATES.init(Updates::new(slots)?);
+    static IMAGE: ConstStaticCell<[u8; image::MAX_IMAGE]> = ConstStaticCell::new([0; image::MAX_IMAGE]);
+    static DESK: StaticCell<Desk> = StaticCell::new();
+    let desk: &'static Desk = DESK.init_with(|| Desk::new(IMAGE.take()));
+    if let Some(failure) = failure {
+        desk.failed(&failure);
+    }
+    tasks.spawn(TaskName::Keeper, |pulse| keep(pulse, gateway, desk, kept, updates, work));
+    Some(desk)
 }
 
 /// Starts tasks. All tasks are started through it, so the watchdog knows all of them.
@@ -91,11 +145,7 @@ enum Refused {
     Storage(<Board as platform::Board>::StorageError),
     Image(image::ImageError),
     Build(proto_core::engine::BuildError),
-    NoDevice {
-        port: u8,
-        bus: &'static str,
-        available: usize,
-    },
+    NoDevice(NoDevice),
     /// The store has no configuration, and the image on the board was taken over and is gone.
     Empty,
     Ethernet(<Board as platform::Board>::EthernetError),
@@ -107,9 +157,7 @@ impl core::fmt::Display for Refused {
             Self::Storage(error) => error.fmt(f),
             Self::Image(error) => error.fmt(f),
             Self::Build(error) => error.fmt(f),
-            Self::NoDevice { port, bus, available } => {
-                write!(f, "port {}: this board has {available} {bus} ports", port + 1)
-            }
+            Self::NoDevice(missing) => missing.fmt(f),
             Self::Empty => f.write_str("the store holds no configuration"),
             Self::Ethernet(error) => error.fmt(f),
         }
@@ -123,12 +171,12 @@ struct Wiring {
     network: Option<Network>,
 }
 
-/// Memory for the configuration during the start, and for the links' buffers afterwards.
+/// Memory for the configuration during the start, and for the buffers of links and console afterwards.
 #[allow(clippy::large_enum_variant, reason = "both share one memory")]
 #[repr(u8)]
 enum Overlay {
     Configuration(GatewayConfig),
-    Links(heapless::Vec<u8, { MAX_LINKS * Buffers::SIZE }>),
+    Links(heapless::Vec<u8, { MAX_LINKS * Buffers::SIZE + CONNECTIONS * console::Buffers::SIZE }>),
 }
 
 impl Overlay {
@@ -151,25 +199,10 @@ impl Overlay {
     }
 }
 
-/// A configuration that runs.
-struct Loaded {
-    gateway: &'static Gateway,
-    wiring: Wiring,
-    /// What is to be done with the store while it runs.
-    keeper: Option<(Kept<Flash>, KeeperWork)>,
-}
-
-/// Work of the keeper.
-#[derive(Clone, Copy)]
-enum KeeperWork {
-    /// This image came from outside the store: it becomes the live one.
-    Adopt(&'static [u8]),
-    /// What runs is on trial for this long.
-    Trial(Duration),
-}
-
-/// The first configuration that can run: the image that was put on the board since the last start; of the store
-/// the one on trial, the live one, the one before; or else the image on the board, which was run before.
+/// Runs the first configuration that can run: the image that was put on the board since the last start; of the store
+/// the one on trial, the live one, the one before; or else the image on the board, which was run before. Returns the
+/// length of its image, or why none runs; leaves to the keeper what is to be done with the store, and in `failure` why
+/// the first one that was tried does not run.
 ///
 /// Nothing is written but the start of a trial, so that the start takes no longer than without a store.
 ///
@@ -177,59 +210,63 @@ enum KeeperWork {
 #[inline(never)]
 fn load(
     board: &mut Board,
-    gateway: &'static mut Gateway,
+    kept: Option<&mut Kept<Flash>>,
+    gateway: &mut Gateway,
     config: &mut GatewayConfig,
-) -> Result<Loaded, Refused> {
+    work: &mut keeper::Work<'static>,
+    failure: &mut Option<Refused>,
+) -> Result<usize, Refused> {
     let own = board.configuration().map_err(Refused::Storage).map(whole);
-    let opened = board.flash().map(Kept::open);
-    let kept = opened.and_then(|opened| opened.inspect_err(|error| error!("{}", Text(error))).ok());
-    let Some(mut kept) = kept else {
+    let Some(kept) = kept else {
         let (image, _) = own?;
-        configure(image, gateway, config)?;
-        let wiring = wiring(image.len(), gateway, config);
-        return Ok(Loaded { gateway, wiring, keeper: None });
+        return configure(image, gateway, config);
     };
+    // An empty place is no failure where the store has something.
     let mut why = own.err();
     if let Ok((image, digest)) = own
         && !kept.store().is_adopted(digest, image.len())
     {
         match configure(image, gateway, config) {
-            Ok(()) => {
-                let wiring = wiring(image.len(), gateway, config);
-                return Ok(Loaded { gateway, wiring, keeper: Some((kept, KeeperWork::Adopt(image))) });
+            Ok(len) => {
+                work.adopt = Some((digest, image));
+                return Ok(len);
             }
-            Err(error) => why = Some(error),
+            Err(error) => (why, *failure) = (Some(error), Some(error)),
         }
     }
     let mut candidates = heapless::Vec::new();
     if let Err(error) = board.block_on(kept.candidates(&mut candidates)) {
         error!("the store: {}", Text(&error));
     }
+    // A trial ends by a restart, whose log is the only one that somebody may look at.
+    if let Some((number, ended)) = kept.store().marks().last {
+        info!("the last trial was of configuration {}: {}", number, Text(&EndedName(ended)));
+    }
     let mut is_first = true;
     for (revision, role) in candidates {
         let Some(image) = kept.image(revision) else { continue };
         match configure(image, gateway, config) {
-            Ok(()) => {
+            Ok(len) => {
                 info!("configuration {} of the store, {}", revision.number, Text(&RoleName(role)));
-                let wiring = wiring(image.len(), gateway, config);
-                let keeper = kept::trial_time(role).map(|time| (kept, KeeperWork::Trial(time)));
-                return Ok(Loaded { gateway, wiring, keeper });
+                work.trial = kept::trial_time(role);
+                work.running = Some(revision.number);
+                return Ok(len);
             }
             Err(error) => {
                 error!("configuration {} of the store cannot run: {}", revision.number, Text(&error));
+                work.trial_failed |= matches!(role, Role::Trial { .. });
                 // It says more than an empty place.
                 if core::mem::take(&mut is_first) {
-                    why = Some(error);
+                    (why, *failure) = (Some(error), Some(error));
                 }
             }
         }
     }
     // Nothing of the store: the image on the board, although it was taken over.
     if let Ok((image, _)) = own
-        && configure(image, gateway, config).is_ok()
+        && let Ok(len) = configure(image, gateway, config)
     {
-        let wiring = wiring(image.len(), gateway, config);
-        return Ok(Loaded { gateway, wiring, keeper: None });
+        return Ok(len);
     }
     Err(why.unwrap_or(Refused::Empty))
 }
@@ -241,24 +278,28 @@ fn whole(bytes: &'static [u8]) -> (&'static [u8], u32) {
     (image, crc.map_or(0, |crc| u32::from_le_bytes(*crc)))
 }
 
-/// Not inlined: it is called in several places.
+/// Runs the configuration of an image; returns the image's length. Not inlined: it is called in several places.
 #[inline(never)]
-fn configure(bytes: &[u8], gateway: &mut Gateway, config: &mut GatewayConfig) -> Result<(), Refused> {
+fn configure(bytes: &[u8], gateway: &mut Gateway, config: &mut GatewayConfig) -> Result<usize, Refused> {
+    decode(bytes, config)?;
+    gateway.configure(config).map_err(Refused::Build)?;
+    Ok(bytes.len())
+}
+
+/// Reads an image whose ports this board has. Not inlined, so that its stack frame is free when the engine is built.
+#[inline(never)]
+fn decode(bytes: &[u8], config: &mut GatewayConfig) -> Result<(), Refused> {
     image::decode_into(bytes, config).map_err(Refused::Image)?;
-    gateway.configure(config).map_err(Refused::Build)
+    PORTS.have(config.ports.iter().map(|port| &port.bus)).map_err(Refused::NoDevice)
 }
 
 #[inline(never)]
-fn wiring(len: usize, gateway: &Gateway, config: &GatewayConfig) -> Wiring {
-    let wiring = Wiring {
-        ports: config
-            .view()
-            .field_ports()
-            .map(|(index, port, _)| (PortId(index), port.bus.clone()))
-            .collect(),
-        links: gateway.links().map(|(id, kind)| (id, kind, Endpoint::of(config, kind))).collect(),
-        network: config.network.fixed().copied(),
-    };
+fn wire(len: usize, gateway: &Gateway, config: &GatewayConfig, wiring: &mut Wiring) {
+    wiring
+        .ports
+        .extend(config.view().field_ports().map(|(index, port, _)| (PortId(index), port.bus.clone())));
+    wiring.links.extend(gateway.links().map(|(id, kind)| (id, kind, Endpoint::of(config, kind))));
+    wiring.network = config.network.fixed().copied();
     info!(
         "configuration: {} bytes; {} field ports, {} links; the engine has {} bytes, its configuration {}",
         len,
@@ -267,16 +308,15 @@ fn wiring(len: usize, gateway: &Gateway, config: &GatewayConfig) -> Wiring {
         size_of::<Gateway>(),
         size_of::<GatewayConfig>(),
     );
-    wiring
 }
 
+/// Starts the tasks of the field ports.
 #[inline(never)]
-fn run(
+fn run_ports(
     tasks: &Tasks,
-    mut board: Board,
+    board: &mut Board,
     gateway: &'static Gateway,
-    wiring: Wiring,
-    mut memory: &'static mut [u8],
+    wiring: &Wiring,
 ) -> Result<(), Refused> {
     // All devices are claimed before anything runs.
     let mut serial_ports: heapless::Vec<_, SERIAL_PORTS> = heapless::Vec::new();
@@ -285,12 +325,13 @@ fn run(
         match bus {
             Bus::Rs485(settings) => {
                 let line = board.serial(settings);
-                let missing = Refused::NoDevice { port: id.0, bus: "RS-485", available: SERIAL_PORTS };
+                let missing =
+                    Refused::NoDevice(NoDevice { port: id.0, bus: "RS-485", available: SERIAL_PORTS });
                 let line = line.ok_or(missing)?;
                 let _ = serial_ports.push((*id, line, settings.baud));
             }
             Bus::Can { bitrate } => {
-                let missing = Refused::NoDevice { port: id.0, bus: "CAN", available: CAN_PORTS };
+                let missing = Refused::NoDevice(NoDevice { port: id.0, bus: "CAN", available: CAN_PORTS });
                 let _ = can_ports.push((*id, board.can(*bitrate).ok_or(missing)?));
             }
             Bus::TcpListen { .. } | Bus::UdpListen { .. } => {}
@@ -304,30 +345,87 @@ fn run(
         tasks.spawn(TaskName::Can(id), |pulse| can_port(pulse, gateway, id, can));
     }
     tasks.spawn(TaskName::Status, |pulse| status(pulse, gateway));
-    // The network is last, so that the field buses run without a PHY.
+    Ok(())
+}
+
+/// Starts the network, the console, and the links of what runs. It is last, so that the field buses run without a PHY.
+#[inline(never)]
+fn connect(
+    tasks: &Tasks,
+    board: &mut Board,
+    gateway: &'static Gateway,
+    desk: Option<&'static Desk>,
+    key: Option<[u8; 16]>,
+    wiring: &Wiring,
+    mut memory: &'static mut [u8],
+) -> Result<Option<&'static Console>, Refused> {
     let ethernet = board.ethernet().map_err(Refused::Ethernet)?;
-    static RESOURCES: StaticCell<StackResources<SOCKETS>> = StaticCell::new();
-    let resources = RESOURCES.init(StackResources::new());
-    let (stack, runner) = embassy_net::new(
-        Fair::new(ethernet, gateway),
-        network_config(wiring.network),
-        resources,
-        board.seed(),
-    );
+    let name = match ethernet.hardware_address() {
+        HardwareAddress::Ethernet(address) => identity::host_name(address),
+        _ => identity::host_name([0; 6]),
+    };
+    let (stack, runner) =
+        network_stack(Fair::new(ethernet, gateway), network_config(wiring.network, &name), board.seed());
     info!("stack: {} bytes while the engine was made", board.stack_used());
     tasks.spawn(TaskName::Network, |pulse| network(pulse, runner));
     tasks.spawn(TaskName::Address, |pulse| address(pulse, stack));
-    for (id, kind, endpoint) in wiring.links {
+    for (id, kind, endpoint) in &wiring.links {
+        let (id, kind, endpoint) = (*id, *kind, endpoint.clone());
         let buffers = Buffers::take(&mut memory, &endpoint).expect("there is room for MAX_LINKS");
         tasks.spawn(TaskName::Link(kind), |pulse| {
             controller_link(pulse, gateway, id, stack, endpoint, buffers)
         });
     }
-    Ok(())
+    Ok(start_console(tasks, board, gateway, desk, key, name, stack, memory))
 }
 
-fn network_config(own: Option<Network>) -> Config {
-    let Some(own) = own else { return Config::dhcpv4(Default::default()) };
+/// Starts the console; `None` if the board cannot have one.
+#[inline(never)]
+#[allow(clippy::too_many_arguments, reason = "each is used once")]
+fn start_console(
+    tasks: &Tasks,
+    board: &mut Board,
+    gateway: &'static Gateway,
+    desk: Option<&'static Desk>,
+    key: Option<[u8; 16]>,
+    name: heapless::String<{ identity::NAME }>,
+    stack: Stack<'static>,
+    mut memory: &'static mut [u8],
+) -> Option<&'static Console> {
+    let Some(secret) = board.random() else {
+        error!("no console: the board has no random numbers");
+        return None;
+    };
+    info!("name {}", name.as_str());
+    static CONSOLE: StaticCell<Console> = StaticCell::new();
+    let console: &'static Console =
+        CONSOLE.init_with(|| Console::new(gateway, desk, PORTS, name, key, secret));
+    for nth in 0..CONNECTIONS {
+        let buffers = console::Buffers::take(&mut memory).expect("there is room for CONNECTIONS");
+        tasks.spawn(TaskName::Console(nth as u8), |pulse| connection(pulse, console, stack, buffers));
+    }
+    let button = board.button();
+    tasks.spawn(TaskName::Button, |pulse| watch_button(pulse, console, button));
+    Some(console)
+}
+
+/// Not inlined, so that its stack frame is free when links and console are started.
+#[inline(never)]
+fn network_stack(
+    ethernet: Fair<'static, Ethernet>,
+    config: Config,
+    seed: u64,
+) -> (Stack<'static>, Runner<'static, Fair<'static, Ethernet>>) {
+    static RESOURCES: StaticCell<StackResources<SOCKETS>> = StaticCell::new();
+    embassy_net::new(ethernet, config, RESOURCES.init(StackResources::new()), seed)
+}
+
+fn network_config(own: Option<Network>, name: &str) -> Config {
+    let Some(own) = own else {
+        let mut config = DhcpConfig::default();
+        config.hostname = heapless::String::try_from(name).ok();
+        return Config::dhcpv4(config);
+    };
     Config::ipv4_static(StaticConfigV4 {
         address: Ipv4Cidr::new(own.address, own.prefix),
         gateway: own.router,
@@ -381,10 +479,36 @@ async fn network(pulse: &'static Pulse, mut runner: Runner<'static, Fair<'static
     pulse.run(pin!(pulse.idle(running.as_mut()))).await
 }
 
+/// What the LED shows.
+#[derive(Clone, Copy)]
+struct Shown {
+    /// `None` if nothing runs, or there is no Ethernet.
+    gateway: Option<&'static Gateway>,
+    console: Option<&'static Console>,
+}
+
 #[embassy_executor::task]
-async fn status_led(pulse: &'static Pulse, gateway: Option<&'static Gateway>, mut led: Led) -> ! {
-    let condition = || gateway.map_or(Condition::Refused, Gateway::condition);
+async fn status_led(pulse: &'static Pulse, shown: Shown, mut led: Led) -> ! {
+    let condition = || match shown.console {
+        Some(console) if console.is_identifying() => Condition::Identify,
+        _ => shown.gateway.map_or(Condition::Refused, Gateway::condition),
+    };
     pulse.run(pin!(led::run(pulse, condition, |is_lit| led.set(is_lit)))).await
+}
+
+#[embassy_executor::task(pool_size = CONNECTIONS)]
+async fn connection(
+    pulse: &'static Pulse,
+    console: &'static Console,
+    stack: Stack<'static>,
+    buffers: console::Buffers<'static>,
+) -> ! {
+    pulse.run(pin!(console.serve(pulse, stack, buffers))).await
+}
+
+#[embassy_executor::task]
+async fn watch_button(pulse: &'static Pulse, console: &'static Console, button: BoardButton) -> ! {
+    pulse.run(pin!(console.watch(pulse, button))).await
 }
 
 /// Logs the board's address whenever it changes.
@@ -410,34 +534,18 @@ async fn status(pulse: &'static Pulse, gateway: &'static Gateway) -> ! {
     pulse.run(pin!(firmware::tasks::status::run(gateway, pulse))).await
 }
 
-/// Changes the store while a configuration runs.
+/// Changes the store while a configuration runs, and restarts the board for another one.
 #[embassy_executor::task]
-async fn keeper(pulse: &'static Pulse, mut kept: Kept<Flash>, work: KeeperWork) -> ! {
-    let keeping = async {
-        match work {
-            KeeperWork::Adopt(image) => {
-                let (image, digest) = whole(image);
-                match pulse.idle(pin!(kept.adopt(digest, image))).await {
-                    Ok(_) => info!("the store has taken over the configuration"),
-                    Err(error) => error!("the store: {}", Text(&error)),
-                }
-            }
-            KeeperWork::Trial(time) => {
-                pulse.idle(pin!(Timer::after(time))).await;
-                warn!("the configuration was not confirmed in time: back to the live one");
-                if let Err(error) = pulse.idle(pin!(kept.end_trial())).await {
-                    error!("the store: {}", Text(&error));
-                }
-                // For the log. A configuration is only changed by a restart.
-                pulse.idle(pin!(Timer::after(LAST_WORDS))).await;
-                cortex_m::peripheral::SCB::sys_reset()
-            }
-        }
-        loop {
-            pulse.idle(pin!(core::future::pending::<()>())).await;
-        }
-    };
-    pulse.run(pin!(keeping)).await
+async fn keep(
+    pulse: &'static Pulse,
+    gateway: &'static Gateway,
+    desk: &'static Desk,
+    kept: &'static mut Kept<Flash>,
+    updates: &'static mut Updates<BoardSlot>,
+    work: keeper::Work<'static>,
+) -> ! {
+    pulse.run(pin!(keeper::run(gateway, pulse, desk, kept, updates, work))).await;
+    cortex_m::peripheral::SCB::sys_reset()
 }
 
 /// Logs the reason repeatedly, because the log may be read late.
@@ -453,11 +561,10 @@ async fn refused(pulse: &'static Pulse, reason: Refused) -> ! {
     pulse.run(pin!(telling)).await
 }
 
-/// One for each link, DHCP and DNS.
-const SOCKETS: usize = MAX_LINKS + 2;
+/// One for each link and connection, DHCP and DNS.
+const SOCKETS: usize = MAX_LINKS + CONNECTIONS + 2;
 /// Interval of that log line.
 const REPEAT: Duration = Duration::from_secs(10);
-/// Between the last log line and a restart.
-const LAST_WORDS: Duration = Duration::from_millis(100);
-/// A task for each port and link, and: engine, network, address, status, LED, refused, keeper, the board's own.
-const MAX_TASKS: usize = SERIAL_PORTS + CAN_PORTS + MAX_LINKS + 8;
+/// A task for each port, link and connection, and: engine, network, address, status, LED, refused, keeper, button,
+/// the board's own.
+const MAX_TASKS: usize = SERIAL_PORTS + CAN_PORTS + MAX_LINKS + CONNECTIONS + 9;

@@ -12,7 +12,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::time::{Duration, Instant};
 
 use embassy_futures::block_on;
-use recipe_store::{Flash, Geometry, Marks, Place, Store, Trial, WORD, Word};
+use recipe_store::{Ended, Flash, Geometry, Marks, Place, Store, Trial, WORD, Word};
 
 /// A running machine, with the lines of its log.
 struct Machine {
@@ -347,7 +347,7 @@ impl StoreFile {
 
     fn read(path: &Path) -> Self {
         let mut bytes = std::fs::read(path).unwrap();
-        bytes.resize(3 * STORE_SECTOR, 0xFF);
+        bytes.resize(2 * STORE_SECTOR, 0xFF);
         Self(path.into(), bytes)
     }
 
@@ -358,7 +358,7 @@ impl StoreFile {
 
 impl Flash for StoreFile {
     fn geometry(&self) -> Geometry {
-        Geometry { sectors: 3, words: (STORE_SECTOR / WORD) as u16 }
+        Geometry { sectors: 2, words: (STORE_SECTOR / WORD) as u16 }
     }
 
     fn read(&self, place: Place) -> Word {
@@ -392,16 +392,20 @@ fn the_store_keeps_what_runs_and_a_trial_ends() {
     assert_eq!((live.number, live.len), (1, bytes.len()));
     block_on(store.keep(2, 2, &bytes, None).unwrap().carry_out(&mut file)).unwrap();
     let trial = Some(Trial { number: 2, attempts: 3, confirm_s: 1 });
-    let marks = Marks { live: Some(1), previous: None, trial };
+    let marks = Marks { live: Some(1), trial, ..Marks::default() };
     block_on(store.mark(marks).unwrap().carry_out(&mut file)).unwrap();
     file.save();
     let mut machine = Machine::with_store(nothing(), &path);
     machine.until("configuration 2 of the store, on trial for 1 s");
     machine.until("was not confirmed in time");
     // By a restart of its own.
+    machine.until("the last trial was of configuration 2: nobody confirmed it in time");
     machine.until("configuration 1 of the store, the live one");
     drop(machine);
-    assert_eq!(Store::mount(&StoreFile::read(&path)).unwrap().marks(), Marks { trial: None, ..marks });
+    assert_eq!(
+        Store::mount(&StoreFile::read(&path)).unwrap().marks(),
+        Marks { trial: None, last: Some((2, Ended::NotConfirmed)), ..marks }
+    );
 }
 
 /// The task with the injected fault.

@@ -31,6 +31,9 @@ pub(crate) fn all() {
 fn config_image_decode(config: &mut GatewayConfig) {
     let _ = black_box(image::decode_into(bytes(), config));
     let _ = black_box(image::image_len(bytes()));
+    let mut scan = black_box(image::Scan::new());
+    let _ = black_box(scan.step(bytes()));
+    black_box(scan.buses());
 }
 
 #[inline(never)]

@@ -2,7 +2,7 @@
 
 use core::hint::black_box;
 
-use firmware::tasks::gateway::Engine;
+use firmware::tasks::gateway::SizedEngine as Engine;
 use proto_core::config::GatewayConfig;
 use proto_core::engine::{Engine as AnyEngine, Input, LinkId, MAX_TAPPED, OUTPUT_BUFFER, PortId};
 use proto_core::histogram::Histogram;

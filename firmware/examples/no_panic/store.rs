@@ -11,7 +11,7 @@ struct Any;
 
 impl Flash for Any {
     fn geometry(&self) -> Geometry {
-        any(Geometry { sectors: 3, words: 4096 })
+        any(Geometry { sectors: 2, words: 4096 })
     }
 
     fn read(&self, place: Place) -> Word {
@@ -53,7 +53,7 @@ fn store_questions(store: &Store) {
 #[inline(never)]
 fn store_changes(store: &mut Store) {
     let trial = any(Some(Trial { number: 3, attempts: 1, confirm_s: 1 }));
-    let marks = any(Marks { live: Some(1), previous: None, trial });
+    let marks = any(Marks { live: Some(1), trial, ..Marks::default() });
     let _ = store.mark(marks).map(store_put);
     let _ = store.keep(any(1), any(2), bytes(), any(None)).map(store_put);
     let _ = store.put(any(Key::Counter(1)), any(2), bytes()).map(store_put);

@@ -20,7 +20,7 @@ const WORDS: u16 = 256;
 
 impl Plain {
     fn new() -> Self {
-        Self { words: vec![BLANK; 3 * usize::from(WORDS)], bytes: List::new(), is_broken: false, writes: 0 }
+        Self { words: vec![BLANK; 2 * usize::from(WORDS)], bytes: List::new(), is_broken: false, writes: 0 }
     }
 
     fn at(place: Place) -> usize {
@@ -30,7 +30,7 @@ impl Plain {
 
 impl Flash for Plain {
     fn geometry(&self) -> Geometry {
-        Geometry { sectors: 3, words: WORDS }
+        Geometry { sectors: 2, words: WORDS }
     }
 
     fn read(&self, place: Place) -> Word {
@@ -58,7 +58,7 @@ impl StoreFlash for Plain {
 
 impl Kept<Plain> {
     fn restart(&mut self) {
-        *self = Kept::open(self.flash.clone()).unwrap();
+        *self = Kept::open(Places::one(self.flash.clone())).unwrap();
     }
 
     fn write(&mut self, put: impl FnOnce(&mut Store) -> Put<'_, 'static>) {
@@ -75,7 +75,7 @@ impl Kept<Plain> {
 }
 
 fn blank() -> Kept<Plain> {
-    Kept::open(Plain::new()).unwrap()
+    Kept::open(Places::one(Plain::new())).unwrap()
 }
 
 #[test]
@@ -93,7 +93,7 @@ fn an_image_outside_the_store_is_taken_over_once() {
     let (revision, _) = kept.store.at_start().candidates[0];
     assert_eq!(kept.image(revision), Some(&b"second"[..]));
     // What was changed in the store since then stays.
-    kept.write(|store| store.mark(Marks { live: Some(1), previous: Some(2), trial: None }).unwrap());
+    kept.write(|store| store.mark(Marks { live: Some(1), previous: Some(2), ..Marks::default() }).unwrap());
     assert!(!block_on(kept.adopt(2, b"second")).unwrap());
     assert_eq!(kept.start(), [(1, Role::Live), (2, Role::Previous)]);
 }
@@ -104,13 +104,14 @@ fn a_trial_is_counted_before_it_runs_and_can_be_ended() {
     block_on(kept.adopt(1, b"first")).unwrap();
     kept.write(|store| store.keep(2, 2, b"second", None).unwrap());
     let trial = Some(Trial { number: 2, attempts: 2, confirm_s: 60 });
-    let marks = Marks { live: Some(1), previous: None, trial };
+    let marks = Marks { live: Some(1), trial, ..Marks::default() };
     kept.write(|store| store.mark(marks).unwrap());
     let on_trial = [(2, Role::Trial { confirm_s: 60 }), (1, Role::Live)];
     assert_eq!(kept.start(), on_trial);
     assert_eq!(kept.store.marks().trial, Some(Trial { number: 2, attempts: 1, confirm_s: 60 }));
     let before = kept.flash.clone();
-    block_on(kept.end_trial()).unwrap();
+    block_on(kept.end_trial(Ended::NotConfirmed)).unwrap();
+    assert_eq!(kept.store.marks().last, Some((2, Ended::NotConfirmed)));
     assert_eq!(kept.start(), [(1, Role::Live)]);
     // Or it is not ended, but the board starts again and again.
     kept.flash = before;
@@ -120,14 +121,90 @@ fn a_trial_is_counted_before_it_runs_and_can_be_ended() {
 }
 
 #[test]
+fn what_is_confirmed_is_live_and_what_is_forgotten_has_no_end() {
+    let mut kept = blank();
+    block_on(kept.adopt(1, b"first")).unwrap();
+    block_on(kept.keep(2, 2, b"second", None)).unwrap();
+    block_on(kept.begin_trial(2, 60)).unwrap();
+    assert_eq!(kept.start(), [(2, Role::Trial { confirm_s: 60 }), (1, Role::Live)]);
+    block_on(kept.make_live(2, Some(1))).unwrap();
+    assert_eq!(kept.start(), [(2, Role::Live), (1, Role::Previous)]);
+    assert_eq!(kept.store.marks().last, Some((2, Ended::Confirmed)));
+    block_on(kept.keep(3, 3, b"third", None)).unwrap();
+    block_on(kept.begin_trial(3, 60)).unwrap();
+    block_on(kept.end_trial(Ended::TakenBack)).unwrap();
+    // In the place of 3, which the mark would name.
+    block_on(kept.keep(4, 4, b"fourth", Some(3))).unwrap();
+    assert_eq!(kept.store.marks().last, None);
+}
+
+#[test]
+fn an_image_is_read_in_parts_and_the_key_is_kept() {
+    let mut kept = blank();
+    let image: List<u8> = (0..1_000_u16).map(|nth| nth as u8).collect();
+    block_on(kept.keep(1, 1, &image, None)).unwrap();
+    let mut read = List::new();
+    let mut room = [0; 96];
+    while let Some(part @ [_, ..]) = kept.image_part(1, read.len(), &mut room) {
+        read.extend_from_slice(part);
+    }
+    assert_eq!(read, image);
+    assert_eq!(kept.image_part(2, 0, &mut room), None);
+    assert_eq!(kept.access_key(), None);
+    block_on(kept.set_access_key(&[7; 16])).unwrap();
+    kept.restart();
+    assert_eq!(kept.access_key(), Some([7; 16]));
+}
+
+#[test]
 fn what_cannot_be_counted_is_not_tried() {
     let mut kept = blank();
     block_on(kept.adopt(1, b"first")).unwrap();
     kept.write(|store| store.keep(2, 2, b"second", None).unwrap());
     let trial = Some(Trial { number: 2, attempts: 2, confirm_s: 60 });
-    kept.write(|store| store.mark(Marks { live: Some(1), previous: None, trial }).unwrap());
+    kept.write(|store| store.mark(Marks { live: Some(1), trial, ..Marks::default() }).unwrap());
     kept.flash.is_broken = true;
     for _ in 0..5 {
         assert_eq!(kept.start(), [(1, Role::Live)]);
     }
+}
+
+#[test]
+fn a_store_in_the_bank_of_the_program_is_moved_once() {
+    let image = |number: u8| vec![number; 700];
+    let mut kept = blank();
+    block_on(kept.keep(1, 1, &image(1), None)).unwrap();
+    block_on(kept.make_live(1, None)).unwrap();
+    let (first, second) = (kept.flash.clone(), Plain::new());
+    let open = |own| Kept::open(Places { first: first.clone(), second: Some(second.clone()), own }).unwrap();
+    assert!(!open(Side::First).is_to_be_moved());
+    let mut moved = open(Side::Second);
+    assert!(moved.is_to_be_moved());
+    block_on(moved.move_home()).unwrap();
+    assert!(!moved.is_to_be_moved());
+    let live = moved.store().revision(1).unwrap();
+    assert_eq!(moved.image(live), Some(&image(1)[..]));
+    assert_eq!(moved.store().marks().live, Some(1));
+    // The next start finds it there, and the firmware before moves it back.
+    let second = moved.flash.clone();
+    let again = |own| {
+        Kept::open(Places { first: first.clone(), second: Some(second.clone()), own })
+            .unwrap()
+            .is_to_be_moved()
+    };
+    assert!(!again(Side::Second) && again(Side::First));
+}
+
+#[test]
+fn long_images_make_the_oldest_give_way() {
+    let mut kept = blank();
+    let len = usize::from(WORDS) * WORD / 4;
+    for number in 1..=9 {
+        block_on(kept.keep(number, number, &vec![number as u8; len], None)).unwrap();
+        block_on(kept.make_live(number, kept.store().marks().live)).unwrap();
+    }
+    let numbers: List<u32> = kept.store().revisions().iter().map(|kept| kept.number).collect();
+    assert!(numbers.ends_with(&[8, 9]) && numbers.len() < 8, "{numbers:?}");
+    kept.restart();
+    assert_eq!(kept.store().marks().live, Some(9));
 }

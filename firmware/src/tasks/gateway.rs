@@ -10,34 +10,22 @@ use core::pin::pin;
 
 use embassy_futures::select::{Either, select};
 use embassy_futures::yield_now;
-use embassy_time::Timer;
+use embassy_time::{Duration, Timer, with_timeout};
 use heapless::Vec;
 use proto_core::config::GatewayConfig;
 use proto_core::engine::{
-    BuildError, Engine as AnyEngine, Health, Input, LinkId, LinkKind, OUTPUT_BUFFER, Output, PortId, Status,
+    BuildError, Health, Input, LinkId, LinkKind, OUTPUT_BUFFER, Output, PortId, Status, Tap,
 };
 use proto_core::sysvar::Direction;
 use proto_core::time::Instant;
+
+pub use recipe_engine::{Engine, MAX_FIELD_PORTS, MAX_LINKS, MAX_TAP, SizedEngine};
 
 use super::control::{LinkControl, PortControl};
 use super::led::Condition;
 use super::notify::Notify;
 use super::watchdog::Pulse;
 use crate::clock::now;
-
-/// Number of field ports that a board can have.
-pub const MAX_FIELD_PORTS: usize = 4;
-/// Number of recipe links that a board can have.
-pub const MAX_UPLINKS: usize = 2;
-/// User-defined fields in one direction, over all ports.
-pub const MAX_FIELDS: usize = 128;
-/// Exchanges with devices, over all ports.
-pub const MAX_EXCHANGES: usize = 32;
-/// Recipe links, and command, urgent commands, state and Modbus.
-pub const MAX_LINKS: usize = Engine::MAX_LINKS;
-
-/// The engine in the size of a board.
-pub type Engine = AnyEngine<MAX_FIELD_PORTS, MAX_UPLINKS, MAX_FIELDS, 0, MAX_EXCHANGES>;
 
 /// The engine and what every task shares with it.
 pub struct Gateway {
@@ -51,6 +39,8 @@ pub struct Gateway {
     more_waits: Cell<bool>,
     /// Number of sleeps that the ports' tasks have been told of.
     sleeps: Cell<u32>,
+    /// The safe values go out, and what comes from the field is not reported any more.
+    is_ending: Cell<bool>,
 }
 
 impl Gateway {
@@ -65,6 +55,7 @@ impl Gateway {
             deadline_moved: Notify::new(),
             more_waits: Cell::new(false),
             sleeps: Cell::new(0),
+            is_ending: Cell::new(false),
         }
     }
 
@@ -108,6 +99,25 @@ impl Gateway {
         }
     }
 
+    /// Passes the ring of frames to `look`.
+    pub fn tap<R>(&self, look: impl FnOnce(&mut Tap<MAX_TAP>) -> R) -> R {
+        look(self.engine.borrow_mut().tap())
+    }
+
+    /// Brings the safe values out, as if all devices were silent from now on, and waits until the controller is known
+    /// to have them, or `limit` has passed. The gateway is to be ended then. Returns whether it has them.
+    pub async fn make_safe(&self, limit: Duration) -> bool {
+        self.is_ending.set(true);
+        self.engine.borrow_mut().make_safe();
+        self.input(Input::Tick);
+        let is_safe = async {
+            while !self.engine.borrow().is_safe() {
+                Timer::after(SAFE_CHECK).await;
+            }
+        };
+        with_timeout(limit, is_safe).await.is_ok()
+    }
+
     /// How often the gateway slept, so that waiting input was discarded.
     pub fn sleeps(&self) -> u32 {
         self.sleeps.get()
@@ -120,6 +130,17 @@ impl Gateway {
 
     /// Handles one input at the present time, and all outputs that follow.
     pub fn input(&self, input: Input<'_>) {
+        let is_of_field = matches!(
+            input,
+            Input::PortBytes { .. }
+                | Input::PortCan { .. }
+                | Input::PortUp { .. }
+                | Input::PortDown { .. }
+                | Input::PortBus { .. }
+        );
+        if is_of_field && self.is_ending.get() {
+            return;
+        }
         let now = now();
         let mut engine = self.engine.borrow_mut();
         let mut buf = self.output.borrow_mut();
@@ -218,6 +239,8 @@ impl Gateway {
     }
 }
 
+/// How often is looked whether the safe values have arrived.
+const SAFE_CHECK: Duration = Duration::from_millis(5);
 /// One for a task whose interrupt occurs while the time is read, one for the network's task, and one for a link's
 /// task after it.
 const QUIET_ROUNDS: u8 = 3;

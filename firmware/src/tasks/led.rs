@@ -15,6 +15,8 @@ pub enum Condition {
     PortSilent,
     /// All links are up and all field ports are alive.
     Running,
+    /// Somebody looks for this board.
+    Identify,
 }
 
 impl Condition {
@@ -25,6 +27,7 @@ impl Condition {
             Self::NoController => &[(100, 900)],
             Self::PortSilent => &[(100, 200), (100, 600)],
             Self::Running => &[(500, 500)],
+            Self::Identify => &[(400, 100), (100, 100), (100, 100)],
         }
     }
 }
@@ -45,8 +48,13 @@ pub async fn run(pulse: &Pulse, condition: impl Fn() -> Condition, mut set: impl
 mod tests {
     use super::*;
 
-    const ALL: [Condition; 4] =
-        [Condition::Refused, Condition::NoController, Condition::PortSilent, Condition::Running];
+    const ALL: [Condition; 5] = [
+        Condition::Refused,
+        Condition::NoController,
+        Condition::PortSilent,
+        Condition::Running,
+        Condition::Identify,
+    ];
 
     #[test]
     fn each_pattern_is_short_and_another_than_the_rest() {

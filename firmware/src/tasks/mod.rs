@@ -2,9 +2,11 @@
 //! [`crate::drivers`] and over the network stack.
 
 pub mod can;
+pub mod console;
 pub(crate) mod control;
 pub mod fair;
 pub mod gateway;
+pub mod keeper;
 pub mod led;
 pub mod link;
 mod notify;

@@ -7,7 +7,7 @@ use proto_core::link::LinkState;
 
 use super::gateway::{Gateway, MAX_FIELD_PORTS, MAX_LINKS};
 use super::watchdog::Pulse;
-use crate::{info, warn};
+use crate::{info, traffic, warn};
 
 /// Logs changes of the status, for ever.
 pub async fn run(gateway: &Gateway, pulse: &Pulse) -> ! {
@@ -66,7 +66,7 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse) -> ! {
                 if *before != now {
                     *before = now;
                     let [frames_in, bytes_in, frames_out, bytes_out, skipped, cycles] = now;
-                    info!(
+                    traffic!(
                         "port {}: in {} frames, {} bytes; out {} frames, {} bytes; {} bytes skipped, {} cycles",
                         port.name, frames_in, bytes_in, frames_out, bytes_out, skipped, cycles,
                     );

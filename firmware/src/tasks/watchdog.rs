@@ -43,6 +43,10 @@ pub enum TaskName {
     Board(u8),
     /// Changes the store.
     Keeper,
+    /// A connection of the console.
+    Console(u8),
+    /// Looks at the button.
+    Button,
 }
 
 impl TaskName {
@@ -67,6 +71,8 @@ impl TaskName {
             Self::Link(LinkKind::Urgent) => (16, 0),
             Self::Link(_) => (17, 0),
             Self::Keeper => (18, 0),
+            Self::Console(number) => (19, number),
+            Self::Button => (20, 0),
         };
         u16::from_be_bytes([kind, number])
     }
@@ -92,6 +98,8 @@ impl TaskName {
             Self::Board(number),
             Self::Link(LinkKind::Urgent),
             Self::Keeper,
+            Self::Console(number),
+            Self::Button,
         ];
         names.into_iter().find(|name| name.code() == code)
     }
@@ -111,6 +119,8 @@ impl fmt::Display for TaskName {
             Self::Refused => f.write_str("refused"),
             Self::Board(number) => write!(f, "board {number}"),
             Self::Keeper => f.write_str("keeper"),
+            Self::Console(number) => write!(f, "console {number}"),
+            Self::Button => f.write_str("button"),
         }
     }
 }

@@ -1,4 +1,4 @@
-//! The flash of the store: a file of the host, named by the fourth semihosting argument. It stands for three sectors of
+//! The flash of the store: a file of the host, named by the fourth semihosting argument. It stands for two sectors of
 //! 128 KiB as the NUCLEO has them; without the argument there is no store. No word of it is ever torn.
 
 use core::cell::RefCell;
@@ -6,6 +6,7 @@ use core::ffi::CStr;
 
 use firmware::kept::StoreFlash;
 use recipe_store::{BLANK, Found, Geometry, MAX_DATA, Place, WORD, Word};
+use recipe_update::SlotFlash;
 use semihosting::fs::File;
 use semihosting::io::{Read, Seek, SeekFrom, Write};
 use static_cell::ConstStaticCell;
@@ -65,7 +66,7 @@ impl Flash {
 
 impl recipe_store::Flash for Flash {
     fn geometry(&self) -> Geometry {
-        Geometry { sectors: 3, words: WORDS }
+        Geometry { sectors: 2, words: WORDS }
     }
 
     fn read(&self, place: Place) -> Word {
@@ -106,6 +107,12 @@ impl Flash {
             }
         }
         bytes
+    }
+}
+
+impl SlotFlash for Flash {
+    fn whole(&self, place: Place) -> Option<Word> {
+        Some(recipe_store::Flash::read(self, place))
     }
 }
 

@@ -3,6 +3,7 @@
 //!
 //! It exists so that the firmware runs end to end in CI.
 
+mod button;
 mod console;
 mod executor;
 mod fault_injection;
@@ -22,7 +23,9 @@ use embassy_sync::waitqueue::AtomicWaker;
 use embassy_time::Duration;
 use firmware::drivers::lan9118::{Lan9118, Registers, StartError};
 use firmware::drivers::slcan::SlcanPort;
+use firmware::kept::Places;
 use firmware::platform::{self, StatusLed};
+use firmware::update::Site;
 use proto_core::config::Rs485;
 
 use watchdog::Watchdog;
@@ -34,6 +37,7 @@ pub(crate) struct Board {
 }
 
 impl platform::Board for Board {
+    const NAME: &'static str = "mps2-an500";
     const SERIAL_PORTS: usize = 2;
     const CAN_PORTS: usize = 1;
     const WATCHDOG_PERIOD: Duration = watchdog::PERIOD;
@@ -44,7 +48,9 @@ impl platform::Board for Board {
     type Ethernet = Lan9118<LanRegisters>;
     type Watchdog = Watchdog;
     type Led = Led;
+    type Button = button::Button;
     type Flash = flash::Flash;
+    type Slot = flash::Flash;
     type StorageError = storage::StorageError;
     type EthernetError = StartError;
 
@@ -52,8 +58,12 @@ impl platform::Board for Board {
         storage::read()
     }
 
-    fn flash(&mut self) -> Option<flash::Flash> {
-        flash::open()
+    fn flash(&mut self) -> Option<Places<flash::Flash>> {
+        flash::open().map(Places::one)
+    }
+
+    fn slots(&mut self) -> Site<flash::Flash> {
+        Site { board: Self::NAME, slots: Err("QEMU runs the program that it is given: there are no slots") }
     }
 
     /// The file's operations end at once.
@@ -95,6 +105,14 @@ impl platform::Board for Board {
 
     fn seed(&mut self) -> u64 {
         storage::host_time()
+    }
+
+    fn random(&mut self) -> Option<[u8; 32]> {
+        storage::random()
+    }
+
+    fn button(&mut self) -> button::Button {
+        button::Button::new()
     }
 
     fn stack_used(&self) -> usize {

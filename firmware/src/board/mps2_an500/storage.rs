@@ -22,10 +22,14 @@ pub(crate) enum StorageError {
 
 impl fmt::Display for StorageError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::NoName => "no configuration: give its path as the second semihosting argument",
-            Self::Unreadable => "cannot read the configuration file",
-        })
+        match self {
+            Self::NoName => f.write_str("no configuration: give its path as the second semihosting argument"),
+            Self::Unreadable => {
+                f.write_str("cannot read the configuration file")?;
+                // The host still has the name.
+                argument(1, |path| write!(f, " {path}")).unwrap_or(Ok(()))
+            }
+        }
     }
 }
 
@@ -60,6 +64,17 @@ pub(super) fn argument<T>(nth: usize, look: impl FnOnce(&str) -> T) -> Option<T>
 
 /// Maximum length of all arguments together, in bytes.
 pub(super) const MAX_ARGUMENTS: usize = 512;
+
+/// Random bytes of the host.
+pub(super) fn random() -> Option<[u8; 32]> {
+    let mut file = File::open(c"/dev/urandom").ok()?;
+    let mut bytes = [0; 32];
+    let mut len = 0;
+    while let Some(room @ [_, ..]) = bytes.get_mut(len..) {
+        len += file.read(room).ok().filter(|count| *count > 0)?;
+    }
+    Some(bytes)
+}
 
 /// The host's clock in seconds.
 pub(super) fn host_time() -> u64 {

@@ -1,5 +1,6 @@
-//! The flash of the store: three sectors of the second bank, of which the program runs in the first, so it goes
-//! on while a sector is erased. RM0433, "Embedded Flash memory".
+//! The flash of the stores and of the slot that the program does not run in. Both are in the bank that it does not run
+//! from, so it goes on while a sector is erased; only a store that another firmware has left in the wrong bank is read
+//! where the program runs. RM0433, "Embedded Flash memory".
 //!
 //! Not by the driver of `embassy-stm32`: that one copies from flash words that a power cut has torn, which is a
 //! bus fault.
@@ -12,23 +13,26 @@ use core::task::{Context, Poll, Waker};
 use embassy_stm32::pac::FLASH;
 use embassy_stm32::pac::flash::regs::{Ccr, Cr};
 use embassy_time::{Duration, Instant, Timer};
-use firmware::kept::StoreFlash;
-use recipe_store::{Found, Geometry, Place, WORD, Word};
+use firmware::kept::{Places, StoreFlash};
+use firmware::update::{Site, Slots};
+use recipe_store::{Found, Geometry, Place, Side, WORD, Word};
+use recipe_update::{Layout, NUCLEO_H743ZI as BOARD, Slot, SlotFlash};
 
-use super::storage::{FLASH_WORD, can_read};
+use super::readable::can_read;
+use super::storage::FLASH_WORD;
 
 unsafe extern "C" {
-    static _store_start: u8;
-    static _store_rest: u8;
+    /// Its address says which slot the program was linked for (memory.x).
+    static _slot: u8;
 }
 
 const _: () = assert!(FLASH_WORD == WORD);
 
-/// Size of a sector in bytes.
-const SECTOR: usize = 128 * 1024;
-const SECOND_BANK: usize = 0x0810_0000;
-/// Index of the second bank in the registers.
-const BANK: usize = 1;
+const FLASH_START: usize = 0x0800_0000;
+const BANK_SIZE: usize = 0x10_0000;
+/// Where the loader has its public key, behind this mark (firmware/loader/loader.x).
+const KEY: usize = FLASH_START + 0x400;
+const KEY_MARK: [u8; 4] = *b"RGUK";
 const KEYS: [u32; 2] = [0x4567_0123, 0xCDEF_89AB];
 /// Clears all flags of a bank.
 const ALL_FLAGS: Ccr = Ccr(0x0FEF_0000);
@@ -44,28 +48,91 @@ struct Wait {
     limit: Duration,
 }
 
-/// The sectors of the store; nothing else writes flash.
-pub(crate) struct Flash(());
+/// A place for the store, or a slot.
+#[derive(Debug)]
+pub(crate) struct Area {
+    /// Address of each sector.
+    sectors: [u32; 5],
+    count: u8,
+}
 
-impl Flash {
-    /// # Safety
-    /// There is only one.
-    pub(super) unsafe fn new() -> Self {
-        Self(())
+const _: () = assert!(BOARD.slot_sectors == 5);
+
+/// The slot that the program was linked for.
+fn running() -> Option<Slot> {
+    match (&raw const _slot).addr() {
+        1 => Some(Slot::A),
+        2 => Some(Slot::B),
+        _ => None,
     }
 }
 
-/// Address of a word.
-fn address(Place { sector, word }: Place) -> usize {
-    let start = match sector {
-        0 | 1 => (&raw const _store_start).addr() + SECTOR * usize::from(sector),
-        _ => (&raw const _store_rest).addr(),
+/// The places for the store.
+///
+/// # Safety
+/// They are made once.
+pub(super) unsafe fn stores() -> Places<Area> {
+    let place = |side: Side| {
+        let [first, second] = BOARD.store(side);
+        Area { sectors: [first, second, second, second, second], count: 2 }
     };
-    start + WORD * usize::from(word)
+    let first = place(Side::First);
+    match running() {
+        Some(slot) => Places { first, second: Some(place(Side::Second)), own: Layout::store_of(slot) },
+        // Slot A may have been filled behind the back of such a program, but nothing of it runs.
+        None => Places { first, second: None, own: Side::First },
+    }
 }
 
-fn unlock() {
-    let bank = FLASH.bank(BANK);
+/// The slots.
+///
+/// # Safety
+/// They are made once.
+pub(super) unsafe fn slots() -> Site<Area> {
+    let slots = match (running(), key()) {
+        (Some(running), Some(key)) => {
+            let start = BOARD.slot(running.other());
+            let sectors = [0, 1, 2, 3, 4].map(|nth: u32| start + nth * BOARD.sector);
+            Ok(Slots { running, key, free: Area { sectors, count: BOARD.slot_sectors } })
+        }
+        (Some(_), None) => Err("there is no loader with a key at the beginning of the flash"),
+        (None, _) => {
+            Err("this firmware was linked for the beginning of the flash, where the loader would be")
+        }
+    };
+    Site { board: BOARD.board, slots }
+}
+
+/// The public key of the loader.
+fn key() -> Option<[u8; 32]> {
+    let mut bytes = [0; 2 * WORD];
+    for (part, address) in bytes.as_chunks_mut::<WORD>().0.iter_mut().zip((KEY..).step_by(WORD)) {
+        if !can_read(address) {
+            return None;
+        }
+        // SAFETY: readable flash, which nobody writes.
+        *part = unsafe { core::ptr::with_exposed_provenance::<Word>(address).read_volatile() };
+    }
+    bytes.strip_prefix(&KEY_MARK)?.first_chunk().copied()
+}
+
+impl Area {
+    /// Address of a word; that of the first for one that there is not.
+    fn address(&self, Place { sector, word }: Place) -> usize {
+        let [first, ..] = self.sectors;
+        let start = self.sectors.get(usize::from(sector)).copied().unwrap_or(first);
+        start as usize + WORD * usize::from(word)
+    }
+}
+
+/// Index of the bank of an address in the registers, and of its sector in the bank.
+fn bank_and_sector(address: usize) -> (usize, u8) {
+    let offset = address - FLASH_START;
+    (offset / BANK_SIZE, (offset % BANK_SIZE / BOARD.sector as usize) as u8)
+}
+
+fn unlock(bank: usize) {
+    let bank = FLASH.bank(bank);
     if bank.cr().read().lock() {
         KEYS.into_iter().for_each(|key| bank.keyr().write_value(key));
     }
@@ -74,70 +141,76 @@ fn unlock() {
 }
 
 /// Waits for the bank, then locks it. If it does not end in time, what was written is missing when it is read.
-async fn finish(wait: Wait) {
+async fn finish(bank: usize, wait: Wait) {
     let begun = Instant::now();
     loop {
-        let state = FLASH.bank(BANK).sr().read();
+        let state = FLASH.bank(bank).sr().read();
         if !state.bsy() && !state.qw() || begun.elapsed() > wait.limit {
             break;
         }
         Timer::after(wait.look).await;
     }
-    FLASH.bank(BANK).ccr().write_value(ALL_FLAGS);
-    FLASH.bank(BANK).cr().write(|w| {
+    FLASH.bank(bank).ccr().write_value(ALL_FLAGS);
+    FLASH.bank(bank).cr().write(|w| {
         w.set_psize(FASTEST);
         w.set_lock(true);
     });
 }
 
-impl recipe_store::Flash for Flash {
-    fn geometry(&self) -> Geometry {
-        Geometry { sectors: 3, words: (SECTOR / WORD) as u16 }
-    }
-
-    fn read(&self, place: Place) -> Word {
-        let address = address(place);
-        if !can_read(address) {
-            return [0; WORD];
-        }
-        // SAFETY: a word of the store in flash, which is readable, and written by nobody else.
-        unsafe { core::ptr::with_exposed_provenance::<Word>(address).read_volatile() }
-    }
-
-    async fn write(&mut self, place: Place, word: &Word) {
-        unlock();
-        let mut control = Cr(0);
-        control.set_psize(FASTEST);
-        control.set_pg(true);
-        FLASH.bank(BANK).cr().write_value(control);
-        barrier();
-        let start = core::ptr::with_exposed_provenance_mut::<u32>(address(place));
-        for (index, part) in word.as_chunks().0.iter().enumerate() {
-            // SAFETY: within the word, in flash that is the store's alone; the bank is unlocked for it.
-            unsafe { start.add(index).write_volatile(u32::from_le_bytes(*part)) }
-        }
-        barrier();
-        finish(WRITE).await;
-    }
-
-    async fn erase(&mut self, sector: u8) {
-        unlock();
-        let number = (address(Place { sector, word: 0 }) - SECOND_BANK) / SECTOR;
-        let mut control = Cr(0);
-        control.set_psize(FASTEST);
-        control.set_ser(true);
-        control.set_snb(number as u8);
-        FLASH.bank(BANK).cr().write_value(control);
-        control.set_start(true);
-        FLASH.bank(BANK).cr().write_value(control);
-        barrier();
-        finish(ERASE).await;
+impl SlotFlash for Area {
+    fn whole(&self, place: Place) -> Option<Word> {
+        let address = self.address(place);
+        // SAFETY: a word of this area in flash, which is readable, and written by nobody else.
+        can_read(address)
+            .then(|| unsafe { core::ptr::with_exposed_provenance::<Word>(address).read_volatile() })
     }
 }
 
-impl StoreFlash for Flash {
+impl recipe_store::Flash for Area {
+    fn geometry(&self) -> Geometry {
+        Geometry { sectors: self.count, words: (BOARD.sector / WORD as u32) as u16 }
+    }
+
+    fn read(&self, place: Place) -> Word {
+        self.whole(place).unwrap_or([0; WORD])
+    }
+
+    async fn write(&mut self, place: Place, word: &Word) {
+        let address = self.address(place);
+        let (bank, _) = bank_and_sector(address);
+        unlock(bank);
+        let mut control = Cr(0);
+        control.set_psize(FASTEST);
+        control.set_pg(true);
+        FLASH.bank(bank).cr().write_value(control);
+        barrier();
+        let start = core::ptr::with_exposed_provenance_mut::<u32>(address);
+        for (index, part) in word.as_chunks().0.iter().enumerate() {
+            // SAFETY: within the word, in flash that is this area's alone; the bank is unlocked for it.
+            unsafe { start.add(index).write_volatile(u32::from_le_bytes(*part)) }
+        }
+        barrier();
+        finish(bank, WRITE).await;
+    }
+
+    async fn erase(&mut self, sector: u8) {
+        let (bank, number) = bank_and_sector(self.address(Place { sector, word: 0 }));
+        unlock(bank);
+        let mut control = Cr(0);
+        control.set_psize(FASTEST);
+        control.set_ser(true);
+        control.set_snb(number);
+        FLASH.bank(bank).cr().write_value(control);
+        control.set_start(true);
+        FLASH.bank(bank).cr().write_value(control);
+        barrier();
+        finish(bank, ERASE).await;
+    }
+}
+
+impl StoreFlash for Area {
     fn bytes(&mut self, found: Found) -> Option<&[u8]> {
-        let start = address(found.data);
+        let start = self.address(found.data);
         // SAFETY: the record lies in one sector. It is not changed while it is borrowed: writing takes `&mut self`.
         // All its words were read when the store was opened, or written and read back since.
         Some(unsafe { core::slice::from_raw_parts(core::ptr::with_exposed_provenance(start), found.len) })

@@ -13,11 +13,34 @@ pub(super) fn ethernet_address() -> [u8; 6] {
 /// fail.
 pub(crate) fn seed() -> u64 {
     let own = firmware::identity::hash(&uid::uid()) ^ Instant::now().as_ticks();
+    start_generator();
+    (0..2).fold(own, |seed, _| seed.rotate_left(32) ^ u64::from(random_word().unwrap_or(0)))
+}
+
+/// Random bytes; `None` if the generator fails, or has failed.
+pub(super) fn random() -> Option<[u8; 32]> {
+    start_generator();
+    let mut bytes = [0; 32];
+    let (words, _) = bytes.as_chunks_mut::<4>();
+    let mut before = 0;
+    for word in words {
+        let random = random_word()?;
+        // RM0433, "True random number generator": the first word after an error is the one before, or 0.
+        if random == before {
+            return None;
+        }
+        before = random;
+        *word = random.to_le_bytes();
+    }
+    let state = RNG.sr().read();
+    (!state.ceis() && !state.seis()).then_some(bytes)
+}
+
+fn start_generator() {
     RCC.ahb2enr().modify(|w| w.set_rngen(true));
     // Enabling the clock takes two cycles; earlier writes are lost.
     RCC.ahb2enr().read();
     RNG.cr().modify(|w| w.set_rngen(true));
-    (0..2).fold(own, |seed, _| seed.rotate_left(32) ^ u64::from(random_word().unwrap_or(0)))
 }
 
 fn random_word() -> Option<u32> {

@@ -1,6 +1,7 @@
 //! ST's NUCLEO-H743ZI2: an STM32H743ZI with a LAN8742A. RS-485 on USART2 and UART7, CAN on FDCAN1; the log goes
 //! to the debugger (defmt, RTT); the configuration image is in flash. Pins and wiring are in firmware/README.md.
 
+mod button;
 mod can;
 mod clocks;
 mod crash_record;
@@ -8,6 +9,7 @@ mod ethernet;
 mod flash;
 mod identity;
 mod leds;
+mod readable;
 mod serial;
 mod storage;
 mod watchdog;
@@ -20,9 +22,12 @@ use embassy_executor::Executor;
 use embassy_stm32::{bind_interrupts, eth};
 use embassy_time::Duration;
 use firmware::fmt::Text;
+use firmware::kept::Places;
+use firmware::update::Site;
 use firmware::{error, info, platform, warn};
 use panic_probe as _;
 use proto_core::config::Rs485;
+use recipe_update::NUCLEO_H743ZI;
 use static_cell::StaticCell;
 
 use leds::Led;
@@ -45,10 +50,13 @@ pub(crate) struct Board {
     link: Option<Led>,
     status: Option<Led>,
     watchdog: Option<Watchdog>,
-    flash: Option<flash::Flash>,
+    stores: Option<Places<flash::Area>>,
+    slots: Option<Site<flash::Area>>,
+    button: Option<button::Button>,
 }
 
 impl platform::Board for Board {
+    const NAME: &'static str = NUCLEO_H743ZI.board;
     const SERIAL_PORTS: usize = 2;
     const CAN_PORTS: usize = 1;
     const WATCHDOG_PERIOD: Duration = watchdog::PERIOD;
@@ -58,7 +66,9 @@ impl platform::Board for Board {
     type Ethernet = ethernet::Ethernet;
     type Watchdog = Watchdog;
     type Led = Led;
-    type Flash = flash::Flash;
+    type Button = button::Button;
+    type Flash = flash::Area;
+    type Slot = flash::Area;
     type StorageError = storage::StorageError;
     type EthernetError = ethernet::EthernetError;
 
@@ -66,8 +76,13 @@ impl platform::Board for Board {
         storage::read()
     }
 
-    fn flash(&mut self) -> Option<flash::Flash> {
-        self.flash.take()
+    fn flash(&mut self) -> Option<Places<flash::Area>> {
+        self.stores.take()
+    }
+
+    fn slots(&mut self) -> Site<flash::Area> {
+        let none = Site { board: Self::NAME, slots: Err("asked for once") };
+        self.slots.take().unwrap_or(none)
     }
 
     fn block_on<T>(&mut self, operation: impl Future<Output = T>) -> T {
@@ -99,6 +114,14 @@ impl platform::Board for Board {
 
     fn seed(&mut self) -> u64 {
         identity::seed()
+    }
+
+    fn random(&mut self) -> Option<[u8; 32]> {
+        identity::random()
+    }
+
+    fn button(&mut self) -> button::Button {
+        self.button.take().expect("asked for once")
     }
 
     fn stack_used(&self) -> usize {
@@ -147,7 +170,10 @@ fn main() -> ! {
         status: Some(leds.status),
         watchdog: Some(watchdog),
         // SAFETY: made here and nowhere else.
-        flash: Some(unsafe { flash::Flash::new() }),
+        stores: Some(unsafe { flash::stores() }),
+        // SAFETY: as above; the stores are elsewhere.
+        slots: Some(unsafe { flash::slots() }),
+        button: Some(button::Button::new(p.PC13)),
     };
     static EXECUTOR: StaticCell<Executor> = StaticCell::new();
     EXECUTOR.init(Executor::new()).run(|spawner| {

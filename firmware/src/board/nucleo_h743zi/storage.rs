@@ -4,11 +4,11 @@
 //! correction code, and reading it is a bus fault. So each flash word of the image is first read once with bus
 //! faults ignored.
 
-use core::arch::asm;
 use core::fmt;
 
-use cortex_m::peripheral::SCB;
 use proto_core::config::image::{HEADER, MAX_IMAGE, image_len};
+
+use super::readable::can_read;
 
 unsafe extern "C" {
     static _config_start: u8;
@@ -59,30 +59,4 @@ fn check(start: usize, len: usize) -> Result<(), StorageError> {
     (start..start + len)
         .step_by(FLASH_WORD)
         .try_for_each(|address| if can_read(address) { Ok(()) } else { Err(StorageError::Torn { address }) })
-}
-
-/// Whether the flash word at this address can be read.
-pub(super) fn can_read(address: usize) -> bool {
-    const CCR_IGNORE_BUS_FAULTS: u32 = 1 << 8;
-    const CFSR_BUS: u32 = 0xBF << 8;
-    // SAFETY: during one load from flash all interrupts and faults are masked, so that a bus fault only sets its
-    // flag. The flag is cleared, and everything else restored.
-    unsafe {
-        let scb = &*SCB::PTR;
-        let control = scb.ccr.read();
-        asm!("cpsid f");
-        scb.ccr.write(control | CCR_IGNORE_BUS_FAULTS);
-        cortex_m::asm::dsb();
-        cortex_m::asm::isb();
-        core::ptr::with_exposed_provenance::<u32>(address).read_volatile();
-        cortex_m::asm::dsb();
-        // No flag was set before: where faults are not ignored they end the program.
-        let faults = scb.cfsr.read() & CFSR_BUS;
-        if faults != 0 {
-            scb.cfsr.write(faults);
-        }
-        scb.ccr.write(control);
-        asm!("cpsie f");
-        faults == 0
-    }
 }

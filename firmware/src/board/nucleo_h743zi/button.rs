@@ -1,0 +1,22 @@
+//! The blue button B1, on PC13: high while it is pressed.
+
+use embassy_stm32::Peri;
+use embassy_stm32::gpio::{Input, Pull};
+use embassy_stm32::peripherals::PC13;
+use firmware::platform;
+
+/// The button.
+pub(crate) struct Button(Input<'static>);
+
+impl Button {
+    pub(super) fn new(pin: Peri<'static, PC13>) -> Self {
+        // Beside the board's own resistor, so that it reads low also where that one is missing.
+        Self(Input::new(pin, Pull::Down))
+    }
+}
+
+impl platform::Button for Button {
+    fn is_pressed(&mut self) -> bool {
+        self.0.is_high()
+    }
+}

@@ -1,0 +1,282 @@
+//! Answers: written into a connection's own memory, and sent from there.
+
+use core::fmt::{self, Display, Write};
+
+use embassy_net::tcp::TcpSocket;
+use embassy_time::{Instant, with_deadline};
+use heapless::Vec;
+use recipe_remote::guard::Refusal;
+use recipe_remote::json;
+use recipe_remote::key::SCHEME;
+use recipe_remote::nonces::NonceText;
+use recipe_remote::response::{Kind, LAST_CHUNK, Length, Response, Status};
+use recipe_remote::revisions::Revision;
+
+use super::MAX_TIME;
+
+/// Why a connection ended before its answer was sent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Ended {
+    /// The client has gone.
+    Gone,
+    /// It did not read in time.
+    Slow,
+    /// A piece is longer than its room.
+    TooLong,
+}
+
+/// An answer whose body is in the room of its connection. It is made without waiting and sent in one place, since each
+/// place that waits takes flash.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Reply {
+    status: Status,
+    kind: Kind,
+    etag: Option<Revision>,
+    allow: Option<&'static str>,
+    retry_after_s: Option<u64>,
+    /// Length of the body; `None` if it had no room.
+    len: Option<usize>,
+}
+
+impl Reply {
+    /// An answer whose body `write` writes.
+    pub(super) fn new(
+        room: &mut [u8],
+        status: Status,
+        kind: Kind,
+        write: impl FnOnce(&mut Room<'_>) -> fmt::Result,
+    ) -> Self {
+        let mut room = Room::new(room);
+        let len = write(&mut room).is_ok().then_some(room.len);
+        Self { status, kind, etag: None, allow: None, retry_after_s: None, len }
+    }
+
+    /// An object with `error`.
+    pub(super) fn error(room: &mut [u8], status: Status, text: impl Display) -> Self {
+        Self::refusing(room, status, &text)
+    }
+
+    /// With the ETag of this revision.
+    pub(super) fn about(self, etag: Option<Revision>) -> Self {
+        Self { etag, ..self }
+    }
+
+    fn refusing(room: &mut [u8], status: Status, text: &dyn Display) -> Self {
+        Self::new(room, status, Kind::Json, |out| {
+            out.write_str("{\"error\":")?;
+            json::write_text(out, text)?;
+            out.write_char('}')
+        })
+    }
+
+    pub(super) fn refused(room: &mut [u8], refusal: &Refusal) -> Self {
+        let reply = Self::error(room, refusal.status, refusal.text);
+        Self { allow: refusal.allow, retry_after_s: refusal.retry_after_s, ..reply }
+    }
+}
+
+/// What comes of a request.
+pub(super) enum Outcome {
+    /// To be sent.
+    Reply(Reply),
+    /// It was sent, or the connection has ended.
+    Sent,
+}
+
+/// The end of a connection that is written to.
+pub(super) struct Line<'s, 'a> {
+    pub(super) socket: &'s mut TcpSocket<'a>,
+    /// Room for a piece of an answer, and for its head.
+    pub(super) room: &'s mut [u8],
+    pub(super) is_head: bool,
+    /// The next nonce for this client, if it signs its requests, or has to.
+    pub(super) nonce: Option<NonceText>,
+}
+
+impl Line<'_, '_> {
+    /// Sends bytes, before `until`.
+    pub(super) async fn send(&mut self, mut bytes: &[u8], until: Instant) -> Result<(), Ended> {
+        while !bytes.is_empty() {
+            match with_deadline(until, self.socket.write(bytes)).await {
+                Ok(Ok(count @ 1..)) => bytes = bytes.get(count..).unwrap_or(&[]),
+                Ok(_) => return Err(Ended::Gone),
+                Err(_) => return Err(Ended::Slow),
+            }
+        }
+        Ok(())
+    }
+
+    /// Sends some bytes of the room.
+    pub(super) async fn send_room(&mut self, from: usize, to: usize, until: Instant) -> Result<(), Ended> {
+        let mut sent = from;
+        while let Some(rest @ [_, ..]) = self.room.get(sent..to) {
+            match with_deadline(until, self.socket.write(rest)).await {
+                Ok(Ok(count @ 1..)) => sent = sent.saturating_add(count),
+                Ok(_) => return Err(Ended::Gone),
+                Err(_) => return Err(Ended::Slow),
+            }
+        }
+        Ok(())
+    }
+
+    /// Sends a whole answer.
+    pub(super) async fn answer(&mut self, reply: &Reply) -> Result<(), Ended> {
+        let body = reply.len.ok_or(Ended::TooLong)?;
+        // Behind the body, as it has its length.
+        let head = self.write_head(body, Length::Bytes(body as u64), reply).ok_or(Ended::TooLong)?;
+        let until = Instant::now() + MAX_TIME;
+        self.send_room(body, body.saturating_add(head), until).await?;
+        self.send_room(0, if self.is_head { 0 } else { body }, until).await
+    }
+
+    /// Sends the head of an answer whose body follows in pieces. Returns whether it is wanted.
+    pub(super) async fn begin(
+        &mut self,
+        kind: Kind,
+        length: Length,
+        etag: Option<Revision>,
+    ) -> Result<bool, Ended> {
+        let reply = Reply::new(self.room, Status::OK, kind, |_| Ok(())).about(etag);
+        let head = self.write_head(0, length, &reply).ok_or(Ended::TooLong)?;
+        self.send_room(0, head, Instant::now() + MAX_TIME).await?;
+        Ok(!self.is_head)
+    }
+
+    /// Writes a head behind the first `from` bytes of the room; returns its length.
+    #[inline(never)]
+    fn write_head(&mut self, from: usize, length: Length, reply: &Reply) -> Option<usize> {
+        let etag = reply.etag.map(Etag);
+        let challenge = self.nonce.as_ref().map(Challenge);
+        let mut fields: Vec<(&str, &dyn Display), 4> = Vec::new();
+        // There is room for all of them.
+        if let Some(etag) = &etag {
+            let _ = fields.push(("ETag", etag));
+        }
+        if let Some(allow) = &reply.allow {
+            let _ = fields.push(("Allow", allow));
+        }
+        if let Some(seconds) = &reply.retry_after_s {
+            let _ = fields.push(("Retry-After", seconds));
+        }
+        match (&challenge, &self.nonce) {
+            (Some(challenge), _) if reply.status == Status::UNAUTHORIZED => {
+                let _ = fields.push(("WWW-Authenticate", challenge));
+            }
+            (_, Some(nonce)) => drop(fields.push(("Next-Nonce", nonce))),
+            _ => {}
+        }
+        let mut room = Room::new(self.room.get_mut(from..)?);
+        Response::new(reply.status, reply.kind, length).with(&fields).write(&mut room).ok()?;
+        Some(room.len)
+    }
+
+    /// Sends the first bytes of the room as a chunk, before `until`.
+    pub(super) async fn chunk(&mut self, len: usize, until: Instant) -> Result<(), Ended> {
+        if len == 0 {
+            return Ok(());
+        }
+        let mut head = heapless::String::<12>::new();
+        write!(head, "{len:x}\r\n").map_err(|_| Ended::TooLong)?;
+        self.send(head.as_bytes(), until).await?;
+        self.send_room(0, len, until).await?;
+        self.send(b"\r\n", until).await
+    }
+
+    /// Ends a body of chunks.
+    pub(super) async fn last_chunk(&mut self) -> Result<(), Ended> {
+        self.send(LAST_CHUNK.as_bytes(), Instant::now() + MAX_TIME).await
+    }
+}
+
+/// A text that is being written.
+pub(super) struct Room<'r> {
+    bytes: &'r mut [u8],
+    pub(super) len: usize,
+}
+
+impl<'r> Room<'r> {
+    pub(super) fn new(bytes: &'r mut [u8]) -> Self {
+        Self { bytes, len: 0 }
+    }
+
+    /// Bytes that there is room for.
+    pub(super) fn left(&self) -> usize {
+        self.bytes.len().saturating_sub(self.len)
+    }
+}
+
+impl Write for Room<'_> {
+    fn write_str(&mut self, text: &str) -> fmt::Result {
+        let end = self.len.saturating_add(text.len());
+        let place = self.bytes.get_mut(self.len..end).ok_or(fmt::Error)?;
+        for (place, byte) in place.iter_mut().zip(text.bytes()) {
+            *place = byte;
+        }
+        self.len = end;
+        Ok(())
+    }
+}
+
+/// The value of `WWW-Authenticate`.
+struct Challenge<'n>(&'n NonceText);
+
+impl Display for Challenge<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{SCHEME} nonce=\"{}\"", self.0)
+    }
+}
+
+/// The ETag of a revision.
+pub(super) struct Etag(pub(super) Revision);
+
+impl Display for Etag {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "\"{}-{:08x}\"", self.0.number, self.0.digest)
+    }
+}
+
+impl Etag {
+    /// The revision whose ETag this is.
+    pub(super) fn parse(text: &str) -> Option<Revision> {
+        let (number, digest) = text.strip_prefix('"')?.strip_suffix('"')?.split_once('-')?;
+        let digest = u32::from_str_radix(digest, 16).ok()?;
+        let revision = Revision { number: number.parse().ok()?, digest };
+        // One text for each revision.
+        let mut same = heapless::String::<24>::new();
+        write!(same, "{}", Self(revision)).ok()?;
+        (same == text).then_some(revision)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::string::ToString;
+
+    use super::*;
+
+    #[test]
+    fn an_etag_has_one_text() {
+        let revision = Revision { number: 12, digest: 0xBAD_CAFE };
+        assert_eq!(Etag(revision).to_string(), "\"12-0badcafe\"");
+        assert_eq!(Etag::parse("\"12-0badcafe\""), Some(revision));
+        for wrong in [
+            "12-0badcafe",
+            "\"12-badcafe\"",
+            "\"12-0BADCAFE\"",
+            "\"+12-0badcafe\"",
+            "\"012-0badcafe\"",
+            "*",
+            "",
+        ] {
+            assert_eq!(Etag::parse(wrong), None, "{wrong}");
+        }
+    }
+
+    #[test]
+    fn what_has_no_room_is_noticed_and_nothing_is_written_behind_it() {
+        let mut bytes = [0xA5; 8];
+        let mut room = Room::new(&mut bytes[..6]);
+        assert!(room.write_str("12345").is_ok() && room.write_str("67").is_err());
+        assert_eq!((room.len, room.left(), bytes), (5, 1, *b"12345\xA5\xA5\xA5"));
+    }
+}

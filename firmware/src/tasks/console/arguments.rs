@@ -1,0 +1,152 @@
+//! The arguments of the operations that change something.
+
+use proto_core::time::Duration as Span;
+use recipe_remote::arguments::{Value, each};
+use recipe_remote::key::{KEY_LEN, Key, from_hex};
+use recipe_remote::route::Operation;
+
+/// What a body asks for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Arguments {
+    /// Of an operation that takes none.
+    None,
+    /// Of `apply`.
+    Apply { number: Option<u32>, trial: Span },
+    /// Of `claim`.
+    Key([u8; KEY_LEN]),
+    /// Of `update/try`: how long, in seconds.
+    Try(u16),
+    /// Of `identify`, in seconds.
+    Seconds(u32),
+    /// They are none of these; this is what is allowed.
+    Wrong(&'static str),
+}
+
+impl Arguments {
+    /// Those of a body.
+    #[inline(never)]
+    pub(super) fn parse(operation: Operation, body: &[u8]) -> Self {
+        match operation {
+            Operation::Apply => apply(body),
+            Operation::Claim => claim(body),
+            Operation::Identify => identify(body),
+            Operation::TryUpdate => try_update(body),
+            _ if each(body, |_, _| false) => Self::None,
+            _ => Self::Wrong("this operation takes no arguments"),
+        }
+    }
+}
+
+fn apply(body: &[u8]) -> Arguments {
+    let (mut number, mut trial) = (None, None);
+    let is_read = each(body, |name, value| match (name, value) {
+        ("confirm_s", Value::Thousandths(millis)) => trial.replace(Span::from_millis(millis)).is_none(),
+        ("revision", value) => {
+            let is_new = number.is_none();
+            number = value.whole();
+            is_new && number.is_some()
+        }
+        _ => false,
+    });
+    match is_read {
+        true => Arguments::Apply { number, trial: trial.unwrap_or(DEFAULT_TRIAL) },
+        false => Arguments::Wrong("apply takes an object with the numbers confirm_s and revision"),
+    }
+}
+
+fn claim(body: &[u8]) -> Arguments {
+    let mut key = None;
+    let is_read = each(body, |name, value| match (name, value) {
+        ("key", Value::Text(text)) if Key::parse(text).is_some() => {
+            key.replace(from_hex::<KEY_LEN>(text)).is_none()
+        }
+        _ => false,
+    });
+    match key.flatten().filter(|_| is_read) {
+        Some(key) => Arguments::Key(key),
+        None => {
+            Arguments::Wrong("key must be 32 hexadecimal digits that are not all equal: {\"key\": \"...\"}")
+        }
+    }
+}
+
+fn identify(body: &[u8]) -> Arguments {
+    let mut seconds = None;
+    let is_read = each(body, |name, value| {
+        let is_new = seconds.is_none();
+        seconds = value.whole().filter(|seconds| (1..=MAX_SECONDS).contains(seconds));
+        name == "s" && is_new && seconds.is_some()
+    });
+    match is_read {
+        true => Arguments::Seconds(seconds.unwrap_or(DEFAULT_SECONDS)),
+        false => Arguments::Wrong("s is out of range; allowed: 1..=600"),
+    }
+}
+
+fn try_update(body: &[u8]) -> Arguments {
+    let mut seconds = None;
+    let is_read = each(body, |name, value| {
+        let is_new = seconds.is_none();
+        seconds = value.whole().filter(|seconds| FIRMWARE_TRIAL.contains(seconds));
+        name == "confirm_s" && is_new && seconds.is_some()
+    });
+    match is_read {
+        true => {
+            Arguments::Try(seconds.and_then(|seconds| seconds.try_into().ok()).unwrap_or(DEFAULT_FIRMWARE_S))
+        }
+        false => Arguments::Wrong("confirm_s is out of range; allowed: 60..=3600"),
+    }
+}
+
+const FIRMWARE_TRIAL: core::ops::RangeInclusive<u32> = 60..=3600;
+const DEFAULT_FIRMWARE_S: u16 = 300;
+const DEFAULT_TRIAL: Span = Span::from_secs(60);
+const DEFAULT_SECONDS: u32 = 10;
+const MAX_SECONDS: u32 = 600;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parse(operation: Operation, body: &str) -> Arguments {
+        Arguments::parse(operation, body.as_bytes())
+    }
+
+    #[test]
+    fn each_operation_has_its_own() {
+        let default = Arguments::Apply { number: None, trial: Span::from_secs(60) };
+        assert_eq!(parse(Operation::Apply, ""), default);
+        assert_eq!(parse(Operation::Apply, "{}"), default);
+        let both = Arguments::Apply { number: Some(3), trial: Span::from_millis(1_500) };
+        assert_eq!(parse(Operation::Apply, "{\"confirm_s\": 1.5, \"revision\": 3}"), both);
+        assert_eq!(parse(Operation::Confirm, "{}"), Arguments::None);
+        assert_eq!(parse(Operation::Identify, ""), Arguments::Seconds(10));
+        assert_eq!(parse(Operation::Identify, "{\"s\":600}"), Arguments::Seconds(600));
+        assert_eq!(parse(Operation::TryUpdate, ""), Arguments::Try(300));
+        assert_eq!(parse(Operation::TryUpdate, "{\"confirm_s\":60}"), Arguments::Try(60));
+        let key = parse(Operation::Claim, "{\"key\": \"000102030405060708090a0b0c0d0eFF\"}");
+        let bytes = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 255];
+        assert_eq!(key, Arguments::Key(bytes));
+    }
+
+    #[test]
+    fn what_is_unknown_or_comes_twice_is_refused() {
+        for (operation, body) in [
+            (Operation::Apply, "{\"confirm\":1}"),
+            (Operation::Apply, "{\"confirm_s\":1,\"confirm_s\":2}"),
+            (Operation::Apply, "{\"revision\":1.5}"),
+            (Operation::Confirm, "{\"a\":1}"),
+            (Operation::Rollback, "x"),
+            (Operation::Identify, "{\"s\":0}"),
+            (Operation::Identify, "{\"s\":601}"),
+            (Operation::Identify, "{\"t\":1}"),
+            (Operation::TryUpdate, "{\"confirm_s\":59}"),
+            (Operation::TryUpdate, "{\"s\":60}"),
+            (Operation::Claim, ""),
+            (Operation::Claim, "{\"key\":\"00\"}"),
+            (Operation::Claim, "{\"key\":\"00000000000000000000000000000000\"}"),
+        ] {
+            assert!(matches!(parse(operation, body), Arguments::Wrong(_)), "{operation:?} {body}");
+        }
+    }
+}

@@ -1,0 +1,236 @@
+//! The operations that change something.
+
+use core::fmt::Write;
+
+use embassy_futures::yield_now;
+use embassy_time::{Duration, Instant};
+use proto_core::config::image::{self, Scan};
+use recipe_remote::claim::{Claim, ClaimError};
+use recipe_remote::key::{KEY_LEN, Key};
+use recipe_remote::response::{Kind, Status};
+use recipe_remote::revisions::Refused;
+use recipe_remote::route::Operation;
+use recipe_update::Downgrade;
+
+use super::Console;
+use super::answer::{Etag, Reply};
+use super::arguments::Arguments;
+use super::connection::Request;
+use crate::clock::now;
+use crate::fmt::Text;
+use crate::tasks::keeper::{Ask, Failed, Turn};
+use crate::warn;
+
+impl Console {
+    /// Carries out a change.
+    pub(super) async fn change<'a>(&'a self, room: &mut [u8], request: Request<'a>) -> Reply {
+        let Request { operation, peer, .. } = request;
+        if operation == Operation::PutConfig
+            && let Some((len, turn)) = &request.image
+            && let Some(refused) = self.look_through(room, *len, turn).await
+        {
+            return refused;
+        }
+        let (ask, turn) = match self.prepare(room, request) {
+            Ok(prepared) => prepared,
+            Err(reply) => return reply,
+        };
+        let done = turn.ask(ask.clone()).await;
+        match (done, ask) {
+            (Ok(_), Ask::Claim(key)) => {
+                self.is_claimed(Some(key));
+                warn!("claimed by {}", Text(&peer));
+                let name = &self.name;
+                Reply::new(room, Status::OK, Kind::Json, |out| {
+                    write!(out, "{{\"name\":\"{name}\",\"claimed\":true}}")
+                })
+            }
+            (Err(_), Ask::Claim(_)) => {
+                self.is_claimed(None);
+                Reply::error(room, Status::INTERNAL, "the key cannot be kept")
+            }
+            // A piece is one of many.
+            (Ok(_), Ask::Piece { .. }) => self.firmware(room, Status::OK),
+            (Ok(_), Ask::ConfirmFirmware) => {
+                warn!("the firmware is confirmed for {}", Text(&peer));
+                self.firmware(room, Status::OK)
+            }
+            (Ok(_), Ask::TryFirmware { .. } | Ask::EndFirmware) => {
+                warn!("another firmware is to run for {}", Text(&peer));
+                self.firmware(room, Status::ACCEPTED)
+            }
+            (Err(Failed::Firmware(why)), _) => {
+                warn!("{} refused to {}: {}", name(operation), Text(&peer), Text(&why));
+                let status = if why.is_wrong() { Status::UNPROCESSABLE } else { Status::CONFLICT };
+                Reply::error(room, status, why)
+            }
+            (Ok(number), _) => {
+                warn!("{} for {}: revision {}", name(operation), Text(&peer), number);
+                let status = if operation == Operation::PutConfig { Status::CREATED } else { Status::OK };
+                self.revisions(room, status, Some(number))
+            }
+            (Err(Failed::Refused(refused)), _) => {
+                warn!("{} refused to {}", name(operation), Text(&peer));
+                refuse(room, refused)
+            }
+            (Err(Failed::Store(why)), _) => Reply::error(room, Status::INTERNAL, why),
+        }
+    }
+
+    /// Reads the whole image that was sent, in pieces between which others run. Returns the answer if it is refused.
+    async fn look_through(&self, room: &mut [u8], len: usize, turn: &Turn<'_>) -> Option<Reply> {
+        let mut scan = Scan::new();
+        loop {
+            match turn.look(len, |bytes| scan.step(bytes)) {
+                Ok(true) => yield_now().await,
+                Ok(false) => break,
+                Err(error) => return Some(Reply::error(room, Status::UNPROCESSABLE, error)),
+            }
+        }
+        let missing = self.ports.have(scan.buses().iter()).err()?;
+        Some(Reply::error(room, Status::UNPROCESSABLE, missing))
+    }
+
+    /// What the keeper is to be asked for; or the answer, if it is not.
+    #[inline(never)]
+    fn prepare<'a>(&'a self, room: &mut [u8], request: Request<'a>) -> Result<(Ask, Turn<'a>), Reply> {
+        let ask = match request.arguments {
+            Arguments::Wrong(text) => return Err(Reply::error(room, Status::BAD_REQUEST, text)),
+            Arguments::Seconds(seconds) => {
+                self.identify_until.set(Instant::now() + Duration::from_secs(seconds.into()));
+                warn!("{} looks for this board: its LED shows it for {} s", Text(&request.peer), seconds);
+                return Err(Reply::new(room, Status::OK, Kind::Json, |out| out.write_str("{}")));
+            }
+            Arguments::Key(key) => return self.take_key(room, key, &request),
+            Arguments::Apply { number, trial } => Ask::Apply { number, trial },
+            Arguments::None if request.operation == Operation::Confirm => Ask::Confirm,
+            Arguments::None if request.operation == Operation::Rollback => Ask::RollBack,
+            Arguments::None if request.operation == Operation::ConfirmUpdate => Ask::ConfirmFirmware,
+            Arguments::None if request.operation == Operation::EndUpdate => Ask::EndFirmware,
+            Arguments::Try(confirm_s) => {
+                Ask::TryFirmware { confirm_s, downgrade: downgrade(room, &request)? }
+            }
+            Arguments::None if request.operation == Operation::PutUpdate => return put_piece(room, request),
+            Arguments::None => return put(room, request),
+        };
+        let Some(desk) = self.desk else { return Err(nothing_kept(room)) };
+        desk.take().map(|turn| (ask, turn)).ok_or_else(|| busy(room))
+    }
+
+    /// Takes a key, if the button was pressed.
+    fn take_key(
+        &self,
+        room: &mut [u8],
+        key: [u8; KEY_LEN],
+        request: &Request<'_>,
+    ) -> Result<(Ask, Turn<'_>), Reply> {
+        let Some(desk) = self.desk else { return Err(nothing_kept(room)) };
+        // Before the claim, which waits for its end otherwise. A board that reads its store takes no key yet.
+        let Some(turn) = desk.take().filter(|_| desk.look(|_| ()).is_some()) else { return Err(busy(room)) };
+        let mut claim = self.claim.get();
+        let offered = claim.offered(now());
+        self.claim.set(claim);
+        let (status, text) = match offered {
+            Ok(()) => return Ok((Ask::Claim(key), turn)),
+            Err(ClaimError::NotPressed) => {
+                (Status::FORBIDDEN, "press the button of the board first; a key is taken for 60 s then")
+            }
+            Err(ClaimError::Busy) => (Status::CONFLICT, "another key is being taken; try again"),
+            Err(ClaimError::Claimed) => (Status::FORBIDDEN, "this board has a key already"),
+        };
+        warn!("claim refused to {}", Text(&request.peer));
+        Err(Reply::error(room, status, text))
+    }
+
+    /// The key is kept, or could not be.
+    fn is_claimed(&self, key: Option<[u8; KEY_LEN]>) {
+        let mut claim: Claim = self.claim.get();
+        claim.written(now(), key.is_some());
+        self.claim.set(claim);
+        if let Some(key) = key {
+            self.guard.borrow_mut().set_key(Some(Key::new(key)));
+        }
+    }
+}
+
+/// Whether somebody has asked for an older firmware.
+fn downgrade(room: &mut [u8], request: &Request<'_>) -> Result<Downgrade, Reply> {
+    match request.head.query("downgrade") {
+        None => Ok(Downgrade::Refused),
+        Some("yes") => Ok(Downgrade::Allowed),
+        Some(_) => Err(Reply::error(room, Status::BAD_REQUEST, "downgrade is out of range; allowed: yes")),
+    }
+}
+
+fn put_piece<'a>(room: &mut [u8], request: Request<'a>) -> Result<(Ask, Turn<'a>), Reply> {
+    let downgrade = downgrade(room, &request)?;
+    let Some((len, turn)) = request.image else { return Err(busy(room)) };
+    let Some(Ok(offset)) = request.head.query("offset").map(str::parse) else {
+        let text = "offset must be a number: where the piece begins in header and image";
+        return Err(Reply::error(room, Status::BAD_REQUEST, text));
+    };
+    Ok((Ask::Piece { offset, len, downgrade }, turn))
+}
+
+fn put<'a>(room: &mut [u8], request: Request<'a>) -> Result<(Ask, Turn<'a>), Reply> {
+    let Some((len, turn)) = request.image else { return Err(busy(room)) };
+    let (status, text) = match request.head.if_match.map(Etag::parse) {
+        None => {
+            let text = "If-Match is needed: the ETag of the revision that this one was made from";
+            (Status::PRECONDITION_REQUIRED, text)
+        }
+        Some(None) => (Status::PRECONDITION_FAILED, "If-Match must be one ETag, such as \"3-0badcafe\""),
+        Some(Some(base)) => {
+            // Bytes behind the image would be kept for nothing.
+            let whole = turn.look(len, |bytes| Ok((image::intact(bytes)?, image::image_len(bytes)?)));
+            return match whole {
+                Ok((digest, len)) => Ok((Ask::Put { base, digest, len }, turn)),
+                Err(error) => {
+                    let error: image::ImageError = error;
+                    Err(Reply::error(room, Status::UNPROCESSABLE, error))
+                }
+            };
+        }
+    };
+    Err(Reply::error(room, status, text))
+}
+
+fn refuse(room: &mut [u8], refused: Refused) -> Reply {
+    let (status, text) = match refused {
+        Refused::Changed(base) => {
+            let text = format_args!("the configuration was changed meanwhile; the newest is {}", Etag(base));
+            return Reply::error(room, Status::PRECONDITION_FAILED, text).about(Some(base));
+        }
+        Refused::OnTrial => (Status::CONFLICT, "a revision is on trial; confirm it or roll it back first"),
+        Refused::NotOnTrial => (Status::CONFLICT, "no revision is on trial"),
+        Refused::NothingWaits => (Status::CONFLICT, "no stored revision waits; name one"),
+        Refused::Unknown => (Status::NOT_FOUND, "there is no such revision"),
+        Refused::Runs => (Status::CONFLICT, "it is live already"),
+        Refused::Trial => (Status::BAD_REQUEST, "confirm_s is out of range; allowed: 1..=3600"),
+        Refused::NoPrevious => (Status::CONFLICT, "no other revision was live before"),
+        _ => return busy(room),
+    };
+    Reply::error(room, status, text)
+}
+
+pub(super) fn busy(room: &mut [u8]) -> Reply {
+    Reply::error(room, Status::CONFLICT, "something else is being done; try again")
+}
+
+pub(super) fn nothing_kept(room: &mut [u8]) -> Reply {
+    Reply::error(room, Status::UNAVAILABLE, "this board has no store, so it keeps nothing")
+}
+
+/// For the log.
+fn name(operation: Operation) -> &'static str {
+    match operation {
+        Operation::PutConfig => "store",
+        Operation::Apply => "apply",
+        Operation::Confirm => "confirm",
+        Operation::PutUpdate => "a piece of a firmware",
+        Operation::TryUpdate => "a trial of a firmware",
+        Operation::ConfirmUpdate => "the end of a firmware's trial",
+        Operation::EndUpdate => "a return to the firmware before",
+        _ => "roll back",
+    }
+}

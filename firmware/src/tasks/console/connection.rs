@@ -1,0 +1,286 @@
+//! A connection: one request, with limits on its length and time.
+
+use core::net::Ipv4Addr;
+use core::ops::Range;
+use core::pin::pin;
+
+use embassy_futures::yield_now;
+use embassy_net::tcp::TcpSocket;
+use embassy_net::{IpAddress, Stack};
+use embassy_time::{Duration, Instant, Timer, with_deadline, with_timeout};
+use recipe_remote::guard::{Admitted, Site};
+use recipe_remote::key::BodyHash;
+use recipe_remote::request::{Head, HeadBuffer, HeadError, Method};
+use recipe_remote::response::{CONTINUE, Status};
+use recipe_remote::route::{Operation, Served};
+
+use super::answer::{Ended, Line, Outcome, Reply};
+use super::arguments::Arguments;
+use super::change::{busy, nothing_kept};
+use super::{Console, MAX_TIME, OneMore, PORT};
+use crate::clock::now;
+use crate::tasks::keeper::Turn;
+use crate::tasks::watchdog::Pulse;
+
+/// The memory of a connection.
+#[derive(Debug)]
+pub struct Buffers<'a> {
+    rx: &'a mut [u8],
+    tx: &'a mut [u8],
+    room: &'a mut [u8],
+}
+
+impl<'a> Buffers<'a> {
+    /// Size in bytes.
+    pub const SIZE: usize = RX + TX + ROOM;
+
+    /// Takes [`Buffers::SIZE`] bytes from the front of `memory`; `None` if there are fewer.
+    pub fn take(memory: &mut &'a mut [u8]) -> Option<Self> {
+        let memory = memory.split_off_mut(..Self::SIZE)?;
+        let (rx, rest) = memory.split_at_mut_checked(RX)?;
+        let (tx, room) = rest.split_at_mut_checked(TX)?;
+        Some(Self { rx, tx, room })
+    }
+}
+
+/// A request with what belongs to it.
+pub(super) struct Request<'a> {
+    pub(super) head: Head<'a>,
+    pub(super) operation: Operation,
+    pub(super) arguments: Arguments,
+    /// The image that was sent, at the desk: its length, and the right to store it.
+    pub(super) image: Option<(usize, Turn<'a>)>,
+    pub(super) peer: Ipv4Addr,
+}
+
+impl Console {
+    /// Serves connections with one socket, for ever.
+    pub async fn serve(&self, pulse: &Pulse, stack: Stack<'_>, buffers: Buffers<'_>) -> ! {
+        let Buffers { rx, tx, room } = buffers;
+        let mut head = HeadBuffer::new();
+        loop {
+            let mut socket = TcpSocket::new(stack, rx, tx);
+            // A peer that never completes the handshake must not occupy the socket.
+            socket.set_timeout(Some(MAX_TIME));
+            let connection = async {
+                if socket.accept(PORT).await.is_err() {
+                    Timer::after(PAUSE).await;
+                    return;
+                }
+                // Nor one that is switched off. Longer than all other limits, or they would have no say.
+                socket.set_timeout(Some(SILENT));
+                // Without limit, as the number of tasks is one.
+                let _one = OneMore::of(&self.connections, usize::MAX);
+                self.count(|counters| &mut counters.connections);
+                head.clear();
+                match self.connection(&mut socket, &mut head, room).await {
+                    Err(Ended::Slow) => self.count(|counters| &mut counters.slow_readers),
+                    Err(Ended::TooLong) => self.count(|counters| &mut counters.cut_off),
+                    Ok(()) => {
+                        socket.close();
+                        if with_timeout(MAX_TIME, socket.flush()).await.is_ok() {
+                            // What is left of a request: a reset before it was taken would hide the answer.
+                            let rest =
+                                async { while socket.read(room).await.is_ok_and(|count| count > 0) {} };
+                            let _ = with_timeout(LINGER, rest).await;
+                        }
+                    }
+                    Err(Ended::Gone) => {}
+                }
+            };
+            pulse.idle(pin!(connection)).await;
+            socket.abort();
+            let _ = with_timeout(CLOSE, socket.flush()).await;
+            yield_now().await;
+        }
+    }
+
+    async fn connection<'a>(
+        &'a self,
+        socket: &mut TcpSocket<'_>,
+        buffer: &'a mut HeadBuffer,
+        room: &mut [u8],
+    ) -> Result<(), Ended> {
+        let mut line = Line { socket, room, is_head: false, nonce: None };
+        let deadline = Instant::now() + MAX_TIME;
+        let rest = match self.receive_head(&mut line, buffer, deadline).await? {
+            Some(rest) => rest,
+            None => return self.was_incomplete(&mut line).await,
+        };
+        let reply = match self.admit(&mut line, buffer) {
+            Ok((admitted, mut request)) => {
+                match self.receive_body(&mut line, &admitted, &mut request, rest, deadline).await? {
+                    Body::Whole => match self.carry_out(&mut line, request).await? {
+                        Outcome::Sent => return Ok(()),
+                        Outcome::Reply(reply) => reply,
+                    },
+                    Body::Other => {
+                        let text = "the body is not the one that was signed";
+                        Reply::error(line.room, Status::UNAUTHORIZED, text)
+                    }
+                    Body::Incomplete => return self.was_incomplete(&mut line).await,
+                }
+            }
+            Err(reply) => reply,
+        };
+        line.answer(&reply).await
+    }
+
+    async fn was_incomplete(&self, line: &mut Line<'_, '_>) -> Result<(), Ended> {
+        self.count(|counters| &mut counters.incomplete);
+        let reply = Reply::refused(line.room, &HeadError::Incomplete.into());
+        line.answer(&reply).await
+    }
+
+    /// Waits for the head. Returns where in the room the beginning of the body is; `None` if it did not arrive in time.
+    async fn receive_head(
+        &self,
+        line: &mut Line<'_, '_>,
+        buffer: &mut HeadBuffer,
+        deadline: Instant,
+    ) -> Result<Option<Range<usize>>, Ended> {
+        loop {
+            let chunk = line.room.get_mut(..CHUNK).unwrap_or(&mut []);
+            let count = match with_deadline(deadline, line.socket.read(chunk)).await {
+                Ok(Ok(count @ 1..)) => count,
+                // A browser opens connections that it may never use.
+                _ if buffer.is_empty() => return Err(Ended::Gone),
+                Err(_) => return Ok(None),
+                Ok(_) => {
+                    self.count(|counters| &mut counters.incomplete);
+                    return Err(Ended::Gone);
+                }
+            };
+            let taken = buffer.push(line.room.get(..count).unwrap_or(&[]));
+            if buffer.head() != Err(HeadError::Incomplete) {
+                return Ok(Some(taken..count));
+            }
+        }
+    }
+
+    /// Decides about a request by its head.
+    #[inline(never)]
+    fn admit<'a>(
+        &'a self,
+        line: &mut Line<'_, '_>,
+        buffer: &'a HeadBuffer,
+    ) -> Result<(Admitted, Request<'a>), Reply> {
+        let (local, peer) = match (line.socket.local_endpoint(), line.socket.remote_endpoint()) {
+            (Some(local), Some(peer)) => (address(local.addr), address(peer.addr)),
+            _ => (Ipv4Addr::UNSPECIFIED, Ipv4Addr::UNSPECIFIED),
+        };
+        let site = Site { local: local.into(), peer: peer.into(), names: &[&self.name] };
+        let mut guard = self.guard.borrow_mut();
+        let admitted = match buffer.head() {
+            Ok(head) => guard.admit(now(), &head, &site, Served::Board).map(|admitted| (head, admitted)),
+            Err(error) => Err(error.into()),
+        };
+        let (head, admitted) = admitted.map_err(|refusal| {
+            if refusal.status == Status::UNAUTHORIZED {
+                line.nonce = Some(guard.nonce(now()));
+            }
+            Reply::refused(line.room, &refusal)
+        })?;
+        line.is_head = admitted.is_head;
+        if admitted.is_signed() {
+            line.nonce = Some(guard.nonce(now()));
+        }
+        let operation = admitted.operation;
+        let mut request = Request { head, operation, arguments: Arguments::None, image: None, peer };
+        if let Some(desk) = self.desk {
+            desk.was_asked();
+        }
+        if matches!(operation, Operation::PutConfig | Operation::PutUpdate) {
+            let Some(desk) = self.desk else { return Err(nothing_kept(line.room)) };
+            let Some(turn) = desk.take() else { return Err(busy(line.room)) };
+            // The guard has limited it.
+            request.image = Some((usize::try_from(admitted.length).unwrap_or(0), turn));
+        }
+        Ok((admitted, request))
+    }
+
+    /// Takes the body, of which a part came with the head.
+    async fn receive_body(
+        &self,
+        line: &mut Line<'_, '_>,
+        admitted: &Admitted,
+        request: &mut Request<'_>,
+        rest: Range<usize>,
+        deadline: Instant,
+    ) -> Result<Body, Ended> {
+        let length = usize::try_from(admitted.length).unwrap_or(0);
+        let mut hash = BodyHash::new();
+        // What is behind the body is another request, which is not looked at.
+        let mut piece = rest.len().min(length);
+        line.room.copy_within(rest.start..rest.start.saturating_add(piece), 0);
+        if admitted.expects_continue && piece < length {
+            line.send(CONTINUE.as_bytes(), deadline).await?;
+        }
+        let (mut received, mut from) = (0_usize, 0_usize);
+        loop {
+            let bytes = line.room.get(from..from.saturating_add(piece)).unwrap_or(&[]);
+            hash.update(bytes);
+            match &mut request.image {
+                Some((_, turn)) => turn.fill(received, bytes),
+                // Arguments are short enough to stay in the room.
+                None => from = from.saturating_add(piece),
+            }
+            received = received.saturating_add(piece);
+            let left = length.saturating_sub(received);
+            if left == 0 {
+                break;
+            }
+            let chunk = line.room.get_mut(from..from.saturating_add(left.min(CHUNK))).unwrap_or(&mut []);
+            piece = match with_deadline(deadline, line.socket.read(chunk)).await {
+                Ok(Ok(count @ 1..)) => count,
+                Err(_) => return Ok(Body::Incomplete),
+                Ok(_) => {
+                    self.count(|counters| &mut counters.incomplete);
+                    return Err(Ended::Gone);
+                }
+            };
+            // Hashing takes its time.
+            yield_now().await;
+        }
+        if admitted.is_signed() && !admitted.is_body(&hash.finish()) {
+            return Ok(Body::Other);
+        }
+        if request.image.is_none() && request.head.method == Method::Post {
+            let body = line.room.get(..length).unwrap_or(&[]);
+            request.arguments = Arguments::parse(request.operation, body);
+        }
+        Ok(Body::Whole)
+    }
+}
+
+/// What has arrived of a body.
+enum Body {
+    Whole,
+    /// It is not the one that was signed.
+    Other,
+    /// It did not arrive in time.
+    Incomplete,
+}
+
+fn address(address: IpAddress) -> Ipv4Addr {
+    match address {
+        IpAddress::Ipv4(four) => four,
+    }
+}
+
+/// Receive buffer of a socket.
+const RX: usize = 1024;
+/// Transmit buffer: what a client far away has not acknowledged.
+const TX: usize = 1536;
+/// Room for the longest piece of an answer, or for its head and a short body.
+const ROOM: usize = 3328;
+/// Bytes that are read at once; an image's are hashed before others run.
+const CHUNK: usize = 512;
+/// How long a client may go on sending after its answer.
+const LINGER: Duration = Duration::from_millis(300);
+/// After so long without a packet a peer is gone.
+const SILENT: Duration = Duration::from_secs(15);
+/// For the reset of a connection.
+const CLOSE: Duration = Duration::from_millis(100);
+/// After a socket that could not be listened with.
+const PAUSE: Duration = Duration::from_millis(100);

@@ -1,0 +1,64 @@
+//! Documents about the engine, sent in pieces.
+
+use embassy_futures::yield_now;
+use embassy_time::Instant;
+use proto_core::engine::Health;
+use recipe_remote::documents::{Document, Pieces};
+use recipe_remote::metrics::Families;
+use recipe_remote::response::{Kind, Length, Status};
+
+use super::answer::{Ended, Line, Outcome, Reply, Room};
+use super::{Console, MAX_ANSWER, MAX_TIME};
+
+/// What is sent.
+#[derive(Debug, Clone)]
+pub(super) enum Source {
+    Pieces(Pieces),
+    Metrics(Families),
+}
+
+impl Source {
+    pub(super) fn of(document: Document) -> Self {
+        Self::Pieces(Pieces::of(document))
+    }
+}
+
+impl Console {
+    /// Sends a whole document as the body of an answer.
+    pub(super) async fn document(
+        &self,
+        line: &mut Line<'_, '_>,
+        kind: Kind,
+        mut source: Source,
+    ) -> Result<Outcome, Ended> {
+        if self.is_idle() {
+            let text = "nothing runs at the moment; try again";
+            return Ok(Outcome::Reply(Reply::error(line.room, Status::UNAVAILABLE, text)));
+        }
+        if !line.begin(kind, Length::Chunked, None).await? {
+            return Ok(Outcome::Sent);
+        }
+        let until = Instant::now() + MAX_ANSWER;
+        while let Some(len) = self.piece(line, &mut source)? {
+            line.chunk(len, until.min(Instant::now() + MAX_TIME)).await?;
+            yield_now().await;
+        }
+        line.last_chunk().await?;
+        Ok(Outcome::Sent)
+    }
+
+    /// Writes the next piece into the room; returns its length. The engine is borrowed only here.
+    pub(super) fn piece(&self, line: &mut Line<'_, '_>, source: &mut Source) -> Result<Option<usize>, Ended> {
+        let mut room = Room::new(line.room);
+        let is_more = self.gateway.report(|status| match source {
+            Source::Pieces(pieces) => pieces.write_next(status, &mut room).map_err(|_| Ended::TooLong),
+            Source::Metrics(families) => families.write_next(status, &mut room).map_err(|_| Ended::TooLong),
+        })?;
+        Ok(is_more.then_some(room.len))
+    }
+
+    /// Whether nothing runs.
+    pub(super) fn is_idle(&self) -> bool {
+        self.gateway.report(|status| status.health()) == Health::Idle
+    }
+}

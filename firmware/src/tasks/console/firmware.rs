@@ -1,0 +1,102 @@
+//! The document `update`: what runs, what is being received, and a trial (docs/api.md section 9).
+
+use core::fmt::{self, Write};
+
+use embassy_time::Instant;
+use recipe_remote::json;
+use recipe_remote::key::Hex;
+use recipe_remote::response::{Kind, Status};
+use recipe_store::Ended;
+use recipe_update::{Header, Slot};
+
+use super::Console;
+use super::answer::{Reply, Room};
+use super::change::{busy, nothing_kept};
+use crate::tasks::keeper::{Desk, FirmwareView};
+use crate::update::{Incoming, Stage, whole_length};
+
+impl Console {
+    /// The document, with this status.
+    #[inline(never)]
+    pub(super) fn firmware(&self, room: &mut [u8], status: Status) -> Reply {
+        if self.desk.is_none() {
+            return nothing_kept(room);
+        }
+        match self.desk.and_then(Desk::firmware) {
+            Some(view) => Reply::new(room, status, Kind::Json, |out| write(out, &view)),
+            // The store is being read or moved.
+            None => busy(room),
+        }
+    }
+}
+
+fn write(out: &mut Room<'_>, view: &FirmwareView) -> fmt::Result {
+    write!(out, "{{\"board\":\"{}\",\"version\":\"{}\"", view.board, env!("CARGO_PKG_VERSION"))?;
+    if let Some(slot) = view.slot {
+        write!(out, ",\"slot\":\"{}\"", letter(slot))?;
+    }
+    if let Some(good) = view.marks.good {
+        write!(out, ",\"good\":\"{}\"", letter(good))?;
+    }
+    if let Some(key) = &view.key {
+        write!(out, ",\"key\":\"{}\"", Hex(key))?;
+    }
+    if let Some(why) = view.cannot {
+        out.write_str(",\"cannot\":")?;
+        json::write_text(out, why)?;
+    }
+    if let Some((until, waits_for)) = view.trial {
+        let left = until.saturating_duration_since(Instant::now()).as_millis();
+        let name = waits_for.name();
+        write!(
+            out,
+            ",\"trial\":{{\"left_s\":{}.{:03},\"waits_for\":\"{name}\"}}",
+            left / 1_000,
+            left % 1_000
+        )?;
+    }
+    if let Some(other) = &view.other {
+        out.write_str(",\"other\":{")?;
+        write_header(out, other)?;
+        out.write_char('}')?;
+    }
+    if let Some(Incoming { header, stage, received }) = &view.incoming {
+        let state = match stage {
+            Stage::Erasing => "erasing",
+            Stage::Receiving => "receiving",
+            Stage::Checking => "checking",
+            Stage::Ready => "ready",
+            Stage::Failed(_) => "failed",
+        };
+        write!(out, ",\"incoming\":{{\"state\":\"{state}\",")?;
+        write_header(out, header)?;
+        write!(out, ",\"length\":{},\"received\":{received}", whole_length(header))?;
+        if let Stage::Failed(why) = stage {
+            out.write_str(",\"why\":")?;
+            json::write_text(out, why)?;
+        }
+        out.write_char('}')?;
+    }
+    if let Some((slot, ended)) = view.marks.last {
+        let ended = match ended {
+            Ended::Confirmed => "confirmed",
+            Ended::NotConfirmed => "not_confirmed",
+            Ended::TakenBack => "taken_back",
+            Ended::Failed => "failed",
+        };
+        write!(out, ",\"last\":{{\"slot\":\"{}\",\"ended\":\"{ended}\"}}", letter(slot))?;
+    }
+    out.write_char('}')
+}
+
+fn write_header(out: &mut Room<'_>, header: &Header) -> fmt::Result {
+    let hash = header.hash().first_chunk::<8>().unwrap_or(&[0; 8]);
+    write!(out, "\"version\":\"{}\",\"sha512\":\"{}\"", header.version(), Hex(hash))
+}
+
+fn letter(slot: Slot) -> char {
+    match slot {
+        Slot::A => 'A',
+        Slot::B => 'B',
+    }
+}

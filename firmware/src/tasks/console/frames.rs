@@ -1,0 +1,97 @@
+//! The frames that went over field ports, as events of a stream.
+
+use core::fmt::{self, Write};
+
+use proto_core::engine::{TapDirection, TapPlace, TapRecord, TapVerdict};
+use proto_core::wire::can::CanId;
+use recipe_remote::json;
+use recipe_remote::key::Hex;
+
+use super::Console;
+use super::answer::Room;
+
+/// Follows the frames as long as it exists.
+pub(super) struct Follower<'c> {
+    console: &'c Console,
+    /// Only of this port.
+    port: Option<&'c str>,
+    /// Records that found no room, and were not told yet.
+    lost: u32,
+}
+
+impl Console {
+    /// Begins to follow the frames; `None` if somebody does already, as there is one ring.
+    pub(super) fn follow<'c>(&'c self, port: Option<&'c str>) -> Option<Follower<'c>> {
+        if self.is_followed.replace(true) {
+            return None;
+        }
+        self.gateway.tap(|tap| tap.listen(true));
+        Some(Follower { console: self, port, lost: 0 })
+    }
+}
+
+impl Drop for Follower<'_> {
+    fn drop(&mut self) {
+        self.console.is_followed.set(false);
+        self.console.gateway.tap(|tap| tap.listen(false));
+    }
+}
+
+impl Follower<'_> {
+    /// Writes an event with as many frames as there is room for; nothing if there are none.
+    pub(super) fn write(&mut self, out: &mut Room<'_>) -> fmt::Result {
+        let mut count = 0_usize;
+        while out.left() > LONGEST {
+            let mut bytes = [0; MOST_BYTES];
+            let room = &mut bytes;
+            let Some(record) = self.console.gateway.tap(move |tap| tap.next(room)) else { break };
+            self.lost = self.lost.saturating_add(record.lost);
+            let TapPlace::Port(id) = record.place else { continue };
+            self.console.gateway.report(|status| {
+                let Some(port) = status.ports().find(|port| port.id == id) else { return Ok(()) };
+                if self.port.is_some_and(|only| only != port.name) {
+                    return Ok(());
+                }
+                out.write_str(if count == 0 { "event: frames\ndata: {\"frames\":[" } else { "," })?;
+                count = count.saturating_add(1);
+                write(out, &record, port.name)
+            })?;
+        }
+        if count > 0 {
+            write!(out, "],\"lost\":{}}}\n\n", core::mem::take(&mut self.lost))?;
+        }
+        Ok(())
+    }
+}
+
+/// The same keys as those of a host, but for what it decodes.
+fn write(out: &mut Room<'_>, record: &TapRecord<'_>, port: &str) -> fmt::Result {
+    write!(out, "{{\"time_us\":{},\"port\":", record.at.as_micros())?;
+    json::write_text(out, port)?;
+    let direction = match record.direction {
+        TapDirection::In => "in",
+        TapDirection::Out => "out",
+    };
+    write!(out, ",\"direction\":\"{direction}\",\"verdict\":")?;
+    match record.verdict {
+        TapVerdict::Rejected(why) => {
+            json::write(out, &why).map_err(|_| fmt::Error)?;
+            write!(out, ",\"text\":\"{}\"", why.text())?;
+        }
+        _ => out.write_str("\"frame\"")?,
+    }
+    match record.can_id {
+        Some(CanId::Standard(id)) => write!(out, ",\"id\":{id}")?,
+        Some(CanId::Extended(id)) => write!(out, ",\"id\":{id},\"extended\":true")?,
+        None => {}
+    }
+    if record.len > record.bytes.len() {
+        write!(out, ",\"len\":{}", record.len)?;
+    }
+    write!(out, ",\"bytes\":\"{}\"}}", Hex(record.bytes))
+}
+
+/// Bytes that are shown of a frame.
+const MOST_BYTES: usize = 256;
+/// Length of the longest record: its bytes, a name of which each letter is escaped, and the rest.
+const LONGEST: usize = 2 * MOST_BYTES + 6 * 32 + 260;

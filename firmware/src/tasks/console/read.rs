@@ -1,0 +1,275 @@
+//! The operations that read.
+
+use core::fmt::{self, Write};
+
+use embassy_futures::yield_now;
+use embassy_time::Instant;
+use proto_core::engine::FieldBus;
+use recipe_remote::claim::Claim;
+use recipe_remote::documents::Document;
+use recipe_remote::json;
+use recipe_remote::key::SCHEME;
+use recipe_remote::metrics::Families;
+use recipe_remote::nonces::MAX_AGE;
+use recipe_remote::response::{Kind, Length, Page, Status};
+use recipe_remote::revisions::{Revision, Revisions};
+use recipe_remote::route::Operation;
+use serde::Serialize;
+
+use super::answer::{Ended, Etag, Line, Outcome, Reply, Room};
+use super::change::{busy, nothing_kept};
+use super::connection::Request;
+use super::documents::Source;
+use super::{Console, MAX_ANSWER, MAX_TIME};
+use crate::clock::now;
+use crate::journal;
+use crate::platform::Ports;
+use crate::tasks::keeper::{Desk, NOTHING, PART};
+
+impl Console {
+    /// Carries out a request.
+    pub(super) async fn carry_out<'a>(
+        &'a self,
+        line: &mut Line<'_, '_>,
+        request: Request<'a>,
+    ) -> Result<Outcome, Ended> {
+        let reply = match request.operation {
+            Operation::Info => self.info(line.room),
+            Operation::Nonce => self.nonce(line.room),
+            Operation::Revisions => self.revisions(line.room, Status::OK, None),
+            Operation::Update => self.firmware(line.room, Status::OK),
+            Operation::Status => return self.document(line, Kind::Json, Source::of(Document::Status)).await,
+            Operation::Values => return self.document(line, Kind::Json, Source::of(Document::Values)).await,
+            Operation::Metrics => {
+                return self.document(line, Kind::Metrics, Source::Metrics(Families::new())).await;
+            }
+            Operation::Stream => return self.stream(line, &request).await,
+            Operation::Log => return log(line, &request).await,
+            Operation::Page => return page(line, &request).await,
+            Operation::Config => return self.config(line, &request).await,
+            _ => self.change(line.room, request).await,
+        };
+        Ok(Outcome::Reply(reply))
+    }
+
+    fn nonce(&self, room: &mut [u8]) -> Reply {
+        let nonce = self.guard.borrow_mut().nonce(now());
+        let age = MAX_AGE.as_millis() / 1_000;
+        Reply::new(room, Status::OK, Kind::Json, |out| {
+            write!(out, "{{\"max_age_s\":{age},\"nonce\":\"{nonce}\",\"scheme\":\"{SCHEME}\"}}")
+        })
+    }
+
+    #[inline(never)]
+    fn info(&self, room: &mut [u8]) -> Reply {
+        Reply::new(room, Status::OK, Kind::Json, |out| {
+            let name = &self.name;
+            let version = env!("CARGO_PKG_VERSION");
+            write!(out, "{{\"role\":\"board\",\"name\":\"{name}\",\"version\":\"{version}\",\"api\":\"v1\"")?;
+            let uptime = Instant::now().as_secs();
+            let mut claim = self.claim.get();
+            claim.poll(now());
+            let is_claimed = claim == Claim::Claimed;
+            write!(out, ",\"uptime_s\":{uptime},\"claimed\":{is_claimed},\"can_be_changed\":{is_claimed}")?;
+            if let Claim::Open { until } = claim {
+                write!(out, ",\"claim_left_s\":{}", until.saturating_since(now()).as_millis() / 1_000)?;
+            }
+            if let Some(running) = self.desk.and_then(Desk::running) {
+                write!(out, ",\"revision\":{running}")?;
+            }
+            let Ports { lines, buses } = self.ports;
+            write!(out, ",\"has\":{{\"rs485\":{lines},\"can\":{buses}}},\"places\":{{\"ports\":{{")?;
+            self.gateway.report(|status| {
+                status.ports().enumerate().try_for_each(|(nth, port)| {
+                    out.write_str(if nth == 0 { "" } else { "," })?;
+                    json::write_text(out, port.name)?;
+                    out.write_str(match port.bus {
+                        FieldBus::Rs485 => ":\"rs485\"",
+                        _ => ":\"can\"",
+                    })
+                })
+            })?;
+            let (connections, streams) = (self.connections.get(), self.streams.get());
+            write!(
+                out,
+                "}}}},\"console\":{{\"connections\":{connections},\"streams\":{streams},\"requests\":"
+            )?;
+            write_json(out, self.guard.borrow().counters())?;
+            out.write_str(",\"counters\":")?;
+            write_json(out, &self.counters.get())?;
+            out.write_str("}}")
+        })
+    }
+
+    /// The revisions, and what happens to them; `changed` is the one that a change was about.
+    #[inline(never)]
+    pub(super) fn revisions(&self, room: &mut [u8], status: Status, changed: Option<u32>) -> Reply {
+        let Some(desk) = self.desk else { return nothing_kept(room) };
+        let reply = desk.look(|revisions| {
+            let etag = changed.and_then(|number| revisions.revision(number));
+            let write = |out: &mut Room<'_>| write_revisions(out, desk, revisions, changed);
+            Reply::new(room, status, Kind::Json, write).about(etag)
+        });
+        // The store is being read, or an image is taken over.
+        reply.unwrap_or_else(|| busy(room))
+    }
+
+    /// The image of what runs, or of the one that was asked for.
+    async fn config(&self, line: &mut Line<'_, '_>, request: &Request<'_>) -> Result<Outcome, Ended> {
+        let (desk, revision) = match self.asked_revision(line.room, request) {
+            Ok(found) => found,
+            Err(reply) => return Ok(Outcome::Reply(reply)),
+        };
+        if !line.begin(Kind::Image, Length::Chunked, Some(revision)).await? {
+            return Ok(Outcome::Sent);
+        }
+        let mut offset = 0;
+        loop {
+            let len = desk.part(revision.number, offset, line.room).await.ok_or(Ended::Gone)?;
+            line.chunk(len, Instant::now() + MAX_TIME).await?;
+            offset = offset.saturating_add(PART);
+            if len < PART {
+                line.last_chunk().await?;
+                return Ok(Outcome::Sent);
+            }
+            yield_now().await;
+        }
+    }
+
+    fn asked_revision(
+        &self,
+        room: &mut [u8],
+        request: &Request<'_>,
+    ) -> Result<(&'static Desk, Revision), Reply> {
+        let Some(desk) = self.desk else { return Err(nothing_kept(room)) };
+        let number = match request.head.query("revision").map(str::parse) {
+            None => desk.running(),
+            Some(Ok(number)) => Some(number),
+            Some(Err(_)) => {
+                return Err(Reply::error(room, Status::BAD_REQUEST, "revision must be a number"));
+            }
+        };
+        let revision = number.and_then(|number| desk.look(|kept| kept.revision(number)).flatten());
+        let Some(revision) = revision.filter(|revision| *revision != NOTHING) else {
+            return Err(Reply::error(room, Status::NOT_FOUND, "there is no such revision"));
+        };
+        if request.head.if_none_match.and_then(Etag::parse) == Some(revision) {
+            let unchanged = Reply::new(room, Status::NOT_MODIFIED, Kind::Image, |_| Ok(()));
+            return Err(unchanged.about(Some(revision)));
+        }
+        Ok((desk, revision))
+    }
+}
+
+/// Sends the newest lines of the log.
+async fn log(line: &mut Line<'_, '_>, request: &Request<'_>) -> Result<Outcome, Ended> {
+    let lines = match request.head.query("lines").map(str::parse) {
+        None => MAX_LINES,
+        Some(Ok(lines @ 1..=MAX_LINES)) => lines,
+        Some(_) => {
+            let text = "lines is out of range; allowed: 1..=256";
+            return Ok(Outcome::Reply(Reply::error(line.room, Status::BAD_REQUEST, text)));
+        }
+    };
+    if !line.begin(Kind::Text, Length::Chunked, None).await? {
+        return Ok(Outcome::Sent);
+    }
+    let mut place = journal::last(lines);
+    // More than the journal has is what came meanwhile.
+    for _ in 0..journal::ROOM.div_ceil(LOG_PIECE) {
+        let (len, behind) = journal::read(place, line.room.get_mut(..LOG_PIECE).unwrap_or(&mut []));
+        if len == 0 {
+            break;
+        }
+        place = behind;
+        line.chunk(len, Instant::now() + MAX_TIME).await?;
+        yield_now().await;
+    }
+    line.last_chunk().await?;
+    Ok(Outcome::Sent)
+}
+
+/// Sends the page for people, unless the client has it.
+async fn page(line: &mut Line<'_, '_>, request: &Request<'_>) -> Result<Outcome, Ended> {
+    let status = PAGE.status(request.head.if_none_match);
+    let mut room = Room::new(line.room);
+    PAGE.write_head(status, &mut room).map_err(|_| Ended::TooLong)?;
+    let (head, until) = (room.len, Instant::now() + MAX_ANSWER);
+    line.send_room(0, head, until.min(Instant::now() + MAX_TIME)).await?;
+    if line.is_head || status != Status::OK {
+        return Ok(Outcome::Sent);
+    }
+    for piece in PAGE.bytes.chunks(PAGE_PIECE) {
+        line.send(piece, until.min(Instant::now() + MAX_TIME)).await?;
+        yield_now().await;
+    }
+    Ok(Outcome::Sent)
+}
+
+/// Writes the document `revisions`.
+fn write_revisions(
+    out: &mut Room<'_>,
+    desk: &Desk,
+    revisions: &Revisions,
+    changed: Option<u32>,
+) -> fmt::Result {
+    out.write_str("{\"kept\":[")?;
+    let kept = revisions.kept().iter().filter(|kept| **kept != NOTHING);
+    for (nth, kept) in kept.enumerate() {
+        let comma = if nth == 0 { "" } else { "," };
+        write!(out, "{comma}{{\"revision\":{},\"etag\":\"", kept.number)?;
+        write_etag(out, *kept)?;
+        out.write_str("\"}")?;
+    }
+    out.write_char(']')?;
+    let real = |number: Option<u32>| number.filter(|number| *number != NOTHING.number);
+    let numbers = [
+        ("running", desk.running()),
+        ("live", real(Some(revisions.live()))),
+        ("previous", real(revisions.previous())),
+        ("waiting", revisions.waiting()),
+        ("revision", changed),
+    ];
+    for (name, number) in numbers {
+        if let Some(number) = number {
+            write!(out, ",\"{name}\":{number}")?;
+        }
+    }
+    if let Some((number, until)) = revisions.trial() {
+        let left = until.saturating_since(now()).as_millis();
+        write!(out, ",\"trial\":{{\"revision\":{number},\"left_s\":{}.{:03}}}", left / 1_000, left % 1_000)?;
+    }
+    if let Some(base) = revisions.base() {
+        out.write_str(",\"base\":\"")?;
+        write_etag(out, base)?;
+        out.write_char('"')?;
+    }
+    if let Some((number, ended)) = revisions.last() {
+        write!(out, ",\"last\":{{\"revision\":{number},\"ended\":\"{}\"}}", ended.name())?;
+    }
+    desk.failure(|failure| {
+        if failure.is_empty() {
+            return Ok(());
+        }
+        out.write_str(",\"failure\":")?;
+        json::write_text(out, failure)
+    })?;
+    out.write_char('}')
+}
+
+/// In a string of JSON: with its quotes escaped.
+fn write_etag(out: &mut Room<'_>, revision: Revision) -> fmt::Result {
+    write!(out, "\\\"{}-{:08x}\\\"", revision.number, revision.digest)
+}
+
+fn write_json(out: &mut Room<'_>, value: &impl Serialize) -> fmt::Result {
+    json::write(out, value).map_err(|_| fmt::Error)
+}
+
+/// The page for people.
+const PAGE: Page =
+    Page { bytes: &recipe_console::PAGE, policy: recipe_console::POLICY, etag: recipe_console::ETAG };
+/// Bytes of it that are given to the network at once.
+const PAGE_PIECE: usize = 1024;
+const MAX_LINES: usize = 256;
+const LOG_PIECE: usize = 1024;

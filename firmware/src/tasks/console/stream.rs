@@ -1,0 +1,105 @@
+//! Server-sent events: state and values five times a second, and frames for a client that asks for them.
+//!
+//! A client that reads slowly gets fewer events and is told how many it lost; one that does not read is dropped.
+
+use core::fmt::Write;
+
+use embassy_futures::select::{Either, select};
+use embassy_futures::yield_now;
+use embassy_time::{Duration, Instant, Timer};
+use recipe_remote::documents::Document;
+use recipe_remote::response::{Kind, Length, Status};
+
+use super::answer::{Ended, Line, Outcome, Reply, Room};
+use super::connection::Request;
+use super::documents::Source;
+use super::{Console, MAX_TIME, OneMore, STREAMS};
+
+impl Console {
+    /// Serves a stream until its client leaves or does not read.
+    pub(super) async fn stream(
+        &self,
+        line: &mut Line<'_, '_>,
+        request: &Request<'_>,
+    ) -> Result<Outcome, Ended> {
+        let Some(_one) = OneMore::of(&self.streams, STREAMS) else {
+            self.count(|counters| &mut counters.turned_away);
+            let text = "too many streams; poll /api/v1/status instead";
+            return Ok(Outcome::Reply(Reply::error(line.room, Status::UNAVAILABLE, text)));
+        };
+        let port = request.head.query("port");
+        let mut follower = None;
+        if request.head.query("frames") == Some("1") {
+            follower = self.follow(port);
+            if follower.is_none() {
+                let text = "another client follows the frames; a board has room for one";
+                return Ok(Outcome::Reply(Reply::error(line.room, Status::UNAVAILABLE, text)));
+            }
+        }
+        line.begin(Kind::Events, Length::Endless, None).await?;
+        let mut next = Instant::now();
+        loop {
+            if let Some(follower) = &mut follower {
+                loop {
+                    let mut room = Room::new(line.room);
+                    follower.write(&mut room).map_err(|_| Ended::TooLong)?;
+                    match room.len {
+                        0 => break,
+                        len => line.send_room(0, len, Instant::now() + MAX_TIME).await?,
+                    }
+                    yield_now().await;
+                }
+            }
+            let now = Instant::now();
+            if now >= next {
+                let lost = now.duration_since(next).as_micros() / PERIOD.as_micros();
+                next += PERIOD;
+                if lost > 0 {
+                    next = now + PERIOD;
+                    self.lose(line, lost).await?;
+                }
+                self.event(line, "status", Document::Status).await?;
+                self.event(line, "values", Document::Values).await?;
+            }
+            let wake = if follower.is_some() { next.min(Instant::now() + FRAMES) } else { next };
+            // It has nothing more to say; what it says all the same is not looked at.
+            let mut said = [0; 32];
+            match select(Timer::at(wake), line.socket.read(&mut said)).await {
+                Either::First(()) | Either::Second(Ok(1..)) => {}
+                Either::Second(_) => return Err(Ended::Gone),
+            }
+            yield_now().await;
+        }
+    }
+
+    async fn event(&self, line: &mut Line<'_, '_>, name: &str, document: Document) -> Result<(), Ended> {
+        let until = Instant::now() + MAX_TIME;
+        if self.is_idle() {
+            // Nothing runs. A comment shows that the stream is still there.
+            return line.send(b":\n\n", until).await;
+        }
+        let mut source = Source::of(document);
+        for text in ["event: ", name, "\ndata: "] {
+            line.send(text.as_bytes(), until).await?;
+        }
+        while let Some(len) = self.piece(line, &mut source)? {
+            line.send_room(0, len, until).await?;
+            yield_now().await;
+        }
+        line.send(b"\n\n", until).await
+    }
+
+    async fn lose(&self, line: &mut Line<'_, '_>, lost: u64) -> Result<(), Ended> {
+        for _ in 0..lost.min(1_000) {
+            self.count(|counters| &mut counters.lost_events);
+        }
+        let mut text = heapless::String::<64>::new();
+        write!(text, "event: lost\ndata: {{\"count\":{lost}}}\n\n").map_err(|_| Ended::TooLong)?;
+        line.send(text.as_bytes(), Instant::now() + MAX_TIME).await
+    }
+}
+
+/// Time between two events.
+const PERIOD: Duration = Duration::from_millis(200);
+/// Time between two looks at the frames: their ring holds little more.
+const FRAMES: Duration = Duration::from_millis(20);

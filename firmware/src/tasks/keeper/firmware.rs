@@ -1,0 +1,162 @@
+//! The keeper's part of updates: pieces of a firmware, its trial, and the end of one.
+
+use embassy_time::Instant;
+use proto_core::engine::PortState;
+use proto_core::link::LinkState;
+use recipe_store::{Ended, SlotMarks};
+use recipe_update::{SlotFlash, begin_trial, confirm, end_trial};
+
+use super::super::gateway::Gateway;
+use super::{Ask, Failed, FirmwareView, Keeper, MAX_SAFE};
+use crate::fmt::Text;
+use crate::kept::{StoreFlash, image_version};
+use crate::update::{Refused, Verdict, WaitsFor, Works};
+use crate::{error, info, warn};
+
+/// What comes of a look at the firmware's trial.
+pub(super) enum Judged {
+    /// Nothing is on trial.
+    Settled,
+    /// It goes on.
+    OnTrial(WaitsFor),
+    /// The board has to be restarted with the firmware before.
+    Restart,
+}
+
+/// How much of the cell works.
+fn works(gateway: &Gateway) -> Works {
+    gateway.report(|status| {
+        let is_up = |state| matches!(state, LinkState::Up { .. } | LinkState::Shared);
+        let links = status.links().filter(|link| is_up(link.state)).count();
+        let ports = status.ports().filter(|port| port.state == PortState::Working).count();
+        let byte = |count| u8::try_from(count).unwrap_or(u8::MAX);
+        Works { links: byte(links), ports: byte(ports) }
+    })
+}
+
+impl<F: StoreFlash, S: SlotFlash> Keeper<'_, F, S> {
+    /// Looks at the trial of the firmware that runs, and confirms or ends it.
+    pub(super) async fn judge(&mut self, gateway: &Gateway) -> Judged {
+        let Some(trial) = &mut self.trial else { return Judged::Settled };
+        match trial.look(Instant::now(), works(gateway), self.desk.was_asked.get()) {
+            Verdict::Waits(waits_for) => Judged::OnTrial(waits_for),
+            Verdict::Confirmed => match self.confirm_firmware().await {
+                Ok(_) => Judged::Settled,
+                // Tried again by the next look, until the time is over.
+                Err(_) if self.trial.is_some_and(|trial| Instant::now() < trial.until()) => {
+                    Judged::OnTrial(WaitsFor::Time)
+                }
+                Err(_) => self.over(Ended::NotConfirmed).await,
+            },
+            Verdict::Over => {
+                warn!("the firmware was not confirmed in time: back to the one before");
+                self.over(Ended::NotConfirmed).await
+            }
+        }
+    }
+
+    async fn over(&mut self, ended: Ended) -> Judged {
+        // The starts of a trial are counted, so it ends also if this cannot be written.
+        if let Some(marks) = end_trial(self.kept.slots(), ended)
+            && let Err(error) = self.kept.mark_slots(marks).await
+        {
+            error!("the store: {}", Text(&error));
+        }
+        Judged::Restart
+    }
+
+    async fn confirm_firmware(&mut self) -> Result<u32, Failed> {
+        let running = self.updates.running();
+        let marks = running.and_then(|running| confirm(self.kept.slots(), running));
+        let marks = marks.ok_or(Failed::Firmware(Refused::NotOnTrial))?;
+        self.kept.mark_slots(marks).await.map_err(|error| {
+            error!("the store: {}", Text(&error));
+            Failed::Store(error)
+        })?;
+        self.trial = None;
+        info!("the firmware is confirmed");
+        Ok(0)
+    }
+
+    /// What readers see.
+    pub(super) fn show(&self, waits_for: Option<WaitsFor>) {
+        let updates = &self.updates;
+        let trial = self.trial.map(|trial| (trial.until(), waits_for.unwrap_or(WaitsFor::Time)));
+        self.desk.firmware.set(Some(FirmwareView {
+            board: *updates.board(),
+            slot: updates.running(),
+            cannot: updates.cannot(),
+            key: updates.key(),
+            marks: self.kept.slots(),
+            trial,
+            other: updates.other().copied(),
+            incoming: updates.incoming(),
+        }));
+    }
+
+    /// Carries out what is about the firmware; `None` if it is not. Returns as the keeper's own does.
+    pub(super) async fn of_firmware(
+        &mut self,
+        gateway: &Gateway,
+        ask: &Ask,
+    ) -> Option<(Result<u32, Failed>, bool)> {
+        let refused = |why| Some((Err(Failed::Firmware(why)), false));
+        let marks = self.kept.slots();
+        match ask {
+            Ask::Put { len, .. } => {
+                let version = image_version(self.desk.image.borrow().get(..*len).unwrap_or(&[]));
+                match self.updates.may_keep(version.unwrap_or(0), marks) {
+                    Ok(()) => None,
+                    Err(why) => refused(why),
+                }
+            }
+            Ask::Piece { offset, len, downgrade } => {
+                Some((self.take_piece(*offset, *len, marks, *downgrade).await, false))
+            }
+            Ask::TryFirmware { confirm_s, downgrade } => {
+                if self.desk.look(|revisions| revisions.trial().is_some()) != Some(false) {
+                    return refused(Refused::Unsettled);
+                }
+                let header = match self.updates.ready(self.kept.versions(), marks, *downgrade) {
+                    Ok(header) => header,
+                    Err(why) => return refused(why),
+                };
+                let before = works(gateway).code();
+                // From here on the board is restarted, whatever comes of it: nothing may wait while a signature is
+                // checked, and a gateway that has let its safe values out does not go on.
+                if !gateway.make_safe(MAX_SAFE).await {
+                    warn!("the controller does not show all safe values");
+                }
+                if let Err(why) = self.updates.verify(&header) {
+                    warn!("the firmware that was received was signed with another key");
+                    return Some((Err(Failed::Firmware(why)), true));
+                }
+                let marks = begin_trial(marks, header.slot(), *confirm_s, before);
+                let marked = self.kept.mark_slots(marks).await;
+                Some((marked.map(|()| 0).map_err(Failed::Store), true))
+            }
+            Ask::ConfirmFirmware => Some((self.confirm_firmware().await, false)),
+            Ask::EndFirmware if self.trial.is_none() => refused(Refused::NotOnTrial),
+            Ask::EndFirmware => {
+                self.over(Ended::TakenBack).await;
+                Some((Ok(0), true))
+            }
+            Ask::Apply { .. } | Ask::Confirm | Ask::RollBack | Ask::Claim(_) => None,
+        }
+    }
+
+    #[allow(clippy::await_holding_refcell_ref, reason = "who has the desk waits for the keeper")]
+    async fn take_piece(
+        &mut self,
+        offset: u32,
+        len: usize,
+        marks: SlotMarks,
+        downgrade: recipe_update::Downgrade,
+    ) -> Result<u32, Failed> {
+        let kept = self.kept.versions();
+        let image = self.desk.image.borrow();
+        let bytes = image.get(..len).unwrap_or(&[]);
+        self.updates.take(offset, bytes, kept, marks, downgrade).await.map_err(Failed::Firmware)?;
+        Ok(0)
+    }
+}
