@@ -10,6 +10,7 @@ use crate::access::{Access, Violation};
 use crate::device::*;
 use crate::devices::{CAN, Devices, Id, MAP};
 use crate::exception::masks;
+use crate::models::rcc::Cause;
 use crate::models::scs::Scs;
 use crate::program::SEV;
 use crate::unicorn::{Engine, Flow, Handler, Reg, SYSTEM};
@@ -71,17 +72,16 @@ impl Board {
         board
     }
 
-    /// Resets the chip; virtual time and what is outside the chip stay as they are.
-    pub(crate) fn reset(&mut self, by_watchdog: bool) {
+    /// Resets the chip, without a cause at power-on; virtual time and what is outside the chip stay as they are.
+    pub(crate) fn reset(&mut self, cause: Option<Cause>) {
         for place in &MAP {
             if place.id != Id::Rcc {
                 self.devices.device(place.id).reset();
             }
         }
-        if by_watchdog {
-            self.devices.rcc.reset_by_watchdog();
-        } else {
-            self.devices.rcc.reset();
+        match cause {
+            Some(cause) => self.devices.rcc.reset_by(cause),
+            None => self.devices.rcc.reset(),
         }
         self.scs.reset();
         self.functions = [[None; 16]; 11];
@@ -317,6 +317,9 @@ impl Handler for Board {
 
     fn block(&mut self, core: Engine, address: u32, len: u32) -> Flow {
         let must_stop = self.violation.is_some() || self.halt.is_some() || self.guard_changed;
+        let must_stop = must_stop || self.scs.wants_reset();
+        // A program that asks the flash whether it is done, and reads it at once, has to see what it has written.
+        let must_stop = must_stop || self.devices.flash.has_changed();
         let is_due = self.now >= self.deadline || must_stop;
         let is_due = is_due || self.has_pending && self.scs.due(masks(core)).is_some();
         if is_due && !self.is_single_step {

@@ -10,6 +10,8 @@
 mod flash;
 mod log;
 
+use std::collections::BTreeMap;
+
 use defmt_decoder::StreamDecoder;
 
 use self::flash::is_flash;
@@ -18,6 +20,7 @@ use crate::board::{Board, FLASH, FLASH_SIZE, Halt};
 use crate::device::*;
 use crate::devices::Devices;
 use crate::exception::{enter, is_return, leave, masks};
+use crate::models::rcc::Cause;
 use crate::models::scs::HARD_FAULT;
 use crate::program::Program;
 use crate::unicorn::{Core, Engine, Exit, MMIO, Reg};
@@ -40,6 +43,8 @@ pub struct Chip {
     is_asleep: bool,
     /// Steps since the log was read.
     steps_unread: u32,
+    /// Pages of flash that are not just read-only for the emulator.
+    pages: BTreeMap<u32, flash::Access>,
     /// The range of the MPU's guard region that is in effect.
     closed: Option<(u32, u32)>,
     /// Consecutive deadlines that were not in the future.
@@ -49,6 +54,8 @@ pub struct Chip {
     pub log: Vec<(Picos, String)>,
     /// Times of the watchdog's resets.
     pub resets: Vec<Picos>,
+    /// Times of the resets that the program asked for.
+    pub restarts: Vec<Picos>,
     /// Faults: address of the instruction, and the bits set in CFSR.
     pub faults: Vec<(u32, u32)>,
     /// How often the core went to sleep.
@@ -92,48 +99,60 @@ impl Chip {
             is_locked_up: false,
             is_asleep: false,
             steps_unread: 0,
+            pages: BTreeMap::new(),
             closed: None,
             stalled: 0,
             decoder: program.log_reader(),
             log: Vec::new(),
             resets: Vec::new(),
+            restarts: Vec::new(),
             faults: Vec::new(),
             waits: 0,
             power_cuts: 0,
         };
-        chip.start(&power_on_ram())?;
+        chip.connect()?;
+        chip.fill_ram();
+        chip.start()?;
         Ok(chip)
     }
 
-    /// A new core at the reset vector, with this RAM.
-    fn start(&mut self, ram: &[Vec<u8>; 2]) -> Result<(), String> {
-        self.core = Core::new()?;
+    /// Connects a new core with its memory.
+    fn connect(&mut self) -> Result<(), String> {
         let core = &self.core;
         core.map(FLASH, FLASH_SIZE, false)?;
         core.map(SYSTEM_FLASH, 0x2_0000, false)?;
-        for ((address, size, _), bytes) in RAM.iter().zip(ram) {
-            core.map(*address, *size, true)?;
-            core.engine().write(*address, bytes);
+        for (address, size, _) in RAM {
+            core.map(address, size, true)?;
         }
-        core.engine().write(FLASH, self.board.devices.flash.cells());
         core.engine().write(UNIQUE_ID, &[1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12]);
         for range in MMIO {
             core.map_devices(range)?;
         }
-        for address in &self.program.waits {
-            core.watch(*address)?;
+        self.program.waits.iter().try_for_each(|address| core.watch(*address))
+    }
+
+    /// The core begins at the reset vector. It is the same one as before, because it keeps its translations of the
+    /// program.
+    fn start(&mut self) -> Result<(), String> {
+        if let Some((start, size)) = self.closed.take() {
+            self.core.protect(start, size, false)?;
         }
-        for word in self.board.devices.flash.torn() {
-            self.close_page(FLASH + word)?;
-        }
-        let engine = core.engine();
+        self.restore_flash()?;
+        let engine = self.core.engine();
+        engine.reset();
         engine.set(Reg::Sp, engine.word(FLASH));
-        engine.set(Reg::Lr, u32::MAX);
         self.pc = engine.word(FLASH + 4);
         self.is_locked_up = false;
         self.is_asleep = false;
-        self.closed = None;
+        self.decoder = self.program.log_reader();
         Ok(())
+    }
+
+    /// RAM after power-on.
+    fn fill_ram(&self) {
+        for (address, size, fill) in RAM {
+            self.engine().write(address, &vec![fill; size as usize]);
+        }
     }
 
     /// Makes a flash word (32 bytes) torn, as by a power failure while it is programmed: reading it is a bus
@@ -147,17 +166,20 @@ impl Chip {
     }
 
     /// Programs flash without checks, like a debugger.
+    ///
+    /// # Panics
+    /// There is no such flash.
     pub fn load(&mut self, address: u32, bytes: &[u8]) {
         self.board.devices.flash.load(address - FLASH, bytes);
-        self.engine().write(address, bytes);
+        self.restore_flash().expect("there is flash");
     }
 
     /// The supply fails and comes back: a new start, with what is in flash.
     pub fn cut_power(&mut self) {
         self.power_cuts += 1;
-        self.board.reset(false);
-        self.start(&power_on_ram()).expect("it has started before");
-        self.decoder = self.program.log_reader();
+        self.board.reset(None);
+        self.fill_ram();
+        self.start().expect("it has started before");
     }
 
     /// Replaces instructions of the program until the next reset.
@@ -251,7 +273,13 @@ impl Chip {
         let engine = self.engine();
         self.board.advance(engine);
         if self.board.devices.watchdog.expires_at().is_some_and(|at| self.board.now >= at) {
-            self.reset_by_watchdog();
+            self.resets.push(self.board.now);
+            self.reset(Cause::Watchdog);
+            return;
+        }
+        if self.board.scs.wants_reset() {
+            self.restarts.push(self.board.now);
+            self.reset(Cause::Program);
             return;
         }
         if self.is_locked_up {
@@ -363,23 +391,13 @@ impl Chip {
         self.board.advance(engine);
     }
 
-    /// Resets the chip; RAM keeps its contents.
-    fn reset_by_watchdog(&mut self) {
-        self.resets.push(self.board.now);
-        let engine = self.engine();
-        let ram = RAM.map(|(address, size, _)| {
-            let mut bytes = vec![0; size as usize];
-            engine.read(address, &mut bytes);
-            bytes
-        });
-        self.board.reset(true);
-        self.start(&ram).expect("it has started before");
-        self.decoder = self.program.log_reader();
+    /// Resets the chip; flash and RAM keep their contents. The log is read before, since the program begins its buffer
+    /// anew.
+    fn reset(&mut self, cause: Cause) {
+        self.read_log();
+        self.board.reset(Some(cause));
+        self.start().expect("it has started before");
     }
-}
-
-fn power_on_ram() -> [Vec<u8>; 2] {
-    RAM.map(|(_, size, fill)| vec![fill; size as usize])
 }
 
 /// The log is read at least once in so many steps.

@@ -1,7 +1,7 @@
 //! The memory map and interrupt lines of the peripherals. RM0433, "Memory and bus architecture"; the clock
 //! gates are those of RCC's registers AHB1ENR to APB4ENR.
 
-use crate::device::{Peripheral, Pin};
+use crate::device::{Peripheral, Picos, Pin};
 use crate::models::ethernet::Ethernet;
 use crate::models::fdcan::Fdcan;
 use crate::models::flash::Flash;
@@ -99,6 +99,30 @@ pub(crate) static MAP: [Place; 25] = [
     place(0x5C00_1000, 0x400, "DBGMCU", None, Id::Dbgmcu, None),
 ];
 
+/// The user's LEDs of the board.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Led {
+    /// LD1, green: PB0.
+    Green,
+    /// LD2, yellow: PE1.
+    Yellow,
+    /// LD3, red: PB14.
+    Red,
+}
+
+impl Led {
+    fn pin(self) -> Pin {
+        match self {
+            Self::Green => Pin('B', 0),
+            Self::Yellow => Pin('E', 1),
+            Self::Red => Pin('B', 14),
+        }
+    }
+}
+
+/// The user's button B1, between the supply and a pin that the board pulls down.
+const BUTTON: Pin = Pin('C', 13);
+
 /// The models.
 #[derive(Debug)]
 pub struct Devices {
@@ -135,7 +159,7 @@ pub struct Devices {
 impl Devices {
     pub(crate) fn new() -> Self {
         let pins = |tx, rx, de| Pins { tx, rx, de, function: 7 };
-        Self {
+        let mut devices = Self {
             rcc: Rcc::new(),
             pwr: Pwr::new(),
             syscfg: Syscfg::new(),
@@ -150,7 +174,23 @@ impl Devices {
             flash: Flash::new(),
             dbgmcu: Plain::new(&DBGMCU),
             axi: Plain::new(&AXI),
-        }
+        };
+        devices.gpio[BUTTON.port()].drive(0, BUTTON.1, false);
+        devices
+    }
+
+    /// Somebody presses B1 for `span`, from `at` on; not before the end of an earlier press.
+    pub fn press_button(&mut self, at: Picos, span: Picos) {
+        let port = &mut self.gpio[BUTTON.port()];
+        port.drive(at, BUTTON.1, true);
+        port.drive(at + span, BUTTON.1, false);
+    }
+
+    /// When an LED was switched on (`true`) and off, in order.
+    pub fn led(&self, led: Led) -> impl DoubleEndedIterator<Item = (Picos, bool)> {
+        let pin = led.pin();
+        let changes = self.gpio[pin.port()].changes.iter();
+        changes.filter(move |(_, of, _)| *of == pin.1).map(|(at, _, is_lit)| (*at, *is_lit))
     }
 
     pub(crate) fn device(&mut self, id: Id) -> &mut dyn Peripheral {
@@ -170,5 +210,32 @@ impl Devices {
             Id::Ethernet => &mut self.ethernet,
             Id::Rng => &mut self.rng,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::device::{Clocks, Context, Functions, MILLI};
+
+    static NONE: Functions = [[None; 16]; 11];
+
+    #[test]
+    fn the_button_is_high_while_it_is_pressed_and_leds_are_told_apart() {
+        const IDR: u32 = 0x10;
+        const BSRR: u32 = 0x18;
+        let mut devices = Devices::new();
+        let at = |now| Context { now, clocks: Clocks::default(), functions: &NONE, is_rmii: false };
+        devices.gpio[2].write(0, !(3 << 26), &at(0)).expect("PC13 becomes an input");
+        devices.press_button(10 * MILLI, 5 * MILLI);
+        devices.press_button(20 * MILLI, MILLI);
+        let mut is_pressed = |ms| devices.gpio[2].read(IDR, &at(ms * MILLI)).expect("it can be read") != 0;
+        let pressed: Vec<u64> = (0..30).filter(|ms| is_pressed(*ms)).collect();
+        assert_eq!(pressed, [10, 11, 12, 13, 14, 20]);
+        devices.gpio[1].write(BSRR, 1 << 14 | 1, &at(MILLI)).expect("LD3 and LD1");
+        devices.gpio[1].write(BSRR, 1 << 16, &at(2 * MILLI)).expect("LD1");
+        assert_eq!(devices.led(Led::Green).collect::<Vec<_>>(), [(MILLI, true), (2 * MILLI, false)]);
+        assert_eq!(devices.led(Led::Red).collect::<Vec<_>>(), [(MILLI, true)]);
+        assert_eq!(devices.led(Led::Yellow).count(), 0);
     }
 }

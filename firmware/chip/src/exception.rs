@@ -18,7 +18,7 @@ const FLOATS_IN_USE: u32 = 1 << 2;
 /// Stacked xPSR: the stack was aligned by one word.
 const ALIGNED: u32 = 1 << 9;
 /// xPSR: the state of an IT block. The emulator ends basic blocks at each KiB, also inside an IT block.
-const IT: u32 = 0x0600_FC00;
+pub(crate) const IT: u32 = 0x0600_FC00;
 const STACKED: [Reg; 6] = [Reg::R0, Reg::R1, Reg::R2, Reg::R3, Reg::R12, Reg::Lr];
 
 /// The core's mask registers.

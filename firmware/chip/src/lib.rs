@@ -31,6 +31,6 @@ pub use access::{Access, Violation};
 #[cfg(feature = "emulator")]
 pub use chip::{CONFIG, Chip, Stopped};
 #[cfg(feature = "emulator")]
-pub use devices::Devices;
+pub use devices::{Devices, Led};
 #[cfg(feature = "emulator")]
 pub use program::Program;

@@ -149,5 +149,8 @@ fn show_end(chip: &mut Chip, last: usize, out: &mut dyn Write) {
     for at in &chip.resets {
         text += &format!("reset by the watchdog after {:.3} ms\n", *at as f64 / MILLI as f64);
     }
+    for at in &chip.restarts {
+        text += &format!("reset by the program after {:.3} ms\n", *at as f64 / MILLI as f64);
+    }
     let _ = out.write_all(text.as_bytes());
 }

@@ -61,6 +61,21 @@ impl Program {
         Ok(Self { segments, waits: waits.collect(), rtt, functions, symbols, table })
     }
 
+    /// Knows also the code of other programs, which something else puts into flash: the firmware that this loader runs.
+    /// Their logs are at one place, and in one table.
+    #[must_use]
+    pub fn knowing(mut self, others: Vec<Self>) -> Self {
+        for mut other in others {
+            self.waits.append(&mut other.waits);
+            self.functions.append(&mut other.functions);
+            self.symbols.append(&mut other.symbols);
+            self.rtt = self.rtt.or(other.rtt);
+            self.table = self.table.or(other.table);
+        }
+        self.functions.sort();
+        self
+    }
+
     /// Address, function and offset, for messages.
     pub fn place(&self, address: u32) -> String {
         let behind = self.functions.partition_point(|(start, ..)| *start <= address);

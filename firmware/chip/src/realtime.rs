@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use crate::device::*;
-use crate::{Chip, Stopped};
+use crate::{Chip, Devices, Led, Stopped};
 use can::Can;
 use network::Network;
 pub use network::exec_if_requested;
@@ -57,6 +57,8 @@ pub struct Figures {
     pub feeds: u64,
     /// Resets by the watchdog.
     pub resets: u64,
+    /// Resets that the program asked for.
+    pub restarts: u64,
     /// Ethernet frames that the chip received, dropped and sent.
     pub ethernet: [u64; 3],
     /// Bytes that the chip received and sent on both serial lines.
@@ -69,12 +71,12 @@ pub struct Figures {
 impl fmt::Display for Figures {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let seconds = |time: Picos| time as f64 / SECOND as f64;
-        let Self { instructions, interrupts, feeds, resets, ethernet, serial, can, .. } = self;
+        let Self { instructions, interrupts, feeds, resets, restarts, ethernet, serial, can, .. } = self;
         write!(
             f,
             "{{\"wall_s\": {:.6}, \"virtual_s\": {:.6}, \"most_behind_s\": {:.6}, \"late_s\": {:.3}, \
              \"instructions\": {instructions}, \"interrupts\": {interrupts}, \"feeds\": {feeds}, \
-             \"resets\": {resets}, \"ethernet_taken\": {}, \"ethernet_dropped\": {}, \"ethernet_sent\": {}, \
+             \"resets\": {resets}, \"restarts\": {restarts}, \"ethernet_taken\": {}, \"ethernet_dropped\": {}, \"ethernet_sent\": {}, \
              \"serial_in\": {}, \"serial_out\": {}, \"can_in\": {}, \"can_out\": {}}}",
             self.wall.as_secs_f64(),
             seconds(self.virtual_time),
@@ -205,6 +207,7 @@ impl Runner {
         figures.interrupts = self.chip.interrupts();
         figures.feeds = self.feeds;
         figures.resets = self.chip.resets.len() as u64;
+        figures.restarts = self.chip.restarts.len() as u64;
         let ethernet = &self.chip.devices().ethernet;
         let [taken, dropped] = [ethernet.received, ethernet.dropped];
         figures.ethernet = [taken, dropped, self.network.as_ref().map_or(0, |network| network.frames_out)];
@@ -290,13 +293,20 @@ impl Runner {
         self.control_clients.retain(|(client, _)| !client.is_gone());
     }
 
-    /// Executes a command of the control socket and returns the line to answer: `cable out`, `cable in`; `stop`
-    /// (time stands still, as under a debugger), `go`; `figures`; `save START LEN PATH` (memory, to a file).
+    /// Executes a command of the control socket and returns the line to answer: `cable out`, `cable in`; `press MS`
+    /// (the button); `power` (it fails and comes back); `leds` (the last changes of each, as JSON); `stop` (time stands
+    /// still, as under a debugger), `go`; `figures`; `save START LEN PATH` (memory, to a file).
     pub fn execute(&mut self, words: &str) -> String {
         let now = self.chip.now();
         match words.splitn(4, ' ').collect::<Vec<_>>().as_slice() {
             ["cable", "out"] => self.chip.devices().ethernet.phy.unplug(),
             ["cable", "in"] => self.chip.devices().ethernet.phy.plug(now),
+            ["press", span] => match span.parse::<u32>() {
+                Ok(span) => self.chip.devices().press_button(now, Picos::from(span) * MILLI),
+                Err(_) => return format!("a number of milliseconds is needed: {words}"),
+            },
+            ["power"] => self.chip.cut_power(),
+            ["leds"] => return leds(self.chip.devices()),
             ["stop"] => self.pace.stop(),
             ["go"] => self.pace.resume(),
             ["figures"] => return self.figures().to_string(),
@@ -318,3 +328,18 @@ impl Runner {
         "done".into()
     }
 }
+
+/// The last changes of each LED, in order: time in ms, and whether it is lit from then on.
+fn leds(devices: &Devices) -> String {
+    let led = |led: Led| {
+        let mut last: Vec<_> = devices.led(led).rev().take(MOST_CHANGES).collect();
+        last.reverse();
+        let change = |(at, is_lit)| format!("[{:.3}, {is_lit}]", at as f64 / MILLI as f64);
+        last.into_iter().map(change).collect::<Vec<String>>().join(", ")
+    };
+    let [green, yellow, red] = [Led::Green, Led::Yellow, Led::Red].map(led);
+    format!("{{\"LD1\": [{green}], \"LD2\": [{yellow}], \"LD3\": [{red}]}}")
+}
+
+/// Of each LED.
+const MOST_CHANGES: usize = 64;

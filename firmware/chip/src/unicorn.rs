@@ -111,6 +111,11 @@ impl Engine {
         self.numbered(Reg::R4 as i32 + number as i32)
     }
 
+    /// Sets one of R0 to R12.
+    pub fn set_general(self, number: u32, value: u32) {
+        self.set_numbered(Reg::R0 as i32 + number as i32, value);
+    }
+
     fn numbered(self, number: i32) -> u32 {
         let mut value = 0_u64;
         // SAFETY: all registers of `Reg` have 32 bits; there is room for 64.
@@ -132,6 +137,20 @@ impl Engine {
         let value = u64::from(value);
         // SAFETY: as above.
         unsafe { (self.api.reg_write)(self.uc, number, (&raw const value).cast()) };
+    }
+
+    /// Gives all registers their values after a reset; the stack pointer and the program counter are the caller's.
+    pub fn reset(self) {
+        const THUMB: u32 = 1 << 24;
+        for number in (Reg::R0 as i32..=Reg::R12 as i32).chain(Reg::S0 as i32..Reg::S0 as i32 + 32) {
+            self.set_numbered(number, 0);
+        }
+        // CONTROL first: it says which stack pointer is meant.
+        for reg in [Reg::Control, Reg::Ipsr, Reg::Primask, Reg::Basepri, Reg::Faultmask, Reg::Fpscr] {
+            self.set(reg, 0);
+        }
+        self.set(Reg::Xpsr, THUMB);
+        self.set(Reg::Lr, u32::MAX);
     }
 
     /// Reads memory without checking access rights; `false` if there is none.
@@ -225,11 +244,19 @@ impl Core {
     }
 
     fn set_access(&self, address: u32, size: u32, access: u32) -> Result<(), String> {
-        const FLUSH_TLB: c_int = 11 | 1 << 30;
         let Engine { api, uc } = self.engine;
         // SAFETY: as above.
         checked("uc_mem_protect", unsafe { (api.protect)(uc, address.into(), size.into(), access) })?;
-        // Cached translations keep the old access rights.
+        self.flush_rights()
+    }
+
+    /// Forgets which accesses were allowed: they are cached, also when access rights have changed.
+    ///
+    /// # Errors
+    /// The library returns an error.
+    pub fn flush_rights(&self) -> Result<(), String> {
+        const FLUSH_TLB: c_int = 11 | 1 << 30;
+        let Engine { api, uc } = self.engine;
         // SAFETY: this request takes nothing.
         checked("uc_ctl", unsafe { (api.ctl)(uc, FLUSH_TLB) })
     }

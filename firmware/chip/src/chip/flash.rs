@@ -3,9 +3,9 @@
 
 use super::{Chip, PRECISE_BUS};
 use crate::board::{FLASH, FLASH_SIZE};
-use crate::exception::masks;
+use crate::exception::{IT, masks};
 use crate::models::flash::WORD;
-use crate::unicorn::Reg;
+use crate::unicorn::{Engine, Reg};
 
 impl Chip {
     /// Whether the page of this address contains torn words.
@@ -14,17 +14,45 @@ impl Chip {
         self.board.devices.flash.torn().any(|word| page(word) == offset)
     }
 
-    /// Makes a page read-only, or inaccessible if it contains a torn word.
-    pub(super) fn close_page(&self, address: u32) -> Result<(), String> {
-        if self.has_torn(address) {
-            self.core.protect(page(address), PAGE, true)
-        } else {
-            self.core.make_read_only(page(address), PAGE)
+    /// Makes a page read-only, or inaccessible if it contains a torn word. Where nothing changes the emulator keeps
+    /// its translations.
+    pub(super) fn close_page(&mut self, address: u32) -> Result<(), String> {
+        let page = page(address);
+        match (self.has_torn(address), self.pages.get(&page)) {
+            (true, Some(Access::None)) | (false, None) => Ok(()),
+            (true, _) => {
+                self.pages.insert(page, Access::None);
+                self.core.protect(page, PAGE, true)
+            }
+            (false, _) => {
+                self.pages.remove(&page);
+                self.core.make_read_only(page, PAGE)
+            }
         }
     }
 
-    /// Executes one instruction with full access to a page of flash.
+    /// Makes the emulator's memory what the cells are, also where code was patched or a power cut left something else.
+    /// Only what differs is written: the emulator drops its translations of what is.
+    pub(super) fn restore_flash(&mut self) -> Result<(), String> {
+        let engine = self.engine();
+        let mut there = vec![0; FLASH_SIZE as usize];
+        engine.read(FLASH, &mut there);
+        let pages = (FLASH..).step_by(PAGE as usize);
+        let cells = self.board.devices.flash.cells().chunks(PAGE as usize);
+        for ((address, cells), there) in pages.zip(cells).zip(there.chunks(PAGE as usize)) {
+            if cells != there {
+                engine.write(address, cells);
+                self.core.invalidate(address, PAGE);
+            }
+        }
+        let torn: Vec<u32> = self.board.devices.flash.torn().map(|word| FLASH + word).collect();
+        let pages: Vec<u32> = self.pages.keys().copied().chain(torn).collect();
+        pages.into_iter().try_for_each(|address| self.close_page(address))
+    }
+
+    /// Executes one instruction with full access to a page of flash. That costs the emulator all its translations.
     pub(super) fn step_in_page(&mut self, address: u32) {
+        self.pages.insert(page(address), Access::Full);
         self.core.protect(page(address), PAGE, false).expect("there is flash");
         // The block was translated without a stop after one instruction.
         self.core.invalidate(self.pc, 4);
@@ -49,14 +77,33 @@ impl Chip {
             }
             self.board.scs.record_fault(PRECISE_BUS, address, false);
         }
-        self.step_in_page(address);
+        match plain(self.engine(), self.pc) {
+            Some(Plain { loads: Some((register, size)), len }) => {
+                let mut bytes = [0; 4];
+                self.engine().read(address, &mut bytes[..size]);
+                self.engine().set_general(register, u32::from_le_bytes(bytes));
+                self.pass(len);
+            }
+            _ => self.step_in_page(address),
+        }
     }
 
-    /// A write to flash: the instruction is executed, and the model decides what the cells hold.
+    /// A write to flash: the model decides what the cells hold. A store that does nothing else is over then; any other
+    /// instruction is executed.
     pub(super) fn program_flash(&mut self, address: u32, (value, size): (u32, u32)) {
         let bytes = &value.to_le_bytes()[..size as usize];
         self.board.program_flash(self.pc, address - FLASH, bytes);
-        self.step_in_page(address);
+        match plain(self.engine(), self.pc) {
+            Some(Plain { loads: None, len }) => self.pass(len),
+            _ => self.step_in_page(address),
+        }
+    }
+
+    /// An instruction was carried out here.
+    fn pass(&mut self, len: u32) {
+        self.pc += len;
+        // After one refused access the emulator lets the next ones through.
+        self.core.flush_rights().expect("it takes nothing");
     }
 
     /// Copies what was erased or programmed into the emulator's memory.
@@ -70,6 +117,44 @@ impl Chip {
             }
         }
     }
+}
+
+/// A load or store of one register that changes no other and is in no IT block: it needs no emulator.
+struct Plain {
+    /// Length of the instruction.
+    len: u32,
+    /// Of a load, the register and the number of bytes, which are extended with zeros.
+    loads: Option<(u32, usize)>,
+}
+
+/// The present instruction, if it is one: LDR, LDRH, LDRB or STR with an offset (Armv7-M ARM A5.2.4, A5.3.7, A5.3.10).
+fn plain(engine: Engine, pc: u32) -> Option<Plain> {
+    let word = engine.word(pc);
+    let (low, high) = (word & 7, word >> 28);
+    let (len, loads) = match word as u16 {
+        _ if engine.reg(Reg::Xpsr) & IT != 0 => return None,
+        0x5000..0x5200 | 0x6000..0x6800 | 0x9000..0x9800 => (2, None),
+        0x5800..0x5A00 | 0x6800..0x7000 => (2, Some((low, 4))),
+        0x5A00..0x5C00 | 0x8800..0x9000 => (2, Some((low, 2))),
+        0x5C00..0x5E00 | 0x7800..0x8000 => (2, Some((low, 1))),
+        0xF8C0..0xF8D0 => (4, None),
+        0xF8D0..0xF8E0 => (4, Some((high, 4))),
+        0xF8B0..0xF8C0 => (4, Some((high, 2))),
+        0xF890..0xF8A0 => (4, Some((high, 1))),
+        _ => return None,
+    };
+    // Into the stack pointer, the link register or the program counter.
+    let is_special = loads.is_some_and(|(register, _)| register > 12);
+    (!is_special).then_some(Plain { len, loads })
+}
+
+/// What the emulator lets the program do with a page, if that is not to read it alone.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Access {
+    /// Nothing.
+    None,
+    /// Anything.
+    Full,
 }
 
 /// The emulator's unit of access rights.

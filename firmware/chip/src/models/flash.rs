@@ -125,8 +125,13 @@ impl Flash {
         }
     }
 
-    /// Programs bytes without checks, like a debugger.
+    /// Programs bytes without checks, like a debugger, which erases before. What was torn there is whole.
     pub fn load(&mut self, offset: u32, bytes: &[u8]) {
+        self.blank(offset, bytes.len() as u32);
+        self.put(offset, bytes);
+    }
+
+    fn put(&mut self, offset: u32, bytes: &[u8]) {
         self.cells[offset as usize..][..bytes.len()].copy_from_slice(bytes);
     }
 
@@ -150,12 +155,19 @@ impl Flash {
         std::mem::take(&mut self.changed)
     }
 
+    /// Whether there are such ranges.
+    #[cfg(any(test, feature = "emulator"))]
+    pub(crate) fn has_changed(&self) -> bool {
+        !self.changed.is_empty()
+    }
+
     /// Number of operations that were begun.
     pub fn operations(&self) -> u64 {
         self.operations
     }
 
     /// Whether the power fails now, once for each `fails_during`.
+    #[cfg(any(test, feature = "emulator"))]
     pub(crate) fn has_failed(&mut self) -> bool {
         self.fails_during.take_if(|number| *number == self.operations).is_some()
     }
@@ -311,7 +323,7 @@ impl Flash {
                 if self.only_looks_blank.remove(&address) {
                     self.torn.insert(address);
                 }
-                self.load(address, &bytes);
+                self.put(address, &bytes);
                 self.changed.push((address, WORD));
             }
         }

@@ -1,11 +1,12 @@
 //! GPIO ports A to K. RM0433, "General-purpose I/Os".
 //!
-//! Changes of outputs are recorded with their times. Inputs read 1, as nothing drives them. Other models
-//! check the alternate functions of their pins.
+//! Changes of outputs are recorded with their times. An input reads what is outside, or its pull, or 1 where there is
+//! neither; an output reads itself, an analog pin 0. Other models check the alternate functions of their pins.
 
 use crate::device::*;
 
 const MODER: u32 = 0x00;
+const PUPDR: u32 = 0x0C;
 const IDR: u32 = 0x10;
 const ODR: u32 = 0x14;
 const BSRR: u32 = 0x18;
@@ -17,7 +18,7 @@ static REGISTERS: [Register; 9] = [
     read_write(MODER, "MODER", !0, !0),
     read_write(0x04, "OTYPER", 0, 0xFFFF),
     read_write(0x08, "OSPEEDR", 0, !0),
-    read_write(0x0C, "PUPDR", 0, !0),
+    read_write(PUPDR, "PUPDR", 0, !0),
     read_only(IDR, "IDR", 0xFFFF),
     read_write(ODR, "ODR", 0, 0xFFFF),
     command(BSRR, "BSRR", !0),
@@ -33,6 +34,8 @@ pub struct Port {
     pub changes: Vec<(Picos, u8, bool)>,
     /// Changes of modes: time, pin, mode.
     pub modes: Vec<(Picos, u8, Mode)>,
+    /// Levels from outside: from when, pin, level.
+    outside: Vec<(Picos, u8, bool)>,
 }
 
 /// The mode of a pin.
@@ -59,8 +62,8 @@ impl Port {
         };
         bank.set(MODER, mode);
         bank.set(0x08, speed);
-        bank.set(0x0C, pull);
-        Self { bank, changes: Vec::new(), modes: Vec::new() }
+        bank.set(PUPDR, pull);
+        Self { bank, changes: Vec::new(), modes: Vec::new(), outside: Vec::new() }
     }
 
     /// The mode of a pin.
@@ -81,6 +84,24 @@ impl Port {
         (self.mode(pin) == Mode::Output).then(|| self.bank.get(ODR) >> pin & 1 != 0)
     }
 
+    /// Something outside drives a pin from this time on, after all that was said of this pin before.
+    pub fn drive(&mut self, from: Picos, pin: u8, level: bool) {
+        self.outside.push((from, pin, level));
+    }
+
+    /// The level of a pin.
+    fn level(&self, pin: u8, now: Picos) -> bool {
+        match self.mode(pin) {
+            Mode::Analog => false,
+            Mode::Output => self.bank.get(ODR) >> pin & 1 != 0,
+            Mode::Input | Mode::Function(_) => {
+                let driven = self.outside.iter().rev().find(|(from, of, _)| *of == pin && *from <= now);
+                let is_pulled_down = self.bank.get(PUPDR) >> (2 * pin) & 3 == 2;
+                driven.map_or(!is_pulled_down, |(.., level)| *level)
+            }
+        }
+    }
+
     /// The alternate function of each pin.
     pub fn functions(&self) -> [Option<u8>; 16] {
         std::array::from_fn(|pin| match self.mode(pin as u8) {
@@ -95,8 +116,9 @@ impl Peripheral for Port {
         &REGISTERS
     }
 
-    fn read(&mut self, offset: u32, _: &Context<'_>) -> Result<u32, Refusal> {
+    fn read(&mut self, offset: u32, at: &Context<'_>) -> Result<u32, Refusal> {
         match offset {
+            IDR => Ok((0..16).fold(0, |bits, pin| bits | u32::from(self.level(pin, at.now)) << pin)),
             BSRR => refuse("can only be written"),
             LCKR => refuse("locks are not modelled"),
             _ => self.bank.read(offset),
@@ -130,5 +152,36 @@ impl Peripheral for Port {
         }
         // Also the debug pins, which no model uses.
         self.bank.set(MODER, !0);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    static NONE: Functions = [[None; 16]; 11];
+
+    fn read(port: &mut Port, now: Picos) -> u32 {
+        let at = Context { now, clocks: Clocks::default(), functions: &NONE, is_rmii: false };
+        port.read(IDR, &at).expect("it can be read")
+    }
+
+    #[test]
+    fn a_pin_reads_what_drives_it() {
+        let mut port = Port::new('C');
+        port.drive(0, 13, false);
+        port.drive(MILLI, 13, true);
+        port.drive(3 * MILLI, 13, false);
+        assert_eq!(read(&mut port, 2 * MILLI), 0, "all pins are analog");
+        port.bank.set(MODER, !(3 << 26) & !(3 << 4) & !(3 << 6) & !(3 << 8) | 1 << 8);
+        port.bank.set(PUPDR, 2 << 6);
+        port.bank.set(ODR, 1 << 4);
+        // PC2 floats, PC3 is pulled down, PC4 is an output.
+        assert_eq!(read(&mut port, 0), 1 << 2 | 1 << 4);
+        assert_eq!(read(&mut port, 2 * MILLI), 1 << 2 | 1 << 4 | 1 << 13);
+        port.reset();
+        port.bank.set(MODER, !(3 << 26));
+        assert_eq!(read(&mut port, 3 * MILLI - 1), 1 << 13, "a reset ends nothing outside");
+        assert_eq!(read(&mut port, 3 * MILLI), 0);
     }
 }

@@ -27,6 +27,15 @@ impl Gate {
     }
 }
 
+/// Why the chip is reset while its supply stays on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Cause {
+    /// The independent watchdog was not fed.
+    Watchdog,
+    /// The program asked for it (SYSRESETREQ).
+    Program,
+}
+
 /// The model.
 #[derive(Debug)]
 pub struct Rcc {
@@ -43,6 +52,8 @@ pub struct Rcc {
 /// Oscillators in CR: enable bit, ready flag, start-up time (datasheet DS12110).
 const OSCILLATORS: [(u32, u32, Picos); 5] =
     [(0, 2, 2 * MICRO), (7, 8, 3 * MICRO), (12, 13, 4 * MICRO), (16, 17, 2 * MICRO), (24, 25, 100 * MICRO)];
+/// PINRSTF and CPURSTF: each reset of the system pulls the pin NRST.
+const PIN_AND_CPU: u32 = 1 << 22 | 1 << 17;
 /// HSEBYP.
 const BYPASS: u32 = 1 << 18;
 /// Longest start-up time of LSI.
@@ -62,9 +73,14 @@ impl Rcc {
         rcc
     }
 
-    /// A reset by the watchdog, which sets a flag in RSR.
-    pub fn reset_by_watchdog(&mut self) {
-        let causes = self.bank.get(RSR) | 1 << 26;
+    /// A reset while the supply stays on: its flags join those in RSR that were not cleared ("Reset source
+    /// identification").
+    pub fn reset_by(&mut self, cause: Cause) {
+        let flag = match cause {
+            Cause::Watchdog => 1 << 26,
+            Cause::Program => 1 << 24,
+        };
+        let causes = self.bank.get(RSR) | flag | PIN_AND_CPU;
         self.reset();
         self.bank.set(RSR, causes);
     }

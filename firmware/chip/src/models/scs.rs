@@ -56,6 +56,7 @@ pub const LINES: usize = 160;
 /// The number of the HardFault exception.
 pub const HARD_FAULT: u16 = 3;
 const SYSTICK: u16 = 15;
+const SYSRESETREQ: u32 = 1 << 2;
 const FIRST_LINE: u16 = 16;
 
 /// The core's mask registers.
@@ -80,6 +81,8 @@ pub struct Scs {
     priorities: [u8; LINES],
     system_priorities: [u8; 12],
     systick_pends: bool,
+    /// The program asked for a reset (AIRCR.SYSRESETREQ).
+    wants_reset: bool,
     ticks: Option<Picos>,
     /// Active exceptions, the outermost first.
     active: Vec<u16>,
@@ -100,6 +103,7 @@ impl Scs {
             priorities: [0; LINES],
             system_priorities: [0; 12],
             systick_pends: false,
+            wants_reset: false,
             ticks: None,
             active: Vec::new(),
             event: false,
@@ -227,6 +231,11 @@ impl Scs {
         self.active.contains(&HARD_FAULT)
     }
 
+    /// Whether the program has asked for a reset of the chip.
+    pub fn wants_reset(&self) -> bool {
+        self.wants_reset
+    }
+
     /// Lets SysTick carry out what is due.
     pub fn advance(&mut self, at: &Context<'_>) {
         while let Some(next) = self.ticks
@@ -329,8 +338,12 @@ impl Scs {
             ICSR if value & !(1 << 25 | 1 << 26) != 0 => return refuse("PendSV and NMI are not modelled"),
             ICSR => self.systick_pends = value & 1 << 26 != 0,
             AIRCR if value >> 16 != 0x05FA => return refuse("without the key"),
-            AIRCR if value & 7 != 0 => return refuse("a reset by the program is not modelled"),
-            AIRCR => self.bank.set(AIRCR, 0xFA05_0000 | value & 0x700),
+            // B3.2.6: for a debugger that halts the core.
+            AIRCR if value & 3 != 0 => return refuse("VECTRESET and VECTCLRACTIVE are not modelled"),
+            AIRCR => {
+                self.bank.set(AIRCR, 0xFA05_0000 | value & 0x700);
+                self.wants_reset |= value & SYSRESETREQ != 0;
+            }
             MPU_RASR if value & 1 != 0 && value >> 24 & 7 != 0 => {
                 return refuse("a region that somebody may use is not modelled");
             }

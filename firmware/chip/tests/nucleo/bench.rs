@@ -57,6 +57,12 @@ impl Bench {
         Self { chip, robot: None, seen: 0 }
     }
 
+    /// A board with this program.
+    pub(crate) fn of(program: &'static Program, image: &[u8]) -> Self {
+        let chip = Chip::new(program, image).unwrap_or_else(|error| panic!("{error}"));
+        Self { chip, robot: None, seen: 0 }
+    }
+
     /// Adds a controller at 192.168.12.10.
     pub(crate) fn with_robot(mut self) -> Self {
         self.robot = Some(Robot::new(&SimConfig::default()));
@@ -67,6 +73,14 @@ impl Bench {
     pub(crate) fn with_robot_of(mut self, toml: &str) -> Self {
         self.robot = Some(Robot::new(&toml::controller(toml)));
         self
+    }
+
+    /// Switches the board off and on, and forgets what it has logged and how often its power was cut.
+    pub(crate) fn begin_again(&mut self) {
+        self.chip.cut_power();
+        self.chip.power_cuts = 0;
+        self.chip.log.clear();
+        self.seen = 0;
     }
 
     pub(crate) fn now(&self) -> Picos {
@@ -116,6 +130,11 @@ impl Bench {
         let (index, at) = found.expect("it was found");
         self.seen = index + 1;
         at
+    }
+
+    /// What was logged up to now is not found by [`Self::until_log`].
+    pub(crate) fn look_no_further_back(&mut self) {
+        self.seen = self.chip.log.len();
     }
 
     /// Whether the log has a line with this text.

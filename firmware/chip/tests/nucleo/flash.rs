@@ -64,5 +64,5 @@ fn a_flash_word_is_there_when_its_bank_is_no_longer_busy() {
 fn a_write_without_leave_ends_the_run() {
     let mut bench = Bench::blank();
     program(&mut bench, READING);
-    bench.run(3 * MILLI);
+    bench.run(10 * MILLI);
 }

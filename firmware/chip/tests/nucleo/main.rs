@@ -1,15 +1,19 @@
 //! The NUCLEO-H743ZI2's binary, unchanged, on the modelled chip. Each test needs the emulator's library and the
 //! firmware (`CHIP_UNICORN`, `CHIP_ELF`; docs/chip.md); `.ci/run nucleo` provides both and runs all tests.
 
+mod attack;
 mod bench;
 mod boot;
 mod can;
 mod cell;
+mod client;
 mod faults;
 mod flash;
+mod page;
 mod realtime;
 mod robot;
 mod serial;
 mod store;
+mod update;
 
 use bench::Bench;

@@ -24,6 +24,8 @@ pub(crate) struct Robot {
     connections: HashMap<ConnId, usize>,
     unsent: HashMap<ConnId, VecDeque<u8>>,
     numbers: u64,
+    /// Of connections to the board.
+    next_port: u16,
     wake: Instant,
     /// Frames from the board.
     pub(crate) frames: Vec<(Picos, Vec<u8>)>,
@@ -79,9 +81,29 @@ impl Robot {
             connections: HashMap::new(),
             unsent: HashMap::new(),
             numbers: 0,
+            next_port: 5_001,
             wake: Instant::ZERO,
             frames: Vec::new(),
         }
+    }
+
+    /// Opens a connection to the board. `room` bytes are taken before somebody reads.
+    pub(crate) fn connect(&mut self, to: IpEndpoint, room: usize) -> SocketHandle {
+        let buffer = |len| tcp::SocketBuffer::new(vec![0; len]);
+        let mut socket = tcp::Socket::new(buffer(room), buffer(8192));
+        socket.connect(self.interface.context(), to, self.next_port).expect("it is new");
+        self.next_port += 1;
+        self.sockets.add(socket)
+    }
+
+    /// Drops a connection that has ended.
+    pub(crate) fn forget(&mut self, handle: SocketHandle) {
+        self.sockets.remove(handle);
+    }
+
+    /// A connection that was opened from here.
+    pub(crate) fn connection(&mut self, handle: SocketHandle) -> &mut tcp::Socket<'static> {
+        self.sockets.get_mut(handle)
     }
 
     pub(crate) fn controller(&self) -> &Controller {
