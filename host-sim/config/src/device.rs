@@ -137,8 +137,28 @@ pub struct DeviceField {
     pub commands: Option<FieldCommands>,
     /// It is the coil of Modbus function 5, which is FF for 1.
     pub is_coil: bool,
+    /// Its `offset` is written, also if it is 0.
+    pub has_offset: bool,
     /// The port whose health it shows, if that is not the port that sends it.
     pub of_port: Option<String>,
+    /// What it may send: limits, or the entries of a table.
+    pub sendable: Vec<FieldSpec>,
+}
+
+impl DeviceField {
+    /// A field with a name, empty if it needs none, and nothing beside its `spec`.
+    pub const fn new(name: String, spec: FieldSpec) -> Self {
+        Self {
+            name,
+            spec,
+            repeats: false,
+            commands: None,
+            is_coil: false,
+            has_offset: false,
+            of_port: None,
+            sendable: Vec::new(),
+        }
+    }
 }
 
 /// The commands that the values of a field pick.

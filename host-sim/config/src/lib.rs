@@ -5,6 +5,8 @@
 //! In: TOML text and `--set` overrides. Out: [`SimConfig`] for the simulated controller, or
 //! `proto_core::config::GatewayConfig` for the gateway. Nothing here opens a device or a socket.
 
+mod advice;
+pub mod board;
 mod device;
 pub mod file;
 mod functions;
@@ -13,6 +15,7 @@ mod schema;
 mod sim;
 mod target;
 
+pub use advice::negative_numbers;
 pub use device::{
     AnyRecipe, DeviceField, DeviceRecipe, ExchangeKind, FieldCommands, FrameEnds, NamedExchange, NamedFrame,
 };

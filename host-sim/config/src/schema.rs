@@ -278,7 +278,9 @@ fn of_text(text: Text) -> Value {
         Text::Variable => pattern(&format!("^({var})$")),
         Text::VariableOrBit => pattern(&format!("^({var})(\\.[0-9]+)?$")),
         Text::Variables => pattern(&format!("^({var}|({groups})\\[[0-9]+\\.\\.[0-9]+\\])$")),
-        Text::Source => pattern(&format!("^(({var})(\\.[0-9]+)?|counter|reply|controller\\..+|port\\..+)$")),
+        Text::Source => pattern(&format!(
+            "^(({var})(\\.[0-9]+)?|counter|reply|controller\\..+|port\\..+|link\\..+\\.up)$"
+        )),
         Text::Pattern(own) => pattern(own),
     }
 }

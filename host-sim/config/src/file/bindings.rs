@@ -18,6 +18,8 @@ pub(super) enum FileInput {
         var: SysVar,
         scale: f32,
         offset: f32,
+        /// It is written in the file.
+        has_offset: bool,
     },
     Bit(VarBit),
     Commands(FileCommands),
@@ -31,7 +33,7 @@ impl FileInput {
     /// The binding, if it needs no table of commands.
     pub(super) fn without_commands(&self) -> InputBinding {
         match *self {
-            Self::Variable { var, scale, offset } => InputBinding::Variable { var, scale, offset },
+            Self::Variable { var, scale, offset, .. } => InputBinding::Variable { var, scale, offset },
             Self::Bit(VarBit { var, bit }) => InputBinding::Bit { var, bit },
             Self::Counter { max } => InputBinding::Counter { max },
             Self::Unused | Self::Commands(_) => InputBinding::Unused,
@@ -143,7 +145,8 @@ fn read_to(field: &Reader<'_>, to: &Item<'_>) -> Result<FileInput> {
             .map_err(|error| to.error(format!("{name:?}: {error}{}", meant_variable(name))));
     }
     let (scale, offset) = read_scale(field)?;
-    Ok(FileInput::Variable { var: read_var(to)?, scale, offset })
+    let has_offset = field.optional("offset").is_some();
+    Ok(FileInput::Variable { var: read_var(to)?, scale, offset, has_offset })
 }
 
 /// `counter = true` or `counter = { max = 14 }`: the number behind which the counter is 0 again.

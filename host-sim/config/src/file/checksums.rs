@@ -56,9 +56,19 @@ fn read_data_id(table: &Reader<'_>) -> Result<DataId> {
         list.iter().map(|item| item.integer(0..=255)).collect::<Result<_>>()?
     };
     let id = DataId::new(&bytes).filter(|id| !id.bytes().is_empty());
-    let id = id.ok_or_else(|| item.error(format!("{} bytes; allowed: 1 to {MAX_DATA_ID}", bytes.len())))?;
+    let id = id.ok_or_else(|| {
+        let hint = if bytes.len() == LIST_OF_IDS {
+            "; data ids that change with the counter, one for each of its numbers, are not supported"
+        } else {
+            ""
+        };
+        item.error(format!("{} bytes; allowed: 1 to {MAX_DATA_ID}{hint}", bytes.len()))
+    })?;
     Ok(if table.word_or(&device::DATA_ID_AT, &DATA_ID_PLACES)? { id.behind() } else { id })
 }
+
+/// Data ids of profiles 2 and 22 of AUTOSAR's end-to-end protection: one for each number of the counter.
+const LIST_OF_IDS: usize = 16;
 
 fn read_algorithm(table: &Reader<'_>) -> Result<Algorithm> {
     let kind = table.required("kind", "the algorithm, such as \"crc16-modbus\"")?;
@@ -115,7 +125,11 @@ fn find_place(item: &Item<'_>, head: usize, fields: &[FileField]) -> Result<usiz
     let mut places = Vec::new();
     let mut offset = Some(head);
     for (nth, field) in fields.iter().enumerate() {
-        let element = field.spec().element();
+        let spec = field.spec();
+        if spec.is_of_field_before() {
+            continue;
+        }
+        let element = spec.element();
         let encoding = element.and_then(|element| element.encoding());
         if encoding.is_some_and(|encoding| encoding.shared) {
             continue;

@@ -7,7 +7,7 @@
 use proto_core::device::{Bits, ByteOrder, Encoding, Kind, Overflow};
 use proto_core::sysvar::Direction;
 
-use super::device::{bind, binding_keys, read_constant, read_name};
+use super::device::{bind, binding_keys, read_constant};
 use super::encoding::refuse;
 use super::reader::{Item, Reader, Result, Spot};
 use super::recipes::{FileField, FileFieldKind, Written};
@@ -53,12 +53,14 @@ impl Packer {
         let encoding = Encoding { kind, order: ByteOrder::Little, shared };
         (self.bytes, self.count) = (byte + 1, self.count + 1);
         let spot = &table.spot;
-        let mut push = |kind| self.fields.push(FileField { spot: spot.clone(), kind });
+        let mut push = |kind, own: Option<Spot>| {
+            self.fields.push(FileField { spot: own.unwrap_or_else(|| spot.clone()), kind });
+        };
         match table.optional("equals") {
-            Some(equals) => push(read_constant(table, &equals, encoding)?),
+            Some(equals) => push(read_constant(table, &equals, encoding)?, None),
             None => {
                 let written = Written { encoding, overflow: Overflow::Usual };
-                bind(table, direction, read_name(table)?, written, push)?;
+                bind(table, direction, written, push)?;
             }
         }
         Ok(())

@@ -138,17 +138,21 @@ fn has_one_bit(field: &Reader<'_>) -> bool {
 }
 
 fn read_command((key, key_spot, item): (&str, Spot, Item<'_>)) -> Result<FileCommand> {
-    let range = match key.split_once("..") {
-        Some((first, last)) => read_value(first).zip(read_value(last)),
-        None => read_value(key).map(|value| (value, value)),
-    };
-    let Some((first, last)) = range else {
+    let Some((first, last)) = read_range(key) else {
         return Err(item.at(key_spot).error(format!(
             "{key:?} is not an integer; the keys of commands are values of the field, such as 1, or ranges of them, \
              such as \"1..100\""
         )));
     };
     Ok(FileCommand { first, last, text: read_text(&item)?, spot: item.spot })
+}
+
+/// A value such as `1`, or a range such as `1..100`.
+pub(super) fn read_range(key: &str) -> Option<(i64, i64)> {
+    match key.split_once("..") {
+        Some((first, last)) => read_value(first).zip(read_value(last)),
+        None => read_value(key).map(|value| (value, value)),
+    }
 }
 
 fn read_value(text: &str) -> Option<i64> {
@@ -162,8 +166,25 @@ fn read_value(text: &str) -> Option<i64> {
 fn read_text(item: &Item<'_>) -> Result<String> {
     match item.string()? {
         "" => Err(item.error("the command is empty")),
-        text => Ok(text.to_owned()),
+        text => match misspelled(text) {
+            Some(meant) => Err(item.error(meant)),
+            None => Ok(text.to_owned()),
+        },
     }
+}
+
+/// What is written of other programs' commands, and what is meant.
+fn misspelled(text: &str) -> Option<String> {
+    let text = text.trim();
+    if let Some((word @ ("run" | "speed"), argument)) = text.split_once([' ', '\t', '=', ':'])
+        && !argument.contains('(')
+    {
+        return Some(format!("{text:?} is no command; write \"{word}({})\"", argument.trim()));
+    }
+    let argument = text.strip_prefix("run")?.trim_start().strip_prefix('(')?;
+    let name = argument.split([',', ')']).next()?.trim();
+    let bare = name.strip_prefix('\'')?.strip_suffix('\'')?;
+    Some(format!("the controller would take the quotes for a part of the name; write {bare} without them"))
 }
 
 #[cfg(test)]
@@ -190,6 +211,11 @@ mod tests {
             [(1, 1, "stop".into()), (-5, 16, "speed({value})".into()), (255, 255, String::new())].to_vec();
         assert_eq!(field(text), Ok((entries, CommandWhen::Kept)));
         assert_eq!(field("commands = { 1 = 'stop' }\nbase = 'reset'").unwrap().1, CommandWhen::Change);
+        // As a controller reads them.
+        for text in ["run (pick.jspf)", "run(\"pick it.jspf\" , 50)", "run(it's.jspf)"] {
+            let entries = field(&format!("commands = {{ 1 = \"\"\"{text}\"\"\" }}")).unwrap().0;
+            assert_eq!(entries, [(1, 1, text.to_owned())]);
+        }
     }
 
     #[test]
@@ -217,6 +243,9 @@ mod tests {
             ("{ falling = 'stop' }\nbits = 3\nidle = 1", "which say it"),
             ("{ level = 'stop' }\nbits = 3\nbase = 'keep'", "not allowed together with level"),
             ("{ rising = '' }\nbits = 3", "the command is empty"),
+            ("{ 1 = 'run pick.jspf' }", "\"run pick.jspf\" is no command; write \"run(pick.jspf)\""),
+            ("{ 1 = 'speed 50' }", "write \"speed(50)\""),
+            ("{ 1 = \"run('pick.jspf',50)\" }", "a part of the name; write pick.jspf without them"),
         ] {
             let message = field(&format!("commands = {text}")).unwrap_err();
             assert!(message.contains(said), "{text}: {message}");

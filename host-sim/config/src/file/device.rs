@@ -14,16 +14,16 @@ use super::bindings::{self, FileInput, FileOutput, OVERFLOWS};
 use super::encoding::{self, OpenNumber, Order, refuse};
 use super::exchanges::FileExchange;
 use super::framings;
-use super::reader::{Item, Reader, Result};
+use super::reader::{Item, Reader, Result, Spot};
 use super::recipes::{FileField, FileFieldKind, FileFrame, FilePart, FileRecipe, Flavour, Written};
-use super::rtu_frames;
+use super::{rtu_frames, sendable};
 use crate::device::{DeviceField, DeviceRecipe, ExchangeKind, FrameEnds, NamedExchange, NamedFrame};
 use crate::keys::field::{self, FILL, OVERFLOW, PAD};
 use crate::keys::recipe::{OF_FRAME, OF_STREAM};
 use crate::keys::{Key, names};
 
 /// The keys of a field or what stands in its place, which no controller's recipe has.
-const OWN_KEYS: [&str; 22] = [
+const OWN_KEYS: [&str; 26] = [
     "equals",
     "overflow",
     "counter",
@@ -46,6 +46,10 @@ const OWN_KEYS: [&str; 22] = [
     "width",
     "until",
     "decimals",
+    "min",
+    "max",
+    "outside",
+    "map",
 ];
 
 /// Why recipes of this kind have no frames of devices; `None` if they may.
@@ -170,7 +174,10 @@ impl FieldReader {
                 let encoding = encoding::read(&table, self.order, &mut self.open)?;
                 push(read_constant(&table, &equals, encoding)?);
             }
-            None => self.read_value(&table, push)?,
+            None => self.read_value(&table, |kind, own| {
+                let spot = own.unwrap_or_else(|| item.spot.clone());
+                fields.push(FileField { spot, kind });
+            })?,
         }
         Ok(())
     }
@@ -190,8 +197,11 @@ impl FieldReader {
     }
 
     /// A field with a name and a value.
-    fn read_value(&mut self, table: &Reader<'_>, push: impl FnMut(FileFieldKind)) -> Result<()> {
-        let name = read_name(table)?;
+    fn read_value(
+        &mut self,
+        table: &Reader<'_>,
+        push: impl FnMut(FileFieldKind, Option<Spot>),
+    ) -> Result<()> {
         let encoding = encoding::read(table, self.order, &mut self.open)?;
         let key = match self.direction {
             Direction::Input => "to",
@@ -201,7 +211,7 @@ impl FieldReader {
             refuse(table, &["overflow"], &format!("allowed only together with {key}"))?;
         }
         let overflow = table.word(&OVERFLOW, &OVERFLOWS)?.unwrap_or(Overflow::Usual);
-        bind(table, self.direction, name, Written { encoding, overflow }, push)
+        bind(table, self.direction, Written { encoding, overflow }, push)
     }
 }
 
@@ -220,7 +230,10 @@ pub(super) fn binding_keys(table: &Reader<'_>, direction: Direction) -> Result<&
 }
 
 fn refuse_bindings(table: &Reader<'_>) -> Result<()> {
-    let bindings = ["to", "commands", "when", "base", "idle", "scale", "offset", "overflow", "counter"];
+    let bindings = [
+        "to", "commands", "when", "base", "idle", "scale", "offset", "overflow", "counter", "min", "max",
+        "outside", "map",
+    ];
     refuse(table, &bindings, "a field with equals is a constant and has nothing else")
 }
 
@@ -244,9 +257,8 @@ pub(super) fn read_constant(
 pub(super) fn bind(
     table: &Reader<'_>,
     direction: Direction,
-    name: String,
     written: Written,
-    mut push: impl FnMut(FileFieldKind),
+    mut push: impl FnMut(FileFieldKind, Option<Spot>),
 ) -> Result<()> {
     let encoding = written.encoding;
     match direction {
@@ -265,9 +277,22 @@ pub(super) fn bind(
                 let value = item.number()?;
                 return Err(item.error(format!("{value} has a fraction; this field has integers only")));
             }
-            push(FileFieldKind::UserOutput { name, written, from });
+            let sendable = sendable::read(table, written, &from)?;
+            if let Some(item) = table.optional("value").filter(|_| table.optional("name").is_none()) {
+                if !encoding.is_integer() {
+                    return Err(item.error("a constant that may have a fraction needs a name"));
+                }
+                let value = item.number()? as i64;
+                push(FileFieldKind::Fixed { name: None, encoding, value }, None);
+                return Ok(());
+            }
+            push(FileFieldKind::UserOutput { name: read_name(table)?, written, from }, None);
+            for (spot, spec) in sendable {
+                push(FileFieldKind::Device { name: None, spec }, Some(spot));
+            }
         }
         Direction::Input => {
+            let name = read_name(table)?;
             let (first, second) = bindings::read_input(table)?;
             let counter = bindings::read_counter(table, &encoding)?.map(|max| FileInput::Counter { max });
             let is_used = counter.is_none() || !matches!(first, FileInput::Unused);
@@ -277,7 +302,7 @@ pub(super) fn bind(
                 let shared =
                     Written { encoding: Encoding { shared: true, ..encoding }, overflow: Overflow::Usual };
                 let written = if again { shared } else { written };
-                push(FileFieldKind::UserInput { name: name.clone(), written, to, again });
+                push(FileFieldKind::UserInput { name: name.clone(), written, to, again }, None);
             }
         }
     }
@@ -434,11 +459,18 @@ impl FileRecipe {
     }
 
     fn named_frame(&self, part: &FilePart, frame: &FileFrame) -> NamedFrame {
+        let mut fields: Vec<DeviceField> = Vec::new();
+        for named in frame.fields.iter().map(FileField::named) {
+            match fields.last_mut().filter(|_| named.spec.is_of_field_before()) {
+                Some(field) => field.sendable.push(named.spec),
+                None => fields.push(named),
+            }
+        }
         NamedFrame {
             id: self.is_can().then_some(frame.id),
             head: part.head.clone(),
             tail: part.tail.clone(),
-            fields: frame.fields.iter().map(FileField::named).collect(),
+            fields,
         }
     }
 
@@ -469,8 +501,11 @@ impl FileField {
             _ => None,
         };
         let of_port = self.port_named().map(|(_, name, _)| name.to_owned());
-        let (name, spec) = (self.name(), self.spec());
-        DeviceField { name, spec, repeats, commands, is_coil: false, of_port }
+        let has_offset = matches!(
+            self.kind,
+            FileFieldKind::UserInput { to: FileInput::Variable { has_offset: true, .. }, .. }
+        );
+        DeviceField { repeats, commands, has_offset, of_port, ..DeviceField::new(self.name(), self.spec()) }
     }
 
     /// What the field is, without a table of commands.

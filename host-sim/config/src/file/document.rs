@@ -91,8 +91,10 @@ impl Document {
         match DeTable::parse(text) {
             Ok(table) => document.root = convert_table(table.get_ref(), &At::File),
             Err(error) => {
-                let at = At::File(error.span().map_or(0, |span| span.start));
-                return Err(document.error(at, "", format!("invalid TOML: {}", one_line(error.message()))));
+                let place = error.span().map(|span| span.start);
+                let hint = hexadecimal(text, place);
+                let message = format!("invalid TOML: {}{hint}", one_line(error.message()));
+                return Err(document.error(At::File(place.unwrap_or(0)), "", message));
             }
         }
         for (number, text) in overrides.iter().enumerate() {
@@ -197,9 +199,26 @@ fn parse_value(text: &str, at: At) -> Result<Node, String> {
     match DeValue::parse(text) {
         Ok(value) => Ok(convert(&value, &|_| at)),
         Err(error) if text.starts_with(['[', '{', '"', '\'']) => {
-            Err(format!("invalid TOML value: {}", one_line(error.message())))
+            let hint = hexadecimal(text, error.span().map(|span| span.start));
+            Err(format!("invalid TOML value: {}{hint}", one_line(error.message())))
         }
         Err(_) => Ok(Node { at, value: Value::Str(text.to_owned()) }),
+    }
+}
+
+/// The end of a message about a place in a list where a hexadecimal byte lacks its mark, such as `[48, AA]`.
+fn hexadecimal(text: &str, place: Option<usize>) -> String {
+    let Some((before, after)) = place.and_then(|place| text.split_at_checked(place)) else {
+        return String::new();
+    };
+    let word = after.split(|c: char| !c.is_ascii_alphanumeric()).next().unwrap_or_default();
+    let is_item =
+        before.trim_end().ends_with(['[', ',']) && after[word.len()..].trim_start().starts_with([']', ',']);
+    match word.len() {
+        1 | 2 if is_item && word.chars().all(|c| c.is_ascii_hexdigit()) => {
+            format!("; a hexadecimal byte is written 0x{}", word.to_ascii_uppercase())
+        }
+        _ => String::new(),
     }
 }
 

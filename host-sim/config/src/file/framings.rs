@@ -95,7 +95,6 @@ fn read_ignored(item: &Item<'_>, width: TextWidth) -> Result<Ignored> {
             return Err(item.error(format!("{c:?} is not ASCII; allowed: characters of one byte, 0..=127")));
         }
         match width {
-            _ if text.is_empty() => return Err(item.error("a text of no characters")),
             TextWidth::Fixed(width) if text.len() > usize::from(width) => {
                 let len = text.len();
                 return Err(item.error(format!(

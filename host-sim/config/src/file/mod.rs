@@ -16,6 +16,7 @@ mod exchanges;
 pub(crate) mod framings;
 mod functions;
 pub(crate) mod gateway;
+mod inventory;
 pub(crate) mod lines;
 pub(crate) mod modbus;
 mod names;
@@ -23,7 +24,9 @@ mod network;
 mod reader;
 pub(crate) mod recipes;
 mod rtu_frames;
+pub(crate) mod sendable;
 mod sources;
+mod sparkplug;
 
 use std::path::Path;
 
@@ -32,7 +35,9 @@ use proto_core::recipe::model::Mode;
 use proto_core::wire::dialect::Dialect;
 
 pub use error::{FileError, Source};
+pub use inventory::{Listed, load_inventory, parse_inventory};
 pub use modbus::function_name;
+pub use sparkplug::{ReportRule, SparkplugFile, load_sparkplug, parse_sparkplug};
 
 use super::device::{AnyRecipe, DeviceRecipe};
 use super::keys;
@@ -97,12 +102,7 @@ pub fn load_recipes(path: &Path, overrides: &[String]) -> Result<Vec<AnyRecipe>>
 /// # Errors
 /// The first mistake in any of the recipes, with its place.
 pub fn load_frames(path: &Path, overrides: &[String]) -> Result<Vec<Option<DeviceRecipe>>> {
-    let read = |text: Text<'_>| {
-        let recipes = read_recipes(text, overrides)?;
-        let framed = |recipe: &FileRecipe| (recipe.mode == Mode::User).then(|| recipe.to_device());
-        Ok(recipes.iter().map(framed).collect())
-    };
-    with_text(path, read)
+    with_text(path, |text| parse_frames(text, overrides))
 }
 
 /// Same as [`load`], from a text.
@@ -113,7 +113,10 @@ pub fn parse(text: Text<'_>, overrides: &[String]) -> Result<Config> {
     let document = Document::parse(text.name, text.toml, overrides)?;
     match kind_of(&document)? {
         Flavour::Gateway => gateway::read(&document).map(Config::Gateway),
-        Flavour::Controller => controller::read(&document).map(|config| Config::Controller(Box::new(config))),
+        Flavour::Controller => {
+            let config = controller::read(&document).map_err(|error| told_kind(&document, error))?;
+            Ok(Config::Controller(Box::new(config)))
+        }
     }
 }
 
@@ -123,7 +126,9 @@ pub fn parse(text: Text<'_>, overrides: &[String]) -> Result<Config> {
 /// The first mistake, with its place.
 pub fn parse_gateway(text: Text<'_>, overrides: &[String]) -> Result<Box<GatewayConfig>> {
     let document = Document::parse(text.name, text.toml, overrides)?;
-    if let Ok(Flavour::Controller) = kind_of(&document) {
+    if let Ok(Flavour::Controller) = kind_of(&document)
+        && has_own_section(&document)
+    {
         return Err(document.whole_file_error(
             "this is a controller file, not a gateway file; run it with host-sim controller -c FILE",
         ));
@@ -153,6 +158,16 @@ pub fn parse_recipes(text: Text<'_>, overrides: &[String]) -> Result<Vec<AnyReci
     Ok(read_recipes(text, overrides)?.iter().map(FileRecipe::named).collect())
 }
 
+/// Same as [`load_frames`], from a text.
+///
+/// # Errors
+/// The first mistake in any of the recipes, with its place.
+pub fn parse_frames(text: Text<'_>, overrides: &[String]) -> Result<Vec<Option<DeviceRecipe>>> {
+    let recipes = read_recipes(text, overrides)?;
+    let framed = |recipe: &FileRecipe| (recipe.mode == Mode::User).then(|| recipe.to_device());
+    Ok(recipes.iter().map(framed).collect())
+}
+
 fn read_recipes(text: Text<'_>, overrides: &[String]) -> Result<Vec<FileRecipe>> {
     let document = Document::parse(text.name, text.toml, overrides)?;
     let flavour = kind_of(&document)?;
@@ -160,25 +175,33 @@ fn read_recipes(text: Text<'_>, overrides: &[String]) -> Result<Vec<FileRecipe>>
         Flavour::Gateway => &keys::top::GATEWAY,
         Flavour::Controller => &keys::top::CONTROLLER,
     };
-    let root = Reader::root(&document, keys)?;
-    recipes::read_all(&root, flavour)
+    let root = Reader::root(&document, keys).map_err(|error| told_kind(&document, error))?;
+    recipes::read_all(&root, flavour).map_err(|error| told_kind(&document, error))
 }
 
 /// A mistake found after the file was read, at the place of `key` (names; an item of an array by
 /// its `name`), or at the nearest place that exists.
 pub fn error_at(path: &Path, overrides: &[String], key: &[&str], message: impl ToString) -> FileError {
-    let message = message.to_string();
-    let located = with_text(path, |text| {
-        let document = Document::parse(text.name, text.toml, overrides)?;
-        Ok(match document.find(key) {
-            Some(at) => document.error(at, &key.join("."), message.as_str()),
-            None => document.whole_file_error(format!("{}: {message}", key.join("."))),
-        })
-    });
-    located.unwrap_or_else(|error| error)
+    with_text(path, |text| Ok(error_in(text, overrides, key, message))).unwrap_or_else(|error| error)
 }
 
-fn with_text<T>(path: &Path, read: impl FnOnce(Text<'_>) -> Result<T>) -> Result<T> {
+/// Same as [`error_at`], in a text.
+pub fn error_in(text: Text<'_>, overrides: &[String], key: &[&str], message: impl ToString) -> FileError {
+    let message = message.to_string();
+    match Document::parse(text.name, text.toml, overrides) {
+        Ok(document) => match document.find(key) {
+            Some(at) => document.error(at, &key.join("."), message.as_str()),
+            None => document.whole_file_error(format!("{}: {message}", key.join("."))),
+        },
+        Err(error) => error,
+    }
+}
+
+/// What `read` makes of the text of a file.
+///
+/// # Errors
+/// If the file cannot be read, and those of `read`.
+pub fn with_text<T>(path: &Path, read: impl FnOnce(Text<'_>) -> Result<T>) -> Result<T> {
     let name = path.display().to_string();
     match std::fs::read_to_string(path) {
         Ok(toml) => read(Text { name: &name, toml: &toml }),
@@ -190,20 +213,29 @@ fn with_text<T>(path: &Path, read: impl FnOnce(Text<'_>) -> Result<T>) -> Result
     }
 }
 
-/// Only a gateway file has a `[controller]`; a controller file has its own sections.
+/// A gateway file has a `[controller]`. A controller file has not, and may leave out all sections of its own.
 fn kind_of(document: &Document) -> Result<Flavour> {
-    let has = |key: &str| document.root.get(key).is_some();
-    match (has("controller"), has("listen") || has("robot") || has("initial") || has("program")) {
+    match (document.root.get("controller").is_some(), has_own_section(document)) {
         (true, false) => Ok(Flavour::Gateway),
-        (false, true) => Ok(Flavour::Controller),
+        (false, _) => Ok(Flavour::Controller),
         (true, true) => Err(document.whole_file_error(
             "both a gateway's section ([controller]) and a controller's ([listen], [robot], [initial], [[program]]); \
              these are two files",
         )),
-        (false, false) => Err(document.whole_file_error(
-            "not a gateway file, which has [controller], and not a controller file, which has [listen] or [robot]",
-        )),
     }
+}
+
+/// Whether it has a section that only controller files have.
+fn has_own_section(document: &Document) -> bool {
+    ["listen", "robot", "initial", "program"].iter().any(|key| document.root.get(key).is_some())
+}
+
+/// A mistake in a file of which nothing but the missing `[controller]` says that it is a controller's.
+fn told_kind(document: &Document, mut error: FileError) -> FileError {
+    if document.root.get("controller").is_none() && !has_own_section(document) {
+        error.message += " (without [controller] it is read as a controller file; a gateway file has that)";
+    }
+    error
 }
 
 fn known_dialect<'a>(item: &Item<'_>, name: &'a str) -> Result<&'a str> {

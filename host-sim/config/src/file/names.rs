@@ -20,6 +20,21 @@ fn distance(given: &str, name: &str) -> usize {
     bare.map_or(whole, |(bare, _)| whole.min(1 + strsim::osa_distance(given, bare)))
 }
 
+/// The same for a key, which other tools may call something else.
+pub(super) fn meant_key(given: &str, names: &[&str]) -> String {
+    let given_plain = plain(given);
+    let is_alias = |(others, _): &&(&str, &str)| others.split(' ').any(|other| other == given_plain);
+    if let Some((_, name)) = KEYS.iter().filter(is_alias).find(|(_, name)| names.contains(name)) {
+        return ask(name);
+    }
+    // The ports of the controller are in a table of their own.
+    let service = given_plain.strip_suffix("port").filter(|_| names.contains(&"ports"));
+    match service.filter(|service| matches!(*service, "command" | "state" | "modbus" | "udp2011")) {
+        Some(service) => format!("; write ports = {{ {service} = ... }}"),
+        None => did_you_mean(given, names.iter().copied()),
+    }
+}
+
 /// The same for the group of a system variable, in a name such as `RobotStat[8]`.
 pub(super) fn meant_variable(given: &str) -> String {
     let pendant = given.strip_prefix("__").and_then(|rest| Some(rest.rsplit_once('_')?.0));
@@ -73,6 +88,17 @@ fn plain(name: &str) -> String {
     name.chars().filter(char::is_ascii_alphanumeric).map(|c| c.to_ascii_lowercase()).collect()
 }
 
+/// What others call the keys.
+const KEYS: [(&str, &str); 7] = [
+    ("baudrate bps bitrate speed", "baud"),
+    ("baudrate baud bps speed", "bitrate"),
+    ("ip ipaddress host hostname", "address"),
+    ("header prefix start", "head"),
+    ("trailer footer suffix end", "tail"),
+    ("stopbit", "stop_bits"),
+    ("extendedid isextended ext", "extended"),
+];
+
 /// What others call the types. Where a name means several, or there is none, what to write.
 const TYPES: [(&str, &str); 15] = [
     ("i8 int8 s8 sint signedchar", "char"),
@@ -120,6 +146,24 @@ mod tests {
     use proto_core::device::Algorithm;
 
     use super::*;
+
+    #[test]
+    fn keys_are_known_by_their_other_names() {
+        let line = ["name", "bus", "baud", "parity", "stop_bits", "timeout_ms"];
+        let controller = ["address", "dialect", "ports", "recipe_link"];
+        for (given, names, said) in [
+            ("baudrate", &line[..], "; did you mean \"baud\"?"),
+            ("baud_rate", &line, "; did you mean \"baud\"?"),
+            ("timeout", &line, "; did you mean \"timeout_ms\"?"),
+            ("baudrate", &["bus", "bitrate"], "; did you mean \"bitrate\"?"),
+            ("modbus_port", &controller, "; write ports = { modbus = ... }"),
+            ("modbus_port", &line, ""),
+            ("ip", &controller, "; did you mean \"address\"?"),
+            ("ip", &line, ""),
+        ] {
+            assert_eq!(meant_key(given, names), said, "{given}");
+        }
+    }
 
     #[test]
     fn checksums_are_known_by_their_other_names() {

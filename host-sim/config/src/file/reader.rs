@@ -4,7 +4,7 @@ use std::ops::RangeInclusive;
 
 use super::document::{At, Document, Node, Table, Value};
 use super::error::FileError;
-use super::names::did_you_mean;
+use super::names::{did_you_mean, meant_key};
 use crate::keys::{self, Key, Need};
 use proto_core::time::Duration;
 
@@ -82,7 +82,7 @@ impl<'a> Reader<'a> {
         let spot = Spot { at: entry.at, key: self.path(&entry.key) };
         let meant = match is_known(&entry.key) {
             true => String::new(),
-            false => did_you_mean(&entry.key, allowed.iter().copied()),
+            false => meant_key(&entry.key, allowed),
         };
         let message = format!("unknown key{when}; allowed: {}{meant}", allowed.join(", "));
         Err(spot.error(self.document, message))
@@ -264,8 +264,17 @@ impl<'a> Item<'a> {
             },
             Value::Int(Ok(value)) => refused(&value.to_string()),
             Value::Int(Err(text)) => refused(text),
-            _ => Err(self.wrong_kind(&format!("an integer in {}..={}", range.start(), range.end()))),
+            _ => Err(self.no_integer(&format!("{}..={}", range.start(), range.end()))),
         }
+    }
+
+    /// An error about a value that is no integer; `allowed` is the range.
+    pub(super) fn no_integer(&self, allowed: &str) -> FileError {
+        let mut error = self.wrong_kind(&format!("an integer in {allowed}"));
+        if let Some(number) = self.as_string().map(str::trim).filter(|text| is_number(text)) {
+            error.message += &format!("; write {number} without quotes");
+        }
+        error
     }
 
     /// Any finite number.
@@ -354,6 +363,14 @@ impl<'a> Item<'a> {
             Some((_, value)) => Ok(value.clone()),
             None => Err(self.error(format!("{text:?} is unknown; allowed: {}{}", allowed(), meant(text)))),
         }
+    }
+}
+
+/// Whether a text is an integer as TOML has it.
+fn is_number(text: &str) -> bool {
+    match text.strip_prefix("0x") {
+        Some(hex) => i64::from_str_radix(hex, 16).is_ok(),
+        None => text.parse::<i64>().is_ok(),
     }
 }
 

@@ -396,6 +396,10 @@ fn read_part(item: &Item<'_>, rules: Rules, is_can: bool, flavour: Flavour) -> R
 /// 11 bits, or 29 with `extended = true`.
 pub(super) fn read_id(frame: &Reader<'_>, item: &Item<'_>) -> Result<CanId> {
     let is_extended = frame.flag(&keys::recipe::EXTENDED)?;
+    let limit = if is_extended { "0x1FFFFFFF" } else { "0x7FF" };
+    if !item.is_integer() {
+        return Err(item.no_integer(&format!("0..={limit}")));
+    }
     let number: i64 = item.integer(i64::MIN..=i64::MAX)?;
     let standard = || u16::try_from(number).ok().map(CanId::Standard);
     let extended = || u32::try_from(number).ok().map(CanId::Extended);
@@ -406,7 +410,6 @@ pub(super) fn read_id(frame: &Reader<'_>, item: &Item<'_>) -> Result<CanId> {
         } else {
             ""
         };
-        let limit = if is_extended { "0x1FFFFFFF" } else { "0x7FF" };
         let shown = if number < 0 { number.to_string() } else { format!("{number:#X}") };
         item.error(format!("{shown} is out of range; allowed: 0..={limit}{hint}"))
     })

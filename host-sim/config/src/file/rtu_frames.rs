@@ -53,9 +53,7 @@ impl Frame {
     }
 
     fn push(&mut self, name: &str, spec: FieldSpec) {
-        let name = name.to_owned();
-        let field = DeviceField { name, spec, repeats: false, commands: None, is_coil: false, of_port: None };
-        self.0.push(field);
+        self.0.push(DeviceField::new(name.to_owned(), spec));
     }
 
     fn byte(&mut self, name: &str, value: u8) {

@@ -1,9 +1,9 @@
 //! Sources of output fields beside the variables, and the variables of a port's health.
 //!
-//! In: `controller.mode`, `port.alive`, `port.NAME.alive`, and `health = { ... }` of a port. Out: the
+//! In: `controller.mode`, `port.alive`, `port.NAME.alive`, `link.modbus.up`, and `health = { ... }` of a port. Out: the
 //! bindings and variables of the configuration.
 
-use proto_core::config::{OutputBinding, PortHealth, PortValue, StateValue};
+use proto_core::config::{LinkSource, OutputBinding, PortHealth, PortValue, StateValue};
 use proto_core::sysvar::SysVar;
 
 use super::bindings::FileOutput;
@@ -16,7 +16,7 @@ const ASKED: [&str; 3] = ["last_error", "state", "isprogfinish"];
 
 /// Whether the text names such a source.
 pub(super) fn is_source(text: &str) -> bool {
-    text.starts_with("controller.") || text.starts_with("port.")
+    ["controller.", "port.", "link."].iter().any(|kind| text.starts_with(kind))
 }
 
 /// Reads the source of an output field.
@@ -31,6 +31,9 @@ pub(super) fn read(item: &Item<'_>, text: &str, scale: f32, offset: f32) -> Resu
         let value = StateValue::parse(name).map_err(|error| item.error(format!("{text:?}: {error}")))?;
         return Ok(FileOutput::Bound(OutputBinding::State { value, scale, offset }));
     }
+    if let Some(rest) = text.strip_prefix("link.") {
+        return read_link(item, text, rest, (scale, offset));
+    }
     let rest = text.strip_prefix("port.").unwrap_or(text);
     let (name, value) = match rest.rsplit_once('.') {
         Some((name, value)) => (Some(name), value),
@@ -42,6 +45,20 @@ pub(super) fn read(item: &Item<'_>, text: &str, scale: f32, offset: f32) -> Resu
         Some(name) => FileOutput::PortNamed { name: name.to_owned(), spot: item.spot.clone(), binding },
         None => FileOutput::Bound(binding),
     })
+}
+
+/// `link.modbus.up`, or of a listening port `link.NAME.up`.
+fn read_link(item: &Item<'_>, text: &str, rest: &str, (scale, offset): (f32, f32)) -> Result<FileOutput> {
+    let Some((name, "up")) = rest.rsplit_once('.') else {
+        return Err(
+            item.error(format!("{text:?} is not known of a link; write for example \"link.modbus.up\""))
+        );
+    };
+    if let Some(link) = LinkSource::named(name) {
+        return Ok(FileOutput::Bound(OutputBinding::Link { link, scale, offset }));
+    }
+    let binding = OutputBinding::Link { link: LinkSource::Listening(0), scale, offset };
+    Ok(FileOutput::PortNamed { name: name.to_owned(), spot: item.spot.clone(), binding })
 }
 
 fn read_value(item: &Item<'_>, name: &str) -> Result<PortValue> {
@@ -58,14 +75,27 @@ pub(super) fn of_port(
     name: &str,
     ports: &[String],
 ) -> std::result::Result<OutputBinding, String> {
-    let OutputBinding::Port { value, scale, offset, .. } = binding else { return Ok(binding) };
     let index = ports.iter().position(|port| port == name);
-    match index.and_then(|index| u8::try_from(index).ok()) {
-        Some(index) => Ok(OutputBinding::Port { port: Some(index), value, scale, offset }),
-        None => {
+    match (binding, index.and_then(|index| u8::try_from(index).ok())) {
+        (OutputBinding::Port { value, scale, offset, .. }, Some(index)) => {
+            Ok(OutputBinding::Port { port: Some(index), value, scale, offset })
+        }
+        (OutputBinding::Link { scale, offset, .. }, Some(index)) => {
+            Ok(OutputBinding::Link { link: LinkSource::Listening(index), scale, offset })
+        }
+        (OutputBinding::Link { .. }, None) => {
+            let names = LinkSource::NAMES.map(|(name, _)| name);
+            let meant = did_you_mean(name, names.into_iter().chain(ports.iter().map(String::as_str)));
+            Err(format!(
+                "there is no link {name:?}; there are {}, and the ports that listen{meant}",
+                names.join(", ")
+            ))
+        }
+        (OutputBinding::Port { .. }, None) => {
             let meant = did_you_mean(name, ports.iter().map(String::as_str));
             Err(format!("there is no port {name:?}; there are {}{meant}", ports.join(", ")))
         }
+        _ => Ok(binding),
     }
 }
 

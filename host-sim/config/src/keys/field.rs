@@ -10,10 +10,11 @@ use crate::file::bindings::OVERFLOWS;
 use crate::file::commands::{BASES, WHENS};
 use crate::file::encoding::OWN_TYPES;
 use crate::file::framings::{COUNTS as ALL_COUNTS, TEXT_ORDERS};
+use crate::file::sendable::OUTSIDES;
 
 /// The name of a field.
 pub const NAME: Key =
-    Key::text_of("name", Text::Any).required().tells("its name in tools; a constant needs none");
+    Key::text_of("name", Text::Any).required().tells("its name in tools; a constant integer needs none");
 const NAME_IF_ANY: Key = Key { need: super::Need::Absent("none"), ..NAME };
 /// The type of a field.
 pub const TYPE: Key = Key::words("type", || {
@@ -61,6 +62,24 @@ pub const OVERFLOW: Key = Key::words("overflow", words!(OVERFLOWS)).absent("abse
     "`\"wrap\"`: what does not fit wraps, as a counter does, from the field to its variable or from the variable to \
      the field. Otherwise a received frame is rejected, and the nearest number is sent. Integers only",
 );
+/// The lowest number that is sent.
+pub const MIN: Key = Key::new("min", Shape::Number(Limits::Any))
+    .absent("of the field")
+    .tells("output, with `from`: the lowest number that is sent, after `scale` and `offset`");
+/// The highest number that is sent.
+pub const MAX: Key = Key::new("max", Shape::Number(Limits::Any))
+    .absent("of the field")
+    .tells("output, with `from`: the highest number that is sent");
+/// What becomes of others.
+pub const OUTSIDE: Key = Key::words("outside", words!(OUTSIDES)).or_word("refuse").tells(
+    "with `min` or `max`, what becomes of a number below or above. `\"refuse\"`: the frame is not sent; `\"clamp\"`: \
+     the nearer of the two is sent",
+);
+/// What is sent for values.
+pub const MAP: Key = Key::new("map", Shape::Map(&Shape::Number(Limits::Any), 1)).tells(
+    "output, with `from`: what is sent for values of the source or ranges of them, such as `{ 0 = 1, \"1..7\" = 2 }`; \
+     with another value the frame is not sent",
+);
 /// A constant that is received.
 pub const EQUALS: Key = Key::integer("equals", i32::MIN as i64, u32::MAX as i64)
     .absent("absent")
@@ -106,7 +125,7 @@ pub const BASE: Key = Key::words("base", words!(BASES)).or_word("reset").beside(
     "what silence, an overdue frame, does with `when = \"change\"`. `\"reset\"`: the next value only sets the base, \
      which later ones differ from. `\"keep\"`: the value before the silence stays the base, for devices that send only \
      changes. Supervision is the same: `timeout_ms`, safe values. After the start, a lost device, bus-off or sleep the \
-     first value only sets the base in any case",
+     first value only sets the base in any case; after sleep a stop in it is given",
 );
 /// A value that picks nothing.
 pub const IDLE: Key = Key::integer("idle", i32::MIN as i64, u32::MAX as i64)
@@ -155,9 +174,9 @@ pub const COUNT_TO: Key = Key::text_of("count_to", Text::Variable)
     .tells("the number of frames accepted on the port, wrapping: the same text twice is seen");
 /// Texts that say nothing.
 pub const IGNORE: Key =
-    Key::new("ignore", Shape::List(&Shape::Text(Text::Length(1, MAX_IGNORED - 1)), 0, usize::MAX)).tells(
+    Key::new("ignore", Shape::List(&Shape::Text(Text::Length(0, MAX_IGNORED - 1)), 0, usize::MAX)).tells(
         "`[\"NOREAD\", \"?\"]`: texts that say that nothing was read: such a frame shows that the device is there, \
-         changes nothing and is counted (`ignored`). Together at most 13 characters; each text after the first takes \
+         changes nothing and is counted (`ignored`). `\"\"` is a frame without a text, such as a lone CR LF. Together at most 13 characters; each text after the first takes \
          one more",
     );
 /// The registers that a text is sent from.
@@ -186,7 +205,11 @@ pub(crate) const WRITTEN: &[Key] =
 /// What an input field is for.
 pub(crate) const BOUND_IN: &[Key] = &[TO, COMMANDS, WHEN, BASE, IDLE, SCALE_IN, OFFSET_IN, EQUALS, COUNTER];
 /// What an output field is for.
-pub(crate) const BOUND_OUT: &[Key] = &[FROM, VALUE, SCALE_OUT, OFFSET_OUT, COUNTER];
+pub(crate) const BOUND_OUT: &[Key] =
+    &[FROM, VALUE, SCALE_OUT, OFFSET_OUT, COUNTER, MIN_OUT, MAX_OUT, OUTSIDE, MAP_OUT];
+const MIN_OUT: Key = MIN.beside(&["from"]);
+const MAX_OUT: Key = MAX.beside(&["from"]);
+const MAP_OUT: Key = MAP.beside(&["from"]);
 /// Padding.
 pub(crate) const PADDING: &[Key] = &[PAD, FILL];
 /// Padding of coils.
@@ -229,12 +252,16 @@ const RULES: &[Rule] = &[
     Rule::Only("word_order", "type", &["dword", "int", "float", "double", "uint64"]),
     Rule::NotBoth("width", "until"),
     Rule::NotBoth("from", "value"),
+    Rule::NotBoth("map", "min"),
+    Rule::NotBoth("map", "max"),
+    Rule::NotBoth("map", "outside"),
 ];
 
 const IS_PAD: &[When] = &[When::Has(&["pad"])];
 const IS_LENGTH: &[When] = &[When::Has(&["length"])];
 const IS_TEXT: &[When] = &[When::Has(&["text"])];
 const IS_CONSTANT: &[When] = &[When::Has(&["equals"])];
+const IS_VALUE: &[When] = &[When::Has(&["value"])];
 const TEXT_TYPED: &[When] = &[When::Is("type", &["text"], &[])];
 
 /// A field of a controller's recipe.
@@ -258,6 +285,7 @@ pub const OUTPUT: Table = Table::of("output field", &[]).at(" in an output field
     Case { when: TEXT_TYPED, keys: &[TEXT_OUT] },
     Case { when: IS_LENGTH, keys: &[LENGTHS, WRITTEN] },
     Case { when: IS_TEXT, keys: &[CONSTANT_TEXT] },
+    Case { when: IS_VALUE, keys: &[&[NAME_IF_ANY, TYPE], BOUND_OUT, &[OVERFLOW_OUT], WRITTEN] },
     Case { when: &[], keys: &[NAMED, BOUND_OUT, &[OVERFLOW_OUT], WRITTEN] },
 ]);
 const OVERFLOW_OUT: Key = OVERFLOW.beside(&["from"]);
@@ -270,10 +298,11 @@ pub const COIL_IN: Table = Table::of("coil that is read", &[]).at(" of a coil").
 ]);
 
 /// A coil that is sent.
-pub const COIL_OUT: Table = Table::of("coil that is written", &[])
-    .at(" of a coil")
-    .rules(RULES)
-    .cases(&[Case { when: IS_PAD, keys: &[COIL_PADDING] }, Case { when: &[], keys: &[COIL, BOUND_OUT] }]);
+pub const COIL_OUT: Table = Table::of("coil that is written", &[]).at(" of a coil").rules(RULES).cases(&[
+    Case { when: IS_PAD, keys: &[COIL_PADDING] },
+    Case { when: IS_VALUE, keys: &[&[NAME_IF_ANY], BOUND_OUT] },
+    Case { when: &[], keys: &[COIL, BOUND_OUT] },
+]);
 
 const GOES_UP: &[When] = &[When::Has(&["to", "commands", "equals", "length_to", "count_to"])];
 
@@ -287,6 +316,7 @@ pub const IN_BLOCK: Table = Table::of("field of a block", &[]).rules(RULES).case
     Case { when: IS_TEXT, keys: &[CONSTANT_TEXT] },
     Case { when: IS_CONSTANT, keys: &[CONSTANT, WRITTEN] },
     Case { when: GOES_UP, keys: &[NAMED, VALUE_IN, &[OVERFLOW_IN], WRITTEN] },
+    Case { when: IS_VALUE, keys: &[&[NAME_IF_ANY, TYPE], BOUND_OUT, &[OVERFLOW_OUT], WRITTEN] },
     Case { when: &[], keys: &[NAMED, BOUND_OUT, &[OVERFLOW_OUT], WRITTEN] },
 ]);
 
@@ -295,5 +325,6 @@ pub const COIL_IN_BLOCK: Table = Table::of("coil of a block", &[]).at(" of a coi
     Case { when: IS_PAD, keys: &[COIL_PADDING] },
     Case { when: IS_CONSTANT, keys: &[&[NAME_IF_ANY, EQUALS]] },
     Case { when: COIL_GOES_UP, keys: &[COIL, VALUE_IN] },
+    Case { when: IS_VALUE, keys: &[&[NAME_IF_ANY], BOUND_OUT] },
     Case { when: &[], keys: &[COIL, BOUND_OUT] },
 ]);

@@ -125,12 +125,13 @@ pub const HEALTH_TABLE: Table = Table::of(
         health(PortValue::NAMES[1].0, "frames accepted"),
         health(PortValue::NAMES[2].0, "milliseconds since the newest one"),
         health(PortValue::NAMES[3].0, "frames rejected"),
+        health(PortValue::NAMES[4].0, "frames with a text that is ignored"),
     ],
 );
 /// Where a port's health goes.
 pub const HEALTH: Key = Key::new("health", Shape::Table(&HEALTH_TABLE)).tells(
     "variables that tell the robot the port's health: `{ alive = \"WordInputReg[20]\", frames = ..., age_ms = ..., \
-     rejected = ... }`; `WordInputReg` and `FloatInputReg` only. The port owns them. Not on listening ports",
+     rejected = ..., ignored = ... }`; `WordInputReg` and `FloatInputReg` only. The port owns them. Not on listening ports",
 );
 
 const fn health(name: &'static str, text: &'static str) -> Key {

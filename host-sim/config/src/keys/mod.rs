@@ -9,8 +9,10 @@ pub mod device;
 pub mod exchange;
 pub mod field;
 pub mod gateway;
+pub mod inventory;
 mod markdown;
 pub mod recipe;
+pub mod sparkplug;
 
 use std::fmt;
 

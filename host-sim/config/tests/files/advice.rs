@@ -129,3 +129,98 @@ fn numbers_of_six_digits_are_refused_with_their_address() {
         assert!(error.ends_with(&said), "{error}");
     }
 }
+
+#[test]
+fn a_device_that_is_told_once_is_to_be_looked_for() {
+    let exchange = |slave: u8, keys: &str| {
+        format!(
+            "[[recipe.exchange]]\nslave = {slave}\nfunction = \"write-register\"\naddress = 1\n{keys}\nwrite = \
+             [{{ name = \"mode{slave}\", type = \"word\", value = 3 }}]\n"
+        )
+    };
+    let recipe = |exchanges: &[String]| format!("kind = \"modbus-rtu\"\n{}", exchanges.concat());
+    let once = "on = [\"start\", \"change\"]";
+    let told = warnings(&recipe(&[exchange(7, once), exchange(7, "on = [\"change\"]")]), MODBUS);
+    assert_eq!(
+        told,
+        [
+            "recipe \"r\": no exchange with slave 7 has a period, so nobody notices that it was without power, and what it \
+          was told is not told again; write every_ms in one of them, such as 500"
+        ]
+    );
+    let told =
+        warnings(&recipe(&[exchange(7, "every_ms = 100"), exchange(7, once), exchange(8, once)]), MODBUS);
+    assert!(told.len() == 1 && told[0].contains("slave 8 "), "{told:?}");
+    for keys in ["every_ms = 100", "on = [\"rising:BitOutputReg[3].0\"]", "on = [\"start\"]\nevery_ms = 500"]
+    {
+        assert_eq!(warnings(&recipe(&[exchange(7, keys)]), MODBUS), [""; 0], "{keys}");
+    }
+    // All slaves are no device.
+    assert_eq!(warnings(&recipe(&[exchange(0, once)]), MODBUS), [""; 0]);
+}
+
+#[test]
+fn what_is_shown_to_users_looks_for_its_devices() {
+    for folder in ["host-sim/configs", "host-sim/templates"] {
+        for entry in std::fs::read_dir(recipe_test_kit::repository().join(folder)).unwrap() {
+            let path = entry.unwrap().path();
+            let Ok(config) = file::load_gateway(&path, &[]) else { continue };
+            let view = config.view();
+            let told: Vec<_> = view.warnings().map(|one| view.describe_warning(one).to_string()).collect();
+            assert!(!told.iter().any(|told| told.contains("has a period")), "{}: {told:?}", path.display());
+        }
+    }
+}
+
+/// What is said of a field with these keys.
+fn negative(recipe: &str) -> Vec<String> {
+    let toml = format!("[controller]\naddress = \"10.0.0.2\"\n[[recipe]]\nname = \"r\"\n{recipe}\n");
+    let frames = file::parse_frames(Text { name: "test.toml", toml: &toml }, &[]).unwrap();
+    recipe_config::negative_numbers(&frames).into_iter().map(|(_, said)| said).collect()
+}
+
+#[test]
+fn negative_numbers_of_a_variable_that_has_none_are_told() {
+    let field = |keys: &str| {
+        let fields = format!("{{ name = \"n\", type = \"byte\", equals = 3 }}, {{ name = \"a\", {keys} }}");
+        let part = format!("[recipe.input]\nhead = [1]\nfields = [{fields}]");
+        format!("kind = \"stream\"\nmode = \"user\"\n{part}")
+    };
+    let to = "to = \"WordInputReg[1]\"";
+    let said = "recipe \"r\", field \"a\": WordInputReg[1] takes 0..=65535, so each frame with a negative number is \
+                rejected; write an offset, or offset = 0 if there is none";
+    for keys in ["type = \"float\"", "type = \"short\", scale = 0.1", "type = \"int24\", endian = \"big\""] {
+        assert_eq!(negative(&field(&format!("{keys}, {to}"))), [said], "{keys}");
+    }
+    for keys in [
+        "type = \"float\", offset = 32768",
+        "type = \"float\", offset = 0",
+        "type = \"word\"",
+        "type = \"byte\"",
+        "type = \"dword\", scale = 0.01",
+        "type = \"word\", bits = \"0..11\"",
+        "type = \"short\", scale = -1",
+    ] {
+        assert_eq!(negative(&field(&format!("{keys}, {to}"))), [""; 0], "{keys}");
+    }
+    let asked = read("read-holding-registers", 4).replace("type = \"word\"", "type = \"short\"");
+    assert_eq!(negative(&asked), [said]);
+}
+
+#[test]
+fn a_timeout_that_two_frames_do_not_fit_is_told() {
+    let floats = "fields = [{ name = \"a\", type = \"float\" }, { name = \"b\", type = \"float\" }, \
+                  { name = \"c\", type = \"word\", to = \"WordInputReg[1]\" }]";
+    let frame = format!("kind = \"stream\"\n[recipe.input]\nhead = [1]\ntail = [2]\n{floats}");
+    let port = |keys: &str| format!("bus = \"rs485\"\n{keys}");
+    assert_eq!(
+        warnings(&frame, &port("timeout_ms = 2")),
+        [
+            "port \"p\": a frame takes 1042 µs on the line, but the timeout is 2 ms, so one lost frame or a short \
+             pause makes the port silent; write two periods of the device or more in timeout_ms"
+        ]
+    );
+    assert_eq!(warnings(&frame, &port("timeout_ms = 3")), [""; 0]);
+    assert_eq!(warnings(&frame, &port("baud = 9600\ntimeout_ms = 24")).len(), 1);
+    assert_eq!(warnings(&frame, &port("baud = 9600\ntimeout_ms = 26")), [""; 0]);
+}

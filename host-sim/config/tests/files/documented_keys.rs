@@ -1,4 +1,4 @@
-//! The tables of keys in docs/configuration.md are those of the key table. `DOCS=write` writes them.
+//! The tables of keys in docs/configuration.md and docs/fleet.md are those of the key table. `DOCS=write` writes them.
 
 use std::collections::HashSet;
 use std::fs;
@@ -8,7 +8,16 @@ use recipe_test_kit::repository;
 
 #[test]
 fn the_page_has_the_tables_of_keys() {
-    let path = repository().join("docs/configuration.md");
+    has_tables("docs/configuration.md", DOCUMENTED);
+}
+
+#[test]
+fn the_page_of_the_fleet_has_its_tables() {
+    has_tables("docs/fleet.md", keys::sparkplug::DOCUMENTED);
+}
+
+fn has_tables(page: &str, documented: &[(&str, &[&[Key]])]) {
+    let path = repository().join(page);
     let page = fs::read_to_string(&path).unwrap();
     let mut made = String::new();
     let mut rest = page.as_str();
@@ -16,13 +25,13 @@ fn the_page_has_the_tables_of_keys() {
     while let Some((before, behind)) = rest.split_once("<!-- keys: ") {
         let (name, behind) = behind.split_once(" -->\n").expect("a name");
         let (_, behind) = behind.split_once("<!-- end -->\n").expect("an end");
-        let (_, keys) = DOCUMENTED.iter().find(|(known, _)| *known == name).expect(name);
+        let (_, keys) = documented.iter().find(|(known, _)| *known == name).expect(name);
         made += &format!("{before}<!-- keys: {name} -->\n{}<!-- end -->\n", keys::rows(keys));
         seen.push(name);
         rest = behind;
     }
     made += rest;
-    let names: Vec<_> = DOCUMENTED.iter().map(|(name, _)| *name).collect();
+    let names: Vec<_> = documented.iter().map(|(name, _)| *name).collect();
     assert_eq!(seen.iter().collect::<HashSet<_>>().len(), seen.len(), "{seen:?}");
     assert!(names.iter().all(|name| seen.contains(name)), "of {names:?} the page has {seen:?}");
     if std::env::var_os("DOCS").is_some() {

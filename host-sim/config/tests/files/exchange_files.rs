@@ -396,3 +396,48 @@ fn a_slave_can_refuse_to_show_stale_values() {
     let on_stale: Vec<_> = config.recipes.iter().map(|recipe| recipe.on_stale).collect();
     assert_eq!(on_stale[..3], [OnStale::Hold, OnStale::Stop, OnStale::Hold]);
 }
+
+#[test]
+fn a_request_may_be_a_head_alone_and_its_constants_need_no_names() {
+    let toml = |first: &str, second: &str| {
+        format!(
+            "[controller]\naddress = \"192.168.12.138\"\n\n[[recipe]]\nname = \"gripper\"\nkind = \"stream\"\nmode = \
+             \"user\"\n\n[[recipe.exchange]]\nevery_ms = 100\nrequest = {{ {first} }}\nreply = {{ head = [1, 3], \
+             fields = [] }}\n\n[[recipe.exchange]]\non = [\"start\"]\nrequest = {{ head = [2], fields = [{second}] \
+             }}\n\n[[port]]\nname = \"line\"\nbus = \"rs485\"\nrecipe = \"gripper\"\n"
+        )
+    };
+    let read = |first: &str, second: &str| {
+        parse_gateway(Text { name: "cell.toml", toml: &toml(first, second) }, &[])
+            .map_err(|error| error.to_string())
+    };
+    let alone = "head = [1, 3], checksum = { kind = \"crc16-modbus\" }, fields = []";
+    let config = read(alone, "{ type = \"byte\", value = 0x41 }, { type = \"word\", value = 500 }").unwrap();
+    let values: Vec<_> = config
+        .fields
+        .iter()
+        .filter_map(|field| match field {
+            FieldSpec::Fixed { value, .. } => Some(*value),
+            _ => None,
+        })
+        .collect();
+    assert_eq!(values, [0x41, 500]);
+    let frames =
+        parse_recipes(Text { name: "cell.toml", toml: &toml(alone, "{ type = \"byte\", value = 1 }") }, &[]);
+    let Some(recipe_config::AnyRecipe::Device(recipe)) = frames.unwrap().pop() else { panic!() };
+    let request = recipe.exchanges[0].request.as_ref().unwrap();
+    let frame = request.lay_out(recipe.carrier, proto_core::sysvar::Direction::Output).unwrap();
+    assert_eq!(frame.layout.lengths(), (4, 4));
+    assert_eq!(recipe.exchanges[1].request.as_ref().unwrap().fields[0].name, "");
+    let constant = "{ type = \"byte\", value = 1 }";
+    for (first, second, said) in [
+        ("fields = []", constant, "request: the frame has no fields"),
+        (alone, "{ type = \"byte\", value = 256 }", "exchange[2].request.fields[1]: "),
+        (alone, "{ type = \"byte\", value = 0.5 }", "0.5 has a fraction"),
+        (alone, "{ type = \"float\", value = 1 }", "a constant that may have a fraction needs a name"),
+        (alone, "{ type = \"byte\", from = \"counter\" }", "name is missing; give the field a name"),
+    ] {
+        let error = read(first, second).unwrap_err();
+        assert!(error.contains(said), "{second}: {error}");
+    }
+}

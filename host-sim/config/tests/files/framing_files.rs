@@ -128,9 +128,11 @@ fn ignored_texts_are_those_that_the_field_can_have() {
     let config = field("ignore = [\"NOREAD\", \"?\"]").unwrap();
     let [FieldSpec::TextInput { ignored, .. }] = config.fields[..] else { panic!("{:?}", config.fields) };
     assert_eq!(ignored, Ignored::new(&[b"NOREAD", b"?"]).unwrap());
+    let config = field("ignore = [\"NOREAD\", \"\"]").unwrap();
+    let [FieldSpec::TextInput { ignored, .. }] = config.fields[..] else { panic!("{:?}", config.fields) };
+    assert!(ignored.has(b"NOREAD") && ignored.has(b""), "a line without a text");
     for (keys, said) in [
         ("ignore = \"NOREAD\"", "expected an array of texts, such as [\"NOREAD\"], found a string"),
-        ("ignore = [\"\"]", "a text of no characters"),
         ("ignore = [\"é\"]", "is not ASCII"),
         ("width = 5, ignore = [\"NOREAD\"]", "6 characters, but the field has 5"),
         ("ignore = [\"NO READ AT ALL\"]", "too long; allowed: 13 characters in one text"),

@@ -12,6 +12,7 @@ mod exchange_files;
 mod framing_files;
 mod golden_images;
 mod schema_files;
+mod sendable_files;
 mod wrong_devices;
 mod wrong_exchanges;
 mod wrong_files;

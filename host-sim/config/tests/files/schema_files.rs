@@ -60,6 +60,7 @@ const BEYOND: &[(&str, &[(&str, &str)])] = &[
             ("", "a part on a byte stream needs a head or a tail"),
             ("", "a text at the beginning of a frame"),
             ("", "framing = \"tail\" needs a tail"),
+            ("", "the checksum must cover bytes of head and fields"),
         ],
     ),
     (

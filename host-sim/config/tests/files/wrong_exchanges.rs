@@ -128,7 +128,7 @@ const CASES: &[Case] = &[
     line("a key of CAN in a stream's request", "request = { head = [2]", "request = { id = 2, head = [2]"),
     line("a framing of a reply", "reply = { head = [0xFE]", "reply = { framing = \"tail\", head = [0xFE]"),
     line("a reply that cannot be found", "reply = { head = [0xFE], ", "reply = { "),
-    line("a request without fields", "head = [0xFD], fields = [{ name = \"light\", type = \"byte\", from = \"WordOutputReg[4]\" }]", "head = [0xFD], fields = []"),
+    line("a request without fields", "head = [0xFD], fields = [{ name = \"light\", type = \"byte\", from = \"WordOutputReg[4]\" }]", "fields = []"),
     line("a field without a value in a request", "{ name = \"light\", type = \"byte\", from = \"WordOutputReg[4]\" }", "{ name = \"light\", type = \"byte\" }"),
     line("a key of a stream in a CAN reply", "reply = { id = 0x701", "reply = { head = [1], id = 0x701"),
     line("no id in a CAN reply", "reply = { id = 0x701, ", "reply = { "),

@@ -6,8 +6,8 @@
 use std::collections::HashSet;
 use std::fmt::Write;
 
-use proto_core::config::{FieldSpec, OutputBinding, PortValue, StateValue};
-use recipe_config::file::{Text, parse, parse_controller, parse_gateway};
+use proto_core::config::{FieldSpec, LinkSource, OutputBinding, PortValue, StateValue};
+use recipe_config::file::{Config, Text, parse, parse_controller, parse_gateway};
 
 const GATEWAY: &str = include_str!("good/cell.toml");
 pub(super) const CONTROLLER: &str = include_str!("good/robot.toml");
@@ -32,6 +32,8 @@ const fn controller(what: &'static str, from: &'static str, to: &'static str) ->
 const CASES: &[Case] = &[
     // The text itself.
     gateway("not TOML", "[controller]", "[controller"),
+    gateway("a hexadecimal byte without its mark", "head = [255, 255]", "head = [48, AA]"),
+    gateway("a hexadecimal byte that begins with a digit", "head = [255, 255]", "head = [0x48, 0D]"),
     gateway("a key twice", "baud = 115200", "baud = 115200\nbaud = 9600"),
     gateway("neither kind of file", GATEWAY, "[[port]]\nname = \"x\"\n"),
     gateway("both kinds of file", "[controller]", "[robot]\n[controller]"),
@@ -101,7 +103,7 @@ const CASES: &[Case] = &[
     gateway("a user field in a realtime recipe", "fields = [\"DigitalOutputCommand[1]\"]\n[recipe.output]\nhead = [255, 255]\ntail", "fields = [{ name = \"x\", type = \"byte\" }]\n[recipe.output]\nhead = [255, 255]\ntail"),
     // User fields.
     gateway("a variable in a user recipe", "{ name = \"fixed\", type = \"byte\", value = 125 }", "\"RobotState[8]\""),
-    gateway("a field without a name", "{ name = \"fixed\", type", "{ type"),
+    gateway("a field without a name", "{ name = \"code\", type", "{ type"),
     gateway("a field with an unknown type", "name = \"fixed\", type = \"byte\"", "name = \"fixed\", type = \"uint8\""),
     gateway("an unknown key of an input field", "scale = 10", "factor = 10"),
     gateway("a scale without to", "to = \"WordInputReg[1]\", ", ""),
@@ -149,6 +151,14 @@ const CASES: &[Case] = &[
     gateway("an unknown on_stale", "on_stale = \"stop\"", "on_stale = \"zero\""),
     // CAN frames.
     gateway("a frame without id", "id = 0x101\n", ""),
+    gateway("an id in quotes", "id = 0x101", "id = \"0x181\""),
+    gateway("an extended id in quotes", "id = 0x101", "extended = true\nid = \"257\""),
+    gateway("an id that is a word", "id = 0x101", "id = \"hand\""),
+    gateway("a program without parentheses", "run(pick.jspf,50)", "run pick.jspf"),
+    gateway("a program in single quotes", "run(pick.jspf,50)", "run('pick.jspf',50)"),
+    gateway("a baud rate by another name", "baud = 115200", "baudrate = 115200"),
+    gateway("a baud rate in quotes", "baud = 115200", "baud = \"115200\""),
+    gateway("a port of the controller by another name", "[controller]", "[controller]\nmodbus_port = 1502"),
     gateway("a standard id beyond 11 bits", "id = 0x101", "id = 0x801"),
     gateway("an extended id beyond 29 bits", "id = 0x101", "extended = true\nid = 0x20000000"),
     gateway("two frames with one id", "[[recipe.output.frame]]\nid = 0x102", "[[recipe.output.frame]]\nid = 0x102\nfields = [{ name = \"x\", type = \"byte\", value = 1 }]\n[[recipe.output.frame]]\nid = 0x102"),
@@ -220,6 +230,9 @@ const CASES: &[Case] = &[
     gateway("an unknown value of a port", "from = \"reply\"", "from = \"port.speed\""),
     gateway("the health of an unknown port", "from = \"reply\"", "from = \"port.rs485-9.alive\""),
     gateway("the health of a listening port", "from = \"reply\"", "from = \"port.up-tcp.alive\""),
+    gateway("an unknown value of a link", "from = \"reply\"", "from = \"link.modbus.down\""),
+    gateway("an unknown link", "from = \"reply\"", "from = \"link.modbsu.up\""),
+    gateway("the link of a field port", "from = \"reply\"", "from = \"link.rs485-1.up\""),
     gateway("a count with a scale", "from = \"reply\"", "from = \"port.frames\", scale = 2"),
     gateway("health in a bit", "recipe = \"orders\"\n\n[[port]]", "recipe = \"orders\"\nhealth = { alive = \"BitInputReg[3].0\" }\n\n[[port]]"),
     gateway("health in a byte of bits", "recipe = \"orders\"\n\n[[port]]", "recipe = \"orders\"\nhealth = { alive = \"BitInputReg[3]\" }\n\n[[port]]"),
@@ -267,18 +280,42 @@ fn the_good_files_are_good() {
         .unwrap_or_else(|error| panic!("{error}"));
 }
 
+/// Without any section of its own, a file still is a controller's, which may leave out all of them.
+#[test]
+fn a_controller_file_may_leave_out_all_its_sections() {
+    let parsed = |toml| parse(Text { name: "robot.toml", toml }, &[]);
+    let ports = "[[recipe]]\nname = \"tool\"\nkind = \"stream\"\nmode = \"user\"\n[recipe.input]\nhead = \
+                 [1]\nfields = [{ name = \"force\", type = \"float\" }]\n\n[[port]]\nname = \
+                 \"rs485\"\nbus = \"rs485\"\nrecipe = \"tool\"\n";
+    for toml in ["", ports] {
+        assert!(matches!(parsed(toml), Ok(Config::Controller(_))), "{toml:?}: {:?}", parsed(toml));
+        let text = Text { name: "robot.toml", toml };
+        assert!(recipe_config::file::parse_recipes(text, &[]).is_ok());
+    }
+    // Who forgot the section is told how the file was read.
+    let gateways = ports.replace("type = \"float\"", "type = \"float\", to = \"FloatInputReg[1]\"");
+    let error = parsed(&gateways).unwrap_err().to_string();
+    assert!(
+        error.ends_with("(without [controller] it is read as a controller file; a gateway file has that)")
+    );
+    let error = parse_gateway(Text { name: "cell.toml", toml: ports }, &[]).unwrap_err().to_string();
+    assert!(error.contains("controller"), "{error}");
+}
+
 /// Every source and key of a port's health, in an otherwise good file.
 #[test]
 fn sources_and_health_are_read() {
     let toml = GATEWAY
         .replacen("from = \"reply\"", "from = \"port.rs485-1.age_ms\", scale = 0.1", 1)
+        .replacen("from = \"counter\"", "from = \"link.up-tcp.up\", scale = -1, offset = 1", 1)
         .replacen("value = 125", "from = \"controller.joint_position[6]\", scale = 100, offset = 1", 1)
         .replacen("send = \"frame\"", "send = \"change\"", 1)
         .replacen("cycle_ms = 4\n", "cycle_ms = 4\nsafe_at_start = true\n", 1)
         .replacen(
             "recipe = \"orders\"\n\n[[port]]",
             "recipe = \"orders\"\nrefresh_ms = 1000\nhealth = { alive = \"WordInputReg[20]\", frames = \
-             \"WordInputReg[21]\", age_ms = \"WordInputReg[22]\", rejected = \"WordInputReg[23]\" }\n\n[[port]]",
+             \"WordInputReg[21]\", age_ms = \"WordInputReg[22]\", rejected = \"WordInputReg[23]\", ignored = \
+             \"WordInputReg[24]\" }\n\n[[port]]",
             1,
         );
     let config =
@@ -287,12 +324,21 @@ fn sources_and_health_are_read() {
     let age = OutputBinding::Port { port: Some(0), value: PortValue::Age, scale: 0.1, offset: 0.0 };
     let value = StateValue::parse("joint_position[6]").unwrap();
     let joint = OutputBinding::State { value, scale: 100.0, offset: 1.0 };
-    assert_eq!(sources, [OutputBinding::Counter, age, joint]);
+    let link = OutputBinding::Link { link: LinkSource::Listening(2), scale: -1.0, offset: 1.0 };
+    assert_eq!(sources, [link, age, joint]);
     assert!(config.ports[0].safe_at_start && !config.ports[1].safe_at_start);
     assert_eq!(config.ports[1].refresh.map(|refresh| refresh.as_millis()), Some(1_000));
     let told: Vec<_> =
         config.ports[1].health.iter().map(|(value, var)| (value.name(), var.index())).collect();
-    assert_eq!(told, [("alive", 20), ("frames", 21), ("age_ms", 22), ("rejected", 23)]);
+    assert_eq!(told, [("alive", 20), ("frames", 21), ("age_ms", 22), ("rejected", 23), ("ignored", 24)]);
+}
+
+#[test]
+fn only_an_item_of_a_list_is_taken_for_a_byte() {
+    for toml in ["a = 1\na = 2", "a = { b = 1, b = 2 }", "b = ab"] {
+        let error = parse(Text { name: "x.toml", toml }, &[]).unwrap_err().to_string();
+        assert!(!error.contains("hexadecimal"), "{error}");
+    }
 }
 
 #[test]

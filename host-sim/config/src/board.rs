@@ -1,0 +1,128 @@
+//! The boards that the firmware runs on, as far as a configuration has to fit them.
+//!
+//! In: a checked configuration. Out: the first thing that this board has not. What every board is refused is told when the
+//! file is read, and when its image is made.
+
+use std::fmt;
+use std::str::FromStr;
+
+use proto_core::config::{Bus, GatewayConfig};
+use proto_core::engine::Engine;
+
+/// A board.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Board {
+    /// Its name, as in the features of the firmware.
+    pub name: &'static str,
+    /// Number of RS-485 lines.
+    pub serial_ports: usize,
+    /// Number of CAN buses.
+    pub can_ports: usize,
+}
+
+/// All boards.
+pub const BOARDS: [Board; 2] = [
+    Board { name: "nucleo-h743zi", serial_ports: 2, can_ports: 1 },
+    Board { name: "mps2-an500", serial_ports: 2, can_ports: 1 },
+];
+
+/// The engine in the size of a board, whose ring of frames is of no matter here: ports, recipe links, fields in one
+/// direction, exchanges.
+type SizedEngine = Engine<4, 2, 128, 0, 32>;
+
+/// What a configuration asks for and a board has not.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Unfit {
+    /// Where in the file: names of tables and keys.
+    pub key: Vec<String>,
+    /// What is wrong there.
+    pub message: String,
+}
+
+impl Board {
+    /// Whether this board can run a configuration: the same checks as at its start.
+    ///
+    /// # Errors
+    /// The first thing that it has not.
+    pub fn check(&self, config: &GatewayConfig) -> Result<(), Unfit> {
+        let (mut lines, mut buses) = (self.serial_ports, self.can_ports);
+        for (_, port, _) in config.view().field_ports() {
+            let (left, bus, available) = match port.bus {
+                Bus::Rs485(_) => (&mut lines, "RS-485", self.serial_ports),
+                Bus::Can { .. } => (&mut buses, "CAN", self.can_ports),
+                Bus::TcpListen { .. } | Bus::UdpListen { .. } => continue,
+            };
+            let Some(rest) = left.checked_sub(1) else {
+                let message =
+                    format!("the board {} has {available} {bus} ports, and this is one more", self.name);
+                return Err(Unfit { key: vec!["port".into(), port.name.to_string(), "bus".into()], message });
+            };
+            *left = rest;
+        }
+        match SizedEngine::new(config) {
+            Ok(_) => Ok(()),
+            Err(error) => {
+                let message = format!("the board {} has no room for it: {error}", self.name);
+                Err(Unfit { key: vec!["port".into()], message })
+            }
+        }
+    }
+}
+
+impl fmt::Display for Board {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name)
+    }
+}
+
+impl FromStr for Board {
+    type Err = String;
+
+    fn from_str(name: &str) -> Result<Self, String> {
+        let known = BOARDS.into_iter().find(|board| board.name == name);
+        known.ok_or_else(|| format!("no such board; there are {}", BOARDS.map(|board| board.name).join(", ")))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_table_has_what_the_firmware_has() {
+        for board in BOARDS {
+            let folder = board.name.replace('-', "_");
+            let path = format!("{}/../../firmware/src/board/{folder}/mod.rs", env!("CARGO_MANIFEST_DIR"));
+            let source = std::fs::read_to_string(&path).unwrap();
+            for (name, count) in [("SERIAL_PORTS", board.serial_ports), ("CAN_PORTS", board.can_ports)] {
+                let line = format!("const {name}: usize = {count};");
+                assert!(source.contains(&line), "{path} has no {line:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_engine_has_the_size_of_the_firmwares() {
+        fn sizes<const P: usize, const U: usize, const F: usize, const T: usize, const E: usize>(
+            _: fn(&GatewayConfig) -> Result<Engine<P, U, F, T, E>, proto_core::engine::BuildError>,
+        ) -> [usize; 4] {
+            [P, U, F, E]
+        }
+        assert_eq!(
+            sizes(|config| SizedEngine::new(config)),
+            sizes(|config| recipe_engine::SizedEngine::new(config))
+        );
+    }
+
+    #[test]
+    fn every_board_of_the_firmware_is_in_the_table() {
+        let path = format!("{}/../../firmware/src/board/mod.rs", env!("CARGO_MANIFEST_DIR"));
+        let source = std::fs::read_to_string(path).unwrap();
+        let known: Vec<_> = source
+            .lines()
+            .filter_map(|line| line.strip_prefix("mod ")?.strip_suffix(';'))
+            .filter(|name| *name != "stack")
+            .collect();
+        assert_eq!(known.len(), BOARDS.len(), "{known:?}");
+    }
+}

@@ -1,0 +1,104 @@
+//! What an output field of a device's frame may send: `min`, `max` and `outside`, or `map`.
+//!
+//! In: the field's table and its encoding. Out: what stands behind the field in the configuration.
+
+use proto_core::config::{FieldSpec, Limits, MapEntry, OutputBinding, Outside, check_sent};
+use proto_core::device::{Encoding, Overflow};
+
+use super::bindings::FileOutput;
+use super::commands::read_range;
+use super::encoding::refuse;
+use super::reader::{Item, Reader, Result, Spot};
+use super::recipes::Written;
+use crate::keys::field::OUTSIDE;
+
+/// The words of `outside`.
+pub(crate) const OUTSIDES: [(&str, Outside); 2] = [("refuse", Outside::Refuse), ("clamp", Outside::Clamp)];
+
+const KEYS: [&str; 4] = ["min", "max", "outside", "map"];
+
+/// What stands behind an output field, with the places of their keys.
+pub(super) fn read(
+    table: &Reader<'_>,
+    written: Written,
+    from: &FileOutput,
+) -> Result<Vec<(Spot, FieldSpec)>> {
+    let (FileOutput::Bound(binding) | FileOutput::PortNamed { binding, .. }) = from else {
+        return Ok(Vec::new());
+    };
+    let Written { encoding, overflow } = written;
+    match *binding {
+        OutputBinding::Constant(_) => {
+            refuse(table, &KEYS, "allowed only together with from: a constant is what it is")?;
+        }
+        OutputBinding::Counter | OutputBinding::CounterTo { .. } => {
+            refuse(table, &KEYS, "not allowed for a count, which wraps")?;
+        }
+        OutputBinding::Port { value, .. } if value.is_count() => {
+            refuse(table, &KEYS, "not allowed for a count, which wraps")?;
+        }
+        _ => {}
+    }
+    if overflow == Overflow::Wrap {
+        refuse(table, &KEYS, "not allowed together with overflow = \"wrap\", which sends any number")?;
+    }
+    if let Some(map) = table.optional("map") {
+        let why = "not allowed together with map, which says what is sent";
+        refuse(table, &["min", "max", "outside", "scale", "offset"], why)?;
+        return read_map(&map, &encoding);
+    }
+    read_limits(table, &encoding)
+}
+
+fn read_limits(table: &Reader<'_>, encoding: &Encoding) -> Result<Vec<(Spot, FieldSpec)>> {
+    let (min, max) = (table.optional("min"), table.optional("max"));
+    let Some(first) = min.as_ref().or(max.as_ref()) else {
+        refuse(table, &["outside"], "allowed only together with min or max")?;
+        return Ok(Vec::new());
+    };
+    let spot = first.spot.clone();
+    let (lowest, highest) = encoding.range();
+    let read = |item: &Option<Item<'_>>, default| match item {
+        Some(item) => read_number(item, encoding),
+        None => Ok(default),
+    };
+    let (low, high) = (read(&min, lowest)?, read(&max, highest)?);
+    if let Some(max) = max.filter(|_| low > high) {
+        return Err(max.error(format!("max {high} is below min {low}")));
+    }
+    let outside = table.word_or(&OUTSIDE, &OUTSIDES)?;
+    Ok(vec![(spot, FieldSpec::Limits(Limits { low, high, outside }))])
+}
+
+fn read_map(map: &Item<'_>, encoding: &Encoding) -> Result<Vec<(Spot, FieldSpec)>> {
+    let mut entries: Vec<(Spot, MapEntry)> = Vec::new();
+    for (key, key_spot, item) in map.any_table()?.entries() {
+        let wrong = |why: String| item.clone().at(key_spot.clone()).error(why);
+        let Some((first, last)) = read_range(key) else {
+            return Err(wrong(format!(
+                "{key:?} is not an integer; the keys of map are values of the source, such as 1, or ranges of them, \
+                 such as \"1..100\""
+            )));
+        };
+        if first > last {
+            return Err(wrong(format!("{key:?} contains no value; allowed: \"{last}..{first}\"")));
+        }
+        let sent = read_number(&item, encoding)?;
+        let mut others = entries.iter().map(|(_, other)| (first.max(other.first), last.min(other.last)));
+        if let Some((value, _)) = others.find(|(first, last)| first <= last) {
+            return Err(wrong(format!("an earlier entry already has the value {value}")));
+        }
+        entries.push((item.spot, MapEntry { first, last, sent }));
+    }
+    if entries.is_empty() {
+        return Err(map.error("no entries; write for example { 0 = 1, \"1..7\" = 2 }"));
+    }
+    Ok(entries.into_iter().map(|(spot, entry)| (spot, FieldSpec::Mapped(entry))).collect())
+}
+
+/// A number that the field can have.
+fn read_number(item: &Item<'_>, encoding: &Encoding) -> Result<f64> {
+    let number = item.number()?;
+    check_sent(encoding, number).map_err(|kind| item.error(kind))?;
+    Ok(number)
+}
