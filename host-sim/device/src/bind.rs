@@ -261,7 +261,16 @@ impl fmt::Display for BindError {
                 write!(f, "`{text}` has no `=`; write NAME=DEVICE, where DEVICE is {DEVICE_FORMS}")
             }
             Self::NoName { text } => write!(f, "`{text}` has no port name before `=`; write NAME=DEVICE"),
-            Self::UnknownDevice { text } => write!(f, "`{text}` is not a device; allowed are {DEVICE_FORMS}"),
+            Self::UnknownDevice { text } => {
+                let kind = if text.starts_with('/') { "serial" } else { "socketcan" };
+                match text.contains([':', ' ']) || text.is_empty() {
+                    true => write!(f, "`{text}` is not a device; allowed are {DEVICE_FORMS}"),
+                    false => write!(
+                        f,
+                        "`{text}` is not a device; is `{kind}:{text}` meant? Allowed are {DEVICE_FORMS}"
+                    ),
+                }
+            }
             Self::Empty { kind } => write!(f, "`{kind}:` needs an argument; allowed are {DEVICE_FORMS}"),
             Self::NoPath { kind } => write!(f, "`{kind}:` has no PATH after its comma"),
             Self::Address { kind, why } => write!(f, "`{kind}:` needs HOST:PORT, but {why}"),
@@ -338,7 +347,9 @@ mod tests {
         for (text, begins) in [
             ("rs485", "`rs485` has no `=`"),
             ("=pty:x", "`=pty:x` has no port name"),
-            ("a=x", "`x` is not a device; allowed are pty:PATH"),
+            ("a=can0", "`can0` is not a device; is `socketcan:can0` meant? Allowed are pty:PATH"),
+            ("a=/dev/ttyUSB0", "`/dev/ttyUSB0` is not a device; is `serial:/dev/ttyUSB0` meant?"),
+            ("a=", "`` is not a device; allowed are pty:PATH"),
             ("a=usb:x", "`usb:x` is not a device"),
             ("a=pty:", "`pty:` needs an argument"),
             ("a=socketcan:", "`socketcan:` needs an argument"),

@@ -12,13 +12,14 @@ use std::time::Duration as StdDuration;
 use proto_core::time::Instant;
 use proto_core::wire::can::CanFrame;
 use proto_core::wire::slcan::{Channel, ChannelState};
-use tokio::net::TcpListener;
+use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Notify;
 use tokio::task::{JoinSet, yield_now};
 use tracing::{info, warn};
 
 use super::bind::{Device, Pace};
 use super::exchange::{Backlog, PortEvent, PortTx};
+use super::kept::{Held, HeldBus, Parked, ParkedBus};
 use super::pty::Pty;
 use super::stream::{self, ByteStream, accept};
 use super::wire::{Full, NodeId, Pacing, Transmitted, Wire};
@@ -220,11 +221,40 @@ impl Drop for Node {
     }
 }
 
+/// An slcan client on TCP.
+#[derive(Debug)]
+pub(crate) struct Client {
+    pub(crate) stream: TcpStream,
+    pub(crate) session: RefCell<Session>,
+}
+
+/// The slcan clients on TCP.
+pub(crate) type Clients = RefCell<Vec<Rc<Client>>>;
+
+/// What a client and the bus have said to each other, as far as it matters for what comes next.
+#[derive(Debug)]
+pub(crate) struct Session {
+    channel: Channel,
+    /// What the client has not taken yet.
+    out: Vec<u8>,
+    /// What came from it and waits for room on the bus.
+    rest: Vec<u8>,
+}
+
+impl Session {
+    fn new(bitrate: u32) -> Self {
+        Self { channel: Channel::new(bitrate), out: Vec::new(), rest: Vec::new() }
+    }
+}
+
 /// A CAN port of the configuration, on a bus of its own that slcan clients connect to.
 #[derive(Debug)]
 pub(super) struct CanPort {
-    pty: Option<Pty>,
-    listener: Option<TcpListener>,
+    pty: Option<(Rc<Pty>, Rc<RefCell<Session>>)>,
+    listener: Option<Rc<TcpListener>>,
+    clients: Rc<Clients>,
+    /// Another owner had it before, and something may wait in it.
+    is_kept: bool,
     bitrate: u32,
     pacing: Pacing,
     tx: Rc<PortTx>,
@@ -233,7 +263,12 @@ pub(super) struct CanPort {
 }
 
 impl CanPort {
-    pub(super) async fn open(device: &Device, bitrate: u32, tx: Rc<PortTx>) -> io::Result<Self> {
+    pub(super) async fn open(
+        device: &Device,
+        bitrate: u32,
+        tx: Rc<PortTx>,
+        kept: Option<Parked>,
+    ) -> io::Result<Self> {
         let (link, listen, pace) = match device {
             Device::SlcanPty { link, pace } => (Some(link), None, *pace),
             Device::SlcanTcp { listen, link, pace } => (link.as_ref(), Some(listen), *pace),
@@ -242,16 +277,33 @@ impl CanPort {
                 return Err(io::Error::new(io::ErrorKind::InvalidInput, what));
             }
         };
-        let listener = match listen {
-            Some(at) => Some(stream::listen(at).await?),
-            None => None,
+        let is_kept = kept.is_some();
+        let (listener, pty, clients) = match kept {
+            Some(Parked::Bus(ParkedBus { pty, listener, clients, .. })) => {
+                let pty = pty.map(|(pty, session)| Ok::<_, io::Error>((pty.unpark()?, session)));
+                let client = |(stream, session)| {
+                    let stream = TcpStream::from_std(stream)?;
+                    Ok::<_, io::Error>(Rc::new(Client { stream, session: RefCell::new(session) }))
+                };
+                let clients = clients.into_iter().map(client).collect::<io::Result<_>>()?;
+                (listener.map(TcpListener::from_std).transpose()?, pty.transpose()?, clients)
+            }
+            _ => {
+                let listener = match listen {
+                    Some(at) => Some(stream::listen(at).await?),
+                    None => None,
+                };
+                let pty = link.map(|link| Pty::open(link)).transpose()?;
+                (listener, pty.map(|pty| (pty, Session::new(bitrate))), Vec::new())
+            }
         };
-        let pty = link.map(|link| Pty::open(link)).transpose()?;
+        let pty = pty.map(|(pty, session)| (Rc::new(pty), Rc::new(RefCell::new(session))));
+        let (listener, clients) = (listener.map(Rc::new), Rc::new(RefCell::new(clients)));
         let pacing = match pace {
             Pace::AtOnce => Pacing::AtOnce,
             Pace::BitRate => Pacing::Bitrate(bitrate),
         };
-        Ok(Self { pty, listener, bitrate, pacing, tx, clock: Clock::real() })
+        Ok(Self { pty, listener, clients, is_kept, bitrate, pacing, tx, clock: Clock::real() })
     }
 
     /// If there are a listener and a terminal, the listener's address: the terminal's link is in the
@@ -259,26 +311,39 @@ impl CanPort {
     pub(super) fn place(&self) -> String {
         match (&self.listener, &self.pty) {
             (Some(listener), _) => stream::address_of(listener),
-            (None, Some(pty)) => pty.link().display().to_string(),
+            (None, Some((pty, _))) => pty.link().display().to_string(),
             (None, None) => String::new(),
         }
     }
 
+    /// What clients are connected to.
+    pub(super) fn held(&self) -> Held {
+        Held::Bus(HeldBus {
+            bitrate: self.bitrate,
+            pty: self.pty.clone(),
+            listener: self.listener.clone(),
+            clients: Rc::clone(&self.clients),
+        })
+    }
+
     pub(super) async fn run(self, mut events: impl FnMut(PortEvent<'_>)) -> io::Result<()> {
-        let Self { pty, listener, bitrate, pacing, tx, clock } = self;
+        let Self { pty, listener, clients, is_kept, bitrate, pacing, tx, clock } = self;
+        if is_kept {
+            tx.note_gap(now());
+        }
         let bus = CanBus::new(pacing, Rc::clone(&tx), clock);
         let node = bus.join();
         tx.count(|counters| counters.ups += 1);
         events(PortEvent::Up);
         let on_terminal = async {
             match &pty {
-                Some(pty) => serve(pty, &bus.join(), bitrate, &tx).await,
+                Some((pty, session)) => serve(&**pty, session, &bus.join(), &tx).await,
                 None => pending().await,
             }
         };
         let on_tcp = async {
             match listener {
-                Some(listener) => serve_all(listener, &bus, bitrate, &tx).await,
+                Some(listener) => serve_all(&listener, &clients, &bus, bitrate, &tx).await,
                 None => pending().await,
             }
         };
@@ -326,12 +391,21 @@ fn hand_over(node: &Node, tx: &PortTx) {
     }
 }
 
-async fn serve_all(listener: TcpListener, bus: &CanBus, bitrate: u32, tx: &Rc<PortTx>) {
-    let mut clients = JoinSet::new();
+async fn serve_all(
+    listener: &TcpListener,
+    clients: &Rc<Clients>,
+    bus: &CanBus,
+    bitrate: u32,
+    tx: &Rc<PortTx>,
+) {
+    let mut tasks = JoinSet::new();
+    for client in clients.borrow().iter() {
+        tasks.spawn_local(serve_client(Rc::clone(client), Rc::clone(clients), bus.join(), Rc::clone(tx)));
+    }
     loop {
         tokio::select! {
-            (stream, peer) = accept(&listener, tx) => {
-                if clients.len() == MAX_CLIENTS {
+            (stream, peer) = accept(listener, tx) => {
+                if tasks.len() == MAX_CLIENTS {
                     drop(stream);
                     tx.count(|counters| counters.refused += 1);
                     if let Some(more) = tx.log_limit.allow(now()) {
@@ -342,36 +416,50 @@ async fn serve_all(listener: TcpListener, bus: &CanBus, bitrate: u32, tx: &Rc<Po
                 }
                 info!(%peer, "slcan client connected");
                 tcp_options::enable_keepalive(&stream);
-                let (node, tx) = (bus.join(), Rc::clone(tx));
-                clients.spawn_local(async move {
-                    let error = serve(&stream, &node, bitrate, &tx).await;
-                    info!(%peer, %error, "slcan client disconnected");
-                    drop(stream);
-                    // Frames that were acknowledged to the client are still sent.
-                    node.set_receiving(false);
-                    while node.waiting() > 0 {
-                        node.sent().await;
-                    }
-                });
+                let client = Rc::new(Client { stream, session: RefCell::new(Session::new(bitrate)) });
+                clients.borrow_mut().push(Rc::clone(&client));
+                tasks.spawn_local(serve_client(client, Rc::clone(clients), bus.join(), Rc::clone(tx)));
             }
-            Some(_) = clients.join_next() => {}
+            Some(_) = tasks.join_next() => {}
         }
     }
 }
 
-/// Serves one client until its connection fails.
-async fn serve<D: ByteStream>(io: &D, node: &Node, bitrate: u32, tx: &PortTx) -> io::Error {
-    let mut channel = Channel::new(bitrate);
+/// Serves a client on TCP until it has gone.
+async fn serve_client(client: Rc<Client>, clients: Rc<Clients>, node: Node, tx: Rc<PortTx>) {
+    let peer = stream::peer_of(&client.stream);
+    let error = serve(&client.stream, &client.session, &node, &tx).await;
+    info!(%peer, %error, "slcan client disconnected");
+    clients.borrow_mut().retain(|other| !Rc::ptr_eq(other, &client));
+    drop(client);
+    // Frames that were acknowledged to the client are still sent.
     node.set_receiving(false);
-    let mut out = Vec::new();
+    while node.waiting() > 0 {
+        node.sent().await;
+    }
+}
+
+/// Serves one client until its connection fails.
+async fn serve<D: ByteStream>(io: &D, session: &RefCell<Session>, node: &Node, tx: &PortTx) -> io::Error {
+    node.set_receiving(false);
+    {
+        // What a client that was taken over had sent before, and what its channel was.
+        let Session { channel, out, rest } = &mut *session.borrow_mut();
+        let (rest, mut unread) = (std::mem::take(rest), 0..rest.len());
+        execute_commands(channel, node, Some(tx), &rest, &mut unread, out);
+    }
     let mut buf = [0; BACKLOG_CHUNK];
     let mut unread = 0..0;
     let mut reported_dropped = 0;
-    let (mut backlog, mut is_old) = (Backlog::default(), false);
+    let (mut backlog, mut is_old) = (Backlog::new(tx), false);
     loop {
+        if backlog.has_slept(tx) {
+            backlog.note(tx, io.has_unread());
+            is_old |= !unread.is_empty();
+        }
         // A frame waits in the bounded queue until the client has read what is before it, and a command until
         // the frames before it have been transmitted.
-        let room = out.len() < MAX_PENDING;
+        let room = session.borrow().out.len() < MAX_PENDING;
         let most = if backlog.is_open(tx) { BACKLOG_CHUNK } else { CHUNK };
         let mut read = None;
         let done = tokio::select! {
@@ -390,6 +478,7 @@ async fn serve<D: ByteStream>(io: &D, node: &Node, bitrate: u32, tx: &PortTx) ->
             }
             _ = node.sent(), if !unread.is_empty() => Ok(()),
             (at, frame) = node.recv(), if room => {
+                let Session { channel, out, .. } = &mut *session.borrow_mut();
                 let mut next = Some((at, frame));
                 while let Some((at, frame)) = next {
                     out.extend(channel.deliver(&frame, at.as_micros() / 1_000).iter().flatten());
@@ -401,20 +490,26 @@ async fn serve<D: ByteStream>(io: &D, node: &Node, bitrate: u32, tx: &PortTx) ->
                 Ok(0) => Err(io::ErrorKind::UnexpectedEof.into()),
                 Ok(count) => {
                     unread = 0..count;
-                    is_old = false;
+                    is_old = backlog.has(tx, count == most) || tx.is_stale();
                     Ok(())
                 }
                 Err(error) => Err(error),
             },
-            ready = io.writable(), if !out.is_empty() => ready,
+            () = tx.slept.notified() => Ok(()),
+            ready = io.writable(), if !session.borrow().out.is_empty() => ready,
             () = tokio::time::sleep(CLIENT_POLL), if io.may_hold_unread() => Ok(()),
         };
-        execute_commands(&mut channel, node, is_old.then_some(tx), &buf, &mut unread, &mut out);
-        let done = done.and_then(|()| flush(io, &mut out, tx));
-        if node.dropped() != reported_dropped {
-            reported_dropped = node.dropped();
-            channel.note_overrun();
-        }
+        let done = {
+            let Session { channel, out, rest } = &mut *session.borrow_mut();
+            execute_commands(channel, node, is_old.then_some(tx), &buf, &mut unread, out);
+            rest.clear();
+            rest.extend_from_slice(buf.get(unread.clone()).unwrap_or_default());
+            if node.dropped() != reported_dropped {
+                reported_dropped = node.dropped();
+                channel.note_overrun();
+            }
+            done.and_then(|()| flush(io, out, tx))
+        };
         match done {
             Err(error) if error.kind() != io::ErrorKind::WouldBlock => return error,
             _ => {}

@@ -44,6 +44,10 @@ pub struct PortTx {
     pub(super) log_limit: LogLimit,
     /// Data read before this instant may have waited while the process slept.
     stale_until: Cell<Instant>,
+    /// How often the process slept.
+    sleeps: Cell<u32>,
+    /// The device does not work any more and is not kept.
+    pub(super) has_failed: Cell<bool>,
     pub(super) slept: Notify,
     pub(super) looked: Notify,
 }
@@ -59,7 +63,15 @@ impl PortTx {
     /// discards everything for [`STALE`]; no old data may be left then.
     pub fn note_sleep(&self, now: Instant) {
         self.stale_until.set(now + STALE);
-        self.slept.notify_one();
+        self.sleeps.set(self.sleeps.get().wrapping_add(1));
+        // Several clients of a bus may wait. One that does not wait now compares the count before it does.
+        self.slept.notify_waiters();
+    }
+
+    /// Nobody read the device until now, which was taken over from another owner. What is read for [`STALE`] is
+    /// dropped by the device's task: the port's owner knows nothing of it.
+    pub(super) fn note_gap(&self, now: Instant) {
+        self.stale_until.set(now + STALE);
     }
 
     /// Whether the port's owner discards data read now, since it may have waited while the process
@@ -103,9 +115,14 @@ impl PortTx {
 }
 
 /// Data that waited while the process slept. A peer's system may hold megabytes for a connection,
-/// more than can be read while the port's owner discards it.
-#[derive(Debug, Default)]
+/// more than can be read while the port's owner discards it; and on a busy machine a device's task may not run
+/// before the owner accepts input again.
+#[derive(Debug)]
 pub(super) struct Backlog {
+    /// The newest sleep after which was seen whether something waited.
+    known: u32,
+    /// Something waited after it, and was not read yet.
+    waits: bool,
     /// There was more than could be read in that time.
     is_behind: bool,
     /// Since when there was no more than could be read at once.
@@ -113,17 +130,39 @@ pub(super) struct Backlog {
 }
 
 impl Backlog {
+    /// Nothing waits in the device now.
+    pub(super) fn new(tx: &PortTx) -> Self {
+        Self { known: tx.sleeps.get(), waits: false, is_behind: false, small_since: None }
+    }
+
+    /// Whether the process slept, and nobody has seen since then if something waits in the device.
+    pub(super) fn has_slept(&self, tx: &PortTx) -> bool {
+        self.known != tx.sleeps.get()
+    }
+
+    /// Whether something waits in the device after the newest sleep.
+    pub(super) fn note(&mut self, tx: &PortTx, waits: bool) {
+        (self.known, self.waits) = (tx.sleeps.get(), waits);
+    }
+
     /// Whether data read now may be part of it: then it may be read in larger pieces.
     pub(super) fn is_open(&self, tx: &PortTx) -> bool {
-        self.is_behind || tx.is_stale()
+        self.is_behind || self.waits || tx.is_stale()
     }
 
     /// Whether data just read is part of it and not discarded by the port's owner. `is_more` if
     /// there was more than was read.
     pub(super) fn has(&mut self, tx: &PortTx, is_more: bool) -> bool {
+        let waited = self.waits || self.has_slept(tx);
+        self.waits &= is_more;
         if tx.is_stale() {
-            self.is_behind = is_more;
+            // Once there was more, a pause does not tell that it was all.
+            self.is_behind |= is_more;
+            self.small_since = None;
             return false;
+        }
+        if waited && !self.is_behind {
+            (self.is_behind, self.small_since) = (true, None);
         }
         if !self.is_behind {
             return false;
@@ -155,7 +194,8 @@ pub struct DeviceCounters {
     /// Bytes sent while no client was connected.
     pub unheard: u64,
     /// Bytes that a client did not read in time, whole frames sent while the queue was full, and
-    /// data that waited while the process slept and was read too late for the engine to discard it.
+    /// data that waited while the process slept and was read too late for the engine to discard it, or
+    /// while one gateway took the place of another.
     pub dropped: u64,
     /// Clients refused because there was one already, or too many.
     pub refused: u64,

@@ -90,6 +90,28 @@ impl Drop for Beside {
     }
 }
 
+/// Reads a file that is its owner's alone, such as a key; at most `max` bytes of it.
+///
+/// # Errors
+/// If it is no regular file, others may read or write it, it cannot be read or is no UTF-8. No error repeats what is in
+/// it.
+pub fn read_private(path: &Path, max: u64) -> io::Result<String> {
+    use std::os::unix::fs::MetadataExt;
+    let file = fs::File::open(path)?;
+    // Of the file that was opened, whatever is at its path by now.
+    let metadata = file.metadata()?;
+    if !metadata.is_file() {
+        return Err(io::Error::other("not a regular file"));
+    }
+    if metadata.mode() & 0o077 != 0 {
+        let mode = metadata.mode() & 0o777;
+        return Err(io::Error::other(format!("others may use it, its mode is {mode:04o}; chmod 0600 it")));
+    }
+    let mut text = String::new();
+    io::Read::read_to_string(&mut io::Read::take(file, max), &mut text)?;
+    Ok(text)
+}
+
 /// The identity of a file or link. One that was deleted and created again is another one, as long as the
 /// first is open or linked elsewhere.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

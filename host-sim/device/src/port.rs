@@ -12,6 +12,7 @@ use proto_core::wire::can::CanId;
 use super::bind::Device;
 use super::can_bus::CanPort;
 use super::exchange::{PortEvent, PortTx};
+use super::kept::{Hold, Kept, Parked};
 use super::serial::SerialPort;
 use super::socketcan::KernelCan;
 use recipe_net::clock::Clock;
@@ -32,6 +33,8 @@ pub enum PortBus {
 #[derive(Debug)]
 pub struct Port {
     driver: Driver,
+    device: Device,
+    is_kept: bool,
     tx: Rc<PortTx>,
 }
 
@@ -48,19 +51,47 @@ impl Port {
     /// # Errors
     /// If the device does not suit the bus, does not exist, or cannot be opened.
     pub async fn open(device: &Device, bus: PortBus) -> io::Result<Self> {
+        Self::open_or_adopt(device, bus, None).await
+    }
+
+    /// The same, or takes over what another owner has left: clients stay connected, and what they have sent
+    /// meanwhile is dropped. What does not suit device and bus is closed first.
+    ///
+    /// # Errors
+    /// As [`Self::open`].
+    pub async fn open_or_adopt(device: &Device, bus: PortBus, kept: Option<Kept>) -> io::Result<Self> {
         let tx = Rc::new(PortTx::default());
+        let kept = kept.filter(|kept| kept.device == *device).map(|kept| kept.what);
+        let kept = kept.filter(|what| bus.suits(what));
+        let is_kept = kept.is_some();
         let driver = match (bus, device) {
             (PortBus::Serial(settings), _) => {
-                Driver::Serial(SerialPort::open(device, settings, Rc::clone(&tx)).await?)
+                Driver::Serial(SerialPort::open(device, settings, Rc::clone(&tx), kept).await?)
             }
             (PortBus::Can { bitrate }, Device::SocketCan { interface }) => {
                 Driver::Kernel(KernelCan::open(interface, bitrate, Rc::clone(&tx))?)
             }
             (PortBus::Can { bitrate }, _) => {
-                Driver::Can(CanPort::open(device, bitrate, Rc::clone(&tx)).await?)
+                Driver::Can(CanPort::open(device, bitrate, Rc::clone(&tx), kept).await?)
             }
         };
-        Ok(Self { driver, tx })
+        Ok(Self { driver, device: device.clone(), is_kept, tx })
+    }
+
+    /// Whether the device was taken over from another owner.
+    pub fn is_kept(&self) -> bool {
+        self.is_kept
+    }
+
+    /// What is needed to keep the device when the tasks of [`Self::run`] are gone; `None` if it is none that is
+    /// kept: nobody is connected to it, or it is opened again at no cost.
+    pub fn hold(&self) -> Option<Hold> {
+        let held = match &self.driver {
+            Driver::Serial(serial) => serial.held()?,
+            Driver::Can(can) => can.held(),
+            Driver::Kernel(_) => return None,
+        };
+        Some(Hold { device: self.device.clone(), held, tx: Rc::clone(&self.tx) })
     }
 
     /// Where a client finds the device: the link to a pseudoterminal, the address of a socket, the name of an
@@ -108,10 +139,25 @@ impl Port {
     /// # Errors
     /// Only if the device fails permanently; otherwise this waits until it is back.
     pub async fn run(self, events: impl FnMut(PortEvent<'_>)) -> io::Result<()> {
-        match self.driver {
+        let tx = Rc::clone(&self.tx);
+        let ended = match self.driver {
             Driver::Serial(serial) => serial.run(events).await,
             Driver::Can(can) => can.run(events).await,
             Driver::Kernel(can) => can.run(events).await,
+        };
+        tx.has_failed.set(true);
+        ended
+    }
+}
+
+impl PortBus {
+    /// Whether a port of this bus can use what another owner has left. The line's settings may be others; the
+    /// channels of slcan clients are for one bit rate.
+    fn suits(self, what: &Parked) -> bool {
+        match (self, what) {
+            (Self::Serial(_), Parked::Pty(_) | Parked::Listen(..)) => true,
+            (Self::Can { bitrate }, Parked::Bus(bus)) => bus.bitrate == bitrate,
+            _ => false,
         }
     }
 }

@@ -10,7 +10,7 @@ use std::path::Path;
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::OFlags;
-use rustix::io::Errno;
+use rustix::io::{Errno, ioctl_fionread};
 use rustix::pty::{OpenptFlags, grantpt, ioctl_tiocgptpeer, openpt, ptsname, unlockpt};
 use rustix::termios::{OptionalActions, QueueSelector, ioctl_tiocnxcl, tcflush, tcgetattr, tcsetattr};
 use tokio::io::Interest;
@@ -31,7 +31,35 @@ pub struct Pty {
     unread: Cell<bool>,
 }
 
+/// A pseudoterminal outside of a runtime: open, with its link, and nobody reads it.
+#[derive(Debug)]
+pub(crate) struct ParkedPty {
+    // Dropped first, as in a `Pty`.
+    link: Symlink,
+    master: OwnedFd,
+    terminal: OwnedFd,
+    unread: bool,
+}
+
+impl ParkedPty {
+    /// Uses it in the current tokio runtime.
+    pub(crate) fn unpark(self) -> io::Result<Pty> {
+        let Self { link, master, terminal, unread } = self;
+        let master = register(master)?;
+        Ok(Pty { link, master, terminal: RefCell::new(Some(terminal)), unread: Cell::new(unread) })
+    }
+}
+
 impl Pty {
+    /// Takes it out of its runtime; its clients notice nothing. `None`, and it is closed, if one of them has
+    /// opened the terminal exclusively at this moment.
+    pub(crate) fn park(self) -> Option<ParkedPty> {
+        self.reopen();
+        let Self { link, master, terminal, unread } = self;
+        let terminal = terminal.into_inner()?;
+        Some(ParkedPty { link, master: master.into_inner(), terminal, unread: unread.get() })
+    }
+
     /// Opens a new pseudoterminal in raw mode, with a symbolic link to it at `link`, in the current tokio
     /// runtime.
     ///
@@ -83,6 +111,11 @@ impl Pty {
             }
             other => other,
         }
+    }
+
+    /// Whether bytes of clients can be read; so if the system does not say.
+    pub fn has_unread(&self) -> bool {
+        ioctl_fionread(self.master.get_ref()) != Ok(0)
     }
 
     /// Drops unread bytes of clients, also those that the kernel has not made readable yet.

@@ -10,13 +10,14 @@ use std::time::Duration as StdDuration;
 
 use proto_core::config::{Parity, Rs485};
 use proto_core::time::{Duration, Instant};
-use tokio::net::TcpListener;
+use tokio::net::{TcpListener, TcpStream};
 use tokio::task::yield_now;
 use tokio_serial::{SerialPortBuilderExt, SerialStream};
 use tracing::{debug, info, warn};
 
 use super::bind::{Device, HostPort, Pace};
 use super::exchange::{Backlog, PortEvent, PortTx};
+use super::kept::{Held, Parked};
 use super::pty::Pty;
 use super::stream::{self, ByteStream, accept};
 use recipe_net::backoff::Backoff;
@@ -30,6 +31,8 @@ use recipe_net::timer::now;
 #[derive(Debug)]
 pub(super) struct SerialPort {
     source: Source,
+    /// Another owner had it before, and something may wait in it.
+    is_kept: bool,
     settings: Rs485,
     tx: Rc<PortTx>,
     /// The clock of the line: when its last bit has left.
@@ -38,16 +41,28 @@ pub(super) struct SerialPort {
 
 #[derive(Debug)]
 enum Source {
-    Pty(Pty, Pace),
+    Pty(Rc<Pty>, Pace),
     Serial(String, SerialStream),
     Connect(HostPort),
-    Listen(TcpListener),
+    Listen(Rc<TcpListener>, Rc<RefCell<Option<Rc<TcpStream>>>>),
 }
 
 impl SerialPort {
-    pub(super) async fn open(device: &Device, settings: Rs485, tx: Rc<PortTx>) -> io::Result<Self> {
+    pub(super) async fn open(
+        device: &Device,
+        settings: Rs485,
+        tx: Rc<PortTx>,
+        kept: Option<Parked>,
+    ) -> io::Result<Self> {
+        let is_kept = kept.is_some();
         let source = match device {
-            Device::Pty { link, pace } => Source::Pty(Pty::open(link)?, *pace),
+            Device::Pty { link, pace } => {
+                let pty = match kept {
+                    Some(Parked::Pty(parked)) => parked.unpark()?,
+                    _ => Pty::open(link)?,
+                };
+                Source::Pty(Rc::new(pty), *pace)
+            }
             Device::Serial { path } => {
                 let path = path.display().to_string();
                 let stream = open_serial(&path, settings)
@@ -55,13 +70,22 @@ impl SerialPort {
                 Source::Serial(path, stream)
             }
             Device::Tcp { to } => Source::Connect(to.clone()),
-            Device::TcpListen { listen } => Source::Listen(stream::listen(listen).await?),
+            Device::TcpListen { listen } => {
+                let (listener, client) = match kept {
+                    Some(Parked::Listen(listener, client)) => {
+                        let client = client.map(TcpStream::from_std).transpose()?;
+                        (TcpListener::from_std(listener)?, client.map(Rc::new))
+                    }
+                    _ => (stream::listen(listen).await?, None),
+                };
+                Source::Listen(Rc::new(listener), Rc::new(RefCell::new(client)))
+            }
             Device::SocketCan { .. } | Device::SlcanPty { .. } | Device::SlcanTcp { .. } => {
                 let what = format!("`{device}` is a CAN device; the port is a serial line");
                 return Err(io::Error::new(io::ErrorKind::InvalidInput, what));
             }
         };
-        Ok(Self { source, settings, tx, clock: Clock::real() })
+        Ok(Self { source, is_kept, settings, tx, clock: Clock::real() })
     }
 
     pub(super) fn place(&self) -> String {
@@ -69,18 +93,30 @@ impl SerialPort {
             Source::Pty(pty, _) => pty.link().display().to_string(),
             Source::Serial(path, _) => path.clone(),
             Source::Connect(to) => to.to_string(),
-            Source::Listen(listener) => stream::address_of(listener),
+            Source::Listen(listener, _) => stream::address_of(listener),
+        }
+    }
+
+    /// What clients are connected to.
+    pub(super) fn held(&self) -> Option<Held> {
+        match &self.source {
+            Source::Pty(pty, _) => Some(Held::Pty(Rc::clone(pty))),
+            Source::Listen(listener, client) => Some(Held::Listen(Rc::clone(listener), Rc::clone(client))),
+            Source::Serial(..) | Source::Connect(_) => None,
         }
     }
 
     pub(super) async fn run(self, mut events: impl FnMut(PortEvent<'_>)) -> io::Result<()> {
-        let Self { source, settings, tx, clock } = self;
+        let Self { source, is_kept, settings, tx, clock } = self;
         let mut sender = Sender::new(settings, Rc::clone(&tx), clock)?;
         match source {
             Source::Pty(pty, pace) => {
                 sender.paced = pace == Pace::BitRate;
+                if is_kept {
+                    drain(&*pty, &tx).await?;
+                }
                 sender.up(&mut events);
-                Err(pump(&pty, &mut sender, &mut events).await)
+                Err(pump(&*pty, &mut sender, &mut events).await)
             }
             Source::Serial(path, stream) => {
                 let mut stream = Some(stream);
@@ -119,17 +155,38 @@ impl SerialPort {
                     backoff.wait().await;
                 }
             }
-            Source::Listen(listener) => loop {
-                let (stream, peer) = accept(&listener, &tx).await;
-                info!(%peer, "client connected");
-                tcp_options::enable_keepalive(&stream);
-                sender.up(&mut events);
-                tokio::select! {
-                    error = pump(&stream, &mut sender, &mut events) => info!(%peer, %error, "client disconnected"),
-                    () = refuse_all(&listener, &tx) => {}
+            Source::Listen(listener, client) => {
+                let mut kept = client.borrow().clone();
+                loop {
+                    let stream = match kept.take() {
+                        Some(stream) => match drain(&*stream, &tx).await {
+                            Ok(()) => stream,
+                            Err(error) => {
+                                info!(%error, "the client disconnected meanwhile");
+                                client.take();
+                                continue;
+                            }
+                        },
+                        None => {
+                            let (stream, peer) = accept(&listener, &tx).await;
+                            info!(%peer, "client connected");
+                            tcp_options::enable_keepalive(&stream);
+                            let stream = Rc::new(stream);
+                            client.replace(Some(Rc::clone(&stream)));
+                            stream
+                        }
+                    };
+                    sender.up(&mut events);
+                    tokio::select! {
+                        error = pump(&*stream, &mut sender, &mut events) => {
+                            info!(peer = %stream::peer_of(&stream), %error, "client disconnected");
+                        }
+                        () = refuse_all(&listener, &tx) => {}
+                    }
+                    client.take();
+                    sender.down(&mut events);
                 }
-                sender.down(&mut events);
-            },
+            }
         }
     }
 }
@@ -173,20 +230,18 @@ async fn pump<D: ByteStream>(
     events: &mut impl FnMut(PortEvent<'_>),
 ) -> io::Error {
     let mut buf = vec![0; BACKLOG_CHUNK];
-    let mut backlog = Backlog::default();
+    let mut backlog = Backlog::new(&sender.tx);
     loop {
+        if backlog.has_slept(&sender.tx) {
+            discard_backlog(device, &sender.tx, &mut backlog, &mut buf, events);
+        }
         let most = if backlog.is_open(&sender.tx) { BACKLOG_CHUNK } else { CHUNK };
         let done = tokio::select! {
             read = device.receive(&mut buf[..most]) => match read {
                 Ok(0) => Err(io::ErrorKind::UnexpectedEof.into()),
                 Ok(count) => {
                     let is_full = count == most;
-                    sender.tx.count(|counters| counters.bytes_in += count as u64);
-                    if backlog.has(&sender.tx, is_full) {
-                        sender.tx.count(|counters| counters.dropped += count as u64);
-                    } else {
-                        events(PortEvent::Bytes(&buf[..count]));
-                    }
+                    take(&buf[..count], is_full, &sender.tx, &mut backlog, events);
                     // A device that never pauses must not delay other tasks. Bytes that the engine discards
                     // take little time, and must be read before it accepts input again.
                     let is_much = is_full && !sender.tx.is_stale();
@@ -196,11 +251,10 @@ async fn pump<D: ByteStream>(
                 Err(error) if error.kind() == io::ErrorKind::Interrupted => Ok(()),
                 Err(error) => Err(error),
             },
-            () = sender.tx.slept.notified() => {
-                discard_backlog(device, &sender.tx, &mut buf, events);
-                Ok(())
+            () = sender.tx.slept.notified() => Ok(()),
+            () = sender.tx.looked.notified(), if D::LATE => {
+                look(device, &sender.tx, &mut backlog, &mut buf[..most], events)
             }
-            () = sender.tx.looked.notified(), if D::LATE => look(device, &sender.tx, &mut buf[..most], events),
             () = sender.tx.wake.notified(), if !sender.sending => sender.begin(device, events),
             expired = sender.timer.expired(), if sender.sending && !sender.blocked => {
                 expired.and_then(|()| sender.advance(device, events))
@@ -219,18 +273,67 @@ async fn pump<D: ByteStream>(
     }
 }
 
+/// Reads and drops what clients sent while nobody read: its age is unknown. That takes [`STALE`](super::exchange::STALE), and longer
+/// while there is more than can be read at once, as after sleep.
+async fn drain(device: &impl ByteStream, tx: &PortTx) -> io::Result<()> {
+    let mut buf = vec![0; BACKLOG_CHUNK];
+    let mut backlog = Backlog::new(tx);
+    tx.note_gap(now());
+    while backlog.is_open(tx) {
+        tokio::select! {
+            read = device.receive(&mut buf) => match read {
+                Ok(0) => return Err(io::ErrorKind::UnexpectedEof.into()),
+                Ok(count) => {
+                    tx.count(|counters| {
+                        counters.bytes_in += count as u64;
+                        counters.dropped += count as u64;
+                    });
+                    backlog.has(tx, count == BACKLOG_CHUNK);
+                    yield_now().await;
+                }
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+                Err(error) => return Err(error),
+            },
+            () = tokio::time::sleep(DRAIN_LOOK) => {
+                if !tx.is_stale() {
+                    backlog.has(tx, false);
+                }
+            }
+        }
+    }
+    device.discard_unread();
+    Ok(())
+}
+
+/// Reports bytes just read, or drops them if they may have waited while the process slept and the engine does not
+/// discard them any more.
+fn take(
+    bytes: &[u8],
+    is_full: bool,
+    tx: &PortTx,
+    backlog: &mut Backlog,
+    events: &mut impl FnMut(PortEvent<'_>),
+) {
+    tx.count(|counters| counters.bytes_in += bytes.len() as u64);
+    if backlog.has(tx, is_full) {
+        tx.count(|counters| counters.dropped += bytes.len() as u64);
+    } else {
+        events(PortEvent::Bytes(bytes));
+    }
+}
+
 /// Reports what can be read now.
 fn look(
     device: &impl ByteStream,
     tx: &PortTx,
+    backlog: &mut Backlog,
     buf: &mut [u8],
     events: &mut impl FnMut(PortEvent<'_>),
 ) -> io::Result<()> {
     match device.try_read(buf) {
         Ok(0) => Err(io::ErrorKind::UnexpectedEof.into()),
         Ok(count) => {
-            tx.count(|counters| counters.bytes_in += count as u64);
-            events(PortEvent::Bytes(buf.get(..count).unwrap_or(buf)));
+            take(buf.get(..count).unwrap_or(buf), count == buf.len(), tx, backlog, events);
             Ok(())
         }
         Err(error) if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::Interrupted) => {
@@ -240,20 +343,22 @@ fn look(
     }
 }
 
-/// Reports what waited while the process slept, so that the engine counts and discards it, and drops the
+/// Reads what waited while the process slept, so that the engine counts and discards it, and drops the
 /// rest: the kernel makes a terminal's bytes readable in pieces, some of them later.
 fn discard_backlog(
     device: &impl ByteStream,
     tx: &PortTx,
+    backlog: &mut Backlog,
     buf: &mut [u8],
     events: &mut impl FnMut(PortEvent<'_>),
 ) {
     for _ in 0..MAX_BACKLOG_READS {
         let Ok(count @ 1..) = device.try_read(buf) else { break };
-        tx.count(|counters| counters.bytes_in += count as u64);
-        events(PortEvent::Bytes(&buf[..count]));
+        take(&buf[..count], count == buf.len(), tx, backlog, events);
     }
     device.discard_unread();
+    // The runtime may not know yet what the system has.
+    backlog.note(tx, device.has_unread());
 }
 
 /// The transmission in progress, and its timing.
@@ -388,6 +493,8 @@ fn bytes_in(settings: &Rs485, time: Duration) -> usize {
 const CHUNK: usize = 512;
 /// The same for bytes that waited while the process slept.
 const BACKLOG_CHUNK: usize = 16 * 1_024;
+/// Interval at which a drained device is looked at while nothing comes.
+const DRAIN_LOOK: StdDuration = StdDuration::from_millis(10);
 /// Maximum number of reads after a sleep before other tasks run.
 const MAX_BACKLOG_READS: usize = 64;
 /// Paced bytes closer together than this are written together, as if from a UART's FIFO.

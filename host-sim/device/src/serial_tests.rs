@@ -5,20 +5,10 @@ use std::io::Write;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
+use super::super::exchange::STALE;
 use super::super::port::{Port, PortBus};
-use super::super::test_kit::{Client, Running, Seen, is_gone, run};
+use super::super::test_kit::{Client, Running, Seen, is_gone, run, serial};
 use super::*;
-
-fn serial(baud: u32) -> PortBus {
-    PortBus::Serial(Rs485 {
-        baud,
-        parity: Parity::None,
-        stop_bits: 1,
-        idle_gap: Duration::from_millis(50),
-        turnaround: Duration::ZERO,
-        echo: false,
-    })
-}
 
 #[test]
 fn a_byte_takes_its_start_data_parity_and_stop_bits() {
@@ -240,3 +230,64 @@ fn an_unsuitable_device_is_refused_by_name() {
         drop(held_open);
     });
 }
+
+const OLD: &[u8] = b"old old old old";
+
+/// What waited while the process slept is not handed over by a task that runs only when the engine accepts input
+/// again; what is sent later is.
+async fn old_bytes_are_dropped(port: &Running, mut write: impl FnMut(&[u8])) {
+    for _ in 0..MANY_ROUNDS {
+        write(OLD);
+        port.tx.note_sleep(now());
+        // The machine does something else.
+        std::thread::sleep(StdDuration::from_millis(2 * STALE.as_millis()));
+        // All is new a little later.
+        let mut bytes = Vec::new();
+        while !bytes.ends_with(b"!") {
+            tokio::time::sleep(StdDuration::from_millis(20)).await;
+            write(b"n!");
+            while let Some(seen) = port.try_next() {
+                let Seen::Bytes(more) = seen else { panic!("{seen:?}") };
+                bytes.extend(more);
+            }
+        }
+        assert!(bytes.iter().all(|byte| b"n!".contains(byte)), "{}", bytes.escape_ascii());
+    }
+}
+
+/// After a sleep in which nothing came the first bytes are handed over, however late they come.
+async fn bytes_after_an_empty_sleep_are_taken(port: &Running, mut write: impl FnMut(&[u8])) {
+    port.tx.note_sleep(now());
+    tokio::time::sleep(StdDuration::from_millis(2 * STALE.as_millis())).await;
+    write(b"a button");
+    assert_eq!(port.bytes(8).await, b"a button");
+    assert_eq!(port.tx.counters().dropped, 0);
+}
+
+#[test]
+fn what_waited_on_a_terminal_is_dropped_by_a_task_that_runs_late() {
+    run(async |dir| {
+        let link = dir.join("rs485").display().to_string();
+        let port = Running::start(&format!("pty:{link}"), serial(115_200)).await;
+        port.expect(Seen::Up).await;
+        let mut client = Client::open(&link);
+        bytes_after_an_empty_sleep_are_taken(&port, |bytes| client.0.write_all(bytes).unwrap()).await;
+        old_bytes_are_dropped(&port, |bytes| client.0.write_all(bytes).unwrap()).await;
+    });
+}
+
+#[test]
+fn what_waited_in_a_connection_is_dropped_by_a_task_that_runs_late() {
+    run(async |_| {
+        let port = Running::start("tcp-listen:127.0.0.1:0", serial(115_200)).await;
+        let mut client = std::net::TcpStream::connect(&port.place).unwrap();
+        port.expect(Seen::Up).await;
+        bytes_after_an_empty_sleep_are_taken(&port, |bytes| client.write_all(bytes).unwrap()).await;
+        old_bytes_are_dropped(&port, |bytes| client.write_all(bytes).unwrap()).await;
+        let dropped = port.tx.counters().dropped;
+        assert!(dropped >= (MANY_ROUNDS * OLD.len()) as u64, "{dropped}");
+    });
+}
+
+/// Two tasks of a select are ready then, and it takes either.
+const MANY_ROUNDS: usize = 8;

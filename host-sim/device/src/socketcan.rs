@@ -25,7 +25,7 @@ use tracing::{debug, info, warn};
 use self::error_frame::StateChange;
 use self::interface::Interface;
 use self::message::{Content, Message};
-use super::exchange::{DeviceCounters, PortEvent, PortTx};
+use super::exchange::{Backlog, DeviceCounters, PortEvent, PortTx};
 use recipe_net::backoff::Backoff;
 use recipe_net::fairness::yield_fairly;
 use recipe_net::log_limit::LogLimit;
@@ -122,6 +122,7 @@ struct Attached<'a> {
     lost: u32,
     /// When to call [`Self::check`], if something is waited for.
     check_at: Instant,
+    backlog: Backlog,
     /// Interval of checks of an interface that is bus-off.
     bus_off_polls: Backoff,
 }
@@ -159,6 +160,7 @@ impl<'a> Attached<'a> {
             refused_since: None,
             lost: 0,
             check_at: Instant::ZERO,
+            backlog: Backlog::new(&port.tx),
             bus_off_polls: Backoff::new(MIN_POLL, MAX_POLL),
         })
     }
@@ -171,6 +173,11 @@ impl<'a> Attached<'a> {
         };
         self.enter_state(self.state, events);
         loop {
+            if self.backlog.has_slept(&self.port.tx)
+                && let Err(error) = self.discard_backlog(events)
+            {
+                return error;
+            }
             let mut more = MoreData::No;
             let done = tokio::select! {
                 // The crate's own async socket waits for data only, and so would not notice that the
@@ -182,6 +189,7 @@ impl<'a> Attached<'a> {
                     }
                     Ok(())
                 }),
+                () = self.port.tx.slept.notified() => Ok(()),
                 () = self.port.tx.wake.notified(), if !self.is_sending() => self.send(events),
                 expired = self.timer.expired() => expired.and_then(|()| self.check(events)),
             };
@@ -210,6 +218,21 @@ impl<'a> Attached<'a> {
         Ok(MoreData::Maybe)
     }
 
+    /// Reads all that can have waited while the process slept, so that the engine counts and discards it. What it
+    /// would not discard any more is dropped.
+    fn discard_backlog(&mut self, events: &mut impl FnMut(PortEvent<'_>)) -> io::Result<()> {
+        for _ in 0..MAX_WAITING {
+            match message::receive(self.socket.as_fd()) {
+                Ok(message) => self.take(message, events)?,
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => break,
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+                Err(error) => return Err(error),
+            }
+        }
+        self.backlog.note(&self.port.tx, false);
+        Ok(())
+    }
+
     fn take(&mut self, message: Message, events: &mut impl FnMut(PortEvent<'_>)) -> io::Result<()> {
         let tx = &self.port.tx;
         match message.content {
@@ -226,7 +249,11 @@ impl<'a> Attached<'a> {
                 if self.is_off() && !message.is_local && Interface::of(&self.port.interface).has_carrier {
                     self.enter_state(BusState::Active, events);
                 }
-                events(PortEvent::Frame { frame });
+                if self.backlog.has_slept(tx) && !tx.is_stale() {
+                    tx.count(|counters| counters.dropped += 1);
+                } else {
+                    events(PortEvent::Frame { frame });
+                }
             }
             Content::Error(frame) => self.take_error(frame, events),
             Content::Fd => tx.count(|counters| counters.fd_frames += 1),
@@ -450,5 +477,7 @@ const ECHO_TIMEOUT: Duration = Duration::from_millis(20);
 const BATCH: usize = 64;
 /// Bytes: half a second of a full bus at 500 kbit/s. Without privileges the system allows a fifth of it.
 const RECEIVE_BUFFER: i32 = 1_024 * 1_024;
+/// More frames than that buffer holds: for each the kernel counts more than this.
+const MAX_WAITING: usize = RECEIVE_BUFFER as usize / 128;
 /// Length of SO_MEMINFO: nine numbers, the last of which counts dropped messages.
 const MEMINFO_LEN: usize = 9 * 4;

@@ -7,6 +7,7 @@ use std::io;
 use std::pin::Pin;
 use std::time::Duration as StdDuration;
 
+use rustix::io::ioctl_fionread;
 use tokio::io::{AsyncRead, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio_serial::{ClearBuffer, SerialPort, SerialStream};
@@ -30,6 +31,10 @@ pub(super) trait ByteStream {
     fn try_read(&self, buf: &mut [u8]) -> io::Result<usize>;
     async fn writable(&self) -> io::Result<()>;
     fn try_write(&self, bytes: &[u8]) -> io::Result<usize>;
+
+    /// Whether the system holds bytes that were not read, also if the runtime does not know of them yet; so if the
+    /// system does not say.
+    fn has_unread(&self) -> bool;
 
     /// Drops bytes that have arrived and were not read, if the system can.
     fn discard_unread(&self) {}
@@ -73,6 +78,9 @@ impl ByteStream for Pty {
     fn try_write(&self, bytes: &[u8]) -> io::Result<usize> {
         Self::try_write(self, bytes)
     }
+    fn has_unread(&self) -> bool {
+        Self::has_unread(self)
+    }
     fn discard_unread(&self) {
         Self::discard_unread(self);
     }
@@ -104,6 +112,9 @@ impl ByteStream for RefCell<SerialStream> {
     fn try_write(&self, bytes: &[u8]) -> io::Result<usize> {
         self.borrow_mut().try_write(bytes)
     }
+    fn has_unread(&self) -> bool {
+        !matches!(self.borrow().bytes_to_read(), Ok(0))
+    }
     fn discard_unread(&self) {
         let _ = self.borrow().clear(ClearBuffer::Input);
     }
@@ -133,6 +144,9 @@ impl ByteStream for TcpStream {
     fn try_write(&self, bytes: &[u8]) -> io::Result<usize> {
         Self::try_write(self, bytes)
     }
+    fn has_unread(&self) -> bool {
+        ioctl_fionread(self) != Ok(0)
+    }
 }
 
 /// Listens at `at`, with limited buffers for each client: what waits in the kernel becomes old, and nothing
@@ -149,18 +163,18 @@ pub(super) fn address_of(listener: &TcpListener) -> String {
     listener.local_addr().map_or_else(|_| String::new(), |at| at.to_string())
 }
 
+/// The address of a client, as text; empty if it has gone.
+pub(super) fn peer_of(stream: &TcpStream) -> String {
+    stream.peer_addr().map_or_else(|_| String::new(), |at| at.to_string())
+}
+
 /// Accepts one client. Errors of the system, such as too few descriptors, are waited out.
 pub(super) async fn accept(listener: &TcpListener, tx: &PortTx) -> (TcpStream, std::net::SocketAddr) {
-    loop {
-        match listener.accept().await {
-            Ok(accepted) => return accepted,
-            Err(error) => {
-                tx.count(|counters| counters.accept_failures += 1);
-                if let Some(more) = tx.log_limit.allow(now()) {
-                    warn!(%error, more, "cannot accept a client");
-                }
-                tokio::time::sleep(StdDuration::from_millis(50)).await;
-            }
+    let failed = |error: &io::Error| {
+        tx.count(|counters| counters.accept_failures += 1);
+        if let Some(more) = tx.log_limit.allow(now()) {
+            warn!(%error, more, "cannot accept a client");
         }
-    }
+    };
+    tcp_options::accept(listener, failed).await
 }

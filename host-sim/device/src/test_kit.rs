@@ -8,6 +8,7 @@ use std::path::Path;
 use std::rc::Rc;
 use std::time::Duration;
 
+use proto_core::config::{Parity, Rs485};
 use proto_core::time::Instant;
 use proto_core::wire::can::CanFrame;
 use rustix::fs::OFlags;
@@ -44,7 +45,11 @@ pub(super) struct Running {
 
 impl Running {
     pub(super) async fn start(bind: &str, bus: PortBus) -> Self {
-        let port = Port::open(&bind.parse().unwrap(), bus).await.unwrap();
+        Self::of(Port::open(&bind.parse().unwrap(), bus).await.unwrap())
+    }
+
+    /// Runs a port that is open.
+    pub(super) fn of(port: Port) -> Self {
         let (place, tx) = (port.place(), port.tx());
         let log = Rc::new(Log::default());
         let sink = Rc::clone(&log);
@@ -76,6 +81,12 @@ impl Running {
         }
     }
 
+    /// An event that has come already.
+    pub(super) fn try_next(&self) -> Option<Seen> {
+        let mut events = self.log.events.borrow_mut();
+        (!events.is_empty()).then(|| events.remove(0).1)
+    }
+
     #[track_caller]
     pub(super) fn expect(&self, expected: Seen) -> impl Future<Output = Instant> {
         let at = std::panic::Location::caller();
@@ -103,6 +114,18 @@ impl Drop for Running {
     fn drop(&mut self) {
         self.task.abort();
     }
+}
+
+/// A line with 8 data bits, no parity, and an idle gap of 50 ms.
+pub(super) fn serial(baud: u32) -> PortBus {
+    PortBus::Serial(Rs485 {
+        baud,
+        parity: Parity::None,
+        stop_bits: 1,
+        idle_gap: proto_core::time::Duration::from_millis(50),
+        turnaround: proto_core::time::Duration::ZERO,
+        echo: false,
+    })
 }
 
 /// Runs a test with a directory of its own, in a runtime like that of the shells.
