@@ -16,6 +16,14 @@ impl fmt::Display for Hex<'_> {
     }
 }
 
+/// The bytes of [`Hex`], with spaces or without; `None` if the text is anything else.
+pub(crate) fn from_hex(text: &str) -> Option<Vec<u8>> {
+    let digits: Option<Vec<u8>> =
+        text.chars().filter(|c| *c != ' ').map(|c| c.to_digit(16).map(|digit| digit as u8)).collect();
+    let (pairs, rest) = digits.as_deref()?.as_chunks::<2>();
+    rest.is_empty().then(|| pairs.iter().map(|[high, low]| high << 4 | low).collect())
+}
+
 /// The places of `what` among `bytes`; they may overlap.
 pub(crate) fn places(bytes: &[u8], what: &[u8]) -> Vec<usize> {
     if what.is_empty() {

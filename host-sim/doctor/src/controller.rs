@@ -1,22 +1,27 @@
 //! Findings about commands and the controller's states: why a reply is a failure.
 
-use proto_core::config::{FieldSpec, InputBinding};
-use proto_core::engine::{PortStatus, ReplyCode};
+use proto_core::command::Request;
+use proto_core::config::ConfigView;
+use proto_core::engine::ReplyCode;
+use proto_core::time::Duration;
 use proto_core::wire::state::{OperationMode, ProgramState, RobotState, SafetyState, States};
 
 use crate::Case;
 use crate::finding::{Cause, Finding, Place, Severity, finding};
+use crate::given::is_command;
+use crate::record::PortRecord;
+use crate::state::Port;
 
 /// Looks at the newest command of each port, and at the controller.
 pub(crate) fn examine(case: &Case<'_>, findings: &mut Vec<Finding>) {
-    for port in case.status.ports() {
-        findings.extend(command(case, &port));
+    for port in &case.status.ports {
+        findings.extend(command(case, port));
     }
-    if findings.iter().any(|finding| is_of_state(finding.cause)) || !has_commands(case) {
+    if findings.iter().any(|finding| is_of_state(finding.cause)) || !has_commands(case.config) {
         return;
     }
     // Nobody has given a command yet.
-    let states = case.status.controller().map(|controller| controller.states).or(case.looked);
+    let states = case.status.controller.or(case.looked);
     if let Some(states) = states
         && let Some((cause, seen, likely, remedy)) = refusal(&states)
     {
@@ -31,44 +36,54 @@ fn is_of_state(cause: Cause) -> bool {
     matches!(cause, Manual | PowerOff | Disabled | SafetyStop | Starting)
 }
 
-fn has_commands(case: &Case<'_>) -> bool {
-    case.config.fields.iter().any(|field| match field {
-        FieldSpec::UserInput { to, .. } | FieldSpec::DeviceInput { to, .. } => {
-            matches!(to, InputBinding::Commands { .. })
-        }
-        _ => false,
-    })
+/// Whether a value can pick a command.
+pub fn has_commands(config: ConfigView<'_>) -> bool {
+    config.fields.iter().any(is_command)
 }
 
 /// The newest command of a port, if something became of it that was not meant.
-fn command(case: &Case<'_>, port: &PortStatus<'_>) -> Option<Finding> {
-    let place = Place::Port(port.name.to_owned());
-    let given = port.command.map_or_else(|| "a command".to_owned(), |command| command.to_string());
+fn command(case: &Case<'_>, port: &Port) -> Option<Finding> {
+    let place = Place::Port(port.name.clone());
+    let given = port.command.clone().unwrap_or_else(|| "a command".to_owned());
     let found = |severity, cause, [seen, expected, likely, remedy]: [String; 4]| {
         Some(finding((severity, &place, cause), seen, expected, likely, remedy))
     };
     match port.reply {
         ReplyCode::Fail => failed(case, port, &place),
-        ReplyCode::NoReply => found(
-            Severity::Fault,
-            Cause::NoReply,
-            [
-                format!("no reply to {given}"),
-                "a reply from the command port".into(),
-                "The connection was lost, or the controller is busy or hangs".into(),
-                "Look at the controller's own log; the command may have been carried out".into(),
-            ],
-        ),
+        ReplyCode::NoReply => {
+            let record = case.ports.iter().find(|record| record.port == port.id);
+            let given_at = record.and_then(PortRecord::newest_command);
+            let age = given_at.map(|at| case.status.at.saturating_since(at));
+            if age.is_some_and(|age| age >= TOLD_FOR) {
+                return None;
+            }
+            let when = age.map_or_else(String::new, |age| format!(", given{}", ago(age)));
+            found(
+                Severity::Fault,
+                Cause::NoReply,
+                [
+                    format!("no reply to {given}{when}"),
+                    "a reply from the command port".into(),
+                    "The connection was lost, or the controller is busy or hangs".into(),
+                    "Look at the controller's own log; the command may have been carried out".into(),
+                ],
+            )
+        }
         ReplyCode::NotSent => {
-            let why = port.last_not_given.map_or("it was not sent", |last| last.why.text());
+            let (why, age) = match &port.not_given {
+                Some(last) if last.age >= TOLD_FOR => return None,
+                Some(last) => (last.text.as_str(), ago(last.age)),
+                None => ("the link or its room was lacking", String::new()),
+            };
             found(
                 Severity::Fault,
                 Cause::NotSent,
                 [
-                    format!("{given} was not sent: {why}"),
+                    format!("{given} was not sent{age}: {why}"),
                     String::new(),
                     "A command is sent at once or not at all".into(),
-                    "Give it again when the link to the command port is up".into(),
+                    "Give it again when the link to the command port is up and the commands before have their replies"
+                        .into(),
                 ],
             )
         }
@@ -76,26 +91,43 @@ fn command(case: &Case<'_>, port: &PortStatus<'_>) -> Option<Finding> {
     }
 }
 
-fn failed(case: &Case<'_>, port: &PortStatus<'_>, place: &Place) -> Option<Finding> {
-    let last = port.last_failed?;
-    let command = last.command.to_string();
-    let then = last.controller.map(|controller| controller.states).or(case.looked);
-    let refused = |why: &str| format!("{command} refused: {why}");
-    let fault = |cause, seen: String, likely: &str, remedy: &str| {
-        Some(finding((Severity::Fault, place, cause), seen, "", likely, remedy))
+fn failed(case: &Case<'_>, port: &Port, place: &Place) -> Option<Finding> {
+    let last = port.failed.as_ref().filter(|last| last.age < TOLD_FOR)?;
+    let (command, age) = (last.command.as_str(), ago(last.age));
+    let word = Request::parse(command.as_bytes()).map_or(command, |request| request.keyword().word());
+    let then = last.controller.or(case.looked);
+    let refused = |why: &str| format!("{command} refused{age}: {why}");
+    let found = |severity, cause, seen: String, likely: &str, remedy: &str| {
+        Some(finding((severity, place, cause), seen, "", likely, remedy))
     };
+    let fault = |cause, seen, likely: &str, remedy: &str| found(Severity::Fault, cause, seen, likely, remedy);
     let Some(states) = then else {
+        // Which of the two it was, nobody can see.
+        if matches!(word, "stop" | "pause") {
+            return found(
+                Severity::Note,
+                Cause::NothingToDo,
+                format!("{command} failed{age}"),
+                "Most often no program runs, and then the controller refuses it; the file needs no state stream, so \
+                 nobody sees that",
+                "If a program did run, look at the pendant's list of errors",
+            );
+        }
         return fault(
             Cause::CommandFailed,
-            format!("{command} failed"),
+            format!("{command} failed{age}"),
             "The controller says no more, and nobody sees its states: the file needs no state stream",
             "Look at the pendant: mode, power, emergency stop, the program's name",
         );
     };
+    if let Some(why) = is_so_already(word, &states) {
+        let likely = "The controller refuses what is so already, such as a stop while nothing runs";
+        return found(Severity::Note, Cause::NothingToDo, refused(why), likely, "Nothing is to be done");
+    }
     // Power on is what a powered-off arm needs.
     let is_cure = |cause: Cause| match cause {
-        Cause::PowerOff => command.starts_with("poweron"),
-        Cause::Disabled => command.starts_with("enable"),
+        Cause::PowerOff => word == "poweron",
+        Cause::Disabled => word == "enable",
         _ => false,
     };
     if let Some((cause, seen, likely, remedy)) = refusal(&states)
@@ -120,22 +152,43 @@ fn failed(case: &Case<'_>, port: &PortStatus<'_>, place: &Place) -> Option<Findi
             &format!("There is no program {name} in the controller, or it has a mistake"),
             "Compare the name with the pendant's list, with capitals, folder and .jspf",
         ),
-        (None, ProgramState::Stopped) if command.starts_with("resume") || command.starts_with("pause") => {
-            fault(
-                Cause::CommandFailed,
-                refused("no program runs"),
-                "There is nothing to pause or to resume",
-                "Start a program first",
-            )
-        }
+        (None, ProgramState::Stopped) if word == "resume" => fault(
+            Cause::CommandFailed,
+            refused("no program runs"),
+            "There is nothing to resume",
+            "Start a program first",
+        ),
         _ => fault(
             Cause::CommandFailed,
-            format!("{command} failed"),
+            format!("{command} failed{age}"),
             "Mode, power and safety do not explain it",
             "Look at the pendant's list of errors",
         ),
     }
 }
+
+/// Why the command has nothing to do: the controller is already what it asks for.
+fn is_so_already(word: &str, states: &States) -> Option<&'static str> {
+    match (word, states.program, states.robot) {
+        ("stop" | "pause", ProgramState::Stopped, _) => Some("no program runs"),
+        ("stop", ProgramState::Stopping, _) => Some("the program is stopping already"),
+        ("pause", ProgramState::Paused | ProgramState::Pausing, _) => Some("the program is paused already"),
+        ("resume", ProgramState::Running, _) => Some("the program runs already"),
+        ("disable", _, RobotState::Disable | RobotState::PowerOff) => Some("the arm is not enabled"),
+        ("poweroff", _, RobotState::PowerOff) => Some("the arm is powered off already"),
+        ("poweron", _, RobotState::Disable | RobotState::Enable) => Some("the arm has power already"),
+        ("enable", _, RobotState::Enable) => Some("the arm is enabled already"),
+        _ => None,
+    }
+}
+
+/// ` 12 s ago`, behind what was then.
+pub(crate) fn ago(age: Duration) -> String {
+    format!(" {} s ago", age.as_millis() / 1000)
+}
+
+/// How long a command that came to nothing is told of: somebody has seen it, or nobody will.
+pub(crate) const TOLD_FOR: Duration = Duration::from_secs(60);
 
 fn mode(mode: OperationMode) -> &'static str {
     match mode {

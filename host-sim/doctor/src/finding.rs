@@ -4,6 +4,9 @@ use std::fmt;
 
 use serde::ser::{Serialize, SerializeMap, Serializer};
 
+/// Stands for the gateway's file in the commands of a remedy: only who has started the doctor knows its name.
+pub const FILE: &str = "FILE";
+
 /// How much a finding matters.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Severity {
@@ -157,12 +160,20 @@ causes! {
     ProgramRuns = "program_runs",
     /// No program has this name.
     ProgramName = "program_name",
+    /// What the command asks for is so already.
+    NothingToDo = "nothing_to_do",
     /// A command failed and nothing says why.
     CommandFailed = "command_failed",
     /// No reply came to a command.
     NoReply = "no_reply",
     /// A command was not sent.
     NotSent = "not_sent",
+    /// A value that is a command only set the base, because it was the first.
+    FirstValue = "first_value",
+    /// A value is in no table of commands.
+    UnknownValue = "unknown_value",
+    /// The gateway itself slept: commands may be among the input that was discarded.
+    Slept = "slept",
 }
 
 /// What is wrong, with the words for people.

@@ -1,6 +1,6 @@
 //! Why does it not work? Findings in words, from what a gateway knows.
 //!
-//! In: a [`Case`]: the configuration, the engine's status, the recent bytes and ids of each port, and what
+//! In: a [`Case`]: the configuration, the state of an engine or of a gateway elsewhere, the recent bytes and ids of each port, and what
 //! is known of each link. Out: [`Finding`]s: what is seen, what was expected, the likely cause and the
 //! remedy. Everything here is a function of its arguments: no clock, no sockets, no devices.
 //!
@@ -13,32 +13,38 @@ mod bytes;
 mod can;
 mod checksum;
 mod controller;
+mod document;
 mod finding;
+mod given;
 mod link;
 mod peers;
 mod port;
 mod record;
 mod shape;
+mod state;
 mod stream;
+mod value;
 mod watch;
 
 use proto_core::config::ConfigView;
-use proto_core::engine::Status;
 use proto_core::time::Duration;
 use proto_core::wire::state::States;
 
 pub use bytes::Hex;
-pub use finding::{Cause, Finding, Place, Severity};
+pub use controller::has_commands;
+pub use document::StatusDocument;
+pub use finding::{Cause, FILE, Finding, Place, Severity};
 pub use record::{KEPT, LinkFacts, PortRecord, Reach, WINDOW};
+pub use state::State;
 pub use watch::{Change, Watch};
 
 /// Everything that findings are made of.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub struct Case<'a> {
     /// What the gateway was told to do.
     pub config: ConfigView<'a>,
     /// What it says of itself.
-    pub status: Status<'a>,
+    pub status: State,
     /// What came in at each field port; a port without a record is judged by its counters alone.
     pub ports: &'a [PortRecord],
     /// What the driver knows of each link beyond the status; may be empty.

@@ -1,22 +1,22 @@
 //! Findings about links: is the controller reached, and does it answer.
 
 use proto_core::config::Parts;
-use proto_core::engine::{LinkInfo, LinkKind, Transport};
-use proto_core::link::LinkState;
+use proto_core::engine::{LinkKind, Transport};
 
 use crate::Case;
 use crate::finding::{Cause, Finding, Place, Severity, finding};
 use crate::record::{LinkFacts, Reach};
+use crate::state;
 
 /// Looks at each link.
 pub(crate) fn examine(case: &Case<'_>, findings: &mut Vec<Finding>) {
-    for info in case.status.links() {
+    for info in &case.status.links {
         // What the second connection to port 2000 lacks, the first carries.
         if info.kind == LinkKind::Urgent {
             continue;
         }
         let facts = case.links.iter().find(|facts| facts.link == info.id);
-        let place = Place::Link(info.name.to_owned());
+        let place = Place::Link(info.name.clone());
         let link = Link { case, info, facts, place };
         findings.extend(link.finding());
         findings.extend(link.strangers());
@@ -25,7 +25,7 @@ pub(crate) fn examine(case: &Case<'_>, findings: &mut Vec<Finding>) {
 
 struct Link<'a> {
     case: &'a Case<'a>,
-    info: LinkInfo<'a>,
+    info: &'a state::Link,
     facts: Option<&'a LinkFacts>,
     place: Place,
 }
@@ -45,12 +45,12 @@ impl Link<'_> {
     }
 
     fn to(&self) -> String {
-        match self.info.endpoint.transport {
-            Transport::Tcp { port } => format!("{} port {port} (TCP)", self.info.endpoint.host),
-            Transport::Udp { port } => format!("{} port {port} (UDP)", self.info.endpoint.host),
+        match self.info.transport {
+            Transport::Tcp { port } => format!("{} port {port} (TCP)", self.info.host),
+            Transport::Udp { port } => format!("{} port {port} (UDP)", self.info.host),
             Transport::TcpListen { local } => format!("{local} (TCP)"),
             Transport::UdpListen { local } => format!("{local} (UDP)"),
-            _ => self.info.endpoint.host.to_owned(),
+            _ => self.info.host.clone(),
         }
     }
 
@@ -65,7 +65,7 @@ impl Link<'_> {
     }
 
     fn is_up(&self) -> bool {
-        matches!(self.info.state, LinkState::Up { .. } | LinkState::Shared)
+        self.info.is_up
     }
 
     fn finding(&self) -> Option<Finding> {
@@ -90,7 +90,7 @@ impl Link<'_> {
             return None;
         }
         let (to, expected) = (self.to(), format!("a connection to {what}"));
-        let host = self.info.endpoint.host;
+        let host = &self.info.host;
         match reach {
             Some(Reach::Refused) => self.fault(Cause::Refused, [
                 format!("{to} refuses the connection"),
@@ -125,10 +125,7 @@ impl Link<'_> {
         let counters = self.info.counters;
         let to = self.to();
         let (what, key) = self.service();
-        let since = match self.info.state {
-            LinkState::Up { since } => self.case.status.at().saturating_since(since).as_millis(),
-            _ => 0,
-        };
+        let since = self.info.up_for.as_millis();
         let silences = self.info.history.silences;
         match self.info.kind {
             LinkKind::State if counters.malformed > 0 && counters.malformed >= counters.received => self
@@ -265,7 +262,7 @@ impl Link<'_> {
             Cause::NotConnected,
             [
                 format!("nobody has connected to {} for {seconds} s", self.to()),
-                format!("the controller at {}", self.info.endpoint.host),
+                format!("the controller at {}", self.info.host),
                 "The controller's recipe client is off or has another address or port".into(),
                 "Enter this machine's address and this port at the pendant; open the port in the firewall"
                     .into(),
@@ -281,7 +278,7 @@ impl Link<'_> {
                 Cause::Stranger,
                 [
                     format!("{strangers} connections or datagrams from other addresses"),
-                    format!("the controller at {}", self.info.endpoint.host),
+                    format!("the controller at {}", self.info.host),
                     "The controller has another address than the file says, or another machine connects"
                         .into(),
                     "Correct controller.address; the log of -v names the peer".into(),

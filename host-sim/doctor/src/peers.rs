@@ -2,13 +2,13 @@
 
 use proto_core::config::{Exchange, Talk};
 use proto_core::device::{Algorithm, ByteOrder};
-use proto_core::engine::PeerStatus;
 use proto_core::modbus::Exception;
 use proto_core::schedule::Presence;
 
 use crate::bytes::{Hex, count};
 use crate::finding::{Cause, Finding, Severity};
 use crate::port::Seen;
+use crate::state::Peer;
 
 /// Looks at each peer.
 pub(crate) fn examine(seen: &Seen<'_>, findings: &mut Vec<Finding>) {
@@ -19,7 +19,7 @@ pub(crate) fn examine(seen: &Seen<'_>, findings: &mut Vec<Finding>) {
         return;
     }
     let is_modbus = exchanges.iter().any(|exchange| matches!(exchange.talk, Talk::Rtu { .. }));
-    for peer in seen.status.peers() {
+    for &peer in &seen.status.peers {
         let counters = peer.counters;
         if peer.presence == Presence::Down && counters.requests >= 2 {
             findings.push(silent(seen, peer, is_modbus));
@@ -31,12 +31,12 @@ pub(crate) fn examine(seen: &Seen<'_>, findings: &mut Vec<Finding>) {
     }
 }
 
-fn name(peer: PeerStatus, is_modbus: bool) -> String {
+fn name(peer: Peer, is_modbus: bool) -> String {
     let word = if is_modbus { "slave" } else { "device" };
     format!("{word} {}", peer.number)
 }
 
-fn silent(seen: &Seen<'_>, peer: PeerStatus, is_modbus: bool) -> Finding {
+fn silent(seen: &Seen<'_>, peer: Peer, is_modbus: bool) -> Finding {
     let who = name(peer, is_modbus);
     let asked =
         format!("{who} asked {} times, {} good replies", peer.counters.requests, peer.counters.replies);
@@ -58,7 +58,7 @@ fn silent(seen: &Seen<'_>, peer: PeerStatus, is_modbus: bool) -> Finding {
                 ],
             );
         }
-        let known = |number: u8| seen.status.peers().any(|peer| peer.number == number);
+        let known = |number: u8| seen.status.peers.iter().any(|peer| peer.number == number);
         if let Some(frame) = frames.iter().find(|frame| !known(frame[0])) {
             return fault(
                 Cause::PeerOther,
@@ -74,10 +74,22 @@ fn silent(seen: &Seen<'_>, peer: PeerStatus, is_modbus: bool) -> Finding {
             );
         }
     }
+    // With settings that were right once, nothing but its power and its wires is left.
+    if peer.counters.replies > peer.counters.checksums.saturating_mul(10) {
+        return fault(
+            Cause::PeerSilent,
+            [
+                format!("{asked}; it has answered before, and does not any more"),
+                expected,
+                "It was switched off or unplugged, or a wire is open".into(),
+                "Check its power and its wires; it is asked again now and then".into(),
+            ],
+        );
+    }
     if peer.counters.checksums > 0 {
         return noise(seen, peer);
     }
-    if !bytes.is_empty() && seen.counters.bytes_in > 0 && seen.status.peers().count() == 1 {
+    if !bytes.is_empty() && seen.counters.bytes_in > 0 && seen.status.peers.len() == 1 {
         return fault(
             Cause::PeerSilent,
             [
@@ -104,7 +116,7 @@ fn silent(seen: &Seen<'_>, peer: PeerStatus, is_modbus: bool) -> Finding {
     )
 }
 
-fn noise(seen: &Seen<'_>, peer: PeerStatus) -> Finding {
+fn noise(seen: &Seen<'_>, peer: Peer) -> Finding {
     seen.found(
         Severity::Fault,
         Cause::ChecksumWrong,
@@ -120,7 +132,7 @@ fn noise(seen: &Seen<'_>, peer: PeerStatus) -> Finding {
     )
 }
 
-fn refuses(seen: &Seen<'_>, peer: PeerStatus, is_modbus: bool) -> Finding {
+fn refuses(seen: &Seen<'_>, peer: Peer, is_modbus: bool) -> Finding {
     let why = match (is_modbus, peer.counters.refusal) {
         (true, code) if code > 0 => format!(": {} (code {code})", Exception::from_code(code)),
         _ => String::new(),

@@ -1,19 +1,21 @@
 //! Findings about field ports: what comes in, and why it is no frame.
 
 use proto_core::config::{Bus, Parity, Port, Recipe};
-use proto_core::engine::{FieldBus, PortCounters, PortId, PortState, PortStatus, Rejection};
+use proto_core::engine::{FieldBus, PortCounters, PortId, PortState, Rejection};
 use proto_core::recipe::model::Mode;
 
 use crate::bytes::{Hex, count, list};
-use crate::finding::{Cause, Finding, Place, Severity, finding};
+use crate::controller::{TOLD_FOR, ago};
+use crate::finding::{Cause, FILE, Finding, Place, Severity, finding};
 use crate::record::{PortRecord, WINDOW};
 use crate::shape::Shape;
+use crate::state;
 use crate::stream::{self, Fit};
-use crate::{Case, can, checksum, peers};
+use crate::{Case, can, checksum, given, peers, value};
 
 /// Looks at each field port.
 pub(crate) fn examine(case: &Case<'_>, findings: &mut Vec<Finding>) {
-    for status in case.status.ports() {
+    for status in &case.status.ports {
         let found = case.config.field_ports().find(|(index, ..)| PortId(*index) == status.id);
         let Some((_, port, recipe)) = found else { continue };
         let empty = PortRecord::new(status.id);
@@ -22,8 +24,8 @@ pub(crate) fn examine(case: &Case<'_>, findings: &mut Vec<Finding>) {
             case,
             port,
             recipe,
-            place: Place::Port(status.name.to_owned()),
-            counters: since(status.counters, &record.counters_before(case.status.at())),
+            place: Place::Port(status.name.clone()),
+            counters: since(&status.counters, &record.counters_before(case.status.at)),
             record,
             status,
         };
@@ -37,7 +39,7 @@ pub(crate) struct Seen<'a> {
     pub(crate) port: &'a Port,
     pub(crate) recipe: &'a Recipe,
     pub(crate) place: Place,
-    pub(crate) status: PortStatus<'a>,
+    pub(crate) status: &'a state::Port,
     pub(crate) record: &'a PortRecord,
     /// Counted within the window.
     pub(crate) counters: PortCounters,
@@ -52,7 +54,7 @@ fn since(now: &PortCounters, before: &PortCounters) -> PortCounters {
     subtract!(
         frames_in bytes_in rejected_not_finite rejected_out_of_range rejected_id rejected_length
         rejected_remote rejected_checksum rejected_unreadable rejected_other_device rejected_counter
-        rejected_no_input tail_mismatches resync_bytes discarded_bytes unanswered refused
+        rejected_no_input tail_mismatches resync_bytes discarded_bytes asleep unanswered refused
     );
     counters
 }
@@ -69,6 +71,7 @@ impl Seen<'_> {
             self.line(findings);
         }
         peers::examine(self, findings);
+        given::examine(self, findings);
     }
 
     /// Makes a finding about the port.
@@ -118,7 +121,11 @@ impl Seen<'_> {
         let Some(shape) = Shape::of(self.case.config, self.recipe) else { return };
         if counters.bytes_in == 0 {
             // A device that is asked is judged by its answers.
-            if self.is_silent() && self.recipe.exchanges.len == 0 && self.case.running >= NOTHING_FOR {
+            // A device that has never sent a whole frame is judged by the piece that it sent.
+            let broken = self.broken_off(&shape).filter(|_| self.status.age.is_none() || !self.is_silent());
+            if broken.is_some() {
+                findings.extend(broken);
+            } else if self.is_silent() && self.recipe.exchanges.len == 0 && self.case.running >= NOTHING_FOR {
                 findings.push(self.no_bytes(&shape));
             }
             return;
@@ -136,8 +143,8 @@ impl Seen<'_> {
     /// The newest bytes; without a record those of the newest rejection.
     fn bytes(&self) -> Vec<u8> {
         let bytes = self.record.bytes();
-        match (bytes.is_empty(), self.status.last_rejection) {
-            (true, Some(last)) => last.bytes().to_vec(),
+        match (bytes.is_empty(), &self.status.rejection) {
+            (true, Some(last)) => last.bytes.clone(),
             _ => bytes,
         }
     }
@@ -193,10 +200,10 @@ impl Seen<'_> {
         let counters = &self.counters;
         let fault = |cause, words| Some(self.found(Severity::Fault, cause, words));
         if self.are_many(counters.rejected_checksum) {
-            let whole = self.status.last_rejection.filter(|last| last.why == Rejection::Checksum);
-            let whole = whole.filter(|last| last.len == last.bytes().len()).map(|last| last.bytes().to_vec());
+            let whole = self.status.rejection.as_ref().filter(|last| last.why == Rejection::Checksum);
+            let whole = whole.filter(|last| last.len == last.bytes.len()).map(|last| last.bytes.as_slice());
             let found = checksum::right_one(shape, bytes)
-                .or_else(|| whole.and_then(|frame| checksum::right_one(shape, &frame)));
+                .or_else(|| whole.and_then(|frame| checksum::right_one(shape, frame)));
             let seen = format!(
                 "{}, {} of them with a wrong checksum",
                 self.came_of(counters.rejected_checksum),
@@ -239,21 +246,55 @@ impl Seen<'_> {
             );
         }
         let unreadable = counters.rejected_unreadable.wrapping_add(counters.rejected_out_of_range);
-        if self.are_many(unreadable) {
-            let last = self.status.last_rejection;
-            let why = last.map_or("a value does not fit", |last| last.why.text());
-            let of = last.map_or(String::new(), |last| format!(" in {}", Hex(last.bytes())));
-            return fault(
-                Cause::BadValue,
-                [
-                    format!("{unreadable} frames rejected: {why}{of}"),
-                    "values that fit the fields and variables of the recipe".into(),
-                    "A field's type, place or scale is not the device's".into(),
-                    "Compare with `host-sim decode FILE --part input` and the bytes above".into(),
-                ],
-            );
+        let values = unreadable.wrapping_add(counters.rejected_not_finite);
+        if self.are_many(values) {
+            return Some(self.bad_value(shape, bytes, values));
         }
         None
+    }
+
+    /// Frames with a value that is not taken.
+    fn bad_value(&self, shape: &Shape<'_>, bytes: &[u8], rejected: u32) -> Finding {
+        use Rejection::{NotFinite, OutOfRange, Unreadable};
+        let is_value = |why| matches!(why, NotFinite | OutOfRange | Unreadable);
+        let last = self.status.rejection.as_ref().filter(|last| is_value(last.why));
+        // Of a long frame only the beginning is kept.
+        let whole = last.filter(|last| last.len == last.bytes.len());
+        let kept = whole.and_then(|last| value::on_line(shape, &last.bytes));
+        let heard = || shape.frames(bytes).last().map(|frame| frame.to_vec());
+        let heard_wrong = shape.frames(bytes).into_iter().rev().find_map(|frame| {
+            let misfit = value::misfit(shape, frame)?;
+            Some((frame.to_vec(), Some(misfit)))
+        });
+        let (frame, misfit) = heard_wrong.unwrap_or_else(|| {
+            // Escape bytes are no part of the frame.
+            let misfit = match (&shape.device, whole) {
+                (Some(_), Some(last)) => value::misfit(shape, &last.bytes),
+                _ => kept.as_ref().and_then(|frame| value::misfit(shape, frame)),
+            };
+            (kept.or_else(heard).unwrap_or_default(), misfit)
+        });
+        let why = last.map_or("a value does not fit", |last| last.why.text());
+        let (seen, expected) = match misfit {
+            Some(misfit) => (misfit.seen, misfit.expected),
+            None => (why.to_owned(), "values that fit the fields and variables of the recipe".to_owned()),
+        };
+        let name = match &*self.recipe.name {
+            name if name.chars().all(|c| c.is_ascii_alphanumeric() || "-_.".contains(c)) => name.to_owned(),
+            name => format!("{name:?}"),
+        };
+        let command = format!("host-sim decode {FILE} --recipe {name} --part input {}", Hex(&frame));
+        self.found(
+            Severity::Fault,
+            Cause::BadValue,
+            [
+                format!("{rejected} frames rejected: {seen}"),
+                expected,
+                "A field's type, place or scale is not the device's, or scale and offset leave too small a range"
+                    .into(),
+                format!("Correct the field; its value in a frame: {}", command.trim_end()),
+            ],
+        )
     }
 
     /// In words, so many frames were found, accepted or not.
@@ -263,8 +304,8 @@ impl Seen<'_> {
     }
 
     fn other_device(&self, shape: &Shape<'_>) -> Option<Finding> {
-        let last = self.status.last_rejection.filter(|last| last.why == Rejection::OtherDevice);
-        let bytes = last.map(|last| last.bytes()).unwrap_or_default();
+        let last = self.status.rejection.as_ref().filter(|last| last.why == Rejection::OtherDevice);
+        let bytes = last.map(|last| last.bytes.as_slice()).unwrap_or_default();
         let differs = shape.constants.iter().find_map(|constant| {
             let seen = bytes.get(constant.at..constant.at + constant.bytes.len())?;
             (seen != constant.bytes).then_some((constant, seen))
@@ -315,17 +356,18 @@ impl Seen<'_> {
     fn nearest(&self, shape: &Shape<'_>, bytes: &[u8]) -> Option<Finding> {
         let counters = &self.counters;
         if counters.frames_in > 0 {
-            return self.noise();
+            return self.noise(shape);
         }
         let lost = counters.resync_bytes.wrapping_add(counters.discarded_bytes);
         if lost == 0 || !self.is_silent() {
-            return None;
+            return self.broken_off(shape);
         }
         let fault = |cause, words| Some(self.found(Severity::Fault, cause, words));
         let came = self.came();
         let hex = |bytes: &[u8]| Hex(bytes).to_string();
         let whole = shape.len.map_or(String::new(), |len| format!("frames of {len} bytes, "));
-        match stream::fit(shape, bytes)? {
+        let Some(fit) = stream::fit(shape, bytes) else { return self.broken_off(shape) };
+        match fit {
             Fit::HeadSwapped { seen } => fault(
                 Cause::HeadSwapped,
                 [
@@ -389,6 +431,41 @@ impl Seen<'_> {
         }
     }
 
+    /// A piece of a frame, and nothing since.
+    fn broken_off(&self, shape: &Shape<'_>) -> Option<Finding> {
+        let last = self.status.rejection.as_ref();
+        let last = last.filter(|last| last.why == Rejection::Partial && last.age < TOLD_FOR)?;
+        if self.status.age.is_some_and(|age| age < last.age) {
+            // The device goes on.
+            return None;
+        }
+        let whole = match shape.lengths() {
+            Some((shortest, longest)) if shortest == longest => longest.to_string(),
+            Some((shortest, longest)) => format!("{shortest} to {longest}"),
+            None => "more".into(),
+        };
+        let expected = match shape.tail {
+            [] => format!("frames of {whole} bytes without a pause"),
+            tail => format!("frames of {whole} bytes without a pause, which end with {}", Hex(tail)),
+        };
+        let (age, bytes) = (ago(last.age), Hex(first(&last.bytes)));
+        Some(self.found(
+            Severity::Warning,
+            Cause::BrokenOff,
+            [
+                match last.bytes.ends_with(shape.tail) && !shape.tail.is_empty() {
+                    true => format!("{} came behind a silence within a frame{age}: {bytes}", count(last.len, "byte")),
+                    false => format!("{} of {whole} bytes{age}, then silence: {bytes}", last.len),
+                },
+                expected,
+                "The device's frame is shorter than the recipe says or ends otherwise, the device pauses within it, or \
+                 was switched off"
+                    .into(),
+                "Correct the fields, the lengths or the tail of the recipe, or raise idle_gap_ms of the port".into(),
+            ],
+        ))
+    }
+
     fn no_head(&self, shape: &Shape<'_>, bytes: &[u8], came: String) -> [String; 4] {
         let high = bytes.iter().filter(|byte| **byte > 0x7F).count() * 100 / bytes.len().max(1);
         let edge = bytes
@@ -429,9 +506,14 @@ impl Seen<'_> {
     }
 
     /// Frames come, and others are damaged.
-    fn noise(&self) -> Option<Finding> {
+    fn noise(&self, shape: &Shape<'_>) -> Option<Finding> {
         let counters = &self.counters;
-        let bad = counters.tail_mismatches.max(counters.rejected_checksum).max(counters.rejected_not_finite);
+        let longest = shape.lengths().map_or(1, |(_, longest)| longest.max(1) as u32);
+        // At least so many pieces.
+        let pieces = counters.discarded_bytes / longest;
+        let bad =
+            [counters.tail_mismatches, counters.rejected_checksum, counters.rejected_not_finite, pieces];
+        let bad = bad.into_iter().max().unwrap_or(0);
         let is_much = bad >= 5 && bad.saturating_mul(10) > counters.frames_in;
         is_much.then(|| {
             self.found(

@@ -12,11 +12,15 @@ use proto_core::wire::can::{CanFrame, CanId};
 pub const KEPT: usize = 1024;
 /// Maximum number of ids of a CAN bus that are counted; further ones are left out.
 const MAX_IDS: usize = 64;
+/// Counters of earlier instants that are kept: those of a window, noted twice a second.
+const NOTES: usize = 16;
+/// Room for the name of a device.
+const DEVICE: usize = 128;
 /// Findings are about this much time before now.
 pub const WINDOW: Duration = Duration::from_secs(5);
 
 /// What came in at a field port.
-#[derive(Debug, Clone)]
+#[derive(Debug)]
 pub struct PortRecord {
     /// The port.
     pub port: PortId,
@@ -26,10 +30,31 @@ pub struct PortRecord {
     turned_at: Instant,
     /// Counters at earlier instants, the oldest first.
     before: VecDeque<(Instant, PortCounters)>,
+    /// Commands that values have picked, and when the newest was, if that was seen.
+    commands: Option<(u32, Option<Instant>)>,
     /// CAN FD frames, which no recipe takes.
     pub fd_frames: u64,
     /// Where the port is bound to, such as `serial:/dev/ttyUSB0`; may be empty.
     pub device: String,
+}
+
+impl Clone for PortRecord {
+    fn clone(&self) -> Self {
+        let mut copy = Self::new(self.port);
+        copy.clone_from(self);
+        copy
+    }
+
+    /// In the room that a copy has already: the thread that moves the data makes one each second.
+    fn clone_from(&mut self, from: &Self) {
+        let Self { port, bytes, ids, turned_at, before, commands, fd_frames, device } = from;
+        (self.port, self.turned_at, self.fd_frames) = (*port, *turned_at, *fd_frames);
+        self.commands = *commands;
+        self.bytes.clone_from(bytes);
+        self.ids.clone_from(ids);
+        self.before.clone_from(before);
+        self.device.clone_from(device);
+    }
 }
 
 /// Frames of an id.
@@ -54,11 +79,12 @@ impl PortRecord {
         Self {
             port,
             bytes: VecDeque::with_capacity(KEPT),
-            ids: Vec::new(),
+            ids: Vec::with_capacity(MAX_IDS),
             turned_at: Instant::ZERO,
-            before: VecDeque::new(),
+            before: VecDeque::with_capacity(NOTES),
+            commands: None,
             fd_frames: 0,
-            device: String::new(),
+            device: String::with_capacity(DEVICE),
         }
     }
 
@@ -82,6 +108,15 @@ impl PortRecord {
 
     /// Notes the counters of this instant; to be called about once a second.
     pub fn note(&mut self, now: Instant, counters: &PortCounters) {
+        self.commands = match self.commands {
+            None => Some((counters.commands, None)),
+            Some((count, _)) if count != counters.commands => Some((counters.commands, Some(now))),
+            same => same,
+        };
+        // Noted more often, the window is shorter.
+        if self.before.len() == NOTES {
+            self.before.pop_front();
+        }
         self.before.push_back((now, *counters));
         while self.before.len() >= 2 && now.saturating_since(self.before[1].0) >= WINDOW {
             self.before.pop_front();
@@ -102,6 +137,11 @@ impl PortRecord {
             Some((at, counters)) if is_old(*at) => *counters,
             _ => PortCounters::default(),
         }
+    }
+
+    /// When the newest command was picked, to a second; `None` if nobody saw it.
+    pub(crate) fn newest_command(&self) -> Option<Instant> {
+        self.commands?.1
     }
 
     /// The newest bytes, the oldest first.

@@ -1,7 +1,7 @@
 //! The frame that a line's device should send, as the doctor compares it with what comes.
 
 use proto_core::config::{ConfigView, DeviceFrame, FieldSpec, Parts, Recipe, StreamPart};
-use proto_core::device::{Boundary, ByteOrder, Carrier, Element, Kind, Part};
+use proto_core::device::{Boundary, ByteOrder, Carrier, Element, Escape, Kind, Part};
 use proto_core::sysvar::Direction;
 use proto_core::wire::scalar::ScalarType;
 
@@ -12,6 +12,11 @@ pub(crate) struct Shape<'c> {
     pub(crate) tail: &'c [u8],
     /// Its length in bytes, if all frames have the same and nothing else than the fields ends them.
     pub(crate) len: Option<usize>,
+    /// All fields of the part, in order.
+    pub(crate) fields: &'c [FieldSpec],
+    /// What tells frames apart, if their fields do not.
+    pub(crate) boundary: Boundary,
+    pub(crate) escape: Option<Escape>,
     pub(crate) floats: Vec<Number>,
     pub(crate) constants: Vec<Constant>,
     /// The frame of a device, with its fields; `None` for a recipe as the controller has it.
@@ -42,6 +47,9 @@ impl<'c> Shape<'c> {
             head: &part.head,
             tail: &part.tail,
             len: None,
+            fields,
+            boundary: part.framing,
+            escape: part.escape,
             floats: Vec::new(),
             constants: Vec::new(),
             device: None,
@@ -96,6 +104,12 @@ impl<'c> Shape<'c> {
             }
         });
         self.device = Some((frame, fields, carrier));
+    }
+
+    /// The shortest and the longest frame in bytes, escape bytes left out; `None` if that is not known.
+    pub(crate) fn lengths(&self) -> Option<(usize, usize)> {
+        let of_device = self.device.as_ref().map(|(frame, ..)| frame.layout.lengths());
+        of_device.or_else(|| self.len.map(|len| (len, len)))
     }
 
     /// The beginnings of right frames, as far as head and tail tell, in bytes of equal frames.

@@ -2,14 +2,19 @@
 
 use proto_core::config::GatewayConfig;
 use proto_core::engine::{BusState, Engine, Input, LinkId, OUTPUT_BUFFER, Output, PortId};
+use proto_core::link::LinkState;
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::state::{LEN, StatePacket};
 use recipe_config::file::{self, Text};
+use recipe_remote::documents::{Document, Pieces};
 
 use super::*;
 
 mod any;
+mod commands;
+mod given;
+mod pieces;
 
 const LINE: PortId = PortId(0);
 
@@ -116,15 +121,37 @@ impl Bench {
         self.input(Input::LinkBytes { link: LinkId::STATE, bytes: &packet.to_bytes() });
     }
 
+    /// What is found from the engine, which is the same as from its document.
+    #[track_caller]
     fn findings(&self) -> Vec<Finding> {
-        examine(&Case {
-            config: self.config.view(),
-            status: self.engine.status(self.now),
-            ports: std::slice::from_ref(&self.record),
-            links: &self.links,
-            running: self.now.saturating_since(self.started),
-            looked: self.looked,
-        })
+        let found = |status: State, ports: &[PortRecord]| {
+            examine(&Case {
+                config: self.config.view(),
+                status,
+                ports,
+                links: &self.links,
+                running: self.now.saturating_since(self.started),
+                looked: self.looked,
+            })
+        };
+        let status = self.engine.status(self.now);
+        let mut text = String::new();
+        Pieces::of(Document::Status).write_all(status, &mut text).unwrap();
+        let document: StatusDocument = serde_json::from_str(&text).unwrap();
+        let up_for = |name: &str| {
+            let link = status.links().find(|link| link.name == name);
+            match link.map(|link| link.state) {
+                Some(LinkState::Up { since }) => self.now.saturating_since(since),
+                _ => Duration::ZERO,
+            }
+        };
+        let read = document.state(&self.config, up_for).unwrap();
+        let records = std::slice::from_ref(&self.record);
+        // Without a record of bytes the newest rejection counts.
+        for ports in [&[], records] {
+            assert_eq!(found(read.clone(), ports), found(status.into(), ports), "{text}");
+        }
+        found(status.into(), records)
     }
 
     /// The findings about ports.
@@ -376,6 +403,49 @@ fn another_device() {
     bench.says(Cause::OtherDevice, &["with 08 in byte 3; expected 09 there", "address"]);
 }
 
+/// Forces of a sensor as hundredths in a word, with an offset.
+const FORCES: &str = "controller = { address = \"127.0.0.1\" }
+    [[recipe]]
+    name = \"force\"
+    kind = \"stream\"
+    mode = \"user\"
+    [recipe.input]
+    head = [0x48, 0xAA]
+    tail = [0x0D, 0x0A]
+    fields = [
+        { name = \"Fx\", type = \"float\", to = \"WordInputReg[1]\", scale = 100, offset = 32768 },
+        { name = \"Fy\", type = \"float\", to = \"WordInputReg[2]\" },
+    ]
+    [[port]]
+    name = \"line\"
+    bus = \"rs485\"
+    recipe = \"force\"";
+
+#[test]
+fn a_value_that_does_not_fit_is_named() {
+    let frame = |x: f32, y: f32| [&HEAD[..], &x.to_le_bytes(), &y.to_le_bytes(), &TAIL].concat();
+    let says = |toml: &str, frame: &[u8], words: &[&str]| {
+        let mut bench = Bench::new(toml);
+        bench.streams(frame);
+        bench.says(Cause::BadValue, words);
+        // A board that was not heard has kept the beginning of the frame.
+        bench.record = PortRecord::new(LINE);
+        bench.says(Cause::BadValue, words);
+    };
+    let range = "field 1, for WordInputReg[1], is 400; expected -327.68..=327.67 there";
+    let command = "host-sim decode FILE --recipe force --part input 48 AA 00 00 C8 43 00 00 80 3F 0D 0A.";
+    says(FORCES, &frame(400.0, 1.0), &[range, command]);
+    let not_a_number = "field 2, for WordInputReg[2], is NaN; expected a finite number there";
+    says(FORCES, &frame(1.0, f32::NAN), &[not_a_number]);
+    // The same as the frame of a device.
+    let device = FORCES.replace("fields = [", "checksum = { kind = \"sum8\" }\nfields = [");
+    let mut summed = frame(400.0, 1.0);
+    let sum = summed[..10].iter().fold(0, |sum: u8, byte| sum.wrapping_add(*byte));
+    summed.insert(10, sum);
+    let command = format!("--part input {}.", Hex(&summed));
+    says(&device, &summed, &[range, &command]);
+}
+
 const MASTER: &str = "controller = { address = \"127.0.0.1\" }
     [[recipe]]
     name = \"r\"
@@ -412,6 +482,12 @@ fn slaves_that_do_not_answer_as_asked() {
     slave(|_| with_crc(&[8, 3, 2, 0, 7])).says(Cause::PeerOther, &["a right frame of slave 8", "slave = 8"]);
     slave(<[u8]>::to_vec).says(Cause::Echo, &["the request itself is heard", "echo = true"]);
     slave(|_| with_crc(&[9, 0x83, 2])).says(Cause::PeerRefuses, &["illegal data address", "code 2"]);
+    let asked = std::cell::Cell::new(0);
+    let unplugged = |_: &[u8]| {
+        asked.set(asked.get() + 1);
+        if asked.get() < 30 { with_crc(&[9, 3, 2, 0, 7]) } else { Vec::new() }
+    };
+    slave(unplugged).says(Cause::PeerSilent, &["29 good replies; it has answered before", "power"]);
     slave(|_| vec![1, 2, 3, 4]).says(Cause::PeerSilent, &["heard: 01 02 03 04", "baud rate"]);
 }
 
@@ -483,70 +559,6 @@ fn links_that_are_silent_or_speak_something_else() {
         bench.pass(20);
     }
     bench.says_also(Cause::OneWay, &["sent, 0 received at 127.0.0.1 port 2011 (UDP)", "Another UDP port"]);
-}
-
-/// A panel that gives a command.
-const PANEL: &str = "controller = { address = \"127.0.0.1\" }
-    [[recipe]]
-    name = \"r\"
-    kind = \"stream\"
-    mode = \"user\"
-    [recipe.input]
-    head = [255]
-    tail = [254]
-    fields = [{ name = \"button\", type = \"byte\", commands = { 1 = \"run(pick.jspf)\" } }]
-    [recipe.output]
-    head = [255]
-    tail = [254]
-    fields = [{ name = \"joint\", type = \"float\", from = \"RobotState[8]\" }]
-    [[port]]
-    name = \"panel\"
-    bus = \"rs485\"
-    recipe = \"r\"";
-
-#[track_caller]
-fn refused(change: impl FnOnce(&mut StatePacket), cause: Cause, words: &[&str]) {
-    let mut bench = Bench::new(PANEL);
-    bench.pass(100);
-    for link in [LinkId::STATE, LinkId::COMMAND] {
-        bench.up(link);
-    }
-    bench.states(change);
-    bench.bytes(&[255, 0, 254]);
-    bench.bytes(&[255, 1, 254]);
-    bench.pass(10);
-    bench.input(Input::LinkBytes { link: LinkId::COMMAND, bytes: b"run fail" });
-    bench.pass(500);
-    bench.says(cause, words);
-}
-
-#[test]
-fn a_refused_command_has_its_reason() {
-    refused(
-        |packet| packet.operation_mode = 0,
-        Cause::Manual,
-        &["port panel: run(pick.jspf) refused: the controller is in manual mode"],
-    );
-    for safety in [4, 5] {
-        let off = |packet: &mut StatePacket| (packet.robot_state, packet.safety_state) = (4, safety);
-        refused(off, Cause::PowerOff, &["refused: the arm is powered off"]);
-    }
-    refused(|packet| packet.robot_state = 5, Cause::Disabled, &["refused: the arm is not enabled"]);
-    refused(|packet| packet.robot_state = 1, Cause::Starting, &["not ready (Initialize)"]);
-    refused(|packet| packet.safety_state = 9, Cause::SafetyStop, &["has stopped the robot (Stop0)"]);
-    refused(|packet| packet.program_state = 2, Cause::ProgramRuns, &["a program runs"]);
-    refused(|_| (), Cause::ProgramName, &["in remote mode, powered and enabled", "no program pick.jspf"]);
-}
-
-#[test]
-fn a_controller_that_would_refuse_is_told_before_a_command() {
-    let mut bench = Bench::new(PANEL);
-    bench.pass(100);
-    bench.up(LinkId::STATE);
-    bench.states(|packet| packet.operation_mode = 0);
-    bench.says_also(Cause::Manual, &["controller: the controller is in manual mode"]);
-    bench.states(|_| ());
-    assert!(bench.findings().iter().all(|finding| finding.place != Place::Controller));
 }
 
 #[test]

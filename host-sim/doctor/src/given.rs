@@ -1,0 +1,96 @@
+//! Findings about values that gave no command, and about presses that may be among discarded input.
+
+use proto_core::config::{ConfigView, FieldSpec, InputBinding, Recipe};
+use proto_core::engine::{NotGiven, Rejection};
+use proto_core::sysvar::Direction;
+
+use crate::bytes::count;
+use crate::controller::{TOLD_FOR, ago};
+use crate::finding::{Cause, Finding, Severity};
+use crate::port::Seen;
+use crate::state::Withheld;
+
+/// Looks at a port whose device gives commands.
+pub(crate) fn examine(seen: &Seen<'_>, findings: &mut Vec<Finding>) {
+    if !gives_commands(seen.case.config, seen.recipe) {
+        return;
+    }
+    findings.extend(slept(seen));
+    findings.extend(seen.status.not_given.as_ref().and_then(|withheld| no_command(seen, withheld)));
+}
+
+/// Whether a value of the recipe can pick a command.
+fn gives_commands(config: ConfigView<'_>, recipe: &Recipe) -> bool {
+    config.fields_of(recipe, Direction::Input).any(|(_, _, field)| is_command(field))
+}
+
+/// Whether a value of the field can pick a command.
+pub(crate) fn is_command(field: &FieldSpec) -> bool {
+    match field {
+        FieldSpec::UserInput { to, .. } | FieldSpec::DeviceInput { to, .. } => {
+            matches!(to, InputBinding::Commands { .. })
+        }
+        _ => false,
+    }
+}
+
+/// A value that should have been a command, and picked none.
+fn no_command(seen: &Seen<'_>, withheld: &Withheld) -> Option<Finding> {
+    let &Withheld { why, value, age, .. } = withheld;
+    // A command since then shows that the device is understood.
+    let given = seen.record.newest_command().map(|at| seen.case.status.at.saturating_since(at));
+    if age >= TOLD_FOR || given.is_some_and(|given| given <= age) {
+        return None;
+    }
+    let (value, age) = (format!("value {value}"), ago(age));
+    let warning = |cause, words| Some(seen.found(Severity::Warning, cause, words));
+    match why? {
+        NotGiven::Based => warning(
+            Cause::FirstValue,
+            [
+                format!("{value} gave no command{age}: it was the first after the start, silence, sleep or a lost device"),
+                "another value before it: the first one only sets the base".into(),
+                "A button was pressed in the first frame, or the device sends only changes".into(),
+                "Release it and press again. If the device sends only changes, write base = \"keep\" beside commands, \
+                 a longer timeout_ms, and level for a stop button"
+                    .into(),
+            ],
+        ),
+        NotGiven::Unknown => warning(
+            Cause::UnknownValue,
+            [
+                format!("{value} gave no command{age}: it is in no entry of the table"),
+                "a value of the table `commands`, or the idle one".into(),
+                "The device sends another number than the table has, or the field is at another place".into(),
+                "Add the value to `commands`, write it as `idle`, or correct the field".into(),
+            ],
+        ),
+        // What was picked and not sent shows in the port's reply.
+        _ => None,
+    }
+}
+
+/// Input that was discarded because the gateway itself slept.
+fn slept(seen: &Seen<'_>) -> Option<Finding> {
+    let last = seen.status.rejection.as_ref();
+    let last = last.filter(|last| last.why == Rejection::Asleep && last.age < TOLD_FOR);
+    let counted = seen.counters.asleep as usize;
+    if last.is_none() && counted == 0 {
+        return None;
+    }
+    let age = last.map_or_else(String::new, |last| ago(last.age));
+    let chunks = match counted {
+        0 => "Input".to_owned(),
+        _ => count(counted, "chunk") + " of input",
+    };
+    Some(seen.found(
+        Severity::Warning,
+        Cause::Slept,
+        [
+            format!("{chunks} discarded{age}: the gateway itself had slept, and what waited is of an unknown age"),
+            "a gateway that is called at least twice a second".into(),
+            "The machine was suspended or overloaded; a button that was pressed meanwhile gave no command".into(),
+            "Press again. A panel that sends only changes should repeat its frame while stop is held".into(),
+        ],
+    ))
+}

@@ -1,0 +1,155 @@
+//! What a gateway says of itself, in a form of its own: taken from an engine, or read from the documents of the API.
+
+use proto_core::engine::{
+    FieldBus, LinkCounters, LinkId, LinkKind, NotGiven, PeerCounters, PortCounters, PortId, PortState,
+    Rejection, ReplyCode, Status, Transport,
+};
+use proto_core::link::{LinkHistory, LinkState};
+use proto_core::schedule::Presence;
+use proto_core::time::{Duration, Instant};
+use proto_core::wire::state::States;
+
+/// State and counters of a gateway at one instant.
+#[derive(Debug, Clone)]
+pub struct State {
+    pub(crate) at: Instant,
+    pub(crate) ports: Vec<Port>,
+    pub(crate) links: Vec<Link>,
+    /// The controller's states in the newest state packet.
+    pub(crate) controller: Option<States>,
+}
+
+/// A field port.
+#[derive(Debug, Clone)]
+pub(crate) struct Port {
+    pub(crate) id: PortId,
+    pub(crate) name: String,
+    pub(crate) bus: FieldBus,
+    pub(crate) state: PortState,
+    pub(crate) age: Option<Duration>,
+    /// Number of its input frames that are overdue or have never come.
+    pub(crate) overdue: usize,
+    pub(crate) reply: ReplyCode,
+    /// The newest command that one of its values picked, such as `run(pick.jspf)`.
+    pub(crate) command: Option<String>,
+    /// The newest value that gave no command.
+    pub(crate) not_given: Option<Withheld>,
+    pub(crate) failed: Option<Failed>,
+    pub(crate) rejection: Option<Rejected>,
+    pub(crate) counters: PortCounters,
+    pub(crate) peers: Vec<Peer>,
+}
+
+/// A value that gave no command.
+#[derive(Debug, Clone)]
+pub(crate) struct Withheld {
+    /// The reason, if it is one that this program knows.
+    pub(crate) why: Option<NotGiven>,
+    /// The reason in words.
+    pub(crate) text: String,
+    pub(crate) value: i64,
+    /// How long ago that was.
+    pub(crate) age: Duration,
+}
+
+/// A command that the controller replied to with a failure.
+#[derive(Debug, Clone)]
+pub(crate) struct Failed {
+    pub(crate) command: String,
+    /// How long ago the reply came.
+    pub(crate) age: Duration,
+    pub(crate) controller: Option<States>,
+}
+
+/// The newest rejection of a port.
+#[derive(Debug, Clone)]
+pub(crate) struct Rejected {
+    pub(crate) why: Rejection,
+    /// How long ago it was.
+    pub(crate) age: Duration,
+    /// Length of what was rejected.
+    pub(crate) len: usize,
+    /// Its first bytes.
+    pub(crate) bytes: Vec<u8>,
+}
+
+/// A slave, or another peer that exchanges of a port are with.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Peer {
+    pub(crate) number: u8,
+    pub(crate) presence: Presence,
+    pub(crate) counters: PeerCounters,
+}
+
+/// A link to the controller.
+#[derive(Debug, Clone)]
+pub(crate) struct Link {
+    pub(crate) id: LinkId,
+    pub(crate) name: String,
+    pub(crate) kind: LinkKind,
+    pub(crate) transport: Transport,
+    pub(crate) host: String,
+    pub(crate) is_up: bool,
+    /// How long it has been up, as far as that is known.
+    pub(crate) up_for: Duration,
+    pub(crate) history: LinkHistory,
+    pub(crate) counters: LinkCounters,
+}
+
+impl From<Status<'_>> for State {
+    fn from(status: Status<'_>) -> Self {
+        let at = status.at();
+        let ports = status.ports().map(|port| Port {
+            id: port.id,
+            name: port.name.to_owned(),
+            bus: port.bus,
+            state: port.state,
+            age: port.age,
+            overdue: port.overdue,
+            reply: port.reply,
+            command: port.command.map(|command| command.to_string()),
+            not_given: port.last_not_given.map(|last| Withheld {
+                why: Some(last.why),
+                text: last.why.text().to_owned(),
+                value: last.value,
+                age: at.saturating_since(last.at),
+            }),
+            failed: port.last_failed.map(|failed| Failed {
+                command: failed.command.to_string(),
+                age: at.saturating_since(failed.at),
+                controller: failed.controller.map(|controller| controller.states),
+            }),
+            rejection: port.last_rejection.map(|last| Rejected {
+                why: last.why,
+                age: Duration::from_millis(at.saturating_since(last.at).as_millis()),
+                len: last.len,
+                bytes: last.bytes().to_vec(),
+            }),
+            counters: *port.counters,
+            peers: port
+                .peers()
+                .map(|peer| Peer { number: peer.number, presence: peer.presence, counters: peer.counters })
+                .collect(),
+        });
+        let links = status.links().map(|link| Link {
+            id: link.id,
+            name: link.name.to_owned(),
+            kind: link.kind,
+            transport: link.endpoint.transport,
+            host: link.endpoint.host.to_owned(),
+            is_up: matches!(link.state, LinkState::Up { .. } | LinkState::Shared),
+            up_for: match link.state {
+                LinkState::Up { since } => at.saturating_since(since),
+                _ => Duration::ZERO,
+            },
+            history: *link.history,
+            counters: *link.counters,
+        });
+        Self {
+            at,
+            ports: ports.collect(),
+            links: links.collect(),
+            controller: status.controller().map(|controller| controller.states),
+        }
+    }
+}

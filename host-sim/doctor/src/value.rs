@@ -1,0 +1,100 @@
+//! Which field of a rejected frame has a value that is not taken, and what would be.
+//!
+//! In: a frame of the recipe, with head and tail. Out: the first field that a gateway rejects the frame for, in
+//! words, and the bytes as they are on the line, as `host-sim decode` takes them.
+
+use proto_core::config::{FieldSpec, Fitting, InputBinding};
+use proto_core::device::{Boundary, Encoding};
+use proto_core::wire::scalar::Scalar;
+
+use crate::shape::Shape;
+
+/// A field whose value is not taken.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Misfit {
+    /// Such as `field 1, for WordInputReg[1], is 400`.
+    pub(crate) seen: String,
+    /// Such as `-327.68..=327.67`.
+    pub(crate) expected: String,
+}
+
+/// The first field of a frame that is not taken; `None` if all are, or if it is no frame of the recipe.
+pub(crate) fn misfit(shape: &Shape<'_>, frame: &[u8]) -> Option<Misfit> {
+    match &shape.device {
+        Some((device, fields, _)) => {
+            let values = device.layout.values(&device.elements, frame);
+            let numbered = (1..).zip(fields.iter()).filter(|(_, field)| field.element().is_some());
+            numbered.zip(values).find_map(|((nth, field), value)| match value {
+                Ok(value) => not_taken(nth, field, value?),
+                Err(why) => Some(Misfit {
+                    seen: format!("{}: {why}", named(nth, field)),
+                    expected: "a number there".into(),
+                }),
+            })
+        }
+        None => {
+            let mut rest = frame.strip_prefix(shape.head)?;
+            (1..).zip(shape.fields).find_map(|(nth, field)| {
+                let ty = match *field {
+                    FieldSpec::System(var) => var.ty(),
+                    FieldSpec::UserInput { ty, .. } => ty,
+                    _ => return None,
+                };
+                let (bytes, after) = rest.split_at_checked(ty.size())?;
+                rest = after;
+                not_taken(nth, field, Encoding::scalar(ty).read(bytes).ok()?)
+            })
+        }
+    }
+}
+
+fn not_taken(nth: usize, field: &FieldSpec, value: Scalar) -> Option<Misfit> {
+    let name = named(nth, field);
+    if !value.is_finite() {
+        return Some(Misfit { seen: format!("{name} is {value}"), expected: "a finite number there".into() });
+    }
+    if field.takes(value) {
+        return None;
+    }
+    let expected = match field.fitting() {
+        Some(Fitting { low, high, .. }) => format!("{}..={} there", number(low), number(high)),
+        None => "a number that fits its variable".into(),
+    };
+    Some(Misfit { seen: format!("{name} is {}", number(value.as_f64())), expected })
+}
+
+/// A configuration has no names of fields: the number in the file, and the variable.
+fn named(nth: usize, field: &FieldSpec) -> String {
+    let var = match *field {
+        FieldSpec::System(var)
+        | FieldSpec::UserInput { to: InputBinding::Variable { var, .. }, .. }
+        | FieldSpec::DeviceInput { to: InputBinding::Variable { var, .. }, .. } => Some(var),
+        _ => None,
+    };
+    var.map_or_else(|| format!("field {nth}"), |var| format!("field {nth}, for {var},"))
+}
+
+/// Without the digits that only the way to binary and back makes.
+fn number(value: f64) -> String {
+    let rounded = format!("{value:.6}").parse().unwrap_or(value);
+    // A sum with 0 has no negative zero.
+    format!("{}", rounded + 0.0)
+}
+
+/// A frame that was kept as the engine sees it, with what is around it on the line; `None` if that is not known.
+pub(crate) fn on_line(shape: &Shape<'_>, kept: &[u8]) -> Option<Vec<u8>> {
+    if shape.device.is_none() {
+        return Some([shape.head, kept, shape.tail].concat());
+    }
+    let mut frame = kept.to_vec();
+    if shape.boundary == Boundary::Tail && !frame.ends_with(shape.tail) {
+        frame.extend(shape.tail);
+    }
+    if let Some(escape) = shape.escape {
+        let len = frame.len();
+        frame.resize(escape.longest(len), 0);
+        let len = escape.stuff(len, &mut frame)?;
+        frame.truncate(len);
+    }
+    Some(frame)
+}
