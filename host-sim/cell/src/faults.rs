@@ -162,9 +162,9 @@ impl Cell {
         self.lines[line.0].connected = false;
     }
 
-    /// The line is connected again.
+    /// The line is connected again, unless its adapter is pulled out.
     pub fn repair(&mut self, line: LineId) {
-        self.lines[line.0].connected = true;
+        self.lines[line.0].connected = self.lines[line.0].is_plugged;
     }
 
     /// The port's adapter is pulled out: its owner is told.
@@ -177,8 +177,8 @@ impl Cell {
 
     /// The adapter is back.
     pub fn plug_in(&mut self, line: LineId) {
-        self.repair(line);
         self.lines[line.0].is_plugged = true;
+        self.repair(line);
         self.port_input(self.lines[line.0].owner, true);
     }
 

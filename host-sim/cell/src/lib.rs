@@ -40,6 +40,7 @@ mod oracle;
 mod queue;
 mod recording;
 mod rng;
+mod rtu;
 mod sleep;
 pub mod soak;
 mod spoil;

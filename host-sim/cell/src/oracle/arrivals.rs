@@ -91,7 +91,7 @@ impl Oracle {
 
 fn values_of(frame: &Frame, payload: &[u8]) -> Vec<(SysVar, Raw)> {
     let mut rest = payload;
-    let vars = frame.fields.iter().filter_map(written);
+    let vars = frame.fields.iter().flat_map(written);
     let values = vars.map(|var| {
         let (bytes, after) = rest.split_at(var.size());
         rest = after;

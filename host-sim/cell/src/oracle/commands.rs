@@ -44,6 +44,8 @@ pub(super) struct Commands {
     overtaken: usize,
     /// The value in the previous frame.
     base: BTreeMap<Place, i64>,
+    /// The fields that had a base when the gateway slept, and no frame since: what changed them may be discarded.
+    woke: BTreeSet<Place>,
     /// The fields whose base survives silence.
     kept: BTreeSet<Place>,
     /// By port.
@@ -87,7 +89,7 @@ impl Commands {
         let mut urgent = Vec::new();
         for &(field, table, when, value) in &frame.commands {
             let place = (nth, frame.frame, field);
-            let before = self.base.insert(place, value);
+            let (before, woke) = (self.base.insert(place, value), self.woke.remove(&place));
             let changed = before.is_some_and(|before| before != value);
             if changed {
                 self.no_longer_asked(place, now);
@@ -109,12 +111,13 @@ impl Commands {
             if entry.text.is_empty() {
                 continue;
             }
-            if !acts {
+            let text = plain(entry.text_for(value).as_bytes());
+            let is_held_stop = woke && is_urgent(&text);
+            if !acts && !is_held_stop {
                 counted.based += 1;
                 continue;
             }
             counted.picked += 1;
-            let text = plain(entry.text_for(value).as_bytes());
             let command = Command { place, value, text, picked: now, since: now, sent: Instant::ZERO };
             if command.is_urgent() {
                 urgent.push(command.clone());
@@ -145,6 +148,9 @@ impl Commands {
     /// A device's frame is overdue, or without `frame` the device is gone: its next value only sets
     /// the base, and its waiting commands are dropped. Silence is normal for fields that keep it.
     pub(super) fn forget(&mut self, nth: usize, frame: Option<usize>, now: Instant) {
+        if frame.is_none() {
+            self.woke.retain(|place| place.0 != nth);
+        }
         let is_of = |place: &Place| place.0 == nth && frame.is_none_or(|frame| frame == place.1);
         let keeps = |place: &Place| frame.is_some() && self.kept.contains(place);
         let gone = self.base.keys().copied().filter(|place| is_of(place) && !keeps(place));
@@ -210,7 +216,7 @@ impl Commands {
 
     /// The gateway slept: commands picked before are dropped.
     pub(super) fn slept(&mut self, now: Instant) {
-        self.base.clear();
+        self.woke.extend(std::mem::take(&mut self.base).into_keys());
         self.lost(LinkId::COMMAND, now);
         self.lost(LinkId::URGENT, now);
         for stop in std::mem::take(&mut self.urgent) {

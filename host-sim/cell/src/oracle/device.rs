@@ -1,15 +1,16 @@
 //! Frames of devices: a plain implementation of docs/configuration.md section 4, for frames whose fields
-//! always have the same length.
+//! always have the same length. What varies is laid out by [`varying`].
 //!
 //! Written from that page, independent of the engine's layouts and encodings.
 
 use std::ops::Range;
 
-use proto_core::config::{FieldSpec, GatewayConfig, OutputBinding, Parts};
-use proto_core::device::{Algorithm, Boundary, ByteOrder, Checksum, Crc, Encoding, Kind, Overflow, Width};
+use proto_core::config::{FieldSpec, GatewayConfig, Limits, OutputBinding, Outside};
+use proto_core::device::{Algorithm, ByteOrder, Checksum, Crc, Encoding, Kind, Overflow, TextWidth, Width};
 use proto_core::wire::scalar::ScalarType;
 
 use super::spec::Frame;
+use super::varying;
 
 /// The places of a frame's fields.
 #[derive(Debug, Clone, Default)]
@@ -61,6 +62,12 @@ impl DeviceSpec {
                 FieldSpec::Padding { len, .. } => (usize::from(*len), false),
                 FieldSpec::Checksum(sum) => (sum_bytes(sum), false),
                 FieldSpec::System(var) => (var.size(), false),
+                // Nothing of it is in the frame.
+                FieldSpec::Limits(_) | FieldSpec::Mapped(_) => (0, true),
+                FieldSpec::TextInput { text, .. } | FieldSpec::TextOutput { text, .. } => match text.width {
+                    TextWidth::Fixed(width) => (usize::from(width), false),
+                    _ => panic!("{field:?} varies"),
+                },
                 other => panic!("{other:?} has no model"),
             };
             if !is_shared {
@@ -75,6 +82,11 @@ impl DeviceSpec {
         }
         spec.len = at - head;
         spec
+    }
+
+    /// Its checksum stands there and covers these bytes.
+    pub(super) fn set_sum(&mut self, sum: Checksum, place: Range<usize>, covered: Range<usize>) {
+        self.sum = Some((sum, place, covered));
     }
 
     /// What a whole frame with the right head, tail and length is.
@@ -118,6 +130,9 @@ impl DeviceSpec {
 
 /// What bytes of a line are, seen as this frame.
 pub(super) fn look(frame: &Frame, bytes: &[u8]) -> Look {
+    if frame.varies {
+        return varying::look(frame, bytes);
+    }
     let seen = bytes.len().min(frame.head.len());
     if bytes[..seen] != frame.head[..seen] {
         return Look::No;
@@ -169,7 +184,7 @@ fn constant(field: &FieldSpec) -> Option<(Encoding, f64)> {
     Some((encoding, shown_as(&encoding, overflow, number)))
 }
 
-fn sum_bytes(sum: &Checksum) -> usize {
+pub(super) fn sum_bytes(sum: &Checksum) -> usize {
     let bytes = match sum.algorithm {
         Algorithm::Crc(crc) => usize::from(crc.width).div_ceil(8),
         Algorithm::Sum16 => 2,
@@ -215,25 +230,45 @@ pub(crate) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
     if let Some(reason) = super::talk::spec::unmodelled(config) {
         return Some(reason);
     }
-    let varies = config.fields.iter().any(|field| match field {
-        FieldSpec::TextInput { .. } | FieldSpec::TextOutput { .. } | FieldSpec::Length(_) => true,
-        _ => field.element().and_then(|element| element.encoding()).is_some_and(|it| it.size().is_none()),
-    });
-    let is_cut = config.recipes.iter().any(|recipe| match &recipe.parts {
-        Parts::Stream { input, output } => [input, output]
-            .into_iter()
-            .flatten()
-            .any(|part| part.framing != Boundary::Fields || part.escape.is_some()),
-        Parts::Can { .. } => false,
-    });
-    if varies || is_cut {
-        return Some("a soak cannot judge texts and frames of varying length");
+    if let Some(reason) = varying::unmodelled(config) {
+        return Some(reason);
     }
     super::bits::unmodelled(config)
 }
 
+/// The number that a field sends for one of its source, by what stands behind the field; `None` if nothing is
+/// sent.
+pub(super) fn sent_for(encoding: &Encoding, number: f64, behind: &[FieldSpec]) -> Option<f64> {
+    let is_whole = encoding.is_integer();
+    match behind.first() {
+        Some(FieldSpec::Limits(Limits { low, high, outside })) => {
+            // Compared as the field shows it, which a float does to seven digits.
+            let shown = if is_whole { number.round() } else { f64::from(number as f32) };
+            let ends = [*low, *high].map(|end| if is_whole { end } else { f64::from(end as f32) });
+            let is_outside = shown < ends[0] || shown > ends[1];
+            (!is_outside || *outside == Outside::Clamp).then(|| number.clamp(*low, *high))
+        }
+        Some(FieldSpec::Mapped(_)) => behind.iter().find_map(|field| match field {
+            FieldSpec::Mapped(entry) => {
+                let own = entry.first as f64..=entry.last as f64;
+                own.contains(&number.round()).then_some(entry.sent)
+            }
+            _ => None,
+        }),
+        _ => Some(number),
+    }
+}
+
+/// What stands behind a field.
+pub(super) fn behind(fields: &[FieldSpec], nth: usize) -> &[FieldSpec] {
+    let rest = &fields[nth + 1..];
+    let len =
+        rest.iter().take_while(|field| matches!(field, FieldSpec::Limits(_) | FieldSpec::Mapped(_))).count();
+    &rest[..len]
+}
+
 /// Number of bytes of a field. Fields of varying length are refused before a run.
-fn length(encoding: &Encoding) -> usize {
+pub(super) fn length(encoding: &Encoding) -> usize {
     match encoding.kind {
         Kind::Scalar(ty) => ty.size(),
         Kind::Uint24 | Kind::Int24 => 3,

@@ -11,6 +11,7 @@ use super::device;
 use super::field::as_number;
 use super::spec::{Frame, Origin, PortSpec, Spec, shown};
 use super::upward::{Upward, Wrong};
+use super::varying;
 
 /// The model of one port's transmissions.
 #[derive(Debug, Clone, Default)]
@@ -130,7 +131,7 @@ impl Downward {
             SendOn::Rising { var, .. } => Some(var),
             _ => None,
         };
-        let fields = port.outputs.iter().flat_map(|frame| &frame.fields).filter_map(shown);
+        let fields = port.outputs.iter().flat_map(|frame| &frame.fields).flat_map(shown);
         self.may_show_all(spec, port, up, fields.chain(trigger), now)
     }
 
@@ -242,6 +243,14 @@ impl Downward {
             self.stale = self.stale.wrapping_add(1);
             return Ok(());
         }
+        let texts = port.outputs.iter().flat_map(|frame| &frame.fields);
+        let fits = texts.filter(|field| is_text(field)).all(|field| text_of(field, up).is_some());
+        if !fits || !port.outputs.iter().all(|frame| self.may_send_values(frame, up)) {
+            // A text that does not fit is not sent, nor is a number that its field may not send.
+            self.due = false;
+            self.stale = self.stale.wrapping_add(1);
+            return Ok(());
+        }
         if port.send == SendOn::Change
             && self.newest.as_ref().is_some_and(|newest| self.is_same(port, up, newest))
         {
@@ -254,7 +263,9 @@ impl Downward {
     fn is_same(&self, port: &PortSpec, up: &Upward, newest: &[u8]) -> bool {
         let mut rest = newest;
         port.outputs.iter().all(|frame| {
-            let Some((part, after)) = rest.split_at_checked(frame.payload) else { return false };
+            // A frame of varying length is the only one of its port.
+            let len = if frame.varies { rest.len() } else { frame.payload };
+            let Some((part, after)) = rest.split_at_checked(len) else { return false };
             rest = after;
             self.agrees(frame, up, part)
         })
@@ -264,12 +275,16 @@ impl Downward {
     pub(super) fn agrees(&self, frame: &Frame, up: &Upward, payload: &[u8]) -> bool {
         if let Some(device) = &frame.device {
             let whole = [&frame.head[..], payload, &frame.tail].concat();
+            let laid_out = if frame.varies { varying::lay_out(frame, &whole).ok() } else { None };
+            if frame.varies && laid_out.is_none() {
+                return false;
+            }
+            let device = laid_out.as_ref().unwrap_or(device);
             return device.sum_is_right(&whole) != Some(false)
-                && frame
-                    .fields
-                    .iter()
-                    .zip(&device.places)
-                    .all(|(field, place)| self.device_field_agrees(field, up, &whole[place.clone()]));
+                && frame.fields.iter().zip(&device.places).enumerate().all(|(nth, (field, place))| {
+                    let behind = device::behind(&frame.fields, nth);
+                    self.device_field_agrees(field, behind, up, &whole[place.clone()])
+                });
         }
         let mut rest = payload;
         frame.fields.iter().all(|field| {
@@ -292,7 +307,11 @@ impl Downward {
                 (
                     None,
                     FieldSpec::UserOutput {
-                        from: OutputBinding::Reply | OutputBinding::State { .. } | OutputBinding::Port { .. },
+                        from:
+                            OutputBinding::Reply
+                            | OutputBinding::State { .. }
+                            | OutputBinding::Port { .. }
+                            | OutputBinding::Link { .. },
                         ..
                     },
                 ) => true,
@@ -305,7 +324,7 @@ impl Downward {
     pub(super) fn made(&self, frame: &Frame, up: &Upward) -> Option<Vec<u8>> {
         let mut bytes = vec![0; frame.payload];
         let places = frame.device.iter().flat_map(|device| &device.places);
-        for (field, place) in frame.fields.iter().zip(places) {
+        for (nth, (field, place)) in frame.fields.iter().zip(places).enumerate() {
             let bytes = &mut bytes[place.clone()];
             let (encoding, overflow, from) = match *field {
                 FieldSpec::DeviceOutput { encoding, overflow, from } => (encoding, overflow, from),
@@ -314,9 +333,11 @@ impl Downward {
                     bytes.fill(fill);
                     continue;
                 }
+                FieldSpec::Limits(_) | FieldSpec::Mapped(_) => continue,
                 _ => return None,
             };
             let number = self.device_number(&encoding, up, from)?;
+            let number = device::sent_for(&encoding, number, device::behind(&frame.fields, nth))?;
             device::write(&encoding, device::shown_as(&encoding, overflow, number), bytes);
         }
         Some(bytes)
@@ -332,7 +353,27 @@ impl Downward {
         }
     }
 
-    fn device_field_agrees(&self, field: &FieldSpec, up: &Upward, bytes: &[u8]) -> bool {
+    /// Whether each field may send its present value.
+    fn may_send_values(&self, frame: &Frame, up: &Upward) -> bool {
+        frame.fields.iter().enumerate().all(|(nth, field)| {
+            let (encoding, from) = match *field {
+                FieldSpec::DeviceOutput { encoding, from, .. } => (encoding, from),
+                FieldSpec::UserOutput { ty, from } => (Encoding::scalar(ty), from),
+                _ => return true,
+            };
+            let behind = device::behind(&frame.fields, nth);
+            let number = if behind.is_empty() { None } else { self.device_number(&encoding, up, from) };
+            number.is_none_or(|number| device::sent_for(&encoding, number, behind).is_some())
+        })
+    }
+
+    fn device_field_agrees(
+        &self,
+        field: &FieldSpec,
+        behind: &[FieldSpec],
+        up: &Upward,
+        bytes: &[u8],
+    ) -> bool {
         let (encoding, overflow, from) = match *field {
             FieldSpec::DeviceOutput { encoding, overflow, from } => (encoding, overflow, from),
             FieldSpec::UserOutput { ty, from } => (Encoding::scalar(ty), Overflow::Usual, from),
@@ -340,14 +381,20 @@ impl Downward {
                 return device::read(&encoding, bytes) == Some(value as f64);
             }
             FieldSpec::Padding { fill, .. } => return bytes.iter().all(|&byte| byte == fill),
-            FieldSpec::Checksum(_) => return true,
+            FieldSpec::Checksum(_) | FieldSpec::Length(_) | FieldSpec::Limits(_) | FieldSpec::Mapped(_) => {
+                return true;
+            }
+            FieldSpec::TextOutput { .. } => return text_of(field, up).is_some_and(|text| text == bytes),
             _ => return false,
         };
         // Reply codes are not modelled.
         if from == OutputBinding::Reply {
             return true;
         }
-        let Some(number) = self.device_number(&encoding, up, from) else { return false };
+        let number = self.device_number(&encoding, up, from);
+        let Some(number) = number.and_then(|number| device::sent_for(&encoding, number, behind)) else {
+            return false;
+        };
         device::read(&encoding, bytes) == Some(device::shown_as(&encoding, overflow, number))
     }
 
@@ -370,7 +417,10 @@ impl Downward {
                 ScalarType::Dword | ScalarType::Double => f64::from(self.cycles),
             }),
             OutputBinding::CounterTo { max } => Some((u64::from(self.cycles) % (u64::from(max) + 1)) as f64),
-            OutputBinding::Reply | OutputBinding::State { .. } | OutputBinding::Port { .. } => None,
+            OutputBinding::Reply
+            | OutputBinding::State { .. }
+            | OutputBinding::Port { .. }
+            | OutputBinding::Link { .. } => None,
         }
     }
 }
@@ -399,4 +449,18 @@ fn field_bytes(ty: ScalarType, number: f64) -> [u8; 8] {
         ScalarType::Double => bytes = number.clamp(f64::MIN, f64::MAX).to_le_bytes(),
     }
     bytes
+}
+
+fn is_text(field: &FieldSpec) -> bool {
+    matches!(field, FieldSpec::TextOutput { .. })
+}
+
+/// The bytes of a text field with the present values; `None` if they do not fit.
+fn text_of(field: &FieldSpec, up: &Upward) -> Option<Vec<u8>> {
+    let FieldSpec::TextOutput { text, from, length_from } = field else { return None };
+    let len = match length_from {
+        Some(var) => Some(as_number(*var, raw_of(up, *var)?) as usize),
+        None => None,
+    };
+    varying::field_of(*text, &varying::text_of(*from, |var| raw_of(up, var), len)?)
 }

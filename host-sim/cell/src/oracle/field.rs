@@ -2,9 +2,10 @@
 //! proto-core/docs/wire/recipes.md sections 4, 6 and 7.
 
 use std::collections::BTreeMap;
+use std::ops::Range;
 
 use proto_core::config::{CommandWhen, FieldSpec, InputBinding, Span};
-use proto_core::device::{Encoding, Overflow};
+use proto_core::device::{Boundary, Encoding, Overflow};
 use proto_core::recipe::model::Mode;
 use proto_core::sysvar::SysVar;
 use proto_core::time::Instant;
@@ -12,8 +13,9 @@ use proto_core::wire::can::CanFrame;
 use proto_core::wire::scalar::{Scalar, ScalarType};
 
 use super::bits::Coils;
-use super::device::{self, Look, Seen};
+use super::device::{self, DeviceSpec, Look, Seen};
 use super::spec::{Frame, PortSpec, Raw};
+use super::varying::{self, CutWatch};
 
 /// Whether a frame is accepted.
 #[derive(Debug, Clone, PartialEq)]
@@ -29,6 +31,10 @@ pub(super) enum Verdict {
     OtherDevice,
     /// The alive counter is that of the frame before.
     Repeated,
+    /// No frame has the length of what came between two ends.
+    WrongLength,
+    /// A text of the port's frame with this index says that there is nothing to say.
+    Ignored(usize),
 }
 
 /// An accepted frame.
@@ -48,6 +54,8 @@ pub(super) struct Accepted {
     pub counts: Vec<((usize, usize), u32)>,
     /// How many of them are not the next one.
     pub jumps: u32,
+    /// Variables that become the number of accepted frames.
+    pub counted: Vec<SysVar>,
 }
 
 /// The newest alive counters by frame and field.
@@ -74,6 +82,8 @@ pub(super) struct LineWatch {
     pub missing: Missing,
     /// The alive counters of the accepted frames.
     pub counts: Counts,
+    /// Of frames that end with a tail or with silence.
+    pub cut: CutWatch,
 }
 
 /// At first, and after silence, a frame is expected to begin at once.
@@ -89,8 +99,16 @@ impl Default for Missing {
 impl LineWatch {
     /// Discards a partial frame after the idle gap.
     pub(super) fn tick(&mut self, port: &PortSpec, now: Instant) {
-        if !self.held.is_empty() && now >= self.heard + port.idle_gap {
+        if port.framing == Boundary::Fields && !self.held.is_empty() && now >= self.heard + port.idle_gap {
             self.discard();
+        }
+    }
+
+    /// What has begun on the port's line is not continued.
+    pub(super) fn discard_of(&mut self, port: &PortSpec) {
+        match port.framing {
+            Boundary::Fields => self.discard(),
+            Boundary::Tail | Boundary::Silence => self.cut_off(),
         }
     }
 
@@ -102,8 +120,13 @@ impl LineWatch {
 
     /// Receives bytes; returns the frames that they complete.
     pub(super) fn bytes(&mut self, port: &PortSpec, bytes: &[u8], now: Instant) -> Vec<Verdict> {
+        let is_late = now >= self.heard + port.idle_gap;
         self.heard = now;
         let Some(frame) = port.inputs.first() else { return Vec::new() };
+        if port.framing != Boundary::Fields {
+            let pieces = self.cut_bytes(port.framing, &frame.tail, bytes, is_late);
+            return pieces.into_iter().filter_map(|piece| self.judge_piece(port, &piece)).collect();
+        }
         self.held.extend_from_slice(bytes);
         if frame.device.is_some() {
             return self.cut_device(frame);
@@ -118,15 +141,15 @@ impl LineWatch {
         self.missing.0 = self.missing.0.and_then(|missing| missing.checked_sub(1));
     }
 
-    /// Drops the first byte of a frame of `len` bytes with a wrong checksum; returns whether a frame was
-    /// expected there.
-    pub(super) fn drop_wrong(&mut self, len: usize) -> bool {
-        let is_expected = self.missing.0 == Some(0);
-        if is_expected {
+    /// Drops the first byte of a frame of `len` bytes with a wrong checksum; returns whether it counts. A reply
+    /// counts where one was expected, any other frame where it is not within one that has been counted.
+    pub(super) fn drop_wrong(&mut self, len: usize, is_reply: bool) -> bool {
+        let counts = self.missing.0.map_or(!is_reply, |missing| missing == 0);
+        if counts {
             self.missing.0 = Some(len);
         }
         self.drop_one();
-        is_expected
+        counts
     }
 
     /// Takes a frame of `len` bytes.
@@ -166,7 +189,7 @@ impl LineWatch {
                 Look::Begins { .. } => break,
                 Look::No => self.drop_one(),
                 Look::Wrong(len) => {
-                    if self.drop_wrong(len) {
+                    if self.drop_wrong(len, false) {
                         found.push(Verdict::WrongChecksum);
                     }
                 }
@@ -247,10 +270,16 @@ pub(super) fn can_of<'f>(
 /// The fields are judged one after the other: the first that cannot be used rejects the frame.
 fn judge_device(frame: &Frame, nth: usize, whole: &[u8], counts: &Counts) -> Verdict {
     let mut accepted = Accepted { frame: nth, ..Accepted::default() };
-    let places = frame.device.iter().flat_map(|device| &device.places);
+    let laid_out = if frame.varies { varying::lay_out(frame, whole).ok() } else { frame.device.clone() };
+    let Some(DeviceSpec { places, .. }) = laid_out else { return Verdict::Unreadable };
+    if texts(frame, &places, whole).any(|(field, text)| {
+        matches!(field, FieldSpec::TextInput { ignored, .. } if ignored.iter().any(|own| own == text))
+    }) {
+        return Verdict::Ignored(nth);
+    }
     // Command fields are counted without the checksum, as they are no elements of it.
     let mut element = 0;
-    for (field, place) in frame.fields.iter().zip(places) {
+    for (field, place) in frame.fields.iter().zip(&places) {
         let at = element;
         element += usize::from(!matches!(field, FieldSpec::Checksum(_)));
         let (encoding, overflow, to) = match *field {
@@ -294,7 +323,29 @@ fn judge_device(frame: &Frame, nth: usize, whole: &[u8], counts: &Counts) -> Ver
             InputBinding::Unused => {}
         }
     }
+    for (field, text) in texts(frame, &places, whole) {
+        let FieldSpec::TextInput { to, length_to, count_to, .. } = *field else { continue };
+        if let Some(words) = to {
+            let Some(values) = varying::registers(words, text) else { return Verdict::OutOfRange };
+            accepted.values.extend(values);
+        }
+        let length = length_to.and_then(|var| Some((var, bound(var, text.len() as f64)?)));
+        accepted.values.extend(length);
+        accepted.counted.extend(count_to);
+    }
     Verdict::Accepted(accepted)
+}
+
+/// The texts of an input frame, without what fills them up.
+fn texts<'f>(
+    frame: &'f Frame,
+    places: &'f [Range<usize>],
+    whole: &'f [u8],
+) -> impl Iterator<Item = (&'f FieldSpec, &'f [u8])> {
+    frame.fields.iter().zip(places).filter_map(|(field, place)| match field {
+        FieldSpec::TextInput { text, .. } => Some((field, varying::text_in(*text, &whole[place.clone()]))),
+        _ => None,
+    })
 }
 
 fn judge(mode: Mode, frame: &Frame, nth: usize, payload: &[u8]) -> Verdict {
@@ -349,7 +400,7 @@ fn coil(var: SysVar, bit: u8, number: f64) -> Coils {
 }
 
 /// A number as a value of a variable, rounded half away from zero; `None` if it does not fit (D22).
-fn bound(var: SysVar, value: f64) -> Option<Raw> {
+pub(super) fn bound(var: SysVar, value: f64) -> Option<Raw> {
     let mut raw = Raw::default();
     match var.ty() {
         ScalarType::Float => {

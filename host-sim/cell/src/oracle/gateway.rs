@@ -1,16 +1,14 @@
-//! The gateway's side: what each input of the engine must lead to, and checks of its outputs.
+//! The gateway's side: what each input of the engine must lead to, and checks of what its field ports send.
 
+use proto_core::device::Boundary;
 use proto_core::engine::{Engine, LinkId, PortId};
 use proto_core::link::LinkState;
-use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::can::{CanFrame, CanId};
 
-use super::bits::Coils;
 use super::field::{self, Accepted, LineWatch, Refused, Verdict};
-use super::spec::{Origin, Owned, Raw, shown, written};
-use super::upward::{Wrong, is_gap};
-use super::wire::{Asked, Safe};
+use super::upward::Wrong;
+use super::wire::Safe;
 use super::{Invariant, LinkWatch, Oracle, PortWatch, place};
 
 /// What a field port hands over.
@@ -23,8 +21,8 @@ pub(super) struct Leaving<'a> {
 }
 
 impl Oracle {
-    /// Handles deadlines that have passed.
-    pub(super) fn pass(&mut self, now: Instant) {
+    /// Handles deadlines that have passed; `is_deaf` says that what waited is not read.
+    pub(super) fn pass(&mut self, is_deaf: bool, now: Instant) {
         let overdue = self.up.overdue(&self.spec, now);
         for &(nth, frame) in &overdue {
             self.forget_commands(nth, Some(frame), now);
@@ -36,6 +34,9 @@ impl Oracle {
         for (watch, port) in self.ports.iter_mut().zip(&self.spec.ports) {
             watch.line.tick(port, now);
             watch.down.tick(port, now);
+        }
+        for nth in 0..self.ports.len() {
+            self.line_silent(nth, is_deaf, now);
         }
         for nth in 0..self.ports.len() {
             self.talk_tick(nth, now);
@@ -53,8 +54,7 @@ impl Oracle {
     pub(super) fn slept(&mut self, now: Instant) {
         for (watch, port) in self.ports.iter_mut().zip(&self.spec.ports) {
             watch.down.slept();
-            watch.line.discard();
-            watch.line.discarded += watch.served.discard();
+            watch.line.discard_of(port);
             if watch.talk.waits() && !port.is_can {
                 watch.down.sent();
             }
@@ -141,6 +141,7 @@ impl Oracle {
             watch.counters.asleep += 1;
             if !port.inputs.is_empty() {
                 watch.line.discarded += bytes.len() as u64;
+                watch.line.lose(port, bytes);
                 let mut apart = LineWatch { held: bytes.to_vec(), ..LineWatch::default() };
                 let verdicts = apart.bytes(port, &[], now);
                 self.waited_in_sleep(verdicts);
@@ -201,6 +202,28 @@ impl Oracle {
         self.talk_values_changed(now);
     }
 
+    /// Silence may have ended a frame, or cut one off.
+    fn line_silent(&mut self, nth: usize, is_deaf: bool, now: Instant) {
+        let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
+        let framing = port.framing;
+        let is_over = now >= watch.down.heard + port.idle_gap;
+        if framing == Boundary::Fields || !is_over || !watch.line.cut_has_begun(framing) {
+            return;
+        }
+        if framing == Boundary::Tail {
+            return watch.line.cut_off();
+        }
+        if is_deaf {
+            // Nobody knows how long it has waited.
+            watch.line.cut_off();
+            watch.down.heard = now;
+            return;
+        }
+        let piece = watch.line.cut_piece();
+        let verdict = watch.line.judge_piece(port, &piece);
+        self.take(nth, verdict.into_iter().collect(), now);
+    }
+
     /// Remembers discarded frames that had waited while the gateway slept.
     fn waited_in_sleep(&mut self, verdicts: Vec<Verdict>) {
         for verdict in verdicts {
@@ -215,11 +238,11 @@ impl Oracle {
 
     /// Applies frames that came in one piece.
     pub(super) fn take(&mut self, nth: usize, verdicts: Vec<Verdict>, now: Instant) {
-        let mut frames = 0;
+        let (mut frames, mut ignored) = (0, 0);
         let mut newest: Option<Accepted> = None;
         for verdict in verdicts {
             let counters = &mut self.ports[nth].counters;
-            let frame = match verdict {
+            let mut frame = match verdict {
                 Verdict::NotFinite => {
                     counters.rejected_not_finite += 1;
                     continue;
@@ -244,9 +267,23 @@ impl Oracle {
                     counters.rejected_counter += 1;
                     continue;
                 }
+                Verdict::WrongLength => {
+                    counters.rejected_length += 1;
+                    continue;
+                }
+                Verdict::Ignored(frame) => {
+                    counters.ignored += 1;
+                    self.up.not_overdue(&self.spec, nth, frame, now);
+                    frames += 1;
+                    ignored += 1;
+                    continue;
+                }
                 Verdict::Accepted(frame) => frame,
             };
             counters.frames_in += 1;
+            let number = f64::from(counters.frames_in as u16);
+            let counted = std::mem::take(&mut frame.counted).into_iter();
+            frame.values.extend(counted.filter_map(|var| Some((var, field::bound(var, number)?))));
             counters.masked += u32::from(frame.masked);
             counters.counter_jumps += frame.jumps;
             self.frames[nth].0 += 1;
@@ -266,9 +303,11 @@ impl Oracle {
                 self.after_frames(now);
             }
         }
+        if frames > 0 {
+            self.after_frames(now);
+            self.ports[nth].down.answered(&self.spec.ports[nth], frames);
+        }
         let Some(newest) = newest else { return };
-        self.after_frames(now);
-        self.ports[nth].down.answered(&self.spec.ports[nth], frames);
         let waits = self.spec.links.iter().any(|link| {
             let wants = newest.values.iter().any(|(var, _)| {
                 let way = self.spec.owned[var.ordinal()].map(|owned| owned.way);
@@ -277,7 +316,7 @@ impl Oracle {
             wants && self.up.is_up(link.id) && !self.up.is_ready(link, now)
         });
         if waits {
-            self.ports[nth].counters.withheld += frames;
+            self.ports[nth].counters.withheld += frames - ignored;
         }
     }
 
@@ -313,225 +352,6 @@ impl Oracle {
             Invariant::Line,
         ];
         self.judge(now, &invariants, result);
-    }
-
-    pub(super) fn link_bytes(&mut self, link: LinkId, bytes: &[u8], now: Instant) {
-        self.traffic[place(link)].1 += 1;
-        match link {
-            LinkId::MODBUS => {
-                let (read, refused) = self.modbus.received(&self.map, bytes);
-                for (var, raw) in read {
-                    if self.spec.origin[var.ordinal()] == Some(Origin::Modbus) {
-                        self.up.received(var, raw, now);
-                    }
-                }
-                self.up.doubt_by_witnesses(&self.spec, now);
-                if !refused.is_empty() {
-                    self.refused.extend(refused);
-                    self.rewrite_at = self.rewrite_at.min(now + REFUSED_PAUSE);
-                }
-                self.values_changed(now);
-            }
-            LinkId::STATE => {
-                self.links[place(link)].line.held.extend_from_slice(bytes);
-                while let Some(packet) = first_packet(&mut self.links[place(link)].line) {
-                    if self.links[place(link)].stream.takes(&packet) {
-                        self.up.state_packet(&self.spec, &packet, now);
-                        self.values_changed(now);
-                    }
-                }
-            }
-            LinkId::COMMAND | LinkId::URGENT => self.commands.hears(link, bytes),
-            _ => self.recipe_bytes(link, bytes, now),
-        }
-    }
-
-    pub(super) fn recipe_bytes(&mut self, link: LinkId, bytes: &[u8], now: Instant) {
-        let Some(spec) = self.spec.link(link) else { return };
-        let Some(frame) = spec.output.clone() else { return };
-        let found = if spec.is_datagram {
-            frame.payload_of(bytes).map(<[u8]>::to_vec).into_iter().collect()
-        } else {
-            let line = &mut self.links[place(link)].line;
-            line.held.extend_from_slice(bytes);
-            line.cut(&frame)
-        };
-        if found.is_empty() {
-            return;
-        }
-        let before = self.up.frame_at[place(link)].replace(now);
-        self.up.heard(now);
-        if before.is_some() && is_gap(before, now) {
-            self.up.controller_was_away(&self.spec, now);
-        }
-        for payload in found {
-            let mut values: Vec<(SysVar, Raw)> = Vec::new();
-            let mut rest = payload.as_slice();
-            for var in frame.fields.iter().filter_map(shown) {
-                let (bytes, after) = rest.split_at(var.size());
-                rest = after;
-                let mut raw = Raw::default();
-                raw[..bytes.len()].copy_from_slice(bytes);
-                if var.is_bits() {
-                    raw[0] &= var.valid_bits();
-                }
-                values.push((var, raw));
-            }
-            for (var, raw) in values {
-                self.up.received(var, raw, now);
-            }
-            self.up.doubt_by_witnesses(&self.spec, now);
-            self.values_changed(now);
-        }
-    }
-
-    pub(super) fn link_send(&mut self, link: LinkId, bytes: &[u8], now: Instant) -> Result<(), Wrong> {
-        if !self.up.is_up(link) {
-            return Err((Invariant::Line, "sent on a link that is not up".to_owned()));
-        }
-        match link {
-            LinkId::COMMAND | LinkId::URGENT => {
-                self.checks[Invariant::Once as usize] += 1;
-                let command = self.commands.sent(link, bytes, now)?;
-                self.robot.hands_over_command(command);
-                Ok(())
-            }
-            LinkId::STATE => Err((Invariant::Ownership, "sent on the state link".to_owned())),
-            LinkId::MODBUS => {
-                if std::mem::replace(&mut self.links[place(link)].busy, true) {
-                    return Err((
-                        Invariant::Line,
-                        "sent before the transport had taken the previous request".to_owned(),
-                    ));
-                }
-                let asked = self.modbus.sent(&self.map, bytes, now)?;
-                let mut safe = Safe::default();
-                match asked {
-                    Asked::Read { .. } => return Ok(()),
-                    Asked::Write(values) => {
-                        for (var, raw) in values {
-                            if self.up.known(var).safe {
-                                safe.vars.push(var);
-                            }
-                            self.wrote(link, var, raw, now)?;
-                        }
-                    }
-                    Asked::WriteBits(coils) => safe.bits = self.wrote_bits(coils, now)?,
-                }
-                self.modbus.carries_safe(safe);
-                Ok(())
-            }
-            _ => self.recipe_send(link, bytes, now),
-        }
-    }
-
-    pub(super) fn wrote(&mut self, link: LinkId, var: SysVar, raw: Raw, now: Instant) -> Result<(), Wrong> {
-        self.looks_at_write();
-        self.checks[Invariant::Edges as usize] += u64::from(var.is_bits());
-        let carried = self.up.wrote(&self.spec, link, var, raw, now)?;
-        self.robot.hands_over(var, raw, carried);
-        Ok(())
-    }
-
-    fn wrote_bits(&mut self, coils: Coils, now: Instant) -> Result<Vec<(usize, u8)>, Wrong> {
-        self.looks_at_write();
-        self.checks[Invariant::Edges as usize] += 1;
-        let (carried, safe) = self.up.wrote_bits(&self.spec, coils, now)?;
-        for carried in carried {
-            self.robot.hands_over(coils.var, [coils.on, 0, 0, 0], carried);
-        }
-        Ok(safe)
-    }
-
-    fn looks_at_write(&mut self) {
-        self.writes += 1;
-        let looked_at = [
-            Invariant::Sent,
-            Invariant::InTime,
-            Invariant::FirstFrame,
-            Invariant::Ownership,
-            Invariant::NoReplay,
-        ];
-        for invariant in looked_at {
-            self.checks[invariant as usize] += 1;
-        }
-    }
-
-    pub(super) fn recipe_send(&mut self, link: LinkId, bytes: &[u8], now: Instant) -> Result<(), Wrong> {
-        if std::mem::replace(&mut self.links[place(link)].busy, true) {
-            return Err((
-                Invariant::Line,
-                "sent before the transport had taken the previous frame".to_owned(),
-            ));
-        }
-        let spec = self.spec.link(link).cloned();
-        let found = spec.as_ref().and_then(|spec| {
-            let frame = spec.input.as_ref()?;
-            Some((spec, frame, frame.payload_of(bytes)?))
-        });
-        let Some((link_spec, frame, payload)) = found else {
-            // The greeting to the UDP server.
-            let is_greeting = link == LinkId::RECIPE_UDP && bytes.len() <= 2 && bytes.iter().all(|&b| b == 0);
-            let wrong = (Invariant::Sent, "sent data that is neither a frame nor a greeting".to_owned());
-            return if is_greeting { Ok(()) } else { Err(wrong) };
-        };
-        let mut rest = payload;
-        let mut wanted = false;
-        for var in frame.fields.iter().filter_map(written) {
-            let (bytes, after) = rest.split_at(var.size());
-            rest = after;
-            let mut raw = Raw::default();
-            raw[..bytes.len()].copy_from_slice(bytes);
-            let is_ours = self.spec.owned[var.ordinal()].is_some_and(|owned| owned.way == link);
-            if is_ours && !self.up.known(var).waiting.is_empty() {
-                wanted = true;
-                self.wrote(link, var, raw, now)?;
-            } else {
-                self.writes += 1;
-                self.checks[Invariant::Sent as usize] += 1;
-                self.checks[Invariant::InTime as usize] += 1;
-                let carried = self.up.carried(&self.spec, link_spec, (var, raw), now)?;
-                wanted |= is_ours && self.up.known(var).safe;
-                self.robot.hands_over(var, raw, carried);
-            }
-        }
-        if !wanted {
-            return Err((Invariant::Sent, "a frame although no value waited".to_owned()));
-        }
-        self.up.handed_over[place(link)] = Some((now, self.up.era));
-        self.up.sent_frame(&self.spec, link, now);
-        Ok(())
-    }
-
-    /// Checks that no value waits although it could be sent.
-    pub(super) fn nothing_waits(&mut self, now: Instant) -> Result<(), Wrong> {
-        let mut left = self.up.waits;
-        while left != 0 {
-            let nth = left.trailing_zeros() as usize;
-            left &= left - 1;
-            let Some(Owned { way, .. }) = self.spec.owned[nth] else { continue };
-            if self.up.known[nth].waiting.is_empty() {
-                self.up.waits &= !(1 << nth);
-                continue;
-            }
-            if !self.up.is_up(way) {
-                continue;
-            }
-            let is_free = match self.spec.link(way) {
-                None => self.modbus.is_free() && !self.links[place(way)].busy,
-                Some(link) => self.links[place(way)].has_room() && self.up.is_ready(link, now),
-            };
-            if is_free {
-                let var = SysVar::from_ordinal(nth).map_or_else(String::new, |var| var.to_string());
-                return Err((Invariant::Delivered, format!("{var} waits although its link is free")));
-            }
-        }
-        let is_free =
-            self.up.is_up(LinkId::MODBUS) && self.modbus.is_free() && !self.links[place(LinkId::MODBUS)].busy;
-        if let Some(var) = self.up.waiting_bits(&self.spec).filter(|_| is_free) {
-            return Err((Invariant::Delivered, format!("bits of {var} wait although Modbus is free")));
-        }
-        Ok(())
     }
 
     /// Compares the engine's counters with the model's.
@@ -577,12 +397,5 @@ impl Oracle {
     }
 }
 
-fn first_packet(line: &mut LineWatch) -> Option<Vec<u8>> {
-    (line.held.len() >= PACKET).then(|| line.held.drain(..PACKET).collect())
-}
-
-const PACKET: usize = 1_468;
 /// After sleep, the gateway discards input from the field for this long.
 const DISCARD_AFTER_SLEEP: Duration = Duration::from_millis(50);
-/// A safe value that the controller refused is repeated after this time.
-const REFUSED_PAUSE: Duration = Duration::from_millis(500);

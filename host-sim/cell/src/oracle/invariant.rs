@@ -78,6 +78,45 @@ pub enum Invariant {
 }
 
 impl Invariant {
+    /// All of them.
+    pub const ALL: [Self; 35] = [
+        Self::Sent,
+        Self::InTime,
+        Self::FirstFrame,
+        Self::Ownership,
+        Self::NoReplay,
+        Self::Edges,
+        Self::Delivered,
+        Self::Counted,
+        Self::Bytes,
+        Self::Once,
+        Self::Known,
+        Self::Age,
+        Self::Shown,
+        Self::Cycle,
+        Self::Line,
+        Self::Transport,
+        Self::Registers,
+        Self::ValueAge,
+        Self::CommandAge,
+        Self::Overtaken,
+        Self::Understood,
+        Self::StopArrives,
+        Self::SafeArrives,
+        Self::Unreadable,
+        Self::OwnAge,
+        Self::FalseTimeout,
+        Self::FromSleep,
+        Self::Destination,
+        Self::Work,
+        Self::Memory,
+        Self::Held,
+        Self::Carried,
+        Self::Periods,
+        Self::Told,
+        Self::NoPanic,
+    ];
+
     /// A short name.
     pub const fn name(self) -> &'static str {
         match self {
@@ -143,41 +182,3 @@ impl std::fmt::Display for Violation {
         write!(f, "{}: {}", self.invariant.name(), self.what)
     }
 }
-
-pub(super) const ALL: [Invariant; 35] = [
-    Invariant::Sent,
-    Invariant::InTime,
-    Invariant::FirstFrame,
-    Invariant::Ownership,
-    Invariant::NoReplay,
-    Invariant::Edges,
-    Invariant::Delivered,
-    Invariant::Counted,
-    Invariant::Bytes,
-    Invariant::Once,
-    Invariant::Known,
-    Invariant::Age,
-    Invariant::Shown,
-    Invariant::Cycle,
-    Invariant::Line,
-    Invariant::Transport,
-    Invariant::Registers,
-    Invariant::ValueAge,
-    Invariant::CommandAge,
-    Invariant::Overtaken,
-    Invariant::Understood,
-    Invariant::StopArrives,
-    Invariant::SafeArrives,
-    Invariant::Unreadable,
-    Invariant::OwnAge,
-    Invariant::FalseTimeout,
-    Invariant::FromSleep,
-    Invariant::Destination,
-    Invariant::Work,
-    Invariant::Memory,
-    Invariant::Held,
-    Invariant::Carried,
-    Invariant::Periods,
-    Invariant::Told,
-    Invariant::NoPanic,
-];

@@ -17,12 +17,14 @@ mod downward;
 mod field;
 mod gateway;
 mod invariant;
+mod links;
 mod robot;
 mod safe;
 mod spec;
 mod stream;
 mod talk;
 mod upward;
+mod varying;
 mod wire;
 
 use std::collections::{BTreeMap, VecDeque};
@@ -36,7 +38,6 @@ use commands::Commands;
 use downward::Downward;
 use field::LineWatch;
 use gateway::Leaving;
-use invariant::ALL;
 pub use invariant::{Invariant, Violation};
 pub(super) use robot::Path;
 use robot::Robot;
@@ -122,7 +123,7 @@ pub(super) struct Oracle {
     pub frames: Vec<(u64, u64)>,
     pub traffic: [(u64, u64); LINKS],
     pub writes: u64,
-    checks: [u64; ALL.len()],
+    checks: [u64; Invariant::ALL.len()],
     violation: Option<Violation>,
 }
 
@@ -158,7 +159,7 @@ impl Oracle {
             frames: vec![(0, 0); spec.ports.len()],
             traffic: [(0, 0); LINKS],
             writes: 0,
-            checks: [0; ALL.len()],
+            checks: [0; Invariant::ALL.len()],
             violation: None,
             spec,
         }
@@ -197,7 +198,7 @@ impl Oracle {
     }
 
     pub(super) fn checks(&self) -> BTreeMap<Invariant, u64> {
-        ALL.into_iter().zip(self.checks).collect()
+        Invariant::ALL.into_iter().zip(self.checks).collect()
     }
 
     fn judge(&mut self, now: Instant, invariants: &[Invariant], result: Result<(), Wrong>) {
@@ -233,7 +234,8 @@ impl Oracle {
             self.find_lost_links(engine, None, now);
         }
         if is_tick || has_slept {
-            self.pass(now);
+            let is_deaf = has_slept || self.discards_until.is_some_and(|until| now < until);
+            self.pass(is_deaf, now);
         }
         if has_slept {
             self.slept(now);
@@ -260,7 +262,7 @@ impl Oracle {
                 watch.counters.downs += u32::from(watch.down.is_up);
                 watch.down.is_up = false;
                 watch.down.reset();
-                watch.line.discard();
+                watch.line.discard_of(&self.spec.ports[nth]);
                 watch.line.discarded += watch.served.discard();
                 watch.talk.gone();
                 self.forget_commands(nth, None, now);
@@ -347,7 +349,7 @@ impl Oracle {
                 if !self.is_late {
                     let result = self.ports[nth].down.rest(&self.spec, nth, &self.up, now);
                     self.judge(now, &[Invariant::Cycle], result);
-                    let result = self.served_rests(nth, now);
+                    let result = self.served_rests(nth, now).and_then(|()| self.talk_rests(nth, now));
                     self.judge(now, &[], result);
                 }
                 let result = self.count(nth, engine);

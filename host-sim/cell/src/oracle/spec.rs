@@ -3,17 +3,23 @@
 //!
 //! Written from that page, independent of the engine's plan.
 
-use proto_core::config::{Bus, FieldSpec, GatewayConfig, InputBinding, OutputBinding, Parts, Recipe, SendOn};
+use proto_core::config::{
+    Bus, FieldSpec, GatewayConfig, InputBinding, OutputBinding, Parts, Recipe, SendOn, Words,
+};
+use proto_core::device::Boundary;
 use proto_core::engine::{LinkId, PortId};
 use proto_core::recipe::model::Mode;
 use proto_core::sysvar::{COUNT, Direction, ModbusPlace, SysVar};
 use proto_core::time::Duration;
 use proto_core::wire::can::CanId;
 
+use super::Invariant;
 use super::bits::{self, Share};
 use super::device::DeviceSpec;
 use super::talk::served::ServedSpec;
 use super::talk::spec::TalkSpec;
+use super::upward::Wrong;
+use super::varying;
 
 /// A value as on the wire; unused bytes are 0.
 pub(super) type Raw = [u8; 4];
@@ -49,6 +55,8 @@ pub(super) struct Frame {
     pub payload: usize,
     /// The places of the fields in a device's own frame.
     pub device: Option<DeviceSpec>,
+    /// The places of its fields are not the same in every frame.
+    pub varies: bool,
 }
 
 /// A field port.
@@ -66,6 +74,8 @@ pub(super) struct PortSpec {
     pub send: SendOn,
     pub idle_gap: Duration,
     pub turnaround: Duration,
+    /// What tells the frames of its input part apart.
+    pub framing: Boundary,
     /// What is asked of slaves or devices. The replies are behind the other inputs.
     pub talk: Option<TalkSpec>,
     /// What a master on a Modbus line may ask. What it writes is behind the other inputs.
@@ -75,7 +85,7 @@ pub(super) struct PortSpec {
 impl PortSpec {
     /// The variables that its frames show, and its requests.
     fn shown(&self) -> impl Iterator<Item = SysVar> {
-        let fields = self.outputs.iter().flat_map(|frame| &frame.fields).filter_map(shown);
+        let fields = self.outputs.iter().flat_map(|frame| &frame.fields).flat_map(shown);
         let rows = self.talk.iter().flat_map(|talk| &talk.rows);
         let asked = rows.flat_map(|row| row.shown().chain(row.rising.map(|(var, _)| var)));
         fields.chain(asked).chain(self.served.iter().flat_map(ServedSpec::shown))
@@ -157,7 +167,7 @@ impl Spec {
         let mut owned = [None; COUNT];
         for (nth, port) in ports.iter().enumerate().filter(|(_, port)| port.is_field) {
             for (frame, part) in port.inputs.iter().enumerate() {
-                for var in part.fields.iter().filter_map(written) {
+                for var in part.fields.iter().flat_map(written) {
                     let carries = |link: &&LinkSpec| link.input.as_ref().is_some_and(|up| up.has(var));
                     let way = links.iter().find(carries).map_or(LinkId::MODBUS, |link| link.id);
                     let safe = config.ports[nth].on_timeout.of(&config.safe_values);
@@ -173,7 +183,7 @@ impl Spec {
         let mut read_back = [false; COUNT];
         for link in &mut links {
             link.reads_back = !is_one_frame(&ports, &owned, link);
-            for var in link.input.iter().flat_map(|up| up.fields.iter().filter_map(written)) {
+            for var in link.input.iter().flat_map(|up| up.fields.iter().flat_map(written)) {
                 read_back[var.ordinal()] |= link.reads_back && var.stream().is_some();
             }
         }
@@ -233,6 +243,21 @@ impl Spec {
         }
     }
 
+    /// Checks that a write has all registers of each text that it has one of, and those that go with it.
+    pub(super) fn has_whole_texts(&self, values: &[(SysVar, Raw)]) -> Result<(), Wrong> {
+        let has = |var: SysVar| values.iter().any(|(own, _)| *own == var);
+        let fields = self.ports.iter().flat_map(|port| &port.inputs).flat_map(|frame| &frame.fields);
+        for field in fields.filter(|field| matches!(field, FieldSpec::TextInput { to: Some(_), .. })) {
+            let FieldSpec::TextInput { to: Some(words), .. } = field else { continue };
+            let there = words.iter().filter(|&var| has(var)).count();
+            if there != 0 && there != usize::from(words.count) {
+                let what = format!("{} alone of a text that begins at {}", there, words.first);
+                return Err((Invariant::Ownership, what));
+            }
+        }
+        Ok(())
+    }
+
     pub(super) fn link(&self, id: LinkId) -> Option<&LinkSpec> {
         self.links.iter().find(|link| link.id == id)
     }
@@ -249,40 +274,44 @@ impl Frame {
     }
 
     pub(super) fn has(&self, var: SysVar) -> bool {
-        self.fields.iter().any(|field| written(field) == Some(var))
+        self.fields.iter().flat_map(written).any(|own| own == var)
     }
 
     fn shows(&self, var: SysVar) -> bool {
-        self.fields.iter().any(|field| shown(field) == Some(var))
+        self.fields.iter().flat_map(shown).any(|own| own == var)
     }
 
     /// The fields' bytes; `None` if head, tail or length differ.
     pub(super) fn payload_of<'b>(&self, bytes: &'b [u8]) -> Option<&'b [u8]> {
         let rest = bytes.strip_prefix(self.head.as_slice())?.strip_suffix(self.tail.as_slice())?;
-        (rest.len() == self.payload).then_some(rest)
+        (self.varies || rest.len() == self.payload).then_some(rest)
     }
 }
 
-/// The variable that an input field writes.
-pub(super) fn written(field: &FieldSpec) -> Option<SysVar> {
-    match *field {
-        FieldSpec::System(var) => Some(var),
-        FieldSpec::UserInput { to: InputBinding::Variable { var, .. }, .. }
-        | FieldSpec::DeviceInput { to: InputBinding::Variable { var, .. }, .. } => Some(var),
-        _ => None,
-    }
+/// The variables that an input field writes: one, or those of a text.
+pub(super) fn written(field: &FieldSpec) -> impl Iterator<Item = SysVar> + use<> {
+    let (words, others) = match *field {
+        FieldSpec::System(var)
+        | FieldSpec::UserInput { to: InputBinding::Variable { var, .. }, .. }
+        | FieldSpec::DeviceInput { to: InputBinding::Variable { var, .. }, .. } => (None, [Some(var), None]),
+        FieldSpec::TextInput { to, length_to, count_to, .. } => (to, [length_to, count_to]),
+        _ => (None, [None, None]),
+    };
+    words.into_iter().flat_map(Words::iter).chain(others.into_iter().flatten())
 }
 
-/// The variable that an output field shows.
-pub(super) fn shown(field: &FieldSpec) -> Option<SysVar> {
-    match *field {
-        FieldSpec::System(var) => Some(var),
+/// The variables that an output field shows.
+pub(super) fn shown(field: &FieldSpec) -> impl Iterator<Item = SysVar> + use<> {
+    let (words, other) = match *field {
+        FieldSpec::System(var) => (None, Some(var)),
         FieldSpec::UserOutput { from, .. } | FieldSpec::DeviceOutput { from, .. } => match from {
-            OutputBinding::Variable { var, .. } | OutputBinding::Bit { var, .. } => Some(var),
-            _ => None,
+            OutputBinding::Variable { var, .. } | OutputBinding::Bit { var, .. } => (None, Some(var)),
+            _ => (None, None),
         },
-        _ => None,
-    }
+        FieldSpec::TextOutput { from, length_from, .. } => (Some(from), length_from),
+        _ => (None, None),
+    };
+    words.into_iter().flat_map(Words::iter).chain(other)
 }
 
 /// The size of a plain recipe's field.
@@ -303,14 +332,16 @@ pub(super) fn frame(head: &[u8], tail: &[u8], id: Option<CanId>, fields: &[Field
         return device_frame(head, tail, id, fields);
     }
     let payload = fields.iter().map(size).sum();
-    Frame { head: head.to_vec(), tail: tail.to_vec(), id, fields: fields.to_vec(), payload, device: None }
+    let (head, tail, fields) = (head.to_vec(), tail.to_vec(), fields.to_vec());
+    Frame { head, tail, id, fields, payload, device: None, varies: false }
 }
 
 /// A frame of a device's recipe, also one that a plain recipe could have.
 pub(super) fn device_frame(head: &[u8], tail: &[u8], id: Option<CanId>, fields: &[FieldSpec]) -> Frame {
-    let device = DeviceSpec::new(head.len(), fields);
+    let varies = fields.iter().any(varying::varies);
+    let device = if varies { DeviceSpec::default() } else { DeviceSpec::new(head.len(), fields) };
     let (head, tail, fields) = (head.to_vec(), tail.to_vec(), fields.to_vec());
-    Frame { head, tail, id, fields, payload: device.len, device: Some(device) }
+    Frame { head, tail, id, fields, payload: device.len, device: Some(device), varies }
 }
 
 fn frames(config: &GatewayConfig, recipe: &Recipe, direction: Direction) -> Vec<Frame> {
@@ -364,6 +395,10 @@ fn port_spec(config: &GatewayConfig, port: &proto_core::config::Port) -> PortSpe
         send: recipe.send,
         idle_gap,
         turnaround,
+        framing: match &recipe.parts {
+            Parts::Stream { input: Some(part), .. } => part.framing,
+            _ => Boundary::Fields,
+        },
         talk,
         served,
     }
@@ -379,7 +414,7 @@ fn link_spec(config: &GatewayConfig, id: LinkId, recipe: &Recipe, is_datagram: b
 /// none.
 fn is_one_frame(ports: &[PortSpec], owned: &[Option<Owned>; COUNT], link: &LinkSpec) -> bool {
     let Some(up) = &link.input else { return true };
-    let vars: Vec<SysVar> = up.fields.iter().filter_map(written).collect();
+    let vars: Vec<SysVar> = up.fields.iter().flat_map(written).collect();
     ports.iter().enumerate().filter(|(_, port)| port.is_field).any(|(nth, port)| {
         (0..port.inputs.len()).any(|frame| {
             let owners: Vec<_> = vars.iter().map(|var| owned[var.ordinal()]).collect();

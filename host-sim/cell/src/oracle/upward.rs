@@ -34,6 +34,8 @@ pub(super) struct Known {
     pub waiting: VecDeque<(Raw, Instant)>,
     /// When the newest field frame with it was accepted.
     pub accepted: Option<Instant>,
+    /// The same, or when a frame of its owner said that there is nothing to say.
+    pub heard: Option<Instant>,
     /// Its owner is not overdue, or it has its safe value.
     pub live: bool,
     /// It has its safe value.
@@ -169,7 +171,7 @@ impl Upward {
                 self.overdue[nth][frame] = None;
                 self.counted[nth].timeouts += 1;
                 overdue.push((nth, frame));
-                for var in part.fields.iter().filter_map(super::spec::written) {
+                for var in part.fields.iter().flat_map(super::spec::written) {
                     self.fell_silent(spec, var, now);
                 }
                 self.bits_silent(spec, nth, frame, now);
@@ -178,16 +180,16 @@ impl Upward {
         overdue
     }
 
-    /// Drops values of bits that waited too long.
+    /// Drops values that waited too long.
     pub(super) fn expire(&mut self, spec: &Spec, now: Instant) {
         if now < self.next_expiry {
             return;
         }
         self.next_expiry = Instant::NEVER;
         for (nth, port) in spec.ports.iter().enumerate().filter(|(_, port)| port.is_field) {
-            for var in port.inputs.iter().flat_map(|part| &part.fields).filter_map(super::spec::written) {
+            for var in port.inputs.iter().flat_map(|part| &part.fields).flat_map(super::spec::written) {
                 let known = &mut self.known[var.ordinal()];
-                if !var.is_bits() || known.safe {
+                if known.safe {
                     continue;
                 }
                 let before = known.waiting.len();
@@ -203,6 +205,9 @@ impl Upward {
 
     fn fell_silent(&mut self, spec: &Spec, var: SysVar, now: Instant) {
         let Some(Owned { port, safe, .. }) = spec.owned[var.ordinal()] else { return };
+        if self.known(var).accepted.is_none() {
+            return;
+        }
         self.waits |= 1 << var.ordinal();
         let known = self.known_mut(var);
         if let Some(safe) = safe {
@@ -223,6 +228,16 @@ impl Upward {
         }
     }
 
+    /// A frame came that says nothing: its device is there.
+    pub(super) fn not_overdue(&mut self, spec: &Spec, nth: usize, frame: usize, now: Instant) {
+        let at = now + spec.ports[nth].timeout;
+        self.overdue[nth][frame] = Some(at);
+        self.next_overdue = self.next_overdue.min(at);
+        for var in spec.ports[nth].inputs[frame].fields.iter().flat_map(super::spec::written) {
+            self.known_mut(var).heard = Some(now);
+        }
+    }
+
     /// Applies a frame.
     pub(super) fn accepted(&mut self, spec: &Spec, nth: usize, frame: &Accepted, now: Instant) {
         let timeout = spec.ports[nth].timeout;
@@ -237,7 +252,7 @@ impl Upward {
             let queued: usize = if var.is_bits() { self.queued(spec, nth) } else { 0 };
             let known = self.known_mut(var);
             known.value = Some((raw, now));
-            known.accepted = Some(now);
+            (known.accepted, known.heard) = (Some(now), Some(now));
             known.live = true;
             known.unconfirmed = false;
             known.unreadable = false;
@@ -273,7 +288,7 @@ impl Upward {
     /// Number of the port's values that wait behind others.
     pub(super) fn queued(&self, spec: &Spec, nth: usize) -> usize {
         let vars = spec.ports[nth].inputs.iter().flat_map(|part| &part.fields);
-        let waiting = vars.filter_map(super::spec::written).filter(|var| var.is_bits());
+        let waiting = vars.flat_map(super::spec::written).filter(|var| var.is_bits());
         let whole: usize = waiting.map(|var| self.known(var).waiting.len().saturating_sub(1)).sum();
         whole + self.queued_bits(spec, nth)
     }
@@ -472,7 +487,7 @@ impl Upward {
     /// Whether a recipe link's frame may be sent: each of its variables is known.
     pub(super) fn is_ready(&self, link: &LinkSpec, now: Instant) -> bool {
         let is_fresh = self.state_at.is_some_and(|at| now.saturating_since(at) <= READ_BACK);
-        let mut vars = link.input.iter().flat_map(|up| up.fields.iter().filter_map(super::spec::written));
+        let mut vars = link.input.iter().flat_map(|up| up.fields.iter().flat_map(super::spec::written));
         vars.all(|var| {
             let known = self.known(var);
             match var.stream() {

@@ -1,13 +1,14 @@
 //! Many runs on several threads; the results do not depend on the number of threads.
 
 use std::collections::BTreeMap;
+use std::ops::Range;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering::Relaxed};
 use std::sync::{Mutex, PoisonError};
 
 use proto_core::time::Duration;
 
-use super::{Level, Report, Scenario, Soak};
+use super::{Level, Report, Scenario, Share, Soak};
 use crate::{FaultKind, Invariant, Rng, Violation};
 
 /// Maximum length of one run.
@@ -21,7 +22,9 @@ pub struct Batch {
     seed: u64,
     span: Duration,
     run_length: Duration,
+    /// Number of runs of all shares.
     runs: usize,
+    share: Share,
     next: AtomicUsize,
     stop: AtomicBool,
     done: Mutex<BTreeMap<usize, Report>>,
@@ -70,7 +73,7 @@ pub struct Total {
     /// Frames in and out, by cell and port.
     pub ports: BTreeMap<(String, String), (u64, u64)>,
     /// Sent and received, by kind of link.
-    pub links: BTreeMap<&'static str, (u64, u64)>,
+    pub links: BTreeMap<String, (u64, u64)>,
     /// Entries of the traces.
     pub events: u64,
     /// Values written to the controller that were checked.
@@ -84,10 +87,7 @@ pub struct Total {
 impl Batch {
     /// `span` of virtual time in these cells, in turn.
     pub fn new(scenarios: Vec<Scenario>, level: Level, seed: u64, span: Duration) -> Self {
-        // Each cell gets a run, even if the span is short.
-        let share = span.as_micros().div_ceil(scenarios.len().max(1) as u64).max(1);
-        let run_length = RUN_LENGTH.min(Duration::from_micros(share));
-        let runs = span.as_micros().div_ceil(run_length.as_micros()) as usize;
+        let (run_length, runs) = split(span, scenarios.len());
         Self {
             scenarios,
             level,
@@ -95,6 +95,7 @@ impl Batch {
             span,
             run_length,
             runs,
+            share: Share::default(),
             next: AtomicUsize::new(0),
             stop: AtomicBool::new(false),
             done: Mutex::new(BTreeMap::new()),
@@ -103,9 +104,73 @@ impl Batch {
         }
     }
 
-    /// Number of runs.
+    /// Only the runs of one share.
+    #[must_use]
+    pub fn only(mut self, share: Share) -> Self {
+        self.share = share;
+        self.next = AtomicUsize::new(self.share_runs().start);
+        self
+    }
+
+    /// Number of runs of all shares.
     pub fn runs(&self) -> usize {
         self.runs
+    }
+
+    /// The runs of this share.
+    pub fn share_runs(&self) -> Range<usize> {
+        self.share.runs(self.runs)
+    }
+
+    /// The share.
+    pub fn share(&self) -> Share {
+        self.share
+    }
+
+    /// The level of faults.
+    pub fn level(&self) -> Level {
+        self.level
+    }
+
+    /// The seed of the batch.
+    pub fn seed(&self) -> u64 {
+        self.seed
+    }
+
+    /// Virtual time of all shares.
+    pub fn whole_span(&self) -> Duration {
+        self.span
+    }
+
+    /// Virtual time of this share.
+    pub fn span(&self) -> Duration {
+        let runs = self.share_runs();
+        self.between(runs)
+    }
+
+    /// The digests of this share's runs, in their order; `None` for a run that is not finished.
+    pub fn digests(&self) -> impl Iterator<Item = Option<u64>> {
+        let done = self.done.lock().unwrap_or_else(PoisonError::into_inner);
+        let digests: Vec<_> =
+            self.share_runs().map(|run| done.get(&run).map(|report| report.digest)).collect();
+        digests.into_iter()
+    }
+
+    /// The cells' names, with a hash of each one's configuration and of the first moments of its first run:
+    /// the same on two machines that would run the batch alike.
+    pub fn fingerprints(&self) -> Vec<(String, u64)> {
+        let first_moments = |nth: usize, scenario: &Scenario| {
+            let mut soak = Soak::new(scenario, self.seed_of(nth), self.level).ok()?;
+            soak.run_to(SAMPLE);
+            Some(soak.report().digest)
+        };
+        let of = |(nth, scenario): (usize, &Scenario)| {
+            // A panic is reported where that run is part of a share.
+            let sample = catch_unwind(AssertUnwindSafe(|| first_moments(nth, scenario))).ok().flatten();
+            let words = [scenario.hash(), sample.unwrap_or(0)];
+            (scenario.name.clone(), words.into_iter().fold(0, mix))
+        };
+        self.scenarios.iter().enumerate().map(of).collect()
     }
 
     /// The seed of a run; its remainder determines the cell.
@@ -127,7 +192,7 @@ impl Batch {
     pub fn work(&self) {
         while !self.stop.load(Relaxed) {
             let run = self.next.fetch_add(1, Relaxed);
-            if run >= self.runs {
+            if run >= self.share_runs().end {
                 return;
             }
             self.carry_out(run);
@@ -153,7 +218,7 @@ impl Batch {
     /// The sums so far.
     pub fn total(&self) -> Total {
         let done = self.done.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut total = Total { of: self.runs, ..Total::default() };
+        let mut total = Total { of: self.share_runs().len(), ..Total::default() };
         for (&run, report) in done.iter() {
             let cell = Self::scenario_of(&self.scenarios, self.seed_of(run)).map_or("", |cell| &cell.name);
             total.add(run, cell, report);
@@ -164,8 +229,7 @@ impl Batch {
     fn carry_out(&self, run: usize) {
         let seed = self.seed_of(run);
         let Some(scenario) = Self::scenario_of(&self.scenarios, seed) else { return };
-        let begins = self.run_length.saturating_mul(run as u64);
-        let length = Duration::from_micros(self.span.as_micros() - begins.as_micros()).min(self.run_length);
+        let length = self.between(run..run + 1);
         let mut soak = match Soak::new(scenario, seed, self.level) {
             Ok(soak) => soak,
             // The caller has made each cell once before.
@@ -201,6 +265,12 @@ impl Batch {
         }
     }
 
+    /// Virtual time of some runs.
+    fn between(&self, runs: Range<usize>) -> Duration {
+        let before = |run: usize| self.run_length.saturating_mul(run as u64).min(self.span).as_micros();
+        Duration::from_micros(before(runs.end) - before(runs.start))
+    }
+
     fn fail(&self, failure: Failure) {
         let mut failed = self.failed.lock().unwrap_or_else(PoisonError::into_inner);
         if failed.as_ref().is_none_or(|before| failure.run < before.run) {
@@ -224,7 +294,7 @@ impl Total {
             *sum = (sum.0 + received, sum.1 + sent);
         }
         for (link, sent, received) in &report.links {
-            let sum = self.links.entry(link).or_default();
+            let sum = self.links.entry((*link).to_owned()).or_default();
             *sum = (sum.0 + sent, sum.1 + received);
         }
         self.events += report.events;
@@ -232,11 +302,29 @@ impl Total {
         for (&invariant, count) in &report.checks {
             *self.checks.entry(invariant).or_default() += count;
         }
-        for word in [run as u64, report.digest] {
-            self.hash = (self.hash.rotate_left(5) ^ word).wrapping_mul(0x9E37_79B9_7F4A_7C15);
-        }
+        self.fold(run, report.digest);
+    }
+
+    /// Takes the digest of the next finished run into the hash.
+    pub(super) fn fold(&mut self, run: usize, digest: u64) {
+        self.hash = [run as u64, digest].into_iter().fold(self.hash, mix);
     }
 }
+
+/// How long each run is, and how many there are.
+pub(super) fn split(span: Duration, cells: usize) -> (Duration, usize) {
+    // Each cell gets a run, even if the span is short.
+    let share = span.as_micros().div_ceil(cells.max(1) as u64).max(1);
+    let run_length = RUN_LENGTH.min(Duration::from_micros(share));
+    (run_length, span.as_micros().div_ceil(run_length.as_micros()) as usize)
+}
+
+fn mix(hash: u64, word: u64) -> u64 {
+    (hash.rotate_left(5) ^ word).wrapping_mul(0x9E37_79B9_7F4A_7C15)
+}
+
+/// The part of a run that is in a cell's fingerprint.
+const SAMPLE: Duration = Duration::from_secs(1);
 
 /// How long a run goes on between two checks for a stop.
 const SLICE: Duration = Duration::from_secs(2);

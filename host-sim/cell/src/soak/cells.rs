@@ -1,5 +1,6 @@
 //! The cells that a soak runs unless it is given others.
 
+use std::fmt::Write;
 use std::path::Path;
 
 use proto_core::config::GatewayConfig;
@@ -43,7 +44,7 @@ macro_rules! embedded {
 
 /// A seed selects by position, so the order must not change. Controllers of examples that have field ports
 /// of their own are replaced, since no device would be connected to them.
-const EMBEDDED: [Embedded; 16] = [
+const EMBEDDED: [Embedded; 17] = [
     embedded!("/../configs/", "rs485-system", "can-hand"),
     embedded!("/../configs/", "udp-server", "udp-server"),
     embedded!("/../configs/", "client", "client"),
@@ -60,6 +61,7 @@ const EMBEDDED: [Embedded; 16] = [
     embedded!("/src/soak/cells/", "gripper-line", "gripper-line"),
     embedded!("/src/soak/cells/", "can-frames", "can-frames"),
     embedded!("/src/soak/cells/", "panel-line", "panel-line"),
+    embedded!("/src/soak/cells/", "scanner-line", "scanner-line"),
 ];
 
 impl Scenario {
@@ -98,6 +100,14 @@ impl Scenario {
         Ok(Self { name, gateway: config, controller: file::load_controller(controller, &[])? })
     }
 
+    /// A hash of both configurations, the same on every machine.
+    pub(super) fn hash(&self) -> u64 {
+        let mut hash = Fnv(0xCBF2_9CE4_8422_2325);
+        // Writing to it cannot fail.
+        let _ = write!(hash, "{:?} {:?}", self.gateway, self.controller);
+        hash.0
+    }
+
     fn parse(cell: &Embedded) -> Result<Self, FileError> {
         let Embedded { name, gateway, controller } = *cell;
         let gateway = file::parse_gateway(Text { name, toml: gateway }, &[])?;
@@ -106,9 +116,21 @@ impl Scenario {
     }
 }
 
+/// FNV-1a over what is written.
+struct Fnv(u64);
+
+impl Write for Fnv {
+    fn write_str(&mut self, text: &str) -> std::fmt::Result {
+        for byte in text.bytes() {
+            self.0 = (self.0 ^ u64::from(byte)).wrapping_mul(0x0100_0000_01B3);
+        }
+        Ok(())
+    }
+}
+
 #[cfg(test)]
 mod tests {
-    use proto_core::config::FieldSpec;
+    use proto_core::config::{FieldSpec, Parts};
     use proto_core::device::{Ignored, Text, TextWidth};
 
     use super::*;
@@ -124,12 +146,15 @@ mod tests {
 
     #[test]
     fn a_cell_that_the_model_does_not_know_is_refused() {
-        let mut config = Scenario::all().unwrap().remove(0).gateway;
+        let mut config = Scenario::named("can-hand").unwrap().unwrap().gateway;
         assert_eq!(unmodelled(&config), None);
+        let Parts::Can { input, .. } = &config.recipes[0].parts else { panic!("a recipe on CAN") };
+        let first = &input.iter().next().unwrap().fields.of(&config.fields)[0];
+        let nth = config.fields.iter().position(|field| std::ptr::eq(field, first)).unwrap();
         let text = Text { width: TextWidth::Fixed(4), fill: None };
         let ignored = Ignored::NONE;
         let field = FieldSpec::TextInput { text, to: None, length_to: None, count_to: None, ignored };
-        config.fields.push(field).unwrap();
+        config.fields[nth] = field;
         assert!(unmodelled(&config).unwrap().contains("texts"));
     }
 }

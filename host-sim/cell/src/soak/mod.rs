@@ -8,9 +8,11 @@
 mod batch;
 mod behaviour;
 mod cells;
+mod part;
 mod peers;
 mod plc;
 mod random_device;
+mod share;
 mod show;
 mod slaves;
 mod template;
@@ -22,8 +24,10 @@ use proto_core::config::{Bus, GatewayConfig};
 use proto_core::engine::PortId;
 use proto_core::time::{Duration, Instant};
 
-pub use batch::{Batch, Progress, RUN_LENGTH, Total};
+pub use batch::{Batch, Failure, Progress, RUN_LENGTH, Total};
 pub use cells::Scenario;
+pub use part::{FORMAT, NotOneBatch, Part, PartCell, PartFailure, Sums};
+pub use share::{MAX_SHARES, NoShare, Share};
 pub use show::show_trace;
 
 use crate::{Cell, CellError, Chunking, FaultInjector, FaultKind, Invariant, Rng, Violation, Wiring};
@@ -196,10 +200,7 @@ fn attach_devices(cell: &mut Cell, config: &GatewayConfig, level: Level, rng: &m
     for port in &config.ports {
         let mut rng = rng.fork();
         let seed = rng.fork();
-        let device = RandomDevice::new(config, port, cell.now(), seed.clone());
-        let slaves = Slaves::new(config, port, cell.now(), seed.clone());
-        let peers = Peers::new(config, port, cell.now(), seed.clone());
-        let plc = Plc::new(config, port, cell.now(), seed);
+        let now = cell.now();
         match port.bus {
             Bus::Rs485(_) => {
                 let line = cell.line_of(&port.name);
@@ -212,21 +213,21 @@ fn attach_devices(cell: &mut Cell, config: &GatewayConfig, level: Level, rng: &m
                 if level == Level::Harsh && rng.below(4) == 0 {
                     cell.line(line).wiring = Wiring::TwoWire;
                 }
-                if let Some(peers) = peers {
+                if let Some(peers) = Peers::new(config, port, now, seed.clone()) {
                     cell.attach(line, peers);
-                } else if let Some(device) = device {
+                } else if let Some(device) = RandomDevice::new(config, port, now, seed.clone()) {
                     cell.attach(line, device);
-                } else if let Some(slaves) = slaves {
+                } else if let Some(slaves) = Slaves::new(config, port, now, seed.clone()) {
                     cell.attach(line, slaves);
-                } else if let Some(plc) = plc {
+                } else if let Some(plc) = Plc::new(config, port, now, seed) {
                     cell.attach(line, plc);
                 }
             }
             Bus::Can { .. } => {
                 let bus = cell.bus_of(&port.name);
-                if let Some(peers) = peers {
+                if let Some(peers) = Peers::new(config, port, now, seed.clone()) {
                     cell.attach_can(bus, peers);
-                } else if let Some(device) = device {
+                } else if let Some(device) = RandomDevice::new(config, port, now, seed) {
                     cell.attach_can(bus, device);
                 }
             }

@@ -176,7 +176,8 @@ impl Peers {
             Behaviour::Losing => return,
             Behaviour::Mistaken => {
                 let other = rng.below(asks.len() as u64) as usize;
-                if other == nth {
+                // If it spoke as another device and late, no master could tell that from the other's reply.
+                if other == nth || asks[other].peer != asks[nth].peer {
                     return;
                 }
                 let Some(other) = asks[other].reply.as_mut().map(|reply| reply.next(rng)) else { return };

@@ -7,6 +7,7 @@ use proto_core::config::{Bus, GatewayConfig, Port, Talk};
 use proto_core::modbus::rtu::Table;
 use proto_core::time::{Duration, Instant};
 
+use crate::rtu::sealed;
 use crate::{Device, Rng};
 
 /// The master.
@@ -178,12 +179,4 @@ fn write(is_coils: bool, first: u16, values: Vec<u16>) -> Vec<u8> {
             [pdu(16, first, values.len() as u16), vec![words.len() as u8], words].concat()
         }
     }
-}
-
-/// A frame with its CRC.
-fn sealed(bytes: &[u8]) -> Vec<u8> {
-    let crc = bytes.iter().fold(0xFFFF_u16, |crc, &byte| {
-        (0..8).fold(crc ^ u16::from(byte), |crc, _| if crc & 1 == 1 { crc >> 1 ^ 0xA001 } else { crc >> 1 })
-    });
-    [bytes, &crc.to_le_bytes()].concat()
 }

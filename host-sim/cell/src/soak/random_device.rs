@@ -48,8 +48,7 @@ impl RandomDevice {
         let mut templates = Vec::new();
         match (&port.bus, &recipe.parts) {
             (Bus::Rs485(_), proto_core::config::Parts::Stream { input: Some(part), .. }) => {
-                let fields = part.fields.of(&config.fields);
-                templates.push(Template::new(config, None, (&part.head, &part.tail), fields));
+                templates.push(Template::of_part(config, part));
             }
             (Bus::Can { .. }, proto_core::config::Parts::Can { input, .. }) => {
                 templates.extend(input.iter().map(|frame| {

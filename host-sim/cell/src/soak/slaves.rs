@@ -14,6 +14,7 @@ use proto_core::modbus::{Coils, Exception, Registers};
 use proto_core::time::{Duration, Instant};
 
 use super::behaviour::{Behaves, Behaviour, Change};
+use crate::rtu::sealed;
 use crate::{Device, Done, Rng, SlaveDone};
 
 /// The slaves of a line.
@@ -119,9 +120,7 @@ impl Slaves {
             Behaviour::Losing if happens => return,
             Behaviour::Mistaken if happens => {
                 let other = others[rng.below(others.len() as u64) as usize];
-                let sealed = [&[other], &reply[1..len - 2]].concat();
-                let crc = crc16(&sealed).to_le_bytes();
-                reply = [&sealed[..], &crc].concat();
+                reply = sealed(&[&[other], &reply[1..len - 2]].concat());
                 if other == address {
                     // One that nobody has.
                     reply[0] = 0xFE;
@@ -313,11 +312,4 @@ impl RegisterBank for Bank {
     fn read_input(&self, address: u16, words: &mut [[u8; 2]]) -> Result<(), Exception> {
         if words.is_empty() { Ok(()) } else { self.words(&self.input, address, words) }
     }
-}
-
-/// CRC-16/MODBUS, for replies that are changed.
-fn crc16(bytes: &[u8]) -> u16 {
-    bytes.iter().fold(0xFFFF, |crc, &byte| {
-        (0..8).fold(crc ^ u16::from(byte), |crc, _| if crc & 1 == 1 { crc >> 1 ^ 0xA001 } else { crc >> 1 })
-    })
 }

@@ -2,8 +2,8 @@
 //!
 //! In: the fields of a frame. Out: values that change a little from frame to frame, and the frame's bytes.
 
-use proto_core::config::{CommandEntry, DeviceFrame, FieldSpec, GatewayConfig, InputBinding};
-use proto_core::device::{Carrier, Probe};
+use proto_core::config::{CommandEntry, DeviceFrame, FieldSpec, GatewayConfig, InputBinding, StreamPart};
+use proto_core::device::{Boundary, Carrier, Probe, TextWidth};
 use proto_core::sysvar::{Direction, SysVar};
 use proto_core::wire::can::CanId;
 use proto_core::wire::scalar::{Scalar, ScalarType};
@@ -36,6 +36,8 @@ pub(super) enum Content {
     Counter { max: u32 },
     /// Numbers that sometimes pick commands.
     Commands { ty: ScalarType, values: Vec<i64> },
+    /// A text, which is made of a random number; the frame's layout says how it ends.
+    Text { width: TextWidth, ignored: Vec<Vec<u8>>, room: usize },
 }
 
 impl Template {
@@ -46,9 +48,25 @@ impl Template {
         delimiters: (&[u8], &[u8]),
         fields: &[FieldSpec],
     ) -> Self {
+        let carrier = if id.is_some() { Carrier::Can } else { Carrier::Stream };
+        Self::carried(config, (carrier, id), delimiters, fields)
+    }
+
+    /// A frame of a part that says itself what tells its frames apart.
+    pub(super) fn of_part(config: &GatewayConfig, part: &StreamPart) -> Self {
+        let is_cut = part.framing != Boundary::Fields || part.escape.is_some();
+        let carrier = if is_cut { Carrier::Whole } else { Carrier::Stream };
+        Self::carried(config, (carrier, None), (&part.head, &part.tail), part.fields.of(&config.fields))
+    }
+
+    fn carried(
+        config: &GatewayConfig,
+        (carrier, id): (Carrier, Option<CanId>),
+        delimiters: (&[u8], &[u8]),
+        fields: &[FieldSpec],
+    ) -> Self {
         let (head, tail) = (delimiters.0.to_vec(), delimiters.1.to_vec());
         let is_device = fields.iter().any(FieldSpec::is_device);
-        let carrier = if id.is_some() { Carrier::Can } else { Carrier::Stream };
         // Validation has refused what cannot be laid out.
         let device = is_device.then(|| DeviceFrame::new(carrier, Direction::Input, delimiters, fields).ok());
         let fields = fields.iter().map(|field| content(config, field)).collect();
@@ -66,8 +84,16 @@ impl Template {
             let elements = self.fields.iter().zip(values);
             let elements = elements.filter(|(content, _)| !matches!(content, Content::Checksum));
             let numbers: Vec<f64> = elements.map(|(_, value)| value.as_f64()).collect();
+            let elements = self.fields.iter().filter(|content| !matches!(content, Content::Checksum));
+            let elements: Vec<&Content> = elements.collect();
+            let text = |nth: usize, out: &mut [u8]| {
+                let text = elements[nth].text(numbers[nth] as u32);
+                out.get_mut(..text.len())?.copy_from_slice(&text);
+                Some(text.len())
+            };
             let mut bytes = [0; 512];
-            let len = device.layout.encode(&device.elements, |nth| numbers[nth], &mut bytes);
+            let number = |nth: usize| numbers[nth];
+            let len = device.layout.encode_with(&device.elements, number, text, &mut bytes);
             let len = len.unwrap_or(0);
             let tail = len.saturating_sub(self.tail.len());
             return bytes.get(self.head.len()..tail).unwrap_or(&[]).to_vec();
@@ -124,13 +150,37 @@ fn content(config: &GatewayConfig, field: &FieldSpec) -> Content {
         FieldSpec::DeviceInput { .. } | FieldSpec::DeviceOutput { .. } => {
             Content::Number { ty: ScalarType::Double, most: 1e3 }
         }
-        // Texts and frames of varying length are refused when the scenario is read.
+        FieldSpec::TextInput { text, to, ignored, .. } => Content::Text {
+            width: text.width,
+            ignored: ignored.iter().map(<[u8]>::to_vec).collect(),
+            room: to.map_or(8, |words| 2 * usize::from(words.count)),
+        },
         FieldSpec::Fixed { .. }
         | FieldSpec::Padding { .. }
-        | FieldSpec::TextInput { .. }
         | FieldSpec::TextOutput { .. }
-        | FieldSpec::Length(_) => Content::Constant,
+        | FieldSpec::Length(_)
+        | FieldSpec::Limits(_)
+        | FieldSpec::Mapped(_) => Content::Constant,
         FieldSpec::Checksum(_) => Content::Checksum,
+    }
+}
+
+impl Content {
+    /// The text of this number: mostly as long as there is room for, some longer, some empty.
+    fn text(&self, number: u32) -> Vec<u8> {
+        let Self::Text { width, ignored, room } = self else { return Vec::new() };
+        let (kind, number) = (number % 16, number / 16);
+        if kind < 2 && !ignored.is_empty() {
+            return ignored[number as usize % ignored.len()].clone();
+        }
+        let most = match width {
+            TextWidth::Fixed(width) => usize::from(*width),
+            _ if kind == 2 => room + 2,
+            _ => *room,
+        };
+        let len = number as usize % (most + 1);
+        let letter = |nth: usize| b'A' + ((number >> (nth % 8)) as usize + nth) as u8 % 26;
+        (0..len).map(letter).collect()
     }
 }
 
@@ -143,7 +193,7 @@ fn ends(entry: &CommandEntry) -> impl Iterator<Item = i64> + use<> {
 fn zero(content: &Content) -> Scalar {
     match content {
         Content::Bits | Content::Constant | Content::Checksum => Scalar::Byte(0),
-        Content::Counter { .. } => Scalar::Dword(0),
+        Content::Counter { .. } | Content::Text { .. } => Scalar::Dword(0),
         Content::Number { ty, .. } | Content::Commands { ty, .. } => number(*ty, 0.0),
     }
 }
@@ -161,6 +211,10 @@ fn number(ty: ScalarType, value: f64) -> Scalar {
 pub(super) fn changed(rng: &mut Rng, content: &Content, before: Scalar) -> Scalar {
     match content {
         Content::Constant | Content::Checksum => before,
+        Content::Text { .. } => match rng.below(4) {
+            0 => before,
+            _ => Scalar::Dword(rng.next_u64() as u32),
+        },
         Content::Counter { max } => match (rng.below(80), before.as_f64() as u32) {
             (0, before) => Scalar::Dword(before),
             (1, _) => Scalar::Dword(max + 1),

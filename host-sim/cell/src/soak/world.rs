@@ -1,7 +1,7 @@
 //! Random events at the controller while a cell runs: inputs change, programs set registers, someone
 //! presses a button.
 
-use proto_core::config::GatewayConfig;
+use proto_core::config::{FieldSpec, GatewayConfig};
 use proto_core::engine::Plan;
 use proto_core::sysvar::{Direction, SysVar};
 use proto_core::time::{Duration, Instant};
@@ -16,6 +16,8 @@ use recipe_config::InitialTarget;
 pub(super) struct World {
     rng: Rng,
     shown: Vec<SysVar>,
+    /// Those that are the length of a text.
+    lengths: Vec<SysVar>,
     next: Instant,
 }
 
@@ -26,7 +28,12 @@ impl World {
         // The simulated motion sets the arm's position.
         let shown =
             SysVar::all().filter(|var| var.direction() == Direction::Output && var.group() != "RobotState");
-        Self { rng, shown: shown.filter(is_shown).collect(), next: now }
+        let lengths = config.fields.iter().filter_map(|field| match *field {
+            FieldSpec::TextOutput { length_from, .. } => length_from,
+            _ => None,
+        });
+        let lengths = lengths.collect();
+        Self { rng, shown: shown.filter(is_shown).collect(), lengths, next: now }
     }
 
     pub(super) fn next(&self) -> Instant {
@@ -52,6 +59,8 @@ impl World {
                         let bit = 1 << self.rng.below(8);
                         f64::from((before as u8 ^ bit) & var.valid_bits())
                     }
+                    // Most texts fit.
+                    ScalarType::Word if self.lengths.contains(&var) => self.rng.below(6) as f64,
                     ScalarType::Word => self.rng.below(65_536) as f64,
                     _ => self.rng.below(20_000) as f64 / 16.0,
                 };

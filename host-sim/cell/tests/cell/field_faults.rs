@@ -327,6 +327,12 @@ fn an_adapter_pulled_out_and_back() {
     cell.unplug(line);
     cell.run_ms(1_000);
     assert!(cell.port("rs485-1").frames_out <= sent + 1, "nothing is sent into the air");
+    // A wire that is repaired meanwhile leads nowhere.
+    cell.repair(line);
+    let received = cell.port("rs485-1").frames_in;
+    cell.send(line, &outputs(1));
+    cell.run_ms(40);
+    assert_eq!(cell.port("rs485-1").frames_in, received);
     cell.line(line).take_heard();
     cell.plug_in(line);
     cell.run_ms(40);

@@ -100,18 +100,20 @@ fn a_stop_does_not_wait_behind_one_that_nobody_answered() {
 }
 
 #[test]
-fn nothing_is_commanded_from_what_was_pressed_while_the_gateway_slept() {
-    let mut cell = watched(&panel(), None);
-    hold(&mut cell, 0, 500);
-    cell.stall_gateway(Duration::from_secs(3));
-    hold(&mut cell, 1, 1_000);
-    hold(&mut cell, 2, 2_500);
-    hold(&mut cell, 2, 3_000);
-    assert_eq!(requests(&cell), 0, "the first frame after sleep sets the base");
-    hold(&mut cell, 0, 500);
-    hold(&mut cell, 2, 500);
-    assert_eq!(requests(&cell), 1);
-    assert_good(&cell);
+fn of_what_was_pressed_while_the_gateway_slept_only_a_stop_that_is_held_is_given() {
+    for (held, given) in [(1, 0), (2, 1)] {
+        let mut cell = watched(&panel(), None);
+        hold(&mut cell, 0, 500);
+        cell.stall_gateway(Duration::from_secs(3));
+        hold(&mut cell, 3 - held, 1_000);
+        hold(&mut cell, held, 2_500);
+        hold(&mut cell, held, 3_000);
+        assert_eq!(requests(&cell), given, "the first frame after sleep sets the base of all others");
+        hold(&mut cell, 0, 500);
+        hold(&mut cell, 2, 500);
+        assert_eq!(requests(&cell), given + 1);
+        assert_good(&cell);
+    }
 }
 
 #[test]

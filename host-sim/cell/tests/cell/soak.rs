@@ -4,10 +4,14 @@ use std::sync::Arc;
 
 use proto_core::time::Duration;
 use recipe_cell::Invariant;
-use recipe_cell::soak::{Batch, Level, Scenario, Soak, Total};
+use recipe_cell::soak::{Batch, Level, Part, PartFailure, Scenario, Share, Soak, Total};
 
 fn soaked(level: Level, seed: u64, span: Duration, jobs: usize) -> Total {
-    let batch = Arc::new(Batch::new(Scenario::all().unwrap(), level, seed, span));
+    ended(Batch::new(Scenario::all().unwrap(), level, seed, span), jobs).total()
+}
+
+fn ended(batch: Batch, jobs: usize) -> Arc<Batch> {
+    let batch = Arc::new(batch);
     let workers: Vec<_> = (0..jobs)
         .map(|_| {
             let batch = Arc::clone(&batch);
@@ -16,13 +20,30 @@ fn soaked(level: Level, seed: u64, span: Duration, jobs: usize) -> Total {
         .collect();
     workers.into_iter().for_each(|worker| worker.join().unwrap());
     assert_eq!(batch.failure(), None);
-    batch.total()
+    batch
+}
+
+/// The documents of shares 1/3, 2/3 and 3/3, and that of one run.
+fn shared(cells: &[&str], level: Level, span: Duration) -> ([Part; 3], Part) {
+    let batch = || {
+        let cells = cells.iter().map(|name| Scenario::named(name).unwrap().unwrap());
+        Batch::new(cells.collect(), level, 42, span)
+    };
+    let part = |batch| {
+        let part = Part::of(&ended(batch, 1), &[], 7);
+        let text = serde_json::to_string(&part).unwrap();
+        let read: Part = serde_json::from_str(&text).unwrap();
+        assert_eq!(read, part);
+        read
+    };
+    let share = |nth| part(batch().only(Share::new(nth, 3).unwrap()));
+    ([1, 2, 3].map(share), part(batch()))
 }
 
 /// The hashes of these runs on every machine. Only a change of what the engine, the controller or the cell
 /// does, or when, may change them; then enter the new ones here.
 const HASHES: [(Level, u64); 2] =
-    [(Level::None, 0x30DD_FB31_617A_8C31), (Level::Harsh, 0xF46B_4886_B3E5_25C2)];
+    [(Level::None, 0xAE65_35C3_93D7_6C27), (Level::Harsh, 0x303B_B0C1_B4F2_9227)];
 
 #[test]
 fn a_seed_means_the_same_trace_on_every_machine() {
@@ -89,6 +110,16 @@ fn devices_that_are_asked_are_judged_at_what_they_have_and_at_the_robot() {
 }
 
 #[test]
+fn a_reply_to_what_was_asked_before_a_restart_shifts_no_others() {
+    let scenario = Scenario::named("gripper-line").unwrap().unwrap();
+    for seed in [640_986_322_689, 1, 2, 3] {
+        let mut soak = Soak::new(&scenario, seed, Level::Harsh).unwrap();
+        soak.run_to(Duration::from_secs(60));
+        assert_eq!(soak.report().violation, None, "seed {seed}");
+    }
+}
+
+#[test]
 fn frames_on_a_bus_are_told_apart_and_counted() {
     let scenario = Scenario::named("can-frames").unwrap().unwrap();
     let mut soak = Soak::new(&scenario, 7, Level::None).unwrap();
@@ -115,4 +146,86 @@ fn a_master_asks_the_gateway_and_lines_echo() {
         let [meters, scale, plc] = &report.ports[..] else { panic!("{report:?}") };
         assert!(meters.1 > 100 && scale.1 > 100 && plc.1 > 50 && plc.2 > 100, "{report:?}");
     }
+}
+
+#[test]
+fn shares_of_three_machines_make_what_one_machine_makes() {
+    let cells: Vec<_> = Scenario::names().collect();
+    for level in [Level::None, Level::Mild, Level::Harsh] {
+        let span = Duration::from_secs(24);
+        let ([first, second, third], whole) = shared(&cells, level, span);
+        let merged = Part::merge(&[third, first, second]).unwrap();
+        assert_eq!(merged, whole);
+        assert_eq!(merged.total().unwrap(), soaked(level, 42, span, 2));
+    }
+}
+
+/// Cells that are quick, one run each.
+const FOUR: [&str; 4] = ["client", "witness", "orders", "rs485-system"];
+
+#[test]
+fn shares_that_are_not_one_run_are_refused() {
+    let ([first, second, third], _) = shared(&FOUR, Level::None, Duration::from_secs(4));
+    let refused = |parts: &[&Part]| {
+        let parts: Vec<_> = parts.iter().map(|&part| part.clone()).collect();
+        Part::merge(&parts).unwrap_err().to_string()
+    };
+    let changed = |change: &dyn Fn(&mut Part)| {
+        let mut part = second.clone();
+        change(&mut part);
+        refused(&[&first, &part, &third])
+    };
+    insta::assert_snapshot!(
+        [
+            refused(&[]),
+            refused(&[&first]),
+            refused(&[&first, &third]),
+            refused(&[&first, &second, &second, &third]),
+            changed(&|part| part.soak = 2),
+            changed(&|part| part.version = "0.1.0".into()),
+            changed(&|part| part.seed = 43),
+            changed(&|part| part.faults = "harsh".into()),
+            changed(&|part| part.virtual_us -= 1),
+            changed(&|part| part.shard = "2/4".into()),
+            changed(&|part| part.shard = "4/3".into()),
+            changed(&|part| part.shard = "3/3".into()),
+            changed(&|part| part.cells[1].name = "saw".into()),
+            changed(&|part| part.cells[1].fingerprint = "0".into()),
+            changed(&|part| part.digests[0] = None),
+            changed(&|part| {
+                part.digests[0] = None;
+                part.sums.cells.get_mut("witness").unwrap().0 = 0;
+            }),
+            changed(&|part| part.digests[0] = Some("+123456789abcdef".into())),
+            changed(&|part| part.digests.push(None)),
+            changed(&|part| part.first_run = 0),
+            changed(&|part| {
+                part.sums.checks.insert("luck".into(), 1);
+            }),
+            changed(&|part| {
+                part.sums.faults.insert("luck".into(), 1);
+            }),
+        ]
+        .join("\n")
+    );
+}
+
+#[test]
+fn a_failure_of_a_share_is_the_failure_of_all() {
+    let ([first, mut second, mut third], _) = shared(&FOUR, Level::None, Duration::from_secs(4));
+    let failure = |run| PartFailure {
+        run,
+        seed: run as u64,
+        cell: "client".into(),
+        after_us: 5,
+        what: "ownership: it wrote what nobody owns".into(),
+    };
+    // A share that has failed has stopped: some of its runs are not there.
+    third.digests.fill(None);
+    third.sums = Default::default();
+    third.failure = Some(failure(3));
+    second.failure = Some(failure(1));
+    let merged = Part::merge(&[third, second, first]).unwrap();
+    assert_eq!(merged.failure, Some(failure(1)));
+    assert_eq!(merged.total().unwrap().runs, 2);
 }

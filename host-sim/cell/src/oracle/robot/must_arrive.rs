@@ -46,8 +46,11 @@ impl Robot {
         let mut checked = 0;
         for &var in &spec.safe_vars {
             let Some(owned) = spec.owned[var.ordinal()] else { continue };
-            let (Some(safe), Some(accepted)) = (owned.safe, up.known(var).accepted) else { continue };
-            let silent = accepted + spec.ports[owned.port].timeout;
+            let known = up.known(var);
+            let (Some(safe), Some(_), Some(heard)) = (owned.safe, known.accepted, known.heard) else {
+                continue;
+            };
+            let silent = heard + spec.ports[owned.port].timeout;
             let mut could = silent.max(all);
             if spec.link(owned.way).is_some() {
                 let Some(ready) = self.ready.get(&owned.way) else { continue };
@@ -67,7 +70,7 @@ impl Robot {
                 let what = format!(
                     "{var} is {} at the controller; its owner has been silent for {} and its safe value is {}",
                     show(var, raw),
-                    now.saturating_since(accepted),
+                    now.saturating_since(heard),
                     show(var, safe)
                 );
                 return Err((Invariant::SafeArrives, what));

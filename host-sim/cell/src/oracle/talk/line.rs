@@ -160,7 +160,11 @@ impl TalkWatch {
         if now < self.free_at {
             return wrong("asked before the pause of the exchange before it was over");
         }
-        let repeated = self.repeat.take().filter(|failed| failed.row == row);
+        if let Some(failed) = self.repeats().filter(|failed| *failed != row) {
+            let what = format!("asked before {} is repeated", name(&talk.rows[failed]));
+            return wrong(&what);
+        }
+        let repeated = self.repeat.take();
         // A second rise shortly before it was asked may be seen after that.
         let rose_before = self.asked.get(&row).zip(self.rose_at.get(&row));
         let is_unseen = rose_before.is_some_and(|(&asked, &rose)| rose <= asked && asked < rose + port.cycle);
@@ -190,8 +194,12 @@ impl TalkWatch {
             );
             return Err((Invariant::Periods, what));
         }
+        if slave.presence == Presence::Down && !spec.is_answered() {
+            let what = format!("{}: asked, and its slave does not answer", name(spec));
+            return Err((Invariant::Periods, what));
+        }
         slave.asked = now;
-        if let Some(first) = self.comes_first(spec.slave, row) {
+        if let Some(first) = self.comes_first(talk, spec.slave, row) {
             let what = format!("{}: asked before {}, which comes first", name(spec), name(&talk.rows[first]));
             return Err((Invariant::Cycle, what));
         }
@@ -220,9 +228,12 @@ impl TalkWatch {
     }
 
     /// What is to be asked at the start of a slave before this exchange, and could be.
-    fn comes_first(&self, slave: u8, row: usize) -> Option<usize> {
+    fn comes_first(&self, talk: &TalkSpec, slave: u8, row: usize) -> Option<usize> {
         let opening = self.opening.get(&slave)?;
-        let first = *opening.iter().find(|nth| !self.passed.contains(*nth))?;
+        // What nobody answers waits for a slave that does not.
+        let is_down = self.slaves.get(&slave).is_some_and(|slave| slave.presence == Presence::Down);
+        let may_be = |nth: &usize| !is_down || talk.rows[*nth].is_answered();
+        let first = *opening.iter().find(|nth| !self.passed.contains(*nth) && may_be(nth))?;
         let is_itself = first == row || opening.contains(&row) && row < first;
         (!is_itself).then_some(first)
     }
@@ -292,16 +303,25 @@ impl TalkWatch {
         let flight = self.flight.take()?;
         let spec = &talk.rows[flight.row];
         self.is_opened(spec.slave, flight.row);
+        let was_down = self.slaves.get(&spec.slave).is_some_and(|slave| slave.presence == Presence::Down);
+        if let Some(opening) = self.opening.get_mut(&spec.slave).filter(|_| was_down && spec.at_start)
+            && opening.range(..flight.row).any(|nth| !talk.rows[*nth].is_answered())
+        {
+            // What waited before it comes first, and then this again.
+            opening.insert(flight.row);
+        }
         self.echo = None;
         self.refused = self.refused.wrapping_add(u32::from(is_refusal));
         self.free_at = now + spec.pause;
         let slave = self.slaves.entry(spec.slave).or_default();
+        let is_first = slave.presence == Presence::Unknown;
         if slave.presence != Presence::Up {
             (slave.presence, slave.since) = (Presence::Up, now);
         }
         slave.failures = 0;
         slave.refuses.insert(flight.row, is_refusal);
-        if flight.timed_out {
+        let is_alone = talk.rows_of(spec.slave).filter(|(_, row)| row.is_answered()).nth(1).is_none();
+        if flight.timed_out || (flight.repeated > 0 || is_first) && !is_alone {
             match flight.sent {
                 Some(sent) => self.hold(spec.slave, flight.row, sent + spec.timeout.saturating_mul(2)),
                 None => self.held_by = Some(flight.row),
@@ -335,6 +355,23 @@ impl TalkWatch {
             self.repeat = Some(flight);
             return None;
         }
+        self.fails(talk, &flight, now)
+    }
+
+    /// The exchange whose request is to be repeated.
+    pub(super) fn repeats(&self) -> Option<usize> {
+        self.repeat.as_ref().map(|failed| failed.row)
+    }
+
+    /// The request cannot be repeated. Returns the slave, which is given up.
+    pub(super) fn is_not_repeated(&mut self, talk: &TalkSpec, now: Instant) -> Option<u8> {
+        let failed = self.repeat.take()?;
+        self.fails(talk, &failed, now)
+    }
+
+    fn fails(&mut self, talk: &TalkSpec, flight: &Flight, now: Instant) -> Option<u8> {
+        let spec = &talk.rows[flight.row];
+        let slave = self.slaves.entry(spec.slave).or_default();
         self.unanswered = self.unanswered.wrapping_add(1);
         self.free_at = now + spec.pause;
         if slave.presence != Presence::Down {
@@ -394,8 +431,8 @@ impl TalkWatch {
             }
         }
         // A request with values is not sent as long as one is unknown or stale.
-        let is_wanted =
-            |number: u8| talk.rows_of(number).any(|(_, row)| row.every.is_some() && row.is_always_ready());
+        let is_asked = |row: &RowSpec| row.every.is_some() && row.is_always_ready() && row.is_answered();
+        let is_wanted = |number: u8| talk.rows_of(number).any(|(_, row)| is_asked(row));
         let are_down = self.slaves.iter().filter(|(_, slave)| slave.presence == Presence::Down);
         for (&number, slave) in are_down.filter(|(number, _)| is_wanted(**number)) {
             checked += 1;

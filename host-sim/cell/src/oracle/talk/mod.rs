@@ -51,7 +51,7 @@ impl Oracle {
                     watch.talk.echoed();
                 }
                 Seen::Wrong(len) => {
-                    if watch.line.drop_wrong(len) {
+                    if watch.line.drop_wrong(len, true) {
                         watch.talk.heard_wrong();
                         verdicts.push(Verdict::WrongChecksum);
                     }
@@ -122,14 +122,18 @@ impl Oracle {
 
     /// The gateway asks.
     pub(super) fn talk_send(&mut self, nth: usize, sent: &Leaving<'_>, now: Instant) -> Result<(), Wrong> {
+        let bytes = sent.bytes;
+        let asked = |talk: &TalkSpec| talk.row_of((sent.id, sent.is_remote), bytes);
+        let row = self.spec.ports[nth].talk.as_ref().and_then(asked);
+        if self.ports[nth].talk.repeats().is_some_and(|failed| row != Some(failed)) {
+            self.gives_up(nth, now);
+        }
         let port = &self.spec.ports[nth];
         let Some(talk) = &port.talk else { return Ok(()) };
         let (robot, watch) = (&self.robot, &mut self.ports[nth]);
-        let bytes = sent.bytes;
         if !watch.down.is_usable() {
             return Err((Invariant::Line, "asked while the line was gone".to_owned()));
         }
-        let row = talk.row_of((sent.id, sent.is_remote), bytes);
         let Some(row) = row else {
             return Err((Invariant::Shown, format!("asked {bytes:02x?}, which no exchange asks")));
         };
@@ -188,6 +192,34 @@ impl Oracle {
         if waited && !watch.talk.waits() && !self.spec.ports[nth].is_can {
             watch.down.sent();
         }
+    }
+
+    /// A request that is to be repeated has failed if its values cannot be shown any more. Returns whether
+    /// it is given up.
+    fn gives_up(&mut self, nth: usize, now: Instant) -> bool {
+        let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
+        let Some((talk, failed)) = port.talk.as_ref().zip(watch.talk.repeats()) else { return false };
+        let shown = talk.rows[failed].shown();
+        if watch.down.may_show_all(&self.spec, port, &self.up, shown, now).is_ok() {
+            return false;
+        }
+        if let Some(slave) = watch.talk.is_not_repeated(talk, now) {
+            self.truth.missed(nth, slave);
+        }
+        true
+    }
+
+    /// The engine has nothing to do: checks that no repetition waits that could be sent.
+    pub(super) fn talk_rests(&mut self, nth: usize, now: Instant) -> Result<(), Wrong> {
+        let (port, watch) = (&self.spec.ports[nth], &self.ports[nth]);
+        let is_free = watch.down.is_usable()
+            && !watch.down.is_busy()
+            && self.discards_until.is_none()
+            && now >= watch.line.heard + port.turnaround;
+        if watch.talk.repeats().is_some() && is_free && !self.gives_up(nth, now) {
+            return Err((Invariant::Periods, "a repetition waits although the line is free".to_owned()));
+        }
+        Ok(())
     }
 
     /// A value may have changed: looks for bits that ask.

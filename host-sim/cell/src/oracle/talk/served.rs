@@ -11,13 +11,13 @@ use proto_core::modbus::rtu::Table;
 use proto_core::sysvar::SysVar;
 use proto_core::time::Instant;
 
-use super::spec::is_right;
 use crate::oracle::device::is_written_by_model;
 use crate::oracle::field::Verdict;
 use crate::oracle::gateway::Leaving;
 use crate::oracle::spec::{Frame, device_frame, shown};
 use crate::oracle::upward::Wrong;
 use crate::oracle::{Invariant, Oracle};
+use crate::rtu::{is_right, sealed};
 
 /// The slave.
 #[derive(Debug, Clone)]
@@ -94,7 +94,7 @@ impl ServedSpec {
             .iter()
             .filter_map(|block| block.output.as_ref())
             .flat_map(|out| &out.fields)
-            .filter_map(shown)
+            .flat_map(shown)
     }
 
     /// The block with this register or coil.
@@ -130,8 +130,13 @@ impl ServedWatch {
 impl Oracle {
     /// Bytes of a master came, or of other slaves.
     pub(in crate::oracle) fn served_bytes(&mut self, nth: usize, bytes: &[u8], now: Instant) {
-        let Some(spec) = &self.spec.ports[nth].served else { return };
-        self.ports[nth].served.received(spec, bytes, now);
+        let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
+        let Some(spec) = &port.served else { return };
+        if watch.down.is_usable() {
+            watch.served.received(spec, bytes, now);
+        } else {
+            watch.line.discarded += bytes.len() as u64;
+        }
     }
 
     /// A request may have ended.
@@ -157,7 +162,7 @@ impl Oracle {
                 address if address == own => {
                     // Behind an earlier request, its master no longer waits.
                     if rest.is_empty() && !too_many {
-                        reply = Some(self.carry_out(nth, pdu, now));
+                        reply = Some((pdu[0], self.carry_out(nth, pdu, now)));
                     }
                 }
                 _ => others += 1,
@@ -165,14 +170,13 @@ impl Oracle {
         }
         is_wrong |= too_many && reply.is_none();
         let counters = &mut self.ports[nth].counters;
-        let is_refused = matches!(reply, Some(Err(_)));
+        let is_refused = matches!(reply, Some((_, Err(_))));
         match (is_wrong, is_refused) {
             (true, _) => counters.rejected_checksum += 1,
             (false, true) => counters.refused += 1,
             (false, false) => counters.rejected_other_device += u32::from(others > 0 && reply.is_none()),
         }
-        self.ports[nth].served.kept = reply.map(|answer| {
-            let function = bytes[bytes.len() - last_len(&bytes) + 1];
+        self.ports[nth].served.kept = reply.map(|(function, answer)| {
             let answer = answer.unwrap_or_else(|Exception(code)| vec![function | 0x80, code]);
             sealed(&[&[own], &answer[..]].concat())
         });
@@ -265,7 +269,7 @@ impl Oracle {
         let Some(output) = &block.output else {
             return watch.served.written.get(&place).cloned().ok_or(FAILURE);
         };
-        let vars = output.fields.iter().filter_map(shown);
+        let vars = output.fields.iter().flat_map(shown);
         watch.down.may_show_all(&self.spec, port, &self.up, vars, now).map_err(|_| FAILURE)?;
         watch.down.made(output, &self.up).ok_or(FAILURE)
     }
@@ -368,23 +372,6 @@ fn first_frame(bytes: &[u8]) -> Option<usize> {
     };
     let lengths = [Some(bytes.len()), request, reply].into_iter().flatten();
     lengths.filter(|len| *len >= 4).find(|&len| bytes.get(..len).is_some_and(is_right))
-}
-
-/// The length of the last frame.
-fn last_len(bytes: &[u8]) -> usize {
-    let mut rest = bytes;
-    while let Some(len) = first_frame(rest).filter(|len| *len < rest.len()) {
-        rest = &rest[len..];
-    }
-    rest.len()
-}
-
-/// A frame with its CRC.
-fn sealed(bytes: &[u8]) -> Vec<u8> {
-    let crc = bytes.iter().fold(0xFFFF_u16, |crc, &byte| {
-        (0..8).fold(crc ^ u16::from(byte), |crc, _| if crc & 1 == 1 { crc >> 1 ^ 0xA001 } else { crc >> 1 })
-    });
-    [bytes, &crc.to_le_bytes()].concat()
 }
 
 /// Two of the longest frames.

@@ -4,7 +4,7 @@
 //! Written from these pages, independent of the engine's exchanges.
 
 use proto_core::config::{
-    Bus, ConfigView, Exchange, FieldSpec, GatewayConfig, OutputBinding, Port, Recipe, Rs485, Talk,
+    Bus, ConfigView, Exchange, FieldSpec, GatewayConfig, OutputBinding, Outside, Port, Recipe, Rs485, Talk,
 };
 use proto_core::modbus::rtu::Operation;
 use proto_core::sysvar::SysVar;
@@ -14,6 +14,7 @@ use proto_core::wire::can::CanId;
 use super::frames::{FramesSpec, frame_of};
 use crate::oracle::device::{self, look};
 use crate::oracle::spec::{Frame, PortSpec, frame};
+use crate::rtu::is_right;
 
 /// The conversation of a port.
 #[derive(Debug, Clone)]
@@ -247,7 +248,7 @@ impl RowSpec {
         }
     }
 
-    fn is_coils(&self) -> bool {
+    pub(super) fn is_coils(&self) -> bool {
         matches!(self.function, 5 | 15)
     }
 
@@ -317,14 +318,10 @@ impl RowSpec {
         (0..count).map(|nth| u16::from(data[nth / 8] >> (nth % 8) & 1)).collect()
     }
 
-    pub(super) fn writes_coils(&self) -> bool {
-        self.is_coils()
-    }
-
     /// The system variables in its request.
     pub(in crate::oracle) fn shown(&self) -> impl Iterator<Item = SysVar> {
         let fields = self.request.iter().flat_map(|request| &request.fields);
-        fields.filter_map(crate::oracle::spec::shown)
+        fields.flat_map(crate::oracle::spec::shown)
     }
 
     /// What the bytes that came are, if they follow this request.
@@ -356,15 +353,6 @@ impl RowSpec {
     }
 }
 
-/// Whether the last two bytes are the CRC of the others, low byte first.
-pub(super) fn is_right(frame: &[u8]) -> bool {
-    let (bytes, crc) = frame.split_at(frame.len() - 2);
-    let remainder = bytes.iter().fold(0xFFFF_u16, |crc, &byte| {
-        (0..8).fold(crc ^ u16::from(byte), |crc, _| if crc & 1 == 1 { crc >> 1 ^ 0xA001 } else { crc >> 1 })
-    });
-    remainder.to_le_bytes() == crc
-}
-
 /// Why the exchanges of a configuration cannot be judged, if they cannot.
 pub(in crate::oracle) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
     if let Some(reason) = super::served::unmodelled(config) {
@@ -377,6 +365,19 @@ pub(in crate::oracle) fn unmodelled(config: &GatewayConfig) -> Option<&'static s
     let has_echo = |port: &Port| matches!(&port.bus, Bus::Rs485(line) if line.echo);
     if config.ports.iter().filter(serves).any(has_echo) {
         return Some("a soak cannot judge a gateway that is a slave on a line that echoes");
+    }
+    let requests = config.exchanges.iter().filter_map(|exchange| match exchange.talk {
+        Talk::Rtu { written, .. } => Some(written),
+        Talk::Frames { request, .. } => config.frames.get(usize::from(request?)).map(|frame| frame.fields),
+        _ => None,
+    });
+    let may_refuse = |field: &FieldSpec| match field {
+        FieldSpec::Limits(limits) => limits.outside == Outside::Refuse,
+        FieldSpec::Mapped(_) => true,
+        _ => false,
+    };
+    if requests.flat_map(|span| span.of(&config.fields)).any(may_refuse) {
+        return Some("a soak cannot judge requests with values that are not sent");
     }
     let asks = |port: &&Port| !config.view().exchanges_of(recipe_of(config.view(), port)).is_empty();
     let answers = |port: &Port| recipe_of(config.view(), port).send == proto_core::config::SendOn::Frame;

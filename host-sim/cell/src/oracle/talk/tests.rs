@@ -9,6 +9,7 @@ use proto_core::time::{Duration, Instant};
 use super::super::tests::{cell, is_rest};
 use super::super::upward::Carried;
 use super::super::{Invariant, Oracle, inputs_of};
+use crate::rtu::sealed;
 use crate::tamper::{Forged, Outward};
 use crate::{Cell, Device, Done, SlaveDone, Talker, Violation};
 
@@ -199,14 +200,6 @@ impl<F: FnMut(Instant, &mut Duration, &mut Vec<Done>)> Device<Vec<u8>> for Hones
     fn take_done(&mut self) -> Vec<SlaveDone> {
         std::mem::take(&mut self.done)
     }
-}
-
-/// A frame with its CRC.
-fn sealed(bytes: &[u8]) -> Vec<u8> {
-    let crc = bytes.iter().fold(0xFFFF_u16, |crc, &byte| {
-        (0..8).fold(crc ^ u16::from(byte), |crc, _| if crc & 1 == 1 { crc >> 1 ^ 0xA001 } else { crc >> 1 })
-    });
-    [bytes, &crc.to_le_bytes()].concat()
 }
 
 /// Three seconds with this device; values of the controller change meanwhile.

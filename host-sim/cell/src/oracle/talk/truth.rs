@@ -165,7 +165,7 @@ impl Truth {
                 (1, result)
             }
             Done::Wrote { coils, address, values } => {
-                let is_it = |row: &RowSpec| row.written == Some(address) && row.writes_coils() == coils;
+                let is_it = |row: &RowSpec| row.written == Some(address) && row.is_coils() == coils;
                 let result = self.wrote(spec, (nth, talk), (slave, &is_it), &values, stalled, now);
                 let line = self.lines.entry(nth).or_default();
                 for (at, value) in (address..).zip(values) {
@@ -244,7 +244,8 @@ impl Truth {
         let from = asked - lag;
         let mut together = vec![(from, asked)];
         for field in fields(row) {
-            let (Some(var), Some(place)) = (crate::oracle::spec::shown(field.0), data.get(field.1.clone()))
+            let (Some(var), Some(place)) =
+                (crate::oracle::spec::shown(field.0).next(), data.get(field.1.clone()))
             else {
                 continue;
             };
@@ -353,7 +354,7 @@ impl Truth {
         };
         let mut wrong = None;
         for (field, place) in fields(row) {
-            let Some(var) = crate::oracle::spec::shown(field) else { continue };
+            let Some(var) = crate::oracle::spec::shown(field).next() else { continue };
             let (at, raw) = *self.had.get(&var.ordinal())?.back()?;
             if at > since {
                 return None;
@@ -381,9 +382,9 @@ impl LineTruth {
     fn written(&self, row: &RowSpec) -> Option<Vec<u8>> {
         let address = row.written?;
         let there =
-            |nth: u16| self.memory.get(&(row.slave, row.writes_coils(), address + nth)).copied().unwrap_or(0);
+            |nth: u16| self.memory.get(&(row.slave, row.is_coils(), address + nth)).copied().unwrap_or(0);
         let len = row.request.as_ref()?.payload;
-        let count = if row.writes_coils() { row.count } else { (len / 2) as u16 };
+        let count = if row.is_coils() { row.count } else { (len / 2) as u16 };
         let values: Vec<u16> = (0..count).map(there).collect();
         Some(row.data_from(&values))
     }

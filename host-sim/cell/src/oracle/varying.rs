@@ -1,0 +1,407 @@
+//! Frames of varying length, the texts in them, and what cuts them: docs/configuration.md section 4, "Frames
+//! of varying length".
+//!
+//! Written from that page, independent of the engine's layouts and cutters. In: a frame and bytes. Out: the
+//! places of the fields in these bytes, as of a frame whose fields always have the same length.
+
+use std::ops::Range;
+
+use proto_core::config::{FieldSpec, GatewayConfig, Parts, Talk, Words};
+use proto_core::device::{Boundary, ByteOrder, Counts, Encoding, Kind, Text, TextWidth, Width};
+use proto_core::sysvar::SysVar;
+
+use super::device::{DeviceSpec, Look, Seen, length, read, sum_bytes};
+use super::field::{LineWatch, Verdict};
+use super::spec::{Frame, PortSpec, Raw};
+
+/// Why whole bytes are no frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Unlike {
+    /// No frame has this length, or the bytes end before a field does.
+    Length,
+    /// Something else in them is another frame's.
+    Content,
+}
+
+/// How many bytes a field has.
+enum Size {
+    Fixed(usize),
+    /// Up to this byte, which stands behind it, and at most so many.
+    Until(u8, usize),
+    /// All that the others leave.
+    Rest,
+}
+
+/// Whether a field has not the same length in every frame, or says how long the frame is.
+pub(super) fn varies(field: &FieldSpec) -> bool {
+    matches!(field, FieldSpec::Length(_)) || !matches!(size(field), Size::Fixed(_))
+}
+
+fn size(field: &FieldSpec) -> Size {
+    let of_encoding = |encoding: &Encoding| match encoding.kind {
+        Kind::Decimal(digits) => of_width(digits.width),
+        Kind::Hex(width) => of_width(width),
+        _ => Size::Fixed(length(encoding)),
+    };
+    match field {
+        FieldSpec::TextInput { text, .. } | FieldSpec::TextOutput { text, .. } => match text.width {
+            TextWidth::Fixed(width) => Size::Fixed(width.into()),
+            TextWidth::Until(end) => Size::Until(end, MAX_TEXT),
+            TextWidth::Rest => Size::Rest,
+        },
+        FieldSpec::UserInput { ty, .. } | FieldSpec::UserOutput { ty, .. } => Size::Fixed(ty.size()),
+        FieldSpec::DeviceInput { encoding, .. }
+        | FieldSpec::DeviceOutput { encoding, .. }
+        | FieldSpec::Fixed { encoding, .. } => of_encoding(encoding),
+        FieldSpec::Padding { len, .. } => Size::Fixed((*len).into()),
+        FieldSpec::Checksum(sum) => Size::Fixed(sum_bytes(sum)),
+        FieldSpec::Length(length) => of_encoding(&length.encoding),
+        FieldSpec::System(var) => Size::Fixed(var.size()),
+        FieldSpec::Limits(_) | FieldSpec::Mapped(_) => Size::Fixed(0),
+    }
+}
+
+fn of_width(width: Width) -> Size {
+    match width {
+        Width::Fixed(width) => Size::Fixed(width.into()),
+        Width::Until(end) => Size::Until(end, MAX_DIGITS),
+    }
+}
+
+fn is_shared(field: &FieldSpec) -> bool {
+    field.element().and_then(|element| element.encoding()).is_some_and(|encoding| encoding.shared)
+}
+
+/// Bytes of the shortest and of the longest frame.
+pub(super) fn lengths(frame: &Frame) -> (usize, usize) {
+    let delimiters = frame.head.len() + frame.tail.len();
+    frame.fields.iter().filter(|field| !is_shared(field)).fold(
+        (delimiters, delimiters),
+        |(low, high), field| match size(field) {
+            Size::Fixed(len) => (low + len, high + len),
+            Size::Until(_, most) => (low + 1, high + most + 1),
+            Size::Rest => (low, high + MAX_TEXT),
+        },
+    )
+}
+
+/// The places of the fields in `whole`, which is one frame from its first byte to its last.
+pub(super) fn lay_out(frame: &Frame, whole: &[u8]) -> Result<DeviceSpec, Unlike> {
+    let (shortest, longest) = lengths(frame);
+    if !(shortest..=longest).contains(&whole.len()) {
+        return Err(Unlike::Length);
+    }
+    if !whole.starts_with(&frame.head) {
+        return Err(Unlike::Content);
+    }
+    let end = whole.len() - frame.tail.len();
+    let mut spec = DeviceSpec::default();
+    let (mut at, mut first) = (frame.head.len(), frame.head.len());
+    for (nth, field) in frame.fields.iter().enumerate() {
+        let (len, further) = match size(field) {
+            Size::Fixed(len) => (len, 0),
+            Size::Until(stop, most) => {
+                let rest = whole.get(at..).unwrap_or(&[]);
+                match rest.iter().position(|&byte| byte == stop) {
+                    Some(len) if len <= most => (len, 1),
+                    Some(_) => return Err(Unlike::Content),
+                    None if rest.len() > most => return Err(Unlike::Content),
+                    None => return Err(Unlike::Length),
+                }
+            }
+            Size::Rest => {
+                let behind: usize = frame.fields[nth + 1..].iter().map(fixed_size).sum();
+                match end.checked_sub(at + behind) {
+                    Some(len) if len <= MAX_TEXT => (len, 0),
+                    _ => return Err(Unlike::Content),
+                }
+            }
+        };
+        if !is_shared(field) {
+            first = at;
+            at += len + further;
+        }
+        if first + len > whole.len() {
+            return Err(Unlike::Length);
+        }
+        spec.places.push(first..first + len);
+        if let FieldSpec::Checksum(sum) = field {
+            let covered = usize::from(sum.first)..sum.last().map_or(first, |last| usize::from(last) + 1);
+            spec.set_sum(*sum, first..first + len, covered);
+        }
+    }
+    spec.len = at - frame.head.len();
+    let says = |(field, place): (&FieldSpec, &Range<usize>)| match field {
+        FieldSpec::Length(own) => {
+            let number = read(&own.encoding, &whole[place.clone()])?;
+            Some(number as i64 + i64::from(own.plus) == counted(frame, own.counts, place.end, whole.len()))
+        }
+        _ => Some(true),
+    };
+    let agree = frame.fields.iter().zip(&spec.places).all(|both| says(both) == Some(true));
+    if at != end || !whole.ends_with(&frame.tail) || !agree {
+        return Err(Unlike::Content);
+    }
+    Ok(spec)
+}
+
+fn fixed_size(field: &FieldSpec) -> usize {
+    match size(field) {
+        Size::Fixed(len) if !is_shared(field) => len,
+        _ => 0,
+    }
+}
+
+/// What a length that ends at `at` counts in a frame of `len` bytes.
+fn counted(frame: &Frame, counts: Counts, at: usize, len: usize) -> i64 {
+    let sum = frame.fields.iter().rev().find(|field| matches!(field, FieldSpec::Checksum(_)));
+    let others = frame.tail.len() + sum.map_or(0, fixed_size);
+    let counted = match counts {
+        Counts::Rest => len - at,
+        Counts::Frame => len,
+        // A soak refuses such a length behind a checksum.
+        Counts::Fields => len.saturating_sub(at + others),
+    };
+    counted as i64
+}
+
+/// What a whole frame is.
+pub(super) fn see(frame: &Frame, whole: &[u8]) -> Result<(DeviceSpec, Seen), Unlike> {
+    let spec = lay_out(frame, whole)?;
+    let seen = spec.see(&frame.fields, whole);
+    Ok((spec, seen))
+}
+
+/// What bytes of a line are, seen as such a frame that is searched: its length stands in front of what varies.
+pub(super) fn look(frame: &Frame, bytes: &[u8]) -> Look {
+    let seen = bytes.len().min(frame.head.len());
+    let (shortest, longest) = lengths(frame);
+    if bytes[..seen] != frame.head[..seen] {
+        return Look::No;
+    }
+    let begins = Look::Begins { is_ours: false };
+    if bytes.len() < shortest {
+        return begins;
+    }
+    let mut at = frame.head.len();
+    let mut said = None;
+    for field in &frame.fields {
+        let len = fixed_size(field);
+        if let FieldSpec::Length(own) = field {
+            let Some(number) = read(&own.encoding, &bytes[at..at + len]) else { return Look::No };
+            let from = counted(frame, own.counts, at + len, longest);
+            said = Some(number as i64 + i64::from(own.plus) + longest as i64 - from);
+            break;
+        }
+        at += len;
+    }
+    let Some(said) = said.and_then(|said| usize::try_from(said).ok()) else { return Look::No };
+    if !(shortest..=longest).contains(&said) {
+        return Look::No;
+    }
+    let Some(whole) = bytes.get(..said) else { return begins };
+    match see(frame, whole) {
+        Ok((_, Seen::Ours)) => Look::Frame(said),
+        Ok((_, Seen::Other)) => Look::Other(said),
+        Ok((_, Seen::WrongChecksum)) => Look::Wrong(said),
+        Ok((_, Seen::Nothing)) | Err(_) => Look::No,
+    }
+}
+
+/// The text that the bytes of a field are: without what fills it up.
+pub(super) fn text_in(text: Text, bytes: &[u8]) -> &[u8] {
+    let (TextWidth::Fixed(_), Some(fill)) = (text.width, text.fill) else { return bytes };
+    let len = bytes.iter().rposition(|&byte| byte != fill).map_or(0, |last| last + 1);
+    &bytes[..len]
+}
+
+/// The registers that have a text, two characters each, zeros behind its end; `None` if it is too long.
+pub(super) fn registers(words: Words, text: &[u8]) -> Option<Vec<(SysVar, Raw)>> {
+    if text.len() > 2 * usize::from(words.count) {
+        return None;
+    }
+    let character = |at: usize| text.get(at).copied().unwrap_or(0);
+    let vars = words.iter().enumerate().map(|(nth, var)| {
+        let (first, second) = (character(2 * nth), character(2 * nth + 1));
+        let word = if words.order == ByteOrder::Little { [first, second] } else { [second, first] };
+        (var, [word[0], word[1], 0, 0])
+    });
+    Some(vars.collect())
+}
+
+/// The text that registers have: up to the first zero, or of so many characters; `None` if there is no room
+/// for these.
+pub(super) fn text_of(
+    words: Words,
+    raw: impl Fn(SysVar) -> Option<Raw>,
+    len: Option<usize>,
+) -> Option<Vec<u8>> {
+    let mut text = Vec::new();
+    for var in words.iter() {
+        let [low, high, ..] = raw(var)?;
+        text.extend(if words.order == ByteOrder::Little { [low, high] } else { [high, low] });
+    }
+    let len = len.unwrap_or_else(|| text.iter().position(|&byte| byte == 0).unwrap_or(text.len()));
+    (len <= text.len()).then(|| text[..len].to_vec())
+}
+
+/// The bytes of a field with this text; `None` if it does not fit.
+pub(super) fn field_of(text: Text, characters: &[u8]) -> Option<Vec<u8>> {
+    let mut bytes = characters.to_vec();
+    match text.width {
+        TextWidth::Fixed(width) => match (usize::from(width).checked_sub(bytes.len())?, text.fill) {
+            (0, _) => {}
+            (more, Some(fill)) => bytes.extend(vec![fill; more]),
+            (_, None) => return None,
+        },
+        TextWidth::Until(end) if bytes.contains(&end) => return None,
+        TextWidth::Until(_) | TextWidth::Rest => {}
+    }
+    (bytes.len() <= MAX_TEXT).then_some(bytes)
+}
+
+/// What came between two ends.
+pub(super) enum Piece {
+    Whole(Vec<u8>),
+    TooLong,
+    /// Its beginning is missing.
+    Cut,
+}
+
+/// Frames that end with a tail, or with silence.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct CutWatch {
+    /// Bytes before those that are held are missing.
+    is_cut: bool,
+    /// Bytes of a tail whose beginning may have been discarded: the newest eight.
+    before: [u8; 8],
+    before_len: usize,
+}
+
+impl LineWatch {
+    /// Bytes came on a line whose frames are cut; `late` says that there may have been silence before them.
+    /// Returns what has ended.
+    pub(super) fn cut_bytes(&mut self, cut: Boundary, tail: &[u8], bytes: &[u8], late: bool) -> Vec<Piece> {
+        let mut pieces = Vec::new();
+        if cut == Boundary::Silence && late && (!self.held.is_empty() || self.cut.is_cut) {
+            self.cut_off();
+        }
+        for &byte in bytes {
+            self.held.push(byte);
+            if cut == Boundary::Tail && self.ends_with(tail) {
+                pieces.push(self.cut_piece());
+            }
+        }
+        pieces
+    }
+
+    fn ends_with(&self, tail: &[u8]) -> bool {
+        let before = &self.cut.before[..self.cut.before_len];
+        [before, &self.held[..]].concat().ends_with(tail)
+    }
+
+    /// Whether silence has something to end.
+    pub(super) fn cut_has_begun(&self, cut: Boundary) -> bool {
+        !self.held.is_empty() || cut == Boundary::Silence && self.cut.is_cut
+    }
+
+    /// What is held has ended.
+    pub(super) fn cut_piece(&mut self) -> Piece {
+        let was_cut = std::mem::take(&mut self.cut).is_cut;
+        let bytes = std::mem::take(&mut self.held);
+        if was_cut {
+            self.discarded += bytes.len().min(LONGEST) as u64;
+            self.frame_bytes += bytes.len().saturating_sub(LONGEST) as u64;
+            return Piece::Cut;
+        }
+        self.frame_bytes += bytes.len() as u64;
+        if bytes.len() > LONGEST { Piece::TooLong } else { Piece::Whole(bytes) }
+    }
+
+    /// Silence, or bytes are missing: what comes up to the next end is dropped with what is held.
+    pub(super) fn cut_off(&mut self) {
+        let newest = self.held.iter().rev().take(8).rev().copied();
+        let before = self.cut.before[..self.cut.before_len].iter().copied();
+        let newest: Vec<u8> = before.chain(newest).collect();
+        let newest = &newest[newest.len().saturating_sub(8)..];
+        let was_cut = self.cut.is_cut || !self.held.is_empty();
+        self.cut = CutWatch { is_cut: was_cut, before: [0; 8], before_len: newest.len() };
+        self.cut.before[..newest.len()].copy_from_slice(newest);
+        self.discarded += self.held.len().min(LONGEST) as u64;
+        self.frame_bytes += self.held.len().saturating_sub(LONGEST) as u64;
+        self.held.clear();
+    }
+}
+
+impl LineWatch {
+    /// These bytes are lost: what they began cannot be trusted.
+    pub(super) fn lose(&mut self, port: &PortSpec, bytes: &[u8]) {
+        let Some(frame) = port.inputs.first().filter(|_| port.framing != Boundary::Fields) else { return };
+        let counted = (self.discarded, self.frame_bytes);
+        self.cut_bytes(port.framing, &frame.tail, bytes, false);
+        self.cut_off();
+        (self.discarded, self.frame_bytes) = counted;
+    }
+
+    /// What came between two ends is a frame as a whole, or rejected as a whole.
+    pub(super) fn judge_piece(&mut self, port: &PortSpec, piece: &Piece) -> Option<Verdict> {
+        let whole = match piece {
+            Piece::Whole(whole) => whole,
+            Piece::TooLong => return Some(Verdict::WrongLength),
+            Piece::Cut => return None,
+        };
+        let frame = port.inputs.first()?;
+        Some(match see(frame, whole) {
+            Ok((_, Seen::Ours)) => self.judge(frame, 0, whole),
+            Ok((_, Seen::Other | Seen::Nothing)) | Err(Unlike::Content) => Verdict::OtherDevice,
+            Ok((_, Seen::WrongChecksum)) => Verdict::WrongChecksum,
+            Err(Unlike::Length) => Verdict::WrongLength,
+        })
+    }
+}
+
+/// Why such frames of a configuration cannot be judged, if they cannot.
+pub(super) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
+    let is_text = |field: &FieldSpec| {
+        matches!(field, FieldSpec::TextInput { .. } | FieldSpec::TextOutput { .. }) || varies(field)
+    };
+    let asked = config.exchanges.iter().flat_map(|exchange| match exchange.talk {
+        Talk::Rtu { written, read, .. } | Talk::Served { written, read, .. } => vec![written, read],
+        Talk::Frames { .. } => Vec::new(),
+    });
+    let asked = asked.chain(config.frames.iter().map(|frame| frame.fields));
+    let on_can = config.recipes.iter().flat_map(|recipe| match &recipe.parts {
+        Parts::Can { input, output } => input.iter().chain(output).map(|frame| frame.fields).collect(),
+        Parts::Stream { .. } => Vec::new(),
+    });
+    if asked.chain(on_can).any(|span| span.of(&config.fields).iter().any(is_text)) {
+        return Some("a soak judges texts and frames of varying length only in the parts of a stream");
+    }
+    let is_sent = |field: &FieldSpec| matches!(field, FieldSpec::DeviceOutput { .. }) && varies(field);
+    if config.fields.iter().any(is_sent) {
+        return Some("a soak cannot judge sent digits of varying length");
+    }
+    for recipe in &config.recipes {
+        let Parts::Stream { input, output } = &recipe.parts else { continue };
+        if [input, output].into_iter().flatten().any(|part| part.escape.is_some()) {
+            return Some("a soak cannot judge escape bytes");
+        }
+        let Some(part) = input.as_ref().filter(|part| part.framing == Boundary::Fields) else { continue };
+        let fields = part.fields.of(&config.fields);
+        let has_sum = fields.iter().any(|field| matches!(field, FieldSpec::Checksum(_)));
+        let first = fields.iter().find(|field| varies(field));
+        let is_led = matches!(first, None | Some(FieldSpec::Length(_)));
+        if !is_led || first.is_some() && (!has_sum || part.head.is_empty() || !part.tail.is_empty()) {
+            return Some(
+                "a soak judges a searched frame of varying length only with a head, a length in front of what \
+                 varies, a checksum and no tail",
+            );
+        }
+    }
+    None
+}
+
+const MAX_TEXT: usize = 128;
+const MAX_DIGITS: usize = 16;
+/// No frame is longer.
+const LONGEST: usize = 512;

@@ -1,0 +1,27 @@
+//! The checksum of Modbus RTU, from proto-core/docs/wire/modbus-rtu.md: for the model and the devices of a soak,
+//! independent of the engine's.
+
+/// A frame with its CRC, the low byte first.
+pub(crate) fn sealed(bytes: &[u8]) -> Vec<u8> {
+    let crc = bytes.iter().fold(0xFFFF_u16, |crc, &byte| {
+        (0..8).fold(crc ^ u16::from(byte), |crc, _| if crc & 1 == 1 { crc >> 1 ^ 0xA001 } else { crc >> 1 })
+    });
+    [bytes, &crc.to_le_bytes()].concat()
+}
+
+/// Whether the last two bytes are the CRC of the others.
+pub(crate) fn is_right(frame: &[u8]) -> bool {
+    let (bytes, _) = frame.split_at(frame.len() - 2);
+    sealed(bytes) == frame
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_specifications_example_has_its_crc() {
+        assert_eq!(sealed(&[2, 7]), [2, 7, 0x41, 0x12]);
+        assert!(is_right(&[2, 7, 0x41, 0x12]) && !is_right(&[2, 7, 0x41, 0x13]));
+    }
+}
