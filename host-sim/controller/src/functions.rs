@@ -11,7 +11,6 @@ use recipe_config::{Function, FunctionInput, InitialTarget, ShownState};
 
 use super::Controller;
 use super::machine::{ErrorId, Machine};
-use super::operations::cause_of;
 
 impl Controller {
     /// Carries out the functions of the inputs that have risen.
@@ -48,10 +47,7 @@ impl Controller {
             Function::Enable => Action::Enable,
             Function::Disable => Action::Disable,
         };
-        let (effect, _) = self.machine.act(now, action)?;
-        self.runs.ends_by(cause_of(action));
-        self.apply(now, effect);
-        Ok(())
+        self.act(now, action).map(drop)
     }
 
     /// Adds the input to the error of the function that was refused.

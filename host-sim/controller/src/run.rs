@@ -1,11 +1,12 @@
 //! What happens with time: transitions, the program's calls, cycles and the state stream.
 
+use proto_core::command::Action;
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::dialect::{FinishNotice, Motion};
 
 use super::events::Happened;
 use super::faults::Link;
-use super::machine::{Effect, ErrorId};
+use super::machine::{Effect, ErrorId, Transition};
 use super::motion::Braking;
 use super::ports::{Handed, Listening, Outgoing};
 use super::program::{Answer, Call, End, Program, Progress, Script, Variables, shortened};
@@ -84,6 +85,17 @@ impl Controller {
         let ports = self.ports.iter().filter_map(|port| port.deadline()).min();
         let all = [self.machine.deadline(), program, state, ports, self.server.deadline()];
         all.into_iter().flatten().min().unwrap_or(Instant::NEVER)
+    }
+
+    /// A command, button or input for the machine, with what it does to the rest of the controller.
+    ///
+    /// # Errors
+    /// The error that the machine shows; nothing else has changed.
+    pub(super) fn act(&mut self, now: Instant, action: Action) -> Result<Transition, ErrorId> {
+        let (effect, transition) = self.machine.act(now, action)?;
+        self.runs.ends_by(cause_of(action));
+        self.apply(now, effect);
+        Ok(transition)
     }
 
     /// Carries out the effect of a state change.
@@ -416,6 +428,16 @@ impl Controller {
             Some(at) => self.send_cut_packet(bytes.get(..at).unwrap_or(&bytes[..])),
             None => self.outputs.push_back(ControllerOutput::StatePacket { bytes }),
         }
+    }
+}
+
+/// The reason that `last_run` shows for a program that an action ends.
+fn cause_of(action: Action) -> &'static str {
+    match action {
+        Action::Disable => "disable",
+        Action::PowerOff => "power_off",
+        Action::Shutdown => "shutdown",
+        _ => "stop",
     }
 }
 

@@ -11,7 +11,7 @@ use proto_core::recipe::model;
 use proto_core::sysvar::{Direction, SysVar};
 use proto_core::time::Duration;
 use proto_core::wire::can::CanId;
-use recipe_config::file::{self, Config, FileError};
+use recipe_config::file::{self, Config, FileError, Text};
 use recipe_config::{
     AnyRecipe, DeviceField, DeviceRecipe, ExchangeKind, FrameEnds, NamedFrame, SimBus, SimConfig, SimField,
     SimParts, SimRecipe,
@@ -92,7 +92,7 @@ pub enum Role {
     Request(usize),
     /// Its reply.
     Reply(usize),
-    /// What a device sends if it refuses the request.
+    /// What the one who is asked sends if it refuses the request.
     Refusal(usize),
 }
 
@@ -171,9 +171,17 @@ impl Model {
     /// # Errors
     /// The first mistake in the file, with its place.
     pub fn load(path: &Path, overrides: &[String]) -> Result<Self, FileError> {
-        let config = file::load(path, overrides)?;
-        let recipes = file::load_recipes(path, overrides)?;
-        let frames = file::load_frames(path, overrides)?;
+        file::with_text(path, |text| Self::parse(text, overrides))
+    }
+
+    /// Same as [`Model::load`], from a text.
+    ///
+    /// # Errors
+    /// The first mistake in the text, with its place.
+    pub fn parse(text: Text<'_>, overrides: &[String]) -> Result<Self, FileError> {
+        let config = file::parse(text, overrides)?;
+        let recipes = file::parse_recipes(text, overrides)?;
+        let frames = file::parse_frames(text, overrides)?;
         // Reading the file has laid out the same frames.
         let all = recipes.iter().zip(&frames).enumerate().map(|(nth, (recipe, framed))| {
             let gateway = match &config {
@@ -187,7 +195,7 @@ impl Model {
             Ok(Recipe { name: recipe.name().to_owned(), formats: formats? })
         });
         let all: Result<Vec<_>, LayoutError> = all.collect();
-        let recipes = all.map_err(|error| file::error_at(path, overrides, &["recipe"], error))?;
+        let recipes = all.map_err(|error| file::error_in(text, overrides, &["recipe"], error))?;
         let (owner, ports) = match &config {
             Config::Gateway(config) => (Owner::Gateway, gateway_ports(config)),
             Config::Controller(config) => (Owner::Controller, controller_ports(config)),
@@ -297,7 +305,7 @@ fn of_device(
         let frames = [
             (Role::Request(nth + 1), asks, &exchange.request),
             (Role::Reply(nth + 1), answers, &exchange.reply),
-            (Role::Refusal(nth + 1), Direction::Input, &exchange.refusal),
+            (Role::Refusal(nth + 1), answers, &exchange.refusal),
         ];
         for (role, direction, frame) in frames {
             let Some(frame) = frame else { continue };
@@ -316,13 +324,9 @@ fn of_device(
 /// The frames of a recipe of system variables.
 fn of_system(recipe: &SimRecipe) -> Result<Vec<Format>, LayoutError> {
     let named = |id, (head, tail): (&[u8], &[u8]), fields: &[SimField]| {
-        let field = |field: &SimField| DeviceField {
-            name: field.name.clone(),
-            spec: FieldSpec::UserInput { ty: field.field.ty(), to: InputBinding::Unused },
-            repeats: false,
-            commands: None,
-            is_coil: false,
-            of_port: None,
+        let field = |field: &SimField| {
+            let spec = FieldSpec::UserInput { ty: field.field.ty(), to: InputBinding::Unused };
+            DeviceField::new(field.name.clone(), spec)
         };
         let fields = fields.iter().map(field).collect();
         NamedFrame { id, head: head.to_vec(), tail: tail.to_vec(), fields }

@@ -35,6 +35,10 @@ pub fn describe_use(field: &Field) -> String {
                     field.field.of_port.as_ref().map_or("this port".into(), |port| format!("port {port}"));
                 format!("{} of {of}{}", value.name(), formula(scale, offset))
             }
+            OutputBinding::Link { link, scale, offset } => {
+                let name = link.name().or(field.field.of_port.as_deref()).unwrap_or_default();
+                format!("link {name} is up{}", formula(scale, offset))
+            }
         },
         FieldSpec::Fixed { value, .. } => format!("always {value}"),
         FieldSpec::TextInput { to: Some(words), .. } => {
@@ -43,7 +47,12 @@ pub fn describe_use(field: &Field) -> String {
         FieldSpec::TextInput { to: None, .. } => "text".into(),
         FieldSpec::TextOutput { from, .. } => format!("text from {} words from {}", from.count, from.first),
         FieldSpec::Length(_) => "length".into(),
-        FieldSpec::System(_) | FieldSpec::Padding { .. } | FieldSpec::Checksum(_) => String::new(),
+        FieldSpec::System(_)
+        | FieldSpec::Padding { .. }
+        | FieldSpec::Checksum(_)
+        // Not among the fields with names.
+        | FieldSpec::Limits(_)
+        | FieldSpec::Mapped(_) => String::new(),
     }
 }
 

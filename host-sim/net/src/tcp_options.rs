@@ -2,6 +2,7 @@
 //! acknowledged.
 
 use std::io;
+use std::net::SocketAddr;
 use std::os::fd::{AsFd, AsRawFd};
 use std::time::Duration;
 
@@ -13,6 +14,19 @@ pub fn limit_buffers(listener: &TcpListener) {
     // Accepted connections inherit the sizes. A system that refuses has limits of its own.
     let _ = sockopt::set_socket_recv_buffer_size(listener, BUFFER);
     let _ = sockopt::set_socket_send_buffer_size(listener, BUFFER);
+}
+
+/// Accepts one connection. Errors of the system, such as too few descriptors, are told to `failed` and waited out.
+pub async fn accept(listener: &TcpListener, mut failed: impl FnMut(&io::Error)) -> (TcpStream, SocketAddr) {
+    loop {
+        match listener.accept().await {
+            Ok(accepted) => return accepted,
+            Err(error) => {
+                failed(&error);
+                tokio::time::sleep(ACCEPT_AGAIN).await;
+            }
+        }
+    }
 }
 
 /// Sends small segments at once (TCP_NODELAY), and ends the connection 20 s after its peer was last heard
@@ -64,6 +78,8 @@ pub fn unacknowledged(stream: &TcpStream) -> io::Result<usize> {
     Ok(usize::try_from(count).unwrap_or(0))
 }
 
+/// Time after which a listening socket is tried again.
+const ACCEPT_AGAIN: Duration = Duration::from_millis(50);
 /// Bytes in each direction.
 const BUFFER: usize = 64 * 1_024;
 /// Silence before the first keepalive probe, and time between two.

@@ -66,7 +66,7 @@ pub fn run(config: SimConfig, options: ControllerOptions) -> Result<(), StartErr
     let bound = run.console.as_ref().map(ConsoleOptions::bind).transpose()?;
     let handle = spawn(config, options)?;
     match bound {
-        Some(bound) => host::foreground(Consoled::start(bound, handle)?, &run),
+        Some(bound) => host::foreground(Consoled::start(bound, handle, run.log.clone())?, &run),
         None => host::foreground(handle, &run),
     }
 }
@@ -92,7 +92,7 @@ pub fn start_with(config: SimConfig, options: ControllerOptions) -> Result<Handl
 }
 
 fn spawn(config: SimConfig, options: ControllerOptions) -> Result<Handle, StartError> {
-    host::start("controller", async move || {
+    host::start("controller", async move |_| {
         let scheduling = match options.pace {
             // It would look for input with priority over the clients that it waits for.
             Pace::Stepped => Scheduling::Ordinary,

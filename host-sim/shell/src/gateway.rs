@@ -1,10 +1,11 @@
 //! The gateway's engine on real sockets and devices.
 //!
-//! Everything runs on one thread. Input of a device or socket is reported to the engine at once, and the
+//! The engine, devices and sockets are on one thread. Input of a device or socket is reported to the engine at once, and the
 //! outputs are carried out before anything else is read. So only one call of the engine is between the last
 //! byte of a field frame and the request to the controller.
 
 mod doctor;
+mod open;
 mod shown;
 mod tapping;
 
@@ -12,34 +13,35 @@ use std::cell::{Cell, RefCell};
 use std::collections::{BTreeMap, BTreeSet};
 use std::rc::Rc;
 use std::sync::Arc;
-use std::sync::mpsc::SyncSender;
-use std::time::SystemTime;
 
-use proto_core::config::{Bus, GatewayConfig, Parts, Port as PortConfig, image};
-use proto_core::engine::{Input, LinkId, LinkKind, OUTPUT_BUFFER, Output, PortId, Transport};
-use proto_core::sysvar::Direction;
+use proto_core::config::GatewayConfig;
+use proto_core::engine::{Input, LinkId, LinkKind, OUTPUT_BUFFER, Output, PortId};
 use proto_core::time::Instant;
 use serde_json::{Value, json};
-use tokio::net::{TcpListener, UdpSocket};
 use tokio::sync::Notify;
 use tokio::task::JoinSet;
 use tracing::{info, trace, warn};
 
+use doctor::Doctor;
+pub(crate) use doctor::Told;
 pub use doctor::listen;
+pub(crate) use doctor::{look_at_states, unexplained};
+use open::Devices;
 
 use super::console::window::{MAX_SAFE, Window};
-use super::console::{self, ConfigFile, Supervised};
+use super::console::{ConfigFile, ConsoleOptions, Supervised};
 use super::host::{self, Handle, Shell};
 use super::link::{self, Endpoint, LinkControl, LinkEvent};
+use super::telling::{Glimpse, Teller};
 use super::{RunOptions, StartError};
-use recipe_capture::{Cell as Watched, Epoch, Watch};
+use recipe_capture::{Decoder, Watch};
 use recipe_device::bind::Bind;
 use recipe_device::exchange::{PortEvent, PortTx};
-use recipe_device::port::{Port, PortBus};
+use recipe_device::kept::Shelf;
+use recipe_device::port::Port;
 use recipe_doctor::PortRecord;
 use recipe_net::fairness;
 use recipe_net::realtime::{self, Scheduling};
-use recipe_net::tcp_options;
 use recipe_net::timer::{Timer, now};
 use shown::Shown;
 use tapping::{TAP, Tapping};
@@ -52,8 +54,12 @@ pub(crate) type Engine = proto_core::engine::Engine<8, 4, 512, TAP>;
 pub(crate) struct Observers {
     /// Captures and recordings.
     pub watch: Watch,
+    /// What frames mean, for them.
+    pub decoder: Arc<Decoder>,
     /// A console.
     pub window: Option<Arc<Window>>,
+    /// An edge node.
+    pub glimpse: Option<Glimpse>,
     /// Whoever reads the log or the statistics, where findings are told.
     pub readers: bool,
 }
@@ -61,7 +67,13 @@ pub(crate) struct Observers {
 impl Observers {
     pub(crate) fn of(options: &RunOptions) -> Self {
         let readers = options.stats.is_some() || tracing::enabled!(tracing::Level::INFO);
-        Self { watch: options.watch.clone(), window: None, readers }
+        Self {
+            watch: options.watch.clone(),
+            decoder: Arc::clone(&options.decoder),
+            window: None,
+            glimpse: None,
+            readers,
+        }
     }
 }
 
@@ -72,8 +84,10 @@ struct Gateway {
     links: Vec<(LinkId, LinkKind, Endpoint)>,
     ready: Value,
     window: Option<Arc<Window>>,
+    /// That of an edge node.
+    glimpse: Option<Arc<Window>>,
     /// Who looks at it once a second, if somebody does.
-    doctor: Option<SyncSender<doctor::Snapshot>>,
+    doctor: Option<Doctor>,
 }
 
 /// What the gateway may send.
@@ -107,83 +121,23 @@ struct Core {
     started: Instant,
     /// What came in at each port lately.
     records: RefCell<Vec<PortRecord>>,
-    /// The newest findings, if somebody looks.
-    told: RefCell<Option<doctor::Told>>,
 }
 
 impl Gateway {
-    /// Opens devices and listening sockets.
-    async fn open(
-        config: &GatewayConfig,
-        binds: &[Bind],
-        voice: Voice,
-        watch: &Watch,
-    ) -> Result<Self, StartError> {
-        let engine: Box<Engine> =
-            Box::new(Engine::new(config).map_err(|error| StartError::new(error.to_string()))?);
-        let field = || config.view().field_ports().map(|(_, port, _)| port);
-        if let Some(bind) = binds.iter().find(|bind| field().all(|port| port.name != bind.port.as_str())) {
-            let names: Vec<_> = field().map(|port| port.name.as_str()).collect();
-            let message = format!("--bind {bind}: there is no such port; there are {}", names.join(", "));
-            return Err(StartError::new(message));
-        }
-        let (mut ports, mut records) = (Vec::new(), Vec::new());
-        let mut asks = BTreeSet::new();
-        for (index, port, recipe) in config.view().field_ports() {
-            let mut device = open_port(port, binds).await?;
-            if matches!(recipe.parts, Parts::Can { .. }) {
-                let ids = |part| config.view().can_ids(recipe, part);
-                device.listen_to(ids(Direction::Input).chain(ids(Direction::Output)).collect());
-            }
-            let mut record = PortRecord::new(PortId(index));
-            let bind = binds.iter().find(|bind| port.name == bind.port.as_str());
-            record.device = bind.map(|bind| bind.device.to_string()).unwrap_or_default();
-            records.push(record);
-            if recipe.exchanges.len > 0 {
-                asks.insert(PortId(index));
-            }
-            ports.push((PortId(index), device));
-        }
-        let mut links = Vec::new();
-        for info in engine.links() {
-            links.push((info.id, info.kind, open_endpoint(info.endpoint).await?));
-        }
-        let name = |id: PortId| config.ports.get(usize::from(id.0)).map_or("", |port| port.name.as_str());
-        let mut places = serde_json::Map::new();
-        for (id, port) in &ports {
-            places.insert(name(*id).to_owned(), json!(port.place()));
-        }
-        for (_, kind, endpoint) in &links {
-            if let LinkKind::RecipeTcpListen { port } | LinkKind::RecipeUdpListen { port } = kind {
-                places.insert(name(*port).to_owned(), json!(endpoint.place()));
-            }
-        }
-        let tapping = begin_tapping(config, &engine, watch)?;
-        let core = Rc::new(Core {
-            tapping: RefCell::new(tapping),
-            ports: ports.iter().map(|(id, port)| (*id, (name(*id).to_owned(), port.tx()))).collect(),
-            links: links.iter().map(|(id, ..)| (*id, Rc::default())).collect(),
-            engine: RefCell::new(engine),
-            deadline: Cell::new(Instant::NEVER),
-            sleeps: Cell::new(0),
-            unreachable: RefCell::default(),
-            deadline_moved: Notify::new(),
-            is_ending: Cell::new(false),
-            voice,
-            asks,
-            started: now(),
-            records: RefCell::new(records),
-            told: RefCell::default(),
-        });
-        Ok(Self { core, ports, links, ready: json!({ "ports": places }), window: None, doctor: None })
-    }
-
     async fn drive(self) -> Result<(), StartError> {
-        let Self { core: shared, ports, links, window, doctor, .. } = self;
+        let Self { core: shared, ports, links, window, glimpse, doctor, .. } = self;
         let mut tasks = JoinSet::new();
         if let Some(window) = window {
             let core = Rc::clone(&shared);
             tasks.spawn_local(async move { core.show(&window).await });
+            if doctor.is_none() {
+                let core = Rc::clone(&shared);
+                tasks.spawn_local(async move { core.keep_notes().await });
+            }
+        }
+        if let Some(glimpse) = glimpse {
+            let core = Rc::clone(&shared);
+            tasks.spawn_local(async move { core.show(&glimpse).await });
         }
         for (id, port) in ports {
             let core = Rc::clone(&shared);
@@ -258,13 +212,17 @@ impl Core {
         }
     }
 
-    /// Fills a console's window when it asks, and brings the safe values out when it wants to end this gateway.
+    /// Fills a window when somebody asks, and brings the safe values out when it wants to end this gateway.
     async fn show(&self, window: &Window) -> Result<(), StartError> {
         loop {
             tokio::select! {
                 () = window.wanted.notified() => window.fill(|shot| {
                     shot.engine.clone_from(&self.engine.borrow());
                     shot.at = now();
+                    shot.running = shot.at.saturating_since(self.started);
+                    shot.keep_records(&self.records.borrow());
+                    shot.links.clear();
+                    shot.links.extend(self.engine.borrow().links().map(|info| self.facts_of(info.id)));
                     shot.devices = Default::default();
                     for (port, (_, tx)) in &self.ports {
                         if let Some(counters) = shot.devices.get_mut(usize::from(port.0)) {
@@ -275,6 +233,7 @@ impl Core {
                 () = window.ending.notified() => {
                     self.is_ending.set(true);
                     self.engine.borrow_mut().make_safe();
+                    self.tapping.borrow_mut().make_safe(now());
                     self.input(Input::Tick);
                     let is_safe = async {
                         while !self.engine.borrow().is_safe() {
@@ -454,9 +413,6 @@ impl Core {
                 lift(shown, "turned_away");
             }
         }
-        if let Some(told) = &*self.told.borrow() {
-            stats["findings"] = doctor::words(told);
-        }
         stats
     }
 }
@@ -465,17 +421,6 @@ impl Drop for Core {
     fn drop(&mut self) {
         self.tapping.get_mut().end(self.engine.get_mut(), now());
     }
-}
-
-/// Begins to tell whoever watches.
-fn begin_tapping(config: &GatewayConfig, engine: &Engine, watch: &Watch) -> Result<Tapping, StartError> {
-    let at = now();
-    let cell = Watched::new(config, engine, Epoch { at, wall: SystemTime::now() });
-    let mut bytes = vec![0; image::MAX_IMAGE];
-    let len = image::encode(config, &mut bytes).map_err(|error| StartError::new(error.to_string()))?;
-    bytes.truncate(len);
-    Tapping::begin(watch, cell, at, &bytes)
-        .map_err(|error| StartError::new(format!("cannot start a thread: {error}")))
 }
 
 /// Moves the entries of the inner object `key` to the outer one.
@@ -493,19 +438,25 @@ fn lift(outer: &mut Value, key: &str) {
 /// # Errors
 /// The reason why it could not start; nothing is left behind then.
 pub fn run(config: GatewayConfig, options: RunOptions) -> Result<(), StartError> {
-    let handle = spawn(config, options.binds.clone(), options.scheduling, Observers::of(&options))?;
+    let teller = options.sparkplug.clone().map(Teller::start).transpose()?;
+    let glimpse = teller.as_ref().map(Teller::glimpse);
+    let observers = Observers { glimpse, ..Observers::of(&options) };
+    let handle = spawn(config, options.binds.clone(), options.scheduling, observers, Shelf::default())?;
     host::foreground(handle, &options)
 }
 
-/// Same, with a console that can give it another configuration. Without options for a console it has none.
+/// Same, with a console that can give it another configuration.
 ///
 /// # Errors
 /// The reason why it could not start; nothing is left behind then.
-pub fn run_with_console(file: ConfigFile, options: RunOptions) -> Result<(), StartError> {
-    match &options.console {
-        Some(console) => host::foreground(Supervised::start(file, &options, console)?, &options),
-        None => run(*console::gateway(&file)?, options),
-    }
+pub fn run_with_console(
+    file: ConfigFile,
+    console: &ConsoleOptions,
+    options: &RunOptions,
+) -> Result<(), StartError> {
+    let teller = options.sparkplug.clone().map(Teller::start).transpose()?;
+    let glimpse = teller.as_ref().map(Teller::glimpse);
+    host::foreground(Supervised::start(file, options, console, glimpse)?, options)
 }
 
 /// Starts the gateway on a thread of its own; dropping the handle ends it.
@@ -523,95 +474,43 @@ pub fn start(config: GatewayConfig, binds: Vec<Bind>) -> Result<Handle, StartErr
 /// The reason why it could not start; nothing is left behind then.
 pub fn start_watched(config: GatewayConfig, binds: Vec<Bind>, watch: &Watch) -> Result<Handle, StartError> {
     let observers = Observers { watch: watch.clone(), ..Observers::default() };
-    spawn(config, binds, Scheduling::Ordinary, observers)
+    spawn(config, binds, Scheduling::Ordinary, observers, Shelf::default())
 }
 
-/// Starts the gateway, with those who look at it.
+/// Starts the gateway, with those who look at it. Devices that another one has left are on the shelf, and this one leaves
+/// its own there.
 pub(crate) fn spawn(
     config: GatewayConfig,
     binds: Vec<Bind>,
     scheduling: Scheduling,
     observers: Observers,
+    shelf: Shelf,
 ) -> Result<Handle, StartError> {
-    let Observers { watch, window, readers } = observers;
-    let watched = watch.clone();
-    let handle = host::start("gateway", async move || {
-        let mut gateway = Gateway::open(&config, &binds, Voice::Full, &watched).await?;
-        gateway.window = window;
-        if readers {
-            let (doctor, told) = doctor::start(config)?;
-            gateway.doctor = Some(doctor);
-            gateway.core.told.replace(Some(told));
+    let watch = observers.watch.clone();
+    let (doctor, told) = match observers.readers {
+        true => doctor::start(config.clone(), &binds).map(|(doctor, told)| (Some(doctor), Some(told)))?,
+        false => (None, None),
+    };
+    let glimpse = observers.glimpse.as_ref().map(|glimpse| glimpse.open(&config));
+    let handle = host::start("gateway", async move |at_end| {
+        let devices = Devices { binds: &binds, left: Some((shelf, at_end)) };
+        let mut gateway = Gateway::open(&config, devices, Voice::Full, &observers).await?;
+        gateway.window = observers.window;
+        gateway.glimpse = glimpse;
+        if doctor.is_some() || gateway.window.is_some() {
+            gateway.core.keep_records(&config, &binds);
         }
+        gateway.doctor = doctor;
         // Not as an argument of the log, which is not evaluated unless it is printed.
         let scheduling = realtime::apply(scheduling);
         info!(%scheduling, "the gateway is running");
         Ok(gateway)
     })?;
-    Ok(handle.with_watch(watch))
+    Ok(handle.with_watch(watch).with_findings(told))
 }
 
 /// How often is looked whether the safe values have arrived.
 const SAFE_CHECK: std::time::Duration = std::time::Duration::from_millis(5);
-
-async fn open_port(port: &PortConfig, binds: &[Bind]) -> Result<Port, StartError> {
-    let name = port.name.as_str();
-    let bus = match port.bus {
-        Bus::Rs485(settings) => PortBus::Serial(settings),
-        Bus::Can { bitrate } => PortBus::Can { bitrate },
-        Bus::TcpListen { .. } | Bus::UdpListen { .. } => {
-            return Err(StartError::new(format!("port {name} is not a field port")));
-        }
-    };
-    let mut own = binds.iter().filter(|bind| bind.port == name);
-    let (Some(bind), None) = (own.next(), own.next()) else {
-        let examples = match bus {
-            PortBus::Serial(_) => "pty:PATH or serial:/dev/ttyUSB0",
-            PortBus::Can { .. } => "socketcan:can0, slcan-tcp:127.0.0.1:0 or slcan-pty:PATH",
-        };
-        return Err(StartError::new(format!(
-            "port {name} needs exactly one device: --bind {name}=DEVICE, such as {examples}"
-        )));
-    };
-    Port::open(&bind.device, bus)
-        .await
-        .map_err(|error| StartError::new(format!("--bind {name}={}: {error}", bind.device)))
-}
-
-async fn open_endpoint(to: proto_core::engine::Endpoint<'_>) -> Result<Endpoint, StartError> {
-    if to.host.is_empty() {
-        let message = "controller.address is needed: the controller's address or host name";
-        return Err(StartError::new(message));
-    }
-    let host = to.host.to_owned();
-    let refused = |address, error| StartError::new(format!("cannot listen on {address}: {error}"));
-    Ok(match to.transport {
-        Transport::Tcp { port } => Endpoint::Tcp { host, port },
-        Transport::Udp { port } => Endpoint::Udp { host, port },
-        Transport::TcpListen { local } => {
-            let listener = TcpListener::bind(local).await.map_err(|error| refused(local, error))?;
-            tcp_options::limit_buffers(&listener);
-            Endpoint::TcpListen { listener, controller: host }
-        }
-        Transport::UdpListen { local } => {
-            let socket = UdpSocket::bind(local).await.map_err(|error| refused(local, error))?;
-            Endpoint::UdpListen { socket, controller: host }
-        }
-        other => return Err(StartError::new(format!("unknown kind of link: {other:?}"))),
-    })
-}
-
-impl Endpoint {
-    /// The address of a listening link.
-    fn place(&self) -> String {
-        let address = match self {
-            Self::TcpListen { listener, .. } => listener.local_addr(),
-            Self::UdpListen { socket, .. } => socket.local_addr(),
-            Self::Tcp { host, port } | Self::Udp { host, port } => return format!("{host}:{port}"),
-        };
-        address.map_or_else(|_| String::new(), |address| address.to_string())
-    }
-}
 
 #[cfg(test)]
 #[path = "gateway_tests.rs"]

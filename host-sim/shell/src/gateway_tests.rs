@@ -67,7 +67,9 @@ impl Cell {
         let binds = binds.map(|bind| bind.parse().unwrap());
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         LocalSet::new().block_on(&runtime, async {
-            let gateway = Gateway::open(&config, &binds, Voice::Full, &Watch::new()).await.unwrap();
+            let gateway = Gateway::open(&config, Devices::own(&binds), Voice::Full, &Observers::default())
+                .await
+                .unwrap();
             let cell = Self { core: Rc::clone(&gateway.core), places: gateway.ready["ports"].clone() };
             let running = spawn_local(gateway.drive());
             let limit = StdDuration::from_secs(60);
@@ -303,7 +305,10 @@ fn reported_late(pieces: &[&[u8]]) -> PortCounters {
         ["line=tcp-listen:127.0.0.1:0", "can=slcan-tcp:127.0.0.1:0"].map(|bind| bind.parse().unwrap());
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
     LocalSet::new().block_on(&runtime, async move {
-        let core = Gateway::open(&config, &binds, Voice::Full, &Watch::new()).await.unwrap().core;
+        let core = Gateway::open(&config, Devices::own(&binds), Voice::Full, &Observers::default())
+            .await
+            .unwrap()
+            .core;
         core.input(Input::Tick);
         core.port_event(LINE, PortEvent::Up);
         for piece in pieces {

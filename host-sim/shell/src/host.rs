@@ -1,6 +1,7 @@
 //! What every shell needs: a thread with a runtime, a handle, and in the foreground the `ready` line,
 //! statistics and a clean end.
 
+use std::cell::RefCell;
 use std::io::{self, Write};
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::sync::{Arc, mpsc as blocking};
@@ -14,6 +15,7 @@ use tracing::warn;
 
 use super::service::Service;
 use super::{RunOptions, Signals, StartError};
+use crate::gateway::Told;
 use crate::out::{is_broken_pipe, print_stderr};
 
 /// Stack size: an engine is built by value, and unoptimised code has several copies of it on the stack.
@@ -36,6 +38,7 @@ pub struct Handle {
     ready: Value,
     requests: mpsc::UnboundedSender<Request>,
     watch: Watch,
+    findings: Option<Told>,
     thread: Option<JoinHandle<Result<(), StartError>>>,
 }
 
@@ -55,27 +58,50 @@ pub(crate) trait Running {
 
 /// Asks a shell, from any thread.
 #[derive(Debug, Clone)]
-pub(crate) struct Asker(mpsc::UnboundedSender<Request>);
+pub(crate) struct Asker {
+    requests: mpsc::UnboundedSender<Request>,
+    /// What is found by another thread than the one that is asked.
+    findings: Option<Told>,
+}
 
 impl Asker {
     /// One line of statistics; `None` if the shell has ended.
     pub(crate) fn stats(&self) -> Option<Value> {
         let (answer, stats) = blocking::channel();
-        self.0.send(Request::Stats(answer)).ok()?;
-        stats.recv().ok()
+        self.requests.send(Request::Stats(answer)).ok()?;
+        let mut stats = stats.recv().ok()?;
+        if let Some(findings) = &self.findings {
+            stats["findings"] = findings.words();
+        }
+        Some(stats)
     }
 
     /// Waits until it answers; false if it has ended.
     pub(crate) async fn answers(&self) -> bool {
         let (answer, answered) = oneshot::channel();
-        self.0.send(Request::Ping(answer)).is_ok() && answered.await.is_ok()
+        self.requests.send(Request::Ping(answer)).is_ok() && answered.await.is_ok()
     }
 
     /// One whose questions come out at the other end.
     #[cfg(test)]
     pub(super) fn channel() -> (Self, mpsc::UnboundedReceiver<Request>) {
         let (requests, inbox) = mpsc::unbounded_channel();
-        (Self(requests), inbox)
+        (Self { requests, findings: None }, inbox)
+    }
+}
+
+/// What the thread of a shell does at its end, after all tasks are gone and before its runtime is.
+#[derive(Default)]
+pub(super) struct AtEnd(RefCell<Vec<Box<dyn FnOnce()>>>);
+
+impl AtEnd {
+    /// Adds something to do. What fails to open ends too.
+    pub(super) fn add(&self, act: impl FnOnce() + 'static) {
+        self.0.borrow_mut().push(Box::new(act));
+    }
+
+    fn run(self) {
+        self.0.into_inner().into_iter().for_each(|act| act());
     }
 }
 
@@ -90,7 +116,7 @@ pub(super) enum Request {
 /// Opens a shell on a thread of its own and waits until everything is listening.
 pub(super) fn start<S: Shell>(
     name: &str,
-    open: impl AsyncFnOnce() -> Result<S, StartError> + Send + 'static,
+    open: impl AsyncFnOnce(&AtEnd) -> Result<S, StartError> + Send + 'static,
 ) -> Result<Handle, StartError> {
     let (requests, inbox) = mpsc::unbounded_channel();
     let (opened, outcome) = blocking::channel();
@@ -98,9 +124,9 @@ pub(super) fn start<S: Shell>(
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
         let runtime =
             runtime.map_err(|error| StartError::new(format!("cannot start the runtime: {error}")))?;
-        let local = LocalSet::new();
-        local.block_on(&runtime, async move {
-            let shell = match open().await {
+        let (local, at_end) = (LocalSet::new(), AtEnd::default());
+        let ended = local.block_on(&runtime, async {
+            let shell = match open(&at_end).await {
                 Ok(shell) => shell,
                 Err(error) => {
                     let _ = opened.send(Err(error));
@@ -113,12 +139,21 @@ pub(super) fn start<S: Shell>(
                 ended = shell.run() => ended.map_err(StartError::after_start),
                 () = serve(inbox, stats) => Ok(()),
             }
-        })
+        });
+        drop(local);
+        at_end.run();
+        ended
     });
     let thread = thread.map_err(|error| StartError::new(format!("cannot start a thread: {error}")))?;
     match outcome.recv() {
-        Ok(Ok(ready)) => Ok(Handle { ready, requests, watch: Watch::new(), thread: Some(thread) }),
-        Ok(Err(error)) => Err(error),
+        Ok(Ok(ready)) => {
+            Ok(Handle { ready, requests, watch: Watch::new(), findings: None, thread: Some(thread) })
+        }
+        Ok(Err(error)) => {
+            // Whoever tries again finds nothing open.
+            let _ = joined(thread);
+            Err(error)
+        }
         // The thread ended before it sent a result; its own result says why.
         Err(_) => Err(joined(thread).err().unwrap_or_else(|| StartError::new(format!("{name} ended")))),
     }
@@ -156,7 +191,7 @@ impl Handle {
     }
 
     pub(crate) fn asker(&self) -> Asker {
-        Asker(self.requests.clone())
+        Asker { requests: self.requests.clone(), findings: self.findings.clone() }
     }
 
     /// What is seen at the gateway's ports and links, for any number of subscribers; a controller tells
@@ -169,6 +204,13 @@ impl Handle {
         // Not by an update: a handle ends its shell when it is dropped.
         let mut handle = self;
         handle.watch = watch;
+        handle
+    }
+
+    /// What another thread finds belongs to the statistics.
+    pub(super) fn with_findings(self, findings: Option<Told>) -> Self {
+        let mut handle = self;
+        handle.findings = findings;
         handle
     }
 

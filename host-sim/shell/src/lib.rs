@@ -9,14 +9,17 @@ mod events_file;
 pub mod gateway;
 mod host;
 mod link;
+pub mod log;
 pub mod out;
 mod ready;
 mod service;
 mod signals;
 mod tcp;
+mod telling;
 mod udp;
 
 use std::fmt;
+use std::sync::Arc;
 use std::time::Duration;
 
 pub use events_file::EventsFile;
@@ -24,8 +27,9 @@ pub use host::Handle;
 pub use ready::ReadyFile;
 pub use signals::Signals;
 
-use recipe_capture::Watch;
+use recipe_capture::{Decoder, Watch};
 use recipe_device::bind::Bind;
+pub use recipe_fleet::file::Telling;
 pub use recipe_net::realtime::Scheduling;
 
 /// Options of a run beside its file.
@@ -41,8 +45,14 @@ pub struct RunOptions {
     pub scheduling: Scheduling,
     /// The console.
     pub console: Option<console::ConsoleOptions>,
+    /// Where and how a gateway tells what it knows.
+    pub sparkplug: Option<Telling>,
     /// What is seen of a gateway, for who has subscribed.
     pub watch: Watch,
+    /// The frames of its file by name, for who has subscribed. A gateway with a console has those of what it runs.
+    pub decoder: Arc<Decoder>,
+    /// The log, whose newest lines a console shows.
+    pub log: Option<log::Log>,
     /// `ready` goes to stderr: stdout is for a capture.
     pub stdout_is_taken: bool,
 }

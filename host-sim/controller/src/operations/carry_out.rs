@@ -128,12 +128,8 @@ impl Controller {
     }
 
     fn press(&mut self, now: Instant, action: Action) -> Result<(), Refused> {
-        match self.machine.act(now, action) {
-            Ok((effect, _)) => {
-                self.runs.ends_by(cause_of(action));
-                self.apply(now, effect);
-                Ok(())
-            }
+        match self.act(now, action) {
+            Ok(_) => Ok(()),
             Err(_) => refused(self.newest_error()),
         }
     }
@@ -151,7 +147,7 @@ impl Controller {
             },
         };
         let Some(script) = program::named(&self.scripts, program).cloned() else {
-            return refused(format!("there is no program {program}; there are {}", self.script_names()));
+            return Err(self.no_program(program));
         };
         if self.machine.check_run_at_pendant().is_err() {
             return refused(self.newest_error());
@@ -166,9 +162,22 @@ impl Controller {
         }
     }
 
-    fn script_names(&self) -> String {
+    fn no_program(&self, name: &str) -> Refused {
         let names: Vec<&str> = self.scripts.iter().map(Script::name).collect();
-        if names.is_empty() { "none".to_owned() } else { names.join(", ") }
+        let names = if names.is_empty() { "none".to_owned() } else { names.join(", ") };
+        Refused(format!("program: there is no program {name}; there are {names}"))
+    }
+
+    /// Whether an operation may name this program: to run it as commands do, or to remove it.
+    pub(crate) fn check_program(&self, operation: &Operation) -> Result<(), Refused> {
+        let (program, is_there) = match operation {
+            Operation::Run { program, .. } => (program, program::named(&self.scripts, program).is_some()),
+            Operation::Remove { program } => {
+                (program, self.scripts.iter().any(|script| script.name() == program))
+            }
+            _ => return Ok(()),
+        };
+        if is_there { Ok(()) } else { Err(self.no_program(program)) }
     }
 
     fn check_idle(&self, program: &str) -> Result<(), Refused> {
@@ -204,14 +213,14 @@ impl Controller {
     fn remove(&mut self, program: &str) -> Result<(), Refused> {
         self.check_idle(program)?;
         let Some(nth) = self.scripts.iter().position(|script| script.name() == program) else {
-            return refused(format!("there is no program {program}; there are {}", self.script_names()));
+            return Err(self.no_program(program));
         };
         self.scripts.remove(nth);
         Ok(())
     }
 
     pub(super) fn port_index(&self, name: &str) -> Result<usize, Refused> {
-        self.port_named(name).map_err(Refused)
+        self.port_named(name).map_err(|error| Refused(format!("port: {error}")))
     }
 
     fn give_recipe(&mut self, now: Instant, port: &str, recipe: Option<&str>) -> Result<(), Refused> {
@@ -222,7 +231,10 @@ impl Controller {
                 let recipes = &self.config.recipes;
                 let Some(index) = recipes.iter().position(|recipe| recipe.name == name) else {
                     let names: Vec<_> = recipes.iter().map(|recipe| recipe.name.as_str()).collect();
-                    return refused(format!("there is no recipe {name}; there are {}", names.join(", ")));
+                    return refused(format!(
+                        "recipe: there is no recipe {name}; there are {}",
+                        names.join(", ")
+                    ));
                 };
                 Some(index)
             }
@@ -247,16 +259,6 @@ impl Controller {
 pub(crate) fn number(value: f64) -> Value {
     let is_whole = value.fract() == 0.0 && value.abs() < 9e15;
     if is_whole { json!(value as i64) } else { json!(value) }
-}
-
-/// The reason that `last_run` shows for a program that an action ends.
-pub(crate) fn cause_of(action: Action) -> &'static str {
-    match action {
-        Action::Disable => "disable",
-        Action::PowerOff => "power_off",
-        Action::Shutdown => "shutdown",
-        _ => "stop",
-    }
 }
 
 /// Maximum length of a program's name.

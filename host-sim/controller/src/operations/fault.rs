@@ -4,7 +4,7 @@ use proto_core::modbus::Exception;
 use proto_core::time::Duration;
 use serde::{Deserialize, Serialize};
 
-use super::{Refused, refused};
+use super::{Refused, refused, time};
 use crate::{Controller, Link};
 
 /// A fault, with what it is on.
@@ -139,7 +139,7 @@ impl Controller {
             }
             (None, None, Some(_), None, _) => refused("kind: an item can only spoil"),
             (None, None, None, Some(seconds), None) => {
-                self.delay_transitions(duration("transitions", *seconds)?);
+                self.delay_transitions(time("transitions", *seconds)?);
                 Ok(())
             }
             _ => refused(
@@ -156,7 +156,7 @@ impl Controller {
             (Kind::Garbage, _) => self.faults.set_garbage(server, true),
             (Kind::Delay, Link::Command | Link::Modbus) => {
                 let Some(seconds) = fault.seconds else { return refused("seconds are missing") };
-                self.delay_answers(server, duration("seconds", seconds)?);
+                self.delay_answers(server, time("seconds", seconds)?);
             }
             (Kind::Exception, Link::Modbus) => {
                 let Some(code) = fault.code else { return refused("code is missing") };
@@ -218,12 +218,3 @@ fn check_arguments(fault: &Fault) -> Result<(), Refused> {
     }
     Ok(())
 }
-
-fn duration(name: &str, seconds: f64) -> Result<Duration, Refused> {
-    if !(0.0..=MAX_SECONDS).contains(&seconds) {
-        return refused(format!("{name}: {seconds} is not within 0 to {MAX_SECONDS}"));
-    }
-    Ok(Duration::from_micros((seconds * 1e6).round() as u64))
-}
-
-const MAX_SECONDS: f64 = 86_400.0;

@@ -9,6 +9,7 @@ mod fault;
 
 use std::collections::BTreeMap;
 
+use proto_core::time::Duration;
 use proto_core::wire::state::OperationMode;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
@@ -17,7 +18,7 @@ use super::condition::Condition;
 use super::events::KINDS;
 use super::faults::Link;
 use super::machine::SafetyHold;
-pub(crate) use carry_out::{cause_of, number};
+pub(crate) use carry_out::number;
 pub use fault::{Fault, Kind, NoNumber, Spoil};
 
 /// An operation. In JSON its name is the value of `do`.
@@ -290,6 +291,20 @@ pub fn check_kinds(kinds: &[String]) -> Result<(), Refused> {
         None => Ok(()),
     }
 }
+
+/// A time in seconds, of the key `name`.
+///
+/// # Errors
+/// It is not within 0 to a day.
+pub fn time(name: &str, seconds: f64) -> Result<Duration, Refused> {
+    if !(0.0..=MAX_SECONDS).contains(&seconds) {
+        return refused(format!("{name}: {seconds} is not within 0 to {MAX_SECONDS}"));
+    }
+    Ok(Duration::from_micros((seconds * 1e6).round() as u64))
+}
+
+/// The longest time that is waited, delayed or planned for.
+const MAX_SECONDS: f64 = 86_400.0;
 
 const fn default_max() -> usize {
     1_000

@@ -17,7 +17,6 @@ use proto_core::wire::state::ProgramState;
 use super::Link;
 use crate::events::Happened;
 use crate::machine::{ErrorId, Progress, Transition};
-use crate::operations::cause_of;
 use crate::program;
 use crate::{ConnId, Controller, ControllerOutput};
 
@@ -200,10 +199,8 @@ impl Controller {
                 self.speed_changed(now);
                 self.reply(now, conn, &reply);
             }
-            Command::Do(action) => match self.machine.act(now, action) {
-                Ok((effect, transition)) => {
-                    self.runs.ends_by(cause_of(action));
-                    self.apply(now, effect);
+            Command::Do(action) => match self.act(now, action) {
+                Ok(transition) => {
                     if let Some(session) = self.server.command.get_mut(&conn) {
                         session.pending = Some(Pending { transition, until: now + MAX_TRANSITION });
                     }

@@ -425,7 +425,7 @@ fn a_port_gets_another_recipe_and_another_cycle() {
     assert_eq!(cell.take_sent().len(), 5);
     assert!(refusal(&mut cell, &json!({ "do": "cycle", "port": "p", "ms": 3 })).contains("not within 4 to"));
     let why = refusal(&mut cell, &json!({ "do": "recipe", "port": "p", "recipe": "x" }));
-    assert_eq!(why, "there is no recipe x; there are r");
+    assert_eq!(why, "recipe: there is no recipe x; there are r");
 }
 
 #[test]

@@ -13,7 +13,7 @@ use toml::de::{DeTable, DeValue};
 use super::{Step, Timeline, Trigger};
 use crate::Controller;
 use crate::condition::Condition;
-use crate::operations::{Operation, Refused};
+use crate::operations::{Operation, Refused, time};
 
 impl Timeline {
     /// Reads a timeline for this controller. `name` is the file's name in messages.
@@ -45,7 +45,7 @@ impl Timeline {
             }
         }
         for (step, (key, table)) in steps.iter().zip(tables) {
-            let checked = trial.check_program(&step.operation);
+            let checked = trial.controller.check_program(&step.operation);
             checked.map_err(|error| file.nearest(&key, "program", table, &error))?;
         }
         Ok(Self { steps, began: None })
@@ -70,11 +70,11 @@ impl File<'_> {
         let wrong = |name: &str, message: &str| {
             self.error(place(name).unwrap_or(at), &format!("{key}.{name}"), message)
         };
-        let seconds = |name: &str, value: Value| match value.as_f64() {
-            Some(seconds) if (0.0..=MAX_SECONDS).contains(&seconds) => {
-                Ok(Duration::from_micros((seconds * 1e6).round() as u64))
-            }
-            _ => Err(wrong(name, &format!("{value} is not a number of seconds within 0 to {MAX_SECONDS}"))),
+        let seconds = |name: &str, value: Value| {
+            let Some(seconds) = value.as_f64() else {
+                return Err(wrong(name, &format!("{value} is not a number of seconds")));
+            };
+            time(name, seconds).map_err(|error| self.nearest(key, name, table, &error))
         };
         let (at_s, when) = (fields.remove("at_s"), fields.remove("when"));
         let (after_s, repeat) = (fields.remove("after_s"), fields.remove("repeat"));
@@ -116,10 +116,14 @@ impl File<'_> {
     fn nearest(&self, key: &str, otherwise: &str, table: &DeTable<'_>, error: &Refused) -> FileError {
         let named = |text: &str| find(table, text).map(|(path, at)| (format!("{key}.{path}"), at));
         let quoted = |quote: char| error.0.split(quote).nth(1).and_then(named);
-        let before = error.0.split_once(": ").and_then(|(name, _)| named(name));
-        let place = before.or_else(|| quoted('`')).or_else(|| quoted('"'));
+        let before = error.0.split_once(": ").and_then(|(name, message)| Some((named(name)?, message)));
+        // The place has the name already.
+        let (place, message) = match before {
+            Some((place, message)) => (Some(place), message),
+            None => (quoted('`').or_else(|| quoted('"')), error.0.as_str()),
+        };
         let (path, at) = place.or_else(|| named(otherwise)).unwrap_or_else(|| (key.to_owned(), 0));
-        self.error(if at == 0 { self.table_start(table) } else { at }, &path, error.0.as_str())
+        self.error(if at == 0 { self.table_start(table) } else { at }, &path, message)
     }
 
     fn table_start(&self, table: &DeTable<'_>) -> usize {
@@ -151,22 +155,6 @@ impl Trial {
     fn new(config: &SimConfig) -> Result<Self, String> {
         let controller = Controller::new(config).map_err(|error| error.to_string())?;
         Ok(Self { controller })
-    }
-
-    /// Whether the file or a step has this program.
-    fn check_program(&mut self, operation: &Operation) -> Result<(), Refused> {
-        let (Operation::Run { program, .. } | Operation::Remove { program }) = operation else {
-            return Ok(());
-        };
-        let programs = self.controller.operate(NOW, &Operation::Programs {})?;
-        let names: Vec<&str> = programs.as_array().into_iter().flatten().filter_map(Value::as_str).collect();
-        match names.contains(&program.as_str()) {
-            true => Ok(()),
-            false => Err(Refused(format!(
-                "program: there is no program {program}; there are {}",
-                names.join(", ")
-            ))),
-        }
     }
 
     fn check(&mut self, operation: Operation) -> Result<Operation, Refused> {
@@ -243,5 +231,3 @@ fn json(value: &Spanned<DeValue<'_>>) -> Result<Value, (usize, String)> {
 const UNKNOWN: &str = "unknown key; a timeline has only steps, written [[step]]";
 /// The time of all trials.
 const NOW: Instant = Instant::from_millis(1);
-/// The latest time of a step.
-const MAX_SECONDS: f64 = 86_400.0;

@@ -1,5 +1,6 @@
 //! The endpoints: what each operation answers.
 
+use std::ops::RangeInclusive;
 use std::rc::Rc;
 
 use proto_core::time::Duration;
@@ -8,13 +9,14 @@ use recipe_remote::key::SCHEME;
 use recipe_remote::nonces::MAX_AGE;
 use recipe_remote::response::{Kind, Status};
 use recipe_remote::revisions::{Refused, Revision, TRIAL};
-use recipe_remote::route::{Operation, Served};
+use recipe_remote::route::Operation;
 use serde::Deserialize;
 use serde_json::{Value, json};
 use tokio::sync::oneshot;
 use tracing::{info, warn};
 
 use super::http::{Reply, Request};
+use super::reading::host_name;
 use super::supervisor::{Command, Failed, View, What, left_of};
 use super::{Server, Source, check, pendant};
 
@@ -22,7 +24,7 @@ impl Server {
     /// Carries out a request.
     pub(super) async fn carry_out(&self, request: Request<'_>) -> Reply {
         match (request.admitted.operation, &self.source) {
-            (Operation::Info, _) => self.info(),
+            (Operation::Page, _) => Reply::page(request.head.if_none_match),
             (Operation::Nonce, _) => {
                 let nonce = self.guard.borrow_mut().nonce(now());
                 let age = MAX_AGE.as_millis() / 1_000;
@@ -31,17 +33,12 @@ impl Server {
                     &json!({ "nonce": nonce.as_str(), "scheme": SCHEME, "max_age_s": age }),
                 )
             }
-            (operation @ (Operation::Status | Operation::Values | Operation::Metrics), source) => {
-                let Some(snapshot) = self.snapshots.newest(source).await else { return nothing_runs() };
-                let (kind, text) = match operation {
-                    Operation::Values => (Kind::Json, snapshot.values()),
-                    Operation::Metrics => (Kind::Metrics, snapshot.metrics()),
-                    _ => (Kind::Json, Some(snapshot.status())),
-                };
-                text.map_or_else(nothing_runs, |text| Reply::text(kind, text))
-            }
             (Operation::Check, _) => match std::str::from_utf8(&request.body) {
-                Ok(toml) => Reply::json(Status::OK, &check::report(toml)),
+                Ok(toml) => match request.head.query("image") {
+                    None => Reply::json(Status::OK, &check::report(toml)),
+                    Some("1") => image(toml),
+                    Some(_) => Reply::error(Status::BAD_REQUEST, "image is out of range; allowed: 1"),
+                },
                 Err(error) => Reply::error(Status::BAD_REQUEST, &format!("not UTF-8: {error}")),
             },
             (Operation::Config, Source::Gateway { shared, .. }) => config(&shared.view(), &request),
@@ -52,47 +49,57 @@ impl Server {
                 info!(peer = %request.peer, body = %String::from_utf8_lossy(&request.body), "pendant");
                 pendant::operate(*control, &request.body).await
             }
-            (operation, Source::Gateway { .. }) => self.change(operation, request).await,
-            // The table of routes has no others.
-            (_, Source::Controller { .. }) => Reply::error(Status::NOT_FOUND, "there is no such path"),
+            (Operation::Identify, Source::Gateway { .. }) => self.identify(&request),
+            (
+                Operation::Update
+                | Operation::PutUpdate
+                | Operation::TryUpdate
+                | Operation::ConfirmUpdate
+                | Operation::EndUpdate,
+                _,
+            ) => Reply::error(
+                Status::NOT_IMPLEMENTED,
+                "this gateway is a program; it is updated as a package, as it was installed",
+            ),
+            (
+                operation @ (Operation::PutConfig
+                | Operation::Apply
+                | Operation::Confirm
+                | Operation::Rollback),
+                Source::Gateway { .. },
+            ) => self.change(operation, request).await,
+            (operation, _) => self.read(operation, &request.head).await,
         }
     }
 
-    fn info(&self) -> Reply {
-        let role = match self.source.served() {
-            Served::Gateway => "gateway",
-            Served::Controller => "controller",
+    /// Tells a person beside several machines which one this is.
+    fn identify(&self, request: &Request<'_>) -> Reply {
+        let IdentifyArguments { s } = match arguments(&request.body) {
+            Ok(arguments) => arguments,
+            Err(reply) => return reply,
         };
-        let mut info = json!({
-            "role": role,
-            "version": env!("CARGO_PKG_VERSION"),
-            "api": "v1",
-            "uptime_s": now().saturating_since(self.started).as_millis() / 1_000,
-            "can_be_changed": self.guard.borrow().has_key(),
-            "console": {
-                "address": self.address,
-                "connections": self.connections.get(),
-                "streams": self.streams.get(),
-                "requests": self.guard.borrow().counters(),
-                "counters": self.counters.get(),
-            },
-        });
-        if let Source::Gateway { shared, .. } = &self.source {
-            let view = shared.view();
-            info["places"] = view.ready.clone();
-            info["revision"] = json!(view.revisions.as_ref().and_then(|revisions| revisions.running()));
+        if !IDENTIFY.contains(&s) {
+            let text = format!("s is out of range; allowed: {}..={}", IDENTIFY.start(), IDENTIFY.end());
+            return Reply::error(Status::BAD_REQUEST, &text);
         }
-        Reply::json(Status::OK, &info)
+        let name = host_name().unwrap_or_default();
+        let peer = request.peer.ip().to_canonical();
+        warn!(%peer, name, console = %self.address, "this is the gateway that somebody looks for");
+        Reply::json(Status::OK, &json!({}))
     }
 
     /// Requests that change the configuration, or what runs.
     async fn change(&self, operation: Operation, request: Request<'_>) -> Reply {
-        let Source::Gateway { shared, commands } = &self.source else { return nothing_runs() };
+        let Source::Gateway { shared, commands, .. } = &self.source else { return nothing_runs() };
         let what = match operation {
-            Operation::PutConfig => match put(&request, &shared.view().overrides.clone()) {
-                Ok(what) => what,
-                Err(reply) => return reply,
-            },
+            Operation::PutConfig => {
+                // The view must not be held while a text is read and an engine is built of it.
+                let overrides = shared.view().overrides.clone();
+                match put(&request, &overrides) {
+                    Ok(what) => what,
+                    Err(reply) => return reply,
+                }
+            }
             Operation::Apply => match arguments::<ApplyArguments>(&request.body) {
                 Ok(ApplyArguments { confirm_s, revision }) => {
                     What::Apply { number: revision, trial: Duration::from_millis((confirm_s * 1e3) as u64) }
@@ -143,6 +150,14 @@ impl Server {
     }
 }
 
+/// The image of a text for a board, or its first mistake.
+fn image(toml: &str) -> Reply {
+    match check::image(toml) {
+        Ok(bytes) => Reply::image(bytes),
+        Err(mistake) => Reply::json(Status::UNPROCESSABLE, &Value::Object(mistake.json())),
+    }
+}
+
 /// The text of the configuration that runs, or of the one that was asked for.
 fn config(view: &View, request: &Request<'_>) -> Reply {
     let Some(revisions) = &view.revisions else { return nothing_runs() };
@@ -165,7 +180,7 @@ fn config(view: &View, request: &Request<'_>) -> Reply {
 }
 
 /// The revisions, and what happens to them.
-fn revisions(view: &View) -> Value {
+pub(super) fn revisions(view: &View) -> Value {
     let Some(revisions) = &view.revisions else { return json!({ "kept": [] }) };
     let kept: Vec<_> = view
         .entries
@@ -211,10 +226,28 @@ fn default_trial() -> f64 {
 #[serde(deny_unknown_fields)]
 struct NoArguments {}
 
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct IdentifyArguments {
+    #[serde(default = "default_identify")]
+    s: u32,
+}
+
+fn default_identify() -> u32 {
+    10
+}
+
+/// For how many seconds a board shows itself. A host writes one line to its log.
+const IDENTIFY: RangeInclusive<u32> = 1..=600;
+
 /// The arguments in a body; none at all is an empty object.
 fn arguments<T: serde::de::DeserializeOwned>(body: &[u8]) -> Result<T, Reply> {
     let body = if body.is_empty() { b"{}" } else { body };
-    serde_json::from_slice(body).map_err(|error| Reply::error(Status::BAD_REQUEST, &error.to_string()))
+    // Else an array would be taken for the values of an object.
+    let object = serde_json::from_slice(body).map(Value::Object);
+    object
+        .and_then(serde_json::from_value)
+        .map_err(|error| Reply::error(Status::BAD_REQUEST, &error.to_string()))
 }
 
 /// A configuration to store: refused here if it could not run.
@@ -272,7 +305,7 @@ fn refusal(refused: Refused) -> Reply {
     Reply::error(status, &text)
 }
 
-fn nothing_runs() -> Reply {
+pub(super) fn nothing_runs() -> Reply {
     Reply::error(Status::UNAVAILABLE, "nothing runs at the moment; try again")
 }
 

@@ -1,11 +1,29 @@
 //! Texts of configurations: whether they can run, or one mistake with its place.
 
-use proto_core::config::{GatewayConfig, MAX_PORTS};
+use std::sync::Arc;
+
+use proto_core::config::{GatewayConfig, MAX_PORTS, image};
 use proto_core::engine::Engine;
+use recipe_capture::Decoder;
 use recipe_config::SimConfig;
 use recipe_config::file::{self, Config, FileError, Source, Text};
 use recipe_controller::Controller;
+use recipe_export::Model;
 use serde_json::{Map, Value, json};
+
+/// A gateway that can be started, and what its frames are called.
+#[derive(Debug, Clone)]
+pub(super) struct Prepared {
+    pub(super) config: Arc<GatewayConfig>,
+    pub(super) decoder: Arc<Decoder>,
+}
+
+/// Everything that a gateway of this text needs before it is started.
+pub(super) fn prepare(name: &str, toml: &str, overrides: &[String]) -> Result<Prepared, Box<Mistake>> {
+    let config = gateway(name, toml, overrides)?;
+    let model = Model::parse(Text { name, toml }, overrides).map_err(Mistake::of_file)?;
+    Ok(Prepared { config: config.into(), decoder: Arc::new(Decoder::new(&model)) })
+}
 
 /// The gateway of a text.
 pub(super) fn gateway(
@@ -16,6 +34,17 @@ pub(super) fn gateway(
     let config = file::parse_gateway(Text { name, toml }, overrides).map_err(Mistake::of_file)?;
     has_room(&config)?;
     Ok(config)
+}
+
+/// The image of a gateway's text, as `host-sim image` makes it.
+pub(super) fn image(toml: &str) -> Result<Vec<u8>, Box<Mistake>> {
+    let config = gateway(NAME, toml, &[])?;
+    let mut bytes = vec![0; image::MAX_IMAGE];
+    let len = image::encode(&*config, &mut bytes).map_err(|error| Mistake::of_whole(&error))?;
+    bytes.truncate(len);
+    // An image that a board would refuse is never given out.
+    image::decode(&bytes).map_err(|error| Mistake::of_whole(&error))?;
+    Ok(bytes)
 }
 
 fn has_room(config: &GatewayConfig) -> Result<(), Box<Mistake>> {
@@ -33,8 +62,10 @@ pub(super) fn report(toml: &str) -> Value {
         Config::Gateway(config) => {
             has_room(&config)?;
             let view = config.view();
-            let warnings: Vec<_> =
-                view.warnings().map(|warning| view.describe_warning(warning).to_string()).collect();
+            let warnings = view.warnings().map(|warning| view.describe_warning(warning).to_string());
+            let frames = file::parse_frames(Text { name: NAME, toml }, &[]).map_err(Mistake::of_file)?;
+            let of_file = recipe_config::negative_numbers(&frames).into_iter().map(|(_, said)| said);
+            let warnings: Vec<_> = warnings.chain(of_file).collect();
             Ok(json!({ "ok": true, "kind": "gateway", "warnings": warnings }))
         }
         Config::Controller(config) => {

@@ -10,8 +10,7 @@ use recipe_net::timer::now;
 use recipe_remote::guard::{Admitted, Refusal, Site};
 use recipe_remote::key::{BodyHash, SCHEME};
 use recipe_remote::request::{Head, HeadBuffer, HeadError};
-use recipe_remote::response::{CONTINUE, Kind, Length, Response, Status};
-use recipe_remote::route::Operation;
+use recipe_remote::response::{CONTINUE, Kind, Length, Page, Response, Status};
 use serde_json::{Value, json};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
@@ -26,14 +25,53 @@ use super::{Server, stream};
 pub(super) struct Reply {
     pub(super) status: Status,
     pub(super) kind: Kind,
-    pub(super) body: Rc<str>,
+    pub(super) body: Body,
     pub(super) fields: Vec<(&'static str, String)>,
+}
+
+/// What a response carries.
+#[derive(Debug)]
+pub(super) enum Body {
+    /// A text.
+    Text(Rc<str>),
+    /// Part of the program.
+    Bytes(&'static [u8]),
+    /// Made for this request.
+    Made(Vec<u8>),
+}
+
+impl Body {
+    fn as_bytes(&self) -> &[u8] {
+        match self {
+            Self::Text(text) => text.as_bytes(),
+            Self::Bytes(bytes) => bytes,
+            Self::Made(bytes) => bytes,
+        }
+    }
+}
+
+impl<T: Into<Rc<str>>> From<T> for Body {
+    fn from(text: T) -> Self {
+        Self::Text(text.into())
+    }
 }
 
 impl Reply {
     /// A document that was made before.
     pub(super) fn text(kind: Kind, body: Rc<str>) -> Self {
-        Self { status: Status::OK, kind, body, fields: Vec::new() }
+        Self { status: Status::OK, kind, body: Body::Text(body), fields: Vec::new() }
+    }
+
+    /// The page for people, unless the client has it.
+    pub(super) fn page(if_none_match: Option<&str>) -> Self {
+        let status = PAGE.status(if_none_match);
+        let body = Body::Bytes(if status == Status::OK { PAGE.bytes } else { &[] });
+        Self { status, kind: Kind::Page, body, fields: Vec::new() }
+    }
+
+    /// A configuration image.
+    pub(super) fn image(bytes: Vec<u8>) -> Self {
+        Self { status: Status::OK, kind: Kind::Image, body: Body::Made(bytes), fields: Vec::new() }
     }
 
     /// A JSON value.
@@ -79,13 +117,13 @@ impl Server {
     pub(super) async fn accept(self: Rc<Self>, listener: TcpListener) {
         tcp_options::limit_buffers(&listener);
         loop {
-            match listener.accept().await {
-                Ok((stream, peer)) => self.welcome(stream, peer),
-                Err(error) => {
-                    warn!(%error, "cannot accept a connection of the console");
-                    tokio::time::sleep(Duration::from_millis(50)).await;
+            let failed = |error: &io::Error| {
+                if let Some(more) = self.log_limit.allow(now()) {
+                    warn!(%error, more, "cannot accept a connection of the console");
                 }
-            }
+            };
+            let (stream, peer) = tcp_options::accept(&listener, failed).await;
+            self.welcome(stream, peer);
             tokio::task::yield_now().await;
         }
     }
@@ -96,7 +134,7 @@ impl Server {
             self.count(|counters| counters.turned_away += 1);
             // Without waiting for anything: there may be thousands.
             let reply = Reply::error(Status::UNAVAILABLE, "too many connections; try again");
-            let _ = stream.try_write(text_of(&reply).as_bytes());
+            let _ = stream.try_write(&bytes_of(&reply));
             return;
         }
         self.connections.set(self.connections.get() + 1);
@@ -161,8 +199,8 @@ impl Server {
                 return linger(stream).await;
             }
         };
-        if admitted.operation == Operation::Stream {
-            return stream::serve(self, stream).await;
+        if admitted.operation.is_endless() {
+            return stream::serve(self, stream, admitted.operation, &head).await;
         }
         let Some(body) = self.body(&mut stream, &admitted, rest, deadline).await? else { return Ok(()) };
         if admitted.is_signed() {
@@ -216,12 +254,12 @@ impl Server {
     }
 
     async fn answer(&self, stream: &mut TcpStream, reply: &Reply, is_head: bool) -> io::Result<()> {
-        let mut text = text_of(reply);
+        let mut bytes = bytes_of(reply);
         if is_head {
-            text.truncate(text.len() - reply.body.len());
+            bytes.truncate(bytes.len() - reply.body.as_bytes().len());
         }
         let write = async {
-            stream.write_all(text.as_bytes()).await?;
+            stream.write_all(&bytes).await?;
             stream.shutdown().await
         };
         timeout(MAX_TIME, write).await.unwrap_or_else(|_| {
@@ -231,9 +269,12 @@ impl Server {
     }
 }
 
-/// The text of a response.
-pub(super) fn text_of(reply: &Reply) -> String {
-    head_of(reply, Length::Bytes(reply.body.len() as u64)) + &*reply.body
+/// A whole response.
+pub(super) fn bytes_of(reply: &Reply) -> Vec<u8> {
+    let body = reply.body.as_bytes();
+    let mut bytes = head_of(reply, Length::Bytes(body.len() as u64)).into_bytes();
+    bytes.extend_from_slice(body);
+    bytes
 }
 
 /// The text of a head.
@@ -242,7 +283,10 @@ pub(super) fn head_of(reply: &Reply, length: Length) -> String {
         reply.fields.iter().map(|(name, value)| (*name, value as &dyn std::fmt::Display)).collect();
     let mut text = String::new();
     // A `String` has room for everything.
-    let _ = Response::new(reply.status, reply.kind, length).with(&fields).write(&mut text);
+    let _ = match reply.kind {
+        Kind::Page => PAGE.write_head(reply.status, &mut text),
+        kind => Response::new(reply.status, kind, length).with(&fields).write(&mut text),
+    };
     text
 }
 
@@ -255,6 +299,9 @@ async fn linger(mut stream: TcpStream) -> io::Result<()> {
     Ok(())
 }
 
+/// The page for people.
+const PAGE: Page =
+    Page { bytes: &recipe_console::PAGE, policy: recipe_console::POLICY, etag: recipe_console::ETAG };
 /// Maximum number of connections.
 const MAX_CONNECTIONS: usize = 8;
 /// How long a request may take to arrive, and a response to be read.

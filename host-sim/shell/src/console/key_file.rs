@@ -1,10 +1,8 @@
 //! `--console-key FILE`: the key, in a file that nobody else can read.
 
-use std::fs::File;
-use std::io::Read;
-use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 
+use recipe_device::files::read_private;
 use recipe_remote::key::Key;
 
 use crate::StartError;
@@ -16,19 +14,7 @@ use crate::StartError;
 pub fn read_key(path: &Path) -> Result<Key, StartError> {
     let refused =
         |why: &dyn std::fmt::Display| StartError::new(format!("--console-key {}: {why}", path.display()));
-    let mut file = File::open(path).map_err(|error| refused(&error))?;
-    // Of the file that was opened, whatever is at its path by now.
-    let metadata = file.metadata().map_err(|error| refused(&error))?;
-    if !metadata.is_file() {
-        return Err(refused(&"not a regular file"));
-    }
-    if metadata.mode() & 0o077 != 0 {
-        let mode = metadata.mode() & 0o777;
-        return Err(refused(&format_args!("others may use it, its mode is {mode:04o}; chmod 0600 it")));
-    }
-    let mut text = String::new();
-    let read = file.by_ref().take(100).read_to_string(&mut text);
-    read.map_err(|error| refused(&error))?;
+    let text = read_private(path, 100).map_err(|error| refused(&error))?;
     // The contents are not repeated: a mistyped key is almost one.
     Key::parse(text.trim_end()).ok_or_else(|| {
         refused(&"not 32 hexadecimal digits; `(umask 077; openssl rand -hex 16 > FILE)` makes a key")

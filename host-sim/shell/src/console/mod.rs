@@ -5,9 +5,11 @@
 
 mod api;
 mod check;
+mod frames;
 mod http;
 mod key_file;
 mod pendant;
+mod reading;
 mod snapshots;
 mod store;
 mod stream;
@@ -15,14 +17,15 @@ mod supervisor;
 pub(crate) mod window;
 
 use std::cell::{Cell, RefCell};
-use std::io::Read;
 use std::net::{SocketAddr, TcpListener};
 use std::path::PathBuf;
 use std::rc::Rc;
 use std::sync::{Arc, mpsc as blocking};
 use std::thread::JoinHandle;
 
-use proto_core::config::GatewayConfig;
+use recipe_capture::Watch;
+use recipe_device::random::random;
+use recipe_net::log_limit::LogLimit;
 use recipe_net::timer::now;
 use recipe_remote::guard::Guard;
 use recipe_remote::key::Key;
@@ -33,6 +36,7 @@ use tracing::info;
 
 use crate::StartError;
 use crate::host::{Asker, Handle, Running};
+use crate::log::Log;
 pub use key_file::read_key;
 use snapshots::Snapshots;
 pub use supervisor::ConfigFile;
@@ -40,6 +44,9 @@ pub(crate) use supervisor::Supervised;
 
 /// Stack of a thread that builds engines, which is done by value.
 const STACK: usize = 16 << 20;
+
+/// How far the console's thread stands back behind others.
+const NICENESS: i32 = 10;
 
 /// Options of a console.
 #[derive(Debug, Clone)]
@@ -50,6 +57,8 @@ pub struct ConsoleOptions {
     pub key: Option<Key>,
     /// The folder that keeps the last revisions of the configuration; without one they end with the process.
     pub state: Option<PathBuf>,
+    /// The port of the other half's console on this machine: the controller's for a gateway, and the reverse.
+    pub peer: Option<u16>,
 }
 
 /// A socket that listens and is not served yet.
@@ -58,6 +67,7 @@ pub(crate) struct Bound {
     listener: TcpListener,
     address: SocketAddr,
     key: Option<Key>,
+    peer: Option<u16>,
 }
 
 impl ConsoleOptions {
@@ -71,23 +81,17 @@ impl ConsoleOptions {
         let bound = TcpListener::bind(self.address).and_then(|listener| {
             listener.set_nonblocking(true)?;
             let address = listener.local_addr()?;
-            Ok(Bound { listener, address, key: self.key.clone() })
+            Ok(Bound { listener, address, key: self.key.clone(), peer: self.peer })
         });
         bound.map_err(|error| refused(&error))
     }
-}
-
-/// The gateway of a file.
-pub(crate) fn gateway(file: &ConfigFile) -> Result<Box<GatewayConfig>, StartError> {
-    let config = check::gateway(&file.name, &file.toml, &file.overrides);
-    config.map_err(|mistake| StartError::new(format!("{}: {mistake}", file.name)))
 }
 
 /// What a console serves.
 #[derive(Debug)]
 pub(crate) enum Source {
     /// A gateway that can be given another configuration.
-    Gateway { shared: Arc<supervisor::Shared>, commands: blocking::Sender<supervisor::Command> },
+    Gateway { shared: Arc<supervisor::Shared>, commands: blocking::Sender<supervisor::Command>, watch: Watch },
     /// A simulated controller, and the address of its control socket.
     Controller { asker: Asker, control: SocketAddr },
 }
@@ -111,30 +115,31 @@ pub(crate) struct Console {
 
 impl Console {
     /// Serves a socket on a thread of its own.
-    pub(crate) fn start(bound: Bound, source: Source) -> Result<Self, StartError> {
+    pub(crate) fn start(bound: Bound, source: Source, log: Option<Log>) -> Result<Self, StartError> {
         let refused = |error: std::io::Error| StartError::new(format!("console: {error}"));
-        let mut secret = [0; 32];
-        std::fs::File::open("/dev/urandom")
-            .and_then(|mut file| file.read_exact(&mut secret))
-            .map_err(refused)?;
-        let Bound { listener, address, key } = bound;
+        let Bound { listener, address, key, peer } = bound;
         let end = Arc::new(Notify::new());
         let ended = Arc::clone(&end);
-        let guard = Guard::new(key, secret);
+        let guard = Guard::new(key, random().map_err(refused)?);
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(refused)?;
         let listener = {
             let _inside = runtime.enter();
             tokio::net::TcpListener::from_std(listener).map_err(refused)?
         };
         let serve = move || {
+            // Where the gateway's thread has no better right, it still goes first.
+            let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), NICENESS);
             let server = Rc::new(Server {
                 address,
+                peer,
                 source,
                 guard: RefCell::new(guard),
                 snapshots: Snapshots::default(),
                 connections: Cell::new(0),
                 streams: Cell::new(0),
                 counters: Cell::default(),
+                log,
+                log_limit: LogLimit::default(),
                 started: now(),
             });
             let local = tokio::task::LocalSet::new();
@@ -177,10 +182,10 @@ pub(crate) struct Consoled {
 
 impl Consoled {
     /// Serves a console for a controller that runs.
-    pub(crate) fn start(bound: Bound, handle: Handle) -> Result<Self, StartError> {
+    pub(crate) fn start(bound: Bound, handle: Handle, log: Option<Log>) -> Result<Self, StartError> {
         let control = handle.place("control").parse();
         let control = control.map_err(|error| StartError::new(format!("control socket: {error}")))?;
-        let console = Console::start(bound, Source::Controller { asker: handle.asker(), control })?;
+        let console = Console::start(bound, Source::Controller { asker: handle.asker(), control }, log)?;
         let mut ready = handle.ready().clone();
         ready["console"] = json!(console.address());
         Ok(Self { ready, console: Some(console), handle })
@@ -213,12 +218,15 @@ impl Running for Consoled {
 /// Everything that the connections share.
 struct Server {
     address: SocketAddr,
+    peer: Option<u16>,
     source: Source,
     guard: RefCell<Guard>,
     snapshots: Snapshots,
     connections: Cell<usize>,
     streams: Cell<usize>,
     counters: Cell<ServerCounters>,
+    log: Option<Log>,
+    log_limit: LogLimit,
     started: proto_core::time::Instant,
 }
 
@@ -235,6 +243,8 @@ struct ServerCounters {
     slow_readers: u64,
     /// Events that streams left out because their client reads slowly.
     lost_events: u64,
+    /// Frames that streams left out.
+    lost_frames: u64,
 }
 
 impl Server {

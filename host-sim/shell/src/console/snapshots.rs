@@ -1,9 +1,14 @@
 //! What readers are shown: one copy of the engine for all of them, at most ten times a second.
 
-use std::cell::{OnceCell, RefCell};
+use std::cell::{Cell, OnceCell, RefCell};
 use std::rc::Rc;
+use std::sync::Arc;
+use std::time::Duration as StdDuration;
 
+use proto_core::config::GatewayConfig;
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::state::States;
+use recipe_doctor::{Case, Finding, examine};
 use recipe_net::timer::now;
 use recipe_remote::documents::{Document, Pieces};
 use recipe_remote::json;
@@ -12,6 +17,7 @@ use serde_json::Value;
 
 use super::Source;
 use super::window::{Shot, Window};
+use crate::gateway::{look_at_states, unexplained};
 
 /// The newest snapshot.
 #[derive(Default)]
@@ -21,6 +27,8 @@ pub(super) struct Snapshots {
     room: RefCell<Option<Box<Shot>>>,
     /// Those who ask at the same time get the same copy.
     turn: tokio::sync::Mutex<()>,
+    /// The controller's states after a command had failed at that instant, if they could be seen.
+    looked: Cell<Option<(Instant, Option<States>)>>,
 }
 
 /// State, counters and values at one instant. Each text is made when somebody wants it, and once.
@@ -33,7 +41,7 @@ pub(super) struct Snapshot {
 }
 
 enum Taken {
-    Gateway(Box<Shot>),
+    Gateway(Box<Shot>, Arc<GatewayConfig>),
     Controller(Value),
 }
 
@@ -48,8 +56,8 @@ impl Snapshots {
         }
         let what = match source {
             Source::Gateway { shared, .. } => {
-                let window = shared.window()?;
-                Taken::Gateway(self.copy(&window).await?)
+                let (window, config) = shared.running()?;
+                Taken::Gateway(self.copy(&window).await?, config)
             }
             Source::Controller { asker, .. } => {
                 let asker = asker.clone();
@@ -65,13 +73,28 @@ impl Snapshots {
         });
         let before = self.newest.replace(Some(Rc::clone(&snapshot)));
         // Its room is used again, if no stream is still reading.
-        if let Some(Snapshot { what: Taken::Gateway(shot), .. }) = before.and_then(Rc::into_inner) {
+        if let Some(Snapshot { what: Taken::Gateway(shot, _), .. }) = before.and_then(Rc::into_inner) {
             self.room.replace(Some(shot));
         }
         Some(snapshot)
     }
 
-    async fn copy(&self, window: &std::sync::Arc<Window>) -> Option<Box<Shot>> {
+    /// The controller's states, looked at once for each command that failed; `None` if they do not show in time.
+    pub(super) async fn look_at_controller(&self, failed: Instant, snapshot: &Snapshot) -> Option<States> {
+        let Taken::Gateway(_, config) = &snapshot.what else { return None };
+        if let Some((at, states)) = self.looked.get()
+            && at >= failed
+        {
+            return states;
+        }
+        let config = Arc::clone(config);
+        let looking = tokio::task::spawn_blocking(move || look_at_states(&config.controller));
+        let states = tokio::time::timeout(MAX_LOOK, looking).await.ok()?.ok()?;
+        self.looked.set(Some((failed, states)));
+        states
+    }
+
+    async fn copy(&self, window: &Arc<Window>) -> Option<Box<Shot>> {
         let room = self.room.take().unwrap_or_else(Shot::empty);
         match window.look(room).await {
             Ok(shot) => Some(shot),
@@ -88,14 +111,14 @@ impl Snapshot {
     pub(super) fn status(&self) -> Rc<str> {
         let make = || match &self.what {
             Taken::Controller(stats) => stats.to_string(),
-            Taken::Gateway(shot) => status_of(shot),
+            Taken::Gateway(shot, _) => status_of(shot),
         };
         Rc::clone(self.status.get_or_init(|| make().into()))
     }
 
     /// The document `values`.
     pub(super) fn values(&self) -> Option<Rc<str>> {
-        let Taken::Gateway(shot) = &self.what else { return None };
+        let Taken::Gateway(shot, _) = &self.what else { return None };
         let make =
             || written(|text| Pieces::of(Document::Values).write_all(shot.engine.status(shot.at), text));
         Some(Rc::clone(self.values.get_or_init(|| make().into())))
@@ -103,9 +126,28 @@ impl Snapshot {
 
     /// The metrics.
     pub(super) fn metrics(&self) -> Option<Rc<str>> {
-        let Taken::Gateway(shot) = &self.what else { return None };
+        let Taken::Gateway(shot, _) = &self.what else { return None };
         let make = || written(|text| Families::new().write_all(shot.engine.status(shot.at), text));
         Some(Rc::clone(self.metrics.get_or_init(|| make().into())))
+    }
+
+    /// Since when a command has failed for which nobody saw the controller's states.
+    pub(super) fn unexplained(&self) -> Option<Instant> {
+        let Taken::Gateway(shot, _) = &self.what else { return None };
+        unexplained(shot.engine.status(shot.at))
+    }
+
+    /// What is wrong. `looked` are the controller's states, if somebody else than the engine has looked.
+    pub(super) fn findings(&self, looked: Option<States>) -> Option<Vec<Finding>> {
+        let Taken::Gateway(shot, config) = &self.what else { return None };
+        Some(examine(&Case {
+            config: config.view(),
+            status: shot.engine.status(shot.at).into(),
+            ports: shot.records(),
+            links: &shot.links,
+            running: shot.running,
+            looked,
+        }))
     }
 }
 
@@ -137,5 +179,7 @@ fn written<R>(write: impl FnOnce(&mut String) -> R) -> String {
     text
 }
 
+/// How long the controller's states are waited for.
+const MAX_LOOK: StdDuration = StdDuration::from_secs(3);
 /// The age at which a snapshot is replaced if somebody asks.
 const MAX_AGE: Duration = Duration::from_millis(100);

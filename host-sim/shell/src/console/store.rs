@@ -196,8 +196,14 @@ impl Store {
             Err(error) => return Err(error),
         };
         let Index { kept, live, .. } = &index;
-        if kept.len() > MAX_REVISIONS || !kept.is_sorted_by(|one, next| one.number < next.number) {
-            return Err(wrong(format!("{INDEX}: not a list of at most {MAX_REVISIONS} rising numbers")));
+        let is_rising = kept.is_sorted_by(|one, next| one.number < next.number);
+        // The next one has a number too.
+        let is_last = kept.last().is_some_and(|last| last.number == u32::MAX);
+        if kept.len() > MAX_REVISIONS || !is_rising || is_last {
+            return Err(wrong(format!(
+                "{INDEX}: not a list of at most {MAX_REVISIONS} rising numbers below {}",
+                u32::MAX
+            )));
         }
         if !kept.is_empty() && kept.iter().all(|entry| entry.number != *live) {
             return Err(wrong(format!("{INDEX}: the live revision {live} is not kept")));

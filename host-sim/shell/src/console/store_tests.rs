@@ -97,6 +97,12 @@ fn a_folder_is_for_one_process_and_must_make_sense() {
             index.replace("\"number\": 1", "\"number\": 5").replace("\"live\": 1", "\"live\": 5"),
             "revision-5.toml: ",
         ),
+        (
+            index
+                .replace("\"number\": 1", "\"number\": 4294967295")
+                .replace("\"live\": 1", "\"live\": 4294967295"),
+            "rising numbers below 4294967295",
+        ),
     ] {
         fs::write(folder.join(INDEX), text).unwrap();
         let error = Store::open(Some(folder), ("cell.toml", "one")).unwrap_err().to_string();
@@ -110,4 +116,75 @@ fn without_a_folder_it_is_in_memory() {
     store.keep(2, "two", "127.0.0.1", None).unwrap();
     store.mark(2, 1).unwrap();
     assert_eq!(live(&store), "two");
+}
+
+/// The index with pieces replaced by others, by chance and the same in each run.
+#[test]
+fn any_index_is_refused_in_one_line_or_makes_sense() {
+    const PIECES: [&str; 16] = [
+        "0",
+        "1",
+        "2",
+        "-1",
+        "4294967295",
+        "4294967296",
+        "1e3",
+        "null",
+        "\"\"",
+        "{",
+        "}",
+        "[]",
+        ",",
+        "\"live\"",
+        "x",
+        "\n",
+    ];
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let mut store = open(folder, "one");
+    store.keep(2, "two", "127.0.0.1", None).unwrap();
+    store.mark(2, 1).unwrap();
+    store.mark(1, 2).unwrap();
+    drop(store);
+    fs::write(folder.join(name(u32::MAX)), "most").unwrap();
+    let right = fs::read_to_string(folder.join(INDEX)).unwrap();
+    let mut seed = 1_u64;
+    let mut below = |count: usize| {
+        seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (seed >> 33) as usize % count
+    };
+    let (mut taken, mut refused) = (0, 0);
+    for round in 0..1_500 {
+        let mut text = right.clone();
+        // Numbers, which stand behind a colon, are hit more often than by chance.
+        let values = right.match_indices(": ").map(|(at, _)| at + 2);
+        let numbers: Vec<_> = values.filter(|at| right.as_bytes()[*at].is_ascii_digit()).collect();
+        for _ in 0..=below(2) {
+            let at = if round % 2 == 0 { numbers[below(numbers.len())] } else { below(text.len()) };
+            let at = at.min(text.len() - 1);
+            text.replace_range(at..(at + 1 + below(8) / 7).min(text.len()), PIECES[below(PIECES.len())]);
+        }
+        fs::write(folder.join(INDEX), &text).unwrap();
+        for number in [1, 2, u32::MAX] {
+            fs::write(folder.join(name(number)), number.to_string()).unwrap();
+        }
+        // The file is the same as before, or a person has changed it.
+        match Store::open(Some(folder), ("cell.toml", ["one", "new"][below(2)])) {
+            Ok(store) => {
+                let revisions = store.revisions().expect("it makes sense");
+                assert_eq!(revisions.live(), store.index.live, "{text}");
+                assert!(store.entries().iter().all(|entry| store.text(entry.number).is_some()), "{text}");
+                taken += 1;
+            }
+            Err(error) => {
+                let error = error.to_string();
+                assert!(
+                    error.starts_with("--console-state ") && !error.contains('\n'),
+                    "{error:?} of {text}"
+                );
+                refused += 1;
+            }
+        }
+    }
+    assert!(taken > 100 && refused > 100, "{taken} taken, {refused} refused");
 }

@@ -12,8 +12,10 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc as blocking};
 use std::thread::JoinHandle;
 use std::time::Duration as StdDuration;
 
+use proto_core::config::GatewayConfig;
 use proto_core::time::{Duration, Instant};
 use recipe_device::bind::Bind;
+use recipe_device::kept::Shelf;
 use recipe_net::realtime::Scheduling;
 use recipe_net::timer::now;
 use recipe_remote::revisions::{Ended, Output, Refused, Result as Done, Revision, Revisions};
@@ -21,12 +23,13 @@ use serde_json::{Value, json};
 use tokio::sync::oneshot;
 use tracing::{error, info, warn};
 
-use super::check;
+use super::check::{self, Prepared};
 use super::store::{Entry, Store, digest};
 use super::window::Window;
 use super::{Bound, Console, ConsoleOptions, Source};
 use crate::gateway::{self, Observers};
 use crate::host::{Asker, Handle, Running};
+use crate::telling::Glimpse;
 use crate::{RunOptions, StartError};
 
 /// The configuration that a gateway was started with.
@@ -104,8 +107,18 @@ pub(crate) struct View {
     pub(super) failure: Option<String>,
     /// Overrides, which apply to every revision.
     pub(super) overrides: Vec<String>,
+    /// What runs.
+    pub(super) config: Option<Arc<GatewayConfig>>,
     asker: Option<Asker>,
     window: Option<Arc<Window>>,
+}
+
+impl View {
+    /// The text of the configuration that runs.
+    pub(super) fn running_text(&self) -> Option<Arc<str>> {
+        self.config.as_ref()?;
+        self.texts.get(&self.revisions.as_ref()?.running()?).cloned()
+    }
 }
 
 /// Between the supervisor and its readers.
@@ -117,9 +130,10 @@ impl Shared {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The window of the gateway that runs.
-    pub(super) fn window(&self) -> Option<Arc<Window>> {
-        self.view().window.clone()
+    /// The gateway that runs: its window, and its configuration.
+    pub(super) fn running(&self) -> Option<(Arc<Window>, Arc<GatewayConfig>)> {
+        let view = self.view();
+        view.window.clone().zip(view.config.clone())
     }
 }
 
@@ -140,6 +154,7 @@ impl Supervised {
         file: ConfigFile,
         options: &RunOptions,
         console: &ConsoleOptions,
+        glimpse: Option<Glimpse>,
     ) -> Result<Self, StartError> {
         let bound = console.bind()?;
         let store = Store::open(console.state.as_deref(), (&file.name, &file.toml))?;
@@ -151,13 +166,14 @@ impl Supervised {
         let supervisor = Supervisor {
             store,
             revisions,
-            handle: None,
+            running: None,
             shared: Arc::clone(&shared),
             overrides: file.overrides,
             state: console.state.clone(),
             binds: options.binds.clone(),
             scheduling: options.scheduling,
-            observers: Observers::of(options),
+            shelf: Shelf::default(),
+            observers: Observers { glimpse, ..Observers::of(options) },
             put: None,
             failure: None,
         };
@@ -171,13 +187,14 @@ impl Supervised {
             Err(_) => return Err(StartError::new("the supervisor ended")),
         }
         let mut running = Self { ready: Value::Null, shared, commands, thread: Some(thread), console: None };
-        running.serve(bound)?;
+        running.serve(bound, options)?;
         Ok(running)
     }
 
-    fn serve(&mut self, bound: Bound) -> Result<(), StartError> {
-        let source = Source::Gateway { shared: Arc::clone(&self.shared), commands: self.commands.clone() };
-        let console = Console::start(bound, source)?;
+    fn serve(&mut self, bound: Bound, options: &RunOptions) -> Result<(), StartError> {
+        let (shared, commands) = (Arc::clone(&self.shared), self.commands.clone());
+        let source = Source::Gateway { shared, commands, watch: options.watch.clone() };
+        let console = Console::start(bound, source, options.log.clone())?;
         self.ready = self.shared.view().ready.clone();
         self.ready["console"] = json!(console.address());
         self.console = Some(console);
@@ -222,15 +239,26 @@ impl Running for Supervised {
     }
 }
 
+/// A gateway that another one may take the place of.
+struct Replaceable {
+    /// The number of its revision.
+    number: u32,
+    handle: Handle,
+    window: Arc<Window>,
+    config: Arc<GatewayConfig>,
+}
+
 struct Supervisor {
     store: Store,
     revisions: Revisions,
-    handle: Option<(Handle, Arc<Window>)>,
+    running: Option<Replaceable>,
     shared: Arc<Shared>,
     overrides: Vec<String>,
     state: Option<PathBuf>,
     binds: Vec<Bind>,
     scheduling: Scheduling,
+    /// Devices on the way from one gateway to the next.
+    shelf: Shelf,
     /// Who looks at each gateway, but for the console.
     observers: Observers,
     /// The text that is to be kept, and who sent it.
@@ -248,7 +276,8 @@ impl Supervisor {
         if let Some(folder) = &self.state {
             info!(revision = live, folder = %folder.display(), "running this revision");
         }
-        let started = self.start(live).and_then(|()| self.store.has_started());
+        let started = self.prepare(live).and_then(|prepared| self.start(live, prepared));
+        let started = started.and_then(|()| self.store.has_started());
         let is_open = started.is_ok();
         self.show();
         let _ = opened.send(started);
@@ -259,12 +288,12 @@ impl Supervisor {
             self.drain();
             match inbox.recv_timeout(LOOK_INTERVAL) {
                 Ok(Command { what: What::Shutdown, .. }) | Err(RecvTimeoutError::Disconnected) => {
-                    return self.handle.take().map_or(Ok(()), |(handle, _)| handle.shutdown());
+                    return self.running.take().map_or(Ok(()), |running| running.handle.shutdown());
                 }
                 Ok(command) => self.carry_out(command),
                 Err(RecvTimeoutError::Timeout) => {}
             }
-            if self.handle.as_ref().is_some_and(|(handle, _)| handle.has_ended()) {
+            if self.running.as_ref().is_some_and(|running| running.handle.has_ended()) {
                 self.has_ended()?;
             }
         }
@@ -272,8 +301,8 @@ impl Supervisor {
 
     /// The gateway has ended by itself. What was live ends the process, as it does without a console.
     fn has_ended(&mut self) -> Result<(), StartError> {
-        let Some((handle, _)) = self.handle.take() else { return Ok(()) };
-        let ended = handle.shutdown();
+        let Some(running) = self.running.take() else { return Ok(()) };
+        let ended = running.handle.shutdown();
         let Some((number, _)) = self.revisions.trial() else { return ended };
         let why = ended.err().map_or_else(|| "it ended".to_owned(), |error| error.to_string());
         warn!(revision = number, why, "the revision on trial ended by itself");
@@ -323,8 +352,7 @@ impl Supervisor {
                     Done::Stored(self.keep(revision.number, forget, &mut failed))
                 }
                 Output::Run { number } => {
-                    self.stop();
-                    let started = self.start(number);
+                    let started = self.replace_by(number);
                     if let Err(error) = &started {
                         error!(revision = number, %error, "the revision does not start");
                         self.failure = Some(error.to_string());
@@ -362,28 +390,55 @@ impl Supervisor {
         kept.is_ok()
     }
 
+    /// Runs a revision instead of what runs. What is wrong with it shows before anything is stopped.
+    fn replace_by(&mut self, number: u32) -> Result<(), StartError> {
+        if self.running.as_ref().is_some_and(|running| running.number == number) {
+            // The one that was to take its place could not be prepared.
+            return Ok(());
+        }
+        let prepared = self.prepare(number)?;
+        self.stop();
+        self.start(number, prepared)
+    }
+
+    fn prepare(&self, number: u32) -> Result<Prepared, StartError> {
+        let text = self.store.text(number).map_or("", |text| text);
+        let name = format!("revision {number}");
+        check::prepare(&name, text, &self.overrides)
+            .map_err(|mistake| StartError::new(format!("{name}: {mistake}")))
+    }
+
     /// Brings the safe values out and ends what runs.
     fn stop(&mut self) {
-        let Some((handle, window)) = self.handle.take() else { return };
-        let mut view = self.shared.view();
-        (view.asker, view.window) = (None, None);
-        drop(view);
+        let Some(Replaceable { handle, window, .. }) = self.running.take() else { return };
+        // From here on nothing runs.
+        self.show();
         window.make_safe();
         if let Err(error) = handle.shutdown() {
             warn!(%error, "the gateway had ended by itself");
         }
     }
 
-    fn start(&mut self, number: u32) -> Result<(), StartError> {
-        let text = self.store.text(number).map_or("", |text| text);
-        let name = format!("revision {number}");
-        let config = check::gateway(&name, text, &self.overrides);
-        let config = config.map_err(|mistake| StartError::new(format!("{name}: {mistake}")))?;
+    fn start(&mut self, number: u32, prepared: Prepared) -> Result<(), StartError> {
         let window = Arc::new(Window::new());
-        let observers = Observers { window: Some(Arc::clone(&window)), ..self.observers.clone() };
-        let handle = gateway::spawn(*config, self.binds.clone(), self.scheduling, observers)?;
-        self.handle = Some((handle, window));
+        let Prepared { config, decoder } = prepared;
+        let observers = Observers { window: Some(Arc::clone(&window)), decoder, ..self.observers.clone() };
+        let copy = (*config).clone();
+        let binds = self.binds_of(number, &config);
+        let handle = gateway::spawn(copy, binds, self.scheduling, observers, self.shelf.clone())?;
+        self.running = Some(Replaceable { number, handle, window, config });
         Ok(())
+    }
+
+    /// The devices of the ports that a revision has. Those of other ports are kept for when they come.
+    fn binds_of(&self, number: u32, config: &GatewayConfig) -> Vec<Bind> {
+        let has =
+            |bind: &&Bind| config.view().field_ports().any(|(_, port, _)| port.name == bind.port.as_str());
+        let (used, spare): (Vec<_>, Vec<_>) = self.binds.iter().partition(has);
+        for bind in spare {
+            warn!(revision = number, %bind, "--bind is not used: the revision has no such port");
+        }
+        used.into_iter().cloned().collect()
     }
 
     /// Shows readers how it is now.
@@ -394,10 +449,11 @@ impl Supervisor {
         view.texts = self.store.texts().clone();
         view.failure = self.failure.clone();
         view.overrides = self.overrides.clone();
-        let handle = self.handle.as_ref();
-        view.asker = handle.map(|(handle, _)| handle.asker());
-        view.window = handle.map(|(_, window)| Arc::clone(window));
-        view.ready = handle.map_or(Value::Null, |(handle, _)| handle.ready().clone());
+        let running = self.running.as_ref();
+        view.asker = running.map(|running| running.handle.asker());
+        view.window = running.map(|running| Arc::clone(&running.window));
+        view.config = running.map(|running| Arc::clone(&running.config));
+        view.ready = running.map_or(Value::Null, |running| running.handle.ready().clone());
     }
 }
 

@@ -5,11 +5,14 @@
 
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
-use std::time::Duration;
+use std::time::Duration as StdDuration;
 
 use crate::gateway::Engine;
-use proto_core::time::Instant;
+use proto_core::config::MAX_PORTS;
+use proto_core::engine::PortId;
+use proto_core::time::{Duration, Instant};
 use recipe_device::exchange::DeviceCounters;
+use recipe_doctor::{LinkFacts, PortRecord};
 use tokio::sync::Notify;
 
 /// Between the thread of an engine and the console's.
@@ -31,14 +34,41 @@ pub(crate) struct Shot {
     /// The instant.
     pub(crate) at: Instant,
     /// The counters of the devices, by the port's number.
-    pub(crate) devices: [Option<DeviceCounters>; proto_core::config::MAX_PORTS],
+    pub(crate) devices: [Option<DeviceCounters>; MAX_PORTS],
+    /// What came in at each port lately; the first `ports` of them.
+    records: Vec<PortRecord>,
+    ports: usize,
+    /// What is known of the links to the controller.
+    pub(crate) links: Vec<LinkFacts>,
+    /// How long the gateway has been running.
+    pub(crate) running: Duration,
 }
 
 impl Shot {
     /// Room for a copy of any engine.
-    pub(super) fn empty() -> Box<Self> {
-        let engine = Box::new(Engine::idle());
-        Box::new(Self { engine, at: Instant::ZERO, devices: [None; proto_core::config::MAX_PORTS] })
+    pub(crate) fn empty() -> Box<Self> {
+        Box::new(Self {
+            engine: Box::new(Engine::idle()),
+            at: Instant::ZERO,
+            devices: [None; MAX_PORTS],
+            records: (0..MAX_PORTS).map(|_| PortRecord::new(PortId(0))).collect(),
+            ports: 0,
+            links: Vec::with_capacity(2 * MAX_PORTS),
+            running: Duration::ZERO,
+        })
+    }
+
+    /// Copies what came in at each port into the memory that is there.
+    pub(crate) fn keep_records(&mut self, records: &[PortRecord]) {
+        for (room, record) in self.records.iter_mut().zip(records) {
+            room.clone_from(record);
+        }
+        self.ports = records.len();
+    }
+
+    /// What came in at each port lately.
+    pub(super) fn records(&self) -> &[PortRecord] {
+        self.records.get(..self.ports).unwrap_or(&self.records)
     }
 }
 
@@ -67,7 +97,7 @@ impl Window {
     }
 
     /// The console's thread: a copy in this room, or the room if there is none in time.
-    pub(super) async fn look(&self, room: Box<Shot>) -> Result<Box<Shot>, Option<Box<Shot>>> {
+    pub(crate) async fn look(&self, room: Box<Shot>) -> Result<Box<Shot>, Option<Box<Shot>>> {
         let put = |room: Option<Box<Shot>>| {
             let mut shot = self.shot.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
             std::mem::replace(&mut *shot, room)
@@ -109,6 +139,6 @@ impl Window {
 }
 
 /// How long the console waits for a copy.
-const MAX_WAIT: Duration = Duration::from_millis(500);
+const MAX_WAIT: StdDuration = StdDuration::from_millis(500);
 /// How long safe values may take: so long they are repeated where nothing shows them (proto-core/docs/engine.md section 6).
-pub(crate) const MAX_SAFE: Duration = Duration::from_secs(1);
+pub(crate) const MAX_SAFE: StdDuration = StdDuration::from_secs(1);

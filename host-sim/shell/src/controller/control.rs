@@ -97,21 +97,17 @@ impl ControllerShell {
     /// Accepts the clients of the control socket.
     pub(super) async fn serve_control(self: Rc<Self>, listener: TcpListener) {
         loop {
-            match listener.accept().await {
-                Ok((stream, peer)) => {
-                    self.note_activity();
-                    debug!(%peer, "control client connected");
-                    Rc::clone(&self).welcome(stream);
-                    yield_fairly().await;
+            let failed = |error: &io::Error| {
+                self.count(|counters| counters.accept_failures += 1);
+                if let Some(more) = self.log_limit.allow(timer::now()) {
+                    warn!(%error, more, "cannot accept a client of the control socket");
                 }
-                Err(error) => {
-                    self.count(|counters| counters.accept_failures += 1);
-                    if let Some(more) = self.log_limit.allow(timer::now()) {
-                        warn!(%error, more, "cannot accept a client of the control socket");
-                    }
-                    tokio::time::sleep(StdDuration::from_millis(50)).await;
-                }
-            }
+            };
+            let (stream, peer) = tcp_options::accept(&listener, failed).await;
+            self.note_activity();
+            debug!(%peer, "control client connected");
+            Rc::clone(&self).welcome(stream);
+            yield_fairly().await;
         }
     }
 

@@ -23,19 +23,15 @@ impl ControllerShell {
     pub(super) async fn serve(self: Rc<Self>, link: Link, listener: TcpListener) {
         tcp_options::limit_buffers(&listener);
         loop {
-            match listener.accept().await {
-                Ok((stream, peer)) => {
-                    self.accept(link, stream, peer);
-                    yield_fairly().await;
+            let failed = |error: &io::Error| {
+                self.count(|counters| counters.accept_failures += 1);
+                if let Some(more) = self.log_limit.allow(now()) {
+                    warn!(?link, %error, more, "cannot accept a connection");
                 }
-                Err(error) => {
-                    self.count(|counters| counters.accept_failures += 1);
-                    if let Some(more) = self.log_limit.allow(now()) {
-                        warn!(?link, %error, more, "cannot accept a connection");
-                    }
-                    tokio::time::sleep(StdDuration::from_millis(50)).await;
-                }
-            }
+            };
+            let (stream, peer) = tcp_options::accept(&listener, failed).await;
+            self.accept(link, stream, peer);
+            yield_fairly().await;
         }
     }
 

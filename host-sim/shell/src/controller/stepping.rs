@@ -13,6 +13,7 @@ use tracing::warn;
 
 use super::{ControllerShell, Outward};
 use recipe_controller::Condition;
+use recipe_controller::operations::time;
 use recipe_net::fairness::is_anyone_busy;
 use recipe_net::timer;
 
@@ -34,13 +35,13 @@ impl ControllerShell {
         if !self.clock.is_stepped() {
             return Err("the clock runs by itself; `advance` needs --time stepped, `wait` does not".into());
         }
-        let time = span("seconds", seconds)?;
-        self.await_turn(self.clock.now() + time, seconds, None).await
+        let until = self.clock.now() + time("seconds", seconds).map_err(|refused| refused.0)?;
+        self.await_turn(until, seconds, None).await
     }
 
     /// Waits until the condition holds; a stepped clock moves meanwhile.
     pub(super) async fn wait_for(&self, condition: Condition, timeout_s: f64) -> Result<(), String> {
-        let until = self.clock.now() + span("timeout_s", timeout_s)?;
+        let until = self.clock.now() + time("timeout_s", timeout_s).map_err(|refused| refused.0)?;
         let since = self.controller.borrow().newest_event() + 1;
         let holds = self.controller.borrow().holds(&condition, since);
         match holds.map_err(|error| error.to_string())? {
@@ -177,15 +178,6 @@ impl ControllerShell {
     }
 }
 
-fn span(name: &str, seconds: f64) -> Result<Duration, String> {
-    if !(0.0..=MAX_SECONDS).contains(&seconds) {
-        return Err(format!("{name}: {seconds} is not within 0 to {MAX_SECONDS}"));
-    }
-    Ok(Duration::from_micros((seconds * 1e6).round() as u64))
-}
-
-/// The longest time that may be waited for.
-const MAX_SECONDS: f64 = 86_400.0;
 /// After so many rounds of all tasks without an event, an instant is over: an event may pass several tasks.
 const QUIET_ROUNDS: u32 = 4;
 /// The least time without an event, for what the kernel passes on by a thread of its own.

@@ -1,7 +1,8 @@
 //! Findings of a running gateway, and of one that only listens.
 //!
 //! A running gateway is looked at once a second, if somebody reads what is found. The gateway's thread
-//! copies the engine and the records; another thread looks at them and logs.
+//! copies the engine and the records into a room; another thread looks at them, logs, and gives the room
+//! back. While it has not, nothing is copied.
 //!
 //! A gateway that only listens gives nothing to the controller, and nothing to the field unless it is to
 //! ask: [`super::Voice`] is the one gate that every output passes. Its engine is told of no link but the
@@ -9,28 +10,46 @@
 
 use std::net::{TcpStream, ToSocketAddrs};
 use std::rc::Rc;
-use std::sync::mpsc::{Receiver, Sender, SyncSender, TrySendError, channel, sync_channel};
+use std::sync::mpsc::{Receiver, Sender, SyncSender, TryRecvError, channel, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration as StdDuration;
 
-use proto_core::config::{ControllerLink, FieldSpec, GatewayConfig, InputBinding};
-use proto_core::engine::ReplyCode;
+use proto_core::config::{ControllerLink, GatewayConfig};
+use proto_core::engine::{LinkId, PortId, ReplyCode, Status};
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::dialect::Dialect;
 use proto_core::wire::state::{StateStream, States};
-use recipe_capture::Watch as Unwatched;
-use recipe_doctor::{Case, Change, Finding, LinkFacts, PortRecord, Watch, examine};
+use recipe_doctor::{Case, Change, Finding, LinkFacts, PortRecord, Watch, examine, has_commands};
 use serde_json::{Value, json};
 use tracing::info;
 
-use super::{Core, Engine, Gateway, Voice};
+use super::open::Devices;
+use super::{Core, Engine, Gateway, Observers, Voice};
 use crate::host::{self, Shell};
 use crate::{Signals, StartError};
 use recipe_device::bind::Bind;
 use recipe_net::timer::now;
 
-/// The newest findings of a gateway that is looked at.
-pub(super) type Told = Arc<Mutex<Vec<Finding>>>;
+/// The words of the newest findings of a gateway that is looked at.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Told(Arc<Mutex<Vec<String>>>);
+
+impl Told {
+    pub(crate) fn words(&self) -> Value {
+        json!(*self.0.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    fn replace(&self, findings: &[Finding]) {
+        let words = findings.iter().map(Finding::to_string).collect();
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = words;
+    }
+}
+
+/// The thread that looks, as the gateway's thread sees it.
+pub(super) struct Doctor {
+    rooms: Receiver<Box<Snapshot>>,
+    filled: SyncSender<Box<Snapshot>>,
+}
 
 /// A gateway at one instant.
 pub(super) struct Snapshot {
@@ -42,30 +61,41 @@ pub(super) struct Snapshot {
 }
 
 impl Snapshot {
+    /// Room for a copy of a gateway with these records.
+    fn room(ports: Vec<PortRecord>) -> Box<Self> {
+        let engine = Box::new(Engine::idle());
+        let links = Vec::with_capacity(Engine::MAX_LINKS);
+        Box::new(Self { at: Instant::ZERO, running: Duration::ZERO, engine, ports, links })
+    }
+
     fn findings(&self, config: &GatewayConfig, looked: Option<States>) -> Vec<Finding> {
         examine(&Case {
             config: config.view(),
-            status: self.engine.status(self.at),
+            status: self.engine.status(self.at).into(),
             ports: &self.ports,
             links: &self.links,
             running: self.running,
             looked,
         })
     }
+}
 
-    /// Since when a command has failed for which nobody saw the controller's states.
-    fn unexplained(&self) -> Option<Instant> {
-        let ports = self.engine.status(self.at).ports();
-        let failed = ports.filter(|port| port.reply == ReplyCode::Fail).filter_map(|port| port.last_failed);
-        failed.filter(|failed| failed.controller.is_none()).map(|failed| failed.at).max()
-    }
+/// Since when a command has failed for which nobody saw the controller's states.
+pub(crate) fn unexplained(status: Status<'_>) -> Option<Instant> {
+    let failed = status.ports().filter(|port| port.reply == ReplyCode::Fail);
+    let failed = failed.filter_map(|port| port.last_failed);
+    failed.filter(|failed| failed.controller.is_none()).map(|failed| failed.at).max()
 }
 
 impl Core {
-    /// Notes the counters of this instant, and copies everything that findings are made of.
-    pub(super) fn snapshot(&self) -> Snapshot {
-        let at = now();
-        let engine = self.engine.borrow().clone();
+    /// Begins to keep what comes in at each port.
+    pub(super) fn keep_records(&self, config: &GatewayConfig, binds: &[Bind]) {
+        self.records.replace(records(config, binds));
+    }
+
+    /// Notes the counters of this instant.
+    fn note(&self, at: Instant) {
+        let engine = self.engine.borrow();
         let mut records = self.records.borrow_mut();
         for port in engine.status(at).ports() {
             if let Some(record) = records.iter_mut().find(|record| record.port == port.id) {
@@ -73,55 +103,104 @@ impl Core {
                 record.fd_frames = self.ports.get(&port.id).map_or(0, |(_, tx)| tx.counters().fd_frames);
             }
         }
-        let links = engine.links().map(|info| {
-            let control = self.links.get(&info.id);
-            LinkFacts {
-                link: info.id,
-                reach: control.and_then(|control| control.reach()),
-                strangers: control.map_or(0, |control| control.refusals().strangers),
-            }
-        });
-        let links = links.collect();
-        let running = at.saturating_since(self.started);
-        Snapshot { at, running, engine, ports: records.clone(), links }
     }
 
-    /// Has the gateway looked at once a second.
-    pub(super) async fn be_watched(&self, doctor: SyncSender<Snapshot>) -> Result<(), StartError> {
+    /// Copies everything that findings are made of.
+    fn copy_to(&self, room: &mut Snapshot, at: Instant) {
+        let Snapshot { at: taken, running, engine, ports, links } = room;
+        (*taken, *running) = (at, at.saturating_since(self.started));
+        engine.clone_from(&self.engine.borrow());
+        ports.clone_from(&self.records.borrow());
+        links.clear();
+        links.extend(engine.links().map(|info| self.facts_of(info.id)));
+    }
+
+    /// What is known of a link beyond the engine's status.
+    pub(super) fn facts_of(&self, link: LinkId) -> LinkFacts {
+        let control = self.links.get(&link);
+        LinkFacts {
+            link,
+            reach: control.and_then(|control| control.reach()),
+            strangers: control.map_or(0, |control| control.refusals().strangers),
+        }
+    }
+
+    /// Notes the counters once a second. Never returns.
+    pub(super) async fn keep_notes(&self) -> Result<(), StartError> {
         let mut ticks = tokio::time::interval(LOOK);
         ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         loop {
             ticks.tick().await;
-            // A busy machine has looked at the one before not yet.
-            if let Err(TrySendError::Disconnected(_)) = doctor.try_send(self.snapshot()) {
-                return std::future::pending().await;
-            }
+            self.note(now());
+        }
+    }
+
+    /// Has the gateway looked at once a second.
+    pub(super) async fn be_watched(&self, doctor: Doctor) -> Result<(), StartError> {
+        let mut ticks = tokio::time::interval(LOOK);
+        ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+        loop {
+            ticks.tick().await;
+            let at = now();
+            self.note(at);
+            let mut room = match doctor.rooms.try_recv() {
+                Ok(room) => room,
+                // A busy machine has looked at the one before not yet.
+                Err(TryRecvError::Empty) => continue,
+                Err(TryRecvError::Disconnected) => return std::future::pending().await,
+            };
+            self.copy_to(&mut room, at);
+            // There is one room, so there is place for it.
+            let _ = doctor.filled.try_send(room);
         }
     }
 }
 
 /// Starts the thread that looks at snapshots and logs what begins and ends.
-pub(super) fn start(config: GatewayConfig) -> Result<(SyncSender<Snapshot>, Told), StartError> {
-    let (sender, inbox) = sync_channel(1);
+pub(super) fn start(config: GatewayConfig, binds: &[Bind]) -> Result<(Doctor, Told), StartError> {
+    let (filled, inbox) = sync_channel(1);
+    let (empty, rooms) = sync_channel(1);
+    let room = Snapshot::room(records(&config, binds));
     let told = Told::default();
-    let own = Arc::clone(&told);
+    let own = told.clone();
     let thread = std::thread::Builder::new().name("doctor".to_owned());
     thread
-        .spawn(move || log_changes(&config, &inbox, &own))
+        .spawn(move || {
+            // The gateway's thread is there until both ends of this one are.
+            let _ = empty.send(room);
+            log_changes(&config, &inbox, &empty, &own);
+        })
         .map_err(|error| StartError::new(format!("cannot start a thread: {error}")))?;
-    Ok((sender, told))
+    Ok((Doctor { rooms, filled }, told))
 }
 
-fn log_changes(config: &GatewayConfig, inbox: &Receiver<Snapshot>, told: &Told) {
+/// An empty record of each port.
+fn records(config: &GatewayConfig, binds: &[Bind]) -> Vec<PortRecord> {
+    let record = config.view().field_ports().map(|(index, port, _)| {
+        let mut record = PortRecord::new(PortId(index));
+        let bind = binds.iter().find(|bind| port.name == bind.port.as_str());
+        record.device = bind.map(|bind| bind.device.to_string()).unwrap_or_default();
+        record
+    });
+    record.collect()
+}
+
+fn log_changes(
+    config: &GatewayConfig,
+    inbox: &Receiver<Box<Snapshot>>,
+    empty: &SyncSender<Box<Snapshot>>,
+    told: &Told,
+) {
     let mut watch = Watch::new();
     let mut looked: Option<(Instant, Option<States>)> = None;
     for snapshot in inbox {
-        if let Some(failed_at) = snapshot.unexplained()
+        let failed = unexplained(snapshot.engine.status(snapshot.at));
+        if let Some(failed_at) = failed
             && looked.is_none_or(|(at, _)| at < failed_at)
         {
             looked = Some((failed_at, look_at_states(&config.controller)));
         }
-        let states = snapshot.unexplained().and(looked).and_then(|(_, states)| states);
+        let states = failed.and(looked).and_then(|(_, states)| states);
         let findings = snapshot.findings(config, states);
         for change in watch.update(snapshot.at, &findings) {
             match change {
@@ -129,18 +208,14 @@ fn log_changes(config: &GatewayConfig, inbox: &Receiver<Snapshot>, told: &Told) 
                 Change::Ends { place, cause } => info!("{place}: over: {}", cause.name().replace('_', " ")),
             }
         }
-        *told.lock().unwrap_or_else(PoisonError::into_inner) = findings;
+        told.replace(&findings);
+        // Nobody takes it if the gateway has ended.
+        let _ = empty.try_send(snapshot);
     }
 }
 
-/// The words of the newest findings.
-pub(super) fn words(told: &Told) -> Value {
-    let told = told.lock().unwrap_or_else(PoisonError::into_inner);
-    told.iter().map(|finding| json!(finding.to_string())).collect()
-}
-
 /// The controller's states: one packet of its state stream. Nothing is sent to it.
-fn look_at_states(controller: &ControllerLink) -> Option<States> {
+pub(crate) fn look_at_states(controller: &ControllerLink) -> Option<States> {
     let dialect = Dialect::named(&controller.dialect)?;
     let place = (controller.address.as_str(), controller.state_port).to_socket_addrs().ok()?.next()?;
     let mut connection = TcpStream::connect_timeout(&place, MAX_LOOK).ok()?;
@@ -174,8 +249,9 @@ pub fn listen(
 ) -> Result<Vec<Finding>, StartError> {
     let (sender, findings) = channel();
     let voice = if ask { Voice::Asking } else { Voice::Silent };
-    let handle = host::start("doctor", async move || {
-        let gateway = Gateway::open(&config, &binds, voice, &Unwatched::new()).await?;
+    let handle = host::start("doctor", async move |_| {
+        let gateway = Gateway::open(&config, Devices::own(&binds), voice, &Observers::default()).await?;
+        gateway.core.keep_records(&config, &binds);
         Ok(Listener { gateway, config, time, sender })
     })?;
     // It is dropped at the end of the run.
@@ -206,22 +282,19 @@ impl Shell for Listener {
 
     async fn run(self) -> Result<(), StartError> {
         let core = Rc::clone(&self.gateway.core);
-        let noting = async {
-            loop {
-                core.snapshot();
-                tokio::time::sleep(LOOK).await;
-            }
-        };
         let mut signals = Signals::catch().map_err(|error| StartError::new(format!("signals: {error}")))?;
         tokio::select! {
             ended = self.gateway.drive() => ended?,
-            () = noting => {}
+            ended = core.keep_notes() => ended?,
             () = tokio::time::sleep(self.time) => {}
             _ = signals.next() => {}
         }
-        let snapshot = core.snapshot();
+        let at = now();
+        core.note(at);
+        let mut snapshot = Snapshot::room(Vec::new());
+        core.copy_to(&mut snapshot, at);
         let has_states = snapshot.engine.status(snapshot.at).controller().is_some();
-        let looked = match !has_states && has_commands(&self.config) {
+        let looked = match !has_states && has_commands(self.config.view()) {
             true => look_at_states(&self.config.controller),
             false => None,
         };
@@ -229,15 +302,6 @@ impl Shell for Listener {
         let _ = self.sender.send(snapshot.findings(&self.config, looked));
         Ok(())
     }
-}
-
-fn has_commands(config: &GatewayConfig) -> bool {
-    config.fields.iter().any(|field| match field {
-        FieldSpec::UserInput { to, .. } | FieldSpec::DeviceInput { to, .. } => {
-            matches!(to, InputBinding::Commands { .. })
-        }
-        _ => false,
-    })
 }
 
 /// Interval at which a gateway is looked at.

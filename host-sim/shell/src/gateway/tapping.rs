@@ -47,8 +47,9 @@ pub(super) struct Tapping {
 }
 
 impl Tapping {
-    /// Begins to tell of a gateway, which must not have been called yet.
-    pub(super) fn begin(watch: &Watch, cell: Cell, at: Instant, image: &[u8]) -> io::Result<Self> {
+    /// Begins to tell of a gateway, which must not have been called yet. Passes are recorded if there is an
+    /// image, with which a recording begins.
+    pub(super) fn begin(watch: &Watch, cell: Cell, at: Instant, image: Option<&[u8]>) -> io::Result<Self> {
         let (ring, consumer) = RingBuffer::new(RING);
         let began = Record { at, lost: 0, what: What::Began(Arc::new(cell)) };
         let reader = Reader { watch: watch.clone(), ring: consumer, message: Vec::new() };
@@ -58,11 +59,11 @@ impl Tapping {
             ring,
             message: Vec::with_capacity(MAX_MESSAGE),
             is_too_long: false,
-            records_passes: watch.wanted().passes,
+            records_passes: image.is_some(),
             lost: [0; 2],
             reader: Some(reader),
         };
-        if tapping.records_passes {
+        if let Some(image) = image {
             tapping.head(PASS, at);
             tapping.entry(&Entry::Start { image });
             tapping.push(PASS);
@@ -81,6 +82,15 @@ impl Tapping {
             self.records_passes = wanted.passes;
             self.head(PASS, at);
             self.entry(&Entry::Input { at, input });
+        }
+    }
+
+    /// The engine is told to prepare its end.
+    pub(super) fn make_safe(&mut self, at: Instant) {
+        if self.records_passes {
+            self.head(PASS, at);
+            self.entry(&Entry::MakeSafe);
+            self.push(PASS);
         }
     }
 

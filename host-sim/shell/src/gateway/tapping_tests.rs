@@ -12,11 +12,12 @@ const PASSES: Interest = Interest { frames: false, passes: true };
 
 fn cell() -> Cell {
     let epoch = Epoch { at: Instant::from_micros(0), wall: SystemTime::UNIX_EPOCH };
-    Cell { ports: Vec::new(), links: Vec::new(), epoch }
+    Cell { ports: Vec::new(), links: Vec::new(), decoder: Arc::default(), epoch }
 }
 
 fn begin(watch: &Watch) -> Tapping {
-    Tapping::begin(watch, cell(), Instant::from_micros(0), &[1, 2, 3]).unwrap()
+    let image = watch.wanted().passes.then_some(&[1, 2, 3][..]);
+    Tapping::begin(watch, cell(), Instant::from_micros(0), image).unwrap()
 }
 
 fn record(at: u64, verdict: TapVerdict, can_id: Option<CanId>, bytes: &[u8]) -> TapRecord<'_> {

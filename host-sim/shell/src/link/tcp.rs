@@ -99,18 +99,14 @@ impl Link<'_> {
     async fn refuse_others(&self, others: Option<(&TcpListener, &[IpAddr])>) {
         let Some((listener, known)) = others else { return std::future::pending().await };
         loop {
-            match listener.accept().await {
-                Ok((stream, peer)) => {
-                    drop(stream);
-                    if self.control.is_controller(self.name, known, peer) {
-                        let count = |refusals: &mut Refusals| refusals.refused += 1;
-                        self.control.refuse(self.name, peer, "there is already a connection", count);
-                    }
-                    yield_fairly().await;
-                }
-                // Probably too few descriptors, until connections end.
-                Err(_) => sleep(Duration::from_millis(100)).await,
+            // It is closed at once, so a failure matters to nobody.
+            let (stream, peer) = tcp_options::accept(listener, |_| {}).await;
+            drop(stream);
+            if self.control.is_controller(self.name, known, peer) {
+                let count = |refusals: &mut Refusals| refusals.refused += 1;
+                self.control.refuse(self.name, peer, "there is already a connection", count);
             }
+            yield_fairly().await;
         }
     }
 }
