@@ -83,26 +83,38 @@ enum Opened {
     Pipe,
 }
 
+/// Refuses a path at which something else is than a capture, or nothing.
+///
+/// # Errors
+/// Why nothing may be written there.
+pub fn replaceable(path: &Path) -> io::Result<()> {
+    let refused = |message: &str| Err(io::Error::new(io::ErrorKind::AlreadyExists, message));
+    let found = match fs::metadata(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
+        found => found?,
+    };
+    let kind = found.file_type();
+    if kind.is_fifo() || kind.is_char_device() {
+        return Ok(());
+    }
+    if !kind.is_file() {
+        return refused("not a file; give another name");
+    }
+    let mut first = Vec::new();
+    File::open(path)?.take(MAGIC.len() as u64).read_to_end(&mut first)?;
+    if !first.is_empty() && first != MAGIC {
+        return refused("this file exists and is no capture; give another name or remove it");
+    }
+    Ok(())
+}
+
 /// Opens a file, unless that would replace something else than a capture.
 fn check(path: &Path) -> io::Result<Opened> {
-    let refused = |message: &str| Err(io::Error::new(io::ErrorKind::AlreadyExists, message));
-    match fs::metadata(path) {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => {}
-        Err(error) => return Err(error),
-        Ok(found) => {
-            let kind = found.file_type();
-            if kind.is_fifo() || kind.is_char_device() {
-                return Ok(Opened::Pipe);
-            }
-            if !kind.is_file() {
-                return refused("not a file; give another name");
-            }
-            let mut first = Vec::new();
-            File::open(path)?.take(MAGIC.len() as u64).read_to_end(&mut first)?;
-            if !first.is_empty() && first != MAGIC {
-                return refused("this file exists and is no capture; give another name or remove it");
-            }
-        }
+    replaceable(path)?;
+    if let Ok(found) = fs::metadata(path)
+        && !found.is_file()
+    {
+        return Ok(Opened::Pipe);
     }
     File::create(path).map(Opened::File)
 }
@@ -163,7 +175,7 @@ mod tests {
     fn told(watch: &Watch, frames: u64) {
         let port = CellPort { id: PortId(0), name: "line".into(), is_can: false, bit_rate: 0 };
         let epoch = Epoch { at: Instant::from_micros(0), wall: SystemTime::UNIX_EPOCH };
-        let cell = Arc::new(Cell { ports: vec![port], links: Vec::new(), epoch });
+        let cell = Arc::new(Cell { ports: vec![port], links: Vec::new(), decoder: Arc::default(), epoch });
         watch.give(Record { at: Instant::from_micros(0), lost: 0, what: What::Began(cell) });
         for nth in 0..frames {
             let frame = Frame {

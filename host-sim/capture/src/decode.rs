@@ -14,8 +14,8 @@ use serde_json::{Map, Value, json};
 
 use crate::record::Frame;
 
-/// Knows the frames of a file.
-#[derive(Debug, Clone)]
+/// Knows the frames of a file; by default of one that has none.
+#[derive(Debug, Clone, Default)]
 pub struct Decoder {
     ports: Vec<(String, Vec<Topic>)>,
 }
@@ -143,13 +143,17 @@ fn to_json(scalar: Scalar) -> Value {
 #[cfg(test)]
 mod tests {
     use proto_core::engine::{PortId, TapPlace, TapVerdict};
-    use recipe_test_kit::example;
+    use recipe_test_kit::{example, repository};
 
     use super::*;
 
     #[track_caller]
     fn decoded(file: &str, port: &str, direction: TapDirection, id: Option<u16>, bytes: &[u8]) -> String {
-        let model = Model::load(&example(file), &[]).unwrap();
+        let path = match file.strip_prefix("templates/") {
+            Some(file) => repository().join("host-sim/templates").join(file),
+            None => example(file),
+        };
+        let model = Model::load(&path, &[]).unwrap();
         let frame = Frame {
             place: TapPlace::Port(PortId(0)),
             direction,
@@ -180,5 +184,16 @@ mod tests {
         );
         assert_eq!(decoded("rs485-system.toml", "rs485-1", In, None, &[0xFF, 0xFF, 1, 0xEE]), "none");
         assert_eq!(decoded("can-hand.toml", "hand", In, Some(0x501), &[1, 2, 3, 4, 5, 6]), "none", "its own");
+    }
+
+    #[test]
+    fn a_slave_sends_refusals_and_a_master_receives_them() {
+        use TapDirection::{In, Out};
+        let refused = [0x05, 0x90, 0x02, 0x8C, 0x00];
+        assert_eq!(
+            decoded("templates/siemens-s7-1200.toml", "plc", Out, None, &refused),
+            r#"/plc/refusal__1 {"code":2,"function":144,"slave":5}"#
+        );
+        assert_eq!(decoded("templates/siemens-s7-1200.toml", "plc", In, None, &refused), "none", "its own");
     }
 }

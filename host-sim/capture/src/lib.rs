@@ -6,6 +6,7 @@
 
 #![forbid(unsafe_code)]
 
+mod calls;
 mod capture_file;
 mod decode;
 pub mod pcapng;
@@ -16,7 +17,7 @@ pub mod replay;
 mod test_run;
 mod watch;
 
-pub use capture_file::{CaptureFile, Target};
+pub use capture_file::{CaptureFile, Target, replaceable};
 pub use decode::{Decoder, Topic};
 pub use record::{Cell, CellPort, Epoch, Frame, Record, What, rejection};
 pub use watch::{Arrived, Interest, Next, Subscription, Watch};

@@ -8,8 +8,10 @@ use proto_core::engine::{Engine, LinkId, PortId, TapDirection, TapPlace, TapVerd
 use proto_core::time::Instant;
 use proto_core::wire::can::CanId;
 
+use crate::decode::Decoder;
+
 /// One thing that was seen.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone)]
 pub struct Record {
     /// When, on the engine's clock.
     pub at: Instant,
@@ -20,7 +22,7 @@ pub struct Record {
 }
 
 /// What was seen.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone)]
 pub enum What {
     /// An engine begins, with these ports and links. Everybody who watches gets it first.
     Began(Arc<Cell>),
@@ -48,13 +50,15 @@ pub struct Frame {
     pub bytes: Box<[u8]>,
 }
 
-/// A gateway's ports and links, and its clock.
-#[derive(Debug, Clone, PartialEq)]
+/// A gateway's ports and links, its frames, and its clock.
+#[derive(Debug, Clone)]
 pub struct Cell {
     /// Field ports.
     pub ports: Vec<CellPort>,
     /// Links to the controller, by id, with names such as `modbus`.
     pub links: Vec<(LinkId, String)>,
+    /// The frames of its configuration, by name.
+    pub decoder: Arc<Decoder>,
     /// The wall clock at an instant of the engine's clock.
     pub epoch: Epoch,
 }
@@ -97,11 +101,12 @@ impl Epoch {
 }
 
 impl Cell {
-    /// The ports and links of an engine with this configuration.
+    /// The ports and links of an engine with this configuration, whose frames `decoder` knows.
     pub fn new<const P: usize, const U: usize, const F: usize, const T: usize, const E: usize>(
         config: &GatewayConfig,
         engine: &Engine<P, U, F, T, E>,
         epoch: Epoch,
+        decoder: Arc<Decoder>,
     ) -> Self {
         let ports = config.view().field_ports().map(|(index, port, _)| {
             let (is_can, bit_rate) = match port.bus {
@@ -112,7 +117,7 @@ impl Cell {
             CellPort { id: PortId(index), name: port.name.to_string(), is_can, bit_rate }
         });
         let links = engine.links().map(|link| (link.id, link.name.to_owned()));
-        Self { ports: ports.collect(), links: links.collect(), epoch }
+        Self { ports: ports.collect(), links: links.collect(), decoder, epoch }
     }
 
     /// A field port.

@@ -1,12 +1,13 @@
 //! Recordings of whole runs: MCAP files in a folder, within a budget.
 //!
-//! In: a subscription, and the file that the gateway runs. Out: `RUN.PART.mcap` files. A run is one start of
+//! In: a subscription. Out: `RUN.PART.mcap` files. A run is one start of
 //! `host-sim gateway`, called after its time; its parts are files of limited size. Each has
 //!
 //! - a channel for the frames of each kind at each port, decoded to JSON with a schema: `/hand/input/502`
 //! - a channel for frames that were rejected or that the file does not have: `/hand/rejected`, `/hand/other`
 //! - the channel [`ENGINE`] with every call of the engine, from which [`replay`](crate::replay) runs it again.
 //!
+//! Where the gateway gets another configuration, another part begins: the same channel may have other values then.
 //! The oldest parts go when the folder is full. A process that is killed loses the last second at most.
 
 mod folder;
@@ -24,7 +25,6 @@ use proto_core::wire::can::CanId;
 use serde_json::{Value, json};
 use tracing::{info, warn};
 
-use crate::decode::Decoder;
 use crate::record::{Cell, Frame, Record, What, rejection};
 use crate::watch::{Arrived, Interest, Next, Subscription, Watch};
 use part::Part;
@@ -61,7 +61,7 @@ impl Recording {
     ///
     /// # Errors
     /// If the folder cannot be made or read.
-    pub fn start(watch: &Watch, options: RecordOptions, decoder: Decoder) -> io::Result<Self> {
+    pub fn start(watch: &Watch, options: RecordOptions) -> io::Result<Self> {
         let folder = Folder::open(&options.folder)?;
         let subscription = watch.subscribe(Interest { frames: true, passes: true }, ROOM);
         let (end, ended) = channel();
@@ -70,7 +70,6 @@ impl Recording {
             failures: Arc::clone(&failures),
             folder,
             options,
-            decoder,
             cell: None,
             run: None,
             part: None,
@@ -100,7 +99,6 @@ struct Recorder {
     failures: Arc<AtomicU64>,
     folder: Folder,
     options: RecordOptions,
-    decoder: Decoder,
     cell: Option<Arc<Cell>>,
     run: Option<String>,
     part: Option<Part>,
@@ -159,7 +157,8 @@ impl Recorder {
         if let What::Began(cell) = what {
             self.run.get_or_insert_with(|| run_name(cell.epoch.wall));
             self.cell = Some(Arc::clone(cell));
-            return Ok(());
+            // A channel has one schema in a file.
+            return self.part.take().map_or(Ok(()), Part::finish);
         }
         let sequence = match what {
             What::Pass(_) => {
@@ -178,7 +177,7 @@ impl Recorder {
         let time = cell.epoch.unix_nanos(*at);
         match what {
             What::Pass(bytes) => part.engine(time, sequence, bytes)?,
-            What::Frame(frame) => write_frame(part, &self.decoder, &cell, time, frame)?,
+            What::Frame(frame) => write_frame(part, &cell, time, frame)?,
             What::Began(_) => {}
         }
         if part.len() >= self.options.file.saturating_sub(MARGIN)
@@ -210,12 +209,12 @@ impl Recorder {
     }
 }
 
-fn write_frame(part: &mut Part, decoder: &Decoder, cell: &Cell, time: u64, frame: &Frame) -> io::Result<()> {
+fn write_frame(part: &mut Part, cell: &Cell, time: u64, frame: &Frame) -> io::Result<()> {
     // What goes over links is in the calls of the engine.
     let TapPlace::Port(port) = frame.place else { return Ok(()) };
     let Some(port) = cell.port(port) else { return Ok(()) };
     if frame.verdict == TapVerdict::Taken
-        && let Some((topic, values)) = decoder.decode(&port.name, frame)
+        && let Some((topic, values)) = cell.decoder.decode(&port.name, frame)
     {
         return part.message(&topic.name, &topic.title, &topic.schema, time, &values);
     }

@@ -6,17 +6,17 @@
 
 use std::fmt;
 use std::fs::{self, File};
-use std::io::{self, BufReader, Write};
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-use mcap::sans_io::LinearReaderOptions;
 use proto_core::config::GatewayConfig;
 use proto_core::config::image;
 use proto_core::engine::{Engine, Input, OUTPUT_BUFFER, Output};
 use proto_core::record::{Entry, MAGIC, totals};
 use proto_core::time::Instant;
 
-use crate::recording::{ENGINE, Folder, run_of};
+use crate::calls::{self, End, Then};
+use crate::recording::{Folder, run_of};
 
 /// Why a recording cannot be replayed at all.
 #[derive(Debug)]
@@ -166,34 +166,23 @@ impl Runner<'_> {
     /// One file; false if the replay has stopped.
     fn part(&mut self, path: &Path, sequence: &mut Option<u32>) -> Result<bool, ReplayError> {
         let file = File::open(path).map_err(|error| ReplayError::Io(path.to_owned(), error))?;
-        // The file of a killed process has no end.
-        let options = LinearReaderOptions::default().with_skip_end_magic(true);
-        let messages = mcap::io::MessageReader::new_with_options(BufReader::new(file), options);
-        for message in messages {
-            let Ok(message) = message else {
-                self.report.is_cut = true;
-                break;
-            };
-            if message.channel.topic != ENGINE {
-                continue;
-            }
+        let end = calls::each(file, &mut |number, bytes| {
             let missing = match *sequence {
-                Some(last) => message.sequence.wrapping_sub(last).wrapping_sub(1),
+                Some(last) => number.wrapping_sub(last).wrapping_sub(1),
                 None => 0,
             };
             if missing > 0 {
                 let at = self.report.span.map(|(_, last)| last);
                 self.report.stopped = Some(Stopped::Gap { at, missing });
-                return Ok(false);
+                return Ok(Then::Stop);
             }
-            *sequence = Some(message.sequence);
-            self.write_plain(&message.data)?;
-            self.entries(&message.data)?;
-            if self.report.stopped.is_some() {
-                return Ok(false);
-            }
-        }
-        Ok(true)
+            *sequence = Some(number);
+            self.write_plain(bytes)?;
+            self.entries(bytes)?;
+            Ok(if self.report.stopped.is_some() { Then::Stop } else { Then::GoOn })
+        })?;
+        self.report.is_cut |= end == End::Cut;
+        Ok(end != End::Stopped)
     }
 
     fn finish(self, path: &Path) -> Result<Report, ReplayError> {
@@ -256,6 +245,10 @@ impl Runner<'_> {
                         );
                     }
                 }
+                Entry::MakeSafe => match &mut self.engine {
+                    Some(engine) => engine.make_safe(),
+                    None => self.has_headless = true,
+                },
                 // Those of a call are taken with it.
                 Entry::Output(_) => {}
             }

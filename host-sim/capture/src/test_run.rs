@@ -7,8 +7,11 @@ use proto_core::config::{GatewayConfig, image};
 use proto_core::engine::{Engine, Input, OUTPUT_BUFFER, Output, PortId, TapDirection, TapPlace, TapVerdict};
 use proto_core::record::{Entry, totals};
 use proto_core::time::Instant;
+use recipe_config::file::Text;
+use recipe_export::Model;
 use recipe_test_kit::example;
 
+use crate::decode::Decoder;
 use crate::record::{Cell, Epoch, Frame, Record, What};
 use crate::watch::Watch;
 
@@ -25,11 +28,17 @@ pub(crate) struct Run {
 impl Run {
     /// The engine begins.
     pub(crate) fn begin(watch: &Watch) -> Self {
-        let config = config();
+        Self::begin_with(watch, &std::fs::read_to_string(example(FILE)).unwrap())
+    }
+
+    /// The engine of a file with this text begins.
+    pub(crate) fn begin_with(watch: &Watch, toml: &str) -> Self {
+        let config = recipe_test_kit::toml::gateway(toml);
+        let model = Model::parse(Text { name: "cell.toml", toml }, &[]).unwrap();
         let engine = Box::new(Engine::new(&*config).unwrap());
         let at = Instant::from_millis(1_000);
         let wall = UNIX_EPOCH + Duration::from_secs(1_800_000_000);
-        let cell = Cell::new(&config, &engine, Epoch { at, wall });
+        let cell = Cell::new(&config, &engine, Epoch { at, wall }, Arc::new(Decoder::new(&model)));
         watch.give(Record { at, lost: 0, what: What::Began(Arc::new(cell)) });
         let mut bytes = vec![0; image::MAX_IMAGE];
         let len = image::encode(&*config, &mut bytes).unwrap();

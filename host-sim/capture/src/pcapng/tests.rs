@@ -19,6 +19,7 @@ fn cell(ports: &[(&str, bool)]) -> Arc<Cell> {
     Arc::new(Cell {
         ports: ports.iter().enumerate().map(port).collect(),
         links: vec![(LinkId::MODBUS, "modbus".into())],
+        decoder: Arc::default(),
         epoch: Epoch { at: Instant::from_micros(0), wall: SystemTime::UNIX_EPOCH + Duration::from_secs(5) },
     })
 }

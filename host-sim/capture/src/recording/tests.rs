@@ -4,7 +4,6 @@ use std::fs;
 use std::path::Path;
 
 use proto_core::engine::Input;
-use recipe_export::Model;
 use recipe_test_kit::{example, until};
 
 use super::*;
@@ -12,9 +11,8 @@ use crate::replay::{Report, Stopped, replay};
 use crate::test_run::{FILE, Run, config};
 
 fn start(folder: &Path, watch: &Watch, budget: u64) -> Recording {
-    let model = Model::load(&example(FILE), &[]).unwrap();
     let options = RecordOptions { folder: folder.to_owned(), budget, file: MIN_FILE };
-    Recording::start(watch, options, Decoder::new(&model)).unwrap()
+    Recording::start(watch, options).unwrap()
 }
 
 fn used(folder: &Path) -> u64 {
@@ -51,6 +49,29 @@ fn a_run_is_recorded_by_name_and_replayed_to_the_end() {
             "{report:?}"
         );
     }
+}
+
+#[test]
+fn each_configuration_of_a_run_has_its_own_values() {
+    let folder = tempfile::tempdir().unwrap();
+    let watch = Watch::new();
+    let recording = start(folder.path(), &watch, 1 << 30);
+    let toml = fs::read_to_string(example(FILE)).unwrap();
+    let other = toml.replace("DigitalOutputCommand[1]", "DigitalOutputCommand[2]");
+    for toml in [toml, other] {
+        let mut run = Run::begin_with(&watch, &toml);
+        run.frame(7);
+        run.end();
+    }
+    watch.close();
+    recording.finish();
+    let parts = Folder::open(folder.path()).unwrap().parts().unwrap();
+    let values: Vec<_> = parts.iter().flat_map(|(path, _)| messages(path)).collect();
+    let values: Vec<_> = values.iter().filter(|(topic, _)| topic == "/rs485__1/input").collect();
+    assert_eq!(values[0].1, br#"{"DigitalOutputCommand_1_":7}"#);
+    assert_eq!(values[1].1, br#"{"DigitalOutputCommand_2_":7}"#);
+    let report = replay(folder.path(), None).unwrap();
+    assert!(matches!(report, Report { starts: 2, files: 2, stopped: None, is_cut: false, .. }), "{report:?}");
 }
 
 #[test]
@@ -183,4 +204,30 @@ fn a_failure_is_over_when_the_disk_is_back() {
     recording.finish();
     let replayed = replay(&place, None);
     assert!(matches!(replayed, Err(crate::replay::ReplayError::NoStart(_))), "{replayed:?}");
+}
+
+#[test]
+fn a_length_that_no_memory_has_is_a_file_that_was_cut() {
+    let place = tempfile::tempdir().unwrap();
+    let file = place.path().join("damaged.mcap");
+    let head = [&b"\x89MCAP0\r\n\x01"[..], &u64::MAX.to_le_bytes(), &[0; 16]].concat();
+    for bytes in [head.clone(), [&head[..9], &(1_u64 << 40).to_le_bytes(), &[0; 16]].concat()] {
+        std::fs::write(&file, bytes).unwrap();
+        let error = replay(&file, None).unwrap_err().to_string();
+        assert!(error.ends_with("not a recording of a gateway"), "{error}");
+    }
+}
+
+#[test]
+fn a_record_that_is_longer_than_its_chunk_is_the_end_of_the_file() {
+    let place = tempfile::tempdir().unwrap();
+    let file = place.path().join("damaged.mcap");
+    // A chunk without times, sizes, checksum and compression, whose one record says to have 40 bytes.
+    let record = [&[0x05][..], &40_u64.to_le_bytes(), &[0; 8]].concat();
+    let len = record.len() as u64;
+    let chunk = [&[0; 16][..], &len.to_le_bytes(), &[0; 8], &len.to_le_bytes(), &record].concat();
+    let bytes = [&b"\x89MCAP0\r\n\x06"[..], &(chunk.len() as u64).to_le_bytes(), &chunk, &[0; 64]].concat();
+    std::fs::write(&file, bytes).unwrap();
+    let error = replay(&file, None).unwrap_err().to_string();
+    assert!(error.ends_with("not a recording of a gateway"), "{error}");
 }

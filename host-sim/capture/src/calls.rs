@@ -1,0 +1,117 @@
+//! The calls of the engine in an MCAP file, whatever the file holds.
+//!
+//! In: a file of a recording ([`crate::recording`]), also a damaged one. Out: each call with its number. Chunks are
+//! taken apart here: the library's reader does not check that the records in a chunk end where it does.
+
+use std::collections::BTreeSet;
+use std::fs::File;
+use std::io::Read;
+
+use mcap::records::{Record, op};
+use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
+use mcap::{McapError, parse_record};
+
+use crate::recording::ENGINE;
+
+/// Takes a call and its number.
+pub(crate) type Take<'t, E> = dyn FnMut(u32, &[u8]) -> Result<Then, E> + 't;
+
+/// What becomes of the file after a call.
+pub(crate) enum Then {
+    GoOn,
+    Stop,
+}
+
+/// How the file ended.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) enum End {
+    Whole,
+    /// Within a record, or where nothing can be read.
+    Cut,
+    /// As it was told.
+    Stopped,
+}
+
+/// Hands over each call with its number.
+///
+/// # Errors
+/// That of `take`.
+pub(crate) fn each<E>(mut file: File, take: &mut Take<'_, E>) -> Result<End, E> {
+    let Ok(len) = file.metadata().map(|found| found.len()) else { return Ok(End::Cut) };
+    // The file of a killed process has no end. A damaged one may name a length that no memory has.
+    let options = LinearReaderOptions::default()
+        .with_skip_end_magic(true)
+        .with_emit_chunks(true)
+        .with_record_length_limit(usize::try_from(len).unwrap_or(usize::MAX));
+    let mut reader = LinearReader::new_with_options(options);
+    let mut channels = Channels::default();
+    loop {
+        match reader.next_event() {
+            None => return Ok(End::Whole),
+            Some(Err(_)) => return Ok(End::Cut),
+            Some(Ok(LinearReadEvent::ReadRequest(wanted))) => {
+                let Ok(read) = file.read(reader.insert(wanted)) else { return Ok(End::Cut) };
+                reader.notify_read(read);
+            }
+            Some(Ok(LinearReadEvent::Record { opcode, data })) => {
+                match channels.record(opcode, data, take)? {
+                    End::Whole => {}
+                    end => return Ok(end),
+                }
+            }
+        }
+    }
+}
+
+/// The channels of the engine's calls.
+#[derive(Default)]
+struct Channels(BTreeSet<u16>);
+
+impl Channels {
+    /// A record, which may have others in it.
+    fn record<E>(&mut self, opcode: u8, data: &[u8], take: &mut Take<'_, E>) -> Result<End, E> {
+        if !matches!(opcode, op::CHANNEL | op::MESSAGE | op::CHUNK) {
+            return Ok(End::Whole);
+        }
+        match parse_record(opcode, data) {
+            Err::<_, McapError>(_) => return Ok(End::Cut),
+            Ok(Record::Channel(channel)) => {
+                if channel.topic == ENGINE {
+                    self.0.insert(channel.id);
+                } else {
+                    self.0.remove(&channel.id);
+                }
+            }
+            Ok(Record::Message { header, data }) if self.0.contains(&header.channel_id) => {
+                if let Then::Stop = take(header.sequence, &data)? {
+                    return Ok(End::Stopped);
+                }
+            }
+            // A recording has no compressed ones.
+            Ok(Record::Chunk { header, data }) if header.compression.is_empty() => {
+                return self.chunk(&data, take);
+            }
+            Ok(Record::Chunk { .. }) => return Ok(End::Cut),
+            Ok(_) => {}
+        }
+        Ok(End::Whole)
+    }
+
+    fn chunk<E>(&mut self, mut rest: &[u8], take: &mut Take<'_, E>) -> Result<End, E> {
+        while let Some((opcode, behind)) = rest.split_first() {
+            let Some((len, behind)) = behind.split_first_chunk() else { return Ok(End::Cut) };
+            let len = usize::try_from(u64::from_le_bytes(*len)).unwrap_or(usize::MAX);
+            let Some((data, behind)) = behind.split_at_checked(len) else { return Ok(End::Cut) };
+            rest = behind;
+            // None is in another one.
+            if *opcode == op::CHUNK {
+                return Ok(End::Cut);
+            }
+            match self.record(*opcode, data, take)? {
+                End::Whole => {}
+                end => return Ok(end),
+            }
+        }
+        Ok(End::Whole)
+    }
+}
