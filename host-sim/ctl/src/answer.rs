@@ -1,0 +1,61 @@
+//! What a command found: as a document, as text, and as one row among those of other gateways.
+
+use serde_json::Value;
+
+use crate::failure::Verdict;
+use crate::table::{Cell, View};
+
+/// The outcome of a command at one gateway.
+#[derive(Debug, Clone)]
+pub struct Answer {
+    pub(crate) document: Value,
+    pub(crate) text: Text,
+    /// What a table of several gateways shows of it: headings and cells.
+    pub(crate) row: Vec<(&'static str, Cell)>,
+    pub(crate) verdict: Verdict,
+}
+
+/// Text for people.
+#[derive(Debug, Clone)]
+pub(crate) enum Text {
+    /// Made by this program.
+    Made(String),
+    /// A document of the gateway that is text itself, such as a configuration.
+    Document(String),
+}
+
+impl Answer {
+    /// An answer without trouble.
+    pub(crate) fn new(document: Value, text: String) -> Self {
+        Self { document, text: Text::Made(text), row: Vec::new(), verdict: Verdict::Well }
+    }
+
+    #[must_use]
+    pub(crate) fn with_row(self, row: Vec<(&'static str, Cell)>) -> Self {
+        Self { row, ..self }
+    }
+
+    #[must_use]
+    pub(crate) fn with_verdict(self, is_well: bool) -> Self {
+        Self { verdict: if is_well { Verdict::Well } else { Verdict::Trouble }, ..self }
+    }
+
+    /// What the exit code says.
+    pub fn verdict(&self) -> Verdict {
+        self.verdict
+    }
+
+    /// As a document, on one line.
+    pub fn json(&self) -> String {
+        crate::shown::json(&self.document) + "\n"
+    }
+
+    /// As text. A document of the gateway goes to a file or pipe as it is.
+    pub fn text(&self, view: View) -> String {
+        match &self.text {
+            Text::Made(text) => text.clone(),
+            Text::Document(text) if view.is_terminal => crate::shown::lines(text).into_owned(),
+            Text::Document(text) => text.clone(),
+        }
+    }
+}

@@ -1,0 +1,411 @@
+//! Commands about another configuration: `config`, `push`, `apply`, `confirm`, `rollback`; and `identify`.
+//!
+//! A file is checked here before anything is sent. A host takes its text; a board takes the image that is made of it
+//! here.
+
+use std::net::IpAddr;
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use proto_core::config::{GatewayConfig, MAX_PORTS, image};
+use proto_core::engine::Engine;
+use recipe_config::board::Board;
+use recipe_config::file::{self, FileError};
+use serde_json::{Value, json};
+
+use crate::answer::{Answer, Text};
+use crate::client::{Body, Call, Client};
+use crate::failure::{Failure, Verdict};
+use crate::reading::{ended_words, revisions_of};
+use crate::shown;
+use crate::table::Cell;
+
+/// A configuration that can run, as a host and as a board take it.
+#[derive(Debug, Clone)]
+pub struct Configuration {
+    toml: Result<String, String>,
+    image: Result<Vec<u8>, String>,
+}
+
+impl Configuration {
+    /// Reads a gateway file, with overrides that only a board takes, or an image, which only a board takes too. With a
+    /// board, it must fit that one.
+    ///
+    /// # Errors
+    /// Its first mistake, with its place.
+    pub fn read(path: &Path, set: &[String], board: Option<Board>) -> Result<Self, Failure> {
+        let name = path.display().to_string();
+        let whole = |why: String| FileError {
+            source: file::Source::WholeFile { file: name.clone() },
+            key: String::new(),
+            message: why,
+        };
+        let bytes = std::fs::read(path).map_err(|error| whole(format!("cannot be read: {error}")))?;
+        if bytes.starts_with(&image::MAGIC) {
+            return Self::of_image(&name, bytes, set, board);
+        }
+        let toml =
+            String::from_utf8(bytes).map_err(|_| whole("neither a text nor an image of a board".into()))?;
+        // Of the text that is sent, whatever is at its path by now.
+        let config = file::parse_gateway(file::Text { name: &name, toml: &toml }, set)?;
+        if let Err(error) = Engine::<MAX_PORTS>::new(&*config) {
+            return Err(file::error_at(path, set, &["port"], error).into());
+        }
+        if let Some(Err(unfit)) = board.map(|board| board.check(&config)) {
+            let key: Vec<&str> = unfit.key.iter().map(String::as_str).collect();
+            return Err(file::error_at(path, set, &key, unfit.message).into());
+        }
+        let is_asked_for = set.iter().any(|set| set.starts_with("controller.address="));
+        let image = match is_this_machine(&config.controller.address) && !is_asked_for {
+            true => {
+                let why = "this is the board itself, where no controller is; give the controller's address with \
+                           --set controller.address=ADDRESS, or write it in the file";
+                Err(file::error_at(path, set, &["controller", "address"], why).to_string())
+            }
+            false => image_of(&config).map_err(|why| format!("{name}: {why}")),
+        };
+        let toml = match set.is_empty() {
+            true => Ok(toml),
+            false => Err(format!(
+                "{name}: a host takes the text as it is; --set is for boards, and an option of `host-sim gateway`"
+            )),
+        };
+        Ok(Self { toml, image })
+    }
+
+    fn of_image(name: &str, bytes: Vec<u8>, set: &[String], board: Option<Board>) -> Result<Self, Failure> {
+        let wrong = |why: String| Failure::wrong(format!("{name}: {why}"));
+        if !set.is_empty() {
+            return Err(wrong("an image has no keys for --set; make another one of its file".into()));
+        }
+        let config = image::decode(&bytes).map_err(|error| wrong(error.to_string()))?;
+        if let Some(Err(unfit)) = board.map(|board| board.check(&config)) {
+            return Err(wrong(format!("{}: {}", unfit.key.join("."), unfit.message)));
+        }
+        Ok(Self {
+            toml: Err(format!("{name}: an image is for boards; a host takes the gateway file itself, TOML")),
+            image: Ok(bytes),
+        })
+    }
+}
+
+/// Whether an address is that of whoever uses it.
+fn is_this_machine(address: &str) -> bool {
+    address == "localhost" || address.parse::<IpAddr>().is_ok_and(|ip| ip.to_canonical().is_loopback())
+}
+
+fn image_of(config: &GatewayConfig) -> Result<Vec<u8>, String> {
+    let mut bytes = vec![0; image::MAX_IMAGE];
+    let len = image::encode(config, &mut bytes).map_err(|error| error.to_string())?;
+    bytes.truncate(len);
+    // What a board would refuse is never sent.
+    image::decode(&bytes).map_err(|error| error.to_string())?;
+    Ok(bytes)
+}
+
+/// What takes a configuration.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Role {
+    /// A gateway on a host.
+    Host,
+    /// A board.
+    Board,
+}
+
+impl Role {
+    /// What a gateway says that it is.
+    pub(crate) fn of(client: &Client) -> Result<Self, Failure> {
+        match client.json("info")?["role"].as_str() {
+            Some("gateway") => Ok(Self::Host),
+            Some("board") => Ok(Self::Board),
+            Some("controller") => {
+                Err(client.refused("this is a simulated controller; it takes no configuration"))
+            }
+            _ => Err(client.refused("its `info` has no role that is known here; is this a gateway?")),
+        }
+    }
+}
+
+/// A configuration as a gateway keeps it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Stored {
+    /// The text of a host's.
+    Toml(String),
+    /// The image of a board's.
+    Image(Vec<u8>),
+}
+
+/// The configuration that runs, or another one that is kept.
+///
+/// # Errors
+/// If it is refused or not reached.
+pub fn stored(client: &Client, revision: Option<u32>) -> Result<Stored, Failure> {
+    let path = revision.map_or_else(|| "config".to_owned(), |number| format!("config?revision={number}"));
+    let reply = client.get(&path)?;
+    let kind = reply.field("content-type").unwrap_or_default();
+    match kind.split(';').next().unwrap_or_default().trim() {
+        "application/octet-stream" => Ok(Stored::Image(reply.body)),
+        _ => client.text(reply).map(Stored::Toml),
+    }
+}
+
+impl Stored {
+    /// As a host or a board has it.
+    pub fn bytes(&self) -> &[u8] {
+        match self {
+            Self::Toml(text) => text.as_bytes(),
+            Self::Image(bytes) => bytes,
+        }
+    }
+
+    /// The configuration itself, as far as it says what runs: overrides of the command line are not in it.
+    ///
+    /// # Errors
+    /// If it is no configuration that this program reads.
+    pub fn read(&self) -> Result<Box<GatewayConfig>, String> {
+        match self {
+            Self::Toml(toml) => {
+                let text = file::Text { name: "config", toml };
+                file::parse_gateway(text, &[]).map_err(|error| error.to_string())
+            }
+            Self::Image(bytes) => image::decode(bytes).map(Box::new).map_err(|error| error.to_string()),
+        }
+    }
+}
+
+/// `config` without a file to write to.
+///
+/// # Errors
+/// If it is refused or not reached.
+pub fn config(client: &Client, revision: Option<u32>) -> Result<Answer, Failure> {
+    let stored = stored(client, revision)?;
+    let len = Cell::number(stored.bytes().len());
+    let (document, text) = match stored {
+        Stored::Toml(toml) => (json!({ "toml": toml }), Text::Document(toml)),
+        Stored::Image(bytes) => {
+            let text = match Stored::Image(bytes.clone()).read() {
+                Ok(config) => format!(
+                    "an image of {} bytes, with {} ports and {} recipes; -o FILE writes it\n",
+                    bytes.len(),
+                    config.ports.len(),
+                    config.recipes.len()
+                ),
+                Err(why) => {
+                    format!("an image of {} bytes that this program does not read: {why}\n", bytes.len())
+                }
+            };
+            let hex: String = bytes.iter().map(|byte| format!("{byte:02x}")).collect();
+            (json!({ "image": hex }), Text::Made(text))
+        }
+    };
+    Ok(Answer { document, text, row: vec![("bytes", len)], verdict: Verdict::Well })
+}
+
+/// How a stored revision is put on trial.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Trial {
+    /// Seconds until it is taken back unless it is confirmed.
+    pub confirm_s: f64,
+    /// Another one than the stored one that waits.
+    pub revision: Option<u32>,
+}
+
+/// `push`: stores a configuration, and puts it on trial if that is asked for.
+///
+/// # Errors
+/// If it is refused or not reached.
+pub fn push(client: &Client, configuration: &Configuration, trial: Option<Trial>) -> Result<Answer, Failure> {
+    let body = match Role::of(client)? {
+        Role::Host => Body::Toml(configuration.toml.as_deref().map_err(Failure::wrong)?),
+        Role::Board => Body::Image(configuration.image.as_deref().map_err(Failure::wrong)?),
+    };
+    // What it is based on is what is there now: a person pushes a whole file.
+    let base = client.json("revisions")?;
+    let Some(etag) = base["base"].as_str().filter(|etag| is_etag(etag)) else {
+        return Err(client.refused("it names no revision that a change could be based on"));
+    };
+    let call = Call { method: "PUT", path: "config", body, if_match: Some(etag), more_time: Duration::ZERO };
+    let reply = client.accepted(client.call(&call)?)?;
+    let document = client.document(&reply)?;
+    let Some(revision) = document["waiting"].as_u64().or(document["revision"].as_u64()) else {
+        return Err(client.refused("it does not say which revision it has stored"));
+    };
+    if let Some(trial) = trial {
+        return apply(client, trial);
+    }
+    let text = format!("revision {revision} is stored and waits; `apply` puts it on trial\n");
+    let row = vec![("revision", Cell::number(revision)), ("is", "waiting".into())];
+    Ok(Answer::new(document, text).with_row(row))
+}
+
+/// An ETag as it may stand in a head.
+fn is_etag(text: &str) -> bool {
+    text.len() <= 64 && text.bytes().all(|byte| byte.is_ascii_graphic())
+}
+
+/// `apply`.
+///
+/// # Errors
+/// If it is refused, not reached, or the revision does not start.
+pub fn apply(client: &Client, trial: Trial) -> Result<Answer, Failure> {
+    let mut arguments = json!({ "confirm_s": trial.confirm_s });
+    if let Some(revision) = trial.revision {
+        arguments["revision"] = revision.into();
+    }
+    let before = client.json("revisions")?["last"].clone();
+    let document = replacing(client, "apply", &arguments)?;
+    let revision = document["revision"].as_u64();
+    let Some(revision) = revision.or(document["trial"]["revision"].as_u64()) else {
+        return Err(client.refused("it does not say which revision it applies"));
+    };
+    // A board starts again with it, and answers before.
+    let is_there = |shown: &Value| shown["running"] == revision && shown["trial"]["revision"] == revision;
+    let document = match is_there(&document) {
+        true => document,
+        false => {
+            let mut seen = document["trial"]["revision"] == revision;
+            let mut ended = |shown: &Value| {
+                let is_on = shown["trial"]["revision"] == revision;
+                seen |= is_on;
+                // It may have ended in the same way before.
+                !is_on && shown["last"]["revision"] == revision && (seen || shown["last"] != before)
+            };
+            until(client, &is_there, &mut ended, revision)?
+        }
+    };
+    let left = document["trial"]["left_s"].as_f64().unwrap_or(trial.confirm_s);
+    let text = format!(
+        "revision {revision} runs on trial; it is taken back in {left:.0} s unless it is confirmed: \
+         `confirm` keeps it, `rollback` takes it back at once\n"
+    );
+    let row = vec![("revision", Cell::number(revision)), ("is", "on trial".into())];
+    Ok(Answer::new(document, text).with_row(row))
+}
+
+/// Makes a request that replaces the gateway.
+fn replacing(client: &Client, path: &str, arguments: &Value) -> Result<Value, Failure> {
+    let call = Call { more_time: REPLACING, ..Call::post(path, arguments) };
+    let reply = client.accepted(client.call(&call)?)?;
+    client.document(&reply)
+}
+
+/// The revisions once `found` is true of them; a failure if the trial of this one has `ended` before.
+fn until(
+    client: &Client,
+    found: &dyn Fn(&Value) -> bool,
+    ended: &mut dyn FnMut(&Value) -> bool,
+    revision: u64,
+) -> Result<Value, Failure> {
+    let deadline = Instant::now() + RESTARTING;
+    loop {
+        let last = client.json("revisions");
+        if let Ok(document) = &last {
+            if found(document) {
+                return last;
+            }
+            if ended(document) {
+                let ended = document["last"]["ended"].as_str().unwrap_or_default();
+                let why = document["failure"].as_str().map(shown::line).unwrap_or_default();
+                let why = if why.is_empty() { String::new() } else { format!(": {why}") };
+                return Err(client.refused(format!("revision {revision}: {}{why}", ended_words(ended))));
+            }
+        }
+        if Instant::now() > deadline {
+            return Err(match last {
+                Err(failure) => failure,
+                Ok(_) => client.refused(format!("revision {revision} does not run in time")),
+            });
+        }
+        if client.stop().wait(AGAIN) {
+            return Err(client.refused("ended before the revision ran; `revisions` shows what became of it"));
+        }
+    }
+}
+
+/// `confirm`.
+///
+/// # Errors
+/// If it is refused or not reached.
+pub fn confirm(client: &Client) -> Result<Answer, Failure> {
+    let reply = client.accepted(client.call(&Call::post("confirm", &json!({})))?)?;
+    let document = client.document(&reply)?;
+    let live = document["live"].as_u64().unwrap_or_default();
+    let row = vec![("revision", Cell::number(live)), ("is", "live".into())];
+    Ok(Answer::new(document, format!("revision {live} is live\n")).with_row(row))
+}
+
+/// What `rollback` does without a trial.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum WithoutTrial {
+    /// Nothing.
+    Refuse,
+    /// It returns to the revision that was live before.
+    Previous,
+}
+
+/// `rollback`. The API steps back to the revision before if there is no trial, which is not what somebody wants who
+/// takes back a trial that has just ended by itself: so this looks first.
+///
+/// # Errors
+/// If it is refused, here or there, or not reached.
+pub fn rollback(client: &Client, without: WithoutTrial) -> Result<Answer, Failure> {
+    if without == WithoutTrial::Refuse {
+        let document = client.json("revisions")?;
+        if document["trial"].is_null() {
+            return Err(client.refused(no_trial(&document)));
+        }
+    }
+    let document = replacing(client, "rollback", &json!({}))?;
+    // Without a trial it returns to the revision before.
+    let revision = document["live"].as_u64().unwrap_or_default();
+    let is_there = |shown: &Value| {
+        shown["running"] == revision && shown["live"] == revision && shown.get("trial").is_none()
+    };
+    let document = match is_there(&document) {
+        true => document,
+        false => until(client, &is_there, &mut |_| false, revision)?,
+    };
+    let row = vec![("revision", Cell::number(revision)), ("is", "live".into())];
+    let text = revisions_of(document.clone()).text(crate::table::View { width: None, is_terminal: false });
+    Ok(Answer::new(document, format!("revision {revision} runs and is live\n\n{text}")).with_row(row))
+}
+
+/// Why a trial cannot be taken back, and what could be meant.
+fn no_trial(revisions: &Value) -> String {
+    let Some(live) = revisions["live"].as_u64() else {
+        return "no revision is on trial, and none was confirmed".into();
+    };
+    let mut text = format!("no revision is on trial; revision {live} is live");
+    if revisions["running"] != live {
+        text += ", and does not run at the moment";
+    }
+    let last = &revisions["last"];
+    if let (Some(revision), Some(ended)) = (last["revision"].as_u64(), last["ended"].as_str()) {
+        text += &format!(". The last trial, of revision {revision}: {}", ended_words(ended));
+    }
+    if let Some(previous) = revisions["previous"].as_u64() {
+        text += &format!(
+            ". `apply --revision {previous}` tries the one before, `rollback --previous` makes it live at once"
+        );
+    }
+    text
+}
+
+/// `identify`: a host writes a line, a board lets its lamp blink.
+///
+/// # Errors
+/// If it is refused or not reached.
+pub fn identify(client: &Client, seconds: u32) -> Result<Answer, Failure> {
+    let arguments = json!({ "s": seconds });
+    let reply = client.accepted(client.call(&Call::post("identify", &arguments))?)?;
+    let document = client.document(&reply)?;
+    let text = format!("{} shows itself for {seconds} s\n", client.address());
+    Ok(Answer::new(document, text))
+}
+
+/// Time that a gateway may take to let its safe values out, end, and start another one.
+const REPLACING: Duration = Duration::from_secs(10);
+/// Time that a board may take to start again.
+const RESTARTING: Duration = Duration::from_secs(30);
+/// Time between two looks at a board that starts again.
+const AGAIN: Duration = Duration::from_millis(300);

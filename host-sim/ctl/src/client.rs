@@ -1,0 +1,360 @@
+//! A client of one gateway.
+//!
+//! In: requests of docs/api.md. Out: answers, or a failure in words. Signs what needs the key: everything over a
+//! network, and what changes something on the own machine. The key itself is never sent, also not on the own
+//! machine, where the API would take it: a forwarded port leads to another one.
+
+use std::cell::RefCell;
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use recipe_remote::key::{BodyHash, Hex, Key, SCHEME, Signed};
+use serde_json::Value;
+
+use crate::address::Address;
+use crate::failure::Failure;
+use crate::http::{Event, Exchange, NoReply, Reply, Request, Stream, words};
+use crate::shown;
+use crate::stop::Stop;
+
+/// The beginning of every path.
+const API: &str = "/api/v1/";
+
+/// A gateway, and how it is talked to. One thread uses it at a time.
+#[derive(Debug)]
+pub struct Client {
+    address: Address,
+    places: Vec<SocketAddr>,
+    host: Option<Address>,
+    key: Option<Key>,
+    timeout: Duration,
+    stop: Stop,
+    /// From the last answer; valid for one request.
+    nonce: RefCell<Option<String>>,
+}
+
+/// What is sent with a request.
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum Body<'a> {
+    None,
+    Json(&'a Value),
+    Toml(&'a str),
+    Image(&'a [u8]),
+}
+
+impl Body<'_> {
+    fn bytes(&self) -> Vec<u8> {
+        match self {
+            Self::None => Vec::new(),
+            Self::Json(value) => value.to_string().into_bytes(),
+            Self::Toml(text) => text.as_bytes().to_vec(),
+            Self::Image(bytes) => bytes.to_vec(),
+        }
+    }
+
+    fn kind(&self) -> Option<&'static str> {
+        match self {
+            Self::None => None,
+            Self::Json(_) => Some("application/json"),
+            Self::Toml(_) => Some("application/toml"),
+            Self::Image(_) => Some("application/octet-stream"),
+        }
+    }
+}
+
+/// A request of the API.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Call<'a> {
+    pub(crate) method: &'static str,
+    /// Behind [`API`], with its query.
+    pub(crate) path: &'a str,
+    pub(crate) body: Body<'a>,
+    pub(crate) if_match: Option<&'a str>,
+    /// Time in addition to that of every request: the gateway is replaced meanwhile.
+    pub(crate) more_time: Duration,
+}
+
+impl<'a> Call<'a> {
+    pub(crate) const fn get(path: &'a str) -> Self {
+        Self { method: "GET", path, body: Body::None, if_match: None, more_time: Duration::ZERO }
+    }
+
+    pub(crate) const fn post(path: &'a str, body: &'a Value) -> Self {
+        Self { method: "POST", path, body: Body::Json(body), if_match: None, more_time: Duration::ZERO }
+    }
+}
+
+impl Client {
+    /// A client of the gateway at this address. A request and its answer take at most `timeout`.
+    ///
+    /// # Errors
+    /// If the address is a name that nobody knows.
+    pub fn new(address: Address, key: Option<Key>, timeout: Duration, stop: Stop) -> Result<Self, Failure> {
+        let places = address.resolve().map_err(|error| Failure::Refused(format!("{address}: {error}")))?;
+        Ok(Self { address, places, host: None, key, timeout, stop, nonce: RefCell::new(None) })
+    }
+
+    /// The same, if the gateway knows itself by another address than the one that leads to it, such as a forwarded
+    /// port.
+    #[must_use]
+    pub fn known_as(self, host: Option<Address>) -> Self {
+        Self { host, ..self }
+    }
+
+    /// The same gateway, until another end.
+    pub(crate) fn until(&self, stop: Stop) -> Self {
+        let (address, places, key) = (self.address.clone(), self.places.clone(), self.key.clone());
+        let (host, timeout) = (self.host.clone(), self.timeout);
+        Self { address, places, host, key, timeout, stop, nonce: RefCell::new(None) }
+    }
+
+    /// The same gateway with another key.
+    pub(crate) fn with_key(&self, key: Key) -> Self {
+        Self { key: Some(key), ..self.until(self.stop.clone()) }
+    }
+
+    /// Its address, as it was given.
+    pub fn address(&self) -> &Address {
+        &self.address
+    }
+
+    pub(crate) fn stop(&self) -> &Stop {
+        &self.stop
+    }
+
+    /// A failure of this gateway in words.
+    pub(crate) fn refused(&self, why: impl std::fmt::Display) -> Failure {
+        Failure::Refused(format!("{}: {}", self.address, shown::line(&why.to_string())))
+    }
+
+    /// A document.
+    pub(crate) fn json(&self, path: &str) -> Result<Value, Failure> {
+        let reply = self.get(path)?;
+        self.document(&reply)
+    }
+
+    /// A document that this server may not have: `None` if there is no such path.
+    pub(crate) fn json_if_there(&self, path: &str) -> Result<Option<Value>, Failure> {
+        let reply = self.call(&Call::get(path))?;
+        match reply.status() {
+            404 => Ok(None),
+            200..=299 => self.document(&reply).map(Some),
+            _ => Err(self.refusal(&reply)),
+        }
+    }
+
+    /// An answer to a plain read.
+    pub(crate) fn get(&self, path: &str) -> Result<Reply, Failure> {
+        let reply = self.call(&Call::get(path))?;
+        self.accepted(reply)
+    }
+
+    /// The answer if it is none of a refusal.
+    pub(crate) fn accepted(&self, reply: Reply) -> Result<Reply, Failure> {
+        match reply.status() {
+            200..=299 => Ok(reply),
+            _ => Err(self.refusal(&reply)),
+        }
+    }
+
+    /// A body as JSON.
+    pub(crate) fn document(&self, reply: &Reply) -> Result<Value, Failure> {
+        serde_json::from_slice(&reply.body)
+            .map_err(|_| self.refused("the answer is no JSON; is this a gateway?"))
+    }
+
+    /// A body as text.
+    pub(crate) fn text(&self, reply: Reply) -> Result<String, Failure> {
+        String::from_utf8(reply.body).map_err(|_| self.refused("the answer is no text; is this a gateway?"))
+    }
+
+    /// Opens a stream.
+    pub(crate) fn stream(&self, path: &str) -> Result<Events<'_>, Failure> {
+        self.opened(self.exchange(&Call::get(path))?)
+    }
+
+    fn opened(&self, exchange: Exchange) -> Result<Events<'_>, Failure> {
+        if !(200..=299).contains(&exchange.status()) {
+            let reply = exchange.finish().map_err(|error| self.no_reply(error))?;
+            return Err(self.refusal(&reply));
+        }
+        let stream = exchange.stream().map_err(|error| self.no_reply(error))?;
+        Ok(Events { client: self, stream })
+    }
+
+    /// Opens a stream that this server may not have: `None` if there is no such path.
+    pub(crate) fn stream_if_there(&self, path: &str) -> Result<Option<Events<'_>>, Failure> {
+        let exchange = self.exchange(&Call::get(path))?;
+        if exchange.status() == 404 {
+            return Ok(None);
+        }
+        self.opened(exchange).map(Some)
+    }
+
+    /// Makes a request; any answer is one.
+    pub(crate) fn call(&self, call: &Call<'_>) -> Result<Reply, Failure> {
+        self.exchange(call)?.finish().map_err(|error| self.no_reply(error))
+    }
+
+    fn exchange(&self, call: &Call<'_>) -> Result<Exchange, Failure> {
+        let nonce = self.nonce.take();
+        let is_kept = nonce.is_some();
+        let nonce = match nonce {
+            None if self.key.is_some() && !self.is_open(call) => Some(self.take_nonce()?),
+            nonce => nonce,
+        };
+        let exchange = self.send(call, nonce.as_deref())?;
+        // The nonce had become old, or it needs the key after all. A fresh nonce means that the key is wrong,
+        // and asking again would count as another wrong one.
+        let again = exchange.status() == 401 && self.key.is_some() && (nonce.is_none() || is_kept);
+        if !again {
+            self.nonce.replace(exchange.field("next-nonce").and_then(fit_nonce));
+            return Ok(exchange);
+        }
+        drop(exchange);
+        let nonce = self.take_nonce()?;
+        self.send(call, Some(&nonce))
+    }
+
+    /// Whether it needs no key: reading on this machine.
+    fn is_open(&self, call: &Call<'_>) -> bool {
+        call.method == "GET" && self.places.iter().all(|place| place.ip().to_canonical().is_loopback())
+    }
+
+    fn take_nonce(&self) -> Result<String, Failure> {
+        let reply = self.send(&Call::get("nonce"), None)?.finish().map_err(|error| self.no_reply(error))?;
+        let document = self.document(&self.accepted(reply)?)?;
+        let nonce = document["nonce"].as_str().and_then(fit_nonce);
+        nonce.ok_or_else(|| self.refused("its nonce is none; is this a gateway?"))
+    }
+
+    fn send(&self, call: &Call<'_>, nonce: Option<&str>) -> Result<Exchange, Failure> {
+        let target = format!("{API}{}", call.path);
+        let body = call.body.bytes();
+        let mut fields = Vec::new();
+        if let (Some(key), Some(nonce)) = (&self.key, nonce) {
+            let mut hash = BodyHash::new();
+            hash.update(&body);
+            let hash = Hex(&hash.finish()).to_string();
+            let mac = key.sign(&Signed { nonce, method: call.method, target: &target, body: &hash });
+            let proof = format!("{SCHEME} nonce={nonce}, body={hash}, mac={}", Hex(&mac));
+            fields.push(("Authorization", proof));
+        }
+        if let Some(kind) = call.body.kind() {
+            fields.push(("Content-Type", kind.to_owned()));
+        }
+        if let Some(etag) = call.if_match {
+            fields.push(("If-Match", etag.to_owned()));
+        }
+        let host = self.host.as_ref().map(Address::to_string);
+        let request = Request {
+            method: call.method,
+            host: host.as_deref(),
+            target: &target,
+            fields: &fields,
+            body: &body,
+        };
+        let timeout = self.timeout + call.more_time;
+        let mut last = None;
+        for &place in &self.places {
+            match Exchange::start(place, &request, timeout, &self.stop) {
+                // Nothing was sent, so another address of the name may be tried.
+                Err(NoReply::Unreached(error)) => {
+                    let hint = self.address.hint(place);
+                    last = Some(format!("nobody is there: {place}: {}{hint}", words(&error)));
+                }
+                done => return done.map_err(|error| self.no_reply(error)),
+            }
+        }
+        Err(self.refused(last.unwrap_or_default()))
+    }
+
+    fn no_reply(&self, error: NoReply) -> Failure {
+        match error {
+            NoReply::Unreached(error) => self.refused(words(&error)),
+            NoReply::Broken(why) => self.refused(why),
+            NoReply::Stopped => self.refused("ended before the answer came"),
+        }
+    }
+
+    /// A refusal in words. A configuration that is wrong is a wrong file.
+    pub(crate) fn refusal(&self, reply: &Reply) -> Failure {
+        let document: Value = serde_json::from_slice(&reply.body).unwrap_or_default();
+        let status = reply.status();
+        let said = match document["error"].as_str() {
+            Some(error) if !error.is_empty() => shown::line(error).into_owned(),
+            _ => format!("it answers with status {status}; is this a gateway?"),
+        };
+        let more = match (status, &self.key) {
+            (401, None) => "; give its key with --key FILE".to_owned(),
+            (401, Some(_)) => ": that of --key is not the gateway's".to_owned(),
+            (429, _) => match reply.field("retry-after").and_then(|text| text.parse::<u32>().ok()) {
+                Some(seconds) => format!(" {seconds} s"),
+                None => String::new(),
+            },
+            (421, _) => "; if a forwarded port leads there, give its own address with --host, or as `host` in the inventory"
+                .to_owned(),
+            (403, _) if said.contains("has no key") => {
+                "; start the gateway with --console-key, or claim the board".to_owned()
+            }
+            _ => String::new(),
+        };
+        let text = format!("{}: {said}{more}", self.address);
+        if status != 422 {
+            return Failure::Refused(text);
+        }
+        let place = match (document["line"].as_u64(), document["column"].as_u64()) {
+            (Some(line), Some(column)) => format!("{line}:{column}: "),
+            _ => String::new(),
+        };
+        let key = document["key"].as_str().map(|key| format!("{}: ", shown::line(key))).unwrap_or_default();
+        Failure::Wrong(format!("{}: the configuration is refused: {place}{key}{said}", self.address))
+    }
+}
+
+/// The events of a gateway.
+#[derive(Debug)]
+pub(crate) struct Events<'a> {
+    client: &'a Client,
+    stream: Stream,
+}
+
+impl Events<'_> {
+    /// The next event; `None` once the command shall end.
+    pub(crate) fn next(&mut self) -> Result<Option<Event>, Failure> {
+        match self.stream.event() {
+            Ok(Some(event)) => Ok(Some(event)),
+            Ok(None) => Err(self.client.refused("the gateway has ended the stream")),
+            Err(NoReply::Stopped) => Ok(None),
+            Err(error) => Err(self.client.no_reply(error)),
+        }
+    }
+
+    /// The next bytes, of a stream that has no events; `None` once it or the command ends.
+    pub(crate) fn bytes(&mut self) -> Result<Option<Vec<u8>>, Failure> {
+        match self.stream.bytes() {
+            Ok(bytes) => Ok(bytes),
+            Err(NoReply::Stopped) => Ok(None),
+            Err(error) => Err(self.client.no_reply(error)),
+        }
+    }
+}
+
+/// A nonce as it may stand in a head: nothing that a server sends may add lines to it.
+fn fit_nonce(text: &str) -> Option<String> {
+    let is_fit = (16..=128).contains(&text.len()) && text.bytes().all(|byte| byte.is_ascii_hexdigit());
+    is_fit.then(|| text.to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_nonce_adds_nothing_to_a_head() {
+        assert!(fit_nonce("0000000928a724da00000000c27868a9e87ad27a773140a5").is_some());
+        for wrong in ["", "00", "0000000928a724da\r\nHost: x", "0000000928a724da, mac=", &"0".repeat(129)] {
+            assert_eq!(fit_nonce(wrong), None, "{wrong:?}");
+        }
+    }
+}

@@ -1,0 +1,231 @@
+//! Several gateways at once: those of an inventory.
+//!
+//! In: an inventory, a command. Out: what each answered. Each is asked by a thread of its own, at most
+//! [`MAX_AT_ONCE`] at a time; one that does not answer delays no other.
+
+use std::path::Path;
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
+use std::time::Duration;
+
+use recipe_config::file::load_inventory;
+use recipe_remote::key::Key;
+use serde_json::{Map, Value, json};
+
+use crate::address::Address;
+use crate::answer::Answer;
+use crate::client::Client;
+use crate::failure::{Failure, Verdict};
+use crate::key_file;
+use crate::stop::Stop;
+use crate::table::{Cell, Look, Table, View};
+
+/// Gateways that are asked at a time.
+pub const MAX_AT_ONCE: usize = 16;
+
+/// One gateway of an inventory, with what is needed to ask it.
+#[derive(Debug, Clone)]
+pub struct Member {
+    name: String,
+    address: Address,
+    host: Option<Address>,
+    key: Option<Key>,
+}
+
+impl Member {
+    /// Its name.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// A client of it.
+    ///
+    /// # Errors
+    /// If its address is a name that nobody knows.
+    pub fn client(&self, timeout: Duration, stop: Stop) -> Result<Client, Failure> {
+        let client = Client::new(self.address.clone(), self.key.clone(), timeout, stop)?;
+        Ok(client.known_as(self.host.clone()))
+    }
+}
+
+/// Reads an inventory and the keys that it names. With names in `only`, those alone.
+///
+/// # Errors
+/// A mistake in the file, with its place; a key that cannot be read; a name that it does not have.
+pub fn members(path: &Path, only: &[String]) -> Result<Vec<Member>, Failure> {
+    let listed = load_inventory(path, |address| address.parse::<Address>().map(|_| ()))?;
+    for name in only {
+        if !listed.iter().any(|one| one.name == *name) {
+            let names: Vec<_> = listed.iter().map(|one| one.name.as_str()).collect();
+            return Err(Failure::wrong(format!(
+                "--only {name}: {} has no such gateway; it has {}",
+                path.display(),
+                names.join(", ")
+            )));
+        }
+    }
+    let wanted = listed.into_iter().filter(|one| only.is_empty() || only.contains(&one.name));
+    wanted
+        .map(|one| {
+            let parsed = |text: &str| text.parse::<Address>().map_err(Failure::wrong);
+            let address = parsed(&one.address)?;
+            let host = one.host.as_deref().map(parsed).transpose()?;
+            let key = one.key.as_deref().map(key_file::read).transpose()?;
+            Ok(Member { name: one.name, address, host, key })
+        })
+        .collect()
+}
+
+/// How a change goes through an inventory.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Rollout {
+    /// So many at a time; the next ones begin once these have ended.
+    pub batch: usize,
+    /// Begin no further batch once one has failed.
+    pub stop_on_failure: bool,
+}
+
+/// What became of a command at each gateway of an inventory.
+#[derive(Debug)]
+pub struct Outcomes(Vec<(String, Outcome)>);
+
+#[derive(Debug)]
+enum Outcome {
+    Answered(Box<Answer>),
+    Failed(Failure),
+    /// One before has failed, or somebody pressed Ctrl-C.
+    NotBegun,
+}
+
+/// Asks all of them. Without a rollout all are one batch.
+pub fn ask(
+    members: &[Member],
+    rollout: Option<Rollout>,
+    timeout: Duration,
+    stop: &Stop,
+    work: &(dyn Fn(&Client) -> Result<Answer, Failure> + Sync),
+) -> Outcomes {
+    let batch = rollout.map_or(members.len(), |rollout| rollout.batch).max(1);
+    let mut outcomes = Vec::new();
+    let mut has_failed = false;
+    for members in members.chunks(batch) {
+        let is_over = stop.is_asked() || has_failed && rollout.is_some_and(|rollout| rollout.stop_on_failure);
+        let found = match is_over {
+            true => members.iter().map(|_| Outcome::NotBegun).collect(),
+            false => ask_batch(members, timeout, stop, work),
+        };
+        has_failed |= found.iter().any(|outcome| !matches!(outcome, Outcome::Answered(_)));
+        outcomes.extend(members.iter().map(|member| member.name.clone()).zip(found));
+    }
+    Outcomes(outcomes)
+}
+
+fn ask_batch(
+    members: &[Member],
+    timeout: Duration,
+    stop: &Stop,
+    work: &(dyn Fn(&Client) -> Result<Answer, Failure> + Sync),
+) -> Vec<Outcome> {
+    let next = AtomicUsize::new(0);
+    let found: Vec<Mutex<Outcome>> = members.iter().map(|_| Mutex::new(Outcome::NotBegun)).collect();
+    std::thread::scope(|scope| {
+        for _ in 0..members.len().min(MAX_AT_ONCE) {
+            scope.spawn(|| {
+                while !stop.is_asked()
+                    && let nth = next.fetch_add(1, Relaxed)
+                    && let (Some(member), Some(place)) = (members.get(nth), found.get(nth))
+                {
+                    let answer = member.client(timeout, stop.clone()).and_then(|client| work(&client));
+                    let outcome = match answer {
+                        Ok(answer) => Outcome::Answered(Box::new(answer)),
+                        Err(failure) => Outcome::Failed(failure),
+                    };
+                    *place.lock().unwrap_or_else(std::sync::PoisonError::into_inner) = outcome;
+                }
+            });
+        }
+    });
+    let taken = |place: Mutex<Outcome>| place.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner);
+    found.into_iter().map(taken).collect()
+}
+
+impl Outcomes {
+    /// Whether all have answered, and whether all is well with them; a failure names those that have not.
+    ///
+    /// # Errors
+    /// If one has failed.
+    pub fn verdict(&self) -> Result<Verdict, Failure> {
+        let failed = self.0.iter().filter(|(_, outcome)| !matches!(outcome, Outcome::Answered(_)));
+        let names: Vec<_> = failed.map(|(name, _)| name.as_str()).collect();
+        if !names.is_empty() {
+            let (count, all) = (names.len(), self.0.len());
+            return Err(Failure::refused(format!("{count} of {all} gateways failed: {}", names.join(", "))));
+        }
+        let is_well = |(_, outcome): &(String, Outcome)| match outcome {
+            Outcome::Answered(answer) => answer.verdict() == Verdict::Well,
+            _ => false,
+        };
+        Ok(if self.0.iter().all(is_well) { Verdict::Well } else { Verdict::Trouble })
+    }
+
+    /// A table with a row for each.
+    pub fn table(&self, view: View) -> String {
+        let headings: Vec<&str> = self
+            .0
+            .iter()
+            .find_map(|(_, outcome)| match outcome {
+                Outcome::Answered(answer) => Some(answer.row.iter().map(|(name, _)| *name).collect()),
+                _ => None,
+            })
+            .unwrap_or_default();
+        let has_failures = self.0.iter().any(|(_, outcome)| !matches!(outcome, Outcome::Answered(_)));
+        let mut all = vec!["gateway"];
+        all.extend(&headings);
+        if has_failures {
+            all.push("failure");
+        }
+        let mut table = Table::new(&all);
+        for (name, outcome) in &self.0 {
+            let mut cells = vec![Cell::of(name)];
+            match outcome {
+                Outcome::Answered(answer) => cells.extend(answer.row.iter().map(|(_, cell)| cell.clone())),
+                other => {
+                    cells.extend(headings.iter().map(|_| Cell::default()));
+                    let why = match other {
+                        Outcome::Failed(failure) => failure.message(),
+                        _ => "not begun",
+                    };
+                    cells.push(Cell::of(why).look(Look::Wrong));
+                }
+            }
+            table.row(cells);
+        }
+        table.show(view)
+    }
+
+    /// The whole answers, one below the other.
+    pub fn sections(&self, view: View) -> String {
+        let mut text = String::new();
+        for (name, outcome) in &self.0 {
+            let body = match outcome {
+                Outcome::Answered(answer) => answer.text(view),
+                Outcome::Failed(failure) => format!("{}\n", failure.message()),
+                Outcome::NotBegun => "not begun\n".into(),
+            };
+            text += &format!("== {}\n{body}\n", crate::shown::line(name));
+        }
+        text
+    }
+
+    /// One document for all, on one line.
+    pub fn json(&self) -> String {
+        let entry = |outcome: &Outcome| match outcome {
+            Outcome::Answered(answer) => json!({ "ok": true, "answer": answer.document }),
+            Outcome::Failed(failure) => json!({ "ok": false, "error": failure.message() }),
+            Outcome::NotBegun => json!({ "ok": false, "error": "not begun" }),
+        };
+        let all: Map<String, Value> =
+            self.0.iter().map(|(name, outcome)| (name.clone(), entry(outcome))).collect();
+        crate::shown::json(&all.into()) + "\n"
+    }
+}

@@ -1,0 +1,108 @@
+//! A real board of a rollout: the functions of one board's update (docs/api.md section 9).
+
+use std::time::{Duration, Instant};
+
+use super::{Board, Seen, State};
+use crate::client::Client;
+use crate::failure::Failure;
+use crate::firmware::Update;
+use crate::fleet::Member;
+use crate::stop::Stop;
+use crate::update::{Downgrade, Firmware, Health, begin_trial, confirm, fitting, health, push, take_back};
+
+/// A board of an inventory and the firmware for it.
+#[derive(Debug)]
+pub struct Real<'a> {
+    member: &'a Member,
+    update: &'a Update,
+    version: String,
+    timeout: Duration,
+    trial_s: u32,
+    downgrade: Downgrade,
+    since: Instant,
+}
+
+/// The version of the firmware in an update.
+///
+/// # Errors
+/// It contains no firmware.
+pub fn version_of(update: &Update) -> Result<String, Failure> {
+    let links = update.links();
+    let version = links.first().map(|link| link.header.version().to_string());
+    version.ok_or_else(|| Failure::wrong("the update contains no firmware"))
+}
+
+/// The gateways of an inventory as boards that get this update, each with its name.
+///
+/// # Errors
+/// The update contains no firmware.
+pub fn real_boards<'a>(
+    members: &'a [Member],
+    update: &'a Update,
+    timeout: Duration,
+    trial_s: u32,
+    downgrade: Downgrade,
+) -> Result<Vec<(String, Real<'a>)>, Failure> {
+    let version = version_of(update)?;
+    let since = Instant::now();
+    let board = |member: &'a Member| {
+        let version = version.clone();
+        (member.name().to_owned(), Real { member, update, version, timeout, trial_s, downgrade, since })
+    };
+    Ok(members.iter().map(board).collect())
+}
+
+impl Real<'_> {
+    /// A client that nobody stops: a board that has begun is brought to its end.
+    fn client(&self) -> Result<Client, Failure> {
+        self.member.client(self.timeout, Stop::new())
+    }
+}
+
+impl Board for Real<'_> {
+    fn inspect(&self) -> Result<Seen, Failure> {
+        let client = self.client()?;
+        let firmware = Firmware::of(&client)?;
+        let is_this = firmware.version == self.version;
+        let state = match (is_this, &firmware.trial) {
+            (true, Some(_)) => State::OnTrial,
+            (false, Some(_)) => State::OtherOnTrial,
+            (true, None) => State::Confirmed,
+            (false, None) => {
+                fitting(&client, &firmware, self.update)?;
+                State::Other
+            }
+        };
+        Ok(Seen { version: firmware.version, state })
+    }
+
+    fn health(&self) -> Result<Health, Failure> {
+        health(&self.client()?)
+    }
+
+    fn push(&self) -> Result<(), Failure> {
+        let client = self.client()?;
+        let link = fitting(&client, &Firmware::of(&client)?, self.update)?;
+        push(&client, &link, self.downgrade, &mut |_| {}).map(|_| ())
+    }
+
+    fn begin(&self) -> Result<(), Failure> {
+        begin_trial(&self.client()?, self.trial_s, self.downgrade, &mut |_| {}).map(|_| ())
+    }
+
+    fn confirm(&self) -> Result<(), Failure> {
+        confirm(&self.client()?).map(|_| ())
+    }
+
+    fn back(&self) -> Result<(), Failure> {
+        take_back(&self.client()?, &mut |_| {}).map(|_| ())
+    }
+
+    fn now(&self) -> Duration {
+        self.since.elapsed()
+    }
+
+    fn wait(&self, time: Duration) {
+        std::thread::sleep(time);
+    }
+}

@@ -1,0 +1,155 @@
+//! What became of a rollout: a table for people, a document for programs, and where to go on.
+
+use std::collections::BTreeMap;
+
+use serde_json::{Value, json};
+
+use super::{Entry, Left, Outcome, words};
+use crate::failure::{Failure, Verdict};
+use crate::table::{Cell, Look, Table, View};
+use crate::update::Health;
+
+/// What became of a rollout.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Report {
+    /// The version of the firmware.
+    pub version: String,
+    /// The boards in the order of the inventory.
+    pub entries: Vec<Entry>,
+    /// Somebody has asked to end.
+    pub was_stopped: bool,
+}
+
+impl Report {
+    /// That of a rollout that has not begun.
+    pub fn before<'a>(version: &str, names: impl Iterator<Item = &'a str>) -> Self {
+        Self { version: version.to_owned(), entries: names.map(Entry::new).collect(), was_stopped: false }
+    }
+
+    /// A line of what became of one board.
+    pub fn line(entry: &Entry) -> String {
+        format!("{}: {}", crate::shown::line(&entry.name), crate::shown::line(&entry.outcome.words().0))
+    }
+
+    /// The boards that have failed.
+    pub fn failed(&self) -> impl Iterator<Item = &Entry> {
+        self.entries.iter().filter(|entry| matches!(entry.outcome, Outcome::Failed { .. }))
+    }
+
+    /// A table with a row for each board.
+    pub fn table(&self, view: View) -> String {
+        let health =
+            |health: &Option<Health>| health.as_ref().map_or(Cell::of(""), |health| Cell::of(words(health)));
+        let mut table = Table::new(&["gateway", "was", "before", "after", "outcome"]);
+        for entry in &self.entries {
+            let was = Cell::of(entry.was.as_deref().unwrap_or_default());
+            let (words, look) = entry.outcome.words();
+            table.row([
+                Cell::of(&entry.name),
+                was,
+                health(&entry.before),
+                health(&entry.after),
+                Cell::of(words).look(look),
+            ]);
+        }
+        table.show(view)
+    }
+
+    /// How many boards there are of which outcome, and where to go on.
+    pub fn summary(&self) -> String {
+        let count = |wanted: &str| self.entries.iter().filter(|entry| entry.outcome.name() == wanted).count();
+        let (updated, already, failed) = (count("updated"), count("already"), count("failed"));
+        let mut text = format!(
+            "{} of {} boards run {}: {updated} updated, {already} before; {failed} failed",
+            updated + already,
+            self.entries.len(),
+            self.version
+        );
+        let left: Vec<_> = self.entries.iter().filter(|entry| entry.outcome == Outcome::NotBegun).collect();
+        if let Some(first) = left.first() {
+            let why = if self.was_stopped { "ended" } else { "stopped by the failure" };
+            let name = crate::shown::line(&first.name);
+            text += &format!("; {why}, {} not begun, from {name} on", left.len());
+        }
+        if !left.is_empty() || failed > 0 {
+            text += "; the same command goes on with those that do not run it";
+        }
+        text
+    }
+
+    /// As a document.
+    pub fn document(&self) -> Value {
+        let health = |health: &Option<Health>| match health {
+            Some(health) => {
+                json!({ "health": health.word, "links_up": health.links_up, "ports_working": health.ports_working })
+            }
+            None => Value::Null,
+        };
+        let entry = |entry: &Entry| {
+            let mut document = json!({
+                "gateway": entry.name,
+                "outcome": entry.outcome.name(),
+                "was": entry.was,
+                "before": health(&entry.before),
+                "after": health(&entry.after),
+            });
+            if let Outcome::Failed { step, why, left } = &entry.outcome {
+                document["step"] = step.name().into();
+                document["error"] = why.as_str().into();
+                document["left"] = left.name().into();
+            }
+            document
+        };
+        let mut counts = BTreeMap::from(["updated", "already", "failed", "not_begun"].map(|name| (name, 0)));
+        for entry in &self.entries {
+            *counts.entry(entry.outcome.name()).or_default() += 1;
+        }
+        json!({
+            "version": self.version,
+            "stopped": self.was_stopped,
+            "counts": counts,
+            "gateways": self.entries.iter().map(entry).collect::<Vec<_>>(),
+        })
+    }
+
+    /// What the exit code says: well if all boards run the firmware.
+    ///
+    /// # Errors
+    /// The summary if one does not.
+    pub fn verdict(&self) -> Result<Verdict, Failure> {
+        let is_there = |entry: &Entry| matches!(entry.outcome, Outcome::Updated | Outcome::Already);
+        match self.entries.iter().all(is_there) {
+            true => Ok(Verdict::Well),
+            false => Err(Failure::refused(self.summary())),
+        }
+    }
+}
+
+impl Outcome {
+    /// In a document.
+    pub const fn name(&self) -> &'static str {
+        match self {
+            Self::NotBegun => "not_begun",
+            Self::Already => "already",
+            Self::Updated => "updated",
+            Self::Failed { .. } => "failed",
+        }
+    }
+
+    pub(crate) fn words(&self) -> (String, Look) {
+        match self {
+            Self::NotBegun => ("not begun".into(), Look::Doubtful),
+            Self::Already => ("ran it already".into(), Look::Well),
+            Self::Updated => ("updated".into(), Look::Well),
+            Self::Failed { step, why, left } => {
+                let left = match left {
+                    Left::Before => "runs the firmware before",
+                    Left::OnTrial => "runs the new one on trial, until its time is over",
+                    Left::New => "runs the new one",
+                    Left::Unknown => "what it runs is not known",
+                };
+                (format!("failed at {}: {why}; {left}", step.name()), Look::Wrong)
+            }
+        }
+    }
+}

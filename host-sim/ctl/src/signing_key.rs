@@ -1,0 +1,118 @@
+//! Files with the keys that firmware is signed with: 64 hexadecimal digits each. The private one is its owner's alone.
+
+use std::ffi::OsString;
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+use recipe_device::random::random;
+use recipe_remote::key::Hex;
+use recipe_update::PublicKey;
+
+use crate::digits::{self, MAX_FILE, exists, write_new, wrong};
+use crate::failure::Failure;
+
+/// A private key. It is not shown, also not for debugging.
+pub(crate) struct Seed(pub(crate) [u8; 32]);
+
+/// Makes a key: the private one in a new file of mode 0600, the public one in another whose name ends in `.pub`.
+/// Returns the digits of the public one, and the name of its file.
+///
+/// # Errors
+/// One of the files exists, or cannot be written.
+pub fn make(path: &Path) -> Result<(String, PathBuf), Failure> {
+    let public_path = beside(path);
+    // Before anything is made: a private key without its public one would have to be deleted by hand.
+    if public_path.exists() {
+        return Err(exists(&public_path));
+    }
+    let seed = random().map(Seed).map_err(|error| wrong(path, &error))?;
+    let public = Hex(&PublicKey::of_seed(&seed.0).bytes()).to_string();
+    write_new(path, &Hex(&seed.0).to_string(), 0o600)?;
+    write_new(&public_path, &public, 0o644)?;
+    Ok((public, public_path))
+}
+
+/// Reads a private key.
+pub(crate) fn read(path: &Path) -> Result<Seed, Failure> {
+    parse(&digits::read(path)?).map(Seed).ok_or_else(|| {
+        wrong(path, &"not 64 hexadecimal digits; `host-sim ctl keygen --signing FILE` makes a key")
+    })
+}
+
+/// Reads a public key.
+pub(crate) fn read_public(path: &Path) -> Result<PublicKey, Failure> {
+    let mut text = String::new();
+    let file = File::open(path).and_then(|file| file.take(MAX_FILE).read_to_string(&mut text));
+    file.map_err(|error| wrong(path, &error))?;
+    parse(&text)
+        .as_ref()
+        .and_then(PublicKey::parse)
+        .ok_or_else(|| wrong(path, &"not a public key: 64 hexadecimal digits of a file that ends in .pub"))
+}
+
+fn parse(text: &str) -> Option<[u8; 32]> {
+    let digits = text.trim_end().as_bytes();
+    let mut bytes = [0; 32];
+    if digits.len() != 2 * bytes.len() {
+        return None;
+    }
+    for (byte, pair) in bytes.iter_mut().zip(digits.as_chunks::<2>().0) {
+        let [high, low] = pair.map(|digit| char::from(digit).to_digit(16));
+        *byte = (high? << 4 | low?) as u8;
+    }
+    Some(bytes)
+}
+
+/// The name of the file with the public key.
+fn beside(path: &Path) -> PathBuf {
+    let mut name = OsString::from(path);
+    name.push(".pub");
+    name.into()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::{MetadataExt, PermissionsExt};
+
+    use super::*;
+
+    #[test]
+    fn a_new_key_is_its_owners_alone_and_never_replaced() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("signing.key");
+        let (digits, public_path) = make(&path).unwrap();
+        assert_eq!(std::fs::metadata(&path).unwrap().mode() & 0o777, 0o600);
+        assert_eq!(public_path, folder.path().join("signing.key.pub"));
+        assert_eq!(std::fs::read_to_string(&public_path).unwrap(), format!("{digits}\n"));
+        let seed = read(&path).unwrap();
+        assert_eq!(read_public(&public_path).unwrap(), PublicKey::of_seed(&seed.0));
+        let before = std::fs::read(&path).unwrap();
+        let error = make(&path).unwrap_err();
+        assert!(error.message().contains("keys are not replaced"), "{error:?}");
+        std::fs::remove_file(&public_path).unwrap();
+        assert!(make(&path).is_err());
+        assert_eq!(std::fs::read(&path).unwrap(), before);
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "nothing stays beside it");
+    }
+
+    #[test]
+    fn a_key_that_is_none_is_refused_and_never_shown() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("signing.key");
+        make(&path).unwrap();
+        let digits = std::fs::read_to_string(&path).unwrap();
+        for wrong in ["", &digits[1..], &format!("0{digits}"), &digits.replace(['a', '3', '7'], "x")] {
+            std::fs::write(&path, wrong).unwrap();
+            let error = read(&path).err().unwrap();
+            assert!(error.message().contains("not 64 hexadecimal digits"), "{error:?}");
+            assert!(!error.message().contains(&digits[40..60]), "{error:?}");
+        }
+        std::fs::write(&path, &digits).unwrap();
+        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o644)).unwrap();
+        assert!(read(&path).err().unwrap().message().contains("its mode is 0644"));
+        // A point that is not on the curve.
+        std::fs::write(&path, format!("{:0<64}\n", "02")).unwrap();
+        assert!(read_public(&path).unwrap_err().message().contains("not a public key"));
+    }
+}

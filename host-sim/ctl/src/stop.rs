@@ -1,0 +1,55 @@
+//! The end of what would go on for ever: Ctrl-C, or a time.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::time::{Duration, Instant};
+
+/// Tells a command that goes on that it shall end.
+#[derive(Debug, Clone, Default)]
+pub struct Stop {
+    asked: Arc<AtomicBool>,
+    at: Option<Instant>,
+}
+
+impl Stop {
+    /// Nobody has asked yet.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// The same, which also stops after `time`.
+    #[must_use]
+    pub fn after(&self, time: Duration) -> Self {
+        Self { asked: Arc::clone(&self.asked), at: Instant::now().checked_add(time) }
+    }
+
+    /// Asks all clones to end.
+    pub fn ask(&self) {
+        self.asked.store(true, Relaxed);
+    }
+
+    /// Whether it shall end.
+    pub fn is_asked(&self) -> bool {
+        self.was_interrupted() || self.at.is_some_and(|at| Instant::now() >= at)
+    }
+
+    /// Whether it shall end because somebody has asked, not because the time is over.
+    pub fn was_interrupted(&self) -> bool {
+        self.asked.load(Relaxed)
+    }
+
+    /// Waits; returns early if it is to end, with `true`.
+    pub fn wait(&self, time: Duration) -> bool {
+        let until = Instant::now() + time;
+        loop {
+            let left = until.saturating_duration_since(Instant::now());
+            if self.is_asked() || left.is_zero() {
+                return self.is_asked();
+            }
+            std::thread::sleep(left.min(LOOK));
+        }
+    }
+}
+
+/// How often a wait looks whether it shall end.
+pub(crate) const LOOK: Duration = Duration::from_millis(50);

@@ -1,0 +1,186 @@
+//! Tables and words as text for people: aligned columns, names as they are, colours only for what is wrong or well.
+//!
+//! Colours are ANSI sequences, which the program takes out where nobody sees them.
+
+use std::fmt::Write;
+
+use anstyle::{AnsiColor, Style};
+
+use crate::shown;
+
+/// How text is laid out.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct View {
+    /// Places in a line; `None` if lines may have any length.
+    pub width: Option<usize>,
+    /// Whether what is watched replaces what was there before.
+    pub is_terminal: bool,
+}
+
+/// How a cell looks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(crate) enum Look {
+    #[default]
+    Plain,
+    Well,
+    Wrong,
+    Doubtful,
+}
+
+/// A cell.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Cell {
+    text: String,
+    look: Look,
+    /// At the right end of its column, as numbers are.
+    is_number: bool,
+}
+
+impl Cell {
+    pub(crate) fn of(text: impl AsRef<str>) -> Self {
+        Self { text: shown::line(text.as_ref()).into_owned(), ..Self::default() }
+    }
+
+    pub(crate) fn number(text: impl ToString) -> Self {
+        Self { is_number: true, ..Self::of(text.to_string()) }
+    }
+
+    pub(crate) fn is_empty(&self) -> bool {
+        self.text.is_empty()
+    }
+
+    #[must_use]
+    pub(crate) fn look(self, look: Look) -> Self {
+        Self { look, ..self }
+    }
+}
+
+impl From<&str> for Cell {
+    fn from(text: &str) -> Self {
+        Self::of(text)
+    }
+}
+
+impl From<String> for Cell {
+    fn from(text: String) -> Self {
+        Self::of(text)
+    }
+}
+
+/// Rows below a line of headings.
+#[derive(Debug, Clone)]
+pub(crate) struct Table {
+    rows: Vec<Vec<Cell>>,
+}
+
+impl Table {
+    pub(crate) fn new(headings: &[&str]) -> Self {
+        Self { rows: vec![headings.iter().map(|&heading| heading.into()).collect()] }
+    }
+
+    pub(crate) fn row(&mut self, cells: impl IntoIterator<Item = Cell>) {
+        self.rows.push(cells.into_iter().collect());
+    }
+
+    /// Whether there is nothing below the headings.
+    pub(crate) fn is_empty(&self) -> bool {
+        self.rows.len() <= 1
+    }
+
+    /// The lines. What has no room in the last column is cut.
+    pub(crate) fn show(&self, view: View) -> String {
+        let columns = self.rows.iter().map(Vec::len).max().unwrap_or(0);
+        let width = |column: usize| {
+            self.rows.iter().filter_map(|row| row.get(column)).map(|cell| shown::width(&cell.text)).max()
+        };
+        let widths: Vec<usize> = (0..columns).map(|column| width(column).unwrap_or(0)).collect();
+        // A heading stands as its column does.
+        let numbers: Vec<bool> = (0..columns)
+            .map(|column| {
+                self.rows.iter().skip(1).filter_map(|row| row.get(column)).any(|cell| cell.is_number)
+            })
+            .collect();
+        let mut text = String::new();
+        for row in &self.rows {
+            let mut line = String::new();
+            let mut used = 0;
+            for (nth, cell) in row.iter().enumerate() {
+                if nth > 0 {
+                    line.push_str("  ");
+                    used += 2;
+                }
+                let room = view.width.map_or(usize::MAX, |width| width.saturating_sub(used));
+                let is_last = nth + 1 == row.len();
+                let words = if is_last { cut(&cell.text, room) } else { cell.text.clone() };
+                let pad = " ".repeat(widths[nth].saturating_sub(shown::width(&words)));
+                let painted = paint(&words, cell.look);
+                // Writing to a `String` never fails.
+                let _ = match (numbers[nth], is_last) {
+                    (true, _) => write!(line, "{pad}{painted}"),
+                    (false, true) => write!(line, "{painted}"),
+                    (false, false) => write!(line, "{painted}{pad}"),
+                };
+                used += widths[nth];
+            }
+            text.push_str(line.trim_end());
+            text.push('\n');
+        }
+        text
+    }
+}
+
+/// Lines `name  value`.
+pub(crate) fn facts(rows: impl IntoIterator<Item = (&'static str, Cell)>) -> String {
+    let rows: Vec<_> = rows.into_iter().collect();
+    let width = rows.iter().map(|(name, _)| name.len()).max().unwrap_or(0);
+    let mut text = String::new();
+    for (name, cell) in &rows {
+        let _ = writeln!(text, "{name:width$}  {}", paint(&cell.text, cell.look));
+    }
+    text
+}
+
+/// A text with its colour.
+pub(crate) fn paint(text: &str, look: Look) -> String {
+    let colour = match look {
+        Look::Plain => return text.to_owned(),
+        Look::Well => AnsiColor::Green,
+        Look::Wrong => AnsiColor::Red,
+        Look::Doubtful => AnsiColor::Yellow,
+    };
+    let style = Style::new().fg_color(Some(colour.into()));
+    format!("{style}{text}{style:#}")
+}
+
+/// The beginning of a text that has no room.
+fn cut(text: &str, room: usize) -> String {
+    if shown::width(text) <= room {
+        return text.to_owned();
+    }
+    let mut short = String::new();
+    for c in text.chars() {
+        if shown::width(&short) + shown::width(c.encode_utf8(&mut [0; 4])) + 1 > room {
+            break;
+        }
+        short.push(c);
+    }
+    short + "…"
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn columns_are_aligned_and_the_last_one_is_cut() {
+        let mut table = Table::new(&["port", "frames", "state"]);
+        table.row(["力觉".into(), Cell::number(1_234), Cell::of("working").look(Look::Well)]);
+        table.row([Cell::of("rs485-1\u{1b}"), Cell::number(7), "no frame since 12:00".into()]);
+        let text = table.show(View { width: Some(40), is_terminal: true });
+        let lines: Vec<_> = text.lines().collect();
+        assert_eq!(lines[0], "port           frames  state");
+        assert_eq!(lines[1], "力觉             1234  \u{1b}[32mworking\u{1b}[0m");
+        assert_eq!(lines[2], "rs485-1\\u{1b}       7  no frame since 1…");
+        assert_eq!(shown::width(lines[2]), 40);
+    }
+}

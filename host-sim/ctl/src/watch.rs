@@ -1,0 +1,77 @@
+//! `--watch`: state or variables as the gateway's stream brings them, until somebody presses Ctrl-C.
+
+use std::io::Write;
+
+use serde_json::Value;
+
+use crate::answer::Answer;
+use crate::client::Client;
+use crate::failure::Failure;
+use crate::reading::{status_of, values_of};
+use crate::table::View;
+
+/// What is watched.
+#[derive(Debug, Clone)]
+pub enum Watched {
+    /// State, ports, links.
+    Status,
+    /// Variables with one of these in their names.
+    Values(Vec<String>),
+}
+
+/// Prints what the stream brings: on a terminal in place of what was there, elsewhere one after the other. With
+/// `json` one document a line.
+///
+/// # Errors
+/// If it is refused, not reached, or the stream ends.
+pub fn watch(
+    client: &Client,
+    what: &Watched,
+    json: bool,
+    view: View,
+    out: &mut dyn Write,
+) -> Result<(), Failure> {
+    let mut events = client.stream("stream")?;
+    let name = match what {
+        Watched::Status => "status",
+        Watched::Values(_) => "values",
+    };
+    while let Some(event) = events.next()? {
+        if event.name != name {
+            continue;
+        }
+        let document: Value = serde_json::from_str(&event.data)
+            .map_err(|_| client.refused("an event is no JSON; is this a gateway?"))?;
+        let answer = match what {
+            Watched::Status => status_of(document, view),
+            Watched::Values(filters) => values_of(document, filters, view),
+        };
+        print(&answer, json, view, out)?;
+    }
+    Ok(())
+}
+
+fn print(answer: &Answer, json: bool, view: View, out: &mut dyn Write) -> Result<(), Failure> {
+    if json {
+        out.write_all(answer.json().as_bytes())?;
+    } else if view.is_terminal {
+        // To the upper left corner; what is there is overwritten, and what is left of it erased.
+        let text = answer.text(view).replace('\n', "\x1b[K\n");
+        write!(out, "\x1b[H{text}\x1b[J")?;
+    } else {
+        writeln!(out, "{}", answer.text(view))?;
+    }
+    out.flush()?;
+    Ok(())
+}
+
+/// Empties a terminal before something is watched on it.
+///
+/// # Errors
+/// If nothing more can be printed.
+pub fn clear(view: View, out: &mut dyn Write) -> Result<(), Failure> {
+    if view.is_terminal {
+        write!(out, "\x1b[2J")?;
+    }
+    Ok(())
+}
