@@ -3,8 +3,9 @@
 
     python3 make_deb.py HOST_SIM [--runs-as COMMAND] [-o FOLDER]
 
-Prints the package's path. Its architecture is that of HOST_SIM; on another one than this machine's, COMMAND runs it
-(the completions are its output). The same files give the same package. Needs Python 3.11 and dpkg-deb.
+Prints the package's path. Its architecture is that of HOST_SIM, and it depends on the libraries that HOST_SIM needs. On
+another architecture than this machine's, COMMAND runs it (the completions are its output). The same files give the same
+package. Needs Python 3.11, dpkg-deb and readelf.
 """
 
 import argparse
@@ -12,15 +13,22 @@ import gzip
 import os
 import pathlib
 import shutil
+import re
 import subprocess
+import sys
 import tempfile
 
 import tomllib
 
 HERE = pathlib.Path(__file__).resolve().parent
 ROOT = HERE.parent.parent
+sys.path.insert(0, str(ROOT / "host-sim/python"))
+sys.dont_write_bytecode = True
+
+import make_wheel  # noqa: E402
+
 NAME = "recipe-gateway"
-ARCHITECTURES = {62: "amd64", 183: "arm64"}
+ARCHITECTURES = {"x86_64": "amd64", "aarch64": "arm64"}
 # Of every file in the package: 2026-01-01.
 TIME = 1767225600
 COMPLETIONS = {
@@ -38,7 +46,7 @@ def main():
     arguments = parser.parse_args()
     version = tomllib.loads((ROOT / "Cargo.toml").read_text())["workspace"]["package"]["version"]
     binary = arguments.host_sim.read_bytes()
-    architecture = ARCHITECTURES[int.from_bytes(binary[18:20], "little")]
+    architecture, depends = needs(arguments.host_sim)
     runs_as = arguments.runs_as or arguments.host_sim.resolve()
 
     documents = f"usr/share/doc/{NAME}"
@@ -72,7 +80,8 @@ def main():
         size = sum(-(-len(content) // 1024) for content, _ in files.values())
         control = top / "DEBIAN"
         control.mkdir()
-        (control / "control").write_text(CONTROL.format(name=NAME, version=version, arch=architecture, size=size))
+        told = CONTROL.format(name=NAME, version=version, arch=architecture, size=size, depends=depends)
+        (control / "control").write_text(told)
         for script in ("postinst", "prerm", "postrm"):
             shutil.copy(HERE / script, control / script)
             (control / script).chmod(0o755)
@@ -83,6 +92,15 @@ def main():
         build = ["dpkg-deb", "--root-owner-group", "-Zxz", "--build", top, package]
         subprocess.run(build, env={**os.environ, "SOURCE_DATE_EPOCH": str(TIME)}, stdout=subprocess.DEVNULL, check=True)
     print(package)
+
+
+def needs(binary):
+    """The architecture of a binary, and the packages that it depends on; ends with a message if others are needed."""
+    glibc, machine = re.fullmatch(r"manylinux_(\d+_\d+)_(\w+)", make_wheel.platform(binary)).groups()
+    depends = [f"libc6 (>= {glibc.replace('_', '.')})"]
+    if "[libgcc_s.so.1]" in make_wheel.readelf("--dynamic", binary):
+        depends.append("libgcc-s1")
+    return ARCHITECTURES[machine], ", ".join(depends)
 
 
 def text(name):
@@ -111,7 +129,7 @@ Version: {version}
 Architecture: {arch}
 Maintainer: The recipe-gateway authors <noreply@recipe-gateway.invalid>
 Installed-Size: {size}
-Depends: libc6 (>= 2.17), libgcc-s1
+Depends: {depends}
 Recommends: systemd
 Suggests: can-utils, iproute2, wireshark
 Section: comm

@@ -12,6 +12,7 @@ use clap::Args;
 use proto_core::config::{GatewayConfig, MAX_PORTS};
 use proto_core::engine::Engine;
 use recipe_config::SimConfig;
+use recipe_config::board::Board;
 use recipe_config::file::{self, Config, FileError};
 use recipe_controller::{BuildError, Controller};
 
@@ -26,6 +27,9 @@ pub(super) struct CheckArgs {
     /// Print JSON, of mistakes too (docs/checking.md)
     #[arg(long)]
     json: bool,
+    /// Whether this board can run it: nucleo-h743zi or mps2-an500
+    #[arg(long, value_name = "BOARD")]
+    board: Option<Board>,
     /// CAN ports of the file that are on one bus
     #[arg(long, value_name = "PORT,PORT", value_parser = names)]
     same_bus: Vec<Names>,
@@ -93,12 +97,14 @@ fn report(args: &CheckArgs) -> Result<Report, Refused> {
     let (mut report, mut placed) = match &config {
         Config::Gateway(config) => {
             check_room(path, overrides, config)?;
+            check_board(path, overrides, config, args.board)?;
             let frames = file::load_frames(path, overrides)?;
             let shared: Vec<_> = args.same_bus.iter().map(|names| names.0.clone()).collect();
             let (buses, troubles) = bus::loads(config, &recipes, &shared).map_err(Refused::Argument)?;
             let mut report = fill::gateway(name, config, &recipes, &frames);
             report.buses = buses;
             let mut placed = fill::warnings(config);
+            placed.extend(recipe_config::negative_numbers(&frames));
             placed.extend(
                 troubles
                     .into_iter()
@@ -108,6 +114,9 @@ fn report(args: &CheckArgs) -> Result<Report, Refused> {
         }
         Config::Controller(_) if !args.same_bus.is_empty() => {
             return Err(Refused::Argument("--same-bus is for gateway files".into()));
+        }
+        Config::Controller(_) if args.board.is_some() => {
+            return Err(Refused::Argument("--board is for gateway files".into()));
         }
         Config::Controller(config) => {
             check_build(path, overrides, config)?;
@@ -151,6 +160,18 @@ fn check_room(path: &Path, overrides: &[String], config: &GatewayConfig) -> Resu
         Ok(_) => Ok(()),
         Err(error) => Err(file::error_at(path, overrides, &["port"], error)),
     }
+}
+
+/// Checks what only this board can refuse.
+pub(super) fn check_board(
+    path: &Path,
+    overrides: &[String],
+    config: &GatewayConfig,
+    board: Option<Board>,
+) -> Result<(), FileError> {
+    let Some(Err(unfit)) = board.map(|board| board.check(config)) else { return Ok(()) };
+    let key: Vec<&str> = unfit.key.iter().map(String::as_str).collect();
+    Err(file::error_at(path, overrides, &key, unfit.message))
 }
 
 /// Checks what only the controller can refuse.

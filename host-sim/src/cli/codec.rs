@@ -2,6 +2,7 @@
 //!
 //! In: recipes from a file. Out: frames from values and values from frames.
 
+use proto_core::config::FieldSpec;
 use proto_core::recipe::model::{Field, Framing, Rules};
 use proto_core::recipe::{CanLayout, StreamLayout};
 use proto_core::sysvar::Direction;
@@ -19,6 +20,8 @@ pub(super) struct Part {
     pub(super) layout: Layout,
     /// One for a stream part, one per id for a CAN part.
     pub(super) frames: Vec<FrameFields>,
+    /// The recipe and the part of it, for a recipe as the controller has it.
+    plain: Option<(String, Direction)>,
 }
 
 #[derive(Debug)]
@@ -44,6 +47,8 @@ pub(super) struct NamedField {
     pub(super) name: String,
     pub(super) ty: ScalarType,
     pub(super) unit: &'static str,
+    /// What a gateway does with its value, in a gateway file.
+    pub(super) spec: Option<FieldSpec>,
 }
 
 impl Part {
@@ -131,7 +136,18 @@ impl Part {
 
     fn of_device(device: DevicePart) -> Self {
         let frames = device.ids().map(|id| FrameFields { id, fields: Vec::new() }).collect();
-        Self { layout: Layout::Device(Box::new(device)), frames }
+        Self { layout: Layout::Device(Box::new(device)), frames, plain: None }
+    }
+
+    /// Notes what a gateway does with the values, of the same file's recipes as frames.
+    pub(super) fn bind(&mut self, recipes: &[Option<DeviceRecipe>]) {
+        let Some((name, direction)) = &self.plain else { return };
+        let Some(recipe) = recipes.iter().flatten().find(|recipe| recipe.name == *name) else { return };
+        for (frame, bound) in self.frames.iter_mut().zip(recipe.part(*direction)) {
+            for (field, bound) in frame.fields.iter_mut().zip(&bound.fields) {
+                field.spec = Some(bound.spec);
+            }
+        }
     }
 
     /// Whether its only frame is always the same, so that no values are needed.
@@ -155,14 +171,16 @@ impl Part {
                 } else {
                     Layout::Stream(Box::new(compile(Framing::Bytes).map_err(refused)?))
                 };
-                Ok(Self { layout, frames: vec![FrameFields::new(None, &part.fields)] })
+                let frames = vec![FrameFields::new(None, &part.fields)];
+                Ok(Self { layout, frames, plain: Some((recipe.name.clone(), direction)) })
             }
             SimParts::Can { input, output } => {
                 let frames = if direction == Direction::Input { input } else { output };
                 let entries = frames.iter().map(|frame| (frame.id, fields(&frame.fields)));
                 let layout = CanLayout::new(rules, entries).map_err(refused)?;
                 let frames = frames.iter().map(|frame| FrameFields::new(Some(frame.id), &frame.fields));
-                Ok(Self { layout: Layout::Can(Box::new(layout)), frames: frames.collect() })
+                let plain = Some((recipe.name.clone(), direction));
+                Ok(Self { layout: Layout::Can(Box::new(layout)), frames: frames.collect(), plain })
             }
         }
     }
@@ -251,6 +269,7 @@ impl FrameFields {
                 Field::System(var) => unit_of(var),
                 Field::User(_) => "",
             },
+            spec: None,
         };
         Self { id, fields: fields.iter().map(named).collect() }
     }

@@ -77,7 +77,7 @@ impl Talk {
             ("request", &named.request, asks, Some(budget.request)),
             ("reply", &named.reply, answers, Some(budget.reply)),
             // Of Modbus it is always the same.
-            ("refusal", &named.refusal, Direction::Input, None),
+            ("refusal", &named.refusal, answers, None),
         ] {
             let is_shown = name != "refusal" || named.kind == ExchangeKind::Frames;
             let Some(frame) = frame.as_ref().filter(|_| is_shown) else { continue };

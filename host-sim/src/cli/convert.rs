@@ -13,6 +13,7 @@ use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::Scalar;
 
 use super::codec::{FrameFields, Layout, NamedField, Part};
+use super::scale;
 use super::text::{self, CanLine, Prefix};
 
 type Outcome = Result<(), String>;
@@ -231,7 +232,10 @@ fn show_stream(
         note(notes, &format!("line {line}: a receiver rejects this frame: {error}"));
     }
     match part.frames.first() {
-        Some(frame) => write_line(out, &show_values(frame, layout.values(payload))),
+        Some(frame) => {
+            note_refused(frame, layout.values(payload), line, notes);
+            write_line(out, &show_values(frame, layout.values(payload)))
+        }
         None => Ok(()),
     }
 }
@@ -286,8 +290,23 @@ fn show_can(part: &Part, frame: &CanFrame, line: usize, notes: &mut dyn Write) -
     if let Err(error) = entry.check(frame.data()) {
         note(notes, &format!("line {line}: a receiver rejects this frame: {error}"));
     }
+    note_refused(fields, entry.values(frame.data()), line, notes);
     let values = show_values(fields, entry.values(frame.data()));
     Ok(format!("id={} {values}", text::show_id(frame.id())))
+}
+
+/// Says if a gateway rejects the frame for a value that does not fit its variable.
+fn note_refused(
+    frame: &FrameFields,
+    values: impl Iterator<Item = Scalar>,
+    line: usize,
+    notes: &mut dyn Write,
+) {
+    let refused =
+        |(field, value): (&NamedField, Scalar)| scale::refused(field.spec.as_ref()?, &field.name, value);
+    if let Some(why) = frame.fields.iter().zip(values).find_map(refused) {
+        note(notes, &format!("line {line}: a gateway rejects this frame: {why}"));
+    }
 }
 
 fn show_values(frame: &FrameFields, values: impl Iterator<Item = Scalar>) -> String {

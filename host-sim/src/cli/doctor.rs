@@ -4,13 +4,13 @@
 //! 1 findings (a note alone is none), 2 a file or an argument is wrong and nothing was started.
 
 use std::io::{self, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::Args;
 use recipe_device::bind::Bind;
-use recipe_doctor::{Finding, Severity};
+use recipe_doctor::{FILE, Finding, Severity};
 use recipe_shell::out::{Printed, print_stderr};
 use serde_json::json;
 
@@ -65,7 +65,9 @@ pub(super) fn run(args: DoctorArgs) -> ExitCode {
         Err(error) => return wrong(error),
     };
     let findings = match recipe_shell::gateway::listen(*config, args.bind, args.time, args.ask) {
-        Ok(findings) => findings,
+        Ok(findings) => {
+            findings.into_iter().map(|finding| with_file(finding, &args.config)).collect::<Vec<_>>()
+        }
         Err(error) => {
             print_stderr(&error);
             return ExitCode::from(error.exit_code());
@@ -78,6 +80,14 @@ pub(super) fn run(args: DoctorArgs) -> ExitCode {
         (Printed::Whole, Err(error)) => wrong(error),
         _ => ExitCode::from(u8::from(!is_well)),
     })
+}
+
+/// With the file's name in the command of the remedy.
+fn with_file(mut finding: Finding, file: &Path) -> Finding {
+    let (before, after) =
+        (format!("host-sim decode {FILE} "), format!("host-sim decode {} ", file.display()));
+    finding.remedy = finding.remedy.replace(&before, &after);
+    finding
 }
 
 fn print_json(out: &mut dyn Write, findings: &[Finding]) -> io::Result<()> {

@@ -3,16 +3,15 @@
 //! In: a gateway file or a controller file, or a kind of file. Out: a CAN database, a plugin for Wireshark, a map of
 //! the variables; the schema of that kind.
 
-use std::fs;
-use std::io::{self, Write};
-use std::path::{Path, PathBuf};
+use std::io::Write;
+use std::path::PathBuf;
 
 use clap::{Args, Subcommand, ValueEnum};
 use recipe_config::FileKind;
-use recipe_device::files::{Beside, Identity};
 use recipe_export::{Model, dbc, lua, map};
 use recipe_shell::out::print_stderr;
 
+use super::output::Written;
 use super::{Outcome, Overrides};
 
 /// Arguments of `export`.
@@ -175,32 +174,8 @@ impl FileArgs {
             return out.write_all(text.as_bytes()).map_err(|error| error.to_string());
         };
         let name = path.display();
-        self.put(path, text.as_bytes()).map_err(|error| format!("{name}: {error}"))?;
+        let written = Written { bytes: text.as_bytes(), name: "it", made_from: Some(&self.file) };
+        written.put(path, || Ok(self.force), "").map_err(|error| format!("{name}: {error}"))?;
         writeln!(out, "{name}: {} bytes", text.len()).map_err(|error| error.to_string())
-    }
-
-    fn put(&self, path: &Path, bytes: &[u8]) -> io::Result<()> {
-        let refused = |message: &str| Err(io::Error::new(io::ErrorKind::AlreadyExists, message));
-        let found = match fs::metadata(path) {
-            Err(error) if error.kind() == io::ErrorKind::NotFound => {
-                return Beside::file(path, bytes)?.0.put_new(path);
-            }
-            found => found?,
-        };
-        if found.is_dir() {
-            return refused("a folder; give the name of a file in it");
-        }
-        if !found.is_file() {
-            // A pipe or a device: nothing is replaced.
-            return fs::File::options().write(true).open(path)?.write_all(bytes);
-        }
-        if Identity::of(&found) == Identity::of(&fs::metadata(&self.file)?) {
-            return refused("this is the file that it is made from; give another name");
-        }
-        if !self.force {
-            return refused("this file exists; give another name or --force");
-        }
-        let place = fs::canonicalize(path)?;
-        Beside::file(&place, bytes)?.0.replace(&place)
     }
 }

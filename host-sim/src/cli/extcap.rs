@@ -56,7 +56,7 @@ pub(super) const EXAMPLES: &str = "\
 Wireshark starts it. Once, so that it is found:
   ln -s \"$(command -v host-sim)\" ~/.local/lib/wireshark/extcap/host-sim-extcap
 Then start the gateway with its API, and tell where its ready file is:
-  host-sim gateway -c cell.toml --bind hand=can0 --console 127.0.0.1:0 --ready run/ready.json
+  host-sim gateway -c cell.toml --bind hand=socketcan:can0 --console 127.0.0.1:0 --ready run/ready.json
   RGW_READY=run/ready.json wireshark
 
 Examples, as Wireshark does it:

@@ -130,7 +130,7 @@ fn laid_out_rows(frame: &NamedFrame, laid_out: &DeviceFrame, part: Direction) ->
                 add(place, &field.name, format!("{} <- {}", show_text(&text), show_words(from)));
             }
             FieldSpec::Length(length) => add(place, &field.name, show_length(&length)),
-            FieldSpec::UserOutput { .. } | FieldSpec::DeviceOutput { .. } if field.is_coil => {
+            _ if field.is_coil => {
                 add(place, &field.name, format!("FF for 1, 00 for 0{}", show_use(field)));
             }
             spec => {
@@ -237,8 +237,12 @@ fn show_encoding(encoding: &Encoding) -> String {
     kind + order
 }
 
-/// The constant, the variable or the bit behind how the field is written.
+/// The constant, the variable or the bit behind how the field is written, and what may be sent of it.
 fn show_use(field: &DeviceField) -> String {
+    show_source(field) + scale::of_sendable(&field.sendable).as_str()
+}
+
+fn show_source(field: &DeviceField) -> String {
     let spec = &field.spec;
     if let Some(bit) = spec.bit() {
         let is_input = matches!(spec, FieldSpec::UserInput { .. } | FieldSpec::DeviceInput { .. });
@@ -259,6 +263,10 @@ fn show_use(field: &DeviceField) -> String {
             OutputBinding::Port { value, .. } => {
                 let of = field.of_port.as_ref().map_or("the port".to_owned(), |port| format!("port {port}"));
                 format!(" <- {} of {of}{}", value.name(), scale::of_output(spec))
+            }
+            OutputBinding::Link { link, .. } => {
+                let name = link.name().or(field.of_port.as_deref()).unwrap_or_default();
+                format!(" <- link {name} is up{}", scale::of_output(spec))
             }
             OutputBinding::Variable { .. } | OutputBinding::Bit { .. } => String::new(),
         },

@@ -2,14 +2,14 @@
 
 use std::fs;
 use std::io::{self, Read, Write};
-use std::os::unix::fs::FileTypeExt;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
 use proto_core::config::image;
+use recipe_config::board::Board;
 
+use super::output::Written;
 use super::{Outcome, Overrides, check};
-use recipe_device::files::{Beside, Identity};
 
 /// Arguments of `image`.
 #[derive(Debug, Args)]
@@ -22,12 +22,17 @@ pub(super) struct ImageArgs {
     /// Replace a file even if it is no image; never the input file
     #[arg(long)]
     force: bool,
+    /// The board that is to run it, nucleo-h743zi or mps2-an500: what it has not is refused here
+    #[arg(long, value_name = "BOARD")]
+    board: Option<Board>,
     #[command(flatten)]
     overrides: Overrides,
 }
 
 pub(super) fn run(args: &ImageArgs, out: &mut dyn Write) -> Outcome {
     let config = check::load_gateway(&args.file, &args.overrides.set).map_err(|error| error.to_string())?;
+    check::check_board(&args.file, &args.overrides.set, &config, args.board)
+        .map_err(|error| error.to_string())?;
     let mut bytes = vec![0; image::MAX_IMAGE];
     let len = image::encode(&*config, &mut bytes).map_err(|error| error.to_string())?;
     bytes.truncate(len);
@@ -40,36 +45,9 @@ pub(super) fn run(args: &ImageArgs, out: &mut dyn Write) -> Outcome {
 
 /// Writes the image unless that would replace another file.
 fn write(args: &ImageArgs, bytes: &[u8]) -> io::Result<()> {
-    let refused = |message: &str| Err(io::Error::new(io::ErrorKind::AlreadyExists, message));
-    let found = match fs::metadata(&args.output) {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => {
-            if args.output.is_symlink() {
-                return refused("a link to a file that does not exist; give another name");
-            }
-            return Beside::file(&args.output, bytes)?.0.put_new(&args.output);
-        }
-        found => found?,
-    };
-    let kind = found.file_type();
-    if kind.is_char_device() || kind.is_fifo() {
-        // A pipe or a device: nothing is replaced.
-        return fs::File::options().write(true).open(&args.output)?.write_all(bytes);
-    }
-    if kind.is_dir() {
-        return refused("a folder; give the name of a file in it");
-    }
-    if !kind.is_file() {
-        return refused("not a regular file; give another name");
-    }
-    if Identity::of(&found) == Identity::of(&fs::metadata(&args.file)?) {
-        return refused("this is the file that the image is made from; give another name");
-    }
-    if !args.force && !is_image(&args.output)? {
-        return refused("this file exists and is not an image; give another name or --force");
-    }
-    // Replace the target of a symbolic link, not the link.
-    let place = fs::canonicalize(&args.output)?;
-    Beside::file(&place, bytes)?.0.replace(&place)
+    let image = Written { bytes, name: "the image", made_from: Some(&args.file) };
+    let may_be_replaced = || Ok(args.force || is_image(&args.output)?);
+    image.put(&args.output, may_be_replaced, " and is not an image")
 }
 
 /// Whether a file begins like an image of any version, or is empty, as `mktemp` makes it.

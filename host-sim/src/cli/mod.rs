@@ -8,13 +8,16 @@ mod check;
 mod codec;
 mod conversation;
 mod convert;
+mod ctl;
 mod doctor;
 mod export;
 mod extcap;
+mod fleet;
 mod frame;
 mod image;
 mod log;
 mod new;
+mod output;
 mod pendant;
 mod plan;
 mod record;
@@ -27,6 +30,7 @@ mod values;
 
 use std::ffi::OsString;
 use std::io::{self, Write};
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -68,6 +72,7 @@ Examples:
   host-sim gateway -c cell.toml --bind rs485-1=serial:/dev/ttyUSB0
   host-sim doctor -c cell.toml --bind rs485-1=serial:/dev/ttyUSB0
                                                  why does it not work?
+  host-sim ctl --to 192.168.0.20 status          ask a gateway that runs
   host-sim encode cell.toml --part input 1       the frame that switches DO1 on
   host-sim decode cell.toml --part input FF FF 01 EE EE
 
@@ -76,9 +81,14 @@ an argument is wrong and nothing was started.";
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Run a whole cell in one process and check the six worked examples
+    /// Run a whole cell in one process and check the six worked examples, or a living cell with its pages
     #[command(after_help = DEMO_EXAMPLES)]
-    Demo,
+    Demo {
+        /// Run a cell until it is ended, with the gateway's page at this address and the controller's at the
+        /// next port; port 0: any
+        #[arg(long, value_name = "ADDRESS:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1:8480")]
+        console: Option<SocketAddr>,
+    },
     /// Run the simulated controller
     #[command(after_help = CONTROLLER_EXAMPLES)]
     Controller(run::ControllerRun),
@@ -88,6 +98,9 @@ enum Command {
     /// Listen for some seconds and say what is wrong: ports, devices, links, the controller's mode
     #[command(after_help = doctor::EXAMPLES)]
     Doctor(doctor::DoctorArgs),
+    /// Ask and change running gateways, on hosts and boards: state, frames, another configuration
+    #[command(after_help = ctl::EXAMPLES)]
+    Ctl(ctl::CtlArgs),
     /// Act on a running controller: press its buttons, set inputs, begin faults, watch its state
     #[command(after_help = pendant::EXAMPLES)]
     Pendant(pendant::PendantArgs),
@@ -106,6 +119,9 @@ enum Command {
     /// Be an interface of Wireshark: a running gateway
     #[command(after_help = extcap::EXAMPLES)]
     Extcap(extcap::ExtcapArgs),
+    /// Run many simulated edge nodes against a broker, and print what they do
+    #[command(after_help = fleet::EXAMPLES)]
+    Fleet(fleet::FleetArgs),
     /// Run the engine of a recorded gateway again, in virtual time, and compare what it does
     #[command(after_help = replay::EXAMPLES)]
     Replay(replay::ReplayArgs),
@@ -127,8 +143,12 @@ enum Command {
 }
 
 const DEMO_EXAMPLES: &str = "\
-Prints PASS or FAIL for each example. Exit code 0 only if all pass. Ctrl-C ends it
-and removes its temporary files.";
+Examples:
+  host-sim demo              the six worked examples: PASS or FAIL for each
+  host-sim demo --console    a living cell, to be watched and changed in a browser
+
+Exit code 0 only if all examples pass. Ctrl-C ends it and removes its temporary
+files.";
 
 const CONTROLLER_EXAMPLES: &str = "\
 Examples:
@@ -147,10 +167,13 @@ Examples:
   host-sim gateway -c cell.toml --set port.rs485-1.baud=9600 --stats 1s
   host-sim gateway -v -c cell.toml --bind rs485-1=serial:/dev/ttyUSB0
                                                  -v says in words what is wrong, and when it is over
-  host-sim gateway -c cell.toml --bind hand=can0 --capture - | wireshark -k -i -
-  host-sim gateway -c cell.toml --bind hand=can0 --record run --record-budget 10GiB
+  host-sim gateway -c cell.toml --bind hand=socketcan:can0 --capture - | wireshark -k -i -
+  host-sim gateway -c cell.toml --bind hand=socketcan:can0 --record run --record-budget 10GiB
   host-sim gateway -c cell.toml --console 127.0.0.1:8480 --console-key console.key --console-state revisions
       and then: curl http://127.0.0.1:8480/api/v1/status
+  host-sim gateway -c cell.toml --bind hand=socketcan:can0 --sparkplug sparkplug.toml
+  host-sim gateway -c new.toml --bind force=serial:/dev/ttyUSB0 --console 127.0.0.1:8480 --console-key console.key
+                                                 new.toml has no ports: the page in a browser adds them
 
 Captures and recordings never delay the gateway: what cannot be written is lost and
 counted. docs/capture.md says what is in them.";
@@ -302,14 +325,17 @@ pub fn main() -> ExitCode {
         Ok(cli) => cli,
         Err(error) => return not_run(&error),
     };
-    let _log = log::start(cli.verbose);
+    let log = log::start(cli.verbose);
+    let _last_write = log.last_write();
     let mut out = Out::new(io::stdout());
-    let done = match cli.command.unwrap_or(Command::Demo) {
-        Command::Demo => return crate::demo::run(),
-        Command::Controller(run) => return run.controller(),
-        Command::Gateway(run) => return run.gateway(),
+    let done = match cli.command.unwrap_or(Command::Demo { console: None }) {
+        Command::Demo { console: None } => return crate::demo::run(),
+        Command::Demo { console: Some(address) } => return crate::demo::run_living(address),
+        Command::Controller(run) => return run.controller(log),
+        Command::Gateway(run) => return run.gateway(log),
         Command::Doctor(args) => return doctor::run(args),
         Command::Pendant(args) => return pendant::run(args),
+        Command::Ctl(args) => return ctl::run(args),
         Command::Completions { shell } => {
             let mut script = Vec::new();
             let shell = clap_complete::Shell::from(shell);
@@ -322,6 +348,7 @@ pub fn main() -> ExitCode {
             return out.finish(|_| code);
         }
         Command::Extcap(args) => return extcap::run(&args, out),
+        Command::Fleet(args) => return fleet::run(&args, out),
         Command::Replay(args) => return replay::run(&args, out),
         Command::New(args) => new::run(&args, &mut out),
         Command::Check(args) => match check::run(&args, &mut out) {
@@ -416,7 +443,9 @@ impl Which {
             }
             (None, number) => codec::Part::choose_exchange(&recipes, recipe, number, None),
         };
-        part.map_err(|message: String| format!("{}: {message}", self.file.display()))
+        let mut part = part.map_err(|message: String| format!("{}: {message}", self.file.display()))?;
+        part.bind(&file::load_frames(&self.file, &self.overrides.set).map_err(|error| error.to_string())?);
+        Ok(part)
     }
 }
 

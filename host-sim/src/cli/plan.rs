@@ -1,6 +1,6 @@
 //! The way up or the source of each variable, as `check` prints it.
 
-use proto_core::config::{Bus, FieldSpec, GatewayConfig, InputBinding, OutputBinding, SendOn};
+use proto_core::config::{Bus, FieldSpec, GatewayConfig, InputBinding, LinkSource, OutputBinding, SendOn};
 use proto_core::engine::{LinkId, Plan, PortId, Source, WayUp};
 use proto_core::sysvar::{Direction, ModbusPlace, SysVar, VarBit};
 use serde::Serialize;
@@ -68,6 +68,13 @@ pub(super) fn ways(config: &GatewayConfig) -> Vec<Way> {
                 Some(OutputBinding::Port { port: Some(of), value, .. }) => {
                     let from = format!("<- port {}", port_name(config, PortId(of)));
                     (format!("port.{}.{}", port_name(config, PortId(of)), value.name()), from)
+                }
+                Some(OutputBinding::Link { link, .. }) => {
+                    let name = match link {
+                        LinkSource::Listening(port) => port_name(config, PortId(port)),
+                        _ => link.name().unwrap_or_default(),
+                    };
+                    (format!("link.{name}.up"), "<- the gateway".into())
                 }
                 _ => continue,
             };

@@ -1,6 +1,7 @@
 //! `--capture` and `--record` of `gateway`: what goes over its ports and links, as files.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use clap::Args;
 use recipe_capture::pcapng::Scope;
@@ -43,13 +44,17 @@ impl WatchArgs {
         self.capture.as_deref() == Some(Path::new("-"))
     }
 
-    /// Begins what was asked for. `file` is what the gateway runs.
-    pub(super) fn start(
-        &self,
-        watch: &Watch,
-        file: &Path,
-        overrides: &[String],
-    ) -> Result<Watching, StartError> {
+    /// What the frames of a file are called, if somebody asks.
+    pub(super) fn decoder(&self, file: &Path, overrides: &[String]) -> Result<Arc<Decoder>, StartError> {
+        if self.record.is_none() {
+            return Ok(Arc::default());
+        }
+        let model = Model::load(file, overrides).map_err(|error| StartError::new(error.to_string()))?;
+        Ok(Arc::new(Decoder::new(&model)))
+    }
+
+    /// Begins what was asked for.
+    pub(super) fn start(&self, watch: &Watch) -> Result<Watching, StartError> {
         let mut watching = Watching { watch: watch.clone(), capture: None, recording: None };
         if let Some(folder) = &self.record {
             let (budget, file_size) = (self.record_budget, self.record_file);
@@ -59,9 +64,8 @@ impl WatchArgs {
                      and the budget is twice that of a file at least"
                 )));
             }
-            let model = Model::load(file, overrides).map_err(|error| StartError::new(error.to_string()))?;
             let options = RecordOptions { folder: folder.clone(), budget, file: file_size };
-            let recording = Recording::start(watch, options, Decoder::new(&model));
+            let recording = Recording::start(watch, options);
             let refused = |error| StartError::new(format!("--record {}: {error}", folder.display()));
             watching.recording = Some(recording.map_err(refused)?);
         }

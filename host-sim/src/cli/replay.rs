@@ -26,7 +26,7 @@ pub(super) struct ReplayArgs {
 
 pub(super) const EXAMPLES: &str = "\
 Examples:
-  host-sim gateway -c cell.toml --bind rs485-1=/dev/ttyUSB0 --record run
+  host-sim gateway -c cell.toml --bind rs485-1=serial:/dev/ttyUSB0 --record run
   host-sim replay run                            the newest run in the folder
   host-sim replay run/20261122-204500-123.0001.mcap
   host-sim replay run --plain cell.rgr

@@ -14,8 +14,9 @@ use recipe_controller::timeline::Timeline;
 use recipe_device::bind::Bind;
 use recipe_shell::console::{self, ConfigFile, ConsoleOptions};
 use recipe_shell::controller::{ControllerOptions, MAX_FACTOR, MIN_FACTOR, Pace};
+use recipe_shell::log::Log;
 use recipe_shell::out::print_stderr;
-use recipe_shell::{self as shell, EventsFile, ReadyFile, RunOptions, Scheduling, StartError};
+use recipe_shell::{self as shell, EventsFile, ReadyFile, RunOptions, Scheduling, StartError, Telling};
 
 /// Arguments of `controller` and `gateway`.
 #[derive(Debug, Args)]
@@ -27,7 +28,8 @@ pub(super) struct Run {
     overrides: Overrides,
     /// Bind a port to a device: pty:PATH, pty-paced:PATH, serial:/dev/ttyUSB0, tcp:HOST:PORT,
     /// tcp-listen:HOST:PORT; socketcan:vcan0, slcan-pty:PATH, slcan-tcp:HOST:PORT[,PATH], the last two
-    /// also as slcan-pty-unpaced and slcan-tcp-unpaced
+    /// also as slcan-pty-unpaced and slcan-tcp-unpaced. With --console also for ports that the file does not
+    /// have yet: they are used once a revision has the port
     #[arg(long, value_name = "NAME=DEVICE")]
     bind: Vec<Bind>,
     /// Write the actual addresses to this file once everything is listening; removed at the end
@@ -50,6 +52,9 @@ pub(super) struct Run {
     /// unless the file was changed; only for the gateway
     #[arg(long, value_name = "DIR", requires = "console")]
     console_state: Option<PathBuf>,
+    /// The port of the other console on this machine, the controller's or the gateway's: its page becomes a tab
+    #[arg(long, value_name = "PORT", requires = "console")]
+    console_peer: Option<u16>,
 }
 
 /// Arguments of `gateway`.
@@ -59,6 +64,10 @@ pub(super) struct GatewayRun {
     run: Run,
     #[command(flatten)]
     watch: WatchArgs,
+    /// Tell a broker what this gateway knows: Sparkplug B over MQTT, by this file (docs/fleet.md). Nothing can be
+    /// written or commanded from there
+    #[arg(long, value_name = "FILE")]
+    sparkplug: Option<PathBuf>,
 }
 
 /// Arguments of `controller`.
@@ -83,26 +92,35 @@ pub(super) struct ControllerRun {
 }
 
 impl GatewayRun {
-    pub(super) fn gateway(self) -> ExitCode {
-        let Self { run, watch } = self;
+    pub(super) fn gateway(self, log: Log) -> ExitCode {
+        let Self { run, watch, sparkplug } = self;
         let (path, overrides) = (run.config.clone(), run.overrides.set.clone());
         let loaded = check::load_gateway(&path, &overrides);
+        let sparkplug = match sparkplug.as_deref().map(Telling::load).transpose() {
+            Ok(sparkplug) => sparkplug,
+            Err(error) => return wrong(error),
+        };
         // Even if the file is wrong, a ready file of a killed run is removed.
-        match (run.options(), loaded) {
+        match (run.options(log), loaded) {
             (Ok(options), Ok(config)) => {
                 if watch.takes_stdout() && options.stats.is_some() {
                     return wrong(
                         "--stats is for stdout, and so is --capture -; give the capture a file or a pipe",
                     );
                 }
-                let options = RunOptions { stdout_is_taken: watch.takes_stdout(), ..options };
-                let watching = match watch.start(&options.watch, &path, &overrides) {
+                let decoder = match watch.decoder(&path, &overrides) {
+                    Ok(decoder) => decoder,
+                    Err(error) => return finished(Err(error)),
+                };
+                let options =
+                    RunOptions { stdout_is_taken: watch.takes_stdout(), decoder, sparkplug, ..options };
+                let watching = match watch.start(&options.watch) {
                     Ok(watching) => watching,
                     Err(error) => return finished(Err(error)),
                 };
                 let result = match &options.console {
-                    Some(_) => ConfigFile::read(&path, overrides)
-                        .and_then(|file| shell::gateway::run_with_console(file, options)),
+                    Some(console) => ConfigFile::read(&path, overrides)
+                        .and_then(|file| shell::gateway::run_with_console(file, console, &options)),
                     None => shell::gateway::run(*config, options),
                 };
                 watching.finish();
@@ -115,25 +133,25 @@ impl GatewayRun {
 }
 
 impl Run {
-    fn options(self) -> Result<RunOptions, StartError> {
+    fn options(self, log: Log) -> Result<RunOptions, StartError> {
         let ready = self.ready.map(ReadyFile::at).transpose()?;
         let scheduling = if self.no_realtime { Scheduling::Ordinary } else { Scheduling::FifoIfAllowed };
         let key = self.console_key.as_deref().map(console::read_key).transpose()?;
-        let state = self.console_state;
-        let console = self.console.map(|address| ConsoleOptions { address, key, state });
+        let (state, peer) = (self.console_state, self.console_peer);
+        let console = self.console.map(|address| ConsoleOptions { address, key, state, peer });
         let (binds, stats) = (self.bind, self.stats);
-        Ok(RunOptions { binds, ready, stats, scheduling, console, ..RunOptions::default() })
+        Ok(RunOptions { binds, ready, stats, scheduling, console, log: Some(log), ..RunOptions::default() })
     }
 }
 
 impl ControllerRun {
-    pub(super) fn controller(self) -> ExitCode {
+    pub(super) fn controller(self, log: Log) -> ExitCode {
         let loaded = check::load_controller(&self.run.config, &self.run.overrides.set);
         let loaded = loaded.map_err(|error| error.to_string()).and_then(|config| {
             let timeline = self.timeline.as_deref().map(|path| read_timeline(path, &config)).transpose()?;
             Ok((config, timeline))
         });
-        match (self.options(), loaded) {
+        match (self.options(log), loaded) {
             (Ok(options), Ok((config, timeline))) => {
                 finished(shell::controller::run(config, ControllerOptions { timeline, ..options }))
             }
@@ -142,13 +160,13 @@ impl ControllerRun {
         }
     }
 
-    fn options(self) -> Result<ControllerOptions, StartError> {
+    fn options(self, log: Log) -> Result<ControllerOptions, StartError> {
         let Self { run, time: pace, seed, events, timeline: _ } = self;
         if run.console_state.is_some() {
             return Err(StartError::new("--console-state: a simulated controller keeps no revisions"));
         }
         let events = events.map(EventsFile::at).transpose()?;
-        Ok(ControllerOptions { run: run.options()?, pace, seed, events, timeline: None })
+        Ok(ControllerOptions { run: run.options(log)?, pace, seed, events, timeline: None })
     }
 }
 

@@ -2,27 +2,22 @@
 //!
 //! In: a field and its binding. Out: the end of its line, empty if the number stays as it is and always fits.
 
-use proto_core::config::{FieldSpec, InputBinding, OutputBinding};
-use proto_core::device::{Encoding, Overflow};
-use proto_core::wire::scalar::ScalarType;
+use proto_core::config::{FieldSpec, Fitting, InputBinding, Limits, MapEntry, OutputBinding, Outside};
+use proto_core::device::Overflow;
+use proto_core::wire::scalar::Scalar;
 
 /// ` = value * 0.1 + 5, if in 0..=655300`.
 pub(super) fn of_input(spec: &FieldSpec, to: &InputBinding) -> String {
-    let InputBinding::Variable { var, scale, offset } = *to else { return String::new() };
-    let (encoding, overflow) = match *spec {
-        FieldSpec::UserInput { ty, .. } => (Encoding::scalar(ty), Overflow::Usual),
-        FieldSpec::DeviceInput { encoding, overflow, .. } => (encoding, overflow),
-        _ => return String::new(),
-    };
+    let InputBinding::Variable { scale, offset, .. } = *to else { return String::new() };
     let formula = match formula("value", scale, offset) {
         formula if formula.is_empty() => formula,
         formula => format!(" = {formula}"),
     };
-    if overflow == Overflow::Wrap {
+    if matches!(spec, FieldSpec::DeviceInput { overflow: Overflow::Wrap, .. }) {
         return format!("{formula}, wraps");
     }
-    match fitting(&encoding, var.ty(), f64::from(scale), f64::from(offset)) {
-        Some((low, high)) => format!("{formula}, if in {}..={}", number(low), number(high)),
+    match spec.fitting() {
+        Some(fitting) => format!("{formula}, if in {}", range(&fitting)),
         None => formula,
     }
 }
@@ -37,11 +32,31 @@ pub(super) fn of_output(spec: &FieldSpec) -> String {
         Some(
             OutputBinding::Variable { scale, offset, .. }
             | OutputBinding::State { scale, offset, .. }
-            | OutputBinding::Port { scale, offset, .. },
+            | OutputBinding::Port { scale, offset, .. }
+            | OutputBinding::Link { scale, offset, .. },
         ) => formula("", scale, offset),
         _ => String::new(),
     };
     scaled + wraps
+}
+
+/// `, if in 0..=100`, `, clamped to 0..=100`, or `, 0: 1, 1..7: 2`, behind all that; empty if any number is sent.
+pub(super) fn of_sendable(sendable: &[FieldSpec]) -> String {
+    let show = |spec: &FieldSpec| match *spec {
+        FieldSpec::Limits(Limits { low, high, outside }) => {
+            let how = match outside {
+                Outside::Refuse => "if in",
+                Outside::Clamp => "clamped to",
+            };
+            format!(", {how} {}..={}", number(low), number(high))
+        }
+        FieldSpec::Mapped(MapEntry { first, last, sent }) if first == last => {
+            format!(", {first}: {}", number(sent))
+        }
+        FieldSpec::Mapped(MapEntry { first, last, sent }) => format!(", {first}..{last}: {}", number(sent)),
+        _ => String::new(),
+    };
+    sendable.iter().map(show).collect()
 }
 
 /// `value * 0.1 + 5`; empty if nothing is to be done.
@@ -55,27 +70,21 @@ fn formula(value: &str, scale: f32, offset: f32) -> String {
     if times.is_empty() && plus.is_empty() { String::new() } else { format!("{value}{times}{plus}") }
 }
 
-/// The field's numbers that fit the variable, if others do not. A frame with another one is rejected.
-fn fitting(encoding: &Encoding, ty: ScalarType, scale: f64, offset: f64) -> Option<(f64, f64)> {
-    if matches!(ty, ScalarType::Float | ScalarType::Double) {
-        // Only a huge number would not fit.
+/// Why a gateway rejects a frame with this value of an input field; `None` if it takes it.
+pub(super) fn refused(spec: &FieldSpec, name: &str, value: Scalar) -> Option<String> {
+    if !value.is_finite() || spec.takes(value) {
         return None;
     }
-    let (low, high) = encoding.range();
-    // Of the variable, rounded as the engine rounds.
-    let (least, most) = ty.range();
-    let ends = [(least - 0.5 - offset) / scale, (most + 0.5 - offset) / scale];
-    let (first, last) = (ends[0].min(ends[1]), ends[0].max(ends[1]));
-    if first < low && last > high {
-        return None;
-    }
-    // Next to the end, where rounding decides, the number that surely fits.
-    let exact = [(least - offset) / scale, (most - offset) / scale];
-    let (first, last) = (exact[0].min(exact[1]), exact[0].max(exact[1]));
-    let whole = encoding.is_integer();
-    let first = if whole { first.ceil() } else { first };
-    let last = if whole { last.floor() } else { last };
-    Some((first.max(low), last.min(high)))
+    let allowed = match spec.fitting() {
+        Some(fitting) => format!("{}; {} takes {}", number(value.as_f64()), fitting.var, range(&fitting)),
+        None => format!("{}, which does not fit its variable", number(value.as_f64())),
+    };
+    Some(format!("{name} is {allowed}"))
+}
+
+/// `0..=655.35`.
+pub(super) fn range(fitting: &Fitting) -> String {
+    format!("{}..={}", number(fitting.low), number(fitting.high))
 }
 
 /// Without the digits that only the way to binary and back makes.
@@ -89,12 +98,23 @@ fn number(value: f64) -> String {
 mod tests {
     use super::*;
     use proto_core::sysvar::SysVar;
+    use proto_core::wire::scalar::ScalarType;
 
     #[track_caller]
     fn input(ty: ScalarType, var: &str, scale: f32, offset: f32) -> String {
         let var = SysVar::parse(var).unwrap();
         let to = InputBinding::Variable { var, scale, offset };
         of_input(&FieldSpec::UserInput { ty, to }, &to)
+    }
+
+    #[test]
+    fn what_a_field_may_send_is_shown() {
+        let limits = |outside| [FieldSpec::Limits(Limits { low: -0.5, high: 100.0, outside })];
+        assert_eq!(of_sendable(&limits(Outside::Refuse)), ", if in -0.5..=100");
+        assert_eq!(of_sendable(&limits(Outside::Clamp)), ", clamped to -0.5..=100");
+        let entry = |first, last, sent| FieldSpec::Mapped(MapEntry { first, last, sent });
+        assert_eq!(of_sendable(&[entry(0, 0, 1.0), entry(1, 7, 2.0)]), ", 0: 1, 1..7: 2");
+        assert_eq!(of_sendable(&[]), "");
     }
 
     #[test]

@@ -1,7 +1,10 @@
-//! `soak`: cells in virtual time with faults and checks of everything that the gateway does, and the
-//! replay of a failed run.
+//! `soak`: cells in virtual time with faults and checks of everything that the gateway does, the replay of
+//! a failed run, and one result of a run that several machines have shared.
 //!
-//! Progress goes to stderr, the table to stdout.
+//! Progress goes to stderr, the table or the document to stdout.
+
+mod merge;
+mod table;
 
 use std::io::{IsTerminal, Write};
 use std::path::Path;
@@ -9,14 +12,15 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::{Duration as WallTime, Instant as WallInstant};
 
-use clap::{Args, ValueEnum};
+use clap::{Args, Subcommand, ValueEnum};
 use proto_core::time::Duration;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use super::wrong;
 use recipe_cell::Cell;
-use recipe_cell::soak::{Batch, Level, Progress, Scenario, Soak, Total, show_trace};
+use recipe_cell::soak::{Batch, Level, Part, PartFailure, Progress, Scenario, Share, Soak, show_trace};
 use recipe_shell::out::print_stderr;
+use table::{failure, progress_line, show_seconds, table};
 
 pub(super) const EXAMPLES: &str = "\
 Runs the gateway's engine against the simulated controller in virtual time. Devices
@@ -36,11 +40,18 @@ Examples:
   host-sim soak --cell cell.toml,robot.toml      your own gateway and controller
   host-sim soak --replay 93570312@41.250300 --trace
 
+On three machines with the same host-sim, each with its own number, then on one:
+  host-sim soak --hours 72 --seed 42 --shard 1/3 --json > 1.json
+  host-sim soak merge 1.json 2.json 3.json       the table and the hash of all 72 hours
+
 Exit codes: 0 all invariants held; 1 one was violated; 2 an argument is invalid.";
 
 /// Arguments of `soak`.
 #[derive(Debug, Args)]
+#[command(args_conflicts_with_subcommands = true)]
 pub(super) struct SoakArgs {
+    #[command(subcommand)]
+    command: Option<SoakCommand>,
     /// Virtual hours of all runs together
     #[arg(long, value_name = "HOURS", default_value = "1", value_parser = parse_hours)]
     hours: Duration,
@@ -57,12 +68,25 @@ pub(super) struct SoakArgs {
     /// Number of threads [default: one per processor]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     jobs: Option<u16>,
+    /// Run only this share of the runs, such as 1/3; `soak merge` makes one result of all shares
+    #[arg(long, value_name = "NTH/OF", requires = "json")]
+    shard: Option<Share>,
+    /// Print one JSON document in place of the table
+    #[arg(long)]
+    json: bool,
     /// Repeat one run up to this instant, with the same --cell and --faults
-    #[arg(long, value_name = "SEED@SECONDS", value_parser = parse_replay)]
+    #[arg(long, value_name = "SEED@SECONDS", value_parser = parse_replay, conflicts_with_all = ["shard", "json"])]
     replay: Option<(u64, Duration)>,
     /// With --replay: show the trace of the last two seconds
     #[arg(long, requires = "replay")]
     trace: bool,
+}
+
+#[derive(Debug, Subcommand)]
+enum SoakCommand {
+    /// Make one result of the documents of all shares, as if one machine had run them
+    #[command(after_help = merge::EXAMPLES)]
+    Merge(merge::MergeArgs),
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
@@ -85,8 +109,11 @@ impl From<LevelName> for Level {
     }
 }
 
-/// Runs a batch, or replays one run.
+/// Runs a batch or a share of it, replays one run, or merges shares.
 pub(super) fn run(args: &SoakArgs, out: &mut dyn Write) -> ExitCode {
+    if let Some(SoakCommand::Merge(args)) = &args.command {
+        return merge::run(args, out);
+    }
     let scenarios = match scenarios(&args.cell) {
         Ok(scenarios) => scenarios,
         Err(message) => return wrong(message),
@@ -123,7 +150,13 @@ fn scenarios(cells: &[String]) -> Result<Vec<Scenario>, String> {
 }
 
 fn batch(args: &SoakArgs, scenarios: Vec<Scenario>, out: &mut dyn Write) -> ExitCode {
-    let batch = Arc::new(Batch::new(scenarios, args.faults.into(), args.seed, args.hours));
+    let batch = Batch::new(scenarios, args.faults.into(), args.seed, args.hours);
+    let share = args.shard.unwrap_or_default();
+    if share.of() > batch.runs() {
+        let runs = batch.runs();
+        return wrong(format!("--shard {share}: there are only {runs} runs, so at most {runs} shards"));
+    }
+    let batch = Arc::new(batch.only(share));
     let jobs =
         args.jobs.map_or_else(|| std::thread::available_parallelism().map_or(1, usize::from), usize::from);
     let began = WallInstant::now();
@@ -140,41 +173,37 @@ fn batch(args: &SoakArgs, scenarios: Vec<Scenario>, out: &mut dyn Write) -> Exit
         Ok(interrupt) => interrupt,
         Err(error) => return wrong(error),
     };
-    let workers: Vec<_> = (0..jobs.min(batch.runs()))
+    let workers: Vec<_> = (0..jobs.min(batch.share_runs().len()))
         .map(|_| {
             let batch = Arc::clone(&batch);
             std::thread::spawn(move || batch.work())
         })
         .collect();
-    let interrupted = runtime.block_on(watch(&batch, &workers, interrupt, args.hours, began));
+    let interrupted = runtime.block_on(watch(&batch, &workers, interrupt, began));
     batch.stop();
     for worker in workers {
         // Workers catch the panics of their runs.
         let _ = worker.join();
     }
-    let total = batch.total();
-    let _ = write!(out, "{}", table(&total, args, began.elapsed()));
-    if let Some(failure) = batch.failure() {
-        let at = show_seconds(failure.after);
-        let _ = writeln!(
-            out,
-            "\nFAIL  {}\n      cell {}, seed {}, {at} s after its start; repeat it with\n\
-             \n      host-sim soak{}{} --replay {}@{at} --trace",
-            failure.what,
-            failure.cell,
-            failure.seed,
-            shown_cells(&args.cell),
-            shown_level(args.faults),
-            failure.seed,
-        );
-        return ExitCode::FAILURE;
-    }
-    if interrupted {
-        let _ = writeln!(out, "\ninterrupted: {} of {} runs were finished", total.runs, total.of);
+    let wall = began.elapsed();
+    let interrupted = interrupted.then(|| {
+        let Progress { runs, .. } = batch.progress();
+        format!("interrupted: {runs} of {} runs were finished", batch.share_runs().len())
+    });
+    let failed = batch
+        .failure()
+        .map(|failed| failure(&PartFailure::from(failed), &args.cell, Level::from(args.faults).name()));
+    if args.json {
+        let part = Part::of(&batch, &args.cell, wall.as_micros() as u64);
+        let _ = writeln!(out, "{}", serde_json::to_string(&part).unwrap_or_default());
+        failed.iter().chain(&interrupted).for_each(print_stderr);
     } else {
-        let _ = writeln!(out, "\nPASS  all invariants held");
+        let total = batch.total();
+        let _ = write!(out, "{}", table(&total, args.seed, Level::from(args.faults).name(), wall));
+        let last = failed.as_ref().or(interrupted.as_ref()).map_or(PASS, String::as_str);
+        let _ = writeln!(out, "\n{last}");
     }
-    ExitCode::SUCCESS
+    if failed.is_some() { ExitCode::FAILURE } else { ExitCode::SUCCESS }
 }
 
 /// Shows progress until all workers are done; returns true after SIGINT.
@@ -182,7 +211,6 @@ async fn watch(
     batch: &Batch,
     workers: &[std::thread::JoinHandle<()>],
     mut interrupt: Signal,
-    hours: Duration,
     began: WallInstant,
 ) -> bool {
     let is_terminal = std::io::stderr().is_terminal();
@@ -191,7 +219,7 @@ async fn watch(
         let wait = if is_terminal { REDRAW_EVERY } else { LINE_EVERY };
         if shown.elapsed() >= wait {
             shown = WallInstant::now();
-            let line = progress_line(batch.progress(), hours, began.elapsed());
+            let line = progress_line(batch.progress(), batch.span(), began.elapsed());
             if is_terminal {
                 show(format_args!("\r{line}\x1B[K"));
             } else {
@@ -220,60 +248,6 @@ async fn watch(
 /// Writes progress; errors are ignored, since it is no result.
 fn show(text: impl std::fmt::Display) {
     let _ = write!(std::io::stderr(), "{text}");
-}
-
-fn progress_line(progress: Progress, hours: Duration, wall: WallTime) -> String {
-    format!(
-        "{:.2} of {:.2} virtual hours, {} runs, {:.0} virtual hours a minute",
-        in_hours(progress.elapsed),
-        in_hours(hours),
-        progress.runs,
-        per_minute(progress.elapsed, wall)
-    )
-}
-
-/// The table of results. For one seed, only the two lines about wall time differ.
-fn table(total: &Total, args: &SoakArgs, wall: WallTime) -> String {
-    let mut lines = vec![
-        format!("virtual hours       {:.3}", in_hours(total.span)),
-        format!("wall time           {:.1} s", wall.as_secs_f64()),
-        format!("hours a minute      {:.1}", per_minute(total.span, wall)),
-        format!("runs                {}", total.runs),
-        format!("seed, faults        {}, {}", args.seed, Level::from(args.faults).name()),
-        format!("events              {}", total.events),
-        format!("writes checked      {}", total.writes),
-        String::new(),
-        "cell                 runs   hours".to_owned(),
-    ];
-    for (cell, (runs, span)) in &total.cells {
-        lines.push(format!("  {cell:<18} {runs:>4} {:>7.3}", in_hours(*span)));
-    }
-    lines.push(String::new());
-    lines.push("port                                    frames in  frames out".to_owned());
-    for ((cell, port), (received, sent)) in &total.ports {
-        lines.push(format!("  {:<34} {received:>12} {sent:>11}", format!("{cell}: {port}")));
-    }
-    lines.push(String::new());
-    lines.push("link                                         sent    received".to_owned());
-    for (link, (sent, received)) in &total.links {
-        lines.push(format!("  {link:<34} {sent:>12} {received:>11}"));
-    }
-    lines.push(String::new());
-    lines.push("fault                                       times".to_owned());
-    if total.faults.is_empty() {
-        lines.push("  none".to_owned());
-    }
-    for (kind, times) in &total.faults {
-        lines.push(format!("  {:<34} {times:>12}", kind.name()));
-    }
-    lines.push(String::new());
-    lines.push("invariant                                  checks".to_owned());
-    for (invariant, checks) in &total.checks {
-        lines.push(format!("  {:<34} {checks:>12}", invariant.name()));
-    }
-    lines.push(String::new());
-    lines.push(format!("trace hash          {:016x}\n", total.hash));
-    lines.join("\n")
 }
 
 fn replay(args: &SoakArgs, scenarios: &[Scenario], seed: u64, at: Duration, out: &mut dyn Write) -> ExitCode {
@@ -305,29 +279,6 @@ fn replay(args: &SoakArgs, scenarios: &[Scenario], seed: u64, at: Duration, out:
     }
 }
 
-fn in_hours(span: Duration) -> f64 {
-    span.as_micros() as f64 / 3.6e9
-}
-
-fn per_minute(span: Duration, wall: WallTime) -> f64 {
-    in_hours(span) * 60.0 / wall.as_secs_f64().max(1e-3)
-}
-
-fn show_seconds(span: Duration) -> String {
-    format!("{}.{:06}", span.as_micros() / 1_000_000, span.as_micros() % 1_000_000)
-}
-
-fn shown_cells(cells: &[String]) -> String {
-    cells.iter().map(|cell| format!(" --cell {cell}")).collect()
-}
-
-fn shown_level(level: LevelName) -> String {
-    match level {
-        LevelName::Harsh => String::new(),
-        other => format!(" --faults {}", Level::from(other).name()),
-    }
-}
-
 fn parse_hours(text: &str) -> Result<Duration, String> {
     let refused =
         || format!("{text:?} is not a number of hours above 0 and at most 100000, such as 24 or 0.5");
@@ -353,6 +304,8 @@ fn parse_replay(text: &str) -> Result<(u64, Duration), String> {
     Ok((seed.parse().map_err(|_| refused())?, Duration::from_micros(seconds * 1_000_000 + micros)))
 }
 
+/// The last line of a run without a violation.
+const PASS: &str = "PASS  all invariants held";
 /// Time before the end of a replay that the trace shows.
 const SHOWN: Duration = Duration::from_secs(2);
 const MAX_ENTRIES: usize = 100_000;

@@ -21,6 +21,9 @@ pub(super) struct Picks {
     /// Absent for values that pick nothing.
     #[serde(skip_serializing_if = "Option::is_none")]
     command: Option<String>,
+    /// `keep`, if the field keeps its base over a silence.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    base: Option<&'static str>,
 }
 
 /// What becomes of a port's inputs without frames, and of its outputs without a source.
@@ -64,13 +67,14 @@ fn picks_of(frame: &NamedFrame) -> impl Iterator<Item = Picks> {
             first: *first,
             last: *last,
             command: (!command.is_empty()).then(|| command.clone()),
+            base: (commands.when == CommandWhen::Kept).then_some("keep"),
         })
     })
 }
 
 /// A line for each command.
 pub(super) fn show_commands(commands: &[Picks]) -> String {
-    let row = |Picks { field, when, first, last, command }: &Picks| {
+    let row = |Picks { field, when, first, last, command, .. }: &Picks| {
         let values = if first == last { first.to_string() } else { format!("{first}..{last}") };
         let command = command.as_deref().unwrap_or("none, idle");
         [field.clone(), format!("{when} {values}"), command.to_owned()]
@@ -83,13 +87,22 @@ pub(super) fn show_commands(commands: &[Picks]) -> String {
     let line =
         |[name, value, command]: &[String; 3]| format!("    {name:names$}  {value:values$}  {command}\n");
     let lines: String = rows.iter().map(line).collect();
-    if lines.is_empty() { lines } else { format!("  commands\n{lines}") }
+    let mut kept: Vec<_> =
+        commands.iter().filter(|one| one.base.is_some()).map(|one| &one.field[..]).collect();
+    kept.dedup();
+    let kept = match &kept[..] {
+        [] => String::new(),
+        names => format!(
+            "    over a silence, the last value of {} counts on; after the start, the first one picks nothing\n",
+            names.join(", ")
+        ),
+    };
+    if lines.is_empty() { lines } else { format!("  commands\n{lines}{kept}") }
 }
 
 fn verb(commands: &FieldCommands) -> &'static str {
     match commands.when {
-        CommandWhen::Change => "becomes",
-        CommandWhen::Kept => "becomes, even over a silence,",
+        CommandWhen::Change | CommandWhen::Kept => "becomes",
         CommandWhen::Frame => "is",
     }
 }
@@ -249,7 +262,13 @@ mod tests {
              order  becomes 255     none, idle\n  timeout  100 ms without a frame: WordInputReg[1] = 7\n"
         );
         let kept = shown(&format!("{values}, base = \"keep\""), "");
-        assert!(kept.contains("order  becomes, even over a silence, 200     stop\n"), "{kept}");
+        assert!(
+            kept.contains(
+                "order  becomes 200     stop\n    over a silence, the last value of order counts on; after the \
+                 start, the first one picks nothing\n"
+            ),
+            "{kept}"
+        );
         let level = shown("bits = 3, commands = { level = \"stop\" }", "timeout_ms = 250");
         assert_eq!(
             level,

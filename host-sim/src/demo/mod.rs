@@ -7,6 +7,7 @@ mod cell;
 mod device;
 mod examples;
 mod folder;
+mod living;
 mod show;
 
 use std::io;
@@ -14,6 +15,7 @@ use std::process::ExitCode;
 use std::time::Instant;
 
 use folder::Folder;
+pub use living::run_living;
 use recipe_shell::Signals;
 use recipe_shell::out::print_stderr;
 use show::Show;

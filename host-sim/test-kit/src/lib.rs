@@ -4,7 +4,9 @@
 //! on cells or on the shell, so that every crate can use them.
 
 pub mod can;
+pub mod chip;
 mod host_sim;
+pub mod http;
 mod process;
 pub mod toml;
 

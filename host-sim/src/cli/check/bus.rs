@@ -268,7 +268,11 @@ pub(super) fn show(loads: &[Load]) -> String {
             report += &format!("    not counted: {what}\n");
         }
     }
-    if report.is_empty() { report } else { format!("\nCAN buses, with each input once a cycle\n{report}") }
+    if report.is_empty() {
+        report
+    } else {
+        format!("\nCAN buses, if devices send each input once in the port's cycle_ms\n{report}")
+    }
 }
 
 #[cfg(test)]

@@ -1,13 +1,14 @@
 //! From a checked file to the report on it.
 
 use proto_core::config::{Bus, GatewayConfig, PartBudget, Port, Talk, Warning, can_frame_time};
+use proto_core::device::{Boundary, Carrier};
 use proto_core::recipe::model::{Field, Mode};
 use proto_core::sysvar::{Direction, SysVar};
 use proto_core::time::Duration;
 use proto_core::wire::can::CanId;
 use recipe_config::{
-    AnyRecipe, DeviceRecipe, Function, Functions, ShownState, SimBus, SimConfig, SimField, SimParts, SimPort,
-    SimRecipe,
+    AnyRecipe, DeviceRecipe, FrameEnds, Function, Functions, ShownState, SimBus, SimConfig, SimField,
+    SimParts, SimPort, SimRecipe,
 };
 
 use super::super::values::Times;
@@ -74,6 +75,8 @@ fn gateway_port(
     let parts = [Direction::Input, Direction::Output].into_iter().filter_map(|part| {
         let mut shown = Part::new(part, config.view().budget(port, part)?, port.cycle);
         shown.picture = frames.map(|recipe| frame::picture(recipe, part));
+        shown.least_bytes =
+            frames.and_then(|recipe| shortest(recipe, part)).filter(|least| *least < shown.bytes);
         Some(shown)
     });
     report::Port {
@@ -92,6 +95,19 @@ fn gateway_port(
     }
 }
 
+/// The bytes of the shortest frame on the line, with what escapes need at least.
+fn shortest(recipe: &DeviceRecipe, part: Direction) -> Option<usize> {
+    let FrameEnds { boundary, escape } = recipe.ends(part);
+    let carrier = match (recipe.carrier, boundary, escape) {
+        (Carrier::Stream, Boundary::Fields, None) => Carrier::Stream,
+        (Carrier::Can, ..) => return None,
+        _ => Carrier::Whole,
+    };
+    // Cannot fail: reading the file laid out the same frames.
+    let (shortest, _) = recipe.part(part).first()?.lay_out(carrier, part).ok()?.layout.lengths();
+    Some(shortest + escape.map_or(0, |escape| escape.longest(0)))
+}
+
 /// What is valid but may not do what was intended, with its place.
 pub(super) fn warnings(config: &GatewayConfig) -> Vec<Placed> {
     let view = config.view();
@@ -106,9 +122,9 @@ pub(super) fn warnings(config: &GatewayConfig) -> Vec<Placed> {
     let place = |warning: Warning| match warning {
         Warning::DoesNotFit { port: nth, .. } => port(nth, "cycle_ms"),
         Warning::LineFull { port: nth, .. } => port(nth, "recipe"),
-        Warning::AskedRarely { port: nth, .. } | Warning::ForgetsBase { port: nth, .. } => {
-            port(nth, "timeout_ms")
-        }
+        Warning::AskedRarely { port: nth, .. }
+        | Warning::ForgetsBase { port: nth, .. }
+        | Warning::ShortTimeout { port: nth, .. } => port(nth, "timeout_ms"),
         Warning::ManualAddress { recipe: nth, exchange, .. } => {
             let of = config.recipes.get(usize::from(nth)).map(|recipe| view.exchanges_of(recipe));
             let exchanged = of.and_then(|of| of.get(usize::from(exchange)));
@@ -119,6 +135,10 @@ pub(super) fn warnings(config: &GatewayConfig) -> Vec<Placed> {
             };
             let number = (u16::from(exchange) + 1).to_string();
             [recipe(nth), [list, &number, "address"].map(str::to_owned).to_vec()].concat()
+        }
+        Warning::NeverLookedFor { recipe: nth, exchange, .. } => {
+            let number = (u16::from(exchange) + 1).to_string();
+            [recipe(nth), ["exchange", &number].map(str::to_owned).to_vec()].concat()
         }
         Warning::StopOnEdge { recipe: nth, .. }
         | Warning::ReadBack { recipe: nth, .. }

@@ -109,10 +109,14 @@ pub(super) struct Part {
     /// `input` or `output`.
     pub(super) part: &'static str,
     pub(super) frames: usize,
+    /// Of the longest frame, with its head, tail and all escape bytes that it may need.
     pub(super) bytes: usize,
-    /// On the line; 0 where there is none.
+    /// Of the shortest, if the length of its frames varies.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) least_bytes: Option<usize>,
+    /// On the line, of the longest; 0 where there is none.
     pub(super) time_us: u64,
-    /// How often an input part can come at most.
+    /// How often an input part can come at most, the longest frame if its length varies.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) most_per_second: Option<u64>,
     /// What an output part takes of its cycle.
@@ -259,6 +263,7 @@ impl Part {
             part: name_of(part),
             frames: budget.frames,
             bytes: budget.bytes,
+            least_bytes: None,
             time_us: micros,
             most_per_second: (is_input && micros > 0).then(|| 1_000_000 / micros),
             cycle_percent: (!is_input && micros > 0).then(|| micros * 100 / cycle.as_micros().max(1)),
@@ -271,15 +276,18 @@ impl Part {
     /// One line: size and time of a part, how often it can be sent, and its share of the cycle; then its bytes.
     fn show(&self) -> String {
         let frames = if self.frames == 1 { String::new() } else { format!(" in {} frames", self.frames) };
-        let size = format!("{} byte{}{frames}", self.bytes, if self.bytes == 1 { "" } else { "s" });
+        let least = self.least_bytes.map_or_else(String::new, |least| format!("{least} to "));
+        let size = format!("{least}{} byte{}{frames}", self.bytes, if self.bytes == 1 { "" } else { "s" });
+        let (longest, such) = if least.is_empty() { ("", "") } else { (" the longest", " of these") };
         let rest = match (self.most_per_second, self.cycle_percent) {
-            (Some(most), _) => format!("at most {most} a second"),
+            (Some(most), _) => format!("at most {most}{such} a second"),
             (_, Some(percent)) => format!("{percent} % of a cycle of {}", self.cycle),
             _ => String::new(),
         };
         let mut report = format!("  {:6}  {size}", self.part);
         if self.time_us > 0 {
-            report += &format!(", {}.{:03} ms on the line, {rest}", self.time_us / 1000, self.time_us % 1000);
+            let (millis, micros) = (self.time_us / 1000, self.time_us % 1000);
+            report += &format!(",{longest} {millis}.{micros:03} ms on the line, {rest}");
         }
         report.push('\n');
         report += &self.picture.as_ref().map_or_else(String::new, Picture::show);

@@ -12,7 +12,7 @@ use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::Scalar;
 use recipe_config::{DeviceRecipe, ExchangeKind, FrameEnds, NamedExchange, NamedFrame};
 
-use super::super::text;
+use super::super::{scale, text};
 use super::{note, write_line};
 
 /// What keeps the bytes of a frame that its values do not tell.
@@ -53,6 +53,8 @@ struct Told {
 struct Value {
     name: String,
     kind: ValueKind,
+    /// What a gateway does with it, each use of its bytes.
+    specs: Vec<FieldSpec>,
     /// Its elements: more than one if the bytes are used more than once.
     elements: Vec<usize>,
     /// What is sent if nothing else is asked for.
@@ -78,6 +80,8 @@ enum Given {
 struct Seen {
     shown: String,
     is_finite: bool,
+    /// Of a number that the frame has.
+    value: Option<Scalar>,
 }
 
 impl DevicePart {
@@ -277,11 +281,18 @@ impl DevicePart {
     /// Says if a gateway rejects a frame for its values.
     fn note_values(&self, format: &Format, frame: &[u8], line: usize, notes: &mut dyn std::io::Write) {
         let Ok(values) = format.values(frame) else { return };
-        let is_wrong = |(_, seen): &(&Value, Seen)| !seen.is_finite;
-        if let Some((value, _)) = format.values.iter().zip(values).find(is_wrong)
-            && self.direction == Direction::Input
-        {
-            note(notes, &format!("line {line}: a receiver rejects this frame: {} is not finite", value.name));
+        if self.direction != Direction::Input {
+            return;
+        }
+        let why = |(value, seen): (&Value, Seen)| {
+            let refused = |spec| scale::refused(spec, &value.name, seen.value?);
+            match seen.is_finite {
+                false => Some(("receiver", format!("{} is not finite", value.name))),
+                true => value.specs.iter().find_map(refused).map(|why| ("gateway", why)),
+            }
+        };
+        if let Some((who, why)) = format.values.iter().zip(values).find_map(why) {
+            note(notes, &format!("line {line}: a {who} rejects this frame: {why}"));
         }
     }
 }
@@ -304,11 +315,15 @@ fn values_of(named: &NamedFrame, is_multiplexed: bool) -> Vec<Value> {
             (None, _) => continue,
         };
         match values.last_mut() {
-            Some(before) if field.repeats => before.elements.push(nth),
+            Some(before) if field.repeats => {
+                before.elements.push(nth);
+                before.specs.push(field.spec);
+            }
             _ => {
                 let is_fixed = is_multiplexed && constant.is_some();
                 let name = field.name.clone();
-                values.push(Value { name, kind, elements: vec![nth], constant, is_fixed });
+                let specs = vec![field.spec];
+                values.push(Value { name, kind, specs, elements: vec![nth], constant, is_fixed });
             }
         }
     }
@@ -376,17 +391,20 @@ impl Format {
                 (ValueKind::Text, _) => {
                     let text = layout.text(elements, frame, nth);
                     let text = text.ok_or_else(|| format!("{}: no text", value.name))?;
-                    Ok(Seen { shown: text::show_text(text), is_finite: true })
+                    Ok(Seen { shown: text::show_text(text), is_finite: true, value: None })
                 }
-                (ValueKind::Number(_), Some(Ok(Some(scalar)))) => {
-                    Ok(Seen { shown: text::show_scalar(*scalar).to_string(), is_finite: scalar.is_finite() })
-                }
+                (ValueKind::Number(_), Some(Ok(Some(scalar)))) => Ok(Seen {
+                    shown: text::show_scalar(*scalar).to_string(),
+                    is_finite: scalar.is_finite(),
+                    value: Some(*scalar),
+                }),
                 // The probe has compared it.
                 (_, Some(Ok(None))) if value.is_fixed => {
                     let constant = value.constant.unwrap_or(f64::NAN);
                     Ok(Seen {
                         shown: text::show_scalar(Scalar::Double(constant)).to_string(),
                         is_finite: true,
+                        value: None,
                     })
                 }
                 (_, Some(Err(error))) => Err(format!("{}: {error}", value.name)),

@@ -187,7 +187,11 @@ fn the_scales_text_is_a_number() {
     // Blanks are not what a gateway would write, so the bytes are kept.
     assert_eq!(lines[0], format!("weight=12.34 raw={}", line("ST,GS,+  12.34kg\r\n").replace(' ', "")));
     assert_eq!(lines[1], "weight=-12.34");
-    assert_eq!(notes, "18 bytes skipped outside of frames\n");
+    assert_eq!(
+        notes,
+        "line 1: a gateway rejects this frame: weight is -12.34; WordInputReg[1] takes 0..=655.35\n\
+         18 bytes skipped outside of frames\n"
+    );
     assert_eq!(from_values(&part, None, &["-12.34"]).unwrap(), line("ST,GS,-0012.34kg\r\n"));
     assert_eq!(from_values(&part, None, &["12.345"]).unwrap_err(), "weight: 12.345 has more than 2 decimals");
     let broken = format!("{} {}", line("ST,GS,12x34.00kg\r\n"), line("ST,GS,00012.34kg\r\n"));

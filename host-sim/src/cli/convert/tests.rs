@@ -217,3 +217,36 @@ proptest! {
         prop_assert_eq!(encoded(&stream, &decoded(&stream, &frame).0).unwrap(), frame);
     }
 }
+
+const FORCES: &str = r#"
+[controller]
+address = "127.0.0.1"
+[[recipe]]
+name = "force"
+kind = "stream"
+mode = "user"
+[recipe.input]
+head = [0x48, 0xAA]
+tail = [0x0D, 0x0A]
+fields = [
+  { name = "Fx", type = "float", to = "WordInputReg[1]", scale = 100, offset = 32768 },
+  { name = "Fy", type = "float", to = "WordInputReg[2]" },
+]
+"#;
+
+#[test]
+fn a_value_that_a_gateway_rejects_is_named() {
+    let why = "line 1: a gateway rejects this frame: Fx is 400; WordInputReg[1] takes -327.68..=327.67\n";
+    // As a recipe of the controller's own kind, and as the frame of a device.
+    let constant = "{ name = \"id\", type = \"byte\", equals = 9 },";
+    for (more, byte) in [("", ""), (constant, "09 ")] {
+        let toml = FORCES.replacen("  { name = \"Fy\"", &format!("{more}\n  {{ name = \"Fy\""), 1);
+        let text = Text { name: "test.toml", toml: &toml };
+        let mut part = part(&toml, Direction::Input);
+        part.bind(&recipe_config::file::parse_frames(text, &[]).unwrap());
+        let (values, notes) = decoded(&part, &format!("48 AA 00 00 C8 43 {byte}00 00 80 3F 0D 0A"));
+        assert_eq!(notes, why, "{values}");
+        let (_, notes) = decoded(&part, &format!("48 AA 00 00 80 3F {byte}00 00 80 3F 0D 0A"));
+        assert_eq!(notes, "");
+    }
+}

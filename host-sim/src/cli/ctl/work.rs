@@ -1,0 +1,291 @@
+//! What each command does: once its files are read, at one gateway or at many.
+
+use std::io::Write;
+use std::path::Path;
+
+use recipe_ctl::{
+    Answer, Client, Configuration, Failure, Firmware, Member, Names, Rollout, Stop, Trial, Update, Verdict,
+    Watched, WithoutTrial, key_file, signing_key, update,
+};
+use recipe_shell::out::print_stderr;
+
+use super::Run;
+use super::act::Act;
+use super::updating::Updating;
+use crate::cli::output::Written;
+
+/// What a gateway answers.
+type Ask<'a> = Box<dyn Fn(&Client, Run) -> Result<Answer, Failure> + Sync + 'a>;
+/// What prints by itself.
+type Follow<'a> = Box<dyn Fn(&Client, Run, &mut dyn Write) -> Result<Verdict, Failure> + 'a>;
+
+/// What goes through an inventory by rules of its own.
+type Through<'a> = Box<dyn Fn(&[Member], &Stop, Run, &mut dyn Write) -> Result<Verdict, Failure> + 'a>;
+
+/// What is done here, once.
+type Alone<'a> = Box<dyn FnOnce(Run, &mut dyn Write) -> Result<Verdict, Failure> + 'a>;
+
+/// A command whose files have been read.
+pub(super) enum Work<'a> {
+    /// It needs no gateway.
+    Alone(Alone<'a>),
+    /// Each gateway has an answer.
+    Ask(Ask<'a>, Many),
+    /// It is for one gateway.
+    Follow(Follow<'a>),
+    /// It is for an inventory, also of one gateway.
+    Through(Through<'a>),
+}
+
+/// How the answers of many gateways are shown.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Many {
+    /// A table with a row for each.
+    Rows,
+    /// One below the other.
+    Sections,
+}
+
+impl Act {
+    /// Reads the files of the command, which is for an inventory or for one gateway.
+    pub(super) fn prepare(&self, is_for_inventory: bool) -> Result<Work<'_>, Failure> {
+        Ok(match self {
+            Self::Info => rows(|client, _| recipe_ctl::info(client)),
+            Self::Status { watch: false } => rows(|client, run| recipe_ctl::status(client, run.view)),
+            Self::Status { watch: true } => {
+                Work::Follow(Box::new(|client, run, out| watch(client, &Watched::Status, run, out)))
+            }
+            Self::Values { watch: false, filter } => {
+                sections(move |client, run| recipe_ctl::values(client, filter, run.view))
+            }
+            Self::Values { watch: true, filter } => {
+                let watched = Watched::Values(filter.clone());
+                Work::Follow(Box::new(move |client, run, out| watch(client, &watched, run, out)))
+            }
+            Self::Trace { port, file } => {
+                let names = file.as_deref().map(Names::read).transpose()?;
+                Work::Follow(Box::new(move |client, run, out| {
+                    recipe_ctl::trace(client, port.as_deref(), names.as_ref(), run.json, out)?;
+                    Ok(Verdict::Well)
+                }))
+            }
+            Self::Capture { file, port, time } => Work::Follow(Box::new(move |client, run, out| {
+                run.print(&recipe_ctl::capture(client, file, port.as_deref(), *time)?, out)
+            })),
+            Self::Doctor { time } => rows(move |client, _| recipe_ctl::doctor(client, *time)),
+            Self::Metrics => sections(|client, _| recipe_ctl::metrics(client)),
+            Self::Log { lines } => sections(move |client, _| recipe_ctl::log(client, *lines)),
+            Self::Config { revision, output: None, .. } => {
+                sections(move |client, _| recipe_ctl::config(client, *revision))
+            }
+            Self::Config { revision, output: Some(path), force } => {
+                Work::Follow(Box::new(move |client, _, out| {
+                    let stored = recipe_ctl::stored(client, *revision)?;
+                    write(path, stored.bytes(), *force)?;
+                    writeln!(out, "{}: {} bytes", path.display(), stored.bytes().len())?;
+                    Ok(Verdict::Well)
+                }))
+            }
+            Self::Bundle { file, force } => Work::Follow(Box::new(move |client, run, out| {
+                let document = recipe_ctl::bundle(client)?;
+                let text = format!("{document:#}\n");
+                write(file, text.as_bytes(), *force)?;
+                run.print(&recipe_ctl::bundled(&document, &file.display().to_string(), text.len()), out)
+            })),
+            Self::Revisions => rows(|client, _| recipe_ctl::revisions(client)),
+            Self::Push { file, apply, confirm_s, set, board, .. } => {
+                let trial = apply.then_some(Trial { confirm_s: *confirm_s, revision: None });
+                let configuration = Configuration::read(file, set, *board)?;
+                rows(move |client, _| recipe_ctl::push(client, &configuration, trial))
+            }
+            Self::Apply { revision, confirm_s, .. } => {
+                let trial = Trial { confirm_s: *confirm_s, revision: *revision };
+                rows(move |client, _| recipe_ctl::apply(client, trial))
+            }
+            Self::Confirm { .. } => rows(|client, _| recipe_ctl::confirm(client)),
+            Self::Rollback { previous } => {
+                let without = if *previous { WithoutTrial::Previous } else { WithoutTrial::Refuse };
+                rows(move |client, _| recipe_ctl::rollback(client, without))
+            }
+            Self::Update { file: None, back: true, .. } => Work::Follow(Box::new(move |client, run, out| {
+                run.print(&update::taken_back(client, &mut |line| print_stderr(line))?, out)
+            })),
+            Self::Update { file: None, confirm: true, .. } => rows(|client, _| update::confirmed(client)),
+            Self::Update { file: None, .. } => rows(|client, _| update::shown(client)),
+            Self::Update {
+                file: Some(file),
+                try_it: false,
+                confirm: false,
+                confirm_s,
+                downgrade,
+                report,
+                many,
+                ..
+            } if is_for_inventory => {
+                let updating = Updating {
+                    update: Update::read(file)?,
+                    trial_s: confirm_s.unwrap_or(TRIAL_S),
+                    downgrade: allowed(*downgrade),
+                    rollout: many.rollout(),
+                    report: report.as_deref(),
+                };
+                Work::Through(Box::new(move |members, stop, run, out| {
+                    updating.roll_out(members, stop, run, out)
+                }))
+            }
+            Self::Update {
+                file: Some(file), try_it, confirm_s, confirm, downgrade, report, many, ..
+            } => {
+                if !*try_it && (*confirm || confirm_s.is_some()) {
+                    return Err(Failure::wrong(
+                        "--confirm and --confirm-s with a file need --try: what was never tried is not kept",
+                    ));
+                }
+                if many.is_said() || report.is_some() {
+                    return Err(Failure::wrong(
+                        "--batch, --stop-on-failure and --report are for --inventory FILE without --try, where every \
+                         board is tried and confirmed",
+                    ));
+                }
+                let file = Update::read(file)?;
+                let trial_s = try_it.then_some(confirm_s.unwrap_or(TRIAL_S));
+                let plan = update::Plan { trial_s, confirm: *confirm, downgrade: allowed(*downgrade) };
+                Work::Follow(Box::new(move |client, run, out| {
+                    run.print(&update::update(client, &file, plan, &mut |line| print_stderr(line))?, out)
+                }))
+            }
+            Self::Identify { seconds } => rows(move |client, _| recipe_ctl::identify(client, *seconds)),
+            Self::Claim { file } => Work::Follow(Box::new(move |client, run, out| {
+                run.print(&recipe_ctl::claim(client, file, &mut |line| print_stderr(line))?, out)
+            })),
+            Self::Keygen { file, signing: false } => Work::Alone(Box::new(move |_, out| {
+                key_file::make(file)?;
+                writeln!(out, "{}: a new key, for its owner alone", file.display())?;
+                Ok(Verdict::Well)
+            })),
+            Self::Keygen { file, signing: true } => Work::Alone(Box::new(move |_, out| {
+                let (public, public_file) = signing_key::make(file)?;
+                writeln!(out, "{}: a new key to sign with, for its owner alone", file.display())?;
+                writeln!(out, "{}: its public key, for loaders: {public}", public_file.display())?;
+                Ok(Verdict::Well)
+            })),
+            Self::Sign { signing_key, board, version, slot_a, slot_b, reads, writes, output, force } => {
+                let firmware = Firmware {
+                    key: signing_key.clone(),
+                    board: board.clone(),
+                    version: version.clone(),
+                    slot_a: slot_a.clone(),
+                    slot_b: slot_b.clone(),
+                    reads: *reads,
+                    writes: *writes,
+                };
+                Work::Alone(Box::new(move |_, out| {
+                    let bytes = recipe_ctl::sign(&firmware)?;
+                    write(output, &bytes, *force)?;
+                    let public = recipe_ctl::public_of(signing_key)?;
+                    writeln!(out, "{}: {}", output.display(), Update::of(bytes)?.summary(&public))?;
+                    Ok(Verdict::Well)
+                }))
+            }
+            Self::Inspect { file, public_key, slot: None, .. } => Work::Alone(Box::new(move |run, out| {
+                run.print(&Update::read(file)?.inspect(public_key.as_deref(), run.view)?, out)
+            })),
+            Self::Inspect { file, public_key, slot: Some(slot), output, force } => {
+                Work::Alone(Box::new(move |run, out| {
+                    let update = Update::read(file)?;
+                    let answer = update.inspect(public_key.as_deref(), run.view)?;
+                    if answer.verdict() != Verdict::Well {
+                        return run.print(&answer, out);
+                    }
+                    let (address, bytes) = update.flat(*slot)?;
+                    if let Some(output) = output {
+                        write(output, &bytes, *force)?;
+                        writeln!(
+                            out,
+                            "{}: {} bytes for address {address:08X}",
+                            output.display(),
+                            bytes.len()
+                        )?;
+                    }
+                    Ok(Verdict::Well)
+                }))
+            }
+        })
+    }
+}
+
+fn allowed(downgrade: bool) -> update::Downgrade {
+    match downgrade {
+        true => update::Downgrade::Allowed,
+        false => update::Downgrade::Refused,
+    }
+}
+
+fn rows<'a>(ask: impl Fn(&Client, Run) -> Result<Answer, Failure> + Sync + 'a) -> Work<'a> {
+    Work::Ask(Box::new(ask), Many::Rows)
+}
+
+fn sections<'a>(ask: impl Fn(&Client, Run) -> Result<Answer, Failure> + Sync + 'a) -> Work<'a> {
+    Work::Ask(Box::new(ask), Many::Sections)
+}
+
+fn watch(client: &Client, what: &Watched, run: Run, out: &mut dyn Write) -> Result<Verdict, Failure> {
+    if !run.json {
+        recipe_ctl::clear(run.view, out)?;
+    }
+    recipe_ctl::watch(client, what, run.json, run.view, out)?;
+    Ok(Verdict::Well)
+}
+
+pub(super) fn write(path: &Path, bytes: &[u8], force: bool) -> Result<(), Failure> {
+    let written = Written { bytes, name: "it", made_from: None };
+    written
+        .put(path, || Ok(force), "")
+        .map_err(|error| Failure::wrong(format!("{}: {error}", path.display())))
+}
+
+impl Run {
+    fn print(self, answer: &Answer, out: &mut dyn Write) -> Result<Verdict, Failure> {
+        let text = if self.json { answer.json() } else { answer.text(self.view) };
+        out.write_all(text.as_bytes())?;
+        Ok(answer.verdict())
+    }
+}
+
+/// Asks one gateway.
+pub(super) fn at_one(
+    work: Work<'_>,
+    client: &Client,
+    run: Run,
+    out: &mut dyn Write,
+) -> Result<Verdict, Failure> {
+    match work {
+        Work::Alone(alone) => alone(run, out),
+        Work::Ask(ask, _) => run.print(&ask(client, run)?, out),
+        Work::Follow(follow) => follow(client, run, out),
+        Work::Through(_) => Err(Failure::wrong("this command is for an inventory")),
+    }
+}
+
+/// Asks many gateways.
+pub(super) fn at_many(
+    (ask, many): (&Ask<'_>, Many),
+    members: &[Member],
+    rollout: Option<Rollout>,
+    stop: &Stop,
+    run: Run,
+    out: &mut dyn Write,
+) -> Result<Verdict, Failure> {
+    let outcomes = recipe_ctl::ask(members, rollout, run.timeout, stop, &|client| ask(client, run));
+    let text = match many {
+        _ if run.json => outcomes.json(),
+        Many::Rows => outcomes.table(run.view),
+        Many::Sections => outcomes.sections(run.view),
+    };
+    out.write_all(text.as_bytes())?;
+    out.flush()?;
+    outcomes.verdict()
+}
+
+/// How long a firmware is on trial, in seconds, unless something else is said.
+const TRIAL_S: u32 = 300;
