@@ -142,7 +142,7 @@ fn files() -> Vec<(String, String)> {
             let path = entry.unwrap().path();
             let name = path.file_name().unwrap().to_string_lossy().into_owned();
             if path.is_dir() {
-                if !["target", ".git", "run", "__pycache__"].contains(&name.as_str()) {
+                if !["target", ".git", "run", "__pycache__", "node_modules"].contains(&name.as_str()) {
                     folders.push(path);
                 }
             } else if ["rs", "md", "toml", "py", "sh"].iter().any(|end| name.ends_with(&format!(".{end}"))) {

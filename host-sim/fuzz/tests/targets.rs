@@ -1,9 +1,23 @@
-//! The fuzz target with its corpus and a fixed number of random inputs (docs/fuzzing.md).
+//! Every fuzz target with its corpus and a fixed number of random inputs (docs/fuzzing.md).
 
 use std::path::Path;
 
-#[test]
-fn toml() {
-    let corpus = Path::new(env!("CARGO_MANIFEST_DIR")).join("corpus");
-    host_sim_fuzz::target("toml").check(&corpus);
+macro_rules! targets {
+    ($($name:ident)*) => {
+        $(
+            #[test]
+            fn $name() {
+                let corpus = Path::new(env!("CARGO_MANIFEST_DIR")).join("corpus");
+                host_sim_fuzz::target(stringify!($name)).check(&corpus);
+            }
+        )*
+
+        #[test]
+        fn none_is_forgotten() {
+            let names: Vec<_> = host_sim_fuzz::TARGETS.iter().map(|target| target.name).collect();
+            assert_eq!(names, [$(stringify!($name)),*]);
+        }
+    };
 }
+
+targets! { toml inventory sparkplug operations timeline recording }

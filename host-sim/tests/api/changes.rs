@@ -1,5 +1,7 @@
 //! Another configuration: stored, tried, confirmed, taken back, and there after a restart.
 
+use std::io::Write;
+
 use recipe_test_kit::until;
 use serde_json::json;
 
@@ -80,11 +82,57 @@ fn what_cannot_run_is_refused_with_its_place_and_what_does_not_start_is_taken_ba
     put(cell.console, &cell.base(), &other).must_be(201);
     let failed = post(cell.console, "apply", "").must_be(409).json();
     assert!(
-        failed["error"].as_str().unwrap().contains("revision 2 does not start: --bind device="),
+        failed["error"]
+            .as_str()
+            .unwrap()
+            .contains("revision 2 does not start: port other needs exactly one device"),
         "{failed}"
     );
     assert_eq!((&failed["running"], &failed["last"]["ended"]), (&json!(1), &json!("failed")));
     assert_eq!(get(cell.console, "config").body, config(500));
+}
+
+#[test]
+fn what_does_not_start_is_found_before_anything_is_stopped() {
+    let mut cell = Cell::new();
+    // Another name than the option below knows.
+    let other = config(400).replace("name = \"device\"", "name = \"other\"");
+    put(cell.console, &cell.base(), &other).must_be(201);
+    cell.restart_with(&["--set", "port.device.timeout_ms=450"]);
+    let mut panel = cell.panel();
+    cell.switch(&mut panel, 5);
+    let place = get(cell.console, "info").json()["places"]["ports"]["device"].clone();
+    let failed = post(cell.console, "apply", r#"{"revision": 2}"#).must_be(409).json();
+    assert!(
+        failed["error"].as_str().unwrap().contains("revision 2 does not start: revision 2: "),
+        "{failed}"
+    );
+    assert_eq!((&failed["running"], &failed["last"]["ended"]), (&json!(1), &json!("failed")));
+    // The panel is still connected, and its outputs are what they were.
+    assert_eq!(get(cell.console, "info").json()["places"]["ports"]["device"], place);
+    cell.outputs_are(5);
+    panel.write_all(&frame(6)).unwrap();
+    cell.outputs_are(6);
+}
+
+#[test]
+fn a_device_may_be_bound_before_its_port_is_there() {
+    let mut cell = Cell::new();
+    cell.restart_with(&["--bind=later=tcp-listen:127.0.0.1:0"]);
+    let ports = |cell: &Cell| get(cell.console, "info").must_be(200).json()["places"]["ports"].clone();
+    assert!(ports(&cell).get("later").is_none());
+    assert!(get(cell.console, "log").must_be(200).body.contains("--bind is not used"));
+    let more = config(500)
+        + "[[recipe]]\nname = \"lamp\"\nkind = \"stream\"\nmode = \"user\"\n[recipe.output]\nhead = [1]\n\
+           fields = [{ name = \"lamp\", type = \"byte\", value = 1 }]\n\
+           [[port]]\nname = \"later\"\nbus = \"rs485\"\nrecipe = \"lamp\"\n";
+    put(cell.console, &cell.base(), &more).must_be(201);
+    post(cell.console, "apply", "").must_be(200);
+    let place = ports(&cell)["later"].as_str().unwrap().parse::<std::net::SocketAddr>().unwrap();
+    let mut device = std::net::TcpStream::connect(place).unwrap();
+    let mut frame = [0; 2];
+    std::io::Read::read_exact(&mut device, &mut frame).unwrap();
+    assert_eq!(frame, [1, 1]);
 }
 
 #[test]

@@ -2,11 +2,12 @@
 //! answer as its schema says.
 
 use recipe_remote::request::Method;
-use recipe_remote::route::{Access, BodyType, Operation, ROUTES};
+use recipe_remote::route::{Access, BodyType, ROUTES, Route, Served};
 use recipe_test_kit::repository;
 use serde_json::{Value, json};
 
 use crate::kit::*;
+use crate::live::{frames_of, send_frame};
 
 fn description() -> Value {
     let text = std::fs::read_to_string(repository().join("docs/api/openapi.json")).unwrap();
@@ -63,6 +64,12 @@ fn check(root: &Value, schema: &Value, value: &Value, place: &str) -> Result<(),
     Ok(())
 }
 
+/// What a host serves; the board's own are in docs/api.md section 8.
+fn routes() -> impl Iterator<Item = &'static Route> {
+    let is_of_host = |route: &&Route| route.served.iter().any(|served| *served != Served::Board);
+    ROUTES.iter().filter(is_of_host)
+}
+
 fn method_of(method: Method) -> String {
     method.name().to_lowercase()
 }
@@ -74,7 +81,7 @@ fn every_route_is_described_and_nothing_else() {
     for (path, methods) in description["paths"].as_object().unwrap() {
         for (method, operation) in methods.as_object().unwrap() {
             described.push((path.clone(), method.clone()));
-            let route = ROUTES.iter().find(|route| route.path == path && method_of(route.method) == *method);
+            let route = routes().find(|route| route.path == path && method_of(route.method) == *method);
             let route = route.unwrap_or_else(|| panic!("{method} {path} is not served"));
             let needs_key = operation["security"] != json!([]);
             assert_eq!(needs_key, route.access != Access::Open, "{method} {path}");
@@ -84,7 +91,7 @@ fn every_route_is_described_and_nothing_else() {
             assert_eq!(types, expected, "{method} {path}");
         }
     }
-    for route in ROUTES {
+    for route in routes() {
         let pair = (route.path.to_owned(), method_of(route.method));
         assert!(described.contains(&pair), "{pair:?} is not described");
     }
@@ -119,9 +126,7 @@ fn every_answer_is_as_described() {
         seen.push((path.to_owned(), method.to_owned()));
         answer
     };
-    for route in
-        ROUTES.iter().filter(|route| route.method == Method::Get && route.operation != Operation::Stream)
-    {
+    for route in routes().filter(|route| route.method == Method::Get && !route.operation.is_endless()) {
         look(route.path, "get", request(cell.console, &format!("GET {}", route.path), "", ""));
     }
     look("/api/v1/config", "get", get(cell.console, "config?revision=9").must_be(404));
@@ -139,6 +144,20 @@ fn every_answer_is_as_described() {
     look("/api/v1/confirm", "post", post(cell.console, "confirm", "{").must_be(400));
     look("/api/v1/rollback", "post", post(cell.console, "rollback", "").must_be(200));
     look("/api/v1/rollback", "post", request(cell.console, "POST /api/v1/rollback", "", "").must_be(401));
+    look("/api/v1/identify", "post", post(cell.console, "identify", "").must_be(200));
+    look("/api/v1/identify", "post", post(cell.console, "identify", r#"{"s": 0}"#).must_be(400));
+    let octets = format!("Authorization: Bearer {KEY}\nContent-Type: application/octet-stream");
+    let piece = request(cell.console, "PUT /api/v1/update?offset=0", &octets, "x");
+    look("/api/v1/update", "put", piece.must_be(501));
+    for operation in ["update/try", "update/confirm", "update/back"] {
+        look(&format!("/api/v1/{operation}"), "post", post(cell.console, operation, "").must_be(501));
+    }
+    look("/api/v1/log", "get", get(cell.console, "log?lines=0").must_be(400));
+    look("/api/v1/export/dbc", "get", get(cell.console, "export/dbc?port=none").must_be(404));
+    // The panel's connection stays over all that.
+    let event = frames_of(&cell, "", |frame| frame["port"] == "device", || send_frame(&mut panel));
+    let schema = json!({ "$ref": "#/components/schemas/Frames" });
+    check(&description, &schema, &event, "frames").unwrap();
     let robot = cell.folder.path().join("robot.toml");
     let key = cell.folder.path().join("key").display().to_string();
     let robot = BINARY.controller(&robot, &["--console", "127.0.0.1:0", "--console-key", &key]);
@@ -146,7 +165,9 @@ fn every_answer_is_as_described() {
     look("/api/v1/pendant", "post", post(console, "pendant", r#"{"do": "state"}"#).must_be(200));
     look("/api/v1/pendant", "post", post(console, "pendant", r#"{"do": "x"}"#).must_be(422));
     look("/api/v1/status", "get", get(console, "status").must_be(200));
-    for route in ROUTES.iter().filter(|route| route.operation != Operation::Stream) {
+    look("/api/v1/log", "get", get(console, "log").must_be(200));
+    look("/api/v1/bundle", "get", get(console, "bundle").must_be(200));
+    for route in routes().filter(|route| !route.operation.is_endless()) {
         let pair = (route.path.to_owned(), method_of(route.method));
         assert!(seen.contains(&pair), "{pair:?} was not tried");
     }

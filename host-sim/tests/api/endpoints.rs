@@ -1,12 +1,11 @@
 //! What each endpoint that reads answers.
 
-use std::io::{BufRead, BufReader, Write};
-use std::net::TcpStream;
+use std::io::Write;
 
-use recipe_test_kit::PATIENCE;
-use serde_json::{Value, json};
+use serde_json::json;
 
 use crate::kit::*;
+use crate::live::follow;
 
 #[test]
 fn info_says_who_and_where() {
@@ -83,30 +82,29 @@ fn a_check_names_the_place_of_a_mistake_and_stores_nothing() {
     assert_eq!(cell.revisions()["kept"].as_array().unwrap().len(), 1);
 }
 
-/// Events of a stream until `found` is satisfied.
-fn follow(cell: &Cell, mut found: impl FnMut(&str, &Value) -> bool) {
-    let mut stream = TcpStream::connect(cell.console).unwrap();
-    stream.set_read_timeout(Some(PATIENCE)).unwrap();
-    write!(stream, "GET /api/v1/stream HTTP/1.1\r\nHost: {}\r\n\r\n", cell.console).unwrap();
-    let mut lines = BufReader::new(stream).lines().map(Result::unwrap);
-    assert_eq!(lines.next().as_deref(), Some("HTTP/1.1 200 OK"));
-    assert!(
-        lines
-            .by_ref()
-            .take_while(|line| !line.is_empty())
-            .any(|line| line == "Content-Type: text/event-stream")
-    );
-    let mut event = String::new();
-    for line in lines {
-        if let Some(name) = line.strip_prefix("event: ") {
-            event = name.to_owned();
-        } else if let Some(data) = line.strip_prefix("data: ")
-            && found(&event, &serde_json::from_str(data).unwrap())
-        {
-            return;
-        }
-    }
-    panic!("the stream ended");
+#[test]
+fn a_check_makes_the_image_for_a_board_on_request() {
+    let cell = Cell::new();
+    let image = |query: &str, text: &str| {
+        let line = format!("POST /api/v1/check?image={query}");
+        request(cell.console, &line, "Content-Type: application/toml", text)
+    };
+    let made = image("1", &config(100)).must_be(200);
+    assert_eq!(made.field("Content-Type"), Some("application/octet-stream"));
+    assert!(made.body.starts_with("RGCI"), "{made:?}");
+    let wrong = image("1", &config(100).replace("timeout_ms = 100", "timeout_ms = \"soon\"")).must_be(422);
+    assert_eq!(wrong.json()["key"], "port.device.timeout_ms");
+    // A board runs no controller.
+    image("1", ROBOT).must_be(422);
+    assert!(image("2", &config(100)).must_be(400).body.contains("allowed: 1"));
+}
+
+#[test]
+fn info_names_the_other_console_of_the_machine() {
+    let mut cell = Cell::new();
+    assert_eq!(get(cell.console, "info").must_be(200).json().get("peer_port"), None);
+    cell.restart_with(&["--console-peer=8481"]);
+    assert_eq!(get(cell.console, "info").must_be(200).json()["peer_port"], 8481);
 }
 
 #[test]
@@ -114,7 +112,7 @@ fn a_stream_shows_what_happens() {
     let cell = Cell::new();
     let mut panel = cell.panel();
     let (mut sent, mut statuses) = (false, 0);
-    follow(&cell, |event, data| match event {
+    follow(&cell, "", |event, data| match event {
         "status" => {
             statuses += 1;
             if !std::mem::replace(&mut sent, true) {
@@ -130,7 +128,7 @@ fn a_stream_shows_what_happens() {
     // It also goes on while the gateway is replaced.
     put(cell.console, &cell.base(), &config(400)).must_be(201);
     let mut is_applied = false;
-    follow(&cell, |event, data| {
+    follow(&cell, "", |event, data| {
         if !std::mem::replace(&mut is_applied, true) {
             post(cell.console, "apply", "").must_be(200);
         }

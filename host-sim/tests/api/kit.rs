@@ -48,7 +48,8 @@ pub(crate) fn send(to: SocketAddr, bytes: &[u8]) -> Option<String> {
     let _ = stream.write_all(bytes);
     let mut answer = Vec::new();
     stream.read_to_end(&mut answer).ok()?;
-    String::from_utf8(answer).ok()
+    // The page is compressed; everything else is text.
+    Some(String::from_utf8_lossy(&answer).into_owned())
 }
 
 pub(crate) fn parse(answer: &str) -> Response {
@@ -108,22 +109,32 @@ pub(crate) struct Cell {
 
 impl Cell {
     pub(crate) fn new() -> Self {
+        Self::with("tcp-listen:127.0.0.1:0", &config(500))
+    }
+
+    /// With another device, in which FOLDER stands for the cell's, and another configuration.
+    pub(crate) fn with(device: &str, config: &str) -> Self {
         let folder = tempfile::tempdir().unwrap();
         write_key(&folder);
         std::fs::write(folder.path().join("robot.toml"), ROBOT).unwrap();
-        std::fs::write(folder.path().join("cell.toml"), config(500)).unwrap();
+        std::fs::write(folder.path().join("cell.toml"), config).unwrap();
         let robot = BINARY.controller(&folder.path().join("robot.toml"), &[]);
-        let gateway = gateway(&folder, &robot, "127.0.0.1:0");
+        let device = device.replace("FOLDER", folder.path().to_str().unwrap());
+        let gateway = gateway(&folder, &robot, &device, &[]);
         let console = gateway.at("console");
         Self { gateway, robot, console, folder }
     }
 
     /// Ends the gateway and starts it again.
     pub(crate) fn restart(&mut self) {
-        let next = |cell: &Self| gateway(&cell.folder, &cell.robot, "127.0.0.1:0");
+        self.restart_with(&[]);
+    }
+
+    /// Same, with further options.
+    pub(crate) fn restart_with(&mut self, options: &[&str]) {
         // One process uses the folder of revisions.
         self.gateway.end_by(rustix::process::Signal::TERM);
-        self.gateway = next(self);
+        self.gateway = gateway(&self.folder, &self.robot, "tcp-listen:127.0.0.1:0", options);
         self.console = self.gateway.at("console");
     }
 
@@ -137,7 +148,7 @@ impl Cell {
     /// The panel switches its outputs, until the controller has them: a gateway that has just started drops
     /// what comes before its links are up.
     #[track_caller]
-    pub(crate) fn switch(&self, panel: &mut TcpStream, value: u8) {
+    pub(crate) fn switch(&self, panel: &mut impl Write, value: u8) {
         until(&format!("outputs {value}"), || {
             panel.write_all(&frame(value)).unwrap();
             let shown = self.robot.newest()["registers"]["DigitalOutputCommand[1]"].as_u64();
@@ -189,19 +200,21 @@ pub(crate) fn write_key(folder: &TempDir) -> PathBuf {
     path
 }
 
-fn gateway(folder: &TempDir, robot: &HostSim, console: &str) -> HostSim {
+fn gateway(folder: &TempDir, robot: &HostSim, device: &str, options: &[&str]) -> HostSim {
     let path = |name: &str| folder.path().join(name).display().to_string();
     let (key, state) = (path("key"), path("state"));
-    let extra = [
-        "--bind=device=tcp-listen:127.0.0.1:0",
+    let device = format!("--bind=device={device}");
+    let mut extra = vec![
+        &device,
         "--console",
-        console,
+        "127.0.0.1:0",
         "--console-key",
         &key,
         "--console-state",
         &state,
         "--no-realtime",
     ];
+    extra.extend(options);
     BINARY.gateway(&folder.path().join("cell.toml"), robot, &extra)
 }
 

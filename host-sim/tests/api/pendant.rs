@@ -26,10 +26,20 @@ fn the_pendant_does_what_the_control_socket_does() {
     post(console, "pendant", r#"{"do": "follow"}"#).must_be(400);
     post(console, "pendant", "[]").must_be(400);
     // What only a gateway has.
-    for path in ["values", "config", "revisions", "metrics"] {
+    for path in
+        ["values", "config", "revisions", "metrics", "schema", "export/lua", "doctor", "capture.pcapng"]
+    {
         get(console, path).must_be(404);
     }
     post(console, "apply", "").must_be(404);
+    post(console, "identify", "").must_be(404);
+    get(console, "stream?frames=1").must_be(400);
+    let bundle = get(console, "bundle").must_be(200).json();
+    assert_eq!(bundle["info"]["role"], "controller");
+    assert_eq!(bundle["status"]["mode"], robot.fresh()["mode"]);
+    let names: Vec<_> = bundle.as_object().unwrap().keys().collect();
+    assert_eq!(names, ["info", "log", "status"]);
+    assert!(!get(console, "log").must_be(200).body.contains("ERROR"));
     robot.end();
 }
 

@@ -58,14 +58,14 @@ impl Cell {
 fn manual_mode() {
     let cell = Cell::new("pick.jspf", "manual", "enabled");
     let words = ["the controller is in manual mode"];
-    cell.says(&["run(pick.jspf) refused: the controller is in manual mode"]);
+    cell.says(&["run(pick.jspf) refused ", " s ago: the controller is in manual mode"]);
     finds(&doctor(&cell.file, &cell.arguments()), "manual", &words);
 }
 
 #[test]
 fn power_off() {
     let cell = Cell::new("pick.jspf", "remote", "off");
-    cell.says(&["run(pick.jspf) refused: the arm is powered off"]);
+    cell.says(&["run(pick.jspf) refused ", " s ago: the arm is powered off"]);
     finds(&doctor(&cell.file, &cell.arguments()), "power_off", &["the arm is powered off"]);
 }
 

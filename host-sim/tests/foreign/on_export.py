@@ -284,6 +284,8 @@ def capture_of(packets):
 
 # Numbers in every order, digits, characters, bits, lengths, checksums, escape bytes, exchanges.
 SERIAL = ("force-sensor-crc", "gripper", "modbus-line", "datalogic-quickscan", "mettler-toledo-sics", "witmotion-imu")
+# Of a slave, which receives requests and sends the rest.
+SLAVES = ("siemens-s7-1200",)
 
 
 def value_for(kind, nth):
@@ -297,7 +299,7 @@ def dissected():
     compared, fields_seen = 0, 0
     with tempfile.TemporaryDirectory(prefix="foreign-") as folder:
         folder = pathlib.Path(folder)
-        for name in SERIAL:
+        for name in SERIAL + SLAVES:
             path = CONFIGS / f"{name}.toml"
             path = path if path.exists() else TEMPLATES / f"{name}.toml"
             frames = {}
@@ -316,8 +318,7 @@ def dissected():
                     continue
                 shown = host_sim("decode", path, *which, *done.stdout.split()).split()
                 shown = dict(token.split("=", 1) for token in shown if "=" in token and not token.startswith("raw="))
-                # No slaves are among these.
-                sent = part in ("output", "request")
+                sent = part in ("output", "request") if name in SERIAL else part in ("reply", "refusal")
                 packets.append((port, 2 if sent else 1, bytes.fromhex(done.stdout)))
                 expected.append((role, shown, done.stdout.strip()))
             capture, plugin = folder / f"{name}.pcapng", folder / f"{name}.lua"

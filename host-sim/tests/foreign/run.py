@@ -4,7 +4,7 @@
     python run.py --host-sim target/debug/host-sim [WORD ...]
 
 With words, only cases whose title has one of them. Exit code 0 only when every case passed. Needs
-requirements.txt and Debian's mbpoll.
+requirements.txt and Debian's mbpoll and mosquitto.
 """
 
 import argparse
@@ -23,7 +23,8 @@ import cell  # noqa: E402
 
 MODULES = (
     "on_sockets", "on_habits", "on_modbus", "on_rtu_line", "on_serial", "on_can", "on_canopen", "on_dbc",
-    "on_export", "on_recipe_sockets", "through_gateway", "on_modbus_ports",
+    "on_export", "on_metrics", "on_recipe_sockets", "through_gateway", "on_modbus_ports",
+    "on_sparkplug",
 )
 # A case that hangs in somebody's library ends here.
 CASE_LIMIT = 60

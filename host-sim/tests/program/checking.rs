@@ -159,6 +159,68 @@ fn ports_on_one_bus_are_added_up() {
 }
 
 #[test]
+fn frames_that_vary_are_shown_with_the_longest() {
+    let shown = |input: &str| {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("line.toml");
+        let toml = format!(
+            "controller = {{ address = \"127.0.0.1\" }}
+            [[recipe]]
+            name = \"r\"
+            kind = \"stream\"
+            mode = \"user\"
+            [recipe.input]
+            {input}
+            [[port]]
+            name = \"line\"
+            bus = \"rs485\"
+            baud = 9600
+            recipe = \"r\""
+        );
+        std::fs::write(&path, toml).unwrap();
+        let path = path.to_str().unwrap();
+        let text = String::from_utf8(host_sim(&["check", path]).stdout).unwrap();
+        let (_, json) = json(&["check", "--json", path]);
+        let part = &json["ports"][0]["parts"][0];
+        let sizes = ["least_bytes", "bytes", "time_us"].map(|key| part[key].as_u64());
+        (text.lines().find(|line| line.starts_with("  input")).unwrap_or(&text).to_owned(), sizes)
+    };
+    let code = "{ name = \"code\", type = \"text\", to = \"WordInputReg[1..8]\" }";
+    let word = "{ name = \"a\", type = \"word\", to = \"WordInputReg[1]\" }";
+    assert_eq!(
+        shown(&format!("framing = \"tail\"\ntail = [13, 10]\nfields = [{code}]")),
+        (
+            "  input   2 to 130 bytes, the longest 135.417 ms on the line, at most 7 of these a second"
+                .into(),
+            [Some(2), Some(130), Some(135_417)]
+        )
+    );
+    assert_eq!(
+        shown(&format!("head = [2]\nfields = [{{ length = true, type = \"byte\" }}, {code}]")),
+        (
+            "  input   2 to 130 bytes, the longest 135.417 ms on the line, at most 7 of these a second"
+                .into(),
+            [Some(2), Some(130), Some(135_417)]
+        )
+    );
+    // DLE STX, two bytes that may have to be doubled, DLE ETX.
+    assert_eq!(
+        shown(&format!("escape = \"dle\"\nfields = [{word}]")),
+        (
+            "  input   6 to 8 bytes, the longest 8.334 ms on the line, at most 119 of these a second".into(),
+            [Some(6), Some(8), Some(8_334)]
+        )
+    );
+    assert_eq!(
+        shown(&format!("head = [2, 3]\nfields = [{word}]")),
+        (
+            "  input   4 bytes, 4.167 ms on the line, at most 239 a second".into(),
+            [None, Some(4), Some(4_167)]
+        )
+    );
+}
+
+#[test]
 fn the_schema_is_printed() {
     for (kind, key) in [("gateway", "network"), ("controller", "program")] {
         let (code, schema) = json(&["export", "schema", kind]);
@@ -195,4 +257,30 @@ fn every_key_of_the_json_is_documented() {
     keys(&json(&["check", &file, "--json", "--set", "network.address=192.168.12.20/24"]).1, &mut all);
     let missing: Vec<_> = all.iter().filter(|key| !page.contains(&format!("`{key}`"))).collect();
     assert!(all.len() > 60 && missing.is_empty(), "{} keys; not in docs/checking.md: {missing:?}", all.len());
+}
+
+#[test]
+fn a_board_is_given_no_more_than_it_has() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("cell.toml");
+    let toml = std::fs::read_to_string(path("force-sensor.toml")).unwrap();
+    let port = "\n[[port]]\nname = \"more-N\"\nbus = \"can\"\nrecipe = \"more-N\"\n[[recipe]]\nname = \"more-N\"\n\
+                kind = \"can\"\nmode = \"realtime\"\n[[recipe.input.frame]]\nid = 1\nfields = [\"WordInputReg[N]\"]\n";
+    std::fs::write(&file, format!("{toml}{}{}", port.replace('N', "1"), port.replace('N', "2"))).unwrap();
+    let (file, image) = (file.to_str().unwrap(), folder.path().join("cell.img"));
+    assert!(host_sim(&["check", file]).status.success());
+    for args in [
+        vec!["check", file, "--board", "nucleo-h743zi"],
+        vec!["image", file, "-o", image.to_str().unwrap(), "--board", "mps2-an500"],
+    ] {
+        let output = host_sim(&args);
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(2), "{said}");
+        assert!(said.contains("port.more-2.bus: the board ") && said.contains("has 1 CAN ports"), "{said}");
+    }
+    assert!(!image.exists());
+    assert!(host_sim(&["check", &path("force-sensor.toml"), "--board", "nucleo-h743zi"]).status.success());
+    let output = host_sim(&["check", file, "--board", "pico"]);
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(said.contains("there are nucleo-h743zi, mps2-an500"), "{said}");
 }

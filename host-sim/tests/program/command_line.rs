@@ -3,7 +3,7 @@
 use std::io::Write;
 use std::process::{Output, Stdio};
 
-use recipe_test_kit::example;
+use recipe_test_kit::{HostSim, example};
 
 use super::BINARY;
 
@@ -251,6 +251,10 @@ fn an_image_that_no_board_takes_is_not_written() {
     let message = refused(&["image", file.to_str().unwrap(), "-o", image.to_str().unwrap()]);
     assert!(message.contains("16384 bytes"), "{message}");
     assert!(!image.exists());
+    // A gateway on this host needs none.
+    let mut gateway = BINARY.run("gateway", &file);
+    let bus = "--bind=bus=slcan-tcp:127.0.0.1:0";
+    HostSim::start(gateway.args(["--set", "controller.address=127.0.0.1", bus])).end();
 }
 
 #[test]

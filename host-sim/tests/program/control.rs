@@ -136,7 +136,7 @@ fn a_timeline_acts_by_itself_and_a_wrong_one_starts_nothing() {
     let mut command = BINARY.run("controller", &example("udp-server-controller.toml"));
     let output = command.args(recipe_test_kit::free_servers()).arg(timeline).output().unwrap();
     let message = String::from_utf8(output.stderr).unwrap();
-    let place = format!("{}:4:11: step[1].items.DI[99]: DI[99]: ", file.display());
+    let place = format!("{}:4:11: step[1].items.DI[99]: there is only DI[1..16]", file.display());
     assert!(output.status.code() == Some(2) && message.starts_with(&place), "{message}");
     assert!(output.stdout.is_empty());
 }
@@ -273,12 +273,15 @@ fn the_threads_that_move_data_have_real_time_scheduling_where_it_is_allowed() {
     let is_allowed = std::thread::spawn(|| realtime::apply(Scheduling::FifoIfAllowed).word() == "fifo");
     let is_allowed = is_allowed.join().unwrap();
     let is_fifo = |program: &HostSim, thread: &str| {
-        let tasks = std::fs::read_dir(format!("/proc/{}/task", program.pid().as_raw_pid())).unwrap();
         let read = |task: &Path, file: &str| std::fs::read_to_string(task.join(file)).unwrap_or_default();
-        let tasks = tasks.map(|task| task.unwrap().path());
-        let named = tasks.filter(|task| read(task, "comm").trim() == thread).collect::<Vec<_>>();
-        let [task] = &named[..] else { panic!("one thread is called {thread}: {named:?}") };
-        let stat = read(task, "stat");
+        // A new thread is called as the one that made it until it has named itself.
+        let task = recipe_test_kit::until("one thread of that name", || {
+            let tasks = std::fs::read_dir(format!("/proc/{}/task", program.pid().as_raw_pid())).unwrap();
+            let tasks = tasks.map(|task| task.unwrap().path());
+            let named = tasks.filter(|task| read(task, "comm").trim() == thread).collect::<Vec<_>>();
+            <[_; 1]>::try_from(named).ok().map(|[task]| task)
+        });
+        let stat = read(&task, "stat");
         // Behind the name in parentheses, which is the second field, the 41st is the policy.
         let policy = stat.rsplit_once(") ").and_then(|(_, rest)| rest.split(' ').nth(38)).unwrap();
         policy == SCHED_FIFO

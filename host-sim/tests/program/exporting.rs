@@ -38,6 +38,10 @@ fn a_file_is_replaced_only_if_that_is_said() {
     assert!(code == Some(2) && text.contains("is made from"), "{text}");
     let (code, text) = export(&["map", &input, "-o", folder.path().to_str().unwrap(), "--force"]);
     assert!(code == Some(2) && text.contains("a folder"), "{text}");
+    let link = folder.path().join("link");
+    std::os::unix::fs::symlink(folder.path().join("nowhere"), &link).unwrap();
+    let (code, text) = export(&["map", &input, "-o", link.to_str().unwrap(), "--force"]);
+    assert!(code == Some(2) && text.contains("a link to a file that does not exist"), "{text}");
 }
 
 const TWO: &str = r#"

@@ -49,21 +49,39 @@ fn command_lines(folder: &Path) -> Vec<Vec<String>> {
         line(&["export", "schema"]),
         line(&["image", &gateway, "-o", &at("cell.img")]),
         line(&[&soak[..], &["--hours", "0.001"]].concat()),
+        line(&[&soak[..], &["--hours", "0.001", "--json"]].concat()),
+        line(&["soak", "merge", &soaked()]),
         line(&[&soak[..], &["--replay", "9@2.5", "--trace"]].concat()),
         line(&["encode", &gateway, "--part", "input", "1"]),
         line(&["decode", &gateway, "--part", "input", "FFFF01EEEE", "FFFF01EEEE"]),
         line(&["pendant", "--to", &control_socket(), "programs"]),
+        line(&["ctl", "--to", &console(), "revisions"]),
         line(&["export", "map", &gateway]),
         line(&["export", "dbc", &config("can-hand.toml")]),
         line(&["export", "lua", &gateway]),
         line(&["extcap", "--extcap-interfaces"]),
         line(&["replay", &recording(&gateway)]),
+        // Its exit code is that of a broker, which is not here (tests/fleet).
+        line(&["fleet", "--help"]),
         line(&["completions", "bash"]),
         line(&["help"]),
         line(&["--help"]),
         line(&["check", "--help"]),
         line(&["--version"]),
     ]
+}
+
+/// What a soak has printed.
+fn soaked() -> String {
+    static MADE: OnceLock<String> = OnceLock::new();
+    let make = || {
+        let args = ["soak", "--cell", "rs485-system", "--hours", "0.001", "--json"];
+        let output = BINARY.command().args(args).output().unwrap();
+        let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join("soaked.json");
+        std::fs::write(&path, output.stdout).unwrap();
+        path.to_str().unwrap().to_owned()
+    };
+    MADE.get_or_init(make).clone()
 }
 
 /// A plain recording of a gateway that has begun.
@@ -96,6 +114,24 @@ fn control_socket() -> String {
                 let _ =
                     read.get_mut().write_all(b"{\"ok\":true,\"time_s\":0.0,\"result\":[\"pick.jspf\"]}\n");
             }
+        }
+    });
+    address
+}
+
+/// A console that answers every client once; it serves until the tests end.
+fn console() -> String {
+    let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = listener.local_addr().unwrap().to_string();
+    std::thread::spawn(move || {
+        for stream in listener.incoming().map_while(Result::ok) {
+            let mut read = BufReader::new(stream);
+            let mut line = String::new();
+            while read.read_line(&mut line).is_ok_and(|len| len > 2) {
+                line.clear();
+            }
+            // The client may be gone.
+            let _ = read.get_mut().write_all(b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\n{}");
         }
     });
     address

@@ -48,9 +48,81 @@ fn a_replay_shows_what_happened() {
     assert_eq!(quiet.lines().count(), 3, "{quiet}");
 }
 
+/// Three runs of some seconds, with more arguments.
+fn three_runs(args: &[&str]) -> Output {
+    let cells = ["--cell", "client", "--cell", "witness", "--cell", "orders"];
+    host_sim(&[&["--hours", "0.005", "--seed", "7"], &cells[..], args].concat())
+}
+
+/// The table without its two lines about wall time.
+fn without_wall_time(table: &str) -> String {
+    let lines: Vec<_> = table.lines().filter(|line| !line.starts_with("wall time")).collect();
+    let (kept, rates): (Vec<_>, Vec<_>) =
+        lines.into_iter().partition(|line| !line.starts_with("hours a minute"));
+    assert_eq!(rates.len(), 1, "{table}");
+    kept.join("\n")
+}
+
+#[test]
+fn shares_make_the_table_of_one_machine() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    let files = ["1/3", "2/3", "3/3"].map(|share| {
+        let document = text(&three_runs(&["--shard", share, "--json"]), 0);
+        let file = at(&share.replace('/', "-"));
+        std::fs::write(&file, document).unwrap();
+        file
+    });
+    let [first, second, third] = files.each_ref().map(String::as_str);
+    let merged = text(&host_sim(&["merge", third, first, second]), 0);
+    assert!(merged.ends_with("\nPASS  all invariants held\n"), "{merged}");
+    assert_eq!(without_wall_time(&merged), without_wall_time(&text(&three_runs(&[]), 0)));
+    // What was merged is a document of one machine.
+    std::fs::write(at("all"), text(&host_sim(&["merge", first, second, third, "--json"]), 0)).unwrap();
+    assert_eq!(text(&host_sim(&["merge", &at("all")]), 0), merged);
+
+    let document = std::fs::read_to_string(second).unwrap();
+    let failed = r#""failure":{"run":1,"seed":41,"cell":"orders","after_us":2500000,"what":"ownership: 7"}"#;
+    let change = |name: &str, from: &str, to: &str| {
+        assert!(document.contains(from), "{from}: {document}");
+        std::fs::write(at(name), document.replace(from, to)).unwrap();
+        at(name)
+    };
+    let failed = change("failed", r#""failure":null"#, failed);
+    let table = text(&host_sim(&["merge", first, &failed, third]), 1);
+    let (_, end) = table.split_once("\n\nFAIL").unwrap();
+    insta::assert_snapshot!("merged_failure", end);
+    let output = host_sim(&["merge", first, &failed, third, "--json"]);
+    assert!(text(&output, 1).contains("ownership"));
+    assert!(output.stderr.starts_with(b"FAIL  ownership: 7\n"), "{output:?}");
+
+    let refused = |files: &[&str]| {
+        let output = host_sim(&[&["merge"], files].concat());
+        assert_eq!(text(&output, 2), "");
+        String::from_utf8(output.stderr).unwrap().replace(&at(""), "")
+    };
+    std::fs::write(at("table"), &merged).unwrap();
+    insta::assert_snapshot!(
+        "merge_refused",
+        [
+            refused(&[]),
+            refused(&[first, second]),
+            refused(&[first, second, third, first]),
+            refused(&[first, &at("none")]),
+            refused(&[&at("table")]),
+            refused(&[&change("format", r#""soak":1"#, r#""soak":9"#)]),
+            refused(&[first, &change("key", r#""seed":7"#, r#""seeds":7"#), third]),
+            refused(&[first, &change("seed", r#""seed":7"#, r#""seed":8"#), third]),
+            refused(&[&change("nothing", r#""soak":1,"#, "")]),
+        ]
+        .join("\n")
+    );
+}
+
 #[test]
 fn help_and_refusals() {
     insta::assert_snapshot!("help", text(&host_sim(&["--help"]), 0));
+    insta::assert_snapshot!("merge_help", text(&host_sim(&["merge", "--help"]), 0));
     let refused = |args: &[&str]| {
         let output = host_sim(args);
         assert_eq!(text(&output, 2), "", "nothing was started");
@@ -64,6 +136,12 @@ fn help_and_refusals() {
         refused(&["--replay", "5"]),
         refused(&["--trace"]),
         refused(&["--jobs", "0"]),
+        refused(&["--shard", "0/3", "--json"]),
+        refused(&["--shard", "4/3", "--json"]),
+        refused(&["--shard", "1/3"]),
+        refused(&["--shard", "1/3", "--json", "--replay", "9@2"]),
+        refused(&["--shard", "3/18", "--json"]),
+        refused(&["--seed", "1", "merge", "no-such.json"]),
     ];
     insta::assert_snapshot!("refused", messages.join("\n"));
 }

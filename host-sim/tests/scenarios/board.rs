@@ -278,25 +278,45 @@ fn forwarded(config: &GatewayConfig, socket: &Path) -> Vec<(String, SocketAddr)>
     ports.filter_map(|port| Some((port.name.as_str().to_owned(), place(forward(&port.bus)?)))).collect()
 }
 
-/// Sends a command to QEMU; returns the result.
+/// Sends a command to QEMU, which may be carried out twice; returns the result. QEMU may not listen yet, and has one
+/// place for a client: it may reset one that comes while it notices that the one before has gone.
 #[track_caller]
 pub(crate) fn qmp(socket: &Path, command: &str, arguments: Value) -> Value {
-    let mut stream = UnixStream::connect(socket).unwrap();
-    let mut lines = BufReader::new(stream.try_clone().unwrap()).lines();
-    lines.next().unwrap().unwrap();
+    let mut failed = None;
+    let answer = || match try_qmp(socket, command, &arguments) {
+        Ok(answer) => Some(answer),
+        Err(error) => {
+            failed = Some(error);
+            // Or one comes after the other, each while the one before is going.
+            std::thread::sleep(Duration::from_millis(100));
+            None
+        }
+    };
+    let mut answer = until(&format!("QEMU's answer to {command}"), answer);
+    if let Some(error) = failed.filter(|error| error.kind() != std::io::ErrorKind::NotFound) {
+        eprintln!("{command}: at first {error}");
+    }
+    assert!(answer.get("return").is_some(), "{command}: {answer}");
+    answer["return"].take()
+}
+
+/// Same; returns the whole answer.
+fn try_qmp(socket: &Path, command: &str, arguments: &Value) -> std::io::Result<Value> {
+    let mut stream = UnixStream::connect(socket)?;
+    let mut lines = BufReader::new(stream.try_clone()?).lines();
     let mut answer = Value::Null;
-    for (command, arguments) in [("qmp_capabilities", json!({})), (command, arguments)] {
-        writeln!(stream, "{}", json!({ "execute": command, "arguments": arguments })).unwrap();
+    for (command, arguments) in [("qmp_capabilities", &json!({})), (command, arguments)] {
+        writeln!(stream, "{}", json!({ "execute": command, "arguments": arguments }))?;
         // Skip events and the greeting.
         answer = loop {
-            let line: Value = serde_json::from_str(&lines.next().unwrap().unwrap()).unwrap();
+            let line = lines.next().ok_or(std::io::ErrorKind::UnexpectedEof)??;
+            let line: Value = serde_json::from_str(&line)?;
             if line.get("event").is_none() && line.get("QMP").is_none() {
                 break line;
             }
         };
-        assert!(answer.get("return").is_some(), "{command}: {answer}");
     }
-    answer["return"].take()
+    Ok(answer)
 }
 
 /// From the lines `link NAME: up (COUNT)` and `link NAME: lost` of a log.

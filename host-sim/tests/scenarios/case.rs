@@ -14,6 +14,8 @@ use super::robot::{Robot, RobotPlan};
 
 /// The time limit of a scenario.
 const LIMIT: Duration = Duration::from_secs(90);
+/// Maximum number of attempts of a scenario in which the machine stops the gateway.
+const ATTEMPTS: usize = 3;
 /// Number of lines of each log that are shown if a case fails.
 const SHOWN: usize = 12;
 
@@ -98,15 +100,42 @@ impl Case {
     }
 }
 
-/// Runs the scenario on a separate thread, so that its time limit ends a hang.
+/// Runs the scenario, alone if it has to be. A gateway that the machine has stopped for half a second discards what
+/// its devices sent meanwhile, as it must; a scenario that is not about that then fails, and is run again.
 pub(crate) fn run(
     name: &str,
     scenario: &Scenario,
-    environment: Arc<dyn Environment>,
+    environment: &Arc<dyn Environment>,
     machine: &RwLock<()>,
 ) -> Result<(), Failed> {
-    let others = (!scenario.is_alone).then(|| machine.read());
-    let whole = scenario.is_alone.then(|| machine.write());
+    let _others = (!scenario.is_alone).then(|| machine.read());
+    let _whole = scenario.is_alone.then(|| machine.write());
+    for _ in 1..ATTEMPTS {
+        match attempt(name, scenario, Arc::clone(environment)) {
+            Err(failed) if failed.has_slept && !scenario.is_of_sleep => {
+                eprintln!("{name}: the machine stopped the gateway, once more; {}", failed.message);
+            }
+            ended => return ended.map_err(|failed| failed.message.into()),
+        }
+    }
+    attempt(name, scenario, Arc::clone(environment)).map_err(|failed| failed.message.into())
+}
+
+/// Why an attempt failed.
+struct Failure {
+    message: String,
+    /// A gateway's log says that it slept.
+    has_slept: bool,
+}
+
+impl From<std::io::Error> for Failure {
+    fn from(error: std::io::Error) -> Self {
+        Self { message: error.to_string(), has_slept: false }
+    }
+}
+
+/// Runs the scenario on a separate thread, so that its time limit ends a hang.
+fn attempt(name: &str, scenario: &Scenario, environment: Arc<dyn Environment>) -> Result<(), Failure> {
     let logs = Path::new(env!("CARGO_TARGET_TMPDIR")).join("scenarios").join(name.replace("::", "-"));
     let _ = std::fs::remove_dir_all(&logs);
     std::fs::create_dir_all(&logs)?;
@@ -144,27 +173,34 @@ pub(crate) fn run(
     if ended.try_recv().is_ok() || outcome.is_ok() {
         let _ = thread.join();
     }
-    drop((others, whole));
     match outcome {
         Ok(()) => {
             let _ = std::fs::remove_dir_all(&logs);
             Ok(())
         }
-        Err(message) => Err(format!("{message}\n{}", ends_of(&logs)).into()),
+        Err(message) => {
+            let logs = logs_in(&logs);
+            let has_slept = logs.iter().any(|(_, log)| log.contains("the gateway slept"));
+            Err(Failure { message: format!("{message}\n{}", ends_of(&logs)), has_slept })
+        }
     }
 }
 
-/// The end of each log.
-fn ends_of(logs: &Path) -> String {
-    let mut files: Vec<_> = std::fs::read_dir(logs).into_iter().flatten().flatten().collect();
+/// Each log: its path and its text.
+fn logs_in(folder: &Path) -> Vec<(PathBuf, String)> {
+    let mut files: Vec<_> = std::fs::read_dir(folder).into_iter().flatten().flatten().collect();
     files.sort_by_key(|file| file.file_name());
+    let text = |path: &Path| String::from_utf8_lossy(&std::fs::read(path).unwrap_or_default()).into_owned();
+    files.iter().map(|file| (file.path(), text(&file.path()))).collect()
+}
+
+/// The end of each log.
+fn ends_of(logs: &[(PathBuf, String)]) -> String {
     let mut text = String::new();
-    for file in files {
-        let log = std::fs::read(file.path()).unwrap_or_default();
-        let log = String::from_utf8_lossy(&log);
+    for (path, log) in logs {
         let lines: Vec<&str> = log.lines().collect();
         let end = lines[lines.len().saturating_sub(SHOWN)..].join("\n    ");
-        text.push_str(&format!("{}:\n    {end}\n", file.path().display()));
+        text.push_str(&format!("{}:\n    {end}\n", path.display()));
     }
     text
 }

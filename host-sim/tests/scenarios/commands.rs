@@ -74,18 +74,25 @@ fn hold(panel: &mut LineClient, frame: &[u8], time: Duration, mut meanwhile: imp
     }
 }
 
-/// Starts the program by an order while everything works.
+/// Starts the program by an order while everything works. After a sleep of the gateway, which a busy machine may cause,
+/// the first frame is the base again: then the order is given once more, as a person would.
 #[track_caller]
 fn start(panel: &mut LineClient, gateway: &mut dyn Gateway, robot: &Robot) {
-    // The first frame only sets the base.
-    let frames = gateway.port("device").frames_in;
-    until("the base is taken", || {
-        panel.send(&order(NOTHING, 0));
-        (gateway.port("device").frames_in > frames).then_some(())
-    });
     until("the program runs", || {
-        panel.send(&order(RUN, 0));
-        robot.is_running().then_some(())
+        // The first frame only sets the base.
+        let frames = gateway.port("device").frames_in;
+        until("the base is taken", || {
+            panel.send(&order(NOTHING, 0));
+            (gateway.port("device").frames_in > frames).then_some(())
+        });
+        let pressed = Instant::now();
+        while pressed.elapsed() < WATCHED {
+            hold(panel, &order(RUN, 0), PERIOD, || ());
+            if robot.is_running() {
+                return Some(());
+            }
+        }
+        None
     });
 }
 

@@ -130,7 +130,7 @@ fn ignored(environment: &str, scenario: &Scenario, why: &str) -> Trial {
 fn trial(scenario: Scenario, environment: Arc<dyn Environment>, machine: &Arc<RwLock<()>>) -> Trial {
     let name = format!("{}::{}", environment.name(), scenario.name);
     let machine = Arc::clone(machine);
-    Trial::test(name.clone(), move || case::run(&name, &scenario, environment, &machine))
+    Trial::test(name.clone(), move || case::run(&name, &scenario, &environment, &machine))
 }
 
 /// Why there is no firmware to run.

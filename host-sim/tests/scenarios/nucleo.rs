@@ -2,14 +2,13 @@
 //! lines and CAN on sockets, Ethernet by QEMU's user network, the log on the emulator's stdout.
 
 use std::ffi::OsString;
-use std::io::{BufRead, BufReader, Write};
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use serde_json::Value;
 
-use recipe_test_kit::until;
+use recipe_test_kit::{chip, until};
 
 use super::board::{self, Machine, Wires};
 use super::environment::{Cable, Environment, Gateway, Plan};
@@ -86,30 +85,24 @@ impl Chip {
         arguments.extend(["--control".into(), place("control")]);
         let program = Program::start(plan.case, "chip", &nucleo.emulator, &arguments);
         let mut chip = Self { program, wires };
-        // The last socket that each program opens. Its file may exist before it listens.
-        for last in ["control", "qmp"] {
-            until("the emulator's sockets", || {
-                chip.must_run();
-                UnixStream::connect(chip.wires.folder.join(last)).ok()
-            });
-        }
+        // The last socket that the emulator opens. Its file may exist before it listens.
+        until("the emulator's sockets", || {
+            chip.must_run();
+            UnixStream::connect(chip.wires.folder.join("control")).ok()
+        });
+        // And that of QEMU's network.
         chip.wires.read_forwarded(&config, "qmp");
         chip
     }
 
-    /// Asks the emulator.
-    #[track_caller]
-    fn request(&self, words: &str) -> String {
-        let mut stream = self.wires.socket("control");
-        writeln!(stream, "{words}").unwrap();
-        let mut answer = String::new();
-        BufReader::new(stream).read_line(&mut answer).unwrap();
-        answer.trim_end().to_owned()
+    /// The emulator's socket.
+    fn control(&self) -> PathBuf {
+        self.wires.folder.join("control")
     }
 
     #[track_caller]
     fn command(&self, words: &str) {
-        assert_eq!(self.request(words), "done", "{words}");
+        chip::command(&self.control(), words);
     }
 }
 
@@ -153,7 +146,7 @@ impl Machine for Chip {
 
     #[track_caller]
     fn counts(&self) -> Value {
-        serde_json::from_str(&self.request("figures")).unwrap()
+        serde_json::from_str(&chip::request(&self.control(), "figures")).unwrap()
     }
 }
 

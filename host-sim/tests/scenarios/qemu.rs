@@ -2,13 +2,10 @@
 //! UART 3.
 
 use std::ffi::OsString;
-use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use serde_json::{Value, json};
-
-use recipe_test_kit::until;
 
 use super::board::{self, Machine, Wires};
 use super::environment::{Cable, Environment, Gateway, Plan};
@@ -88,11 +85,7 @@ impl Board {
         arguments.extend(["-kernel".into(), elf.into()]);
         let program = Program::start(plan.case, "qemu", Path::new("qemu-system-arm"), &arguments);
         let mut board = Self { program, log, wires };
-        // The last socket that QEMU opens. Its file may exist before it listens.
-        until("QEMU's sockets", || {
-            board.must_run();
-            UnixStream::connect(board.wires.folder.join("qmp")).ok()
-        });
+        // By the last socket that QEMU opens.
         board.wires.read_forwarded(&config, "qmp");
         board
     }

@@ -253,7 +253,7 @@ fn overrun(interface: &str) {
     assert!(port["device"]["frames_in"].as_u64() > Some(100), "{port}");
     // Accepted, or rejected if the stall was so long that it counts as sleep.
     let count = |name: &str| port[name].as_u64().unwrap();
-    assert_eq!(count("frames_in") + count("asleep"), port["device"]["frames_in"], "{port}");
+    assert_eq!(count("frames_in") + not_believed(port), port["device"]["frames_in"], "{port}");
     goes_on(interface, &gateway, &robot);
     gateway.end();
     robot.end();
@@ -268,14 +268,19 @@ fn stopped(interface: &str) {
     tool(&format!("cangen {interface} -g 1 -I 001 -L 3 -D 010203 -n {WAITING}"));
     std::thread::sleep(STOPPED);
     gateway.signal(Signal::CONT);
-    let stats = gateway.stats("awake", |stats| stats["sleeps"] == 1);
-    let port = &stats["ports"]["can-1"];
-    assert_eq!((&port["frames_in"], &port["asleep"]), (&0.into(), &WAITING.into()), "{port}");
+    let all = |stats: &Value| stats["sleeps"] == 1 && not_believed(&stats["ports"]["can-1"]) == WAITING;
+    let stats = gateway.stats("awake", all);
+    assert_eq!(stats["ports"]["can-1"]["frames_in"], 0, "{stats}");
     goes_on(interface, &gateway, &robot);
     let register = robot.fresh()["registers"]["WordInputReg[1]"].as_f64();
     assert_eq!(register, Some(4.0));
     gateway.end();
     robot.end();
+}
+
+/// Frames that waited while the gateway slept: discarded by the engine, or dropped if they were read too late for that.
+fn not_believed(port: &Value) -> u64 {
+    port["asleep"].as_u64().unwrap() + port["device"]["dropped"].as_u64().unwrap()
 }
 
 /// Checks that it works as before, once its links are up.
