@@ -111,6 +111,8 @@ export class Board {
     /** Time of a step in milliseconds: erasing, checking, starting. */
     step = 300;
     cannot = undefined;
+    /** Steps that a test holds until it has seen what is shown meanwhile. */
+    held = {};
 
     constructor(key) {
         this.key = key;
@@ -127,6 +129,24 @@ export class Board {
     end() {
         this.server.closeAllConnections();
         this.server.close();
+    }
+
+    /** From now on `name` lasts until `goOn(name)`: "erasing", "lost", "restart" or "trial". */
+    hold(name) {
+        let goOn;
+        const until = new Promise((done) => (goOn = done));
+        this.held[name] = { until, goOn };
+    }
+
+    goOn(name) {
+        this.held[name].goOn();
+        delete this.held[name];
+    }
+
+    /** The step `name`: so many milliseconds, and longer if it is held. */
+    async lasts(name, ms = this.step) {
+        await wait(ms);
+        await this.held[name]?.until;
     }
 
     document() {
@@ -150,7 +170,7 @@ export class Board {
         this.incoming = null;
         change();
         this.began = Date.now();
-        await wait(this.step);
+        await this.lasts("restart");
         this.isAway = false;
     }
 
@@ -225,7 +245,7 @@ export class Board {
             if (incoming.received > this.loseAt) {
                 // It was taken, and its answer never came.
                 [this.loseAt, this.isAway] = [Infinity, true];
-                setTimeout(() => (this.isAway = false), 1500);
+                void this.lasts("lost").then(() => (this.isAway = false));
                 this.store(body);
                 return socket.destroy();
             }
@@ -247,7 +267,7 @@ export class Board {
         const incoming = { state: "erasing", version, sha512, length, received: HEADER, image: [] };
         this.incoming = incoming;
         this.other = null;
-        setTimeout(() => (incoming.state = "receiving"), this.step);
+        void this.lasts("erasing").then(() => (incoming.state = "receiving"));
         return done();
     }
 
@@ -277,7 +297,7 @@ export class Board {
             const ms = this.trialMs ?? confirm_s * 1000;
             this.swap();
             this.trial = { until: Date.now() + ms };
-            this.timer = setTimeout(() => this.endTrial("not_confirmed"), ms);
+            this.timer = setTimeout(() => void this.lasts("trial", 0).then(() => this.endTrial("not_confirmed")), ms);
         });
     }
 
