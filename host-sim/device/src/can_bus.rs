@@ -337,7 +337,7 @@ impl CanPort {
         events(PortEvent::Up);
         let on_terminal = async {
             match &pty {
-                Some((pty, session)) => serve(&**pty, session, &bus.join(), &tx).await,
+                Some((pty, session)) => serve(&**pty, session, &bus.join(), &tx, Backlog::new(&tx)).await,
                 None => pending().await,
             }
         };
@@ -400,11 +400,15 @@ async fn serve_all(
 ) {
     let mut tasks = JoinSet::new();
     for client in clients.borrow().iter() {
-        tasks.spawn_local(serve_client(Rc::clone(client), Rc::clone(clients), bus.join(), Rc::clone(tx)));
+        let backlog = Backlog::new(tx);
+        tasks.spawn_local(serve_client(Rc::clone(client), Rc::clone(clients), bus.join(), Rc::clone(tx), backlog));
     }
+    let mut known = tx.sleeps();
     loop {
         tokio::select! {
             (stream, peer) = accept(listener, tx) => {
+                let backlog = Backlog::accepted(tx, known);
+                known = tx.sleeps();
                 if tasks.len() == MAX_CLIENTS {
                     drop(stream);
                     tx.count(|counters| counters.refused += 1);
@@ -418,7 +422,7 @@ async fn serve_all(
                 tcp_options::enable_keepalive(&stream);
                 let client = Rc::new(Client { stream, session: RefCell::new(Session::new(bitrate)) });
                 clients.borrow_mut().push(Rc::clone(&client));
-                tasks.spawn_local(serve_client(client, Rc::clone(clients), bus.join(), Rc::clone(tx)));
+                tasks.spawn_local(serve_client(client, Rc::clone(clients), bus.join(), Rc::clone(tx), backlog));
             }
             Some(_) = tasks.join_next() => {}
         }
@@ -426,9 +430,9 @@ async fn serve_all(
 }
 
 /// Serves a client on TCP until it has gone.
-async fn serve_client(client: Rc<Client>, clients: Rc<Clients>, node: Node, tx: Rc<PortTx>) {
+async fn serve_client(client: Rc<Client>, clients: Rc<Clients>, node: Node, tx: Rc<PortTx>, backlog: Backlog) {
     let peer = stream::peer_of(&client.stream);
-    let error = serve(&client.stream, &client.session, &node, &tx).await;
+    let error = serve(&client.stream, &client.session, &node, &tx, backlog).await;
     info!(%peer, %error, "slcan client disconnected");
     clients.borrow_mut().retain(|other| !Rc::ptr_eq(other, &client));
     drop(client);
@@ -440,7 +444,13 @@ async fn serve_client(client: Rc<Client>, clients: Rc<Clients>, node: Node, tx: 
 }
 
 /// Serves one client until its connection fails.
-async fn serve<D: ByteStream>(io: &D, session: &RefCell<Session>, node: &Node, tx: &PortTx) -> io::Error {
+async fn serve<D: ByteStream>(
+    io: &D,
+    session: &RefCell<Session>,
+    node: &Node,
+    tx: &PortTx,
+    mut backlog: Backlog,
+) -> io::Error {
     node.set_receiving(false);
     {
         // What a client that was taken over had sent before, and what its channel was.
@@ -451,7 +461,7 @@ async fn serve<D: ByteStream>(io: &D, session: &RefCell<Session>, node: &Node, t
     let mut buf = [0; BACKLOG_CHUNK];
     let mut unread = 0..0;
     let mut reported_dropped = 0;
-    let (mut backlog, mut is_old) = (Backlog::new(tx), false);
+    let mut is_old = false;
     loop {
         if backlog.has_slept(tx) {
             backlog.note(tx, io.has_unread());

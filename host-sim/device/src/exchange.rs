@@ -74,6 +74,11 @@ impl PortTx {
         self.stale_until.set(now + STALE);
     }
 
+    /// How often the process slept.
+    pub(super) fn sleeps(&self) -> u32 {
+        self.sleeps.get()
+    }
+
     /// Whether the port's owner discards data read now, since it may have waited while the process
     /// slept.
     pub(super) fn is_stale(&self) -> bool {
@@ -133,6 +138,13 @@ impl Backlog {
     /// Nothing waits in the device now.
     pub(super) fn new(tx: &PortTx) -> Self {
         Self { known: tx.sleeps.get(), waits: false, is_behind: false, small_since: None }
+    }
+
+    /// A new connection, for which was waited since [`PortTx::sleeps`] was `known`. What came while the process slept may
+    /// wait in it, unless that was long ago.
+    pub(super) fn accepted(tx: &PortTx, known: u32) -> Self {
+        let is_long_ago = now().saturating_since(tx.stale_until.get()) >= MAX_BACKLOG;
+        Self { known: if is_long_ago { tx.sleeps.get() } else { known }, ..Self::new(tx) }
     }
 
     /// Whether the process slept, and nobody has seen since then if something waits in the device.

@@ -116,7 +116,8 @@ impl SerialPort {
                     drain(&*pty, &tx).await?;
                 }
                 sender.up(&mut events);
-                Err(pump(&*pty, &mut sender, &mut events).await)
+                let backlog = Backlog::new(&tx);
+                Err(pump(&*pty, &mut sender, backlog, &mut events).await)
             }
             Source::Serial(path, stream) => {
                 let mut stream = Some(stream);
@@ -132,7 +133,7 @@ impl SerialPort {
                     };
                     backoff.reset();
                     sender.up(&mut events);
-                    let error = pump(&device, &mut sender, &mut events).await;
+                    let error = pump(&device, &mut sender, Backlog::new(&tx), &mut events).await;
                     warn!(%path, %error, "device lost, will be reopened");
                     sender.down(&mut events);
                 }
@@ -140,13 +141,15 @@ impl SerialPort {
             Source::Connect(to) => {
                 let mut backoff = Backoff::new(StdDuration::from_millis(20), StdDuration::from_secs(2));
                 loop {
+                    let known = tx.sleeps();
                     match connect((to.host.as_str(), to.port)).await {
                         Ok(stream) => {
                             info!(%to, "connected");
                             backoff.reset();
                             tcp_options::enable_keepalive(&stream);
                             sender.up(&mut events);
-                            let error = pump(&stream, &mut sender, &mut events).await;
+                            let backlog = Backlog::accepted(&tx, known);
+                            let error = pump(&stream, &mut sender, backlog, &mut events).await;
                             info!(%to, %error, "connection lost");
                             sender.down(&mut events);
                         }
@@ -157,10 +160,11 @@ impl SerialPort {
             }
             Source::Listen(listener, client) => {
                 let mut kept = client.borrow().clone();
+                let mut known = tx.sleeps();
                 loop {
-                    let stream = match kept.take() {
+                    let (stream, backlog) = match kept.take() {
                         Some(stream) => match drain(&*stream, &tx).await {
-                            Ok(()) => stream,
+                            Ok(()) => (stream, Backlog::new(&tx)),
                             Err(error) => {
                                 info!(%error, "the client disconnected meanwhile");
                                 client.take();
@@ -173,12 +177,13 @@ impl SerialPort {
                             tcp_options::enable_keepalive(&stream);
                             let stream = Rc::new(stream);
                             client.replace(Some(Rc::clone(&stream)));
-                            stream
+                            (stream, Backlog::accepted(&tx, known))
                         }
                     };
+                    known = tx.sleeps();
                     sender.up(&mut events);
                     tokio::select! {
-                        error = pump(&*stream, &mut sender, &mut events) => {
+                        error = pump(&*stream, &mut sender, backlog, &mut events) => {
                             info!(peer = %stream::peer_of(&stream), %error, "client disconnected");
                         }
                         () = refuse_all(&listener, &tx) => {}
@@ -227,10 +232,10 @@ fn open_serial(path: &str, settings: Rs485) -> io::Result<SerialStream> {
 async fn pump<D: ByteStream>(
     device: &D,
     sender: &mut Sender,
+    mut backlog: Backlog,
     events: &mut impl FnMut(PortEvent<'_>),
 ) -> io::Error {
     let mut buf = vec![0; BACKLOG_CHUNK];
-    let mut backlog = Backlog::new(&sender.tx);
     loop {
         if backlog.has_slept(&sender.tx) {
             discard_backlog(device, &sender.tx, &mut backlog, &mut buf, events);

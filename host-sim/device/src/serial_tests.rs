@@ -289,5 +289,34 @@ fn what_waited_in_a_connection_is_dropped_by_a_task_that_runs_late() {
     });
 }
 
+/// A client that connected meanwhile was not even accepted then.
+#[test]
+fn what_waited_in_a_connection_that_waited_itself_is_dropped() {
+    run(async |_| {
+        let port = Running::start("tcp-listen:127.0.0.1:0", serial(115_200)).await;
+        tokio::task::yield_now().await;
+        for _ in 0..MANY_ROUNDS {
+            let mut client = std::net::TcpStream::connect(&port.place).unwrap();
+            client.write_all(OLD).unwrap();
+            port.tx.note_sleep(now());
+            // The machine does something else.
+            std::thread::sleep(StdDuration::from_millis(2 * STALE.as_millis()));
+            port.expect(Seen::Up).await;
+            let mut bytes = Vec::new();
+            while !bytes.ends_with(b"!") {
+                tokio::time::sleep(StdDuration::from_millis(20)).await;
+                client.write_all(b"n!").unwrap();
+                while let Some(seen) = port.try_next() {
+                    let Seen::Bytes(more) = seen else { panic!("{seen:?}") };
+                    bytes.extend(more);
+                }
+            }
+            assert!(bytes.iter().all(|byte| b"n!".contains(byte)), "{}", bytes.escape_ascii());
+            drop(client);
+            while port.next().await.1 != Seen::Down {}
+        }
+    });
+}
+
 /// Two tasks of a select are ready then, and it takes either.
 const MANY_ROUNDS: usize = 8;
