@@ -401,7 +401,13 @@ async fn serve_all(
     let mut tasks = JoinSet::new();
     for client in clients.borrow().iter() {
         let backlog = Backlog::new(tx);
-        tasks.spawn_local(serve_client(Rc::clone(client), Rc::clone(clients), bus.join(), Rc::clone(tx), backlog));
+        tasks.spawn_local(serve_client(
+            Rc::clone(client),
+            Rc::clone(clients),
+            bus.join(),
+            Rc::clone(tx),
+            backlog,
+        ));
     }
     let mut known = tx.sleeps();
     loop {
@@ -430,7 +436,13 @@ async fn serve_all(
 }
 
 /// Serves a client on TCP until it has gone.
-async fn serve_client(client: Rc<Client>, clients: Rc<Clients>, node: Node, tx: Rc<PortTx>, backlog: Backlog) {
+async fn serve_client(
+    client: Rc<Client>,
+    clients: Rc<Clients>,
+    node: Node,
+    tx: Rc<PortTx>,
+    backlog: Backlog,
+) {
     let peer = stream::peer_of(&client.stream);
     let error = serve(&client.stream, &client.session, &node, &tx, backlog).await;
     info!(%peer, %error, "slcan client disconnected");

@@ -7,6 +7,7 @@ use proto_core::wire::can::CanId;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
+use super::super::exchange::STALE;
 use super::super::port::{Port, PortBus};
 use super::super::test_kit::{Client, Running, Seen, run};
 use super::super::wire::{MAX_QUEUED, frame_bits};
@@ -244,6 +245,35 @@ fn a_client_that_reads_loses_nothing_of_an_unpaced_burst() {
         one.write_all(&b"t0010\r".repeat(2_000)).await.unwrap();
         assert_eq!(received_ids(&mut two, 2_000).await, [1; 2_000]);
         assert_eq!(port.tx.counters().dropped, 0);
+    });
+}
+
+/// A client that connected and sent while the process slept was not even accepted then.
+#[test]
+fn what_waited_in_a_connection_that_waited_itself_is_dropped() {
+    run(async |_| {
+        let port = Running::start("slcan-tcp:127.0.0.1:0", BUS).await;
+        port.expect(Seen::Up).await;
+        for _ in 0..4 {
+            let mut client = std::net::TcpStream::connect(&port.place).unwrap();
+            client.write_all(b"C\rS6\rO\rt0011AA\r").unwrap();
+            port.tx.note_sleep(now());
+            // The machine does something else.
+            std::thread::sleep(std::time::Duration::from_millis(2 * STALE.as_millis()));
+            let id = loop {
+                client.write_all(b"t0021BB\r").unwrap();
+                tokio::time::sleep(std::time::Duration::from_millis(20)).await;
+                match port.try_next() {
+                    Some(Seen::Frame(frame)) => break frame.id(),
+                    other => assert_eq!(other, None),
+                }
+            };
+            assert_eq!(id, CanId::Standard(2));
+            drop(client);
+            // Those that it sent while it was waited for.
+            tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+            while port.try_next().is_some() {}
+        }
     });
 }
 
