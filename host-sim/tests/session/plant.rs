@@ -168,7 +168,7 @@ impl Releases {
     }
 
     /// An update of what was built, changed in both links and signed with this key; returns its path.
-    fn sign(&self, name: &str, key: &str, change: impl Fn(&mut Vec<u8>, u32)) -> String {
+    fn sign(&self, name: &str, key: &str, change: impl Fn(&mut [u8], u32)) -> String {
         let linked = SLOTS.map(|(slot, start)| {
             let built = Surroundings::named(&format!("CHIP_SLOT_{slot:?}"));
             let mut elf =
@@ -188,7 +188,7 @@ impl Releases {
 }
 
 /// Another text in its place.
-fn another_text(elf: &mut Vec<u8>, _: u32) {
+fn another_text(elf: &mut [u8], _: u32) {
     let places: Vec<_> =
         (0..elf.len() - TEXT.len()).filter(|at| elf[*at..].starts_with(TEXT.as_bytes())).collect();
     assert!(!places.is_empty(), "the firmware has no text {TEXT:?}");
@@ -199,7 +199,7 @@ fn another_text(elf: &mut Vec<u8>, _: u32) {
 
 /// It asks for a reset with its first instructions (Armv7-M ARM A7.7): ldr r0, [pc, #4]; ldr r1, [pc, #8];
 /// str r1, [r0]; b .
-fn that_does_not_run(elf: &mut Vec<u8>, start: u32) {
+fn that_does_not_run(elf: &mut [u8], start: u32) {
     let vectors = place(elf, start);
     let reset = number(elf, vectors + 4) & !1;
     let mut code: Vec<u16> = Vec::new();
@@ -230,7 +230,7 @@ fn number(bytes: &[u8], at: usize) -> u32 {
     u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]])
 }
 
-fn unchanged(_: &mut Vec<u8>, _: u32) {}
+fn unchanged(_: &mut [u8], _: u32) {}
 
 #[test]
 #[ignore = "needs CHIP_UNICORN, CHIP_LOADER, CHIP_SLOT_A, CHIP_SLOT_B and qemu-system-arm"]

@@ -4,10 +4,10 @@
 //! One update from slot A to slot B is recorded. The flash that a cut leaves is made from what was recorded, and a
 //! board starts with it: it has to run something whole, with its configuration, and to finish the update.
 //!
-//! With `CHIP_CUTS=N` all operations are cut that are no plain word of the image, and N of those, with every kind of torn
-//! word; for each stage and kind one board finishes its update. `CHIP_CUTS_FROM=M` leaves out what comes before operation
-//! M. Without both the kinds take turns, of the stages in which the loader checks a whole firmware only the last operation
-//! is cut, and the boards finish of which the least is missing, and one of which all is.
+//! With `CHIP_CUTS=N` all operations are cut that are no plain word of the image, and N of those, with every kind of
+//! torn word; for each stage and kind one board finishes its update. `CHIP_CUTS_FROM=M` leaves out what comes before
+//! operation M. Without `CHIP_CUTS` the kinds take turns. Of the stages after which the loader checks a whole firmware,
+//! which takes long here, only the last operation is cut then; those boards finish, and one that is sent all again.
 
 use std::collections::BTreeSet;
 

@@ -1,5 +1,5 @@
-//! Firmware on trial that does not run as it should (docs/update.md section 4), made of the real one: it hangs, crashes,
-//! is restarted by a person. The board goes back to the one before, and says how the trial has ended.
+//! Firmware on trial that does not run as it should (docs/update.md section 4), made of the real one: it hangs, it
+//! crashes, a person restarts it. The board goes back to the one before, and says how the trial has ended.
 
 use chip::device::{MILLI, SECOND};
 use recipe_update::{IMAGE_OFFSET, NUCLEO_H743ZI as BOARD, Slot};
