@@ -30,6 +30,8 @@ pub struct Slots<S> {
     pub running: Slot,
     /// The public key of the loader.
     pub key: [u8; 32],
+    /// The flash of that slot: only read.
+    pub own: S,
     /// The flash of the other slot.
     pub free: S,
 }
@@ -137,13 +139,17 @@ pub struct Updates<S> {
     incoming: Option<Incoming>,
     /// What the other slot holds, whole.
     other: Option<Header>,
+    build: Option<Build>,
 }
 
 impl<S: SlotFlash> Updates<S> {
     /// Nothing is being received; the other slot is looked at. `None` if the board's name is none.
     pub fn new(site: Site<S>) -> Option<Self> {
         let board = BoardName::parse(site.board)?;
-        let mut updates = Self { board, slots: site.slots, receive: None, incoming: None, other: None };
+        let slots = site.slots;
+        let own = slots.as_ref().ok().and_then(|slots| header_of(&slots.own, slots.running, &board).ok());
+        let build = own.as_ref().map(build_of);
+        let mut updates = Self { board, slots, receive: None, incoming: None, other: None, build };
         updates.look();
         Some(updates)
     }
@@ -173,6 +179,11 @@ impl<S: SlotFlash> Updates<S> {
     /// Why this firmware takes no update.
     pub fn cannot(&self) -> Option<&'static str> {
         self.slots.as_ref().err().copied()
+    }
+
+    /// Which build runs; `None` if its slot has no header.
+    pub fn build(&self) -> Option<Build> {
+        self.build
     }
 
     /// What is being received, or was.
@@ -356,6 +367,14 @@ impl<S: SlotFlash> Updates<S> {
             false => Err(Refused::Format(version)),
         }
     }
+}
+
+/// The first bytes of the SHA-512 of an image. They tell builds of one version apart.
+pub type Build = [u8; 8];
+
+/// The build that this header is of.
+pub fn build_of(header: &Header) -> Build {
+    header.hash().first_chunk().copied().unwrap_or_default()
 }
 
 /// Length of header and image.

@@ -20,6 +20,7 @@ use crate::board::{Board, FLASH, FLASH_SIZE, Halt};
 use crate::device::*;
 use crate::devices::Devices;
 use crate::exception::{enter, is_return, leave, masks};
+use crate::models::flash::Contents;
 use crate::models::rcc::Cause;
 use crate::models::scs::HARD_FAULT;
 use crate::program::Program;
@@ -165,12 +166,27 @@ impl Chip {
         self.close_page(address)
     }
 
+    /// Whether all bytes from an address on are in flash.
+    pub fn has_flash(&self, address: u32, len: usize) -> bool {
+        let room = address.checked_sub(FLASH).and_then(|offset| FLASH_SIZE.checked_sub(offset));
+        room.is_some_and(|room| len <= room as usize)
+    }
+
     /// Programs flash without checks, like a debugger.
     ///
     /// # Panics
     /// There is no such flash.
     pub fn load(&mut self, address: u32, bytes: &[u8]) {
         self.board.devices.flash.load(address - FLASH, bytes);
+        self.restore_flash().expect("there is flash");
+    }
+
+    /// Flash holds this from now on.
+    ///
+    /// # Panics
+    /// There is no such flash.
+    pub fn hold(&mut self, contents: &Contents) {
+        self.board.devices.flash.hold(contents);
         self.restore_flash().expect("there is flash");
     }
 

@@ -1,6 +1,9 @@
 //! `chip ELF [IMAGE] [--ms N] [--last N]`: runs the firmware for N ms of virtual time (default 2000) and
 //! prints its log; at the end the program counter, the last register accesses, and the speed of the run.
 //!
+//! With a loader as ELF, `--load ADDRESS=FILE` writes what is in a slot, as `host-sim ctl inspect --slot` makes it, and
+//! `--knows ELF` names the programs that run there.
+//!
 //! `chip ELF [IMAGE] --realtime [...]`: runs it in real time until it is interrupted, with sockets for its serial
 //! lines, CAN bus and Ethernet (docs/chip.md section 5).
 
@@ -14,8 +17,8 @@ use chip::realtime::{Ended, Runner, Wiring, exec_if_requested};
 use chip::{Chip, Program, Stopped};
 use signal_hook::consts::{SIGINT, SIGTERM};
 
-const USAGE: &str = "usage: chip ELF [IMAGE] [--ms N] [--last N]
-       chip ELF [IMAGE] --realtime [--rs485 PLACE [--rs485 PLACE]] [--can PLACE]
+const USAGE: &str = "usage: chip ELF [IMAGE] [--load ADDRESS=FILE].. [--knows ELF].. [--ms N] [--last N]
+       chip ELF [IMAGE] [--load ADDRESS=FILE].. [--knows ELF].. --realtime [--rs485 PLACE [--rs485 PLACE]] [--can PLACE]
             [--network OPTIONS [--qmp PATH]] [--control PLACE] [--last N]
 PLACE is HOST:PORT or the path of a socket; OPTIONS are those of QEMU's '-netdev user', or ''";
 
@@ -29,19 +32,32 @@ fn main() -> ExitCode {
 
 struct Options {
     files: Vec<String>,
+    /// Bytes for flash, by their address.
+    loads: Vec<(u32, String)>,
+    /// Programs that the first one runs.
+    known: Vec<String>,
     ms: u64,
     last: usize,
     wiring: Option<Wiring>,
 }
 
 fn options(mut args: impl Iterator<Item = String>) -> Result<Options, String> {
-    let mut options = Options { files: Vec::new(), ms: 2_000, last: 20, wiring: None };
+    let mut options = Options {
+        files: Vec::new(),
+        loads: Vec::new(),
+        known: Vec::new(),
+        ms: 2_000,
+        last: 20,
+        wiring: None,
+    };
     let (mut wiring, mut is_wired) = (Wiring::default(), false);
     while let Some(arg) = args.next() {
         let mut value = || args.next().ok_or_else(|| format!("{arg} needs a value"));
         let number = |value: String| value.parse().map_err(|_| format!("{value}: not a number"));
         is_wired |= ["--rs485", "--can", "--network", "--qmp", "--control"].contains(&arg.as_str());
         match arg.as_str() {
+            "--load" => options.loads.push(load(&value()?)?),
+            "--knows" => options.known.push(value()?),
             "--ms" => options.ms = number(value()?)?,
             "--last" => options.last = number(value()?)? as usize,
             "--realtime" => options.wiring = Some(Wiring::default()),
@@ -62,13 +78,31 @@ fn options(mut args: impl Iterator<Item = String>) -> Result<Options, String> {
     Ok(options)
 }
 
+/// An address in hexadecimal, and the file for it.
+fn load(value: &str) -> Result<(u32, String), String> {
+    let parts = value.split_once('=').and_then(|(address, file)| {
+        let address = u32::from_str_radix(address.trim_start_matches("0x"), 16).ok()?;
+        Some((address, file.to_owned()))
+    });
+    parts.ok_or_else(|| format!("{value}: not an address and a file, as 0x08020000=slot-a.bin"))
+}
+
 fn run() -> Result<ExitCode, String> {
     let options = options(std::env::args().skip(1))?;
     let [elf, image @ ..] = options.files.as_slice() else { return Err(USAGE.into()) };
     let read = |file: &String| std::fs::read(file).map_err(|error| format!("{file}: {error}"));
-    let program: &'static Program = Box::leak(Box::new(Program::read(&read(elf)?)?));
+    let parse = |file: &String| Program::read(&read(file)?);
+    let known = options.known.iter().map(parse).collect::<Result<Vec<_>, _>>()?;
+    let program: &'static Program = Box::leak(Box::new(parse(elf)?.knowing(known)));
     let image = image.first().map(read).transpose()?.unwrap_or_default();
     let mut chip = Chip::new(program, &image)?;
+    for (address, file) in &options.loads {
+        let bytes = read(file)?;
+        if !chip.has_flash(*address, bytes.len()) {
+            return Err(format!("{file}: {} bytes at {address:08X} are not in flash", bytes.len()));
+        }
+        chip.load(*address, &bytes);
+    }
     let _ = chip.accesses(options.last).count();
     match &options.wiring {
         Some(wiring) => in_real_time(chip, wiring, options.last),

@@ -1,8 +1,9 @@
-//! The proof that nothing in proto-core, recipe-store or recipe-remote panics: an image in which every entry of theirs
-//! that sees what a device, a peer, a file or flash sent is called with values that the compiler knows nothing about, and
-//! whose panic handler needs a symbol that does not exist. It links only when the optimiser has removed
-//! every panic. `.ci/run` builds it as the firmware is built, and prints how much stack each of these
-//! functions takes (docs/architecture.md section 4).
+//! The proof that nothing in proto-core, recipe-store, recipe-update or recipe-remote panics: an image in which every
+//! entry of theirs that sees what a device, a peer, a file or flash sent is called with values that the compiler knows
+//! nothing about, and whose panic handler needs a symbol that does not exist. It links only when the optimiser has
+//! removed every panic. With recipe-update, whose signatures are a library's, every call of a panic is looked at
+//! instead. `.ci/run` builds it as the firmware is built, and prints how much stack each of these functions takes
+//! (docs/architecture.md section 4).
 //!
 //! It is never run on a board. On a host the same calls are made once, which shows little.
 #![cfg_attr(target_os = "none", no_std, no_main)]
@@ -16,6 +17,7 @@ mod remote;
 mod rtu;
 mod state;
 mod store;
+mod update;
 mod words;
 mod zeros;
 
@@ -50,8 +52,11 @@ fn exercise() {
         remote::all();
         store::all();
     }
+    if matches!(VARIANT, Variant::Signed) {
+        update::all();
+    }
     match VARIANT {
-        Variant::Proof | Variant::Core | Variant::Shown => {}
+        Variant::Proof | Variant::Core | Variant::Shown | Variant::Signed => {}
         Variant::Provoked => _ = black_box(bytes()[any(7_usize)]),
         Variant::Words => words::all(),
     }
@@ -70,6 +75,8 @@ enum Variant {
     Shown,
     /// The same, with what errors say of themselves: `core` prints it, and has panics of its own.
     Words,
+    /// The same, with recipe-update: its signatures and hashes are a library's, which has panics of its own.
+    Signed,
 }
 
 const VARIANT: Variant = match option_env!("NO_PANIC") {
@@ -78,6 +85,7 @@ const VARIANT: Variant = match option_env!("NO_PANIC") {
         b"provoked" => Variant::Provoked,
         b"shown" => Variant::Shown,
         b"words" => Variant::Words,
+        b"signed" => Variant::Signed,
         _ => Variant::Proof,
     },
     None => Variant::Proof,
@@ -105,7 +113,7 @@ mod image {
         }
         match super::VARIANT {
             super::Variant::Proof | super::Variant::Core | super::Variant::Provoked => proto_core_can_panic(),
-            super::Variant::Shown | super::Variant::Words => loop {},
+            super::Variant::Shown | super::Variant::Words | super::Variant::Signed => loop {},
         }
     }
 

@@ -2,12 +2,15 @@
 
 use core::hint::black_box;
 
-use recipe_store::{Adoption, Flash, Geometry, Key, Marks, Place, Put, Step, Store, Trial, Word};
+use recipe_store::{
+    Adoption, Flash, Geometry, Key, Marks, Place, Put, Slot, SlotMarks, SlotTrial, Step, Store, Trial, Word,
+    newest,
+};
 
 use crate::{any, bytes, room};
 
 /// Flash of a size and contents that the compiler knows nothing about.
-struct Any;
+pub(crate) struct Any;
 
 impl Flash for Any {
     fn geometry(&self) -> Geometry {
@@ -31,6 +34,7 @@ impl Flash for Any {
 pub(crate) fn all() {
     if let Some(mut store) = store_mount() {
         store_questions(black_box(&store));
+        store_move(black_box(&store));
         store_changes(black_box(&mut store));
     }
 }
@@ -50,6 +54,17 @@ fn store_questions(store: &Store) {
     black_box(store.is_adopted(any(1), any(2)));
 }
 
+/// Which of two places counts, and the way from one to the other.
+#[inline(never)]
+fn store_move(store: &Store) {
+    if let Ok(newest) = newest(&Any, &Any) {
+        black_box((newest.store.slots(), newest.store.generation(), newest.side, newest.may_move));
+    }
+    let mut relocation = store.relocate();
+    while !matches!(black_box(relocation.next(&Any, &Any)), Step::End(_)) {}
+    black_box(relocation.moved().is_some());
+}
+
 #[inline(never)]
 fn store_changes(store: &mut Store) {
     let trial = any(Some(Trial { number: 3, attempts: 1, confirm_s: 1 }));
@@ -59,6 +74,9 @@ fn store_changes(store: &mut Store) {
     let _ = store.put(any(Key::Counter(1)), any(2), bytes()).map(store_put);
     let _ = store.set_access_key(any(&[0; 16])).map(store_put);
     let _ = store.set_counter(any(1), any(2)).map(store_put);
+    let on_trial = SlotTrial { slot: Slot::B, attempts: 3, confirm_s: 60, before: 0 };
+    let slots = any(SlotMarks { good: Some(Slot::A), trial: Some(on_trial), last: None });
+    let _ = store.mark_slots(slots).map(store_put);
     let _ = store.set_birth_sequence(any(1)).map(store_put);
     if let Ok(Adoption::Write(put)) = store.adopt(any(1), bytes()) {
         store_put(put);

@@ -28,7 +28,7 @@ use super::watchdog::Pulse;
 use crate::clock::now;
 use crate::fmt::Text;
 use crate::kept::{Kept, StoreFlash};
-use crate::update::{self, Incoming, Updates, WaitsFor, Works};
+use crate::update::{self, Build, Incoming, Updates, WaitsFor, Works};
 use crate::{error, info, warn};
 
 /// What a client asks for.
@@ -96,6 +96,8 @@ pub struct FirmwareView {
     pub board: BoardName,
     /// The slot that the program runs in.
     pub slot: Option<Slot>,
+    /// Which build runs.
+    pub build: Option<Build>,
     /// Why it takes no update.
     pub cannot: Option<&'static str>,
     /// The public key of the loader.

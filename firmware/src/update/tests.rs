@@ -55,10 +55,15 @@ impl SlotFlash for Ram {
     }
 }
 
+/// A slot of which nothing is known.
+fn unknown() -> Ram {
+    Ram { words: vec![[0; WORD]; 3 * usize::from(WORDS)], erases: 0, worn: None }
+}
+
 fn board() -> Updates<Ram> {
-    let free = Ram { words: vec![[0; WORD]; 3 * usize::from(WORDS)], erases: 0, worn: None };
     let key = PublicKey::of_seed(&SEED).bytes();
-    Updates::new(Site { board: "test", slots: Ok(Slots { running: Slot::A, key, free }) }).unwrap()
+    let slots = Slots { running: Slot::A, key, own: unknown(), free: unknown() };
+    Updates::new(Site { board: "test", slots: Ok(slots) }).unwrap()
 }
 
 fn image() -> Vec<u8> {

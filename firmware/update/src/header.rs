@@ -77,10 +77,12 @@ impl Version {
 
     /// Three numbers with dots between, such as `0.3.0`; `None` for other texts.
     pub fn parse(text: &str) -> Option<Self> {
-        let mut parts = text.split('.').map(|part| {
-            let is_number = part.bytes().all(|byte| byte.is_ascii_digit());
-            let is_number = is_number && (part == "0" || !part.starts_with('0'));
-            part.parse().ok().filter(|_| is_number)
+        let mut parts = text.as_bytes().split(|byte| *byte == b'.').map(|part| {
+            let is_number = match part {
+                [b'1'..=b'9', rest @ ..] => rest.iter().all(u8::is_ascii_digit),
+                other => other == b"0",
+            };
+            str::from_utf8(part).ok()?.parse().ok().filter(|_| is_number)
         });
         let version = Self::new(parts.next()??, parts.next()??, parts.next()??);
         parts.next().is_none().then_some(version)

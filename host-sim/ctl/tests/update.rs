@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use recipe_ctl::update::{Downgrade, Plan, update};
 use recipe_ctl::{Client, Failure, Stop, Update, Verdict};
+use recipe_remote::key::Hex;
 use recipe_update::{
     BoardName, FILE_HEAD, Formats, HEADER, Header, Parts, PublicKey, Slot, Version, file_head, link_padding,
 };
@@ -26,6 +27,8 @@ struct Board {
     lost: usize,
     /// Links that are up on trial.
     links: usize,
+    /// It runs this build of 0.3.0.
+    build: Option<&'static str>,
     requests: Vec<String>,
 }
 
@@ -37,6 +40,9 @@ impl Board {
         let mut text = format!(
             "{{\"board\":\"nucleo-h743zi\",\"version\":\"0.2.0\",\"slot\":\"{slot}\",\"key\":\"{key}\""
         );
+        if let Some(digits) = self.build {
+            text = text.replace("0.2.0", "0.3.0") + &format!(",\"sha512\":\"{digits}\"");
+        }
         if self.on_trial {
             text += ",\"trial\":{\"left_s\":50.5,\"waits_for\":\"time\"}";
         }
@@ -198,6 +204,17 @@ fn it_is_confirmed_if_the_board_does_as_well_as_before() {
     let (state, client) = board(Board { links: 0, ..Board::default() });
     let answer = update(&client, &file("nucleo-h743zi", &SEED), plan, &mut |_| {}).unwrap();
     assert_eq!((answer.verdict(), state.lock().unwrap().confirmed), (Verdict::Trouble, false));
+}
+
+#[test]
+fn the_build_that_runs_is_not_sent_and_another_one_of_the_version_is() {
+    let update_file = file("nucleo-h743zi", &SEED);
+    let same = Hex(&update_file.links()[0].header.hash()[..8]).to_string().leak();
+    for (build, is_sent) in [(&*same, false), ("0b0b0b0b0b0b0b0b", true)] {
+        let (board, client) = board(Board { build: Some(build), ..Board::default() });
+        let answer = update(&client, &update_file, SEND, &mut |_| {}).unwrap();
+        assert_eq!((answer.verdict(), board.lock().unwrap().image == image()), (Verdict::Well, is_sent));
+    }
 }
 
 #[test]

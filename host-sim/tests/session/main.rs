@@ -6,6 +6,8 @@
 //!
 //! `HOST_SIM_FIRMWARE=ELF cargo test -p host-sim --test session -- --include-ignored on_a_board`
 //! `HOST_SIM_NUCLEO=ELF cargo test -p host-sim --test session -- --include-ignored on_a_nucleo`
+//!
+//! And of two boards that get another firmware ([`plant`]).
 
 mod board;
 mod commands;
@@ -13,6 +15,7 @@ mod ctl;
 mod host;
 mod nucleo;
 mod panel;
+mod plant;
 mod qemu;
 mod robot;
 mod script;

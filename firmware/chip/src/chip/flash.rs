@@ -54,8 +54,9 @@ impl Chip {
     pub(super) fn step_in_page(&mut self, address: u32) {
         self.pages.insert(page(address), Access::Full);
         self.core.protect(page(address), PAGE, false).expect("there is flash");
-        // The block was translated without a stop after one instruction.
-        self.core.invalidate(self.pc, 4);
+        // This block was translated without a stop after one instruction, and so was that of the next instruction if
+        // a run has ever begun there.
+        self.core.invalidate(self.pc, 8);
         self.board.is_single_step = true;
         self.core.run_one(self.pc, &mut self.board);
         self.board.is_single_step = false;

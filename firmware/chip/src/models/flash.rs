@@ -6,7 +6,9 @@
 //! Refused: wrong keys, writes with LOCK set or without PG, incomplete flash words, register changes while the
 //! bank is busy, and too few wait states for the clock.
 
-use std::collections::BTreeSet;
+mod contents;
+
+pub use contents::{Contents, Operation};
 
 use crate::device::*;
 
@@ -63,17 +65,9 @@ pub enum Torn {
 
 /// An operation of a bank.
 #[derive(Debug, Clone, PartialEq, Eq)]
-enum Work {
-    Erase { first: u32, until: Picos },
-    Program { address: u32, bytes: [u8; 32], until: Picos },
-}
-
-impl Work {
-    fn until(&self) -> Picos {
-        match self {
-            Self::Erase { until, .. } | Self::Program { until, .. } => *until,
-        }
-    }
+struct Work {
+    operation: Operation,
+    until: Picos,
 }
 
 #[derive(Debug, Default)]
@@ -92,16 +86,14 @@ struct Half {
 pub struct Flash {
     bank: Bank,
     halves: [Half; 2],
-    cells: Vec<u8>,
-    /// Offsets of the flash words whose ECC does not match.
-    torn: BTreeSet<u32>,
-    /// Offsets of those that only look blank.
-    only_looks_blank: BTreeSet<u32>,
+    contents: Contents,
     /// What interrupted operations leave.
     pub leaves: Torn,
     /// The power fails during the operation of this number ([`Flash::operations`]).
     pub fails_during: Option<u64>,
     operations: u64,
+    /// If it is there, each operation is noted in it when it begins.
+    pub journal: Option<Vec<Operation>>,
     /// Ranges that have changed since [`Flash::take_changed`].
     changed: Vec<(u32, u32)>,
     /// Number of erased sectors.
@@ -114,12 +106,11 @@ impl Flash {
         Self {
             bank: Bank::new(&REGISTERS),
             halves: Default::default(),
-            cells: vec![0xFF; 2 * BANK as usize],
-            torn: BTreeSet::new(),
-            only_looks_blank: BTreeSet::new(),
+            contents: Contents::erased(),
             leaves: Torn::Fault,
             fails_during: None,
             operations: 0,
+            journal: None,
             changed: Vec::new(),
             erases: 0,
         }
@@ -127,27 +118,33 @@ impl Flash {
 
     /// Programs bytes without checks, like a debugger, which erases before. What was torn there is whole.
     pub fn load(&mut self, offset: u32, bytes: &[u8]) {
-        self.blank(offset, bytes.len() as u32);
-        self.put(offset, bytes);
-    }
-
-    fn put(&mut self, offset: u32, bytes: &[u8]) {
-        self.cells[offset as usize..][..bytes.len()].copy_from_slice(bytes);
+        self.contents.blank(offset, bytes.len() as u32);
+        self.contents.put(offset, bytes);
     }
 
     /// The contents of both banks.
     pub fn cells(&self) -> &[u8] {
-        &self.cells
+        self.contents.cells()
+    }
+
+    /// All that flash holds.
+    pub fn contents(&self) -> &Contents {
+        &self.contents
+    }
+
+    /// It holds this from now on.
+    pub(crate) fn hold(&mut self, contents: &Contents) {
+        self.contents.clone_from(contents);
     }
 
     /// Makes the ECC of a flash word invalid.
     pub fn tear(&mut self, offset: u32) {
-        self.torn.insert(offset & !(WORD - 1));
+        self.contents.tear(offset);
     }
 
     /// Offsets of the flash words whose ECC does not match.
     pub fn torn(&self) -> impl Iterator<Item = u32> {
-        self.torn.iter().copied()
+        self.contents.torn()
     }
 
     /// The ranges that have changed since the last call: offset and length.
@@ -175,45 +172,11 @@ impl Flash {
     /// A power failure: tears the flash word being programmed. Of the sector being erased, some words are as
     /// before, some erased, and the others torn.
     pub fn lose_power(&mut self) {
-        for index in 0..self.halves.len() {
-            match self.halves[index].work.take() {
-                Some(Work::Program { address, bytes, .. }) => self.interrupt(address, &bytes),
-                Some(Work::Erase { first, .. }) => {
-                    for address in (first..first + SECTOR).step_by(WORD as usize) {
-                        // Neighbours differ, and each cut differs from the one before.
-                        match (address / WORD + self.operations as u32).wrapping_mul(0x9E37_79B9) >> 30 {
-                            0 => {}
-                            1 => self.blank(address, WORD),
-                            _ => self.interrupt(address, &[0xFF; WORD as usize]),
-                        }
-                    }
-                }
-                None => {}
+        for half in &mut self.halves {
+            if let Some(Work { operation, .. }) = half.work.take() {
+                self.contents.interrupt(&operation, self.leaves, self.operations as u32);
             }
         }
-    }
-
-    /// What is left of a word that would have become `bytes`.
-    fn interrupt(&mut self, address: u32, bytes: &[u8; WORD as usize]) {
-        match self.leaves {
-            Torn::Fault => _ = self.torn.insert(address),
-            Torn::Blank => {
-                self.blank(address, WORD);
-                self.only_looks_blank.insert(address);
-            }
-            Torn::Half => {
-                let cells = &mut self.cells[address as usize..][..WORD as usize];
-                for (index, (cell, byte)) in cells.iter_mut().zip(bytes).enumerate() {
-                    *cell = byte | if index % 3 == 0 { 0xA5 } else { 0 };
-                }
-            }
-        }
-    }
-
-    fn blank(&mut self, first: u32, len: u32) {
-        self.cells[first as usize..][..len as usize].fill(0xFF);
-        self.torn.retain(|word| !(first..first + len).contains(word));
-        self.only_looks_blank.retain(|word| !(first..first + len).contains(word));
     }
 
     /// Checks the wait states for this bus clock, at VOS1.
@@ -262,12 +225,10 @@ impl Flash {
             half.collected = Some((address, content, there));
             return Ok(());
         }
-        let is_blank = self.cells[word as usize..][..32].iter().all(|byte| *byte == 0xFF);
-        if !is_blank || self.torn.contains(&word) {
+        if !self.contents.takes_a_write(word) {
             return refuse("the flash word was written before; it is to be erased first");
         }
-        half.work = Some(Work::Program { address: word, bytes: content, until: now + PROGRAM });
-        self.operations += 1;
+        self.begin(index, Operation::Program { address: word, bytes: content }, now + PROGRAM);
         Ok(())
     }
 
@@ -289,8 +250,7 @@ impl Flash {
             (false, _) => Ok(()),
             (true, SER) => {
                 let first = BANK * index as u32 + SECTOR * (value >> 8 & 7);
-                self.halves[index].work = Some(Work::Erase { first, until: now + ERASE });
-                self.operations += 1;
+                self.begin(index, Operation::Erase { first }, now + ERASE);
                 Ok(())
             }
             _ => refuse("START without SER alone is not modelled"),
@@ -312,20 +272,22 @@ impl Flash {
         Ok(())
     }
 
-    fn finish(&mut self, work: Work) {
-        match work {
-            Work::Erase { first, .. } => {
-                self.blank(first, SECTOR);
+    fn begin(&mut self, index: usize, operation: Operation, until: Picos) {
+        self.halves[index].work = Some(Work { operation, until });
+        self.operations += 1;
+        if let Some(journal) = &mut self.journal {
+            journal.push(operation);
+        }
+    }
+
+    fn finish(&mut self, operation: &Operation) {
+        self.contents.carry_out(operation);
+        match *operation {
+            Operation::Erase { first } => {
                 self.changed.push((first, SECTOR));
                 self.erases += 1;
             }
-            Work::Program { address, bytes, .. } => {
-                if self.only_looks_blank.remove(&address) {
-                    self.torn.insert(address);
-                }
-                self.put(address, &bytes);
-                self.changed.push((address, WORD));
-            }
+            Operation::Program { address, .. } => self.changed.push((address, WORD)),
         }
     }
 }
@@ -371,16 +333,16 @@ impl Peripheral for Flash {
 
     fn advance(&mut self, at: &Context<'_>) -> Result<(), Refusal> {
         for index in 0..2 {
-            if let Some(work) = self.halves[index].work.take_if(|work| at.now >= work.until()) {
+            if let Some(work) = self.halves[index].work.take_if(|work| at.now >= work.until) {
                 self.halves[index].flags |= EOP;
-                self.finish(work);
+                self.finish(&work.operation);
             }
         }
         Ok(())
     }
 
     fn deadline(&self, _: &Context<'_>) -> Option<Picos> {
-        self.halves.iter().filter_map(|half| half.work.as_ref().map(Work::until)).min()
+        self.halves.iter().filter_map(|half| half.work.as_ref().map(|work| work.until)).min()
     }
 
     /// An operation in progress is interrupted.

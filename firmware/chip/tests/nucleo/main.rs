@@ -7,13 +7,16 @@ mod boot;
 mod can;
 mod cell;
 mod client;
+mod cuts;
 mod faults;
 mod flash;
 mod page;
 mod realtime;
 mod robot;
 mod serial;
+mod slots;
 mod store;
+mod trials;
 mod update;
 
 use bench::Bench;

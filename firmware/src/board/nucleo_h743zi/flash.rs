@@ -1,5 +1,5 @@
-//! The flash of the stores and of the slot that the program does not run in. Both are in the bank that it does not run
-//! from, so it goes on while a sector is erased; only a store that another firmware has left in the wrong bank is read
+//! The flash of the stores and of the slots. What is written, the stores and the slot that the program does not run in,
+//! is in the bank that it does not run from, so it goes on while a sector is erased; only a store that another firmware has left in the wrong bank is read
 //! where the program runs. RM0433, "Embedded Flash memory".
 //!
 //! Not by the driver of `embassy-stm32`: that one copies from flash words that a power cut has torn, which is a
@@ -91,9 +91,12 @@ pub(super) unsafe fn stores() -> Places<Area> {
 pub(super) unsafe fn slots() -> Site<Area> {
     let slots = match (running(), key()) {
         (Some(running), Some(key)) => {
-            let start = BOARD.slot(running.other());
-            let sectors = [0, 1, 2, 3, 4].map(|nth: u32| start + nth * BOARD.sector);
-            Ok(Slots { running, key, free: Area { sectors, count: BOARD.slot_sectors } })
+            let area = |slot: Slot| {
+                let start = BOARD.slot(slot);
+                let sectors = [0, 1, 2, 3, 4].map(|nth: u32| start + nth * BOARD.sector);
+                Area { sectors, count: BOARD.slot_sectors }
+            };
+            Ok(Slots { running, key, own: area(running), free: area(running.other()) })
         }
         (Some(_), None) => Err("there is no loader with a key at the beginning of the flash"),
         (None, _) => {

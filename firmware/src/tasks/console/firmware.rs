@@ -13,7 +13,7 @@ use super::Console;
 use super::answer::{Reply, Room};
 use super::change::{busy, nothing_kept};
 use crate::tasks::keeper::{Desk, FirmwareView};
-use crate::update::{Incoming, Stage, whole_length};
+use crate::update::{Incoming, Stage, build_of, whole_length};
 
 impl Console {
     /// The document, with this status.
@@ -32,6 +32,9 @@ impl Console {
 
 fn write(out: &mut Room<'_>, view: &FirmwareView) -> fmt::Result {
     write!(out, "{{\"board\":\"{}\",\"version\":\"{}\"", view.board, env!("CARGO_PKG_VERSION"))?;
+    if let Some(build) = &view.build {
+        write!(out, ",\"sha512\":\"{}\"", Hex(build))?;
+    }
     if let Some(slot) = view.slot {
         write!(out, ",\"slot\":\"{}\"", letter(slot))?;
     }
@@ -90,8 +93,7 @@ fn write(out: &mut Room<'_>, view: &FirmwareView) -> fmt::Result {
 }
 
 fn write_header(out: &mut Room<'_>, header: &Header) -> fmt::Result {
-    let hash = header.hash().first_chunk::<8>().unwrap_or(&[0; 8]);
-    write!(out, "\"version\":\"{}\",\"sha512\":\"{}\"", header.version(), Hex(hash))
+    write!(out, "\"version\":\"{}\",\"sha512\":\"{}\"", header.version(), Hex(&build_of(header)))
 }
 
 fn letter(slot: Slot) -> char {

@@ -85,6 +85,7 @@ impl<F: StoreFlash, S: SlotFlash> Keeper<'_, F, S> {
         self.desk.firmware.set(Some(FirmwareView {
             board: *updates.board(),
             slot: updates.running(),
+            build: updates.build(),
             cannot: updates.cannot(),
             key: updates.key(),
             marks: self.kept.slots(),

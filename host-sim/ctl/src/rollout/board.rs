@@ -15,7 +15,6 @@ use crate::update::{Downgrade, Firmware, Health, begin_trial, confirm, fitting, 
 pub struct Real<'a> {
     member: &'a Member,
     update: &'a Update,
-    version: String,
     timeout: Duration,
     trial_s: u32,
     downgrade: Downgrade,
@@ -43,11 +42,10 @@ pub fn real_boards<'a>(
     trial_s: u32,
     downgrade: Downgrade,
 ) -> Result<Vec<(String, Real<'a>)>, Failure> {
-    let version = version_of(update)?;
+    version_of(update)?;
     let since = Instant::now();
     let board = |member: &'a Member| {
-        let version = version.clone();
-        (member.name().to_owned(), Real { member, update, version, timeout, trial_s, downgrade, since })
+        (member.name().to_owned(), Real { member, update, timeout, trial_s, downgrade, since })
     };
     Ok(members.iter().map(board).collect())
 }
@@ -63,8 +61,7 @@ impl Board for Real<'_> {
     fn inspect(&self) -> Result<Seen, Failure> {
         let client = self.client()?;
         let firmware = Firmware::of(&client)?;
-        let is_this = firmware.version == self.version;
-        let state = match (is_this, &firmware.trial) {
+        let state = match (firmware.is_of(self.update), &firmware.trial) {
             (true, Some(_)) => State::OnTrial,
             (false, Some(_)) => State::OtherOnTrial,
             (true, None) => State::Confirmed,

@@ -24,6 +24,8 @@ enum Kind {
     Program,
     /// Its connection breaks after the first piece.
     Breaks,
+    /// It runs the version of the update, in another build, and says which.
+    Rebuilt,
 }
 
 #[derive(Debug, Default)]
@@ -73,7 +75,7 @@ fn answer(kind: Kind, inside: &mut Inside, asked: &Asked) -> Reply {
                 "ports": { "force": { "state": "working" } },
             }))
         }
-        ("GET", "update") => ok(&said(inside)),
+        ("GET", "update") => ok(&said(kind, inside)),
         ("PUT", "update") => {
             let offset: usize = query.strip_prefix("offset=").unwrap().parse().unwrap();
             if offset > 0 && kind == Kind::Breaks && !std::mem::replace(&mut inside.has_broken, true) {
@@ -83,40 +85,44 @@ fn answer(kind: Kind, inside: &mut Inside, asked: &Asked) -> Reply {
             if offset == inside.received.len() {
                 inside.received.extend(&asked.body);
             }
-            ok(&said(inside))
+            ok(&said(kind, inside))
         }
         ("POST", "update/try") => {
             inside.confirm_s = asked.json()["confirm_s"].as_u64();
             inside.on_trial = true;
-            document(202, "", &said(inside))
+            document(202, "", &said(kind, inside))
         }
         ("POST", "update/confirm") => {
             inside.is_updated = true;
-            end_trial(inside, "confirmed")
+            end_trial(kind, inside, "confirmed")
         }
         ("POST", "update/back") => {
-            let before = document(202, "", &said(inside));
-            let _ = end_trial(inside, "taken_back");
+            let before = document(202, "", &said(kind, inside));
+            let _ = end_trial(kind, inside, "taken_back");
             before
         }
         _ => not_found(),
     }
 }
 
-fn end_trial(inside: &mut Inside, how: &'static str) -> Reply {
+fn end_trial(kind: Kind, inside: &mut Inside, how: &'static str) -> Reply {
     inside.on_trial = false;
     inside.last = Some(how);
-    ok(&said(inside))
+    ok(&said(kind, inside))
 }
 
 /// The document `update`.
-fn said(inside: &Inside) -> Value {
+fn said(kind: Kind, inside: &Inside) -> Value {
     let is_new = inside.is_updated || inside.on_trial;
     let mut said = json!({
         "board": "nucleo-h743zi",
-        "version": if is_new { "0.3.0" } else { "0.2.0" },
+        "version": if is_new || kind == Kind::Rebuilt { "0.3.0" } else { "0.2.0" },
         "slot": if is_new { "B" } else { "A" },
     });
+    if kind == Kind::Rebuilt {
+        let hash = inside.received.get(96..104).filter(|_| is_new).unwrap_or(&[0x0B; 8]);
+        said["sha512"] = hash.iter().map(|byte| format!("{byte:02x}")).collect::<String>().into();
+    }
     if inside.on_trial {
         said["trial"] = json!({ "left_s": 60.0, "waits_for": "controller" });
     }
@@ -178,6 +184,18 @@ fn boards_of_an_inventory_are_updated_and_one_that_does_worse_is_taken_back() {
     assert_eq!(report.entries[0].outcome, Outcome::Already);
     assert_eq!(report.entries[3].outcome, Outcome::Already);
     assert_eq!(boards[0].count("PUT") + boards[0].count("POST"), sent);
+}
+
+#[test]
+fn another_build_of_the_same_version_is_sent_and_the_same_one_is_not() {
+    let folder = Folder::new();
+    let update = folder.update();
+    let boards = [Kind::Rebuilt].map(Board::start);
+    assert_eq!(rolled_out(&boards, &update).entries[0].outcome, Outcome::Updated);
+    let sent = boards[0].count("PUT");
+    assert!(sent > 0);
+    assert_eq!(rolled_out(&boards, &update).entries[0].outcome, Outcome::Already);
+    assert_eq!(boards[0].count("PUT"), sent);
 }
 
 #[test]

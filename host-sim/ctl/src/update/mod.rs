@@ -1,0 +1,143 @@
+//! The firmware of a board: what it says of it (docs/api.md section 9, docs/update.md).
+//!
+//! In: a board's client. Out: what the board says, as [`Firmware`], and whether that is the firmware of a file. The
+//! steps of an update are in `steps`, all of one for one board in `command`.
+
+mod command;
+mod health;
+mod steps;
+
+use recipe_remote::key::{Hex, from_hex};
+use recipe_update::{PublicKey, Slot};
+use serde_json::Value;
+
+use crate::client::Client;
+use crate::failure::Failure;
+use crate::firmware::Update;
+use crate::shown;
+
+pub use command::{Plan, confirmed, shown, taken_back, update};
+pub use health::{Health, health};
+pub use steps::{Progress, begin_trial, confirm, fitting, push, take_back, wait_confirmed};
+
+/// What a board says of its firmware: the document `update`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Firmware {
+    /// Its board, such as `nucleo-h743zi`.
+    pub board: String,
+    /// The version that runs.
+    pub version: String,
+    /// The first digits of the SHA-512 of what runs, which tell builds of one version apart; `None` if the board does
+    /// not say it.
+    pub sha512: Option<String>,
+    /// The slot it runs in; `None` if it takes no updates.
+    pub slot: Option<Slot>,
+    /// Why it takes no update.
+    pub cannot: Option<String>,
+    /// The key that its loader takes firmware of.
+    pub key: Option<PublicKey>,
+    /// What runs is on trial.
+    pub trial: Option<Trial>,
+    /// What is being received, or was.
+    pub incoming: Option<Incoming>,
+    /// The newest trial that has ended: its slot, and how.
+    pub last: Option<(Slot, String)>,
+    /// The document itself.
+    pub document: Value,
+}
+
+/// A firmware that runs on trial.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Trial {
+    /// Seconds until it is taken back.
+    pub left_s: f64,
+    /// What is missing until it confirms itself.
+    pub waits_for: String,
+}
+
+/// A firmware on its way into the free slot.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Incoming {
+    /// `erasing`, `receiving`, `checking`, `ready` or `failed`.
+    pub state: String,
+    /// The first digits of its SHA-512.
+    pub sha512: String,
+    /// Length of header and image in bytes.
+    pub length: u64,
+    /// Where the next piece begins.
+    pub received: u64,
+    /// Why it has failed.
+    pub why: String,
+}
+
+/// Whether an older firmware than the one that runs is taken.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Downgrade {
+    /// The board refuses it.
+    Refused,
+    /// Somebody has asked for it.
+    Allowed,
+}
+
+impl Firmware {
+    /// What the board says.
+    ///
+    /// # Errors
+    /// It is refused, such as by a gateway on a host, or not reached.
+    pub fn of(client: &Client) -> Result<Self, Failure> {
+        Self::read(client, client.json("update")?)
+    }
+
+    pub(super) fn read(client: &Client, document: Value) -> Result<Self, Failure> {
+        let text = |value: &Value| value.as_str().map(|text| shown::line(text).into_owned());
+        let slot = |value: &Value| match value.as_str() {
+            Some("A") => Some(Slot::A),
+            Some("B") => Some(Slot::B),
+            _ => None,
+        };
+        let (Some(board), Some(version)) = (text(&document["board"]), text(&document["version"])) else {
+            return Err(client.refused("its `update` names no board and version; is this a board?"));
+        };
+        let incoming = &document["incoming"];
+        let trial = &document["trial"];
+        Ok(Self {
+            board,
+            version,
+            sha512: text(&document["sha512"]),
+            slot: slot(&document["slot"]),
+            cannot: text(&document["cannot"]),
+            key: document["key"].as_str().and_then(from_hex).and_then(|bytes| PublicKey::parse(&bytes)),
+            trial: trial.is_object().then(|| Trial {
+                left_s: trial["left_s"].as_f64().unwrap_or_default(),
+                waits_for: text(&trial["waits_for"]).unwrap_or_default(),
+            }),
+            incoming: incoming.is_object().then(|| Incoming {
+                state: text(&incoming["state"]).unwrap_or_default(),
+                sha512: text(&incoming["sha512"]).unwrap_or_default(),
+                length: incoming["length"].as_u64().unwrap_or_default(),
+                received: incoming["received"].as_u64().unwrap_or_default(),
+                why: text(&incoming["why"]).unwrap_or_default(),
+            }),
+            last: slot(&document["last"]["slot"]).zip(text(&document["last"]["ended"])),
+            document,
+        })
+    }
+
+    /// Whether it runs the firmware of this file: the same version, and the same build as far as the board says which
+    /// it is.
+    pub fn is_of(&self, update: &Update) -> bool {
+        let links = update.links();
+        let is_version = links.first().is_some_and(|link| link.header.version().to_string() == self.version);
+        is_version && self.is_build_of(update) != Some(false)
+    }
+
+    /// Whether what runs is the image of this file for its slot; `None` if the board does not say what it runs, or the
+    /// file has no image for that slot.
+    pub fn is_build_of(&self, update: &Update) -> Option<bool> {
+        let said = self.sha512.as_deref()?;
+        let link = update.links().into_iter().find(|link| Some(link.header.slot()) == self.slot)?;
+        let digits = Hex(&link.header.hash()[..]).to_string();
+        // A board says the first digits, and how many is its affair.
+        Some(!said.is_empty() && digits.starts_with(said))
+    }
+}

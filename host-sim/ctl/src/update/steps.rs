@@ -1,0 +1,299 @@
+//! The steps of an update, each with its end: sent, tried, confirmed, taken back. They can be put together for many
+//! boards.
+
+use std::time::{Duration, Instant};
+
+use recipe_update::Link;
+use serde_json::{Value, json};
+
+use super::{Downgrade, Firmware, Trial};
+use crate::client::{Body, Call, Client};
+use crate::failure::Failure;
+use crate::firmware::Update;
+use crate::http::Reply;
+
+/// What is told while a firmware is sent and tried.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Progress {
+    /// The slot is being erased.
+    Erasing,
+    /// So many bytes of so many were taken.
+    Sent {
+        /// Bytes that the board has.
+        received: u64,
+        /// All of them.
+        length: u64,
+    },
+    /// The board computes the hash.
+    Checking,
+    /// The board restarts.
+    Restarting,
+    /// It runs the firmware on trial, which waits for this until it confirms itself.
+    OnTrial(Trial),
+}
+
+impl Progress {
+    /// A line for people.
+    pub fn words(&self) -> String {
+        match self {
+            Self::Erasing => "the slot is being erased".to_owned(),
+            Self::Sent { received, length } => {
+                // In tens, so that a line is printed for each of them and not for each piece.
+                let tenths = (received * 10).checked_div(*length).unwrap_or(10);
+                format!("sent: {} %", tenths * 10)
+            }
+            Self::Checking => "the board computes the hash".to_owned(),
+            Self::Restarting => "the safe values are out; the board restarts".to_owned(),
+            Self::OnTrial(Trial { waits_for, .. }) => format!("on trial; it waits for: {waits_for}"),
+        }
+    }
+}
+
+/// The part of an update file that this board takes.
+///
+/// # Errors
+/// It takes none, or none of this file: another board, no link for its free slot, damaged, or signed with another key
+/// than its loader's.
+pub fn fitting<'u>(client: &Client, board: &Firmware, update: &'u Update) -> Result<Link<'u>, Failure> {
+    if let Some(why) = &board.cannot {
+        return Err(client.refused(why));
+    }
+    let Some(slot) = board.slot else {
+        return Err(client.refused("its firmware does not say in which slot it runs"));
+    };
+    let links = update.links();
+    let free = slot.other();
+    let link = links.into_iter().find(|link| link.header.slot() == free);
+    let link = link.ok_or_else(|| {
+        client.refused(format!("slot {free:?} is free, and the file has no firmware linked for it"))
+    })?;
+    let named = link.header.parts().board;
+    if named.as_str() != board.board {
+        return Err(
+            client.refused(format!("this is a {}; the firmware is for the board {named}", board.board))
+        );
+    }
+    link.check().map_err(|why| client.refused(why))?;
+    if let Some(key) = &board.key {
+        link.header.verify(key).map_err(|why| client.refused(why))?;
+    }
+    Ok(link)
+}
+
+/// Sends a firmware into the free slot, or what is missing of it, until the board has computed its hash. Changes
+/// nothing of what runs.
+///
+/// # Errors
+/// It is refused, damaged on the way, or the board was not reached for a minute.
+pub fn push(
+    client: &Client,
+    link: &Link<'_>,
+    downgrade: Downgrade,
+    told: &mut dyn FnMut(Progress),
+) -> Result<Firmware, Failure> {
+    let length = (link.header_bytes.len() + link.image.len()) as u64;
+    let mut lost: Option<Instant> = None;
+    // Where the next piece begins; `None` while the board has something else to do.
+    let mut next = Some(0);
+    loop {
+        let asked = match next {
+            Some(offset) => put(client, link, offset, downgrade),
+            None => client.call(&Call::get("update")),
+        };
+        let firmware = match asked {
+            Ok(reply) => answered(client, reply)?,
+            Err(failure) => {
+                let since = *lost.get_or_insert_with(Instant::now);
+                if since.elapsed() > AWAY || client.stop().wait(AGAIN) {
+                    return Err(failure);
+                }
+                // Whether it was restarted meanwhile is seen by what it says to the header.
+                next = Some(0);
+                continue;
+            }
+        };
+        lost = None;
+        let Some(incoming) = &firmware.incoming else {
+            return Err(client.refused("it does not say what it has received"));
+        };
+        next = None;
+        match incoming.state.as_str() {
+            "ready" => return Ok(firmware),
+            "failed" => {
+                return Err(client.refused(format!("it has not taken the firmware: {}", incoming.why)));
+            }
+            "receiving" => {
+                next = Some(incoming.received);
+                told(Progress::Sent { received: incoming.received, length });
+                if client.stop().is_asked() {
+                    return Err(client.refused("ended; the same command goes on where this one has"));
+                }
+                continue;
+            }
+            "erasing" => told(Progress::Erasing),
+            _ => told(Progress::Checking),
+        }
+        if client.stop().wait(AGAIN) {
+            return Err(client.refused("ended; the same command goes on where this one has"));
+        }
+    }
+}
+
+/// Sends the piece of a firmware that begins there.
+fn put(client: &Client, link: &Link<'_>, offset: u64, downgrade: Downgrade) -> Result<Reply, Failure> {
+    let header = link.header_bytes.len();
+    let at = usize::try_from(offset).unwrap_or(usize::MAX);
+    let piece = match at.checked_sub(header) {
+        None => link.header_bytes.get(at..),
+        Some(at) => link.image.get(at..).map(|rest| rest.get(..PIECE).unwrap_or(rest)),
+    };
+    let Some(piece) = piece.filter(|piece| !piece.is_empty()) else {
+        return Err(client.refused("it asks for bytes that the firmware does not have"));
+    };
+    let path = format!("update?offset={offset}{}", more(downgrade, '&'));
+    let more_time = Duration::ZERO;
+    let call = Call { method: "PUT", path: &path, body: Body::Image(piece), if_match: None, more_time };
+    client.call(&call)
+}
+
+/// The document of an answer.
+fn answered(client: &Client, reply: Reply) -> Result<Firmware, Failure> {
+    Firmware::read(client, client.document(&client.accepted(reply)?)?)
+}
+
+/// Runs what was received on trial: returns when the board has restarted with it.
+///
+/// # Errors
+/// It is refused, or the board does not come back with it in time.
+pub fn begin_trial(
+    client: &Client,
+    confirm_s: u32,
+    downgrade: Downgrade,
+    told: &mut dyn FnMut(Progress),
+) -> Result<Firmware, Failure> {
+    let before = Firmware::of(client)?;
+    let path = format!("update/try{}", more(downgrade, '?'));
+    post(client, &path, &json!({ "confirm_s": confirm_s }))?;
+    told(Progress::Restarting);
+    // The trial ends by itself after that, and restarts take their time.
+    let there = |now: &Firmware| now.trial.is_some();
+    let failed = |now: &Firmware| {
+        now.last != before.last && now.trial.is_none() && now.slot == before.slot && now.last.is_some()
+    };
+    back(client, RESTARTING, &there, &failed)
+}
+
+/// Waits until the firmware that runs on trial was confirmed, by itself or by somebody.
+///
+/// # Errors
+/// The trial has ended otherwise.
+pub fn wait_confirmed(client: &Client, told: &mut dyn FnMut(Progress)) -> Result<Firmware, Failure> {
+    let mut seen = Firmware::of(client)?;
+    let slot = seen.slot;
+    loop {
+        let Some(trial) = seen.trial.clone() else {
+            return match seen.last.clone() {
+                Some((ended, how)) if Some(ended) == slot && how == "confirmed" && seen.slot == slot => {
+                    Ok(seen)
+                }
+                Some((_, how)) => Err(client.refused(format!("the trial has ended: {}", ended_words(&how)))),
+                None => Err(client.refused("no firmware is on trial")),
+            };
+        };
+        let left = trial.left_s.max(0.0);
+        told(Progress::OnTrial(trial));
+        if client.stop().wait(AGAIN) {
+            return Err(client.refused("ended during the trial; `ctl update --confirm` or `--back` ends it"));
+        }
+        seen = match Firmware::of(client) {
+            Ok(seen) => seen,
+            // It restarts, or is on its way back.
+            Err(_) => back(client, RESTARTING + Duration::from_secs_f64(left), &|_| true, &|_| false)?,
+        };
+    }
+}
+
+/// Keeps the firmware that is on trial.
+///
+/// # Errors
+/// It is refused, or the board not reached.
+pub fn confirm(client: &Client) -> Result<Firmware, Failure> {
+    post(client, "update/confirm", &json!({}))
+}
+
+/// Takes the firmware on trial back: returns when the board runs the one before.
+///
+/// # Errors
+/// It is refused, or the board does not come back in time.
+pub fn take_back(client: &Client, told: &mut dyn FnMut(Progress)) -> Result<Firmware, Failure> {
+    let slot = post(client, "update/back", &json!({}))?.slot;
+    told(Progress::Restarting);
+    back(client, RESTARTING, &|now| now.slot != slot && now.trial.is_none(), &|_| false)
+}
+
+fn post(client: &Client, path: &str, arguments: &Value) -> Result<Firmware, Failure> {
+    let call = Call { more_time: REPLACING, ..Call::post(path, arguments) };
+    answered(client, client.call(&call)?)
+}
+
+/// The board, once it is `there` again.
+fn back(
+    client: &Client,
+    limit: Duration,
+    there: &dyn Fn(&Firmware) -> bool,
+    failed: &dyn Fn(&Firmware) -> bool,
+) -> Result<Firmware, Failure> {
+    let deadline = Instant::now() + limit;
+    loop {
+        // Its answer leaves before it restarts.
+        if client.stop().wait(AGAIN) {
+            return Err(
+                client.refused("ended before the board was back; `ctl update` shows what became of it")
+            );
+        }
+        let seen = Firmware::of(client);
+        match &seen {
+            Ok(firmware) if there(firmware) => return seen,
+            Ok(firmware) if failed(firmware) => {
+                let how = firmware.last.as_ref().map_or("failed", |(_, how)| how.as_str());
+                return Err(client.refused(format!("the trial has ended: {}", ended_words(how))));
+            }
+            _ => {}
+        }
+        if Instant::now() > deadline {
+            return Err(match seen {
+                Err(failure) => failure,
+                Ok(now) => client.refused(format!("it still runs {} without a trial", now.version)),
+            });
+        }
+    }
+}
+
+/// How a trial ended, in words.
+pub(super) fn ended_words(ended: &str) -> &str {
+    match ended {
+        "confirmed" => "it was confirmed",
+        "not_confirmed" => "it was not confirmed in time, and the firmware before runs",
+        "taken_back" => "it was taken back, and the firmware before runs",
+        "failed" => "the firmware did not run, and the one before does",
+        other => other,
+    }
+}
+
+fn more(downgrade: Downgrade, mark: char) -> String {
+    match downgrade {
+        Downgrade::Refused => String::new(),
+        Downgrade::Allowed => format!("{mark}downgrade=yes"),
+    }
+}
+
+/// Bytes of an image that are sent at once: as many as a board takes.
+const PIECE: usize = 16 << 10;
+/// How long a board may be away while a firmware is sent.
+const AWAY: Duration = Duration::from_secs(60);
+/// Time that a board may take to bring its safe values out and check a signature.
+const REPLACING: Duration = Duration::from_secs(10);
+/// Time that a board may take to start again: three starts that the watchdog ends, and the one before.
+const RESTARTING: Duration = Duration::from_secs(60);
+/// Time between two looks.
+pub(super) const AGAIN: Duration = Duration::from_millis(300);
