@@ -181,6 +181,8 @@ impl Driver {
         let until = loop {
             match node.poll_output(now(), catalog, buf) {
                 Output::Open => is_opening = true,
+                // A host measures a birth at once.
+                Output::Busy => {}
                 Output::Keep { bd_seq } => listener.keep(bd_seq),
                 Output::Send(bytes) => {
                     let Some(stream) = &mut self.stream else { continue };
