@@ -247,21 +247,6 @@ fn deadline(until: Instant) -> TokioInstant {
     TokioInstant::now() + left.min(LONGEST)
 }
 
-/// A failure in words.
-pub fn words(failure: Failure) -> String {
-    match failure {
-        Failure::Closed => "no connection".into(),
-        Failure::Silent => "the broker does not answer".into(),
-        Failure::Refused { code: 4 } => "the broker refuses the user or the password".into(),
-        Failure::Refused { code: 5 } => "the broker does not allow this client".into(),
-        Failure::Refused { code } => format!("the broker refuses the connection with code {code}"),
-        Failure::SubscriptionRefused => "the broker refuses the subscription to commands".into(),
-        Failure::Protocol(_) => "the broker does not speak MQTT 3.1.1".into(),
-        Failure::HostOffline => "the primary host is offline".into(),
-        other => format!("{other:?}"),
-    }
-}
-
 /// Length of a node's pieces, and of what is read at once.
 const BUFFER: usize = 8_192;
 /// How long the broker may take nothing.

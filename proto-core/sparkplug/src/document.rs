@@ -6,7 +6,7 @@
 //! ```text
 //! "RGWE" 1 0                                      tells nothing
 //! "RGWE" 1 1 host port client_id login keep_alive_s group node primary_host
-//!            sample_ms interval_ms counter_interval_ms time_server values rules
+//!            sample_ms interval_ms counter_interval_ms time_server time_port values rules
 //! ```
 
 use heapless::{String, Vec};
@@ -43,8 +43,8 @@ pub struct Document {
     pub interval: Duration,
     /// Same, for counters.
     pub counter_interval: Duration,
-    /// The name or IPv4 address of a server of SNTP; `None`: UTC stays unknown.
-    pub time_server: Option<Host>,
+    /// The name or IPv4 address of a server of SNTP, and its UDP port; `None`: UTC stays unknown.
+    pub time_server: Option<(Host, u16)>,
     /// Variables of the controller that are told beside those that field ports send.
     pub values: Vec<VarRange, MAX_RULES>,
     /// Exceptions.
@@ -133,10 +133,7 @@ impl Document {
     fn read(&mut self, from: &mut From<'_>) -> Result<(), DocumentError> {
         let wrong = |of| DocumentError::Value { of };
         self.host = from.host("the broker")?;
-        self.port = match u16::from_le_bytes(from.array()?) {
-            0 => return Err(wrong("the port")),
-            port => port,
-        };
+        self.port = from.port()?;
         let settings = &mut self.settings;
         settings.client_id = from.known_text("the client's name")?;
         settings.login = match from.flag("the login")? {
@@ -155,7 +152,10 @@ impl Document {
         self.sample = from.time("the sample's time")?;
         self.interval = from.time("the interval")?;
         self.counter_interval = from.time("the counters' interval")?;
-        self.time_server = from.flag("the time server")?.then(|| from.host("the time server")).transpose()?;
+        self.time_server = match from.flag("the time server")? {
+            true => Some((from.host("the time server")?, from.port()?)),
+            false => None,
+        };
         self.values.clear();
         for _ in 0..from.byte()? {
             let range = from.range()?;
@@ -204,8 +204,9 @@ impl Document {
             time(&mut out, duration);
         }
         out.byte(self.time_server.is_some().into());
-        if let Some(server) = &self.time_server {
+        if let Some((server, port)) = &self.time_server {
             text(&mut out, server);
+            out.put(&port.to_le_bytes());
         }
         out.byte(u8::try_from(self.values.len()).unwrap_or(u8::MAX));
         for values in &self.values {
@@ -306,6 +307,13 @@ impl<'a> From<'a> {
         let is_known = |byte: u8| byte.is_ascii_alphanumeric() || matches!(byte, b'.' | b'-' | b'_');
         let is_host = !host.is_empty() && host.bytes().all(is_known);
         Host::try_from(host).ok().filter(|_| is_host).ok_or(DocumentError::Value { of })
+    }
+
+    fn port(&mut self) -> Result<u16, DocumentError> {
+        match u16::from_le_bytes(self.array()?) {
+            0 => Err(DocumentError::Value { of: "the port" }),
+            port => Ok(port),
+        }
     }
 
     fn time(&mut self, of: &'static str) -> Result<Duration, DocumentError> {

@@ -24,7 +24,7 @@ pub(crate) fn full() -> Document {
         sample: Duration::from_millis(100),
         interval: Duration::from_millis(500),
         counter_interval: Duration::from_secs(3_600),
-        time_server: Some(Host::try_from("10.0.0.1").unwrap()),
+        time_server: Some((Host::try_from("10.0.0.1").unwrap(), 123)),
         values: [of("RobotState[1..6]")].into_iter().collect(),
         rules: [
             rule("ForceEnd[1..6]", 0.5, None),
@@ -89,7 +89,7 @@ fn the_longest_document_has_room() {
     let text = Text::new(&"x".repeat(crate::node::MAX_TEXT)).unwrap();
     let name = id(&"n".repeat(64));
     document.host = Host::try_from(&*"h".repeat(MAX_HOST)).unwrap();
-    document.time_server = Some(document.host.clone());
+    document.time_server = Some((document.host.clone(), 123));
     let settings = &mut document.settings;
     (settings.group, settings.node, settings.primary_host) = (name.clone(), name.clone(), Some(name));
     (settings.client_id, settings.login) = (text.clone(), Some((text.clone(), text)));
@@ -118,7 +118,8 @@ fn what_cannot_be_is_refused_with_its_place() {
     wrong(&|document| document.sample = Duration::from_millis(99), "the sample's time");
     wrong(&|document| document.interval = Duration::from_millis(3_600_001), "the interval");
     wrong(&|document| document.counter_interval = Duration::ZERO, "the counters' interval");
-    wrong(&|document| document.time_server = Some(Host::new()), "the time server");
+    wrong(&|document| document.time_server = Some((Host::new(), 123)), "the time server");
+    wrong(&|document| document.time_server = Some((document.host.clone(), 0)), "the port");
     wrong(&|document| document.values[0] = of("FloatInputReg[1]"), "the values");
     wrong(&|document| document.rules[0].dead_band = f64::NAN, "a dead band");
     wrong(&|document| document.rules[0].dead_band = -0.5, "a dead band");

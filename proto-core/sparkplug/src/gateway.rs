@@ -242,29 +242,27 @@ impl<'c, const METRICS: usize> GatewayCatalog<'c, METRICS> {
                     Item::FramesOut => port.map(|port| Value::UInt32(port.counters.frames_out)),
                     Item::Rejected => port.map(|port| Value::UInt32(port.counters.rejected())),
                     Item::Timeouts => port.map(|port| Value::UInt32(port.counters.timeouts)),
-                    // Set below, if they are known.
-                    Item::Var(_) | Item::Bit(..) => None,
+                    Item::Var(var) => {
+                        let known = status.variable(var);
+                        let is_of_now = |age| var.direction() == Direction::Input || age <= MAX_AGE;
+                        known.filter(|known| is_of_now(known.age)).map(|known| value_of(known.value))
+                    }
+                    // Set below, if it is known.
+                    Item::Bit(..) => None,
                 };
             }
         }
         let here = || self.items.iter().enumerate().take(part.end).skip(part.start);
-        if !here().any(|(_, told)| matches!(told.item, Item::Var(_) | Item::Bit(..))) {
+        if !here().any(|(_, told)| matches!(told.item, Item::Bit(..))) {
             return;
         }
-        for known in status.variables() {
-            let wanted = match known.bit {
-                None => Item::Var(known.var),
-                Some(bit) => Item::Bit(known.var, bit),
-            };
-            if known.var.direction() == Direction::Output && known.age > MAX_AGE {
-                continue;
-            }
+        for known in status.bits() {
+            let Some(bit) = known.bit else { continue };
+            let wanted = Item::Bit(known.var, bit);
             for (place, _) in here().filter(|(_, told)| told.item == wanted) {
-                let Some(value) = values.get_mut(place) else { break };
-                *value = Some(match (known.value, known.bit) {
-                    (Scalar::Byte(byte), Some(_)) => Value::Boolean(byte != 0),
-                    (scalar, _) => value_of(scalar),
-                });
+                if let (Some(value), Scalar::Byte(byte)) = (values.get_mut(place), known.value) {
+                    *value = Some(Value::Boolean(byte != 0));
+                }
             }
         }
     }

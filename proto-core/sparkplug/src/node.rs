@@ -271,6 +271,11 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         matches!(self.phase, Phase::Online)
     }
 
+    /// Whether there is a connection, as far as the driver has said.
+    pub const fn is_connected(&self) -> bool {
+        !matches!(self.phase, Phase::Idle { .. } | Phase::Opening { .. } | Phase::Ended)
+    }
+
     /// Whether it has died as [`Input::End`] asked.
     pub const fn has_ended(&self) -> bool {
         matches!(self.phase, Phase::Ended)
@@ -417,10 +422,6 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
     /// Whether the primary host says that it is not there.
     fn is_host_gone(&self) -> bool {
         self.host.get().is_some_and(|host| !host.is_online)
-    }
-
-    const fn is_connected(&self) -> bool {
-        !matches!(self.phase, Phase::Idle { .. } | Phase::Opening { .. } | Phase::Ended)
     }
 
     fn note(&mut self, failure: Failure) {

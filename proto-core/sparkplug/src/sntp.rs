@@ -64,6 +64,22 @@ pub enum ReplyError {
     Late,
 }
 
+impl core::fmt::Display for ReplyError {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.write_str(match self {
+            Self::Short { .. } => "a reply is too short",
+            Self::Originate => "a reply is none to the request",
+            Self::Mode { .. } => "a reply is none of a server of SNTP",
+            Self::Kiss { .. } => "it wants to be left alone",
+            Self::Unsynchronised => "it does not know the time itself",
+            Self::Time => "it tells an impossible time",
+            Self::Late => "a reply came too late",
+        })
+    }
+}
+
+impl core::error::Error for ReplyError {}
+
 impl Sntp {
     /// A client that asks at once. `seed` is another one at each start.
     pub const fn new(seed: u64) -> Self {

@@ -113,6 +113,24 @@ pub enum Failure {
     Broken,
 }
 
+impl core::fmt::Display for Failure {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.write_str(match self {
+            Self::Closed => "no connection",
+            Self::Silent => "the broker does not answer",
+            Self::Refused { code: 4 } => "the broker refuses the user or the password",
+            Self::Refused { code: 5 } => "the broker does not allow this client",
+            Self::Refused { code } => return write!(f, "the broker refuses the connection with code {code}"),
+            Self::SubscriptionRefused => "the broker refuses the subscription to commands",
+            Self::Protocol(_) => "the broker does not speak MQTT 3.1.1",
+            Self::HostOffline => "the primary host is offline",
+            Self::Broken => "what is told changes while it is told",
+        })
+    }
+}
+
+impl core::error::Error for Failure {}
+
 /// Counts since the node was made.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[non_exhaustive]

@@ -368,7 +368,7 @@ pub(super) fn owner_of(starts: &[u16], place: u16) -> Owner {
 const UTC: &str = "Node Info/UTC";
 
 /// Metrics of a birth that are measured in one call: less work than writing a piece.
-const MEASURED_AT_ONCE: usize = 16;
+const MEASURED_AT_ONCE: usize = 8;
 
 /// The most bytes behind the metrics of a payload.
 const MAX_END: usize = 3;
