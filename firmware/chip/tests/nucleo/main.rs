@@ -4,9 +4,11 @@
 mod attack;
 mod bench;
 mod boot;
+mod broker;
 mod can;
 mod cell;
 mod client;
+mod edge;
 mod faults;
 mod flash;
 mod page;
