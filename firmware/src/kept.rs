@@ -9,6 +9,7 @@ use core::fmt;
 use embassy_time::Duration;
 use heapless::Vec;
 use proto_core::config::image;
+use recipe_sparkplug::document::{Document, DocumentError};
 use recipe_store::{
     Adoption, Ended, Flash, Found, KeepError, MAX_REVISIONS, Marks, MountError, Newest, PutError, Revision,
     Role, Side, SlotMarks, Store, Trial, WORD, newest,
@@ -262,6 +263,35 @@ impl<F: StoreFlash> Kept<F> {
     /// It cannot be written.
     pub async fn set_access_key(&mut self, key: &[u8; 16]) -> Result<(), KeepError> {
         Ok(self.store.set_access_key(key)?.carry_out(&mut self.flash).await?)
+    }
+
+    /// Reads the settings of the edge node into `document`. Returns whether it tells; `None` if there are none.
+    pub fn edge(&mut self, document: &mut Document) -> Option<Result<bool, DocumentError>> {
+        let bytes = self.flash.bytes(self.store.edge()?)?;
+        Some(document.decode(bytes))
+    }
+
+    /// Keeps the settings of the edge node. If there is no room, the oldest configurations that no mark names are
+    /// forgotten.
+    ///
+    /// # Errors
+    /// They cannot be written; those before are kept.
+    pub async fn set_edge(&mut self, settings: &[u8]) -> Result<(), KeepError> {
+        for _ in 0..MAX_REVISIONS {
+            match self.store.set_edge(settings) {
+                Ok(put) => return Ok(put.carry_out(&mut self.flash).await?),
+                Err(full) => self.make_room(full.into(), None).await?,
+            }
+        }
+        Ok(self.store.set_edge(settings)?.carry_out(&mut self.flash).await?)
+    }
+
+    /// Keeps the number of the edge node's session.
+    ///
+    /// # Errors
+    /// It cannot be written.
+    pub async fn set_session(&mut self, bd_seq: u8) -> Result<(), KeepError> {
+        Ok(self.store.set_birth_sequence(bd_seq)?.carry_out(&mut self.flash).await?)
     }
 
     async fn mark(&mut self, marks: Marks) -> Result<(), KeepError> {

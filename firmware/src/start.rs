@@ -12,12 +12,14 @@ use firmware::fmt::Text;
 use firmware::identity;
 use firmware::kept::{self, EndedName, Kept, RoleName};
 use firmware::platform::{self, FeedWatchdog as _, NoDevice, Ports, StatusLed as _};
-use firmware::tasks::console::{self, CONNECTIONS, Console};
+use firmware::tasks::console::{self, CONNECTIONS, Console, NodeView};
+use firmware::tasks::edge::{self, Cannot, Edge};
 use firmware::tasks::fair::Fair;
 use firmware::tasks::gateway::{Gateway, MAX_LINKS};
 use firmware::tasks::keeper::{self, Desk};
 use firmware::tasks::led::Condition;
 use firmware::tasks::link::{Buffers, Endpoint};
+use firmware::tasks::time::{self, WallClock};
 use firmware::tasks::watchdog::{Pulse, TaskName};
 use firmware::tasks::{can, led, link, serial, watchdog};
 use firmware::update::{Site, Updates};
@@ -69,6 +71,7 @@ pub(crate) fn start(spawner: Spawner, mut board: Board) -> Tasks {
         wire(len, gateway, config, &mut wiring);
     }
     let gateway: &'static Gateway = gateway;
+    let telling = make_edge(kept.as_deref_mut(), gateway, loaded.is_ok().then_some(&*config), board.seed());
     let key = kept.as_ref().and_then(|kept| kept.access_key());
     let slots = board.slots();
     let desk = kept.and_then(|kept| open_desk(&tasks, gateway, kept, slots, work, failure));
@@ -76,7 +79,7 @@ pub(crate) fn start(spawner: Spawner, mut board: Board) -> Tasks {
     if ran.is_err() {
         wiring.links.clear();
     }
-    let connected = connect(&tasks, &mut board, gateway, desk, key, &wiring, overlay.links());
+    let connected = connect(&tasks, &mut board, gateway, desk, key, &wiring, telling, overlay.links());
     let console = connected.as_ref().ok().copied().flatten();
     let refused_why = ran.err().or(connected.err());
     let shown = Shown { gateway: refused_why.is_none().then_some(gateway), console };
@@ -94,6 +97,54 @@ fn open_store(board: &mut Board) -> Option<&'static mut Kept<Flash>> {
     let places = board.flash()?;
     let kept = Kept::open(places).inspect_err(|error| error!("{}", Text(error))).ok()?;
     Some(KEPT.init(kept))
+}
+
+/// The edge node, if there are settings for one.
+struct Telling {
+    view: NodeView,
+    node: Option<&'static mut edge::Node>,
+    seed: u64,
+}
+
+/// Makes the edge node of what runs, while its configuration is there.
+#[inline(never)]
+fn make_edge(
+    kept: Option<&mut Kept<Flash>>,
+    gateway: &Gateway,
+    config: Option<&GatewayConfig>,
+    seed: u64,
+) -> Telling {
+    static EDGE: StaticCell<Edge> = StaticCell::new();
+    static CLOCK: ConstStaticCell<WallClock> = ConstStaticCell::new(WallClock::unknown());
+    static MEMORY: ConstStaticCell<edge::Memory> = ConstStaticCell::new(edge::Memory::ZEROED);
+    static NODE: StaticCell<edge::Node> = StaticCell::new();
+    let edge: &'static Edge = EDGE.init(Edge::off());
+    let mut telling =
+        Telling { view: NodeView { edge, document: None, clock: CLOCK.take() }, node: None, seed };
+    let edge::Memory { document, rest } = MEMORY.take();
+    let bd_seq = kept.as_ref().and_then(|kept| kept.store().birth_sequence());
+    match kept.and_then(|kept| kept.edge(document)) {
+        None | Some(Ok(false)) => return telling,
+        Some(Ok(true)) => {}
+        Some(Err(error)) => {
+            error!("edge node: {}", Text(&error));
+            edge.cannot(Cannot::Settings(error));
+            return telling;
+        }
+    }
+    let document: &'static edge::Document = document;
+    telling.view.document = Some(document);
+    let made = config
+        .ok_or(Cannot::NothingRuns)
+        .and_then(|config| edge::Node::make(document, rest, gateway, config.view(), bd_seq, seed));
+    match made {
+        Ok(node) => telling.node = Some(NODE.init(node)),
+        Err(why) => {
+            error!("edge node: {}", Text(&why));
+            edge.cannot(why);
+        }
+    }
+    telling
 }
 
 /// Starts the keeper.
@@ -348,8 +399,10 @@ fn run_ports(
     Ok(())
 }
 
-/// Starts the network, the console, and the links of what runs. It is last, so that the field buses run without a PHY.
+/// Starts the network, the console, the links of what runs, and the edge node. It is last, so that the field buses run
+/// without a PHY.
 #[inline(never)]
+#[allow(clippy::too_many_arguments, reason = "each is used once")]
 fn connect(
     tasks: &Tasks,
     board: &mut Board,
@@ -357,6 +410,7 @@ fn connect(
     desk: Option<&'static Desk>,
     key: Option<[u8; 16]>,
     wiring: &Wiring,
+    telling: Telling,
     mut memory: &'static mut [u8],
 ) -> Result<Option<&'static Console>, Refused> {
     let ethernet = board.ethernet().map_err(Refused::Ethernet)?;
@@ -376,7 +430,17 @@ fn connect(
             controller_link(pulse, gateway, id, stack, endpoint, buffers)
         });
     }
-    Ok(start_console(tasks, board, gateway, desk, key, name, stack, memory))
+    let view = telling.view;
+    if let (Some(node), Some(desk)) = (telling.node, desk) {
+        if let Some(server) = view.document.and_then(|document| document.time_server.as_ref()) {
+            let (host, port) = (server.0.as_str(), server.1);
+            tasks.spawn(TaskName::Time, |pulse| {
+                time_server(pulse, stack, host, port, view.clock, telling.seed)
+            });
+        }
+        tasks.spawn(TaskName::Edge, |pulse| edge_node(pulse, gateway, stack, desk, view, node));
+    }
+    Ok(start_console(tasks, board, gateway, desk, key, view, name, stack, memory))
 }
 
 /// Starts the console; `None` if the board cannot have one.
@@ -388,6 +452,7 @@ fn start_console(
     gateway: &'static Gateway,
     desk: Option<&'static Desk>,
     key: Option<[u8; 16]>,
+    node: NodeView,
     name: heapless::String<{ identity::NAME }>,
     stack: Stack<'static>,
     mut memory: &'static mut [u8],
@@ -399,7 +464,7 @@ fn start_console(
     info!("name {}", name.as_str());
     static CONSOLE: StaticCell<Console> = StaticCell::new();
     let console: &'static Console =
-        CONSOLE.init_with(|| Console::new(gateway, desk, PORTS, name, key, secret));
+        CONSOLE.init_with(|| Console::new(gateway, desk, PORTS, node, name, key, secret));
     for nth in 0..CONNECTIONS {
         let buffers = console::Buffers::take(&mut memory).expect("there is room for CONNECTIONS");
         tasks.spawn(TaskName::Console(nth as u8), |pulse| connection(pulse, console, stack, buffers));
@@ -511,6 +576,32 @@ async fn watch_button(pulse: &'static Pulse, console: &'static Console, button: 
     pulse.run(pin!(console.watch(pulse, button))).await
 }
 
+/// Tells a broker what the gateway knows.
+#[embassy_executor::task]
+async fn edge_node(
+    pulse: &'static Pulse,
+    gateway: &'static Gateway,
+    stack: Stack<'static>,
+    desk: &'static Desk,
+    view: NodeView,
+    node: &'static mut edge::Node,
+) -> ! {
+    pulse.run(pin!(node.run(gateway, pulse, stack, desk, view.edge, view.clock))).await
+}
+
+/// Asks a server for UTC.
+#[embassy_executor::task]
+async fn time_server(
+    pulse: &'static Pulse,
+    stack: Stack<'static>,
+    host: &'static str,
+    port: u16,
+    clock: &'static WallClock,
+    seed: u64,
+) -> ! {
+    pulse.run(pin!(time::run(pulse, stack, (host, port), clock, seed))).await
+}
+
 /// Logs the board's address whenever it changes.
 #[embassy_executor::task]
 async fn address(pulse: &'static Pulse, stack: Stack<'static>) -> ! {
@@ -561,10 +652,10 @@ async fn refused(pulse: &'static Pulse, reason: Refused) -> ! {
     pulse.run(pin!(telling)).await
 }
 
-/// One for each link and connection, DHCP and DNS.
-const SOCKETS: usize = MAX_LINKS + CONNECTIONS + 2;
+/// One for each link and connection, the broker, the time server, DHCP and DNS.
+const SOCKETS: usize = MAX_LINKS + CONNECTIONS + 4;
 /// Interval of that log line.
 const REPEAT: Duration = Duration::from_secs(10);
 /// A task for each port, link and connection, and: engine, network, address, status, LED, refused, keeper, button,
-/// the board's own.
-const MAX_TASKS: usize = SERIAL_PORTS + CAN_PORTS + MAX_LINKS + CONNECTIONS + 9;
+/// edge node, time, the board's own.
+const MAX_TASKS: usize = SERIAL_PORTS + CAN_PORTS + MAX_LINKS + CONNECTIONS + 11;

@@ -9,7 +9,7 @@ mod firmware;
 use core::cell::{Cell, RefCell};
 use core::pin::pin;
 
-use embassy_futures::select::{Either3, select3};
+use embassy_futures::select::{Either4, select4};
 use embassy_sync::blocking_mutex::raw::NoopRawMutex;
 use embassy_sync::mutex::Mutex;
 use embassy_sync::signal::Signal;
@@ -76,6 +76,15 @@ pub enum Ask {
     ConfirmFirmware,
     /// Return to the firmware before.
     EndFirmware,
+    /// Keep the settings of the edge node of this length in `Desk::image`.
+    Edge {
+        /// Their length in bytes.
+        len: usize,
+        /// Whether they say that something is told.
+        tells: bool,
+        /// Whether the board is to restart with them.
+        restart: bool,
+    },
 }
 
 /// Why nothing was done.
@@ -131,6 +140,9 @@ pub struct Desk {
     wanted: Signal<NoopRawMutex, (u32, usize)>,
     part: RefCell<[u8; PART]>,
     part_len: Signal<NoopRawMutex, Option<usize>>,
+    /// The number of a session that begins, and whether it is kept.
+    session: Signal<NoopRawMutex, u8>,
+    session_kept: Signal<NoopRawMutex, bool>,
     readers: Mutex<NoopRawMutex, ()>,
     firmware: Cell<Option<FirmwareView>>,
     /// A request was admitted since the start.
@@ -151,6 +163,8 @@ impl Desk {
             wanted: Signal::new(),
             part: RefCell::new([0; PART]),
             part_len: Signal::new(),
+            session: Signal::new(),
+            session_kept: Signal::new(),
             readers: Mutex::new(()),
             firmware: Cell::new(None),
             was_asked: Cell::new(false),
@@ -193,6 +207,14 @@ impl Desk {
     /// Takes the desk for a change; `None` if somebody else has it.
     pub fn take(&self) -> Option<Turn<'_>> {
         (!self.is_taken.replace(true)).then_some(Turn { desk: self, is_asked: false })
+    }
+
+    /// Keeps the number of a session of the edge node, which alone calls this. Returns whether it is kept. Waits while
+    /// the store is being written.
+    pub async fn keep_session(&self, bd_seq: u8) -> bool {
+        self.session_kept.reset();
+        self.session.signal(bd_seq);
+        self.session_kept.wait().await
     }
 
     /// Copies the image of a configuration from `offset` on, a multiple of [`PART`], and returns the number of bytes:
@@ -355,10 +377,10 @@ impl<F: StoreFlash, S: SlotFlash> Keeper<'_, F, S> {
             }
             self.show(waits_for);
             let desk = self.desk;
-            let next = select3(desk.asked.wait(), desk.wanted.wait(), Timer::at(until));
+            let next = select4(desk.asked.wait(), desk.wanted.wait(), desk.session.wait(), Timer::at(until));
             let next = pulse.idle(pin!(next)).await;
             match next {
-                Either3::First(ask) => {
+                Either4::First(ask) => {
                     let (result, is_restart) = pulse.idle(pin!(self.carry_out(gateway, ask))).await;
                     self.show(waits_for);
                     desk.done.signal(result);
@@ -368,12 +390,16 @@ impl<F: StoreFlash, S: SlotFlash> Keeper<'_, F, S> {
                     }
                     desk.is_taken.set(false);
                 }
-                Either3::Second((number, offset)) => {
+                Either4::Second((number, offset)) => {
                     let mut part = desk.part.borrow_mut();
                     let len = self.kept.image_part(number, offset, &mut part[..]).map(<[u8]>::len);
                     desk.part_len.signal(len);
                 }
-                Either3::Third(()) => {}
+                Either4::Third(bd_seq) => {
+                    let kept = pulse.idle(pin!(self.kept.set_session(bd_seq))).await;
+                    desk.session_kept.signal(kept.is_ok());
+                }
+                Either4::Fourth(()) => {}
             }
         }
     }
@@ -393,6 +419,9 @@ impl<F: StoreFlash, S: SlotFlash> Keeper<'_, F, S> {
         if let Some(done) = self.of_firmware(gateway, &ask).await {
             return done;
         }
+        if let Ask::Edge { len, restart, .. } = ask {
+            return self.keep_edge(len, restart).await;
+        }
         let mut image_len = 0;
         let decided = {
             let mut revisions = self.desk.revisions.borrow_mut();
@@ -404,7 +433,8 @@ impl<F: StoreFlash, S: SlotFlash> Keeper<'_, F, S> {
                 | Ask::Piece { .. }
                 | Ask::TryFirmware { .. }
                 | Ask::ConfirmFirmware
-                | Ask::EndFirmware => Ok(0),
+                | Ask::EndFirmware
+                | Ask::Edge { .. } => Ok(0),
                 Ask::Put { base, digest, len } => {
                     image_len = len;
                     revisions.put(base, digest)
@@ -433,6 +463,19 @@ impl<F: StoreFlash, S: SlotFlash> Keeper<'_, F, S> {
         let next = self.drain(image_len, &mut failed).await;
         let result = failed.map_or(Ok(number), |why| Err(Failed::Store(why)));
         (result, matches!(next, Next::Restart))
+    }
+
+    /// Keeps settings of the edge node. A trial is not cut short for a restart.
+    #[allow(clippy::await_holding_refcell_ref, reason = "who has the desk waits for the keeper")]
+    async fn keep_edge(&mut self, len: usize, restart: bool) -> (Result<u32, Failed>, bool) {
+        let is_on_trial = self.desk.look(|revisions| revisions.trial().is_some()) == Some(true);
+        if restart && (is_on_trial || self.trial.is_some()) {
+            return (Err(Failed::Refused(Refused::OnTrial)), false);
+        }
+        let image = self.desk.image.borrow();
+        let kept = self.kept.set_edge(image.get(..len).unwrap_or(&[])).await;
+        let is_restart = restart && kept.is_ok();
+        (kept.map(|()| 0).map_err(Failed::Store), is_restart)
     }
 
     /// What the revisions ask for.

@@ -162,7 +162,8 @@ impl Driver<'_> {
     }
 }
 
-async fn resolve(stack: Stack<'_>, host: &str) -> Option<IpAddress> {
+/// The address of a host; `None` if it is not found.
+pub(super) async fn resolve(stack: Stack<'_>, host: &str) -> Option<IpAddress> {
     if let Ok(address) = host.parse::<Ipv4Addr>() {
         return Some(IpAddress::Ipv4(address));
     }

@@ -4,6 +4,7 @@
 pub mod can;
 pub mod console;
 pub(crate) mod control;
+pub mod edge;
 pub mod fair;
 pub mod gateway;
 pub mod keeper;
@@ -12,6 +13,7 @@ pub mod link;
 mod notify;
 pub mod serial;
 pub mod status;
+pub mod time;
 pub mod watchdog;
 
 #[cfg(test)]

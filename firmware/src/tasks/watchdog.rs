@@ -47,6 +47,10 @@ pub enum TaskName {
     Console(u8),
     /// Looks at the button.
     Button,
+    /// The edge node.
+    Edge,
+    /// Asks for UTC.
+    Time,
 }
 
 impl TaskName {
@@ -73,6 +77,8 @@ impl TaskName {
             Self::Keeper => (18, 0),
             Self::Console(number) => (19, number),
             Self::Button => (20, 0),
+            Self::Edge => (21, 0),
+            Self::Time => (22, 0),
         };
         u16::from_be_bytes([kind, number])
     }
@@ -100,6 +106,8 @@ impl TaskName {
             Self::Keeper,
             Self::Console(number),
             Self::Button,
+            Self::Edge,
+            Self::Time,
         ];
         names.into_iter().find(|name| name.code() == code)
     }
@@ -121,6 +129,8 @@ impl fmt::Display for TaskName {
             Self::Keeper => f.write_str("keeper"),
             Self::Console(number) => write!(f, "console {number}"),
             Self::Button => f.write_str("button"),
+            Self::Edge => f.write_str("edge node"),
+            Self::Time => f.write_str("time"),
         }
     }
 }

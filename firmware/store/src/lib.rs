@@ -10,7 +10,7 @@
         clippy::arithmetic_side_effects
     )
 )]
-//! What a board keeps over restarts and power cuts: configurations, a key, counters (docs/store.md).
+//! What a board keeps over restarts and power cuts: configurations, a key, settings, counters (docs/store.md).
 //!
 //! In: the words of some sectors of flash, and what is to be kept. Out: which words are to be written and which
 //! sectors erased, and what is kept. Knows neither a chip nor what a configuration contains.

@@ -10,7 +10,7 @@ use crate::{WORD, Word};
 /// Maximum length of a record's data in bytes: that of a configuration image.
 pub const MAX_DATA: usize = 16 * 1024;
 /// Number of counters.
-pub const COUNTERS: u8 = 4;
+pub const COUNTERS: u8 = 3;
 /// Number of keys.
 pub(crate) const KEYS: usize = 18;
 /// Version of the layout of the store: another one is not read.
@@ -34,6 +34,8 @@ pub enum Key {
     Adopted,
     /// A counter, below [`COUNTERS`].
     Counter(u8),
+    /// The settings of the edge node. To a program that knows nothing of it, it is a counter that is copied along.
+    Edge,
     /// Which slots of the firmware are good and on trial.
     Slots,
     /// How often the store was moved to another place.
@@ -50,6 +52,7 @@ impl Key {
             Self::BirthSequence => Some(10),
             Self::Adopted => Some(11),
             Self::Counter(number @ 0..COUNTERS) => Some(12 | number),
+            Self::Edge => Some(15),
             Self::Slots => Some(16),
             Self::Generation => Some(17),
             Self::Image(_) | Self::Counter(_) => None,

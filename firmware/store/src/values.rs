@@ -1,6 +1,6 @@
-//! The small values: the key of the API, Sparkplug's bdSeq, counters.
+//! The small values: the key of the API, settings and bdSeq of the edge node, counters.
 
-use crate::{Flash, Key, Put, PutError, Store};
+use crate::{Flash, Found, Key, Put, PutError, Store};
 
 impl Store {
     /// The key of the API; `None` if the board was not claimed.
@@ -42,5 +42,18 @@ impl Store {
     /// It cannot be kept.
     pub fn set_birth_sequence(&mut self, value: u8) -> Result<Put<'_, 'static>, PutError> {
         self.put(Key::BirthSequence, value.into(), &[])
+    }
+
+    /// Where the settings of the edge node are; `None` if there are none.
+    pub fn edge(&self) -> Option<Found> {
+        self.find(Key::Edge).filter(|found| found.len > 0)
+    }
+
+    /// Keeps the settings of the edge node; no bytes are none.
+    ///
+    /// # Errors
+    /// They cannot be kept; those before are.
+    pub fn set_edge<'d>(&mut self, settings: &'d [u8]) -> Result<Put<'_, 'd>, PutError> {
+        self.put(Key::Edge, 0, settings)
     }
 }

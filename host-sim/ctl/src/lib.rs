@@ -15,6 +15,7 @@ mod claim;
 mod client;
 mod digits;
 mod doctor;
+pub mod edge;
 mod failure;
 mod firmware;
 mod fleet;

@@ -181,6 +181,8 @@ impl Driver {
         let until = loop {
             match node.poll_output(now(), catalog, buf) {
                 Output::Open => is_opening = true,
+                // A host measures a birth at once.
+                Output::Busy => {}
                 Output::Keep { bd_seq } => listener.keep(bd_seq),
                 Output::Send(bytes) => {
                     let Some(stream) = &mut self.stream else { continue };
@@ -243,21 +245,6 @@ fn deadline(until: Instant) -> TokioInstant {
     let left = Duration::from_micros(until.saturating_since(now()).as_micros());
     // A node that waits for nothing is asked again all the same.
     TokioInstant::now() + left.min(LONGEST)
-}
-
-/// A failure in words.
-pub fn words(failure: Failure) -> String {
-    match failure {
-        Failure::Closed => "no connection".into(),
-        Failure::Silent => "the broker does not answer".into(),
-        Failure::Refused { code: 4 } => "the broker refuses the user or the password".into(),
-        Failure::Refused { code: 5 } => "the broker does not allow this client".into(),
-        Failure::Refused { code } => format!("the broker refuses the connection with code {code}"),
-        Failure::SubscriptionRefused => "the broker refuses the subscription to commands".into(),
-        Failure::Protocol(_) => "the broker does not speak MQTT 3.1.1".into(),
-        Failure::HostOffline => "the primary host is offline".into(),
-        other => format!("{other:?}"),
-    }
 }
 
 /// Length of a node's pieces, and of what is read at once.

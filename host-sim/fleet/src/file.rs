@@ -41,18 +41,10 @@ impl Telling {
             None => Ok(Broker::plain(&file.host, file.port)),
         };
         let broker = broker.map_err(|why| of_file(format!("broker.ca: {why}")))?;
-        let id = |name: &str| Id::new(name).map_err(|error| of_file(error.to_string()));
-        let mut settings = Settings::new(id(&file.group)?, id(&file.node)?);
-        settings.primary_host = file.primary_host.as_deref().map(id).transpose()?;
-        settings.keep_alive = file.keep_alive;
-        if let Some(client_id) = file.client_id.as_deref().and_then(Text::new) {
-            settings.client_id = client_id;
+        if file.time_server.is_some() {
+            return Err(of_file("time.server: for a board; the clock here is set by the system".into()));
         }
-        settings.login = file
-            .login
-            .as_deref()
-            .map(|login| read_login(login).map_err(|why| of_file(format!("broker.login: {why}"))))
-            .transpose()?;
+        let settings = settings_of(&file).map_err(of_file)?;
         if let Some(kept) = &file.bd_seq {
             // A mistake shows before anything runs.
             read_bd_seq(kept).map_err(|why| of_file(format!("node.bd_seq: {why}")))?;
@@ -75,6 +67,21 @@ impl Telling {
             values: &self.file.values,
         }
     }
+}
+
+/// The names of a file's node, and what its login has.
+pub(crate) fn settings_of(file: &SparkplugFile) -> Result<Settings, String> {
+    let id = |name: &str| Id::new(name).map_err(|error| error.to_string());
+    let mut settings = Settings::new(id(&file.group)?, id(&file.node)?);
+    settings.primary_host = file.primary_host.as_deref().map(id).transpose()?;
+    settings.keep_alive = file.keep_alive;
+    if let Some(client_id) = file.client_id.as_deref().and_then(Text::new) {
+        settings.client_id = client_id;
+    }
+    let login = file.login.as_deref();
+    settings.login =
+        login.map(|login| read_login(login).map_err(|why| format!("broker.login: {why}"))).transpose()?;
+    Ok(settings)
 }
 
 /// Reads a file with two lines, user and password, that nobody else can read.
@@ -162,6 +169,8 @@ mod tests {
             Telling::load(&path).map(|telling| telling.broker.address())
         };
         assert_eq!(load("plain = true"), Ok("b:1883".into()));
+        let of_a_board = load("plain = true\n[time]\nserver = \"10.0.0.1\"");
+        assert!(of_a_board.unwrap_err().contains("time.server: for a board"));
         assert!(load("ca = \"none.pem\"").unwrap_err().contains("broker.ca: "));
         std::fs::write(folder.path().join("empty.pem"), "").unwrap();
         assert!(load("ca = \"empty.pem\"").unwrap_err().ends_with("no certificate in it; allowed: PEM"));

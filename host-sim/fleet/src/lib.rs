@@ -4,6 +4,7 @@
 //! broker, also over TLS, files, the system's clock; and many simulated nodes in one process, for tests of brokers.
 #![forbid(unsafe_code)]
 
+pub mod board;
 pub mod broker;
 pub mod drive;
 pub mod file;

@@ -11,7 +11,7 @@ use std::time::Duration;
 use proto_core::config::GatewayConfig;
 use proto_core::time::Instant;
 use recipe_device::random::random;
-use recipe_fleet::drive::{Listener, Sampled, Sampler, drive, words};
+use recipe_fleet::drive::{Listener, Sampled, Sampler, drive};
 use recipe_fleet::file::{Telling, read_bd_seq, write_bd_seq};
 use recipe_net::timer::now;
 use recipe_sparkplug::gateway::GatewayCatalog;
@@ -204,7 +204,7 @@ impl Listener for Told<'_> {
     fn failed(&mut self, failure: Failure, error: Option<&io::Error>) {
         let broker = self.telling.broker.address();
         let error = error.map(ToString::to_string);
-        warn!(broker, why = words(failure), error, "no session with the broker; trying again");
+        warn!(broker, why = %failure, error, "no session with the broker; trying again");
     }
 }
 

@@ -149,6 +149,8 @@ fn every_answer_is_as_described() {
     let octets = format!("Authorization: Bearer {KEY}\nContent-Type: application/octet-stream");
     let piece = request(cell.console, "PUT /api/v1/update?offset=0", &octets, "x");
     look("/api/v1/update", "put", piece.must_be(501));
+    look("/api/v1/edge", "get", get(cell.console, "edge").must_be(501));
+    look("/api/v1/edge", "put", request(cell.console, "PUT /api/v1/edge", &octets, "x").must_be(501));
     for operation in ["update/try", "update/confirm", "update/back"] {
         look(&format!("/api/v1/{operation}"), "post", post(cell.console, operation, "").must_be(501));
     }

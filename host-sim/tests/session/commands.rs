@@ -62,6 +62,12 @@ fn mistakes_are_told_before_anything_is_asked() {
     wrong(&["--inventory", &path("two.toml"), "--only", "c", "info"], "has no such gateway; it has a, b");
     wrong(&["--inventory", &path("two.toml"), "trace"], "choose one with --only NAME");
     wrong(&["--inventory", &path("two.toml"), "status", "--watch"], "choose one with --only NAME");
+    let tls = "[broker]\naddress = \"b\"\nca = \"c\"\n[node]\ngroup = \"g\"\nname = \"n\"\n";
+    std::fs::write(path("tls.toml"), tls).unwrap();
+    wrong(&["--to", nobody, "edge", &path("tls.toml")], "tls.toml: broker.ca: a board speaks no TLS");
+    wrong(&["--to", nobody, "edge", &path("open.key")], "open.key:1:");
+    wrong(&["--to", nobody, "edge", "--restart"], "--restart is for a file or --off");
+    wrong(&["--inventory", &path("two.toml"), "edge", &path("tls.toml")], "a Sparkplug file names one node");
     wrong(&["keygen", &path("open.key")], "keys are not replaced");
     wrong(&["--to", nobody, "nonsense"], "nonsense");
     assert!(run(&["info"], Some("a b")).err.contains("HOST_SIM_GATEWAY: "));

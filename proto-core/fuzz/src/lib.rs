@@ -16,6 +16,7 @@ mod any_frames;
 mod can;
 mod command;
 mod deframer;
+mod edge;
 mod engine;
 mod framer;
 mod http_guard;
@@ -91,6 +92,7 @@ pub const TARGETS: &[Target] = &[
     },
     Target { name: "http_head", run: http_head::run, seeds: http_head::seeds, runs: 8_000, longest: 600 },
     Target { name: "http_guard", run: http_guard::run, seeds: http_guard::seeds, runs: 1_500, longest: 600 },
+    Target { name: "edge", run: edge::run, seeds: edge::seeds, runs: 8_000, longest: 600 },
     Target { name: "mqtt", run: mqtt::run, seeds: mqtt::seeds, runs: 8_000, longest: 600 },
     Target { name: "image", run: image::run, seeds: image::seeds, runs: 3_000, longest: 3_000 },
     Target { name: "store", run: store::run, seeds: store::seeds, runs: 3_000, longest: 2_000 },

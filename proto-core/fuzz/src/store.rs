@@ -28,7 +28,7 @@ const KEYS: [Key; 18] = [
     Key::Counter(0),
     Key::Counter(1),
     Key::Counter(2),
-    Key::Counter(3),
+    Key::Edge,
     Key::Slots,
     Key::Generation,
 ];

@@ -21,4 +21,4 @@ macro_rules! targets {
     };
 }
 
-targets! { deframer framer can state slcan modbus_server modbus_client command_server command_client engine any_engine http_head http_guard mqtt image store update }
+targets! { deframer framer can state slcan modbus_server modbus_client command_server command_client engine any_engine http_head http_guard edge mqtt image store update }

@@ -66,6 +66,10 @@ pub enum Operation {
     ConfirmUpdate,
     /// Return to the firmware before.
     EndUpdate,
+    /// How the edge node does.
+    Edge,
+    /// Keep settings for the edge node.
+    PutEdge,
 }
 
 impl Operation {
@@ -84,6 +88,7 @@ impl Operation {
             Self::Check => &["image"],
             Self::PutUpdate => &["offset", "downgrade"],
             Self::TryUpdate => &["downgrade"],
+            Self::PutEdge => &["restart"],
             _ => &[],
         }
     }
@@ -120,7 +125,7 @@ pub enum BodyType {
     Toml,
     /// `application/json`; a request without a body needs no type.
     Json,
-    /// `application/octet-stream`: a configuration image, or a piece of a firmware.
+    /// `application/octet-stream`: a configuration image, a piece of a firmware, or settings of an edge node.
     Image,
 }
 
@@ -199,6 +204,8 @@ pub const ROUTES: &[Route] = &[
         GATEWAYS,
     ),
     route("/api/v1/update/back", Method::Post, Operation::EndUpdate, Access::Write, BodyType::Json, GATEWAYS),
+    route("/api/v1/edge", Method::Get, Operation::Edge, Access::Read, BodyType::None, GATEWAYS),
+    route("/api/v1/edge", Method::Put, Operation::PutEdge, Access::Write, BodyType::Image, GATEWAYS),
     // There is no key to be shown yet; the button stands for it.
     route("/api/v1/claim", Method::Post, Operation::Claim, Access::Open, BodyType::Json, BOARD),
 ];

@@ -9,6 +9,11 @@ pub(crate) struct Clock {
 }
 
 impl Clock {
+    /// Nobody has told it yet.
+    pub(crate) const fn unknown() -> Self {
+        Self { known: None }
+    }
+
     /// It is `utc_ms` at this instant. True if it was not known before.
     pub(crate) fn set(&mut self, at: Instant, utc_ms: u64) -> bool {
         self.known.replace((at, utc_ms)).is_none()

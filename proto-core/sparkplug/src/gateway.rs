@@ -4,6 +4,8 @@
 //! its links, the controller's states, and the controller's variables that field ports send or that are asked for.
 //! Each field port is a device, which is alive while the port works, with the variables that it writes.
 
+use core::ops::Range;
+
 use heapless::{String, Vec};
 use proto_core::config::{ConfigView, MAX_PORTS};
 use proto_core::engine::{PortState, Status};
@@ -16,6 +18,9 @@ use crate::catalog::{Catalog, MAX_NAME, Metric, Owner, Report};
 use crate::node::Counters;
 use crate::topic::MAX_ID;
 use crate::value::{DataType, Value};
+
+/// The rule of what has none.
+const NO_RULE: u8 = u8::MAX;
 
 /// Most links of a gateway.
 const MAX_LINKS: usize = 16;
@@ -54,12 +59,20 @@ pub struct GatewayCatalog<'c, const METRICS: usize> {
     version: &'static str,
     ports: Vec<Port, MAX_PORTS>,
     links: Vec<Name, MAX_LINKS>,
-    items: Vec<Item, METRICS>,
+    items: Vec<Told, METRICS>,
     /// Where the items of the node and of each port begin, and where the last ones end.
     starts: Vec<usize, { MAX_PORTS + 2 }>,
 }
 
 type Name = String<MAX_ID>;
+
+/// What is told, and the number of the rule for it.
+#[derive(Debug, Clone, Copy)]
+struct Told {
+    item: Item,
+    /// [`NO_RULE`] if there is none.
+    rule: u8,
+}
 
 #[derive(Debug, Clone)]
 struct Port {
@@ -170,24 +183,45 @@ impl<'c, const METRICS: usize> GatewayCatalog<'c, METRICS> {
         node: &Counters,
         values: &mut [Option<Value>],
     ) -> u32 {
+        self.sample_part(status, uptime, node, 0..self.items.len(), values);
+        self.alive(status)
+    }
+
+    /// The ports that work: bit n is the nth device.
+    pub fn alive(&self, status: Status<'_>) -> u32 {
         let mut alive = 0_u32;
-        for (nth, port) in (0_u8..).zip(&self.ports) {
-            let is_alive =
-                status.ports().any(|status| status.id.0 == port.index && status.state == PortState::Working);
-            if is_alive {
-                alive |= 1_u32.checked_shl(nth.into()).unwrap_or(0);
-            }
+        for port in status.ports().filter(|port| port.state == PortState::Working) {
+            let nth = (0_u32..).zip(&self.ports).find(|(_, known)| known.index == port.id.0);
+            alive |= nth.and_then(|(nth, _)| 1_u32.checked_shl(nth)).unwrap_or(0);
         }
+        alive
+    }
+
+    /// Same as [`Self::sample`] for some of the places, so that a driver can let others run in between.
+    pub fn sample_part(
+        &self,
+        status: Status<'_>,
+        uptime: Duration,
+        node: &Counters,
+        part: Range<usize>,
+        values: &mut [Option<Value>],
+    ) {
+        let alive = self.alive(status);
         for (owner, places) in self.owners() {
             let port = match owner {
                 Owner::Node => None,
                 Owner::Device(nth) => self.ports.get(usize::from(nth)),
             };
+            let places = places.start.max(part.start)..places.end.min(part.end);
+            if places.is_empty() {
+                continue;
+            }
             let port = port.and_then(|port| status.ports().find(|status| status.id.0 == port.index));
             for place in places {
-                let (Some(&item), Some(value)) = (self.items.get(place), values.get_mut(place)) else {
+                let (Some(told), Some(value)) = (self.items.get(place), values.get_mut(place)) else {
                     break;
                 };
+                let item = told.item;
                 *value = match item {
                     Item::Version => Some(Value::Word(self.version)),
                     Item::Uptime => Some(Value::UInt64(uptime.as_millis() / 1_000)),
@@ -208,28 +242,29 @@ impl<'c, const METRICS: usize> GatewayCatalog<'c, METRICS> {
                     Item::FramesOut => port.map(|port| Value::UInt32(port.counters.frames_out)),
                     Item::Rejected => port.map(|port| Value::UInt32(port.counters.rejected())),
                     Item::Timeouts => port.map(|port| Value::UInt32(port.counters.timeouts)),
-                    // Set below, if they are known.
-                    Item::Var(_) | Item::Bit(..) => None,
+                    Item::Var(var) => {
+                        let known = status.variable(var);
+                        let is_of_now = |age| var.direction() == Direction::Input || age <= MAX_AGE;
+                        known.filter(|known| is_of_now(known.age)).map(|known| value_of(known.value))
+                    }
+                    // Set below, if it is known.
+                    Item::Bit(..) => None,
                 };
             }
         }
-        for known in status.variables() {
-            let wanted = match known.bit {
-                None => Item::Var(known.var),
-                Some(bit) => Item::Bit(known.var, bit),
-            };
-            if known.var.direction() == Direction::Output && known.age > MAX_AGE {
-                continue;
-            }
-            let places = self.items.iter().zip(values.iter_mut()).filter(|(item, _)| **item == wanted);
-            for (_, value) in places {
-                *value = Some(match (known.value, known.bit) {
-                    (Scalar::Byte(byte), Some(_)) => Value::Boolean(byte != 0),
-                    (scalar, _) => value_of(scalar),
-                });
+        let here = || self.items.iter().enumerate().take(part.end).skip(part.start);
+        if !here().any(|(_, told)| matches!(told.item, Item::Bit(..))) {
+            return;
+        }
+        for known in status.bits() {
+            let Some(bit) = known.bit else { continue };
+            let wanted = Item::Bit(known.var, bit);
+            for (place, _) in here().filter(|(_, told)| told.item == wanted) {
+                if let (Some(value), Scalar::Byte(byte)) = (values.get_mut(place), known.value) {
+                    *value = Some(Value::Boolean(byte != 0));
+                }
             }
         }
-        alive
     }
 
     /// The number of metrics, which is the length of a sample.
@@ -247,19 +282,28 @@ impl<'c, const METRICS: usize> GatewayCatalog<'c, METRICS> {
     }
 
     fn add(&mut self, item: Item) -> Result<(), NoRoom> {
-        self.items.push(item).map_err(|_| NoRoom)
+        let rule = match item {
+            Item::Var(var) => {
+                let mut rules = (0_u8..NO_RULE).zip(self.rates.rules);
+                let last =
+                    rules.by_ref().filter(|(_, rule)| rule.vars.iter().any(|known| known == var)).last();
+                last.map_or(NO_RULE, |(nth, _)| nth)
+            }
+            _ => NO_RULE,
+        };
+        self.items.push(Told { item, rule }).map_err(|_| NoRoom)
     }
 
     /// Adds what the present owner does not have yet.
     fn add_once(&mut self, item: Item) -> Result<(), NoRoom> {
         let start = self.starts.last().copied().unwrap_or(0);
-        match self.items.iter().skip(start).any(|known| *known == item) {
+        match self.items.iter().skip(start).any(|known| known.item == item) {
             true => Ok(()),
             false => self.add(item),
         }
     }
 
-    fn owners(&self) -> impl Iterator<Item = (Owner, core::ops::Range<usize>)> {
+    fn owners(&self) -> impl Iterator<Item = (Owner, Range<usize>)> {
         let owners = core::iter::once(Owner::Node).chain((0..).map(Owner::Device));
         let ranges = self.starts.iter().zip(self.starts.iter().skip(1));
         owners.zip(ranges.map(|(start, end)| *start..*end))
@@ -281,7 +325,7 @@ impl<const METRICS: usize> Catalog for GatewayCatalog<'_, METRICS> {
     }
 
     fn metric(&self, place: usize) -> Option<Metric<'_>> {
-        let item = *self.items.get(place)?;
+        let item = self.items.get(place)?.item;
         let is_nodes = self.starts.get(1).is_some_and(|end| place < *end);
         let plain = |name: &str, data_type, unit, description| Metric {
             name: joined(&[name]),
@@ -341,16 +385,11 @@ impl<const METRICS: usize> Catalog for GatewayCatalog<'_, METRICS> {
 
     fn report(&self, place: usize) -> Report {
         let usual = Report { dead_band: 0.0, min_interval: self.rates.min_interval };
-        let var = match self.items.get(place) {
-            Some(Item::Var(var)) => *var,
-            Some(Item::Uptime | Item::FramesIn | Item::FramesOut | Item::Rejected | Item::Timeouts) => {
-                return Report { min_interval: self.rates.counter_interval, ..usual };
-            }
-            _ => return usual,
-        };
-        let mut rules = self.rates.rules.iter().rev();
-        let rule = rules.find(|rule| rule.vars.iter().any(|known| known == var));
-        rule.map_or(usual, |rule| Report {
+        let Some(Told { item, rule }) = self.items.get(place).copied() else { return usual };
+        if matches!(item, Item::Uptime | Item::FramesIn | Item::FramesOut | Item::Rejected | Item::Timeouts) {
+            return Report { min_interval: self.rates.counter_interval, ..usual };
+        }
+        self.rates.rules.get(usize::from(rule)).map_or(usual, |rule| Report {
             dead_band: rule.dead_band,
             min_interval: rule.min_interval.unwrap_or(usual.min_interval),
         })

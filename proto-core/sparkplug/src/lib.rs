@@ -4,6 +4,8 @@
 //! no TLS and no clock, and nothing here allocates. It only tells: the one command that it obeys is the request for
 //! new births.
 //!
+//! Beside the node are what a board needs of its own: its settings as bytes ([`document`]), and UTC ([`sntp`]).
+//!
 //! A driver has a connection and follows the contract of all state machines of this repository: change once, then
 //! drain the outputs.
 //!
@@ -74,11 +76,13 @@ extern crate std;
 mod bytes;
 pub mod catalog;
 mod clock;
+pub mod document;
 pub mod gateway;
 mod history;
 pub mod mqtt;
 pub mod node;
 mod payload;
 mod protobuf;
+pub mod sntp;
 pub mod topic;
 pub mod value;

@@ -4,6 +4,8 @@
 //! the subscription to commands, births of the node and of each device that is alive, then data by exception. What
 //! changes while there is no session is kept and told later, marked as historical.
 
+mod io;
+mod maybe;
 mod messages;
 mod poll;
 mod settings;
@@ -16,8 +18,10 @@ use crate::clock::Clock;
 use crate::history::{History, Past};
 use crate::mqtt::{Inbox, Packet, ProtocolError};
 use crate::payload::{self, Asked, HostState};
-use crate::topic::{self, Id, IdError};
+use crate::topic;
 use crate::value::{DataType, Value};
+pub use io::{Counters, Failure, Input, NodeError, Output};
+use maybe::Maybe;
 pub use messages::MAX_METRIC;
 pub use settings::{MAX_TEXT, Settings, Text};
 
@@ -26,139 +30,6 @@ pub const MIN_BUFFER: usize = 768;
 
 /// The longest packet that is received; longer publications are skipped.
 const MAX_PACKET: usize = 512;
-
-/// What happened.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Input<'a> {
-    /// The connection that was asked for is there.
-    Opened,
-    /// It could not be made, or is gone.
-    Closed,
-    /// Bytes of the server.
-    Bytes(&'a [u8]),
-    /// All values at this instant, by the places of the catalog; `None`: unknown. What is missing at the end is
-    /// unknown too.
-    Sample {
-        /// The values.
-        values: &'a [Option<Value>],
-        /// The devices that work: bit n is device n.
-        alive: u32,
-    },
-    /// UTC at this instant.
-    Time {
-        /// Milliseconds since 1970.
-        utc_ms: u64,
-    },
-    /// Die, close the connection and open none any more.
-    End,
-}
-
-/// What is to be done.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Output<'b> {
-    /// Open a connection to the server, and report [`Input::Opened`] or [`Input::Closed`].
-    Open,
-    /// Keep this number where it survives a restart, before the next output is asked for.
-    Keep {
-        /// The number, to be given to [`EdgeNode::new`] after a restart.
-        bd_seq: u8,
-    },
-    /// Send all these bytes before the next output is asked for.
-    Send(&'b [u8]),
-    /// Close the connection; it is not to be reported.
-    Close,
-    /// Nothing until then, or until the next input.
-    Sleep {
-        /// [`Instant::NEVER`] if there is nothing to wait for.
-        until: Instant,
-    },
-}
-
-/// Why a node cannot be made.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[non_exhaustive]
-pub enum NodeError {
-    /// More metrics than there is room for.
-    Metrics {
-        /// Their number.
-        count: usize,
-        /// The room.
-        room: usize,
-    },
-    /// More devices than [`MAX_DEVICES`].
-    Devices {
-        /// Their number.
-        count: usize,
-    },
-    /// The name of a device cannot be part of a topic.
-    Device {
-        /// The device.
-        nth: usize,
-        /// What is wrong with its name.
-        error: IdError,
-    },
-    /// Two devices have the same name.
-    SameDevice {
-        /// The second one.
-        nth: usize,
-    },
-    /// The catalog has no metric at a place.
-    Metric {
-        /// The place.
-        place: usize,
-    },
-}
-
-/// Why a session ended or did not begin.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[non_exhaustive]
-pub enum Failure {
-    /// There was no connection, or it broke.
-    Closed,
-    /// The server did not answer in time.
-    Silent,
-    /// The server refused CONNECT, with this code of MQTT 3.1.1.
-    Refused {
-        /// 4: wrong user or password, 5: not authorised.
-        code: u8,
-    },
-    /// The server refused the subscription.
-    SubscriptionRefused,
-    /// The server does not speak MQTT 3.1.1.
-    Protocol(ProtocolError),
-    /// The primary host is offline.
-    HostOffline,
-    /// The catalog, or the driver's buffer, does not keep what is written of it.
-    Broken,
-}
-
-/// Counts since the node was made.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-#[non_exhaustive]
-pub struct Counters {
-    /// Connections that the server accepted.
-    pub sessions: u32,
-    /// Births of the node.
-    pub births: u32,
-    /// Those of them that were asked for.
-    pub rebirths: u32,
-    /// Messages of data.
-    pub data: u64,
-    /// Values that were told late, marked as historical.
-    pub historical: u64,
-    /// Values that were never told, because there was no room to keep them.
-    pub lost: u64,
-    /// Values that wait to be told.
-    pub kept: usize,
-    /// Commands that were not obeyed: metrics that nobody may write.
-    pub refused: u32,
-    /// Messages that nobody could read, or that were too long.
-    pub unreadable: u32,
-    /// Sessions and attempts that failed.
-    pub failures: u32,
-    /// Metrics left out of a birth because they are longer than [`MAX_METRIC`].
-    pub left_out: u32,
-}
 
 /// An edge node with room for so many metrics, and for so many values while nobody listens.
 #[derive(Debug, Clone)]
@@ -171,6 +42,8 @@ pub struct EdgeNode<const METRICS: usize, const HISTORY: usize> {
     clock: Clock,
     /// When the values were sampled.
     sampled_at: Instant,
+    /// The date of the birth that is on its way, and of the values that it tells.
+    dates: Dates,
     /// Devices that work, and those that were born in this session.
     alive: u32,
     born: u32,
@@ -185,14 +58,14 @@ pub struct EdgeNode<const METRICS: usize, const HISTORY: usize> {
     pong_until: Option<Instant>,
     birth_at: Option<Instant>,
     is_rebirth_wanted: bool,
-    host: Option<HostState>,
+    host: Maybe<HostState>,
     /// The connection is of no use.
     must_close: bool,
     is_ending: bool,
     online_since: Option<Instant>,
     attempts: u32,
     random: u64,
-    failure: Option<Failure>,
+    failure: Maybe<Failure>,
     counters: Counters,
 }
 
@@ -209,8 +82,9 @@ struct Slot {
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u8)]
 enum Phase {
-    /// No connection until then.
+    /// No connection until then. It is the first, so that a node that is not made yet is all zeros.
     Idle {
         until: Instant,
     },
@@ -237,6 +111,15 @@ enum Phase {
     Ended,
 }
 
+/// What a birth says of the time. It is fixed when the birth begins, as its length is.
+#[derive(Debug, Clone, Copy)]
+struct Dates {
+    now_ms: u64,
+    /// Of the values that it tells.
+    sampled_ms: u64,
+    is_utc: bool,
+}
+
 /// A birth on its way.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Birth {
@@ -246,15 +129,48 @@ struct Birth {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Stage {
-    Head,
+    /// Nothing is written yet, and the values that it tells are not chosen.
+    Begin,
+    /// The metrics before this place have so many bytes.
+    Measure { next: usize, len: usize },
     /// The metric at this place is next, and so many bytes are left.
-    Metrics {
-        next: usize,
-        left: usize,
-    },
+    Metrics { next: usize, left: usize },
 }
 
 impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
+    /// A node that is not made yet: all its bytes are zero. It waits until it is made by [`Self::configure`].
+    pub const fn idle() -> Self {
+        Self {
+            settings: Settings::empty(),
+            slots: Vec::new(),
+            starts: Vec::new(),
+            history: History::new(),
+            clock: Clock::unknown(),
+            sampled_at: Instant::ZERO,
+            dates: Dates { now_ms: 0, sampled_ms: 0, is_utc: false },
+            alive: 0,
+            born: 0,
+            device_births: [None; MAX_DEVICES],
+            phase: Phase::Idle { until: Instant::ZERO },
+            inbox: Inbox::new(),
+            acks: Deque::new(),
+            seq: 0,
+            bd_seq: None,
+            ping_at: Instant::ZERO,
+            pong_until: None,
+            birth_at: None,
+            is_rebirth_wanted: false,
+            host: Maybe::Nothing,
+            must_close: false,
+            is_ending: false,
+            online_since: None,
+            attempts: 0,
+            random: 0,
+            failure: Maybe::Nothing,
+            counters: Counters::NONE,
+        }
+    }
+
     /// A node without a session. `bd_seq` is what [`Output::Keep`] gave before a restart; `seed` is another one
     /// for each node, so that they do not all come back at the same time.
     ///
@@ -266,22 +182,37 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         bd_seq: Option<u8>,
         seed: u64,
     ) -> Result<Self, NodeError> {
+        let mut node = Self::idle();
+        node.configure(&settings, catalog, bd_seq, seed)?;
+        Ok(node)
+    }
+
+    /// Makes an [idle](Self::idle) node, in its place; [`Self::new`] says of what.
+    ///
+    /// # Errors
+    /// Those of [`Self::new`]. It is of no use then.
+    pub fn configure(
+        &mut self,
+        settings: &Settings,
+        catalog: &impl Catalog,
+        bd_seq: Option<u8>,
+        seed: u64,
+    ) -> Result<(), NodeError> {
         let count = catalog.devices();
         if count > MAX_DEVICES {
             return Err(NodeError::Devices { count });
         }
-        let (mut starts, mut slots) = (Vec::new(), Vec::new());
         let mut end = 0_usize;
         for owner in owners(count) {
-            let _ = starts.push(u16::try_from(end).unwrap_or(u16::MAX));
+            let _ = self.starts.push(u16::try_from(end).unwrap_or(u16::MAX));
             end = end.saturating_add(catalog.metrics(owner));
         }
         if end > METRICS || end >= usize::from(u16::MAX) {
             return Err(NodeError::Metrics { count: end, room: METRICS });
         }
-        let _ = starts.push(u16::try_from(end).unwrap_or(u16::MAX));
+        let _ = self.starts.push(u16::try_from(end).unwrap_or(u16::MAX));
         for nth in 0..count {
-            Id::new(catalog.device(nth)).map_err(|error| NodeError::Device { nth, error })?;
+            topic::check(catalog.device(nth)).map_err(|error| NodeError::Device { nth, error })?;
             if (0..nth).any(|other| catalog.device(other) == catalog.device(nth)) {
                 return Err(NodeError::SameDevice { nth });
             }
@@ -289,36 +220,11 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         for place in 0..end {
             let data_type = catalog.metric(place).ok_or(NodeError::Metric { place })?.data_type;
             let slot = Slot { data_type, is_pending: false, current: None, told: None, told_at: None };
-            let _ = slots.push(slot);
+            let _ = self.slots.push(slot);
         }
-        Ok(Self {
-            settings,
-            slots,
-            starts,
-            history: History::new(),
-            clock: Clock::default(),
-            sampled_at: Instant::ZERO,
-            alive: 0,
-            born: 0,
-            device_births: [None; MAX_DEVICES],
-            phase: Phase::Idle { until: Instant::ZERO },
-            inbox: Inbox::new(),
-            acks: Deque::new(),
-            seq: 0,
-            bd_seq,
-            ping_at: Instant::NEVER,
-            pong_until: None,
-            birth_at: None,
-            is_rebirth_wanted: false,
-            host: None,
-            must_close: false,
-            is_ending: false,
-            online_since: None,
-            attempts: 0,
-            random: seed | 1,
-            failure: None,
-            counters: Counters::default(),
-        })
+        self.settings.clone_from(settings);
+        (self.bd_seq, self.random, self.ping_at) = (bd_seq, seed | 1, Instant::NEVER);
+        Ok(())
     }
 
     /// Takes one input. `now` never goes back; the catalog is always the same.
@@ -329,7 +235,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
                     self.bd_seq = Some(self.bd_seq.map_or(0, |last| last.wrapping_add(1)));
                     self.inbox.clear();
                     self.acks.clear();
-                    (self.host, self.pong_until, self.ping_at) = (None, None, Instant::NEVER);
+                    (self.host, self.pong_until, self.ping_at) = (Maybe::Nothing, None, Instant::NEVER);
                     self.phase = Phase::Keep;
                 }
             }
@@ -357,12 +263,17 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
 
     /// Why the last session or attempt failed; `None` while there is a session.
     pub const fn failure(&self) -> Option<Failure> {
-        self.failure
+        self.failure.get()
     }
 
     /// Whether the node and its devices were born and data is told.
     pub const fn is_online(&self) -> bool {
         matches!(self.phase, Phase::Online)
+    }
+
+    /// Whether there is a connection, as far as the driver has said.
+    pub const fn is_connected(&self) -> bool {
+        !matches!(self.phase, Phase::Idle { .. } | Phase::Opening { .. } | Phase::Ended)
     }
 
     /// Whether it has died as [`Input::End`] asked.
@@ -477,8 +388,8 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
             }
             (Event::Host(state), _) => {
                 // An older statement may come late.
-                if self.host.is_none_or(|known| state.timestamp >= known.timestamp) {
-                    self.host = Some(state);
+                if self.host.get().is_none_or(|known| state.timestamp >= known.timestamp) {
+                    self.host = Maybe::Just(state);
                     self.look_for_host();
                 }
             }
@@ -495,13 +406,13 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
 
     /// Begins to tell when the primary host is there, if one is waited for.
     fn look_for_host(&mut self) {
-        let is_there = match (&self.settings.primary_host, self.host) {
+        let is_there = match (&self.settings.primary_host, self.host.get()) {
             (None, _) => true,
             (Some(_), host) => host.is_some_and(|host| host.is_online),
         };
         match self.phase {
             Phase::Waiting if is_there => {
-                self.phase = Phase::Birth(Birth { owner: Owner::Node, stage: Stage::Head });
+                self.phase = Phase::Birth(Birth { owner: Owner::Node, stage: Stage::Begin });
             }
             // A packet that was begun is finished first.
             _ => {}
@@ -510,15 +421,11 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
 
     /// Whether the primary host says that it is not there.
     fn is_host_gone(&self) -> bool {
-        self.host.is_some_and(|host| !host.is_online)
-    }
-
-    const fn is_connected(&self) -> bool {
-        !matches!(self.phase, Phase::Idle { .. } | Phase::Opening { .. } | Phase::Ended)
+        self.host.get().is_some_and(|host| !host.is_online)
     }
 
     fn note(&mut self, failure: Failure) {
-        self.failure = Some(failure);
+        self.failure = Maybe::Just(failure);
         self.counters.failures = self.counters.failures.saturating_add(1);
     }
 

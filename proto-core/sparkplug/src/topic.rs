@@ -35,19 +35,29 @@ impl Id {
     /// # Errors
     /// If it cannot be part of a topic.
     pub fn new(name: &str) -> Result<Self, IdError> {
-        if name.is_empty() {
-            return Err(IdError::Empty);
-        }
-        let is_reserved = |c: &char| matches!(c, '+' | '/' | '#') || c.is_control();
-        if let Some(character) = name.chars().find(is_reserved) {
-            return Err(IdError::Reserved { character });
-        }
+        check(name)?;
         String::try_from(name).map(Self).map_err(|_| IdError::Long { len: name.len() })
+    }
+
+    /// Of what is not made yet.
+    pub(crate) const fn empty() -> Self {
+        Self(String::new())
     }
 
     /// The name.
     pub fn as_str(&self) -> &str {
         &self.0
+    }
+}
+
+/// Whether a name can be part of a topic.
+pub(crate) fn check(name: &str) -> Result<(), IdError> {
+    let is_reserved = |c: &char| matches!(c, '+' | '/' | '#') || c.is_control();
+    match name.chars().find(is_reserved) {
+        _ if name.is_empty() => Err(IdError::Empty),
+        Some(character) => Err(IdError::Reserved { character }),
+        None if name.len() > MAX_ID => Err(IdError::Long { len: name.len() }),
+        None => Ok(()),
     }
 }
 

@@ -221,7 +221,8 @@ impl<'a> Status<'a> {
         self.whole_variables().chain(self.bits())
     }
 
-    fn bits(self) -> impl Iterator<Item = VariableStatus<'a>> {
+    /// The known bits with owners of their own.
+    pub fn bits(self) -> impl Iterator<Item = VariableStatus<'a>> {
         self.bits.shares().iter().flat_map(move |share| {
             let at = self.image.stamp_of(GroupId(share.frame));
             let owner = self.ports.get(usize::from(share.port)).map(|port| port.name.as_str());
@@ -240,15 +241,18 @@ impl<'a> Status<'a> {
     }
 
     fn whole_variables(self) -> impl Iterator<Item = VariableStatus<'a>> {
-        SysVar::all().filter_map(move |var| {
-            let age = self.image.age(var, self.at)?;
-            self.image.is_readable(var).then(|| VariableStatus {
-                var,
-                value: self.image.value(var),
-                age,
-                owner: self.owner(var),
-                bit: None,
-            })
+        SysVar::all().filter_map(move |var| self.variable(var))
+    }
+
+    /// A variable as a whole; `None` if it is unknown, or unreadable.
+    pub fn variable(self, var: SysVar) -> Option<VariableStatus<'a>> {
+        let age = self.image.age(var, self.at)?;
+        self.image.is_readable(var).then(|| VariableStatus {
+            var,
+            value: self.image.value(var),
+            age,
+            owner: self.owner(var),
+            bit: None,
         })
     }
 

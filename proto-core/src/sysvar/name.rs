@@ -13,6 +13,11 @@ pub struct VarRange {
 }
 
 impl VarRange {
+    /// The variables from `first` to `last`; `None` if they are not of one group, in order.
+    pub fn of(first: SysVar, last: SysVar) -> Option<Self> {
+        (first <= last && first.group() == last.group()).then_some(Self { first, last })
+    }
+
     /// The variables, in order.
     pub fn iter(self) -> impl ExactSizeIterator<Item = SysVar> + Clone {
         (self.first.0..self.last.0.saturating_add(1)).map(SysVar)

@@ -25,16 +25,16 @@ const LATER: Picos = MILLI;
 const FORMAT: Format = Format { baud: 115_200, odd_parity: None, stop_bits: 1 };
 
 /// What a cell did in the time.
-struct Did {
+pub(crate) struct Did {
     /// Of each bus: frames that left, and how much one was off its time at most.
-    out: [(&'static str, usize, Picos); 2],
+    pub(crate) out: [(&'static str, usize, Picos); 2],
     /// The document `status` at the end.
-    status: Value,
-    instructions: u64,
+    pub(crate) status: Value,
+    pub(crate) instructions: u64,
 }
 
 /// Frames come on the line every 10 ms and on CAN every 2 ms; `others` do what they do in between.
-fn work(bench: &mut Bench, span: Picos, mut others: impl FnMut(&mut Bench)) -> Did {
+pub(crate) fn work(bench: &mut Bench, span: Picos, mut others: impl FnMut(&mut Bench)) -> Did {
     let (begin, instructions) = (bench.now(), bench.chip.instructions());
     let mut number = 0_u8;
     for step in 0..span / (2 * MILLI) {

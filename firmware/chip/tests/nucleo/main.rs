@@ -4,10 +4,12 @@
 mod attack;
 mod bench;
 mod boot;
+mod broker;
 mod can;
 mod cell;
 mod client;
 mod cuts;
+mod edge;
 mod faults;
 mod flash;
 mod page;

@@ -96,6 +96,25 @@ impl Robot {
         self.sockets.add(socket)
     }
 
+    /// Adds a socket that somebody else listens with.
+    pub(crate) fn add_server(&mut self) -> SocketHandle {
+        let buffer = || tcp::SocketBuffer::new(vec![0; 2048]);
+        self.sockets.add(tcp::Socket::new(buffer(), buffer()))
+    }
+
+    /// Adds a socket for datagrams to this port.
+    pub(crate) fn add_datagrams(&mut self, port: u16) -> SocketHandle {
+        let buffer = || udp::PacketBuffer::new(vec![udp::PacketMetadata::EMPTY; 4], vec![0; 1024]);
+        let mut socket = udp::Socket::new(buffer(), buffer());
+        socket.bind(port).expect("a port");
+        self.sockets.add(socket)
+    }
+
+    /// A socket of [`Self::add_datagrams`].
+    pub(crate) fn udp(&mut self, handle: SocketHandle) -> &mut udp::Socket<'static> {
+        self.sockets.get_mut(handle)
+    }
+
     /// Drops a connection that has ended.
     pub(crate) fn forget(&mut self, handle: SocketHandle) {
         self.sockets.remove(handle);

@@ -12,10 +12,10 @@ use recipe_remote::revisions::Refused;
 use recipe_remote::route::Operation;
 use recipe_update::Downgrade;
 
-use super::Console;
 use super::answer::{Etag, Reply};
 use super::arguments::Arguments;
 use super::connection::Request;
+use super::{Console, edge};
 use crate::clock::now;
 use crate::fmt::Text;
 use crate::tasks::keeper::{Ask, Failed, Turn};
@@ -59,6 +59,7 @@ impl Console {
                 warn!("another firmware is to run for {}", Text(&peer));
                 self.firmware(room, Status::ACCEPTED)
             }
+            (Ok(_), Ask::Edge { tells, restart, .. }) => self.edge_is_kept(room, peer, tells, restart),
             (Err(Failed::Firmware(why)), _) => {
                 warn!("{} refused to {}: {}", name(operation), Text(&peer), Text(&why));
                 let status = if why.is_wrong() { Status::UNPROCESSABLE } else { Status::CONFLICT };
@@ -111,6 +112,9 @@ impl Console {
                 Ask::TryFirmware { confirm_s, downgrade: downgrade(room, &request)? }
             }
             Arguments::None if request.operation == Operation::PutUpdate => return put_piece(room, request),
+            Arguments::None if request.operation == Operation::PutEdge => {
+                return edge::settings(room, request);
+            }
             Arguments::None => return put(room, request),
         };
         let Some(desk) = self.desk else { return Err(nothing_kept(room)) };
@@ -231,6 +235,7 @@ fn name(operation: Operation) -> &'static str {
         Operation::TryUpdate => "a trial of a firmware",
         Operation::ConfirmUpdate => "the end of a firmware's trial",
         Operation::EndUpdate => "a return to the firmware before",
+        Operation::PutEdge => "settings of the edge node",
         _ => "roll back",
     }
 }

@@ -190,7 +190,7 @@ impl Console {
         if let Some(desk) = self.desk {
             desk.was_asked();
         }
-        if matches!(operation, Operation::PutConfig | Operation::PutUpdate) {
+        if matches!(operation, Operation::PutConfig | Operation::PutUpdate | Operation::PutEdge) {
             let Some(desk) = self.desk else { return Err(nothing_kept(line.room)) };
             let Some(turn) = desk.take() else { return Err(busy(line.room)) };
             // The guard has limited it.

@@ -11,6 +11,7 @@ mod arguments;
 mod change;
 mod connection;
 mod documents;
+mod edge;
 mod firmware;
 mod frames;
 mod read;
@@ -24,9 +25,12 @@ use heapless::String;
 use recipe_remote::claim::Claim;
 use recipe_remote::guard::Guard;
 use recipe_remote::key::Key;
+use recipe_sparkplug::document::Document;
 
+use super::edge::Edge;
 use super::gateway::Gateway;
 use super::keeper::Desk;
+use super::time::WallClock;
 use super::watchdog::Pulse;
 use crate::clock::now;
 use crate::identity::NAME;
@@ -48,6 +52,7 @@ pub struct Console {
     desk: Option<&'static Desk>,
     /// Those of the board.
     ports: Ports,
+    node: NodeView,
     name: String<NAME>,
     guard: RefCell<Guard>,
     claim: Cell<Claim>,
@@ -57,6 +62,17 @@ pub struct Console {
     /// Somebody follows the frames.
     is_followed: Cell<bool>,
     identify_until: Cell<Instant>,
+}
+
+/// The edge node, as far as clients see it.
+#[derive(Clone, Copy)]
+pub struct NodeView {
+    /// How it does.
+    pub edge: &'static Edge,
+    /// Its settings, if it has some.
+    pub document: Option<&'static Document>,
+    /// Whether it knows UTC.
+    pub clock: &'static WallClock,
 }
 
 /// Counters of connections. They wrap.
@@ -82,6 +98,7 @@ impl Console {
         gateway: &'static Gateway,
         desk: Option<&'static Desk>,
         ports: Ports,
+        node: NodeView,
         name: String<NAME>,
         key: Option<[u8; 16]>,
         secret: [u8; 32],
@@ -90,6 +107,7 @@ impl Console {
             gateway,
             desk,
             ports,
+            node,
             name,
             claim: Cell::new(Claim::at_start(key.is_some())),
             guard: RefCell::new(Guard::new(key.map(Key::new), secret)),

@@ -37,6 +37,7 @@ impl Console {
             Operation::Info => self.info(line.room),
             Operation::Nonce => self.nonce(line.room),
             Operation::Revisions => self.revisions(line.room, Status::OK, None),
+            Operation::Edge => self.edge(line.room, Status::OK),
             Operation::Update => self.firmware(line.room, Status::OK),
             Operation::Status => return self.document(line, Kind::Json, Source::of(Document::Status)).await,
             Operation::Values => return self.document(line, Kind::Json, Source::of(Document::Values)).await,

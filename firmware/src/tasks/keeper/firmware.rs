@@ -142,7 +142,7 @@ impl<F: StoreFlash, S: SlotFlash> Keeper<'_, F, S> {
                 self.over(Ended::TakenBack).await;
                 Some((Ok(0), true))
             }
-            Ask::Apply { .. } | Ask::Confirm | Ask::RollBack | Ask::Claim(_) => None,
+            Ask::Apply { .. } | Ask::Confirm | Ask::RollBack | Ask::Claim(_) | Ask::Edge { .. } => None,
         }
     }
 

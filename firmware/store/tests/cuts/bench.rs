@@ -16,6 +16,7 @@ pub(crate) enum Operation {
     Counter(u8, u64),
     BirthSequence(u8),
     Key([u8; 16]),
+    Edge(Vec<u8>),
 }
 
 /// Everything a store holds.
@@ -23,7 +24,8 @@ pub(crate) enum Operation {
 pub(crate) struct Contents {
     images: BTreeMap<u32, (u32, Vec<u8>)>,
     marks: Marks,
-    counters: [u64; 4],
+    counters: [u64; 3],
+    edge: Vec<u8>,
     birth: Option<u8>,
     key: Option<[u8; 16]>,
 }
@@ -82,8 +84,11 @@ pub(crate) fn life(changes: usize, lens: &[usize]) -> Vec<Operation> {
         }
         all.extend([
             Operation::BirthSequence(number as u8),
-            Operation::Counter(number as u8 % 4, number.into()),
+            Operation::Counter(number as u8 % 3, number.into()),
         ]);
+        if number % 4 == 1 {
+            all.push(Operation::Edge(image(!number, number as usize * 7 % 150)));
+        }
         if all.len() >= changes {
             all.truncate(changes);
             return all;
@@ -106,6 +111,9 @@ impl Operation {
             Self::BirthSequence(value) => {
                 block_on(store.set_birth_sequence(*value).expect("there is room").carry_out(flash))
             }
+            Self::Edge(settings) => {
+                block_on(store.set_edge(settings).expect("there is room").carry_out(flash))
+            }
             Self::Key(key) => block_on(store.set_access_key(key).expect("there is room").carry_out(flash)),
         };
         done.is_ok()
@@ -120,10 +128,12 @@ impl Contents {
             let image = store.image(flash, kept.number, &mut room).expect("it is kept").to_vec();
             (kept.number, (kept.digest, image))
         });
+        let images = images.collect();
         Self {
-            images: images.collect(),
+            images,
             marks: store.marks(),
             counters: std::array::from_fn(|number| store.counter(number as u8)),
+            edge: store.get(flash, recipe_store::Key::Edge, &mut room).unwrap_or_default().to_vec(),
             birth: store.birth_sequence(),
             key: store.access_key(flash),
         }
@@ -145,6 +155,7 @@ impl Contents {
             Operation::Counter(number, value) => new.counters[usize::from(*number)] = *value,
             Operation::BirthSequence(value) => new.birth = Some(*value),
             Operation::Key(key) => new.key = Some(*key),
+            Operation::Edge(settings) => new.edge.clone_from(settings),
         }
         new
     }

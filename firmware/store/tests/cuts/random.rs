@@ -21,7 +21,7 @@ fn run(seed: u64, starts: u32) -> (u32, u32) {
         bench.flash.cut_after(left as u32, next(u64::MAX));
         loop {
             let change = match next(4) {
-                0 => Operation::Counter(next(4) as u8, next(u64::MAX)),
+                0 => Operation::Counter(next(3) as u8, next(u64::MAX)),
                 1 => Operation::BirthSequence(next(256) as u8),
                 _ => changes.next().unwrap_or_else(|| Operation::Keep {
                     number: 2_000 + next(100) as u32,

@@ -106,7 +106,7 @@ fn what_does_not_fit_is_refused_before_anything_is_erased() {
         PutError::TooLong { len: MAX_DATA + 1 }
     );
     assert_eq!(bench.store.put(Key::Image(8), 0, &[]).unwrap_err(), PutError::Key);
-    assert_eq!(bench.store.put(Key::Counter(4), 0, &[]).unwrap_err(), PutError::Key);
+    assert_eq!(bench.store.put(Key::Counter(3), 0, &[]).unwrap_err(), PutError::Key);
 }
 
 #[test]

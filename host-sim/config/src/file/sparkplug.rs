@@ -15,7 +15,8 @@ use super::{Text, with_text};
 use crate::keys::Key;
 use crate::keys::sparkplug::{
     ADDRESS, BD_SEQ, BROKER, CA, CLIENT_ID, COUNTERS, DEAD_BAND, FILE, GROUP, INTERVAL, KEEP_ALIVE, LOGIN,
-    NAME, NODE, PLAIN, PRIMARY_HOST, REPORT, RULE, RULE_INTERVAL, RULE_VALUES, SAMPLE, VALUES,
+    NAME, NODE, PLAIN, PRIMARY_HOST, REPORT, RULE, RULE_INTERVAL, RULE_VALUES, SAMPLE, SERVER, TIME_TABLE,
+    VALUES,
 };
 
 /// Where and how a gateway tells what it knows.
@@ -51,6 +52,8 @@ pub struct SparkplugFile {
     pub values: Vec<VarRange>,
     /// Exceptions.
     pub rules: Vec<ReportRule>,
+    /// Of a board: the server that it asks for UTC, and its port.
+    pub time_server: Option<(String, u16)>,
 }
 
 /// How some variables are told.
@@ -151,7 +154,15 @@ pub fn parse_sparkplug(
             return Err(rule.error("more than 64 rules"));
         }
     }
+    let time_server = match root.optional("time") {
+        Some(item) => {
+            let server = item.table(&TIME_TABLE)?.required(SERVER.name, "such as \"10.0.0.1\"")?;
+            Some(host_and_port(&server, 123)?)
+        }
+        None => None,
+    };
     Ok(SparkplugFile {
+        time_server,
         host,
         port,
         login: path(&broker, &LOGIN)?,

@@ -56,6 +56,8 @@ fn a_mistake_has_its_place_and_says_what_is_allowed() {
             format!("{GOOD}[report]\nvalues = [\"FloatInputReg[1]\"]"),
             "s.toml:8:11: report.values[1]: only variables of the controller",
         ),
+        (format!("{GOOD}[time]\n"), "s.toml:7:1: time: server is missing"),
+        (format!("{GOOD}[time]\nserver = \"a b\""), "s.toml:8:10: time.server: \"a b\" is no host"),
         (format!("{GOOD}[[rule]]\nvalues = \"Force[1]\""), "s.toml:8:10: rule[1].values: "),
         (
             format!("{GOOD}[[rule]]\nvalues = \"ForceEnd[1]\"\ndead_band = -1"),

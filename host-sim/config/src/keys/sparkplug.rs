@@ -65,6 +65,13 @@ pub(crate) const RULE_INTERVAL: Key =
 /// `[[rule]]`.
 pub const RULE: Table = Table::of("report rule", &[RULE_VALUES, DEAD_BAND, RULE_INTERVAL]).at(" of a rule");
 
+pub(crate) const SERVER: Key = Key::text_of("server", Text::Length(1, 255))
+    .required()
+    .tells("of a board: the server of SNTP that it asks for UTC, a host name or an IPv4 address, with or without a port: `\"10.0.0.1\"`");
+
+/// `[time]`.
+pub const TIME_TABLE: Table = Table::of("time", &[SERVER]);
+
 /// The file.
 pub const FILE: Table = Table::of(
     "Sparkplug file",
@@ -72,6 +79,7 @@ pub const FILE: Table = Table::of(
         Key::new("broker", Shape::Table(&BROKER)).required().is("where it is told"),
         Key::new("node", Shape::Table(&NODE)).required().is("what it is called there"),
         Key::new("report", Shape::Table(&REPORT)).is("what is told, and how often"),
+        Key::new("time", Shape::Table(&TIME_TABLE)).absent("UTC of the system; on a board unknown").is("UTC"),
         Key::new("rule", Shape::List(&Shape::Table(&RULE), 0, 64))
             .is("exceptions for variables; the last one that has a variable counts"),
     ],
@@ -83,4 +91,5 @@ pub const DOCUMENTED: &[(&str, &[&[Key]])] = &[
     ("node", &[NODE.common]),
     ("report", &[REPORT.common]),
     ("rule", &[RULE.common]),
+    ("time", &[TIME_TABLE.common]),
 ];

@@ -1,6 +1,7 @@
 //! `ctl` against servers that are scripted, good and hostile ones.
 
 mod board;
+mod edge;
 mod firmware;
 mod fleet;
 mod hostile;

@@ -61,6 +61,10 @@ impl Server {
                 Status::NOT_IMPLEMENTED,
                 "this gateway is a program; it is updated as a package, as it was installed",
             ),
+            (Operation::Edge | Operation::PutEdge, _) => Reply::error(
+                Status::NOT_IMPLEMENTED,
+                "this gateway is a program; its edge node is given with --sparkplug, and its log says how it does",
+            ),
             (
                 operation @ (Operation::PutConfig
                 | Operation::Apply

@@ -162,6 +162,18 @@ pub(super) enum Act {
         #[command(flatten)]
         many: Many,
     },
+    /// Let a board tell a broker what it knows, as an edge node of Sparkplug, or show how its node does
+    #[command(after_help = help::EDGE)]
+    Edge {
+        /// The Sparkplug file; without it, how the node does
+        file: Option<PathBuf>,
+        /// It tells nothing any more
+        #[arg(long, conflicts_with = "file")]
+        off: bool,
+        /// Start the board again, so that it counts at once
+        #[arg(long)]
+        restart: bool,
+    },
     /// Show which one it is: a board lets its lamp blink, a host writes a line to its log
     Identify {
         /// For so many seconds

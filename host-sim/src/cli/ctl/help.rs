@@ -140,6 +140,19 @@ alone, so the same command goes on where one has ended. Ctrl-C waits for the boa
 Exit code 1 if one of the boards does not run it, 2 if the file is wrong, 3 if the
 board does worse than before.";
 
+pub(super) const EDGE: &str = "\
+The file is that of `host-sim gateway --sparkplug`, with plain = true: a board speaks no TLS.
+Whoever listens on the way reads the password. The board keeps it, never shows it, and tells
+from its next start on; --restart starts it at once, after the safe values went out.
+
+Examples:
+  host-sim ctl --to 192.168.0.20 edge sparkplug.toml --restart
+  host-sim ctl --to 192.168.0.20 edge
+  host-sim ctl --to 192.168.0.20 edge --off --restart
+  host-sim ctl --inventory cells.toml edge               all of them
+
+Exit code 2 if the file is wrong, 3 if the node has no session.";
+
 pub(super) const KEYGEN: &str = "\
 The key of a gateway on a host: the file belongs on its machine and on yours. With
 --signing, a key for updates of boards: FILE stays where firmware is signed, and FILE.pub

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use recipe_ctl::{
     Answer, Client, Configuration, Failure, Firmware, Member, Names, Rollout, Stop, Trial, Update, Verdict,
-    Watched, WithoutTrial, key_file, signing_key, update,
+    Watched, WithoutTrial, edge, key_file, signing_key, update,
 };
 use recipe_shell::out::print_stderr;
 
@@ -153,6 +153,23 @@ impl Act {
                 Work::Follow(Box::new(move |client, run, out| {
                     run.print(&update::update(client, &file, plan, &mut |line| print_stderr(line))?, out)
                 }))
+            }
+            Self::Edge { file: Some(_), .. } if is_for_inventory => {
+                return Err(Failure::wrong(
+                    "a Sparkplug file names one node, and an inventory may have several gateways; give it with --to",
+                ));
+            }
+            Self::Edge { file: None, off: false, restart: true } => {
+                return Err(Failure::wrong("--restart is for a file or --off"));
+            }
+            Self::Edge { file: None, off: false, .. } => rows(|client, _| edge::shown(client)),
+            Self::Edge { file, restart, .. } => {
+                let settings = match file {
+                    Some(file) => recipe_fleet::board::settings(file).map_err(Failure::wrong)?,
+                    None => recipe_sparkplug::document::OFF.to_vec(),
+                };
+                let from = if *restart { edge::From::Now } else { edge::From::NextStart };
+                rows(move |client, _| edge::set(client, &settings, from))
             }
             Self::Identify { seconds } => rows(move |client, _| recipe_ctl::identify(client, *seconds)),
             Self::Claim { file } => Work::Follow(Box::new(move |client, run, out| {

@@ -1,6 +1,6 @@
 //! The messages of a node, as packets of MQTT.
 
-use super::{Birth, EdgeNode, Owner, Stage, has};
+use super::{Birth, Dates, EdgeNode, Owner, Stage, has};
 use crate::bytes::Out;
 use crate::catalog::Catalog;
 use crate::mqtt;
@@ -14,6 +14,8 @@ pub const MAX_METRIC: usize = 512;
 
 /// What became of a piece of a birth.
 pub(super) enum Piece<'b> {
+    /// There is none yet.
+    Later,
     /// These bytes, and there is more.
     Part(&'b [u8]),
     /// The last bytes.
@@ -96,22 +98,32 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
     ) -> Piece<'b> {
         let room = buf.len();
         let places = self.places(birth.owner);
+        if birth.stage == Stage::Begin {
+            self.begin_birth(now, birth.owner);
+            birth.stage = Stage::Measure { next: places.start, len: 0 };
+        }
         let mut out = Out::new(buf);
+        let is_first = matches!(birth.stage, Stage::Measure { .. });
         let (mut next, left) = match birth.stage {
-            Stage::Head => {
-                self.begin_birth(birth.owner);
+            Stage::Begin => return Piece::Broken,
+            Stage::Measure { next, len } => {
+                let end = next.saturating_add(MEASURED_AT_ONCE).min(places.end);
+                let measured = (next..end).map(|place| self.birth_metric_len(catalog, place));
+                let len = measured.fold(len, usize::saturating_add);
+                if end < places.end {
+                    birth.stage = Stage::Measure { next: end, len };
+                    return Piece::Later;
+                }
                 let device = device_name(catalog, birth.owner);
                 let head = |out: &mut Out<'_>| {
                     mqtt::text_of(out, |out| self.write_topic(out, Verb::Birth, device));
-                    payload::begin(out, self.clock.at(now));
+                    payload::begin(out, self.dates.now_ms);
                     if birth.owner == Owner::Node {
                         self.write_own_metrics(out);
                     }
                 };
-                let metrics = places.clone().map(|place| self.birth_metric_len(catalog, place));
-                let metrics = metrics.fold(0, usize::saturating_add);
                 let end = Out::count(|out| payload::end(out, self.seq));
-                let len = Out::count(head).saturating_add(metrics).saturating_add(end);
+                let len = Out::count(head).saturating_add(len).saturating_add(end);
                 if len > mqtt::MAX_BODY {
                     return Piece::Broken;
                 }
@@ -138,7 +150,6 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
             payload::end(&mut out, self.seq);
         }
         let Some(left) = left.checked_sub(out.len().saturating_sub(before)) else { return Piece::Broken };
-        let is_first = birth.stage == Stage::Head;
         birth.stage = Stage::Metrics { next, left };
         match out.finish() {
             Some(bytes) if is_last && left == 0 => Piece::Last(bytes),
@@ -260,8 +271,13 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
     }
 
     /// The values that the birth tells, and its number.
-    fn begin_birth(&mut self, owner: Owner) {
+    fn begin_birth(&mut self, now: Instant, owner: Owner) {
         let sampled_at = self.sampled_at;
+        self.dates = Dates {
+            now_ms: self.clock.at(now),
+            sampled_ms: self.clock.at(sampled_at),
+            is_utc: self.clock.is_known(),
+        };
         let places = self.places(owner);
         for slot in self.slots.iter_mut().take(places.end).skip(places.start) {
             slot.tell(sampled_at);
@@ -276,10 +292,10 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
 
     /// What a birth of the node has beside the catalog. Nobody may write by an alias, so there is none.
     fn write_own_metrics(&self, out: &mut Out<'_>) {
-        let at = self.clock.at(self.sampled_at);
+        let at = self.dates.sampled_ms;
         payload::metric(out, &payload::bd_seq_metric(at, self.session()));
         payload::metric(out, &payload::plain(payload::REBIRTH, at, Value::Boolean(false)));
-        payload::metric(out, &payload::plain(UTC, at, Value::Boolean(self.clock.is_known())));
+        payload::metric(out, &payload::plain(UTC, at, Value::Boolean(self.dates.is_utc)));
     }
 
     /// 0 if the metric is left out.
@@ -296,7 +312,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
             name: Some(&metric.name),
             data_type: Some(slot.data_type),
             details: Details { unit: metric.unit, range: metric.range, description: metric.description },
-            ..data_metric(place, self.clock.at(self.sampled_at), slot.told, false)
+            ..data_metric(place, self.dates.sampled_ms, slot.told, false)
         };
         payload::metric(out, &shown);
     }
@@ -350,6 +366,9 @@ pub(super) fn owner_of(starts: &[u16], place: u16) -> Owner {
 
 /// Says whether timestamps are UTC; if not, they count from the node's start, in 1970.
 const UTC: &str = "Node Info/UTC";
+
+/// Metrics of a birth that are measured in one call: less work than writing a piece.
+const MEASURED_AT_ONCE: usize = 8;
 
 /// The most bytes behind the metrics of a payload.
 const MAX_END: usize = 3;

@@ -3,7 +3,7 @@
 use proto_core::time::{Duration, Instant};
 
 use super::messages::Piece;
-use super::{Birth, EdgeNode, Failure, Output, Owner, Phase, Stage, has, owners};
+use super::{Birth, EdgeNode, Failure, Maybe, Output, Owner, Phase, Stage, has, owners};
 use crate::bytes::Out;
 use crate::catalog::Catalog;
 use crate::mqtt;
@@ -112,7 +112,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
             }
             self.counters.rebirths = self.counters.rebirths.saturating_add(1);
             self.is_rebirth_wanted = false;
-            let birth = Birth { owner: Owner::Node, stage: Stage::Head };
+            let birth = Birth { owner: Owner::Node, stage: Stage::Begin };
             return self.poll_birth(now, catalog, birth, buf);
         }
         let mut next = next;
@@ -127,7 +127,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
                     let last = self.device_births.get(usize::from(nth)).copied().flatten();
                     let may_at = last.map_or(Instant::ZERO, |at| at + BIRTH_PAUSE);
                     if now >= may_at {
-                        let birth = Birth { owner: Owner::Device(nth), stage: Stage::Head };
+                        let birth = Birth { owner: Owner::Device(nth), stage: Stage::Begin };
                         return self.poll_birth(now, catalog, birth, buf);
                     }
                     next = next.min(may_at);
@@ -157,7 +157,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         mut birth: Birth,
         buf: &'b mut [u8],
     ) -> Output<'b> {
-        let is_first = birth.stage == Stage::Head;
+        let is_first = birth.stage == Stage::Begin;
         if is_first {
             match birth.owner {
                 Owner::Node => {
@@ -173,6 +173,10 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
             }
         }
         match self.write_birth(now, catalog, &mut birth, buf) {
+            Piece::Later => {
+                self.phase = Phase::Birth(birth);
+                Output::Busy
+            }
             Piece::Part(bytes) => {
                 self.phase = Phase::Birth(birth);
                 Output::Send(bytes)
@@ -183,12 +187,12 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
                 let next = next.filter(|nth| has(self.alive, *nth) && !has(self.born, *nth));
                 let is_sequence = self.phase != Phase::Online || birth.owner == Owner::Node;
                 self.phase = match next.min().filter(|_| is_sequence && !self.is_interrupted()) {
-                    Some(nth) => Phase::Birth(Birth { owner: Owner::Device(nth), stage: Stage::Head }),
+                    Some(nth) => Phase::Birth(Birth { owner: Owner::Device(nth), stage: Stage::Begin }),
                     None => Phase::Online,
                 };
                 if self.phase == Phase::Online {
                     self.online_since.get_or_insert(now);
-                    self.failure = None;
+                    self.failure = Maybe::Nothing;
                 }
                 Output::Send(bytes)
             }

@@ -52,6 +52,18 @@ pub struct Settings {
 }
 
 impl Settings {
+    /// Of a node that is not made yet; all its bytes are zero.
+    pub(crate) const fn empty() -> Self {
+        Self {
+            group: Id::empty(),
+            node: Id::empty(),
+            primary_host: None,
+            client_id: Text(String::new()),
+            login: None,
+            keep_alive: Duration::ZERO,
+        }
+    }
+
     /// A node without a password or a primary host, with a keep-alive of 30 s; for its server it is called
     /// `group/node`.
     pub fn new(group: Id, node: Id) -> Self {

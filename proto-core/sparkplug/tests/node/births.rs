@@ -81,16 +81,22 @@ fn long_births_come_in_pieces_of_the_buffer() {
 #[test]
 fn a_sample_in_the_middle_of_a_birth_changes_nothing_of_it() {
     use proto_core::time::Instant;
-    use recipe_sparkplug::node::Output;
+    use recipe_sparkplug::node::{Input, Output};
     let mut rig = Rig::new(settings(), Plant { more: 200, ..Plant::default() });
     rig.connect();
     rig.drain();
     rig.receive(&[0x90, 3, 0, 1, 1]);
     let mut bytes = Vec::new();
     let mut piece = [0; MIN_BUFFER];
-    while let Output::Send(sent) = rig.node.poll_output(Instant::from_millis(1_000), &rig.plant, &mut piece) {
-        bytes.extend_from_slice(sent);
-        // Unknown values are shorter.
+    loop {
+        match rig.node.poll_output(Instant::from_millis(1_000), &rig.plant, &mut piece) {
+            Output::Send(sent) => bytes.extend_from_slice(sent),
+            Output::Busy => {}
+            _ => break,
+        }
+        // Unknown values are shorter, and so are dates before UTC was known.
+        let utc_ms = 1 << (bytes.len() % 40);
+        rig.node.handle(Instant::from_millis(1_000), Input::Time { utc_ms }, &rig.plant);
         rig.values.iter_mut().for_each(|value| *value = None);
         rig.sample();
     }

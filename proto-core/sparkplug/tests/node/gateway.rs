@@ -129,6 +129,27 @@ fn samples_have_the_type_of_their_metric_and_nothing_invented() {
 }
 
 #[test]
+fn parts_of_a_sample_are_the_whole() {
+    let config = config();
+    let engine = engine(&config);
+    let now = Instant::from_micros(2_000);
+    let catalog = Small::new(config.view(), engine.status(now), RATES, "0.0.0").unwrap();
+    let (uptime, counters) = (Duration::from_secs(9), Counters::default());
+    let mut whole = vec![None; catalog.len()];
+    let alive = catalog.sample(engine.status(now), uptime, &counters, &mut whole);
+    assert_eq!(catalog.alive(engine.status(now)), alive);
+    for len in [1, 7, catalog.len()] {
+        let mut values = vec![Some(Value::Boolean(true)); catalog.len()];
+        for start in (0..catalog.len()).step_by(len) {
+            catalog.sample_part(engine.status(now), uptime, &counters, start..start + len, &mut values);
+            let later = values.iter().skip(start + len);
+            assert!(later.clone().all(|value| *value == Some(Value::Boolean(true))), "{len}");
+        }
+        assert_eq!(values, whole, "{len}");
+    }
+}
+
+#[test]
 fn rules_count_for_their_variables_and_the_last_one_wins() {
     let config = config();
     let engine = engine(&config);

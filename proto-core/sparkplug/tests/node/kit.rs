@@ -280,6 +280,8 @@ impl Rig {
                     self.received.clear();
                     done.push(Did::Close);
                 }
+                // Others run meanwhile.
+                Output::Busy => self.now = self.now + Duration::from_millis(1),
                 Output::Send(bytes) => {
                     self.pieces += 1;
                     self.received.extend_from_slice(bytes);

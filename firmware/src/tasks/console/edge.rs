@@ -1,0 +1,126 @@
+//! The document `edge`: how the edge node does, and new settings for it (docs/api.md section 10).
+
+use core::fmt::{self, Write};
+
+use recipe_remote::json;
+use recipe_remote::response::{Kind, Status};
+use recipe_sparkplug::document::{Document, DocumentError};
+
+use super::Console;
+use super::answer::{Reply, Room};
+use super::change::busy;
+use super::connection::Request;
+use crate::fmt::Text;
+use crate::tasks::edge::View;
+use crate::tasks::keeper::{Ask, Turn};
+use crate::warn;
+
+impl Console {
+    /// The document, with this status.
+    #[inline(never)]
+    pub(super) fn edge(&self, room: &mut [u8], status: Status) -> Reply {
+        Reply::new(room, status, Kind::Json, |out| self.write_edge(out))
+    }
+
+    fn write_edge(&self, out: &mut Room<'_>) -> fmt::Result {
+        let node = &self.node;
+        let state = match node.edge.view() {
+            View::Off => "off",
+            View::Cannot(_) => "cannot",
+            View::Runs(telling) if telling.is_online => "online",
+            View::Runs(_) => "offline",
+        };
+        write!(out, "{{\"state\":\"{state}\"")?;
+        match node.edge.view() {
+            View::Off => {}
+            View::Cannot(why) => write_why(out, &why)?,
+            View::Runs(telling) => {
+                if let Some(failure) = telling.failure {
+                    write_why(out, &failure)?;
+                }
+                if let Some(document) = node.document {
+                    out.write_str(",\"broker\":")?;
+                    json::write_text(out, format_args!("{}:{}", document.host, document.port))?;
+                    for (name, id) in [("group", &document.settings.group), ("node", &document.settings.node)]
+                    {
+                        write!(out, ",\"{name}\":")?;
+                        json::write_text(out, id.as_str())?;
+                    }
+                    if let Some((server, port)) = &document.time_server {
+                        out.write_str(",\"time_server\":")?;
+                        json::write_text(out, format_args!("{server}:{port}"))?;
+                    }
+                }
+                write!(out, ",\"utc\":{}", node.clock.is_known())?;
+                if let Some(bd_seq) = telling.bd_seq {
+                    write!(out, ",\"bd_seq\":{bd_seq}")?;
+                }
+                write!(out, ",\"metrics\":{},\"counters\":{{", telling.metrics)?;
+                let counters = telling.counters;
+                let all = [
+                    ("sessions", counters.sessions.into()),
+                    ("births", counters.births.into()),
+                    ("rebirths", counters.rebirths.into()),
+                    ("data", counters.data),
+                    ("historical", counters.historical),
+                    ("lost", counters.lost),
+                    ("kept", counters.kept as u64),
+                    ("refused", counters.refused.into()),
+                    ("unreadable", counters.unreadable.into()),
+                    ("failures", counters.failures.into()),
+                    ("left_out", counters.left_out.into()),
+                ];
+                for (nth, (name, count)) in all.into_iter().enumerate() {
+                    let comma = if nth == 0 { "" } else { "," };
+                    write!(out, "{comma}\"{name}\":{count}")?;
+                }
+                out.write_char('}')?;
+            }
+        }
+        if let Some(tells) = node.edge.next() {
+            write!(out, ",\"next\":\"{}\"", if tells { "other" } else { "off" })?;
+        }
+        out.write_char('}')
+    }
+
+    /// Settings were kept.
+    pub(super) fn edge_is_kept(
+        &self,
+        room: &mut [u8],
+        peer: core::net::Ipv4Addr,
+        tells: bool,
+        restart: bool,
+    ) -> Reply {
+        self.node.edge.keeps(tells);
+        warn!("{} has changed the settings of the edge node", Text(&peer));
+        self.edge(room, if restart { Status::ACCEPTED } else { Status::OK })
+    }
+}
+
+/// What the keeper is asked for with the settings that were sent, and whether they tell anything; or the answer.
+#[inline(never)]
+pub(super) fn settings<'a>(room: &mut [u8], request: Request<'a>) -> Result<(Ask, Turn<'a>), Reply> {
+    let restart = match request.head.query("restart") {
+        None => false,
+        Some("yes") => true,
+        Some(_) => {
+            return Err(Reply::error(room, Status::BAD_REQUEST, "restart is out of range; allowed: yes"));
+        }
+    };
+    let Some((len, turn)) = request.image else { return Err(busy(room)) };
+    match turn.look(len, read) {
+        Ok(tells) => Ok((Ask::Edge { len, tells, restart }, turn)),
+        Err(error) => Err(Reply::error(room, Status::UNPROCESSABLE, error)),
+    }
+}
+
+/// Not inlined, so that its stack frame is free when the keeper is asked.
+#[inline(never)]
+fn read(bytes: &[u8]) -> Result<bool, DocumentError> {
+    Document::empty().decode(bytes)
+}
+
+fn write_why(out: &mut Room<'_>, why: &dyn fmt::Display) -> fmt::Result {
+    out.write_str(",\"why\":")?;
+    json::write_text(out, why)
+}

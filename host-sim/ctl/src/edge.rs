@@ -1,0 +1,104 @@
+//! The edge node of a board: what it does, and other settings for it (docs/api.md section 10).
+
+use std::time::{Duration, Instant};
+
+use serde_json::Value;
+
+use crate::answer::Answer;
+use crate::client::{Body, Call, Client};
+use crate::failure::Failure;
+use crate::table::{Cell, facts};
+
+/// When settings that are kept take effect.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum From {
+    /// With the next start, whenever that is.
+    NextStart,
+    /// With a start at once.
+    Now,
+}
+
+/// How the edge node of a board does.
+///
+/// # Errors
+/// If it is refused, such as by a gateway on a host, or not reached.
+pub fn shown(client: &Client) -> Result<Answer, Failure> {
+    client.json("edge").map(answer)
+}
+
+/// Keeps settings for the edge node of a board, in the form that a board takes.
+///
+/// # Errors
+/// If it is refused or not reached, or the board does not come back.
+pub fn set(client: &Client, settings: &[u8], from: From) -> Result<Answer, Failure> {
+    let (path, more_time) = match from {
+        From::NextStart => ("edge", Duration::ZERO),
+        From::Now => ("edge?restart=yes", RESTARTING),
+    };
+    let call = Call { method: "PUT", path, body: Body::Image(settings), if_match: None, more_time };
+    let document = client.document(&client.accepted(client.call(&call)?)?)?;
+    match from {
+        From::NextStart => Ok(answer(document)),
+        From::Now => restarted(client).map(answer),
+    }
+}
+
+/// The document once the board has started again.
+fn restarted(client: &Client) -> Result<Value, Failure> {
+    let deadline = Instant::now() + RESTARTING;
+    loop {
+        let last = client.json("edge");
+        match &last {
+            // Before the restart it still says what is kept for it; after it, it takes a moment to connect.
+            Ok(document) if document.get("next").is_none() && !is_trying(document) => return last,
+            Ok(document) if document.get("next").is_none() && Instant::now() > deadline => return last,
+            _ if Instant::now() > deadline => {
+                return last.and_then(|_| {
+                    Err(client.refused("the settings are kept; it has not restarted in time"))
+                });
+            }
+            _ => {}
+        }
+        if client.stop().wait(AGAIN) {
+            return Err(client.refused("ended before the board had restarted; the settings are kept"));
+        }
+    }
+}
+
+/// Whether it has neither a session nor a reason why not.
+fn is_trying(document: &Value) -> bool {
+    document["state"] == "offline" && document.get("why").is_none()
+}
+
+fn answer(document: Value) -> Answer {
+    let word = |key: &str| document[key].as_str().map(Cell::of);
+    let count = |key: &str| document["counters"][key].as_u64();
+    let mut rows: Vec<(&'static str, Cell)> = Vec::new();
+    rows.extend(word("state").map(|state| ("edge node", state)));
+    rows.extend(word("why").map(|why| ("why", why)));
+    rows.extend(word("broker").map(|broker| ("broker", broker)));
+    rows.extend(word("group").map(|group| ("group", group)));
+    rows.extend(word("node").map(|node| ("name", node)));
+    rows.extend(document["utc"].as_bool().map(|utc| ("UTC", if utc { "known" } else { "unknown" }.into())));
+    rows.extend(word("time_server").map(|server| ("time server", server)));
+    rows.extend(document["bd_seq"].as_u64().map(|number| ("session", Cell::number(number))));
+    rows.extend(document["metrics"].as_u64().map(|count| ("metrics", Cell::number(count))));
+    for (name, key) in [("messages", "data"), ("births", "births"), ("values lost", "lost")] {
+        rows.extend(count(key).map(|count| (name, Cell::number(count))));
+    }
+    match document["next"].as_str() {
+        Some("off") => rows.push(("next start", "it tells nothing".into())),
+        Some(_) => rows.push(("next start", "with other settings".into())),
+        None => {}
+    }
+    let row = ["state", "broker", "why"].map(|key| (key, word(key).unwrap_or_default()));
+    let text = facts(rows);
+    let is_well =
+        matches!(document["state"].as_str(), Some("off" | "online")) || document.get("next").is_some();
+    Answer::new(document, text).with_row(row.into()).with_verdict(is_well)
+}
+
+/// How long a board may take to start again.
+const RESTARTING: Duration = Duration::from_secs(30);
+/// Time between two looks.
+const AGAIN: Duration = Duration::from_millis(200);
