@@ -18,6 +18,13 @@ use rig::{Cell, MS};
 
 /// The whole way of a field frame, design limit.
 const PASS: u64 = 3_000;
+/// The same byte by byte, most of which come to nothing.
+const BYTES: u64 = 5_000;
+/// What is for another node.
+const FOREIGN: u64 = 200;
+/// A state packet, whole and in segments.
+const STATE: u64 = 1_200;
+const SEGMENTS: u64 = 2_000;
 
 type Pass = fn(&mut Bench);
 
@@ -25,18 +32,20 @@ type Pass = fn(&mut Bench);
 const NO_CYCLE: Duration = Duration::from_secs(3_600);
 
 /// Name, limit and work.
-const WORKS: [(&str, Option<u64>, Pass); 11] = [
+const WORKS: [(&str, Option<u64>, Pass); 13] = [
     ("field frame, bare", None, Bench::bare),
     ("field frame to Modbus request, answer", Some(PASS), Bench::modbus),
     ("field frame to two requests, answers", None, Bench::modbus_twice),
     ("field frame to recipe frame over UDP", Some(PASS), Bench::udp),
-    ("field frame byte by byte to UDP", None, Bench::udp_bytes),
+    ("field frame byte by byte to UDP", Some(BYTES), Bench::udp_bytes),
     ("CAN frame applied", None, Bench::can),
-    ("state packet", None, Bench::state),
+    ("state packet", Some(STATE), Bench::state),
     ("state packet of a starting controller", None, Bench::state_of_starting),
     ("idle tick", None, Bench::idle),
     ("cycle of one port", None, Bench::cycle),
     ("field frame to request, acknowledged", None, Bench::modbus_acknowledged),
+    ("CAN frame of another node", Some(FOREIGN), Bench::foreign),
+    ("state packet in three segments", Some(SEGMENTS), Bench::state_segments),
 ];
 
 fn main() -> ExitCode {
@@ -61,6 +70,8 @@ fn main() -> ExitCode {
         work!(8),
         work!(9),
         work!(10),
+        work!(11),
+        work!(12),
     ];
     instructions::main(&works).unwrap_or_else(|| {
         divan::main();
@@ -243,6 +254,19 @@ impl Bench {
     fn state(&mut self) {
         let packet = std::mem::take(&mut self.packet);
         self.pass(Input::LinkBytes { link: LinkId::STATE, bytes: black_box(&packet) });
+        self.packet = packet;
+    }
+
+    fn foreign(&mut self) {
+        let frame = CanFrame::new(CanId::Standard(0x50E), &[1, 2]).expect("a right frame");
+        self.pass(Input::PortCan { port: BUS, frame: black_box(frame) });
+    }
+
+    fn state_segments(&mut self) {
+        let packet = std::mem::take(&mut self.packet);
+        for piece in packet.chunks(536) {
+            self.pass(Input::LinkBytes { link: LinkId::STATE, bytes: black_box(piece) });
+        }
         self.packet = packet;
     }
 

@@ -325,7 +325,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             codec: Codec::Can { input: None, output: None },
             mode: recipe.mode,
             line,
-            partial_until: Instant::NEVER,
+            is_partial: false,
             sender,
             inputs,
             outputs,

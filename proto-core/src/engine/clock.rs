@@ -30,8 +30,11 @@ const LAST: Instant = Instant::from_micros(u64::MAX - 1);
 /// its fields is worked out anew.
 #[derive(Debug, Clone)]
 pub(super) struct Clock {
-    /// Nothing depends on the clock before this. It may be earlier than needed, never later.
+    /// Nothing but partial frames depends on the clock before this. It may be earlier than needed, never later.
     pub timer_at: Instant,
+    /// No partial frame ends by silence before this; the same. On a busy line it passes often and finds that more bytes
+    /// have come.
+    pub partial_at: Instant,
     /// The newest instant of a call.
     pub now: Instant,
     /// A deadline has come and its tick has not been reported. Expired data may still wait, so
@@ -49,12 +52,16 @@ pub(super) struct Clock {
     pub deaf_until: Instant,
     /// What [`Engine::poll_output`] asks before it sleeps.
     pub ask: Ask,
+    /// The engine sleeps, as announced, until then, and the newest call was before: what sets no deadline, and asks
+    /// nobody, leaves everything as it is. [`Instant::ZERO`] if that is not known.
+    pub calm_until: Instant,
 }
 
 impl Clock {
     /// Before the first call, which asks every port and link, because `timer_at` has come.
     pub(super) const START: Self = Self {
         timer_at: Instant::ZERO,
+        partial_at: Instant::ZERO,
         now: Instant::ZERO,
         is_late: false,
         announced: Instant::ZERO,
@@ -63,10 +70,17 @@ impl Clock {
         is_deaf: false,
         deaf_until: Instant::ZERO,
         ask: Ask::NONE,
+        calm_until: Instant::ZERO,
     };
 }
 
 impl Clock {
+    /// Whether an input at `now` finds the engine asleep, and no deadline or beat has come.
+    #[inline(always)]
+    pub(super) fn is_calm(&self, now: Instant) -> bool {
+        now >= self.now && now < self.calm_until
+    }
+
     /// Whether a call at `now` finds nothing to do, and the timer is right.
     #[inline(always)]
     pub(super) fn is_quiet(&self, now: Instant) -> bool {
@@ -82,8 +96,12 @@ pub(super) struct Ask(u8);
 
 impl Ask {
     pub(super) const NONE: Self = Self(0);
-    /// Links that may send.
-    pub(super) const LINKS: Self = Self(1);
+    /// Links that may send; the command link is only asked with the others.
+    pub(super) const LINKS: Self = Self(1 | 16 | 32);
+    /// Recipe links that may send.
+    pub(super) const RECIPES: Self = Self(16);
+    /// The Modbus link, which may send.
+    pub(super) const MODBUS: Self = Self(32);
     /// Links that may be opened or closed.
     pub(super) const ACTIONS: Self = Self(2);
     /// Ports that may send.
@@ -92,7 +110,7 @@ impl Ask {
     // This way round, because an engine without a configuration is all zeros, which take no flash.
     pub(super) const ARMED: Self = Self(8);
     /// All ports and links.
-    pub(super) const ALL: Self = Self(7);
+    pub(super) const ALL: Self = Self(Self::LINKS.0 | 2 | 4);
 
     /// Whether it is to be asked.
     #[inline(always)]
@@ -126,15 +144,32 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     pub(super) fn tick(&mut self, now: Instant) {
         (self.clock.is_late, self.clock.announced) = (false, Instant::NEVER);
         self.clock.is_deaf &= now < self.clock.deaf_until;
-        if now >= self.clock.timer_at {
+        if now >= self.clock.timer_at || now >= self.clock.partial_at && self.ends_partial(now) {
             self.advance(now);
         }
+    }
+
+    /// Whether silence ends a partial frame; when it may, else.
+    #[inline(never)]
+    fn ends_partial(&mut self, now: Instant) -> bool {
+        self.clock.partial_at = self.partial_deadline();
+        now >= self.clock.partial_at
+    }
+
+    /// When silence ends a partial frame, the first of all ports.
+    fn partial_deadline(&self) -> Instant {
+        self.ports.iter().map(FieldPort::partial_until).min().unwrap_or(Instant::NEVER)
     }
 
     /// When the engine has something to do without an input, computed exactly. [`Output::Sleep`]
     /// may be earlier, never later.
     pub fn deadline(&self) -> Instant {
-        let ports = self.ports.iter().map(FieldPort::deadline);
+        self.firm_deadline().min(self.partial_deadline())
+    }
+
+    /// The same without partial frames.
+    fn firm_deadline(&self) -> Instant {
+        let ports = self.ports.iter().map(FieldPort::send_deadline);
         let ports = ports.min().unwrap_or(Instant::NEVER);
         let hears_at = if self.clock.is_deaf { self.clock.deaf_until } else { Instant::NEVER };
         let own = ports.min(self.links.deadline()).min(self.store.deadline()).min(hears_at);
@@ -146,21 +181,41 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     pub(super) fn poll_sleep<'b>(&mut self) -> Output<'b> {
         if !self.clock.ask.has(Ask::ARMED) {
             self.clock.ask.add(Ask::ARMED);
-            self.clock.timer_at = self.deadline();
+            self.clock.timer_at = self.firm_deadline();
+            self.clock.partial_at = self.partial_deadline();
         }
         self.sleep()
+    }
+
+    /// A tick came before anything was due: the engine sleeps on, as long as it may by now.
+    #[inline(always)]
+    pub(super) fn announce_anew(&mut self) {
+        let until = self.next_call();
+        (self.clock.announced, self.clock.calm_until) = (until, until);
+    }
+
+    /// The next deadline or beat; the timer is right.
+    #[inline(always)]
+    fn next_call(&self) -> Instant {
+        if self.ports.is_empty() {
+            return self.clock.timer_at;
+        }
+        self.clock.timer_at.min(self.clock.partial_at).min(self.clock.beat_at)
     }
 
     /// Until the next deadline or beat; the timer is right.
     #[inline(always)]
     pub(super) fn sleep<'b>(&mut self) -> Output<'b> {
-        let beat_at = if self.ports.is_empty() { Instant::NEVER } else { self.clock.beat_at };
-        let until = self.clock.timer_at.min(beat_at);
+        let until = self.next_call();
         if until == Instant::NEVER {
             return Output::Sleep { until };
         }
-        self.clock.announced = self.clock.announced.min(until);
-        Output::Sleep { until: self.clock.announced }
+        let until = self.clock.announced.min(until);
+        self.clock.announced = until;
+        if self.clock.ask == Ask::ARMED && self.clock.now < until && !self.clock.is_deaf {
+            self.clock.calm_until = until;
+        }
+        Output::Sleep { until }
     }
 
     /// The present, and whether the gateway has slept until now.
@@ -239,7 +294,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     fn read_ended(&mut self, now: Instant) {
         for index in 0..self.ports.len() {
             if let Some(port) = self.ports.get(index)
-                && now >= port.partial_until
+                && now >= port.partial_until()
             {
                 let id = port.id;
                 self.port_silent(id, now);

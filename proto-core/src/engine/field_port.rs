@@ -43,9 +43,8 @@ pub(super) struct FieldPort {
     pub codec: Codec,
     pub mode: Mode,
     pub line: LineTiming,
-    /// When the frame that has begun is given up; [`Instant::NEVER`] if none has. Noted after each
-    /// change: deadlines are asked for far more often.
-    pub partial_until: Instant,
+    /// Whether a frame has begun that silence ends. Noted after each change: deadlines are asked for far more often.
+    pub is_partial: bool,
     pub sender: Sender,
     /// The port's range of the input bindings; those of all CAN frames follow each other.
     pub inputs: Span,
@@ -147,9 +146,22 @@ impl FieldPort {
             return None;
         }
         self.heard(bytes, now);
-        self.partial_until = self.line.partial_until(true);
+        self.is_partial = true;
         // What is heard later only makes deadlines later.
-        Some(if had_begun { Instant::NEVER } else { self.partial_until })
+        Some(if had_begun { Instant::NEVER } else { self.partial_until() })
+    }
+
+    /// Takes a byte that continues the frame whose head was seen, and is not its last. `false` if it has to be looked
+    /// at; then it was not taken.
+    #[inline(always)]
+    pub(super) fn hold_byte(&mut self, byte: u8, now: Instant) -> bool {
+        let Codec::Stream { deframer, .. } = &mut self.codec else { return false };
+        if !deframer.hold_byte(byte) {
+            return false;
+        }
+        bump(&mut self.counters.bytes_in);
+        self.line.heard = now;
+        true
     }
 
     /// Reads the frames in `rest`; stops after the first accepted one if the image is to be checked
@@ -191,7 +203,7 @@ impl FieldPort {
             }
         }
         *rest = left;
-        self.partial_until = self.line.partial_until(deframer.pending() > 0);
+        self.is_partial = deframer.pending() > 0;
         let stats = deframer.stats();
         self.counters.tail_mismatches = stats.tail_mismatches as u32;
         let skipped = (stats.skipped_bytes as u32).wrapping_sub(self.counters.resync_bytes);
@@ -243,6 +255,19 @@ impl FieldPort {
                 && now.saturating_since(last.at) >= FOREIGN_PAUSE
         };
         why != Rejection::ForeignId || self.last_rejection.as_ref().is_none_or(may_be_meant)
+    }
+
+    /// Counts a frame that is for another node of the bus. `false` if it may be ours, or is worth keeping; then it was
+    /// not counted.
+    #[inline(always)]
+    pub(super) fn passes_by(&mut self, frame: &CanFrame, now: Instant) -> bool {
+        let Codec::Can { input: Some(layout), .. } = &self.codec else { return false };
+        if frame.is_remote() || layout.has(frame.id()) || self.is_news(Rejection::ForeignId, now) {
+            return false;
+        }
+        add(&mut self.counters.bytes_in, frame.data().len());
+        bump(&mut self.counters.rejected_id);
+        true
     }
 
     #[inline(always)]
@@ -298,7 +323,7 @@ impl FieldPort {
     /// still to be read with [`Self::frames`].
     pub(super) fn advance<const TAP: usize>(&mut self, tap: &mut Tap<TAP>, now: Instant) -> bool {
         let mut is_ended = false;
-        if now >= self.partial_until {
+        if now >= self.partial_until() {
             is_ended = self.ends_by_silence();
             if !is_ended {
                 self.discard_partial(tap, now);
@@ -311,8 +336,20 @@ impl FieldPort {
     /// When something happens on the port without an input.
     #[inline]
     pub(super) fn deadline(&self) -> Instant {
-        debug_assert_eq!(self.partial_until, self.line.partial_until(self.has_begun()), "not noted");
-        self.partial_until.min(self.sender.deadline(self.line.quiet_at()))
+        self.partial_until().min(self.send_deadline())
+    }
+
+    /// When something may be sent without an input.
+    #[inline]
+    pub(super) fn send_deadline(&self) -> Instant {
+        self.sender.deadline(self.line.quiet_at())
+    }
+
+    /// When the frame that has begun is given up; [`Instant::NEVER`] if none has.
+    #[inline]
+    pub(super) fn partial_until(&self) -> Instant {
+        debug_assert_eq!(self.is_partial, self.has_begun(), "not noted");
+        self.line.partial_until(self.is_partial)
     }
 
     /// Whether a frame may be handed over now.
@@ -338,7 +375,7 @@ impl FieldPort {
     #[cold]
     #[inline(never)]
     pub(super) fn note_partial(&mut self) {
-        self.partial_until = self.line.partial_until(self.has_begun());
+        self.is_partial = self.has_begun();
     }
 
     #[cold]
@@ -434,3 +471,19 @@ pub(super) fn fields_before(layout: &CanLayout, index: usize) -> usize {
 
 /// Time between two kept frames of ids that no recipe has.
 const FOREIGN_PAUSE: Duration = Duration::from_millis(100);
+
+/// The port with this number: its place, if no listening port comes before it.
+#[inline]
+pub(super) fn find_port(ports: &mut [FieldPort], id: PortId) -> Option<&mut FieldPort> {
+    let nth = usize::from(id.0);
+    match ports.get(nth) {
+        Some(port) if port.id == id => ports.get_mut(nth),
+        _ => search_port(ports, id),
+    }
+}
+
+#[cold]
+#[inline(never)]
+fn search_port(ports: &mut [FieldPort], id: PortId) -> Option<&mut FieldPort> {
+    ports.iter_mut().find(|port| port.id == id)
+}

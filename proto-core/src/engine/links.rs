@@ -5,6 +5,7 @@
 
 use heapless::{String, Vec};
 
+use super::clock::Ask;
 use super::command_link::CommandLink;
 use super::connection::Connection;
 use super::counters::{LinkCounters, add};
@@ -13,6 +14,7 @@ use super::modbus_link::ModbusLink;
 use super::state_link::StateLink;
 use super::store::Store;
 use super::uplink::Uplink;
+use crate::image::InputSet;
 use crate::link::{LinkAction, LinkHistory, LinkState, Supervisor};
 use crate::time::Instant;
 
@@ -298,9 +300,11 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
     }
 
     /// The next output to the controller: commands that stop the robot, then field values, then
-    /// other commands.
+    /// other commands. Links that have nothing to send until something else happens are no longer in `ask`.
+    #[inline(always)]
     pub(super) fn next_upward<const PORTS: usize>(
         &mut self,
+        ask: &mut Ask,
         store: &mut Store<PORTS>,
         out: &mut [u8],
     ) -> Option<(LinkId, usize)> {
@@ -309,19 +313,60 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         {
             return Some(sent);
         }
-        let state = self.state.first().map(|state| state.group);
-        for link in &mut self.recipes {
-            if let Some(len) = link.next_frame(store, state, out) {
-                return Some((link.id, len));
+        if ask.has(Ask::RECIPES) {
+            let state = self.state.first().map(|state| state.group);
+            let mut left = self.recipes.len();
+            for link in &mut self.recipes {
+                left = left.wrapping_sub(1);
+                if let Some(len) = link.next_frame(store, state, out) {
+                    // It is busy now, and those before it had nothing.
+                    if left == 0 {
+                        ask.remove(Ask::RECIPES);
+                    }
+                    return Some((link.id, len));
+                }
             }
+            ask.remove(Ask::RECIPES);
         }
-        if let Some(link) = self.modbus.first_mut()
-            && let Some(len) = link.next_request(store, out)
-        {
-            return Some((LinkId::MODBUS, len));
+        if ask.has(Ask::MODBUS) {
+            // One transaction at a time.
+            ask.remove(Ask::MODBUS);
+            if let Some(link) = self.modbus.first_mut()
+                && let Some(len) = link.next_request(store, out)
+            {
+                return Some((LinkId::MODBUS, len));
+            }
         }
         let link = self.command.first_mut()?;
         link.next_command(out, store.now).map(|len| (LinkId::COMMAND, len))
+    }
+
+    /// What may have an output when something has happened to this link. Beside a command link, which looks at what the
+    /// others do, all.
+    #[inline(always)]
+    pub(super) fn ask_of(&self, link: LinkId) -> Ask {
+        if !self.command.is_empty() {
+            return Ask::LINKS;
+        }
+        match link {
+            LinkId::STATE => Ask::NONE,
+            LinkId::MODBUS => Ask::MODBUS,
+            _ => Ask::RECIPES,
+        }
+    }
+
+    /// The same, and the links that write one of these variables, which wait.
+    #[inline(always)]
+    pub(super) fn ask_for(&self, waiting: &InputSet, asked: Ask) -> Ask {
+        if waiting.is_empty() { asked } else { self.ask_writers(waiting, asked) }
+    }
+
+    #[inline(never)]
+    fn ask_writers(&self, waiting: &InputSet, mut asked: Ask) -> Ask {
+        let is_wanted = |writes: &InputSet| !waiting.and(writes).is_empty();
+        asked.add(Ask::RECIPES.when(self.recipes.iter().any(|link| is_wanted(&link.writes))));
+        asked.add(Ask::MODBUS.when(self.modbus.first().is_some_and(|link| is_wanted(&link.writes))));
+        asked
     }
 
     /// Whether a command that stops the robot waits.

@@ -49,6 +49,7 @@ mod requests;
 mod sender;
 mod served;
 mod session;
+mod short_way;
 mod state_link;
 mod status;
 #[cfg(feature = "serde")]
@@ -82,10 +83,11 @@ use clock::{Ask, Clock};
 use counters::add;
 use exchanges::Exchanges;
 use field_output::Downward;
-use field_port::FieldPort;
+use field_port::{FieldPort, find_port};
 use frames::Accepted;
 use links::Links;
 use port_health::PortsHealth;
+use short_way::SHORT;
 use store::{SafeBytes, Store};
 use user::Bindings;
 
@@ -146,16 +148,31 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     ///
     /// Inputs for a port or link that the configuration does not have are ignored.
     pub fn handle(&mut self, now: Instant, input: Input<'_>) {
+        // Most bytes of a busy line continue a frame and do not end it: nothing comes of them.
+        if let Input::PortBytes { port, bytes: &[byte] } = input
+            && self.clock.is_calm(now)
+            && let Some(port) = find_port(&mut self.ports, port)
+            && port.hold_byte(byte, now)
+        {
+            self.clock.now = now;
+            return;
+        }
+        self.handle_other(now, &input);
+    }
+
+    // Apart, so that those do not pay for its registers. By reference, because it would be copied.
+    #[inline(never)]
+    fn handle_any(&mut self, now: Instant, input: &Input<'_>) {
+        self.clock.calm_until = Instant::ZERO;
         let now = self.present(now);
         self.clock.is_late = now >= self.clock.announced;
         // Any input may set an earlier deadline; one that becomes later is noticed in time.
-        match input {
+        match *input {
             Input::PortBytes { port, bytes } => {
                 if bytes.len() > SHORT || !self.hold(port, bytes, now) {
                     self.port_bytes(port, bytes, now);
                 }
             }
-            // By reference: it would be copied for the functions that may see it.
             Input::PortCan { port, ref frame } => self.port_can(port, frame, now),
             Input::PortSent { port } => self.port_sent(port),
             Input::PortUp { port } => self.port_up(port),
@@ -178,9 +195,19 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     // In a driver's loop, the addresses of all that it may need would be worked out before each pass.
     #[inline(never)]
     pub fn poll_output<'b>(&mut self, now: Instant, buf: &'b mut [u8; OUTPUT_BUFFER]) -> Output<'b> {
+        if now < self.clock.calm_until {
+            debug_assert!(self.clock.is_quiet(now) && !self.clock.is_late);
+            return Output::Sleep { until: self.clock.calm_until };
+        }
+        self.poll_any(now, buf)
+    }
+
+    #[inline(never)]
+    fn poll_any<'b>(&mut self, now: Instant, buf: &'b mut [u8; OUTPUT_BUFFER]) -> Output<'b> {
         if self.clock.is_quiet(now) {
             return self.sleep();
         }
+        self.clock.calm_until = Instant::ZERO;
         self.poll_work(now, buf)
     }
 
@@ -195,7 +222,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             // To send a command, a connection may have to be closed first.
             self.clock.ask.add(Ask::ACTIONS.when(!self.links.command.is_empty()));
             self.store.now = now;
-            let upward = self.links.next_upward(&mut self.store, &mut buf[..]);
+            let upward = self.links.next_upward(&mut self.clock.ask, &mut self.store, &mut buf[..]);
             self.carry_outcomes();
             if let Some((link, len)) = upward {
                 self.arm(self.links.deadline_of(link));
@@ -261,23 +288,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 
     /// Whether ports and links that are not asked really have no output.
     fn all_are_silent(&mut self, out: &mut [u8], now: Instant) -> bool {
-        self.links.next_upward(&mut self.store, out).is_none()
+        self.links.next_upward(&mut { Ask::ALL }, &mut self.store, out).is_none()
             && self.links.next_action().is_none()
             && self.next_downward(out, now).is_none()
             && !(self.exchanges.is_used() && self.next_request(out, now).is_some())
-    }
-
-    /// Takes bytes that only continue or begin a frame, which are most calls of a driver that reports each byte.
-    /// `false` if they have to be looked at; then nothing was taken.
-    #[inline(never)]
-    fn hold(&mut self, id: PortId, bytes: &[u8], now: Instant) -> bool {
-        if self.clock.is_deaf {
-            return false;
-        }
-        let Some(port) = find_port(&mut self.ports, id) else { return false };
-        let Some(deadline) = port.hold(bytes, now) else { return false };
-        self.arm(deadline);
-        true
     }
 
     // Each input has its own function, so that no other pays for the registers it needs.
@@ -425,14 +439,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[inline(never)]
     fn link_sent(&mut self, link: LinkId) {
         let deadline = self.links.sent(link);
-        self.clock.ask.add(Ask::LINKS);
+        self.clock.ask.add(self.links.ask_of(link));
         self.arm(deadline);
     }
 
     #[inline(never)]
     fn link_acked(&mut self, link: LinkId, left: u32) {
         self.links.acked(link, left, &mut self.store);
-        self.clock.ask.add(Ask::LINKS);
+        self.clock.ask.add(self.links.ask_of(link));
         self.arm(self.links.deadline_of(link));
     }
 
@@ -448,7 +462,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 self.tap.came(link, taken, now);
             }
             self.carry_results();
-            self.arm_link(link);
+            let asked = self.links.ask_of(link);
+            self.clock.ask.add(self.links.ask_for(&self.store.outbox.dirty(), asked));
+            self.clock.ask.add(Ask::ACTIONS);
+            self.arm(self.links.deadline_of(link));
             self.image_changed();
             if rest.is_empty() {
                 return;
@@ -505,7 +522,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         if accepted.frames == 0 {
             return;
         }
-        self.clock.ask.add(Ask::LINKS);
+        self.clock.ask.add(Ask::LINKS.when(!self.links.command.is_empty()));
         let mut deadline = self.store.deadline();
         if deadline <= now {
             self.expire_waiting();
@@ -519,19 +536,26 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
         self.carry_outcomes();
         self.image_changed();
-        let dirty = self.store.outbox.dirty().and(&accepted.set);
+        let dirty = self.store.outbox.dirty();
         let state = self.links.state.first().map(|state| state.group);
         let mut waits = false;
         for link in &mut self.links.recipes {
-            if !dirty.and(&link.writes).is_empty() {
+            let wanted = dirty.and(&link.writes);
+            if wanted.is_empty() {
+                continue;
+            }
+            self.clock.ask.add(Ask::RECIPES);
+            if !wanted.and(&accepted.set).is_empty() {
                 link.offered.or_at(now);
                 waits = waits || link.supervisor.is_up() && !link.is_ready(&self.store, state);
             }
         }
-        if let Some(link) = self.links.modbus.first_mut()
-            && !dirty.and(&link.writes).is_empty()
-        {
-            link.offered.or_at(now);
+        if let Some(link) = self.links.modbus.first_mut() {
+            let wanted = dirty.and(&link.writes);
+            self.clock.ask.add(Ask::MODBUS.when(!wanted.is_empty()));
+            if !wanted.and(&accepted.set).is_empty() {
+                link.offered.or_at(now);
+            }
         }
         if waits && let Some(port) = find_port(&mut self.ports, port) {
             add(&mut port.counters.withheld, accepted.frames as usize);
@@ -572,11 +596,4 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
         None
     }
-}
-
-/// Bytes that a driver may report before a frame is complete. More are likely to have its end.
-const SHORT: usize = 16;
-
-fn find_port(ports: &mut [FieldPort], id: PortId) -> Option<&mut FieldPort> {
-    ports.iter_mut().find(|port| port.id == id)
 }

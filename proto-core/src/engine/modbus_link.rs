@@ -306,7 +306,7 @@ impl ModbusLink {
                 Beside::Whole(whole) => pending = whole,
             }
         }
-        let first = pending.iter().find(|var| var.ordinal() >= self.cursor).or(pending.iter().next())?;
+        let first = pending.first_from(self.cursor)?;
         let sent = self.write_whole(first, &pending, store, out);
         if store.bits.is_used {
             self.offer_the_rest(sent.as_ref(), store);

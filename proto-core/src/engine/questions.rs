@@ -67,6 +67,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     pub fn make_safe(&mut self) {
         self.store.all_overdue();
         self.clock.timer_at = Instant::ZERO;
+        self.clock.calm_until = Instant::ZERO;
         self.clock.ask.add(Ask::ALL);
     }
 

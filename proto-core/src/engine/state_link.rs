@@ -10,8 +10,9 @@ use crate::config::StateValue;
 use crate::image::{GroupId, Image, InputSet, MAX_EXTRA};
 use crate::link::{LinkTimings, Supervisor};
 use crate::sysvar::{COUNT, SysVar};
-use crate::time::Duration;
+use crate::time::{Duration, Instant};
 use crate::wire::dialect::Dialect;
+use crate::wire::runs::{MAX_RUN, all_finite, copy};
 use crate::wire::scalar::{Scalar, ScalarType};
 use crate::wire::state::{StateStream, StateView};
 
@@ -86,6 +87,18 @@ impl StateLink {
     pub(super) fn transport(&self) -> Transport {
         Transport::Tcp { port: self.port }
     }
+
+    /// Takes bytes that do not complete a packet: what is heard only makes deadlines later. `false` if
+    /// [`Connection::received`] has to read them, or nothing of this connection counts; then nothing was taken.
+    #[inline]
+    pub(super) fn hold(&mut self, bytes: &[u8], now: Instant) -> bool {
+        if !self.supervisor.is_up() || !self.stream.hold(bytes) {
+            return false;
+        }
+        self.supervisor.heard(now);
+        add(&mut self.counters.bytes_in, bytes.len());
+        true
+    }
 }
 
 impl Connection for StateLink {
@@ -105,9 +118,11 @@ impl Connection for StateLink {
                     bump(&mut self.counters.received);
                     self.codes = view.state_codes();
                     let not_live = self.read_back.minus(&store.live);
-                    for &var in &self.shown {
-                        if !view.read_var(var).is_some_and(|value| store.image.receive(var, value)) {
-                            bump(&mut self.counters.unreadable);
+                    let mut left = &self.shown[..];
+                    while let Some((run, behind)) = next_run(left) {
+                        left = behind;
+                        if take_run(run, &view, &mut store.image).is_none() {
+                            add(&mut self.counters.unreadable, take_each(run, &view, &mut store.image));
                         }
                     }
                     if !self.kept.is_empty() {
@@ -146,6 +161,43 @@ impl Connection for StateLink {
         }
         &[]
     }
+}
+
+/// The first variables that follow each other in the table, and so in the packet and in the image; at most what is
+/// copied at once.
+#[inline]
+fn next_run(shown: &[SysVar]) -> Option<(&[SysVar], &[SysVar])> {
+    let first = shown.first()?;
+    let left_in_row = usize::from(first.span().last.saturating_sub(first.index())).saturating_add(1);
+    let most = left_in_row.min(MAX_RUN.checked_div(first.size()).unwrap_or(1));
+    let places = first.ordinal()..;
+    let len = shown.iter().zip(places).take(most).take_while(|(var, place)| var.ordinal() == *place).count();
+    shown.split_at_checked(len.max(1))
+}
+
+/// Copies a run of words or floats. `None`, with nothing changed, if its variables have to be looked at one by one:
+/// bits, a value that is not finite, or one before it that was not.
+#[inline]
+fn take_run(run: &[SysVar], view: &StateView<'_>, image: &mut Image) -> Option<()> {
+    let first = run.first()?;
+    if first.is_bits() || image.has_unreadable() {
+        return None;
+    }
+    let len = run.len().saturating_mul(first.size());
+    let from = view.as_bytes().get(usize::from(first.stream()?.offset)..)?.get(..len)?;
+    if first.ty() == ScalarType::Float && !all_finite(from) {
+        return None;
+    }
+    copy(image.bytes_mut().get_mut(first.image_offset()..)?.get_mut(..len)?, from);
+    Some(())
+}
+
+/// Takes a run's variables one by one; returns how many cannot be read.
+#[inline(never)]
+fn take_each(run: &[SysVar], view: &StateView<'_>, image: &mut Image) -> usize {
+    let is_unreadable =
+        |var: &&SysVar| !view.read_var(**var).is_some_and(|value| image.receive(**var, value));
+    run.iter().filter(is_unreadable).count()
 }
 
 /// Reads back the bits that none of our ports has sent.

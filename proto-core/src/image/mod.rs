@@ -166,6 +166,11 @@ impl Image {
         }
     }
 
+    /// Whether any variable's or extra value's newest value was not readable.
+    pub(crate) fn has_unreadable(&self) -> bool {
+        self.any_unreadable
+    }
+
     /// Whether the variable's newest value was readable, if there was one.
     pub(crate) fn is_readable(&self, var: SysVar) -> bool {
         !self.unreadable.contains(var)

@@ -80,16 +80,49 @@ impl InputSet {
 
     /// Number of consecutive variables in the table, from `first` on, that are all in the set.
     pub(crate) fn run_len(&self, first: SysVar) -> usize {
-        let ordinal = first.ordinal() as u32;
-        self.bits().checked_shr(ordinal).map_or(0, |bits| bits.trailing_ones() as usize)
+        let ordinal = first.ordinal();
+        // Most runs lie in one word; numbers of 128 bits are slow on a Cortex-M.
+        let (within, left) = ((ordinal % 32) as u32, 32_u32.wrapping_sub((ordinal % 32) as u32));
+        let run = self.0.get(ordinal / 32).map_or(0, |word| (word >> within).trailing_ones());
+        if run < left { run as usize } else { self.long_run_len(ordinal) }
+    }
+
+    /// The same where the run may go on in the next word.
+    #[cold]
+    #[inline(never)]
+    fn long_run_len(&self, ordinal: usize) -> usize {
+        self.bits().checked_shr(ordinal as u32).map_or(0, |bits| bits.trailing_ones() as usize)
     }
 
     /// The `len` variables from `first` on, without those that are not inputs.
     pub(crate) fn run(first: SysVar, len: usize) -> Self {
-        let upto = |end: usize| !u128::MAX.checked_shl(end.min(INPUT_COUNT) as u32).unwrap_or(0);
-        let start = first.ordinal();
-        let bits = upto(start.saturating_add(len)) & !upto(start);
-        Self([bits as u32, bits.wrapping_shr(32) as u32, bits.wrapping_shr(64) as u32])
+        let end = first.ordinal().saturating_add(len).min(INPUT_COUNT);
+        Self::from(first.ordinal()).minus(&Self::from(end))
+    }
+
+    /// Everything from this place of the table on, also behind the last input.
+    fn from(start: usize) -> Self {
+        let mut words = [u32::MAX; WORDS];
+        for (nth, word) in words.iter_mut().enumerate() {
+            let before = start.saturating_sub(nth.wrapping_mul(32));
+            *word = u32::MAX.checked_shl(before as u32).unwrap_or(0);
+        }
+        Self(words)
+    }
+
+    /// The first variable of the set at or behind this place of the table, or else the first of all.
+    pub(crate) fn first_from(&self, ordinal: usize) -> Option<SysVar> {
+        self.and(&Self::from(ordinal)).first().or_else(|| self.first())
+    }
+
+    /// The first variable in table order.
+    pub(crate) fn first(&self) -> Option<SysVar> {
+        let (nth, word) = match self.0 {
+            [0, 0, word] => (64_usize, word),
+            [0, word, _] => (32, word),
+            [word, ..] => (0, word),
+        };
+        if word == 0 { None } else { SysVar::from_ordinal(nth.wrapping_add(word.trailing_zeros() as usize)) }
     }
 
     /// The variables, in table order.
@@ -226,6 +259,17 @@ mod tests {
         assert!(run.iter().eq((0..5).map(|nth| SysVar::from_ordinal(force.ordinal() + nth).unwrap())));
         assert_eq!(InputSet::run(SysVar::from_ordinal(0).unwrap(), COUNT), all);
         assert_eq!(InputSet::run(SysVar::from_ordinal(INPUT_COUNT).unwrap(), 3), InputSet::EMPTY);
+        for from in 0..COUNT {
+            let first = SysVar::from_ordinal(from).unwrap();
+            let behind = all.iter().find(|var| var.ordinal() >= from).or(all.iter().next());
+            assert_eq!((all.first_from(from), InputSet::EMPTY.first_from(from)), (behind, None));
+            assert_eq!(InputSet::from_iter([force]).first_from(from), Some(force));
+            for len in 0..COUNT {
+                let run = InputSet::run(first, len);
+                assert!(run.iter().eq(all.iter().filter(|var| (from..from + len).contains(&var.ordinal()))));
+                assert_eq!(run.run_len(first), len.min(INPUT_COUNT.saturating_sub(from)));
+            }
+        }
         assert!(InputSet::EMPTY.is_empty() && InputSet::EMPTY.or(&some).and(&all) == some);
     }
 }

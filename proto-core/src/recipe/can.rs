@@ -110,6 +110,12 @@ impl CanLayout {
         Ok(index)
     }
 
+    /// Whether a frame of the part has this id.
+    #[inline]
+    pub(crate) fn has(&self, id: CanId) -> bool {
+        self.index_of(key_of(id)).is_some()
+    }
+
     /// The frame with this index in the part.
     #[inline]
     pub fn frame(&self, index: usize) -> Option<CanFrameLayout<'_>> {

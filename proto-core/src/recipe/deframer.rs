@@ -9,8 +9,8 @@
 
 use super::error::DatagramError;
 use super::model::MAX_STREAM_FRAME;
-use super::runs;
 use super::stream::StreamLayout;
+use crate::wire::runs;
 
 /// Counters of a [`Deframer`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -36,6 +36,8 @@ pub struct Deframer {
     ring: [u8; RING],
     start: u16,
     len: u16,
+    /// Up to this many bytes are held whatever they are, because the head was seen; 0 if each has to be looked at.
+    hold_until: u16,
     stats: DeframerStats,
 }
 
@@ -63,7 +65,7 @@ impl Deframer {
     /// An empty deframer.
     pub const fn new() -> Self {
         let stats = DeframerStats { frames: 0, skipped_bytes: 0, tail_mismatches: 0, discarded_bytes: 0 };
-        Self { ring: [0; RING], start: 0, len: 0, stats }
+        Self { ring: [0; RING], start: 0, len: 0, hold_until: 0, stats }
     }
 
     /// The payload of the next frame. Takes bytes from the front of `chunk`. Call it again with the
@@ -89,32 +91,38 @@ impl Deframer {
         self.search(layout, chunk)
     }
 
-    /// Holds a chunk that neither completes a frame nor shows that none has begun, as most chunks of a slow line
-    /// do. `false` if [`Self::next_frame`] has to look at it; then nothing was taken.
+    /// Holds a byte that can only continue the frame whose head was seen, as most bytes of a slow line do. `false`
+    /// if it may begin, end or break a frame; then it was not taken.
+    #[inline(always)]
+    pub(crate) fn hold_byte(&mut self, byte: u8) -> bool {
+        if self.len >= self.hold_until {
+            return false;
+        }
+        count_visits(1);
+        if let Some(place) = self.ring.get_mut(usize::from(self.len)) {
+            *place = byte;
+        }
+        self.len = self.len.wrapping_add(1);
+        true
+    }
+
+    /// Holds a chunk that neither completes a frame nor shows that none has begun. `false` if [`Self::next_frame`] has
+    /// to look at it; then nothing was taken.
     #[inline]
     pub(crate) fn hold(&mut self, layout: &StreamLayout, chunk: &[u8]) -> bool {
         let held = self.pending();
         let end = held.saturating_add(chunk.len());
-        if self.start != 0 || end >= layout.frame_len() {
-            return false;
-        }
-        // A driver that does not wait reports single bytes.
-        if let [byte] = chunk {
-            if held < layout.head_word().len() && layout.head().get(held) != Some(byte) {
-                return false;
-            }
-            if let Some(place) = self.ring.get_mut(held) {
-                *place = *byte;
-            }
-        } else {
+        if end > usize::from(self.hold_until) {
             let missing = layout.head().get(held..).unwrap_or(&[]);
-            if chunk.is_empty() || !missing.iter().zip(chunk).all(|(expected, byte)| expected == byte) {
+            let begins = || missing.iter().zip(chunk).all(|(expected, byte)| expected == byte);
+            if self.start != 0 || end >= layout.frame_len() || !begins() {
                 return false;
             }
-            self.put(held, chunk);
+            self.hold_until = hold_until(layout, end);
         }
+        self.put(held, chunk);
         self.len = end as u16;
-        true
+        !chunk.is_empty()
     }
 
     /// The bytes of a possible frame that are held, in two pieces.
@@ -137,6 +145,7 @@ impl Deframer {
         self.stats.discarded_bytes = self.stats.discarded_bytes.wrapping_add(dropped as u64);
         self.start = 0;
         self.len = 0;
+        self.hold_until = 0;
         dropped
     }
 
@@ -158,6 +167,7 @@ impl Deframer {
         let Some((frame, after)) = chunk.split_at_checked(layout.frame_len()) else {
             self.put(0, chunk);
             self.len = chunk.len() as u16;
+            self.hold_until = hold_until(layout, chunk.len());
             *chunk = &[];
             return None;
         };
@@ -205,9 +215,11 @@ impl Deframer {
             let Some((more, after)) = chunk.split_at_checked(missing) else {
                 self.put(held, chunk);
                 self.len = self.len.wrapping_add(chunk.len() as u16);
+                self.hold_until = hold_until(layout, self.pending());
                 *chunk = &[];
                 return Held::Partial;
             };
+            self.hold_until = 0;
             self.put(held, more);
             count_visits(layout.tail_word().len());
             if self.ring.get(..layout.frame_len()).is_some_and(|frame| layout.tail_word().ends(frame)) {
@@ -306,7 +318,7 @@ impl Deframer {
         count_visits(bytes.len());
         match self.ring.get_mut(at..at.saturating_add(bytes.len())) {
             Some(target) if bytes.len() <= runs::MAX_RUN => runs::copy(target, bytes),
-            Some(target) => copy_long(target, bytes),
+            Some(target) => runs::copy_long(target, bytes),
             None => {}
         }
     }
@@ -314,6 +326,13 @@ impl Deframer {
     fn skip(&mut self, bytes: usize) {
         self.stats.skipped_bytes = self.stats.skipped_bytes.wrapping_add(bytes as u64);
     }
+}
+
+/// How many bytes of a frame are held without being looked at, of which so many are there: all but the last, when the
+/// head is complete.
+#[inline]
+fn hold_until(layout: &StreamLayout, held: usize) -> u16 {
+    if held < layout.head_word().len() { 0 } else { (layout.frame_len() as u16).saturating_sub(1) }
 }
 
 /// Rotates the ring until the byte at `start` is at its front, by three reversals: unlike
@@ -326,14 +345,6 @@ fn rotate(ring: &mut [u8; RING], start: usize) {
         from.reverse();
     }
     ring.reverse();
-}
-
-/// Out of line, so that short copies do without the call.
-#[inline(never)]
-fn copy_long(to: &mut [u8], from: &[u8]) {
-    if to.len() == from.len() {
-        to.copy_from_slice(from);
-    }
 }
 
 /// The payload of a datagram that is exactly one frame.

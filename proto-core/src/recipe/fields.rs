@@ -5,8 +5,8 @@ use heapless::Vec;
 
 use super::error::{EncodeError, FieldPlace, PartError, ValueError};
 use super::model::{Field, MAX_FIELDS, Mode, Rules};
-use super::runs;
 use crate::sysvar::{Direction, IMAGE_BYTES, SysVar};
+use crate::wire::runs;
 use crate::wire::scalar::{Scalar, ScalarType};
 
 /// One field and its place in the payload.

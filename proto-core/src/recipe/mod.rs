@@ -15,7 +15,6 @@ mod delimiter;
 mod error;
 mod fields;
 pub mod model;
-mod runs;
 mod stream;
 
 pub use can::{CanFrameLayout, CanLayout, CanReject};

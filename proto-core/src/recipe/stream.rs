@@ -7,8 +7,8 @@ use super::delimiter::{Head, Tail};
 use super::error::{EncodeError, FieldPlace, NoSpace, PartError, ValueError};
 use super::fields::{Applied, FrameFields, PlacedField, Pool, Values};
 use super::model::{Field, Framing, MAX_DELIMITER, MAX_STREAM_FRAME, Mode, Rules};
-use super::runs;
 use crate::sysvar::IMAGE_BYTES;
+use crate::wire::runs;
 use crate::wire::scalar::Scalar;
 
 /// One part of a stream recipe, checked and ready to decode and encode; about 0.8 KiB.

@@ -6,6 +6,7 @@
 pub(crate) mod ascii;
 pub mod can;
 pub mod dialect;
+pub(crate) mod runs;
 pub mod scalar;
 pub mod slcan;
 pub mod state;

@@ -9,6 +9,7 @@ use core::fmt;
 
 use super::places::{BOOLS, FARTHEST_RAD, LIMITS, STATES, TCP_POSE};
 use super::view::{LEN, StateView};
+use crate::wire::runs::copy;
 
 /// Why bytes do not begin at the beginning of a packet (docs/wire/state.md section 3, D8).
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -114,8 +115,8 @@ impl Earlier {
                 self.codes = Some(codes);
             }
         }
-        self.joints = *part(bytes, 0);
-        self.tcp = *part(bytes, TCP_POSE);
+        copy(&mut self.joints, part::<JOINTS>(bytes, 0));
+        copy(&mut self.tcp, part::<TCP>(bytes, TCP_POSE));
         Ok(())
     }
 
@@ -145,8 +146,13 @@ fn check(bytes: &[u8; LEN], is_started: bool) -> Result<(), Misaligned> {
     if wrong > ALLOWED_WRONG_JOINTS {
         return Err(first_wrong_joint(joints, wrong));
     }
-    let bools = BOOLS.iter().map(|run| bytes.get(run.from..).and_then(|run_on| run_on.get(..run.len)));
-    let wrong: u16 = bools.flatten().filter(|run| !are_bools(run)).map(wrong_bools).sum();
+    let mut wrong = 0_u16;
+    for run in BOOLS {
+        let run = bytes.get(run.from..).and_then(|behind| behind.get(..run.len)).unwrap_or(&[]);
+        if !are_bools(run) {
+            wrong = wrong.saturating_add(wrong_bools(run));
+        }
+    }
     if wrong > ALLOWED_WRONG_BOOLS {
         return Err(Misaligned::Bools { wrong, allowed: ALLOWED_WRONG_BOOLS });
     }
@@ -204,12 +210,13 @@ fn first_wrong_joint(joints: &[u8; JOINTS], wrong: u8) -> Misaligned {
     Misaligned::JointPosition { wrong, allowed: ALLOWED_WRONG_JOINTS, joint, position }
 }
 
-/// Whether every byte is 0 or 1: checked four at a time, since nearly every packet is right.
+/// Whether every byte is 0 or 1: checked many at a time, since nearly every packet is right.
+#[inline]
 fn are_bools(bytes: &[u8]) -> bool {
-    let (words, rest) = bytes.as_chunks::<4>();
-    let words = words.iter().fold(0, |all, word| all | u32::from_ne_bytes(*word));
+    let (words, rest) = bytes.as_chunks::<16>();
+    let words = words.iter().fold(0, |all, word| all | u128::from_ne_bytes(*word));
     let rest = rest.iter().fold(0, |all, byte| all | byte);
-    words & 0xFEFE_FEFE == 0 && rest & 0xFE == 0
+    words & u128::from_ne_bytes([0xFE; 16]) == 0 && rest & 0xFE == 0
 }
 
 #[cold]

@@ -7,6 +7,7 @@
 
 use super::alignment::{Earlier, Misaligned};
 use super::view::{LEN, StateView};
+use crate::wire::runs::copy_long;
 
 /// After this many misaligned packets in a row the connection must be reopened.
 pub const MAX_MISALIGNED: u32 = 3;
@@ -49,7 +50,7 @@ impl StateStream {
                 let room = self.buffer.get_mut(self.len..).unwrap_or(&mut []);
                 let count = room.len().min(chunk.len());
                 let (taken, rest) = chunk.split_at_checked(count)?;
-                room.get_mut(..count)?.copy_from_slice(taken);
+                copy_long(room.get_mut(..count)?, taken);
                 *chunk = rest;
                 self.len = self.len.saturating_add(count);
                 if self.len < LEN {
@@ -70,6 +71,20 @@ impl StateStream {
                 Some(Err(misaligned))
             }
         }
+    }
+
+    /// Takes bytes that do not complete a packet. `false` if they do, or if there are none; then none were taken.
+    #[inline]
+    pub(crate) fn hold(&mut self, chunk: &[u8]) -> bool {
+        let held = self.pending();
+        let end = held.saturating_add(chunk.len());
+        if end >= LEN || chunk.is_empty() {
+            return false;
+        }
+        let Some(room) = self.buffer.get_mut(held..end) else { return false };
+        copy_long(room, chunk);
+        self.len = end;
+        true
     }
 
     /// Misaligned packets since the last good one.

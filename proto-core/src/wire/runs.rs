@@ -5,11 +5,11 @@
 //! Cortex-M.
 
 /// The longest run.
-pub(super) const MAX_RUN: usize = 32;
+pub(crate) const MAX_RUN: usize = 32;
 
 /// Copies `from`, at most [`MAX_RUN`] bytes, into `to`, which has the same length.
 #[inline]
-pub(super) fn copy(to: &mut [u8], from: &[u8]) {
+pub(crate) fn copy(to: &mut [u8], from: &[u8]) {
     debug_assert!(to.len() == from.len() && from.len() <= MAX_RUN);
     match from.len() {
         // As one number: an array of sixteen bytes is a call of `memcpy` on a Cortex-M.
@@ -18,6 +18,27 @@ pub(super) fn copy(to: &mut [u8], from: &[u8]) {
         4.. => both_ends(to, from, as_is::<4>),
         2.. => both_ends(to, from, as_is::<2>),
         _ => both_ends(to, from, as_is::<1>),
+    }
+}
+
+/// Copies a piece of any length to one of the same length, by runs: on a Cortex-M half the work of `memcpy`, which
+/// moves one word at a time.
+#[inline(never)]
+pub(crate) fn copy_long(to: &mut [u8], from: &[u8]) {
+    let (to_runs, to_rest) = to.as_chunks_mut::<16>();
+    let (from_runs, from_rest) = from.as_chunks::<16>();
+    let (to_pairs, to_last) = to_runs.as_chunks_mut::<2>();
+    let (from_pairs, from_last) = from_runs.as_chunks::<2>();
+    let number = |bytes: [u8; 16]| u128::from_ne_bytes(bytes).to_ne_bytes();
+    for ([to, to_next], [from, from_next]) in to_pairs.iter_mut().zip(from_pairs) {
+        *to = number(*from);
+        *to_next = number(*from_next);
+    }
+    for (to, from) in to_last.iter_mut().zip(from_last) {
+        *to = number(*from);
+    }
+    if to_rest.len() == from_rest.len() {
+        copy(to_rest, from_rest);
     }
 }
 
@@ -40,7 +61,7 @@ fn both_ends<const N: usize>(to: &mut [u8], from: &[u8], by: impl Fn([u8; N]) ->
 /// Whether none of the binary32 numbers in `run`, at most [`MAX_RUN`] bytes, is infinite or not a
 /// number.
 #[inline]
-pub(super) fn all_finite(run: &[u8]) -> bool {
+pub(crate) fn all_finite(run: &[u8]) -> bool {
     debug_assert!(run.len() <= MAX_RUN && run.len().is_multiple_of(4));
     match run.len() {
         16.. => finite_at_both_ends::<16>(run),
@@ -86,6 +107,17 @@ mod tests {
             let from: Vec<u8> = (1..=len as u8).collect();
             let mut to = vec![0xA5; len + 2];
             copy(&mut to[1..=len], &from);
+            assert_eq!(to[1..=len], from);
+            assert_eq!((to[0], to[len + 1]), (0xA5, 0xA5));
+        }
+    }
+
+    #[test]
+    fn a_long_copy_is_whole_and_stays_inside() {
+        for len in 0..=5 * MAX_RUN {
+            let from: Vec<u8> = (0..len).map(|at| at as u8 ^ 0x5A).collect();
+            let mut to = vec![0xA5; len + 2];
+            copy_long(&mut to[1..=len], &from);
             assert_eq!(to[1..=len], from);
             assert_eq!((to[0], to[len + 1]), (0xA5, 0xA5));
         }
