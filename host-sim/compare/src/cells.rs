@@ -1,0 +1,149 @@
+//! Many cells on this machine, a gateway process each: a frame of a device goes up to the robot's registers every 4 ms, and
+//! a frame goes down to the device every 4 ms. The devices and the robots are this program, on the same machine.
+
+use std::fs::File;
+use std::io::{Read, Write};
+use std::time::{Duration, Instant};
+
+use recipe_net::realtime::{self, Scheduling};
+use recipe_test_kit::{HostSim, PATIENCE};
+use rustix::fs::{OFlags, fcntl_getfl, fcntl_setfl};
+
+use crate::cell_files::{self, OUT_LEN, frame, is_connected};
+use crate::figures::{processor_time, quantile};
+use crate::modbus_peer::Peer;
+
+const PERIOD: Duration = Duration::from_millis(4);
+/// The cells take turns within a period: devices of different machines do not send at the same moment.
+const STEPS: u32 = 8;
+/// Cells whose command and state one simulated controller is.
+const PER_CONTROLLER: usize = 16;
+
+/// The device of a cell, and what was seen of it.
+struct Device {
+    line: File,
+    value: u8,
+    sent: Instant,
+    arrived: bool,
+    late: u64,
+    heard: usize,
+}
+
+/// Runs so many cells for so long, and prints what they kept.
+pub(crate) fn run(cells: usize, seconds: u64) {
+    let mut peer = Peer::new(cells);
+    let robots: Vec<_> = (0..cells.div_ceil(PER_CONTROLLER)).map(|_| cell_files::controller()).collect();
+    let folders: Vec<_> = (0..cells).map(|_| tempfile::tempdir().expect("a temporary folder")).collect();
+    let gateways: Vec<_> = (0..cells)
+        .map(|nth| {
+            cell_files::gateway(folders[nth].path(), &robots[nth / PER_CONTROLLER], peer.address(nth), true)
+        })
+        .collect();
+    let began = Instant::now();
+    while !gateways.iter().all(|gateway| is_connected(&gateway.newest())) {
+        assert!(began.elapsed() < 6 * PATIENCE, "not all gateways are connected");
+        peer.serve(Duration::from_millis(10), |_, _| {});
+    }
+    let mut devices: Vec<_> =
+        folders.iter().map(|folder| Device::open(&folder.path().join("line"))).collect();
+    let scheduled = realtime::apply(Scheduling::FifoIfAllowed);
+    // The first second is not counted: what the gateways had to send before waits in the lines.
+    drive(&mut devices, &mut peer, 1);
+    for device in &mut devices {
+        (device.late, device.heard) = (0, 0);
+    }
+    let before = Counted::of(&gateways);
+    let (mut samples, sent) = drive(&mut devices, &mut peer, seconds);
+    let after = Counted::of(&gateways);
+
+    let wanted = cells as f64 * seconds as f64 * 250.0;
+    let heard: usize = devices.iter().map(|device| device.heard / OUT_LEN).sum();
+    let late: u64 = devices.iter().map(|device| device.late).sum();
+    let used = (after.used - before.used).as_secs_f64() / seconds as f64;
+    println!("{cells} cells for {seconds} s; devices and robots with {scheduled}");
+    println!(
+        "  frames sent by devices      {sent}, {:.1} % of 250 a second each",
+        sent as f64 / wanted * 100.0
+    );
+    println!("  values at the registers     {}; {late} were overtaken by the next one", samples.len());
+    println!(
+        "  frames heard by devices     {heard}, {:.1} % of 250 a second each",
+        heard as f64 / wanted * 100.0
+    );
+    println!("  cycles left out             {}", after.skipped - before.skipped);
+    println!(
+        "  processor of all gateways   {used:.2} cores, {:.2} % of one for each",
+        used / cells as f64 * 100.0
+    );
+    let quantiles = [0.5, 0.99, 1.0].map(|share| quantile(&mut samples, share));
+    println!(
+        "  us from frame to register   p50 {:.0}, p99 {:.0}, most {:.0}",
+        quantiles[0], quantiles[1], quantiles[2]
+    );
+}
+
+/// The devices send and listen for so long: microseconds until each value was at the robot, and frames sent.
+fn drive(devices: &mut [Device], peer: &mut Peer, seconds: u64) -> (Vec<f64>, usize) {
+    let mut samples = Vec::new();
+    let mut sent = 0;
+    let began = Instant::now();
+    let steps = u32::try_from(seconds * 250).expect("some seconds") * STEPS;
+    for step in 0..steps {
+        let due = began + PERIOD * step / STEPS;
+        loop {
+            let left = due.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                break;
+            }
+            peer.serve(left, |cell, value| devices[cell].arrives(value, &mut samples));
+        }
+        for device in devices.iter_mut().skip((step % STEPS) as usize).step_by(STEPS as usize) {
+            device.step();
+            sent += 1;
+        }
+    }
+    (samples, sent)
+}
+
+impl Device {
+    fn open(line: &std::path::Path) -> Self {
+        let line = cell_files::open(line);
+        let flags = fcntl_getfl(&line).unwrap();
+        fcntl_setfl(&line, flags | OFlags::NONBLOCK).unwrap();
+        Self { line, value: 0, sent: Instant::now(), arrived: true, late: 0, heard: 0 }
+    }
+
+    /// Takes what was sent to it, and sends the next frame.
+    fn step(&mut self) {
+        let mut heard = [0; 1_024];
+        self.heard += self.line.read(&mut heard).unwrap_or(0);
+        self.late += u64::from(!self.arrived);
+        self.value = self.value.wrapping_add(1);
+        self.arrived = false;
+        self.sent = Instant::now();
+        self.line.write_all(&frame(self.value)).expect("a line takes what nobody has read for a second");
+    }
+
+    fn arrives(&mut self, value: u16, samples: &mut Vec<f64>) {
+        if value == u16::from(self.value) && !self.arrived {
+            self.arrived = true;
+            samples.push(self.sent.elapsed().as_nanos() as f64 / 1e3);
+        }
+    }
+}
+
+/// What all gateways have counted.
+struct Counted {
+    skipped: u64,
+    used: Duration,
+}
+
+impl Counted {
+    fn of(gateways: &[HostSim]) -> Self {
+        let skipped = |gateway: &HostSim| gateway.newest()["ports"]["device"]["skipped_cycles"].as_u64();
+        Self {
+            skipped: gateways.iter().map(|gateway| skipped(gateway).expect("statistics have it")).sum(),
+            used: gateways.iter().map(|gateway| processor_time(gateway.pid())).sum(),
+        }
+    }
+}
