@@ -133,6 +133,7 @@ impl Flash {
     }
 
     /// It holds this from now on.
+    #[cfg(any(test, feature = "emulator"))]
     pub(crate) fn hold(&mut self, contents: &Contents) {
         self.contents.clone_from(contents);
     }
