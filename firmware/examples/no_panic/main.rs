@@ -1,6 +1,6 @@
-//! The proof that nothing in proto-core, recipe-store or recipe-remote panics: an image in which every entry of theirs
-//! that sees what a device, a peer, a file or flash sent is called with values that the compiler knows nothing about, and
-//! whose panic handler needs a symbol that does not exist. It links only when the optimiser has removed
+//! The proof that nothing in proto-core, recipe-store, recipe-remote or recipe-sparkplug panics: an image in which every
+//! entry of theirs that sees what a device, a peer, a file or flash sent is called with values that the compiler knows
+//! nothing about, and whose panic handler needs a symbol that does not exist. It links only when the optimiser has removed
 //! every panic. `.ci/run` builds it as the firmware is built, and prints how much stack each of these
 //! functions takes (docs/architecture.md section 4).
 //!
@@ -14,6 +14,7 @@ mod protocols;
 mod recipes;
 mod remote;
 mod rtu;
+mod sparkplug;
 mod state;
 mod store;
 mod words;
@@ -48,6 +49,7 @@ fn exercise() {
     zeros::all();
     if !matches!(VARIANT, Variant::Core) {
         remote::all();
+        sparkplug::all();
         store::all();
     }
     match VARIANT {
