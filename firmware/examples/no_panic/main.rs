@@ -1,9 +1,9 @@
-//! The proof that nothing in proto-core, recipe-store, recipe-update or recipe-remote panics: an image in which every
-//! entry of theirs that sees what a device, a peer, a file or flash sent is called with values that the compiler knows
-//! nothing about, and whose panic handler needs a symbol that does not exist. It links only when the optimiser has
-//! removed every panic. With recipe-update, whose signatures are a library's, every call of a panic is looked at
-//! instead. `.ci/run` builds it as the firmware is built, and prints how much stack each of these functions takes
-//! (docs/architecture.md section 4).
+//! The proof that nothing in proto-core, recipe-store, recipe-update, recipe-remote or recipe-sparkplug panics: an image
+//! in which every entry of theirs that sees what a device, a peer, a file or flash sent is called with values that the
+//! compiler knows nothing about, and whose panic handler needs a symbol that does not exist. It links only when the
+//! optimiser has removed every panic. With recipe-update, whose signatures are a library's, every call of a panic is
+//! looked at instead. `.ci/run` builds it as the firmware is built, and prints how much stack each of these functions
+//! takes (docs/architecture.md section 4).
 //!
 //! It is never run on a board. On a host the same calls are made once, which shows little.
 #![cfg_attr(target_os = "none", no_std, no_main)]
@@ -15,6 +15,7 @@ mod protocols;
 mod recipes;
 mod remote;
 mod rtu;
+mod sparkplug;
 mod state;
 mod store;
 mod update;
@@ -50,6 +51,7 @@ fn exercise() {
     zeros::all();
     if !matches!(VARIANT, Variant::Core) {
         remote::all();
+        sparkplug::all();
         store::all();
     }
     if matches!(VARIANT, Variant::Signed) {

@@ -398,8 +398,11 @@ impl<const METRICS: usize> Catalog for GatewayCatalog<'_, METRICS> {
 
 /// The unit of a variable. A row of two units has three quantities of each, such as a pose.
 fn unit_of(var: SysVar) -> &'static str {
-    match var.unit().split_once(", ") {
-        None => var.unit(),
+    let unit = var.unit();
+    // The search of `core` for a text has panics that the optimiser keeps.
+    let comma = unit.bytes().position(|byte| byte == b',');
+    match comma.and_then(|at| Some((unit.get(..at)?, unit.get(at.saturating_add(2)..)?))) {
+        None => unit,
         Some((first, _)) if var.index().saturating_sub(var.span().first) < 3 => first,
         Some((_, second)) => second,
     }

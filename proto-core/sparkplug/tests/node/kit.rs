@@ -281,7 +281,7 @@ impl Rig {
                     done.push(Did::Close);
                 }
                 // Others run meanwhile.
-                Output::Busy => self.now = self.now + Duration::from_millis(1),
+                Output::Busy => self.now += Duration::from_millis(1),
                 Output::Send(bytes) => {
                     self.pieces += 1;
                     self.received.extend_from_slice(bytes);

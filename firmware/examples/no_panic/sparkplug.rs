@@ -1,0 +1,101 @@
+//! The edge node: what a broker and a time server send, settings as bytes, and what a gateway tells.
+
+use core::hint::black_box;
+
+use proto_core::config::GatewayConfig;
+use proto_core::time::{Duration, Instant};
+use recipe_sparkplug::catalog::{Catalog as _, Owner};
+use recipe_sparkplug::document::Document;
+use recipe_sparkplug::gateway::{GatewayCatalog, Rates};
+use recipe_sparkplug::node::{Counters, EdgeNode, Input, MIN_BUFFER};
+use recipe_sparkplug::sntp::Sntp;
+use recipe_sparkplug::value::Value;
+use static_cell::ConstStaticCell;
+
+use crate::{any, bytes, room};
+
+type Engine = proto_core::engine::Engine<2, 1, 32, 0, 4>;
+type Catalog = GatewayCatalog<'static, 64>;
+type Node = EdgeNode<64, 16>;
+
+pub(crate) fn all() {
+    static DOCUMENT: ConstStaticCell<Document> = ConstStaticCell::new(Document::empty());
+    static NODE: ConstStaticCell<Node> = ConstStaticCell::new(Node::idle());
+    static ENGINE: ConstStaticCell<Engine> = ConstStaticCell::new(Engine::idle());
+    static CONFIG: GatewayConfig = GatewayConfig::empty();
+    sparkplug_time();
+    let (Some(document), Some(node), Some(engine)) =
+        (DOCUMENT.try_take(), NODE.try_take(), ENGINE.try_take())
+    else {
+        return;
+    };
+    sparkplug_document(black_box(&mut *document));
+    let _ = black_box(black_box(&mut *engine).configure(black_box(&CONFIG)));
+    let document: &'static Document = document;
+    if let Some(catalog) = sparkplug_catalog(document, black_box(engine), &CONFIG) {
+        sparkplug_sample(black_box(&catalog), black_box(engine));
+        if node.configure(&document.settings, black_box(&catalog), any(None), any(1)).is_ok() {
+            sparkplug_node(black_box(node), black_box(&catalog));
+        }
+    }
+}
+
+#[inline(never)]
+fn sparkplug_time() {
+    let mut sntp = Sntp::new(any(1));
+    let sntp = black_box(&mut sntp);
+    black_box((sntp.poll(any(Instant::ZERO)), sntp.deadline(), sntp.counters()));
+    let _ = black_box(sntp.receive(any(Instant::ZERO), bytes()));
+}
+
+#[inline(never)]
+fn sparkplug_document(document: &mut Document) {
+    let _ = black_box(document.decode(bytes()));
+    let mut out = [0; 256];
+    let _ = black_box(document.encode(room(&mut out)));
+}
+
+#[inline(never)]
+fn sparkplug_catalog(
+    document: &'static Document,
+    engine: &Engine,
+    config: &'static GatewayConfig,
+) -> Option<Catalog> {
+    let rates = Rates {
+        min_interval: document.interval,
+        counter_interval: document.counter_interval,
+        rules: &document.rules,
+        values: &document.values,
+    };
+    Catalog::new(black_box(config).view(), engine.status(any(Instant::ZERO)), rates, "0").ok()
+}
+
+#[inline(never)]
+fn sparkplug_sample(catalog: &Catalog, engine: &Engine) {
+    let mut values = [None; 64];
+    let status = engine.status(any(Instant::ZERO));
+    let counters = any(Counters::NONE);
+    let part = any(0)..any(64);
+    catalog.sample_part(status, any(Duration::ZERO), &counters, part, black_box(&mut values[..]));
+    black_box((values, catalog.alive(status), catalog.len()));
+    black_box((catalog.metric(any(1)), catalog.report(any(1)), catalog.metrics(any(Owner::Node))));
+}
+
+#[inline(never)]
+fn sparkplug_node(node: &mut Node, catalog: &Catalog) {
+    let now = any(Instant::ZERO);
+    let values: [Option<Value>; 64] = any([None; 64]);
+    for input in [
+        Input::Opened,
+        Input::Closed,
+        Input::Bytes(bytes()),
+        Input::Sample { values: any(&values[..]), alive: any(1) },
+        Input::Time { utc_ms: any(1) },
+        Input::End,
+    ] {
+        node.handle(now, any(input), catalog);
+    }
+    let mut piece = [0; MIN_BUFFER];
+    black_box(node.poll_output(now, catalog, room(&mut piece)));
+    black_box((node.counters(), node.failure(), node.is_online(), node.bd_seq()));
+}
