@@ -36,7 +36,7 @@ const GATEWAYS: [&str; 16] = [
 ];
 
 /// Pieces of a Sparkplug file.
-const TOLD: [&str; 32] = [
+const TOLD: [&str; 36] = [
     "[broker]\n",
     "address = \"broker.plant.example:8883\"\n",
     "address = \"[::1]:1883\"\n",
@@ -69,6 +69,10 @@ const TOLD: [&str; 32] = [
     "dead_band = nan\n",
     "[broker]\naddress = \"b\"\nplain = true\n[node]\ngroup = \"g\"\nname = \"n\"\n",
     "rule = []\n",
+    "[time]\n",
+    "server = \"10.0.0.1\"\n",
+    "server = \"ntp.plant.example:1123\"\n",
+    "server = \"a:0\"\n",
 ];
 
 pub(crate) fn run_inventory(input: &[u8]) {
@@ -166,7 +170,7 @@ fn millis(table: &Table, key: &str) -> Option<Option<Duration>> {
 }
 
 fn sparkplug(table: &Table) -> Option<SparkplugFile> {
-    only(table, &["broker", "node", "report", "rule"])?;
+    only(table, &["broker", "node", "report", "rule", "time"])?;
     let broker = table.get("broker")?.as_table()?;
     only(broker, &["address", "ca", "plain", "login", "client_id", "keep_alive_s"])?;
     let node = table.get("node")?.as_table()?;
@@ -206,8 +210,16 @@ fn sparkplug(table: &Table) -> Option<SparkplugFile> {
     if values.len() > 64 || rules.len() > 64 {
         return None;
     }
+    let mut time_server = None;
+    if let Some(time) = table.get("time") {
+        let time = time.as_table()?;
+        only(time, &["server"])?;
+        let (server, port) = place(&words(time, "server", 255)??)?;
+        time_server = Some((server, port.unwrap_or(123)));
+    }
     let or = |key, default| Some(millis(report, key)?.unwrap_or(Duration::from_millis(default)));
     Some(SparkplugFile {
+        time_server,
         host,
         port,
         ca: ca.map(PathBuf::from),
@@ -254,8 +266,14 @@ pub(crate) fn inventory_seeds() -> Vec<Vec<u8>> {
 }
 
 pub(crate) fn sparkplug_seeds() -> Vec<Vec<u8>> {
-    let mut seeds =
-        vec![vec![30], vec![30, 19, 20, 22, 23, 24, 26, 27, 28], vec![0, 1, 6, 9, 10, 11, 13, 14, 16]];
+    let mut seeds = vec![
+        vec![30],
+        vec![30, 19, 20, 22, 23, 24, 26, 27, 28],
+        vec![30, 32, 33],
+        vec![30, 32, 34],
+        vec![30, 32, 35],
+        vec![0, 1, 6, 9, 10, 11, 13, 14, 16],
+    ];
     seeds.extend((0..TOLD.len() as u8).flat_map(|nth| {
         [vec![30, nth], vec![0, nth, 7, 13, 14, 16], vec![30, 19, nth], vec![30, 26, 27, nth]]
     }));

@@ -130,6 +130,14 @@ impl Process {
         serde_json::from_str(&self.line()).unwrap()
     }
 
+    /// Whether it has ended.
+    ///
+    /// # Panics
+    /// If the system does not say.
+    pub fn has_ended(&mut self) -> bool {
+        self.child.try_wait().unwrap().is_some()
+    }
+
     /// Checks that it is still running.
     ///
     /// # Panics

@@ -161,9 +161,19 @@ impl Surroundings {
     #[track_caller]
     fn claim(&self, press: impl FnOnce()) {
         let ctl = Ctl { to: self.to, host: Some(BOARD), key: None, timeout: TIMEOUT };
-        let mut claim = Process::start(&mut ctl.command(&["claim", &self.path("key")]));
+        let start = || Process::start(&mut ctl.command(&["claim", &self.path("key")]));
+        let mut claim = start();
         until("it asks for the button", || {
-            claim.errors().iter().any(|line| line.starts_with("press the button of rgw-")).then_some(())
+            let asks = |line: &String| line.starts_with("press the button of rgw-");
+            if claim.errors().iter().any(asks) {
+                return Some(());
+            }
+            // A board has few places; one that has none for a moment is asked again, as by a person.
+            if claim.has_ended() {
+                eprintln!("claim: {}", claim.all_errors());
+                claim = start();
+            }
+            None
         });
         press();
         assert!(claim.ended().success(), "{}", claim.all_errors());
