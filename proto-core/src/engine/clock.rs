@@ -164,16 +164,19 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     /// When the engine has something to do without an input, computed exactly. [`Output::Sleep`]
     /// may be earlier, never later.
     pub fn deadline(&self) -> Instant {
-        self.firm_deadline().min(self.partial_deadline())
+        let (firm, partial) = self.deadlines();
+        firm.min(partial)
     }
 
-    /// The same without partial frames.
-    fn firm_deadline(&self) -> Instant {
-        let ports = self.ports.iter().map(FieldPort::send_deadline);
-        let ports = ports.min().unwrap_or(Instant::NEVER);
+    /// The same without partial frames, and of these.
+    fn deadlines(&self) -> (Instant, Instant) {
+        let (mut firm, mut partial) = (Instant::NEVER, Instant::NEVER);
+        for port in &self.ports {
+            (firm, partial) = (firm.min(port.send_deadline()), partial.min(port.partial_until()));
+        }
         let hears_at = if self.clock.is_deaf { self.clock.deaf_until } else { Instant::NEVER };
-        let own = ports.min(self.links.deadline()).min(self.store.deadline()).min(hears_at);
-        if self.exchanges.is_used() { own.min(self.talk_deadline()) } else { own }
+        let firm = firm.min(self.links.deadline()).min(self.store.deadline()).min(hears_at);
+        (if self.exchanges.is_used() { firm.min(self.talk_deadline()) } else { firm }, partial)
     }
 
     /// Nothing is to be done until the next deadline or beat.
@@ -181,8 +184,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     pub(super) fn poll_sleep<'b>(&mut self) -> Output<'b> {
         if !self.clock.ask.has(Ask::ARMED) {
             self.clock.ask.add(Ask::ARMED);
-            self.clock.timer_at = self.firm_deadline();
-            self.clock.partial_at = self.partial_deadline();
+            (self.clock.timer_at, self.clock.partial_at) = self.deadlines();
         }
         self.sleep()
     }

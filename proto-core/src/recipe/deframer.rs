@@ -36,7 +36,8 @@ pub struct Deframer {
     ring: [u8; RING],
     start: u16,
     len: u16,
-    /// Up to this many bytes are held whatever they are, because the head was seen; 0 if each has to be looked at.
+    /// Up to this many bytes are held whatever they are, because the head was seen; 0 if each has to be looked at. Only
+    /// [`Self::hold`] notes it: what comes in long chunks has no use for it.
     hold_until: u16,
     stats: DeframerStats,
 }
@@ -167,7 +168,6 @@ impl Deframer {
         let Some((frame, after)) = chunk.split_at_checked(layout.frame_len()) else {
             self.put(0, chunk);
             self.len = chunk.len() as u16;
-            self.hold_until = hold_until(layout, chunk.len());
             *chunk = &[];
             return None;
         };
@@ -215,7 +215,6 @@ impl Deframer {
             let Some((more, after)) = chunk.split_at_checked(missing) else {
                 self.put(held, chunk);
                 self.len = self.len.wrapping_add(chunk.len() as u16);
-                self.hold_until = hold_until(layout, self.pending());
                 *chunk = &[];
                 return Held::Partial;
             };

@@ -72,15 +72,6 @@ fn restarted(mut bench: Bench, settings: &[u8]) -> (Bench, Broker) {
     (bench, broker)
 }
 
-/// Runs until the frames of the test and those of the board, which share one line, never meet: the board begins one every
-/// 4 ms, the test every 10 ms.
-fn align(bench: &mut Bench) {
-    let sent = &bench.chip.devices().usart2.line.sent;
-    let last = sent.chunks_exact(7).next_back().expect("it sends every 4 ms")[0].start;
-    let phase = (bench.now() - last) % (4 * MILLI);
-    bench.run(5 * MILLI - phase);
-}
-
 /// Runs until the broker has such a message behind `from`; returns its place.
 #[track_caller]
 fn until_told(
@@ -240,11 +231,9 @@ fn why_nothing_is_told_is_said_and_the_node_comes_back() {
 fn a_broker_that_dies_and_comes_back_costs_the_cell_no_frame_and_no_cycle() {
     let span = 12 * SECOND;
     let (mut bench, _) = restarted(claimed(), &OFF);
-    align(&mut bench);
     let alone = work(&mut bench, span, |_| {});
     let (mut bench, mut broker) = restarted(claimed(), &settings());
     until_verb(&mut bench, &mut broker, 0, "NBIRTH");
-    align(&mut bench);
     let begin = bench.now();
     // All moods, one after the other; a node that has failed waits two seconds at most before it tries again.
     let moods = [

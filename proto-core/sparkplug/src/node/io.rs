@@ -66,7 +66,7 @@ pub enum NodeError {
         /// The room.
         room: usize,
     },
-    /// More devices than [`MAX_DEVICES`].
+    /// More devices than [`MAX_DEVICES`](crate::catalog::MAX_DEVICES).
     Devices {
         /// Their number.
         count: usize,
