@@ -33,16 +33,16 @@ pub(crate) struct Did {
     pub(crate) instructions: u64,
 }
 
-/// Runs until the frames of the test and those of the board, which share one line, never meet: the board begins one every
-/// 4 ms, the test every 10 ms.
+/// Runs until frames that the test sends on the line from now on, every 8 ms, are in the middle between those of the board,
+/// which has the same line and begins one every 4 ms: they never meet, also if the board is a millisecond late.
 fn align(bench: &mut Bench) {
     let sent = &bench.chip.devices().usart2.line.sent;
     let last = sent.chunks_exact(7).next_back().expect("it sends every 4 ms")[0].start;
     let phase = (bench.now() - last) % (4 * MILLI);
-    bench.run(5 * MILLI - phase);
+    bench.run(6 * MILLI - phase);
 }
 
-/// Frames come on the line every 10 ms and on CAN every 2 ms; `others` do what they do in between.
+/// Frames come on the line every 8 ms and on CAN every 2 ms; `others` do what they do in between.
 pub(crate) fn work(bench: &mut Bench, span: Picos, mut others: impl FnMut(&mut Bench)) -> Did {
     align(bench);
     let (begin, instructions) = (bench.now(), bench.chip.instructions());
@@ -50,7 +50,7 @@ pub(crate) fn work(bench: &mut Bench, span: Picos, mut others: impl FnMut(&mut B
     for step in 0..span / (2 * MILLI) {
         let now = begin + step * 2 * MILLI;
         number = number.wrapping_add(1);
-        if step % 5 == 0 {
+        if step % 4 == 0 {
             bench.chip.devices().usart2.line.send(now, &[255, 255, number, 0, 7, 238, 238], FORMAT);
         }
         bench.chip.devices().can.bus.send(now + 500 * MICRO, Frame::standard(1, &[number]));
