@@ -1,7 +1,7 @@
 /* A Modbus TCP server of libmodbus for many connections: modbus_server ADDRESS:PORT. */
 #include <arpa/inet.h>
 #include <errno.h>
-#include <modbus.h>
+#include <modbus/modbus.h>
 #include <netinet/tcp.h>
 #include <poll.h>
 #include <stdio.h>
