@@ -11,6 +11,7 @@ use super::super::exchange::STALE;
 use super::super::port::{Port, PortBus};
 use super::super::test_kit::{Client, Running, Seen, run};
 use super::super::wire::{MAX_QUEUED, frame_bits};
+use super::clients::MAX_CLIENTS;
 use super::*;
 
 const START: Instant = Instant::from_micros(1_000);
