@@ -12,13 +12,14 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use clap::ValueEnum;
-use recipe_test_kit::{HostSim, Process, free_servers};
+use recipe_test_kit::Process;
 use rustix::event::epoll;
 use rustix::process::Pid;
 use tokio_modbus::prelude::{ExceptionCode, Request, Response};
 use tokio_modbus::server::Service;
 use tokio_modbus::server::tcp::{Server, accept_tcp_connection};
 
+use crate::cell_files;
 use crate::figures::{processor_time, quantile};
 use crate::programs;
 
@@ -38,10 +39,7 @@ pub(crate) enum Kind {
 
 /// Compares them, and prints a table for each number of connections.
 pub(crate) fn compare(rounds: usize) {
-    let file = tempfile::NamedTempFile::new().expect("a temporary file");
-    let mut controller = programs::host_sim();
-    controller.arg("controller").arg("-c").arg(file.path()).args(free_servers());
-    let controller = HostSim::start(&mut controller);
+    let controller = cell_files::controller();
     let epoll = Other::start(programs::this().args(["serve", "epoll"]));
     let tokio_modbus = Other::start(programs::this().args(["serve", "tokio-modbus"]));
     let libmodbus = Other::start(&mut programs::in_c("modbus_server", &["-lmodbus"]));
