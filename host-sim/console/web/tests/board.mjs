@@ -11,7 +11,7 @@ import { tmpdir } from "node:os";
 import { join, resolve } from "node:path";
 import { after, before, test } from "node:test";
 import { chromium } from "playwright-core";
-import { PROGRAM, until } from "./cell.mjs";
+import { newPage, PROGRAM, until } from "./cell.mjs";
 
 const ROOT = resolve("../../..");
 const ELF = resolve(ROOT, process.env.FIRMWARE_ELF ?? "target/thumb/thumbv7em-none-eabihf/firmware/firmware");
@@ -162,7 +162,7 @@ const card = (page, title) => page.locator("section.card").filter({ has: page.ge
 test("a board is claimed, changed, and returns from what cannot run", async () => {
     const context = await browser.newContext({ viewport: { width: 1280, height: 900 }, locale: "en-GB", acceptDownloads: true });
     context.setDefaultTimeout(20_000);
-    const page = await context.newPage();
+    const page = await newPage(context);
     const errors = [];
     page.on("pageerror", (error) => errors.push(error.message));
     await page.goto(`${address}/`);

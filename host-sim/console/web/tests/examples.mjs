@@ -7,7 +7,7 @@ import { tmpdir } from "node:os";
 import { join, resolve } from "node:path";
 import { after, before, test } from "node:test";
 import { chromium } from "playwright-core";
-import { KEY, start, until } from "./cell.mjs";
+import { KEY, newPage, start, until } from "./cell.mjs";
 
 const CONFIGS = resolve("../../configs");
 const PICTURES = "../../../target/console";
@@ -121,7 +121,7 @@ async function empty(robotFile, robotArguments, binds, run) {
         processes.push(gateway);
         await context.addInitScript((key) => sessionStorage.setItem("recipe-gateway-key", key), KEY);
         context.setDefaultTimeout(10_000);
-        const page = await context.newPage();
+        const page = await newPage(context);
         await page.goto(`http://${gateway.ready.console}/#recipes`);
         const info = async () => (await fetch(`http://${gateway.ready.console}/api/v1/info`)).json();
         const item = async (name) => {

@@ -131,7 +131,7 @@ export class Board {
         this.server.close();
     }
 
-    /** From now on `name` lasts until `goOn(name)`: "erasing", "lost", "restart" or "trial". */
+    /** From now on `name` lasts until `goOn(name)`: "erasing", "sending" (at a third), "lost", "restart" or "trial". */
     hold(name) {
         let goOn;
         const until = new Promise((done) => (goOn = done));
@@ -250,7 +250,8 @@ export class Board {
                 return socket.destroy();
             }
             this.store(body);
-            return setTimeout(done, this.pieceMs ?? 0);
+            const isFar = incoming.received > incoming.length / 3;
+            return void this.lasts(isFar ? "sending" : "", this.pieceMs ?? 0).then(done);
         }
         const version = [160, 162, 164].map((at) => body.readUInt16LE(at)).join(".");
         const older = `the firmware ${version} is older than the one that runs, ${this.version}; a downgrade has to be asked for`;
