@@ -1,6 +1,7 @@
 //! The NUCLEO's firmware, unchanged, on its modelled chip in real time (docs/chip.md section 5), as a board that is
 //! bought without a key: its button is pressed, and its plug is pulled.
 
+use std::ffi::OsString;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -10,6 +11,25 @@ use serde_json::Value;
 
 use crate::board::{Board, LINE, Surroundings};
 use crate::target::Target;
+
+/// The emulator's socket for the board's button and plug.
+pub(crate) fn control(around: &Surroundings) -> PathBuf {
+    around.path("control").into()
+}
+
+/// Starts the emulator with a program and the image of a configuration file, on the board's line and network.
+pub(crate) fn emulate(around: &Surroundings, elf: &Path, file: &Path, more: &[OsString]) -> Process {
+    // Beside this program's binary: `cargo build -p chip` has made it.
+    let mut command = Command::new(Path::new(env!("CARGO_BIN_EXE_host-sim")).with_file_name("chip"));
+    command.arg(elf).arg(around.image(file)).arg("--realtime");
+    command.arg("--rs485").arg(around.path(LINE));
+    command.arg("--control").arg(control(around));
+    command.arg("--network").arg(around.forward());
+    command.args(more);
+    let chip = Process::start(command.stdout(Stdio::piped()).stderr(Stdio::piped()));
+    until("the emulator's sockets", || UnixStream::connect(control(around)).ok());
+    chip
+}
 
 /// The board, its panel on RS-485 A.
 pub(crate) struct Nucleo {
@@ -26,9 +46,8 @@ impl Nucleo {
         Self { elf, around: Surroundings::new(), chip: None }
     }
 
-    /// The emulator's socket.
     fn control(&self) -> PathBuf {
-        self.around.path("control").into()
+        control(&self.around)
     }
 
     fn log(&self) -> String {
@@ -47,16 +66,7 @@ impl Board for Nucleo {
 
     fn start(&mut self, file: &Path) {
         if self.chip.is_none() {
-            // Beside this program's binary: `cargo build -p chip` has made it.
-            let emulator = Path::new(env!("CARGO_BIN_EXE_host-sim")).with_file_name("chip");
-            let mut command = Command::new(emulator);
-            command.arg(&self.elf).arg(self.around.image(file)).arg("--realtime");
-            command.arg("--rs485").arg(self.around.path(LINE));
-            command.arg("--control").arg(self.around.path("control"));
-            command.arg("--network").arg(self.around.forward());
-            let chip = Process::start(command.stdout(Stdio::piped()).stderr(Stdio::piped()));
-            self.chip = Some(chip);
-            until("the emulator's sockets", || UnixStream::connect(self.control()).ok());
+            self.chip = Some(emulate(&self.around, &self.elf, file, &[]));
         }
     }
 

@@ -4,20 +4,19 @@
 //! What is built once is made several builds of: one in which a text is different, and one that does not run.
 
 use std::os::unix::fs::OpenOptionsExt;
-use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use recipe_ctl::update::{Downgrade, begin_trial, push};
 use recipe_ctl::{Client, Slot, Stop, Update, key_file};
-use recipe_test_kit::{Process, chip, until};
+use recipe_test_kit::{Process, chip};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
 use crate::BINARY;
-use crate::board::{Board, LINE, Surroundings};
+use crate::board::{Board, Surroundings};
 use crate::ctl::{Ctl, Printed, TIMEOUT};
+use crate::nucleo::{control, emulate};
 use crate::target::Target;
 
 /// The private key of RFC 8032's third test. The loader of the tests is built for its public key.
@@ -46,18 +45,11 @@ impl Board for Slotted {
     }
 
     fn start(&mut self, file: &Path) {
-        let emulator = Path::new(env!("CARGO_BIN_EXE_host-sim")).with_file_name("chip");
-        let mut command = Command::new(emulator);
-        command.arg(Surroundings::named("CHIP_LOADER")).arg(self.around.image(file)).arg("--realtime");
-        command.arg("--load").arg(format!("0x08020000={}", self.slot_a.display()));
+        let mut more = vec!["--load".into(), format!("0x08020000={}", self.slot_a.display()).into()];
         for slot in ["CHIP_SLOT_A", "CHIP_SLOT_B"] {
-            command.arg("--knows").arg(Surroundings::named(slot));
+            more.extend(["--knows".into(), Surroundings::named(slot).into()]);
         }
-        command.arg("--rs485").arg(self.around.path(LINE));
-        command.arg("--control").arg(self.control());
-        command.arg("--network").arg(self.around.forward());
-        self.chip = Some(Process::start(command.stdout(Stdio::piped()).stderr(Stdio::piped())));
-        until("the emulator's sockets", || UnixStream::connect(self.control()).ok());
+        self.chip = Some(emulate(&self.around, &Surroundings::named("CHIP_LOADER"), file, &more));
     }
 
     fn press(&self) {
@@ -95,7 +87,7 @@ impl Slotted {
     }
 
     fn control(&self) -> PathBuf {
-        self.around.path("control").into()
+        control(&self.around)
     }
 
     fn key(&self) -> PathBuf {

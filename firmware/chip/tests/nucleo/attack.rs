@@ -4,17 +4,13 @@
 //! Everything is in virtual time, so the same happens in every run. `CHIP_ATTACK` is the number of hostile connections
 //! (default 150).
 
-use chip::device::{MICRO, MILLI, Picos, SECOND};
-use chip::models::can_bus::Frame;
-use chip::models::line::Format;
-use serde_json::Value;
+use chip::device::{MILLI, Picos, SECOND};
 use smoltcp::iface::SocketHandle;
 
 use crate::Bench;
-use crate::cell::off_the_grid;
 use crate::client::{WIDE, ask, ask_signed, browser, claim, connection, open, read, signed};
+use crate::load::work;
 use crate::page::cyclic;
-use crate::serial::word;
 
 /// Between two hostile connections.
 const EVERY: Picos = 25 * MILLI;
@@ -22,52 +18,6 @@ const EVERY: Picos = 25 * MILLI;
 const HELD: [Picos; 2] = [60 * MILLI, 6 * SECOND];
 /// How much later a cycle may be for all of this: the longest that a connection keeps the others waiting.
 const LATER: Picos = MILLI;
-const FORMAT: Format = Format { baud: 115_200, odd_parity: None, stop_bits: 1 };
-
-/// What a cell did in the time.
-pub(crate) struct Did {
-    /// Of each bus: frames that left, and how much one was off its time at most.
-    pub(crate) out: [(&'static str, usize, Picos); 2],
-    /// The document `status` at the end.
-    pub(crate) status: Value,
-    pub(crate) instructions: u64,
-}
-
-/// Runs until frames that the test sends on the line from now on, every 8 ms, are in the middle between those of the board,
-/// which has the same line and begins one every 4 ms: they never meet, also if the board is a millisecond late.
-fn align(bench: &mut Bench) {
-    let sent = &bench.chip.devices().usart2.line.sent;
-    let last = sent.chunks_exact(7).next_back().expect("it sends every 4 ms")[0].start;
-    let phase = (bench.now() - last) % (4 * MILLI);
-    bench.run(6 * MILLI - phase);
-}
-
-/// Frames come on the line every 8 ms and on CAN every 2 ms; `others` do what they do in between.
-pub(crate) fn work(bench: &mut Bench, span: Picos, mut others: impl FnMut(&mut Bench)) -> Did {
-    align(bench);
-    let (begin, instructions) = (bench.now(), bench.chip.instructions());
-    let mut number = 0_u8;
-    for step in 0..span / (2 * MILLI) {
-        let now = begin + step * 2 * MILLI;
-        number = number.wrapping_add(1);
-        if step % 4 == 0 {
-            bench.chip.devices().usart2.line.send(now, &[255, 255, number, 0, 7, 238, 238], FORMAT);
-        }
-        bench.chip.devices().can.bus.send(now + 500 * MICRO, Frame::standard(1, &[number]));
-        others(bench);
-        bench.run(now + 2 * MILLI - bench.now());
-    }
-    let out = off_the_grid(bench, begin);
-    let instructions = bench.chip.instructions() - instructions;
-    // The newest ones are with the controller.
-    bench.run(20 * MILLI);
-    assert_eq!(word(bench, "WordInputReg[4]"), f64::from(number));
-    // Those who attack are gone, or given up.
-    bench.run(7 * SECOND);
-    let status = ask_signed(bench, "GET /api/v1/status").json();
-    Did { out, status, instructions }
-}
-
 /// A connection of somebody who means no good.
 struct Hostile {
     handle: SocketHandle,
@@ -217,28 +167,7 @@ fn who_watches_or_attacks_the_console_costs_the_cell_no_frame_and_no_cycle() {
         "{seconds} s, {count} hostile connections, {} pages, {:?} events; {console}",
         watchers.pages, watchers.events
     );
-    for (what, did) in [("alone", &alone), ("attacked", &attacked)] {
-        println!("{what}: {:.1} million instructions a second", did.instructions as f64 / seconds / 1e6);
-        for (bus, frames, off) in did.out {
-            println!("  {bus}: {frames} frames out, off by {} us at most", off / MICRO);
-        }
-        for (name, histogram) in did.status["latency"].as_object().expect("an object") {
-            let [count, median, most] = ["count", "p50_us", "max_us"].map(|key| &histogram[key]);
-            println!("  {name}: {count}, median {median} us, at most {most} us");
-        }
-    }
-    for ((bus, alone, usual), (_, attacked, off)) in alone.out.into_iter().zip(attacked.out) {
-        assert!(alone.abs_diff(attacked) <= 1, "{bus}: {attacked} cycles of {alone}");
-        assert!(off < usual + LATER, "{bus}: off by {} us instead of {}", off / MICRO, usual / MICRO);
-    }
-    for port in ["rs485-1", "can-1"] {
-        let [alone, attacked] = [&alone, &attacked].map(|did| did.status["ports"][port]["counters"].clone());
-        for counter in ["skipped_cycles", "skipped_bytes"] {
-            assert_eq!(alone[counter], attacked[counter], "{port}.{counter}\n{alone}\n{attacked}");
-        }
-        assert_eq!(alone["frames_in"], attacked["frames_in"], "{port}\n{alone}\n{attacked}");
-    }
-    assert_eq!(attacked.status["sleeps"], 0);
+    attacked.is_like(&alone, "attacked", LATER);
     assert!(bench.chip.resets.is_empty() && bench.chip.faults.is_empty());
     // They were served, not only turned away by the network.
     for counter in [&console["requests"]["without_key"], &console["counters"]["incomplete"]] {

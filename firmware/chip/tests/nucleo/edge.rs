@@ -13,13 +13,15 @@ use recipe_test_kit::http::Response;
 use serde_json::Value;
 
 use crate::Bench;
-use crate::attack::work;
 use crate::broker::{Broker, Mood, Told};
 use crate::client::{ask_signed, claim, exchange, signed_with};
+use crate::load::work;
 use crate::page::cyclic;
 
 /// How much later a cycle may be for an edge node: a part of a sample, or a piece of a birth.
 const LATER: Picos = 500 * MICRO;
+/// `Node Control/Rebirth` = true, as a host sends it.
+const REBIRTH: &[u8] = b"\x12\x1a\x0a\x14Node Control/Rebirth\x20\x0b\x70\x01";
 
 fn settings() -> Vec<u8> {
     let id = |name| Id::new(name).expect("a name");
@@ -72,6 +74,14 @@ fn restarted(mut bench: Bench, settings: &[u8]) -> (Bench, Broker) {
     (bench, broker)
 }
 
+fn run(bench: &mut Bench, broker: &mut Broker, span: Picos) {
+    let end = bench.now() + span;
+    while bench.now() < end {
+        broker.go_on(bench);
+        bench.run(MILLI);
+    }
+}
+
 /// Runs until the broker has such a message behind `from`; returns its place.
 #[track_caller]
 fn until_told(
@@ -100,11 +110,7 @@ fn until_verb(bench: &mut Bench, broker: &mut Broker, from: usize, verb: &str) -
 #[track_caller]
 fn until_state(bench: &mut Bench, broker: &mut Broker, what: &str, is_it: impl Fn(&Value) -> bool) -> Value {
     for _ in 0..100 {
-        let end = bench.now() + SECOND;
-        while bench.now() < end {
-            broker.go_on(bench);
-            bench.run(MILLI);
-        }
+        run(bench, broker, SECOND);
         let document = state(bench);
         if is_it(&document) {
             return document;
@@ -159,9 +165,8 @@ fn a_plant_reads_the_board_from_birth_to_the_next_session() {
 
     // A command is no way in, but for the request for births.
     let from = broker.told.len();
-    let rebirth = b"\x12\x1a\x0a\x14Node Control/Rebirth\x20\x0b\x70\x01";
     broker.publish(&mut bench, "spBv1.0/hall/NCMD/press", b"\x12\x13\x0a\x0dcontroller/x1\x20\x0b\x70\x01");
-    broker.publish(&mut bench, "spBv1.0/hall/NCMD/press", rebirth);
+    broker.publish(&mut bench, "spBv1.0/hall/NCMD/press", REBIRTH);
     until_verb(&mut bench, &mut broker, from, "NBIRTH");
     let document = until_state(&mut bench, &mut broker, "online", |document| document["state"] == "online");
     assert_eq!((&document["counters"]["refused"], &document["utc"]), (&1.into(), &true.into()), "{document}");
@@ -182,11 +187,7 @@ fn a_plant_reads_the_board_from_birth_to_the_next_session() {
     let connects = broker.connects.len();
     restart(&mut bench, &OFF);
     assert_eq!(state(&mut bench), serde_json::json!({ "state": "off" }));
-    let end = bench.now() + 5 * SECOND;
-    while bench.now() < end {
-        broker.go_on(&mut bench);
-        bench.run(MILLI);
-    }
+    run(&mut bench, &mut broker, 5 * SECOND);
     assert_eq!(broker.connects.len(), connects);
 }
 
@@ -209,11 +210,7 @@ fn why_nothing_is_told_is_said_and_the_node_comes_back() {
     }
     // What changed meanwhile is told behind the births, with its own time.
     broker.device = Some(77);
-    let end = bench.now() + SECOND;
-    while bench.now() < end {
-        broker.go_on(&mut bench);
-        bench.run(MILLI);
-    }
+    run(&mut bench, &mut broker, SECOND);
     let from = broker.told.len();
     broker.mood = Mood::Well;
     broker.kill(&mut bench);
@@ -255,34 +252,12 @@ fn a_broker_that_dies_and_comes_back_costs_the_cell_no_frame_and_no_cycle() {
         // Births again and again.
         if mood == Mood::Well && broker.is_connected(bench) && ms / 300 != asked {
             asked = ms / 300;
-            let rebirth = b"\x12\x1a\x0a\x14Node Control/Rebirth\x20\x0b\x70\x01";
-            broker.publish(bench, "spBv1.0/hall/NCMD/press", rebirth);
+            broker.publish(bench, "spBv1.0/hall/NCMD/press", REBIRTH);
         }
     });
     let births = (0..broker.told.len()).filter(|at| broker.told[*at].topic.contains("/NBIRTH/")).count();
     println!("{} messages, {births} births, {} connections", broker.told.len(), broker.connects.len());
-    let seconds = span as f64 / SECOND as f64;
-    for (what, did) in [("alone", &alone), ("with an edge node", &edge)] {
-        println!("{what}: {:.1} million instructions a second", did.instructions as f64 / seconds / 1e6);
-        for (bus, frames, off) in did.out {
-            println!("  {bus}: {frames} frames out, off by {} us at most", off / MICRO);
-        }
-        for (name, histogram) in did.status["latency"].as_object().expect("an object") {
-            let [count, median, most] = ["count", "p50_us", "max_us"].map(|key| &histogram[key]);
-            println!("  {name}: {count}, median {median} us, at most {most} us");
-        }
-    }
-    for ((bus, alone, usual), (_, edge, off)) in alone.out.into_iter().zip(edge.out) {
-        assert!(alone.abs_diff(edge) <= 1, "{bus}: {edge} cycles of {alone}");
-        assert!(off < usual + LATER, "{bus}: off by {} us instead of {}", off / MICRO, usual / MICRO);
-    }
-    for port in ["rs485-1", "can-1"] {
-        let [alone, edge] = [&alone, &edge].map(|did| did.status["ports"][port]["counters"].clone());
-        for counter in ["frames_in", "skipped_cycles", "skipped_bytes", "timeouts"] {
-            assert_eq!(alone[counter], edge[counter], "{port}.{counter}\n{alone}\n{edge}");
-        }
-    }
-    assert_eq!(edge.status["sleeps"], 0);
+    edge.is_like(&alone, "with an edge node", LATER);
     assert!(births >= 3 && broker.connects.len() >= 2, "{births} births, {:?}", broker.connects);
     assert!(bench.chip.faults.is_empty());
 }

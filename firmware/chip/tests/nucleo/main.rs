@@ -12,6 +12,7 @@ mod cuts;
 mod edge;
 mod faults;
 mod flash;
+mod load;
 mod page;
 mod realtime;
 mod robot;
