@@ -2,6 +2,8 @@
 //!
 //! Each `#[task]` here wraps a generic function of the library, because a task cannot be generic.
 
+mod configuration;
+
 use core::pin::pin;
 
 use embassy_executor::{SpawnError, SpawnToken, Spawner};
@@ -10,7 +12,7 @@ use embassy_net_driver::{Driver as _, HardwareAddress};
 use embassy_time::{Duration, Timer};
 use firmware::fmt::Text;
 use firmware::identity;
-use firmware::kept::{self, EndedName, Kept, RoleName};
+use firmware::kept::Kept;
 use firmware::platform::{self, FeedWatchdog as _, NoDevice, Ports, StatusLed as _};
 use firmware::tasks::console::{self, CONNECTIONS, Console, NodeView};
 use firmware::tasks::edge::{self, Cannot, Edge};
@@ -24,12 +26,13 @@ use firmware::tasks::watchdog::{Pulse, TaskName};
 use firmware::tasks::{can, led, link, serial, watchdog};
 use firmware::update::{Site, Updates};
 use firmware::{error, info, warn};
-use proto_core::config::{Bus, GatewayConfig, Network, image};
+use proto_core::config::image::MAX_IMAGE;
+use proto_core::config::{Bus, GatewayConfig, Network};
 use proto_core::engine::{LinkId, LinkKind, PortId};
-use recipe_store::Role;
 use static_cell::{ConstStaticCell, StaticCell};
 
 use crate::board::Board;
+use configuration::{Refused, load};
 use firmware::platform::Board as _;
 
 // The devices of the chosen board.
@@ -159,7 +162,7 @@ fn open_desk(
 ) -> Option<&'static Desk> {
     static UPDATES: StaticCell<Updates<BoardSlot>> = StaticCell::new();
     let updates = UPDATES.init(Updates::new(slots)?);
-    static IMAGE: ConstStaticCell<[u8; image::MAX_IMAGE]> = ConstStaticCell::new([0; image::MAX_IMAGE]);
+    static IMAGE: ConstStaticCell<[u8; MAX_IMAGE]> = ConstStaticCell::new([0; MAX_IMAGE]);
     static DESK: StaticCell<Desk> = StaticCell::new();
     let desk: &'static Desk = DESK.init_with(|| Desk::new(IMAGE.take()));
     if let Some(failure) = failure {
@@ -187,31 +190,6 @@ impl Tasks {
     ) {
         let pulse = self.watch.register(name).expect("MAX_TASKS is large enough");
         self.spawner.spawn(task(pulse).expect("its pool is large enough"));
-    }
-}
-
-/// Why nothing runs.
-#[derive(Debug, Clone, Copy)]
-enum Refused {
-    Storage(<Board as platform::Board>::StorageError),
-    Image(image::ImageError),
-    Build(proto_core::engine::BuildError),
-    NoDevice(NoDevice),
-    /// The store has no configuration, and the image on the board was taken over and is gone.
-    Empty,
-    Ethernet(<Board as platform::Board>::EthernetError),
-}
-
-impl core::fmt::Display for Refused {
-    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
-        match self {
-            Self::Storage(error) => error.fmt(f),
-            Self::Image(error) => error.fmt(f),
-            Self::Build(error) => error.fmt(f),
-            Self::NoDevice(missing) => missing.fmt(f),
-            Self::Empty => f.write_str("the store holds no configuration"),
-            Self::Ethernet(error) => error.fmt(f),
-        }
     }
 }
 
@@ -248,100 +226,6 @@ impl Overlay {
         let _ = buffers.resize_default(buffers.capacity());
         buffers
     }
-}
-
-/// Runs the first configuration that can run: the image that was put on the board since the last start; of the store
-/// the one on trial, the live one, the one before; or else the image on the board, which was run before. Returns the
-/// length of its image, or why none runs; leaves to the keeper what is to be done with the store, and in `failure` why
-/// the first one that was tried does not run.
-///
-/// Nothing is written but the start of a trial, so that the start takes no longer than without a store.
-///
-/// Not inlined, so that its stack frame is free when the tasks run.
-#[inline(never)]
-fn load(
-    board: &mut Board,
-    kept: Option<&mut Kept<Flash>>,
-    gateway: &mut Gateway,
-    config: &mut GatewayConfig,
-    work: &mut keeper::Work<'static>,
-    failure: &mut Option<Refused>,
-) -> Result<usize, Refused> {
-    let own = board.configuration().map_err(Refused::Storage).map(whole);
-    let Some(kept) = kept else {
-        let (image, _) = own?;
-        return configure(image, gateway, config);
-    };
-    // An empty place is no failure where the store has something.
-    let mut why = own.err();
-    if let Ok((image, digest)) = own
-        && !kept.store().is_adopted(digest, image.len())
-    {
-        match configure(image, gateway, config) {
-            Ok(len) => {
-                work.adopt = Some((digest, image));
-                return Ok(len);
-            }
-            Err(error) => (why, *failure) = (Some(error), Some(error)),
-        }
-    }
-    let mut candidates = heapless::Vec::new();
-    if let Err(error) = board.block_on(kept.candidates(&mut candidates)) {
-        error!("the store: {}", Text(&error));
-    }
-    // A trial ends by a restart, whose log is the only one that somebody may look at.
-    if let Some((number, ended)) = kept.store().marks().last {
-        info!("the last trial was of configuration {}: {}", number, Text(&EndedName(ended)));
-    }
-    let mut is_first = true;
-    for (revision, role) in candidates {
-        let Some(image) = kept.image(revision) else { continue };
-        match configure(image, gateway, config) {
-            Ok(len) => {
-                info!("configuration {} of the store, {}", revision.number, Text(&RoleName(role)));
-                work.trial = kept::trial_time(role);
-                work.running = Some(revision.number);
-                return Ok(len);
-            }
-            Err(error) => {
-                error!("configuration {} of the store cannot run: {}", revision.number, Text(&error));
-                work.trial_failed |= matches!(role, Role::Trial { .. });
-                // It says more than an empty place.
-                if core::mem::take(&mut is_first) {
-                    (why, *failure) = (Some(error), Some(error));
-                }
-            }
-        }
-    }
-    // Nothing of the store: the image on the board, although it was taken over.
-    if let Ok((image, _)) = own
-        && let Ok(len) = configure(image, gateway, config)
-    {
-        return Ok(len);
-    }
-    Err(why.unwrap_or(Refused::Empty))
-}
-
-/// The image without what follows it, and its CRC.
-fn whole(bytes: &'static [u8]) -> (&'static [u8], u32) {
-    let image = image::image_len(bytes).ok().and_then(|len| bytes.get(..len)).unwrap_or(bytes);
-    let crc = image.get(image::HEADER - 4..).and_then(|rest| rest.first_chunk());
-    (image, crc.map_or(0, |crc| u32::from_le_bytes(*crc)))
-}
-
-/// Runs the configuration of an image; returns the image's length. Not inlined: it is called in several places.
-#[inline(never)]
-fn configure(bytes: &[u8], gateway: &mut Gateway, config: &mut GatewayConfig) -> Result<usize, Refused> {
-    decode(bytes, config)?;
-    gateway.configure(config).map_err(Refused::Build)?;
-    Ok(bytes.len())
-}
-
-/// Reads an image whose ports this board has. Not inlined, so that its stack frame is free when the engine is built.
-#[inline(never)]
-fn decode(bytes: &[u8], config: &mut GatewayConfig) -> Result<(), Refused> {
-    image::decode_into(bytes, config).map_err(Refused::Image)?;
-    PORTS.have(config.ports.iter().map(|port| &port.bus)).map_err(Refused::NoDevice)
 }
 
 #[inline(never)]
