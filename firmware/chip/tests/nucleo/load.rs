@@ -10,6 +10,8 @@ use crate::cell::off_the_grid;
 use crate::client::ask_signed;
 use crate::serial::word;
 
+/// Of each port: what is the same in both.
+const COUNTERS: [&str; 5] = ["frames_in", "skipped_cycles", "resync_bytes", "discarded_bytes", "timeouts"];
 const FORMAT: Format = Format { baud: 115_200, odd_parity: None, stop_bits: 1 };
 
 /// What a cell did in the time.
@@ -85,9 +87,12 @@ impl Did {
             );
         }
         for port in ["rs485-1", "can-1"] {
-            let [usual, counters] = [alone, self].map(|did| &did.status["ports"][port]["counters"]);
-            for counter in ["frames_in", "skipped_cycles", "skipped_bytes", "timeouts"] {
-                assert_eq!(usual[counter], counters[counter], "{port}.{counter}\n{usual}\n{counters}");
+            for counter in COUNTERS {
+                let [usual, counted] = [alone, self].map(|did| {
+                    let counters = &did.status["ports"][port]["counters"];
+                    counters[counter].as_u64().unwrap_or_else(|| panic!("no {port}.{counter}: {counters}"))
+                });
+                assert_eq!(usual, counted, "{port}.{counter} of {}", self.status);
             }
         }
         assert_eq!(self.status["sleeps"], 0);
