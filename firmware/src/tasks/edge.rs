@@ -335,6 +335,8 @@ impl Driver<'_> {
     async fn open(&mut self, stack: Stack<'_>, document: &Document, socket: &mut TcpSocket<'_>) {
         let connected = {
             let connecting = async {
+                // Before it has an address every attempt fails at once.
+                stack.wait_config_up().await;
                 let address = resolve(stack, &document.host).await?;
                 socket.connect(IpEndpoint::new(address, document.port)).await.ok()
             };
@@ -412,7 +414,7 @@ const RX: usize = 512;
 const TX: usize = 2_048;
 /// Bytes that are read at once.
 const READ: usize = 256;
-/// How long a connection may take, with the look-up of its name.
+/// How long a connection may take, with the board's address and the look-up of a name.
 const OPEN_TIME: Duration = Duration::from_secs(20);
 /// How long the broker may take nothing.
 const WRITE_TIME: Duration = Duration::from_secs(10);

@@ -134,6 +134,7 @@ fn a_plant_reads_the_board_from_birth_to_the_next_session() {
 
     let birth = until_verb(&mut bench, &mut broker, 0, "NBIRTH");
     assert_eq!(birth, 0, "it is the first message");
+    assert!(!bench.history().contains("no connection"), "{}", bench.history());
     assert_eq!(broker.connects, [("press".into(), "cold steel".into(), 0)]);
     let told = broker.told[birth].clone();
     assert_eq!((told.topic.as_str(), told.seq), ("spBv1.0/hall/NBIRTH/press", Some(0)));
