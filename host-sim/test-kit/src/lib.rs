@@ -7,6 +7,7 @@ pub mod can;
 pub mod chip;
 mod host_sim;
 pub mod http;
+pub mod latency;
 mod process;
 pub mod toml;
 

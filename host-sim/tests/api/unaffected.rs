@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use recipe_test_kit::{HostSim, example, until};
+use recipe_test_kit::{HostSim, example, latency, until};
 use serde_json::Value;
 
 use crate::kit::*;
@@ -93,22 +93,8 @@ fn measure(gateway: &HostSim, panel: &Panel) -> Measure {
     let sent = panel.sent.load(Relaxed);
     gateway.stats("all frames", |stats| number(stats, "/ports/rs485-1/frames_in") >= sent);
     let latency = ["handed_over", "arrived", "lateness", "modbus"].map(|name| {
-        let buckets = |stats: &Value| -> Vec<u64> {
-            let buckets = stats["latency"][name]["buckets"].as_array().unwrap();
-            buckets.iter().map(|count| count.as_u64().unwrap()).collect()
-        };
-        let grown: Vec<u64> =
-            buckets(&after).iter().zip(buckets(&before)).map(|(after, before)| after - before).collect();
-        let count: u64 = grown.iter().sum();
-        let place = |share: u64| {
-            let mut seen = 0;
-            let reached = |samples: &u64| {
-                seen += samples;
-                seen * 100 >= count * share
-            };
-            grown.iter().position(reached).unwrap_or(0)
-        };
-        (name.to_owned(), count, [50, 99, 100].map(place))
+        let (count, places) = latency::grown(&before, &after, name);
+        (name.to_owned(), count, places)
     });
     Measure { losses: losses.to_vec(), cycles, expired, latency: latency.to_vec() }
 }

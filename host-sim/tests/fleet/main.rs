@@ -3,10 +3,12 @@
 //! `apt-get install mosquitto mosquitto-clients openssl`, then
 //! `HOST_SIM_FIRMWARE=ELF cargo test -p host-sim --test fleet -- --include-ignored`
 //!
-//! The ELF is the firmware for QEMU (firmware/README.md), which needs Debian's qemu-system-arm.
+//! The ELF is the firmware for QEMU (firmware/README.md), which needs Debian's qemu-system-arm. `HOST_SIM_LOAD_SECONDS` is
+//! the length of each run under full load (default 3).
 
 mod broker;
 mod cell;
+mod load;
 mod many;
 mod on_board;
 mod reader;
@@ -28,5 +30,12 @@ mod robot;
 #[allow(dead_code, reason = "the session needs more of it")]
 #[path = "../session/target.rs"]
 mod target;
+
+// The load of the scenarios.
+#[allow(dead_code, reason = "the scenarios need more of it")]
+#[path = "../scenarios/field.rs"]
+mod field;
+#[path = "../scenarios/traffic.rs"]
+mod traffic;
 
 pub(crate) use cell::BINARY;

@@ -59,7 +59,7 @@ fn board() -> (Qemu, Ctl) {
 }
 
 /// The Sparkplug file for the board, which reaches this machine by another address.
-fn settings(plant: &Plant, rest: &str) -> PathBuf {
+pub(crate) fn settings(plant: &Plant, rest: &str) -> PathBuf {
     let file = plant.sparkplug("plain = true\nlogin = \"press.login\"", "", rest);
     let text = std::fs::read_to_string(&file).unwrap().replace("localhost", "10.0.2.2");
     plant.write("board.toml", &text)

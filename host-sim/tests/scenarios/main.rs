@@ -37,6 +37,7 @@ mod refusal;
 mod robot;
 mod rtu;
 mod safe;
+mod traffic;
 mod unreadable;
 
 use std::path::{Path, PathBuf};

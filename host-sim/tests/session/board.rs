@@ -17,7 +17,7 @@ use crate::target::Target;
 
 /// The address that QEMU's user network gives a board, and that of this host in it.
 const BOARD: &str = "10.0.2.15";
-const HERE: &str = "10.0.2.2";
+pub(crate) const HERE: &str = "10.0.2.2";
 
 /// A board, as far as it differs from others.
 pub(crate) trait Board {
@@ -104,7 +104,7 @@ pub(crate) const LINE: &str = "line";
 /// Around a board.
 pub(crate) struct Surroundings {
     folder: TempDir,
-    robot: Robot,
+    pub(crate) robot: Robot,
     panel: Option<Panel>,
     /// Where its port 80 is reached.
     to: SocketAddr,
@@ -114,6 +114,11 @@ impl Surroundings {
     pub(crate) fn new() -> Self {
         let folder = tempfile::tempdir().unwrap();
         let robot = Robot::new(folder.path());
+        Self::with(folder, robot)
+    }
+
+    /// With another controller.
+    pub(crate) fn with(folder: TempDir, robot: Robot) -> Self {
         // Free at the moment; nobody else asks for it by number.
         let to = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
         Self { folder, robot, panel: None, to }

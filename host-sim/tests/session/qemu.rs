@@ -6,6 +6,9 @@ use std::process::{Child, Command, Stdio};
 use crate::board::{Board, LINE, Surroundings};
 use crate::target::Target;
 
+/// The sockets of its UARTs: RS-485 twice, the panel on the first one, and CAN as slcan.
+pub(crate) const UARTS: [&str; 3] = [LINE, "line-b", "can"];
+
 /// The board, its panel on the first line.
 pub(crate) struct Qemu {
     elf: PathBuf,
@@ -16,8 +19,12 @@ pub(crate) struct Qemu {
 impl Qemu {
     /// A board with the firmware that `HOST_SIM_FIRMWARE` names.
     pub(crate) fn new() -> Self {
-        let elf = Surroundings::named("HOST_SIM_FIRMWARE");
-        Self { elf, around: Surroundings::new(), qemu: None }
+        Self::with(Surroundings::new())
+    }
+
+    /// The same around it.
+    pub(crate) fn with(around: Surroundings) -> Self {
+        Self { elf: Surroundings::named("HOST_SIM_FIRMWARE"), around, qemu: None }
     }
 
     fn path(&self, name: &str) -> String {
@@ -41,7 +48,9 @@ impl Board for Qemu {
     fn start(&mut self, file: &Path) {
         let image = self.around.image(file);
         let _ = std::fs::remove_file(self.path("log"));
-        let _ = std::fs::remove_file(self.path(LINE));
+        for uart in UARTS {
+            let _ = std::fs::remove_file(self.path(uart));
+        }
         // As in firmware/README.md: image, fault, store, button.
         let arguments = format!(
             "enable=on,target=native,arg=firmware,arg={image},arg=none,arg={},arg={}",
@@ -51,8 +60,10 @@ impl Board for Qemu {
         let qemu = Command::new("qemu-system-arm")
             .args("-M mps2-an500 -display none -monitor none".split(' '))
             .args(["-nic", &format!("user,{}", self.around.forward())])
-            .args(["-serial", &format!("unix:{},server=on,wait=off", self.path(LINE))])
-            .args(["-serial", "null", "-serial", "null", "-serial", &format!("file:{}", self.path("log"))])
+            .args(UARTS.iter().flat_map(|uart| {
+                ["-serial".to_owned(), format!("unix:{},server=on,wait=off", self.path(uart))]
+            }))
+            .args(["-serial", &format!("file:{}", self.path("log"))])
             .args(["-semihosting-config", &arguments, "-kernel"])
             .arg(&self.elf)
             .stdin(Stdio::null())

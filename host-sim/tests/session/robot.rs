@@ -7,14 +7,19 @@ use recipe_test_kit::{HostSim, toml};
 use crate::BINARY;
 
 /// `host-sim controller`.
-pub(crate) struct Robot(HostSim);
+pub(crate) struct Robot(pub(crate) HostSim);
 
 impl Robot {
     /// Starts it; its file is in this folder.
     pub(crate) fn new(folder: &Path) -> Self {
         let file = folder.join("robot.toml");
         std::fs::write(&file, "[listen]\naddress = \"127.0.0.1\"\n").unwrap();
-        Self(BINARY.controller(&file, &[]))
+        Self::of(&file)
+    }
+
+    /// With another file.
+    pub(crate) fn of(file: &Path) -> Self {
+        Self(BINARY.controller(file, &[]))
     }
 
     /// The text of a configuration of a gateway with a panel, which reaches this controller by its address on
