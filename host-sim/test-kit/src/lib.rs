@@ -36,6 +36,23 @@ pub fn until<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
     }
 }
 
+/// Calls `count` repeatedly until it returns `wanted` or more. It may take long, as something emulated does on a busy
+/// machine, as long as it grows.
+///
+/// # Panics
+/// If it has not grown for [`PATIENCE`].
+#[track_caller]
+pub fn until_grown(what: &str, wanted: u64, mut count: impl FnMut() -> u64) {
+    let mut reached = None;
+    while reached < Some(wanted) {
+        let more = until(&format!("{wanted} {what}; {}", reached.unwrap_or(0)), || {
+            let newest = Some(count());
+            (newest > reached).then_some(newest)
+        });
+        reached = more;
+    }
+}
+
 /// The root folder of the repository.
 pub fn repository() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../..")

@@ -7,7 +7,7 @@ use std::time::Duration;
 use proto_core::config::{Bus, GatewayConfig};
 use serde_json::Value;
 
-use recipe_test_kit::{SERVERS, until};
+use recipe_test_kit::{SERVERS, until, until_grown};
 
 use super::case::Case;
 use super::field::{CanClient, LineClient};
@@ -105,10 +105,10 @@ impl dyn Gateway + '_ {
     #[track_caller]
     pub(crate) fn until_bytes_in(&mut self, port: &str, bytes: u64) -> PortStatus {
         let mut newest = PortStatus::default();
-        until(&format!("{bytes} bytes from {port}"), || {
+        until_grown(&format!("bytes from {port}"), bytes, || {
             self.must_run();
             newest = self.port(port);
-            (newest.bytes_in >= bytes).then_some(())
+            newest.bytes_in
         });
         newest
     }
@@ -117,10 +117,10 @@ impl dyn Gateway + '_ {
     #[track_caller]
     pub(crate) fn until_frames_in(&mut self, port: &str, frames: u64) -> PortStatus {
         let mut newest = PortStatus::default();
-        until(&format!("{frames} frames from {port}"), || {
+        until_grown(&format!("frames from {port}"), frames, || {
             self.must_run();
             newest = self.port(port);
-            (newest.frames_in >= frames).then_some(())
+            newest.frames_in
         });
         newest
     }

@@ -65,6 +65,7 @@ fn full_load(case: &Case) {
 
     // In: all that was sent was accepted, and the newest value has reached the controller.
     let force_port = gateway.until_bytes_in("force", sensor.bytes);
+    gateway.until_frames_in("bus", can.frames.into());
     robot.until("WordInputReg[1]", f64::from((can.frames - 1) as u16));
     robot.until("WordInputReg[2]", f64::from(((can.frames - 1) >> 16) as u16));
     robot.until("ForceEnd[1]", f64::from((sensor.frames - 1) as f32));
