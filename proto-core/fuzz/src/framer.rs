@@ -3,7 +3,7 @@
 
 use proto_core::device::{
     Algorithm, Bits, ByteOrder, Carrier, Checksum, Crc, Digits, Element, Encoding, Found, FrameLayout,
-    Framer, Kind, Overflow, Width,
+    Framer, Kind, Overflow, Probe, Width,
 };
 use proto_core::sysvar::Direction;
 use proto_core::wire::scalar::ScalarType;
@@ -128,10 +128,12 @@ impl Test {
             self.received += chunk.len();
             let expected = self.reader.receive(&self.plain, chunk);
             let (mut rest, mut found) = (chunk, Vec::new());
-            // So little effort that no byte is dropped unseen.
-            while let Some(event) =
-                self.framer.next_frame(&mut rest, 1, |bytes| layout.probe(elements, bytes))
-            {
+            // So little effort that no byte is dropped unseen: a long frame without a head costs more than a byte pays for.
+            let probe = |bytes: &[u8]| match layout.probe(elements, bytes) {
+                Probe::No(_) => Probe::No(1),
+                probe => probe,
+            };
+            while let Some(event) = self.framer.next_frame(&mut rest, 1, probe) {
                 found.push(match event {
                     Found::Frame(bytes) => (Seen::Frame(bytes.len()), bytes.to_vec()),
                     Found::Other(bytes) => (Seen::Other(bytes.len()), bytes.to_vec()),
@@ -301,5 +303,9 @@ pub(crate) fn seeds() -> Vec<Vec<u8>> {
     let ascii = [0x10 | 1 | 2 << 2 | 1 << 5, b':', b'\r', b'\n', 0, 0x1B, 0, 0, 0x3B, 0, 0, 44, 1, 77];
     // Nothing but a constant.
     let bare = [1 << 5, 201, 3, 1, 0xEF, 0xBE, 0, 0, 0, 2, 0, 0];
-    [&checked[..], &gripper, &scale, &ascii, &bare].map(|start| [start, &life].concat()).to_vec()
+    let mut seeds =
+        [&checked[..], &gripper, &scale, &ascii, &bare].map(|start| [start, &life].concat()).to_vec();
+    // A long frame without a head, that begins with its own padding.
+    seeds.push([&[255; 5][..], b"1", &[255; 30], b"\tSg\x02\x05"].concat());
+    seeds
 }
