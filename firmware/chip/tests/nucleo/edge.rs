@@ -65,12 +65,13 @@ fn restart(bench: &mut Bench, settings: &[u8]) {
 
 /// The same, until its links are up.
 fn restarted(mut bench: Bench, settings: &[u8]) -> (Bench, Broker) {
-    let broker = Broker::new(&mut bench);
+    let mut broker = Broker::new(&mut bench);
     restart(&mut bench, settings);
     bench.until("a Modbus connection", 10 * SECOND, |bench| {
+        broker.go_on(bench);
         bench.robot.as_ref().is_some_and(|robot| robot.counters().modbus.open == 1)
     });
-    bench.run(SECOND);
+    run(&mut bench, &mut broker, SECOND);
     (bench, broker)
 }
 
@@ -239,8 +240,8 @@ fn a_broker_that_dies_and_comes_back_costs_the_cell_no_frame_and_no_cycle() {
         (1_500, Mood::Full),
         (2_500, Mood::Gone),
         (3_000, Mood::Garbage),
-        (5_500, Mood::Silent),
-        (6_500, Mood::Well),
+        (4_500, Mood::Silent),
+        (5_000, Mood::Well),
     ];
     let mut asked = 0;
     let edge = work(&mut bench, span, |bench| {
