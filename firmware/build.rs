@@ -46,8 +46,8 @@ const NUCLEO_H743ZI: Places = Places { slots: [0x0802_0000, 0x0810_0000], whole:
 const MPS2_AN500: Places = Places { slots: [0x0010_0000, 0x0020_0000], whole: (0, 4 << 20) };
 
 impl Places {
-    /// Writes program.x, which the board's script includes: for the slot of the environment, and into the folders slot-a
-    /// and slot-b for each, of which link-slots makes use.
+    /// Writes program.x, which the board's script includes: for the slot of the environment, and into the folders
+    /// slot-a and slot-b for each, of which link-slots makes use.
     fn place_program(&self, out: &Path) {
         println!("cargo::rerun-if-env-changed={SLOT}");
         let slot = env::var(SLOT).unwrap_or_default();

@@ -91,8 +91,8 @@ impl Machine for Board {
 /// Leaves the board to the firmware.
 fn run(vectors: u32) -> ! {
     board::leave();
-    // SAFETY: the image was checked, and nothing of the loader is used any more. It begins with a vector table, which is
-    // aligned for the most vectors of a chip.
+    // SAFETY: the image was checked, and nothing of the loader is used any more. The image begins with a vector table,
+    // which is aligned for the 166 vectors of the STM32H743, and for the fewer of QEMU's board.
     unsafe {
         (*cortex_m::peripheral::SCB::PTR).vtor.write(vectors);
         cortex_m::asm::dsb();

@@ -9,7 +9,8 @@
 //!
 //! And of boards that get another firmware ([`plant`]), in QEMU with what `.ci/run loader firmware-qemu` has made:
 //!
-//! `QEMU_LOADER=ELF QEMU_SLOT_A=ELF QEMU_SLOT_B=ELF cargo test -p host-sim --test session -- --include-ignored plant::qemu`
+//! `QEMU_LOADER=ELF QEMU_SLOT_A=ELF QEMU_SLOT_B=ELF \
+//!     cargo test -p host-sim --test session -- --include-ignored plant::qemu`
 
 mod board;
 mod commands;

@@ -34,7 +34,7 @@ pub(super) fn slots() -> Site<HostFlash> {
 
 fn opened() -> Result<Slots<HostFlash>, &'static str> {
     let running = running().ok_or("QEMU runs the program that it is given: there are no slots")?;
-    let key = key().ok_or("there is no loader with a key at the beginning of the memory")?;
+    let key = key().ok_or("there is no loader with a key at the beginning of the flash")?;
     let name = Name::argument(SLOTS).ok_or("no file of the slots was named")?;
     let open = |slot: Slot| {
         HostFlash::open(&name, BOARD.slot_offset(slot), BOARD.slot_sectors)

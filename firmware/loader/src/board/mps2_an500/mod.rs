@@ -73,8 +73,8 @@ pub(crate) fn load(chosen: &Chosen, slots: &[Area; 2]) -> Option<u32> {
         let place = Place { sector, word: u16::try_from(word.checked_rem(words)?).ok()? };
         let bytes = slot.whole(place)?;
         let address = start.checked_add(nth.checked_mul(WORD as u32)?)?;
-        // SAFETY: RAM for programs, within the slot, because the header was checked to be for it: the loader is in front
-        // of the slots, and nothing else is in them.
+        // SAFETY: RAM for programs, within the slot, because the header was checked to be for it: the loader is in
+        // front of the slots, and nothing else is in them.
         unsafe { core::ptr::with_exposed_provenance_mut::<[u8; WORD]>(address as usize).write(bytes) }
     }
     let trial = if chosen.is_trial { " on trial" } else { "" };

@@ -5,7 +5,7 @@ mod lamp;
 #[path = "../../../../src/board/nucleo_h743zi/readable.rs"]
 mod readable;
 mod register;
-pub(crate) mod watchdog;
+mod watchdog;
 
 use core::fmt;
 
