@@ -9,20 +9,18 @@ fn main() {
         return;
     }
     // The sources refuse two boards or none, with a better message.
-    let (file, script) = if env::var_os("CARGO_FEATURE_BOARD_MPS2_AN500").is_some() {
-        ("boards/mps2-an500/mps2-an500.x", "mps2-an500.x")
+    let (file, script, places) = if env::var_os("CARGO_FEATURE_BOARD_MPS2_AN500").is_some() {
+        ("boards/mps2-an500/mps2-an500.x", "mps2-an500.x", &MPS2_AN500)
     } else {
-        // cortex-m-rt's script, which includes memory.x, which includes program.x.
-        ("../memory.x", "link.x")
+        // cortex-m-rt's script, which includes memory.x.
+        ("../memory.x", "link.x", &NUCLEO_H743ZI)
     };
     let out = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets OUT_DIR"));
     let file = Path::new(file);
     println!("cargo::rerun-if-changed={}", file.display());
     let copy = out.join(file.file_name().expect("a file"));
     fs::copy(file, copy).unwrap_or_else(|error| panic!("{}: {error}", file.display()));
-    if script == "link.x" {
-        place_program(&out);
-    }
+    places.place_program(&out);
     println!("cargo::rustc-link-search={}", out.display());
     println!("cargo::rustc-link-arg=-T{script}");
     if env::var_os("CARGO_FEATURE_DEFMT").is_some() {
@@ -32,37 +30,46 @@ fn main() {
 
 /// The slot to link for, a or b (docs/update.md section 2).
 const SLOT: &str = "FIRMWARE_SLOT";
-/// Name, number and address of the slots of the NUCLEO. `host-sim ctl sign` compares with its own table of them.
-const SLOTS: [(&str, u32, u32); 2] = [("a", 1, 0x0802_0000), ("b", 2, 0x0810_0000)];
 /// Size of a slot, and of what is before the image.
 const SIZE: u32 = 640 << 10;
 const HEADER: u32 = 1 << 10;
-/// Of a program without a slot: the beginning of the flash, up to the store.
-const WHOLE: (u32, u32) = (0x0800_0000, 768 << 10);
 
-/// Writes program.x: for the slot of the environment, and into the folders slot-a and slot-b for each, of which
-/// link-slots makes use.
-fn place_program(out: &Path) {
-    println!("cargo::rerun-if-env-changed={SLOT}");
-    let slot = env::var(SLOT).unwrap_or_default();
-    let mut program = program(0, WHOLE.0, WHOLE.1);
-    let mut is_known = slot.is_empty();
-    for (letter, number, start) in SLOTS {
-        let in_slot = self::program(number, start + HEADER, SIZE - HEADER);
-        let folder = out.join(format!("slot-{letter}"));
-        fs::create_dir_all(&folder).expect("OUT_DIR can be written");
-        fs::write(folder.join("program.x"), &in_slot).expect("OUT_DIR can be written");
-        if slot == letter {
-            program = in_slot;
-            is_known = true;
+/// Where a board has its programs.
+struct Places {
+    /// Addresses of the slots A and B. `host-sim ctl sign` compares with its own table of them.
+    slots: [u32; 2],
+    /// Of a program without a slot: address, and the room up to what is something else.
+    whole: (u32, u32),
+}
+
+const NUCLEO_H743ZI: Places = Places { slots: [0x0802_0000, 0x0810_0000], whole: (0x0800_0000, 768 << 10) };
+const MPS2_AN500: Places = Places { slots: [0x0010_0000, 0x0020_0000], whole: (0, 4 << 20) };
+
+impl Places {
+    /// Writes program.x, which the board's script includes: for the slot of the environment, and into the folders
+    /// slot-a and slot-b for each, of which link-slots makes use.
+    fn place_program(&self, out: &Path) {
+        println!("cargo::rerun-if-env-changed={SLOT}");
+        let slot = env::var(SLOT).unwrap_or_default();
+        let mut program = program(0, self.whole.0, self.whole.1);
+        let mut is_known = slot.is_empty();
+        for (number, (letter, start)) in (1..).zip(["a", "b"].into_iter().zip(self.slots)) {
+            let in_slot = self::program(number, start + HEADER, SIZE - HEADER);
+            let folder = out.join(format!("slot-{letter}"));
+            fs::create_dir_all(&folder).expect("OUT_DIR can be written");
+            fs::write(folder.join("program.x"), &in_slot).expect("OUT_DIR can be written");
+            if slot == letter {
+                program = in_slot;
+                is_known = true;
+            }
         }
+        if !is_known {
+            println!(
+                "cargo::error={SLOT}={slot}: a and b are slots; without it the beginning of the flash is meant"
+            );
+        }
+        fs::write(out.join("program.x"), program).expect("OUT_DIR can be written");
     }
-    if !is_known {
-        println!(
-            "cargo::error={SLOT}={slot}: a and b are slots; without it the beginning of the flash is meant"
-        );
-    }
-    fs::write(out.join("program.x"), program).expect("OUT_DIR can be written");
 }
 
 /// Where the program is. `_slot` is 1 for slot A, 2 for slot B, 0 without one.

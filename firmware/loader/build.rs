@@ -1,4 +1,4 @@
-//! Provides the linker script, and the public key of `RECIPE_UPDATE_KEY`.
+//! Provides the linker script, the memory of the board, and the public key of `RECIPE_UPDATE_KEY`.
 
 use std::path::{Path, PathBuf};
 use std::{env, fs};
@@ -12,6 +12,13 @@ fn main() {
     let out = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets OUT_DIR"));
     println!("cargo::rerun-if-changed=loader.x");
     fs::copy("loader.x", out.join("loader.x")).expect("the linker script is there");
+    // The sources refuse two boards or none, with a better message.
+    let board = match env::var_os("CARGO_FEATURE_BOARD_MPS2_AN500") {
+        Some(_) => "boards/mps2-an500.x",
+        None => "boards/nucleo-h743zi.x",
+    };
+    println!("cargo::rerun-if-changed={board}");
+    fs::copy(board, out.join("board.x")).expect("the memory of the board is there");
     println!("cargo::rustc-link-search={}", out.display());
     println!("cargo::rustc-link-arg-bins=-Tloader.x");
     match key() {

@@ -4,11 +4,10 @@ use core::fmt;
 use core::panic::PanicInfo;
 
 use embassy_futures::block_on;
-use recipe_store::{Newest, Side, SlotMarks, newest};
-use recipe_update::{BoardName, IMAGE_OFFSET, Machine, NUCLEO_H743ZI as BOARD, PublicKey, Slot, choose};
+use recipe_store::{Newest, Side, SlotMarks, Store, newest};
+use recipe_update::{BoardName, Machine, PublicKey, Slot, choose};
 
-use crate::flash::Area;
-use crate::{lamp, watchdog};
+use crate::board::{self, Area, BOARD};
 
 /// The public key that firmware is signed for, behind a mark: at a fixed place (loader.x), where the firmware reads it.
 #[unsafe(link_section = ".update_key")]
@@ -23,40 +22,48 @@ struct MarkedKey {
 
 #[cortex_m_rt::entry]
 fn main() -> ! {
-    watchdog::start();
-    if let Some(mut core) = cortex_m::Peripherals::take() {
-        // Reading flash takes seven wait states after a reset.
-        core.SCB.enable_icache();
-    }
+    board::start();
     match chosen() {
-        Some(slot) => run(slot),
-        None => lamp::blink(),
+        Some(vectors) => run(vectors),
+        None => board::nothing_runs(),
     }
 }
 
-/// The slot to be run. Not inlined, so that the stack of the signature is free again.
+/// The vector table of the firmware to be run. Not inlined, so that the stack of the signature is free again.
 #[inline(never)]
-fn chosen() -> Option<Slot> {
-    // SAFETY: each area is made once, and they do not overlap (a test of the layout).
-    let mut board = unsafe {
-        Board {
-            slots: Slot::ALL.map(|slot| Area::slot(slot)),
-            stores: [Side::First, Side::Second].map(|side| Area::store(side)),
-            newest: None,
-        }
-    };
-    let [first, second] = &board.stores;
-    board.newest = newest(first, second).ok();
-    let marks = board.newest.as_ref().map(|newest| newest.store.slots());
+fn chosen() -> Option<u32> {
+    // SAFETY: called once.
+    let (slots, stores) = unsafe { (board::slots()?, board::stores()) };
+    let mut board = Board { slots, store: stores.and_then(mounted) };
+    let marks = board.store.as_ref().map(|kept| kept.store.slots());
     let name = BoardName::parse(BOARD.board)?;
     let key = PublicKey::parse(&KEY.key)?;
-    choose(&mut board, marks, &name, &key).map(|chosen| chosen.slot)
+    let chosen = choose(&mut board, marks, &name, &key)?;
+    board::load(&chosen, &board.slots)
+}
+
+/// The store that counts, and where it is.
+struct Kept {
+    store: Store,
+    flash: Area,
+}
+
+/// A board with one bank has one place.
+fn mounted((first, second): (Area, Option<Area>)) -> Option<Kept> {
+    let Some(second) = second else {
+        return Some(Kept { store: Store::mount(&first).ok()?, flash: first });
+    };
+    let Newest { store, side, .. } = newest(&first, &second).ok()?;
+    let flash = match side {
+        Side::First => first,
+        Side::Second => second,
+    };
+    Some(Kept { store, flash })
 }
 
 struct Board {
     slots: [Area; 2],
-    stores: [Area; 2],
-    newest: Option<Newest>,
+    store: Option<Kept>,
 }
 
 impl Machine for Board {
@@ -71,30 +78,23 @@ impl Machine for Board {
     }
 
     fn mark(&mut self, marks: SlotMarks) -> bool {
-        let Some(newest) = &mut self.newest else { return false };
-        let [first, second] = &mut self.stores;
-        let flash = match newest.side {
-            Side::First => first,
-            Side::Second => second,
-        };
+        let Some(Kept { store, flash }) = &mut self.store else { return false };
         // Nothing in it waits for anything but the flash, and the flash is waited for in place.
-        newest.store.mark_slots(marks).is_ok_and(|put| block_on(put.carry_out(flash)).is_ok())
+        store.mark_slots(marks).is_ok_and(|put| block_on(put.carry_out(flash)).is_ok())
     }
 
-    /// There is no log: what became of a trial is in the marks.
-    fn passed_over(&mut self, _: Slot, _: &dyn fmt::Display) {}
+    fn passed_over(&mut self, slot: Slot, why: &dyn fmt::Display) {
+        board::say(format_args!("slot {slot:?} is not run: {why}"));
+    }
 }
 
-/// Leaves everything to the firmware but the watchdog, which goes on: what hangs before it feeds it has used a start.
-fn run(slot: Slot) -> ! {
-    watchdog::feed();
-    let vectors = BOARD.slot(slot).saturating_add(IMAGE_OFFSET);
-    // SAFETY: the loader ends here, so nothing of it is used any more.
-    let mut core = unsafe { cortex_m::Peripherals::steal() };
-    core.SCB.disable_icache();
-    // SAFETY: the image was checked. It begins with a vector table, which is aligned for the 166 vectors of the chip.
+/// Leaves the board to the firmware.
+fn run(vectors: u32) -> ! {
+    board::leave();
+    // SAFETY: the image was checked, and nothing of the loader is used any more. The image begins with a vector table,
+    // which is aligned for the 166 vectors of the STM32H743, and for the fewer of QEMU's board.
     unsafe {
-        core.SCB.vtor.write(vectors);
+        (*cortex_m::peripheral::SCB::PTR).vtor.write(vectors);
         cortex_m::asm::dsb();
         cortex_m::asm::isb();
         cortex_m::asm::bootload(core::ptr::with_exposed_provenance(vectors as usize))

@@ -3,6 +3,7 @@
 //! A board defines `Board`, which implements [`firmware::platform::Board`], and `main`, which creates it and
 //! starts the tasks.
 
+mod slot;
 mod stack;
 
 #[cfg(feature = "board-mps2-an500")]

@@ -13,25 +13,40 @@ pub struct Layout {
     pub slots: [u32; 2],
     /// Number of sectors of a slot, which lie one behind the other.
     pub slot_sectors: u8,
-    /// Where the sectors of each place for the store begin.
-    pub stores: [[u32; 2]; 2],
     /// Where RAM begins and ends: a vector table begins with the address of a stack.
     pub ram: &'static [(u32, u32)],
 }
 
+/// The addresses of the sectors of two places for the store.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Stores(pub [[u32; 2]; 2]);
+
 /// ST's NUCLEO-H743ZI2. Sectors 0 to 7 are the first bank, 8 to 15 the second. The loader is in sector 0, the image of
-/// a probe in sector 14. A firmware keeps its store in the bank that it does not run from.
+/// a probe in sector 14.
 pub const NUCLEO_H743ZI: Layout = Layout {
     board: "nucleo-h743zi",
     sector: 0x2_0000,
     slots: [0x0802_0000, 0x0810_0000],
     slot_sectors: 5,
-    stores: [[0x081A_0000, 0x081E_0000], [0x080C_0000, 0x080E_0000]],
     ram: &[(0x2000_0000, 0x2002_0000), (0x2400_0000, 0x2408_0000)],
 };
 
+/// Its stores. A firmware keeps its own in the bank that it does not run from.
+pub const NUCLEO_H743ZI_STORES: Stores = Stores([[0x081A_0000, 0x081E_0000], [0x080C_0000, 0x080E_0000]]);
+
+/// QEMU's `mps2-an500`. A file of the host stands for the flash, in which slot B lies behind slot A; the loader copies
+/// the slot that it runs to these addresses, in 4 MiB of RAM for programs, of which the first is the loader's. The
+/// store has one place, in a file too: there are no banks that stand still.
+pub const MPS2_AN500: Layout = Layout {
+    board: "mps2-an500",
+    sector: 0x2_0000,
+    slots: [0x0010_0000, 0x0020_0000],
+    slot_sectors: 5,
+    ram: &[(0x2000_0000, 0x2040_0000)],
+};
+
 /// All boards with a loader.
-pub const BOARDS: [&Layout; 1] = [&NUCLEO_H743ZI];
+pub const BOARDS: [&Layout; 2] = [&NUCLEO_H743ZI, &MPS2_AN500];
 
 impl Layout {
     /// The board of this name.
@@ -53,9 +68,19 @@ impl Layout {
         (self.slot_sectors as u32).saturating_mul(self.sector)
     }
 
-    /// The addresses of the sectors of a place for the store.
-    pub const fn store(&self, side: Side) -> [u32; 2] {
-        let [first, second] = self.stores;
+    /// Where a slot begins in memory that holds all of them one behind the other.
+    pub const fn slot_offset(&self, slot: Slot) -> u32 {
+        match slot {
+            Slot::A => 0,
+            Slot::B => self.slot_size(),
+        }
+    }
+}
+
+impl Stores {
+    /// The addresses of the sectors of a place.
+    pub const fn sectors(&self, side: Side) -> [u32; 2] {
+        let Self([first, second]) = *self;
         match side {
             Side::First => first,
             Side::Second => second,
@@ -63,7 +88,7 @@ impl Layout {
     }
 
     /// The place for the store of a firmware that runs in this slot.
-    pub const fn store_of(slot: Slot) -> Side {
+    pub const fn of(slot: Slot) -> Side {
         match slot {
             Slot::A => Side::First,
             Slot::B => Side::Second,
@@ -76,27 +101,47 @@ mod tests {
     use super::*;
     use std::vec::Vec;
 
+    fn sectors(layout: &Layout) -> Vec<u32> {
+        let of = |start: u32| (0..u32::from(layout.slot_sectors)).map(move |nth| start + nth * layout.sector);
+        layout.slots.into_iter().flat_map(of).collect()
+    }
+
+    fn do_not_overlap(mut all: Vec<u32>) {
+        let count = all.len();
+        all.sort();
+        all.dedup();
+        assert_eq!(all.len(), count);
+    }
+
     #[test]
-    fn nothing_overlaps_and_a_store_is_not_in_the_bank_of_its_firmware() {
+    fn slots_do_not_overlap() {
         for layout in BOARDS {
-            let sectors =
-                |start: u32| (0..u32::from(layout.slot_sectors)).map(move |nth| start + nth * layout.sector);
-            let mut all: Vec<u32> = layout.slots.into_iter().flat_map(sectors).collect();
-            all.extend(layout.stores.as_flattened());
-            let count = all.len();
-            all.sort();
-            all.dedup();
-            assert_eq!(all.len(), count);
-            assert!(
-                all.iter()
-                    .all(|start| start % layout.sector == 0 && *start > 0x0800_0000 && *start != 0x081C_0000)
-            );
-            let bank = |address: u32| address >> 20;
-            for slot in Slot::ALL {
-                let store = layout.store(Layout::store_of(slot));
-                assert!(store.iter().all(|address| bank(*address) != bank(layout.slot(slot))));
-            }
+            let all = sectors(layout);
+            assert!(all.iter().all(|start| start % layout.sector == 0));
+            do_not_overlap(all);
             assert_eq!(Layout::of(layout.board), Some(layout));
+            assert_eq!(layout.slot_offset(Slot::B), u32::from(layout.slot_sectors) * layout.sector);
         }
+    }
+
+    #[test]
+    fn a_store_of_the_nucleo_is_not_in_the_bank_of_its_firmware() {
+        let mut all = sectors(&NUCLEO_H743ZI);
+        all.extend(NUCLEO_H743ZI_STORES.0.as_flattened());
+        assert!(all.iter().all(|start| {
+            start % NUCLEO_H743ZI.sector == 0 && *start > 0x0800_0000 && *start != 0x081C_0000
+        }));
+        do_not_overlap(all);
+        let bank = |address: u32| address >> 20;
+        for slot in Slot::ALL {
+            let store = NUCLEO_H743ZI_STORES.sectors(Stores::of(slot));
+            assert!(store.iter().all(|address| bank(*address) != bank(NUCLEO_H743ZI.slot(slot))));
+        }
+    }
+
+    #[test]
+    fn a_slot_of_qemus_board_is_in_the_ram_for_programs_behind_the_loader() {
+        let all = sectors(&MPS2_AN500);
+        assert!(all.iter().all(|start| (0x10_0000..0x40_0000).contains(start)));
     }
 }

@@ -51,7 +51,7 @@ pub use file::{FILE_HEAD, FileError, Link, UpdateFile, file_head, link_padding};
 pub use header::{
     BoardName, Foreign, Formats, HEADER, Header, HeaderError, IMAGE_OFFSET, Parts, PublicKey, SIGNED, Version,
 };
-pub use layout::{BOARDS, Layout, NUCLEO_H743ZI};
+pub use layout::{BOARDS, Layout, MPS2_AN500, NUCLEO_H743ZI, NUCLEO_H743ZI_STORES, Stores};
 pub use receive::{Gap, Receive, ReceiveError, Step};
 pub use recipe_store::{Ended, Side, Slot, SlotMarks, SlotTrial};
 pub use rules::{Downgrade, Refused, Running, may_keep};

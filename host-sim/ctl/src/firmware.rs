@@ -44,7 +44,7 @@ pub struct Firmware {
 pub fn sign(firmware: &Firmware) -> Result<Vec<u8>, Failure> {
     let layout = Layout::of(&firmware.board).ok_or_else(|| {
         let names: Vec<&str> = recipe_update::BOARDS.iter().map(|layout| layout.board).collect();
-        Failure::wrong(format!("no board {:?} has slots; there is {}", firmware.board, names.join(", ")))
+        Failure::wrong(format!("no board {:?} has slots; there are {}", firmware.board, names.join(", ")))
     })?;
     let version = Version::parse(&firmware.version).ok_or_else(|| {
         Failure::wrong(format!("{:?} is no version; three numbers such as 0.3.0 are one", firmware.version))

@@ -7,7 +7,10 @@
 //! `HOST_SIM_FIRMWARE=ELF cargo test -p host-sim --test session -- --include-ignored on_a_board`
 //! `HOST_SIM_NUCLEO=ELF cargo test -p host-sim --test session -- --include-ignored on_a_nucleo`
 //!
-//! And of two boards that get another firmware ([`plant`]).
+//! And of boards that get another firmware ([`plant`]), in QEMU with what `.ci/run loader firmware-qemu` has made:
+//!
+//! `QEMU_LOADER=ELF QEMU_SLOT_A=ELF QEMU_SLOT_B=ELF \
+//!     cargo test -p host-sim --test session -- --include-ignored plant::qemu`
 
 mod board;
 mod commands;

@@ -1,97 +1,66 @@
-//! Two boards with a loader, the NUCLEO's firmware in slot A, get another one with `host-sim ctl update`
-//! (docs/update.md): on their modelled chips in real time (docs/chip.md section 5).
-//!
-//! What is built once is made several builds of: one in which a text is different, and one that does not run.
+//! Boards with a loader, a firmware in slot A, get another one with `host-sim ctl update` (docs/update.md): NUCLEOs on
+//! their modelled chips, and QEMU's.
 
-use std::os::unix::fs::OpenOptionsExt;
+mod nucleo;
+mod qemu;
+mod releases;
+
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use recipe_ctl::update::{Downgrade, begin_trial, push};
-use recipe_ctl::{Client, Slot, Stop, Update, key_file};
-use recipe_test_kit::{Process, chip};
+use recipe_ctl::{Client, Stop, Update, key_file};
 use serde_json::{Value, json};
-use tempfile::TempDir;
 
 use crate::BINARY;
-use crate::board::{Board, Surroundings};
+use crate::board::Board;
 use crate::ctl::{Ctl, Printed, TIMEOUT};
-use crate::nucleo::{control, emulate};
 use crate::target::Target;
+use releases::{Built, OTHER_TEXT, Releases, TEXT, another_text, that_restarts, unchanged};
 
-/// The private key of RFC 8032's third test. The loader of the tests is built for its public key.
-const SEED: &str = "c5aa8df43f9f837bedb7442f31dcb7b166d38535076f094b85ce3a2e0b4458f7";
-/// A text of the firmware, and that of another build in its place.
-const TEXT: &str = "no firmware is on trial";
-const OTHER_TEXT: &str = "no firmware is on TRIAL";
-/// An image begins so far behind its slot.
-const SLOTS: [(Slot, u32); 2] = [(Slot::A, 0x0802_0400), (Slot::B, 0x0810_0400)];
+/// A board with a loader.
+trait Slotted: Board + Sized + Send + Sync {
+    /// What was built for it.
+    const BUILT: Built;
 
-/// A board with the loader, on RS-485 A its panel.
-struct Slotted {
-    around: Surroundings,
-    /// What a probe has written into slot A.
-    slot_a: PathBuf,
-    chip: Option<Process>,
-}
+    /// One that was never started, with this in slot A.
+    fn new(slot_a: &Path) -> Self;
 
-impl Board for Slotted {
-    fn around(&self) -> &Surroundings {
-        &self.around
-    }
+    /// How often it has restarted by itself, since it has power.
+    fn restarts(&self) -> u64;
 
-    fn around_mut(&mut self) -> &mut Surroundings {
-        &mut self.around
-    }
-
-    fn start(&mut self, file: &Path) {
-        let mut more = vec!["--load".into(), format!("0x08020000={}", self.slot_a.display()).into()];
-        for slot in ["CHIP_SLOT_A", "CHIP_SLOT_B"] {
-            more.extend(["--knows".into(), Surroundings::named(slot).into()]);
-        }
-        self.chip = Some(emulate(&self.around, &Surroundings::named("CHIP_LOADER"), file, &more));
-    }
-
-    fn press(&self) {
-        chip::command(&self.control(), "press 200");
-    }
-
-    fn kill(&mut self) {
-        chip::command(&self.control(), "power");
-    }
-
-    fn short_trial_s(&self) -> u32 {
-        60
-    }
-}
-
-impl Slotted {
     /// In service: claimed, its panel plugged in, everything works.
     fn in_service(slot_a: &Path) -> Self {
-        let mut board = Self { around: Surroundings::new(), slot_a: slot_a.to_owned(), chip: None };
-        let made = BINARY.command().args(["ctl", "keygen"]).arg(board.around.path("key")).output().unwrap();
-        assert!(made.status.success(), "{made:?}");
-        let file = PathBuf::from(board.around.path("first.toml"));
-        std::fs::write(&file, board.config(500)).unwrap();
+        let mut board = Self::new(slot_a);
+        Releases::ctl(&["keygen", &board.around().path("key")]);
+        std::fs::write(board.file(), board.config(500)).unwrap();
         // The loader checks what it has never run.
-        Board::start(&mut board, &file);
-        patiently("it answers", || {
-            let printed = board.ctl().run(&["update"]);
-            // One that has no key says so.
-            (printed.code == 0 || printed.err.contains("key")).then_some(())
-        });
+        board.switch_on();
         board.claim();
         board.plug();
         board.ctl().until(0, &["status"]);
         board
     }
 
-    fn control(&self) -> PathBuf {
-        control(&self.around)
+    /// The file of the configuration that it is bought with.
+    fn file(&self) -> PathBuf {
+        self.around().path("first.toml").into()
+    }
+
+    /// Switches it on, and waits until it answers.
+    #[track_caller]
+    fn switch_on(&mut self) {
+        let file = self.file();
+        Board::start(self, &file);
+        patiently("it answers", || {
+            let printed = self.ctl().run(&["update"]);
+            // One that has no key says so.
+            (printed.code == 0 || printed.err.contains("key")).then_some(())
+        });
     }
 
     fn key(&self) -> PathBuf {
-        self.around.path("key").into()
+        self.around().path("key").into()
     }
 
     fn ctl(&self) -> Ctl {
@@ -112,6 +81,14 @@ impl Slotted {
         self.ctl().json(&["update"])
     }
 
+    /// Runs this firmware on trial, for a minute.
+    #[track_caller]
+    fn tries(&self, file: &str) {
+        let printed = self.ctl().run(&["update", file, "--try", "--confirm-s", "60"]);
+        // It is asked at once, and may not have its links yet.
+        assert!(matches!(printed.code, 0 | 3) && printed.out.contains("runs on trial"), "{printed:?}");
+    }
+
     /// Its slot, and what it answers to the end of a trial that there is not: another text in another build.
     #[track_caller]
     fn runs(&self, slot: &str, text: &str) {
@@ -126,123 +103,23 @@ impl Slotted {
     }
 }
 
-impl Drop for Slotted {
-    fn drop(&mut self) {
-        if std::thread::panicking() {
-            let log = self.chip.as_ref().map_or_else(String::new, |chip| chip.lines().join("\n"));
-            eprintln!("the log of a board:\n{log}");
-        }
-        self.pull();
-    }
-}
-
-/// Update files.
-struct Releases(TempDir);
-
-impl Releases {
-    fn new() -> Self {
-        let releases = Self(tempfile::tempdir().unwrap());
-        let mut key = std::fs::OpenOptions::new();
-        let mut key = key.write(true).create_new(true).mode(0o600).open(releases.path("the.key")).unwrap();
-        std::io::Write::write_all(&mut key, SEED.as_bytes()).unwrap();
-        releases
-    }
-
-    fn path(&self, name: &str) -> PathBuf {
-        self.0.path().join(name)
-    }
-
-    /// `ctl` without a board.
-    #[track_caller]
-    fn ctl(args: &[&str]) {
-        let made = BINARY.command().arg("ctl").args(args).output().unwrap();
-        assert!(made.status.success(), "{made:?}");
-    }
-
-    /// An update of what was built, changed in both links and signed with this key; returns its path.
-    fn sign(&self, name: &str, key: &str, change: impl Fn(&mut [u8], u32)) -> String {
-        let linked = SLOTS.map(|(slot, start)| {
-            let built = Surroundings::named(&format!("CHIP_SLOT_{slot:?}"));
-            let mut elf =
-                std::fs::read(&built).unwrap_or_else(|error| panic!("{}: {error}", built.display()));
-            change(&mut elf, start);
-            let path = self.path(&format!("{name}-{slot:?}.elf"));
-            std::fs::write(&path, elf).unwrap();
-            path.display().to_string()
-        });
-        let (key, file) = (self.path(key).display().to_string(), self.path(name).display().to_string());
-        let [a, b] = &linked;
-        let what = ["--board", "nucleo-h743zi", "--version", env!("CARGO_PKG_VERSION")];
-        let files = ["--signing-key", &key, "--slot-a", a, "--slot-b", b, "-o", &file];
-        Self::ctl(&[&["sign"], &what[..], &files].concat());
-        file
-    }
-}
-
-/// Another text in its place.
-fn another_text(elf: &mut [u8], _: u32) {
-    let places: Vec<_> =
-        (0..elf.len() - TEXT.len()).filter(|at| elf[*at..].starts_with(TEXT.as_bytes())).collect();
-    assert!(!places.is_empty(), "the firmware has no text {TEXT:?}");
-    for at in places {
-        elf[at..at + TEXT.len()].copy_from_slice(OTHER_TEXT.as_bytes());
-    }
-}
-
-/// It asks for a reset with its first instructions (Armv7-M ARM A7.7): ldr r0, [pc, #4]; ldr r1, [pc, #8];
-/// str r1, [r0]; b .
-fn that_does_not_run(elf: &mut [u8], start: u32) {
-    let vectors = place(elf, start);
-    let reset = number(elf, vectors + 4) & !1;
-    let mut code: Vec<u16> = Vec::new();
-    if reset % 4 == 2 {
-        code.push(0xBF00);
-    }
-    code.extend([0x4801, 0x4902, 0x6001, 0xE7FE]);
-    let mut bytes: Vec<u8> = code.iter().flat_map(|half| half.to_le_bytes()).collect();
-    bytes.extend([0xE000_ED0C_u32, 0x05FA_0004].iter().flat_map(|word| word.to_le_bytes()));
-    let at = place(elf, reset);
-    elf[at..at + bytes.len()].copy_from_slice(&bytes);
-}
-
-/// Where a byte of flash is in an ELF file.
-fn place(elf: &[u8], address: u32) -> usize {
-    let half = |at: usize| usize::from(u16::from_le_bytes([elf[at], elf[at + 1]]));
-    let (headers, size, count) = (number(elf, 28) as usize, half(42), half(44));
-    let segments = (0..count).map(|nth| headers + nth * size);
-    let found =
-        segments.map(|at| [1, 3, 4].map(|word| number(elf, at + 4 * word))).find_map(|[from, paddr, len]| {
-            let behind = address.checked_sub(paddr).filter(|behind| *behind < len)?;
-            Some((from + behind) as usize)
-        });
-    found.expect("it is in the program")
-}
-
-fn number(bytes: &[u8], at: usize) -> u32 {
-    u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]])
-}
-
-fn unchanged(_: &mut [u8], _: u32) {}
-
-#[test]
-#[ignore = "needs CHIP_UNICORN, CHIP_LOADER, CHIP_SLOT_A, CHIP_SLOT_B and qemu-system-arm"]
-fn a_plant_of_nucleos_gets_another_firmware() {
-    let releases = Releases::new();
-    let first = releases.sign("first.rgu", "the.key", unchanged);
-    let second = releases.sign("second.rgu", "the.key", another_text);
-    let broken = releases.sign("broken.rgu", "the.key", that_does_not_run);
-    let flat = releases.path("slot-a.bin");
-    Releases::ctl(&["inspect", &first, "--slot", "a", "-o", flat.to_str().unwrap()]);
+/// Two boards: one is updated and takes another update back, the other refuses what is wrong; then both in a rollout.
+fn gets_another_firmware<B: Slotted>() {
+    let releases = Releases::new(B::BUILT);
+    let first = releases.sign("first.rgu", unchanged);
+    let second = releases.sign("second.rgu", another_text);
+    let broken = releases.sign("broken.rgu", that_restarts);
+    let flat = releases.flat(&first);
     let (press, saw) = std::thread::scope(|scope| {
-        let saw = scope.spawn(|| Slotted::in_service(&flat));
-        (Slotted::in_service(&flat), saw.join().unwrap())
+        let saw = scope.spawn(|| B::in_service(&flat));
+        (B::in_service(&flat), saw.join().unwrap())
     });
     std::thread::scope(|scope| {
         scope.spawn(|| refuses_what_is_foreign_or_changed(&saw, &releases, &second));
         is_updated_and_taken_back(&press, &first, &second);
     });
 
-    let entry = |name: &str, board: &Slotted| {
+    let entry = |name: &str, board: &B| {
         let (to, host, key) = (board.address(), board.host().unwrap(), board.key());
         let key = key.display();
         format!("[[gateway]]\nname = \"{name}\"\naddress = \"{to}\"\nhost = \"{host}\"\nkey = \"{key}\"\n")
@@ -290,7 +167,7 @@ fn roll_out(releases: &Releases, inventory: &Path, file: &str) -> (Printed, Valu
 }
 
 /// Sent, tried and confirmed; then the one before, which is taken back.
-fn is_updated_and_taken_back(board: &Slotted, first: &str, second: &str) {
+fn is_updated_and_taken_back<B: Slotted>(board: &B, first: &str, second: &str) {
     let ctl = board.ctl();
     let before = board.firmware();
     board.runs("A", TEXT);
@@ -304,8 +181,7 @@ fn is_updated_and_taken_back(board: &Slotted, first: &str, second: &str) {
     assert_eq!(ctl.json(&["revisions"])["live"], revisions["live"], "its configuration came along");
     let again = ctl.done(&["update", second, "--try", "--confirm"]);
     assert!(again.contains("nothing was sent"), "{again}");
-    let tried = ctl.done(&["update", first, "--try"]);
-    assert!(tried.contains("runs on trial"), "{tried}");
+    board.tries(first);
     assert_eq!(board.firmware()["slot"], "A");
     ctl.done(&["update", "--back"]);
     board.runs("B", OTHER_TEXT);
@@ -314,11 +190,11 @@ fn is_updated_and_taken_back(board: &Slotted, first: &str, second: &str) {
 }
 
 /// Refused by `ctl`, which sends nothing; and by the board, when all is sent.
-fn refuses_what_is_foreign_or_changed(board: &Slotted, releases: &Releases, second: &str) {
+fn refuses_what_is_foreign_or_changed<B: Slotted>(board: &B, releases: &Releases, second: &str) {
     let ctl = board.ctl();
-    let (before, restarts) = (board.firmware(), figures(board)["restarts"].as_u64().unwrap());
+    let (before, restarts) = (board.firmware(), board.restarts());
     Releases::ctl(&["keygen", "--signing", releases.path("other.key").to_str().unwrap()]);
-    let foreign = releases.sign("foreign.rgu", "other.key", another_text);
+    let foreign = releases.sign_as("foreign.rgu", "other.key", env!("CARGO_PKG_VERSION"), another_text);
     let mut changed = std::fs::read(second).unwrap();
     let last = changed.len() - 100_000;
     changed[last] ^= 1;
@@ -342,9 +218,7 @@ fn refuses_what_is_foreign_or_changed(board: &Slotted, releases: &Releases, seco
     push(&client, &update.links()[1], Downgrade::Refused, &mut |_| {}).unwrap();
     let failure = begin_trial(&client, 60, Downgrade::Refused, &mut |_| {}).unwrap_err();
     assert!(failure.message().contains("not signed with the key"), "{failure:?}");
-    patiently("it restarts with what it had", || {
-        (figures(board)["restarts"].as_u64()? > restarts).then_some(())
-    });
+    patiently("it restarts with what it had", || (board.restarts() > restarts).then_some(()));
     patiently("it answers", || (ctl.run(&["update"]).code == 0).then_some(()));
     board.runs("A", TEXT);
     assert!(board.firmware()["last"].is_null(), "nothing was on trial");
@@ -362,8 +236,4 @@ fn patiently<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
         assert!(Instant::now() < deadline, "never: {what}");
         std::thread::sleep(Duration::from_millis(100));
     }
-}
-
-fn figures(board: &Slotted) -> Value {
-    serde_json::from_str(&chip::request(&board.control(), "figures")).unwrap()
 }

@@ -26,13 +26,56 @@ impl Qemu {
     pub(crate) fn with(around: Surroundings) -> Self {
         Self { elf: Surroundings::named("HOST_SIM_FIRMWARE"), around, qemu: None }
     }
+}
 
-    fn path(&self, name: &str) -> String {
-        self.around.path(name)
+/// What the board has said since it was switched on.
+pub(crate) fn log(around: &Surroundings) -> String {
+    std::fs::read_to_string(around.path("log")).unwrap_or_default()
+}
+
+/// Starts QEMU with a program and the image of a configuration file, on the board's lines and network. Store and button
+/// are files; `more` arguments follow.
+pub(crate) fn emulate(around: &Surroundings, elf: &Path, file: &Path, more: &[&str]) -> Child {
+    let image = around.image(file);
+    let _ = std::fs::remove_file(around.path("log"));
+    for uart in UARTS {
+        let _ = std::fs::remove_file(around.path(uart));
     }
+    // As in firmware/README.md: image, fault, store, button.
+    let mut arguments = format!(
+        "enable=on,target=native,arg=firmware,arg={image},arg=none,arg={},arg={}",
+        around.path("store"),
+        around.path("button")
+    );
+    arguments.extend(more.iter().map(|argument| format!(",arg={argument}")));
+    let qemu = Command::new("qemu-system-arm")
+        .args("-M mps2-an500 -display none -monitor none".split(' '))
+        .args(["-nic", &format!("user,{}", around.forward())])
+        .args(UARTS.iter().flat_map(|uart| {
+            ["-serial".to_owned(), format!("unix:{},server=on,wait=off", around.path(uart))]
+        }))
+        .args(["-serial", &format!("file:{}", around.path("log"))])
+        .args(["-semihosting-config", &arguments, "-kernel"])
+        .arg(elf)
+        .stdin(Stdio::null())
+        .spawn();
+    qemu.expect("qemu-system-arm runs")
+}
 
-    fn log(&self) -> String {
-        std::fs::read_to_string(self.path("log")).unwrap_or_default()
+/// Presses the button of a board.
+pub(crate) fn press(around: &Surroundings) {
+    std::fs::write(around.path("button"), "").unwrap();
+}
+
+pub(crate) fn let_go(around: &Surroundings) {
+    std::fs::remove_file(around.path("button")).unwrap();
+}
+
+/// Ends QEMU at once: the board has no power.
+pub(crate) fn kill(qemu: &mut Option<Child>) {
+    if let Some(mut qemu) = qemu.take() {
+        qemu.kill().unwrap();
+        qemu.wait().unwrap();
     }
 }
 
@@ -46,44 +89,19 @@ impl Board for Qemu {
     }
 
     fn start(&mut self, file: &Path) {
-        let image = self.around.image(file);
-        let _ = std::fs::remove_file(self.path("log"));
-        for uart in UARTS {
-            let _ = std::fs::remove_file(self.path(uart));
-        }
-        // As in firmware/README.md: image, fault, store, button.
-        let arguments = format!(
-            "enable=on,target=native,arg=firmware,arg={image},arg=none,arg={},arg={}",
-            self.path("store"),
-            self.path("button")
-        );
-        let qemu = Command::new("qemu-system-arm")
-            .args("-M mps2-an500 -display none -monitor none".split(' '))
-            .args(["-nic", &format!("user,{}", self.around.forward())])
-            .args(UARTS.iter().flat_map(|uart| {
-                ["-serial".to_owned(), format!("unix:{},server=on,wait=off", self.path(uart))]
-            }))
-            .args(["-serial", &format!("file:{}", self.path("log"))])
-            .args(["-semihosting-config", &arguments, "-kernel"])
-            .arg(&self.elf)
-            .stdin(Stdio::null())
-            .spawn();
-        self.qemu = Some(qemu.expect("qemu-system-arm runs"));
+        self.qemu = Some(emulate(&self.around, &self.elf, file, &[]));
     }
 
     fn press(&self) {
-        std::fs::write(self.path("button"), "").unwrap();
+        press(&self.around);
     }
 
     fn let_go(&self) {
-        std::fs::remove_file(self.path("button")).unwrap();
+        let_go(&self.around);
     }
 
     fn kill(&mut self) {
-        if let Some(mut qemu) = self.qemu.take() {
-            qemu.kill().unwrap();
-            qemu.wait().unwrap();
-        }
+        kill(&mut self.qemu);
     }
 
     fn short_trial_s(&self) -> u32 {
@@ -94,7 +112,7 @@ impl Board for Qemu {
 impl Drop for Qemu {
     fn drop(&mut self) {
         if std::thread::panicking() {
-            eprintln!("the board's log:\n{}", self.log());
+            eprintln!("the board's log:\n{}", log(&self.around));
         }
         self.pull();
         Board::kill(self);

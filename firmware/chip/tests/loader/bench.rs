@@ -6,7 +6,9 @@ use chip::device::{MILLI, Picos, SECOND};
 use chip::{Chip, Program};
 use embassy_futures::block_on;
 use recipe_store::{BLANK, Flash, Geometry, Place, Side, WORD, Word, newest};
-use recipe_update::{IMAGE_OFFSET, NUCLEO_H743ZI as BOARD, Slot, SlotMarks, SlotTrial};
+use recipe_update::{
+    IMAGE_OFFSET, NUCLEO_H743ZI as BOARD, NUCLEO_H743ZI_STORES as STORES, Slot, SlotMarks, SlotTrial,
+};
 
 use crate::image::{Image, LEAVES, mark};
 
@@ -72,7 +74,7 @@ impl Bench {
     /// Everything but the loader is blank.
     pub(crate) fn blank(&mut self) {
         let all = BOARD.slots.iter().map(|start| (*start, BOARD.slot_size()));
-        let stores = BOARD.stores.as_flattened().iter().map(|start| (*start, BOARD.sector));
+        let stores = STORES.0.as_flattened().iter().map(|start| (*start, BOARD.sector));
         let all: Vec<_> = all.chain(stores).collect();
         for (start, len) in all {
             self.chip.load(start, &vec![0xFF; len as usize]);
@@ -82,7 +84,7 @@ impl Bench {
     fn place(&mut self, side: Side) -> Copy {
         let flash = &self.chip.devices().flash;
         let torn: Vec<u32> = flash.torn().collect();
-        let words = BOARD.store(side).into_iter().flat_map(|start| {
+        let words = STORES.sectors(side).into_iter().flat_map(|start| {
             let first = start - FLASH;
             let bytes = &flash.cells()[first as usize..][..BOARD.sector as usize];
             (first..).step_by(WORD).zip(bytes.as_chunks().0)
@@ -101,7 +103,7 @@ impl Bench {
         let mut first = self.place(Side::First);
         let mut store = recipe_store::Store::mount(&first).expect("it can be one");
         block_on(store.mark_slots(marks).expect("there is room").carry_out(&mut first)).expect("it is flash");
-        for (start, words) in BOARD.store(Side::First).into_iter().zip(first.0.chunks(WORDS.into())) {
+        for (start, words) in STORES.sectors(Side::First).into_iter().zip(first.0.chunks(WORDS.into())) {
             self.chip.load(start, words.as_flattened());
         }
     }

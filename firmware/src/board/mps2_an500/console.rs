@@ -1,5 +1,7 @@
 //! The console: UART 3, without interrupts. What cannot be sent at once is dropped, because the log must not delay
 //! the buses.
+//!
+//! The loader has this file too (firmware/loader/src/board/mps2_an500/mod.rs).
 
 use core::fmt::{self, Write};
 
@@ -10,7 +12,7 @@ const STATE: u32 = UART + 0x4;
 const STATE_TX_FULL: u32 = 1;
 
 /// Starts the UART.
-pub(super) fn start() {
+pub(crate) fn start() {
     write(UART + 0x10, 16);
     write(UART + 0x8, 1);
 }
@@ -29,14 +31,6 @@ impl Write for Console {
 }
 
 /// Prints.
-pub(super) fn print(text: fmt::Arguments<'_>) {
+pub(crate) fn print(text: fmt::Arguments<'_>) {
     let _ = Console.write_fmt(text);
-}
-
-/// Prints the running task.
-pub(super) fn print_running() {
-    match firmware::tasks::watchdog::running() {
-        Some(task) => print(format_args!("task {task} was running\r\n")),
-        None => print(format_args!("no task was running\r\n")),
-    }
 }

@@ -8,7 +8,7 @@ use core::pin::pin;
 use embassy_time::{Duration, Timer};
 use firmware::tasks::watchdog::{Pulse, TaskName};
 
-use super::storage;
+use super::arguments::argument;
 use crate::start::Tasks;
 
 #[derive(Debug, Clone, Copy)]
@@ -26,7 +26,7 @@ enum InjectedFault {
 
 /// Starts the fault that was asked for.
 pub(super) fn start(tasks: &Tasks) {
-    let asked = storage::argument(2, |name| {
+    let asked = argument(2, |name| {
         Some(match name {
             "stall" => InjectedFault::Stall,
             "spin" => InjectedFault::Spin,

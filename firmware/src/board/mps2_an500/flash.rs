@@ -1,127 +1,79 @@
-//! The flash of the store: a file of the host, named by the fourth semihosting argument. It stands for two sectors of
-//! 128 KiB as the NUCLEO has them; without the argument there is no store. No word of it is ever torn.
-
-use core::cell::RefCell;
-use core::ffi::CStr;
+//! The flash of the store, a file of the host that the fourth semihosting argument names, and that of the slots, which
+//! the sixth one names. Without the fourth there is no store.
 
 use firmware::kept::StoreFlash;
-use recipe_store::{BLANK, Found, Geometry, MAX_DATA, Place, WORD, Word};
-use recipe_update::SlotFlash;
-use semihosting::fs::File;
-use semihosting::io::{Read, Seek, SeekFrom, Write};
+use firmware::update::{Site, Slots};
+use recipe_store::{Flash, Found, Geometry, MAX_DATA, Place, WORD, Word};
+use recipe_update::{MPS2_AN500 as BOARD, Slot};
 use static_cell::ConstStaticCell;
 
-use super::storage::{self, MAX_ARGUMENTS};
+use super::super::slot::running;
+use super::arguments::Name;
+use super::host_flash::HostFlash;
 
-const WORDS: u16 = 4096;
-/// Words that are read at once: each access to the file is a trap.
-const PAGE: usize = 32;
-
-/// The file.
-pub(crate) struct Flash {
-    file: RefCell<File>,
-    /// The last page that was read: its offset in the file, and its bytes.
-    page: RefCell<Option<(u64, [u8; PAGE * WORD])>>,
+/// The store: two sectors, as the NUCLEO has them.
+pub(crate) struct StoreFile {
+    flash: HostFlash,
     record: &'static mut [u8; MAX_DATA],
 }
 
-/// Opens the file, or makes it; called once.
-pub(super) fn open() -> Option<Flash> {
+/// Opens the store, or makes it; called once.
+pub(super) fn store() -> Option<StoreFile> {
     static RECORD: ConstStaticCell<[u8; MAX_DATA]> = ConstStaticCell::new([0; MAX_DATA]);
-    let opened = storage::argument(3, |path| {
-        let mut name = [0; MAX_ARGUMENTS];
-        name.get_mut(..path.len())?.copy_from_slice(path.as_bytes());
-        let name = CStr::from_bytes_until_nul(&name).ok()?;
-        let opened = File::options().read(true).write(true).open(name);
-        opened.or_else(|_| File::options().read(true).write(true).create(true).truncate(true).open(name)).ok()
-    });
-    let Some(file) = opened? else {
+    let Some(flash) = HostFlash::open(&Name::argument(STORE)?, 0, STORE_SECTORS) else {
         firmware::error!("the file of the store cannot be opened");
         return None;
     };
-    Some(Flash { file: RefCell::new(file), page: RefCell::new(None), record: RECORD.take() })
+    Some(StoreFile { flash, record: RECORD.take() })
 }
 
-fn offset(Place { sector, word }: Place) -> u64 {
-    (u64::from(sector) * u64::from(WORDS) + u64::from(word)) * WORD as u64
+/// The slots.
+pub(super) fn slots() -> Site<HostFlash> {
+    Site { board: BOARD.board, slots: opened() }
 }
 
-impl Flash {
-    /// Whether all bytes are in the file.
-    fn write_at(&mut self, offset: u64, mut bytes: &[u8]) -> bool {
-        *self.page.get_mut() = None;
-        let file = self.file.get_mut();
-        if file.seek(SeekFrom::Start(offset)).is_err() {
-            return false;
-        }
-        while !bytes.is_empty() {
-            match file.write(bytes) {
-                Ok(count @ 1..) => bytes = bytes.get(count..).unwrap_or(&[]),
-                _ => return false,
-            }
-        }
-        true
-    }
+fn opened() -> Result<Slots<HostFlash>, &'static str> {
+    let running = running().ok_or("QEMU runs the program that it is given: there are no slots")?;
+    let key = key().ok_or("there is no loader with a key at the beginning of the flash")?;
+    let name = Name::argument(SLOTS).ok_or("no file of the slots was named")?;
+    let open = |slot: Slot| {
+        HostFlash::open(&name, BOARD.slot_offset(slot), BOARD.slot_sectors)
+            .ok_or("the file of the slots cannot be opened")
+    };
+    Ok(Slots { running, key, own: open(running)?, free: open(running.other())? })
 }
 
-impl recipe_store::Flash for Flash {
+/// The public key of the loader, behind a mark (firmware/loader/loader.x).
+fn key() -> Option<[u8; 32]> {
+    // SAFETY: memory for programs, which nobody writes; the program itself is elsewhere.
+    let marked = unsafe { core::ptr::with_exposed_provenance::<[u8; 36]>(KEY).read_volatile() };
+    marked.strip_prefix(b"RGUK")?.first_chunk().copied()
+}
+
+impl Flash for StoreFile {
     fn geometry(&self) -> Geometry {
-        Geometry { sectors: 2, words: WORDS }
+        self.flash.geometry()
     }
 
     fn read(&self, place: Place) -> Word {
-        let offset = offset(place);
-        let inside = offset % (PAGE * WORD) as u64;
-        let mut page = self.page.borrow_mut();
-        let (_, bytes) = match &mut *page {
-            Some(page) if page.0 == offset - inside => page,
-            page => page.insert((offset - inside, self.read_page(offset - inside))),
-        };
-        bytes.as_chunks().0.get(inside as usize / WORD).copied().unwrap_or(BLANK)
+        self.flash.read(place)
     }
 
     async fn write(&mut self, place: Place, word: &Word) {
-        // What is missing shows when it is read back.
-        let _ = self.write_at(offset(place), word);
+        self.flash.write(place, word).await;
     }
 
     async fn erase(&mut self, sector: u8) {
-        for word in (0..WORDS).step_by(PAGE) {
-            let _ = self.write_at(offset(Place { sector, word }), &[0xFF; PAGE * WORD]);
-        }
+        self.flash.erase(sector).await;
     }
 }
 
-impl Flash {
-    /// What is behind the end of the file is blank.
-    fn read_page(&self, offset: u64) -> [u8; PAGE * WORD] {
-        let mut bytes = [0xFF; PAGE * WORD];
-        let mut file = self.file.borrow_mut();
-        let mut len = 0;
-        if file.seek(SeekFrom::Start(offset)).is_ok() {
-            while let Some(room @ [_, ..]) = bytes.get_mut(len..) {
-                match file.read(room) {
-                    Ok(count @ 1..) => len += count,
-                    _ => break,
-                }
-            }
-        }
-        bytes
-    }
-}
-
-impl SlotFlash for Flash {
-    fn whole(&self, place: Place) -> Option<Word> {
-        Some(recipe_store::Flash::read(self, place))
-    }
-}
-
-impl StoreFlash for Flash {
+impl StoreFlash for StoreFile {
     fn bytes(&mut self, found: Found) -> Option<&[u8]> {
         let mut place = found.data;
         let words = found.len.div_ceil(WORD);
         for nth in 0..words {
-            let word = recipe_store::Flash::read(self, place);
+            let word = self.flash.read(place);
             let part = self.record.get_mut(nth * WORD..)?;
             part.iter_mut().zip(word).for_each(|(byte, read)| *byte = read);
             place.word += 1;
@@ -129,3 +81,11 @@ impl StoreFlash for Flash {
         self.record.get(..found.len)
     }
 }
+
+/// The arguments with the names of the files. The loader has them too.
+const STORE: usize = 3;
+const SLOTS: usize = 5;
+/// Sectors of the store.
+const STORE_SECTORS: u8 = 2;
+/// Where the loader has its key.
+const KEY: usize = 0x400;

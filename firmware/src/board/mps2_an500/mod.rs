@@ -1,13 +1,15 @@
 //! QEMU's `mps2-an500`: a Cortex-M7 with five UARTs and a LAN9118. RS-485 on UART 0 and 1, CAN as slcan
-//! on UART 2, the log on UART 3; the configuration is a file of the host, named by semihosting.
+//! on UART 2, the log on UART 3; configuration, store and slots are files of the host, named by semihosting.
 //!
 //! It exists so that the firmware runs end to end in CI.
 
+mod arguments;
 mod button;
 mod console;
 mod executor;
 mod fault_injection;
 mod flash;
+mod host_flash;
 mod log_output;
 mod registers;
 mod storage;
@@ -27,6 +29,7 @@ use firmware::kept::Places;
 use firmware::platform::{self, StatusLed};
 use firmware::update::Site;
 use proto_core::config::Rs485;
+use recipe_update::MPS2_AN500;
 
 use watchdog::Watchdog;
 
@@ -37,7 +40,7 @@ pub(crate) struct Board {
 }
 
 impl platform::Board for Board {
-    const NAME: &'static str = "mps2-an500";
+    const NAME: &'static str = MPS2_AN500.board;
     const SERIAL_PORTS: usize = 2;
     const CAN_PORTS: usize = 1;
     const WATCHDOG_PERIOD: Duration = watchdog::PERIOD;
@@ -49,8 +52,8 @@ impl platform::Board for Board {
     type Watchdog = Watchdog;
     type Led = Led;
     type Button = button::Button;
-    type Flash = flash::Flash;
-    type Slot = flash::Flash;
+    type Flash = flash::StoreFile;
+    type Slot = host_flash::HostFlash;
     type StorageError = storage::StorageError;
     type EthernetError = StartError;
 
@@ -58,12 +61,12 @@ impl platform::Board for Board {
         storage::read()
     }
 
-    fn flash(&mut self) -> Option<Places<flash::Flash>> {
-        flash::open().map(Places::one)
+    fn flash(&mut self) -> Option<Places<flash::StoreFile>> {
+        flash::store().map(Places::one)
     }
 
-    fn slots(&mut self) -> Site<flash::Flash> {
-        Site { board: Self::NAME, slots: Err("QEMU runs the program that it is given: there are no slots") }
+    fn slots(&mut self) -> Site<host_flash::HostFlash> {
+        flash::slots()
     }
 
     /// The file's operations end at once.
@@ -143,23 +146,34 @@ fn main() -> ! {
     })
 }
 
-/// Ends QEMU with this exit code.
+/// Ends QEMU with this exit code. With a loader it is a board that restarts: which firmware runs then is the loader's
+/// decision.
 fn end(code: i32) -> ! {
-    semihosting::process::exit(code)
+    match super::slot::running() {
+        None => semihosting::process::exit(code),
+        Some(_) => cortex_m::peripheral::SCB::sys_reset(),
+    }
+}
+
+fn print_running() {
+    match firmware::tasks::watchdog::running() {
+        Some(task) => console::print(format_args!("task {task} was running\r\n")),
+        None => console::print(format_args!("no task was running\r\n")),
+    }
 }
 
 #[panic_handler]
 fn panic(info: &core::panic::PanicInfo<'_>) -> ! {
     cortex_m::interrupt::disable();
     console::print(format_args!("{info}\r\n"));
-    console::print_running();
+    print_running();
     end(101)
 }
 
 #[cortex_m_rt::exception]
 unsafe fn HardFault(frame: &cortex_m_rt::ExceptionFrame) -> ! {
     console::print(format_args!("hard fault at {:08X}\r\n", frame.pc()));
-    console::print_running();
+    print_running();
     end(102)
 }
 

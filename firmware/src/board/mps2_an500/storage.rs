@@ -1,15 +1,15 @@
 //! The configuration image: a file of the host, named by the second semihosting argument
 //! (`-semihosting-config ...,arg=firmware,arg=PATH`).
 
-use core::ffi::CStr;
 use core::fmt;
 
 use proto_core::config::image::MAX_IMAGE;
-use semihosting::experimental::env;
 use semihosting::experimental::time::SystemTime;
 use semihosting::fs::File;
 use semihosting::io::Read;
 use static_cell::ConstStaticCell;
+
+use super::arguments::{Name, argument};
 
 /// Why there is no image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -36,14 +36,8 @@ impl fmt::Display for StorageError {
 /// Reads the image; called once.
 pub(super) fn read() -> Result<&'static [u8], StorageError> {
     static IMAGE: ConstStaticCell<[u8; MAX_IMAGE]> = ConstStaticCell::new([0; MAX_IMAGE]);
-    let opened = argument(1, |path| {
-        let mut name = [0; MAX_ARGUMENTS];
-        let room = name.get_mut(..path.len()).ok_or(StorageError::NoName)?;
-        room.copy_from_slice(path.as_bytes());
-        let name = CStr::from_bytes_until_nul(&name).map_err(|_| StorageError::NoName)?;
-        File::open(name).map_err(|_| StorageError::Unreadable)
-    });
-    let mut file = opened.ok_or(StorageError::NoName)??;
+    let name = Name::argument(1).ok_or(StorageError::NoName)?;
+    let mut file = File::open(name.as_c_str()).map_err(|_| StorageError::Unreadable)?;
     let image = IMAGE.take();
     let mut len = 0;
     while let Some(room @ [_, ..]) = image.get_mut(len..) {
@@ -55,15 +49,6 @@ pub(super) fn read() -> Result<&'static [u8], StorageError> {
     }
     Ok(&image[..len])
 }
-
-/// Passes one of the semihosting arguments to `look`.
-pub(super) fn argument<T>(nth: usize, look: impl FnOnce(&str) -> T) -> Option<T> {
-    let args = env::args::<MAX_ARGUMENTS>().ok()?;
-    (&args).nth(nth).and_then(Result::ok).map(look)
-}
-
-/// Maximum length of all arguments together, in bytes.
-pub(super) const MAX_ARGUMENTS: usize = 512;
 
 /// Random bytes of the host.
 pub(super) fn random() -> Option<[u8; 32]> {

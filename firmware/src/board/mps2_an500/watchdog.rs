@@ -45,5 +45,5 @@ impl FeedWatchdog for Watchdog {
 #[cortex_m_rt::exception]
 unsafe fn NonMaskableInt() {
     console::print(format_args!("the watchdog was not fed\r\n"));
-    console::print_running();
+    super::print_running();
 }

@@ -16,15 +16,11 @@ use embassy_time::{Duration, Instant, Timer};
 use firmware::kept::{Places, StoreFlash};
 use firmware::update::{Site, Slots};
 use recipe_store::{Found, Geometry, Place, Side, WORD, Word};
-use recipe_update::{Layout, NUCLEO_H743ZI as BOARD, Slot, SlotFlash};
+use recipe_update::{NUCLEO_H743ZI as BOARD, NUCLEO_H743ZI_STORES as STORES, Slot, SlotFlash, Stores};
 
+use super::super::slot::running;
 use super::readable::can_read;
 use super::storage::FLASH_WORD;
-
-unsafe extern "C" {
-    /// Its address says which slot the program was linked for (memory.x).
-    static _slot: u8;
-}
 
 const _: () = assert!(FLASH_WORD == WORD);
 
@@ -58,27 +54,18 @@ pub(crate) struct Area {
 
 const _: () = assert!(BOARD.slot_sectors == 5);
 
-/// The slot that the program was linked for.
-fn running() -> Option<Slot> {
-    match (&raw const _slot).addr() {
-        1 => Some(Slot::A),
-        2 => Some(Slot::B),
-        _ => None,
-    }
-}
-
 /// The places for the store.
 ///
 /// # Safety
 /// They are made once.
 pub(super) unsafe fn stores() -> Places<Area> {
     let place = |side: Side| {
-        let [first, second] = BOARD.store(side);
+        let [first, second] = STORES.sectors(side);
         Area { sectors: [first, second, second, second, second], count: 2 }
     };
     let first = place(Side::First);
     match running() {
-        Some(slot) => Places { first, second: Some(place(Side::Second)), own: Layout::store_of(slot) },
+        Some(slot) => Places { first, second: Some(place(Side::Second)), own: Stores::of(slot) },
         // Slot A may have been filled behind the back of such a program, but nothing of it runs.
         None => Places { first, second: None, own: Side::First },
     }

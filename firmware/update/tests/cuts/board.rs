@@ -7,8 +7,8 @@ use std::rc::Rc;
 use embassy_futures::block_on;
 use recipe_store::{Flash, Geometry, Marks, Newest, Place, Side, SlotMarks, Word, newest};
 use recipe_update::{
-    BoardName, Chosen, Downgrade, Formats, Header, Layout, Machine, Parts, PublicKey, Receive, Running, Slot,
-    SlotFlash, Step, Version, begin_trial, choose, confirm, file_head, link_padding,
+    BoardName, Chosen, Downgrade, Formats, Header, Machine, Parts, PublicKey, Receive, Running, Slot,
+    SlotFlash, Step, Stores, Version, begin_trial, choose, confirm, file_head, link_padding,
 };
 
 use crate::model::{Nor, Torn};
@@ -248,7 +248,7 @@ impl Board {
             Side::First => (first, second),
             Side::Second => (second, first),
         };
-        if found.side != Layout::store_of(slot) {
+        if found.side != Stores::of(slot) {
             assert!(found.may_move);
             let _ = block_on(found.store.relocate().carry_out(from, to));
         }
@@ -333,7 +333,7 @@ impl Board {
         assert_eq!(self.marks().good, Some(chosen.slot));
         assert_eq!(self.marks().trial, None);
         self.move_store(chosen.slot);
-        assert_eq!(self.newest().side, Layout::store_of(chosen.slot));
+        assert_eq!(self.newest().side, Stores::of(chosen.slot));
     }
 }
 

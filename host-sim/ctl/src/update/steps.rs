@@ -178,7 +178,11 @@ pub fn begin_trial(
     // The trial ends by itself after that, and restarts take their time.
     let there = |now: &Firmware| now.trial.is_some();
     let failed = |now: &Firmware| {
-        now.last != before.last && now.trial.is_none() && now.slot == before.slot && now.last.is_some()
+        // Two trials of one slot may end alike. What was received is told until the restart.
+        let has_restarted = before.incoming.is_some() && now.incoming.is_none();
+        let tried = now.last.as_ref().map(|(slot, _)| *slot);
+        let is_of_this_trial = now.last != before.last || has_restarted && tried != now.slot;
+        is_of_this_trial && now.trial.is_none() && now.slot == before.slot && now.last.is_some()
     };
     back(client, RESTARTING, &there, &failed)
 }

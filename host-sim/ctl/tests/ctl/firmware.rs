@@ -173,7 +173,10 @@ fn arguments_that_mean_nothing_are_refused() {
         change(&mut folder.firmware, &path);
         folder.refused(words);
     };
-    change(&|firmware, _| firmware.board = "mps2-an500".to_owned(), "has slots; there is nucleo-h743zi");
+    change(
+        &|firmware, _| firmware.board = "mps2-an385".to_owned(),
+        "slots; there are nucleo-h743zi, mps2-an500",
+    );
     change(&|firmware, _| firmware.version = "0.3".to_owned(), "three numbers such as 0.3.0");
     change(&|firmware, _| firmware.reads = Some((3, 2)), "cannot write 2");
     change(&|firmware, _| firmware.writes = Some(9), "cannot write 9");

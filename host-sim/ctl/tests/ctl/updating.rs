@@ -26,6 +26,8 @@ enum Kind {
     Breaks,
     /// It runs the version of the update, in another build, and says which.
     Rebuilt,
+    /// What it is given does not run.
+    Fails,
 }
 
 #[derive(Debug, Default)]
@@ -89,7 +91,12 @@ fn answer(kind: Kind, inside: &mut Inside, asked: &Asked) -> Reply {
         }
         ("POST", "update/try") => {
             inside.confirm_s = asked.json()["confirm_s"].as_u64();
-            inside.on_trial = true;
+            inside.on_trial = kind != Kind::Fails;
+            if kind == Kind::Fails {
+                inside.last = Some("failed");
+                // It has restarted, and knows nothing of what came before.
+                inside.received.clear();
+            }
             document(202, "", &said(kind, inside))
         }
         ("POST", "update/confirm") => {
@@ -196,6 +203,21 @@ fn another_build_of_the_same_version_is_sent_and_the_same_one_is_not() {
     assert!(sent > 0);
     assert_eq!(rolled_out(&boards, &update).entries[0].outcome, Outcome::Already);
     assert_eq!(boards[0].count("PUT"), sent);
+}
+
+/// The second end of a trial is told as the first one, although the board says the same of both.
+#[test]
+fn a_firmware_that_does_not_run_is_told_each_time() {
+    let folder = Folder::new();
+    let update = folder.update();
+    let boards = [Kind::Fails].map(Board::start);
+    for _ in 0..2 {
+        let report = rolled_out(&boards, &update);
+        let Outcome::Failed { step: Step::Begin, why, .. } = &report.entries[0].outcome else {
+            panic!("{report:?}")
+        };
+        assert!(why.contains("the firmware did not run"), "{why}");
+    }
 }
 
 #[test]

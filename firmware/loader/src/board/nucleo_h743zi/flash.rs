@@ -7,11 +7,11 @@
 use core::sync::atomic::{Ordering, fence};
 
 use recipe_store::{Flash, Geometry, Place, Side, WORD, Word};
-use recipe_update::{NUCLEO_H743ZI as BOARD, Slot, SlotFlash};
+use recipe_update::{NUCLEO_H743ZI as BOARD, NUCLEO_H743ZI_STORES as STORES, Slot, SlotFlash};
 
-use crate::readable::can_read;
-use crate::register::Register;
-use crate::watchdog;
+use super::readable::can_read;
+use super::register::Register;
+use super::watchdog;
 
 /// A slot or a place for the store.
 pub(crate) struct Area {
@@ -32,7 +32,7 @@ impl Area {
     /// # Safety
     /// Nothing else is made for this place.
     pub(crate) unsafe fn store(side: Side) -> Self {
-        let [first, second] = BOARD.store(side);
+        let [first, second] = STORES.sectors(side);
         Self { sectors: [first, second, second, second, second], count: 2 }
     }
 

@@ -1,7 +1,7 @@
 //! LD3, the red lamp, at PB14: nothing can run.
 
-use crate::register::Register;
-use crate::watchdog;
+use super::register::Register;
+use super::watchdog;
 
 // SAFETY: registers of RCC and GPIOB, which the loader alone uses.
 const CLOCKS: Register = unsafe { Register::at(0x5802_44E0) };

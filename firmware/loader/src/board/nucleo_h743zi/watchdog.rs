@@ -3,7 +3,7 @@
 //! It runs from the first instruction on, also over the start of the firmware: a firmware on trial that hangs before
 //! it has a watchdog of its own comes to an end too.
 
-use crate::register::Register;
+use super::register::Register;
 
 // SAFETY: registers of IWDG1, which the loader alone uses.
 const KEY: Register = unsafe { Register::at(0x5800_4800) };

@@ -1,0 +1,104 @@
+//! QEMU's `mps2-an500`: slots and store are files of the host, a slot runs from the RAM for programs that it is copied
+//! to, and the log is on UART 3.
+
+#[path = "../../../../src/board/mps2_an500/arguments.rs"]
+mod arguments;
+#[path = "../../../../src/board/mps2_an500/console.rs"]
+mod console;
+#[path = "../../../../src/board/mps2_an500/host_flash.rs"]
+mod host_flash;
+#[path = "../../../../src/board/mps2_an500/registers.rs"]
+#[allow(dead_code, reason = "the firmware uses more devices")]
+mod registers;
+mod watchdog;
+
+use core::fmt;
+
+use recipe_store::{Place, WORD};
+pub(crate) use recipe_update::MPS2_AN500 as BOARD;
+use recipe_update::{Chosen, IMAGE_OFFSET, Slot, SlotFlash};
+
+use arguments::Name;
+pub(crate) use host_flash::HostFlash as Area;
+
+/// Before anything is read.
+pub(crate) fn start() {
+    watchdog::start();
+    console::start();
+}
+
+/// The slots, A first.
+///
+/// # Safety
+/// Called once, as on the other boards.
+pub(crate) unsafe fn slots() -> Option<[Area; 2]> {
+    let open = |slot: Slot| {
+        let name = Name::argument(SLOTS)?;
+        Area::open(&name, BOARD.slot_offset(slot), BOARD.slot_sectors)
+    };
+    let opened = open(Slot::A).zip(open(Slot::B));
+    if opened.is_none() {
+        say(format_args!("the file of the slots, the sixth semihosting argument, cannot be opened"));
+    }
+    opened.map(<[Area; 2]>::from)
+}
+
+/// The place for the store.
+///
+/// # Safety
+/// Called once, as on the other boards.
+pub(crate) unsafe fn stores() -> Option<(Area, Option<Area>)> {
+    let store = Area::open(&Name::argument(STORE)?, 0, STORE_SECTORS)?;
+    Some((store, None))
+}
+
+/// Into the log.
+pub(crate) fn say(line: fmt::Arguments<'_>) {
+    console::print(format_args!("loader: {line}\r\n"));
+}
+
+/// Copies what was chosen to its address; returns that of its vector table.
+pub(crate) fn load(chosen: &Chosen, slots: &[Area; 2]) -> Option<u32> {
+    let [a, b] = slots;
+    let slot = match chosen.slot {
+        Slot::A => a,
+        Slot::B => b,
+    };
+    let start = BOARD.slot(chosen.slot).checked_add(IMAGE_OFFSET)?;
+    let words = BOARD.sector.checked_div(WORD as u32)?;
+    let first = IMAGE_OFFSET.checked_div(WORD as u32)?;
+    for nth in 0..chosen.header.length().div_ceil(WORD as u32) {
+        let word = first.checked_add(nth)?;
+        let sector = u8::try_from(word.checked_div(words)?).ok()?;
+        let place = Place { sector, word: u16::try_from(word.checked_rem(words)?).ok()? };
+        let bytes = slot.whole(place)?;
+        let address = start.checked_add(nth.checked_mul(WORD as u32)?)?;
+        // SAFETY: RAM for programs, within the slot, because the header was checked to be for it: the loader is in
+        // front of the slots, and nothing else is in them.
+        unsafe { core::ptr::with_exposed_provenance_mut::<[u8; WORD]>(address as usize).write(bytes) }
+    }
+    let trial = if chosen.is_trial { " on trial" } else { "" };
+    say(format_args!("slot {:?} runs{trial}, version {}", chosen.slot, chosen.header.version()));
+    Some(start)
+}
+
+/// Leaves everything to the firmware but the watchdog, which goes on: what hangs before it feeds it has used a start.
+pub(crate) fn leave() {
+    watchdog::feed();
+}
+
+/// Only another file of the slots helps.
+pub(crate) fn nothing_runs() -> ! {
+    say(format_args!("no slot holds a firmware that can run"));
+    loop {
+        // The watchdog's interrupt wakes the core.
+        cortex_m::asm::wfi();
+        watchdog::feed();
+    }
+}
+
+/// The arguments with the names of the files. The firmware has them too.
+const STORE: usize = 3;
+const SLOTS: usize = 5;
+/// Sectors of the store.
+const STORE_SECTORS: u8 = 2;

@@ -1,0 +1,35 @@
+//! The watchdog: a counter that raises a non-maskable interrupt at its first zero and resets the machine at its second.
+//!
+//! It runs from the first instruction on, also over the start of the firmware: a firmware on trial that hangs before
+//! it has a watchdog of its own comes to an end too.
+
+use super::registers::{WATCHDOG, write};
+
+const LOAD: u32 = WATCHDOG;
+const CONTROL: u32 = WATCHDOG + 0x8;
+const INTCLEAR: u32 = WATCHDOG + 0xC;
+const LOCK: u32 = WATCHDOG + 0xC00;
+const UNLOCK: u32 = 0x1ACC_E551;
+/// Interrupt and reset enabled.
+const CONTROL_ON: u32 = 0b11;
+/// Cycles of 25 MHz until the counter is zero: 4 s, as the firmware has it.
+const HALF: u32 = 100_000_000;
+
+/// Starts it, with 8 s until the reset.
+pub(crate) fn start() {
+    write(LOCK, UNLOCK);
+    write(LOAD, HALF);
+    write(CONTROL, CONTROL_ON);
+    write(LOCK, 0);
+}
+
+/// Begins its time anew.
+pub(crate) fn feed() {
+    write(LOCK, UNLOCK);
+    write(INTCLEAR, 1);
+    write(LOCK, 0);
+}
+
+/// The emulator's host may be busy: the second half is left.
+#[cortex_m_rt::exception]
+unsafe fn NonMaskableInt() {}
