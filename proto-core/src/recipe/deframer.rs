@@ -215,7 +215,7 @@ impl Deframer {
     /// held.
     #[inline(always)]
     fn search<'c>(&mut self, layout: &StreamLayout, chunk: &mut &'c [u8]) -> Option<&'c [u8]> {
-        let skip = layout.head_word().find(chunk);
+        let skip = layout.head_word().find(chunk)?;
         count_visits(layout.head_word().len().saturating_mul(skip.saturating_add(1).min(chunk.len())));
         if skip > 0 {
             self.skip(skip);
@@ -250,7 +250,7 @@ impl Deframer {
             self.stats.tail_mismatches = self.stats.tail_mismatches.wrapping_add(1);
             self.skip(1);
             let rest = chunk.get(1..).unwrap_or(&[]);
-            let skip = layout.head_word().find(rest);
+            let skip = layout.head_word().find(rest).unwrap_or(0);
             count_visits(layout.head_word().len().saturating_mul(skip.saturating_add(1).min(rest.len())));
             self.skip(skip);
             *chunk = rest.get(skip..).unwrap_or(&[]);

@@ -67,13 +67,14 @@ impl Head {
         }
     }
 
-    /// Number of bytes at the front of `data` that cannot begin a frame.
+    /// Number of bytes at the front of `data` that cannot begin a frame; `None` if there is no data.
     #[inline]
-    pub(super) fn find(&self, data: &[u8]) -> usize {
+    pub(super) fn find(&self, data: &[u8]) -> Option<usize> {
         match data.first_chunk() {
-            Some(front) if self.is(front) => 0,
-            Some(_) => self.find_behind(data),
-            None => self.find_in_few(data),
+            Some(front) if self.is(front) => Some(0),
+            Some(_) => Some(self.find_behind(data)),
+            None if data.is_empty() => None,
+            None => Some(self.find_in_few(data)),
         }
     }
 
