@@ -47,8 +47,8 @@ const RING: usize = MAX_STREAM_FRAME;
 const WRAP: usize = RING - 1;
 const _: () = assert!(RING.is_power_of_two());
 
-/// How an attempt to complete a partial frame ended, and how many bytes of the chunk it took: fewer than two frames, since
-/// bytes of the chunk in front of which nothing is held any more are given back.
+/// How an attempt to complete a partial frame ended, and how many bytes of the chunk it took: fewer than two frames,
+/// since what was taken is given back when nothing before it is held any more.
 enum Held {
     /// A whole frame is in the ring from here on, and nothing is held any more.
     Frame { at: u16, taken: u16 },
