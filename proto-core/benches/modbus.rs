@@ -10,20 +10,28 @@ use divan::Bencher;
 use instructions::Work;
 use proto_core::modbus::adu::MAX_ADU;
 use proto_core::modbus::client::{Client, ClientEvent};
-use proto_core::modbus::map::{HOLDING, Space, check_read, check_write};
+use proto_core::modbus::map::{COILS, HOLDING, Space, check_read, check_write};
 use proto_core::modbus::pdu::{Request, Response};
 use proto_core::modbus::server::{RegisterBank, Server};
 use proto_core::modbus::{Coils, Exception, Registers};
 
 const WORDS: usize = HOLDING as usize;
 const DIGITAL_OUTPUTS: u16 = 192;
+/// All coils but the first, so that no byte of the answer is one of the bank.
+const COILS_READ: usize = COILS as usize - 1;
 
 fn main() -> ExitCode {
     let works = [
-        Work { name: "read 118 registers", limit: Some(500), run: |n| repeat(n, &mut Exchange::read) },
+        Work { name: "read 118 registers", limit: Some(480), run: |n| repeat(n, &mut Exchange::read) },
         Work { name: "read 118 registers, bare copy", limit: None, run: |n| repeat(n, &mut Bare::read) },
         Work { name: "write 16 coils", limit: Some(350), run: |n| repeat(n, &mut Exchange::write) },
         Work { name: "write 16 coils, bare copy", limit: None, run: |n| repeat(n, &mut Bare::write) },
+        Work { name: "read 231 coils", limit: Some(1200), run: |n| repeat(n, &mut Exchange::read_coils) },
+        Work {
+            name: "read 231 coils, one by one",
+            limit: None,
+            run: |n| repeat(n, &mut Exchange::read_each_coil),
+        },
     ];
     instructions::main(&works).unwrap_or_else(|| {
         divan::main();
@@ -55,6 +63,12 @@ fn write_16_coils_bare_copy(bencher: Bencher<'_, '_>) {
     bencher.bench_local(|| bare.write());
 }
 
+#[divan::bench]
+fn read_231_coils(bencher: Bencher<'_, '_>) {
+    let mut exchange = Exchange::default();
+    bencher.bench_local(|| exchange.read_coils());
+}
+
 fn repeat<T: Default>(iterations: u64, work: &mut impl FnMut(&mut T)) {
     let mut state = T::default();
     for _ in 0..iterations {
@@ -70,6 +84,10 @@ struct Exchange {
     request: [u8; MAX_ADU],
     answer: [u8; MAX_ADU],
     words: [u16; WORDS],
+    /// Eight coils each, as byte variables have them.
+    coils: [u8; COILS_READ.div_ceil(8)],
+    each_coil: [bool; COILS_READ],
+    each: bool,
 }
 
 impl Default for Exchange {
@@ -78,10 +96,16 @@ impl Default for Exchange {
         Self {
             client: Client::new(1),
             server: Server::new(),
-            bank: Bank { coils: [0; 29], words: words.map(u16::to_be_bytes) },
+            bank: Bank {
+                coils: std::array::from_fn(|nth| nth as u8 * 0x1B),
+                words: words.map(u16::to_be_bytes),
+            },
             request: [0; MAX_ADU],
             answer: [0; MAX_ADU],
             words: [0; WORDS],
+            coils: [0; COILS_READ.div_ceil(8)],
+            each_coil: [false; COILS_READ],
+            each: false,
         }
     }
 }
@@ -100,6 +124,18 @@ impl Exchange {
         assert_eq!(self.bank.coils[24..26], packed);
     }
 
+    fn read_coils(&mut self) {
+        let request = Request::ReadCoils { address: 1, count: black_box(COILS_READ as u16) };
+        self.exchange(request);
+        assert_eq!(self.coils[0], self.bank.coils[0] >> 1 | self.bank.coils[1] << 7);
+    }
+
+    fn read_each_coil(&mut self) {
+        self.each = true;
+        self.exchange(Request::ReadCoils { address: 1, count: black_box(COILS_READ as u16) });
+        assert_eq!(self.each_coil[7], self.bank.coils[1] & 1 == 1);
+    }
+
     fn exchange(&mut self, request: Request<'_>) {
         let sent = self.client.start(request, &mut self.request).expect("idle");
         let mut received = black_box(&self.request[..sent]);
@@ -110,22 +146,38 @@ impl Exchange {
             Some(ClientEvent::Response(Response::Registers(registers))) => {
                 self.words.iter_mut().zip(registers.iter()).for_each(|(word, value)| *word = value);
             }
+            Some(ClientEvent::Response(Response::Coils(coils))) => {
+                if self.each {
+                    self.each_coil.iter_mut().zip(coils.iter()).for_each(|(coil, on)| *coil = on);
+                } else {
+                    let firsts = (0..).step_by(8);
+                    self.coils.iter_mut().zip(firsts).for_each(|(eight, first)| {
+                        *eight = coils.byte(first).unwrap_or_default();
+                    });
+                }
+            }
             Some(ClientEvent::Response(_)) => {}
             other => panic!("{other:?}"),
         }
-        black_box(&mut self.words);
+        black_box((&mut self.words, &mut self.coils, &mut self.each_coil));
     }
 }
 
-/// The controller's map with its access rules, all of it kept as the wire has it.
+/// The controller's map with its access rules, all of it kept as the wire has it. A byte more, so that each coil is in
+/// two neighbours.
 struct Bank {
-    coils: [u8; 29],
+    coils: [u8; 30],
     words: [[u8; 2]; WORDS],
 }
 
 impl RegisterBank for Bank {
-    fn read_coils(&self, _: u16, _: u16, _: &mut [u8]) -> Result<(), Exception> {
-        Err(Exception::DeviceFailure)
+    fn read_coils(&self, address: u16, count: u16, packed: &mut [u8]) -> Result<(), Exception> {
+        check_read(Space::Coils, address, count)?;
+        let (first, shift) = (usize::from(address / 8), address % 8);
+        for (target, pair) in packed.iter_mut().zip(self.coils[first..].windows(2)) {
+            *target = (u16::from_le_bytes([pair[0], pair[1]]) >> shift) as u8;
+        }
+        Ok(())
     }
 
     fn write_coils(&mut self, address: u16, coils: Coils<'_>) -> Result<(), Exception> {

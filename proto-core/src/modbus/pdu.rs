@@ -8,6 +8,7 @@ pub use super::adu::MAX_PDU;
 use super::exception::Exception;
 pub use super::values::MAX_READ_COILS;
 use super::values::{Coils, Registers, packed_len};
+use crate::wire::runs;
 
 /// Most registers in one FC 3 request.
 pub const MAX_READ_REGISTERS: u16 = 0x007D;
@@ -512,7 +513,11 @@ fn copy_masked(data: &[u8], last_mask: u8, target: &mut [u8]) {
     if target.len() != data.len() {
         return;
     }
-    target.copy_from_slice(data);
+    if data.len() <= runs::MAX_RUN {
+        runs::copy(target, data);
+    } else {
+        target.copy_from_slice(data);
+    }
     if let Some(last) = target.last_mut() {
         *last &= last_mask;
     }

@@ -57,6 +57,7 @@ impl<'a> Coils<'a> {
     }
 
     /// Coil `nth`, counted from 0.
+    #[inline]
     pub fn coil(self, nth: u16) -> Option<bool> {
         if nth >= self.count {
             return None;
@@ -71,6 +72,7 @@ impl<'a> Coils<'a> {
 
     /// Up to eight coils from `first` on as one byte, the first in the least significant bit: a
     /// byte variable of the map. `None` if `first` is beyond the last coil.
+    #[inline]
     pub fn byte(self, first: u16) -> Option<u8> {
         let left = self.count.checked_sub(first).filter(|left| *left != 0)?;
         let at = usize::from(first >> 3);

@@ -8,7 +8,7 @@ use embedded_can::Frame;
 use heapless::Vec;
 
 use super::error::{EncodeError, FieldPlace, PartError, ValueError};
-use super::fields::{Applied, FrameFields, PlacedField, Pool, Share, Values};
+use super::fields::{Applied, FrameFields, PlacedField, Pool, Runs, Share, Values};
 use super::model::{Field, MAX_CAN_IDS, Rules};
 use crate::sysvar::IMAGE_BYTES;
 use crate::wire::can::{CanFrame, CanId, MAX_CAN_DATA};
@@ -44,8 +44,8 @@ pub enum CanReject {
 #[derive(Debug, Clone)]
 pub struct CanLayout {
     rules: Rules,
-    /// The frames' ids, in one word each.
-    keys: Vec<u32, MAX_CAN_IDS>,
+    /// The frames' ids, in one word each, as many as `shares`. The rest is [`NO_KEY`].
+    keys: [u32; MAX_CAN_IDS],
     shares: Vec<Share, MAX_CAN_IDS>,
     /// Places of the ids: indices of frames, or [`EMPTY`]. See [`CanLayout::search_order`].
     places: [u8; PLACES],
@@ -56,8 +56,9 @@ pub struct CanLayout {
 #[derive(Debug, Clone, Copy)]
 pub struct CanFrameLayout<'a> {
     id: CanId,
+    index: usize,
     share: &'a Share,
-    pool: &'a Pool,
+    layout: &'a CanLayout,
 }
 
 impl CanLayout {
@@ -69,8 +70,8 @@ impl CanLayout {
     where
         F: IntoIterator<Item = Field>,
     {
-        let mut layout =
-            Self { rules, keys: Vec::new(), shares: Vec::new(), places: [EMPTY; PLACES], pool: Pool::new() };
+        let (keys, places) = ([NO_KEY; MAX_CAN_IDS], [EMPTY; PLACES]);
+        let mut layout = Self { rules, keys, shares: Vec::new(), places, pool: Pool::new() };
         for (id, fields) in frames {
             layout.push(id, fields)?;
         }
@@ -84,7 +85,7 @@ impl CanLayout {
 
     /// The frames' ids, in declared order.
     pub fn ids(&self) -> impl ExactSizeIterator<Item = CanId> + Clone + '_ {
-        self.keys.iter().map(|&key| id_of(key))
+        self.keys.get(..self.shares.len()).unwrap_or(&[]).iter().map(|&key| id_of(key))
     }
 
     /// Number of frames in the part, 1..=32.
@@ -102,7 +103,8 @@ impl CanLayout {
             return Err(CanReject::Remote { id });
         }
         let index = self.index_of(key_of(id)).ok_or(CanReject::UnknownId { id })?;
-        let expected = self.shares.get(index).map_or(0, |share| share.len);
+        let share = self.shares.get(index).ok_or(CanReject::UnknownId { id })?;
+        let expected = share.whole.len() as u8;
         let got = frame.data().len();
         if got != usize::from(expected) {
             return Err(CanReject::WrongLength { frame: index as u8, expected, got: got as u8 });
@@ -119,8 +121,9 @@ impl CanLayout {
     /// The frame with this index in the part.
     #[inline]
     pub fn frame(&self, index: usize) -> Option<CanFrameLayout<'_>> {
-        let id = id_of(*self.keys.get(index)?);
-        Some(CanFrameLayout { id, share: self.shares.get(index)?, pool: &self.pool })
+        let share = self.shares.get(index)?;
+        let key = self.keys.get(index).copied().unwrap_or(NO_KEY);
+        Some(CanFrameLayout { id: id_of(key), index, share, layout: self })
     }
 
     /// The frames in declared order.
@@ -145,7 +148,7 @@ impl CanLayout {
         for (nth, field) in fields.into_iter().enumerate() {
             let at = FieldPlace { frame: Some(frame), field: nth.min(usize::from(u8::MAX)) as u8 };
             let shares = &self.shares;
-            let place_of = |nth| place_among(shares, frame, nth);
+            let place_of = |nth| place_among(shares, first_field, frame, nth);
             self.pool.push(self.rules, field, at, first_step, place_of)?;
             len = len.saturating_add(field.ty().size());
         }
@@ -161,16 +164,27 @@ impl CanLayout {
         {
             *place = frame;
         }
+        if let Some(place) = self.keys.get_mut(nth) {
+            *place = key;
+        }
+        let whole = self.pool.whole(first_step, len);
+        let share = Share { first_field: first_field as u8, first_step: first_step as u8, whole };
         // There is room: the count was checked above.
-        let share = self.pool.share_since(first_field, first_step, len);
-        self.shares.push(share).map_err(|_| PartError::TooManyFrames)?;
-        self.keys.push(key).map_err(|_| PartError::TooManyFrames)
+        self.shares.push(share).map_err(|_| PartError::TooManyFrames)
     }
 
     /// The index of the frame with this id. At least half of the places are empty, so the search is
     /// short.
     #[inline]
     fn index_of(&self, key: u32) -> Option<usize> {
+        let first = self.search_order(key).next()?;
+        let index = usize::from(*self.places.get(first)?);
+        if *self.keys.get(index)? == key { Some(index) } else { self.index_behind(key) }
+    }
+
+    /// The same, when there is another frame at its first choice.
+    #[inline(never)]
+    fn index_behind(&self, key: u32) -> Option<usize> {
         for at in self.search_order(key) {
             let index = usize::from(*self.places.get(at)?);
             // An empty place is not an index.
@@ -198,7 +212,7 @@ impl<'a> CanFrameLayout<'a> {
     /// Length of its data in bytes, 1..=8.
     #[allow(clippy::len_without_is_empty, reason = "no frame of a recipe is empty")]
     pub const fn len(&self) -> usize {
-        self.share.len as usize
+        self.share.whole.len()
     }
 
     /// Its fields in order, each with its place in the data.
@@ -226,17 +240,18 @@ impl<'a> CanFrameLayout<'a> {
     /// [`ValueError`]: a float that is not finite, or data of another length.
     #[inline]
     pub fn apply(&self, data: &[u8], image: &mut [u8; IMAGE_BYTES]) -> Result<Applied, ValueError> {
-        match self.pool.runs(self.share).and_then(|runs| runs.apply(data, image)) {
+        match self.share.whole.apply(data, image) {
             Some(applied) => Ok(applied),
-            None => self.check(data).map(|()| Applied::default()),
+            // Not by `self`, which would have to be in memory on the way above.
+            None => Self::apply_runs(self.layout, self.index, data, image),
         }
     }
 
     /// The frame with the image's values. User-defined fields have no place there and are zero.
     pub fn encode(&self, image: &[u8; IMAGE_BYTES]) -> CanFrame {
-        CanFrame::filled(self.id, self.share.len, |data| {
-            if let Some(runs) = self.pool.runs(self.share) {
-                runs.encode(image, data);
+        CanFrame::filled(self.id, self.len() as u8, |data| {
+            if !self.share.whole.encode(image, data) {
+                self.runs().encode(image, data);
             }
         })
     }
@@ -247,24 +262,51 @@ impl<'a> CanFrameLayout<'a> {
     /// [`EncodeError`]: too few or too many values, or a value of another type.
     pub fn encode_values(&self, values: &[Scalar]) -> Result<CanFrame, EncodeError> {
         self.frame_fields().accepts(values)?;
-        Ok(CanFrame::filled(self.id, self.share.len, |data| self.frame_fields().encode_values(values, data)))
+        Ok(CanFrame::filled(self.id, self.len() as u8, |data| {
+            self.frame_fields().encode_values(values, data)
+        }))
     }
 
     fn frame_fields(&self) -> FrameFields<'a> {
-        self.pool.fields(self.share)
+        let first = usize::from(self.share.first_field);
+        let end = self.next().map_or(self.layout.pool.field_count(), |next| usize::from(next.first_field));
+        self.layout.pool.fields(first, end, self.len())
+    }
+
+    fn runs(&self) -> Runs<'a> {
+        let first = usize::from(self.share.first_step);
+        let end = self.next().map_or(self.layout.pool.step_count(), |next| usize::from(next.first_step));
+        self.layout.pool.runs(first, end, self.len())
+    }
+
+    fn next(&self) -> Option<&'a Share> {
+        self.layout.shares.get(self.index.saturating_add(1))
+    }
+
+    #[inline(never)]
+    fn apply_runs(
+        layout: &CanLayout,
+        index: usize,
+        data: &[u8],
+        image: &mut [u8; IMAGE_BYTES],
+    ) -> Result<Applied, ValueError> {
+        // The index is of a frame.
+        let Some(frame) = layout.frame(index) else { return Ok(Applied::default()) };
+        match frame.runs().apply(data, image) {
+            Some(applied) => Ok(applied),
+            None => frame.check(data).map(|()| Applied::default()),
+        }
     }
 }
 
-/// The place of the n-th field of the part; fields after the finished frames belong to `frame`.
-fn place_among(finished: &[Share], frame: u8, nth: usize) -> FieldPlace {
-    let holds = |share: &Share| nth < usize::from(share.field_end);
-    let index = finished.iter().position(holds);
-    let first = match index.and_then(|index| finished.get(index)) {
-        Some(share) => share.first_field,
-        None => finished.last().map_or(0, |share| share.field_end),
+/// The place of the n-th field of the part; fields from `first_field` on belong to the new `frame`.
+fn place_among(finished: &[Share], first_field: usize, frame: u8, nth: usize) -> FieldPlace {
+    let begun = finished.iter().take_while(|share| usize::from(share.first_field) <= nth).enumerate().last();
+    let (frame, first) = match begun {
+        Some((index, share)) if nth < first_field => (index as u8, usize::from(share.first_field)),
+        _ => (frame, first_field),
     };
-    let frame = index.map_or(frame, |index| index as u8);
-    FieldPlace { frame: Some(frame), field: nth.saturating_sub(usize::from(first)) as u8 }
+    FieldPlace { frame: Some(frame), field: nth.saturating_sub(first) as u8 }
 }
 
 /// Twice the maximum number of ids, so that the search for a missing one ends soon.
@@ -275,6 +317,9 @@ const _: () = assert!(PLACES.is_power_of_two());
 const SPREAD: u32 = 0x9E37_79B1;
 /// No frame has this index.
 const EMPTY: u8 = u8::MAX;
+
+/// No id has this key.
+const NO_KEY: u32 = u32::MAX;
 
 /// Marks an extended id in a key.
 const EXTENDED: u32 = 1 << 31;

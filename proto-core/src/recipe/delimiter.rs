@@ -51,6 +51,13 @@ impl Head {
         same(front, &self.bytes, &self.mask)
     }
 
+    /// Whether the lowest `seen` of eight bytes, 1 to the head's length, are the beginning of the head.
+    #[inline(always)]
+    pub(super) fn may_be(&self, bytes: u64, seen: usize) -> bool {
+        let unseen = 64_u32.wrapping_sub(8_u32.wrapping_mul(seen as u32));
+        (bytes ^ u64::from_le_bytes(self.bytes)).wrapping_shl(unseen) == 0
+    }
+
     /// Whether `data` begins with the head, or is the beginning of it.
     #[inline]
     pub(super) fn agrees(&self, data: &[u8]) -> bool {
@@ -60,25 +67,40 @@ impl Head {
         }
     }
 
-    /// Number of bytes at the front of `data` that cannot begin a frame.
+    /// Number of bytes at the front of `data` that cannot begin a frame; `None` if there is no data.
     #[inline]
-    pub(super) fn find(&self, data: &[u8]) -> usize {
+    pub(super) fn find(&self, data: &[u8]) -> Option<usize> {
         match data.first_chunk() {
-            Some(front) if self.is(front) => 0,
-            _ => self.find_further(data),
+            Some(front) if self.is(front) => Some(0),
+            Some(_) => Some(self.find_behind(data)),
+            None if data.is_empty() => None,
+            None => Some(self.find_in_few(data)),
         }
     }
 
+    /// The same, when the first eight bytes do not begin with the head.
     #[inline(never)]
-    fn find_further(&self, data: &[u8]) -> usize {
+    fn find_behind(&self, data: &[u8]) -> usize {
+        let mut rest = data;
+        while let Some((_, behind)) = rest.split_first() {
+            rest = behind;
+            match rest.first_chunk() {
+                Some(front) if self.is(front) => return data.len().wrapping_sub(rest.len()),
+                Some(_) => {}
+                None => break,
+            }
+        }
+        data.len().wrapping_sub(rest.len()).wrapping_add(self.find_in_few(rest))
+    }
+
+    /// The same in fewer than eight bytes, which are compared with the beginning of the head.
+    #[inline(never)]
+    fn find_in_few(&self, data: &[u8]) -> usize {
         let mut skip = 0_usize;
         let mut rest = data;
         while !self.agrees(rest) {
-            let [first, ..] = self.bytes;
-            let behind = rest.get(1..).unwrap_or(&[]);
-            let ahead = behind.iter().position(|&byte| byte == first).unwrap_or(behind.len());
-            skip = skip.saturating_add(ahead).saturating_add(1);
-            rest = behind.get(ahead..).unwrap_or(&[]);
+            rest = rest.get(1..).unwrap_or(&[]);
+            skip = skip.wrapping_add(1);
         }
         skip
     }

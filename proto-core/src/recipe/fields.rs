@@ -84,7 +84,7 @@ pub(super) struct FrameFields<'a> {
     len: usize,
 }
 
-/// One frame's runs.
+/// One frame's runs, of which there are several, or none if its fields are user-defined.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Runs<'a> {
     steps: &'a [Step],
@@ -92,15 +92,12 @@ pub(super) struct Runs<'a> {
     len: usize,
 }
 
-/// The range of fields and runs of a [`Pool`] that belong to a frame, and their length on the wire.
+/// Where the fields and runs of a frame begin in a [`Pool`]. They end where those of the next frame begin.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Share {
     pub(super) first_field: u8,
-    pub(super) field_end: u8,
     pub(super) first_step: u8,
-    pub(super) step_end: u8,
-    /// Bytes.
-    pub(super) len: u8,
+    pub(super) whole: Step,
 }
 
 impl Pool {
@@ -151,39 +148,23 @@ impl Pool {
         Ok(())
     }
 
-    /// The fields and runs added since `first_field` and `first_step` were the next ones.
-    pub(super) fn share_since(&self, first_field: usize, first_step: usize, len: usize) -> Share {
-        Share {
-            first_field: first_field as u8,
-            field_end: self.field_count() as u8,
-            first_step: first_step as u8,
-            step_end: self.step_count() as u8,
-            len: len as u8,
+    /// A frame of `len` bytes as one run: all of what was added since `first_step` was the next one. Most parts are;
+    /// else the run is nowhere in the image.
+    pub(super) fn whole(&self, first_step: usize, len: usize) -> Step {
+        match self.steps.get(first_step..) {
+            Some([step]) => *step,
+            _ => Step { image: NOWHERE, len: u8::try_from(len).unwrap_or_default(), kind: Kind::PLAIN },
         }
     }
 
-    /// The fields of one of several frames.
-    pub(super) fn fields(&self, share: &Share) -> FrameFields<'_> {
-        let range = usize::from(share.first_field)..usize::from(share.field_end);
-        FrameFields { fields: self.fields.get(range).unwrap_or(&[]), len: usize::from(share.len) }
+    /// The fields from `first` to before `end`, of a frame of `len` bytes.
+    pub(super) fn fields(&self, first: usize, end: usize, len: usize) -> FrameFields<'_> {
+        FrameFields { fields: self.fields.get(first..end).unwrap_or(&[]), len }
     }
 
-    /// The runs of one of several frames.
-    #[inline]
-    pub(super) fn runs(&self, share: &Share) -> Option<Runs<'_>> {
-        let range = usize::from(share.first_step)..usize::from(share.step_end);
-        Some(Runs { steps: self.steps.get(range)?, len: usize::from(share.len) })
-    }
-
-    /// The fields of a part that is one frame.
-    pub(super) fn all_fields(&self, len: usize) -> FrameFields<'_> {
-        FrameFields { fields: &self.fields, len }
-    }
-
-    /// The runs of a part that is one frame.
-    #[inline]
-    pub(super) fn all_runs(&self, len: usize) -> Runs<'_> {
-        Runs { steps: &self.steps, len }
+    /// The runs from `first` to before `end`, of a frame of `len` bytes.
+    pub(super) fn runs(&self, first: usize, end: usize, len: usize) -> Runs<'_> {
+        Runs { steps: self.steps.get(first..end).unwrap_or(&[]), len }
     }
 }
 
@@ -208,16 +189,8 @@ impl Step {
 impl Runs<'_> {
     /// Writes a payload into the image; `None`, with nothing written, if [`FrameFields::check`] has
     /// to look closer.
-    #[inline(always)]
-    pub(super) fn apply(self, payload: &[u8], image: &mut [u8; IMAGE_BYTES]) -> Option<Applied> {
-        // Most parts are one run.
-        let [step] = self.steps else { return self.apply_many(payload, image) };
-        (payload.len() == usize::from(step.len) && step.accepts(payload))
-            .then(|| Applied { masked: step.write(payload, image) })
-    }
-
     #[inline(never)]
-    fn apply_many(self, payload: &[u8], image: &mut [u8; IMAGE_BYTES]) -> Option<Applied> {
+    pub(super) fn apply(self, payload: &[u8], image: &mut [u8; IMAGE_BYTES]) -> Option<Applied> {
         if payload.len() != self.len {
             return None;
         }
@@ -242,16 +215,8 @@ impl Runs<'_> {
     }
 
     /// Fills a payload from the image; user-defined fields have no place there and become zero.
-    #[inline]
-    pub(super) fn encode(self, image: &[u8; IMAGE_BYTES], payload: &mut [u8]) {
-        match self.steps {
-            [step] => step.read(image, payload),
-            _ => self.encode_many(image, payload),
-        }
-    }
-
     #[inline(never)]
-    fn encode_many(self, image: &[u8; IMAGE_BYTES], payload: &mut [u8]) {
+    pub(super) fn encode(self, image: &[u8; IMAGE_BYTES], payload: &mut [u8]) {
         let mut rest = payload;
         for step in self.steps {
             let Some((run, after)) = rest.split_at_mut_checked(usize::from(step.len)) else { return };
@@ -316,6 +281,38 @@ impl<'a> FrameFields<'a> {
 }
 
 impl Step {
+    /// Bytes of the payload.
+    #[inline]
+    pub(super) const fn len(&self) -> usize {
+        self.len as usize
+    }
+
+    /// Writes a payload that is one run into the image; `None`, with nothing written, if [`Runs::apply`] or
+    /// [`FrameFields::check`] has to look closer.
+    #[inline(always)]
+    pub(super) fn apply(&self, payload: &[u8], image: &mut [u8; IMAGE_BYTES]) -> Option<Applied> {
+        if payload.len() != self.len() {
+            return None;
+        }
+        let target = image.get_mut(self.range())?;
+        if self.kind == Kind::FLOATS {
+            return runs::copy_finite(target, payload).then_some(Applied { masked: 0 });
+        }
+        Some(Applied { masked: self.put(payload, target) })
+    }
+
+    /// Fills a payload that is one run from the image; `false`, with nothing written, if it is none.
+    #[inline(always)]
+    pub(super) fn encode(&self, image: &[u8; IMAGE_BYTES], payload: &mut [u8]) -> bool {
+        match image.get(self.range()) {
+            Some(source) if payload.len() == source.len() => {
+                runs::copy(payload, source);
+                true
+            }
+            _ => false,
+        }
+    }
+
     /// Whether the values of a run may be used.
     #[inline]
     fn accepts(&self, run: &[u8]) -> bool {
@@ -326,7 +323,11 @@ impl Step {
     /// set.
     #[inline]
     fn write(&self, run: &[u8], image: &mut [u8; IMAGE_BYTES]) -> u16 {
-        let Some(target) = image.get_mut(self.range()) else { return 0 };
+        image.get_mut(self.range()).map_or(0, |target| self.put(run, target))
+    }
+
+    #[inline]
+    fn put(&self, run: &[u8], target: &mut [u8]) -> u16 {
         match self.kind {
             Kind::PLAIN | Kind::FLOATS => {
                 runs::copy(target, run);
@@ -354,3 +355,7 @@ impl Step {
         start..start.saturating_add(usize::from(self.len))
     }
 }
+
+/// No run is so far behind in the image.
+const NOWHERE: u16 = u16::MAX;
+const _: () = assert!(IMAGE_BYTES < NOWHERE as usize);

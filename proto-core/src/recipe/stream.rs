@@ -5,7 +5,7 @@
 
 use super::delimiter::{Head, Tail};
 use super::error::{EncodeError, FieldPlace, NoSpace, PartError, ValueError};
-use super::fields::{Applied, FrameFields, PlacedField, Pool, Values};
+use super::fields::{Applied, FrameFields, PlacedField, Pool, Runs, Step, Values};
 use super::model::{Field, Framing, MAX_DELIMITER, MAX_STREAM_FRAME, Mode, Rules};
 use crate::sysvar::IMAGE_BYTES;
 use crate::wire::runs;
@@ -19,6 +19,7 @@ pub struct StreamLayout {
     tail: Tail,
     frame_len: u16,
     payload_len: u16,
+    whole: Step,
     pool: Pool,
 }
 
@@ -54,8 +55,9 @@ impl StreamLayout {
         if frame_len > MAX_STREAM_FRAME {
             return Err(PartError::StreamFrameTooLong { len: frame_len });
         }
+        let whole = pool.whole(0, payload_len);
         let (frame_len, payload_len) = (frame_len as u16, payload_len as u16);
-        Ok(Self { rules, head, tail, frame_len, payload_len, pool })
+        Ok(Self { rules, head, tail, frame_len, payload_len, whole, pool })
     }
 
     /// The mode and the direction of the part.
@@ -108,9 +110,9 @@ impl StreamLayout {
     /// [`ValueError`]: a float that is not finite, or a payload of another length.
     #[inline]
     pub fn apply(&self, payload: &[u8], image: &mut [u8; IMAGE_BYTES]) -> Result<Applied, ValueError> {
-        match self.pool.all_runs(self.payload_len()).apply(payload, image) {
+        match self.whole.apply(payload, image) {
             Some(applied) => Ok(applied),
-            None => self.check(payload).map(|()| Applied::default()),
+            None => self.apply_runs(payload, image),
         }
     }
 
@@ -122,7 +124,9 @@ impl StreamLayout {
     #[inline]
     pub fn encode(&self, image: &[u8; IMAGE_BYTES], out: &mut [u8]) -> Result<usize, NoSpace> {
         let payload = self.delimited(out)?;
-        self.pool.all_runs(self.payload_len()).encode(image, payload);
+        if !self.whole.encode(image, payload) {
+            self.all_runs().encode(image, payload);
+        }
         Ok(self.frame_len())
     }
 
@@ -140,7 +144,19 @@ impl StreamLayout {
     }
 
     fn all_fields(&self) -> FrameFields<'_> {
-        self.pool.all_fields(self.payload_len())
+        self.pool.fields(0, self.pool.field_count(), self.payload_len())
+    }
+
+    fn all_runs(&self) -> Runs<'_> {
+        self.pool.runs(0, self.pool.step_count(), self.payload_len())
+    }
+
+    #[inline(never)]
+    fn apply_runs(&self, payload: &[u8], image: &mut [u8; IMAGE_BYTES]) -> Result<Applied, ValueError> {
+        match self.all_runs().apply(payload, image) {
+            Some(applied) => Ok(applied),
+            None => self.check(payload).map(|()| Applied::default()),
+        }
     }
 
     pub(super) const fn head_word(&self) -> &Head {

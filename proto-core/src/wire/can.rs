@@ -27,6 +27,9 @@ pub enum CanId {
 pub struct CanFrame {
     id: CanId,
     remote: bool,
+    /// The data length code: what a remote frame asks for.
+    dlc: u8,
+    /// Bytes of data; none in a remote frame.
     len: u8,
     data: [u8; MAX_CAN_DATA],
 }
@@ -62,7 +65,8 @@ impl From<embedded_can::Id> for CanId {
 impl CanFrame {
     /// A data frame; `None` when the id is too large for its kind or there are more than 8 bytes.
     pub fn new(id: CanId, data: &[u8]) -> Option<Self> {
-        let mut frame = Self { id, remote: false, len: data.len() as u8, data: [0; MAX_CAN_DATA] };
+        let len = data.len() as u8;
+        let mut frame = Self { id, remote: false, dlc: len, len, data: [0; MAX_CAN_DATA] };
         frame.data.get_mut(..data.len())?.copy_from_slice(data);
         id.is_valid().then_some(frame)
     }
@@ -71,7 +75,7 @@ impl CanFrame {
     /// is more than 8.
     pub fn remote(id: CanId, len: usize) -> Option<Self> {
         let fits = id.is_valid() && len <= MAX_CAN_DATA;
-        fits.then_some(Self { id, remote: true, len: len as u8, data: [0; MAX_CAN_DATA] })
+        fits.then_some(Self { id, remote: true, dlc: len as u8, len: 0, data: [0; MAX_CAN_DATA] })
     }
 
     /// A data frame of `len` bytes, which `fill` writes. The caller has checked that the id is
@@ -82,7 +86,7 @@ impl CanFrame {
         if let Some(used) = data.get_mut(..usize::from(len)) {
             fill(used);
         }
-        Self { id, remote: false, len, data }
+        Self { id, remote: false, dlc: len, len, data }
     }
 
     /// A data frame of the first [`MAX_CAN_DATA`] of these bytes. The caller has checked that the id
@@ -107,8 +111,7 @@ impl CanFrame {
 
     /// The data; empty in a remote frame.
     pub fn data(&self) -> &[u8] {
-        let len = if self.remote { 0 } else { usize::from(self.len) };
-        self.data.get(..len).unwrap_or(&[])
+        self.data.get(..usize::from(self.len)).unwrap_or(&[])
     }
 }
 
@@ -142,7 +145,7 @@ impl Frame for CanFrame {
     }
 
     fn dlc(&self) -> usize {
-        usize::from(self.len)
+        usize::from(self.dlc)
     }
 
     fn data(&self) -> &[u8] {

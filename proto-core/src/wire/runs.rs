@@ -64,25 +64,52 @@ fn both_ends<const N: usize>(to: &mut [u8], from: &[u8], by: impl Fn([u8; N]) ->
 pub(crate) fn all_finite(run: &[u8]) -> bool {
     debug_assert!(run.len() <= MAX_RUN && run.len().is_multiple_of(4));
     match run.len() {
-        16.. => finite_at_both_ends::<16>(run),
-        8.. => finite_at_both_ends::<8>(run),
-        _ => finite_at_both_ends::<4>(run),
+        16.. => finite_ends::<16>(run).is_some(),
+        8.. => finite_ends::<8>(run).is_some(),
+        4.. => finite_ends::<4>(run).is_some(),
+        _ => true,
+    }
+}
+
+/// The same and [`copy`] in one; nothing is copied unless all numbers are finite.
+#[inline(always)]
+pub(crate) fn copy_finite(to: &mut [u8], run: &[u8]) -> bool {
+    debug_assert!(to.len() == run.len() && run.len() <= MAX_RUN && run.len().is_multiple_of(4));
+    match run.len() {
+        16.. => finite_ends::<16>(run).is_some_and(|_| {
+            both_ends(to, run, |bytes: [u8; 16]| u128::from_ne_bytes(bytes).to_ne_bytes());
+            true
+        }),
+        9.. => finite_ends::<8>(run).is_some_and(|_| {
+            both_ends(to, run, as_is::<8>);
+            true
+        }),
+        // Both ends are the same.
+        8 => one_end::<8>(to, run),
+        4.. => one_end::<4>(to, run),
+        _ => true,
     }
 }
 
 #[inline(always)]
-fn finite_at_both_ends<const N: usize>(run: &[u8]) -> bool {
-    match (run.first_chunk::<N>(), run.last_chunk::<N>()) {
-        (Some(front), Some(back)) => {
-            let (front, back) = (front.as_chunks().0, back.as_chunks().0);
-            // Looking at all of them without a branch for each is one vector operation.
-            !front
-                .iter()
-                .zip(back)
-                .fold(false, |any, (&front, &back)| any | is_special(front) | is_special(back))
+fn one_end<const N: usize>(to: &mut [u8], run: &[u8]) -> bool {
+    match (to.first_chunk_mut(), finite_ends::<N>(run)) {
+        (Some(target), Some((all, _))) => {
+            *target = *all;
+            true
         }
-        _ => true,
+        _ => false,
     }
+}
+
+/// The numbers in the first and in the last bytes of a run, which overlap, if all are finite.
+#[inline(always)]
+fn finite_ends<const N: usize>(run: &[u8]) -> Option<(&[u8; N], &[u8; N])> {
+    let (front, back) = (run.first_chunk::<N>()?, run.last_chunk::<N>()?);
+    let numbers = front.as_chunks().0.iter().zip(back.as_chunks().0);
+    // Looking at all of them without a branch for each is one vector operation.
+    let special = numbers.fold(false, |any, (&front, &back)| any | is_special(front) | is_special(back));
+    (!special).then_some((front, back))
 }
 
 /// Whether all bits of the number's exponent are set: adding one to it then carries into the sign.
@@ -131,11 +158,18 @@ mod tests {
             let floats: Vec<f32> = ordinary.into_iter().cycle().take(count).collect();
             let bytes = |floats: &[f32]| -> Vec<u8> { floats.iter().flat_map(|f| f.to_le_bytes()).collect() };
             assert!(all_finite(&bytes(&floats)), "{count} ordinary numbers");
+            let mut to = vec![0xA5; 4 * count + 2];
+            assert!(copy_finite(&mut to[1..=4 * count], &bytes(&floats)));
+            assert_eq!(to[1..=4 * count], bytes(&floats));
+            assert_eq!((to[0], to[4 * count + 1]), (0xA5, 0xA5));
             for at in 0..count {
                 for special in specials {
                     let mut floats = floats.clone();
                     floats[at] = special;
                     assert!(!all_finite(&bytes(&floats)), "{special} at {at} of {count}");
+                    let mut to = vec![0xA5; 4 * count];
+                    assert!(!copy_finite(&mut to, &bytes(&floats)), "{special} at {at} of {count}");
+                    assert_eq!(to, vec![0xA5; 4 * count]);
                 }
             }
         }
