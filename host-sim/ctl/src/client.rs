@@ -5,6 +5,7 @@
 //! machine, where the API would take it: a forwarded port leads to another one.
 
 use std::cell::RefCell;
+use std::io::ErrorKind;
 use std::net::SocketAddr;
 use std::time::Duration;
 
@@ -218,7 +219,7 @@ impl Client {
 
     /// Whether it needs no key: reading on this machine.
     fn is_open(&self, call: &Call<'_>) -> bool {
-        call.method == "GET" && self.places.iter().all(|place| place.ip().to_canonical().is_loopback())
+        call.method == "GET" && self.places.iter().copied().all(is_here)
     }
 
     fn take_nonce(&self) -> Result<String, Failure> {
@@ -256,14 +257,29 @@ impl Client {
         };
         let timeout = self.timeout + call.more_time;
         let mut last = None;
-        for &place in &self.places {
-            match Exchange::start(place, &request, timeout, &self.stop) {
-                // Nothing was sent, so another address of the name may be tried.
-                Err(NoReply::Unreached(error)) => {
-                    let hint = self.address.hint(place);
-                    last = Some(format!("nobody is there: {place}: {}{hint}", words(&error)));
+        for attempt in 0..ATTEMPTS {
+            if attempt > 0 && self.stop.wait(AGAIN) {
+                return Err(self.no_reply(NoReply::Stopped));
+            }
+            let mut may_be_full = false;
+            for &place in &self.places {
+                match Exchange::start(place, &request, timeout, &self.stop) {
+                    // Nothing was sent, so another address of the name may be tried.
+                    Err(NoReply::Unreached(error)) => {
+                        may_be_full |= error.kind() == ErrorKind::ConnectionRefused && !is_here(place);
+                        let hint = self.address.hint(place);
+                        last = Some(format!("nobody is there: {place}: {}{hint}", words(&error)));
+                    }
+                    // By a forwarded port. What changes something may have been done, and a nonce is used once.
+                    Err(NoReply::Reset(why)) if call.method == "GET" && nonce.is_none() => {
+                        may_be_full = true;
+                        last = Some(why);
+                    }
+                    done => return done.map_err(|error| self.no_reply(error)),
                 }
-                done => return done.map_err(|error| self.no_reply(error)),
+            }
+            if !may_be_full {
+                break;
             }
         }
         Err(self.refused(last.unwrap_or_default()))
@@ -272,7 +288,7 @@ impl Client {
     fn no_reply(&self, error: NoReply) -> Failure {
         match error {
             NoReply::Unreached(error) => self.refused(words(&error)),
-            NoReply::Broken(why) => self.refused(why),
+            NoReply::Reset(why) | NoReply::Broken(why) => self.refused(why),
             NoReply::Stopped => self.refused("ended before the answer came"),
         }
     }
@@ -308,9 +324,22 @@ impl Client {
             _ => String::new(),
         };
         let key = document["key"].as_str().map(|key| format!("{}: ", shown::line(key))).unwrap_or_default();
-        Failure::Wrong(format!("{}: the configuration is refused: {place}{key}{said}", self.address))
+        // Only a configuration has places and keys.
+        let what =
+            if place.is_empty() && key.is_empty() { "it is refused" } else { "the configuration is refused" };
+        Failure::Wrong(format!("{}: {what}: {place}{key}{said}", self.address))
     }
 }
+
+/// Whether it is on this machine.
+fn is_here(place: SocketAddr) -> bool {
+    place.ip().to_canonical().is_loopback()
+}
+
+/// A board has four places for connections, and turns others away while they are taken: it is asked so many times.
+const ATTEMPTS: u32 = 6;
+/// Between two of them.
+const AGAIN: Duration = Duration::from_millis(200);
 
 /// The events of a gateway.
 #[derive(Debug)]

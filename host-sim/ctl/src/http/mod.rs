@@ -64,6 +64,8 @@ impl Reply {
 pub(crate) enum NoReply {
     /// No connection was made; nothing was sent.
     Unreached(io::Error),
+    /// The connection was reset.
+    Reset(String),
     /// It ended, or took too long, or is none.
     Broken(String),
     /// The command shall end.
@@ -243,6 +245,9 @@ fn receive(
                 return Ok(count);
             }
             Err(error) if is_wait(&error) => {}
+            Err(error) if error.kind() == io::ErrorKind::ConnectionReset => {
+                return Err(NoReply::Reset(words(&error)));
+            }
             Err(error) => return Err(NoReply::Broken(words(&error))),
         }
     }

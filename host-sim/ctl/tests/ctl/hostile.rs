@@ -1,9 +1,9 @@
 //! Servers that are broken, or mean it: everything ends in time, in little room, with one message.
 
-use std::io::Write;
+use std::io::{Read, Write};
 use std::time::{Duration, Instant};
 
-use recipe_ctl::{Client, Failure, Watched};
+use recipe_ctl::{Client, Failure, Stop, Watched};
 use serde_json::json;
 
 use crate::server::*;
@@ -161,4 +161,35 @@ fn names_never_reach_a_terminal_as_they_came() {
     }
     let message = message(recipe_ctl::metrics(&client));
     assert!(message.contains("\\u{1b}]0;x"), "{message}");
+}
+
+/// As a board does whose places are all taken, by a forwarded port.
+#[test]
+fn who_resets_connections_is_asked_again_but_not_to_change_something_twice() {
+    let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let at = listener.local_addr().unwrap();
+    let asked = std::thread::spawn(move || {
+        let mut methods = Vec::new();
+        for (nth, stream) in listener.incoming().take(4).enumerate() {
+            let mut stream = stream.unwrap();
+            // What was not read when it is closed resets it.
+            let mut method = [0; 4];
+            while stream.peek(&mut method).unwrap() < method.len() {}
+            methods.push(String::from_utf8(method.to_vec()).unwrap());
+            if nth == 2 {
+                let mut request = [0; 4_096];
+                while !request.windows(4).any(|four| four == b"\r\n\r\n") {
+                    stream.read(&mut request).unwrap();
+                }
+                stream
+                    .write_all(b"HTTP/1.1 200 OK\r\nContent-Length: 15\r\n\r\n{\"name\":\"cell\"}")
+                    .unwrap();
+            }
+        }
+        methods
+    });
+    let client = Client::new(at.to_string().parse().unwrap(), None, PATIENT, Stop::new()).unwrap();
+    recipe_ctl::info(&client).unwrap();
+    assert!(message(recipe_ctl::confirm(&client)).contains("reset"));
+    assert_eq!(asked.join().unwrap(), ["GET ", "GET ", "GET ", "POST"]);
 }
