@@ -97,7 +97,7 @@ impl Default for Exchange {
             client: Client::new(1),
             server: Server::new(),
             bank: Bank {
-                coils: std::array::from_fn(|nth| nth as u8 * 0x1B),
+                coils: std::array::from_fn(|nth| (nth as u8).wrapping_mul(0x1B)),
                 words: words.map(u16::to_be_bytes),
             },
             request: [0; MAX_ADU],

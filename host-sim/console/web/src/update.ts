@@ -23,7 +23,7 @@ const FILE_HEAD = 16;
 /** The filler behind an image is up to a multiple of this. */
 const WORD = 32;
 /** Longest image of each board in bytes: a slot without its first KiB. */
-export const ROOM: Record<string, number> = { "nucleo-h743zi": 5 * 0x20000 - 1024 };
+export const ROOM: Record<string, number> = { "mps2-an500": 5 * 0x20000 - 1024, "nucleo-h743zi": 5 * 0x20000 - 1024 };
 
 /** The other slot. */
 export const otherThan = (slot: Slot): Slot => (slot === "A" ? "B" : "A");

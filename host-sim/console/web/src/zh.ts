@@ -331,6 +331,8 @@ export const zh: Record<string, string> = {
     "This board takes no update: {why}.": "此板不接受更新：{why}。",
     "QEMU runs the program that it is given: there are no slots": "QEMU 运行所给的程序，没有槽",
     "there is no loader with a key at the beginning of the flash": "闪存开头没有带密钥的引导程序",
+    "no file of the slots was named": "没有指定槽的文件",
+    "the file of the slots cannot be opened": "无法打开槽的文件",
     "this firmware was linked for the beginning of the flash, where the loader would be": "此固件链接在闪存开头，即引导程序的位置",
     "The board restarts with another firmware.": "板正在以另一固件重新启动。",
     "It is not back after a minute. This page goes on asking it.": "一分钟后仍未恢复。此页面会继续查询。",
