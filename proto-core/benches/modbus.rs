@@ -22,11 +22,11 @@ const COILS_READ: usize = COILS as usize - 1;
 
 fn main() -> ExitCode {
     let works = [
-        Work { name: "read 118 registers", limit: Some(480), run: |n| repeat(n, &mut Exchange::read) },
+        Work { name: "read 118 registers", limit: Some(350), run: |n| repeat(n, &mut Exchange::read) },
         Work { name: "read 118 registers, bare copy", limit: None, run: |n| repeat(n, &mut Bare::read) },
-        Work { name: "write 16 coils", limit: Some(350), run: |n| repeat(n, &mut Exchange::write) },
+        Work { name: "write 16 coils", limit: Some(240), run: |n| repeat(n, &mut Exchange::write) },
         Work { name: "write 16 coils, bare copy", limit: None, run: |n| repeat(n, &mut Bare::write) },
-        Work { name: "read 231 coils", limit: Some(1200), run: |n| repeat(n, &mut Exchange::read_coils) },
+        Work { name: "read 231 coils", limit: Some(1160), run: |n| repeat(n, &mut Exchange::read_coils) },
         Work {
             name: "read 231 coils, one by one",
             limit: None,
@@ -144,7 +144,7 @@ impl Exchange {
         let mut received = black_box(&self.answer[..answered]);
         match self.client.receive(&mut received) {
             Some(ClientEvent::Response(Response::Registers(registers))) => {
-                self.words.iter_mut().zip(registers.iter()).for_each(|(word, value)| *word = value);
+                registers.copy_to(&mut self.words);
             }
             Some(ClientEvent::Response(Response::Coils(coils))) => {
                 if self.each {
@@ -183,9 +183,8 @@ impl RegisterBank for Bank {
     fn write_coils(&mut self, address: u16, coils: Coils<'_>) -> Result<(), Exception> {
         check_write(Space::Coils, address, coils.count())?;
         if address.is_multiple_of(8) && coils.count().is_multiple_of(8) {
-            let first = usize::from(address / 8);
-            self.coils[first..][..coils.packed().len()].copy_from_slice(coils.packed());
-            return Ok(());
+            let target = self.coils.get_mut(usize::from(address / 8)..).unwrap_or_default();
+            return coils.copy_to(target).map(|_| ()).ok_or(Exception::IllegalDataAddress);
         }
         Err(Exception::DeviceFailure)
     }

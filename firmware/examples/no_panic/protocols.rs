@@ -130,11 +130,13 @@ fn modbus_values() {
     if let Some(coils) = any(Coils::new(bytes(), any(9))) {
         black_box((coils.coil(any(3)), coils.byte(any(3)), coils.last_mask(), coils == any(coils)));
         coils.iter().for_each(|coil| _ = black_box(coil));
+        black_box(coils.copy_to(room(&mut out)));
     }
     black_box(Coils::pack(bytes().iter().map(|byte| byte & 1 != 0), room(&mut out)));
     if let Some(registers) = any(Registers::new(bytes())) {
         black_box((registers.register(any(3)), registers.count()));
         registers.iter().rev().for_each(|register| _ = black_box(register));
+        black_box(registers.copy_to(black_box(&mut [0; 128][..])));
     }
     black_box(Registers::pack(bytes().iter().map(|&byte| u16::from(byte)), room(&mut out)));
     black_box(Registers::from_little_endian(bytes(), room(&mut out)));

@@ -10,11 +10,22 @@ pub const MAX_ADU: usize = 260;
 pub const HEADER_LEN: usize = 7;
 /// Longest PDU.
 pub const MAX_PDU: usize = 253;
+/// Length of a header and a function code.
+pub(super) const FRONT_LEN: usize = 8;
 
 /// Length of the header up to and including its length field.
 const PREFIX_LEN: usize = 6;
+/// The fields of a [`Front`].
+const TRANSACTION_SHIFT: u32 = 48;
+const TRANSACTION: u64 = 0xFFFF << TRANSACTION_SHIFT;
+const LENGTH_SHIFT: u32 = 16;
+const UNIT_SHIFT: u32 = 8;
+const UNIT: u64 = 0xFF << UNIT_SHIFT;
+const FUNCTION: u64 = 0xFF;
 /// The length field counts the unit id and the PDU: at least a function code, at most 253 bytes (D10).
-const LENGTHS: core::ops::RangeInclusive<u16> = 2..=254;
+const LENGTHS: core::ops::RangeInclusive<u16> = NO_DATA..=254;
+/// The length field of a frame without anything behind its function code.
+const NO_DATA: u16 = 2;
 
 /// One received frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -56,14 +67,6 @@ impl fmt::Display for AduError {
 
 impl core::error::Error for AduError {}
 
-/// The header of a frame that carries `pdu_len` bytes of PDU.
-#[inline]
-pub(super) const fn header(transaction: u16, unit: u8, pdu_len: usize) -> [u8; HEADER_LEN] {
-    let [t1, t0] = transaction.to_be_bytes();
-    let [l1, l0] = (pdu_len as u16).wrapping_add(1).to_be_bytes();
-    [t1, t0, 0, 0, l1, l0, unit]
-}
-
 /// Cuts a connection's bytes into frames.
 ///
 /// Holds at most one partial frame. A frame that lies whole in a chunk is returned in place,
@@ -74,12 +77,18 @@ pub struct AduReader {
     filled: usize,
 }
 
-/// Where a whole frame is.
+/// A whole frame.
 #[derive(Clone, Copy)]
-pub(super) enum Place<'c> {
-    Chunk(&'c [u8]),
-    Buffer(usize),
+pub(super) struct Frame<'a> {
+    pub(super) front: Front,
+    /// What comes behind the function code.
+    pub(super) data: &'a [u8],
 }
+
+/// Transaction id, protocol id, length, unit id and function code: what every frame begins with, as one number, the
+/// first byte in its highest bits. So they are compared and written at once.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Front(u64);
 
 impl Default for AduReader {
     fn default() -> Self {
@@ -100,8 +109,17 @@ impl AduReader {
     /// After an [`AduError`] the rest of the chunk is dropped and the connection must be closed;
     /// the reader is at the start of a connection again.
     pub fn next_adu<'s, 'c: 's>(&'s mut self, chunk: &mut &'c [u8]) -> Option<Result<Adu<'s>, AduError>> {
-        let place = self.advance(chunk)?;
-        Some(place.map(|place| self.adu(place)))
+        let received = *chunk;
+        let (front, bytes) = match self.take(chunk) {
+            Some(Frame { front, .. }) => (front, received),
+            None => match self.next_buffered(chunk)? {
+                Ok(front) => (front, &self.buffer[..]),
+                Err(error) => return Some(Err(error)),
+            },
+        };
+        let pdu = bytes.get(HEADER_LEN..).and_then(|behind| behind.get(..front.data_len().saturating_add(1)));
+        let (transaction, unit) = (front.transaction(), front.unit());
+        Some(Ok(Adu { transaction, unit, pdu: pdu.unwrap_or_default() }))
     }
 
     /// Forgets a partial frame, for a new connection.
@@ -114,56 +132,44 @@ impl AduReader {
         self.filled
     }
 
+    /// Takes a frame that lies whole at the front of `chunk`. `None`, with nothing taken, if
+    /// [`Self::next_buffered`] has to look at what is there.
     #[inline]
-    pub(super) fn advance<'c>(&mut self, chunk: &mut &'c [u8]) -> Option<Result<Place<'c>, AduError>> {
-        if chunk.is_empty() {
-            return None;
-        }
-        if self.filled != 0 {
-            return self.advance_buffered(chunk);
-        }
-        let Some(prefix) = chunk.first_chunk() else { return self.advance_buffered(chunk) };
-        let total = match frame_len(prefix) {
-            Ok(total) => total,
-            Err(error) => return Some(Err(self.fail(chunk, error))),
-        };
-        let Some((frame, rest)) = chunk.split_at_checked(total) else {
-            return self.advance_buffered(chunk);
-        };
+    pub(super) fn take<'c>(&self, chunk: &mut &'c [u8]) -> Option<Frame<'c>> {
+        let (front, behind) = chunk.split_first_chunk().filter(|_| self.filled == 0)?;
+        let front = Front::from_bytes(front);
+        let (data, rest) = behind.split_at_checked(front.checked_data_len()?)?;
         *chunk = rest;
-        Some(Ok(Place::Chunk(frame)))
+        Some(Frame { front, data })
     }
 
-    /// The frame at `place`, which must come from the last call of [`AduReader::advance`].
-    #[inline]
-    pub(super) fn adu<'s, 'c: 's>(&'s self, place: Place<'c>) -> Adu<'s> {
-        let frame = match place {
-            Place::Chunk(frame) => frame,
-            Place::Buffer(len) => self.buffer.get(..len).unwrap_or_default(),
-        };
-        match frame.split_first_chunk::<HEADER_LEN>() {
-            Some((&[t1, t0, _, _, _, _, unit], pdu)) => {
-                Adu { transaction: u16::from_be_bytes([t1, t0]), unit, pdu }
-            }
-            // Not reached: every place holds at least a header and one byte.
-            None => Adu { transaction: 0, unit: 0, pdu: &[] },
-        }
-    }
-
+    /// Takes what a frame in pieces needs, and returns the front of the one that is whole then; its data is
+    /// [`Self::data`]. A header that is wrong comes here too.
     #[cold]
-    fn advance_buffered<'c>(&mut self, chunk: &mut &'c [u8]) -> Option<Result<Place<'c>, AduError>> {
-        if !self.fill_to(PREFIX_LEN, chunk) {
+    #[inline(never)]
+    pub(super) fn next_buffered(&mut self, chunk: &mut &[u8]) -> Option<Result<Front, AduError>> {
+        // As most chunks end.
+        if chunk.is_empty() || !self.fill_to(PREFIX_LEN, chunk) {
             return None;
         }
         let total = match self.buffer.first_chunk().map(frame_len)? {
             Ok(total) => total,
-            Err(error) => return Some(Err(self.fail(chunk, error))),
+            Err(error) => {
+                self.filled = 0;
+                *chunk = &[];
+                return Some(Err(error));
+            }
         };
         if !self.fill_to(total, chunk) {
             return None;
         }
         self.filled = 0;
-        Some(Ok(Place::Buffer(total)))
+        Some(Ok(Front::from_bytes(self.buffer.first_chunk()?)))
+    }
+
+    /// The data of the frame that [`Self::next_buffered`] has just returned the front of.
+    pub(super) fn data(&self, front: Front) -> &[u8] {
+        self.buffer.get(FRONT_LEN..).and_then(|behind| behind.get(..front.data_len())).unwrap_or_default()
     }
 
     /// Moves bytes from `chunk` until `target` are buffered; false if the chunk was too short.
@@ -178,12 +184,75 @@ impl AduReader {
         *chunk = rest;
         self.filled >= target
     }
+}
 
-    #[cold]
-    fn fail(&mut self, chunk: &mut &[u8], error: AduError) -> AduError {
-        self.filled = 0;
-        *chunk = &[];
-        error
+impl Front {
+    /// How the first frame of a connection to a unit begins, but for its length and function code.
+    pub(super) const fn first(unit: u8) -> Self {
+        Self((unit as u64) << UNIT_SHIFT)
+    }
+
+    /// The same of the next frame to that unit, with a function code and without a length.
+    #[inline]
+    pub(super) const fn next(self, function: u8) -> Self {
+        Self((self.0 & (TRANSACTION | UNIT)).wrapping_add(1 << TRANSACTION_SHIFT) | function as u64)
+    }
+
+    /// This front, of a frame with `had` bytes behind the function code, of one with `data_len` bytes there.
+    #[inline]
+    pub(super) const fn resized(self, had: usize, data_len: usize) -> Self {
+        Self(self.0.wrapping_add((data_len as u64).wrapping_sub(had as u64) << LENGTH_SHIFT))
+    }
+
+    /// This front, which is without a length, of a frame with `data_len` bytes behind the function code.
+    #[inline]
+    pub(super) const fn carrying(self, data_len: usize) -> Self {
+        Self(self.0 | ((data_len as u16).wrapping_add(NO_DATA) as u64) << LENGTH_SHIFT)
+    }
+
+    /// The same front with another function code.
+    pub(super) const fn with_function(self, function: u8) -> Self {
+        Self(self.0 & !FUNCTION | function as u64)
+    }
+
+    #[inline]
+    pub(super) const fn from_bytes(bytes: &[u8; FRONT_LEN]) -> Self {
+        Self(u64::from_be_bytes(*bytes))
+    }
+
+    #[inline]
+    pub(super) const fn to_bytes(self) -> [u8; FRONT_LEN] {
+        self.0.to_be_bytes()
+    }
+
+    #[inline]
+    pub(super) const fn transaction(self) -> u16 {
+        (self.0 >> TRANSACTION_SHIFT) as u16
+    }
+
+    #[inline]
+    pub(super) const fn unit(self) -> u8 {
+        (self.0 >> UNIT_SHIFT) as u8
+    }
+
+    #[inline]
+    pub(super) const fn function(self) -> u8 {
+        self.0 as u8
+    }
+
+    /// Number of bytes behind the function code, of a front whose header is right.
+    #[inline]
+    pub(super) const fn data_len(self) -> usize {
+        ((self.0 >> LENGTH_SHIFT) as u16).wrapping_sub(NO_DATA) as usize
+    }
+
+    /// The same; `None` if the header is wrong.
+    #[inline]
+    fn checked_data_len(self) -> Option<usize> {
+        // Protocol id and length together: the id has to be 0.
+        let length = (self.0 >> LENGTH_SHIFT) as u32;
+        let range = u32::from(*LENGTHS.start())..=u32::from(*LENGTHS.end());
+        range.contains(&length).then(|| length.wrapping_sub(NO_DATA.into()) as usize)
     }
 }
 

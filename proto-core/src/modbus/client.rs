@@ -6,19 +6,22 @@
 
 use core::fmt;
 
-use super::adu::{self, Adu, AduError, AduReader, HEADER_LEN};
+use super::adu::{AduError, AduReader, FRONT_LEN, Frame, Front, HEADER_LEN};
 use super::exception::Exception;
+use super::parts::{OPERANDS_LEN, Operands, Parts, copy_cleared};
 use super::pdu::{EncodeError, Request, RequestHead, Response, ResponseError};
 
 /// The client's side of one connection.
 #[derive(Debug, Clone)]
 pub struct Client {
     reader: AduReader,
-    unit: u8,
-    transaction: u16,
     in_flight: bool,
-    /// The newest request, in flight or not.
-    request: RequestHead,
+    /// How the answer to the newest request begins if it was carried out, in flight or not.
+    answer: Front,
+    /// How many bytes come behind that.
+    answer_len: u16,
+    /// Address, and count or value of the newest request.
+    operands: Operands,
     stale: u32,
 }
 
@@ -102,8 +105,8 @@ impl core::error::Error for StartError {}
 impl Client {
     /// A client for a new connection to the server's unit id `unit`.
     pub const fn new(unit: u8) -> Self {
-        let request = RequestHead { function: 0, address: 0, count_or_value: 0 };
-        Self { reader: AduReader::new(), unit, transaction: 0, in_flight: false, request, stale: 0 }
+        let (answer, operands) = (Front::first(unit), Operands::new(0, 0));
+        Self { reader: AduReader::new(), in_flight: false, answer, answer_len: 0, operands, stale: 0 }
     }
 
     /// Whether a request is in flight.
@@ -113,7 +116,12 @@ impl Client {
 
     /// Function code, address and count or value of the request in flight.
     pub const fn in_flight(&self) -> Option<RequestHead> {
-        if self.in_flight { Some(self.request) } else { None }
+        if self.in_flight { Some(self.request()) } else { None }
+    }
+
+    /// The newest request, in flight or not.
+    const fn request(&self) -> RequestHead {
+        self.operands.of(self.answer.function())
     }
 
     /// Answers that arrived after their request had been given up, since the start.
@@ -133,40 +141,98 @@ impl Client {
             return Err(StartError::Busy);
         }
         let parts = request.parts();
-        let available = out.len();
-        let no_space = || {
-            let needed = parts.encoded_len().saturating_add(HEADER_LEN);
-            StartError::Encode(EncodeError::NoSpace { needed, available })
-        };
-        let (header, body) = out.split_first_chunk_mut().ok_or_else(no_space)?;
-        let pdu_len = parts.encode(body).map_err(|error| match error {
-            EncodeError::NoSpace { .. } => no_space(),
-            other => StartError::Encode(other),
-        })?;
-        self.transaction = self.transaction.wrapping_add(1);
-        *header = adu::header(self.transaction, self.unit, pdu_len);
+        // What tells reads from writes is asked first, so that a request of a known kind goes straight there.
+        match parts.data {
+            None => {
+                parts.check_count().map_err(StartError::Encode)?;
+                let available = out.len();
+                let heads = out.first_chunk_mut().ok_or_else(|| no_space(&parts, available))?;
+                self.begin(&parts, heads, OPERANDS_LEN, parts.answer_len);
+                Ok(HEADS_LEN)
+            }
+            Some((data, unused)) => {
+                parts.check_count().map_err(StartError::Encode)?;
+                let no_space = no_space(&parts, out.len());
+                let (heads, rest) = out.split_first_chunk_mut().ok_or(no_space)?;
+                let (byte_count, rest) = rest.split_first_mut().ok_or(no_space)?;
+                let target = rest.get_mut(..data.len()).ok_or(no_space)?;
+                // At most 246 bytes by the limits of the count.
+                *byte_count = data.len() as u8;
+                copy_cleared(data, unused, target);
+                self.begin(&parts, heads, parts.data_len(), OPERANDS_LEN);
+                Ok(parts.data_len().wrapping_add(FRONT_LEN))
+            }
+        }
+    }
+
+    /// Writes what a request's frame has before its data, and waits for the answer.
+    #[inline]
+    fn begin(&mut self, parts: &Parts<'_>, heads: &mut [u8; HEADS_LEN], data_len: usize, answer_len: usize) {
+        let newest = self.answer.next(parts.function);
+        if let Some((front, rest)) = heads.split_first_chunk_mut() {
+            *front = newest.carrying(data_len).to_bytes();
+            if let Some(operands) = rest.first_chunk_mut() {
+                *operands = parts.operands.to_bytes();
+            }
+        }
+        self.answer = newest.carrying(answer_len);
+        self.answer_len = answer_len as u16;
+        self.operands = parts.operands;
         self.in_flight = true;
-        self.request = parts.head;
-        Ok(pdu_len.saturating_add(HEADER_LEN))
     }
 
     /// Takes bytes from the front of `bytes` up to the end of the next answer and returns what it
     /// says; `None` once all of `bytes` is taken. To be called until then.
     #[inline]
     pub fn receive<'s, 'c: 's>(&'s mut self, bytes: &mut &'c [u8]) -> Option<ClientEvent<'s>> {
+        match self.take_answer(bytes) {
+            Some(response) => Some(ClientEvent::Response(response)),
+            // As most chunks end.
+            None if bytes.is_empty() => None,
+            None => self.receive_other(bytes),
+        }
+    }
+
+    /// Takes the one answer that is expected, whole and at the front of the chunk. `None`, with nothing taken, if
+    /// [`Self::receive_other`] has to look closer.
+    #[inline]
+    fn take_answer<'c>(&mut self, bytes: &mut &'c [u8]) -> Option<Response<'c>> {
+        if !self.in_flight {
+            return None;
+        }
+        let (front, behind) = bytes.split_first_chunk()?;
+        if Front::from_bytes(front) != self.answer || self.reader.pending() != 0 {
+            return None;
+        }
+        let (data, rest) = behind.split_at_checked(usize::from(self.answer_len))?;
+        let response = Response::expected(self.answer.function(), self.operands, data)?;
+        self.in_flight = false;
+        *bytes = rest;
+        Some(response)
+    }
+
+    /// The same for anything else that may come: answers in pieces, refusals, late answers, violations.
+    #[inline(never)]
+    fn receive_other<'s, 'c: 's>(&'s mut self, bytes: &mut &'c [u8]) -> Option<ClientEvent<'s>> {
+        let newest = self.answer.transaction();
         loop {
-            let place = match self.reader.advance(bytes)? {
-                Ok(place) => place,
-                Err(error) => return Some(self.violated(bytes, Violation::Header(error))),
+            let (front, in_chunk) = match self.reader.take(bytes) {
+                Some(Frame { front, data }) => (front, Some(data)),
+                None => match self.reader.next_buffered(bytes)? {
+                    Ok(front) => (front, None),
+                    Err(error) => return Some(self.violated(bytes, Violation::Header(error))),
+                },
             };
-            let Adu { transaction, unit, .. } = self.reader.adu(place);
-            if self.in_flight && transaction == self.transaction {
-                if unit != self.unit {
-                    let violation = Violation::Unit { expected: self.unit, received: unit };
-                    return Some(self.violated(bytes, violation));
+            let received = front.transaction();
+            if self.in_flight && received == newest {
+                let (expected, received) = (self.answer.unit(), front.unit());
+                if received != expected {
+                    return Some(self.violated(bytes, Violation::Unit { expected, received }));
                 }
                 self.in_flight = false;
-                return Some(match Response::parse(self.request, self.reader.adu(place).pdu) {
+                let request = self.request();
+                let data = in_chunk.unwrap_or_else(|| self.reader.data(front));
+                return Some(match Response::parse_data(request, front.function(), data) {
                     Ok(Ok(response)) => ClientEvent::Response(response),
                     Ok(Err(exception)) => ClientEvent::Exception(exception),
                     Err(error) => {
@@ -176,9 +242,8 @@ impl Client {
                 });
             }
             // Ids count up, so those in the half circle behind the newest one are older.
-            if self.transaction.wrapping_sub(transaction) >= 0x8000 {
-                let violation = Violation::Transaction { newest: self.transaction, received: transaction };
-                return Some(self.violated(bytes, violation));
+            if newest.wrapping_sub(received) >= 0x8000 {
+                return Some(self.violated(bytes, Violation::Transaction { newest, received }));
             }
             self.stale = self.stale.saturating_add(1);
         }
@@ -202,3 +267,11 @@ impl Client {
         ClientEvent::Violation(violation)
     }
 }
+
+fn no_space(parts: &Parts<'_>, available: usize) -> StartError {
+    let needed = parts.encoded_len().saturating_add(HEADER_LEN);
+    StartError::Encode(EncodeError::NoSpace { needed, available })
+}
+
+/// What a frame has before its data.
+const HEADS_LEN: usize = FRONT_LEN + OPERANDS_LEN;

@@ -69,10 +69,8 @@ pub fn check_read(space: Space, address: u16, count: u16) -> Result<(), Exceptio
         Space::Coils => COILS,
         Space::Holding => HOLDING,
     };
-    match address.checked_add(count) {
-        Some(past) if past <= end => Ok(()),
-        _ => Err(Exception::IllegalDataAddress),
-    }
+    let past = u32::from(address).wrapping_add(u32::from(count));
+    if past <= u32::from(end) { Ok(()) } else { Err(Exception::IllegalDataAddress) }
 }
 
 /// Checks that `count` items from `address` can be written, all of them (D10).
@@ -85,8 +83,9 @@ pub fn check_write(space: Space, address: u16, count: u16) -> Result<(), Excepti
         Space::Coils => COIL_RUNS.get(usize::from(address)),
         Space::Holding => HOLDING_RUNS.get(usize::from(address)),
     };
-    match (run_end, address.checked_add(count)) {
-        (Some(run_end), Some(past)) if past <= *run_end => Ok(()),
+    let past = u32::from(address).wrapping_add(u32::from(count));
+    match run_end {
+        Some(run_end) if past <= u32::from(*run_end) => Ok(()),
         _ => Err(Exception::IllegalDataAddress),
     }
 }

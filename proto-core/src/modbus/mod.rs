@@ -34,6 +34,7 @@ pub mod adu;
 pub mod client;
 mod exception;
 pub mod map;
+mod parts;
 pub mod pdu;
 pub mod rtu;
 pub mod server;

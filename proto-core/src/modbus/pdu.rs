@@ -6,9 +6,9 @@ use core::fmt;
 
 pub use super::adu::MAX_PDU;
 use super::exception::Exception;
+use super::parts::{COIL_OFF, COIL_ON, NO_COUNT, Operands, Parts, coil_value, copy_cleared, in_limit};
 pub use super::values::MAX_READ_COILS;
 use super::values::{Coils, Registers, packed_len};
-use crate::wire::runs;
 
 /// Most registers in one FC 3 request.
 pub const MAX_READ_REGISTERS: u16 = 0x007D;
@@ -242,8 +242,10 @@ impl<'a> Request<'a> {
     /// function or byte count.
     #[inline]
     pub fn parse(pdu: &'a [u8]) -> Result<Self, Exception> {
-        let Some((head, rest)) = pdu.split_first_chunk() else { return Err(refusal(pdu)) };
-        let RequestHead { function, address, count_or_value } = RequestHead::from_bytes(head);
+        let (&function, data) = pdu.split_first().ok_or(Exception::IllegalFunction)?;
+        let Some((operands, rest)) = data.split_first_chunk() else { return Err(refusal(function)) };
+        let operands = Operands::from_bytes(operands);
+        let (address, count_or_value) = (operands.address(), operands.count_or_value());
         let request = match (function, rest) {
             (function::READ_COILS, []) if in_limit(count_or_value, MAX_READ_COILS) => {
                 Self::ReadCoils { address, count: count_or_value }
@@ -260,7 +262,7 @@ impl<'a> Request<'a> {
             {
                 match Coils::exact(packed, count_or_value) {
                     Some(coils) => Self::WriteCoils { address, coils },
-                    None => return Err(refusal(pdu)),
+                    None => return Err(refusal(function)),
                 }
             }
             (function::WRITE_REGISTERS, [byte_count, bytes @ ..])
@@ -268,10 +270,10 @@ impl<'a> Request<'a> {
             {
                 match Registers::exact(bytes, count_or_value) {
                     Some(registers) => Self::WriteRegisters { address, registers },
-                    None => return Err(refusal(pdu)),
+                    None => return Err(refusal(function)),
                 }
             }
-            _ => return Err(refusal(pdu)),
+            _ => return Err(refusal(function)),
         };
         Ok(request)
     }
@@ -279,7 +281,8 @@ impl<'a> Request<'a> {
     /// Function code, address, and count or value.
     #[inline]
     pub fn head(&self) -> RequestHead {
-        self.parts().head
+        let parts = self.parts();
+        parts.operands.of(parts.function)
     }
 
     /// Length of the request's PDU; 5..=252 for a request that can be sent.
@@ -299,18 +302,16 @@ impl<'a> Request<'a> {
 
     #[inline]
     pub(super) fn parts(&self) -> Parts<'a> {
-        let single = |function, address, count_or_value, max| Parts {
-            head: RequestHead { function, address, count_or_value },
-            max,
-            data: None,
-        };
+        let single = Parts::new;
         match *self {
-            Self::ReadCoils { address, count } => {
-                single(function::READ_COILS, address, count, MAX_READ_COILS)
-            }
-            Self::ReadHolding { address, count } => {
-                single(function::READ_HOLDING, address, count, MAX_READ_REGISTERS)
-            }
+            Self::ReadCoils { address, count } => Parts {
+                answer_len: packed_len(count).wrapping_add(1),
+                ..single(function::READ_COILS, address, count, MAX_READ_COILS)
+            },
+            Self::ReadHolding { address, count } => Parts {
+                answer_len: usize::from(count).wrapping_mul(2).wrapping_add(1),
+                ..single(function::READ_HOLDING, address, count, MAX_READ_REGISTERS)
+            },
             Self::WriteCoil { address, value } => {
                 single(function::WRITE_COIL, address, coil_value(value), NO_COUNT)
             }
@@ -318,88 +319,85 @@ impl<'a> Request<'a> {
                 single(function::WRITE_REGISTER, address, value, NO_COUNT)
             }
             Self::WriteCoils { address, coils } => Parts {
-                data: Some((coils.packed(), coils.last_mask())),
+                data: Some((coils.packed(), coils.unused())),
                 ..single(function::WRITE_COILS, address, coils.count(), MAX_WRITE_COILS)
             },
             Self::WriteRegisters { address, registers } => Parts {
-                data: Some((registers.as_be_bytes(), 0xFF)),
+                data: Some((registers.as_be_bytes(), 0)),
                 ..single(function::WRITE_REGISTERS, address, registers.count(), MAX_WRITE_REGISTERS)
             },
         }
     }
 }
 
-/// The contents of a request's PDU.
-#[derive(Clone, Copy)]
-pub(super) struct Parts<'a> {
-    pub(super) head: RequestHead,
-    /// Limit of the count, or [`NO_COUNT`].
-    max: u16,
-    /// The data of a multiple write, and the bits of its last byte that are sent.
-    data: Option<(&'a [u8], u8)>,
-}
-
-impl Parts<'_> {
-    #[inline]
-    pub(super) fn encoded_len(&self) -> usize {
-        self.data.map_or(HEAD_LEN, |(data, _)| data.len().saturating_add(MULTIPLE_HEAD_LEN))
-    }
-
-    #[inline]
-    pub(super) fn encode(&self, out: &mut [u8]) -> Result<usize, EncodeError> {
-        let (count, max) = (self.head.count_or_value, self.max);
-        if max != NO_COUNT && !in_limit(count, max) {
-            return Err(EncodeError::Count { count, max });
-        }
-        let (needed, available) = (self.encoded_len(), out.len());
-        let no_space = EncodeError::NoSpace { needed, available };
-        let out = out.get_mut(..needed).ok_or(no_space)?;
-        let (head, rest) = out.split_first_chunk_mut().ok_or(no_space)?;
-        *head = self.head.to_bytes();
-        if let Some((data, last_mask)) = self.data
-            && let Some((byte_count, target)) = rest.split_first_mut()
-        {
-            // At most 246 bytes by the check above.
-            *byte_count = data.len() as u8;
-            copy_masked(data, last_mask, target);
-        }
-        Ok(needed)
-    }
-}
-
 impl<'a> Response<'a> {
+    /// The answer to a request of `function` that was carried out; `data` is what comes behind its
+    /// function code, of the length that the request asks for. `None` if it is not exactly that.
+    #[inline]
+    pub(super) fn expected(function: u8, operands: Operands, data: &'a [u8]) -> Option<Self> {
+        let (address, count_or_value) = (operands.address(), operands.count_or_value());
+        // By ranges, so that one comparison tells reads from writes: it is a function that a request can have.
+        match function {
+            0..=function::READ_COILS => {
+                let (byte_count, packed) = data.split_first()?;
+                let coils = Coils::of_request(packed, count_or_value);
+                (usize::from(*byte_count) == packed.len()).then_some(Self::Coils(coils))
+            }
+            function::READ_DISCRETE..=function::READ_HOLDING => {
+                let (byte_count, bytes) = data.split_first()?;
+                let registers = Registers::of_request(bytes);
+                (usize::from(*byte_count) == bytes.len()).then_some(Self::Registers(registers))
+            }
+            _ if Operands::from_bytes(data.try_into().ok()?) != operands => None,
+            function::WRITE_COIL => Some(Self::WroteCoil { address, value: count_or_value != COIL_OFF }),
+            function::WRITE_REGISTER => Some(Self::WroteRegister { address, value: count_or_value }),
+            function::WRITE_COILS => Some(Self::WroteCoils { address, count: count_or_value }),
+            _ => Some(Self::WroteRegisters { address, count: count_or_value }),
+        }
+    }
+
     /// Reads the answer to `request`: a response, or the exception the server refused it with.
     ///
     /// # Errors
     /// [`ResponseError`] when the bytes do not answer that request.
     #[inline]
     pub fn parse(request: RequestHead, pdu: &'a [u8]) -> Result<Result<Self, Exception>, ResponseError> {
+        match pdu.split_first() {
+            Some((&received, data)) => Self::parse_data(request, received, data),
+            None => Err(ResponseError::Length { expected: HEAD_LEN, received: 0 }),
+        }
+    }
+
+    /// The same for the function code and what comes behind it.
+    pub(super) fn parse_data(
+        request: RequestHead,
+        received: u8,
+        data: &'a [u8],
+    ) -> Result<Result<Self, Exception>, ResponseError> {
         let RequestHead { function, address, count_or_value } = request;
-        let Some((received, data)) = pdu.split_first() else {
-            return Err(ResponseError::Length { expected: HEAD_LEN, received: 0 });
-        };
-        if *received != function {
-            return parse_exception(function, *received, data).map(Err);
+        if received != function {
+            return parse_exception(function, received, data).map(Err);
         }
         match function {
             function::READ_COILS => {
                 let packed = counted(data, packed_len(count_or_value))?;
                 match Coils::exact(packed, count_or_value) {
                     Some(coils) => Ok(Ok(Self::Coils(coils))),
-                    None => Err(unanswerable(pdu)),
+                    None => Err(unanswerable(data)),
                 }
             }
             function::READ_HOLDING => {
                 let bytes = counted(data, usize::from(count_or_value).saturating_mul(2))?;
                 match Registers::new(bytes) {
                     Some(registers) => Ok(Ok(Self::Registers(registers))),
-                    None => Err(unanswerable(pdu)),
+                    None => Err(unanswerable(data)),
                 }
             }
             _ => {
-                let echo = <&[u8; HEAD_LEN]>::try_from(pdu)
-                    .map_err(|_| ResponseError::Length { expected: HEAD_LEN, received: pdu.len() })?;
-                let echo = RequestHead::from_bytes(echo);
+                let Ok(echo) = data.try_into().map(Operands::from_bytes) else {
+                    return Err(unanswerable(data));
+                };
+                let echo = echo.of(function);
                 if echo != request {
                     return Err(ResponseError::Echo { expected: request, received: echo });
                 }
@@ -434,14 +432,14 @@ impl<'a> Response<'a> {
             Self::Coils(coils) => {
                 if let [function, byte_count, data @ ..] = out {
                     (*function, *byte_count) = (function::READ_COILS, data.len() as u8);
-                    copy_masked(coils.packed(), coils.last_mask(), data);
+                    copy_cleared(coils.packed(), coils.unused(), data);
                 }
                 return Ok(needed);
             }
             Self::Registers(registers) => {
                 if let [function, byte_count, data @ ..] = out {
                     (*function, *byte_count) = (function::READ_HOLDING, data.len() as u8);
-                    copy_masked(registers.as_be_bytes(), 0xFF, data);
+                    copy_cleared(registers.as_be_bytes(), 0, data);
                 }
                 return Ok(needed);
             }
@@ -458,11 +456,6 @@ impl<'a> Response<'a> {
 
 impl RequestHead {
     #[inline]
-    pub(super) const fn from_bytes(&[function, a1, a0, c1, c0]: &[u8; HEAD_LEN]) -> Self {
-        Self { function, address: u16::from_be_bytes([a1, a0]), count_or_value: u16::from_be_bytes([c1, c0]) }
-    }
-
-    #[inline]
     pub(super) const fn to_bytes(self) -> [u8; HEAD_LEN] {
         let ([a1, a0], [c1, c0]) = (self.address.to_be_bytes(), self.count_or_value.to_be_bytes());
         [self.function, a1, a0, c1, c0]
@@ -474,10 +467,10 @@ pub fn exception_pdu(function: u8, exception: Exception) -> [u8; 2] {
     [function | function::EXCEPTION_FLAG, exception.code()]
 }
 
-/// A read of nothing or of too much, which no request asks for, has no answer.
+/// An echo of another length; a read of nothing or of too much, which no request asks for, has no answer at all.
 #[cold]
-fn unanswerable(pdu: &[u8]) -> ResponseError {
-    ResponseError::Length { expected: HEAD_LEN, received: pdu.len() }
+fn unanswerable(data: &[u8]) -> ResponseError {
+    ResponseError::Length { expected: HEAD_LEN, received: data.len().saturating_add(1) }
 }
 
 #[cold]
@@ -506,58 +499,22 @@ fn counted(data: &[u8], expected: usize) -> Result<&[u8], ResponseError> {
     }
 }
 
-/// Copies `data` to `target`, which is as long, and keeps only some bits of its last byte.
-#[inline]
-fn copy_masked(data: &[u8], last_mask: u8, target: &mut [u8]) {
-    // Asked for here, where the compiler sees it.
-    if target.len() != data.len() {
-        return;
-    }
-    if data.len() <= runs::MAX_RUN {
-        runs::copy(target, data);
-    } else {
-        target.copy_from_slice(data);
-    }
-    if let Some(last) = target.last_mut() {
-        *last &= last_mask;
-    }
-}
-
 /// What a server answers to a request that cannot be parsed: 03 when it knows the function.
 #[cold]
-fn refusal(pdu: &[u8]) -> Exception {
-    match pdu.first() {
-        Some(
-            &(function::READ_COILS
-            | function::READ_HOLDING
-            | function::WRITE_COIL
-            | function::WRITE_REGISTER
-            | function::WRITE_COILS
-            | function::WRITE_REGISTERS),
-        ) => Exception::IllegalDataValue,
+#[inline(never)]
+pub(super) fn refusal(function: u8) -> Exception {
+    match function {
+        function::READ_COILS
+        | function::READ_HOLDING
+        | function::WRITE_COIL
+        | function::WRITE_REGISTER
+        | function::WRITE_COILS
+        | function::WRITE_REGISTERS => Exception::IllegalDataValue,
         _ => Exception::IllegalFunction,
     }
 }
 
-#[inline]
-const fn in_limit(count: u16, max: u16) -> bool {
-    count != 0 && count <= max
-}
-
-#[inline]
-const fn coil_value(on: bool) -> u16 {
-    if on { COIL_ON } else { COIL_OFF }
-}
-
-/// Function code, address, count or value.
+/// Function code and operands.
 pub(super) const HEAD_LEN: usize = 5;
-/// The same and a byte count.
-const MULTIPLE_HEAD_LEN: usize = 6;
 /// Function code and byte count of a read's answer.
 pub(super) const READ_HEAD_LEN: usize = 2;
-
-/// In place of a limit, where the head carries a value.
-const NO_COUNT: u16 = u16::MAX;
-
-const COIL_OFF: u16 = 0x0000;
-const COIL_ON: u16 = 0xFF00;

@@ -3,10 +3,11 @@
 //! In: a connection's bytes. Out: one answer for each request, from a [`RegisterBank`] that knows
 //! the map. Any unit id is answered and echoed (D10).
 
-use super::adu::{self, AduError, AduReader, HEADER_LEN, MAX_ADU, MAX_PDU};
+use super::adu::{AduError, AduReader, FRONT_LEN, Frame, MAX_ADU, MAX_PDU};
 use super::exception::Exception;
+use super::parts::{COIL_OFF, COIL_ON, OPERANDS_LEN, Operands, in_limit};
 use super::pdu::{
-    HEAD_LEN, MAX_READ_REGISTERS, READ_HEAD_LEN, Request, RequestHead, exception_pdu, function,
+    MAX_READ_REGISTERS, MAX_WRITE_COILS, MAX_WRITE_REGISTERS, exception_pdu, function, refusal,
 };
 use super::values::{Coils, MAX_READ_COILS, Registers, last_mask, packed_len};
 
@@ -85,14 +86,24 @@ impl Server {
         bank: &mut B,
         out: &mut [u8; MAX_ADU],
     ) -> Option<Result<usize, AduError>> {
-        let request = match self.reader.advance(bytes)? {
-            Ok(place) => self.reader.adu(place),
-            Err(error) => return Some(Err(error)),
+        let Frame { front, data } = match self.reader.take(bytes) {
+            Some(frame) => frame,
+            None => match self.reader.next_buffered(bytes)? {
+                Ok(front) => Frame { front, data: self.reader.data(front) },
+                Err(error) => return Some(Err(error)),
+            },
         };
-        let (header, body) = split_frame(out)?;
-        let len = answer(request.pdu, bank, body);
-        *header = adu::header(request.transaction, request.unit, len);
-        Some(Ok(len.saturating_add(HEADER_LEN)))
+        let (target, body) = out.split_first_chunk_mut()?;
+        let body = body.first_chunk_mut()?;
+        let (front, len) = match carry_out(front.function(), data, bank, body) {
+            Ok(len) => (front, len),
+            Err(exception) => {
+                let answer = refuse(front.function(), data, exception, bank, body);
+                (front.with_function(answer.function), answer.data_len)
+            }
+        };
+        *target = front.resized(data.len(), len).to_bytes();
+        Some(Ok(len.wrapping_add(FRONT_LEN)))
     }
 
     /// Forgets a partial request, for a new connection.
@@ -106,25 +117,60 @@ impl Server {
 /// For other framings of PDUs; [`Server`] calls it for each frame.
 #[inline]
 pub fn answer<B: RegisterBank + ?Sized>(pdu: &[u8], bank: &mut B, out: &mut [u8; MAX_PDU]) -> usize {
-    match Request::parse(pdu).and_then(|request| carry_out(request, bank, out)) {
-        Ok(len) => len,
-        Err(Exception::IllegalFunction) => match read_inputs(pdu, bank, out) {
-            Ok(len) => len,
-            Err(exception) => refuse(pdu, exception, out),
-        },
-        Err(exception) => refuse(pdu, exception, out),
-    }
+    let (&asked, data) = pdu.split_first().unwrap_or((&0, &[]));
+    let Some((function, body)) = out.split_first_mut() else { return 0 };
+    let Some(body) = body.first_chunk_mut() else { return 0 };
+    let answer = match carry_out(asked, data, bank, body) {
+        Ok(data_len) => Answer { function: asked, data_len },
+        Err(exception) => refuse(asked, data, exception, bank, body),
+    };
+    *function = answer.function;
+    answer.data_len.wrapping_add(1)
+}
+
+/// What an answer begins with, and how many bytes come behind that.
+struct Answer {
+    function: u8,
+    data_len: usize,
+}
+
+/// What comes behind a function code.
+type Body = [u8; MAX_PDU - 1];
+
+/// Another function, or an exception.
+#[cold]
+#[inline(never)]
+fn refuse<B: RegisterBank + ?Sized>(
+    function: u8,
+    data: &[u8],
+    exception: Exception,
+    bank: &B,
+    out: &mut Body,
+) -> Answer {
+    let inputs = match exception {
+        Exception::IllegalFunction => read_inputs(function, data, bank, out),
+        _ => Err(exception),
+    };
+    let exception = match inputs {
+        Ok(data_len) => return Answer { function, data_len },
+        Err(exception) => exception,
+    };
+    let [function, code] = exception_pdu(function, exception);
+    let [first, ..] = out;
+    *first = code;
+    Answer { function, data_len: 1 }
 }
 
 /// FC 2 and 4, which a client of this project never asks.
-#[cold]
 fn read_inputs<B: RegisterBank + ?Sized>(
-    pdu: &[u8],
+    function: u8,
+    data: &[u8],
     bank: &B,
-    out: &mut [u8; MAX_PDU],
+    out: &mut Body,
 ) -> Result<usize, Exception> {
-    let head = pdu.first_chunk().map(RequestHead::from_bytes).ok_or(Exception::IllegalFunction)?;
-    let RequestHead { function, address, count_or_value: count } = head;
+    let Some((operands, more)) = data.split_first_chunk() else { return Err(Exception::IllegalFunction) };
+    let operands = Operands::from_bytes(operands);
+    let (address, count) = (operands.address(), operands.count_or_value());
     let max = match function {
         function::READ_DISCRETE => MAX_READ_COILS,
         function::READ_INPUT => MAX_READ_REGISTERS,
@@ -135,94 +181,115 @@ fn read_inputs<B: RegisterBank + ?Sized>(
         function::READ_DISCRETE => bank.read_discrete(address, 0, &mut [])?,
         _ => bank.read_input(address, &mut [])?,
     }
-    if pdu.len() != HEAD_LEN || count == 0 || count > max {
+    if !more.is_empty() || !in_limit(count, max) {
         return Err(Exception::IllegalDataValue);
     }
     check_end(address, count)?;
-    let len = if function == function::READ_DISCRETE {
-        let packed = read_answer(out, head, packed_len(count))?;
-        packed.fill(0);
-        bank.read_discrete(address, count, packed)?;
-        if let Some(last) = packed.last_mut() {
-            *last &= last_mask(count);
-        }
-        packed.len()
-    } else {
-        let bytes = read_answer(out, head, usize::from(count).saturating_mul(2))?;
-        bank.read_input(address, bytes.as_chunks_mut().0)?;
-        bytes.len()
-    };
-    Ok(len.saturating_add(READ_HEAD_LEN))
+    match function {
+        function::READ_DISCRETE => read_bits(out, count, |packed| bank.read_discrete(address, count, packed)),
+        _ => read_words(out, count, |words| bank.read_input(address, words)),
+    }
 }
 
+/// Carries out a request, of which `data` is what comes behind its function code, and writes what comes behind the
+/// answer's. Returns how much that is.
+// Without a value that can be any request: it would be written and taken apart again. What a request must have is asked
+// by its length first, because that is known to be right for both reads and for both writes then.
 #[inline]
 fn carry_out<B: RegisterBank + ?Sized>(
-    request: Request<'_>,
+    function: u8,
+    data: &[u8],
     bank: &mut B,
-    out: &mut [u8; MAX_PDU],
+    out: &mut Body,
 ) -> Result<usize, Exception> {
-    let head = request.head();
-    match request {
-        Request::ReadCoils { address, count } => {
+    let Some((operands, more)) = data.split_first_chunk() else { return Err(refusal(function)) };
+    let operands = Operands::from_bytes(operands);
+    let (address, count) = (operands.address(), operands.count_or_value());
+    if let Some((byte_count, data)) = more.split_first() {
+        if usize::from(*byte_count) != data.len() {
+            return Err(refusal(function));
+        }
+        if function == function::WRITE_COILS && in_limit(count, MAX_WRITE_COILS) {
+            let coils = Coils::exact(data, count).ok_or(Exception::IllegalDataValue)?;
             check_end(address, count)?;
-            let packed = read_answer(out, head, packed_len(count))?;
-            packed.fill(0);
-            bank.read_coils(address, count, packed)?;
-            if let Some(last) = packed.last_mut() {
-                *last &= last_mask(count);
-            }
-            return Ok(packed.len().saturating_add(READ_HEAD_LEN));
-        }
-        Request::ReadHolding { address, count } => {
-            check_end(address, count)?;
-            let bytes = read_answer(out, head, usize::from(count).saturating_mul(2))?;
-            bank.read_holding(address, bytes.as_chunks_mut().0)?;
-            return Ok(bytes.len().saturating_add(READ_HEAD_LEN));
-        }
-        Request::WriteCoil { address, value } => {
-            let coil = [u8::from(value)];
-            bank.write_coils(address, Coils::new(&coil, 1).ok_or(Exception::DeviceFailure)?)?;
-        }
-        Request::WriteRegister { address, value } => {
-            let word = value.to_be_bytes();
-            bank.write_holding(address, Registers::new(&word).ok_or(Exception::DeviceFailure)?)?;
-        }
-        Request::WriteCoils { address, coils } => {
-            check_end(address, coils.count())?;
             bank.write_coils(address, coils)?;
-        }
-        Request::WriteRegisters { address, registers } => {
-            check_end(address, registers.count())?;
+        } else if function == function::WRITE_REGISTERS && in_limit(count, MAX_WRITE_REGISTERS) {
+            let registers = Registers::exact(data, count).ok_or(Exception::IllegalDataValue)?;
+            check_end(address, count)?;
             bank.write_holding(address, registers)?;
+        } else {
+            return Err(refusal(function));
         }
+    } else if function == function::READ_HOLDING && in_limit(count, MAX_READ_REGISTERS) {
+        check_end(address, count)?;
+        return read_words(out, count, |words| bank.read_holding(address, words));
+    } else if function == function::READ_COILS && in_limit(count, MAX_READ_COILS) {
+        check_end(address, count)?;
+        return read_bits(out, count, |packed| bank.read_coils(address, count, packed));
+    } else {
+        write_one(function, operands, bank)?;
     }
-    // Every write is answered by its first five bytes.
-    *out.first_chunk_mut().ok_or(Exception::DeviceFailure)? = head.to_bytes();
-    Ok(HEAD_LEN)
+    // Every write is answered by its operands.
+    *out.first_chunk_mut().ok_or(Exception::DeviceFailure)? = operands.to_bytes();
+    Ok(OPERANDS_LEN)
 }
 
-/// Function code and byte count of a read's answer; returns the place for the data.
+/// FC 5 and 6.
+#[inline(never)]
+fn write_one<B: RegisterBank + ?Sized>(
+    function: u8,
+    operands: Operands,
+    bank: &mut B,
+) -> Result<(), Exception> {
+    let (address, value) = (operands.address(), operands.count_or_value());
+    match function {
+        function::WRITE_COIL if value == COIL_OFF || value == COIL_ON => {
+            let coil = [u8::from(value == COIL_ON)];
+            bank.write_coils(address, Coils::new(&coil, 1).ok_or(Exception::DeviceFailure)?)
+        }
+        function::WRITE_REGISTER => {
+            let word = value.to_be_bytes();
+            bank.write_holding(address, Registers::new(&word).ok_or(Exception::DeviceFailure)?)
+        }
+        _ => Err(refusal(function)),
+    }
+}
+
+/// Byte count and packed bits of an answer; returns how many bytes that is. `read` gets them cleared.
 #[inline]
-fn read_answer(out: &mut [u8; MAX_PDU], head: RequestHead, len: usize) -> Result<&mut [u8], Exception> {
-    let (answer_head, data) = out.split_first_chunk_mut().ok_or(Exception::DeviceFailure)?;
+fn read_bits(
+    out: &mut Body,
+    count: u16,
+    read: impl FnOnce(&mut [u8]) -> Result<(), Exception>,
+) -> Result<usize, Exception> {
+    let packed = read_answer(out, packed_len(count))?;
+    packed.fill(0);
+    read(packed)?;
+    if let Some(last) = packed.last_mut() {
+        *last &= last_mask(count);
+    }
+    Ok(packed.len().saturating_add(1))
+}
+
+/// The same for registers.
+#[inline]
+fn read_words(
+    out: &mut Body,
+    count: u16,
+    read: impl FnOnce(&mut [[u8; 2]]) -> Result<(), Exception>,
+) -> Result<usize, Exception> {
+    let bytes = read_answer(out, usize::from(count).saturating_mul(2))?;
+    read(bytes.as_chunks_mut().0)?;
+    Ok(bytes.len().saturating_add(1))
+}
+
+/// The byte count of a read's answer; returns the place for the data.
+#[inline]
+fn read_answer(out: &mut Body, len: usize) -> Result<&mut [u8], Exception> {
+    let (byte_count, data) = out.split_first_mut().ok_or(Exception::DeviceFailure)?;
     // At most 250 bytes by the limits of the count.
-    *answer_head = [head.function, len as u8];
+    *byte_count = len as u8;
     data.get_mut(..len).ok_or(Exception::DeviceFailure)
-}
-
-#[cold]
-fn refuse(pdu: &[u8], exception: Exception, out: &mut [u8; MAX_PDU]) -> usize {
-    let refusal = exception_pdu(pdu.first().copied().unwrap_or_default(), exception);
-    if let Some(target) = out.first_chunk_mut() {
-        *target = refusal;
-    }
-    refusal.len()
-}
-
-#[inline]
-fn split_frame(out: &mut [u8; MAX_ADU]) -> Option<(&mut [u8; HEADER_LEN], &mut [u8; MAX_PDU])> {
-    let (header, body) = out.split_first_chunk_mut()?;
-    Some((header, body.first_chunk_mut()?))
 }
 
 /// Addresses are 16 bits: a run beyond the last one is outside every map.

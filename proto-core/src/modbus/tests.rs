@@ -95,7 +95,8 @@ fn serve(bank: &mut Bank, stream: &[u8], chunk: usize) -> Result<Vec<u8>, AduErr
 }
 
 fn frame(transaction: u16, unit: u8, pdu: &[u8]) -> Vec<u8> {
-    let mut frame = super::adu::header(transaction, unit, pdu.len()).to_vec();
+    let ([t1, t0], [l1, l0]) = (transaction.to_be_bytes(), (pdu.len() as u16 + 1).to_be_bytes());
+    let mut frame = vec![t1, t0, 0, 0, l1, l0, unit];
     frame.extend_from_slice(pdu);
     frame
 }
@@ -479,4 +480,68 @@ fn registers_are_big_endian() {
     assert_eq!(Registers::pack([1, 2, 3], &mut [0; 5]), None);
     assert_eq!((Registers::new(&[]), Registers::new(&[1])), (None, None));
     assert_eq!(Registers::new(&[0; 252]), None);
+}
+
+#[test]
+fn registers_are_copied_whole_and_no_further() {
+    let bytes: Vec<u8> = (0..250).map(|nth: u8| nth.wrapping_mul(7)).collect();
+    for count in 1..=125 {
+        let registers = Registers::new(&bytes[..2 * count]).unwrap();
+        for room in [0, 1, count - 1, count, count + 1, 130] {
+            let mut words = [0xA5A5; 131];
+            let copied = registers.copy_to(&mut words[..room]);
+            assert_eq!(copied, count.min(room));
+            assert!(registers.iter().take(copied).eq(words[..copied].iter().copied()), "{count} to {room}");
+            assert!(words[copied..].iter().all(|&word| word == 0xA5A5), "{count} to {room}");
+        }
+    }
+}
+
+#[test]
+fn coils_are_copied_without_the_bits_beyond_the_last() {
+    let packed = [0xFF; 40];
+    for count in 1..=320 {
+        let coils = Coils::new(&packed, count).unwrap();
+        let len = coils.packed().len();
+        let mut bytes = [0xA5; 41];
+        assert_eq!(coils.copy_to(&mut bytes), Some(len));
+        assert_eq!(bytes.iter().take(len).map(|byte| byte.count_ones()).sum::<u32>(), u32::from(count));
+        assert_eq!((bytes[len - 1], bytes[len]), (coils.last_mask(), 0xA5));
+        bytes.fill(0xA5);
+        assert_eq!((coils.copy_to(&mut bytes[..len - 1]), bytes), (None, [0xA5; 41]));
+    }
+}
+
+/// The only answer that is taken at a glance is the right one: any other is what it is when it comes in pieces.
+#[test]
+fn an_answer_in_one_piece_is_what_it_is_in_two() {
+    let (on, words) = ([0x5A, 0x03], [0, 1, 0, 2]);
+    let requests = [
+        Request::ReadCoils { address: 1, count: 19 },
+        READ_TWO,
+        Request::WriteCoil { address: 3, value: true },
+        Request::WriteRegister { address: 3, value: 9 },
+        Request::WriteCoils { address: 0, coils: Coils::new(&on, 11).unwrap() },
+        Request::WriteRegisters { address: 2, registers: Registers::new(&words).unwrap() },
+    ];
+    for request in requests {
+        let mut client = Client::new(7);
+        let asked = started(&mut client, request);
+        let answer = serve(&mut Bank::default(), &asked, asked.len()).unwrap();
+        assert!(matches!(client.clone().receive(&mut &answer[..]), Some(ClientEvent::Response(_))));
+        let changed = (0..8 * answer.len()).map(|bit| {
+            let mut answer = answer.clone();
+            answer[bit / 8] ^= 1 << (bit % 8);
+            answer
+        });
+        let longer = [[&answer[..], &[1]].concat(), answer[..answer.len() - 1].to_vec()];
+        for answer in changed.chain(longer).chain([answer.clone()]) {
+            let (mut whole, mut cut) = (client.clone(), client.clone());
+            let (mut all, mut first, mut rest) = (&answer[..], &answer[..1], &answer[1..]);
+            assert_eq!(cut.receive(&mut first), None);
+            let seen = whole.receive(&mut all).map(|event| std::format!("{event:?}"));
+            assert_eq!(seen, cut.receive(&mut rest).map(|event| std::format!("{event:?}")), "{answer:02x?}");
+            assert_eq!((all.len(), whole.busy()), (rest.len(), cut.busy()), "{answer:02x?}");
+        }
+    }
 }

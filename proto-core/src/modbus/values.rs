@@ -1,6 +1,8 @@
 //! Coils and registers as they are in a PDU: borrowed, length-checked views (docs/wire/modbus.md
 //! section 3).
 
+use super::parts::copy_cleared;
+
 /// Maximum number of coils in an FC 1 request, and so in any answer or write.
 pub const MAX_READ_COILS: u16 = 0x07D0;
 
@@ -30,6 +32,13 @@ impl<'a> Coils<'a> {
     pub(super) fn exact(packed: &'a [u8], count: u16) -> Option<Self> {
         let fits = count != 0 && count <= MAX_READ_COILS && packed.len() == packed_len(count);
         fits.then_some(Self { packed, count })
+    }
+
+    /// The `count` coils of an answer, in exactly as many bytes as they take. Both were checked by whoever sent the
+    /// request, and its answer's length.
+    #[inline]
+    pub(super) const fn of_request(packed: &'a [u8], count: u16) -> Self {
+        Self { packed, count }
     }
 
     /// Packs `coils` into the front of `buffer`; `None` when there are none, or more than 2000, or
@@ -82,9 +91,24 @@ impl<'a> Coils<'a> {
         Some(if left < 8 { byte & last_mask(left) } else { byte })
     }
 
+    /// Writes the packed coils to the front of `bytes`, the bits beyond the last one as 0, and returns how many bytes
+    /// that are; `None`, with nothing written, if it is too short.
+    #[inline]
+    pub fn copy_to(self, bytes: &mut [u8]) -> Option<usize> {
+        let target = bytes.get_mut(..self.packed.len())?;
+        copy_cleared(self.packed, self.unused(), target);
+        Some(target.len())
+    }
+
     /// The packed bytes; bits beyond the last coil may have any value, see [`Coils::last_mask`].
     pub const fn packed(self) -> &'a [u8] {
         self.packed
+    }
+
+    /// Number of bits of the last packed byte that are no coils: its highest ones.
+    #[inline]
+    pub(super) const fn unused(self) -> u8 {
+        self.count.wrapping_neg() as u8 & 7
     }
 
     /// The bits of the last packed byte that are coils.
@@ -134,6 +158,12 @@ impl<'a> Registers<'a> {
         (len != 0 && len <= MAX_REGISTER_BYTES && bytes.len() == len).then_some(Self { bytes })
     }
 
+    /// The registers of an answer, as many bytes as the request asks for: its sender has checked the count.
+    #[inline]
+    pub(super) const fn of_request(bytes: &'a [u8]) -> Self {
+        Self { bytes }
+    }
+
     /// Writes `values` big-endian into the front of `buffer`; `None` when there are none, or more
     /// than 125, or `buffer` is too short.
     pub fn pack(values: impl IntoIterator<Item = u16>, buffer: &'a mut [u8]) -> Option<Self> {
@@ -172,11 +202,54 @@ impl<'a> Registers<'a> {
         self.bytes.as_chunks::<2>().0.iter().map(|word| u16::from_be_bytes(*word))
     }
 
+    /// Writes the registers to the front of `words`, as many as fit, and returns how many.
+    #[inline]
+    pub fn copy_to(self, words: &mut [u16]) -> usize {
+        let registers = self.bytes.as_chunks::<2>().0;
+        let count = registers.len().min(words.len());
+        let (Some(registers), Some(words)) = (registers.get(..count), words.get_mut(..count)) else {
+            return 0;
+        };
+        turn(registers, words);
+        count
+    }
+
     /// The registers as on the wire.
     pub const fn as_be_bytes(self) -> &'a [u8] {
         self.bytes
     }
 }
+
+/// Turns as many registers as there are words.
+// Pieces of a fixed size are vector operations without a loop for what is left over: the last words are turned together
+// with some that are turned anyway.
+#[inline]
+fn turn(registers: &[[u8; 2]], words: &mut [u16]) {
+    let (Some(last), true) = (registers.last_chunk(), registers.len() == words.len()) else {
+        return registers.iter().zip(words).for_each(|(from, to)| *to = u16::from_be_bytes(*from));
+    };
+    if let Some(last_words) = words.last_chunk_mut() {
+        turn_piece::<HALF>(last, last_words);
+    }
+    let (pieces, rest) = registers.as_chunks::<PIECE>();
+    let (word_pieces, rest_words) = words.as_chunks_mut::<PIECE>();
+    for (piece, words) in pieces.iter().zip(word_pieces) {
+        turn_piece(piece, words);
+    }
+    if let (Some(half), Some(words)) = (rest.first_chunk(), rest_words.first_chunk_mut()) {
+        turn_piece::<HALF>(half, words);
+    }
+}
+
+// All are read before any is written: so they need not be known to lie apart.
+#[inline(always)]
+fn turn_piece<const N: usize>(registers: &[[u8; 2]; N], words: &mut [u16; N]) {
+    *words = registers.map(u16::from_be_bytes);
+}
+
+/// A vector's registers, and two vectors'.
+const HALF: usize = 8;
+const PIECE: usize = 16;
 
 /// Bytes that `count` packed coils take.
 #[inline]

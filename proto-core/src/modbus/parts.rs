@@ -1,0 +1,147 @@
+//! What the PDUs of both sides are made of: operands, the data of a write, limits (docs/wire/modbus.md section 3).
+//!
+//! In: the fields of a request. Out: its bytes behind the function code. Does not know connections.
+
+use super::pdu::{EncodeError, RequestHead};
+use crate::wire::runs;
+
+/// What most PDUs have behind their function code: an address, and a count or value, as one number.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Operands(u32);
+
+impl Operands {
+    #[inline]
+    pub(super) const fn new(address: u16, count_or_value: u16) -> Self {
+        Self((address as u32) << 16 | count_or_value as u32)
+    }
+
+    #[inline]
+    pub(super) const fn from_bytes(bytes: &[u8; OPERANDS_LEN]) -> Self {
+        Self(u32::from_be_bytes(*bytes))
+    }
+
+    #[inline]
+    pub(super) const fn to_bytes(self) -> [u8; OPERANDS_LEN] {
+        self.0.to_be_bytes()
+    }
+
+    #[inline]
+    pub(super) const fn address(self) -> u16 {
+        (self.0 >> 16) as u16
+    }
+
+    #[inline]
+    pub(super) const fn count_or_value(self) -> u16 {
+        self.0 as u16
+    }
+
+    /// The head of a request of `function`.
+    #[inline]
+    pub(super) const fn of(self, function: u8) -> RequestHead {
+        RequestHead { function, address: self.address(), count_or_value: self.count_or_value() }
+    }
+}
+
+/// The contents of a request's PDU.
+#[derive(Clone, Copy)]
+pub(super) struct Parts<'a> {
+    pub(super) function: u8,
+    pub(super) operands: Operands,
+    /// Limit of the count, or [`NO_COUNT`].
+    pub(super) max: u16,
+    /// The data of a multiple write, and how many of the highest bits of its last byte are sent as 0.
+    pub(super) data: Option<(&'a [u8], u8)>,
+    /// Number of bytes behind the function code of the answer, if the request is carried out.
+    pub(super) answer_len: usize,
+}
+
+impl Parts<'_> {
+    /// The parts of a request without data, whose answer has its operands.
+    #[inline]
+    pub(super) const fn new(function: u8, address: u16, count_or_value: u16, max: u16) -> Self {
+        let operands = Operands::new(address, count_or_value);
+        Self { function, operands, max, data: None, answer_len: OPERANDS_LEN }
+    }
+
+    /// Number of bytes behind the function code.
+    #[inline]
+    pub(super) fn data_len(&self) -> usize {
+        self.data.map_or(OPERANDS_LEN, |(data, _)| data.len().wrapping_add(OPERANDS_LEN + 1))
+    }
+
+    /// Refuses a count that the function does not allow.
+    #[inline]
+    pub(super) fn check_count(&self) -> Result<(), EncodeError> {
+        let (count, max) = (self.operands.count_or_value(), self.max);
+        if max == NO_COUNT || in_limit(count, max) { Ok(()) } else { Err(EncodeError::Count { count, max }) }
+    }
+
+    /// Writes what comes behind the function code to `out`, which is [`Self::data_len`] bytes long.
+    #[inline]
+    pub(super) fn write(&self, out: &mut [u8]) {
+        let Some((operands, rest)) = out.split_first_chunk_mut() else { return };
+        *operands = self.operands.to_bytes();
+        if let Some((data, unused)) = self.data
+            && let Some((byte_count, target)) = rest.split_first_mut()
+        {
+            // At most 246 bytes by the limits of the count.
+            *byte_count = data.len() as u8;
+            copy_cleared(data, unused, target);
+        }
+    }
+
+    #[inline]
+    pub(super) fn encoded_len(&self) -> usize {
+        self.data_len().saturating_add(1)
+    }
+
+    #[inline]
+    pub(super) fn encode(&self, out: &mut [u8]) -> Result<usize, EncodeError> {
+        self.check_count()?;
+        let (needed, available) = (self.encoded_len(), out.len());
+        let no_space = EncodeError::NoSpace { needed, available };
+        let out = out.get_mut(..needed).ok_or(no_space)?;
+        let (function, data) = out.split_first_mut().ok_or(no_space)?;
+        *function = self.function;
+        self.write(data);
+        Ok(needed)
+    }
+}
+
+/// Copies `data` to `target`, which is as long, and clears the highest `unused` bits, at most 7, of its last byte.
+#[inline]
+pub(super) fn copy_cleared(data: &[u8], unused: u8, target: &mut [u8]) {
+    match (&mut *target, data) {
+        // Sixteen digital outputs, or one register.
+        ([first, second], &[from, next]) => (*first, *second) = (from, next),
+        // Asked for here, where the compiler sees it.
+        (target, data) if target.len() != data.len() => return,
+        (target, data) if data.len() <= runs::MAX_RUN => runs::copy(target, data),
+        (target, data) => target.copy_from_slice(data),
+    }
+    if unused != 0
+        && let Some(last) = target.last_mut()
+    {
+        *last &= 0xFF_u8.wrapping_shr(unused.into());
+    }
+}
+
+#[inline]
+pub(super) const fn in_limit(count: u16, max: u16) -> bool {
+    count != 0 && count <= max
+}
+
+#[inline]
+pub(super) const fn coil_value(on: bool) -> u16 {
+    if on { COIL_ON } else { COIL_OFF }
+}
+
+/// Address, and count or value.
+pub(super) const OPERANDS_LEN: usize = 4;
+
+/// In place of a limit, where the operand is a value.
+pub(super) const NO_COUNT: u16 = u16::MAX;
+
+/// The values of FC 5.
+pub(super) const COIL_OFF: u16 = 0x0000;
+pub(super) const COIL_ON: u16 = 0xFF00;
