@@ -53,6 +53,14 @@ impl Stamp {
     pub(crate) const fn get(self) -> Instant {
         Instant(!self.0)
     }
+
+    /// This instant, if it is earlier.
+    #[inline]
+    pub(crate) const fn or_earlier(&mut self, instant: Instant) {
+        if !instant.0 > self.0 {
+            self.0 = !instant.0;
+        }
+    }
 }
 
 impl fmt::Debug for Stamp {

@@ -245,6 +245,7 @@ proptest! {
             let frame = layout.frame(nth).unwrap().encode_values(&sent).unwrap();
             prop_assert_eq!(frame.id(), *id);
             prop_assert_eq!(layout.accept(&frame), Ok(nth));
+            prop_assert_eq!(layout.accept_frame(&frame), Ok(nth));
             let accepted = layout.frame(nth).unwrap();
             prop_assert!(accepted.values(frame.data()).eq(sent.iter().copied()));
             let mut image = [0x5A; IMAGE_BYTES];

@@ -76,7 +76,7 @@ fn can_codec(layout: &CanLayout) {
     let Some(frame) = any(CanFrame::new(any(CanId::Standard(1)), bytes())) else { return };
     let mut image = [0; IMAGE_BYTES];
     let image = black_box(&mut image);
-    let _ = black_box(layout.accept(&frame));
+    let _ = black_box((layout.accept(&frame), layout.accept_frame(&frame)));
     layout.ids().for_each(|id| _ = black_box(id));
     for frame in layout.frames() {
         let _ = black_box(frame.check(bytes()));

@@ -311,7 +311,7 @@ impl Can {
     pub(crate) fn decode(&mut self) -> usize {
         let mut applied = 0;
         for received in &self.frames {
-            let Ok(index) = self.layout.accept(received) else { continue };
+            let Ok(index) = self.layout.accept_frame(received) else { continue };
             let Some(frame) = self.layout.frame(index) else { continue };
             applied += usize::from(frame.apply(received.data(), &mut self.image).is_ok());
         }

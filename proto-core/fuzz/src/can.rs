@@ -63,6 +63,7 @@ fn is_right(rules: Rules, part: &[(CanId, Vec<Field>)]) -> bool {
 fn received(layout: &CanLayout, part: &[(CanId, Vec<Field>)], frame: &CanFrame) {
     let declared = part.iter().position(|(id, _)| *id == frame.id());
     let accepted = layout.accept(frame);
+    assert_eq!(layout.accept_frame(frame), accepted, "an id that was checked before");
     match declared {
         _ if frame.is_remote() => assert_eq!(accepted, Err(CanReject::Remote { id: frame.id() })),
         None => assert_eq!(accepted, Err(CanReject::UnknownId { id: frame.id() })),

@@ -95,7 +95,21 @@ impl InputSet {
     }
 
     /// The `len` variables from `first` on, without those that are not inputs.
+    #[inline]
     pub(crate) fn run(first: SysVar, len: usize) -> Self {
+        let (nth, within) = (first.ordinal() / 32, first.ordinal() % 32);
+        // Most runs lie in one word.
+        if within.saturating_add(len) > 32 || first.ordinal().saturating_add(len) > INPUT_COUNT {
+            return Self::long_run(first, len);
+        }
+        let bits = !u32::MAX.checked_shl(len as u32).unwrap_or(0) << within;
+        let of = |word: usize| if word == nth { bits } else { 0 };
+        Self([of(0), of(1), of(2)])
+    }
+
+    /// The same, wherever they are.
+    #[inline(never)]
+    fn long_run(first: SysVar, len: usize) -> Self {
         let end = first.ordinal().saturating_add(len).min(INPUT_COUNT);
         Self::from(first.ordinal()).minus(&Self::from(end))
     }
@@ -111,8 +125,27 @@ impl InputSet {
     }
 
     /// The first variable of the set at or behind this place of the table, or else the first of all.
+    #[inline]
     pub(crate) fn first_from(&self, ordinal: usize) -> Option<SysVar> {
-        self.and(&Self::from(ordinal)).first().or_else(|| self.first())
+        // Mostly it is near.
+        let behind = self.0.get(ordinal / 32).map_or(0, |word| word >> (ordinal % 32));
+        if behind != 0 {
+            return SysVar::from_ordinal(ordinal.saturating_add(behind.trailing_zeros() as usize));
+        }
+        self.first_behind(ordinal)
+    }
+
+    /// The same, where the word of this place has none behind it.
+    #[inline(never)]
+    fn first_behind(&self, ordinal: usize) -> Option<SysVar> {
+        for (nth, word) in self.0.iter().enumerate() {
+            if *word != 0 && nth > ordinal / 32 {
+                return SysVar::from_ordinal(
+                    nth.wrapping_mul(32).wrapping_add(word.trailing_zeros() as usize),
+                );
+            }
+        }
+        self.first()
     }
 
     /// The first variable in table order.

@@ -1,7 +1,8 @@
 //! The compiled part of a CAN recipe: frame ids, each with its fields
 //! (docs/wire/recipes.md section 6).
 //!
-//! In: anything that is an [`embedded_can::Frame`], or the process image. Out: the other. A frame
+//! In: a [`CanFrame`] or anything else that is an [`embedded_can::Frame`], or the process image.
+//! Out: the other. A frame
 //! that is not of the recipe is rejected with a reason to count, and never applied in part.
 
 use embedded_can::Frame;
@@ -11,7 +12,7 @@ use super::error::{EncodeError, FieldPlace, PartError, ValueError};
 use super::fields::{Applied, FrameFields, PlacedField, Pool, Runs, Share, Values};
 use super::model::{Field, MAX_CAN_IDS, Rules};
 use crate::sysvar::IMAGE_BYTES;
-use crate::wire::can::{CanFrame, CanId, MAX_CAN_DATA};
+use crate::wire::can::{CanFrame, CanId, CanKey, MAX_CAN_DATA};
 use crate::wire::scalar::Scalar;
 
 /// Why a received frame is not a frame of the recipe (D17).
@@ -44,8 +45,8 @@ pub enum CanReject {
 #[derive(Debug, Clone)]
 pub struct CanLayout {
     rules: Rules,
-    /// The frames' ids, in one word each, as many as `shares`. The rest is [`NO_KEY`].
-    keys: [u32; MAX_CAN_IDS],
+    /// The frames' ids, in one word each, as many as `shares`. The rest is [`CanKey::NONE`].
+    keys: [CanKey; MAX_CAN_IDS],
     shares: Vec<Share, MAX_CAN_IDS>,
     /// Places of the ids: indices of frames, or [`EMPTY`]. See [`CanLayout::search_order`].
     places: [u8; PLACES],
@@ -70,7 +71,7 @@ impl CanLayout {
     where
         F: IntoIterator<Item = Field>,
     {
-        let (keys, places) = ([NO_KEY; MAX_CAN_IDS], [EMPTY; PLACES]);
+        let (keys, places) = ([CanKey::NONE; MAX_CAN_IDS], [EMPTY; PLACES]);
         let mut layout = Self { rules, keys, shares: Vec::new(), places, pool: Pool::new() };
         for (id, fields) in frames {
             layout.push(id, fields)?;
@@ -85,7 +86,7 @@ impl CanLayout {
 
     /// The frames' ids, in declared order.
     pub fn ids(&self) -> impl ExactSizeIterator<Item = CanId> + Clone + '_ {
-        self.keys.get(..self.shares.len()).unwrap_or(&[]).iter().map(|&key| id_of(key))
+        self.keys.get(..self.shares.len()).unwrap_or(&[]).iter().map(|&key| key.id())
     }
 
     /// Number of frames in the part, 1..=32.
@@ -98,32 +99,49 @@ impl CanLayout {
     /// # Errors
     /// [`CanReject`]: another id, a remote frame, or another length.
     pub fn accept(&self, frame: &impl Frame) -> Result<usize, CanReject> {
-        let id = CanId::from(frame.id());
-        if frame.is_remote_frame() {
-            return Err(CanReject::Remote { id });
+        self.accept_parts(CanKey::of(frame.id().into()), frame.is_remote_frame(), frame.data().len())
+    }
+
+    /// The same for a frame whose id was checked when it was made, and is not checked again.
+    ///
+    /// # Errors
+    /// [`CanReject`]: another id, a remote frame, or another length.
+    #[inline]
+    pub fn accept_frame(&self, frame: &CanFrame) -> Result<usize, CanReject> {
+        self.accept_parts(frame.key(), frame.is_remote(), frame.len())
+    }
+
+    #[inline]
+    fn accept_parts(&self, key: CanKey, is_remote: bool, got: usize) -> Result<usize, CanReject> {
+        if is_remote {
+            return Err(CanReject::Remote { id: key.id() });
         }
-        let index = self.index_of(key_of(id)).ok_or(CanReject::UnknownId { id })?;
-        let share = self.shares.get(index).ok_or(CanReject::UnknownId { id })?;
-        let expected = share.whole.len() as u8;
-        let got = frame.data().len();
-        if got != usize::from(expected) {
-            return Err(CanReject::WrongLength { frame: index as u8, expected, got: got as u8 });
+        let unknown = || CanReject::UnknownId { id: key.id() };
+        let index = self.index_of(key).ok_or_else(unknown)?;
+        let share = self.shares.get(index).ok_or_else(unknown)?;
+        let expected = share.whole.len();
+        if got != expected {
+            return Err(CanReject::WrongLength {
+                frame: index as u8,
+                expected: expected as u8,
+                got: got as u8,
+            });
         }
         Ok(index)
     }
 
-    /// Whether a frame of the part has this id.
+    /// Whether a frame of the part has the id of this one.
     #[inline]
-    pub(crate) fn has(&self, id: CanId) -> bool {
-        self.index_of(key_of(id)).is_some()
+    pub(crate) fn has_id_of(&self, frame: &CanFrame) -> bool {
+        self.index_of(frame.key()).is_some()
     }
 
     /// The frame with this index in the part.
     #[inline]
     pub fn frame(&self, index: usize) -> Option<CanFrameLayout<'_>> {
         let share = self.shares.get(index)?;
-        let key = self.keys.get(index).copied().unwrap_or(NO_KEY);
-        Some(CanFrameLayout { id: id_of(key), index, share, layout: self })
+        let key = self.keys.get(index).copied().unwrap_or(CanKey::NONE);
+        Some(CanFrameLayout { id: key.id(), index, share, layout: self })
     }
 
     /// The frames in declared order.
@@ -158,7 +176,7 @@ impl CanLayout {
         if len > MAX_CAN_DATA {
             return Err(PartError::CanFrameTooLong { frame, len });
         }
-        let key = key_of(id);
+        let key = CanKey::of(id);
         if let Some(free) = self.search_order(key).find(|&at| self.places.get(at) == Some(&EMPTY))
             && let Some(place) = self.places.get_mut(free)
         {
@@ -176,7 +194,7 @@ impl CanLayout {
     /// The index of the frame with this id. At least half of the places are empty, so the search is
     /// short.
     #[inline]
-    fn index_of(&self, key: u32) -> Option<usize> {
+    fn index_of(&self, key: CanKey) -> Option<usize> {
         let first = self.search_order(key).next()?;
         let index = usize::from(*self.places.get(first)?);
         if *self.keys.get(index)? == key { Some(index) } else { self.index_behind(key) }
@@ -184,7 +202,7 @@ impl CanLayout {
 
     /// The same, when there is another frame at its first choice.
     #[inline(never)]
-    fn index_behind(&self, key: u32) -> Option<usize> {
+    fn index_behind(&self, key: CanKey) -> Option<usize> {
         for at in self.search_order(key) {
             let index = usize::from(*self.places.get(at)?);
             // An empty place is not an index.
@@ -197,8 +215,8 @@ impl CanLayout {
 
     /// The places of a key, first choice first.
     #[inline]
-    fn search_order(&self, key: u32) -> impl Iterator<Item = usize> + use<> {
-        let first = (key.wrapping_mul(SPREAD) >> PLACE_SHIFT) as usize;
+    fn search_order(&self, key: CanKey) -> impl Iterator<Item = usize> + use<> {
+        let first = (key.number().wrapping_mul(SPREAD) >> PLACE_SHIFT) as usize;
         (0..PLACES).map(move |further| first.wrapping_add(further) % PLACES)
     }
 }
@@ -317,23 +335,6 @@ const _: () = assert!(PLACES.is_power_of_two());
 const SPREAD: u32 = 0x9E37_79B1;
 /// No frame has this index.
 const EMPTY: u8 = u8::MAX;
-
-/// No id has this key.
-const NO_KEY: u32 = u32::MAX;
-
-/// Marks an extended id in a key.
-const EXTENDED: u32 = 1 << 31;
-
-const fn key_of(id: CanId) -> u32 {
-    match id {
-        CanId::Standard(id) => id as u32,
-        CanId::Extended(id) => id | EXTENDED,
-    }
-}
-
-const fn id_of(key: u32) -> CanId {
-    if key & EXTENDED == 0 { CanId::Standard(key as u16) } else { CanId::Extended(key & !EXTENDED) }
-}
 
 impl core::fmt::Display for CanReject {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {

@@ -224,8 +224,8 @@ impl Deframer {
         let Some((frame, after)) = chunk.split_at_checked(layout.frame_len()) else {
             self.put(0, chunk);
             self.len = chunk.len() as u16;
-            // Without a head, every byte is one; but no byte is none.
-            let begun = chunk.len() >= layout.head_word().len().max(1);
+            // Without a head, every byte is one; and there is one.
+            let begun = chunk.len() >= layout.head_word().len();
             self.hold_until = if begun { hold_until(layout) } else { 0 };
             *chunk = &[];
             return None;
@@ -499,7 +499,12 @@ fn tail_word_at(start: usize, frame_len: usize) -> usize {
 /// Copies to a piece of the same length.
 #[inline]
 fn copy(to: &mut [u8], from: &[u8]) {
-    if from.len() <= runs::MAX_RUN { runs::copy(to, from) } else { runs::copy_long(to, from) }
+    // In this order, so that a short piece is not asked first whether it is a long one.
+    match from.len() {
+        0..16 => runs::copy(to, from),
+        16..=runs::MAX_RUN => runs::copy(to, from),
+        _ => runs::copy_long(to, from),
+    }
 }
 
 /// Rotates the ring until the byte at `start` is at its front, by three reversals: unlike

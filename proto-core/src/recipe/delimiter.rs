@@ -96,14 +96,33 @@ impl Head {
     /// The same in fewer than eight bytes, which are compared with the beginning of the head.
     #[inline(never)]
     fn find_in_few(&self, data: &[u8]) -> usize {
-        let mut skip = 0_usize;
-        let mut rest = data;
-        while !self.agrees(rest) {
-            rest = rest.get(1..).unwrap_or(&[]);
-            skip = skip.wrapping_add(1);
+        let (head, mask) = (u64::from_le_bytes(self.bytes), u64::from_le_bytes(self.mask));
+        let (mut rest, mut left) = (few(data), data.len());
+        // Of as many bytes as are left; none at all agree with any head.
+        let mut there = !u64::MAX.wrapping_shl(8_u32.wrapping_mul(left as u32));
+        while left > 0 && (rest ^ head) & mask & there != 0 {
+            rest = rest.wrapping_shr(8);
+            there = there.wrapping_shr(8);
+            left = left.wrapping_sub(1);
         }
-        skip
+        data.len().wrapping_sub(left)
     }
+}
+
+/// Fewer than eight bytes as one number, the first in its lowest bits.
+#[inline(always)]
+fn few(data: &[u8]) -> u64 {
+    let place = |behind: usize| 8_u32.wrapping_mul(data.len().wrapping_sub(behind) as u32);
+    // Two halves, which overlap in the middle.
+    if let (Some(front), Some(back)) = (data.first_chunk(), data.last_chunk()) {
+        let (front, back) = (u32::from_le_bytes(*front), u32::from_le_bytes(*back));
+        return u64::from(front) | u64::from(back).wrapping_shl(place(4));
+    }
+    if let (Some(front), Some(back)) = (data.first_chunk(), data.last_chunk()) {
+        let (front, back) = (u16::from_le_bytes(*front), u16::from_le_bytes(*back));
+        return u64::from(front) | u64::from(back).wrapping_shl(place(2));
+    }
+    data.first().copied().unwrap_or_default().into()
 }
 
 impl Tail {

@@ -95,6 +95,7 @@ impl SysVar {
     }
 
     /// The table row the variable belongs to.
+    #[inline]
     pub fn span(self) -> &'static Span {
         table::span_of(self.ordinal())
     }
@@ -160,7 +161,14 @@ impl SysVar {
         Self::all().find(|var| var.direction() == Direction::Output && var.stream() == Some(place))
     }
 
+    /// Number of variables from this one to the last of its row.
+    #[inline]
+    pub(crate) fn left_in_row(self) -> usize {
+        self.span().len().saturating_sub(usize::from(self.place_in_span()))
+    }
+
     /// The variable's place in the Modbus map; inputs can be written and read back there.
+    #[inline]
     pub fn modbus(self) -> Option<ModbusPlace> {
         let nth = self.place_in_span();
         self.span().modbus.map(|place| match place {
@@ -176,6 +184,7 @@ impl SysVar {
         })
     }
 
+    #[inline]
     fn place_in_span(self) -> u16 {
         table::place_in_span(self.ordinal())
     }

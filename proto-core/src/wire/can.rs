@@ -25,13 +25,60 @@ pub enum CanId {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct CanFrame {
-    id: CanId,
+    key: CanKey,
     remote: bool,
     /// The data length code: what a remote frame asks for.
     dlc: u8,
     /// Bytes of data; none in a remote frame.
     len: u8,
     data: [u8; MAX_CAN_DATA],
+}
+
+/// An id in one word, so that ids are compared and looked up without asking for their kind.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(crate) struct CanKey(u32);
+
+/// Marks an extended id in a key.
+const EXTENDED: u32 = 1 << 31;
+
+impl CanKey {
+    /// No id has it.
+    pub(crate) const NONE: Self = Self(u32::MAX);
+
+    #[inline]
+    pub(crate) const fn of(id: CanId) -> Self {
+        match id {
+            CanId::Standard(id) => Self(id as u32),
+            CanId::Extended(id) => Self(id | EXTENDED),
+        }
+    }
+
+    #[inline]
+    pub(crate) const fn id(self) -> CanId {
+        if self.0 & EXTENDED == 0 {
+            CanId::Standard(self.0 as u16)
+        } else {
+            CanId::Extended(self.0 & !EXTENDED)
+        }
+    }
+
+    #[inline]
+    pub(crate) const fn number(self) -> u32 {
+        self.0
+    }
+}
+
+impl fmt::Debug for CanKey {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.id().fmt(f)
+    }
+}
+
+#[cfg(feature = "defmt")]
+impl defmt::Format for CanKey {
+    fn format(&self, to: defmt::Formatter<'_>) {
+        self.id().format(to);
+    }
 }
 
 impl CanId {
@@ -66,7 +113,8 @@ impl CanFrame {
     /// A data frame; `None` when the id is too large for its kind or there are more than 8 bytes.
     pub fn new(id: CanId, data: &[u8]) -> Option<Self> {
         let len = data.len() as u8;
-        let mut frame = Self { id, remote: false, dlc: len, len, data: [0; MAX_CAN_DATA] };
+        let key = CanKey::of(id);
+        let mut frame = Self { key, remote: false, dlc: len, len, data: [0; MAX_CAN_DATA] };
         frame.data.get_mut(..data.len())?.copy_from_slice(data);
         id.is_valid().then_some(frame)
     }
@@ -74,8 +122,8 @@ impl CanFrame {
     /// A remote frame that asks for `len` bytes; `None` when the id is too large for its kind or `len`
     /// is more than 8.
     pub fn remote(id: CanId, len: usize) -> Option<Self> {
-        let fits = id.is_valid() && len <= MAX_CAN_DATA;
-        fits.then_some(Self { id, remote: true, dlc: len as u8, len: 0, data: [0; MAX_CAN_DATA] })
+        let (key, fits) = (CanKey::of(id), id.is_valid() && len <= MAX_CAN_DATA);
+        fits.then_some(Self { key, remote: true, dlc: len as u8, len: 0, data: [0; MAX_CAN_DATA] })
     }
 
     /// A data frame of `len` bytes, which `fill` writes. The caller has checked that the id is
@@ -86,7 +134,7 @@ impl CanFrame {
         if let Some(used) = data.get_mut(..usize::from(len)) {
             fill(used);
         }
-        Self { id, remote: false, dlc: len, len, data }
+        Self { key: CanKey::of(id), remote: false, dlc: len, len, data }
     }
 
     /// A data frame of the first [`MAX_CAN_DATA`] of these bytes. The caller has checked that the id
@@ -101,7 +149,13 @@ impl CanFrame {
 
     /// The frame's id.
     pub const fn id(&self) -> CanId {
-        self.id
+        self.key.id()
+    }
+
+    /// The same in one word.
+    #[inline]
+    pub(crate) const fn key(&self) -> CanKey {
+        self.key
     }
 
     /// Whether it is a remote frame.
@@ -109,9 +163,17 @@ impl CanFrame {
         self.remote
     }
 
+    /// Number of bytes of data; 0 in a remote frame.
+    #[inline]
+    pub(crate) fn len(&self) -> usize {
+        self.len as usize
+    }
+
     /// The data; empty in a remote frame.
+    #[inline]
     pub fn data(&self) -> &[u8] {
-        self.data.get(..usize::from(self.len)).unwrap_or(&[])
+        // There are never more, which the compiler does not know.
+        self.data.get(..self.len().min(MAX_CAN_DATA)).unwrap_or(&[])
     }
 }
 
@@ -125,7 +187,7 @@ impl Frame for CanFrame {
     }
 
     fn is_extended(&self) -> bool {
-        matches!(self.id, CanId::Extended(_))
+        matches!(CanFrame::id(self), CanId::Extended(_))
     }
 
     fn is_remote_frame(&self) -> bool {
@@ -134,7 +196,7 @@ impl Frame for CanFrame {
 
     fn id(&self) -> embedded_can::Id {
         // The constructors accept only ids that fit, so the fallbacks are never reached.
-        match self.id {
+        match CanFrame::id(self) {
             CanId::Standard(id) => {
                 embedded_can::StandardId::new(id).unwrap_or(embedded_can::StandardId::ZERO).into()
             }

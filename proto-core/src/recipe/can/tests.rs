@@ -204,3 +204,22 @@ proptest! {
         }
     }
 }
+
+#[test]
+fn a_frame_is_accepted_with_and_without_a_look_at_its_id() {
+    let extended = |number| CanId::Extended(number);
+    let part = [(id(5), bytes(2)), (extended(5), bytes(3)), (extended(0x1FFF_FFFF), bytes(1))];
+    let layout = CanLayout::new(USER_IN, part).unwrap();
+    for id in [id(5), extended(5), id(6), extended(6), id(0x7FF), extended(0x7FF), extended(0x1FFF_FFFF)] {
+        for len in 0..=8 {
+            let frame = CanFrame::new(id, &vec![0; len]).unwrap();
+            assert_eq!(layout.accept_frame(&frame), layout.accept(&frame), "{frame:?}");
+            assert_eq!(layout.has_id_of(&frame), layout.ids().any(|other| other == id));
+            assert_eq!((frame.id(), frame.data().len()), (id, len));
+            let remote = CanFrame::remote(id, len).unwrap();
+            assert_eq!(layout.accept_frame(&remote), Err(CanReject::Remote { id }));
+        }
+    }
+    let frame = CanFrame::new(extended(5), &[1]).unwrap();
+    assert!(std::format!("{frame:?}").contains("Extended(5)"), "{frame:?}");
+}

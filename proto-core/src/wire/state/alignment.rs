@@ -7,7 +7,7 @@
 
 use core::fmt;
 
-use super::places::{BOOLS, FARTHEST_RAD, LIMITS, STATES, TCP_POSE};
+use super::places::{BLOCK, BOOL_BLOCKS, BOOL_BYTES, BOOLS, FARTHEST_RAD, LIMITS, STATES, TCP_POSE};
 use super::view::{LEN, StateView};
 use crate::wire::runs::copy;
 
@@ -146,15 +146,11 @@ fn check(bytes: &[u8; LEN], is_started: bool) -> Result<(), Misaligned> {
     if wrong > ALLOWED_WRONG_JOINTS {
         return Err(first_wrong_joint(joints, wrong));
     }
-    let mut wrong = 0_u16;
-    for run in BOOLS {
-        let run = bytes.get(run.from..).and_then(|behind| behind.get(..run.len)).unwrap_or(&[]);
-        if !are_bools(run) {
-            wrong = wrong.saturating_add(wrong_bools(run));
+    if !are_bools(bytes) {
+        let wrong = wrong_bools(bytes);
+        if wrong > ALLOWED_WRONG_BOOLS {
+            return Err(Misaligned::Bools { wrong, allowed: ALLOWED_WRONG_BOOLS });
         }
-    }
-    if wrong > ALLOWED_WRONG_BOOLS {
-        return Err(Misaligned::Bools { wrong, allowed: ALLOWED_WRONG_BOOLS });
     }
     if is_started { Ok(()) } else { check_quantities(bytes) }
 }
@@ -210,18 +206,23 @@ fn first_wrong_joint(joints: &[u8; JOINTS], wrong: u8) -> Misaligned {
     Misaligned::JointPosition { wrong, allowed: ALLOWED_WRONG_JOINTS, joint, position }
 }
 
-/// Whether every byte is 0 or 1: checked many at a time, since nearly every packet is right.
+/// Whether every bool is 0 or 1: checked many at a time, since nearly every packet is right.
 #[inline]
-fn are_bools(bytes: &[u8]) -> bool {
-    let (words, rest) = bytes.as_chunks::<16>();
-    let words = words.iter().fold(0, |all, word| all | u128::from_ne_bytes(*word));
-    let rest = rest.iter().fold(0, |all, byte| all | byte);
-    words & u128::from_ne_bytes([0xFE; 16]) == 0 && rest & 0xFE == 0
+fn are_bools(bytes: &[u8; LEN]) -> bool {
+    let mut words = 0;
+    for run in BOOL_BLOCKS {
+        let run = bytes.get(run.from..).and_then(|behind| behind.get(..run.len)).unwrap_or(&[]);
+        words = run.as_chunks::<BLOCK>().0.iter().fold(words, |all, word| all | u128::from_ne_bytes(*word));
+    }
+    let single = BOOL_BYTES.iter().fold(0, |all, &at| all | bytes.get(at).copied().unwrap_or(0));
+    words & u128::from_ne_bytes([0xFE; BLOCK]) == 0 && single & 0xFE == 0
 }
 
 #[cold]
-fn wrong_bools(bytes: &[u8]) -> u16 {
-    bytes.iter().map(|&byte| u16::from(byte > 1)).sum()
+#[inline(never)]
+fn wrong_bools(bytes: &[u8; LEN]) -> u16 {
+    let all = BOOLS.iter().filter_map(|run| bytes.get(run.from..)?.get(..run.len)).flatten();
+    all.map(|&byte| u16::from(byte > 1)).sum()
 }
 
 /// The largest difference of two floats at the same place, not counting floats that are not finite.

@@ -18,6 +18,51 @@ pub(super) struct Bools {
 /// Every bool that is not reserved, consecutive ones merged.
 pub(super) const BOOLS: &[Bools] = BOOL_RUNS.0.split_at(BOOL_RUNS.1).0;
 
+/// The same in whole blocks.
+pub(super) const BOOL_BLOCKS: &[Bools] = {
+    const BLOCKS: ([Bools; BOOLS.len()], usize) = {
+        let mut blocks = [Bools { from: 0, len: 0 }; BOOLS.len()];
+        let (mut run, mut count) = (0, 0);
+        while run < BOOLS.len() {
+            if BOOLS[run].len >= BLOCK {
+                blocks[count] = Bools { from: BOOLS[run].from, len: BOOLS[run].len / BLOCK * BLOCK };
+                count += 1;
+            }
+            run += 1;
+        }
+        (blocks, count)
+    };
+    BLOCKS.0.split_at(BLOCKS.1).0
+};
+
+/// Bytes of a block.
+pub(super) const BLOCK: usize = 16;
+
+/// The bools that are in no block.
+pub(super) const BOOL_BYTES: [usize; single_bools()] = {
+    let mut places = [0; single_bools()];
+    let (mut run, mut count) = (0, 0);
+    while run < BOOLS.len() {
+        let mut at = BOOLS[run].len / BLOCK * BLOCK;
+        while at < BOOLS[run].len {
+            places[count] = BOOLS[run].from + at;
+            count += 1;
+            at += 1;
+        }
+        run += 1;
+    }
+    places
+};
+
+const fn single_bools() -> usize {
+    let (mut run, mut count) = (0, 0);
+    while run < BOOLS.len() {
+        count += BOOLS[run].len % BLOCK;
+        run += 1;
+    }
+    count
+}
+
 /// Fields that are looked at more closely in a packet without a started controller's codes, how
 /// many of their items, and how large these can be in their unit. Not here: what is reserved, and
 /// registers and forces, which users write.
