@@ -14,7 +14,7 @@ use core::hint::black_box;
 use firmware::tasks::gateway::Engine;
 use proto_core::config::image::{self, MAX_IMAGE};
 use proto_core::config::{GatewayConfig, Port};
-use proto_core::engine::{Input, LinkId, OUTPUT_BUFFER, Output, PortId};
+use proto_core::engine::{Handled, Input, LinkId, OUTPUT_BUFFER, Output, PortId};
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::can::{CanFrame, CanId};
 use static_cell::ConstStaticCell;
@@ -256,11 +256,15 @@ fn pass(
     out: &mut [u8; OUTPUT_BUFFER],
     sent: &mut usize,
 ) {
-    engine.handle(now, input);
+    if engine.handle(now, input) == Handled::Asleep {
+        return;
+    }
     loop {
         match engine.poll_output(now, out) {
             // As the firmware does it: the tick that is due comes behind what has arrived.
-            Output::Sleep { until } if until <= now => engine.handle(now, Input::Tick),
+            Output::Sleep { until } if until <= now => {
+                engine.handle(now, Input::Tick);
+            }
             Output::Sleep { .. } => return,
             Output::LinkSend { bytes, .. } | Output::PortSend { bytes, .. } => *sent += bytes.len(),
             Output::PortSendCan { frame, .. } => *sent += frame.data().len(),

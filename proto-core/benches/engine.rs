@@ -11,7 +11,7 @@ use std::process::ExitCode;
 
 use divan::Bencher;
 use instructions::Work;
-use proto_core::engine::{Engine, Input, LinkId, OUTPUT_BUFFER, Output, PortId};
+use proto_core::engine::{Engine, Handled, Input, LinkId, OUTPUT_BUFFER, Output, PortId};
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::can::{CanFrame, CanId};
 use rig::{Cell, MS};
@@ -19,12 +19,12 @@ use rig::{Cell, MS};
 /// The whole way of a field frame, design limit.
 const PASS: u64 = 3_000;
 /// The same byte by byte, most of which come to nothing.
-const BYTES: u64 = 5_000;
+const BYTES: u64 = 3_500;
 /// What is for another node.
 const FOREIGN: u64 = 200;
 /// A state packet, whole and in segments.
-const STATE: u64 = 1_200;
-const SEGMENTS: u64 = 2_000;
+const STATE: u64 = 900;
+const SEGMENTS: u64 = 1_700;
 
 type Pass = fn(&mut Bench);
 
@@ -303,11 +303,15 @@ fn drain(
     out: &mut [u8; OUTPUT_BUFFER],
     sent: &mut usize,
 ) {
-    engine.handle(now, input);
+    if engine.handle(now, input) == Handled::Asleep {
+        return;
+    }
     loop {
         match engine.poll_output(now, out) {
             // As a driver does: the tick that is due comes behind what has arrived.
-            Output::Sleep { until } if until <= now => engine.handle(now, Input::Tick),
+            Output::Sleep { until } if until <= now => {
+                engine.handle(now, Input::Tick);
+            }
             Output::Sleep { .. } => return,
             Output::LinkSend { bytes, .. } => *sent = bytes.len(),
             other => {

@@ -10,7 +10,7 @@ mod rig;
 
 use proto_core::config::*;
 use proto_core::device::Encoding;
-use proto_core::engine::{Engine, Input, LinkId, OUTPUT_BUFFER, Output, PortCounters, PortId};
+use proto_core::engine::{Engine, Handled, Input, LinkId, OUTPUT_BUFFER, Output, PortCounters, PortId};
 use proto_core::recipe::StreamLayout;
 use proto_core::recipe::model::{Field, Framing, Mode, Rules};
 use proto_core::sysvar::{Direction, VarRange};
@@ -27,9 +27,17 @@ const STREAMS: [(&[u8], &[u8], &str); 4] = [
     (&[7], &[], "WordInputReg[5..6]"),
     (&[], &[9, 9, 7], "WordInputReg[7..8]"),
 ];
+/// When silence ends a frame of them: before the next cycle, and behind it.
+const GAPS: [Duration; STREAMS.len()] = [
+    Duration::from_millis(5),
+    Duration::from_millis(50),
+    Duration::from_millis(50),
+    Duration::from_millis(12),
+];
 const DEVICE: PortId = PortId(4);
 const BUS: PortId = PortId(5);
-const NOBODY: PortId = PortId(99);
+/// Of no configuration: what is reported of it is ignored, but the engine looks at all links.
+const NOTHING: Input<'_> = Input::LinkDown { link: LinkId(99) };
 
 type Gateway = Engine<8, 2, 64, 65_536, 0>;
 
@@ -37,12 +45,14 @@ fn cell() -> GatewayConfig {
     let mut cell = Cell::new();
     let up = cell.stream(&["ForceEnd[1..6]"], &[]);
     cell.recipe_link(up);
-    for (head, tail, names) in STREAMS {
+    for ((head, tail, names), gap) in STREAMS.into_iter().zip(GAPS) {
         let fields = cell.system(&[names]);
         let input = cell.part(head, tail, fields);
         let recipe = cell.recipe(Mode::Realtime, Parts::Stream { input, output: None });
         cell.rs485(recipe);
         cell.last_port().timeout = MS(100);
+        let Bus::Rs485(line) = &mut cell.last_port().bus else { panic!("a line") };
+        line.idle_gap = gap;
     }
     // The last of them is shown what the state stream says.
     let fields = cell.system(&["RobotState[8..13]"]);
@@ -61,6 +71,9 @@ fn cell() -> GatewayConfig {
     let input = cell.part(&[], &[], fields);
     let recipe = cell.recipe(Mode::User, Parts::Stream { input, output: None });
     assert_eq!(cell.rs485(recipe), DEVICE);
+    // Before anything else is due.
+    let Bus::Rs485(line) = &mut cell.last_port().bus else { panic!("a line") };
+    line.idle_gap = MS(6);
     let recipe = cell.can(&[(0x100, &["WordInputReg[13]"]), (0x101, &["WordInputReg[14]"])], &[]);
     assert_eq!(cell.can_port(recipe), BUS);
     cell.0
@@ -96,57 +109,102 @@ struct Side {
     wake: Instant,
     /// Told before each byte.
     disturbed: bool,
+    /// What became of outputs and is reported later; if it is not reported at once.
+    later: Option<Vec<Report>>,
+}
+
+/// What became of an output.
+#[derive(Clone, Copy)]
+enum Report {
+    Up(LinkId),
+    Taken(LinkId),
+    Answered([u8; 12]),
+    Left(PortId),
+}
+
+impl Report {
+    fn input(&self) -> Input<'_> {
+        match *self {
+            Self::Up(link) => Input::LinkUp { link },
+            Self::Taken(link) => Input::LinkSent { link },
+            Self::Answered(ref answer) => Input::LinkBytes { link: LinkId::MODBUS, bytes: answer },
+            Self::Left(port) => Input::PortSent { port },
+        }
+    }
 }
 
 impl Side {
-    fn new(config: &GatewayConfig, disturbed: bool, listens: bool, now: Instant) -> Self {
+    fn new(config: &GatewayConfig, disturbed: bool, Habits { listens, late }: Habits, now: Instant) -> Self {
         let engine = Box::new(Gateway::new(config).unwrap());
-        let mut side = Self { engine, out: Vec::new(), sleeps: Vec::new(), wake: now, disturbed };
+        let later = late.then(Vec::new);
+        let mut side = Self { engine, out: Vec::new(), sleeps: Vec::new(), wake: now, disturbed, later };
         side.engine.tap().listen(listens);
         side.call(now, Input::Tick);
         for port in 0..6 {
             side.call(now, Input::PortUp { port: PortId(port) });
         }
+        while side.report(now, 0) {}
         side
     }
 
     fn call(&mut self, now: Instant, input: Input<'_>) {
         if self.disturbed {
-            self.engine.handle(now, Input::PortSent { port: NOBODY });
+            assert_eq!(self.engine.handle(now, NOTHING), Handled::Poll);
         }
-        self.engine.handle(now, input);
+        let (handled, outputs, wake) = (self.engine.handle(now, input), self.out.len(), self.wake);
         self.drain(now);
+        if handled == Handled::Asleep {
+            assert!(!self.disturbed);
+            assert_eq!((self.out.len(), self.wake), (outputs, wake), "{input:?} was said to lead to nothing");
+        }
+    }
+
+    /// What became of an earlier output is reported; `false` if there is nothing to report.
+    fn report(&mut self, now: Instant, nth: usize) -> bool {
+        let Some(later) = self.later.as_mut().filter(|later| !later.is_empty()) else { return false };
+        let report = later.remove(nth.min(later.len() - 1));
+        self.call(now, report.input());
+        true
     }
 
     fn drain(&mut self, now: Instant) {
         let mut buf = [0; OUTPUT_BUFFER];
         loop {
             let output = self.engine.poll_output(now, &mut buf);
-            let (mut answer, mut answered) = ([0; 12], false);
-            let report = match output {
+            let mut reports = Vec::new();
+            match output {
                 Output::Sleep { until } => {
                     assert!(until <= self.engine.deadline().max(now));
                     self.wake = until;
                     self.sleeps.push(until);
                     return;
                 }
-                Output::LinkOpen { link, .. } => Some(Input::LinkUp { link }),
+                Output::LinkOpen { link, .. } => reports.push(Report::Up(link)),
                 Output::LinkSend { link, bytes } => {
-                    if let (LinkId::MODBUS, Some(front)) = (link, bytes.get(..12)) {
-                        answer.copy_from_slice(front);
-                        (answer[5], answered) = (6, true);
+                    reports.push(Report::Taken(link));
+                    if let (LinkId::MODBUS, Some(front)) = (link, bytes.first_chunk()) {
+                        let mut answer = *front;
+                        answer[5] = 6;
+                        reports.push(Report::Answered(answer));
                     }
-                    Some(Input::LinkSent { link })
                 }
-                Output::PortSend { port, .. } => Some(Input::PortSent { port }),
-                _ => None,
-            };
-            self.out.push((now, format!("{output:?}")));
-            if let Some(report) = report {
-                self.engine.handle(now, report);
+                Output::PortSend { port, .. } => reports.push(Report::Left(port)),
+                Output::LinkClose { link } => {
+                    let is_gone = |report: &Report| match *report {
+                        Report::Up(of) | Report::Taken(of) => of == link,
+                        Report::Answered(_) => link == LinkId::MODBUS,
+                        Report::Left(_) => false,
+                    };
+                    self.later.iter_mut().for_each(|later| later.retain(|report| !is_gone(report)));
+                }
+                _ => {}
             }
-            if answered {
-                self.engine.handle(now, Input::LinkBytes { link: LinkId::MODBUS, bytes: &answer });
+            self.out.push((now, format!("{output:?}")));
+            match &mut self.later {
+                Some(later) => later.extend(reports),
+                None => reports.iter().for_each(|report| {
+                    self.engine.handle(now, report.input());
+                }),
             }
         }
     }
@@ -182,6 +240,14 @@ impl Side {
     }
 }
 
+/// What drivers do: listen to the ring of frames, or not; report what became of an output at once, or later and not
+/// always in the outputs' order.
+#[derive(Clone, Copy)]
+struct Habits {
+    listens: bool,
+    late: bool,
+}
+
 /// The engines, and the frames of each stream read literally.
 struct Line {
     swift: Side,
@@ -190,16 +256,15 @@ struct Line {
     reference: Vec<PlainDeframer>,
     /// When each of them had its newest byte; its frame is given up after the gap.
     heard: [Instant; STREAMS.len()],
-    gap: Duration,
     now: Instant,
     /// The driver was on time, and the devices were there.
     is_reference_right: bool,
 }
 
 impl Line {
-    fn new(listens: bool) -> Self {
+    fn new(habits: Habits) -> Self {
         let (config, now) = (cell(), Instant::from_millis(5_000));
-        let side = |disturbed| Side::new(&config, disturbed, listens, now);
+        let side = |disturbed| Side::new(&config, disturbed, habits, now);
         let rules = Rules { mode: Mode::Realtime, direction: Direction::Input };
         let reference = STREAMS.iter().map(|(head, tail, names)| {
             let fields = VarRange::parse(names).unwrap().iter().map(Field::System);
@@ -207,14 +272,21 @@ impl Line {
         });
         let reference = reference.collect();
         let (swift, plain, chunked) = (side(false), side(true), side(false));
-        let (heard, gap) = ([now; STREAMS.len()], Rs485::default().idle_gap);
-        Self { swift, plain, chunked, reference, heard, gap, now, is_reference_right: true }
+        let heard = [now; STREAMS.len()];
+        Self { swift, plain, chunked, reference, heard, now, is_reference_right: true }
     }
 
     fn all(&mut self, input: Input<'_>) {
         self.swift.call(self.now, input);
         self.plain.call(self.now, input);
         self.chunked.call(self.now, input);
+    }
+
+    /// A driver reports what became of an earlier output.
+    fn report(&mut self, nth: usize) {
+        for side in [&mut self.swift, &mut self.plain, &mut self.chunked] {
+            side.report(self.now, nth);
+        }
     }
 
     /// Bytes that came at once, on the way that each of the engines has.
@@ -230,7 +302,7 @@ impl Line {
                 self.reference.get_mut(usize::from(port.0)).filter(|_| self.is_reference_right)
             {
                 let heard = std::mem::replace(&mut self.heard[usize::from(port.0)], self.now);
-                if self.now >= heard + self.gap {
+                if self.now >= heard + GAPS[usize::from(port.0)] {
                     line.silence();
                 }
                 let found = line.receive(&[byte]).len();
@@ -335,9 +407,12 @@ fn sent(dice: &mut Dice, port: PortId) -> Vec<u8> {
 
 fn run(seed: u64, steps: usize) -> u32 {
     let mut dice = Dice(seed);
-    let mut line = Line::new(seed.is_multiple_of(4));
+    let mut line = Line::new(Habits { listens: seed.is_multiple_of(4), late: seed % 2 == 1 });
     for _ in 0..steps {
         let port = PortId(dice.below(5) as u8);
+        for _ in 0..dice.below(6) {
+            line.report(dice.below(2) as usize);
+        }
         match dice.below(24) {
             0 => line.can(&mut dice),
             1 => {

@@ -7,8 +7,8 @@
 
 use proto_core::config::GatewayConfig;
 use proto_core::engine::{
-    BuildError, Engine as AnyEngine, Input, LinkId, LinkInfo, OUTPUT_BUFFER, Output, PortCounters, PortId,
-    Status, Tap,
+    BuildError, Engine as AnyEngine, Handled, Input, LinkId, LinkInfo, OUTPUT_BUFFER, Output, PortCounters,
+    PortId, Status, Tap,
 };
 use proto_core::time::Instant;
 
@@ -48,8 +48,8 @@ impl Engine {
     }
 
     /// Reports an event, or that time has passed.
-    pub fn handle(&mut self, now: Instant, input: Input<'_>) {
-        self.0.handle(now, input);
+    pub fn handle(&mut self, now: Instant, input: Input<'_>) -> Handled {
+        self.0.handle(now, input)
     }
 
     /// The next output for the driver.

@@ -14,7 +14,7 @@ use embassy_time::{Duration, Timer, with_timeout};
 use heapless::Vec;
 use proto_core::config::GatewayConfig;
 use proto_core::engine::{
-    BuildError, Health, Input, LinkId, LinkKind, OUTPUT_BUFFER, Output, PortId, Status, Tap,
+    BuildError, Handled, Health, Input, LinkId, LinkKind, OUTPUT_BUFFER, Output, PortId, Status, Tap,
 };
 use proto_core::sysvar::Direction;
 use proto_core::time::Instant;
@@ -144,7 +144,9 @@ impl Gateway {
         let now = now();
         let mut engine = self.engine.borrow_mut();
         let mut buf = self.output.borrow_mut();
-        engine.handle(now, input);
+        if engine.handle(now, input) == Handled::Asleep {
+            return;
+        }
         if self.sleeps.replace(engine.sleeps()) != engine.sleeps() {
             self.ports.iter().for_each(|(_, control)| control.slept());
         }

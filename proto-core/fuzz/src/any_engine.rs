@@ -2,7 +2,7 @@
 //! or does not: the engine keeps its side of it, and does no more for one input than it may.
 
 use proto_core::config::{FieldSpec, GatewayConfig, Parts, image};
-use proto_core::engine::{BusState, Engine, Input, LinkId, LinkKind, OUTPUT_BUFFER, Output, PortId};
+use proto_core::engine::{BusState, Engine, Handled, Input, LinkId, LinkKind, OUTPUT_BUFFER, Output, PortId};
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::can::CanFrame;
 
@@ -298,16 +298,20 @@ impl Driver {
             self.said.iter_mut().for_each(|said| said.awaits = None);
         }
         self.called = self.now;
-        self.engine.handle(self.now, input);
-        self.drain();
+        let (handled, wake) = (self.engine.handle(self.now, input), self.wake);
+        let outputs = self.drain();
+        if handled == Handled::Asleep {
+            assert_eq!((outputs, self.wake), (0, wake), "{input:?} was said to lead to nothing");
+        }
         // Only a tick lets deadlines pass: before it, they may lie in the past.
         let ticked = matches!(input, Input::Tick);
         assert!(!ticked || self.wake > self.now, "asked to be called at once again");
     }
 
-    fn drain(&mut self) {
+    /// Carries out what the engine wants, and returns how much that was.
+    fn drain(&mut self) -> usize {
         let mut out = [0xA5; OUTPUT_BUFFER];
-        for _ in 0..=MOST_OUTPUTS {
+        for outputs in 0..=MOST_OUTPUTS {
             match self.engine.poll_output(self.now, &mut out) {
                 Output::Sleep { until } => {
                     assert!(
@@ -322,7 +326,7 @@ impl Driver {
                         self.now
                     );
                     self.wake = until;
-                    return;
+                    return outputs;
                 }
                 Output::PortSend { port, bytes } => {
                     let bytes = bytes.to_vec();

@@ -6,7 +6,7 @@
 use super::Engine;
 use super::counters::{add, bump};
 use super::field_port::FieldPort;
-use super::io::Output;
+use super::io::{Handled, Output};
 use super::store::Overdue;
 use super::user::silence_commands;
 use crate::time::{Duration, Instant};
@@ -79,6 +79,12 @@ impl Clock {
     #[inline(always)]
     pub(super) fn is_calm(&self, now: Instant) -> bool {
         now >= self.now && now < self.calm_until
+    }
+
+    /// The same of an engine without ports, too, which is not called at every beat.
+    #[inline(always)]
+    pub(super) fn is_asleep(&self, now: Instant) -> bool {
+        self.is_calm(now) && now < self.beat_at
     }
 
     /// Whether a call at `now` finds nothing to do, and the timer is right.
@@ -220,8 +226,36 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         Output::Sleep { until }
     }
 
+    /// An input has come: the present. An engine that is asleep has nothing late, and no beat to look at.
+    #[inline(always)]
+    pub(super) fn begin(&mut self, was_asleep: bool, now: Instant) -> Instant {
+        self.clock.calm_until = Instant::ZERO;
+        if was_asleep {
+            debug_assert!(!self.clock.is_late && !self.clock.is_deaf);
+            (self.clock.now, self.store.now) = (now, now);
+            return now;
+        }
+        let now = self.present(now);
+        self.clock.is_late = now >= self.clock.announced;
+        now
+    }
+
+    /// It has been handled: whether the engine was asleep, and has nothing to do before it wakes.
+    #[inline(always)]
+    pub(super) fn end(&mut self, was_asleep: bool) -> Handled {
+        if was_asleep
+            && self.clock.ask == Ask::ARMED
+            && self.clock.timer_at.min(self.clock.partial_at) >= self.clock.announced
+        {
+            self.clock.calm_until = self.clock.announced;
+            return Handled::Asleep;
+        }
+        Handled::Poll
+    }
+
     /// The present, and whether the gateway has slept until now.
-    pub(super) fn present(&mut self, now: Instant) -> Instant {
+    #[inline(never)]
+    fn present(&mut self, now: Instant) -> Instant {
         let now = self.forward(now);
         self.store.now = now;
         if now >= self.clock.beat_at {

@@ -332,7 +332,7 @@ impl FieldPort {
                 };
                 hash = digest(hash, out.get(..len).unwrap_or(&[]));
             }
-            if !self.sender.is_news(hash, now) {
+            if !self.sender.is_news(|| hash, now) {
                 self.sender.dismiss();
                 return None;
             }

@@ -60,7 +60,7 @@ impl FieldPort {
         };
         let frame = encoded.and_then(|len| out.get(..len));
         match frame {
-            Some(frame) if self.sender.is_news(digest(DIGEST_SEED, frame), now) => {
+            Some(frame) if self.sender.is_news(|| digest(DIGEST_SEED, frame), now) => {
                 let len = frame.len();
                 bump(&mut self.counters.frames_out);
                 add(&mut self.counters.bytes_out, len);
@@ -121,6 +121,6 @@ impl FieldPort {
             hash = digest(hash, frame.data());
             nth = nth.saturating_add(1);
         }
-        self.sender.is_news(hash, now)
+        self.sender.is_news(|| hash, now)
     }
 }

@@ -3,6 +3,7 @@
 //! In: bytes and CAN frames. Out: values in the store, and frames when they are due. Does not know
 //! how values reach the controller.
 
+use super::clock::Ask;
 use super::command_link::CommandLink;
 use super::counters::{PortCounters, add, bump};
 use super::device_port::DeviceCodec;
@@ -197,7 +198,7 @@ impl FieldPort {
             let verdict = frames.take(layout, payload, usize::from(self.first_frame), &mut accepted);
             tap.record(|| came(self.id, now, verdict, None, [layout.head(), payload, layout.tail()]));
             match verdict {
-                Ok(()) if frames.store.watches_bits => break,
+                Ok(()) if left.is_empty() || frames.store.watches_bits => break,
                 Ok(()) => {}
                 Err(why) => keep(&mut self.last_rejection, why, None, payload, now),
             }
@@ -262,7 +263,7 @@ impl FieldPort {
     #[inline(always)]
     pub(super) fn passes_by(&mut self, frame: &CanFrame, now: Instant) -> bool {
         let Codec::Can { input: Some(layout), .. } = &self.codec else { return false };
-        if frame.is_remote() || layout.has(frame.id()) || self.is_news(Rejection::ForeignId, now) {
+        if frame.is_remote() || layout.has_id_of(frame) || self.is_news(Rejection::ForeignId, now) {
             return false;
         }
         add(&mut self.counters.bytes_in, frame.data().len());
@@ -289,7 +290,7 @@ impl FieldPort {
             bump(&mut self.counters.rejected_no_input);
             return Err(Rejection::NoInput);
         };
-        let index = layout.accept(frame);
+        let index = layout.accept_frame(frame);
         let (Ok(index), Some(frame_layout)) = (index, index.ok().and_then(|nth| layout.frame(nth))) else {
             let (counter, why) = match index {
                 Err(CanReject::Remote { .. }) => (&mut self.counters.rejected_remote, Rejection::Remote),
@@ -337,6 +338,15 @@ impl FieldPort {
     #[inline]
     pub(super) fn deadline(&self) -> Instant {
         self.partial_until().min(self.send_deadline())
+    }
+
+    /// The same after something was heard, if that has begun a frame or made one due; other deadlines stay as they
+    /// were. A port that may have an output is to be asked.
+    #[inline(always)]
+    pub(super) fn deadline_of_heard(&self, ask: &mut Ask) -> Option<Instant> {
+        let is_due = self.sender.is_due();
+        ask.add(Ask::PORTS.when(is_due));
+        (is_due || self.is_partial).then(|| self.deadline())
     }
 
     /// When something may be sent without an input.

@@ -301,6 +301,16 @@ pub enum Input<'a> {
     Tick,
 }
 
+/// Whether anything comes of an input.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Handled {
+    /// Call [`super::Engine::poll_output`] until it is [`Output::Sleep`].
+    Poll,
+    /// Nothing: the engine sleeps on, until the instant of the newest [`Output::Sleep`]. Polling it is harmless.
+    Asleep,
+}
+
 /// A task for the driver.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]

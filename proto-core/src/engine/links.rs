@@ -11,6 +11,7 @@ use super::connection::Connection;
 use super::counters::{LinkCounters, add};
 use super::io::{Endpoint, LinkId, LinkKind, Transport};
 use super::modbus_link::ModbusLink;
+use super::outbox::Outbox;
 use super::state_link::StateLink;
 use super::store::Store;
 use super::uplink::Uplink;
@@ -290,6 +291,28 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         deadline.unwrap_or(Instant::NEVER)
     }
 
+    /// The same, if the link has nothing to send before `until`, nor has any other. Returns when it has; `None` if
+    /// somebody may have something, and then nothing was noted.
+    #[inline(always)]
+    pub(super) fn sent_before_next(
+        &mut self,
+        id: LinkId,
+        outbox: &Outbox,
+        until: Instant,
+    ) -> Option<Instant> {
+        if !self.command.is_empty() {
+            return None;
+        }
+        match id {
+            LinkId::STATE => None,
+            LinkId::MODBUS => self.modbus.first_mut()?.sent_before_answer(),
+            id => {
+                let link = self.recipes.iter_mut().find(|link| link.id == id)?;
+                link.sent_before_next(outbox, until)
+            }
+        }
+    }
+
     /// The peer's transport has acknowledged all but `left` bytes.
     pub(super) fn acked<const PORTS: usize>(&mut self, id: LinkId, left: u32, store: &mut Store<PORTS>) {
         if let LinkId::COMMAND | LinkId::URGENT = id {
@@ -300,18 +323,19 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
     }
 
     /// The next output to the controller: commands that stop the robot, then field values, then
-    /// other commands. Links that have nothing to send until something else happens are no longer in `ask`.
+    /// other commands. With it, the earliest of the link's deadlines that may have come earlier. Links that have nothing
+    /// to send until something else happens are no longer in `ask`.
     #[inline(always)]
     pub(super) fn next_upward<const PORTS: usize>(
         &mut self,
         ask: &mut Ask,
         store: &mut Store<PORTS>,
         out: &mut [u8],
-    ) -> Option<(LinkId, usize)> {
+    ) -> Option<(LinkId, usize, Instant)> {
         if let Some(link) = self.command.first_mut()
-            && let Some(sent) = link.next_stop(out, store.now)
+            && let Some((id, len)) = link.next_stop(out, store.now)
         {
-            return Some(sent);
+            return Some((id, len, link.deadline()));
         }
         if ask.has(Ask::RECIPES) {
             let state = self.state.first().map(|state| state.group);
@@ -323,7 +347,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
                     if left == 0 {
                         ask.remove(Ask::RECIPES);
                     }
-                    return Some((link.id, len));
+                    return Some((link.id, len, link.deadline()));
                 }
             }
             ask.remove(Ask::RECIPES);
@@ -334,11 +358,11 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
             if let Some(link) = self.modbus.first_mut()
                 && let Some(len) = link.next_request(store, out)
             {
-                return Some((LinkId::MODBUS, len));
+                return Some((LinkId::MODBUS, len, link.answer_deadline()));
             }
         }
         let link = self.command.first_mut()?;
-        link.next_command(out, store.now).map(|len| (LinkId::COMMAND, len))
+        link.next_command(out, store.now).map(|len| (LinkId::COMMAND, len, link.deadline()))
     }
 
     /// What may have an output when something has happened to this link. Beside a command link, which looks at what the
@@ -353,6 +377,31 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
             LinkId::MODBUS => Ask::MODBUS,
             _ => Ask::RECIPES,
         }
+    }
+
+    /// What may have an output after bytes came on this link, and the earliest of its deadlines that may have come
+    /// earlier.
+    #[inline(always)]
+    pub(super) fn asked_by_bytes(&mut self, id: LinkId, waiting: &InputSet, now: Instant) -> (Ask, Instant) {
+        if self.command.is_empty() {
+            match id {
+                // Its only deadline is that of silence.
+                LinkId::STATE if self.state.first().is_some_and(|link| link.supervisor.is_up()) => {
+                    return (Ask::NONE, Instant::NEVER);
+                }
+                LinkId::MODBUS => {
+                    if let Some(link) = self.modbus.first_mut()
+                        && link.supervisor.is_up()
+                    {
+                        return (Ask::MODBUS.when(link.may_ask(waiting, now)), link.deadline());
+                    }
+                }
+                _ => {}
+            }
+        }
+        let mut asked = self.ask_of(id);
+        asked.add(Ask::ACTIONS);
+        (asked, self.deadline_of(id))
     }
 
     /// The same, and the links that write one of these variables, which wait.

@@ -35,6 +35,7 @@ mod io;
 mod latency;
 mod line;
 mod line_timing;
+mod link_input;
 mod links;
 mod modbus_link;
 mod modbus_poll;
@@ -66,7 +67,9 @@ pub use build_error::BuildError;
 pub use clock::ASLEEP;
 pub use counters::{LinkCounters, PortCounters};
 pub use failed::FailedCommand;
-pub use io::{BusState, Endpoint, Input, LinkId, LinkKind, Output, PortId, PortState, ReplyCode, Transport};
+pub use io::{
+    BusState, Endpoint, Handled, Input, LinkId, LinkKind, Output, PortId, PortState, ReplyCode, Transport,
+};
 pub use latency::Latency;
 pub use line::PeerCounters;
 pub use links::LinkInfo;
@@ -147,7 +150,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     /// that of the previous call counts as the previous one.
     ///
     /// Inputs for a port or link that the configuration does not have are ignored.
-    pub fn handle(&mut self, now: Instant, input: Input<'_>) {
+    ///
+    /// The answer spares a driver [`Self::poll_output`] where nothing comes of an input; it may be ignored.
+    pub fn handle(&mut self, now: Instant, input: Input<'_>) -> Handled {
         // Most bytes of a busy line continue a frame and do not end it: nothing comes of them.
         if let Input::PortBytes { port, bytes: &[byte] } = input
             && self.clock.is_calm(now)
@@ -155,25 +160,20 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             && port.hold_byte(byte, now)
         {
             self.clock.now = now;
-            return;
+            return Handled::Asleep;
         }
-        self.handle_other(now, &input);
+        self.handle_other(now, &input)
     }
 
     // Apart, so that those do not pay for its registers. By reference, because it would be copied.
     #[inline(never)]
-    fn handle_any(&mut self, now: Instant, input: &Input<'_>) {
-        self.clock.calm_until = Instant::ZERO;
-        let now = self.present(now);
-        self.clock.is_late = now >= self.clock.announced;
+    fn handle_any(&mut self, now: Instant, input: &Input<'_>) -> Handled {
+        let was_asleep = self.clock.is_asleep(now);
+        let now = self.begin(was_asleep, now);
         // Any input may set an earlier deadline; one that becomes later is noticed in time.
         match *input {
-            Input::PortBytes { port, bytes } => {
-                if bytes.len() > SHORT || !self.hold(port, bytes, now) {
-                    self.port_bytes(port, bytes, now);
-                }
-            }
-            Input::PortCan { port, ref frame } => self.port_can(port, frame, now),
+            // They have functions of their own.
+            Input::PortBytes { .. } | Input::PortCan { .. } => {}
             Input::PortSent { port } => self.port_sent(port),
             Input::PortUp { port } => self.port_up(port),
             Input::PortDown { port } => self.port_down(port, now),
@@ -185,6 +185,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             Input::LinkAcked { link, left } => self.link_acked(link, left),
             Input::Tick => self.tick(now),
         }
+        self.end(was_asleep)
     }
 
     /// The next output for the driver. Call it again until it is [`Output::Sleep`]. Nothing is sent
@@ -197,9 +198,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     pub fn poll_output<'b>(&mut self, now: Instant, buf: &'b mut [u8; OUTPUT_BUFFER]) -> Output<'b> {
         if now < self.clock.calm_until {
             debug_assert!(self.clock.is_quiet(now) && !self.clock.is_late);
+            debug_assert!(self.all_are_silent(&mut buf[..], now), "a sleeping engine has an output");
             return Output::Sleep { until: self.clock.calm_until };
         }
-        self.poll_any(now, buf)
+        match self.clock.ask {
+            Ask::ARMED => self.poll_any(now, buf),
+            _ => self.poll_work(now, buf),
+        }
     }
 
     #[inline(never)]
@@ -207,13 +212,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         if self.clock.is_quiet(now) {
             return self.sleep();
         }
-        self.clock.calm_until = Instant::ZERO;
         self.poll_work(now, buf)
     }
 
     /// The next output, if something may have one.
     #[inline(never)]
     fn poll_work<'b>(&mut self, now: Instant, buf: &'b mut [u8; OUTPUT_BUFFER]) -> Output<'b> {
+        self.clock.calm_until = Instant::ZERO;
         let now = self.forward(now);
         if now >= self.clock.timer_at {
             self.ask_all();
@@ -224,8 +229,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             self.store.now = now;
             let upward = self.links.next_upward(&mut self.clock.ask, &mut self.store, &mut buf[..]);
             self.carry_outcomes();
-            if let Some((link, len)) = upward {
-                self.arm(self.links.deadline_of(link));
+            if let Some((link, len, deadline)) = upward {
+                self.arm(deadline);
                 let bytes = buf.get(..len).unwrap_or(&[]);
                 self.tap.went(TapPlace::Link(link), None, bytes, now);
                 return Output::LinkSend { link, bytes };
@@ -294,27 +299,40 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             && !(self.exchanges.is_used() && self.next_request(out, now).is_some())
     }
 
-    // Each input has its own function, so that no other pays for the registers it needs.
+    // Each input has its own function, so that no other pays for the registers it needs. The two that bring frames begin
+    // and end by themselves.
     #[inline(never)]
+    fn handle_bytes(&mut self, now: Instant, input: &Input<'_>) -> Handled {
+        let Input::PortBytes { port: id, bytes } = *input else { return Handled::Poll };
+        let was_asleep = self.clock.is_asleep(now);
+        let now = self.begin(was_asleep, now);
+        // If it was asleep, they could not be held.
+        let is_held = !was_asleep && bytes.len() <= SHORT && self.hold(id, bytes, now);
+        let is_taken = is_held || self.exchanges.is_used() && self.talk_bytes(id, bytes, now);
+        if !is_taken {
+            self.port_bytes(id, bytes, now);
+        }
+        self.end(was_asleep)
+    }
+
+    #[inline(always)]
     fn port_bytes(&mut self, id: PortId, bytes: &[u8], now: Instant) {
-        if self.exchanges.is_used() && self.talk_bytes(id, bytes, now) {
-            return;
-        }
-        if let Some(port) = find_port(&mut self.ports, id) {
-            if self.clock.is_deaf {
-                return port.discard(bytes, None, &mut self.tap, now);
-            }
-            port.heard(bytes, now);
-        }
-        let mut rest = bytes;
+        let (mut rest, mut is_first) = (bytes, true);
         loop {
             let (store, command) = (&mut self.store, self.links.command.first_mut());
             let Some(port) = find_port(&mut self.ports, id) else { return };
+            if is_first {
+                if self.clock.is_deaf {
+                    return port.discard(bytes, None, &mut self.tap, now);
+                }
+                port.heard(bytes, now);
+                is_first = false;
+            }
             let accepted = port.frames(&mut rest, &self.bindings.inputs, store, command, &mut self.tap);
-            self.clock.ask.add(Ask::PORTS.when(port.sender.is_due()));
-            let deadline = port.deadline();
-            self.arm(deadline);
-            self.after_field(id, &accepted, now);
+            if let Some(deadline) = port.deadline_of_heard(&mut self.clock.ask) {
+                self.arm(deadline);
+            }
+            self.after_frame(id, &accepted, now);
             if rest.is_empty() {
                 return;
             }
@@ -341,23 +359,19 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.after_field(id, &accepted, now);
     }
 
+    #[inline(never)]
+    fn handle_frame(&mut self, now: Instant, input: &Input<'_>) -> Handled {
+        let Input::PortCan { port: id, ref frame } = *input else { return Handled::Poll };
+        let was_asleep = self.clock.is_asleep(now);
+        let now = self.begin(was_asleep, now);
+        if !(self.exchanges.is_used() && self.talk_can(id, frame, now)) {
+            self.port_can(id, frame, now);
+        }
+        self.end(was_asleep)
+    }
+
+    #[inline(always)]
     fn port_can(&mut self, id: PortId, frame: &CanFrame, now: Instant) {
-        if self.exchanges.is_used() {
-            return self.can_beside_exchanges(id, frame, now);
-        }
-        self.plain_can(id, frame, now);
-    }
-
-    #[cold]
-    #[inline(never)]
-    fn can_beside_exchanges(&mut self, id: PortId, frame: &CanFrame, now: Instant) {
-        if !self.talk_can(id, frame, now) {
-            self.plain_can(id, frame, now);
-        }
-    }
-
-    #[inline(never)]
-    fn plain_can(&mut self, id: PortId, frame: &CanFrame, now: Instant) {
         let (store, command) = (&mut self.store, self.links.command.first_mut());
         let Some(port) = find_port(&mut self.ports, id) else { return };
         if self.clock.is_deaf {
@@ -368,10 +382,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             // Most are for other nodes of the bus.
             return;
         }
-        self.clock.ask.add(Ask::PORTS.when(port.sender.is_due()));
-        let deadline = port.deadline();
-        self.arm(deadline);
-        self.after_field(id, &accepted, now);
+        if let Some(deadline) = port.deadline_of_heard(&mut self.clock.ask) {
+            self.arm(deadline);
+        }
+        self.after_frame(id, &accepted, now);
     }
 
     #[inline(never)]
@@ -423,56 +437,6 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.tell_alive(now);
     }
 
-    #[cold]
-    fn link_up(&mut self, link: LinkId) {
-        self.links.up(link, &mut self.store);
-        self.arm_link(link);
-    }
-
-    #[cold]
-    fn link_down(&mut self, link: LinkId) {
-        self.links.down(link, &mut self.store);
-        self.carry_results();
-        self.arm_link(link);
-    }
-
-    #[inline(never)]
-    fn link_sent(&mut self, link: LinkId) {
-        let deadline = self.links.sent(link);
-        self.clock.ask.add(self.links.ask_of(link));
-        self.arm(deadline);
-    }
-
-    #[inline(never)]
-    fn link_acked(&mut self, link: LinkId, left: u32) {
-        self.links.acked(link, left, &mut self.store);
-        self.clock.ask.add(self.links.ask_of(link));
-        self.arm(self.links.deadline_of(link));
-    }
-
-    #[inline(never)]
-    fn link_bytes(&mut self, link: LinkId, bytes: &[u8], now: Instant) {
-        let is_up = self.links.heard(link, bytes.len(), now);
-        let mut rest = if is_up { bytes } else { &[] };
-        loop {
-            if is_up {
-                let before = rest;
-                rest = self.links.received(link, rest, &mut self.store);
-                let taken = before.get(..before.len().saturating_sub(rest.len())).unwrap_or(&[]);
-                self.tap.came(link, taken, now);
-            }
-            self.carry_results();
-            let asked = self.links.ask_of(link);
-            self.clock.ask.add(self.links.ask_for(&self.store.outbox.dirty(), asked));
-            self.clock.ask.add(Ask::ACTIONS);
-            self.arm(self.links.deadline_of(link));
-            self.image_changed();
-            if rest.is_empty() {
-                return;
-            }
-        }
-    }
-
     /// Drops commands whose device is gone.
     fn drop_forgotten(&mut self, now: Instant) {
         if let Some(command) = self.links.command.first_mut() {
@@ -481,13 +445,6 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             self.arm(deadline);
         }
         self.carry_outcomes();
-    }
-
-    /// Something happened on a link that may change its deadline, or close it.
-    fn arm_link(&mut self, link: LinkId) {
-        self.clock.ask.add(Ask::LINKS);
-        self.clock.ask.add(Ask::ACTIONS);
-        self.arm(self.links.deadline_of(link));
     }
 
     fn change_port(&mut self, id: PortId, change: impl FnOnce(&mut FieldPort)) {
@@ -517,8 +474,15 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         });
     }
 
-    /// After a field frame: checks bits that trigger, and frames that wait for their neighbours.
+    /// [`Self::after_frame`], on its own, where it matters less.
+    #[inline(never)]
     fn after_field(&mut self, port: PortId, accepted: &Accepted, now: Instant) {
+        self.after_frame(port, accepted, now);
+    }
+
+    /// After a field frame: checks bits that trigger, and frames that wait for their neighbours.
+    #[inline(always)]
+    fn after_frame(&mut self, port: PortId, accepted: &Accepted, now: Instant) {
         if accepted.frames == 0 {
             return;
         }
@@ -537,8 +501,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.carry_outcomes();
         self.image_changed();
         let dirty = self.store.outbox.dirty();
-        let state = self.links.state.first().map(|state| state.group);
-        let mut waits = false;
+        let (state, mut waits) = (&self.links.state, false);
         for link in &mut self.links.recipes {
             let wanted = dirty.and(&link.writes);
             if wanted.is_empty() {
@@ -547,6 +510,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             self.clock.ask.add(Ask::RECIPES);
             if !wanted.and(&accepted.set).is_empty() {
                 link.offered.or_at(now);
+                let state = || state.first().map(|state| state.group);
                 waits = waits || link.supervisor.is_up() && !link.is_ready(&self.store, state);
             }
         }
@@ -586,11 +550,17 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     /// The next output to the field.
     fn next_downward(&mut self, out: &mut [u8], now: Instant) -> Option<(PortId, Downward)> {
         let (image, bindings) = (&self.store.image, self.bindings.outputs());
+        let mut left = self.ports.len();
         for port in &mut self.ports {
+            left = left.wrapping_sub(1);
             if port.may_send(now)
                 && let Some(downward) = port.next_output(image, bindings, out, now)
             {
                 port.sender.take_due_since().record(now, &mut self.store.latency.lateness);
+                // Those before it had nothing.
+                if left == 0 && !port.sender.is_due() && !self.exchanges.is_used() {
+                    self.clock.ask.remove(Ask::PORTS);
+                }
                 return Some((port.id, downward));
             }
         }

@@ -213,7 +213,31 @@ impl ModbusLink {
         Some(len)
     }
 
-    fn answer_deadline(&self) -> Instant {
+    /// The transport took a request that is still to be answered: nothing else can be asked before. `None` if something
+    /// can be; then it was not noted. Otherwise [`Instant::NEVER`], as no deadline has changed.
+    #[inline(always)]
+    pub(super) fn sent_before_answer(&mut self) -> Option<Instant> {
+        self.in_flight.as_ref()?;
+        self.unsent = false;
+        Some(Instant::NEVER)
+    }
+
+    /// Whether [`Self::next_request`] may have one, on a link that is up.
+    #[inline(always)]
+    pub(super) fn may_ask(&mut self, waiting: &InputSet, now: Instant) -> bool {
+        if self.in_flight.is_some() || self.unsent {
+            return false;
+        }
+        if !waiting.and(&self.writes).is_empty() {
+            return true;
+        }
+        self.offered = Since::NONE;
+        self.blocks.iter().any(|block| block.grid.next() <= now)
+    }
+
+    /// When the transaction in flight is given up; [`Instant::NEVER`] if none is.
+    #[inline(always)]
+    pub(super) fn answer_deadline(&self) -> Instant {
         self.in_flight.map_or(Instant::NEVER, |asked| asked.until)
     }
 
@@ -350,14 +374,16 @@ impl ModbusLink {
         store: &mut Store<PORTS>,
         out: &mut [u8],
     ) -> Option<(usize, Asked)> {
-        let (address, kind) = place_of(first)?;
-        let (each, most) = match (kind, first.modbus()) {
-            (Kind::Coils, Some(ModbusPlace::Coils { count, .. })) => (count.max(1), MAX_WRITE_COILS),
-            _ => (1, MAX_WRITE_REGISTERS),
+        let (address, kind, each, most) = match first.modbus()? {
+            ModbusPlace::Coils { first, count: 0 | 1 } => (first, Kind::Coils, 1, MAX_WRITE_COILS),
+            ModbusPlace::Coils { first, count } => {
+                (first, Kind::Coils, count, MAX_WRITE_COILS.checked_div(count).unwrap_or(1))
+            }
+            ModbusPlace::Register { address } => (address, Kind::Registers, 1, MAX_WRITE_REGISTERS),
+            ModbusPlace::Scaled { .. } => return None,
         };
         // Variables of one row of the table follow each other in the map as they do in the image.
-        let left_in_row = first.span().last.saturating_sub(first.index()).saturating_add(1);
-        let most = usize::from(most.checked_div(each).unwrap_or(1).min(u16::from(left_in_row)));
+        let most = usize::from(most).min(first.left_in_row());
         let count = pending.run_len(first).min(most);
         let items = each.saturating_mul(count as u16);
         let vars = InputSet::run(first, count);

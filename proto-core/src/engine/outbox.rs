@@ -109,6 +109,7 @@ impl Outbox {
     }
 
     /// Variables with a value to write.
+    #[inline]
     pub(super) fn dirty(&self) -> InputSet {
         self.dirty
     }
@@ -168,6 +169,7 @@ impl Outbox {
     }
 
     /// An accepted frame set variables that are not bits.
+    #[inline]
     pub(super) fn offer_analog(&mut self, vars: &InputSet) {
         self.dirty = self.dirty.or(vars);
     }
@@ -226,6 +228,7 @@ impl Outbox {
     }
 
     /// The variables' values have been handed over to their link.
+    #[inline]
     pub(super) fn taken(&mut self, vars: &InputSet) {
         self.dirty = self.dirty.minus(vars);
     }

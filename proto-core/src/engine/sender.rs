@@ -10,23 +10,31 @@ use crate::schedule::Grid;
 use crate::time::{Duration, Instant};
 
 /// A set of the image's groups.
+// In words: numbers of 128 bits are slow on a Cortex-M.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct GroupSet(u128);
-
-const _: () = assert!(MAX_GROUPS <= 128);
+pub(super) struct GroupSet([u32; MAX_GROUPS.div_ceil(32)]);
 
 impl GroupSet {
     pub(super) fn insert(&mut self, group: GroupId) {
-        self.0 |= 1_u128.checked_shl(u32::from(group.0)).unwrap_or(0);
+        if let Some(word) = self.0.get_mut(usize::from(group.0) / 32) {
+            *word |= 1_u32.wrapping_shl(u32::from(group.0) % 32);
+        }
     }
 
-    fn iter(self) -> impl Iterator<Item = GroupId> {
-        let mut left = self.0;
-        core::iter::from_fn(move || {
-            let next = left.trailing_zeros();
-            left &= left.wrapping_sub(1);
-            (next < 128).then_some(GroupId(next as u8))
-        })
+    /// Whether something is true of all its groups.
+    #[inline(always)]
+    fn all(self, is_true: impl Fn(GroupId) -> bool) -> bool {
+        for (nth, word) in self.0.into_iter().enumerate() {
+            let mut left = word;
+            while left != 0 {
+                let bit = left.trailing_zeros() as usize;
+                left &= left.wrapping_sub(1);
+                if !is_true(GroupId(nth.wrapping_mul(32).wrapping_add(bit) as u8)) {
+                    return false;
+                }
+            }
+        }
+        true
     }
 }
 
@@ -141,6 +149,13 @@ impl Sender {
         self.in_flight = false;
     }
 
+    /// The same, if nothing else is due; else it is not noted, and the answer is `false`.
+    #[inline(always)]
+    pub(super) fn sent_before_next(&mut self) -> bool {
+        self.in_flight &= self.due;
+        !self.due
+    }
+
     /// Since when the frame, or the first CAN frame of the cycle, has been due; returned once.
     pub(super) fn take_due_since(&mut self) -> Since {
         core::mem::replace(&mut self.due_since, Since::NONE)
@@ -180,6 +195,7 @@ impl Sender {
     }
 
     /// This many input frames were accepted at once: the newest is answered.
+    #[inline(always)]
     pub(super) fn frames_accepted(
         &mut self,
         count: u32,
@@ -187,10 +203,15 @@ impl Sender {
         counters: &mut PortCounters,
         now: Instant,
     ) {
-        if self.on == SendOn::Frame && usable && count > 0 {
-            counters.skipped_cycles = counters.skipped_cycles.wrapping_add(count.wrapping_sub(1));
-            self.raise(counters, Since::at(now));
+        if matches!(self.on, SendOn::Frame) && usable && count > 0 {
+            self.answer_newest(count, counters, now);
         }
+    }
+
+    #[inline(never)]
+    fn answer_newest(&mut self, count: u32, counters: &mut PortCounters, now: Instant) {
+        counters.skipped_cycles = counters.skipped_cycles.wrapping_add(count.wrapping_sub(1));
+        self.raise(counters, Since::at(now));
     }
 
     /// Values in the image changed: checks the bit that triggers.
@@ -216,18 +237,21 @@ impl Sender {
     #[inline(always)]
     pub(super) fn may_show(&self, image: &Image, now: Instant) -> bool {
         image.can_read(&self.shown, self.shown_extra)
-            && self.sources.iter().all(|group| match image.stamp_of(group) {
+            && self.sources.all(|group| match image.stamp_of(group) {
                 Some(at) => self.on_stale == OnStale::Hold || now.saturating_since(at) <= self.stale_after,
                 None => false,
             })
     }
 
     /// Whether a frame with this digest is new, on a port that sends only changes, or is to be sent
-    /// again.
-    pub(super) fn is_news(&mut self, digest: u64, now: Instant) -> bool {
-        if self.on != SendOn::Change {
-            return true;
-        }
+    /// again. Other ports pay for no digest.
+    #[inline(always)]
+    pub(super) fn is_news(&mut self, digest: impl FnOnce() -> u64, now: Instant) -> bool {
+        self.on != SendOn::Change || self.is_change(digest(), now)
+    }
+
+    #[inline(never)]
+    fn is_change(&mut self, digest: u64, now: Instant) -> bool {
         let news = self.digest != Some(digest) || now >= self.refresh_at;
         self.digest = Some(digest);
         if news {

@@ -168,8 +168,7 @@ impl Connection for StateLink {
 #[inline]
 fn next_run(shown: &[SysVar]) -> Option<(&[SysVar], &[SysVar])> {
     let first = shown.first()?;
-    let left_in_row = usize::from(first.span().last.saturating_sub(first.index())).saturating_add(1);
-    let most = left_in_row.min(MAX_RUN.checked_div(first.size()).unwrap_or(1));
+    let most = first.left_in_row().min(MAX_RUN.checked_div(first.size()).unwrap_or(1));
     let places = first.ordinal()..;
     let len = shown.iter().zip(places).take(most).take_while(|(var, place)| var.ordinal() == *place).count();
     shown.split_at_checked(len.max(1))

@@ -158,9 +158,8 @@ impl<const PORTS: usize> Store<PORTS> {
         let now = self.now;
         let Some(frame) = self.frames.get_mut(nth) else { return InputSet::EMPTY };
         frame.overdue_at = now + frame.timeout;
-        self.next_overdue = Stamp::at(self.next_overdue.get().min(frame.overdue_at));
-        let too_old = too_old_at(now, frame.timeout);
-        self.next_expiry = Stamp::at(self.next_expiry.get().min(too_old));
+        self.next_overdue.or_earlier(frame.overdue_at);
+        self.next_expiry.or_earlier(too_old_at(now, frame.timeout));
         let (set, port) = (frame.set, usize::from(frame.port));
         self.image.stamp(GroupId(nth as u8), now);
         self.live = self.live.or(&set);
@@ -193,8 +192,15 @@ impl<const PORTS: usize> Store<PORTS> {
 
     #[inline(always)]
     fn offer(&mut self, port: usize, vars: &InputSet, counters: &mut PortCounters) {
-        let Some(queue) = self.edges.get_mut(port) else { return };
         self.outbox.offer_analog(&vars.minus(&InputSet::BYTES));
+        if !vars.and(&InputSet::BYTES).is_empty() {
+            self.offer_bits(port, vars, counters);
+        }
+    }
+
+    #[inline(never)]
+    fn offer_bits(&mut self, port: usize, vars: &InputSet, counters: &mut PortCounters) {
+        let Some(queue) = self.edges.get_mut(port) else { return };
         for var in vars.and(&InputSet::BYTES).iter() {
             let value = self.image.bytes().get(var.image_offset()).copied().unwrap_or(0);
             self.outbox.offer_bits(queue, counters, var, value, self.now);

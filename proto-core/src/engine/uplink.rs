@@ -9,6 +9,7 @@ use super::counters::{LinkCounters, add, bump};
 use super::flight::Flight;
 use super::io::{LinkId, LinkKind, Transport};
 use super::latency::Since;
+use super::outbox::Outbox;
 use super::store::Store;
 use crate::config::Name;
 use crate::image::{GroupId, Image, InputSet};
@@ -153,14 +154,15 @@ impl Uplink {
     ) -> Option<usize> {
         let (now, mut born) = (store.now, Since::NONE);
         let len = match &self.input {
-            Some(layout) if wanted && self.is_ready(store, state) => {
+            Some(layout) if wanted && self.is_ready(store, || state) => {
                 let len = encode(layout, store, out)?;
                 born = core::mem::replace(&mut self.offered, Since::NONE);
                 born.record(now, &mut store.latency.handed_over);
                 store.taken(&self.writes);
                 self.handed_over = Some((now, store.era));
-                let repeats = self.repeat_at == Instant::NEVER || is_new(store);
-                if repeats && !store.unconfirmed.and(&self.writes).is_empty() {
+                if !store.unconfirmed.and(&self.writes).is_empty()
+                    && (self.repeat_at == Instant::NEVER || is_new(store))
+                {
                     self.repeat_at = self.repeat_at.min(now + REPEAT_EVERY);
                 }
                 bump(&mut self.counters.sent);
@@ -184,6 +186,23 @@ impl Uplink {
         Some(len)
     }
 
+    /// The transport took what was sent, and nothing else is to be sent before `until`. Returns when that is; `None` if
+    /// there may be something, and then it was not noted.
+    #[inline(always)]
+    pub(super) fn sent_before_next(&mut self, outbox: &Outbox, until: Instant) -> Option<Instant> {
+        let speaks_at = self.speaks_at();
+        if !self.supervisor.is_up()
+            || self.flight.is_full()
+            || speaks_at < until
+            || !outbox.dirty().and(&self.writes).is_empty()
+        {
+            return None;
+        }
+        self.busy = false;
+        self.offered = Since::NONE;
+        Some(speaks_at)
+    }
+
     /// Whether a datagram is a frame of the output part.
     pub(super) fn is_frame(&self, bytes: &[u8]) -> bool {
         self.output.as_ref().is_some_and(|layout| datagram(layout, bytes).is_ok())
@@ -196,11 +215,24 @@ impl Uplink {
 
     /// Whether every variable of the frame has a value that its owner sent or that was just read
     /// back.
-    pub(super) fn is_ready<const PORTS: usize>(&self, store: &Store<PORTS>, state: Option<GroupId>) -> bool {
+    #[inline(always)]
+    pub(super) fn is_ready<const PORTS: usize>(
+        &self,
+        store: &Store<PORTS>,
+        state: impl FnOnce() -> Option<GroupId>,
+    ) -> bool {
         let others = self.set.minus(&store.live);
-        if others.is_empty() {
-            return true;
-        }
+        others.is_empty() || self.are_known(&others, store, state())
+    }
+
+    /// The same of those that have no value of their owner.
+    #[inline(never)]
+    fn are_known<const PORTS: usize>(
+        &self,
+        others: &InputSet,
+        store: &Store<PORTS>,
+        state: Option<GroupId>,
+    ) -> bool {
         let read_back = state
             .and_then(|group| store.image.stamp_of(group))
             .is_some_and(|at| store.now.saturating_since(at) <= READ_BACK_MAX_AGE);
@@ -332,6 +364,7 @@ impl Connection for Uplink {
         self.repeat_at = now + if fast { REPEAT_EVERY } else { REPEAT_SLOWLY };
     }
 
+    #[inline]
     fn deadline(&self) -> Instant {
         let speaks_at = if self.busy { Instant::NEVER } else { self.speaks_at() };
         speaks_at.min(self.flight.deadline()).min(self.repeat_at)

@@ -6,7 +6,7 @@ use std::collections::BTreeSet;
 use proto_core::config::*;
 use proto_core::device::Algorithm;
 use proto_core::engine::{
-    Engine, Input, LinkId, LinkInfo, LinkKind, OUTPUT_BUFFER, Output, PortCounters, PortId,
+    Engine, Handled, Input, LinkId, LinkInfo, LinkKind, OUTPUT_BUFFER, Output, PortCounters, PortId,
 };
 use proto_core::modbus::adu::MAX_ADU;
 use proto_core::modbus::server::{RegisterBank, Server};
@@ -290,12 +290,15 @@ impl Rig {
 
     /// One input, and everything that follows from it at this instant.
     pub fn input(&mut self, input: Input<'_>) {
-        self.engine.handle(self.now, input);
+        let (handled, before) = (self.engine.handle(self.now, input), (self.wake, self.log.len()));
         self.called = self.now;
         if self.logs_ticks && matches!(input, Input::Tick) {
             self.log.push((self.now, Out::Tick));
         }
         self.drain();
+        if handled == Handled::Asleep {
+            assert_eq!((self.wake, self.log.len()), before, "{input:?} was said to lead to nothing");
+        }
         if matches!(input, Input::Tick) {
             if self.reacted && self.wake <= self.now {
                 // What the controller did meanwhile is due at once.

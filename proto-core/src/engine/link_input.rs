@@ -1,0 +1,70 @@
+//! What the driver reports of links to the controller.
+//!
+//! In: a link is up or down, bytes came on it, its transport took some. Out: values in the store, results of commands,
+//! and which ports and links may have an output now. Does not know what travels on a link.
+
+use super::Engine;
+use super::clock::Ask;
+use super::io::LinkId;
+use crate::time::Instant;
+
+impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize, const EXCHANGES: usize>
+    Engine<PORTS, UPLINKS, FIELDS, TAP, EXCHANGES>
+{
+    #[cold]
+    pub(super) fn link_up(&mut self, link: LinkId) {
+        self.links.up(link, &mut self.store);
+        self.arm_link(link);
+    }
+
+    #[cold]
+    pub(super) fn link_down(&mut self, link: LinkId) {
+        self.links.down(link, &mut self.store);
+        self.carry_results();
+        self.arm_link(link);
+    }
+
+    #[inline(never)]
+    pub(super) fn link_sent(&mut self, link: LinkId) {
+        let deadline = self.links.sent(link);
+        self.clock.ask.add(self.links.ask_of(link));
+        self.arm(deadline);
+    }
+
+    #[inline(never)]
+    pub(super) fn link_acked(&mut self, link: LinkId, left: u32) {
+        self.links.acked(link, left, &mut self.store);
+        self.clock.ask.add(self.links.ask_of(link));
+        self.arm(self.links.deadline_of(link));
+    }
+
+    #[inline(never)]
+    pub(super) fn link_bytes(&mut self, link: LinkId, bytes: &[u8], now: Instant) {
+        let is_up = self.links.heard(link, bytes.len(), now);
+        let mut rest = if is_up { bytes } else { &[] };
+        loop {
+            if is_up {
+                let before = rest;
+                rest = self.links.received(link, rest, &mut self.store);
+                let taken = before.get(..before.len().saturating_sub(rest.len())).unwrap_or(&[]);
+                self.tap.came(link, taken, now);
+            }
+            self.carry_results();
+            let dirty = self.store.outbox.dirty();
+            let (asked, deadline) = self.links.asked_by_bytes(link, &dirty, now);
+            self.clock.ask.add(self.links.ask_for(&dirty, asked));
+            self.arm(deadline);
+            self.image_changed();
+            if rest.is_empty() {
+                return;
+            }
+        }
+    }
+
+    /// Something happened on a link that may change its deadline, or close it.
+    fn arm_link(&mut self, link: LinkId) {
+        self.clock.ask.add(Ask::LINKS);
+        self.clock.ask.add(Ask::ACTIONS);
+        self.arm(self.links.deadline_of(link));
+    }
+}
