@@ -3,7 +3,7 @@
 //! They need QEMU (`apt-get install qemu-system-arm`), the firmware for `mps2-an500` and `host-sim`:
 //! `FIRMWARE_ELF=... HOST_SIM=target/debug/host-sim cargo test -p firmware --test machine -- --ignored`
 
-use std::io::{BufRead, BufReader, Write};
+use std::io::{BufRead, BufReader, Read, Write};
 use std::net::UdpSocket;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
@@ -13,6 +13,7 @@ use std::time::{Duration, Instant};
 
 use embassy_futures::block_on;
 use recipe_store::{Ended, Flash, Geometry, Marks, Place, Store, Trial, WORD, Word};
+use recipe_test_kit::{qemu, until};
 
 /// A running machine, with the lines of its log.
 struct Machine {
@@ -38,13 +39,20 @@ impl Machine {
     }
 
     fn start_with(arguments: &str, options: &[&str]) -> Self {
+        Self::start_on(&["-serial", "null"], arguments, options)
+    }
+
+    /// The same, with this device on the CAN bus.
+    fn start_on(bus: &[&str], arguments: &str, options: &[&str]) -> Self {
         let arguments = format!("enable=on,target=native,arg=firmware,{arguments}");
         let monitor = tempfile::tempdir().unwrap();
         let socket = format!("unix:{}/socket,server=on,wait=off", monitor.path().display());
         let mut qemu = Command::new("qemu-system-arm")
             .args("-M mps2-an500 -display none".split(' '))
             .args(["-monitor", &socket])
-            .args("-serial null -serial null -serial null -serial stdio".split(' '))
+            .args("-serial null -serial null".split(' '))
+            .args(bus)
+            .args(["-serial", "stdio"])
             .args(["-semihosting-config", &arguments, "-kernel"])
             .arg(variable("FIRMWARE_ELF"))
             .args(options)
@@ -113,6 +121,13 @@ impl Machine {
                 line.trim().rsplit_once("0x").and_then(|(_, digits)| u32::from_str_radix(digits, 16).ok());
             missing.retain(|wanted| Some(*wanted) != value);
         }
+    }
+
+    /// Lets a machine run that was started with `-S`.
+    fn go_on(&self) {
+        let mut monitor =
+            until("QEMU's monitor", || UnixStream::connect(self.monitor.path().join("socket")).ok());
+        writeln!(monitor, "cont").unwrap();
     }
 
     /// Collects the log for `time`; returns all of it.
@@ -296,6 +311,27 @@ fn with_an_address_of_its_own_the_board_finds_the_controller_by_name() {
         }
     }
     assert!(asked > 0);
+}
+
+/// A client that opens the bus while the board has no power yet. QEMU keeps its bytes, and the board asks for them.
+#[test]
+#[ignore = "needs QEMU and the firmware"]
+fn what_came_on_a_line_before_the_start_is_taken_at_once() {
+    let folder = tempfile::tempdir().unwrap();
+    let image = image(&folder, "can-hand.toml", &["controller.address=10.0.2.2"]);
+    let path = folder.path().join("can");
+    let bus = qemu::line("can", &path);
+    let arguments = format!("arg={},arg=none", image.display());
+    let options = [&qemu::MACHINE[..], &["-S", "-nic", "user"]].concat();
+    let mut machine = Machine::start_on(&bus.each_ref().map(String::as_str), &arguments, &options);
+    let mut client = until("QEMU's socket", || UnixStream::connect(&path).ok());
+    client.set_read_timeout(Some(PATIENCE)).unwrap();
+    client.write_all(b"O\r").unwrap();
+    machine.go_on();
+    machine.until("configuration: ");
+    let mut answer = [0];
+    client.read_exact(&mut answer).expect("the bus is opened");
+    assert_eq!(answer, *b"\r");
 }
 
 /// For longer than the watchdog's period, while links to a missing controller are retried.

@@ -33,6 +33,8 @@ pub struct Lan9118<R> {
     tx: [u8; BUFFER],
     /// Number of received frames with errors or too long.
     dropped: u32,
+    /// Whether the PHY has a link, once it was asked.
+    link: Option<bool>,
 }
 
 /// Why the controller does not start.
@@ -87,7 +89,8 @@ impl<R: Registers> Lan9118<R> {
         regs.write(RX_CFG, 0);
         regs.write(TX_CFG, 0xC000);
         regs.write(TX_CFG, TX_ON);
-        let mut driver = Self { regs, waker, address: [0; 6], rx: [0; BUFFER], tx: [0; BUFFER], dropped: 0 };
+        let mut driver =
+            Self { regs, waker, address: [0; 6], rx: [0; BUFFER], tx: [0; BUFFER], dropped: 0, link: None };
         let low = driver.mac_read(MAC_ADDRL)?.to_le_bytes();
         let high = driver.mac_read(MAC_ADDRH)?.to_le_bytes();
         driver.address = [low[0], low[1], low[2], low[3], high[0], high[1]];
@@ -146,6 +149,15 @@ impl<R: Registers> Lan9118<R> {
             info = self.regs.read(TX_FIFO_INF);
         }
         (info & 0xFFFF) as usize >= BUFFER
+    }
+
+    /// Asks the PHY, and acknowledges its interrupt first, so that a change after this is not missed.
+    fn read_link(&self) -> Result<bool, StartError> {
+        self.regs.write(INT_STS, INT_PHY);
+        self.phy_read(PHY_INT_SOURCE)?;
+        // The bit latches a loss until it is read.
+        self.phy_read(PHY_BMSR)?;
+        Ok(self.phy_read(PHY_BMSR)? & BMSR_LINK != 0)
     }
 
     fn enable_interrupts(&self) {
@@ -227,18 +239,13 @@ impl<R: Registers> Driver for Lan9118<R> {
 
     fn link_state(&mut self, cx: &mut Context<'_>) -> LinkState {
         self.waker.register(cx.waker());
-        // Reading the source acknowledges the PHY's interrupt. The link bit latches a loss until it is read, so
-        // it is read twice.
-        let state = self.phy_read(PHY_INT_SOURCE).and_then(|_| {
-            self.phy_read(PHY_BMSR)?;
-            self.phy_read(PHY_BMSR)
-        });
-        self.regs.write(INT_STS, INT_PHY);
-        self.enable_interrupts();
-        match state {
-            Ok(status) if status & BMSR_LINK != 0 => LinkState::Up,
-            _ => LinkState::Down,
+        // The stack asks with each frame, and the PHY is far away: its registers are read when it says that something
+        // has changed.
+        if self.link.is_none() || self.regs.read(INT_STS) & INT_PHY != 0 {
+            self.link = self.read_link().ok();
+            self.enable_interrupts();
         }
+        if self.link == Some(true) { LinkState::Up } else { LinkState::Down }
     }
 
     fn capabilities(&self) -> Capabilities {

@@ -9,6 +9,7 @@ mod host_sim;
 pub mod http;
 pub mod latency;
 mod process;
+pub mod qemu;
 pub mod toml;
 
 use std::path::{Path, PathBuf};

@@ -5,6 +5,7 @@ use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use recipe_test_kit::qemu;
 use serde_json::{Value, json};
 
 use super::board::{self, Machine, Wires};
@@ -70,20 +71,20 @@ impl Board {
             ["-M", "mps2-an500", "-display", "none", "-monitor", "none", "-nic", &network]
                 .map(OsString::from)
                 .into();
-        let mut add = |words: [String; 2]| arguments.extend(words.map(OsString::from));
+        arguments.extend(qemu::MACHINE.map(OsString::from));
         for uart in UARTS {
-            let path = wires.folder.join(uart);
-            let device = format!("socket,id={uart},path={},server=on,wait=off", path.display());
-            add(["-chardev".into(), device]);
-            add(["-serial".into(), format!("chardev:{uart}")]);
+            arguments.extend(qemu::line(uart, &wires.folder.join(uart)).map(OsString::from));
         }
+        let mut add = |words: [String; 2]| arguments.extend(words.map(OsString::from));
         add(["-chardev".into(), format!("file,id=log,path={}", log.display())]);
         add(["-serial".into(), "chardev:log".into()]);
         add(["-qmp".into(), format!("unix:{},server=on,wait=off", wires.folder.join("qmp").display())]);
         let named = format!("enable=on,target=native,arg=firmware,arg={}", image.display());
         add(["-semihosting-config".into(), named]);
         arguments.extend(["-kernel".into(), elf.into()]);
-        let program = Program::start(plan.case, "qemu", Path::new("qemu-system-arm"), &arguments);
+        let program = qemu::on_one_processor(|| {
+            Program::start(plan.case, "qemu", Path::new("qemu-system-arm"), &arguments)
+        });
         let mut board = Self { program, log, wires };
         // By the last socket that QEMU opens.
         board.wires.read_forwarded(&config, "qmp");

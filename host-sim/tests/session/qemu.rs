@@ -3,6 +3,8 @@
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
+use recipe_test_kit::qemu;
+
 use crate::board::{Board, LINE, Surroundings};
 use crate::target::Target;
 
@@ -48,18 +50,17 @@ pub(crate) fn emulate(around: &Surroundings, elf: &Path, file: &Path, more: &[&s
         around.path("button")
     );
     arguments.extend(more.iter().map(|argument| format!(",arg={argument}")));
-    let qemu = Command::new("qemu-system-arm")
+    let mut command = Command::new("qemu-system-arm");
+    command
         .args("-M mps2-an500 -display none -monitor none".split(' '))
         .args(["-nic", &format!("user,{}", around.forward())])
-        .args(UARTS.iter().flat_map(|uart| {
-            ["-serial".to_owned(), format!("unix:{},server=on,wait=off", around.path(uart))]
-        }))
+        .args(qemu::MACHINE)
+        .args(UARTS.iter().flat_map(|uart| qemu::line(uart, Path::new(&around.path(uart)))))
         .args(["-serial", &format!("file:{}", around.path("log"))])
         .args(["-semihosting-config", &arguments, "-kernel"])
         .arg(elf)
-        .stdin(Stdio::null())
-        .spawn();
-    qemu.expect("qemu-system-arm runs")
+        .stdin(Stdio::null());
+    qemu::on_one_processor(|| command.spawn()).expect("qemu-system-arm runs")
 }
 
 /// Presses the button of a board.

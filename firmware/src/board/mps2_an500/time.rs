@@ -15,6 +15,7 @@ const COUNTER: u32 = FPGAIO + 0x18;
 const PRESCALE: u32 = FPGAIO + 0x1C;
 // Registers of TIMER0.
 const CTRL: u32 = TIMER0;
+const VALUE: u32 = TIMER0 + 0x4;
 const RELOAD: u32 = TIMER0 + 0x8;
 const INTCLEAR: u32 = TIMER0 + 0xC;
 /// Enabled, with interrupt.
@@ -42,6 +43,8 @@ embassy_time_driver::time_driver_impl!(static CLOCK: Clock = Clock {
 pub(super) fn start() {
     write(PRESCALE, 24);
     write(COUNTER, 0);
+    write(RELOAD, (LONGEST * CYCLES_PER_MICRO) as u32);
+    write(CTRL, CTRL_ALARM);
     Irq::TIMER0.enable();
     on_alarm();
 }
@@ -56,15 +59,13 @@ impl State {
         u64::from(self.rounds) << 32 | u64::from(counter)
     }
 
-    /// Wakes what is due and sets the alarm for what is next.
+    /// Wakes what is due and sets the alarm for what is next: one access, since each one to this timer costs the emulator
+    /// some microseconds.
     fn rearm(&mut self) {
         let now = self.now();
         let next = self.queue.next_expiration(now);
         let wait = next.saturating_sub(now).clamp(1, LONGEST);
-        write(CTRL, 0);
-        write(INTCLEAR, 1);
-        write(RELOAD, (wait * CYCLES_PER_MICRO) as u32);
-        write(CTRL, CTRL_ALARM);
+        write(VALUE, (wait * CYCLES_PER_MICRO) as u32);
     }
 }
 
@@ -90,6 +91,7 @@ impl Driver for Clock {
 
 /// The alarm's interrupt.
 pub(super) fn on_alarm() {
+    write(INTCLEAR, 1);
     CLOCK.with(State::rearm);
 }
 

@@ -130,6 +130,9 @@ impl Uart {
             write(uart.base + BAUDDIV, 16);
             write(uart.base + CTRL, CTRL_TX | CTRL_RX | CTRL_RX_IRQ);
             uart.drain();
+            // What a multiplexer of QEMU's has kept since before comes when the register is read, and else only behind the
+            // next byte.
+            let _ = read(uart.base + DATA);
         });
         let irq = 2 * port as u16;
         Irq(irq).enable();

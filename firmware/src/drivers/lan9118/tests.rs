@@ -22,6 +22,8 @@ struct Model {
     mac: [u32; 12],
     mac_data: u32,
     phy: [u32; 32],
+    int_sts: u32,
+    phy_reads: usize,
     /// Arrives when interrupts are enabled next: between the check and the sleep.
     late: Option<Vec<u8>>,
     sent: usize,
@@ -55,6 +57,7 @@ impl super::Registers for Registers {
             PMT_CTRL => 1,
             BYTE_TEST => 0x8765_4321,
             MAC_DATA => model.mac_data,
+            INT_STS => model.int_sts,
             HW_CFG | E2P_CMD | MAC_CMD => 0,
             other => panic!("register {other:02X} is read"),
         }
@@ -73,6 +76,7 @@ impl super::Registers for Registers {
                 }
             }
             IRQ_CFG => model.irq_cfg = value,
+            INT_STS => model.int_sts &= !value,
             MAC_DATA => model.mac_data = value,
             MAC_CMD => {
                 let register = (value & 0xFF) as usize;
@@ -86,7 +90,11 @@ impl super::Registers for Registers {
                         if model.mac_data & MII_WRITE != 0 {
                             model.phy[phy] = model.mac[MAC_MII_DATA as usize];
                         } else {
+                            model.phy_reads += 1;
                             model.mac[MAC_MII_DATA as usize] = model.phy[phy];
+                            if phy == PHY_INT_SOURCE as usize {
+                                model.phy[phy] = 0;
+                            }
                         }
                     }
                 }
@@ -238,12 +246,42 @@ fn without_room_nothing_is_begun_and_statuses_are_taken_away() {
     assert_eq!(receive(&mut driver), Some(frame(60)));
 }
 
+impl Registers {
+    /// Plugs the cable or pulls it: the PHY says that something has changed.
+    fn plug(&self, is_plugged: bool) {
+        let mut model = self.0.borrow_mut();
+        model.phy[PHY_BMSR as usize] = if is_plugged { BMSR_LINK } else { 0 };
+        model.phy[PHY_INT_SOURCE as usize] = 0x10;
+        model.int_sts |= INT_PHY;
+    }
+}
+
 #[test]
 fn the_link_follows_the_phy() {
     let mut driver = started();
     let mut cx = Context::from_waker(Waker::noop());
     assert!(matches!(driver.link_state(&mut cx), LinkState::Down));
-    driver.regs.0.borrow_mut().phy[PHY_BMSR as usize] = BMSR_LINK;
-    assert!(matches!(driver.link_state(&mut cx), LinkState::Up));
-    assert_ne!(driver.regs.0.borrow().int_en & INT_PHY, 0);
+    for _ in 0..2 {
+        driver.regs.plug(true);
+        assert!(matches!(driver.link_state(&mut cx), LinkState::Up));
+        let acknowledged = |model: &Model| (model.int_sts, model.phy[PHY_INT_SOURCE as usize]);
+        assert_eq!(acknowledged(&driver.regs.0.borrow()), (0, 0));
+        assert_ne!(driver.regs.0.borrow().int_en & INT_PHY, 0);
+        driver.regs.plug(false);
+        assert!(matches!(driver.link_state(&mut cx), LinkState::Down));
+    }
+}
+
+#[test]
+fn the_phy_is_read_at_the_start_and_when_it_says_so() {
+    let mut driver = started();
+    driver.regs.plug(true);
+    driver.regs.0.borrow_mut().int_sts = 0;
+    let mut cx = Context::from_waker(Waker::noop());
+    assert!(matches!(driver.link_state(&mut cx), LinkState::Up), "plugged before the start");
+    let reads = driver.regs.0.borrow().phy_reads;
+    for _ in 0..1000 {
+        assert!(matches!(driver.link_state(&mut cx), LinkState::Up));
+    }
+    assert_eq!(driver.regs.0.borrow().phy_reads, reads);
 }
