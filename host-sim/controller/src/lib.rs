@@ -178,7 +178,11 @@ impl Controller {
             return;
         }
         self.advance(now);
-        let before = self.writer_of(&input).and_then(|_| self.recorder.before(&self.registers));
+        let mut before = match input {
+            // Most requests only read: it is copied by the first that does not.
+            ControllerInput::ModbusBytes { .. } => None,
+            _ => self.writer_of(&input).and_then(|_| self.recorder.before(&self.registers)),
+        };
         match input {
             ControllerInput::CommandOpened { conn, from } => self.opened(now, Link::Command, conn, from),
             ControllerInput::StateOpened { conn, from } => self.opened(now, Link::State, conn, from),
@@ -187,7 +191,7 @@ impl Controller {
             ControllerInput::StateClosed { conn } => self.closed(now, Link::State, conn),
             ControllerInput::ModbusClosed { conn } => self.closed(now, Link::Modbus, conn),
             ControllerInput::CommandBytes { conn, bytes } => self.command_bytes(now, conn, bytes),
-            ControllerInput::ModbusBytes { conn, bytes } => self.modbus_bytes(now, conn, bytes),
+            ControllerInput::ModbusBytes { conn, bytes } => before = self.modbus_bytes(now, conn, bytes),
             ControllerInput::Udp2011 { peer, bytes } => self.udp_bytes(now, peer, bytes),
             ControllerInput::Udp2011Unreachable { peer } => {
                 for port in &mut self.ports {

@@ -45,7 +45,7 @@ impl ParkedPty {
     /// Uses it in the current tokio runtime.
     pub(crate) fn unpark(self) -> io::Result<Pty> {
         let Self { link, master, terminal, unread } = self;
-        let master = register(master)?;
+        let master = register(master, Interest::READABLE)?;
         Ok(Pty { link, master, terminal: RefCell::new(Some(terminal)), unread: Cell::new(unread) })
     }
 }
@@ -78,7 +78,7 @@ impl Pty {
         let target = ptsname(&master, Vec::new())?.into_string().map_err(io::Error::other)?;
         let terminal = ioctl_tiocgptpeer(&master, flags)?;
         set_raw(&terminal)?;
-        let master = register(master)?;
+        let master = register(master, Interest::READABLE)?;
         let link = Symlink::create(link, Path::new(&target))?;
         Ok(Self { link, master, terminal: RefCell::new(Some(terminal)), unread: Cell::new(false) })
     }
@@ -97,20 +97,28 @@ impl Pty {
         Ok(())
     }
 
-    /// Reads what clients wrote.
+    /// Reads what clients wrote. After less than `buf` holds, [`Self::readable`] waits for more.
     ///
     /// # Errors
     /// [`io::ErrorKind::WouldBlock`] if there is nothing.
     pub fn try_read(&self, buf: &mut [u8]) -> io::Result<usize> {
-        let read = self.attempt(Interest::READABLE, |fd| rustix::io::read(fd, &mut *buf));
-        match read {
-            // No terminal side is open at the moment: see `has_client`.
-            Err(error) if error.raw_os_error() == Some(Errno::IO.raw_os_error()) => {
-                self.reopen();
-                Err(io::ErrorKind::WouldBlock.into())
-            }
-            other => other,
+        // Whatever readiness the reactor knows: it has not polled a new descriptor yet.
+        let read = rustix::io::read(self.master.get_ref(), &mut *buf);
+        if match read {
+            // A terminal returns all that has arrived; what comes later makes it readable again. Another read would wait
+            // for the kernel's thread that still passes on these bytes.
+            Ok(count) => count > 0 && count < buf.len(),
+            Err(error) => error == Errno::AGAIN,
+        } {
+            let would_block: io::Result<()> = Err(io::ErrorKind::WouldBlock.into());
+            let _ = self.master.try_io(Interest::READABLE, |_| would_block);
         }
+        // No terminal side is open at the moment: see `has_client`.
+        if read == Err(Errno::IO) {
+            self.reopen();
+            return Err(io::ErrorKind::WouldBlock.into());
+        }
+        Ok(read?)
     }
 
     /// Whether bytes of clients can be read; so if the system does not say.
@@ -127,9 +135,13 @@ impl Pty {
     /// Waits until bytes can be written. Cancel safe.
     ///
     /// # Errors
-    /// If the runtime is shutting down.
+    /// If the runtime is shutting down, or the system has no descriptor left.
     pub async fn writable(&self) -> io::Result<()> {
-        self.master.writable().await?.retain_ready();
+        // Of its own, for the rare client that does not read: the other one would wake this thread for each read of a
+        // client.
+        let master =
+            register(rustix::io::fcntl_dupfd_cloexec(self.master.get_ref(), 0)?, Interest::WRITABLE)?;
+        master.writable().await?.retain_ready();
         Ok(())
     }
 
@@ -139,7 +151,7 @@ impl Pty {
     /// [`io::ErrorKind::WouldBlock`] if the client has left tens of kilobytes unread.
     pub fn try_write(&self, bytes: &[u8]) -> io::Result<usize> {
         self.unread.set(true);
-        self.attempt(Interest::WRITABLE, |fd| rustix::io::write(fd, bytes))
+        Ok(rustix::io::write(self.master.get_ref(), bytes)?)
     }
 
     /// Whether a client has the terminal open now. If not, bytes that the last one left unread are dropped
@@ -170,20 +182,6 @@ impl Pty {
     /// it drops them.
     pub fn may_hold_unread(&self) -> bool {
         self.unread.get()
-    }
-
-    /// Makes the call whatever readiness the reactor knows: it has not polled a new descriptor yet.
-    fn attempt(
-        &self,
-        interest: Interest,
-        call: impl FnOnce(&OwnedFd) -> rustix::io::Result<usize>,
-    ) -> io::Result<usize> {
-        let result = call(self.master.get_ref()).map_err(io::Error::from);
-        if result.as_ref().is_err_and(|error| error.kind() == io::ErrorKind::WouldBlock) {
-            let would_block: io::Result<()> = Err(io::ErrorKind::WouldBlock.into());
-            let _ = self.master.try_io(interest, |_| would_block);
-        }
-        result
     }
 
     fn reopen(&self) {
@@ -250,6 +248,40 @@ mod tests {
             peer.read_exact(&mut got).unwrap();
             assert_eq!(got, all);
             assert_eq!(peer.read(&mut got).unwrap_err().kind(), io::ErrorKind::WouldBlock, "no echo");
+        });
+    }
+
+    #[test]
+    fn no_byte_is_left_behind_by_reads_of_any_length() {
+        run(async |link| {
+            let pty = Pty::open(link).unwrap();
+            let mut peer = client(link);
+            // Through the kernel's ring many times, whose end is met at another place each time.
+            for round in 0..200_usize {
+                let bytes: Vec<u8> = (0..97 * (round % 7 + 1)).map(|nth| (nth + round) as u8).collect();
+                peer.write_all(&bytes).unwrap();
+                assert_eq!(read_from(&pty, bytes.len()).await, bytes, "round {round}");
+            }
+        });
+    }
+
+    #[test]
+    fn a_full_terminal_can_be_written_again_when_its_client_has_read() {
+        run(async |link| {
+            let pty = Pty::open(link).unwrap();
+            let mut peer = client(link);
+            let written = std::iter::from_fn(|| pty.try_write(&[0x5A; 1_024]).ok()).sum::<usize>();
+            assert!(written > 4_096, "{written}");
+            let mut left = written;
+            let read_all = async {
+                while left > 0 {
+                    left -= peer.read(&mut [0; 4_096]).unwrap_or(0);
+                    tokio::task::yield_now().await;
+                }
+            };
+            let (writable, ()) = tokio::join!(pty.writable(), read_all);
+            writable.unwrap();
+            assert_eq!(pty.try_write(b"again").unwrap(), 5);
         });
     }
 

@@ -23,7 +23,7 @@ use super::stream::{self, ByteStream, accept};
 use recipe_net::backoff::Backoff;
 use recipe_net::clock::{Alarm, Clock};
 use recipe_net::connect::connect;
-use recipe_net::fairness::yield_fairly;
+use recipe_net::fairness::{give_way, yield_fairly};
 use recipe_net::tcp_options;
 use recipe_net::timer::now;
 
@@ -250,7 +250,7 @@ async fn pump<D: ByteStream>(
                     // A device that never pauses must not delay other tasks. Bytes that the engine discards
                     // take little time, and must be read before it accepts input again.
                     let is_much = is_full && !sender.tx.is_stale();
-                    if is_much { yield_fairly().await } else { yield_now().await }
+                    if is_much { yield_fairly().await } else { give_way().await }
                     Ok(())
                 }
                 Err(error) if error.kind() == io::ErrorKind::Interrupted => Ok(()),

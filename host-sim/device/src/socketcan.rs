@@ -167,7 +167,12 @@ impl<'a> Attached<'a> {
 
     /// Moves frames in both directions until the interface is gone.
     async fn work(&mut self, events: &mut impl FnMut(PortEvent<'_>)) -> io::Error {
-        let ready = match self.socket.as_fd().try_clone_to_owned().and_then(register) {
+        let ready = match self
+            .socket
+            .as_fd()
+            .try_clone_to_owned()
+            .and_then(|fd| register(fd, Interest::READABLE | Interest::WRITABLE))
+        {
             Ok(ready) => ready,
             Err(error) => return error,
         };

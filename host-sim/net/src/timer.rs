@@ -15,6 +15,7 @@ use rustix::time::{
     ClockId, Itimerspec, TimerfdClockId, TimerfdFlags, TimerfdTimerFlags, Timespec, clock_gettime,
     timerfd_create, timerfd_settime,
 };
+use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
 use super::reactor::register;
@@ -42,7 +43,7 @@ impl Timer {
     pub fn new() -> io::Result<Self> {
         let flags = TimerfdFlags::NONBLOCK | TimerfdFlags::CLOEXEC;
         let fd = timerfd_create(TimerfdClockId::Boottime, flags)?;
-        Ok(Self { fd: register(fd)?, armed: Cell::new(Instant::NEVER) })
+        Ok(Self { fd: register(fd, Interest::READABLE)?, armed: Cell::new(Instant::NEVER) })
     }
 
     /// The deadline, or [`Instant::NEVER`].
@@ -76,12 +77,20 @@ impl Timer {
     pub async fn expired(&self) -> io::Result<()> {
         loop {
             let mut ready = self.fd.readable().await?;
+            if now() >= self.armed.get() {
+                // The expirations are not read: to arm it sets their number back, and the reactor is told of each once.
+                ready.clear_ready();
+                self.armed.set(Instant::NEVER);
+                return Ok(());
+            }
+            // That of an earlier deadline, unless two clocks of the kernel disagree.
             match ready.try_io(|fd| Ok(rustix::io::read(fd.get_ref(), &mut [0; 8])?)) {
-                Ok(Ok(_)) => {
+                Ok(Ok(_)) if self.armed.get() != Instant::NEVER => {
                     self.armed.set(Instant::NEVER);
                     return Ok(());
                 }
                 Ok(Err(error)) => return Err(error),
+                Ok(Ok(_)) => {}
                 Err(_would_block) => {}
             }
         }
@@ -173,6 +182,21 @@ mod tests {
             timer.sleep_until(Instant::ZERO).await.unwrap();
             timer.arm(now() + Duration::from_secs(3_600)).unwrap();
             timer.sleep_until(now() + Duration::from_millis(1)).await.unwrap();
+        });
+    }
+
+    #[test]
+    fn a_deadline_that_has_passed_unseen_is_not_the_next_one() {
+        run(async {
+            let timer = Timer::new().unwrap();
+            for _ in 0..20 {
+                // The reactor learns of it, and nobody asks.
+                timer.arm(Instant::ZERO).unwrap();
+                tokio::task::yield_now().await;
+                let deadline = now() + Duration::from_millis(2);
+                timer.sleep_until(deadline).await.unwrap();
+                assert!(now() >= deadline);
+            }
         });
     }
 

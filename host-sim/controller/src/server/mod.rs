@@ -14,6 +14,7 @@ use proto_core::modbus::server::{RegisterBank, Server as ModbusServer};
 use proto_core::modbus::{Coils, Exception, Registers as Words};
 use proto_core::time::Instant;
 
+use super::events::{Before, Recorder};
 use super::faults::{CommandClients, Link};
 use super::registers::Registers;
 use super::{ConnId, Controller, ControllerOutput, Counters, ServerCounters};
@@ -161,11 +162,18 @@ impl Controller {
         self.server.places.closed(conn);
     }
 
-    pub(super) fn modbus_bytes(&mut self, now: Instant, conn: ConnId, bytes: &[u8]) {
-        let Some(session) = self.server.modbus.get_mut(&conn) else { return };
+    /// Answers the requests in these bytes. Returns the values before the first write, if there was one and writes are
+    /// recorded.
+    pub(super) fn modbus_bytes(&mut self, now: Instant, conn: ConnId, bytes: &[u8]) -> Option<Before> {
+        let session = self.server.modbus.get_mut(&conn)?;
         let counters = &mut self.counters.modbus;
         counters.bytes_in += bytes.len() as u64;
-        let mut bank = Bank { registers: &mut self.registers, exception: self.faults.exception() };
+        let mut bank = Bank {
+            registers: &mut self.registers,
+            exception: self.faults.exception(),
+            recorder: &self.recorder,
+            before: None,
+        };
         let mut rest = bytes;
         let mut answer = [0; MAX_ADU];
         let mut answers = Vec::new();
@@ -181,6 +189,7 @@ impl Controller {
             counters.refusals += u64::from(answer[7] & 0x80 != 0);
             answers.extend_from_slice(answer.get(..len).unwrap_or(&[]));
         }
+        let before = bank.before;
         if !answers.is_empty() {
             self.send(now, Link::Modbus, conn, answers);
         }
@@ -189,6 +198,7 @@ impl Controller {
             self.closed(now, Link::Modbus, conn);
             self.outputs.push_back(ControllerOutput::Close { conn });
         }
+        before
     }
 
     pub(super) fn udp_bytes(&mut self, now: Instant, peer: SocketAddr, bytes: &[u8]) {
@@ -253,11 +263,20 @@ impl Controller {
 struct Bank<'a> {
     registers: &'a mut Registers,
     exception: Option<Exception>,
+    recorder: &'a Recorder,
+    /// The values before the first write.
+    before: Option<Before>,
 }
 
 impl Bank<'_> {
     fn check(&self) -> Result<(), Exception> {
         self.exception.map_or(Ok(()), Err)
+    }
+
+    fn note_before(&mut self) {
+        if self.before.is_none() {
+            self.before = self.recorder.before(self.registers);
+        }
     }
 }
 
@@ -269,6 +288,7 @@ impl RegisterBank for Bank<'_> {
 
     fn write_coils(&mut self, address: u16, coils: Coils<'_>) -> Result<(), Exception> {
         self.check()?;
+        self.note_before();
         self.registers.write_coils(address, coils)
     }
 
@@ -279,6 +299,7 @@ impl RegisterBank for Bank<'_> {
 
     fn write_holding(&mut self, address: u16, registers: Words<'_>) -> Result<(), Exception> {
         self.check()?;
+        self.note_before();
         self.registers.write_holding(address, registers)
     }
 }

@@ -120,9 +120,20 @@ struct Connection<'a> {
     unwritten: Vec<u8>,
     /// Number of bytes that the peer is known to have acknowledged.
     acked: u64,
-    /// Whether acknowledgements are polled, because some are missing.
-    is_polled: bool,
+    watch: Watch,
     reads: u64,
+}
+
+/// How acknowledgements are looked for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Watch {
+    /// Not at all, and the system has no time limit either.
+    Off,
+    /// Some are missing: they are polled.
+    Missing,
+    /// None is missing, for less than [`QUIET`]. The system keeps its time limit, which a transmission each few
+    /// milliseconds would otherwise set and remove again.
+    Quiet,
 }
 
 impl<'a> Connection<'a> {
@@ -134,7 +145,8 @@ impl<'a> Connection<'a> {
         tcp_options::reset_on_close(stream)?;
         tcp_options::enable_keepalive(stream);
         let (reader, writer) = stream.split();
-        let own = Self { link, session, writer, unwritten: Vec::new(), acked: 0, is_polled: false, reads: 0 };
+        let own =
+            Self { link, session, writer, unwritten: Vec::new(), acked: 0, watch: Watch::Off, reads: 0 };
         Ok((own, reader))
     }
 
@@ -155,10 +167,19 @@ impl<'a> Connection<'a> {
             if self.is_over() {
                 break;
             }
-            if self.is_outstanding() && !self.is_polled {
-                self.is_polled = true;
-                tcp_options::set_user_timeout(self.writer.as_ref(), USER_TIMEOUT);
-                poll.as_mut().reset(Instant::now() + ACK_POLL);
+            match (self.watch, self.is_outstanding()) {
+                (Watch::Off | Watch::Quiet, true) => {
+                    if self.watch == Watch::Off {
+                        tcp_options::set_user_timeout(self.writer.as_ref(), USER_TIMEOUT);
+                    }
+                    self.watch = Watch::Missing;
+                    poll.as_mut().reset(Instant::now() + ACK_POLL);
+                }
+                (Watch::Missing, false) => {
+                    self.watch = Watch::Quiet;
+                    poll.as_mut().reset(Instant::now() + QUIET);
+                }
+                _ => {}
             }
             tokio::select! {
                 read = reader.read(&mut chunk) => match read? {
@@ -167,15 +188,13 @@ impl<'a> Connection<'a> {
                 },
                 ready = self.writer.writable(), if !self.unwritten.is_empty() => ready?,
                 () = changed.notified() => {}
-                () = &mut poll, if self.is_polled => {
+                () = &mut poll, if self.watch != Watch::Off => if self.watch == Watch::Missing {
                     self.poll_acked(events)?;
-                    self.is_polled = self.is_outstanding();
-                    if self.is_polled {
-                        poll.as_mut().reset(Instant::now() + ACK_POLL);
-                    } else {
-                        tcp_options::clear_user_timeout(self.writer.as_ref());
-                    }
-                }
+                    poll.as_mut().reset(Instant::now() + ACK_POLL);
+                } else {
+                    self.watch = Watch::Off;
+                    tcp_options::clear_user_timeout(self.writer.as_ref());
+                },
                 () = &mut refusing => {}
             }
         }
@@ -252,6 +271,9 @@ const ACK_POLL: Duration = Duration::from_millis(10);
 const USER_TIMEOUT: Duration = Duration::from_secs(2);
 /// Maximum number of bytes per read.
 const CHUNK: usize = 2_048;
+/// Time without missing acknowledgements after which the system's time limit is removed: long before the first keepalive
+/// probe, with which it must not meet.
+const QUIET: Duration = Duration::from_millis(100);
 /// Number of reads before other tasks run.
 const READS_AT_ONCE: u64 = 16;
 /// More than the backlog of a listening socket: connections after these are not old.

@@ -1,13 +1,16 @@
 //! Acknowledgement of bytes that were handed over, with peers whose buffers are too small for them.
 
 use std::io::Read;
+use std::os::fd::AsFd;
 
+use rustix::net::sockopt;
 use tokio::io::AsyncWriteExt;
 use tokio::net::TcpSocket;
+use tokio::sync::Notify;
 use tokio::task::yield_now;
 
 use super::super::tests::{Running, Seen, connected, inside, tcp_listen};
-use super::super::{Endpoint, Refusals};
+use super::super::{Endpoint, LinkControl, Refusals};
 use super::*;
 
 /// A link that is up, and its peer, which has a small receive buffer.
@@ -120,6 +123,45 @@ fn bytes_that_the_link_still_holds_are_not_acknowledged_either() {
         };
         tokio::join!(reading, watching);
         assert!(is_sent);
+    });
+}
+
+#[test]
+fn the_systems_time_limit_stays_between_transmissions_and_goes_in_silence() {
+    inside(async || {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let mut stream = TcpStream::connect(listener.local_addr().unwrap()).await.unwrap();
+        let (mut peer, _) = listener.accept().await.unwrap();
+        let socket = stream.as_fd().try_clone_to_owned().unwrap();
+        let limit = || sockopt::tcp_user_timeout(&socket).unwrap();
+        let control = LinkControl::default();
+        control.open();
+        let link = Link { name: "link", control: &control };
+        let (connection, reader) = Connection::new(&link, control.session.get(), &mut stream).unwrap();
+        let answered = Notify::new();
+        let mut events = |event: LinkEvent<'_>| {
+            if let LinkEvent::Bytes(_) = event {
+                answered.notify_one();
+            }
+        };
+        let timeline = async {
+            assert_eq!(limit(), 0);
+            for _ in 0..3 {
+                control.send(b"request");
+                peer.read_exact(&mut [0; 7]).await.unwrap();
+                peer.write_all(b"answer").await.unwrap();
+                answered.notified().await;
+                assert_eq!(limit(), USER_TIMEOUT.as_millis() as u32);
+            }
+            let quiet = Instant::now();
+            while limit() != 0 {
+                sleep(Duration::from_millis(5)).await;
+            }
+            assert!(quiet.elapsed() >= QUIET / 2, "{:?}", quiet.elapsed());
+            control.close();
+        };
+        let (ended, ()) = tokio::join!(connection.carry(reader, None, &mut events), timeline);
+        ended.unwrap();
     });
 }
 
