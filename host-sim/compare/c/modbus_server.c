@@ -4,6 +4,7 @@
 #include <modbus/modbus.h>
 #include <netinet/tcp.h>
 #include <poll.h>
+#include <sched.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -32,6 +33,9 @@ int main(int argc, char **argv)
     int listener = modbus_tcp_listen(context, MOST);
     if (listener < 0)
         fail("listen");
+    /* As the controller does; a system that refuses refuses it there too. */
+    struct sched_param priority = {.sched_priority = 1};
+    sched_setscheduler(0, SCHED_FIFO, &priority);
     puts("ready");
     fflush(stdout);
     struct pollfd sockets[MOST] = {{listener, POLLIN, 0}};

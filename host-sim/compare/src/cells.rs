@@ -52,14 +52,15 @@ pub(crate) fn run(cells: usize, seconds: u64) {
     for device in &mut devices {
         (device.late, device.heard) = (0, 0);
     }
-    let before = Counted::of(&gateways);
+    let before = Counted::of(&gateways, &robots);
     let (mut samples, sent) = drive(&mut devices, &mut peer, seconds);
-    let after = Counted::of(&gateways);
+    let after = Counted::of(&gateways, &robots);
 
     let wanted = cells as f64 * seconds as f64 * 250.0;
     let heard: usize = devices.iter().map(|device| device.heard / OUT_LEN).sum();
     let late: u64 = devices.iter().map(|device| device.late).sum();
-    let used = (after.used - before.used).as_secs_f64() / seconds as f64;
+    let cores = |after: Duration, before: Duration| (after - before).as_secs_f64() / seconds as f64;
+    let used = cores(after.used, before.used);
     println!("{cells} cells for {seconds} s; devices and robots with {scheduled}");
     println!(
         "  frames sent by devices      {sent}, {:.1} % of 250 a second each",
@@ -74,6 +75,11 @@ pub(crate) fn run(cells: usize, seconds: u64) {
     println!(
         "  processor of all gateways   {used:.2} cores, {:.2} % of one for each",
         used / cells as f64 * 100.0
+    );
+    println!(
+        "  processor of the others     devices and registers {:.2} cores, command and state {:.2}",
+        cores(after.players, before.players),
+        cores(after.robots, before.robots)
     );
     let quantiles = [0.5, 0.99, 1.0].map(|share| quantile(&mut samples, share));
     println!(
@@ -136,14 +142,20 @@ impl Device {
 struct Counted {
     skipped: u64,
     used: Duration,
+    /// Processor time of this program.
+    players: Duration,
+    /// That of the simulated controllers.
+    robots: Duration,
 }
 
 impl Counted {
-    fn of(gateways: &[HostSim]) -> Self {
+    fn of(gateways: &[HostSim], robots: &[HostSim]) -> Self {
         let skipped = |gateway: &HostSim| gateway.newest()["ports"]["device"]["skipped_cycles"].as_u64();
         Self {
             skipped: gateways.iter().map(|gateway| skipped(gateway).expect("statistics have it")).sum(),
             used: gateways.iter().map(|gateway| processor_time(gateway.pid())).sum(),
+            players: processor_time(rustix::process::getpid()),
+            robots: robots.iter().map(|robot| processor_time(robot.pid())).sum(),
         }
     }
 }

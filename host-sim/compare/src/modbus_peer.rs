@@ -11,6 +11,8 @@ use rustix::event::{Timespec, epoll};
 
 /// Header before the unit and the function.
 const HEAD: usize = 6;
+/// The longest answer.
+const ANSWER: usize = 260;
 
 pub(crate) struct Peer {
     poll: rustix::fd::OwnedFd,
@@ -79,47 +81,48 @@ fn answer(socket: &mut TcpStream, waiting: &mut Vec<u8>, mut written: impl FnMut
         Err(error) if error.kind() == ErrorKind::WouldBlock => return true,
         Err(_) => return false,
     }
-    while waiting.len() >= HEAD {
-        let len = HEAD + usize::from(u16::from_be_bytes([waiting[4], waiting[5]]));
-        if waiting.len() < len {
-            break;
-        }
-        let request: Vec<u8> = waiting.drain(..len).collect();
-        let (answer, value) = reply(&request);
+    let mut at = 0;
+    while let Some(rest) = waiting.get(at..)
+        && rest.len() >= HEAD
+    {
+        let len = HEAD + usize::from(u16::from_be_bytes([rest[4], rest[5]]));
+        let Some(request) = rest.get(..len) else { break };
+        let mut room = [0; ANSWER];
+        let (answer, value) = reply(request, &mut room);
         if let Some(value) = value {
             written(value);
         }
-        if socket.write_all(&answer).is_err() {
+        if socket.write_all(answer).is_err() {
             return false;
         }
+        at += len;
     }
+    waiting.drain(..at);
     true
 }
 
 /// The answer, and the first value of what writes registers.
-fn reply(request: &[u8]) -> (Vec<u8>, Option<u16>) {
+fn reply<'r>(request: &[u8], room: &'r mut [u8; ANSWER]) -> (&'r [u8], Option<u16>) {
     let word = |at: usize| u16::from_be_bytes([request[at], request[at + 1]]);
-    let mut answer = request[..8].to_vec();
-    let mut value = None;
-    match request[7] {
+    room[..8].copy_from_slice(&request[..8]);
+    let (len, value) = match request[7] {
         // Coils and registers: all are 0.
         function @ 1..=4 => {
-            let bytes = if function < 3 { word(10).div_ceil(8) } else { 2 * word(10) } as u8;
-            answer.push(bytes);
-            answer.resize(9 + usize::from(bytes), 0);
+            let bytes = if function < 3 { word(10).div_ceil(8) } else { 2 * word(10) };
+            room[8] = bytes as u8;
+            (9 + usize::from(bytes), None)
         }
-        6 => {
-            value = Some(word(10));
-            answer.extend_from_slice(&request[8..12]);
+        function @ (5 | 6 | 15 | 16) => {
+            room[8..12].copy_from_slice(&request[8..12]);
+            let value = match function {
+                6 => Some(word(10)),
+                16 => Some(word(13)),
+                _ => None,
+            };
+            (12, value)
         }
-        16 => {
-            value = Some(word(13));
-            answer.extend_from_slice(&request[8..12]);
-        }
-        5 | 15 => answer.extend_from_slice(&request[8..12]),
         function => panic!("function {function} is not expected"),
-    }
-    let len = (answer.len() - HEAD) as u16;
-    answer[4..6].copy_from_slice(&len.to_be_bytes());
-    (answer, value)
+    };
+    room[4..6].copy_from_slice(&((len - HEAD) as u16).to_be_bytes());
+    (&room[..len], value)
 }

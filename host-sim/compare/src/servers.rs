@@ -1,6 +1,7 @@
 //! Modbus TCP servers with 8 and 64 connections, each of which always has one request for 118 registers in flight: the
 //! simulated controller's, libmodbus', tokio-modbus', and a bare epoll loop that answers with as many bytes without
-//! looking at the request.
+//! looking at the request. All of them have the scheduling that the controller asks for, which decides how often a
+//! server is woken; who asks has an ordinary one.
 
 use std::collections::BTreeMap;
 use std::future::{Ready, ready};
@@ -12,6 +13,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use clap::ValueEnum;
+use recipe_net::realtime::{self, Scheduling};
 use recipe_test_kit::Process;
 use rustix::event::epoll;
 use rustix::process::Pid;
@@ -119,6 +121,7 @@ impl Side {
 
 /// Is a server, until the process is killed.
 pub(crate) fn serve(kind: Kind, address: SocketAddr) {
+    realtime::apply(Scheduling::FifoIfAllowed);
     match kind {
         Kind::Epoll => serve_bare(address),
         Kind::TokioModbus => serve_with_tokio(address),

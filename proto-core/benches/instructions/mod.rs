@@ -100,7 +100,8 @@ fn count_all(works: &[Work], beside: &[Beside]) -> ExitCode {
 /// Instructions of a whole process that does the work `iterations` times.
 pub(crate) fn count(name: &str, iterations: u64) -> Option<u64> {
     let output = Command::new("valgrind")
-        .args(["--tool=callgrind", "--callgrind-out-file=/dev/null"])
+        // A work may become another program.
+        .args(["--tool=callgrind", "--callgrind-out-file=/dev/null", "--trace-children=yes"])
         .arg(std::env::current_exe().ok()?)
         .args(["run", name, &iterations.to_string()])
         .output()

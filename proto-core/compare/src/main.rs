@@ -5,10 +5,11 @@
 //! cargo run --release -p recipe-compare -- instructions
 //! ```
 //!
-//! Each must find all frames, and the same newest values. It fails when proto-core takes more than half of what another library
+//! `CANTOOLS=PROGRAM` names cantools, if it is not in `PATH`; `cc` builds what it writes. Each must find all frames, and the same newest values. It fails when proto-core takes more than half of what another library
 //! takes. The table is in docs/performance.md.
 
 mod can;
+mod cantools;
 #[path = "../../benches/instructions/mod.rs"]
 mod instructions;
 mod modbus;
@@ -36,6 +37,7 @@ fn main() -> ExitCode {
         work("CAN: proto-core", |n| repeat(n, workload::Can::new(), workload::Can::decode)),
         work("CAN: one match, by hand", |n| repeat(n, workload::Can::new(), workload::Can::decode_bare)),
         work("CAN: dbc-rs 0.7.1", |n| repeat(n, can::Dbc::new(), can::Dbc::decode)),
+        work("CAN: C by cantools 45.1.0", cantools::run),
         work("read 118 words: proto-core", |n| modbus::ProtoCore::default().repeat(n, modbus::What::Words)),
         work("read 118 words: modbus-core 0.2.0", |n| {
             modbus::ModbusCore::default().repeat(n, modbus::What::Words);
@@ -57,6 +59,12 @@ fn main() -> ExitCode {
         ("write 16 coils: proto-core", "write 16 coils: modbus-core 0.2.0"),
         ("write 16 coils: proto-core", "write 16 coils: rmodbus 0.13.0"),
     ];
+    if std::env::args().nth(1).as_deref() == Some("instructions")
+        && let Err(text) = cantools::build()
+    {
+        eprintln!("{text}");
+        return ExitCode::FAILURE;
+    }
     let beside = beside.map(|(name, bare)| Beside { name, bare, limit: Limit::Times(0.5) });
     instructions::main_beside(&works, &beside).unwrap_or_else(|| {
         eprintln!("say `instructions`, or `run NAME COUNT` to look at one with another tool:");

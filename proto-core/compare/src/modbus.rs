@@ -112,7 +112,7 @@ impl ProtoCore {
             if let Some(ClientEvent::Response(Response::Registers(words))) =
                 self.client.receive(&mut received)
             {
-                self.words.iter_mut().zip(words.iter()).for_each(|(word, value)| *word = value);
+                words.copy_to(&mut self.words);
             }
             black_box(&mut self.words);
         }
