@@ -2,7 +2,7 @@
 
 use std::fs::{File, OpenOptions};
 use std::net::SocketAddr;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use recipe_test_kit::HostSim;
 use serde_json::Value;
@@ -27,6 +27,25 @@ pub(crate) fn controller() -> HostSim {
 
 /// A gateway with a line at `folder/line`; `output` adds a frame to the device every 4 ms.
 pub(crate) fn gateway(folder: &Path, robot: &HostSim, modbus: SocketAddr, output: bool) -> HostSim {
+    let file = write(folder, "cell", robot, modbus, output);
+    let mut command = programs::host_sim();
+    command.args(["gateway", "--stats", "1s", "-c"]).arg(file);
+    HostSim::start(command.arg("--bind").arg(format!("device=pty:{}", folder.join("line").display())))
+}
+
+/// The gateways of several cells in one process on so many threads. The file of each is `cellN.toml` in its folder.
+pub(crate) fn gateways(folders: &[impl AsRef<Path>], files: &[PathBuf], threads: usize) -> HostSim {
+    let mut command = programs::host_sim();
+    command.args(["gateway", "--stats", "1s", "--threads", &threads.to_string()]);
+    for ((nth, folder), file) in folders.iter().enumerate().zip(files) {
+        command.arg("-c").arg(file);
+        command.arg(format!("--bind=cell{nth}/device=pty:{}", folder.as_ref().join("line").display()));
+    }
+    HostSim::start(&mut command)
+}
+
+/// Writes the file of a cell.
+pub(crate) fn write(folder: &Path, name: &str, robot: &HostSim, modbus: SocketAddr, output: bool) -> PathBuf {
     let (sent, cycle) = match output {
         true => {
             let fields = r#"[{ name = "lamp", type = "byte", value = 1 }]"#;
@@ -63,11 +82,9 @@ recipe = "three-bytes"
         field(2),
         field(3),
     );
-    let file = folder.join("cell.toml");
+    let file = folder.join(name).with_extension("toml");
     std::fs::write(&file, text).unwrap();
-    let mut command = programs::host_sim();
-    command.args(["gateway", "--stats", "1s", "-c"]).arg(file);
-    HostSim::start(command.arg("--bind").arg(format!("device=pty:{}", folder.join("line").display())))
+    file
 }
 
 /// Whether all links of a gateway are up.

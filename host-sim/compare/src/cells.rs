@@ -1,4 +1,4 @@
-//! Many cells on this machine, a gateway process each: a frame of a device goes up to the robot's registers every 4 ms, and
+//! Many cells on this machine, a gateway process each or one for all: a frame of a device goes up to the robot's registers every 4 ms, and
 //! a frame goes down to the device every 4 ms. The devices and the robots are this program, on the same machine.
 
 use std::fs::File;
@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 use recipe_net::realtime::{self, Scheduling};
 use recipe_test_kit::{HostSim, PATIENCE};
 use rustix::fs::{OFlags, fcntl_getfl, fcntl_setfl};
+use serde_json::Value;
 
 use crate::cell_files::{self, OUT_LEN, frame, is_connected};
 use crate::figures::{processor_time, quantile};
@@ -29,18 +30,39 @@ struct Device {
     heard: usize,
 }
 
-/// Runs so many cells for so long, and prints what they kept.
-pub(crate) fn run(cells: usize, seconds: u64) {
+/// The gateways of all cells.
+enum Gateways {
+    /// A process each.
+    Processes(Vec<HostSim>),
+    /// One process for all.
+    One(HostSim),
+}
+
+/// Runs so many cells for so long, and prints what they kept. With `threads`, one process serves all cells on so many.
+pub(crate) fn run(cells: usize, seconds: u64, threads: Option<usize>) {
     let mut peer = Peer::new(cells);
     let robots: Vec<_> = (0..cells.div_ceil(PER_CONTROLLER)).map(|_| cell_files::controller()).collect();
     let folders: Vec<_> = (0..cells).map(|_| tempfile::tempdir().expect("a temporary folder")).collect();
-    let gateways: Vec<_> = (0..cells)
-        .map(|nth| {
-            cell_files::gateway(folders[nth].path(), &robots[nth / PER_CONTROLLER], peer.address(nth), true)
-        })
-        .collect();
+    let of = |nth: usize| (folders[nth].path(), &robots[nth / PER_CONTROLLER], peer.address(nth));
+    let gateways = match threads {
+        None => Gateways::Processes(
+            (0..cells)
+                .map(|nth| {
+                    let (folder, robot, modbus) = of(nth);
+                    cell_files::gateway(folder, robot, modbus, true)
+                })
+                .collect(),
+        ),
+        Some(threads) => {
+            let files = (0..cells).map(|nth| {
+                let (folder, robot, modbus) = of(nth);
+                cell_files::write(folder, &format!("cell{nth}"), robot, modbus, true)
+            });
+            Gateways::One(cell_files::gateways(&folders, &files.collect::<Vec<_>>(), threads))
+        }
+    };
     let began = Instant::now();
-    while !gateways.iter().all(|gateway| is_connected(&gateway.newest())) {
+    while !gateways.cells().iter().all(is_connected) {
         assert!(began.elapsed() < 6 * PATIENCE, "not all gateways are connected");
         peer.serve(Duration::from_millis(10), |_, _| {});
     }
@@ -61,7 +83,11 @@ pub(crate) fn run(cells: usize, seconds: u64) {
     let late: u64 = devices.iter().map(|device| device.late).sum();
     let cores = |after: Duration, before: Duration| (after - before).as_secs_f64() / seconds as f64;
     let used = cores(after.used, before.used);
-    println!("{cells} cells for {seconds} s; devices and robots with {scheduled}");
+    match threads {
+        None => print!("{cells} cells, a process each,"),
+        Some(threads) => print!("{cells} cells in one process, on {threads} threads,"),
+    }
+    println!(" for {seconds} s; devices and robots with {scheduled}");
     println!(
         "  frames sent by devices      {sent}, {:.1} % of 250 a second each",
         sent as f64 / wanted * 100.0
@@ -86,6 +112,28 @@ pub(crate) fn run(cells: usize, seconds: u64) {
         "  us from frame to register   p50 {:.0}, p99 {:.0}, most {:.0}",
         quantiles[0], quantiles[1], quantiles[2]
     );
+}
+
+impl Gateways {
+    /// What each cell said last.
+    fn cells(&self) -> Vec<Value> {
+        match self {
+            Self::Processes(gateways) => gateways.iter().map(HostSim::newest).collect(),
+            Self::One(gateway) => {
+                let newest = gateway.newest();
+                // Without statistics yet, one that is not connected.
+                let cells = newest["cells"].as_object().map(|cells| cells.values().cloned().collect());
+                cells.unwrap_or_else(|| vec![Value::Null])
+            }
+        }
+    }
+
+    fn processor_time(&self) -> Duration {
+        match self {
+            Self::Processes(gateways) => gateways.iter().map(|gateway| processor_time(gateway.pid())).sum(),
+            Self::One(gateway) => processor_time(gateway.pid()),
+        }
+    }
 }
 
 /// The devices send and listen for so long: microseconds until each value was at the robot, and frames sent.
@@ -149,11 +197,11 @@ struct Counted {
 }
 
 impl Counted {
-    fn of(gateways: &[HostSim], robots: &[HostSim]) -> Self {
-        let skipped = |gateway: &HostSim| gateway.newest()["ports"]["device"]["skipped_cycles"].as_u64();
+    fn of(gateways: &Gateways, robots: &[HostSim]) -> Self {
+        let skipped = |cell: &Value| cell["ports"]["device"]["skipped_cycles"].as_u64();
         Self {
-            skipped: gateways.iter().map(|gateway| skipped(gateway).expect("statistics have it")).sum(),
-            used: gateways.iter().map(|gateway| processor_time(gateway.pid())).sum(),
+            skipped: gateways.cells().iter().map(|cell| skipped(cell).expect("statistics have it")).sum(),
+            used: gateways.processor_time(),
             players: processor_time(rustix::process::getpid()),
             robots: robots.iter().map(|robot| processor_time(robot.pid())).sum(),
         }

@@ -44,7 +44,7 @@ enum What {
         #[arg(long, default_value_t = 25)]
         rounds: usize,
     },
-    /// Gateways, a process each, with a frame up and a frame down every 4 ms
+    /// Gateways, a process each or one for all, with a frame up and a frame down every 4 ms
     Cells {
         /// How many, one run after the other
         #[arg(default_values_t = [10, 25, 50, 100])]
@@ -52,6 +52,9 @@ enum What {
         /// Seconds of each run
         #[arg(long, default_value_t = 20)]
         seconds: u64,
+        /// One process for all, on so many threads
+        #[arg(long)]
+        threads: Option<usize>,
     },
     /// One of the servers, as a process of its own
     #[command(hide = true)]
@@ -62,7 +65,9 @@ fn main() -> ExitCode {
     match Arguments::parse().what {
         What::Servers { rounds } => servers::compare(rounds.max(1)),
         What::Relay { rounds } => relay::compare(rounds.max(1)),
-        What::Cells { cells, seconds } => cells.into_iter().for_each(|cells| cells::run(cells, seconds)),
+        What::Cells { cells, seconds, threads } => {
+            cells.into_iter().for_each(|cells| cells::run(cells, seconds, threads));
+        }
         What::Serve { kind, address } => servers::serve(kind, address),
     }
     ExitCode::SUCCESS

@@ -3,6 +3,7 @@
 
 use std::cell::Cell;
 use std::future::poll_fn;
+use std::pin::pin;
 use std::rc::Rc;
 use std::task::Poll;
 
@@ -16,7 +17,7 @@ thread_local! {
     static TURN: Rc<Semaphore> = Rc::new(Semaphore::new(1));
     /// Number of tasks in [`yield_fairly`].
     static WAITING: Cell<usize> = const { Cell::new(0) };
-    /// The next deadline of this thread's engine.
+    /// The next deadline of the engine whose tasks run now.
     static DEADLINE: Cell<Instant> = const { Cell::new(Instant::NEVER) };
 }
 
@@ -64,9 +65,24 @@ impl Drop for Waiting {
     }
 }
 
-/// Sets the next deadline of this thread's engine, for [`let_others_run`] and [`arrival_time`].
+/// Sets the next deadline of the engine to which the task that runs belongs, for [`let_others_run`] and
+/// [`arrival_time`]: that of the work around it ([`apart`]), else of this thread.
 pub fn set_deadline(deadline: Instant) {
     DEADLINE.set(deadline);
+}
+
+/// Gives an engine and the tasks around it a deadline of their own, where several share a thread. All tasks have to be
+/// polled within `work`, as those of a [`LocalSet`](tokio::task::LocalSet) are that it runs.
+pub async fn apart<F: Future>(work: F) -> F::Output {
+    let mut work = pin!(work);
+    let mut own = Instant::NEVER;
+    poll_fn(|cx| {
+        let outer = DEADLINE.replace(own);
+        let polled = work.as_mut().poll(cx);
+        own = DEADLINE.replace(outer);
+        polled
+    })
+    .await
 }
 
 /// Lets all other tasks report input that had arrived by the deadline, before the engine handles it.
@@ -93,7 +109,7 @@ pub async fn let_others_run() {
     }
 }
 
-/// The latest time at which input that is read now can count as arrived: now, or the engine's deadline if the
+/// The latest time at which input that is read now can count as arrived: now, or its engine's deadline if the
 /// thread was blocked when it passed.
 pub fn arrival_time() -> Instant {
     let now = now();
@@ -158,6 +174,28 @@ mod tests {
             }
             tasks.join_all().await;
             assert_eq!(*order.borrow(), ["can run", "gives way"]);
+        });
+    }
+
+    #[test]
+    fn engines_of_one_thread_have_deadlines_of_their_own() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        LocalSet::new().block_on(&runtime, async {
+            let late = now() - BLOCKED;
+            let engine = |deadline| async move {
+                let tasks = LocalSet::new();
+                let arrived = tasks.run_until(async move {
+                    set_deadline(deadline);
+                    // The other one sets its own before this one goes on.
+                    yield_now().await;
+                    tokio::task::spawn_local(async { arrival_time() }).await.unwrap()
+                });
+                apart(arrived).await
+            };
+            let (missed, kept) = tokio::join!(engine(late), engine(now() + Duration::from_secs(3_600)));
+            assert_eq!(missed, late);
+            assert!(kept > late, "{kept:?}");
+            assert!(arrival_time() >= kept, "outside nothing is late");
         });
     }
 

@@ -26,6 +26,7 @@ use super::console::{ConsoleOptions, Consoled};
 use super::events_file::Writer;
 use super::host::{self, Handle, Shell};
 use super::tcp::{Accepted, Connection};
+use super::worker::Place;
 use super::{EventsFile, RunOptions, StartError};
 use control::ControlClient;
 use recipe_config::SimConfig;
@@ -66,8 +67,8 @@ pub fn run(config: SimConfig, options: ControllerOptions) -> Result<(), StartErr
     let bound = run.console.as_ref().map(ConsoleOptions::bind).transpose()?;
     let handle = spawn(config, options)?;
     match bound {
-        Some(bound) => host::foreground(Consoled::start(bound, handle, run.log.clone())?, &run),
-        None => host::foreground(handle, &run),
+        Some(bound) => host::foreground(Box::new(Consoled::start(bound, handle, run.log.clone())?), &run),
+        None => host::foreground(Box::new(handle), &run),
     }
 }
 
@@ -92,7 +93,7 @@ pub fn start_with(config: SimConfig, options: ControllerOptions) -> Result<Handl
 }
 
 fn spawn(config: SimConfig, options: ControllerOptions) -> Result<Handle, StartError> {
-    host::start("controller", async move |_| {
+    host::start(&Place::alone(), "controller", async move |_| {
         let scheduling = match options.pace {
             // It would look for input with priority over the clients that it waits for.
             Pace::Stepped => Scheduling::Ordinary,

@@ -4,6 +4,7 @@
 //! outputs are carried out before anything else is read. So only one call of the engine is between the last
 //! byte of a field frame and the request to the controller.
 
+pub mod cells;
 mod doctor;
 mod open;
 mod shown;
@@ -33,6 +34,7 @@ use super::console::{ConfigFile, ConsoleOptions, Supervised};
 use super::host::{self, Handle, Shell};
 use super::link::{self, Endpoint, LinkControl, LinkEvent};
 use super::telling::{Glimpse, Teller};
+use super::worker::Place;
 use super::{RunOptions, StartError};
 use recipe_capture::{Decoder, Watch};
 use recipe_device::bind::Bind;
@@ -441,8 +443,9 @@ pub fn run(config: GatewayConfig, options: RunOptions) -> Result<(), StartError>
     let teller = options.sparkplug.clone().map(Teller::start).transpose()?;
     let glimpse = teller.as_ref().map(Teller::glimpse);
     let observers = Observers { glimpse, ..Observers::of(&options) };
-    let handle = spawn(config, options.binds.clone(), options.scheduling, observers, Shelf::default())?;
-    host::foreground(handle, &options)
+    let (binds, shelf) = (options.binds.clone(), Shelf::default());
+    let handle = spawn(config, binds, options.scheduling, observers, shelf, &Place::alone())?;
+    host::foreground(Box::new(handle), &options)
 }
 
 /// Same, with a console that can give it another configuration.
@@ -456,7 +459,8 @@ pub fn run_with_console(
 ) -> Result<(), StartError> {
     let teller = options.sparkplug.clone().map(Teller::start).transpose()?;
     let glimpse = teller.as_ref().map(Teller::glimpse);
-    host::foreground(Supervised::start(file, options, console, glimpse)?, options)
+    let supervised = Supervised::start(file, options, console, glimpse, Place::alone())?;
+    host::foreground(Box::new(supervised), options)
 }
 
 /// Starts the gateway on a thread of its own; dropping the handle ends it.
@@ -474,25 +478,29 @@ pub fn start(config: GatewayConfig, binds: Vec<Bind>) -> Result<Handle, StartErr
 /// The reason why it could not start; nothing is left behind then.
 pub fn start_watched(config: GatewayConfig, binds: Vec<Bind>, watch: &Watch) -> Result<Handle, StartError> {
     let observers = Observers { watch: watch.clone(), ..Observers::default() };
-    spawn(config, binds, Scheduling::Ordinary, observers, Shelf::default())
+    spawn(config, binds, Scheduling::Ordinary, observers, Shelf::default(), &Place::alone())
 }
 
-/// Starts the gateway, with those who look at it. Devices that another one has left are on the shelf, and this one leaves
-/// its own there.
+/// Starts the gateway at a place, with those who look at it. Devices that another one has left are on the shelf, and this
+/// one leaves its own there.
 pub(crate) fn spawn(
     config: GatewayConfig,
     binds: Vec<Bind>,
     scheduling: Scheduling,
     observers: Observers,
     shelf: Shelf,
+    place: &Place,
 ) -> Result<Handle, StartError> {
     let watch = observers.watch.clone();
     let (doctor, told) = match observers.readers {
-        true => doctor::start(config.clone(), &binds).map(|(doctor, told)| (Some(doctor), Some(told)))?,
+        true => {
+            let (doctor, told) = doctor::start(config.clone(), &binds, place.span.clone())?;
+            (Some(doctor), Some(told))
+        }
         false => (None, None),
     };
     let glimpse = observers.glimpse.as_ref().map(|glimpse| glimpse.open(&config));
-    let handle = host::start("gateway", async move |at_end| {
+    let handle = host::start(place, "gateway", async move |at_end| {
         let devices = Devices { binds: &binds, left: Some((shelf, at_end)) };
         let mut gateway = Gateway::open(&config, devices, Voice::Full, &observers).await?;
         gateway.window = observers.window;

@@ -1,13 +1,16 @@
 //! What every shell needs: a thread with a runtime, a handle, and in the foreground the `ready` line,
 //! statistics and a clean end.
+//!
+//! A shell has a thread of its own, or shares a [`Worker`] with others. In both cases it runs in a [`LocalSet`] of its
+//! own, so that its tasks end with it.
 
 use std::cell::RefCell;
-use std::io::{self, Write};
-use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
-use std::sync::{Arc, mpsc as blocking};
+use std::io;
+use std::sync::mpsc as blocking;
 use std::thread::JoinHandle;
 
 use recipe_capture::Watch;
+use recipe_net::fairness;
 use serde_json::Value;
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::LocalSet;
@@ -16,13 +19,15 @@ use tracing::warn;
 use super::service::Service;
 use super::{RunOptions, Signals, StartError};
 use crate::gateway::Told;
-use crate::out::{is_broken_pipe, print_stderr};
+use crate::out::print_stderr;
+use crate::stdout::{Failure, Stdout};
+use crate::worker::{Place, Shared};
 
 /// Stack size: an engine is built by value, and unoptimised code has several copies of it on the stack.
-const STACK: usize = 16 << 20;
+pub(super) const STACK: usize = 16 << 20;
 
 /// A gateway or a controller that runs on one thread until it is dropped.
-pub(super) trait Shell {
+pub(super) trait Shell: 'static {
     /// The addresses and paths for the `ready` line, by name.
     fn ready(&self) -> Value;
     /// A function that returns one line of statistics while the shell runs.
@@ -31,7 +36,7 @@ pub(super) trait Shell {
     fn run(self) -> impl Future<Output = Result<(), StartError>>;
 }
 
-/// A shell that runs on a thread of its own. Dropping it ends the shell and waits until its sockets
+/// A shell that runs on a thread of its own or a shared one. Dropping it ends the shell and waits until its sockets
 /// are closed and its links removed.
 #[derive(Debug)]
 pub struct Handle {
@@ -39,7 +44,16 @@ pub struct Handle {
     requests: mpsc::UnboundedSender<Request>,
     watch: Watch,
     findings: Option<Told>,
-    thread: Option<JoinHandle<Result<(), StartError>>>,
+    home: Option<Home>,
+}
+
+/// Where a shell runs.
+#[derive(Debug)]
+enum Home {
+    /// On a thread of its own.
+    Alone(JoinHandle<Result<(), StartError>>),
+    /// Among others.
+    Among(Shared),
 }
 
 /// Something that runs and can be asked, in the foreground.
@@ -48,12 +62,12 @@ pub(crate) trait Running {
     fn ready(&self) -> &Value;
     /// One line of statistics; `None` if there is none at the moment.
     fn stats(&self) -> Option<Value>;
-    /// Asks the thread that moves the data; `None` if there is none at the moment.
-    fn asker(&self) -> Option<Asker>;
+    /// Ask the threads that move the data; none if one of them is missing at the moment.
+    fn askers(&self) -> Vec<Asker>;
     /// Whether it has ended by itself.
     fn has_ended(&self) -> bool;
     /// Ends it and waits for it. If it had ended by itself, the reason is the error.
-    fn shutdown(self) -> Result<(), StartError>;
+    fn shutdown(self: Box<Self>) -> Result<(), StartError>;
 }
 
 /// Asks a shell, from any thread.
@@ -113,49 +127,96 @@ pub(super) enum Request {
     Shutdown,
 }
 
-/// Opens a shell on a thread of its own and waits until everything is listening.
+/// Opens a shell and waits until everything is listening.
 pub(super) fn start<S: Shell>(
+    place: &Place,
     name: &str,
     open: impl AsyncFnOnce(&AtEnd) -> Result<S, StartError> + Send + 'static,
 ) -> Result<Handle, StartError> {
     let (requests, inbox) = mpsc::unbounded_channel();
     let (opened, outcome) = blocking::channel();
+    let home = match place.shared() {
+        None => Home::Alone(alone(name, Opening { open, opened, inbox })?),
+        Some((worker, begin)) => {
+            let opening = Opening { open, opened, inbox };
+            Home::Among(worker.run(place.span.clone(), move || async move {
+                let (local, at_end) = (LocalSet::new(), AtEnd::default());
+                let ended = fairness::apart(local.run_until(opening.run(&at_end, begin.wait()))).await;
+                drop(local);
+                at_end.run();
+                ended
+            })?)
+        }
+    };
+    match outcome.recv() {
+        Ok(Ok(ready)) => {
+            Ok(Handle { ready, requests, watch: Watch::new(), findings: None, home: Some(home) })
+        }
+        Ok(Err(error)) => {
+            // Whoever tries again finds nothing open.
+            let _ = home.ended();
+            Err(error)
+        }
+        // The thread ended before it sent a result; its own result says why.
+        Err(_) => Err(home.ended().err().unwrap_or_else(|| StartError::new(format!("{name} ended")))),
+    }
+}
+
+fn alone<S: Shell, O>(
+    name: &str,
+    opening: Opening<O>,
+) -> Result<JoinHandle<Result<(), StartError>>, StartError>
+where
+    O: AsyncFnOnce(&AtEnd) -> Result<S, StartError> + Send + 'static,
+{
     let thread = std::thread::Builder::new().name(name.to_owned()).stack_size(STACK).spawn(move || {
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
-        let runtime =
-            runtime.map_err(|error| StartError::new(format!("cannot start the runtime: {error}")))?;
+        let runtime = runtime()?;
         let (local, at_end) = (LocalSet::new(), AtEnd::default());
-        let ended = local.block_on(&runtime, async {
-            let shell = match open(&at_end).await {
-                Ok(shell) => shell,
-                Err(error) => {
-                    let _ = opened.send(Err(error));
-                    return Ok(());
-                }
-            };
-            let stats = shell.stats();
-            let _ = opened.send(Ok(shell.ready()));
-            tokio::select! {
-                ended = shell.run() => ended.map_err(StartError::after_start),
-                () = serve(inbox, stats) => Ok(()),
-            }
-        });
+        let ended = local.block_on(&runtime, opening.run(&at_end, std::future::ready(())));
         drop(local);
         at_end.run();
         ended
     });
-    let thread = thread.map_err(|error| StartError::new(format!("cannot start a thread: {error}")))?;
-    match outcome.recv() {
-        Ok(Ok(ready)) => {
-            Ok(Handle { ready, requests, watch: Watch::new(), findings: None, thread: Some(thread) })
+    thread.map_err(|error| StartError::new(format!("cannot start a thread: {error}")))
+}
+
+/// The runtime of a thread.
+pub(super) fn runtime() -> Result<tokio::runtime::Runtime, StartError> {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
+    runtime.map_err(|error| StartError::new(format!("cannot start the runtime: {error}")))
+}
+
+/// A shell that is to be opened.
+struct Opening<O> {
+    open: O,
+    opened: blocking::Sender<Result<Value, StartError>>,
+    inbox: mpsc::UnboundedReceiver<Request>,
+}
+
+impl<O> Opening<O> {
+    /// Opens it, and runs it when it may begin.
+    async fn run<S: Shell>(self, at_end: &AtEnd, begin: impl Future<Output = ()>) -> Result<(), StartError>
+    where
+        O: AsyncFnOnce(&AtEnd) -> Result<S, StartError>,
+    {
+        let Self { open, opened, inbox } = self;
+        let shell = match open(at_end).await {
+            Ok(shell) => shell,
+            Err(error) => {
+                let _ = opened.send(Err(error));
+                return Ok(());
+            }
+        };
+        let stats = shell.stats();
+        let _ = opened.send(Ok(shell.ready()));
+        let run = async {
+            begin.await;
+            shell.run().await.map_err(StartError::after_start)
+        };
+        tokio::select! {
+            ended = run => ended,
+            () = serve(inbox, stats) => Ok(()),
         }
-        Ok(Err(error)) => {
-            // Whoever tries again finds nothing open.
-            let _ = joined(thread);
-            Err(error)
-        }
-        // The thread ended before it sent a result; its own result says why.
-        Err(_) => Err(joined(thread).err().unwrap_or_else(|| StartError::new(format!("{name} ended")))),
     }
 }
 
@@ -216,7 +277,7 @@ impl Handle {
 
     /// Whether the shell has ended by itself.
     pub fn has_ended(&self) -> bool {
-        self.thread.as_ref().is_none_or(JoinHandle::is_finished)
+        self.home.as_ref().is_none_or(Home::has_ended)
     }
 
     /// Ends the shell and waits for it.
@@ -229,7 +290,7 @@ impl Handle {
 
     fn end(&mut self) -> Result<(), StartError> {
         let _ = self.requests.send(Request::Shutdown);
-        self.thread.take().map_or(Ok(()), joined)
+        self.home.take().map_or(Ok(()), Home::ended)
     }
 }
 
@@ -242,16 +303,16 @@ impl Running for Handle {
         self.stats()
     }
 
-    fn asker(&self) -> Option<Asker> {
-        Some(self.asker())
+    fn askers(&self) -> Vec<Asker> {
+        vec![self.asker()]
     }
 
     fn has_ended(&self) -> bool {
         self.has_ended()
     }
 
-    fn shutdown(self) -> Result<(), StartError> {
-        self.shutdown()
+    fn shutdown(self: Box<Self>) -> Result<(), StartError> {
+        Self::shutdown(*self)
     }
 }
 
@@ -261,14 +322,31 @@ impl Drop for Handle {
     }
 }
 
-fn joined(thread: JoinHandle<Result<(), StartError>>) -> Result<(), StartError> {
-    thread.join().unwrap_or_else(|_| Err(StartError::new("a thread panicked").after_start()))
+impl Home {
+    fn has_ended(&self) -> bool {
+        match self {
+            Self::Alone(thread) => thread.is_finished(),
+            Self::Among(shared) => shared.has_ended(),
+        }
+    }
+
+    /// Waits for its end.
+    fn ended(self) -> Result<(), StartError> {
+        match self {
+            Self::Alone(thread) => thread.join().unwrap_or_else(|_| Err(panicked())),
+            Self::Among(shared) => shared.ended(),
+        }
+    }
+}
+
+/// A thread or a shell panicked.
+pub(super) fn panicked() -> StartError {
+    StartError::new("a thread panicked").after_start()
 }
 
 /// Prints `ready` and statistics, and ends on a signal.
-pub(super) fn foreground(handle: impl Running, options: &RunOptions) -> Result<(), StartError> {
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
-    let runtime = runtime.map_err(|error| StartError::new(format!("cannot start the runtime: {error}")))?;
+pub(super) fn foreground(handle: Box<dyn Running>, options: &RunOptions) -> Result<(), StartError> {
+    let runtime = runtime()?;
     let mut stdout = Stdout::start()
         .map_err(|error| StartError::new(format!("cannot start the thread for statistics: {error}")))?;
     let result = runtime.block_on(async {
@@ -287,7 +365,7 @@ pub(super) fn foreground(handle: impl Running, options: &RunOptions) -> Result<(
         let mut ticks = options.stats.map(tokio::time::interval);
         let mut check = tokio::time::interval(CHECK_INTERVAL);
         let result = {
-            let mut alive = std::pin::pin!(service.keep_alive(|| handle.asker()));
+            let mut alive = std::pin::pin!(service.keep_alive(|| handle.askers()));
             loop {
                 tokio::select! {
                     _ = signals.next() => break Ok(()),
@@ -326,76 +404,6 @@ pub(super) fn foreground(handle: impl Running, options: &RunOptions) -> Result<(
     result
 }
 
-/// Lines for stdout, written by a thread of its own, because a slow reader must not delay signals. Lines that
-/// are not read or cannot be written are lost and counted.
-struct Stdout {
-    waiting: blocking::SyncSender<String>,
-    failures: mpsc::UnboundedReceiver<Failure>,
-    /// Closed when everything has been written.
-    written: blocking::Receiver<()>,
-    lost: Arc<AtomicU64>,
-}
-
-/// Why a line was not written; reported once until a line is written again.
-enum Failure {
-    /// The reader has closed stdout.
-    Closed,
-    /// It was the first line, `ready`.
-    NotReady(io::Error),
-    /// It was another line; the next may succeed, such as after a full disk.
-    Lost(io::Error),
-}
-
-impl Stdout {
-    fn start() -> io::Result<Self> {
-        let (waiting, inbox) = blocking::sync_channel::<String>(MAX_LINES);
-        let (open, written) = blocking::channel();
-        let (report, failures) = mpsc::unbounded_channel();
-        let lost = Arc::<AtomicU64>::default();
-        let count = Arc::clone(&lost);
-        std::thread::Builder::new().name("stdout".to_owned()).spawn(move || {
-            let _open: blocking::Sender<()> = open;
-            let mut failing = false;
-            for (nth, line) in inbox.into_iter().enumerate() {
-                let Err(error) = print_line(&line) else {
-                    failing = false;
-                    continue;
-                };
-                count.fetch_add(1, Relaxed);
-                if !std::mem::replace(&mut failing, true) {
-                    let _ = report.send(match nth {
-                        _ if is_broken_pipe(&error) => Failure::Closed,
-                        0 => Failure::NotReady(error),
-                        _ => Failure::Lost(error),
-                    });
-                }
-            }
-        })?;
-        Ok(Self { waiting, failures, written, lost })
-    }
-
-    fn print(&mut self, line: String) {
-        if self.waiting.try_send(line).is_err() {
-            self.lost.fetch_add(1, Relaxed);
-        }
-    }
-
-    fn lost(&self) -> u64 {
-        self.lost.load(Relaxed)
-    }
-
-    /// Waits until all lines are written, for [`FLUSH_TIMEOUT`] at most.
-    fn finish(self) {
-        drop(self.waiting);
-        let _ = self.written.recv_timeout(FLUSH_TIMEOUT);
-    }
-}
-
-/// Maximum number of lines that wait for the reader of stdout.
-const MAX_LINES: usize = 16;
-/// How long the end of the program waits for the reader.
-const FLUSH_TIMEOUT: std::time::Duration = std::time::Duration::from_millis(500);
-
 /// Interval at which the foreground checks that the shell still runs.
 const CHECK_INTERVAL: std::time::Duration = std::time::Duration::from_millis(100);
 
@@ -406,10 +414,4 @@ async fn tick(ticks: &mut Option<tokio::time::Interval>) {
         }
         None => std::future::pending().await,
     }
-}
-
-fn print_line(line: &str) -> io::Result<()> {
-    let mut out = io::stdout().lock();
-    writeln!(out, "{line}")?;
-    out.flush()
 }

@@ -14,9 +14,11 @@ pub mod out;
 mod ready;
 mod service;
 mod signals;
+mod stdout;
 mod tcp;
 mod telling;
 mod udp;
+mod worker;
 
 use std::fmt;
 use std::sync::Arc;
@@ -74,6 +76,12 @@ impl StartError {
     #[must_use]
     pub fn after_start(self) -> Self {
         Self { had_started: true, ..self }
+    }
+
+    /// The same error, of one of several cells.
+    #[must_use]
+    pub(crate) fn of(self, cell: &str) -> Self {
+        Self { message: format!("{cell}: {}", self.message), ..self }
     }
 
     /// 2 if nothing was started, 1 if the run failed later.

@@ -111,19 +111,26 @@ fn read(path: &Path, len: u64) -> io::Result<Option<String>> {
     Ok(String::from_utf8(fs::read(path)?).ok())
 }
 
-/// Whether this is the text of a ready file: an object of addresses, with an object of ports. An empty file
-/// counts too: `mktemp` creates one, and nothing is lost with it.
+/// Whether this is the text of a ready file: an object of addresses with an object of ports, or an object of several
+/// such cells. An empty file counts too: `mktemp` creates one, and nothing is lost with it.
 fn is_ready(text: &str) -> bool {
+    match serde_json::from_str::<Value>(text) {
+        Ok(ready) => match ready.get("cells").and_then(Value::as_object) {
+            Some(cells) => ready.as_object().is_some_and(|all| all.len() == 1) && cells.values().all(is_cell),
+            None => is_cell(&ready),
+        },
+        Err(_) => text.is_empty(),
+    }
+}
+
+fn is_cell(ready: &Value) -> bool {
     let addresses =
         |value: &Value| value.as_object().is_some_and(|ports| ports.values().all(Value::is_string));
     let is_address = |(key, value): (&String, &Value)| match key.as_str() {
         "ports" => addresses(value),
         _ => value.is_string(),
     };
-    match serde_json::from_str(text) {
-        Ok(Value::Object(ready)) => ready.contains_key("ports") && ready.iter().all(is_address),
-        _ => text.is_empty(),
-    }
+    ready.as_object().is_some_and(|ready| ready.contains_key("ports") && ready.iter().all(is_address))
 }
 
 const FOLDER: &str = "a folder; give the name of a file in it";
@@ -160,7 +167,8 @@ mod tests {
     #[test]
     fn a_file_left_by_a_killed_run_is_removed_at_once() {
         let (_folder, path) = place();
-        for left in [format!("{}\n", ready()), json!({ "ports": {} }).to_string(), String::new()] {
+        let cells = json!({ "cells": { "left": ready(), "right": { "ports": {} } } }).to_string();
+        for left in [format!("{}\n", ready()), json!({ "ports": {} }).to_string(), cells, String::new()] {
             fs::write(&path, left).unwrap();
             let file = ReadyFile::at(path.clone()).unwrap();
             assert!(!path.exists(), "nobody reads the old one");
@@ -174,8 +182,20 @@ mod tests {
     #[test]
     fn any_other_file_stays() {
         let (_folder, path) = place();
+        let one_is_none = r#"{"cells":{"left":{"ports":{}},"right":{}}}"#;
+        let and_more = r#"{"cells":{"left":{"ports":{}}},"ports":{}}"#;
         let long = format!("{}{}", ready(), " ".repeat(1 << 16));
-        for other in ["[port]\n", "{}", "[]", "\n", r#"{"ports":[]}"#, r#"{"ports":{},"n":1}"#, &long] {
+        for other in [
+            "[port]\n",
+            "{}",
+            "[]",
+            "\n",
+            r#"{"ports":[]}"#,
+            r#"{"ports":{},"n":1}"#,
+            &long,
+            one_is_none,
+            and_more,
+        ] {
             fs::write(&path, other).unwrap();
             let message = ReadyFile::at(path.clone()).unwrap_err().to_string();
             assert!(

@@ -1,8 +1,8 @@
 //! What a run tells the service manager that started it: that it is ready, that it works, that it ends.
 //!
 //! systemd gives a service of `Type=notify` a socket in `NOTIFY_SOCKET`, and one with `WatchdogSec=` the time
-//! within which it must say that it works in `WATCHDOG_USEC`. It says so only when the thread that moves the
-//! robot's data has answered: a run whose main thread alone is alive is restarted. Without a service manager
+//! within which it must say that it works in `WATCHDOG_USEC`. It says so only when the threads that move the
+//! robots' data have answered: a run whose main thread alone is alive is restarted. Without a service manager
 //! nothing is done.
 
 use std::time::Duration;
@@ -33,21 +33,24 @@ impl Service {
         tell(&[NotifyState::Stopping, NotifyState::Status("ending")]);
     }
 
-    /// Says again and again that the run works, as long as its thread answers. Never returns.
-    pub(super) async fn keep_alive(&self, thread: impl Fn() -> Option<Asker>) {
-        self.each_beat(thread, || tell(&[NotifyState::Watchdog])).await;
+    /// Says again and again that the run works, as long as each of its threads answers. Never returns.
+    pub(super) async fn keep_alive(&self, threads: impl Fn() -> Vec<Asker>) {
+        self.each_beat(threads, || tell(&[NotifyState::Watchdog])).await;
     }
 
-    async fn each_beat(&self, thread: impl Fn() -> Option<Asker>, say: impl Fn()) {
+    async fn each_beat(&self, threads: impl Fn() -> Vec<Asker>, say: impl Fn()) {
         let Some(patience) = self.patience else { return std::future::pending().await };
         let mut beat = tokio::time::interval(patience / BEATS);
         beat.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         loop {
             beat.tick().await;
             // While a configuration is replaced there is none.
-            if let Some(thread) = thread()
-                && thread.answers().await
-            {
+            let threads = threads();
+            let mut works = !threads.is_empty();
+            for thread in threads {
+                works &= thread.answers().await;
+            }
+            if works {
                 say();
             }
         }
@@ -72,6 +75,12 @@ mod tests {
     #[tokio::test(start_paused = true)]
     async fn a_thread_that_does_not_answer_is_not_said_to_work() {
         let (thread, mut inbox) = Asker::channel();
+        let (works, mut other) = Asker::channel();
+        let always_works = async {
+            while let Some(Request::Ping(answer)) = other.recv().await {
+                let _ = answer.send(());
+            }
+        };
         let service = Service { patience: Some(Duration::from_secs(3)) };
         let said = Cell::new(0);
         let works_for_a_while = async {
@@ -86,8 +95,9 @@ mod tests {
             }
         };
         tokio::select! {
-            () = service.each_beat(|| Some(thread.clone()), || said.set(said.get() + 1)) => unreachable!("it goes on"),
+            () = service.each_beat(|| vec![works.clone(), thread.clone()], || said.set(said.get() + 1)) => unreachable!("it goes on"),
             () = works_for_a_while => unreachable!("the service is there"),
+            () = always_works => unreachable!("the service is there"),
             () = tokio::time::sleep(Duration::from_secs(60)) => {}
         }
         assert_eq!(said.get(), 4);
@@ -98,7 +108,7 @@ mod tests {
         let (thread, mut inbox) = Asker::channel();
         let service = Service { patience: None };
         tokio::select! {
-            () = service.keep_alive(|| Some(thread.clone())) => unreachable!("it goes on"),
+            () = service.keep_alive(|| vec![thread.clone()]) => unreachable!("it goes on"),
             () = tokio::time::sleep(Duration::from_secs(60)) => {}
         }
         assert!(inbox.try_recv().is_err());

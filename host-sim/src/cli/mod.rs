@@ -4,6 +4,7 @@
 //! written, 2 if a file or an argument cannot be used (nothing was started then). A reader that closes the
 //! pipe is no failure.
 
+mod cells;
 mod check;
 mod codec;
 mod conversation;
@@ -172,6 +173,8 @@ Examples:
   host-sim gateway -c cell.toml --console 127.0.0.1:8480 --console-key console.key --console-state revisions
       and then: curl http://127.0.0.1:8480/api/v1/status
   host-sim gateway -c cell.toml --bind hand=socketcan:can0 --sparkplug sparkplug.toml
+  host-sim gateway -c left.toml -c right.toml --bind left/hand=socketcan:can0 --bind right/hand=socketcan:can1
+                                                 one process for several cells: docs/several-cells.md
   host-sim gateway -c new.toml --bind force=serial:/dev/ttyUSB0 --console 127.0.0.1:8480 --console-key console.key
                                                  new.toml has no ports: the page in a browser adds them
 

@@ -39,6 +39,15 @@ pub(super) struct Watching {
 }
 
 impl WatchArgs {
+    /// The option that asks for something.
+    pub(super) fn option(&self) -> Option<&'static str> {
+        match (&self.capture, &self.record) {
+            (Some(_), _) => Some("--capture"),
+            (None, Some(_)) => Some("--record"),
+            (None, None) => None,
+        }
+    }
+
     /// Whether stdout is for the capture.
     pub(super) fn takes_stdout(&self) -> bool {
         self.capture.as_deref() == Some(Path::new("-"))

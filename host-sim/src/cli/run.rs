@@ -1,6 +1,7 @@
 //! `host-sim controller` and `host-sim gateway`: options, and the way from a file to a run.
 
 use std::net::SocketAddr;
+use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
@@ -8,7 +9,7 @@ use std::time::Duration;
 use clap::Args;
 
 use super::record::WatchArgs;
-use super::{Overrides, check, wrong};
+use super::{Overrides, cells, check, wrong};
 use recipe_config::SimConfig;
 use recipe_controller::timeline::Timeline;
 use recipe_device::bind::Bind;
@@ -21,9 +22,6 @@ use recipe_shell::{self as shell, EventsFile, ReadyFile, RunOptions, Scheduling,
 /// Arguments of `controller` and `gateway`.
 #[derive(Debug, Args)]
 pub(super) struct Run {
-    /// The configuration file
-    #[arg(short, long, value_name = "FILE")]
-    config: PathBuf,
     #[command(flatten)]
     overrides: Overrides,
     /// Bind a port to a device: pty:PATH, pty-paced:PATH, serial:/dev/ttyUSB0, tcp:HOST:PORT,
@@ -60,6 +58,13 @@ pub(super) struct Run {
 /// Arguments of `gateway`.
 #[derive(Debug, Args)]
 pub(super) struct GatewayRun {
+    /// The configuration file. With several, one process serves several cells, each called like its file without the
+    /// extension: --bind CELL/NAME=DEVICE, --set CELL/KEY=VALUE
+    #[arg(short, long, value_name = "FILE", required = true)]
+    config: Vec<PathBuf>,
+    /// Serve several cells on so many threads; without it, one for each processor
+    #[arg(long, value_name = "N")]
+    threads: Option<NonZeroUsize>,
     #[command(flatten)]
     run: Run,
     #[command(flatten)]
@@ -73,6 +78,9 @@ pub(super) struct GatewayRun {
 /// Arguments of `controller`.
 #[derive(Debug, Args)]
 pub(super) struct ControllerRun {
+    /// The configuration file
+    #[arg(short, long, value_name = "FILE")]
+    config: PathBuf,
     #[command(flatten)]
     run: Run,
     /// How the controller's clock runs: real; factor=N, so many times as fast as the machine's, such as 20 or
@@ -93,8 +101,25 @@ pub(super) struct ControllerRun {
 
 impl GatewayRun {
     pub(super) fn gateway(self, log: Log) -> ExitCode {
-        let Self { run, watch, sparkplug } = self;
-        let (path, overrides) = (run.config.clone(), run.overrides.set.clone());
+        let Self { config, threads, run, watch, sparkplug } = self;
+        let path = match <[PathBuf; 1]>::try_from(config) {
+            Ok([path]) => path,
+            Err(files) => {
+                if let Some(option) = watch.option().or(sparkplug.map(|_| "--sparkplug")) {
+                    return wrong(format_args!("{option} is for one cell; run a gateway of its own for it"));
+                }
+                return match cells::prepare(&files, run, log) {
+                    Ok((cells, options)) => {
+                        finished(shell::gateway::cells::run(cells, cells::threads(threads), &options))
+                    }
+                    Err(error) => finished(Err(error)),
+                };
+            }
+        };
+        if threads.is_some() {
+            return wrong("--threads is for several cells; give -c FILE for each of them");
+        }
+        let overrides = run.overrides.set.clone();
         let loaded = check::load_gateway(&path, &overrides);
         let sparkplug = match sparkplug.as_deref().map(Telling::load).transpose() {
             Ok(sparkplug) => sparkplug,
@@ -133,7 +158,12 @@ impl GatewayRun {
 }
 
 impl Run {
-    fn options(self, log: Log) -> Result<RunOptions, StartError> {
+    /// What overrides keys of the file.
+    pub(super) fn overrides(&self) -> &[String] {
+        &self.overrides.set
+    }
+
+    pub(super) fn options(self, log: Log) -> Result<RunOptions, StartError> {
         let ready = self.ready.map(ReadyFile::at).transpose()?;
         let scheduling = if self.no_realtime { Scheduling::Ordinary } else { Scheduling::FifoIfAllowed };
         let key = self.console_key.as_deref().map(console::read_key).transpose()?;
@@ -146,7 +176,7 @@ impl Run {
 
 impl ControllerRun {
     pub(super) fn controller(self, log: Log) -> ExitCode {
-        let loaded = check::load_controller(&self.run.config, &self.run.overrides.set);
+        let loaded = check::load_controller(&self.config, &self.run.overrides.set);
         let loaded = loaded.map_err(|error| error.to_string()).and_then(|config| {
             let timeline = self.timeline.as_deref().map(|path| read_timeline(path, &config)).transpose()?;
             Ok((config, timeline))
@@ -161,7 +191,7 @@ impl ControllerRun {
     }
 
     fn options(self, log: Log) -> Result<ControllerOptions, StartError> {
-        let Self { run, time: pace, seed, events, timeline: _ } = self;
+        let Self { run, time: pace, seed, events, .. } = self;
         if run.console_state.is_some() {
             return Err(StartError::new("--console-state: a simulated controller keeps no revisions"));
         }

@@ -1,6 +1,7 @@
 //! The program as users and scripts run it.
 
 mod capturing;
+mod cells;
 mod checking;
 mod command_line;
 mod control;

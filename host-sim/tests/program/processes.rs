@@ -135,7 +135,7 @@ fn gateway_of(file: &Path, line: &Path) -> Command {
 
 /// Checks for exit code 2 and one line on stderr, and returns the line.
 #[track_caller]
-fn refused(command: &mut Command) -> String {
+pub(crate) fn refused(command: &mut Command) -> String {
     let mut child = command.spawn().unwrap();
     ended(&mut child, PATIENCE);
     let output = child.wait_with_output().unwrap();

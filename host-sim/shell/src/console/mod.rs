@@ -201,15 +201,15 @@ impl Running for Consoled {
         self.handle.stats()
     }
 
-    fn asker(&self) -> Option<Asker> {
-        Some(self.handle.asker())
+    fn askers(&self) -> Vec<Asker> {
+        vec![self.handle.asker()]
     }
 
     fn has_ended(&self) -> bool {
         self.handle.has_ended()
     }
 
-    fn shutdown(mut self) -> Result<(), StartError> {
+    fn shutdown(mut self: Box<Self>) -> Result<(), StartError> {
         self.console = None;
         self.handle.shutdown()
     }

@@ -30,6 +30,7 @@ use super::{Bound, Console, ConsoleOptions, Source};
 use crate::gateway::{self, Observers};
 use crate::host::{Asker, Handle, Running};
 use crate::telling::Glimpse;
+use crate::worker::Place;
 use crate::{RunOptions, StartError};
 
 /// The configuration that a gateway was started with.
@@ -155,6 +156,7 @@ impl Supervised {
         options: &RunOptions,
         console: &ConsoleOptions,
         glimpse: Option<Glimpse>,
+        place: Place,
     ) -> Result<Self, StartError> {
         let bound = console.bind()?;
         let store = Store::open(console.state.as_deref(), (&file.name, &file.toml))?;
@@ -173,13 +175,17 @@ impl Supervised {
             binds: options.binds.clone(),
             scheduling: options.scheduling,
             shelf: Shelf::default(),
+            place,
             observers: Observers { glimpse, ..Observers::of(options) },
             put: None,
             failure: None,
         };
         let (opened, outcome) = blocking::channel();
         let thread = std::thread::Builder::new().name("supervisor".to_owned()).stack_size(super::STACK);
-        let thread = thread.spawn(move || supervisor.run(&opened, &inbox));
+        let thread = thread.spawn(move || {
+            let _of = supervisor.place.span.clone().entered();
+            supervisor.run(&opened, &inbox)
+        });
         let thread = thread.map_err(|error| StartError::new(format!("cannot start a thread: {error}")))?;
         match outcome.recv() {
             Ok(Ok(())) => {}
@@ -223,18 +229,19 @@ impl Running for Supervised {
     }
 
     fn stats(&self) -> Option<Value> {
-        self.asker()?.stats()
+        let asker = self.shared.view().asker.clone();
+        asker?.stats()
     }
 
-    fn asker(&self) -> Option<Asker> {
-        self.shared.view().asker.clone()
+    fn askers(&self) -> Vec<Asker> {
+        self.shared.view().asker.clone().into_iter().collect()
     }
 
     fn has_ended(&self) -> bool {
         self.thread.as_ref().is_none_or(JoinHandle::is_finished)
     }
 
-    fn shutdown(mut self) -> Result<(), StartError> {
+    fn shutdown(mut self: Box<Self>) -> Result<(), StartError> {
         self.end()
     }
 }
@@ -259,6 +266,8 @@ struct Supervisor {
     scheduling: Scheduling,
     /// Devices on the way from one gateway to the next.
     shelf: Shelf,
+    /// Where each gateway runs.
+    place: Place,
     /// Who looks at each gateway, but for the console.
     observers: Observers,
     /// The text that is to be kept, and who sent it.
@@ -425,7 +434,8 @@ impl Supervisor {
         let observers = Observers { window: Some(Arc::clone(&window)), decoder, ..self.observers.clone() };
         let copy = (*config).clone();
         let binds = self.binds_of(number, &config);
-        let handle = gateway::spawn(copy, binds, self.scheduling, observers, self.shelf.clone())?;
+        let handle =
+            gateway::spawn(copy, binds, self.scheduling, observers, self.shelf.clone(), &self.place)?;
         self.running = Some(Replaceable { number, handle, window, config });
         Ok(())
     }

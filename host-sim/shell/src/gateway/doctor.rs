@@ -21,11 +21,12 @@ use proto_core::wire::dialect::Dialect;
 use proto_core::wire::state::{StateStream, States};
 use recipe_doctor::{Case, Change, Finding, LinkFacts, PortRecord, Watch, examine, has_commands};
 use serde_json::{Value, json};
-use tracing::info;
+use tracing::{Span, info};
 
 use super::open::Devices;
 use super::{Core, Engine, Gateway, Observers, Voice};
 use crate::host::{self, Shell};
+use crate::worker::Place;
 use crate::{Signals, StartError};
 use recipe_device::bind::Bind;
 use recipe_net::timer::now;
@@ -157,7 +158,7 @@ impl Core {
 }
 
 /// Starts the thread that looks at snapshots and logs what begins and ends.
-pub(super) fn start(config: GatewayConfig, binds: &[Bind]) -> Result<(Doctor, Told), StartError> {
+pub(super) fn start(config: GatewayConfig, binds: &[Bind], span: Span) -> Result<(Doctor, Told), StartError> {
     let (filled, inbox) = sync_channel(1);
     let (empty, rooms) = sync_channel(1);
     let room = Snapshot::room(records(&config, binds));
@@ -168,6 +169,7 @@ pub(super) fn start(config: GatewayConfig, binds: &[Bind]) -> Result<(Doctor, To
         .spawn(move || {
             // The gateway's thread is there until both ends of this one are.
             let _ = empty.send(room);
+            let _of = span.entered();
             log_changes(&config, &inbox, &empty, &own);
         })
         .map_err(|error| StartError::new(format!("cannot start a thread: {error}")))?;
@@ -249,7 +251,7 @@ pub fn listen(
 ) -> Result<Vec<Finding>, StartError> {
     let (sender, findings) = channel();
     let voice = if ask { Voice::Asking } else { Voice::Silent };
-    let handle = host::start("doctor", async move |_| {
+    let handle = host::start(&Place::alone(), "doctor", async move |_| {
         let gateway = Gateway::open(&config, Devices::own(&binds), voice, &Observers::default()).await?;
         gateway.core.keep_records(&config, &binds);
         Ok(Listener { gateway, config, time, sender })
