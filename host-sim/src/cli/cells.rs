@@ -27,9 +27,9 @@ pub(super) fn prepare(files: &[PathBuf], run: Run, log: Log) -> Result<(Vec<Cell
     let names = Names::of(files)?;
     let overrides = names.shares(overrides.iter().map(|text| names.split("--set", text)))?;
     let mut read = Vec::with_capacity(files.len());
-    for (path, overrides) in files.iter().zip(overrides) {
-        let config =
-            check::load_gateway(path, &overrides).map_err(|error| StartError::new(error.to_string()))?;
+    for ((path, name), overrides) in files.iter().zip(&names.0).zip(overrides) {
+        let config = check::load_gateway(path, &overrides)
+            .map_err(|error| StartError::new(format!("{name}: {error}")))?;
         read.push((config, ConfigFile::read(path, overrides)?));
     }
     let options = options?;

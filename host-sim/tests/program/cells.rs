@@ -110,7 +110,7 @@ fn each_cell_has_its_own_robot_and_does_not_need_the_others() {
     let stats = gateway.next_stats(|stats| stats["cells"]["left"]["links"]["modbus"]["state"] != "up");
     assert!(is_up(&stats["cells"]["right"]), "{stats}");
     let told = until("a line in the log", || gateway.log("no connection to the controller").first().cloned());
-    assert!(told.contains("left"), "{told}");
+    assert!(told.contains("cell{name=\"left\"}"), "{told}");
     switch(&mut devices[1], 9);
     is_switched(&right, 9.0);
     let stats = gateway.next_stats(|stats| stats["cells"]["right"]["ports"]["rs485-1"]["frames_in"] == 2);
@@ -143,12 +143,15 @@ fn each_cell_has_a_console_of_its_own() {
         let output = ctl.args(["ctl", "--to", &to, "--key"]).arg(&key).args(&words).output().unwrap();
         assert!(output.status.success(), "{words:?}: {}", String::from_utf8_lossy(&output.stderr));
     }
+    gateway.skip_lines();
     gateway.next_stats(|stats| is_up(&stats["cells"]["left"]) && sent(stats, "right") > Some(before + 50));
     let mut devices = NAMES.map(|name| cells.device(name));
     for (device, robot) in devices.iter_mut().zip(&robots) {
         switch(device, 3);
         is_switched(robot, 3.0);
     }
+    let told = gateway.log("what=\"confirm\"");
+    assert!(told[0].contains("cell{name=\"left\"}"), "{told:?}");
     let kept = |name: &str| std::fs::read_dir(state.join(name)).unwrap().count();
     assert!(kept("left") > kept("right"), "a revision more");
     gateway.ended_by(Signal::TERM);
@@ -170,15 +173,18 @@ fn all_cells_start_or_none() {
     started(&mut no_place, "right: --bind rs485-1=pty:/dev/null/line: ");
 
     let mut wrong = cells().with_lines();
-    std::fs::write(wrong.folder.path().join("right.toml"), "[[port]]\nname = 1\n").unwrap();
+    std::fs::write(wrong.folder.path().join("right.toml"), "[controller]\naddress = 1\n").unwrap();
     started(&mut wrong, "right.toml:2:");
+    let mut missing = cells().with_lines();
+    std::fs::write(missing.folder.path().join("right.toml"), "").unwrap();
+    started(&mut missing, "right: --set controller.ports.state=");
 
     for (option, words) in [
         ("--bind=rs485-1=pty:line", "--bind rs485-1=pty:line: for which cell? Write the cell before it"),
         ("--bind=up/rs485-1=pty:line", "there is no cell up; there are left, right"),
         ("--set=port.rs485-1.baud=9600", "such as left/port.rs485-1.baud=9600"),
         ("--bind=left/other=pty:line", "left: --bind other=pty:line: there is no such port"),
-        ("--set=left/port.rs485-1.baud=1", "left.toml"),
+        ("--set=left/port.rs485-1.baud=1", "left: --set port.rs485-1.baud=1: "),
         ("--capture=file.pcapng", "--capture is for one cell"),
         ("--record=folder", "--record is for one cell"),
         ("--sparkplug=node.toml", "--sparkplug is for one cell"),

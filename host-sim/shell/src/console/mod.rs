@@ -32,7 +32,7 @@ use recipe_remote::key::Key;
 use recipe_remote::route::Served;
 use serde_json::{Value, json};
 use tokio::sync::Notify;
-use tracing::info;
+use tracing::{Span, info};
 
 use crate::StartError;
 use crate::host::{Asker, Handle, Running};
@@ -126,7 +126,9 @@ impl Console {
             let _inside = runtime.enter();
             tokio::net::TcpListener::from_std(listener).map_err(refused)?
         };
+        let span = Span::current();
         let serve = move || {
+            let _of = span.entered();
             // Where the gateway's thread has no better right, it still goes first.
             let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), NICENESS);
             let server = Rc::new(Server {

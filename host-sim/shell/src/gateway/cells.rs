@@ -58,6 +58,8 @@ pub fn run(cells: Vec<Cell>, threads: NonZeroUsize, options: &RunOptions) -> Res
 
 fn start(cell: Cell, place: Place) -> Result<Box<dyn Running>, StartError> {
     let Cell { config, file, options, .. } = cell;
+    // For threads that are started here.
+    let _of = place.span.clone().entered();
     if let Some(console) = &options.console {
         return Ok(Box::new(Supervised::start(file, &options, console, None, place)?));
     }
