@@ -77,6 +77,9 @@ pub(crate) fn run(cells: usize, seconds: u64, threads: Option<usize>) {
     let before = Counted::of(&gateways, &robots);
     let (mut samples, sent) = drive(&mut devices, &mut peer, seconds);
     let after = Counted::of(&gateways, &robots);
+    if std::env::var_os("SHOW").is_some() {
+        println!("{}", gateways.cells()[3]);
+    }
 
     let wanted = cells as f64 * seconds as f64 * 250.0;
     let heard: usize = devices.iter().map(|device| device.heard / OUT_LEN).sum();
@@ -118,7 +121,7 @@ impl Gateways {
     /// What each cell said last.
     fn cells(&self) -> Vec<Value> {
         match self {
-            Self::Processes(gateways) => gateways.iter().map(HostSim::newest).collect(),
+            Self::Processes(gateways) => gateways.iter().map(|gateway| gateway.newest()).collect(),
             Self::One(gateway) => {
                 let newest = gateway.newest();
                 // Without statistics yet, one that is not connected.

@@ -6,6 +6,7 @@
 
 use std::cell::RefCell;
 use std::io;
+use std::pin::Pin;
 use std::sync::mpsc as blocking;
 use std::thread::JoinHandle;
 
@@ -200,7 +201,9 @@ impl<O> Opening<O> {
         O: AsyncFnOnce(&AtEnd) -> Result<S, StartError>,
     {
         let Self { open, opened, inbox } = self;
-        let shell = match open(at_end).await {
+        // On the heap and behind a pointer: else its frame, with room for an engine, would be that of every poll.
+        let opening: Pin<Box<dyn Future<Output = _>>> = Box::pin(open(at_end));
+        let shell = match opening.await {
             Ok(shell) => shell,
             Err(error) => {
                 let _ = opened.send(Err(error));

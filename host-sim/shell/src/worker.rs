@@ -5,6 +5,8 @@ use std::pin::Pin;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
+use proto_core::time::Duration;
+use recipe_net::timer::{Timer, now};
 use tokio::sync::{mpsc, watch};
 use tokio::task::{LocalSet, spawn_local};
 use tracing::{Instrument, Span};
@@ -38,18 +40,33 @@ impl Place {
 
 /// When shells may run that have been opened.
 #[derive(Debug, Clone)]
-pub(crate) struct Begin(watch::Receiver<bool>);
+pub(crate) struct Begin {
+    begins: watch::Receiver<bool>,
+    after: Duration,
+}
 
 impl Begin {
     /// It begins when `true` is sent. If the sender is gone before, it never does.
     pub(crate) fn channel() -> (watch::Sender<bool>, Self) {
         let (begins, begin) = watch::channel(false);
-        (begins, Self(begin))
+        (begins, Self { begins: begin, after: Duration::ZERO })
+    }
+
+    /// The same, and so much later.
+    pub(crate) fn and_later(&self, after: Duration) -> Self {
+        Self { begins: self.begins.clone(), after }
     }
 
     pub(super) async fn wait(mut self) {
-        if self.0.wait_for(|begins| *begins).await.is_err() {
+        if self.begins.wait_for(|begins| *begins).await.is_err() {
             std::future::pending().await
+        }
+        if self.after > Duration::ZERO
+            && let Ok(timer) = Timer::new()
+            && timer.arm(now() + self.after).is_ok()
+        {
+            // Without the timer it begins at once.
+            let _ = timer.expired().await;
         }
     }
 }

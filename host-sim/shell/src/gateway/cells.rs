@@ -7,6 +7,7 @@ use std::num::NonZeroUsize;
 use std::sync::Arc;
 
 use proto_core::config::GatewayConfig;
+use proto_core::time::Duration;
 use recipe_device::kept::Shelf;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use serde_json::{Map, Value, json};
@@ -41,10 +42,12 @@ pub fn run(cells: Vec<Cell>, threads: NonZeroUsize, options: &RunOptions) -> Res
     let workers: Vec<_> =
         (0..threads.get().min(cells.len())).map(|_| Worker::start("gateways")).collect::<Result<_, _>>()?;
     let (begins, begin) = Begin::channel();
+    let count = cells.len() as u64;
     let mut started = Vec::with_capacity(cells.len());
-    for (cell, worker) in cells.into_iter().zip(workers.iter().cycle()) {
+    for ((nth, cell), worker) in (0..).zip(cells).zip(workers.iter().cycle()) {
         let span = error_span!("cell", name = cell.name);
-        let place = Place::among(Arc::clone(worker), begin.clone(), span);
+        let begin = begin.and_later(Duration::from_micros(nth * CYCLE.as_micros() / count));
+        let place = Place::among(Arc::clone(worker), begin, span);
         let name = cell.name.clone();
         let run = start(cell, place).map_err(|error| error.of(&name))?;
         started.push((name, run));
@@ -55,6 +58,9 @@ pub fn run(cells: Vec<Cell>, threads: NonZeroUsize, options: &RunOptions) -> Res
     let _ = begins.send(true);
     host::foreground(Box::new(Cells::new(started)), options)
 }
+
+/// The cells' cycles begin one after the other within the usual one, so that they do not wait for each other each time.
+const CYCLE: Duration = Duration::from_millis(4);
 
 fn start(cell: Cell, place: Place) -> Result<Box<dyn Running>, StartError> {
     let Cell { config, file, options, .. } = cell;
