@@ -136,18 +136,17 @@ pub(super) fn start<S: Shell>(
 ) -> Result<Handle, StartError> {
     let (requests, inbox) = mpsc::unbounded_channel();
     let (opened, outcome) = blocking::channel();
+    let open = Box::new(open);
+    let opening = Opening { open: Box::new(|at_end| Box::pin(open(at_end))), opened, inbox };
     let home = match place.shared() {
-        None => Home::Alone(alone(name, Opening { open, opened, inbox })?),
-        Some((worker, begin)) => {
-            let opening = Opening { open, opened, inbox };
-            Home::Among(worker.run(place.span.clone(), move || async move {
-                let (local, at_end) = (LocalSet::new(), AtEnd::default());
-                let ended = fairness::apart(local.run_until(opening.run(&at_end, begin.wait()))).await;
-                drop(local);
-                at_end.run();
-                ended
-            })?)
-        }
+        None => Home::Alone(alone(name, opening)?),
+        Some((worker, begin)) => Home::Among(worker.run(place.span.clone(), move || async move {
+            let (local, at_end) = (LocalSet::new(), AtEnd::default());
+            let ended = fairness::apart(local.run_until(opening.run(&at_end, begin.wait()))).await;
+            drop(local);
+            at_end.run();
+            ended
+        })?),
     };
     match outcome.recv() {
         Ok(Ok(ready)) => {
@@ -163,13 +162,10 @@ pub(super) fn start<S: Shell>(
     }
 }
 
-fn alone<S: Shell, O>(
+fn alone<S: Shell>(
     name: &str,
-    opening: Opening<O>,
-) -> Result<JoinHandle<Result<(), StartError>>, StartError>
-where
-    O: AsyncFnOnce(&AtEnd) -> Result<S, StartError> + Send + 'static,
-{
+    opening: Opening<S>,
+) -> Result<JoinHandle<Result<(), StartError>>, StartError> {
     let thread = std::thread::Builder::new().name(name.to_owned()).stack_size(STACK).spawn(move || {
         let runtime = runtime()?;
         let (local, at_end) = (LocalSet::new(), AtEnd::default());
@@ -188,22 +184,22 @@ pub(super) fn runtime() -> Result<tokio::runtime::Runtime, StartError> {
 }
 
 /// A shell that is to be opened.
-struct Opening<O> {
-    open: O,
+struct Opening<S> {
+    open: Open<S>,
     opened: blocking::Sender<Result<Value, StartError>>,
     inbox: mpsc::UnboundedReceiver<Request>,
 }
 
-impl<O> Opening<O> {
+/// Opens a shell. It is called through a pointer, and so is its future: what it needs on the stack, with room for an
+/// engine and a configuration, would else be touched at every wake of the shell.
+type Open<S> =
+    Box<dyn for<'a> FnOnce(&'a AtEnd) -> Pin<Box<dyn Future<Output = Result<S, StartError>> + 'a>> + Send>;
+
+impl<S: Shell> Opening<S> {
     /// Opens it, and runs it when it may begin.
-    async fn run<S: Shell>(self, at_end: &AtEnd, begin: impl Future<Output = ()>) -> Result<(), StartError>
-    where
-        O: AsyncFnOnce(&AtEnd) -> Result<S, StartError>,
-    {
+    async fn run(self, at_end: &AtEnd, begin: impl Future<Output = ()>) -> Result<(), StartError> {
         let Self { open, opened, inbox } = self;
-        // On the heap and behind a pointer: else its frame, with room for an engine, would be that of every poll.
-        let opening: Pin<Box<dyn Future<Output = _>>> = Box::pin(open(at_end));
-        let shell = match opening.await {
+        let shell = match open(at_end).await {
             Ok(shell) => shell,
             Err(error) => {
                 let _ = opened.send(Err(error));
