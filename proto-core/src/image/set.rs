@@ -132,23 +132,17 @@ impl InputSet {
         if behind != 0 {
             return SysVar::from_ordinal(ordinal.saturating_add(behind.trailing_zeros() as usize));
         }
-        self.first_behind(ordinal)
-    }
-
-    /// The same, where the word of this place has none behind it.
-    #[inline(never)]
-    fn first_behind(&self, ordinal: usize) -> Option<SysVar> {
-        for (nth, word) in self.0.iter().enumerate() {
-            if *word != 0 && nth > ordinal / 32 {
-                return SysVar::from_ordinal(
-                    nth.wrapping_mul(32).wrapping_add(word.trailing_zeros() as usize),
-                );
-            }
+        // The words behind that one, or else all.
+        let [_, b, c] = self.0;
+        match ordinal / 32 {
+            0 if b | c != 0 => Self([0, b, c]).first(),
+            1 if c != 0 => Self([0, 0, c]).first(),
+            _ => self.first(),
         }
-        self.first()
     }
 
     /// The first variable in table order.
+    #[inline]
     pub(crate) fn first(&self) -> Option<SysVar> {
         let (nth, word) = match self.0 {
             [0, 0, word] => (64_usize, word),
