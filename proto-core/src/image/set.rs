@@ -297,6 +297,14 @@ mod tests {
                 assert_eq!(run.run_len(first), len.min(INPUT_COUNT.saturating_sub(from)));
             }
         }
+        // Two variables, of one word and of two.
+        for pair in [[0, 20], [0, 40], [5, 77], [31, 32], [33, 70], [63, 64], [65, 88]] {
+            let two: InputSet = pair.into_iter().filter_map(SysVar::from_ordinal).collect();
+            for from in 0..COUNT {
+                let next = pair.into_iter().find(|&ordinal| ordinal >= from).unwrap_or(pair[0]);
+                assert_eq!(two.first_from(from), SysVar::from_ordinal(next), "{pair:?} from {from}");
+            }
+        }
         assert!(InputSet::EMPTY.is_empty() && InputSet::EMPTY.or(&some).and(&all) == some);
     }
 }
