@@ -33,6 +33,14 @@ def count(program, image):
     return {name: (int(mean), int(most)) for mean, most, name in lines}
 
 
+def make_image(host_sim, folder):
+    """The configuration image of the cell whose passes are counted."""
+    image = pathlib.Path(folder) / "counts.img"
+    source = ROOT / "firmware/examples/counts.toml"
+    subprocess.run([host_sim, "image", source, "-o", image], check=True, stdout=subprocess.DEVNULL)
+    return image
+
+
 def compiler(program):
     """The compiler's version, as noted in the program."""
     found = re.search(rb"\0rustc version ([^\0]+)", b"\0" + pathlib.Path(program).read_bytes())
@@ -55,9 +63,7 @@ def main():
     options = parser.parse_args()
 
     with tempfile.TemporaryDirectory() as folder:
-        image = pathlib.Path(folder) / "counts.img"
-        source = ROOT / "firmware/examples/counts.toml"
-        subprocess.run([options.host_sim, "image", source, "-o", image], check=True, stdout=subprocess.DEVNULL)
+        image = make_image(options.host_sim, folder)
         found = count(options.program, image)
         if found != count(options.program, image):
             sys.exit("two runs counted differently")

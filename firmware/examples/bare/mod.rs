@@ -31,6 +31,13 @@ pub(crate) fn with_path<T>(nth: usize, then: impl FnOnce(&CStr) -> T) -> T {
     }
 }
 
+/// Whether there is an `nth` semihosting argument, and this is true of it.
+#[allow(dead_code, reason = "not every program has one that may be left out")]
+pub(crate) fn is_argument(nth: usize, is_true: impl FnOnce(&str) -> bool) -> bool {
+    let Ok(args) = env::args::<1024>() else { fail("arguments", &"too long") };
+    (&args).nth(nth).and_then(Result::ok).is_some_and(is_true)
+}
+
 /// Reads the file that the `nth` argument names.
 #[allow(dead_code, reason = "not every program reads one")]
 pub(crate) fn read_file(nth: usize, room: &'static mut [u8]) -> &'static [u8] {

@@ -20,7 +20,7 @@ use crate::config::{Name, Span};
 use crate::recipe::Deframer;
 use crate::recipe::StreamLayout;
 use crate::recipe::model::Mode;
-use crate::recipe::{CanLayout, CanReject};
+use crate::recipe::{CanLayout, CanReject, Found};
 use crate::time::{Duration, Instant};
 use crate::wire::can::{CanFrame, CanId};
 
@@ -224,10 +224,10 @@ impl FieldPort {
         keep(&mut self.last_rejection, Rejection::NoInput, None, bytes, now);
     }
 
-    /// A frame from the bus.
+    /// A frame from the bus, and what [`Self::find_can`] has found.
     pub(super) fn can<const PORTS: usize, const TAP: usize>(
         &mut self,
-        frame: &CanFrame,
+        (frame, found): (&CanFrame, Found),
         bindings: &[InputBind],
         store: &mut Store<PORTS>,
         commands: Option<&mut CommandLink>,
@@ -235,7 +235,7 @@ impl FieldPort {
     ) -> Accepted {
         let now = store.now;
         let mut accepted = Accepted::default();
-        let verdict = self.take_can(frame, bindings, store, commands, &mut accepted);
+        let verdict = self.take_can((frame, found), bindings, store, commands, &mut accepted);
         tap.record(|| came(self.id, now, verdict, Some(frame.id()), [frame.data(), &[], &[]]));
         if let Err(why) = verdict
             && self.is_news(why, now)
@@ -258,15 +258,21 @@ impl FieldPort {
         why != Rejection::ForeignId || self.last_rejection.as_ref().is_none_or(may_be_meant)
     }
 
-    /// Counts a frame that is for another node of the bus. `false` if it may be ours, or is worth keeping; then it was
-    /// not counted.
+    /// The recipe's frame with the id of this one; `None` if the port has no CAN recipe, or one without input.
+    #[inline(always)]
+    pub(super) fn find_can(&self, frame: &CanFrame) -> Option<Found> {
+        let Codec::Can { input: Some(layout), .. } = &self.codec else { return None };
+        Some(layout.find(frame))
+    }
+
+    /// Counts a frame of an id that the recipe does not have, which is for another node of the bus. `false` if it is
+    /// worth keeping; then it was not counted.
     #[inline(always)]
     pub(super) fn passes_by(&mut self, frame: &CanFrame, now: Instant) -> bool {
-        let Codec::Can { input: Some(layout), .. } = &self.codec else { return false };
-        if frame.is_remote() || layout.has_id_of(frame) || self.is_news(Rejection::ForeignId, now) {
+        if frame.is_remote() || self.is_news(Rejection::ForeignId, now) {
             return false;
         }
-        add(&mut self.counters.bytes_in, frame.data().len());
+        add(&mut self.counters.bytes_in, frame.len());
         bump(&mut self.counters.rejected_id);
         true
     }
@@ -274,14 +280,14 @@ impl FieldPort {
     #[inline(always)]
     fn take_can<const PORTS: usize>(
         &mut self,
-        frame: &CanFrame,
+        (frame, found): (&CanFrame, Found),
         bindings: &[InputBind],
         store: &mut Store<PORTS>,
         commands: Option<&mut CommandLink>,
         accepted: &mut Accepted,
     ) -> Result<(), Rejection> {
         let now = store.now;
-        add(&mut self.counters.bytes_in, frame.data().len());
+        add(&mut self.counters.bytes_in, frame.len());
         let usable = self.is_usable();
         let Codec::Can { input, .. } = &self.codec else {
             return self.device_can(frame, bindings, store, commands, accepted);
@@ -290,7 +296,7 @@ impl FieldPort {
             bump(&mut self.counters.rejected_no_input);
             return Err(Rejection::NoInput);
         };
-        let index = layout.accept_frame(frame);
+        let index = layout.accept_found(frame, found);
         let (Ok(index), Some(frame_layout)) = (index, index.ok().and_then(|nth| layout.frame(nth))) else {
             let (counter, why) = match index {
                 Err(CanReject::Remote { .. }) => (&mut self.counters.rejected_remote, Rejection::Remote),

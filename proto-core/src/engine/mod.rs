@@ -96,6 +96,7 @@ use user::Bindings;
 
 use crate::config::{MAX_EXCHANGES, MAX_SAFE_VALUES};
 use crate::link::LinkAction;
+use crate::recipe::Found;
 use crate::recipe::model::MAX_STREAM_FRAME;
 use crate::time::Instant;
 use crate::wire::can::CanFrame;
@@ -193,8 +194,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     ///
     /// What stops the robot comes first, then what brings field values to the controller, then what
     /// keeps links up, then what goes to the field.
-    // In a driver's loop, the addresses of all that it may need would be worked out before each pass.
-    #[inline(never)]
+    // In a driver's loop, the addresses of all that it may need would be worked out before each pass. A board has a
+    // function of its own around this one (firmware/engine): one call is enough there.
+    #[cfg_attr(not(target_os = "none"), inline(never))]
     pub fn poll_output<'b>(&mut self, now: Instant, buf: &'b mut [u8; OUTPUT_BUFFER]) -> Output<'b> {
         if now < self.clock.calm_until {
             debug_assert!(self.clock.is_quiet(now) && !self.clock.is_late);
@@ -360,24 +362,26 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     }
 
     #[inline(never)]
-    fn handle_frame(&mut self, now: Instant, input: &Input<'_>) -> Handled {
+    fn handle_frame(&mut self, found: Found, now: Instant, input: &Input<'_>) -> Handled {
         let Input::PortCan { port: id, ref frame } = *input else { return Handled::Poll };
-        let was_asleep = self.clock.is_asleep(now);
+        // A frame is looked up when the engine is calm.
+        let was_asleep =
+            if found == Found::NOT_LOOKED_UP { self.clock.is_asleep(now) } else { now < self.clock.beat_at };
         let now = self.begin(was_asleep, now);
         if !(self.exchanges.is_used() && self.talk_can(id, frame, now)) {
-            self.port_can(id, frame, now);
+            self.port_can(id, frame, found, now);
         }
         self.end(was_asleep)
     }
 
     #[inline(always)]
-    fn port_can(&mut self, id: PortId, frame: &CanFrame, now: Instant) {
+    fn port_can(&mut self, id: PortId, frame: &CanFrame, found: Found, now: Instant) {
         let (store, command) = (&mut self.store, self.links.command.first_mut());
         let Some(port) = find_port(&mut self.ports, id) else { return };
         if self.clock.is_deaf {
             return port.discard(frame.data(), Some(frame.id()), &mut self.tap, now);
         }
-        let accepted = port.can(frame, &self.bindings.inputs, store, command, &mut self.tap);
+        let accepted = port.can((frame, found), &self.bindings.inputs, store, command, &mut self.tap);
         if accepted.frames == 0 {
             // Most are for other nodes of the bus.
             return;

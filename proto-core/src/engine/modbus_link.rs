@@ -77,7 +77,7 @@ enum Turn {
 
 /// The same, with its request.
 enum Beside {
-    Bits(Option<(usize, Asked)>),
+    Bits(Option<usize>),
     Whole(InputSet),
 }
 
@@ -195,16 +195,18 @@ impl ModbusLink {
         if pending.is_empty() {
             self.offered = Since::NONE;
         }
-        let asked = match poll {
+        match poll {
             Some(block) if pending.is_empty() || self.first == First::Poll => self.poll(block, out, now),
-            None if pending.is_empty() => return None,
+            None if pending.is_empty() => None,
             _ => self.write(store, out),
-        };
-        let (len, asked) = asked?;
-        self.first = match asked {
-            Asked::Write { .. } => First::Poll,
-            Asked::Poll { .. } => First::Write,
-        };
+        }
+    }
+
+    /// A request of so many bytes is handed over. Returns their number.
+    // By whoever writes it: a result with the sets in it would be copied from place to place.
+    #[inline]
+    fn asked(&mut self, len: usize, asked: Asked, next: First, now: Instant) -> Option<usize> {
+        self.first = next;
         bump(&mut self.counters.sent);
         let until = now + ANSWER_TIMEOUT;
         self.in_flight = Some(InFlight { asked, until });
@@ -302,7 +304,7 @@ impl ModbusLink {
         due.min_by_key(|(_, block)| block.grid.next()).map(|(nth, _)| nth)
     }
 
-    fn poll(&mut self, nth: usize, out: &mut [u8], now: Instant) -> Option<(usize, Asked)> {
+    fn poll(&mut self, nth: usize, out: &mut [u8], now: Instant) -> Option<usize> {
         let block = self.blocks.get_mut(nth)?;
         // Polls missed while a transaction was in flight are not made up for.
         block.grid.due(now);
@@ -312,16 +314,12 @@ impl ModbusLink {
             Kind::Registers => Request::ReadHolding { address, count },
         };
         let len = self.client.start(request, out).ok()?;
-        Some((len, Asked::Poll { block: nth }))
+        self.asked(len, Asked::Poll { block: nth }, First::Write, now)
     }
 
     /// One request for the first pending variable and those that follow it without a gap.
     #[inline(never)]
-    fn write<const PORTS: usize>(
-        &mut self,
-        store: &mut Store<PORTS>,
-        out: &mut [u8],
-    ) -> Option<(usize, Asked)> {
+    fn write<const PORTS: usize>(&mut self, store: &mut Store<PORTS>, out: &mut [u8]) -> Option<usize> {
         // Once more: a set that is handed over does not stay in registers.
         let mut pending = store.outbox.dirty().and(&self.writes);
         if store.bits.is_used {
@@ -333,7 +331,7 @@ impl ModbusLink {
         let first = pending.first_from(self.cursor)?;
         let sent = self.write_whole(first, &pending, store, out);
         if store.bits.is_used {
-            self.offer_the_rest(sent.as_ref(), store);
+            self.offer_the_rest(store);
         }
         sent
     }
@@ -357,9 +355,9 @@ impl ModbusLink {
     /// What waits beside a request counts as offered with it.
     #[cold]
     #[inline(never)]
-    fn offer_the_rest<const PORTS: usize>(&mut self, sent: Option<&(usize, Asked)>, store: &Store<PORTS>) {
+    fn offer_the_rest<const PORTS: usize>(&mut self, store: &Store<PORTS>) {
         if !store.outbox.dirty().and(&self.writes).is_empty()
-            && let Some(&(_, Asked::Write { born, .. })) = sent
+            && let Some(InFlight { asked: Asked::Write { born, .. }, .. }) = self.in_flight
         {
             self.offered = born;
         }
@@ -373,8 +371,9 @@ impl ModbusLink {
         pending: &InputSet,
         store: &mut Store<PORTS>,
         out: &mut [u8],
-    ) -> Option<(usize, Asked)> {
-        let (address, kind, each, most) = match first.modbus()? {
+    ) -> Option<usize> {
+        let place = first.place();
+        let (address, kind, each, most) = match place.modbus? {
             ModbusPlace::Coils { first, count: 0 | 1 } => (first, Kind::Coils, 1, MAX_WRITE_COILS),
             ModbusPlace::Coils { first, count } => {
                 (first, Kind::Coils, count, MAX_WRITE_COILS.checked_div(count).unwrap_or(1))
@@ -383,23 +382,26 @@ impl ModbusLink {
             ModbusPlace::Scaled { .. } => return None,
         };
         // Variables of one row of the table follow each other in the map as they do in the image.
-        let most = usize::from(most).min(first.left_in_row());
+        let most = usize::from(most).min(place.left_in_row);
         let count = pending.run_len(first).min(most);
-        let items = each.saturating_mul(count as u16);
         let vars = InputSet::run(first, count);
         self.cursor = first.ordinal().saturating_add(count);
-        let mut bits = [0; BIT_INPUT_COUNT];
-        if kind == Kind::Coils {
-            for (place, var) in bits.iter_mut().zip(vars.iter()) {
-                *place = store.outbox.bit_value(var);
-            }
-        }
         // Registers are packed after the longest request, where nothing has to be cleared for them.
         let (out, room) = out.split_at_mut_checked(MAX_ADU)?;
+        let mut bits;
         let request = match kind {
-            Kind::Coils => Request::WriteCoils { address, coils: Coils::new(bits.get(..count)?, items)? },
+            Kind::Coils => {
+                bits = [0; BIT_INPUT_COUNT];
+                for (place, var) in bits.iter_mut().zip(vars.iter()) {
+                    *place = store.outbox.bit_value(var);
+                }
+                Request::WriteCoils {
+                    address,
+                    coils: Coils::new(bits.get(..count)?, each.saturating_mul(count as u16))?,
+                }
+            }
             Kind::Registers => {
-                let start = first.image_offset();
+                let start = place.image_offset;
                 let words = store.image.bytes().get(start..start.saturating_add(count.saturating_mul(2)))?;
                 let registers = Registers::from_little_endian(words, room)?;
                 Request::WriteRegisters { address, registers }
@@ -409,11 +411,15 @@ impl ModbusLink {
         let born = self.offered;
         born.record(store.now, &mut store.latency.handed_over);
         let safe = store.safe.and(&vars);
-        store.taken(&vars);
+        match kind {
+            Kind::Coils => store.taken(&vars),
+            // Words do not queue.
+            Kind::Registers => store.outbox.taken(&vars),
+        }
         if pending.minus(&vars).is_empty() {
             self.offered = Since::NONE;
         }
-        Some((len, Asked::Write { safe, born }))
+        self.asked(len, Asked::Write { safe, born }, First::Poll, store.now)
     }
 
     /// Whose turn it is where bits have owners: the first variable at or behind the cursor, or the
@@ -447,7 +453,7 @@ impl ModbusLink {
         mask: u8,
         store: &mut Store<PORTS>,
         out: &mut [u8],
-    ) -> Option<(usize, Asked)> {
+    ) -> Option<usize> {
         let (first, _) = place_of(var)?;
         let (from, count) = (mask.trailing_zeros(), mask.count_ones());
         let packed = [store.bits.next_bits(var).checked_shr(from)?];
@@ -464,7 +470,7 @@ impl ModbusLink {
             self.offered = Since::NONE;
         }
         self.safe_bits = (safe != 0).then_some((var, safe));
-        Some((len, Asked::Write { safe: InputSet::EMPTY, born }))
+        self.asked(len, Asked::Write { safe: InputSet::EMPTY, born }, First::Poll, store.now)
     }
 }
 

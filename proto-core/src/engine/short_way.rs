@@ -8,6 +8,7 @@
 use super::Engine;
 use super::find_port;
 use super::io::{Handled, Input, LinkId, PortId};
+use crate::recipe::Found;
 use crate::time::Instant;
 
 impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize, const EXCHANGES: usize>
@@ -54,12 +55,22 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             && self.clock.is_calm(now)
             && !self.tap.is_listening()
             && let Some(port) = find_port(&mut self.ports, port)
-            && port.passes_by(frame, now)
+            && let Some(found) = port.find_can(frame)
         {
-            self.clock.now = now;
-            return Handled::Asleep;
+            if found == Found::NONE && port.passes_by(frame, now) {
+                self.clock.now = now;
+                return Handled::Asleep;
+            }
+            return self.handle_frame(found, now, input);
         }
-        self.handle_frame(now, input)
+        self.handle_unseen(now, input)
+    }
+
+    // On its own, so that a frame that was looked up does not pay for having been.
+    #[cold]
+    #[inline(never)]
+    fn handle_unseen(&mut self, now: Instant, input: &Input<'_>) -> Handled {
+        self.handle_frame(Found::NOT_LOOKED_UP, now, input)
     }
 
     /// Most pieces of the state stream do not complete a packet.

@@ -104,6 +104,9 @@ pub(super) struct Store<const PORTS: usize> {
     pub era: u32,
     /// Variables whose link is up; none of whose bits each has an owner.
     pub reachable: InputSet,
+    /// Variables that are live, not safe and reachable, as a frame left them: the next one changes none of that. Some
+    /// may be missing.
+    settled: InputSet,
     /// Variables of whose bits each has its owner.
     pub bits: Bits,
     /// Variables that tell the robot the health of ports.
@@ -141,6 +144,7 @@ impl<const PORTS: usize> Store<PORTS> {
             heard_at: None,
             era: 0,
             reachable: InputSet::EMPTY,
+            settled: InputSet::EMPTY,
             bits: Bits::new(),
             health: InputSet::EMPTY,
             health_at: Stamp::NEVER,
@@ -162,18 +166,29 @@ impl<const PORTS: usize> Store<PORTS> {
         self.next_expiry.or_earlier(too_old_at(now, frame.timeout));
         let (set, port) = (frame.set, usize::from(frame.port));
         self.image.stamp(GroupId(nth as u8), now);
-        self.live = self.live.or(&set);
-        if !self.safe.and(&set).is_empty() {
-            // Waiting safe values begin to age now, and may have expired already.
-            self.next_expiry = Stamp::at(now);
-            self.safe = self.safe.minus(&set);
-            self.unconfirmed = self.unconfirmed.minus(&set);
-        }
-        if set.and(&self.reachable) != set {
+        debug_assert!(self.settled.minus(&self.live.and(&self.reachable).minus(&self.safe)).is_empty());
+        if !set.minus(&self.settled).is_empty() && !self.settle(&set) {
             return self.accepted_in_part(nth, counters);
         }
         self.offer(port, &set, counters);
         set
+    }
+
+    /// These variables have a value of their owner again. Whether the links of all are up.
+    #[inline(always)]
+    fn settle(&mut self, set: &InputSet) -> bool {
+        self.live = self.live.or(set);
+        if !self.safe.and(set).is_empty() {
+            // Waiting safe values begin to age now, and may have expired already.
+            self.next_expiry = Stamp::at(self.now);
+            self.safe = self.safe.minus(set);
+            self.unconfirmed = self.unconfirmed.minus(set);
+        }
+        let are_reachable = set.minus(&self.reachable).is_empty();
+        if are_reachable {
+            self.settled = self.settled.or(set);
+        }
+        are_reachable
     }
 
     /// A frame came and says nothing: its values stay as they are, and it is not overdue.
@@ -282,6 +297,7 @@ impl<const PORTS: usize> Store<PORTS> {
             // Its device only said that there is nothing to say: nothing was written yet.
             return Some(Overdue::Frame(frame, 0));
         }
+        self.settled = self.settled.minus(&frame.set);
         let queue = self.edges.get_mut(usize::from(frame.port))?;
         let mut dropped = 0_usize;
         for var in frame.set.minus(&self.bits.bytes).iter() {
@@ -436,6 +452,7 @@ impl<const PORTS: usize> Store<PORTS> {
     /// A link was lost: waiting values are dropped, except safe values.
     pub(super) fn link_lost(&mut self, vars: &InputSet) {
         self.reachable = self.reachable.minus(vars);
+        self.settled = self.settled.minus(vars);
         for frame in &self.frames {
             let port = usize::from(frame.port);
             let (Some(queue), Some(count)) = (self.edges.get_mut(port), self.lost.get_mut(port)) else {

@@ -132,23 +132,17 @@ impl InputSet {
         if behind != 0 {
             return SysVar::from_ordinal(ordinal.saturating_add(behind.trailing_zeros() as usize));
         }
-        self.first_behind(ordinal)
-    }
-
-    /// The same, where the word of this place has none behind it.
-    #[inline(never)]
-    fn first_behind(&self, ordinal: usize) -> Option<SysVar> {
-        for (nth, word) in self.0.iter().enumerate() {
-            if *word != 0 && nth > ordinal / 32 {
-                return SysVar::from_ordinal(
-                    nth.wrapping_mul(32).wrapping_add(word.trailing_zeros() as usize),
-                );
-            }
+        // The words behind that one, or else all.
+        let [_, b, c] = self.0;
+        match ordinal / 32 {
+            0 if b | c != 0 => Self([0, b, c]).first(),
+            1 if c != 0 => Self([0, 0, c]).first(),
+            _ => self.first(),
         }
-        self.first()
     }
 
     /// The first variable in table order.
+    #[inline]
     pub(crate) fn first(&self) -> Option<SysVar> {
         let (nth, word) = match self.0 {
             [0, 0, word] => (64_usize, word),
@@ -301,6 +295,14 @@ mod tests {
                 let run = InputSet::run(first, len);
                 assert!(run.iter().eq(all.iter().filter(|var| (from..from + len).contains(&var.ordinal()))));
                 assert_eq!(run.run_len(first), len.min(INPUT_COUNT.saturating_sub(from)));
+            }
+        }
+        // Two variables, of one word and of two.
+        for pair in [[0, 20], [0, 40], [5, 77], [31, 32], [33, 70], [63, 64], [65, 88]] {
+            let two: InputSet = pair.into_iter().filter_map(SysVar::from_ordinal).collect();
+            for from in 0..COUNT {
+                let next = pair.into_iter().find(|&ordinal| ordinal >= from).unwrap_or(pair[0]);
+                assert_eq!(two.first_from(from), SysVar::from_ordinal(next), "{pair:?} from {from}");
             }
         }
         assert!(InputSet::EMPTY.is_empty() && InputSet::EMPTY.or(&some).and(&all) == some);

@@ -67,6 +67,17 @@ pub enum ModbusPlace {
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub struct SysVar(u8);
 
+/// Where a variable is.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Place {
+    /// In the Modbus map.
+    pub modbus: Option<ModbusPlace>,
+    /// Number of variables from it to the last of its row.
+    pub left_in_row: usize,
+    /// In the process image.
+    pub image_offset: usize,
+}
+
 /// Number of system variables.
 pub const COUNT: usize = table::COUNT;
 /// Number of inputs; they have the lowest ordinals.
@@ -164,24 +175,31 @@ impl SysVar {
     /// Number of variables from this one to the last of its row.
     #[inline]
     pub(crate) fn left_in_row(self) -> usize {
-        self.span().len().saturating_sub(usize::from(self.place_in_span()))
+        self.place().left_in_row
     }
 
     /// The variable's place in the Modbus map; inputs can be written and read back there.
     #[inline]
     pub fn modbus(self) -> Option<ModbusPlace> {
-        let nth = self.place_in_span();
-        self.span().modbus.map(|place| match place {
+        self.place().modbus
+    }
+
+    /// Its places, looked up once.
+    #[inline]
+    pub(crate) fn place(self) -> Place {
+        let (span, nth, image_offset) = table::place_of(self.ordinal());
+        // No address is near the end of 16 bits; a test looks at all of them.
+        let modbus = span.modbus.map(|place| match place {
             ModbusPlace::Coils { first, count } => {
-                ModbusPlace::Coils { first: first.saturating_add(nth.saturating_mul(count)), count }
+                ModbusPlace::Coils { first: first.wrapping_add(nth.wrapping_mul(count)), count }
             }
-            ModbusPlace::Register { address } => {
-                ModbusPlace::Register { address: address.saturating_add(nth) }
-            }
+            ModbusPlace::Register { address } => ModbusPlace::Register { address: address.wrapping_add(nth) },
             ModbusPlace::Scaled { address, per_unit } => {
-                ModbusPlace::Scaled { address: address.saturating_add(nth), per_unit }
+                ModbusPlace::Scaled { address: address.wrapping_add(nth), per_unit }
             }
-        })
+        });
+        let left_in_row = span.len().wrapping_sub(nth.into());
+        Place { modbus, left_in_row, image_offset }
     }
 
     #[inline]

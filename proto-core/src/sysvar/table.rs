@@ -63,7 +63,7 @@ impl Span {
 
     /// Number of variables in the row.
     pub const fn len(&self) -> usize {
-        (self.last - self.first + 1) as usize
+        (self.last as usize).wrapping_sub(self.first as usize).wrapping_add(1)
     }
 
     /// No row is empty.
@@ -169,6 +169,13 @@ static PLACES: [(u8, u8, u16); COUNT] = {
 pub(super) fn span_of(ordinal: usize) -> &'static Span {
     let row = PLACES.get(ordinal).map_or(0, |place| usize::from(place.0));
     SPANS.get(row).unwrap_or(&SPANS[0])
+}
+
+/// The row, the place in it, and the offset in the image.
+#[inline]
+pub(super) fn place_of(ordinal: usize) -> (&'static Span, u16, usize) {
+    let (row, nth, offset) = PLACES.get(ordinal).copied().unwrap_or_default();
+    (SPANS.get(usize::from(row)).unwrap_or(&SPANS[0]), nth.into(), offset.into())
 }
 
 #[inline]

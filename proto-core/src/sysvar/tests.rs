@@ -48,6 +48,30 @@ fn places_are_those_of_the_specification() {
 }
 
 #[test]
+fn places_of_a_row_follow_each_other() {
+    for span in &SPANS {
+        let row: std::vec::Vec<_> = SysVar::all().filter(|v| core::ptr::eq(v.span(), span)).collect();
+        assert_eq!(row.len(), span.len());
+        for (nth, v) in row.iter().enumerate() {
+            let place = v.place();
+            assert_eq!((place.left_in_row, place.image_offset), (row.len() - nth, v.image_offset()), "{v}");
+            let further =
+                |first: u16, each: u16| first.checked_add(each.checked_mul(nth as u16).unwrap()).unwrap();
+            let modbus = span.modbus.map(|first| match first {
+                ModbusPlace::Coils { first, count } => {
+                    ModbusPlace::Coils { first: further(first, count), count }
+                }
+                ModbusPlace::Register { address } => ModbusPlace::Register { address: further(address, 1) },
+                ModbusPlace::Scaled { address, per_unit } => {
+                    ModbusPlace::Scaled { address: further(address, 1), per_unit }
+                }
+            });
+            assert_eq!(place.modbus, modbus, "{v}");
+        }
+    }
+}
+
+#[test]
 fn every_name_means_the_variable_that_prints_it() {
     use std::string::ToString;
     let mut offset = 0;
