@@ -300,11 +300,13 @@ impl Recorder {
 impl Controller {
     /// Keeps events from now on, for [`Self::events_since`].
     pub fn record_events(&mut self) {
+        self.quiet.ends();
         self.record_newest_events(MAX_EVENTS);
     }
 
     /// The same, with another number of events that are kept: writes, and all others.
     pub fn record_newest_events(&mut self, max: usize) {
+        self.quiet.ends();
         (self.recorder.on, self.recorder.max) = (true, max.max(1));
     }
 
@@ -359,6 +361,7 @@ impl Controller {
 
     /// Tells of an operation that nobody gets an answer to, and that was refused.
     pub fn note_refused(&mut self, now: Instant, operation: &Operation, error: &str) {
+        self.quiet.ends();
         self.happened(now, || Happened::Refused {
             operation: serde_json::to_value(operation).unwrap_or(Value::Null),
             error: error.to_owned(),

@@ -158,55 +158,65 @@ impl Faults {
 impl Controller {
     /// Drops all answers of the server from now on; requests are still carried out.
     pub fn mute(&mut self, link: Link) {
+        self.quiet.ends();
         self.faults.muted[link as usize] = true;
     }
 
     /// Ends [`Self::mute`].
     pub fn unmute(&mut self, link: Link) {
+        self.quiet.ends();
         self.faults.muted[link as usize] = false;
     }
 
     /// Closes every new connection of the server at once from now on.
     pub fn refuse(&mut self, link: Link) {
+        self.quiet.ends();
         self.faults.refused[link as usize] = true;
     }
 
     /// Ends [`Self::refuse`].
     pub fn accept(&mut self, link: Link) {
+        self.quiet.ends();
         self.faults.refused[link as usize] = false;
     }
 
     /// Sets how many clients port 2000 accepts. Connected clients stay until the next one connects.
     pub fn command_clients(&mut self, clients: CommandClients) {
+        self.quiet.ends();
         self.faults.command_clients = clients;
     }
 
     /// Closes all connections of the server.
     pub fn disconnect(&mut self, link: Link) {
+        self.quiet.ends();
         self.close_clients(link);
     }
 
     /// Delays every answer of the server from now on. Without effect on the state stream, which has no
     /// answers.
     pub fn delay_answers(&mut self, link: Link, delay: Duration) {
+        self.quiet.ends();
         self.faults.delay[link as usize] = delay;
     }
 
     /// Makes the transitions of `poweron`, `poweroff`, `enable`, `disable`, `stop` and `pause` longer by `by`
     /// from now on.
     pub fn delay_transitions(&mut self, by: Duration) {
+        self.quiet.ends();
         self.faults.transitions = by;
         self.machine.delay_transitions(by);
     }
 
     /// Answers every Modbus request with this exception, without carrying it out; `None` ends it.
     pub fn answer_modbus_with(&mut self, exception: Option<Exception>) {
+        self.quiet.ends();
         self.faults.exception = exception;
     }
 
     /// Sends only the first `len` bytes of the next state packet, then closes every connection of
     /// port 2001.
     pub fn cut_next_state_packet(&mut self, len: usize) {
+        self.quiet.ends();
         self.faults.state_cut = Some(len);
     }
 
@@ -219,6 +229,7 @@ impl Controller {
     /// # Errors
     /// [`NoSuchFloat`] if there is no such item; nothing changed.
     pub fn spoil(&mut self, name: &str, instead: f32) -> Result<(), NoSuchFloat> {
+        self.quiet.ends();
         self.faults.spoiled.spoil(name, instead)
     }
 
@@ -227,11 +238,13 @@ impl Controller {
     /// # Errors
     /// [`NoSuchFloat`] if there is no such item.
     pub fn heal(&mut self, name: &str) -> Result<(), NoSuchFloat> {
+        self.quiet.ends();
         self.faults.spoiled.heal(name)
     }
 
     /// Drops everything that the port sends from now on. `port` is its index in the configuration.
     pub fn mute_port(&mut self, port: usize) {
+        self.quiet.ends();
         if !self.faults.mutes_port(port) {
             self.faults.muted_ports.push(port);
         }
@@ -239,11 +252,13 @@ impl Controller {
 
     /// Ends [`Self::mute_port`].
     pub fn unmute_port(&mut self, port: usize) {
+        self.quiet.ends();
         self.faults.muted_ports.retain(|&muted| muted != port);
     }
 
     /// Closes the connection of a TCP client port. Without effect on other ports.
     pub fn close_port(&mut self, port: usize) {
+        self.quiet.ends();
         if let Some(own) = self.ports.get_mut(port).filter(|own| own.is_tcp_client() && own.is_up()) {
             own.went_down();
             self.outputs.push_back(ControllerOutput::PortClose { port });
@@ -254,6 +269,7 @@ impl Controller {
     /// initial values and otherwise 0, and the robot boots to power off (docs/simulated-controller.md section
     /// 1). Faults stay.
     pub fn restart(&mut self, now: Instant) {
+        self.quiet.ends();
         self.close_all_clients();
         if let Some(running) = self.running.take() {
             self.runs.ends_by("restart");
@@ -289,6 +305,7 @@ impl Controller {
     /// As [`Self::restart`], but registers and outputs are 0 whatever their initial values are. Only wired
     /// inputs and the arm have their initial values.
     pub fn restart_cleared(&mut self, now: Instant) {
+        self.quiet.ends();
         self.restart(now);
         self.registers.clear();
     }
@@ -304,6 +321,7 @@ impl Controller {
     /// Switches to another dialect, as a software update would, and restarts the controller. Without effect
     /// if there is no such dialect.
     pub fn replace_software(&mut self, now: Instant, dialect: &str) {
+        self.quiet.ends();
         if let Some(dialect) = Dialect::named(dialect) {
             self.dialect = dialect;
             self.restart(now);
@@ -319,6 +337,7 @@ impl Controller {
     /// [`SetError::Value`] if the value is out of range, [`SetError::ShowsState`] if the output shows a state;
     /// nothing changed.
     pub fn force(&mut self, target: InitialTarget, value: f64) -> Result<(), SetError> {
+        self.quiet.ends();
         self.registers.force(target, value)?;
         // The tool's frame decides where the TCP is.
         self.arm_shown = None;
@@ -336,6 +355,7 @@ impl Controller {
         port: usize,
         recipe: Option<usize>,
     ) -> Result<(), RecipeError> {
+        self.quiet.ends();
         let epoch = self.port_epoch(port, now);
         let (Some(own), Some(place)) = (self.ports.get_mut(port), self.config.ports.get_mut(port)) else {
             return Ok(());
@@ -350,11 +370,13 @@ impl Controller {
 
     /// Changes the operation mode, as the key switch does.
     pub fn set_mode(&mut self, mode: OperationMode) {
+        self.quiet.ends();
         self.machine.set_mode(mode);
     }
 
     /// Presses the emergency stop: the program ends, and the robot is disabled.
     pub fn emergency_stop(&mut self, now: Instant) {
+        self.quiet.ends();
         self.runs.ends_by("emergency_stop");
         let effect = self.machine.emergency_stop(now);
         self.apply(now, effect);
@@ -362,6 +384,7 @@ impl Controller {
 
     /// Causes a protective stop, as an open door does: the program ends, and the robot is disabled.
     pub fn protective_stop(&mut self, now: Instant) {
+        self.quiet.ends();
         self.runs.ends_by("protective_stop");
         let effect = self.machine.protective_stop(now);
         self.apply(now, effect);
@@ -369,17 +392,20 @@ impl Controller {
 
     /// Makes the arm collide on this axis (proto-core/docs/wire/state.md section 2): the program is paused.
     pub fn collide(&mut self, now: Instant, axis: u8) {
+        self.quiet.ends();
         let effect = self.machine.collide(now, axis);
         self.apply(now, effect);
     }
 
     /// Removes and acknowledges the cause of a stop: the safety state recovers.
     pub fn clear_stop(&mut self, now: Instant) {
+        self.quiet.ends();
         self.machine.clear_stop(now);
     }
 
     /// Lets the safety controller stop working: the program ends, and the robot is disabled.
     pub fn hold_safety(&mut self, now: Instant, hold: SafetyHold) {
+        self.quiet.ends();
         self.runs.ends_by("safety");
         let effect = self.machine.hold_safety(now, hold);
         self.apply(now, effect);
@@ -387,17 +413,20 @@ impl Controller {
 
     /// Ends [`Self::hold_safety`].
     pub fn release_safety(&mut self) {
+        self.quiet.ends();
         self.machine.release_safety();
     }
 
     /// Reduces the speed, as a person in a safety zone does.
     pub fn enter_reduced(&mut self, now: Instant) {
+        self.quiet.ends();
         self.machine.set_reduced(true);
         self.speed_changed(now);
     }
 
     /// Ends the reduced speed.
     pub fn leave_reduced(&mut self, now: Instant) {
+        self.quiet.ends();
         self.machine.set_reduced(false);
         self.speed_changed(now);
     }

@@ -59,6 +59,7 @@ impl Controller {
     /// # Errors
     /// [`ItemError`] if there is no such item, or it cannot have the value; nothing changed.
     pub fn force_item(&mut self, name: &str, value: f64) -> Result<(), ItemError> {
+        self.quiet.ends();
         let wrong = |reason: String| ItemError { name: name.to_owned(), reason };
         match name.parse::<InitialTarget>() {
             Ok(target) => self.force(target, value).map_err(|error| {
@@ -83,6 +84,7 @@ impl Controller {
     /// # Errors
     /// [`ItemError`] if the packet has no such item.
     pub fn release_item(&mut self, name: &str) -> Result<(), ItemError> {
+        self.quiet.ends();
         let item = PacketItem::named(name).ok_or_else(|| ItemError {
             name: name.to_owned(),
             reason: "the state packet has no such item".to_owned(),

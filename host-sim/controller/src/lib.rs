@@ -28,6 +28,7 @@ pub mod motion;
 pub mod operations;
 mod ports;
 pub mod program;
+mod quiet;
 mod random;
 pub mod registers;
 mod run;
@@ -60,14 +61,15 @@ use motion::Arm;
 use ports::Port;
 pub use ports::{MAX_INBOX, MAX_UDP_CLIENTS, PortCounters, RecipeError};
 use program::{Script, Variables};
+use quiet::Quiet;
 use random::Random;
 use recipe_config::{Power, SimConfig};
 use registers::Registers;
 use run::Running;
 use runs::Runs;
 pub use runs::{Outcome, Run};
-use server::Server;
 pub use server::{MAX_COMMAND_CONNECTIONS, MAX_MODBUS_CONNECTIONS, MAX_ORDERS, MAX_STATE_CONNECTIONS};
+use server::{Requested, Server};
 
 pub use spoiled::NoSuchFloat;
 pub use test_controller::{Out, TestController};
@@ -100,6 +102,7 @@ pub struct Controller {
     runs: Runs,
     counters: Counters,
     outputs: VecDeque<ControllerOutput>,
+    quiet: Quiet,
     /// After `shutdown()` on port 2000.
     is_shut_down: bool,
 }
@@ -151,6 +154,7 @@ impl Controller {
             runs: Runs::default(),
             counters: Counters::default(),
             outputs: VecDeque::new(),
+            quiet: Quiet::default(),
             is_shut_down: false,
         })
     }
@@ -158,6 +162,7 @@ impl Controller {
     /// Lets a seed choose the phases of the state stream and of the ports' cycles, and what random faults
     /// send. To be called before anything else.
     pub fn seed(&mut self, seed: u64) {
+        self.quiet.ends();
         let mut random = Random::seeded(seed);
         self.faults.seed(random.next());
         self.state_phase = Duration::from_micros(random.below(STATE_PERIOD.as_micros()));
@@ -177,6 +182,17 @@ impl Controller {
         if self.is_shut_down {
             return;
         }
+        if let ControllerInput::ModbusBytes { conn, bytes } = input
+            && self.quiet.lasts(now)
+        {
+            // Time has brought nothing, and requests that only read change nothing that it could bring.
+            let (before, effect) = self.modbus_bytes(now, conn, bytes);
+            if effect == Requested::Changes {
+                self.quiet.ends();
+            }
+            return self.note_writes(now, before, "modbus");
+        }
+        self.quiet.ends();
         self.advance(now);
         let mut before = match input {
             // Most requests only read: it is copied by the first that does not.
@@ -191,7 +207,7 @@ impl Controller {
             ControllerInput::StateClosed { conn } => self.closed(now, Link::State, conn),
             ControllerInput::ModbusClosed { conn } => self.closed(now, Link::Modbus, conn),
             ControllerInput::CommandBytes { conn, bytes } => self.command_bytes(now, conn, bytes),
-            ControllerInput::ModbusBytes { conn, bytes } => before = self.modbus_bytes(now, conn, bytes),
+            ControllerInput::ModbusBytes { conn, bytes } => before = self.modbus_bytes(now, conn, bytes).0,
             ControllerInput::Udp2011 { peer, bytes } => self.udp_bytes(now, peer, bytes),
             ControllerInput::Udp2011Unreachable { peer } => {
                 for port in &mut self.ports {
@@ -256,13 +272,17 @@ impl Controller {
         if let Some(output) = self.outputs.pop_front() {
             return output;
         }
-        if !self.is_shut_down {
-            self.advance(now);
+        if self.is_shut_down {
+            return ControllerOutput::Sleep { until: Instant::NEVER };
         }
+        if let Some(until) = self.quiet.deadline(now) {
+            return ControllerOutput::Sleep { until };
+        }
+        self.advance(now);
         match self.outputs.pop_front() {
             Some(output) => output,
             None if self.is_shut_down => ControllerOutput::Sleep { until: Instant::NEVER },
-            None => ControllerOutput::Sleep { until: self.deadline() },
+            None => ControllerOutput::Sleep { until: self.rest() },
         }
     }
 

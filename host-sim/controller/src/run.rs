@@ -204,21 +204,21 @@ impl Controller {
             drives_on: machine.drives_on(),
         });
         self.show_states();
-        let stale = match self.arm_shown {
-            None => true,
-            Some(shown) => {
-                let rest = self.arm.rest();
-                let at_rest = rest.is_some_and(|rest| rest <= shown);
-                let just_stopped = rest.is_some_and(|rest| rest <= now);
-                !at_rest && (just_stopped || now >= shown + SERVO_CYCLE)
-            }
-        };
-        if stale {
+        if now >= self.next_arm_state() {
             let tool = self.registers.tool();
             let actual = self.arm.observe(now, &tool, self.registers.payload_kg());
             // The simulated servo drives follow without lag.
             self.registers.show_arm(actual, actual);
             self.arm_shown = Some(now);
+        }
+    }
+
+    /// When the registers show another state of the arm than now: in the next cycle of the drives, or at rest.
+    pub(super) fn next_arm_state(&self) -> Instant {
+        let Some(shown) = self.arm_shown else { return Instant::ZERO };
+        match self.arm.rest() {
+            Some(rest) if rest <= shown => Instant::NEVER,
+            rest => rest.unwrap_or(Instant::NEVER).min(shown + SERVO_CYCLE),
         }
     }
 

@@ -63,7 +63,7 @@ pub struct TestController {
     pub(crate) now: Instant,
     links: BTreeMap<ConnId, Link>,
     /// Bytes that each client has received and [`Self::take`] has not returned.
-    received: BTreeMap<ConnId, Vec<u8>>,
+    pub(crate) received: BTreeMap<ConnId, Vec<u8>>,
     pub(crate) closed: Vec<ConnId>,
     /// Data sent by ports, with the time.
     pub(crate) sent: Vec<(Instant, usize, Out)>,

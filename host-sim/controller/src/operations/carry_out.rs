@@ -18,6 +18,7 @@ impl Controller {
     /// # Errors
     /// [`Refused`]; nothing changed. `follow`, `advance` and `wait` are always refused: they are the caller's.
     pub fn operate(&mut self, now: Instant, operation: &Operation) -> Done {
+        self.quiet.ends();
         self.begin(now);
         if self.is_shut_down {
             return refused("the controller is shut down");

@@ -128,6 +128,15 @@ impl Registers {
     }
 }
 
+impl Registers {
+    /// Clients have read. What they read again and again is kept as they read it, until it changes.
+    pub(crate) fn were_read(&mut self) {
+        if self.shown.is_worth_keeping() {
+            self.shown.keep(MAP.words.map(|word| self.word(word).to_be_bytes()));
+        }
+    }
+}
+
 impl RegisterBank for Registers {
     fn read_coils(&self, address: u16, count: u16, packed: &mut [u8]) -> Result<(), Exception> {
         map::check_read(Space::Coils, address, count)?;
@@ -157,7 +166,16 @@ impl RegisterBank for Registers {
 
     fn read_holding(&self, address: u16, words: &mut [[u8; 2]]) -> Result<(), Exception> {
         let first = usize::from(address);
-        let map = MAP.words.get(first..first + words.len()).ok_or(Exception::IllegalDataAddress)?;
+        let run = first..first + words.len();
+        if let Some(shown) = self.shown.get() {
+            words.copy_from_slice(shown.get(run.clone()).ok_or(Exception::IllegalDataAddress)?);
+            debug_assert!(
+                run.zip(words).all(|(nth, shown)| *shown == self.word(MAP.words[nth]).to_be_bytes()),
+                "a register has changed unseen"
+            );
+            return Ok(());
+        }
+        let map = MAP.words.get(run).ok_or(Exception::IllegalDataAddress)?;
         for (target, &word) in words.iter_mut().zip(map) {
             *target = self.word(word).to_be_bytes();
         }
@@ -166,6 +184,7 @@ impl RegisterBank for Registers {
 
     fn write_holding(&mut self, address: u16, registers: Words<'_>) -> Result<(), Exception> {
         map::check_write(Space::Holding, address, registers.count())?;
+        self.shown.forget();
         let words = MAP.words.get(usize::from(address)..).unwrap_or(&[]);
         for (&word, value) in words.iter().zip(registers.iter()) {
             match word {
@@ -188,4 +207,4 @@ pub(super) const COUNTS_PER_MA: u16 = 100;
 /// Counts of voltage inputs: 1 mV each.
 pub(super) const COUNTS_PER_V: u16 = 1_000;
 const COIL_BYTES: usize = (COILS / 8) as usize;
-const WORDS: usize = HOLDING as usize;
+pub(super) const WORDS: usize = HOLDING as usize;

@@ -85,7 +85,11 @@ impl Registers {
     pub(super) fn keep_shown(&mut self) {
         for (&offset, &(mask, bits)) in PLACES.functional_outputs.iter().zip(&self.functional.shown) {
             let byte = &mut self.image[offset];
-            *byte = *byte & !mask | bits & mask;
+            let kept = *byte & !mask | bits & mask;
+            if *byte != kept {
+                *byte = kept;
+                self.shown.forget();
+            }
         }
     }
 }

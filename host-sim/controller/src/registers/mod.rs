@@ -11,6 +11,7 @@ mod bank;
 mod forced;
 mod functional;
 mod packet;
+mod shown;
 
 use std::sync::LazyLock;
 
@@ -21,6 +22,7 @@ use super::motion::{ArmState, Frame};
 use forced::Forced;
 pub(crate) use forced::PacketItem;
 use functional::Functional;
+use shown::ShownWords;
 
 use recipe_config::{AnalogInput, BitGroup, InitialTarget};
 
@@ -66,6 +68,7 @@ pub struct Registers {
     status: Status,
     functional: Functional,
     forced: Forced,
+    shown: ShownWords,
 }
 
 /// Why an item was not set.
@@ -111,6 +114,7 @@ impl Default for Registers {
             status: Status::default(),
             functional: Functional::default(),
             forced: Forced::default(),
+            shown: ShownWords::default(),
         }
     }
 }
@@ -125,6 +129,7 @@ impl Registers {
     pub fn write_inputs<R>(&mut self, write: impl FnOnce(&mut [u8; IMAGE_BYTES]) -> R) -> R {
         let before = (self.vector(PLACES.force_end), self.vector(PLACES.tool));
         let inputs_before = self.functional_inputs();
+        self.shown.forget();
         let result = write(&mut self.image);
         self.follow();
         self.note_edges(inputs_before);
@@ -249,6 +254,7 @@ impl Registers {
                 }
             }
             InitialTarget::Analog { group, index } => {
+                self.shown.forget();
                 let (low, high) = group.range();
                 if index == 0 || index > group.count() || !(low..=high).contains(&value) {
                     return Err(wrong);
@@ -321,6 +327,7 @@ impl Registers {
 
     /// Sets the arm's state, actual and commanded.
     pub fn show_arm(&mut self, actual: ArmState, target: ArmState) {
+        self.shown.forget();
         self.arm = actual;
         self.target = target;
         let shown = self.image.get_mut(PLACES.robot_state..).unwrap_or(&mut []);
@@ -332,7 +339,10 @@ impl Registers {
 
     /// Sets the codes of the state machines.
     pub fn show_status(&mut self, status: Status) {
-        self.status = status;
+        if status != self.status {
+            self.shown.forget();
+            self.status = status;
+        }
     }
 
     /// Six consecutive float variables.

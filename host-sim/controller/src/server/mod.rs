@@ -164,8 +164,13 @@ impl Controller {
 
     /// Answers the requests in these bytes. Returns the values before the first write, if there was one and writes are
     /// recorded.
-    pub(super) fn modbus_bytes(&mut self, now: Instant, conn: ConnId, bytes: &[u8]) -> Option<Before> {
-        let session = self.server.modbus.get_mut(&conn)?;
+    pub(super) fn modbus_bytes(
+        &mut self,
+        now: Instant,
+        conn: ConnId,
+        bytes: &[u8],
+    ) -> (Option<Before>, Requested) {
+        let Some(session) = self.server.modbus.get_mut(&conn) else { return (None, Requested::Nothing) };
         let counters = &mut self.counters.modbus;
         counters.bytes_in += bytes.len() as u64;
         let mut bank = Bank {
@@ -173,32 +178,36 @@ impl Controller {
             exception: self.faults.exception(),
             recorder: &self.recorder,
             before: None,
+            has_written: false,
         };
         let mut rest = bytes;
         let mut answer = [0; MAX_ADU];
         let mut answers = Vec::new();
         let mut violated = false;
+        let before_these = counters.requests;
         while let Some(result) = session.receive(&mut rest, &mut bank, &mut answer) {
             let Ok(len) = result else {
                 violated = true;
                 break;
             };
-            self.server.places.active(now, conn);
             counters.requests += 1;
             // The function code follows the seven bytes of the header.
             counters.refusals += u64::from(answer[7] & 0x80 != 0);
             answers.extend_from_slice(answer.get(..len).unwrap_or(&[]));
         }
-        let before = bank.before;
-        if !answers.is_empty() {
-            self.send(now, Link::Modbus, conn, answers);
+        let (before, has_written) = (bank.before, bank.has_written);
+        if counters.requests != before_these {
+            self.server.places.active(now, conn);
+            self.registers.were_read();
         }
+        let sent = if answers.is_empty() { Sent::Now } else { self.send(now, Link::Modbus, conn, answers) };
         if violated {
             self.counters.modbus.violations += 1;
             self.closed(now, Link::Modbus, conn);
             self.outputs.push_back(ControllerOutput::Close { conn });
         }
-        before
+        let changes = has_written || violated || sent == Sent::Later;
+        (before, if changes { Requested::Changes } else { Requested::Nothing })
     }
 
     pub(super) fn udp_bytes(&mut self, now: Instant, peer: SocketAddr, bytes: &[u8]) {
@@ -230,12 +239,12 @@ impl Controller {
         self.close_clients(Link::State);
     }
 
-    fn send(&mut self, now: Instant, link: Link, conn: ConnId, mut bytes: Vec<u8>) {
+    fn send(&mut self, now: Instant, link: Link, conn: ConnId, mut bytes: Vec<u8>) -> Sent {
         self.faults.spoil_bytes(link, &mut bytes);
         let counters = self.counters.of(link);
         if self.faults.mutes(link) {
             counters.muted += 1;
-            return;
+            return Sent::Never;
         }
         counters.bytes_out += bytes.len() as u64;
         // Answers of a connection stay in order.
@@ -251,12 +260,31 @@ impl Controller {
                 }
                 _ => self.outputs.push_back(ControllerOutput::Send { conn, bytes }),
             }
+            Sent::Now
         } else if self.server.delayed.len() < MAX_DELAYED {
             self.server.delayed.push_back((due, conn, bytes));
+            Sent::Later
         } else {
             counters.muted += 1;
+            Sent::Never
         }
     }
+}
+
+/// What Modbus requests have done beside being answered.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Requested {
+    Nothing,
+    /// Something that [`Controller::advance`] may have to look at.
+    Changes,
+}
+
+/// When an answer is sent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Sent {
+    Now,
+    Later,
+    Never,
 }
 
 /// The registers, or the exception that a fault demands.
@@ -266,6 +294,7 @@ struct Bank<'a> {
     recorder: &'a Recorder,
     /// The values before the first write.
     before: Option<Before>,
+    has_written: bool,
 }
 
 impl Bank<'_> {
@@ -274,6 +303,7 @@ impl Bank<'_> {
     }
 
     fn note_before(&mut self) {
+        self.has_written = true;
         if self.before.is_none() {
             self.before = self.recorder.before(self.registers);
         }

@@ -25,6 +25,8 @@ enum Step {
     Down(u8),
     Sent(u8),
     Knob(u8),
+    Late(u64),
+    Read(u8, u8, u8),
 }
 
 fn text() -> impl Strategy<Value = Vec<u8>> {
@@ -134,6 +136,11 @@ fn everything() -> SimConfig {
 }
 
 fn apply(cell: &mut TestController, step: Step) {
+    act(cell, step);
+    cell.drain();
+}
+
+fn act(cell: &mut TestController, step: Step) {
     let address = |nth: u8| Ipv4Addr::new(10, 0, 0, nth % 3).into();
     let conn = |kind: u8, nth: u8| ConnId(u64::from(kind) * 100 + u64::from(nth));
     let now = cell.now;
@@ -215,8 +222,45 @@ fn apply(cell: &mut TestController, step: Step) {
                 }
             }
         }
+        // As a shell that the system has not let run.
+        Step::Late(micros) => cell.now += Duration::from_micros(micros),
+        Step::Read(nth, address, count) => {
+            let request = [0, 7, 0, 0, 0, 6, 1, 3, 0, address, 0, count];
+            cell.input(ControllerInput::ModbusBytes { conn: conn(1, nth), bytes: &request });
+        }
     }
-    cell.drain();
+}
+
+/// Steps of a controller that is mostly read from.
+fn calm_step() -> impl Strategy<Value = Step> {
+    prop_oneof![
+        12 => (0..4_u8, prop_oneof![Just((0, 118)), (0..118_u8, 1..8_u8)])
+            .prop_map(|(conn, (address, count))| Step::Read(conn, address, count)),
+        3 => prop_oneof![0..2_000_u64, 0..200_000_u64].prop_map(Step::Late),
+        1 => (0..5_u8).prop_map(|step| Step::Knob(step * 25 + 19)),
+        1 => (0..4_u8, 0..4_u8).prop_map(|(conn, bit)| {
+            Step::Modbus(conn, vec![0, 1, 0, 0, 0, 6, 1, 5, 0, 192 + bit, if bit < 2 { 0xFF } else { 0 }, 0])
+        }),
+        4 => step(),
+    ]
+}
+
+/// All that can be seen of a controller.
+fn seen(cell: &TestController) -> String {
+    let controller = &cell.controller;
+    let events: Vec<_> = controller.events_since(0).collect();
+    let (registers, counters) = (controller.registers(), controller.counters());
+    format!(
+        "{:?} {:?} {:?} {:?} {:?} {:?} {:?} {:?} {events:?} {counters:?}",
+        cell.received,
+        cell.closed,
+        cell.sent,
+        cell.packets,
+        registers.image(),
+        registers.arm(),
+        registers.status(),
+        controller.machine(),
+    )
 }
 
 proptest! {
@@ -247,6 +291,39 @@ proptest! {
             prop_assert!(arm.position.iter().chain(&arm.pose).chain(&arm.torque).all(|item| item.is_finite()));
             cell.packets.clear();
             cell.sent.clear();
+        }
+    }
+
+    #[test]
+    fn a_controller_that_looks_only_if_it_must_is_as_one_that_always_does(
+        steps in proptest::collection::vec(calm_step(), 1..160),
+        is_calm in any::<bool>(),
+    ) {
+        let config = if is_calm { SimConfig::default() } else { everything() };
+        let (mut cell, mut twin) = (robot(&config), robot(&config));
+        twin.controller.quiet.forbid();
+        for cell in [&mut cell, &mut twin] {
+            cell.controller.record_events();
+            cell.run_ms(1);
+            for (kind, nth) in [(0, 0), (1, 0), (1, 1), (2, 0)] {
+                apply(cell, Step::Open(kind, nth));
+            }
+        }
+        for step in steps {
+            // Knobs are turned between two calls as well.
+            let is_knob = matches!(step, Step::Knob(_) | Step::Late(_));
+            for cell in [&mut cell, &mut twin] {
+                act(cell, step.clone());
+            }
+            if !is_knob {
+                prop_assert_eq!(cell.drain(), twin.drain());
+            }
+            prop_assert_eq!(seen(&cell), seen(&twin));
+            for cell in [&mut cell, &mut twin] {
+                cell.packets.clear();
+                cell.sent.clear();
+                cell.received.clear();
+            }
         }
     }
 }

@@ -14,8 +14,11 @@ impl ControllerShell {
         let controller = self.controller.borrow();
         let newest = controller.newest_event();
         let told = self.told.replace(newest);
+        if newest == told {
+            return;
+        }
         let in_words = enabled!(target: "controller", Level::INFO);
-        if newest == told || !in_words && self.events_file.is_none() {
+        if !in_words && self.events_file.is_none() {
             return;
         }
         for event in controller.events_since(told + 1) {

@@ -1,0 +1,75 @@
+//! When the controller need not be looked at: nothing changes it until an input or a deadline comes.
+//!
+//! Most calls are Modbus requests that only read, at a controller that does nothing meanwhile. [`Controller::advance`]
+//! would find nothing before and after each of them.
+
+use proto_core::time::Instant;
+
+use super::Controller;
+
+/// How long [`Controller::advance`] finds nothing, unless something else changes the controller: whatever does has to
+/// call [`Self::ends`].
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Quiet {
+    /// Not included.
+    until: Instant,
+    /// What [`Controller::deadline`] is meanwhile.
+    deadline: Instant,
+    /// False in a test that compares the controller with one that always looks.
+    #[cfg(test)]
+    allowed: bool,
+}
+
+impl Default for Quiet {
+    fn default() -> Self {
+        Self {
+            until: Instant::ZERO,
+            deadline: Instant::NEVER,
+            #[cfg(test)]
+            allowed: true,
+        }
+    }
+}
+
+impl Quiet {
+    /// Whether time has brought nothing at `now`.
+    pub(super) fn lasts(&self, now: Instant) -> bool {
+        now < self.until
+    }
+
+    /// The controller's deadline, if it is known without a look.
+    pub(super) fn deadline(&self, now: Instant) -> Option<Instant> {
+        self.lasts(now).then_some(self.deadline)
+    }
+
+    /// Something changes the controller.
+    pub(super) fn ends(&mut self) {
+        self.until = Instant::ZERO;
+    }
+
+    fn begins(&mut self, until: Instant, deadline: Instant) {
+        #[cfg(test)]
+        let until = if self.allowed { until } else { Instant::ZERO };
+        (self.until, self.deadline) = (until, deadline);
+    }
+
+    #[cfg(test)]
+    pub(super) fn forbid(&mut self) {
+        *self = Self { allowed: false, ..Self::default() };
+    }
+}
+
+impl Controller {
+    /// Notes that nothing is left to do, and until when. Returns the deadline.
+    pub(super) fn rest(&mut self) -> Instant {
+        let deadline = self.deadline();
+        // What a program waits for is not only an instant.
+        let until = match self.running {
+            Some(_) => Instant::ZERO,
+            // Without clients the state stream has no deadline, but its grid goes on.
+            None => deadline.min(self.state_grid.next()).min(self.next_arm_state()),
+        };
+        self.quiet.begins(until, deadline);
+        deadline
+    }
+}
