@@ -240,7 +240,8 @@ mod tests {
         }
         assert!(left_runs.try_recv().is_err() && right_runs.try_recv().is_err(), "not yet");
         begins.send(true).unwrap();
-        (left_runs.recv().unwrap(), right_runs.recv().unwrap());
+        left_runs.recv().unwrap();
+        right_runs.recv().unwrap();
         left.shutdown().unwrap();
         assert!(!right.has_ended());
         assert_eq!(right.stats(), Some(json!("alive")));
@@ -256,7 +257,8 @@ mod tests {
         let (left, left_runs) = opened(&worker, &begin, true);
         let (right, right_runs) = opened(&worker, &begin, false);
         begins.send(true).unwrap();
-        (left_runs.recv().unwrap(), right_runs.recv().unwrap());
+        left_runs.recv().unwrap();
+        right_runs.recv().unwrap();
         assert_eq!(left.shutdown(), Err(panicked()));
         assert_eq!(right.stats(), Some(json!("alive")));
         right.shutdown().unwrap();

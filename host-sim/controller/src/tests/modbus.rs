@@ -197,3 +197,55 @@ fn a_later_dialect_keeps_the_mode_in_the_units_digit() {
     let c = cell.modbus_client();
     assert_eq!(cell.modbus(c, &[3, 0, 0, 0, 1]), [3, 2, 0, 2]);
 }
+
+#[test]
+fn registers_that_were_read_again_and_again_follow_the_arm() {
+    let config = r#"
+[robot]
+power = "enabled"
+[[program]]
+name = "work.jspf"
+script = "movej([1.0, 0, 0, 0, 0, 0], 1.0);"
+"#;
+    let mut cell = TestController::from_toml(config).unwrap();
+    let (c, m) = (cell.command_client(), cell.modbus_client());
+    // The joints' velocities; the controller keeps what is often read.
+    let read = |cell: &mut TestController| {
+        let answers: Vec<_> = (0..6).map(|_| cell.modbus(m, &[3, 0, 99, 0, 7])).collect();
+        assert!(answers.iter().all(|answer| *answer == answers[0]), "{answers:?}");
+        answers[0].clone()
+    };
+    let at_rest = read(&mut cell);
+    assert_eq!(at_rest[2..], [0; 14]);
+    cell.order(c, "run(\"work.jspf\")");
+    let mut moved = 0;
+    while cell.controller.program_name().is_some() {
+        cell.run_ms(4);
+        moved += usize::from(read(&mut cell) != at_rest);
+    }
+    assert!(moved > 100, "{moved} cycles");
+    cell.run_ms(100);
+    assert_eq!(read(&mut cell), at_rest);
+}
+
+#[test]
+fn a_written_coil_has_its_function_at_once_however_quiet_it_was() {
+    let config = r#"
+[robot]
+power = "enabled"
+[functions]
+start = "work.jspf"
+inputs = { "BitInputReg[1].0" = "start" }
+[[program]]
+name = "work.jspf"
+script = "loop { wait_ms(10); }"
+"#;
+    let mut cell = TestController::from_toml(config).unwrap();
+    let m = cell.modbus_client();
+    for _ in 0..6 {
+        cell.modbus(m, &[3, 0, 0, 0, 118]);
+    }
+    assert_eq!(cell.controller.program_name(), None);
+    cell.modbus(m, &[5, 0, 0, 0xFF, 0]);
+    assert_eq!(cell.controller.program_name(), Some("work.jspf"), "no time has passed");
+}
