@@ -59,7 +59,7 @@ pub(super) struct Run {
 #[derive(Debug, Args)]
 pub(super) struct GatewayRun {
     /// The configuration file. With several, one process serves several cells, each called like its file without the
-    /// extension: --bind CELL/NAME=DEVICE, --set CELL/KEY=VALUE
+    /// extension; then write --bind CELL/NAME=DEVICE and --set CELL/KEY=VALUE
     #[arg(short, long, value_name = "FILE", required = true)]
     config: Vec<PathBuf>,
     /// Serve several cells on so many threads; without it, one for each processor
