@@ -265,7 +265,10 @@ async fn is_not_believed(
     }
     let after = cell.counters(port);
     assert!(after.frames_in <= before.frames_in + 2, "{after:?}");
-    assert_eq!((after.asleep > 0, cell.sleeps() > 0), (true, true), "{after:?}");
+    // A system that hands the bytes over late does so after the engine has noted the sleep: then the device discards them.
+    let dropped = cell.core.ports[&port].1.counters().dropped;
+    assert!(after.asleep > 0 || dropped > 0, "{dropped} {after:?}");
+    assert!(cell.sleeps() > 0);
     Ok(())
 }
 
