@@ -127,7 +127,14 @@ impl Machine {
     fn go_on(&self) {
         let mut monitor =
             until("QEMU's monitor", || UnixStream::connect(self.monitor.path().join("socket")).ok());
+        monitor.set_read_timeout(Some(PATIENCE)).unwrap();
         writeln!(monitor, "cont").unwrap();
+        // What QEMU has not read yet is lost with the connection. It asks for a command at the start, and again.
+        let (mut said, mut byte) = (Vec::new(), [0]);
+        while said.windows(6).filter(|words| words == b"(qemu)").count() < 2 {
+            monitor.read_exact(&mut byte).expect("the monitor answers");
+            said.push(byte[0]);
+        }
     }
 
     /// Collects the log for `time`; returns all of it.
