@@ -23,7 +23,7 @@ use super::stream::{self, ByteStream, accept};
 use recipe_net::backoff::Backoff;
 use recipe_net::clock::{Alarm, Clock};
 use recipe_net::connect::connect;
-use recipe_net::fairness::{give_way, yield_fairly};
+use recipe_net::fairness::{Either, Order, either, give_way, yield_fairly};
 use recipe_net::tcp_options;
 use recipe_net::timer::now;
 
@@ -236,38 +236,37 @@ async fn pump<D: ByteStream>(
     events: &mut impl FnMut(PortEvent<'_>),
 ) -> io::Error {
     let mut buf = vec![0; BACKLOG_CHUNK];
+    // Nothing is asked before a frame, unless what came last was one too: a line that never pauses would be all there is.
+    let mut order = Order::LeftFirst;
     loop {
         if backlog.has_slept(&sender.tx) {
             discard_backlog(device, &sender.tx, &mut backlog, &mut buf, events);
         }
         let most = if backlog.is_open(&sender.tx) { BACKLOG_CHUNK } else { CHUNK };
-        let done = tokio::select! {
-            read = device.receive(&mut buf[..most]) => match read {
-                Ok(0) => Err(io::ErrorKind::UnexpectedEof.into()),
-                Ok(count) => {
-                    let is_full = count == most;
-                    take(&buf[..count], is_full, &sender.tx, &mut backlog, events);
-                    // A device that never pauses must not delay other tasks. Bytes that the engine discards
-                    // take little time, and must be read before it accepts input again.
-                    let is_much = is_full && !sender.tx.is_stale();
-                    if is_much { yield_fairly().await } else { give_way().await }
-                    Ok(())
+        let next = either(device.receive(&mut buf[..most]), other(device, sender), order).await;
+        order = if matches!(next, Either::Left(_)) { Order::RightFirst } else { Order::LeftFirst };
+        let done = match next {
+            Either::Left(Ok(0)) => Err(io::ErrorKind::UnexpectedEof.into()),
+            Either::Left(Ok(count)) => {
+                let is_full = count == most;
+                take(&buf[..count], is_full, &sender.tx, &mut backlog, events);
+                // A device that never pauses must not delay other tasks. Bytes that the engine discards
+                // take little time, and must be read before it accepts input again.
+                let is_much = is_full && !sender.tx.is_stale();
+                if is_much {
+                    yield_fairly().await
+                } else {
+                    give_way().await
                 }
-                Err(error) if error.kind() == io::ErrorKind::Interrupted => Ok(()),
-                Err(error) => Err(error),
-            },
-            () = sender.tx.slept.notified() => Ok(()),
-            () = sender.tx.looked.notified(), if D::LATE => {
-                look(device, &sender.tx, &mut backlog, &mut buf[..most], events)
+                Ok(())
             }
-            () = sender.tx.wake.notified(), if !sender.sending => sender.begin(device, events),
-            expired = sender.timer.expired(), if sender.sending && !sender.blocked => {
-                expired.and_then(|()| sender.advance(device, events))
-            }
-            ready = device.writable(), if sender.blocked => {
-                ready.and_then(|()| sender.advance(device, events))
-            }
-            () = tokio::time::sleep(CLIENT_POLL), if device.may_hold_unread() => {
+            Either::Left(Err(error)) if error.kind() == io::ErrorKind::Interrupted => Ok(()),
+            Either::Left(Err(error)) => Err(error),
+            Either::Right(Other::Slept) => Ok(()),
+            Either::Right(Other::Looked) => look(device, &sender.tx, &mut backlog, &mut buf[..most], events),
+            Either::Right(Other::HandedOver) => sender.begin(device, events),
+            Either::Right(Other::Due(due)) => due.and_then(|()| sender.advance(device, events)),
+            Either::Right(Other::MayHaveGone) => {
                 device.has_client();
                 Ok(())
             }
@@ -275,6 +274,31 @@ async fn pump<D: ByteStream>(
         if let Err(error) = done {
             return error;
         }
+    }
+}
+
+/// What a port waits for, other than bytes.
+enum Other {
+    /// The process slept.
+    Slept,
+    /// Received bytes are asked for.
+    Looked,
+    /// There is something to send.
+    HandedOver,
+    /// The transmission can go on.
+    Due(io::Result<()>),
+    /// A client may have gone and left bytes unread.
+    MayHaveGone,
+}
+
+async fn other<D: ByteStream>(device: &D, sender: &Sender) -> Other {
+    tokio::select! {
+        () = sender.tx.slept.notified() => Other::Slept,
+        () = sender.tx.looked.notified(), if D::LATE => Other::Looked,
+        () = sender.tx.wake.notified(), if !sender.sending => Other::HandedOver,
+        expired = sender.timer.expired(), if sender.sending && !sender.blocked => Other::Due(expired),
+        ready = device.writable(), if sender.blocked => Other::Due(ready),
+        () = tokio::time::sleep(CLIENT_POLL), if device.may_hold_unread() => Other::MayHaveGone,
     }
 }
 

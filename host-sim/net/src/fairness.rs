@@ -45,6 +45,51 @@ pub async fn give_way() {
     .await;
 }
 
+/// What was ready of two.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Either<L, R> {
+    /// The left one.
+    Left(L),
+    /// The right one.
+    Right(R),
+}
+
+/// Which of two is asked first, and wins if both are ready.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Order {
+    /// The left one.
+    LeftFirst,
+    /// The right one.
+    RightFirst,
+}
+
+/// Waits for one of two in an order that may be another one each time, so that neither has to wait for ever. The other one is
+/// dropped. Cancel safe if both are.
+pub async fn either<L, R>(
+    left: impl Future<Output = L>,
+    right: impl Future<Output = R>,
+    order: Order,
+) -> Either<L, R> {
+    let (mut left, mut right) = (pin!(left), pin!(right));
+    poll_fn(|cx| {
+        if order == Order::LeftFirst
+            && let Poll::Ready(done) = left.as_mut().poll(cx)
+        {
+            return Poll::Ready(Either::Left(done));
+        }
+        if let Poll::Ready(done) = right.as_mut().poll(cx) {
+            return Poll::Ready(Either::Right(done));
+        }
+        if order == Order::RightFirst
+            && let Poll::Ready(done) = left.as_mut().poll(cx)
+        {
+            return Poll::Ready(Either::Left(done));
+        }
+        Poll::Pending
+    })
+    .await
+}
+
 /// Whether a task waits in [`yield_fairly`], because it has more to do at once.
 pub fn is_anyone_busy() -> bool {
     WAITING.get() > 0
@@ -174,6 +219,20 @@ mod tests {
             }
             tasks.join_all().await;
             assert_eq!(*order.borrow(), ["can run", "gives way"]);
+        });
+    }
+
+    #[test]
+    fn of_two_that_are_ready_the_order_decides() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        runtime.block_on(async {
+            let ready = |order| either(std::future::ready(1), std::future::ready(2), order);
+            assert_eq!(ready(Order::LeftFirst).await, Either::Left(1));
+            assert_eq!(ready(Order::RightFirst).await, Either::Right(2));
+            for order in [Order::LeftFirst, Order::RightFirst] {
+                assert_eq!(either(std::future::pending::<()>(), yield_now(), order).await, Either::Right(()));
+                assert_eq!(either(yield_now(), std::future::pending::<()>(), order).await, Either::Left(()));
+            }
         });
     }
 

@@ -7,6 +7,7 @@
 use std::cell::RefCell;
 use std::io;
 use std::pin::Pin;
+use std::rc::Rc;
 use std::sync::mpsc as blocking;
 use std::thread::JoinHandle;
 
@@ -14,7 +15,7 @@ use recipe_capture::Watch;
 use recipe_net::fairness;
 use serde_json::Value;
 use tokio::sync::{mpsc, oneshot};
-use tokio::task::LocalSet;
+use tokio::task::{LocalSet, spawn_local};
 use tracing::warn;
 
 use super::service::Service;
@@ -105,9 +106,9 @@ impl Asker {
     }
 }
 
-/// What the thread of a shell does at its end, after all tasks are gone and before its runtime is.
-#[derive(Default)]
-pub(super) struct AtEnd(RefCell<Vec<Box<dyn FnOnce()>>>);
+/// What the thread of a shell does at its end, after all tasks are gone and before its runtime is. A clone is the same.
+#[derive(Default, Clone)]
+pub(super) struct AtEnd(Rc<RefCell<Vec<Box<dyn FnOnce()>>>>);
 
 impl AtEnd {
     /// Adds something to do. What fails to open ends too.
@@ -116,7 +117,7 @@ impl AtEnd {
     }
 
     fn run(self) {
-        self.0.into_inner().into_iter().for_each(|act| act());
+        self.0.take().into_iter().for_each(|act| act());
     }
 }
 
@@ -142,7 +143,7 @@ pub(super) fn start<S: Shell>(
         None => Home::Alone(alone(name, opening)?),
         Some((worker, begin)) => Home::Among(worker.run(place.span.clone(), move || async move {
             let (local, at_end) = (LocalSet::new(), AtEnd::default());
-            let ended = fairness::apart(local.run_until(opening.run(&at_end, begin.wait()))).await;
+            let ended = fairness::apart(local.run_until(opening.run_as_task(&at_end, begin.wait()))).await;
             drop(local);
             at_end.run();
             ended
@@ -169,7 +170,7 @@ fn alone<S: Shell>(
     let thread = std::thread::Builder::new().name(name.to_owned()).stack_size(STACK).spawn(move || {
         let runtime = runtime()?;
         let (local, at_end) = (LocalSet::new(), AtEnd::default());
-        let ended = local.block_on(&runtime, opening.run(&at_end, std::future::ready(())));
+        let ended = local.block_on(&runtime, opening.run_as_task(&at_end, std::future::ready(())));
         drop(local);
         at_end.run();
         ended
@@ -196,10 +197,20 @@ type Open<S> =
     Box<dyn for<'a> FnOnce(&'a AtEnd) -> Pin<Box<dyn Future<Output = Result<S, StartError>> + 'a>> + Send>;
 
 impl<S: Shell> Opening<S> {
+    /// The same as [`Self::run`], in a task of its own: what a [`LocalSet`] runs around its tasks is polled at each wake
+    /// of any of them.
+    async fn run_as_task(
+        self,
+        at_end: &AtEnd,
+        begin: impl Future<Output = ()> + 'static,
+    ) -> Result<(), StartError> {
+        spawn_local(self.run(at_end.clone(), begin)).await.unwrap_or_else(|_| Err(panicked()))
+    }
+
     /// Opens it, and runs it when it may begin.
-    async fn run(self, at_end: &AtEnd, begin: impl Future<Output = ()>) -> Result<(), StartError> {
+    async fn run(self, at_end: AtEnd, begin: impl Future<Output = ()>) -> Result<(), StartError> {
         let Self { open, opened, inbox } = self;
-        let shell = match open(at_end).await {
+        let shell = match open(&at_end).await {
             Ok(shell) => shell,
             Err(error) => {
                 let _ = opened.send(Err(error));

@@ -5,11 +5,11 @@
 //!
 //! Data that waited in a socket while the link was closed is never reported, because its age is unknown.
 
+mod outbox;
 mod tcp;
 mod udp;
 
 use std::cell::{Cell, RefCell};
-use std::collections::VecDeque;
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::time::Duration;
@@ -25,6 +25,8 @@ use recipe_net::connect::connect;
 use recipe_net::fairness::yield_fairly;
 use recipe_net::log_limit::LogLimit;
 use recipe_net::timer::now;
+
+use outbox::{Outbox, Way};
 
 /// The other end of a link.
 #[derive(Debug)]
@@ -55,7 +57,7 @@ pub(super) enum LinkEvent<'a> {
 #[derive(Debug, Default)]
 pub(super) struct LinkControl {
     session: Cell<Session>,
-    outbox: RefCell<VecDeque<Vec<u8>>>,
+    outbox: RefCell<Outbox>,
     /// Bytes handed over in this session.
     handed: Cell<u64>,
     changed: Notify,
@@ -86,9 +88,6 @@ pub(super) struct Refusals {
     pub(super) refused: u64,
 }
 
-/// The engine has one transmission in flight at a time, so a working link never reaches this.
-const MAX_QUEUED: usize = 8;
-
 impl LinkControl {
     pub(super) fn open(&self) {
         if !self.session.get().is_open() {
@@ -102,11 +101,11 @@ impl LinkControl {
         }
     }
 
+    /// Hands bytes over: to the system at once, if it takes them. The link's task reports that it has, and sends what is
+    /// left.
     pub(super) fn send(&self, bytes: &[u8]) {
-        let mut outbox = self.outbox.borrow_mut();
-        if outbox.len() < MAX_QUEUED {
+        if self.outbox.borrow_mut().take(bytes) {
             self.handed.set(self.handed.get() + bytes.len() as u64);
-            outbox.push_back(bytes.to_vec());
         }
         self.changed.notify_one();
     }
@@ -156,7 +155,7 @@ impl LinkControl {
 
     fn next_session(&self) {
         self.session.set(Session(self.session.get().0 + 1));
-        self.outbox.borrow_mut().clear();
+        self.outbox.take();
         self.handed.set(0);
         self.changed.notify_one();
     }
@@ -183,14 +182,35 @@ impl LinkControl {
         }
     }
 
-    /// The next transmission.
-    fn next(&self) -> Option<Vec<u8>> {
-        self.outbox.borrow_mut().pop_front()
+    /// Lets [`Self::send`] write to a socket of this session, until what is returned is dropped.
+    fn lend(&self, way: Way) -> Lent<'_> {
+        self.outbox.borrow_mut().open(way);
+        Lent(self)
     }
 
-    /// Number of bytes in the outbox.
+    /// Datagrams go to this peer from now on.
+    fn answer(&self, peer: SocketAddr) {
+        self.outbox.borrow_mut().answer(peer);
+    }
+
+    /// Sends what waits, as far as `write` takes it, and returns whether it has become true that everything handed over is
+    /// sent.
+    fn flush(&self, write: impl FnMut(&[u8]) -> io::Result<usize>) -> io::Result<bool> {
+        self.outbox.borrow_mut().flush(write)
+    }
+
+    /// Number of bytes that the system has not accepted.
     fn waiting(&self) -> usize {
-        self.outbox.borrow().iter().map(Vec::len).sum()
+        self.outbox.borrow().waiting()
+    }
+}
+
+/// A socket that [`LinkControl::send`] may use.
+struct Lent<'a>(&'a LinkControl);
+
+impl Drop for Lent<'_> {
+    fn drop(&mut self) {
+        self.0.outbox.borrow_mut().close();
     }
 }
 

@@ -1,5 +1,6 @@
 //! Links against real sockets that behave like a controller.
 
+use std::collections::VecDeque;
 use std::rc::Rc;
 
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -179,10 +180,12 @@ fn after_a_close_nothing_is_reported_and_nothing_old_is_sent() {
         peer.write_all(b"late").await.unwrap();
         link.control.send(b"old");
         link.control.close();
+        // Too late.
+        link.control.send(b"older");
         let mut rest = Vec::new();
         // Bytes in flight reset the connection.
         let _ = peer.read_to_end(&mut rest).await;
-        assert_eq!(rest, b"");
+        assert_eq!(rest, b"old", "it was at the peer before the close");
         link.control.open();
         let (mut peer, _) = listener.accept().await.unwrap();
         link.expect(Seen::Up).await;
@@ -266,6 +269,25 @@ fn a_udp_link_is_down_if_the_peer_is_unreachable() {
         link.control.send(b"frame");
         link.expect(Seen::Sent).await;
         link.expect(Seen::Down).await;
+    });
+}
+
+#[test]
+fn a_udp_link_is_down_if_that_is_found_when_something_is_handed_over() {
+    inside(async || {
+        let peer = UdpSocket::bind("127.0.0.1:0").await.unwrap();
+        let at = peer.local_addr().unwrap();
+        let link = Running::start(Endpoint::Udp { host: at.ip().to_string(), port: at.port() });
+        link.control.open();
+        link.expect(Seen::Up).await;
+        // The task has a socket to lend.
+        tokio::task::yield_now().await;
+        drop(peer);
+        // The first one is refused, and the system says so to the second one, and to nobody else.
+        link.control.send(b"frame");
+        link.control.send(b"frame");
+        link.expect(Seen::Down).await;
+        assert!(link.is_silent());
     });
 }
 

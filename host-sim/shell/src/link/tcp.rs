@@ -16,7 +16,8 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::time::{Instant, sleep};
 use tracing::info;
 
-use super::{Link, LinkEvent, Refusals, Session};
+use super::outbox::Way;
+use super::{Lent, Link, LinkEvent, Refusals, Session};
 use recipe_net::connect::connect;
 use recipe_net::fairness::yield_fairly;
 use recipe_net::tcp_options;
@@ -116,8 +117,8 @@ struct Connection<'a> {
     link: &'a Link<'a>,
     session: Session,
     writer: WriteHalf<'a>,
-    /// The part of the present transmission that the system has not accepted.
-    unwritten: Vec<u8>,
+    /// For what is handed over while this task does something else.
+    _lent: Lent<'a>,
     /// Number of bytes that the peer is known to have acknowledged.
     acked: u64,
     watch: Watch,
@@ -144,9 +145,9 @@ impl<'a> Connection<'a> {
     ) -> io::Result<(Self, ReadHalf<'a>)> {
         tcp_options::reset_on_close(stream)?;
         tcp_options::enable_keepalive(stream);
+        let lent = link.control.lend(Way::new(stream, None)?);
         let (reader, writer) = stream.split();
-        let own =
-            Self { link, session, writer, unwritten: Vec::new(), acked: 0, watch: Watch::Off, reads: 0 };
+        let own = Self { link, session, writer, _lent: lent, acked: 0, watch: Watch::Off, reads: 0 };
         Ok((own, reader))
     }
 
@@ -186,7 +187,7 @@ impl<'a> Connection<'a> {
                     0 => return Ok(()),
                     len => self.take(&chunk[..len], events).await?,
                 },
-                ready = self.writer.writable(), if !self.unwritten.is_empty() => ready?,
+                ready = self.writer.writable(), if self.link.control.waiting() > 0 => ready?,
                 () = changed.notified() => {}
                 () = &mut poll, if self.watch != Watch::Off => if self.watch == Watch::Missing {
                     self.poll_acked(events)?;
@@ -223,21 +224,8 @@ impl<'a> Connection<'a> {
 
     /// Writes as much as the system accepts.
     fn write(&mut self, events: &mut impl FnMut(LinkEvent<'_>)) -> io::Result<()> {
-        while !self.is_over() {
-            if self.unwritten.is_empty() {
-                match self.link.control.next() {
-                    Some(bytes) => self.unwritten = bytes,
-                    None => return Ok(()),
-                }
-            }
-            match self.writer.try_write(&self.unwritten) {
-                Ok(len) => drop(self.unwritten.drain(..len)),
-                Err(error) if error.kind() == io::ErrorKind::WouldBlock => return Ok(()),
-                Err(error) => return Err(error),
-            }
-            if self.unwritten.is_empty() && self.link.control.waiting() == 0 {
-                events(LinkEvent::Sent);
-            }
+        while !self.is_over() && self.link.control.flush(|bytes| self.writer.try_write(bytes))? {
+            events(LinkEvent::Sent);
         }
         Ok(())
     }
@@ -253,8 +241,7 @@ impl<'a> Connection<'a> {
             return Ok(());
         }
         let control = self.link.control;
-        let left =
-            tcp_options::unacknowledged(self.writer.as_ref())? + self.unwritten.len() + control.waiting();
+        let left = tcp_options::unacknowledged(self.writer.as_ref())? + control.waiting();
         let acked = control.handed.get().saturating_sub(left as u64);
         if acked != self.acked {
             self.acked = acked;

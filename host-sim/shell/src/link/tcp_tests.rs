@@ -66,6 +66,73 @@ fn acknowledgements_are_reported_before_later_data() {
 }
 
 #[test]
+fn what_is_handed_over_is_sent_before_the_links_task_runs() {
+    inside(async || {
+        let (link, _listener, peer) = connected().await;
+        // Blocking reads: no task runs until they return.
+        let mut peer = peer.into_std().unwrap();
+        peer.set_nonblocking(false).unwrap();
+        peer.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
+        for round in 0..3_u8 {
+            link.control.send(&[round; 5]);
+            let mut got = [0; 5];
+            peer.read_exact(&mut got).unwrap();
+            assert_eq!(got, [round; 5]);
+            assert!(link.is_silent());
+            link.expect(Seen::Sent).await;
+        }
+    });
+}
+
+#[test]
+fn what_does_not_fit_is_sent_by_the_task_in_order() {
+    inside(async || {
+        let (link, _listener, peer) = pair().await;
+        // More than fits the buffers of both sides.
+        const MUCH: usize = 8 << 20;
+        link.control.send(&vec![1; MUCH]);
+        assert!(link.control.waiting() > 0);
+        // There is room for the second one before the task has sent the rest of the first one.
+        let mut peer = peer.into_std().unwrap();
+        peer.set_nonblocking(false).unwrap();
+        peer.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
+        let mut got = vec![0; MUCH + PIECE];
+        let read = MUCH - link.control.waiting();
+        peer.read_exact(&mut got[..read]).unwrap();
+        link.control.send(&[2; PIECE]);
+        assert!(link.control.waiting() > PIECE, "{}", link.control.waiting());
+        peer.set_nonblocking(true).unwrap();
+        let mut peer = TcpStream::from_std(peer).unwrap();
+        peer.read_exact(&mut got[read..]).await.unwrap();
+        assert!(got[..MUCH].iter().all(|byte| *byte == 1));
+        assert_eq!(got[MUCH..], [2; PIECE]);
+        link.expect(Seen::Sent).await;
+        assert!(link.is_silent(), "once for both");
+    });
+}
+
+#[test]
+fn a_loss_that_is_found_when_something_is_handed_over_is_reported_once() {
+    inside(async || {
+        let (link, listener, peer) = connected().await;
+        tcp_options::reset_on_close(&peer).unwrap();
+        // Without a chance for the link's task, which would notice it by itself.
+        drop(peer);
+        link.control.send(b"to a peer that is gone");
+        link.control.send(b"to a connection that has failed");
+        link.expect(Seen::Down).await;
+        assert!(link.is_silent());
+        link.control.open();
+        let (mut peer, _) = listener.accept().await.unwrap();
+        link.expect(Seen::Up).await;
+        link.control.send(b"new");
+        let mut got = [0; 3];
+        peer.read_exact(&mut got).await.unwrap();
+        assert_eq!(&got, b"new");
+    });
+}
+
+#[test]
 fn a_late_acknowledgement_is_reported() {
     inside(async || {
         let (link, _listener, mut peer) = pair().await;
@@ -148,6 +215,8 @@ fn the_systems_time_limit_stays_between_transmissions_and_goes_in_silence() {
             assert_eq!(limit(), 0);
             for _ in 0..3 {
                 control.send(b"request");
+                // The connection sees that something is missing before it is answered.
+                yield_now().await;
                 peer.read_exact(&mut [0; 7]).await.unwrap();
                 peer.write_all(b"answer").await.unwrap();
                 answered.notified().await;

@@ -8,6 +8,7 @@ use rustix::net::RecvFlags;
 use tokio::net::UdpSocket;
 use tracing::info;
 
+use super::outbox::Way;
 use super::{Link, LinkEvent, Session};
 use recipe_net::fairness::yield_fairly;
 
@@ -77,27 +78,18 @@ impl Link<'_> {
         mut client: Option<Client<'_>>,
         events: &mut impl FnMut(LinkEvent<'_>),
     ) -> io::Result<()> {
+        let _lent = self.control.lend(Way::new(socket, client.as_ref().map(|client| client.peer))?);
         let mut datagram = vec![0; MAX_DATAGRAM];
-        let mut next = None;
         let mut reads = 0_u64;
         while !self.control.is_over(session) {
-            next = next.or_else(|| self.control.next());
-            if let Some(bytes) = &next {
-                let sent = match &client {
-                    None => socket.try_send(bytes),
-                    Some(client) => socket.try_send_to(bytes, client.peer),
-                };
-                match sent {
-                    Ok(_) => {
-                        next = None;
-                        if self.control.waiting() == 0 {
-                            events(LinkEvent::Sent);
-                        }
-                        continue;
-                    }
-                    Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
-                    Err(error) => return Err(error),
-                }
+            let peer = client.as_ref().map(|client| client.peer);
+            let is_sent = self.control.flush(|bytes| match peer {
+                None => socket.try_send(bytes),
+                Some(peer) => socket.try_send_to(bytes, peer),
+            })?;
+            if is_sent {
+                events(LinkEvent::Sent);
+                continue;
             }
             tokio::select! {
                 received = receive(socket, client.is_some(), &mut datagram) => {
@@ -108,6 +100,7 @@ impl Link<'_> {
                             let is_known = self.control.is_controller(self.name, &client.known, from);
                             if is_known && (client.is_frame)(datagram) {
                                 client.peer = from;
+                                self.control.answer(from);
                             }
                             is_known
                         }
@@ -119,7 +112,7 @@ impl Link<'_> {
                     reads += 1;
                     yield_sometimes(reads).await;
                 }
-                ready = socket.writable(), if next.is_some() => ready?,
+                ready = socket.writable(), if self.control.waiting() > 0 => ready?,
                 () = self.control.changed.notified() => {}
             }
         }
