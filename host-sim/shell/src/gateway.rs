@@ -255,20 +255,26 @@ impl Core {
         if self.is_ending.get() && event != PortEvent::Sent {
             return;
         }
-        if let Some(record) = self.records.borrow_mut().iter_mut().find(|record| record.port == port) {
-            match &event {
-                PortEvent::Bytes(bytes) => record.heard(bytes),
-                PortEvent::Frame { frame } => record.frame(frame),
-                _ => {}
-            }
-        }
+        // The engine first: what comes of it is on its way before anything is noted.
         match event {
             PortEvent::Up => self.input(Input::PortUp { port }),
             PortEvent::Down => self.input(Input::PortDown { port }),
-            PortEvent::Bytes(bytes) => self.input(Input::PortBytes { port, bytes }),
-            PortEvent::Frame { frame } => self.input(Input::PortCan { port, frame }),
+            PortEvent::Bytes(bytes) => {
+                self.input(Input::PortBytes { port, bytes });
+                self.record(port, |record| record.heard(bytes));
+            }
+            PortEvent::Frame { frame } => {
+                self.input(Input::PortCan { port, frame });
+                self.record(port, |record| record.frame(&frame));
+            }
             PortEvent::Bus(state) => self.input(Input::PortBus { port, state }),
             PortEvent::Sent => self.input(Input::PortSent { port }),
+        }
+    }
+
+    fn record(&self, port: PortId, note: impl FnOnce(&mut PortRecord)) {
+        if let Some(record) = self.records.borrow_mut().iter_mut().find(|record| record.port == port) {
+            note(record);
         }
     }
 

@@ -1,8 +1,8 @@
 //! What every shell needs: a thread with a runtime, a handle, and in the foreground the `ready` line,
 //! statistics and a clean end.
 //!
-//! A shell has a thread of its own, or shares a [`Worker`] with others. In both cases it runs in a [`LocalSet`] of its
-//! own, so that its tasks end with it.
+//! A shell has a thread of its own with a runtime, or shares a [`Worker`] with others and has a [`LocalSet`] there. Either
+//! way its tasks end with it.
 
 use std::cell::RefCell;
 use std::io;
@@ -34,7 +34,7 @@ pub(super) trait Shell: 'static {
     fn ready(&self) -> Value;
     /// A function that returns one line of statistics while the shell runs.
     fn stats(&self) -> impl Fn() -> Value + 'static;
-    /// Runs in a [`LocalSet`]; returns only if something fails permanently, or after a shutdown command.
+    /// Runs where tasks can be spawned that stay on this thread; returns only if something fails permanently, or after a shutdown command.
     fn run(self) -> impl Future<Output = Result<(), StartError>>;
 }
 
@@ -106,7 +106,7 @@ impl Asker {
     }
 }
 
-/// What the thread of a shell does at its end, after all tasks are gone and before its runtime is. A clone is the same.
+/// What the thread of a shell does at its end, after all tasks are gone. A clone is the same.
 #[derive(Default, Clone)]
 pub(super) struct AtEnd(Rc<RefCell<Vec<Box<dyn FnOnce()>>>>);
 
@@ -168,10 +168,13 @@ fn alone<S: Shell>(
     opening: Opening<S>,
 ) -> Result<JoinHandle<Result<(), StartError>>, StartError> {
     let thread = std::thread::Builder::new().name(name.to_owned()).stack_size(STACK).spawn(move || {
-        let runtime = runtime()?;
-        let (local, at_end) = (LocalSet::new(), AtEnd::default());
-        let ended = local.block_on(&runtime, opening.run_as_task(&at_end, std::future::ready(())));
-        drop(local);
+        let runtime =
+            tokio::runtime::Builder::new_current_thread().enable_all().build_local(Default::default());
+        let runtime = runtime.map_err(no_runtime)?;
+        let at_end = AtEnd::default();
+        let ended = runtime.block_on(opening.run_as_task(&at_end, std::future::ready(())));
+        // With it go its tasks.
+        drop(runtime);
         at_end.run();
         ended
     });
@@ -180,8 +183,11 @@ fn alone<S: Shell>(
 
 /// The runtime of a thread.
 pub(super) fn runtime() -> Result<tokio::runtime::Runtime, StartError> {
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
-    runtime.map_err(|error| StartError::new(format!("cannot start the runtime: {error}")))
+    tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(no_runtime)
+}
+
+fn no_runtime(error: io::Error) -> StartError {
+    StartError::new(format!("cannot start the runtime: {error}"))
 }
 
 /// A shell that is to be opened.
@@ -197,8 +203,8 @@ type Open<S> =
     Box<dyn for<'a> FnOnce(&'a AtEnd) -> Pin<Box<dyn Future<Output = Result<S, StartError>> + 'a>> + Send>;
 
 impl<S: Shell> Opening<S> {
-    /// The same as [`Self::run`], in a task of its own: what a [`LocalSet`] runs around its tasks is polled at each wake
-    /// of any of them.
+    /// The same as [`Self::run`], in a task of its own: what is run around the tasks is polled at each wake of any of
+    /// them.
     async fn run_as_task(
         self,
         at_end: &AtEnd,
