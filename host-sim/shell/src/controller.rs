@@ -1,6 +1,8 @@
 //! The simulated controller on real sockets and devices.
 
 mod control;
+mod modbus;
+mod model;
 mod open;
 mod outward;
 mod playing;
@@ -13,6 +15,7 @@ use std::cell::{Cell, RefCell};
 use std::collections::{BTreeMap, VecDeque};
 use std::net::SocketAddr;
 use std::rc::Rc;
+use std::sync::Arc;
 
 use proto_core::engine::BusState;
 use proto_core::time::{Duration, Instant};
@@ -29,10 +32,12 @@ use super::tcp::{Accepted, Connection};
 use super::worker::Place;
 use super::{EventsFile, RunOptions, StartError};
 use control::ControlClient;
+use modbus::Modbus;
+use model::Shared;
 use recipe_config::SimConfig;
 use recipe_controller::operations::Operation;
 use recipe_controller::timeline::Timeline;
-use recipe_controller::{ConnId, Controller, ControllerInput, ControllerOutput, Link};
+use recipe_controller::{ConnId, ControllerInput, ControllerOutput, Link};
 use recipe_device::bind::Bind;
 use recipe_device::exchange::{PortEvent, PortTx};
 use recipe_device::port::Port;
@@ -141,7 +146,10 @@ impl Shell for Running {
 
 /// The controller, with its sockets and devices.
 struct ControllerShell {
-    controller: RefCell<Controller>,
+    controller: Arc<Shared>,
+    /// The Modbus connections have a thread of their own, except with a stepped clock, which has to know when none of
+    /// them has anything to do.
+    modbus: Option<Modbus>,
     connections: RefCell<BTreeMap<ConnId, Client>>,
     next_connection: Cell<u64>,
     udp: UdpSocket,
@@ -175,7 +183,6 @@ struct ControllerShell {
     control_clients: RefCell<Vec<Rc<ControlClient>>>,
     refused_control_clients: Cell<usize>,
     ended: Notify,
-    counters: Cell<ShellCounters>,
     refusal_log: LogLimit,
     log_limit: LogLimit,
 }
@@ -258,11 +265,19 @@ impl ControllerShell {
         }
     }
 
+    /// Carries out what the thread of the Modbus connections has left to do.
+    async fn follow_modbus(self: Rc<Self>) {
+        loop {
+            self.controller.changed().await;
+            self.drain(self.clock.now());
+        }
+    }
+
     /// Reports an event to the controller and carries out its outputs.
     fn input(&self, input: ControllerInput<'_>) {
         let now = self.clock.now();
         self.note_activity();
-        self.controller.borrow_mut().handle(now, input);
+        self.controller.lock().handle(now, input);
         self.drain(now);
     }
 
@@ -270,9 +285,9 @@ impl ControllerShell {
     fn operate(&self, operation: &Operation) -> Result<Value, String> {
         let now = self.clock.now();
         self.note_activity();
-        let done = self.controller.borrow_mut().operate(now, operation);
+        let done = self.controller.lock().operate(now, operation);
         self.drain(now);
-        done.map_err(|refused| refused.to_string())
+        done
     }
 
     fn note_activity(&self) {
@@ -285,7 +300,7 @@ impl ControllerShell {
             return;
         }
         let until = loop {
-            let output = self.controller.borrow_mut().poll_output(now);
+            let output = self.controller.lock().poll_output(now);
             if let ControllerOutput::Sleep { until } = output {
                 let Some(report) = self.reports.borrow_mut().pop_front() else { break until };
                 let input = match report {
@@ -293,7 +308,7 @@ impl ControllerShell {
                     Report::Unreachable(peer) => ControllerInput::Udp2011Unreachable { peer },
                     Report::Dropped(link, conn) => closed(link, conn),
                 };
-                self.controller.borrow_mut().handle(now, input);
+                self.controller.lock().handle(now, input);
             } else {
                 self.carry_out(output);
             }
@@ -305,6 +320,14 @@ impl ControllerShell {
         self.play();
         self.check_waits();
         self.tell_events();
+        self.watch();
+    }
+
+    /// Notes whether anybody has to hear of each change. Called before the changes that count are looked for.
+    fn watch(&self) {
+        let is_watched =
+            !self.waits.borrow().is_empty() || self.timeline.borrow().is_some() || self.tells_anybody();
+        self.controller.lock().watch(is_watched);
     }
 
     fn carry_out(&self, output: ControllerOutput) {
@@ -395,9 +418,7 @@ impl ControllerShell {
     }
 
     fn count(&self, change: impl FnOnce(&mut ShellCounters)) {
-        let mut counters = self.counters.get();
-        change(&mut counters);
-        self.counters.set(counters);
+        self.controller.count(change);
     }
 }
 

@@ -245,8 +245,8 @@ impl Connection {
 
 /// Maximum number of bytes per read, whose requests are carried out before other tasks run: the longest
 /// Modbus request.
-const CHUNK: usize = 260;
+pub(super) const CHUNK: usize = 260;
 /// Maximum number of bytes that wait for a peer; more than the answers to the requests of one read.
-const MAX_UNSENT: usize = 64 * 1_024;
+pub(super) const MAX_UNSENT: usize = 64 * 1_024;
 /// How long a closed connection may take to send the rest.
-const LINGER: std::time::Duration = std::time::Duration::from_secs(2);
+pub(super) const LINGER: std::time::Duration = std::time::Duration::from_secs(2);
