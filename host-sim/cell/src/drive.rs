@@ -7,6 +7,7 @@ use proto_core::wire::can::{CanFrame, CanId};
 use super::connection::{Connection, Peer};
 use super::due::Due;
 use super::network::{ConnectPolicy, Item, Sender, Way};
+use super::oracle::{Inputs, copied_inputs, inputs_of};
 use super::{AnyPort, BusId, COMMAND_CLIENT, Cell, End, LineId, What, udp_peer};
 use recipe_controller::{ControllerInput, ControllerOutput, Link};
 
@@ -375,18 +376,15 @@ impl Cell {
     }
 
     /// The controller's inputs; `None` if no model compares them.
-    pub(super) fn inputs_before(&self) -> Option<Vec<u8>> {
-        self.oracle.as_ref().map(|_| self.inputs())
+    pub(super) fn inputs_before(&self) -> Option<Inputs> {
+        self.oracle.as_ref().map(|_| copied_inputs(self.controller.registers().image()))
     }
 
-    pub(super) fn inputs(&self) -> Vec<u8> {
-        super::oracle::inputs_of(self.controller.registers().image())
-    }
-
-    fn datagram_arrived(&mut self, link: LinkId, tag: u64, bytes: &[u8], before: Option<Vec<u8>>) {
-        let (after, slowest) = (self.inputs_before(), self.gate(link).network.slowest());
-        if let (Some(oracle), Some(before), Some(after)) = (&mut self.oracle, before, after) {
-            oracle.arrived_datagram(link, tag, bytes, (&before, &after), slowest, self.now);
+    fn datagram_arrived(&mut self, link: LinkId, tag: u64, bytes: &[u8], before: Option<Inputs>) {
+        let slowest = self.gate(link).network.slowest();
+        if let (Some(oracle), Some(before)) = (&mut self.oracle, before) {
+            let after = inputs_of(self.controller.registers().image());
+            oracle.arrived_datagram(link, tag, bytes, (&before, after), slowest, self.now);
         }
     }
 

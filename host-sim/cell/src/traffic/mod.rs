@@ -10,6 +10,7 @@ use proto_core::engine::{Input, LinkId, LinkKind};
 use super::connection::Peer;
 use super::due::Due;
 use super::network::{Item, Sender, Way};
+use super::oracle::inputs_of;
 use super::tcp::{Arrived, USER_TIMEOUT};
 use super::{AnyPort, Cell, End, What, udp_peer};
 use recipe_controller::{ConnId, ControllerInput, Link};
@@ -218,9 +219,10 @@ impl Cell {
             Peer::Server(Link::State) => return,
             Peer::Client(port) => ControllerInput::PortBytes { port, bytes },
         });
-        let (after, slowest) = (self.inputs_before(), self.gate(link).network.slowest());
-        if let (Some(oracle), Some(before), Some(after)) = (&mut self.oracle, before, after) {
-            oracle.arrived(id, link, bytes, (&before, &after), slowest, self.now);
+        let slowest = self.gate(link).network.slowest();
+        if let (Some(oracle), Some(before)) = (&mut self.oracle, before) {
+            let after = inputs_of(self.controller.registers().image());
+            oracle.arrived(id, link, bytes, (&before, after), slowest, self.now);
         }
     }
 }
