@@ -34,7 +34,9 @@ impl Cell {
 
     /// Handles everything that is due now, once.
     fn step(&mut self) {
-        self.show_controller();
+        if !std::mem::replace(&mut self.controller_is_seen, true) {
+            self.show_controller();
+        }
         if let Some(due) = self.queue.pop_due(self.now) {
             self.carry_out(due);
             return;
@@ -49,14 +51,21 @@ impl Cell {
     }
 
     fn next_deadline(&self) -> Instant {
+        let engine = if self.is_asleep() { Instant::NEVER } else { self.engine_wake };
+        self.queue.next().min(engine).min(self.controller_wake).min(self.devices_wake)
+    }
+
+    /// Something has been done with a device, which may have another deadline now.
+    pub(super) fn note_deadlines(&mut self) {
         let lines = self.lines.iter().filter_map(|line| line.device.as_ref()).map(|device| device.deadline());
         let buses = self.buses.iter().filter_map(|bus| bus.device.as_ref()).map(|device| device.deadline());
-        let devices = lines.chain(buses).min().unwrap_or(Instant::NEVER);
-        let engine = if self.is_asleep() { Instant::NEVER } else { self.engine_wake };
-        self.queue.next().min(engine).min(self.controller_wake).min(devices)
+        self.devices_wake = lines.chain(buses).min().unwrap_or(Instant::NEVER);
     }
 
     fn poll_devices(&mut self) {
+        if self.now < self.devices_wake {
+            return;
+        }
         for nth in 0..self.lines.len() {
             let now = self.now;
             let device = self.lines[nth].device.as_mut().filter(|device| device.deadline() <= now);
@@ -130,7 +139,8 @@ impl Cell {
         if let Some(oracle) = &mut self.oracle {
             oracle.input(now, &input, &self.engine);
         }
-        let mut buf = [0; OUTPUT_BUFFER];
+        // An input can come of an output: each has a buffer of its own.
+        let mut buf = self.buffer.take().unwrap_or_else(|| Box::new([0; OUTPUT_BUFFER]));
         loop {
             let output = self.engine.poll_output(now, &mut buf);
             #[cfg(test)]
@@ -143,9 +153,10 @@ impl Cell {
                 }
             }
             if !self.hand_over(output) {
-                return;
+                break;
             }
         }
+        self.buffer = Some(buf);
     }
 
     /// Carries out the engine's output; false if it was `Sleep`.
@@ -210,6 +221,7 @@ impl Cell {
         self.controller.handle(now, input);
         self.show_controller();
         self.drain_controller();
+        self.controller_is_seen = false;
     }
 
     /// The model sees the controller's registers, if it needs them.
@@ -394,12 +406,16 @@ impl Cell {
 }
 
 /// A frame in the form of the trace.
-pub(super) fn can_bytes(frame: &CanFrame) -> Vec<u8> {
+pub(super) fn can_bytes(frame: &CanFrame) -> impl std::ops::Deref<Target = [u8]> {
     let id = match frame.id() {
         CanId::Standard(id) => u32::from(id),
         CanId::Extended(id) => id | 0x8000_0000,
     };
-    id.to_be_bytes().into_iter().chain(frame.data().iter().copied()).collect()
+    let mut bytes = heapless::Vec::<u8, 12>::new();
+    // A frame has at most eight bytes.
+    let _ = bytes.extend_from_slice(&id.to_be_bytes());
+    let _ = bytes.extend_from_slice(frame.data());
+    bytes
 }
 
 /// Maximum number of steps at one instant, far more than needed.

@@ -28,16 +28,15 @@ impl Cell {
             }
         };
         let waited = conn.pipe(way).retransmit_at;
-        let arrivals = conn.pipe(way).send(now, item, acks, gate, way);
+        let queue = &mut self.queue;
+        let arrives = |at| queue.push(at, Due::Arrival { conn: id, way });
+        conn.pipe(way).send(now, item, acks, gate, way, arrives);
         if waited.is_none()
             && let Some(at) = conn.pipe(way).retransmit_at
         {
             self.queue.push(at, Due::Retransmit { conn: id, way });
         }
         let is_too_much = way == Way::Down && !conn.down.dead && conn.down.on_the_way() > CONTROLLER_BUFFER;
-        for at in arrivals {
-            self.queue.push(at, Due::Arrival { conn: id, way });
-        }
         if is_too_much {
             self.reset_conn(id);
         }
@@ -130,6 +129,7 @@ impl Cell {
     /// Network ports send without delay.
     fn controller_input_later(&mut self, port: usize) {
         self.controller.handle(self.now, ControllerInput::PortSent { port });
+        self.controller_is_seen = false;
     }
 
     /// Something may have arrived at one end of a connection.
