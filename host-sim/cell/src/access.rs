@@ -43,6 +43,7 @@ impl Cell {
     /// The controller, to inject faults. They take effect with the next [`Self::run`].
     pub fn controller_mut(&mut self) -> &mut Controller {
         self.controller_wake = self.now;
+        self.controller_is_seen = false;
         &mut self.controller
     }
 
@@ -159,11 +160,13 @@ impl Cell {
     /// Attaches a device to a line; it replaces the previous one.
     pub fn attach(&mut self, line: LineId, device: impl Device<Vec<u8>> + 'static) {
         self.lines[line.0].device = Some(Box::new(device));
+        self.note_deadlines();
     }
 
     /// Attaches a device to a bus; it replaces the previous one.
     pub fn attach_can(&mut self, bus: BusId, device: impl Device<CanFrame> + 'static) {
         self.buses[bus.0].device = Some(Box::new(device));
+        self.note_deadlines();
     }
 
     /// Sends as the device on the line, after its previous transmission.

@@ -12,7 +12,7 @@ pub trait Device<M> {
         Vec::new()
     }
 
-    /// When to call [`Self::poll`].
+    /// When to call [`Self::poll`]. Only [`Self::poll`] and [`Self::receive`] change it.
     fn deadline(&self) -> Instant {
         Instant::NEVER
     }

@@ -7,6 +7,7 @@ use proto_core::wire::can::{CanFrame, CanId};
 use super::connection::{Connection, Peer};
 use super::due::Due;
 use super::network::{ConnectPolicy, Item, Sender, Way};
+use super::oracle::{Inputs, copied_inputs, inputs_of};
 use super::{AnyPort, BusId, COMMAND_CLIENT, Cell, End, LineId, What, udp_peer};
 use recipe_controller::{ControllerInput, ControllerOutput, Link};
 
@@ -33,7 +34,9 @@ impl Cell {
 
     /// Handles everything that is due now, once.
     fn step(&mut self) {
-        self.show_controller();
+        if !std::mem::replace(&mut self.controller_is_seen, true) {
+            self.show_controller();
+        }
         if let Some(due) = self.queue.pop_due(self.now) {
             self.carry_out(due);
             return;
@@ -48,14 +51,21 @@ impl Cell {
     }
 
     fn next_deadline(&self) -> Instant {
+        let engine = if self.is_asleep() { Instant::NEVER } else { self.engine_wake };
+        self.queue.next().min(engine).min(self.controller_wake).min(self.devices_wake)
+    }
+
+    /// Something has been done with a device, which may have another deadline now.
+    pub(super) fn note_deadlines(&mut self) {
         let lines = self.lines.iter().filter_map(|line| line.device.as_ref()).map(|device| device.deadline());
         let buses = self.buses.iter().filter_map(|bus| bus.device.as_ref()).map(|device| device.deadline());
-        let devices = lines.chain(buses).min().unwrap_or(Instant::NEVER);
-        let engine = if self.is_asleep() { Instant::NEVER } else { self.engine_wake };
-        self.queue.next().min(engine).min(self.controller_wake).min(devices)
+        self.devices_wake = lines.chain(buses).min().unwrap_or(Instant::NEVER);
     }
 
     fn poll_devices(&mut self) {
+        if self.now < self.devices_wake {
+            return;
+        }
         for nth in 0..self.lines.len() {
             let now = self.now;
             let device = self.lines[nth].device.as_mut().filter(|device| device.deadline() <= now);
@@ -129,7 +139,8 @@ impl Cell {
         if let Some(oracle) = &mut self.oracle {
             oracle.input(now, &input, &self.engine);
         }
-        let mut buf = [0; OUTPUT_BUFFER];
+        // An input can come of an output: each has a buffer of its own.
+        let mut buf = self.buffer.take().unwrap_or_else(|| Box::new([0; OUTPUT_BUFFER]));
         loop {
             let output = self.engine.poll_output(now, &mut buf);
             #[cfg(test)]
@@ -142,9 +153,10 @@ impl Cell {
                 }
             }
             if !self.hand_over(output) {
-                return;
+                break;
             }
         }
+        self.buffer = Some(buf);
     }
 
     /// Carries out the engine's output; false if it was `Sleep`.
@@ -209,6 +221,7 @@ impl Cell {
         self.controller.handle(now, input);
         self.show_controller();
         self.drain_controller();
+        self.controller_is_seen = false;
     }
 
     /// The model sees the controller's registers, if it needs them.
@@ -375,18 +388,15 @@ impl Cell {
     }
 
     /// The controller's inputs; `None` if no model compares them.
-    pub(super) fn inputs_before(&self) -> Option<Vec<u8>> {
-        self.oracle.as_ref().map(|_| self.inputs())
+    pub(super) fn inputs_before(&self) -> Option<Inputs> {
+        self.oracle.as_ref().map(|_| copied_inputs(self.controller.registers().image()))
     }
 
-    pub(super) fn inputs(&self) -> Vec<u8> {
-        super::oracle::inputs_of(self.controller.registers().image())
-    }
-
-    fn datagram_arrived(&mut self, link: LinkId, tag: u64, bytes: &[u8], before: Option<Vec<u8>>) {
-        let (after, slowest) = (self.inputs_before(), self.gate(link).network.slowest());
-        if let (Some(oracle), Some(before), Some(after)) = (&mut self.oracle, before, after) {
-            oracle.arrived_datagram(link, tag, bytes, (&before, &after), slowest, self.now);
+    fn datagram_arrived(&mut self, link: LinkId, tag: u64, bytes: &[u8], before: Option<Inputs>) {
+        let slowest = self.gate(link).network.slowest();
+        if let (Some(oracle), Some(before)) = (&mut self.oracle, before) {
+            let after = inputs_of(self.controller.registers().image());
+            oracle.arrived_datagram(link, tag, bytes, (&before, after), slowest, self.now);
         }
     }
 
@@ -396,12 +406,16 @@ impl Cell {
 }
 
 /// A frame in the form of the trace.
-pub(super) fn can_bytes(frame: &CanFrame) -> Vec<u8> {
+pub(super) fn can_bytes(frame: &CanFrame) -> impl std::ops::Deref<Target = [u8]> {
     let id = match frame.id() {
         CanId::Standard(id) => u32::from(id),
         CanId::Extended(id) => id | 0x8000_0000,
     };
-    id.to_be_bytes().into_iter().chain(frame.data().iter().copied()).collect()
+    let mut bytes = heapless::Vec::<u8, 12>::new();
+    // A frame has at most eight bytes.
+    let _ = bytes.extend_from_slice(&id.to_be_bytes());
+    let _ = bytes.extend_from_slice(frame.data());
+    bytes
 }
 
 /// Maximum number of steps at one instant, far more than needed.

@@ -1,5 +1,6 @@
 //! Traffic between ports and their devices: bytes on lines, frames on buses.
 
+use proto_core::engine::Input;
 use proto_core::time::Instant;
 use proto_core::wire::can::CanFrame;
 
@@ -67,6 +68,7 @@ impl Cell {
     pub(super) fn line_did(&mut self, id: LineId) {
         let line = &mut self.lines[id.0];
         let done = line.device.as_mut().map_or_else(Vec::new, |device| device.take_done());
+        self.note_deadlines();
         self.device_did(self.lines[id.0].owner, done);
     }
 
@@ -74,6 +76,7 @@ impl Cell {
     pub(super) fn bus_did(&mut self, id: BusId) {
         let bus = &mut self.buses[id.0];
         let done = bus.device.as_mut().map_or_else(Vec::new, |device| device.take_done());
+        self.note_deadlines();
         self.device_did(self.buses[id.0].owner, done);
     }
 
@@ -92,7 +95,10 @@ impl Cell {
 
     pub(super) fn port_receives(&mut self, owner: AnyPort, bytes: &[u8]) {
         match owner {
-            AnyPort::Gateway(port) => self.report_port_event(port, PortEvent::Bytes(bytes.to_vec())),
+            AnyPort::Gateway(port) if self.is_asleep() => {
+                self.report_port_event(port, PortEvent::Bytes(bytes.to_vec()));
+            }
+            AnyPort::Gateway(port) => self.engine_input(Input::PortBytes { port, bytes }),
             AnyPort::Controller(port) => self.controller_input(ControllerInput::PortBytes { port, bytes }),
         }
     }

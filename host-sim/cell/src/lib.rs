@@ -56,7 +56,7 @@ use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use proto_core::config::GatewayConfig;
-use proto_core::engine::{BuildError as EngineError, Engine, LinkId, PortId};
+use proto_core::engine::{BuildError as EngineError, Engine, LinkId, OUTPUT_BUFFER, PortId};
 use proto_core::time::{Duration, Instant};
 
 pub use can::{BusCounters, CanBus};
@@ -141,6 +141,12 @@ pub struct Cell {
     engine_wake: Instant,
     controller: Controller,
     controller_wake: Instant,
+    /// The model has seen the controller's registers as they are.
+    controller_is_seen: bool,
+    /// The earliest deadline of all devices.
+    devices_wake: Instant,
+    /// For what the engine hands over; `None` while it is used.
+    buffer: Option<Box<[u8; OUTPUT_BUFFER]>>,
     now: Instant,
     queue: Queue<Due>,
     gates: BTreeMap<LinkId, Gate>,
@@ -210,6 +216,9 @@ impl Cell {
             engine_wake: Instant::ZERO,
             controller: Controller::new(controller).map_err(CellError::Controller)?,
             controller_wake: Instant::ZERO,
+            controller_is_seen: false,
+            devices_wake: Instant::NEVER,
+            buffer: None,
             now: START,
             queue: Queue::new(),
             gates: BTreeMap::new(),

@@ -1,6 +1,8 @@
 //! A queue of events, ordered by time and, at one instant, by arrival.
+//!
+//! What is ordered is small, and the events stay where they are: most of a cell's time would go into moving them.
 
-use std::cmp::Ordering;
+use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
 use proto_core::time::Instant;
@@ -8,60 +10,88 @@ use proto_core::time::Instant;
 /// The queue.
 #[derive(Debug)]
 pub(super) struct Queue<T> {
-    entries: BinaryHeap<Entry<T>>,
+    /// The earliest entry is on top.
+    order: BinaryHeap<Reverse<Entry>>,
+    things: Vec<Option<T>>,
+    /// Free places in `things`.
+    free: Vec<usize>,
     pushed: u64,
 }
 
-#[derive(Debug)]
-struct Entry<T> {
-    at: Instant,
-    nth: u64,
-    thing: T,
-}
+/// An instant, a number that grows with each entry, and a place in `things`: in one number, so that one comparison
+/// orders two of them.
+type Entry = u128;
 
 impl<T> Queue<T> {
     pub(super) const fn new() -> Self {
-        Self { entries: BinaryHeap::new(), pushed: 0 }
+        Self { order: BinaryHeap::new(), things: Vec::new(), free: Vec::new(), pushed: 0 }
     }
 
     pub(super) fn push(&mut self, at: Instant, thing: T) {
-        self.entries.push(Entry { at, nth: self.pushed, thing });
+        let place = match self.free.pop() {
+            Some(place) => {
+                self.things[place] = Some(thing);
+                place
+            }
+            None => {
+                self.things.push(Some(thing));
+                self.things.len() - 1
+            }
+        };
+        assert!(place < MOST, "{place} events wait");
+        let behind = self.pushed << PLACE_BITS | place as u64;
+        self.order.push(Reverse(u128::from(at.as_micros()) << 64 | u128::from(behind)));
         self.pushed += 1;
     }
 
     pub(super) fn len(&self) -> usize {
-        self.entries.len()
+        self.order.len()
     }
 
     pub(super) fn next(&self) -> Instant {
-        self.entries.peek().map_or(Instant::NEVER, |entry| entry.at)
+        self.order.peek().map_or(Instant::NEVER, |Reverse(entry)| Instant::from_micros((entry >> 64) as u64))
     }
 
     pub(super) fn pop_due(&mut self, now: Instant) -> Option<T> {
         if self.next() > now {
             return None;
         }
-        self.entries.pop().map(|entry| entry.thing)
+        let Reverse(entry) = self.order.pop()?;
+        let place = entry as usize % MOST;
+        self.free.push(place);
+        self.things[place].take()
     }
 }
 
-/// The earliest entry is the greatest, because a heap returns the greatest first.
-impl<T> Ord for Entry<T> {
-    fn cmp(&self, other: &Self) -> Ordering {
-        (other.at, other.nth).cmp(&(self.at, self.nth))
+/// More events than the model allows to wait at once; 2^40 can be pushed.
+const PLACE_BITS: u32 = 24;
+const MOST: usize = 1 << PLACE_BITS;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn events_come_by_time_and_at_one_instant_in_the_order_of_their_arrival() {
+        let at = Instant::from_micros;
+        let mut queue = Queue::new();
+        let mut come = Vec::new();
+        for round in 1..=100 {
+            for nth in 0..7 {
+                queue.push(at(10 * round + 5 * (nth % 3)), (round, nth));
+            }
+            assert_eq!(queue.pop_due(at(10 * round - 1)), None);
+            while let Some(event) = queue.pop_due(at(10 * round + 5)) {
+                come.push(event);
+            }
+        }
+        while let Some(event) = queue.pop_due(Instant::NEVER) {
+            come.push(event);
+        }
+        let mut expected: Vec<_> = (1..=100).flat_map(|round| (0..7).map(move |nth| (round, nth))).collect();
+        expected.sort_by_key(|&(round, nth)| (10 * round + 5 * (nth % 3), round, nth));
+        assert_eq!(come, expected);
+        assert_eq!((queue.len(), queue.next()), (0, Instant::NEVER));
+        assert!(queue.things.len() <= 14, "places are used again");
     }
 }
-
-impl<T> PartialOrd for Entry<T> {
-    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
-        Some(self.cmp(other))
-    }
-}
-
-impl<T> PartialEq for Entry<T> {
-    fn eq(&self, other: &Self) -> bool {
-        self.nth == other.nth
-    }
-}
-
-impl<T> Eq for Entry<T> {}

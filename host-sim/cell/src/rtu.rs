@@ -3,16 +3,21 @@
 
 /// A frame with its CRC, the low byte first.
 pub(crate) fn sealed(bytes: &[u8]) -> Vec<u8> {
+    [bytes, &crc(bytes)].concat()
+}
+
+/// The low byte first.
+fn crc(bytes: &[u8]) -> [u8; 2] {
     let crc = bytes.iter().fold(0xFFFF_u16, |crc, &byte| {
         (0..8).fold(crc ^ u16::from(byte), |crc, _| if crc & 1 == 1 { crc >> 1 ^ 0xA001 } else { crc >> 1 })
     });
-    [bytes, &crc.to_le_bytes()].concat()
+    crc.to_le_bytes()
 }
 
 /// Whether the last two bytes are the CRC of the others.
 pub(crate) fn is_right(frame: &[u8]) -> bool {
-    let (bytes, _) = frame.split_at(frame.len() - 2);
-    sealed(bytes) == frame
+    let (bytes, own) = frame.split_at(frame.len() - 2);
+    crc(bytes) == own
 }
 
 #[cfg(test)]

@@ -87,14 +87,7 @@ impl Cell {
 
     fn report_port_events(&mut self, waiting: Vec<(PortId, PortEvent)>) {
         for (port, event) in waiting {
-            self.engine_input(match &event {
-                PortEvent::Up => Input::PortUp { port },
-                PortEvent::Down => Input::PortDown { port },
-                PortEvent::Sent => Input::PortSent { port },
-                PortEvent::Bus(state) => Input::PortBus { port, state: *state },
-                PortEvent::Bytes(bytes) => Input::PortBytes { port, bytes },
-                PortEvent::Frame(frame) => Input::PortCan { port, frame: *frame },
-            });
+            self.engine_input(event.input(port));
         }
     }
 
@@ -116,7 +109,7 @@ impl Cell {
     pub(super) fn report_port_event(&mut self, port: PortId, event: PortEvent) {
         match &mut self.asleep {
             Some(waiting) => waiting.keep(port, event),
-            None => self.report_port_events(vec![(port, event)]),
+            None => self.engine_input(event.input(port)),
         }
     }
 
@@ -138,6 +131,19 @@ impl Cell {
             waiting.links.push(due);
         }
         None
+    }
+}
+
+impl PortEvent {
+    fn input(&self, port: PortId) -> Input<'_> {
+        match self {
+            Self::Up => Input::PortUp { port },
+            Self::Down => Input::PortDown { port },
+            Self::Sent => Input::PortSent { port },
+            Self::Bus(state) => Input::PortBus { port, state: *state },
+            Self::Bytes(bytes) => Input::PortBytes { port, bytes },
+            Self::Frame(frame) => Input::PortCan { port, frame: *frame },
+        }
     }
 }
 

@@ -7,7 +7,7 @@ use super::Cell;
 use super::connection::Connection;
 use super::due::Due;
 use super::network::{ConnectPolicy, Gate, Way};
-use super::oracle::Path;
+use super::oracle::{Path, inputs_of};
 use recipe_controller::Link;
 
 impl Cell {
@@ -37,9 +37,9 @@ impl Cell {
         if self.oracle.is_none() {
             return;
         }
-        let (paths, inputs, now) = (self.paths(), self.inputs(), self.now);
+        let (paths, now) = (self.paths(), self.now);
         if let Some(oracle) = &mut self.oracle {
-            oracle.survey(&paths, &inputs, now);
+            oracle.survey(&paths, inputs_of(self.controller.registers().image()), now);
         }
         self.queue.push(now + SURVEY_EVERY, Due::Survey);
     }

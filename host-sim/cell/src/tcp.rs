@@ -88,7 +88,7 @@ impl Pipe {
         }
     }
 
-    /// Hands an item over; returns when its segments arrive. None do while an earlier one is lost.
+    /// Hands an item over; `arrives` gets when each of its segments arrives. None does while an earlier one is lost.
     pub(super) fn send(
         &mut self,
         now: Instant,
@@ -96,7 +96,8 @@ impl Pipe {
         acks: u64,
         gate: &mut Gate,
         way: Way,
-    ) -> Vec<Instant> {
+        mut arrives: impl FnMut(Instant),
+    ) {
         if let Item::Bytes(bytes) = &item {
             if self.unacked() == 0 {
                 self.unacked_since = now;
@@ -104,15 +105,14 @@ impl Pipe {
             self.sent += bytes.len() as u64;
         }
         if self.dead {
-            return Vec::new();
+            return;
         }
         if gate.is_cut(way) || self.retransmit_at.is_some() {
             self.segments.push_back(Segment { sent_at: now, arrives: Instant::NEVER, acks, item });
             self.retransmit_at.get_or_insert(now + self.rto);
-            return Vec::new();
+            return;
         }
         let network = gate.network;
-        let mut arrivals = Vec::new();
         let mut arrive = |gate: &mut Gate, item| {
             let late = gate.rng.up_to(network.jitter) + gate.rng.up_to(network.merge);
             let mut at = (now + network.delay + late).max(self.newest);
@@ -122,7 +122,7 @@ impl Pipe {
             }
             self.newest = at;
             self.segments.push_back(Segment { sent_at: now, arrives: at, acks, item });
-            arrivals.push(at);
+            arrives(at);
         };
         match (item, network.longest_segment) {
             (Item::Bytes(bytes), Some(longest)) => {
@@ -136,7 +136,6 @@ impl Pipe {
             }
             (item, _) => arrive(gate, item),
         }
-        arrivals
     }
 
     /// Takes the next item that has arrived; bytes that came together are one piece. Also returns how

@@ -101,9 +101,7 @@ impl Trace {
         for word in words {
             self.mix(u64::from_le_bytes(*word));
         }
-        let mut last = [0; 8];
-        last[..rest.len()].copy_from_slice(rest);
-        self.mix(u64::from_le_bytes(last));
+        self.mix(rest.iter().rev().fold(0, |word, &byte| word << 8 | u64::from(byte)));
         if self.entries.len() < self.limit {
             self.entries.push(Entry { at, what, subject, bytes: bytes.to_vec() });
         }

@@ -394,10 +394,11 @@ impl Controller {
         let image = spoiled.as_ref().unwrap_or(self.registers.image());
         for (nth, port) in self.ports.iter_mut().enumerate() {
             let outgoing = port.poll(now, image);
+            if outgoing.is_empty() {
+                continue;
+            }
             if self.faults.mutes_port(nth) {
-                if !outgoing.is_empty() {
-                    port.sent();
-                }
+                port.sent();
                 continue;
             }
             self.outputs.extend(outgoing.into_iter().map(|outgoing| match outgoing {

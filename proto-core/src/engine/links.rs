@@ -161,6 +161,18 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         self.view().infos()
     }
 
+    /// Whether a link is up.
+    pub(super) fn is_up(&self, id: LinkId) -> bool {
+        let supervisor = match id {
+            LinkId::COMMAND => self.command.first().map(|link| &link.ordinary.supervisor),
+            LinkId::URGENT => self.command.first().and_then(|link| Some(&link.urgent.as_ref()?.supervisor)),
+            LinkId::STATE => self.state.first().map(|link| &link.supervisor),
+            LinkId::MODBUS => self.modbus.first().map(|link| &link.supervisor),
+            id => self.recipes.iter().find(|link| link.id == id).map(|link| &link.supervisor),
+        };
+        supervisor.is_some_and(Supervisor::is_up)
+    }
+
     /// Where a link of [`Self::infos`] goes; the controller's name is written into `buf`.
     #[cold]
     #[inline(never)]

@@ -48,6 +48,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.links.infos()
     }
 
+    /// Whether a link is up; false if the configuration does not need it. [`Self::links`] tells more of it.
+    pub fn is_up(&self, link: LinkId) -> bool {
+        self.links.is_up(link)
+    }
+
     /// Whether a datagram is a frame of the link's output part. The driver of a listening UDP link
     /// checks this before it answers another sender than before.
     pub fn is_frame(&self, link: LinkId, datagram: &[u8]) -> bool {

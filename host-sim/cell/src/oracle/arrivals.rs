@@ -5,9 +5,9 @@ use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 
 use super::bits::Coils;
-use super::field::LineWatch;
-use super::spec::{Frame, Raw, written};
-use super::wire::Asked;
+use super::field::Cut;
+use super::spec::{Frame, Raw};
+use super::wire::{Asked, Inputs};
 use super::{Invariant, Oracle};
 
 impl Oracle {
@@ -18,7 +18,7 @@ impl Oracle {
         conn: u64,
         link: LinkId,
         bytes: &[u8],
-        (before, after): (&[u8], &[u8]),
+        (before, after): (&Inputs, &[u8]),
         slowest: Duration,
         now: Instant,
     ) {
@@ -26,33 +26,36 @@ impl Oracle {
         self.judge(now, &[Invariant::Transport], result);
         self.delivered(conn, bytes.len(), slowest, now);
         self.robot.applied(before, after, now);
-        let mut expected = before.to_vec();
+        let mut expected = None;
         match link {
             LinkId::MODBUS => {
-                for pdu in self.controller.requests(conn, bytes) {
-                    match self.map.request(&pdu) {
-                        Some(Asked::Write(values)) => put_all(&mut expected, &values),
-                        Some(Asked::WriteBits(Coils { var, mask, on })) => {
-                            let byte = &mut expected[var.image_offset()];
-                            *byte = *byte & !mask | on;
-                        }
-                        _ => {}
+                let Self { controller, map, .. } = self;
+                controller.requests(conn, bytes, |pdu| match map.request(pdu) {
+                    Some(Asked::Write(values)) => {
+                        let expected = expected.get_or_insert(*before);
+                        values.iter().for_each(|value| put(expected, *value));
                     }
-                }
+                    Some(Asked::WriteBits(Coils { var, mask, on })) => {
+                        let byte = &mut expected.get_or_insert(*before)[var.image_offset()];
+                        *byte = *byte & !mask | on;
+                    }
+                    _ => {}
+                });
             }
             LinkId::COMMAND | LinkId::URGENT | LinkId::STATE => {}
             _ => {
-                let Some(frame) = self.spec.link(link).and_then(|link| link.input.clone()) else { return };
-                let mut held = std::mem::take(self.controller.held(conn));
+                let Self { controller, spec, .. } = self;
+                let Some(frame) = spec.link(link).and_then(|link| link.input.as_ref()) else { return };
+                let held = controller.held(conn);
                 held.extend_from_slice(bytes);
-                let mut line = LineWatch { held, ..LineWatch::default() };
-                for payload in line.cut(&frame) {
-                    put_all(&mut expected, &values_of(&frame, &payload));
+                let mut cut = Cut::default();
+                while let Some(payload) = cut.next(frame, held) {
+                    put_frame(expected.get_or_insert(*before), frame, payload);
                 }
-                *self.controller.held(conn) = line.held;
+                held.drain(..cut.len());
             }
         }
-        self.registers(before, &expected, after, now);
+        self.registers(before, expected.as_ref(), after, now);
     }
 
     /// Same, for a datagram.
@@ -61,7 +64,7 @@ impl Oracle {
         link: LinkId,
         tag: u64,
         bytes: &[u8],
-        (before, after): (&[u8], &[u8]),
+        (before, after): (&Inputs, &[u8]),
         slowest: Duration,
         now: Instant,
     ) {
@@ -69,18 +72,18 @@ impl Oracle {
         self.judge(now, &[Invariant::Transport], result);
         self.datagram_delivered(tag, slowest, now);
         self.robot.applied(before, after, now);
-        let mut expected = before.to_vec();
+        let mut expected = None;
         if let Some(frame) = self.spec.link(link).and_then(|link| link.input.as_ref())
             && let Some(payload) = frame.payload_of(bytes)
         {
-            put_all(&mut expected, &values_of(frame, payload));
+            put_frame(expected.get_or_insert(*before), frame, payload);
         }
-        self.registers(before, &expected, after, now);
+        self.registers(before, expected.as_ref(), after, now);
     }
 
     /// A write is applied as a whole or, if the controller refuses it, not at all.
-    fn registers(&mut self, before: &[u8], expected: &[u8], after: &[u8], now: Instant) {
-        let result = if after == expected || after == before {
+    fn registers(&mut self, before: &Inputs, expected: Option<&Inputs>, after: &[u8], now: Instant) {
+        let result = if after == before || expected.is_some_and(|expected| after == expected) {
             Ok(())
         } else {
             Err((Invariant::Registers, "the controller's inputs are not the values written".to_owned()))
@@ -89,25 +92,22 @@ impl Oracle {
     }
 }
 
-fn values_of(frame: &Frame, payload: &[u8]) -> Vec<(SysVar, Raw)> {
+/// The controller takes a frame.
+fn put_frame(inputs: &mut Inputs, frame: &Frame, payload: &[u8]) {
     let mut rest = payload;
-    let vars = frame.fields.iter().flat_map(written);
-    let values = vars.map(|var| {
+    for &var in &frame.written {
         let (bytes, after) = rest.split_at(var.size());
         rest = after;
         let mut raw = Raw::default();
         raw[..bytes.len()].copy_from_slice(bytes);
-        (var, raw)
-    });
-    values.collect()
+        put(inputs, (var, raw));
+    }
 }
 
-fn put_all(image: &mut [u8], values: &[(SysVar, Raw)]) {
-    for (var, raw) in values {
-        let at = var.image_offset();
-        let mask = if var.is_bits() { var.valid_bits() } else { 0xFF };
-        for (place, byte) in image[at..at + var.size()].iter_mut().zip(raw) {
-            *place = byte & mask;
-        }
+fn put(inputs: &mut Inputs, (var, raw): (SysVar, Raw)) {
+    let at = var.image_offset();
+    let mask = if var.is_bits() { var.valid_bits() } else { 0xFF };
+    for (place, byte) in inputs[at..at + var.size()].iter_mut().zip(raw) {
+        *place = byte & mask;
     }
 }

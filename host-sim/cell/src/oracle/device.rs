@@ -112,9 +112,10 @@ impl DeviceSpec {
         let (sum, place, covered) = self.sum.as_ref()?;
         let (id, covered) = (sum.data_id.bytes(), &frame[covered.clone()]);
         let (before, behind) = if sum.data_id.is_behind() { (&[][..], id) } else { (id, &[][..]) };
-        let number = checksum(&sum.algorithm, &[before, covered, behind].concat());
+        let number = checksum(&sum.algorithm, [before, covered, behind].into_iter().flatten().copied());
         let len = if sum.text { place.len() / 2 } else { place.len() };
-        let mut bytes = number.to_be_bytes()[4 - len..].to_vec();
+        let mut bytes = number.to_be_bytes();
+        let bytes = &mut bytes[4 - len..];
         if sum.order == ByteOrder::Little {
             bytes.reverse();
         }
@@ -193,24 +194,24 @@ pub(super) fn sum_bytes(sum: &Checksum) -> usize {
     if sum.text { 2 * bytes } else { bytes }
 }
 
-fn checksum(algorithm: &Algorithm, bytes: &[u8]) -> u32 {
-    let sum: u32 = bytes.iter().map(|&byte| u32::from(byte)).sum();
+fn checksum(algorithm: &Algorithm, bytes: impl Iterator<Item = u8> + Clone) -> u32 {
+    let sum = || bytes.clone().map(u32::from).sum::<u32>();
     match algorithm {
-        Algorithm::Sum8 => sum % 256,
-        Algorithm::Sum16 => sum % 65_536,
-        Algorithm::Lrc => (256 - sum % 256) % 256,
-        Algorithm::Xor8 => u32::from(bytes.iter().fold(0, |xor, byte| xor ^ byte)),
+        Algorithm::Sum8 => sum() % 256,
+        Algorithm::Sum16 => sum() % 65_536,
+        Algorithm::Lrc => (256 - sum() % 256) % 256,
+        Algorithm::Xor8 => u32::from(bytes.fold(0, |xor, byte| xor ^ byte)),
         Algorithm::Crc(crc) => crc_of(crc, bytes),
         other => panic!("{other:?} has no model"),
     }
 }
 
 /// The remainder, a bit at a time.
-fn crc_of(crc: &Crc, bytes: &[u8]) -> u32 {
+fn crc_of(crc: &Crc, bytes: impl Iterator<Item = u8>) -> u32 {
     let width = u32::from(crc.width);
     let top = 1_u64 << width;
     let mut register = u64::from(crc.init);
-    for &byte in bytes {
+    for byte in bytes {
         let byte = if crc.refin { byte.reverse_bits() } else { byte };
         for bit in (0..8).rev() {
             let carry = register >> (width - 1) & 1 ^ u64::from(byte >> bit & 1);
@@ -287,22 +288,34 @@ fn fixed(width: Width) -> usize {
     }
 }
 
-/// The bytes with the highest first.
-fn ordered(order: ByteOrder, bytes: &[u8]) -> Vec<u8> {
-    let mut bytes = bytes.to_vec();
+/// The place of the `nth` byte from the highest on, of so many.
+fn place_of(order: ByteOrder, nth: usize, len: usize) -> usize {
     match order {
-        ByteOrder::Big => {}
-        ByteOrder::Little => bytes.reverse(),
-        ByteOrder::BigSwapped => bytes = bytes.chunks(2).rev().flatten().copied().collect(),
-        ByteOrder::LittleSwapped => bytes.chunks_mut(2).for_each(<[u8]>::reverse),
+        ByteOrder::Big => nth,
+        ByteOrder::Little => len - 1 - nth,
+        // Pairs from the last one on; of an odd number, the last byte is alone.
+        ByteOrder::BigSwapped => match nth.checked_sub(len % 2) {
+            Some(nth) => len - len % 2 - 2 - nth / 2 * 2 + nth % 2,
+            None => len - 1,
+        },
+        ByteOrder::LittleSwapped if nth ^ 1 < len => nth ^ 1,
+        ByteOrder::LittleSwapped => nth,
     }
-    bytes
+}
+
+/// The bytes with the highest first.
+fn ordered(order: ByteOrder, bytes: &[u8]) -> impl Iterator<Item = u8> {
+    (0..bytes.len()).map(move |nth| bytes[place_of(order, nth, bytes.len())])
+}
+
+/// The unsigned number that the bytes are.
+fn unsigned(order: ByteOrder, bytes: &[u8]) -> u64 {
+    ordered(order, bytes).fold(0, |number, byte| number << 8 | u64::from(byte))
 }
 
 /// The number of a field's bytes; `None` if it is not readable.
 pub(super) fn read(encoding: &Encoding, bytes: &[u8]) -> Option<f64> {
-    let ordered = ordered(encoding.order, bytes);
-    let unsigned = ordered.iter().fold(0_u64, |number, &byte| number << 8 | u64::from(byte));
+    let unsigned = unsigned(encoding.order, bytes);
     let signed = |number: u64, bits: u32| (number << (64 - bits)).cast_signed() >> (64 - bits);
     Some(match encoding.kind {
         Kind::Scalar(ty) => match ty {
@@ -320,7 +333,7 @@ pub(super) fn read(encoding: &Encoding, bytes: &[u8]) -> Option<f64> {
             if bits.signed { signed(number, bits.count.into()) as f64 } else { number as f64 }
         }
         Kind::Bcd { .. } => {
-            let digits: String = ordered.iter().map(|byte| format!("{byte:02x}")).collect();
+            let digits: String = ordered(encoding.order, bytes).map(|byte| format!("{byte:02x}")).collect();
             digits.parse::<u32>().ok()?.into()
         }
         Kind::Hex(_) => {
@@ -360,13 +373,13 @@ pub(super) fn write(encoding: &Encoding, number: f64, bytes: &mut [u8]) {
         Kind::Scalar(ScalarType::Double) => number.to_bits(),
         Kind::Bits(bits) => {
             let mask = ((1_u64 << bits.count) - 1) << bits.first;
-            let before =
-                ordered(encoding.order, bytes).iter().fold(0_u64, |all, &byte| all << 8 | u64::from(byte));
-            before & !mask | ((number as i64).cast_unsigned() << bits.first) & mask
+            unsigned(encoding.order, bytes) & !mask | ((number as i64).cast_unsigned() << bits.first) & mask
         }
         _ => (number as i64).cast_unsigned(),
     };
-    bytes.copy_from_slice(&ordered(encoding.order, &number.to_be_bytes()[8 - len..]));
+    for (nth, byte) in number.to_be_bytes()[8 - len..].iter().enumerate() {
+        bytes[place_of(encoding.order, nth, len)] = *byte;
+    }
 }
 
 /// The number that a field shows for `number`: rounded, and the nearest that it can have or wrapped.
@@ -414,5 +427,32 @@ pub(super) fn range(encoding: &Encoding) -> (f64, f64) {
             (-most(whole - 1), most(whole))
         }
         other => panic!("{other:?} has no model"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bytes_are_ordered_as_the_pieces_that_they_are_made_of() {
+        let bytes = [1, 2, 3, 4, 5, 6, 7, 8];
+        for len in 1..=bytes.len() {
+            let bytes = &bytes[..len];
+            let pairs = || bytes.chunks(2).map(<[u8]>::to_vec);
+            let each_turned = pairs().map(|mut pair| {
+                pair.reverse();
+                pair
+            });
+            let expected = [
+                (ByteOrder::Big, bytes.to_vec()),
+                (ByteOrder::Little, bytes.iter().rev().copied().collect()),
+                (ByteOrder::BigSwapped, pairs().rev().flatten().collect()),
+                (ByteOrder::LittleSwapped, each_turned.flatten().collect()),
+            ];
+            for (order, expected) in expected {
+                assert_eq!(ordered(order, bytes).collect::<Vec<_>>(), expected, "{order:?} of {len}");
+            }
+        }
     }
 }

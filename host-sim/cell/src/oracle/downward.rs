@@ -1,15 +1,17 @@
 //! What each field port must send, and when (proto-core/docs/engine.md section 8).
 
+use std::borrow::Cow;
+
 use proto_core::config::{FieldSpec, OutputBinding, SendOn};
 use proto_core::device::{Encoding, Overflow};
 use proto_core::sysvar::SysVar;
-use proto_core::time::Instant;
+use proto_core::time::{Duration, Instant};
 use proto_core::wire::scalar::ScalarType;
 
 use super::Invariant;
 use super::device;
 use super::field::as_number;
-use super::spec::{Frame, Origin, PortSpec, Spec, shown};
+use super::spec::{Frame, Origin, PortSpec, Spec};
 use super::upward::{Upward, Wrong};
 use super::varying;
 
@@ -38,6 +40,29 @@ pub(super) struct Downward {
     pub bytes_out: u32,
     pub skipped: u32,
     pub stale: u32,
+}
+
+/// Why a value must not be shown. Most are no violation, so it is put into words only for one that is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Hidden {
+    Unreadable(SysVar),
+    Unknown(SysVar),
+    Stale(SysVar, Duration),
+}
+
+impl Hidden {
+    /// The violation if it was shown all the same.
+    pub(super) fn wrong(self, spec: &Spec) -> Wrong {
+        match self {
+            Self::Unreadable(var) => (Invariant::Unreadable, format!("{var} is unreadable")),
+            Self::Unknown(var) => (Invariant::Known, format!("{var} was never received")),
+            Self::Stale(var, age) => {
+                let is_own = spec.origin[var.ordinal()] == Some(Origin::Field);
+                let invariant = if is_own { Invariant::OwnAge } else { Invariant::Age };
+                (invariant, format!("{var} is {age} old"))
+            }
+        }
+    }
 }
 
 impl Downward {
@@ -126,39 +151,29 @@ impl Downward {
     }
 
     /// Whether all values of the port are known and, if the recipe requires it, not stale.
-    fn may_show(&self, spec: &Spec, port: &PortSpec, up: &Upward, now: Instant) -> Result<(), Wrong> {
-        let trigger = match port.send {
-            SendOn::Rising { var, .. } => Some(var),
-            _ => None,
-        };
-        let fields = port.outputs.iter().flat_map(|frame| &frame.fields).flat_map(shown);
-        self.may_show_all(spec, port, up, fields.chain(trigger), now)
+    fn may_show(port: &PortSpec, up: &Upward, now: Instant) -> Result<(), Hidden> {
+        Self::may_show_all(port, up, port.needed.iter().copied(), now)
     }
 
     /// Whether these values are known and, if the recipe requires it, not stale.
     pub(super) fn may_show_all(
-        &self,
-        spec: &Spec,
         port: &PortSpec,
         up: &Upward,
-        vars: impl Iterator<Item = SysVar>,
+        mut vars: impl Iterator<Item = SysVar>,
         now: Instant,
-    ) -> Result<(), Wrong> {
-        for var in vars {
-            if up.known(var).unreadable {
-                return Err((Invariant::Unreadable, format!("{var} is unreadable")));
+    ) -> Result<(), Hidden> {
+        vars.try_for_each(|var| {
+            let known = up.known(var);
+            if known.unreadable {
+                return Err(Hidden::Unreadable(var));
             }
-            let Some((_, at)) = up.known(var).value else {
-                return Err((Invariant::Known, format!("{var} was never received")));
-            };
+            let Some((_, at)) = known.value else { return Err(Hidden::Unknown(var)) };
             let age = now.saturating_since(at);
             if port.stops_when_stale && age > port.stale_after {
-                let is_own = spec.origin[var.ordinal()] == Some(Origin::Field);
-                let invariant = if is_own { Invariant::OwnAge } else { Invariant::Age };
-                return Err((invariant, format!("{var} is {age} old")));
+                return Err(Hidden::Stale(var, age));
             }
-        }
-        Ok(())
+            Ok(())
+        })
     }
 
     /// A request of so many bytes was handed over.
@@ -202,7 +217,7 @@ impl Downward {
             ));
         }
         if self.next_can == 0 {
-            self.may_show(spec, port, up, now)?;
+            Self::may_show(port, up, now).map_err(|hidden| hidden.wrong(spec))?;
             self.begun.clear();
         }
         let shown = frame.payload_of(bytes);
@@ -229,16 +244,17 @@ impl Downward {
     }
 
     /// The engine has nothing to do: checks that no frame is due that could be sent.
-    pub(super) fn rest(&mut self, spec: &Spec, nth: usize, up: &Upward, now: Instant) -> Result<(), Wrong> {
-        let port = &spec.ports[nth];
-        if !self.may_send(port, now) {
-            return Ok(());
-        }
+    #[inline]
+    pub(super) fn rest(&mut self, port: &PortSpec, up: &Upward, now: Instant) -> Result<(), Wrong> {
+        if self.may_send(port, now) { self.rests_unsent(port, up, now) } else { Ok(()) }
+    }
+
+    fn rests_unsent(&mut self, port: &PortSpec, up: &Upward, now: Instant) -> Result<(), Wrong> {
         if port.outputs.is_empty() {
             self.due = false;
             return Ok(());
         }
-        if self.may_show(spec, port, up, now).is_err() {
+        if Self::may_show(port, up, now).is_err() {
             self.due = false;
             self.stale = self.stale.wrapping_add(1);
             return Ok(());
@@ -274,7 +290,10 @@ impl Downward {
     /// Whether the payload has the present values.
     pub(super) fn agrees(&self, frame: &Frame, up: &Upward, payload: &[u8]) -> bool {
         if let Some(device) = &frame.device {
-            let whole = [&frame.head[..], payload, &frame.tail].concat();
+            let whole = match (&frame.head[..], &frame.tail[..]) {
+                ([], []) => Cow::Borrowed(payload),
+                (head, tail) => Cow::Owned([head, payload, tail].concat()),
+            };
             let laid_out = if frame.varies { varying::lay_out(frame, &whole).ok() } else { None };
             if frame.varies && laid_out.is_none() {
                 return false;

@@ -131,7 +131,12 @@ impl LineWatch {
         if frame.device.is_some() {
             return self.cut_device(frame);
         }
-        self.cut(frame).iter().map(|payload| judge(port.mode, frame, 0, payload)).collect()
+        let (mut cut, mut found) = (Cut::default(), Vec::new());
+        while let Some(payload) = cut.next(frame, &self.held) {
+            found.push(judge(port.mode, frame, 0, payload));
+        }
+        self.remove(&cut);
+        found
     }
 
     /// Drops the first byte that is held: nothing begins with it.
@@ -206,30 +211,50 @@ impl LineWatch {
         found
     }
 
-    /// Removes complete frames from the held bytes; returns the bytes of their fields.
-    pub(super) fn cut(&mut self, frame: &Frame) -> Vec<Vec<u8>> {
-        let mut found = Vec::new();
-        let mut at = 0;
-        while let Some(rest) = self.held.get(at..).filter(|rest| !rest.is_empty()) {
+    /// Removes what was cut off the held bytes, and counts it.
+    pub(super) fn remove(&mut self, cut: &Cut) {
+        self.held.drain(..cut.at);
+        self.mismatches += cut.mismatches;
+        self.dropped += cut.dropped;
+        self.frame_bytes += cut.frame_bytes;
+    }
+}
+
+/// How far held bytes have been looked through for complete frames.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Cut {
+    at: usize,
+    mismatches: u64,
+    dropped: u64,
+    frame_bytes: u64,
+}
+
+impl Cut {
+    /// The number of bytes that were frames, or are dropped.
+    pub(super) fn len(&self) -> usize {
+        self.at
+    }
+
+    /// The bytes of the fields of the next frame.
+    pub(super) fn next<'h>(&mut self, frame: &Frame, held: &'h [u8]) -> Option<&'h [u8]> {
+        while let Some(rest) = held.get(self.at..).filter(|rest| !rest.is_empty()) {
             let seen = rest.len().min(frame.head.len());
             if rest[..seen] != frame.head[..seen] {
                 self.dropped += 1;
-                at += 1;
+                self.at += 1;
                 continue;
             }
-            let Some(whole) = rest.get(..frame.len()) else { break };
+            let whole = rest.get(..frame.len())?;
             if let Some(payload) = frame.payload_of(whole) {
-                found.push(payload.to_vec());
                 self.frame_bytes += frame.len() as u64;
-                at += frame.len();
-            } else {
-                self.mismatches += 1;
-                self.dropped += 1;
-                at += 1;
+                self.at += frame.len();
+                return Some(payload);
             }
+            self.mismatches += 1;
+            self.dropped += 1;
+            self.at += 1;
         }
-        self.held.drain(..at);
-        found
+        None
     }
 }
 
@@ -270,16 +295,18 @@ pub(super) fn can_of<'f>(
 /// The fields are judged one after the other: the first that cannot be used rejects the frame.
 fn judge_device(frame: &Frame, nth: usize, whole: &[u8], counts: &Counts) -> Verdict {
     let mut accepted = Accepted { frame: nth, ..Accepted::default() };
-    let laid_out = if frame.varies { varying::lay_out(frame, whole).ok() } else { frame.device.clone() };
-    let Some(DeviceSpec { places, .. }) = laid_out else { return Verdict::Unreadable };
-    if texts(frame, &places, whole).any(|(field, text)| {
+    let laid_out = if frame.varies { varying::lay_out(frame, whole).ok() } else { None };
+    let device = if frame.varies { laid_out.as_ref() } else { frame.device.as_ref() };
+    let Some(DeviceSpec { places, .. }) = device else { return Verdict::Unreadable };
+    accepted.values.reserve(frame.written.len());
+    if texts(frame, places, whole).any(|(field, text)| {
         matches!(field, FieldSpec::TextInput { ignored, .. } if ignored.iter().any(|own| own == text))
     }) {
         return Verdict::Ignored(nth);
     }
     // Command fields are counted without the checksum, as they are no elements of it.
     let mut element = 0;
-    for (field, place) in frame.fields.iter().zip(&places) {
+    for (field, place) in frame.fields.iter().zip(places) {
         let at = element;
         element += usize::from(!matches!(field, FieldSpec::Checksum(_)));
         let (encoding, overflow, to) = match *field {
@@ -323,7 +350,7 @@ fn judge_device(frame: &Frame, nth: usize, whole: &[u8], counts: &Counts) -> Ver
             InputBinding::Unused => {}
         }
     }
-    for (field, text) in texts(frame, &places, whole) {
+    for (field, text) in texts(frame, places, whole) {
         let FieldSpec::TextInput { to, length_to, count_to, .. } = *field else { continue };
         if let Some(words) = to {
             let Some(values) = varying::registers(words, text) else { return Verdict::OutOfRange };
@@ -350,6 +377,7 @@ fn texts<'f>(
 
 fn judge(mode: Mode, frame: &Frame, nth: usize, payload: &[u8]) -> Verdict {
     let mut accepted = Accepted { frame: nth, ..Accepted::default() };
+    accepted.values.reserve(frame.written.len());
     let mut rest = payload;
     let mut out_of_range = false;
     for (place, field) in frame.fields.iter().enumerate() {
@@ -429,9 +457,7 @@ pub(super) fn bound(var: SysVar, value: f64) -> Option<Raw> {
 
 /// A field's value; an `f64` can represent each type exactly.
 fn read(ty: ScalarType, bytes: &[u8]) -> f64 {
-    let mut wide = [0; 8];
-    wide[..bytes.len()].copy_from_slice(bytes);
-    let bits = u64::from_le_bytes(wide);
+    let bits = bytes.iter().rev().fold(0_u64, |bits, &byte| bits << 8 | u64::from(byte));
     match ty {
         ScalarType::Byte => f64::from(bits as u8),
         ScalarType::Char => f64::from(bits as u8 as i8),

@@ -2,11 +2,13 @@
 
 use proto_core::device::Boundary;
 use proto_core::engine::{Engine, LinkId, PortId};
-use proto_core::link::LinkState;
+use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::can::{CanFrame, CanId};
 
-use super::field::{self, Accepted, LineWatch, Refused, Verdict};
+use super::counters::differ;
+use super::field::{self, LineWatch, Refused, Verdict};
+use super::spec::Raw;
 use super::upward::Wrong;
 use super::wire::Safe;
 use super::{Invariant, LinkWatch, Oracle, PortWatch, place};
@@ -73,10 +75,12 @@ impl Oracle {
     /// Finds the links that the engine has given up by itself. `reported` is the link of the input, which
     /// handles it.
     pub(super) fn find_lost_links(&mut self, engine: &Engine, reported: Option<LinkId>, now: Instant) {
-        for link in engine.links() {
-            let is_lost = !matches!(link.state, LinkState::Up { .. });
-            if is_lost && Some(link.id) != reported && self.up.is_up(link.id) {
-                self.link_lost(link.id, now);
+        let mut left = self.up.are_up;
+        while left != 0 {
+            let link = LinkId(left.trailing_zeros() as u8);
+            left &= left - 1;
+            if Some(link) != reported && !engine.is_up(link) {
+                self.link_lost(link, now);
             }
         }
     }
@@ -163,7 +167,7 @@ impl Oracle {
         if self.discards_until.is_some() {
             counters.asleep += 1;
             let verdict = field::can(port, &mut LineWatch::default(), frame);
-            self.waited_in_sleep(verdict.into_iter().collect());
+            self.waited_in_sleep(verdict.ok());
             return;
         }
         if port.talk.is_some() {
@@ -180,7 +184,7 @@ impl Oracle {
     pub(super) fn take_can(&mut self, nth: usize, verdict: Result<Verdict, Refused>, now: Instant) {
         let counters = &mut self.ports[nth].counters;
         match verdict {
-            Ok(verdict) => self.take(nth, vec![verdict], now),
+            Ok(verdict) => self.take(nth, [verdict], now),
             Err(Refused::Remote) => counters.rejected_remote += 1,
             Err(Refused::Id) => counters.rejected_id += 1,
             Err(Refused::Length) => counters.rejected_length += 1,
@@ -221,11 +225,11 @@ impl Oracle {
         }
         let piece = watch.line.cut_piece();
         let verdict = watch.line.judge_piece(port, &piece);
-        self.take(nth, verdict.into_iter().collect(), now);
+        self.take(nth, verdict, now);
     }
 
     /// Remembers discarded frames that had waited while the gateway slept.
-    fn waited_in_sleep(&mut self, verdicts: Vec<Verdict>) {
+    fn waited_in_sleep(&mut self, verdicts: impl IntoIterator<Item = Verdict>) {
         for verdict in verdicts {
             let Verdict::Accepted(frame) = verdict else { continue };
             self.checks[Invariant::FromSleep as usize] += 1;
@@ -237,9 +241,9 @@ impl Oracle {
     }
 
     /// Applies frames that came in one piece.
-    pub(super) fn take(&mut self, nth: usize, verdicts: Vec<Verdict>, now: Instant) {
+    pub(super) fn take(&mut self, nth: usize, verdicts: impl IntoIterator<Item = Verdict>, now: Instant) {
         let (mut frames, mut ignored) = (0, 0);
-        let mut newest: Option<Accepted> = None;
+        let mut newest: Option<Vec<(SysVar, Raw)>> = None;
         for verdict in verdicts {
             let counters = &mut self.ports[nth].counters;
             let mut frame = match verdict {
@@ -297,7 +301,7 @@ impl Oracle {
             }
             self.up.accepted(&self.spec, nth, &frame, now);
             self.values_changed(now);
-            newest = Some(frame);
+            newest = Some(frame.values);
             // The engine does this after each frame if there are triggers, otherwise after all of them.
             if self.spec.has_triggers {
                 self.after_frames(now);
@@ -309,7 +313,7 @@ impl Oracle {
         }
         let Some(newest) = newest else { return };
         let waits = self.spec.links.iter().any(|link| {
-            let wants = newest.values.iter().any(|(var, _)| {
+            let wants = newest.iter().any(|(var, _)| {
                 let way = self.spec.owned[var.ordinal()].map(|owned| owned.way);
                 way == Some(link.id) && !self.up.known(*var).waiting.is_empty()
             });
@@ -382,7 +386,7 @@ impl Oracle {
             let what = format!("port {nth} counted a timeout although its device was not silent");
             return Err((Invariant::FalseTimeout, what));
         }
-        if *actual != expected {
+        if differ(actual, &expected) {
             return Err((Invariant::Counted, format!("port {nth} counted {actual:?}, not {expected:?}")));
         }
         let accounted = line.frame_bytes + line.dropped + line.discarded + line.held.len() as u64;

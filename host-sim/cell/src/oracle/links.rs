@@ -1,12 +1,14 @@
 //! The gateway's links: what must follow from what they receive, and checks of what they send.
 
+use std::rc::Rc;
+
 use proto_core::engine::LinkId;
 use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 
 use super::bits::Coils;
-use super::field::LineWatch;
-use super::spec::{Origin, Owned, Raw, shown, written};
+use super::field::Cut;
+use super::spec::{Frame, Origin, Owned, Raw};
 use super::upward::{Wrong, is_gap};
 use super::wire::{Asked, Safe};
 use super::{Invariant, Oracle, place};
@@ -16,12 +18,12 @@ impl Oracle {
         self.traffic[place(link)].1 += 1;
         match link {
             LinkId::MODBUS => {
-                let (read, refused) = self.modbus.received(&self.map, bytes);
-                for (var, raw) in read {
-                    if self.spec.origin[var.ordinal()] == Some(Origin::Modbus) {
-                        self.up.received(var, raw, now);
+                let Self { modbus, map, spec, up, .. } = self;
+                let refused = modbus.received(map, bytes, |var, raw| {
+                    if spec.origin[var.ordinal()] == Some(Origin::Modbus) {
+                        up.received(var, raw, now);
                     }
-                }
+                });
                 self.up.doubt_by_witnesses(&self.spec, now);
                 if !refused.is_empty() {
                     self.refused.extend(refused);
@@ -30,13 +32,18 @@ impl Oracle {
                 self.values_changed(now);
             }
             LinkId::STATE => {
-                self.links[place(link)].line.held.extend_from_slice(bytes);
-                while let Some(packet) = first_packet(&mut self.links[place(link)].line) {
-                    if self.links[place(link)].stream.takes(&packet) {
-                        self.up.state_packet(&self.spec, &packet, now);
+                let mut held = std::mem::take(&mut self.links[place(link)].line.held);
+                held.extend_from_slice(bytes);
+                let packets = held.chunks_exact(PACKET);
+                let left = packets.remainder().len();
+                for packet in packets {
+                    if self.links[place(link)].stream.takes(packet) {
+                        self.up.state_packet(&self.spec, packet, now);
                         self.values_changed(now);
                     }
                 }
+                held.drain(..held.len() - left);
+                self.links[place(link)].line.held = held;
             }
             LinkId::COMMAND | LinkId::URGENT => self.commands.hears(link, bytes),
             _ => self.recipe_bytes(link, bytes, now),
@@ -44,42 +51,53 @@ impl Oracle {
     }
 
     pub(super) fn recipe_bytes(&mut self, link: LinkId, bytes: &[u8], now: Instant) {
-        let Some(spec) = self.spec.link(link) else { return };
-        let Some(frame) = spec.output.clone() else { return };
-        let found = if spec.is_datagram {
-            frame.payload_of(bytes).map(<[u8]>::to_vec).into_iter().collect()
-        } else {
-            let line = &mut self.links[place(link)].line;
-            line.held.extend_from_slice(bytes);
-            line.cut(&frame)
-        };
-        if found.is_empty() {
+        let all = Rc::clone(&self.spec);
+        let Some(spec) = all.link(link) else { return };
+        let Some(frame) = &spec.output else { return };
+        if spec.is_datagram {
+            if let Some(payload) = frame.payload_of(bytes) {
+                self.frame_came(link, now);
+                self.recipe_frame(frame, payload, now);
+            }
             return;
         }
+        let mut held = std::mem::take(&mut self.links[place(link)].line.held);
+        held.extend_from_slice(bytes);
+        let (mut cut, mut is_first) = (Cut::default(), true);
+        while let Some(payload) = cut.next(frame, &held) {
+            if std::mem::take(&mut is_first) {
+                self.frame_came(link, now);
+            }
+            self.recipe_frame(frame, payload, now);
+        }
+        let line = &mut self.links[place(link)].line;
+        line.held = held;
+        line.remove(&cut);
+    }
+
+    /// One or several frames came on a recipe link.
+    fn frame_came(&mut self, link: LinkId, now: Instant) {
         let before = self.up.frame_at[place(link)].replace(now);
         self.up.heard(now);
         if before.is_some() && is_gap(before, now) {
             self.up.controller_was_away(&self.spec, now);
         }
-        for payload in found {
-            let mut values: Vec<(SysVar, Raw)> = Vec::new();
-            let mut rest = payload.as_slice();
-            for var in frame.fields.iter().flat_map(shown) {
-                let (bytes, after) = rest.split_at(var.size());
-                rest = after;
-                let mut raw = Raw::default();
-                raw[..bytes.len()].copy_from_slice(bytes);
-                if var.is_bits() {
-                    raw[0] &= var.valid_bits();
-                }
-                values.push((var, raw));
+    }
+
+    fn recipe_frame(&mut self, frame: &Frame, payload: &[u8], now: Instant) {
+        let mut rest = payload;
+        for &var in &frame.shown {
+            let (bytes, after) = rest.split_at(var.size());
+            rest = after;
+            let mut raw = Raw::default();
+            raw[..bytes.len()].copy_from_slice(bytes);
+            if var.is_bits() {
+                raw[0] &= var.valid_bits();
             }
-            for (var, raw) in values {
-                self.up.received(var, raw, now);
-            }
-            self.up.doubt_by_witnesses(&self.spec, now);
-            self.values_changed(now);
+            self.up.received(var, raw, now);
         }
+        self.up.doubt_by_witnesses(&self.spec, now);
+        self.values_changed(now);
     }
 
     pub(super) fn link_send(&mut self, link: LinkId, bytes: &[u8], now: Instant) -> Result<(), Wrong> {
@@ -162,8 +180,8 @@ impl Oracle {
                 "sent before the transport had taken the previous frame".to_owned(),
             ));
         }
-        let spec = self.spec.link(link).cloned();
-        let found = spec.as_ref().and_then(|spec| {
+        let all = Rc::clone(&self.spec);
+        let found = all.link(link).and_then(|spec| {
             let frame = spec.input.as_ref()?;
             Some((spec, frame, frame.payload_of(bytes)?))
         });
@@ -175,7 +193,7 @@ impl Oracle {
         };
         let mut rest = payload;
         let mut wanted = false;
-        for var in frame.fields.iter().flat_map(written) {
+        for &var in &frame.written {
             let (bytes, after) = rest.split_at(var.size());
             rest = after;
             let mut raw = Raw::default();
@@ -231,10 +249,6 @@ impl Oracle {
         }
         Ok(())
     }
-}
-
-fn first_packet(line: &mut LineWatch) -> Option<Vec<u8>> {
-    (line.held.len() >= PACKET).then(|| line.held.drain(..PACKET).collect())
 }
 
 const PACKET: usize = 1_468;

@@ -12,6 +12,7 @@
 mod arrivals;
 mod bits;
 mod commands;
+mod counters;
 pub(crate) mod device;
 mod downward;
 mod field;
@@ -28,10 +29,10 @@ mod varying;
 mod wire;
 
 use std::collections::{BTreeMap, VecDeque};
+use std::rc::Rc;
 
 use proto_core::config::GatewayConfig;
 use proto_core::engine::{BusState, Engine, Input, LinkId, Output, PortCounters};
-use proto_core::link::LinkState;
 use proto_core::time::{Duration, Instant};
 
 use commands::Commands;
@@ -46,8 +47,8 @@ use talk::line::TalkWatch;
 use talk::served::ServedWatch;
 use talk::truth::Truth;
 use upward::{Upward, Wrong};
-pub(super) use wire::inputs_of;
 use wire::{Controller, Map, Modbus, Safe};
+pub(super) use wire::{Inputs, copied_inputs, inputs_of};
 
 /// The model's state of one field port.
 #[derive(Debug, Clone, Default)]
@@ -92,7 +93,8 @@ impl LinkWatch {
 /// The model and its results.
 #[derive(Debug, Clone)]
 pub(super) struct Oracle {
-    spec: Spec,
+    /// Shared, so that it can be looked at while the rest changes.
+    spec: Rc<Spec>,
     map: Map,
     up: Upward,
     ports: Vec<PortWatch>,
@@ -161,7 +163,7 @@ impl Oracle {
             writes: 0,
             checks: [0; Invariant::ALL.len()],
             violation: None,
-            spec,
+            spec: Rc::new(spec),
         }
     }
 
@@ -201,11 +203,19 @@ impl Oracle {
         Invariant::ALL.into_iter().zip(self.checks).collect()
     }
 
+    #[inline]
     fn judge(&mut self, now: Instant, invariants: &[Invariant], result: Result<(), Wrong>) {
         for &invariant in invariants {
             self.checks[invariant as usize] += 1;
         }
-        if let (Err((invariant, what)), None) = (result, &self.violation) {
+        if let Err(wrong) = result {
+            self.violate(now, wrong);
+        }
+    }
+
+    #[cold]
+    fn violate(&mut self, now: Instant, (invariant, what): Wrong) {
+        if self.violation.is_none() {
             self.violation = Some(Violation { invariant, at: now, what });
         }
     }
@@ -285,7 +295,7 @@ impl Oracle {
             Input::LinkUp { link } => {
                 self.forget_sender(link);
                 self.up.controller_was_away(&self.spec, now);
-                if !self.up.is_up(link) && is_up(engine, link) {
+                if !self.up.is_up(link) && engine.is_up(link) {
                     self.up.link_up(link, now);
                     self.links[place(link)] = LinkWatch::default();
                 }
@@ -347,10 +357,11 @@ impl Oracle {
         for nth in 0..self.ports.len() {
             if self.spec.ports[nth].is_field {
                 if !self.is_late {
-                    let result = self.ports[nth].down.rest(&self.spec, nth, &self.up, now);
+                    let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
+                    let result = watch.down.rest(port, &self.up, now);
+                    let result = result.and_then(|()| self.served_rests(nth, now));
+                    let result = result.and_then(|()| self.talk_rests(nth, now));
                     self.judge(now, &[Invariant::Cycle], result);
-                    let result = self.served_rests(nth, now).and_then(|()| self.talk_rests(nth, now));
-                    self.judge(now, &[], result);
                 }
                 let result = self.count(nth, engine);
                 self.judge(now, &[Invariant::Counted, Invariant::Bytes], result);
@@ -376,10 +387,6 @@ impl Oracle {
 /// Index of a link in arrays of per-link state.
 pub(super) fn place(link: LinkId) -> usize {
     usize::from(link.0) % LINKS
-}
-
-fn is_up(engine: &Engine, id: LinkId) -> bool {
-    engine.links().any(|link| link.id == id && matches!(link.state, LinkState::Up { .. }))
 }
 
 /// Maximum number of links: those to the controller's fixed ports, and one per listening port.

@@ -199,8 +199,9 @@ fn a_safe_value_that_is_not_there() {
     let (mut cell, _) = ready(&panel_cell(), &panel(0, 1));
     cell.run_ms(3_000);
     assert_eq!(cell.value("DigitalOutputCommand[1]"), 128.0);
-    let (paths, inputs, now) = (cell.paths(), cell.inputs(), cell.now());
-    let mut without = inputs.clone();
+    let inputs = copied_inputs(cell.controller().registers().image());
+    let (paths, now) = (cell.paths(), cell.now());
+    let mut without = inputs;
     without[0] = 1;
     let judged = |change: &dyn Fn(&mut Oracle), cell: &mut Cell| {
         let mut oracle = cell.oracle.clone().unwrap();

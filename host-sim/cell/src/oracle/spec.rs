@@ -51,6 +51,9 @@ pub(super) struct Frame {
     pub tail: Vec<u8>,
     pub id: Option<CanId>,
     pub fields: Vec<FieldSpec>,
+    /// The variables that they write, and those that they show.
+    pub written: Vec<SysVar>,
+    pub shown: Vec<SysVar>,
     /// Number of bytes of all fields, checksum included.
     pub payload: usize,
     /// The places of the fields in a device's own frame.
@@ -67,6 +70,11 @@ pub(super) struct PortSpec {
     pub mode: Mode,
     pub inputs: Vec<Frame>,
     pub outputs: Vec<Frame>,
+    /// The variables that the inputs write, and the byte variables among them.
+    pub written: Vec<SysVar>,
+    pub written_bits: Vec<SysVar>,
+    /// The variables that the outputs show, and that of the bit that triggers them.
+    pub needed: Vec<SysVar>,
     pub timeout: Duration,
     pub stale_after: Duration,
     pub stops_when_stale: bool,
@@ -85,7 +93,7 @@ pub(super) struct PortSpec {
 impl PortSpec {
     /// The variables that its frames show, and its requests.
     fn shown(&self) -> impl Iterator<Item = SysVar> {
-        let fields = self.outputs.iter().flat_map(|frame| &frame.fields).flat_map(shown);
+        let fields = self.outputs.iter().flat_map(|frame| &frame.shown).copied();
         let rows = self.talk.iter().flat_map(|talk| &talk.rows);
         let asked = rows.flat_map(|row| row.shown().chain(row.rising.map(|(var, _)| var)));
         fields.chain(asked).chain(self.served.iter().flat_map(ServedSpec::shown))
@@ -101,6 +109,9 @@ pub(super) struct LinkSpec {
     pub output: Option<Frame>,
     /// Variables in its frames up are read back while their owners are overdue.
     pub reads_back: bool,
+    /// How long what is handed over may be in flight. After that, unacknowledged data is given up with its
+    /// connection. Datagrams do not wait.
+    pub not_after: Duration,
 }
 
 /// The specification of a whole gateway.
@@ -167,7 +178,7 @@ impl Spec {
         let mut owned = [None; COUNT];
         for (nth, port) in ports.iter().enumerate().filter(|(_, port)| port.is_field) {
             for (frame, part) in port.inputs.iter().enumerate() {
-                for var in part.fields.iter().flat_map(written) {
+                for &var in &part.written {
                     let carries = |link: &&LinkSpec| link.input.as_ref().is_some_and(|up| up.has(var));
                     let way = links.iter().find(carries).map_or(LinkId::MODBUS, |link| link.id);
                     let safe = config.ports[nth].on_timeout.of(&config.safe_values);
@@ -182,8 +193,13 @@ impl Spec {
         }
         let mut read_back = [false; COUNT];
         for link in &mut links {
+            if !link.is_datagram {
+                let owned = owned.iter().flatten().filter(|owned: &&Owned| owned.way == link.id);
+                let timeouts = owned.map(|owned| ports[owned.port].timeout);
+                link.not_after = timeouts.min().unwrap_or_default().max(Duration::from_millis(250));
+            }
             link.reads_back = !is_one_frame(&ports, &owned, link);
-            for var in link.input.iter().flat_map(|up| up.fields.iter().flat_map(written)) {
+            for var in link.input.iter().flat_map(|up| &up.written) {
                 read_back[var.ordinal()] |= link.reads_back && var.stream().is_some();
             }
         }
@@ -274,11 +290,11 @@ impl Frame {
     }
 
     pub(super) fn has(&self, var: SysVar) -> bool {
-        self.fields.iter().flat_map(written).any(|own| own == var)
+        self.written.contains(&var)
     }
 
     fn shows(&self, var: SysVar) -> bool {
-        self.fields.iter().flat_map(shown).any(|own| own == var)
+        self.shown.contains(&var)
     }
 
     /// The fields' bytes; `None` if head, tail or length differ.
@@ -332,16 +348,26 @@ pub(super) fn frame(head: &[u8], tail: &[u8], id: Option<CanId>, fields: &[Field
         return device_frame(head, tail, id, fields);
     }
     let payload = fields.iter().map(size).sum();
-    let (head, tail, fields) = (head.to_vec(), tail.to_vec(), fields.to_vec());
-    Frame { head, tail, id, fields, payload, device: None, varies: false }
+    Frame { payload, ..any_frame(head, tail, id, fields) }
 }
 
 /// A frame of a device's recipe, also one that a plain recipe could have.
 pub(super) fn device_frame(head: &[u8], tail: &[u8], id: Option<CanId>, fields: &[FieldSpec]) -> Frame {
     let varies = fields.iter().any(varying::varies);
     let device = if varies { DeviceSpec::default() } else { DeviceSpec::new(head.len(), fields) };
-    let (head, tail, fields) = (head.to_vec(), tail.to_vec(), fields.to_vec());
-    Frame { head, tail, id, fields, payload: device.len, device: Some(device), varies }
+    Frame { payload: device.len, device: Some(device), varies, ..any_frame(head, tail, id, fields) }
+}
+
+fn any_frame(head: &[u8], tail: &[u8], id: Option<CanId>, fields: &[FieldSpec]) -> Frame {
+    Frame {
+        head: head.to_vec(),
+        tail: tail.to_vec(),
+        id,
+        fields: fields.to_vec(),
+        written: fields.iter().flat_map(written).collect(),
+        shown: fields.iter().flat_map(shown).collect(),
+        ..Frame::default()
+    }
 }
 
 fn frames(config: &GatewayConfig, recipe: &Recipe, direction: Direction) -> Vec<Frame> {
@@ -382,12 +408,21 @@ fn port_spec(config: &GatewayConfig, port: &proto_core::config::Port) -> PortSpe
         }
         _ => (Duration::MAX, Duration::ZERO),
     };
+    let outputs = frames(config, recipe, Direction::Output);
+    let written: Vec<SysVar> = inputs.iter().flat_map(|frame| &frame.written).copied().collect();
+    let trigger = match recipe.send {
+        SendOn::Rising { var, .. } => Some(var),
+        _ => None,
+    };
     PortSpec {
+        written_bits: written.iter().copied().filter(|var| var.is_bits()).collect(),
+        written,
+        needed: outputs.iter().flat_map(|frame| &frame.shown).copied().chain(trigger).collect(),
         is_field: port.bus.is_field(),
         is_can: matches!(port.bus, Bus::Can { .. }),
         mode: recipe.mode,
         inputs,
-        outputs: frames(config, recipe, Direction::Output),
+        outputs,
         timeout: port.timeout,
         stale_after: port.stale_after,
         stops_when_stale: recipe.on_stale == proto_core::config::OnStale::Stop,
@@ -407,17 +442,16 @@ fn port_spec(config: &GatewayConfig, port: &proto_core::config::Port) -> PortSpe
 fn link_spec(config: &GatewayConfig, id: LinkId, recipe: &Recipe, is_datagram: bool) -> LinkSpec {
     let part = |direction| frames(config, recipe, direction).into_iter().next();
     let (input, output) = (part(Direction::Input), part(Direction::Output));
-    LinkSpec { id, is_datagram, input, output, reads_back: false }
+    LinkSpec { id, is_datagram, input, output, reads_back: false, not_after: Duration::ZERO }
 }
 
 /// Whether one field frame has all variables of the link's frame, with safe values for all of them or for
 /// none.
 fn is_one_frame(ports: &[PortSpec], owned: &[Option<Owned>; COUNT], link: &LinkSpec) -> bool {
     let Some(up) = &link.input else { return true };
-    let vars: Vec<SysVar> = up.fields.iter().flat_map(written).collect();
     ports.iter().enumerate().filter(|(_, port)| port.is_field).any(|(nth, port)| {
         (0..port.inputs.len()).any(|frame| {
-            let owners: Vec<_> = vars.iter().map(|var| owned[var.ordinal()]).collect();
+            let owners: Vec<_> = up.written.iter().map(|var| owned[var.ordinal()]).collect();
             let brought = owners.iter().all(|o| o.is_some_and(|o| (o.port, o.frame) == (nth, frame)));
             let safe: Vec<bool> = owners.iter().map(|o| o.is_some_and(|o| o.safe.is_some())).collect();
             brought && (safe.iter().all(|safe| *safe) || safe.iter().all(|safe| !safe))

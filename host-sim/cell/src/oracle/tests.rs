@@ -389,7 +389,7 @@ fn what_reaches_the_controller_and_was_not_sent() {
     let cell = cell(CELL);
     let (mut oracle, now) = (Oracle::new(cell.gateway()), cell.now());
     oracle.sent(7, LinkId::MODBUS, &coils(1), Duration::ZERO, now);
-    let inputs = inputs_of(cell.controller().registers().image());
+    let inputs = copied_inputs(cell.controller().registers().image());
     oracle.arrived(7, LinkId::MODBUS, &coils(2), (&inputs, &inputs), Duration::ZERO, now);
     assert_eq!(oracle.violation().map(|broken| broken.invariant), Some(Invariant::Transport));
 }
@@ -399,8 +399,8 @@ fn inputs_that_are_not_what_was_written() {
     let cell = cell(CELL);
     let (mut oracle, now) = (Oracle::new(cell.gateway()), cell.now());
     oracle.sent(7, LinkId::MODBUS, &coils(1), Duration::ZERO, now);
-    let before = inputs_of(cell.controller().registers().image());
-    let mut after = before.clone();
+    let before = copied_inputs(cell.controller().registers().image());
+    let mut after = before;
     after[0] = 3;
     oracle.arrived(7, LinkId::MODBUS, &coils(1), (&before, &after), Duration::ZERO, now);
     assert_eq!(oracle.violation().map(|broken| broken.invariant), Some(Invariant::Registers));

@@ -6,6 +6,7 @@ use std::collections::VecDeque;
 use proto_core::engine::LinkId;
 use proto_core::sysvar::{COUNT, SysVar};
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::scalar::ScalarType;
 
 use super::Invariant;
 use super::bits::Waits;
@@ -95,6 +96,8 @@ pub(super) struct Upward {
     pub counted: Vec<Counted>,
     /// When the links that carry values came up; `None` while they are down.
     pub up: [Option<Instant>; 16],
+    /// The same as a set of bits.
+    pub are_up: u16,
     pub state_at: Option<Instant>,
     /// When the newest frame of each recipe link came, on any connection.
     pub frame_at: [Option<Instant>; 16],
@@ -125,6 +128,7 @@ impl Upward {
             overdue: spec.ports.iter().map(|port| vec![None; port.inputs.len()]).collect(),
             counted: vec![Counted::default(); spec.ports.len()],
             up: [None; 16],
+            are_up: 0,
             state_at: None,
             frame_at: [None; 16],
             heard_at: None,
@@ -148,7 +152,7 @@ impl Upward {
     }
 
     pub(super) fn is_up(&self, link: LinkId) -> bool {
-        self.up[usize::from(link.0)].is_some()
+        self.are_up >> link.0 & 1 == 1
     }
 
     /// The frames that became overdue, as port and index; their variables get safe values or hold.
@@ -171,7 +175,7 @@ impl Upward {
                 self.overdue[nth][frame] = None;
                 self.counted[nth].timeouts += 1;
                 overdue.push((nth, frame));
-                for var in part.fields.iter().flat_map(super::spec::written) {
+                for &var in &part.written {
                     self.fell_silent(spec, var, now);
                 }
                 self.bits_silent(spec, nth, frame, now);
@@ -187,7 +191,7 @@ impl Upward {
         }
         self.next_expiry = Instant::NEVER;
         for (nth, port) in spec.ports.iter().enumerate().filter(|(_, port)| port.is_field) {
-            for var in port.inputs.iter().flat_map(|part| &part.fields).flat_map(super::spec::written) {
+            for &var in &port.written {
                 let known = &mut self.known[var.ordinal()];
                 if known.safe {
                     continue;
@@ -233,7 +237,7 @@ impl Upward {
         let at = now + spec.ports[nth].timeout;
         self.overdue[nth][frame] = Some(at);
         self.next_overdue = self.next_overdue.min(at);
-        for var in spec.ports[nth].inputs[frame].fields.iter().flat_map(super::spec::written) {
+        for &var in &spec.ports[nth].inputs[frame].written {
             self.known_mut(var).heard = Some(now);
         }
     }
@@ -287,15 +291,15 @@ impl Upward {
 
     /// Number of the port's values that wait behind others.
     pub(super) fn queued(&self, spec: &Spec, nth: usize) -> usize {
-        let vars = spec.ports[nth].inputs.iter().flat_map(|part| &part.fields);
-        let waiting = vars.flat_map(super::spec::written).filter(|var| var.is_bits());
-        let whole: usize = waiting.map(|var| self.known(var).waiting.len().saturating_sub(1)).sum();
+        let waiting = spec.ports[nth].written_bits.iter();
+        let whole: usize = waiting.map(|var| self.known(*var).waiting.len().saturating_sub(1)).sum();
         whole + self.queued_bits(spec, nth)
     }
 
     /// A link came up.
     pub(super) fn link_up(&mut self, link: LinkId, now: Instant) {
         self.up[usize::from(link.0)] = Some(now);
+        self.are_up |= 1 << link.0;
         self.handed_over[usize::from(link.0)] = None;
     }
 
@@ -304,6 +308,7 @@ impl Upward {
         if self.up[usize::from(link.0)].take().is_none() {
             return;
         }
+        self.are_up &= !(1 << link.0);
         self.rewrite_at[usize::from(link.0)] = Instant::NEVER;
         if link == LinkId::MODBUS {
             self.bits_lost(spec);
@@ -370,7 +375,7 @@ impl Upward {
     /// A value came on a link; one that is not finite makes the variable unreadable.
     pub(super) fn received(&mut self, var: SysVar, raw: Raw, now: Instant) {
         let known = self.known_mut(var);
-        known.unreadable = !super::field::as_number(var, raw).is_finite();
+        known.unreadable = var.ty() == ScalarType::Float && !f32::from_le_bytes(raw).is_finite();
         if !known.unreadable {
             known.value = Some((raw, now));
         }
@@ -487,8 +492,8 @@ impl Upward {
     /// Whether a recipe link's frame may be sent: each of its variables is known.
     pub(super) fn is_ready(&self, link: &LinkSpec, now: Instant) -> bool {
         let is_fresh = self.state_at.is_some_and(|at| now.saturating_since(at) <= READ_BACK);
-        let mut vars = link.input.iter().flat_map(|up| up.fields.iter().flat_map(super::spec::written));
-        vars.all(|var| {
+        let mut vars = link.input.iter().flat_map(|up| &up.written);
+        vars.all(|&var| {
             let known = self.known(var);
             match var.stream() {
                 _ if known.live => true,
@@ -508,7 +513,7 @@ pub(super) fn in_packet(var: SysVar, packet: &[u8]) -> Option<Raw> {
         raw[0] = bytes.iter().rev().fold(0, |bits, &bit| bits << 1 | u8::from(bit != 0)) & var.valid_bits();
     } else {
         raw[..bytes.len()].copy_from_slice(bytes);
-        if var.ty() == proto_core::wire::scalar::ScalarType::Float && !f32::from_le_bytes(raw).is_finite() {
+        if var.ty() == ScalarType::Float && !f32::from_le_bytes(raw).is_finite() {
             return None;
         }
     }

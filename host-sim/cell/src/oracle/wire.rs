@@ -22,6 +22,14 @@ pub(super) enum Asked {
     WriteBits(Coils),
 }
 
+/// Coils or registers that are read.
+#[derive(Debug, Clone, Copy)]
+struct Reads {
+    coils: bool,
+    first: u16,
+    count: u16,
+}
+
 /// What a write has of safe values.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Safe {
@@ -44,7 +52,8 @@ impl Safe {
 /// The one transaction in flight.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Modbus {
-    in_flight: Option<([u8; 2], Asked, Instant)>,
+    /// Its number, what it reads, and when it was sent.
+    in_flight: Option<([u8; 2], Option<Reads>, Instant)>,
     /// The safe values in the write in flight.
     safe: Safe,
     held: Vec<u8>,
@@ -83,24 +92,29 @@ impl Modbus {
         let (head, pdu) = bytes.split_at_checked(7).ok_or_else(|| wrong("has no header"))?;
         let asked = map.request(pdu).ok_or_else(|| wrong("touches addresses that are not a variable"))?;
         self.safe = Safe::default();
-        self.in_flight = Some(([head[0], head[1]], asked.clone(), now));
+        let read = match asked {
+            Asked::Read { coils, first, count } => Some(Reads { coils, first, count }),
+            Asked::Write(_) | Asked::WriteBits(_) => None,
+        };
+        self.in_flight = Some(([head[0], head[1]], read, now));
         Ok(asked)
     }
 
-    /// Handles the controller's bytes; returns the values read, and the safe values refused.
-    pub(super) fn received(&mut self, map: &Map, bytes: &[u8]) -> (Vec<(SysVar, Raw)>, Safe) {
+    /// Handles the controller's bytes; `read` gets the values read. Returns the safe values refused.
+    pub(super) fn received(&mut self, map: &Map, bytes: &[u8], mut read: impl FnMut(SysVar, Raw)) -> Safe {
         self.held.extend_from_slice(bytes);
-        let (mut found, mut refused) = (Vec::new(), Safe::default());
-        while let Some(len) = frame_len(&self.held) {
-            let frame: Vec<u8> = self.held.drain(..len).collect();
+        let (mut at, mut refused) = (0, Safe::default());
+        while let Some(len) = frame_len(&self.held[at..]) {
+            let frame = &self.held[at..at + len];
+            at += len;
             let Some((id, asked, _)) = &self.in_flight else { continue };
             if frame[..2] != *id {
                 continue;
             }
-            if let (Asked::Read { coils, first, count }, Some(data)) = (asked, frame.get(9..))
+            if let (Some(reads), Some(data)) = (*asked, frame.get(9..))
                 && frame[7] & 0x80 == 0
             {
-                found.extend(map.read(*coils, *first, *count, data));
+                map.read(reads, data, &mut read);
             }
             let safe = std::mem::take(&mut self.safe);
             if frame[7] & 0x80 != 0 {
@@ -108,7 +122,8 @@ impl Modbus {
             }
             self.in_flight = None;
         }
-        (found, refused)
+        self.held.drain(..at);
+        refused
     }
 }
 
@@ -204,15 +219,15 @@ impl Map {
     }
 
     /// The variables that are completely in the range that was read.
-    fn read(&self, coils: bool, first: u16, count: u16, data: &[u8]) -> Vec<(SysVar, Raw)> {
-        let mut found = Vec::new();
+    fn read(&self, reads: Reads, data: &[u8], mut found: impl FnMut(SysVar, Raw)) {
+        let Reads { coils, first, count } = reads;
         for address in first..first.saturating_add(count) {
             let nth = usize::from(address - first);
             if !coils {
                 if let (Some(Some(var)), Some(pair)) =
                     (self.words.get(usize::from(address)), data.get(2 * nth..2 * nth + 2))
                 {
-                    found.push((*var, [pair[1], pair[0], 0, 0]));
+                    found(*var, [pair[1], pair[0], 0, 0]);
                 }
                 continue;
             }
@@ -226,10 +241,9 @@ impl Map {
                 let bit =
                     |bit: usize| data.get((nth + bit) / 8).map_or(0, |byte| byte >> ((nth + bit) % 8) & 1);
                 let packed = (0..usize::from(bits)).fold(0, |sum, at| sum | bit(at) << at);
-                found.push((var, [packed, 0, 0, 0]));
+                found(var, [packed, 0, 0, 0]);
             }
         }
-        found
     }
 }
 
@@ -269,7 +283,9 @@ impl Controller {
 
     pub(super) fn arrived(&mut self, conn: u64, bytes: &[u8]) -> Result<(), Wrong> {
         let sent = self.sent.entry(conn).or_default();
-        if bytes.len() > sent.len() || !bytes.iter().eq(sent.iter().take(bytes.len())) {
+        let (front, back) = sent.as_slices();
+        let (begin, rest) = bytes.split_at(bytes.len().min(front.len()));
+        if !front.starts_with(begin) || !back.starts_with(rest) {
             return Err((
                 Invariant::Transport,
                 "the controller received bytes that were not sent".to_owned(),
@@ -287,15 +303,16 @@ impl Controller {
         Err((Invariant::Transport, "the controller received a datagram that was not sent".to_owned()))
     }
 
-    /// The complete Modbus requests in the data that has arrived.
-    pub(super) fn requests(&mut self, conn: u64, bytes: &[u8]) -> Vec<Vec<u8>> {
+    /// Finds the complete Modbus requests in the data that has arrived.
+    pub(super) fn requests(&mut self, conn: u64, bytes: &[u8], mut each: impl FnMut(&[u8])) {
         let held = self.held.entry(conn).or_default();
         held.extend_from_slice(bytes);
-        let mut found = Vec::new();
-        while let Some(len) = frame_len(held) {
-            found.push(held.drain(..len).skip(7).collect());
+        let mut at = 0;
+        while let Some(len) = frame_len(&held[at..]) {
+            each(&held[at + 7..at + len]);
+            at += len;
         }
-        found
+        held.drain(..at);
     }
 
     /// Received bytes of a recipe connection; the caller finds the frames.
@@ -310,10 +327,19 @@ impl Controller {
 }
 
 /// The input variables in the controller's image.
-pub(crate) fn inputs_of(image: &[u8]) -> Vec<u8> {
-    image[..INPUT_BYTES].to_vec()
+pub(crate) fn inputs_of(image: &[u8]) -> &[u8] {
+    &image[..INPUT_BYTES]
 }
 
+/// The same, copied before they change.
+pub(crate) fn copied_inputs(image: &[u8]) -> Inputs {
+    let mut inputs = [0; INPUT_BYTES];
+    inputs.copy_from_slice(inputs_of(image));
+    inputs
+}
+
+/// The controller's input variables.
+pub(crate) type Inputs = [u8; INPUT_BYTES];
 /// Inputs come first in the image (proto-core/docs/wire/sysvars.md section 1).
 const INPUT_BYTES: usize = 253;
 

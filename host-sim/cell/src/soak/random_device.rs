@@ -143,9 +143,7 @@ impl Device<Vec<u8>> for RandomDevice {
     fn poll(&mut self, now: Instant) -> Vec<Vec<u8>> {
         let Some(nth) = self.step(now) else { return Vec::new() };
         let template = &self.templates[nth];
-        let mut frame = template.head.clone();
-        frame.extend(template.payload(&self.values[nth]));
-        frame.extend(&template.tail);
+        let mut frame = template.whole(&self.values[nth]);
         if self.behaviour == Behaviour::Careless {
             let rng = &mut self.rng;
             let len = frame.len() as u64;

@@ -10,6 +10,7 @@ use proto_core::engine::{Input, LinkId, LinkKind};
 use super::connection::Peer;
 use super::due::Due;
 use super::network::{Item, Sender, Way};
+use super::oracle::inputs_of;
 use super::tcp::{Arrived, USER_TIMEOUT};
 use super::{AnyPort, Cell, End, What, udp_peer};
 use recipe_controller::{ConnId, ControllerInput, Link};
@@ -27,16 +28,15 @@ impl Cell {
             }
         };
         let waited = conn.pipe(way).retransmit_at;
-        let arrivals = conn.pipe(way).send(now, item, acks, gate, way);
+        let queue = &mut self.queue;
+        let arrives = |at| queue.push(at, Due::Arrival { conn: id, way });
+        conn.pipe(way).send(now, item, acks, gate, way, arrives);
         if waited.is_none()
             && let Some(at) = conn.pipe(way).retransmit_at
         {
             self.queue.push(at, Due::Retransmit { conn: id, way });
         }
         let is_too_much = way == Way::Down && !conn.down.dead && conn.down.on_the_way() > CONTROLLER_BUFFER;
-        for at in arrivals {
-            self.queue.push(at, Due::Arrival { conn: id, way });
-        }
         if is_too_much {
             self.reset_conn(id);
         }
@@ -129,6 +129,7 @@ impl Cell {
     /// Network ports send without delay.
     fn controller_input_later(&mut self, port: usize) {
         self.controller.handle(self.now, ControllerInput::PortSent { port });
+        self.controller_is_seen = false;
     }
 
     /// Something may have arrived at one end of a connection.
@@ -218,9 +219,10 @@ impl Cell {
             Peer::Server(Link::State) => return,
             Peer::Client(port) => ControllerInput::PortBytes { port, bytes },
         });
-        let (after, slowest) = (self.inputs_before(), self.gate(link).network.slowest());
-        if let (Some(oracle), Some(before), Some(after)) = (&mut self.oracle, before, after) {
-            oracle.arrived(id, link, bytes, (&before, &after), slowest, self.now);
+        let slowest = self.gate(link).network.slowest();
+        if let (Some(oracle), Some(before)) = (&mut self.oracle, before) {
+            let after = inputs_of(self.controller.registers().image());
+            oracle.arrived(id, link, bytes, (&before, after), slowest, self.now);
         }
     }
 }

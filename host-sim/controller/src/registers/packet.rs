@@ -1,5 +1,8 @@
 //! The registers in the state packet of port 2001 (proto-core/docs/wire/state.md section 2).
 
+use std::ops::Range;
+use std::sync::LazyLock;
+
 use proto_core::modbus::map::unscaled;
 use proto_core::sysvar::SysVar;
 use proto_core::wire::scalar::ScalarError;
@@ -82,11 +85,9 @@ impl Registers {
 
     /// Writes every system variable that is in the packet.
     fn put_variables(&self, packet: &mut [u8; LEN]) {
-        for var in SysVar::all() {
-            let Some(place) = var.stream() else { continue };
-            let (offset, len) = (usize::from(place.offset), usize::from(place.len));
-            let value = self.image.get(var.image_offset()..).and_then(|bytes| bytes.get(..var.size()));
-            let (Some(shown), Some(value)) = (packet.get_mut(offset..offset + len), value) else { continue };
+        for Place { image, packet: place } in SHOWN.iter() {
+            let value = self.image.get(image.clone());
+            let (Some(shown), Some(value)) = (packet.get_mut(place.clone()), value) else { continue };
             match value {
                 [bits] => {
                     for (nth, byte) in shown.iter_mut().enumerate() {
@@ -98,6 +99,22 @@ impl Registers {
         }
     }
 }
+
+/// Where a variable is.
+struct Place {
+    image: Range<usize>,
+    packet: Range<usize>,
+}
+
+/// The variables in the packet, looked up once.
+static SHOWN: LazyLock<Vec<Place>> = LazyLock::new(|| {
+    let place = |var: SysVar| {
+        let (shown, image) = (var.stream()?, var.image_offset());
+        let offset = usize::from(shown.offset);
+        Some(Place { image: image..image + var.size(), packet: offset..offset + usize::from(shown.len) })
+    };
+    SysVar::all().filter_map(place).collect()
+});
 
 /// Status words of the servo drives as in CiA 402: operation enabled, switch on disabled.
 const DRIVE_ENABLED: u32 = 0x0637;

@@ -78,6 +78,8 @@ pub(super) struct Robot {
     /// Content of the transmission that the engine is handing over.
     values: Vec<(SysVar, Raw, Carried)>,
     command: Option<InFlightCommand>,
+    /// Room for values that is used again.
+    spare: Vec<Vec<(SysVar, Raw, Carried)>>,
     in_flight: BTreeMap<u64, InFlight>,
     /// The newest datagrams; the first one has this number.
     datagrams: VecDeque<Transmission>,
@@ -161,7 +163,7 @@ impl Robot {
             end: 0,
             not_after: not_after(spec, link),
             slowest,
-            values: std::mem::take(&mut self.values),
+            values: std::mem::replace(&mut self.values, self.spare.pop().unwrap_or_default()),
             command: self.command.take(),
         }
     }
@@ -246,7 +248,10 @@ impl Robot {
     /// Compares the controller's inputs before an arrival with those after the previous one: other programs
     /// made the changes.
     fn find_foreign_writes(&mut self, before: &[u8], now: Instant) {
-        if self.inputs.len() == before.len() && self.inputs != before {
+        if self.inputs == before {
+            return;
+        }
+        if self.inputs.len() == before.len() {
             for (at, _) in before.iter().zip(&self.inputs).enumerate().filter(|(_, (new, old))| new != old) {
                 self.foreign_writes.insert(at, now);
             }
@@ -257,8 +262,10 @@ impl Robot {
 
     pub(super) fn applied(&mut self, before: &[u8], after: &[u8], now: Instant) {
         self.find_foreign_writes(before, now);
-        self.inputs.clear();
-        self.inputs.extend_from_slice(after);
+        if before != after {
+            self.inputs.clear();
+            self.inputs.extend_from_slice(after);
+        }
     }
 
     pub(super) fn len(&self) -> usize {
@@ -320,14 +327,14 @@ impl Oracle {
         let Some(in_flight) = self.robot.in_flight.get_mut(&conn) else { return };
         in_flight.arrived += len as u64;
         let arrived = in_flight.arrived;
-        let mut delivered = Vec::new();
-        while let Some(transmission) =
-            in_flight.transmissions.pop_front_if(|transmission| transmission.end <= arrived)
-        {
-            delivered.push(transmission);
-        }
-        for transmission in delivered {
+        let next = |robot: &mut Robot| {
+            let transmissions = &mut robot.in_flight.get_mut(&conn)?.transmissions;
+            transmissions.pop_front_if(|transmission| transmission.end <= arrived)
+        };
+        while let Some(mut transmission) = next(&mut self.robot) {
             self.judge_transmission(&transmission, slowest, now);
+            transmission.values.clear();
+            self.robot.spare.push(transmission.values);
         }
     }
 
@@ -433,18 +440,9 @@ impl Oracle {
     }
 }
 
-/// How long data handed over to a link may be in flight. After that, unacknowledged data is given up with
-/// its connection. Datagrams do not wait.
+/// How long data handed over to a link may be in flight.
 fn not_after(spec: &Spec, link: LinkId) -> Duration {
-    match spec.link(link) {
-        None => Duration::from_millis(500),
-        Some(link) if link.is_datagram => Duration::ZERO,
-        Some(link) => {
-            let owned = spec.owned.iter().flatten().filter(|owned| owned.way == link.id);
-            let timeouts = owned.map(|owned| spec.ports[owned.port].timeout);
-            timeouts.min().unwrap_or_default().max(Duration::from_millis(250))
-        }
-    }
+    spec.link(link).map_or(Duration::from_millis(500), |link| link.not_after)
 }
 
 /// A command arrives within this time after it was picked.

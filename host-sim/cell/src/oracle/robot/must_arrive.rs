@@ -108,6 +108,7 @@ impl Oracle {
         if self.violation.is_some() {
             return;
         }
+        self.truth.forget_old(now);
         self.remembered = self.controller.size() + self.commands.len() + self.robot.len() + self.truth.len();
         for path in paths {
             if self.robot.conns.insert(path.link, path.conn) != Some(path.conn) {

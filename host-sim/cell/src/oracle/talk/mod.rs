@@ -15,6 +15,7 @@ use proto_core::wire::can::CanFrame;
 use self::line::TalkWatch;
 use self::spec::{RowSpec, Seen, TalkSpec};
 use super::device::{Look, look};
+use super::downward::Downward;
 use super::field::Verdict;
 use super::gateway::Leaving;
 use super::spec::PortSpec;
@@ -92,7 +93,7 @@ impl Oracle {
         let is_refusal = awaited.and_then(|frames| frames.refusal.as_ref()).is_some_and(is_it);
         if is_reply || is_refusal {
             let verdict = self.answered(nth, frame.data(), !is_reply, now);
-            return self.take(nth, verdict.into_iter().collect(), now);
+            return self.take(nth, verdict, now);
         }
         let answers = awaited.into_iter().flat_map(|frames| frames.reply.iter().chain(&frames.refusal));
         let answers = answers.map(|own| (usize::MAX, own));
@@ -147,12 +148,13 @@ impl Oracle {
             watch.talk.keeps_periods(port, talk, line, stalled, now)?;
         self.checks[Invariant::Cycle as usize] += 1;
         look_at_opening(&mut watch.talk, port, |row| {
-            watch.down.may_show_all(&self.spec, port, &self.up, row.shown(), now).is_ok()
+            Downward::may_show_all(port, &self.up, row.shown(), now).is_ok()
         });
         watch.talk.hands_over(port, talk, (row, bytes), line, now)?;
         let asked = &talk.rows[row];
         if let Some(request) = &asked.request {
-            watch.down.may_show_all(&self.spec, port, &self.up, asked.shown(), now)?;
+            let hidden = Downward::may_show_all(port, &self.up, asked.shown(), now);
+            hidden.map_err(|hidden| hidden.wrong(&self.spec))?;
             let data = asked.data_of(bytes);
             let payload = if asked.frames.is_some() { request.payload_of(&data) } else { Some(&data[..]) };
             if !payload.is_some_and(|payload| watch.down.agrees(request, &self.up, payload)) {
@@ -183,7 +185,7 @@ impl Oracle {
         let Some(talk) = &self.spec.ports[nth].talk else { return };
         let watch = &mut self.ports[nth];
         look_at_opening(&mut watch.talk, &self.spec.ports[nth], |row| {
-            watch.down.may_show_all(&self.spec, &self.spec.ports[nth], &self.up, row.shown(), now).is_ok()
+            Downward::may_show_all(&self.spec.ports[nth], &self.up, row.shown(), now).is_ok()
         });
         let waited = watch.talk.waits();
         if let Some(slave) = watch.talk.tick(talk, watch.line.heard, now) {
@@ -200,7 +202,7 @@ impl Oracle {
         let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
         let Some((talk, failed)) = port.talk.as_ref().zip(watch.talk.repeats()) else { return false };
         let shown = talk.rows[failed].shown();
-        if watch.down.may_show_all(&self.spec, port, &self.up, shown, now).is_ok() {
+        if Downward::may_show_all(port, &self.up, shown, now).is_ok() {
             return false;
         }
         if let Some(slave) = watch.talk.is_not_repeated(talk, now) {
@@ -212,11 +214,14 @@ impl Oracle {
     /// The engine has nothing to do: checks that no repetition waits that could be sent.
     pub(super) fn talk_rests(&mut self, nth: usize, now: Instant) -> Result<(), Wrong> {
         let (port, watch) = (&self.spec.ports[nth], &self.ports[nth]);
+        if watch.talk.repeats().is_none() {
+            return Ok(());
+        }
         let is_free = watch.down.is_usable()
             && !watch.down.is_busy()
             && self.discards_until.is_none()
             && now >= watch.line.heard + port.turnaround;
-        if watch.talk.repeats().is_some() && is_free && !self.gives_up(nth, now) {
+        if is_free && !self.gives_up(nth, now) {
             return Err((Invariant::Periods, "a repetition waits although the line is free".to_owned()));
         }
         Ok(())
@@ -227,7 +232,7 @@ impl Oracle {
         for (watch, port) in self.ports.iter_mut().zip(&self.spec.ports) {
             let Some(talk) = &port.talk else { continue };
             look_at_opening(&mut watch.talk, port, |row| {
-                watch.down.may_show_all(&self.spec, port, &self.up, row.shown(), now).is_ok()
+                Downward::may_show_all(port, &self.up, row.shown(), now).is_ok()
             });
             let is_on = |row: &RowSpec| {
                 let (var, bit) = row.rising?;

@@ -12,9 +12,10 @@ use proto_core::sysvar::SysVar;
 use proto_core::time::Instant;
 
 use crate::oracle::device::is_written_by_model;
+use crate::oracle::downward::Downward;
 use crate::oracle::field::Verdict;
 use crate::oracle::gateway::Leaving;
-use crate::oracle::spec::{Frame, device_frame, shown};
+use crate::oracle::spec::{Frame, device_frame};
 use crate::oracle::upward::Wrong;
 use crate::oracle::{Invariant, Oracle};
 use crate::rtu::{is_right, sealed};
@@ -90,11 +91,7 @@ impl ServedSpec {
 
     /// The variables that a master reads.
     pub(in crate::oracle) fn shown(&self) -> impl Iterator<Item = SysVar> {
-        self.blocks
-            .iter()
-            .filter_map(|block| block.output.as_ref())
-            .flat_map(|out| &out.fields)
-            .flat_map(shown)
+        self.blocks.iter().filter_map(|block| block.output.as_ref()).flat_map(|out| out.shown.iter().copied())
     }
 
     /// The block with this register or coil.
@@ -269,8 +266,8 @@ impl Oracle {
         let Some(output) = &block.output else {
             return watch.served.written.get(&place).cloned().ok_or(FAILURE);
         };
-        let vars = output.fields.iter().flat_map(shown);
-        watch.down.may_show_all(&self.spec, port, &self.up, vars, now).map_err(|_| FAILURE)?;
+        let vars = output.shown.iter().copied();
+        Downward::may_show_all(port, &self.up, vars, now).map_err(|_| FAILURE)?;
         watch.down.made(output, &self.up).ok_or(FAILURE)
     }
 
@@ -296,7 +293,7 @@ impl Oracle {
         if is_taken {
             self.ports[nth].served.written.insert(place, data);
         }
-        self.take(nth, vec![verdict], now);
+        self.take(nth, [verdict], now);
         if is_taken { Ok(()) } else { Err(VALUE) }
     }
 
@@ -328,11 +325,14 @@ impl Oracle {
     /// Checks that no reply waits although it could be sent.
     pub(in crate::oracle) fn served_rests(&self, nth: usize, now: Instant) -> Result<(), Wrong> {
         let (port, watch) = (&self.spec.ports[nth], &self.ports[nth]);
+        if watch.served.kept.is_none() {
+            return Ok(());
+        }
         let may_send = watch.down.is_usable()
             && !watch.down.is_busy()
             && self.discards_until.is_none()
             && now >= watch.down.heard + port.turnaround;
-        if watch.served.kept.is_some() && may_send {
+        if may_send {
             return Err((Invariant::Cycle, "a reply waits although the line is free".to_owned()));
         }
         Ok(())

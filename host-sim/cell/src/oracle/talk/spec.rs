@@ -320,8 +320,7 @@ impl RowSpec {
 
     /// The system variables in its request.
     pub(in crate::oracle) fn shown(&self) -> impl Iterator<Item = SysVar> {
-        let fields = self.request.iter().flat_map(|request| &request.fields);
-        fields.flat_map(crate::oracle::spec::shown)
+        self.request.iter().flat_map(|request| request.shown.iter().copied())
     }
 
     /// What the bytes that came are, if they follow this request.

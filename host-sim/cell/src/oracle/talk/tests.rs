@@ -8,7 +8,7 @@ use proto_core::time::{Duration, Instant};
 
 use super::super::tests::{cell, is_rest};
 use super::super::upward::Carried;
-use super::super::{Invariant, Oracle, inputs_of};
+use super::super::{Invariant, Oracle, copied_inputs};
 use crate::rtu::sealed;
 use crate::tamper::{Forged, Outward};
 use crate::{Cell, Device, Done, SlaveDone, Talker, Violation};
@@ -362,7 +362,7 @@ fn arrives(value: u8, age: Duration) -> Option<Invariant> {
     oracle.robot.hands_over(var, [value, 0, 0, 0], carried);
     let write = [0, 0, 0, 0, 0, 9, 1, 16, 0, 128, 0, 1, 2, 0, value];
     oracle.sent(7, LinkId::MODBUS, &write, Duration::ZERO, now);
-    let inputs = inputs_of(cell.controller().registers().image());
+    let inputs = copied_inputs(cell.controller().registers().image());
     oracle.arrived(7, LinkId::MODBUS, &write, (&inputs, &inputs), Duration::ZERO, now);
     oracle.violation().map(|broken| broken.invariant)
 }

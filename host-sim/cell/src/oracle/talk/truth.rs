@@ -4,6 +4,7 @@
 //! took. Out: violations. Knows nothing of timeouts and repetitions.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::ops::Range;
 
 use proto_core::config::{FieldSpec, OutputBinding};
 use proto_core::device::{Encoding, Overflow};
@@ -23,9 +24,21 @@ use crate::{Done, SlaveDone};
 #[derive(Debug, Clone, Default)]
 pub(in crate::oracle) struct Truth {
     lines: BTreeMap<usize, LineTruth>,
-    /// The values that the controller had, each with when it came, for variables that slaves are told.
-    had: BTreeMap<usize, VecDeque<(Instant, Raw)>>,
-    told: Vec<SysVar>,
+    /// The variables that slaves are told, by ordinal.
+    told: Vec<Told>,
+    /// The part of the controller's image that has them, when it was last looked at.
+    seen: Vec<u8>,
+    seen_from: usize,
+}
+
+/// A variable that slaves are told.
+#[derive(Debug, Clone)]
+struct Told {
+    var: SysVar,
+    /// Its place in the controller's image.
+    place: Range<usize>,
+    /// The values that the controller had, each with when it came.
+    had: VecDeque<(Instant, Raw)>,
 }
 
 /// The slaves of one line.
@@ -60,7 +73,15 @@ impl Truth {
         let mut told: Vec<SysVar> = rows.flat_map(RowSpec::shown).collect();
         told.sort_by_key(|var| var.ordinal());
         told.dedup();
-        Self { lines: BTreeMap::new(), had: BTreeMap::new(), told }
+        let told: Vec<Told> = told
+            .into_iter()
+            .map(|var| {
+                let at = var.image_offset();
+                Told { var, place: at..at + var.size(), had: VecDeque::new() }
+            })
+            .collect();
+        let seen_from = told.iter().map(|told| told.place.start).min().unwrap_or_default();
+        Self { lines: BTreeMap::new(), told, seen: Vec::new(), seen_from }
     }
 
     /// Whether the controller's registers are needed.
@@ -70,18 +91,35 @@ impl Truth {
 
     /// The controller's variables as they are now.
     pub(in crate::oracle) fn sees_controller(&mut self, image: &[u8], now: Instant) {
-        for var in &self.told {
-            let at = var.image_offset();
+        // Most steps of a cell change nothing of it.
+        if !self.seen.is_empty() && image[self.seen_from..].starts_with(&self.seen) {
+            return;
+        }
+        let end = self.told.iter().map(|told| told.place.end).max().unwrap_or(self.seen_from);
+        self.seen.clear();
+        self.seen.extend_from_slice(&image[self.seen_from..end]);
+        for Told { place, had, .. } in &mut self.told {
             let mut raw = Raw::default();
-            raw[..var.size()].copy_from_slice(&image[at..at + var.size()]);
-            let had = self.had.entry(var.ordinal()).or_default();
+            raw[..place.len()].copy_from_slice(&image[place.clone()]);
             if had.back().is_none_or(|newest| newest.1 != raw) {
                 had.push_back((now, raw));
             }
+        }
+    }
+
+    /// Forgets values that the controller had too long ago.
+    pub(in crate::oracle) fn forget_old(&mut self, now: Instant) {
+        for Told { had, .. } in &mut self.told {
             while had.len() > 1 && now.saturating_since(had[1].0) > REMEMBERED {
                 had.pop_front();
             }
         }
+    }
+
+    /// The values that the controller had.
+    fn had(&self, var: SysVar) -> Option<&VecDeque<(Instant, Raw)>> {
+        let nth = self.told.binary_search_by_key(&var.ordinal(), |told| told.var.ordinal());
+        nth.ok().map(|nth| &self.told[nth].had).filter(|had| !had.is_empty())
     }
 
     pub(in crate::oracle) fn garbled(&mut self, port: usize, now: Instant) {
@@ -126,6 +164,7 @@ impl Truth {
         let port = &spec.ports[nth];
         let Some(talk) = &port.talk else { return (0, Ok(())) };
         let slave = done.slave;
+        self.forget_old(now);
         match done.what {
             Done::Forgot => {
                 let line = self.lines.entry(nth).or_default();
@@ -273,7 +312,7 @@ impl Truth {
 
     /// When the controller had values of a variable for which `is_it` is true.
     fn spans(&self, var: SysVar, now: Instant, is_it: impl Fn(Raw) -> bool) -> Vec<(Instant, Instant)> {
-        let Some(had) = self.had.get(&var.ordinal()) else { return Vec::new() };
+        let Some(had) = self.had(var) else { return Vec::new() };
         let ends = had.iter().skip(1).map(|(at, _)| *at).chain([now.max(Instant::ZERO)]);
         let spans = had.iter().zip(ends).filter(|((_, raw), _)| is_it(*raw));
         spans.map(|((since, _), until)| (*since, until)).collect()
@@ -355,7 +394,7 @@ impl Truth {
         let mut wrong = None;
         for (field, place) in fields(row) {
             let Some(var) = crate::oracle::spec::shown(field).next() else { continue };
-            let (at, raw) = *self.had.get(&var.ordinal())?.back()?;
+            let (at, raw) = *self.had(var)?.back()?;
             if at > since {
                 return None;
             }
@@ -373,7 +412,8 @@ impl Truth {
         let of_line = |line: &LineTruth| {
             line.answers.len() + line.requests.len() + line.held.values().map(VecDeque::len).sum::<usize>()
         };
-        self.lines.values().map(of_line).sum::<usize>() + self.had.values().map(VecDeque::len).sum::<usize>()
+        self.lines.values().map(of_line).sum::<usize>()
+            + self.told.iter().map(|told| told.had.len()).sum::<usize>()
     }
 }
 
