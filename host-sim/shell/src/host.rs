@@ -108,7 +108,9 @@ impl Asker {
 
 /// What the thread of a shell does at its end, after all tasks are gone. A clone is the same.
 #[derive(Default, Clone)]
-pub(super) struct AtEnd(Rc<RefCell<Vec<Box<dyn FnOnce()>>>>);
+pub(super) struct AtEnd(Rc<RefCell<Vec<Act>>>);
+
+type Act = Box<dyn FnOnce()>;
 
 impl AtEnd {
     /// Adds something to do. What fails to open ends too.
