@@ -3,10 +3,13 @@
 use std::cell::RefCell;
 use std::rc::Rc;
 
+use proto_core::config::SendOn;
 use proto_core::engine::{Input, LinkId, Output, PortId};
+use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 
 use super::*;
+use crate::soak::Scenario;
 use crate::tamper::{Forged, Inward, Outward};
 use crate::{Cell, Talker};
 use recipe_config::SimConfig;
@@ -392,6 +395,80 @@ fn what_reaches_the_controller_and_was_not_sent() {
     let inputs = copied_inputs(cell.controller().registers().image());
     oracle.arrived(7, LinkId::MODBUS, &coils(2), (&inputs, &inputs), Duration::ZERO, now);
     assert_eq!(oracle.violation().map(|broken| broken.invariant), Some(Invariant::Transport));
+}
+
+#[test]
+fn each_byte_that_reaches_the_controller_is_compared_with_those_sent() {
+    let mut controller = wire::Controller::new();
+    let sent: Vec<u8> = (0..200).collect();
+    // Five bytes are always on their way, wherever the room for them begins.
+    for (nth, byte) in sent.iter().enumerate() {
+        controller.sent(7, &[*byte]);
+        let Some(first) = (nth + 1).checked_sub(5) else { continue };
+        let waiting = &sent[first..=nth];
+        for wrong in 0..waiting.len() {
+            let mut bytes = waiting.to_vec();
+            bytes[wrong] ^= 1;
+            assert!(controller.arrived(7, &bytes).is_err(), "{nth}, {wrong}");
+        }
+        assert!(controller.arrived(7, &[waiting, &[0]].concat()).is_err());
+        assert_eq!(controller.clone().arrived(7, waiting), Ok(()));
+        assert_eq!(controller.arrived(7, &waiting[..1]), Ok(()));
+    }
+}
+
+#[test]
+fn a_port_needs_what_its_frames_show_and_the_bit_that_triggers_them() {
+    let mut triggers = 0;
+    for scenario in Scenario::all().unwrap() {
+        let spec = Spec::new(&scenario.gateway);
+        for port in &spec.ports {
+            let fields = port.outputs.iter().flat_map(|frame| &frame.fields);
+            let mut expected: Vec<SysVar> = fields.flat_map(spec::shown).collect();
+            if let SendOn::Rising { var, .. } = port.send {
+                expected.push(var);
+                triggers += 1;
+            }
+            assert_eq!(port.needed, expected, "{}", scenario.name);
+        }
+    }
+    assert!(triggers > 0);
+}
+
+#[test]
+fn only_floats_can_be_unreadable() {
+    let cell = cell(CELL);
+    let (mut up, now) = (Upward::new(&Spec::new(cell.gateway())), cell.now());
+    let var = SysVar::parse("FloatOutputReg[1]").unwrap();
+    let readable = 1.5_f32.to_le_bytes();
+    for unreadable in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+        up.received(var, readable, now);
+        assert!(!up.known(var).unreadable);
+        up.received(var, unreadable.to_le_bytes(), now);
+        assert_eq!((up.known(var).unreadable, up.known(var).value), (true, Some((readable, now))));
+    }
+    let var = SysVar::parse("WordOutputReg[1]").unwrap();
+    up.received(var, [0xFF, 0xFF, 0, 0], now);
+    assert_eq!((up.known(var).unreadable, up.known(var).value), (false, Some(([0xFF, 0xFF, 0, 0], now))));
+}
+
+#[test]
+fn data_of_a_link_may_be_in_flight_as_long_as_its_values_may_wait() {
+    let mut found = [0; 2];
+    for scenario in Scenario::all().unwrap() {
+        let spec = Spec::new(&scenario.gateway);
+        for link in &spec.links {
+            let owned = spec.owned.iter().flatten().filter(|owned| owned.way == link.id);
+            let shortest = owned.map(|owned| spec.ports[owned.port].timeout).min();
+            let expected = match link.is_datagram {
+                true => Duration::ZERO,
+                false => shortest.unwrap_or_default().max(Duration::from_millis(250)),
+            };
+            assert_eq!(link.not_after, expected, "{}: {:?}", scenario.name, link.id);
+            found[usize::from(link.is_datagram)] += 1;
+        }
+    }
+    assert!(found.into_iter().all(|found| found > 0), "{found:?}");
 }
 
 #[test]

@@ -9,9 +9,12 @@ use proto_core::time::{Duration, Instant};
 use super::super::tests::{cell, is_rest};
 use super::super::upward::Carried;
 use super::super::{Invariant, Oracle, copied_inputs};
+use crate::due::Due;
 use crate::rtu::sealed;
 use crate::tamper::{Forged, Outward};
 use crate::{Cell, Device, Done, SlaveDone, Talker, Violation};
+use recipe_config::InitialTarget;
+use recipe_controller::ControllerInput;
 
 /// A slave that is read at two places, whose replies look alike, and told two values together.
 const SLAVE: &str = r#"
@@ -274,6 +277,41 @@ fn a_reply_that_the_device_did_not_make() {
             }
         });
         assert_eq!(violation.invariant, Invariant::Held, "{violation}");
+    }
+}
+
+#[test]
+fn a_repetition_that_is_held_back() {
+    let mut cell = cell(&SLAVE.replace("retries = 0", "retries = 2"));
+    let mut newest = Vec::new();
+    let outward: Outward = Box::new(move |_, _, output| {
+        let Output::PortSend { bytes, .. } = output else { return None };
+        let is_repeated = std::mem::replace(&mut newest, bytes.to_vec()) == *bytes;
+        is_repeated.then(Vec::new)
+    });
+    cell.tamper(None, Some(outward));
+    let line = cell.line_of("device");
+    cell.attach(line, Honest::new(|_, _, _| ()));
+    cell.run_ms(1_500);
+    assert_eq!(cell.violation(), None);
+    cell.cut(line);
+    cell.run_ms(200);
+    assert_eq!(cell.violation().map(|broken| broken.invariant), Some(Invariant::Periods));
+}
+
+#[test]
+fn what_changes_while_the_controller_is_asked_for_its_outputs_is_seen_at_the_next_step() {
+    let mut cell = cell(SLAVE);
+    cell.run_ms(10);
+    let var = SysVar::parse("WordOutputReg[1]").unwrap();
+    for value in [7, 8] {
+        cell.controller_input(ControllerInput::Tick);
+        cell.controller.force(InitialTarget::Var(var), f64::from(value)).unwrap();
+        let now = cell.now();
+        cell.queue.push(now, Due::Survey);
+        cell.run(Duration::from_micros(0));
+        let newest = cell.oracle.as_ref().unwrap().truth.had(var).unwrap().back().copied();
+        assert_eq!(newest, Some((now, [value, 0, 0, 0])));
     }
 }
 

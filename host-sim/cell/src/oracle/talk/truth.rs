@@ -117,7 +117,7 @@ impl Truth {
     }
 
     /// The values that the controller had.
-    fn had(&self, var: SysVar) -> Option<&VecDeque<(Instant, Raw)>> {
+    pub(super) fn had(&self, var: SysVar) -> Option<&VecDeque<(Instant, Raw)>> {
         let nth = self.told.binary_search_by_key(&var.ordinal(), |told| told.var.ordinal());
         nth.ok().map(|nth| &self.told[nth].had).filter(|had| !had.is_empty())
     }
