@@ -7,6 +7,7 @@
 //! Work is linear in the bytes received, whatever they are: each byte costs at most a few
 //! comparisons with the up to eight bytes of head and tail and a few copies, which a test counts.
 
+use self::disturbed::Completed;
 use super::delimiter::Head;
 use super::error::DatagramError;
 use super::model::{MAX_DELIMITER, MAX_STREAM_FRAME};
@@ -47,15 +48,35 @@ const RING: usize = MAX_STREAM_FRAME;
 const WRAP: usize = RING - 1;
 const _: () = assert!(RING.is_power_of_two());
 
-/// How an attempt to complete a partial frame ended, and how many bytes of the chunk it took: fewer than two frames,
-/// since what was taken is given back when nothing before it is held any more.
+/// What became of a frame whose beginning is held.
 enum Held {
-    /// A whole frame is in the ring from here on, and nothing is held any more.
-    Frame { at: u16, taken: u16 },
+    /// It is whole: so many bytes at the front of the ring. Nothing is held any more.
+    Whole(usize),
     /// The chunk is used up.
     Partial,
-    /// Something else is held now, or nothing.
-    Again { taken: u16 },
+    /// Each byte has to be looked at; nothing was taken.
+    Disturbed,
+}
+
+/// Whether a chunk had a frame. Where that is is told elsewhere: a caller's branch on this alone can be decided where it
+/// is returned, and one on a slice that may be absent is not.
+enum Found {
+    Frame,
+    /// None; the chunk is used up.
+    Nothing,
+}
+
+impl Found {
+    #[inline(always)]
+    fn of<'f>(found: Option<&'f [u8]>, frame: &mut &'f [u8]) -> Self {
+        match found {
+            Some(found) => {
+                *frame = found;
+                Self::Frame
+            }
+            None => Self::Nothing,
+        }
+    }
 }
 
 impl Default for Deframer {
@@ -81,51 +102,77 @@ impl Deframer {
         layout: &StreamLayout,
         chunk: &mut &'c [u8],
     ) -> Option<&'s [u8]> {
-        if self.len != 0 {
-            let (held, frame_len) = (self.pending(), layout.frame_len());
-            // The ring is not wrapped and the head is known to be right: all that undisturbed traffic needs.
-            if usize::from(self.hold_until).wrapping_add(1) == frame_len
-                && let Some(missing) = self.ring.get_mut(held..frame_len)
-            {
-                let Some((more, after)) = chunk.split_at_checked(missing.len()) else {
-                    self.put(held, chunk);
-                    self.len = self.len.wrapping_add(chunk.len() as u16);
-                    *chunk = &[];
-                    return None;
-                };
-                count_visits(missing.len().saturating_add(layout.tail_word().len()));
-                copy(missing, more);
-                if self.ring.get(..frame_len).is_some_and(|frame| layout.tail_word().ends(frame)) {
-                    self.stats.frames = self.stats.frames.wrapping_add(1);
-                    self.len = 0;
-                    self.hold_until = 0;
-                    *chunk = after;
-                    return layout.payload_of(self.ring.get(..frame_len)?);
-                }
-                // Nothing was taken yet: the bytes after the held ones do not count.
-            }
-            match self.complete(layout, chunk) {
-                Held::Frame { at, taken } => {
-                    *chunk = chunk.get(usize::from(taken)..).unwrap_or(&[]);
-                    return layout.payload_of(self.ring.get(usize::from(at)..)?);
-                }
-                Held::Partial => {
-                    *chunk = &[];
-                    return None;
-                }
-                Held::Again { taken } => {
-                    // A copy, so that the caller's chunk can stay in registers on the ways above.
-                    let mut rest = chunk.get(usize::from(taken)..).unwrap_or(&[]);
-                    let found = self.next_behind(layout, &mut rest);
-                    *chunk = rest;
-                    return found;
-                }
-            }
+        let mut frame: &[u8] = &[];
+        match self.next_whole(layout, chunk, &mut frame) {
+            // In one place for all frames, where the compiler sees how long a payload is.
+            Found::Frame => layout.payload_of(frame),
+            Found::Nothing => None,
         }
-        self.search(layout, chunk)
     }
 
-    /// The same, after what was held first.
+    /// The same with head and tail.
+    #[inline(always)]
+    fn next_whole<'s, 'c: 's>(
+        &'s mut self,
+        layout: &StreamLayout,
+        chunk: &mut &'c [u8],
+        frame: &mut &'s [u8],
+    ) -> Found {
+        if self.len == 0 {
+            return self.search(layout, chunk, frame);
+        }
+        match self.go_on(layout, chunk) {
+            Held::Whole(len) => return Found::of(self.ring.get(..len), frame),
+            Held::Partial => return Found::Nothing,
+            Held::Disturbed => {}
+        }
+        match self.complete(layout, chunk) {
+            Completed::Frame { at, taken } => {
+                *chunk = chunk.get(usize::from(taken)..).unwrap_or(&[]);
+                Found::of(self.ring.get(usize::from(at)..), frame)
+            }
+            Completed::Partial => {
+                *chunk = &[];
+                Found::Nothing
+            }
+            Completed::Again { taken } => {
+                // A copy, so that the caller's chunk can stay in registers on the ways above.
+                let mut rest = chunk.get(usize::from(taken)..).unwrap_or(&[]);
+                let found = self.next_behind(layout, &mut rest);
+                *chunk = rest;
+                Found::of(found, frame)
+            }
+        }
+    }
+
+    /// Takes all that an undisturbed frame needs: the ring is not wrapped, and the head is known to be right.
+    #[inline(always)]
+    fn go_on(&mut self, layout: &StreamLayout, chunk: &mut &[u8]) -> Held {
+        let (held, frame_len) = (self.pending(), layout.frame_len());
+        if self.hold_until != hold_until(layout) {
+            return Held::Disturbed;
+        }
+        let Some(missing) = self.ring.get_mut(held..frame_len) else { return Held::Disturbed };
+        let Some((more, after)) = chunk.split_at_checked(missing.len()) else {
+            self.put(held, chunk);
+            self.len = self.len.wrapping_add(chunk.len() as u16);
+            *chunk = &[];
+            return Held::Partial;
+        };
+        count_visits(missing.len().saturating_add(layout.tail_word().len()));
+        copy(missing, more);
+        if !self.ring.get(..frame_len).is_some_and(|frame| layout.tail_word().ends(frame)) {
+            // The bytes after the held ones do not count.
+            return Held::Disturbed;
+        }
+        self.stats.frames = self.stats.frames.wrapping_add(1);
+        self.len = 0;
+        self.hold_until = 0;
+        *chunk = after;
+        Held::Whole(frame_len)
+    }
+
+    /// The next frame with head and tail, after what was held first.
     #[inline(never)]
     fn next_behind<'s, 'c: 's>(
         &'s mut self,
@@ -133,19 +180,24 @@ impl Deframer {
         chunk: &mut &'c [u8],
     ) -> Option<&'s [u8]> {
         while self.len != 0 {
+            match self.go_on(layout, chunk) {
+                Held::Whole(len) => return self.ring.get(..len),
+                Held::Partial => return None,
+                Held::Disturbed => {}
+            }
             match self.complete(layout, chunk) {
-                Held::Frame { at, taken } => {
+                Completed::Frame { at, taken } => {
                     *chunk = chunk.get(usize::from(taken)..).unwrap_or(&[]);
-                    return layout.payload_of(self.ring.get(usize::from(at)..)?);
+                    return self.ring.get(usize::from(at)..);
                 }
-                Held::Partial => {
+                Completed::Partial => {
                     *chunk = &[];
                     return None;
                 }
-                Held::Again { taken } => *chunk = chunk.get(usize::from(taken)..).unwrap_or(&[]),
+                Completed::Again { taken } => *chunk = chunk.get(usize::from(taken)..).unwrap_or(&[]),
             }
         }
-        self.search(layout, chunk)
+        self.search_on(layout, chunk)
     }
 
     /// Holds a byte that can only continue the frame whose head was seen, as most bytes of a slow line do. `false`
@@ -214,33 +266,48 @@ impl Deframer {
     /// Looks for a frame in the chunk itself, with nothing held. Bytes that may become one are
     /// held.
     #[inline(always)]
-    fn search<'c>(&mut self, layout: &StreamLayout, chunk: &mut &'c [u8]) -> Option<&'c [u8]> {
-        let skip = layout.head_word().find(chunk)?;
-        count_visits(layout.head_word().len().saturating_mul(skip.saturating_add(1).min(chunk.len())));
-        if skip > 0 {
-            self.skip(skip);
-            *chunk = chunk.get(skip..).unwrap_or(&[]);
+    fn search<'s, 'c: 's>(
+        &mut self,
+        layout: &StreamLayout,
+        chunk: &mut &'c [u8],
+        frame: &mut &'s [u8],
+    ) -> Found {
+        count_visits(layout.head_word().len());
+        if !layout.head_word().begins(chunk) {
+            let Some(begun) = self.seek(layout.head_word(), chunk) else {
+                *chunk = &[];
+                return Found::Nothing;
+            };
+            *chunk = begun;
         }
-        let Some((frame, after)) = chunk.split_at_checked(layout.frame_len()) else {
-            self.put(0, chunk);
+        let Some((found, after)) = chunk.split_at_checked(layout.frame_len()) else {
+            self.put_first(chunk);
             self.len = chunk.len() as u16;
-            // Without a head, every byte is one; and there is one.
-            let begun = chunk.len() >= layout.head_word().len();
-            self.hold_until = if begun { hold_until(layout) } else { 0 };
+            self.hold_until = hold_until(layout);
             *chunk = &[];
-            return None;
+            return Found::Nothing;
         };
         count_visits(layout.tail_word().len());
-        if !layout.tail_word().ends(frame) {
-            // A copy, so that the caller's chunk can stay in registers on the way above.
-            let mut rest = *chunk;
-            let found = self.search_behind(layout, &mut rest);
-            *chunk = rest;
-            return found;
+        if layout.tail_word().ends(found) {
+            self.stats.frames = self.stats.frames.wrapping_add(1);
+            *chunk = after;
+            *frame = found;
+            return Found::Frame;
         }
-        self.stats.frames = self.stats.frames.wrapping_add(1);
-        *chunk = after;
-        layout.payload_of(frame)
+        // A copy, so that the caller's chunk can stay in registers on the way above.
+        let mut rest = *chunk;
+        let found = self.search_behind(layout, &mut rest);
+        *chunk = rest;
+        Found::of(found, frame)
+    }
+
+    #[inline(always)]
+    fn search_on<'c>(&mut self, layout: &StreamLayout, chunk: &mut &'c [u8]) -> Option<&'c [u8]> {
+        let mut frame: &[u8] = &[];
+        match self.search(layout, chunk, &mut frame) {
+            Found::Frame => Some(frame),
+            Found::Nothing => None,
+        }
     }
 
     /// The same behind a head whose tail is wrong.
@@ -249,224 +316,73 @@ impl Deframer {
         loop {
             self.stats.tail_mismatches = self.stats.tail_mismatches.wrapping_add(1);
             self.skip(1);
-            let rest = chunk.get(1..).unwrap_or(&[]);
-            let skip = layout.head_word().find(rest).unwrap_or(0);
-            count_visits(layout.head_word().len().saturating_mul(skip.saturating_add(1).min(rest.len())));
-            self.skip(skip);
-            *chunk = rest.get(skip..).unwrap_or(&[]);
+            *chunk = chunk.get(1..).unwrap_or(&[]);
+            count_visits(layout.head_word().len());
+            if !layout.head_word().begins(chunk) {
+                let Some(begun) = self.seek(layout.head_word(), chunk) else {
+                    *chunk = &[];
+                    return None;
+                };
+                *chunk = begun;
+            }
             match chunk.get(..layout.frame_len()) {
                 Some(frame) if !layout.tail_word().ends(frame) => count_visits(layout.tail_word().len()),
-                _ => return self.search(layout, chunk),
+                _ => return self.search_on(layout, chunk),
             }
         }
     }
 
-    /// Takes what fewer bytes than a head need to become one.
+    /// Skips to the first head in a chunk that does not begin with one, as far as [`Head::begins`] says. `None` if
+    /// there is none; then the beginning of one at the chunk's end is held.
     #[inline(never)]
-    fn complete_head(&mut self, head: &Head, hold_until: u16, chunk: &[u8]) -> Held {
-        let mut len = self.pending();
-        let mut bytes = u64::from_le_bytes(self.word(usize::from(self.start)));
-        let mut taken = 0_u16;
-        let mut dropped = 0_usize;
-        for &byte in chunk {
-            let place = 8_u32.wrapping_mul(len as u32);
-            bytes = bytes & !0xFF_u64.wrapping_shl(place) | u64::from(byte).wrapping_shl(place);
-            len = len.wrapping_add(1);
-            taken = taken.wrapping_add(1);
-            while len > usize::from(taken) && !head.may_be(bytes, len) {
-                count_visits(head.len());
-                bytes = bytes.wrapping_shr(8);
-                len = len.wrapping_sub(1);
-                dropped = dropped.wrapping_add(1);
-            }
-            if len == usize::from(taken) || len >= head.len() {
-                break;
-            }
+    fn seek<'c>(&mut self, head: &Head, chunk: &'c [u8]) -> Option<&'c [u8]> {
+        let (&first, behind) = chunk.split_first()?;
+        if behind.is_empty() && head.len() > 1 {
+            self.hold_first(head, first);
+            return None;
         }
-        self.skip(dropped);
-        self.start = 0;
-        if len == usize::from(taken) {
-            // What is left is of the chunk, and is looked for there.
-            self.len = 0;
-            return Held::Again { taken: 0 };
-        }
-        count_visits(MAX_DELIMITER);
-        if let Some(front) = self.ring.first_chunk_mut() {
-            *front = bytes.to_le_bytes();
-        }
-        self.len = len as u16;
-        if len >= head.len() {
-            self.hold_until = hold_until;
-        }
-        if usize::from(taken) == chunk.len() { Held::Partial } else { Held::Again { taken } }
-    }
-
-    /// Takes what the held bytes need to become a frame, whatever they are and whatever comes.
-    #[inline(always)]
-    fn complete(&mut self, layout: &StreamLayout, chunk: &[u8]) -> Held {
-        match self.pending() < layout.head_word().len() {
-            true => self.complete_head(layout.head_word(), hold_until(layout), chunk),
-            false => self.complete_frame(layout, chunk),
-        }
-    }
-
-    /// Takes what held bytes with a whole head at their front need to become a frame.
-    #[inline(never)]
-    fn complete_frame(&mut self, layout: &StreamLayout, chunk: &[u8]) -> Held {
-        let (start, held) = (usize::from(self.start), self.pending());
-        let len = held.wrapping_add(chunk.len());
-        if len > layout.frame_len() {
-            return self.complete_behind(layout, chunk);
-        }
-        self.put_around(start.wrapping_add(held) & WRAP, chunk);
-        if len < layout.frame_len() {
-            self.len = len as u16;
-            return Held::Partial;
-        }
-        let (behind, left) = (start.wrapping_add(1) & WRAP, len.wrapping_sub(1));
-        // Every byte of the worst line there is comes along here: one frame is over and the next one is held.
-        if left > chunk.len()
-            && left >= layout.head_word().len()
-            && !layout.tail_word().is(&self.word(tail_word_at(start, len)))
-            && layout.head_word().is(&self.word(behind))
-        {
-            count_visits(2 * MAX_DELIMITER);
-            self.stats.tail_mismatches = self.stats.tail_mismatches.wrapping_add(1);
+        count_visits(head.len());
+        // What is wrong is one byte more often than several.
+        if behind.first_chunk().is_some_and(|front| head.is(front)) {
             self.skip(1);
-            self.start = behind as u16;
-            self.len = left as u16;
-            self.hold_until = 0;
-            return Held::Partial;
+            return Some(behind);
         }
-        self.complete_behind(layout, chunk)
+        let skip = head.find_behind(chunk);
+        count_visits(head.len().saturating_mul(skip));
+        self.skip(skip);
+        let rest = chunk.get(skip..)?;
+        if rest.len() >= MAX_DELIMITER { Some(rest) } else { self.seek_in_few(head, rest) }
     }
 
-    /// The same, whatever is held and whatever comes: also with other frames behind the first that is held.
+    /// The same in fewer than eight bytes, with which a head may begin.
     #[inline(never)]
-    fn complete_behind(&mut self, layout: &StreamLayout, chunk: &[u8]) -> Held {
-        let (head, tail, frame_len) = (layout.head_word(), layout.tail_word(), layout.frame_len());
+    fn seek_in_few<'c>(&mut self, head: &Head, few: &'c [u8]) -> Option<&'c [u8]> {
+        let skip = head.find_in_few(few);
+        count_visits(head.len().saturating_mul(skip.saturating_add(1).min(few.len())));
+        self.skip(skip);
+        let rest = few.get(skip..)?;
+        if rest.len() >= head.len() && !rest.is_empty() {
+            return Some(rest);
+        }
+        self.put_first(rest);
+        self.len = rest.len() as u16;
         self.hold_until = 0;
-        let held = self.pending();
-        let (mut start, mut len) = (usize::from(self.start), held);
-        if len >= frame_len {
-            // The layout was changed without a discard.
-            self.discard();
-            return Held::Again { taken: 0 };
-        }
-        let mut rest = chunk;
-        loop {
-            let missing = frame_len.wrapping_sub(len);
-            let (more, after) = rest.split_at_checked(missing).unwrap_or((rest, &[]));
-            self.put_around(start.wrapping_add(len) & WRAP, more);
-            if more.len() < missing {
-                len = len.wrapping_add(more.len());
-                rest = after;
-                break;
-            }
-            (len, rest) = (frame_len, after);
-            let taken = chunk.len().wrapping_sub(rest.len());
-            count_visits(tail.len());
-            if tail.is(&self.word(tail_word_at(start, len))) {
-                self.skip(held.wrapping_add(taken).wrapping_sub(len));
-                return Held::Frame { at: self.settle(layout, start) as u16, taken: taken as u16 };
-            }
-            self.stats.tail_mismatches = self.stats.tail_mismatches.wrapping_add(1);
-            loop {
-                count_visits(head.len());
-                start = start.wrapping_add(1) & WRAP;
-                len = len.wrapping_sub(1);
-                if len <= taken {
-                    // What is left is of the chunk, and is looked for there.
-                    self.skip(held.wrapping_add(taken).wrapping_sub(len));
-                    self.start = 0;
-                    self.len = 0;
-                    return Held::Again { taken: taken.wrapping_sub(len) as u16 };
-                }
-                let front = self.word(start);
-                if head.is(&front) || len < head.len() && head.may_be(u64::from_le_bytes(front), len) {
-                    break;
-                }
-            }
-            if len < head.len() || rest.is_empty() {
-                break;
-            }
-        }
-        let taken = chunk.len().wrapping_sub(rest.len());
-        let dropped = held.wrapping_add(taken).wrapping_sub(len);
-        self.skip(dropped);
-        self.len = len as u16;
-        self.start = start as u16;
-        if !rest.is_empty() {
-            return Held::Again { taken: taken as u16 };
-        }
-        if self.move_to_front(dropped) && len >= head.len() {
-            self.hold_until = hold_until(layout);
-        }
-        Held::Partial
+        None
     }
 
-    /// Moves the held bytes to the front of the ring, where the next ones need less care, if they are no more than
-    /// were dropped: so each byte is moved for one that was dropped. Returns whether they are there.
-    #[inline]
-    fn move_to_front(&mut self, dropped: usize) -> bool {
-        let (start, len) = (usize::from(self.start), self.pending());
-        if start == 0 || len > dropped || len > start {
-            return start == 0;
-        }
-        let Some((front, from)) = self.ring.split_at_mut_checked(start) else { return false };
-        let (Some(front), Some(from)) = (front.get_mut(..len), from.get(..len)) else { return false };
-        count_visits(len);
-        copy(front, from);
-        self.start = 0;
-        true
-    }
-
-    /// Eight bytes of the ring.
+    /// Holds a byte if it begins a head, which has more than one.
     #[inline(always)]
-    fn word(&self, at: usize) -> [u8; MAX_DELIMITER] {
-        match self.ring.get(at..).and_then(|from| from.first_chunk()) {
-            Some(word) => *word,
-            None => self.word_around(at),
-        }
-    }
-
-    #[cold]
-    #[inline(never)]
-    fn word_around(&self, at: usize) -> [u8; MAX_DELIMITER] {
-        core::array::from_fn(|nth| self.ring.get(at.wrapping_add(nth) & WRAP).copied().unwrap_or_default())
-    }
-
-    /// The frame that begins at `start`, in one piece; nothing is held afterwards.
-    fn settle(&mut self, layout: &StreamLayout, start: usize) -> usize {
-        self.stats.frames = self.stats.frames.wrapping_add(1);
-        self.start = 0;
-        self.len = 0;
-        self.hold_until = 0;
-        if start.saturating_add(layout.frame_len()) <= RING {
-            return start;
-        }
-        count_visits(RING);
-        rotate(&mut self.ring, start);
-        0
-    }
-
-    /// Writes to the ring, and from its end on to its front, without counting it as held.
-    #[inline]
-    fn put_around(&mut self, at: usize, bytes: &[u8]) {
-        if let [byte] = bytes {
-            count_visits(1);
-            if let Some(place) = self.ring.get_mut(at) {
-                *place = *byte;
-            }
+    fn hold_first(&mut self, head: &Head, byte: u8) {
+        if !head.may_be(byte.into(), 1) {
+            self.skip(1);
             return;
         }
-        match bytes.split_at_checked(RING.saturating_sub(at)) {
-            None => self.put(at, bytes),
-            Some((first, second)) => {
-                self.put(at, first);
-                self.put(0, second);
-            }
+        count_visits(1);
+        if let Some(place) = self.ring.first_mut() {
+            *place = byte;
         }
+        self.len = 1;
+        self.hold_until = 0;
     }
 
     /// Writes to the ring without counting it as held.
@@ -475,6 +391,21 @@ impl Deframer {
         count_visits(bytes.len());
         if let Some(target) = self.ring.get_mut(at..at.saturating_add(bytes.len())) {
             copy(target, bytes);
+        }
+    }
+
+    /// Writes to the front of the ring without counting it as held.
+    #[inline(always)]
+    fn put_first(&mut self, bytes: &[u8]) {
+        match bytes.len() {
+            // On its own: the compiler sees that a short piece fits.
+            len @ 0..16 => {
+                count_visits(len);
+                if let Some(target) = self.ring.get_mut(..len) {
+                    runs::copy(target, bytes);
+                }
+            }
+            _ => self.put(0, bytes),
         }
     }
 
@@ -490,12 +421,6 @@ fn hold_until(layout: &StreamLayout) -> u16 {
     (layout.frame_len() as u16).wrapping_sub(1)
 }
 
-/// Where the eight bytes begin with which a frame ends; in front of a frame of less stands anything.
-#[inline]
-fn tail_word_at(start: usize, frame_len: usize) -> usize {
-    start.wrapping_add(frame_len).wrapping_sub(MAX_DELIMITER) & WRAP
-}
-
 /// Copies to a piece of the same length.
 #[inline]
 fn copy(to: &mut [u8], from: &[u8]) {
@@ -505,18 +430,6 @@ fn copy(to: &mut [u8], from: &[u8]) {
         16..=runs::MAX_RUN => runs::copy(to, from),
         _ => runs::copy_long(to, from),
     }
-}
-
-/// Rotates the ring until the byte at `start` is at its front, by three reversals: unlike
-/// `rotate_left`, they need no length check.
-#[cold]
-#[inline(never)]
-fn rotate(ring: &mut [u8; RING], start: usize) {
-    if let Some((before, from)) = ring.split_at_mut_checked(start) {
-        before.reverse();
-        from.reverse();
-    }
-    ring.reverse();
 }
 
 /// The payload of a datagram that is exactly one frame.
@@ -536,6 +449,8 @@ pub fn datagram<'d>(layout: &StreamLayout, bytes: &'d [u8]) -> Result<&'d [u8], 
     }
     layout.payload_of(bytes).ok_or(length)
 }
+
+mod disturbed;
 
 #[cfg(not(test))]
 #[inline(always)]

@@ -7,6 +7,9 @@ use super::model::MAX_DELIMITER;
 pub(super) struct Head {
     bytes: [u8; MAX_DELIMITER],
     mask: [u8; MAX_DELIMITER],
+    /// The head and its mask in the lowest two bytes; what no two bytes are if it is longer.
+    short: u32,
+    short_mask: u32,
     len: u8,
 }
 
@@ -29,7 +32,12 @@ impl Head {
         let (mut bytes, mut mask) = ([0; MAX_DELIMITER], [0; MAX_DELIMITER]);
         bytes.get_mut(..head.len())?.copy_from_slice(head);
         mask.get_mut(..head.len())?.fill(0xFF);
-        Some(Self { bytes, mask, len: head.len() as u8 })
+        let lowest = |bytes: [u8; MAX_DELIMITER]| u64::from_le_bytes(bytes) as u32 & 0xFFFF;
+        let (short, short_mask) = match head.len() {
+            0..=2 => (lowest(bytes), lowest(mask)),
+            _ => (u32::MAX, u32::MAX),
+        };
+        Some(Self { bytes, mask, short, short_mask, len: head.len() as u8 })
     }
 
     pub(super) fn bytes(&self) -> &[u8] {
@@ -51,6 +59,17 @@ impl Head {
         same(front, &self.bytes, &self.mask)
     }
 
+    /// Whether `data` begins with the head. Also `false` if it is one byte, or fewer than eight and the head is longer
+    /// than two: these need a closer look.
+    #[inline(always)]
+    pub(super) fn begins(&self, data: &[u8]) -> bool {
+        match (data.first_chunk(), data.first_chunk()) {
+            (Some(front), _) => self.is(front),
+            (None, Some(&two)) => (u32::from(u16::from_le_bytes(two)) ^ self.short) & self.short_mask == 0,
+            (None, None) => false,
+        }
+    }
+
     /// Whether the lowest `seen` of eight bytes, 1 to the head's length, are the beginning of the head.
     #[inline(always)]
     pub(super) fn may_be(&self, bytes: u64, seen: usize) -> bool {
@@ -67,35 +86,21 @@ impl Head {
         }
     }
 
-    /// Number of bytes at the front of `data` that cannot begin a frame; `None` if there is no data.
+    /// Number of bytes before the first head behind the first byte of `data`; only those that have seven behind them are
+    /// looked at.
+    #[inline(always)]
+    pub(super) fn find_behind(&self, data: &[u8]) -> usize {
+        let behind = data.get(1..).unwrap_or(&[]);
+        let begins = |window: &[u8]| window.first_chunk().is_some_and(|front| self.is(front));
+        match behind.windows(MAX_DELIMITER).position(begins) {
+            Some(at) => at.wrapping_add(1),
+            None => data.len().saturating_sub(MAX_DELIMITER.wrapping_sub(1)),
+        }
+    }
+
+    /// Number of bytes at the front of `data`, which are fewer than eight, that cannot begin a frame.
     #[inline]
-    pub(super) fn find(&self, data: &[u8]) -> Option<usize> {
-        match data.first_chunk() {
-            Some(front) if self.is(front) => Some(0),
-            Some(_) => Some(self.find_behind(data)),
-            None if data.is_empty() => None,
-            None => Some(self.find_in_few(data)),
-        }
-    }
-
-    /// The same, when the first eight bytes do not begin with the head.
-    #[inline(never)]
-    fn find_behind(&self, data: &[u8]) -> usize {
-        let mut rest = data;
-        while let Some((_, behind)) = rest.split_first() {
-            rest = behind;
-            match rest.first_chunk() {
-                Some(front) if self.is(front) => return data.len().wrapping_sub(rest.len()),
-                Some(_) => {}
-                None => break,
-            }
-        }
-        data.len().wrapping_sub(rest.len()).wrapping_add(self.find_in_few(rest))
-    }
-
-    /// The same in fewer than eight bytes, which are compared with the beginning of the head.
-    #[inline(never)]
-    fn find_in_few(&self, data: &[u8]) -> usize {
+    pub(super) fn find_in_few(&self, data: &[u8]) -> usize {
         let (head, mask) = (u64::from_le_bytes(self.bytes), u64::from_le_bytes(self.mask));
         let (mut rest, mut left) = (few(data), data.len());
         // Of as many bytes as are left; none at all agree with any head.

@@ -295,6 +295,19 @@ impl Step {
             return None;
         }
         let target = image.get_mut(self.range())?;
+        self.put_checked(payload, target)
+    }
+
+    /// The same of a payload of which it is known that it is as long as the run, if the run is in the image.
+    #[inline(always)]
+    pub(super) fn apply_all(&self, payload: &[u8], image: &mut [u8; IMAGE_BYTES]) -> Option<Applied> {
+        let start = usize::from(self.image);
+        let target = image.get_mut(start..start.wrapping_add(payload.len()))?;
+        self.put_checked(payload, target)
+    }
+
+    #[inline(always)]
+    fn put_checked(&self, payload: &[u8], target: &mut [u8]) -> Option<Applied> {
         if self.kind == Kind::FLOATS {
             return runs::copy_finite(target, payload).then_some(Applied { masked: 0 });
         }

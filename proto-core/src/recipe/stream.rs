@@ -110,10 +110,13 @@ impl StreamLayout {
     /// [`ValueError`]: a float that is not finite, or a payload of another length.
     #[inline]
     pub fn apply(&self, payload: &[u8], image: &mut [u8; IMAGE_BYTES]) -> Result<Applied, ValueError> {
-        match self.whole.apply(payload, image) {
-            Some(applied) => Ok(applied),
-            None => self.apply_runs(payload, image),
+        // Compared here, and not with the run's length: whoever took the payload from a frame has this one at hand.
+        if payload.len() == self.payload_len()
+            && let Some(applied) = self.whole.apply_all(payload, image)
+        {
+            return Ok(applied);
         }
+        self.apply_runs(payload, image)
     }
 
     /// Writes a frame with the image's values to the front of `out` and returns its length.

@@ -12,11 +12,12 @@ pub(crate) const MAX_RUN: usize = 32;
 pub(crate) fn copy(to: &mut [u8], from: &[u8]) {
     debug_assert!(to.len() == from.len() && from.len() <= MAX_RUN);
     match from.len() {
-        16.. => wide_ends(to, from),
-        8.. => both_ends::<8>(to, from),
-        4.. => both_ends::<4>(to, from),
-        2.. => both_ends::<2>(to, from),
-        _ => both_ends::<1>(to, from),
+        // As one number: an array of sixteen bytes is a call of `memcpy` on a Cortex-M.
+        16.. => both_ends(to, from, |bytes| u128::from_ne_bytes(bytes).to_ne_bytes()),
+        8.. => both_ends(to, from, as_is::<8>),
+        4.. => both_ends(to, from, as_is::<4>),
+        2.. => both_ends(to, from, as_is::<2>),
+        _ => both_ends(to, from, as_is::<1>),
     }
 }
 
@@ -41,28 +42,18 @@ pub(crate) fn copy_long(to: &mut [u8], from: &[u8]) {
     }
 }
 
-#[inline(always)]
-fn both_ends<const N: usize>(to: &mut [u8], from: &[u8]) {
-    if let (Some(&front), Some(&back)) = (from.first_chunk::<N>(), from.last_chunk::<N>()) {
-        if let Some(target) = to.first_chunk_mut() {
-            *target = front;
-        }
-        if let Some(target) = to.last_chunk_mut() {
-            *target = back;
-        }
-    }
+fn as_is<const N: usize>(bytes: [u8; N]) -> [u8; N] {
+    bytes
 }
 
-/// The same with sixteen bytes, as numbers: an array of them is a call of `memcpy` on a Cortex-M.
 #[inline(always)]
-fn wide_ends(to: &mut [u8], from: &[u8]) {
-    if let (Some(&front), Some(&back)) = (from.first_chunk(), from.last_chunk()) {
-        let (front, back) = (u128::from_ne_bytes(front), u128::from_ne_bytes(back));
+fn both_ends<const N: usize>(to: &mut [u8], from: &[u8], by: impl Fn([u8; N]) -> [u8; N]) {
+    if let (Some(&front), Some(&back)) = (from.first_chunk::<N>(), from.last_chunk::<N>()) {
         if let Some(target) = to.first_chunk_mut() {
-            *target = front.to_ne_bytes();
+            *target = by(front);
         }
         if let Some(target) = to.last_chunk_mut() {
-            *target = back.to_ne_bytes();
+            *target = by(back);
         }
     }
 }
@@ -85,12 +76,19 @@ pub(crate) fn all_finite(run: &[u8]) -> bool {
 pub(crate) fn copy_finite(to: &mut [u8], run: &[u8]) -> bool {
     debug_assert!(to.len() == run.len() && run.len() <= MAX_RUN && run.len().is_multiple_of(4));
     match run.len() {
-        16.. => finite_ends::<16>(run).is_some_and(|_| {
-            wide_ends(to, run);
+        16.. => finite_ends::<16>(run).is_some_and(|(&front, &back)| {
+            // As numbers before anything is stored, so that they stay in the registers they were checked in.
+            let (front, back) = (u128::from_ne_bytes(front), u128::from_ne_bytes(back));
+            if let Some(target) = to.first_chunk_mut() {
+                *target = front.to_ne_bytes();
+            }
+            if let Some(target) = to.last_chunk_mut() {
+                *target = back.to_ne_bytes();
+            }
             true
         }),
         9.. => finite_ends::<8>(run).is_some_and(|_| {
-            both_ends::<8>(to, run);
+            both_ends(to, run, as_is::<8>);
             true
         }),
         // Both ends are the same.
