@@ -7,7 +7,7 @@ use super::model::MAX_DELIMITER;
 pub(super) struct Head {
     bytes: [u8; MAX_DELIMITER],
     mask: [u8; MAX_DELIMITER],
-    /// The head and its mask in the lowest two bytes; what no two bytes are if it is longer.
+    /// A head of up to two bytes and its mask; what no two bytes are if it is longer.
     short: u32,
     short_mask: u32,
     len: u8,
@@ -59,8 +59,8 @@ impl Head {
         same(front, &self.bytes, &self.mask)
     }
 
-    /// Whether `data` begins with the head. Also `false` if it is one byte, or fewer than eight and the head is longer
-    /// than two: these need a closer look.
+    /// Whether `data` begins with the head. `false` for some data that does, too: for a single byte, and for fewer than
+    /// eight if the head has more than two.
     #[inline(always)]
     pub(super) fn begins(&self, data: &[u8]) -> bool {
         match (data.first_chunk(), data.first_chunk()) {
@@ -86,8 +86,8 @@ impl Head {
         }
     }
 
-    /// Number of bytes before the first head behind the first byte of `data`; only those that have seven behind them are
-    /// looked at.
+    /// Number of bytes at the front of `data`, which does not begin with a head, before one. All but the last seven if
+    /// none begins before these.
     #[inline(always)]
     pub(super) fn find_behind(&self, data: &[u8]) -> usize {
         let behind = data.get(1..).unwrap_or(&[]);
@@ -98,7 +98,7 @@ impl Head {
         }
     }
 
-    /// Number of bytes at the front of `data`, which are fewer than eight, that cannot begin a frame.
+    /// Number of bytes at the front of fewer than eight that cannot begin a frame.
     #[inline]
     pub(super) fn find_in_few(&self, data: &[u8]) -> usize {
         let (head, mask) = (u64::from_le_bytes(self.bytes), u64::from_le_bytes(self.mask));

@@ -298,7 +298,7 @@ impl Step {
         self.put_checked(payload, target)
     }
 
-    /// The same of a payload of which it is known that it is as long as the run, if the run is in the image.
+    /// The same of a payload that is as long as the run, unless the run is nowhere in the image.
     #[inline(always)]
     pub(super) fn apply_all(&self, payload: &[u8], image: &mut [u8; IMAGE_BYTES]) -> Option<Applied> {
         let start = usize::from(self.image);

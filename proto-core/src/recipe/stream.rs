@@ -110,7 +110,7 @@ impl StreamLayout {
     /// [`ValueError`]: a float that is not finite, or a payload of another length.
     #[inline]
     pub fn apply(&self, payload: &[u8], image: &mut [u8; IMAGE_BYTES]) -> Result<Applied, ValueError> {
-        // Compared here, and not with the run's length: whoever took the payload from a frame has this one at hand.
+        // Not with the run's length: that a payload of a frame is as long as this one the compiler knows.
         if payload.len() == self.payload_len()
             && let Some(applied) = self.whole.apply_all(payload, image)
         {

@@ -77,7 +77,7 @@ pub(crate) fn copy_finite(to: &mut [u8], run: &[u8]) -> bool {
     debug_assert!(to.len() == run.len() && run.len() <= MAX_RUN && run.len().is_multiple_of(4));
     match run.len() {
         16.. => finite_ends::<16>(run).is_some_and(|(&front, &back)| {
-            // As numbers before anything is stored, so that they stay in the registers they were checked in.
+            // Both before one is stored, so that they stay in the registers in which they were checked.
             let (front, back) = (u128::from_ne_bytes(front), u128::from_ne_bytes(back));
             if let Some(target) = to.first_chunk_mut() {
                 *target = front.to_ne_bytes();
