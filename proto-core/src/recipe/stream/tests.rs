@@ -162,6 +162,20 @@ fn a_float_that_is_not_finite_rejects_the_whole_frame() {
 }
 
 #[test]
+fn a_payload_of_another_length_is_refused() {
+    for names in [&["ForceEnd[1..6]"][..], &["WordInputReg[1]"], &["WordInputReg[1]", "ForceEnd[1..6]"]] {
+        let layout = part(REALTIME_IN, system(names)).unwrap();
+        let expected = layout.payload_len();
+        for got in (0..=expected + 8).filter(|&got| got != expected) {
+            let mut image = [0xA5; IMAGE_BYTES];
+            let error = ValueError::Length { expected, got };
+            assert_eq!(layout.apply(&vec![0; got], &mut image), Err(error), "{names:?}");
+            assert_eq!(image, [0xA5; IMAGE_BYTES], "all or nothing");
+        }
+    }
+}
+
+#[test]
 fn long_runs_of_neighbours_are_moved_whole() {
     for (direction, first) in
         [(Direction::Input, "DigitalOutputCommand[1]"), (Direction::Output, "RobotState[1]")]
