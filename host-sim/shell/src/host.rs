@@ -34,7 +34,8 @@ pub(super) trait Shell: 'static {
     fn ready(&self) -> Value;
     /// A function that returns one line of statistics while the shell runs.
     fn stats(&self) -> impl Fn() -> Value + 'static;
-    /// Runs where tasks can be spawned that stay on this thread; returns only if something fails permanently, or after a shutdown command.
+    /// Runs where tasks can be spawned that stay on this thread; returns only if something fails permanently, or after a
+    /// shutdown command.
     fn run(self) -> impl Future<Output = Result<(), StartError>>;
 }
 
