@@ -171,7 +171,12 @@ impl Client {
 
     /// Opens a stream.
     pub(crate) fn stream(&self, path: &str) -> Result<Events<'_>, Failure> {
-        self.opened(self.exchange(&Call::get(path))?)
+        self.opened(self.open(path)?)
+    }
+
+    fn open(&self, path: &str) -> Result<Exchange, Failure> {
+        let call = Call::get(path);
+        self.asked_again(&call, || self.exchange(&call))
     }
 
     fn opened(&self, exchange: Exchange) -> Result<Events<'_>, Failure> {
@@ -185,7 +190,7 @@ impl Client {
 
     /// Opens a stream that this server may not have: `None` if there is no such path.
     pub(crate) fn stream_if_there(&self, path: &str) -> Result<Option<Events<'_>>, Failure> {
-        let exchange = self.exchange(&Call::get(path))?;
+        let exchange = self.open(path)?;
         if exchange.status() == 404 {
             return Ok(None);
         }
@@ -194,10 +199,32 @@ impl Client {
 
     /// Makes a request; any answer is one.
     pub(crate) fn call(&self, call: &Call<'_>) -> Result<Reply, Failure> {
-        self.exchange(call)?.finish().map_err(|error| self.no_reply(error))
+        self.asked_again(call, || Ok(self.exchange(call)?.finish()?))
     }
 
-    fn exchange(&self, call: &Call<'_>) -> Result<Exchange, Failure> {
+    /// Reads until it is not reset any more: a board whose places are taken does that to a forwarded port, and to what
+    /// it has to cut off. What changes something is asked once, as it may have been done.
+    fn asked_again<T>(
+        &self,
+        call: &Call<'_>,
+        mut ask: impl FnMut() -> Result<T, Missed>,
+    ) -> Result<T, Failure> {
+        let mut left = if call.method == "GET" { ATTEMPTS } else { 1 };
+        loop {
+            left -= 1;
+            match ask() {
+                Ok(done) => return Ok(done),
+                Err(Missed::Answer(NoReply::Reset(_))) if left > 0 => {}
+                Err(Missed::Answer(error)) => return Err(self.no_reply(error)),
+                Err(Missed::For(failure)) => return Err(failure),
+            }
+            if self.stop.wait(AGAIN) {
+                return Err(self.no_reply(NoReply::Stopped));
+            }
+        }
+    }
+
+    fn exchange(&self, call: &Call<'_>) -> Result<Exchange, Missed> {
         let nonce = self.nonce.take();
         let is_kept = nonce.is_some();
         let nonce = match nonce {
@@ -223,13 +250,14 @@ impl Client {
     }
 
     fn take_nonce(&self) -> Result<String, Failure> {
-        let reply = self.send(&Call::get("nonce"), None)?.finish().map_err(|error| self.no_reply(error))?;
+        let call = Call::get("nonce");
+        let reply = self.asked_again(&call, || Ok(self.send(&call, None)?.finish()?))?;
         let document = self.document(&self.accepted(reply)?)?;
         let nonce = document["nonce"].as_str().and_then(fit_nonce);
         nonce.ok_or_else(|| self.refused("its nonce is none; is this a gateway?"))
     }
 
-    fn send(&self, call: &Call<'_>, nonce: Option<&str>) -> Result<Exchange, Failure> {
+    fn send(&self, call: &Call<'_>, nonce: Option<&str>) -> Result<Exchange, Missed> {
         let target = format!("{API}{}", call.path);
         let body = call.body.bytes();
         let mut fields = Vec::new();
@@ -259,7 +287,7 @@ impl Client {
         let mut last = None;
         for attempt in 0..ATTEMPTS {
             if attempt > 0 && self.stop.wait(AGAIN) {
-                return Err(self.no_reply(NoReply::Stopped));
+                return Err(NoReply::Stopped.into());
             }
             let mut may_be_full = false;
             for &place in &self.places {
@@ -270,19 +298,14 @@ impl Client {
                         let hint = self.address.hint(place);
                         last = Some(format!("nobody is there: {place}: {}{hint}", words(&error)));
                     }
-                    // By a forwarded port. What changes something may have been done, and a nonce is used once.
-                    Err(NoReply::Reset(why)) if call.method == "GET" && nonce.is_none() => {
-                        may_be_full = true;
-                        last = Some(why);
-                    }
-                    done => return done.map_err(|error| self.no_reply(error)),
+                    done => return Ok(done?),
                 }
             }
             if !may_be_full {
                 break;
             }
         }
-        Err(self.refused(last.unwrap_or_default()))
+        Err(self.refused(last.unwrap_or_default()).into())
     }
 
     fn no_reply(&self, error: NoReply) -> Failure {
@@ -334,6 +357,26 @@ impl Client {
 /// Whether it is on this machine.
 fn is_here(place: SocketAddr) -> bool {
     place.ip().to_canonical().is_loopback()
+}
+
+/// Why a request was not answered.
+enum Missed {
+    /// There was none, or not to its end.
+    Answer(NoReply),
+    /// In words already: it was not reached, or has refused.
+    For(Failure),
+}
+
+impl From<NoReply> for Missed {
+    fn from(why: NoReply) -> Self {
+        Self::Answer(why)
+    }
+}
+
+impl From<Failure> for Missed {
+    fn from(why: Failure) -> Self {
+        Self::For(why)
+    }
 }
 
 /// A board has four places for connections, and turns others away while they are taken: it is asked so many times.

@@ -111,8 +111,14 @@ impl Exchange {
                 }
                 Err(HeadError::Incomplete) => match receive(&mut stream, bytes, deadline, stop)? {
                     0 if bytes.is_empty() => {
-                        let why = sent.as_ref().err().map_or("it closed the connection".into(), words);
-                        return Err(NoReply::Broken(format!("no answer: {why}")));
+                        return Err(match &sent {
+                            // The system tells a reset once: whoever writes first hears of it.
+                            Err(error) if is_reset(error) => {
+                                NoReply::Reset(format!("no answer: {}", words(error)))
+                            }
+                            Err(error) => NoReply::Broken(format!("no answer: {}", words(error))),
+                            Ok(()) => NoReply::Broken("no answer: it closed the connection".into()),
+                        });
                     }
                     0 => return Err(NoReply::Broken(HeadError::Incomplete.to_string())),
                     _ => {}
@@ -245,12 +251,14 @@ fn receive(
                 return Ok(count);
             }
             Err(error) if is_wait(&error) => {}
-            Err(error) if error.kind() == io::ErrorKind::ConnectionReset => {
-                return Err(NoReply::Reset(words(&error)));
-            }
+            Err(error) if is_reset(&error) => return Err(NoReply::Reset(words(&error))),
             Err(error) => return Err(NoReply::Broken(words(&error))),
         }
     }
+}
+
+fn is_reset(error: &io::Error) -> bool {
+    matches!(error.kind(), io::ErrorKind::ConnectionReset | io::ErrorKind::BrokenPipe)
 }
 
 fn is_wait(error: &io::Error) -> bool {

@@ -1,6 +1,7 @@
 //! Servers that are broken, or mean it: everything ends in time, in little room, with one message.
 
 use std::io::{Read, Write};
+use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
 use recipe_ctl::{Client, Failure, Stop, Watched};
@@ -194,4 +195,32 @@ fn who_resets_connections_is_asked_again_but_not_to_change_something_twice() {
     recipe_ctl::info(&client).unwrap();
     assert!(message(recipe_ctl::confirm(&client)).contains("reset"));
     assert_eq!(asked.join().unwrap(), ["GET ", "GET ", "GET ", "POST"]);
+}
+
+/// The same where reading needs the key: each time with another nonce, as one is used once.
+#[test]
+fn who_resets_what_is_signed_is_asked_again_with_another_nonce() {
+    let (nonces, reads) = (AtomicU32::new(0), AtomicU32::new(0));
+    let server = Server::start(move |asked| match (asked.path.as_str(), asked.signed_nonce()) {
+        ("nonce", _) if nonces.fetch_add(1, Relaxed) == 0 => reset(b""),
+        ("nonce", _) => ok(&json!({ "nonce": format!("{:032x}", nonces.load(Relaxed)) })),
+        (_, None) => document(401, "", &json!({ "error": "it needs the key" })),
+        (_, Some(_)) => match reads.fetch_add(1, Relaxed) {
+            0 => reset(b""),
+            1 => reset(b"HTTP/1.1 200 OK\r\nContent-Length: 15\r\n\r\n{\"name\""),
+            _ => ok(&json!({ "name": "cell" })),
+        },
+    });
+    let client = server.patient(true, PATIENT);
+    recipe_ctl::info(&client).unwrap();
+    let nonces: Vec<_> = server.asked().iter().filter_map(Asked::signed_nonce).collect();
+    assert_eq!(nonces, [2, 3, 4].map(|nonce| format!("{nonce:032x}")));
+}
+
+/// Writes this, and resets the connection.
+fn reset(piece: &'static [u8]) -> Reply {
+    Reply::Write(Box::new(|stream| {
+        stream.write_all(piece)?;
+        Ok(rustix::net::sockopt::set_socket_linger(stream, Some(Duration::ZERO))?)
+    }))
 }

@@ -175,6 +175,7 @@ fn a_board_in_qemu_loses_power_during_an_update() {
     // The same command goes on when the board is back, from the beginning.
     let mut sending = Process::start(&mut ctl.command(&["update", &second]));
     patiently("some of it is there", || {
+        sending.must_run();
         // The one that sends has most of the board's attention.
         let shown: Value = serde_json::from_str(&ctl.run(&["--json", "update"]).out).ok()?;
         (shown["incoming"]["received"].as_u64()? > 50_000).then_some(())
