@@ -65,6 +65,15 @@ fn feed(deframer: &mut Deframer, layout: &StreamLayout, mut chunk: &[u8]) -> Vec
     payloads
 }
 
+/// The same as the engine does it: what nothing can come of is only held.
+fn hold_or_feed(deframer: &mut Deframer, layout: &StreamLayout, chunk: &[u8]) -> Vec<Vec<u8>> {
+    let is_held = matches!(*chunk, [byte] if deframer.hold_byte(byte)) || deframer.hold(layout, chunk);
+    if is_held { Vec::new() } else { feed(deframer, layout, chunk) }
+}
+
+/// Both ways to give a chunk to a deframer.
+const WAYS: [fn(&mut Deframer, &StreamLayout, &[u8]) -> Vec<Vec<u8>>; 2] = [feed, hold_or_feed];
+
 fn feed_all<'a>(
     deframer: &mut Deframer,
     layout: &StreamLayout,
@@ -196,10 +205,10 @@ fn a_head_that_repeats_itself_is_found_after_its_own_beginning() {
 /// Gives a line to a deframer and to the reference, in chunks of every size.
 #[track_caller]
 fn is_read_as_the_reference_reads_it(layout: &StreamLayout, line: &[u8]) {
-    for size in 1..=line.len() {
+    for (size, way) in (1..=line.len()).flat_map(|size| WAYS.map(|way| (size, way))) {
         let (mut deframer, mut reference) = (Deframer::new(), Reference::default());
         for chunk in line.chunks(size) {
-            assert_eq!(feed(&mut deframer, layout, chunk), reference.feed(layout, chunk), "{line:?}, {size}");
+            assert_eq!(way(&mut deframer, layout, chunk), reference.feed(layout, chunk), "{line:?}, {size}");
             assert_eq!(deframer.stats(), reference.stats, "{line:?}, {size}");
             let (first, second) = deframer.held();
             assert_eq!([first, second].concat(), reference.bytes, "{line:?}, {size}");
@@ -233,6 +242,15 @@ fn silence_discards_a_partial_frame() {
     assert_eq!(feed(&mut deframer, &layout, &sensor_frame(2)), [sensor_payload(2)]);
     let expected = DeframerStats { frames: 1, discarded_bytes: 13, ..Default::default() };
     assert_eq!(deframer.stats(), expected);
+
+    // Also its head is forgotten: what ends like a frame does not become one.
+    feed(&mut deframer, &layout, &sensor_frame(3)[..13]);
+    deframer.discard();
+    let mut headless = sensor_frame(4);
+    headless[0] ^= 1;
+    for byte in headless {
+        assert_eq!(hold_or_feed(&mut deframer, &layout, &[byte]), Vec::<Vec<u8>>::new());
+    }
 }
 
 #[test]
@@ -404,20 +422,23 @@ proptest! {
         sizes in many(prop_oneof![Just(1_usize), 1..64_usize, 1..2000_usize], 1..20),
     ) {
         let line = line(&layout, &events);
-        let (mut deframer, mut reference) = (Deframer::new(), Reference::default());
-        let mut sizes = sizes.into_iter().cycle();
-        let mut rest = &line[..];
-        VISITS.set(0);
-        while !rest.is_empty() {
-            let (chunk, after) = rest.split_at(sizes.next().unwrap().min(rest.len()));
-            prop_assert_eq!(feed(&mut deframer, &layout, chunk), reference.feed(&layout, chunk));
-            prop_assert_eq!(deframer.stats(), reference.stats);
-            prop_assert_eq!(deframer.pending(), reference.bytes.len());
-            rest = after;
+        for way in WAYS {
+            let (mut deframer, mut reference) = (Deframer::new(), Reference::default());
+            let mut sizes = sizes.iter().cycle();
+            let mut rest = &line[..];
+            VISITS.set(0);
+            while !rest.is_empty() {
+                let (chunk, after) = rest.split_at(*sizes.next().unwrap().min(&rest.len()));
+                prop_assert_eq!(way(&mut deframer, &layout, chunk), reference.feed(&layout, chunk));
+                prop_assert_eq!(deframer.stats(), reference.stats);
+                prop_assert_eq!(deframer.pending(), reference.bytes.len());
+                rest = after;
+            }
+            prop_assert!(VISITS.get() <= VISITS_PER_BYTE * line.len());
+            let stats = deframer.stats();
+            let accounted =
+                stats.frames * layout.frame_len() as u64 + stats.skipped_bytes + deframer.pending() as u64;
+            prop_assert_eq!(accounted, line.len() as u64, "every byte is accounted for");
         }
-        prop_assert!(VISITS.get() <= VISITS_PER_BYTE * line.len());
-        let stats = deframer.stats();
-        let accounted = stats.frames * layout.frame_len() as u64 + stats.skipped_bytes + deframer.pending() as u64;
-        prop_assert_eq!(accounted, line.len() as u64, "every byte is accounted for");
     }
 }
