@@ -37,6 +37,9 @@ enum What {
         /// Rounds of 120 ms for each server
         #[arg(long, default_value_t = 25)]
         rounds: usize,
+        /// Who asks has one processor, and the servers another one
+        #[arg(long)]
+        apart: bool,
     },
     /// From the last byte on a pseudoterminal to the Modbus request, of the gateway and of a relay in C
     Relay {
@@ -63,7 +66,7 @@ enum What {
 
 fn main() -> ExitCode {
     match Arguments::parse().what {
-        What::Servers { rounds } => servers::compare(rounds.max(1)),
+        What::Servers { rounds, apart } => servers::compare(rounds.max(1), apart),
         What::Relay { rounds } => relay::compare(rounds.max(1)),
         What::Cells { cells, seconds, threads } => {
             cells.into_iter().for_each(|cells| cells::run(cells, seconds, threads));

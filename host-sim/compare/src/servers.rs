@@ -17,6 +17,7 @@ use recipe_net::realtime::{self, Scheduling};
 use recipe_test_kit::Process;
 use rustix::event::epoll;
 use rustix::process::Pid;
+use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
 use tokio_modbus::prelude::{ExceptionCode, Request, Response};
 use tokio_modbus::server::Service;
 use tokio_modbus::server::tcp::{Server, accept_tcp_connection};
@@ -39,12 +40,17 @@ pub(crate) enum Kind {
     TokioModbus,
 }
 
-/// Compares them, and prints a table for each number of connections.
-pub(crate) fn compare(rounds: usize) {
+/// Compares them, and prints a table for each number of connections. If they are `apart`, who asks has one processor, and
+/// the servers share another one: the scheduler decides nothing.
+pub(crate) fn compare(rounds: usize, apart: bool) {
     let controller = cell_files::controller();
     let epoll = Other::start(programs::this().args(["serve", "epoll"]));
     let tokio_modbus = Other::start(programs::this().args(["serve", "tokio-modbus"]));
     let libmodbus = Other::start(&mut programs::in_c("modbus_server", &["-lmodbus"]));
+    if apart {
+        let others = [&epoll, &tokio_modbus, &libmodbus].map(|other| other.process.pid());
+        keep_apart(others.into_iter().chain([controller.pid()]));
+    }
     for connections in [8, 64] {
         let mut sides = [
             Side::new("bare epoll", epoll.address, epoll.process.pid(), connections),
@@ -60,6 +66,28 @@ pub(crate) fn compare(rounds: usize) {
         for side in &mut sides {
             let (rate, cost) = (quantile(&mut side.rates, 0.5), quantile(&mut side.costs, 0.5));
             println!("  {:<14} {rate:>12.0} {:>20.3} {cost:>20.0}", side.name, rate / bare);
+        }
+    }
+}
+
+/// Puts this thread on the first processor that it may use, and these processes on the second one.
+fn keep_apart(servers: impl Iterator<Item = Pid>) {
+    let allowed = sched_getaffinity(None).expect("the system says which processors there are");
+    let mut processors = (0..CpuSet::MAX_CPU).filter(|&processor| allowed.is_set(processor)).map(|processor| {
+        let mut one = CpuSet::new();
+        one.set(processor);
+        one
+    });
+    let (Some(own), Some(theirs)) = (processors.next(), processors.next()) else {
+        panic!("they cannot be kept apart: this program may use one processor only")
+    };
+    sched_setaffinity(None, &own).expect("an allowed processor");
+    for server in servers {
+        let threads = std::fs::read_dir(format!("/proc/{server}/task")).expect("it runs");
+        for thread in threads {
+            let name = thread.expect("a thread").file_name();
+            let thread = name.to_str().and_then(|name| name.parse().ok()).and_then(Pid::from_raw);
+            sched_setaffinity(thread, &theirs).expect("a thread of our own, on an allowed processor");
         }
     }
 }
