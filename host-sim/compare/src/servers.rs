@@ -40,8 +40,8 @@ pub(crate) enum Kind {
     TokioModbus,
 }
 
-/// Compares them, and prints a table for each number of connections. If they are `apart`, who asks has one processor, and
-/// the servers share another one: the scheduler decides nothing.
+/// Compares them, and prints a table for each number of connections. If they are `apart`, who asks has one processor,
+/// and the servers share another one: the scheduler decides nothing.
 pub(crate) fn compare(rounds: usize, apart: bool) {
     let controller = cell_files::controller();
     let epoll = Other::start(programs::this().args(["serve", "epoll"]));
@@ -73,11 +73,12 @@ pub(crate) fn compare(rounds: usize, apart: bool) {
 /// Puts this thread on the first processor that it may use, and these processes on the second one.
 fn keep_apart(servers: impl Iterator<Item = Pid>) {
     let allowed = sched_getaffinity(None).expect("the system says which processors there are");
-    let mut processors = (0..CpuSet::MAX_CPU).filter(|&processor| allowed.is_set(processor)).map(|processor| {
-        let mut one = CpuSet::new();
-        one.set(processor);
-        one
-    });
+    let mut processors =
+        (0..CpuSet::MAX_CPU).filter(|&processor| allowed.is_set(processor)).map(|processor| {
+            let mut one = CpuSet::new();
+            one.set(processor);
+            one
+        });
     let (Some(own), Some(theirs)) = (processors.next(), processors.next()) else {
         panic!("they cannot be kept apart: this program may use one processor only")
     };

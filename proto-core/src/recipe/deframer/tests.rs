@@ -71,8 +71,11 @@ fn hold_or_feed(deframer: &mut Deframer, layout: &StreamLayout, chunk: &[u8]) ->
     if is_held { Vec::new() } else { feed(deframer, layout, chunk) }
 }
 
-/// Both ways to give a chunk to a deframer.
-const WAYS: [fn(&mut Deframer, &StreamLayout, &[u8]) -> Vec<Vec<u8>>; 2] = [feed, hold_or_feed];
+/// Gives a chunk to a deframer and returns the payloads in it.
+type Way = fn(&mut Deframer, &StreamLayout, &[u8]) -> Vec<Vec<u8>>;
+
+/// Both of them.
+const WAYS: [Way; 2] = [feed, hold_or_feed];
 
 fn feed_all<'a>(
     deframer: &mut Deframer,
