@@ -13,8 +13,6 @@ mod process;
 use std::sync::{Mutex, MutexGuard};
 use std::time::Duration;
 
-use serde_json::Value;
-
 use attack::Attack;
 use clients::{Clients, Service};
 use process::{Usage, usage};
@@ -50,9 +48,15 @@ impl Scene {
     }
 
     /// Lets attacks go on until the clients were served as before for some time while the process's memory did
-    /// not grow. Then the process has to end on a signal, while the attacks go on. Returns its last statistics.
+    /// not grow. Then the process has to end on a signal, while the attacks go on.
     #[track_caller]
-    fn survives(self, attacks: Vec<Attack>) -> Value {
+    fn survives(self, attacks: Vec<Attack>) {
+        self.survives_until(attacks, |process| drop(process.fresh()));
+    }
+
+    /// The same, with something to wait for under attack, before the signal.
+    #[track_caller]
+    fn survives_until(self, attacks: Vec<Attack>, awaited: impl FnOnce(&HostSim)) {
         self.clients.measure(WARM_UP);
         let mut quiet = None;
         in_one_of_several_tries(|| {
@@ -77,11 +81,10 @@ impl Scene {
                 self.clients.measure(WARM_UP);
             })
         });
-        let stats = self.process.fresh();
+        awaited(&self.process);
         drop(self.clients);
         self.process.end();
         drop(attacks);
-        stats
     }
 }
 
