@@ -1,5 +1,6 @@
 //! The record of the program's register accesses, and the violation that ends a run.
 
+use std::borrow::Cow;
 use std::fmt;
 
 use crate::device::Picos;
@@ -14,7 +15,7 @@ pub struct Access {
     /// The peripheral's name.
     pub peripheral: &'static str,
     /// The register's name.
-    pub register: String,
+    pub register: Cow<'static, str>,
     /// The value read or written.
     pub value: u32,
     /// Whether it was a write.

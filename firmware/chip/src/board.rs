@@ -3,12 +3,13 @@
 
 mod blocks;
 
+use std::borrow::Cow;
 use std::collections::VecDeque;
 
 use self::blocks::ENDLESS;
 use crate::access::{Access, Violation};
 use crate::device::*;
-use crate::devices::{CAN, Devices, Id, MAP};
+use crate::devices::{CAN, Devices, Id, MAP, Place};
 use crate::exception::masks;
 use crate::models::rcc::Cause;
 use crate::models::scs::Scs;
@@ -20,6 +21,15 @@ use crate::unicorn::{Engine, Flow, Handler, Reg, SYSTEM};
 pub(crate) enum Halt {
     /// At the WFE or WFI at this address.
     Wait(u32),
+}
+
+/// What a device that is left alone does next.
+#[derive(Debug, Clone, Copy)]
+struct Next {
+    /// Time of its next event.
+    at: Picos,
+    /// Level of its interrupt line.
+    line: bool,
 }
 
 /// Devices, virtual time and the access record.
@@ -43,6 +53,8 @@ pub(crate) struct Board {
     cycle: Picos,
     deadline: Picos,
     has_pending: bool,
+    /// What is next at each place of [`MAP`].
+    next: [Next; MAP.len()],
     /// Length in bytes and number of instructions of each basic block seen in flash, by its address.
     blocks: Vec<(u16, u16)>,
 }
@@ -66,6 +78,7 @@ impl Board {
             cycle: 1,
             deadline: 0,
             has_pending: false,
+            next: [Next { at: Picos::MAX, line: false }; MAP.len()],
             blocks: vec![(0, 0); FLASH_SIZE as usize / 2],
         };
         board.update_clocks();
@@ -103,35 +116,63 @@ impl Board {
         act(&mut self.devices, &mut self.scs, &at)
     }
 
-    /// Updates the next deadline and the interrupt lines.
+    /// Looks at all devices anew: what is next, and the interrupt lines.
     fn refresh(&mut self) {
+        self.refresh_those(|_, _| true);
+    }
+
+    /// The same, where only these can have changed.
+    fn refresh_those(&mut self, is_meant: impl Fn(&Place, Next) -> bool) {
+        let mut next = self.next;
         let (deadline, has_pending) = self.with_devices(|devices, scs, at| {
             let mut deadline = scs.deadline().unwrap_or(Picos::MAX);
-            for place in MAP.iter().filter(|place| place.changes_with_time()) {
-                let device = devices.device(place.id);
-                deadline = deadline.min(device.deadline(at).unwrap_or(Picos::MAX));
+            for (place, next) in MAP.iter().zip(&mut next).filter(|(place, _)| place.changes_with_time()) {
+                if is_meant(place, *next) {
+                    let device = devices.device(place.id);
+                    next.at = device.deadline(at).unwrap_or(Picos::MAX);
+                    next.line = place.line.is_some() && device.interrupt_line();
+                }
+                deadline = deadline.min(next.at);
                 if let Some(line) = place.line {
-                    scs.set_line(line, device.interrupt_line());
+                    scs.set_line(line, next.line);
                 }
             }
             (deadline, scs.most_urgent().is_some())
         });
+        self.next = next;
         self.deadline = deadline.min(self.limit);
         self.has_pending = has_pending;
     }
 
-    /// Time of the next event of any device.
+    /// Time of the next event of any device, whatever has been done to them from outside.
     pub(crate) fn deadline(&mut self) -> Picos {
         self.refresh();
         self.deadline
     }
 
+    /// The same, where nothing was done from outside.
+    pub(crate) fn known_deadline(&self) -> Picos {
+        self.deadline
+    }
+
     /// Lets all devices carry out what is due.
     pub(crate) fn advance(&mut self, core: Engine) {
+        self.advance_those(core, |_, _| true);
+    }
+
+    /// The same, where nothing but time has changed since [`Board::advance`] or an access.
+    pub(crate) fn advance_due(&mut self, core: Engine) {
+        let now = self.now;
+        self.advance_those(core, |_, next| next.at <= now);
+    }
+
+    fn advance_those(&mut self, core: Engine, is_meant: impl Fn(&Place, Next) -> bool) {
+        let next = self.next;
         let refused = self.with_devices(|devices, scs, at| {
             scs.advance(at);
             let mut memory = core;
-            for place in MAP.iter().filter(|place| place.changes_with_time()) {
+            let places = MAP.iter().zip(next).filter(|(place, _)| place.changes_with_time());
+            for (place, _) in places.filter(|(place, next)| is_meant(place, *next)) {
                 let result = devices.device(place.id).advance(at);
                 let result = match place.id {
                     Id::Ethernet => result.and_then(|()| devices.ethernet.transfer(&mut memory, at)),
@@ -148,14 +189,14 @@ impl Board {
                 at: self.now,
                 pc: core.reg(Reg::Pc),
                 peripheral,
-                register: String::new(),
+                register: "".into(),
                 value: 0,
                 is_write: false,
                 times: 0,
             };
             self.violation.get_or_insert(Violation { access, reason });
         }
-        self.refresh();
+        self.refresh_those(is_meant);
     }
 
     /// A write by the program to flash memory.
@@ -166,7 +207,7 @@ impl Board {
             at: self.now,
             pc,
             peripheral: "flash",
-            register: format!("[{offset:06X}]"),
+            register: format!("[{offset:06X}]").into(),
             value: u32::from_le_bytes(value),
             is_write: true,
             times: 1,
@@ -175,7 +216,7 @@ impl Board {
             self.violation.get_or_insert(Violation { access: access.clone(), reason });
         }
         self.record(access);
-        self.refresh();
+        self.refresh_those(|place, _| place.id == Id::Flash);
     }
 
     fn record(&mut self, access: Access) {
@@ -194,6 +235,7 @@ impl Board {
     }
 
     fn access(&mut self, core: Engine, address: u32, size: u32, value: Option<u32>) -> u32 {
+        let place = MAP.iter().find(|place| (place.base..place.base + place.size).contains(&address));
         let (name, register, result) = if address >= SYSTEM {
             let offset = address.wrapping_sub(0xE000_E000);
             let result = self.with_devices(|_, scs, at| match value {
@@ -203,7 +245,7 @@ impl Board {
             self.guard_changed |= value.is_some() && (0xD90..0xDB0).contains(&offset);
             ("core", Scs::name(offset), result)
         } else {
-            self.access_device(address, size, value)
+            self.access_device(place, address, size, value)
         };
         let is_write = value.is_some();
         let access = Access {
@@ -227,23 +269,31 @@ impl Board {
         if is_write && name.starts_with("GPIO") {
             self.functions = std::array::from_fn(|index| self.devices.gpio[index].functions());
         }
-        if is_write {
-            self.advance(core);
-        } else {
-            self.refresh();
+        let accessed = place.map(|place| if place.id == Id::CanRam { Id::Can } else { place.id });
+        let is_accessed = |place: &Place| Some(place.id) == accessed;
+        let now = self.now;
+        match accessed {
+            // What all others see: clocks, and the pins' functions.
+            Some(Id::Rcc | Id::Pwr | Id::Syscfg | Id::Gpio(_)) if is_write => self.advance(core),
+            _ if is_write => self.advance_those(core, |place, next| is_accessed(place) || next.at <= now),
+            _ => self.refresh_those(|place, _| is_accessed(place)),
         }
         result.unwrap_or(0)
     }
 
     fn access_device(
         &mut self,
+        place: Option<&Place>,
         address: u32,
         size: u32,
         value: Option<u32>,
-    ) -> (&'static str, String, Result<u32, Refusal>) {
-        let found = MAP.iter().find(|place| (place.base..place.base + place.size).contains(&address));
-        let Some(place) = found else {
-            return ("nothing", format!("{address:08X}"), refuse("nothing is modelled at this address"));
+    ) -> (&'static str, Cow<'static, str>, Result<u32, Refusal>) {
+        let Some(place) = place else {
+            return (
+                "nothing",
+                format!("{address:08X}").into(),
+                refuse("nothing is modelled at this address"),
+            );
         };
         let offset = address - place.base;
         if place.id == Id::CanRam {
@@ -254,7 +304,7 @@ impl Board {
                 Some(value) => can.ram_write(word, value).map(|()| value),
                 None => can.ram_read(word),
             });
-            return (place.name, format!("[{word}]"), result);
+            return (place.name, format!("[{word}]").into(), result);
         }
         let result = self.with_devices(|devices, _, at| {
             if let Some(gate) = place.gate {
@@ -277,7 +327,10 @@ impl Board {
         });
         let registers = self.devices.device(place.id).registers();
         let register = registers.iter().find(|register| register.offset == offset & !3);
-        let register = register.map_or_else(|| format!("+{offset:03X}"), |register| register.name.into());
+        let register = match register {
+            Some(register) => register.name.into(),
+            None => format!("+{offset:03X}").into(),
+        };
         (place.name, register, result)
     }
 

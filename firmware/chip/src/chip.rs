@@ -261,8 +261,11 @@ impl Chip {
     /// # Errors
     /// A violation.
     pub fn run_until(&mut self, end: Picos) -> Result<(), Stopped> {
+        self.board.limit = end;
+        // Outside, anything may have changed.
+        let engine = self.engine();
+        self.board.advance(engine);
         while self.board.now < end {
-            self.board.limit = end;
             self.step(end);
             if self.board.devices.flash.has_failed() {
                 self.read_log();
@@ -287,7 +290,7 @@ impl Chip {
 
     fn step(&mut self, end: Picos) {
         let engine = self.engine();
-        self.board.advance(engine);
+        self.board.advance_due(engine);
         if self.board.devices.watchdog.expires_at().is_some_and(|at| self.board.now >= at) {
             self.resets.push(self.board.now);
             self.reset(Cause::Watchdog);
@@ -399,12 +402,12 @@ impl Chip {
 
     /// Advances time to the next event of a device.
     fn idle(&mut self, end: Picos) {
-        let next = self.board.deadline().min(end);
+        let next = self.board.known_deadline().min(end);
         self.stalled = if next > self.board.now { 0 } else { self.stalled + 1 };
         assert!(self.stalled < 1_000, "a model's deadline does not advance: {next}");
         self.board.now = self.board.now.max(next);
         let engine = self.engine();
-        self.board.advance(engine);
+        self.board.advance_due(engine);
     }
 
     /// Resets the chip; flash and RAM keep their contents. The log is read before, since the program begins its buffer

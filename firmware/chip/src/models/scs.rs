@@ -3,6 +3,8 @@
 //!
 //! The only MPU region modelled is one without access rights: the stack guard.
 
+use std::borrow::Cow;
+
 use crate::device::*;
 
 const CSR: u32 = 0x010;
@@ -257,16 +259,16 @@ impl Scs {
     }
 
     /// The name of a register.
-    pub fn name(offset: u32) -> String {
+    pub fn name(offset: u32) -> Cow<'static, str> {
         match REGISTERS.iter().find(|register| register.offset == offset) {
             Some(register) => register.name.into(),
-            None if PRIORITIES.contains(&offset) => format!("NVIC_IPR[{}]", offset - PRIORITIES.start),
+            None if PRIORITIES.contains(&offset) => format!("NVIC_IPR[{}]", offset - PRIORITIES.start).into(),
             None if SYSTEM_PRIORITIES.contains(&offset) => "SHPR".into(),
             None if NVIC.contains(&offset) => {
                 let kind = ["ISER", "ICER", "ISPR", "ICPR"][((offset - NVIC.start) / 0x80) as usize];
-                format!("NVIC_{kind}{}", offset % 0x80 / 4)
+                format!("NVIC_{kind}{}", offset % 0x80 / 4).into()
             }
-            None => format!("+{offset:03X}"),
+            None => format!("+{offset:03X}").into(),
         }
     }
 
