@@ -23,15 +23,6 @@ pub(crate) enum Halt {
     Wait(u32),
 }
 
-/// What a device that is left alone does next.
-#[derive(Debug, Clone, Copy)]
-struct Next {
-    /// Time of its next event.
-    at: Picos,
-    /// Level of its interrupt line.
-    line: bool,
-}
-
 /// Devices, virtual time and the access record.
 pub(crate) struct Board {
     pub(crate) devices: Devices,
@@ -53,8 +44,8 @@ pub(crate) struct Board {
     cycle: Picos,
     deadline: Picos,
     has_pending: bool,
-    /// What is next at each place of [`MAP`].
-    next: [Next; MAP.len()],
+    /// Time of the next event at each place of [`MAP`].
+    next: [Picos; MAP.len()],
     /// Length in bytes and number of instructions of each basic block seen in flash, by its address.
     blocks: Vec<(u16, u16)>,
 }
@@ -78,7 +69,7 @@ impl Board {
             cycle: 1,
             deadline: 0,
             has_pending: false,
-            next: [Next { at: Picos::MAX, line: false }; MAP.len()],
+            next: [Picos::MAX; MAP.len()],
             blocks: vec![(0, 0); FLASH_SIZE as usize / 2],
         };
         board.update_clocks();
@@ -122,20 +113,19 @@ impl Board {
     }
 
     /// The same, where only these can have changed.
-    fn refresh_those(&mut self, is_meant: impl Fn(&Place, Next) -> bool) {
+    fn refresh_those(&mut self, is_meant: impl Fn(&Place, Picos) -> bool) {
         let mut next = self.next;
         let (deadline, has_pending) = self.with_devices(|devices, scs, at| {
             let mut deadline = scs.deadline().unwrap_or(Picos::MAX);
             for (place, next) in MAP.iter().zip(&mut next).filter(|(place, _)| place.changes_with_time()) {
                 if is_meant(place, *next) {
                     let device = devices.device(place.id);
-                    next.at = device.deadline(at).unwrap_or(Picos::MAX);
-                    next.line = place.line.is_some() && device.interrupt_line();
+                    *next = device.deadline(at).unwrap_or(Picos::MAX);
+                    if let Some(line) = place.line {
+                        scs.set_line(line, device.interrupt_line());
+                    }
                 }
-                deadline = deadline.min(next.at);
-                if let Some(line) = place.line {
-                    scs.set_line(line, next.line);
-                }
+                deadline = deadline.min(*next);
             }
             (deadline, scs.most_urgent().is_some())
         });
@@ -163,10 +153,10 @@ impl Board {
     /// The same, where nothing but time has changed since [`Board::advance`] or an access.
     pub(crate) fn advance_due(&mut self, core: Engine) {
         let now = self.now;
-        self.advance_those(core, |_, next| next.at <= now);
+        self.advance_those(core, |_, next| next <= now);
     }
 
-    fn advance_those(&mut self, core: Engine, is_meant: impl Fn(&Place, Next) -> bool) {
+    fn advance_those(&mut self, core: Engine, is_meant: impl Fn(&Place, Picos) -> bool) {
         let next = self.next;
         let refused = self.with_devices(|devices, scs, at| {
             scs.advance(at);
@@ -235,7 +225,8 @@ impl Board {
     }
 
     fn access(&mut self, core: Engine, address: u32, size: u32, value: Option<u32>) -> u32 {
-        let place = MAP.iter().find(|place| (place.base..place.base + place.size).contains(&address));
+        let holds = |place: &&Place| (place.base..place.base + place.size).contains(&address);
+        let place = if address >= SYSTEM { None } else { MAP.iter().find(holds) };
         let (name, register, result) = if address >= SYSTEM {
             let offset = address.wrapping_sub(0xE000_E000);
             let result = self.with_devices(|_, scs, at| match value {
@@ -261,22 +252,24 @@ impl Board {
             self.violation.get_or_insert(Violation { access: access.clone(), reason: reason.clone() });
         }
         self.record(access);
-        if is_write && name == "RCC" {
-            self.apply_resets();
-            self.update_clocks();
-            self.check_speed();
-        }
-        if is_write && name.starts_with("GPIO") {
-            self.functions = std::array::from_fn(|index| self.devices.gpio[index].functions());
-        }
         let accessed = place.map(|place| if place.id == Id::CanRam { Id::Can } else { place.id });
         let is_accessed = |place: &Place| Some(place.id) == accessed;
         let now = self.now;
         match accessed {
-            // What all others see: clocks, and the pins' functions.
-            Some(Id::Rcc | Id::Pwr | Id::Syscfg | Id::Gpio(_)) if is_write => self.advance(core),
-            _ if is_write => self.advance_those(core, |place, next| is_accessed(place) || next.at <= now),
-            _ => self.refresh_those(|place, _| is_accessed(place)),
+            _ if !is_write => self.refresh_those(|place, _| is_accessed(place)),
+            // All others see clocks, and the pins' functions.
+            Some(Id::Rcc) => {
+                self.apply_resets();
+                self.update_clocks();
+                self.check_speed();
+                self.advance(core);
+            }
+            Some(Id::Gpio(_)) => {
+                self.functions = std::array::from_fn(|index| self.devices.gpio[index].functions());
+                self.advance(core);
+            }
+            Some(Id::Pwr | Id::Syscfg) => self.advance(core),
+            _ => self.advance_those(core, |place, next| is_accessed(place) || next <= now),
         }
         result.unwrap_or(0)
     }
@@ -327,10 +320,8 @@ impl Board {
         });
         let registers = self.devices.device(place.id).registers();
         let register = registers.iter().find(|register| register.offset == offset & !3);
-        let register = match register {
-            Some(register) => register.name.into(),
-            None => format!("+{offset:03X}").into(),
-        };
+        let register =
+            register.map_or_else(|| format!("+{offset:03X}").into(), |register| register.name.into());
         (place.name, register, result)
     }
 
