@@ -60,7 +60,7 @@ fn defaults_are_those_of_a_file() {
         stop_bits: 1,
         idle_gap: ms(50),
         turnaround: Duration::from_micros(100),
-        echo: false,
+        echo: Echo::Auto,
     };
     assert_eq!(config.ports[0].bus, Bus::Rs485(line));
     assert_eq!(config.ports[1].bus, Bus::Can { bitrate: 500_000 });

@@ -295,7 +295,7 @@ fn an_echo_needs_exchanges() {
         Config::builder()
             .controller("10.0.0.2")
             .recipe(recipe)
-            .port(Port::rs485("line", "line").echo())
+            .port(Port::rs485("line", "line").echo(Echo::Yes))
             .build()
     };
     let one = [OutputField::constant(Byte, 1.0)];
@@ -308,5 +308,5 @@ fn an_echo_needs_exchanges() {
     let value = value();
     let asks = [Ask::request(AskFrame::stream(&[1], &[], &value)).at_start()];
     let config = echo(Recipe::user("line").exchanges(&asks)).unwrap();
-    assert!(matches!(config.ports[0].bus, Bus::Rs485(line) if line.echo));
+    assert!(matches!(config.ports[0].bus, Bus::Rs485(line) if line.echo == Echo::Yes));
 }

@@ -11,7 +11,7 @@ use proto_core::config::image::{
     ImageError, MAX_IMAGE, OLDEST_VERSION, VERSION, decode, decode_into, encode, image_len,
 };
 use proto_core::config::{
-    BoardAddress, Bus, CommandWhen, FieldSpec, GatewayConfig, InputBinding, LinkSource, OnStale,
+    BoardAddress, Bus, CommandWhen, Echo, FieldSpec, GatewayConfig, InputBinding, LinkSource, OnStale,
     OutputBinding, Outside, Parity, Parts, PortValue, SendOn, Talk,
 };
 use proto_core::device::{Algorithm, Boundary, ByteOrder, Counts, Escape, Kind, Overflow, TextWidth, Width};
@@ -163,6 +163,7 @@ fn serialized_types_are_those_of_the_version() {
         Bus,
         CanId,
         CommandWhen,
+        Echo,
         FieldSpec,
         InputBinding,
         LinkSource,

@@ -1,5 +1,6 @@
 //! Traffic between ports and their devices: bytes on lines, frames on buses.
 
+use proto_core::config::Echo;
 use proto_core::engine::Input;
 use proto_core::time::Instant;
 use proto_core::wire::can::CanFrame;
@@ -32,7 +33,7 @@ impl Cell {
             End::Device => self.hand_on(id, owner, &chunk.bytes),
             End::Port => {
                 let mut answers = Vec::new();
-                if line.settings().echo && line.is_plugged {
+                if line.settings().echo == Echo::Yes && line.is_plugged {
                     // The adapter gives back what the port sends, whether or not it reaches the device.
                     self.hand_on(id, owner, &chunk.bytes);
                 }

@@ -124,7 +124,7 @@ pub(super) fn serial(baud: u32) -> PortBus {
         stop_bits: 1,
         idle_gap: proto_core::time::Duration::from_millis(50),
         turnaround: proto_core::time::Duration::ZERO,
-        echo: false,
+        echo: proto_core::config::Echo::No,
     })
 }
 

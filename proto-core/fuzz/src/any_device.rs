@@ -3,7 +3,7 @@
 //! Most of them are right, because a wrong one is refused before anything happens. Some are not.
 
 use proto_core::config::{
-    AskWhen, Bus, CanFramePart, CommandWhen, Delimiter, Exchange, FieldSpec, FrameSpec, InputBinding,
+    AskWhen, Bus, CanFramePart, CommandWhen, Delimiter, Echo, Exchange, FieldSpec, FrameSpec, InputBinding,
     LinkSource, OutputBinding, Parts, PortValue, Span, StateValue, StreamPart, Talk, Words,
 };
 use proto_core::device::{
@@ -411,7 +411,12 @@ pub(crate) fn line(cell: &mut Cell, input: &mut Source<'_>) {
     let has_exchanges = cell.0.recipes[recipe].exchanges.len > 0;
     let port = cell.last_port();
     if let Bus::Rs485(line) = &mut port.bus {
-        line.echo = kind & 1 == 1 && has_exchanges;
+        line.echo = match kind {
+            _ if !has_exchanges => Echo::No,
+            kind if kind & 1 == 1 => Echo::Yes,
+            kind if kind & 2 == 2 => Echo::Auto,
+            _ => Echo::No,
+        };
         line.turnaround = Duration::from_micros([0, 100, 1_750, 4_000][usize::from(kind >> 1 & 3)]);
         line.idle_gap = Duration::from_micros([50_000, 1_750, 50_000, 5_000][usize::from(kind >> 3 & 3)]);
     }

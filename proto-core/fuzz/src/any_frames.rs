@@ -4,7 +4,7 @@
 //! to it is looked at byte by byte.
 
 use proto_core::config::{
-    Bus, DeviceFrame, Exchange, FieldSpec, FrameSpec, GatewayConfig, Parts, Recipe, StreamPart, Talk,
+    Bus, DeviceFrame, Echo, Exchange, FieldSpec, FrameSpec, GatewayConfig, Parts, Recipe, StreamPart, Talk,
 };
 use proto_core::device::{Carrier, Escape};
 use proto_core::modbus::rtu::Operation;
@@ -63,7 +63,7 @@ pub(crate) fn bytes(
         Talk::Rtu { .. } => slaves_reply(&said.sent, which, input)?,
         Talk::Served { operation, .. } => with_crc(&masters_request(exchange.peer, operation, which, input)),
     };
-    let has_echo = matches!(&config.ports.get(port)?.bus, Bus::Rs485(line) if line.echo);
+    let has_echo = matches!(&config.ports.get(port)?.bus, Bus::Rs485(line) if line.echo == Echo::Yes);
     Some(if has_echo && which & 0x40 == 0 { [&said.sent[..], &frame].concat() } else { frame })
 }
 

@@ -302,6 +302,7 @@ impl ConfigMut<'_> {
         port.timeout = from.timeout.unwrap_or(port.timeout);
         port.stale_after = from.stale_after.unwrap_or(port.stale_after);
         (port.health, port.safe_at_start, port.refresh) = (from.health, from.safe_at_start, from.refresh);
+        port.absent = from.absent.unwrap_or(port.absent);
         self.put_port(port, &from.safe)
     }
 

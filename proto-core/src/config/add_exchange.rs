@@ -6,13 +6,13 @@
 use super::ask::{Ask, AskFrame, AskTalk, of_block};
 use super::error::{ConfigError, ConfigErrorKind as Kind, ExchangeKey, Place};
 use super::exchange::{Exchange, FrameSpec, Talk};
-use super::fields::Fields;
+use super::fields::{Fields, Var};
 use super::view::ConfigMut;
-use super::{AskWhen, Delimiter, ExchangeError, FieldSpec, Span};
+use super::{AskWhen, Delimiter, ExchangeError, FieldSpec, OutcomeTo, Span};
 use crate::device::{Bits, ByteOrder, Encoding, Kind as EncodingKind, Overflow};
 use crate::modbus::rtu::{Operation, Table};
 use crate::recipe::model::MAX_DELIMITER;
-use crate::sysvar::Direction;
+use crate::sysvar::{Direction, ParseError};
 
 /// The numbers of the next frames: of the input part, and of the output part.
 #[derive(Clone, Copy)]
@@ -50,8 +50,27 @@ impl ConfigMut<'_> {
                 let var = var.read().map_err(|error| ConfigError { place, kind: Kind::Variable(error) })?;
                 when.rising = Some((var, bit));
             }
-            let Ask { peer, timeout, retries, pause, .. } = *ask;
-            let _ = self.exchanges.push(Exchange { peer, talk, when, timeout, retries, pause });
+            let Ask { peer, timeout, retries, pause, trigger, late, stop, follow, overdue, .. } = *ask;
+            let (event_retries, retries) = (retries.unwrap_or(0), retries.unwrap_or(1));
+            let outcome = outcome(&ask.outcome).map_err(|error| ConfigError {
+                place: at(ExchangeKey::Outcome),
+                kind: Kind::Variable(error),
+            })?;
+            let _ = self.exchanges.push(Exchange {
+                peer,
+                talk,
+                when,
+                timeout,
+                retries,
+                event_retries,
+                pause,
+                trigger,
+                late,
+                stop,
+                follow,
+                overdue,
+                outcome,
+            });
         }
         Ok(super::add::span(start, self.exchanges.len()))
     }
@@ -172,6 +191,12 @@ impl Refused {
             Self::Kind(kind) => at(kind),
         }
     }
+}
+
+fn outcome(from: &[Option<Var<'_>>; 3]) -> Result<OutcomeTo, ParseError> {
+    let read = |var: &Option<Var<'_>>| var.map(|var| var.read()).transpose();
+    let [to, code_to, count_to] = from;
+    Ok(OutcomeTo { to: read(to)?, code_to: read(code_to)?, count_to: read(count_to)? })
 }
 
 fn with_counts(operation: Operation, read: u16, written: u16) -> Operation {

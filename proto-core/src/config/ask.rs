@@ -57,8 +57,14 @@ pub struct Ask<'a> {
     pub(super) when: AskWhen,
     pub(super) rising: Option<(Var<'a>, u8)>,
     pub(super) timeout: Duration,
-    pub(super) retries: u8,
+    pub(super) retries: Option<u8>,
     pub(super) pause: Duration,
+    pub(super) trigger: Option<Duration>,
+    pub(super) late: Option<Duration>,
+    pub(super) stop: bool,
+    pub(super) follow: Option<u8>,
+    pub(super) overdue: Option<Duration>,
+    pub(super) outcome: [Option<Var<'a>>; 3],
 }
 
 /// Operations have counts of 0 here.
@@ -185,7 +191,21 @@ impl<'a> Ask<'a> {
 
     const fn new(peer: u8, talk: AskTalk<'a>) -> Self {
         let (when, timeout, pause) = (AskWhen::NEVER, DEFAULT_REPLY_TIMEOUT, Duration::ZERO);
-        Self { peer, talk, when, rising: None, timeout, retries: 1, pause }
+        Self {
+            peer,
+            talk,
+            when,
+            rising: None,
+            timeout,
+            retries: None,
+            pause,
+            trigger: None,
+            late: None,
+            stop: false,
+            follow: None,
+            overdue: None,
+            outcome: [None; 3],
+        }
     }
 
     /// What answers the request. No effect on Modbus, whose replies are known.
@@ -216,7 +236,7 @@ impl<'a> Ask<'a> {
         self
     }
 
-    /// Asked at the start, and each time that the device has come back.
+    /// Asked at the start, and again when the device has started anew.
     pub const fn at_start(mut self) -> Self {
         self.when.start = true;
         self
@@ -240,9 +260,61 @@ impl<'a> Ask<'a> {
         self
     }
 
-    /// How often a request without a good reply is repeated at once; once by default.
+    /// How often a request without a good reply is repeated at once. By default once; an event, or what is only asked
+    /// at the start, is not: the device may carry it out twice.
     pub const fn retries(mut self, retries: u8) -> Self {
-        self.retries = retries;
+        self.retries = Some(retries);
+        self
+    }
+
+    /// How long after an event it may be sent, up to 10 s; by default the timeout of the port, at most 1 s.
+    pub const fn trigger(mut self, trigger: Duration) -> Self {
+        self.trigger = Some(trigger);
+        self
+    }
+
+    /// How long after its request a reply may come; by default three timeouts, at least 1 s. Until then nothing is asked
+    /// of the device whose reply could be taken for it.
+    pub const fn late(mut self, late: Duration) -> Self {
+        self.late = Some(late);
+        self
+    }
+
+    /// It stops its device: it goes first, cancels the device's events, and is repeated until it is confirmed.
+    pub const fn stops(mut self) -> Self {
+        self.stop = true;
+        self
+    }
+
+    /// Sent after the good answer of this exchange of the recipe, counted from 0.
+    pub const fn follows(mut self, exchange: u8) -> Self {
+        self.follow = Some(exchange);
+        self
+    }
+
+    /// When the values of the reply are overdue; [`Port::NEVER`](super::Port::NEVER) for a reply that comes only when
+    /// something happens. By default the timeout of the port.
+    pub const fn overdue(mut self, overdue: Duration) -> Self {
+        self.overdue = Some(overdue);
+        self
+    }
+
+    /// The variable that tells the robot what became of an event, as the number of an
+    /// [`Outcome`](crate::engine::Outcome).
+    pub fn outcome(mut self, to: impl Into<Var<'a>>) -> Self {
+        self.outcome[0] = Some(to.into());
+        self
+    }
+
+    /// The variable that gets the code with which the device refused the newest event, or 0.
+    pub fn outcome_code(mut self, to: impl Into<Var<'a>>) -> Self {
+        self.outcome[1] = Some(to.into());
+        self
+    }
+
+    /// The variable that counts the events that have ended, wrapping.
+    pub fn outcome_count(mut self, to: impl Into<Var<'a>>) -> Self {
+        self.outcome[2] = Some(to.into());
         self
     }
 

@@ -5,8 +5,8 @@
 
 use core::fmt;
 
-use super::{Bus, ConfigView, Exchange, FieldSpec, Parity, Parts, Port, Recipe, Rs485, Span, Talk};
-use crate::modbus::rtu::{Echo, Slave, Timing};
+use super::{Bus, ConfigView, Echo, Exchange, FieldSpec, Parity, Parts, Port, Recipe, Rs485, Span, Talk};
+use crate::modbus::rtu::{self, Slave, Timing};
 use crate::sysvar::{Direction, SysVar};
 use crate::time::Duration;
 use crate::wire::can::CanId;
@@ -26,7 +26,8 @@ impl Rs485 {
     /// A Modbus slave on this line; `None` if that is no address of one.
     pub(crate) fn slave(&self, address: u8) -> Option<Slave> {
         let timing = Timing::new(self.baud, self.bits_per_character() as u8).with_silence(self.idle_gap);
-        Slave::new(timing, if self.echo { Echo::Heard } else { Echo::Absent }, address)
+        let echo = if self.echo == Echo::Yes { rtu::Echo::Heard } else { rtu::Echo::Absent };
+        Slave::new(timing, echo, address)
     }
 
     /// The time that `n` and a half characters take on the line.
@@ -353,7 +354,7 @@ mod tests {
 
     fn line(baud: u32, parity: Parity, stop_bits: u8) -> Rs485 {
         let (idle_gap, turnaround) = (Duration::from_millis(50), Duration::ZERO);
-        Rs485 { baud, parity, stop_bits, idle_gap, turnaround, echo: false }
+        Rs485 { baud, parity, stop_bits, idle_gap, turnaround, echo: Echo::No }
     }
 
     #[test]

@@ -5,16 +5,21 @@ use core::fmt;
 use super::error::{ConfigErrorKind as Kind, ExchangeKey as Key, Place};
 use super::exchange::{Exchange, FrameSpec, Talk};
 use super::rules::{Check, MAX_TIME, check_pool, check_time, fail};
-use super::{ConfigView, Constants, DeviceFrame, FieldSpec, Parts, Recipe, Span, StreamPart};
+use super::{
+    ConfigView, Constants, DeviceFrame, FieldSpec, Parts, Port, PortHealth, Recipe, Span, StreamPart,
+};
 use crate::device::{Carrier, LayoutError};
 use crate::modbus::rtu::{BROADCAST, CountError, MAX_ADDRESS, MAX_SLAVES, Operation};
 use crate::recipe::PartError;
 use crate::recipe::model::{MAX_CAN_IDS, Mode};
-use crate::sysvar::Direction;
+use crate::sysvar::{Direction, SysVar};
+use crate::time::Duration;
 use crate::wire::can::CanId;
 
 /// The longest pause after an exchange.
-const MAX_PAUSE: crate::time::Duration = crate::time::Duration::from_secs(10);
+const MAX_PAUSE: Duration = Duration::from_secs(10);
+/// The longest time in which an event may be sent.
+const LONGEST_TRIGGER: Duration = Duration::from_secs(10);
 
 /// Why an exchange is refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -92,6 +97,31 @@ pub enum ExchangeError {
     },
     /// More CAN ids of received frames than one port can have.
     TooManyIds,
+    /// The time in which an event may be sent.
+    Trigger {
+        /// The time.
+        time: Duration,
+    },
+    /// A time or outcome of events of an exchange that no event asks.
+    NoEvent,
+    /// A write that stops its peer and that nothing confirms.
+    StopNeedsReply,
+    /// An exchange that follows itself, or one that the recipe does not have.
+    FollowsNothing {
+        /// The exchange that it names, counted from 0.
+        follow: u8,
+    },
+    /// An exchange that follows one without a reply.
+    FollowsUnanswered,
+    /// An exchange that follows another and has a rising bit of its own, or stops its peer.
+    FollowsAndRises,
+    /// Exchanges that follow each other in a circle.
+    FollowsCircle,
+    /// A variable that cannot tell what became of an event.
+    NotForOutcome {
+        /// The variable.
+        var: SysVar,
+    },
 }
 
 impl fmt::Display for ExchangeError {
@@ -154,6 +184,26 @@ impl fmt::Display for ExchangeError {
             Self::RefusalValues => f.write_str(
                 "a refusal only tells that the device refuses; its fields have no to and no commands",
             ),
+            Self::Trigger { time } => {
+                write!(f, "{time} is out of range; allowed: above 0, at most {LONGEST_TRIGGER}")
+            }
+            Self::NoEvent => {
+                f.write_str("only for an exchange that a rising bit or another exchange triggers")
+            }
+            Self::StopNeedsReply => {
+                f.write_str("a write that stops is repeated until it is confirmed; it needs a reply")
+            }
+            Self::FollowsNothing { .. } => f.write_str("it follows another exchange of the same recipe"),
+            Self::FollowsUnanswered => {
+                f.write_str("the exchange that it follows has no reply, so nothing tells that it was done")
+            }
+            Self::FollowsAndRises => f.write_str(
+                "one that follows another has no rising bit of its own, and does not stop the device",
+            ),
+            Self::FollowsCircle => f.write_str("the exchanges follow each other in a circle"),
+            Self::NotForOutcome { var } => {
+                write!(f, "{var} cannot tell what became of an event; allowed: WordInputReg, FloatInputReg")
+            }
             Self::TooManyIds => {
                 write!(f, "more than {MAX_CAN_IDS} ids of received frames; a CAN port has no room for more")
             }
@@ -213,12 +263,57 @@ impl<'a> ExchangeCheck<'a> {
             if let Some((var, bit)) = exchange.when.rising {
                 super::check_recipe::check_trigger(self.at(nth, Key::Rising), var, bit)?;
             }
+            self.check_event(nth, exchange)?;
         }
         if self.config.can_ids(self.recipe, Direction::Input).nth(MAX_CAN_IDS).is_some() {
             let last = self.recipe.exchanges.len.saturating_sub(1) as u8;
             return self.refuse(last, Key::Whole, ExchangeError::TooManyIds);
         }
         Ok(())
+    }
+
+    /// What becomes of events, in which order, and what the robot is told of it.
+    fn check_event(&self, nth: u8, exchange: &Exchange) -> Check {
+        if let Some(time) = exchange.trigger {
+            if !exchange.is_event() {
+                return self.refuse(nth, Key::Trigger, ExchangeError::NoEvent);
+            }
+            if time == Duration::ZERO || time > LONGEST_TRIGGER {
+                return self.refuse(nth, Key::Trigger, ExchangeError::Trigger { time });
+            }
+        }
+        if let Some(late) = exchange.late.filter(|late| *late > MAX_TIME) {
+            return fail(self.at(nth, Key::Late), Kind::TimeTooLong { time: late, longest: MAX_TIME });
+        }
+        if let Some(overdue) = exchange.overdue.filter(|overdue| *overdue != Port::NEVER) {
+            check_time(self.at(nth, Key::Overdue), overdue, MAX_TIME)?;
+        }
+        if exchange.stop && !exchange.is_answered() {
+            return self.refuse(nth, Key::Stop, ExchangeError::StopNeedsReply);
+        }
+        if exchange.outcome.variables().next().is_some() && !exchange.is_event() {
+            return self.refuse(nth, Key::Outcome, ExchangeError::NoEvent);
+        }
+        if let Some(var) = exchange.outcome.variables().find(|var| !PortHealth::can_write(*var)) {
+            return self.refuse(nth, Key::Outcome, ExchangeError::NotForOutcome { var });
+        }
+        let Some(follow) = exchange.follow else { return Ok(()) };
+        let exchanges = self.config.exchanges_of(self.recipe);
+        let refuse = |error| self.refuse(nth, Key::Follow, error);
+        if exchange.when.rising.is_some() || exchange.stop {
+            return refuse(ExchangeError::FollowsAndRises);
+        }
+        let mut before = follow;
+        for _ in 0..=exchanges.len() {
+            match exchanges.get(usize::from(before)) {
+                _ if before == nth => return refuse(ExchangeError::FollowsNothing { follow }),
+                None => return refuse(ExchangeError::FollowsNothing { follow }),
+                Some(leader) if !leader.is_answered() => return refuse(ExchangeError::FollowsUnanswered),
+                Some(Exchange { follow: Some(next), .. }) => before = *next,
+                Some(_) => return Ok(()),
+            }
+        }
+        refuse(ExchangeError::FollowsCircle)
     }
 
     /// Whether the frames that the exchange takes are told from all others that can come while they are
@@ -264,7 +359,7 @@ impl<'a> ExchangeCheck<'a> {
             return self.refuse(nth, Key::Whole, ExchangeError::NeedsUser);
         }
         let is_alone = matches!(self.recipe.parts, Parts::Stream { input: None, output: None });
-        let (peer, is_never) = (exchange.peer, exchange.when.is_never());
+        let (peer, is_never) = (exchange.peer, exchange.is_never());
         match exchange.talk {
             Talk::Rtu { .. } | Talk::Served { .. } if !is_alone => {
                 self.refuse(nth, Key::Whole, ExchangeError::PartsBesideModbus)

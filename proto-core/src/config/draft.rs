@@ -8,7 +8,7 @@ use super::ask::Ask;
 use super::error::ConfigErrorKind as Kind;
 use super::fields::{CanFields, Fields, Var};
 use super::rules::text;
-use super::{Bus, OnStale, Parity, Port, PortHealth, Recipe, Rs485, SafeValue, SendOn};
+use super::{Bus, Echo, OnStale, Parity, Port, PortHealth, Recipe, Rs485, SafeValue, SendOn};
 use crate::recipe::model::Mode;
 use crate::sysvar::SysVar;
 use crate::time::Duration;
@@ -228,6 +228,7 @@ pub struct PortBuilder<'a, B = Rs485> {
     pub(super) safe_at_start: bool,
     pub(super) refresh: Option<Duration>,
     pub(super) health: PortHealth,
+    pub(super) absent: Option<Duration>,
 }
 
 /// The bus of a [`PortBuilder`] that listens.
@@ -352,6 +353,7 @@ impl<'a, B> PortBuilder<'a, B> {
             safe_at_start: false,
             refresh: None,
             health: PortHealth::NONE,
+            absent: None,
         }
     }
 
@@ -389,6 +391,13 @@ impl<'a, B> PortBuilder<'a, B> {
     /// A recipe that is sent on change is also sent after this long without a change.
     pub fn refresh(mut self, refresh: Duration) -> Self {
         self.refresh = Some(refresh);
+        self
+    }
+
+    /// A peer of the recipe's exchanges that was not heard for this long has started anew when it is heard again; 3 s
+    /// by default.
+    pub fn absent(mut self, absent: Duration) -> Self {
+        self.absent = Some(absent);
         self
     }
 
@@ -430,9 +439,9 @@ impl<B: SerialLine> PortBuilder<'_, B> {
         self
     }
 
-    /// What is sent is heard as well. Only with a recipe of exchanges.
-    pub fn echo(mut self) -> Self {
-        self.bus.line().echo = true;
+    /// Whether what is sent is heard as well; learned by default. [`Echo::Yes`] only with a recipe of exchanges.
+    pub fn echo(mut self, echo: Echo) -> Self {
+        self.bus.line().echo = echo;
         self
     }
 }

@@ -23,10 +23,52 @@ pub struct Exchange {
     pub when: AskWhen,
     /// How long the reply may take, from the end of the request to the end of the reply.
     pub timeout: Duration,
-    /// How often a request without a good reply is repeated at once.
+    /// How often a request without a good reply is repeated at once: a period, or a value that is written until the
+    /// device has it.
     pub retries: u8,
+    /// The same for an event: a rise, a step that follows one, or what is only asked at the start. A device may carry
+    /// out twice what is repeated.
+    pub event_retries: u8,
     /// How long the line rests after it.
     pub pause: Duration,
+    /// How long after an event its request may still be sent; `None` is the timeout of the port, at most
+    /// [`MAX_TRIGGER`].
+    pub trigger: Option<Duration>,
+    /// How long after its request a reply may come, which is late after [`Self::timeout`]. Until then nothing is asked
+    /// of the peer whose reply could be taken for it. `None` is three times the timeout, at least
+    /// [`DEFAULT_LATE`].
+    pub late: Option<Duration>,
+    /// It stops its peer: it goes first, cancels the peer's events, and is repeated until it is confirmed.
+    pub stop: bool,
+    /// The exchange of the recipe, counted from 0, after whose good answer this one is sent.
+    pub follow: Option<u8>,
+    /// When the values of the reply are overdue; `None` is the timeout of the port, [`Port::NEVER`](super::Port::NEVER)
+    /// is never, for a reply that comes only when something happens.
+    pub overdue: Option<Duration>,
+    /// The variables that tell the robot what became of its events.
+    pub outcome: OutcomeTo,
+}
+
+/// The variables that tell the robot what became of an exchange's events.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct OutcomeTo {
+    /// The outcome: [`Outcome`](crate::engine::Outcome) as a number.
+    pub to: Option<SysVar>,
+    /// The code with which the device refused the newest event, or 0.
+    pub code_to: Option<SysVar>,
+    /// The number of events that have ended, wrapping.
+    pub count_to: Option<SysVar>,
+}
+
+impl OutcomeTo {
+    /// Nothing is told.
+    pub const NONE: Self = Self { to: None, code_to: None, count_to: None };
+
+    /// The variables that are written.
+    pub fn variables(&self) -> impl Iterator<Item = SysVar> + use<> {
+        [self.to, self.code_to, self.count_to].into_iter().flatten()
+    }
 }
 
 /// The frames of an exchange.
@@ -85,11 +127,12 @@ pub struct FrameSpec {
 pub struct AskWhen {
     /// With this period.
     pub every: Option<Duration>,
-    /// Once at the start, and each time that the peer has come back.
+    /// Once at the start of the gateway, and again when the peer has started.
     pub start: bool,
     /// When a value of the request has changed; looked at each cycle of the port.
     pub change: bool,
-    /// When this bit goes from 0 to 1; looked at each cycle of the port.
+    /// When this bit goes from 0 to 1; looked at each time that it is read. The rise is an event: it is sent once and in
+    /// time, or not at all.
     pub rising: Option<(SysVar, u8)>,
 }
 
@@ -110,11 +153,66 @@ impl AskWhen {
 
 /// How long a reply may take by default.
 pub const DEFAULT_REPLY_TIMEOUT: Duration = Duration::from_millis(100);
+/// How long a reply may be late by default, if three timeouts are shorter.
+pub const DEFAULT_LATE: Duration = Duration::from_secs(1);
+/// The longest time in which an event may be sent.
+pub const MAX_TRIGGER: Duration = Duration::from_secs(1);
 
 impl Exchange {
-    /// An exchange with the defaults of a file: a timeout of 100 ms, one repetition, no pause.
+    /// An exchange with the defaults of a file: a timeout of 100 ms, one repetition but none of an event, no pause.
     pub const fn new(peer: u8, talk: Talk, when: AskWhen) -> Self {
-        Self { peer, talk, when, timeout: DEFAULT_REPLY_TIMEOUT, retries: 1, pause: Duration::ZERO }
+        Self {
+            peer,
+            talk,
+            when,
+            timeout: DEFAULT_REPLY_TIMEOUT,
+            retries: 1,
+            event_retries: 0,
+            pause: Duration::ZERO,
+            trigger: None,
+            late: None,
+            stop: false,
+            follow: None,
+            overdue: None,
+            outcome: OutcomeTo::NONE,
+        }
+    }
+
+    /// How long after its request a reply may come.
+    pub fn late(&self) -> Duration {
+        self.late.unwrap_or(self.timeout.saturating_mul(3).max(DEFAULT_LATE))
+    }
+
+    /// How long after an event its request may be sent, on a port with this timeout.
+    pub fn trigger(&self, port_timeout: Duration) -> Duration {
+        self.trigger.unwrap_or(port_timeout.min(MAX_TRIGGER))
+    }
+
+    /// Whether its start is an event: it is asked at the start and for no other reason, and may do something there. What
+    /// is only read is read again until it is answered.
+    pub const fn is_start_event(&self) -> bool {
+        let AskWhen { every, start, change, rising } = self.when;
+        let reads = matches!(self.talk, Talk::Rtu { operation, .. } if operation.written_len() == 0);
+        start && every.is_none() && !change && rising.is_none() && !reads
+    }
+
+    /// Whether an event asks it: a rise that does not stop the peer, or the answer to another one.
+    pub const fn is_event(&self) -> bool {
+        (self.when.rising.is_some() || self.follow.is_some()) && !self.stop
+    }
+
+    /// Whether nothing ever asks it: its frame comes unasked, or a master asks.
+    pub fn is_never(&self) -> bool {
+        self.when.is_never() && self.follow.is_none()
+    }
+
+    /// Whether it is asked and has a reply.
+    pub const fn is_answered(&self) -> bool {
+        match self.talk {
+            Talk::Rtu { .. } => self.peer != crate::modbus::rtu::BROADCAST,
+            Talk::Served { .. } => false,
+            Talk::Frames { request, reply, .. } => request.is_some() && reply.is_some(),
+        }
     }
 
     /// Whether a master asks, and the gateway answers.

@@ -56,6 +56,18 @@ pub enum ExchangeKey {
     Timeout,
     /// How long the line rests after it.
     Pause,
+    /// How long after an event it may be sent.
+    Trigger,
+    /// How long after its request a reply may come.
+    Late,
+    /// Whether it stops its peer.
+    Stop,
+    /// The exchange that it follows.
+    Follow,
+    /// When the values of its reply are overdue.
+    Overdue,
+    /// The variables that tell what became of its events.
+    Outcome,
     /// The request.
     Request,
     /// The reply.
@@ -100,4 +112,6 @@ pub enum PortKey {
     SafeAtStart,
     /// When it sends without a change.
     Refresh,
+    /// After how long without a word a peer of its exchanges has started anew.
+    Absent,
 }

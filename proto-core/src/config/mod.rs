@@ -52,14 +52,16 @@ pub use draft::{
 pub use error::{
     ConfigError, ConfigErrorKind, ControllerKey, Counted, ExchangeKey, NetworkKey, Place, PortKey, RecipeKey,
 };
-pub use exchange::{AskWhen, DEFAULT_REPLY_TIMEOUT, Exchange, FrameSpec, Talk};
+pub use exchange::{
+    AskWhen, DEFAULT_LATE, DEFAULT_REPLY_TIMEOUT, Exchange, FrameSpec, MAX_TRIGGER, OutcomeTo, Talk,
+};
 pub use fields::{CanFields, Fields, InputField, OutputField, Sum, Var};
 pub use fitting::Fitting;
 pub use line_budget::ExchangeBudget;
 pub use listen::listen_address;
 pub use network::{BoardAddress, Network};
 pub(crate) use port::MIN_CYCLE;
-pub use port::{Bus, Parity, Port, Rs485};
+pub use port::{Bus, Echo, Parity, Port, Rs485};
 pub use recipe::{
     CanFramePart, CommandEntry, CommandWhen, FieldSpec, InputBinding, MAX_COMMAND_TEXT, OnStale,
     OutputBinding, Parts, Recipe, SendOn, Span, StreamPart, Words,

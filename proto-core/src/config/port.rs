@@ -34,12 +34,17 @@ pub struct Port {
     pub safe_at_start: bool,
     /// A recipe that is sent on change is also sent after this long without a change.
     pub refresh: Option<Duration>,
+    /// A peer of the recipe's exchanges that was not heard for this long has started anew when it is heard again.
+    pub absent: Duration,
 }
 
 impl Port {
     /// The timeout of a port that is never overdue: it works from the start, and its values hold. A
     /// hundred years, so that instants behind it can still be told from no instant at all.
     pub const NEVER: Duration = Duration::from_secs(100 * 365 * 86_400);
+
+    /// The default of [`Self::absent`].
+    pub const ABSENT: Duration = Duration::from_secs(3);
 
     /// A port with the file's defaults: a cycle of 4 ms, a timeout of 100 ms, stale after 500 ms, and
     /// inputs that hold, also at the start.
@@ -55,6 +60,7 @@ impl Port {
             health: PortHealth::NONE,
             safe_at_start: false,
             refresh: None,
+            absent: Self::ABSENT,
         }
     }
 }
@@ -106,14 +112,38 @@ pub struct Rs485 {
     pub idle_gap: Duration,
     /// The line must have been silent for this long before a frame is sent.
     pub turnaround: Duration,
-    /// What is sent is heard as well, as with a 2-wire adapter whose receiver is always on. Only with
-    /// a recipe of exchanges.
-    pub echo: bool,
+    /// Whether what is sent is heard as well. Only with a recipe of exchanges.
+    pub echo: Echo,
+}
+
+/// Whether a line gives back what is sent on it, as a 2-wire adapter does whose receiver is always on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub enum Echo {
+    /// Only others are heard.
+    No,
+    /// Each own byte is heard.
+    Yes,
+    /// It is learned from an exchange whose reply differs from its request, each time that the line is opened. Until
+    /// then a reply that equals its request confirms nothing.
+    #[default]
+    Auto,
+}
+
+impl Echo {
+    /// What is known before anything was heard.
+    pub(crate) const fn known(self) -> Option<bool> {
+        match self {
+            Self::No => Some(false),
+            Self::Yes => Some(true),
+            Self::Auto => None,
+        }
+    }
 }
 
 impl Default for Rs485 {
     /// The defaults of a file: 115 200 bit/s, no parity, 1 stop bit, an idle gap of 50 ms, a
-    /// turnaround of 100 µs, no echo.
+    /// turnaround of 100 µs, an echo that is learned.
     fn default() -> Self {
         Self {
             baud: 115_200,
@@ -121,7 +151,7 @@ impl Default for Rs485 {
             stop_bits: 1,
             idle_gap: Duration::from_millis(50),
             turnaround: Duration::from_micros(100),
-            echo: false,
+            echo: Echo::Auto,
         }
     }
 }

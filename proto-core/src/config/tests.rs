@@ -317,7 +317,7 @@ fn add_exchanges(config: &mut GatewayConfig) {
         [Ask::request(AskFrame::remote(id)).reply(AskFrame::can(id, &state)).every(time).pause(time)];
     for (name, asks) in [("master", &master[..]), ("slave", &slave), ("talk", &talk)] {
         config.add_recipe(&Recipe::user(name).exchanges(asks)).unwrap();
-        config.add_port(&Port::modbus_rtu(name, name).echo()).unwrap();
+        config.add_port(&Port::modbus_rtu(name, name).echo(Echo::Yes)).unwrap();
     }
     config.add_recipe(&Recipe::user("remote").exchanges(&remote)).unwrap();
     config.add_port(&Port::can("remote", "remote")).unwrap();

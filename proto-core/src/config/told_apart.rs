@@ -4,24 +4,36 @@
 //! In: the fields of frames. Out: which of their bits are always the same, and whether two frames
 //! differ in one of them.
 
-use super::{ConfigView, DeviceFrame, FieldSpec, OutputBinding, Parts, Recipe};
-use crate::device::{Carrier, Encoding, Kind, Overflow, Part};
+use super::{ConfigView, DeviceFrame, FieldSpec, FrameSpec, OutputBinding, Parts, Recipe};
+use crate::device::{Carrier, Encoding, Kind, LayoutError, Overflow, Part};
 use crate::recipe::model::Mode;
 use crate::sysvar::Direction;
 use crate::wire::can::{CanId, MAX_CAN_DATA};
 
-/// The bits of a CAN frame that are the same in every frame.
+/// The bytes that are looked at: all of a CAN frame, and the first ones of a frame on a line.
+const LOOKED_AT: usize = 32;
+const _: () = assert!(LOOKED_AT >= MAX_CAN_DATA);
+
+/// The bits at the beginning of a frame that are the same in every frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Constants {
-    mask: [u8; MAX_CAN_DATA],
-    value: [u8; MAX_CAN_DATA],
+    mask: [u8; LOOKED_AT],
+    value: [u8; LOOKED_AT],
 }
 
 impl Constants {
     /// Those of a frame with these fields; none if it cannot be laid out.
     pub fn of(fields: &[FieldSpec], part: Direction) -> Self {
+        Self::of_frame(DeviceFrame::new(Carrier::Can, part, (&[], &[]), fields), &[], fields)
+    }
+
+    /// Those of a frame that was laid out, with its head.
+    fn of_frame(frame: Result<DeviceFrame, LayoutError>, head: &[u8], fields: &[FieldSpec]) -> Self {
         let mut constants = Self::default();
-        let Ok(frame) = DeviceFrame::new(Carrier::Can, part, (&[], &[]), fields) else { return constants };
+        let Ok(frame) = frame else { return constants };
+        for ((mask, value), byte) in constants.mask.iter_mut().zip(&mut constants.value).zip(head) {
+            (*mask, *value) = (0xFF, *byte);
+        }
         frame.layout.parts(&frame.elements, |part, place| {
             let Part::Element(nth) = part else { return };
             let field = fields.iter().filter(|field| field.element().is_some()).nth(nth);
@@ -34,6 +46,9 @@ impl Constants {
 
     fn add(&mut self, at: usize, encoding: &Encoding, value: f64) {
         let (Some(mask), Some(bytes)) = (self.mask.get_mut(at..), self.value.get_mut(at..)) else { return };
+        if encoding.size().unwrap_or(0) > mask.len() {
+            return;
+        }
         match encoding.kind {
             // All ones, beside the other bits of the number.
             Kind::Bits(_) => {
@@ -49,6 +64,27 @@ impl Constants {
         let masks = self.mask.iter().zip(&other.mask).map(|(one, other)| one & other);
         let values = self.value.iter().zip(&other.value).map(|(one, other)| one ^ other);
         masks.zip(values).any(|(mask, value)| mask & value != 0)
+    }
+}
+
+impl FrameSpec {
+    /// Whether no bytes are both this frame and the other one, as frames from a device.
+    pub(crate) fn is_told_from(&self, other: &Self, config: ConfigView<'_>) -> bool {
+        if self.id != other.id {
+            return true;
+        }
+        let lengths =
+            |frame: &Self| frame.layout(config, Direction::Input).ok().map(|frame| frame.layout.lengths());
+        if let (Some((short, long)), Some((shortest, longest))) = (lengths(self), lengths(other))
+            && (long < shortest || longest < short)
+        {
+            return true;
+        }
+        let constants = |frame: &Self| {
+            let fields = frame.fields.of(config.fields);
+            Constants::of_frame(frame.layout(config, Direction::Input), &frame.head, fields)
+        };
+        constants(self).differ(&constants(other))
     }
 }
 

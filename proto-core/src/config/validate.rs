@@ -12,8 +12,8 @@ use super::rules::{
     check_time, fail, is_marked, mark,
 };
 use super::{
-    Bus, ConfigView, MAX_ALL_FIELDS, MAX_COMMANDS, MAX_EXCHANGES, MAX_PORTS, MAX_RECIPES, MAX_SAFE_VALUES,
-    Parts, Port, PortHealth, Recipe, SafeValue, SendOn,
+    Bus, ConfigView, Echo, MAX_ALL_FIELDS, MAX_COMMANDS, MAX_EXCHANGES, MAX_PORTS, MAX_RECIPES,
+    MAX_SAFE_VALUES, Parts, Port, PortHealth, Recipe, SafeValue, SendOn,
 };
 use crate::image::BitSet;
 use crate::recipe::model::{Framing, Mode};
@@ -115,7 +115,7 @@ impl<'c> ConfigView<'c> {
                     return fail(at(PortKey::Recipe), Kind::NeedsStreamRecipe { recipe: port.recipe });
                 }
                 self.check_framing(index, port.recipe, recipe)?;
-                if line.echo && recipe.exchanges.len == 0 {
+                if line.echo == Echo::Yes && recipe.exchanges.len == 0 {
                     return fail(at(PortKey::Echo), Kind::EchoNeedsExchanges);
                 }
             }
@@ -138,6 +138,7 @@ impl<'c> ConfigView<'c> {
             check_time(at(PortKey::Timeout), port.timeout, MAX_TIME)?;
         }
         check_time(at(PortKey::StaleAfter), port.stale_after, MAX_TIME)?;
+        check_time(at(PortKey::Absent), port.absent, MAX_TIME)?;
         check_pool(at(PortKey::OnTimeout), port.on_timeout, self.safe_values.len())?;
         if port.safe_at_start && port.on_timeout.len == 0 {
             return fail(at(PortKey::SafeAtStart), Kind::NoSafeValues);
@@ -215,8 +216,7 @@ impl<'c> ConfigView<'c> {
                     _ => *owner = Some(index),
                 }
             }
-            for (_, var) in port.health.iter() {
-                let place = Place::Port { port: index, key: PortKey::Health };
+            for (place, var) in self.told_by(index, port, recipe) {
                 match owners.get_mut(var.ordinal()) {
                     Some(Some(other)) if *other == index => return fail(place, Kind::HealthTwice { var }),
                     Some(Some(other)) => return fail(place, Kind::OwnedTwice { var, other: *other }),
@@ -263,10 +263,9 @@ impl<'c> ConfigView<'c> {
                 }
             }
         }
-        for (port, port_config, _) in self.field_ports() {
-            for (_, var) in port_config.health.iter() {
+        for (port, port_config, recipe) in self.field_ports() {
+            for (place, var) in self.told_by(port, port_config, recipe) {
                 if var.modbus().is_none() && !self.carried(Direction::Input, var) {
-                    let place = Place::Port { port, key: PortKey::Health };
                     return fail(place, Kind::NoWayUp { var, port });
                 }
             }

@@ -5,6 +5,7 @@
 
 use heapless::VecView;
 
+use super::error::{ExchangeKey, Place, PortKey};
 use super::network::Network;
 use super::walk::{FrameFields, FrameVariables, Variables};
 use super::{
@@ -99,7 +100,23 @@ impl<'c> ConfigView<'c> {
     /// The input variables that a field port owns: those that its frames write, and those of its
     /// health.
     pub fn owned_by(self, port: &'c Port, recipe: &'c Recipe) -> impl Iterator<Item = SysVar> + 'c {
-        self.written_by(recipe).chain(port.health.iter().map(|(_, var)| var))
+        self.written_by(recipe).chain(self.told_by(0, port, recipe).map(|(_, var)| var))
+    }
+
+    /// The input variables that tell the robot something about the port with this index: its health, and what became of
+    /// events. Each with its place.
+    pub(crate) fn told_by(
+        self,
+        index: u8,
+        port: &'c Port,
+        recipe: &'c Recipe,
+    ) -> impl Iterator<Item = (Place, SysVar)> + 'c {
+        let health = Place::Port { port: index, key: PortKey::Health };
+        let outcomes = (0..).zip(self.exchanges_of(recipe)).flat_map(move |(exchange, of)| {
+            let place = Place::Exchange { recipe: port.recipe, exchange, key: ExchangeKey::Outcome };
+            of.outcome.variables().map(move |var| (place, var))
+        });
+        port.health.iter().map(move |(_, var)| (health, var)).chain(outcomes)
     }
 
     /// Whether the output part of a field port shows a value of the controller's state packet.
@@ -117,7 +134,8 @@ impl<'c> ConfigView<'c> {
     /// Whether a field port writes the variable.
     pub(super) fn is_owned(self, var: SysVar) -> bool {
         self.field_ports().any(|(_, port, recipe)| {
-            self.carries(recipe, Direction::Input, var) || port.health.iter().any(|(_, own)| own == var)
+            self.carries(recipe, Direction::Input, var)
+                || self.told_by(0, port, recipe).any(|(_, own)| own == var)
         })
     }
 }

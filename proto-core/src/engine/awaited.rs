@@ -1,14 +1,16 @@
 //! What may come on a port with exchanges, and what a frame that came is.
 //!
-//! In: the request on its way, and the frames that come unasked. Out: the frame's part in it. Applies
-//! nothing.
+//! In: the request on its way, those whose replies may still come, and the frames that come unasked. Out: the frame's
+//! part in it. Applies nothing.
 
 use super::device_port::{DeviceFormat, better, elements, probe};
 use super::exchanges::{Asks, InputFormat, Item};
 use super::line::{Flight, OwnRequest};
+use super::turns::Row;
 use super::user::InputBind;
 use crate::device::Probe;
 use crate::modbus::rtu::{self, Expected, REFUSAL_LEN};
+use crate::time::Instant;
 
 /// What a received frame is.
 pub(super) enum Heard<'i> {
@@ -16,10 +18,16 @@ pub(super) enum Heard<'i> {
     Echo,
     /// The awaited reply; the data of a Modbus frame, or the frame.
     Reply(Option<&'i InputFormat>),
+    /// The awaited reply, or the echo of the own request.
+    ReplyOrEcho,
     /// The device refuses the request.
     Refusal,
-    /// A frame that comes unasked, and its place in the store.
-    Unasked(&'i DeviceFormat, usize),
+    /// A reply to an earlier request of this exchange that came too late.
+    Late(u8),
+    /// An answer to one of several requests; nothing tells which.
+    Ambiguous,
+    /// A frame that comes unasked, its place in the store, and its exchange if it is of one.
+    Unasked(&'i DeviceFormat, usize, Option<u8>),
 }
 
 /// What may come now.
@@ -29,10 +37,14 @@ pub(super) struct Awaited<'i> {
     pub formats: &'i [DeviceFormat],
     pub first_frame: u8,
     pub items: &'i [Item],
+    pub rows: &'i [Row],
     pub flight: Option<Flight>,
-    /// The echo of the request comes before its reply.
+    /// The echo of the request that comes, or may come, before its reply.
     pub echo: Option<OwnRequest>,
+    /// Whether it comes for sure.
+    pub has_echo: bool,
     pub bindings: &'i [InputBind],
+    pub now: Instant,
 }
 
 impl<'i> Awaited<'i> {
@@ -40,39 +52,49 @@ impl<'i> Awaited<'i> {
         self.items.get(usize::from(self.flight?.exchange))
     }
 
+    /// The reply of a Modbus slave that is awaited.
     pub(super) fn expected(&self) -> Option<Expected> {
         self.flight?.expected
     }
 
-    /// The reply and the refusal that a device's own frames are.
-    pub(super) fn answers(&self) -> impl Iterator<Item = &'i DeviceFormat> {
-        let item = self.asked().filter(|_| self.echo.is_none());
-        let item = item.filter(|item| matches!(item.asks, Asks::Frame | Asks::Remote { .. }));
-        let reply = |item: &'i Item| item.reply.iter().map(|reply| &reply.format).chain(&item.refusal);
-        item.into_iter().flat_map(reply)
+    /// Nothing but the own echo is awaited.
+    fn waits_for_echo(&self) -> bool {
+        self.has_echo && self.echo.is_some()
     }
 
-    pub(super) fn unasked(&self) -> impl Iterator<Item = (&'i DeviceFormat, usize)> {
-        let part = (usize::from(self.first_frame)..).zip(self.formats).map(|(slot, format)| (format, slot));
-        let others = self.items.iter().filter(|item| matches!(item.asks, Asks::Nothing));
-        let others = others.filter_map(|item| item.reply.as_ref());
-        part.chain(others.map(|reply| (&reply.format, usize::from(reply.slot))))
+    /// The reply and the refusal that a device's own frames are.
+    pub(super) fn answers(&self) -> impl Iterator<Item = &'i DeviceFormat> {
+        self.asked().filter(|_| !self.waits_for_echo()).into_iter().flat_map(answers_of)
+    }
+
+    /// The exchanges whose replies may still come, but for the one that is on its way.
+    fn outstanding(&self) -> impl Iterator<Item = (u8, &'i Row, &'i Item)> {
+        let (own, now) = (self.flight.map(|flight| flight.exchange), self.now);
+        let all = (0_u8..).zip(self.rows).zip(self.items).map(|((nth, row), item)| (nth, row, item));
+        all.filter(move |(nth, row, _)| Some(*nth) != own && row.is_outstanding(now))
+    }
+
+    pub(super) fn unasked(&self) -> impl Iterator<Item = (&'i DeviceFormat, usize, Option<u8>)> {
+        let part =
+            (usize::from(self.first_frame)..).zip(self.formats).map(|(slot, format)| (format, slot, None));
+        let others = (0_u8..).zip(self.items).filter(|(_, item)| matches!(item.asks, Asks::Nothing));
+        let others = others.filter_map(|(nth, item)| Some((nth, item.reply.as_ref()?)));
+        part.chain(others.map(|(nth, reply)| (&reply.format, usize::from(reply.slot), Some(nth))))
     }
 
     /// What bytes of a line are.
     pub(super) fn probe(&self, bytes: &[u8]) -> Probe {
-        let mut best = match self.expected().filter(|_| self.echo.is_none()) {
-            Some(expected) => match expected.probe(bytes) {
-                rtu::Probe::No => Probe::No(1),
-                rtu::Probe::Partial => Probe::Partial(1),
-                rtu::Probe::Reply(len) => Probe::Frame(len),
-                rtu::Probe::Refused(_) => Probe::Frame(REFUSAL_LEN),
-                rtu::Probe::Wrong => Probe::Wrong(expected.len_of(bytes)),
-            },
+        let mut best = match self.expected().filter(|_| !self.waits_for_echo()) {
+            Some(expected) => probe_reply(&expected, bytes),
             None => Probe::No(1),
         };
         if let Some(echo) = &self.echo {
-            best = echo.probe(bytes);
+            best = if self.has_echo { echo.probe(bytes) } else { better(best, echo.probe(bytes)) };
+        }
+        for (_, row, _) in self.outstanding() {
+            if let Some(expected) = &row.expected {
+                best = better(best, right_reply(expected, bytes));
+            }
         }
         for format in self.all() {
             best = better(best, probe(format, self.bindings, bytes));
@@ -91,28 +113,55 @@ impl<'i> Awaited<'i> {
     }
 
     /// The frames that may come, but for those of Modbus.
-    fn all(&self) -> impl Iterator<Item = &'i DeviceFormat> {
-        self.answers().chain(self.unasked().map(|(format, _)| format))
+    pub(super) fn all(&self) -> impl Iterator<Item = &'i DeviceFormat> {
+        let late = self.outstanding().flat_map(|(_, _, item)| answers_of(item));
+        self.answers().chain(self.unasked().map(|(format, ..)| format)).chain(late)
     }
 
     /// What a frame of a line is that [`Self::probe`] has found.
     pub(super) fn heard(&self, frame: &[u8]) -> Option<Heard<'i>> {
         let is = |format: &DeviceFormat| matches!(probe(format, self.bindings, frame), Probe::Frame(len) if len == frame.len());
-        if let Some(echo) = &self.echo {
-            if echo.probe(frame) == Probe::Frame(frame.len()) {
-                return Some(Heard::Echo);
-            }
-        } else if let Some(expected) = self.expected() {
-            match expected.probe(frame) {
-                rtu::Probe::Reply(_) => return Some(Heard::Reply(self.asked()?.reply.as_ref())),
-                rtu::Probe::Refused(_) => return Some(Heard::Refusal),
-                _ => {}
-            }
+        let is_echo = self.echo.is_some_and(|echo| echo.probe(frame) == Probe::Frame(frame.len()));
+        if is_echo && self.has_echo {
+            return Some(Heard::Echo);
         }
-        self.answer(is).or_else(|| {
-            let (format, slot) = self.unasked().find(|(format, _)| is(format))?;
-            Some(Heard::Unasked(format, slot))
+        let answer = self.expected().filter(|_| !self.waits_for_echo()).and_then(|expected| {
+            match expected.probe(frame) {
+                rtu::Probe::Reply(_) => Some(Heard::Reply(self.asked()?.reply.as_ref())),
+                rtu::Probe::Refused(_) => Some(Heard::Refusal),
+                _ => None,
+            }
+        });
+        let answer = answer.or_else(|| self.answer(is));
+        match answer {
+            Some(Heard::Reply(_)) if is_echo => return Some(Heard::ReplyOrEcho),
+            None if is_echo => return Some(Heard::Echo),
+            _ => {}
+        }
+        let is_right = |expected: &Expected| {
+            matches!(expected.probe(frame), rtu::Probe::Reply(_) | rtu::Probe::Refused(_))
+        };
+        let is_late = |row: &Row, item: &'i Item| {
+            row.expected.as_ref().is_some_and(is_right) || answers_of(item).any(is)
+        };
+        self.told(answer, is_late).or_else(|| {
+            let (format, slot, nth) = self.unasked().find(|(format, ..)| is(format))?;
+            Some(Heard::Unasked(format, slot, nth))
         })
+    }
+
+    /// An answer, unless it may be a refusal of another request; else a late reply.
+    pub(super) fn told(
+        &self,
+        answer: Option<Heard<'i>>,
+        is_late: impl Fn(&Row, &'i Item) -> bool,
+    ) -> Option<Heard<'i>> {
+        let late = || self.outstanding().find(|(_, row, item)| is_late(row, item));
+        match answer {
+            Some(Heard::Refusal) if late().is_some() => Some(Heard::Ambiguous),
+            Some(answer) => Some(answer),
+            None => late().map(|(nth, ..)| Heard::Late(nth)),
+        }
     }
 
     pub(super) fn answer(&self, is: impl Fn(&DeviceFormat) -> bool) -> Option<Heard<'i>> {
@@ -120,5 +169,29 @@ impl<'i> Awaited<'i> {
         let reply = self.asked()?.reply.as_ref();
         let reply = reply.filter(|reply| core::ptr::eq(&reply.format, found));
         Some(reply.map_or(Heard::Refusal, |reply| Heard::Reply(Some(reply))))
+    }
+}
+
+/// The reply and the refusal of an exchange with frames of the device's own.
+pub(super) fn answers_of(item: &Item) -> impl Iterator<Item = &DeviceFormat> {
+    let item = Some(item).filter(|item| matches!(item.asks, Asks::Frame | Asks::Remote { .. }));
+    item.into_iter().flat_map(|item| item.reply.iter().map(|reply| &reply.format).chain(&item.refusal))
+}
+
+fn probe_reply(expected: &Expected, bytes: &[u8]) -> Probe {
+    match expected.probe(bytes) {
+        rtu::Probe::No => Probe::No(1),
+        rtu::Probe::Partial => Probe::Partial(1),
+        rtu::Probe::Reply(len) => Probe::Frame(len),
+        rtu::Probe::Refused(_) => Probe::Frame(REFUSAL_LEN),
+        rtu::Probe::Wrong => Probe::Wrong(expected.len_of(bytes)),
+    }
+}
+
+/// A late reply; one with a wrong checksum is nothing.
+fn right_reply(expected: &Expected, bytes: &[u8]) -> Probe {
+    match probe_reply(expected, bytes) {
+        Probe::Wrong(_) => Probe::No(1),
+        probe => probe,
     }
 }

@@ -232,13 +232,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             self.store.is_overdue_from_start();
         }
         let mut next_binding = self.bindings.inputs.len() as u16;
-        let parts = recipe.part_frames(Direction::Input).map(|_| true);
+        let parts = recipe.part_frames(Direction::Input).map(|_| (true, port.timeout));
         let replies = config.exchanges_of(recipe).iter().filter_map(|exchange| {
             exchange.fields(config.frames, Direction::Input)?;
-            Some(exchange.when.every.is_some() || exchange.when.is_never())
+            let is_steady = exchange.when.every.is_some() || exchange.is_never();
+            Some((is_steady, exchange.overdue.unwrap_or(port.timeout)))
         });
         let frames = config.frames_of(recipe, Direction::Input).zip(parts.chain(replies));
-        for ((_, fields), is_expected) in frames {
+        for ((_, fields), (is_expected, timeout)) in frames {
             let fields = fields.of(config.fields);
             let whole: InputSet = fields.iter().flat_map(FieldSpec::variables).collect();
             let mut set = whole;
@@ -256,8 +257,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 port: self.ports.len() as u8,
                 bindings,
                 overdue_at: if port.safe_at_start { Instant::ZERO } else { Instant::NEVER },
-                timeout: port.timeout,
-                is_expected: is_expected && port.timeout != Port::NEVER,
+                timeout,
+                is_expected: is_expected && timeout != Port::NEVER,
             };
             let group = GroupId(self.store.frames.len() as u8);
             self.store

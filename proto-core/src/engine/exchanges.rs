@@ -8,15 +8,18 @@ use heapless::{Vec, VecView};
 use super::Engine;
 use super::build_error::{BuildError, one_too_many};
 use super::device_port::DeviceFormat;
-use super::line::{Line, PeerCounters, PeerState, Talks, Times, is_looked_at};
+use super::events::{Event, Told, Trigger};
+use super::line::{Line, PeerCounters, PeerState, Talks, Times};
+use super::turns::{Row, RowKind, RowTimes, Turn};
 use super::user::{InputBind, InputTo};
 use crate::config::{
-    Bus, ConfigView, Counted, DeviceFrame, Exchange, FieldSpec, FrameSpec, Port, Recipe, Span, Talk,
+    Bus, ConfigView, Counted, DeviceFrame, Echo, Exchange, FieldSpec, FrameSpec, OutcomeTo, Port, Recipe,
+    Span, Talk,
 };
 use crate::device::{Carrier, LayoutError};
 use crate::modbus::rtu::{BROADCAST, Operation, Table, Timing};
-use crate::schedule::{Grid, Peer, Row};
-use crate::sysvar::{Direction, SysVar};
+use crate::schedule::Grid;
+use crate::sysvar::Direction;
 use crate::time::{Duration, Instant};
 use crate::wire::can::CanId;
 
@@ -26,11 +29,11 @@ pub(super) struct Exchanges<const N: usize> {
     items: Vec<Item, N>,
     rows: Vec<Row, N>,
     peers: Vec<PeerState, N>,
-    /// What masters have written.
+    /// What masters have written, and the requests of events.
     written: [Piece; N],
 }
 
-/// Bytes of a block that a master writes; a block takes as many pieces as it needs.
+/// Bytes of a block that a master writes, or of the request of an event; each takes as many pieces as it needs.
 pub(super) type Piece = [u8; 32];
 
 /// The same, of any size.
@@ -51,14 +54,24 @@ pub(super) struct Item {
     pub times: Times,
     /// It is asked when a value of the request changes.
     pub on_change: bool,
-    /// It is asked when this bit rises.
-    pub rising: Option<(SysVar, u8)>,
+    /// The bit whose rise asks it.
+    pub trigger: Option<Trigger>,
+    /// It stops its peer.
+    pub stops: bool,
+    /// The exchange of the port after whose good answer it is sent.
+    pub follow: Option<u8>,
+    /// How long after an event its request may be sent.
+    pub window: Duration,
+    pub event: Event,
+    /// What the robot is told of its events, in which variables, and whether that is new.
+    pub told: Told,
+    pub outcome: OutcomeTo,
+    pub is_news: bool,
     /// The newest request, to tell a change.
     pub digest: Option<u64>,
-    pub last_bit: Option<bool>,
     /// It was to be asked, and a value of it was unknown or stale.
     pub is_owed: bool,
-    /// Where a block that a master writes is kept, so that the master can read it.
+    /// Where a block that a master writes is kept, so that the master can read it; or the request of an event.
     pub pieces: Span,
     /// A master has written it.
     pub is_written: bool,
@@ -109,6 +122,10 @@ impl<const N: usize> Exchanges<N> {
 
     pub(super) fn peers(&self) -> &[PeerState] {
         &self.peers
+    }
+
+    pub(super) fn items_mut(&mut self) -> &mut [Item] {
+        &mut self.items
     }
 }
 
@@ -259,13 +276,19 @@ impl Formats<'_> {
             times: Times {
                 timeout: exchange.timeout,
                 pause: exchange.pause,
-                retries: exchange.retries,
+                retries: [exchange.retries, exchange.event_retries],
                 is_answered: true,
             },
             on_change: exchange.when.change,
-            rising: exchange.when.rising,
+            trigger: exchange.when.rising.map(Trigger::new),
+            stops: exchange.stop,
+            follow: exchange.follow,
+            window: Duration::ZERO,
+            event: Event::Over,
+            told: Told::default(),
+            outcome: exchange.outcome,
+            is_news: exchange.outcome != OutcomeTo::NONE,
             digest: None,
-            last_bit: None,
             is_owed: false,
             pieces: Span::default(),
             is_written: false,
@@ -340,20 +363,35 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let may_wait = |exchange: &Exchange| {
             exchange.when.start && exchange.fields(config.frames, Direction::Output).is_some()
         };
-        let looks = exchanges.iter().any(|exchange| is_looked_at(&exchange.when) || may_wait(exchange));
+        let looks = exchanges.iter().any(|exchange| exchange.when.change || may_wait(exchange));
         let looks = looks.then(|| Grid::starting_at(Instant::ZERO, port.cycle));
         let line_of = match &port.bus {
             Bus::Rs485(line) => Some(line),
             _ => None,
         };
         let mut hears_unasked = part_frames(Direction::Input) > 0;
-        for exchange in exchanges {
+        self.store.watches_bits |= exchanges.iter().any(|exchange| exchange.when.rising.is_some());
+        for (nth, exchange) in exchanges.iter().enumerate() {
             let mut item = formats.item(exchange)?;
-            if let (Asks::Served { .. }, Some(block)) = (item.asks, &item.reply) {
+            item.window = exchange.trigger(port.timeout);
+            item.follow = item.follow.or_else(|| step_before(exchanges, nth));
+            let request_len = match (item.asks, &item.request) {
+                (Asks::Rtu { operation, .. }, _) => operation.request_len(),
+                (Asks::Remote { .. }, _) | (_, None) => 0,
+                (_, Some(request)) => request.layout.lengths().1,
+            };
+            let kept = match (item.asks, &item.reply) {
+                (Asks::Served { .. }, Some(block)) => block.format.layout.lengths().1,
+                (Asks::Served { .. }, None) => 0,
+                // Escape bytes double a frame at most; there are none beside exchanges.
+                _ if exchange.is_event() => request_len,
+                _ => 0,
+            };
+            if kept > 0 {
                 let ends =
                     self.exchanges.items.iter().map(|item| item.pieces.start.saturating_add(item.pieces.len));
                 let used = ends.max().unwrap_or(0);
-                let len = block.format.layout.lengths().1.div_ceil(size_of::<Piece>());
+                let len = kept.div_ceil(size_of::<Piece>());
                 if usize::from(used).saturating_add(len) > EXCHANGES {
                     return Err(one_too_many(Counted::WrittenPieces, EXCHANGES));
                 }
@@ -366,21 +404,23 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 None => {
                     let peer = own.len();
                     let counters = PeerCounters::default();
-                    let new = PeerState { number: exchange.peer, counters, turn: Peer::NEW };
+                    let new = PeerState { number: exchange.peer, counters, turn: Turn::new(port.absent) };
                     self.exchanges.peers.push(new).map_err(|_| full())?;
                     peer
                 }
             };
             let on_line = |len: usize| line_of.map_or(Duration::ZERO, |line| line.time_on_line(len));
-            let request_len = match (item.asks, &item.request) {
-                (Asks::Rtu { operation, .. }, _) => operation.request_len(),
-                (_, Some(request)) => request.layout.lengths().1,
-                (_, None) => 0,
-            };
             let cost = on_line(request_len) + exchange.timeout + exchange.pause;
-            let when = (exchange.when.every, exchange.when.start);
-            let row = Row::new(peer as u8, when, (cost, exchange.timeout), Instant::ZERO)
-                .with_reply(item.times.is_answered && !matches!(item.asks, Asks::Nothing));
+            let kind = RowKind {
+                is_answered: exchange.is_answered(),
+                starts: exchange.when.start,
+                is_state: !exchange.is_start_event(),
+                stops: exchange.stop,
+            };
+            let every = exchange.when.every;
+            let times = RowTimes { every, cost, timeout: exchange.timeout, late: exchange.late() };
+            let mut row = Row::new(peer as u8, kind, times);
+            row.alike = alike(config, exchanges, exchange);
             self.exchanges.rows.push(row).map_err(|_| full())?;
             self.exchanges.items.push(item).map_err(|_| full())?;
         }
@@ -389,9 +429,46 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             Span { start, len: exchanges.len() as u16 },
             Span { start: first_peer as u16, len: peers },
             looks,
-            line_of.is_some_and(|line| line.echo),
+            line_of.map_or(Echo::No, |line| line.echo),
         );
         line.hears_unasked = hears_unasked;
         Ok(line)
     }
+}
+
+/// The step before an exchange that is triggered by the same bit as an earlier one of its peer: they are one dialogue.
+fn step_before(exchanges: &[Exchange], nth: usize) -> Option<u8> {
+    let own = exchanges.get(nth).filter(|own| own.when.rising.is_some() && !own.stop)?;
+    let is_step =
+        |other: &Exchange| other.peer == own.peer && other.when.rising == own.when.rising && !other.stop;
+    let before = exchanges.iter().take(nth).rposition(|other| is_step(other))?;
+    Some(before as u8)
+}
+
+/// The exchanges of the peer, as bits, whose replies cannot be told from those of this one by content or length.
+fn alike(config: ConfigView<'_>, exchanges: &[Exchange], own: &Exchange) -> u64 {
+    let frame = |nth: Option<u8>| config.frames.get(usize::from(nth?));
+    let is_alike = |other: &Exchange| {
+        own.peer == other.peer
+            && own.is_answered()
+            && other.is_answered()
+            && match (own.talk, other.talk) {
+                (Talk::Rtu { operation: own, .. }, Talk::Rtu { operation: other, .. }) => {
+                    own.is_answered_like(&other)
+                }
+                (Talk::Frames { reply: own, .. }, Talk::Frames { reply: other, .. }) => {
+                    match (frame(own), frame(other)) {
+                        (Some(own), Some(other)) => {
+                            core::ptr::eq(own, other) || !own.is_told_from(other, config)
+                        }
+                        _ => true,
+                    }
+                }
+                _ => false,
+            }
+    };
+    (0_u32..)
+        .zip(exchanges)
+        .filter(|(_, other)| is_alike(other))
+        .fold(0, |set, (nth, _)| set | 1_u64.unbounded_shl(nth))
 }

@@ -1,14 +1,15 @@
-//! The conversation on one line: which exchange has it, and what the line waits for.
+//! The exchanges of one line: which of them has it, and what the line waits for.
 //!
-//! In: requests that were handed over and have left, replies, the time. Out: the next exchange, and
-//! when to look again. Does not know frames.
+//! In: requests that were handed over and have left, replies, the time. Out: the next exchange, and when to look
+//! again. Does not know frames.
 
 use super::line_timing::LineTiming;
 use super::sender::{DIGEST_SEED, digest};
-use crate::config::{AskWhen, Span};
+use super::turns::{Cause, Ended, News, Row, Turn, Turns};
+use crate::config::{Echo, Span};
 use crate::device::Probe;
 use crate::modbus::rtu::Expected;
-use crate::schedule::{Grid, Peer, Presence, Row, Taken, Turns};
+use crate::schedule::{Grid, Presence};
 use crate::time::{Duration, Instant};
 
 /// Counters of one peer of a line since the start; they wrap.
@@ -33,6 +34,44 @@ pub struct PeerCounters {
     pub retries: u32,
     /// Times at which a request was not sent because a value of it was unknown or stale.
     pub unprepared: u32,
+    /// Replies that came too late; nothing of them was taken.
+    pub late_replies: u32,
+    /// Requests that ended with what may have been their own echo.
+    pub unconfirmed: u32,
+    /// Times at which the peer had started, so that what is asked at its start was asked again.
+    pub starts: u32,
+    /// What became of events.
+    pub events: EventCounters,
+}
+
+/// What became of events (docs/engine.md section 13), by the outcome's number; they wrap.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(default))]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[non_exhaustive]
+pub struct EventCounters {
+    /// 2: the device confirmed it.
+    pub done: u32,
+    /// 3: the device refused it.
+    pub refused: u32,
+    /// 4: the device accepted it, and takes its time.
+    pub accepted: u32,
+    /// 5: it was sent, and no answer tells what became of it.
+    pub unknown: u32,
+    /// 6: it could not be sent in time.
+    pub expired: u32,
+    /// 7: not sent; a value is outside its limits.
+    pub out_of_limits: u32,
+    /// 8: not sent; a value is unknown or stale.
+    pub no_value: u32,
+    /// 9: not sent; the device is away.
+    pub away: u32,
+    /// 10: not sent; the event before it was still open.
+    pub still_open: u32,
+    /// 11: not sent; a write that stops the device came first.
+    pub stopped: u32,
+    /// 12: not sent; the step before it was not done.
+    pub not_followed: u32,
 }
 
 /// One peer of a line.
@@ -41,7 +80,7 @@ pub(super) struct PeerState {
     /// Address of the slave, or number of the device.
     pub number: u8,
     pub counters: PeerCounters,
-    pub turn: Peer,
+    pub turn: Turn,
 }
 
 /// What a line is used for.
@@ -64,15 +103,25 @@ pub(super) enum Phase {
 pub(super) struct Flight {
     /// The exchange, counted from 0 on the port.
     pub exchange: u8,
-    taken: Taken,
+    pub cause: Cause,
     /// Repetitions so far.
     repeated: u8,
-    /// One of the requests had no reply in time.
-    timed_out: bool,
+    /// When the first transmission left that had no reply in time.
+    unanswered: Option<Instant>,
     /// A reply with a wrong checksum came.
     pub is_wrong: bool,
+    /// One came to an earlier transmission: that, or noise.
+    was_wrong: bool,
+    /// What came is its reply, or its own echo.
+    pub may_be_echo: bool,
+    /// Its reply could be taken for that to another request.
+    is_ambiguous: bool,
     /// The reply of a Modbus slave.
     pub expected: Option<Expected>,
+    /// Command, index and subindex of an SDO request.
+    pub sdo: Option<[u8; 3]>,
+    /// Of its bytes.
+    digest: u64,
     until: Instant,
 }
 
@@ -81,6 +130,19 @@ pub(super) struct Flight {
 pub(super) enum Failure {
     Timeout,
     Checksum,
+    /// All that came may have been its own echo.
+    Echo,
+}
+
+/// What became of a request that failed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Over {
+    /// It is repeated.
+    Repeated,
+    /// It was given up.
+    GivenUp(News),
+    /// Nobody knows: see [`Failure::Echo`].
+    Unconfirmed,
 }
 
 /// The times of one exchange.
@@ -88,12 +150,13 @@ pub(super) enum Failure {
 pub(super) struct Times {
     pub timeout: Duration,
     pub pause: Duration,
-    pub retries: u8,
+    /// Repetitions of a state, and of an event.
+    pub retries: [u8; 2],
     /// Whether it has a reply.
     pub is_answered: bool,
 }
 
-/// The conversation of one port.
+/// The exchanges of one port.
 #[derive(Debug, Clone)]
 pub(super) struct Line {
     /// The port's range of the exchanges, and of the peers.
@@ -101,18 +164,19 @@ pub(super) struct Line {
     pub peers: Span,
     pub phase: Phase,
     run: u8,
-    /// Values and bits that ask are looked at with this period, if there are any.
+    /// Values that ask are looked at with this period, if there are any.
     pub looks: Option<Grid>,
     /// No exchange is due before.
     look_at: Instant,
+    /// No event expires before.
+    pub expires_at: Instant,
     /// When the newest request left.
     sent: Instant,
-    /// The exchange and its timeout of a repetition that is still leaving, although a late reply to the
-    /// request before has ended it.
-    late: Option<(u8, Duration)>,
-    /// Own bytes are heard.
-    pub has_echo: bool,
-    /// The echo that is still to come.
+    /// Whether own bytes are heard, as the file says.
+    echo_setting: Echo,
+    /// The same as far as it is known: as the file says, or as it was learned.
+    pub has_echo: Option<bool>,
+    /// The echo that is still to come, or may come.
     pub echo: Option<OwnRequest>,
     /// Frames come that nobody asked for.
     pub hears_unasked: bool,
@@ -152,37 +216,37 @@ pub(super) struct Talks<'a> {
 }
 
 impl Flight {
-    /// Whether something wanted it beside its period.
-    pub(super) const fn was_requested(&self) -> bool {
-        self.taken.was_requested()
-    }
-
     /// Whether its request has been sent before.
     pub(super) const fn is_repetition(&self) -> bool {
         self.repeated > 0
+    }
+
+    /// Since when a reply to it could have been expected, if an earlier transmission had none in time.
+    pub(super) const fn unanswered(&self) -> Option<Instant> {
+        self.unanswered
+    }
+
+    /// Whether a request with these bytes may follow those that had no reply: one that is confirmed late must not
+    /// confirm another value.
+    pub(super) fn may_repeat(&self, request: &[u8]) -> bool {
+        self.repeated == 0 || self.digest == digest(DIGEST_SEED, request)
     }
 }
 
 impl Talks<'_> {
     /// The peer that a request is to.
     pub(super) fn peer_of(&mut self, flight: Flight) -> Option<&mut PeerState> {
-        let peer = self.number_of_peer(flight);
+        let peer = self.rows.get(usize::from(flight.exchange)).map_or(0, |row| row.peer);
         self.peers.get_mut(usize::from(peer))
     }
 
-    /// Whether no other exchange with a reply is with the peer of a request.
-    fn is_alone(&self, flight: Flight) -> bool {
-        let peer = self.number_of_peer(flight);
-        self.rows.iter().filter(|row| row.peer() == peer && row.is_answered()).nth(1).is_none()
-    }
-
-    fn number_of_peer(&self, flight: Flight) -> u8 {
-        self.rows.get(usize::from(flight.exchange)).map_or(0, Row::peer)
+    fn row_of(&mut self, flight: Flight) -> Option<&mut Row> {
+        self.rows.get_mut(usize::from(flight.exchange))
     }
 }
 
 impl Line {
-    pub(super) fn new(exchanges: Span, peers: Span, looks: Option<Grid>, has_echo: bool) -> Self {
+    pub(super) fn new(exchanges: Span, peers: Span, looks: Option<Grid>, echo: Echo) -> Self {
         Self {
             exchanges,
             peers,
@@ -190,9 +254,10 @@ impl Line {
             run: 0,
             looks,
             look_at: Instant::ZERO,
+            expires_at: Instant::NEVER,
             sent: Instant::ZERO,
-            late: None,
-            has_echo,
+            echo_setting: echo,
+            has_echo: echo.known(),
             echo: None,
             hears_unasked: false,
         }
@@ -221,6 +286,14 @@ impl Line {
         }
     }
 
+    /// The exchange whose request is on its way, or is to be repeated.
+    pub(super) const fn occupied_by(&self) -> Option<Flight> {
+        match self.phase {
+            Phase::Sending(flight) | Phase::Waiting(flight) | Phase::Repeat(flight) => Some(flight),
+            Phase::Idle | Phase::Resting(_) => None,
+        }
+    }
+
     /// The exchange whose request is to be made now; `None` until the line is to be looked at again.
     /// It has the line if [`Self::handed_over`] follows, else the next is asked for.
     pub(super) fn next(&mut self, talks: &mut Talks<'_>, now: Instant) -> Option<Flight> {
@@ -230,14 +303,19 @@ impl Line {
         }
         match self.turns(talks, |turns| turns.choose(now)) {
             Ok(exchange) => {
-                let taken = self.turns(talks, |turns| turns.take(exchange, now));
+                let cause = self.turns(talks, |turns| turns.take(exchange, now));
                 Some(Flight {
                     exchange: exchange as u8,
-                    taken,
+                    cause,
                     repeated: 0,
-                    timed_out: false,
+                    unanswered: None,
                     is_wrong: false,
+                    was_wrong: false,
+                    may_be_echo: false,
+                    is_ambiguous: false,
                     expected: None,
+                    sdo: None,
+                    digest: 0,
                     until: Instant::NEVER,
                 })
             }
@@ -249,25 +327,42 @@ impl Line {
     }
 
     /// The request was handed over.
-    pub(super) fn handed_over(&mut self, flight: Flight, expected: Option<Expected>, request: &[u8]) {
-        if self.has_echo {
+    pub(super) fn handed_over(
+        &mut self,
+        talks: &mut Talks<'_>,
+        flight: Flight,
+        (expected, sdo): (Option<Expected>, Option<[u8; 3]>),
+        request: &[u8],
+        now: Instant,
+    ) {
+        if self.has_echo != Some(false) {
             self.echo = OwnRequest::new(request);
         }
-        self.phase = Phase::Sending(Flight { expected, is_wrong: false, until: Instant::NEVER, ..flight });
+        let nth = usize::from(flight.exchange);
+        let is_ambiguous = self.turns(talks, |turns| turns.is_ambiguous(nth, now));
+        if let Some(row) = talks.rows.get_mut(nth) {
+            row.expected = expected;
+        }
+        let digest = digest(DIGEST_SEED, request);
+        self.phase = Phase::Sending(Flight {
+            expected,
+            sdo,
+            is_ambiguous: flight.is_ambiguous || is_ambiguous,
+            is_wrong: false,
+            may_be_echo: false,
+            digest,
+            until: Instant::NEVER,
+            ..flight
+        });
     }
 
     /// It has left. Returns whether the line now waits for the reply.
     pub(super) fn sent(
         &mut self,
-        talks: &mut Talks<'_>,
         times: impl FnOnce(u8) -> Option<Times>,
         line: &LineTiming,
         now: Instant,
     ) -> bool {
-        if let Some((exchange, timeout)) = self.late.take() {
-            let not_before = now + timeout.saturating_mul(2);
-            self.turns(talks, |turns| turns.hold(usize::from(exchange), not_before));
-        }
         let Phase::Sending(flight) = self.phase else { return false };
         self.sent = now;
         let times = times(flight.exchange);
@@ -290,20 +385,41 @@ impl Line {
         }
     }
 
-    /// The peer has answered, whatever it says.
-    pub(super) fn answered(&mut self, talks: &mut Talks<'_>, flight: Flight, times: Times, now: Instant) {
-        // The reply may be a late one to the first of the requests. Then that to the repetition is
-        // still to come, and must not be taken for one to another exchange.
-        // If a damaged one was the reason, that costs a peer with a single exchange more than it is worth.
-        // The first one may answer what was asked before the gateway or the port was there.
-        let is_first = talks.peer_of(flight).is_some_and(|peer| peer.is_unknown());
-        let late = flight.timed_out || (flight.repeated > 0 || is_first) && !talks.is_alone(flight);
-        let not_before = if late { self.sent + times.timeout.saturating_mul(2) } else { Instant::ZERO };
-        if late && matches!(self.phase, Phase::Sending(_)) {
-            self.late = Some((flight.exchange, times.timeout));
+    /// What came is the reply, or the request's own echo: only what comes behind it can tell.
+    pub(super) fn heard_reply_or_echo(&mut self) {
+        if let Phase::Sending(flight) | Phase::Waiting(flight) = &mut self.phase {
+            flight.may_be_echo = true;
         }
-        self.turns(talks, |turns| turns.answered(usize::from(flight.exchange), now, not_before));
+        self.echo = None;
+    }
+
+    /// Own bytes are heard, or are not. Returns whether that is news.
+    pub(super) fn learn_echo(&mut self, has_echo: bool) -> bool {
+        let is_news = self.has_echo.is_none();
+        if is_news {
+            self.has_echo = Some(has_echo);
+        }
+        is_news
+    }
+
+    /// The peer has answered. What it says counts for nothing where the answer could be another request's: that is
+    /// [`Ended::Unclear`].
+    pub(super) fn answered(
+        &mut self,
+        talks: &mut Talks<'_>,
+        flight: Flight,
+        ended: Ended,
+        times: Times,
+        now: Instant,
+    ) -> (Ended, News) {
+        let ended = if flight.is_ambiguous { Ended::Unclear } else { ended };
+        // The reply may be a late one to the first of the requests. Then that to the repetition is still to come.
+        let sent = if matches!(self.phase, Phase::Sending(_)) { now } else { self.sent };
+        leave_outstanding(talks, flight, flight.repeated, sent, now);
+        let news =
+            self.turns(talks, |turns| turns.answered(usize::from(flight.exchange), flight.cause, ended, now));
         self.rest(times.pause, now);
+        (ended, news)
     }
 
     fn rest(&mut self, pause: Duration, now: Instant) {
@@ -317,43 +433,75 @@ impl Line {
         let Phase::Waiting(flight) = self.phase else { return None };
         match flight.is_wrong {
             true if now >= line.silent_at().min(flight.until) => Some((flight, Failure::Checksum)),
+            false if now >= flight.until && flight.may_be_echo => Some((flight, Failure::Echo)),
             false if now >= flight.until => Some((flight, Failure::Timeout)),
             _ => None,
         }
     }
 
-    /// Repeats the request, or gives it up. Returns whether it was given up.
+    /// Repeats the request, or gives it up.
     pub(super) fn failed(
         &mut self,
         talks: &mut Talks<'_>,
         (flight, failure): (Flight, Failure),
         times: Times,
         now: Instant,
-    ) -> bool {
-        let Some(peer) = talks.peer_of(flight) else { return true };
+    ) -> Over {
+        let sent = self.sent;
+        let Some(peer) = talks.peer_of(flight) else { return Over::GivenUp(News::Nothing) };
         let counters = &mut peer.counters;
         let counter = match failure {
             Failure::Timeout => &mut counters.timeouts,
             Failure::Checksum => &mut counters.checksums,
+            Failure::Echo => &mut counters.unconfirmed,
         };
         *counter = counter.wrapping_add(1);
-        if peer.turn.presence() == Presence::Up && flight.repeated < times.retries {
+        if failure == Failure::Echo {
+            let nth = usize::from(flight.exchange);
+            self.turns(talks, |turns| turns.answered(nth, flight.cause, Ended::Unconfirmed, now));
+            self.rest(times.pause, now);
+            return Over::Unconfirmed;
+        }
+        let retries = match flight.cause {
+            Cause::State(_) => times.retries[0],
+            Cause::Start | Cause::Event => times.retries[1],
+        };
+        let unanswered = flight.unanswered.or((failure == Failure::Timeout).then_some(sent));
+        if peer.turn.presence() == Presence::Up && flight.repeated < retries {
             counters.retries = counters.retries.wrapping_add(1);
             let repeated = flight.repeated.saturating_add(1);
-            let timed_out = flight.timed_out || failure == Failure::Timeout;
-            self.phase = Phase::Repeat(Flight { repeated, timed_out, ..flight });
+            let was_wrong = flight.was_wrong || failure == Failure::Checksum;
+            self.phase = Phase::Repeat(Flight { repeated, unanswered, was_wrong, ..flight });
             self.echo = None;
-            return false;
+            return Over::Repeated;
         }
-        self.give_up(talks, flight, times, now);
-        true
+        if failure == Failure::Timeout && self.echo_setting == Echo::Auto {
+            // The adapter may be another one.
+            self.has_echo = None;
+        }
+        let was_wrong = flight.was_wrong || failure == Failure::Checksum;
+        Over::GivenUp(self.give_up(talks, Flight { unanswered, was_wrong, ..flight }, failure, times, now))
     }
 
     /// The request has failed and is not repeated.
-    pub(super) fn give_up(&mut self, talks: &mut Talks<'_>, flight: Flight, times: Times, now: Instant) {
+    pub(super) fn give_up(
+        &mut self,
+        talks: &mut Talks<'_>,
+        flight: Flight,
+        failure: Failure,
+        times: Times,
+        now: Instant,
+    ) -> News {
         let sent = self.sent;
-        self.turns(talks, |turns| turns.failed(usize::from(flight.exchange), flight.taken, now, sent));
+        leave_outstanding(talks, flight, flight.repeated.saturating_add(1), sent, now);
+        let nth = usize::from(flight.exchange);
+        let news = self.turns(talks, |turns| match failure {
+            Failure::Timeout => turns.failed(nth, flight.cause, now, sent),
+            // It said something, and nobody knows what.
+            _ => turns.answered(nth, flight.cause, Ended::Unclear, now),
+        });
         self.rest(times.pause, now);
+        news
     }
 
     /// The rest of the line is over.
@@ -366,33 +514,45 @@ impl Line {
         }
     }
 
+    /// The line is to be looked at: something is wanted, or may be asked earlier than it was.
+    pub(super) const fn look(&mut self, now: Instant) {
+        self.look_at = now;
+    }
+
     /// The exchange is asked as soon as the line is free.
     pub(super) fn request(&mut self, talks: &mut Talks<'_>, exchange: usize, now: Instant) {
         self.turns(talks, |turns| turns.request(exchange, now));
         self.look_at = now;
     }
 
-    /// What has begun is not continued: the device is gone, or the gateway slept.
-    pub(super) fn abandon(&mut self, talks: &mut Talks<'_>, now: Instant) {
+    /// What has begun is not continued: the device is gone, or the gateway slept. Returns the request that was on its
+    /// way.
+    pub(super) fn abandon(&mut self, talks: &mut Talks<'_>, now: Instant) -> Option<Flight> {
+        let flight = self.occupied_by();
         // One without a reply is sent once, whether it is heard or not.
-        let is_answered = |exchange: u8| talks.rows.get(usize::from(exchange)).is_some_and(Row::is_answered);
-        if let Phase::Repeat(flight) | Phase::Sending(flight) | Phase::Waiting(flight) = self.phase
-            && flight.taken.was_requested()
-            && is_answered(flight.exchange)
+        if let Some(Flight { exchange, cause: Cause::State(Some(_)), .. }) = flight
+            && talks.rows.get(usize::from(exchange)).is_some_and(Row::is_answered)
         {
-            self.turns(talks, |turns| turns.request(usize::from(flight.exchange), now));
+            self.turns(talks, |turns| turns.request(usize::from(exchange), now));
+        }
+        if let Some(row) = flight.and_then(|flight| talks.row_of(flight)).filter(|row| row.is_answered()) {
+            row.leaves_outstanding(
+                flight.map_or(0, |flight| flight.repeated.saturating_add(1)),
+                now + row.late(),
+                now,
+            );
         }
         self.phase = Phase::Idle;
-        self.late = None;
         self.look_at = now;
         self.echo = None;
+        flight
     }
 
     /// The device is there, perhaps another one: what is asked at the start is asked.
     pub(super) fn begin(&mut self, talks: &mut Talks<'_>, now: Instant) {
         self.abandon(talks, now);
-        talks.rows.iter_mut().for_each(|row| row.restart(now));
-        talks.peers.iter_mut().for_each(|peer| peer.turn.forget());
+        self.turns(talks, |turns| turns.begin(now));
+        self.has_echo = self.echo_setting.known();
     }
 
     /// When something happens without an input.
@@ -409,40 +569,29 @@ impl Line {
         looks.min(next)
     }
 
-    fn turns<T>(&mut self, talks: &mut Talks<'_>, ask: impl FnOnce(&mut Turns<'_, PeerState>) -> T) -> T {
+    pub(super) fn turns<T>(&mut self, talks: &mut Talks<'_>, ask: impl FnOnce(&mut Turns<'_>) -> T) -> T {
         ask(&mut Turns { rows: talks.rows, peers: talks.peers, run: &mut self.run })
     }
 }
 
 impl PeerState {
-    /// Whether it has not been asked since the gateway or the port is there.
-    fn is_unknown(&self) -> bool {
-        self.turn.presence() == Presence::Unknown
-    }
-
     /// Whether it did not answer when it was last asked.
     pub(super) fn is_down(&self) -> bool {
         self.turn.presence() == Presence::Down
     }
 }
 
-impl AsMut<Peer> for PeerState {
-    fn as_mut(&mut self) -> &mut Peer {
-        &mut self.turn
-    }
-}
-
-impl AsRef<Peer> for PeerState {
-    fn as_ref(&self) -> &Peer {
-        &self.turn
+/// A reply to an earlier transmission may still come. Behind what had a wrong checksum, and may have been noise, it is
+/// not later than two timeouts.
+fn leave_outstanding(talks: &mut Talks<'_>, flight: Flight, count: u8, sent: Instant, now: Instant) {
+    let Some(row) = talks.row_of(flight) else { return };
+    if flight.unanswered.is_some() {
+        row.leaves_outstanding(count, sent + row.late(), now);
+    } else if flight.was_wrong && row.alike.count_ones() > 1 {
+        row.leaves_outstanding(count, sent + row.late().min(row.timeout().saturating_mul(2)), now);
     }
 }
 
 fn resting(until: Instant, now: Instant) -> Phase {
     if until > now { Phase::Resting(until) } else { Phase::Idle }
-}
-
-/// Whether an exchange needs its values or a bit to be looked at.
-pub(super) const fn is_looked_at(when: &AskWhen) -> bool {
-    when.change || when.rising.is_some()
 }

@@ -15,7 +15,7 @@ use super::outbox::Outbox;
 use super::state_link::StateLink;
 use super::store::Store;
 use super::uplink::Uplink;
-use crate::image::InputSet;
+use crate::image::{GroupId, InputSet};
 use crate::link::{LinkAction, LinkHistory, LinkState, Supervisor};
 use crate::time::Instant;
 
@@ -137,6 +137,15 @@ impl<'a> LinksView<'a> {
 }
 
 impl<const UPLINKS: usize> Links<UPLINKS> {
+    /// Which connection the values of a group come over, counted; 0 for what does not come from the controller.
+    pub(super) fn connection_of(&self, group: GroupId) -> u32 {
+        let state = self.state.iter().filter(|link| link.group == group).map(|link| &link.supervisor);
+        let recipes =
+            self.recipes.iter().filter(|link| link.group == Some(group)).map(|link| &link.supervisor);
+        let modbus = self.modbus.iter().filter(|link| link.polls(group)).map(|link| &link.supervisor);
+        state.chain(recipes).chain(modbus).next().map_or(0, |supervisor| supervisor.history().connects)
+    }
+
     pub(super) const fn new() -> Self {
         Self {
             host: String::new(),

@@ -25,6 +25,7 @@ mod connection;
 mod counters;
 mod counts;
 mod device_port;
+mod events;
 mod exchanges;
 mod failed;
 mod field_output;
@@ -59,6 +60,7 @@ mod stops;
 mod store;
 mod talk;
 mod tap;
+mod turns;
 mod uplink;
 mod user;
 mod whole_port;
@@ -66,12 +68,13 @@ mod whole_port;
 pub use build_error::BuildError;
 pub use clock::ASLEEP;
 pub use counters::{LinkCounters, PortCounters};
+pub use events::Outcome;
 pub use failed::FailedCommand;
 pub use io::{
     BusState, Endpoint, Handled, Input, LinkId, LinkKind, Output, PortId, PortState, ReplyCode, Transport,
 };
 pub use latency::Latency;
-pub use line::PeerCounters;
+pub use line::{EventCounters, PeerCounters};
 pub use links::LinkInfo;
 pub use not_given::{LastNotGiven, NotGiven};
 pub use plan::{Plan, PlanError, Source, WayUp};
@@ -541,6 +544,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[inline(never)]
     fn check_triggers(&mut self) {
         self.show_health(self.store.now);
+        if self.exchanges.is_used() {
+            self.check_events();
+        }
         self.clock.ask.add(Ask::PORTS);
         let mut first = Instant::NEVER;
         for port in &mut self.ports {

@@ -119,6 +119,11 @@ pub(super) struct ModbusLink {
 }
 
 impl ModbusLink {
+    /// Whether it reads the variables of a group.
+    pub(super) fn polls(&self, group: GroupId) -> bool {
+        self.blocks.iter().any(|block| block.group == group)
+    }
+
     pub(super) fn new(port: u16, unit: u8, writes: InputSet) -> Self {
         Self {
             supervisor: Supervisor::new(LinkTimings::TCP),

@@ -63,6 +63,8 @@ struct Told {
 pub(super) struct PortsHealth {
     shown: Vec<Shown, MAX_EXTRA>,
     told: Vec<Told, MOST>,
+    /// Whether the robot is told anything: health, or what became of events.
+    is_told: bool,
     /// The group of the variables.
     group: GroupId,
     tell_at: Instant,
@@ -72,12 +74,13 @@ pub(super) struct PortsHealth {
 impl PortsHealth {
     pub(super) const fn new() -> Self {
         let (tell_at, repeat_at) = (Instant::ZERO, Instant::ZERO);
-        Self { shown: Vec::new(), told: Vec::new(), group: GroupId(0), tell_at, repeat_at }
+        Self { shown: Vec::new(), told: Vec::new(), is_told: false, group: GroupId(0), tell_at, repeat_at }
     }
 
     pub(super) fn clear(&mut self) {
         self.shown.clear();
         self.told.clear();
+        self.is_told = false;
         self.group = GroupId(0);
         self.tell_at = Instant::ZERO;
         self.repeat_at = Instant::ZERO;
@@ -195,13 +198,18 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         groups: &mut Groups,
     ) -> Result<(), BuildError> {
         for (nth, (_, port, _)) in (0..).zip(config.field_ports()) {
-            for (value, var) in port.health.iter() {
-                if self.health.told.is_empty() {
+            let recipe = config.recipes.get(usize::from(port.recipe));
+            let vars = recipe.into_iter().flat_map(|recipe| config.told_by(nth, port, recipe));
+            for (_, var) in vars {
+                if !self.health.is_told {
+                    self.health.is_told = true;
                     self.health.group = groups.next().ok_or(one_too_many(Counted::Groups, MAX_GROUPS))?;
                     self.store.check_health_at(Instant::ZERO);
                 }
                 self.store.image.assign(var, self.health.group);
                 self.store.health.insert(var);
+            }
+            for (value, var) in port.health.iter() {
                 // There is room for every value of every port.
                 let _ = self.health.told.push(Told { port: nth, value, var, last: None });
             }
@@ -249,14 +257,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[cold]
     #[inline(never)]
     pub(super) fn check_health(&mut self, now: Instant) {
-        if !self.health.told.is_empty() && now >= self.health.tell_at {
+        if self.health.is_told && now >= self.health.tell_at {
             self.tell_changes(now);
             self.health.tell_at = now + CHECK_EVERY;
         }
         self.show_health(now);
         let shows = self.ports.iter().filter(|port| port.sender.shows_health);
         let next = shows.map(|port| port.sender.next_cycle(now)).min().unwrap_or(Instant::NEVER);
-        let tell_at = if self.health.told.is_empty() { Instant::NEVER } else { self.health.tell_at };
+        let tell_at = if self.health.is_told { self.health.tell_at } else { Instant::NEVER };
         self.store.check_health_at(next.min(tell_at));
     }
 
@@ -267,6 +275,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             self.health.repeat_at = now + REPEAT_EVERY;
         }
         self.tell_health(|_| true, repeats, now);
+        if self.exchanges.is_used() {
+            self.tell_outcomes(repeats);
+        }
         self.store.image.stamp(self.health.group, now);
     }
 

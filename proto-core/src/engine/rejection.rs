@@ -41,11 +41,13 @@ pub enum Rejection {
     Refused,
     /// An alive counter that the frame before had, too.
     Repeated,
+    /// A reply that came too late, or that answers one of several requests.
+    Late,
 }
 
 impl Rejection {
     /// All reasons.
-    pub const ALL: [Self; 16] = [
+    pub const ALL: [Self; 17] = [
         Self::NoFrame,
         Self::Partial,
         Self::NotFinite,
@@ -62,6 +64,7 @@ impl Rejection {
         Self::Escape,
         Self::Refused,
         Self::Repeated,
+        Self::Late,
     ];
 
     /// A short text, such as `no frame found`.
@@ -83,6 +86,7 @@ impl Rejection {
             Self::Escape => "wrong escape bytes",
             Self::Refused => "the device refuses the request",
             Self::Repeated => "the counter of the frame before",
+            Self::Late => "a reply that came too late",
         }
     }
 }

@@ -1,20 +1,23 @@
 //! The requests of exchanges: which is next, and its bytes.
 //!
 //! In: the image, the exchanges of a port, its line. Out: a request, unless a value of it is unknown or
-//! stale.
+//! stale. The request of an event was made when it happened.
 
 use super::counters::{PortCounters, bump};
 use super::device_port::DeviceCodec;
-use super::exchanges::{Asks, Item};
+use super::events::{Event, Outcome};
+use super::exchanges::{Asks, Item, Piece};
 use super::io::ReplyCode;
-use super::line::{Line, Talks};
+use super::line::{Failure, Line, Talks};
 use super::sender::{DIGEST_SEED, Sender, digest};
+use super::turns::Cause;
 use super::user::{OutputBind, Outputs};
 use super::whole_port::Outgoing;
 use crate::config::OutputBinding;
-use crate::image::Image;
+use crate::image::{GroupId, Image};
 use crate::modbus::rtu::{Expected, MAX_ADU};
 use crate::time::Instant;
+use crate::wire::can::CanId;
 
 /// Makes the frames of requests.
 pub(super) struct Maker<'a> {
@@ -27,13 +30,14 @@ pub(super) struct Maker<'a> {
 }
 
 impl Maker<'_> {
-    /// Looks at values and bits that ask, and makes the next request. Returns its exchange and its
-    /// length in `out`. A request that cannot be repeated is counted in `counters`.
+    /// Looks at values that ask, and makes the next request. Returns its exchange and its length in `out`. A request
+    /// that cannot be repeated is counted in `counters`.
     pub(super) fn next(
         &self,
         line: &mut Line,
         items: &mut [Item],
         talks: &mut Talks<'_>,
+        kept: &[Piece],
         counters: &mut PortCounters,
         is_busy: bool,
         out: &mut [u8],
@@ -52,37 +56,59 @@ impl Maker<'_> {
                 return None;
             }
             let flight = line.next(talks, now)?;
-            let item = items.get(usize::from(flight.exchange))?;
+            let nth = usize::from(flight.exchange);
+            let item = items.get_mut(nth)?;
+            let made = match (flight.cause, item.event) {
+                (Cause::Event, Event::Ready { len, .. } | Event::Sent { len, .. }) => {
+                    copy(item, kept, usize::from(len), out);
+                    Some(usize::from(len))
+                }
+                (Cause::Event, _) => continue,
+                _ => self.make(item, out),
+            };
             let peer = talks.peer_of(flight)?;
-            let Some(len) = self.make(item, out) else {
+            let Some(len) = made else {
                 bump(&mut peer.counters.unprepared);
                 if flight.is_repetition() {
-                    // A late reply to what was sent must not be taken for one to another request.
                     bump(&mut counters.unanswered);
-                    line.give_up(talks, flight, item.times, now);
-                } else if let Some(item) = items.get_mut(usize::from(flight.exchange)) {
-                    item.is_owed |= flight.was_requested();
+                    line.give_up(talks, flight, Failure::Timeout, item.times, now);
+                } else {
+                    item.is_owed |= matches!(flight.cause, Cause::State(Some(_)));
+                    line.turns(talks, |turns| turns.not_sent(nth, flight.cause, now));
                 }
                 continue;
             };
-            bump(&mut peer.counters.requests);
             let request = out.get(..len).unwrap_or(&[]);
+            if !flight.may_repeat(request) {
+                // A reply to the old value must not confirm the new one. The exchange is asked again when none can come.
+                bump(&mut counters.unanswered);
+                line.give_up(talks, flight, Failure::Timeout, item.times, now);
+                continue;
+            }
+            bump(&mut peer.counters.requests);
             let expected = match item.asks {
                 Asks::Rtu { operation, .. } => Expected::of(&operation, request),
                 _ => None,
             };
-            if let Some(item) = items.get_mut(usize::from(flight.exchange)) {
+            match item.event {
+                Event::Ready { len, until } if flight.cause == Cause::Event => {
+                    item.event = Event::Sent { len, until }
+                }
+                _ => {}
+            }
+            if flight.cause != Cause::Event {
                 // What goes out now is neither owed any more, nor a change.
                 item.is_owed = false;
                 item.digest = item.on_change.then(|| digest(DIGEST_SEED, request));
             }
-            line.handed_over(flight, expected, request);
+            let told_by = (expected, sdo_of(item, request));
+            line.handed_over(talks, flight, told_by, request, now);
             return Some((flight.exchange, len));
         }
         None
     }
 
-    /// Whether a value of the request has changed, or its bit has risen, or it waited for its values.
+    /// Whether a value of the request has changed, or it waited for its values.
     fn is_wanted(&self, item: &mut Item, out: &mut [u8]) -> bool {
         let mut is_wanted = item.is_owed && self.make(item, out).is_some();
         item.is_owed &= !is_wanted;
@@ -93,22 +119,35 @@ impl Maker<'_> {
             is_wanted |= item.digest != Some(hash);
             item.digest = Some(hash);
         }
-        if let Some((var, bit)) = item.rising
-            && self.image.is_known(var)
-        {
-            let on = self.image.bit(var, bit) == 1.0;
-            is_wanted |= on && item.last_bit == Some(false);
-            item.last_bit = Some(on);
-        }
         is_wanted
+    }
+
+    fn fields(&self, item: &Item) -> &[OutputBind] {
+        item.request.as_ref().map_or(&[], |format| format.bindings.of(self.bindings.binds))
+    }
+
+    /// The groups of the variables whose values are in the request.
+    pub(super) fn groups_of(&self, item: &Item) -> impl Iterator<Item = GroupId> {
+        self.fields(item).iter().filter_map(|field| match field.from {
+            OutputBinding::Variable { var, .. } | OutputBinding::Bit { var, .. } => self.image.group(var),
+            _ => None,
+        })
+    }
+
+    /// Writes the request of an event to the front of `out`, or says why it has none.
+    pub(super) fn make_event(&self, item: &Item, out: &mut [u8]) -> Result<usize, Outcome> {
+        if !self.fields(item).iter().all(|field| may_send(self.sender, self.image, field, self.now)) {
+            return Err(Outcome::NoValue);
+        }
+        self.encode(item, out).ok_or(Outcome::OutOfLimits)
     }
 
     /// Writes a request to the front of `out`; `None` if a value of it is unknown or stale.
     fn make(&self, item: &Item, out: &mut [u8]) -> Option<usize> {
-        let fields = item.request.as_ref().map_or(&[][..], |format| format.bindings.of(self.bindings.binds));
-        if !fields.iter().all(|field| may_send(self.sender, self.image, field, self.now)) {
-            return None;
-        }
+        self.make_event(item, out).ok()
+    }
+
+    fn encode(&self, item: &Item, out: &mut [u8]) -> Option<usize> {
         let (frames_sent, reply) = (self.sender.frames_sent, self.reply);
         let texts = &self.codec.texts;
         let outgoing = Outgoing { image: self.image, bindings: self.bindings, texts, frames_sent, reply };
@@ -123,6 +162,23 @@ impl Maker<'_> {
             _ => None,
         }
     }
+}
+
+/// The request of an event as it was made.
+fn copy(item: &Item, kept: &[Piece], len: usize, out: &mut [u8]) {
+    let kept = item.pieces.of(kept).iter().flatten().take(len);
+    out.iter_mut().zip(kept).for_each(|(slot, &byte)| *slot = byte);
+}
+
+/// Index and subindex of an SDO request, with its command in front.
+fn sdo_of(item: &Item, request: &[u8]) -> Option<[u8; 3]> {
+    let (request_id, reply_id) = (item.request.as_ref()?.id, item.reply.as_ref()?.format.id);
+    let (CanId::Standard(request_id @ 0x601..=0x67F), CanId::Standard(reply_id)) = (request_id, reply_id)
+    else {
+        return None;
+    };
+    let &[_, index @ .., _, _, _, _] = request.first_chunk::<8>()?;
+    (request_id.checked_sub(0x80) == Some(reply_id) && item.refusal.is_none()).then_some(index)
 }
 
 /// Whether a field's value is known, and fresh unless the recipe holds.

@@ -139,6 +139,11 @@ impl Sender {
         self.in_flight = true;
     }
 
+    /// How old a value may be that is sent.
+    pub(super) const fn stale_after(&self) -> Duration {
+        self.stale_after
+    }
+
     /// Whether a value that came at this instant may be sent.
     pub(super) fn is_fresh(&self, came: Instant, now: Instant) -> bool {
         self.on_stale == OnStale::Hold || now.saturating_since(came) <= self.stale_after

@@ -199,6 +199,19 @@ impl<const PORTS: usize> Store<PORTS> {
         self.next_overdue = Stamp::at(self.next_overdue.get().min(frame.overdue_at));
     }
 
+    /// The values of the newest frame may be as old as this: their age runs from the request that they could belong to.
+    #[cold]
+    pub(super) fn was_asked(&mut self, nth: usize, since: Instant) {
+        let group = GroupId(nth as u8);
+        let Some(frame) = self.frames.get_mut(nth) else { return };
+        if self.image.stamp_of(group) != Some(self.now) {
+            return;
+        }
+        self.image.stamp(group, since);
+        frame.overdue_at = since + frame.timeout;
+        self.next_overdue.or_earlier(frame.overdue_at);
+    }
+
     /// [`Self::accepted`], on its own, where it matters less.
     #[inline(never)]
     pub(super) fn accepted_apart(&mut self, nth: usize, counters: &mut PortCounters) -> InputSet {

@@ -4,26 +4,28 @@
 //! and requests. Which exchange is next is the line's business ([`super::line`]); ports without
 //! exchanges do not come here.
 
-use super::awaited::{Awaited, Heard};
+use super::awaited::{Awaited, Heard, answers_of};
 use super::clock::Ask;
 use super::command_link::CommandLink;
 use super::counters::{PortCounters, add, bump};
 use super::device_port::{DeviceCodec, DeviceFormat, elements, judge_can};
+use super::events::{Events, Outcome, Sources};
 use super::exchanges::{Asks, Item, View};
 use super::field_output::Downward;
 use super::field_port::{Codec, FieldPort, came, keep};
 use super::frames::{Accepted, Frames};
 use super::io::{Output, PortId};
-use super::line::{Flight, Line, Phase, Talks};
+use super::line::{Flight, Line, Over, Phase, Talks, Times};
 use super::rejection::Rejection;
 use super::requests::Maker;
 use super::store::Store;
 use super::tap::{Tap, TapPlace};
-use super::user::{InputBind, Outputs};
+use super::turns::{Cause, Ended};
+use super::user::{InputBind, Outputs, wrapping_count};
 use super::whole_port::Reader;
 use super::{Engine, OUTPUT_BUFFER, find_port};
 use crate::device::{Found, Probe};
-use crate::image::Image;
+use crate::image::{GroupId, Image, InputSet};
 use crate::modbus::rtu::MAX_ADU;
 use crate::time::Instant;
 use crate::wire::can::CanFrame;
@@ -55,7 +57,7 @@ impl FieldPort {
                 let deadline = line.deadline(&self.line);
                 // Until the line is free, there is only that to wait for.
                 let own = if self.sender.is_busy() && line.may_ask() { Instant::NEVER } else { deadline };
-                own.min(self.slave_deadline()).min(self.reply_deadline())
+                own.min(line.expires_at).min(self.slave_deadline()).min(self.reply_deadline())
             }
             _ => Instant::NEVER,
         }
@@ -110,63 +112,97 @@ impl FieldPort {
         let (items, mut talks) = view.of(line);
         let mut frames =
             Frames::new((self.id, self.mode), &mut self.reply, &mut self.counters, bindings, store, commands);
-        let (first_frame, flight, echo) = (self.first_frame, line.flight(), line.echo);
-        let mut awaited = Awaited { formats, first_frame, items, flight, echo, bindings };
-        let effort = |awaited: &Awaited<'_>| {
-            let all = awaited.answers().chain(awaited.unasked().map(|(format, _)| format));
-            all.map(|format| format.layout.lengths().1.saturating_add(usize::from(format.bindings.len)))
-                .fold(MAX_ADU, usize::saturating_add)
-        };
-        while let Some(found) = framer.next_frame(&mut left, effort(&awaited), |bytes| awaited.probe(bytes)) {
-            let (frame, verdict) = match found {
-                Found::Frame(frame) => {
-                    let heard = awaited.heard(frame);
-                    if let Some(Heard::Echo) = heard {
-                        (line.echo, awaited.echo) = (None, None);
-                        continue;
-                    }
-                    let verdict = match &heard {
-                        Some(Heard::Reply(Some(reply))) => {
-                            let data = match awaited.expected() {
+        let first_frame = self.first_frame;
+        loop {
+            let awaited = Awaited {
+                formats,
+                first_frame,
+                items,
+                rows: talks.rows,
+                flight: line.flight(),
+                echo: line.echo,
+                has_echo: line.has_echo == Some(true),
+                bindings,
+                now,
+            };
+            let effort = awaited.all();
+            let effort = effort
+                .map(|format| format.layout.lengths().1.saturating_add(usize::from(format.bindings.len)))
+                .fold(MAX_ADU, usize::saturating_add);
+            let Some(found) = framer.next_frame(&mut left, effort, |bytes| awaited.probe(bytes)) else {
+                break;
+            };
+            let (frame, what) = match found {
+                Found::Frame(frame) => (frame, awaited.heard(frame)),
+                Found::Other(frame) => {
+                    let verdict = frames.rejected(Rejection::OtherDevice);
+                    tap.record(|| came(self.id, now, verdict, None, [frame, &[], &[]]));
+                    keep(&mut self.last_rejection, Rejection::OtherDevice, None, frame, now);
+                    continue;
+                }
+                Found::Wrong(frame) => {
+                    line.heard_wrong();
+                    let verdict = frames.rejected(Rejection::Checksum);
+                    tap.record(|| came(self.id, now, verdict, None, [frame, &[], &[]]));
+                    keep(&mut self.last_rejection, Rejection::Checksum, None, frame, now);
+                    continue;
+                }
+            };
+            if let Some(Heard::Echo) = what {
+                line.echo = None;
+                learn_echo(line, &mut talks, true, now);
+                continue;
+            }
+            let expected = awaited.expected();
+            let (flight, times) = (awaited.flight, awaited.asked().map(|item| item.times));
+            let (verdict, sign) = match what {
+                Some(Heard::Reply(reply)) => {
+                    let verdict = match reply {
+                        Some(reply) => {
+                            let data = match expected {
                                 Some(_) => frame.get(3..frame.len().saturating_sub(2)).unwrap_or(&[]),
                                 None => frame,
                             };
-                            frames.take_device(
-                                &reply.format,
-                                texts,
-                                data,
-                                usize::from(reply.slot),
-                                &mut accepted,
-                            )
-                        }
-                        Some(Heard::Unasked(format, slot)) => {
-                            frames.take_device(format, texts, frame, *slot, &mut accepted)
+                            let slot = usize::from(reply.slot);
+                            let verdict = frames.take_device(&reply.format, texts, data, slot, &mut accepted);
+                            if let Some(since) = flight.and_then(|flight| flight.unanswered()) {
+                                frames.store.was_asked(slot, since);
+                            }
+                            verdict
                         }
                         // A write was carried out.
-                        Some(Heard::Reply(None)) => Ok(()),
-                        Some(Heard::Refusal) => Err(Rejection::Refused),
-                        Some(Heard::Echo) | None => Err(Rejection::NoFrame),
+                        None => Ok(()),
                     };
-                    if let (Some(Heard::Reply(_) | Heard::Refusal), Some(flight), Some(item)) =
-                        (&heard, awaited.flight, awaited.asked())
-                    {
-                        let is_refused = matches!(heard, Some(Heard::Refusal));
-                        let code = frame.get(2).copied().unwrap_or(0);
-                        note_answer(&mut talks, frames.counters, flight, is_refused.then_some(code));
-                        if matches!(line.phase, Phase::Waiting(_)) {
-                            self.sender.sent();
-                        }
-                        line.answered(&mut talks, flight, item.times, now);
-                    }
-                    (frame, verdict)
+                    (verdict, Sign::Answer(Ended::Good, 0))
                 }
-                Found::Other(frame) => (frame, frames.rejected(Rejection::OtherDevice)),
-                Found::Wrong(frame) => {
-                    line.heard_wrong();
-                    (frame, frames.rejected(Rejection::Checksum))
+                Some(Heard::ReplyOrEcho) => (Ok(()), Sign::ReplyOrEcho),
+                Some(Heard::Refusal) => {
+                    let code = expected.and(frame.get(2)).copied().unwrap_or(0);
+                    (
+                        Err(Rejection::Refused),
+                        Sign::Answer(refused_with(code, expected.is_some()), code.into()),
+                    )
                 }
+                Some(Heard::Late(nth)) => (Err(Rejection::Late), Sign::Late(nth)),
+                Some(Heard::Ambiguous) => (Err(Rejection::Late), Sign::Ambiguous),
+                Some(Heard::Unasked(format, slot, nth)) => {
+                    (frames.take_device(format, texts, frame, slot, &mut accepted), Sign::Unasked(nth))
+                }
+                Some(Heard::Echo) | None => (Err(Rejection::NoFrame), Sign::Nothing),
             };
-            (awaited.flight, awaited.echo) = (line.flight(), line.echo);
+            match (sign, flight, times) {
+                (Sign::Answer(ended, code), Some(flight), Some(times)) => {
+                    if flight.may_be_echo || line.echo.is_some() {
+                        learn_echo(line, &mut talks, flight.may_be_echo, now);
+                    }
+                    if matches!(line.phase, Phase::Waiting(_)) {
+                        self.sender.sent();
+                    }
+                    answered(line, items, &mut talks, frames.counters, (flight, times), (ended, code), now);
+                }
+                (Sign::ReplyOrEcho, ..) => line.heard_reply_or_echo(),
+                (sign, ..) => signs(line, items, &mut talks, sign, now),
+            }
             tap.record(|| came(self.id, now, verdict, None, [frame, &[], &[]]));
             match verdict {
                 // What is held can hold further frames, so only the rest of the chunk waits.
@@ -206,36 +242,56 @@ impl FieldPort {
         }
         let flight = line.flight();
         let first_frame = self.first_frame;
-        let awaited = Awaited { formats, first_frame, items, flight, echo: None, bindings };
+        let (echo, has_echo) = (None, false);
+        let awaited =
+            Awaited { formats, first_frame, items, rows: talks.rows, flight, echo, has_echo, bindings, now };
         let is = |format: &DeviceFormat| {
             let fields = elements(format.bindings.of(bindings));
             format.id == frame.id()
                 && matches!(format.layout.probe_whole(fields, frame.data()), Probe::Frame(_))
         };
-        if let Some(heard) = awaited.answer(is)
-            && let (Some(flight), Some(item)) = (flight, awaited.asked())
-        {
-            let verdict = match heard {
-                Heard::Reply(Some(reply)) => {
-                    let slot = usize::from(reply.slot);
-                    frames.take_device(&reply.format, texts, frame.data(), slot, accepted)
-                }
-                _ => Err(Rejection::Refused),
-            };
-            let is_refused = verdict == Err(Rejection::Refused);
-            note_answer(&mut talks, frames.counters, flight, is_refused.then_some(0));
-            line.answered(&mut talks, flight, item.times, now);
-            return verdict;
-        }
-        let answers = awaited.answers().map(|format| (usize::MAX, format));
-        let all = answers.chain(awaited.unasked().map(|(format, slot)| (slot, format)));
-        let (slot, format) = match judge_can(all, bindings, frame) {
-            Ok(found) => found,
-            Err(why) => return frames.rejected(why),
+        let (answer, code) = match awaited.answer(is) {
+            Some(answer) => (Some(answer), 0),
+            None => match sdo_abort(&awaited, frame) {
+                Some(code) => (Some(Heard::Refusal), code),
+                None => (None, 0),
+            },
         };
-        frames.take_device(format, texts, frame.data(), slot, accepted)?;
-        self.sender.frames_accepted(1, usable, &mut self.counters, now);
-        Ok(())
+        let times = awaited.asked().map(|item| item.times);
+        let (verdict, sign) = match awaited.told(answer, |_, item| answers_of(item).any(is)) {
+            Some(Heard::Reply(Some(reply))) => {
+                let slot = usize::from(reply.slot);
+                let verdict = frames.take_device(&reply.format, texts, frame.data(), slot, accepted);
+                if let Some(since) = flight.and_then(|flight| flight.unanswered()) {
+                    frames.store.was_asked(slot, since);
+                }
+                (verdict, Sign::Answer(Ended::Good, 0))
+            }
+            Some(Heard::Refusal) => (Err(Rejection::Refused), Sign::Answer(Ended::Refused, code)),
+            Some(Heard::Late(nth)) => (Err(Rejection::Late), Sign::Late(nth)),
+            Some(_) => (Err(Rejection::Late), Sign::Ambiguous),
+            None => {
+                let answers = awaited.answers().map(|format| (None, format));
+                let unasked = awaited.unasked();
+                let all = answers.chain(unasked.map(|(format, slot, nth)| (Some((slot, nth)), format)));
+                let (place, format) = match judge_can(all, bindings, frame) {
+                    Ok(found) => found,
+                    Err(why) => return frames.rejected(why),
+                };
+                let (slot, nth) = place.unwrap_or((usize::MAX, None));
+                frames.take_device(format, texts, frame.data(), slot, accepted)?;
+                signs(line, items, &mut talks, Sign::Unasked(nth), now);
+                self.sender.frames_accepted(1, usable, &mut self.counters, now);
+                return Ok(());
+            }
+        };
+        match (sign, flight, times) {
+            (Sign::Answer(ended, code), Some(flight), Some(times)) => {
+                answered(line, items, &mut talks, frames.counters, (flight, times), (ended, code), now);
+            }
+            (sign, ..) => signs(line, items, &mut talks, sign, now),
+        }
+        verdict
     }
 
     /// The next request, if the line is free for one.
@@ -254,9 +310,9 @@ impl FieldPort {
         let Codec::Device(codec) = &mut self.codec else { return None };
         // Apart from the rest of the codec, which makes the frames.
         let mut line = codec.line.take()?;
-        let (items, mut talks) = view.of(&line);
+        let (items, mut talks, kept) = view.served(&line);
         let maker = Maker { image, bindings, codec, sender: &self.sender, reply: self.reply, now };
-        let request = maker.next(&mut line, items, &mut talks, &mut self.counters, is_busy, out);
+        let request = maker.next(&mut line, items, &mut talks, kept, &mut self.counters, is_busy, out);
         let is_on_can = codec.reader.is_none();
         if let (Some(_), Some(Reader::Search(framer))) = (&request, &mut codec.reader)
             && !line.hears_unasked
@@ -287,26 +343,50 @@ impl FieldPort {
         let Some(line) = self.line_mut() else { return };
         let (items, mut talks) = view.of(line);
         let times = |nth: u8| items.get(usize::from(nth)).map(|item| item.times);
+        let flight = line.flight();
         // A bus is free for others while a reply is awaited.
-        if line.sent(&mut talks, times, &timing, now) && !is_on_can {
+        let is_awaited = line.sent(times, &timing, now);
+        if let Some(flight) = flight.filter(|_| !is_awaited) {
+            // Nobody says whether it was heard. What follows it is sent behind it.
+            let nth = usize::from(flight.exchange);
+            let mut events = Events { items, talks: &mut talks, line, now };
+            if flight.cause == Cause::Event {
+                events.end_unanswered(nth);
+            }
+        }
+        if is_awaited && !is_on_can {
             self.sender.hold();
         }
     }
 
-    /// Pauses end, and replies that have not come fail.
+    /// Pauses end, replies that have not come fail, and events expire.
     fn advance_talk(&mut self, mut view: View<'_>, now: Instant) {
         let (timing, is_on_can) = (self.line, self.is_on_can());
         let Some(line) = self.line_mut() else { return };
         line.advance(now);
-        let Some(failure) = line.failure(&timing, now) else { return };
         let (items, mut talks) = view.of(line);
-        let Some(item) = items.get(usize::from(failure.0.exchange)) else { return };
-        let is_over = line.failed(&mut talks, failure, item.times, now);
+        Events { items, talks: &mut talks, line, now }.expire();
+        let Some(failure) = line.failure(&timing, now) else { return };
+        let Some(times) = items.get(usize::from(failure.0.exchange)).map(|item| item.times) else { return };
+        let over = line.failed(&mut talks, failure, times, now);
+        let (nth, is_event) = (usize::from(failure.0.exchange), failure.0.cause == Cause::Event);
+        let ended = match over {
+            Over::Repeated => None,
+            Over::GivenUp(_) => Some(Ended::Unclear),
+            Over::Unconfirmed => Some(Ended::Unconfirmed),
+        };
+        let mut events = Events { items, talks: &mut talks, line, now };
+        if let Some(ended) = ended {
+            events.ended(nth, is_event, ended, 0);
+        }
+        if let Over::GivenUp(news) = over {
+            events.note(nth, news);
+        }
         // A bus was not held while the reply was awaited: a frame of the cycle may be on its way.
         if !is_on_can {
             self.sender.sent();
         }
-        if is_over {
+        if matches!(over, Over::GivenUp(_)) {
             bump(&mut self.counters.unanswered);
         }
     }
@@ -315,11 +395,42 @@ impl FieldPort {
         let is_on_can = self.is_on_can();
         let Some(line) = self.line_mut() else { return };
         let was_waiting = matches!(line.phase, Phase::Waiting(_));
-        let (_, mut talks) = view.of(line);
-        line.abandon(&mut talks, now);
+        let (items, mut talks) = view.of(line);
+        let flight = line.abandon(&mut talks, now);
+        for item in &mut *items {
+            if let Some(trigger) = &mut item.trigger {
+                trigger.forget();
+            }
+        }
+        let mut events = Events { items, talks: &mut talks, line, now };
+        if let Some(flight) = flight.filter(|flight| flight.cause == Cause::Event) {
+            events.end(usize::from(flight.exchange), Outcome::Unknown, 0);
+        }
+        events.end_waiting(None, Outcome::Away);
         if was_waiting && !is_on_can {
             self.sender.sent();
         }
+    }
+
+    /// Values in the image have changed: looks at the bits that ask.
+    pub(super) fn triggers(
+        &mut self,
+        image: &Image,
+        bindings: Outputs<'_>,
+        mut view: View<'_>,
+        (first_of_links, connection): (u8, &dyn Fn(GroupId) -> u32),
+        now: Instant,
+    ) {
+        let is_usable = self.is_usable();
+        let Codec::Device(codec) = &mut self.codec else { return };
+        let Some(mut line) = codec.line.take() else { return };
+        let (items, mut talks, kept) = view.served(&line);
+        let stale_after = self.sender.stale_after();
+        let maker = Maker { image, bindings, codec, sender: &self.sender, reply: self.reply, now };
+        let sources = Sources { first_of_links, connection, stale_after, is_usable };
+        let mut events = Events { items, talks: &mut talks, line: &mut line, now };
+        events.image_changed(&maker, &sources, kept);
+        codec.line = Some(line);
     }
 
     fn begin_talk(&mut self, mut view: View<'_>, now: Instant) {
@@ -330,7 +441,7 @@ impl FieldPort {
         let Some(line) = self.line_mut() else { return };
         let (items, mut talks) = view.of(line);
         for item in items {
-            (item.digest, item.last_bit, item.is_owed) = (None, None, false);
+            (item.digest, item.is_owed) = (None, false);
         }
         line.begin(&mut talks, now);
         line.looks = line.looks.map(|grid| crate::schedule::Grid::starting_at(now, grid.period()));
@@ -341,19 +452,101 @@ fn view_item<'v>(view: &'v mut View<'_>, line: &Line, nth: u8) -> Option<&'v Ite
     view.of(line).0.get(usize::from(nth))
 }
 
-/// Counts an answer at its port and peer; a refusal comes with its code.
-fn note_answer(talks: &mut Talks<'_>, counters: &mut PortCounters, flight: Flight, refusal: Option<u8>) {
-    if refusal.is_some() {
-        bump(&mut counters.refused);
+/// What a frame says of the exchanges.
+#[derive(Clone, Copy)]
+enum Sign {
+    Nothing,
+    /// The request on its way is answered, with the code of a refusal.
+    Answer(Ended, u16),
+    ReplyOrEcho,
+    /// A late reply to an earlier request of this exchange.
+    Late(u8),
+    Ambiguous,
+    /// A frame that nobody asked for, of this exchange.
+    Unasked(Option<u8>),
+}
+
+/// What a refusal means; on Modbus its code tells (docs/wire/modbus-rtu.md section 4).
+const fn refused_with(code: u8, is_modbus: bool) -> Ended {
+    match code {
+        5 if is_modbus => Ended::Accepted,
+        6 if is_modbus => Ended::Busy,
+        4 | 8 | 10 | 11 if is_modbus => Ended::Unclear,
+        _ => Ended::Refused,
     }
-    let Some(peer) = talks.peer_of(flight) else { return };
-    match refusal {
-        None => bump(&mut peer.counters.replies),
-        Some(code) => {
-            bump(&mut peer.counters.refused);
-            peer.counters.refusal = code;
+}
+
+/// The code of an SDO abort, the low half, if the frame is one for the request on its way.
+fn sdo_abort(awaited: &Awaited<'_>, frame: &CanFrame) -> Option<u16> {
+    let multiplexer = awaited.flight?.sdo?;
+    let reply = awaited.asked()?.reply.as_ref()?;
+    let &[0x80, a, b, c, low, high, _, _] = frame.data().first_chunk::<8>()? else { return None };
+    (frame.id() == reply.format.id && [a, b, c] == multiplexer).then_some(u16::from_le_bytes([low, high]))
+}
+
+/// Own bytes are heard, or are not: what was not confirmed for that reason is, or is written again.
+fn learn_echo(line: &mut Line, talks: &mut Talks<'_>, has_echo: bool, now: Instant) {
+    if !line.learn_echo(has_echo) {
+        return;
+    }
+    for nth in 0..talks.rows.len() {
+        let Some(row) = talks.rows.get_mut(nth) else { break };
+        let was_unconfirmed = core::mem::take(&mut row.is_unconfirmed);
+        if was_unconfirmed && has_echo && row.is_state() {
+            line.request(talks, nth, now);
         }
     }
+}
+
+/// The request on its way is answered: counts it at its port and peer, and tells the events.
+fn answered(
+    line: &mut Line,
+    items: &mut [Item],
+    talks: &mut Talks<'_>,
+    counters: &mut PortCounters,
+    (flight, times): (Flight, Times),
+    (ended, code): (Ended, u16),
+    now: Instant,
+) {
+    let is_refused = ended != Ended::Good;
+    if is_refused {
+        bump(&mut counters.refused);
+    }
+    if let Some(peer) = talks.peer_of(flight) {
+        if is_refused {
+            bump(&mut peer.counters.refused);
+            peer.counters.refusal = code as u8;
+        } else {
+            bump(&mut peer.counters.replies);
+        }
+    }
+    let (ended, news) = line.answered(talks, flight, ended, times, now);
+    let nth = usize::from(flight.exchange);
+    let mut events = Events { items, talks, line, now };
+    events.note(nth, news);
+    events.ended(nth, flight.cause == Cause::Event, ended, code);
+}
+
+/// A frame that is no answer to the request on its way is a sign of life of its peer.
+fn signs(line: &mut Line, items: &mut [Item], talks: &mut Talks<'_>, sign: Sign, now: Instant) {
+    let nth = match (sign, line.flight()) {
+        (Sign::Late(nth), _) | (Sign::Unasked(Some(nth)), _) => usize::from(nth),
+        (Sign::Ambiguous, Some(flight)) => usize::from(flight.exchange),
+        _ => return,
+    };
+    let Some(row) = talks.rows.get_mut(nth) else { return };
+    let which = row.peer;
+    if matches!(sign, Sign::Late(_)) {
+        row.late_reply_came();
+    }
+    if !matches!(sign, Sign::Unasked(_))
+        && let Some(peer) = talks.peers.get_mut(usize::from(which))
+    {
+        bump(&mut peer.counters.late_replies);
+    }
+    let news = line.turns(talks, |turns| turns.heard(which, None, now));
+    line.look(now);
+    Events { items, talks, line, now }.note(nth, news);
 }
 
 impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize, const EXCHANGES: usize>
@@ -439,8 +632,54 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         true
     }
 
+    /// Values in the image have changed: looks at the bits that ask, on all ports.
+    #[cold]
+    #[inline(never)]
+    pub(super) fn check_events(&mut self) {
+        let now = self.store.now;
+        for nth in 0..self.ports.len() {
+            let Some(port) = self.ports.get_mut(nth) else { break };
+            if port.line().is_none() {
+                continue;
+            }
+            let (id, links) = (port.id, &self.links);
+            let first_of_links = self.store.frames.len() as u8;
+            let connection = |group| links.connection_of(group);
+            let (image, view) = (&self.store.image, self.exchanges.view());
+            port.triggers(image, self.bindings.outputs(), view, (first_of_links, &connection), now);
+            self.after_talk(id);
+        }
+    }
+
+    /// Tells the robot what became of events, if that is new or to be repeated.
+    #[cold]
+    #[inline(never)]
+    pub(super) fn tell_outcomes(&mut self, repeats: bool) {
+        let mut told = InputSet::EMPTY;
+        for item in self.exchanges.items_mut() {
+            if !repeats && !item.is_news {
+                continue;
+            }
+            item.is_news = false;
+            let (to, state) = (item.outcome, item.told);
+            let values =
+                [(to.to, state.outcome as u16), (to.code_to, state.code), (to.count_to, state.ended)];
+            for (var, value) in values {
+                let Some(var) = var else { continue };
+                // The value has the variable's type.
+                let _ = self.store.image.set(var, wrapping_count(var.ty(), value.into()));
+                told.insert(var);
+            }
+        }
+        if !told.is_empty() {
+            self.store.tell(&told);
+            self.clock.ask.add(Ask::LINKS);
+        }
+    }
+
     /// The line may be free, or wait for something else.
     fn after_talk(&mut self, id: PortId) {
+        self.tell_outcomes(false);
         self.clock.ask.add(Ask::PORTS);
         if let Some(port) = find_port(&mut self.ports, id) {
             port.note_partial();

@@ -109,11 +109,6 @@ impl Peer {
         missed: 0,
     };
 
-    /// It may be another one.
-    pub(crate) fn forget(&mut self) {
-        *self = Self { missed: self.missed, ..Self::NEW };
-    }
-
     pub(crate) const fn presence(&self) -> Presence {
         self.presence
     }
@@ -136,29 +131,6 @@ impl Row {
         let grid = every.map(|period| Grid::starting_at(now, period));
         let (requested, taken) = (start.then_some(now), Instant::ZERO);
         Self { peer, grid, start, opens: start, requested, is_answered: true, taken, cost, timeout }
-    }
-
-    /// The same, but nobody answers unless `is_answered`.
-    pub(crate) const fn with_reply(mut self, is_answered: bool) -> Self {
-        self.is_answered = is_answered;
-        self
-    }
-
-    pub(crate) const fn peer(&self) -> u8 {
-        self.peer
-    }
-
-    pub(crate) const fn is_answered(&self) -> bool {
-        self.is_answered
-    }
-
-    /// The line begins anew: what is asked at the start is asked again, and periods begin now.
-    pub(crate) fn restart(&mut self, now: Instant) {
-        self.requested = self.start.then_some(now);
-        self.opens = self.start;
-        if let Some(grid) = &mut self.grid {
-            *grid = Grid::starting_at(now, grid.period());
-        }
     }
 }
 
@@ -278,14 +250,6 @@ impl<P: AsRef<Peer> + AsMut<Peer>> Turns<'_, P> {
         }
     }
 
-    /// The peer of a row is asked nothing before this: a reply to an earlier request may still come.
-    pub(crate) fn hold(&mut self, nth: usize, not_before: Instant) {
-        let Some(which) = self.rows.get(nth).map(|row| row.peer) else { return };
-        if let Some(peer) = self.peers.get_mut(usize::from(which)).map(AsMut::as_mut) {
-            peer.not_before = peer.not_before.max(not_before);
-        }
-    }
-
     /// The peer has not answered, the last time to a request whose sending ended at `sent`.
     pub(crate) fn failed(&mut self, nth: usize, taken: Taken, now: Instant, sent: Instant) {
         let Some(row) = self.rows.get_mut(nth) else { return };
@@ -316,13 +280,6 @@ impl Row {
     /// When the period that is due, or the next one, is missed.
     fn end_of_period(&self) -> Instant {
         self.grid.as_ref().map_or(Instant::NEVER, |grid| grid.next() + grid.period())
-    }
-}
-
-impl Taken {
-    /// Whether something wanted it beside its period.
-    pub(crate) const fn was_requested(&self) -> bool {
-        self.requested.is_some()
     }
 }
 

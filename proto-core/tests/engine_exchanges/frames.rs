@@ -41,7 +41,7 @@ fn frame(cell: &mut Cell, id: Option<u16>, head: &[u8], tail: &[u8], fields: Vec
 }
 
 fn asks(request: Option<u8>, reply: Option<u8>, refusal: Option<u8>, when: AskWhen) -> Exchange {
-    Exchange::new(0, Talk::Frames { request, reply, refusal }, when)
+    never_late(Exchange::new(0, Talk::Frames { request, reply, refusal }, when))
 }
 
 /// A screwdriver: `Q` asks for torque and angle, which `A` answers and `N` refuses with a code. It says
@@ -154,7 +154,7 @@ fn an_echo_behind_a_late_reply_is_no_reply() {
     let both = [0, 1].map(|_| frame(&mut cell, None, b"Q", b"", vec![fixed(1)]));
     let port = talking(&mut cell, &[asks(both[0], both[1], None, AskWhen::every(MS(50)))]);
     let Bus::Rs485(settings) = &mut cell.last_port().bus else { panic!() };
-    settings.echo = true;
+    settings.echo = Echo::Yes;
     let mut line = Line::new(&cell, port);
     line.run(MS(220), |request| Some((MS(3), [b"Z\x01", request].concat())));
     let counters = line.rig.counters(port);

@@ -84,12 +84,12 @@ fn cell(table: &Table) -> (Cell, PortId) {
             let Talk::Rtu { read, written, .. } = poll.talk else { panic!() };
             let operation = Operation::ReadHoldingRegisters { address: FIRST + nth, count: 1 };
             let talk = Talk::Rtu { operation, written, read };
-            Exchange { talk, timeout: TIMEOUT, retries, pause: MS(pause), ..poll }
+            Exchange { talk, timeout: TIMEOUT, late: None, retries, pause: MS(pause), ..poll }
         })
         .collect();
     let port = talking(&mut cell, &exchanges);
     let Bus::Rs485(line) = &mut cell.last_port().bus else { panic!() };
-    (line.turnaround, line.echo) = (SILENCE, table.has_echo);
+    (line.turnaround, line.echo) = (SILENCE, if table.has_echo { Echo::Yes } else { Echo::No });
     cell.last_port().timeout = MS(60_000);
     (cell, port)
 }

@@ -27,7 +27,7 @@ fn sets_mode(cell: &mut Cell, slave: u8, when: AskWhen) -> Exchange {
         from: OutputBinding::Constant(3.0),
     }]);
     let operation = Operation::WriteRegister { address: 1 };
-    Exchange::new(slave, Talk::Rtu { operation, written, read: Span::default() }, when)
+    never_late(Exchange::new(slave, Talk::Rtu { operation, written, read: Span::default() }, when))
 }
 
 #[test]
@@ -150,7 +150,17 @@ fn what_is_asked_at_the_start_is_asked_again_when_the_slave_or_the_port_is_back(
     line.rig.input(Input::PortUp { port });
     assert_eq!(count(&line.run(MS(500), done)), 1);
     assert_eq!(line.rig.engine.port_state(port), Some(PortState::Working));
-    line.run(MS(1_000), |_| None);
+    line.run(MS(2_900), |_| None);
+    assert_eq!(
+        count(&line.run(MS(8_000), done)),
+        0,
+        "replies were lost, it may have been there all the time"
+    );
+    let polls = |request: &[u8]| if request[1] == 6 { None } else { done(request) };
+    line.rig.input(Input::PortDown { port });
+    line.rig.input(Input::PortUp { port });
+    assert_eq!(count(&line.run(MS(8_000), polls)), 1, "it may have been carried out");
+    line.run(MS(6_000), |_| None);
     assert_eq!(count(&line.run(MS(8_000), done)), 1, "the slave is back");
     line.rig.input(Input::PortDown { port });
     assert_eq!(line.run(MS(500), done), []);
@@ -209,7 +219,7 @@ fn the_echo_of_a_request_is_no_reply() {
     write.when = AskWhen::every(MS(20));
     let port = talking(&mut cell, &[write]);
     let Bus::Rs485(settings) = &mut cell.last_port().bus else { panic!() };
-    settings.echo = true;
+    settings.echo = Echo::Yes;
     let mut line = Line::new(&cell, port);
     let asked = line.run(MS(95), |request| {
         let mut heard = request.to_vec();
@@ -229,7 +239,7 @@ fn a_late_reply_is_not_taken_for_another_exchange() {
         let mut exchange = reads(cell, 5, &[name], AskWhen::every(MS(40)));
         let Talk::Rtu { operation, .. } = &mut exchange.talk else { panic!() };
         *operation = Operation::ReadHoldingRegisters { address, count: 1 };
-        Exchange { timeout: MS(30), ..exchange }
+        Exchange { timeout: MS(30), late: None, ..exchange }
     };
     let table = [late(&mut cell, "WordInputReg[1]", 1), late(&mut cell, "WordInputReg[2]", 2)];
     let port = talking(&mut cell, &table);
@@ -250,27 +260,30 @@ fn a_late_reply_is_not_taken_for_another_exchange() {
 }
 
 #[test]
-fn a_reply_to_what_was_asked_before_the_start_shifts_no_others() {
+fn what_was_asked_before_the_start_may_be_answered_before_anything_is_asked() {
     let mut cell = Cell::new();
     let table = [1, 2].map(|address| {
         let name = format!("WordInputReg[{address}]");
         let mut exchange = reads(&mut cell, 5, &[&name], AskWhen::every(MS(40)));
         let Talk::Rtu { operation, .. } = &mut exchange.talk else { panic!() };
         *operation = Operation::ReadHoldingRegisters { address, count: 1 };
-        Exchange { timeout: MS(30), ..exchange }
+        Exchange { timeout: MS(30), late: None, ..exchange }
     });
     let port = talking(&mut cell, &table);
-    for delay in 1..29 {
+    for delay in [1, 29, 400, 998] {
         let mut line = Line::new(&cell, port);
-        // A gateway before this one had asked for the second register. The slave answers in turn.
+        let begin = line.rig.now;
+        // A gateway before this one had asked for the second register.
         line.comes(MS(delay), &registers(5, &[102]));
-        let asked = line.run(MS(300), |request| Some((MS(29), registers(5, &[u16::from(request[3]) + 100]))));
-        let pause = asked[1].0.saturating_since(asked[0].0);
-        assert!((MS(60)..MS(64)).contains(&pause), "two timeouts: {pause}");
+        let asked =
+            line.run(MS(1_300), |request| Some((MS(29), registers(5, &[u16::from(request[3]) + 100]))));
+        let first = asked[0].0.saturating_since(begin);
+        assert!((DEFAULT_LATE - MS(1)..DEFAULT_LATE + MS(5)).contains(&first), "{first}");
         for written in line.rig.take_written() {
             let Written::Registers(address, words) = written else { panic!() };
-            let second = (address..).zip(words).find(|(at, _)| *at == 9);
-            assert!(second.is_none_or(|(_, word)| word == 102), "at a delay of {delay} ms");
+            for (at, word) in (address..).zip(words) {
+                assert_eq!(word, at - 7 + 100, "at a delay of {delay} ms");
+            }
         }
         assert_eq!(line.rig.map.registers[8..10], [101, 102], "at a delay of {delay} ms");
     }
@@ -299,7 +312,7 @@ fn replies_come_late(noise: Option<Vec<u8>>) {
         *operation = Operation::ReadHoldingRegisters { address, count: 1 };
         exchange
     });
-    table.iter_mut().for_each(|exchange| exchange.timeout = MS(30));
+    table.iter_mut().for_each(|exchange| (exchange.timeout, exchange.late) = (MS(30), None));
     let port = talking(&mut cell, &table);
     let variables = ["WordInputReg[1]", "WordInputReg[2]"].map(var);
     for delay in (1..55).step_by(2) {
@@ -349,7 +362,13 @@ fn a_reply_is_not_taken_for_another_exchange_when_the_repetition_cannot_be_made(
         let (read_address, write_address) = (address, address + 0x20);
         let operation =
             Operation::ReadWriteRegisters { read_address, read_count: 1, write_address, write_count: 1 };
-        Exchange { timeout: MS(30), retries: 3, talk: Talk::Rtu { operation, written, read }, ..poll }
+        Exchange {
+            timeout: MS(30),
+            late: None,
+            retries: 3,
+            talk: Talk::Rtu { operation, written, read },
+            ..poll
+        }
     };
     let shown = writes(&mut cell, 5, &["WordOutputReg[1]"], AskWhen::NEVER).talk;
     let constant = sets_mode(&mut cell, 5, AskWhen::NEVER).talk;
@@ -370,7 +389,7 @@ fn a_reply_is_not_taken_for_another_exchange_when_the_repetition_cannot_be_made(
     for delay in (31..59).step_by(3) {
         for offset in (0..40).step_by(5) {
             let mut line = Line::new(&cell, port);
-            line.run(MS(500 + offset), answer(MS(1)));
+            line.run(MS(1_500 + offset), answer(MS(1)));
             // The controller falls silent, and then the slave is late.
             line.rig.modbus_answers = false;
             line.run(MS(70), answer(MS(1)));
@@ -440,7 +459,7 @@ fn what_a_slave_is_asked_at_its_start_comes_first_and_in_order() {
         reads(&mut cell, 5, &["WordInputReg[4]"], AskWhen::every(MS(50))),
     ];
     let port = talking(&mut cell, &table);
-    cell.last_port().timeout = MS(500);
+    (cell.last_port().timeout, cell.last_port().absent) = (MS(500), MS(500));
     let mut line = Line::new(&cell, port);
     let done = |request: &[u8]| {
         let reply = if request[1] == 16 { with_crc(&request[..6]) } else { registers(request[0], &[1]) };
@@ -455,8 +474,11 @@ fn what_a_slave_is_asked_at_its_start_comes_first_and_in_order() {
     assert!(asked.iter().filter(|(_, sent)| sent[0] == 5).count() > 20);
     for round in 0..4 {
         let asked = places(&line.run(MS(12_000), done));
+        // What found it again may have been another question.
+        let start = asked.iter().position(|place| *place == 0xA0).unwrap();
+        assert!(start <= 1, "round {round}: {asked:02X?}");
         let first = asked.iter().position(|place| *place == 0xA1).unwrap();
-        assert!(asked[..first].iter().all(|place| *place == 0xA0), "round {round}: {asked:02X?}");
+        assert!(asked[start..first].iter().all(|place| *place == 0xA0), "round {round}: {asked:02X?}");
         assert_eq!((asked[first + 1], asked.len() > 1_000), (0x20, true), "the command, then polls");
         // It is away, and comes back at another moment in each round.
         line.run(MS(700 + round * 333), |request| if request[0] == 4 { None } else { done(request) });
@@ -473,6 +495,7 @@ fn what_is_asked_at_the_start_waits_until_its_values_are_fresh() {
         let port = talking(&mut cell, &[lamp, poll]);
         cell.last_recipe().on_stale = OnStale::Stop;
         cell.last_port().stale_after = MS(200);
+        cell.last_port().absent = MS(500);
         let mut line = Line::new(&cell, port);
         let done = |request: &[u8]| {
             let reply = if request[1] == 16 { with_crc(&request[..6]) } else { registers(4, &[1]) };

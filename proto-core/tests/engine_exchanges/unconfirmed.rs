@@ -28,7 +28,7 @@ fn command(cell: &mut Cell, when: AskWhen) -> Exchange {
     let field =
         FieldSpec::DeviceOutput { encoding, overflow: Overflow::Usual, from: from("WordOutputReg[1]") };
     let request = frame(cell, b"C", vec![field]);
-    Exchange::new(1, Talk::Frames { request, reply: None, refusal: None }, when)
+    never_late(Exchange::new(1, Talk::Frames { request, reply: None, refusal: None }, when))
 }
 
 /// A letter alone, confirmed with the same small letter or not at all.
@@ -38,7 +38,7 @@ fn letter(cell: &mut Cell, letter: u8, is_answered: bool, when: AskWhen) -> Exch
     let request = frame(cell, &[], fixed(letter));
     let small = fixed(letter.to_ascii_lowercase());
     let reply = is_answered.then(|| frame(cell, &[], small)).flatten();
-    Exchange::new(1, Talk::Frames { request, reply, refusal: None }, when)
+    never_late(Exchange::new(1, Talk::Frames { request, reply, refusal: None }, when))
 }
 
 /// A gripper that takes commands, and is asked for its position each 100 ms.
@@ -47,6 +47,7 @@ fn gripper(when: AskWhen) -> Line {
     let commands = command(&mut cell, when);
     let position = letter(&mut cell, b'Q', true, AskWhen::every(MS(100)));
     let port = talking(&mut cell, &[commands, position]);
+    cell.last_port().absent = MS(1_000);
     let mut line = Line::new(&cell, port);
     set(&mut line, 1);
     line
@@ -115,14 +116,14 @@ fn what_comes_first_at_the_start_comes_first_when_the_device_is_back() {
         letter(&mut cell, b'Q', true, AskWhen::every(MS(100))),
     ];
     let port = talking(&mut cell, &table);
+    cell.last_port().absent = MS(1_000);
     let mut line = Line::new(&cell, port);
     let letters = |told: Vec<Vec<u8>>| told.iter().map(|request| request[0]).collect::<Vec<_>>();
     assert_eq!(letters(told(&mut line, MS(250), true))[..4], *b"RSTQ");
     let silent = letters(told(&mut line, MS(3_000), false));
-    let probes = silent.iter().skip_while(|letter| **letter == b'Q').collect::<Vec<_>>();
-    assert!(probes.len() > 2 && probes.iter().all(|letter| **letter == b'S'), "{silent:?}");
+    assert!(silent.len() > 2 && silent.iter().all(|letter| *letter == b'Q'), "{silent:?}");
     let back = letters(told(&mut line, MS(12_000), true));
-    assert_eq!(back[..5], *b"SRSTQ", "{back:?}");
+    assert_eq!(back[..5], *b"QRSTQ", "{back:?}");
     assert!(back[5..].iter().all(|letter| *letter == b'Q'), "{back:?}");
 }
 

@@ -57,7 +57,7 @@ fn settings(baud: u32, parity: Parity, stop_bits: u8) -> Rs485 {
         stop_bits,
         idle_gap: CoreDuration::ZERO,
         turnaround: CoreDuration::ZERO,
-        echo: false,
+        echo: proto_core::config::Echo::No,
     }
 }
 

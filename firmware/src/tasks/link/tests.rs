@@ -219,7 +219,7 @@ fn rs485() -> Bus {
         stop_bits: 1,
         idle_gap: CoreDuration::from_millis(50),
         turnaround: CoreDuration::ZERO,
-        echo: false,
+        echo: proto_core::config::Echo::No,
     })
 }
 

@@ -3,10 +3,10 @@
 //! In: the tables of a gateway file's recipe. Out: [`FileExchange`]s, whose frames were laid out. The
 //! frames here are a device's own; those of Modbus are in `modbus`.
 
-use proto_core::config::{AskWhen, DEFAULT_REPLY_TIMEOUT, ExchangeError, ExchangeKey};
+use proto_core::config::{AskWhen, DEFAULT_REPLY_TIMEOUT, ExchangeError, ExchangeKey, OutcomeTo, Port};
 use proto_core::device::{Boundary, Carrier};
 use proto_core::recipe::model::{Mode, Rules};
-use proto_core::sysvar::Direction;
+use proto_core::sysvar::{Direction, SysVar};
 use proto_core::time::Duration;
 use proto_core::wire::can::CanId;
 
@@ -34,6 +34,8 @@ pub(super) struct FileExchange {
     pub(super) is_can: bool,
     /// The request is a remote frame on CAN.
     pub(super) remote: bool,
+    /// When the values of its reply are overdue.
+    pub(super) overdue: Option<Duration>,
     pub(super) timing: AskTiming,
 }
 
@@ -41,12 +43,29 @@ pub(super) struct FileExchange {
 pub(super) struct AskTiming {
     pub(super) when: AskWhen,
     pub(super) timeout: Duration,
-    pub(super) retries: u8,
+    pub(super) retries: Option<u8>,
     pub(super) pause: Duration,
+    pub(super) trigger: Option<Duration>,
+    pub(super) late: Option<Duration>,
+    pub(super) stop: bool,
+    pub(super) follow: Option<u8>,
+    pub(super) outcome: OutcomeTo,
 }
 
 /// The keys of [`AskTiming`].
-const TIMING_KEYS: [&str; 5] = ["every_ms", "on", "timeout_ms", "retries", "pause_ms"];
+const TIMING_KEYS: [&str; 11] = [
+    "every_ms",
+    "on",
+    "timeout_ms",
+    "retries",
+    "pause_ms",
+    "trigger_ms",
+    "late_ms",
+    "stop",
+    "name",
+    "follow",
+    "outcome",
+];
 
 /// The exchanges of a stream or CAN recipe.
 pub(super) fn read_all(recipe: &Reader<'_>, mode: Mode, is_can: bool) -> Result<Vec<FileExchange>> {
@@ -55,10 +74,31 @@ pub(super) fn read_all(recipe: &Reader<'_>, mode: Mode, is_can: bool) -> Result<
         let first = tables.first().map(|table| table.error(ExchangeError::NeedsUser));
         return Err(first.unwrap_or_else(|| item.error(ExchangeError::NeedsUser)));
     }
-    tables.iter().map(|table| read(table, is_can)).collect()
+    let names = names(&tables)?;
+    tables.iter().map(|table| read(table, is_can, &names)).collect()
 }
 
-fn read(table: &Reader<'_>, is_can: bool) -> Result<FileExchange> {
+/// The names of exchanges, `None` for those without one.
+pub(super) fn names(tables: &[Reader<'_>]) -> Result<Vec<Option<String>>> {
+    let mut names: Vec<Option<String>> = Vec::new();
+    for table in tables {
+        let Some(item) = table.optional(exchange::NAME.name) else {
+            names.push(None);
+            continue;
+        };
+        let name = item.string()?;
+        if names.iter().flatten().any(|before| before == name) {
+            return Err(item.error(format!("another exchange of the recipe is called {name:?}")));
+        }
+        if !(1..=32).contains(&name.len()) {
+            return Err(item.error("a name has 1 to 32 bytes"));
+        }
+        names.push(Some(name.to_owned()));
+    }
+    Ok(names)
+}
+
+fn read(table: &Reader<'_>, is_can: bool, names: &[Option<String>]) -> Result<FileExchange> {
     table.check(if is_can { &exchange::OF_CAN } else { &exchange::OF_STREAM })?;
     let peer = table.integer_or(&exchange::PEER)?;
     let frame = |key, direction| {
@@ -74,11 +114,15 @@ fn read(table: &Reader<'_>, is_can: bool) -> Result<FileExchange> {
         }
         (None, ..) => refuse(table, &TIMING_KEYS, "there is no request to send; allowed: reply, peer")?,
         (Some(_), None, _) => {
-            refuse(table, &["timeout_ms", "retries"], "there is no reply to wait for")?;
+            refuse(table, &["timeout_ms", "retries", "late_ms", "stop"], "there is no reply to wait for")?;
         }
         _ => {}
     }
-    let timing = AskTiming::read(table)?;
+    let timing = AskTiming::read(table, names)?;
+    let overdue = match table.optional("reply") {
+        Some(reply) => read_overdue(&reply.any_table()?, "timeout_ms")?,
+        None => None,
+    };
     if request.is_some() {
         timing.check_asked(table)?;
     }
@@ -107,8 +151,24 @@ fn read(table: &Reader<'_>, is_can: bool) -> Result<FileExchange> {
         refusal,
         is_can,
         remote,
+        overdue,
         timing,
     })
+}
+
+/// When the values of a reply are overdue.
+pub(super) fn read_overdue(table: &Reader<'_>, key: &str) -> Result<Option<Duration>> {
+    let own = table.optional(key);
+    let Some(item) = table.optional(exchange::EXPECT.name) else {
+        return own.map(|own| own.time(&exchange::OVERDUE)).transpose();
+    };
+    item.choice(&exchange::EXPECTATIONS)?;
+    match own {
+        Some(own) => {
+            Err(own.error("a reply that is expected as an event is never overdue; remove one of the two"))
+        }
+        None => Ok(Some(Port::NEVER)),
+    }
 }
 
 /// The places of all keys of an exchange; that of the exchange for keys that it does not have.
@@ -118,6 +178,12 @@ pub(super) fn spots(table: &Reader<'_>, own: &[(&str, ExchangeKey)]) -> Vec<(Exc
         ("on", ExchangeKey::Rising),
         ("timeout_ms", ExchangeKey::Timeout),
         ("pause_ms", ExchangeKey::Pause),
+        ("trigger_ms", ExchangeKey::Trigger),
+        ("late_ms", ExchangeKey::Late),
+        ("stop", ExchangeKey::Stop),
+        ("follow", ExchangeKey::Follow),
+        ("outcome", ExchangeKey::Outcome),
+        ("overdue_ms", ExchangeKey::Overdue),
     ];
     let spot = |key| table.optional(key).map_or(table.spot.clone(), |item| item.spot);
     let keys = own.iter().copied().chain(timing).map(|(name, key)| (key, spot(name)));
@@ -131,8 +197,10 @@ fn read_frame(item: &Item<'_>, key: &str, direction: Direction, is_can: bool) ->
     let recipe = if is_can { "a CAN recipe" } else { "a stream recipe" };
     let keys = match (is_can, is_request) {
         (true, true) => &exchange::CAN_REQUEST,
+        (true, false) if key == "refusal" => &exchange::CAN_REFUSAL,
         (true, false) => &exchange::CAN_REPLY,
         (false, true) => &exchange::STREAM_REQUEST,
+        (false, false) if key == "refusal" => &exchange::STREAM_REFUSAL,
         (false, false) => &exchange::STREAM_REPLY,
     };
     table.check_keys(&[keys.common, OF_FRAME], &format!(" of a {key} in {recipe}"))?;
@@ -203,10 +271,20 @@ impl FileFrame {
 
 impl AskTiming {
     /// Of what is never asked.
-    pub(super) const NEVER: Self =
-        Self { when: AskWhen::NEVER, timeout: DEFAULT_REPLY_TIMEOUT, retries: 1, pause: Duration::ZERO };
+    pub(super) const NEVER: Self = Self {
+        when: AskWhen::NEVER,
+        timeout: DEFAULT_REPLY_TIMEOUT,
+        retries: None,
+        pause: Duration::ZERO,
+        trigger: None,
+        late: None,
+        stop: false,
+        follow: None,
+        outcome: OutcomeTo::NONE,
+    };
 
-    pub(super) fn read(table: &Reader<'_>) -> Result<Self> {
+    /// `names` are those of all exchanges of the recipe.
+    pub(super) fn read(table: &Reader<'_>, names: &[Option<String>]) -> Result<Self> {
         let mut when = AskWhen { every: table.time(&exchange::EVERY)?, ..AskWhen::NEVER };
         if let Some(on) = table.optional("on") {
             let list = on.array("such as [\"start\", \"change\"]")?;
@@ -220,15 +298,52 @@ impl AskTiming {
         Ok(Self {
             when,
             timeout: table.time_or(&exchange::TIMEOUT)?,
-            retries: table.integer_or(&exchange::RETRIES)?,
+            retries: table.integer(&exchange::RETRIES)?,
             pause: table.time_or(&exchange::PAUSE)?,
+            trigger: table.time(&exchange::TRIGGER)?,
+            late: table.time(&exchange::LATE)?,
+            stop: table.flag(&exchange::STOP)?,
+            follow: table.optional("follow").map(|item| read_follow(&item, names)).transpose()?,
+            outcome: table.optional("outcome").map_or(Ok(OutcomeTo::NONE), |item| read_outcome(&item))?,
         })
     }
 
     /// Refuses a request that is never sent.
     pub(super) fn check_asked(&self, table: &Reader<'_>) -> Result<()> {
-        if self.when.is_never() { Err(table.error(ExchangeError::Never)) } else { Ok(()) }
+        if self.when.is_never() && self.follow.is_none() {
+            Err(table.error(ExchangeError::Never))
+        } else {
+            Ok(())
+        }
     }
+}
+
+/// The number of the exchange with a name.
+fn read_follow(item: &Item<'_>, names: &[Option<String>]) -> Result<u8> {
+    let name = item.string()?;
+    let nth = names.iter().position(|other| other.as_deref() == Some(name));
+    nth.and_then(|nth| u8::try_from(nth).ok()).ok_or_else(|| {
+        let known: Vec<_> = names.iter().flatten().map(|name| format!("{name:?}")).collect();
+        let known =
+            if known.is_empty() { "none of the recipe has a name".to_owned() } else { known.join(", ") };
+        item.error(format!("there is no exchange {name:?}; allowed: {known}"))
+    })
+}
+
+/// The variables that tell what became of events.
+fn read_outcome(item: &Item<'_>) -> Result<OutcomeTo> {
+    let table = item.table(&exchange::OUTCOME_TABLE)?;
+    let variable = |key| -> Result<Option<SysVar>> {
+        let Some(item) = table.optional(key) else { return Ok(None) };
+        let text = item.string()?;
+        SysVar::parse(text).map(Some).map_err(|error| item.error(format!("{text:?}: {error}")))
+    };
+    let outcome =
+        OutcomeTo { to: variable("to")?, code_to: variable("code_to")?, count_to: variable("count_to")? };
+    if outcome == OutcomeTo::NONE {
+        return Err(item.error("empty; allowed: to, code_to, count_to"));
+    }
+    Ok(outcome)
 }
 
 /// One entry of `on`.

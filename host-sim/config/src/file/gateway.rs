@@ -6,7 +6,7 @@ use std::collections::HashMap;
 
 use heapless::Vec as Bounded;
 use proto_core::config::{
-    Bus, CanFramePart, CommandEntry, ConfigError, ControllerKey, ControllerLink, Delimiter, FieldSpec,
+    Bus, CanFramePart, CommandEntry, ConfigError, ControllerKey, ControllerLink, Delimiter, Echo, FieldSpec,
     GatewayConfig, InputBinding, MAX_ADDRESS, MAX_ALL_FIELDS, MAX_COMMAND_TEXT, MAX_COMMANDS, MAX_LISTEN,
     MAX_PORTS, MAX_RECIPES, MAX_SAFE_VALUES, NetworkKey, Parts, Place, Port, PortKey, Recipe, RecipeKey,
     RecipeLink, SafeValue, Span, StreamPart, check_address, check_bit,
@@ -27,7 +27,8 @@ use super::recipes::{self, FileField, FileRecipe, Flavour, RecipeKind};
 use super::sources;
 use crate::keys;
 use crate::keys::gateway::{
-    COMMAND, ECHO, LINK_UDP, MODBUS, REFRESH, SAFE_AT_START, STALE_AFTER, STATE, TIMEOUT, UDP2011,
+    ABSENT, COMMAND, ECHO, ECHOES, LINK_UDP, MODBUS, REFRESH, SAFE_AT_START, STALE_AFTER, STATE, TIMEOUT,
+    UDP2011,
 };
 
 /// Reads the whole file and checks it.
@@ -304,6 +305,7 @@ impl<'a> Builder<'a> {
         port.on_timeout = self.add_safe_values(table)?;
         port.safe_at_start = table.flag(&SAFE_AT_START)?;
         port.refresh = table.time(&REFRESH)?;
+        port.absent = table.time_or(&ABSENT)?;
         if let Some(item) = table.optional("health") {
             port.health = sources::read_health(&item)?;
         }
@@ -456,7 +458,14 @@ fn read_bus(table: &Reader<'_>, kind: BusKind) -> Result<Bus> {
                 BusKind::Rs485 => read_line(table)?,
                 _ => read_rtu_line(table, kind == BusKind::ModbusMaster)?,
             };
-            line.echo = table.flag(&ECHO)?;
+            line.echo = match table.optional(ECHO.name) {
+                None => Echo::Auto,
+                Some(item) => match item.as_bool() {
+                    Some(true) => Echo::Yes,
+                    Some(false) => Echo::No,
+                    None => item.choice(&ECHOES)?,
+                },
+            };
             Bus::Rs485(line)
         }
         BusKind::Can => Bus::Can { bitrate: read_bitrate(table)? },

@@ -86,7 +86,8 @@ pub(super) fn read_master(recipe: &Reader<'_>) -> Result<Vec<FileExchange>> {
     if exchanges.is_empty() {
         return Err(recipe.error("a recipe of a Modbus master needs an exchange, [[recipe.exchange]]"));
     }
-    exchanges.iter().map(read_exchange).collect()
+    let names = exchanges::names(&exchanges)?;
+    exchanges.iter().map(|table| read_exchange(table, &names)).collect()
 }
 
 /// The blocks of a slave.
@@ -100,7 +101,7 @@ pub(super) fn read_slave(recipe: &Reader<'_>) -> Result<Vec<FileExchange>> {
     blocks.iter().map(|block| read_block(block, address)).collect()
 }
 
-fn read_exchange(table: &Reader<'_>) -> Result<FileExchange> {
+fn read_exchange(table: &Reader<'_>, names: &[Option<String>]) -> Result<FileExchange> {
     let all = keys::names(exchange::OF_MODBUS.keys());
     table.check_names(&all, exchange::OF_MODBUS.place, |_| false)?;
     let slave = table.required("slave", "the slave's address, 1..=247, or 0 to write to all of them")?;
@@ -131,7 +132,11 @@ fn read_exchange(table: &Reader<'_>) -> Result<FileExchange> {
         return Err(slave.error(ExchangeError::BroadcastRead));
     }
     if peer == BROADCAST {
-        refuse(table, &["timeout_ms", "retries"], "nobody answers what is written to all slaves")?;
+        refuse(
+            table,
+            &["timeout_ms", "retries", "late_ms", "stop"],
+            "nobody answers what is written to all slaves",
+        )?;
     }
     let count = |list: &Option<List<'_>>| list.as_ref().map_or(0, |list| list.count);
     if matches!(function, Function::WriteCoil | Function::WriteRegister) && count(&write) != 1 {
@@ -146,7 +151,11 @@ fn read_exchange(table: &Reader<'_>) -> Result<FileExchange> {
     }
     let operation = function.operation((first, count(&read)), (write_first, count(&write)));
     check(table, &operation, &read, &write)?;
-    let timing = AskTiming::read(table)?;
+    let timing = AskTiming::read(table, names)?;
+    if !function.reads() {
+        refuse(table, &["expect", "overdue_ms"], "this function writes only; its reply has no values")?;
+    }
+    let overdue = exchanges::read_overdue(table, "overdue_ms")?;
     timing.check_asked(table)?;
     let spots = exchanges::spots(table, &[("slave", ExchangeKey::Peer), ("address", ExchangeKey::Registers)]);
     Ok(FileExchange {
@@ -159,6 +168,7 @@ fn read_exchange(table: &Reader<'_>) -> Result<FileExchange> {
         refusal: None,
         is_can: false,
         remote: false,
+        overdue,
         timing,
     })
 }
@@ -199,6 +209,7 @@ fn read_block(table: &Reader<'_>, peer: u8) -> Result<FileExchange> {
         refusal: None,
         is_can: false,
         remote: false,
+        overdue: None,
         timing: AskTiming::NEVER,
     })
 }

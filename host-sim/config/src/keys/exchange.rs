@@ -18,21 +18,76 @@ pub const ON: Key = Key::new(
     Shape::List(&Shape::Text(Text::Pattern("^(start|change|rising:.+)$")), 1, usize::MAX),
 )
 .tells(
-    "`\"start\"`: asked at the start, and each time that the device has come back; `\"change\"`: when a value of the \
-     request has changed; `\"rising:BitOutputReg[3].0\"`: when this bit goes from 0 to 1. The last two are looked at \
-     each `cycle_ms`",
+    "`\"start\"`: asked at the start, and again when the device has started anew; `\"change\"`: when a value of the \
+     request has changed, looked at each `cycle_ms`; `\"rising:BitOutputReg[3].0\"`: when this bit goes from 0 to 1, an \
+     event that is sent once and in time, or not at all",
 );
 /// How long a reply may take.
 pub const TIMEOUT: Key = Key::millis("timeout_ms", Limits::AboveZero(HOUR_MS))
     .or(100)
     .is("from the end of the request to the end of the reply");
 /// How often a request is repeated.
-pub const RETRIES: Key =
-    Key::integer("retries", 0, 255).or(1).is("how often a request without a good reply is repeated at once");
+pub const RETRIES: Key = Key::integer("retries", 0, 255).absent("1; of an event 0").is(
+    "how often a request without a good reply is repeated at once. An event, or what is only asked at the start, may be \
+     carried out twice by a device when it is repeated",
+);
+/// How long after an event it may be sent.
+pub const TRIGGER: Key = Key::millis("trigger_ms", Limits::AboveZero(10_000.0))
+    .absent("`timeout_ms` of the port, at most 1000")
+    .is("how long after an event its request may still be sent");
+/// How late a reply may come.
+pub const LATE: Key = Key::millis("late_ms", Limits::Within(0.0, HOUR_MS))
+    .absent("3 × `timeout_ms`, at least 1000")
+    .is("how long after its request a reply may come. Until then nothing is asked of the device whose reply could be \
+         taken for it");
+/// It stops the device.
+pub const STOP: Key = Key::bool("stop").tells(
+    "`true`: it stops the device. It goes before everything else on the line, cancels the device's events that wait, \
+     and is repeated until it is confirmed",
+);
+/// What other exchanges call it.
+pub const NAME: Key =
+    Key::text_of("name", Text::Length(1, 32)).absent("none").is("what `follow` of another exchange calls it");
+/// The exchange before it.
+pub const FOLLOW: Key = Key::text_of("follow", Text::Length(1, 32)).absent("none").is(
+    "the name of an exchange of the recipe: this one is sent after each good answer to that one, as an event",
+);
+/// Where the outcome of an event goes.
+pub const OUTCOME_TABLE: Table = Table::of(
+    "outcome",
+    &[
+        Key::text_of("to", Text::Variable)
+            .is("becomes what the newest event came to, as a number; see below"),
+        Key::text_of("code_to", Text::Variable)
+            .is("becomes the code with which the device refused it, such as a Modbus exception, or 0"),
+        Key::text_of("count_to", Text::Variable).is("the number of events that have ended, wrapping"),
+    ],
+);
+/// What the robot is told of events.
+pub const OUTCOME: Key = Key::new("outcome", Shape::Table(&OUTCOME_TABLE)).absent("none").tells(
+    "variables that tell the robot what became of an event: `{ to = \"WordInputReg[20]\", code_to = ..., count_to = ... \
+     }`; `WordInputReg` and `FloatInputReg` only. The port owns them",
+);
+/// Whether the reply comes steadily.
+pub const EXPECT: Key = Key::words("expect", words!(EXPECTATIONS)).absent("steadily").tells(
+    "`\"event\"`: it comes only when something happens; its values hold, and the port is not silent without it",
+);
+/// When the values of a reply are overdue.
+pub const OVERDUE: Key = Key::millis("overdue_ms", Limits::AboveZero(HOUR_MS))
+    .absent("`timeout_ms` of the port")
+    .is("after this time without a good reply its variables take their safe values");
+const REPLY_TIMEOUT: Key = Key::millis("timeout_ms", Limits::AboveZero(HOUR_MS))
+    .absent("`timeout_ms` of the port")
+    .is("of a reply: after this time without a good one its variables take their safe values");
+/// The words of `expect`.
+pub(crate) const EXPECTATIONS: [(&str, ()); 1] = [("event", ())];
 /// The rest behind it.
 pub const PAUSE: Key =
     Key::millis("pause_ms", Limits::Within(0.0, 10_000.0)).or(0).is("how long the line rests after it");
-pub(crate) const TIMING: &[Key] = &[EVERY, ON, TIMEOUT, RETRIES, PAUSE];
+pub(crate) const TIMING: &[Key] =
+    &[EVERY, ON, TIMEOUT, RETRIES, PAUSE, TRIGGER, LATE, STOP, NAME, FOLLOW, OUTCOME];
+/// Of a reply of Modbus, which has no table of its own.
+pub(crate) const OF_REPLY: &[Key] = &[EXPECT, OVERDUE];
 const ASKED: &[&str] = &["request"];
 const TIMING_OF_FRAMES: &[Key] = &[
     EVERY.beside(ASKED),
@@ -40,6 +95,12 @@ const TIMING_OF_FRAMES: &[Key] = &[
     TIMEOUT.beside(ASKED),
     RETRIES.beside(ASKED),
     PAUSE.beside(ASKED),
+    TRIGGER.beside(ASKED),
+    LATE.beside(ASKED),
+    STOP.beside(ASKED),
+    NAME.beside(ASKED),
+    FOLLOW.beside(ASKED),
+    OUTCOME.beside(ASKED),
 ];
 
 const fn request(table: &'static Table) -> Key {
@@ -63,25 +124,28 @@ pub const REMOTE: Key = Key::bool("remote").tells("of a request on CAN: it has n
 const SENT_FIELDS: Key = Key { need: Need::Absent("none"), ..OUTPUT_FIELDS };
 
 pub(crate) const STREAM_REQUEST: Table = frame("stream request", &[HEAD, TAIL, OUTPUT_FIELDS]);
-pub(crate) const STREAM_REPLY: Table = frame("stream reply", &[HEAD, TAIL, INPUT_FIELDS]);
+pub(crate) const STREAM_REPLY: Table =
+    frame("stream reply", &[HEAD, TAIL, INPUT_FIELDS, REPLY_TIMEOUT, EXPECT]);
 pub(crate) const CAN_REQUEST: Table = frame("CAN request", &[ID, EXTENDED, SENT_FIELDS, REMOTE]);
-pub(crate) const CAN_REPLY: Table = frame("CAN reply", &[ID, EXTENDED, INPUT_FIELDS]);
+pub(crate) const CAN_REPLY: Table = frame("CAN reply", &[ID, EXTENDED, INPUT_FIELDS, REPLY_TIMEOUT, EXPECT]);
+pub(crate) const STREAM_REFUSAL: Table = frame("stream refusal", &[HEAD, TAIL, INPUT_FIELDS]);
+pub(crate) const CAN_REFUSAL: Table = frame("CAN refusal", &[ID, EXTENDED, INPUT_FIELDS]);
 
 const fn frame(name: &'static str, keys: &'static [Key]) -> Table {
     Table::of(name, keys).cases(&[Case { when: &[], keys: &[OF_FRAME] }])
 }
 
 /// The frames of an exchange.
-pub(crate) const FRAMES: &[Key] = &[request(&STREAM_REQUEST), reply(&STREAM_REPLY), refusal(&STREAM_REPLY)];
+pub(crate) const FRAMES: &[Key] = &[request(&STREAM_REQUEST), reply(&STREAM_REPLY), refusal(&STREAM_REFUSAL)];
 
 /// An exchange of frames on a line.
 pub const OF_STREAM: Table =
-    Table::of("exchange", &[PEER, request(&STREAM_REQUEST), reply(&STREAM_REPLY), refusal(&STREAM_REPLY)])
+    Table::of("exchange", &[PEER, request(&STREAM_REQUEST), reply(&STREAM_REPLY), refusal(&STREAM_REFUSAL)])
         .at(" of an exchange")
         .cases(&[Case { when: &[], keys: &[TIMING_OF_FRAMES] }]);
 /// An exchange of frames on CAN.
 pub const OF_CAN: Table =
-    Table::of("exchange on CAN", &[PEER, request(&CAN_REQUEST), reply(&CAN_REPLY), refusal(&CAN_REPLY)])
+    Table::of("exchange on CAN", &[PEER, request(&CAN_REQUEST), reply(&CAN_REPLY), refusal(&CAN_REFUSAL)])
         .at(" of an exchange")
         .cases(&[Case { when: &[], keys: &[TIMING_OF_FRAMES] }]);
 
@@ -126,11 +190,11 @@ pub const OF_MODBUS: Table =
     Table::of("exchange of Modbus", &[SLAVE, FUNCTION, ADDRESS]).at(" of an exchange of Modbus").cases(&[
         Case {
             when: &[When::Is("function", &["read-write-registers"], &[23])],
-            keys: &[&[WRITE_ADDRESS, WORD_ORDER_OF_REGISTERS, READ, WRITE], TIMING],
+            keys: &[&[WRITE_ADDRESS, WORD_ORDER_OF_REGISTERS, READ, WRITE], TIMING, OF_REPLY],
         },
         Case {
             when: &[When::Is("function", &["read-holding-registers", "read-input-registers"], &[3, 4])],
-            keys: &[&[WORD_ORDER_OF_REGISTERS, READ], TIMING],
+            keys: &[&[WORD_ORDER_OF_REGISTERS, READ], TIMING, OF_REPLY],
         },
         Case {
             when: &[When::Is("function", &["write-register", "write-registers"], &[6, 16])],
@@ -138,7 +202,7 @@ pub const OF_MODBUS: Table =
         },
         Case {
             when: &[When::Is("function", &["read-coils", "read-discrete-inputs"], &[1, 2])],
-            keys: &[&[WORD_ORDER_OF_REGISTERS, read(&Shape::Table(&field::COIL_IN))], TIMING],
+            keys: &[&[WORD_ORDER_OF_REGISTERS, read(&Shape::Table(&field::COIL_IN))], TIMING, OF_REPLY],
         },
         Case {
             when: &[When::Is("function", &["write-coil", "write-coils"], &[5, 15])],

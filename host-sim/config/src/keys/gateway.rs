@@ -1,6 +1,6 @@
 //! `[controller]`, `[network]` and `[[port]]` of gateway files.
 
-use proto_core::config::{Bus, MAX_ADDRESS, MAX_LISTEN, PortValue};
+use proto_core::config::{Bus, Echo, MAX_ADDRESS, MAX_LISTEN, PortValue};
 use proto_core::wire::dialect::Dialect;
 
 use super::{Case, HOUR_MS, Key, Limits, Shape, Table, Text, When, words};
@@ -156,9 +156,17 @@ pub const TURNAROUND: Key =
          19200 bit/s",
     );
 /// Whether the adapter hears itself.
-pub const ECHO: Key = Key::bool("echo").tells(
+pub const ECHO: Key = Key::new("echo", Shape::Either(&[Shape::Bool, Shape::Words(words!(ECHOES))])).or_word("auto").tells(
     "`true`: the adapter gives back what is sent, as one with two wires does whose receiver is always on. Only with a \
-     recipe of exchanges (`rs485`)",
+     recipe of exchanges. `\"auto\"`: learned from an exchange whose reply differs from its request, each time that the \
+     line is opened; until then a reply that equals its request confirms nothing (`rs485`)",
+);
+/// The words of `echo`.
+pub(crate) const ECHOES: [(&str, Echo); 1] = [("auto", Echo::Auto)];
+/// When a device has started anew.
+pub const ABSENT: Key = Key::millis("absent_ms", Limits::AboveZero(HOUR_MS)).or(3_000).is(
+    "a device of the recipe's exchanges that answered nothing for this long has started anew when it answers again: what \
+     is asked at its start is asked",
 );
 /// Speed of a CAN bus.
 pub const BITRATE: Key =
@@ -171,7 +179,7 @@ pub const LISTEN: Key = Key::text_of("listen", Text::Length(1, MAX_LISTEN))
 /// The keys of a serial line.
 pub(crate) const LINE: &[Key] = &[BAUD, PARITY, STOP_BITS, IDLE_GAP, TURNAROUND];
 /// The keys of a field port, on any bus.
-pub(crate) const FIELD: &[Key] = &[ON_TIMEOUT, SAFE_AT_START, REFRESH, HEALTH];
+pub(crate) const FIELD: &[Key] = &[ON_TIMEOUT, SAFE_AT_START, REFRESH, HEALTH, ABSENT];
 
 /// `[[port]]` of a gateway file.
 pub const PORT: Table = Table::of("port", &[NAME, BUS, RECIPE, CYCLE, TIMEOUT, STALE_AFTER]).cases(&[

@@ -121,7 +121,7 @@ pub(super) fn rs485() -> SimBus {
         stop_bits: 1,
         idle_gap: Duration::from_millis(50),
         turnaround: Duration::from_micros(300),
-        echo: false,
+        echo: proto_core::config::Echo::No,
     })
 }
 

@@ -2,7 +2,7 @@
 //!
 //! In: nothing; others fill it. Out: text, and serde's data model. Its shape is in docs/checking.md.
 
-use proto_core::config::{Parity, PartBudget, Rs485};
+use proto_core::config::{Echo, Parity, PartBudget, Rs485};
 use proto_core::sysvar::Direction;
 use proto_core::time::Duration;
 use recipe_config::file::{FileError, Source};
@@ -94,13 +94,31 @@ pub(super) struct Port {
 #[derive(Debug, Serialize)]
 #[serde(tag = "bus", rename_all = "kebab-case")]
 pub(super) enum Bus {
-    Rs485 { baud: u32, parity: &'static str, stop_bits: u8, echo: bool },
-    Can { bitrate: u32 },
-    TcpListen { address: String },
-    UdpListen { address: String },
-    UdpServer { udp_port: u16 },
-    TcpClient { address: String },
-    UdpClient { address: String },
+    Rs485 {
+        baud: u32,
+        parity: &'static str,
+        stop_bits: u8,
+        #[serde(serialize_with = "echo_setting")]
+        echo: Echo,
+    },
+    Can {
+        bitrate: u32,
+    },
+    TcpListen {
+        address: String,
+    },
+    UdpListen {
+        address: String,
+    },
+    UdpServer {
+        udp_port: u16,
+    },
+    TcpClient {
+        address: String,
+    },
+    UdpClient {
+        address: String,
+    },
 }
 
 /// A part of a port's recipe.
@@ -220,6 +238,15 @@ impl Refusal {
     }
 }
 
+/// As the file has it: `true`, `false` or `"auto"`.
+fn echo_setting<S: serde::Serializer>(echo: &Echo, to: S) -> Result<S::Ok, S::Error> {
+    match echo {
+        Echo::No => to.serialize_bool(false),
+        Echo::Yes => to.serialize_bool(true),
+        Echo::Auto => to.serialize_str("auto"),
+    }
+}
+
 fn millis<S: serde::Serializer>(time: &Duration, to: S) -> Result<S::Ok, S::Error> {
     to.serialize_f64(time.as_micros() as f64 / 1e3)
 }
@@ -242,7 +269,7 @@ impl Bus {
         match self {
             Self::Rs485 { baud, parity, stop_bits, echo } => {
                 let parity = parity.chars().next().unwrap_or(' ').to_ascii_uppercase();
-                let echo = if *echo { ", with echo" } else { "" };
+                let echo = if *echo == Echo::Yes { ", with echo" } else { "" };
                 format!("rs485, {baud} baud 8{parity}{stop_bits}{echo}")
             }
             Self::Can { bitrate } => format!("can, {bitrate} bit/s"),

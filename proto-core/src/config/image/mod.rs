@@ -16,6 +16,7 @@ mod scan;
 mod v1;
 mod v2;
 mod v3;
+mod v4;
 
 pub use scan::Scan;
 
@@ -32,7 +33,7 @@ use super::{ConfigError, ConfigMut, ConfigView, GatewayConfig};
 /// The first bytes of every image.
 pub const MAGIC: [u8; 4] = *b"RGCI";
 /// The version of the payload: one more for every change of a serialized type.
-pub const VERSION: u32 = 3;
+pub const VERSION: u32 = 4;
 /// The oldest version that is read.
 pub const OLDEST_VERSION: u32 = 1;
 /// Length of the header: magic, version, payload length and CRC-32, four bytes each, little-endian.
@@ -177,7 +178,7 @@ pub fn encode<'c>(config: impl Into<ConfigView<'c>>, out: &mut [u8]) -> Result<u
 fn encode_view(config: ConfigView<'_>, out: &mut [u8]) -> Result<usize, NoSpace> {
     let no_space = NoSpace { available: out.len() };
     let (header, room) = out.split_at_mut_checked(HEADER).ok_or(no_space)?;
-    let payload = v3::write(config, room).map_err(|_| no_space)?;
+    let payload = v4::write(config, room).map_err(|_| no_space)?;
     let length = u32::try_from(payload.len()).map_err(|_| no_space)?;
     let crc = checksum(VERSION, length, payload);
     let words = [u32::from_le_bytes(MAGIC), VERSION, length, crc];
@@ -239,7 +240,8 @@ fn read_head(version: u32, rest: &mut &[u8], config: &mut ConfigMut<'_>) -> Resu
     match version {
         1 => v1::read_head(rest, config),
         2 => v2::read_head(rest, config),
-        _ => v3::read_head(rest, config),
+        3 => v3::read_head(rest, config),
+        _ => v4::read_head(rest, config),
     }
 }
 
@@ -247,7 +249,7 @@ fn read_head(version: u32, rest: &mut &[u8], config: &mut ConfigMut<'_>) -> Resu
 const fn lists(version: u32) -> &'static [Counted] {
     match version {
         1 | 2 => &v2::LISTS,
-        _ => &v3::LISTS,
+        _ => &v4::LISTS,
     }
 }
 
@@ -270,7 +272,8 @@ fn read_entries(
 ) -> Result<(), ImageError> {
     match version {
         1 | 2 => v2::read_entries(list, count, rest, config),
-        _ => v3::read_entries(list, count, rest, config),
+        3 => v3::read_entries(list, count, rest, config),
+        _ => v4::read_entries(list, count, rest, config),
     }
 }
 

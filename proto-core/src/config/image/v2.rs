@@ -350,7 +350,7 @@ struct Rs485 {
 
 impl From<Rs485> for config::Rs485 {
     fn from(Rs485 { baud, parity, stop_bits, idle_gap, turnaround }: Rs485) -> Self {
-        Self { baud, parity: parity.into(), stop_bits, idle_gap, turnaround, echo: false }
+        Self { baud, parity: parity.into(), stop_bits, idle_gap, turnaround, echo: config::Echo::No }
     }
 }
 

@@ -1,55 +1,19 @@
-//! Version 3, the newest: the configuration's own types, as postcard writes them one after the other.
+//! Version 3: before events of exchanges. Frozen: what it reads never changes.
 //!
-//! A change of one of these types raises the version, and leaves a copy of the old type here.
+//! Exchanges and ports as they were then, each with `From` into today's; what else the lists have is that of today.
 
-use serde::Serialize;
+use serde::Deserialize;
 
-use super::{ConfigMut, ConfigView, ImageError, item, items};
+use super::{ConfigMut, ImageError, item, items, v4};
 use crate::config::error::Counted;
-use crate::config::{
-    BoardAddress, CommandEntry, ControllerLink, Exchange, FieldSpec, FrameSpec, Port, Recipe, SafeValue,
-};
-
-/// A whole configuration, borrowed. Postcard writes a struct as its fields, and a list as its length
-/// and its items.
-#[derive(Serialize)]
-struct Payload<'c> {
-    controller: &'c ControllerLink,
-    network: BoardAddress,
-    recipes: &'c [Recipe],
-    ports: &'c [Port],
-    fields: &'c [FieldSpec],
-    commands: &'c [CommandEntry],
-    safe_values: &'c [SafeValue],
-    exchanges: &'c [Exchange],
-    frames: &'c [FrameSpec],
-}
-
-pub(super) fn write<'o>(config: ConfigView<'_>, out: &'o mut [u8]) -> postcard::Result<&'o mut [u8]> {
-    let ConfigView { controller, network, recipes, ports, fields, commands, safe_values, exchanges, frames } =
-        config;
-    let network = network.copied().into();
-    let payload =
-        Payload { controller, network, recipes, ports, fields, commands, safe_values, exchanges, frames };
-    postcard::to_slice(&payload, out)
-}
+use crate::config::{self, AskWhen, Bus, Name, PortHealth, Span, Talk};
+use crate::time::Duration;
 
 pub(super) fn read_head(rest: &mut &[u8], config: &mut ConfigMut<'_>) -> Result<(), ImageError> {
     *config.controller = item(rest)?;
     *config.network = item(rest)?;
     Ok(())
 }
-
-/// The lists of [`Payload`].
-pub(super) static LISTS: [Counted; 7] = [
-    Counted::Recipes,
-    Counted::Ports,
-    Counted::Fields,
-    Counted::Commands,
-    Counted::SafeValues,
-    Counted::Exchanges,
-    Counted::ExchangeFrames,
-];
 
 pub(super) fn read_entries(
     list: Counted,
@@ -58,12 +22,70 @@ pub(super) fn read_entries(
     config: &mut ConfigMut<'_>,
 ) -> Result<(), ImageError> {
     match list {
-        Counted::Recipes => items::<Recipe, _>(rest, count, config.recipes),
         Counted::Ports => items::<Port, _>(rest, count, config.ports),
-        Counted::Fields => items::<FieldSpec, _>(rest, count, config.fields),
-        Counted::Commands => items::<CommandEntry, _>(rest, count, config.commands),
-        Counted::SafeValues => items::<SafeValue, _>(rest, count, config.safe_values),
         Counted::Exchanges => items::<Exchange, _>(rest, count, config.exchanges),
-        _ => items::<FrameSpec, _>(rest, count, config.frames),
+        _ => v4::read_entries(list, count, rest, config),
+    }
+}
+
+#[derive(Deserialize)]
+struct Port {
+    name: Name,
+    bus: Bus,
+    recipe: u8,
+    cycle: Duration,
+    timeout: Duration,
+    on_timeout: Span,
+    stale_after: Duration,
+    health: PortHealth,
+    safe_at_start: bool,
+    refresh: Option<Duration>,
+}
+
+impl From<Port> for config::Port {
+    fn from(old: Port) -> Self {
+        let Port {
+            name,
+            bus,
+            recipe,
+            cycle,
+            timeout,
+            on_timeout,
+            stale_after,
+            health,
+            safe_at_start,
+            refresh,
+        } = old;
+        let absent = Self::ABSENT;
+        Self {
+            name,
+            bus,
+            recipe,
+            cycle,
+            timeout,
+            on_timeout,
+            stale_after,
+            health,
+            safe_at_start,
+            refresh,
+            absent,
+        }
+    }
+}
+
+/// Its repetitions were those of events, too: they are not repeated any more.
+#[derive(Deserialize)]
+struct Exchange {
+    peer: u8,
+    talk: Talk,
+    when: AskWhen,
+    timeout: Duration,
+    retries: u8,
+    pause: Duration,
+}
+
+impl From<Exchange> for config::Exchange {
+    fn from(Exchange { peer, talk, when, timeout, retries, pause }: Exchange) -> Self {
+        Self { timeout, retries, pause, ..Self::new(peer, talk, when) }
     }
 }

@@ -333,6 +333,20 @@ fn behind_count(rest: &mut [u8], len: usize) -> Option<&mut [u8]> {
     Some(data)
 }
 
+impl Operation {
+    /// Whether a good reply to this request can be one to the other, of the same slave. What is written into one
+    /// register or coil is in the reply, and tells two writes with different values apart; here they count as alike.
+    pub(crate) fn is_answered_like(&self, other: &Self) -> bool {
+        if self.function() != other.function() {
+            return false;
+        }
+        match (self.reply_data_len(), other.reply_data_len()) {
+            (Some(one), Some(other)) => one == other,
+            _ => self.head() == other.head(),
+        }
+    }
+}
+
 /// What the reply to a request looks like.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Expected {

@@ -4,7 +4,8 @@
 //! Written from these pages, independent of the engine's exchanges.
 
 use proto_core::config::{
-    Bus, ConfigView, Exchange, FieldSpec, GatewayConfig, OutputBinding, Outside, Port, Recipe, Rs485, Talk,
+    Bus, ConfigView, Echo, Exchange, FieldSpec, GatewayConfig, OutputBinding, Outside, Port, Recipe, Rs485,
+    Talk,
 };
 use proto_core::modbus::rtu::Operation;
 use proto_core::sysvar::SysVar;
@@ -130,7 +131,7 @@ impl TalkSpec {
             all_costs = all_costs + on_line + row.timeout + row.pause + silence;
             rows.push(row);
         }
-        let has_echo = line.is_some_and(|line| line.echo);
+        let has_echo = line.is_some_and(|line| line.echo == Echo::Yes);
         (!rows.is_empty()).then_some(Self { rows, silence, all_costs, has_echo, unasked })
     }
 
@@ -361,7 +362,7 @@ pub(in crate::oracle) fn unmodelled(config: &GatewayConfig) -> Option<&'static s
         let exchanges = config.view().exchanges_of(recipe_of(config.view(), port));
         exchanges.iter().any(|exchange| matches!(exchange.talk, Talk::Served { .. }))
     };
-    let has_echo = |port: &Port| matches!(&port.bus, Bus::Rs485(line) if line.echo);
+    let has_echo = |port: &Port| matches!(&port.bus, Bus::Rs485(line) if line.echo == Echo::Yes);
     if config.ports.iter().filter(serves).any(has_echo) {
         return Some("a soak cannot judge a gateway that is a slave on a line that echoes");
     }

@@ -27,8 +27,15 @@ impl Builder<'_> {
                 talk,
                 when: timing.when,
                 timeout: timing.timeout,
-                retries: timing.retries,
+                retries: timing.retries.unwrap_or(1),
+                event_retries: timing.retries.unwrap_or(0),
                 pause: timing.pause,
+                trigger: timing.trigger,
+                late: timing.late,
+                stop: timing.stop,
+                follow: timing.follow,
+                overdue: exchange.overdue,
+                outcome: timing.outcome,
             };
             if self.config.exchanges.push(added).is_err() {
                 return Err(self.too_many(exchange));
