@@ -2,8 +2,10 @@
 
 use proto_core::config::{AskWhen, Exchange, GatewayConfig, Port};
 use proto_core::device::Carrier;
+use proto_core::engine::{Plan, Source};
 use proto_core::modbus::rtu::{BROADCAST, Operation, Table};
 use proto_core::sysvar::Direction;
+use proto_core::time::Duration;
 use recipe_config::{DeviceRecipe, ExchangeKind, NamedExchange, function_name};
 use serde::Serialize;
 
@@ -26,6 +28,14 @@ pub(super) struct Talk {
     takes_us: u64,
     #[serde(skip_serializing_if = "Option::is_none")]
     without_reply_us: Option<u64>,
+    /// How long behind a request without a reply these exchanges wait, by their numbers.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    late_ms: Option<f64>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    held_back: Vec<usize>,
+    /// The shortest pulse of its bit that is seen for sure.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pulse_ms: Option<f64>,
     /// Of the line, if it has a period.
     #[serde(skip_serializing_if = "Option::is_none")]
     percent: Option<u64>,
@@ -91,6 +101,10 @@ impl Talk {
                 rows: frame::rows(frame, carrier, part),
             });
         }
+        let recipe = config.recipes.get(usize::from(port.recipe));
+        let held = recipe.map_or(0, |recipe| config.view().held_back_by(recipe, exchange));
+        let held_back: Vec<usize> = (1..=64).filter(|nth| held >> (nth - 1) & 1 == 1).collect();
+        let millis = |time: Duration| time.as_micros() as f64 / 1e3;
         let takes_us = budget.time.as_micros();
         let longest = budget.time_without_reply.as_micros();
         Self {
@@ -101,6 +115,9 @@ impl Talk {
             frames,
             takes_us,
             without_reply_us: (longest > takes_us).then_some(longest),
+            late_ms: (!held_back.is_empty()).then(|| millis(exchange.late())),
+            held_back,
+            pulse_ms: shortest_pulse(config, port, exchange).map(millis),
             percent: exchange.when.every.map(|every| (takes_us * 100).div_ceil(every.as_micros().max(1))),
         }
     }
@@ -118,6 +135,17 @@ impl Talk {
             lost.unwrap_or_default(),
             own.unwrap_or_default()
         );
+        if let Some(late) = self.late_ms.filter(|late| *late > 0.0) {
+            let numbers: Vec<_> = self.held_back.iter().map(usize::to_string).collect();
+            let others = if numbers.len() == 1 { "exchange" } else { "exchanges" };
+            report += &format!(
+                "    a reply that does not come holds {others} {} back for {late} ms\n",
+                numbers.join(", ")
+            );
+        }
+        if let Some(pulse) = self.pulse_ms {
+            report += &format!("    a pulse of {pulse} ms or more is seen for sure\n");
+        }
         report
     }
 }
@@ -186,6 +214,19 @@ fn times(exchange: &Exchange, named: &NamedExchange) -> String {
         _ if times.is_empty() => "comes unasked".to_owned(),
         _ => times.join(", "),
     }
+}
+
+/// The shortest pulse of the bit of an exchange that is read as 1, whenever it comes: two readings, of which one may be
+/// a little late. Not of a bit that another device sends.
+fn shortest_pulse(config: &GatewayConfig, port: &Port, exchange: &Exchange) -> Option<Duration> {
+    let (var, _) = exchange.when.rising?;
+    let reading = match Plan::new(config).ok()?.source(var)? {
+        Source::Modbus => port.cycle,
+        Source::Recipe(_) => Duration::from_millis(4),
+        Source::State => Duration::from_millis(100),
+        Source::Field(_) => return None,
+    };
+    Some(reading.saturating_mul(2))
 }
 
 fn show_time(micros: u64) -> String {

@@ -5,8 +5,8 @@
 //! In: a configuration. Out: [`Warning`]s. Nothing is refused here.
 
 use super::{
-    CommandEntry, CommandWhen, ConfigView, Exchange, FieldSpec, InputBinding, Port, Recipe, Span, Talk,
-    Warning,
+    Bus, CommandEntry, CommandWhen, ConfigView, Echo, Exchange, FieldSpec, InputBinding, Port, Recipe, Span,
+    Talk, Warning,
 };
 use crate::command::Request;
 use crate::device::Kind;
@@ -41,8 +41,88 @@ impl<'c> ConfigView<'c> {
     /// What often is a mistake.
     pub(super) fn advice(self) -> impl Iterator<Item = Warning> + 'c {
         let commands = self.stops_on_edges().chain(self.forgotten_bases());
-        let times = self.short_timeouts().chain(self.lost_peers());
-        self.manual_addresses().chain(commands).chain(times)
+        let times = self.short_timeouts().chain(self.slow_replies()).chain(self.lost_peers());
+        let events = self.repeated_events().chain(self.without_stop()).chain(self.unknown_echoes());
+        self.manual_addresses().chain(commands).chain(times).chain(events)
+    }
+
+    /// Events that a device may carry out twice.
+    fn repeated_events(self) -> impl Iterator<Item = Warning> + 'c {
+        (0..).zip(self.recipes).flat_map(move |(recipe, of)| {
+            let all = (0..).zip(self.exchanges_of(of));
+            let is_repeated = |one: &Exchange| {
+                one.is_answered() && one.event_retries > 0 && (one.is_event() || one.is_start_event())
+            };
+            let repeated = all.filter(move |(_, one)| is_repeated(one));
+            repeated.map(move |(exchange, _)| Warning::RepeatedEvent { recipe, exchange })
+        })
+    }
+
+    /// Devices that a bit triggers and nothing stops.
+    fn without_stop(self) -> impl Iterator<Item = Warning> + 'c {
+        (0..).zip(self.recipes).flat_map(move |(recipe, of)| {
+            let all = self.exchanges_of(of);
+            let writes = |one: &Exchange| {
+                one.when.rising.is_some()
+                    && match one.talk {
+                        Talk::Rtu { operation, .. } => operation.written_len() > 0,
+                        _ => true,
+                    }
+            };
+            let has_stop = move |peer: u8| all.iter().any(|other| other.peer == peer && other.stop);
+            let is_first = move |nth: usize, one: &Exchange| {
+                !all.iter().take(nth).any(|other| other.peer == one.peer && writes(other))
+            };
+            let found = all
+                .iter()
+                .enumerate()
+                .filter(move |&(nth, one)| writes(one) && is_first(nth, one) && !has_stop(one.peer));
+            found.map(move |(nth, one)| Warning::NoStop { recipe, exchange: nth as u8, peer: one.peer })
+        })
+    }
+
+    /// Lines whose echo cannot be learned.
+    fn unknown_echoes(self) -> impl Iterator<Item = Warning> + 'c {
+        let ports = (0..)
+            .zip(self.ports)
+            .filter(|(_, port)| matches!(&port.bus, Bus::Rs485(line) if line.echo == Echo::Auto));
+        ports.filter_map(move |(port, config)| {
+            let of = self.recipes.get(usize::from(config.recipe))?;
+            let mut answered = self.exchanges_of(of).iter().filter(|one| one.is_answered()).peekable();
+            answered.peek()?;
+            answered.all(|one| self.may_be_echo(one)).then_some(Warning::EchoUnknown { port })
+        })
+    }
+
+    /// Whether the reply of an exchange can have the bytes of its request.
+    fn may_be_echo(self, exchange: &Exchange) -> bool {
+        match exchange.talk {
+            Talk::Rtu { operation, .. } => {
+                matches!(operation, Operation::WriteCoil { .. } | Operation::WriteRegister { .. })
+            }
+            Talk::Frames { request: Some(request), reply: Some(reply), .. } => {
+                let frame = |nth: u8| self.frames.get(usize::from(nth));
+                frame(request).zip(frame(reply)).is_none_or(|(request, reply)| reply.may_echo(request, self))
+            }
+            _ => false,
+        }
+    }
+
+    /// Replies that need more time on the line than their timeout allows.
+    fn slow_replies(self) -> impl Iterator<Item = Warning> + 'c {
+        (0..).zip(self.ports).flat_map(move |(port, config)| {
+            let of = self.recipes.get(usize::from(config.recipe));
+            let all = of.map_or(&[][..], |of| self.exchanges_of(of));
+            (0..).zip(all).filter_map(move |(exchange, one)| {
+                let (time, timeout) = (self.reply_time(config, one), one.timeout);
+                (one.is_answered() && time > timeout).then_some(Warning::SlowReply {
+                    port,
+                    exchange,
+                    time,
+                    timeout,
+                })
+            })
+        })
     }
 
     /// Devices that are told something once, and that nobody asks often enough to see that they were without

@@ -242,6 +242,39 @@ pub enum Warning {
         /// How long the frames take.
         time: Duration,
     },
+    /// An event, or what is only asked at the start, is repeated without a reply: the device may carry it out twice.
+    RepeatedEvent {
+        /// The recipe.
+        recipe: u8,
+        /// Index of the exchange in the recipe.
+        exchange: u8,
+    },
+    /// A bit triggers a write to a device, and nothing stops the device.
+    NoStop {
+        /// The recipe.
+        recipe: u8,
+        /// Index of the first such exchange with the device.
+        exchange: u8,
+        /// The slave's address, or the number of the device.
+        peer: u8,
+    },
+    /// Whether a line echoes is to be learned, and none of its exchanges has a reply that differs from its request: no
+    /// write is ever confirmed.
+    EchoUnknown {
+        /// The port.
+        port: u8,
+    },
+    /// A reply takes longer on the line than its timeout allows.
+    SlowReply {
+        /// The port.
+        port: u8,
+        /// Index of the exchange in the recipe.
+        exchange: u8,
+        /// The time of the reply on the line, with the silence before it.
+        time: Duration,
+        /// Its timeout.
+        timeout: Duration,
+    },
     /// A way up carries a variable that no port writes: it is read back from the state stream and
     /// sent on, so for 100 ms a change made by somebody else can be undone.
     ReadBack {
@@ -336,6 +369,33 @@ impl fmt::Display for DescribedWarning<'_> {
                 "port {:?}: a frame takes {time} on the line, but the timeout is {timeout}, so one lost frame or a \
                  short pause makes the port silent; write two periods of the device or more in timeout_ms",
                 port_name(port)
+            ),
+            Warning::RepeatedEvent { recipe, exchange } => write!(
+                f,
+                "recipe {:?}, exchange {}: an event is repeated if its reply is lost, so the device may carry it out \
+                 twice; retries = 0 does not repeat it",
+                recipe_name(recipe),
+                exchange.saturating_add(1)
+            ),
+            Warning::NoStop { recipe, exchange, peer } => write!(
+                f,
+                "recipe {:?}, exchange {}: a bit triggers a write to device {peer}, and no exchange with stop = true \
+                 stops it; if it moves something, add one",
+                recipe_name(recipe),
+                exchange.saturating_add(1)
+            ),
+            Warning::EchoUnknown { port } => write!(
+                f,
+                "port {:?}: each reply equals its request, so nothing tells it from an echo, and no write is \
+                 confirmed; write echo = false, or true if the adapter hears itself",
+                port_name(port)
+            ),
+            Warning::SlowReply { port, exchange, time, timeout } => write!(
+                f,
+                "port {:?}, exchange {}: the reply takes {time} on the line, and timeout_ms is {timeout}, so it is \
+                 always too late",
+                port_name(port),
+                exchange.saturating_add(1)
             ),
             Warning::ReadBack { recipe, var } => write!(
                 f,

@@ -4,7 +4,7 @@
 
 use super::budget::can_frame_time;
 use super::exchange::{Exchange, FrameSpec, Talk};
-use super::{Bus, ConfigView, FieldSpec, Port, SendOn};
+use super::{Bus, ConfigView, FieldSpec, Port, Recipe, SendOn};
 use crate::modbus::rtu::{BROADCAST, Timing};
 use crate::sysvar::Direction;
 use crate::time::Duration;
@@ -47,13 +47,49 @@ impl ConfigView<'_> {
         let [request_id, reply_id] = ids;
         let asks = request_on_line(port, exchange, request, request_id);
         let answers = on_line(port, exchange, reply, reply_id);
-        let waits = if expects_reply(exchange) { answers.max(exchange.timeout) } else { answers };
+        let waits = if exchange.is_answered() { answers.max(exchange.timeout) } else { answers };
         ExchangeBudget {
             request,
             reply,
             time: asks + answers + exchange.pause,
             time_without_reply: asks + waits + exchange.pause,
         }
+    }
+
+    /// How long the reply to an exchange takes on the line of `port`, with the silence before it.
+    pub(super) fn reply_time(self, port: &Port, exchange: &Exchange) -> Duration {
+        let budget = self.exchange_budget(port, exchange);
+        on_line(port, exchange, budget.reply, None)
+    }
+
+    /// The exchanges of a recipe, as bits, that wait while a reply to this one may come: those of its peer whose replies
+    /// cannot be told from its own.
+    pub fn held_back_by(self, recipe: &Recipe, exchange: &Exchange) -> u64 {
+        let all = (0_u32..).zip(self.exchanges_of(recipe));
+        let held = all.filter(|(_, other)| self.are_alike(exchange, other));
+        held.fold(0, |set, (nth, _)| set | 1_u64.unbounded_shl(nth))
+    }
+
+    /// Whether the replies to two exchanges cannot be told apart by content or length.
+    fn are_alike(self, own: &Exchange, other: &Exchange) -> bool {
+        let frame = |nth: Option<u8>| self.frames.get(usize::from(nth?));
+        own.peer == other.peer
+            && own.is_answered()
+            && other.is_answered()
+            && match (own.talk, other.talk) {
+                (Talk::Rtu { operation: own, .. }, Talk::Rtu { operation: other, .. }) => {
+                    own.is_answered_like(&other)
+                }
+                (Talk::Frames { reply: own, .. }, Talk::Frames { reply: other, .. }) => {
+                    match (frame(own), frame(other)) {
+                        (Some(own), Some(other)) => {
+                            core::ptr::eq(own, other) || !own.is_told_from(other, self)
+                        }
+                        _ => true,
+                    }
+                }
+                _ => false,
+            }
     }
 
     /// How much of the line of `port` is taken, in percent, rounded up: by its exchanges with a period
@@ -91,14 +127,6 @@ impl ConfigView<'_> {
         let fields =
             frame.fields.of(self.fields).iter().map(FieldSpec::longest).fold(0, usize::saturating_add);
         fields.saturating_add(frame.head.len()).saturating_add(frame.tail.len())
-    }
-}
-
-fn expects_reply(exchange: &Exchange) -> bool {
-    match exchange.talk {
-        Talk::Rtu { .. } => exchange.peer != BROADCAST,
-        Talk::Served { .. } => false,
-        Talk::Frames { request, reply, .. } => request.is_some() && reply.is_some(),
     }
 }
 

@@ -80,11 +80,26 @@ impl FrameSpec {
         {
             return true;
         }
-        let constants = |frame: &Self| {
-            let fields = frame.fields.of(config.fields);
-            Constants::of_frame(frame.layout(config, Direction::Input), &frame.head, fields)
-        };
+        let constants = |frame: &Self| frame.constants(config, Direction::Input);
         constants(self).differ(&constants(other))
+    }
+
+    /// Whether this frame from a device may have the bytes of that request.
+    pub(crate) fn may_echo(&self, request: &Self, config: ConfigView<'_>) -> bool {
+        let lengths =
+            |frame: &Self, part| frame.layout(config, part).ok().map(|frame| frame.layout.lengths());
+        let overlap = match (lengths(self, Direction::Input), lengths(request, Direction::Output)) {
+            (Some((short, long)), Some((shortest, longest))) => long >= shortest && longest >= short,
+            _ => true,
+        };
+        self.id == request.id
+            && overlap
+            && !self.constants(config, Direction::Input).differ(&request.constants(config, Direction::Output))
+    }
+
+    fn constants(&self, config: ConfigView<'_>, part: Direction) -> Constants {
+        let fields = self.fields.of(config.fields);
+        Constants::of_frame(self.layout(config, part), &self.head, fields)
     }
 }
 

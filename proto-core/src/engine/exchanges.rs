@@ -420,7 +420,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             let every = exchange.when.every;
             let times = RowTimes { every, cost, timeout: exchange.timeout, late: exchange.late() };
             let mut row = Row::new(peer as u8, kind, times);
-            row.alike = alike(config, exchanges, exchange);
+            row.alike = config.held_back_by(recipe, exchange);
             self.exchanges.rows.push(row).map_err(|_| full())?;
             self.exchanges.items.push(item).map_err(|_| full())?;
         }
@@ -443,32 +443,4 @@ fn step_before(exchanges: &[Exchange], nth: usize) -> Option<u8> {
         |other: &Exchange| other.peer == own.peer && other.when.rising == own.when.rising && !other.stop;
     let before = exchanges.iter().take(nth).rposition(|other| is_step(other))?;
     Some(before as u8)
-}
-
-/// The exchanges of the peer, as bits, whose replies cannot be told from those of this one by content or length.
-fn alike(config: ConfigView<'_>, exchanges: &[Exchange], own: &Exchange) -> u64 {
-    let frame = |nth: Option<u8>| config.frames.get(usize::from(nth?));
-    let is_alike = |other: &Exchange| {
-        own.peer == other.peer
-            && own.is_answered()
-            && other.is_answered()
-            && match (own.talk, other.talk) {
-                (Talk::Rtu { operation: own, .. }, Talk::Rtu { operation: other, .. }) => {
-                    own.is_answered_like(&other)
-                }
-                (Talk::Frames { reply: own, .. }, Talk::Frames { reply: other, .. }) => {
-                    match (frame(own), frame(other)) {
-                        (Some(own), Some(other)) => {
-                            core::ptr::eq(own, other) || !own.is_told_from(other, config)
-                        }
-                        _ => true,
-                    }
-                }
-                _ => false,
-            }
-    };
-    (0_u32..)
-        .zip(exchanges)
-        .filter(|(_, other)| is_alike(other))
-        .fold(0, |set, (nth, _)| set | 1_u64.unbounded_shl(nth))
 }

@@ -136,7 +136,15 @@ pub(super) fn warnings(config: &GatewayConfig) -> Vec<Placed> {
             let number = (u16::from(exchange) + 1).to_string();
             [recipe(nth), [list, &number, "address"].map(str::to_owned).to_vec()].concat()
         }
-        Warning::NeverLookedFor { recipe: nth, exchange, .. } => {
+        Warning::EchoUnknown { port: nth } => port(nth, "echo"),
+        Warning::SlowReply { port: nth, exchange, .. } => {
+            let of = config.ports.get(usize::from(nth)).map_or(0, |port| port.recipe);
+            let number = (u16::from(exchange) + 1).to_string();
+            [recipe(of), ["exchange", &number].map(str::to_owned).to_vec()].concat()
+        }
+        Warning::RepeatedEvent { recipe: nth, exchange }
+        | Warning::NoStop { recipe: nth, exchange, .. }
+        | Warning::NeverLookedFor { recipe: nth, exchange, .. } => {
             let number = (u16::from(exchange) + 1).to_string();
             [recipe(nth), ["exchange", &number].map(str::to_owned).to_vec()].concat()
         }
