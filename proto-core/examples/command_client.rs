@@ -70,7 +70,7 @@ fn show(event: &ClientEvent<'_>) {
     match event {
         ClientEvent::Reply { kind, reply, .. } => println!("         {kind:?}: {reply:?}"),
         ClientEvent::ScriptFinish => println!("         the program has ended"),
-        ClientEvent::Unsolicited { text } => println!("         unasked: {}", text.escape_ascii()),
+        ClientEvent::Unsolicited { text, .. } => println!("         unasked: {}", text.escape_ascii()),
         ClientEvent::Timeout => println!("         given up: no reply"),
     }
 }

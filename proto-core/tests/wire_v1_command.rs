@@ -67,6 +67,10 @@ fn replies() {
     answered(did(Action::Enable, Outcome::Success), b"enable success", b"enable success\r\n");
     answered(did(Action::Disable, Outcome::Fail), b"disable fail", b"disable fail\r\n");
     answered(did(Action::Shutdown, Outcome::Success), b"shutdown success", b"shutdown success\r\n");
+    answered(Reply::Already(Action::PowerOn), b"already poweron", b"already poweron\r\n");
+    answered(Reply::Already(Action::PowerOff), b"already poweroff", b"already poweroff\r\n");
+    answered(Reply::Already(Action::Enable), b"already enable", b"already enable\r\n");
+    answered(Reply::Already(Action::Disable), b"already disable", b"already disable\r\n");
     let codes = StateCodes { robot: 6, program: 0, safety: 5, mode: 2 };
     answered(Reply::State(codes), b"6:0:5:2", b"6:0:5:2\r\n");
     answered(Reply::ProgramFinished(true), b"1", b"1\r\n");

@@ -50,6 +50,22 @@ fn command(case: &Case<'_>, port: &Port) -> Option<Finding> {
     };
     match port.reply {
         ReplyCode::Fail => failed(case, port, &place),
+        ReplyCode::Pending | ReplyCode::Other => {
+            let others = case.status.links.iter().filter_map(|link| link.other_text.as_ref());
+            let mut others = others.filter(|other| other.age < TOLD_FOR);
+            let other = others.find(|other| other.command == port.command && other.command.is_some())?;
+            found(
+                Severity::Fault,
+                Cause::OtherReply,
+                [
+                    format!("{given} answered{}: {:?}", ago(other.age), other.text),
+                    "success, fail or already, and the command's name".into(),
+                    "A controller version with other words: nobody knows whether it was done".into(),
+                    "Look at the robot: it is not sent again. Report the words, so that they can be read"
+                        .into(),
+                ],
+            )
+        }
         ReplyCode::NoReply => {
             let record = case.ports.iter().find(|record| record.port == port.id);
             let given_at = record.and_then(PortRecord::newest_command);

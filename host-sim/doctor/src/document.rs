@@ -19,7 +19,7 @@ use serde::de::IntoDeserializer;
 use serde::de::value::{Error, StrDeserializer};
 
 use crate::bytes::from_hex;
-use crate::state::{Failed, Link, Peer, Port, Rejected, State, Withheld};
+use crate::state::{Failed, Link, OtherText, Peer, Port, Rejected, State, Withheld};
 
 /// The document `status`.
 #[derive(Debug, Clone, Deserialize)]
@@ -97,6 +97,14 @@ struct LinkDocument {
     history: LinkHistory,
     #[serde(default)]
     counters: LinkCounters,
+    other_text: Option<OtherTextDocument>,
+}
+
+#[derive(Debug, Clone, Deserialize)]
+struct OtherTextDocument {
+    text: String,
+    age_ms: u64,
+    command: Option<String>,
 }
 
 #[derive(Debug, Clone, Deserialize)]
@@ -163,6 +171,11 @@ impl StatusDocument {
                 up_for: if shown.state == "up" { up_for(info.name) } else { Duration::ZERO },
                 history: shown.history,
                 counters: shown.counters,
+                other_text: shown.other_text.as_ref().map(|other| OtherText {
+                    text: other.text.clone(),
+                    age: Duration::from_millis(other.age_ms),
+                    command: other.command.clone(),
+                }),
             })
         });
         Ok(State {

@@ -166,6 +166,8 @@ causes! {
     CommandFailed = "command_failed",
     /// No reply came to a command.
     NoReply = "no_reply",
+    /// A command was answered in words that are not known.
+    OtherReply = "other_reply",
     /// A command was not sent.
     NotSent = "not_sent",
     /// A value that is a command only set the base, because it was the first.

@@ -94,6 +94,18 @@ pub(crate) struct Link {
     pub(crate) up_for: Duration,
     pub(crate) history: LinkHistory,
     pub(crate) counters: LinkCounters,
+    /// The newest text of the command port that no command got as its reply.
+    pub(crate) other_text: Option<OtherText>,
+}
+
+/// A text that no command got as its reply.
+#[derive(Debug, Clone)]
+pub(crate) struct OtherText {
+    pub(crate) text: String,
+    /// How long ago it came.
+    pub(crate) age: Duration,
+    /// The unanswered command whose reply it may be.
+    pub(crate) command: Option<String>,
 }
 
 impl From<Status<'_>> for State {
@@ -144,6 +156,11 @@ impl From<Status<'_>> for State {
             },
             history: *link.history,
             counters: *link.counters,
+            other_text: link.other_text.map(|other| OtherText {
+                text: other.text.to_owned(),
+                age: at.saturating_since(other.at),
+                command: other.command.map(|command| command.to_string()),
+            }),
         });
         Self {
             at,

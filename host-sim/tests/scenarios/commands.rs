@@ -1,4 +1,4 @@
-//! Commands that would start something late, and a stop that must not wait.
+//! Commands that would start something late, a stop that must not wait, and commands for what is so already.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -25,6 +25,7 @@ pub(crate) fn all() -> Vec<Scenario> {
         .with_true_cable(),
         Scenario::new("a_gateway_that_was_stopped_starts_nothing", asleep).of_sleep(),
         Scenario::new("a_stop_behind_a_start_without_a_reply", stop_behind),
+        Scenario::new("commands_for_what_is_so_already", already),
     ]
 }
 
@@ -203,5 +204,56 @@ fn stop_behind(case: &Case) {
     let stopped = stopped.unwrap_or_else(|| panic!("the program still runs after {HELD:?}"));
     assert!(stopped < SOON, "it was stopped after {stopped:?}");
     assert!(!robot.is_running(), "it was started again");
+    gateway.must_run();
+}
+
+/// A newer controller answers `already poweron` where nothing is left to do. That is a reply like others: the usual
+/// start sequence starts the program on a robot that is on, and a repeated stop costs nothing.
+fn already(case: &Case) {
+    const POWERON: u8 = 1;
+    const ENABLE: u8 = 2;
+    const START: u8 = 3;
+    const DISABLE: u8 = 8;
+    /// How long a switch is pressed.
+    const PRESSED: Duration = Duration::from_millis(100);
+    /// A reply that is missing holds everything up for 10 s.
+    const SOON: Duration = Duration::from_secs(5);
+    let robot = case.robot_of(&ENDLESS.replace("[robot]", "[robot]\ndialect = \"v2.6\"")).start();
+    let table = r#"1 = "poweron", 2 = "enable", 3 = "run(endless.jspf)", 8 = "disable", 9 = "stop""#;
+    let mut gateway = case.gateway_of(&toml::panel(table, 1_000)).robot(&robot).start();
+    gateway.until_up(Link::Command, 1);
+    gateway.until_up(Link::Urgent, 1);
+    let mut panel = gateway.line("device");
+    let frames = gateway.port("device").frames_in;
+    until("the base is taken", || {
+        panel.send(&order(NOTHING, 0));
+        (gateway.port("device").frames_in > frames).then_some(())
+    });
+    let begin = Instant::now();
+    let until_running = |panel: &mut LineClient, begin: Instant| {
+        while !robot.is_running() {
+            assert!(begin.elapsed() < SOON, "the program does not run after {:?}", begin.elapsed());
+            hold(panel, &order(START, 0), PERIOD, || ());
+        }
+    };
+    for value in [POWERON, ENABLE, START] {
+        hold(&mut panel, &order(value, 0), PRESSED, || ());
+    }
+    until_running(&mut panel, begin);
+    until("the program ends", || {
+        panel.send(&order(DISABLE, 0));
+        (!robot.is_running()).then_some(())
+    });
+    let begin = Instant::now();
+    for value in [NOTHING, DISABLE, NOTHING, DISABLE, NOTHING, ENABLE] {
+        hold(&mut panel, &order(value, 0), PRESSED, || ());
+    }
+    // Enabling takes the robot 200 ms.
+    hold(&mut panel, &order(NOTHING, 0), 4 * PRESSED, || ());
+    until_running(&mut panel, begin);
+    let links = [gateway.link(Link::Command), gateway.link(Link::Urgent)];
+    assert!(links.iter().all(|link| link.is_up && link.connects == 1), "{links:?}");
+    // Each once: three, three times off, and two again.
+    assert_eq!((robot.count("/command/requests"), robot.count("/command/refusals")), (8, 0));
     gateway.must_run();
 }

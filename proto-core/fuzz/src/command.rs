@@ -7,7 +7,7 @@ use proto_core::command::{
 use proto_core::time::Instant;
 use proto_core::wire::dialect::Dialect;
 
-use crate::reference_command::{Client, Command, Event, Heard, Server, Turn};
+use crate::reference_command::{Asked, Client, Command, Event, Heard, Server, Turn};
 use crate::source::{Source, cut};
 
 /// Bytes of a connection that one input may lead to.
@@ -33,7 +33,7 @@ const TEXTS: [&[u8]; 16] = [
     b"\0",
 ];
 /// And answered.
-const REPLIES: [&[u8]; 16] = [
+const REPLIES: [&[u8]; 24] = [
     b"run start",
     b"run fail",
     b"set success",
@@ -50,6 +50,14 @@ const REPLIES: [&[u8]; 16] = [
     b"\r\n",
     b"set speed ",
     b"getlasterror success",
+    b"already stop",
+    b"already poweron",
+    b"already poweroff",
+    b"script error",
+    b"Error: cannot stop\n",
+    b"poweron refused\n",
+    b"FAILED to run: set speed\n",
+    b"busy\n",
 ];
 
 /// The time a byte stands for, in microseconds: around 20 ms and 100 ms, and long.
@@ -164,7 +172,8 @@ pub(crate) fn run_client(input: &[u8]) {
                 ask(&mut client, &mut expected, now, TEXTS[usize::from(op >> 4)], turn);
                 continue;
             }
-            1 | 2 => REPLIES[usize::from(op >> 4)],
+            1 => REPLIES[usize::from(op >> 4)],
+            2 => REPLIES[usize::from(op >> 3) % REPLIES.len()],
             3 | 4 => input.take(1 + usize::from(op >> 3)),
             5 => {
                 now += wait(&mut input);
@@ -211,7 +220,7 @@ fn ask(client: &mut CommandClient, expected: &mut Client, now: u64, text: &[u8],
 }
 
 fn hear(client: &mut CommandClient, expected: &mut Client, now: u64, chunk: &[u8]) {
-    let word = |request: &Option<(String, u64)>| request.as_ref().map(|(word, _)| word.clone());
+    let word = |request: &Option<Asked>| request.as_ref().map(|asked| asked.word.clone());
     let mut words = [word(&expected.waiting), word(&expected.beside)];
     let (mut rest, mut events) = (chunk, Vec::new());
     // What silence ends, and a timeout, take no bytes: one a text that was held.
@@ -225,7 +234,10 @@ fn hear(client: &mut CommandClient, expected: &mut Client, now: u64, chunk: &[u8
         }
         events.push(match event {
             ClientEvent::ScriptFinish => Event::ScriptFinish,
-            ClientEvent::Unsolicited { text } => Event::Unsolicited(text.to_vec()),
+            ClientEvent::Unsolicited { text, beside } => {
+                let turn = beside.map(|beside| if beside { Turn::Beside } else { Turn::InTurn });
+                Event::Unsolicited(text.to_vec(), turn)
+            }
             ClientEvent::Timeout => Event::Timeout,
             ClientEvent::Reply { beside, kind, reply, text } => {
                 let word = words[usize::from(beside)].as_deref();
@@ -244,13 +256,18 @@ fn hear(client: &mut CommandClient, expected: &mut Client, now: u64, chunk: &[u8
     assert_eq!(client.deadline().map(Instant::as_micros), expected.deadline());
 }
 
+fn says_failure(text: &[u8]) -> bool {
+    let text = text.to_ascii_lowercase();
+    text.windows(4).any(|letters| letters == b"fail") || text.windows(5).any(|letters| letters == b"error")
+}
+
 /// A reply's kind, and that it can be written and read again.
 fn reply_again(word: &str, kind: ReplyKind, reply: &Reply<'_>, text: &[u8]) {
     let keyword = Keyword::from_word(word).expect("a keyword was asked");
     let expected = match text {
         b"unknown command" => ReplyKind::UnknownCommand,
         _ if ["state", "isprogfinish", "getlasterror"].contains(&word) => ReplyKind::Value,
-        _ if text.ends_with(b"fail") => ReplyKind::Fail,
+        _ if says_failure(text) => ReplyKind::Fail,
         _ => ReplyKind::Success,
     };
     assert_eq!((kind, reply.kind()), (expected, expected));
@@ -361,6 +378,13 @@ pub(crate) fn client_seeds() -> Vec<Vec<u8>> {
             seeds
                 .push([&[0, ask(request), beside(5)][..], &replies, &[5, 97, 7, ask(5), 5, 255, 7]].concat());
         }
+    }
+    // What is so already, and words that the client does not know, of each request and of two.
+    for (nth, request) in [(16, 5), (17, 6), (18, 6), (19, 1), (20, 5), (21, 6), (22, 1), (22, 4), (23, 6)] {
+        let answer = |nth: u8| nth << 3 | 2;
+        seeds.push(vec![0, ask(request), answer(nth), 5, 97, 7, answer(nth), 5, 97, 7, 5, 255, 7]);
+        let two = [ask(6), beside(5), answer(nth), answer(23), answer(23), answer(nth), answer(16)];
+        seeds.push([&[0][..], &two, &[5, 97, 7, 5, 255, 7]].concat());
     }
     // The beginning of a reply when the time is up.
     seeds.push([&[0, ask(7)][..], &bytes(b"10"), &[5, 255, 7]].concat());

@@ -7,7 +7,7 @@
 use core::cell::Cell;
 use core::fmt;
 
-use super::reply::{Match, Reply, ReplyKind, SCRIPT_FINISH, match_fixed, match_value};
+use super::reply::{Match, Reply, ReplyKind, SCRIPT_FINISH, failure, match_fixed, match_value, named_at};
 use super::request::{EncodeError, Keyword, ParseError, Request};
 use super::text::{is_blank, is_terminator, trim_start};
 use crate::time::{Duration, Instant};
@@ -48,7 +48,11 @@ pub struct CommandClient {
 #[derive(Debug, Clone, Copy)]
 struct Waiting {
     keyword: Keyword,
+    /// When it was written.
+    since: Instant,
     until: Instant,
+    /// An unknown text has come that may be its reply.
+    has_text: bool,
 }
 
 /// The result of a request, or an unsolicited text.
@@ -68,10 +72,14 @@ pub enum ClientEvent<'a> {
     },
     /// A program that was started from port 2000 has ended.
     ScriptFinish,
-    /// A text that answers no request in flight: a late reply, or an unknown text.
+    /// A text that answers no request in flight: a late reply, or an unknown text. No request is
+    /// over.
     Unsolicited {
         /// The text, without a terminator.
         text: &'a [u8],
+        /// The request in flight whose reply in unknown words it may be: that beside the older one if
+        /// `true`. `None` for a late reply, or if no request can be meant.
+        beside: Option<bool>,
     },
     /// The request in flight is given up. A reply may still come, as an unsolicited text; a value
     /// would be taken for the next reply of its kind, so reconnect before the next request.
@@ -172,7 +180,7 @@ impl CommandClient {
         if !SCRIPT_FINISH.as_bytes().starts_with(self.received()) {
             self.len = 0;
         }
-        self.waiting = Some(Waiting { keyword: request.keyword(), until: now + self.timeout });
+        self.waiting = Some(self.written(request.keyword(), now));
         Ok(len)
     }
 
@@ -206,8 +214,12 @@ impl CommandClient {
             }
             _ => request.encode(dialect, out).map_err(StartError::Encode)?,
         };
-        self.beside = Some(Waiting { keyword: request.keyword(), until: now + self.timeout });
+        self.beside = Some(self.written(request.keyword(), now));
         Ok(len)
+    }
+
+    fn written(&self, keyword: Keyword, now: Instant) -> Waiting {
+        Waiting { keyword, since: now, until: now + self.timeout, has_text: false }
     }
 
     /// Takes bytes from the front of `bytes` until an event is complete. `None` means that all of
@@ -291,7 +303,7 @@ impl CommandClient {
                     let rest = bytes.get(at..).unwrap_or(&[]);
                     matches!(match_fixed(rest), Match::Complete { .. })
                 });
-                Some(Found::Unsolicited { len: glued.unwrap_or(end) })
+                Some(self.judge_words(glued.unwrap_or(end)))
             }
         }
     }
@@ -314,7 +326,29 @@ impl CommandClient {
             Reply::ScriptFinish => Found::ScriptFinish { len },
             _ if answers(self.waiting) => Found::Reply { len, beside: false },
             _ if answers(self.beside) => Found::Reply { len, beside: true },
-            _ => Found::Unsolicited { len },
+            _ => Found::Unsolicited { len, beside: None },
+        }
+    }
+
+    /// What the unknown text at the front is: a failure if it names a request and says so. Otherwise
+    /// it may be the reply to the request that it names, or to the oldest that has had no text yet.
+    fn judge_words(&self, len: usize) -> Found {
+        let text = self.received().get(..len).unwrap_or(&[]);
+        let requests = [(false, self.waiting), (true, self.beside)];
+        // A text that was there before a request was written is not its reply.
+        let requests = requests.into_iter().filter_map(|(beside, waiting)| Some((beside, waiting?)));
+        let requests = requests.filter(|(_, waiting)| waiting.since <= self.newest);
+        let named = requests.clone().filter_map(|(beside, waiting)| {
+            Some((named_at(waiting.keyword, text)?, beside, waiting.keyword))
+        });
+        match named.min_by_key(|(at, ..)| *at) {
+            Some((_, beside, keyword)) if failure(keyword, text).is_some() => Found::Reply { len, beside },
+            Some((_, beside, _)) => Found::Unsolicited { len, beside: Some(beside) },
+            None => {
+                let beside =
+                    requests.clone().find(|(_, waiting)| !waiting.has_text).map(|(beside, _)| beside);
+                Found::Unsolicited { len, beside }
+            }
         }
     }
 
@@ -357,22 +391,29 @@ impl CommandClient {
     }
 
     fn hand_out(&mut self, found: Found) -> ClientEvent<'_> {
-        let (Found::Reply { len, .. } | Found::ScriptFinish { len } | Found::Unsolicited { len }) = found;
+        let (Found::Reply { len, .. } | Found::ScriptFinish { len } | Found::Unsolicited { len, .. }) = found;
         self.handed_out = len;
         let waiting = match found {
             Found::Reply { beside: false, .. } => core::mem::replace(&mut self.waiting, self.beside.take()),
             Found::Reply { beside: true, .. } => self.beside.take(),
+            Found::Unsolicited { beside: Some(beside), .. } => {
+                let request = if beside { &mut self.beside } else { &mut self.waiting };
+                if let Some(waiting) = request {
+                    waiting.has_text = true;
+                }
+                None
+            }
             _ => None,
         };
         let bytes = self.buffer.get(..self.len).unwrap_or(&[]);
         let text = bytes.get(..len).unwrap_or(&[]);
         match found {
             Found::ScriptFinish { .. } => ClientEvent::ScriptFinish,
-            Found::Unsolicited { .. } => ClientEvent::Unsolicited { text },
+            Found::Unsolicited { beside, .. } => ClientEvent::Unsolicited { text, beside },
             Found::Reply { beside, .. } => {
                 match waiting.and_then(|waiting| Reply::parse(waiting.keyword, text)) {
                     Some(reply) => ClientEvent::Reply { beside, kind: reply.kind(), reply, text },
-                    None => ClientEvent::Unsolicited { text },
+                    None => ClientEvent::Unsolicited { text, beside: None },
                 }
             }
         }
@@ -412,5 +453,5 @@ impl Default for CommandClient {
 enum Found {
     Reply { len: usize, beside: bool },
     ScriptFinish { len: usize },
-    Unsolicited { len: usize },
+    Unsolicited { len: usize, beside: Option<bool> },
 }

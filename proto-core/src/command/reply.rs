@@ -49,6 +49,8 @@ pub enum Reply<'a> {
         /// The result.
         outcome: Outcome,
     },
+    /// To an action of which nothing is left to do: `already poweron`. It is as good as done.
+    Already(Action),
     /// To `state`.
     State(StateCodes),
     /// To `isprogfinish`: whether the program has finished.
@@ -122,9 +124,10 @@ impl<'a> Reply<'a> {
     /// The kind of answer; [`ReplyKind::Value`] for the unsolicited text.
     pub const fn kind(&self) -> ReplyKind {
         match self {
-            Self::Run(Outcome::Success) | Self::SpeedSet(_) | Self::Did { outcome: Outcome::Success, .. } => {
-                ReplyKind::Success
-            }
+            Self::Run(Outcome::Success)
+            | Self::SpeedSet(_)
+            | Self::Did { outcome: Outcome::Success, .. }
+            | Self::Already(_) => ReplyKind::Success,
             Self::Run(Outcome::Fail) | Self::SpeedRefused | Self::Did { outcome: Outcome::Fail, .. } => {
                 ReplyKind::Fail
             }
@@ -161,6 +164,10 @@ impl<'a> Reply<'a> {
                 writer.push_str(" ");
                 writer.push_str(outcome.word());
             }
+            Self::Already(action) => {
+                writer.push_str(ALREADY);
+                writer.push_str(action.word());
+            }
             Self::State(StateCodes { robot, program, safety, mode }) => {
                 writer.push_number::<10>(robot.into());
                 for code in [program, safety, mode] {
@@ -188,7 +195,8 @@ impl<'a> Reply<'a> {
     }
 
     /// Reads the whole text of a reply to `keyword`, in the form of any dialect, with or without a
-    /// terminator. `None` if it is not one.
+    /// terminator. A text that names the command and contains `fail`, `failed` or `error` is a
+    /// failure, whatever else it says. `None` if it is not a reply to `keyword`.
     pub fn parse(keyword: Keyword, text: &'a [u8]) -> Option<Self> {
         let text = trim(text);
         let whole = |found: Match<'a>| match found {
@@ -200,6 +208,7 @@ impl<'a> Reply<'a> {
         whole(match_value(keyword, text))
             .or_else(|| whole(match_fixed(text)))
             .filter(|reply| reply.answers(keyword) || *reply == Self::ScriptFinish)
+            .or_else(|| failure(keyword, text))
     }
 
     /// Whether this can be an answer to `keyword`.
@@ -207,7 +216,7 @@ impl<'a> Reply<'a> {
         match *self {
             Self::Run(_) => keyword == Keyword::Run,
             Self::SpeedSet(_) | Self::SpeedRefused => keyword == Keyword::Speed,
-            Self::Did { action, .. } => keyword == Keyword::Do(action),
+            Self::Did { action, .. } | Self::Already(action) => keyword == Keyword::Do(action),
             Self::State(_) => keyword == Keyword::State,
             Self::ProgramFinished(_) => keyword == Keyword::IsProgFinish,
             Self::LastError { .. } => keyword == Keyword::GetLastError,
@@ -236,6 +245,7 @@ pub(super) fn match_fixed(bytes: &[u8]) -> Match<'static> {
         (RUN_START, Reply::Run(Outcome::Success)),
         (RUN_SUCCESS, Reply::Run(Outcome::Success)),
         (RUN_FAIL, Reply::Run(Outcome::Fail)),
+        (SCRIPT_ERROR, Reply::Run(Outcome::Fail)),
         (SET_SUCCESS, Reply::SpeedSet(None)),
         (SET_FAIL, Reply::SpeedRefused),
         (UNKNOWN_COMMAND, Reply::UnknownCommand),
@@ -267,6 +277,22 @@ pub(super) fn match_fixed(bytes: &[u8]) -> Match<'static> {
                 Front::Other => {}
             }
         }
+    }
+    match front(bytes, ALREADY) {
+        Front::Whole(rest) => {
+            for action in Action::ALL {
+                match front(rest, action.word()) {
+                    Front::Whole(rest) => {
+                        let len = bytes.len().saturating_sub(rest.len());
+                        return Match::Complete { len, reply: Reply::Already(action) };
+                    }
+                    Front::Beginning => partial = true,
+                    Front::Other => {}
+                }
+            }
+        }
+        Front::Beginning => partial = true,
+        Front::Other => {}
     }
     match front(bytes, SET_SPEED) {
         Front::Whole(rest) => match match_percent(rest) {
@@ -363,6 +389,33 @@ fn match_error(bytes: &[u8]) -> Match<'_> {
     }
 }
 
+/// Which word of `text` is the first that names the command; `None` if none does.
+pub(super) fn named_at(keyword: Keyword, text: &[u8]) -> Option<usize> {
+    let is_name = |word: &[u8]| {
+        word.eq_ignore_ascii_case(keyword.word().as_bytes())
+            || keyword == Keyword::Speed && word.eq_ignore_ascii_case(SET)
+    };
+    words(text).position(is_name)
+}
+
+/// The failure that a text in words of its own reports to `keyword`; `None` if it reports none. Values
+/// have no failure.
+pub(super) fn failure<'a>(keyword: Keyword, text: &[u8]) -> Option<Reply<'a>> {
+    let is_failure = |word: &[u8]| FAILURES.iter().any(|failure| word.eq_ignore_ascii_case(failure));
+    named_at(keyword, text)?;
+    words(text).find(|word| is_failure(word))?;
+    match keyword {
+        Keyword::Run => Some(Reply::Run(Outcome::Fail)),
+        Keyword::Speed => Some(Reply::SpeedRefused),
+        Keyword::Do(action) => Some(Reply::Did { action, outcome: Outcome::Fail }),
+        Keyword::State | Keyword::IsProgFinish | Keyword::GetLastError => None,
+    }
+}
+
+fn words(text: &[u8]) -> impl Iterator<Item = &[u8]> {
+    text.split(|byte| !byte.is_ascii_alphanumeric())
+}
+
 /// How `bytes` compare with `text`.
 enum Front<'a> {
     /// They begin with the whole text; this is the rest.
@@ -385,11 +438,18 @@ fn front<'a>(bytes: &'a [u8], text: &str) -> Front<'a> {
 const RUN_START: &str = "run start";
 const RUN_SUCCESS: &str = "run success";
 const RUN_FAIL: &str = "run fail";
+const SCRIPT_ERROR: &str = "script error";
+const ALREADY: &str = "already ";
 const SET_SUCCESS: &str = "set success";
 const SET_FAIL: &str = "set fail";
 const SET_SPEED: &str = "set speed ";
 const UNKNOWN_COMMAND: &str = "unknown command";
 pub(super) const SCRIPT_FINISH: &str = "script finish";
+
+/// What replies to `speed` call it.
+const SET: &[u8] = b"set";
+/// Words of a failure.
+const FAILURES: [&[u8]; 3] = [b"fail", b"failed", b"error"];
 
 /// Longest number in `set speed V%`.
 const LONGEST_PERCENT: usize = 16;

@@ -11,6 +11,7 @@ use super::command_tables::{CommandField, Entry, MAX_COMMAND_FIELDS, Picked, Tab
 use super::failed::FailedCommands;
 use super::io::{LinkId, PortId, ReplyCode, Transport};
 use super::not_given::{LastNotGiven, NotGiven};
+use super::other_text::OtherText;
 use super::outcome::Outcomes;
 use super::session::{Event, Sent, Session, may_go_at};
 use super::stops::{COMMAND_QUEUE, STOP_TTL, Stops, Waiting};
@@ -91,6 +92,13 @@ impl CommandLink {
     pub(super) fn newest_of(&self, port: PortId) -> Option<CommandText<'_>> {
         let (entry, value) = (*self.picked.get(usize::from(port.0))?)?;
         self.text(entry, value)
+    }
+
+    /// The newest text of a connection that no command got as its reply.
+    pub(super) fn other_text_of<'a>(&'a self, session: &'a Session) -> Option<OtherText<'a>> {
+        let last = session.last_text.as_ref()?;
+        let command = last.command.and_then(|(entry, value)| self.text(entry, value));
+        Some(OtherText { at: last.at, text: &last.text, command })
     }
 
     /// The text that a value picked.
@@ -322,7 +330,10 @@ impl CommandLink {
         // Of two commands of a kind the newer one is sent again: its result is the one that is
         // shown.
         for sent in [beside, first].into_iter().flatten() {
-            if sent.keyword.is_urgent() && is_asked(&self.fields, &sent.command) {
+            if sent.has_text {
+                // It has arrived, and sending it again would say the same once more.
+                self.outcomes.push(sent.command, ReplyCode::Other);
+            } else if sent.keyword.is_urgent() && is_asked(&self.fields, &sent.command) {
                 self.stops.push_again(sent.keyword, Waiting { since: now, ..sent.command });
             } else {
                 self.outcomes.push(sent.command, ReplyCode::NoReply);
@@ -534,14 +545,13 @@ impl CommandLink {
         sent
     }
 
-    /// Whether an urgent command waits or is unanswered.
+    /// Whether an urgent command waits or may not have arrived. One that the controller has answered in
+    /// unknown words holds back no other any more.
     fn is_stopping(&self) -> bool {
-        let urgent = |sent: &Option<Sent>| sent.is_some_and(|sent| sent.keyword.is_urgent());
-        let session = self.urgent.as_ref();
-        !self.stops.is_empty()
-            || session.is_some_and(|session| session.in_flight.is_some() || session.beside.is_some())
-            || urgent(&self.ordinary.in_flight)
-            || self.ordinary.beside.is_some()
+        let holds = |sent: &Sent| sent.keyword.is_urgent() && !sent.has_text;
+        let sessions = [Some(&self.ordinary), self.urgent.as_ref()].into_iter().flatten();
+        let mut sent = sessions.flat_map(|session| [session.in_flight, session.beside]).flatten();
+        !self.stops.is_empty() || sent.any(|sent| holds(&sent))
     }
 
     /// When something happens without an input. An event on one connection may concern the other.

@@ -11,6 +11,7 @@ use super::connection::Connection;
 use super::counters::{LinkCounters, add};
 use super::io::{Endpoint, LinkId, LinkKind, Transport};
 use super::modbus_link::ModbusLink;
+use super::other_text::OtherText;
 use super::outbox::Outbox;
 use super::state_link::StateLink;
 use super::store::Store;
@@ -37,6 +38,11 @@ pub struct LinkInfo<'a> {
     pub history: &'a LinkHistory,
     /// Its counters.
     pub counters: &'a LinkCounters,
+    /// Of a connection to port 2000: the newest text that no command got as its reply.
+    pub other_text: Option<OtherText<'a>>,
+    /// The instant of the snapshot, from which ages count; zero outside a [`super::Status`].
+    #[cfg(feature = "serde")]
+    pub(super) at: Instant,
 }
 
 /// One item or none. All zeros when empty, unlike an `Option` of a struct.
@@ -98,7 +104,8 @@ impl<'a> LinksView<'a> {
             let urgent = link.urgent.iter().map(|session| (LinkId::URGENT, LinkKind::Urgent, session));
             let all = core::iter::once((LinkId::COMMAND, LinkKind::Command, &link.ordinary)).chain(urgent);
             all.map(move |(id, kind, session)| {
-                self.info(id, kind, link.transport(), &session.supervisor, &session.counters)
+                let info = self.info(id, kind, link.transport(), &session.supervisor, &session.counters);
+                LinkInfo { other_text: link.other_text_of(session), ..info }
             })
         });
         let state = self.state.into_iter().map(move |link| {
@@ -132,6 +139,9 @@ impl<'a> LinksView<'a> {
             state: supervisor.state(),
             history: supervisor.history(),
             counters,
+            other_text: None,
+            #[cfg(feature = "serde")]
+            at: Instant::ZERO,
         }
     }
 }

@@ -5,6 +5,7 @@ use super::counters::{LinkCounters, add, bump};
 use super::flight::Flight;
 use super::io::ReplyCode;
 use super::latency::Since;
+use super::other_text::LastText;
 use super::stops::{STOP_TTL, Waiting};
 use crate::command::{ClientEvent, CommandClient, Keyword, ReplyKind, StartError};
 use crate::link::{LinkTimings, Supervisor};
@@ -18,6 +19,8 @@ pub(super) struct Sent {
     pub keyword: Keyword,
     /// When it was handed over.
     pub at: Instant,
+    /// It has arrived, and the controller has sent a text that may be its reply in unknown words.
+    pub has_text: bool,
 }
 
 /// An event on a connection.
@@ -38,6 +41,8 @@ pub(super) struct Session {
     /// The command whose reply is awaited, and a newer, urgent one that did not wait for it.
     pub in_flight: Option<Sent>,
     pub beside: Option<Sent>,
+    /// The newest text that no command got as its reply.
+    pub last_text: Option<LastText>,
     /// The transport has not taken the newest command yet.
     unsent: bool,
     flight: Flight<2>,
@@ -51,6 +56,7 @@ impl Session {
             client: CommandClient::new(),
             in_flight: None,
             beside: None,
+            last_text: None,
             unsent: false,
             flight: Flight::new(),
         }
@@ -80,7 +86,7 @@ impl Session {
         out: &mut [u8],
         (now, until): (Instant, Instant),
     ) -> Result<usize, StartError> {
-        let sent = Some(Sent { command, keyword, at: now });
+        let sent = Some(Sent { command, keyword, at: now, has_text: false });
         let len = if self.client.busy() {
             let len = self.client.start_beside(now, text.as_bytes(), dialect, out)?;
             self.beside = sent;
@@ -149,8 +155,18 @@ impl Session {
                 return Some(Event::TimedOut);
             }
             ClientEvent::ScriptFinish => return Some(Event::Other),
-            _ => {
+            ClientEvent::Unsolicited { text, beside } => {
                 bump(&mut self.counters.malformed);
+                let sent = match beside {
+                    None => None,
+                    Some(false) => self.in_flight.as_mut(),
+                    Some(true) => self.beside.as_mut(),
+                };
+                self.last_text = Some(LastText::new(now, text, sent.as_ref().map(|sent| sent.command)));
+                if let Some(sent) = sent {
+                    // What came before the command had arrived is not its reply.
+                    sent.has_text |= self.flight.is_empty();
+                }
                 return Some(Event::Other);
             }
         };

@@ -213,7 +213,11 @@ impl<'a> Status<'a> {
 
     /// The links that the configuration needs.
     pub fn links(self) -> impl Iterator<Item = LinkInfo<'a>> {
-        self.links.infos()
+        self.links.infos().map(move |link| LinkInfo {
+            #[cfg(feature = "serde")]
+            at: self.at,
+            ..link
+        })
     }
 
     /// The known variables, in the order of the table; then bits with owners of their own.

@@ -6,7 +6,7 @@
 //!                      "command"?, "last_not_given"?, "last_failed"?, "last_rejection"?,
 //!                      "peers"?: { NUMBER: { "presence", "missed_periods", "counters" } },
 //!                      "counters" } },
-//!   "links": { NAME: { "kind", "state", "history", "counters" } },
+//!   "links": { NAME: { "kind", "state", "history", "other_text"?, "counters" } },
 //!   "controller"?: { "mode", "robot", "program", "safety", "age_ms" },
 //!   "values": { VARIABLE: { "value", "age_ms", "owner"? } },
 //!   "latency" }
@@ -21,6 +21,7 @@ use serde::ser::{Serialize, SerializeMap, Serializer};
 use super::failed::FailedCommand;
 use super::links::LinkInfo;
 use super::not_given::LastNotGiven;
+use super::other_text::OtherText;
 use super::rejection::LastRejection;
 use super::status::{ControllerStatus, FieldBus, PeerStatus, PortStatus, Status, VariableStatus};
 use crate::time::Instant;
@@ -180,7 +181,23 @@ impl Serialize for LinkInfo<'_> {
         map.serialize_entry("kind", self.kind.name())?;
         map.serialize_entry("state", self.state.name())?;
         map.serialize_entry("history", self.history)?;
+        if let Some(other) = &self.other_text {
+            map.serialize_entry("other_text", &At(other, self.at))?;
+        }
         map.serialize_entry("counters", self.counters)?;
+        map.end()
+    }
+}
+
+impl Serialize for At<&OtherText<'_>> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let &Self(other, at) = self;
+        let mut map = serializer.serialize_map(None)?;
+        map.serialize_entry("text", other.text)?;
+        map.serialize_entry("age_ms", &at.saturating_since(other.at).as_millis())?;
+        if let Some(command) = other.command {
+            map.serialize_entry("command", &Text(command))?;
+        }
         map.end()
     }
 }

@@ -69,6 +69,17 @@ pub enum SpeedReply {
     Percent,
 }
 
+/// A controller's answer to `poweron`, `poweroff`, `enable` or `disable` of which nothing is left to
+/// do.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum RepeatReply {
+    /// `poweron fail`
+    Fail,
+    /// `already poweron`
+    Already,
+}
+
 /// Whether a controller notifies its command clients when a program has ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
@@ -118,6 +129,8 @@ pub struct Dialect {
     pub run_reply: RunReply,
     /// A server's answer to a good `speed`. A client takes both.
     pub speed_reply: SpeedReply,
+    /// A server's answer to a command for the state that is there. A client takes both.
+    pub repeat_reply: RepeatReply,
     /// Whether a server sends `script finish`. A client always takes it.
     pub finish_notice: FinishNotice,
     /// The safety state's code for "updating firmware" (SS_UPDATE): 15 or 99.
@@ -144,6 +157,7 @@ impl Dialect {
         reply_terminator: Terminator::None,
         run_reply: RunReply::Start,
         speed_reply: SpeedReply::Success,
+        repeat_reply: RepeatReply::Fail,
         finish_notice: FinishNotice::Silent,
         safety_update: 15,
         robot_update: None,
@@ -163,6 +177,7 @@ impl Dialect {
         reply_terminator: Terminator::CrLf,
         run_reply: RunReply::Success,
         speed_reply: SpeedReply::Percent,
+        repeat_reply: RepeatReply::Already,
         finish_notice: FinishNotice::ScriptFinish,
         safety_update: 99,
         robot_update: Some(7),

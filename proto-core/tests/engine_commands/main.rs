@@ -2,6 +2,7 @@
 
 mod bits;
 mod ranges;
+mod replies;
 #[path = "../rig/mod.rs"]
 mod rig;
 mod silence;

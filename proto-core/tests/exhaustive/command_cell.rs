@@ -7,7 +7,7 @@ use proto_core::time::{Duration, Instant};
 use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::ScalarType;
 
-use crate::command_judge::{BIT, FIRST_COIL, Facts, GARBAGE, Header, SAFE};
+use crate::command_judge::{BIT, FIRST_COIL, Facts, GARBAGE, Header, OTHER_WORDS, SAFE};
 use crate::driver::{Broken, Conns, Gateway, Is, PORT, STEADY, Small};
 use crate::orders::{NONE, Order, RUN, STOP};
 use crate::rig::{Cell, user_in, var};
@@ -50,6 +50,8 @@ pub enum Event {
     Replied(LinkId, Order, bool),
     /// A reply comes that answers nothing.
     Stray,
+    /// Words come that the gateway does not know.
+    OtherWords(LinkId),
     Gone,
     Back,
     BusOff,
@@ -164,6 +166,7 @@ impl World for CommandCell {
             add(Acked(link), !conn.unsent && !conn.under_way.is_empty());
             add(AckedFirst(link), !conn.unsent && conn.under_way.len() > 1);
             if !conn.unsent {
+                add(OtherWords(link), judge.orders.is_without_words(link));
                 for order in judge.orders.unanswered(link) {
                     add(Replied(link, order, true), true);
                     add(Replied(link, order, false), true);
@@ -235,6 +238,7 @@ impl World for CommandCell {
             }
             Garbage => self.tell(Input::LinkBytes { link: LinkId::MODBUS, bytes: &GARBAGE }),
             Stray => self.tell(Input::LinkBytes { link: LinkId::COMMAND, bytes: b"run start" }),
+            OtherWords(link) => self.answer(link, OTHER_WORDS),
             Replied(link, order, is_done) => {
                 let text: &[u8] = match (order, is_done) {
                     (Order::Run, true) => b"run start",

@@ -15,6 +15,8 @@ pub const FIRST_COIL: u16 = 32;
 pub const SAFE: u8 = 4;
 /// Not Modbus: another protocol's id.
 pub const GARBAGE: [u8; 9] = [0, 1, 9, 9, 0, 3, 1, 15, 4];
+/// A text of port 2000 that is no reply.
+pub const OTHER_WORDS: &[u8] = b"busy\n";
 
 const ANSWER_TIMEOUT: Duration = Duration::from_millis(500);
 const REFUSED_PAUSE: Duration = Duration::from_millis(500);
@@ -133,6 +135,7 @@ impl Judge for Facts {
                     self.modbus_lost();
                 }
                 LinkId::MODBUS => self.modbus_answered(now, bytes),
+                _ if bytes == OTHER_WORDS => self.orders.other_words(link),
                 _ => {
                     let order = if bytes.starts_with(b"run") { Order::Run } else { Order::Stop };
                     self.orders.replied(link, order, !bytes.ends_with(b"fail"));

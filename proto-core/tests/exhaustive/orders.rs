@@ -43,6 +43,8 @@ struct Asked {
     order: Order,
     picked: Picked,
     at: Instant,
+    /// The controller has answered it in words that nobody knows.
+    has_words: bool,
 }
 
 #[derive(Debug, Clone)]
@@ -172,7 +174,9 @@ impl Orders {
         }
         // Of two, the newer one waits again.
         for asked in gone.into_iter().rev() {
-            if asked.order == Order::Stop && self.is_asked() {
+            if asked.has_words {
+                self.settle(asked.picked.nth, ReplyCode::Other);
+            } else if asked.order == Order::Stop && self.is_asked() {
                 self.stop.get_or_insert(Picked { since: now, ..asked.picked });
             } else {
                 self.settle(asked.picked.nth, ReplyCode::NoReply);
@@ -208,7 +212,8 @@ impl Orders {
     pub fn slept(&mut self) {
         self.woke |= self.base.take().is_some();
         for asked in std::mem::take(&mut self.asked) {
-            self.settle(asked.picked.nth, ReplyCode::NoReply);
+            let reply = if asked.has_words { ReplyCode::Other } else { ReplyCode::NoReply };
+            self.settle(asked.picked.nth, reply);
         }
         self.drop_runs();
         if let Some(stop) = self.stop.take() {
@@ -237,10 +242,12 @@ impl Orders {
             if is_stopping {
                 return Err("runs while it is to stop".to_owned());
             }
-            if link != LinkId::COMMAND || !self.asked.is_empty() {
+            // What holds nothing back any more has its own connection.
+            let is_past = |asked: &Asked| asked.link == LinkId::URGENT && asked.has_words;
+            if link != LinkId::COMMAND || !self.asked.iter().all(is_past) {
                 return Err(format!("runs by {link:?} while {:?} is unanswered", self.asked));
             }
-            self.asked.push(Asked { link, order: Order::Run, picked, at: now });
+            self.asked.push(Asked { link, order: Order::Run, picked, at: now, has_words: false });
             return Ok(until);
         }
         // A line feed ends a keyword that is unanswered, so that the controller takes them for two.
@@ -263,13 +270,27 @@ impl Orders {
             conns.must_close(now, LinkId::COMMAND);
             self.lost(LinkId::COMMAND, now);
         }
-        self.asked.push(Asked { link, order: Order::Stop, picked, at: now });
+        self.asked.push(Asked { link, order: Order::Stop, picked, at: now, has_words: false });
         Ok(now + SOON)
     }
 
     /// What is unanswered on a connection.
     pub fn unanswered(&self, link: LinkId) -> impl Iterator<Item = Order> {
         self.asked.iter().filter(move |asked| asked.link == link).map(|asked| asked.order)
+    }
+
+    /// The controller said something that nobody knows: it may be the reply to the oldest that has had
+    /// none of that.
+    pub fn other_words(&mut self, link: LinkId) {
+        let mut asked = self.asked.iter_mut().filter(|asked| asked.link == link);
+        if let Some(asked) = asked.find(|asked| !asked.has_words) {
+            asked.has_words = true;
+        }
+    }
+
+    /// Whether something is unanswered on a connection, and no unknown words have come for it.
+    pub fn is_without_words(&self, link: LinkId) -> bool {
+        self.asked.iter().any(|asked| asked.link == link && !asked.has_words)
     }
 
     /// The controller replied; to something that nobody asked, it may be.
@@ -344,7 +365,8 @@ impl Orders {
     }
 
     fn is_stopping(&self) -> bool {
-        self.stop.is_some() || self.asked.iter().any(|asked| asked.order == Order::Stop)
+        let holds = |asked: &Asked| asked.order == Order::Stop && !asked.has_words;
+        self.stop.is_some() || self.asked.iter().any(holds)
     }
 
     fn drop_runs(&mut self) {

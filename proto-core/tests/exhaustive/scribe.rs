@@ -262,7 +262,7 @@ impl Scribe {
         match text {
             b"None" | b"Some" if self.field == Field::Shown => return,
             // Whether there is one is only shown, too.
-            b"LastRejection" => {
+            b"LastRejection" | b"LastText" => {
                 self.word = Word::Struct(Kind::LeftOut);
                 return;
             }
@@ -291,7 +291,9 @@ impl Scribe {
             b"bytes" | b"group" | b"ring" | b"buffer" | b"mask" | b"codes" | b"picked" => {
                 Word::Field(Field::Buffer)
             }
-            b"last_rejection" | b"offered" | b"due_since" | b"born" => Word::Field(Field::Shown),
+            b"last_rejection" | b"last_text" | b"offered" | b"due_since" | b"born" => {
+                Word::Field(Field::Shown)
+            }
             b"stamps" | b"packet_at" | b"source_at" | b"frame_at" => Word::Field(Field::Stamps),
             b"unconfirmed_since" => Word::Field(Field::Unconfirmed),
             b"confirmed_at" => Word::Field(Field::Confirmed),

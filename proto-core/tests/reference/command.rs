@@ -192,8 +192,24 @@ pub enum Event {
     /// To the older request, or to the one beside it.
     Reply(Turn, Vec<u8>),
     ScriptFinish,
-    Unsolicited(Vec<u8>),
+    /// With the request whose reply it may be.
+    Unsolicited(Vec<u8>, Option<Turn>),
     Timeout,
+}
+
+/// A request in flight.
+#[derive(Debug, Clone)]
+pub struct Asked {
+    pub word: String,
+    since: u64,
+    until: u64,
+    has_text: bool,
+}
+
+impl Asked {
+    fn new(word: &str, now: u64) -> Self {
+        Self { word: word.to_owned(), since: now, until: now + 10_000_000, has_text: false }
+    }
 }
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -216,10 +232,9 @@ enum Front {
 #[derive(Debug, Clone, Default)]
 pub struct Client {
     bytes: Vec<u8>,
-    /// The keyword that is waited for, and until when.
-    pub waiting: Option<(String, u64)>,
-    /// The same of a younger, urgent request that was not kept waiting.
-    pub beside: Option<(String, u64)>,
+    pub waiting: Option<Asked>,
+    /// A younger, urgent request that was not kept waiting.
+    pub beside: Option<Asked>,
     dropping: bool,
     newest: u64,
     pub dropped: u32,
@@ -230,19 +245,19 @@ impl Client {
         if !b"script finish".starts_with(&self.bytes) {
             self.bytes.clear();
         }
-        self.waiting = Some((word.to_owned(), now + 10_000_000));
+        self.waiting = Some(Asked::new(word, now));
     }
 
     pub fn start_beside(&mut self, now: u64, word: &str) {
         if self.waiting.is_none() {
             return self.start(now, word);
         }
-        self.beside = Some((word.to_owned(), now + 10_000_000));
+        self.beside = Some(Asked::new(word, now));
     }
 
     /// When the older one is given up.
     fn until(&self) -> Option<u64> {
-        [&self.waiting, &self.beside].into_iter().flatten().map(|(_, until)| *until).min()
+        [&self.waiting, &self.beside].into_iter().flatten().map(|asked| asked.until).min()
     }
 
     pub fn abort(&mut self) {
@@ -322,10 +337,11 @@ impl Client {
         }
         let text: Vec<u8> = self.bytes.drain(..len).collect();
         // What answers both is the answer to the one in turn.
-        let is_reply = !matches!(front, Front::Other);
-        let answers = |request: &Option<(String, u64)>| {
-            is_reply && request.as_ref().is_some_and(|(word, _)| answers(word, &text))
-        };
+        if matches!(front, Front::Other) {
+            return self.hear_words(text, events);
+        }
+        let answers =
+            |request: &Option<Asked>| request.as_ref().is_some_and(|asked| answers(&asked.word, &text));
         events.push(if text == b"script finish" {
             Event::ScriptFinish
         } else if answers(&self.waiting) {
@@ -335,8 +351,52 @@ impl Client {
             self.beside = None;
             Event::Reply(Turn::Beside, text)
         } else {
-            Event::Unsolicited(text)
+            Event::Unsolicited(text, None)
         });
+    }
+
+    /// Words that are no reply, unless they name a request and say that it failed.
+    fn hear_words(&mut self, text: Vec<u8>, events: &mut Vec<Event>) {
+        let words = words(&text);
+        let newest = self.newest;
+        let place_of_name = |asked: &Option<Asked>| {
+            let asked = asked.as_ref().filter(|asked| asked.since <= newest)?;
+            words.iter().position(|word| *word == asked.word || asked.word == "speed" && word == "set")
+        };
+        let named = match (place_of_name(&self.waiting), place_of_name(&self.beside)) {
+            (Some(older), Some(beside)) if beside < older => Some(Turn::Beside),
+            (Some(_), _) => Some(Turn::InTurn),
+            (None, Some(_)) => Some(Turn::Beside),
+            (None, None) => None,
+        };
+        let can_fail = |asked: &Option<Asked>| {
+            let is_question = |asked: &Asked| BARE[8..].contains(&asked.word.as_str());
+            asked.as_ref().is_some_and(|asked| !is_question(asked))
+        };
+        let fails = words.iter().any(|word| ["fail", "failed", "error"].contains(&word.as_str()));
+        match named {
+            Some(Turn::InTurn) if fails && can_fail(&self.waiting) => {
+                self.waiting = self.beside.take();
+                return events.push(Event::Reply(Turn::InTurn, text));
+            }
+            Some(Turn::Beside) if fails && can_fail(&self.beside) => {
+                self.beside = None;
+                return events.push(Event::Reply(Turn::Beside, text));
+            }
+            _ => {}
+        }
+        let has_none = |asked: &Option<Asked>| {
+            asked.as_ref().is_some_and(|asked| asked.since <= newest && !asked.has_text)
+        };
+        let to = named
+            .or_else(|| has_none(&self.waiting).then_some(Turn::InTurn))
+            .or_else(|| has_none(&self.beside).then_some(Turn::Beside));
+        match to {
+            Some(Turn::InTurn) => self.waiting.iter_mut().for_each(|asked| asked.has_text = true),
+            Some(Turn::Beside) => self.beside.iter_mut().for_each(|asked| asked.has_text = true),
+            None => {}
+        }
+        events.push(Event::Unsolicited(text, to));
     }
 
     fn front(&self) -> Front {
@@ -344,7 +404,7 @@ impl Client {
         if let Some(len) = text_reply(bytes) {
             return Front::Complete(len);
         }
-        let word = self.waiting.as_ref().map_or("", |(word, _)| word);
+        let word = self.waiting.as_ref().map_or("", |asked| &asked.word);
         let value = match word {
             "state" => state(bytes),
             "isprogfinish" if is_flag(bytes) => Front::Complete(1),
@@ -364,13 +424,15 @@ static TEXTS: LazyLock<Vec<String>> = LazyLock::new(|| {
         "run start",
         "run success",
         "run fail",
+        "script error",
         "set success",
         "set fail",
         "unknown command",
         "script finish",
     ];
     let did = BARE[..8].iter().flat_map(|word| [format!("{word} success"), format!("{word} fail")]);
-    fixed.into_iter().map(str::to_owned).chain(did).collect()
+    let already = BARE[..8].iter().map(|word| format!("already {word}"));
+    fixed.into_iter().map(str::to_owned).chain(did).chain(already).collect()
 });
 
 /// The length of the text reply that `bytes` begin with.
@@ -450,11 +512,18 @@ fn answers(word: &str, text: &[u8]) -> bool {
     let text = String::from_utf8_lossy(text);
     match word {
         _ if text == "unknown command" => true,
-        "run" => text.starts_with("run "),
+        "run" => text.starts_with("run ") || text == "script error",
         "speed" => text.starts_with("set "),
         "state" => text.contains(':'),
         "isprogfinish" => text == "0" || text == "1",
         "getlasterror" => text.contains(':'),
-        _ => text.starts_with(&format!("{word} ")),
+        _ => text.starts_with(&format!("{word} ")) || text == format!("already {word}"),
     }
+}
+
+/// Its words in small letters.
+fn words(text: &[u8]) -> Vec<String> {
+    let letters = text.iter().map(|&byte| if byte.is_ascii_alphanumeric() { byte as char } else { ' ' });
+    let text: String = letters.collect();
+    text.to_lowercase().split(' ').map(str::to_owned).collect()
 }

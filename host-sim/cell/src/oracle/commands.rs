@@ -244,11 +244,12 @@ impl Commands {
         self.heard[side(link)].push_str(&String::from_utf8_lossy(bytes));
     }
 
-    /// Matches the replies that the engine has counted with unanswered commands.
-    pub(super) fn match_replies(&mut self, engine: &Engine) {
+    /// Matches the replies that the engine has counted with unanswered commands. A whole reply that it has
+    /// not counted is an error.
+    pub(super) fn match_replies(&mut self, engine: &Engine) -> Result<(), Wrong> {
         if self.unanswered.is_empty() {
             self.heard.iter_mut().for_each(String::clear);
-            return;
+            return Ok(());
         }
         for info in engine.links() {
             if info.id != LinkId::COMMAND && info.id != LinkId::URGENT {
@@ -268,10 +269,18 @@ impl Commands {
                 let heard = &mut self.heard[place];
                 *heard = heard.replacen(word(&command.text), "", 1);
             }
+            let mut unanswered = self.unanswered.iter().filter(|(on, _)| *on == info.id);
+            let heard = &self.heard[place];
+            if let Some((reply, text)) =
+                unanswered.find_map(|(_, command)| Some((command.reply_in(heard)?, &command.text)))
+            {
+                return Err((Invariant::Counted, format!("{reply:?} came, and {text} is still unanswered")));
+            }
             if self.unanswered.iter().all(|(on, _)| *on != info.id) {
                 self.heard[place].clear();
             }
         }
+        Ok(())
     }
 
     /// Checks a command that the engine sends, and returns it.
@@ -336,6 +345,17 @@ impl Commands {
 }
 
 impl Command {
+    /// The reply to it in a text that the controller sent, in the form of any version.
+    fn reply_in(&self, heard: &str) -> Option<String> {
+        let word = word(&self.text);
+        let forms = match word {
+            "run" => vec!["run start".to_owned(), "run success".to_owned(), "run fail".to_owned()],
+            "speed" => vec!["set success".to_owned(), "set fail".to_owned()],
+            _ => vec![format!("{word} success"), format!("{word} fail"), format!("already {word}")],
+        };
+        forms.into_iter().find(|reply| heard.contains(reply))
+    }
+
     fn same_kind(&self, other: &Self) -> bool {
         self.place.0 == other.place.0 && self.text == other.text
     }

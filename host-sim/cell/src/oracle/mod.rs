@@ -306,7 +306,8 @@ impl Oracle {
             Input::LinkAcked { link, left } => self.links[place(link)].acked(left),
             _ => {}
         }
-        self.commands.match_replies(engine);
+        let result = self.commands.match_replies(engine);
+        self.judge(now, &[], result);
         if reported.is_some() {
             self.find_lost_links(engine, None, now);
         }

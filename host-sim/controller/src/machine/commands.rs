@@ -78,6 +78,21 @@ impl Machine {
         Ok((effect, Transition { action, begun: self.begun }))
     }
 
+    /// Whether the robot is where the command would lead it, so that nothing is left to do. Only of power
+    /// and drives: without a program, `stop` and `pause` are refused.
+    pub fn is_already(&self, action: Action) -> bool {
+        match action {
+            Action::PowerOn => matches!(
+                self.robot,
+                Robot::Disabled | Robot::Enabling { .. } | Robot::Enabled | Robot::Disabling { .. }
+            ),
+            Action::PowerOff => self.robot == Robot::Off,
+            Action::Enable => self.robot == Robot::Enabled,
+            Action::Disable => self.robot == Robot::Disabled,
+            Action::Stop | Action::Pause | Action::Resume | Action::Shutdown => false,
+        }
+    }
+
     /// The effect on the rest of the controller, or why the command is refused.
     fn begin(&mut self, now: Instant, action: Action) -> Result<Effect, &'static str> {
         let begins = now + self.delay;

@@ -11,7 +11,7 @@ use proto_core::command::{
     UnknownCommand,
 };
 use proto_core::time::{Duration, Instant};
-use proto_core::wire::dialect::Dialect;
+use proto_core::wire::dialect::{Dialect, RepeatReply};
 use proto_core::wire::state::ProgramState;
 
 use super::Link;
@@ -198,6 +198,11 @@ impl Controller {
                 };
                 self.speed_changed(now);
                 self.reply(now, conn, &reply);
+            }
+            Command::Do(action)
+                if self.dialect.repeat_reply == RepeatReply::Already && self.machine.is_already(action) =>
+            {
+                self.reply(now, conn, &Reply::Already(action));
             }
             Command::Do(action) => match self.act(now, action) {
                 Ok(transition) => {

@@ -228,3 +228,40 @@ fn a_later_dialect_speaks_otherwise() {
     cell.run_ms(100);
     assert_eq!(cell.packets[0].1.reserved_656[4], 50, "global speed at byte 660");
 }
+
+#[test]
+fn a_later_dialect_says_what_is_so_already() {
+    for (power, said) in [
+        (Power::Off, ["poweron", "already poweroff", "enable fail", "disable fail"]),
+        (Power::On, ["already poweron", "poweroff", "enable", "already disable"]),
+        (Power::Enabled, ["already poweron", "poweroff", "already enable", "disable"]),
+    ] {
+        for (command, expected) in ["poweron", "poweroff", "enable", "disable"].into_iter().zip(said) {
+            let mut cell = robot(&with_power(with_dialect(config(), "v2.6"), power));
+            let c = cell.command_client();
+            let answer = cell.ask(c, command);
+            // What begins a transition is answered at its end.
+            cell.run_ms(400);
+            let later = String::from_utf8(cell.take(c)).unwrap();
+            let expected = match expected == command {
+                true => format!("{command} success\r\n"),
+                false => format!("{expected}\r\n"),
+            };
+            assert_eq!([answer, later].concat(), expected, "{power:?}");
+            let error = if expected.contains("fail") { "2001" } else { "0" };
+            assert_eq!(cell.ask(c, "getlasterror").split(':').next(), Some(error), "nothing was refused");
+            // The published description knows no such text.
+            if expected.starts_with("already") {
+                let mut cell = robot(&with_power(config(), power));
+                let c = cell.command_client();
+                assert_eq!(cell.ask(c, command), format!("{command} fail"));
+            }
+        }
+    }
+    // On, and on the way to another state.
+    let mut cell = robot(&with_power(with_dialect(config(), "v2.6"), Power::On));
+    let (c, d) = (cell.command_client(), cell.command_client());
+    assert_eq!(cell.ask(c, "enable"), "");
+    assert_eq!(cell.ask(d, "poweron"), "already poweron\r\n");
+    assert_eq!(cell.ask(d, "enable"), "enable fail\r\n", "not yet");
+}

@@ -125,6 +125,37 @@ fn a_command_without_a_reply_is_told_with_its_age_for_a_minute() {
 }
 
 #[test]
+fn a_reply_in_unknown_words_is_told_with_them_for_a_minute() {
+    let mut bench = Bench::new(PANEL);
+    bench.pass(1_100);
+    bench.up(LinkId::COMMAND);
+    bench.bytes(&[255, 0, 254]);
+    let other = |bench: &mut Bench| {
+        bench.input(Input::LinkAcked { link: LinkId::COMMAND, left: 0 });
+        bench.input(Input::LinkBytes { link: LinkId::COMMAND, bytes: b"teach mode\r\n" });
+    };
+    // Of no command.
+    other(&mut bench);
+    bench.bytes(&[255, 1, 254]);
+    bench.pass(10);
+    assert_eq!(bench.of_ports(), []);
+    other(&mut bench);
+    let lives = |bench: &mut Bench, seconds: u64| {
+        for _ in 0..seconds * 20 {
+            bench.bytes(&[255, 1, 254]);
+            bench.pass(50);
+        }
+    };
+    lives(&mut bench, 5);
+    bench.says(Cause::OtherReply, &["run(pick.jspf) answered", "5 s ago: \"teach mode\""]);
+    // The end of its time changes nothing.
+    lives(&mut bench, 50);
+    bench.says(Cause::OtherReply, &["55 s ago"]);
+    lives(&mut bench, 6);
+    assert_eq!(bench.of_ports(), []);
+}
+
+#[test]
 fn a_controller_that_would_refuse_is_told_before_a_command() {
     let mut bench = Bench::new(PANEL);
     bench.pass(100);

@@ -17,7 +17,14 @@ fn show(event: &ClientEvent<'_>) -> String {
     match event {
         ClientEvent::Reply { kind, text, .. } => format!("{kind:?} {}", String::from_utf8_lossy(text)),
         ClientEvent::ScriptFinish => "finish".into(),
-        ClientEvent::Unsolicited { text } => format!("?{}", String::from_utf8_lossy(text)),
+        ClientEvent::Unsolicited { text, beside } => {
+            let to = match beside {
+                None => "?",
+                Some(false) => "?older: ",
+                Some(true) => "?beside: ",
+            };
+            format!("{to}{}", String::from_utf8_lossy(text))
+        }
         ClientEvent::Timeout => "timeout".into(),
     }
 }
@@ -134,7 +141,7 @@ fn an_error_without_its_terminator_is_complete_after_100_ms() {
 fn a_blank_before_a_message_does_not_end_it_early() {
     let mut client = asking("getlasterror");
     assert!(receive(&mut client, at(1), b"hellorun start 1F:joint").is_empty());
-    assert_eq!(receive(&mut client, at(21), b""), ["?hello", "?run start"]);
+    assert_eq!(receive(&mut client, at(21), b""), ["?older: hello", "?run start"]);
     assert_eq!(client.deadline(), Some(at(101)));
     assert!(receive(&mut client, at(100), b"").is_empty());
     assert_eq!(receive(&mut client, at(101), b""), ["Value 1F:joint"]);
@@ -189,15 +196,117 @@ fn unknown_texts_are_reported_and_do_not_hide_the_reply() {
     let mut client = asking("enable");
     assert_eq!(
         receive(&mut client, at(1), b"welcome\r\nenable success"),
-        ["?welcome", "Success enable success"]
+        ["?older: welcome", "Success enable success"]
     );
     let mut client = asking("enable");
     assert!(receive(&mut client, at(1), b">enable success").is_empty());
     assert_eq!(client.deadline(), Some(at(21)));
-    assert_eq!(receive(&mut client, at(21), b""), ["?>", "Success enable success"]);
+    assert_eq!(receive(&mut client, at(21), b""), ["?older: >", "Success enable success"]);
     let mut client = asking("enable");
-    assert_eq!(receive(&mut client, at(1), b"enable suc\r\n"), ["?enable suc"]);
+    assert_eq!(receive(&mut client, at(1), b"enable suc\r\n"), ["?older: enable suc"]);
     assert!(client.busy());
+}
+
+#[test]
+fn what_is_so_already_is_done() {
+    for word in ["poweron", "poweroff", "enable", "disable", "stop"] {
+        let text = format!("already {word}");
+        let success = format!("Success {text}");
+        for piece in 1..text.len() {
+            let mut client = asking(word);
+            let (first, rest) = text.as_bytes().split_at(piece);
+            assert!(receive(&mut client, at(1), first).is_empty());
+            assert_eq!(client.deadline(), Some(at(10_000)), "the beginning of a reply");
+            assert_eq!(receive(&mut client, at(2), rest), [&*success], "complete with its last byte");
+            assert!(!client.busy());
+        }
+    }
+    // The reply to another command ends none.
+    let mut client = asking("poweron");
+    assert_eq!(
+        receive(&mut client, at(1), b"already poweroffalready enable"),
+        ["?already poweroff", "?already enable"]
+    );
+    assert!(client.busy());
+    assert_eq!(receive(&mut client, at(2), b"already poweron"), ["Success already poweron"]);
+}
+
+#[test]
+fn a_text_that_names_the_command_and_a_failure_is_a_failure() {
+    for (command, text) in [
+        ("poweron", "poweron error"),
+        ("poweron", "Error: PowerOn, the brake is open"),
+        ("enable", "could not enable (FAILED)"),
+        ("run(a)", "error 5: cannot run a.jspf"),
+        ("run(a)", "script error"),
+        ("speed(5)", "speed error"),
+        ("speed(5)", "set: failed"),
+    ] {
+        let mut client = asking(command);
+        let line = format!("{text}\r\n");
+        assert_eq!(receive(&mut client, at(1), line.as_bytes()), [format!("Fail {text}")]);
+        assert!(!client.busy());
+        let mut client = asking(command);
+        let found =
+            [receive(&mut client, at(1), text.as_bytes()), receive(&mut client, at(21), b"")].concat();
+        assert_eq!(found, [format!("Fail {text}")], "without a terminator");
+    }
+}
+
+#[test]
+fn other_words_end_no_request() {
+    for (command, text) in [
+        ("poweron", "the robot has power"),
+        ("poweron", "error: no brake"),
+        ("poweron", "poweron refused"),
+        ("poweron", "poweron errors: 0"),
+        ("poweron", "enable error"),
+        ("poweron", "script error"),
+        ("state", "state error"),
+    ] {
+        let mut client = asking(command);
+        let line = format!("{text}\n");
+        let to = if text == "script error" { "?" } else { "?older: " };
+        assert_eq!(receive(&mut client, at(1), line.as_bytes()), [format!("{to}{text}")]);
+        assert!(client.busy(), "{text}");
+        assert_eq!(receive(&mut client, at(9_999), b""), [""; 0]);
+        assert_eq!(receive(&mut client, at(10_000), b""), ["timeout"]);
+    }
+    assert_eq!(receive(&mut CommandClient::new(), at(1), b"welcome\n"), ["?welcome"]);
+}
+
+#[test]
+fn other_words_belong_to_the_request_that_they_name_or_to_the_oldest_without_any() {
+    let two = || {
+        let mut client = asking("resume");
+        client.start_beside(at(5), b"stop", &Dialect::V2_3, &mut [0; 16]).unwrap();
+        client
+    };
+    let mut client = two();
+    assert_eq!(
+        receive(&mut client, at(6), b"stopping to stop, not to resume\n"),
+        ["?beside: stopping to stop, not to resume"]
+    );
+    assert_eq!(receive(&mut client, at(6), b"busy\nbusy\n"), ["?older: busy", "?busy"]);
+    let mut client = two();
+    assert_eq!(
+        receive(&mut client, at(6), b"busy\nbusy\nbusy\n"),
+        ["?older: busy", "?beside: busy", "?busy"]
+    );
+    assert!(client.busy() && client.busy_beside());
+    assert_eq!(receive(&mut client, at(7), b"resume success"), ["Success resume success"]);
+    assert_eq!(receive(&mut client, at(7), b"busy\n"), ["?busy"], "what is left has had its words");
+    let mut client = two();
+    assert_eq!(
+        receive(&mut client, at(6), b"error: stop before resume\n"),
+        ["Fail error: stop before resume"]
+    );
+    assert!(client.busy() && !client.busy_beside(), "the first that it names");
+    // It was on its way before the stop.
+    let mut client = asking("resume");
+    assert!(receive(&mut client, at(4), b"stop error").is_empty());
+    client.start_beside(at(5), b"stop", &Dialect::V2_3, &mut [0; 16]).unwrap();
+    assert_eq!(receive(&mut client, at(24), b""), ["?older: stop error"]);
 }
 
 #[test]
@@ -215,7 +324,8 @@ fn a_flood_is_handed_on_in_bounded_pieces() {
     let mut client = asking("stop");
     let events = receive(&mut client, at(1), &[b'#'; 1000]);
     assert_eq!(events.len(), 3);
-    assert!(events.iter().all(|event| event.len() == MAX_REPLY + 1));
+    let texts: Vec<&str> = events.iter().map(|event| event.trim_start_matches("?older: ")).collect();
+    assert!(texts.iter().all(|text| text.trim_start_matches('?').len() == MAX_REPLY));
     assert_eq!(receive(&mut client, at(2), b"\nstop success").last().unwrap(), "Success stop success");
 }
 

@@ -97,6 +97,16 @@ fn replies_are_read_in_both_dialects_forms() {
     assert_eq!(Reply::parse(Do(Action::Stop), b"pause fail"), None);
     assert_eq!(Reply::parse(Do(Action::PowerOn), b"poweroff success"), None);
     assert_eq!(Reply::parse(State, b"unknown command\r\n"), Some(Reply::UnknownCommand));
+    let already = Reply::parse(Do(Action::Enable), b"already enable\r\n");
+    assert_eq!(already, Some(Reply::Already(Action::Enable)));
+    assert_eq!(already.map(|reply| reply.kind()), Some(ReplyKind::Success));
+    assert_eq!(Reply::parse(Do(Action::Enable), b"already disable"), None);
+    assert_eq!(Reply::parse(Do(Action::Enable), b"already"), None);
+    assert_eq!(Reply::parse(Run, b"already run"), None, "it may be another program");
+    let fail = Reply::Did { action: Action::Enable, outcome: Outcome::Fail };
+    assert_eq!(Reply::parse(Do(Action::Enable), b"Error: cannot enable"), Some(fail));
+    assert_eq!(Reply::parse(Do(Action::Enable), b"Error: cannot disable"), None);
+    assert_eq!(Reply::parse(Run, b"script error"), Some(Reply::Run(Outcome::Fail)));
 }
 
 #[test]
@@ -142,6 +152,7 @@ proptest! {
                 replies.push((Keyword::Do(action), Reply::Did { action, outcome }));
             }
         }
+        replies.extend(Action::ALL.map(|action| (Keyword::Do(action), Reply::Already(action))));
         let [robot, program, safety, mode] = codes;
         replies.push((Keyword::Speed, Reply::SpeedSet(Percent::new(speed))));
         replies.push((Keyword::Speed, Reply::SpeedRefused));
