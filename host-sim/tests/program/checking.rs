@@ -189,7 +189,7 @@ fn ids_that_collide_are_told() {
         said.filter(|said| said.contains("destroy")).collect::<Vec<_>>()
     };
     let end = "if both are on one bus, two frames with one id at the same time destroy each other";
-    let a = port("a", &(frame("input", 0x101) + &frame("output", 0x201)));
+    let a = port("a", &(frame("input", 0x101) + frame("output", 0x201).as_str()));
     assert_eq!(told(&[a.clone(), port("b", &frame("output", 0x202))], &[]), [""; 0]);
     assert_eq!(
         told(&[a.clone(), port("b", &frame("output", 0x201))], &[]),
@@ -203,7 +203,7 @@ fn ids_that_collide_are_told() {
     assert_eq!(told(&[a.clone(), port("b", &frame("input", 0x101))], &[]), [""; 0]);
     let one_bus = ["--same-bus", "a,b"];
     assert_eq!(told(&[a.clone(), port("b", &frame("output", 0x201))], &one_bus).len(), 1);
-    let own = told(&[port("a", &(frame("input", 0x101) + &frame("output", 0x101)))], &[]);
+    let own = told(&[port("a", &(frame("input", 0x101) + frame("output", 0x101).as_str()))], &[]);
     assert!(own.len() == 1 && own[0].starts_with("port \"a\" sends id 0x101 and receives it: "), "{own:?}");
 }
 
