@@ -3,13 +3,13 @@
 mod rig;
 
 use proto_core::config::*;
-use proto_core::device::{Algorithm, Checksum, Encoding, Overflow};
+use proto_core::device::{Algorithm, Checksum, Encoding, LayoutError, Overflow};
 use proto_core::engine::{PortId, Rejection};
 use proto_core::recipe::PartError;
 use proto_core::recipe::model::Mode;
 use proto_core::sysvar::{Direction, ModbusPlace};
 use proto_core::time::Duration;
-use proto_core::wire::can::CanId;
+use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::{Scalar, ScalarType as T};
 use rig::*;
 
@@ -449,4 +449,43 @@ fn what_makes_no_sense_behind_a_field_is_refused_with_its_place() {
         );
         assert!(error.kind.to_string().contains(said), "{fields:?}: {}", error.kind);
     }
+}
+
+#[test]
+fn a_cycle_is_handed_over_at_once_in_its_order_with_a_frame_without_data() {
+    let mut cell = Cell::new();
+    let frames = [(0x310, vec![output(44.0), output(1.0)]), (0x210, vec![output(15.0)]), (0x80, vec![])];
+    let port = bus(&mut cell, [&[], &frames]);
+    let mut rig = cell.rig();
+    rig.run(MS(300));
+    let sent = rig.can_sent_to(port);
+    let cycle = [(0x310, &[44, 1][..]), (0x210, &[15]), (0x80, &[])];
+    let cycle = cycle.map(|(id, data)| CanFrame::new(CanId::Standard(id), data).unwrap());
+    assert!(sent.len() > 3 && sent.len().is_multiple_of(3), "{sent:?}");
+    assert!(sent.chunks(3).all(|frames| frames == cycle), "{sent:?}");
+}
+
+#[test]
+fn a_request_on_can_may_be_without_data() {
+    let mut cell = Cell::new();
+    let port = bus(&mut cell, [&[(0x181, vec![input(T::Byte, to("WordInputReg[1]"))])], &[]]);
+    let fields = cell.fields([]);
+    let (id, head, tail) = (Some(CanId::Standard(0x80)), Delimiter::new(), Delimiter::new());
+    cell.0.frames.push(FrameSpec { id, remote: false, head, tail, fields }).unwrap();
+    let sync = Talk::Frames { request: Some(0), reply: None, refusal: None };
+    cell.0.exchanges.push(Exchange::new(0, sync, AskWhen::every(MS(20)))).unwrap();
+    cell.last_recipe().exchanges = Span { start: 0, len: 1 };
+    let mut rig = cell.rig();
+    rig.run(MS(300));
+    let sent = rig.can_sent_to(port);
+    let sync = CanFrame::new(CanId::Standard(0x80), &[]).unwrap();
+    assert!(sent.len() >= 10 && sent.iter().all(|frame| *frame == sync), "{sent:?}");
+}
+
+#[test]
+fn what_is_received_on_can_has_a_field() {
+    let mut cell = Cell::new();
+    bus(&mut cell, [&[(0x181, vec![])], &[(0x80, vec![])]]);
+    let ConfigError { kind, .. } = cell.0.validate().unwrap_err();
+    assert!(matches!(kind, ConfigErrorKind::Layout(LayoutError::Empty)), "{kind:?}");
 }

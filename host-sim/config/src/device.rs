@@ -121,6 +121,10 @@ pub struct NamedFrame {
     pub tail: Vec<u8>,
     /// The fields, and the checksum at its place.
     pub fields: Vec<DeviceField>,
+    /// Its name, if the file gives it one: of an output frame on CAN.
+    pub name: Option<String>,
+    /// The name of the frame behind which it is sent.
+    pub after: Option<String>,
 }
 
 /// A field of a device's frame. Its `spec` has no table of commands: the field is unused there, and

@@ -15,7 +15,7 @@ mod schema;
 mod sim;
 mod target;
 
-pub use advice::negative_numbers;
+pub use advice::{negative_numbers, orders_before_values};
 pub use device::{
     AnyRecipe, DeviceField, DeviceRecipe, ExchangeKind, FieldCommands, FrameEnds, NamedExchange, NamedFrame,
 };

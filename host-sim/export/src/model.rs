@@ -329,7 +329,7 @@ fn of_system(recipe: &SimRecipe) -> Result<Vec<Format>, LayoutError> {
             DeviceField::new(field.name.clone(), spec)
         };
         let fields = fields.iter().map(field).collect();
-        NamedFrame { id, head: head.to_vec(), tail: tail.to_vec(), fields }
+        NamedFrame { id, head: head.to_vec(), tail: tail.to_vec(), fields, name: None, after: None }
     };
     let mut formats = Vec::new();
     let mut add = |part: Direction, carrier, frame: &NamedFrame, fields: &[SimField]| {

@@ -105,6 +105,7 @@ fn report(args: &CheckArgs) -> Result<Report, Refused> {
             report.buses = buses;
             let mut placed = fill::warnings(config);
             placed.extend(recipe_config::negative_numbers(&frames));
+            placed.extend(recipe_config::orders_before_values(&frames));
             placed.extend(
                 troubles
                     .into_iter()

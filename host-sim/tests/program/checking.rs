@@ -123,7 +123,12 @@ fn ports_on_one_bus_are_added_up() {
     let (_, alone) = json(&["check", &file, "--json"]);
     let buses = alone["buses"].as_array().unwrap();
     assert_eq!(buses.len(), 2, "{alone:#}");
-    assert!(alone["warnings"].as_array().unwrap().is_empty(), "{alone:#}");
+    // Both send 0x201, which matters if the ports are on one bus.
+    let warnings = alone["warnings"].as_array().unwrap();
+    assert_eq!(warnings.len(), 1, "{alone:#}");
+    let said = warnings[0]["message"].as_str().unwrap();
+    assert!(said.contains("both send id 0x201; if both are on one bus, two frames"), "{said}");
+    assert_eq!(warnings[0]["key"], "port.can-2.bus");
     let load = |bus: &Value, key: &str| bus[key].as_f64().unwrap();
     let sum: f64 = buses.iter().map(|bus| load(bus, "worst_percent")).sum();
 
@@ -156,6 +161,50 @@ fn ports_on_one_bus_are_added_up() {
         assert_eq!(output.status.code(), Some(2), "{message}");
         assert!(message.contains(said), "{message}");
     }
+}
+
+#[test]
+fn ids_that_collide_are_told() {
+    let frame = |part: &str, id: u16| {
+        let field = match part {
+            "input" => "type = \"byte\"".to_owned(),
+            _ => "type = \"byte\", value = 1".to_owned(),
+        };
+        format!("[[recipe.{part}.frame]]\nid = {id}\nfields = [{{ name = \"x\", {field} }}]\n")
+    };
+    let port = |name: &str, frames: &str| {
+        format!(
+            "[[recipe]]\nname = \"{name}\"\nkind = \"can\"\nmode = \"user\"\n{frames}\
+             [[port]]\nname = \"{name}\"\nbus = \"can\"\nrecipe = \"{name}\"\n"
+        )
+    };
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("cell.toml");
+    let file = path.to_str().unwrap();
+    let told = |ports: &[String], more: &[&str]| {
+        std::fs::write(&path, format!("[controller]\naddress = \"10.0.0.2\"\n{}", ports.concat())).unwrap();
+        let (_, report) = json(&[&["check", file, "--json"], more].concat());
+        let said =
+            report["warnings"].as_array().unwrap().iter().map(|w| w["message"].as_str().unwrap().to_owned());
+        said.filter(|said| said.contains("destroy")).collect::<Vec<_>>()
+    };
+    let end = "if both are on one bus, two frames with one id at the same time destroy each other";
+    let a = port("a", &(frame("input", 0x101) + frame("output", 0x201).as_str()));
+    assert_eq!(told(&[a.clone(), port("b", &frame("output", 0x202))], &[]), [""; 0]);
+    assert_eq!(
+        told(&[a.clone(), port("b", &frame("output", 0x201))], &[]),
+        [format!("port \"a\" and port \"b\" both send id 0x201; {end}")]
+    );
+    assert_eq!(
+        told(&[a.clone(), port("b", &frame("output", 0x101))], &[]),
+        [format!("port \"b\" sends id 0x101, which port \"a\" receives from a device; {end}")]
+    );
+    // Both may listen to one device.
+    assert_eq!(told(&[a.clone(), port("b", &frame("input", 0x101))], &[]), [""; 0]);
+    let one_bus = ["--same-bus", "a,b"];
+    assert_eq!(told(&[a.clone(), port("b", &frame("output", 0x201))], &one_bus).len(), 1);
+    let own = told(&[port("a", &(frame("input", 0x101) + frame("output", 0x101).as_str()))], &[]);
+    assert!(own.len() == 1 && own[0].starts_with("port \"a\" sends id 0x101 and receives it: "), "{own:?}");
 }
 
 #[test]

@@ -167,6 +167,8 @@ fn plc(case: &Case) {
     plc.until(&mut *gateway, &robot, "the robot's output at the PLC", |_, read| read == [1200]);
     robot.command("run(faster.jspf)", "run start");
     plc.until(&mut *gateway, &robot, "the new output at the PLC", |_, read| read == [1500]);
+    // Its line gives a false byte before each request and one behind it.
+    plc.is_noisy = true;
     plc.block = [8, 0, 1240];
     plc.until(&mut *gateway, &robot, "the second block at the robot", |robot, _| {
         robot.newest("WordInputReg[1]") == 8.0 && robot.newest("WordInputReg[2]") == 124.0
@@ -308,6 +310,8 @@ struct Plc {
     read: Vec<u16>,
     /// A request was sent and has no reply yet.
     is_waiting: bool,
+    /// The line gives a byte when its direction changes.
+    is_noisy: bool,
 }
 
 impl Plc {
@@ -325,7 +329,7 @@ impl Plc {
         ];
         let clock = Clock(std::time::Instant::now());
         let master = Master::new(timing(), Echo::Absent, &table, clock.now()).unwrap();
-        Self { line, clock, master, block: [0; 3], read: Vec::new(), is_waiting: false }
+        Self { line, clock, master, block: [0; 3], read: Vec::new(), is_waiting: false, is_noisy: false }
     }
 
     /// Asks until the robot, and what was read last, are as wanted. Then the line is silent.
@@ -356,7 +360,12 @@ impl Plc {
         while let Some(output) = self.master.poll(self.clock.now(), values, &mut out) {
             match output {
                 Output::Send(len) => {
-                    self.line.send(&out[..len]);
+                    let frame = &out[..len];
+                    if self.is_noisy {
+                        self.line.send(&[&[0], frame, &[0xFF]].concat());
+                    } else {
+                        self.line.send(frame);
+                    }
                     self.is_waiting = true;
                 }
                 Output::Reply { reply, .. } => {

@@ -163,6 +163,7 @@ impl<'c> ConfigView<'c> {
     pub fn is_device(self, recipe: &Recipe) -> bool {
         recipe.exchanges.len > 0
             || recipe.repeats_ids()
+            || recipe.sends_empty()
             || [Direction::Input, Direction::Output].into_iter().any(|part| {
                 recipe.stream_part(part).is_some_and(StreamPart::is_cut)
                     || recipe

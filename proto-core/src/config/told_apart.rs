@@ -153,4 +153,9 @@ impl Recipe {
                     .any(|(nth, frame)| frames.iter().take(nth).any(|before| before.id == frame.id))
             })
     }
+    /// Whether a frame without data is sent: only to devices.
+    pub(crate) fn sends_empty(&self) -> bool {
+        let Parts::Can { output, .. } = &self.parts else { return false };
+        self.mode == Mode::User && output.iter().any(|frame| frame.fields.len == 0)
+    }
 }

@@ -110,7 +110,9 @@ impl FrameLayout {
             Vec::from_slice(bytes).map_err(|_| LayoutError::DelimiterTooLong { len: bytes.len() })
         };
         let (head, tail) = (delimiter(head)?, delimiter(tail)?);
-        if elements.is_empty() && head.is_empty() {
+        // A frame on CAN has its id, such as the SYNC of CANopen.
+        let is_sent_on_can = carrier == Carrier::Can && direction == Direction::Output;
+        if elements.is_empty() && head.is_empty() && !is_sent_on_can {
             return Err(LayoutError::Empty);
         }
         if elements.len() > MAX_FIELDS {

@@ -4,3 +4,4 @@ mod faults;
 mod line;
 mod periods;
 mod properties;
+mod stray;

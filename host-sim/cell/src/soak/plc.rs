@@ -152,9 +152,17 @@ impl Device<Vec<u8>> for Plc {
                 // Without a silence between them, the newest counts.
                 2 => frame = [&frame[..], &frame].concat(),
                 3 => frame = [sealed(&[self.slave % 247 + 1, 6, 0, 1, 0, 2]), frame].concat(),
+                4 => frame = [&[0, 0][..], &frame].concat(),
                 _ => {}
             }
         }
+        // A line gives such a byte while its direction changes.
+        let false_byte = |rng: &mut Rng| match rng.below(8) {
+            0 => vec![0],
+            1 => vec![0xFF],
+            _ => vec![],
+        };
+        let frame = [false_byte(rng), frame, false_byte(rng)].concat();
         self.next = now + Duration::from_micros(pause);
         vec![frame]
     }

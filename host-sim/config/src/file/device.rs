@@ -416,6 +416,12 @@ impl FileRecipe {
             && [&self.input, &self.output].into_iter().flatten().any(repeats)
     }
 
+    /// Whether it sends a frame without data.
+    fn sends_empty(&self) -> bool {
+        let frames = self.output.iter().flat_map(|part| &part.frames);
+        self.is_can() && self.mode == Mode::User && frames.into_iter().any(|frame| frame.fields.is_empty())
+    }
+
     /// Whether it has frames that no recipe of the controller has.
     pub(super) fn is_device(&self) -> bool {
         let parts = [&self.input, &self.output].into_iter().flatten();
@@ -424,6 +430,7 @@ impl FileRecipe {
         !self.exchanges.is_empty()
             || is_cut
             || self.repeats_ids()
+            || self.sends_empty()
             || fields.any(|field| field.spec().is_device())
     }
 
@@ -471,6 +478,8 @@ impl FileRecipe {
             head: part.head.clone(),
             tail: part.tail.clone(),
             fields,
+            name: frame.order.name().map(str::to_owned),
+            after: frame.order.after().map(str::to_owned),
         }
     }
 

@@ -12,6 +12,7 @@ use proto_core::wire::can::CanId;
 
 use super::bindings::{FileInput, Sending};
 use super::encoding::refuse;
+use super::order::FrameOrder;
 use super::reader::{Item, Reader, Result, Spot};
 use super::recipes::{self, FileField, FileFieldKind, FileFrame, FilePart, Flavour};
 use crate::device::ExchangeKind;
@@ -260,7 +261,8 @@ impl FilePart {
 
 impl FileFrame {
     fn new(spot: Spot) -> Self {
-        Self { id_spot: spot.clone(), spot, id: CanId::Standard(0), fields: Vec::new() }
+        let (id, order) = (CanId::Standard(0), FrameOrder::default());
+        Self { id_spot: spot.clone(), spot, id, fields: Vec::new(), order }
     }
 
     /// Registers or coils.

@@ -21,6 +21,7 @@ pub(crate) mod lines;
 pub(crate) mod modbus;
 mod names;
 mod network;
+mod order;
 mod reader;
 pub(crate) mod recipes;
 mod rtu_frames;

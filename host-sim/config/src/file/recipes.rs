@@ -20,6 +20,7 @@ use super::exchanges::{self, FileExchange};
 use super::framings;
 use super::modbus;
 use super::names::{did_you_mean, meant_variable};
+use super::order::{self, FrameOrder, ORDER_KEYS};
 use super::reader::{Item, Reader, Result, Spot};
 use crate::device::AnyRecipe;
 use crate::keys;
@@ -94,6 +95,8 @@ pub(super) struct FileFrame {
     pub(super) id: CanId,
     pub(super) id_spot: Spot,
     pub(super) fields: Vec<FileField>,
+    /// Of an output frame on CAN.
+    pub(super) order: FrameOrder,
 }
 
 pub(super) struct FileField {
@@ -342,7 +345,7 @@ fn read(table: &Reader<'_>, flavour: Flavour) -> Result<FileRecipe> {
     }
     let on_stale = read_on_stale(table, output.is_some(), exchanges.is_empty())?;
     let spot = table.spot.clone();
-    let recipe = FileRecipe { on_stale, spot, name, name_spot, mode, kind, input, output, exchanges };
+    let mut recipe = FileRecipe { on_stale, spot, name, name_spot, mode, kind, input, output, exchanges };
     let is_device = flavour == Flavour::Gateway && recipe.is_device();
     for direction in [Direction::Input, Direction::Output] {
         let Some(part) = recipe.part(direction) else { continue };
@@ -354,6 +357,9 @@ fn read(table: &Reader<'_>, flavour: Flavour) -> Result<FileRecipe> {
         let framing = if mode == Mode::User { Framing::Bytes } else { Framing::Datagram };
         part.check(Rules { mode, direction }, is_can, framing)
             .map_err(|error| part.spot_of(error).error(table.document, error))?;
+    }
+    if let Some(part) = &mut recipe.output {
+        order::sort(&mut part.frames).map_err(|(spot, message)| spot.error(table.document, message))?;
     }
     Ok(recipe)
 }
@@ -377,18 +383,22 @@ fn read_part(item: &Item<'_>, rules: Rules, is_can: bool, flavour: Flavour) -> R
     if is_can {
         for frame in table.any_tables("frame")? {
             let frame_keys = device::frame_keys(&frame, rules.mode, flavour)?;
-            frame.check_keys(&[keys::recipe::CAN_REALTIME.common, frame_keys], "")?;
+            let has_order = is_gateway_output && rules.mode == Mode::User;
+            let order_keys = if has_order { ORDER_KEYS } else { &[] };
+            frame.check_keys(&[keys::recipe::CAN_REALTIME.common, order_keys, frame_keys], "")?;
+            let order = if has_order { FrameOrder::read(&frame)? } else { FrameOrder::default() };
             let item = frame.required("id", "the frame's CAN id")?;
             let id = read_id(&frame, &item)?;
             let fields = read_fields(&frame, 0, rules, flavour)?;
-            part.frames.push(FileFrame { spot: frame.spot.clone(), id, id_spot: item.spot, fields });
+            part.frames.push(FileFrame { spot: frame.spot.clone(), id, id_spot: item.spot, fields, order });
         }
     } else {
         (part.head, part.head_spot) = read_bytes(&table, "head")?;
         (part.tail, part.tail_spot) = read_bytes(&table, "tail")?;
         let fields = read_fields(&table, part.head.len(), rules, flavour)?;
         let spot = table.spot.clone();
-        part.frames.push(FileFrame { spot: spot.clone(), id: CanId::Standard(0), id_spot: spot, fields });
+        let (id, order) = (CanId::Standard(0), FrameOrder::default());
+        part.frames.push(FileFrame { spot: spot.clone(), id, id_spot: spot, fields, order });
     }
     Ok(part)
 }

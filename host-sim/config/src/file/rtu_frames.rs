@@ -114,6 +114,6 @@ impl Frame {
         if let Some(algorithm) = Algorithm::named("crc16-modbus") {
             self.push("", FieldSpec::Checksum(Checksum::standard(algorithm)));
         }
-        NamedFrame { id: None, head: Vec::new(), tail: Vec::new(), fields: self.0 }
+        NamedFrame { id: None, head: Vec::new(), tail: Vec::new(), fields: self.0, name: None, after: None }
     }
 }

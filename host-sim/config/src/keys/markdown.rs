@@ -37,6 +37,7 @@ pub const DOCUMENTED: &[(&str, &[&[Key]])] = &[
     ("limits and maps", &[&[field::MIN, field::MAX, field::OUTSIDE, field::MAP]]),
     ("commands", &[&[field::WHEN, field::BASE, field::IDLE]]),
     ("output", &[&[recipe::SEND, recipe::ON_STALE]]),
+    ("order of frames", &[&[recipe::FRAME_NAME, recipe::AFTER]]),
     ("device frame", &[recipe::OF_FRAME]),
     (
         "device field",

@@ -105,6 +105,16 @@ pub const ID: Key = Key::integer("id", 0, 0x1FFF_FFFF)
 /// Whether it has 29 bits.
 pub const EXTENDED: Key = Key::bool("extended").tells("29-bit ids, 0..=0x1FFFFFFF");
 
+/// The name of an output frame.
+pub const FRAME_NAME: Key = Key::text_of("name", Text::Name)
+    .absent("none")
+    .tells("of an output frame: its name for `after`, 1..=32 characters, unique in the part");
+/// The frame that goes before it.
+pub const AFTER: Key = Key::text_of("after", Text::Name).absent("order of the file").tells(
+    "of an output frame: the name of the frame of the same cycle behind which it is sent, such as a control word \
+     behind the target that it starts",
+);
+
 /// The device's keys of a stream part.
 pub(crate) const OF_STREAM: &[Key] = &[ENDIAN, WORD_ORDER, CHECKSUM, FRAMING, ESCAPE];
 /// Those of a CAN frame, and of a frame of an exchange.
@@ -148,8 +158,8 @@ pub(crate) const CAN_REALTIME: Table = Table::of("realtime CAN frame", &[ID, EXT
 const CAN_PLAIN: Table = Table::of("CAN frame of a controller", &[ID, EXTENDED, PLAIN_FIELDS]);
 const CAN_IN: Table =
     Table::of("CAN input frame", &[ID, EXTENDED, INPUT_FIELDS]).cases(&[always(&[OF_FRAME])]);
-const CAN_OUT: Table =
-    Table::of("CAN output frame", &[ID, EXTENDED, OUTPUT_FIELDS]).cases(&[always(&[OF_FRAME])]);
+const CAN_OUT: Table = Table::of("CAN output frame", &[ID, EXTENDED, FRAME_NAME, AFTER, OUTPUT_FIELDS])
+    .cases(&[always(&[OF_FRAME])]);
 
 pub(crate) const CAN_PART: Table =
     Table::of("realtime CAN part", &[frames(&Shape::Table(&CAN_REALTIME))]).at(CAN);

@@ -9,6 +9,7 @@ mod document_examples;
 mod documented_keys;
 mod example_files;
 mod exchange_files;
+mod frame_order;
 mod framing_files;
 mod golden_images;
 mod schema_files;

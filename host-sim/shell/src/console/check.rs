@@ -64,7 +64,8 @@ pub(super) fn report(toml: &str) -> Value {
             let view = config.view();
             let warnings = view.warnings().map(|warning| view.describe_warning(warning).to_string());
             let frames = file::parse_frames(Text { name: NAME, toml }, &[]).map_err(Mistake::of_file)?;
-            let of_file = recipe_config::negative_numbers(&frames).into_iter().map(|(_, said)| said);
+            let of_file = recipe_config::negative_numbers(&frames).into_iter();
+            let of_file = of_file.chain(recipe_config::orders_before_values(&frames)).map(|(_, said)| said);
             let warnings: Vec<_> = warnings.chain(of_file).collect();
             Ok(json!({ "ok": true, "kind": "gateway", "warnings": warnings }))
         }

@@ -83,7 +83,7 @@ pub(super) fn loads(
         groups.push(group);
     }
     groups.extend(can.iter().filter(|port| !named.contains(&port.name.as_str())).map(|port| vec![*port]));
-    let mut troubles = Vec::new();
+    let mut troubles = collisions(config, &groups);
     let loads = groups
         .iter()
         .filter(|group| !group.is_empty())
@@ -231,7 +231,74 @@ fn wrong(config: &GatewayConfig, ports: &[&Port], load: &Load) -> Vec<Trouble> {
     troubles
 }
 
-/// The ids that the gateway sends on a port.
+/// Ids that collide, within a port and, if the ports are on one bus, between them. What ports that are on one bus
+/// both send is told with it.
+fn collisions(config: &GatewayConfig, groups: &[Vec<&Port>]) -> Vec<Trouble> {
+    let ports: Vec<(usize, &Port)> =
+        (0..).zip(groups).flat_map(|(group, ports)| ports.iter().map(move |port| (group, *port))).collect();
+    let mut troubles = Vec::new();
+    for (nth, &(group, port)) in ports.iter().enumerate() {
+        let name = port.name.as_str();
+        let mut say = |port: &str, said: String| troubles.push((port.to_owned(), said));
+        if let Some(id) = shared(sent(config, port), received(config, port)) {
+            say(
+                name,
+                format!(
+                    "port {name:?} sends id {} and receives it: on one bus, two nodes that send one id at the same time \
+                     destroy each other's frames",
+                    text::show_id(id)
+                ),
+            );
+        }
+        for &(other_group, other) in ports.iter().take(nth) {
+            let is_one = group == other_group;
+            let condition = if is_one { "" } else { "; if both are on one bus" };
+            let end = "two frames with one id at the same time destroy each other";
+            if !is_one && let Some(id) = shared(sent(config, other), sent(config, port)) {
+                let (first, id) = (&other.name, text::show_id(id));
+                say(name, format!("port {first:?} and port {name:?} both send id {id}{condition}, {end}"));
+            }
+            let from_other = shared(sent(config, other), received(config, port)).map(|id| (other, port, id));
+            let from_this = shared(sent(config, port), received(config, other)).map(|id| (port, other, id));
+            for (sender, receiver, id) in from_other.into_iter().chain(from_this) {
+                let (sender, receiver, id) = (&sender.name, &receiver.name, text::show_id(id));
+                let what =
+                    format!("port {sender:?} sends id {id}, which port {receiver:?} receives from a device");
+                say(name, format!("{what}{condition}, {end}"));
+            }
+        }
+    }
+    troubles
+}
+
+/// The first id that is in both.
+fn shared(one: impl Iterator<Item = CanId>, other: impl Iterator<Item = CanId>) -> Option<CanId> {
+    let other: Vec<_> = other.collect();
+    one.into_iter().find(|id| other.contains(id))
+}
+
+/// The ids that devices send on a port.
+fn received(config: &GatewayConfig, port: &Port) -> impl Iterator<Item = CanId> {
+    let recipe = config.recipes.get(usize::from(port.recipe));
+    let input = match recipe.map(|recipe| &recipe.parts) {
+        Some(Parts::Can { input, .. }) => &input[..],
+        _ => &[],
+    };
+    let exchanges = recipe.map_or(&[][..], |recipe| config.view().exchanges_of(recipe));
+    let replies = exchanges.iter().flat_map(|exchange| match exchange.talk {
+        // A remote request has the id of its reply.
+        Talk::Frames { request, reply, refusal } if !is_remote(config, request) => [reply, refusal],
+        _ => [None, None],
+    });
+    let replies = replies.flatten().filter_map(|nth| config.frames.get(usize::from(nth))?.id);
+    input.iter().map(|frame| frame.id).chain(replies)
+}
+
+fn is_remote(config: &GatewayConfig, request: Option<u8>) -> bool {
+    request.and_then(|nth| config.frames.get(usize::from(nth))).is_some_and(|frame| frame.remote)
+}
+
+/// The ids of the data frames that the gateway sends on a port.
 fn sent(config: &GatewayConfig, port: &Port) -> impl Iterator<Item = CanId> {
     let recipe = config.recipes.get(usize::from(port.recipe));
     let parts = recipe.map(|recipe| &recipe.parts);
@@ -242,7 +309,9 @@ fn sent(config: &GatewayConfig, port: &Port) -> impl Iterator<Item = CanId> {
     let view = config.view();
     let exchanges = recipe.map_or(&[][..], |recipe| view.exchanges_of(recipe));
     let requests = exchanges.iter().filter_map(|exchange| match exchange.talk {
-        Talk::Frames { request, .. } => config.frames.get(usize::from(request?))?.id,
+        Talk::Frames { request, .. } if !is_remote(config, request) => {
+            config.frames.get(usize::from(request?))?.id
+        }
         _ => None,
     });
     output.iter().map(|frame| frame.id).chain(requests)

@@ -15,7 +15,8 @@ use crate::time::Instant;
 ///
 /// The silence of the line ends a frame. Where the caller saw no silence between frames, as behind
 /// an operating system, they are told apart by their lengths. Only the newest request is answered:
-/// for an earlier one the master no longer waits.
+/// for an earlier one the master no longer waits. One byte 0x00 or 0xFF before the frames of a burst
+/// and one behind them, as a line gives while its direction changes, are no part of them.
 #[derive(Debug, Clone)]
 pub struct Slave {
     timing: Timing,
@@ -170,15 +171,30 @@ impl Slave {
     ) -> Option<usize> {
         let mut rest = self.buffer.get(..self.len)?;
         let counters = &mut self.counters;
-        if let Some((len, crc)) = self.sent
-            && let Some((own, others)) = rest.split_at_checked(len)
-            && own.ends_with(&crc)
-            && is_right(own)
+        if let Some((len, crc)) = self.sent {
+            let behind_echo = |bytes: &'_ [u8]| {
+                let own = bytes.get(..len)?;
+                (own.ends_with(&crc) && is_right(own)).then_some(len)
+            };
+            let inner = without_stray(rest);
+            let echo = behind_echo(rest).or_else(|| behind_echo(inner?)?.checked_add(1));
+            rest = echo.and_then(|echo| rest.get(echo..)).unwrap_or(rest);
+        }
+        let mut reading = Reading { own: self.address, is_bare: false };
+        if !self.overrun
+            && let Some(inner) = without_stray(rest)
+            && let bare = (Reading { is_bare: true, ..reading })
+            && bare.explains(inner)
         {
-            rest = others;
+            if bare.first_frame(rest).is_some() && reading.explains(rest) {
+                // Nobody can tell which of the two was sent.
+                counters.wrong = counters.wrong.saturating_add(1);
+                return None;
+            }
+            (rest, reading) = (inner, bare);
         }
         while !rest.is_empty() {
-            let Some((frame, behind)) = first_frame(rest) else {
+            let Some((frame, behind)) = reading.first_frame(rest) else {
                 counters.wrong = counters.wrong.saturating_add(1);
                 return None;
             };
@@ -213,14 +229,65 @@ impl Slave {
     }
 }
 
-/// The frame at the front of `bytes`, with a right CRC: all of them, or what the function and the
-/// byte count say of a request or reply.
-fn first_frame(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
-    let lengths = [FrameLen::Known(bytes.len()), request_len(bytes), reply_len(bytes)];
-    lengths.into_iter().find_map(|len| match len {
-        FrameLen::Known(len) => bytes.split_at_checked(len).filter(|(frame, _)| is_right(frame)),
-        _ => None,
-    })
+/// How the bytes of a burst are taken for frames.
+#[derive(Debug, Clone, Copy)]
+struct Reading {
+    /// The address of the slave.
+    own: u8,
+    /// A byte before them was dropped, so a frame counts only with the length that its function and
+    /// byte count say.
+    is_bare: bool,
+}
+
+impl Reading {
+    /// Whether `bytes` are frames and nothing else, but for a false byte behind them.
+    fn explains(self, mut bytes: &[u8]) -> bool {
+        while let Some((_, behind)) = self.first_frame(bytes) {
+            if behind.is_empty() {
+                return true;
+            }
+            bytes = behind;
+        }
+        false
+    }
+
+    /// The frame at the front of `bytes`, with a right CRC, and what is behind it: all of them, or what
+    /// the function and the byte count say of a request or reply. A single false byte behind it is
+    /// dropped, but for a frame to this slave only if its length is a request's.
+    fn first_frame(self, bytes: &[u8]) -> Option<(&[u8], &[u8])> {
+        let is_for_this = bytes.first().is_some_and(|&address| address == self.own || address == BROADCAST);
+        let (whole, request, reply) = (FrameLen::Known(bytes.len()), request_len(bytes), reply_len(bytes));
+        // The CRC of a frame with 0x00 behind it is right as well. So what is to be carried out is looked
+        // for first with a request's length, and of two lengths the shorter one is tried first.
+        let (first, second) = match (request, reply) {
+            (FrameLen::Known(request_len), FrameLen::Known(reply_len)) if reply_len < request_len => {
+                (reply, request)
+            }
+            _ => (request, reply),
+        };
+        let lengths = match (is_for_this, self.is_bare) {
+            (true, false) => [request, whole, reply],
+            (true, true) => [request, FrameLen::Unknown, FrameLen::Unknown],
+            (false, false) => [whole, first, second],
+            (false, true) => [first, second, FrameLen::Unknown],
+        };
+        lengths.into_iter().find_map(|len| {
+            let FrameLen::Known(known) = len else { return None };
+            let (frame, behind) = bytes.split_at_checked(known).filter(|(frame, _)| is_right(frame))?;
+            let is_last = matches!(behind, &[byte] if is_stray(byte)) && (!is_for_this || len == request);
+            Some((frame, if is_last { &[] } else { behind }))
+        })
+    }
+}
+
+/// Whether this is what a line gives while its direction changes.
+const fn is_stray(byte: u8) -> bool {
+    matches!(byte, 0x00 | 0xFF)
+}
+
+/// What is behind a false byte at the front.
+fn without_stray(bytes: &[u8]) -> Option<&[u8]> {
+    bytes.split_first().filter(|(first, _)| is_stray(**first)).map(|(_, inner)| inner)
 }
 
 fn writes(pdu: &[u8]) -> bool {

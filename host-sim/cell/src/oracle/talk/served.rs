@@ -145,20 +145,24 @@ impl Oracle {
         }
         let (own, too_many) = (spec.address, std::mem::take(&mut watch.too_many));
         let bytes = std::mem::take(&mut watch.held);
-        let (mut rest, mut reply, mut others, mut is_wrong) = (&bytes[..], None, 0, false);
-        while !rest.is_empty() && reply.is_none() {
-            let Some(len) = first_frame(rest) else {
-                is_wrong = true;
-                break;
-            };
-            let (frame, behind) = rest.split_at(len);
-            rest = behind;
-            let pdu = &frame[1..len - 2];
+        let mut burst = Burst::read(&bytes, own, false);
+        if let [0 | 0xFF, inner @ ..] = &bytes[..]
+            && !too_many
+            && let inner = Burst::read(inner, own, true)
+            && inner.is_whole()
+        {
+            let is_either = burst.is_whole() && first_frame(&bytes, own, true).is_some();
+            burst = if is_either { Burst { frames: Vec::new(), rest: &bytes } } else { inner };
+        }
+        let mut is_wrong = !burst.rest.is_empty();
+        let (mut reply, mut others) = (None, 0);
+        for (at, frame) in (1..).zip(&burst.frames) {
+            let pdu = &frame[1..frame.len() - 2];
             match frame[0] {
                 0 if matches!(pdu[0], 5 | 6 | 15 | 16) => drop(self.carry_out(nth, pdu, now)),
                 address if address == own => {
                     // Behind an earlier request, its master no longer waits.
-                    if rest.is_empty() && !too_many {
+                    if at == burst.frames.len() && burst.rest.is_empty() && !too_many {
                         reply = Some((pdu[0], self.carry_out(nth, pdu, now)));
                     }
                 }
@@ -358,9 +362,34 @@ pub(super) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
         .then_some("a soak cannot judge constants, digits and reply codes in the blocks of a slave")
 }
 
-/// The length of the frame at the front of `bytes`: all of them, or what the function says of a request or
-/// a reply.
-fn first_frame(bytes: &[u8]) -> Option<usize> {
+/// What was between two silences: frames with a right CRC, and what follows the last of them.
+#[derive(Debug)]
+struct Burst<'a> {
+    frames: Vec<&'a [u8]>,
+    rest: &'a [u8],
+}
+
+impl<'a> Burst<'a> {
+    /// `is_bare`: the byte before it was dropped.
+    fn read(bytes: &'a [u8], own: u8, is_bare: bool) -> Self {
+        let (mut frames, mut rest) = (Vec::new(), bytes);
+        while let Some((len, is_request)) = first_frame(rest, own, is_bare) {
+            let (frame, behind) = rest.split_at(len);
+            frames.push(frame);
+            let may_drop = is_request || !matches!(frame[0], 0) && frame[0] != own;
+            rest = if may_drop && matches!(behind, [0 | 0xFF]) { &[] } else { behind };
+        }
+        Self { frames, rest }
+    }
+
+    fn is_whole(&self) -> bool {
+        !self.frames.is_empty() && self.rest.is_empty()
+    }
+}
+
+/// The length of the frame at the front of `bytes`, and whether it is as long as a request: what the function
+/// says of a request or a reply, or all of them.
+fn first_frame(bytes: &[u8], own: u8, is_bare: bool) -> Option<(usize, bool)> {
     let counted = |at: usize, more: usize| bytes.get(at).map(|&count| usize::from(count) + more);
     let (request, reply) = match bytes.get(1)? {
         1..=4 => (Some(8), counted(2, 5)),
@@ -370,8 +399,17 @@ fn first_frame(bytes: &[u8]) -> Option<usize> {
         0x80.. => (None, Some(5)),
         _ => (None, None),
     };
-    let lengths = [Some(bytes.len()), request, reply].into_iter().flatten();
-    lengths.filter(|len| *len >= 4).find(|&len| bytes.get(..len).is_some_and(is_right))
+    let all = Some(bytes.len()).filter(|_| !is_bare);
+    let lengths = if matches!(bytes[0], 0) || bytes[0] == own {
+        [request, all, reply.filter(|_| !is_bare)]
+    } else {
+        let mut known = [request, reply];
+        known.sort();
+        [all, known[0], known[1]]
+    };
+    let is_one = |len: usize| (4..=256).contains(&len) && bytes.get(..len).is_some_and(is_right);
+    let len = lengths.into_iter().flatten().find(|&len| is_one(len))?;
+    Some((len, Some(len) == request))
 }
 
 /// Two of the longest frames.

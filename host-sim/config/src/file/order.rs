@@ -1,0 +1,109 @@
+//! In which order the output frames of a CAN recipe are sent.
+//!
+//! In: the frames as the file has them, with `name` and `after`. Out: the same frames, each behind the one that
+//! it is to follow. The gateway hands a whole cycle over at once, in this order.
+
+use super::names::did_you_mean;
+use super::reader::{Reader, Result, Spot};
+use super::recipes::FileFrame;
+use crate::keys::Key;
+use crate::keys::recipe::{AFTER, FRAME_NAME};
+
+/// The keys of [`FrameOrder`].
+pub(super) const ORDER_KEYS: &[Key] = &[FRAME_NAME, AFTER];
+
+/// What a frame is called, and which one goes before it.
+#[derive(Debug, Clone, Default)]
+pub(super) struct FrameOrder {
+    name: Option<(String, Spot)>,
+    after: Option<(String, Spot)>,
+}
+
+impl FrameOrder {
+    pub(super) fn read(frame: &Reader<'_>) -> Result<Self> {
+        let read = |key: &Key| {
+            let Some(item) = frame.optional(key.name) else { return Ok(None) };
+            let name = item.string()?;
+            proto_core::config::check_name(name).map_err(|kind| item.error(kind))?;
+            Ok(Some((name.to_owned(), item.spot)))
+        };
+        Ok(Self { name: read(&FRAME_NAME)?, after: read(&AFTER)? })
+    }
+
+    pub(super) fn name(&self) -> Option<&str> {
+        self.name.as_ref().map(|(name, _)| name.as_str())
+    }
+
+    pub(super) fn after(&self) -> Option<&str> {
+        self.after.as_ref().map(|(name, _)| name.as_str())
+    }
+}
+
+/// Puts each frame behind the one that it names. Otherwise the order of the file stays.
+///
+/// # Errors
+/// What is wrong with a name, and where.
+pub(super) fn sort(frames: &mut Vec<FileFrame>) -> std::result::Result<(), (Spot, String)> {
+    check(frames)?;
+    let mut waiting = std::mem::take(frames);
+    while !waiting.is_empty() {
+        let is_sent = |name: &str| frames.iter().any(|frame| frame.order.name() == Some(name));
+        match waiting.iter().position(|frame| frame.order.after().is_none_or(is_sent)) {
+            Some(next) => frames.push(waiting.remove(next)),
+            None => return Err(circle(&waiting)),
+        }
+    }
+    Ok(())
+}
+
+fn check(frames: &[FileFrame]) -> std::result::Result<(), (Spot, String)> {
+    let names = || frames.iter().filter_map(|frame| frame.order.name());
+    for (nth, FileFrame { order, .. }) in frames.iter().enumerate() {
+        if let Some((name, spot)) = &order.name
+            && names_before(frames, nth).any(|before| before == name)
+        {
+            let message = format!("there is already an output frame {name:?}; names must differ");
+            return Err((spot.clone(), message));
+        }
+        let Some((after, spot)) = &order.after else { continue };
+        if order.name() == Some(after) {
+            let message =
+                format!("a frame cannot be sent after itself, {after:?}; allowed: another output frame");
+            return Err((spot.clone(), message));
+        }
+        if !names().any(|name| name == after) {
+            let known: Vec<_> = names().map(|name| format!("{name:?}")).collect();
+            let known = match &known[..] {
+                [] => "no output frame of this recipe has a name".to_owned(),
+                known => format!("there are {}", known.join(", ")),
+            };
+            let meant = did_you_mean(after, names());
+            return Err((spot.clone(), format!("there is no output frame {after:?}; {known}{meant}")));
+        }
+    }
+    Ok(())
+}
+
+fn names_before(frames: &[FileFrame], nth: usize) -> impl Iterator<Item = &str> {
+    frames.iter().take(nth).filter_map(|frame| frame.order.name())
+}
+
+/// What is wrong with frames that all wait for each other: those from the first of them back to it.
+fn circle(waiting: &[FileFrame]) -> (Spot, String) {
+    let mut names: Vec<&str> = Vec::new();
+    let mut at = waiting.first();
+    // Every one of these waits for another of them, so it ends where a name comes again.
+    while let Some(after) = at.and_then(|frame| frame.order.after())
+        && !names.contains(&after)
+    {
+        names.push(after);
+        at = waiting.iter().find(|frame| frame.order.name() == Some(after));
+    }
+    let again = at.and_then(|frame| frame.order.after()).unwrap_or_default();
+    let circle = names.iter().skip_while(|name| **name != again).chain([&again]);
+    let circle: Vec<_> = circle.map(|name| format!("{name:?}")).collect();
+    let spot = at.or(waiting.first()).and_then(|frame| frame.order.after.clone()).map(|(_, spot)| spot);
+    let message = format!("{} is a circle; allowed: one of them without after", circle.join(" after "));
+    // A frame that waits has `after`.
+    (spot.unwrap_or_else(|| waiting[0].spot.clone()), message)
+}
