@@ -24,6 +24,7 @@ mod confirmed;
 mod connection;
 mod counters;
 mod counts;
+mod device_frame;
 mod device_port;
 mod exchanges;
 mod failed;
@@ -47,6 +48,7 @@ mod port_health;
 mod questions;
 mod rejection;
 mod requests;
+mod rules;
 mod sender;
 mod served;
 mod session;
@@ -62,6 +64,7 @@ mod tap;
 mod uplink;
 mod user;
 mod whole_port;
+mod withheld;
 
 pub use build_error::BuildError;
 pub use clock::ASLEEP;
@@ -75,7 +78,7 @@ pub use line::PeerCounters;
 pub use links::LinkInfo;
 pub use not_given::{LastNotGiven, NotGiven};
 pub use plan::{Plan, PlanError, Source, WayUp};
-pub use rejection::{KEPT_BYTES, LastRejection, Rejection};
+pub use rejection::{KEPT_BYTES, LastRejection, RejectedField, Rejection};
 pub use status::{ControllerStatus, FieldBus, Health, PeerStatus, PortStatus, Status, VariableStatus};
 pub use stops::COMMAND_QUEUE;
 pub use tap::{MAX_TAPPED, TAP_OVERHEAD, Tap, TapDirection, TapPlace, TapRecord, TapVerdict};
@@ -117,7 +120,7 @@ const _: () = assert!(INPUT_BUFFER >= LEN && INPUT_BUFFER > MAX_STREAM_FRAME);
 /// `TAP` bytes are for the ring of [`Engine::tap`], and `EXCHANGES` is the number of exchanges with
 /// devices over all ports; 0 costs nothing. The defaults are the maximum of a file.
 ///
-/// `Engine<4, 1, 128, 0, 0>` takes less than 41 KiB.
+/// `Engine<4, 1, 128, 0, 0>` takes less than 42 KiB.
 // In this order, because an engine is larger than what one instruction reaches: what every call looks at
 // comes first, what only some configurations have comes last.
 #[derive(Debug, Clone)]
