@@ -116,7 +116,7 @@ fn a_rejected_field_costs_the_others_nothing_and_takes_its_own_safe_value() {
     rig.run(MS(99));
     assert_eq!(rig.take_written(), []);
     rig.run(MS(1));
-    assert_eq!(rig.take_written(), [one(FIRST, 9), one(THIRD, 65_535)]);
+    assert_eq!(rig.take_written(), [one(THIRD, 65_535), one(FIRST, 9)]);
     assert_eq!(rig.counters(port).timeouts, 1);
 }
 

@@ -305,6 +305,7 @@ impl fmt::Display for DescribedKind<'_> {
             Kind::NoTextNeedsDigits => {
                 f.write_str("a text stands for no value in fields of digits only: decimal, hex")
             }
+            Kind::NoComma => f.write_str("a decimal comma is for decimal fields that no comma ends"),
             Kind::LimitsAndWrap => {
                 f.write_str("overflow = \"wrap\" takes any number; as, min, max and map do not")
             }

@@ -339,6 +339,8 @@ pub enum ConfigErrorKind {
     },
     /// A text can only stand for no value where digits stand.
     NoTextNeedsDigits,
+    /// A comma is for decimal digits that it does not end.
+    NoComma,
     /// A field that wraps has limits or a table.
     LimitsAndWrap,
     /// A field has limits twice, or limits and a table.

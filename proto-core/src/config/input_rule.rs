@@ -56,6 +56,8 @@ pub enum InputRule {
     NoNumber(f64),
     /// This text says that there is no value, spaces around it aside; fields of digits only.
     NoText(NoText),
+    /// The digits of a decimal field have a comma where others have a point.
+    Comma,
     /// This variable, a word register or one bit, is 1 while the field's newest value was taken, and 0 when it was rejected,
     /// had none, or is overdue.
     ValidTo {
@@ -206,6 +208,13 @@ impl<'c> BehindInput<'c> {
             InputRule::NoText(_) => {
                 let is_digits = own.encoding.is_digits();
                 if is_digits { Ok(()) } else { fail(place, Kind::NoTextNeedsDigits) }
+            }
+            InputRule::Comma => {
+                let is_decimal = matches!(own.encoding.kind, EncodingKind::Decimal(_));
+                if !is_decimal || own.encoding.until() == Some(b',') {
+                    return fail(place, Kind::NoComma);
+                }
+                Ok(())
             }
             InputRule::ValidTo { var, bit } => {
                 if core::mem::replace(&mut self.has_valid, true) {

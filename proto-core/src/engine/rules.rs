@@ -8,7 +8,7 @@
 use super::rejection::Rejection;
 use super::user::{InputBind, InputTo, Written};
 use crate::config::{FieldSpec, InputRule, Limits, MapEntry, NO_TEXT, Outside, fitting_numbers};
-use crate::device::{Element, Encoding, Kind, Overflow, Unreadable};
+use crate::device::{Element, Encoding, Kind, MAX_DIGITS, Overflow, Unreadable};
 use crate::image::{bind_to_variable, round};
 use crate::sysvar::SysVar;
 use crate::wire::scalar::{Scalar, ScalarType};
@@ -46,6 +46,8 @@ enum Is {
     NoNumber,
     /// The same of a text of so many characters, eight in a word.
     NoText(u8),
+    /// The digits have a comma for a point.
+    Comma,
     /// This variable, or these bits of it, tells whether a value was taken.
     ValidTo,
 }
@@ -85,6 +87,7 @@ pub(super) fn words_of(field: &FieldSpec) -> impl Iterator<Item = InputBind> + u
         FieldSpec::InputRule(rule) => {
             words[0] = match rule {
                 InputRule::Int16 => Some(Rule::new(Is::TwosComplement, 0)),
+                InputRule::Comma => Some(Rule::new(Is::Comma, 0)),
                 InputRule::Else(becomes) => number(Is::Else, becomes),
                 InputRule::NoNumber(code) => number(Is::NoNumber, code),
                 InputRule::NoText(text) => {
@@ -180,11 +183,15 @@ impl<'a> Rules<'a> {
         value: Result<Scalar, Unreadable>,
         bytes: impl FnOnce() -> Option<&'a [u8]>,
     ) -> Taken {
-        if self.iter().any(|rule| matches!(rule.is, Is::NoText(_)))
-            && bytes().is_some_and(|bytes| self.is_no_text(bytes))
-        {
+        let needs_bytes = self.iter().any(|rule| matches!(rule.is, Is::NoText(_) | Is::Comma));
+        let bytes = if needs_bytes { bytes() } else { None };
+        if bytes.is_some_and(|bytes| self.is_no_text(bytes)) {
             return Taken::NoValue;
         }
+        let value = match self.find(Is::Comma) {
+            None => value,
+            Some(_) => read_comma(self.encoding, bytes.unwrap_or(&[])),
+        };
         let Ok(value) = value else { return Taken::Rejected(Rejection::Unreadable) };
         let number = value.as_f64();
         let is_single = self.encoding.is_some_and(|own| own.kind == Kind::Scalar(ScalarType::Float));
@@ -285,4 +292,18 @@ impl<'a> Rules<'a> {
             (fitting, limits) => fitting.or(limits),
         }
     }
+}
+
+/// A decimal number with a comma for its point.
+fn read_comma(encoding: Option<Encoding>, bytes: &[u8]) -> Result<Scalar, Unreadable> {
+    let mut digits = [0; MAX_DIGITS];
+    let digits = digits.get_mut(..bytes.len()).ok_or(Unreadable::TooLarge)?;
+    for (slot, &byte) in digits.iter_mut().zip(bytes) {
+        *slot = match byte {
+            b',' => b'.',
+            b'.' => return Err(Unreadable::NotADigit),
+            byte => byte,
+        };
+    }
+    encoding.ok_or(Unreadable::Length)?.read(digits)
 }
