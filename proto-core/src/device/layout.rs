@@ -345,8 +345,8 @@ impl FrameLayout {
         })
     }
 
-    /// The bytes of the `nth` element of such a frame.
-    pub(crate) fn bytes_of<'a>(
+    /// The bytes of the `nth` element of such a frame; `None` if there is no such element.
+    pub fn bytes_of<'a>(
         &self,
         elements: impl IntoIterator<Item: Borrow<Element>>,
         frame: &'a [u8],

@@ -79,6 +79,7 @@ pub use links::LinkInfo;
 pub use not_given::{LastNotGiven, NotGiven};
 pub use plan::{Plan, PlanError, Source, WayUp};
 pub use rejection::{KEPT_BYTES, LastRejection, RejectedField, Rejection};
+pub use rules::{Taken, judge_field};
 pub use status::{ControllerStatus, FieldBus, Health, PeerStatus, PortStatus, Status, VariableStatus};
 pub use stops::COMMAND_QUEUE;
 pub use tap::{MAX_TAPPED, TAP_OVERHEAD, Tap, TapDirection, TapPlace, TapRecord, TapVerdict};

@@ -5,11 +5,16 @@
 //! kept as single words behind the bindings of their port, in the room of further fields: fields without rules have no
 //! room for them.
 
+use heapless::Vec;
+
 use super::rejection::Rejection;
 use super::user::{InputBind, InputTo, Written};
-use crate::config::{FieldSpec, InputRule, Limits, MapEntry, NO_TEXT, Outside, fitting_numbers};
+use crate::config::{
+    FieldSpec, InputBinding, InputRule, Limits, MapEntry, NO_TEXT, Outside, fitting_numbers,
+};
 use crate::device::{Element, Encoding, Kind, MAX_DIGITS, Overflow, Unreadable};
 use crate::image::{bind_to_variable, round};
+use crate::recipe::model::MAX_FIELDS;
 use crate::sysvar::SysVar;
 use crate::wire::scalar::{Scalar, ScalarType};
 
@@ -113,13 +118,41 @@ pub(super) fn scale_word(scale: f32, offset: f32) -> InputBind {
     Rule { is: Is::Scale, high, low }.to_bind()
 }
 
-/// What becomes of a field's value.
+/// What becomes of the value of an input field that writes a variable.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum Taken {
+pub enum Taken {
+    /// The variable becomes this.
     Value(Scalar),
-    /// The device says that it has none.
+    /// The device says that it has no value now.
     NoValue,
+    /// The field is rejected.
     Rejected(Rejection),
+}
+
+/// What a gateway makes of the value of an input field: the first of `fields`, which the others stand behind. `bytes` are those
+/// of the field in its frame, `value` is what [`Encoding::read`] makes of them. Also the lowest and the highest number that
+/// is taken, if not all are. `None` if the field writes no variable as a whole.
+///
+/// For tools that show frames; the engine does the same.
+pub fn judge_field(
+    fields: &[FieldSpec],
+    value: Result<Scalar, Unreadable>,
+    bytes: &[u8],
+) -> Option<(Taken, Option<(f64, f64)>)> {
+    let (to, element) = match *fields.first()? {
+        FieldSpec::UserInput { to, .. } | FieldSpec::DeviceInput { to, .. } => {
+            (to, fields.first()?.element()?)
+        }
+        _ => return None,
+    };
+    let InputBinding::Variable { var, scale, offset } = to else { return None };
+    let mut words: Vec<InputBind, MAX_FIELDS> = Vec::new();
+    words.push(scale_word(scale, offset)).ok()?;
+    let behind = fields.iter().skip(1).take_while(|field| field.is_of_field_before());
+    behind.flat_map(words_of).try_for_each(|word| words.push(word)).ok()?;
+    let binding = InputBind::new(InputTo::Ruled { var, first: 0, count: words.len() as u8 }, element);
+    let rules = Rules::of(&binding, &words)?;
+    Some((rules.take(value, || Some(bytes)), rules.range()))
 }
 
 /// The variable of a field, and the numbers that it takes.

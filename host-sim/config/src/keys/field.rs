@@ -117,8 +117,8 @@ pub const VALID_TO: Key = Key::text_of("valid_to", Text::VariableOrBit).beside(&
 pub const POINT: Key = Key::words("point", words!(POINTS))
     .or_word(".")
     .beside(&["to"])
-    .tells("of `decimal`, input: `\",\"` if the digits have a comma where others have a point");
-const RULES_IN: &[Key] = &[AS, MIN_IN, MAX_IN, OUTSIDE_IN, MAP_IN, NO_VALUE, VALID_TO, POINT];
+    .tells("of `decimal`, input: `\",\"` if the digits have a comma where others have `\".\"`");
+pub(crate) const RULES_IN: &[Key] = &[AS, MIN_IN, MAX_IN, OUTSIDE_IN, MAP_IN, NO_VALUE, VALID_TO, POINT];
 /// A constant that is received.
 pub const EQUALS: Key = Key::integer("equals", i32::MIN as i64, u32::MAX as i64)
     .absent("absent")

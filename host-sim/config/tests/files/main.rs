@@ -11,6 +11,7 @@ mod example_files;
 mod exchange_files;
 mod framing_files;
 mod golden_images;
+mod input_rule_files;
 mod schema_files;
 mod sendable_files;
 mod wrong_devices;
