@@ -281,18 +281,20 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 let Some(InputBind { to, .. }) = self.bindings.inputs.last_mut().filter(|_| words > 0) else {
                     continue;
                 };
-                match to {
-                    InputTo::Variable { var, .. } => {
-                        // The scale is the first.
-                        let count = words.saturating_add(1);
-                        *to = InputTo::Ruled { var: *var, count: count as u8, first: next_rule };
-                        next_rule = next_rule.saturating_add(count);
-                    }
-                    InputTo::Ruled { count, .. } => {
-                        *count = count.saturating_add(words as u8);
-                        next_rule = next_rule.saturating_add(words);
-                    }
-                    _ => {}
+                let new = match *to {
+                    // The scale is the first.
+                    InputTo::Variable { var, .. } => Some((var, next_rule, 0, words.saturating_add(1))),
+                    InputTo::Ruled { var, first, count } => Some((var, first, u16::from(count), words)),
+                    _ => None,
+                };
+                if let Some((var, first, before, words)) = new {
+                    let needed = before.saturating_add(words);
+                    let count = u8::try_from(needed).map_err(|_| {
+                        let (needed, room) = (needed.into(), u8::MAX.into());
+                        BuildError::TooMany { what: Counted::UserFields, needed, room }
+                    })?;
+                    *to = InputTo::Ruled { var, count, first };
+                    next_rule = next_rule.saturating_add(words);
                 }
                 continue;
             };

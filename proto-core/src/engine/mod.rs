@@ -10,7 +10,7 @@
 //! such input is unknown, and it is discarded.
 //!
 //! Errors of a device or of the controller are counted and skipped. They are never an error of the
-//! run loop, and nothing is applied in part.
+//! run loop. Nothing is applied in part, but for frames of devices, whose fields are judged one by one.
 
 mod awaited;
 mod bits;

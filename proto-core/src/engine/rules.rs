@@ -14,7 +14,6 @@ use crate::config::{
 };
 use crate::device::{Element, Encoding, Kind, MAX_DIGITS, Overflow, Unreadable};
 use crate::image::{bind_to_variable, round};
-use crate::recipe::model::MAX_FIELDS;
 use crate::sysvar::SysVar;
 use crate::wire::scalar::{Scalar, ScalarType};
 
@@ -146,7 +145,7 @@ pub fn judge_field(
         _ => return None,
     };
     let InputBinding::Variable { var, scale, offset } = to else { return None };
-    let mut words: Vec<InputBind, MAX_FIELDS> = Vec::new();
+    let mut words: Vec<InputBind, { u8::MAX as usize }> = Vec::new();
     words.push(scale_word(scale, offset)).ok()?;
     let behind = fields.iter().skip(1).take_while(|field| field.is_of_field_before());
     behind.flat_map(words_of).try_for_each(|word| words.push(word)).ok()?;

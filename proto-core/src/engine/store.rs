@@ -418,7 +418,9 @@ impl<const PORTS: usize> Store<PORTS> {
     pub(super) fn expire_waiting(&mut self, mut count: impl FnMut(usize, usize)) {
         self.next_expiry = Stamp::NEVER;
         for nth in 0..self.frames.len() {
-            if let Some(frame) = self.frames.get(nth).copied() {
+            let Some(frame) = self.frames.get(nth) else { break };
+            if !frame.set.and(&self.outbox.dirty()).is_empty() {
+                let frame = *frame;
                 self.expire_set((GroupId(nth as u8), nth), &frame, &mut count);
             }
         }
