@@ -43,7 +43,7 @@ fn shared(cells: &[&str], level: Level, span: Duration) -> ([Part; 3], Part) {
 /// The hashes of these runs on every machine. Only a change of what the engine, the controller or the cell
 /// does, or when, may change them; then enter the new ones here.
 const HASHES: [(Level, u64); 2] =
-    [(Level::None, 0xAE65_35C3_93D7_6C27), (Level::Harsh, 0x303B_B0C1_B4F2_9227)];
+    [(Level::None, 0xD688_4518_1D1B_15DB), (Level::Harsh, 0xC350_138C_F5F8_3F9B)];
 
 #[test]
 fn a_seed_means_the_same_trace_on_every_machine() {
