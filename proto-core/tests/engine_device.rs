@@ -7,7 +7,7 @@ use proto_core::device::{Algorithm, Bits, ByteOrder, Checksum, Digits, Encoding,
 use proto_core::engine::{Input, PortId, Rejection, ReplyCode};
 use proto_core::recipe::model::Mode;
 use proto_core::wire::can::{CanFrame, CanId};
-use proto_core::wire::scalar::{Scalar, ScalarType as T};
+use proto_core::wire::scalar::ScalarType as T;
 use rig::*;
 
 fn to(name: &str) -> InputBinding {
@@ -295,15 +295,17 @@ fn what_a_device_cannot_have_is_refused_with_its_place() {
 }
 
 #[test]
-fn a_value_that_was_refused_changes_nothing() {
+fn a_value_that_was_refused_changes_nothing_else() {
     let mut cell = Cell::new();
     let fields =
-        [fixed(1), input(big(T::Word), to("WordInputReg[1]")), input(big(T::Float), InputBinding::Unused)];
+        [fixed(1), input(big(T::Word), to("WordInputReg[1]")), input(big(T::Float), to("FloatInputReg[1]"))];
     let port = device(&mut cell, &fields, &[], SendOn::Period);
+    let link = cell.stream(&["FloatInputReg[1]"], &[]);
+    cell.recipe_link(link);
     let mut rig = cell.rig();
     rig.run(MS(10));
     rig.bytes(port, &[&[1, 0, 5][..], &f32::NAN.to_be_bytes()].concat());
-    assert_eq!(rig.counters(port).rejected_not_finite, 1);
-    assert_eq!(rig.engine.image().value(var("WordInputReg[1]")), Scalar::Word(0));
-    assert_eq!(rig.take_written(), []);
+    assert_eq!((rig.counters(port).rejected_fields, rig.counters(port).rejected_not_finite), (1, 0));
+    assert_eq!(rig.take_written(), [Written::Registers(8, vec![5])]);
+    assert!(!rig.engine.image().is_known(var("FloatInputReg[1]")));
 }

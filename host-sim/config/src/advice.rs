@@ -2,9 +2,10 @@
 //!
 //! In: the recipes of a gateway file as frames. Out: sentences, each with the key it is about.
 
-use proto_core::config::{FieldSpec, OutputBinding};
+use proto_core::config::{FieldSpec, InputRule, OutputBinding};
 use proto_core::device::Carrier;
 use proto_core::wire::can::CanId;
+use proto_core::wire::scalar::ScalarType;
 
 use crate::device::{DeviceField, DeviceRecipe, NamedFrame};
 
@@ -91,8 +92,8 @@ fn varying(frame: &NamedFrame) -> impl Iterator<Item = &str> {
 /// Parts of the names of such fields.
 const ORDERS: [&str; 6] = ["control", "command", "cmd", "start", "trigger", "enable"];
 
-/// Fields that can be negative and write a variable that cannot, without `offset`: each frame with a negative
-/// number is rejected. An `offset = 0` that is written says that this is known.
+/// Fields that can be negative and write a variable that cannot, without `offset`: a negative number is
+/// rejected. An `offset = 0` that is written says that this is known.
 pub fn negative_numbers(recipes: &[Option<DeviceRecipe>]) -> Vec<(Vec<String>, String)> {
     let advice = |recipe: &DeviceRecipe| {
         let parts = recipe.input.iter().map(|frame| &frame.fields);
@@ -109,10 +110,19 @@ pub fn negative_numbers(recipes: &[Option<DeviceRecipe>]) -> Vec<(Vec<String>, S
 
 fn of_field(recipe: &str, field: &DeviceField) -> Option<String> {
     let var = field.spec.rejects_negative().filter(|_| !field.has_offset)?;
+    let is_told = field.sendable.iter().any(|rule| match rule {
+        FieldSpec::InputRule(InputRule::Int16) | FieldSpec::Mapped(_) => true,
+        FieldSpec::Limits(limits) => limits.low >= 0.0,
+        _ => false,
+    });
+    if is_told {
+        return None;
+    }
     let (least, most) = var.ty().range();
     Some(format!(
-        "recipe {recipe:?}, field {:?}: {var} takes {least}..={most}, so each frame with a negative number is \
-         rejected; write an offset, or offset = 0 if there is none",
-        field.name
+        "recipe {recipe:?}, field {:?}: {var} takes {least}..={most}, so a negative number is rejected; write {}an offset, \
+         or offset = 0 if there is none",
+        field.name,
+        if var.ty() == ScalarType::Word { "as = \"int16\", " } else { "" }
     ))
 }

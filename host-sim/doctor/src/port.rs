@@ -54,7 +54,7 @@ fn since(now: &PortCounters, before: &PortCounters) -> PortCounters {
     subtract!(
         frames_in bytes_in rejected_not_finite rejected_out_of_range rejected_id rejected_length
         rejected_remote rejected_checksum rejected_unreadable rejected_other_device rejected_counter
-        rejected_no_input tail_mismatches resync_bytes discarded_bytes asleep unanswered refused
+        rejected_fields rejected_no_input tail_mismatches resync_bytes discarded_bytes asleep unanswered refused
     );
     counters
 }
@@ -248,13 +248,17 @@ impl Seen<'_> {
         let unreadable = counters.rejected_unreadable.wrapping_add(counters.rejected_out_of_range);
         let values = unreadable.wrapping_add(counters.rejected_not_finite);
         if self.are_many(values) {
-            return Some(self.bad_value(shape, bytes, values));
+            return Some(self.bad_value(shape, bytes, format!("{values} frames rejected")));
+        }
+        if self.are_many(counters.rejected_fields) {
+            let told = format!("{} fields of frames rejected", counters.rejected_fields);
+            return Some(self.bad_value(shape, bytes, told));
         }
         None
     }
 
-    /// Frames with a value that is not taken.
-    fn bad_value(&self, shape: &Shape<'_>, bytes: &[u8], rejected: u32) -> Finding {
+    /// Frames or fields with a value that is not taken.
+    fn bad_value(&self, shape: &Shape<'_>, bytes: &[u8], rejected: String) -> Finding {
         use Rejection::{NotFinite, OutOfRange, Unreadable};
         let is_value = |why| matches!(why, NotFinite | OutOfRange | Unreadable);
         let last = self.status.rejection.as_ref().filter(|last| is_value(last.why));
@@ -288,7 +292,7 @@ impl Seen<'_> {
             Severity::Fault,
             Cause::BadValue,
             [
-                format!("{rejected} frames rejected: {seen}"),
+                format!("{rejected}: {seen}"),
                 expected,
                 "A field's type, place or scale is not the device's, or scale and offset leave too small a range"
                     .into(),

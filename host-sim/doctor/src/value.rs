@@ -3,8 +3,9 @@
 //! In: a frame of the recipe, with head and tail. Out: the first field that a gateway rejects the frame for, in
 //! words, and the bytes as they are on the line, as `host-sim decode` takes them.
 
-use proto_core::config::{FieldSpec, Fitting, InputBinding};
+use proto_core::config::{FieldSpec, Fitting, InputBinding, InputRule};
 use proto_core::device::{Boundary, Encoding};
+use proto_core::engine::{Taken, judge_field};
 use proto_core::wire::scalar::Scalar;
 
 use crate::shape::Shape;
@@ -23,11 +24,14 @@ pub(crate) fn misfit(shape: &Shape<'_>, frame: &[u8]) -> Option<Misfit> {
     match &shape.device {
         Some((device, fields, _)) => {
             let values = device.layout.values(&device.elements, frame);
-            let numbered = (1..).zip(fields.iter()).filter(|(_, field)| field.element().is_some());
-            numbered.zip(values).find_map(|((nth, field), value)| match value {
-                Ok(value) => not_taken(nth, field, value?),
+            let numbered = (0..fields.len()).filter(|&at| fields[at].element().is_some());
+            // In the file, what stands behind a field is a key of it.
+            let nth = |at: usize| 1 + fields[..at].iter().filter(|field| !field.is_of_field_before()).count();
+            numbered.zip(values).find_map(|(at, value)| match value {
+                Ok(value) => not_taken_device(nth(at), &fields[at..], value?),
+                Err(_) if has_own_digits(&fields[at..]) => None,
                 Err(why) => Some(Misfit {
-                    seen: format!("{}: {why}", named(nth, field)),
+                    seen: format!("{}: {why}", named(nth(at), &fields[at])),
                     expected: "a number there".into(),
                 }),
             })
@@ -46,6 +50,32 @@ pub(crate) fn misfit(shape: &Shape<'_>, frame: &[u8]) -> Option<Misfit> {
             })
         }
     }
+}
+
+/// Whether digits may be none, or have a comma, so that only the gateway can tell.
+fn has_own_digits(fields: &[FieldSpec]) -> bool {
+    let behind = fields.iter().skip(1).take_while(|field| field.is_of_field_before());
+    behind
+        .into_iter()
+        .any(|rule| matches!(rule, FieldSpec::InputRule(InputRule::NoText(_) | InputRule::Comma)))
+}
+
+/// The first of these fields, of a device's frame.
+fn not_taken_device(nth: usize, fields: &[FieldSpec], value: Scalar) -> Option<Misfit> {
+    let field = fields.first()?;
+    let Some((taken, allowed)) = judge_field(fields, Ok(value), &[]) else {
+        return not_taken(nth, field, value);
+    };
+    let Taken::Rejected(_) = taken else { return None };
+    let name = named(nth, field);
+    if !value.is_finite() {
+        return not_taken(nth, field, value);
+    }
+    let expected = match allowed {
+        Some((low, high)) => format!("{}..={} there", number(low), number(high)),
+        None => "a number that its variable takes".into(),
+    };
+    Some(Misfit { seen: format!("{name} is {}", number(value.as_f64())), expected })
 }
 
 fn not_taken(nth: usize, field: &FieldSpec, value: Scalar) -> Option<Misfit> {

@@ -52,7 +52,8 @@ pub fn describe_use(field: &Field) -> String {
         | FieldSpec::Checksum(_)
         // Not among the fields with names.
         | FieldSpec::Limits(_)
-        | FieldSpec::Mapped(_) => String::new(),
+        | FieldSpec::Mapped(_)
+        | FieldSpec::InputRule(_) => String::new(),
     }
 }
 

@@ -251,7 +251,7 @@ fn show_source(field: &DeviceField) -> String {
     match (*spec, spec.variable()) {
         (FieldSpec::Fixed { value, .. }, _) => format!(" = {value}"),
         (FieldSpec::UserInput { to, .. } | FieldSpec::DeviceInput { to, .. }, Some(var)) => {
-            format!(" -> {var}{}", scale::of_input(spec, &to))
+            format!(" -> {var}{}", scale::of_input(spec, &to, &field.sendable))
         }
         (_, Some(var)) => format!(" <- {var}{}", scale::of_output(spec)),
         (FieldSpec::UserOutput { from, .. } | FieldSpec::DeviceOutput { from, .. }, None) => match from {

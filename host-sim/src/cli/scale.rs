@@ -2,12 +2,15 @@
 //!
 //! In: a field and its binding. Out: the end of its line, empty if the number stays as it is and always fits.
 
-use proto_core::config::{FieldSpec, Fitting, InputBinding, Limits, MapEntry, OutputBinding, Outside};
+use proto_core::config::{
+    FieldSpec, Fitting, InputBinding, InputRule, Limits, MapEntry, OutputBinding, Outside,
+};
 use proto_core::device::Overflow;
+use proto_core::engine::{Taken, judge_field};
 use proto_core::wire::scalar::Scalar;
 
 /// ` = value * 0.1 + 5, if in 0..=655300`.
-pub(super) fn of_input(spec: &FieldSpec, to: &InputBinding) -> String {
+pub(super) fn of_input(spec: &FieldSpec, to: &InputBinding, behind: &[FieldSpec]) -> String {
     let InputBinding::Variable { scale, offset, .. } = *to else { return String::new() };
     let formula = match formula("value", scale, offset) {
         formula if formula.is_empty() => formula,
@@ -16,7 +19,10 @@ pub(super) fn of_input(spec: &FieldSpec, to: &InputBinding) -> String {
     if matches!(spec, FieldSpec::DeviceInput { overflow: Overflow::Wrap, .. }) {
         return format!("{formula}, wraps");
     }
-    match spec.fitting() {
+    // What these let pass is told behind it.
+    let is_told =
+        |rule: &FieldSpec| matches!(rule, FieldSpec::InputRule(InputRule::Int16) | FieldSpec::Mapped(_));
+    match spec.fitting().filter(|_| !behind.iter().any(is_told)) {
         Some(fitting) => format!("{formula}, if in {}", range(&fitting)),
         None => formula,
     }
@@ -54,6 +60,16 @@ pub(super) fn of_sendable(sendable: &[FieldSpec]) -> String {
             format!(", {first}: {}", number(sent))
         }
         FieldSpec::Mapped(MapEntry { first, last, sent }) => format!(", {first}..{last}: {}", number(sent)),
+        FieldSpec::InputRule(rule) => match rule {
+            InputRule::Int16 => ", as int16 if in -32768..=32767".into(),
+            InputRule::Else(becomes) => format!(", else: {}", number(becomes)),
+            InputRule::NoNumber(code) => format!(", no value: {}", number(code)),
+            InputRule::NoText(text) => format!(", no value: {:?}", String::from_utf8_lossy(text.bytes())),
+            InputRule::Comma => ", with a comma".into(),
+            InputRule::ValidTo { var, bit: Some(bit) } => format!(", valid -> {var}.{bit}"),
+            InputRule::ValidTo { var, bit: None } => format!(", valid -> {var}"),
+            _ => String::new(),
+        },
         _ => String::new(),
     };
     sendable.iter().map(show).collect()
@@ -68,6 +84,20 @@ fn formula(value: &str, scale: f32, offset: f32) -> String {
         offset => format!(" + {offset}"),
     };
     if times.is_empty() && plus.is_empty() { String::new() } else { format!("{value}{times}{plus}") }
+}
+
+/// Why a gateway rejects a field of a device's frame, the first of these, with this value; `None` if it takes it.
+pub(super) fn refused_field(fields: &[FieldSpec], name: &str, value: Scalar) -> Option<String> {
+    let (taken, allowed) = judge_field(fields, Ok(value), &[])?;
+    if !value.is_finite() || !matches!(taken, Taken::Rejected(_)) {
+        return None;
+    }
+    let value = number(value.as_f64());
+    let var = fields.first().and_then(FieldSpec::variable)?;
+    Some(match allowed {
+        Some((low, high)) => format!("{name} is {value}; {var} takes {}..={}", number(low), number(high)),
+        None => format!("{name} is {value}, which {var} does not take"),
+    })
 }
 
 /// Why a gateway rejects a frame with this value of an input field; `None` if it takes it.
@@ -104,7 +134,7 @@ mod tests {
     fn input(ty: ScalarType, var: &str, scale: f32, offset: f32) -> String {
         let var = SysVar::parse(var).unwrap();
         let to = InputBinding::Variable { var, scale, offset };
-        of_input(&FieldSpec::UserInput { ty, to }, &to)
+        of_input(&FieldSpec::UserInput { ty, to }, &to, &[])
     }
 
     #[test]

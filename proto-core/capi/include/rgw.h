@@ -365,6 +365,10 @@ typedef struct rgw_port_counters {
   // Frames rejected because their alive counter is that of the frame before: the device may be
   // frozen.
   uint32_t rejected_counter;
+  // Fields of accepted frames of devices that were rejected.
+  uint32_t rejected_fields;
+  // Fields of accepted frames that have no value now, as the device says.
+  uint32_t fields_without_value;
   // Frames received on a port whose recipe has no input part.
   uint32_t rejected_no_input;
   // Frames that began with the head but did not end with the tail (D19).

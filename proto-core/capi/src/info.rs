@@ -60,6 +60,10 @@ pub struct PortCounters {
     /// Frames rejected because their alive counter is that of the frame before: the device may be
     /// frozen.
     pub rejected_counter: u32,
+    /// Fields of accepted frames of devices that were rejected.
+    pub rejected_fields: u32,
+    /// Fields of accepted frames that have no value now, as the device says.
+    pub fields_without_value: u32,
     /// Frames received on a port whose recipe has no input part.
     pub rejected_no_input: u32,
     /// Frames that began with the head but did not end with the tail (D19).
@@ -157,6 +161,7 @@ impl From<&engine::PortCounters> for PortCounters {
             counters: frames_in bytes_in frames_out bytes_out
                 rejected_not_finite rejected_out_of_range rejected_id rejected_length rejected_remote
                 rejected_checksum rejected_unreadable rejected_other_device rejected_counter
+                rejected_fields fields_without_value
                 rejected_no_input
                 tail_mismatches resync_bytes discarded_bytes asleep masked counter_jumps ignored
                 edges_lost values_expired undelivered withheld

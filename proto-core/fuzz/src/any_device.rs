@@ -4,7 +4,8 @@
 
 use proto_core::config::{
     AskWhen, Bus, CanFramePart, CommandWhen, Delimiter, Echo, Exchange, FieldSpec, FrameSpec, InputBinding,
-    LinkSource, OutputBinding, Parts, PortValue, Span, StateValue, StreamPart, Talk, Words,
+    InputRule, Limits, LinkSource, MapEntry, NoText, OutputBinding, Outside, Parts, PortValue, Span,
+    StateValue, StreamPart, Talk, Words,
 };
 use proto_core::device::{
     Algorithm, Bits, Boundary, ByteOrder, Checksum, Counts, Encoding, Escape, Ignored, Kind, Length,
@@ -175,6 +176,35 @@ fn value(input: &mut Source<'_>, direction: Direction, table: Span, encoding: En
     }
 }
 
+/// What may stand behind an input field that writes a variable.
+fn rules(input: &mut Source<'_>, spec: &FieldSpec) -> Vec<FieldSpec> {
+    if !matches!(spec, FieldSpec::DeviceInput { to: InputBinding::Variable { .. }, .. }) {
+        return Vec::new();
+    }
+    let kind = input.u8();
+    let rule = FieldSpec::InputRule;
+    let no_value = || rule(InputRule::NoNumber(f64::from(kind >> 4)));
+    let valid = |input: &mut Source<'_>| {
+        let bit = Some(kind >> 5);
+        rule(InputRule::ValidTo { var: var(input, Direction::Input), bit })
+    };
+    let outside = if kind & 16 == 0 { Outside::Refuse } else { Outside::Clamp };
+    let entry = |first, last| FieldSpec::Mapped(MapEntry { first, last, sent: f64::from(kind >> 6) });
+    match kind & 15 {
+        0 => vec![rule(InputRule::Int16)],
+        1 => vec![FieldSpec::Limits(Limits { low: 1.0, high: f64::from(kind >> 2), outside })],
+        2 => vec![entry(0, 3), entry(4, 9)],
+        3 => vec![entry(0, 3), rule(InputRule::Else(1.0))],
+        4 => vec![no_value(), valid(input)],
+        5 => vec![valid(input)],
+        6 => vec![rule(InputRule::Int16), no_value()],
+        // Only digits have these.
+        7 => NoText::new("--").map(|text| rule(InputRule::NoText(text))).into_iter().collect(),
+        8 => vec![rule(InputRule::Comma)],
+        _ => Vec::new(),
+    }
+}
+
 fn words(input: &mut Source<'_>, direction: Direction, count: u8) -> Words {
     let name = match direction {
         Direction::Input => format!("WordInputReg[{}]", 1 + input.below(24)),
@@ -226,7 +256,9 @@ fn fields(input: &mut Source<'_>, direction: Direction, table: Span, is_small: b
                 }
             }
         };
+        let behind = rules(input, &spec);
         specs.push(spec);
+        specs.extend(behind);
     }
     if kind & 1 == 1 && kind & 8 != 0 && !is_small {
         specs.push(text(input, direction, TextWidth::Rest));
@@ -255,7 +287,9 @@ fn registers(input: &mut Source<'_>, direction: Direction, table: Span) -> (Vec<
             }
             _ => (value(input, direction, table, Encoding::scalar(ScalarType::Word).big_endian()), 1),
         };
+        let behind = rules(input, &spec);
         specs.push(spec);
+        specs.extend(behind);
         count += size;
     }
     (specs, count)
@@ -397,6 +431,8 @@ fn frames(
             match field {
                 FieldSpec::DeviceInput { to, .. } => *to = InputBinding::Unused,
                 FieldSpec::TextInput { to, .. } => *to = None,
+                // Without a variable nothing may stand behind it.
+                field if field.is_of_field_before() => *field = FieldSpec::Padding { len: 1, fill: 0 },
                 _ => {}
             }
         }

@@ -4,6 +4,7 @@
 use super::check_exchange::ExchangeCheck;
 use super::device::field_of;
 use super::error::{ConfigError, ConfigErrorKind as Kind, Place, RecipeKey};
+use super::input_rule::BehindInput;
 use super::rules::{Check, check_bit, check_new_name, check_pool, fail, is_marked, mark};
 use super::sendable::Behind;
 use super::{
@@ -56,8 +57,9 @@ impl<'a> RecipeCheck<'a> {
                 let place = Place::Field { recipe: self.index, part, frame, field };
                 self.check_field(place, part, spec)?;
             }
-            if part == Direction::Output {
-                self.check_sendable()?;
+            match part {
+                Direction::Input => self.check_rules()?,
+                Direction::Output => self.check_sendable()?,
             }
         }
         if self.recipe.mode == Mode::User {
@@ -116,7 +118,8 @@ impl<'a> RecipeCheck<'a> {
                 | FieldSpec::Length(_),
             )
             // What they stand behind is checked with the frame.
-            | (Mode::User, Direction::Output, FieldSpec::Limits(_) | FieldSpec::Mapped(_)) => Ok(()),
+            | (Mode::User, _, FieldSpec::Limits(_) | FieldSpec::Mapped(_))
+            | (Mode::User, Direction::Input, FieldSpec::InputRule(_)) => Ok(()),
             (Mode::User, Direction::Input, FieldSpec::TextInput { to, length_to, count_to, .. }) => {
                 let is_input = |var: SysVar| var.direction() == Direction::Input;
                 let vars = to.iter().map(|words| words.first).chain(length_to).chain(count_to);
@@ -139,6 +142,21 @@ impl<'a> RecipeCheck<'a> {
         let (recipe, part) = (self.index, Direction::Output);
         for (frame, span) in self.config.frames_of(self.recipe, part) {
             let mut behind = Behind::default();
+            let mut rest = span.of(self.config.fields);
+            let mut field = 0_u8;
+            while let Some((_, after)) = rest.split_first() {
+                behind.check(Place::Field { recipe, part, frame, field }, rest)?;
+                (rest, field) = (after, field.saturating_add(1));
+            }
+        }
+        Ok(())
+    }
+
+    /// What becomes of the values of input fields.
+    fn check_rules(&self) -> Check {
+        let (recipe, part) = (self.index, Direction::Input);
+        for (frame, span) in self.config.frames_of(self.recipe, part) {
+            let mut behind = BehindInput::default();
             let mut rest = span.of(self.config.fields);
             let mut field = 0_u8;
             while let Some((_, after)) = rest.split_first() {

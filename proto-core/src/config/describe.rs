@@ -301,15 +301,27 @@ impl fmt::Display for DescribedKind<'_> {
                 names.try_for_each(|name| write!(f, " {name}"))
             }
             Kind::NothingToLimit => f.write_str("only an output field with a source has limits or a map"),
+            Kind::NothingToRule => f.write_str(
+                "only an input field that writes a variable, and not a bit of it, has as, min, max, map, no_value or \
+                 valid_to",
+            ),
+            Kind::RuleTwice => f.write_str("it is said twice, or too late, what becomes of the field's value"),
+            Kind::ElseWithoutMap => f.write_str("else is for a map with other entries"),
+            Kind::NotInVariable { var, value } => write!(f, "{var} cannot be {}", Decimal::Double(value)),
+            Kind::NotAWord { var } => write!(f, "{var} is no word register; allowed: WordInputReg"),
+            Kind::NoTextNeedsDigits => {
+                f.write_str("a text stands for no value in fields of digits only: decimal, hex")
+            }
+            Kind::NoComma => f.write_str("a decimal comma is for decimal fields that no comma ends"),
             Kind::LimitsAndWrap => {
-                f.write_str("overflow = \"wrap\" sends any number; min, max and map do not")
+                f.write_str("overflow = \"wrap\" takes any number; as, min, max and map do not")
             }
             Kind::LimitsAndMap => {
-                f.write_str("a map sends nothing but its own numbers; min, max and outside are not for it")
+                f.write_str("a map has nothing but its own numbers; min, max and outside are not for it")
             }
             Kind::LimitedCount => f.write_str("a count wraps, so min, max and map are not allowed"),
             Kind::ScaledMap => {
-                f.write_str("a map takes the values of the source, so scale and offset are not allowed")
+                f.write_str("a map takes values as they are, so scale and offset are not allowed")
             }
             Kind::BackwardLimits { low, high } => {
                 let [low, high] = [low, high].map(Decimal::Double);

@@ -40,7 +40,7 @@ impl DeviceFrame {
                 (None, FieldSpec::Checksum(sum)) if checksum.is_none() => {
                     checksum = Some((*sum, elements.len()));
                 }
-                (None, FieldSpec::Limits(_) | FieldSpec::Mapped(_)) => {}
+                (None, field) if field.is_of_field_before() => {}
                 (None, _) => return Err(LayoutError::ChecksumPlace),
             }
         }
@@ -94,12 +94,13 @@ impl FieldSpec {
             | Self::TextOutput { .. }
             | Self::Length(_)
             | Self::Limits(_)
-            | Self::Mapped(_) => true,
+            | Self::Mapped(_)
+            | Self::InputRule(_) => true,
         }
     }
 
-    /// The field as an element of a device's frame; `None` for a checksum, for what only says what the field
-    /// before it may send, and for the fields of realtime recipes.
+    /// The field as an element of a device's frame; `None` for a checksum, for what only says something of the
+    /// field before it, and for the fields of realtime recipes.
     pub const fn element(&self) -> Option<Element> {
         Some(match *self {
             Self::UserInput { ty, .. } | Self::UserOutput { ty, .. } => Element::value(Encoding::scalar(ty)),
@@ -110,7 +111,9 @@ impl FieldSpec {
             Self::Padding { len, fill } => Element::Padding { len, fill },
             Self::TextInput { text, .. } | Self::TextOutput { text, .. } => Element::Text(text),
             Self::Length(length) => Element::Length(length),
-            Self::System(_) | Self::Checksum(_) | Self::Limits(_) | Self::Mapped(_) => return None,
+            Self::System(_) | Self::Checksum(_) | Self::Limits(_) | Self::Mapped(_) | Self::InputRule(_) => {
+                return None;
+            }
         })
     }
 

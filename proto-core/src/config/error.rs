@@ -319,6 +319,28 @@ pub enum ConfigErrorKind {
     OnlyIntegersWrap,
     /// Limits or an entry of a table stand behind no output field with a source.
     NothingToLimit,
+    /// Limits, a table or a rule stand behind no input field that writes a variable as a whole.
+    NothingToRule,
+    /// A field has the same rule twice, or one after the table that it changes.
+    RuleTwice,
+    /// What becomes of all other values, without a table.
+    ElseWithoutMap,
+    /// A number that its variable cannot have.
+    NotInVariable {
+        /// The variable.
+        var: SysVar,
+        /// The number.
+        value: f64,
+    },
+    /// This is for word registers only.
+    NotAWord {
+        /// The variable.
+        var: SysVar,
+    },
+    /// A text can only stand for no value where digits stand.
+    NoTextNeedsDigits,
+    /// A comma is for decimal digits that it does not end.
+    NoComma,
     /// A field that wraps has limits or a table.
     LimitsAndWrap,
     /// A field has limits twice, or limits and a table.

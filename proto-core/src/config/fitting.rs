@@ -42,31 +42,12 @@ impl FieldSpec {
     }
 
     /// The numbers of an input field that fit its variable; `None` if all do that the field can have,
-    /// or if it writes none. Of a float variable only huge numbers would not fit: `None`.
+    /// or if it writes none. Of a float variable only huge numbers would not fit: `None`. What stands behind the field is
+    /// not looked at.
     pub fn fitting(&self) -> Option<Fitting> {
         let Written { encoding, var, scale, offset } = self.written()?;
-        if matches!(var.ty(), ScalarType::Float | ScalarType::Double) {
-            return None;
-        }
-        let (scale, offset) = (f64::from(scale), f64::from(offset));
-        let (low, high) = encoding.range();
-        let (least, most) = match (var.ty(), var.ty().range()) {
-            (ScalarType::Byte, (least, most)) => (least, most.min(f64::from(var.valid_bits()))),
-            (_, range) => range,
-        };
-        let between = |one: f64, other: f64| (one.min(other), one.max(other));
-        // Of the variable, rounded as the engine rounds.
-        let (first, last) = between((least - 0.5 - offset) / scale, (most + 0.5 - offset) / scale);
-        if first < low && last > high {
-            return None;
-        }
-        // Next to the end, where rounding decides, the number that surely fits.
-        let (first, last) = between((least - offset) / scale, (most - offset) / scale);
-        let (first, last) = match encoding.is_integer() {
-            true => (ceil(first), -ceil(-last)),
-            false => (first, last),
-        };
-        Some(Fitting { var, low: first.max(low), high: last.min(high) })
+        let (low, high) = fitting_numbers(&encoding, (var, var.ty()), scale, offset)?;
+        Some(Fitting { var, low, high })
     }
 
     /// Whether an input field's variable takes the number. True for a field that writes none.
@@ -82,6 +63,37 @@ impl FieldSpec {
         let is_unsigned = var.ty().range().0 >= 0.0;
         (is_signed && is_unsigned && scale > 0.0 && offset == 0.0).then_some(var)
     }
+}
+
+/// The numbers that a field can have and that fit its variable, which holds numbers of this type; `None` if all do.
+pub(crate) fn fitting_numbers(
+    encoding: &Encoding,
+    (var, ty): (SysVar, ScalarType),
+    scale: f32,
+    offset: f32,
+) -> Option<(f64, f64)> {
+    if matches!(ty, ScalarType::Float | ScalarType::Double) {
+        return None;
+    }
+    let (scale, offset) = (f64::from(scale), f64::from(offset));
+    let (low, high) = encoding.range();
+    let (least, most) = match (ty, ty.range()) {
+        (ScalarType::Byte, (least, most)) => (least, most.min(f64::from(var.valid_bits()))),
+        (_, range) => range,
+    };
+    let between = |one: f64, other: f64| (one.min(other), one.max(other));
+    // Of the variable, rounded as the engine rounds.
+    let (first, last) = between((least - 0.5 - offset) / scale, (most + 0.5 - offset) / scale);
+    if first < low && last > high {
+        return None;
+    }
+    // Next to the end, where rounding decides, the number that surely fits.
+    let (first, last) = between((least - offset) / scale, (most - offset) / scale);
+    let (first, last) = match encoding.reads_integers() {
+        true => (ceil(first), -ceil(-last)),
+        false => (first, last),
+    };
+    Some((first.max(low), last.min(high)))
 }
 
 /// The next integer above; `core` has no `ceil`.

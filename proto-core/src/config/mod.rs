@@ -24,6 +24,7 @@ mod fields;
 mod fitting;
 #[cfg(feature = "image")]
 pub mod image;
+mod input_rule;
 mod keys;
 mod line_budget;
 mod listen;
@@ -57,6 +58,8 @@ pub use exchange::{
 };
 pub use fields::{CanFields, Fields, InputField, OutputField, Sum, Var};
 pub use fitting::Fitting;
+pub(crate) use fitting::fitting_numbers;
+pub use input_rule::{InputRule, NO_TEXT, NoText};
 pub use line_budget::ExchangeBudget;
 pub use listen::listen_address;
 pub use network::{BoardAddress, Network};

@@ -6,7 +6,7 @@
 use heapless::{String, Vec};
 
 use super::walk::{PartFrames, Variables};
-use super::{Delimiter, Limits, LinkSource, MapEntry, Name, PortValue, StateValue};
+use super::{Delimiter, InputRule, Limits, LinkSource, MapEntry, Name, PortValue, StateValue};
 use crate::device::{Boundary, ByteOrder, Checksum, Encoding, Escape, Ignored, Length, Overflow, Text};
 use crate::recipe::model::{Field, MAX_CAN_IDS, Mode};
 use crate::sysvar::{Direction, SysVar, VarBit};
@@ -218,11 +218,15 @@ pub enum FieldSpec {
     },
     /// The frame's length stands here.
     Length(Length),
-    /// What the output field before this may send; nothing stands in the frame. Only in frames of devices.
+    /// What the output field before this may send, or which numbers the input field before it takes; nothing stands in
+    /// the frame. Only in frames of devices.
     Limits(Limits),
-    /// An entry of the table of what the output field before this sends; nothing stands in the frame. Only in
-    /// frames of devices.
+    /// An entry of the table of what the output field before this sends, or of what the variable of the input field before
+    /// it becomes; nothing stands in the frame. Only in frames of devices.
     Mapped(MapEntry),
+    /// What else becomes of the value of the input field before this; nothing stands in the frame. Only in frames of
+    /// devices.
+    InputRule(InputRule),
 }
 
 /// A run of word variables that holds a text, two characters each.
@@ -273,6 +277,7 @@ impl FieldSpec {
             | Self::DeviceInput { to: InputBinding::Bit { var, bit }, .. }
             | Self::UserOutput { from: OutputBinding::Bit { var, bit }, .. }
             | Self::DeviceOutput { from: OutputBinding::Bit { var, bit }, .. } => Some(VarBit { var, bit }),
+            Self::InputRule(rule) => rule.bit(),
             _ => None,
         }
     }
@@ -301,6 +306,7 @@ impl FieldSpec {
                 OutputBinding::Variable { var, .. } | OutputBinding::Bit { var, .. } => Some(var),
                 _ => None,
             },
+            Self::InputRule(rule) => rule.variable(),
             _ => None,
         }
     }

@@ -1,4 +1,5 @@
-//! What the number of an output field may be: limits, or a table of the numbers that are sent.
+//! What the number of an output field may be: limits, or a table of the numbers that are sent. Input fields have the same
+//! (`input_rule.rs`).
 //!
 //! Both stand behind their field, as entries of their own, so that fields without them have no room for
 //! them. Frames have nothing in their place. A number that is not allowed is not sent, and with it the
@@ -13,11 +14,11 @@ use crate::image::round;
 /// Maximum number of limits and entries of tables of numbers on all ports together.
 pub const MAX_SENDABLE: usize = 64;
 
-/// The numbers that an output field may send, of those that fit it.
+/// The numbers that an output field may send, of those that fit it; or those that an input field takes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Limits {
-    /// The lowest number, after scale and offset.
+    /// The lowest number, as the frame has it: of an output field after scale and offset, of an input field before.
     pub low: f64,
     /// The highest number.
     pub high: f64,
@@ -30,15 +31,15 @@ pub struct Limits {
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub enum Outside {
-    /// It is not sent, nor is its frame.
+    /// It is not sent, nor is its frame. An input field with it is rejected.
     #[default]
     Refuse,
-    /// The nearer limit is sent.
+    /// The nearer limit is sent, or taken.
     Clamp,
 }
 
 /// One entry of the table of an output field: these values of its source send this number. A value in no
-/// entry is not sent, nor is its frame.
+/// entry is not sent, nor is its frame. Of an input field: for these values its variable becomes this number.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct MapEntry {
@@ -46,16 +47,24 @@ pub struct MapEntry {
     pub first: i64,
     /// The last value.
     pub last: i64,
-    /// The number that is sent.
+    /// The number that is sent, or that the variable becomes.
     pub sent: f64,
 }
 
 impl Limits {
     /// The number that is sent for `number`; not a number if none is.
     pub(crate) fn apply(&self, encoding: &Encoding, number: f64) -> f64 {
+        self.apply_to(encoding.is_integer(), number)
+    }
+
+    /// The number that is taken for `number`; not a number if none is.
+    pub(crate) fn take(&self, encoding: &Encoding, number: f64) -> f64 {
+        self.apply_to(encoding.reads_integers(), number)
+    }
+
+    fn apply_to(&self, is_integer: bool, number: f64) -> f64 {
         // A scale such as 0.1 is a little more than it is written, so numbers that a float does not tell
         // from a limit are within it.
-        let is_integer = encoding.is_integer();
         let near = |number: f64| if is_integer { round(number) } else { f64::from(number as f32) };
         let is_inside = near(number) >= near(self.low) && near(number) <= near(self.high);
         if number.is_nan() || !is_inside && self.outside == Outside::Refuse {
@@ -74,9 +83,9 @@ impl MapEntry {
 }
 
 impl FieldSpec {
-    /// Whether it only says what the field before it may send.
+    /// Whether it only says what the field before it may send, or what becomes of its value.
     pub const fn is_of_field_before(&self) -> bool {
-        matches!(self, Self::Limits(_) | Self::Mapped(_))
+        matches!(self, Self::Limits(_) | Self::Mapped(_) | Self::InputRule(_))
     }
 }
 
@@ -120,7 +129,7 @@ impl<'c> Behind<'c> {
                 let before = self.field.map_or(&[][..], |(.., all)| all);
                 let before = before.get(1..).unwrap_or(&[]).iter().take(self.entries);
                 self.entries = self.entries.saturating_add(1);
-                check_entry(place, &encoding, &entry, before)
+                check_entry(place, Some(&encoding), &entry, before)
             }
             FieldSpec::UserOutput { ty, from } => {
                 self.begin(Some((Encoding::scalar(ty), Overflow::Usual, from, rest)));
@@ -175,13 +184,18 @@ fn is_scaled(from: OutputBinding) -> bool {
 fn check_limits(place: Place, encoding: &Encoding, limits: &Limits) -> Check {
     check_number(place, encoding, limits.low)?;
     check_number(place, encoding, limits.high)?;
+    check_order(place, limits)
+}
+
+pub(super) fn check_order(place: Place, limits: &Limits) -> Check {
     let Limits { low, high, .. } = *limits;
     if low > high { fail(place, Kind::BackwardLimits { low, high }) } else { Ok(()) }
 }
 
-fn check_entry<'c>(
+/// `encoding` is of the field that has the number of the entry, if one has.
+pub(super) fn check_entry<'c>(
     place: Place,
-    encoding: &Encoding,
+    encoding: Option<&Encoding>,
     entry: &MapEntry,
     before: impl Iterator<Item = &'c FieldSpec>,
 ) -> Check {
@@ -189,7 +203,9 @@ fn check_entry<'c>(
     if first > last {
         return fail(place, Kind::BackwardRange { first, last });
     }
-    check_number(place, encoding, sent)?;
+    if let Some(encoding) = encoding {
+        check_number(place, encoding, sent)?;
+    }
     let others = before.filter_map(|field| match field {
         FieldSpec::Mapped(other) => Some(other),
         _ => None,

@@ -245,7 +245,17 @@ impl Encoding {
         }
     }
 
-    /// Whether all values are integers.
+    /// Whether it is written in digits of ASCII.
+    pub const fn is_digits(&self) -> bool {
+        matches!(self.kind, Kind::Decimal(_) | Kind::Hex(_))
+    }
+
+    /// Whether all values that are read are integers: digits may have a point, however they are written.
+    pub const fn reads_integers(&self) -> bool {
+        self.is_integer() && !matches!(self.kind, Kind::Decimal(_))
+    }
+
+    /// Whether all values that are written are integers.
     pub const fn is_integer(&self) -> bool {
         match self.kind {
             Kind::Scalar(ty) => !matches!(ty, ScalarType::Float | ScalarType::Double),

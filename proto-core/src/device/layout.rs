@@ -347,6 +347,23 @@ impl FrameLayout {
         })
     }
 
+    /// The bytes of the `nth` element of such a frame; `None` if there is no such element.
+    pub fn bytes_of<'a>(
+        &self,
+        elements: impl IntoIterator<Item: Borrow<Element>>,
+        frame: &'a [u8],
+        nth: usize,
+    ) -> Option<&'a [u8]> {
+        let mut places = Places::new(self, Some(frame.len()));
+        for (at, element) in elements.into_iter().enumerate() {
+            let place = places.find(element.borrow(), frame).ok()?;
+            if at == nth {
+                return frame.get(place);
+            }
+        }
+        None
+    }
+
     /// The text that the `nth` element of such a frame is; `None` if it is no text.
     pub fn text<'a>(
         &self,

@@ -14,7 +14,7 @@ use heapless::Vec;
 use super::counters::{PortCounters, bump};
 use super::outbox::{EdgeQueue, Offer};
 use super::store::SafeBytes;
-use crate::image::{BitSet, Image, InputSet};
+use crate::image::{BitSet, GroupId, Image, InputSet};
 use crate::sysvar::{INPUT_COUNT, SysVar, VarBit};
 use crate::time::{Duration, Instant};
 
@@ -30,6 +30,8 @@ pub(super) struct Share {
     pub frame: u8,
     /// Index of its port in the engine.
     pub port: u8,
+    /// One more than the number of its group while a field of it is rejected; 0 if it has its frame's.
+    group: u8,
     /// Since when the value that is written next has waited.
     at: Instant,
 }
@@ -37,6 +39,16 @@ pub(super) struct Share {
 impl Share {
     fn bits(&self) -> BitSet {
         BitSet::of(self.var, self.mask)
+    }
+
+    /// The group that it has the age of.
+    pub(super) fn group(&self) -> GroupId {
+        self.withheld_in().unwrap_or(GroupId(self.frame))
+    }
+
+    /// The group that it has while a field of it is rejected.
+    fn withheld_in(&self) -> Option<GroupId> {
+        self.group.checked_sub(1).map(GroupId)
     }
 }
 
@@ -112,7 +124,9 @@ impl Bits {
         match self.shares.iter_mut().find(same) {
             Some(share) => share.mask |= mask,
             None => {
-                self.shares.push(Share { var: bit.var, mask, frame, port, at: Instant::ZERO }).ok()?;
+                self.shares
+                    .push(Share { var: bit.var, mask, frame, port, group: 0, at: Instant::ZERO })
+                    .ok()?;
             }
         }
         self.bytes.insert(bit.var);
@@ -147,7 +161,7 @@ impl Bits {
     ) -> Offered {
         let mut offered = Offered { reachable: InputSet::EMPTY, undelivered: false, was_safe: false };
         for (nth, share) in self.shares.iter_mut().enumerate() {
-            if usize::from(share.frame) != frame {
+            if usize::from(share.frame) != frame || share.group != 0 {
                 continue;
             }
             let (bits, place) = (share.bits(), place(nth));
@@ -200,12 +214,12 @@ impl Bits {
         }
     }
 
-    /// A frame is overdue: its bits take their safe values in place of everything that waits. Bits
-    /// without one hold.
+    /// A group is overdue, that of a frame or of rejected fields: its bits take their safe values in place of everything
+    /// that waits. Bits without one hold.
     #[inline(never)]
     pub(super) fn time_out(
         &mut self,
-        frame: usize,
+        group: GroupId,
         queue: &mut EdgeQueue,
         image: &mut Image,
         safe: &[SafeBytes],
@@ -213,7 +227,7 @@ impl Bits {
     ) -> TimedOut {
         let mut done = TimedOut { dropped: 0, is_safe: false, held: InputSet::EMPTY };
         for (nth, share) in self.shares.iter_mut().enumerate() {
-            if usize::from(share.frame) != frame {
+            if share.group() != group {
                 continue;
             }
             let var = share.var;
@@ -224,7 +238,8 @@ impl Bits {
             }
             let waited = queue.drop_all(place(nth));
             let held = BitSet::of(var, share.mask & !mask);
-            if !held.is_empty() {
+            // Without a value, there is nothing to hold.
+            if !self.live.and(held).is_empty() {
                 let is_dirty = !self.dirty.and(held).is_empty();
                 done.dropped = done.dropped.saturating_add(waited).saturating_add(usize::from(is_dirty));
                 done.held.insert(var);
@@ -245,6 +260,45 @@ impl Bits {
             }
         }
         done
+    }
+
+    /// The groups of shares with a rejected field.
+    pub(super) fn withheld_groups(&self) -> impl Iterator<Item = GroupId> + '_ {
+        self.shares.iter().filter_map(Share::withheld_in)
+    }
+
+    /// Whether a frame has shares in these bytes that have its age.
+    pub(super) fn has_unwithheld(&self, frame: u8, bytes: &InputSet) -> bool {
+        !bytes.is_empty()
+            && self
+                .shares
+                .iter()
+                .any(|share| share.frame == frame && bytes.contains(share.var) && share.group == 0)
+    }
+
+    /// The shares of a frame in these bytes have a group of their own, unless they had one.
+    pub(super) fn withhold(&mut self, frame: u8, bytes: &InputSet, group: GroupId) {
+        for share in self.shares.iter_mut().filter(|share| share.frame == frame && bytes.contains(share.var))
+        {
+            if share.group == 0 {
+                share.group = group.0.saturating_add(1);
+            }
+        }
+    }
+
+    /// The shares of a frame in these bytes have its age again.
+    pub(super) fn readmit(&mut self, frame: u8, bytes: &InputSet) {
+        for share in self.shares.iter_mut().filter(|share| share.frame == frame && bytes.contains(share.var))
+        {
+            share.group = 0;
+        }
+    }
+
+    /// The shares of one group have another one.
+    pub(super) fn regroup(&mut self, from: GroupId, to: GroupId) {
+        for share in self.shares.iter_mut().filter(|share| share.withheld_in() == Some(from)) {
+            share.group = to.0.saturating_add(1);
+        }
     }
 
     /// Drops what has waited for longer than `timeout`; returns the number of values, and since when

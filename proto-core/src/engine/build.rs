@@ -23,6 +23,7 @@ use super::modbus_link::{MAX_POLL_BLOCKS, ModbusLink};
 use super::outbox::EdgeQueue;
 use super::plan::{Plan, Source, WayUp, sent_by, shown_by, uplinks};
 use super::port_health::PortsHealth;
+use super::rules::{scale_word, words_of};
 use super::sender::Sender;
 use super::state_link::StateLink;
 use super::store::{InputFrame, MAX_INPUT_FRAMES, SafeBytes, Store};
@@ -30,8 +31,8 @@ use super::tap::Tap;
 use super::uplink::{Uplink, UplinkSetup};
 use super::user::{Bindings, InputBind, InputTo, OutputBind, Sendable};
 use crate::config::{
-    Bus, ConfigView, Counted, FieldSpec, InputBinding, MAX_SENDABLE, MIN_CYCLE, OutputBinding, Parts, Port,
-    Recipe, SendOn, Span, listen_address,
+    Bus, ConfigView, Counted, FieldSpec, InputBinding, InputRule, MAX_SAFE_VALUES, MAX_SENDABLE, MIN_CYCLE,
+    OutputBinding, Parts, Port, Recipe, SendOn, Span, listen_address,
 };
 use crate::image::{GroupId, InputSet, MAX_GROUPS};
 use crate::link::LinkTimings;
@@ -186,7 +187,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 let to = match field {
                     FieldSpec::UserInput { to, .. } | FieldSpec::DeviceInput { to, .. } => *to,
                     _ if field.element().is_some() => InputBinding::Unused,
-                    _ => continue,
+                    _ => {
+                        // What stands behind a field, and its scale before that.
+                        inputs = inputs.saturating_add(words_of(field).count());
+                        continue;
+                    }
                 };
                 inputs = inputs.saturating_add(1);
                 commands = commands.saturating_add(usize::from(matches!(to, InputBinding::Commands { .. })));
@@ -268,9 +273,32 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             whole.iter().for_each(|var| self.store.image.assign(var, group));
         }
         let full = || one_too_many(Counted::UserFields, FIELDS);
+        let mut next_rule = next_binding;
         let mut inputs = Span { start: self.bindings.inputs.len() as u16, len: 0 };
         for (frame, nth, field) in config.fields_of(recipe, Direction::Input) {
-            let Some(element) = field.element() else { continue };
+            let Some(element) = field.element() else {
+                // Those of the field that was added last.
+                let words = words_of(field).count() as u16;
+                let Some(InputBind { to, .. }) = self.bindings.inputs.last_mut().filter(|_| words > 0) else {
+                    continue;
+                };
+                let new = match *to {
+                    // The scale is the first.
+                    InputTo::Variable { var, .. } => Some((var, next_rule, 0, words.saturating_add(1))),
+                    InputTo::Ruled { var, first, count } => Some((var, first, u16::from(count), words)),
+                    _ => None,
+                };
+                if let Some((var, first, before, words)) = new {
+                    let needed = before.saturating_add(words);
+                    let count = u8::try_from(needed).map_err(|_| {
+                        let (needed, room) = (needed.into(), u8::MAX.into());
+                        BuildError::TooMany { what: Counted::UserFields, needed, room }
+                    })?;
+                    *to = InputTo::Ruled { var, count, first };
+                    next_rule = next_rule.saturating_add(words);
+                }
+                continue;
+            };
             let to = match *field {
                 FieldSpec::UserInput { to, .. } | FieldSpec::DeviceInput { to, .. } => to,
                 _ => InputBinding::Unused,
@@ -298,6 +326,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             self.bindings.inputs.push(InputBind::new(to, element)).map_err(|_| full())?;
             inputs.len = inputs.len.saturating_add(1);
         }
+        self.add_rules(config, port, recipe)?;
         let mut outputs = Span { start: self.bindings.outputs.len() as u16, len: 0 };
         for (_, _, field) in config.fields_of(recipe, Direction::Output) {
             if let Some(sendable) = Sendable::new(field) {
@@ -339,6 +368,39 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         };
         self.ports.push(port).map_err(|_| one_too_many(Counted::FieldPorts, PORTS))?;
         self.store.edges.push(EdgeQueue::default()).map_err(|_| one_too_many(Counted::FieldPorts, PORTS))
+    }
+
+    /// What stands behind the input fields of a port follows its bindings, in the order of the fields.
+    #[inline(never)]
+    fn add_rules(&mut self, config: ConfigView<'_>, port: &Port, recipe: &Recipe) -> Result<(), BuildError> {
+        let mut scale = None;
+        for (_, _, field) in config.fields_of(recipe, Direction::Input) {
+            if field.element().is_some() {
+                scale = match *field {
+                    FieldSpec::UserInput { to: InputBinding::Variable { scale, offset, .. }, .. }
+                    | FieldSpec::DeviceInput { to: InputBinding::Variable { scale, offset, .. }, .. } => {
+                        Some(scale_word(scale, offset))
+                    }
+                    _ => None,
+                };
+            }
+            let words = words_of(field);
+            let first = scale.take_if(|_| field.is_of_field_before());
+            for word in first.into_iter().chain(words) {
+                self.bindings.inputs.push(word).map_err(|_| one_too_many(Counted::UserFields, FIELDS))?;
+            }
+            // What tells whether a value was taken is 0 when its port is silent.
+            let FieldSpec::InputRule(InputRule::ValidTo { var, bit }) = *field else { continue };
+            let mask = bit.map_or(u8::MAX, |bit| VarBit { var, bit }.mask().unwrap_or(0));
+            let own = port.on_timeout.of(config.safe_values);
+            if own.iter().all(|safe| safe.var != var || safe.mask & mask == 0) {
+                let safe = SafeBytes { var, bytes: [0; 4], mask };
+                self.safe_values
+                    .push(safe)
+                    .map_err(|_| one_too_many(Counted::SafeValues, MAX_SAFE_VALUES))?;
+            }
+        }
+        Ok(())
     }
 
     /// Lays out the frames of the port that was added last. In its place: a codec is large, and each

@@ -341,9 +341,26 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     fn expire_frames(&mut self, now: Instant) {
         let mut timed_out = false;
         while let Some(overdue) = self.store.next_timeout(&self.safe_values) {
-            let Overdue::Frame(frame, dropped) = overdue else {
-                self.check_health(now);
-                continue;
+            let (frame, dropped) = match overdue {
+                Overdue::Frame(frame, dropped) => (frame, dropped),
+                Overdue::Health => {
+                    self.check_health(now);
+                    continue;
+                }
+                Overdue::Fields(port, dropped) => {
+                    timed_out = true;
+                    if let Some(port) = self.ports.get_mut(usize::from(port)) {
+                        add(&mut port.counters.values_expired, dropped);
+                    }
+                    continue;
+                }
+                Overdue::Command(field) => {
+                    timed_out = true;
+                    if let Some(link) = self.links.command.first_mut() {
+                        link.silent(field, now);
+                    }
+                    continue;
+                }
             };
             timed_out = true;
             if let Some(port) = self.ports.get_mut(usize::from(frame.port)) {

@@ -14,9 +14,9 @@ pub struct PortCounters {
     pub frames_out: u32,
     /// Bytes handed over to the driver (CAN: data bytes).
     pub bytes_out: u32,
-    /// Frames rejected for a value that is not finite (D22).
+    /// Frames rejected for a value that is not finite (D22); of a device's frames, those of which no value was taken.
     pub rejected_not_finite: u32,
-    /// Frames rejected because a bound value did not fit its variable (D22).
+    /// The same because a bound value did not fit its variable (D22).
     pub rejected_out_of_range: u32,
     /// CAN frames ignored because the recipe does not have their id (D17).
     pub rejected_id: u32,
@@ -26,13 +26,18 @@ pub struct PortCounters {
     pub rejected_remote: u32,
     /// Frames rejected because their checksum is wrong.
     pub rejected_checksum: u32,
-    /// Frames rejected because a field is not a number, such as a letter among digits.
+    /// The same because a field is not a number, such as a letter among digits.
     pub rejected_unreadable: u32,
     /// Frames that are right and of another device: a constant is not ours.
     pub rejected_other_device: u32,
     /// Frames rejected because their alive counter is that of the frame before: the device may be
     /// frozen.
     pub rejected_counter: u32,
+    /// Fields of accepted frames of devices that were rejected: a value that does not fit, is not finite, or is not a
+    /// number.
+    pub rejected_fields: u32,
+    /// Fields of accepted frames that have no value now, as the device says.
+    pub fields_without_value: u32,
     /// Frames received on a port whose recipe has no input part.
     pub rejected_no_input: u32,
     /// Frames that began with the head but did not end with the tail (D19).

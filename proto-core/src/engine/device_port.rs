@@ -1,7 +1,7 @@
 //! The frames of a device that no recipe of the controller can describe: found, taken, and made.
 //!
-//! In: bytes and CAN frames, and the port's bindings with their elements. Out: values in the store,
-//! and frames when they are due. Recipes of the controller's own kinds do not come here.
+//! In: bytes and CAN frames, and the port's bindings with their elements. Out: frames that were found, which
+//! `device_frame.rs` applies, and frames when they are due. Recipes of the controller's own kinds do not come here.
 
 use heapless::Vec;
 
@@ -9,22 +9,21 @@ use super::build_error::{BuildError, one_too_many};
 use super::command_link::CommandLink;
 use super::counters::bump;
 use super::field_output::Downward;
-use super::field_port::{Codec, FieldPort, came, keep};
+use super::field_port::{Codec, FieldPort, came, keep_why};
 use super::frames::{Accepted, Frames};
 use super::line::Line;
 use super::rejection::Rejection;
 use super::sender::{DIGEST_SEED, digest};
 use super::store::Store;
 use super::tap::Tap;
-use super::user::{InputBind, InputTo, Outputs, Written};
+use super::user::{InputBind, Outputs};
 use super::whole_port::{MAX_TEXTS, Outgoing, Reader, TextBind, texts_of};
 use crate::config::{CanFramePart, ConfigView, Counted, DeviceFrame, Parts, Recipe, Rs485, Span};
-use crate::device::{Cutter, Element, Encoding, Escape, Found, FrameLayout, Framer, Overflow, Probe};
-use crate::image::{Image, bind_to_variable};
-use crate::sysvar::{Direction, SysVar};
+use crate::device::{Cutter, Element, Escape, Found, FrameLayout, Framer, Probe};
+use crate::image::Image;
+use crate::sysvar::Direction;
 use crate::time::Instant;
 use crate::wire::can::{CanFrame, CanId};
-use crate::wire::scalar::Scalar;
 
 /// Maximum number of frames of one port with a device's own frames, both ways together.
 pub(super) const MAX_DEVICE_FRAMES: usize = 18;
@@ -245,11 +244,10 @@ impl FieldPort {
                 Found::Wrong(frame) => (frame, frames.rejected(Rejection::Checksum)),
             };
             tap.record(|| came(self.id, now, verdict, None, [frame, &[], &[]]));
-            match verdict {
-                // What is held can hold further frames, so only the rest of the chunk waits.
-                Ok(()) if frames.store.watches_bits && !left.is_empty() => break,
-                Ok(()) => {}
-                Err(why) => keep(&mut self.last_rejection, why, None, frame, now),
+            keep_why(&mut self.last_rejection, verdict, frames.store, None, frame);
+            // What is held can hold further frames, so only the rest of the chunk waits.
+            if verdict.is_ok() && frames.store.watches_bits && !left.is_empty() {
+                break;
             }
         }
         *rest = left;
@@ -357,79 +355,4 @@ impl FieldPort {
         }
         Some(downward)
     }
-}
-
-impl<const PORTS: usize> Frames<'_, PORTS> {
-    /// Applies a frame as a whole or not at all, and counts it in `accepted`.
-    pub(super) fn take_device(
-        &mut self,
-        format: &DeviceFormat,
-        texts: &[TextBind],
-        frame: &[u8],
-        slot: usize,
-        accepted: &mut Accepted,
-    ) -> Result<(), Rejection> {
-        if self.is_ignored(texts, format, frame) {
-            bump(&mut self.counters.ignored);
-            self.store.not_overdue(slot);
-            // Without variables; an answer to each frame is sent for this one, too.
-            accepted.frames = accepted.frames.wrapping_add(1);
-            return Ok(());
-        }
-        let bindings = format.bindings.of(self.bindings);
-        let values = || bindings.iter().zip(format.layout.values(elements(bindings), frame));
-        for (binding, value) in values() {
-            match value {
-                Err(_) => self.rejected(Rejection::Unreadable)?,
-                Ok(Some(value)) if !value.is_finite() => self.rejected(Rejection::NotFinite)?,
-                Ok(Some(value)) => self.fits(binding, value).or_else(|why| self.rejected(why))?,
-                Ok(None) => {}
-            }
-        }
-        self.texts_fit(texts, format, frame).or_else(|why| self.rejected(why))?;
-        for (binding, value) in values() {
-            let Ok(Some(value)) = value else { continue };
-            match (bound(binding, value), binding.to) {
-                (Some((var, value)), _) => {
-                    // It fits: all values were tried before the first was applied.
-                    let _ = self.store.image.set(var, value);
-                }
-                (None, InputTo::Counter(nth)) => {
-                    if self.store.counts.take(nth, value) {
-                        bump(&mut self.counters.counter_jumps);
-                    }
-                }
-                (None, _) => self.apply_user(&binding.to, value),
-            }
-        }
-        self.take_texts(texts, format, frame);
-        if let Some(link) = &mut self.commands {
-            link.frame_ends();
-        }
-        bump(&mut self.counters.frames_in);
-        accepted.frames = accepted.frames.wrapping_add(1);
-        accepted.set = self.store.accepted_apart(slot, self.counters);
-        Ok(())
-    }
-
-    /// Whether a value may be taken for its binding.
-    fn fits(&self, binding: &InputBind, value: Scalar) -> Result<(), Rejection> {
-        match binding.to {
-            InputTo::Variable { .. } if bound(binding, value).is_none() => Err(Rejection::OutOfRange),
-            InputTo::Counter(nth) => self.store.counts.check(nth, value),
-            _ => Ok(()),
-        }
-    }
-}
-
-/// The variable and the value that a field's value becomes; `None` if it does not fit, or is not for
-/// a variable.
-fn bound(binding: &InputBind, value: Scalar) -> Option<(SysVar, Scalar)> {
-    let InputTo::Variable { var, scale, offset } = binding.to else { return None };
-    let Written::Value { overflow: Overflow::Wrap, .. } = binding.written else {
-        return binding.to.bound(value);
-    };
-    let number = value.as_f64() * f64::from(scale) + f64::from(offset);
-    let number = Encoding::scalar(var.ty()).fit(number, Overflow::Wrap)?;
-    bind_to_variable(var, Scalar::Double(number), 1.0, 0.0).map(|value| (var, value))
 }

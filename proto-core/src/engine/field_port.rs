@@ -237,10 +237,8 @@ impl FieldPort {
         let mut accepted = Accepted::default();
         let verdict = self.take_can((frame, found), bindings, store, commands, &mut accepted);
         tap.record(|| came(self.id, now, verdict, Some(frame.id()), [frame.data(), &[], &[]]));
-        if let Err(why) = verdict
-            && self.is_news(why, now)
-        {
-            keep(&mut self.last_rejection, why, Some(frame.id()), frame.data(), now);
+        if verdict.is_ok() || verdict.is_err_and(|why| self.is_news(why, now)) {
+            keep_why(&mut self.last_rejection, verdict, store, Some(frame.id()), frame.data());
         }
         accepted
     }
@@ -464,6 +462,26 @@ pub(super) fn keep(
     now: Instant,
 ) {
     *last = Some(LastRejection::new(now, why, can_id, bytes));
+}
+
+/// Keeps why a device's frame was rejected, or a field of it.
+#[inline]
+pub(super) fn keep_why<const PORTS: usize>(
+    last: &mut Option<LastRejection>,
+    verdict: Result<(), Rejection>,
+    store: &mut Store<PORTS>,
+    can_id: Option<CanId>,
+    bytes: &[u8],
+) {
+    if verdict.is_err() || store.rejected_field.is_some() {
+        let field = store.rejected_field.take();
+        if let Some(why) = field.map(|field| field.why).or(verdict.err()) {
+            keep(last, why, can_id, bytes, store.now);
+            if let Some(last) = last {
+                last.field = field;
+            }
+        }
+    }
 }
 
 /// Input from a field port's device, for the tap.

@@ -1,4 +1,5 @@
-//! Applying the frames that came from a field port: as a whole or not at all.
+//! Applying the frames that came from a field port: as a whole or not at all. Those of devices are applied field by field, in
+//! `device_frame.rs`.
 //!
 //! In: the payload of a frame that was found, with its layout. Out: values in the store, commands, and counters. Does
 //! not know how frames are found.
@@ -123,7 +124,12 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
 
     pub(super) fn apply_user(&mut self, binding: &InputTo, value: Scalar) {
         match *binding {
-            InputTo::Unused | InputTo::Fixed { .. } | InputTo::Counter(_) => {}
+            InputTo::Unused
+            | InputTo::Fixed { .. }
+            | InputTo::Counter(_)
+            // Only in frames of devices.
+            | InputTo::Ruled { .. }
+            | InputTo::Rule(_) => {}
             InputTo::Variable { .. } => {
                 if let Some((var, value)) = binding.bound(value) {
                     // It fits: all values were tried before the first was applied.

@@ -90,6 +90,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             frames: &self.store.frames,
             health: &self.health,
             image: &self.store.image,
+            inputs: &self.bindings.inputs,
             bits: &self.store.bits,
             links: self.links.view(),
             latency: &self.store.latency,

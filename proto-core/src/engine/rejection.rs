@@ -1,9 +1,10 @@
 //! Why input on a port or link was rejected, as counters, tap and status report it.
 
+use crate::sysvar::SysVar;
 use crate::time::{Duration, Instant};
 use crate::wire::can::CanId;
 
-/// Why a frame, packet or answer was rejected. Nothing of it was applied.
+/// Why a frame, packet or answer was rejected, and nothing of it applied; or a field of a device's frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(rename_all = "snake_case"))]
@@ -91,11 +92,37 @@ impl Rejection {
     }
 }
 
+/// A field of a device's frame that was rejected, with or without the rest of its frame.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
+pub struct RejectedField {
+    /// Index of the frame among the recipe's input frames; those of exchanges follow those of the input part.
+    pub frame: u8,
+    /// Index of the field in the frame, in the order of the wire; checksums do not count.
+    pub field: u8,
+    /// The variable that the value is for; the first one of a text.
+    pub var: Option<SysVar>,
+    /// The number that the frame had, before scale and offset; `None` if it could not be read, and for a text.
+    pub value: Option<f64>,
+    /// The lowest and the highest number that is taken, in the same unit; `None` where the field can have no other ones, or
+    /// the numbers are no range.
+    pub allowed: Option<(f64, f64)>,
+}
+
+/// The same as the engine keeps it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct FieldRejection {
+    pub value: f64,
+    /// Index among the bindings of all ports.
+    pub binding: u16,
+    pub why: Rejection,
+}
+
 /// Number of bytes of a rejection that are kept.
 pub const KEPT_BYTES: usize = 32;
 
 /// The newest rejection of a port, with the first [`KEPT_BYTES`] of the rejected bytes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LastRejection {
     /// When it was; for bytes without a frame, when the first came.
     pub at: Instant,
@@ -107,6 +134,8 @@ pub struct LastRejection {
     /// [`Rejection::NoFrame`] it is the number of bytes that belong to no frame, and the kept bytes
     /// are those of the chunks with them.
     pub len: usize,
+    /// The field that was rejected, if it was one of a device's frame.
+    pub(super) field: Option<FieldRejection>,
     /// When its newest bytes came.
     newest_at: Instant,
     kept: u8,
@@ -115,8 +144,16 @@ pub struct LastRejection {
 
 impl LastRejection {
     pub(super) fn new(at: Instant, why: Rejection, can_id: Option<CanId>, bytes: &[u8]) -> Self {
-        let mut rejection =
-            Self { at, why, can_id, len: bytes.len(), newest_at: at, kept: 0, bytes: [0; KEPT_BYTES] };
+        let mut rejection = Self {
+            at,
+            why,
+            can_id,
+            len: bytes.len(),
+            field: None,
+            newest_at: at,
+            kept: 0,
+            bytes: [0; KEPT_BYTES],
+        };
         for (kept, &byte) in rejection.bytes.iter_mut().zip(bytes) {
             *kept = byte;
         }

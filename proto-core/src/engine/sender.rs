@@ -241,11 +241,22 @@ impl Sender {
     /// Whether the values may be sent at `now`: all known, and fresh unless the recipe holds.
     #[inline(always)]
     pub(super) fn may_show(&self, image: &Image, now: Instant) -> bool {
-        image.can_read(&self.shown, self.shown_extra)
+        (!image.has_unreadable() || self.can_show(image, now))
             && self.sources.all(|group| match image.stamp_of(group) {
                 Some(at) => self.on_stale == OnStale::Hold || now.saturating_since(at) <= self.stale_after,
                 None => false,
             })
+    }
+
+    /// Whether all values are readable, and those whose fields are rejected are fresh: their frames' age is not theirs.
+    #[cold]
+    #[inline(never)]
+    fn can_show(&self, image: &Image, now: Instant) -> bool {
+        image.can_read(&self.shown, self.shown_extra)
+            && self
+                .shown
+                .inputs(&image.withheld())
+                .all(|var| image.known_since(var).is_some_and(|at| self.is_fresh(at, now)))
     }
 
     /// Whether a frame with this digest is new, on a port that sends only changes, or is to be sent

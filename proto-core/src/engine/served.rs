@@ -124,7 +124,7 @@ impl<const PORTS: usize> Blocks<'_, PORTS> {
             return Err(Exception::IllegalDataAddress);
         };
         self.frames
-            .take_device(format, self.texts, data, usize::from(*slot), self.accepted)
+            .take_block(format, self.texts, data, usize::from(*slot), self.accepted)
             .map_err(|_| Exception::IllegalDataValue)?;
         let kept = self.written.iter_mut().skip(usize::from(pieces.start)).take(usize::from(pieces.len));
         kept.flatten().zip(data).for_each(|(slot, &byte)| *slot = byte);
@@ -239,6 +239,9 @@ impl FieldPort {
             && why != Rejection::OtherDevice
         {
             keep(&mut self.last_rejection, why, None, request, now);
+        }
+        if let (Some(field), Some(last)) = (store.rejected_field.take(), &mut self.last_rejection) {
+            last.field = Some(field);
         }
         accepted
     }

@@ -17,9 +17,12 @@ use super::line::{PeerCounters, PeerState};
 use super::links::{LinkInfo, LinksView};
 use super::not_given::LastNotGiven;
 use super::port_health::PortsHealth;
-use super::rejection::LastRejection;
+use super::rejection::{LastRejection, RejectedField};
+use super::rules::allowed;
 use super::store::InputFrame;
-use crate::config::CommandText;
+use super::user::InputBind;
+use super::whole_port::TextBind;
+use crate::config::{CommandText, Span};
 use crate::image::{GroupId, Image};
 use crate::link::LinkState;
 use crate::schedule::Presence;
@@ -36,6 +39,8 @@ pub struct Status<'a> {
     pub(super) frames: &'a [InputFrame],
     pub(super) health: &'a PortsHealth,
     pub(super) image: &'a Image,
+    /// Those of all ports.
+    pub(super) inputs: &'a [InputBind],
     pub(super) bits: &'a Bits,
     pub(super) links: LinksView<'a>,
     pub(super) latency: &'a Latency,
@@ -113,6 +118,8 @@ pub struct PortStatus<'a> {
     /// The newest rejection. A CAN frame with an unknown id replaces no other rejection: on a
     /// shared bus it is for another node.
     pub last_rejection: Option<&'a LastRejection>,
+    /// The field of a device's frame that it was, with or without the rest of the frame.
+    pub rejected_field: Option<RejectedField>,
     /// Counters since the start.
     pub counters: &'a PortCounters,
     peers: &'a [PeerState],
@@ -228,7 +235,7 @@ impl<'a> Status<'a> {
     /// The known bits with owners of their own.
     pub fn bits(self) -> impl Iterator<Item = VariableStatus<'a>> {
         self.bits.shares().iter().flat_map(move |share| {
-            let at = self.image.stamp_of(GroupId(share.frame));
+            let at = self.image.stamp_of(share.group());
             let owner = self.ports.get(usize::from(share.port)).map(|port| port.name.as_str());
             let value = self.image.byte(share.var);
             (0..8).filter_map(move |bit| {
@@ -298,9 +305,42 @@ impl<'a> Status<'a> {
         if var.direction() != Direction::Input || self.bits.bytes.contains(var) {
             return None;
         }
-        let frame = self.frames.iter().find(|frame| frame.set.contains(var));
+        let frame = self.frames.iter().find(|frame| frame.set.contains(var) || self.has_field(frame, var));
         let port = frame.map(|frame| frame.port).or_else(|| self.health.owner(var))?;
         self.ports.get(usize::from(port)).map(|port| port.name.as_str())
+    }
+
+    /// Whether a field of the frame writes this variable, which has left it because the field was rejected.
+    fn has_field(&self, frame: &InputFrame, var: SysVar) -> bool {
+        if !self.image.withheld().contains(var) {
+            return false;
+        }
+        let is_written =
+            frame.bindings.of(self.inputs).iter().any(|binding| binding.to.variable() == Some(var));
+        let texts = self.texts(usize::from(frame.port));
+        is_written
+            || texts.iter().any(|text| text.is_in(frame.bindings) && text.variables().any(|own| own == var))
+    }
+
+    /// The texts of a port's frames.
+    fn texts(&self, port: usize) -> &'a [TextBind] {
+        match self.ports.get(port).map(|port| &port.codec) {
+            Some(Codec::Device(device)) => &device.texts,
+            _ => &[],
+        }
+    }
+
+    /// The field that a rejection of this port was.
+    fn rejected(&self, port: usize, last: &LastRejection) -> Option<RejectedField> {
+        let rejected = last.field?;
+        let own = self.frames.iter().filter(|frame| usize::from(frame.port) == port);
+        let place = |span: Span| rejected.binding.checked_sub(span.start).filter(|&nth| nth < span.len);
+        let (frame, field) = (0..).zip(own).find_map(|(nth, frame)| Some((nth, place(frame.bindings)?)))?;
+        let (var, allowed) = allowed(self.inputs.get(usize::from(rejected.binding))?, self.inputs);
+        let of_text = self.texts(port).iter().find(|text| text.is_input(rejected.binding));
+        let var = var.or_else(|| of_text.and_then(|text| text.variables().next()));
+        let value = (!rejected.value.is_nan()).then_some(rejected.value);
+        Some(RejectedField { frame, field: field as u8, var, value, allowed })
     }
 
     fn last_failed(&self, port: PortId) -> Option<FailedCommand<'a>> {
@@ -338,6 +378,7 @@ impl<'a> Status<'a> {
             last_not_given: self.links.command.and_then(|link| link.not_given_of(port.id)),
             last_failed: self.last_failed(port.id),
             last_rejection: port.last_rejection.as_ref(),
+            rejected_field: port.last_rejection.as_ref().and_then(|last| self.rejected(index, last)),
             counters: &port.counters,
             peers,
             #[cfg(feature = "serde")]

@@ -3,7 +3,9 @@
 //! ```text
 //! { "time_us", "sleeps",
 //!   "ports": { NAME: { "bus", "bus_state"?, "recipe", "state", "age_ms"?, "overdue", "reply",
-//!                      "command"?, "last_not_given"?, "last_failed"?, "last_rejection"?,
+//!                      "command"?, "last_not_given"?, "last_failed"?,
+//!                      "last_rejection"?: { "why", "text", "age_ms", "can_id"?, "len", "bytes",
+//!                                           "field"?: { "frame", "field", "to"?, "value"?, "allowed"? } },
 //!                      "peers"?: { NUMBER: { "presence", "missed_periods", "counters" } },
 //!                      "counters" } },
 //!   "links": { NAME: { "kind", "state", "history", "other_text"?, "counters" } },
@@ -22,7 +24,7 @@ use super::failed::FailedCommand;
 use super::links::LinkInfo;
 use super::not_given::LastNotGiven;
 use super::other_text::OtherText;
-use super::rejection::LastRejection;
+use super::rejection::{LastRejection, RejectedField};
 use super::status::{ControllerStatus, FieldBus, PeerStatus, PortStatus, Status, VariableStatus};
 use crate::time::Instant;
 use crate::wire::scalar::Scalar;
@@ -62,12 +64,34 @@ impl fmt::Display for Hex<'_> {
     }
 }
 
+/// A rejected field.
+struct Field(RejectedField);
+
+impl Serialize for Field {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let Self(field) = self;
+        let mut map = serializer.serialize_map(None)?;
+        map.serialize_entry("frame", &field.frame)?;
+        map.serialize_entry("field", &field.field)?;
+        if let Some(var) = field.var {
+            map.serialize_entry("to", &Text(var))?;
+        }
+        if let Some(value) = field.value.filter(|value| value.is_finite()) {
+            map.serialize_entry("value", &value)?;
+        }
+        if let Some(allowed) = field.allowed {
+            map.serialize_entry("allowed", &allowed)?;
+        }
+        map.end()
+    }
+}
+
 /// A rejection, with the instant of the status.
-struct Rejected<'a>(&'a LastRejection, Instant);
+struct Rejected<'a>(&'a LastRejection, Option<RejectedField>, Instant);
 
 impl Serialize for Rejected<'_> {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let &Self(rejection, at) = self;
+        let &Self(rejection, field, at) = self;
         let mut map = serializer.serialize_map(None)?;
         map.serialize_entry("why", &rejection.why)?;
         map.serialize_entry("text", rejection.why.text())?;
@@ -76,6 +100,9 @@ impl Serialize for Rejected<'_> {
             map.serialize_entry("can_id", &Text(id))?;
         }
         map.serialize_entry("len", &rejection.len)?;
+        if let Some(field) = field {
+            map.serialize_entry("field", &Field(field))?;
+        }
         map.serialize_entry("bytes", &Text(Hex(rejection.bytes())))?;
         map.end()
     }
@@ -128,7 +155,7 @@ impl Serialize for PortStatus<'_> {
             map.serialize_entry("last_failed", &At(failed, at))?;
         }
         if let Some(rejection) = port.last_rejection {
-            map.serialize_entry("last_rejection", &Rejected(rejection, at))?;
+            map.serialize_entry("last_rejection", &Rejected(rejection, port.rejected_field, at))?;
         }
         if port.peers().next().is_some() {
             map.serialize_entry("peers", &Map(|| port.peers().map(|peer| (peer.number, peer))))?;

@@ -8,6 +8,8 @@ use super::counters::{PortCounters, bump};
 use super::counts::Counts;
 use super::latency::Latency;
 use super::outbox::{EdgeQueue, Outbox};
+use super::rejection::FieldRejection;
+use super::withheld::{Withheld, members};
 use crate::config::{SafeValue, Span};
 use crate::image::{BitSet, GroupId, Image, InputSet};
 use crate::sysvar::SysVar;
@@ -46,6 +48,10 @@ impl InputFrame {
 pub(super) enum Overdue {
     /// A frame, and how many waiting values were dropped.
     Frame(InputFrame, usize),
+    /// Rejected fields of a port's frames, and how many waiting values were dropped.
+    Fields(u8, usize),
+    /// A rejected command field.
+    Command(u8),
     /// What the robot is told about the health of ports.
     Health,
 }
@@ -117,9 +123,13 @@ pub(super) struct Store<const PORTS: usize> {
     lost: [u32; PORTS],
     has_lost: bool,
     /// No frame is overdue before this.
-    next_overdue: Stamp,
+    pub(super) next_overdue: Stamp,
     /// No value has waited too long before this.
     next_expiry: Stamp,
+    /// Fields that are rejected while their frames are accepted.
+    pub withheld: Withheld,
+    /// The newest field of the frame that was taken last that was rejected, until its port has noted it.
+    pub rejected_field: Option<FieldRejection>,
 }
 
 impl<const PORTS: usize> Store<PORTS> {
@@ -152,6 +162,8 @@ impl<const PORTS: usize> Store<PORTS> {
             has_lost: false,
             next_overdue: Stamp::NEVER,
             next_expiry: Stamp::NEVER,
+            withheld: Withheld::new(),
+            rejected_field: None,
         }
     }
 
@@ -295,12 +307,21 @@ impl<const PORTS: usize> Store<PORTS> {
         }
         let overdue = self.frames.iter_mut().enumerate().find(|(_, frame)| frame.overdue_at <= now);
         let Some((nth, frame)) = overdue else {
+            if self.withheld.is_used
+                && let Some(overdue) = self.next_field_timeout(safe)
+            {
+                return Some(overdue);
+            }
             if self.health_at.get() <= now {
                 self.health_at = Stamp::NEVER;
                 return Some(Overdue::Health);
             }
             let next = self.frames.iter().map(|frame| frame.overdue_at).min();
-            self.next_overdue = Stamp::at(next.unwrap_or(Instant::NEVER).min(self.health_at.get()));
+            let mut next = next.unwrap_or(Instant::NEVER).min(self.health_at.get());
+            if self.withheld.is_used {
+                next = next.min(self.withheld.deadline());
+            }
+            self.next_overdue = Stamp::at(next);
             return None;
         };
         let is_from_start = frame.overdue_at == Instant::ZERO;
@@ -310,11 +331,35 @@ impl<const PORTS: usize> Store<PORTS> {
             // Its device only said that there is nothing to say: nothing was written yet.
             return Some(Overdue::Frame(frame, 0));
         }
-        self.settled = self.settled.minus(&frame.set);
-        let queue = self.edges.get_mut(usize::from(frame.port))?;
+        let dropped = self.time_out((GroupId(nth as u8), frame.port), &frame.set, safe);
+        Some(Overdue::Frame(frame, dropped))
+    }
+
+    /// Handles the first rejected field that is overdue.
+    #[cold]
+    #[inline(never)]
+    fn next_field_timeout(&mut self, safe: &[SafeBytes]) -> Option<Overdue> {
+        if let Some(field) = self.withheld.next_command(self.now) {
+            return Some(Overdue::Command(field));
+        }
+        let (group, frame) = self.withheld.next_overdue(self.now)?;
+        let port = self.frames.get(usize::from(frame))?.port;
+        let dropped = self.time_out((group, port), &members(&self.image, group), safe);
+        Some(Overdue::Fields(port, dropped))
+    }
+
+    /// The variables of a group take their safe values or hold; returns how many waiting values were dropped.
+    fn time_out(&mut self, (group, port): (GroupId, u8), set: &InputSet, safe: &[SafeBytes]) -> usize {
+        let now = self.now;
+        self.settled = self.settled.minus(set);
+        let Some(queue) = self.edges.get_mut(usize::from(port)) else { return 0 };
         let mut dropped = 0_usize;
-        for var in frame.set.minus(&self.bits.bytes).iter() {
+        for var in set.minus(&self.bits.bytes).iter() {
             let Some(value) = safe.iter().find(|safe| safe.var == var) else {
+                if !self.live.contains(var) {
+                    // It has never had a value.
+                    continue;
+                }
                 let waited = self.outbox.forget(queue, &InputSet::from_iter([var]));
                 dropped = dropped.saturating_add(waited);
                 match waited {
@@ -338,7 +383,7 @@ impl<const PORTS: usize> Store<PORTS> {
         }
         if self.bits.is_used {
             let TimedOut { dropped: bits, is_safe, held } =
-                self.bits.time_out(nth, queue, &mut self.image, safe, now);
+                self.bits.time_out(group, queue, &mut self.image, safe, now);
             dropped = dropped.saturating_add(bits);
             self.read_back = self.read_back.minus(&held);
             if is_safe {
@@ -346,7 +391,7 @@ impl<const PORTS: usize> Store<PORTS> {
             }
             self.bits_changed();
         }
-        Some(Overdue::Frame(frame, dropped))
+        dropped
     }
 
     /// At the first tick, the frames that are overdue from the start are handled.
@@ -359,6 +404,7 @@ impl<const PORTS: usize> Store<PORTS> {
         for frame in self.frames.iter_mut().filter(|frame| frame.overdue_at != Instant::NEVER) {
             frame.overdue_at = Instant::ZERO;
         }
+        self.withheld.all_overdue();
         self.next_overdue = Stamp::at(Instant::ZERO);
     }
 
@@ -383,47 +429,70 @@ impl<const PORTS: usize> Store<PORTS> {
 
     /// Drops values that have waited for longer than their port's timeout, and counts them there.
     pub(super) fn expire_waiting(&mut self, mut count: impl FnMut(usize, usize)) {
-        let now = self.now;
         self.next_expiry = Stamp::NEVER;
-        for (nth, frame) in self.frames.iter().enumerate() {
-            let bits = self.outbox.dirty().and(&self.bits.bytes).and(&frame.set);
-            let bytes = InputSet::BYTES.minus(&self.bits.bytes);
-            let dirty = frame.set.and(&self.outbox.dirty()).minus(&self.safe);
-            let waiting = dirty.and(&bytes);
-            let newest = dirty.minus(&InputSet::BYTES);
-            if dirty.is_empty() && bits.is_empty() {
-                continue;
+        for nth in 0..self.frames.len() {
+            let Some(frame) = self.frames.get(nth) else { break };
+            if !frame.set.and(&self.outbox.dirty()).is_empty() {
+                let frame = *frame;
+                self.expire_set((GroupId(nth as u8), nth), &frame, &mut count);
             }
-            let port = usize::from(frame.port);
-            if let Some(queue) = self.edges.get_mut(port) {
-                let (mut dropped, mut oldest) = (0, Instant::NEVER);
-                if !newest.is_empty()
-                    && let Some(at) = self.image.stamp_of(GroupId(nth as u8))
-                {
-                    // Frames that say nothing keep the device from being overdue, and its value waiting.
-                    if now.saturating_since(at) > frame.timeout {
-                        dropped = self.outbox.forget(queue, &newest);
-                    } else {
-                        oldest = at;
-                    }
-                }
-                if !waiting.is_empty() {
-                    let (more, older) = self.outbox.expire(queue, &waiting, frame.timeout, now);
-                    (dropped, oldest) = (dropped.saturating_add(more), oldest.min(older));
-                }
-                if !bits.is_empty() {
-                    let (more, older) = self.bits.expire(nth, queue, frame.timeout, now);
-                    (dropped, oldest) = (dropped.saturating_add(more), oldest.min(older));
-                }
-                let too_old = too_old_at(oldest, frame.timeout);
-                self.next_expiry = Stamp::at(self.next_expiry.get().min(too_old));
-                if dropped > 0 {
-                    count(port, dropped);
+        }
+        if self.withheld.is_used {
+            // Those whose time is over wait for nothing but their safe values.
+            for (group, nth) in self.withheld.groups() {
+                if let Some(frame) = self.frames.get(usize::from(nth)).copied() {
+                    let own = InputFrame { set: members(&self.image, group), ..frame };
+                    self.expire_set((group, usize::from(nth)), &own, &mut count);
                 }
             }
         }
         if self.bits.is_used {
             self.bits_changed();
+        }
+    }
+
+    /// The same of the variables of one group, the `nth` frame's or of rejected fields of it.
+    fn expire_set(
+        &mut self,
+        (group, nth): (GroupId, usize),
+        frame: &InputFrame,
+        count: &mut impl FnMut(usize, usize),
+    ) {
+        let now = self.now;
+        let bits = self.outbox.dirty().and(&self.bits.bytes).and(&frame.set);
+        let bytes = InputSet::BYTES.minus(&self.bits.bytes);
+        let dirty = frame.set.and(&self.outbox.dirty()).minus(&self.safe);
+        let waiting = dirty.and(&bytes);
+        let newest = dirty.minus(&InputSet::BYTES);
+        if dirty.is_empty() && bits.is_empty() {
+            return;
+        }
+        let port = usize::from(frame.port);
+        if let Some(queue) = self.edges.get_mut(port) {
+            let (mut dropped, mut oldest) = (0, Instant::NEVER);
+            if !newest.is_empty()
+                && let Some(at) = self.image.stamp_of(group)
+            {
+                // Frames that say nothing keep the device from being overdue, and its value waiting.
+                if now.saturating_since(at) > frame.timeout {
+                    dropped = self.outbox.forget(queue, &newest);
+                } else {
+                    oldest = at;
+                }
+            }
+            if !waiting.is_empty() {
+                let (more, older) = self.outbox.expire(queue, &waiting, frame.timeout, now);
+                (dropped, oldest) = (dropped.saturating_add(more), oldest.min(older));
+            }
+            if !bits.is_empty() {
+                let (more, older) = self.bits.expire(nth, queue, frame.timeout, now);
+                (dropped, oldest) = (dropped.saturating_add(more), oldest.min(older));
+            }
+            let too_old = too_old_at(oldest, frame.timeout);
+            self.next_expiry = Stamp::at(self.next_expiry.get().min(too_old));
+            if dropped > 0 {
+                count(port, dropped);
+            }
         }
     }
 
@@ -476,6 +545,9 @@ impl<const PORTS: usize> Store<PORTS> {
             *count = count.saturating_add(dropped as u32);
             self.has_lost |= dropped > 0;
         }
+        if self.withheld.is_used {
+            self.withheld_lost(vars);
+        }
         let bytes = vars.and(&self.bits.bytes);
         if bytes.is_empty() {
             return;
@@ -488,6 +560,24 @@ impl<const PORTS: usize> Store<PORTS> {
             }
         });
         self.bits_changed();
+    }
+
+    /// The same for variables whose fields are rejected.
+    #[cold]
+    #[inline(never)]
+    fn withheld_lost(&mut self, vars: &InputSet) {
+        for (group, nth) in self.withheld.groups() {
+            let Some(port) = self.frames.get(usize::from(nth)).map(|frame| usize::from(frame.port)) else {
+                continue;
+            };
+            let (Some(queue), Some(count)) = (self.edges.get_mut(port), self.lost.get_mut(port)) else {
+                continue;
+            };
+            let whole = members(&self.image, group).and(vars);
+            let dropped = self.outbox.forget(queue, &whole.minus(&self.safe));
+            *count = count.saturating_add(dropped as u32);
+            self.has_lost |= dropped > 0;
+        }
     }
 
     /// Number of values per port that were dropped because their link was lost, since the last

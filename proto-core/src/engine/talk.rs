@@ -12,7 +12,7 @@ use super::device_port::{DeviceCodec, DeviceFormat, elements, judge_can};
 use super::events::{Events, Outcome, Sources};
 use super::exchanges::{Asks, Item, View};
 use super::field_output::Downward;
-use super::field_port::{Codec, FieldPort, came, keep};
+use super::field_port::{Codec, FieldPort, came, keep_why};
 use super::frames::{Accepted, Frames};
 use super::io::{Output, PortId};
 use super::line::{Flight, Line, Over, Phase, Talks, Times};
@@ -137,14 +137,14 @@ impl FieldPort {
                 Found::Other(frame) => {
                     let verdict = frames.rejected(Rejection::OtherDevice);
                     tap.record(|| came(self.id, now, verdict, None, [frame, &[], &[]]));
-                    keep(&mut self.last_rejection, Rejection::OtherDevice, None, frame, now);
+                    keep_why(&mut self.last_rejection, verdict, frames.store, None, frame);
                     continue;
                 }
                 Found::Wrong(frame) => {
                     line.heard_wrong();
                     let verdict = frames.rejected(Rejection::Checksum);
                     tap.record(|| came(self.id, now, verdict, None, [frame, &[], &[]]));
-                    keep(&mut self.last_rejection, Rejection::Checksum, None, frame, now);
+                    keep_why(&mut self.last_rejection, verdict, frames.store, None, frame);
                     continue;
                 }
             };
@@ -204,11 +204,10 @@ impl FieldPort {
                 (sign, ..) => signs(line, items, &mut talks, sign, now),
             }
             tap.record(|| came(self.id, now, verdict, None, [frame, &[], &[]]));
-            match verdict {
-                // What is held can hold further frames, so only the rest of the chunk waits.
-                Ok(()) if frames.store.watches_bits && !left.is_empty() => break,
-                Ok(()) => {}
-                Err(why) => keep(&mut self.last_rejection, why, None, frame, now),
+            keep_why(&mut self.last_rejection, verdict, frames.store, None, frame);
+            // What is held can hold further frames, so only the rest of the chunk waits.
+            if verdict.is_ok() && frames.store.watches_bits && !left.is_empty() {
+                break;
             }
         }
         *rest = left;
@@ -622,10 +621,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let (inputs, view) = (&self.bindings.inputs, self.exchanges.view());
         let verdict = port.talk_frame(frame, inputs, store, command, view, &mut accepted);
         self.tap.record(|| came(id, now, verdict, Some(frame.id()), [frame.data(), &[], &[]]));
-        if let Err(why) = verdict
-            && port.is_news(why, now)
-        {
-            keep(&mut port.last_rejection, why, Some(frame.id()), frame.data(), now);
+        if verdict.is_ok() || verdict.is_err_and(|why| port.is_news(why, now)) {
+            keep_why(&mut port.last_rejection, verdict, &mut self.store, Some(frame.id()), frame.data());
         }
         self.after_talk(id);
         self.after_field(id, &accepted, now);

@@ -4,6 +4,7 @@ use heapless::Vec;
 
 use super::command_link::CommandLink;
 use super::io::ReplyCode;
+use super::rules::Rule;
 use crate::config::{FieldSpec, Limits, MAX_SENDABLE, MapEntry, OutputBinding, Span};
 use crate::device::{Element, Encoding, Length, Overflow, Text, wrap};
 use crate::image::{Image, bind_to_variable, saturate_to_field};
@@ -89,6 +90,14 @@ pub(super) enum InputTo {
     },
     /// Index of an alive counter.
     Counter(u8),
+    /// A variable, by the rules at these places behind the port's bindings.
+    Ruled {
+        var: SysVar,
+        count: u8,
+        first: u16,
+    },
+    /// A part of these rules; no field of a frame.
+    Rule(Rule),
     /// The halves of a constant, so that they need no more alignment than the others.
     Fixed {
         high: i32,
@@ -97,6 +106,14 @@ pub(super) enum InputTo {
 }
 
 impl InputTo {
+    /// The variable that the value becomes as a whole.
+    pub(super) const fn variable(&self) -> Option<SysVar> {
+        match *self {
+            Self::Variable { var, .. } | Self::Ruled { var, .. } => Some(var),
+            _ => None,
+        }
+    }
+
     /// The variable and the value that the received value becomes; `None` if the value does not fit
     /// or the binding is not to a variable.
     pub(super) fn bound(&self, value: Scalar) -> Option<(SysVar, Scalar)> {

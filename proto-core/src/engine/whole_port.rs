@@ -9,7 +9,7 @@ use heapless::Vec;
 use super::command_link::CommandLink;
 use super::counters::add;
 use super::device_port::{DeviceCodec, DeviceFormat, elements};
-use super::field_port::{Codec, FieldPort, came, keep};
+use super::field_port::{Codec, FieldPort, came, keep_why};
 use super::frames::{Accepted, Frames};
 use super::io::ReplyCode;
 use super::rejection::Rejection;
@@ -107,6 +107,23 @@ pub(super) fn texts_of(
 }
 
 impl TextBind {
+    /// Whether it is an input text of the frame with these bindings.
+    pub(super) fn is_in(&self, bindings: Span) -> bool {
+        self.direction == Direction::Input
+            && self.binding.checked_sub(bindings.start).is_some_and(|at| at < bindings.len)
+    }
+
+    /// Whether it is the input text of this binding.
+    pub(super) fn is_input(&self, binding: u16) -> bool {
+        self.direction == Direction::Input && self.binding == binding
+    }
+
+    /// The variables that an input text becomes.
+    pub(super) fn variables(&self) -> impl Iterator<Item = SysVar> + use<> {
+        let words = self.words.into_iter().flat_map(Words::iter);
+        words.chain(self.length).chain(self.count)
+    }
+
     /// Whether there is room for a text of `len` characters.
     fn has_room(&self, len: usize) -> bool {
         self.words.is_none_or(|words| len <= words.room())
@@ -170,22 +187,25 @@ fn texts_in(
 }
 
 impl<const PORTS: usize> Frames<'_, PORTS> {
-    /// Whether all texts of an input frame have room.
-    pub(super) fn texts_fit(
+    /// The texts of an input frame, each with its place among the frame's fields, and the text if there is room for it.
+    pub(super) fn texts<'t>(
         &self,
-        texts: &[TextBind],
-        format: &DeviceFormat,
-        frame: &[u8],
-    ) -> Result<(), Rejection> {
+        texts: &'t [TextBind],
+        format: &'t DeviceFormat,
+        frame: &'t [u8],
+    ) -> impl Iterator<Item = (usize, &'t TextBind, Result<&'t [u8], Rejection>)>
+    where
+        Self: 't,
+    {
         let bindings = format.bindings.of(self.bindings);
-        for (at, text) in texts_in(texts, format.bindings, Direction::Input) {
-            match format.layout.text(elements(bindings), frame, at) {
-                Some(found) if text.has_room(found.len()) => {}
-                Some(_) => return Err(Rejection::OutOfRange),
-                None => return Err(Rejection::Unreadable),
-            }
-        }
-        Ok(())
+        texts_in(texts, format.bindings, Direction::Input).map(move |(at, text)| {
+            let found = match format.layout.text(elements(bindings), frame, at) {
+                Some(found) if text.has_room(found.len()) => Ok(found),
+                Some(_) => Err(Rejection::OutOfRange),
+                None => Err(Rejection::Unreadable),
+            };
+            (at, text, found)
+        })
     }
 
     /// Whether one of the texts of an input frame says that there is nothing to say.
@@ -199,12 +219,14 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
         })
     }
 
-    /// Puts all texts of an input frame into their variables.
+    /// Puts the texts of an input frame into their variables, but those for which there is no room.
     pub(super) fn take_texts(&mut self, texts: &[TextBind], format: &DeviceFormat, frame: &[u8]) {
         let bindings = format.bindings.of(self.bindings);
         let nth = self.counters.frames_in.wrapping_add(1);
         for (at, text) in texts_in(texts, format.bindings, Direction::Input) {
-            if let Some(found) = format.layout.text(elements(bindings), frame, at) {
+            if let Some(found) = format.layout.text(elements(bindings), frame, at)
+                && text.has_room(found.len())
+            {
                 text.apply(found, nth, &mut self.store.image);
             }
         }
@@ -331,10 +353,9 @@ impl FieldPort {
                 }
             };
             tap.record(|| came(self.id, now, verdict, None, [frame, &[], &[]]));
-            match verdict {
-                Ok(()) if frames.store.watches_bits && !left.is_empty() => break,
-                Ok(()) => {}
-                Err(why) => keep(&mut self.last_rejection, why, None, frame, now),
+            keep_why(&mut self.last_rejection, verdict, frames.store, None, frame);
+            if verdict.is_ok() && frames.store.watches_bits && !left.is_empty() {
+                break;
             }
         }
         *rest = left;

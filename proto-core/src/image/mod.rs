@@ -21,6 +21,10 @@ pub(crate) type ImageBytes = [u8; IMAGE_BYTES];
 /// Maximum number of groups of variables that arrive together.
 pub(crate) const MAX_GROUPS: usize = 96;
 
+/// Number of groups of fields that were rejected while the rest of their frame was accepted. Their ids follow those
+/// above.
+pub(crate) const WITHHELD_GROUPS: usize = 14;
+
 /// Maximum number of values beside the system variables that ports show.
 pub(crate) const MAX_EXTRA: usize = 32;
 
@@ -37,10 +41,12 @@ pub struct Image {
     /// One more than the number of the group; 0 for a variable without a group.
     group: [u8; COUNT],
     /// When each group last arrived; [`Instant::NEVER`] before the first time.
-    stamps: [Stamp; MAX_GROUPS],
+    stamps: [Stamp; MAX_GROUPS + WITHHELD_GROUPS],
+    /// Variables whose field was rejected in the newest frame of their owner: they have a group of their own meanwhile.
+    withheld: InputSet,
     /// Variables whose newest value could not be read, whatever else their group brought.
     unreadable: VarSet,
-    /// Whether there are any, among the extra values too.
+    /// Whether there are any of these two kinds, among the extra values too.
     any_unreadable: bool,
     /// Values beside the system variables that ports show, and which of them are unreadable.
     extra: [f64; MAX_EXTRA],
@@ -53,7 +59,8 @@ impl Image {
         Self {
             bytes: [0; IMAGE_BYTES],
             group: [0; COUNT],
-            stamps: [Stamp::NEVER; MAX_GROUPS],
+            stamps: [Stamp::NEVER; MAX_GROUPS + WITHHELD_GROUPS],
+            withheld: InputSet::EMPTY,
             unreadable: VarSet::EMPTY,
             any_unreadable: false,
             extra: [0.0; MAX_EXTRA],
@@ -162,11 +169,36 @@ impl Image {
     pub(crate) fn all_readable(&mut self, vars: impl Iterator<Item = SysVar>) {
         if self.any_unreadable {
             vars.for_each(|var| self.unreadable.remove(var));
-            self.any_unreadable = !self.unreadable.is_empty() || self.unreadable_extra != ExtraSet::EMPTY;
+            self.note_unreadable();
         }
     }
 
-    /// Whether any variable's or extra value's newest value was not readable.
+    fn note_unreadable(&mut self) {
+        self.any_unreadable = !self.unreadable.is_empty()
+            || self.unreadable_extra != ExtraSet::EMPTY
+            || !self.withheld.is_empty();
+    }
+
+    /// The variables that have the age of their own newest value, and not that of their owner's frame.
+    pub(crate) fn withheld(&self) -> InputSet {
+        self.withheld
+    }
+
+    /// The variable's field was rejected: it has the age of this group until it is back.
+    pub(crate) fn withhold(&mut self, var: SysVar, group: GroupId) {
+        self.assign(var, group);
+        self.withheld.insert(var);
+        self.any_unreadable = true;
+    }
+
+    /// The variable's field is accepted again: it has the age of this group, its frame's.
+    pub(crate) fn readmit(&mut self, var: SysVar, frame: GroupId) {
+        self.assign(var, frame);
+        self.withheld.remove(var);
+        self.note_unreadable();
+    }
+
+    /// Whether any variable's or extra value's newest value was not readable, or was rejected.
     pub(crate) fn has_unreadable(&self) -> bool {
         self.any_unreadable
     }

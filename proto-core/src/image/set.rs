@@ -213,6 +213,12 @@ impl VarSet {
         self.0.iter().all(|word| *word == 0)
     }
 
+    /// Those of these input variables that are in the set.
+    pub(crate) fn inputs(&self, vars: &InputSet) -> impl Iterator<Item = SysVar> + use<> {
+        let own = *self;
+        vars.iter().filter(move |&var| own.contains(var))
+    }
+
     /// Whether a variable is in both sets.
     pub(crate) fn meets(&self, other: &Self) -> bool {
         self.0.iter().zip(&other.0).any(|(one, other)| one & other != 0)

@@ -13,7 +13,7 @@ use proto_core::time::{Duration, Instant};
 use super::Invariant;
 use super::field::Accepted;
 use super::spec::{Frame, LinkSpec, PortSpec, Spec};
-use super::upward::{Carried, EDGES, Upward, Wrong};
+use super::upward::{Alone, Carried, EDGES, Upward, Wrong};
 
 /// The bits that one input frame writes in one byte.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -44,6 +44,8 @@ pub(super) struct Waits {
     /// It has its safe value, and since when.
     safe: bool,
     safe_at: Instant,
+    /// A field of it was rejected in the newest frame.
+    pub alone: Option<Alone>,
 }
 
 /// The shares of all field ports, in the order of their first fields.
@@ -98,7 +100,7 @@ impl Upward {
         let is_up = self.is_up(LinkId::MODBUS);
         let mut undelivered = false;
         for (place, share) in spec.shares.iter().enumerate() {
-            if (share.port, share.frame) != (nth, frame.frame) {
+            if (share.port, share.frame) != (nth, frame.frame) || frame.without.bytes.contains(&share.var) {
                 continue;
             }
             let own = frame.bits.iter().filter(|coils| coils.var == share.var);
@@ -131,19 +133,26 @@ impl Upward {
 
     /// A frame is overdue: its bits take their safe values, or hold.
     pub(super) fn bits_silent(&mut self, spec: &Spec, nth: usize, frame: usize, now: Instant) {
-        for (state, share) in self.shares.iter_mut().zip(&spec.shares) {
-            if (share.port, share.frame) != (nth, frame) {
-                continue;
+        for (place, share) in spec.shares.iter().enumerate() {
+            if (share.port, share.frame) == (nth, frame) && self.shares[place].alone.is_none() {
+                self.share_silent(spec, place, now);
             }
-            let waited = state.waiting.len() as u32;
-            state.waiting.clear();
-            match share.safe {
-                Some(safe) => {
-                    state.waiting.push_back((safe, now));
-                    (state.left, state.safe, state.safe_at) = (share.mask, true, now);
-                }
-                None => self.counted[nth].values_expired += waited,
+        }
+    }
+
+    /// The same of one share.
+    pub(super) fn share_silent(&mut self, spec: &Spec, place: usize, now: Instant) {
+        let (share, state) = (&spec.shares[place], &mut self.shares[place]);
+        let waited = state.waiting.len() as u32;
+        state.waiting.clear();
+        match share.safe {
+            Some(safe) => {
+                // Its owner may never have sent it.
+                state.accepted = state.accepted.or(Some(now));
+                state.waiting.push_back((safe, now));
+                (state.left, state.safe, state.safe_at) = (share.mask, true, now);
             }
+            None => self.counted[share.port].values_expired += waited,
         }
     }
 

@@ -155,6 +155,16 @@ impl Commands {
         let keeps = |place: &Place| frame.is_some() && self.kept.contains(place);
         let gone = self.base.keys().copied().filter(|place| is_of(place) && !keeps(place));
         let gone: Vec<Place> = gone.collect();
+        self.lose(gone, now);
+    }
+
+    /// A command field was rejected for as long as its device may be silent.
+    pub(super) fn forget_one(&mut self, place: Place, now: Instant) {
+        let is_lost = self.base.contains_key(&place) && !self.kept.contains(&place);
+        self.lose(is_lost.then_some(place), now);
+    }
+
+    fn lose(&mut self, gone: impl IntoIterator<Item = Place>, now: Instant) {
         for place in gone {
             self.base.remove(&place);
             self.no_longer_asked(place, now);

@@ -25,6 +25,8 @@ pub(super) fn differ(one: &PortCounters, other: &PortCounters) -> bool {
         rejected_unreadable
         rejected_other_device
         rejected_counter
+        rejected_fields
+        fields_without_value
         rejected_no_input
         tail_mismatches
         resync_bytes

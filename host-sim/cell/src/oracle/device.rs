@@ -5,7 +5,7 @@
 
 use std::ops::Range;
 
-use proto_core::config::{FieldSpec, GatewayConfig, Limits, OutputBinding, Outside};
+use proto_core::config::{FieldSpec, GatewayConfig, InputRule, Limits, OutputBinding, Outside};
 use proto_core::device::{Algorithm, ByteOrder, Checksum, Crc, Encoding, Kind, Overflow, TextWidth, Width};
 use proto_core::wire::scalar::ScalarType;
 
@@ -63,7 +63,7 @@ impl DeviceSpec {
                 FieldSpec::Checksum(sum) => (sum_bytes(sum), false),
                 FieldSpec::System(var) => (var.size(), false),
                 // Nothing of it is in the frame.
-                FieldSpec::Limits(_) | FieldSpec::Mapped(_) => (0, true),
+                FieldSpec::Limits(_) | FieldSpec::Mapped(_) | FieldSpec::InputRule(_) => (0, true),
                 FieldSpec::TextInput { text, .. } | FieldSpec::TextOutput { text, .. } => match text.width {
                     TextWidth::Fixed(width) => (usize::from(width), false),
                     _ => panic!("{field:?} varies"),
@@ -260,11 +260,82 @@ pub(super) fn sent_for(encoding: &Encoding, number: f64, behind: &[FieldSpec]) -
     }
 }
 
+/// What is read from an input field.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Read {
+    Number(f64),
+    Unreadable,
+    /// The device says that it has none.
+    NoValue,
+}
+
+/// The number of an input field, by what stands behind it.
+pub(super) fn read_ruled(encoding: &Encoding, bytes: &[u8], behind: &[FieldSpec]) -> Read {
+    let rules = || {
+        behind
+            .iter()
+            .filter_map(|field| if let FieldSpec::InputRule(rule) = field { Some(rule) } else { None })
+    };
+    let trimmed = bytes.trim_ascii();
+    if rules().any(|rule| matches!(rule, InputRule::NoText(text) if text.bytes() == trimmed)) {
+        return Read::NoValue;
+    }
+    let has_comma = rules().any(|rule| *rule == InputRule::Comma);
+    let turned: Vec<u8> = bytes.iter().map(|byte| if *byte == b',' { b'.' } else { *byte }).collect();
+    let number = match has_comma {
+        true if bytes.contains(&b'.') => None,
+        true => read(encoding, &turned),
+        false => read(encoding, bytes),
+    };
+    let Some(number) = number else { return Read::Unreadable };
+    let is_single = encoding.kind == Kind::Scalar(ScalarType::Float);
+    let is_same = |code: f64| {
+        code == number || code.is_nan() && number.is_nan() || is_single && code as f32 == number as f32
+    };
+    match rules().any(|rule| matches!(rule, InputRule::NoNumber(code) if is_same(*code))) {
+        true => Read::NoValue,
+        false => Read::Number(number),
+    }
+}
+
+/// What a variable becomes for the number of its field, before it is rounded; `None` if the number is not allowed.
+pub(super) fn taken_for(
+    encoding: &Encoding,
+    number: f64,
+    (scale, offset): (f32, f32),
+    behind: &[FieldSpec],
+) -> Option<f64> {
+    let entries = || {
+        behind
+            .iter()
+            .filter_map(|field| if let FieldSpec::Mapped(entry) = field { Some(entry) } else { None })
+    };
+    if entries().next().is_some() {
+        let own = entries().find(|entry| (entry.first as f64..=entry.last as f64).contains(&number.round()));
+        let otherwise = behind.iter().find_map(|field| match field {
+            FieldSpec::InputRule(InputRule::Else(number)) => Some(*number),
+            _ => None,
+        });
+        return own.map(|entry| entry.sent).or(otherwise);
+    }
+    let mut number = number;
+    for field in behind {
+        let FieldSpec::Limits(Limits { low, high, outside }) = *field else { continue };
+        let is_single = !encoding.is_integer() || matches!(encoding.kind, Kind::Decimal(_));
+        // As a float shows it, unless it is an integer.
+        let of = |number: f64| if is_single { f64::from(number as f32) } else { number };
+        if (of(number) < of(low) || of(number) > of(high)) && outside == Outside::Refuse {
+            return None;
+        }
+        number = number.clamp(low, high);
+    }
+    Some(number * f64::from(scale) + f64::from(offset))
+}
+
 /// What stands behind a field.
 pub(super) fn behind(fields: &[FieldSpec], nth: usize) -> &[FieldSpec] {
     let rest = &fields[nth + 1..];
-    let len =
-        rest.iter().take_while(|field| matches!(field, FieldSpec::Limits(_) | FieldSpec::Mapped(_))).count();
+    let len = rest.iter().take_while(|field| field.is_of_field_before()).count();
     &rest[..len]
 }
 

@@ -167,7 +167,9 @@ impl Downward {
             if known.unreadable {
                 return Err(Hidden::Unreadable(var));
             }
-            let Some((_, at)) = known.value else { return Err(Hidden::Unknown(var)) };
+            let Some((_, at)) = known.value.filter(|_| !known.unknown) else {
+                return Err(Hidden::Unknown(var));
+            };
             let age = now.saturating_since(at);
             if port.stops_when_stale && age > port.stale_after {
                 return Err(Hidden::Stale(var, age));
@@ -352,7 +354,7 @@ impl Downward {
                     bytes.fill(fill);
                     continue;
                 }
-                FieldSpec::Limits(_) | FieldSpec::Mapped(_) => continue,
+                FieldSpec::Limits(_) | FieldSpec::Mapped(_) | FieldSpec::InputRule(_) => continue,
                 _ => return None,
             };
             let number = self.device_number(&encoding, up, from)?;
@@ -400,7 +402,11 @@ impl Downward {
                 return device::read(&encoding, bytes) == Some(value as f64);
             }
             FieldSpec::Padding { fill, .. } => return bytes.iter().all(|&byte| byte == fill),
-            FieldSpec::Checksum(_) | FieldSpec::Length(_) | FieldSpec::Limits(_) | FieldSpec::Mapped(_) => {
+            FieldSpec::Checksum(_)
+            | FieldSpec::Length(_)
+            | FieldSpec::Limits(_)
+            | FieldSpec::Mapped(_)
+            | FieldSpec::InputRule(_) => {
                 return true;
             }
             FieldSpec::TextOutput { .. } => return text_of(field, up).is_some_and(|text| text == bytes),

@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 use std::ops::Range;
 
-use proto_core::config::{CommandWhen, FieldSpec, InputBinding, Span};
+use proto_core::config::{CommandWhen, FieldSpec, InputBinding, InputRule, Span};
 use proto_core::device::{Boundary, Encoding, Overflow};
 use proto_core::recipe::model::Mode;
 use proto_core::sysvar::SysVar;
@@ -13,7 +13,7 @@ use proto_core::wire::can::CanFrame;
 use proto_core::wire::scalar::{Scalar, ScalarType};
 
 use super::bits::Coils;
-use super::device::{self, DeviceSpec, Look, Seen};
+use super::device::{self, DeviceSpec, Look, Read, Seen};
 use super::spec::{Frame, PortSpec, Raw};
 use super::varying::{self, CutWatch};
 
@@ -56,6 +56,30 @@ pub(super) struct Accepted {
     pub jumps: u32,
     /// Variables that become the number of accepted frames.
     pub counted: Vec<SysVar>,
+    /// What the frame has no value for.
+    pub without: Without,
+}
+
+/// The fields of an accepted frame of a device that are rejected, or that have no value now.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub(super) struct Without {
+    pub vars: Vec<SysVar>,
+    /// Bytes with a bit that could not be read: all bits that the frame writes in them.
+    pub bytes: Vec<SysVar>,
+    /// Command fields, by their index in the frame.
+    pub commands: Vec<usize>,
+    /// How many are rejected, and what the frame would be rejected for.
+    pub rejected: u32,
+    pub why: Option<Box<Verdict>>,
+    /// How many have no value, as the device says.
+    pub no_value: u32,
+}
+
+impl Without {
+    fn reject(&mut self, why: Verdict) {
+        self.rejected += 1;
+        self.why.get_or_insert_with(|| Box::new(why));
+    }
 }
 
 /// The newest alive counters by frame and field.
@@ -172,6 +196,18 @@ impl LineWatch {
             self.counts.extend(accepted.counts.iter().copied());
         }
         verdict
+    }
+
+    /// Judges what a master writes: all of it is taken, or nothing.
+    pub(super) fn judge_block(&mut self, frame: &Frame, nth: usize, data: &[u8]) -> Verdict {
+        let counts = self.counts.clone();
+        match self.judge_data(frame, nth, data) {
+            Verdict::Accepted(Accepted { without: Without { why: Some(why), .. }, .. }) => {
+                self.counts = counts;
+                *why
+            }
+            verdict => verdict,
+        }
     }
 
     /// Judges the data of a reply.
@@ -292,7 +328,7 @@ pub(super) fn can_of<'f>(
     why
 }
 
-/// The fields are judged one after the other: the first that cannot be used rejects the frame.
+/// Each field is judged by itself; the frame is rejected if a counter is wrong, or if it tells nothing.
 fn judge_device(frame: &Frame, nth: usize, whole: &[u8], counts: &Counts) -> Verdict {
     let mut accepted = Accepted { frame: nth, ..Accepted::default() };
     let laid_out = if frame.varies { varying::lay_out(frame, whole).ok() } else { None };
@@ -304,63 +340,134 @@ fn judge_device(frame: &Frame, nth: usize, whole: &[u8], counts: &Counts) -> Ver
     }) {
         return Verdict::Ignored(nth);
     }
-    // Command fields are counted without the checksum, as they are no elements of it.
+    // Command fields are counted without what is no element of the frame.
     let mut element = 0;
-    for (field, place) in frame.fields.iter().zip(places) {
+    let mut tells = false;
+    let mut wrong_count = None;
+    for (place_of, (field, place)) in frame.fields.iter().zip(places).enumerate() {
         let at = element;
-        element += usize::from(!matches!(field, FieldSpec::Checksum(_)));
+        element += usize::from(!matches!(field, FieldSpec::Checksum(_)) && !field.is_of_field_before());
         let (encoding, overflow, to) = match *field {
             FieldSpec::DeviceInput { encoding, overflow, to } => (encoding, overflow, to),
             FieldSpec::UserInput { ty, to } => (Encoding::scalar(ty), Overflow::Usual, to),
             _ => continue,
         };
-        let Some(number) = device::read(&encoding, &whole[place.clone()]) else { return Verdict::Unreadable };
-        if !number.is_finite() {
-            return Verdict::NotFinite;
-        }
+        let rules = device::behind(&frame.fields, place_of);
+        let bytes = &whole[place.clone()];
+        let number = match device::read_ruled(&encoding, bytes, rules) {
+            Read::Number(number) if number.is_finite() => Ok(number),
+            Read::Number(_) => Err(Some(Verdict::NotFinite)),
+            Read::Unreadable => Err(Some(Verdict::Unreadable)),
+            Read::NoValue => Err(None),
+        };
+        let valid = |is_valid: bool, accepted: &mut Accepted| {
+            for rule in rules {
+                match *rule {
+                    FieldSpec::InputRule(InputRule::ValidTo { var, bit: Some(bit) }) => {
+                        accepted.bits.push(coil(var, bit, f64::from(u8::from(is_valid))));
+                    }
+                    FieldSpec::InputRule(InputRule::ValidTo { var, bit: None }) => {
+                        accepted
+                            .values
+                            .extend(bound(var, f64::from(u8::from(is_valid))).map(|raw| (var, raw)));
+                    }
+                    _ => continue,
+                }
+                return true;
+            }
+            false
+        };
         match to {
             InputBinding::Variable { var, scale, offset } => {
-                let number = number * f64::from(scale) + f64::from(offset);
-                let number = match overflow {
-                    Overflow::Wrap => device::shown_as(&Encoding::scalar(var.ty()), overflow, number),
-                    Overflow::Usual => number,
-                };
-                match bound(var, number) {
-                    Some(raw) => accepted.values.push((var, raw)),
-                    None => return Verdict::OutOfRange,
+                let raw = number.and_then(|number| {
+                    let number = device::taken_for(&encoding, number, (scale, offset), rules);
+                    let number = number.ok_or(Some(Verdict::OutOfRange))?;
+                    let is_int16 = rules.contains(&FieldSpec::InputRule(InputRule::Int16));
+                    let number = match overflow {
+                        Overflow::Wrap => device::shown_as(&Encoding::scalar(var.ty()), overflow, number),
+                        Overflow::Usual if is_int16 => match number.round() {
+                            number if number < -32_768.0 || number > 32_767.0 => f64::NAN,
+                            number if number < 0.0 => number + 65_536.0,
+                            number => number,
+                        },
+                        Overflow::Usual => number,
+                    };
+                    bound(var, number).ok_or(Some(Verdict::OutOfRange))
+                });
+                tells |= valid(raw.is_ok(), &mut accepted);
+                match raw {
+                    Ok(raw) => accepted.values.push((var, raw)),
+                    Err(why) => {
+                        accepted.without.vars.push(var);
+                        match why {
+                            Some(why) => accepted.without.reject(why),
+                            None => accepted.without.no_value += 1,
+                        }
+                    }
                 }
             }
-            InputBinding::Commands { table, when } => {
-                accepted.commands.push((at, table, when, number as i64));
-            }
-            InputBinding::Bit { var, bit } => accepted.bits.push(coil(var, bit, number)),
+            InputBinding::Commands { table, when } => match number {
+                Ok(number) => accepted.commands.push((at, table, when, number as i64)),
+                Err(why) => {
+                    accepted.without.commands.push(at);
+                    accepted.without.reject(why.unwrap_or(Verdict::Unreadable));
+                }
+            },
+            InputBinding::Bit { var, bit } => match number {
+                Ok(number) => accepted.bits.push(coil(var, bit, number)),
+                Err(why) => {
+                    accepted.without.bytes.push(var);
+                    accepted.without.reject(why.unwrap_or(Verdict::Unreadable));
+                }
+            },
             InputBinding::Counter { max } => {
                 let before = counts.get(&(nth, at)).copied();
-                if number > f64::from(max) {
-                    return Verdict::OutOfRange;
+                match number {
+                    Err(why) => wrong_count = wrong_count.or(why),
+                    Ok(number) if number > f64::from(max) => {
+                        wrong_count = wrong_count.or(Some(Verdict::OutOfRange));
+                    }
+                    Ok(number) if before == Some(number as u32) => {
+                        wrong_count = wrong_count.or(Some(Verdict::Repeated));
+                    }
+                    Ok(number) => {
+                        let number = number as u32;
+                        let next = |before: u32| if before >= max { 0 } else { before + 1 };
+                        accepted.jumps += u32::from(before.is_some_and(|before| next(before) != number));
+                        accepted.counts.push(((nth, at), number));
+                    }
                 }
-                let number = number as u32;
-                if before == Some(number) {
-                    return Verdict::Repeated;
-                }
-                let next = |before: u32| if before >= max { 0 } else { before + 1 };
-                accepted.jumps += u32::from(before.is_some_and(|before| next(before) != number));
-                accepted.counts.push(((nth, at), number));
             }
-            InputBinding::Unused => {}
+            InputBinding::Unused => {
+                if let Err(why) = number {
+                    accepted.without.reject(why.unwrap_or(Verdict::Unreadable));
+                }
+            }
         }
+    }
+    if let Some(why) = wrong_count {
+        return why;
     }
     for (field, text) in texts(frame, places, whole) {
         let FieldSpec::TextInput { to, length_to, count_to, .. } = *field else { continue };
-        if let Some(words) = to {
-            let Some(values) = varying::registers(words, text) else { return Verdict::OutOfRange };
-            accepted.values.extend(values);
+        let registers = to.map(|words| varying::registers(words, text));
+        if let Some(None) = registers {
+            accepted.without.vars.extend(super::spec::written(field));
+            accepted.without.reject(Verdict::OutOfRange);
+            continue;
         }
+        accepted.values.extend(registers.flatten().into_iter().flatten());
         let length = length_to.and_then(|var| Some((var, bound(var, text.len() as f64)?)));
         accepted.values.extend(length);
         accepted.counted.extend(count_to);
     }
-    Verdict::Accepted(accepted)
+    accepted.bits.retain(|coils| !accepted.without.bytes.contains(&coils.var));
+    let Accepted { values, bits, commands, counted, without, .. } = &accepted;
+    let is_nothing = values.is_empty() && bits.is_empty() && commands.is_empty() && counted.is_empty();
+    match &without.why {
+        Some(why) if is_nothing && without.no_value == 0 && !tells => (**why).clone(),
+        _ => Verdict::Accepted(accepted),
+    }
 }
 
 /// The texts of an input frame, without what fills them up.

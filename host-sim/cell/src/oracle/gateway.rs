@@ -29,7 +29,11 @@ impl Oracle {
         for &(nth, frame) in &overdue {
             self.forget_commands(nth, Some(frame), now);
         }
-        if !overdue.is_empty() {
+        let (commands, any) = self.up.overdue_alone(&self.spec, now);
+        for place in commands {
+            self.forget_command(place, now);
+        }
+        if !overdue.is_empty() || any {
             self.values_changed(now);
         }
         self.up.expire(&self.spec, now);
@@ -68,6 +72,12 @@ impl Oracle {
 
     pub(super) fn forget_commands(&mut self, nth: usize, frame: Option<usize>, now: Instant) {
         self.commands.forget(nth, frame, now);
+        let commands = &self.commands;
+        self.robot.no_longer_asked(|command| commands.is_asked(command), now);
+    }
+
+    fn forget_command(&mut self, place: super::commands::Place, now: Instant) {
+        self.commands.forget_one(place, now);
         let commands = &self.commands;
         self.robot.no_longer_asked(|command| commands.is_asked(command), now);
     }
@@ -284,7 +294,17 @@ impl Oracle {
                 }
                 Verdict::Accepted(frame) => frame,
             };
+            if !self.up.has_room(&self.spec, nth, &frame, now) {
+                match frame.without.why.as_deref() {
+                    Some(Verdict::Unreadable) => counters.rejected_unreadable += 1,
+                    Some(Verdict::NotFinite) => counters.rejected_not_finite += 1,
+                    _ => counters.rejected_out_of_range += 1,
+                }
+                continue;
+            }
             counters.frames_in += 1;
+            counters.rejected_fields += frame.without.rejected;
+            counters.fields_without_value += frame.without.no_value;
             let number = f64::from(counters.frames_in as u16);
             let counted = std::mem::take(&mut frame.counted).into_iter();
             frame.values.extend(counted.filter_map(|var| Some((var, field::bound(var, number)?))));

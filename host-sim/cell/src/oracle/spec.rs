@@ -4,7 +4,7 @@
 //! Written from that page, independent of the engine's plan.
 
 use proto_core::config::{
-    Bus, FieldSpec, GatewayConfig, InputBinding, OutputBinding, Parts, Recipe, SendOn, Words,
+    Bus, FieldSpec, GatewayConfig, InputBinding, InputRule, OutputBinding, Parts, Recipe, SendOn, Words,
 };
 use proto_core::device::Boundary;
 use proto_core::engine::{LinkId, PortId};
@@ -187,6 +187,10 @@ impl Spec {
                         safe.value.encode(&mut raw);
                         raw
                     });
+                    let is_told = |field: &FieldSpec| {
+                        *field == FieldSpec::InputRule(InputRule::ValidTo { var, bit: None })
+                    };
+                    let safe = safe.or_else(|| part.fields.iter().any(is_told).then(Raw::default));
                     owned[var.ordinal()] = Some(Owned { port: nth, frame, way, safe });
                 }
             }
@@ -311,6 +315,7 @@ pub(super) fn written(field: &FieldSpec) -> impl Iterator<Item = SysVar> + use<>
         | FieldSpec::UserInput { to: InputBinding::Variable { var, .. }, .. }
         | FieldSpec::DeviceInput { to: InputBinding::Variable { var, .. }, .. } => (None, [Some(var), None]),
         FieldSpec::TextInput { to, length_to, count_to, .. } => (to, [length_to, count_to]),
+        FieldSpec::InputRule(InputRule::ValidTo { var, bit: None }) => (None, [Some(var), None]),
         _ => (None, [None, None]),
     };
     words.into_iter().flat_map(Words::iter).chain(others.into_iter().flatten())

@@ -1,7 +1,7 @@
 //! The values that are to be written to the controller, and the checks of each write
 //! (proto-core/docs/engine.md section 5).
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use proto_core::engine::LinkId;
 use proto_core::sysvar::{COUNT, SysVar};
@@ -15,6 +15,8 @@ use super::spec::{LinkSpec, Origin, Owned, Raw, Spec};
 
 /// Maximum number of values per port that wait behind the next ones.
 pub(super) const EDGES: usize = 16;
+/// Maximum number of groups of rejected fields that have their time at once.
+const GROUPS: usize = 12;
 /// Maximum age of a value that was read back.
 const READ_BACK: Duration = Duration::from_millis(500);
 
@@ -53,6 +55,19 @@ pub(super) struct Known {
     pub unsent: bool,
     /// Values that waited while the gateway slept; `None` once a frame has come since.
     pub slept: Option<Vec<Raw>>,
+    /// Its field was rejected in the newest frame of its owner.
+    pub alone: Option<Alone>,
+    /// It has its safe value, and has never had another one.
+    pub unknown: bool,
+}
+
+/// The time of a field that is rejected.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct Alone {
+    /// When it is overdue; `None` once it was.
+    pub overdue: Option<Instant>,
+    /// When its newest value came.
+    pub since: Option<Instant>,
 }
 
 impl Known {
@@ -93,6 +108,10 @@ pub(super) struct Upward {
     pub shares: Vec<Waits>,
     /// When each input frame of each port is overdue.
     overdue: Vec<Vec<Option<Instant>>>,
+    /// When each was accepted last.
+    taken: Vec<Vec<Option<Instant>>>,
+    /// The command fields that are rejected, by port, frame and field.
+    pub commands_alone: BTreeMap<(usize, usize, usize), Alone>,
     pub counted: Vec<Counted>,
     /// When the links that carry values came up; `None` while they are down.
     pub up: [Option<Instant>; 16],
@@ -126,6 +145,8 @@ impl Upward {
             known: vec![Known::default(); COUNT],
             shares: vec![Waits::default(); spec.shares.len()],
             overdue: spec.ports.iter().map(|port| vec![None; port.inputs.len()]).collect(),
+            taken: spec.ports.iter().map(|port| vec![None; port.inputs.len()]).collect(),
+            commands_alone: BTreeMap::new(),
             counted: vec![Counted::default(); spec.ports.len()],
             up: [None; 16],
             are_up: 0,
@@ -176,12 +197,79 @@ impl Upward {
                 self.counted[nth].timeouts += 1;
                 overdue.push((nth, frame));
                 for &var in &part.written {
-                    self.fell_silent(spec, var, now);
+                    if self.known(var).alone.is_none() {
+                        self.fell_silent(spec, var, now);
+                    }
                 }
                 self.bits_silent(spec, nth, frame, now);
             }
         }
         overdue
+    }
+
+    /// Rejected fields whose own time is over; returns the command fields among them, and whether there is any.
+    pub(super) fn overdue_alone(&mut self, spec: &Spec, now: Instant) -> (Vec<(usize, usize, usize)>, bool) {
+        let is_over =
+            |alone: &Option<Alone>| alone.and_then(|alone| alone.overdue).is_some_and(|at| now >= at);
+        let vars: Vec<SysVar> =
+            SysVar::all().filter(|var| is_over(&self.known[var.ordinal()].alone)).collect();
+        for &var in &vars {
+            let known = self.known_mut(var);
+            known.alone = known.alone.map(|alone| Alone { overdue: None, ..alone });
+            let has_safe = spec.owned[var.ordinal()].is_some_and(|owned| owned.safe.is_some());
+            if known.accepted.is_none() && has_safe {
+                (known.accepted, known.unknown, known.live) = (Some(now), true, true);
+            }
+            self.fell_silent(spec, var, now);
+        }
+        let shares: Vec<usize> =
+            (0..self.shares.len()).filter(|&nth| is_over(&self.shares[nth].alone)).collect();
+        for &nth in &shares {
+            let alone = &mut self.shares[nth].alone;
+            *alone = alone.map(|alone| Alone { overdue: None, ..alone });
+            self.share_silent(spec, nth, now);
+        }
+        let over = self.commands_alone.iter().filter(|(_, alone)| is_over(&Some(**alone)));
+        let commands: Vec<_> = over.map(|(place, _)| *place).collect();
+        commands.iter().for_each(|place| _ = self.commands_alone.remove(place));
+        let any = !vars.is_empty() || !shares.is_empty() || !commands.is_empty();
+        (commands, any)
+    }
+
+    /// The time of fields that are rejected in this frame and were not in the one before.
+    fn alone(&self, spec: &Spec, nth: usize, frame: usize, now: Instant) -> Alone {
+        let since = self.taken[nth][frame];
+        let timeout = spec.ports[nth].timeout;
+        let overdue = match since {
+            Some(at) => self.overdue[nth][frame].map(|_| at + timeout),
+            None => Some(now + timeout),
+        };
+        Alone { overdue, since }
+    }
+
+    /// Whether the rejected fields of a frame can have a time of their own beside all others.
+    pub(super) fn has_room(&self, spec: &Spec, nth: usize, frame: &Accepted, now: Instant) -> bool {
+        let of_var = |var: &SysVar| {
+            let owned = spec.owned[var.ordinal()];
+            let key = owned.map(|owned| (owned.port, owned.frame));
+            key.zip(self.known(*var).alone)
+        };
+        let vars = SysVar::all().filter_map(|var| of_var(&var));
+        let shares = self.shares.iter().zip(&spec.shares);
+        let shares = shares.filter_map(|(state, share)| Some(((share.port, share.frame), state.alone?)));
+        let commands = self.commands_alone.iter().map(|(place, alone)| ((place.0, place.1), *alone));
+        let groups: BTreeSet<_> =
+            vars.chain(shares).chain(commands).filter(|(_, alone)| alone.overdue.is_some()).collect();
+        let without = &frame.without;
+        let is_new = without.vars.iter().any(|var| self.known(*var).alone.is_none())
+            || spec.shares.iter().zip(&self.shares).any(|(share, state)| {
+                (share.port, share.frame) == (nth, frame.frame)
+                    && without.bytes.contains(&share.var)
+                    && state.alone.is_none()
+            })
+            || without.commands.iter().any(|at| !self.commands_alone.contains_key(&(nth, frame.frame, *at)));
+        let own = ((nth, frame.frame), self.alone(spec, nth, frame.frame, now));
+        !is_new || groups.contains(&own) || groups.len() < GROUPS
     }
 
     /// Drops values that waited too long.
@@ -238,13 +326,37 @@ impl Upward {
         self.overdue[nth][frame] = Some(at);
         self.next_overdue = self.next_overdue.min(at);
         for &var in &spec.ports[nth].inputs[frame].written {
-            self.known_mut(var).heard = Some(now);
+            let known = self.known_mut(var);
+            if known.alone.is_none() {
+                known.heard = Some(now);
+            }
         }
     }
 
     /// Applies a frame.
     pub(super) fn accepted(&mut self, spec: &Spec, nth: usize, frame: &Accepted, now: Instant) {
         let timeout = spec.ports[nth].timeout;
+        let alone = self.alone(spec, nth, frame.frame, now);
+        for var in &frame.without.vars {
+            self.known_mut(*var).alone.get_or_insert(alone);
+        }
+        for (state, share) in self.shares.iter_mut().zip(&spec.shares) {
+            if (share.port, share.frame) == (nth, frame.frame) {
+                match frame.without.bytes.contains(&share.var) {
+                    true => _ = state.alone.get_or_insert(alone),
+                    false => state.alone = None,
+                }
+            }
+        }
+        for (at, ..) in &frame.commands {
+            self.commands_alone.remove(&(nth, frame.frame, *at));
+        }
+        if alone.since.is_some() && alone.overdue.is_some() {
+            for at in &frame.without.commands {
+                self.commands_alone.entry((nth, frame.frame, *at)).or_insert(alone);
+            }
+        }
+        self.taken[nth][frame.frame] = Some(now);
         self.overdue[nth][frame.frame] = Some(now + timeout);
         self.next_overdue = self.next_overdue.min(now + timeout);
         self.next_expiry = self.next_expiry.min(now + timeout + Duration::from_micros(1));
@@ -258,6 +370,8 @@ impl Upward {
             known.value = Some((raw, now));
             (known.accepted, known.heard) = (Some(now), Some(now));
             known.live = true;
+            known.alone = None;
+            known.unknown = false;
             known.unconfirmed = false;
             known.unreadable = false;
             known.slept = None;

@@ -57,7 +57,7 @@ fn size(field: &FieldSpec) -> Size {
         FieldSpec::Checksum(sum) => Size::Fixed(sum_bytes(sum)),
         FieldSpec::Length(length) => of_encoding(&length.encoding),
         FieldSpec::System(var) => Size::Fixed(var.size()),
-        FieldSpec::Limits(_) | FieldSpec::Mapped(_) => Size::Fixed(0),
+        FieldSpec::Limits(_) | FieldSpec::Mapped(_) | FieldSpec::InputRule(_) => Size::Fixed(0),
     }
 }
 
@@ -69,7 +69,8 @@ fn of_width(width: Width) -> Size {
 }
 
 fn is_shared(field: &FieldSpec) -> bool {
-    field.element().and_then(|element| element.encoding()).is_some_and(|encoding| encoding.shared)
+    field.is_of_field_before()
+        || field.element().and_then(|element| element.encoding()).is_some_and(|encoding| encoding.shared)
 }
 
 /// Bytes of the shortest and of the longest frame.

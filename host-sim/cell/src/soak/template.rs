@@ -160,7 +160,8 @@ fn content(config: &GatewayConfig, field: &FieldSpec) -> Content {
         | FieldSpec::TextOutput { .. }
         | FieldSpec::Length(_)
         | FieldSpec::Limits(_)
-        | FieldSpec::Mapped(_) => Content::Constant,
+        | FieldSpec::Mapped(_)
+        | FieldSpec::InputRule(_) => Content::Constant,
         FieldSpec::Checksum(_) => Content::Checksum,
     }
 }

@@ -16,14 +16,14 @@ use super::exchanges::FileExchange;
 use super::framings;
 use super::reader::{Item, Reader, Result, Spot};
 use super::recipes::{FileField, FileFieldKind, FileFrame, FilePart, FileRecipe, Flavour, Written};
-use super::{rtu_frames, sendable};
+use super::{input_rules, rtu_frames, sendable};
 use crate::device::{DeviceField, DeviceRecipe, ExchangeKind, FrameEnds, NamedExchange, NamedFrame};
 use crate::keys::field::{self, FILL, OVERFLOW, PAD};
 use crate::keys::recipe::{OF_FRAME, OF_STREAM};
 use crate::keys::{Key, names};
 
 /// The keys of a field or what stands in its place, which no controller's recipe has.
-const OWN_KEYS: [&str; 26] = [
+const OWN_KEYS: [&str; 30] = [
     "equals",
     "overflow",
     "counter",
@@ -50,6 +50,10 @@ const OWN_KEYS: [&str; 26] = [
     "max",
     "outside",
     "map",
+    "as",
+    "no_value",
+    "valid_to",
+    "point",
 ];
 
 /// Why recipes of this kind have no frames of devices; `None` if they may.
@@ -232,7 +236,7 @@ pub(super) fn binding_keys(table: &Reader<'_>, direction: Direction) -> Result<&
 fn refuse_bindings(table: &Reader<'_>) -> Result<()> {
     let bindings = [
         "to", "commands", "when", "base", "idle", "scale", "offset", "overflow", "counter", "min", "max",
-        "outside", "map",
+        "outside", "map", "as", "no_value", "valid_to", "point",
     ];
     refuse(table, &bindings, "a field with equals is a constant and has nothing else")
 }
@@ -295,6 +299,7 @@ pub(super) fn bind(
             let name = read_name(table)?;
             let (first, second) = bindings::read_input(table)?;
             let counter = bindings::read_counter(table, &encoding)?.map(|max| FileInput::Counter { max });
+            let rules = input_rules::read(table, written, &first)?;
             let is_used = counter.is_none() || !matches!(first, FileInput::Unused);
             let uses = [Some(first).filter(|_| is_used), counter, second];
             for (nth, to) in uses.into_iter().flatten().enumerate() {
@@ -303,6 +308,10 @@ pub(super) fn bind(
                     Written { encoding: Encoding { shared: true, ..encoding }, overflow: Overflow::Usual };
                 let written = if again { shared } else { written };
                 push(FileFieldKind::UserInput { name: name.clone(), written, to, again }, None);
+                // Those of the variable, which is the first.
+                for (spot, spec) in rules.iter().filter(|_| !again) {
+                    push(FileFieldKind::Device { name: None, spec: *spec }, Some(spot.clone()));
+                }
             }
         }
     }

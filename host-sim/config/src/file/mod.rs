@@ -16,6 +16,7 @@ mod exchanges;
 pub(crate) mod framings;
 mod functions;
 pub(crate) mod gateway;
+pub(crate) mod input_rules;
 mod inventory;
 pub(crate) mod lines;
 pub(crate) mod modbus;

@@ -1,6 +1,6 @@
 //! The fields of user recipes, and what stands in their place.
 
-use proto_core::config::MAX_COMMAND_TEXT;
+use proto_core::config::{MAX_COMMAND_TEXT, NO_TEXT};
 use proto_core::device::{MAX_DIGITS, MAX_IGNORED, MAX_TEXT};
 use proto_core::wire::scalar::ScalarType;
 
@@ -10,6 +10,7 @@ use crate::file::bindings::OVERFLOWS;
 use crate::file::commands::{BASES, WHENS};
 use crate::file::encoding::OWN_TYPES;
 use crate::file::framings::{COUNTS as ALL_COUNTS, TEXT_ORDERS};
+use crate::file::input_rules::{AS_WORDS, POINTS};
 use crate::file::sendable::OUTSIDES;
 
 /// The name of a field.
@@ -60,7 +61,7 @@ pub const DECIMALS: Key = Key::integer("decimals", 0, 9).or(0).is("of `decimal`:
 /// What happens to numbers that do not fit.
 pub const OVERFLOW: Key = Key::words("overflow", words!(OVERFLOWS)).absent("absent").tells(
     "`\"wrap\"`: what does not fit wraps, as a counter does, from the field to its variable or from the variable to \
-     the field. Otherwise a received frame is rejected, and the nearest number is sent. Integers only",
+     the field. Otherwise a received field is rejected, and the nearest number is sent. Integers only",
 );
 /// The lowest number that is sent.
 pub const MIN: Key = Key::new("min", Shape::Number(Limits::Any))
@@ -80,6 +81,44 @@ pub const MAP: Key = Key::new("map", Shape::Map(&Shape::Number(Limits::Any), 1))
     "output, with `from`: what is sent for values of the source or ranges of them, such as `{ 0 = 1, \"1..7\" = 2 }`; \
      with another value the frame is not sent",
 );
+/// How a variable has a number.
+pub const AS: Key = Key::words("as", words!(AS_WORDS)).beside(&["to"]).absent("absent").tells(
+    "input, with a word register: `\"int16\"`: the register has -32768..=32767 in two's complement, as the program reads \
+     it with its sign. Without it a negative number is rejected",
+);
+const MIN_IN: Key =
+    MIN.beside(&["to"]).tells("input: the lowest number that is taken, before `scale` and `offset`");
+const MAX_IN: Key = MAX.beside(&["to"]).tells("input: the highest number that is taken");
+const OUTSIDE_IN: Key = OUTSIDE.tells(
+    "with `min` or `max`, what becomes of a number below or above. `\"refuse\"`: the field is rejected; `\"clamp\"`: the \
+     nearer of the two is taken",
+);
+const MAP_IN: Key = MAP.beside(&["to"]).tells(
+    "input: what the variable becomes for values of the field or ranges of them, such as `{ 0 = 1, \"1..7\" = 2, else = 9 }`; \
+     without `else` the field is rejected with another value",
+);
+/// What says that there is no value.
+pub const NO_VALUE: Key = Key::new(
+    "no_value",
+    Shape::List(&Shape::Either(&[Shape::Number(Limits::Any), Shape::Text(Text::Length(1, NO_TEXT))]), 1, usize::MAX),
+)
+.beside(&["to"])
+.tells(
+    "input: numbers, and for `decimal` and `hex` also texts of up to 8 characters, that say that there is no value now, such \
+     as `[0x7FFF]` or `[\"----\"]`. No error: the variable keeps its value for `timeout_ms`, and the field is counted \
+     (`fields_without_value`)",
+);
+/// What says whether there is one.
+pub const VALID_TO: Key = Key::text_of("valid_to", Text::VariableOrBit).beside(&["to"]).tells(
+    "input: a bit or a word register that is 1 while the field's newest value was taken, and 0 when it was rejected, had \
+     none, or is overdue",
+);
+/// The point of digits.
+pub const POINT: Key = Key::words("point", words!(POINTS))
+    .or_word(".")
+    .beside(&["to"])
+    .tells("of `decimal`, input: `\",\"` if the digits have a comma where others have `\".\"`");
+pub(crate) const RULES_IN: &[Key] = &[AS, MIN_IN, MAX_IN, OUTSIDE_IN, MAP_IN, NO_VALUE, VALID_TO, POINT];
 /// A constant that is received.
 pub const EQUALS: Key = Key::integer("equals", i32::MIN as i64, u32::MAX as i64)
     .absent("absent")
@@ -158,8 +197,7 @@ pub const TEXT_FILL: Key = Key::text_of("fill", Text::Length(1, 1)).beside(&["wi
 );
 /// The registers of a text.
 pub const TEXT_TO: Key = Key::text_of("to", Text::Variables).tells(
-    "`\"WordInputReg[1..8]\"`: the registers, two characters each, zeros behind the end. A frame with a longer text is \
-     rejected",
+    "`\"WordInputReg[1..8]\"`: the registers, two characters each, zeros behind the end. A longer text is rejected",
 );
 /// The order of characters in a register.
 pub const TEXT_ORDER: Key = Key::words("order", words!(TEXT_ORDERS))
@@ -203,7 +241,10 @@ pub const PLUS: Key =
 pub(crate) const WRITTEN: &[Key] =
     &[OWN_ENDIAN, OWN_WORD_ORDER, BITS, SIGNED, NEW, WIDTH_IF_ANY, UNTIL, DECIMALS];
 /// What an input field is for.
-pub(crate) const BOUND_IN: &[Key] = &[TO, COMMANDS, WHEN, BASE, IDLE, SCALE_IN, OFFSET_IN, EQUALS, COUNTER];
+pub(crate) const BOUND_IN: &[Key] = &[
+    TO, COMMANDS, WHEN, BASE, IDLE, SCALE_IN, OFFSET_IN, EQUALS, COUNTER, AS, MIN_IN, MAX_IN, OUTSIDE_IN,
+    MAP_IN, NO_VALUE, VALID_TO, POINT,
+];
 /// What an output field is for.
 pub(crate) const BOUND_OUT: &[Key] =
     &[FROM, VALUE, SCALE_OUT, OFFSET_OUT, COUNTER, MIN_OUT, MAX_OUT, OUTSIDE, MAP_OUT];
@@ -249,6 +290,7 @@ const RULES: &[Rule] = &[
     Rule::Only("width", "type", &["bcd", "decimal", "hex", "text"]),
     Rule::Only("until", "type", &["decimal", "hex", "text"]),
     Rule::Only("decimals", "type", &["decimal"]),
+    Rule::Only("point", "type", &["decimal"]),
     Rule::Only("word_order", "type", &["dword", "int", "float", "double", "uint64"]),
     Rule::NotBoth("width", "until"),
     Rule::NotBoth("from", "value"),
@@ -274,7 +316,7 @@ pub const INPUT: Table = Table::of("input field", &[]).at(" in an input field").
     Case { when: IS_LENGTH, keys: &[LENGTHS, WRITTEN] },
     Case { when: IS_TEXT, keys: &[CONSTANT_TEXT] },
     Case { when: IS_CONSTANT, keys: &[CONSTANT, WRITTEN] },
-    Case { when: &[], keys: &[NAMED, VALUE_IN, &[OVERFLOW_IN], WRITTEN] },
+    Case { when: &[], keys: &[NAMED, VALUE_IN, RULES_IN, &[OVERFLOW_IN], WRITTEN] },
 ]);
 const VALUE_IN: &[Key] = &[TO, COMMANDS, WHEN, BASE, IDLE, SCALE_IN, OFFSET_IN, COUNTER];
 const OVERFLOW_IN: Key = OVERFLOW.beside(&["to"]);
@@ -294,7 +336,7 @@ const OVERFLOW_OUT: Key = OVERFLOW.beside(&["from"]);
 pub const COIL_IN: Table = Table::of("coil that is read", &[]).at(" of a coil").cases(&[
     Case { when: IS_PAD, keys: &[COIL_PADDING] },
     Case { when: IS_CONSTANT, keys: &[&[NAME_IF_ANY, EQUALS]] },
-    Case { when: &[], keys: &[COIL, VALUE_IN] },
+    Case { when: &[], keys: &[COIL, VALUE_IN, RULES_IN] },
 ]);
 
 /// A coil that is sent.
@@ -315,7 +357,7 @@ pub const IN_BLOCK: Table = Table::of("field of a block", &[]).rules(RULES).case
     Case { when: TEXT_TYPED, keys: &[TEXT_IN] },
     Case { when: IS_TEXT, keys: &[CONSTANT_TEXT] },
     Case { when: IS_CONSTANT, keys: &[CONSTANT, WRITTEN] },
-    Case { when: GOES_UP, keys: &[NAMED, VALUE_IN, &[OVERFLOW_IN], WRITTEN] },
+    Case { when: GOES_UP, keys: &[NAMED, VALUE_IN, RULES_IN, &[OVERFLOW_IN], WRITTEN] },
     Case { when: IS_VALUE, keys: &[&[NAME_IF_ANY, TYPE], BOUND_OUT, &[OVERFLOW_OUT], WRITTEN] },
     Case { when: &[], keys: &[NAMED, BOUND_OUT, &[OVERFLOW_OUT], WRITTEN] },
 ]);
@@ -324,7 +366,7 @@ pub const IN_BLOCK: Table = Table::of("field of a block", &[]).rules(RULES).case
 pub const COIL_IN_BLOCK: Table = Table::of("coil of a block", &[]).at(" of a coil").rules(RULES).cases(&[
     Case { when: IS_PAD, keys: &[COIL_PADDING] },
     Case { when: IS_CONSTANT, keys: &[&[NAME_IF_ANY, EQUALS]] },
-    Case { when: COIL_GOES_UP, keys: &[COIL, VALUE_IN] },
+    Case { when: COIL_GOES_UP, keys: &[COIL, VALUE_IN, RULES_IN] },
     Case { when: IS_VALUE, keys: &[&[NAME_IF_ANY], BOUND_OUT] },
     Case { when: &[], keys: &[COIL, BOUND_OUT] },
 ]);

@@ -35,6 +35,7 @@ pub const DOCUMENTED: &[(&str, &[&[Key]])] = &[
         &[&[field::TO, field::COMMANDS, field::FROM, field::VALUE, field::SCALE_IN, field::OFFSET_IN]],
     ),
     ("limits and maps", &[&[field::MIN, field::MAX, field::OUTSIDE, field::MAP]]),
+    ("received values", &[field::RULES_IN]),
     ("commands", &[&[field::WHEN, field::BASE, field::IDLE]]),
     ("output", &[&[recipe::SEND, recipe::ON_STALE]]),
     ("order of frames", &[&[recipe::FRAME_NAME, recipe::AFTER]]),

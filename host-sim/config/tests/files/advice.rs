@@ -187,14 +187,16 @@ fn negative_numbers_of_a_variable_that_has_none_are_told() {
         format!("kind = \"stream\"\nmode = \"user\"\n{part}")
     };
     let to = "to = \"WordInputReg[1]\"";
-    let said = "recipe \"r\", field \"a\": WordInputReg[1] takes 0..=65535, so each frame with a negative number is \
-                rejected; write an offset, or offset = 0 if there is none";
+    let said = "recipe \"r\", field \"a\": WordInputReg[1] takes 0..=65535, so a negative number is rejected; \
+                write as = \"int16\", an offset, or offset = 0 if there is none";
     for keys in ["type = \"float\"", "type = \"short\", scale = 0.1", "type = \"int24\", endian = \"big\""] {
         assert_eq!(negative(&field(&format!("{keys}, {to}"))), [said], "{keys}");
     }
     for keys in [
         "type = \"float\", offset = 32768",
         "type = \"float\", offset = 0",
+        "type = \"short\", as = \"int16\"",
+        "type = \"short\", min = 0",
         "type = \"word\"",
         "type = \"byte\"",
         "type = \"dword\", scale = 0.01",

@@ -12,6 +12,7 @@ mod exchange_files;
 mod frame_order;
 mod framing_files;
 mod golden_images;
+mod input_rule_files;
 mod schema_files;
 mod sendable_files;
 mod wrong_devices;

@@ -3,14 +3,14 @@
 //! In: the frames of one part as the file has them. Out: what `encode` and `decode` write. What two
 //! frames with the same values can differ in, such as padding, is kept in `raw=`.
 
-use proto_core::config::{DeviceFrame, FieldSpec, OutputBinding};
+use proto_core::config::{DeviceFrame, FieldSpec, InputRule, OutputBinding};
 use proto_core::device::{Carrier, Cutter, Digits, Element, Encoding, Found, Framer, Kind, Piece, Probe};
 use proto_core::modbus::rtu;
 use proto_core::recipe::model::MAX_STREAM_FRAME;
 use proto_core::sysvar::Direction;
 use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::Scalar;
-use recipe_config::{DeviceRecipe, ExchangeKind, FrameEnds, NamedExchange, NamedFrame};
+use recipe_config::{DeviceField, DeviceRecipe, ExchangeKind, FrameEnds, NamedExchange, NamedFrame};
 
 use super::super::{scale, text};
 use super::{note, write_line};
@@ -54,7 +54,8 @@ struct Value {
     name: String,
     kind: ValueKind,
     /// What a gateway does with it, each use of its bytes.
-    specs: Vec<FieldSpec>,
+    /// Each use of its bytes, with what stands behind it.
+    specs: Vec<Vec<FieldSpec>>,
     /// Its elements: more than one if the bytes are used more than once.
     elements: Vec<usize>,
     /// What is sent if nothing else is asked for.
@@ -278,23 +279,28 @@ impl DevicePart {
         }
     }
 
-    /// Says if a gateway rejects a frame for its values.
+    /// Says which fields of a frame a gateway rejects for their values.
     fn note_values(&self, format: &Format, frame: &[u8], line: usize, notes: &mut dyn std::io::Write) {
         let Ok(values) = format.values(frame) else { return };
         if self.direction != Direction::Input {
             return;
         }
         let why = |(value, seen): (&Value, Seen)| {
-            let refused = |spec| scale::refused(spec, &value.name, seen.value?);
+            let refused = |uses: &Vec<FieldSpec>| scale::refused_field(uses, &value.name, seen.value?);
             match seen.is_finite {
-                false => Some(("receiver", format!("{} is not finite", value.name))),
-                true => value.specs.iter().find_map(refused).map(|why| ("gateway", why)),
+                false => Some(format!("{} is not finite", value.name)),
+                true => value.specs.iter().find_map(refused),
             }
         };
-        if let Some((who, why)) = format.values.iter().zip(values).find_map(why) {
-            note(notes, &format!("line {line}: a {who} rejects this frame: {why}"));
+        for why in format.values.iter().zip(values).filter_map(why) {
+            note(notes, &format!("line {line}: a gateway rejects this field: {why}"));
         }
     }
+}
+
+/// A field, and what stands behind it.
+fn uses(field: &DeviceField) -> Vec<FieldSpec> {
+    [field.spec].into_iter().chain(field.sendable.iter().copied()).collect()
 }
 
 /// The fields with a value, each once.
@@ -317,12 +323,12 @@ fn values_of(named: &NamedFrame, is_multiplexed: bool) -> Vec<Value> {
         match values.last_mut() {
             Some(before) if field.repeats => {
                 before.elements.push(nth);
-                before.specs.push(field.spec);
+                before.specs.push(uses(field));
             }
             _ => {
                 let is_fixed = is_multiplexed && constant.is_some();
                 let name = field.name.clone();
-                let specs = vec![field.spec];
+                let specs = vec![uses(field)];
                 values.push(Value { name, kind, specs, elements: vec![nth], constant, is_fixed });
             }
         }
@@ -384,7 +390,18 @@ impl Format {
     /// The values of a frame, each once.
     fn values(&self, frame: &[u8]) -> Result<Vec<Seen>, String> {
         let DeviceFrame { layout, elements } = &self.frame;
-        let all: Vec<_> = layout.values(elements, frame).collect();
+        let mut all: Vec<_> = layout.values(elements, frame).collect();
+        for value in &self.values {
+            let rules = value.specs.iter().flatten();
+            let has_comma = rules.clone().any(|rule| *rule == FieldSpec::InputRule(InputRule::Comma));
+            let Some(nth) = value.elements.first().copied().filter(|_| has_comma) else { continue };
+            let Some(bytes) = layout.bytes_of(elements, frame, nth) else { continue };
+            // As it would be with a point.
+            let turned: Vec<u8> = bytes.iter().map(|byte| if *byte == b',' { b'.' } else { *byte }).collect();
+            if let (ValueKind::Number(encoding), Some(read)) = (&value.kind, all.get_mut(nth)) {
+                *read = encoding.read(&turned).map(Some);
+            }
+        }
         let value = |value: &Value| {
             let nth = value.elements.first().copied().unwrap_or(usize::MAX);
             match (&value.kind, all.get(nth)) {

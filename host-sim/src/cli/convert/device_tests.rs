@@ -189,7 +189,7 @@ fn the_scales_text_is_a_number() {
     assert_eq!(lines[1], "weight=-12.34");
     assert_eq!(
         notes,
-        "line 1: a gateway rejects this frame: weight is -12.34; WordInputReg[1] takes 0..=655.35\n\
+        "line 1: a gateway rejects this field: weight is -12.34; WordInputReg[1] takes 0..=655.35\n\
          18 bytes skipped outside of frames\n"
     );
     assert_eq!(from_values(&part, None, &["-12.34"]).unwrap(), line("ST,GS,-0012.34kg\r\n"));

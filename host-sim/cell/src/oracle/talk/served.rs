@@ -292,7 +292,7 @@ impl Oracle {
             // Bits beyond the last coil mean nothing.
             *last &= (1 << left) - 1;
         }
-        let verdict = self.ports[nth].line.judge_data(&port.inputs[frame], frame, &data);
+        let verdict = self.ports[nth].line.judge_block(&port.inputs[frame], frame, &data);
         let is_taken = matches!(verdict, Verdict::Accepted(_));
         if is_taken {
             self.ports[nth].served.written.insert(place, data);

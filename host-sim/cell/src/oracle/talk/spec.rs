@@ -14,7 +14,7 @@ use proto_core::wire::can::CanId;
 
 use super::frames::{FramesSpec, frame_of};
 use crate::oracle::device::{self, look};
-use crate::oracle::spec::{Frame, PortSpec, frame};
+use crate::oracle::spec::{Frame, PortSpec, device_frame};
 use crate::rtu::is_right;
 
 /// The conversation of a port.
@@ -97,8 +97,9 @@ impl TalkSpec {
             let mut row = RowSpec::new(rows.len(), exchange);
             match exchange.talk {
                 Talk::Rtu { operation, written, read } => {
-                    let data =
-                        |fields: &[FieldSpec]| (!fields.is_empty()).then(|| frame(&[], &[], None, fields));
+                    let data = |fields: &[FieldSpec]| {
+                        (!fields.is_empty()).then(|| device_frame(&[], &[], None, fields))
+                    };
                     row.request = data(written.of(&config.fields));
                     if let Some(reply) = data(read.of(&config.fields)) {
                         row.reply = Some(inputs.len());

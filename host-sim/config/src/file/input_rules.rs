@@ -1,0 +1,192 @@
+//! What becomes of the value of an input field: `as`, `min`, `max` and `outside`, `map`, `no_value`, `valid_to`, `point`.
+//!
+//! In: the field's table, its encoding, its variable. Out: what stands behind the field in the configuration.
+
+use proto_core::config::{FieldSpec, InputRule, Limits, MapEntry, NO_TEXT, NoText};
+use proto_core::device::{Encoding, Kind, Overflow};
+use proto_core::sysvar::{Direction, SysVar, VarBit};
+use proto_core::wire::scalar::ScalarType;
+
+use super::bindings::{FileInput, read_var};
+use super::commands::read_range;
+use super::encoding::refuse;
+use super::names::meant_variable;
+use super::reader::{Item, Reader, Result, Spot};
+use super::recipes::Written;
+use super::sendable::OUTSIDES;
+use crate::keys::field::{AS, OUTSIDE, POINT};
+
+/// The words of `as`.
+pub(crate) const AS_WORDS: [(&str, InputRule); 1] = [("int16", InputRule::Int16)];
+/// The words of `point`.
+pub(crate) const POINTS: [(&str, Option<InputRule>); 2] = [(".", None), (",", Some(InputRule::Comma))];
+
+/// All of these keys.
+pub(super) const KEYS: [&str; 8] = ["as", "min", "max", "outside", "map", "no_value", "valid_to", "point"];
+
+/// What stands behind an input field, with the places of their keys.
+pub(super) fn read(table: &Reader<'_>, written: Written, to: &FileInput) -> Result<Vec<(Spot, FieldSpec)>> {
+    let Written { encoding, overflow } = written;
+    let var = match *to {
+        FileInput::Variable { var, .. } => var,
+        FileInput::Bit(_) => {
+            let why = "not allowed for a bit: it is off for 0 and on for any other value";
+            return refuse(table, &KEYS, why).map(|()| Vec::new());
+        }
+        _ => return refuse(table, &KEYS, "allowed only together with to").map(|()| Vec::new()),
+    };
+    if overflow == Overflow::Wrap {
+        let why = "not allowed together with overflow = \"wrap\", which takes any number";
+        refuse(table, &["as", "min", "max", "outside", "map"], why)?;
+    }
+    let mut rules = Vec::new();
+    let rule = |item: &Item<'_>, rule| (item.spot.clone(), FieldSpec::InputRule(rule));
+    if let Some(item) = table.optional("point") {
+        if !matches!(encoding.kind, Kind::Decimal(_)) {
+            return Err(item.error("only decimal has a point"));
+        }
+        if let Some(Some(comma)) = table.word(&POINT, &POINTS)? {
+            if encoding.until() == Some(b',') {
+                return Err(item.error("a comma ends the field (until), so it cannot be its point"));
+            }
+            rules.push(rule(&item, comma));
+        }
+    }
+    if let (Some(item), Some(int16)) = (table.optional("as"), table.word(&AS, &AS_WORDS)?) {
+        if var.ty() != ScalarType::Word {
+            return Err(item.error(format!("{var} is no word register; allowed: WordInputReg")));
+        }
+        rules.push(rule(&item, int16));
+    }
+    let is_int16 = !rules.is_empty() && table.optional("as").is_some();
+    if let Some(map) = table.optional("map") {
+        let why = "not allowed together with map, which says what the variable becomes";
+        refuse(table, &["min", "max", "outside", "scale", "offset"], why)?;
+        read_map(&map, var, is_int16, &mut rules)?;
+    } else {
+        rules.extend(read_limits(table, &encoding)?);
+    }
+    if let Some(list) = table.optional("no_value") {
+        for item in
+            list.array("of numbers or texts that say that there is no value, such as [0x7FFF] or [\"----\"]")?
+        {
+            rules.push(rule(&item, read_no_value(&item, &encoding)?));
+        }
+    }
+    if let Some(item) = table.optional("valid_to") {
+        rules.push(rule(&item, read_valid_to(&item)?));
+    }
+    Ok(rules)
+}
+
+fn read_limits(table: &Reader<'_>, encoding: &Encoding) -> Result<Option<(Spot, FieldSpec)>> {
+    let (min, max) = (table.optional("min"), table.optional("max"));
+    let Some(first) = min.as_ref().or(max.as_ref()) else {
+        refuse(table, &["outside"], "allowed only together with min or max")?;
+        return Ok(None);
+    };
+    let spot = first.spot.clone();
+    let (lowest, highest) = encoding.range();
+    let read = |item: &Option<Item<'_>>, default| match item {
+        Some(item) => read_number(item, encoding),
+        None => Ok(default),
+    };
+    let (low, high) = (read(&min, lowest)?, read(&max, highest)?);
+    if let Some(max) = max.filter(|_| low > high) {
+        return Err(max.error(format!("max {high} is below min {low}")));
+    }
+    let outside = table.word_or(&OUTSIDE, &OUTSIDES)?;
+    Ok(Some((spot, FieldSpec::Limits(Limits { low, high, outside }))))
+}
+
+/// A number that the field can have.
+fn read_number(item: &Item<'_>, encoding: &Encoding) -> Result<f64> {
+    let number = item.number()?;
+    let (low, high) = encoding.range();
+    if !(low..=high).contains(&number) {
+        return Err(item.error(format!("the field cannot be {number}; allowed: {low}..={high}")));
+    }
+    if encoding.reads_integers() && number.fract() != 0.0 {
+        return Err(item.error(format!("{number} has a fraction; this field has integers only")));
+    }
+    Ok(number)
+}
+
+fn read_map(map: &Item<'_>, var: SysVar, is_int16: bool, rules: &mut Vec<(Spot, FieldSpec)>) -> Result<()> {
+    let (mut entries, mut otherwise): (Vec<(Spot, MapEntry)>, _) = (Vec::new(), None);
+    for (key, key_spot, item) in map.any_table()?.entries() {
+        let wrong = |why: String| item.clone().at(key_spot.clone()).error(why);
+        let sent = item.number()?;
+        let (low, high) = match var.ty() {
+            _ if is_int16 => ScalarType::Short.range(),
+            ScalarType::Byte => (0.0, f64::from(var.valid_bits())),
+            ty => ty.range(),
+        };
+        if !(low..=high).contains(&sent) || var.ty() != ScalarType::Float && sent.fract() != 0.0 {
+            return Err(item.error(format!("{var} cannot be {sent}; allowed: {low}..={high}")));
+        }
+        if key == "else" {
+            otherwise = Some((item.spot.clone(), FieldSpec::InputRule(InputRule::Else(sent))));
+            continue;
+        }
+        let Some((first, last)) = read_range(key) else {
+            return Err(wrong(format!(
+                "{key:?} is not an integer; the keys of map are values of the field, such as 1, ranges of them, such as \
+                 \"1..100\", or else"
+            )));
+        };
+        if first > last {
+            return Err(wrong(format!("{key:?} contains no value; allowed: \"{last}..{first}\"")));
+        }
+        let mut others = entries.iter().map(|(_, other)| (first.max(other.first), last.min(other.last)));
+        if let Some((value, _)) = others.find(|(first, last)| first <= last) {
+            return Err(wrong(format!("an earlier entry already has the value {value}")));
+        }
+        entries.push((item.spot, MapEntry { first, last, sent }));
+    }
+    if entries.is_empty() {
+        return Err(map.error("no entries; write for example { 0 = 1, \"1..7\" = 2, else = 9 }"));
+    }
+    rules.extend(entries.into_iter().map(|(spot, entry)| (spot, FieldSpec::Mapped(entry))).chain(otherwise));
+    Ok(())
+}
+
+fn read_no_value(item: &Item<'_>, encoding: &Encoding) -> Result<InputRule> {
+    let Some(text) = item.as_string() else {
+        return read_number(item, encoding).map(InputRule::NoNumber);
+    };
+    if !encoding.is_digits() {
+        return Err(item.error("a text is for fields of digits only: decimal, hex; write a number"));
+    }
+    NoText::new(text).map(InputRule::NoText).ok_or_else(|| {
+        item.error(format!(
+            "{text:?} is no such text; allowed: 1..={NO_TEXT} printable characters of ASCII, without blanks at the ends"
+        ))
+    })
+}
+
+fn read_valid_to(item: &Item<'_>) -> Result<InputRule> {
+    let name = item.string()?;
+    if let Some(bit) = VarBit::parse(name) {
+        let VarBit { var, bit } =
+            bit.map_err(|error| item.error(format!("{name:?}: {error}{}", meant_variable(name))))?;
+        return input(item, var).map(|()| InputRule::ValidTo { var, bit: Some(bit) });
+    }
+    let var = read_var(item)?;
+    input(item, var)?;
+    match var.ty() {
+        ScalarType::Word => Ok(InputRule::ValidTo { var, bit: None }),
+        _ => Err(item.error(format!(
+            "{var} is no word register; allowed: WordInputReg, or a bit such as BitInputReg[3].4"
+        ))),
+    }
+}
+
+fn input(item: &Item<'_>, var: SysVar) -> Result<()> {
+    match var.direction() {
+        Direction::Input => Ok(()),
+        Direction::Output => {
+            Err(item.error(format!("{var} is an output of the controller; allowed: its inputs")))
+        }
+    }
+}
