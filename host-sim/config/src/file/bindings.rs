@@ -209,7 +209,7 @@ pub(super) fn read_output(field: &Reader<'_>) -> Result<FileOutput> {
     Ok(FileOutput::Bound(binding))
 }
 
-fn read_var(item: &Item<'_>) -> Result<SysVar> {
+pub(super) fn read_var(item: &Item<'_>) -> Result<SysVar> {
     let name = item.string()?;
     SysVar::parse(name).map_err(|error| item.error(format!("{name:?}: {error}{}", meant_variable(name))))
 }
