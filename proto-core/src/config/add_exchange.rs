@@ -51,18 +51,12 @@ impl ConfigMut<'_> {
                 when.rising = Some((var, bit));
             }
             let Ask { peer, timeout, retries, pause, trigger, late, stop, follow, overdue, .. } = *ask;
-            let (event_retries, retries) = (retries.unwrap_or(0), retries.unwrap_or(1));
             let outcome = outcome(&ask.outcome).map_err(|error| ConfigError {
                 place: at(ExchangeKey::Outcome),
                 kind: Kind::Variable(error),
             })?;
-            let _ = self.exchanges.push(Exchange {
-                peer,
-                talk,
-                when,
+            let exchange = Exchange {
                 timeout,
-                retries,
-                event_retries,
                 pause,
                 trigger,
                 late,
@@ -70,7 +64,9 @@ impl ConfigMut<'_> {
                 follow,
                 overdue,
                 outcome,
-            });
+                ..Exchange::new(peer, talk, when)
+            };
+            let _ = self.exchanges.push(exchange.repeated(retries));
         }
         Ok(super::add::span(start, self.exchanges.len()))
     }

@@ -172,7 +172,7 @@ impl fmt::Display for ExchangeError {
             Self::Overlap => f.write_str("an earlier block has some of these registers or coils"),
             Self::Nothing => f.write_str("an exchange needs a request, a reply or both"),
             Self::LoneRefusal => f.write_str("a refusal answers a request that has a reply"),
-            Self::Never => f.write_str("it would never be asked; set every_ms or on"),
+            Self::Never => f.write_str("it would never be asked; set every_ms, on or follow"),
             Self::Unasked => f.write_str("there is no request to send; remove every_ms and on"),
             Self::RemoteFields => f.write_str("a remote request has no fields"),
             Self::RemoteReply => f.write_str("only a request can be remote"),
@@ -187,20 +187,24 @@ impl fmt::Display for ExchangeError {
             Self::Trigger { time } => {
                 write!(f, "{time} is out of range; allowed: above 0, at most {LONGEST_TRIGGER}")
             }
-            Self::NoEvent => {
-                f.write_str("only for an exchange that a rising bit or another exchange triggers")
-            }
+            Self::NoEvent => f.write_str(
+                "allowed only for an event: an exchange with a rising bit in on, or with follow, and without stop",
+            ),
             Self::StopNeedsReply => {
                 f.write_str("a write that stops is repeated until it is confirmed; it needs a reply")
             }
-            Self::FollowsNothing { .. } => f.write_str("it follows another exchange of the same recipe"),
+            Self::FollowsNothing { .. } => {
+                f.write_str("an exchange follows another one of its recipe, not itself")
+            },
             Self::FollowsUnanswered => {
                 f.write_str("the exchange that it follows has no reply, so nothing tells that it was done")
             }
             Self::FollowsAndRises => f.write_str(
-                "one that follows another has no rising bit of its own, and does not stop the device",
+                "an exchange that follows another has no rising bit of its own in on, and no stop",
             ),
-            Self::FollowsCircle => f.write_str("the exchanges follow each other in a circle"),
+            Self::FollowsCircle => {
+                f.write_str("the exchanges follow each other in a circle, so nothing begins it; remove one follow")
+            }
             Self::NotForOutcome { var } => {
                 write!(f, "{var} cannot tell what became of an event; allowed: WordInputReg, FloatInputReg")
             }
@@ -306,7 +310,8 @@ impl<'a> ExchangeCheck<'a> {
         let mut before = follow;
         for _ in 0..=exchanges.len() {
             match exchanges.get(usize::from(before)) {
-                _ if before == nth => return refuse(ExchangeError::FollowsNothing { follow }),
+                _ if follow == nth => return refuse(ExchangeError::FollowsNothing { follow }),
+                _ if before == nth => return refuse(ExchangeError::FollowsCircle),
                 None => return refuse(ExchangeError::FollowsNothing { follow }),
                 Some(leader) if !leader.is_answered() => return refuse(ExchangeError::FollowsUnanswered),
                 Some(Exchange { follow: Some(next), .. }) => before = *next,

@@ -178,6 +178,12 @@ impl Exchange {
         }
     }
 
+    /// The same exchange with the repetitions that a file has for it: without any, one of a state and none of an event.
+    pub fn repeated(self, retries: Option<u8>) -> Self {
+        let of_event = if self.is_event() || self.is_start_event() { retries } else { None };
+        Self { retries: retries.unwrap_or(1), event_retries: of_event.unwrap_or(0), ..self }
+    }
+
     /// How long after its request a reply may come.
     pub fn late(&self) -> Duration {
         self.late.unwrap_or(self.timeout.saturating_mul(3).max(DEFAULT_LATE))

@@ -6,11 +6,11 @@
 use proto_core::config::{AskWhen, DEFAULT_REPLY_TIMEOUT, ExchangeError, ExchangeKey, OutcomeTo, Port};
 use proto_core::device::{Boundary, Carrier};
 use proto_core::recipe::model::{Mode, Rules};
-use proto_core::sysvar::{Direction, SysVar};
+use proto_core::sysvar::{Direction, SysVar, VarBit};
 use proto_core::time::Duration;
 use proto_core::wire::can::CanId;
 
-use super::bindings::{FileInput, Sending};
+use super::bindings::{self, FileInput, Sending};
 use super::encoding::refuse;
 use super::order::FrameOrder;
 use super::reader::{Item, Reader, Result, Spot};
@@ -92,7 +92,7 @@ pub(super) fn names(tables: &[Reader<'_>]) -> Result<Vec<Option<String>>> {
             return Err(item.error(format!("another exchange of the recipe is called {name:?}")));
         }
         if !(1..=32).contains(&name.len()) {
-            return Err(item.error("a name has 1 to 32 bytes"));
+            return Err(item.error(format!("{name:?} has {} bytes; allowed: 1..=32", name.len())));
         }
         names.push(Some(name.to_owned()));
     }
@@ -326,9 +326,11 @@ fn read_follow(item: &Item<'_>, names: &[Option<String>]) -> Result<u8> {
     let nth = names.iter().position(|other| other.as_deref() == Some(name));
     nth.and_then(|nth| u8::try_from(nth).ok()).ok_or_else(|| {
         let known: Vec<_> = names.iter().flatten().map(|name| format!("{name:?}")).collect();
-        let known =
-            if known.is_empty() { "none of the recipe has a name".to_owned() } else { known.join(", ") };
-        item.error(format!("there is no exchange {name:?}; allowed: {known}"))
+        let allowed = match known.is_empty() {
+            true => "no exchange of the recipe has a name".to_owned(),
+            false => format!("allowed: {}", known.join(", ")),
+        };
+        item.error(format!("there is no exchange {name:?}; {allowed}"))
     })
 }
 
@@ -337,13 +339,15 @@ fn read_outcome(item: &Item<'_>) -> Result<OutcomeTo> {
     let table = item.table(&exchange::OUTCOME_TABLE)?;
     let variable = |key| -> Result<Option<SysVar>> {
         let Some(item) = table.optional(key) else { return Ok(None) };
-        let text = item.string()?;
-        SysVar::parse(text).map(Some).map_err(|error| item.error(format!("{text:?}: {error}")))
+        if VarBit::parse(item.string()?).is_some() {
+            return Err(item.error("a number does not fit in one bit; allowed: WordInputReg, FloatInputReg"));
+        }
+        bindings::read_var(&item).map(Some)
     };
     let outcome =
         OutcomeTo { to: variable("to")?, code_to: variable("code_to")?, count_to: variable("count_to")? };
     if outcome == OutcomeTo::NONE {
-        return Err(item.error("empty; allowed: to, code_to, count_to"));
+        return Err(item.error("no variable; allowed: to, code_to, count_to"));
     }
     Ok(outcome)
 }

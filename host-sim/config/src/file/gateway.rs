@@ -446,6 +446,19 @@ fn read_address(item: &Item<'_>) -> Result<heapless::String<MAX_ADDRESS>> {
     Ok(bounded(text))
 }
 
+fn read_echo(item: &Item<'_>) -> Result<Echo> {
+    let word = item.as_string().and_then(|text| ECHOES.iter().find(|(word, _)| *word == text));
+    match (item.as_bool(), word) {
+        (Some(true), _) => Ok(Echo::Yes),
+        (Some(false), _) => Ok(Echo::No),
+        (None, Some((_, echo))) => Ok(*echo),
+        (None, None) => Err(match item.as_string() {
+            Some(text) => item.error(format!("{text:?} is unknown; allowed: true, false, \"auto\"")),
+            None => item.wrong_kind("true, false or \"auto\""),
+        }),
+    }
+}
+
 fn read_bus(table: &Reader<'_>, kind: BusKind) -> Result<Bus> {
     let listen = || -> Result<heapless::String<MAX_LISTEN>> {
         let item = table.required("listen", "an IP address and a port, such as \"0.0.0.0:50000\"")?;
@@ -458,14 +471,7 @@ fn read_bus(table: &Reader<'_>, kind: BusKind) -> Result<Bus> {
                 BusKind::Rs485 => read_line(table)?,
                 _ => read_rtu_line(table, kind == BusKind::ModbusMaster)?,
             };
-            line.echo = match table.optional(ECHO.name) {
-                None => Echo::Auto,
-                Some(item) => match item.as_bool() {
-                    Some(true) => Echo::Yes,
-                    Some(false) => Echo::No,
-                    None => item.choice(&ECHOES)?,
-                },
-            };
+            line.echo = table.optional(ECHO.name).map_or(Ok(Echo::Auto), |item| read_echo(&item))?;
             Bus::Rs485(line)
         }
         BusKind::Can => Bus::Can { bitrate: read_bitrate(table)? },

@@ -199,7 +199,7 @@ impl<'a> Item<'a> {
         Self { spot, ..self }
     }
 
-    fn wrong_kind(&self, wanted: &str) -> FileError {
+    pub(super) fn wrong_kind(&self, wanted: &str) -> FileError {
         self.error(format!("expected {wanted}, found {}", self.node.value.kind()))
     }
 

@@ -86,6 +86,8 @@ pub const PAUSE: Key =
     Key::millis("pause_ms", Limits::Within(0.0, 10_000.0)).or(0).is("how long the line rests after it");
 pub(crate) const TIMING: &[Key] =
     &[EVERY, ON, TIMEOUT, RETRIES, PAUSE, TRIGGER, LATE, STOP, NAME, FOLLOW, OUTCOME];
+/// Of a reply in a device's own frames, beside those of its frame.
+pub(crate) const OF_REPLY_FRAME: &[Key] = &[REPLY_TIMEOUT, EXPECT];
 /// Of a reply of Modbus, which has no table of its own.
 pub(crate) const OF_REPLY: &[Key] = &[EXPECT, OVERDUE];
 const ASKED: &[&str] = &["request"];
@@ -104,7 +106,7 @@ const TIMING_OF_FRAMES: &[Key] = &[
 ];
 
 const fn request(table: &'static Table) -> Key {
-    Key::new("request", Shape::Table(table)).tells("the frame that asks. Needs `every_ms` or `on`")
+    Key::new("request", Shape::Table(table)).tells("the frame that asks. Needs `every_ms`, `on` or `follow`")
 }
 
 const fn reply(table: &'static Table) -> Key {

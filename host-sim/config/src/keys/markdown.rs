@@ -76,11 +76,14 @@ pub const DOCUMENTED: &[(&str, &[&[Key]])] = &[
     ),
     ("length", &[&[field::LENGTH, field::COUNTS, field::PLUS]]),
     ("exchange", &[&[exchange::PEER], exchange::TIMING, exchange::FRAMES, &[exchange::REMOTE]]),
+    ("reply", &[exchange::OF_REPLY_FRAME]),
+    ("outcome", &[exchange::OUTCOME_TABLE.common]),
     (
         "Modbus exchange",
         &[
             exchange::OF_MODBUS.common,
             &[exchange::WRITE_ADDRESS, exchange::READ, exchange::WRITE, device::WORD_ORDER_OF_REGISTERS],
+            exchange::OF_REPLY,
         ],
     ),
     ("block", &[exchange::BLOCK.common, &[exchange::BLOCK_FIELDS]]),

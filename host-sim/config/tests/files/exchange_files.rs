@@ -1,7 +1,7 @@
 //! What the keys of exchanges and of Modbus mean in the configuration.
 
 use proto_core::config::{
-    Ask, AskFrame, AskWhen, Bus, CanFields, Coil, Exchange, FieldSpec, GatewayConfig, InputBinding,
+    Ask, AskFrame, AskWhen, Bus, CanFields, Coil, Echo, Exchange, FieldSpec, GatewayConfig, InputBinding,
     InputField, OnStale, OutputBinding, OutputField, Parity, Parts, Port, Recipe, Rs485, Span, StateValue,
     Talk,
 };
@@ -175,7 +175,10 @@ fn lines_of_modbus_have_its_silences() {
     let plain = Rs485::default();
     // A reply may come in pieces, so a master waits as long for its end as others do.
     let usual = plain.idle_gap;
-    assert_eq!(lines, [(usual, slow, true), (ms(3), fast, false), (usual, plain.turnaround, false)]);
+    assert_eq!(
+        lines,
+        [(usual, slow, Echo::Yes), (ms(3), fast, Echo::Auto), (usual, plain.turnaround, Echo::Auto)]
+    );
 }
 
 #[test]
@@ -328,7 +331,13 @@ fn a_program_writes_what_a_file_says() {
                     .peer(1)
                     .every(ms(100))]),
         )
-        .port(Port::modbus_rtu("line", "line").baud(19_200).parity(Parity::Even).timeout(ms(2000)).echo())
+        .port(
+            Port::modbus_rtu("line", "line")
+                .baud(19_200)
+                .parity(Parity::Even)
+                .timeout(ms(2000))
+                .echo(Echo::Yes),
+        )
         .port(Port::modbus_rtu_slave("plc", "plc").idle_gap(ms(3)))
         .port(Port::rs485("talk", "talk"))
         .port(Port::can("drive", "drive"))

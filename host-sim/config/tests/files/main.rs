@@ -7,6 +7,7 @@ mod damaged_files;
 mod device_files;
 mod document_examples;
 mod documented_keys;
+mod event_files;
 mod example_files;
 mod exchange_files;
 mod frame_order;

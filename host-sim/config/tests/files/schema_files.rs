@@ -10,7 +10,10 @@ use toml::{Table, Value};
 
 /// What a schema cannot know, and why: pieces of a place and of the reader's message.
 const BEYOND: &[(&str, &[(&str, &str)])] = &[
-    ("names of other things in the file", &[("recipe", "there is no recipe")]),
+    (
+        "names of other things in the file",
+        &[("recipe", "there is no recipe"), ("follow", "there is no exchange")],
+    ),
     (
         "which recipe a port takes, and what the port does with it",
         &[
@@ -73,6 +76,8 @@ const BEYOND: &[(&str, &[(&str, &str)])] = &[
             ("", "it would never be asked"),
             ("", "an exchange needs a request, a reply or both"),
             ("", "there is no reply to wait for"),
+            ("follow", "has no reply"),
+            ("outcome", "no variable"),
             ("", "a recipe needs an input part"),
             ("", "no value to send"),
             ("request", "fields is missing"),

@@ -44,7 +44,6 @@ const CASES: &[Case] = &[
     line("an unknown function code", "function = 23", "function = 43"),
     line("a function that is a bool", "function = 23", "function = true"),
     line("an unknown key of an exchange", "every_ms = 100\n", "evry_ms = 100\n"),
-    line("a name of an exchange", "every_ms = 100\n", "every_ms = 100\nname = \"io\"\n"),
     line("no address", "address = 0x07D0\n", ""),
     line("an address beyond 16 bits", "address = 0x07D0", "address = 0x10000"),
     line("registers behind the last one", "address = 0x07D0", "address = 0xFFFC"),

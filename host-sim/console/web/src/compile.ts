@@ -297,6 +297,13 @@ function recipe(keys: Keys, pools: Pools): Value {
     return { name, mode: capital(mode), parts: { [isCan ? "Can" : "Stream"]: parts }, on_stale, send, exchanges: { start: pools.exchanges.length, len: 0 } };
 }
 
+export const ECHOES: Record<string, unknown> = { No: false, Yes: true, Auto: "auto" };
+
+function echo(keys: Keys): Value {
+    const value = keys.get("echo") ?? "auto";
+    return Object.keys(ECHOES).find((name) => ECHOES[name] === value) ?? keys.fail("echo", 'must be true, false or "auto"');
+}
+
 function bus(keys: Keys): Value {
     const kind = keys.word("bus", ["rs485", "can", "tcp-listen", "udp-listen"]);
     if (kind === "can") return { Can: { bitrate: keys.whole("bitrate", 10_000, 1_000_000, 500_000) } };
@@ -308,7 +315,7 @@ function bus(keys: Keys): Value {
             stop_bits: keys.whole("stop_bits", 1, 2, 1),
             idle_gap: keys.time("idle_gap_ms", 1e-3, 1000, 50),
             turnaround: Math.round(keys.number("turnaround_us", 0, 1_000_000, 100)),
-            echo: keys.flag("echo"),
+            echo: echo(keys),
         },
     };
 }
@@ -352,6 +359,7 @@ function port(keys: Keys, recipes: string[], pools: Pools): Value {
         health: { alive: told("alive"), frames: told("frames"), age: told("age_ms"), rejected: told("rejected"), ignored: told("ignored") },
         safe_at_start: keys.flag("safe_at_start"),
         refresh: keys.has("refresh_ms") ? keys.time("refresh_ms", 1e-3, HOUR) : null,
+        absent: keys.time("absent_ms", 1e-3, HOUR, 3000),
     };
     health.end();
     keys.end();

@@ -2,7 +2,7 @@
 // names of fields; they are made up. A recipe that compile.ts could not make again stays as it is, as a text of its
 // bytes: `kind = "image"`.
 import { ROWS as STATE } from "image-types";
-import { type Span, LINKS, NAMES, NEVER_US, PORT_VALUES, compile, isSpan, moved } from "./compile";
+import { type Span, ECHOES, LINKS, NAMES, NEVER_US, PORT_VALUES, compile, isSpan, moved } from "./compile";
 import { type Struct, type Value, decode, encode } from "./image";
 import { type Table, read, replaced } from "./toml";
 
@@ -186,7 +186,7 @@ function portOf(port: Struct, recipes: Struct[], safe: Struct[]): Table {
     }
     const line: Table =
         kind === "Rs485"
-            ? { baud: bus["baud"], parity: lower(bus["parity"]), stop_bits: bus["stop_bits"], idle_gap_ms: ms(bus["idle_gap"]), turnaround_us: bus["turnaround"], echo: bus["echo"] }
+            ? { baud: bus["baud"], parity: lower(bus["parity"]), stop_bits: bus["stop_bits"], idle_gap_ms: ms(bus["idle_gap"]), turnaround_us: bus["turnaround"], echo: ECHOES[String(bus["echo"])] }
             : bus;
     return {
         name: port["name"],
@@ -200,8 +200,9 @@ function portOf(port: Struct, recipes: Struct[], safe: Struct[]): Table {
                 stale_after_ms: ms(port["stale_after"]),
                 safe_at_start: port["safe_at_start"],
                 refresh_ms: ms(port["refresh"]),
+                absent_ms: ms(port["absent"]),
             },
-            { parity: "none", stop_bits: 1, idle_gap_ms: 50, turnaround_us: 100, echo: false, cycle_ms: 4, timeout_ms: 100, stale_after_ms: 500, safe_at_start: false },
+            { parity: "none", stop_bits: 1, idle_gap_ms: 50, turnaround_us: 100, echo: "auto", cycle_ms: 4, timeout_ms: 100, stale_after_ms: 500, safe_at_start: false, absent_ms: 3000 },
         ),
         ...(Object.keys(health).length > 0 ? { health: Object.fromEntries(Object.entries(health).map(([key, place]) => [key, nameOf(place)])) } : {}),
         ...(Object.keys(on_timeout).length > 0 ? { on_timeout } : {}),

@@ -129,6 +129,8 @@ parity = "odd"
 stop_bits = 2
 idle_gap_ms = 0.5
 turnaround_us = 0
+echo = false
+absent_ms = 4500.5
 cycle_ms = 7.5
 timeout_ms = "never"
 stale_after_ms = 1234.5
@@ -186,6 +188,20 @@ test("what stays as an image can be moved between others", () => {
     }
 });
 
+test("the form edits a port beside exchanges that stay as they are", () => {
+    const [, , image] = gateways.find(([name]) => name === "events.toml");
+    const shown = decompile(image);
+    assert.equal(shown.match(/kind = "image"/g).length, 2);
+    assert.ok(shown.includes("absent_ms = 5000") && shown.includes("echo = false"), shown);
+    // The usual echo is not written.
+    assert.equal(shown.match(/echo/g).length, 1);
+    const [, toml] = files.find(([name]) => name === "events.toml");
+    const edits = [["absent_ms = 5000", "absent_ms = 250"], ["echo = false", "echo = true"]];
+    const edited = (text) => edits.reduce((text, [from, to]) => text.replace(from, to), text);
+    assert.notEqual(edited(shown), shown);
+    assert.deepEqual(attempt(edited(shown)), made(edited(toml)));
+});
+
 test("mistakes have their place", () => {
     const [, text] = files.find(([name]) => name === "rs485-user.toml");
     for (const [from, to, key, said] of [
@@ -193,6 +209,8 @@ test("mistakes have their place", () => {
         ['type = "byte", to', 'type = "bite", to', "recipe.three-bytes.input.fields[1].type", "allowed: byte"],
         ['bus = "rs485"', 'bus = "rs485"\nbaud = 300', "port.rs485-1.baud", "1200..=4000000"],
         ['bus = "rs485"', 'bus = "rs485"\nbadu = 9600', "port.rs485-1.badu", "cannot write this"],
+        ['bus = "rs485"', 'bus = "rs485"\necho = "maybe"', "port.rs485-1.echo", 'true, false or "auto"'],
+        ['bus = "rs485"', 'bus = "rs485"\nabsent_ms = 0', "port.rs485-1.absent_ms", "out of range"],
         ['recipe = "three-bytes"', 'recipe = "four"', "port.rs485-1.recipe", "no recipe"],
         ["head = [255, 255]", "head = [255, 256]", "recipe.three-bytes.input.head", "8 bytes"],
         ['value = 125 },\n    { name = "output2"', 'value = 125, from = "reply" },\n    { name = "output2"', "recipe.three-bytes.output.fields[1].from", "from or value"],

@@ -23,12 +23,7 @@ impl Builder<'_> {
             let talk = self.talk(recipe, exchange, &mut numbers)?;
             let timing = &exchange.timing;
             let added = Exchange {
-                peer: exchange.peer,
-                talk,
-                when: timing.when,
                 timeout: timing.timeout,
-                retries: timing.retries.unwrap_or(1),
-                event_retries: timing.retries.unwrap_or(0),
                 pause: timing.pause,
                 trigger: timing.trigger,
                 late: timing.late,
@@ -36,8 +31,9 @@ impl Builder<'_> {
                 follow: timing.follow,
                 overdue: exchange.overdue,
                 outcome: timing.outcome,
+                ..Exchange::new(exchange.peer, talk, timing.when)
             };
-            if self.config.exchanges.push(added).is_err() {
+            if self.config.exchanges.push(added.repeated(timing.retries)).is_err() {
                 return Err(self.too_many(exchange));
             }
         }
