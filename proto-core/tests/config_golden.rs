@@ -11,8 +11,8 @@ use proto_core::config::image::{
     ImageError, MAX_IMAGE, OLDEST_VERSION, VERSION, decode, decode_into, encode, image_len,
 };
 use proto_core::config::{
-    BoardAddress, Bus, CommandWhen, Echo, FieldSpec, GatewayConfig, InputBinding, LinkSource, OnStale,
-    OutputBinding, Outside, Parity, Parts, PortValue, SendOn, Talk,
+    BoardAddress, Bus, CommandWhen, Echo, FieldSpec, GatewayConfig, InputBinding, InputRule, LinkSource,
+    OnStale, OutputBinding, Outside, Parity, Parts, PortValue, SendOn, Talk,
 };
 use proto_core::device::{Algorithm, Boundary, ByteOrder, Counts, Escape, Kind, Overflow, TextWidth, Width};
 use proto_core::modbus::rtu::Operation;
@@ -166,6 +166,7 @@ fn serialized_types_are_those_of_the_version() {
         Echo,
         FieldSpec,
         InputBinding,
+        InputRule,
         LinkSource,
         Mode,
         OnStale,

@@ -20,7 +20,7 @@ use super::rejection::Rejection;
 use super::requests::Maker;
 use super::store::Store;
 use super::tap::{Tap, TapPlace};
-use super::turns::{Cause, Ended};
+use super::turns::{Cause, Ended, News};
 use super::user::{InputBind, Outputs, wrapping_count};
 use super::whole_port::Reader;
 use super::{Engine, OUTPUT_BUFFER, find_port};
@@ -28,7 +28,7 @@ use crate::device::{Found, Probe};
 use crate::image::{GroupId, Image, InputSet};
 use crate::modbus::rtu::MAX_ADU;
 use crate::time::Instant;
-use crate::wire::can::CanFrame;
+use crate::wire::can::{CanFrame, CanId};
 
 impl FieldPort {
     /// The conversation, if the recipe has exchanges.
@@ -238,6 +238,15 @@ impl FieldPort {
             Frames::new((self.id, self.mode), &mut self.reply, &mut self.counters, bindings, store, commands);
         if frame.is_remote() {
             return frames.rejected(Rejection::Remote);
+        }
+        if let Some(which) = booted_peer(items, &talks, frame) {
+            let nth = talks.rows.iter().position(|row| row.peer == which).unwrap_or(0);
+            line.turns(&mut talks, |turns| turns.started(which, None, now));
+            line.look(now);
+            let mut events = Events { items, talks: &mut talks, line, now };
+            events.note(nth, News::Started);
+            // What it was to do, it has forgotten.
+            events.end_waiting(Some(which), Outcome::Away);
         }
         let flight = line.flight();
         let first_frame = self.first_frame;
@@ -473,6 +482,15 @@ const fn refused_with(code: u8, is_modbus: bool) -> Ended {
         4 | 8 | 10 | 11 if is_modbus => Ended::Unclear,
         _ => Ended::Refused,
     }
+}
+
+/// The peer whose CANopen node says that it has booted: its object dictionary is asked with SDO in one of the exchanges.
+fn booted_peer(items: &[Item], talks: &Talks<'_>, frame: &CanFrame) -> Option<u8> {
+    let (CanId::Standard(id @ 0x701..=0x77F), [0]) = (frame.id(), frame.data()) else { return None };
+    let sdo = CanId::Standard(id.wrapping_sub(0x100));
+    let is_of_node = |item: &Item| item.request.as_ref().is_some_and(|request| request.id == sdo);
+    let nth = items.iter().position(is_of_node)?;
+    talks.rows.get(nth).map(|row| row.peer)
 }
 
 /// The code of an SDO abort, the low half, if the frame is one for the request on its way.

@@ -1,5 +1,8 @@
 //! Presence is of the device, not of an exchange; starting it is an event.
 
+use proto_core::recipe::model::Mode;
+use proto_core::wire::can::CanId;
+
 use super::*;
 
 const ACTIVATE: u16 = 0x03E8;
@@ -119,4 +122,83 @@ fn an_absent_slave_is_found_within_64_timeouts() {
     let times: Vec<_> = asked.iter().filter(|(_, request)| request[0] == 2).map(|(at, _)| *at).collect();
     let longest = times.windows(2).map(|pair| pair[1].saturating_since(pair[0])).max().unwrap();
     assert!(longest <= MS(6_400 + 250), "{longest}");
+}
+
+/// A CANopen node, 5: an object that is set at the start, and one that is read each 50 ms.
+fn node() -> (Cell, PortId) {
+    let mut cell = Cell::new();
+    let byte = |value: i64| FieldSpec::Fixed { encoding: Encoding::scalar(T::Byte), value };
+    let mut frame = |id: u16, fields: Vec<FieldSpec>| {
+        let fields = cell.fields(fields);
+        let index = cell.0.frames.len() as u8;
+        let (id, none) = (Some(CanId::Standard(id)), Delimiter::from_slice(&[]).unwrap());
+        cell.0.frames.push(FrameSpec { id, remote: false, head: none.clone(), tail: none, fields }).unwrap();
+        Some(index)
+    };
+    let pad = |len| FieldSpec::Padding { len, fill: 0 };
+    let value = FieldSpec::DeviceInput {
+        encoding: Encoding::scalar(T::Byte),
+        overflow: Overflow::Usual,
+        to: to("WordInputReg[1]"),
+    };
+    let set = frame(0x605, vec![byte(0x2F), byte(0x17), byte(0x10), byte(0), byte(1), pad(3)]);
+    let is_set = frame(0x585, vec![byte(0x60), byte(0x17), byte(0x10), byte(0), pad(4)]);
+    let read = frame(0x605, vec![byte(0x40), byte(0x01), byte(0x10), byte(0), pad(4)]);
+    let is_read = frame(0x585, vec![byte(0x4F), byte(0x01), byte(0x10), byte(0), value, pad(3)]);
+    let exchange = |request, reply, when| {
+        never_late(Exchange::new(5, Talk::Frames { request, reply, refusal: None }, when))
+    };
+    let start = AskWhen { start: true, ..AskWhen::NEVER };
+    let table = [exchange(set, is_set, start), exchange(read, is_read, AskWhen::every(MS(50)))];
+    let parts = Parts::Can { input: Default::default(), output: Default::default() };
+    let recipe = cell.recipe(Mode::User, parts);
+    cell.0.exchanges.extend(table);
+    cell.last_recipe().exchanges = Span { start: 0, len: 2 };
+    let port = cell.can_port(recipe);
+    (cell, port)
+}
+
+/// Runs a node that answers good, or with an SDO abort; returns how often the object was set.
+fn play(rig: &mut Rig, port: PortId, millis: u64, is_set: bool) -> usize {
+    let mut sets = 0;
+    for _ in 0..millis {
+        rig.run(MS(1));
+        for frame in rig.can_sent_to(port) {
+            let data = frame.data();
+            let is_write = data[0] == 0x2F;
+            sets += usize::from(is_write);
+            let reply = match (is_write, is_set) {
+                (true, true) => [0x60, data[1], data[2], data[3], 0, 0, 0, 0],
+                (true, false) => [0x80, data[1], data[2], data[3], 0x11, 0, 9, 6],
+                (false, _) => [0x4F, data[1], data[2], data[3], 7, 0, 0, 0],
+            };
+            rig.can(port, 0x585, &reply);
+        }
+    }
+    sets
+}
+
+#[test]
+fn an_sdo_abort_that_no_file_describes_is_an_answer() {
+    let (cell, port) = node();
+    let mut rig = cell.rig();
+    assert_eq!(play(&mut rig, port, 5_000, false), 1);
+    let status = rig.engine.status(rig.now);
+    let peer = status.ports().next().unwrap().peers().next().unwrap();
+    assert_eq!((peer.counters.refused, peer.presence.name(), peer.counters.timeouts), (1, "up", 0));
+    assert_eq!(rig.map.registers[8], 7, "the rest of the node is read");
+}
+
+#[test]
+fn a_node_that_says_that_it_has_booted_is_set_again() {
+    let (cell, port) = node();
+    let mut rig = cell.rig();
+    assert_eq!(play(&mut rig, port, 1_000, true), 1);
+    // It was away for less than a request takes.
+    rig.can(port, 0x705, &[0]);
+    assert_eq!(play(&mut rig, port, 1_000, true), 1);
+    for (id, data) in [(0x705, &[5][..]), (0x706, &[0]), (0x705, &[0, 0])] {
+        rig.can(port, id, data);
+        assert_eq!(play(&mut rig, port, 1_000, true), 0, "{id:X} {data:?}");
+    }
 }

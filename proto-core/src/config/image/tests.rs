@@ -28,7 +28,7 @@ fn a_configuration_survives_and_what_follows_does_not_matter() {
 fn the_header_has_its_fixed_layout() {
     let image = image();
     assert_eq!(image[..4], *b"RGCI");
-    assert_eq!(image[4..8], [3, 0, 0, 0]);
+    assert_eq!(image[4..8], [4, 0, 0, 0]);
     assert_eq!(image[8..12], ((image.len() - HEADER) as u32).to_le_bytes());
 }
 
