@@ -43,7 +43,7 @@ fn shared(cells: &[&str], level: Level, span: Duration) -> ([Part; 3], Part) {
 /// The hashes of these runs on every machine. Only a change of what the engine, the controller or the cell
 /// does, or when, may change them; then enter the new ones here.
 const HASHES: [(Level, u64); 2] =
-    [(Level::None, 0xAE65_35C3_93D7_6C27), (Level::Harsh, 0x303B_B0C1_B4F2_9227)];
+    [(Level::None, 0xA98F_186C_D7DF_EAC7), (Level::Harsh, 0x104C_ECE7_AA2B_AAD3)];
 
 #[test]
 fn a_seed_means_the_same_trace_on_every_machine() {
