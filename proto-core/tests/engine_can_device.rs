@@ -452,7 +452,7 @@ fn what_makes_no_sense_behind_a_field_is_refused_with_its_place() {
 }
 
 #[test]
-fn a_cycle_is_handed_over_at_once_in_its_order_with_a_frame_without_data() {
+fn a_cycle_is_handed_over_in_its_order_with_a_frame_without_data() {
     let mut cell = Cell::new();
     let frames = [(0x310, vec![output(44.0), output(1.0)]), (0x210, vec![output(15.0)]), (0x80, vec![])];
     let port = bus(&mut cell, [&[], &frames]);
