@@ -54,7 +54,7 @@ fn mistakes_in_modbus_have_their_place() {
     assert!(with(&[read, write]).is_ok());
     assert_refused(
         &[Ask::read_holding_registers(9, 0, &register)],
-        "it would never be asked; set every_ms or on",
+        "it would never be asked; set every_ms, on or follow",
     );
     assert_refused_at(
         &[read, Ask::write_registers(248, 0, &value).on_change()],
@@ -161,7 +161,7 @@ fn mistakes_in_frames_have_their_place() {
         with(&[ask.reply(reply), Ask::unasked(AskFrame::stream(&[4], &[], &[InputField::unused(Byte)]))])
             .is_ok()
     );
-    assert_refused(&[Ask::request(frame)], "it would never be asked; set every_ms or on");
+    assert_refused(&[Ask::request(frame)], "it would never be asked; set every_ms, on or follow");
     assert_refused(&[Ask::unasked(reply).at_start()], "there is no request to send; remove every_ms and on");
     assert_refused_at(&[ask.refusal(reply)], "refusal", "a refusal answers a request that has a reply");
     assert_refused_at(

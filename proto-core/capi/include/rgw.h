@@ -8,11 +8,11 @@
 #include <stdint.h>
 
 // Newest version of the configuration images that this library reads. Older versions are read too.
-#define RGW_IMAGE_VERSION 3
+#define RGW_IMAGE_VERSION 4
 
 // Memory for a configuration, in bytes: enough on every machine. It is needed until
 // `rgw_gateway_configure` has returned.
-#define RGW_CONFIG_SIZE 21504
+#define RGW_CONFIG_SIZE 22528
 
 // Field ports that a gateway has room for.
 #define RGW_MAX_PORTS 4
@@ -27,7 +27,7 @@
 #define RGW_MAX_EXCHANGES 16
 
 // Memory for a gateway, in bytes: enough on every machine.
-#define RGW_GATEWAY_SIZE 53248
+#define RGW_GATEWAY_SIZE 58368
 
 // Number of the link to port 2000.
 #define RGW_LINK_COMMAND 0

@@ -8,12 +8,12 @@ use crate::Status;
 use crate::memory::{bytes, give, place, shared};
 
 /// Newest version of the configuration images that this library reads. Older versions are read too.
-pub const RGW_IMAGE_VERSION: u32 = 3;
+pub const RGW_IMAGE_VERSION: u32 = 4;
 const _: () = assert!(RGW_IMAGE_VERSION == image::VERSION);
 
 /// Memory for a configuration, in bytes: enough on every machine. It is needed until
 /// `rgw_gateway_configure` has returned.
-pub const RGW_CONFIG_SIZE: usize = 21_504;
+pub const RGW_CONFIG_SIZE: usize = 22_528;
 const _: () = assert!(size_of::<Config>() <= RGW_CONFIG_SIZE);
 
 /// A configuration in the caller's memory: at most 6 ports, 6 recipes with 256 fields together, 32
