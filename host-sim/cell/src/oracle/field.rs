@@ -57,7 +57,27 @@ pub(super) struct Accepted {
     /// Variables that become the number of accepted frames.
     pub counted: Vec<SysVar>,
     /// What the frame has no value for.
-    pub without: Without,
+    pub without: Box<Without>,
+}
+
+/// Why a field of a device's frame is rejected, or for a counter the frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Unfit {
+    NotFinite,
+    OutOfRange,
+    Unreadable,
+    Repeated,
+}
+
+impl From<Unfit> for Verdict {
+    fn from(why: Unfit) -> Self {
+        match why {
+            Unfit::NotFinite => Self::NotFinite,
+            Unfit::OutOfRange => Self::OutOfRange,
+            Unfit::Unreadable => Self::Unreadable,
+            Unfit::Repeated => Self::Repeated,
+        }
+    }
 }
 
 /// The fields of an accepted frame of a device that are rejected, or that have no value now.
@@ -70,15 +90,15 @@ pub(super) struct Without {
     pub commands: Vec<usize>,
     /// How many are rejected, and what the frame would be rejected for.
     pub rejected: u32,
-    pub why: Option<Box<Verdict>>,
+    pub why: Option<Unfit>,
     /// How many have no value, as the device says.
     pub no_value: u32,
 }
 
 impl Without {
-    fn reject(&mut self, why: Verdict) {
+    fn reject(&mut self, why: Unfit) {
         self.rejected += 1;
-        self.why.get_or_insert_with(|| Box::new(why));
+        self.why.get_or_insert(why);
     }
 }
 
@@ -201,13 +221,11 @@ impl LineWatch {
     /// Judges what a master writes: all of it is taken, or nothing.
     pub(super) fn judge_block(&mut self, frame: &Frame, nth: usize, data: &[u8]) -> Verdict {
         let counts = self.counts.clone();
-        match self.judge_data(frame, nth, data) {
-            Verdict::Accepted(Accepted { without: Without { why: Some(why), .. }, .. }) => {
-                self.counts = counts;
-                *why
-            }
-            verdict => verdict,
-        }
+        let verdict = self.judge_data(frame, nth, data);
+        let Verdict::Accepted(accepted) = &verdict else { return verdict };
+        let Some(why) = accepted.without.why else { return verdict };
+        self.counts = counts;
+        why.into()
     }
 
     /// Judges the data of a reply.
@@ -356,8 +374,8 @@ fn judge_device(frame: &Frame, nth: usize, whole: &[u8], counts: &Counts) -> Ver
         let bytes = &whole[place.clone()];
         let number = match device::read_ruled(&encoding, bytes, rules) {
             Read::Number(number) if number.is_finite() => Ok(number),
-            Read::Number(_) => Err(Some(Verdict::NotFinite)),
-            Read::Unreadable => Err(Some(Verdict::Unreadable)),
+            Read::Number(_) => Err(Some(Unfit::NotFinite)),
+            Read::Unreadable => Err(Some(Unfit::Unreadable)),
             Read::NoValue => Err(None),
         };
         let valid = |is_valid: bool, accepted: &mut Accepted| {
@@ -381,18 +399,18 @@ fn judge_device(frame: &Frame, nth: usize, whole: &[u8], counts: &Counts) -> Ver
             InputBinding::Variable { var, scale, offset } => {
                 let raw = number.and_then(|number| {
                     let number = device::taken_for(&encoding, number, (scale, offset), rules);
-                    let number = number.ok_or(Some(Verdict::OutOfRange))?;
+                    let number = number.ok_or(Some(Unfit::OutOfRange))?;
                     let is_int16 = rules.contains(&FieldSpec::InputRule(InputRule::Int16));
                     let number = match overflow {
                         Overflow::Wrap => device::shown_as(&Encoding::scalar(var.ty()), overflow, number),
                         Overflow::Usual if is_int16 => match number.round() {
-                            number if number < -32_768.0 || number > 32_767.0 => f64::NAN,
+                            number if !(-32_768.0..=32_767.0).contains(&number) => f64::NAN,
                             number if number < 0.0 => number + 65_536.0,
                             number => number,
                         },
                         Overflow::Usual => number,
                     };
-                    bound(var, number).ok_or(Some(Verdict::OutOfRange))
+                    bound(var, number).ok_or(Some(Unfit::OutOfRange))
                 });
                 tells |= valid(raw.is_ok(), &mut accepted);
                 match raw {
@@ -410,14 +428,14 @@ fn judge_device(frame: &Frame, nth: usize, whole: &[u8], counts: &Counts) -> Ver
                 Ok(number) => accepted.commands.push((at, table, when, number as i64)),
                 Err(why) => {
                     accepted.without.commands.push(at);
-                    accepted.without.reject(why.unwrap_or(Verdict::Unreadable));
+                    accepted.without.reject(why.unwrap_or(Unfit::Unreadable));
                 }
             },
             InputBinding::Bit { var, bit } => match number {
                 Ok(number) => accepted.bits.push(coil(var, bit, number)),
                 Err(why) => {
                     accepted.without.bytes.push(var);
-                    accepted.without.reject(why.unwrap_or(Verdict::Unreadable));
+                    accepted.without.reject(why.unwrap_or(Unfit::Unreadable));
                 }
             },
             InputBinding::Counter { max } => {
@@ -425,10 +443,10 @@ fn judge_device(frame: &Frame, nth: usize, whole: &[u8], counts: &Counts) -> Ver
                 match number {
                     Err(why) => wrong_count = wrong_count.or(why),
                     Ok(number) if number > f64::from(max) => {
-                        wrong_count = wrong_count.or(Some(Verdict::OutOfRange));
+                        wrong_count = wrong_count.or(Some(Unfit::OutOfRange));
                     }
                     Ok(number) if before == Some(number as u32) => {
-                        wrong_count = wrong_count.or(Some(Verdict::Repeated));
+                        wrong_count = wrong_count.or(Some(Unfit::Repeated));
                     }
                     Ok(number) => {
                         let number = number as u32;
@@ -440,20 +458,20 @@ fn judge_device(frame: &Frame, nth: usize, whole: &[u8], counts: &Counts) -> Ver
             }
             InputBinding::Unused => {
                 if let Err(why) = number {
-                    accepted.without.reject(why.unwrap_or(Verdict::Unreadable));
+                    accepted.without.reject(why.unwrap_or(Unfit::Unreadable));
                 }
             }
         }
     }
     if let Some(why) = wrong_count {
-        return why;
+        return why.into();
     }
     for (field, text) in texts(frame, places, whole) {
         let FieldSpec::TextInput { to, length_to, count_to, .. } = *field else { continue };
         let registers = to.map(|words| varying::registers(words, text));
         if let Some(None) = registers {
             accepted.without.vars.extend(super::spec::written(field));
-            accepted.without.reject(Verdict::OutOfRange);
+            accepted.without.reject(Unfit::OutOfRange);
             continue;
         }
         accepted.values.extend(registers.flatten().into_iter().flatten());
@@ -464,8 +482,8 @@ fn judge_device(frame: &Frame, nth: usize, whole: &[u8], counts: &Counts) -> Ver
     accepted.bits.retain(|coils| !accepted.without.bytes.contains(&coils.var));
     let Accepted { values, bits, commands, counted, without, .. } = &accepted;
     let is_nothing = values.is_empty() && bits.is_empty() && commands.is_empty() && counted.is_empty();
-    match &without.why {
-        Some(why) if is_nothing && without.no_value == 0 && !tells => (**why).clone(),
+    match without.why {
+        Some(why) if is_nothing && without.no_value == 0 && !tells => why.into(),
         _ => Verdict::Accepted(accepted),
     }
 }

@@ -295,9 +295,9 @@ impl Oracle {
                 Verdict::Accepted(frame) => frame,
             };
             if !self.up.has_room(&self.spec, nth, &frame, now) {
-                match frame.without.why.as_deref() {
-                    Some(Verdict::Unreadable) => counters.rejected_unreadable += 1,
-                    Some(Verdict::NotFinite) => counters.rejected_not_finite += 1,
+                match frame.without.why {
+                    Some(field::Unfit::Unreadable) => counters.rejected_unreadable += 1,
+                    Some(field::Unfit::NotFinite) => counters.rejected_not_finite += 1,
                     _ => counters.rejected_out_of_range += 1,
                 }
                 continue;
