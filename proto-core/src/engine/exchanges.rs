@@ -441,6 +441,6 @@ fn step_before(exchanges: &[Exchange], nth: usize) -> Option<u8> {
     let own = exchanges.get(nth).filter(|own| own.when.rising.is_some() && !own.stop)?;
     let is_step =
         |other: &Exchange| other.peer == own.peer && other.when.rising == own.when.rising && !other.stop;
-    let before = exchanges.iter().take(nth).rposition(|other| is_step(other))?;
+    let before = exchanges.iter().take(nth).rposition(is_step)?;
     Some(before as u8)
 }

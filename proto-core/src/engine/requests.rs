@@ -35,9 +35,7 @@ impl Maker<'_> {
     pub(super) fn next(
         &self,
         line: &mut Line,
-        items: &mut [Item],
-        talks: &mut Talks<'_>,
-        kept: &[Piece],
+        (items, talks, kept): (&mut [Item], &mut Talks<'_>, &[Piece]),
         counters: &mut PortCounters,
         is_busy: bool,
         out: &mut [u8],

@@ -320,7 +320,7 @@ impl FieldPort {
         let mut line = codec.line.take()?;
         let (items, mut talks, kept) = view.served(&line);
         let maker = Maker { image, bindings, codec, sender: &self.sender, reply: self.reply, now };
-        let request = maker.next(&mut line, items, &mut talks, kept, &mut self.counters, is_busy, out);
+        let request = maker.next(&mut line, (items, &mut talks, kept), &mut self.counters, is_busy, out);
         let is_on_can = codec.reader.is_none();
         if let (Some(_), Some(Reader::Search(framer))) = (&request, &mut codec.reader)
             && !line.hears_unasked

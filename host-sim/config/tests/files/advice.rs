@@ -140,7 +140,10 @@ fn a_device_that_is_told_once_is_to_be_looked_for() {
     };
     let recipe = |exchanges: &[String]| format!("kind = \"modbus-rtu\"\n{}", exchanges.concat());
     let once = "on = [\"start\", \"change\"]";
-    let told = warnings(&recipe(&[exchange(7, once), exchange(7, "on = [\"change\"]")]), MODBUS);
+    let told = warnings(
+        &recipe(&[exchange(7, once), exchange(7, "on = [\"change\"]")]),
+        "bus = \"modbus-rtu\"\necho = false",
+    );
     assert_eq!(
         told,
         [
@@ -148,15 +151,21 @@ fn a_device_that_is_told_once_is_to_be_looked_for() {
           was told is not told again; write every_ms in one of them, such as 500"
         ]
     );
-    let told =
-        warnings(&recipe(&[exchange(7, "every_ms = 100"), exchange(7, once), exchange(8, once)]), MODBUS);
+    let told = warnings(
+        &recipe(&[exchange(7, "every_ms = 100"), exchange(7, once), exchange(8, once)]),
+        "bus = \"modbus-rtu\"\necho = false",
+    );
     assert!(told.len() == 1 && told[0].contains("slave 8 "), "{told:?}");
     for keys in ["every_ms = 100", "on = [\"rising:BitOutputReg[3].0\"]", "on = [\"start\"]\nevery_ms = 500"]
     {
-        assert_eq!(warnings(&recipe(&[exchange(7, keys)]), MODBUS), [""; 0], "{keys}");
+        assert_eq!(
+            warnings(&recipe(&[exchange(7, keys)]), "bus = \"modbus-rtu\"\necho = false"),
+            [""; 0],
+            "{keys}"
+        );
     }
     // All slaves are no device.
-    assert_eq!(warnings(&recipe(&[exchange(0, once)]), MODBUS), [""; 0]);
+    assert_eq!(warnings(&recipe(&[exchange(0, once)]), "bus = \"modbus-rtu\"\necho = false"), [""; 0]);
 }
 
 #[test]
