@@ -236,10 +236,12 @@ fields = [
 
 #[test]
 fn a_value_that_a_gateway_rejects_is_named() {
-    let why = "line 1: a gateway rejects this frame: Fx is 400; WordInputReg[1] takes -327.68..=327.67\n";
     // As a recipe of the controller's own kind, and as the frame of a device.
     let constant = "{ name = \"id\", type = \"byte\", equals = 9 },";
-    for (more, byte) in [("", ""), (constant, "09 ")] {
+    for (more, byte, what) in [("", "", "frame"), (constant, "09 ", "field")] {
+        let why = format!(
+            "line 1: a gateway rejects this {what}: Fx is 400; WordInputReg[1] takes -327.68..=327.67\n"
+        );
         let toml = FORCES.replacen("  { name = \"Fy\"", &format!("{more}\n  {{ name = \"Fy\""), 1);
         let text = Text { name: "test.toml", toml: &toml };
         let mut part = part(&toml, Direction::Input);
