@@ -56,6 +56,8 @@ pub(super) struct Accepted {
     pub jumps: u32,
     /// Variables that become the number of accepted frames.
     pub counted: Vec<SysVar>,
+    /// When it was asked for first, if an earlier request had no reply in time: its values may be as old as that.
+    pub asked: Option<Instant>,
 }
 
 /// The newest alive counters by frame and field.
