@@ -2,6 +2,8 @@
 
 use proto_core::time::{Duration, Instant};
 
+use crate::judge::Act;
+
 /// A device: `M` is `Vec<u8>` on an RS-485 line and a CAN frame on a bus.
 ///
 /// Returned messages are sent in order, each as soon as the device's previous one has left.
@@ -77,6 +79,8 @@ pub enum Done {
     },
     /// It lost its power, and with it everything that was written.
     Forgot,
+    /// An entry in the log of a device of a judged cell.
+    Acted(Act),
 }
 
 /// Sends at a rate: the n-th message is `make(n)` and leaves at `start + n * 1 s / rate`, rounded down

@@ -226,6 +226,9 @@ impl Cell {
 
     /// The model sees the controller's registers, if it needs them.
     fn show_controller(&mut self) {
+        if let Some(judge) = &mut self.judge {
+            judge.sees_controller(self.controller.registers().image(), self.now);
+        }
         if let Some(oracle) = self.oracle.as_mut().filter(|oracle| oracle.wants_controller()) {
             oracle.sees_controller(self.controller.registers().image(), self.now);
         }

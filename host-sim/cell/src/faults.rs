@@ -203,6 +203,9 @@ impl Cell {
     /// It is error-active again.
     pub fn bus_on(&mut self, bus: BusId) {
         self.buses[bus.0].is_off = false;
+        if let Some(judge) = &mut self.judge {
+            judge.port_begins(self.now);
+        }
         self.bus_state(bus, BusState::Active);
     }
 
@@ -284,6 +287,10 @@ impl Cell {
     /// The gateway loses power and restarts: its connections are reset, and its counters start at
     /// 0.
     pub fn restart_gateway(&mut self) {
+        self.count_outcomes();
+        if let Some(judge) = &mut self.judge {
+            judge.gateway_starts(self.now);
+        }
         self.trace.add(self.now, What::Fault, Entry::GATEWAY, &[]);
         let known = self.conns.iter().filter(|(_, conn)| !conn.forgotten);
         let conns: Vec<(u64, Peer)> = known.map(|(&id, conn)| (id, conn.peer)).collect();

@@ -8,7 +8,7 @@ use proto_core::wire::can::CanFrame;
 use super::due::Due;
 use super::line::{Chunk, Chunking};
 use super::sleep::PortEvent;
-use super::{AnyPort, BusId, Cell, End, LineId, SlaveDone};
+use super::{AnyPort, BusId, Cell, Done, End, LineId, SlaveDone};
 use recipe_controller::ControllerInput;
 
 impl Cell {
@@ -33,7 +33,7 @@ impl Cell {
             End::Device => self.hand_on(id, owner, &chunk.bytes),
             End::Port => {
                 let mut answers = Vec::new();
-                if line.settings().echo == Echo::Yes && line.is_plugged {
+                if (line.gives_back || line.settings().echo == Echo::Yes) && line.is_plugged {
                     // The adapter gives back what the port sends, whether or not it reaches the device.
                     self.hand_on(id, owner, &chunk.bytes);
                 }
@@ -82,6 +82,14 @@ impl Cell {
     }
 
     fn device_did(&mut self, owner: AnyPort, done: Vec<SlaveDone>) {
+        if let Some(judge) = &mut self.judge {
+            for done in done {
+                if let Done::Acted(act) = done.what {
+                    judge.did(act, self.now);
+                }
+            }
+            return;
+        }
         if let (AnyPort::Gateway(port), Some(oracle)) = (owner, &mut self.oracle) {
             done.into_iter().for_each(|done| oracle.slave_did(usize::from(port.0), done, self.now));
         }
@@ -158,6 +166,9 @@ impl Cell {
     }
 
     pub(super) fn port_input(&mut self, owner: AnyPort, is_up: bool) {
+        if let (AnyPort::Gateway(_), Some(judge)) = (owner, &mut self.judge) {
+            judge.port_begins(self.now);
+        }
         match owner {
             AnyPort::Gateway(port) => {
                 self.report_port_event(port, if is_up { PortEvent::Up } else { PortEvent::Down })

@@ -34,6 +34,7 @@ mod due;
 mod faults;
 mod field;
 mod injector;
+mod judge;
 mod line;
 mod network;
 mod oracle;
@@ -62,6 +63,7 @@ use proto_core::time::{Duration, Instant};
 pub use can::{BusCounters, CanBus};
 pub use device::{Device, Done, Responder, SlaveDone, Talker};
 pub use injector::{FaultInjector, FaultKind};
+pub use judge::{Act, Kind, OUTCOMES, Order};
 pub use line::{Chunking, Line, LineCounters, MAX_HEARD, Wiring};
 pub use network::{Network, Way};
 pub use oracle::{Invariant, Violation};
@@ -168,6 +170,8 @@ pub struct Cell {
     recorder: Option<Recorder>,
     /// The model that checks everything; `None` before [`Cell::watch`].
     oracle: Option<Box<Oracle>>,
+    /// Judges what the device carries out, in a cell of its own.
+    judge: Option<Box<judge::Judge>>,
     /// Changes the engine's inputs and outputs, so that the gateway breaks its promises.
     #[cfg(test)]
     tamper: Option<tamper::Tamper>,
@@ -237,6 +241,7 @@ impl Cell {
             trace: Trace::new(),
             recorder,
             oracle: None,
+            judge: None,
             #[cfg(test)]
             tamper: None,
             reply: Vec::new(),
@@ -259,12 +264,17 @@ impl Cell {
 
     /// The first violation; `None` if there was none.
     pub fn violation(&self) -> Option<&Violation> {
-        self.oracle.as_ref().and_then(|oracle| oracle.violation())
+        let judged = self.judge.as_ref().and_then(|judge| judge.violation());
+        self.oracle.as_ref().and_then(|oracle| oracle.violation()).or(judged)
     }
 
     /// Number of checks of each invariant.
     pub fn checks(&self) -> BTreeMap<Invariant, u64> {
-        self.oracle.as_ref().map(|oracle| oracle.checks()).unwrap_or_default()
+        let mut checks = self.oracle.as_ref().map(|oracle| oracle.checks()).unwrap_or_default();
+        for (&what, count) in self.judge.iter().flat_map(|judge| judge.checks()) {
+            *checks.entry(what).or_default() += count;
+        }
+        checks
     }
 
     /// Number of values written to the controller that were checked.

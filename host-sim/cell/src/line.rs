@@ -60,6 +60,8 @@ pub struct Line {
     pub wiring: Wiring,
     /// Number of bytes per million that have a bit flipped.
     pub noise_ppm: u32,
+    /// The port's adapter gives back what the port sends, whatever the configuration says.
+    pub gives_back: bool,
     /// Counters.
     pub counters: LineCounters,
     pub(super) connected: bool,
@@ -105,6 +107,7 @@ impl Line {
             chunking: Chunking::Whole,
             wiring: Wiring::FourWire,
             noise_ppm: 0,
+            gives_back: false,
             counters: LineCounters::default(),
             connected: true,
             is_plugged: true,

@@ -34,6 +34,10 @@ impl Cell {
     }
 
     pub(super) fn survey(&mut self) {
+        if self.judge.is_some() {
+            self.survey_device();
+            self.queue.push(self.now + SURVEY_EVERY, Due::Survey);
+        }
         if self.oracle.is_none() {
             return;
         }
@@ -46,6 +50,9 @@ impl Cell {
 
     /// The controller sends on a connection: checks for a command that it did not understand.
     pub(super) fn replied(&mut self, conn: u64, bytes: &[u8]) {
+        if let Some(judge) = &mut self.judge {
+            judge.answered(conn, bytes, self.now);
+        }
         let Some(oracle) = &mut self.oracle else { return };
         let link = self.conns.get(&conn).map(|conn| conn.link);
         if let Some(link @ (LinkId::COMMAND | LinkId::URGENT)) = link

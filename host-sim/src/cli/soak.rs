@@ -20,7 +20,7 @@ use super::wrong;
 use recipe_cell::Cell;
 use recipe_cell::soak::{Batch, Level, Part, PartFailure, Progress, Scenario, Share, Soak, show_trace};
 use recipe_shell::out::print_stderr;
-use table::{failure, progress_line, show_seconds, table};
+use table::{failure, progress_line, rare_outcomes, show_seconds, table};
 
 pub(super) const EXAMPLES: &str = "\
 Runs the gateway's engine against the simulated controller in virtual time. Devices
@@ -193,17 +193,20 @@ fn batch(args: &SoakArgs, scenarios: Vec<Scenario>, out: &mut dyn Write) -> Exit
     let failed = batch
         .failure()
         .map(|failed| failure(&PartFailure::from(failed), &args.cell, Level::from(args.faults).name()));
+    // Of one share nobody can say.
+    let is_whole = share == Share::default() && interrupted.is_none() && failed.is_none();
+    let rare = is_whole.then(|| rare_outcomes(&batch.total(), args.faults.into())).flatten();
     if args.json {
         let part = Part::of(&batch, &args.cell, wall.as_micros() as u64);
         let _ = writeln!(out, "{}", serde_json::to_string(&part).unwrap_or_default());
-        failed.iter().chain(&interrupted).for_each(print_stderr);
+        failed.iter().chain(&interrupted).chain(&rare).for_each(print_stderr);
     } else {
         let total = batch.total();
         let _ = write!(out, "{}", table(&total, args.seed, Level::from(args.faults).name(), wall));
-        let last = failed.as_ref().or(interrupted.as_ref()).map_or(PASS, String::as_str);
+        let last = failed.as_ref().or(interrupted.as_ref()).or(rare.as_ref()).map_or(PASS, String::as_str);
         let _ = writeln!(out, "\n{last}");
     }
-    if failed.is_some() { ExitCode::FAILURE } else { ExitCode::SUCCESS }
+    if failed.is_some() || rare.is_some() { ExitCode::FAILURE } else { ExitCode::SUCCESS }
 }
 
 /// Shows progress until all workers are done; returns true after SIGINT.

@@ -110,10 +110,10 @@ fn shares_make_the_table_of_one_machine() {
             refused(&[first, second, third, first]),
             refused(&[first, &at("none")]),
             refused(&[&at("table")]),
-            refused(&[&change("format", r#""soak":1"#, r#""soak":9"#)]),
+            refused(&[&change("format", r#""soak":2"#, r#""soak":9"#)]),
             refused(&[first, &change("key", r#""seed":7"#, r#""seeds":7"#), third]),
             refused(&[first, &change("seed", r#""seed":7"#, r#""seed":8"#), third]),
-            refused(&[&change("nothing", r#""soak":1,"#, "")]),
+            refused(&[&change("nothing", r#""soak":2,"#, "")]),
         ]
         .join("\n")
     );

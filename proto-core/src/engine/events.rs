@@ -203,7 +203,8 @@ impl Events<'_, '_> {
         let connection = maker.image.group(trigger.var).map_or(0, sources.connection);
         let [rises, stops] = trigger.read(Reading { on, at, connection }, sources.stale_after);
         if item.stops {
-            if stops && sources.is_usable {
+            // Also while the device is away: it is a state.
+            if stops {
                 self.stop(nth);
             }
         } else if rises {
@@ -340,7 +341,7 @@ impl Events<'_, '_> {
             self.end(nth, outcome, code);
         }
         if outcome == Outcome::Done {
-            self.follow(nth);
+            self.follow(nth, is_event);
         }
         self.note_expiry();
     }
@@ -358,8 +359,11 @@ impl Events<'_, '_> {
         self.note_expiry();
     }
 
-    /// The steps behind an exchange that is done.
-    fn follow(&mut self, nth: usize) {
+    /// The steps behind an exchange that is done. Those behind an event were made with it, unless they have ended since,
+    /// such as by a stop.
+    fn follow(&mut self, nth: usize, is_event: bool) {
+        let peer = self.talks.rows.get(nth).map(|row| row.peer);
+        let is_stopping = peer.is_some_and(|peer| self.is_stopping(peer));
         for other in 0..self.items.len() {
             let Some(item) = self.items.get_mut(other).filter(|item| item.follow == Some(nth as u8)) else {
                 continue;
@@ -370,8 +374,14 @@ impl Events<'_, '_> {
                     item.event = Event::Ready { len, until };
                     self.ready(other);
                 }
+                Event::Over if is_event => {}
                 // Its leader is no event: the step is one from now on.
-                Event::Over => self.open(other, Event::Risen { at: Instant::ZERO, until }),
+                Event::Over => {
+                    self.open(other, Event::Risen { at: Instant::ZERO, until });
+                    if is_stopping {
+                        self.end(other, Outcome::Stopped, 0);
+                    }
+                }
                 _ => self.count(other, Outcome::StillOpen),
             }
         }
@@ -414,7 +424,7 @@ impl Events<'_, '_> {
 
     /// The request of an event without a reply has left.
     pub(super) fn end_unanswered(&mut self, nth: usize) {
-        self.follow(nth);
+        self.follow(nth, true);
         self.end(nth, Outcome::Unknown, 0);
         self.note_expiry();
     }

@@ -7,4 +7,5 @@ mod properties;
 mod rig;
 mod rtu;
 mod slave;
+mod stops;
 mod unconfirmed;

@@ -58,6 +58,8 @@ pub(super) struct Accepted {
     pub counted: Vec<SysVar>,
     /// What the frame has no value for.
     pub without: Box<Without>,
+    /// When it was asked for first, if an earlier request had no reply in time: its values may be as old as that.
+    pub asked: Option<Instant>,
 }
 
 /// Why a field of a device's frame is rejected, or for a counter the frame.

@@ -64,7 +64,7 @@ impl Oracle {
             if watch.talk.waits() && !port.is_can {
                 watch.down.sent();
             }
-            watch.talk.abandon();
+            watch.talk.abandon(port.talk.as_ref(), now);
             watch.talk.disturbed_at = now + DISCARD_AFTER_SLEEP;
         }
         self.discards_until = Some(now + DISCARD_AFTER_SLEEP);

@@ -73,13 +73,23 @@ pub enum Invariant {
     Periods,
     /// A slave that answers soon has the controller's values.
     Told,
+    /// A device carries out an event at most once for a rise, in time, with the robot's values since the rise.
+    EventsOnce,
+    /// A stop comes before every event, and soon.
+    StopsFirst,
+    /// What a device is told at its start is carried out once for each start.
+    StartsOnce,
+    /// What the robot is shown of a device was so, not long ago.
+    DeviceValues,
+    /// A device keeps what the robot has.
+    DeviceKeeps,
     /// Nothing panics.
     NoPanic,
 }
 
 impl Invariant {
     /// All of them.
-    pub const ALL: [Self; 35] = [
+    pub const ALL: [Self; 40] = [
         Self::Sent,
         Self::InTime,
         Self::FirstFrame,
@@ -114,6 +124,11 @@ impl Invariant {
         Self::Carried,
         Self::Periods,
         Self::Told,
+        Self::EventsOnce,
+        Self::StopsFirst,
+        Self::StartsOnce,
+        Self::DeviceValues,
+        Self::DeviceKeeps,
         Self::NoPanic,
     ];
 
@@ -154,6 +169,11 @@ impl Invariant {
             Self::Carried => "slave-is-told-right",
             Self::Periods => "periods-are-kept",
             Self::Told => "slave-is-told",
+            Self::EventsOnce => "events-once",
+            Self::StopsFirst => "stops-first",
+            Self::StartsOnce => "starts-once",
+            Self::DeviceValues => "device-values",
+            Self::DeviceKeeps => "device-keeps",
             Self::NoPanic => "no-panic",
         }
     }

@@ -274,7 +274,7 @@ impl Oracle {
                 watch.down.reset();
                 watch.line.discard_of(&self.spec.ports[nth]);
                 watch.line.discarded += watch.served.discard();
-                watch.talk.gone();
+                watch.talk.gone(self.spec.ports[nth].talk.as_ref(), now);
                 self.forget_commands(nth, None, now);
             }
             Input::PortBus { port, state } => {
@@ -286,7 +286,7 @@ impl Oracle {
                 if is_news {
                     watch.counters.bus_offs += 1;
                     watch.down.reset();
-                    watch.talk.gone();
+                    watch.talk.gone(self.spec.ports[nth].talk.as_ref(), now);
                     self.forget_commands(nth, None, now);
                 } else if was_off && !is_off {
                     self.begin_talk(nth, now);

@@ -403,12 +403,12 @@ fn port_spec(config: &GatewayConfig, port: &proto_core::config::Port) -> PortSpe
             let characters = (half_bits * 1_000_000).div_ceil(2 * u64::from(line.baud));
             let characters = Duration::from_micros(characters);
             let silence = line.turnaround.max(characters);
-            talk = TalkSpec::new(config, recipe, (Some(&line), silence), &mut inputs);
+            talk = TalkSpec::new(config, recipe, (port, Some(&line), silence), &mut inputs);
             served = ServedSpec::new(config, recipe, line, &mut inputs);
             (line.idle_gap.max(characters), line.turnaround)
         }
         Bus::Can { .. } => {
-            talk = TalkSpec::new(config, recipe, (None, Duration::ZERO), &mut inputs);
+            talk = TalkSpec::new(config, recipe, (port, None, Duration::ZERO), &mut inputs);
             (Duration::MAX, Duration::ZERO)
         }
         _ => (Duration::MAX, Duration::ZERO),

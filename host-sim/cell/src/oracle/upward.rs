@@ -401,6 +401,26 @@ impl Upward {
             }
         }
         self.counted[nth].undelivered += u32::from(undelivered);
+        if let Some(since) = frame.asked {
+            self.was_asked(nth, frame, timeout, since);
+        }
+    }
+
+    /// The values of a frame may be as old as this.
+    fn was_asked(&mut self, nth: usize, frame: &Accepted, timeout: Duration, since: Instant) {
+        self.overdue[nth][frame.frame] = Some(since + timeout);
+        self.next_overdue = self.next_overdue.min(since + timeout);
+        self.next_expiry = self.next_expiry.min(since + timeout + Duration::from_micros(1));
+        for &(var, _) in frame.values.iter().filter(|(var, _)| !var.is_bits()) {
+            let known = self.known_mut(var);
+            (known.accepted, known.heard) = (Some(since), Some(since));
+            if let Some(value) = &mut known.value {
+                value.1 = since;
+            }
+            if let Some(newest) = known.waiting.back_mut() {
+                newest.1 = since;
+            }
+        }
     }
 
     /// Number of the port's values that wait behind others.

@@ -9,7 +9,7 @@ use std::sync::{Mutex, PoisonError};
 use proto_core::time::Duration;
 
 use super::{Level, Report, Scenario, Share, Soak};
-use crate::{FaultKind, Invariant, Rng, Violation};
+use crate::{FaultKind, Invariant, Kind, OUTCOMES, Rng, Violation};
 
 /// Maximum length of one run.
 pub const RUN_LENGTH: Duration = Duration::from_secs(600);
@@ -80,6 +80,8 @@ pub struct Total {
     pub writes: u64,
     /// Number of checks of each invariant.
     pub checks: BTreeMap<Invariant, u64>,
+    /// What became of events of devices that are judged.
+    pub outcomes: BTreeMap<String, u64>,
     /// One hash of the traces of all runs.
     pub hash: u64,
 }
@@ -302,7 +304,23 @@ impl Total {
         for (&invariant, count) in &report.checks {
             *self.checks.entry(invariant).or_default() += count;
         }
+        for (&outcome, count) in &report.outcomes {
+            *self.outcomes.entry(outcome.to_owned()).or_default() += count;
+        }
         self.fold(run, report.digest);
+    }
+
+    /// The outcomes of events that were too rare in a long harsh run of all cells whose devices are judged, each with how
+    /// often it was counted. Empty for any other run.
+    pub fn rare_outcomes(&self, level: Level) -> Vec<(&'static str, u64)> {
+        let spans = |kind| self.cells.iter().filter(move |(name, _)| Kind::of(name) == Some(kind));
+        let span =
+            |kind| spans(kind).map(|(_, (_, span))| *span).fold(Duration::ZERO, |all, span| all + span);
+        if level != Level::Harsh || Kind::ALL.into_iter().any(|kind| span(kind) < LONG) {
+            return Vec::new();
+        }
+        let count = |name| self.outcomes.get(name).copied().unwrap_or_default();
+        OUTCOMES.into_iter().map(|name| (name, count(name))).filter(|(_, count)| *count < OFTEN).collect()
     }
 
     /// Takes the digest of the next finished run into the hash.
@@ -323,6 +341,11 @@ fn mix(hash: u64, word: u64) -> u64 {
     (hash.rotate_left(5) ^ word).wrapping_mul(0x9E37_79B9_7F4A_7C15)
 }
 
+/// In this much time of each judged cell every outcome of an event occurs often: a little less than the share of one
+/// cell in a day of all.
+const LONG: Duration = Duration::from_secs(3_600);
+/// How often, at least.
+const OFTEN: u64 = 100;
 /// The part of a run that is in a cell's fingerprint.
 const SAMPLE: Duration = Duration::from_secs(1);
 

@@ -82,13 +82,13 @@ impl Behaves {
         let timeout = timeout.as_micros();
         Duration::from_micros(match self.like {
             Behaviour::Slow => rng.below(timeout * 8 / 10),
-            Behaviour::Late if rng.below(2) == 0 => rng.between(timeout / 2, timeout * 2 - MARGIN),
+            Behaviour::Late if rng.below(2) == 0 => rng.between(timeout / 2, timeout * 3 - MARGIN),
             _ => rng.below(3_000),
         })
     }
 }
 
-/// A reply is at the master this long before twice the timeout, in microseconds: the time of a reply on a
+/// A reply is at the master this long before three times the timeout, in microseconds: the time of a reply on a
 /// line, of others before it, and in an adapter that gathers bytes.
 const MARGIN: u64 = 45_000;
 /// After this long without power a device has forgotten what it was told. It has been asked often enough by

@@ -19,6 +19,8 @@ pub struct Scenario {
     pub gateway: Box<GatewayConfig>,
     /// The controller's configuration.
     pub controller: SimConfig,
+    /// The device whose acts are judged by its own log; `None` if the model watches the gateway.
+    pub judged: Option<crate::judge::Kind>,
 }
 
 struct Embedded {
@@ -44,7 +46,7 @@ macro_rules! embedded {
 
 /// A seed selects by position, so the order must not change. Controllers of examples that have field ports
 /// of their own are replaced, since no device would be connected to them.
-const EMBEDDED: [Embedded; 17] = [
+const EMBEDDED: [Embedded; 21] = [
     embedded!("/../configs/", "rs485-system", "can-hand"),
     embedded!("/../configs/", "udp-server", "udp-server"),
     embedded!("/../configs/", "client", "client"),
@@ -62,6 +64,10 @@ const EMBEDDED: [Embedded; 17] = [
     embedded!("/src/soak/cells/", "can-frames", "can-frames"),
     embedded!("/src/soak/cells/", "panel-line", "panel-line"),
     embedded!("/src/soak/cells/", "scanner-line", "scanner-line"),
+    embedded!("/src/soak/cells/", "judged-gripper", "judged"),
+    embedded!("/src/soak/cells/", "judged-axis", "judged"),
+    embedded!("/src/soak/cells/", "judged-rfid", "judged"),
+    embedded!("/src/soak/cells/", "judged-drive", "judged"),
 ];
 
 impl Scenario {
@@ -97,7 +103,7 @@ impl Scenario {
             let source = file::Source::WholeFile { file: gateway.display().to_string() };
             return Err(FileError { source, key: String::new(), message: reason.to_owned() });
         }
-        Ok(Self { name, gateway: config, controller: file::load_controller(controller, &[])? })
+        Ok(Self { name, gateway: config, controller: file::load_controller(controller, &[])?, judged: None })
     }
 
     /// A hash of both configurations, the same on every machine.
@@ -112,7 +118,7 @@ impl Scenario {
         let Embedded { name, gateway, controller } = *cell;
         let gateway = file::parse_gateway(Text { name, toml: gateway }, &[])?;
         let controller = file::parse_controller(Text { name, toml: controller }, &[])?;
-        Ok(Self { name: name.to_owned(), gateway, controller })
+        Ok(Self { name: name.to_owned(), gateway, controller, judged: crate::judge::Kind::of(name) })
     }
 }
 

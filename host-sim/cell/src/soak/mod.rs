@@ -30,6 +30,7 @@ pub use part::{FORMAT, NotOneBatch, Part, PartCell, PartFailure, Sums};
 pub use share::{MAX_SHARES, NoShare, Share};
 pub use show::show_trace;
 
+use crate::judge::Program;
 use crate::{Cell, CellError, Chunking, FaultInjector, FaultKind, Invariant, Rng, Violation, Wiring};
 use peers::Peers;
 use plc::Plc;
@@ -72,8 +73,33 @@ impl Level {
 pub struct Soak {
     cell: Cell,
     injector: Option<FaultInjector>,
-    world: World,
+    life: Life,
     start: Instant,
+}
+
+/// What happens at the robot.
+#[derive(Debug)]
+enum Life {
+    /// Anything.
+    World(World),
+    /// A program that asks a device.
+    Program(Program),
+}
+
+impl Life {
+    fn next(&self) -> Instant {
+        match self {
+            Self::World(world) => world.next(),
+            Self::Program(program) => program.next(),
+        }
+    }
+
+    fn poll(&mut self, cell: &mut Cell) {
+        match self {
+            Self::World(world) => world.poll(cell),
+            Self::Program(program) => program.poll(cell),
+        }
+    }
 }
 
 /// The report of one run.
@@ -95,6 +121,8 @@ pub struct Report {
     pub writes: u64,
     /// Number of checks of each invariant.
     pub checks: BTreeMap<Invariant, u64>,
+    /// What became of events, where a device is judged.
+    pub outcomes: BTreeMap<&'static str, u64>,
     /// The first violation, and its time from the start.
     pub violation: Option<(Violation, Duration)>,
 }
@@ -107,9 +135,18 @@ impl Soak {
     pub fn new(scenario: &Scenario, seed: u64, level: Level) -> Result<Self, CellError> {
         let mut cell = Cell::new(&scenario.gateway, &scenario.controller, seed)?;
         let mut rng = cell.fork_rng();
-        cell.watch();
         cell.keep_heard(0);
-        attach_devices(&mut cell, &scenario.gateway, level, &mut rng);
+        let program = match scenario.judged {
+            None => {
+                cell.watch();
+                attach_devices(&mut cell, &scenario.gateway, level, &mut rng);
+                None
+            }
+            Some(kind) => {
+                prepare_line(&mut cell, &scenario.gateway, level, &mut rng);
+                Some(kind.begin(&mut cell, &scenario.gateway, rng.fork()))
+            }
+        };
         if level == Level::Harsh {
             cell.every_network(|network| {
                 network.delay = rng.up_to(Duration::from_millis(2));
@@ -126,10 +163,13 @@ impl Soak {
                 network.send_buffer = 1_024 << rng.below(7);
             });
         }
-        let world = World::new(&scenario.gateway, cell.now(), rng.fork());
+        let life = match program {
+            Some(program) => Life::Program(program),
+            None => Life::World(World::new(&scenario.gateway, cell.now(), rng.fork())),
+        };
         let injector = level.pause().map(|pause| FaultInjector::new(&mut cell, &FaultKind::ALL, pause));
         let start = cell.now();
-        Ok(Self { cell, injector, world, start })
+        Ok(Self { cell, injector, life, start })
     }
 
     /// The cell.
@@ -152,7 +192,7 @@ impl Soak {
     pub fn run_to(&mut self, elapsed: Duration) {
         let end = self.start + elapsed;
         while self.cell.violation().is_none() {
-            let next = self.world.next().min(end);
+            let next = self.life.next().min(end);
             let span = next.saturating_since(self.cell.now());
             match &mut self.injector {
                 Some(injector) => injector.run(&mut self.cell, span),
@@ -161,7 +201,7 @@ impl Soak {
             if next >= end {
                 return;
             }
-            self.world.poll(&mut self.cell);
+            self.life.poll(&mut self.cell);
         }
     }
 
@@ -187,12 +227,30 @@ impl Soak {
             writes: self.cell.watched_writes(),
             // There is no report after a panic.
             checks: self.cell.checks().into_iter().chain([(Invariant::NoPanic, 1)]).collect(),
+            outcomes: self.cell.outcomes(),
             violation: self
                 .cell
                 .violation()
                 .map(|broken| (broken.clone(), broken.at.saturating_since(self.start))),
         }
     }
+}
+
+/// How the line of a device that is judged delivers bytes.
+fn prepare_line(cell: &mut Cell, config: &GatewayConfig, level: Level, rng: &mut Rng) {
+    let Some(port) = config.ports.first().filter(|port| matches!(port.bus, Bus::Rs485(_))) else { return };
+    let line = cell.line_of(&port.name);
+    cell.line(line).chunking = match rng.below(5) {
+        2 => Chunking::Gathered(Duration::from_millis(rng.between(1, 8))),
+        0 => Chunking::Pieces(rng.between(1, 16) as usize),
+        1 => Chunking::Random(rng.between(1, 40) as usize),
+        _ => Chunking::Whole,
+    };
+    if level == Level::Harsh && rng.below(4) == 0 {
+        cell.line(line).wiring = Wiring::TwoWire;
+    }
+    // An adapter of which nobody has told that it gives back what is sent.
+    cell.line(line).gives_back = level == Level::Harsh && rng.below(3) == 0;
 }
 
 /// Attaches a device to each field port and sets how its line delivers bytes.

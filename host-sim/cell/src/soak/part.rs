@@ -73,6 +73,8 @@ pub struct Sums {
     pub faults: BTreeMap<String, u64>,
     /// Checks by the invariant's name.
     pub checks: BTreeMap<String, u64>,
+    /// Outcomes of events by name.
+    pub outcomes: BTreeMap<String, u64>,
 }
 
 /// A failed run.
@@ -295,12 +297,14 @@ impl Sums {
             links: total.links.clone(),
             faults: total.faults.iter().map(|(kind, &times)| (kind.name().to_owned(), times)).collect(),
             checks: total.checks.iter().map(|(what, &times)| (what.name().to_owned(), times)).collect(),
+            outcomes: total.outcomes.clone(),
         }
     }
 
     fn total(&self) -> Result<Total, String> {
         let mut total = Total { events: self.events, writes: self.writes, ..Total::default() };
         total.links = self.links.clone();
+        total.outcomes = self.outcomes.clone();
         for (name, &(runs, span_us)) in &self.cells {
             let span = Duration::from_micros(span_us);
             total.runs = total.runs.saturating_add(runs);
@@ -337,7 +341,11 @@ impl Sums {
             add_pairs(self.ports.entry(cell.clone()).or_default(), ports);
         }
         add_pairs(&mut self.links, &other.links);
-        for (sums, others) in [(&mut self.faults, &other.faults), (&mut self.checks, &other.checks)] {
+        for (sums, others) in [
+            (&mut self.faults, &other.faults),
+            (&mut self.checks, &other.checks),
+            (&mut self.outcomes, &other.outcomes),
+        ] {
             for (name, times) in others {
                 let sum = sums.entry(name.clone()).or_default();
                 *sum = sum.saturating_add(*times);
@@ -354,5 +362,5 @@ fn add_pairs(sums: &mut BTreeMap<String, (u64, u64)>, others: &BTreeMap<String, 
 }
 
 /// The version of the documents.
-pub const FORMAT: u32 = 1;
+pub const FORMAT: u32 = 2;
 const VERSION: &str = env!("CARGO_PKG_VERSION");

@@ -3,7 +3,7 @@
 //! In: the port's exchanges and a seed. Out: replies, most of them right and in time, and frames that
 //! nobody asked for. Each peer changes its behaviour every few seconds: prompt, slow, late, refusing,
 //! dead, or with replies that are damaged, cut short, lost, behind noise, or to another question. None
-//! takes twice its timeout for a reply, which no master could tell from one to the next request.
+//! takes three times its timeout for a reply, behind which no master could tell it from one to the next request.
 
 use proto_core::config::{Bus, DeviceFrame, FieldSpec, GatewayConfig, OutputBinding, Parts, Port, Talk};
 use proto_core::device::{Carrier, Probe};

@@ -2,8 +2,8 @@
 //!
 //! In: the port's exchanges and a seed. Out: replies, most of them right and in time. Each slave
 //! changes its behaviour every few seconds: prompt, slow, late, refusing, dead, or with replies that are
-//! damaged, lost or under another slave's address. None takes twice its timeout for a reply, which no
-//! master could tell from one to the next request (proto-core/docs/wire/modbus-rtu.md section 4).
+//! damaged, lost or under another slave's address. None takes three times its timeout for a reply, behind
+//! which no master could tell it from one to the next request (proto-core/docs/wire/modbus-rtu.md section 4).
 
 use std::collections::BTreeMap;
 

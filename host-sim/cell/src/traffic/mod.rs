@@ -211,6 +211,9 @@ impl Cell {
     fn controller_bytes(&mut self, id: u64, link: LinkId, peer: Peer, bytes: &[u8]) {
         let conn = ConnId(id);
         self.trace.add(self.now, What::ControllerReceived, id, bytes);
+        if let (Some(judge), Peer::Server(Link::Modbus)) = (&mut self.judge, peer) {
+            judge.asked(id, bytes, self.now);
+        }
         let before = self.inputs_before();
         self.controller_input(match peer {
             Peer::Server(Link::Command) => ControllerInput::CommandBytes { conn, bytes },

@@ -181,7 +181,7 @@ fn shares_that_are_not_one_run_are_refused() {
             refused(&[&first]),
             refused(&[&first, &third]),
             refused(&[&first, &second, &second, &third]),
-            changed(&|part| part.soak = 2),
+            changed(&|part| part.soak = 1),
             changed(&|part| part.version = "0.1.0".into()),
             changed(&|part| part.seed = 43),
             changed(&|part| part.faults = "harsh".into()),

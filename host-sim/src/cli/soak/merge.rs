@@ -7,11 +7,11 @@ use std::process::ExitCode;
 use std::time::Duration as WallTime;
 
 use clap::Args;
-use recipe_cell::soak::{FORMAT, Part};
+use recipe_cell::soak::{FORMAT, Level, Part};
 use recipe_shell::out::print_stderr;
 use serde_json::Value;
 
-use super::table::{failure, table};
+use super::table::{failure, rare_outcomes, table};
 use super::{PASS, wrong};
 
 pub(super) const EXAMPLES: &str = "\
@@ -51,7 +51,10 @@ pub(super) fn run(args: &MergeArgs, out: &mut dyn Write) -> ExitCode {
         Err(message) => return wrong(message),
     };
     let cells: Vec<_> = merged.cells.iter().filter_map(|cell| cell.chosen.clone()).collect();
-    let failed = merged.failure.as_ref().map(|failed| failure(failed, &cells, &merged.faults));
+    let level =
+        [Level::None, Level::Mild, Level::Harsh].into_iter().find(|level| level.name() == merged.faults);
+    let rare = level.and_then(|level| rare_outcomes(&total, level));
+    let failed = merged.failure.as_ref().map(|failed| failure(failed, &cells, &merged.faults)).or(rare);
     if args.json {
         let _ = writeln!(out, "{}", serde_json::to_string(&merged).unwrap_or_default());
         failed.iter().for_each(print_stderr);

@@ -45,8 +45,22 @@ pub(super) fn table(total: &Total, seed: u64, faults: &str, wall: WallTime) -> S
         lines.push(format!("  {:<34} {checks:>12}", invariant.name()));
     }
     lines.push(String::new());
+    if !total.outcomes.is_empty() {
+        lines.push("outcome of an event                         times".to_owned());
+        for (outcome, times) in &total.outcomes {
+            lines.push(format!("  {outcome:<34} {times:>12}"));
+        }
+        lines.push(String::new());
+    }
     lines.push(format!("trace hash          {:016x}\n", total.hash));
     lines.join("\n")
+}
+
+/// Which outcomes of events a long run did not have often enough to say anything about them; `None` if there is none.
+pub(super) fn rare_outcomes(total: &Total, level: Level) -> Option<String> {
+    let rare: Vec<_> =
+        total.rare_outcomes(level).iter().map(|(name, times)| format!("{name} {times} times")).collect();
+    (!rare.is_empty()).then(|| format!("FAIL  outcomes of events that were too rare: {}", rare.join(", ")))
 }
 
 /// A failed run, and the command that repeats it; `cells` are the words of `--cell`.

@@ -41,6 +41,14 @@ impl Seen {
         }
     }
 
+    /// The same of an exchange that is not awaited.
+    pub(super) fn late(self, row: usize) -> Self {
+        match self {
+            Self::Reply(len) | Self::Refusal(len) => Self::Late(len, row),
+            other => other,
+        }
+    }
+
     /// What bytes are that may be one of two frames: a frame is more than the beginning of one of ours, that
     /// is more than one of others, and that is more than the beginning of one of others or a wrong
     /// checksum. Of equals, the first.
@@ -51,7 +59,13 @@ impl Seen {
             Self::Begins { is_ours: false } => 2,
             Self::Other(_) => 3,
             Self::Begins { is_ours: true } => 4,
-            Self::Echo(_) | Self::Reply(_) | Self::Refusal(_) | Self::Unasked(..) => 5,
+            Self::Echo(_)
+            | Self::Reply(_)
+            | Self::Refusal(_)
+            | Self::ReplyOrEcho(_)
+            | Self::Late(..)
+            | Self::Ambiguous(_)
+            | Self::Unasked(..) => 5,
         };
         if rank(&other) > rank(&self) { other } else { self }
     }

@@ -6,9 +6,10 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use proto_core::config::Echo;
 use proto_core::time::{Duration, Instant};
 
-use super::spec::{RowSpec, Seen, TalkSpec};
+use super::spec::{Kind, RowSpec, Seen, TalkSpec};
 use crate::oracle::Invariant;
 use crate::oracle::spec::PortSpec;
 use crate::oracle::upward::Wrong;
@@ -21,22 +22,16 @@ pub(in crate::oracle) struct TalkWatch {
     leaving: bool,
     /// The newest request has failed, and may be repeated.
     repeat: Option<Flight>,
-    /// An exchange ended while its repetition was leaving; until then, its slave is not asked for others.
-    held_by: Option<usize>,
     free_at: Instant,
     slaves: BTreeMap<u8, SlaveWatch>,
-    /// When each exchange was asked last, without repetitions.
-    asked: BTreeMap<usize, Instant>,
-    /// Exchanges that a rising bit wants.
-    risen: BTreeMap<usize, bool>,
-    last_bits: BTreeMap<usize, bool>,
-    /// When such a bit rose again before it was asked, newest.
-    rose_at: BTreeMap<usize, Instant>,
+    rows: Vec<RowWatch>,
     /// Exchanges that are to be asked at the start and have not been asked since, by slave.
     opening: BTreeMap<u8, BTreeSet<usize>>,
     /// Those of them whose values were unknown or stale meanwhile, so that they may have been passed over.
     passed: BTreeSet<usize>,
-    /// The request whose bytes are still to come back.
+    /// Whether own bytes come back, as far as it is known.
+    has_echo: Option<bool>,
+    /// The request whose bytes are still to come back, or may come back.
     echo: Option<Vec<u8>>,
     pub unanswered: u32,
     pub refused: u32,
@@ -53,10 +48,16 @@ pub(in crate::oracle) struct Flight {
     pub request: Vec<u8>,
     /// When the first of its repetitions was handed over.
     pub began: Instant,
+    /// Until when its event may be sent.
+    expires: Option<Instant>,
     sent: Option<Instant>,
     repeated: u8,
-    timed_out: bool,
+    /// When the first transmission of it left that had no reply in time.
+    pub timed_out: Option<Instant>,
     is_wrong: bool,
+    was_wrong: bool,
+    /// What came is its reply, or its echo.
+    may_be_echo: bool,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -72,50 +73,133 @@ enum Presence {
 struct SlaveWatch {
     presence: Presence,
     since: Instant,
-    /// It is not asked before this, or only for this exchange.
-    held_until: Instant,
-    held_for: usize,
+    was_heard: bool,
+    /// When the first request left that it has not answered since it was heard, and when the newest one failed.
+    failing: Option<(Instant, Instant)>,
     failures: u32,
-    /// It is down, and not asked before this.
-    not_before: Instant,
     asked: Instant,
-    /// Its newest answer to each exchange is a refusal.
-    refuses: BTreeMap<usize, bool>,
+    started: Instant,
+}
+
+/// What is known of an exchange.
+#[derive(Debug, Clone, Default)]
+struct RowWatch {
+    /// When it was asked last, without repetitions.
+    asked: Option<Instant>,
+    /// The newest request since the port came up.
+    request: Option<Vec<u8>>,
+    /// How many replies to earlier transmissions may still come, and until when.
+    outstanding: (u8, Instant),
+    /// Until when one of its replies, or one like it, has been awaited.
+    blocked_until: Instant,
+    was_answered: bool,
+    is_missed: bool,
+    failures: u32,
+    /// It is asked at this instant at the latest, as far as its own failures go.
+    calm_at: Instant,
+    is_unconfirmed: bool,
+    is_refused: bool,
+    /// It may be sent at the start.
+    starts: bool,
+    last_bit: Option<bool>,
+    /// Its bit has risen, and it may be sent until then.
+    risen: Option<Instant>,
+}
+
+/// What a device has answered.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Ended {
+    Good,
+    /// For good.
+    Refused,
+    /// It has not carried it out.
+    Busy,
+    /// It may have carried it out.
+    Unclear,
+}
+
+impl Ended {
+    /// What a refusal means: on Modbus its code says that.
+    pub(super) const fn refused(code: u8, is_modbus: bool) -> Self {
+        match code {
+            6 if is_modbus => Self::Busy,
+            4 | 8 | 10 | 11 if is_modbus => Self::Unclear,
+            _ => Self::Refused,
+        }
+    }
+}
+
+impl RowWatch {
+    fn is_outstanding(&self, now: Instant) -> bool {
+        self.outstanding.0 > 0 && self.outstanding.1 > now
+    }
+
+    fn leaves(&mut self, count: u8, until: Instant, now: Instant) {
+        let before = if self.is_outstanding(now) { self.outstanding.0 } else { 0 };
+        self.outstanding = (before.saturating_add(count), self.outstanding.1.max(until));
+    }
+
+    fn waits_longer(&mut self, timeout: Duration, now: Instant) {
+        self.failures += 1;
+        self.calm_at = now + wait(timeout, self.failures);
+    }
 }
 
 impl TalkWatch {
     /// The device of the port is there, perhaps another one.
     pub(in crate::oracle) fn begin(&mut self, talk: Option<&TalkSpec>, now: Instant) {
-        self.abandon();
+        let Some(talk) = talk else { return };
+        self.abandon(Some(talk), now);
         self.slaves.clear();
-        self.asked.clear();
-        self.risen.clear();
-        self.last_bits.clear();
-        self.rose_at.clear();
         self.opening.clear();
         self.passed.clear();
-        for row in talk.iter().flat_map(|talk| &talk.rows).filter(|row| row.at_start) {
-            self.opening.entry(row.slave).or_default().insert(row.nth);
+        self.rows = vec![RowWatch::default(); talk.rows.len()];
+        for (watch, row) in self.rows.iter_mut().zip(&talk.rows) {
+            watch.starts = row.kind == Kind::Start;
+            if row.at_start {
+                self.opening.entry(row.slave).or_default().insert(row.nth);
+            }
+            if row.is_answered() {
+                // Nobody knows what was asked before.
+                watch.outstanding = (u8::MAX, now + row.late);
+                watch.blocked_until = now + row.late;
+            }
         }
+        self.has_echo = known(talk.echo);
         (self.began, self.disturbed_at) = (now, now);
     }
 
     /// What has begun is not continued.
-    pub(in crate::oracle) fn abandon(&mut self) {
-        let flight = self.flight.take().or(self.repeat.take());
-        if let Some(row) = flight.map(|flight| flight.row)
-            && self.risen.contains_key(&row)
+    pub(in crate::oracle) fn abandon(&mut self, talk: Option<&TalkSpec>, now: Instant) {
+        // A request that is about to be repeated counts as one that was.
+        let flight = self.flight.take().or(self.repeat.take().map(|mut flight| {
+            flight.repeated += 1;
+            flight
+        }));
+        if let Some((flight, talk)) = flight.zip(talk)
+            && talk.rows[flight.row].is_answered()
         {
-            self.risen.insert(row, true);
+            let late = now + talk.rows[flight.row].late;
+            self.leaves(talk, flight.row, flight.repeated + 1, late, now);
         }
-        (self.repeat, self.held_by) = (None, None);
+        for row in &mut self.rows {
+            (row.risen, row.last_bit) = (None, None);
+        }
         (self.free_at, self.echo) = (Instant::ZERO, None);
     }
 
     /// The port is gone.
-    pub(in crate::oracle) fn gone(&mut self) {
-        self.abandon();
+    pub(in crate::oracle) fn gone(&mut self, talk: Option<&TalkSpec>, now: Instant) {
+        self.abandon(talk, now);
         self.leaving = false;
+    }
+
+    /// Replies to an exchange may come until then.
+    fn leaves(&mut self, talk: &TalkSpec, row: usize, count: u8, until: Instant, now: Instant) {
+        self.rows[row].leaves(count, until, now);
+        for &other in &talk.rows[row].alike {
+            self.rows[other].blocked_until = self.rows[other].blocked_until.max(until);
+        }
     }
 
     /// Whether nothing is on its way or about to be repeated.
@@ -129,13 +213,13 @@ impl TalkWatch {
         passed.extend(opening.values().flatten().copied().filter(|&row| !can_ask(row)));
     }
 
-    /// Bits that ask have changed.
+    /// Bits that ask have changed. A rise needs a 0 that was read before.
     pub(super) fn watch(&mut self, talk: &TalkSpec, bit: impl Fn(&RowSpec) -> Option<bool>, now: Instant) {
-        for (nth, row) in talk.rows.iter().enumerate().filter(|(_, row)| row.rising.is_some()) {
-            let Some(on) = bit(row) else { continue };
-            let before = self.last_bits.insert(nth, on);
-            if on && before == Some(false) && self.risen.insert(nth, true) == Some(true) {
-                self.rose_at.insert(nth, now);
+        for (watch, row) in self.rows.iter_mut().zip(&talk.rows).filter(|(_, row)| row.rising.is_some()) {
+            let on = bit(row);
+            let before = std::mem::replace(&mut watch.last_bit, on);
+            if on == Some(true) && before == Some(false) {
+                watch.risen = Some(now + row.trigger);
             }
         }
     }
@@ -165,37 +249,41 @@ impl TalkWatch {
             return wrong(&what);
         }
         let repeated = self.repeat.take();
-        // A second rise shortly before it was asked may be seen after that.
-        let rose_before = self.asked.get(&row).zip(self.rose_at.get(&row));
-        let is_unseen = rose_before.is_some_and(|(&asked, &rose)| rose <= asked && asked < rose + port.cycle);
-        if is_unseen {
-            self.rose_at.remove(&row);
-        }
-        let is_wanted = spec.rising.is_none()
-            || spec.every.is_some()
-            || repeated.is_some()
-            || self.risen.insert(row, false) == Some(true)
-            || is_unseen;
-        if !is_wanted {
-            let what = format!("{}: asked although its bit has not risen", name(spec));
+        let expires = match &repeated {
+            Some(failed) => failed.expires,
+            None => self.rows[row].risen.take(),
+        };
+        if spec.kind == Kind::Event && repeated.is_none() && expires.is_none_or(|until| until < now) {
+            let what = format!("{}: asked although its bit has not risen just now", name(spec));
             return Err((Invariant::Cycle, what));
         }
-        let slave = self.slaves.entry(spec.slave).or_default();
-        if now < slave.held_until && slave.held_for != row {
-            let left = slave.held_until.saturating_since(now);
-            let what = format!("asked {left} before the replies to another exchange with it are over");
+        if repeated.is_none() && spec.kind == Kind::Start && !std::mem::take(&mut self.rows[row].starts) {
+            let what = format!("{}: asked although its device has not started", name(spec));
+            return Err((Invariant::Cycle, what));
+        }
+        if repeated.is_none()
+            && let Some(other) =
+                spec.alike.iter().copied().find(|&other| self.rows[other].is_outstanding(now))
+        {
+            let left = self.rows[other].outstanding.1.saturating_since(now);
+            let what = format!("asked {left} before the replies to {} are over", name(&talk.rows[other]));
             return wrong(&what);
         }
-        if slave.presence == Presence::Down && now < slave.not_before {
+        let slave = self.slaves.entry(spec.slave).or_default();
+        if slave.presence == Presence::Down && !spec.is_answered() {
+            let what = format!("{}: asked, and its slave does not answer", name(spec));
+            return Err((Invariant::Periods, what));
+        }
+        let not_before =
+            slave.failing.map(|(_, newest)| newest + wait(talk.shortest(spec.slave), slave.failures).half());
+        if let Some(left) = not_before.filter(|_| slave.presence == Presence::Down && repeated.is_none())
+            && now < left
+        {
             let what = format!(
                 "{}: asked {} before a slave that does not answer may be asked",
                 name(spec),
-                slave.not_before.saturating_since(now)
+                left.saturating_since(now)
             );
-            return Err((Invariant::Periods, what));
-        }
-        if slave.presence == Presence::Down && !spec.is_answered() {
-            let what = format!("{}: asked, and its slave does not answer", name(spec));
             return Err((Invariant::Periods, what));
         }
         slave.asked = now;
@@ -203,27 +291,44 @@ impl TalkWatch {
             let what = format!("{}: asked before {}, which comes first", name(spec), name(&talk.rows[first]));
             return Err((Invariant::Cycle, what));
         }
+        self.is_opened(spec.slave, row);
         let began = repeated.as_ref().map_or(now, |failed| failed.began);
+        let watch = &mut self.rows[row];
         if repeated.is_none() {
-            self.asked.insert(row, now);
+            watch.asked = Some(now);
         }
+        watch.request = Some(request.to_vec());
         let repeats = repeated.as_ref().map_or(0, |failed| failed.repeated + 1);
         self.flight = Some(Flight {
             row,
             request: request.to_vec(),
             began,
+            expires,
             sent: None,
             repeated: repeats,
-            timed_out: repeated.is_some_and(|failed| failed.timed_out),
+            timed_out: repeated.as_ref().and_then(|failed| failed.timed_out),
             is_wrong: false,
+            was_wrong: repeated.is_some_and(|failed| failed.was_wrong),
+            may_be_echo: false,
         });
         self.leaving = true;
-        self.echo = talk.has_echo.then(|| request.to_vec());
+        if self.has_echo != Some(false) {
+            self.echo = Some(request.to_vec());
+        }
         Ok(())
     }
 
     /// The request has come back.
     pub(super) fn echoed(&mut self) {
+        self.echo = None;
+        self.has_echo.get_or_insert(true);
+    }
+
+    /// What came is the reply, or the echo of the request.
+    pub(super) fn heard_reply_or_echo(&mut self) {
+        if let Some(flight) = &mut self.flight {
+            flight.may_be_echo = true;
+        }
         self.echo = None;
     }
 
@@ -248,19 +353,13 @@ impl TalkWatch {
     /// The request has left.
     pub(in crate::oracle) fn left(&mut self, talk: &TalkSpec, turnaround: Duration, now: Instant) {
         self.leaving = false;
-        if let Some(row) = self.held_by.take() {
-            let spec = &talk.rows[row];
-            self.hold(spec.slave, row, now + spec.timeout.saturating_mul(2));
-        }
         let Some(flight) = self.flight.as_mut().filter(|flight| flight.sent.is_none()) else { return };
         let spec = &talk.rows[flight.row];
         if spec.is_answered() {
             flight.sent = Some(now);
         } else {
-            let row = flight.row;
             self.flight = None;
             self.free_at = now + spec.rest(turnaround);
-            self.is_opened(spec.slave, row);
         }
     }
 
@@ -269,27 +368,72 @@ impl TalkWatch {
         self.flight.as_ref().is_some_and(|flight| flight.sent.is_some())
     }
 
+    /// The exchanges whose replies may come although they are not awaited, each with its newest request.
+    fn late_rows(&self, now: Instant) -> impl Iterator<Item = (usize, &RowWatch)> {
+        let own = self.flight.as_ref().map(|flight| flight.row);
+        let rows = self.rows.iter().enumerate();
+        rows.filter(move |(nth, row)| Some(*nth) != own && row.is_outstanding(now))
+    }
+
     /// What the bytes that are held begin with.
-    pub(super) fn see(&self, port: &PortSpec, talk: &TalkSpec, bytes: &[u8]) -> Seen {
-        let answer = match (&self.echo, &self.flight) {
-            // The reply is looked for behind the echo.
-            (Some(own), _) => match bytes.get(..own.len()) {
+    pub(super) fn see(&self, port: &PortSpec, talk: &TalkSpec, bytes: &[u8], now: Instant) -> Seen {
+        let echo = match &self.echo {
+            None => Seen::No,
+            Some(own) => match bytes.get(..own.len()) {
                 Some(whole) if whole == own => Seen::Echo(own.len()),
                 None if bytes.first() == own.first() => Seen::Begins { is_ours: true },
                 _ => Seen::No,
             },
+        };
+        let answer = match &self.flight {
+            // The reply is looked for behind the echo.
+            _ if self.has_echo == Some(true) && self.echo.is_some() => Seen::No,
             // Nobody answers what is for all.
-            (None, Some(flight)) if talk.rows[flight.row].is_answered() => {
+            Some(flight) if talk.rows[flight.row].is_answered() => {
                 talk.rows[flight.row].see(&flight.request, bytes)
             }
-            (None, _) => Seen::No,
+            _ => Seen::No,
         };
-        answer.or(talk.see_unasked(port, bytes))
+        let late = self.late_rows(now).fold(Seen::No, |seen, (nth, row)| {
+            seen.or(talk.rows[nth].see_late(row.request.as_deref(), bytes).late(nth))
+        });
+        let answer = match (answer, echo) {
+            (Seen::Reply(len), Seen::Echo(own)) if own == len => Seen::ReplyOrEcho(len),
+            _ => answer.or(echo),
+        };
+        match (answer, late) {
+            // It may be one to an earlier request.
+            (Seen::Refusal(len), Seen::Late(other, _)) if other == len => Seen::Ambiguous(len),
+            _ => answer.or(late).or(talk.see_unasked(port, bytes)),
+        }
     }
 
-    /// The exchange that a reply is awaited to.
-    pub(super) fn awaits<'t>(&self, talk: &'t TalkSpec) -> Option<&'t RowSpec> {
-        self.flight.as_ref().map(|flight| &talk.rows[flight.row])
+    /// The exchange that a reply is awaited to, and the request.
+    pub(super) fn awaits<'t>(&self, talk: &'t TalkSpec) -> Option<(&'t RowSpec, &[u8])> {
+        self.flight.as_ref().map(|flight| (&talk.rows[flight.row], &flight.request[..]))
+    }
+
+    /// The exchange that was not answered in time, and that `is` a reply to.
+    pub(super) fn late_of(
+        &self,
+        talk: &TalkSpec,
+        is: impl Fn(&RowSpec) -> bool,
+        now: Instant,
+    ) -> Option<usize> {
+        self.late_rows(now).map(|(nth, _)| nth).find(|&nth| is(&talk.rows[nth]))
+    }
+
+    /// A late reply to this exchange came. Returns the slave if it has started.
+    pub(super) fn came_late(&mut self, talk: &TalkSpec, row: usize, now: Instant) -> Option<u8> {
+        let outstanding = &mut self.rows[row].outstanding;
+        outstanding.0 = outstanding.0.saturating_sub(1);
+        self.heard(talk, talk.rows[row].slave, now)
+    }
+
+    /// An answer came that may belong to one of several requests.
+    pub(super) fn came_ambiguous(&mut self, talk: &TalkSpec, now: Instant) -> Option<u8> {
+        let slave = talk.rows[self.flight.as_ref()?.row].slave;
+        self.heard(talk, slave, now)
     }
 
     pub(super) fn heard_wrong(&mut self) {
@@ -298,44 +442,80 @@ impl TalkWatch {
         }
     }
 
-    /// The slave has answered.
-    pub(super) fn answered(&mut self, talk: &TalkSpec, is_refusal: bool, now: Instant) -> Option<Flight> {
+    /// The slave has answered. Returns the request, and the slave if it has started.
+    pub(super) fn answered(
+        &mut self,
+        talk: &TalkSpec,
+        ended: Ended,
+        now: Instant,
+    ) -> Option<(Flight, Option<u8>)> {
         let flight = self.flight.take()?;
         let spec = &talk.rows[flight.row];
-        self.is_opened(spec.slave, flight.row);
-        let was_down = self.slaves.get(&spec.slave).is_some_and(|slave| slave.presence == Presence::Down);
-        if let Some(opening) = self.opening.get_mut(&spec.slave).filter(|_| was_down && spec.at_start)
-            && opening.range(..flight.row).any(|nth| !talk.rows[*nth].is_answered())
-        {
-            // What waited before it comes first, and then this again.
-            opening.insert(flight.row);
+        if flight.may_be_echo || self.echo.is_some() {
+            self.has_echo.get_or_insert(flight.may_be_echo);
         }
+        self.refused = self.refused.wrapping_add(u32::from(ended != Ended::Good));
+        self.rest(spec.pause, now);
+        self.leaves_of(talk, &flight, flight.repeated, flight.sent.unwrap_or(now), now);
+        let started = self.ended(talk, &flight, ended, now);
+        self.rows[flight.row].is_refused = ended == Ended::Refused;
+        Some((flight, started))
+    }
+
+    fn rest(&mut self, pause: Duration, now: Instant) {
+        self.free_at = now + pause;
         self.echo = None;
-        self.refused = self.refused.wrapping_add(u32::from(is_refusal));
-        self.free_at = now + spec.pause;
-        let slave = self.slaves.entry(spec.slave).or_default();
-        let is_first = slave.presence == Presence::Unknown;
+    }
+
+    /// So many replies to a request may still come.
+    fn leaves_of(&mut self, talk: &TalkSpec, flight: &Flight, count: u8, sent: Instant, now: Instant) {
+        let spec = &talk.rows[flight.row];
+        if flight.timed_out.is_some() {
+            self.leaves(talk, flight.row, count, sent + spec.late, now);
+        } else if flight.was_wrong && spec.alike.len() > 1 {
+            // It may have been noise, with the reply behind it.
+            self.leaves(talk, flight.row, count, sent + spec.late.min(spec.timeout.saturating_mul(2)), now);
+        }
+    }
+
+    /// A request has ended with a sign of its slave.
+    fn ended(&mut self, talk: &TalkSpec, flight: &Flight, ended: Ended, now: Instant) -> Option<u8> {
+        let spec = &talk.rows[flight.row];
+        let watch = &mut self.rows[flight.row];
+        (watch.was_answered, watch.is_unconfirmed) = (true, false);
+        match ended {
+            Ended::Good | Ended::Refused => (watch.failures, watch.calm_at) = (0, Instant::ZERO),
+            Ended::Busy | Ended::Unclear => watch.waits_longer(spec.timeout, now),
+        }
+        if ended == Ended::Busy {
+            // It was not carried out, so it may be sent again.
+            watch.starts |= spec.kind == Kind::Start;
+            watch.risen = watch.risen.or(flight.expires);
+        }
+        self.heard(talk, spec.slave, now)
+    }
+
+    /// A sign of life of a slave. Returns it if it has started: what is asked at its start is asked again.
+    pub(super) fn heard(&mut self, talk: &TalkSpec, number: u8, now: Instant) -> Option<u8> {
+        let slave = self.slaves.entry(number).or_default();
+        let has_started = slave.failing.is_some_and(|(since, newest)| {
+            newest.saturating_since(since) >= talk.absent || !slave.was_heard && slave.failures > 1
+        });
         if slave.presence != Presence::Up {
             (slave.presence, slave.since) = (Presence::Up, now);
         }
-        slave.failures = 0;
-        slave.refuses.insert(flight.row, is_refusal);
-        let is_alone = talk.rows_of(spec.slave).filter(|(_, row)| row.is_answered()).nth(1).is_none();
-        if flight.timed_out || (flight.repeated > 0 || is_first) && !is_alone {
-            match flight.sent {
-                Some(sent) => self.hold(spec.slave, flight.row, sent + spec.timeout.saturating_mul(2)),
-                None => self.held_by = Some(flight.row),
-            }
+        (slave.was_heard, slave.failing, slave.failures) = (true, None, 0);
+        for (watch, row) in self.rows.iter_mut().zip(&talk.rows).filter(|(_, row)| row.slave == number) {
+            watch.is_missed = false;
+            watch.starts |= has_started && row.kind == Kind::Start;
         }
-        Some(flight)
+        if has_started {
+            slave.started = now;
+        }
+        has_started.then_some(number)
     }
 
-    fn hold(&mut self, slave: u8, row: usize, until: Instant) {
-        let slave = self.slaves.entry(slave).or_default();
-        (slave.held_until, slave.held_for) = (until, row);
-    }
-
-    /// A deadline may have passed: replies that have not come fail. Returns whether the slave is given up.
+    /// A deadline may have passed: replies that have not come fail.
     pub(super) fn tick(&mut self, talk: &TalkSpec, heard: Instant, now: Instant) -> Option<u8> {
         let flight = self.flight.as_ref()?;
         let spec = &talk.rows[flight.row];
@@ -345,17 +525,29 @@ impl TalkWatch {
             return None;
         }
         let mut flight = self.flight.take()?;
+        if flight.may_be_echo && !flight.is_wrong {
+            // Nobody knows. It is not a failure.
+            self.rest(spec.pause, now);
+            let watch = &mut self.rows[flight.row];
+            (watch.was_answered, watch.is_unconfirmed) = (true, true);
+            return None;
+        }
         self.echo = None;
-        flight.timed_out |= !flight.is_wrong;
+        flight.timed_out = flight.timed_out.or(flight.sent.filter(|_| !flight.is_wrong));
+        flight.was_wrong |= flight.is_wrong;
         let slave = self.slaves.entry(spec.slave).or_default();
         if slave.presence != Presence::Down {
             self.disturbed_at = self.disturbed_at.max(now);
         }
-        if slave.presence == Presence::Up && flight.repeated < spec.retries {
+        let retries = if spec.kind == Kind::State { spec.retries } else { spec.event_retries };
+        if slave.presence == Presence::Up && flight.repeated < retries {
             self.repeat = Some(flight);
             return None;
         }
-        self.fails(talk, &flight, now)
+        if !flight.is_wrong && talk.echo == Echo::Auto {
+            self.has_echo = None;
+        }
+        self.fails(talk, &flight, flight.is_wrong, now)
     }
 
     /// The exchange whose request is to be repeated.
@@ -363,32 +555,51 @@ impl TalkWatch {
         self.repeat.as_ref().map(|failed| failed.row)
     }
 
-    /// The request cannot be repeated. Returns the slave, which is given up.
-    pub(super) fn is_not_repeated(&mut self, talk: &TalkSpec, now: Instant) -> Option<u8> {
-        let failed = self.repeat.take()?;
-        self.fails(talk, &failed, now)
+    /// The request that is to be repeated.
+    pub(super) fn repeated_request(&self) -> Option<&[u8]> {
+        self.repeat.as_ref().map(|failed| &failed.request[..])
     }
 
-    fn fails(&mut self, talk: &TalkSpec, flight: &Flight, now: Instant) -> Option<u8> {
+    /// The request cannot be repeated. Returns the slave if it has started.
+    pub(super) fn is_not_repeated(&mut self, talk: &TalkSpec, now: Instant) -> Option<u8> {
+        let mut failed = self.repeat.take()?;
+        // It counts as repeated.
+        failed.repeated += 1;
+        self.fails(talk, &failed, false, now)
+    }
+
+    fn fails(&mut self, talk: &TalkSpec, flight: &Flight, is_wrong: bool, now: Instant) -> Option<u8> {
         let spec = &talk.rows[flight.row];
-        let slave = self.slaves.entry(spec.slave).or_default();
         self.unanswered = self.unanswered.wrapping_add(1);
-        self.free_at = now + spec.pause;
-        if slave.presence != Presence::Down {
+        self.rest(spec.pause, now);
+        let sent = flight.sent.unwrap_or(now);
+        self.leaves_of(talk, flight, flight.repeated + 1, sent, now);
+        if is_wrong {
+            // It said something, and nobody knows what.
+            return self.ended(talk, flight, Ended::Unclear, now);
+        }
+        let watch = &mut self.rows[flight.row];
+        watch.is_missed = true;
+        watch.waits_longer(spec.timeout, now);
+        let is_silent = self.is_silent(talk, spec.slave);
+        let slave = self.slaves.entry(spec.slave).or_default();
+        slave.failing = Some((slave.failing.map_or(sent, |(since, _)| since), now));
+        slave.failures += 1;
+        if is_silent && slave.presence != Presence::Down {
             (slave.presence, slave.since) = (Presence::Down, now);
         }
-        slave.failures += 1;
-        let wait = spec.timeout.saturating_mul(1 << slave.failures.min(6)).min(LONGEST_WAIT);
-        slave.not_before = (now + wait).max(flight.sent? + spec.timeout.saturating_mul(2));
-        if self.risen.contains_key(&flight.row) {
-            self.risen.insert(flight.row, true);
-        }
-        // It may have lost its power.
-        let at_start = talk.rows_of(spec.slave).filter(|(_, row)| row.at_start).map(|(nth, _)| nth);
-        let at_start: Vec<usize> = at_start.collect();
-        self.passed.retain(|row| !at_start.contains(row));
-        self.opening.entry(spec.slave).or_default().extend(at_start);
-        Some(spec.slave)
+        None
+    }
+
+    /// Whether a slave is away: each of its exchanges that used to be answered, or two of them, failed since it was
+    /// heard; all of them count if none ever was.
+    fn is_silent(&self, talk: &TalkSpec, number: u8) -> bool {
+        let rows = talk.rows_of(number).filter(|(_, row)| row.is_answered());
+        let rows: Vec<&RowWatch> = rows.map(|(nth, _)| &self.rows[nth]).collect();
+        let was_answered = rows.iter().any(|row| row.was_answered);
+        let telling: Vec<_> = rows.into_iter().filter(|row| row.was_answered || !was_answered).collect();
+        let missed = telling.iter().filter(|row| row.is_missed).count();
+        missed > 0 && missed >= telling.len().min(2)
     }
 
     /// Checks that the line has not been idle although a period has ended, that every period has its turn,
@@ -404,29 +615,30 @@ impl TalkWatch {
     ) -> Result<u64, Wrong> {
         let mut checked = 0;
         let free = self.free_at.max(heard + port.turnaround).max(self.disturbed_at);
-        for (nth, row) in talk.rows.iter().enumerate() {
-            let (Some(every), Some(&asked), true) = (row.every, self.asked.get(&nth), row.is_always_ready())
-            else {
+        for ((nth, row), watch) in talk.rows.iter().enumerate().zip(&self.rows) {
+            let (Some(every), Some(asked), true) = (row.every, watch.asked, row.is_always_ready()) else {
                 continue;
             };
             let Some(slave) = self.slaves.get(&row.slave) else { continue };
             // Nothing is known of a device that nobody expects an answer of.
             let is_mute = slave.presence == Presence::Unknown
                 && talk.rows_of(row.slave).all(|(_, row)| !row.is_answered());
-            if slave.presence != Presence::Up && !is_mute {
+            let is_calm = slave.presence == Presence::Up && slave.failing.is_none();
+            if !is_calm && !is_mute || self.is_opening(talk, row.slave, slave) {
                 continue;
             }
             checked += 1;
-            let due = (asked + every).max(free).max(slave.held_until).max(slave.since);
+            let ready = watch.blocked_until.max(watch.calm_at).max(slave.since);
+            let due = (asked + every).max(free).max(ready);
             let idle = now.saturating_since(due);
             if self.is_free() && !is_busy && idle > IDLE + stalled(due) {
                 let what = format!("{}: its period has ended, and the line is free for {idle}", name(row));
                 return Err((Invariant::Periods, what));
             }
-            let from = asked.max(slave.since).max(self.disturbed_at).max(slave.held_until);
+            let from = asked.max(self.disturbed_at).max(ready);
             let waits = now.saturating_since(from);
             if waits > every.saturating_mul(2) + talk.all_costs + stalled(from) {
-                let what = format!("{}: not asked for {waits}", name(row));
+                let what = format!("{}: not asked for {waits}", name(&talk.rows[nth]));
                 return Err((Invariant::Periods, what));
             }
         }
@@ -436,23 +648,62 @@ impl TalkWatch {
         let are_down = self.slaves.iter().filter(|(_, slave)| slave.presence == Presence::Down);
         for (&number, slave) in are_down.filter(|(number, _)| is_wanted(**number)) {
             checked += 1;
-            let timeouts = talk.rows_of(number).map(|(_, row)| row.timeout);
-            let wait = timeouts.max().unwrap_or_default().saturating_mul(64).min(LONGEST_WAIT);
+            let rows = || talk.rows_of(number).map(|(_, row)| row);
+            let longest = rows().map(|row| row.timeout).max().unwrap_or_default();
+            let late = rows().map(|row| row.late).max().unwrap_or_default();
             let from = slave.asked.max(self.began);
             let waits = now.saturating_since(from);
-            if waits > wait.saturating_mul(2) + talk.all_costs.saturating_mul(2) + stalled(from) {
+            let costs = talk.all_costs.saturating_mul(2) + late;
+            if waits > wait(longest, 6).saturating_mul(2) + costs + stalled(from) {
                 return Err((Invariant::Periods, format!("slave {number} is not looked for since {waits}")));
             }
         }
         Ok(checked)
     }
 
+    /// Whether something may have to come first at the start of a slave.
+    fn is_opening(&self, talk: &TalkSpec, number: u8, slave: &SlaveWatch) -> bool {
+        let starts = |(nth, row): (usize, &RowSpec)| {
+            let watch = &self.rows[nth];
+            let was_asked = watch.asked.is_some_and(|asked| asked > slave.started.max(self.began));
+            row.at_start && (!was_asked || watch.failures > 0)
+        };
+        self.opening.get(&number).is_some_and(|opening| !opening.is_empty())
+            || talk.rows_of(number).any(starts)
+    }
+
     /// Since when the exchange could be carried out without any failure on the line; `None` if it cannot.
     pub(super) fn could_ask(&self, talk: &TalkSpec, row: usize) -> Option<Instant> {
-        let slave = self.slaves.get(&talk.rows[row].slave)?;
-        let is_refused = slave.refuses.get(&row).copied().unwrap_or(false);
-        let is_up = slave.presence == Presence::Up && !is_refused;
-        is_up.then(|| slave.since.max(self.disturbed_at).max(slave.held_until).max(self.began))
+        let number = talk.rows[row].slave;
+        let (slave, watch) = (self.slaves.get(&number)?, &self.rows[row]);
+        let is_up = slave.presence == Presence::Up && slave.failing.is_none();
+        let is_taken = !watch.is_refused && !watch.is_unconfirmed && watch.failures == 0;
+        let since = slave.since.max(self.disturbed_at).max(watch.blocked_until).max(slave.started);
+        (is_up && is_taken && !self.is_opening(talk, number, slave)).then_some(since.max(self.began))
+    }
+}
+
+/// How long a slave that does not answer, or an exchange, is not asked.
+fn wait(timeout: Duration, failures: u32) -> Duration {
+    timeout.saturating_mul(1 << failures.min(6)).min(LONGEST_WAIT.max(timeout.saturating_mul(2)))
+}
+
+trait Half {
+    fn half(self) -> Self;
+}
+
+impl Half for Duration {
+    fn half(self) -> Self {
+        Self::from_micros(self.as_micros() / 2)
+    }
+}
+
+/// What the file says of own bytes.
+fn known(echo: Echo) -> Option<bool> {
+    match echo {
+        Echo::Yes => Some(true),
+        Echo::No => Some(false),
+        Echo::Auto => None,
     }
 }
 

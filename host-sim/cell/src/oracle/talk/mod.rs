@@ -12,14 +12,14 @@ pub(super) mod truth;
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::can::CanFrame;
 
-use self::line::TalkWatch;
-use self::spec::{RowSpec, Seen, TalkSpec};
+use self::line::{Ended, TalkWatch};
+use self::spec::{Kind, RowSpec, Seen, TalkSpec};
 use super::device::{Look, look};
 use super::downward::Downward;
-use super::field::Verdict;
+use super::field::{Accepted, Verdict};
 use super::gateway::Leaving;
-use super::spec::PortSpec;
-use super::upward::Wrong;
+use super::spec::{Frame, PortSpec};
+use super::upward::{Upward, Wrong};
 use super::{Invariant, Oracle};
 use crate::SlaveDone;
 
@@ -44,7 +44,7 @@ impl Oracle {
             if watch.line.held.is_empty() {
                 return;
             }
-            match watch.talk.see(port, talk, &watch.line.held) {
+            match watch.talk.see(port, talk, &watch.line.held, now) {
                 Seen::Begins { .. } => return,
                 Seen::No => watch.line.drop_one(),
                 Seen::Echo(len) => {
@@ -61,17 +61,35 @@ impl Oracle {
                     watch.line.take_front(len);
                     verdicts.push(Verdict::OtherDevice);
                 }
+                Seen::ReplyOrEcho(len) => {
+                    watch.line.take_front(len);
+                    watch.talk.heard_reply_or_echo();
+                }
+                Seen::Late(len, row) => {
+                    watch.line.take_front(len);
+                    let started = watch.talk.came_late(talk, row, now);
+                    self.started(nth, started);
+                }
+                Seen::Ambiguous(len) => {
+                    watch.line.take_front(len);
+                    let started = watch.talk.came_ambiguous(talk, now);
+                    self.started(nth, started);
+                }
                 Seen::Unasked(len, frame) => {
                     let whole = watch.line.take_front(len);
                     verdicts.push(watch.line.judge(&port.inputs[frame], frame, &whole));
+                    let started = heard_unasked(&mut watch.talk, talk, frame, now);
+                    self.started(nth, started);
                 }
                 Seen::Refusal(len) => {
                     let refusal = watch.line.take_front(len);
-                    self.answered(nth, &refusal, true, now);
+                    let is_modbus = watch.talk.awaits(talk).is_some_and(|(row, _)| row.frames.is_none());
+                    let ended = Ended::refused(refusal.get(2).copied().unwrap_or(0), is_modbus);
+                    self.answered(nth, &refusal, ended, now);
                 }
                 Seen::Reply(len) => {
                     let reply = watch.line.take_front(len);
-                    verdicts.extend(self.answered(nth, &reply, false, now));
+                    verdicts.extend(self.answered(nth, &reply, Ended::Good, now));
                 }
             }
         }
@@ -88,37 +106,72 @@ impl Oracle {
         let is_it = |own: &super::spec::Frame| {
             own.id == Some(frame.id()) && look(own, frame.data()) == Look::Frame(frame.data().len())
         };
-        let awaited = watch.talk.awaits(talk).and_then(|row| row.frames.as_ref());
-        let is_reply = awaited.and_then(|frames| frames.reply.as_ref()).is_some_and(is_it);
-        let is_refusal = awaited.and_then(|frames| frames.refusal.as_ref()).is_some_and(is_it);
-        if is_reply || is_refusal {
-            let verdict = self.answered(nth, frame.data(), !is_reply, now);
-            return self.take(nth, verdict, now);
+        let awaited = watch.talk.awaits(talk);
+        let frames = awaited.and_then(|(row, _)| row.frames.as_ref());
+        let is_reply = frames.and_then(|frames| frames.reply.as_ref()).is_some_and(is_it);
+        let is_refusal = frames.and_then(|frames| frames.refusal.as_ref()).is_some_and(is_it)
+            || awaited.is_some_and(|(row, request)| row.is_abort(request, frame.id(), frame.data()));
+        let is_answer = |row: &RowSpec| {
+            let frames = row.frames.as_ref().filter(|frames| frames.is_asked);
+            frames.is_some_and(|frames| frames.reply.iter().chain(&frames.refusal).any(is_it))
+        };
+        let late = watch.talk.late_of(talk, is_answer, now).filter(|_| !is_reply);
+        match (is_reply || is_refusal, late) {
+            (true, None) => {
+                let ended = if is_reply { Ended::Good } else { Ended::Refused };
+                let verdict = self.answered(nth, frame.data(), ended, now);
+                return self.take(nth, verdict, now);
+            }
+            (true, Some(_)) => {
+                let started = watch.talk.came_ambiguous(talk, now);
+                return self.started(nth, started);
+            }
+            (false, Some(row)) => {
+                let started = watch.talk.came_late(talk, row, now);
+                return self.started(nth, started);
+            }
+            (false, None) => {}
         }
-        let answers = awaited.into_iter().flat_map(|frames| frames.reply.iter().chain(&frames.refusal));
+        let answers = frames.into_iter().flat_map(|frames| frames.reply.iter().chain(&frames.refusal));
         let answers = answers.map(|own| (usize::MAX, own));
         let unasked = talk.unasked.iter().map(|&unasked| (unasked, &port.inputs[unasked]));
+        let which = talk.unasked.iter().copied().find(|&unasked| is_it(&port.inputs[unasked]));
         let verdict = super::field::can_of(answers.chain(unasked), port.mode, &mut watch.line, frame);
+        if let (Ok(Verdict::Accepted(_)), Some(which)) = (&verdict, which) {
+            let started = heard_unasked(&mut watch.talk, talk, which, now);
+            self.started(nth, started);
+        }
         self.take_can(nth, verdict, now);
     }
 
+    /// The gateway knows that a slave has started.
+    fn started(&mut self, nth: usize, slave: Option<u8>) {
+        if let Some(slave) = slave {
+            self.truth.started(nth, slave);
+        }
+    }
+
     /// A device has answered; returns what becomes of its values.
-    fn answered(&mut self, nth: usize, reply: &[u8], is_refusal: bool, now: Instant) -> Option<Verdict> {
+    fn answered(&mut self, nth: usize, reply: &[u8], ended: Ended, now: Instant) -> Option<Verdict> {
         let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
         let talk = port.talk.as_ref()?;
-        let (began, waits) = (watch.talk.began, watch.talk.waits());
-        let flight = watch.talk.answered(talk, is_refusal, now)?;
+        let waits = watch.talk.waits();
+        let (flight, started) = watch.talk.answered(talk, ended, now)?;
         if waits && !port.is_can {
             watch.down.sent();
         }
         let row = &talk.rows[flight.row];
-        let result = self.truth.taken((nth, port), row, &flight, (reply, began), now);
-        let verdict = row.reply.filter(|_| !is_refusal).map(|frame| match row.frames {
+        let result = self.truth.taken((nth, port), row, &flight, reply, now);
+        let verdict = row.reply.filter(|_| ended == Ended::Good).map(|frame| match row.frames {
             Some(_) => watch.line.judge(&port.inputs[frame], frame, reply),
             None => watch.line.judge_data(&port.inputs[frame], frame, &reply[3..reply.len() - 2]),
         });
         self.judge(now, &[Invariant::Held], result);
-        verdict
+        self.started(nth, started);
+        verdict.map(|verdict| match verdict {
+            Verdict::Accepted(frame) => Verdict::Accepted(Accepted { asked: flight.timed_out, ..frame }),
+            other => other,
+        })
     }
 
     /// The gateway asks.
@@ -126,7 +179,7 @@ impl Oracle {
         let bytes = sent.bytes;
         let asked = |talk: &TalkSpec| talk.row_of((sent.id, sent.is_remote), bytes);
         let row = self.spec.ports[nth].talk.as_ref().and_then(asked);
-        if self.ports[nth].talk.repeats().is_some_and(|failed| row != Some(failed)) {
+        if self.ports[nth].talk.repeated_request().is_some_and(|failed| failed != bytes) {
             self.gives_up(nth, now);
         }
         let port = &self.spec.ports[nth];
@@ -152,12 +205,11 @@ impl Oracle {
         });
         watch.talk.hands_over(port, talk, (row, bytes), line, now)?;
         let asked = &talk.rows[row];
-        if let Some(request) = &asked.request {
+        // What an event says was decided when it happened.
+        if let Some(request) = asked.request.as_ref().filter(|_| asked.kind != Kind::Event) {
             let hidden = Downward::may_show_all(port, &self.up, asked.shown(), now);
             hidden.map_err(|hidden| hidden.wrong(&self.spec))?;
-            let data = asked.data_of(bytes);
-            let payload = if asked.frames.is_some() { request.payload_of(&data) } else { Some(&data[..]) };
-            if !payload.is_some_and(|payload| watch.down.agrees(request, &self.up, payload)) {
+            if !agrees(&watch.down, asked, request, &self.up, bytes) {
                 let what = format!("{}: the request does not have the newest values", line::name(asked));
                 return Err((Invariant::Shown, what));
             }
@@ -188,26 +240,33 @@ impl Oracle {
             Downward::may_show_all(&self.spec.ports[nth], &self.up, row.shown(), now).is_ok()
         });
         let waited = watch.talk.waits();
-        if let Some(slave) = watch.talk.tick(talk, watch.line.heard, now) {
-            self.truth.missed(nth, slave);
+        let started = watch.talk.tick(talk, watch.line.heard, now);
+        if let Some(slave) = started {
+            self.truth.started(nth, slave);
         }
         if waited && !watch.talk.waits() && !self.spec.ports[nth].is_can {
             watch.down.sent();
         }
     }
 
-    /// A request that is to be repeated has failed if its values cannot be shown any more. Returns whether
-    /// it is given up.
+    /// A request that is to be repeated has failed if its values cannot be shown any more, or have changed. Returns
+    /// whether it is given up.
     fn gives_up(&mut self, nth: usize, now: Instant) -> bool {
         let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
         let Some((talk, failed)) = port.talk.as_ref().zip(watch.talk.repeats()) else { return false };
-        let shown = talk.rows[failed].shown();
-        if Downward::may_show_all(port, &self.up, shown, now).is_ok() {
+        let row = &talk.rows[failed];
+        let is_same = |request: &[u8]| {
+            row.request.as_ref().is_none_or(|own| agrees(&watch.down, row, own, &self.up, request))
+        };
+        let is_event = row.kind == Kind::Event;
+        if is_event
+            || Downward::may_show_all(port, &self.up, row.shown(), now).is_ok()
+                && watch.talk.repeated_request().is_some_and(is_same)
+        {
             return false;
         }
-        if let Some(slave) = watch.talk.is_not_repeated(talk, now) {
-            self.truth.missed(nth, slave);
-        }
+        let started = watch.talk.is_not_repeated(talk, now);
+        self.started(nth, started);
         true
     }
 
@@ -300,6 +359,19 @@ impl Oracle {
             self.judge(now, &[], result.map(drop));
         }
     }
+}
+
+/// A frame came that nobody asked for: a sign of life if it is of an exchange.
+fn heard_unasked(watch: &mut TalkWatch, talk: &TalkSpec, frame: usize, now: Instant) -> Option<u8> {
+    let row = talk.rows.iter().find(|row| row.reply == Some(frame))?;
+    watch.heard(talk, row.slave, now)
+}
+
+/// Whether a request has the newest values.
+fn agrees(down: &Downward, row: &RowSpec, request: &Frame, up: &Upward, bytes: &[u8]) -> bool {
+    let data = row.data_of(bytes);
+    let payload = if row.frames.is_some() { request.payload_of(&data) } else { Some(&data[..]) };
+    payload.is_some_and(|payload| down.agrees(request, up, payload))
 }
 
 /// Looks for exchanges that are to be asked at the start, and whose values cannot be shown.

@@ -25,8 +25,10 @@ pub(in crate::oracle) struct TalkSpec {
     pub silence: Duration,
     /// Time of all rows if nobody answers, each once.
     pub all_costs: Duration,
-    /// Own bytes come back.
-    pub has_echo: bool,
+    /// Whether own bytes come back.
+    pub echo: Echo,
+    /// A slave that was not heard for so long has started.
+    pub absent: Duration,
     /// The input frames of the port that come without being asked for.
     pub unasked: Vec<usize>,
 }
@@ -50,8 +52,17 @@ pub(in crate::oracle) struct RowSpec {
     pub at_start: bool,
     pub on_change: bool,
     pub rising: Option<(SysVar, u8)>,
+    pub kind: Kind,
     pub timeout: Duration,
+    /// Repetitions of a state, and of an event.
     pub retries: u8,
+    pub event_retries: u8,
+    /// How long after its bit has risen it may be sent.
+    pub trigger: Duration,
+    /// How long after a request its reply may come.
+    pub late: Duration,
+    /// The exchanges of its slave, it among them, whose replies look like its own.
+    pub alike: Vec<usize>,
     pub pause: Duration,
     /// The input frame of the port that the data of its reply is.
     pub reply: Option<usize>,
@@ -59,6 +70,17 @@ pub(in crate::oracle) struct RowSpec {
     pub request: Option<Frame>,
     /// Bytes before the data.
     head: Vec<u8>,
+}
+
+/// Why an exchange is asked.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(in crate::oracle) enum Kind {
+    /// A bit rises.
+    Event,
+    /// Its slave starts, and it may do something then.
+    Start,
+    /// Something is to be known, or to be as the controller has it.
+    State,
 }
 
 /// What bytes are while a reply is awaited.
@@ -74,6 +96,12 @@ pub(in crate::oracle) enum Seen {
     Echo(usize),
     Reply(usize),
     Refusal(usize),
+    /// The reply, or the request itself.
+    ReplyOrEcho(usize),
+    /// A reply to an earlier request of another exchange: its length, and which exchange.
+    Late(usize, usize),
+    /// A refusal of one of several requests.
+    Ambiguous(usize),
     /// A frame that comes unasked: its length, and which input frame of the port it is.
     Unasked(usize, usize),
     /// A frame of another device.
@@ -87,14 +115,14 @@ impl TalkSpec {
     pub(in crate::oracle) fn new(
         config: &GatewayConfig,
         recipe: &Recipe,
-        (line, silence): (Option<&Rs485>, Duration),
+        (port, line, silence): (&Port, Option<&Rs485>, Duration),
         inputs: &mut Vec<Frame>,
     ) -> Option<Self> {
         let mut rows: Vec<RowSpec> = Vec::new();
         let mut all_costs = Duration::ZERO;
         let mut unasked: Vec<usize> = (0..inputs.len()).collect();
         for exchange in config.view().exchanges_of(recipe) {
-            let mut row = RowSpec::new(rows.len(), exchange);
+            let mut row = RowSpec::new(rows.len(), exchange, port.timeout);
             match exchange.talk {
                 Talk::Rtu { operation, written, read } => {
                     let data = |fields: &[FieldSpec]| {
@@ -132,8 +160,23 @@ impl TalkSpec {
             all_costs = all_costs + on_line + row.timeout + row.pause + silence;
             rows.push(row);
         }
-        let has_echo = line.is_some_and(|line| line.echo == Echo::Yes);
-        (!rows.is_empty()).then_some(Self { rows, silence, all_costs, has_echo, unasked })
+        let is_alike = |one: &RowSpec, other: &RowSpec| {
+            let is_same = one.nth == other.nth || one.is_answered_like(other);
+            one.slave == other.slave && one.is_answered() && other.is_answered() && is_same
+        };
+        let alike: Vec<Vec<usize>> = rows
+            .iter()
+            .map(|row| rows.iter().filter(|other| is_alike(row, other)).map(|other| other.nth).collect())
+            .collect();
+        rows.iter_mut().zip(alike).for_each(|(row, alike)| row.alike = alike);
+        let echo = line.map_or(Echo::No, |line| line.echo);
+        let absent = port.absent;
+        (!rows.is_empty()).then_some(Self { rows, silence, all_costs, echo, absent, unasked })
+    }
+
+    /// The shortest timeout of the exchanges with a slave.
+    pub(super) fn shortest(&self, slave: u8) -> Duration {
+        self.rows_of(slave).map(|(_, row)| row.timeout).min().unwrap_or_default()
     }
 
     /// The exchange of a request; `id` is that of a CAN frame, and `is_remote` says that it has no data.
@@ -169,8 +212,20 @@ impl TalkSpec {
 }
 
 impl RowSpec {
-    fn new(nth: usize, exchange: &Exchange) -> Self {
+    fn new(nth: usize, exchange: &Exchange, port_timeout: Duration) -> Self {
+        let when = &exchange.when;
+        let reads = matches!(exchange.talk, Talk::Rtu { written, .. } if written.len == 0);
+        let kind = match (when.rising, when.every.is_some() || when.change) {
+            (Some(_), _) => Kind::Event,
+            (None, false) if when.start && !reads => Kind::Start,
+            _ => Kind::State,
+        };
         Self {
+            kind,
+            event_retries: exchange.event_retries,
+            trigger: exchange.trigger.unwrap_or(port_timeout.min(Duration::from_secs(1))),
+            late: exchange.late.unwrap_or(exchange.timeout.saturating_mul(3).max(Duration::from_secs(1))),
+            alike: Vec::new(),
             nth,
             slave: exchange.peer,
             frames: None,
@@ -196,6 +251,21 @@ impl RowSpec {
         match &self.frames {
             Some(frames) => frames.is_asked && frames.reply.is_some(),
             None => self.slave != 0,
+        }
+    }
+
+    /// Whether nothing in a good reply tells it from one to the other exchange.
+    fn is_answered_like(&self, other: &Self) -> bool {
+        match (&self.frames, &other.frames) {
+            (Some(one), Some(other)) => match (&one.reply, &other.reply) {
+                (Some(one), Some(other)) => device::can_be_the_same(one, other),
+                _ => false,
+            },
+            _ => {
+                let is_same = self.function == other.function && self.reply_data() == other.reply_data();
+                let is_there = (self.address, self.count) == (other.address, other.count);
+                is_same && (self.reply_data().is_some() || is_there)
+            }
         }
     }
 
@@ -325,6 +395,29 @@ impl RowSpec {
         self.request.iter().flat_map(|request| request.shown.iter().copied())
     }
 
+    /// The same of a reply that comes too late, if `request` was the newest one; a wrong checksum is nothing.
+    pub(super) fn see_late(&self, request: Option<&[u8]>, bytes: &[u8]) -> Seen {
+        match (&self.frames, request) {
+            (Some(_), _) => self.see(&[], bytes),
+            (None, None) => Seen::No,
+            (None, Some(request)) => match self.see(request, bytes) {
+                Seen::Wrong(_) => Seen::No,
+                seen => seen,
+            },
+        }
+    }
+
+    /// Whether a frame on a bus is the abort of this SDO request, where the file has no other refusal.
+    pub(super) fn is_abort(&self, request: &[u8], id: CanId, frame: &[u8]) -> bool {
+        let Some(FramesSpec { reply: Some(reply), refusal: None, .. }) = &self.frames else { return false };
+        let is_sdo = match (self.request.as_ref().and_then(|own| own.id), reply.id) {
+            (Some(CanId::Standard(asked @ 0x601..=0x67F)), Some(CanId::Standard(own))) => asked == own + 0x80,
+            _ => false,
+        };
+        let is_whole = frame.len() == 8 && request.len() == 8;
+        is_sdo && Some(id) == reply.id && is_whole && frame[0] == 0x80 && frame[1..4] == request[1..4]
+    }
+
     /// What the bytes that came are, if they follow this request.
     pub(super) fn see(&self, request: &[u8], bytes: &[u8]) -> Seen {
         if let Some(frames) = &self.frames {
@@ -340,6 +433,7 @@ impl RowSpec {
         }
         let head = match self.reply_data() {
             Some(len) => vec![self.slave, self.function, len as u8],
+            // One register or coil is in the reply with its value.
             None => request[..6].to_vec(),
         };
         let seen = bytes.len().min(head.len());
@@ -377,6 +471,27 @@ pub(in crate::oracle) fn unmodelled(config: &GatewayConfig) -> Option<&'static s
         FieldSpec::Mapped(_) => true,
         _ => false,
     };
+    let is_dialogue = |exchange: &Exchange| {
+        let is_mixed = exchange.when.rising.is_some()
+            && (exchange.when.every.is_some() || exchange.when.change || exchange.when.start);
+        exchange.stop
+            || exchange.follow.is_some()
+            || is_mixed
+            || exchange.outcome.variables().next().is_some()
+    };
+    let is_step = |recipe: &Recipe| {
+        let exchanges = config.view().exchanges_of(recipe);
+        exchanges.iter().enumerate().any(|(nth, own)| {
+            let is_same = |other: &Exchange| (other.peer, other.when.rising) == (own.peer, own.when.rising);
+            own.when.rising.is_some() && exchanges[..nth].iter().any(is_same)
+        })
+    };
+    if config.exchanges.iter().any(is_dialogue) || config.recipes.iter().any(is_step) {
+        return Some(
+            "a soak cannot judge stops, dialogues, outcomes and events that are states as well of other cells \
+             than its own",
+        );
+    }
     if requests.flat_map(|span| span.of(&config.fields)).any(may_refuse) {
         return Some("a soak cannot judge requests with values that are not sent");
     }

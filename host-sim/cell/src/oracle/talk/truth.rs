@@ -12,7 +12,7 @@ use proto_core::sysvar::{ModbusPlace, SysVar};
 use proto_core::time::{Duration, Instant};
 
 use super::line::{Flight, name};
-use super::spec::{RowSpec, TalkSpec};
+use super::spec::{Kind, RowSpec, TalkSpec};
 use crate::oracle::Invariant;
 use crate::oracle::device::{self, Look};
 use crate::oracle::field::{LineWatch, Verdict, as_number, show};
@@ -51,7 +51,7 @@ struct LineTruth {
     took: BTreeMap<usize, Vec<u8>>,
     /// What was written to each slave: coils or registers, and where.
     memory: BTreeMap<(u8, bool, u16), u16>,
-    /// Slaves that have forgotten what was written, and have not missed a request since.
+    /// Slaves that have forgotten what was written, of which the gateway does not know that.
     forgot: BTreeSet<u8>,
     /// The values that each variable had at its slave.
     held: BTreeMap<usize, VecDeque<(Instant, Raw)>>,
@@ -126,8 +126,8 @@ impl Truth {
         self.lines.entry(port).or_default().garbled = Some(now);
     }
 
-    /// A request to a slave has failed for good: the gateway knows that the slave was away.
-    pub(super) fn missed(&mut self, port: usize, slave: u8) {
+    /// The gateway knows that the slave has started.
+    pub(super) fn started(&mut self, port: usize, slave: u8) {
         if let Some(line) = self.lines.get_mut(&port) {
             line.forgot.remove(&slave);
         }
@@ -166,6 +166,7 @@ impl Truth {
         let slave = done.slave;
         self.forget_old(now);
         match done.what {
+            Done::Acted(_) => (0, Ok(())),
             Done::Forgot => {
                 let line = self.lines.entry(nth).or_default();
                 line.memory.retain(|(of, ..), _| *of != slave);
@@ -277,7 +278,11 @@ impl Truth {
         let data = row.data_from(values);
         // Without a limit, a value must have been there at any time that is remembered.
         let lag = match port.stops_when_stale {
-            true => port.stale_after + way_of(spec, row) + stalled.min(STALL) + STALL,
+            true => {
+                // An event has the values of the moment at which it happened.
+                let waited = if row.kind == Kind::Event { row.trigger } else { Duration::ZERO };
+                port.stale_after + way_of(spec, row) + waited + stalled.min(STALL) + STALL
+            }
             false => REMEMBERED,
         };
         let from = asked - lag;
@@ -324,7 +329,7 @@ impl Truth {
         port: (usize, &PortSpec),
         row: &RowSpec,
         flight: &Flight,
-        (reply, began): (&[u8], Instant),
+        reply: &[u8],
         now: Instant,
     ) -> Result<(), Wrong> {
         let (nth, spec) = port;
@@ -343,9 +348,7 @@ impl Truth {
         if line.answers.iter().any(|answer| is_it(&answer)) {
             return Ok(());
         }
-        // Two timeouts after the port came up, nothing can be left of what was asked before.
-        let settled = began + row.timeout.saturating_mul(4);
-        if self.is_excused(nth, flight.began) || now < settled {
+        if self.is_excused(nth, flight.began) {
             for (var, raw) in values_of(spec, row, reply) {
                 self.holds(nth, var, raw, now);
             }

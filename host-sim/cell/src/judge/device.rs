@@ -1,0 +1,161 @@
+//! What all devices have in common: their log, their mood, their values, and replies on their way.
+
+use proto_core::time::{Duration, Instant};
+
+use super::mood::{Mood, Moods};
+use super::{Act, Order};
+use crate::Rng;
+use crate::device::{Done, SlaveDone};
+
+/// A device without its protocol.
+#[derive(Debug)]
+pub(super) struct Machine {
+    pub rng: Rng,
+    moods: Moods,
+    timeout: Duration,
+    values: [u16; 3],
+    counts: [u8; 3],
+    /// Replies that are to leave: when, their bytes, and the entry in the log.
+    leaving: Vec<(Instant, Vec<u8>, Act)>,
+    log: Vec<Act>,
+    /// On a bus, what is damaged is lost.
+    is_on_bus: bool,
+    /// What it was asked last.
+    order: Option<Order>,
+}
+
+/// What becomes of an order.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Answer {
+    Good,
+    Refused(u8),
+}
+
+impl Machine {
+    pub(super) fn new(rng: Rng, start: Instant, timeout: Duration, is_on_bus: bool) -> Self {
+        Self {
+            rng,
+            moods: Moods::new(start),
+            timeout,
+            values: [0; 3],
+            counts: [0; 3],
+            leaving: Vec::new(),
+            log: Vec::new(),
+            is_on_bus,
+            order: None,
+        }
+    }
+
+    pub(super) fn is_on(&self) -> bool {
+        self.moods.now != Mood::Off
+    }
+
+    /// A question or an order of its own was received.
+    pub(super) fn heard(&mut self, order: Option<Order>) {
+        self.order = order;
+        self.log.push(Act::Heard(order));
+    }
+
+    /// It is given an order, and carries it out or does not. `codes` are those that mean something of their own.
+    pub(super) fn order(&mut self, order: Order, values: Vec<u32>, has_codes: bool) -> Answer {
+        self.heard(Some(order));
+        if self.moods.now != Mood::Refusing || self.rng.below(2) == 0 {
+            self.log.push(Act::Did(order, values));
+            return Answer::Good;
+        }
+        let code = match has_codes {
+            true => [1, 2, 3, 4, 5, 5, 6, 6, 6, 7, 8, 10, 11][self.rng.below(13) as usize],
+            false => 1,
+        };
+        let does = match code {
+            // Accepted: it takes its time.
+            5 if has_codes => true,
+            // It failed on the way, or somebody between did.
+            4 | 8 | 10 | 11 => self.rng.below(2) == 0,
+            _ => false,
+        };
+        if does {
+            self.log.push(Act::Did(order, values));
+        }
+        self.log.push(Act::Refused(order, code));
+        Answer::Refused(code)
+    }
+
+    /// One of its values, which says in its high byte which one it is.
+    pub(super) fn value(&mut self, nth: usize) -> u16 {
+        self.heard(None);
+        self.renew(nth)
+    }
+
+    /// The same without a question.
+    pub(super) fn renew(&mut self, nth: usize) -> u16 {
+        if self.rng.below(2) == 0 || self.values[nth] == 0 {
+            self.counts[nth] = self.counts[nth].wrapping_add(1);
+            self.values[nth] = (0x41 + nth as u16) << 8 | u16::from(self.counts[nth]);
+            self.log.push(Act::Holds(nth, self.values[nth]));
+        }
+        self.values[nth]
+    }
+
+    /// A reply of its own leaves, as its mood is. `tells`: it is not the same as the request.
+    pub(super) fn reply(&mut self, mut bytes: Vec<u8>, tells: bool, now: Instant) {
+        let delay = self.moods.delay(self.timeout, &mut self.rng);
+        let happens = self.rng.below(2) == 0;
+        let in_time = delay + WAY < self.timeout;
+        let mut is_whole = true;
+        let lost = Act::Replied { order: self.order, tells, is_whole: false, in_time: false };
+        match self.moods.now {
+            Mood::Losing if happens => return self.log.push(lost),
+            Mood::Damaged if happens => {
+                if self.is_on_bus {
+                    return self.log.push(lost);
+                }
+                let at = self.rng.below(bytes.len() as u64) as usize;
+                bytes[at] ^= 1 << self.rng.below(8);
+                is_whole = false;
+            }
+            _ => {}
+        }
+        let left = Act::Replied { order: self.order, tells, is_whole, in_time: is_whole && in_time };
+        self.leaving.push((now + delay, bytes, left));
+    }
+
+    pub(super) fn deadline(&self) -> Instant {
+        self.leaving.iter().map(|(at, ..)| *at).min().unwrap_or(Instant::NEVER).min(self.moods.ends)
+    }
+
+    /// What leaves now; and whether the device has lost its power.
+    pub(super) fn poll(&mut self, now: Instant) -> (Vec<Vec<u8>>, bool) {
+        let mut has_lost_power = false;
+        if now >= self.moods.ends {
+            let was_on = self.is_on();
+            self.moods.next(now, &mut self.rng);
+            match (was_on, self.is_on()) {
+                (true, false) => {
+                    has_lost_power = true;
+                    self.leaving.clear();
+                    self.log.push(Act::PowerOff);
+                }
+                (false, true) => self.log.push(Act::PowerOn),
+                _ => {}
+            }
+        }
+        let mut leave = Vec::new();
+        while let Some(nth) = self.leaving.iter().position(|(at, ..)| *at <= now) {
+            let (_, bytes, left) = self.leaving.remove(nth);
+            self.log.push(left);
+            leave.push(bytes);
+        }
+        (leave, has_lost_power)
+    }
+
+    pub(super) fn take_done(&mut self) -> Vec<SlaveDone> {
+        std::mem::take(&mut self.log)
+            .into_iter()
+            .map(|act| SlaveDone { slave: 0, what: Done::Acted(act) })
+            .collect()
+    }
+}
+
+/// More than a reply is on its way: on the line, and in an adapter that gathers bytes.
+const WAY: Duration = Duration::from_millis(25);

@@ -1,0 +1,604 @@
+//! What devices carried out, judged by two logs: the device's own, and the robot's (docs/cell.md section 5).
+//!
+//! In: what each device did and when, as it decoded the requests by itself; the controller's registers whenever they
+//! change, and which of them it has served to whom. Out: violations. Knows neither the engine nor what the
+//! configuration became: what a cell promises is written down in [`Rules`] by hand. Of the gateway it knows when it
+//! starts and when it is not called, and of the line when it was disturbed, because both are nobody's fault.
+
+mod axis;
+mod device;
+mod drive;
+mod gripper;
+mod mood;
+mod program;
+mod rfid;
+mod robot;
+mod rtu;
+mod rules;
+#[cfg(test)]
+mod tests;
+
+use std::collections::{BTreeMap, VecDeque};
+
+use proto_core::config::GatewayConfig;
+use proto_core::sysvar::SysVar;
+use proto_core::time::{Duration, Instant};
+
+pub(crate) use program::Program;
+pub(crate) use rules::Rules;
+
+use crate::{Cell, Invariant, Rng, Violation};
+use robot::Robot;
+use rules::{MOVE_BIT, STOP_BIT};
+
+/// What a device did, as its own log has it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Act {
+    /// It received a whole request of its own: an order, or a question.
+    Heard(Option<Order>),
+    /// It carried out an order with these values.
+    Did(Order, Vec<u32>),
+    /// It refused an order with a code.
+    Refused(Order, u8),
+    /// A reply left, or did not although it should.
+    Replied {
+        /// The order that it is a reply to, if it is one.
+        order: Option<Order>,
+        /// It is not the same as the request, so nobody takes it for an echo.
+        tells: bool,
+        /// It left as it should be.
+        is_whole: bool,
+        /// And it was at the gateway in time for sure.
+        in_time: bool,
+    },
+    /// The value of this number is this from now on.
+    Holds(usize, u16),
+    /// It lost its power, and with it what it was told.
+    PowerOff,
+    /// It is there again.
+    PowerOn,
+}
+
+/// What a device can be ordered to do.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Order {
+    /// To move: an event.
+    Move,
+    /// The second step of a dialogue that began with [`Self::Move`].
+    Step,
+    /// To stop.
+    Stop,
+    /// What it is told at its start, and what moves it: homing, a mode.
+    Start,
+    /// A value that it keeps.
+    Keep,
+}
+
+/// Judges one cell.
+#[derive(Debug)]
+pub(crate) struct Judge {
+    rules: Rules,
+    robot: Robot,
+    /// What its values were, each since when.
+    held: Vec<VecDeque<(Instant, u16)>>,
+    /// What the robot's registers had of them when they were looked at.
+    shown: Vec<Option<u16>>,
+    /// The events that were carried out, by the instant of the rise.
+    moved: VecDeque<Moved>,
+    /// A stop that is to be carried out.
+    stop: Option<Pending>,
+    stop_heard: Option<Instant>,
+    /// How often it may be started.
+    starts: u32,
+    began: Instant,
+    /// When a reply that is no echo last left in time on an undisturbed line.
+    replied: Option<Instant>,
+    /// What it was told to keep, and when it was refused last with which code.
+    kept: Option<u32>,
+    refused: Option<(Instant, u8)>,
+    is_on: bool,
+    /// When something last went wrong with the line or the device.
+    calm_since: Instant,
+    /// When that, or a reply to what it is to keep was missing, late or damaged; or no reply came in time.
+    trouble: Instant,
+    /// When a reply last left in time.
+    in_time: Instant,
+    is_disturbed: bool,
+    outcomes: BTreeMap<&'static str, u64>,
+    counted: BTreeMap<&'static str, u32>,
+    checks: BTreeMap<Invariant, u64>,
+    violation: Option<Violation>,
+}
+
+/// An event that was carried out.
+#[derive(Debug, Clone, Copy)]
+struct Moved {
+    at: Instant,
+    /// From when its values are.
+    from: Instant,
+    /// When a good reply to it left.
+    replied: Option<Instant>,
+    /// The step behind it was carried out.
+    stepped: bool,
+}
+
+/// A stop that the gateway knows of.
+#[derive(Debug, Clone, Copy)]
+struct Pending {
+    /// When the controller answered with it, and when the gateway had the answer.
+    at: Instant,
+    known: Option<Instant>,
+    conn: u64,
+    /// Other requests that the device heard since.
+    others: u32,
+}
+
+impl Judge {
+    pub(crate) fn new(rules: Rules, now: Instant) -> Self {
+        let values = rules.values.len();
+        let mut judge = Self {
+            robot: Robot::new(&rules),
+            rules,
+            held: vec![VecDeque::new(); values],
+            shown: vec![None; values],
+            moved: VecDeque::new(),
+            stop: None,
+            stop_heard: None,
+            starts: 0,
+            began: now,
+            replied: None,
+            kept: None,
+            refused: None,
+            is_on: true,
+            calm_since: now,
+            trouble: now,
+            in_time: now,
+            is_disturbed: false,
+            outcomes: BTreeMap::new(),
+            counted: BTreeMap::new(),
+            checks: BTreeMap::new(),
+            violation: None,
+        };
+        judge.port_begins(now);
+        judge
+    }
+
+    pub(crate) fn violation(&self) -> Option<&Violation> {
+        self.violation.as_ref()
+    }
+
+    pub(crate) fn checks(&self) -> &BTreeMap<Invariant, u64> {
+        &self.checks
+    }
+
+    /// How often each outcome of an event was counted.
+    pub(crate) fn outcomes(&self) -> &BTreeMap<&'static str, u64> {
+        &self.outcomes
+    }
+
+    /// The gateway starts.
+    pub(crate) fn gateway_starts(&mut self, now: Instant) {
+        self.counted.clear();
+        self.robot.gateway_starts();
+        self.stop = None;
+        self.port_begins(now);
+    }
+
+    /// The gateway's port is there, or there again.
+    pub(crate) fn port_begins(&mut self, now: Instant) {
+        (self.starts, self.began, self.replied) = (1, now, None);
+        self.disturbed(now);
+    }
+
+    /// The line, or the gateway's port, is disturbed at this instant.
+    pub(crate) fn disturbed(&mut self, now: Instant) {
+        (self.calm_since, self.trouble) = (now, now);
+    }
+
+    /// The controller's variables as they are now.
+    pub(crate) fn sees_controller(&mut self, image: &[u8], now: Instant) {
+        if self.violation.is_some() {
+            return;
+        }
+        self.robot.sees(image, now);
+        for nth in 0..self.rules.values.len() {
+            let value = robot::word(image, self.rules.values[nth]);
+            if self.shown[nth].replace(value) == Some(value) {
+                continue;
+            }
+            if self.shown[nth].is_some() && value != 0 && value != self.rules.safe {
+                let result = self.was_held(nth, value, now);
+                self.judge(Invariant::DeviceValues, result, now);
+            }
+        }
+    }
+
+    /// Bytes of a Modbus connection arrived at the controller.
+    pub(crate) fn asked(&mut self, conn: u64, bytes: &[u8], now: Instant) {
+        self.robot.asked(conn, bytes, now);
+    }
+
+    /// The controller sends bytes on a connection.
+    pub(crate) fn answered(&mut self, conn: u64, bytes: &[u8], now: Instant) {
+        for at in self.robot.answered(conn, bytes, now, self.stop_heard) {
+            // Until the device has it, each stop is the newest one.
+            self.stop = Some(Pending { at, known: None, conn, others: 0 });
+        }
+    }
+
+    /// The device did something.
+    pub(crate) fn did(&mut self, act: Act, now: Instant) {
+        if self.violation.is_some() {
+            return;
+        }
+        match act {
+            Act::Heard(Some(Order::Stop)) => {
+                self.stop_heard = Some(now);
+                self.stop = None;
+            }
+            Act::Heard(_) => self.hears_another(now),
+            Act::Did(Order::Move, values) => {
+                let result = self.moves(&values, now);
+                self.judge(Invariant::EventsOnce, result, now);
+            }
+            Act::Did(Order::Step, values) => {
+                let result = self.steps(&values, now);
+                self.judge(Invariant::EventsOnce, result, now);
+            }
+            Act::Did(Order::Stop, _) => {}
+            Act::Did(Order::Start, _) => {
+                let result = match self.starts.checked_sub(1) {
+                    Some(left) => {
+                        self.starts = left;
+                        Ok(())
+                    }
+                    None => Err("the device was started again, and nothing says that it has started".into()),
+                };
+                self.judge(Invariant::StartsOnce, result, now);
+            }
+            Act::Did(Order::Keep, values) => self.kept = values.first().copied(),
+            Act::Refused(Order::Keep, code) => self.refused = Some((now, code)),
+            Act::Refused(..) => {}
+            Act::Replied { order, tells, is_whole, in_time } => {
+                if order == Some(Order::Keep) && !in_time {
+                    self.trouble = now;
+                }
+                if in_time {
+                    self.in_time = now;
+                }
+                if let Some(moved) = self.moved.back_mut().filter(|moved| is_whole && moved.replied.is_none())
+                {
+                    moved.replied = Some(now);
+                }
+                self.replies(is_whole, in_time && tells, now);
+            }
+            Act::Holds(nth, value) => {
+                self.held[nth].push_back((now, value));
+                while self.held[nth].len() > 1 && now.saturating_since(self.held[nth][1].0) > REMEMBERED {
+                    self.held[nth].pop_front();
+                }
+            }
+            Act::PowerOff => {
+                (self.is_on, self.kept) = (false, None);
+                self.disturbed(now);
+            }
+            Act::PowerOn => {
+                self.is_on = true;
+                self.disturbed(now);
+            }
+        }
+    }
+
+    fn judge(&mut self, invariant: Invariant, result: Result<(), String>, now: Instant) {
+        *self.checks.entry(invariant).or_default() += 1;
+        if let (Err(what), None) = (result, &self.violation) {
+            self.violation = Some(Violation { invariant, at: now, what });
+        }
+    }
+
+    /// A value of the device reaches the robot.
+    fn was_held(&self, nth: usize, value: u16, now: Instant) -> Result<(), String> {
+        let since = now - self.rules.value_age;
+        let mut ends: Vec<Instant> = self.held[nth].iter().skip(1).map(|(at, _)| *at).collect();
+        ends.push(now);
+        let was = self.held[nth].iter().zip(ends).any(|((_, held), end)| *held == value && end >= since);
+        if was {
+            return Ok(());
+        }
+        let var = self.rules.values[nth];
+        Err(format!(
+            "{var} became {value:#06x}, which the device did not hold within {}",
+            self.rules.value_age
+        ))
+    }
+
+    /// The device carries out an event: the bit must have risen, just now, for no other.
+    fn moves(&mut self, values: &[u32], now: Instant) -> Result<(), String> {
+        let rules = &self.rules;
+        let found = self.robot.rise_for(rules, values, now)?;
+        if let Some(stop) = found.stop
+            && self.stop_heard.is_none_or(|heard| heard < stop)
+        {
+            let what = format!(
+                "it moved by a rise that was read {} after a stop that it has not heard of",
+                found.read.saturating_since(stop)
+            );
+            self.judge(Invariant::StopsFirst, Err(what), now);
+        }
+        *self.checks.entry(Invariant::StopsFirst).or_default() += 1;
+        self.moved.push_back(Moved { at: now, from: found.read, replied: None, stepped: false });
+        if self.moved.len() > MOVES {
+            self.moved.pop_front();
+        }
+        Ok(())
+    }
+
+    /// The second step of a dialogue: behind the first, whose reply left, with the values of then.
+    fn steps(&mut self, values: &[u32], now: Instant) -> Result<(), String> {
+        let Some((sources, trigger)) = self.rules.step.as_ref() else { return Ok(()) };
+        let Some(first) = self.moved.back_mut() else { return Err("a second step without a first".into()) };
+        let Some(replied) = first.replied else {
+            return Err("the second step was carried out, and no good reply to the first has left".into());
+        };
+        if std::mem::replace(&mut first.stepped, true) {
+            return Err("the second step was carried out twice".into());
+        }
+        let waited = now.saturating_since(replied);
+        if waited > *trigger + STALL + ON_THE_LINE {
+            return Err(format!("the second step was carried out {waited} after the first"));
+        }
+        let (from, until) = (first.from, first.at);
+        if !self.robot.had(sources, values, from, until) {
+            return Err(format!("the second step has {values:?}, which the robot did not have at the first"));
+        }
+        Ok(())
+    }
+
+    fn hears_another(&mut self, now: Instant) {
+        let grace = ON_THE_LINE;
+        let Some(stop) = &mut self.stop else { return };
+        if !stop.known.is_some_and(|known| now > known + grace) {
+            return;
+        }
+        stop.others += 1;
+        if stop.others > OTHERS {
+            let what = format!("it has heard {} other requests since it was to stop", stop.others);
+            self.judge(Invariant::StopsFirst, Err(what), now);
+        }
+    }
+
+    fn replies(&mut self, is_whole: bool, tells: bool, now: Instant) {
+        if self.is_disturbed || !is_whole {
+            return;
+        }
+        let was_away = match self.replied {
+            Some(before) => now.saturating_since(before) + SLACK >= self.rules.absent,
+            // Never heard: it was asked in vain at least twice.
+            None => now.saturating_since(self.began) + SLACK >= self.rules.first_failures,
+        };
+        if was_away {
+            self.starts = 1;
+        }
+        if tells {
+            self.replied = Some(now);
+        }
+    }
+
+    /// Called at intervals. `is_disturbed`: the line has noise or is cut, or the gateway is not called.
+    pub(crate) fn survey(&mut self, is_disturbed: bool, now: Instant) {
+        if self.violation.is_some() {
+            return;
+        }
+        self.is_disturbed = is_disturbed;
+        if is_disturbed {
+            self.disturbed(now);
+        }
+        if let Some(stop) = &mut self.stop {
+            stop.known = stop.known.or_else(|| self.robot.taken(stop.conn, stop.at));
+            let since = stop.known.map(|known| known.max(self.calm_since));
+            if let Some(since) = since.filter(|_| self.is_on) {
+                let waits = now.saturating_since(since);
+                let result = match waits > STOPS_WITHIN {
+                    true => Err(format!("it was to stop, and has not heard of it for {waits}")),
+                    false => Ok(()),
+                };
+                self.judge(Invariant::StopsFirst, result, now);
+            }
+        }
+        if now.saturating_since(self.in_time) > AWAY {
+            self.trouble = now;
+        }
+        if let Some(result) = self.keeps(now) {
+            self.judge(Invariant::DeviceKeeps, result, now);
+        }
+        self.robot.forget(now);
+    }
+
+    /// Whether the device has what the robot has had for long, if nothing speaks against it.
+    fn keeps(&self, now: Instant) -> Option<Result<(), String>> {
+        let var = self.rules.keeps?;
+        let kept = self.kept.filter(|_| self.is_on)?;
+        let (since, value) = self.robot.rests(var)?;
+        let mut since = since.max(self.trouble);
+        if let Some((at, code)) = self.refused {
+            // A final refusal ends it until the value changes.
+            if at >= since && !matches!(code, 4 | 6 | 8 | 10 | 11) {
+                return None;
+            }
+            since = since.max(at);
+        }
+        if now.saturating_since(since) < KEEPS_WITHIN || !self.robot.is_read_steadily(var, since, now) {
+            return None;
+        }
+        Some(match kept == u32::from(value) {
+            true => Ok(()),
+            false => {
+                Err(format!("it keeps {kept}; {var} has been {value} for {}", now.saturating_since(since)))
+            }
+        })
+    }
+
+    /// Takes the gateway's counters of outcomes.
+    pub(crate) fn count(&mut self, counters: impl IntoIterator<Item = (&'static str, u32)>) {
+        for (name, count) in counters {
+            let before = self.counted.insert(name, count).unwrap_or(0);
+            *self.outcomes.entry(name).or_default() += u64::from(count.saturating_sub(before));
+        }
+    }
+}
+
+impl Cell {
+    /// Judges from now on what the device of a cell carries out, by its own log and the robot's. Time stops after the
+    /// first violation. Call it before time advances.
+    pub(crate) fn judge_device(&mut self, rules: Rules) {
+        self.judge = Some(Box::new(Judge::new(rules, self.now)));
+        self.queue.push(self.now, crate::due::Due::Survey);
+    }
+
+    /// How often each outcome of an event was counted.
+    pub fn outcomes(&self) -> BTreeMap<&'static str, u64> {
+        self.judge.as_ref().map(|judge| judge.outcomes().clone()).unwrap_or_default()
+    }
+
+    /// The judge looks at the line, and takes the gateway's counters.
+    pub(crate) fn survey_device(&mut self) {
+        let is_disturbed = self.is_asleep() || self.is_line_disturbed();
+        self.count_outcomes();
+        let now = self.now;
+        if let Some(judge) = &mut self.judge {
+            judge.survey(is_disturbed, now);
+        }
+    }
+
+    fn is_line_disturbed(&self) -> bool {
+        self.lines.iter().any(|line| line.noise_ppm > 0 || !line.connected || !line.is_plugged)
+            || self.buses.iter().any(|bus| bus.loss_ppm > 0 || !bus.connected || bus.is_off)
+    }
+
+    /// Before the gateway restarts, and at intervals.
+    pub(crate) fn count_outcomes(&mut self) {
+        let Some(judge) = &mut self.judge else { return };
+        let mut sums: BTreeMap<&'static str, u32> = BTreeMap::new();
+        let status = self.engine.status(self.now);
+        for peer in status.ports().flat_map(|port| port.peers().collect::<Vec<_>>()) {
+            let events = peer.counters.events;
+            for (name, count) in [
+                ("done", events.done),
+                ("refused", events.refused),
+                ("accepted", events.accepted),
+                ("unknown", events.unknown),
+                ("expired", events.expired),
+                ("out-of-limits", events.out_of_limits),
+                ("no-value", events.no_value),
+                ("away", events.away),
+                ("still-open", events.still_open),
+                ("stopped", events.stopped),
+                ("not-followed", events.not_followed),
+            ] {
+                *sums.entry(name).or_default() += count;
+            }
+        }
+        judge.count(sums);
+    }
+}
+
+/// The kinds of devices whose cells are judged. Modbus TCP is a fifth: a device that answers on a connection and
+/// reports the same acts.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    /// On Modbus RTU.
+    Gripper,
+    /// On Modbus RTU, with a motion in two steps.
+    Axis,
+    /// With texts.
+    Rfid,
+    /// On CANopen.
+    Drive,
+}
+
+impl Kind {
+    /// All of them.
+    pub(crate) const ALL: [Self; 4] = [Self::Gripper, Self::Axis, Self::Rfid, Self::Drive];
+
+    /// That of an embedded cell of this name.
+    pub(crate) fn of(cell: &str) -> Option<Self> {
+        Some(match cell {
+            "judged-gripper" => Self::Gripper,
+            "judged-axis" => Self::Axis,
+            "judged-rfid" => Self::Rfid,
+            "judged-drive" => Self::Drive,
+            _ => return None,
+        })
+    }
+
+    /// Connects the device, and lets it be judged. Returns the robot's program.
+    pub(crate) fn begin(self, cell: &mut Cell, config: &GatewayConfig, mut rng: Rng) -> Program {
+        let rules = match self {
+            Self::Gripper => gripper::rules(),
+            Self::Axis => axis::rules(),
+            Self::Rfid => rfid::rules(),
+            Self::Drive => drive::rules(),
+        };
+        let (now, own) = (cell.now(), rng.fork());
+        let name = config.ports.first().map_or("", |port| port.name.as_str()).to_owned();
+        match self {
+            Self::Gripper => {
+                let line = cell.line_of(&name);
+                cell.attach(line, gripper::device(own, now));
+            }
+            Self::Axis => {
+                let line = cell.line_of(&name);
+                cell.attach(line, axis::device(own, now));
+            }
+            Self::Rfid => {
+                let line = cell.line_of(&name);
+                cell.attach(line, rfid::Head::new(own, now));
+            }
+            Self::Drive => {
+                let bus = cell.bus_of(&name);
+                cell.attach_can(bus, drive::Drive::new(own, now));
+            }
+        }
+        let program = Program::new(&rules, now, rng.fork());
+        cell.judge_device(rules);
+        program
+    }
+}
+
+/// The names of all outcomes of events.
+pub const OUTCOMES: [&str; 11] = [
+    "done",
+    "refused",
+    "accepted",
+    "unknown",
+    "expired",
+    "out-of-limits",
+    "no-value",
+    "away",
+    "still-open",
+    "stopped",
+    "not-followed",
+];
+
+/// The bits of the variable that asks.
+pub(crate) fn bits() -> (SysVar, u8, u8) {
+    (rules::var("BitOutputReg[3]"), MOVE_BIT, STOP_BIT)
+}
+
+/// What was held longer ago is not needed.
+const REMEMBERED: Duration = Duration::from_secs(10);
+const MOVES: usize = 16;
+/// A request is at its device so long after it was handed over, at most.
+const ON_THE_LINE: Duration = Duration::from_millis(100);
+/// A longer stall of the gateway is sleep, after which nothing goes on.
+const STALL: Duration = Duration::from_millis(500);
+/// A stop is heard of within this time, if nothing is wrong with line and device.
+const STOPS_WITHIN: Duration = Duration::from_millis(800);
+/// More requests than this are not lost by chance beside others that arrive.
+const OTHERS: u32 = 12;
+/// The device has a value within this time: the longest wait behind refusals, and the late time.
+const KEEPS_WITHIN: Duration = Duration::from_secs(7);
+/// A device that replies at least this often is never away.
+const AWAY: Duration = Duration::from_millis(500);
+/// How exactly absences are seen from both ends.
+const SLACK: Duration = Duration::from_millis(100);

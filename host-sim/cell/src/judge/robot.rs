@@ -1,0 +1,344 @@
+//! The robot's log: its registers, and what its Modbus server has served on which connection.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use proto_core::sysvar::{ModbusPlace, SysVar};
+use proto_core::time::{Duration, Instant};
+
+use super::rules::{MOVE_BIT, Rules, STOP_BIT, Source, var};
+
+/// What the robot had and said.
+#[derive(Debug)]
+pub(super) struct Robot {
+    bits: SysVar,
+    first_coil: u16,
+    /// When the bit that asks for a motion rose, and whether that was carried out.
+    rises: VecDeque<(Instant, bool)>,
+    was_on: bool,
+    words: Vec<Word>,
+    readings: VecDeque<Reading>,
+    conns: BTreeMap<u64, Conn>,
+}
+
+/// A variable that the device is told.
+#[derive(Debug)]
+struct Word {
+    var: SysVar,
+    register: u16,
+    had: VecDeque<(Instant, u16)>,
+    /// When it was read and the gateway has got it.
+    read: VecDeque<Instant>,
+}
+
+/// The bits as they were read over a connection.
+#[derive(Debug, Clone, Copy)]
+struct Reading {
+    conn: u64,
+    asked: Instant,
+    answered: Instant,
+    moves: bool,
+    stops: bool,
+    /// When the gateway had it for sure.
+    taken: Option<Instant>,
+}
+
+/// A connection of the Modbus server.
+#[derive(Debug, Default)]
+struct Conn {
+    came: Vec<u8>,
+    went: Vec<u8>,
+    /// By transaction: when it was asked, function, address and count.
+    pending: BTreeMap<u16, (Instant, u8, u16, u16)>,
+    /// When the newest request came.
+    newest: Option<Instant>,
+    /// Registers of the newest answer, which the gateway may not have yet.
+    open: Vec<usize>,
+}
+
+/// The rise that an order was carried out for.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Rise {
+    /// When the controller answered with it.
+    pub read: Instant,
+    /// When it had answered with a stop before, or with it.
+    pub stop: Option<Instant>,
+}
+
+impl Robot {
+    pub(super) fn new(rules: &Rules) -> Self {
+        let bits = var("BitOutputReg[3]");
+        let first_coil = match bits.modbus() {
+            Some(ModbusPlace::Coils { first, .. }) => first,
+            _ => panic!("{bits} has no coils"),
+        };
+        let register = |var: SysVar| match var.modbus() {
+            Some(ModbusPlace::Register { address }) => address,
+            _ => panic!("{var} has no register"),
+        };
+        let words = rules.sources().map(|var| Word {
+            var,
+            register: register(var),
+            had: VecDeque::new(),
+            read: VecDeque::new(),
+        });
+        Self {
+            bits,
+            first_coil,
+            rises: VecDeque::new(),
+            was_on: false,
+            words: words.collect(),
+            readings: VecDeque::new(),
+            conns: BTreeMap::new(),
+        }
+    }
+
+    /// The gateway knows nothing of before.
+    pub(super) fn gateway_starts(&mut self) {
+        self.readings.clear();
+    }
+
+    /// The controller's variables as they are now.
+    pub(super) fn sees(&mut self, image: &[u8], now: Instant) {
+        let on = image[self.bits.image_offset()] >> MOVE_BIT & 1 == 1;
+        if on && !std::mem::replace(&mut self.was_on, on) {
+            self.rises.push_back((now, false));
+        }
+        self.was_on = on;
+        for Word { var, had, .. } in &mut self.words {
+            let value = word(image, *var);
+            if had.back().is_none_or(|(_, newest)| *newest != value) {
+                had.push_back((now, value));
+            }
+        }
+    }
+
+    /// Bytes came on a connection of the Modbus server.
+    pub(super) fn asked(&mut self, id: u64, bytes: &[u8], now: Instant) {
+        let conn = self.conns.entry(id).or_default();
+        conn.came.extend_from_slice(bytes);
+        while let Some(frame) = next_frame(&mut conn.came) {
+            // One at a time is asked, and given up after half a second: what comes earlier follows an answer.
+            let is_soon = conn.newest.is_some_and(|newest| now.saturating_since(newest) < SURELY_TAKEN);
+            conn.newest = Some(now);
+            if is_soon {
+                for nth in conn.open.drain(..) {
+                    self.words[nth].read.push_back(now);
+                }
+                let newest = self.readings.iter_mut().rev().find(|reading| reading.conn == id);
+                if let Some(reading) = newest {
+                    reading.taken.get_or_insert(now);
+                }
+            }
+            conn.open.clear();
+            if let &[high, low, _, _, _, _, _, function @ (1 | 3), a, b, c, d] = &frame[..] {
+                let asked = (now, function, u16::from_be_bytes([a, b]), u16::from_be_bytes([c, d]));
+                conn.pending.insert(u16::from_be_bytes([high, low]), asked);
+            }
+        }
+    }
+
+    /// The controller sends on a connection. Returns when it answered with a stop that is new.
+    /// The device has heard of one at `heard`.
+    pub(super) fn answered(
+        &mut self,
+        id: u64,
+        bytes: &[u8],
+        now: Instant,
+        heard: Option<Instant>,
+    ) -> Vec<Instant> {
+        let mut stops = Vec::new();
+        let Some(conn) = self.conns.get_mut(&id) else { return stops };
+        conn.went.extend_from_slice(bytes);
+        while let Some(frame) = next_frame(&mut conn.went) {
+            let transaction = u16::from_be_bytes([frame[0], frame[1]]);
+            let Some((asked, function, address, count)) = conn.pending.remove(&transaction) else { continue };
+            if frame.len() < 9 || frame[7] != function {
+                continue;
+            }
+            let data = &frame[9..];
+            if function == 3 {
+                let read = |word: &Word| (address..address.saturating_add(count)).contains(&word.register);
+                let words = self.words.iter().enumerate();
+                conn.open.extend(words.filter(|(_, word)| read(word)).map(|(nth, _)| nth));
+                continue;
+            }
+            let coil = |bit: u8| {
+                let nth = usize::from((self.first_coil + u16::from(bit)).checked_sub(address)?);
+                (nth < usize::from(count))
+                    .then(|| data.get(nth / 8).map(|byte| byte >> (nth % 8) & 1 == 1))?
+            };
+            if let (Some(moves), Some(stops_now)) = (coil(MOVE_BIT), coil(STOP_BIT)) {
+                let before = self.readings.iter().rev().find(|reading| reading.taken.is_some());
+                let is_new = before
+                    .is_none_or(|before| !before.stops && heard.is_none_or(|heard| heard < before.answered));
+                if stops_now && is_new {
+                    stops.push(now);
+                }
+                self.readings.push_back(Reading {
+                    conn: id,
+                    asked,
+                    answered: now,
+                    moves,
+                    stops: stops_now,
+                    taken: None,
+                });
+            }
+        }
+        stops
+    }
+
+    /// When the gateway had what was answered at this instant for sure.
+    pub(super) fn taken(&self, conn: u64, answered: Instant) -> Option<Instant> {
+        let reading =
+            self.readings.iter().find(|reading| (reading.conn, reading.answered) == (conn, answered));
+        reading?.taken
+    }
+
+    /// The rise that an order with these values, carried out now, is of. It is used up.
+    pub(super) fn rise_for(&mut self, rules: &Rules, values: &[u32], now: Instant) -> Result<Rise, String> {
+        let (sources, trigger) = &rules.moves;
+        let mut why = "it was carried out, and the bit was not read rising".to_owned();
+        for nth in 0..self.readings.len() {
+            let on = self.readings[nth];
+            if !on.moves {
+                continue;
+            }
+            let before = self.readings.range(..nth).rev().find(|reading| reading.conn == on.conn);
+            let Some(off) = before.filter(|before| !before.moves) else { continue };
+            // In the network, and in the socket of a gateway that is not called.
+            let known = on.taken.unwrap_or(on.answered + ON_ITS_WAY);
+            let late = now.saturating_since(known + *trigger + super::ON_THE_LINE);
+            if late > Duration::ZERO {
+                why = format!("it was carried out {late} after the rise was over");
+                continue;
+            }
+            let apart = on.answered.saturating_since(off.answered);
+            if apart > rules.stale_after + ON_ITS_WAY {
+                why = format!("it was carried out for a rise from a 0 that was read {apart} before");
+                continue;
+            }
+            let between = |at: Instant| at >= off.asked && at <= on.answered;
+            let rise = self.rises.iter().position(|(at, used)| between(*at) && !used);
+            let Some(rise) = rise else {
+                why = "it was carried out twice for one rise".to_owned();
+                continue;
+            };
+            if !self.had(sources, values, on.answered, now) {
+                why = format!(
+                    "it was carried out with {values:?}, which the robot did not have since the rise"
+                );
+                continue;
+            }
+            // All rises between two readings are one to the gateway.
+            self.rises
+                .iter_mut()
+                .skip(rise)
+                .filter(|(at, _)| between(*at))
+                .for_each(|(_, used)| *used = true);
+            return Ok(Rise { read: on.answered, stop: self.stop_before(nth) });
+        }
+        Err(why)
+    }
+
+    /// When a stop was read over the same connection, at the latest with this reading.
+    fn stop_before(&self, nth: usize) -> Option<Instant> {
+        let conn = self.readings[nth].conn;
+        let own: Vec<&Reading> = self.readings.range(..=nth).filter(|reading| reading.conn == conn).collect();
+        let rises = (0..own.len()).rev().find(|&at| {
+            own[at].stops
+                && (at == 0 || !own[at - 1].stops)
+                && (own[at].taken.is_some() || at + 1 == own.len())
+        });
+        // What was read long ago may have been forgotten here.
+        rises.filter(|&at| at > 0).map(|at| own[at].answered)
+    }
+
+    /// Whether the robot had these values together at an instant between these two.
+    pub(super) fn had(&self, sources: &[Source], values: &[u32], from: Instant, until: Instant) -> bool {
+        if sources.len() != values.len() {
+            return false;
+        }
+        let mut together = vec![(from, until)];
+        for (source, value) in sources.iter().zip(values) {
+            let var = match source {
+                Source::Constant(constant) if constant == value => continue,
+                Source::Constant(_) => return false,
+                Source::Word(var) => var,
+            };
+            let Some(word) = self.words.iter().find(|word| word.var == *var) else { return false };
+            let ends = word.had.iter().skip(1).map(|(at, _)| *at).chain([until]);
+            let spans: Vec<_> = word
+                .had
+                .iter()
+                .zip(ends)
+                .filter(|((_, had), _)| u32::from(*had) == *value)
+                .map(|((since, _), end)| (*since, end))
+                .collect();
+            let both = together.iter().flat_map(|one| {
+                let cut = spans.iter().map(|other| (one.0.max(other.0), one.1.min(other.1)));
+                cut.filter(|(since, end)| since <= end)
+            });
+            together = both.collect();
+        }
+        !together.is_empty()
+    }
+
+    /// Since when the robot has had its value of a variable.
+    pub(super) fn rests(&self, var: SysVar) -> Option<(Instant, u16)> {
+        self.words.iter().find(|word| word.var == var)?.had.back().copied()
+    }
+
+    /// Whether the gateway has read a variable again and again in this time.
+    pub(super) fn is_read_steadily(&self, var: SysVar, since: Instant, now: Instant) -> bool {
+        let Some(word) = self.words.iter().find(|word| word.var == var) else { return false };
+        let mut newest = since;
+        for at in word.read.iter().copied().filter(|at| *at >= since).chain([now]) {
+            if at.saturating_since(newest) > STEADILY {
+                return false;
+            }
+            newest = at;
+        }
+        true
+    }
+
+    /// Forgets what is too old.
+    pub(super) fn forget(&mut self, now: Instant) {
+        let is_old = |at: Instant| now.saturating_since(at) > REMEMBERED;
+        while self.readings.front().is_some_and(|reading| is_old(reading.answered)) {
+            self.readings.pop_front();
+        }
+        while self.rises.front().is_some_and(|(at, _)| is_old(*at)) {
+            self.rises.pop_front();
+        }
+        for Word { had, read, .. } in &mut self.words {
+            while had.len() > 1 && is_old(had[1].0) {
+                had.pop_front();
+            }
+            while read.front().is_some_and(|at| is_old(*at)) {
+                read.pop_front();
+            }
+        }
+        self.conns.retain(|_, conn| conn.newest.is_none_or(|newest| !is_old(newest)));
+    }
+}
+
+/// A word in the controller's image.
+pub(super) fn word(image: &[u8], var: SysVar) -> u16 {
+    let at = var.image_offset();
+    u16::from_le_bytes([image[at], image[at + 1]])
+}
+
+/// Takes a whole frame of Modbus TCP off the front.
+fn next_frame(bytes: &mut Vec<u8>) -> Option<Vec<u8>> {
+    let len = 6 + usize::from(u16::from_be_bytes([*bytes.get(4)?, *bytes.get(5)?]));
+    (bytes.len() >= len).then(|| bytes.drain(..len).collect())
+}
+
+/// A request that comes so soon after the one before follows an answer: others are given up after 500 ms.
+const SURELY_TAKEN: Duration = Duration::from_millis(150);
+/// An answer is at the gateway within this time, or nothing is taken from it: 500 ms, and a stall.
+const ON_ITS_WAY: Duration = Duration::from_secs(1);
+/// What is read at least this often is never stale.
+const STEADILY: Duration = Duration::from_millis(250);
+/// What happened longer ago is not needed.
+const REMEMBERED: Duration = Duration::from_secs(20);
