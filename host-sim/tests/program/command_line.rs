@@ -149,7 +149,7 @@ fn an_image_is_what_a_board_takes() {
     let set = "controller.address=10.0.2.2";
     let output = ok(&["image", &file, "--set", set, "-o", image], "");
     let bytes = std::fs::read(image).unwrap();
-    assert_eq!(output, format!("{image}: {} bytes, version 3\n", bytes.len()));
+    assert_eq!(output, format!("{image}: {} bytes, version 4\n", bytes.len()));
     let config = proto_core::config::image::decode(&bytes).unwrap();
     assert_eq!(config.controller.address, "10.0.2.2");
     assert_eq!(config.ports[0].name, "force");

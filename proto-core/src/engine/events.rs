@@ -238,7 +238,7 @@ impl Events<'_, '_> {
         let until = self.now + item.window;
         self.open(nth, Event::Risen { at, until });
         let Some(peer) = self.talks.rows.get(nth).map(|row| row.peer) else { return };
-        let is_away = self.talks.peers.get(usize::from(peer)).is_some_and(|peer| peer.is_down());
+        let is_away = self.line.turns(self.talks, |turns| turns.is_known_to_be_away(peer));
         if is_away || !is_usable {
             self.end(nth, Outcome::Away, 0);
         } else if self.is_stopping(peer) {

@@ -12,8 +12,8 @@
 //! exchange's `late` time has passed. Until then those exchanges of the peer wait whose replies could be taken for it,
 //! the same exchange among them. Nothing else waits.
 //!
-//! **A peer** is away when nothing was heard of it: when each of its exchanges that used to be answered, or two of
-//! them, failed since. It is then asked in the gaps between the others, in which its whole timeout fits, and at the
+//! **A peer** is away when nothing was heard of it: when each of its exchanges with a period that used to be answered, or
+//! two of them, failed since; where none has a period, those without one count. It is then asked in the gaps between the others, in which its whole timeout fits, and at the
 //! latest when its wait is over. The wait grows to 2^[`LONGEST_WAIT`] timeouts, so a peer that never answers takes at
 //! most 1 part in 65 of the line. An exchange that is not answered while others of its peer are has a wait of its own.
 //!
@@ -619,8 +619,18 @@ impl Turns<'_> {
         let was_answered = rows().any(|row| row.was_answered);
         // One that never was does not say anything while others were.
         let telling = || rows().filter(|row| row.was_answered || !was_answered);
+        // Nor does one that is asked now and then while others have a period: they will tell.
+        let has_period = telling().any(|row| row.grid.is_some());
+        let telling = || telling().filter(|row| row.grid.is_some() || !has_period);
         let (all, missed) = (telling().count(), telling().filter(|row| row.is_missed).count());
         missed >= all.min(2) && missed > 0
+    }
+
+    /// Whether a peer is away, and is asked with a period, so that its return is noticed. Nothing tells whether one that
+    /// is only asked when something happens is still away.
+    pub(super) fn is_known_to_be_away(&self, which: u8) -> bool {
+        let is_asked = |row: &Row| row.peer == which && row.kind.is_answered && row.grid.is_some();
+        self.peers.get(usize::from(which)).is_some_and(PeerState::is_down) && self.rows.iter().any(is_asked)
     }
 }
 

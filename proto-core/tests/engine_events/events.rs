@@ -285,3 +285,39 @@ fn a_port_that_goes_while_an_event_is_on_its_way_does_not_send_it_again() {
     axis.run(3_000, good);
     assert_eq!((axis.taken(), axis.told()[0]), (vec![], 9));
 }
+
+#[test]
+fn a_device_that_has_moved_before_and_is_away_does_not_move_either() {
+    let mut axis = Axis::new(|_, _| vec![]);
+    axis.pulse(good);
+    assert_eq!(axis.taken(), [1_000]);
+    axis.run(2_000, |_| None);
+    axis.pulse(|_| None);
+    assert_eq!((axis.taken(), axis.told()[0]), (vec![], 9));
+}
+
+#[test]
+fn one_lost_reply_to_an_event_does_not_make_a_device_away_that_is_asked_with_a_period() {
+    let mut axis = Axis::new(|_, _| vec![]);
+    axis.pulse(good);
+    axis.pulse(|request| if request[1] == 16 { None } else { good(request) });
+    assert_eq!(axis.line.peer(3).presence.name(), "up");
+    axis.pulse(good);
+    assert_eq!(axis.taken(), [1_000; 3]);
+}
+
+#[test]
+fn a_device_that_is_only_told_something_now_and_then_is_told_it_again() {
+    let mut cell = Cell::new();
+    let start = sets(&mut cell, 3, TARGET, Some("WordOutputReg[1]"), 0.0, rising(0));
+    let port = talking(&mut cell, &[start]);
+    let mut axis = Axis { line: Line::new(&cell, port), done: vec![] };
+    axis.line.word("WordOutputReg[1]", 1_000);
+    axis.run(200, good);
+    axis.pulse(|_| None);
+    axis.run(2_000, good);
+    assert_eq!(axis.taken(), [1_000]);
+    // Nobody would have noticed that it is back.
+    axis.pulse(good);
+    assert_eq!((axis.taken(), axis.line.events(3).done), (vec![1_000], 1));
+}

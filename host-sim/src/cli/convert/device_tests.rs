@@ -130,7 +130,9 @@ fn documented(part: &str) -> (String, String) {
     let document = std::fs::read_to_string(path).unwrap();
     let (_, text) = document.split_once(&format!("\n### {part}\n")).unwrap();
     let text = text.split("\n## ").next().unwrap().split("\n### ").next().unwrap();
-    let blocks: Vec<_> = text.split("```\n").skip(1).step_by(2).collect();
+    // Those behind the first one of this part are of Modbus.
+    let count = if part == "Conversations" { 1 } else { usize::MAX };
+    let blocks: Vec<_> = text.split("```\n").skip(1).step_by(2).take(count).collect();
     (blocks.concat(), text.to_owned())
 }
 

@@ -515,6 +515,14 @@ impl TalkWatch {
         has_started.then_some(number)
     }
 
+    /// A CANopen node said that it has booted: what is asked at its start is asked again.
+    pub(super) fn booted(&mut self, talk: &TalkSpec, number: u8, now: Instant) {
+        for (watch, row) in self.rows.iter_mut().zip(&talk.rows).filter(|(_, row)| row.slave == number) {
+            watch.starts |= row.kind == Kind::Start;
+        }
+        self.slaves.entry(number).or_default().started = now;
+    }
+
     /// A deadline may have passed: replies that have not come fail.
     pub(super) fn tick(&mut self, talk: &TalkSpec, heard: Instant, now: Instant) -> Option<u8> {
         let flight = self.flight.as_ref()?;
@@ -592,13 +600,17 @@ impl TalkWatch {
     }
 
     /// Whether a slave is away: each of its exchanges that used to be answered, or two of them, failed since it was
-    /// heard; all of them count if none ever was.
+    /// heard; all of them count if none ever was. If one of those has a period, only those with one count.
     fn is_silent(&self, talk: &TalkSpec, number: u8) -> bool {
         let rows = talk.rows_of(number).filter(|(_, row)| row.is_answered());
-        let rows: Vec<&RowWatch> = rows.map(|(nth, _)| &self.rows[nth]).collect();
-        let was_answered = rows.iter().any(|row| row.was_answered);
-        let telling: Vec<_> = rows.into_iter().filter(|row| row.was_answered || !was_answered).collect();
-        let missed = telling.iter().filter(|row| row.is_missed).count();
+        let rows: Vec<_> = rows.map(|(nth, row)| (row.every.is_some(), &self.rows[nth])).collect();
+        let was_answered = rows.iter().any(|(_, row)| row.was_answered);
+        let mut telling = rows;
+        telling.retain(|(_, row)| row.was_answered || !was_answered);
+        if telling.iter().any(|(has_period, _)| *has_period) {
+            telling.retain(|(has_period, _)| *has_period);
+        }
+        let missed = telling.iter().filter(|(_, row)| row.is_missed).count();
         missed > 0 && missed >= telling.len().min(2)
     }
 

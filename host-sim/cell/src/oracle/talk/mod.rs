@@ -103,6 +103,12 @@ impl Oracle {
             watch.counters.rejected_remote += 1;
             return;
         }
+        let booted = talk.booted(frame.id(), frame.data());
+        if let Some(slave) = booted {
+            watch.talk.booted(talk, slave, now);
+            self.truth.started(nth, slave);
+        }
+        let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
         let is_it = |own: &super::spec::Frame| {
             own.id == Some(frame.id()) && look(own, frame.data()) == Look::Frame(frame.data().len())
         };

@@ -111,6 +111,15 @@ pub(in crate::oracle) enum Seen {
 }
 
 impl TalkSpec {
+    /// The device whose CANopen node says with this frame that it has booted: 0 with id 0x700 + node, of a node that is
+    /// asked with SDO.
+    pub(super) fn booted(&self, id: CanId, data: &[u8]) -> Option<u8> {
+        let (CanId::Standard(id @ 0x701..=0x77F), [0]) = (id, data) else { return None };
+        let asked = Some(CanId::Standard(0x600 + (id - 0x700)));
+        let of_node = self.rows.iter().find(|row| row.request.as_ref().is_some_and(|own| own.id == asked));
+        of_node.map(|row| row.slave)
+    }
+
     /// The exchanges of a recipe, whose replies are behind its other input frames; `None` without any.
     pub(in crate::oracle) fn new(
         config: &GatewayConfig,
