@@ -72,3 +72,13 @@ fn the_step_behind_one_that_is_on_its_way_is_not_carried_out_after_a_stop() {
     asked.extend(line.run(MS(300), |request| Some((MS(2), answer(request)))));
     assert_eq!(written(&asked), [1, 3]);
 }
+
+#[test]
+fn a_stop_on_its_way_is_sent_again_when_the_port_is_reported_again() {
+    let (mut line, port) = axis();
+    set(&mut line, 1, true);
+    line.run(MS(40), |_| None);
+    line.rig.input(Input::PortUp { port });
+    let asked = line.run(MS(300), |request| Some((MS(2), answer(request))));
+    assert_eq!(written(&asked).first(), Some(&3));
+}
