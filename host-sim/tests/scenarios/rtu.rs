@@ -57,6 +57,8 @@ bus = "modbus-rtu"
 baud = 115200
 recipe = "drive"
 timeout_ms = 1000
+# It has forgotten everything after half a second without power.
+absent_ms = 500
 on_timeout = { "WordInputReg[1]" = 65000 }
 "#;
 const SPEED: usize = 32;

@@ -414,7 +414,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             let kind = RowKind {
                 is_answered: exchange.is_answered(),
                 starts: exchange.when.start,
-                is_state: !exchange.is_start_event(),
+                is_state: !exchange.is_start_event()
+                    && (!exchange.is_event()
+                        || exchange.when.every.is_some()
+                        || exchange.when.change
+                        || exchange.when.start),
                 stops: exchange.stop,
             };
             let every = exchange.when.every;

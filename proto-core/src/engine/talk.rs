@@ -446,13 +446,19 @@ impl FieldPort {
             // What came while the line was not there is too old to be answered.
             add(&mut self.counters.discarded_bytes, slave.discard());
         }
+        let is_on_can = self.is_on_can();
         let Some(line) = self.line_mut() else { return };
+        let was_waiting = matches!(line.phase, Phase::Waiting(_));
         let (items, mut talks) = view.of(line);
         for item in items {
             (item.digest, item.is_owed) = (None, false);
         }
         line.begin(&mut talks, now);
         line.looks = line.looks.map(|grid| crate::schedule::Grid::starting_at(now, grid.period()));
+        // Nobody has said that the port was gone, and its reply is not awaited any more.
+        if was_waiting && !is_on_can {
+            self.sender.sent();
+        }
     }
 }
 

@@ -72,3 +72,29 @@ fn the_step_behind_one_that_is_on_its_way_is_not_carried_out_after_a_stop() {
     asked.extend(line.run(MS(300), |request| Some((MS(2), answer(request)))));
     assert_eq!(written(&asked), [1, 3]);
 }
+
+#[test]
+fn a_stop_on_its_way_is_sent_again_when_the_port_is_reported_again() {
+    let (mut line, port) = axis();
+    set(&mut line, 1, true);
+    line.run(MS(40), |_| None);
+    line.rig.input(Input::PortUp { port });
+    let asked = line.run(MS(300), |request| Some((MS(2), answer(request))));
+    assert_eq!(written(&asked).first(), Some(&3));
+}
+
+#[test]
+fn an_event_that_only_an_echo_answered_is_not_sent_again_when_the_echo_is_learned() {
+    let mut cell = Cell::new();
+    let event = asked_by(&mut cell, 0, 1);
+    let other = reads(&mut cell, 8, &["WordInputReg[1]"], AskWhen::every(MS(100)));
+    let port = talking(&mut cell, &[event, other]);
+    let mut line = Line::new(&cell, port);
+    line.run(MS(100), |_| None);
+    set(&mut line, 0, true);
+    let asked = line.run(MS(250), |request| (request[1] == 6).then(|| (MS(1), request.to_vec())));
+    assert_eq!(written(&asked), [1]);
+    let echoed = |request: &[u8]| Some((MS(1), [request, &registers(8, &[5])].concat()));
+    let asked = line.run(MS(3_000), |request| if request[1] == 3 { echoed(request) } else { None });
+    assert_eq!(written(&asked), [0; 0]);
+}

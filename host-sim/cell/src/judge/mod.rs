@@ -179,7 +179,7 @@ impl Judge {
     /// The gateway starts.
     pub(crate) fn gateway_starts(&mut self, now: Instant) {
         self.counted.clear();
-        self.robot.gateway_starts();
+        self.robot.gateway_starts(now);
         self.stop = None;
         self.port_begins(now);
     }
@@ -373,8 +373,11 @@ impl Judge {
         }
         let was_away = match self.replied {
             Some(before) => now.saturating_since(before) + SLACK >= self.rules.absent,
-            // Never heard: it was asked in vain at least twice.
-            None => now.saturating_since(self.began) + SLACK >= self.rules.first_failures,
+            // Never heard: it was asked in vain at least twice, behind the late time unless it was to stop.
+            None => {
+                let stops = self.stop.is_some() || self.stop_heard.is_some_and(|heard| heard >= self.began);
+                stops || now.saturating_since(self.began) + SLACK >= self.rules.first_failures
+            }
         };
         if was_away {
             self.starts = 1;

@@ -18,6 +18,8 @@ pub(super) struct Robot {
     words: Vec<Word>,
     readings: VecDeque<Reading>,
     conns: BTreeMap<u64, Conn>,
+    /// When the gateway started.
+    started: Instant,
 }
 
 /// A variable that the device is told.
@@ -89,12 +91,13 @@ impl Robot {
             words: words.collect(),
             readings: VecDeque::new(),
             conns: BTreeMap::new(),
+            started: Instant::ZERO,
         }
     }
 
     /// The gateway knows nothing of before.
-    pub(super) fn gateway_starts(&mut self) {
-        self.readings.clear();
+    pub(super) fn gateway_starts(&mut self, now: Instant) {
+        self.started = now;
     }
 
     /// The controller's variables as they are now.
@@ -168,7 +171,11 @@ impl Robot {
                     .then(|| data.get(nth / 8).map(|byte| byte >> (nth % 8) & 1 == 1))?
             };
             if let (Some(moves), Some(stops_now)) = (coil(MOVE_BIT), coil(STOP_BIT)) {
-                let before = self.readings.iter().rev().find(|reading| reading.taken.is_some());
+                let before = self
+                    .readings
+                    .iter()
+                    .rev()
+                    .find(|reading| reading.taken.is_some() && reading.answered >= self.started);
                 let is_new = before
                     .is_none_or(|before| !before.stops && heard.is_none_or(|heard| heard < before.answered));
                 if stops_now && is_new {

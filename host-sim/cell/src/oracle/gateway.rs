@@ -211,6 +211,9 @@ impl Oracle {
     pub(super) fn begin_talk(&mut self, nth: usize, now: Instant) {
         let watch = &mut self.ports[nth];
         watch.line.discarded += watch.served.discard();
+        if watch.talk.waits() && !self.spec.ports[nth].is_can {
+            watch.down.sent();
+        }
         watch.talk.begin(self.spec.ports[nth].talk.as_ref(), now);
         // What rises from now on asks.
         self.talk_values_changed(now);

@@ -179,8 +179,12 @@ impl TalkWatch {
         if let Some((flight, talk)) = flight.zip(talk)
             && talk.rows[flight.row].is_answered()
         {
-            let late = now + talk.rows[flight.row].late;
-            self.leaves(talk, flight.row, flight.repeated + 1, late, now);
+            // Behind the newest transmission that has left; one that has not may wait as long from now on.
+            let late = talk.rows[flight.row].late;
+            match flight.sent {
+                Some(sent) => self.leaves(talk, flight.row, flight.repeated + 1, sent + late, now),
+                None => self.leaves(talk, flight.row, 0, now + late, now),
+            }
         }
         for row in &mut self.rows {
             (row.risen, row.last_bit) = (None, None);
@@ -257,7 +261,11 @@ impl TalkWatch {
             let what = format!("{}: asked although its bit has not risen just now", name(spec));
             return Err((Invariant::Cycle, what));
         }
-        if repeated.is_none() && spec.kind == Kind::Start && !std::mem::take(&mut self.rows[row].starts) {
+        // What was away for long enough may be asked before it is heard.
+        let failing = self.slaves.get(&spec.slave).and_then(|slave| slave.failing);
+        let is_away = failing.is_some_and(|(since, _)| now.saturating_since(since) >= talk.absent);
+        let starts = std::mem::take(&mut self.rows[row].starts) || is_away;
+        if repeated.is_none() && spec.kind == Kind::Start && !starts {
             let what = format!("{}: asked although its device has not started", name(spec));
             return Err((Invariant::Cycle, what));
         }
