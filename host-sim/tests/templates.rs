@@ -56,7 +56,11 @@ fn the_list_is_the_folder() {
 fn every_template_is_a_valid_gateway_file_without_warnings() {
     for name in names() {
         let report = ok(&["check", &file(&name)], "");
-        assert!(report.contains("a valid gateway file") && !report.contains("\nwarnings"), "{report}");
+        assert!(report.contains("a valid gateway file"), "{report}");
+        // Some move something, and have no stop yet: that is told.
+        let warnings = report.split_once("\nwarnings").map_or("", |(_, behind)| behind);
+        let others = warnings.lines().skip(1).filter(|line| !line.contains("no exchange with stop = true"));
+        assert_eq!(others.collect::<Vec<_>>(), [""; 0], "{name}");
     }
 }
 

@@ -457,6 +457,10 @@ impl Line {
         };
         *counter = counter.wrapping_add(1);
         if failure == Failure::Echo {
+            // What came may have been the echo, and the reply is still to come.
+            let unanswered = flight.unanswered.or(Some(sent));
+            let count = flight.repeated.saturating_add(1);
+            leave_outstanding(talks, Flight { unanswered, ..flight }, count, sent, now);
             let nth = usize::from(flight.exchange);
             self.turns(talks, |turns| turns.answered(nth, flight.cause, Ended::Unconfirmed, now));
             self.rest(times.pause, now);

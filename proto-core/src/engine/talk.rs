@@ -192,7 +192,9 @@ impl FieldPort {
             };
             match (sign, flight, times) {
                 (Sign::Answer(ended, code), Some(flight), Some(times)) => {
-                    if flight.may_be_echo || line.echo.is_some() {
+                    // Of a repetition, two copies may be the replies to both requests.
+                    let is_sure = !flight.is_repetition() && !is_outstanding(&talks, flight, now);
+                    if is_sure && (flight.may_be_echo || line.echo.is_some()) {
                         learn_echo(line, &mut talks, flight.may_be_echo, now);
                     }
                     if matches!(line.phase, Phase::Waiting(_)) {
@@ -505,6 +507,11 @@ fn sdo_abort(awaited: &Awaited<'_>, frame: &CanFrame) -> Option<u16> {
     let reply = awaited.asked()?.reply.as_ref()?;
     let &[0x80, a, b, c, low, high, _, _] = frame.data().first_chunk::<8>()? else { return None };
     (frame.id() == reply.format.id && [a, b, c] == multiplexer).then_some(u16::from_le_bytes([low, high]))
+}
+
+/// Whether a reply to an earlier request of the same exchange may still come.
+fn is_outstanding(talks: &Talks<'_>, flight: Flight, now: Instant) -> bool {
+    talks.rows.get(usize::from(flight.exchange)).is_some_and(|row| row.is_outstanding(now))
 }
 
 /// Own bytes are heard, or are not: what was not confirmed for that reason is, or is written again.

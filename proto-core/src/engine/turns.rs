@@ -496,9 +496,14 @@ impl Turns<'_> {
     /// A row that was taken was not sent: a value of it is missing.
     pub(super) fn not_sent(&mut self, nth: usize, cause: Cause, now: Instant) {
         let Some(row) = self.rows.get_mut(nth) else { return };
-        if cause == Cause::Start {
+        match cause {
             // Without `opens`: the others need not wait for its values.
-            row.start = Start::Wanted(now + row.times.timeout);
+            Cause::Start => row.start = Start::Wanted(now + row.times.timeout),
+            Cause::State(Some(_)) if row.kind.stops => {
+                row.requested.get_or_insert(now);
+                row.wait.not_before = now + row.times.timeout;
+            }
+            _ => {}
         }
     }
 

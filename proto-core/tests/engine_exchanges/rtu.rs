@@ -481,7 +481,7 @@ fn what_a_slave_is_asked_at_its_start_comes_first_and_in_order() {
         assert!(asked[start..first].iter().all(|place| *place == 0xA0), "round {round}: {asked:02X?}");
         assert_eq!((asked[first + 1], asked.len() > 1_000), (0x20, true), "the command, then polls");
         // It is away, and comes back at another moment in each round.
-        line.run(MS(700 + round * 333), |request| if request[0] == 4 { None } else { done(request) });
+        line.run(MS(1_500 + round * 333), |request| if request[0] == 4 { None } else { done(request) });
     }
 }
 

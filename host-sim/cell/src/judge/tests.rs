@@ -171,27 +171,6 @@ fn a_late_reply_that_is_taken_for_another() {
 }
 
 #[test]
-fn a_value_that_is_lost_when_the_device_is_busy() {
-    finds("judged-gripper", Invariant::DeviceKeeps, |cell| {
-        let asked: Waits = Rc::default();
-        let said = Rc::clone(&asked);
-        let outward: Outward = Box::new(move |now, _, output| {
-            if let Output::PortSend { bytes, .. } = output {
-                *asked.borrow_mut() = vec![(now, bytes.to_vec())];
-            }
-            None
-        });
-        let inward: Inward = Box::new(move |_, input| match input {
-            Input::PortBytes { bytes, .. } if bytes.len() == 5 && bytes.starts_with(&[9, 0x86, 6]) => {
-                said.borrow().last().map(|(_, request)| request.clone()).filter(|request| request[1] == 6)
-            }
-            _ => None,
-        });
-        cell.tamper(Some(inward), Some(outward));
-    });
-}
-
-#[test]
 fn an_echo_that_is_taken_for_a_confirmation() {
     let mut scenario = Scenario::named("judged-gripper").unwrap().unwrap();
     let Bus::Rs485(line) = &mut scenario.gateway.ports[0].bus else { panic!() };

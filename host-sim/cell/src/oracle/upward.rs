@@ -408,6 +408,7 @@ impl Upward {
 
     /// The values of a frame may be as old as this.
     fn was_asked(&mut self, nth: usize, frame: &Accepted, timeout: Duration, since: Instant) {
+        self.taken[nth][frame.frame] = Some(since);
         self.overdue[nth][frame.frame] = Some(since + timeout);
         self.next_overdue = self.next_overdue.min(since + timeout);
         self.next_expiry = self.next_expiry.min(since + timeout + Duration::from_micros(1));

@@ -43,7 +43,7 @@ fn shared(cells: &[&str], level: Level, span: Duration) -> ([Part; 3], Part) {
 /// The hashes of these runs on every machine. Only a change of what the engine, the controller or the cell
 /// does, or when, may change them; then enter the new ones here.
 const HASHES: [(Level, u64); 2] =
-    [(Level::None, 0xC99D_A9A9_D00E_3B7A), (Level::Harsh, 0x0185_2A28_0146_B3F0)];
+    [(Level::None, 0xB2B0_9ED0_A281_088E), (Level::Harsh, 0xE33F_EE13_E4EA_5018)];
 
 #[test]
 fn a_seed_means_the_same_trace_on_every_machine() {
@@ -97,7 +97,7 @@ fn devices_that_are_asked_are_judged_at_what_they_have_and_at_the_robot() {
     let levels = [Level::None, Level::Harsh].into_iter();
     for (name, level) in levels.flat_map(|level| [("modbus-line", level), ("gripper-line", level)]) {
         let scenario = Scenario::named(name).unwrap().unwrap();
-        let mut soak = Soak::new(&scenario, 11, level).unwrap();
+        let mut soak = Soak::new(&scenario, 12, level).unwrap();
         soak.run_to(Duration::from_secs(120));
         let report = soak.report();
         assert_eq!(report.violation, None);
@@ -152,7 +152,8 @@ fn a_master_asks_the_gateway_and_lines_echo() {
 
 #[test]
 fn shares_of_three_machines_make_what_one_machine_makes() {
-    let cells: Vec<_> = Scenario::names().collect();
+    let all = Scenario::all().unwrap();
+    let cells: Vec<_> = all.iter().map(|cell| cell.name.as_str()).collect();
     for level in [Level::None, Level::Mild, Level::Harsh] {
         let span = Duration::from_secs(24);
         let ([first, second, third], whole) = shared(&cells, level, span);

@@ -459,7 +459,9 @@ impl TalkWatch {
     ) -> Option<(Flight, Option<u8>)> {
         let flight = self.flight.take()?;
         let spec = &talk.rows[flight.row];
-        if flight.may_be_echo || self.echo.is_some() {
+        // Two copies behind a repetition, or behind a request whose earlier reply may still come, may be two replies.
+        let is_sure = flight.repeated == 0 && !self.rows[flight.row].is_outstanding(now);
+        if is_sure && (flight.may_be_echo || self.echo.is_some()) {
             self.has_echo.get_or_insert(flight.may_be_echo);
         }
         self.refused = self.refused.wrapping_add(u32::from(ended != Ended::Good));
@@ -543,8 +545,11 @@ impl TalkWatch {
         let mut flight = self.flight.take()?;
         if flight.may_be_echo && !flight.is_wrong {
             // Nobody knows. It is not a failure.
+            // What came may have been the echo, and the replies are still to come.
+            let until = flight.sent? + spec.late;
             self.rest(spec.pause, now);
             let watch = &mut self.rows[flight.row];
+            watch.leaves(flight.repeated + 1, until, now);
             (watch.was_answered, watch.is_unconfirmed) = (true, true);
             return None;
         }
