@@ -226,7 +226,8 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
         if let Some(first) = sorted.first
             && (is_block || is_nothing || !self.store.withhold(slot, &sorted.without))
         {
-            self.store.rejected_field = Some(first);
+            self.store.rejected_field.clear();
+            let _ = self.store.rejected_field.push(first);
             return self.rejected(first.why);
         }
         if sorted.first.is_none() && !self.store.withhold(slot, &sorted.without) {
@@ -236,7 +237,8 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
         self.apply(format, texts, frame, Some(&sorted));
         add(&mut self.counters.rejected_fields, sorted.rejected);
         add(&mut self.counters.fields_without_value, sorted.no_value);
-        self.store.rejected_field = sorted.first;
+        self.store.rejected_field.clear();
+        self.store.rejected_field.extend(sorted.first);
         accepted.frames = accepted.frames.wrapping_add(1);
         accepted.set = self.store.accepted_apart(slot, self.counters);
         Ok(())

@@ -473,8 +473,8 @@ pub(super) fn keep_why<const PORTS: usize>(
     can_id: Option<CanId>,
     bytes: &[u8],
 ) {
-    if verdict.is_err() || store.rejected_field.is_some() {
-        let field = store.rejected_field.take();
+    if verdict.is_err() || !store.rejected_field.is_empty() {
+        let field = store.rejected_field.pop();
         if let Some(why) = field.map(|field| field.why).or(verdict.err()) {
             keep(last, why, can_id, bytes, store.now);
             if let Some(last) = last {

@@ -240,7 +240,7 @@ impl FieldPort {
         {
             keep(&mut self.last_rejection, why, None, request, now);
         }
-        if let (Some(field), Some(last)) = (store.rejected_field.take(), &mut self.last_rejection) {
+        if let (Some(field), Some(last)) = (store.rejected_field.pop(), &mut self.last_rejection) {
             last.field = Some(field);
         }
         accepted

@@ -64,6 +64,17 @@ impl fmt::Display for Hex<'_> {
     }
 }
 
+/// A number of a field: a whole one as such, another one in 32 bits, which a board writes without the much longer code
+/// for all 64.
+struct Number(f64);
+
+impl Serialize for Number {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let whole = self.0 as i64;
+        if whole as f64 == self.0 { serializer.serialize_i64(whole) } else { serializer.serialize_f32(self.0 as f32) }
+    }
+}
+
 /// A rejected field.
 struct Field(RejectedField);
 
@@ -77,10 +88,10 @@ impl Serialize for Field {
             map.serialize_entry("to", &Text(var))?;
         }
         if let Some(value) = field.value.filter(|value| value.is_finite()) {
-            map.serialize_entry("value", &value)?;
+            map.serialize_entry("value", &Number(value))?;
         }
-        if let Some(allowed) = field.allowed {
-            map.serialize_entry("allowed", &allowed)?;
+        if let Some((low, high)) = field.allowed {
+            map.serialize_entry("allowed", &(Number(low), Number(high)))?;
         }
         map.end()
     }

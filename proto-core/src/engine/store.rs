@@ -129,7 +129,7 @@ pub(super) struct Store<const PORTS: usize> {
     /// Fields that are rejected while their frames are accepted.
     pub withheld: Withheld,
     /// The newest field of the frame that was taken last that was rejected, until its port has noted it.
-    pub rejected_field: Option<FieldRejection>,
+    pub rejected_field: Vec<FieldRejection, 1>,
 }
 
 impl<const PORTS: usize> Store<PORTS> {
@@ -163,7 +163,7 @@ impl<const PORTS: usize> Store<PORTS> {
             next_overdue: Stamp::NEVER,
             next_expiry: Stamp::NEVER,
             withheld: Withheld::new(),
-            rejected_field: None,
+            rejected_field: Vec::new(),
         }
     }
 

@@ -357,7 +357,7 @@ impl Judge {
     fn hears_another(&mut self, now: Instant) {
         let grace = ON_THE_LINE;
         let Some(stop) = &mut self.stop else { return };
-        if !stop.known.is_some_and(|known| now > known + grace) {
+        if stop.known.is_none_or(|known| now <= known + grace) {
             return;
         }
         stop.others += 1;

@@ -13,8 +13,6 @@
 //! remain readable.
 
 mod scan;
-mod v1;
-mod v2;
 mod v3;
 mod v4;
 
@@ -35,7 +33,7 @@ pub const MAGIC: [u8; 4] = *b"RGCI";
 /// The version of the payload: one more for every change of a serialized type.
 pub const VERSION: u32 = 4;
 /// The oldest version that is read.
-pub const OLDEST_VERSION: u32 = 1;
+pub const OLDEST_VERSION: u32 = 3;
 /// Length of the header: magic, version, payload length and CRC-32, four bytes each, little-endian.
 pub const HEADER: usize = 16;
 /// Maximum length of an image, header included. Every configuration that a board has room for is
@@ -238,19 +236,14 @@ fn decode_view(bytes: &[u8], mut config: ConfigMut<'_>) -> Result<(), ImageError
 /// What is in front of the lists: the controller, and the board's address.
 fn read_head(version: u32, rest: &mut &[u8], config: &mut ConfigMut<'_>) -> Result<(), ImageError> {
     match version {
-        1 => v1::read_head(rest, config),
-        2 => v2::read_head(rest, config),
         3 => v3::read_head(rest, config),
         _ => v4::read_head(rest, config),
     }
 }
 
-/// The lists, in their order. Versions 1 and 2 have the same.
-const fn lists(version: u32) -> &'static [Counted] {
-    match version {
-        1 | 2 => &v2::LISTS,
-        _ => &v4::LISTS,
-    }
+/// The lists, in their order: the same in all versions that are read.
+const fn lists(_: u32) -> &'static [Counted] {
+    &v4::LISTS
 }
 
 /// The number of entries of a list.
@@ -271,7 +264,6 @@ fn read_entries(
     config: &mut ConfigMut<'_>,
 ) -> Result<(), ImageError> {
     match version {
-        1 | 2 => v2::read_entries(list, count, rest, config),
         3 => v3::read_entries(list, count, rest, config),
         _ => v4::read_entries(list, count, rest, config),
     }

@@ -84,8 +84,8 @@ fn nothing_of_the_previous_configuration_remains() {
 /// Lists that an older version does not have are empty, whatever was there.
 #[test]
 fn nothing_of_a_newer_configuration_remains_in_an_older_one() {
-    let old = include_bytes!("../../../tests/golden/v2/serial.img");
-    let newer = include_bytes!("../../../tests/golden/v3/modbus-master.img");
+    let old = include_bytes!("../../../tests/golden/v3/serial.img");
+    let newer = include_bytes!("../../../tests/golden/v4/modbus-master.img");
     let mut config = decode(newer).unwrap();
     assert!(!config.exchanges.is_empty());
     assert_eq!(decode_into(old, &mut config), Ok(()));
