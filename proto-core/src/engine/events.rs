@@ -161,11 +161,11 @@ impl EventCounters {
 }
 
 /// What the values of requests are read from, as far as their age matters.
-pub(super) struct Sources<'a> {
+pub(super) struct Sources<C> {
     /// Groups below this are frames of field ports.
     pub first_of_links: u8,
     /// Which connection a group's values come over, counted.
-    pub connection: &'a dyn Fn(GroupId) -> u32,
+    pub connection: C,
     pub stale_after: Duration,
     /// Whether the device of the port is there.
     pub is_usable: bool,
@@ -181,7 +181,7 @@ pub(super) struct Events<'a, 't> {
 
 impl Events<'_, '_> {
     /// Values in the image have changed: looks at the bits, and makes the requests of events whose values are there.
-    pub(super) fn image_changed(&mut self, maker: &Maker<'_>, sources: &Sources<'_>, kept: &mut [Piece]) {
+    pub(super) fn image_changed(&mut self, maker: &Maker<'_>, sources: &Sources<impl Fn(GroupId) -> u32>, kept: &mut [Piece]) {
         for nth in 0..self.items.len() {
             self.read_bit(nth, maker, sources);
         }
@@ -191,7 +191,7 @@ impl Events<'_, '_> {
         self.note_expiry();
     }
 
-    fn read_bit(&mut self, nth: usize, maker: &Maker<'_>, sources: &Sources<'_>) {
+    fn read_bit(&mut self, nth: usize, maker: &Maker<'_>, sources: &Sources<impl Fn(GroupId) -> u32>) {
         let Some(item) = self.items.get_mut(nth) else { return };
         let Some(trigger) = &mut item.trigger else { return };
         let Some(at) = maker.image.known_since(trigger.var) else { return trigger.forget() };
@@ -200,7 +200,7 @@ impl Events<'_, '_> {
         if is_old {
             return;
         }
-        let connection = maker.image.group(trigger.var).map_or(0, sources.connection);
+        let connection = maker.image.group(trigger.var).map_or(0, &sources.connection);
         let [rises, stops] = trigger.read(Reading { on, at, connection }, sources.stale_after);
         if item.stops {
             // Also while the device is away: it is a state.
@@ -262,7 +262,7 @@ impl Events<'_, '_> {
     }
 
     /// Makes the request of an event whose values are there, and those of all steps that follow it.
-    fn freeze(&mut self, nth: usize, maker: &Maker<'_>, sources: &Sources<'_>, kept: &mut [Piece]) {
+    fn freeze(&mut self, nth: usize, maker: &Maker<'_>, sources: &Sources<impl Fn(GroupId) -> u32>, kept: &mut [Piece]) {
         let Some(Item { event: Event::Risen { at, until }, .. }) = self.items.get(nth) else { return };
         let (at, until) = (*at, *until);
         let bit_group = self

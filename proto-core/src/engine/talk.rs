@@ -428,7 +428,7 @@ impl FieldPort {
         image: &Image,
         bindings: Outputs<'_>,
         mut view: View<'_>,
-        (first_of_links, connection): (u8, &dyn Fn(GroupId) -> u32),
+        (first_of_links, connection): (u8, impl Fn(GroupId) -> u32),
         now: Instant,
     ) {
         let is_usable = self.is_usable();
@@ -674,7 +674,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             let first_of_links = self.store.frames.len() as u8;
             let connection = |group| links.connection_of(group);
             let (image, view) = (&self.store.image, self.exchanges.view());
-            port.triggers(image, self.bindings.outputs(), view, (first_of_links, &connection), now);
+            port.triggers(image, self.bindings.outputs(), view, (first_of_links, connection), now);
             self.after_talk(id);
         }
     }
