@@ -181,7 +181,12 @@ pub(super) struct Events<'a, 't> {
 
 impl Events<'_, '_> {
     /// Values in the image have changed: looks at the bits, and makes the requests of events whose values are there.
-    pub(super) fn image_changed(&mut self, maker: &Maker<'_>, sources: &Sources<impl Fn(GroupId) -> u32>, kept: &mut [Piece]) {
+    pub(super) fn image_changed(
+        &mut self,
+        maker: &Maker<'_>,
+        sources: &Sources<impl Fn(GroupId) -> u32>,
+        kept: &mut [Piece],
+    ) {
         for nth in 0..self.items.len() {
             self.read_bit(nth, maker, sources);
         }
@@ -262,7 +267,13 @@ impl Events<'_, '_> {
     }
 
     /// Makes the request of an event whose values are there, and those of all steps that follow it.
-    fn freeze(&mut self, nth: usize, maker: &Maker<'_>, sources: &Sources<impl Fn(GroupId) -> u32>, kept: &mut [Piece]) {
+    fn freeze(
+        &mut self,
+        nth: usize,
+        maker: &Maker<'_>,
+        sources: &Sources<impl Fn(GroupId) -> u32>,
+        kept: &mut [Piece],
+    ) {
         let Some(Item { event: Event::Risen { at, until }, .. }) = self.items.get(nth) else { return };
         let (at, until) = (*at, *until);
         let bit_group = self

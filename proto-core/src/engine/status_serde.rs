@@ -71,7 +71,11 @@ struct Number(f64);
 impl Serialize for Number {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let whole = self.0 as i64;
-        if whole as f64 == self.0 { serializer.serialize_i64(whole) } else { serializer.serialize_f32(self.0 as f32) }
+        if whole as f64 == self.0 {
+            serializer.serialize_i64(whole)
+        } else {
+            serializer.serialize_f32(self.0 as f32)
+        }
     }
 }
 
