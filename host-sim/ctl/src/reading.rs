@@ -116,9 +116,10 @@ fn ports(document: &Value) -> Table {
     let mut table = Table::new(&headings);
     for (name, port) in document["ports"].as_object().into_iter().flatten() {
         let counters = &port["counters"];
-        // Those for other nodes of a CAN bus are none of ours.
+        // Those for other nodes of a CAN bus are none of ours, and a rejected field is no frame.
         let is_rejection = |key: &str| {
-            (key.starts_with("rejected_") && key != "rejected_id" && key != "rejected_remote")
+            (key.starts_with("rejected_")
+                && !matches!(key, "rejected_id" | "rejected_remote" | "rejected_fields"))
                 || key == "tail_mismatches"
         };
         let counted = counters.as_object().into_iter().flatten();

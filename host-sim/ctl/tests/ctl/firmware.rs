@@ -100,7 +100,7 @@ fn an_update_has_what_was_linked_for_each_slot() {
     let answer = update.inspect(Some(&public), VIEW).unwrap();
     assert_eq!(answer.verdict(), Verdict::Well);
     let text = answer.text(VIEW);
-    assert!(text.contains("firmware        0.3.0\n") && text.contains("reads versions 1 to"), "{text}");
+    assert!(text.contains("firmware        0.3.0\n") && text.contains("reads versions 3 to"), "{text}");
     assert_eq!(text.matches("of this key").count(), 2, "{text}");
     for (slot, start) in [(Slot::A, A), (Slot::B, B)] {
         let (address, flat) = update.flat(slot).unwrap();
