@@ -107,6 +107,8 @@ fn drive(case: &Case) {
     // It loses its power, and has forgotten the speed when it is back.
     drive.answers(Answers::Nothing);
     robot.until("WordInputReg[1]", SAFE);
+    // It was away for its time once two more questions were not answered in time, which the third one tells.
+    drive.until_unanswered(3);
     drive.set(SPEED, 0);
     drive.set(SPEED + 1, 0);
     drive.set(ACTUAL, 903);
@@ -329,6 +331,8 @@ struct Inside {
     written: Vec<(u16, u16)>,
     /// Questions that were answered.
     asked: u32,
+    /// What was asked and written while it answered nothing.
+    unanswered: u32,
 }
 
 /// A drive with registers on a line.
@@ -340,8 +344,14 @@ struct Drive {
 
 impl Drive {
     fn on(mut line: LineClient, address: u8) -> Self {
-        let inside =
-            Inside { registers: [0; 64], answers: Answers::Well, damaged: 0, written: vec![], asked: 0 };
+        let inside = Inside {
+            registers: [0; 64],
+            answers: Answers::Well,
+            damaged: 0,
+            written: vec![],
+            asked: 0,
+            unanswered: 0,
+        };
         let (inside, is_over) = (Arc::new(Mutex::new(inside)), Arc::<AtomicBool>::default());
         let (own, ends) = (Arc::clone(&inside), Arc::clone(&is_over));
         let mut slave = Slave::new(timing(), Echo::Absent, address).unwrap();
@@ -364,7 +374,7 @@ impl Drive {
                         out[len - 1] ^= 0x10;
                         line.send(&out[..len]);
                     }
-                    Answers::Nothing => {}
+                    Answers::Nothing => inside.unanswered += 1,
                 }
             }
         });
@@ -397,6 +407,13 @@ impl Drive {
     fn until_asked(&self, count: u32) {
         let wanted = self.inside().asked + count;
         until("the axis is asked again and again", || (self.inside().asked >= wanted).then_some(()));
+    }
+
+    /// Waits until so many more requests came that it does not answer.
+    #[track_caller]
+    fn until_unanswered(&self, count: u32) {
+        let wanted = self.inside().unanswered + count;
+        until("requests without an answer", || (self.inside().unanswered >= wanted).then_some(()));
     }
 
     /// Replies with a wrong CRC so far.
