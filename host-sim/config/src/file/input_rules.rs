@@ -2,19 +2,18 @@
 //!
 //! In: the field's table, its encoding, its variable. Out: what stands behind the field in the configuration.
 
-use proto_core::config::{FieldSpec, InputRule, Limits, MapEntry, NO_TEXT, NoText};
+use proto_core::config::{FieldSpec, InputRule, MapEntry, NO_TEXT, NoText};
 use proto_core::device::{Encoding, Kind, Overflow};
 use proto_core::sysvar::{Direction, SysVar, VarBit};
 use proto_core::wire::scalar::ScalarType;
 
 use super::bindings::{FileInput, read_var};
-use super::commands::read_range;
 use super::encoding::refuse;
 use super::names::meant_variable;
 use super::reader::{Item, Reader, Result, Spot};
 use super::recipes::Written;
-use super::sendable::OUTSIDES;
-use crate::keys::field::{AS, OUTSIDE, POINT};
+use super::sendable::{add_entry, read_limits};
+use crate::keys::field::{AS, POINT};
 
 /// The words of `as`.
 pub(crate) const AS_WORDS: [(&str, InputRule); 1] = [("int16", InputRule::Int16)];
@@ -64,7 +63,7 @@ pub(super) fn read(table: &Reader<'_>, written: Written, to: &FileInput) -> Resu
         refuse(table, &["min", "max", "outside", "scale", "offset"], why)?;
         read_map(&map, var, is_int16, &mut rules)?;
     } else {
-        rules.extend(read_limits(table, &encoding)?);
+        rules.extend(read_limits(table, &encoding, |item| read_number(item, &encoding))?);
     }
     if let Some(list) = table.optional("no_value") {
         for item in
@@ -77,26 +76,6 @@ pub(super) fn read(table: &Reader<'_>, written: Written, to: &FileInput) -> Resu
         rules.push(rule(&item, read_valid_to(&item)?));
     }
     Ok(rules)
-}
-
-fn read_limits(table: &Reader<'_>, encoding: &Encoding) -> Result<Option<(Spot, FieldSpec)>> {
-    let (min, max) = (table.optional("min"), table.optional("max"));
-    let Some(first) = min.as_ref().or(max.as_ref()) else {
-        refuse(table, &["outside"], "allowed only together with min or max")?;
-        return Ok(None);
-    };
-    let spot = first.spot.clone();
-    let (lowest, highest) = encoding.range();
-    let read = |item: &Option<Item<'_>>, default| match item {
-        Some(item) => read_number(item, encoding),
-        None => Ok(default),
-    };
-    let (low, high) = (read(&min, lowest)?, read(&max, highest)?);
-    if let Some(max) = max.filter(|_| low > high) {
-        return Err(max.error(format!("max {high} is below min {low}")));
-    }
-    let outside = table.word_or(&OUTSIDE, &OUTSIDES)?;
-    Ok(Some((spot, FieldSpec::Limits(Limits { low, high, outside }))))
 }
 
 /// A number that the field can have.
@@ -115,7 +94,6 @@ fn read_number(item: &Item<'_>, encoding: &Encoding) -> Result<f64> {
 fn read_map(map: &Item<'_>, var: SysVar, is_int16: bool, rules: &mut Vec<(Spot, FieldSpec)>) -> Result<()> {
     let (mut entries, mut otherwise): (Vec<(Spot, MapEntry)>, _) = (Vec::new(), None);
     for (key, key_spot, item) in map.any_table()?.entries() {
-        let wrong = |why: String| item.clone().at(key_spot.clone()).error(why);
         let sent = item.number()?;
         let (low, high) = match var.ty() {
             _ if is_int16 => ScalarType::Short.range(),
@@ -129,20 +107,8 @@ fn read_map(map: &Item<'_>, var: SysVar, is_int16: bool, rules: &mut Vec<(Spot, 
             otherwise = Some((item.spot.clone(), FieldSpec::InputRule(InputRule::Else(sent))));
             continue;
         }
-        let Some((first, last)) = read_range(key) else {
-            return Err(wrong(format!(
-                "{key:?} is not an integer; the keys of map are values of the field, such as 1, ranges of them, such as \
-                 \"1..100\", or else"
-            )));
-        };
-        if first > last {
-            return Err(wrong(format!("{key:?} contains no value; allowed: \"{last}..{first}\"")));
-        }
-        let mut others = entries.iter().map(|(_, other)| (first.max(other.first), last.min(other.last)));
-        if let Some((value, _)) = others.find(|(first, last)| first <= last) {
-            return Err(wrong(format!("an earlier entry already has the value {value}")));
-        }
-        entries.push((item.spot, MapEntry { first, last, sent }));
+        let keys = "values of the field, such as 1, ranges of them, such as \"1..100\", or else";
+        add_entry(&mut entries, (key, key_spot, &item), keys, || Ok(sent))?;
     }
     if entries.is_empty() {
         return Err(map.error("no entries; write for example { 0 = 1, \"1..7\" = 2, else = 9 }"));

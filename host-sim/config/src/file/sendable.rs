@@ -47,53 +47,65 @@ pub(super) fn read(
         refuse(table, &["min", "max", "outside", "scale", "offset"], why)?;
         return read_map(&map, &encoding);
     }
-    read_limits(table, &encoding)
+    let limits = read_limits(table, &encoding, |item| read_number(item, &encoding))?;
+    Ok(limits.into_iter().collect())
 }
 
-fn read_limits(table: &Reader<'_>, encoding: &Encoding) -> Result<Vec<(Spot, FieldSpec)>> {
+/// The limits of a field, whose numbers `number` reads.
+pub(super) fn read_limits(
+    table: &Reader<'_>,
+    encoding: &Encoding,
+    number: impl Fn(&Item<'_>) -> Result<f64>,
+) -> Result<Option<(Spot, FieldSpec)>> {
     let (min, max) = (table.optional("min"), table.optional("max"));
     let Some(first) = min.as_ref().or(max.as_ref()) else {
         refuse(table, &["outside"], "allowed only together with min or max")?;
-        return Ok(Vec::new());
+        return Ok(None);
     };
     let spot = first.spot.clone();
     let (lowest, highest) = encoding.range();
-    let read = |item: &Option<Item<'_>>, default| match item {
-        Some(item) => read_number(item, encoding),
-        None => Ok(default),
-    };
+    let read = |item: &Option<Item<'_>>, default| item.as_ref().map_or(Ok(default), &number);
     let (low, high) = (read(&min, lowest)?, read(&max, highest)?);
     if let Some(max) = max.filter(|_| low > high) {
         return Err(max.error(format!("max {high} is below min {low}")));
     }
     let outside = table.word_or(&OUTSIDE, &OUTSIDES)?;
-    Ok(vec![(spot, FieldSpec::Limits(Limits { low, high, outside }))])
+    Ok(Some((spot, FieldSpec::Limits(Limits { low, high, outside }))))
 }
 
 fn read_map(map: &Item<'_>, encoding: &Encoding) -> Result<Vec<(Spot, FieldSpec)>> {
     let mut entries: Vec<(Spot, MapEntry)> = Vec::new();
     for (key, key_spot, item) in map.any_table()?.entries() {
-        let wrong = |why: String| item.clone().at(key_spot.clone()).error(why);
-        let Some((first, last)) = read_range(key) else {
-            return Err(wrong(format!(
-                "{key:?} is not an integer; the keys of map are values of the source, such as 1, or ranges of them, \
-                 such as \"1..100\""
-            )));
-        };
-        if first > last {
-            return Err(wrong(format!("{key:?} contains no value; allowed: \"{last}..{first}\"")));
-        }
-        let sent = read_number(&item, encoding)?;
-        let mut others = entries.iter().map(|(_, other)| (first.max(other.first), last.min(other.last)));
-        if let Some((value, _)) = others.find(|(first, last)| first <= last) {
-            return Err(wrong(format!("an earlier entry already has the value {value}")));
-        }
-        entries.push((item.spot, MapEntry { first, last, sent }));
+        let keys = "values of the source, such as 1, or ranges of them, such as \"1..100\"";
+        add_entry(&mut entries, (key, key_spot, &item), keys, || read_number(&item, encoding))?;
     }
     if entries.is_empty() {
         return Err(map.error("no entries; write for example { 0 = 1, \"1..7\" = 2 }"));
     }
     Ok(entries.into_iter().map(|(spot, entry)| (spot, FieldSpec::Mapped(entry))).collect())
+}
+
+/// Adds the entry of a map for the values that its key names, which no earlier entry has; `keys` says what keys are.
+pub(super) fn add_entry(
+    entries: &mut Vec<(Spot, MapEntry)>,
+    (key, key_spot, item): (&str, Spot, &Item<'_>),
+    keys: &str,
+    sent: impl FnOnce() -> Result<f64>,
+) -> Result<()> {
+    let wrong = |why: String| item.clone().at(key_spot.clone()).error(why);
+    let Some((first, last)) = read_range(key) else {
+        return Err(wrong(format!("{key:?} is not an integer; the keys of map are {keys}")));
+    };
+    if first > last {
+        return Err(wrong(format!("{key:?} contains no value; allowed: \"{last}..{first}\"")));
+    }
+    let sent = sent()?;
+    let mut others = entries.iter().map(|(_, other)| (first.max(other.first), last.min(other.last)));
+    if let Some((value, _)) = others.find(|(first, last)| first <= last) {
+        return Err(wrong(format!("an earlier entry already has the value {value}")));
+    }
+    entries.push((item.spot.clone(), MapEntry { first, last, sent }));
+    Ok(())
 }
 
 /// A number that the field can have.
