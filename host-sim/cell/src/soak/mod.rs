@@ -31,6 +31,7 @@ pub use share::{MAX_SHARES, NoShare, Share};
 pub use show::show_trace;
 
 use crate::judge::Program;
+use crate::line::Line;
 use crate::{Cell, CellError, Chunking, FaultInjector, FaultKind, Invariant, Rng, Violation, Wiring};
 use peers::Peers;
 use plc::Plc;
@@ -236,19 +237,24 @@ impl Soak {
     }
 }
 
-/// How the line of a device that is judged delivers bytes.
-fn prepare_line(cell: &mut Cell, config: &GatewayConfig, level: Level, rng: &mut Rng) {
-    let Some(port) = config.ports.first().filter(|port| matches!(port.bus, Bus::Rs485(_))) else { return };
-    let line = cell.line_of(&port.name);
-    cell.line(line).chunking = match rng.below(5) {
-        2 => Chunking::Gathered(Duration::from_millis(rng.between(1, 8))),
+/// How a line delivers bytes; those that are gathered, after at most so many milliseconds.
+fn vary_delivery(line: &mut Line, longest_ms: u64, level: Level, rng: &mut Rng) {
+    line.chunking = match rng.below(5) {
+        2 => Chunking::Gathered(Duration::from_millis(rng.between(1, longest_ms))),
         0 => Chunking::Pieces(rng.between(1, 16) as usize),
         1 => Chunking::Random(rng.between(1, 40) as usize),
         _ => Chunking::Whole,
     };
     if level == Level::Harsh && rng.below(4) == 0 {
-        cell.line(line).wiring = Wiring::TwoWire;
+        line.wiring = Wiring::TwoWire;
     }
+}
+
+/// How the line of a device that is judged delivers bytes.
+fn prepare_line(cell: &mut Cell, config: &GatewayConfig, level: Level, rng: &mut Rng) {
+    let Some(port) = config.ports.first().filter(|port| matches!(port.bus, Bus::Rs485(_))) else { return };
+    let line = cell.line_of(&port.name);
+    vary_delivery(cell.line(line), 8, level, rng);
     // An adapter of which nobody has told that it gives back what is sent.
     cell.line(line).gives_back = level == Level::Harsh && rng.below(3) == 0;
 }
@@ -262,15 +268,7 @@ fn attach_devices(cell: &mut Cell, config: &GatewayConfig, level: Level, rng: &m
         match port.bus {
             Bus::Rs485(_) => {
                 let line = cell.line_of(&port.name);
-                cell.line(line).chunking = match rng.below(5) {
-                    2 => Chunking::Gathered(Duration::from_millis(rng.between(1, 16))),
-                    0 => Chunking::Pieces(rng.between(1, 16) as usize),
-                    1 => Chunking::Random(rng.between(1, 40) as usize),
-                    _ => Chunking::Whole,
-                };
-                if level == Level::Harsh && rng.below(4) == 0 {
-                    cell.line(line).wiring = Wiring::TwoWire;
-                }
+                vary_delivery(cell.line(line), 16, level, &mut rng);
                 if let Some(peers) = Peers::new(config, port, now, seed.clone()) {
                     cell.attach(line, peers);
                 } else if let Some(device) = RandomDevice::new(config, port, now, seed.clone()) {
