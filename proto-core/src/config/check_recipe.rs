@@ -139,28 +139,27 @@ impl<'a> RecipeCheck<'a> {
 
     /// What output fields may send.
     fn check_sendable(&self) -> Check {
-        let (recipe, part) = (self.index, Direction::Output);
-        for (frame, span) in self.config.frames_of(self.recipe, part) {
-            let mut behind = Behind::default();
-            let mut rest = span.of(self.config.fields);
-            let mut field = 0_u8;
-            while let Some((_, after)) = rest.split_first() {
-                behind.check(Place::Field { recipe, part, frame, field }, rest)?;
-                (rest, field) = (after, field.saturating_add(1));
-            }
-        }
-        Ok(())
+        self.check_behind(Direction::Output, Behind::check)
     }
 
     /// What becomes of the values of input fields.
     fn check_rules(&self) -> Check {
-        let (recipe, part) = (self.index, Direction::Input);
+        self.check_behind(Direction::Input, BehindInput::check)
+    }
+
+    /// Looks at each field of a part, with what stands behind it in its frame; each frame begins with nothing.
+    fn check_behind<B: Default>(
+        &self,
+        part: Direction,
+        check: impl Fn(&mut B, Place, &'a [FieldSpec]) -> Check,
+    ) -> Check {
+        let recipe = self.index;
         for (frame, span) in self.config.frames_of(self.recipe, part) {
-            let mut behind = BehindInput::default();
+            let mut behind = B::default();
             let mut rest = span.of(self.config.fields);
             let mut field = 0_u8;
             while let Some((_, after)) = rest.split_first() {
-                behind.check(Place::Field { recipe, part, frame, field }, rest)?;
+                check(&mut behind, Place::Field { recipe, part, frame, field }, rest)?;
                 (rest, field) = (after, field.saturating_add(1));
             }
         }

@@ -223,22 +223,16 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
         }
         let sorted = self.sort(format, texts, frame);
         let is_nothing = sorted.taken.is_empty() && sorted.no_value == 0 && !sorted.tells;
-        if let Some(first) = sorted.first
-            && (is_block || is_nothing || !self.store.withhold(slot, &sorted.without))
-        {
-            self.store.rejected_field.clear();
-            let _ = self.store.rejected_field.push(first);
-            return self.rejected(first.why);
-        }
-        if sorted.first.is_none() && !self.store.withhold(slot, &sorted.without) {
-            return self.rejected(Rejection::OutOfRange);
+        self.store.rejected_field.clear();
+        self.store.rejected_field.extend(sorted.first);
+        let is_refused = sorted.first.is_some() && (is_block || is_nothing);
+        if is_refused || !self.store.withhold(slot, &sorted.without) {
+            return self.rejected(sorted.first.map_or(Rejection::OutOfRange, |first| first.why));
         }
         self.store.readmit(slot, &sorted.taken);
         self.apply(format, texts, frame, Some(&sorted));
         add(&mut self.counters.rejected_fields, sorted.rejected);
         add(&mut self.counters.fields_without_value, sorted.no_value);
-        self.store.rejected_field.clear();
-        self.store.rejected_field.extend(sorted.first);
         accepted.frames = accepted.frames.wrapping_add(1);
         accepted.set = self.store.accepted_apart(slot, self.counters);
         Ok(())

@@ -539,12 +539,10 @@ impl Line {
         {
             self.turns(talks, |turns| turns.request(usize::from(exchange), now));
         }
-        if let Some(row) = flight.and_then(|flight| talks.row_of(flight)).filter(|row| row.is_answered()) {
-            row.leaves_outstanding(
-                flight.map_or(0, |flight| flight.repeated.saturating_add(1)),
-                now + row.late(),
-                now,
-            );
+        if let Some(flight) = flight
+            && let Some(row) = talks.row_of(flight).filter(|row| row.is_answered())
+        {
+            row.leaves_outstanding(flight.repeated.saturating_add(1), now + row.late(), now);
         }
         self.phase = Phase::Idle;
         self.look_at = now;

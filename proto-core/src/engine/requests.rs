@@ -88,13 +88,11 @@ impl Maker<'_> {
                 Asks::Rtu { operation, .. } => Expected::of(&operation, request),
                 _ => None,
             };
-            match item.event {
-                Event::Ready { len, until } if flight.cause == Cause::Event => {
-                    item.event = Event::Sent { len, until }
+            if flight.cause == Cause::Event {
+                if let Event::Ready { len, until } = item.event {
+                    item.event = Event::Sent { len, until };
                 }
-                _ => {}
-            }
-            if flight.cause != Cause::Event {
+            } else {
                 // What goes out now is neither owed any more, nor a change.
                 item.is_owed = false;
                 item.digest = item.on_change.then(|| digest(DIGEST_SEED, request));

@@ -208,7 +208,7 @@ impl<const PORTS: usize> Store<PORTS> {
     pub(super) fn not_overdue(&mut self, nth: usize) {
         let Some(frame) = self.frames.get_mut(nth) else { return };
         frame.overdue_at = self.now + frame.timeout;
-        self.next_overdue = Stamp::at(self.next_overdue.get().min(frame.overdue_at));
+        self.next_overdue.or_earlier(frame.overdue_at);
     }
 
     /// The values of the newest frame may be as old as this: their age runs from the request that they could belong to.
@@ -411,7 +411,7 @@ impl<const PORTS: usize> Store<PORTS> {
     /// The health of ports is checked at this time.
     pub(super) fn check_health_at(&mut self, at: Instant) {
         self.health_at = Stamp::at(at);
-        self.next_overdue = Stamp::at(self.next_overdue.get().min(at));
+        self.next_overdue.or_earlier(at);
     }
 
     /// These variables of the health of ports have new values: they are written if their link is up,
@@ -489,7 +489,7 @@ impl<const PORTS: usize> Store<PORTS> {
                 (dropped, oldest) = (dropped.saturating_add(more), oldest.min(older));
             }
             let too_old = too_old_at(oldest, frame.timeout);
-            self.next_expiry = Stamp::at(self.next_expiry.get().min(too_old));
+            self.next_expiry.or_earlier(too_old);
             if dropped > 0 {
                 count(port, dropped);
             }

@@ -13,9 +13,10 @@
 //! the same exchange among them. Nothing else waits.
 //!
 //! **A peer** is away when nothing was heard of it: when each of its exchanges with a period that used to be answered, or
-//! two of them, failed since; where none has a period, those without one count. It is then asked in the gaps between the others, in which its whole timeout fits, and at the
-//! latest when its wait is over. The wait grows to 2^[`LONGEST_WAIT`] timeouts, so a peer that never answers takes at
-//! most 1 part in 65 of the line. An exchange that is not answered while others of its peer are has a wait of its own.
+//! two of them, failed since; where none has a period, those without one count. It is then asked in the gaps between
+//! the others, in which its whole timeout fits, and at the latest when its wait is over. The wait grows to
+//! 2^[`LONGEST_WAIT`] timeouts, so a peer that never answers takes at most 1 part in 65 of the line. An exchange that is
+//! not answered while others of its peer are has a wait of its own.
 //!
 //! **The start of a device.** What a peer is asked at its start comes before anything else that it is asked, in the
 //! order of the rows. It is asked once, and again only when the peer has started: it said so, or it was away for its

@@ -56,9 +56,9 @@ impl Presence {
 
 /// The exchanges of one line, and the peers that they are with.
 #[derive(Debug)]
-pub(crate) struct Turns<'a, P> {
+pub(crate) struct Turns<'a> {
     pub rows: &'a mut [Row],
-    pub peers: &'a mut [P],
+    pub peers: &'a mut [Peer],
     /// Requested exchanges since the last other one.
     pub run: &'a mut u8,
 }
@@ -134,7 +134,7 @@ impl Row {
     }
 }
 
-impl<P: AsRef<Peer> + AsMut<Peer>> Turns<'_, P> {
+impl Turns<'_> {
     /// Wants a row as soon as possible; false if there is no such row.
     pub(crate) fn request(&mut self, row: usize, now: Instant) -> bool {
         let Some(row) = self.rows.get_mut(row) else { return false };
@@ -154,7 +154,7 @@ impl<P: AsRef<Peer> + AsMut<Peer>> Turns<'_, P> {
             if is_opening && self.waits_for_opening(nth, row) {
                 continue;
             }
-            let Some(peer) = self.peers.get(usize::from(row.peer)).map(AsRef::as_ref) else { continue };
+            let Some(peer) = self.peers.get(usize::from(row.peer)) else { continue };
             if !row.is_answered && peer.presence == Presence::Down {
                 continue;
             }
@@ -197,7 +197,7 @@ impl<P: AsRef<Peer> + AsMut<Peer>> Turns<'_, P> {
 
     /// Whether another row of the peer is to be asked at its start before this one.
     fn waits_for_opening(&self, nth: usize, row: &Row) -> bool {
-        let peer = self.peers.get(usize::from(row.peer)).map(AsRef::as_ref);
+        let peer = self.peers.get(usize::from(row.peer));
         let is_down = peer.is_some_and(|peer| peer.presence == Presence::Down);
         let comes = |other: &Row| other.opens && other.peer == row.peer && (other.is_answered || !is_down);
         let first = self.rows.iter().position(comes);
@@ -208,7 +208,7 @@ impl<P: AsRef<Peer> + AsMut<Peer>> Turns<'_, P> {
     pub(crate) fn take(&mut self, nth: usize, now: Instant) -> Taken {
         let Some(row) = self.rows.get_mut(nth) else { return Taken { requested: None } };
         let missed = row.grid.as_mut().and_then(|grid| grid.due(now)).unwrap_or(0);
-        if let Some(peer) = self.peers.get_mut(usize::from(row.peer)).map(AsMut::as_mut)
+        if let Some(peer) = self.peers.get_mut(usize::from(row.peer))
             && peer.presence != Presence::Down
         {
             let missed = u32::try_from(missed).unwrap_or(u32::MAX);
@@ -223,7 +223,7 @@ impl<P: AsRef<Peer> + AsMut<Peer>> Turns<'_, P> {
     /// else before `not_before`.
     pub(crate) fn answered(&mut self, nth: usize, now: Instant, not_before: Instant) {
         let Some(which) = self.rows.get(nth).map(|row| row.peer) else { return };
-        let Some(peer) = self.peers.get_mut(usize::from(which)).map(AsMut::as_mut) else { return };
+        let Some(peer) = self.peers.get_mut(usize::from(which)) else { return };
         let was_down = peer.presence == Presence::Down;
         peer.presence = Presence::Up;
         peer.failures = 0;
@@ -260,7 +260,7 @@ impl<P: AsRef<Peer> + AsMut<Peer>> Turns<'_, P> {
             row.opens = true;
             row.requested.get_or_insert(now);
         }
-        let Some(peer) = self.peers.get_mut(usize::from(which)).map(AsMut::as_mut) else { return };
+        let Some(peer) = self.peers.get_mut(usize::from(which)) else { return };
         let exponent = peer.failures.saturating_add(FIRST_WAIT).min(LONGEST_WAIT);
         peer.failures = peer.failures.saturating_add(1);
         let longest = WAIT_LIMIT.max(timeout.saturating_mul(2));
@@ -280,18 +280,6 @@ impl Row {
     /// When the period that is due, or the next one, is missed.
     fn end_of_period(&self) -> Instant {
         self.grid.as_ref().map_or(Instant::NEVER, |grid| grid.next() + grid.period())
-    }
-}
-
-impl AsRef<Peer> for Peer {
-    fn as_ref(&self) -> &Peer {
-        self
-    }
-}
-
-impl AsMut<Peer> for Peer {
-    fn as_mut(&mut self) -> &mut Peer {
-        self
     }
 }
 

@@ -217,12 +217,8 @@ pub fn decode_into<
 
 fn decode_view(bytes: &[u8], mut config: ConfigMut<'_>) -> Result<(), ImageError> {
     let (version, mut rest) = payload(bytes)?;
-    // Also those that an older version does not have.
-    for list in lists(VERSION) {
-        config.clear(*list);
-    }
     read_head(version, &mut rest, &mut config)?;
-    for list in lists(version) {
+    for list in &v4::LISTS {
         let room = config.clear(*list);
         let count = count(&mut rest, *list, room)?;
         read_entries(version, *list, count, &mut rest, &mut config)?;
@@ -239,11 +235,6 @@ fn read_head(version: u32, rest: &mut &[u8], config: &mut ConfigMut<'_>) -> Resu
         3 => v3::read_head(rest, config),
         _ => v4::read_head(rest, config),
     }
-}
-
-/// The lists, in their order: the same in all versions that are read.
-const fn lists(_: u32) -> &'static [Counted] {
-    &v4::LISTS
 }
 
 /// The number of entries of a list.

@@ -6,7 +6,8 @@
 
 use heapless::Vec;
 
-use super::{Counted, HEADER, ImageError, count, header, lists, payload, read_entries, read_head};
+use super::v4::LISTS;
+use super::{Counted, HEADER, ImageError, count, header, payload, read_entries, read_head};
 use crate::config::{
     Bus, GatewayConfig, MAX_ALL_FIELDS, MAX_COMMANDS, MAX_EXCHANGES, MAX_PORTS, MAX_RECIPES, MAX_SAFE_VALUES,
 };
@@ -68,12 +69,12 @@ impl Scan {
         }
         for _ in 0..AT_ONCE {
             if self.left == 0 {
-                let Some(list) = lists(version).get(self.lists) else { break };
+                let Some(list) = LISTS.get(self.lists) else { break };
                 self.left = count(&mut rest, *list, room(*list))?;
                 self.lists = self.lists.saturating_add(1);
                 continue;
             }
-            let Some(list) = lists(version).get(self.lists.saturating_sub(1)) else { break };
+            let Some(list) = LISTS.get(self.lists.saturating_sub(1)) else { break };
             config.clear(*list);
             read_entries(version, *list, 1, &mut rest, &mut config)?;
             self.left = self.left.saturating_sub(1);
@@ -85,7 +86,7 @@ impl Scan {
             }
         }
         self.at = all.len().saturating_sub(rest.len());
-        let is_more = self.left > 0 || self.lists < lists(version).len();
+        let is_more = self.left > 0 || self.lists < LISTS.len();
         if !is_more && !rest.is_empty() {
             return Err(ImageError::Contents);
         }

@@ -40,7 +40,7 @@ pub(super) fn read_head(rest: &mut &[u8], config: &mut ConfigMut<'_>) -> Result<
     Ok(())
 }
 
-/// The lists of [`Payload`].
+/// The lists of [`Payload`], in their order: the same in all versions that are read.
 pub(super) static LISTS: [Counted; 7] = [
     Counted::Recipes,
     Counted::Ports,

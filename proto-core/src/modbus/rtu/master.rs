@@ -279,7 +279,7 @@ impl<const N: usize> Master<N> {
         self.receiver.stray()
     }
 
-    fn turns(&mut self) -> Turns<'_, Peer> {
+    fn turns(&mut self) -> Turns<'_> {
         Turns { rows: &mut self.rows, peers: &mut self.peers, run: &mut self.run }
     }
 
