@@ -63,10 +63,11 @@ fn an_invalid_image_is_refused() {
     };
     let newer = *b"RGCI\xE7\x03\0\0\0\0\0\0\0\0\0\0";
     let older = *b"RGCI\x01\0\0\0\0\0\0\0\0\0\0\0";
-    let damaged = *b"RGCI\x02\0\0\0\0\0\0\0\0\0\0\0";
+    let damaged = *b"RGCI\x04\0\0\0\0\0\0\0\0\0\0\0";
     assert_eq!(read(&[]), Status::ImageCut);
     assert_eq!(read(&[0xFF; 64]), Status::ImageNone);
     assert_eq!(read(&newer), Status::ImageVersion);
+    assert_eq!(read(&older), Status::ImageVersion);
     assert_eq!(read(&damaged), Status::ImageDamaged);
     assert!(config.is_null());
     let mut version = 0;
