@@ -500,7 +500,7 @@ impl Line {
         leave_outstanding(talks, flight, flight.repeated.saturating_add(1), sent, now);
         let nth = usize::from(flight.exchange);
         let news = self.turns(talks, |turns| match failure {
-            Failure::Timeout => turns.failed(nth, flight.cause, now, sent),
+            Failure::Timeout => turns.failed(nth, flight.cause, now, flight.unanswered.unwrap_or(sent)),
             // It said something, and nobody knows what.
             _ => turns.answered(nth, flight.cause, Ended::Unclear, now),
         });

@@ -574,7 +574,9 @@ fn signs(line: &mut Line, items: &mut [Item], talks: &mut Talks<'_>, sign: Sign,
     {
         bump(&mut peer.counters.late_replies);
     }
-    let news = line.turns(talks, |turns| turns.heard(which, None, now));
+    // The peer has carried out what its late reply is to.
+    let own = matches!(sign, Sign::Late(_)).then_some(nth);
+    let news = line.turns(talks, |turns| turns.heard(which, own, now));
     line.look(now);
     Events { items, talks, line, now }.note(nth, news);
 }

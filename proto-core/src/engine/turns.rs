@@ -389,6 +389,9 @@ impl Turns<'_> {
             if is_opening && self.waits_for_opening(nth, row) || !row.kind.is_answered && peer.is_away() {
                 continue;
             }
+            if self.start_waits(row) {
+                continue;
+            }
             let free_at = self.free_at(row, now);
             if let Some(wanted) = row.event {
                 let busy_until = if row.wait.is_busy { row.wait.not_before } else { Instant::ZERO };
@@ -463,10 +466,22 @@ impl Turns<'_> {
     fn waits_for_opening(&self, nth: usize, row: &Row) -> bool {
         let is_away = self.peers.get(usize::from(row.peer)).is_some_and(|peer| peer.turn.is_away());
         let comes = |other: &Row| {
-            other.opens == Opens::Yes && other.peer == row.peer && (other.kind.is_answered || !is_away)
+            other.opens == Opens::Yes
+                && other.peer == row.peer
+                && (other.kind.is_answered || !is_away)
+                && !self.start_waits(other)
         };
         let first = self.rows.iter().position(comes);
         first.is_some_and(|first| first != nth)
+    }
+
+    /// Whether a start waits until its peer is heard, because another row will tell: one that is sent to a peer that is
+    /// away may be carried out without a reply, and once more when the peer is back.
+    fn start_waits(&self, row: &Row) -> bool {
+        let tells = |other: &Row| other.peer == row.peer && other.kind.is_answered && other.grid.is_some();
+        row.start != Start::Over
+            && self.peers.get(usize::from(row.peer)).is_some_and(|peer| peer.turn.is_away())
+            && self.rows.iter().any(tells)
     }
 
     /// The row is taken: its request is being sent, or there is nothing to send.
@@ -576,7 +591,7 @@ impl Turns<'_> {
         }
     }
 
-    /// The peer has not answered a request whose sending ended at `sent`.
+    /// The peer has not answered a request that left first at `sent`.
     pub(super) fn failed(&mut self, nth: usize, cause: Cause, now: Instant, sent: Instant) -> News {
         let Some(row) = self.rows.get_mut(nth) else { return News::Nothing };
         let (timeout, which, stops) = (row.times.timeout, row.peer, row.kind.stops);
