@@ -111,7 +111,8 @@ impl Machine {
                     return self.log.push(lost);
                 }
                 let at = self.rng.below(bytes.len() as u64) as usize;
-                bytes[at] ^= 1 << self.rng.below(8);
+                // Never the case of a letter alone, which is no other digit.
+                bytes[at] ^= 1 << self.rng.below(5);
                 is_whole = false;
             }
             _ => {}

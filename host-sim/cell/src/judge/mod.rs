@@ -247,6 +247,10 @@ impl Judge {
             }
             Act::Did(Order::Stop, _) => {}
             Act::Did(Order::Start, _) => {
+                if self.starts == 0 && self.is_away(now) {
+                    // It is the first thing that it hears, and so long nothing was heard of it.
+                    (self.starts, self.replied) = (1, Some(now));
+                }
                 let result = match self.starts.checked_sub(1) {
                     Some(left) => {
                         self.starts = left;
@@ -367,19 +371,23 @@ impl Judge {
         }
     }
 
-    fn replies(&mut self, is_whole: bool, tells: bool, now: Instant) {
-        if self.is_disturbed || !is_whole {
-            return;
-        }
-        let was_away = match self.replied {
+    /// Whether nothing was heard of it for so long that it has started, to the gateway.
+    fn is_away(&self, now: Instant) -> bool {
+        match self.replied {
             Some(before) => now.saturating_since(before) + SLACK >= self.rules.absent,
             // Never heard: it was asked in vain at least twice, behind the late time unless it was to stop.
             None => {
                 let stops = self.stop.is_some() || self.stop_heard.is_some_and(|heard| heard >= self.began);
                 stops || now.saturating_since(self.began) + SLACK >= self.rules.first_failures
             }
-        };
-        if was_away {
+        }
+    }
+
+    fn replies(&mut self, is_whole: bool, tells: bool, now: Instant) {
+        if self.is_disturbed || !is_whole {
+            return;
+        }
+        if self.is_away(now) {
             self.starts = 1;
         }
         if tells {
@@ -421,11 +429,11 @@ impl Judge {
     fn keeps(&self, now: Instant) -> Option<Result<(), String>> {
         let var = self.rules.keeps?;
         let kept = self.kept.filter(|_| self.is_on)?;
-        let (since, value) = self.robot.rests(var)?;
-        let mut since = since.max(self.trouble);
+        let (changed, value) = self.robot.rests(var)?;
+        let mut since = changed.max(self.trouble);
         if let Some((at, code)) = self.refused {
             // A final refusal ends it until the value changes.
-            if at >= since && !matches!(code, 4 | 6 | 8 | 10 | 11) {
+            if at >= changed && !matches!(code, 4 | 6 | 8 | 10 | 11) {
                 return None;
             }
             since = since.max(at);

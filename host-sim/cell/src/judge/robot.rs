@@ -207,7 +207,7 @@ impl Robot {
         let mut why = "it was carried out, and the bit was not read rising".to_owned();
         for nth in 0..self.readings.len() {
             let on = self.readings[nth];
-            if !on.moves {
+            if !on.moves || on.answered < self.started {
                 continue;
             }
             let before = self.readings.range(..nth).rev().find(|reading| reading.conn == on.conn);
