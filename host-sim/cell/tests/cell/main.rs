@@ -9,3 +9,4 @@ mod random_faults;
 mod robot;
 mod soak;
 mod sources;
+mod templates;
