@@ -13,6 +13,7 @@ mod functions;
 pub mod keys;
 mod schema;
 mod sim;
+mod since;
 mod target;
 
 pub use advice::{negative_numbers, orders_before_values};
@@ -28,6 +29,7 @@ pub use sim::{
     AnalogInput, BitGroup, CommandClients, Initial, InitialTarget, Listen, Power, Robot, RobotMode, SimBus,
     SimCanFrame, SimConfig, SimField, SimParts, SimPort, SimProgram, SimRecipe, SimStreamPart,
 };
+pub use since::changes_since_0_2;
 pub use target::TargetError;
 
 /// The example of README.md is a test.

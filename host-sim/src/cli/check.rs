@@ -8,7 +8,7 @@ mod report;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-use clap::Args;
+use clap::{Args, ValueEnum};
 use proto_core::config::{GatewayConfig, MAX_PORTS};
 use proto_core::engine::Engine;
 use recipe_config::SimConfig;
@@ -33,8 +33,18 @@ pub(super) struct CheckArgs {
     /// CAN ports of the file that are on one bus
     #[arg(long, value_name = "PORT,PORT", value_parser = names)]
     same_bus: Vec<Names>,
+    /// Also print what the file means now and did not mean in this version
+    #[arg(long, value_name = "VERSION")]
+    since: Option<Version>,
     #[command(flatten)]
     overrides: Overrides,
+}
+
+/// A version whose files are still in use.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum Version {
+    #[value(name = "0.2", alias = "0.2.0")]
+    V0_2,
 }
 
 /// Names with commas between them.
@@ -103,6 +113,10 @@ fn report(args: &CheckArgs) -> Result<Report, Refused> {
             let (buses, troubles) = bus::loads(config, &recipes, &shared).map_err(Refused::Argument)?;
             let mut report = fill::gateway(name, config, &recipes, &frames);
             report.buses = buses;
+            report.changes = args.since.map(|Version::V0_2| {
+                let changes = recipe_config::changes_since_0_2(config, &frames);
+                messages(path, overrides, &changes)
+            });
             let mut placed = fill::warnings(config);
             placed.extend(recipe_config::negative_numbers(&frames));
             placed.extend(recipe_config::orders_before_values(&frames));
@@ -115,6 +129,11 @@ fn report(args: &CheckArgs) -> Result<Report, Refused> {
         }
         Config::Controller(_) if !args.same_bus.is_empty() => {
             return Err(Refused::Argument("--same-bus is for gateway files".into()));
+        }
+        Config::Controller(_) if args.since.is_some() => {
+            return Err(Refused::Argument(
+                "--since is for gateway files; of others nothing has changed".into(),
+            ));
         }
         Config::Controller(_) if args.board.is_some() => {
             return Err(Refused::Argument("--board is for gateway files".into()));
@@ -131,14 +150,17 @@ fn report(args: &CheckArgs) -> Result<Report, Refused> {
             placed.push((["recipe", recipe.name(), part].map(str::to_owned).to_vec(), said));
         }
     }
-    report.warnings = placed
-        .iter()
-        .map(|(key, said)| {
-            let key: Vec<&str> = key.iter().map(String::as_str).collect();
-            Message::from(file::error_at(path, overrides, &key, said))
-        })
-        .collect();
+    report.warnings = messages(path, overrides, &placed);
     Ok(report)
+}
+
+/// Sentences with the places of their keys.
+fn messages(path: &Path, overrides: &[String], placed: &[fill::Placed]) -> Vec<Message> {
+    let message = |(key, said): &fill::Placed| {
+        let key: Vec<&str> = key.iter().map(String::as_str).collect();
+        Message::from(file::error_at(path, overrides, &key, said))
+    };
+    placed.iter().map(message).collect()
 }
 
 /// Loads a controller file and checks that its programs compile and its values fit.

@@ -186,6 +186,7 @@ Examples:
   host-sim check cell.toml
   host-sim check cell.toml --set port.rs485-1.baud=9600
   host-sim check cell.toml --same-bus can-1,can-2
+  host-sim check cell.toml --since 0.2           what it means now and did not in 0.2
   host-sim check cell.toml --json
 
 If something is wrong: exit code 2 and one message with file, line, column and key.

@@ -333,3 +333,61 @@ fn a_board_is_given_no_more_than_it_has() {
     let said = String::from_utf8(output.stderr).unwrap();
     assert!(said.contains("there are nucleo-h743zi, mps2-an500"), "{said}");
 }
+
+#[test]
+fn what_changed_since_a_version_is_told_with_its_place() {
+    let dir = tempfile::tempdir().unwrap();
+    let cell = dir.path().join("cell.toml");
+    let file = cell.to_str().unwrap();
+    let exchange = "[[recipe.exchange]]\nslave = 1\nfunction = \"write-coil\"\naddress = 3\nlate_ms = 0\n\
+                    on = [\"rising:BitOutputReg[3].0\"]\nwrite = [{ name = \"go\", value = 1 }]\n";
+    let text = format!(
+        "[controller]\naddress = \"10.0.0.2\"\n[[recipe]]\nname = \"r\"\nkind = \"modbus-rtu\"\n{exchange}\
+         [[port]]\nname = \"p\"\nbus = \"modbus-rtu\"\nrecipe = \"r\"\n"
+    );
+    std::fs::write(&cell, text).unwrap();
+    let said = |args: &[&str]| {
+        let output = host_sim(&[&["check", file], args].concat());
+        (output.status.code(), String::from_utf8(output.stdout).unwrap())
+    };
+    let (_, without) = said(&[]);
+    assert!(!without.contains("changed since"), "{without}");
+    let (code, with) = said(&["--since", "0.2"]);
+    assert_eq!(code, Some(0));
+    let changes: Vec<_> = with.split_once("\nchanged since 0.2\n").unwrap().1.lines().collect();
+    assert_eq!(changes.len(), 3, "{with}");
+    assert!(changes[0].starts_with("  port \"p\", echo: learned from"), "{with}");
+    assert!(changes[1].starts_with("  port \"p\", exchange 1, on: a rise is sent once"), "{with}");
+    assert!(changes[2].starts_with("  port \"p\", exchange 1, retries: it is not"), "{with}");
+    // What has been decided since is not told, wherever it was decided.
+    let decided = [
+        "--since",
+        "0.2.0",
+        "--set",
+        "port.p.echo=false",
+        "--set",
+        "recipe.r.exchange.1.retries=0",
+        "--set",
+        "recipe.r.exchange.1.trigger_ms=50",
+    ];
+    let (_, nothing) = said(&decided);
+    assert!(nothing.ends_with("\nchanged since 0.2\n  nothing in this file\n"), "{nothing}");
+
+    let (code, report) = json(&["check", file, "--json", "--since", "0.2"]);
+    assert_eq!(code, Some(0));
+    assert_eq!(report["changes"][1]["key"], "recipe.r.exchange.1.on");
+    assert_eq!((&report["changes"][1]["line"], &report["changes"][1]["file"]), (&11.into(), &file.into()));
+    let (_, report) = json(&["check", file, "--json"]);
+    assert!(report.get("changes").is_none(), "{report:#}");
+
+    for (args, said) in [
+        (["check", file, "--since", "0.1"], "[possible values: 0.2]"),
+        (["check", file, "--since", "1"], "[possible values: 0.2]"),
+        (["check", &path("rs485-system-controller.toml"), "--since", "0.2"], "--since is for gateway files"),
+    ] {
+        let output = host_sim(&args);
+        let message = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(2), "{message}");
+        assert!(message.contains(said), "{message}");
+    }
+}

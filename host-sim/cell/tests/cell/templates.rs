@@ -6,6 +6,7 @@ use proto_core::engine::LinkId;
 use proto_core::time::Duration;
 use recipe_cell::{Cell, Responder};
 use recipe_config::file;
+use recipe_controller::Link;
 use recipe_test_kit::{example, repository};
 
 /// What a slave was asked to write: the address and the values.
@@ -81,7 +82,7 @@ fn running() -> (Cell, Written) {
 
 #[test]
 fn the_gateway_stops_a_drive_when_it_has_lost_the_robot() {
-    let faults: [(fn(&mut Cell), u64); 3] = [
+    let faults: [(fn(&mut Cell), u64); 4] = [
         (
             |cell| {
                 cell.refuse(LinkId::MODBUS);
@@ -89,9 +90,10 @@ fn the_gateway_stops_a_drive_when_it_has_lost_the_robot() {
             },
             100,
         ),
-        // Nobody says so: three requests without an answer do.
-        (|cell| cell.cut_cable(LinkId::MODBUS), 2_000),
-        (|cell| cell.half_open(LinkId::MODBUS), 2_000),
+        // Nobody says so: a request that is not acknowledged does, or three that are not answered.
+        (|cell| cell.cut_cable(LinkId::MODBUS), 550),
+        (|cell| cell.half_open(LinkId::MODBUS), 550),
+        (|cell| cell.controller_mut().mute(Link::Modbus), 1_700),
     ];
     for (nth, (fault, within_ms)) in faults.into_iter().enumerate() {
         let (mut cell, written) = running();
@@ -103,6 +105,9 @@ fn the_gateway_stops_a_drive_when_it_has_lost_the_robot() {
             cell.run_ms(50);
             cell.admit(LinkId::MODBUS);
             cell.repair_cable(LinkId::MODBUS);
+            if nth == 3 {
+                cell.controller_mut().unmute(Link::Modbus);
+            }
             cell.run_ms(10_000);
             // It does not run because the robot is back, but because the robot says so again.
             assert_eq!(taken(&written)[1..], [(COMMAND, vec![NO_FUNCTION])], "fault {nth}");

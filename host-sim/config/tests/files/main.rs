@@ -16,6 +16,7 @@ mod golden_images;
 mod input_rule_files;
 mod schema_files;
 mod sendable_files;
+mod since;
 mod wrong_devices;
 mod wrong_exchanges;
 mod wrong_files;

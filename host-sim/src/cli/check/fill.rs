@@ -56,6 +56,7 @@ pub(super) fn gateway(
         programs: Vec::new(),
         functions: Vec::new(),
         warnings: Vec::new(),
+        changes: None,
     }
 }
 
@@ -180,6 +181,7 @@ pub(super) fn controller(file: String, config: &SimConfig) -> Report {
         programs: config.programs.iter().map(|program| program.name.clone()).collect(),
         functions: functions(&config.functions),
         warnings: Vec::new(),
+        changes: None,
     }
 }
 

@@ -37,6 +37,9 @@ pub(super) struct Report {
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub(super) functions: Vec<Function>,
     pub(super) warnings: Vec<Message>,
+    /// What means something else than in the version that was asked about.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) changes: Option<Vec<Message>>,
 }
 
 /// Addresses and ports of the controller. Port 0 is any free one.
@@ -411,6 +414,13 @@ impl Report {
         if !self.warnings.is_empty() {
             report += "\nwarnings\n";
             report.extend(self.warnings.iter().map(|warning| format!("  {}\n", warning.message)));
+        }
+        if let Some(changes) = &self.changes {
+            report += "\nchanged since 0.2\n";
+            report.extend(changes.iter().map(|change| format!("  {}\n", change.message)));
+            if changes.is_empty() {
+                report += "  nothing in this file\n";
+            }
         }
         report
     }
