@@ -48,6 +48,8 @@ const BEYOND: &[(&str, &[(&str, &str)])] = &[
             ("", "does not fit in a"),
             ("", "the field cannot be"),
             ("value", "has a fraction"),
+            ("map", "has a fraction"),
+            ("map", "is not an integer; the keys of map"),
         ],
     ),
     (
