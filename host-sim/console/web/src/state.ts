@@ -22,8 +22,10 @@ export interface PortStatus {
     last_rejection?: { text: string; age_ms: number; len: number; bytes: string; can_id?: string };
     last_not_given?: { text: string; age_ms: number; value: number };
     last_failed?: { command: string; age_ms: number };
-    peers?: Record<string, { presence: string; missed_periods: number }>;
+    peers?: Record<string, { presence: string; missed_periods: number; counters?: PeerCounters }>;
 }
+/** Numbers, and in `events` numbers of what became of events. */
+export type PeerCounters = Record<string, number | Record<string, number>>;
 export interface LinkStatus {
     kind: string;
     state: string;

@@ -46,9 +46,15 @@ export function health(status: Status): [Tone, string] {
     }
 }
 
-/** The counters of what was not taken: those that are not zero. */
-export function losses(counters: Record<string, number>): [string, number][] {
-    return Object.entries(counters).filter(
-        ([name, count]) => count > 0 && /^(rejected_|tail_mis|resync|discarded|timeouts|refused|downs|bus_offs|unanswered|undelivered|edges_lost|commands_dropped|commands_unknown|malformed|unacknowledged)/.test(name),
+/** The counters of what was not taken or not done, by the port and its devices together: those that are not zero. */
+export function losses({ counters, peers = {} }: PortStatus): [string, number][] {
+    const all = { ...counters };
+    const add = (name: string, count: number) => (all[name] = (all[name] ?? 0) + count);
+    for (const { counters = {} } of Object.values(peers))
+        for (const [name, count] of Object.entries(counters))
+            if (name === "events") Object.entries(count).forEach(([name, count]) => add(`event_${name}`, count));
+            else if (/^(late_r|unc)/.test(name)) add(name, count as number);
+    return Object.entries(all).filter(
+        ([name, count]) => count > 0 && /^(late_r|unc|event_(?!done|acc)|rejected_|tail_mis|resync|discarded|timeouts|refused|downs|bus_offs|unanswered|undelivered|edges_lost|commands_dropped|commands_unknown|malformed|unacknowledged)/.test(name),
     );
 }

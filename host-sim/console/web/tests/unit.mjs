@@ -109,6 +109,27 @@ test("the bytes of frames", () => {
     assert.equal(parsedBytes("300"), null);
 });
 
+test("what a port and its devices lost is one list, with a name for each", async () => {
+    const { losses } = await load("words.ts");
+    const { en } = await load("en.ts");
+    const events = { done: 5, refused: 0, accepted: 1, unknown: 1, expired: 2, out_of_limits: 1, no_value: 1, away: 1, still_open: 1, stopped: 1, not_followed: 1 };
+    const port = {
+        counters: { frames_in: 9, rejected_fields: 3, timeouts: 0, refused: 1 },
+        peers: {
+            1: { counters: { requests: 7, timeouts: 4, late_replies: 2, unconfirmed: 1, events } },
+            2: { counters: { late_replies: 1, events: { expired: 3 } } },
+            3: {},
+        },
+    };
+    const lost = Object.fromEntries(losses(port));
+    assert.deepEqual(lost, {
+        rejected_fields: 3, refused: 1, late_replies: 3, unconfirmed: 1, event_unknown: 1, event_expired: 5, event_out_of_limits: 1,
+        event_no_value: 1, event_away: 1, event_still_open: 1, event_stopped: 1, event_not_followed: 1,
+    });
+    for (const name of Object.keys(lost)) assert.ok(name in en, name);
+    assert.deepEqual(losses({ counters: { frames_in: 1 } }), []);
+});
+
 test("every text is there in Chinese, and none that nobody shows", async () => {
     const { zh } = await load("zh.ts");
     const { en } = await load("en.ts");

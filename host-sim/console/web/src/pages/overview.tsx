@@ -55,7 +55,7 @@ function Wrong({ isWrong }: { isWrong: boolean }) {
 function Port({ name, port }: { name: string; port: PortStatus }) {
     const [tone, words] = portState(port);
     const rate = rates.value[name];
-    const lost = losses(port.counters);
+    const lost = losses(port);
     const own = Object.entries(values.value).filter(([, value]) => value.owner === name);
     return (
         <Card title={name} aside={<Sign tone={isAlive.value ? tone : "idle"}>{isAlive.value ? words : t("unknown")}</Sign>}>
