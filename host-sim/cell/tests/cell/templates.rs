@@ -80,9 +80,11 @@ fn running() -> (Cell, Written) {
     (cell, written)
 }
 
+type Fault = fn(&mut Cell);
+
 #[test]
 fn the_gateway_stops_a_drive_when_it_has_lost_the_robot() {
-    let faults: [(fn(&mut Cell), u64); 4] = [
+    let faults: [(Fault, u64); 4] = [
         (
             |cell| {
                 cell.refuse(LinkId::MODBUS);
