@@ -146,7 +146,7 @@ impl SerialPort {
                         Ok(stream) => {
                             info!(%to, "connected");
                             backoff.reset();
-                            tcp_options::enable_keepalive(&stream);
+                            tcp_options::deliver_in_time(&stream, DELIVERY);
                             sender.up(&mut events);
                             let backlog = Backlog::accepted(&tx, known);
                             let error = pump(&stream, &mut sender, backlog, &mut events).await;
@@ -174,7 +174,7 @@ impl SerialPort {
                         None => {
                             let (stream, peer) = accept(&listener, &tx).await;
                             info!(%peer, "client connected");
-                            tcp_options::enable_keepalive(&stream);
+                            tcp_options::deliver_in_time(&stream, DELIVERY);
                             let stream = Rc::new(stream);
                             client.replace(Some(Rc::clone(&stream)));
                             (stream, Backlog::accepted(&tx, known))
@@ -526,6 +526,8 @@ const BACKLOG_CHUNK: usize = 16 * 1_024;
 const DRAIN_LOOK: StdDuration = StdDuration::from_millis(10);
 /// Maximum number of reads after a sleep before other tasks run.
 const MAX_BACKLOG_READS: usize = 64;
+/// What is sent over TCP arrives within this time, or is dropped with its connection: an event has at most so long.
+const DELIVERY: StdDuration = StdDuration::from_secs(1);
 /// Paced bytes closer together than this are written together, as if from a UART's FIFO.
 const MIN_WRITE_INTERVAL: Duration = Duration::from_micros(500);
 /// Interval at which a serial device's output buffer is checked.

@@ -194,6 +194,38 @@ fn a_tcp_port_connects_when_its_server_appears_and_again_after_a_loss() {
 }
 
 #[test]
+fn what_a_server_does_not_take_in_time_is_dropped_with_its_connection() {
+    run(async |_| {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        tcp_options::limit_buffers(&listener);
+        let at = listener.local_addr().unwrap();
+        let port = Running::start(&format!("tcp:{at}"), serial(4_000_000)).await;
+        // It acknowledges what it has room for, and reads nothing.
+        let (mut server, _) = listener.accept().await.unwrap();
+        port.expect(Seen::Up).await;
+        let mut sent = 0;
+        loop {
+            port.tx.send(&[0x55; 1_024]);
+            sent += 1_024;
+            match port.next().await.1 {
+                Seen::Sent => {}
+                other => break assert_eq!(other, Seen::Down),
+            }
+        }
+        // What it takes at last is not all, and behind it is a reset.
+        let mut taken = 0;
+        let end = loop {
+            match server.read(&mut [0; 4_096]).await {
+                Ok(0) => break None,
+                Ok(len) => taken += len,
+                Err(error) => break Some(error.kind()),
+            }
+        };
+        assert!(end == Some(io::ErrorKind::ConnectionReset) && taken < sent, "{end:?}: {taken} of {sent}");
+    });
+}
+
+#[test]
 fn a_listening_port_has_one_client_at_a_time() {
     run(async |_| {
         let port = Running::start("tcp:127.0.0.1:0", serial(115_200)).await;

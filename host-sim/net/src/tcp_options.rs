@@ -54,6 +54,16 @@ pub fn clear_user_timeout(stream: &TcpStream) {
     set_user_timeout(stream, Duration::ZERO);
 }
 
+/// What is sent arrives within this time, or never: the connection ends, and what waits is dropped. As
+/// [`enable_keepalive`] otherwise.
+pub fn deliver_in_time(stream: &TcpStream, timeout: Duration) {
+    enable_keepalive(stream);
+    // What waits in the system becomes old.
+    let _ = sockopt::set_socket_send_buffer_size(stream, BUFFER);
+    let _ = reset_on_close(stream);
+    set_user_timeout(stream, timeout);
+}
+
 /// However the connection ends from now on, even with this process, it is reset: data that the peer has not
 /// received by then is dropped.
 ///

@@ -63,6 +63,8 @@ pub(super) struct Row {
     pub alike: u64,
     /// How many replies to earlier transmissions may still come, and until when.
     outstanding: (u8, Instant),
+    /// Of a write that stops: replies to what was sent before it was wanted may come until then.
+    former: Instant,
     /// The reply that may come, on Modbus.
     pub expected: Option<Expected>,
     wait: Wait,
@@ -243,6 +245,7 @@ impl Row {
             times,
             alike: 0,
             outstanding: (0, Instant::ZERO),
+            former: Instant::ZERO,
             expected: None,
             wait: Wait::NONE,
             was_answered: false,
@@ -343,6 +346,9 @@ impl Turns<'_> {
     /// Wants a row until it is answered.
     pub(super) fn request(&mut self, nth: usize, now: Instant) {
         if let Some(row) = self.rows.get_mut(nth) {
+            if row.requested.is_none() {
+                row.former = row.outstanding.1;
+            }
             row.requested.get_or_insert(now);
         }
     }
@@ -454,7 +460,12 @@ impl Turns<'_> {
         let others = rows.filter(|(other, nth)| {
             other.is_outstanding(now) && other.peer == row.peer && row.alike.unbounded_shr(*nth) & 1 != 0
         });
-        others.map(|(other, _)| other.outstanding.1).max().unwrap_or(Instant::ZERO)
+        // Whichever of the transmissions of a stop is answered, the peer has stopped since it was wanted.
+        let until = |other: &Row| match row.kind.stops && core::ptr::eq(other, row) {
+            true => row.former,
+            false => other.outstanding.1,
+        };
+        others.map(|(other, _)| until(other)).max().unwrap_or(Instant::ZERO)
     }
 
     /// Whether another reply may come that could be taken for one to this row.
@@ -640,9 +651,10 @@ impl Turns<'_> {
         let was_answered = rows().any(|row| row.was_answered);
         // One that never was does not say anything while others were.
         let telling = || rows().filter(|row| row.was_answered || !was_answered);
-        // Nor does one that is asked now and then while others have a period: they will tell.
+        // Nor does one that is asked now and then while others have a period: they will tell, but for those that come
+        // before them at the start.
         let has_period = telling().any(|row| row.grid.is_some());
-        let telling = || telling().filter(|row| row.grid.is_some() || !has_period);
+        let telling = || telling().filter(|row| row.grid.is_some() || !has_period || row.kind.starts);
         let (all, missed) = (telling().count(), telling().filter(|row| row.is_missed).count());
         missed >= all.min(2) && missed > 0
     }

@@ -130,3 +130,17 @@ fn a_reply_that_may_be_late_does_not_confirm_a_stop() {
     assert_eq!((told[0], told[1..].iter().all(|value| *value == 0)), (1_000, true), "{told:?} on {port:?}");
     assert!(told.len() > 2, "the late reply to the start is none to the stop: {told:?}");
 }
+
+#[test]
+fn a_device_that_was_away_is_stopped_once_when_it_is_back() {
+    let mut axis = axis(|_, _, stop| {
+        stop.late = None;
+        vec![]
+    });
+    axis.run(2_000, good);
+    axis.line.bit(1, true);
+    axis.run(3_000, |_| None);
+    assert!(stops(&mut axis).len() > 10, "it is wanted all the time");
+    axis.run(3_000, good);
+    assert_eq!(stops(&mut axis).len(), 1, "whichever of them was answered, it has stopped since");
+}

@@ -207,7 +207,9 @@ impl Robot {
         let mut why = "it was carried out, and the bit was not read rising".to_owned();
         for nth in 0..self.readings.len() {
             let on = self.readings[nth];
-            if !on.moves || on.answered < self.started {
+            // What the gateway handed over before it started anew may still be on the line.
+            let is_of_before = on.answered < self.started && now > self.started + super::ON_THE_LINE;
+            if !on.moves || is_of_before {
                 continue;
             }
             let before = self.readings.range(..nth).rev().find(|reading| reading.conn == on.conn);
