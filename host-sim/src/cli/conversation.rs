@@ -1,6 +1,6 @@
 //! The exchanges of a recipe as `check` draws them: what is asked when, its bytes, and its time.
 
-use proto_core::config::{AskWhen, Exchange, GatewayConfig, Port};
+use proto_core::config::{AskWhen, Bus, Exchange, GatewayConfig, Port};
 use proto_core::device::Carrier;
 use proto_core::engine::{Plan, Source};
 use proto_core::modbus::rtu::{BROADCAST, Operation, Table};
@@ -36,6 +36,9 @@ pub(super) struct Talk {
     /// The shortest pulse of its bit that is seen for sure.
     #[serde(skip_serializing_if = "Option::is_none")]
     pulse_ms: Option<f64>,
+    /// It is an event on CAN: Linux' own driver cannot take a frame back that waits in the adapter.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    may_leave_late: bool,
     /// Of the line, if it has a period.
     #[serde(skip_serializing_if = "Option::is_none")]
     percent: Option<u64>,
@@ -118,6 +121,7 @@ impl Talk {
             late_ms: (!held_back.is_empty()).then(|| millis(exchange.late())),
             held_back,
             pulse_ms: shortest_pulse(config, port, exchange).map(millis),
+            may_leave_late: exchange.when.rising.is_some() && matches!(port.bus, Bus::Can { .. }),
             percent: exchange.when.every.map(|every| (takes_us * 100).div_ceil(every.as_micros().max(1))),
         }
     }
@@ -145,6 +149,9 @@ impl Talk {
         }
         if let Some(pulse) = self.pulse_ms {
             report += &format!("    a pulse of {pulse} ms or more is seen for sure\n");
+        }
+        if self.may_leave_late {
+            report += "    with socketcan:, a frame that waits in the adapter leaves late\n";
         }
         report
     }
