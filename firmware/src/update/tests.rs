@@ -82,7 +82,7 @@ fn header(seed: &[u8; 32]) -> Header {
 }
 
 fn put(updates: &mut Updates<Ram>, offset: u32, bytes: &[u8]) -> Result<(), Refused> {
-    block_on(updates.take(offset, bytes, Some((1, 3)), GOOD_A, Downgrade::Refused))
+    block_on(updates.take(offset, bytes, Some((FORMATS.oldest, FORMATS.newest)), GOOD_A, Downgrade::Refused))
 }
 
 fn stage(updates: &Updates<Ram>) -> (Stage, u32) {
@@ -168,7 +168,7 @@ fn what_is_wrong_is_refused_and_says_why() {
     let head = header(&SEED).encode();
     let on_trial = block_on(updates.take(0, &head, None, marks, Downgrade::Refused));
     assert_eq!(on_trial, Err(Refused::Rule(recipe_update::Refused::OnTrial)));
-    let kept = block_on(updates.take(0, &head, Some((1, 99)), GOOD_A, Downgrade::Refused));
+    let kept = block_on(updates.take(0, &head, Some((FORMATS.oldest, 99)), GOOD_A, Downgrade::Refused));
     assert!(matches!(kept, Err(Refused::Rule(recipe_update::Refused::Format { kept: 99, .. }))));
     assert_eq!(updates.slots.as_ref().unwrap().free.erases, 0, "nothing was erased");
     assert_eq!(updates.ready(None, GOOD_A, Downgrade::Refused), Err(Refused::NotReady));

@@ -50,6 +50,11 @@ impl Machine {
         self.moods.now != Mood::Off
     }
 
+    /// It refuses orders: a drive that does sends nothing by itself.
+    pub(super) fn is_refusing(&self) -> bool {
+        self.moods.now == Mood::Refusing
+    }
+
     /// A question or an order of its own was received.
     pub(super) fn heard(&mut self, order: Option<Order>) {
         self.order = order;

@@ -5,11 +5,11 @@ use proto_core::wire::can::{CanFrame, CanId};
 
 use super::Order;
 use super::device::{Answer, Machine};
-use super::rules::{Rules, word};
+use super::rules::{Rules, Source, word};
 use crate::{Device, Rng, SlaveDone};
 
 pub(super) fn rules() -> Rules {
-    let moves = vec![word("WordOutputReg[1]"), word("WordOutputReg[2]")];
+    let moves = vec![word("WordOutputReg[1]"), Source::Own(0)];
     Rules::new(moves, &["WordInputReg[1]", "WordInputReg[2]"], TIMEOUT).limit("WordOutputReg[1]", 50_000)
 }
 
@@ -69,7 +69,7 @@ impl Device<CanFrame> for Drive {
             replies.iter().filter_map(|bytes| CanFrame::new(CanId::Standard(0x585), bytes)).collect();
         if now >= self.next_pdo {
             self.next_pdo = now + PDO_EVERY;
-            if self.machine.is_on() {
+            if self.machine.is_on() && !self.machine.is_refusing() {
                 let [low, high] = self.machine.renew(0).to_le_bytes();
                 frames.extend(CanFrame::new(CanId::Standard(0x185), &[low, high, 0x37, 0]));
             }

@@ -29,7 +29,7 @@ pub(crate) use rules::Rules;
 
 use crate::{Cell, Invariant, Rng, Violation};
 use robot::Robot;
-use rules::{MOVE_BIT, STOP_BIT};
+use rules::{MOVE_BIT, STOP_BIT, Source};
 
 /// What a device did, as its own log has it.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -320,6 +320,13 @@ impl Judge {
     fn moves(&mut self, values: &[u32], now: Instant) -> Result<(), String> {
         let rules = &self.rules;
         let found = self.robot.rise_for(rules, values, now)?;
+        for (source, value) in rules.moves.0.iter().zip(values) {
+            if let Source::Own(nth) = source
+                && !u16::try_from(*value).is_ok_and(|value| self.was_held(*nth, value, now).is_ok())
+            {
+                return Err(format!("it was told {value:#06x} as its own value, which it did not hold"));
+            }
+        }
         if let Some(stop) = found.stop
             && self.stop_heard.is_none_or(|heard| heard < stop)
         {

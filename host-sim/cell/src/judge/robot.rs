@@ -121,14 +121,14 @@ impl Robot {
         conn.came.extend_from_slice(bytes);
         while let Some(frame) = next_frame(&mut conn.came) {
             // One at a time is asked, and given up after half a second: what comes earlier follows an answer.
-            let is_soon = conn.newest.is_some_and(|newest| now.saturating_since(newest) < SURELY_TAKEN);
-            conn.newest = Some(now);
-            if is_soon {
+            let before = conn.newest.replace(now);
+            if let Some(before) = before.filter(|before| now.saturating_since(*before) < SURELY_TAKEN) {
                 for nth in conn.open.drain(..) {
                     self.words[nth].read.push_back(now);
                 }
                 let newest = self.readings.iter_mut().rev().find(|reading| reading.conn == id);
-                if let Some(reading) = newest {
+                // An answer to what was given up is not taken.
+                if let Some(reading) = newest.filter(|reading| reading.answered >= before) {
                     reading.taken.get_or_insert(now);
                 }
             }
@@ -272,6 +272,8 @@ impl Robot {
             let var = match source {
                 Source::Constant(constant) if constant == value => continue,
                 Source::Constant(_) => return false,
+                // The device knows.
+                Source::Own(_) => continue,
                 Source::Word(var) => var,
             };
             let Some(word) = self.words.iter().find(|word| word.var == *var) else { return false };

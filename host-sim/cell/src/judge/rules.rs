@@ -7,6 +7,8 @@ use proto_core::time::Duration;
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Source {
     Word(SysVar),
+    /// A value of the device itself, by its number, as it sent it before.
+    Own(usize),
     Constant(u32),
 }
 
@@ -65,7 +67,7 @@ impl Rules {
         let words = self.moves.0.iter().chain(self.step.iter().flat_map(|(sources, _)| sources));
         let words = words.filter_map(|source| match source {
             Source::Word(var) => Some(*var),
-            Source::Constant(_) => None,
+            Source::Own(_) | Source::Constant(_) => None,
         });
         words.chain(self.keeps)
     }
