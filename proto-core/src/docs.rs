@@ -15,6 +15,7 @@ macro_rules! page {
 
 /// [driver]: driver
 /// [wire]: wire
+/// [command]: wire::command
 #[doc = ""]
 #[doc = include_str!("../docs/engine.md")]
 pub mod engine {}
@@ -43,6 +44,7 @@ pub mod wire {
     page!(slcan: );
 
     /// [modbus]: modbus
+    /// [engine]: super::engine
     #[doc = ""]
     #[doc = include_str!("../docs/wire/modbus-rtu.md")]
     pub mod modbus_rtu {}

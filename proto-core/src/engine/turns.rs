@@ -486,13 +486,17 @@ impl Turns<'_> {
         first.is_some_and(|first| first != nth)
     }
 
-    /// Whether a start waits until its peer is heard, because another row will tell: one that is sent to a peer that is
-    /// away may be carried out without a reply, and once more when the peer is back.
+    /// Whether a start waits until its peer is heard, because another row will tell: one that is sent in vain, or while
+    /// the peer is away, may be carried out without a reply, and once more when the peer is back.
     fn start_waits(&self, row: &Row) -> bool {
         let tells = |other: &Row| other.peer == row.peer && other.kind.is_answered && other.grid.is_some();
-        row.start != Start::Over
-            && self.peers.get(usize::from(row.peer)).is_some_and(|peer| peer.turn.is_away())
-            && self.rows.iter().any(tells)
+        let is_away = || self.peers.get(usize::from(row.peer)).is_some_and(|peer| peer.turn.is_away());
+        let waits = match row.start {
+            Start::Over => false,
+            Start::Wanted(_) => is_away(),
+            Start::Unheard(_) => true,
+        };
+        waits && self.rows.iter().any(tells)
     }
 
     /// The row is taken: its request is being sent, or there is nothing to send.
@@ -651,10 +655,9 @@ impl Turns<'_> {
         let was_answered = rows().any(|row| row.was_answered);
         // One that never was does not say anything while others were.
         let telling = || rows().filter(|row| row.was_answered || !was_answered);
-        // Nor does one that is asked now and then while others have a period: they will tell, but for those that come
-        // before them at the start.
+        // Nor does one that is asked now and then while others have a period: they will tell.
         let has_period = telling().any(|row| row.grid.is_some());
-        let telling = || telling().filter(|row| row.grid.is_some() || !has_period || row.kind.starts);
+        let telling = || telling().filter(|row| row.grid.is_some() || !has_period);
         let (all, missed) = (telling().count(), telling().filter(|row| row.is_missed).count());
         missed >= all.min(2) && missed > 0
     }

@@ -252,12 +252,12 @@ impl Robot {
     /// When a stop was read over the same connection, at the latest with this reading.
     fn stop_before(&self, nth: usize) -> Option<Instant> {
         let conn = self.readings[nth].conn;
-        let own: Vec<&Reading> = self.readings.range(..=nth).filter(|reading| reading.conn == conn).collect();
-        let rises = (0..own.len()).rev().find(|&at| {
-            own[at].stops
-                && (at == 0 || !own[at - 1].stops)
-                && (own[at].taken.is_some() || at + 1 == own.len())
+        let own = self.readings.range(..=nth).enumerate().filter(|(at, reading)| {
+            // The gateway had all of them.
+            reading.conn == conn && (reading.taken.is_some() || *at == nth)
         });
+        let own: Vec<&Reading> = own.map(|(_, reading)| reading).collect();
+        let rises = (0..own.len()).rev().find(|&at| own[at].stops && (at == 0 || !own[at - 1].stops));
         // What was read long ago may have been forgotten here.
         rises.filter(|&at| at > 0).map(|at| own[at].answered)
     }

@@ -604,7 +604,8 @@ impl TalkWatch {
         watch.waits_longer(spec.timeout, now);
         let is_silent = self.is_silent(talk, spec.slave);
         let slave = self.slaves.entry(spec.slave).or_default();
-        slave.failing = Some((slave.failing.map_or(sent, |(since, _)| since), now));
+        let first = flight.timed_out.unwrap_or(sent);
+        slave.failing = Some((slave.failing.map_or(first, |(since, _)| since), now));
         slave.failures += 1;
         if is_silent && slave.presence != Presence::Down {
             (slave.presence, slave.since) = (Presence::Down, now);
