@@ -54,7 +54,7 @@ impl Ports {
             let (left, bus, available) = match bus {
                 Bus::Rs485(_) => (&mut lines, "RS-485", self.lines),
                 Bus::Can { .. } => (&mut buses, "CAN", self.buses),
-                Bus::TcpListen { .. } | Bus::UdpListen { .. } => continue,
+                Bus::ModbusTcp { .. } | Bus::TcpListen { .. } | Bus::UdpListen { .. } => continue,
             };
             *left = left.checked_sub(1).ok_or(NoDevice { port, bus, available })?;
         }

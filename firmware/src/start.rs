@@ -269,7 +269,8 @@ fn run_ports(
                 let missing = Refused::NoDevice(NoDevice { port: id.0, bus: "CAN", available: CAN_PORTS });
                 let _ = can_ports.push((*id, board.can(*bitrate).ok_or(missing)?));
             }
-            Bus::TcpListen { .. } | Bus::UdpListen { .. } => {}
+            // These have links.
+            Bus::ModbusTcp { .. } | Bus::TcpListen { .. } | Bus::UdpListen { .. } => {}
         }
     }
     tasks.spawn(TaskName::Engine, |pulse| engine(pulse, gateway));

@@ -310,3 +310,37 @@ fn an_echo_needs_exchanges() {
     let config = echo(Recipe::user("line").exchanges(&asks)).unwrap();
     assert!(matches!(config.ports[0].bus, Bus::Rs485(line) if line.echo == Echo::Yes));
 }
+
+#[test]
+fn a_port_of_modbus_tcp_takes_what_a_master_asks() {
+    let build = |asks: &[Ask<'_>], host: &str, tcp_port| -> Result<Config, String> {
+        let port = Port::modbus_tcp("drive", "drive", host).tcp_port(tcp_port);
+        let config = Config::builder().controller("10.0.0.2").recipe(Recipe::user("drive").exchanges(asks));
+        config.port(port).build().map_err(|error| error.to_string())
+    };
+    let (register, value) = (register(), value());
+    let asks = [Ask::read_holding_registers(255, 0, &register).every(ms(100))];
+    let config = build(&asks, "drive.cell", 1502).unwrap();
+    assert_eq!(config.ports[0].bus, Bus::ModbusTcp { host: "drive.cell".try_into().unwrap(), port: 1502 });
+    let budget = config.view().exchange_budget(&config.ports[0], &config.exchanges[0]);
+    assert_eq!((budget.request, budget.reply, budget.time), (12, 11, Duration::ZERO));
+    let refused = |asks: &[Ask<'_>], host, port| build(asks, host, port).unwrap_err();
+    assert!(refused(&asks, "drive cell", 502).starts_with("port 1, to: "));
+    assert!(refused(&asks, "drive.cell", 0).starts_with("port 1, to: "));
+    let to_all = [Ask::write_registers(0, 0, &value).on_change()];
+    assert_eq!(
+        refused(&to_all, "drive.cell", 502),
+        "recipe 1, exchange 1, peer: slave 0 is all of them, which Modbus TCP does not have; allowed: 1..=255"
+    );
+    let frames = [Ask::request(AskFrame::stream(&[1], &[], &value)).at_start()];
+    assert_eq!(
+        refused(&frames, "drive.cell", 502),
+        "port 1, recipe: recipe 1 has no exchanges of a Modbus master; a port of Modbus TCP takes only such recipes"
+    );
+    let on_line = Config::builder().controller("10.0.0.2").recipe(Recipe::user("line").exchanges(&asks));
+    let error = on_line.port(Port::modbus_rtu("line", "line")).build().unwrap_err().to_string();
+    assert!(
+        error.ends_with("slave 255 is out of range; allowed: 1..=247, or 0 to write to all of them"),
+        "{error}"
+    );
+}

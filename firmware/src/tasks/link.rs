@@ -1,4 +1,4 @@
-//! One link to the controller: opened, closed and fed as the engine requests.
+//! One link to the controller or a device: opened, closed and fed as the engine requests.
 //!
 //! A link is one task. It owns its socket, reports received data to the engine and sends what is in its
 //! outbox. It knows no protocol and makes no decision: a link that fails reports this once and waits to be
@@ -27,7 +27,7 @@ use super::watchdog::Pulse;
 /// The remote end of a link.
 #[derive(Debug, Clone)]
 pub enum Endpoint {
-    /// The controller's TCP server.
+    /// The TCP server of the controller, or of a device.
     Tcp {
         /// Address or name.
         host: String<64>,
@@ -77,6 +77,12 @@ impl Endpoint {
             }
             LinkKind::RecipeTcpListen { port } => Self::TcpListen { port: listen(usize::from(port.0)), host },
             LinkKind::RecipeUdpListen { port } => Self::UdpListen { port: listen(usize::from(port.0)), host },
+            LinkKind::ModbusDevice { port } => {
+                match config.ports.get(usize::from(port.0)).map(|port| &port.bus) {
+                    Some(Bus::ModbusTcp { host, port }) => Self::Tcp { host: host.clone(), port: *port },
+                    _ => unreachable!("another port"),
+                }
+            }
             other => unreachable!("no such link: {}", other.name()),
         }
     }
@@ -138,7 +144,7 @@ pub async fn run(
 /// Which side connects, and to which port.
 #[derive(Clone, Copy)]
 enum Role {
-    /// The board connects to this port of the controller.
+    /// The board connects to this port of the controller or device.
     Client(u16),
     /// The controller connects to this port of the board.
     Server(u16),

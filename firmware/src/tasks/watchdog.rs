@@ -73,6 +73,7 @@ impl TaskName {
             Self::Refused => (14, 0),
             Self::Board(number) => (15, number),
             Self::Link(LinkKind::Urgent) => (16, 0),
+            Self::Link(LinkKind::ModbusDevice { port }) => (23, port.0),
             Self::Link(_) => (17, 0),
             Self::Keeper => (18, 0),
             Self::Console(number) => (19, number),
@@ -108,6 +109,7 @@ impl TaskName {
             Self::Button,
             Self::Edge,
             Self::Time,
+            Self::Link(LinkKind::ModbusDevice { port }),
         ];
         names.into_iter().find(|name| name.code() == code)
     }

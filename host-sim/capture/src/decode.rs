@@ -5,11 +5,13 @@
 
 use proto_core::device::{Element, Kind};
 use proto_core::engine::TapDirection;
+use proto_core::modbus::adu::HEADER_LEN;
+use proto_core::modbus::rtu;
 use proto_core::sysvar::Direction;
 use proto_core::wire::can::CanId;
 use proto_core::wire::scalar::{Scalar, ScalarType};
 use recipe_export::names::mangle;
-use recipe_export::{Format, Model, describe_use, unit_of};
+use recipe_export::{Format, Model, PortBus, describe_use, unit_of};
 use serde_json::{Map, Value, json};
 
 use crate::record::Frame;
@@ -17,7 +19,14 @@ use crate::record::Frame;
 /// Knows the frames of a file; by default of one that has none.
 #[derive(Debug, Clone, Default)]
 pub struct Decoder {
-    ports: Vec<(String, Vec<Topic>)>,
+    ports: Vec<PortTopics>,
+}
+
+#[derive(Debug, Clone)]
+struct PortTopics {
+    name: String,
+    is_modbus_tcp: bool,
+    topics: Vec<Topic>,
 }
 
 /// Frames of one kind at one port.
@@ -58,7 +67,11 @@ impl Decoder {
                     let recipe = recipe.map_or("", |recipe| &recipe.name);
                     Topic::new(name, format!("{recipe} {}", format.role.name()), format)
                 });
-            (port.name.clone(), topics.collect())
+            PortTopics {
+                name: port.name.clone(),
+                is_modbus_tcp: matches!(port.bus, PortBus::ModbusTcp),
+                topics: topics.collect(),
+            }
         });
         Self { ports: ports.collect() }
     }
@@ -69,10 +82,19 @@ impl Decoder {
             TapDirection::In => Direction::Input,
             TapDirection::Out => Direction::Output,
         };
-        let (_, topics) = self.ports.iter().find(|(name, _)| name == port)?;
-        let topics = topics.iter().filter(|topic| topic.format.direction == direction);
+        let port = self.ports.iter().find(|own| own.name == port)?;
+        let of_line = if port.is_modbus_tcp { Some(as_on_line(frame)?) } else { None };
+        let frame = of_line.as_ref().unwrap_or(frame);
+        let topics = port.topics.iter().filter(|topic| topic.format.direction == direction);
         topics.filter_map(|topic| Some((topic, topic.values(frame)?))).next()
     }
+}
+
+/// A frame of Modbus TCP as it would be on a line, which the file's frames are.
+fn as_on_line(frame: &Frame) -> Option<Frame> {
+    let mut bytes = frame.bytes.get(HEADER_LEN - 1..).filter(|_| frame.len == frame.bytes.len())?.to_vec();
+    bytes.extend(rtu::checksum(&bytes).to_le_bytes());
+    Some(Frame { len: bytes.len(), bytes: bytes.into(), ..frame.clone() })
 }
 
 impl Topic {

@@ -112,7 +112,7 @@ impl Cell {
             let (is_can, bit_rate) = match port.bus {
                 Bus::Rs485(line) => (false, line.baud),
                 Bus::Can { bitrate } => (true, bitrate),
-                Bus::TcpListen { .. } | Bus::UdpListen { .. } => (false, 0),
+                Bus::ModbusTcp { .. } | Bus::TcpListen { .. } | Bus::UdpListen { .. } => (false, 0),
             };
             CellPort { id: PortId(index), name: port.name.to_string(), is_can, bit_rate }
         });

@@ -21,7 +21,7 @@ impl Cell {
             let far = match port.bus {
                 Bus::Rs485(settings) => Medium::Line(self.add_line(owner, settings)),
                 Bus::Can { bitrate } => Medium::Bus(self.add_bus(owner, bitrate)),
-                Bus::TcpListen { .. } | Bus::UdpListen { .. } => continue,
+                Bus::ModbusTcp { .. } | Bus::TcpListen { .. } | Bus::UdpListen { .. } => continue,
             };
             self.names.insert(port.name.as_str().to_owned(), far);
         }

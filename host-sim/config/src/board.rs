@@ -50,7 +50,7 @@ impl Board {
             let (left, bus, available) = match port.bus {
                 Bus::Rs485(_) => (&mut lines, "RS-485", self.serial_ports),
                 Bus::Can { .. } => (&mut buses, "CAN", self.can_ports),
-                Bus::TcpListen { .. } | Bus::UdpListen { .. } => continue,
+                Bus::ModbusTcp { .. } | Bus::TcpListen { .. } | Bus::UdpListen { .. } => continue,
             };
             let Some(rest) = left.checked_sub(1) else {
                 let message =

@@ -6,7 +6,7 @@
 
 use std::collections::BTreeMap;
 
-use proto_core::config::{GatewayConfig, MAX_PORTS};
+use proto_core::config::{Bus, GatewayConfig, MAX_PORTS};
 use proto_core::engine::{
     BusState, Engine, FieldBus, LinkCounters, PeerCounters, PortCounters, PortId, PortState, ReplyCode,
 };
@@ -151,9 +151,8 @@ impl StatusDocument {
     ) -> Result<State, proto_core::engine::BuildError> {
         let view = config.view();
         let ports = view.field_ports().filter_map(|(index, port, _)| {
-            let is_can = matches!(port.bus, proto_core::config::Bus::Can { .. });
             let name = port.name.as_str();
-            Some(self.ports.get(name)?.port(PortId(index), name, is_can))
+            Some(self.ports.get(name)?.port(PortId(index), name, &port.bus))
         });
         let ports = ports.collect();
         // An engine knows which links a configuration needs, and where they go.
@@ -188,13 +187,14 @@ impl StatusDocument {
 }
 
 impl PortDocument {
-    fn port(&self, id: PortId, name: &str, is_can: bool) -> Port {
+    fn port(&self, id: PortId, name: &str, bus: &Bus) -> Port {
         let bus_state = self.bus_state.as_deref();
         let states = [BusState::Active, BusState::Warning, BusState::Passive, BusState::BusOff];
         let state = states.into_iter().find(|state| Some(state.name()) == bus_state);
-        let bus = match is_can {
-            true => FieldBus::Can { state: state.unwrap_or(BusState::Active) },
-            false => FieldBus::Rs485,
+        let bus = match bus {
+            Bus::Can { .. } => FieldBus::Can { state: state.unwrap_or(BusState::Active) },
+            Bus::ModbusTcp { .. } => FieldBus::ModbusTcp,
+            _ => FieldBus::Rs485,
         };
         let states = [PortState::Working, PortState::Silent, PortState::BusOff, PortState::Gone];
         let state = states.into_iter().find(|state| state.name() == self.state);

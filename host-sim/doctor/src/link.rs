@@ -60,6 +60,7 @@ impl Link<'_> {
             LinkKind::Command => ("the command port, usually 2000", "command"),
             LinkKind::State => ("the state stream, usually 2001", "state"),
             LinkKind::Modbus => ("the Modbus server, usually 502", "modbus"),
+            LinkKind::ModbusDevice { .. } => ("the device's Modbus server, usually 502", "to"),
             _ => ("the recipe server, usually 2011", "udp2011"),
         }
     }
@@ -91,19 +92,29 @@ impl Link<'_> {
         }
         let (to, expected) = (self.to(), format!("a connection to {what}"));
         let host = &self.info.host;
+        // Where the file says where it is.
+        let (address, port, where_on) = match self.info.kind {
+            LinkKind::ModbusDevice { .. } => {
+                ("to of the port".to_owned(), "to of the port".to_owned(), "device")
+            }
+            _ => ("controller.address".to_owned(), format!("controller.ports.{key} of the file"), "pendant"),
+        };
         match reach {
             Some(Reach::Refused) => self.fault(Cause::Refused, [
                 format!("{to} refuses the connection"),
                 expected,
                 "The machine is there and nobody listens at this port: another port number, or the service is off"
                     .into(),
-                format!("Check controller.ports.{key} of the file, and that the service is on at the pendant"),
+                format!("Check {port}, and that the service is on at the {where_on}"),
             ]),
             Some(Reach::NoSuchHost) => self.fault(Cause::NoSuchHost, [
                 format!("the name {host} is not known"),
                 expected,
-                "controller.address is misspelt, or no name server knows it".into(),
-                "Write the controller's IP address".into(),
+                format!("{address} is misspelt, or no name server knows it"),
+                match self.info.kind {
+                    LinkKind::ModbusDevice { .. } => "Write the device's IP address".into(),
+                    _ => "Write the controller's IP address".into(),
+                },
             ]),
             Some(Reach::Failed(error)) => self.fault(Cause::Unreachable, [
                 format!("{to}: {error}"),
@@ -114,8 +125,9 @@ impl Link<'_> {
             _ => self.fault(Cause::Unreachable, [
                 format!("no answer from {to}"),
                 expected,
-                "controller.address is another machine's or nobody's, a cable is unplugged, or a firewall drops it"
-                    .into(),
+                format!(
+                    "{address} is another machine's or nobody's, a cable is unplugged, or a firewall drops it"
+                ),
                 format!("Try `ping {host}`; check cable, address and mask"),
             ]),
         }

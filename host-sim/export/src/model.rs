@@ -68,6 +68,8 @@ pub enum PortBus {
         /// Bit/s.
         bitrate: u32,
     },
+    /// A connection of Modbus TCP to devices: each frame has its header, and no CRC.
+    ModbusTcp,
     /// TCP or UDP.
     Network,
 }
@@ -242,6 +244,7 @@ fn gateway_ports(config: &GatewayConfig) -> Vec<Port> {
             bus: match port.bus {
                 Bus::Rs485(line) => PortBus::Serial { baud: line.baud },
                 Bus::Can { bitrate } => PortBus::Can { bitrate },
+                Bus::ModbusTcp { .. } => PortBus::ModbusTcp,
                 Bus::TcpListen { .. } | Bus::UdpListen { .. } => PortBus::Network,
             },
             recipe: Some(usize::from(port.recipe)),

@@ -307,7 +307,15 @@ impl Core {
             return;
         }
         let mut unreachable = self.unreachable.borrow_mut();
-        if is_up && unreachable.remove(&id) {
+        if let LinkKind::ModbusDevice { .. } = info.kind {
+            if is_up && unreachable.remove(&id) {
+                warn!(port = info.name, "connected to the device again");
+            } else if is_up {
+                info!(port = info.name, "connected to the device");
+            } else if unreachable.insert(id) {
+                warn!(port = info.name, "no connection to the device; trying again");
+            }
+        } else if is_up && unreachable.remove(&id) {
             warn!(link = info.name, "connected to the controller again");
         } else if is_up {
             info!(link = info.name, "connected to the controller");
@@ -366,6 +374,7 @@ impl Core {
             (Voice::Asking, Output::PortSend { port, .. } | Output::PortSendCan { port, .. }) => {
                 self.asks.contains(port)
             }
+            (Voice::Asking, Output::LinkSend { link, .. }) => self.asks_over(*link),
             (_, &Output::LinkOpen { link, .. }) => self.may_open(link),
             (_, Output::LinkClose { .. }) => true,
             _ => false,
@@ -373,9 +382,15 @@ impl Core {
     }
 
     /// Whether a link may be opened. A gateway that only listens reads the state stream, on which nothing
-    /// is ever sent.
+    /// is ever sent; one that asks also has the connections to devices.
     fn may_open(&self, link: LinkId) -> bool {
-        self.voice == Voice::Full || link == LinkId::STATE
+        let asks = self.voice == Voice::Asking && self.asks_over(link);
+        self.voice == Voice::Full || link == LinkId::STATE || asks
+    }
+
+    /// Whether a link is the connection to devices that are asked.
+    fn asks_over(&self, link: LinkId) -> bool {
+        link.port().is_some_and(|port| self.asks.contains(&port))
     }
 
     fn with_port(&self, id: PortId, act: impl FnOnce(&PortTx)) {

@@ -79,6 +79,7 @@ impl Talk {
             ExchangeKind::Slave(_) => "block",
             _ => "exchange",
         };
+        let is_tcp = matches!(port.bus, Bus::ModbusTcp { .. });
         let budget = config.view().exchange_budget(port, exchange);
         // A slave receives requests and sends replies.
         let (asks, answers) = match named.kind {
@@ -96,15 +97,18 @@ impl Talk {
             let Some(frame) = frame.as_ref().filter(|_| is_shown) else { continue };
             let remote = named.remote && name == "request";
             let carrier = if frame.id.is_some() { Carrier::Can } else { Carrier::Stream };
+            let rows = frame::rows(frame, carrier, part);
             frames.push(TalkFrame {
                 frame: name,
                 id: frame.id.map(text::show_id),
                 bytes: len.filter(|_| !remote),
                 remote,
-                rows: frame::rows(frame, carrier, part),
+                rows: if is_tcp { frame::over_tcp(rows) } else { rows },
             });
         }
         let recipe = config.recipes.get(usize::from(port.recipe));
+        // A transaction id tells all replies apart.
+        let recipe = recipe.filter(|_| !is_tcp);
         let held = recipe.map_or(0, |recipe| config.view().held_back_by(recipe, exchange));
         let held_back: Vec<usize> = (1..=64).filter(|nth| held >> (nth - 1) & 1 == 1).collect();
         let millis = |time: Duration| time.as_micros() as f64 / 1e3;
@@ -122,7 +126,11 @@ impl Talk {
             held_back,
             pulse_ms: shortest_pulse(config, port, exchange).map(millis),
             may_leave_late: exchange.when.rising.is_some() && matches!(port.bus, Bus::Can { .. }),
-            percent: exchange.when.every.map(|every| (takes_us * 100).div_ceil(every.as_micros().max(1))),
+            percent: exchange
+                .when
+                .every
+                .filter(|_| !is_tcp)
+                .map(|every| (takes_us * 100).div_ceil(every.as_micros().max(1))),
         }
     }
 
@@ -133,12 +141,9 @@ impl Talk {
         report.extend(self.frames.iter().map(TalkFrame::show));
         let lost = self.without_reply_us.map(|longest| format!(", {} without a reply", show_time(longest)));
         let own = self.percent.map(|percent| format!(", {percent} % of the time"));
-        report += &format!(
-            "    takes {}{}{}\n",
-            show_time(self.takes_us),
-            lost.unwrap_or_default(),
-            own.unwrap_or_default()
-        );
+        // A network takes what it takes.
+        let takes = if self.takes_us > 0 { show_time(self.takes_us) } else { "no time of a line".to_owned() };
+        report += &format!("    takes {}{}{}\n", takes, lost.unwrap_or_default(), own.unwrap_or_default());
         if let Some(late) = self.late_ms.filter(|late| *late > 0.0) {
             let numbers: Vec<_> = self.held_back.iter().map(usize::to_string).collect();
             let others = if numbers.len() == 1 { "exchange" } else { "exchanges" };

@@ -38,6 +38,21 @@ struct Frame {
     rows: Vec<Row>,
 }
 
+/// The rows of a frame of a Modbus line as it is over TCP: a header in front, and no checksum at the end.
+pub(super) fn over_tcp(mut rows: Vec<Row>) -> Vec<Row> {
+    const HEADER: usize = 6;
+    rows.pop();
+    for row in &mut rows {
+        let places = row.bytes.split("..").map(|place| place.parse::<usize>().map(|place| place + HEADER));
+        if let Ok(places) = places.collect::<Result<Vec<_>, _>>() {
+            row.bytes = places.iter().map(ToString::to_string).collect::<Vec<_>>().join("..");
+        }
+    }
+    let is = "transaction id, 0 and length, 2 bytes each".to_owned();
+    rows.insert(0, Row { bytes: format!("0..{}", HEADER - 1), name: "header".to_owned(), is });
+    rows
+}
+
 /// The frames of one part, a line for each run of bytes.
 pub(super) fn picture(recipe: &DeviceRecipe, part: Direction) -> Picture {
     let ends = match recipe.ends(part) {

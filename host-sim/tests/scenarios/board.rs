@@ -85,7 +85,7 @@ impl Wires {
             let socket = match &port.bus {
                 Bus::Rs485(_) => lines.next(),
                 Bus::Can { .. } => buses.next(),
-                Bus::TcpListen { .. } | Bus::UdpListen { .. } => None,
+                Bus::ModbusTcp { .. } | Bus::TcpListen { .. } | Bus::UdpListen { .. } => None,
             };
             ports.extend(socket.map(|socket| (port.name.as_str().to_owned(), *socket)));
         }
@@ -255,7 +255,7 @@ fn forward(bus: &Bus) -> Option<(&'static str, u16)> {
     let (kind, listen) = match bus {
         Bus::TcpListen { listen } => ("tcp", listen),
         Bus::UdpListen { listen } => ("udp", listen),
-        Bus::Rs485(_) | Bus::Can { .. } => return None,
+        Bus::Rs485(_) | Bus::Can { .. } | Bus::ModbusTcp { .. } => return None,
     };
     Some((kind, listen.parse::<SocketAddr>().unwrap().port()))
 }

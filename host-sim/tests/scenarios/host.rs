@@ -51,7 +51,7 @@ impl Environment for Host {
         for port in &plan.config().ports {
             let name = port.name.as_str();
             let reached = match (&port.bus, &mut network) {
-                (Bus::Rs485(_) | Bus::Can { .. }, _) => continue,
+                (Bus::Rs485(_) | Bus::Can { .. } | Bus::ModbusTcp { .. }, _) => continue,
                 (Bus::TcpListen { .. }, Some(network)) => network.tcp(place(name)),
                 (Bus::UdpListen { .. }, Some(network)) => network.udp(place(name)),
                 (_, None) => place(name),
@@ -106,7 +106,7 @@ fn arguments(plan: &Plan<'_>, servers: &[(&'static str, u16)]) -> Vec<String> {
             Bus::TcpListen { .. } | Bus::UdpListen { .. } => {
                 arguments.push(format!("--set=port.{name}.listen=127.0.0.1:0"));
             }
-            Bus::Rs485(_) | Bus::Can { .. } => {}
+            Bus::Rs485(_) | Bus::Can { .. } | Bus::ModbusTcp { .. } => {}
         }
     }
     for port in &config.ports {
@@ -114,7 +114,7 @@ fn arguments(plan: &Plan<'_>, servers: &[(&'static str, u16)]) -> Vec<String> {
         let device = match port.bus {
             Bus::Rs485(_) => format!("pty:{}", plan.case.folder.path().join(name).display()),
             Bus::Can { .. } => "slcan-tcp:127.0.0.1:0".to_owned(),
-            Bus::TcpListen { .. } | Bus::UdpListen { .. } => continue,
+            Bus::ModbusTcp { .. } | Bus::TcpListen { .. } | Bus::UdpListen { .. } => continue,
         };
         arguments.push(format!("--bind={name}={device}"));
     }

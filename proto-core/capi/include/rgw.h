@@ -126,6 +126,8 @@ enum rgw_port_kind
   RGW_PORT_KIND_TCP_LISTEN = 2,
   // A UDP port that the controller sends to: a link, not a field port.
   RGW_PORT_KIND_UDP_LISTEN = 3,
+  // Devices of Modbus TCP: a field port that has a link and no device of its own.
+  RGW_PORT_KIND_MODBUS_TCP = 4,
 };
 #ifndef __cplusplus
 #if __STDC_VERSION__ >= 202311L

@@ -33,6 +33,8 @@ pub enum Kind {
     TcpListen = 2,
     /// A UDP port that the controller sends to: a link, not a field port.
     UdpListen = 3,
+    /// Devices of Modbus TCP: a field port that has a link and no device of its own.
+    ModbusTcp = 4,
 }
 
 /// A serial line's parity.
@@ -170,6 +172,7 @@ pub unsafe extern "C" fn rgw_config_port(
                 bit_rate: line.baud,
             },
             Bus::Can { bitrate } => PortSettings { bit_rate: *bitrate, ..other(Kind::Can) },
+            Bus::ModbusTcp { .. } => other(Kind::ModbusTcp),
             Bus::TcpListen { .. } => other(Kind::TcpListen),
             Bus::UdpListen { .. } => other(Kind::UdpListen),
         };

@@ -6,7 +6,7 @@ use super::error::{ConfigErrorKind as Kind, ExchangeKey as Key, Place};
 use super::exchange::{Exchange, FrameSpec, Talk};
 use super::rules::{Check, MAX_TIME, check_pool, check_time, fail};
 use super::{
-    ConfigView, Constants, DeviceFrame, FieldSpec, Parts, Port, PortHealth, Recipe, Span, StreamPart,
+    Bus, ConfigView, Constants, DeviceFrame, FieldSpec, Parts, Port, PortHealth, Recipe, Span, StreamPart,
 };
 use crate::device::{Carrier, LayoutError};
 use crate::modbus::rtu::{BROADCAST, CountError, MAX_ADDRESS, MAX_SLAVES, Operation};
@@ -56,6 +56,8 @@ pub enum ExchangeError {
     },
     /// A broadcast that reads: nobody would answer.
     BroadcastRead,
+    /// A write to all slaves over Modbus TCP, which has no broadcast.
+    BroadcastOverTcp,
     /// A field of coils that is not one bit.
     NotCoils,
     /// More slaves or other peers than one port can have.
@@ -156,6 +158,9 @@ impl fmt::Display for ExchangeError {
             }
             Self::BroadcastRead => {
                 f.write_str("slave 0 is all of them, which cannot be read; allowed: writes")
+            }
+            Self::BroadcastOverTcp => {
+                f.write_str("slave 0 is all of them, which Modbus TCP does not have; allowed: 1..=255")
             }
             Self::NotCoils => f.write_str("the fields of coils are one bit each; their type is Coil"),
             Self::TooManyPeers => {
@@ -370,7 +375,7 @@ impl<'a> ExchangeCheck<'a> {
                 self.refuse(nth, Key::Whole, ExchangeError::PartsBesideModbus)
             }
             Talk::Rtu { operation, written, read } => {
-                if peer > MAX_ADDRESS {
+                if peer > MAX_ADDRESS && !self.is_only_over_tcp() {
                     return self.refuse(nth, Key::Peer, ExchangeError::Slave { address: peer });
                 }
                 if peer == BROADCAST && operation.reads() {
@@ -408,6 +413,12 @@ impl<'a> ExchangeCheck<'a> {
                 self.check_frames(nth, is_never, [request, reply, refusal])
             }
         }
+    }
+
+    /// Whether all ports with this recipe are of Modbus TCP, whose unit ids have no end but that of a byte.
+    fn is_only_over_tcp(&self) -> bool {
+        let mut own = self.config.ports.iter().filter(|port| port.recipe == self.index).peekable();
+        own.peek().is_some() && own.all(|port| matches!(port.bus, Bus::ModbusTcp { .. }))
     }
 
     /// Counts, and that the fields fill them: those that are written, and those that are read.

@@ -152,6 +152,7 @@ impl PortKey {
             Self::Echo => "echo",
             Self::Bitrate => "bitrate",
             Self::Listen => "listen",
+            Self::To => "to",
             Self::Health => "health",
             Self::Absent => "absent",
             Self::SafeAtStart => "safe at start",
@@ -398,6 +399,11 @@ impl fmt::Display for DescribedKind<'_> {
             Kind::NeedsStreamRecipe { recipe } => {
                 write!(f, "{} is a CAN recipe; only CAN ports take CAN recipes", recipe_name(recipe))
             }
+            Kind::NeedsModbusMaster { recipe } => write!(
+                f,
+                "{} has no exchanges of a Modbus master; a port of Modbus TCP takes only such recipes",
+                recipe_name(recipe)
+            ),
             Kind::NeedsCanRecipe { recipe } => {
                 write!(f, "{} is a stream recipe; a CAN port takes only CAN recipes", recipe_name(recipe))
             }
@@ -471,7 +477,7 @@ impl fmt::Display for DescribedKind<'_> {
                 write!(f, "{var} cannot tell a port's health; allowed: WordInputReg, FloatInputReg")
             }
             Kind::HealthTwice { var } => write!(f, "this port already writes {var}"),
-            Kind::OnlyFieldPorts => f.write_str("allowed only on field ports: rs485, can"),
+            Kind::OnlyFieldPorts => f.write_str("allowed only on field ports: rs485, modbus-tcp, can"),
             Kind::NoSafeValues => f.write_str("the port has no safe values; write them in on_timeout"),
             Kind::OnlyChangesRefresh => {
                 f.write_str("allowed only with a recipe whose output part has send = \"change\"")

@@ -252,6 +252,13 @@ impl RtuLine {
     }
 }
 
+/// The bus of a [`PortBuilder`] over Modbus TCP: where the device, or its gateway, is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ModbusTcp<'a> {
+    host: &'a str,
+    port: u16,
+}
+
 /// The bus of a [`PortBuilder`] on CAN: its bit rate.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Can(u32);
@@ -313,6 +320,16 @@ impl Port {
     /// and turnaround are 3.5 characters, or 1750 µs above 19 200 bit/s, unless they are set.
     pub fn modbus_rtu_slave<'a>(name: &'a str, recipe: &'a str) -> PortBuilder<'a, RtuLine> {
         PortBuilder::new(name, recipe, RtuLine::new(true))
+    }
+
+    /// Devices of which the gateway is the Modbus TCP client, for a recipe of a Modbus master; by default at TCP port 502
+    /// of `host`, an IP address or a name.
+    pub const fn modbus_tcp<'a>(
+        name: &'a str,
+        recipe: &'a str,
+        host: &'a str,
+    ) -> PortBuilder<'a, ModbusTcp<'a>> {
+        PortBuilder::new(name, recipe, ModbusTcp { host, port: Bus::MODBUS_TCP })
     }
 
     /// A CAN bus; by default 500 kbit/s.
@@ -454,7 +471,15 @@ impl PortBuilder<'_, Can> {
     }
 }
 
-/// The bus of a [`PortBuilder`]: [`Rs485`], [`RtuLine`], [`Can`], [`Listen`].
+impl PortBuilder<'_, ModbusTcp<'_>> {
+    /// The TCP port.
+    pub fn tcp_port(mut self, port: u16) -> Self {
+        self.bus.port = port;
+        self
+    }
+}
+
+/// The bus of a [`PortBuilder`]: [`Rs485`], [`RtuLine`], [`ModbusTcp`], [`Can`], [`Listen`].
 pub trait PortBus: sealed::Sealed {}
 
 /// A serial line as the bus of a [`PortBuilder`]: [`Rs485`], [`RtuLine`].
@@ -464,11 +489,12 @@ impl SerialLine for Rs485 {}
 impl SerialLine for RtuLine {}
 impl PortBus for Rs485 {}
 impl PortBus for RtuLine {}
+impl PortBus for ModbusTcp<'_> {}
 impl PortBus for Can {}
 impl PortBus for Listen<'_> {}
 
 pub(super) mod sealed {
-    use super::{Bus, Can, Duration, Kind, Listen, Rs485, RtuLine, text};
+    use super::{Bus, Can, Duration, Kind, Listen, ModbusTcp, Rs485, RtuLine, text};
 
     /// Buses are those of the configuration.
     pub trait Sealed {
@@ -512,6 +538,12 @@ pub(super) mod sealed {
     impl Line for RtuLine {
         fn line(&mut self) -> &mut Rs485 {
             &mut self.line
+        }
+    }
+
+    impl Sealed for ModbusTcp<'_> {
+        fn bus(&self) -> Result<Bus, Kind> {
+            Ok(Bus::ModbusTcp { host: text(self.host)?, port: self.port })
         }
     }
 

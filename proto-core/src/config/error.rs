@@ -118,7 +118,7 @@ pub enum Counted {
     FieldPorts,
     /// Input frames of all field ports.
     InputFrames,
-    /// Recipe links of an engine.
+    /// Recipe links and Modbus TCP ports of an engine.
     RecipeLinks,
     /// User-defined fields of all field ports in one direction.
     UserFields,
@@ -163,7 +163,7 @@ impl core::fmt::Display for Counted {
             Self::Counters => "alive counters in input frames",
             Self::DeviceFrames => "frames of a device on one port",
             Self::InputFrames => "input frames",
-            Self::RecipeLinks => "recipe links",
+            Self::RecipeLinks => "recipe links and Modbus TCP ports",
             Self::UserFields => "user-defined fields in one direction",
             Self::CommandFields => "command fields",
             Self::CommandBytes => "bytes of command texts",
@@ -483,6 +483,11 @@ pub enum ConfigErrorKind {
     },
     /// A CAN recipe on a port or link that carries byte streams (D16).
     NeedsStreamRecipe {
+        /// Index of the recipe.
+        recipe: u8,
+    },
+    /// Another recipe than that of a Modbus master on a port of Modbus TCP.
+    NeedsModbusMaster {
         /// Index of the recipe.
         recipe: u8,
     },

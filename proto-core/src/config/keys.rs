@@ -106,6 +106,8 @@ pub enum PortKey {
     Bitrate,
     /// The address to listen on.
     Listen,
+    /// The device to connect to.
+    To,
     /// The variables of its health.
     Health,
     /// Whether it starts with safe values.

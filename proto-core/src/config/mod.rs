@@ -48,7 +48,8 @@ pub use command_text::CommandText;
 pub(crate) use command_text::{fill_in, placeholders};
 pub use device::DeviceFrame;
 pub use draft::{
-    Can, ControllerBuilder, Listen, PortBuilder, PortBus, RecipeBuilder, RtuLine, SafeValues, SerialLine,
+    Can, ControllerBuilder, Listen, ModbusTcp, PortBuilder, PortBus, RecipeBuilder, RtuLine, SafeValues,
+    SerialLine,
 };
 pub use error::{
     ConfigError, ConfigErrorKind, ControllerKey, Counted, ExchangeKey, NetworkKey, Place, PortKey, RecipeKey,

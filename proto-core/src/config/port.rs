@@ -4,7 +4,7 @@
 
 use heapless::String;
 
-use super::{MAX_LISTEN, Name, PortHealth, Span};
+use super::{MAX_ADDRESS, MAX_LISTEN, Name, PortHealth, Span};
 use crate::modbus::rtu::Timing;
 use crate::time::Duration;
 
@@ -86,15 +86,24 @@ pub enum Bus {
         /// Address and port.
         listen: String<MAX_LISTEN>,
     },
+    /// Devices on the field side, of which the gateway is the Modbus TCP client over one connection.
+    ModbusTcp {
+        /// IP address or host name.
+        host: String<MAX_ADDRESS>,
+        /// TCP port; a file's default is [`Bus::MODBUS_TCP`].
+        port: u16,
+    },
 }
 
 impl Bus {
     /// Default bit rate of a CAN bus, in bit/s.
     pub const BITRATE: u32 = 500_000;
+    /// Default TCP port of Modbus.
+    pub const MODBUS_TCP: u16 = 502;
 
     /// Whether devices (not the controller) are at the other end.
     pub fn is_field(&self) -> bool {
-        matches!(self, Self::Rs485(_) | Self::Can { .. })
+        matches!(self, Self::Rs485(_) | Self::Can { .. } | Self::ModbusTcp { .. })
     }
 }
 

@@ -5,17 +5,20 @@
 //! and sources).
 
 use super::check_recipe::{RecipeCheck, check_layout};
-use super::error::{ConfigError, ConfigErrorKind as Kind, ControllerKey, Counted, Place, PortKey, RecipeKey};
+use super::error::{
+    ConfigError, ConfigErrorKind as Kind, ControllerKey, Counted, ExchangeKey, Place, PortKey, RecipeKey,
+};
 use super::listen::listen_address;
 use super::rules::{
     Check, MAX_TIME, check_address, check_bitrate, check_cycle, check_new_name, check_pool, check_room,
     check_time, fail, is_marked, mark,
 };
 use super::{
-    Bus, ConfigView, Echo, MAX_ALL_FIELDS, MAX_COMMANDS, MAX_EXCHANGES, MAX_PORTS, MAX_RECIPES,
-    MAX_SAFE_VALUES, Parts, Port, PortHealth, Recipe, SafeValue, SendOn,
+    Bus, ConfigView, Echo, ExchangeError, MAX_ALL_FIELDS, MAX_COMMANDS, MAX_EXCHANGES, MAX_PORTS,
+    MAX_RECIPES, MAX_SAFE_VALUES, Parts, Port, PortHealth, Recipe, SafeValue, SendOn, Talk,
 };
 use crate::image::BitSet;
+use crate::modbus::rtu::BROADCAST;
 use crate::recipe::model::{Framing, Mode};
 use crate::sysvar::{COUNT, Direction, INPUT_COUNT, SysVar, VarBit};
 use crate::wire::dialect::Dialect;
@@ -125,6 +128,13 @@ impl<'c> ConfigView<'c> {
                     return fail(at(PortKey::Recipe), Kind::NeedsCanRecipe { recipe: port.recipe });
                 }
             }
+            Bus::ModbusTcp { host, port: tcp_port } => {
+                check_address(host).map_err(|kind| ConfigError { place: at(PortKey::To), kind })?;
+                if *tcp_port == 0 {
+                    return fail(at(PortKey::To), Kind::ZeroPort);
+                }
+                self.check_master(at(PortKey::Recipe), port.recipe, recipe)?;
+            }
             Bus::TcpListen { listen } | Bus::UdpListen { listen } => {
                 self.check_upstream_recipe(at(PortKey::Recipe), port.recipe)?;
                 if matches!(port.bus, Bus::TcpListen { .. }) {
@@ -158,6 +168,19 @@ impl<'c> ConfigView<'c> {
             }
         }
         Ok(())
+    }
+
+    /// A recipe for Modbus TCP: that of a Modbus master, without a broadcast.
+    fn check_master(&self, place: Place, index: u8, recipe: &Recipe) -> Check {
+        let exchanges = self.exchanges_of(recipe);
+        if exchanges.is_empty() || exchanges.iter().any(|one| !matches!(one.talk, Talk::Rtu { .. })) {
+            return fail(place, Kind::NeedsModbusMaster { recipe: index });
+        }
+        let to_all = (0..).zip(exchanges).find(|(_, one)| one.peer == BROADCAST);
+        to_all.map_or(Ok(()), |(exchange, _)| {
+            let place = Place::Exchange { recipe: index, exchange, key: ExchangeKey::Peer };
+            fail(place, Kind::Exchange(ExchangeError::BroadcastOverTcp))
+        })
     }
 
     /// A byte stream needs a head or a tail to find frames by (D18); everything else is valid on

@@ -13,6 +13,7 @@ use super::command_link::CommandLink;
 use super::command_tables::{MAX_COMMAND_BYTES, MAX_COMMAND_FIELDS};
 use super::counters::PortCounters;
 use super::counts::MAX_COUNTS;
+use super::device_link::DeviceLink;
 use super::device_port::DeviceCodec;
 use super::exchanges::{Exchanges, Places};
 use super::field_port::{Codec, FieldPort};
@@ -124,12 +125,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         bindings.outputs.clear();
         bindings.sendable.clear();
         safe_values.clear();
-        let Links { host, command, state, modbus, recipes } = links;
+        let Links { host, command, state, modbus, recipes, devices } = links;
         host.clear();
         command.clear();
         state.clear();
         modbus.clear();
         recipes.clear();
+        devices.clear();
         health.clear();
         *clock = Clock::START;
     }
@@ -201,12 +203,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 .filter(|(_, _, field)| field.element().is_some())
                 .fold(outputs, |count, _| count.saturating_add(1));
         }
+        let is_tcp = |(_, port, _): &(u8, &Port, &Recipe)| matches!(port.bus, Bus::ModbusTcp { .. });
+        let devices = config.field_ports().filter(is_tcp).count();
         let texts = if commands == 0 { &[] } else { config.commands };
         let bytes = texts.iter().map(|entry| entry.text.len()).fold(0, usize::saturating_add);
         for (what, needed, room) in [
             (Counted::FieldPorts, ports, PORTS),
             (Counted::InputFrames, frames, MAX_INPUT_FRAMES),
-            (Counted::RecipeLinks, uplinks(config).count(), UPLINKS),
+            (Counted::RecipeLinks, uplinks(config).count().saturating_add(devices), UPLINKS),
             (Counted::UserFields, inputs.max(outputs), FIELDS),
             (Counted::CommandFields, commands, MAX_COMMAND_FIELDS),
             (Counted::CommandBytes, bytes, MAX_COMMAND_BYTES),
@@ -347,7 +351,12 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let has_output = recipe.part_frames(Direction::Output).next().is_some();
         let mut sender = Sender::new(recipe.send, recipe.on_stale, port.stale_after, port.cycle, has_output);
         sender.refresh = port.refresh.unwrap_or(Duration::MAX);
-        let port = FieldPort {
+        if let Bus::ModbusTcp { host, port: tcp_port } = &port.bus {
+            let link = DeviceLink::new(PortId(index), port.name.clone(), host.clone(), *tcp_port);
+            let done = self.links.devices.push(link);
+            done.map_err(|_| one_too_many(Counted::RecipeLinks, UPLINKS))?;
+        }
+        let own = FieldPort {
             id: PortId(index),
             name: port.name.clone(),
             recipe: port.recipe,
@@ -366,7 +375,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             counters: PortCounters::default(),
             last_rejection: None,
         };
-        self.ports.push(port).map_err(|_| one_too_many(Counted::FieldPorts, PORTS))?;
+        self.ports.push(own).map_err(|_| one_too_many(Counted::FieldPorts, PORTS))?;
         self.store.edges.push(EdgeQueue::default()).map_err(|_| one_too_many(Counted::FieldPorts, PORTS))
     }
 

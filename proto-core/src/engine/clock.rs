@@ -321,6 +321,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             self.advance_talk(now);
         }
         self.links.advance(&mut self.store);
+        self.carry_connections(now);
         self.carry_results();
     }
 

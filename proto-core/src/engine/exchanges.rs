@@ -10,6 +10,7 @@ use super::build_error::{BuildError, one_too_many};
 use super::device_port::DeviceFormat;
 use super::events::{Event, Told, Trigger};
 use super::line::{Line, PeerCounters, PeerState, Talks, Times};
+use super::transactions::Transactions;
 use super::turns::{Row, RowKind, RowTimes, Turn};
 use super::user::{InputBind, InputTo};
 use crate::config::{
@@ -369,6 +370,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             Bus::Rs485(line) => Some(line),
             _ => None,
         };
+        let is_tcp = matches!(port.bus, Bus::ModbusTcp { .. });
         let mut hears_unasked = part_frames(Direction::Input) > 0;
         self.store.watches_bits |= exchanges.iter().any(|exchange| exchange.when.rising.is_some());
         for (nth, exchange) in exchanges.iter().enumerate() {
@@ -424,7 +426,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             let every = exchange.when.every;
             let times = RowTimes { every, cost, timeout: exchange.timeout, late: exchange.late() };
             let mut row = Row::new(peer as u8, kind, times);
-            row.alike = config.held_back_by(recipe, exchange);
+            // A transaction id tells all replies apart.
+            row.alike = if is_tcp { 0 } else { config.held_back_by(recipe, exchange) };
             self.exchanges.rows.push(row).map_err(|_| full())?;
             self.exchanges.items.push(item).map_err(|_| full())?;
         }
@@ -436,6 +439,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             line_of.map_or(Echo::No, |line| line.echo),
         );
         line.hears_unasked = hears_unasked;
+        line.transactions = is_tcp.then(Transactions::new);
         Ok(line)
     }
 }

@@ -58,7 +58,7 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
             Rejection::NoInput => &mut counters.rejected_no_input,
             Rejection::Remote => &mut counters.rejected_remote,
             Rejection::ForeignId => &mut counters.rejected_id,
-            Rejection::WrongLength => &mut counters.rejected_length,
+            Rejection::WrongLength | Rejection::Malformed => &mut counters.rejected_length,
             Rejection::Checksum => &mut counters.rejected_checksum,
             Rejection::OtherDevice => &mut counters.rejected_other_device,
             Rejection::Repeated => &mut counters.rejected_counter,

@@ -11,7 +11,7 @@ use crate::wire::can::CanFrame;
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct PortId(pub u8);
 
-/// A link to the controller; [`super::Engine::links`] lists them.
+/// A link to the controller, or to the devices of a port of Modbus TCP; [`super::Engine::links`] lists them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct LinkId(pub u8);
@@ -28,12 +28,12 @@ impl LinkId {
     /// The urgent link: a second connection to port 2000, for commands that stop the robot (D26).
     pub const URGENT: Self = Self(FIRST_PORT + MAX_PORTS as u8);
 
-    /// The link of a listening port.
+    /// The link of a listening port, or of a port of Modbus TCP.
     pub const fn of_port(port: PortId) -> Self {
         Self(port.0.saturating_add(FIRST_PORT))
     }
 
-    /// The listening port that the link belongs to, if it belongs to one.
+    /// The port that the link belongs to, if it belongs to one.
     pub const fn port(self) -> Option<PortId> {
         match self.0.checked_sub(FIRST_PORT) {
             Some(port) if self.0 < Self::URGENT.0 => Some(PortId(port)),
@@ -42,7 +42,7 @@ impl LinkId {
     }
 }
 
-/// First id of the links of listening ports.
+/// First id of the links of ports.
 const FIRST_PORT: u8 = 4;
 
 /// The kind of a link: what the driver opens for it.
@@ -70,6 +70,11 @@ pub enum LinkKind {
         /// The port.
         port: PortId,
     },
+    /// TCP to the devices of a field port of Modbus TCP; not to the controller.
+    ModbusDevice {
+        /// The port.
+        port: PortId,
+    },
 }
 
 impl LinkKind {
@@ -83,6 +88,7 @@ impl LinkKind {
             Self::RecipeUdp => "udp2011",
             Self::RecipeTcpListen { .. } => "tcp-listen",
             Self::RecipeUdpListen { .. } => "udp-listen",
+            Self::ModbusDevice { .. } => "modbus-tcp",
         }
     }
 }
@@ -93,13 +99,13 @@ impl LinkKind {
 pub struct Endpoint<'a> {
     /// How it is opened, and at which port.
     pub transport: Transport,
-    /// The controller's address or host name, as configured; empty where the driver learns it
+    /// The controller's or device's address or host name, as configured; empty where the driver learns it
     /// otherwise. For a listening link, the only peer that may connect or send.
     pub host: &'a str,
 }
 
 impl<'a> Endpoint<'a> {
-    /// An endpoint at the controller `host`.
+    /// An endpoint at `host`.
     pub const fn new(transport: Transport, host: &'a str) -> Self {
         Self { transport, host }
     }
@@ -111,7 +117,7 @@ impl<'a> Endpoint<'a> {
 pub enum Transport {
     /// Connect with TCP.
     Tcp {
-        /// The controller's port.
+        /// The controller's or device's port.
         port: u16,
     },
     /// Send UDP datagrams from any local port, and receive the answers.
@@ -226,7 +232,7 @@ impl ReplyCode {
 #[derive(Debug, Clone, Copy)]
 #[non_exhaustive]
 pub enum Input<'a> {
-    /// A port's device is ready.
+    /// A port's device is ready. Not for a port of Modbus TCP, which has a link.
     PortUp {
         /// The port.
         port: PortId,

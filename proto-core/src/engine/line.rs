@@ -5,6 +5,7 @@
 
 use super::line_timing::LineTiming;
 use super::sender::{DIGEST_SEED, digest};
+use super::transactions::Transactions;
 use super::turns::{Cause, Ended, News, Row, Turn, Turns};
 use crate::config::{Echo, Span};
 use crate::device::Probe;
@@ -180,6 +181,8 @@ pub(super) struct Line {
     pub echo: Option<OwnRequest>,
     /// Frames come that nobody asked for.
     pub hears_unasked: bool,
+    /// Over Modbus TCP: which request a reply belongs to.
+    pub transactions: Option<Transactions>,
 }
 
 /// What tells the echo of a request from other bytes.
@@ -260,6 +263,7 @@ impl Line {
             has_echo: echo.known(),
             echo: None,
             hears_unasked: false,
+            transactions: None,
         }
     }
 
@@ -533,6 +537,14 @@ impl Line {
     /// way.
     pub(super) fn abandon(&mut self, talks: &mut Talks<'_>, now: Instant) -> Option<Flight> {
         let flight = self.occupied_by();
+        if let Some(all) = &mut self.transactions {
+            all.forget();
+            self.turns(talks, |turns| {
+                turns.lost(flight.map(|flight| (usize::from(flight.exchange), flight.cause)), now)
+            });
+            (self.phase, self.look_at) = (Phase::Idle, now);
+            return flight;
+        }
         // One without a reply is sent once, whether it is heard or not.
         if let Some(Flight { exchange, cause: Cause::State(Some(_)), .. }) = flight
             && talks.rows.get(usize::from(exchange)).is_some_and(Row::is_answered)
@@ -550,10 +562,13 @@ impl Line {
         flight
     }
 
-    /// The device is there, perhaps another one: what is asked at the start is asked.
+    /// The device is there, perhaps another one: what is asked at the start is asked. A connection of Modbus TCP that is
+    /// there again says nothing about its devices.
     pub(super) fn begin(&mut self, talks: &mut Talks<'_>, now: Instant) {
         self.abandon(talks, now);
-        self.turns(talks, |turns| turns.begin(now));
+        let is_resumed =
+            self.transactions.as_mut().is_some_and(|all| core::mem::replace(&mut all.was_open, true));
+        self.turns(talks, |turns| if is_resumed { turns.resume(now) } else { turns.begin(now) });
         self.has_echo = self.echo_setting.known();
     }
 

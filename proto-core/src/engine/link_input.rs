@@ -1,4 +1,4 @@
-//! What the driver reports of links to the controller.
+//! What the driver reports of links. Those of ports are told on (`device_link.rs`).
 //!
 //! In: a link is up or down, bytes came on it, its transport took some. Out: values in the store, results of commands,
 //! and which ports and links may have an output now. Does not know what travels on a link.
@@ -13,12 +13,18 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 {
     #[cold]
     pub(super) fn link_up(&mut self, link: LinkId) {
+        if self.device_link(link).is_some() {
+            return self.device_up(link);
+        }
         self.links.up(link, &mut self.store);
         self.arm_link(link);
     }
 
     #[cold]
     pub(super) fn link_down(&mut self, link: LinkId) {
+        if self.device_link(link).is_some() {
+            return self.device_down(link);
+        }
         self.links.down(link, &mut self.store);
         self.carry_results();
         self.arm_link(link);
@@ -26,6 +32,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 
     #[inline(never)]
     pub(super) fn link_sent(&mut self, link: LinkId) {
+        if self.device_link(link).is_some() {
+            return self.device_sent(link);
+        }
         let deadline = self.links.sent(link);
         self.clock.ask.add(self.links.ask_of(link));
         self.arm(deadline);
@@ -33,6 +42,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 
     #[inline(never)]
     pub(super) fn link_acked(&mut self, link: LinkId, left: u32) {
+        if self.device_link(link).is_some() {
+            return self.device_acked(link, left);
+        }
         self.links.acked(link, left, &mut self.store);
         self.clock.ask.add(self.links.ask_of(link));
         self.arm(self.links.deadline_of(link));
@@ -40,6 +52,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 
     #[inline(never)]
     pub(super) fn link_bytes(&mut self, link: LinkId, bytes: &[u8], now: Instant) {
+        if self.device_link(link).is_some() {
+            return self.device_bytes(link, bytes, now);
+        }
         let is_up = self.links.heard(link, bytes.len(), now);
         let mut rest = if is_up { bytes } else { &[] };
         loop {

@@ -1,4 +1,4 @@
-//! All links to the controller: which link a report is for, and the order in which they send.
+//! All links: which link a report is for, and the order in which they send.
 //!
 //! Three kinds of links are one connection each; [`Connection`] has their differences. The command
 //! link has two connections and decides for both.
@@ -9,6 +9,7 @@ use super::clock::Ask;
 use super::command_link::CommandLink;
 use super::connection::Connection;
 use super::counters::{LinkCounters, add};
+use super::device_link::DeviceLink;
 use super::io::{Endpoint, LinkId, LinkKind, Transport};
 use super::modbus_link::ModbusLink;
 use super::other_text::OtherText;
@@ -86,6 +87,8 @@ pub(super) struct Links<const UPLINKS: usize> {
     pub state: Maybe<StateLink>,
     pub modbus: Maybe<ModbusLink>,
     pub recipes: Vec<Uplink, UPLINKS>,
+    /// Together with the recipe links as many as those may be.
+    pub devices: Vec<DeviceLink, UPLINKS>,
 }
 
 /// All links, read-only.
@@ -96,30 +99,50 @@ pub(super) struct LinksView<'a> {
     pub state: Option<&'a StateLink>,
     modbus: Option<&'a ModbusLink>,
     recipes: &'a [Uplink],
+    devices: &'a [DeviceLink],
 }
 
 impl<'a> LinksView<'a> {
     pub(super) fn infos(self) -> impl Iterator<Item = LinkInfo<'a>> {
-        let command = self.command.into_iter().flat_map(move |link| {
-            let urgent = link.urgent.iter().map(|session| (LinkId::URGENT, LinkKind::Urgent, session));
-            let all = core::iter::once((LinkId::COMMAND, LinkKind::Command, &link.ordinary)).chain(urgent);
-            all.map(move |(id, kind, session)| {
+        (0..).map_while(move |nth| self.nth(nth))
+    }
+
+    // Not a chain of iterators, which each use of it would have code of its own for.
+    #[inline(never)]
+    fn nth(self, mut nth: usize) -> Option<LinkInfo<'a>> {
+        if let Some(link) = self.command {
+            let session = match (nth, &link.urgent) {
+                (0, _) => Some((LinkId::COMMAND, LinkKind::Command, &link.ordinary)),
+                (1, Some(urgent)) => Some((LinkId::URGENT, LinkKind::Urgent, urgent)),
+                _ => None,
+            };
+            if let Some((id, kind, session)) = session {
                 let info = self.info(id, kind, link.transport(), &session.supervisor, &session.counters);
-                LinkInfo { other_text: link.other_text_of(session), ..info }
-            })
-        });
-        let state = self.state.into_iter().map(move |link| {
-            self.info(LinkId::STATE, LinkKind::State, link.transport(), &link.supervisor, &link.counters)
-        });
-        let modbus = self.modbus.into_iter().map(move |link| {
-            self.info(LinkId::MODBUS, LinkKind::Modbus, link.transport(), &link.supervisor, &link.counters)
-        });
-        let recipes = self.recipes.iter();
-        let recipes = recipes.map(move |link| {
+                return Some(LinkInfo { other_text: link.other_text_of(session), ..info });
+            }
+            nth = nth.saturating_sub(if link.urgent.is_some() { 2 } else { 1 });
+        }
+        if let Some(link) = self.state {
+            if nth == 0 {
+                let (id, kind) = (LinkId::STATE, LinkKind::State);
+                return Some(self.info(id, kind, link.transport(), &link.supervisor, &link.counters));
+            }
+            nth = nth.saturating_sub(1);
+        }
+        if let Some(link) = self.modbus {
+            if nth == 0 {
+                let (id, kind) = (LinkId::MODBUS, LinkKind::Modbus);
+                return Some(self.info(id, kind, link.transport(), &link.supervisor, &link.counters));
+            }
+            nth = nth.saturating_sub(1);
+        }
+        if let Some(link) = self.recipes.get(nth) {
             let info = self.info(link.id, link.kind, link.transport, &link.supervisor, &link.counters);
-            LinkInfo { name: link.name.as_deref().unwrap_or(info.name), ..info }
-        });
-        command.chain(state).chain(modbus).chain(recipes)
+            return Some(LinkInfo { name: link.name.as_deref().unwrap_or(info.name), ..info });
+        }
+        let link = self.devices.get(nth.saturating_sub(self.recipes.len()))?;
+        let info = self.info(link.id(), link.kind(), link.transport(), &link.supervisor, &link.counters);
+        Some(LinkInfo { name: &link.name, endpoint: Endpoint::new(link.transport(), &link.host), ..info })
     }
 
     fn info(
@@ -163,6 +186,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
             state: Vec::new(),
             modbus: Vec::new(),
             recipes: Vec::new(),
+            devices: Vec::new(),
         }
     }
 
@@ -173,6 +197,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
             state: self.state.first(),
             modbus: self.modbus.first(),
             recipes: &self.recipes,
+            devices: &self.devices,
         }
     }
 
@@ -187,22 +212,25 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
             LinkId::URGENT => self.command.first().and_then(|link| Some(&link.urgent.as_ref()?.supervisor)),
             LinkId::STATE => self.state.first().map(|link| &link.supervisor),
             LinkId::MODBUS => self.modbus.first().map(|link| &link.supervisor),
-            id => self.recipes.iter().find(|link| link.id == id).map(|link| &link.supervisor),
+            id => {
+                let device = self.devices.iter().find(|link| link.id() == id).map(|link| &link.supervisor);
+                device.or_else(|| self.recipes.iter().find(|link| link.id == id).map(|link| &link.supervisor))
+            }
         };
         supervisor.is_some_and(Supervisor::is_up)
     }
 
-    /// Where a link of [`Self::infos`] goes; the controller's name is written into `buf`.
+    /// Where a link of [`Self::infos`] goes; the host's name is written into `buf`.
     #[cold]
     #[inline(never)]
     pub(super) fn endpoint<'b>(&self, id: LinkId, buf: &'b mut [u8]) -> Endpoint<'b> {
-        let transport = self.infos().find(|info| info.id == id).map(|info| info.endpoint.transport);
-        let host = buf.get_mut(..self.host.len()).unwrap_or(&mut []);
-        for (place, byte) in host.iter_mut().zip(self.host.bytes()) {
+        let to = self.infos().find(|info| info.id == id).map(|info| info.endpoint);
+        let to = to.unwrap_or(Endpoint::new(Transport::Tcp { port: 0 }, ""));
+        let host = buf.get_mut(..to.host.len()).unwrap_or(&mut []);
+        for (place, byte) in host.iter_mut().zip(to.host.bytes()) {
             *place = byte;
         }
-        let host = core::str::from_utf8(host).unwrap_or("");
-        Endpoint::new(transport.unwrap_or(Transport::Tcp { port: 0 }), host)
+        Endpoint::new(to.transport, core::str::from_utf8(host).unwrap_or(""))
     }
 
     /// Handles everything that depends on the clock.
@@ -219,6 +247,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
                 link.lost(store);
             }
         });
+        self.devices.iter_mut().for_each(|link| link.advance(now));
     }
 
     /// The gateway itself slept: the age of data on its connections is unknown, so all of them are
@@ -232,6 +261,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
             link.supervisor.give_up(now);
             link.lost(store);
         });
+        self.devices.iter_mut().for_each(|link| link.give_up(now));
     }
 
     /// The driver reports that a link is usable.
@@ -471,7 +501,11 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
             return Some((LinkId::MODBUS, action));
         }
         let mut recipes = self.recipes.iter_mut();
-        recipes.find_map(|link| link.supervisor.take_action().map(|action| (link.id, action)))
+        let action = recipes.find_map(|link| link.supervisor.take_action().map(|action| (link.id, action)));
+        action.or_else(|| {
+            let mut devices = self.devices.iter_mut();
+            devices.find_map(|link| link.supervisor.take_action().map(|action| (link.id(), action)))
+        })
     }
 
     /// When something happens without an input.
@@ -480,6 +514,9 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         first = first.min(self.find_deadline(LinkId::STATE)).min(self.find_deadline(LinkId::MODBUS));
         for link in &self.recipes {
             first = first.min(link.deadline()).min(link.supervisor.deadline());
+        }
+        for link in &self.devices {
+            first = first.min(link.deadline());
         }
         first
     }

@@ -25,6 +25,7 @@ mod connection;
 mod counters;
 mod counts;
 mod device_frame;
+mod device_link;
 mod device_port;
 mod events;
 mod exchanges;
@@ -63,6 +64,7 @@ mod stops;
 mod store;
 mod talk;
 mod tap;
+mod transactions;
 mod turns;
 mod uplink;
 mod user;
@@ -185,6 +187,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             // They have functions of their own.
             Input::PortBytes { .. } | Input::PortCan { .. } => {}
             Input::PortSent { port } => self.port_sent(port),
+            // A port is there while its connection is.
+            Input::PortUp { port } | Input::PortDown { port } if self.has_connection(port) => {}
             Input::PortUp { port } => self.port_up(port),
             Input::PortDown { port } => self.port_down(port, now),
             Input::PortBus { port, state } => self.port_bus(port, state, now),

@@ -15,6 +15,7 @@ use super::user::{OutputBind, Outputs};
 use super::whole_port::Outgoing;
 use crate::config::OutputBinding;
 use crate::image::{GroupId, Image};
+use crate::modbus::adu::PREFIX_LEN;
 use crate::modbus::rtu::{Expected, MAX_ADU};
 use crate::time::Instant;
 use crate::wire::can::CanId;
@@ -49,7 +50,9 @@ impl Maker<'_> {
             }
         }
         // Each exchange that has no values yet is passed over once.
+        let at = if line.transactions.is_some() { PREFIX_LEN } else { 0 };
         for _ in 0..=items.len() {
+            let body = out.get_mut(at..)?;
             if is_busy || !line.may_ask() {
                 return None;
             }
@@ -58,11 +61,11 @@ impl Maker<'_> {
             let item = items.get_mut(nth)?;
             let made = match (flight.cause, item.event) {
                 (Cause::Event, Event::Ready { len, .. } | Event::Sent { len, .. }) => {
-                    copy(item, kept, usize::from(len), out);
+                    copy(item, kept, usize::from(len), body);
                     Some(usize::from(len))
                 }
                 (Cause::Event, _) => continue,
-                _ => self.make(item, out),
+                _ => self.make(item, body),
             };
             let peer = talks.peer_of(flight)?;
             let Some(len) = made else {
@@ -76,8 +79,8 @@ impl Maker<'_> {
                 }
                 continue;
             };
-            let request = out.get(..len).unwrap_or(&[]);
-            if !flight.may_repeat(request) {
+            let request = body.get(..len).unwrap_or(&[]);
+            if line.transactions.is_none() && !flight.may_repeat(request) {
                 // A reply to the old value must not confirm the new one. The exchange is asked again when none can come.
                 bump(&mut counters.unanswered);
                 line.give_up(talks, flight, Failure::Timeout, item.times, now);
@@ -99,6 +102,10 @@ impl Maker<'_> {
             }
             let told_by = (expected, sdo_of(item, request));
             line.handed_over(talks, flight, told_by, request, now);
+            let len = match &mut line.transactions {
+                Some(all) => all.begin(flight.exchange, len, out)?,
+                None => len,
+            };
             return Some((flight.exchange, len));
         }
         None

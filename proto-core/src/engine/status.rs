@@ -11,7 +11,7 @@ use super::bits::Bits;
 use super::counters::PortCounters;
 use super::failed::FailedCommand;
 use super::field_port::{Codec, FieldPort};
-use super::io::{BusState, PortId, PortState, ReplyCode};
+use super::io::{BusState, LinkKind, PortId, PortState, ReplyCode};
 use super::latency::Latency;
 use super::line::{PeerCounters, PeerState};
 use super::links::{LinkInfo, LinksView};
@@ -55,6 +55,8 @@ pub struct Status<'a> {
 pub enum FieldBus {
     /// A serial line.
     Rs485,
+    /// A connection of Modbus TCP.
+    ModbusTcp,
     /// A CAN bus.
     Can {
         /// The CAN controller's error state.
@@ -279,9 +281,10 @@ impl<'a> Status<'a> {
     pub fn health(&self) -> Health {
         // Another link carries the traffic of a shared one.
         let is_up = |link: LinkInfo<'_>| matches!(link.state, LinkState::Up { .. } | LinkState::Shared);
+        let is_controllers = |link: &LinkInfo<'_>| !matches!(link.kind, LinkKind::ModbusDevice { .. });
         if self.ports.is_empty() && self.links().next().is_none() {
             Health::Idle
-        } else if !self.links().all(is_up) {
+        } else if !self.links().filter(is_controllers).all(is_up) {
             Health::NoController
         } else if !self.ports().all(|port| port.state == PortState::Working) {
             Health::PortSilent
@@ -364,7 +367,11 @@ impl<'a> Status<'a> {
             Codec::Can { .. } => true,
             Codec::Device(device) => device.reader.is_none(),
         };
-        let bus = if is_can { FieldBus::Can { state: port.bus } } else { FieldBus::Rs485 };
+        let bus = match port.line() {
+            _ if is_can => FieldBus::Can { state: port.bus },
+            Some(line) if line.transactions.is_some() => FieldBus::ModbusTcp,
+            _ => FieldBus::Rs485,
+        };
         PortStatus {
             id: port.id,
             name: &port.name,

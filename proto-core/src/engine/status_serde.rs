@@ -148,6 +148,7 @@ impl Serialize for PortStatus<'_> {
         let mut map = serializer.serialize_map(None)?;
         match port.bus {
             FieldBus::Rs485 => map.serialize_entry("bus", "rs485")?,
+            FieldBus::ModbusTcp => map.serialize_entry("bus", "modbus-tcp")?,
             FieldBus::Can { state } => {
                 map.serialize_entry("bus", "can")?;
                 map.serialize_entry("bus_state", state.name())?;

@@ -14,12 +14,13 @@ use super::exchanges::{Asks, Item, View};
 use super::field_output::Downward;
 use super::field_port::{Codec, FieldPort, came, keep_why};
 use super::frames::{Accepted, Frames};
-use super::io::{Output, PortId};
+use super::io::{LinkId, Output, PortId};
 use super::line::{Flight, Line, Over, Phase, Talks, Times};
 use super::rejection::Rejection;
 use super::requests::Maker;
 use super::store::Store;
 use super::tap::{Tap, TapPlace};
+use super::transactions;
 use super::turns::{Cause, Ended, News};
 use super::user::{InputBind, Outputs, wrapping_count};
 use super::whole_port::Reader;
@@ -39,7 +40,7 @@ impl FieldPort {
         }
     }
 
-    fn line_mut(&mut self) -> Option<&mut Line> {
+    pub(super) fn line_mut(&mut self) -> Option<&mut Line> {
         match &mut self.codec {
             Codec::Device(device) => device.line.as_mut(),
             _ => None,
@@ -129,20 +130,27 @@ impl FieldPort {
             let effort = effort
                 .map(|format| format.layout.lengths().1.saturating_add(usize::from(format.bindings.len)))
                 .fold(MAX_ADU, usize::saturating_add);
-            let Some(found) = framer.next_frame(&mut left, effort, |bytes| awaited.probe(bytes)) else {
-                break;
-            };
-            let (frame, what) = match found {
-                Found::Frame(frame) => (frame, awaited.heard(frame)),
-                Found::Other(frame) => {
-                    let verdict = frames.rejected(Rejection::OtherDevice);
-                    tap.record(|| came(self.id, now, verdict, None, [frame, &[], &[]]));
-                    keep_why(&mut self.last_rejection, verdict, frames.store, None, frame);
-                    continue;
+            let is_tcp = line.transactions.is_some();
+            let probe = |bytes: &[u8]| if is_tcp { transactions::probe(bytes) } else { awaited.probe(bytes) };
+            let Some(found) = framer.next_frame(&mut left, effort, probe) else { break };
+            let (frame, what) = match (found, &mut line.transactions) {
+                (Found::Frame(frame), None) => (frame, Ok(awaited.heard(frame))),
+                (Found::Frame(frame), Some(all)) => (frame, Ok(all.heard(&awaited, frame))),
+                (Found::Other(frame), None) => (frame, Err(Rejection::OtherDevice)),
+                (Found::Other(frame), Some(all)) => {
+                    // Nothing behind it can be read.
+                    (all.is_lost, left) = (true, &[]);
+                    (frame, Err(Rejection::Malformed))
                 }
-                Found::Wrong(frame) => {
+                (Found::Wrong(frame), _) => {
                     line.heard_wrong();
-                    let verdict = frames.rejected(Rejection::Checksum);
+                    (frame, Err(Rejection::Checksum))
+                }
+            };
+            let what = match what {
+                Ok(what) => what,
+                Err(why) => {
+                    let verdict = frames.rejected(why);
                     tap.record(|| came(self.id, now, verdict, None, [frame, &[], &[]]));
                     keep_why(&mut self.last_rejection, verdict, frames.store, None, frame);
                     continue;
@@ -155,17 +163,22 @@ impl FieldPort {
             }
             let expected = awaited.expected();
             let (flight, times) = (awaited.flight, awaited.asked().map(|item| item.times));
+            // Of a Modbus frame.
+            let (data, code) = match is_tcp {
+                true => transactions::content(frame),
+                false => (frame.get(3..frame.len().saturating_sub(2)).unwrap_or(&[]), frame.get(2).copied()),
+            };
             let (verdict, sign) = match what {
                 Some(Heard::Reply(reply)) => {
                     let verdict = match reply {
                         Some(reply) => {
-                            let data = match expected {
-                                Some(_) => frame.get(3..frame.len().saturating_sub(2)).unwrap_or(&[]),
-                                None => frame,
-                            };
+                            let data = if expected.is_some() { data } else { frame };
                             let slot = usize::from(reply.slot);
                             let verdict = frames.take_device(&reply.format, texts, data, slot, &mut accepted);
-                            if let Some(since) = flight.and_then(|flight| flight.unanswered()) {
+                            // A transaction id tells to which of the requests it is the reply.
+                            if let Some(since) =
+                                flight.filter(|_| !is_tcp).and_then(|flight| flight.unanswered())
+                            {
                                 frames.store.was_asked(slot, since);
                             }
                             verdict
@@ -177,7 +190,7 @@ impl FieldPort {
                 }
                 Some(Heard::ReplyOrEcho) => (Ok(()), Sign::ReplyOrEcho),
                 Some(Heard::Refusal) => {
-                    let code = expected.and(frame.get(2)).copied().unwrap_or(0);
+                    let code = expected.and(code).unwrap_or(0);
                     (
                         Err(Rejection::Refused),
                         Sign::Answer(refused_with(code, expected.is_some()), code.into()),
@@ -188,6 +201,7 @@ impl FieldPort {
                 Some(Heard::Unasked(format, slot, nth)) => {
                     (frames.take_device(format, texts, frame, slot, &mut accepted), Sign::Unasked(nth))
                 }
+                None if is_tcp => (frames.rejected(Rejection::OtherDevice), Sign::Nothing),
                 Some(Heard::Echo) | None => (Err(Rejection::NoFrame), Sign::Nothing),
             };
             match (sign, flight, times) {
@@ -326,6 +340,7 @@ impl FieldPort {
         let is_on_can = codec.reader.is_none();
         if let (Some(_), Some(Reader::Search(framer))) = (&request, &mut codec.reader)
             && !line.hears_unasked
+            && line.transactions.is_none()
         {
             // What is held is too old to be the reply.
             add(&mut self.counters.discarded_bytes, framer.discard());
@@ -597,7 +612,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             Downward::Bytes(len) => {
                 let bytes = buf.get(..len).unwrap_or(&[]);
                 self.tap.went(TapPlace::Port(port), None, bytes, now);
-                Output::PortSend { port, bytes }
+                match self.goes_over_link(port, now) {
+                    true => Output::LinkSend { link: LinkId::of_port(port), bytes },
+                    false => Output::PortSend { port, bytes },
+                }
             }
             Downward::Can(frame) => {
                 self.tap.went(TapPlace::Port(port), Some(frame.id()), frame.data(), now);

@@ -367,6 +367,34 @@ impl Turns<'_> {
         *self.run = 0;
     }
 
+    /// The connection to the peers is lost, and perhaps a row's request with it: it was not answered. How long they
+    /// stay away counts from here.
+    pub(super) fn lost(&mut self, row: Option<(usize, Cause)>, now: Instant) {
+        if let Some((nth, cause)) = row {
+            self.failed(nth, cause, now, now);
+        }
+        for peer in &mut *self.peers {
+            peer.turn.failing.get_or_insert((now, now));
+        }
+    }
+
+    /// The connection is there again: periods begin now, and nobody has to wait.
+    pub(super) fn resume(&mut self, now: Instant) {
+        for row in &mut *self.rows {
+            (row.event, row.wait) = (None, Wait::NONE);
+            if let Some(grid) = &mut row.grid {
+                *grid = Grid::starting_at(now, grid.period());
+            }
+        }
+        for Turn { presence, failing, not_before, nevertheless, .. } in
+            self.peers.iter_mut().map(|peer| &mut peer.turn)
+        {
+            (*presence, *not_before, *nevertheless) = (Presence::Unknown, Instant::ZERO, Instant::ZERO);
+            *failing = failing.map(|(since, _)| (since, now));
+        }
+        *self.run = 0;
+    }
+
     /// Whether a write that stops this peer is still to be sent.
     pub(super) fn is_stopping(&self, which: u8) -> bool {
         self.rows.iter().any(|row| row.peer == which && row.kind.stops && row.requested.is_some())

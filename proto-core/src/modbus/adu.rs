@@ -14,7 +14,7 @@ pub const MAX_PDU: usize = 253;
 pub(super) const FRONT_LEN: usize = 8;
 
 /// Length of the header up to and including its length field.
-const PREFIX_LEN: usize = 6;
+pub(crate) const PREFIX_LEN: usize = 6;
 /// The fields of a [`Front`].
 const TRANSACTION_SHIFT: u32 = 48;
 const TRANSACTION: u64 = 0xFFFF << TRANSACTION_SHIFT;
@@ -258,7 +258,7 @@ impl Front {
 
 /// The length of the whole frame, from the first six bytes of its header.
 #[inline]
-fn frame_len(&[_, _, p1, p0, l1, l0]: &[u8; PREFIX_LEN]) -> Result<usize, AduError> {
+pub(crate) fn frame_len(&[_, _, p1, p0, l1, l0]: &[u8; PREFIX_LEN]) -> Result<usize, AduError> {
     let protocol = u16::from_be_bytes([p1, p0]);
     if protocol != 0 {
         return Err(AduError::Protocol { received: protocol });

@@ -86,6 +86,7 @@ impl Console {
                     json::write_text(out, port.name)?;
                     out.write_str(match port.bus {
                         FieldBus::Rs485 => ":\"rs485\"",
+                        FieldBus::ModbusTcp => ":\"modbus-tcp\"",
                         _ => ":\"can\"",
                     })
                 })

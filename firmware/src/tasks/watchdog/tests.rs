@@ -108,6 +108,7 @@ fn the_task_that_has_the_processor_is_known_by_name() {
         TaskName::Link(LinkKind::RecipeUdp),
         TaskName::Link(LinkKind::RecipeTcpListen { port }),
         TaskName::Link(LinkKind::RecipeUdpListen { port }),
+        TaskName::Link(LinkKind::ModbusDevice { port }),
         TaskName::Network,
         TaskName::Address,
         TaskName::Status,

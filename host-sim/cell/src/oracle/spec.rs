@@ -172,7 +172,7 @@ impl Spec {
             match port.bus {
                 Bus::TcpListen { .. } => links.push(link_spec(config, id, recipe, false)),
                 Bus::UdpListen { .. } => links.push(link_spec(config, id, recipe, true)),
-                Bus::Rs485(_) | Bus::Can { .. } => {}
+                Bus::Rs485(_) | Bus::Can { .. } | Bus::ModbusTcp { .. } => {}
             }
         }
         let mut owned = [None; COUNT];

@@ -287,7 +287,7 @@ fn attach_devices(cell: &mut Cell, config: &GatewayConfig, level: Level, rng: &m
                     cell.attach_can(bus, device);
                 }
             }
-            Bus::TcpListen { .. } | Bus::UdpListen { .. } => {}
+            Bus::ModbusTcp { .. } | Bus::TcpListen { .. } | Bus::UdpListen { .. } => {}
         }
     }
 }

@@ -68,7 +68,9 @@ impl Gateway {
     ) -> Result<Self, StartError> {
         let engine: Box<Engine> =
             Box::new(Engine::new(config).map_err(|error| StartError::new(error.to_string()))?);
-        let field = || config.view().field_ports().map(|(_, port, _)| port);
+        // Those of Modbus TCP have links.
+        let has_device = |port: &PortConfig| !matches!(port.bus, Bus::ModbusTcp { .. });
+        let field = || config.view().field_ports().map(|(_, port, _)| port).filter(|port| has_device(port));
         if let Some(bind) =
             devices.binds.iter().find(|bind| field().all(|port| port.name != bind.port.as_str()))
         {
@@ -78,13 +80,16 @@ impl Gateway {
         }
         let (mut ports, mut asks) = (Vec::new(), BTreeSet::new());
         for (index, port, recipe) in config.view().field_ports() {
+            if recipe.exchanges.len > 0 {
+                asks.insert(PortId(index));
+            }
+            if !has_device(port) {
+                continue;
+            }
             let mut device = devices.open(port).await?;
             if matches!(recipe.parts, Parts::Can { .. }) {
                 let ids = |part| config.view().can_ids(recipe, part);
                 device.listen_to(ids(Direction::Input).chain(ids(Direction::Output)).collect());
-            }
-            if recipe.exchanges.len > 0 {
-                asks.insert(PortId(index));
             }
             ports.push((PortId(index), device));
         }
@@ -98,7 +103,10 @@ impl Gateway {
             places.insert(name(*id).to_owned(), json!(port.place()));
         }
         for (_, kind, endpoint) in &links {
-            if let LinkKind::RecipeTcpListen { port } | LinkKind::RecipeUdpListen { port } = kind {
+            if let LinkKind::RecipeTcpListen { port }
+            | LinkKind::RecipeUdpListen { port }
+            | LinkKind::ModbusDevice { port } = kind
+            {
                 places.insert(name(*port).to_owned(), json!(endpoint.place()));
             }
         }
@@ -157,7 +165,7 @@ async fn open_port(port: &PortConfig, binds: &[Bind], kept: Option<Kept>) -> Res
     let bus = match port.bus {
         Bus::Rs485(settings) => PortBus::Serial(settings),
         Bus::Can { bitrate } => PortBus::Can { bitrate },
-        Bus::TcpListen { .. } | Bus::UdpListen { .. } => {
+        Bus::ModbusTcp { .. } | Bus::TcpListen { .. } | Bus::UdpListen { .. } => {
             return Err(StartError::new(format!("port {name} is not a field port")));
         }
     };

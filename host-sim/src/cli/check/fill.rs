@@ -68,6 +68,7 @@ fn gateway_port(
 ) -> report::Port {
     let bus = match &port.bus {
         Bus::Rs485(line) => report::Bus::of_line(line),
+        Bus::ModbusTcp { host, port } => report::Bus::ModbusTcp { host: host.to_string(), tcp_port: *port },
         Bus::Can { bitrate } => report::Bus::Can { bitrate: *bitrate },
         Bus::TcpListen { listen } => report::Bus::TcpListen { address: listen.to_string() },
         Bus::UdpListen { listen } => report::Bus::UdpListen { address: listen.to_string() },
@@ -80,6 +81,7 @@ fn gateway_port(
             frames.and_then(|recipe| shortest(recipe, part)).filter(|least| *least < shown.bytes);
         Some(shown)
     });
+    let is_tcp = matches!(port.bus, Bus::ModbusTcp { .. });
     report::Port {
         name: port.name.to_string(),
         bus,
@@ -87,7 +89,7 @@ fn gateway_port(
         cycle_ms: port.cycle,
         parts: parts.collect(),
         exchanges: frames.map_or_else(Vec::new, |recipe| conversation::all(config, port, recipe)),
-        exchanges_percent: config.view().line_share(port).filter(|_| frames.is_some()),
+        exchanges_percent: config.view().line_share(port).filter(|_| frames.is_some() && !is_tcp),
         commands: frames.map_or_else(Vec::new, values::commands),
         times: values::times(config, port),
         safe_at_start: port.safe_at_start,
@@ -264,7 +266,7 @@ fn pendant_of_gateway(config: &GatewayConfig, recipes: &[AnyRecipe]) -> Vec<Pend
         match &port.bus {
             Bus::TcpListen { listen } => add(format!("TCP client to this gateway, {listen}"), port.recipe),
             Bus::UdpListen { listen } => add(format!("UDP client to this gateway, {listen}"), port.recipe),
-            Bus::Rs485(_) | Bus::Can { .. } => {}
+            Bus::Rs485(_) | Bus::Can { .. } | Bus::ModbusTcp { .. } => {}
         }
     }
     links

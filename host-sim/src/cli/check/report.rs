@@ -107,6 +107,10 @@ pub(super) enum Bus {
     Can {
         bitrate: u32,
     },
+    ModbusTcp {
+        host: String,
+        tcp_port: u16,
+    },
     TcpListen {
         address: String,
     },
@@ -276,6 +280,7 @@ impl Bus {
                 format!("rs485, {baud} baud 8{parity}{stop_bits}{echo}")
             }
             Self::Can { bitrate } => format!("can, {bitrate} bit/s"),
+            Self::ModbusTcp { host, tcp_port } => format!("modbus-tcp, {host} port {tcp_port}"),
             Self::TcpListen { address } => format!("the controller's TCP client connects to {address}"),
             Self::UdpListen { address } => format!("the controller's UDP client sends to {address}"),
             Self::UdpServer { udp_port } => format!("UDP server {udp_port}"),

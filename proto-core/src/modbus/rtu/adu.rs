@@ -18,7 +18,7 @@ pub const BROADCAST: u8 = 0;
 pub const MAX_ADDRESS: u8 = 247;
 
 /// Bytes of the CRC, low byte first.
-pub(super) const CRC_LEN: usize = 2;
+pub(crate) const CRC_LEN: usize = 2;
 /// Address and CRC.
 const OVERHEAD: usize = 1 + CRC_LEN;
 

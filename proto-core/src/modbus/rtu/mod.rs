@@ -52,6 +52,7 @@ mod slave;
 mod timing;
 
 pub use crate::schedule::Presence;
+pub(crate) use adu::CRC_LEN;
 pub use adu::{
     Adu, AduError, BROADCAST, FrameLen, MAX_ADDRESS, MAX_ADU, MIN_ADU, checksum, reply_len, request_len,
 };

@@ -407,6 +407,25 @@ impl Expected {
         }
     }
 
+    /// Whether a whole frame without its CRC is the reply, or else says that the request is refused; `None` if it is
+    /// neither.
+    pub(crate) fn judge(&self, frame: &[u8]) -> Option<bool> {
+        let (&[slave, function], rest) = frame.split_first_chunk()?;
+        if slave != self.slave {
+            return None;
+        }
+        if function == self.function | function::EXCEPTION_FLAG {
+            return (rest.len() == 1).then_some(false);
+        }
+        let fits = match self.body {
+            Body::Data(len) => rest
+                .split_first()
+                .is_some_and(|(count, data)| *count == len && data.len() == usize::from(len)),
+            Body::Echo(head) => rest == head,
+        };
+        (function == self.function && fits).then_some(true)
+    }
+
     /// What `bytes` begin with.
     pub(crate) fn probe(&self, bytes: &[u8]) -> Probe {
         let [slave, rest @ ..] = bytes else { return Probe::Partial };
