@@ -6,10 +6,10 @@ use std::collections::HashMap;
 
 use heapless::Vec as Bounded;
 use proto_core::config::{
-    Bus, CanFramePart, CommandEntry, ConfigError, ControllerKey, ControllerLink, Delimiter, Echo, FieldSpec,
-    GatewayConfig, InputBinding, MAX_ADDRESS, MAX_ALL_FIELDS, MAX_COMMAND_TEXT, MAX_COMMANDS, MAX_LISTEN,
-    MAX_PORTS, MAX_RECIPES, MAX_SAFE_VALUES, NetworkKey, Parts, Place, Port, PortKey, Recipe, RecipeKey,
-    RecipeLink, SafeValue, Span, StreamPart, check_address, check_bit,
+    Bus, CanFramePart, CommandEntry, ConfigError, ConfigErrorKind, ControllerKey, ControllerLink, Delimiter,
+    Echo, FieldSpec, GatewayConfig, InputBinding, MAX_ADDRESS, MAX_ALL_FIELDS, MAX_COMMAND_TEXT,
+    MAX_COMMANDS, MAX_LISTEN, MAX_PORTS, MAX_RECIPES, MAX_SAFE_VALUES, NetworkKey, Parts, Place, Port,
+    PortKey, Recipe, RecipeKey, RecipeLink, SafeValue, Span, StreamPart, check_address, check_bit,
 };
 use proto_core::recipe::model::{Framing, MAX_CAN_IDS};
 use proto_core::sysvar::{Direction, ParseError, SysVar, VarBit};
@@ -56,16 +56,18 @@ pub(crate) enum BusKind {
     Rs485,
     ModbusMaster,
     ModbusSlave,
+    ModbusTcp,
     Can,
     TcpListen,
     UdpListen,
 }
 
 /// The words of `bus`.
-pub(crate) const BUSES: [(&str, BusKind); 6] = [
+pub(crate) const BUSES: [(&str, BusKind); 7] = [
     ("rs485", BusKind::Rs485),
     ("modbus-rtu", BusKind::ModbusMaster),
     ("modbus-rtu-slave", BusKind::ModbusSlave),
+    ("modbus-tcp", BusKind::ModbusTcp),
     ("can", BusKind::Can),
     ("tcp-listen", BusKind::TcpListen),
     ("udp-listen", BusKind::UdpListen),
@@ -80,18 +82,20 @@ impl BusKind {
     /// A recipe of Modbus and its line go together.
     fn check_modbus(self, recipe: &FileRecipe) -> std::result::Result<(), String> {
         let wanted = match self {
-            Self::ModbusMaster => Some(RecipeKind::ModbusMaster),
+            Self::ModbusMaster | Self::ModbusTcp => Some(RecipeKind::ModbusMaster),
             Self::ModbusSlave => Some(RecipeKind::ModbusSlave),
             _ => None,
         };
         let (name, kind) = (&recipe.name, recipe.kind.name());
         match wanted {
             Some(wanted) if recipe.kind != wanted => Err(format!(
-                "recipe {name:?} has kind = {kind:?}; bus = {0:?} takes only recipes with kind = {0:?}",
-                self.name()
+                "recipe {name:?} has kind = {kind:?}; bus = {:?} takes only recipes with kind = {:?}",
+                self.name(),
+                wanted.name()
             )),
             None if recipe.kind.is_modbus() => Err(format!(
-                "recipe {name:?} has kind = {kind:?}, which needs bus = {kind:?}; this port has bus = {:?}",
+                "recipe {name:?} has kind = {kind:?}, which needs bus = {kind:?}{}; this port has bus = {:?}",
+                if recipe.kind == RecipeKind::ModbusMaster { " or \"modbus-tcp\"" } else { "" },
                 self.name()
             )),
             _ => Ok(()),
@@ -270,7 +274,10 @@ impl<'a> Builder<'a> {
     fn add_port(&mut self, table: &Reader<'a>, recipes: &[FileRecipe]) -> Result<()> {
         let (name, _) = recipes::read_name(table)?;
         let kind = table
-            .required("bus", "rs485, modbus-rtu, modbus-rtu-slave, can, tcp-listen or udp-listen")?
+            .required(
+                "bus",
+                "rs485, modbus-rtu, modbus-rtu-slave, modbus-tcp, can, tcp-listen or udp-listen",
+            )?
             .choice(&BUSES)?;
         let index = self.config.ports.len() as u8;
         if usize::from(index) == MAX_PORTS {
@@ -373,7 +380,7 @@ impl<'a> Builder<'a> {
     }
 }
 
-const PORT_PLACES: [PortKey; 16] = [
+const PORT_PLACES: [PortKey; 17] = [
     PortKey::Name,
     PortKey::Recipe,
     PortKey::Cycle,
@@ -387,6 +394,7 @@ const PORT_PLACES: [PortKey; 16] = [
     PortKey::Echo,
     PortKey::Bitrate,
     PortKey::Listen,
+    PortKey::To,
     PortKey::Health,
     PortKey::SafeAtStart,
     PortKey::Refresh,
@@ -474,10 +482,37 @@ fn read_bus(table: &Reader<'_>, kind: BusKind) -> Result<Bus> {
             line.echo = table.optional(ECHO.name).map_or(Ok(Echo::Auto), |item| read_echo(&item))?;
             Bus::Rs485(line)
         }
+        BusKind::ModbusTcp => read_modbus_tcp(table)?,
         BusKind::Can => Bus::Can { bitrate: read_bitrate(table)? },
         BusKind::TcpListen => Bus::TcpListen { listen: listen()? },
         BusKind::UdpListen => Bus::UdpListen { listen: listen()? },
     })
+}
+
+/// Where the devices of Modbus TCP are: a host, and perhaps a port.
+fn read_modbus_tcp(table: &Reader<'_>) -> Result<Bus> {
+    let item = table.required("to", "the device's IP address or host name, such as \"192.168.1.50\"")?;
+    let text = item.string()?;
+    let wrong = || item.error(format!("{text:?} is not HOST or HOST:PORT, such as \"192.168.1.50:502\""));
+    // An IPv6 address has colons of its own.
+    let (host, port) = match text.strip_prefix('[').and_then(|rest| rest.split_once(']')) {
+        Some((host, "")) => (host, None),
+        Some((host, rest)) => (host, Some(rest.strip_prefix(':').ok_or_else(wrong)?)),
+        None if text.matches(':').count() > 1 => (text, None),
+        None => text.split_once(':').map_or((text, None), |(host, port)| (host, Some(port))),
+    };
+    let digits =
+        |port: &str| port.bytes().all(|byte| byte.is_ascii_digit()).then(|| port.parse().ok()).flatten();
+    let port = match port {
+        Some(port) => digits(port).filter(|port| *port != 0).ok_or_else(wrong)?,
+        None => Bus::MODBUS_TCP,
+    };
+    check_address(host).map_err(|kind| match kind {
+        ConfigErrorKind::Address => wrong(),
+        kind => item.error(format!("{host:?} is {kind}")),
+    })?;
+    check_ipv4(host).map_err(|message| item.error(message))?;
+    Ok(Bus::ModbusTcp { host: bounded(host), port })
 }
 
 /// The layout accepted no more bytes than there is room for.

@@ -69,6 +69,7 @@ pub(super) fn key_name(key: PortKey) -> &'static str {
         PortKey::Echo => "echo",
         PortKey::Bitrate => "bitrate",
         PortKey::Listen => "listen",
+        PortKey::To => "to",
         // A mistake without a key of its own concerns the port as a whole.
         _ => "name",
     }

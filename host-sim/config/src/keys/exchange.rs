@@ -152,9 +152,10 @@ pub const OF_CAN: Table =
         .cases(&[Case { when: &[], keys: &[TIMING_OF_FRAMES] }]);
 
 /// The slave that is asked.
-pub const SLAVE: Key = Key::integer("slave", 0, 247)
+pub const SLAVE: Key = Key::integer("slave", 0, 255)
     .required()
-    .tells("1..=247; 0 writes to all slaves, and nobody answers. After it nothing is sent for 100 ms");
+    .tells("1..=247; 0 writes to all slaves, and nobody answers. After it nothing is sent for 100 ms. Over Modbus TCP the unit \
+     id, 1..=255");
 /// What is asked of it.
 pub const FUNCTION: Key = Key::new(
     "function",

@@ -75,7 +75,8 @@ pub const NAME: Key = Key::text_of("name", Text::Name).required().tells(
 /// What a port is.
 pub const BUS: Key = Key::words("bus", words!(BUSES)).required().tells(
     "`\"rs485\"`, `\"can\"`: devices; `\"modbus-rtu\"`, `\"modbus-rtu-slave\"`: a serial line for a recipe of this \
-     `kind`, with the keys of `rs485`; `\"tcp-listen\"`, `\"udp-listen\"`: what the controller's TCP or UDP client \
+     `kind`, with the keys of `rs485`; `\"modbus-tcp\"`: devices that the gateway connects to, for a recipe with `kind = \
+     \"modbus-rtu\"`; `\"tcp-listen\"`, `\"udp-listen\"`: what the controller's TCP or UDP client \
      connects to",
 );
 /// The recipe of a port.
@@ -176,6 +177,12 @@ pub const LISTEN: Key = Key::text_of("listen", Text::Length(1, MAX_LISTEN))
     .required()
     .tells("IP address and port, such as `\"0.0.0.0:50000\"` (`tcp-listen`, `udp-listen`)");
 
+/// Where the devices of Modbus TCP are.
+pub const TO: Key = Key::text_of("to", Text::Any).required().tells(
+    "IP address or host name of the device, or of the gateway before it, with a TCP port if it is not 502: \
+     `\"192.168.1.50\"`, `\"plc.cell:1502\"` (`modbus-tcp`)",
+);
+
 /// The keys of a serial line.
 pub(crate) const LINE: &[Key] = &[BAUD, PARITY, STOP_BITS, IDLE_GAP, TURNAROUND];
 /// The keys of a field port, on any bus.
@@ -187,6 +194,7 @@ pub const PORT: Table = Table::of("port", &[NAME, BUS, RECIPE, CYCLE, TIMEOUT, S
         when: &[When::Is("bus", &["rs485", "modbus-rtu", "modbus-rtu-slave"], &[])],
         keys: &[LINE, &[ECHO], FIELD],
     },
+    Case { when: &[When::Is("bus", &["modbus-tcp"], &[])], keys: &[&[TO], FIELD] },
     Case { when: &[When::Is("bus", &["can"], &[])], keys: &[&[BITRATE], FIELD] },
     Case { when: &[When::Is("bus", &["tcp-listen", "udp-listen"], &[])], keys: &[&[LISTEN]] },
 ]);

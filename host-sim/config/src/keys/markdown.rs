@@ -26,7 +26,7 @@ pub const DOCUMENTED: &[(&str, &[&[Key]])] = &[
             gateway::PORT.common,
             gateway::FIELD,
             gateway::LINE,
-            &[gateway::ECHO, gateway::BITRATE, gateway::LISTEN],
+            &[gateway::ECHO, gateway::BITRATE, gateway::TO, gateway::LISTEN],
         ],
     ),
     ("health", &[gateway::HEALTH_TABLE.common]),

@@ -17,6 +17,7 @@ mod input_rule_files;
 mod schema_files;
 mod sendable_files;
 mod since;
+mod tcp_files;
 mod wrong_devices;
 mod wrong_exchanges;
 mod wrong_files;

@@ -50,6 +50,7 @@ const BEYOND: &[(&str, &[(&str, &str)])] = &[
             ("value", "has a fraction"),
             ("map", "has a fraction"),
             ("map", "is not an integer; the keys of map"),
+            ("max", "has a fraction"),
         ],
     ),
     (
@@ -92,6 +93,7 @@ const BEYOND: &[(&str, &[(&str, &str)])] = &[
             ("address", "is not an IP address"),
             ("address", "is neither an IP address nor a host name"),
             ("listen", "not an address to listen on"),
+            ("to", "is not HOST or HOST:PORT"),
         ],
     ),
 ];
