@@ -69,6 +69,7 @@ fn check_says_what_functional_inputs_do() {
 #[test]
 fn check_draws_the_frames_of_a_device() {
     insta::assert_snapshot!("check_gripper", checked("gripper.toml", &[]));
+    insta::assert_snapshot!("check_modbus_tcp", checked("modbus-tcp.toml", &[]));
     insta::assert_snapshot!("check_modbus_line", checked("modbus-line.toml", &[]));
     insta::assert_snapshot!("check_force_sensor_crc", checked("force-sensor-crc.toml", &[]));
     insta::assert_snapshot!("check_scale", checked("scale.toml", &[]));

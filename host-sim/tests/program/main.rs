@@ -6,6 +6,7 @@ mod checking;
 mod command_line;
 mod control;
 mod exporting;
+mod modbus_tcp;
 mod output;
 mod processes;
 mod rejections;
