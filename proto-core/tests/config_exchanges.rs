@@ -3,6 +3,7 @@
 use proto_core::config::*;
 use proto_core::device::Encoding;
 use proto_core::modbus::rtu::{Operation, Table};
+use proto_core::sysvar::Direction;
 use proto_core::time::Duration;
 use proto_core::wire::can::CanId;
 use proto_core::wire::scalar::ScalarType::{Byte, Dword, Float, Word};
@@ -163,12 +164,9 @@ fn mistakes_in_frames_have_their_place() {
     );
     assert_refused(&[Ask::request(frame)], "it would never be asked; set every_ms, on or follow");
     assert_refused(&[Ask::unasked(reply).at_start()], "there is no request to send; remove every_ms and on");
-    assert_refused_at(&[ask.refusal(reply)], "refusal", "a refusal answers a request that has a reply");
-    assert_refused_at(
-        &[ask.reply(AskFrame::stream(&[4], &[], &[InputField::unused(Byte)])).refusal(reply)],
-        "refusal",
-        "a refusal only tells that the device refuses; its fields have no to and no commands",
-    );
+    let lone = "a pending answer or a refusal answers a request that has a reply";
+    assert_refused_at(&[ask.refusal(reply)], "refusal", lone);
+    assert_refused_at(&[ask.pending(reply)], "pending", lone);
     let id = CanId::Standard(0x701);
     let unused = [InputField::unused(Byte)];
     let can = AskFrame::can(id, &unused);
@@ -189,11 +187,100 @@ fn mistakes_in_frames_have_their_place() {
          a constant is needed"
     );
     let mut config = with(&[ask]).unwrap();
-    config.exchanges[0].talk = Talk::Frames { request: Some(7), reply: None, refusal: None };
+    config.exchanges[0].talk = Talk::Frames { request: Some(7), reply: None, pending: None, refusal: None };
     let error = config.validate().unwrap_err();
     assert_eq!(error.kind, ConfigErrorKind::OutsidePool { end: 8, len: 1 });
-    config.exchanges[0].talk = Talk::Frames { request: None, reply: None, refusal: None };
+    config.exchanges[0].talk = Talk::Frames { request: None, reply: None, pending: None, refusal: None };
     assert_eq!(config.validate().unwrap_err().kind, ConfigErrorKind::Exchange(ExchangeError::Nothing));
+}
+
+/// A status that tells which answer it is; what is behind it goes to a register.
+fn status(value: i64) -> [InputField<'static>; 2] {
+    [InputField::constant(Byte, value), InputField::variable(Byte, "WordInputReg[1]")]
+}
+
+#[test]
+fn several_answers_are_told_apart() {
+    let (request, done, busy) = ([OutputField::constant(Byte, 9.0)], status(0), status(1));
+    let code = [InputField::variable(Byte, "WordInputReg[2]"), InputField::padding(1)];
+    let plain = [InputField::constant(Byte, 1), InputField::padding(1)];
+    let ask = Ask::request(AskFrame::stream(b"G", &[], &request)).every(ms(100));
+    fn answer<'a>(fields: &'a [InputField<'a>]) -> AskFrame<'a> {
+        AskFrame::stream(b"S", &[], fields)
+    }
+    fn can<'a>(fields: &'a [InputField<'a>]) -> AskFrame<'a> {
+        AskFrame::can(CanId::Standard(0x201), fields)
+    }
+    let config = with(&[ask.reply(answer(&done)).pending(answer(&plain)).refusal(answer(&code))]).unwrap();
+    let Talk::Frames { reply, pending, refusal, .. } = config.exchanges[0].talk else { panic!() };
+    assert_eq!((reply, pending, refusal), (Some(1), Some(2), Some(3)));
+    // A mistake in any of them has its place: they are counted if they have values.
+    let wrong = [InputField::constant(Byte, 5), InputField::variable(Byte, "WordOutputReg[1]")];
+    let place = |frame| Place::Field { recipe: 0, part: Direction::Input, frame, field: 1 };
+    let at = |asks: &[Ask<'_>]| with(asks).unwrap_err().place;
+    let both = ask.reply(answer(&done));
+    assert_eq!(at(&[both.pending(answer(&wrong))]), place(1));
+    assert_eq!(at(&[both.pending(answer(&plain)).refusal(answer(&wrong))]), place(1));
+    let four = [InputField::constant(Byte, 4), InputField::variable(Byte, "WordInputReg[4]")];
+    assert_eq!(at(&[both.pending(answer(&four)).refusal(answer(&wrong))]), place(2));
+    let unasked = [InputField::variable(Byte, "WordOutputReg[1]")];
+    let unasked = Ask::unasked(AskFrame::stream(b"E", &[], &unasked));
+    let second = Place::Field { recipe: 0, part: Direction::Input, frame: 3, field: 0 };
+    assert_eq!(at(&[both.pending(answer(&four)).refusal(answer(&code)), unasked]), second);
+    let hidden = "every such frame is another answer to the request as well, which is looked for first (the reply, then \
+                  pending, then refusal) or is shorter; give that one a constant that this one does not have";
+    assert_refused_at(&[ask.reply(answer(&code)).pending(answer(&plain))], "pending", hidden);
+    assert_refused_at(&[ask.reply(answer(&done)).refusal(answer(&done))], "refusal", hidden);
+    // A shorter frame without a constant is the beginning of each longer one.
+    let short = [InputField::unused(Byte)];
+    assert_refused_at(&[ask.reply(answer(&done)).refusal(answer(&short))], "reply", hidden);
+    let on_can = Ask::request(AskFrame::can(CanId::Standard(1), &request)).every(ms(100));
+    assert!(with(&[on_can.reply(can(&done)).refusal(can(&short))]).is_ok(), "CAN tells the length");
+    assert_refused_at(&[on_can.reply(can(&code)).refusal(can(&plain))], "refusal", hidden);
+    assert!(with(&[on_can.reply(can(&done)).pending(can(&busy))]).is_err(), "two write one register");
+    // What may be an echo says nothing.
+    let echo = [InputField::unused(Byte)];
+    assert_refused_at(
+        &[ask.reply(answer(&done)).pending(AskFrame::stream(b"G", &[], &echo))],
+        "pending",
+        "it may have the bytes of its request, so an echo would be taken for it; give it another constant",
+    );
+    let stops = [InputField::commands(Byte, &[(1, "stop")]), InputField::padding(1)];
+    assert_refused_at(
+        &[ask.reply(answer(&done)).refusal(answer(&stops))],
+        "refusal",
+        "the fields of a pending answer and of a refusal have no commands and no counter",
+    );
+}
+
+#[test]
+fn a_restart_is_told_by_a_number_of_a_reply() {
+    let fields = [
+        InputField::padding(2),
+        InputField::constant(Word, 7),
+        InputField::unused(Word),
+        InputField::variable(Float, "WordInputReg[1]"),
+    ];
+    let value = value();
+    let start = Ask::write_registers(9, 0, &value).at_start();
+    let read =
+        |field, value| Ask::read_holding_registers(9, 0, &fields).every(ms(100)).restarted(field, value);
+    for good in [read(1, 65_535.0), read(2, 0.5)] {
+        let config = with(&[start, good]).unwrap();
+        assert!(config.exchanges[1].restarted.is_some());
+    }
+    let refused = |ask, why: &str| {
+        let error = with(&[start, ask]).unwrap_err().to_string();
+        assert_eq!(error, format!("recipe 1, exchange 2, restarted: {why}"));
+    };
+    refused(read(0, 7.0), "field 1 of the reply is no number");
+    refused(read(3, 7.0), "field 4 of the reply is no number");
+    refused(read(1, 65_536.0), "the field cannot be 65536; allowed: 0..=65535");
+    refused(read(1, 0.5), "0.5 has a fraction; this field has integers only");
+    let nothing = "a restart means that what is asked at the start is asked again; allowed in the reply of an exchange, \
+                   if one of the device has \"start\" in on";
+    refused(Ask::read_holding_registers(8, 0, &fields).every(ms(100)).restarted(1, 0.0), nothing);
+    refused(Ask::write_registers(9, 5, &value).every(ms(100)).restarted(1, 0.0), nothing);
 }
 
 #[test]
@@ -206,10 +293,7 @@ fn a_refused_recipe_leaves_nothing_behind() {
         Ask::request(AskFrame::stream(&[1], &[], &wrong)),
     ];
     let error = config.add_recipe(&Recipe::user("line").exchanges(&asks)).unwrap_err();
-    assert_eq!(
-        error.place,
-        Place::Field { recipe: 0, part: proto_core::sysvar::Direction::Output, frame: 1, field: 0 }
-    );
+    assert_eq!(error.place, Place::Field { recipe: 0, part: Direction::Output, frame: 1, field: 0 });
     assert_eq!((config.exchanges.len(), config.frames.len(), config.fields.len()), (0, 0, 0));
     let asks = [Ask::write_registers(1, 0, &value); 3];
     let error = config.add_recipe(&Recipe::user("line").exchanges(&asks)).unwrap_err();

@@ -201,8 +201,8 @@ fn a_port_hears_the_ids_of_its_exchanges() {
     let reply = frame(0x581, vec![fixed(0x43), input(T::Byte, to("WordInputReg[2]"))]);
     let refusal = frame(0x581, vec![fixed(0x80), input(T::Byte, InputBinding::Unused)]);
     let heartbeat = frame(0x701, vec![input(T::Byte, to("WordInputReg[3]"))]);
-    let asked = Talk::Frames { request, reply, refusal };
-    let unasked = Talk::Frames { request: None, reply: heartbeat, refusal: None };
+    let asked = Talk::Frames { request, reply, pending: None, refusal };
+    let unasked = Talk::Frames { request: None, reply: heartbeat, pending: None, refusal: None };
     cell.0.exchanges.push(Exchange::new(0, asked, AskWhen::every(MS(100)))).unwrap();
     cell.0.exchanges.push(Exchange::new(0, unasked, AskWhen::NEVER)).unwrap();
     cell.last_recipe().exchanges = Span { start: 0, len: 2 };
@@ -472,7 +472,7 @@ fn a_request_on_can_may_be_without_data() {
     let fields = cell.fields([]);
     let (id, head, tail) = (Some(CanId::Standard(0x80)), Delimiter::new(), Delimiter::new());
     cell.0.frames.push(FrameSpec { id, remote: false, head, tail, fields }).unwrap();
-    let sync = Talk::Frames { request: Some(0), reply: None, refusal: None };
+    let sync = Talk::Frames { request: Some(0), reply: None, pending: None, refusal: None };
     cell.0.exchanges.push(Exchange::new(0, sync, AskWhen::every(MS(20)))).unwrap();
     cell.last_recipe().exchanges = Span { start: 0, len: 1 };
     let mut rig = cell.rig();

@@ -7,7 +7,7 @@ use proto_core::device::Carrier;
 use proto_core::wire::can::CanId;
 use proto_core::wire::scalar::ScalarType;
 
-use crate::device::{DeviceField, DeviceRecipe, NamedFrame};
+use crate::device::{DeviceField, DeviceRecipe, NamedExchange, NamedFrame};
 
 /// Output frames that look like orders, such as a control word, and are sent before values of the same device: a
 /// drive starts with the target of the cycle before. `after` at one of the two says that the order is meant.
@@ -99,7 +99,8 @@ pub fn negative_numbers(recipes: &[Option<DeviceRecipe>]) -> Vec<(Vec<String>, S
         let parts = recipe.input.iter().map(|frame| &frame.fields);
         let talk = |frame: &Option<NamedFrame>| frame.as_ref().map(|frame| frame.fields.clone());
         let exchanged = recipe.exchanges.iter().flat_map(|exchange| {
-            [&exchange.request, &exchange.reply, &exchange.refusal].map(talk).into_iter().flatten()
+            let NamedExchange { request, reply, pending, refusal, .. } = exchange;
+            [request, reply, pending, refusal].map(talk).into_iter().flatten()
         });
         let fields = parts.cloned().chain(exchanged).flatten();
         let told = fields.filter_map(|field| of_field(&recipe.name, &field));

@@ -75,6 +75,8 @@ pub struct NamedExchange {
     pub request: Option<NamedFrame>,
     /// What answers.
     pub reply: Option<NamedFrame>,
+    /// What the device sends while it is at it.
+    pub pending: Option<NamedFrame>,
     /// What the device sends if it refuses the request.
     pub refusal: Option<NamedFrame>,
     /// The request is a remote frame on CAN, without data.

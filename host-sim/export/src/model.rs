@@ -94,6 +94,8 @@ pub enum Role {
     Request(usize),
     /// Its reply.
     Reply(usize),
+    /// What the one who is asked sends while it is at it.
+    Pending(usize),
     /// What the one who is asked sends if it refuses the request.
     Refusal(usize),
 }
@@ -106,6 +108,7 @@ impl Role {
             Self::Output => "output".into(),
             Self::Request(nth) => format!("request-{nth}"),
             Self::Reply(nth) => format!("reply-{nth}"),
+            Self::Pending(nth) => format!("pending-{nth}"),
             Self::Refusal(nth) => format!("refusal-{nth}"),
         }
     }
@@ -308,6 +311,7 @@ fn of_device(
         let frames = [
             (Role::Request(nth + 1), asks, &exchange.request),
             (Role::Reply(nth + 1), answers, &exchange.reply),
+            (Role::Pending(nth + 1), answers, &exchange.pending),
             (Role::Refusal(nth + 1), answers, &exchange.refusal),
         ];
         for (role, direction, frame) in frames {

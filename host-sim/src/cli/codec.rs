@@ -113,7 +113,7 @@ impl Part {
                 format!("there is no exchange {number} in recipe {name:?}; allowed: 1..={}", all.len())
             })?,
         };
-        let all = [TalkPart::Request, TalkPart::Reply, TalkPart::Refusal];
+        let all = [TalkPart::Request, TalkPart::Reply, TalkPart::Pending, TalkPart::Refusal];
         let there: Vec<_> = all.into_iter().filter(|part| part.of(exchange).is_some()).collect();
         let names = || there.iter().map(|part| part.name()).collect::<Vec<_>>().join(", ");
         let talk = match (talk, &there[..]) {
@@ -230,6 +230,7 @@ fn choose_recipe<'r>(recipes: &'r [AnyRecipe], name: Option<&str>) -> Result<&'r
 pub(super) enum TalkPart {
     Request,
     Reply,
+    Pending,
     Refusal,
 }
 
@@ -238,6 +239,7 @@ impl TalkPart {
         match self {
             Self::Request => "request",
             Self::Reply => "reply",
+            Self::Pending => "pending",
             Self::Refusal => "refusal",
         }
     }
@@ -246,6 +248,7 @@ impl TalkPart {
         match self {
             Self::Request => exchange.request.as_ref(),
             Self::Reply => exchange.reply.as_ref(),
+            Self::Pending => exchange.pending.as_ref(),
             Self::Refusal => exchange.refusal.as_ref(),
         }
     }

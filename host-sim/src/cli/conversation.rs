@@ -46,7 +46,7 @@ pub(super) struct Talk {
 
 #[derive(Debug, Serialize)]
 struct TalkFrame {
-    /// `request`, `reply` or `refusal`.
+    /// `request`, `reply`, `pending` or `refusal`.
     frame: &'static str,
     #[serde(skip_serializing_if = "Option::is_none")]
     id: Option<String>,
@@ -90,6 +90,7 @@ impl Talk {
         for (name, frame, part, len) in [
             ("request", &named.request, asks, Some(budget.request)),
             ("reply", &named.reply, answers, Some(budget.reply)),
+            ("pending", &named.pending, answers, None),
             // Of Modbus it is always the same.
             ("refusal", &named.refusal, answers, None),
         ] {

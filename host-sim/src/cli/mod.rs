@@ -246,7 +246,7 @@ struct Which {
     #[arg(long, value_name = "NAME")]
     recipe: Option<String>,
     /// The part: input (user to robot) or output (robot to user), or the frame of an exchange: request,
-    /// reply or refusal; not needed when there is only one
+    /// reply, pending or refusal; not needed when there is only one
     #[arg(long)]
     part: Option<PartName>,
     /// The number of the exchange or block in the recipe, from 1; not needed when there is only one
@@ -279,6 +279,7 @@ enum PartName {
     Output,
     Request,
     Reply,
+    Pending,
     Refusal,
 }
 
@@ -295,6 +296,7 @@ impl From<PartName> for Chosen {
             PartName::Output => Self::Part(Direction::Output),
             PartName::Request => Self::Talk(TalkPart::Request),
             PartName::Reply => Self::Talk(TalkPart::Reply),
+            PartName::Pending => Self::Talk(TalkPart::Pending),
             PartName::Refusal => Self::Talk(TalkPart::Refusal),
         }
     }
@@ -437,7 +439,7 @@ impl Which {
         let recipe = self.recipe.as_deref();
         let part = match (self.part.map(Chosen::from), self.exchange) {
             (Some(Chosen::Part(_)), Some(_)) => {
-                Err("an exchange has no input and output; choose one with --part: request, reply, refusal"
+                Err("an exchange has no input and output; choose one with --part: request, reply, pending, refusal"
                     .into())
             }
             (Some(Chosen::Part(part)), None) => codec::Part::choose(&recipes, recipe, Some(part)),

@@ -4,8 +4,8 @@
 
 use proto_core::config::{
     AskWhen, Bus, CanFramePart, CommandWhen, Delimiter, Echo, Exchange, FieldSpec, FrameSpec, InputBinding,
-    InputRule, Limits, LinkSource, MapEntry, NoText, OutputBinding, Outside, Parts, PortValue, Span,
-    StateValue, StreamPart, Talk, Words,
+    InputRule, Limits, LinkSource, MapEntry, NoText, OutputBinding, Outside, Parts, PortValue, Restarted,
+    Span, StateValue, StreamPart, Talk, Words,
 };
 use proto_core::device::{
     Algorithm, Bits, Boundary, ByteOrder, Checksum, Counts, Encoding, Escape, Ignored, Kind, Length,
@@ -408,11 +408,17 @@ fn frames(
         let specs = if remote { Vec::new() } else { fields(input, direction, table, is_on_can) };
         let fields = room(cell, specs)?;
         let delimiter = |bytes| Delimiter::from_slice(bytes).unwrap_or_default();
-        let is_bare = is_on_can || first == 60;
+        let is_bare = is_on_can || first >= 60;
         let spec = FrameSpec {
             id: is_on_can.then(|| CanId::Standard(first + nth)),
             remote,
-            head: if first == 60 { delimiter(b"E") } else { delimiter(HEADS[usize::from(bytes & 3)]) },
+            head: if first == 60 {
+                delimiter(b"E")
+            } else if first == 80 {
+                delimiter(b"F")
+            } else {
+                delimiter(HEADS[usize::from(bytes & 3)])
+            },
             tail: if is_bare { delimiter(b"") } else { delimiter(TAILS[usize::from(bytes >> 2 & 3)]) },
             fields,
         };
@@ -422,22 +428,32 @@ fn frames(
     };
     let request = if kind & 3 == 0 { None } else { Some(add(input, 20, Direction::Output, table)?) };
     let reply = if kind & 3 == 1 { None } else { Some(add(input, 40, Direction::Input, table)?) };
-    let refusal = if kind & 7 == 7 { Some(add(input, 60, Direction::Input, Span::default())?) } else { None };
+    let mut other = |input: &mut Source<'_>, first, is_there: bool| match is_there {
+        true => add(input, first, Direction::Input, Span::default()).map(Some),
+        false => Some(None),
+    };
+    let pending = other(input, 80, kind & 15 == 15)?;
+    let refusal = other(input, 60, kind & 7 == 7)?;
     let when = if request.is_some() { when(input) } else { AskWhen::NEVER };
-    let refusal = refusal.inspect(|&nth| {
-        // It only tells that the device refuses.
+    for nth in [pending, refusal].into_iter().flatten() {
+        // They pick no commands, and have no counter.
         let span = cell.0.frames[usize::from(nth)].fields;
-        for field in &mut cell.0.fields[usize::from(span.start)..] {
-            match field {
-                FieldSpec::DeviceInput { to, .. } => *to = InputBinding::Unused,
-                FieldSpec::TextInput { to, .. } => *to = None,
-                // Without a variable nothing may stand behind it.
-                field if field.is_of_field_before() => *field = FieldSpec::Padding { len: 1, fill: 0 },
-                _ => {}
+        let (start, len) = (usize::from(span.start), usize::from(span.len));
+        for field in &mut cell.0.fields[start..start + len] {
+            if let FieldSpec::DeviceInput { to, .. } = field
+                && matches!(to, InputBinding::Commands { .. } | InputBinding::Counter { .. })
+            {
+                *to = InputBinding::Unused;
             }
         }
-    });
-    Some(exchange(input, kind >> 6, Talk::Frames { request, reply, refusal }, when))
+    }
+    let talk = Talk::Frames { request, reply, pending, refusal };
+    let mut exchange = exchange(input, kind >> 6, talk, when);
+    let restarted = input.u8();
+    if restarted & 3 == 0 {
+        exchange.restarted = Some(Restarted { field: restarted >> 6, value: f64::from(restarted >> 2 & 15) });
+    }
+    Some(exchange)
 }
 
 /// What a line with devices is like.

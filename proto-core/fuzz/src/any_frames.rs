@@ -55,8 +55,8 @@ pub(crate) fn bytes(
     }
     let exchange = exchanges.get(usize::from(which >> 1) % exchanges.len().max(1))?;
     let frame = match exchange.talk {
-        Talk::Frames { reply, refusal, .. } => {
-            let nth = if which & 0x80 == 0 { reply } else { refusal.or(reply) };
+        Talk::Frames { reply, pending, refusal, .. } => {
+            let nth = answer(which, [reply, pending, refusal]);
             let spec = config.frames.get(usize::from(nth?))?;
             own_frame(config, spec, Carrier::Stream, input)?
         }
@@ -72,10 +72,19 @@ pub(crate) fn can(config: &GatewayConfig, port: usize, input: &mut Source<'_>) -
     let which = input.u8();
     let exchanges = exchanges(config, port);
     let exchange = exchanges.get(usize::from(which >> 1) % exchanges.len().max(1))?;
-    let Talk::Frames { reply, refusal, .. } = exchange.talk else { return None };
-    let nth = if which & 0x80 == 0 { reply } else { refusal.or(reply) };
+    let Talk::Frames { reply, pending, refusal, .. } = exchange.talk else { return None };
+    let nth = answer(which, [reply, pending, refusal]);
     let spec = config.frames.get(usize::from(nth?))?;
     CanFrame::new(spec.id?, &own_frame(config, spec, Carrier::Can, input)?)
+}
+
+/// One of the answers: the reply, or the pending answer or the refusal if there is one.
+fn answer(which: u8, [reply, pending, refusal]: [Option<u8>; 3]) -> Option<u8> {
+    match which >> 6 {
+        0 | 1 => reply,
+        2 => pending.or(refusal).or(reply),
+        _ => refusal.or(reply),
+    }
 }
 
 fn part_frame(config: &GatewayConfig, part: &StreamPart, input: &mut Source<'_>) -> Option<Vec<u8>> {

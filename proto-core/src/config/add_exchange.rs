@@ -5,7 +5,7 @@
 
 use super::ask::{Ask, AskFrame, AskTalk, of_block};
 use super::error::{ConfigError, ConfigErrorKind as Kind, ExchangeKey, Place};
-use super::exchange::{Exchange, FrameSpec, Talk};
+use super::exchange::{Exchange, FrameSpec, Talk, has_values};
 use super::fields::{Fields, Var};
 use super::view::ConfigMut;
 use super::{AskWhen, Delimiter, ExchangeError, FieldSpec, OutcomeTo, Span};
@@ -50,7 +50,9 @@ impl ConfigMut<'_> {
                 let var = var.read().map_err(|error| ConfigError { place, kind: Kind::Variable(error) })?;
                 when.rising = Some((var, bit));
             }
-            let Ask { peer, timeout, retries, pause, trigger, late, stop, follow, overdue, .. } = *ask;
+            let Ask {
+                peer, timeout, retries, pause, trigger, late, stop, follow, overdue, restarted, ..
+            } = *ask;
             let outcome = outcome(&ask.outcome).map_err(|error| ConfigError {
                 place: at(ExchangeKey::Outcome),
                 kind: Kind::Variable(error),
@@ -64,6 +66,7 @@ impl ConfigMut<'_> {
                 follow,
                 overdue,
                 outcome,
+                restarted,
                 ..Exchange::new(peer, talk, when)
             };
             let _ = self.exchanges.push(exchange.repeated(retries));
@@ -109,36 +112,46 @@ impl ConfigMut<'_> {
                 let (written, read) = if part == Direction::Input { (span, none) } else { (none, span) };
                 Ok(Talk::Served { operation, written, read })
             }
-            AskTalk::Frames { request, reply, refusal } => {
-                let mut add = |frame: &Option<AskFrame<'_>>, part: Direction, key, number: u8| match frame {
-                    Some(frame) => self.add_frame((recipe, part, number), frame, at(key)).map(Some),
-                    None => Ok(None),
-                };
-                let mut number = |frame: &Option<AskFrame<'_>>, part| {
-                    if frame.is_some() { frames.next(part) } else { 0 }
-                };
-                let sent = number(request, Direction::Output);
-                let received = number(reply, Direction::Input);
-                Ok(Talk::Frames {
-                    request: add(request, Direction::Output, ExchangeKey::Request, sent)?,
-                    reply: add(reply, Direction::Input, ExchangeKey::Reply, received)?,
-                    refusal: add(refusal, Direction::Input, ExchangeKey::Refusal, u8::MAX)?,
-                })
+            AskTalk::Frames(of) => {
+                let keys = [
+                    (Direction::Output, ExchangeKey::Request),
+                    (Direction::Input, ExchangeKey::Reply),
+                    (Direction::Input, ExchangeKey::Pending),
+                    (Direction::Input, ExchangeKey::Refusal),
+                ];
+                let mut added = [None; 4];
+                for ((added, frame), (part, key)) in added.iter_mut().zip(of).zip(keys) {
+                    let Some(frame) = frame else { continue };
+                    let index = self.add_frame((recipe, part), frame, at(key), frames)?;
+                    let is_counted = matches!(key, ExchangeKey::Request | ExchangeKey::Reply);
+                    let span = self.frames.get(usize::from(index)).map(|frame| frame.fields);
+                    if is_counted || span.is_some_and(|span| has_values(span.of(self.fields))) {
+                        frames.next(part);
+                    }
+                    *added = Some(index);
+                }
+                let [request, reply, pending, refusal] = added;
+                Ok(Talk::Frames { request, reply, pending, refusal })
             }
         }
     }
 
     fn add_frame(
         &mut self,
-        (recipe, part, number): (u8, Direction, u8),
+        (recipe, part): (u8, Direction),
         from: &AskFrame<'_>,
         place: Place,
+        frames: &FrameNumbers,
     ) -> Result<u8, ConfigError> {
         let bytes = |bytes: &[u8]| {
             let kind = Kind::TooLong { len: bytes.len(), longest: MAX_DELIMITER };
             Delimiter::from_slice(bytes).map_err(|_| ConfigError { place, kind })
         };
         let (head, tail) = (bytes(from.head)?, bytes(from.tail)?);
+        let number = match part {
+            Direction::Input => frames.input,
+            Direction::Output => frames.output,
+        };
         let fields = self.fields_of_part(recipe, part, number, &from.fields)?;
         let index = self.frames.len() as u8;
         let _ = self.frames.push(FrameSpec { id: from.id, remote: from.remote, head, tail, fields });

@@ -4,7 +4,7 @@
 //! is that of the file (docs/configuration.md). [`Recipe::user`](super::Recipe::user) takes them with
 //! [`RecipeBuilder::exchanges`](super::RecipeBuilder::exchanges).
 
-use super::exchange::{AskWhen, DEFAULT_REPLY_TIMEOUT};
+use super::exchange::{AskWhen, DEFAULT_REPLY_TIMEOUT, Restarted};
 use super::fields::{Fields, InputField, OutputField, Var};
 use crate::device::Encoding;
 use crate::modbus::rtu::{Operation, Table};
@@ -65,14 +65,24 @@ pub struct Ask<'a> {
     pub(super) follow: Option<u8>,
     pub(super) overdue: Option<Duration>,
     pub(super) outcome: [Option<Var<'a>>; 3],
+    pub(super) restarted: Option<Restarted>,
 }
 
 /// Operations have counts of 0 here.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum AskTalk<'a> {
-    Rtu { operation: Operation, written: Option<Fields<'a>>, read: Option<Fields<'a>> },
-    Served { table: Table, address: u16, fields: Fields<'a> },
-    Frames { request: Option<AskFrame<'a>>, reply: Option<AskFrame<'a>>, refusal: Option<AskFrame<'a>> },
+    Rtu {
+        operation: Operation,
+        written: Option<Fields<'a>>,
+        read: Option<Fields<'a>>,
+    },
+    Served {
+        table: Table,
+        address: u16,
+        fields: Fields<'a>,
+    },
+    /// A request, a reply, a pending answer and a refusal.
+    Frames([Option<AskFrame<'a>>; 4]),
 }
 
 /// A frame of an exchange.
@@ -173,12 +183,12 @@ impl<'a> Ask<'a> {
 
     /// A request of a device's own; of device 0, unless [`Self::peer`] says otherwise.
     pub fn request(request: AskFrame<'a>) -> Self {
-        Self::new(0, AskTalk::Frames { request: Some(request), reply: None, refusal: None })
+        Self::new(0, AskTalk::Frames([Some(request), None, None, None]))
     }
 
     /// A frame that may come at any time.
     pub fn unasked(frame: AskFrame<'a>) -> Self {
-        Self::new(0, AskTalk::Frames { request: None, reply: Some(frame), refusal: None })
+        Self::new(0, AskTalk::Frames([None, Some(frame), None, None]))
     }
 
     fn read(slave: u8, operation: Operation, fields: &'a [InputField<'a>]) -> Self {
@@ -205,22 +215,38 @@ impl<'a> Ask<'a> {
             follow: None,
             overdue: None,
             outcome: [None; 3],
+            restarted: None,
         }
     }
 
     /// What answers the request. No effect on Modbus, whose replies are known.
     pub fn reply(mut self, frame: AskFrame<'a>) -> Self {
-        if let AskTalk::Frames { reply, .. } = &mut self.talk {
+        if let AskTalk::Frames([_, reply, _, _]) = &mut self.talk {
             *reply = Some(frame);
+        }
+        self
+    }
+
+    /// What the device sends while it is at it: its answer is awaited anew. No effect on Modbus.
+    pub fn pending(mut self, frame: AskFrame<'a>) -> Self {
+        if let AskTalk::Frames([_, _, pending, _]) = &mut self.talk {
+            *pending = Some(frame);
         }
         self
     }
 
     /// What the device sends if it refuses the request. No effect on Modbus.
     pub fn refusal(mut self, frame: AskFrame<'a>) -> Self {
-        if let AskTalk::Frames { refusal, .. } = &mut self.talk {
+        if let AskTalk::Frames([_, _, _, refusal]) = &mut self.talk {
             *refusal = Some(frame);
         }
+        self
+    }
+
+    /// The device has restarted when this field of the reply, counted from 0 without padding and texts, becomes `value`:
+    /// what is asked at its start is asked again.
+    pub const fn restarted(mut self, field: u8, value: f64) -> Self {
+        self.restarted = Some(Restarted { field, value });
         self
     }
 
@@ -332,12 +358,10 @@ impl<'a> Ask<'a> {
     /// The frames of a device's own.
     pub(super) fn frames(&self) -> impl Iterator<Item = &AskFrame<'a>> {
         let frames = match &self.talk {
-            AskTalk::Frames { request, reply, refusal } => {
-                [request.as_ref(), reply.as_ref(), refusal.as_ref()]
-            }
-            AskTalk::Rtu { .. } | AskTalk::Served { .. } => [None; 3],
+            AskTalk::Frames(frames) => &frames[..],
+            AskTalk::Rtu { .. } | AskTalk::Served { .. } => &[],
         };
-        frames.into_iter().flatten()
+        frames.iter().flatten()
     }
 
     /// All lists of fields.
@@ -345,7 +369,7 @@ impl<'a> Ask<'a> {
         let own = match &self.talk {
             AskTalk::Rtu { written, read, .. } => [written.as_ref(), read.as_ref()],
             AskTalk::Served { fields, .. } => [Some(fields), None],
-            AskTalk::Frames { .. } => [None; 2],
+            AskTalk::Frames(_) => [None; 2],
         };
         own.into_iter().flatten().chain(self.frames().map(|frame| &frame.fields))
     }

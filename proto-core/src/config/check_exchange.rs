@@ -4,9 +4,11 @@ use core::fmt;
 
 use super::error::{ConfigErrorKind as Kind, ExchangeKey as Key, Place};
 use super::exchange::{Exchange, FrameSpec, Talk};
+use super::input_rule::check_read;
 use super::rules::{Check, MAX_TIME, check_pool, check_time, fail};
 use super::{
-    Bus, ConfigView, Constants, DeviceFrame, FieldSpec, Parts, Port, PortHealth, Recipe, Span, StreamPart,
+    Bus, ConfigView, Constants, DeviceFrame, FieldSpec, InputBinding, Parts, Port, PortHealth, Recipe, Span,
+    StreamPart, has_values,
 };
 use crate::device::{Carrier, LayoutError};
 use crate::modbus::rtu::{BROADCAST, CountError, MAX_ADDRESS, MAX_SLAVES, Operation};
@@ -79,7 +81,7 @@ pub enum ExchangeError {
     Overlap,
     /// Neither request nor reply.
     Nothing,
-    /// A refusal without a request and its reply.
+    /// A pending answer or a refusal without a request and its reply.
     LoneRefusal,
     /// A request that is never sent.
     Never,
@@ -89,8 +91,19 @@ pub enum ExchangeError {
     RemoteFields,
     /// A remote frame that the gateway would receive.
     RemoteReply,
-    /// A refusal with values for variables or commands.
+    /// A pending answer or a refusal with commands or an alive counter.
     RefusalValues,
+    /// A pending answer or a refusal whose frames are all taken for an answer that is looked for first.
+    Hidden,
+    /// A pending answer that may have the bytes of its request, as an echo has.
+    PendingEcho,
+    /// Nothing is asked at the start of the peer, so its restart means nothing; or there is no reply.
+    RestartedNothing,
+    /// The field that tells of a restart is none with a number in the reply.
+    RestartedField {
+        /// The field, counted from 0.
+        field: u8,
+    },
     /// A frame with the id of another one that can come at the same time, and no constant that tells
     /// them apart.
     NotToldApart {
@@ -176,7 +189,7 @@ impl fmt::Display for ExchangeError {
             }
             Self::Overlap => f.write_str("an earlier block has some of these registers or coils"),
             Self::Nothing => f.write_str("an exchange needs a request, a reply or both"),
-            Self::LoneRefusal => f.write_str("a refusal answers a request that has a reply"),
+            Self::LoneRefusal => f.write_str("a pending answer or a refusal answers a request that has a reply"),
             Self::Never => f.write_str("it would never be asked; set every_ms, on or follow"),
             Self::Unasked => f.write_str("there is no request to send; remove every_ms and on"),
             Self::RemoteFields => f.write_str("a remote request has no fields"),
@@ -186,9 +199,23 @@ impl fmt::Display for ExchangeError {
                 "another frame that can come at the same time has id {id}, too, and nothing tells the two apart; give \
                  both a constant at the same place, with another value"
             ),
-            Self::RefusalValues => f.write_str(
-                "a refusal only tells that the device refuses; its fields have no to and no commands",
+            Self::RefusalValues => {
+                f.write_str("the fields of a pending answer and of a refusal have no commands and no counter")
+            }
+            Self::Hidden => f.write_str(
+                "every such frame is another answer to the request as well, which is looked for first (the reply, then \
+                 pending, then refusal) or is shorter; give that one a constant that this one does not have",
             ),
+            Self::PendingEcho => f.write_str(
+                "it may have the bytes of its request, so an echo would be taken for it; give it another constant",
+            ),
+            Self::RestartedNothing => f.write_str(
+                "a restart means that what is asked at the start is asked again; allowed in the reply of an exchange, \
+                 if one of the device has \"start\" in on",
+            ),
+            Self::RestartedField { field } => {
+                write!(f, "field {} of the reply is no number", u16::from(*field).saturating_add(1))
+            }
             Self::Trigger { time } => {
                 write!(f, "{time} is out of range; allowed: above 0, at most {LONGEST_TRIGGER}")
             }
@@ -273,6 +300,7 @@ impl<'a> ExchangeCheck<'a> {
                 super::check_recipe::check_trigger(self.at(nth, Key::Rising), var, bit)?;
             }
             self.check_event(nth, exchange)?;
+            self.check_restarted(nth, exchange)?;
         }
         if self.config.can_ids(self.recipe, Direction::Input).nth(MAX_CAN_IDS).is_some() {
             let last = self.recipe.exchanges.len.saturating_sub(1) as u8;
@@ -329,9 +357,26 @@ impl<'a> ExchangeCheck<'a> {
     /// Whether the frames that the exchange takes are told from all others that can come while they are
     /// awaited: those of one exchange, and those that come unasked.
     fn check_ids(&self, nth: u8, exchange: &Exchange) -> Check {
-        let Talk::Frames { request, reply, refusal } = exchange.talk else { return Ok(()) };
+        let Talk::Frames { request, reply, pending, refusal } = exchange.talk else { return Ok(()) };
+        let spec = |index: u8| self.config.frames.get(usize::from(index));
+        let answers = [(Key::Reply, reply), (Key::Pending, pending), (Key::Refusal, refusal)];
+        for (place, (key, own)) in answers.into_iter().enumerate() {
+            let Some(own) = own.and_then(spec) else { continue };
+            let mut others = answers.into_iter().enumerate().filter(|(other, _)| *other != place);
+            let hides = |(other, (_, index)): (usize, (Key, Option<u8>))| {
+                index.and_then(spec).is_some_and(|index| index.hides(own, other < place, self.config))
+            };
+            if others.any(hides) {
+                return self.refuse(nth, key, ExchangeError::Hidden);
+            }
+            if key == Key::Pending
+                && request.and_then(spec).is_some_and(|request| own.may_echo(request, self.config))
+            {
+                return self.refuse(nth, key, ExchangeError::PendingEcho);
+            }
+        }
         let frame = |index: u8| {
-            let frame = self.config.frames.get(usize::from(index))?;
+            let frame = spec(index)?;
             Some((frame.id?, frame.fields))
         };
         let part = match &self.recipe.parts {
@@ -339,14 +384,13 @@ impl<'a> ExchangeCheck<'a> {
             Parts::Stream { .. } => &[],
         };
         let is_unasked = request.is_none();
-        for (key, own) in [(Key::Reply, reply), (Key::Refusal, refusal)] {
+        for (key, own) in answers {
             let Some((id, fields)) = own.and_then(frame) else { continue };
             let earlier = self.config.exchanges_of(self.recipe).iter().take(usize::from(nth));
             let earlier = earlier
                 .filter(|earlier| is_unasked || matches!(earlier.talk, Talk::Frames { request: None, .. }));
             let earlier = earlier.flat_map(|earlier| earlier.frames(Direction::Input));
-            let of_exchanges = earlier.chain(reply.filter(|_| key == Key::Refusal)).filter_map(frame);
-            let others = part.iter().map(|frame| (frame.id, frame.fields)).chain(of_exchanges);
+            let others = part.iter().map(|frame| (frame.id, frame.fields)).chain(earlier.filter_map(frame));
             let constants = |fields: Span| Constants::of(fields.of(self.config.fields), Direction::Input);
             let mut same_id = others.filter(|(other, _)| *other == id).map(|(_, fields)| fields);
             if same_id.any(|other| !constants(other).differ(&constants(fields))) {
@@ -409,8 +453,8 @@ impl<'a> ExchangeCheck<'a> {
                     }
                 }
             }
-            Talk::Frames { request, reply, refusal } => {
-                self.check_frames(nth, is_never, [request, reply, refusal])
+            Talk::Frames { request, reply, pending, refusal } => {
+                self.check_frames(nth, is_never, [request, reply, pending, refusal])
             }
         }
     }
@@ -439,7 +483,10 @@ impl<'a> ExchangeCheck<'a> {
             }
             let layout = match DeviceFrame::new(Carrier::Whole, part, (&[], &[]), fields) {
                 Ok(frame) => frame.layout,
-                Err(error) => return fail(self.place_of(nth, part, fields, error), Kind::Layout(error)),
+                Err(error) => {
+                    let place = self.place_of(nth, Key::Reply, part, fields, error);
+                    return fail(place, Kind::Layout(error));
+                }
             };
             let (shortest, longest) = layout.lengths();
             if shortest != longest {
@@ -452,10 +499,11 @@ impl<'a> ExchangeCheck<'a> {
         Ok(())
     }
 
-    fn check_frames(&self, nth: u8, is_never: bool, frames: [Option<u8>; 3]) -> Check {
+    fn check_frames(&self, nth: u8, is_never: bool, frames: [Option<u8>; 4]) -> Check {
         let refused = match frames {
-            [None, None, _] => Some((Key::Whole, ExchangeError::Nothing)),
-            [None, _, Some(_)] | [_, None, Some(_)] => Some((Key::Refusal, ExchangeError::LoneRefusal)),
+            [None, None, ..] => Some((Key::Whole, ExchangeError::Nothing)),
+            [None, _, Some(_), _] | [_, None, Some(_), _] => Some((Key::Pending, ExchangeError::LoneRefusal)),
+            [None, _, _, Some(_)] | [_, None, _, Some(_)] => Some((Key::Refusal, ExchangeError::LoneRefusal)),
             [Some(_), ..] if is_never => Some((Key::Whole, ExchangeError::Never)),
             [None, ..] if !is_never => Some((Key::Whole, ExchangeError::Unasked)),
             _ => None,
@@ -463,10 +511,11 @@ impl<'a> ExchangeCheck<'a> {
         if let Some((key, error)) = refused {
             return self.refuse(nth, key, error);
         }
-        let [request, reply, refusal] = frames;
+        let [request, reply, pending, refusal] = frames;
         for (key, part, index) in [
             (Key::Request, Direction::Output, request),
             (Key::Reply, Direction::Input, reply),
+            (Key::Pending, Direction::Input, pending),
             (Key::Refusal, Direction::Input, refusal),
         ] {
             let Some(index) = index else { continue };
@@ -495,21 +544,62 @@ impl<'a> ExchangeCheck<'a> {
                 _ => self.refuse(nth, key, ExchangeError::RemoteReply),
             };
         }
-        if key == Key::Refusal && fields.iter().any(FieldSpec::acts) {
+        let is_other = matches!(key, Key::Pending | Key::Refusal);
+        if is_other && fields.iter().any(is_command_or_counter) {
             return self.refuse(nth, key, ExchangeError::RefusalValues);
         }
         match frame.layout(self.config, part) {
             Ok(_) => Ok(()),
-            Err(error) if key == Key::Refusal => fail(place, Kind::Layout(error)),
-            Err(error) => fail(self.place_of(nth, part, fields, error), Kind::Layout(error)),
+            Err(error) if is_other && !has_values(fields) => fail(place, Kind::Layout(error)),
+            Err(error) => fail(self.place_of(nth, key, part, fields, error), Kind::Layout(error)),
         }
     }
 
-    /// The place of a mistake in the frame of an exchange that has one in this part.
-    fn place_of(&self, nth: u8, part: Direction, fields: &[FieldSpec], error: LayoutError) -> Place {
+    /// The field that tells of a restart.
+    fn check_restarted(&self, nth: u8, exchange: &Exchange) -> Check {
+        let Some(restarted) = exchange.restarted else { return Ok(()) };
+        let refuse = |error| self.refuse(nth, Key::Restarted, error);
+        let exchanges = self.config.exchanges_of(self.recipe);
+        let has_start = exchanges
+            .iter()
+            .any(|other| other.peer == exchange.peer && other.when.start && !other.is_served());
+        let fields = match exchange.fields(self.config.frames, Direction::Input) {
+            Some(span) if has_start => span.of(self.config.fields),
+            _ => return refuse(ExchangeError::RestartedNothing),
+        };
+        match restarted.place(fields) {
+            Some((_, encoding)) => check_read(self.at(nth, Key::Restarted), &encoding, restarted.value),
+            None => refuse(ExchangeError::RestartedField { field: restarted.field }),
+        }
+    }
+
+    /// The place of a mistake in a frame of an exchange that is counted in this part.
+    fn place_of(
+        &self,
+        nth: u8,
+        key: Key,
+        part: Direction,
+        fields: &[FieldSpec],
+        error: LayoutError,
+    ) -> Place {
         let recipe = self.index;
-        let earlier = self.config.exchanges_of(self.recipe).iter().take(usize::from(nth));
-        let before = earlier.filter(|exchange| exchange.fields(self.config.frames, part).is_some()).count();
+        let others = |exchange: &Exchange| match part {
+            Direction::Input => exchange.other_answers(self.config.frames, self.config.fields),
+            Direction::Output => [None; 2],
+        };
+        let count = |exchange: &Exchange| {
+            let own = exchange.fields(self.config.frames, part);
+            [own].into_iter().chain(others(exchange)).flatten().count()
+        };
+        let exchanges = self.config.exchanges_of(self.recipe);
+        let before = exchanges.iter().take(usize::from(nth)).map(count).fold(0, usize::saturating_add);
+        let own = exchanges.get(usize::from(nth));
+        let within = match (key, own.map(others)) {
+            (Key::Pending, _) | (Key::Refusal, Some([None, _])) => 1,
+            (Key::Refusal, _) => 2,
+            _ => 0,
+        };
+        let before = before.saturating_add(within);
         let frame = self.recipe.part_frames(part).count().saturating_add(before) as u8;
         match super::device::field_of(fields, error) {
             Some(field) => Place::Field { recipe, part, frame, field },
@@ -527,6 +617,16 @@ impl FrameSpec {
         let fields: &[FieldSpec] = self.fields.of(config.fields);
         let carrier = if self.id.is_some() { Carrier::Can } else { Carrier::Stream };
         DeviceFrame::new(carrier, part, (&self.head, &self.tail), fields)
+    }
+}
+
+/// Whether a field picks a command or is an alive counter.
+fn is_command_or_counter(field: &FieldSpec) -> bool {
+    match field {
+        FieldSpec::UserInput { to, .. } | FieldSpec::DeviceInput { to, .. } => {
+            matches!(to, InputBinding::Commands { .. } | InputBinding::Counter { .. })
+        }
+        _ => false,
     }
 }
 

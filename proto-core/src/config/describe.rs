@@ -131,7 +131,9 @@ impl ExchangeKey {
             Self::Outcome => ", outcome",
             Self::Request => ", request",
             Self::Reply => ", reply",
+            Self::Pending => ", pending",
             Self::Refusal => ", refusal",
+            Self::Restarted => ", restarted",
         }
     }
 }

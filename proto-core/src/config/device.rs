@@ -71,8 +71,8 @@ impl FieldSpec {
         matches!(self, Self::UserInput { .. } | Self::DeviceInput { .. } | Self::TextInput { .. })
     }
 
-    /// Whether a received value goes to a variable or picks a command.
-    pub(super) fn acts(&self) -> bool {
+    /// Whether a received value goes to a variable, picks a command or is an alive counter.
+    pub fn has_value(&self) -> bool {
         match self {
             Self::UserInput { to, .. } | Self::DeviceInput { to, .. } => *to != InputBinding::Unused,
             Self::TextInput { .. } => self.variables().next().is_some(),

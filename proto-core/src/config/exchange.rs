@@ -4,7 +4,8 @@
 //! beside its parts; their frames are ranges of the same list of fields.
 
 use super::walk::Frames;
-use super::{ConfigView, Delimiter, Recipe, Span};
+use super::{ConfigView, Delimiter, FieldSpec, Recipe, Span};
+use crate::device::{Element, Encoding};
 use crate::modbus::rtu::Operation;
 use crate::sysvar::{Direction, SysVar};
 use crate::time::Duration;
@@ -47,6 +48,35 @@ pub struct Exchange {
     pub overdue: Option<Duration>,
     /// The variables that tell the robot what became of its events.
     pub outcome: OutcomeTo,
+    /// What in its reply tells that the peer has restarted.
+    pub restarted: Option<Restarted>,
+}
+
+/// A number of a reply that tells that the peer has restarted, when the reply before had another one there.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct Restarted {
+    /// The field of the reply that has it, counted from 0: values and constants, without padding and texts.
+    pub field: u8,
+    /// The number, before scale and offset.
+    pub value: f64,
+}
+
+impl Restarted {
+    /// The field in a reply with these fields: its place among those with an element, and its encoding; `None` if it is
+    /// none with a number that may vary.
+    pub(crate) fn place(&self, fields: &[FieldSpec]) -> Option<(u8, Encoding)> {
+        let numbers =
+            (0_u8..).zip(fields.iter().filter_map(FieldSpec::element)).filter_map(|(nth, element)| {
+                match element {
+                    Element::Value { encoding, .. } => Some((nth, Some(encoding))),
+                    Element::Fixed { .. } => Some((nth, None)),
+                    _ => None,
+                }
+            });
+        let (nth, encoding) = numbers.into_iter().nth(usize::from(self.field))?;
+        Some((nth, encoding?))
+    }
 }
 
 /// The variables that tell the robot what became of an exchange's events.
@@ -100,6 +130,8 @@ pub enum Talk {
         request: Option<u8>,
         /// What answers it; without one, sending it is all.
         reply: Option<u8>,
+        /// What the device sends while it is at it, before its answer.
+        pending: Option<u8>,
         /// What the device sends if it refuses the request.
         refusal: Option<u8>,
     },
@@ -175,6 +207,7 @@ impl Exchange {
             follow: None,
             overdue: None,
             outcome: OutcomeTo::NONE,
+            restarted: None,
         }
     }
 
@@ -226,19 +259,18 @@ impl Exchange {
         matches!(self.talk, Talk::Served { .. })
     }
 
-    /// Its frames of a device's own that come from the device (input), a reply before a refusal, or go
+    /// Its frames of a device's own that come from the device (input): a reply, a pending answer, a refusal; or that go
     /// to it (output).
     pub(crate) fn frames(&self, part: Direction) -> impl Iterator<Item = u8> + use<> {
         let frames = match (self.talk, part) {
-            (Talk::Frames { reply, refusal, .. }, Direction::Input) => [reply, refusal],
-            (Talk::Frames { request, .. }, Direction::Output) => [request, None],
-            _ => [None, None],
+            (Talk::Frames { reply, pending, refusal, .. }, Direction::Input) => [reply, pending, refusal],
+            (Talk::Frames { request, .. }, Direction::Output) => [request, None, None],
+            _ => [None; 3],
         };
         frames.into_iter().flatten()
     }
 
-    /// The fields that come from the device (input) or go to it (output); `None` if it has no such
-    /// frame. A refusal only tells that the device refuses.
+    /// The fields that come from the device (input) with a reply, or go to it (output); `None` if it has no such frame.
     pub(crate) fn fields(&self, frames: &[FrameSpec], part: Direction) -> Option<Span> {
         let span = match (self.talk, part) {
             (Talk::Rtu { read, .. }, Direction::Input) => read,
@@ -252,6 +284,21 @@ impl Exchange {
         };
         (span.len > 0).then_some(span)
     }
+
+    /// The fields of its pending answer and of its refusal, where they have values: these are input frames like a reply.
+    /// The others only tell what they are.
+    pub(crate) fn other_answers(&self, frames: &[FrameSpec], pool: &[FieldSpec]) -> [Option<Span>; 2] {
+        let Talk::Frames { pending, refusal, .. } = self.talk else { return [None; 2] };
+        [pending, refusal].map(|nth| {
+            let span = frames.get(usize::from(nth?))?.fields;
+            has_values(span.of(pool)).then_some(span)
+        })
+    }
+}
+
+/// Whether a frame from a device has values.
+pub(crate) fn has_values(fields: &[FieldSpec]) -> bool {
+    fields.iter().any(FieldSpec::has_value)
 }
 
 impl<'c> ConfigView<'c> {
@@ -264,7 +311,8 @@ impl<'c> ConfigView<'c> {
     /// that of the CAN frame, and behind these the frames of the exchanges, counted on.
     pub(crate) fn frames_of(self, recipe: &'c Recipe, part: Direction) -> Frames<'c> {
         let exchanges = self.exchanges_of(recipe).iter();
-        Frames { parts: recipe.part_frames(part), exchanges, frames: self.frames, part, count: 0 }
+        let (frames, pool) = (self.frames, self.fields);
+        Frames { parts: recipe.part_frames(part), exchanges, others: [None; 2], frames, pool, part, count: 0 }
     }
 
     /// Whether frames come from the device (input), or go to it (output).

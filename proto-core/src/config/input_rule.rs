@@ -236,7 +236,7 @@ impl<'c> BehindInput<'c> {
 }
 
 /// Checks that a number can be read from a field.
-fn check_read(place: Place, encoding: &Encoding, value: f64) -> Check {
+pub(super) fn check_read(place: Place, encoding: &Encoding, value: f64) -> Check {
     let (low, high) = encoding.range();
     if !(low..=high).contains(&value) {
         return fail(place, Kind::NotInField { value, low, high });

@@ -72,8 +72,12 @@ pub enum ExchangeKey {
     Request,
     /// The reply.
     Reply,
+    /// The pending answer.
+    Pending,
     /// The refusal.
     Refusal,
+    /// What in the reply tells that its peer has restarted.
+    Restarted,
 }
 
 /// A key of a port.

@@ -65,16 +65,24 @@ impl ConfigView<'_> {
         on_line(port, exchange, budget.reply, None)
     }
 
-    /// The exchanges of a recipe, as bits, that wait while a reply to this one may come: those of its peer whose replies
-    /// cannot be told from its own.
+    /// The exchanges of a recipe, as bits, that wait while an answer to this one may come: those of its peer for whose
+    /// replies it could be taken.
     pub fn held_back_by(self, recipe: &Recipe, exchange: &Exchange) -> u64 {
-        let all = (0_u32..).zip(self.exchanges_of(recipe));
-        let held = all.filter(|(_, other)| self.are_alike(exchange, other));
-        held.fold(0, |set, (nth, _)| set | 1_u64.unbounded_shl(nth))
+        self.exchanges_that(recipe, |other| self.may_confirm(exchange, other))
     }
 
-    /// Whether the replies to two exchanges cannot be told apart by content or length.
-    fn are_alike(self, own: &Exchange, other: &Exchange) -> bool {
+    /// The exchanges, as bits, whose answers could be taken for the reply to this one.
+    pub(crate) fn waits_for(self, recipe: &Recipe, exchange: &Exchange) -> u64 {
+        self.exchanges_that(recipe, |other| self.may_confirm(other, exchange))
+    }
+
+    fn exchanges_that(self, recipe: &Recipe, is_one: impl Fn(&Exchange) -> bool) -> u64 {
+        let all = (0_u32..).zip(self.exchanges_of(recipe)).filter(|(_, exchange)| is_one(exchange));
+        all.fold(0, |set, (nth, _)| set | 1_u64.unbounded_shl(nth))
+    }
+
+    /// Whether what answers an exchange cannot be told from a reply to the other one by content or length.
+    fn may_confirm(self, own: &Exchange, other: &Exchange) -> bool {
         let frame = |nth: Option<u8>| self.frames.get(usize::from(nth?));
         own.peer == other.peer
             && own.is_answered()
@@ -83,13 +91,10 @@ impl ConfigView<'_> {
                 (Talk::Rtu { operation: own, .. }, Talk::Rtu { operation: other, .. }) => {
                     own.is_answered_like(&other)
                 }
-                (Talk::Frames { reply: own, .. }, Talk::Frames { reply: other, .. }) => {
-                    match (frame(own), frame(other)) {
-                        (Some(own), Some(other)) => {
-                            core::ptr::eq(own, other) || !own.is_told_from(other, self)
-                        }
-                        _ => true,
-                    }
+                (Talk::Frames { .. }, Talk::Frames { reply: other, .. }) => {
+                    let Some(other) = frame(other) else { return true };
+                    let mut answers = own.frames(Direction::Input).filter_map(|nth| frame(Some(nth)));
+                    answers.any(|own| core::ptr::eq(own, other) || !own.is_told_from(other, self))
                 }
                 _ => false,
             }

@@ -54,8 +54,10 @@ pub use draft::{
 pub use error::{
     ConfigError, ConfigErrorKind, ControllerKey, Counted, ExchangeKey, NetworkKey, Place, PortKey, RecipeKey,
 };
+pub(crate) use exchange::has_values;
 pub use exchange::{
-    AskWhen, DEFAULT_LATE, DEFAULT_REPLY_TIMEOUT, Exchange, FrameSpec, MAX_TRIGGER, OutcomeTo, Talk,
+    AskWhen, DEFAULT_LATE, DEFAULT_REPLY_TIMEOUT, Exchange, FrameSpec, MAX_TRIGGER, OutcomeTo, Restarted,
+    Talk,
 };
 pub use fields::{CanFields, Fields, InputField, OutputField, Sum, Var};
 pub use fitting::Fitting;

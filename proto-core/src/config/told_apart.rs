@@ -59,6 +59,12 @@ impl Constants {
         encoding.write(value, bytes);
     }
 
+    /// Whether each of these bits is the same in every frame of the other, too.
+    fn are_all_of(&self, other: &Self) -> bool {
+        let is_new = self.mask.iter().zip(&other.mask).any(|(own, other)| own & !other != 0);
+        !is_new && !self.differ(other)
+    }
+
     /// Whether a bit that is the same in every frame of both is not the same in both.
     pub fn differ(&self, other: &Self) -> bool {
         let masks = self.mask.iter().zip(&other.mask).map(|(one, other)| one & other);
@@ -82,6 +88,28 @@ impl FrameSpec {
         }
         let constants = |frame: &Self| frame.constants(config, Direction::Input);
         constants(self).differ(&constants(other))
+    }
+
+    /// Whether all bytes that are the other frame are this one too, as frames from a device, if it is looked for first;
+    /// or begin with it on a line, whichever is.
+    pub(crate) fn hides(&self, other: &Self, is_first: bool, config: ConfigView<'_>) -> bool {
+        let lengths =
+            |frame: &Self| frame.layout(config, Direction::Input).ok().map(|frame| frame.layout.lengths());
+        let (Some((short, long)), Some((shortest, longest))) = (lengths(self), lengths(other)) else {
+            return false;
+        };
+        let is_summed = |frame: &Self| {
+            frame.fields.of(config.fields).iter().any(|field| matches!(field, FieldSpec::Checksum(_)))
+        };
+        let [own, others] = [self, other].map(|frame| frame.constants(config, Direction::Input));
+        self.id == other.id
+            && own.are_all_of(&others)
+            && (is_first && short <= shortest && longest <= long && (!is_summed(self) || is_summed(other))
+                || self.id.is_none()
+                    && self.tail.is_empty()
+                    && short == long
+                    && long < shortest
+                    && !is_summed(self))
     }
 
     /// Whether this frame from a device may have the bytes of that request.

@@ -29,7 +29,10 @@ impl Iterator for PartFrames<'_> {
 pub(crate) struct Frames<'c> {
     pub(super) parts: PartFrames<'c>,
     pub(super) exchanges: Iter<'c, Exchange>,
+    /// What is left of an exchange: its pending answer and its refusal.
+    pub(super) others: [Option<Span>; 2],
     pub(super) frames: &'c [FrameSpec],
+    pub(super) pool: &'c [FieldSpec],
     pub(super) part: Direction,
     pub(super) count: u8,
 }
@@ -38,11 +41,26 @@ impl Iterator for Frames<'_> {
     type Item = (u8, Span);
 
     fn next(&mut self) -> Option<(u8, Span)> {
-        let of_exchanges = || self.exchanges.find_map(|exchange| exchange.fields(self.frames, self.part));
-        let span = self.parts.next().or_else(of_exchanges)?;
+        let span = self.parts.next().or_else(|| self.of_exchanges())?;
         let nth = self.count;
         self.count = nth.wrapping_add(1);
         Some((nth, span))
+    }
+}
+
+impl Frames<'_> {
+    #[inline(never)]
+    fn of_exchanges(&mut self) -> Option<Span> {
+        if let Some(span) = self.others.iter_mut().find_map(Option::take) {
+            return Some(span);
+        }
+        let Self { exchanges, others, frames, pool, part, .. } = self;
+        exchanges.find_map(|exchange| {
+            if *part == Direction::Input {
+                *others = exchange.other_answers(frames, pool);
+            }
+            exchange.fields(frames, *part)
+        })
     }
 }
 

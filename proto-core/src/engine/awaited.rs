@@ -4,7 +4,7 @@
 //! part in it. Applies nothing.
 
 use super::device_port::{DeviceFormat, better, elements, probe};
-use super::exchanges::{Asks, InputFormat, Item};
+use super::exchanges::{Asks, InputFormat, Item, OtherFormat};
 use super::line::{Flight, OwnRequest};
 use super::turns::Row;
 use super::user::InputBind;
@@ -20,10 +20,12 @@ pub(super) enum Heard<'i> {
     Reply(Option<&'i InputFormat>),
     /// The awaited reply, or the echo of the own request.
     ReplyOrEcho,
-    /// The device refuses the request.
-    Refusal,
-    /// A reply to an earlier request of this exchange that came too late.
-    Late(u8),
+    /// The device is at it; its answer follows.
+    Pending(&'i OtherFormat),
+    /// The device refuses the request; with a frame of its own.
+    Refusal(Option<&'i OtherFormat>),
+    /// A reply to an earlier request of this exchange that came too late, or its pending answer.
+    Late { exchange: u8, is_pending: bool },
     /// An answer to one of several requests; nothing tells which.
     Ambiguous,
     /// A frame that comes unasked, its place in the store, and its exchange if it is of one.
@@ -62,7 +64,7 @@ impl<'i> Awaited<'i> {
         self.has_echo && self.echo.is_some()
     }
 
-    /// The reply and the refusal that a device's own frames are.
+    /// The answers that a device's own frames are.
     pub(super) fn answers(&self) -> impl Iterator<Item = &'i DeviceFormat> {
         self.asked().filter(|_| !self.waits_for_echo()).into_iter().flat_map(answers_of)
     }
@@ -128,7 +130,7 @@ impl<'i> Awaited<'i> {
         let answer = self.expected().filter(|_| !self.waits_for_echo()).and_then(|expected| {
             match expected.probe(frame) {
                 rtu::Probe::Reply(_) => Some(Heard::Reply(self.asked()?.reply.as_ref())),
-                rtu::Probe::Refused(_) => Some(Heard::Refusal),
+                rtu::Probe::Refused(_) => Some(Heard::Refusal(None)),
                 _ => None,
             }
         });
@@ -141,41 +143,58 @@ impl<'i> Awaited<'i> {
         let is_right = |expected: &Expected| {
             matches!(expected.probe(frame), rtu::Probe::Reply(_) | rtu::Probe::Refused(_))
         };
-        let is_late = |row: &Row, item: &'i Item| {
-            row.expected.as_ref().is_some_and(is_right) || answers_of(item).any(is)
-        };
-        self.told(answer, is_late).or_else(|| {
+        self.told(answer, is, |row| row.expected.as_ref().is_some_and(is_right)).or_else(|| {
             let (format, slot, nth) = self.unasked().find(|(format, ..)| is(format))?;
             Some(Heard::Unasked(format, slot, nth))
         })
     }
 
-    /// An answer, unless it may be a refusal of another request; else a late reply.
+    /// An answer, unless it may be a refusal of another request or its pending answer; else a late reply. Frames of a
+    /// device's own are told by `is`, those of Modbus by `is_expected`.
     pub(super) fn told(
         &self,
         answer: Option<Heard<'i>>,
-        is_late: impl Fn(&Row, &'i Item) -> bool,
+        is: impl Fn(&DeviceFormat) -> bool,
+        is_expected: impl Fn(&Row) -> bool,
     ) -> Option<Heard<'i>> {
-        let late = || self.outstanding().find(|(_, row, item)| is_late(row, item));
+        if let Some(Heard::Reply(_)) = answer {
+            return answer;
+        }
+        let late = self.outstanding().find_map(|(exchange, row, item)| {
+            let found = answers_of(item).find(|answer| is(answer));
+            let is_pending = found.is_some_and(|found| is_pending(item, found));
+            (found.is_some() || is_expected(row)).then_some(Heard::Late { exchange, is_pending })
+        });
         match answer {
-            Some(Heard::Refusal) if late().is_some() => Some(Heard::Ambiguous),
-            Some(answer) => Some(answer),
-            None => late().map(|(nth, ..)| Heard::Late(nth)),
+            Some(answer) => Some(if late.is_some() { Heard::Ambiguous } else { answer }),
+            None => late,
         }
     }
 
     pub(super) fn answer(&self, is: impl Fn(&DeviceFormat) -> bool) -> Option<Heard<'i>> {
         let found = self.answers().find(|answer| is(answer))?;
-        let reply = self.asked()?.reply.as_ref();
-        let reply = reply.filter(|reply| core::ptr::eq(&reply.format, found));
-        Some(reply.map_or(Heard::Refusal, |reply| Heard::Reply(Some(reply))))
+        let item = self.asked()?;
+        let is_it = |other: &&OtherFormat| core::ptr::eq(&other.format, found);
+        if let Some(reply) = item.reply.as_ref().filter(|reply| core::ptr::eq(&reply.format, found)) {
+            return Some(Heard::Reply(Some(reply)));
+        }
+        let pending = item.pending.as_ref().filter(is_it).map(Heard::Pending);
+        pending.or_else(|| item.refusal.as_ref().map(|refusal| Heard::Refusal(Some(refusal))))
     }
 }
 
-/// The reply and the refusal of an exchange with frames of the device's own.
+/// The answers of an exchange with frames of the device's own, in the order in which they are looked for: its reply, its
+/// pending answer, its refusal.
 pub(super) fn answers_of(item: &Item) -> impl Iterator<Item = &DeviceFormat> {
     let item = Some(item).filter(|item| matches!(item.asks, Asks::Frame | Asks::Remote { .. }));
-    item.into_iter().flat_map(|item| item.reply.iter().map(|reply| &reply.format).chain(&item.refusal))
+    item.into_iter().flat_map(|item| {
+        let others = item.pending.iter().chain(&item.refusal).map(|other| &other.format);
+        item.reply.iter().map(|reply| &reply.format).chain(others)
+    })
+}
+
+fn is_pending(item: &Item, format: &DeviceFormat) -> bool {
+    item.pending.as_ref().is_some_and(|pending| core::ptr::eq(&pending.format, format))
 }
 
 fn probe_reply(expected: &Expected, bytes: &[u8]) -> Probe {

@@ -220,6 +220,7 @@ impl Events<'_, '_> {
     /// A write that stops its peer is wanted: it goes first, and what waits for the peer is cancelled.
     pub(super) fn stop(&mut self, nth: usize) {
         self.line.request(self.talks, nth, self.now);
+        self.line.yield_to_stops(self.talks, self.now);
         let Some(peer) = self.talks.rows.get(nth).map(|row| row.peer) else { return };
         for other in 0..self.items.len() {
             let is_of_peer = self.talks.rows.get(other).is_some_and(|row| row.peer == peer);
@@ -447,6 +448,12 @@ impl Events<'_, '_> {
             News::Nothing => {}
             News::Away => self.end_waiting(Some(which), Outcome::Away),
             News::Started => {
+                for (item, row) in self.items.iter_mut().zip(self.talks.rows.iter()) {
+                    // What it said before says nothing any more.
+                    if let Some(sign) = item.restart.as_mut().filter(|_| row.peer == which) {
+                        sign.was_there = None;
+                    }
+                }
                 if let Some(peer) = self.talks.peers.get_mut(usize::from(which)) {
                     peer.counters.starts = peer.counters.starts.wrapping_add(1);
                 }

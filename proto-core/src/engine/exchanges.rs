@@ -15,7 +15,7 @@ use super::turns::{Row, RowKind, RowTimes, Turn};
 use super::user::{InputBind, InputTo};
 use crate::config::{
     Bus, ConfigView, Counted, DeviceFrame, Echo, Exchange, FieldSpec, FrameSpec, OutcomeTo, Port, Recipe,
-    Span, Talk,
+    Restarted, Span, Talk, has_values,
 };
 use crate::device::{Carrier, LayoutError};
 use crate::modbus::rtu::{BROADCAST, Operation, Table, Timing};
@@ -51,7 +51,10 @@ pub(super) struct Item {
     pub asks: Asks,
     pub request: Option<DeviceFormat>,
     pub reply: Option<InputFormat>,
-    pub refusal: Option<DeviceFormat>,
+    pub pending: Option<OtherFormat>,
+    pub refusal: Option<OtherFormat>,
+    /// What in the reply tells that the peer has restarted.
+    pub restart: Option<RestartSign>,
     pub times: Times,
     /// It is asked when a value of the request changes.
     pub on_change: bool,
@@ -98,6 +101,30 @@ pub(super) enum Asks {
 pub(super) struct InputFormat {
     pub format: DeviceFormat,
     pub slot: u8,
+}
+
+/// A pending answer or a refusal, and its place in the store if it has values.
+#[derive(Debug, Clone)]
+pub(super) struct OtherFormat {
+    pub format: DeviceFormat,
+    pub slot: Option<u8>,
+}
+
+/// The number in a reply that tells that the peer has restarted.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct RestartSign {
+    /// Its place among the elements of the reply.
+    pub element: u8,
+    pub value: f64,
+    /// Whether the reply before had it; `None` if there was none since the peer started.
+    pub was_there: Option<bool>,
+}
+
+impl RestartSign {
+    fn new(of: Restarted, fields: &[FieldSpec]) -> Option<Self> {
+        let (element, _) = of.place(fields)?;
+        Some(Self { element, value: of.value, was_there: None })
+    }
 }
 
 impl<const N: usize> Exchanges<N> {
@@ -205,12 +232,17 @@ impl Formats<'_> {
         Ok(InputFormat { format, slot })
     }
 
-    /// A refusal's fields are behind those of the recipe.
-    fn refusal(
+    /// A pending answer or a refusal. The fields of one without values are behind those of the recipe.
+    fn other(
         &mut self,
         frame: Result<DeviceFrame, LayoutError>,
         id: Option<CanId>,
-    ) -> Result<DeviceFormat, BuildError> {
+        has_values: bool,
+    ) -> Result<OtherFormat, BuildError> {
+        if has_values {
+            let InputFormat { format, slot } = self.input(frame, id)?;
+            return Ok(OtherFormat { format, slot: Some(slot) });
+        }
         let (recipe, part, [frames, _]) = (self.recipe, Direction::Input, self.frames);
         let frame = frame.map_err(|error| BuildError::Layout { recipe, part, frame: frames, error })?;
         let len = frame.elements.len() as u16;
@@ -221,7 +253,8 @@ impl Formats<'_> {
                 .push(bind)
                 .map_err(|_| one_too_many(Counted::UserFields, self.refusals.capacity()))?;
         }
-        Ok(DeviceFormat { layout: frame.layout, id: id.unwrap_or(CanId::Standard(0)), bindings })
+        let format = DeviceFormat { layout: frame.layout, id: id.unwrap_or(CanId::Standard(0)), bindings };
+        Ok(OtherFormat { format, slot: None })
     }
 
     /// The data of Modbus registers or coils that are sent.
@@ -257,8 +290,9 @@ impl Formats<'_> {
     }
 
     #[inline(never)]
-    fn refusal_of(&mut self, spec: &FrameSpec) -> Result<DeviceFormat, BuildError> {
-        self.refusal(spec.layout(self.config, Direction::Input), spec.id)
+    fn other_of(&mut self, spec: &FrameSpec) -> Result<OtherFormat, BuildError> {
+        let has_values = has_values(spec.fields.of(self.config.fields));
+        self.other(spec.layout(self.config, Direction::Input), spec.id, has_values)
     }
 
     /// Bytes of a reply to a remote request.
@@ -273,7 +307,9 @@ impl Formats<'_> {
             asks: Asks::Nothing,
             request: None,
             reply: None,
+            pending: None,
             refusal: None,
+            restart: None,
             times: Times {
                 timeout: exchange.timeout,
                 pause: exchange.pause,
@@ -311,7 +347,7 @@ impl Formats<'_> {
                 item.request = self.data_out(read)?;
                 item.reply = self.data_in(written)?;
             }
-            Talk::Frames { request, reply, refusal } => {
+            Talk::Frames { request, reply, pending, refusal } => {
                 let config = self.config;
                 let frame = |nth: Option<u8>| config.frames.get(usize::from(nth?));
                 if let Some(request) = frame(request) {
@@ -329,12 +365,16 @@ impl Formats<'_> {
                 if let Some(reply) = frame(reply) {
                     item.reply = Some(self.reply_of(reply)?);
                 }
-                if let Some(refusal) = frame(refusal) {
-                    item.refusal = Some(self.refusal_of(refusal)?);
+                for (from, to) in [(pending, &mut item.pending), (refusal, &mut item.refusal)] {
+                    if let Some(spec) = frame(from) {
+                        *to = Some(self.other_of(spec)?);
+                    }
                 }
                 item.times.is_answered = item.reply.is_some();
             }
         }
+        let fields = exchange.fields(self.config.frames, Direction::Input).unwrap_or_default();
+        item.restart = exchange.restarted.and_then(|of| RestartSign::new(of, fields.of(self.config.fields)));
         Ok(item)
     }
 }
@@ -427,7 +467,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             let times = RowTimes { every, cost, timeout: exchange.timeout, late: exchange.late() };
             let mut row = Row::new(peer as u8, kind, times);
             // A transaction id tells all replies apart.
-            row.alike = if is_tcp { 0 } else { config.held_back_by(recipe, exchange) };
+            row.alike = if is_tcp { 0 } else { config.waits_for(recipe, exchange) };
             self.exchanges.rows.push(row).map_err(|_| full())?;
             self.exchanges.items.push(item).map_err(|_| full())?;
         }

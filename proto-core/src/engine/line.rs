@@ -115,6 +115,8 @@ pub(super) struct Flight {
     was_wrong: bool,
     /// What came is its reply, or its own echo.
     pub may_be_echo: bool,
+    /// The peer said that it is at it.
+    is_pending: bool,
     /// Its reply could be taken for that to another request.
     is_ambiguous: bool,
     /// The reply of a Modbus slave.
@@ -124,6 +126,8 @@ pub(super) struct Flight {
     /// Of its bytes.
     digest: u64,
     until: Instant,
+    /// Not even a pending answer is waited for longer.
+    latest: Instant,
 }
 
 /// Why a request has failed.
@@ -133,6 +137,8 @@ pub(super) enum Failure {
     Checksum,
     /// All that came may have been its own echo.
     Echo,
+    /// The peer said that it is at it, and nothing else; or a write that stops goes first.
+    Pending,
 }
 
 /// What became of a request that failed.
@@ -316,11 +322,13 @@ impl Line {
                     is_wrong: false,
                     was_wrong: false,
                     may_be_echo: false,
+                    is_pending: false,
                     is_ambiguous: false,
                     expected: None,
                     sdo: None,
                     digest: 0,
                     until: Instant::NEVER,
+                    latest: Instant::NEVER,
                 })
             }
             Err(later) => {
@@ -373,7 +381,8 @@ impl Line {
         let is_answered = times.is_some_and(|times| times.is_answered);
         let until = |time: fn(&Times) -> Duration| times.as_ref().map_or(now, |times| now + time(times));
         self.phase = if is_answered {
-            Phase::Waiting(Flight { until: until(|times| times.timeout), ..flight })
+            let latest = until(|times| times.timeout.saturating_mul(LONGEST_PENDING));
+            Phase::Waiting(Flight { until: until(|times| times.timeout), latest, ..flight })
         } else {
             // Own bytes are not heard: the silence behind them is kept here.
             resting(until(|times| times.pause).max(now + line.turnaround), now)
@@ -395,6 +404,30 @@ impl Line {
             flight.may_be_echo = true;
         }
         self.echo = None;
+    }
+
+    /// The peer is at it: its answer is awaited anew, as if the request had left now. Writes that stop do not wait for it.
+    pub(super) fn heard_pending(&mut self, talks: &Talks<'_>, timeout: Duration, now: Instant) {
+        if let Phase::Sending(flight) | Phase::Waiting(flight) = &mut self.phase {
+            (flight.is_pending, flight.is_wrong) = (true, false);
+            flight.until = (now + timeout).min(flight.latest);
+        }
+        if matches!(self.phase, Phase::Waiting(_)) {
+            self.sent = now;
+        }
+        self.yield_to_stops(talks, now);
+    }
+
+    /// What is pending is not waited for beyond the turn of a write that stops.
+    pub(super) fn yield_to_stops(&mut self, talks: &Talks<'_>, now: Instant) {
+        let Phase::Waiting(flight) = &mut self.phase else { return };
+        if !flight.is_pending {
+            return;
+        }
+        let others = (0_u8..).zip(talks.rows.iter()).filter(|(nth, _)| *nth != flight.exchange);
+        if let Some(stop) = others.filter_map(|(_, row)| row.stop_at()).min() {
+            flight.until = flight.until.min(stop.max(now));
+        }
     }
 
     /// Own bytes are heard, or are not. Returns whether that is news.
@@ -437,6 +470,7 @@ impl Line {
         let Phase::Waiting(flight) = self.phase else { return None };
         match flight.is_wrong {
             true if now >= line.silent_at().min(flight.until) => Some((flight, Failure::Checksum)),
+            false if now >= flight.until && flight.is_pending => Some((flight, Failure::Pending)),
             false if now >= flight.until && flight.may_be_echo => Some((flight, Failure::Echo)),
             false if now >= flight.until => Some((flight, Failure::Timeout)),
             _ => None,
@@ -455,7 +489,7 @@ impl Line {
         let Some(peer) = talks.peer_of(flight) else { return Over::GivenUp(News::Nothing) };
         let counters = &mut peer.counters;
         let counter = match failure {
-            Failure::Timeout => &mut counters.timeouts,
+            Failure::Timeout | Failure::Pending => &mut counters.timeouts,
             Failure::Checksum => &mut counters.checksums,
             Failure::Echo => &mut counters.unconfirmed,
         };
@@ -474,8 +508,9 @@ impl Line {
             Cause::State(_) => times.retries[0],
             Cause::Start | Cause::Event => times.retries[1],
         };
-        let unanswered = flight.unanswered.or((failure == Failure::Timeout).then_some(sent));
-        if peer.turn.presence() == Presence::Up && flight.repeated < retries {
+        let unanswered = flight.unanswered.or((failure != Failure::Checksum).then_some(sent));
+        // The peer has the request of which it said that it is at it.
+        if peer.turn.presence() == Presence::Up && flight.repeated < retries && !flight.is_pending {
             counters.retries = counters.retries.wrapping_add(1);
             let repeated = flight.repeated.saturating_add(1);
             let was_wrong = flight.was_wrong || failure == Failure::Checksum;
@@ -608,6 +643,9 @@ fn leave_outstanding(talks: &mut Talks<'_>, flight: Flight, count: u8, sent: Ins
         row.leaves_outstanding(count, sent + row.late().min(row.timeout().saturating_mul(2)), now);
     }
 }
+
+/// How long pending answers are waited for, in timeouts.
+const LONGEST_PENDING: u64 = 16;
 
 fn resting(until: Instant, now: Instant) -> Phase {
     if until > now { Phase::Resting(until) } else { Phase::Idle }

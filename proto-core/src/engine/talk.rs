@@ -4,13 +4,13 @@
 //! and requests. Which exchange is next is the line's business ([`super::line`]); ports without
 //! exchanges do not come here.
 
-use super::awaited::{Awaited, Heard, answers_of};
+use super::awaited::{Awaited, Heard};
 use super::clock::Ask;
 use super::command_link::CommandLink;
 use super::counters::{PortCounters, add, bump};
 use super::device_port::{DeviceCodec, DeviceFormat, elements, judge_can};
 use super::events::{Events, Outcome, Sources};
-use super::exchanges::{Asks, Item, View};
+use super::exchanges::{Asks, Item, OtherFormat, View};
 use super::field_output::Downward;
 use super::field_port::{Codec, FieldPort, came, keep_why};
 use super::frames::{Accepted, Frames};
@@ -23,7 +23,7 @@ use super::tap::{Tap, TapPlace};
 use super::transactions;
 use super::turns::{Cause, Ended, News};
 use super::user::{InputBind, Outputs, wrapping_count};
-use super::whole_port::Reader;
+use super::whole_port::{Reader, TextBind};
 use super::{Engine, OUTPUT_BUFFER, find_port};
 use crate::device::{Found, Probe};
 use crate::image::{GroupId, Image, InputSet};
@@ -168,11 +168,15 @@ impl FieldPort {
                 true => transactions::content(frame),
                 false => (frame.get(3..frame.len().saturating_sub(2)).unwrap_or(&[]), frame.get(2).copied()),
             };
+            let before = accepted.frames;
+            // The exchange whose reply was taken, and its data.
+            let mut told = None;
             let (verdict, sign) = match what {
                 Some(Heard::Reply(reply)) => {
                     let verdict = match reply {
                         Some(reply) => {
                             let data = if expected.is_some() { data } else { frame };
+                            told = flight.map(|flight| (flight.exchange, data));
                             let slot = usize::from(reply.slot);
                             let verdict = frames.take_device(&reply.format, texts, data, slot, &mut accepted);
                             // A transaction id tells to which of the requests it is the reply.
@@ -189,22 +193,35 @@ impl FieldPort {
                     (verdict, Sign::Answer(Ended::Good, 0))
                 }
                 Some(Heard::ReplyOrEcho) => (Ok(()), Sign::ReplyOrEcho),
-                Some(Heard::Refusal) => {
+                Some(Heard::Pending(pending)) => {
+                    (take_other(&mut frames, Some(pending), texts, frame, &mut accepted), Sign::Pending)
+                }
+                Some(Heard::Refusal(refusal)) => {
                     let code = expected.and(code).unwrap_or(0);
                     (
-                        Err(Rejection::Refused),
+                        take_other(&mut frames, refusal, texts, frame, &mut accepted)
+                            .and(Err(Rejection::Refused)),
                         Sign::Answer(refused_with(code, expected.is_some()), code.into()),
                     )
                 }
-                Some(Heard::Late(nth)) => (Err(Rejection::Late), Sign::Late(nth)),
+                Some(Heard::Late { exchange, is_pending }) => {
+                    (Err(Rejection::Late), Sign::Late { exchange, is_pending })
+                }
                 Some(Heard::Ambiguous) => (Err(Rejection::Late), Sign::Ambiguous),
                 Some(Heard::Unasked(format, slot, nth)) => {
+                    told = nth.map(|nth| (nth, frame));
                     (frames.take_device(format, texts, frame, slot, &mut accepted), Sign::Unasked(nth))
                 }
                 None if is_tcp => (frames.rejected(Rejection::OtherDevice), Sign::Nothing),
                 Some(Heard::Echo) | None => (Err(Rejection::NoFrame), Sign::Nothing),
             };
+            if let Some(told) = told.filter(|_| verdict.is_ok()) {
+                look_for_restart(line, items, &mut talks, bindings, told, now);
+            }
             match (sign, flight, times) {
+                (Sign::Pending, Some(flight), Some(times)) => {
+                    goes_on(line, items, &mut talks, (flight, times), now);
+                }
                 (Sign::Answer(ended, code), Some(flight), Some(times)) => {
                     // Of a repetition, two copies may be the replies to both requests.
                     let is_sure = !flight.is_repetition() && !is_outstanding(&talks, flight, now);
@@ -222,7 +239,8 @@ impl FieldPort {
             tap.record(|| came(self.id, now, verdict, None, [frame, &[], &[]]));
             keep_why(&mut self.last_rejection, verdict, frames.store, None, frame);
             // What is held can hold further frames, so only the rest of the chunk waits.
-            if verdict.is_ok() && frames.store.watches_bits && !left.is_empty() {
+            let may_change = verdict.is_ok() || accepted.frames != before;
+            if may_change && frames.store.watches_bits && !left.is_empty() {
                 break;
             }
         }
@@ -277,13 +295,15 @@ impl FieldPort {
         let (answer, code) = match awaited.answer(is) {
             Some(answer) => (Some(answer), 0),
             None => match sdo_abort(&awaited, frame) {
-                Some(code) => (Some(Heard::Refusal), code),
+                Some(code) => (Some(Heard::Refusal(None)), code),
                 None => (None, 0),
             },
         };
         let times = awaited.asked().map(|item| item.times);
-        let (verdict, sign) = match awaited.told(answer, |_, item| answers_of(item).any(is)) {
+        let mut told = None;
+        let (verdict, sign) = match awaited.told(answer, is, |_| false) {
             Some(Heard::Reply(Some(reply))) => {
+                told = flight.map(|flight| (flight.exchange, frame.data()));
                 let slot = usize::from(reply.slot);
                 let verdict = frames.take_device(&reply.format, texts, frame.data(), slot, accepted);
                 if let Some(since) = flight.and_then(|flight| flight.unanswered()) {
@@ -291,8 +311,16 @@ impl FieldPort {
                 }
                 (verdict, Sign::Answer(Ended::Good, 0))
             }
-            Some(Heard::Refusal) => (Err(Rejection::Refused), Sign::Answer(Ended::Refused, code)),
-            Some(Heard::Late(nth)) => (Err(Rejection::Late), Sign::Late(nth)),
+            Some(Heard::Pending(pending)) => {
+                (take_other(&mut frames, Some(pending), texts, frame.data(), accepted), Sign::Pending)
+            }
+            Some(Heard::Refusal(refusal)) => (
+                take_other(&mut frames, refusal, texts, frame.data(), accepted).and(Err(Rejection::Refused)),
+                Sign::Answer(Ended::Refused, code),
+            ),
+            Some(Heard::Late { exchange, is_pending }) => {
+                (Err(Rejection::Late), Sign::Late { exchange, is_pending })
+            }
             Some(_) => (Err(Rejection::Late), Sign::Ambiguous),
             None => {
                 let answers = awaited.answers().map(|format| (None, format));
@@ -304,12 +332,21 @@ impl FieldPort {
                 };
                 let (slot, nth) = place.unwrap_or((usize::MAX, None));
                 frames.take_device(format, texts, frame.data(), slot, accepted)?;
+                if let Some(nth) = nth {
+                    look_for_restart(line, items, &mut talks, bindings, (nth, frame.data()), now);
+                }
                 signs(line, items, &mut talks, Sign::Unasked(nth), now);
                 self.sender.frames_accepted(1, usable, &mut self.counters, now);
                 return Ok(());
             }
         };
+        if let Some(told) = told.filter(|_| verdict.is_ok()) {
+            look_for_restart(line, items, &mut talks, bindings, told, now);
+        }
         match (sign, flight, times) {
+            (Sign::Pending, Some(flight), Some(times)) => {
+                goes_on(line, items, &mut talks, (flight, times), now);
+            }
             (Sign::Answer(ended, code), Some(flight), Some(times)) => {
                 answered(line, items, &mut talks, frames.counters, (flight, times), (ended, code), now);
             }
@@ -469,6 +506,9 @@ impl FieldPort {
         let (items, mut talks) = view.of(line);
         for item in items {
             (item.digest, item.is_owed) = (None, false);
+            if let Some(sign) = &mut item.restart {
+                sign.was_there = None;
+            }
         }
         line.begin(&mut talks, now);
         line.looks = line.looks.map(|grid| crate::schedule::Grid::starting_at(now, grid.period()));
@@ -489,9 +529,14 @@ enum Sign {
     Nothing,
     /// The request on its way is answered, with the code of a refusal.
     Answer(Ended, u16),
+    /// Its peer is at it.
+    Pending,
     ReplyOrEcho,
-    /// A late reply to an earlier request of this exchange.
-    Late(u8),
+    /// A late reply to an earlier request of this exchange, or its pending answer.
+    Late {
+        exchange: u8,
+        is_pending: bool,
+    },
     Ambiguous,
     /// A frame that nobody asked for, of this exchange.
     Unasked(Option<u8>),
@@ -572,16 +617,85 @@ fn answered(
     events.ended(nth, flight.cause == Cause::Event, ended, code);
 }
 
+/// The peer is at it, and there.
+#[cold]
+#[inline(never)]
+fn goes_on(
+    line: &mut Line,
+    items: &mut [Item],
+    talks: &mut Talks<'_>,
+    (flight, times): (Flight, Times),
+    now: Instant,
+) {
+    line.heard_pending(talks, times.timeout, now);
+    let nth = usize::from(flight.exchange);
+    let Some(which) = talks.rows.get(nth).map(|row| row.peer) else { return };
+    let news = line.turns(talks, |turns| turns.heard(which, Some(nth), now));
+    Events { items, talks, line, now }.note(nth, news);
+}
+
+/// Takes the values of a pending answer or a refusal, if it has any.
+#[cold]
+#[inline(never)]
+fn take_other<const PORTS: usize>(
+    frames: &mut Frames<'_, PORTS>,
+    other: Option<&OtherFormat>,
+    texts: &[TextBind],
+    frame: &[u8],
+    accepted: &mut Accepted,
+) -> Result<(), Rejection> {
+    match other.and_then(|other| Some((&other.format, usize::from(other.slot?)))) {
+        Some((format, slot)) => frames.take_device(format, texts, frame, slot, accepted),
+        None => Ok(()),
+    }
+}
+
+/// Looks in a reply that was taken for the number that tells that its peer has restarted: it has, if the reply before had
+/// another one there. What is asked at its start is asked again.
+#[cold]
+#[inline(never)]
+fn look_for_restart(
+    line: &mut Line,
+    items: &mut [Item],
+    talks: &mut Talks<'_>,
+    bindings: &[InputBind],
+    (exchange, data): (u8, &[u8]),
+    now: Instant,
+) {
+    let nth = usize::from(exchange);
+    let Some(Item { restart: Some(sign), reply: Some(reply), .. }) = items.get_mut(nth) else { return };
+    let fields = elements(reply.format.bindings.of(bindings));
+    let found = reply.format.layout.values(fields, data).nth(usize::from(sign.element));
+    let Some(Ok(Some(value))) = found else { return };
+    let is_there = value.as_f64() == sign.value;
+    if sign.was_there.replace(is_there) != Some(false) || !is_there {
+        return;
+    }
+    let Some(which) = talks.rows.get(nth).map(|row| row.peer) else { return };
+    let own = line.flight().map(|flight| usize::from(flight.exchange)).filter(|own| *own == nth);
+    line.turns(talks, |turns| {
+        // What its failures say is one start with this.
+        if turns.heard(which, own, now) != News::Started {
+            turns.started(which, own, now);
+        }
+    });
+    line.look(now);
+    let mut events = Events { items, talks, line, now };
+    events.note(nth, News::Started);
+    // What it was to do, it has forgotten.
+    events.end_waiting(Some(which), Outcome::Away);
+}
+
 /// A frame that is no answer to the request on its way is a sign of life of its peer.
 fn signs(line: &mut Line, items: &mut [Item], talks: &mut Talks<'_>, sign: Sign, now: Instant) {
     let nth = match (sign, line.flight()) {
-        (Sign::Late(nth), _) | (Sign::Unasked(Some(nth)), _) => usize::from(nth),
+        (Sign::Late { exchange, .. }, _) | (Sign::Unasked(Some(exchange)), _) => usize::from(exchange),
         (Sign::Ambiguous, Some(flight)) => usize::from(flight.exchange),
         _ => return,
     };
     let Some(row) = talks.rows.get_mut(nth) else { return };
     let which = row.peer;
-    if matches!(sign, Sign::Late(_)) {
+    if matches!(sign, Sign::Late { is_pending: false, .. }) {
         row.late_reply_came();
     }
     if !matches!(sign, Sign::Unasked(_))
@@ -695,6 +809,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             let connection = |group| links.connection_of(group);
             let (image, view) = (&self.store.image, self.exchanges.view());
             port.triggers(image, self.bindings.outputs(), view, (first_of_links, connection), now);
+            if port.has_failed(now) {
+                // What is pending yields to a stop.
+                port.advance_talk(self.exchanges.view(), now);
+            }
             self.after_talk(id);
         }
     }

@@ -59,7 +59,7 @@ pub(super) struct Row {
     /// When it was taken last.
     taken: Instant,
     times: RowTimes,
-    /// The rows of the line, as bits, whose replies cannot be told from its own.
+    /// The rows of the line, as bits, whose answers could be taken for its reply.
     pub alike: u64,
     /// How many replies to earlier transmissions may still come, and until when.
     outstanding: (u8, Instant),
@@ -265,6 +265,11 @@ impl Row {
 
     pub(super) const fn stops(&self) -> bool {
         self.kind.stops
+    }
+
+    /// From when on it is to be sent, if it stops its peer and is wanted.
+    pub(super) fn stop_at(&self) -> Option<Instant> {
+        self.requested.filter(|_| self.kind.stops).map(|wanted| wanted.max(self.wait.not_before))
     }
 
     pub(super) const fn timeout(&self) -> Duration {

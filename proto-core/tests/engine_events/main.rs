@@ -1,6 +1,7 @@
 //! What reaches a device is fresh or not sent at all, and what comes from it is what was asked (docs/engine.md
 //! section 13).
 
+mod answers;
 mod dialogues;
 mod echo;
 mod events;
@@ -8,6 +9,7 @@ mod late;
 #[path = "../engine_exchanges/line.rs"]
 #[allow(dead_code, reason = "each test binary uses its own part")]
 mod line;
+mod restarted;
 #[path = "../rig/mod.rs"]
 mod rig;
 mod start;

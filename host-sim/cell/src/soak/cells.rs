@@ -136,7 +136,7 @@ impl Write for Fnv {
 
 #[cfg(test)]
 mod tests {
-    use proto_core::config::{FieldSpec, Parts};
+    use proto_core::config::{FieldSpec, Parts, Restarted};
     use proto_core::device::{Ignored, Text, TextWidth};
 
     use super::*;
@@ -162,5 +162,9 @@ mod tests {
         let field = FieldSpec::TextInput { text, to: None, length_to: None, count_to: None, ignored };
         config.fields[nth] = field;
         assert!(unmodelled(&config).unwrap().contains("texts"));
+        let mut config = Scenario::named("modbus-line").unwrap().unwrap().gateway;
+        assert_eq!(unmodelled(&config), None);
+        config.exchanges[0].restarted = Some(Restarted { field: 0, value: 0.0 });
+        assert!(unmodelled(&config).unwrap().contains("restart"));
     }
 }

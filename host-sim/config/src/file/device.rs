@@ -192,7 +192,8 @@ impl FieldReader {
         let written = Written::plain(encoding::read_plain_type(table)?);
         Ok(match self.direction {
             Direction::Input => {
-                FileFieldKind::UserInput { name, written, to: FileInput::Unused, again: false }
+                let to = FileInput::Unused;
+                FileFieldKind::UserInput { name, written, to, again: false, restarted: None }
             }
             Direction::Output => {
                 FileFieldKind::UserOutput { name, written, from: bindings::FileOutput::Program }
@@ -235,8 +236,24 @@ pub(super) fn binding_keys(table: &Reader<'_>, direction: Direction) -> Result<&
 
 fn refuse_bindings(table: &Reader<'_>) -> Result<()> {
     let bindings = [
-        "to", "commands", "when", "base", "idle", "scale", "offset", "overflow", "counter", "min", "max",
-        "outside", "map", "as", "no_value", "valid_to", "point",
+        "to",
+        "commands",
+        "when",
+        "base",
+        "idle",
+        "scale",
+        "offset",
+        "overflow",
+        "counter",
+        "min",
+        "max",
+        "outside",
+        "map",
+        "as",
+        "no_value",
+        "valid_to",
+        "point",
+        "restarted",
     ];
     refuse(table, &bindings, "a field with equals is a constant and has nothing else")
 }
@@ -300,6 +317,7 @@ pub(super) fn bind(
             let (first, second) = bindings::read_input(table)?;
             let counter = bindings::read_counter(table, &encoding)?.map(|max| FileInput::Counter { max });
             let rules = input_rules::read(table, written, &first)?;
+            let mut restarted = input_rules::read_restarted(table, &encoding)?;
             let is_used = counter.is_none() || !matches!(first, FileInput::Unused);
             let uses = [Some(first).filter(|_| is_used), counter, second];
             for (nth, to) in uses.into_iter().flatten().enumerate() {
@@ -307,7 +325,8 @@ pub(super) fn bind(
                 let shared =
                     Written { encoding: Encoding { shared: true, ..encoding }, overflow: Overflow::Usual };
                 let written = if again { shared } else { written };
-                push(FileFieldKind::UserInput { name: name.clone(), written, to, again }, None);
+                let (name, restarted) = (name.clone(), restarted.take());
+                push(FileFieldKind::UserInput { name, written, to, again, restarted }, None);
                 // Those of the variable, which is the first.
                 for (spot, spec) in rules.iter().filter(|_| !again) {
                     push(FileFieldKind::Device { name: None, spec: *spec }, Some(spot.clone()));
@@ -493,7 +512,7 @@ impl FileRecipe {
     }
 
     fn named_exchange(&self, exchange: &FileExchange) -> NamedExchange {
-        let FileExchange { peer, kind, output, input, refusal, remote, .. } = exchange;
+        let FileExchange { peer, kind, output, input, pending, refusal, remote, .. } = exchange;
         let frame = |part: &Option<FilePart>| {
             part.as_ref().and_then(|part| Some(self.named_frame(part, part.frames.first()?)))
         };
@@ -507,7 +526,8 @@ impl FileRecipe {
                 rtu_frames::frames(*peer, operation, &fields(input), &fields(output))
             }
         };
-        NamedExchange { peer: *peer, kind: *kind, request, reply, refusal, remote: *remote }
+        let pending = frame(pending);
+        NamedExchange { peer: *peer, kind: *kind, request, reply, pending, refusal, remote: *remote }
     }
 }
 

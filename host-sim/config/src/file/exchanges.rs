@@ -3,8 +3,10 @@
 //! In: the tables of a gateway file's recipe. Out: [`FileExchange`]s, whose frames were laid out. The
 //! frames here are a device's own; those of Modbus are in `modbus`.
 
-use proto_core::config::{AskWhen, DEFAULT_REPLY_TIMEOUT, ExchangeError, ExchangeKey, OutcomeTo, Port};
-use proto_core::device::{Boundary, Carrier};
+use proto_core::config::{
+    AskWhen, DEFAULT_REPLY_TIMEOUT, ExchangeError, ExchangeKey, OutcomeTo, Port, Restarted,
+};
+use proto_core::device::{Boundary, Carrier, Element};
 use proto_core::recipe::model::{Mode, Rules};
 use proto_core::sysvar::{Direction, SysVar, VarBit};
 use proto_core::time::Duration;
@@ -30,6 +32,7 @@ pub(super) struct FileExchange {
     pub(super) output: Option<FilePart>,
     /// What comes from it.
     pub(super) input: Option<FilePart>,
+    pub(super) pending: Option<FilePart>,
     pub(super) refusal: Option<FilePart>,
     /// Its frames are on a CAN bus.
     pub(super) is_can: bool,
@@ -37,6 +40,8 @@ pub(super) struct FileExchange {
     pub(super) remote: bool,
     /// When the values of its reply are overdue.
     pub(super) overdue: Option<Duration>,
+    /// What in its reply tells that the device has restarted.
+    pub(super) restarted: Option<Restarted>,
     pub(super) timing: AskTiming,
 }
 
@@ -107,8 +112,9 @@ fn read(table: &Reader<'_>, is_can: bool, names: &[Option<String>]) -> Result<Fi
     };
     let request = frame("request", Direction::Output)?;
     let reply = frame("reply", Direction::Input)?;
+    let pending = frame("pending", Direction::Input)?;
     let refusal = frame("refusal", Direction::Input)?;
-    match (&request, &reply, &refusal) {
+    match (&request, &reply, pending.as_ref().or(refusal.as_ref())) {
         (None, None, _) => return Err(table.error(ExchangeError::Nothing)),
         (None, _, Some((part, _))) | (_, None, Some((part, _))) => {
             return Err(part.spot.error(table.document, ExchangeError::LoneRefusal));
@@ -127,20 +133,22 @@ fn read(table: &Reader<'_>, is_can: bool, names: &[Option<String>]) -> Result<Fi
     if request.is_some() {
         timing.check_asked(table)?;
     }
-    if let Some((part, _)) = &refusal {
+    for (part, _) in [&pending, &refusal].into_iter().flatten() {
         check_refusal(table, part)?;
     }
-    let spots = spots(
+    let mut spots = spots(
         table,
         &[
             ("peer", ExchangeKey::Peer),
             ("request", ExchangeKey::Request),
             ("reply", ExchangeKey::Reply),
+            ("pending", ExchangeKey::Pending),
             ("refusal", ExchangeKey::Refusal),
         ],
     );
+    let restarted = restarted(table, reply.as_ref().map(|(part, _)| part), &mut spots)?;
     let remote = request.as_ref().is_some_and(|(_, remote)| *remote);
-    let [output, input, refusal] = [request, reply, refusal].map(|frame| Some(frame?.0));
+    let [output, input, pending, refusal] = [request, reply, pending, refusal].map(|frame| Some(frame?.0));
     let kind = ExchangeKind::Frames;
     Ok(FileExchange {
         spot: table.spot.clone(),
@@ -149,10 +157,12 @@ fn read(table: &Reader<'_>, is_can: bool, names: &[Option<String>]) -> Result<Fi
         kind,
         output,
         input,
+        pending,
         refusal,
         is_can,
         remote,
         overdue,
+        restarted,
         timing,
     })
 }
@@ -191,20 +201,50 @@ pub(super) fn spots(table: &Reader<'_>, own: &[(&str, ExchangeKey)]) -> Vec<(Exc
     keys.chain([(ExchangeKey::Whole, table.spot.clone())]).collect()
 }
 
-/// A request, a reply or a refusal, and whether it is a remote frame.
+/// The field of a reply that tells of a restart; its place is added to `spots`.
+pub(super) fn restarted(
+    table: &Reader<'_>,
+    reply: Option<&FilePart>,
+    spots: &mut Vec<(ExchangeKey, Spot)>,
+) -> Result<Option<Restarted>> {
+    let Some(reply) = reply else { return Ok(None) };
+    let has_number = |field: &&FileField| {
+        matches!(field.spec().element(), Some(Element::Value { .. } | Element::Fixed { .. }))
+    };
+    let numbers = reply.fields().iter().filter(has_number).enumerate();
+    let mut found = numbers.filter_map(|(nth, field)| Some((nth, field.restarted()?)));
+    let Some((nth, (spot, value))) = found.next() else { return Ok(None) };
+    if let Some((_, (other, _))) = found.next() {
+        return Err(other.error(table.document, "another field of the reply has restarted; one tells it"));
+    }
+    spots.push((ExchangeKey::Restarted, spot.clone()));
+    Ok(Some(Restarted { field: u8::try_from(nth).unwrap_or(u8::MAX), value: *value }))
+}
+
+/// Elsewhere nothing tells of a restart.
+pub(super) fn refuse_restarted(table: &Reader<'_>, part: Option<&FilePart>) -> Result<()> {
+    let fields = part.into_iter().flat_map(|part| part.frames.iter().flat_map(|frame| &frame.fields));
+    match fields.filter_map(FileField::restarted).next() {
+        Some((spot, _)) => Err(spot.error(table.document, ExchangeError::RestartedNothing)),
+        None => Ok(()),
+    }
+}
+
+/// A request, a reply, a pending answer or a refusal, and whether it is a remote frame.
 fn read_frame(item: &Item<'_>, key: &str, direction: Direction, is_can: bool) -> Result<(FilePart, bool)> {
     let table = item.any_table()?;
     let is_request = direction == Direction::Output;
     let recipe = if is_can { "a CAN recipe" } else { "a stream recipe" };
     let keys = match (is_can, is_request) {
         (true, true) => &exchange::CAN_REQUEST,
-        (true, false) if key == "refusal" => &exchange::CAN_REFUSAL,
+        (true, false) if key != "reply" => &exchange::CAN_REFUSAL,
         (true, false) => &exchange::CAN_REPLY,
         (false, true) => &exchange::STREAM_REQUEST,
-        (false, false) if key == "refusal" => &exchange::STREAM_REFUSAL,
+        (false, false) if key != "reply" => &exchange::STREAM_REFUSAL,
         (false, false) => &exchange::STREAM_REPLY,
     };
-    table.check_keys(&[keys.common, OF_FRAME], &format!(" of a {key} in {recipe}"))?;
+    let what = if key == "pending" { "pending answer" } else { key };
+    table.check_keys(&[keys.common, OF_FRAME], &format!(" of a {what} in {recipe}"))?;
     let mut part = FilePart::new(&table);
     let mut frame = FileFrame::new(table.spot.clone());
     if is_can {
@@ -226,13 +266,14 @@ fn read_frame(item: &Item<'_>, key: &str, direction: Direction, is_can: bool) ->
     Ok((part, false))
 }
 
-/// A refusal has nothing to do but to be known.
+/// A pending answer or a refusal has values, and nothing else.
 fn check_refusal(table: &Reader<'_>, part: &FilePart) -> Result<()> {
-    let acts = |field: &&FileField| match &field.kind {
-        FileFieldKind::UserInput { to, .. } => !matches!(to, FileInput::Unused),
-        _ => field.spec().variables().next().is_some(),
+    refuse_restarted(table, Some(part))?;
+    let is_other = |field: &&FileField| {
+        let FileFieldKind::UserInput { to, .. } = &field.kind else { return false };
+        matches!(to, FileInput::Commands(_) | FileInput::Counter { .. })
     };
-    match part.frames.iter().flat_map(|frame| &frame.fields).find(acts) {
+    match part.fields().iter().find(is_other) {
         Some(field) => Err(field.spot.error(table.document, ExchangeError::RefusalValues)),
         None => Ok(()),
     }
@@ -256,6 +297,15 @@ impl FilePart {
     /// The fields, if it is the frame of an exchange.
     pub(super) fn fields(&self) -> &[FileField] {
         self.frames.first().map_or(&[], |frame| &frame.fields)
+    }
+}
+
+impl FileField {
+    fn restarted(&self) -> Option<&(Spot, f64)> {
+        match &self.kind {
+            FileFieldKind::UserInput { restarted, .. } => restarted.as_ref(),
+            _ => None,
+        }
     }
 }
 

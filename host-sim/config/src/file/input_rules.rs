@@ -13,7 +13,7 @@ use super::names::meant_variable;
 use super::reader::{Item, Reader, Result, Spot};
 use super::recipes::Written;
 use super::sendable::{add_entry, read_limits};
-use crate::keys::field::{AS, POINT};
+use crate::keys::field::{AS, POINT, RESTARTED};
 
 /// The words of `as`.
 pub(crate) const AS_WORDS: [(&str, InputRule); 1] = [("int16", InputRule::Int16)];
@@ -76,6 +76,12 @@ pub(super) fn read(table: &Reader<'_>, written: Written, to: &FileInput) -> Resu
         rules.push(rule(&item, read_valid_to(&item)?));
     }
     Ok(rules)
+}
+
+/// The number that tells that the device has restarted.
+pub(super) fn read_restarted(table: &Reader<'_>, encoding: &Encoding) -> Result<Option<(Spot, f64)>> {
+    let Some(item) = table.optional(RESTARTED.name) else { return Ok(None) };
+    Ok(Some((item.spot.clone(), read_number(&item, encoding)?)))
 }
 
 /// A number that the field can have.

@@ -157,7 +157,9 @@ fn read_exchange(table: &Reader<'_>, names: &[Option<String>]) -> Result<FileExc
     }
     let overdue = exchanges::read_overdue(table, "overdue_ms")?;
     timing.check_asked(table)?;
-    let spots = exchanges::spots(table, &[("slave", ExchangeKey::Peer), ("address", ExchangeKey::Registers)]);
+    let mut spots =
+        exchanges::spots(table, &[("slave", ExchangeKey::Peer), ("address", ExchangeKey::Registers)]);
+    let restarted = exchanges::restarted(table, read.as_ref().map(|list| &list.part), &mut spots)?;
     Ok(FileExchange {
         spot: table.spot.clone(),
         spots,
@@ -165,10 +167,12 @@ fn read_exchange(table: &Reader<'_>, names: &[Option<String>]) -> Result<FileExc
         kind: ExchangeKind::Master(operation),
         output: write.map(|list| list.part),
         input: read.map(|list| list.part),
+        pending: None,
         refusal: None,
         is_can: false,
         remote: false,
         overdue,
+        restarted,
         timing,
     })
 }
@@ -198,6 +202,7 @@ fn read_block(table: &Reader<'_>, peer: u8) -> Result<FileExchange> {
         Direction::Output => check(table, &operation, &list, &None)?,
     }
     let part = list.map(|list| list.part);
+    exchanges::refuse_restarted(table, part.as_ref())?;
     let (input, output) = if direction == Direction::Input { (part, None) } else { (None, part) };
     Ok(FileExchange {
         spot: table.spot.clone(),
@@ -206,10 +211,12 @@ fn read_block(table: &Reader<'_>, peer: u8) -> Result<FileExchange> {
         kind: ExchangeKind::Slave(operation),
         output,
         input,
+        pending: None,
         refusal: None,
         is_can: false,
         remote: false,
         overdue: None,
+        restarted: None,
         timing: AskTiming::NEVER,
     })
 }

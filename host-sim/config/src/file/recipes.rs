@@ -112,6 +112,8 @@ pub(super) enum FileFieldKind {
         written: Written,
         to: FileInput,
         again: bool,
+        /// The number that tells that the device has restarted.
+        restarted: Option<(Spot, f64)>,
     },
     UserOutput {
         name: String,
@@ -400,6 +402,7 @@ fn read_part(item: &Item<'_>, rules: Rules, is_can: bool, flavour: Flavour) -> R
         let (id, order) = (CanId::Standard(0), FrameOrder::default());
         part.frames.push(FileFrame { spot: spot.clone(), id, id_spot: spot, fields, order });
     }
+    exchanges::refuse_restarted(&table, Some(&part))?;
     Ok(part)
 }
 

@@ -117,7 +117,14 @@ const fn reply(table: &'static Table) -> Key {
 const fn refusal(table: &'static Table) -> Key {
     Key::new("refusal", Shape::Table(table))
         .beside(&["reply"])
-        .tells("what the device sends if it refuses the request; its fields have no `to` and no `commands`")
+        .tells("the frame with which the device refuses the request")
+}
+
+const fn pending(table: &'static Table) -> Key {
+    Key::new("pending", Shape::Table(table)).beside(&["reply"]).tells(
+        "the frame with which the device says that it is at it, and that its answer follows: the wait for it begins anew, up \
+         to 16 times `timeout_ms` behind the request",
+    )
 }
 
 /// A remote frame of CAN.
@@ -138,18 +145,29 @@ const fn frame(name: &'static str, keys: &'static [Key]) -> Table {
 }
 
 /// The frames of an exchange.
-pub(crate) const FRAMES: &[Key] = &[request(&STREAM_REQUEST), reply(&STREAM_REPLY), refusal(&STREAM_REFUSAL)];
+pub(crate) const FRAMES: &[Key] =
+    &[request(&STREAM_REQUEST), reply(&STREAM_REPLY), pending(&STREAM_REFUSAL), refusal(&STREAM_REFUSAL)];
 
 /// An exchange of frames on a line.
-pub const OF_STREAM: Table =
-    Table::of("exchange", &[PEER, request(&STREAM_REQUEST), reply(&STREAM_REPLY), refusal(&STREAM_REFUSAL)])
-        .at(" of an exchange")
-        .cases(&[Case { when: &[], keys: &[TIMING_OF_FRAMES] }]);
+pub const OF_STREAM: Table = Table::of(
+    "exchange",
+    &[
+        PEER,
+        request(&STREAM_REQUEST),
+        reply(&STREAM_REPLY),
+        pending(&STREAM_REFUSAL),
+        refusal(&STREAM_REFUSAL),
+    ],
+)
+.at(" of an exchange")
+.cases(&[Case { when: &[], keys: &[TIMING_OF_FRAMES] }]);
 /// An exchange of frames on CAN.
-pub const OF_CAN: Table =
-    Table::of("exchange on CAN", &[PEER, request(&CAN_REQUEST), reply(&CAN_REPLY), refusal(&CAN_REFUSAL)])
-        .at(" of an exchange")
-        .cases(&[Case { when: &[], keys: &[TIMING_OF_FRAMES] }]);
+pub const OF_CAN: Table = Table::of(
+    "exchange on CAN",
+    &[PEER, request(&CAN_REQUEST), reply(&CAN_REPLY), pending(&CAN_REFUSAL), refusal(&CAN_REFUSAL)],
+)
+.at(" of an exchange")
+.cases(&[Case { when: &[], keys: &[TIMING_OF_FRAMES] }]);
 
 /// The slave that is asked.
 pub const SLAVE: Key = Key::integer("slave", 0, 255)

@@ -118,6 +118,11 @@ pub const POINT: Key = Key::words("point", words!(POINTS))
     .or_word(".")
     .beside(&["to"])
     .tells("of `decimal`, input: `\",\"` if the digits have a comma where others have `\".\"`");
+/// What tells that the device has restarted.
+pub const RESTARTED: Key = Key::new("restarted", Shape::Number(Limits::Any)).absent("none").tells(
+    "input, in the reply of an exchange: when the field becomes this number, and was another one in the reply before, the \
+     device has restarted: what is asked at its start is asked again. It needs no `to`",
+);
 pub(crate) const RULES_IN: &[Key] = &[AS, MIN_IN, MAX_IN, OUTSIDE_IN, MAP_IN, NO_VALUE, VALID_TO, POINT];
 /// A constant that is received.
 pub const EQUALS: Key = Key::integer("equals", i32::MIN as i64, u32::MAX as i64)
@@ -243,7 +248,7 @@ pub(crate) const WRITTEN: &[Key] =
 /// What an input field is for.
 pub(crate) const BOUND_IN: &[Key] = &[
     TO, COMMANDS, WHEN, BASE, IDLE, SCALE_IN, OFFSET_IN, EQUALS, COUNTER, AS, MIN_IN, MAX_IN, OUTSIDE_IN,
-    MAP_IN, NO_VALUE, VALID_TO, POINT,
+    MAP_IN, NO_VALUE, VALID_TO, POINT, RESTARTED,
 ];
 /// What an output field is for.
 pub(crate) const BOUND_OUT: &[Key] =
@@ -316,7 +321,7 @@ pub const INPUT: Table = Table::of("input field", &[]).at(" in an input field").
     Case { when: IS_LENGTH, keys: &[LENGTHS, WRITTEN] },
     Case { when: IS_TEXT, keys: &[CONSTANT_TEXT] },
     Case { when: IS_CONSTANT, keys: &[CONSTANT, WRITTEN] },
-    Case { when: &[], keys: &[NAMED, VALUE_IN, RULES_IN, &[OVERFLOW_IN], WRITTEN] },
+    Case { when: &[], keys: &[NAMED, VALUE_IN, RULES_IN, &[OVERFLOW_IN, RESTARTED], WRITTEN] },
 ]);
 const VALUE_IN: &[Key] = &[TO, COMMANDS, WHEN, BASE, IDLE, SCALE_IN, OFFSET_IN, COUNTER];
 const OVERFLOW_IN: Key = OVERFLOW.beside(&["to"]);
@@ -336,7 +341,7 @@ const OVERFLOW_OUT: Key = OVERFLOW.beside(&["from"]);
 pub const COIL_IN: Table = Table::of("coil that is read", &[]).at(" of a coil").cases(&[
     Case { when: IS_PAD, keys: &[COIL_PADDING] },
     Case { when: IS_CONSTANT, keys: &[&[NAME_IF_ANY, EQUALS]] },
-    Case { when: &[], keys: &[COIL, VALUE_IN, RULES_IN] },
+    Case { when: &[], keys: &[COIL, VALUE_IN, RULES_IN, &[RESTARTED]] },
 ]);
 
 /// A coil that is sent.

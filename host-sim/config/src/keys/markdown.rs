@@ -45,7 +45,7 @@ pub const DOCUMENTED: &[(&str, &[&[Key]])] = &[
         &[
             &[field::NAME, field::TYPE],
             field::WRITTEN,
-            &[field::OVERFLOW, field::EQUALS, field::COUNTER],
+            &[field::OVERFLOW, field::EQUALS, field::COUNTER, field::RESTARTED],
             field::PADDING,
             field::CONSTANT_TEXT,
         ],

@@ -1,6 +1,7 @@
 //! Configuration files as people write them: the examples, those of the documents, wrong and damaged ones.
 
 mod advice;
+mod answer_files;
 mod bits;
 mod counter_files;
 mod damaged_files;

@@ -121,7 +121,7 @@ const CASES: &[Case] = &[
     line("a period without a request", "[[recipe.exchange]]\nreply", "[[recipe.exchange]]\nevery_ms = 10\nreply"),
     line("a timeout without a reply", "pause_ms = 10", "timeout_ms = 10"),
     line("a refusal without a reply", "pause_ms = 10", "refusal = { head = [7], fields = [{ pad = 1 }] }"),
-    line("a refusal that sets a variable", "{ name = \"code\", type = \"byte\" }", "{ name = \"code\", type = \"byte\", to = \"WordInputReg[20]\" }"),
+    line("a refusal that picks a command", "{ name = \"code\", type = \"byte\" }", "{ name = \"code\", type = \"byte\", commands = { 1 = \"stop\" } }"),
     line("a frame that is no table", "reply = { head = [0xFE], fields = [{ name = \"event\", type = \"byte\", to = \"WordInputReg[12]\" }] }", "reply = \"OK\""),
     line("an unknown key of a request", "request = { head = [2]", "request = { haed = [2]"),
     line("a key of CAN in a stream's request", "request = { head = [2]", "request = { id = 2, head = [2]"),

@@ -232,7 +232,7 @@ function fields(part: Keys, side: "input" | "output", isRealtime: boolean, pools
 /** Everything in a recipe that is counted from the beginning of a list, moved. */
 export function moved(value: Value, by: Record<"fields" | "commands" | "exchanges" | "frames", number>, port: (nth: number) => number, key = ""): Value {
     if (Array.isArray(value)) return value.map((one) => moved(one, by, port, key));
-    if (typeof value === "number") return ["request", "reply", "refusal"].includes(key) ? value + by.frames : ["port", "Listening"].includes(key) ? port(value) : value;
+    if (typeof value === "number") return ["request", "reply", "pending", "refusal"].includes(key) ? value + by.frames : ["port", "Listening"].includes(key) ? port(value) : value;
     if (typeof value !== "object" || value === null) return value;
     const { start, len } = value as unknown as Span;
     // An empty list is at 0, nowhere, or where one would begin; that of exchanges always is.

@@ -147,7 +147,7 @@ function packed(config: Struct, nth: number, lists: Lists): Table {
     };
     const walk = (value: Value, key: string) => {
         if (Array.isArray(value)) for (const one of value) walk(one, key);
-        else if (typeof value === "number" && ["request", "reply", "refusal"].includes(key)) see("frames", { start: value, len: 1 });
+        else if (typeof value === "number" && ["request", "reply", "pending", "refusal"].includes(key)) see("frames", { start: value, len: 1 });
         else if (typeof value === "object" && value !== null) {
             if (isSpan(value)) see(key === "table" ? "commands" : key === "exchanges" ? "exchanges" : "fields", value as unknown as Span);
             else for (const [name, one] of Object.entries(value)) walk(one, name);

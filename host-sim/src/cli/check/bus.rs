@@ -287,8 +287,10 @@ fn received(config: &GatewayConfig, port: &Port) -> impl Iterator<Item = CanId> 
     let exchanges = recipe.map_or(&[][..], |recipe| config.view().exchanges_of(recipe));
     let replies = exchanges.iter().flat_map(|exchange| match exchange.talk {
         // A remote request has the id of its reply.
-        Talk::Frames { request, reply, refusal } if !is_remote(config, request) => [reply, refusal],
-        _ => [None, None],
+        Talk::Frames { request, reply, pending, refusal } if !is_remote(config, request) => {
+            [reply, pending, refusal]
+        }
+        _ => [None; 3],
     });
     let replies = replies.flatten().filter_map(|nth| config.frames.get(usize::from(nth))?.id);
     input.iter().map(|frame| frame.id).chain(replies)

@@ -144,7 +144,7 @@ impl TalkSpec {
                     }
                     row.begin(&operation);
                 }
-                Talk::Frames { request, reply, refusal } => {
+                Talk::Frames { request, reply, refusal, .. } => {
                     let frame = |nth: Option<u8>| frame_of(config, nth?);
                     let request = frame(request);
                     let remote =
@@ -495,6 +495,23 @@ pub(in crate::oracle) fn unmodelled(config: &GatewayConfig) -> Option<&'static s
             own.when.rising.is_some() && exchanges[..nth].iter().any(is_same)
         })
     };
+    let has_values = |exchange: &Exchange| match exchange.talk {
+        Talk::Frames { refusal: Some(refusal), .. } => {
+            let fields = config.frames.get(usize::from(refusal)).map(|frame| frame.fields.of(&config.fields));
+            fields.is_some_and(|fields| fields.iter().any(FieldSpec::has_value))
+        }
+        _ => false,
+    };
+    let is_more = |exchange: &Exchange| {
+        matches!(exchange.talk, Talk::Frames { pending: Some(_), .. })
+            || exchange.restarted.is_some()
+            || has_values(exchange)
+    };
+    if config.exchanges.iter().any(is_more) {
+        return Some(
+            "a soak cannot judge pending answers, values in refusals and numbers that tell of a restart",
+        );
+    }
     if config.exchanges.iter().any(is_dialogue) || config.recipes.iter().any(is_step) {
         return Some(
             "a soak cannot judge stops, dialogues, outcomes and events that are states as well of other cells \

@@ -31,6 +31,7 @@ impl Builder<'_> {
                 follow: timing.follow,
                 overdue: exchange.overdue,
                 outcome: timing.outcome,
+                restarted: exchange.restarted,
                 ..Exchange::new(exchange.peer, talk, timing.when)
             };
             if self.config.exchanges.push(added.repeated(timing.retries)).is_err() {
@@ -61,14 +62,23 @@ impl Builder<'_> {
                 return Ok(Talk::Served { operation, written: fields(input), read: fields(output) });
             }
         }
-        // Nothing of a refusal has a place of its own in later checks.
-        let mut refusals = u8::MAX;
-        let refusal = self.frame_fields(recipe, Direction::Input, from.refusal.as_ref(), &mut refusals)?;
+        let pending = self.other_fields(recipe, from.pending.as_ref(), inputs)?;
+        let refusal = self.other_fields(recipe, from.refusal.as_ref(), inputs)?;
         Ok(Talk::Frames {
             request: self.add_frame(from, from.output.as_ref(), output, from.remote)?,
             reply: self.add_frame(from, from.input.as_ref(), input, false)?,
+            pending: self.add_frame(from, from.pending.as_ref(), pending, false)?,
             refusal: self.add_frame(from, from.refusal.as_ref(), refusal, false)?,
         })
+    }
+
+    /// The fields of a pending answer or a refusal. Without values, nothing of it has a place of its own in later
+    /// checks.
+    fn other_fields(&mut self, recipe: u8, file: Option<&FilePart>, next: &mut u8) -> Result<Option<Span>> {
+        let has_values = |file: &FilePart| file.fields().iter().any(|field| field.spec().has_value());
+        let mut none = u8::MAX;
+        let number = if file.is_some_and(has_values) { next } else { &mut none };
+        self.frame_fields(recipe, Direction::Input, file, number)
     }
 
     /// The fields of a frame, which takes the next number.
