@@ -187,10 +187,10 @@ fn mistakes_in_frames_have_their_place() {
          a constant is needed"
     );
     let mut config = with(&[ask]).unwrap();
-    config.exchanges[0].talk = Talk::Frames { request: Some(7), reply: None, pending: None, refusal: None };
+    config.exchanges[0].talk = Talk::Frames { request: Some(7), reply: None, refusal: None };
     let error = config.validate().unwrap_err();
     assert_eq!(error.kind, ConfigErrorKind::OutsidePool { end: 8, len: 1 });
-    config.exchanges[0].talk = Talk::Frames { request: None, reply: None, pending: None, refusal: None };
+    config.exchanges[0].talk = Talk::Frames { request: None, reply: None, refusal: None };
     assert_eq!(config.validate().unwrap_err().kind, ConfigErrorKind::Exchange(ExchangeError::Nothing));
 }
 
@@ -212,8 +212,8 @@ fn several_answers_are_told_apart() {
         AskFrame::can(CanId::Standard(0x201), fields)
     }
     let config = with(&[ask.reply(answer(&done)).pending(answer(&plain)).refusal(answer(&code))]).unwrap();
-    let Talk::Frames { reply, pending, refusal, .. } = config.exchanges[0].talk else { panic!() };
-    assert_eq!((reply, pending, refusal), (Some(1), Some(2), Some(3)));
+    let Talk::Frames { reply, refusal, .. } = config.exchanges[0].talk else { panic!() };
+    assert_eq!((reply, config.exchanges[0].pending, refusal), (Some(1), Some(2), Some(3)));
     // A mistake in any of them has its place: they are counted if they have values.
     let wrong = [InputField::constant(Byte, 5), InputField::variable(Byte, "WordOutputReg[1]")];
     let place = |frame| Place::Field { recipe: 0, part: Direction::Input, frame, field: 1 };
@@ -227,8 +227,8 @@ fn several_answers_are_told_apart() {
     let unasked = Ask::unasked(AskFrame::stream(b"E", &[], &unasked));
     let second = Place::Field { recipe: 0, part: Direction::Input, frame: 3, field: 0 };
     assert_eq!(at(&[both.pending(answer(&four)).refusal(answer(&code)), unasked]), second);
-    let hidden = "every such frame is another answer to the request as well, which is looked for first (the reply, then \
-                  pending, then refusal) or is shorter; give that one a constant that this one does not have";
+    let hidden = "every such frame is another answer as well, which is looked for first (reply, pending, refusal) or is \
+                  shorter; give that one a constant that this one does not have";
     assert_refused_at(&[ask.reply(answer(&code)).pending(answer(&plain))], "pending", hidden);
     assert_refused_at(&[ask.reply(answer(&done)).refusal(answer(&done))], "refusal", hidden);
     // A shorter frame without a constant is the beginning of each longer one.
@@ -243,7 +243,7 @@ fn several_answers_are_told_apart() {
     assert_refused_at(
         &[ask.reply(answer(&done)).pending(AskFrame::stream(b"G", &[], &echo))],
         "pending",
-        "it may have the bytes of its request, so an echo would be taken for it; give it another constant",
+        "it may have the bytes of its request, as an echo has; give it another constant",
     );
     let stops = [InputField::commands(Byte, &[(1, "stop")]), InputField::padding(1)];
     assert_refused_at(
@@ -277,8 +277,8 @@ fn a_restart_is_told_by_a_number_of_a_reply() {
     refused(read(3, 7.0), "field 4 of the reply is no number");
     refused(read(1, 65_536.0), "the field cannot be 65536; allowed: 0..=65535");
     refused(read(1, 0.5), "0.5 has a fraction; this field has integers only");
-    let nothing = "a restart means that what is asked at the start is asked again; allowed in the reply of an exchange, \
-                   if one of the device has \"start\" in on";
+    let nothing =
+        "allowed in the reply of an exchange, if one of its device has \"start\" in on, which is asked again";
     refused(Ask::read_holding_registers(8, 0, &fields).every(ms(100)).restarted(1, 0.0), nothing);
     refused(Ask::write_registers(9, 5, &value).every(ms(100)).restarted(1, 0.0), nothing);
 }

@@ -201,8 +201,8 @@ fn a_port_hears_the_ids_of_its_exchanges() {
     let reply = frame(0x581, vec![fixed(0x43), input(T::Byte, to("WordInputReg[2]"))]);
     let refusal = frame(0x581, vec![fixed(0x80), input(T::Byte, InputBinding::Unused)]);
     let heartbeat = frame(0x701, vec![input(T::Byte, to("WordInputReg[3]"))]);
-    let asked = Talk::Frames { request, reply, pending: None, refusal };
-    let unasked = Talk::Frames { request: None, reply: heartbeat, pending: None, refusal: None };
+    let asked = Talk::Frames { request, reply, refusal };
+    let unasked = Talk::Frames { request: None, reply: heartbeat, refusal: None };
     cell.0.exchanges.push(Exchange::new(0, asked, AskWhen::every(MS(100)))).unwrap();
     cell.0.exchanges.push(Exchange::new(0, unasked, AskWhen::NEVER)).unwrap();
     cell.last_recipe().exchanges = Span { start: 0, len: 2 };
@@ -212,7 +212,7 @@ fn a_port_hears_the_ids_of_its_exchanges() {
     let standard = |ids: &[u16]| ids.iter().map(|&id| CanId::Standard(id)).collect::<Vec<_>>();
     assert_eq!(ids(Direction::Input), standard(&[0x181, 0x581, 0x701]));
     assert_eq!(ids(Direction::Output), standard(&[0x601]));
-    // A refusal that is not told from the reply is refused, and so is a reply from what comes unasked.
+    // A refusal that is always taken for the reply is refused, and so is a reply that is not told from what comes unasked.
     let refused = |cell: &Cell| match cell.0.validate() {
         Err(ConfigError { place: Place::Exchange { exchange, key, .. }, kind }) => (exchange, key, kind),
         other => panic!("{other:?}"),
@@ -221,7 +221,8 @@ fn a_port_hears_the_ids_of_its_exchanges() {
     let mut same = Cell(cell.0.clone());
     let fields = same.fields([fixed(0x43), input(T::Byte, InputBinding::Unused)]);
     same.0.frames[usize::from(refusal.unwrap())].fields = fields;
-    assert_eq!(refused(&same), (0, ExchangeKey::Refusal, kind(0x581)));
+    let hidden = ConfigErrorKind::Exchange(ExchangeError::Hidden);
+    assert_eq!(refused(&same), (0, ExchangeKey::Refusal, hidden));
     let mut unasked = cell;
     unasked.0.frames[usize::from(heartbeat.unwrap())].id = Some(CanId::Standard(0x581));
     assert_eq!(refused(&unasked), (1, ExchangeKey::Reply, kind(0x581)));
@@ -472,7 +473,7 @@ fn a_request_on_can_may_be_without_data() {
     let fields = cell.fields([]);
     let (id, head, tail) = (Some(CanId::Standard(0x80)), Delimiter::new(), Delimiter::new());
     cell.0.frames.push(FrameSpec { id, remote: false, head, tail, fields }).unwrap();
-    let sync = Talk::Frames { request: Some(0), reply: None, pending: None, refusal: None };
+    let sync = Talk::Frames { request: Some(0), reply: None, refusal: None };
     cell.0.exchanges.push(Exchange::new(0, sync, AskWhen::every(MS(20)))).unwrap();
     cell.last_recipe().exchanges = Span { start: 0, len: 1 };
     let mut rig = cell.rig();

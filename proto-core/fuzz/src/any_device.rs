@@ -447,8 +447,8 @@ fn frames(
             }
         }
     }
-    let talk = Talk::Frames { request, reply, pending, refusal };
-    let mut exchange = exchange(input, kind >> 6, talk, when);
+    let talk = Talk::Frames { request, reply, refusal };
+    let mut exchange = Exchange { pending, ..exchange(input, kind >> 6, talk, when) };
     let restarted = input.u8();
     if restarted & 3 == 0 {
         exchange.restarted = Some(Restarted { field: restarted >> 6, value: f64::from(restarted >> 2 & 15) });

@@ -55,8 +55,8 @@ pub(crate) fn bytes(
     }
     let exchange = exchanges.get(usize::from(which >> 1) % exchanges.len().max(1))?;
     let frame = match exchange.talk {
-        Talk::Frames { reply, pending, refusal, .. } => {
-            let nth = answer(which, [reply, pending, refusal]);
+        Talk::Frames { reply, refusal, .. } => {
+            let nth = answer(which, [reply, exchange.pending, refusal]);
             let spec = config.frames.get(usize::from(nth?))?;
             own_frame(config, spec, Carrier::Stream, input)?
         }
@@ -72,8 +72,8 @@ pub(crate) fn can(config: &GatewayConfig, port: usize, input: &mut Source<'_>) -
     let which = input.u8();
     let exchanges = exchanges(config, port);
     let exchange = exchanges.get(usize::from(which >> 1) % exchanges.len().max(1))?;
-    let Talk::Frames { reply, pending, refusal, .. } = exchange.talk else { return None };
-    let nth = answer(which, [reply, pending, refusal]);
+    let Talk::Frames { reply, refusal, .. } = exchange.talk else { return None };
+    let nth = answer(which, [reply, exchange.pending, refusal]);
     let spec = config.frames.get(usize::from(nth?))?;
     CanFrame::new(spec.id?, &own_frame(config, spec, Carrier::Can, input)?)
 }

@@ -43,7 +43,7 @@ impl ConfigMut<'_> {
         let start = self.exchanges.len();
         for (nth, ask) in asks.iter().enumerate() {
             let at = |key| Place::Exchange { recipe, exchange: nth as u8, key };
-            let talk = self.talk(recipe, ask, &at, &mut frames)?;
+            let (talk, pending) = self.talk(recipe, ask, &at, &mut frames)?;
             let mut when = AskWhen { rising: None, ..ask.when };
             if let Some((var, bit)) = ask.rising {
                 let place = at(ExchangeKey::Rising);
@@ -66,6 +66,7 @@ impl ConfigMut<'_> {
                 follow,
                 overdue,
                 outcome,
+                pending,
                 restarted,
                 ..Exchange::new(peer, talk, when)
             };
@@ -80,7 +81,7 @@ impl ConfigMut<'_> {
         ask: &Ask<'_>,
         at: &impl Fn(ExchangeKey) -> Place,
         frames: &mut FrameNumbers,
-    ) -> Result<Talk, ConfigError> {
+    ) -> Result<(Talk, Option<u8>), ConfigError> {
         let refused = |kind| ConfigError { place: at(ExchangeKey::Registers), kind };
         match &ask.talk {
             AskTalk::Rtu { operation, written, read } => {
@@ -94,7 +95,8 @@ impl ConfigMut<'_> {
                 };
                 let (written, write_count) = add(written, Direction::Output)?;
                 let (read, read_count) = add(read, Direction::Input)?;
-                Ok(Talk::Rtu { operation: with_counts(*operation, read_count, write_count), written, read })
+                let operation = with_counts(*operation, read_count, write_count);
+                Ok((Talk::Rtu { operation, written, read }, None))
             }
             &AskTalk::Served { table, address, fields } => {
                 let part = match fields {
@@ -110,7 +112,7 @@ impl ConfigMut<'_> {
                 let operation = with_counts(of_block(table, address, part), count, count);
                 let none = Span::default();
                 let (written, read) = if part == Direction::Input { (span, none) } else { (none, span) };
-                Ok(Talk::Served { operation, written, read })
+                Ok((Talk::Served { operation, written, read }, None))
             }
             AskTalk::Frames(of) => {
                 let keys = [
@@ -131,7 +133,7 @@ impl ConfigMut<'_> {
                     *added = Some(index);
                 }
                 let [request, reply, pending, refusal] = added;
-                Ok(Talk::Frames { request, reply, pending, refusal })
+                Ok((Talk::Frames { request, reply, refusal }, pending))
             }
         }
     }

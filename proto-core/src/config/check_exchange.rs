@@ -203,15 +203,14 @@ impl fmt::Display for ExchangeError {
                 f.write_str("the fields of a pending answer and of a refusal have no commands and no counter")
             }
             Self::Hidden => f.write_str(
-                "every such frame is another answer to the request as well, which is looked for first (the reply, then \
-                 pending, then refusal) or is shorter; give that one a constant that this one does not have",
+                "every such frame is another answer as well, which is looked for first (reply, pending, refusal) or is \
+                 shorter; give that one a constant that this one does not have",
             ),
             Self::PendingEcho => f.write_str(
-                "it may have the bytes of its request, so an echo would be taken for it; give it another constant",
+                "it may have the bytes of its request, as an echo has; give it another constant",
             ),
             Self::RestartedNothing => f.write_str(
-                "a restart means that what is asked at the start is asked again; allowed in the reply of an exchange, \
-                 if one of the device has \"start\" in on",
+                "allowed in the reply of an exchange, if one of its device has \"start\" in on, which is asked again",
             ),
             Self::RestartedField { field } => {
                 write!(f, "field {} of the reply is no number", u16::from(*field).saturating_add(1))
@@ -357,9 +356,9 @@ impl<'a> ExchangeCheck<'a> {
     /// Whether the frames that the exchange takes are told from all others that can come while they are
     /// awaited: those of one exchange, and those that come unasked.
     fn check_ids(&self, nth: u8, exchange: &Exchange) -> Check {
-        let Talk::Frames { request, reply, pending, refusal } = exchange.talk else { return Ok(()) };
+        let Talk::Frames { request, reply, refusal } = exchange.talk else { return Ok(()) };
         let spec = |index: u8| self.config.frames.get(usize::from(index));
-        let answers = [(Key::Reply, reply), (Key::Pending, pending), (Key::Refusal, refusal)];
+        let answers = [(Key::Reply, reply), (Key::Pending, exchange.pending), (Key::Refusal, refusal)];
         for (place, (key, own)) in answers.into_iter().enumerate() {
             let Some(own) = own.and_then(spec) else { continue };
             let mut others = answers.into_iter().enumerate().filter(|(other, _)| *other != place);
@@ -453,8 +452,8 @@ impl<'a> ExchangeCheck<'a> {
                     }
                 }
             }
-            Talk::Frames { request, reply, pending, refusal } => {
-                self.check_frames(nth, is_never, [request, reply, pending, refusal])
+            Talk::Frames { request, reply, refusal } => {
+                self.check_frames(nth, is_never, [request, reply, exchange.pending, refusal])
             }
         }
     }
@@ -484,7 +483,7 @@ impl<'a> ExchangeCheck<'a> {
             let layout = match DeviceFrame::new(Carrier::Whole, part, (&[], &[]), fields) {
                 Ok(frame) => frame.layout,
                 Err(error) => {
-                    let place = self.place_of(nth, Key::Reply, part, fields, error);
+                    let place = self.place_of(nth, part, fields, error);
                     return fail(place, Kind::Layout(error));
                 }
             };
@@ -551,7 +550,7 @@ impl<'a> ExchangeCheck<'a> {
         match frame.layout(self.config, part) {
             Ok(_) => Ok(()),
             Err(error) if is_other && !has_values(fields) => fail(place, Kind::Layout(error)),
-            Err(error) => fail(self.place_of(nth, key, part, fields, error), Kind::Layout(error)),
+            Err(error) => fail(self.place_of(nth, part, fields, error), Kind::Layout(error)),
         }
     }
 
@@ -574,33 +573,22 @@ impl<'a> ExchangeCheck<'a> {
     }
 
     /// The place of a mistake in a frame of an exchange that is counted in this part.
-    fn place_of(
-        &self,
-        nth: u8,
-        key: Key,
-        part: Direction,
-        fields: &[FieldSpec],
-        error: LayoutError,
-    ) -> Place {
+    fn place_of(&self, nth: u8, part: Direction, fields: &[FieldSpec], error: LayoutError) -> Place {
         let recipe = self.index;
-        let others = |exchange: &Exchange| match part {
-            Direction::Input => exchange.other_answers(self.config.frames, self.config.fields),
-            Direction::Output => [None; 2],
+        let exchange = self.config.exchanges_of(self.recipe).get(usize::from(nth));
+        let mut walk = self.config.frames_of(self.recipe, part);
+        // The frame of this exchange that has these fields.
+        let is_it = |of: Option<(&Exchange, bool)>, span: Span| {
+            let own = exchange.zip(of).is_some_and(|(own, (other, _))| core::ptr::eq(own, other));
+            own && core::ptr::eq(span.of(self.config.fields), fields)
         };
-        let count = |exchange: &Exchange| {
-            let own = exchange.fields(self.config.frames, part);
-            [own].into_iter().chain(others(exchange)).flatten().count()
-        };
-        let exchanges = self.config.exchanges_of(self.recipe);
-        let before = exchanges.iter().take(usize::from(nth)).map(count).fold(0, usize::saturating_add);
-        let own = exchanges.get(usize::from(nth));
-        let within = match (key, own.map(others)) {
-            (Key::Pending, _) | (Key::Refusal, Some([None, _])) => 1,
-            (Key::Refusal, _) => 2,
-            _ => 0,
-        };
-        let before = before.saturating_add(within);
-        let frame = self.recipe.part_frames(part).count().saturating_add(before) as u8;
+        let mut frame = 0;
+        while let Some((count, span)) = walk.next() {
+            frame = count;
+            if is_it(walk.exchange(), span) {
+                break;
+            }
+        }
         match super::device::field_of(fields, error) {
             Some(field) => Place::Field { recipe, part, frame, field },
             None => Place::Frame { recipe, part, frame },

@@ -48,6 +48,9 @@ pub struct Exchange {
     pub overdue: Option<Duration>,
     /// The variables that tell the robot what became of its events.
     pub outcome: OutcomeTo,
+    /// The frame of a device's own that says that it is at it and that its answer follows, as an index into
+    /// [`GatewayConfig::frames`](super::GatewayConfig::frames).
+    pub pending: Option<u8>,
     /// What in its reply tells that the peer has restarted.
     pub restarted: Option<Restarted>,
 }
@@ -130,8 +133,6 @@ pub enum Talk {
         request: Option<u8>,
         /// What answers it; without one, sending it is all.
         reply: Option<u8>,
-        /// What the device sends while it is at it, before its answer.
-        pending: Option<u8>,
         /// What the device sends if it refuses the request.
         refusal: Option<u8>,
     },
@@ -207,6 +208,7 @@ impl Exchange {
             follow: None,
             overdue: None,
             outcome: OutcomeTo::NONE,
+            pending: None,
             restarted: None,
         }
     }
@@ -261,13 +263,20 @@ impl Exchange {
 
     /// Its frames of a device's own that come from the device (input): a reply, a pending answer, a refusal; or that go
     /// to it (output).
-    pub(crate) fn frames(&self, part: Direction) -> impl Iterator<Item = u8> + use<> {
-        let frames = match (self.talk, part) {
-            (Talk::Frames { reply, pending, refusal, .. }, Direction::Input) => [reply, pending, refusal],
-            (Talk::Frames { request, .. }, Direction::Output) => [request, None, None],
-            _ => [None; 3],
-        };
-        frames.into_iter().flatten()
+    pub(crate) fn frames(&self, part: Direction) -> impl Iterator<Item = u8> + use<'_> {
+        (0..3).filter_map(move |nth| self.frame(part, nth))
+    }
+
+    #[inline(never)]
+    fn frame(&self, part: Direction, nth: u8) -> Option<u8> {
+        let Talk::Frames { request, reply, refusal } = self.talk else { return None };
+        match (part, nth) {
+            (Direction::Input, 0) => reply,
+            (Direction::Input, 1) => self.pending,
+            (Direction::Input, 2) => refusal,
+            (Direction::Output, 0) => request,
+            _ => None,
+        }
     }
 
     /// The fields that come from the device (input) with a reply, or go to it (output); `None` if it has no such frame.
@@ -288,11 +297,11 @@ impl Exchange {
     /// The fields of its pending answer and of its refusal, where they have values: these are input frames like a reply.
     /// The others only tell what they are.
     pub(crate) fn other_answers(&self, frames: &[FrameSpec], pool: &[FieldSpec]) -> [Option<Span>; 2] {
-        let Talk::Frames { pending, refusal, .. } = self.talk else { return [None; 2] };
-        [pending, refusal].map(|nth| {
-            let span = frames.get(usize::from(nth?))?.fields;
+        let span = |nth| {
+            let span = frames.get(usize::from(self.frame(Direction::Input, nth)?))?.fields;
             has_values(span.of(pool)).then_some(span)
-        })
+        };
+        [span(1), span(2)]
     }
 }
 
@@ -312,7 +321,8 @@ impl<'c> ConfigView<'c> {
     pub(crate) fn frames_of(self, recipe: &'c Recipe, part: Direction) -> Frames<'c> {
         let exchanges = self.exchanges_of(recipe).iter();
         let (frames, pool) = (self.frames, self.fields);
-        Frames { parts: recipe.part_frames(part), exchanges, others: [None; 2], frames, pool, part, count: 0 }
+        let (of, others) = (None, [None; 2]);
+        Frames { parts: recipe.part_frames(part), exchanges, of, others, frames, pool, part, count: 0 }
     }
 
     /// Whether frames come from the device (input), or go to it (output).

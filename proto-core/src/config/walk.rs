@@ -29,7 +29,9 @@ impl Iterator for PartFrames<'_> {
 pub(crate) struct Frames<'c> {
     pub(super) parts: PartFrames<'c>,
     pub(super) exchanges: Iter<'c, Exchange>,
-    /// What is left of an exchange: its pending answer and its refusal.
+    /// The exchange that the newest frame is of, and whether the frame is its reply; `None` if it is of a part.
+    pub(super) of: Option<(&'c Exchange, bool)>,
+    /// What is left of that exchange: its pending answer and its refusal.
     pub(super) others: [Option<Span>; 2],
     pub(super) frames: &'c [FrameSpec],
     pub(super) pool: &'c [FieldSpec],
@@ -48,19 +50,27 @@ impl Iterator for Frames<'_> {
     }
 }
 
-impl Frames<'_> {
+impl<'c> Frames<'c> {
+    /// The exchange that the newest frame is of, and whether the frame is its reply; `None` if it is of a part.
+    pub(crate) fn exchange(&self) -> Option<(&'c Exchange, bool)> {
+        self.of
+    }
+
     #[inline(never)]
     fn of_exchanges(&mut self) -> Option<Span> {
         if let Some(span) = self.others.iter_mut().find_map(Option::take) {
+            self.of = self.of.map(|(exchange, _)| (exchange, false));
             return Some(span);
         }
-        let Self { exchanges, others, frames, pool, part, .. } = self;
-        exchanges.find_map(|exchange| {
-            if *part == Direction::Input {
-                *others = exchange.other_answers(frames, pool);
+        for exchange in self.exchanges.by_ref() {
+            let Some(span) = exchange.fields(self.frames, self.part) else { continue };
+            self.of = Some((exchange, true));
+            if self.part == Direction::Input {
+                self.others = exchange.other_answers(self.frames, self.pool);
             }
-            exchange.fields(frames, *part)
-        })
+            return Some(span);
+        }
+        None
     }
 }
 

@@ -161,8 +161,8 @@ impl<'i> Awaited<'i> {
             return answer;
         }
         let late = self.outstanding().find_map(|(exchange, row, item)| {
-            let found = answers_of(item).find(|answer| is(answer));
-            let is_pending = found.is_some_and(|found| is_pending(item, found));
+            let found = place_of(item, &is);
+            let is_pending = found == Some(1);
             (found.is_some() || is_expected(row)).then_some(Heard::Late { exchange, is_pending })
         });
         match answer {
@@ -172,29 +172,36 @@ impl<'i> Awaited<'i> {
     }
 
     pub(super) fn answer(&self, is: impl Fn(&DeviceFormat) -> bool) -> Option<Heard<'i>> {
-        let found = self.answers().find(|answer| is(answer))?;
-        let item = self.asked()?;
-        let is_it = |other: &&OtherFormat| core::ptr::eq(&other.format, found);
-        if let Some(reply) = item.reply.as_ref().filter(|reply| core::ptr::eq(&reply.format, found)) {
-            return Some(Heard::Reply(Some(reply)));
+        let item = self.asked().filter(|_| !self.waits_for_echo())?;
+        match place_of(item, &is)? {
+            0 => Some(Heard::Reply(item.reply.as_ref())),
+            1 => item.pending.as_ref().map(Heard::Pending),
+            _ => Some(Heard::Refusal(item.refusal.as_ref())),
         }
-        let pending = item.pending.as_ref().filter(is_it).map(Heard::Pending);
-        pending.or_else(|| item.refusal.as_ref().map(|refusal| Heard::Refusal(Some(refusal))))
     }
+}
+
+/// Which of its answers a frame is, in their order.
+fn place_of(item: &Item, is: &impl Fn(&DeviceFormat) -> bool) -> Option<u8> {
+    (0..3).find(|nth| answer_of(item, *nth).is_some_and(is))
 }
 
 /// The answers of an exchange with frames of the device's own, in the order in which they are looked for: its reply, its
 /// pending answer, its refusal.
 pub(super) fn answers_of(item: &Item) -> impl Iterator<Item = &DeviceFormat> {
-    let item = Some(item).filter(|item| matches!(item.asks, Asks::Frame | Asks::Remote { .. }));
-    item.into_iter().flat_map(|item| {
-        let others = item.pending.iter().chain(&item.refusal).map(|other| &other.format);
-        item.reply.iter().map(|reply| &reply.format).chain(others)
-    })
+    (0..3_u8).filter_map(|nth| answer_of(item, nth))
 }
 
-fn is_pending(item: &Item, format: &DeviceFormat) -> bool {
-    item.pending.as_ref().is_some_and(|pending| core::ptr::eq(&pending.format, format))
+#[inline(never)]
+fn answer_of(item: &Item, nth: u8) -> Option<&DeviceFormat> {
+    if !matches!(item.asks, Asks::Frame | Asks::Remote { .. }) {
+        return None;
+    }
+    match nth {
+        0 => item.reply.as_ref().map(|reply| &reply.format),
+        1 => item.pending.as_ref().map(|pending| &pending.format),
+        _ => item.refusal.as_ref().map(|refusal| &refusal.format),
+    }
 }
 
 fn probe_reply(expected: &Expected, bytes: &[u8]) -> Probe {

@@ -241,18 +241,17 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             self.store.is_overdue_from_start();
         }
         let mut next_binding = self.bindings.inputs.len() as u16;
-        let parts = recipe.part_frames(Direction::Input).map(|_| (true, port.timeout));
-        let replies = config.exchanges_of(recipe).iter().flat_map(|exchange| {
-            let is_steady = exchange.when.every.is_some() || exchange.is_never();
-            let reply = exchange.fields(config.frames, Direction::Input);
-            let reply = reply.map(|_| (is_steady, exchange.overdue.unwrap_or(port.timeout)));
-            // These come only when something happens.
-            let [pending, refusal] = exchange.other_answers(config.frames, config.fields);
-            [reply, pending.map(|_| (false, Port::NEVER)), refusal.map(|_| (false, Port::NEVER))]
-        });
-        let replies = replies.flatten();
-        let frames = config.frames_of(recipe, Direction::Input).zip(parts.chain(replies));
-        for ((_, fields), (is_expected, timeout)) in frames {
+        let mut frames = config.frames_of(recipe, Direction::Input);
+        while let Some((_, fields)) = frames.next() {
+            let (is_expected, timeout) = match frames.exchange() {
+                None => (true, port.timeout),
+                Some((exchange, true)) => {
+                    let is_steady = exchange.when.every.is_some() || exchange.is_never();
+                    (is_steady, exchange.overdue.unwrap_or(port.timeout))
+                }
+                // A pending answer or a refusal comes only when something happens.
+                Some((_, false)) => (false, Port::NEVER),
+            };
             let fields = fields.of(config.fields);
             let whole: InputSet = fields.iter().flat_map(FieldSpec::variables).collect();
             let mut set = whole;

@@ -347,7 +347,7 @@ impl Formats<'_> {
                 item.request = self.data_out(read)?;
                 item.reply = self.data_in(written)?;
             }
-            Talk::Frames { request, reply, pending, refusal } => {
+            Talk::Frames { request, reply, refusal } => {
                 let config = self.config;
                 let frame = |nth: Option<u8>| config.frames.get(usize::from(nth?));
                 if let Some(request) = frame(request) {
@@ -365,7 +365,7 @@ impl Formats<'_> {
                 if let Some(reply) = frame(reply) {
                     item.reply = Some(self.reply_of(reply)?);
                 }
-                for (from, to) in [(pending, &mut item.pending), (refusal, &mut item.refusal)] {
+                for (from, to) in [(exchange.pending, &mut item.pending), (refusal, &mut item.refusal)] {
                     if let Some(spec) = frame(from) {
                         *to = Some(self.other_of(spec)?);
                     }

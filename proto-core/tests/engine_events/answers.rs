@@ -56,9 +56,9 @@ impl Device {
         let value = frame(&mut cell, None, b"V", vec![byte_to("WordInputReg[1]")]);
         let halt = frame(&mut cell, None, b"H", vec![fixed(7)]);
         let halted = frame(&mut cell, None, b"T", vec![fixed(0)]);
-        let talk = |request, reply| Talk::Frames { request, reply, pending: None, refusal: None };
-        let mut start =
-            Exchange::new(1, Talk::Frames { request: go, reply: done, pending, refusal }, rising(0));
+        let talk = |request, reply| Talk::Frames { request, reply, refusal: None };
+        let mut start = Exchange::new(1, Talk::Frames { request: go, reply: done, refusal }, rising(0));
+        start.pending = pending;
         start.late = Some(Duration::ZERO);
         start.outcome = OutcomeTo { to: Some(var("WordInputReg[2]")), ..OutcomeTo::NONE };
         change(&mut start);
@@ -227,14 +227,14 @@ fn a_stop_does_not_wait_for_what_is_pending() {
 #[test]
 fn a_stop_that_is_not_confirmed_yet_has_its_turns() {
     let mut cell = Cell::new();
-    let talk = |request, reply, pending| Talk::Frames { request, reply, pending, refusal: None };
+    let talk = |request, reply| Talk::Frames { request, reply, refusal: None };
     let (go, done) =
         (frame(&mut cell, None, b"G", vec![fixed(7)]), frame(&mut cell, None, b"S", vec![fixed(0)]));
     let pending = frame(&mut cell, None, b"S", vec![fixed(1)]);
     let (halt, halted) =
         (frame(&mut cell, None, b"H", vec![fixed(7)]), frame(&mut cell, None, b"T", vec![fixed(0)]));
-    let start = never_late(Exchange::new(1, talk(go, done, pending), AskWhen::every(MS(50))));
-    let mut stop = never_late(Exchange::new(2, talk(halt, halted, None), rising(1)));
+    let start = Exchange { pending, ..never_late(Exchange::new(1, talk(go, done), AskWhen::every(MS(50)))) };
+    let mut stop = never_late(Exchange::new(2, talk(halt, halted), rising(1)));
     stop.stop = true;
     let port = talking(&mut cell, &[start, stop]);
     let mut line = Line::new(&cell, port);
@@ -302,8 +302,8 @@ fn two(first: [&[u8]; 2], second: [Option<&[u8]>; 2]) -> Line {
         let request = frame(&mut cell, None, request, vec![fixed(7)]);
         let [reply, pending] =
             answers.map(|head| head.and_then(|head| frame(&mut cell, None, head, vec![fixed(0)])));
-        let talk = Talk::Frames { request, reply, pending, refusal: None };
-        Exchange { late: Some(MS(1_000)), retries: 0, ..Exchange::new(1, talk, when) }
+        let talk = Talk::Frames { request, reply, refusal: None };
+        Exchange { late: Some(MS(1_000)), retries: 0, pending, ..Exchange::new(1, talk, when) }
     };
     let first = exchange(b"A", first.map(Some), AskWhen::every(MS(10_000)));
     let mut second = exchange(b"C", second, rising(0));
@@ -361,8 +361,8 @@ fn answers_with_one_id_on_can() {
     let reply = frame(&mut cell, Some(0x201), &[], vec![fixed(9), fixed(0)]);
     let pending = frame(&mut cell, Some(0x201), &[], vec![fixed(9), fixed(1)]);
     let refusal = frame(&mut cell, Some(0x201), &[], vec![fixed(9), byte_to(CODE)]);
-    let talk = Talk::Frames { request, reply, pending, refusal };
-    let mut exchange = never_late(Exchange::new(1, talk, rising(0)));
+    let talk = Talk::Frames { request, reply, refusal };
+    let mut exchange = Exchange { pending, ..never_late(Exchange::new(1, talk, rising(0))) };
     exchange.outcome.to = Some(var("WordInputReg[2]"));
     let parts = Parts::Can { input: Default::default(), output: Default::default() };
     let recipe = cell.recipe(Mode::User, parts);

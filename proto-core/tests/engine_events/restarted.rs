@@ -111,7 +111,7 @@ fn a_frame_that_comes_unasked_tells_of_a_restart() {
     let unused =
         FieldSpec::DeviceInput { encoding: bits, overflow: Overflow::Usual, to: InputBinding::Unused };
     let (go, done, state) = (frame(b"G", fixed), frame(b"D", fixed), frame(b"E", unused));
-    let talk = |request, reply| Talk::Frames { request, reply, pending: None, refusal: None };
+    let talk = |request, reply| Talk::Frames { request, reply, refusal: None };
     let start = AskWhen { start: true, ..AskWhen::NEVER };
     let start = never_late(Exchange::new(1, talk(go, done), start));
     let mut unasked = never_late(Exchange::new(1, talk(None, state), AskWhen::NEVER));

@@ -146,7 +146,7 @@ fn node() -> (Cell, PortId) {
     let read = frame(0x605, vec![byte(0x40), byte(0x01), byte(0x10), byte(0), pad(4)]);
     let is_read = frame(0x585, vec![byte(0x4F), byte(0x01), byte(0x10), byte(0), value, pad(3)]);
     let exchange = |request, reply, when| {
-        never_late(Exchange::new(5, Talk::Frames { request, reply, pending: None, refusal: None }, when))
+        never_late(Exchange::new(5, Talk::Frames { request, reply, refusal: None }, when))
     };
     let start = AskWhen { start: true, ..AskWhen::NEVER };
     let table = [exchange(set, is_set, start), exchange(read, is_read, AskWhen::every(MS(50)))];

@@ -41,7 +41,7 @@ fn frame(cell: &mut Cell, id: Option<u16>, head: &[u8], tail: &[u8], fields: Vec
 }
 
 fn asks(request: Option<u8>, reply: Option<u8>, refusal: Option<u8>, when: AskWhen) -> Exchange {
-    never_late(Exchange::new(0, Talk::Frames { request, reply, pending: None, refusal }, when))
+    never_late(Exchange::new(0, Talk::Frames { request, reply, refusal }, when))
 }
 
 /// A screwdriver: `Q` asks for torque and angle, which `A` answers and `N` refuses with a code. It says

@@ -28,7 +28,7 @@ fn command(cell: &mut Cell, when: AskWhen) -> Exchange {
     let field =
         FieldSpec::DeviceOutput { encoding, overflow: Overflow::Usual, from: from("WordOutputReg[1]") };
     let request = frame(cell, b"C", vec![field]);
-    never_late(Exchange::new(1, Talk::Frames { request, reply: None, pending: None, refusal: None }, when))
+    never_late(Exchange::new(1, Talk::Frames { request, reply: None, refusal: None }, when))
 }
 
 /// A letter alone, confirmed with the same small letter or not at all.
@@ -38,7 +38,7 @@ fn letter(cell: &mut Cell, letter: u8, is_answered: bool, when: AskWhen) -> Exch
     let request = frame(cell, &[], fixed(letter));
     let small = fixed(letter.to_ascii_lowercase());
     let reply = is_answered.then(|| frame(cell, &[], small)).flatten();
-    never_late(Exchange::new(1, Talk::Frames { request, reply, pending: None, refusal: None }, when))
+    never_late(Exchange::new(1, Talk::Frames { request, reply, refusal: None }, when))
 }
 
 /// A gripper that takes commands, and is asked for its position each 100 ms.

@@ -94,7 +94,7 @@ impl Peers {
         }
         let (mut peers, mut asks): (Vec<Peer>, Vec<Ask>) = (Vec::new(), Vec::new());
         for (exchange, spec) in config.view().exchanges_of(recipe).iter().enumerate() {
-            let Talk::Frames { request, reply, refusal, .. } = spec.talk else { return None };
+            let Talk::Frames { request, reply, refusal } = spec.talk else { return None };
             let frame = |nth: Option<u8>| config.frames.get(usize::from(nth?));
             let sends = |nth: Option<u8>| {
                 let frame = frame(nth)?;

@@ -144,12 +144,9 @@ fn a_conversation_has_frames_of_its_own() {
     let config = line();
     let talk = exchanges(&config, 2);
     assert_eq!((talk[0].peer, talk[0].when), (3, AskWhen::every(ms(50))));
-    assert_eq!(
-        talk[0].talk,
-        Talk::Frames { request: Some(0), reply: Some(1), pending: None, refusal: Some(2) }
-    );
-    assert_eq!(talk[1].talk, Talk::Frames { request: None, reply: Some(3), pending: None, refusal: None });
-    assert_eq!(talk[2].talk, Talk::Frames { request: Some(4), reply: None, pending: None, refusal: None });
+    assert_eq!(talk[0].talk, Talk::Frames { request: Some(0), reply: Some(1), refusal: Some(2) });
+    assert_eq!(talk[1].talk, Talk::Frames { request: None, reply: Some(3), refusal: None });
+    assert_eq!(talk[2].talk, Talk::Frames { request: Some(4), reply: None, refusal: None });
     assert_eq!(talk[2].pause, ms(10));
     let reply = &config.frames[1];
     assert_eq!((&reply.head[..], &reply.tail[..], reply.id, reply.remote), (&[2][..], &[3][..], None, false));
@@ -373,12 +370,12 @@ fn shown(config: &GatewayConfig, recipe: usize) -> Vec<String> {
             Talk::Rtu { operation, written, read } | Talk::Served { operation, written, read } => {
                 format!("{timing:?} {operation:?} {:?} {:?}", fields(written), fields(read))
             }
-            Talk::Frames { request, reply, pending, refusal } => {
+            Talk::Frames { request, reply, refusal } => {
                 format!(
                     "{timing:?} {:?} {:?} {:?} {:?}",
                     frame(request),
                     frame(reply),
-                    frame(pending),
+                    frame(exchange.pending),
                     frame(refusal)
                 )
             }

@@ -58,7 +58,7 @@ const BEYOND: &[(&str, &[(&str, &str)])] = &[
         "the bytes of a frame",
         &[
             ("", "tells where a frame begins"),
-            ("", "is another answer to the request"),
+            ("", "is another answer as well"),
             ("", "registers have two each"),
             ("", "a frame of"),
             ("", "the frame has no fields"),
@@ -81,7 +81,7 @@ const BEYOND: &[(&str, &[(&str, &str)])] = &[
             ("", "an exchange needs a request, a reply or both"),
             ("", "there is no reply to wait for"),
             ("follow", "has no reply"),
-            ("restarted", "a restart means"),
+            ("restarted", "if one of its device has"),
             ("outcome", "no variable"),
             ("", "a recipe needs an input part"),
             ("", "no value to send"),

@@ -287,8 +287,8 @@ fn received(config: &GatewayConfig, port: &Port) -> impl Iterator<Item = CanId> 
     let exchanges = recipe.map_or(&[][..], |recipe| config.view().exchanges_of(recipe));
     let replies = exchanges.iter().flat_map(|exchange| match exchange.talk {
         // A remote request has the id of its reply.
-        Talk::Frames { request, reply, pending, refusal } if !is_remote(config, request) => {
-            [reply, pending, refusal]
+        Talk::Frames { request, reply, refusal } if !is_remote(config, request) => {
+            [reply, exchange.pending, refusal]
         }
         _ => [None; 3],
     });

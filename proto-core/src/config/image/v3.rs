@@ -6,8 +6,7 @@ use serde::Deserialize;
 
 use super::{ConfigMut, ImageError, item, items, v4};
 use crate::config::error::Counted;
-use crate::config::{self, AskWhen, Bus, Name, PortHealth, Span};
-use crate::modbus::rtu::Operation;
+use crate::config::{self, AskWhen, Bus, Name, PortHealth, Span, Talk};
 use crate::time::Duration;
 
 pub(super) fn read_head(rest: &mut &[u8], config: &mut ConfigMut<'_>) -> Result<(), ImageError> {
@@ -85,27 +84,8 @@ struct Exchange {
     pause: Duration,
 }
 
-#[derive(Deserialize)]
-enum Talk {
-    Rtu { operation: Operation, written: Span, read: Span },
-    Served { operation: Operation, written: Span, read: Span },
-    Frames { request: Option<u8>, reply: Option<u8>, refusal: Option<u8> },
-}
-
-impl From<Talk> for config::Talk {
-    fn from(old: Talk) -> Self {
-        match old {
-            Talk::Rtu { operation, written, read } => Self::Rtu { operation, written, read },
-            Talk::Served { operation, written, read } => Self::Served { operation, written, read },
-            Talk::Frames { request, reply, refusal } => {
-                Self::Frames { request, reply, pending: None, refusal }
-            }
-        }
-    }
-}
-
 impl From<Exchange> for config::Exchange {
     fn from(Exchange { peer, talk, when, timeout, retries, pause }: Exchange) -> Self {
-        Self { timeout, retries, pause, ..Self::new(peer, talk.into(), when) }
+        Self { timeout, retries, pause, ..Self::new(peer, talk, when) }
     }
 }

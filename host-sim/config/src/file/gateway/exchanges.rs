@@ -20,7 +20,7 @@ impl Builder<'_> {
                 let place = Place::Exchange { recipe, exchange: number, key: *key };
                 self.spots.insert(place, spot.clone());
             }
-            let talk = self.talk(recipe, exchange, &mut numbers)?;
+            let (talk, pending) = self.talk(recipe, exchange, &mut numbers)?;
             let timing = &exchange.timing;
             let added = Exchange {
                 timeout: timing.timeout,
@@ -31,6 +31,7 @@ impl Builder<'_> {
                 follow: timing.follow,
                 overdue: exchange.overdue,
                 outcome: timing.outcome,
+                pending,
                 restarted: exchange.restarted,
                 ..Exchange::new(exchange.peer, talk, timing.when)
             };
@@ -48,7 +49,8 @@ impl Builder<'_> {
         self.error(&exchange.spot, message)
     }
 
-    fn talk(&mut self, recipe: u8, from: &FileExchange, numbers: &mut [u8; 2]) -> Result<Talk> {
+    /// The frames, and the pending answer.
+    fn talk(&mut self, recipe: u8, from: &FileExchange, numbers: &mut [u8; 2]) -> Result<(Talk, Option<u8>)> {
         let [inputs, outputs] = numbers;
         let output = self.frame_fields(recipe, Direction::Output, from.output.as_ref(), outputs)?;
         let input = self.frame_fields(recipe, Direction::Input, from.input.as_ref(), inputs)?;
@@ -56,20 +58,19 @@ impl Builder<'_> {
         match from.kind {
             ExchangeKind::Frames => {}
             ExchangeKind::Master(operation) => {
-                return Ok(Talk::Rtu { operation, written: fields(output), read: fields(input) });
+                return Ok((Talk::Rtu { operation, written: fields(output), read: fields(input) }, None));
             }
             ExchangeKind::Slave(operation) => {
-                return Ok(Talk::Served { operation, written: fields(input), read: fields(output) });
+                return Ok((Talk::Served { operation, written: fields(input), read: fields(output) }, None));
             }
         }
         let pending = self.other_fields(recipe, from.pending.as_ref(), inputs)?;
         let refusal = self.other_fields(recipe, from.refusal.as_ref(), inputs)?;
-        Ok(Talk::Frames {
-            request: self.add_frame(from, from.output.as_ref(), output, from.remote)?,
-            reply: self.add_frame(from, from.input.as_ref(), input, false)?,
-            pending: self.add_frame(from, from.pending.as_ref(), pending, false)?,
-            refusal: self.add_frame(from, from.refusal.as_ref(), refusal, false)?,
-        })
+        let request = self.add_frame(from, from.output.as_ref(), output, from.remote)?;
+        let reply = self.add_frame(from, from.input.as_ref(), input, false)?;
+        let pending = self.add_frame(from, from.pending.as_ref(), pending, false)?;
+        let refusal = self.add_frame(from, from.refusal.as_ref(), refusal, false)?;
+        Ok((Talk::Frames { request, reply, refusal }, pending))
     }
 
     /// The fields of a pending answer or a refusal. Without values, nothing of it has a place of its own in later
