@@ -114,15 +114,15 @@ impl ConfigMut<'_> {
                 let (written, read) = if part == Direction::Input { (span, none) } else { (none, span) };
                 Ok((Talk::Served { operation, written, read }, None))
             }
-            AskTalk::Frames(of) => {
-                let keys = [
-                    (Direction::Output, ExchangeKey::Request),
-                    (Direction::Input, ExchangeKey::Reply),
-                    (Direction::Input, ExchangeKey::Pending),
-                    (Direction::Input, ExchangeKey::Refusal),
+            AskTalk::Frames([request, reply, refusal]) => {
+                let all = [
+                    (request, Direction::Output, ExchangeKey::Request),
+                    (reply, Direction::Input, ExchangeKey::Reply),
+                    (&ask.pending, Direction::Input, ExchangeKey::Pending),
+                    (refusal, Direction::Input, ExchangeKey::Refusal),
                 ];
                 let mut added = [None; 4];
-                for ((added, frame), (part, key)) in added.iter_mut().zip(of).zip(keys) {
+                for (added, (frame, part, key)) in added.iter_mut().zip(all) {
                     let Some(frame) = frame else { continue };
                     let index = self.add_frame((recipe, part), frame, at(key), frames)?;
                     let is_counted = matches!(key, ExchangeKey::Request | ExchangeKey::Reply);

@@ -65,6 +65,7 @@ pub struct Ask<'a> {
     pub(super) follow: Option<u8>,
     pub(super) overdue: Option<Duration>,
     pub(super) outcome: [Option<Var<'a>>; 3],
+    pub(super) pending: Option<AskFrame<'a>>,
     pub(super) restarted: Option<Restarted>,
 }
 
@@ -81,8 +82,8 @@ pub(super) enum AskTalk<'a> {
         address: u16,
         fields: Fields<'a>,
     },
-    /// A request, a reply, a pending answer and a refusal.
-    Frames([Option<AskFrame<'a>>; 4]),
+    /// A request, a reply and a refusal.
+    Frames([Option<AskFrame<'a>>; 3]),
 }
 
 /// A frame of an exchange.
@@ -183,12 +184,12 @@ impl<'a> Ask<'a> {
 
     /// A request of a device's own; of device 0, unless [`Self::peer`] says otherwise.
     pub fn request(request: AskFrame<'a>) -> Self {
-        Self::new(0, AskTalk::Frames([Some(request), None, None, None]))
+        Self::new(0, AskTalk::Frames([Some(request), None, None]))
     }
 
     /// A frame that may come at any time.
     pub fn unasked(frame: AskFrame<'a>) -> Self {
-        Self::new(0, AskTalk::Frames([None, Some(frame), None, None]))
+        Self::new(0, AskTalk::Frames([None, Some(frame), None]))
     }
 
     fn read(slave: u8, operation: Operation, fields: &'a [InputField<'a>]) -> Self {
@@ -215,13 +216,14 @@ impl<'a> Ask<'a> {
             follow: None,
             overdue: None,
             outcome: [None; 3],
+            pending: None,
             restarted: None,
         }
     }
 
     /// What answers the request. No effect on Modbus, whose replies are known.
     pub fn reply(mut self, frame: AskFrame<'a>) -> Self {
-        if let AskTalk::Frames([_, reply, _, _]) = &mut self.talk {
+        if let AskTalk::Frames([_, reply, _]) = &mut self.talk {
             *reply = Some(frame);
         }
         self
@@ -229,15 +231,15 @@ impl<'a> Ask<'a> {
 
     /// What the device sends while it is at it: its answer is awaited anew. No effect on Modbus.
     pub fn pending(mut self, frame: AskFrame<'a>) -> Self {
-        if let AskTalk::Frames([_, _, pending, _]) = &mut self.talk {
-            *pending = Some(frame);
+        if matches!(self.talk, AskTalk::Frames(_)) {
+            self.pending = Some(frame);
         }
         self
     }
 
     /// What the device sends if it refuses the request. No effect on Modbus.
     pub fn refusal(mut self, frame: AskFrame<'a>) -> Self {
-        if let AskTalk::Frames([_, _, _, refusal]) = &mut self.talk {
+        if let AskTalk::Frames([_, _, refusal]) = &mut self.talk {
             *refusal = Some(frame);
         }
         self
@@ -361,7 +363,7 @@ impl<'a> Ask<'a> {
             AskTalk::Frames(frames) => &frames[..],
             AskTalk::Rtu { .. } | AskTalk::Served { .. } => &[],
         };
-        frames.iter().flatten()
+        frames.iter().chain([&self.pending]).flatten()
     }
 
     /// All lists of fields.
