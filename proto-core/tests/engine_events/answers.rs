@@ -171,6 +171,37 @@ fn a_device_that_says_nothing_behind_a_pending_answer_may_have_done_it() {
     assert_eq!((peer.counters.timeouts, peer.counters.replies, peer.presence.name()), (1, 0, "up"));
 }
 
+/// The only exchange of a device: asked each 50 ms, with an answer that is pending.
+fn alone() -> Line {
+    let mut cell = Cell::new();
+    let request = frame(&mut cell, None, b"G", vec![fixed(7)]);
+    let reply = frame(&mut cell, None, b"S", vec![fixed(0)]);
+    let pending = frame(&mut cell, None, b"S", vec![fixed(1)]);
+    let talk = Talk::Frames { request, reply, refusal: None };
+    let exchange = Exchange { pending, ..Exchange::new(1, talk, AskWhen::every(MS(50))) };
+    let port = talking(&mut cell, &[never_late(exchange)]);
+    Line::new(&cell, port)
+}
+
+#[test]
+fn a_pending_answer_shows_that_the_device_is_there() {
+    let mut line = alone();
+    line.run(MS(3_000), |_| None);
+    assert_eq!(line.peer(1).presence.name(), "down");
+    let mut asked = 0;
+    while asked == 0 {
+        asked = line.run(MS(1), |_| Some((MS(1), b"S\x01".to_vec()))).len();
+    }
+    line.run(MS(5), |_| None);
+    assert_eq!(line.peer(1).presence.name(), "up", "while its answer is awaited");
+    // Nor is the silence behind it an absence.
+    for _ in 0..20_000 {
+        line.run(MS(1), |_| Some((MS(1), b"S\x01".to_vec())));
+        assert_eq!(line.peer(1).presence.name(), "up");
+    }
+    assert!(line.peer(1).counters.timeouts > 3);
+}
+
 #[test]
 fn a_device_that_is_pending_for_ever_does_not_hold_the_line() {
     let mut device = Device::new(|_| ());
@@ -204,6 +235,20 @@ fn a_state_that_stays_pending_is_written_again_later() {
     let before = device.starts;
     device.run(10_000);
     assert_eq!(device.starts, before, "it is done");
+}
+
+/// Nothing more comes from the device: the stop goes at once.
+#[test]
+fn a_stop_ends_the_wait_behind_a_pending_answer_at_once() {
+    let mut device = Device::new(|start| start.timeout = MS(2_000));
+    device.start(&[(20, PENDING)]);
+    device.run(100);
+    device.line.bit(1, true);
+    let wanted = device.line.rig.now;
+    device.run(50);
+    let waited = device.stops.first().map(|at| at.saturating_since(wanted)).unwrap();
+    assert!(waited <= MS(10), "{waited}");
+    assert_eq!(device.outcome(), 5);
 }
 
 #[test]

@@ -59,6 +59,24 @@ fn a_restart_that_is_known_already_is_none() {
     }
 }
 
+/// The start was noticed by another exchange, before the number came.
+#[test]
+fn a_number_of_before_a_start_says_nothing() {
+    let (mut cell, port) = cell();
+    let other = reads_at(&mut cell, 9, 0x20, "WordInputReg[3]", MS(50));
+    cell.0.exchanges.push(other).unwrap();
+    cell.last_recipe().exchanges.len = 4;
+    let mut line = Line::new(&cell, port);
+    assert_eq!(play(&mut line, 1_000, 1), 1);
+    line.run(MS(8_000), |_| None);
+    let is_status = |request: &[u8]| request[1] == 3 && request[3] == 0x10;
+    line.run(MS(12_000), |request| (!is_status(request)).then(|| (MS(2), answer(request, |_| 0))));
+    assert_eq!(line.peer(9).counters.starts, 1);
+    assert_eq!(play(&mut line, 12_000, 0), 0);
+    assert_eq!(line.peer(9).counters.starts, 1);
+    assert_eq!(line.shown("WordInputReg[1]"), 0, "the number came");
+}
+
 #[test]
 fn a_port_that_comes_up_again_begins_with_no_number() {
     let (cell, port) = cell();
