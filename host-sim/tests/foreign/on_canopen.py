@@ -48,6 +48,8 @@ class Encoder:
         self.network.subscribe(0x77F, lambda identifier, data, at: self.heard.append(bytes(data)))
         self.position = 0
         self.over = threading.Event()
+        # What each node says when it has booted (CiA 301), and the package does not.
+        self.network.send_message(0x700 + NODE, bytes([0]))
         self.node.nmt.state = "PRE-OPERATIONAL"
         self.sender = threading.Thread(target=self._send, daemon=True)
         self.sender.start()

@@ -144,6 +144,7 @@ bus = "modbus-rtu"
 baud = 19200
 recipe = "line"
 timeout_ms = 1000
+absent_ms = 500
 on_timeout = { "WordInputReg[8]" = 99, "WordInputReg[9]" = 98 }
 """
 EVERY_TABLE = {
@@ -185,7 +186,7 @@ def master():
             slaves.set(1, 1, 3, [False])
             registers(robot, {"WordInputReg[5]": 200, "WordInputReg[1]": 0})
             slaves.set(3, 3, 0x102, [200])
-            running.until_stats("a rejection", lambda stats: stats["ports"]["line"]["rejected_out_of_range"] > 0)
+            running.until_stats("a rejection", lambda stats: stats["ports"]["line"]["rejected_fields"] > 0)
             registers(robot, {"WordInputReg[5]": 200})
             slaves.set(3, 3, 0x102, [0xFF38])
             client.start("first.jspf")

@@ -27,7 +27,7 @@
 #define RGW_MAX_EXCHANGES 16
 
 // Memory for a gateway, in bytes: enough on every machine.
-#define RGW_GATEWAY_SIZE 58368
+#define RGW_GATEWAY_SIZE 61440
 
 // Number of the link to port 2000.
 #define RGW_LINK_COMMAND 0

@@ -18,7 +18,7 @@ pub const RGW_MAX_FIELDS: usize = 128;
 pub const RGW_MAX_EXCHANGES: usize = 16;
 
 /// Memory for a gateway, in bytes: enough on every machine.
-pub const RGW_GATEWAY_SIZE: usize = 58_368;
+pub const RGW_GATEWAY_SIZE: usize = 61_440;
 const _: () = assert!(size_of::<Gateway>() <= RGW_GATEWAY_SIZE);
 
 /// A gateway in the caller's memory; it must not be moved.

@@ -704,7 +704,7 @@ fn signs(line: &mut Line, items: &mut [Item], talks: &mut Talks<'_>, sign: Sign,
         bump(&mut peer.counters.late_replies);
     }
     // The peer has carried out what its late reply is to.
-    let own = matches!(sign, Sign::Late(_)).then_some(nth);
+    let own = matches!(sign, Sign::Late { is_pending: false, .. }).then_some(nth);
     let news = line.turns(talks, |turns| turns.heard(which, own, now));
     line.look(now);
     Events { items, talks, line, now }.note(nth, news);

@@ -58,11 +58,11 @@ impl Transactions {
         let (&[t1, t0, ..], body) = frame.split_first_chunk::<PREFIX_LEN>()?;
         let id = u16::from_be_bytes([t1, t0]);
         if id != self.newest || awaited.flight.is_none() {
-            return self.take(id).map(Heard::Late);
+            return self.take(id).map(|exchange| Heard::Late { exchange, is_pending: false });
         }
         let is_good = awaited.expected()?.judge(body)?;
         self.take(id);
-        if is_good { Some(Heard::Reply(awaited.asked()?.reply.as_ref())) } else { Some(Heard::Refusal) }
+        if is_good { Some(Heard::Reply(awaited.asked()?.reply.as_ref())) } else { Some(Heard::Refusal(None)) }
     }
 
     /// The exchange of a request without a reply; it has one now.
