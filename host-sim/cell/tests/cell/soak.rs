@@ -61,7 +61,7 @@ fn the_number_of_threads_changes_nothing() {
     // Commands and safe values, and slaves, are checked in longer runs of the cells that have most of them.
     let mut checks = one.checks.clone();
     for (name, seeds, seconds) in
-        [("orders", 1..=3, 180), ("modbus-line", 1..=2, 60), ("judged-drive", 1..=3, 120)]
+        [("orders", 1..=3, 180), ("modbus-line", 1..=2, 60), ("judged-axis", 1..=3, 180)]
     {
         let scenario = Scenario::named(name).unwrap().unwrap();
         for seed in seeds {
