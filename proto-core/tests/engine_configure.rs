@@ -136,7 +136,7 @@ fn what_it_has_no_room_for_is_counted() {
     });
     assert_eq!(
         refused(links.recipe_link("out")),
-        "too many recipe links: 4 are needed; this gateway has room for 1"
+        "too many recipe links and Modbus TCP ports: 4 are needed; this gateway has room for 1"
     );
     let fields = [InputField::unused(ScalarType::Byte); 17];
     let user = base().recipe(Recipe::user("user").stream_input(&[255], &[], &fields));

@@ -107,8 +107,8 @@ pub(super) struct Flight {
     pub cause: Cause,
     /// Repetitions so far.
     repeated: u8,
-    /// When the first transmission left that had no reply in time.
-    unanswered: Option<Instant>,
+    /// When the first transmission left that had no reply in time; never before there is one.
+    unanswered: Instant,
     /// A reply with a wrong checksum came.
     pub is_wrong: bool,
     /// One came to an earlier transmission: that, or noise.
@@ -231,8 +231,8 @@ impl Flight {
     }
 
     /// Since when a reply to it could have been expected, if an earlier transmission had none in time.
-    pub(super) const fn unanswered(&self) -> Option<Instant> {
-        self.unanswered
+    pub(super) fn unanswered(&self) -> Option<Instant> {
+        Some(self.unanswered).filter(|at| *at != Instant::NEVER)
     }
 
     /// Whether a request with these bytes may follow those that had no reply: one that is confirmed late must not
@@ -318,7 +318,7 @@ impl Line {
                     exchange: exchange as u8,
                     cause,
                     repeated: 0,
-                    unanswered: None,
+                    unanswered: Instant::NEVER,
                     is_wrong: false,
                     was_wrong: false,
                     may_be_echo: false,
@@ -496,7 +496,7 @@ impl Line {
         *counter = counter.wrapping_add(1);
         if failure == Failure::Echo {
             // What came may have been the echo, and the reply is still to come.
-            let unanswered = flight.unanswered.or(Some(sent));
+            let unanswered = flight.unanswered.min(sent);
             let count = flight.repeated.saturating_add(1);
             leave_outstanding(talks, Flight { unanswered, ..flight }, count, sent, now);
             let nth = usize::from(flight.exchange);
@@ -508,7 +508,8 @@ impl Line {
             Cause::State(_) => times.retries[0],
             Cause::Start | Cause::Event => times.retries[1],
         };
-        let unanswered = flight.unanswered.or((failure != Failure::Checksum).then_some(sent));
+        let unanswered =
+            if failure == Failure::Checksum { flight.unanswered } else { flight.unanswered.min(sent) };
         // The peer has the request of which it said that it is at it.
         if peer.turn.presence() == Presence::Up && flight.repeated < retries && !flight.is_pending {
             counters.retries = counters.retries.wrapping_add(1);
@@ -539,7 +540,7 @@ impl Line {
         leave_outstanding(talks, flight, flight.repeated.saturating_add(1), sent, now);
         let nth = usize::from(flight.exchange);
         let news = self.turns(talks, |turns| match failure {
-            Failure::Timeout => turns.failed(nth, flight.cause, now, flight.unanswered.unwrap_or(sent)),
+            Failure::Timeout => turns.failed(nth, flight.cause, now, flight.unanswered.min(sent)),
             // It said something, and nobody knows what.
             _ => turns.answered(nth, flight.cause, Ended::Unclear, now),
         });
@@ -637,7 +638,7 @@ impl PeerState {
 /// not later than two timeouts.
 fn leave_outstanding(talks: &mut Talks<'_>, flight: Flight, count: u8, sent: Instant, now: Instant) {
     let Some(row) = talks.row_of(flight) else { return };
-    if flight.unanswered.is_some() {
+    if flight.unanswered().is_some() {
         row.leaves_outstanding(count, sent + row.late(), now);
     } else if flight.was_wrong && row.alike.count_ones() > 1 {
         row.leaves_outstanding(count, sent + row.late().min(row.timeout().saturating_mul(2)), now);
