@@ -305,7 +305,12 @@ function echo(keys: Keys): Value {
 }
 
 function bus(keys: Keys): Value {
-    const kind = keys.word("bus", ["rs485", "can", "tcp-listen", "udp-listen"]);
+    const kind = keys.word("bus", ["rs485", "can", "tcp-listen", "udp-listen", "modbus-tcp"]);
+    if (kind === "modbus-tcp") {
+        // An IPv6 address is in brackets.
+        const to = /^(?:\[(.+)]|([^:]+))(?::(\d+))?$/.exec(keys.text("to")) ?? keys.fail("to", "allowed: HOST or HOST:PORT");
+        return { ModbusTcp: { host: to[1] ?? to[2], port: Number(to[3] ?? 502) } };
+    }
     if (kind === "can") return { Can: { bitrate: keys.whole("bitrate", 10_000, 1_000_000, 500_000) } };
     if (kind !== "rs485") return { [kind === "tcp-listen" ? "TcpListen" : "UdpListen"]: { listen: keys.text("listen") } };
     return {

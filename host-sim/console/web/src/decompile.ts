@@ -187,10 +187,12 @@ function portOf(port: Struct, recipes: Struct[], safe: Struct[]): Table {
     const line: Table =
         kind === "Rs485"
             ? { baud: bus["baud"], parity: lower(bus["parity"]), stop_bits: bus["stop_bits"], idle_gap_ms: ms(bus["idle_gap"]), turnaround_us: bus["turnaround"], echo: ECHOES[String(bus["echo"])] }
-            : bus;
+            : kind === "ModbusTcp"
+              ? { to: `${String(bus["host"]).includes(":") ? `[${bus["host"]}]` : bus["host"]}:${bus["port"]}` }
+              : bus;
     return {
         name: port["name"],
-        bus: { Rs485: "rs485", Can: "can", TcpListen: "tcp-listen", UdpListen: "udp-listen" }[kind],
+        bus: { Rs485: "rs485", Can: "can", TcpListen: "tcp-listen", UdpListen: "udp-listen", ModbusTcp: "modbus-tcp" }[kind],
         recipe: recipes[port["recipe"] as number]!["name"],
         ...unusual(
             {

@@ -173,7 +173,7 @@ function Port({ nth, port }: { nth: number; port: Table }) {
     const recipe = list("recipe").find((recipe) => recipe["name"] === port["recipe"]);
     const bus = String(port["bus"]);
     const isSerial = bus.startsWith("rs485") || bus.startsWith("modbus");
-    const isField = isSerial || bus === "can";
+    const isField = !String(bus).endsWith("listen");
     const setBus = (value: string) => {
         const kept = Object.fromEntries(Object.entries(port).filter(([key]) => !LINE_KEYS.includes(key)));
         put("port", nth, { ...kept, bus: value, ...(value.endsWith("listen") ? { listen: "0.0.0.0:50000" } : {}) });
