@@ -808,8 +808,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             let first_of_links = self.store.frames.len() as u8;
             let connection = |group| links.connection_of(group);
             let (image, view) = (&self.store.image, self.exchanges.view());
+            // Only a tick lets a deadline pass.
+            let was_due = port.has_failed(now);
             port.triggers(image, self.bindings.outputs(), view, (first_of_links, connection), now);
-            if port.has_failed(now) {
+            if !was_due && port.has_failed(now) {
                 // What is pending yields to a stop.
                 port.advance_talk(self.exchanges.view(), now);
             }

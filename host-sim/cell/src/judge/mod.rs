@@ -247,7 +247,8 @@ impl Judge {
             }
             Act::Did(Order::Stop, _) => {}
             Act::Did(Order::Start, _) => {
-                if self.starts == 0 && self.is_away(now) {
+                let unheard = now.saturating_since(self.replied.unwrap_or(self.began));
+                if self.starts == 0 && unheard + SLACK >= self.rules.absent {
                     // It is the first thing that it hears, and so long nothing was heard of it.
                     (self.starts, self.replied) = (1, Some(now));
                 }

@@ -49,7 +49,9 @@ type Waits = Rc<RefCell<Vec<(Instant, Vec<u8>)>>>;
 fn resends(cell: &mut Cell, begin: &'static [u8]) {
     let sent: Waits = Rc::default();
     let outward: Outward = Box::new(move |now, input, output| {
-        if matches!(input, Input::PortBytes { .. }) {
+        if let Input::PortBytes { bytes, .. } = input
+            && (bytes.len() < 2 || bytes.starts_with(&begin[..2]))
+        {
             sent.borrow_mut().clear();
         }
         match output {

@@ -165,14 +165,14 @@ function Imported() {
 }
 
 /** Keys that belong to one kind of line. */
-const LINE_KEYS = ["bus", "baud", "parity", "stop_bits", "idle_gap_ms", "turnaround_us", "echo", "bitrate", "listen"];
+const LINE_KEYS = ["bus", "baud", "parity", "stop_bits", "idle_gap_ms", "turnaround_us", "echo", "bitrate", "listen", "to"];
 const PORT_KEYS = ["name", "bus", "recipe", "baud", "parity", "stop_bits", "bitrate", "listen", "cycle_ms", "timeout_ms", "on_timeout"];
 
 function Port({ nth, port }: { nth: number; port: Table }) {
     const set = (key: string, value: unknown) => put("port", nth, changed(port, key, value));
     const recipe = list("recipe").find((recipe) => recipe["name"] === port["recipe"]);
     const bus = String(port["bus"]);
-    const isSerial = bus.startsWith("rs485") || bus.startsWith("modbus");
+    const isSerial = bus !== "modbus-tcp" && (bus.startsWith("rs485") || bus.startsWith("modbus"));
     const isField = !String(bus).endsWith("listen");
     const setBus = (value: string) => {
         const kept = Object.fromEntries(Object.entries(port).filter(([key]) => !LINE_KEYS.includes(key)));
