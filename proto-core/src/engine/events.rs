@@ -112,11 +112,10 @@ impl Trigger {
         if !reading.on {
             return [false; 2];
         }
-        let was_off = before.is_some_and(|before| {
-            !before.on
-                && before.connection == reading.connection
-                && reading.at.saturating_since(before.at) <= stale_after
-        });
+        let before = before.filter(|before| before.connection == reading.connection);
+        let was_off =
+            before.is_some_and(|before| !before.on && reading.at.saturating_since(before.at) <= stale_after);
+        // What happened between two connections nobody knows.
         [was_off, !before.is_some_and(|before| before.on)]
     }
 }

@@ -392,13 +392,14 @@ impl Judge {
     }
 
     fn replies(&mut self, is_whole: bool, tells: bool, now: Instant) {
-        if self.is_disturbed || !is_whole {
+        if !is_whole {
             return;
         }
         if self.is_away(now) {
             self.starts = 1;
         }
-        if tells {
+        // Of a disturbed line nobody knows whether it arrives.
+        if tells && !self.is_disturbed {
             self.replied = Some(now);
         }
     }
