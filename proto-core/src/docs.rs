@@ -40,7 +40,7 @@ pub mod wire {
     page!(recipes: sysvars);
     page!(state: command sysvars);
     page!(command: state);
-    page!(modbus: sysvars);
+    page!(modbus: sysvars modbus_rtu);
     page!(slcan: );
 
     /// [modbus]: modbus

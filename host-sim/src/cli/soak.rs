@@ -173,12 +173,14 @@ fn batch(args: &SoakArgs, scenarios: Vec<Scenario>, out: &mut dyn Write) -> Exit
         Ok(interrupt) => interrupt,
         Err(error) => return wrong(error),
     };
-    let workers: Vec<_> = (0..jobs.min(batch.share_runs().len()))
-        .map(|_| {
-            let batch = Arc::clone(&batch);
-            std::thread::spawn(move || batch.work())
-        })
-        .collect();
+    let workers = (0..jobs.min(batch.share_runs().len())).map(|_| {
+        let batch = Arc::clone(&batch);
+        std::thread::Builder::new().stack_size(STACK).spawn(move || batch.work())
+    });
+    let workers: Vec<_> = match workers.collect() {
+        Ok(workers) => workers,
+        Err(error) => return wrong(error),
+    };
     let interrupted = runtime.block_on(watch(&batch, &workers, interrupt, began));
     batch.stop();
     for worker in workers {
@@ -312,6 +314,8 @@ const PASS: &str = "PASS  all invariants held";
 /// Time before the end of a replay that the trace shows.
 const SHOWN: Duration = Duration::from_secs(2);
 const MAX_ENTRIES: usize = 100_000;
+/// A build for debugging moves whole cells through the stack.
+const STACK: usize = 16 << 20;
 const REDRAW_EVERY: WallTime = WallTime::from_millis(500);
 const LINE_EVERY: WallTime = WallTime::from_secs(15);
 const POLL_EVERY: WallTime = WallTime::from_millis(20);
