@@ -762,6 +762,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             let (inputs, view) = (&self.bindings.inputs, self.exchanges.view());
             let accepted = port.talk_frames(&mut rest, inputs, store, command, &mut self.tap, view);
             self.after_talk(id);
+            self.note_overdue();
             self.after_field(id, &accepted, now);
             if rest.is_empty() {
                 return true;
@@ -790,6 +791,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             keep_why(&mut port.last_rejection, verdict, &mut self.store, Some(frame.id()), frame.data());
         }
         self.after_talk(id);
+        self.note_overdue();
         self.after_field(id, &accepted, now);
         true
     }
@@ -859,6 +861,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 // A wrong reply came before the request had left, and the line is silent already.
                 self.clock.timer_at = self.clock.timer_at.min(self.clock.now);
             }
+        }
+    }
+
+    /// A value is as old as the first request that it may answer, and may be overdue when it comes.
+    fn note_overdue(&mut self) {
+        if self.store.deadline() <= self.clock.now {
+            self.clock.timer_at = self.clock.timer_at.min(self.clock.now);
         }
     }
 
