@@ -303,6 +303,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
     }
 
+    /// The driver ticks once more at this instant.
+    pub(super) fn tick_again(&mut self) {
+        self.clock.timer_at = self.clock.timer_at.min(self.clock.now);
+    }
+
     /// Handles everything that depends on the clock.
     fn advance(&mut self, now: Instant) {
         // At one instant the clock is checked once: what is done now is due later.

@@ -276,11 +276,7 @@ impl FieldPort {
         if let Some(which) = booted_peer(items, &talks, frame) {
             let nth = talks.rows.iter().position(|row| row.peer == which).unwrap_or(0);
             line.turns(&mut talks, |turns| turns.started(which, None, now));
-            line.look(now);
-            let mut events = Events { items, talks: &mut talks, line, now };
-            events.note(nth, News::Started);
-            // What it was to do, it has forgotten.
-            events.end_waiting(Some(which), Outcome::Away);
+            has_restarted(line, items, &mut talks, (nth, which), now);
         }
         let flight = line.flight();
         let first_frame = self.first_frame;
@@ -679,6 +675,17 @@ fn look_for_restart(
             turns.started(which, own, now);
         }
     });
+    has_restarted(line, items, talks, (nth, which), now);
+}
+
+/// The peer of this exchange has said that it has restarted, and its turns know it.
+fn has_restarted(
+    line: &mut Line,
+    items: &mut [Item],
+    talks: &mut Talks<'_>,
+    (nth, which): (usize, u8),
+    now: Instant,
+) {
     line.look(now);
     let mut events = Events { items, talks, line, now };
     events.note(nth, News::Started);
@@ -859,7 +866,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             deadlines.into_iter().for_each(|at| self.arm(at));
             if has_failed {
                 // A wrong reply came before the request had left, and the line is silent already.
-                self.clock.timer_at = self.clock.timer_at.min(self.clock.now);
+                self.tick_again();
             }
         }
     }
@@ -867,7 +874,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     /// A value is as old as the first request that it may answer, and may be overdue when it comes.
     fn note_overdue(&mut self) {
         if self.store.deadline() <= self.clock.now {
-            self.clock.timer_at = self.clock.timer_at.min(self.clock.now);
+            self.tick_again();
         }
     }
 
