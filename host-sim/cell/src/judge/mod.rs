@@ -247,8 +247,7 @@ impl Judge {
             }
             Act::Did(Order::Stop, _) => {}
             Act::Did(Order::Start, _) => {
-                let unheard = now.saturating_since(self.replied.unwrap_or(self.began));
-                if self.starts == 0 && unheard + SLACK >= self.rules.absent {
+                if self.starts == 0 && self.is_absent(self.replied.unwrap_or(self.began), now) {
                     // It is the first thing that it hears, and so long nothing was heard of it.
                     (self.starts, self.replied) = (1, Some(now));
                 }
@@ -379,10 +378,14 @@ impl Judge {
         }
     }
 
+    fn is_absent(&self, since: Instant, now: Instant) -> bool {
+        now.saturating_since(since) + SLACK >= self.rules.absent
+    }
+
     /// Whether nothing was heard of it for so long that it has started, to the gateway.
     fn is_away(&self, now: Instant) -> bool {
         match self.replied {
-            Some(before) => now.saturating_since(before) + SLACK >= self.rules.absent,
+            Some(before) => self.is_absent(before, now),
             // Never heard: it was asked in vain at least twice, behind the late time unless it was to stop.
             None => {
                 let stops = self.stop.is_some() || self.stop_heard.is_some_and(|heard| heard >= self.began);

@@ -259,10 +259,10 @@ impl Robot {
         let own: Vec<&Reading> = own.map(|(_, reading)| reading).collect();
         let rises = (0..own.len()).rev().find(|&at| own[at].stops && (at == 0 || !own[at - 1].stops));
         // What was read long ago may have been forgotten here.
-        let (before, sure) = rises.filter(|&at| at > 0).map(|at| (own[at - 1].answered, own[at].answered))?;
+        let before = rises.filter(|&at| at > 0).map(|at| own[at - 1].answered)?;
         // The gateway may have had it by an earlier answer.
         let mut all = self.readings.range(..=nth).filter(|reading| reading.conn == conn && reading.stops);
-        all.find(|reading| reading.answered > before).map_or(Some(sure), |first| Some(first.answered))
+        all.find(|reading| reading.answered > before).map(|first| first.answered)
     }
 
     /// Whether the robot had these values together at an instant between these two.
