@@ -2,7 +2,6 @@
 
 use proto_core::engine::Input;
 use proto_core::recipe::model::Mode;
-use proto_core::wire::can::CanId;
 
 use super::*;
 
@@ -10,24 +9,8 @@ use super::*;
 const DONE: u8 = 0;
 const PENDING: u8 = 1;
 
-fn byte() -> Encoding {
-    Encoding::scalar(T::Byte)
-}
-
-fn fixed(value: i64) -> FieldSpec {
-    FieldSpec::Fixed { encoding: byte(), value }
-}
-
-fn byte_to(name: &str) -> FieldSpec {
-    FieldSpec::DeviceInput { encoding: byte(), overflow: Overflow::Usual, to: to(name) }
-}
-
 fn frame(cell: &mut Cell, id: Option<u16>, head: &[u8], fields: Vec<FieldSpec>) -> Option<u8> {
-    let fields = cell.fields(fields);
-    let (head, tail) = (Delimiter::from_slice(head).unwrap(), Delimiter::default());
-    let id = id.map(CanId::Standard);
-    cell.0.frames.push(FrameSpec { id, remote: false, head, tail, fields }).unwrap();
-    Some(cell.0.frames.len() as u8 - 1)
+    frame_of(cell, id, head, &[], fields)
 }
 
 /// `G` starts it, `Q` asks for a value, `H` stops it. Each answer to `G` is `S` and a status, which is the code of a

@@ -11,33 +11,8 @@ use proto_core::wire::scalar::ScalarType as T;
 use crate::line::*;
 use crate::rig::*;
 
-fn byte() -> Encoding {
-    Encoding::scalar(T::Byte)
-}
-
-fn fixed(value: i64) -> FieldSpec {
-    FieldSpec::Fixed { encoding: byte(), value }
-}
-
-fn byte_to(name: &str) -> FieldSpec {
-    FieldSpec::DeviceInput { encoding: byte(), overflow: Overflow::Usual, to: to(name) }
-}
-
 fn byte_to_nothing() -> FieldSpec {
     FieldSpec::DeviceInput { encoding: byte(), overflow: Overflow::Usual, to: InputBinding::Unused }
-}
-
-/// Adds a frame of an exchange and returns its index.
-fn frame(cell: &mut Cell, id: Option<u16>, head: &[u8], tail: &[u8], fields: Vec<FieldSpec>) -> Option<u8> {
-    let fields = cell.fields(fields);
-    let bytes = |bytes| Delimiter::from_slice(bytes).unwrap();
-    let index = cell.0.frames.len() as u8;
-    let id = id.map(CanId::Standard);
-    cell.0
-        .frames
-        .push(FrameSpec { id, remote: false, head: bytes(head), tail: bytes(tail), fields })
-        .unwrap();
-    Some(index)
 }
 
 fn asks(request: Option<u8>, reply: Option<u8>, refusal: Option<u8>, when: AskWhen) -> Exchange {
@@ -47,10 +22,11 @@ fn asks(request: Option<u8>, reply: Option<u8>, refusal: Option<u8>, when: AskWh
 /// A screwdriver: `Q` asks for torque and angle, which `A` answers and `N` refuses with a code. It says
 /// `E` with a number when somebody presses its lever.
 fn screwdriver(cell: &mut Cell) -> PortId {
-    let request = frame(cell, None, &[], b"\r", vec![fixed(0x51)]);
-    let reply = frame(cell, None, b"A", b"\r", vec![byte_to("WordInputReg[1]"), byte_to("WordInputReg[2]")]);
-    let refusal = frame(cell, None, b"N", b"\r", vec![FieldSpec::Padding { len: 1, fill: 0 }]);
-    let event = frame(cell, None, b"E", b"\r", vec![byte_to("WordInputReg[4]")]);
+    let request = frame_of(cell, None, &[], b"\r", vec![fixed(0x51)]);
+    let reply =
+        frame_of(cell, None, b"A", b"\r", vec![byte_to("WordInputReg[1]"), byte_to("WordInputReg[2]")]);
+    let refusal = frame_of(cell, None, b"N", b"\r", vec![FieldSpec::Padding { len: 1, fill: 0 }]);
+    let event = frame_of(cell, None, b"E", b"\r", vec![byte_to("WordInputReg[4]")]);
     let table =
         [asks(request, reply, refusal, AskWhen::every(MS(50))), asks(None, event, None, AskWhen::NEVER)];
     talking(cell, &table)
@@ -93,9 +69,9 @@ fn a_reply_a_refusal_and_what_comes_unasked_are_told_apart() {
 fn a_refusal_that_begins_as_a_shorter_frame_of_another_device_is_taken() {
     let mut cell = Cell::new();
     let sum = || FieldSpec::Checksum(Checksum::standard(Algorithm::CRC16_MODBUS).over(1, None));
-    let request = frame(&mut cell, None, b"Q", b"", vec![fixed(1), sum()]);
-    let reply = frame(&mut cell, None, b"A", b"", vec![fixed(0x20), sum()]);
-    let refusal = frame(&mut cell, None, b"A", b"", vec![fixed(0xA0), byte_to_nothing(), sum()]);
+    let request = frame_of(&mut cell, None, b"Q", b"", vec![fixed(1), sum()]);
+    let reply = frame_of(&mut cell, None, b"A", b"", vec![fixed(0x20), sum()]);
+    let refusal = frame_of(&mut cell, None, b"A", b"", vec![fixed(0xA0), byte_to_nothing(), sum()]);
     let table = [asks(request, reply, refusal, AskWhen::every(MS(50)))];
     let port = talking(&mut cell, &table);
     let mut line = Line::new(&cell, port);
@@ -121,8 +97,8 @@ fn a_refusal_that_begins_as_a_shorter_frame_of_another_device_is_taken() {
 fn a_request_that_failed_while_it_was_leaving_is_repeated_at_once() {
     let mut cell = Cell::new();
     let sum = || FieldSpec::Checksum(Checksum::standard(Algorithm::CRC16_MODBUS).over(1, None));
-    let request = frame(&mut cell, None, b"Q", b"", vec![fixed(1), sum()]);
-    let reply = frame(&mut cell, None, b"A", b"", vec![fixed(0x20), byte_to("WordInputReg[1]"), sum()]);
+    let request = frame_of(&mut cell, None, b"Q", b"", vec![fixed(1), sum()]);
+    let reply = frame_of(&mut cell, None, b"A", b"", vec![fixed(0x20), byte_to("WordInputReg[1]"), sum()]);
     let exchange = asks(request, reply, None, AskWhen::every(MS(200)));
     let port = talking(&mut cell, &[Exchange { timeout: MS(100), ..exchange }]);
     let mut rig = cell.rig();
@@ -151,7 +127,7 @@ fn a_request_that_failed_while_it_was_leaving_is_repeated_at_once() {
 #[test]
 fn an_echo_behind_a_late_reply_is_no_reply() {
     let mut cell = Cell::new();
-    let both = [0, 1].map(|_| frame(&mut cell, None, b"Q", b"", vec![fixed(1)]));
+    let both = [0, 1].map(|_| frame_of(&mut cell, None, b"Q", b"", vec![fixed(1)]));
     let port = talking(&mut cell, &[asks(both[0], both[1], None, AskWhen::every(MS(50)))]);
     let Bus::Rs485(settings) = &mut cell.last_port().bus else { panic!() };
     settings.echo = Echo::Yes;
@@ -168,8 +144,8 @@ fn an_echo_behind_a_late_reply_is_no_reply() {
 fn a_request_and_its_reply_may_be_a_head_alone() {
     let mut cell = Cell::new();
     let sum = || vec![FieldSpec::Checksum(Checksum::standard(Algorithm::CRC16_MODBUS))];
-    let request = frame(&mut cell, None, &[1, 3], b"", sum());
-    let reply = frame(&mut cell, None, b"OK", b"\r", vec![]);
+    let request = frame_of(&mut cell, None, &[1, 3], b"", sum());
+    let reply = frame_of(&mut cell, None, b"OK", b"\r", vec![]);
     let port = talking(&mut cell, &[asks(request, reply, None, AskWhen::every(MS(50)))]);
     let mut line = Line::new(&cell, port);
     let asked = line.run(MS(220), |_| Some((MS(3), b"OK\r".to_vec())));
@@ -181,8 +157,8 @@ fn a_request_and_its_reply_may_be_a_head_alone() {
 #[test]
 fn a_request_waits_for_a_frame_of_the_part_to_leave_and_the_part_for_the_reply() {
     let mut cell = Cell::new();
-    let request = frame(&mut cell, None, &[], &[], vec![fixed(0x51)]);
-    let reply = frame(&mut cell, None, b"A", b"", vec![byte_to("WordInputReg[1]")]);
+    let request = frame_of(&mut cell, None, &[], &[], vec![fixed(0x51)]);
+    let reply = frame_of(&mut cell, None, b"A", b"", vec![byte_to("WordInputReg[1]")]);
     let lamp = cell.fields([fixed(0x4C), fixed(1)]);
     let output = cell.part(&[], &[], lamp);
     let recipe = cell.recipe(Mode::User, Parts::Stream { input: None, output });
@@ -217,20 +193,20 @@ fn a_request_waits_for_a_frame_of_the_part_to_leave_and_the_part_for_the_reply()
 
 /// A CANopen encoder, node 5: NMT start, its position by SDO, its heartbeat.
 fn encoder(cell: &mut Cell) -> PortId {
-    let start = frame(cell, Some(0), &[], &[], vec![fixed(1), fixed(5)]);
+    let start = frame_of(cell, Some(0), &[], &[], vec![fixed(1), fixed(5)]);
     let upload =
         |sub| vec![fixed(0x40), fixed(0x04), fixed(0x60), fixed(sub), FieldSpec::Padding { len: 4, fill: 0 }];
-    let request = frame(cell, Some(0x605), &[], &[], upload(0));
+    let request = frame_of(cell, Some(0x605), &[], &[], upload(0));
     let position = FieldSpec::DeviceInput {
         encoding: Encoding { order: ByteOrder::Little, ..Encoding::scalar(T::Dword) },
         overflow: Overflow::Usual,
         to: to("WordInputReg[1]"),
     };
     let reply =
-        frame(cell, Some(0x585), &[], &[], vec![fixed(0x43), fixed(4), fixed(0x60), fixed(0), position]);
+        frame_of(cell, Some(0x585), &[], &[], vec![fixed(0x43), fixed(4), fixed(0x60), fixed(0), position]);
     let abort = vec![fixed(0x80), fixed(4), fixed(0x60), fixed(0), FieldSpec::Padding { len: 4, fill: 0 }];
-    let refusal = frame(cell, Some(0x585), &[], &[], abort);
-    let heartbeat = frame(cell, Some(0x705), &[], &[], vec![byte_to("WordInputReg[2]")]);
+    let refusal = frame_of(cell, Some(0x585), &[], &[], abort);
+    let heartbeat = frame_of(cell, Some(0x705), &[], &[], vec![byte_to("WordInputReg[2]")]);
     let once = AskWhen { start: true, ..AskWhen::NEVER };
     let table = [
         asks(start, None, None, once),
@@ -289,9 +265,9 @@ fn a_canopen_node_is_started_and_asked_by_sdo() {
 #[test]
 fn a_remote_request_polls_a_node() {
     let mut cell = Cell::new();
-    let poll = frame(&mut cell, Some(0x181), &[], &[], vec![]);
+    let poll = frame_of(&mut cell, Some(0x181), &[], &[], vec![]);
     cell.0.frames.last_mut().unwrap().remote = true;
-    let reply = frame(&mut cell, Some(0x181), &[], &[], vec![byte_to("WordInputReg[1]")]);
+    let reply = frame_of(&mut cell, Some(0x181), &[], &[], vec![byte_to("WordInputReg[1]")]);
     let recipe =
         cell.recipe(Mode::User, Parts::Can { input: Default::default(), output: Default::default() });
     cell.0.exchanges.push(asks(poll, reply, None, AskWhen::every(MS(15)))).unwrap();
@@ -318,9 +294,9 @@ fn a_remote_request_polls_a_node() {
 #[test]
 fn a_frame_on_its_way_still_is_when_a_node_does_not_answer() {
     let mut cell = Cell::new();
-    let poll = frame(&mut cell, Some(0x181), &[], &[], vec![]);
+    let poll = frame_of(&mut cell, Some(0x181), &[], &[], vec![]);
     cell.0.frames.last_mut().unwrap().remote = true;
-    let reply = frame(&mut cell, Some(0x181), &[], &[], vec![byte_to("WordInputReg[1]")]);
+    let reply = frame_of(&mut cell, Some(0x181), &[], &[], vec![byte_to("WordInputReg[1]")]);
     let counter =
         FieldSpec::DeviceOutput { encoding: byte(), overflow: Overflow::Usual, from: OutputBinding::Counter };
     let fields = cell.fields([counter]);
@@ -352,7 +328,7 @@ fn a_frame_on_its_way_still_is_when_a_node_does_not_answer() {
 fn the_line_is_silent_between_requests_that_nobody_answers() {
     let mut cell = Cell::new();
     let table = [0x51, 0x52].map(|letter| {
-        let request = frame(&mut cell, None, &[], b"\r", vec![fixed(letter)]);
+        let request = frame_of(&mut cell, None, &[], b"\r", vec![fixed(letter)]);
         asks(request, None, None, AskWhen::every(MS(20)))
     });
     let port = talking(&mut cell, &table);

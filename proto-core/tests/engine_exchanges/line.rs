@@ -7,6 +7,7 @@ use proto_core::engine::PortId;
 use proto_core::modbus::rtu::Operation;
 use proto_core::recipe::model::Mode;
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::can::CanId;
 use proto_core::wire::scalar::ScalarType as T;
 
 use crate::rig::*;
@@ -30,6 +31,34 @@ pub fn register_to(name: &str) -> FieldSpec {
 
 pub fn register_from(name: &str) -> FieldSpec {
     FieldSpec::DeviceOutput { encoding: word(), overflow: Overflow::Usual, from: from(name) }
+}
+
+pub fn byte() -> Encoding {
+    Encoding::scalar(T::Byte)
+}
+
+pub fn fixed(value: i64) -> FieldSpec {
+    FieldSpec::Fixed { encoding: byte(), value }
+}
+
+pub fn byte_to(name: &str) -> FieldSpec {
+    FieldSpec::DeviceInput { encoding: byte(), overflow: Overflow::Usual, to: to(name) }
+}
+
+/// Adds a frame of an exchange and returns its index.
+pub fn frame_of(
+    cell: &mut Cell,
+    id: Option<u16>,
+    head: &[u8],
+    tail: &[u8],
+    fields: Vec<FieldSpec>,
+) -> Option<u8> {
+    let fields = cell.fields(fields);
+    let bytes = |bytes| Delimiter::from_slice(bytes).unwrap();
+    let index = cell.0.frames.len() as u8;
+    let (id, head, tail) = (id.map(CanId::Standard), bytes(head), bytes(tail));
+    cell.0.frames.push(FrameSpec { id, remote: false, head, tail, fields }).unwrap();
+    Some(index)
 }
 
 /// A port with these exchanges and without parts.

@@ -14,12 +14,7 @@ const ON_CHANGE: AskWhen = AskWhen { change: true, ..AskWhen::NEVER };
 const ON_BOTH: AskWhen = AskWhen { start: true, ..ON_CHANGE };
 
 fn frame(cell: &mut Cell, head: &[u8], fields: Vec<FieldSpec>) -> Option<u8> {
-    let fields = cell.fields(fields);
-    let index = cell.0.frames.len() as u8;
-    let head = Delimiter::from_slice(head).unwrap();
-    let tail = Delimiter::from_slice(b"\r").unwrap();
-    cell.0.frames.push(FrameSpec { id: None, remote: false, head, tail, fields }).unwrap();
-    Some(index)
+    frame_of(cell, None, head, b"\r", fields)
 }
 
 /// `C` and the command, which the gripper does not confirm.
