@@ -5,6 +5,7 @@ use proto_core::device::{
     Algorithm, Bits, Boundary, ByteOrder, Carrier, Checksum, Counts, Digits, Encoding, Escape, Kind, Length,
     Place, Text, TextWidth, Width,
 };
+use proto_core::modbus::adu::HEADER_LEN;
 use proto_core::sysvar::Direction;
 use proto_core::wire::scalar::ScalarType;
 use recipe_config::{DeviceField, DeviceRecipe, FrameEnds, NamedFrame};
@@ -40,7 +41,8 @@ struct Frame {
 
 /// The rows of a frame of a Modbus line as it is over TCP: a header in front, and no checksum at the end.
 pub(super) fn over_tcp(mut rows: Vec<Row>) -> Vec<Row> {
-    const HEADER: usize = 6;
+    // Without the unit id, which is the address of the slave.
+    const HEADER: usize = HEADER_LEN - 1;
     rows.pop();
     for row in &mut rows {
         let places = row.bytes.split("..").map(|place| place.parse::<usize>().map(|place| place + HEADER));
