@@ -62,13 +62,16 @@ impl Maker<'_> {
             let made = match (flight.cause, item.event) {
                 (Cause::Event, Event::Ready { len, .. } | Event::Sent { len, .. }) => {
                     copy(item, kept, usize::from(len), body);
-                    Some(usize::from(len))
+                    Some((usize::from(len), None))
                 }
                 (Cause::Event, _) => continue,
-                _ => self.make(item, body),
+                _ => {
+                    let content = if item.on_change { self.content(item, body) } else { None };
+                    self.make(item, body).map(|len| (len, content))
+                }
             };
             let peer = talks.peer_of(flight)?;
-            let Some(len) = made else {
+            let Some((len, content)) = made else {
                 bump(&mut peer.counters.unprepared);
                 if flight.is_repetition() {
                     bump(&mut counters.unanswered);
@@ -98,7 +101,7 @@ impl Maker<'_> {
             } else {
                 // What goes out now is neither owed any more, nor a change.
                 item.is_owed = false;
-                item.digest = item.on_change.then(|| digest(DIGEST_SEED, request));
+                item.digest = content;
             }
             let told_by = (expected, sdo_of(item, request));
             line.handed_over(talks, flight, told_by, request, now);
@@ -116,13 +119,18 @@ impl Maker<'_> {
         let mut is_wanted = item.is_owed && self.make(item, out).is_some();
         item.is_owed &= !is_wanted;
         if item.on_change
-            && let Some(len) = self.make(item, out)
+            && let Some(content) = self.content(item, out)
         {
-            let hash = digest(DIGEST_SEED, out.get(..len).unwrap_or(&[]));
-            is_wanted |= item.digest != Some(hash);
-            item.digest = Some(hash);
+            is_wanted |= item.digest != Some(content);
+            item.digest = Some(content);
         }
         is_wanted
+    }
+
+    /// What a request says now, but for a counter of frames: that changes with each.
+    fn content(&self, item: &Item, out: &mut [u8]) -> Option<u64> {
+        let len = self.make_counted(item, 0, out).ok()?;
+        Some(digest(DIGEST_SEED, out.get(..len).unwrap_or(&[])))
     }
 
     fn fields(&self, item: &Item) -> &[OutputBind] {
@@ -139,10 +147,15 @@ impl Maker<'_> {
 
     /// Writes the request of an event to the front of `out`, or says why it has none.
     pub(super) fn make_event(&self, item: &Item, out: &mut [u8]) -> Result<usize, Outcome> {
+        self.make_counted(item, self.sender.frames_sent, out)
+    }
+
+    /// The same, with this number of frames before it.
+    fn make_counted(&self, item: &Item, frames_sent: u32, out: &mut [u8]) -> Result<usize, Outcome> {
         if !self.fields(item).iter().all(|field| may_send(self.sender, self.image, field, self.now)) {
             return Err(Outcome::NoValue);
         }
-        self.encode(item, out).ok_or(Outcome::OutOfLimits)
+        self.encode(item, frames_sent, out).ok_or(Outcome::OutOfLimits)
     }
 
     /// Writes a request to the front of `out`; `None` if a value of it is unknown or stale.
@@ -150,9 +163,8 @@ impl Maker<'_> {
         self.make_event(item, out).ok()
     }
 
-    fn encode(&self, item: &Item, out: &mut [u8]) -> Option<usize> {
-        let (frames_sent, reply) = (self.sender.frames_sent, self.reply);
-        let texts = &self.codec.texts;
+    fn encode(&self, item: &Item, frames_sent: u32, out: &mut [u8]) -> Option<usize> {
+        let (texts, reply) = (&self.codec.texts, self.reply);
         let outgoing = Outgoing { image: self.image, bindings: self.bindings, texts, frames_sent, reply };
         match (item.asks, &item.request) {
             (Asks::Rtu { slave, operation }, format) => {

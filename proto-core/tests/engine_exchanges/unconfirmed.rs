@@ -83,6 +83,26 @@ fn a_change_waits_until_the_device_answers_and_is_sent_once() {
 }
 
 #[test]
+fn a_counter_in_a_request_is_no_change() {
+    let mut cell = Cell::new();
+    let encoding = Encoding { order: ByteOrder::Big, ..Encoding::scalar(T::Word) };
+    let value =
+        FieldSpec::DeviceOutput { encoding, overflow: Overflow::Usual, from: from("WordOutputReg[1]") };
+    let encoding = Encoding::scalar(T::Byte);
+    let counter =
+        FieldSpec::DeviceOutput { encoding, overflow: Overflow::Usual, from: OutputBinding::Counter };
+    let request = frame(&mut cell, b"C", vec![value, counter]);
+    let each = never_late(Exchange::new(1, Talk::Frames { request, reply: None, refusal: None }, ON_CHANGE));
+    let position = letter(&mut cell, b'Q', true, AskWhen::every(MS(100)));
+    let port = talking(&mut cell, &[each, position]);
+    let mut line = Line::new(&cell, port);
+    for value in [1, 2, 3] {
+        set(&mut line, value);
+        assert_eq!(commands(&mut line, MS(2_000), true), [value as u8]);
+    }
+}
+
+#[test]
 fn a_command_of_the_start_is_repeated_once_when_the_device_is_back() {
     let mut line = gripper(ON_BOTH);
     assert_eq!(commands(&mut line, MS(1_000), true), [1]);
@@ -114,7 +134,8 @@ fn what_comes_first_at_the_start_comes_first_when_the_device_is_back() {
     cell.last_port().absent = MS(1_000);
     let mut line = Line::new(&cell, port);
     let letters = |told: Vec<Vec<u8>>| told.iter().map(|request| request[0]).collect::<Vec<_>>();
-    assert_eq!(letters(told(&mut line, MS(250), true))[..4], *b"RSTQ");
+    // The first answer tells that it is there.
+    assert_eq!(letters(told(&mut line, MS(250), true))[..5], *b"QRSTQ");
     let silent = letters(told(&mut line, MS(3_000), false));
     assert!(silent.len() > 2 && silent.iter().all(|letter| *letter == b'Q'), "{silent:?}");
     let back = letters(told(&mut line, MS(12_000), true));
