@@ -68,6 +68,9 @@ impl Cell {
         }
         let Some(Waiting { ports, links, .. }) = self.asleep.take() else { return };
         self.disturb(None);
+        if let Some(judge) = &mut self.judge {
+            judge.gateway_wakes(self.now);
+        }
         // The order in which a driver reads its sources is not specified.
         if self.rng.below(2) == 0 {
             self.report_port_events(ports);

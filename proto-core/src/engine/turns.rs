@@ -19,8 +19,9 @@
 //! not answered while others of its peer are has a wait of its own.
 //!
 //! **The start of a device.** What a peer is asked at its start comes before anything else that it is asked, in the
-//! order of the rows. It is asked once, and again only when the peer has started: it said so, or it was away for its
-//! `absent` time.
+//! order of the rows. Where another exchange with a period tells whether the peer is there, it waits until the peer is
+//! heard, or was not heard for its `absent` time. It is asked once, and again only when the peer has started: it said so,
+//! or it was away for its `absent` time.
 
 use super::line::PeerState;
 use crate::modbus::rtu::Expected;
@@ -228,6 +229,16 @@ impl Turn {
 
     fn is_away(&self) -> bool {
         self.presence == Presence::Down
+    }
+
+    /// It was away for its `absent` time.
+    fn was_absent(&self) -> bool {
+        self.failing.is_some_and(|(since, until)| until.saturating_since(since) >= self.absent)
+    }
+
+    /// It has said nothing for that time since the line began: perhaps it does not before it was started.
+    fn is_mute(&self) -> bool {
+        !self.was_heard && self.was_absent()
     }
 }
 
@@ -519,14 +530,14 @@ impl Turns<'_> {
         first.is_some_and(|first| first != nth)
     }
 
-    /// Whether a start waits until its peer is heard, because another row will tell: one that is sent in vain, or while
-    /// the peer is away, may be carried out without a reply, and once more when the peer is back.
+    /// Whether a start waits until its peer is heard, because another row will tell: one that is sent to a peer that is
+    /// perhaps away may be carried out without a reply, and once more when the peer is heard.
     fn start_waits(&self, row: &Row) -> bool {
         let tells = |other: &Row| other.peer == row.peer && other.kind.is_answered && other.grid.is_some();
-        let is_away = || self.peers.get(usize::from(row.peer)).is_some_and(|peer| peer.turn.is_away());
+        let turn = self.peers.get(usize::from(row.peer)).map(|peer| &peer.turn);
         let waits = match row.start {
             Start::Over => false,
-            Start::Wanted(_) => is_away(),
+            Start::Wanted(_) => turn.is_some_and(|turn| turn.presence != Presence::Up && !turn.is_mute()),
             Start::Unheard(_) => true,
         };
         waits && self.rows.iter().any(tells)
@@ -605,9 +616,7 @@ impl Turns<'_> {
         let Some(peer) = self.peers.get_mut(usize::from(which)) else { return News::Nothing };
         let turn = &mut peer.turn;
         let was_away = turn.is_away();
-        let has_started = turn.failing.is_some_and(|(since, until)| {
-            until.saturating_since(since) >= turn.absent || !turn.was_heard && turn.failures > 1
-        });
+        let has_started = turn.was_absent();
         (turn.presence, turn.was_heard, turn.failing, turn.failures) = (Presence::Up, true, None, 0);
         for row in self.rows.iter_mut().filter(|row| row.peer == which) {
             row.is_missed = false;

@@ -257,9 +257,14 @@ fn a_canopen_node_is_started_and_asked_by_sdo() {
     // After bus-off the node may have restarted.
     rig.input(Input::PortBus { port, state: proto_core::engine::BusState::BusOff });
     rig.input(Input::PortBus { port, state: proto_core::engine::BusState::Active });
+    let start = CanFrame::new(CanId::Standard(0), &[1, 5]).unwrap();
+    rig.run(MS(50));
+    let sent = rig.can_sent_to(port);
+    assert!(!sent.contains(&start), "nothing says that it is there: {sent:?}");
+    rig.can(port, 0x585, &[0x43, 4, 0x60, 0, 1, 1, 0, 0]);
     rig.run(MS(50));
     let again = rig.can_sent_to(port);
-    assert!(again.contains(&CanFrame::new(CanId::Standard(0), &[1, 5]).unwrap()), "{again:?}");
+    assert!(again.contains(&start), "{again:?}");
 }
 
 #[test]

@@ -184,6 +184,13 @@ impl Judge {
         self.port_begins(now);
     }
 
+    /// The gateway is called again after a sleep.
+    pub(crate) fn gateway_wakes(&mut self, now: Instant) {
+        self.robot.gateway_wakes(now);
+        // One that it does not have it reads again.
+        self.stop = self.stop.filter(|stop| stop.known.is_some());
+    }
+
     /// The gateway's port is there, or there again.
     pub(crate) fn port_begins(&mut self, now: Instant) {
         (self.starts, self.began, self.replied) = (1, now, None);
@@ -247,7 +254,7 @@ impl Judge {
             }
             Act::Did(Order::Stop, _) => {}
             Act::Did(Order::Start, _) => {
-                if self.starts == 0 && self.is_absent(self.replied.unwrap_or(self.began), now) {
+                if self.starts == 0 && self.is_away(now) {
                     // It is the first thing that it hears, and so long nothing was heard of it.
                     (self.starts, self.replied) = (1, Some(now));
                 }
@@ -384,14 +391,7 @@ impl Judge {
 
     /// Whether nothing was heard of it for so long that it has started, to the gateway.
     fn is_away(&self, now: Instant) -> bool {
-        match self.replied {
-            Some(before) => self.is_absent(before, now),
-            // Never heard: it was asked in vain at least twice, behind the late time unless it was to stop.
-            None => {
-                let stops = self.stop.is_some() || self.stop_heard.is_some_and(|heard| heard >= self.began);
-                stops || now.saturating_since(self.began) + SLACK >= self.rules.first_failures
-            }
-        }
+        self.is_absent(self.replied.unwrap_or(self.began), now)
     }
 
     fn replies(&mut self, is_whole: bool, tells: bool, now: Instant) {

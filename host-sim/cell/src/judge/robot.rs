@@ -20,6 +20,8 @@ pub(super) struct Robot {
     conns: BTreeMap<u64, Conn>,
     /// When the gateway started.
     started: Instant,
+    /// When it was called again after a sleep, which it may begin by discarding what has come.
+    woke: Instant,
 }
 
 /// A variable that the device is told.
@@ -92,12 +94,18 @@ impl Robot {
             readings: VecDeque::new(),
             conns: BTreeMap::new(),
             started: Instant::ZERO,
+            woke: Instant::ZERO,
         }
     }
 
     /// The gateway knows nothing of before.
     pub(super) fn gateway_starts(&mut self, now: Instant) {
         self.started = now;
+    }
+
+    /// What was answered before, and is not known to be taken, may never be.
+    pub(super) fn gateway_wakes(&mut self, now: Instant) {
+        self.woke = now;
     }
 
     /// The controller's variables as they are now.
@@ -128,7 +136,8 @@ impl Robot {
                 }
                 let newest = self.readings.iter_mut().rev().find(|reading| reading.conn == id);
                 // An answer to what was given up is not taken.
-                if let Some(reading) = newest.filter(|reading| reading.answered >= before) {
+                let since = before.max(self.woke);
+                if let Some(reading) = newest.filter(|reading| reading.answered >= since) {
                     reading.taken.get_or_insert(now);
                 }
             }

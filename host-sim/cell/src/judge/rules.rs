@@ -31,8 +31,6 @@ pub(crate) struct Rules {
     pub stale_after: Duration,
     /// What was away for so long has started.
     pub absent: Duration,
-    /// Two requests at the start have failed by then, not before.
-    pub first_failures: Duration,
     /// The most that each variable may be, for the program; beyond it nothing is sent.
     pub limits: Vec<(SysVar, u16)>,
 }
@@ -51,8 +49,6 @@ impl Rules {
             value_age: PORT_TIMEOUT + timeout.saturating_mul(9) + Duration::from_millis(3_500),
             stale_after: Duration::from_millis(300),
             absent: Duration::from_secs(3),
-            // Behind the late time, with which a port begins.
-            first_failures: LATE + Duration::from_micros(timeout.as_micros() * 19 / 10),
             limits: Vec::new(),
         }
     }
@@ -90,4 +86,3 @@ pub(super) fn var(name: &str) -> SysVar {
 pub(super) const MOVE_BIT: u8 = 0;
 pub(super) const STOP_BIT: u8 = 1;
 const PORT_TIMEOUT: Duration = Duration::from_secs(1);
-const LATE: Duration = Duration::from_secs(1);

@@ -43,7 +43,7 @@ fn shared(cells: &[&str], level: Level, span: Duration) -> ([Part; 3], Part) {
 /// The hashes of these runs on every machine. Only a change of what the engine, the controller or the cell
 /// does, or when, may change them; then enter the new ones here.
 const HASHES: [(Level, u64); 2] =
-    [(Level::None, 0x8B3F_292B_288A_1B48), (Level::Harsh, 0xAD3F_6D47_71E2_9F99)];
+    [(Level::None, 0xF3AB_64F5_5FC7_0432), (Level::Harsh, 0xA64D_CD90_FA09_E10E)];
 
 #[test]
 fn a_seed_means_the_same_trace_on_every_machine() {

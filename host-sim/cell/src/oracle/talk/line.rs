@@ -77,6 +77,8 @@ struct SlaveWatch {
     /// When the first request left that it has not answered since it was heard, and when the newest one failed.
     failing: Option<(Instant, Instant)>,
     failures: u32,
+    /// When something at its start was answered that had failed before.
+    opened: Instant,
     asked: Instant,
     started: Instant,
 }
@@ -269,6 +271,11 @@ impl TalkWatch {
             let what = format!("{}: asked although its device has not started", name(spec));
             return Err((Invariant::Cycle, what));
         }
+        let was_heard = self.slaves.get(&spec.slave).is_some_and(|slave| slave.was_heard);
+        if repeated.is_none() && self.start_waits(talk, row) && (was_heard || !is_away) {
+            let what = format!("{}: asked, and nothing tells that its device is there", name(spec));
+            return Err((Invariant::Cycle, what));
+        }
         if repeated.is_none()
             && let Some(other) =
                 spec.alike.iter().copied().find(|&other| self.rows[other].is_outstanding(now))
@@ -345,10 +352,19 @@ impl TalkWatch {
         let opening = self.opening.get(&slave)?;
         // What nobody answers waits for a slave that does not.
         let is_down = self.slaves.get(&slave).is_some_and(|slave| slave.presence == Presence::Down);
-        let may_be = |nth: &usize| !is_down || talk.rows[*nth].is_answered();
+        let may_be =
+            |nth: &usize| (!is_down || talk.rows[*nth].is_answered()) && !self.start_waits(talk, *nth);
         let first = *opening.iter().find(|nth| !self.passed.contains(*nth) && may_be(nth))?;
         let is_itself = first == row || opening.contains(&row) && row < first;
         (!is_itself).then_some(first)
+    }
+
+    /// Whether a start waits for a sign of life of its slave, for which another exchange asks.
+    fn start_waits(&self, talk: &TalkSpec, row: usize) -> bool {
+        let spec = &talk.rows[row];
+        let is_up = self.slaves.get(&spec.slave).is_some_and(|slave| slave.presence == Presence::Up);
+        let tells = |row: &RowSpec| row.is_answered() && row.every.is_some();
+        spec.kind == Kind::Start && !is_up && talk.rows_of(spec.slave).any(|(_, row)| tells(row))
     }
 
     fn is_opened(&mut self, slave: u8, row: usize) {
@@ -493,6 +509,10 @@ impl TalkWatch {
         let spec = &talk.rows[flight.row];
         let watch = &mut self.rows[flight.row];
         (watch.was_answered, watch.is_unconfirmed) = (true, false);
+        if spec.at_start && watch.failures > 0 {
+            // The others may have waited for it.
+            self.slaves.entry(spec.slave).or_default().opened = now;
+        }
         match ended {
             Ended::Good | Ended::Refused => (watch.failures, watch.calm_at) = (0, Instant::ZERO),
             Ended::Busy | Ended::Unclear => watch.waits_longer(spec.timeout, now),
@@ -508,9 +528,8 @@ impl TalkWatch {
     /// A sign of life of a slave. Returns it if it has started: what is asked at its start is asked again.
     pub(super) fn heard(&mut self, talk: &TalkSpec, number: u8, now: Instant) -> Option<u8> {
         let slave = self.slaves.entry(number).or_default();
-        let has_started = slave.failing.is_some_and(|(since, newest)| {
-            newest.saturating_since(since) >= talk.absent || !slave.was_heard && slave.failures > 1
-        });
+        let has_started =
+            slave.failing.is_some_and(|(since, newest)| newest.saturating_since(since) >= talk.absent);
         if slave.presence != Presence::Up {
             (slave.presence, slave.since) = (Presence::Up, now);
         }
@@ -654,7 +673,7 @@ impl TalkWatch {
                 continue;
             }
             checked += 1;
-            let ready = watch.blocked_until.max(watch.calm_at).max(slave.since);
+            let ready = watch.blocked_until.max(watch.calm_at).max(slave.since).max(slave.opened);
             let due = (asked + every).max(free).max(ready);
             let idle = now.saturating_since(due);
             if self.is_free() && !is_busy && idle > IDLE + stalled(due) {
@@ -704,7 +723,8 @@ impl TalkWatch {
         let (slave, watch) = (self.slaves.get(&number)?, &self.rows[row]);
         let is_up = slave.presence == Presence::Up && slave.failing.is_none();
         let is_taken = !watch.is_refused && !watch.is_unconfirmed && watch.failures == 0;
-        let since = slave.since.max(self.disturbed_at).max(watch.blocked_until).max(slave.started);
+        let since = slave.since.max(self.disturbed_at).max(watch.blocked_until).max(slave.opened);
+        let since = since.max(slave.started);
         (is_up && is_taken && !self.is_opening(talk, number, slave)).then_some(since.max(self.began))
     }
 }

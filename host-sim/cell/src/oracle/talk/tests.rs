@@ -423,11 +423,21 @@ fn values_at_the_robot_that_their_slave_did_not_hold() {
 
 #[test]
 fn an_exchange_before_what_is_asked_at_the_start() {
-    // The gateway's first request to the device is replaced by another.
+    let found = caught_out(PEER, |_, _, output| match output {
+        Output::PortSend { bytes, .. } if bytes[..2] == [1, 1] => {
+            Some(vec![Forged::Port(PORT, sealed(&[1, 3, 0, 7]))])
+        }
+        _ => None,
+    });
+    assert_eq!(found, Invariant::Cycle);
+}
+
+#[test]
+fn a_start_before_a_sign_of_life() {
     let mut is_first = true;
     let found = caught_out(PEER, move |_, _, output| match output {
         Output::PortSend { .. } if std::mem::take(&mut is_first) => {
-            Some(vec![Forged::Port(PORT, sealed(&[1, 2]))])
+            Some(vec![Forged::Port(PORT, sealed(&[1, 1]))])
         }
         _ => None,
     });
