@@ -476,6 +476,27 @@ fn an_event_whose_connection_is_lost_is_unknown_and_never_sent_again() {
 }
 
 #[test]
+fn a_bit_of_before_the_controller_and_the_device_were_lost_does_not_rise() {
+    let mut device = Device::new(axis);
+    device.set("WordOutputReg[1]", 1_000);
+    device.run(500, good);
+    // First the controller's connection, then the device's; both are back at once. What is written on the first one has
+    // an answer before the bit is read, and the newest value of the bit is still the 0 of before.
+    device.rig.input(Input::LinkDown { link: LinkId::MODBUS });
+    device.run(7, good);
+    device.lose();
+    device.bit(0, true);
+    let asked = device.run(500, good);
+    assert!(device.is_up() && asked.len() > 5);
+    assert_eq!((starts(&asked), device.events()), (0, EventCounters::default()));
+    // The next rise is one.
+    device.bit(0, false);
+    device.run(100, good);
+    device.bit(0, true);
+    assert_eq!(starts(&device.run(300, good)), 1);
+}
+
+#[test]
 fn an_event_without_a_connection_is_not_sent_later() {
     let mut device = Device::new(axis);
     device.set("WordOutputReg[1]", 1_000);

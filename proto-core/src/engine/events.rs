@@ -66,8 +66,6 @@ pub(super) struct Trigger {
 struct Reading {
     on: bool,
     at: Instant,
-    /// Which connection brought it, counted.
-    connection: u32,
 }
 
 /// The event of an exchange.
@@ -105,14 +103,15 @@ impl Trigger {
         self.last = None;
     }
 
-    /// Takes a reading. Returns whether the bit has risen, for an event, and for a write that stops, which does not need
-    /// to know that it was 0.
-    fn read(&mut self, reading: Reading, stale_after: Duration) -> [bool; 2] {
+    /// Takes a reading over the connection that is up since then. Returns whether the bit has risen, for an event, and for
+    /// a write that stops, which does not need to know that it was 0.
+    fn read(&mut self, reading: Reading, up_since: Instant, stale_after: Duration) -> [bool; 2] {
         let before = self.last.replace(reading);
         if !reading.on {
             return [false; 2];
         }
-        let before = before.filter(|before| before.connection == reading.connection);
+        // By its time: what an earlier connection brought may be looked at again while this one is up.
+        let before = before.filter(|before| before.at >= up_since);
         let was_off =
             before.is_some_and(|before| !before.on && reading.at.saturating_since(before.at) <= stale_after);
         // What happened between two connections nobody knows.
@@ -163,8 +162,8 @@ impl EventCounters {
 pub(super) struct Sources<C> {
     /// Groups below this are frames of field ports.
     pub first_of_links: u8,
-    /// Which connection a group's values come over, counted.
-    pub connection: C,
+    /// Since when the connection is up over which a group's values come.
+    pub up_since: C,
     pub stale_after: Duration,
     /// Whether the device of the port is there.
     pub is_usable: bool,
@@ -183,7 +182,7 @@ impl Events<'_, '_> {
     pub(super) fn image_changed(
         &mut self,
         maker: &Maker<'_>,
-        sources: &Sources<impl Fn(GroupId) -> u32>,
+        sources: &Sources<impl Fn(GroupId) -> Instant>,
         kept: &mut [Piece],
     ) {
         for nth in 0..self.items.len() {
@@ -195,7 +194,7 @@ impl Events<'_, '_> {
         self.note_expiry();
     }
 
-    fn read_bit(&mut self, nth: usize, maker: &Maker<'_>, sources: &Sources<impl Fn(GroupId) -> u32>) {
+    fn read_bit(&mut self, nth: usize, maker: &Maker<'_>, sources: &Sources<impl Fn(GroupId) -> Instant>) {
         let Some(item) = self.items.get_mut(nth) else { return };
         let Some(trigger) = &mut item.trigger else { return };
         let Some(at) = maker.image.known_since(trigger.var) else { return trigger.forget() };
@@ -204,8 +203,8 @@ impl Events<'_, '_> {
         if is_old {
             return;
         }
-        let connection = maker.image.group(trigger.var).map_or(0, &sources.connection);
-        let [rises, stops] = trigger.read(Reading { on, at, connection }, sources.stale_after);
+        let up_since = maker.image.group(trigger.var).map_or(Instant::ZERO, &sources.up_since);
+        let [rises, stops] = trigger.read(Reading { on, at }, up_since, sources.stale_after);
         if item.stops {
             // Also while the device is away: it is a state.
             if stops {
@@ -271,7 +270,7 @@ impl Events<'_, '_> {
         &mut self,
         nth: usize,
         maker: &Maker<'_>,
-        sources: &Sources<impl Fn(GroupId) -> u32>,
+        sources: &Sources<impl Fn(GroupId) -> Instant>,
         kept: &mut [Piece],
     ) {
         let Some(Item { event: Event::Risen { at, until }, .. }) = self.items.get(nth) else { return };

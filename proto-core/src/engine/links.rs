@@ -170,13 +170,17 @@ impl<'a> LinksView<'a> {
 }
 
 impl<const UPLINKS: usize> Links<UPLINKS> {
-    /// Which connection the values of a group come over, counted; 0 for what does not come from the controller.
-    pub(super) fn connection_of(&self, group: GroupId) -> u32 {
+    /// Since when the connection is up over which the values of a group come; [`Instant::ZERO`] if there is none, or for
+    /// what does not come from the controller.
+    pub(super) fn up_since(&self, group: GroupId) -> Instant {
         let state = self.state.iter().filter(|link| link.group == group).map(|link| &link.supervisor);
         let recipes =
             self.recipes.iter().filter(|link| link.group == Some(group)).map(|link| &link.supervisor);
         let modbus = self.modbus.iter().filter(|link| link.polls(group)).map(|link| &link.supervisor);
-        state.chain(recipes).chain(modbus).next().map_or(0, |supervisor| supervisor.history().connects)
+        match state.chain(recipes).chain(modbus).next().map(Supervisor::state) {
+            Some(LinkState::Up { since }) => since,
+            _ => Instant::ZERO,
+        }
     }
 
     pub(super) const fn new() -> Self {

@@ -476,7 +476,7 @@ impl FieldPort {
         image: &Image,
         bindings: Outputs<'_>,
         mut view: View<'_>,
-        (first_of_links, connection): (u8, impl Fn(GroupId) -> u32),
+        (first_of_links, up_since): (u8, impl Fn(GroupId) -> Instant),
         now: Instant,
     ) {
         let is_usable = self.is_usable();
@@ -485,7 +485,7 @@ impl FieldPort {
         let (items, mut talks, kept) = view.served(&line);
         let stale_after = self.sender.stale_after();
         let maker = Maker { image, bindings, codec, sender: &self.sender, reply: self.reply, now };
-        let sources = Sources { first_of_links, connection, stale_after, is_usable };
+        let sources = Sources { first_of_links, up_since, stale_after, is_usable };
         let mut events = Events { items, talks: &mut talks, line: &mut line, now };
         events.image_changed(&maker, &sources, kept);
         codec.line = Some(line);
@@ -815,11 +815,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             }
             let (id, links) = (port.id, &self.links);
             let first_of_links = self.store.frames.len() as u8;
-            let connection = |group| links.connection_of(group);
+            let up_since = |group| links.up_since(group);
             let (image, view) = (&self.store.image, self.exchanges.view());
             // Only a tick lets a deadline pass.
             let was_due = port.has_failed(now);
-            port.triggers(image, self.bindings.outputs(), view, (first_of_links, connection), now);
+            port.triggers(image, self.bindings.outputs(), view, (first_of_links, up_since), now);
             if !was_due && port.has_failed(now) {
                 // What is pending yields to a stop.
                 port.advance_talk(self.exchanges.view(), now);
