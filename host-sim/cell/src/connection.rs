@@ -1,18 +1,24 @@
-//! TCP connections between the gateway and the controller, both directions of each.
+//! TCP connections between the gateway and the controller or a device, both directions of each.
+
+use std::collections::VecDeque;
 
 use proto_core::engine::LinkId;
+use proto_core::time::Instant;
 
+use super::judge::Act;
 use super::network::Way;
 use super::tcp::Pipe;
 use recipe_controller::Link;
 
-/// The controller's end of a connection.
+/// The far end of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Peer {
-    /// One of its servers.
+    /// One of the controller's servers.
     Server(Link),
-    /// The TCP client of a recipe port.
+    /// The TCP client of a recipe port of the controller.
     Client(usize),
+    /// The device of a field port.
+    Device,
 }
 
 /// A TCP connection.
@@ -34,6 +40,8 @@ pub(super) struct Connection {
     pub owes_ack: bool,
     /// The gateway's transport will check for a timeout: [`super::due::Due::UserTimeout`] is queued.
     pub is_watched: bool,
+    /// What is in a device's log once so many bytes have arrived, and when the last of them left.
+    pub told: VecDeque<(u64, Instant, Act)>,
 }
 
 impl Connection {
@@ -49,6 +57,7 @@ impl Connection {
             forgotten: false,
             owes_ack: false,
             is_watched: false,
+            told: VecDeque::new(),
         }
     }
 

@@ -32,6 +32,45 @@ pub trait Device<M> {
     }
 }
 
+/// A device that is a TCP server, such as of Modbus TCP. It has one connection at a time: a new one takes the place of
+/// the one before.
+pub trait Server {
+    /// A connection is there.
+    fn opened(&mut self, now: Instant);
+
+    /// The connection is gone, and what was not sent on it with it.
+    fn closed(&mut self, now: Instant);
+
+    /// Bytes arrived on the connection, in pieces of any size.
+    fn receive(&mut self, now: Instant, bytes: &[u8]);
+
+    /// When to call [`Self::poll`].
+    fn deadline(&self) -> Instant;
+
+    /// The deadline has come; the next one must be later than `now`.
+    fn poll(&mut self, now: Instant) -> Vec<Served>;
+
+    /// What it did since the last call, in order.
+    fn take_done(&mut self) -> Vec<SlaveDone>;
+}
+
+/// What a TCP server does.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Served {
+    /// It sends bytes. The act is in its log once the last of them has arrived.
+    Bytes(Vec<u8>, Option<Act>),
+    /// It closes its connection, in both directions.
+    Close,
+    /// It sends nothing more on its connection, and still receives.
+    HalfClose,
+    /// It resets its connection.
+    Reset,
+    /// It loses its power: its connection is gone, and nobody is told.
+    PowerOff,
+    /// It has power again.
+    PowerOn,
+}
+
 /// What a device did that is asked: a slave of a Modbus line, or a peer with frames of its own.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SlaveDone {

@@ -59,7 +59,8 @@ impl Cell {
     pub(super) fn note_deadlines(&mut self) {
         let lines = self.lines.iter().filter_map(|line| line.device.as_ref()).map(|device| device.deadline());
         let buses = self.buses.iter().filter_map(|bus| bus.device.as_ref()).map(|device| device.deadline());
-        self.devices_wake = lines.chain(buses).min().unwrap_or(Instant::NEVER);
+        let servers = self.servers.values().map(|server| server.deadline());
+        self.devices_wake = lines.chain(buses).chain(servers).min().unwrap_or(Instant::NEVER);
     }
 
     fn poll_devices(&mut self) {
@@ -84,6 +85,7 @@ impl Cell {
                 self.transmit_can(BusId(nth), End::Device, frame);
             }
         }
+        self.poll_servers();
     }
 
     /// Reports to the gateway and to the controller that their ports are up.
@@ -114,7 +116,10 @@ impl Cell {
         let now = self.now;
         match input {
             Input::LinkUp { link } => self.trace.add(now, What::LinkUp, link.0.into(), &[]),
-            Input::LinkDown { link } => self.trace.add(now, What::LinkDown, link.0.into(), &[]),
+            Input::LinkDown { link } => {
+                self.trace.add(now, What::LinkDown, link.0.into(), &[]);
+                self.device_link_disturbed(link);
+            }
             Input::LinkBytes { link, bytes } => {
                 self.trace.add(now, What::LinkReceived, link.0.into(), bytes);
             }
@@ -196,6 +201,7 @@ impl Cell {
             }
             Output::LinkClose { link } => {
                 self.trace.add(now, What::LinkClose, link.0.into(), &[]);
+                self.device_link_disturbed(link);
                 self.close(link);
             }
             Output::LinkSend { link, bytes } => {
@@ -279,7 +285,8 @@ impl Cell {
                     }
                 }
                 ControllerOutput::Shutdown => {
-                    for gate in self.gates.values_mut() {
+                    let devices = &self.servers;
+                    for gate in self.gates.values_mut().filter(|gate| !devices.contains_key(&gate.id)) {
                         gate.connect_policy = ConnectPolicy::Refuse;
                     }
                 }

@@ -132,6 +132,7 @@ impl Cell {
 
     fn note(&mut self, link: LinkId) {
         self.trace.add(self.now, What::Fault, link.0.into(), &[]);
+        self.device_link_disturbed(link);
         self.disturb(Some(link));
     }
 
@@ -238,16 +239,22 @@ impl Cell {
     /// The controller loses power: its ends of all connections are gone without notice.
     /// [`Self::power_up`] ends it.
     pub fn power_cut(&mut self) {
-        let links: Vec<LinkId> = self.link_ids().collect();
+        let links: Vec<LinkId> = self.controller_links().collect();
         links.into_iter().for_each(|link| self.cut_cable(link));
-        let conns: Vec<(u64, Peer)> = self.conns.iter().map(|(&id, conn)| (id, conn.peer)).collect();
+        let conns = self.conns.iter().filter(|(_, conn)| conn.peer != Peer::Device);
+        let conns: Vec<(u64, Peer)> = conns.map(|(&id, conn)| (id, conn.peer)).collect();
+        self.lose_power(conns);
+    }
+
+    /// The far ends of connections are gone without notice.
+    pub(super) fn lose_power(&mut self, conns: Vec<(u64, Peer)>) {
         for (id, peer) in conns {
             let Some(conn) = self.conns.get_mut(&id) else { continue };
             match peer {
                 _ if conn.forgotten => continue,
                 _ if conn.abandoned || conn.closing => drop(self.drop_conn(id)),
                 // The gateway keeps trying to connect.
-                Peer::Server(_) if !conn.accepted => continue,
+                Peer::Server(_) | Peer::Device if !conn.accepted => continue,
                 Peer::Client(_) if !conn.accepted => {
                     let link = conn.link;
                     self.drop_conn(id);
@@ -264,7 +271,7 @@ impl Cell {
 
     /// Power is back; the controller starts with all registers at 0.
     pub fn power_up(&mut self) {
-        let links: Vec<LinkId> = self.link_ids().collect();
+        let links: Vec<LinkId> = self.controller_links().collect();
         links.into_iter().for_each(|link| self.repair_cable(link));
         self.clear_controller();
     }
@@ -342,6 +349,17 @@ impl Cell {
     pub(super) fn listening_for_datagrams(&self) -> Vec<(LinkId, Option<usize>)> {
         let listen = self.gates.values().filter(|gate| matches!(gate.kind, LinkKind::RecipeUdpListen { .. }));
         listen.map(|gate| (gate.id, self.frame_len(gate.id))).collect()
+    }
+
+    /// The links to the controller.
+    fn controller_links(&self) -> impl Iterator<Item = LinkId> + '_ {
+        self.link_ids().filter(|link| !self.servers.contains_key(link))
+    }
+
+    /// The links to devices.
+    pub fn device_links(&self) -> impl Iterator<Item = LinkId> + use<> {
+        let links: Vec<LinkId> = self.servers.keys().copied().collect();
+        links.into_iter()
     }
 
     /// Every link.

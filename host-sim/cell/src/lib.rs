@@ -49,6 +49,7 @@ mod survey;
 #[cfg(test)]
 mod tamper;
 mod tcp;
+mod tcp_device;
 mod trace;
 mod traffic;
 mod wiring;
@@ -61,7 +62,7 @@ use proto_core::engine::{BuildError as EngineError, Engine, LinkId, OUTPUT_BUFFE
 use proto_core::time::{Duration, Instant};
 
 pub use can::{BusCounters, CanBus};
-pub use device::{Device, Done, Responder, SlaveDone, Talker};
+pub use device::{Device, Done, Responder, Served, Server, SlaveDone, Talker};
 pub use injector::{FaultInjector, FaultKind};
 pub use judge::{Act, Kind, OUTCOMES, Order};
 pub use line::{Chunking, Line, LineCounters, MAX_HEARD, Wiring};
@@ -155,6 +156,8 @@ pub struct Cell {
     conns: BTreeMap<u64, Connection>,
     next_conn: u64,
     clients: BTreeMap<usize, Client>,
+    /// The devices of ports that are connections.
+    servers: BTreeMap<LinkId, tcp_device::TcpDevice>,
     lines: Vec<Line>,
     buses: Vec<CanBus>,
     names: BTreeMap<String, Medium>,
@@ -229,6 +232,7 @@ impl Cell {
             conns: BTreeMap::new(),
             next_conn: 1,
             clients: BTreeMap::new(),
+            servers: BTreeMap::new(),
             lines: Vec::new(),
             buses: Vec::new(),
             names: BTreeMap::new(),

@@ -43,6 +43,9 @@ impl Cell {
         self.asleep.get_or_insert_default().generation = generation;
         self.wakes_at = self.wakes_at.max(self.now + span);
         self.queue.push(self.wakes_at, Due::Wake { generation });
+        if let Some(judge) = &mut self.judge {
+            judge.not_called(self.now);
+        }
         if let Some(oracle) = &mut self.oracle {
             oracle.stalled(self.wakes_at, self.now);
         }

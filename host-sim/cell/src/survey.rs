@@ -80,7 +80,7 @@ impl Cell {
         self.gates.values().map(path).collect()
     }
 
-    fn is_sound(&self, gate: &Gate) -> bool {
+    pub(super) fn is_sound(&self, gate: &Gate) -> bool {
         let is_whole = |conn: &Connection| {
             let is_free = |way: &super::tcp::Pipe| {
                 !way.held && !way.dead && way.retransmit_at.is_none() && way.reset_after.is_none()

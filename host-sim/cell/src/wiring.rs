@@ -6,6 +6,7 @@ use proto_core::engine::{LinkId, PortId};
 use super::can::CanBus;
 use super::line::Line;
 use super::network::Gate;
+use super::tcp_device::TcpDevice;
 use super::{AnyPort, BusId, Cell, Client, LineId, Medium};
 use recipe_config::{SimBus, SimConfig};
 
@@ -21,7 +22,11 @@ impl Cell {
             let far = match port.bus {
                 Bus::Rs485(settings) => Medium::Line(self.add_line(owner, settings)),
                 Bus::Can { bitrate } => Medium::Bus(self.add_bus(owner, bitrate)),
-                Bus::ModbusTcp { .. } | Bus::TcpListen { .. } | Bus::UdpListen { .. } => continue,
+                Bus::ModbusTcp { .. } => {
+                    self.servers.insert(LinkId::of_port(PortId(nth)), TcpDevice::default());
+                    continue;
+                }
+                Bus::TcpListen { .. } | Bus::UdpListen { .. } => continue,
             };
             self.names.insert(port.name.as_str().to_owned(), far);
         }

@@ -24,6 +24,19 @@ pub(super) struct Machine {
     order: Option<Order>,
 }
 
+/// What becomes of a reply.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Fate {
+    /// How long it takes.
+    pub delay: Duration,
+    /// It does not leave.
+    pub is_lost: bool,
+    /// It leaves, and is wrong.
+    pub is_wrong: bool,
+    /// It is at the gateway in time for sure.
+    pub in_time: bool,
+}
+
 /// What becomes of an order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Answer {
@@ -102,28 +115,42 @@ impl Machine {
         self.values[nth]
     }
 
-    /// A reply of its own leaves, as its mood is. `tells`: it is not the same as the request.
-    pub(super) fn reply(&mut self, mut bytes: Vec<u8>, tells: bool, now: Instant) {
+    /// What becomes of the next reply, as its mood is.
+    pub(super) fn fate(&mut self) -> Fate {
         let delay = self.moods.delay(self.timeout, &mut self.rng);
         let happens = self.rng.below(2) == 0;
-        let in_time = delay + WAY < self.timeout;
-        let mut is_whole = true;
-        let lost = Act::Replied { order: self.order, tells, is_whole: false, in_time: false };
-        match self.moods.now {
-            Mood::Losing if happens => return self.log.push(lost),
-            Mood::Damaged if happens => {
-                if self.is_on_bus {
-                    return self.log.push(lost);
-                }
-                let at = self.rng.below(bytes.len() as u64) as usize;
-                // Never the case of a letter alone, which is no other digit.
-                bytes[at] ^= 1 << self.rng.below(5);
-                is_whole = false;
-            }
-            _ => {}
+        Fate {
+            delay,
+            is_lost: self.moods.now == Mood::Losing && happens,
+            is_wrong: self.moods.now == Mood::Damaged && happens,
+            in_time: delay + WAY < self.timeout,
         }
-        let left = Act::Replied { order: self.order, tells, is_whole, in_time: is_whole && in_time };
-        self.leaving.push((now + delay, bytes, left));
+    }
+
+    /// The entry in the log of a reply to what it was asked last. `tells`: it is not the same as the request.
+    pub(super) fn replied(&self, tells: bool, is_whole: bool, in_time: bool) -> Act {
+        Act::Replied { order: self.order, tells, is_whole, in_time: is_whole && in_time }
+    }
+
+    /// It does not leave, or not so that it is one.
+    pub(super) fn lose_reply(&mut self, tells: bool) {
+        let lost = self.replied(tells, false, false);
+        self.log.push(lost);
+    }
+
+    /// A reply of its own leaves, as its mood is. `tells`: it is not the same as the request.
+    pub(super) fn reply(&mut self, mut bytes: Vec<u8>, tells: bool, now: Instant) {
+        let fate = self.fate();
+        if fate.is_lost || fate.is_wrong && self.is_on_bus {
+            return self.lose_reply(tells);
+        }
+        if fate.is_wrong {
+            let at = self.rng.below(bytes.len() as u64) as usize;
+            // Never the case of a letter alone, which is no other digit.
+            bytes[at] ^= 1 << self.rng.below(5);
+        }
+        let left = self.replied(tells, !fate.is_wrong, fate.in_time);
+        self.leaving.push((now + fate.delay, bytes, left));
     }
 
     pub(super) fn deadline(&self) -> Instant {

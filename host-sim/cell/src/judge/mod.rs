@@ -6,6 +6,7 @@
 //! starts and when it is not called, and of the line when it was disturbed, because both are nobody's fault.
 
 mod axis;
+mod conveyor;
 mod device;
 mod drive;
 mod gripper;
@@ -15,12 +16,14 @@ mod rfid;
 mod robot;
 mod rtu;
 mod rules;
+mod tcp;
 #[cfg(test)]
 mod tests;
 
 use std::collections::{BTreeMap, VecDeque};
 
 use proto_core::config::GatewayConfig;
+use proto_core::engine::{LinkId, PortId};
 use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 
@@ -51,6 +54,8 @@ pub enum Act {
         /// And it was at the gateway in time for sure.
         in_time: bool,
     },
+    /// Something arrived of it that is no reply to what it was asked: whether it is heard by that, nobody knows.
+    Garbled,
     /// The value of this number is this from now on.
     Holds(usize, u16),
     /// It lost its power, and with it what it was told.
@@ -187,6 +192,7 @@ impl Judge {
     /// The gateway is called again after a sleep.
     pub(crate) fn gateway_wakes(&mut self, now: Instant) {
         self.robot.gateway_wakes(now);
+        self.not_called(now);
         // One that it does not have it reads again.
         self.stop = self.stop.filter(|stop| stop.known.is_some());
     }
@@ -200,6 +206,11 @@ impl Judge {
     /// The line, or the gateway's port, is disturbed at this instant.
     pub(crate) fn disturbed(&mut self, now: Instant) {
         (self.calm_since, self.trouble) = (now, now);
+    }
+
+    /// The gateway is not called at this instant.
+    pub(crate) fn not_called(&mut self, now: Instant) {
+        self.robot.not_called = now;
     }
 
     /// The controller's variables as they are now.
@@ -283,6 +294,11 @@ impl Judge {
                 }
                 self.replies(is_whole, in_time && tells, now);
             }
+            Act::Garbled => {
+                if self.is_away(now) {
+                    self.starts = 1;
+                }
+            }
             Act::Holds(nth, value) => {
                 self.held[nth].push_back((now, value));
                 while self.held[nth].len() > 1 && now.saturating_since(self.held[nth][1].0) > REMEMBERED {
@@ -326,7 +342,7 @@ impl Judge {
     /// The device carries out an event: the bit must have risen, just now, for no other.
     fn moves(&mut self, values: &[u32], now: Instant) -> Result<(), String> {
         let rules = &self.rules;
-        let found = self.robot.rise_for(rules, values, now)?;
+        let found = self.robot.rise_for(rules, values, self.stop_heard, now)?;
         for (source, value) in rules.moves.0.iter().zip(values) {
             if let Source::Own(nth) = source
                 && !u16::try_from(*value).is_ok_and(|value| self.was_held(*nth, value, now).is_ok())
@@ -362,7 +378,8 @@ impl Judge {
             return Err("the second step was carried out twice".into());
         }
         let waited = now.saturating_since(replied);
-        if waited > *trigger + STALL + ON_THE_LINE {
+        let transport = self.robot.transport(&self.rules, replied);
+        if waited > *trigger + STALL + ON_THE_LINE + transport {
             return Err(format!("the second step was carried out {waited} after the first"));
         }
         let (from, until) = (first.from, first.at);
@@ -437,6 +454,14 @@ impl Judge {
         self.robot.forget(now);
     }
 
+    /// Whether the gateway has a connection, where it could have had one for so long.
+    fn connects(&mut self, missed: Duration, now: Instant) {
+        if missed > CONNECTS_WITHIN {
+            let what = format!("the gateway has had no connection to it for {missed}, and could");
+            self.judge(Invariant::DeviceKeeps, Err(what), now);
+        }
+    }
+
     /// Whether the device has what the robot has had for long, if nothing speaks against it.
     fn keeps(&self, now: Instant) -> Option<Result<(), String>> {
         let var = self.rules.keeps?;
@@ -485,17 +510,24 @@ impl Cell {
 
     /// The judge looks at the line, and takes the gateway's counters.
     pub(crate) fn survey_device(&mut self) {
-        let is_disturbed = self.is_asleep() || self.is_line_disturbed();
+        let is_asleep = self.is_asleep();
+        let is_disturbed = is_asleep || self.is_line_disturbed();
+        let missed = self.misses_device_for();
         self.count_outcomes();
         let now = self.now;
         if let Some(judge) = &mut self.judge {
+            if is_asleep {
+                judge.not_called(now);
+            }
             judge.survey(is_disturbed, now);
+            judge.connects(missed, now);
         }
     }
 
     fn is_line_disturbed(&self) -> bool {
         self.lines.iter().any(|line| line.noise_ppm > 0 || !line.connected || !line.is_plugged)
             || self.buses.iter().any(|bus| bus.loss_ppm > 0 || !bus.connected || bus.is_off)
+            || self.is_device_disturbed()
     }
 
     /// Before the gateway restarts, and at intervals.
@@ -525,8 +557,7 @@ impl Cell {
     }
 }
 
-/// The kinds of devices whose cells are judged. Modbus TCP is a fifth: a device that answers on a connection and
-/// reports the same acts.
+/// The kinds of devices whose cells are judged.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     /// On Modbus RTU.
@@ -537,11 +568,13 @@ pub enum Kind {
     Rfid,
     /// On CANopen.
     Drive,
+    /// On Modbus TCP, with a motion in two steps and two units.
+    Conveyor,
 }
 
 impl Kind {
     /// All of them.
-    pub(crate) const ALL: [Self; 4] = [Self::Gripper, Self::Axis, Self::Rfid, Self::Drive];
+    pub(crate) const ALL: [Self; 5] = [Self::Gripper, Self::Axis, Self::Rfid, Self::Drive, Self::Conveyor];
 
     /// That of an embedded cell of this name.
     pub(crate) fn of(cell: &str) -> Option<Self> {
@@ -550,6 +583,7 @@ impl Kind {
             "judged-axis" => Self::Axis,
             "judged-rfid" => Self::Rfid,
             "judged-drive" => Self::Drive,
+            "judged-modbus-tcp" => Self::Conveyor,
             _ => return None,
         })
     }
@@ -561,6 +595,7 @@ impl Kind {
             Self::Axis => axis::rules(),
             Self::Rfid => rfid::rules(),
             Self::Drive => drive::rules(),
+            Self::Conveyor => conveyor::rules(),
         };
         let (now, own) = (cell.now(), rng.fork());
         let name = config.ports.first().map_or("", |port| port.name.as_str()).to_owned();
@@ -581,6 +616,7 @@ impl Kind {
                 let bus = cell.bus_of(&name);
                 cell.attach_can(bus, drive::Drive::new(own, now));
             }
+            Self::Conveyor => cell.attach_server(LinkId::of_port(PortId(0)), conveyor::device(own, now)),
         }
         let program = Program::new(&rules, now, rng.fork());
         cell.judge_device(rules);
@@ -621,6 +657,8 @@ const STOPS_WITHIN: Duration = Duration::from_millis(800);
 const OTHERS: u32 = 12;
 /// The device has a value within this time: the longest wait behind refusals, and the late time.
 const KEEPS_WITHIN: Duration = Duration::from_secs(7);
+/// The gateway is connected again within this time: its longest wait, an attempt that failed, and a repetition by TCP.
+const CONNECTS_WITHIN: Duration = Duration::from_secs(8);
 /// A device that replies at least this often is never away.
 const AWAY: Duration = Duration::from_millis(500);
 /// How exactly absences are seen from both ends.

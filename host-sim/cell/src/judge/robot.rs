@@ -22,6 +22,8 @@ pub(super) struct Robot {
     started: Instant,
     /// When it was called again after a sleep, which it may begin by discarding what has come.
     woke: Instant,
+    /// When it was not called last.
+    pub not_called: Instant,
 }
 
 /// A variable that the device is told.
@@ -95,7 +97,14 @@ impl Robot {
             conns: BTreeMap::new(),
             started: Instant::ZERO,
             woke: Instant::ZERO,
+            not_called: Instant::ZERO,
         }
+    }
+
+    /// How long what was handed over since then may have waited in the transport: a gateway that is not called takes
+    /// nothing back.
+    pub(super) fn transport(&self, rules: &Rules, since: Instant) -> Duration {
+        if self.not_called >= since { rules.transport } else { Duration::ZERO }
     }
 
     /// The gateway knows nothing of before.
@@ -136,8 +145,9 @@ impl Robot {
                 }
                 let newest = self.readings.iter_mut().rev().find(|reading| reading.conn == id);
                 // An answer to what was given up is not taken.
-                let since = before.max(self.woke);
-                if let Some(reading) = newest.filter(|reading| reading.answered >= since) {
+                let woke = self.woke;
+                let is_open = |reading: &&mut Reading| reading.asked >= before && reading.answered >= woke;
+                if let Some(reading) = newest.filter(is_open) {
                     reading.taken.get_or_insert(now);
                 }
             }
@@ -210,9 +220,17 @@ impl Robot {
         reading?.taken
     }
 
-    /// The rise that an order with these values, carried out now, is of. It is used up.
-    pub(super) fn rise_for(&mut self, rules: &Rules, values: &[u32], now: Instant) -> Result<Rise, String> {
+    /// The rise that an order with these values, carried out now, is of. It is used up. Of several that it may be, it is
+    /// the first before which the device had heard of each stop; it did so `heard` last.
+    pub(super) fn rise_for(
+        &mut self,
+        rules: &Rules,
+        values: &[u32],
+        heard: Option<Instant>,
+        now: Instant,
+    ) -> Result<Rise, String> {
         let (sources, trigger) = &rules.moves;
+        let mut found = None;
         let mut why = "it was carried out, and the bit was not read rising".to_owned();
         for nth in 0..self.readings.len() {
             let on = self.readings[nth];
@@ -225,7 +243,8 @@ impl Robot {
             let Some(off) = before.filter(|before| !before.moves) else { continue };
             // In the network, and in the socket of a gateway that is not called.
             let known = on.taken.unwrap_or(on.answered + ON_ITS_WAY);
-            let late = now.saturating_since(known + *trigger + super::ON_THE_LINE);
+            let until = known + *trigger + super::ON_THE_LINE + self.transport(rules, on.answered);
+            let late = now.saturating_since(until);
             if late > Duration::ZERO {
                 why = format!("it was carried out {late} after the rise was over");
                 continue;
@@ -247,15 +266,20 @@ impl Robot {
                 );
                 continue;
             }
-            // All rises between two readings are one to the gateway.
-            self.rises
-                .iter_mut()
-                .skip(rise)
-                .filter(|(at, _)| between(*at))
-                .for_each(|(_, used)| *used = true);
-            return Ok(Rise { read: on.answered, stop: self.stop_before(nth) });
+            let stop = self.stop_before(nth);
+            let is_stopped = stop.is_some_and(|stop| heard.is_none_or(|heard| heard < stop));
+            if !is_stopped || found.is_none() {
+                found = Some((rise, off.asked, Rise { read: on.answered, stop }));
+            }
+            if !is_stopped {
+                break;
+            }
         }
-        Err(why)
+        let Some((rise, from, found)) = found else { return Err(why) };
+        // All rises between two readings are one to the gateway.
+        let between = |at: Instant| at >= from && at <= found.read;
+        self.rises.iter_mut().skip(rise).filter(|(at, _)| between(*at)).for_each(|(_, used)| *used = true);
+        Ok(found)
     }
 
     /// When a stop was read over the same connection, at the latest with this reading.

@@ -31,6 +31,8 @@ pub(crate) struct Rules {
     pub stale_after: Duration,
     /// What was away for so long has started.
     pub absent: Duration,
+    /// How long what was handed over may wait in the transport of a gateway that is not called.
+    pub transport: Duration,
     /// The most that each variable may be, for the program; beyond it nothing is sent.
     pub limits: Vec<(SysVar, u16)>,
 }
@@ -49,6 +51,7 @@ impl Rules {
             value_age: PORT_TIMEOUT + timeout.saturating_mul(9) + Duration::from_millis(3_500),
             stale_after: Duration::from_millis(300),
             absent: Duration::from_secs(3),
+            transport: Duration::ZERO,
             limits: Vec::new(),
         }
     }

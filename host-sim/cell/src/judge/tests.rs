@@ -4,7 +4,7 @@ use std::cell::RefCell;
 use std::rc::Rc;
 
 use proto_core::config::{Bus, Echo};
-use proto_core::engine::{Input, Output, PortId};
+use proto_core::engine::{Input, LinkId, Output, PortId};
 use proto_core::time::{Duration, Instant};
 
 use crate::soak::{Level, Scenario, Soak};
@@ -92,7 +92,7 @@ const STOP: &[u8] = &[9, 6, 1, 0];
 
 #[test]
 fn what_the_gateway_does_is_not_accused() {
-    for name in ["judged-gripper", "judged-axis", "judged-rfid", "judged-drive"] {
+    for name in ["judged-gripper", "judged-axis", "judged-rfid", "judged-drive", "judged-modbus-tcp"] {
         assert_eq!(found(name, 2, |_| ()), None, "{name}");
     }
 }
@@ -183,4 +183,69 @@ fn an_echo_that_is_taken_for_a_confirmation() {
     });
     let found = found.map(|(found, _)| found);
     assert!(matches!(found, Some(Invariant::DeviceKeeps | Invariant::StopsFirst)), "{found:?}");
+}
+
+/// The link of a port of Modbus TCP.
+const LINK: LinkId = LinkId::of_port(PORT);
+const MOVE_TCP: &[u8] = &[1, 16, 2, 0x10];
+const START_TCP: &[u8] = &[1, 6, 2, 0];
+
+/// The newest request that begins like this behind its header is sent again on each connection that is there anew.
+fn resends_on_connections(cell: &mut Cell, begin: &'static [u8]) {
+    let sent: Waits = Rc::default();
+    let outward: Outward = Box::new(move |now, input, output| match (input, output) {
+        (_, Output::LinkSend { link: LINK, bytes }) if bytes[6..].starts_with(begin) => {
+            *sent.borrow_mut() = vec![(now, bytes.to_vec())];
+            None
+        }
+        (Input::LinkUp { link: LINK }, Output::Sleep { .. }) => {
+            let (_, bytes) = sent.borrow_mut().pop()?;
+            Some(vec![Forged::Link(LINK, bytes)])
+        }
+        _ => None,
+    });
+    cell.tamper(None, Some(outward));
+}
+
+#[test]
+fn an_event_that_is_sent_again_on_the_next_connection() {
+    finds("judged-modbus-tcp", Invariant::EventsOnce, |cell| resends_on_connections(cell, MOVE_TCP));
+}
+
+#[test]
+fn a_start_that_is_sent_again_on_the_next_connection() {
+    finds("judged-modbus-tcp", Invariant::StartsOnce, |cell| resends_on_connections(cell, START_TCP));
+}
+
+#[test]
+fn a_reply_to_another_transaction_that_is_taken() {
+    finds("judged-modbus-tcp", Invariant::DeviceValues, |cell| {
+        let newest = Rc::new(RefCell::new([0; 2]));
+        let asked = Rc::clone(&newest);
+        let outward: Outward = Box::new(move |_, _, output| {
+            if let Output::LinkSend { link: LINK, bytes } = output {
+                asked.borrow_mut().copy_from_slice(&bytes[..2]);
+            }
+            None
+        });
+        let inward: Inward = Box::new(move |_, input| match input {
+            Input::LinkBytes { link: LINK, bytes } if bytes.len() == 11 => {
+                Some([&*newest.borrow(), &bytes[2..]].concat())
+            }
+            _ => None,
+        });
+        cell.tamper(Some(inward), Some(outward));
+    });
+}
+
+#[test]
+fn a_gateway_that_does_not_connect_again() {
+    finds("judged-modbus-tcp", Invariant::DeviceKeeps, |cell| {
+        let outward: Outward = Box::new(|now, _, output| match output {
+            // After the first minute.
+            Output::LinkOpen { link: LINK, .. } if now > Instant::from_millis(1_060_000) => Some(Vec::new()),
+            _ => None,
+        });
+        cell.tamper(None, Some(outward));
+    });
 }

@@ -5,7 +5,7 @@
 
 use std::ops::Range;
 
-use proto_core::config::{FieldSpec, GatewayConfig, InputRule, Limits, OutputBinding, Outside};
+use proto_core::config::{Bus, FieldSpec, GatewayConfig, InputRule, Limits, OutputBinding, Outside};
 use proto_core::device::{Algorithm, ByteOrder, Checksum, Crc, Encoding, Kind, Overflow, TextWidth, Width};
 use proto_core::wire::scalar::ScalarType;
 
@@ -228,6 +228,9 @@ fn crc_of(crc: &Crc, bytes: impl Iterator<Item = u8>) -> u32 {
 
 /// Why a configuration cannot be judged, if it cannot.
 pub(crate) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
+    if config.ports.iter().any(|port| matches!(port.bus, Bus::ModbusTcp { .. })) {
+        return Some("a soak cannot judge ports of Modbus TCP");
+    }
     if let Some(reason) = super::talk::spec::unmodelled(config) {
         return Some(reason);
     }

@@ -46,7 +46,7 @@ macro_rules! embedded {
 
 /// A seed selects by position, so the order must not change. Controllers of examples that have field ports
 /// of their own are replaced, since no device would be connected to them.
-const EMBEDDED: [Embedded; 21] = [
+const EMBEDDED: [Embedded; 22] = [
     embedded!("/../configs/", "rs485-system", "can-hand"),
     embedded!("/../configs/", "udp-server", "udp-server"),
     embedded!("/../configs/", "client", "client"),
@@ -68,6 +68,7 @@ const EMBEDDED: [Embedded; 21] = [
     embedded!("/src/soak/cells/", "judged-axis", "judged"),
     embedded!("/src/soak/cells/", "judged-rfid", "judged"),
     embedded!("/src/soak/cells/", "judged-drive", "judged"),
+    embedded!("/src/soak/cells/", "judged-modbus-tcp", "judged"),
 ];
 
 impl Scenario {
@@ -166,5 +167,9 @@ mod tests {
         assert_eq!(unmodelled(&config), None);
         config.exchanges[0].restarted = Some(Restarted { field: 0, value: 0.0 });
         assert!(unmodelled(&config).unwrap().contains("restart"));
+        let mut config = Scenario::named("modbus-line").unwrap().unwrap().gateway;
+        config.ports[0].bus =
+            Scenario::named("judged-modbus-tcp").unwrap().unwrap().gateway.ports[0].bus.clone();
+        assert!(unmodelled(&config).unwrap().contains("Modbus TCP"));
     }
 }

@@ -163,6 +163,10 @@ impl Soak {
                 network.ack_report = rng.up_to(Duration::from_millis(20));
                 network.send_buffer = 1_024 << rng.below(7);
             });
+            // Requests to devices are short.
+            for link in cell.device_links() {
+                cell.network(link).longest_segment = (rng.below(2) == 0).then(|| rng.between(1, 12) as usize);
+            }
         }
         let life = match program {
             Some(program) => Life::Program(program),

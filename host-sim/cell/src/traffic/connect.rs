@@ -31,14 +31,15 @@ impl Cell {
             return;
         }
         let delay = gate.network.delay;
-        let server = match gate.kind {
-            LinkKind::Command | LinkKind::Urgent => Link::Command,
-            LinkKind::State => Link::State,
-            _ => Link::Modbus,
+        let peer = match gate.kind {
+            LinkKind::Command | LinkKind::Urgent => Peer::Server(Link::Command),
+            LinkKind::State => Peer::Server(Link::State),
+            LinkKind::ModbusDevice { .. } => Peer::Device,
+            _ => Peer::Server(Link::Modbus),
         };
         match gate.connect_policy {
             ConnectPolicy::Open => {
-                let id = self.new_conn(link, Peer::Server(server));
+                let id = self.new_conn(link, peer);
                 self.send_item(id, Way::Up, Item::Opened);
             }
             ConnectPolicy::Refuse if !gate.is_cut(Way::Up) && !gate.is_cut(Way::Down) => {
@@ -167,7 +168,7 @@ impl Cell {
         if let Some(conn) = self.conns.get_mut(&id) {
             conn.accepted = true;
         }
-        if let Peer::Server(_) = peer {
+        if let Peer::Server(_) | Peer::Device = peer {
             self.send_item(id, Way::Down, Item::Opened);
         }
         self.controller_input(match peer {
@@ -175,6 +176,7 @@ impl Cell {
             Peer::Server(Link::State) => ControllerInput::StateOpened { conn, from: CLIENT_IP },
             Peer::Server(Link::Modbus) => ControllerInput::ModbusOpened { conn, from: CLIENT_IP },
             Peer::Client(port) => ControllerInput::PortUp { port },
+            Peer::Device => return self.device_accepts(id),
         });
     }
 
@@ -192,6 +194,7 @@ impl Cell {
             Peer::Server(Link::State) => ControllerInput::StateClosed { conn },
             Peer::Server(Link::Modbus) => ControllerInput::ModbusClosed { conn },
             Peer::Client(port) => ControllerInput::PortDown { port },
+            Peer::Device => return self.device_loses(id),
         });
     }
 }

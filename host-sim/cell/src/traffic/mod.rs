@@ -178,6 +178,7 @@ impl Cell {
                     Way::Up => self.controller_bytes(id, link, peer, &bytes),
                     Way::Down => self.engine_input(Input::LinkBytes { link, bytes: &bytes }),
                 }
+                self.device_link_disturbed(link);
                 self.reset_conn(id);
                 return;
             }
@@ -189,6 +190,7 @@ impl Cell {
             // The gateway resets its end, and never closes it.
             (Arrived::Item(Item::Closed), Way::Up) => {}
             (Arrived::Item(Item::Bytes(bytes)), Way::Down) => {
+                self.device_told(id);
                 self.engine_input(Input::LinkBytes { link, bytes: &bytes });
             }
             (Arrived::Item(Item::Opened), Way::Down) => {
@@ -199,7 +201,7 @@ impl Cell {
                 }
             }
             (Arrived::Item(Item::Closed), Way::Down) => {
-                self.drop_conn(id);
+                self.gateway_hears_end(id);
                 self.gate(link).set_open(false);
                 self.engine_input(Input::LinkDown { link });
             }
@@ -211,6 +213,9 @@ impl Cell {
     fn controller_bytes(&mut self, id: u64, link: LinkId, peer: Peer, bytes: &[u8]) {
         let conn = ConnId(id);
         self.trace.add(self.now, What::ControllerReceived, id, bytes);
+        if peer == Peer::Device {
+            return self.device_receives(id, bytes);
+        }
         if let (Some(judge), Peer::Server(Link::Modbus)) = (&mut self.judge, peer) {
             judge.asked(id, bytes, self.now);
         }
@@ -221,6 +226,7 @@ impl Cell {
             // Port 2001 ignores what clients send.
             Peer::Server(Link::State) => return,
             Peer::Client(port) => ControllerInput::PortBytes { port, bytes },
+            Peer::Device => return,
         });
         let slowest = self.gate(link).network.slowest();
         if let (Some(oracle), Some(before)) = (&mut self.oracle, before) {

@@ -5,6 +5,7 @@ mod controller_faults;
 mod examples;
 mod field_faults;
 mod kit;
+mod modbus_tcp;
 mod random_faults;
 mod robot;
 mod soak;

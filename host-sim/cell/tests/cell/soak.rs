@@ -43,7 +43,7 @@ fn shared(cells: &[&str], level: Level, span: Duration) -> ([Part; 3], Part) {
 /// The hashes of these runs on every machine. Only a change of what the engine, the controller or the cell
 /// does, or when, may change them; then enter the new ones here.
 const HASHES: [(Level, u64); 2] =
-    [(Level::None, 0xF3AB_64F5_5FC7_0432), (Level::Harsh, 0xA64D_CD90_FA09_E10E)];
+    [(Level::None, 0xBEEC_E7B8_93FF_3222), (Level::Harsh, 0x4652_20B7_31FE_36D8)];
 
 #[test]
 fn a_seed_means_the_same_trace_on_every_machine() {
