@@ -11,6 +11,7 @@ use proto_core::device::{
     Algorithm, Bits, Boundary, ByteOrder, Checksum, Counts, Encoding, Escape, Ignored, Kind, Length,
     Overflow, Text, TextWidth,
 };
+use proto_core::engine::{LinkId, PortId};
 use proto_core::modbus::rtu::{Operation, Table};
 use proto_core::recipe::model::Mode;
 use proto_core::sysvar::{Direction, SysVar};
@@ -460,7 +461,9 @@ fn frames(
 pub(crate) fn line(cell: &mut Cell, input: &mut Source<'_>) {
     let kind = input.u8();
     let recipe = usize::from(cell.last_port().recipe);
-    let has_exchanges = cell.0.recipes[recipe].exchanges.len > 0;
+    let exchanges = cell.0.recipes[recipe].exchanges.of(&cell.0.exchanges);
+    let has_exchanges = !exchanges.is_empty();
+    let is_master = has_exchanges && exchanges.iter().all(|one| matches!(one.talk, Talk::Rtu { .. }));
     let port = cell.last_port();
     if let Bus::Rs485(line) = &mut port.bus {
         line.echo = match kind {
@@ -472,6 +475,11 @@ pub(crate) fn line(cell: &mut Cell, input: &mut Source<'_>) {
         line.turnaround = Duration::from_micros([0, 100, 1_750, 4_000][usize::from(kind >> 1 & 3)]);
         line.idle_gap = Duration::from_micros([50_000, 1_750, 50_000, 5_000][usize::from(kind >> 3 & 3)]);
     }
+    // The master of a line may as well be the client of a server.
+    if is_master && kind & 0x18 == 0x18 {
+        let host = heapless::String::try_from("10.0.0.9").unwrap_or_default();
+        port.bus = Bus::ModbusTcp { host, port: Bus::MODBUS_TCP };
+    }
     // These need safe values, and a part that is sent on change.
     port.safe_at_start = kind & 0x70 == 0x70;
     port.refresh = (kind & 0xF0 == 0x80).then_some(Duration::from_millis(100));
@@ -481,7 +489,8 @@ pub(crate) fn line(cell: &mut Cell, input: &mut Source<'_>) {
 pub(crate) fn seeds() -> Vec<Vec<u8>> {
     let mut random = Random::new(7);
     let mut seeds = Vec::new();
-    for which in 0..8 {
+    // The last is a master over a connection.
+    for (which, is_tcp) in (0..8).map(|which| (which, false)).chain([(5, true)]) {
         let mut found = 0;
         for _ in 0..2_000 {
             // One recipe with devices, of this kind.
@@ -494,15 +503,19 @@ pub(crate) fn seeds() -> Vec<Vec<u8>> {
             {
                 continue;
             }
+            if matches!(config.ports[0].bus, Bus::ModbusTcp { .. }) != is_tcp {
+                continue;
+            }
             let used = input.len() - source.rest().len();
             input.truncate(used);
-            // Honest, and the port is there.
-            input.extend([0, 1, 0]);
+            // Honest, and the port is there, or its link.
+            let link = LinkId::of_port(PortId(0)).0;
+            input.extend(if is_tcp { [0, 5, link] } else { [0, 1, 0] });
+            let left = if is_tcp { [8, link] } else { [3, 0] };
             for _ in 0..20 {
                 let [ask, answer, value] = [(); 3].map(|()| random.number() as u8);
+                input.extend(left);
                 input.extend([
-                    3,
-                    0,
                     ask & 0xF0 | 9,
                     0,
                     answer,
@@ -516,7 +529,7 @@ pub(crate) fn seeds() -> Vec<Vec<u8>> {
                 break;
             }
         }
-        assert!(found > 0, "no right recipe of kind {which}");
+        assert!(found > 0, "no right recipe of kind {which}, over TCP: {is_tcp}");
     }
     seeds
 }

@@ -137,11 +137,7 @@ impl Driver {
             }
             3 if !self.honest || self.ports[p].sending > 0 => {
                 self.ports[p].sending = 0;
-                if self.said[p].awaits.is_some() {
-                    // From now on the reply may come.
-                    self.said[p].awaits =
-                        any_frames::shortest_wait(&self.config, p).map(|wait| self.now + wait);
-                }
+                self.reply_may_come(p);
                 self.handle(Input::PortSent { port });
             }
             4 => {
@@ -170,10 +166,14 @@ impl Driver {
             }
             7 if !self.honest || self.links[l].opening || self.links[l].up => {
                 self.links[l] = Link { datagram: self.links[l].datagram, ..Link::default() };
+                self.closed(link);
                 self.handle(Input::LinkDown { link });
             }
             8 if !self.honest || self.links[l].sending => {
                 self.links[l].sending = false;
+                if let Some(nth) = self.device_behind(link) {
+                    self.reply_may_come(nth);
+                }
                 self.handle(Input::LinkSent { link });
             }
             9 | 10 => self.field_frame(port, input, op),
@@ -212,8 +212,30 @@ impl Driver {
         }
     }
 
+    /// The port of Modbus TCP that a link is of.
+    fn device_behind(&self, link: LinkId) -> Option<usize> {
+        link.port().map(|port| usize::from(port.0)).filter(|port| any_frames::is_tcp(&self.config, *port))
+    }
+
+    /// A request has left a port: from now on the reply may come.
+    fn reply_may_come(&mut self, port: usize) {
+        if self.said[port].awaits.is_some() {
+            self.said[port].awaits =
+                any_frames::shortest_wait(&self.config, port).map(|wait| self.now + wait);
+        }
+    }
+
+    /// A link is closed: nothing is answered on it any more.
+    fn closed(&mut self, link: LinkId) {
+        if let Some(nth) = self.device_behind(link) {
+            self.said[nth].awaits = None;
+        }
+    }
+
     fn link_bytes(&mut self, link: LinkId, bytes: &[u8]) {
         if !self.honest || self.links[usize::from(link.0)].up {
+            // Perhaps they are the reply.
+            self.closed(link);
             self.handle(Input::LinkBytes { link, bytes });
         }
     }
@@ -251,6 +273,13 @@ impl Driver {
                     return self.handle(Input::PortCan { port, frame });
                 }
             } else if let Some(bytes) = any_frames::bytes(&self.config, nth, &self.said[nth], input) {
+                if any_frames::is_tcp(&self.config, nth) {
+                    let link = LinkId::of_port(port);
+                    for piece in cut(&any_frames::over_tcp(&bytes, &self.said[nth], op), op) {
+                        self.link_bytes(link, piece);
+                    }
+                    return;
+                }
                 for piece in cut(&bytes, op) {
                     self.port_bytes(port, piece);
                 }
@@ -339,6 +368,7 @@ impl Driver {
                     link.opening = true;
                 }
                 Output::LinkClose { link } => {
+                    self.closed(link);
                     let link = &mut self.links[usize::from(link.0)];
                     *link = Link { datagram: link.datagram, ..Link::default() };
                 }
@@ -346,6 +376,13 @@ impl Driver {
                     assert!(!bytes.is_empty());
                     if link == LinkId::MODBUS {
                         self.asked = bytes.to_vec();
+                    }
+                    if let Some(nth) = self.device_behind(link) {
+                        let request = any_frames::request_over_tcp(bytes);
+                        let Some((id, request)) = request else { panic!("no header: {bytes:02X?}") };
+                        let before = std::mem::replace(&mut self.said[nth].transaction, id);
+                        assert_ne!(id, before, "two requests with one id");
+                        self.asks(nth, &request);
                     }
                     let link = &mut self.links[usize::from(link.0)];
                     assert!(
@@ -368,15 +405,21 @@ impl Driver {
 
     fn sent(&mut self, port: PortId, bytes: &[u8]) {
         let nth = usize::from(port.0);
-        assert!(
-            any_frames::may_be_sent(&self.config, nth, bytes),
-            "port {nth} has no such frame: {bytes:02X?}"
-        );
+        assert!(!any_frames::is_tcp(&self.config, nth), "it has no line");
         assert!(
             !self.honest || self.ports[nth].up && self.ports[nth].sending == 0,
             "handed over before the last left"
         );
         self.ports[nth].sending = 1;
+        self.asks(nth, bytes);
+    }
+
+    /// What is asked of the devices of a port.
+    fn asks(&mut self, nth: usize, bytes: &[u8]) {
+        assert!(
+            any_frames::may_be_sent(&self.config, nth, bytes),
+            "port {nth} has no such frame: {bytes:02X?}"
+        );
         let said = &mut self.said[nth];
         let waits = any_frames::shortest_wait(&self.config, nth);
         assert!(

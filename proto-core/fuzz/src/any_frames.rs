@@ -17,14 +17,45 @@ use crate::source::Source;
 /// What was said on a port.
 #[derive(Clone, Default)]
 pub(crate) struct Said {
-    /// The newest bytes that were sent.
+    /// The newest bytes that were sent; over Modbus TCP, those behind the header.
     pub sent: Vec<u8>,
+    /// The id of the newest request over Modbus TCP.
+    pub transaction: u16,
     /// A slave has been asked and may still answer: at the earliest until when.
     pub awaits: Option<Instant>,
 }
 
 pub(crate) fn recipe_of(config: &GatewayConfig, port: usize) -> Option<&Recipe> {
     config.recipes.get(usize::from(config.ports.get(port)?.recipe))
+}
+
+/// Whether a port's devices are reached by Modbus TCP.
+pub(crate) fn is_tcp(config: &GatewayConfig, port: usize) -> bool {
+    config.ports.get(port).is_some_and(|port| matches!(port.bus, Bus::ModbusTcp { .. }))
+}
+
+/// A request over Modbus TCP as one on a line: without its header, and with a CRC; and its id. `None` if the header is
+/// wrong.
+pub(crate) fn request_over_tcp(bytes: &[u8]) -> Option<(u16, Vec<u8>)> {
+    let (&[t1, t0, p1, p0, l1, l0], rest) = bytes.split_first_chunk()?;
+    let is_right = (p1, p0) == (0, 0) && usize::from(u16::from_be_bytes([l1, l0])) == rest.len();
+    is_right.then(|| (u16::from_be_bytes([t1, t0]), with_crc(rest)))
+}
+
+/// What a server says in place of a slave that says `frame`: with the header of the newest request, or with another one.
+pub(crate) fn over_tcp(frame: &[u8], said: &Said, op: u8) -> Vec<u8> {
+    let pdu = &frame[..frame.len().saturating_sub(2)];
+    let newest = said.transaction;
+    let (id, protocol, len) = match op >> 4 {
+        0..11 => (newest, 0, pdu.len()),
+        // Late.
+        11 | 12 => (newest.wrapping_sub(u16::from(op >> 4) - 10), 0, pdu.len()),
+        13 => (newest ^ 0x5500, 0, pdu.len()),
+        14 => (newest, 1, pdu.len()),
+        _ => (newest, 0, pdu.len() ^ 1),
+    };
+    let [l1, l0] = (len as u16).to_be_bytes();
+    [&id.to_be_bytes()[..], &[0, protocol, l1, l0], pdu].concat()
 }
 
 /// The shortest time for which a reply is waited on this port; `None` without a master of Modbus there.
