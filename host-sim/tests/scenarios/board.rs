@@ -358,6 +358,7 @@ fn port_status(log: &str, name: &str) -> PortStatus {
         bytes_out: next(),
         skipped_bytes: next(),
         skipped_cycles: next(),
+        lost_bytes: 0,
     }
 }
 

@@ -159,6 +159,9 @@ pub(crate) struct PortStatus {
     pub(crate) bytes_out: u64,
     pub(crate) skipped_bytes: u64,
     pub(crate) skipped_cycles: u64,
+    /// Bytes that found no room in the buffer of a host's pseudoterminal: its kernel thread, which moves them, may come
+    /// seconds late on a busy machine.
+    pub(crate) lost_bytes: u64,
 }
 
 /// The Ethernet cable.

@@ -181,6 +181,7 @@ impl Gateway for HostGateway {
             bytes_out: number("bytes_out"),
             skipped_bytes: number("resync_bytes"),
             skipped_cycles: number("skipped_cycles"),
+            lost_bytes: stats["device"]["dropped"].as_u64().unwrap_or(0),
         }
     }
 
