@@ -184,13 +184,15 @@ pub(crate) struct Plan<'a> {
     pub(crate) sets: Vec<String>,
     /// The controller's servers; empty if the gateway starts first.
     pub(crate) servers: Vec<(&'static str, SocketAddr)>,
+    /// The TCP servers of devices, on this host, by their ports.
+    pub(crate) devices: Vec<(&'static str, u16)>,
     /// Whether the scenario pulls the cable.
     pub(crate) pulls_cable: bool,
 }
 
 impl<'a> Plan<'a> {
     pub(crate) fn new(case: &'a Case, file: PathBuf) -> Self {
-        Self { case, file, sets: Vec::new(), servers: Vec::new(), pulls_cable: false }
+        Self { case, file, sets: Vec::new(), servers: Vec::new(), devices: Vec::new(), pulls_cable: false }
     }
 
     /// Overrides a key of the file.
@@ -212,6 +214,12 @@ impl<'a> Plan<'a> {
                 *place = address;
             }
         }
+        self
+    }
+
+    /// Sets the address of the device that a port connects to.
+    pub(crate) fn device_at(mut self, port: &'static str, address: SocketAddr) -> Self {
+        self.devices.push((port, address.port()));
         self
     }
 
@@ -238,7 +246,7 @@ impl<'a> Plan<'a> {
         self.case.environment.refuses(self, defect)
     }
 
-    /// All overrides, for a controller at `host` whose servers are on these ports.
+    /// All overrides, for devices at `host`, and a controller there whose servers are on these ports.
     pub(crate) fn overrides(&self, host: &str, servers: &[(&'static str, u16)]) -> Vec<String> {
         let config = self.config();
         let mut overrides = vec![format!("controller.address={host}")];
@@ -251,6 +259,8 @@ impl<'a> Plan<'a> {
                 name => overrides.push(format!("controller.ports.{name}={port}")),
             }
         }
+        let devices = self.devices.iter();
+        overrides.extend(devices.map(|(port, server)| format!("port.{port}.to={host}:{server}")));
         for port in ports(&config, |bus| matches!(bus, Bus::Rs485(_))) {
             overrides.push(format!("port.{port}.idle_gap_ms={IDLE_GAP_MS}"));
         }

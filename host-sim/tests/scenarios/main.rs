@@ -3,8 +3,9 @@
 //!
 //! Each scenario is counted three times, as `host::NAME`, `qemu::NAME` and `nucleo::NAME`. Scenarios that stop
 //! the gateway for seconds run on the host only, since a guest's clock stops with it. The field devices are on
-//! pseudoterminals and slcan over TCP, on emulated UARTs, or on modelled lines and a modelled CAN bus. The
-//! controller is always `host-sim controller`, reached over loopback or over the emulated Ethernet.
+//! pseudoterminals and slcan over TCP, on emulated UARTs, or on modelled lines and a modelled CAN bus; or they
+//! are TCP servers. Those, and the controller, which is always `host-sim controller`, are reached over loopback or
+//! over the emulated Ethernet.
 //!
 //! * `HOST_SIM_FIRMWARE=ELF` names the firmware for QEMU (`qemu-system-arm` has to be installed). Without it
 //!   the cases of QEMU are counted as ignored.
@@ -21,6 +22,7 @@ mod board;
 mod case;
 mod checked;
 mod commands;
+mod devices;
 mod environment;
 mod examples;
 mod faults;
@@ -28,6 +30,7 @@ mod field;
 mod garbage;
 mod host;
 mod load;
+mod modbus_device;
 mod namespace;
 mod network;
 mod nucleo;
@@ -89,6 +92,7 @@ fn main() -> ExitCode {
             commands::all(),
             checked::all(),
             rtu::all(),
+            devices::all(),
             unreadable::all(),
             load::all(),
         ];

@@ -21,7 +21,6 @@ use super::robot::Robot;
 pub(crate) fn all() -> Vec<Scenario> {
     vec![
         Scenario::new("a_drive_on_modbus_rtu_is_asked_and_written", drive),
-        Scenario::new("an_axis_moves_once_for_a_pulse", axis),
         Scenario::new("a_plc_on_modbus_rtu_writes_and_reads_blocks", plc),
     ]
 }
@@ -125,117 +124,6 @@ fn until_drive_has(gateway: &mut dyn Gateway, drive: &Drive, wanted: [u16; 2]) {
     });
 }
 
-/// A bit of the robot starts an axis, which is switched on once; its position is read.
-const AXIS: &str = r#"
-[controller]
-address = "127.0.0.1"
-
-[[recipe]]
-name = "axis"
-kind = "modbus-rtu"
-
-[[recipe.exchange]]
-slave = 3
-function = "write-registers"
-address = 44
-on = ["start"]
-timeout_ms = 300
-write = [{ name = "servo", type = "word", value = 1 }]
-
-[[recipe.exchange]]
-slave = 3
-function = "read-holding-registers"
-address = 16
-every_ms = 50
-timeout_ms = 300
-read = [{ name = "actual", type = "word", to = "WordInputReg[1]" }]
-
-[[recipe.exchange]]
-slave = 3
-function = "write-registers"
-address = 40
-on = ["rising:BitOutputReg[3].0"]
-timeout_ms = 300
-trigger_ms = 1000
-outcome = { to = "WordInputReg[2]", count_to = "WordInputReg[3]" }
-write = [{ name = "target", type = "word", from = "WordOutputReg[1]", max = 2000 }]
-
-[[port]]
-name = "axis"
-bus = "modbus-rtu"
-baud = 115200
-recipe = "axis"
-timeout_ms = 1000
-absent_ms = 600000
-on_timeout = { "WordInputReg[1]" = 65000 }
-"#;
-const TARGET: u16 = 40;
-const SERVO: u16 = 44;
-
-/// A robot whose programs pulse the bit, with a target that is allowed and one that is not.
-const PULSES: &str = r#"
-[initial]
-"WordOutputReg[1]" = 1200
-
-[[program]]
-name = "pulse.jspf"
-script = 'set("BitOutputReg[3]", 1); wait_ms(500); set("BitOutputReg[3]", 0); wait_ms(500);'
-
-[[program]]
-name = "wrong.jspf"
-script = 'set("WordOutputReg[1]", 9000); set("BitOutputReg[3]", 1); wait_ms(500); set("BitOutputReg[3]", 0); wait_ms(500); set("WordOutputReg[1]", 1300);'
-"#;
-
-fn axis(case: &Case) {
-    const DONE: f64 = 2.0;
-    const UNKNOWN: f64 = 5.0;
-    const OUT_OF_LIMITS: f64 = 7.0;
-    const AWAY: f64 = 9.0;
-    let robot = case.robot_of(PULSES).start();
-    let mut gateway = case.gateway_of(AXIS).robot(&robot).start();
-    let axis = Drive::on(gateway.line("axis"), 3);
-    axis.set(ACTUAL, 900);
-    gateway.until_up(Link::Modbus, 1);
-    robot.until("WordInputReg[1]", 900.0);
-    let mut nth = 0.0;
-    let mut pulse = |program: &str, outcome: f64| {
-        nth += 1.0;
-        robot.command(&format!("run({program})"), "run start");
-        robot.until("WordInputReg[3]", nth);
-        robot.until("WordInputReg[2]", outcome);
-        until("the program ends", || {
-            gateway.must_run();
-            (!robot.is_running()).then_some(())
-        });
-    };
-    pulse("pulse.jspf", DONE);
-    assert_eq!(axis.written(), [(SERVO, 1), (TARGET, 1200)]);
-
-    // It moves, and its reply is lost: nothing is sent again, also when it answers well.
-    axis.answers(Answers::ReadsAlone);
-    pulse("pulse.jspf", UNKNOWN);
-    axis.answers(Answers::Well);
-    axis.until_asked(40);
-    assert_eq!(axis.written(), [(TARGET, 1200)]);
-
-    // A target that is not allowed moves nothing when another one is.
-    pulse("wrong.jspf", OUT_OF_LIMITS);
-    axis.until_asked(40);
-    assert_eq!(axis.written(), []);
-
-    // It is away: it neither moves nor is switched on again when it is back.
-    axis.answers(Answers::Nothing);
-    robot.until("WordInputReg[1]", SAFE);
-    pulse("pulse.jspf", AWAY);
-    axis.set(ACTUAL, 901);
-    axis.answers(Answers::Well);
-    robot.until("WordInputReg[1]", 901.0);
-    axis.until_asked(40);
-    assert_eq!(axis.written(), []);
-    pulse("pulse.jspf", DONE);
-    assert_eq!(axis.written(), [(TARGET, 1300)]);
-}
-
 /// The gateway answers a PLC.
 const PLC: &str = r#"
 [controller]
@@ -318,8 +206,6 @@ enum Answers {
     Well,
     WithWrongCrc,
     Nothing,
-    /// What is written is carried out, and not answered.
-    ReadsAlone,
 }
 
 /// What the thread of a drive and its scenario share.
@@ -327,10 +213,6 @@ struct Inside {
     registers: [u16; 64],
     answers: Answers,
     damaged: u32,
-    /// Where something was written, and its first register.
-    written: Vec<(u16, u16)>,
-    /// Questions that were answered.
-    asked: u32,
     /// What was asked and written while it answered nothing.
     unanswered: u32,
 }
@@ -344,14 +226,7 @@ struct Drive {
 
 impl Drive {
     fn on(mut line: LineClient, address: u8) -> Self {
-        let inside = Inside {
-            registers: [0; 64],
-            answers: Answers::Well,
-            damaged: 0,
-            written: vec![],
-            asked: 0,
-            unanswered: 0,
-        };
+        let inside = Inside { registers: [0; 64], answers: Answers::Well, damaged: 0, unanswered: 0 };
         let (inside, is_over) = (Arc::new(Mutex::new(inside)), Arc::<AtomicBool>::default());
         let (own, ends) = (Arc::clone(&inside), Arc::clone(&is_over));
         let mut slave = Slave::new(timing(), Echo::Absent, address).unwrap();
@@ -361,14 +236,8 @@ impl Drive {
                 slave.received(&line.take_some(PIECE), clock.now());
                 let mut inside = own.lock().unwrap();
                 let Some(len) = slave.poll(clock.now(), &mut *inside, &mut out) else { continue };
-                let is_read = out[1] == 3;
                 match inside.answers {
-                    Answers::Well | Answers::ReadsAlone if is_read => {
-                        inside.asked += 1;
-                        line.send(&out[..len]);
-                    }
                     Answers::Well => line.send(&out[..len]),
-                    Answers::ReadsAlone => {}
                     Answers::WithWrongCrc => {
                         inside.damaged += 1;
                         out[len - 1] ^= 0x10;
@@ -395,18 +264,6 @@ impl Drive {
 
     fn answers(&self, answers: Answers) {
         self.inside().answers = answers;
-    }
-
-    /// What was carried out since this was asked last.
-    fn written(&self) -> Vec<(u16, u16)> {
-        std::mem::take(&mut self.inside().written)
-    }
-
-    /// Waits until so many more questions were answered.
-    #[track_caller]
-    fn until_asked(&self, count: u32) {
-        let wanted = self.inside().asked + count;
-        until("the axis is asked again and again", || (self.inside().asked >= wanted).then_some(()));
     }
 
     /// Waits until so many more requests came that it does not answer.
@@ -453,7 +310,6 @@ impl RegisterBank for Inside {
         let places = self.registers.get_mut(usize::from(address)..).unwrap_or(&mut []);
         let places = places.get_mut(..usize::from(registers.count())).ok_or(Exception::IllegalDataAddress)?;
         places.iter_mut().zip(registers.iter()).for_each(|(place, value)| *place = value);
-        self.written.extend(registers.iter().next().map(|first| (address, first)));
         Ok(())
     }
 }
