@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock, RwLock, mpsc};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use libtest_mimic::Failed;
 use recipe_test_kit::example;
@@ -11,10 +11,11 @@ use super::environment::{Environment, Gateway, Plan};
 use super::namespace::Namespace;
 use super::program::Running;
 use super::robot::{Robot, RobotPlan};
+use super::terminals;
 
 /// The time limit of a scenario.
 const LIMIT: Duration = Duration::from_secs(90);
-/// Maximum number of attempts of a scenario in which the machine stops the gateway.
+/// Maximum number of attempts of a scenario in which the machine holds the gateway or its devices up.
 const ATTEMPTS: usize = 3;
 /// Number of lines of each log that are shown if a case fails.
 const SHOWN: usize = 12;
@@ -101,7 +102,8 @@ impl Case {
 }
 
 /// Runs the scenario, alone if it has to be. A gateway that the machine has stopped for half a second discards what
-/// its devices sent meanwhile, as it must; a scenario that is not about that then fails, and is run again.
+/// its devices sent meanwhile, as it must, and devices whose lines the machine holds up look as if they were away: a
+/// scenario that is not about that then fails, and is run again.
 pub(crate) fn run(
     name: &str,
     scenario: &Scenario,
@@ -112,8 +114,8 @@ pub(crate) fn run(
     let _whole = scenario.is_alone.then(|| machine.write());
     for _ in 1..ATTEMPTS {
         match attempt(name, scenario, Arc::clone(environment)) {
-            Err(failed) if failed.has_slept && !scenario.is_of_sleep => {
-                eprintln!("{name}: the machine stopped the gateway, once more; {}", failed.message);
+            Err(Failure { message, held_up: Some(what) }) if !scenario.is_of_sleep => {
+                eprintln!("{name}: the machine held up {what}, once more; {message}");
             }
             ended => return ended.map_err(|failed| failed.message.into()),
         }
@@ -124,13 +126,13 @@ pub(crate) fn run(
 /// Why an attempt failed.
 struct Failure {
     message: String,
-    /// A gateway's log says that it slept.
-    has_slept: bool,
+    /// What the machine held up meanwhile.
+    held_up: Option<&'static str>,
 }
 
 impl From<std::io::Error> for Failure {
     fn from(error: std::io::Error) -> Self {
-        Self { message: error.to_string(), has_slept: false }
+        Self { message: error.to_string(), held_up: None }
     }
 }
 
@@ -148,6 +150,7 @@ fn attempt(name: &str, scenario: &Scenario, environment: Arc<dyn Environment>) -
         running: running.clone(),
         namespace: OnceLock::new(),
     };
+    let (begin, has_terminals) = (Instant::now(), case.environment.has_terminals());
     let (run, limit, has_true_cable) = (scenario.run, scenario.limit, scenario.has_true_cable);
     let (done, ended) = mpsc::channel();
     let thread = std::thread::Builder::new().name(name.to_owned()).spawn(move || {
@@ -181,7 +184,9 @@ fn attempt(name: &str, scenario: &Scenario, environment: Arc<dyn Environment>) -
         Err(message) => {
             let logs = logs_in(&logs);
             let has_slept = logs.iter().any(|(_, log)| log.contains("the gateway slept"));
-            Err(Failure { message: format!("{message}\n{}", ends_of(&logs)), has_slept })
+            let has_lagged = has_terminals && terminals::were_late_since(begin);
+            let held_up = has_slept.then_some("the gateway").or(has_lagged.then_some("the terminals"));
+            Err(Failure { message: format!("{message}\n{}", ends_of(&logs)), held_up })
         }
     }
 }

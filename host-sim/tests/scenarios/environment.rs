@@ -25,6 +25,11 @@ pub(crate) trait Environment: Send + Sync {
         false
     }
 
+    /// Whether its field devices are on pseudoterminals.
+    fn has_terminals(&self) -> bool {
+        false
+    }
+
     /// Makes a cable behind which nothing acknowledges what does not reach the other end. QEMU's network is one
     /// already.
     fn lay_true_cable(&self, _case: &Case) {}

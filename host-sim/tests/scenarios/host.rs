@@ -29,6 +29,10 @@ impl Environment for Host {
         true
     }
 
+    fn has_terminals(&self) -> bool {
+        true
+    }
+
     #[track_caller]
     fn lay_true_cable(&self, case: &Case) {
         let namespace = Arc::new(Namespace::new(case));

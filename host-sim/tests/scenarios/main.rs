@@ -40,6 +40,7 @@ mod refusal;
 mod robot;
 mod rtu;
 mod safe;
+mod terminals;
 mod traffic;
 mod unreadable;
 
@@ -98,6 +99,7 @@ fn main() -> ExitCode {
         ];
         all.into_iter().flatten().filter(move |scenario| sleeps || !scenario.is_of_sleep)
     };
+    terminals::watch();
     // A case that measures runs alone.
     let machine = Arc::new(RwLock::new(()));
     let mut trials = Vec::new();
