@@ -101,6 +101,16 @@ fn mistakes_in_modbus_have_their_place() {
         "the fields have 4 bytes, the registers or coils 2; pad fills them up",
     );
     assert_refused_at(
+        &[Ask::mask_write_register(9, 0, &[OutputField::variable(Dword, "WordOutputReg[1]")]).on_change()],
+        "registers or coils",
+        "the fields have 4 bytes, the registers or coils 2; pad fills them up",
+    );
+    let some = "the fields are some bits of the register, not all; those are written with write-register";
+    for fields in [OutputField::variable(Word, "WordOutputReg[1]"), OutputField::padding(2, 0xFF)] {
+        let ask = Ask::mask_write_register(9, 0, core::slice::from_ref(&fields));
+        assert_refused_at(&[ask.on_change()], "registers or coils", some);
+    }
+    assert_refused_at(
         &[Ask::read_holding_registers(9, 0, &[InputField::unused(Encoding::decimal_until(b','))])
             .every(ms(100))],
         "registers or coils",
@@ -117,6 +127,29 @@ fn mistakes_in_modbus_have_their_place() {
     let many: Vec<_> = (1..=33).map(|slave| Ask::write_registers(slave, 0, &value).on_change()).collect();
     assert!(with(&many[..32]).is_ok());
     assert_refused_at(&many, "peer", "one slave or other peer too many; allowed: up to 32 on a port");
+}
+
+#[test]
+fn the_bits_that_are_written_are_those_of_the_fields() {
+    let bits = |first, last| OutputField::variable(Encoding::bits(Word, first..=last), "WordOutputReg[1]");
+    let more = |encoding: Encoding| OutputField::constant(encoding.shared(), 1.0);
+    let halves = |first: OutputField<'static>| vec![first, OutputField::padding(1, 0xFF)];
+    for (fields, expected) in [
+        (vec![bits(3, 3)], 0x0008),
+        (vec![bits(0, 14)], 0x7FFF),
+        (vec![bits(8, 11), more(Encoding::bit(Word, 0))], 0x0F01),
+        (halves(OutputField::variable(Byte, "WordOutputReg[1]")), 0xFF00),
+        (halves(OutputField::variable(Encoding::bit(Byte, 7), "WordOutputReg[1]")), 0x8000),
+    ] {
+        let config = with(&[Ask::mask_write_register(9, 5, &fields).on_change()]).unwrap();
+        let Talk::Rtu { operation, .. } = config.exchanges[0].talk else { panic!() };
+        assert_eq!(operation, Operation::MaskWriteRegister { address: 5, mask: expected }, "{fields:?}");
+        // Another mask than that of the fields.
+        let mut config = config;
+        let Talk::Rtu { operation, .. } = &mut config.exchanges[0].talk else { panic!() };
+        *operation = Operation::MaskWriteRegister { address: 5, mask: expected ^ 0x0010 };
+        assert_eq!(config.validate().unwrap_err().kind, ConfigErrorKind::Exchange(ExchangeError::Mask));
+    }
 }
 
 #[test]

@@ -7,6 +7,7 @@ mod line;
 mod rig;
 
 use proto_core::config::*;
+use proto_core::device::Encoding;
 use proto_core::engine::{
     EventCounters, FieldBus, Health, Input, LinkId, PeerStatus, PortId, PortState, Rejection, Transport,
 };
@@ -15,6 +16,7 @@ use proto_core::modbus::rtu::Operation;
 use proto_core::recipe::model::Mode;
 use proto_core::sysvar::ModbusPlace;
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::scalar::ScalarType;
 
 use line::{reads, writes};
 use rig::*;
@@ -196,6 +198,31 @@ fn axis(cell: &mut Cell) -> Vec<Exchange> {
 /// Those of the requests that start the axis.
 fn starts(asked: &[Asked]) -> usize {
     asked.iter().filter(|asked| asked.body[1] == 16 && asked.address() == 0x20).count()
+}
+
+#[test]
+fn bits_of_a_register_are_confirmed_by_all_of_their_request() {
+    for (said, outcome) in [(8, 2), (6, 5), (7, 5)] {
+        let mut device = Device::new(|cell| {
+            let mut write = writes(cell, 3, &["WordOutputReg[1]"], rising(0));
+            write.outcome = OutcomeTo { to: Some(var("WordInputReg[5]")), ..OutcomeTo::NONE };
+            let Talk::Rtu { operation, written, .. } = &mut write.talk else { panic!() };
+            *operation = Operation::MaskWriteRegister { address: 0x20, mask: 0x0FF0 };
+            let FieldSpec::DeviceOutput { encoding, .. } = &mut cell.0.fields[usize::from(written.start)]
+            else {
+                panic!()
+            };
+            *encoding = Encoding::bits(ScalarType::Word, 4..=11).big_endian();
+            vec![write]
+        });
+        device.set("WordOutputReg[1]", 0x12);
+        assert_eq!(device.run(300, good), []);
+        device.bit(0, true);
+        let asked = device.run(2_000, |asked| vec![(2, adu(asked.id, &asked.body[..said]))]);
+        let bodies: Vec<&[u8]> = asked.iter().map(|asked| &asked.body[..]).collect();
+        assert_eq!(bodies, [&[3, 22, 0, 0x20, 0xF0, 0x0F, 0x01, 0x20][..]]);
+        assert_eq!(device.shown("WordInputReg[5]"), outcome, "{said} bytes");
+    }
 }
 
 #[test]

@@ -203,9 +203,9 @@ fn rtu_len(bytes: &[u8]) -> Option<usize> {
     if !is_known || bytes[0] > 247 {
         return None;
     }
-    // What the third byte of a reply says, a request or a short reply, a refusal.
+    // What the third byte of a reply says, a request or a short reply, both of function 22, a refusal.
     let counted = bytes.get(2).map(|count| usize::from(*count) + 5);
-    let lens = [counted, Some(8), Some(5)];
+    let lens = [counted, Some(8), Some(10), Some(5)];
     lens.into_iter().flatten().find(|&len| {
         bytes.get(..len).is_some_and(|frame| {
             let (front, sum) = frame.split_at(len - 2);

@@ -336,17 +336,24 @@ fn asked(cell: &mut Cell, input: &mut Source<'_>, table: Span, nth: u16) -> Opti
     let word = |input: &mut Source<'_>| {
         vec![value(input, output_part, table, Encoding::scalar(ScalarType::Word).big_endian())]
     };
-    match kind % 9 {
+    // Bits 4 to 11 of a register.
+    let mask = 0x0FF0;
+    let bits = |input: &mut Source<'_>| {
+        let encoding = Encoding::bits(ScalarType::Word, 4..=11).big_endian();
+        vec![value(input, output_part, table, encoding)]
+    };
+    match kind % 10 {
         0 | 1 => read = coils(input, input_part, table),
         2 | 3 => read = registers(input, input_part, table),
         4 => written = (coils(&mut input.clone(), output_part, table).0[..1].to_vec(), 1),
         5 => written = (word(input), 1),
         6 => written = coils(input, output_part, table),
         7 => written = registers(input, output_part, table),
+        8 => written = (bits(input), 1),
         _ => (read, written) = (registers(input, input_part, table), registers(input, output_part, table)),
     }
     let (count, write_count) = (read.1, written.1);
-    let operation = match kind % 9 {
+    let operation = match kind % 10 {
         0 => Operation::ReadCoils { address, count },
         1 => Operation::ReadDiscreteInputs { address, count },
         2 => Operation::ReadHoldingRegisters { address, count },
@@ -355,6 +362,7 @@ fn asked(cell: &mut Cell, input: &mut Source<'_>, table: Span, nth: u16) -> Opti
         5 => Operation::WriteRegister { address },
         6 => Operation::WriteCoils { address, count: write_count },
         7 => Operation::WriteRegisters { address, count: write_count },
+        8 => Operation::MaskWriteRegister { address, mask },
         _ => Operation::ReadWriteRegisters {
             read_address: address,
             read_count: count,

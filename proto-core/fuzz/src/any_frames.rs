@@ -169,6 +169,7 @@ fn slaves_reply(request: &[u8], which: u8, input: &mut Source<'_>) -> Option<Vec
         (5, _) => data(usize::from(value)),
         (_, 1 | 2) => data(count.div_ceil(8)),
         (_, 3 | 4 | 23) => data(2 * count),
+        (_, 22) => request.get(..8)?.to_vec(),
         _ => request[..6].to_vec(),
     }))
 }
@@ -244,6 +245,11 @@ fn is_request(slave: u8, operation: Operation, bytes: &[u8]) -> bool {
         }
         Operation::WriteRegister { address } => {
             return bytes.len() == 8 && bytes[..2] == [slave, 6] && bytes[2..4] == address.to_be_bytes();
+        }
+        Operation::MaskWriteRegister { address, mask } => {
+            let head = [[slave, 22], address.to_be_bytes(), (!mask).to_be_bytes()].concat();
+            let Some(&[or1, or0, _, _]) = bytes.strip_prefix(&head[..]) else { return false };
+            return u16::from_be_bytes([or1, or0]) & !mask == 0;
         }
         Operation::WriteCoils { address, count } => {
             (15, vec![address, count], Some(usize::from(count).div_ceil(8)))

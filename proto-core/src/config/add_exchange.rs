@@ -4,6 +4,7 @@
 //! bytes, and registers and coils counted. Room was checked when the recipe was begun.
 
 use super::ask::{Ask, AskFrame, AskTalk, of_block};
+use super::device::register_bits;
 use super::error::{ConfigError, ConfigErrorKind as Kind, ExchangeKey, Place};
 use super::exchange::{Exchange, FrameSpec, Talk, has_values};
 use super::fields::{Fields, Var};
@@ -95,7 +96,10 @@ impl ConfigMut<'_> {
                 };
                 let (written, write_count) = add(written, Direction::Output)?;
                 let (read, read_count) = add(read, Direction::Input)?;
-                let operation = with_counts(*operation, read_count, write_count);
+                let mut operation = with_counts(*operation, read_count, write_count);
+                if let Operation::MaskWriteRegister { mask, .. } = &mut operation {
+                    *mask = register_bits(written.of(self.fields));
+                }
                 Ok((Talk::Rtu { operation, written, read }, None))
             }
             &AskTalk::Served { table, address, fields } => {
@@ -230,7 +234,9 @@ fn with_counts(operation: Operation, read: u16, written: u16) -> Operation {
             write_address,
             write_count: written,
         },
-        Operation::WriteCoil { .. } | Operation::WriteRegister { .. } => operation,
+        Operation::WriteCoil { .. }
+        | Operation::WriteRegister { .. }
+        | Operation::MaskWriteRegister { .. } => operation,
     }
 }
 

@@ -97,9 +97,7 @@ impl<'c> ConfigView<'c> {
     /// Whether the reply of an exchange can have the bytes of its request.
     fn may_be_echo(self, exchange: &Exchange) -> bool {
         match exchange.talk {
-            Talk::Rtu { operation, .. } => {
-                matches!(operation, Operation::WriteCoil { .. } | Operation::WriteRegister { .. })
-            }
+            Talk::Rtu { operation, .. } => operation.is_repeated_by_reply(),
             Talk::Frames { request: Some(request), reply: Some(reply), .. } => {
                 let frame = |nth: u8| self.frames.get(usize::from(nth));
                 frame(request).zip(frame(reply)).is_none_or(|(request, reply)| reply.may_echo(request, self))

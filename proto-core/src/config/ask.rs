@@ -164,6 +164,11 @@ impl<'a> Ask<'a> {
         Self::write(slave, Operation::WriteRegisters { address, count: 0 }, fields)
     }
 
+    /// FC 22: writes bits of one holding register; slave 0 is all of them. The slave keeps the bits of no field.
+    pub fn mask_write_register(slave: u8, address: u16, bits: &'a [OutputField<'a>]) -> Self {
+        Self::write(slave, Operation::MaskWriteRegister { address, mask: 0 }, bits)
+    }
+
     /// FC 23: writes holding registers, then reads some.
     pub fn read_write_registers(
         slave: u8,

@@ -2,6 +2,7 @@
 
 use core::fmt;
 
+use super::device::register_bits;
 use super::error::{ConfigErrorKind as Kind, ExchangeKey as Key, Place};
 use super::exchange::{Exchange, FrameSpec, Talk};
 use super::input_rule::check_read;
@@ -75,6 +76,8 @@ pub enum ExchangeError {
     },
     /// The fields have no fixed length.
     Varying,
+    /// The fields are not the bits that the mask names, or are none, or all of the register.
+    Mask,
     /// An operation that a slave does not serve.
     NotServed,
     /// Registers or coils that another block has.
@@ -183,6 +186,9 @@ impl fmt::Display for ExchangeError {
             Self::Fields { needed, found } => {
                 write!(f, "the fields have {found} bytes, the registers or coils {needed}; pad fills them up")
             }
+            Self::Mask => f.write_str(
+                "the fields are some bits of the register, not all; those are written with write-register",
+            ),
             Self::Varying => f.write_str("fields in registers have a fixed length; give the text a width"),
             Self::NotServed => {
                 f.write_str("a block has holding registers, input registers, coils or discrete inputs")
@@ -443,7 +449,8 @@ impl<'a> ExchangeCheck<'a> {
                 match operation {
                     Operation::ReadWriteRegisters { .. }
                     | Operation::WriteCoil { .. }
-                    | Operation::WriteRegister { .. } => {
+                    | Operation::WriteRegister { .. }
+                    | Operation::MaskWriteRegister { .. } => {
                         self.refuse(nth, Key::Registers, ExchangeError::NotServed)
                     }
                     _ => {
@@ -493,6 +500,11 @@ impl<'a> ExchangeCheck<'a> {
             }
             if longest != needed {
                 return refuse(ExchangeError::Fields { needed, found: longest });
+            }
+            if let Operation::MaskWriteRegister { mask, .. } = operation
+                && (mask != register_bits(fields) || matches!(mask, 0 | 0xFFFF))
+            {
+                return refuse(ExchangeError::Mask);
             }
         }
         Ok(())

@@ -65,6 +65,32 @@ pub(super) fn field_of(fields: &[FieldSpec], error: LayoutError) -> Option<u8> {
     field.map(|field| field as u8)
 }
 
+/// The bits of one register, highest byte first, that have a field: what
+/// [`Operation::MaskWriteRegister`](crate::modbus::rtu::Operation::MaskWriteRegister) writes. Padding has none; fields of
+/// more than two bytes, texts and lengths have all.
+pub fn register_bits(fields: &[FieldSpec]) -> u16 {
+    let (mut bits, mut at, mut shared_at) = (0, 0_usize, 0);
+    for element in fields.iter().filter_map(FieldSpec::element) {
+        let len = element.len().unwrap_or(2);
+        if !element.is_shared() {
+            shared_at = at;
+            at = at.saturating_add(len);
+        }
+        let mut register = [0; 2];
+        let Some(own) = register.get_mut(shared_at..).and_then(|rest| rest.get_mut(..len)) else {
+            return u16::MAX;
+        };
+        match element.encoding() {
+            // All ones.
+            Some(encoding) if element.bits().is_some() => drop(encoding.write(-1.0, own)),
+            None if matches!(element, Element::Padding { .. }) => {}
+            _ => own.fill(u8::MAX),
+        }
+        bits |= u16::from_be_bytes(register);
+    }
+    bits
+}
+
 impl FieldSpec {
     /// Whether only a received frame has such a field.
     pub(super) const fn is_input(&self) -> bool {

@@ -46,7 +46,7 @@ pub use builder::ConfigBuilder;
 pub use check_exchange::ExchangeError;
 pub use command_text::CommandText;
 pub(crate) use command_text::{fill_in, placeholders};
-pub use device::DeviceFrame;
+pub use device::{DeviceFrame, register_bits};
 pub use draft::{
     Can, ControllerBuilder, Listen, ModbusTcp, PortBuilder, PortBus, RecipeBuilder, RtuLine, SafeValues,
     SerialLine,

@@ -62,8 +62,10 @@ pub(super) struct Row {
     times: RowTimes,
     /// The rows of the line, as bits, whose answers could be taken for its reply.
     pub alike: u64,
-    /// How many replies to earlier transmissions may still come, and until when.
-    outstanding: (u8, Instant),
+    /// How many replies to earlier transmissions may still come.
+    outstanding: u8,
+    /// Until then they may.
+    outstanding_until: Instant,
     /// Of a write that stops: replies to what was sent before it was wanted may come until then.
     former: Instant,
     /// The reply that may come, on Modbus.
@@ -255,7 +257,8 @@ impl Row {
             taken: Instant::ZERO,
             times,
             alike: 0,
-            outstanding: (0, Instant::ZERO),
+            outstanding: 0,
+            outstanding_until: Instant::ZERO,
             former: Instant::ZERO,
             expected: None,
             wait: Wait::NONE,
@@ -293,18 +296,19 @@ impl Row {
 
     /// Whether a reply to an earlier transmission may still come.
     pub(super) fn is_outstanding(&self, now: Instant) -> bool {
-        self.outstanding.0 > 0 && self.outstanding.1 > now
+        self.outstanding > 0 && self.outstanding_until > now
     }
 
     /// So many replies may come until this instant.
     pub(super) fn leaves_outstanding(&mut self, count: u8, until: Instant, now: Instant) {
-        let before = if self.is_outstanding(now) { self.outstanding.0 } else { 0 };
-        self.outstanding = (before.saturating_add(count), self.outstanding.1.max(until));
+        let before = if self.is_outstanding(now) { self.outstanding } else { 0 };
+        self.outstanding = before.saturating_add(count);
+        self.outstanding_until = self.outstanding_until.max(until);
     }
 
     /// One of the replies that were outstanding has come.
     pub(super) fn late_reply_came(&mut self) {
-        self.outstanding.0 = self.outstanding.0.saturating_sub(1);
+        self.outstanding = self.outstanding.saturating_sub(1);
     }
 
     /// The line begins anew: what is asked at the start is asked again, and periods begin now. What was asked before
@@ -316,7 +320,7 @@ impl Row {
         self.is_unconfirmed = false;
         // Nobody knows how many: they are awaited until the end.
         let count = if self.kind.is_answered { u8::MAX } else { 0 };
-        self.outstanding = (count, now + self.times.late);
+        (self.outstanding, self.outstanding_until) = (count, now + self.times.late);
         if let Some(grid) = &mut self.grid {
             *grid = Grid::starting_at(now, grid.period());
         }
@@ -363,7 +367,7 @@ impl Turns<'_> {
     pub(super) fn request(&mut self, nth: usize, now: Instant) {
         if let Some(row) = self.rows.get_mut(nth) {
             if row.requested.is_none() {
-                row.former = row.outstanding.1;
+                row.former = row.outstanding_until;
             }
             row.requested.get_or_insert(now);
         }
@@ -507,7 +511,7 @@ impl Turns<'_> {
         // Whichever of the transmissions of a stop is answered, the peer has stopped since it was wanted.
         let until = |other: &Row| match row.kind.stops && core::ptr::eq(other, row) {
             true => row.former,
-            false => other.outstanding.1,
+            false => other.outstanding_until,
         };
         others.map(|(other, _)| until(other)).max().unwrap_or(Instant::ZERO)
     }

@@ -37,6 +37,8 @@ pub mod function {
     pub const WRITE_COILS: u8 = 0x0F;
     /// FC 16, write several registers.
     pub const WRITE_REGISTERS: u8 = 0x10;
+    /// FC 22, write bits of one register.
+    pub const MASK_WRITE_REGISTER: u8 = 0x16;
     /// FC 23, write registers, then read registers.
     pub const READ_WRITE_REGISTERS: u8 = 0x17;
     /// Set in the function code of an exception response.

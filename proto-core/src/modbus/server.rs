@@ -43,6 +43,15 @@ pub trait RegisterBank {
     /// The exception to answer with; nothing was changed.
     fn write_holding(&mut self, address: u16, registers: Registers<'_>) -> Result<(), Exception>;
 
+    /// FC 22: writes the register at `address`; the bits of `keep` stay as they are, the others become those of
+    /// `value`, which has no others. A bank without it has not this function.
+    ///
+    /// # Errors
+    /// The exception to answer with; nothing was changed.
+    fn mask_holding(&mut self, _address: u16, _keep: u16, _value: u16) -> Result<(), Exception> {
+        Err(Exception::IllegalFunction)
+    }
+
     /// Same as [`Self::read_coils`] for discrete inputs, FC 2. A bank without them has not this function.
     ///
     /// # Errors
@@ -98,7 +107,7 @@ impl Server {
         let (front, len) = match carry_out(front.function(), data, bank, body) {
             Ok(len) => (front, len),
             Err(exception) => {
-                let answer = refuse(front.function(), data, exception, bank, body);
+                let answer = others(front.function(), data, exception, bank, body);
                 (front.with_function(answer.function), answer.data_len)
             }
         };
@@ -122,7 +131,7 @@ pub fn answer<B: RegisterBank + ?Sized>(pdu: &[u8], bank: &mut B, out: &mut [u8;
     let Some(body) = body.first_chunk_mut() else { return 0 };
     let answer = match carry_out(asked, data, bank, body) {
         Ok(data_len) => Answer { function: asked, data_len },
-        Err(exception) => refuse(asked, data, exception, bank, body),
+        Err(exception) => others(asked, data, exception, bank, body),
     };
     *function = answer.function;
     answer.data_len.wrapping_add(1)
@@ -140,18 +149,21 @@ type Body = [u8; MAX_PDU - 1];
 /// Another function, or an exception.
 #[cold]
 #[inline(never)]
-fn refuse<B: RegisterBank + ?Sized>(
+fn others<B: RegisterBank + ?Sized>(
     function: u8,
     data: &[u8],
     exception: Exception,
-    bank: &B,
+    bank: &mut B,
     out: &mut Body,
 ) -> Answer {
-    let inputs = match exception {
+    let answer = match exception {
+        Exception::IllegalFunction if function == function::MASK_WRITE_REGISTER => {
+            write_masked(data, bank, out)
+        }
         Exception::IllegalFunction => read_inputs(function, data, bank, out),
         _ => Err(exception),
     };
-    let exception = match inputs {
+    let exception = match answer {
         Ok(data_len) => return Answer { function, data_len },
         Err(exception) => exception,
     };
@@ -159,6 +171,20 @@ fn refuse<B: RegisterBank + ?Sized>(
     let [first, ..] = out;
     *first = code;
     Answer { function, data_len: 1 }
+}
+
+/// FC 22, which is answered by its data. Another length is none of this function.
+fn write_masked<B: RegisterBank + ?Sized>(
+    data: &[u8],
+    bank: &mut B,
+    out: &mut Body,
+) -> Result<usize, Exception> {
+    let request: &[u8; 6] = data.try_into().map_err(|_| Exception::IllegalFunction)?;
+    let [a1, a0, k1, k0, v1, v0] = *request;
+    let [address, keep, value] = [[a1, a0], [k1, k0], [v1, v0]].map(u16::from_be_bytes);
+    bank.mask_holding(address, keep, value & !keep)?;
+    *out.first_chunk_mut().ok_or(Exception::DeviceFailure)? = *request;
+    Ok(request.len())
 }
 
 /// FC 2 and 4, which a client of this project never asks.

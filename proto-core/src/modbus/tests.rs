@@ -228,6 +228,45 @@ fn no_bank_is_asked_for_a_run_that_passes_the_last_address() {
 }
 
 #[test]
+fn bits_of_a_register_are_written_by_a_bank_that_can() {
+    struct Masked(u16);
+    impl RegisterBank for Masked {
+        fn read_coils(&self, _: u16, _: u16, _: &mut [u8]) -> Result<(), Exception> {
+            Err(Exception::IllegalDataAddress)
+        }
+        fn write_coils(&mut self, _: u16, _: Coils<'_>) -> Result<(), Exception> {
+            Err(Exception::IllegalDataAddress)
+        }
+        fn read_holding(&self, _: u16, _: &mut [[u8; 2]]) -> Result<(), Exception> {
+            Err(Exception::IllegalDataAddress)
+        }
+        fn write_holding(&mut self, _: u16, _: Registers<'_>) -> Result<(), Exception> {
+            Err(Exception::IllegalDataAddress)
+        }
+        fn mask_holding(&mut self, address: u16, keep: u16, value: u16) -> Result<(), Exception> {
+            if address != 4 {
+                return Err(Exception::IllegalDataAddress);
+            }
+            self.0 = self.0 & keep | value;
+            Ok(())
+        }
+    }
+    // The example of the standard: 0x12 becomes 0x17.
+    let (mut bank, mut out) = (Masked(0x12), [0; MAX_PDU]);
+    let pdu = [0x16, 0x00, 0x04, 0x00, 0xF2, 0x00, 0x25];
+    let len = answer(&pdu, &mut bank, &mut out);
+    assert_eq!((&out[..len], bank.0), (&pdu[..], 0x17));
+    let mut answered = |bank: &mut dyn RegisterBank, pdu: &[u8]| {
+        let len = answer(pdu, bank, &mut out);
+        out[..len].to_vec()
+    };
+    assert_eq!(answered(&mut bank, &[0x16, 0, 5, 0, 0, 0, 1]), [0x96, 2]);
+    assert_eq!(answered(&mut bank, &pdu[..6]), [0x96, 1]);
+    assert_eq!(answered(&mut Bank::default(), &pdu), [0x96, 1], "a bank that cannot");
+    assert_eq!(bank.0, 0x17);
+}
+
+#[test]
 fn a_server_answers_alike_however_the_stream_is_cut() {
     let mut stream = frame(1, 9, &[3, 0, 0, 0, 125]);
     stream.extend(frame(0xFFFF, 0, &[16, 0, 0, 0, 1, 2, 0xAB, 0xCD]));

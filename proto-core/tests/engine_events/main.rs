@@ -9,6 +9,7 @@ mod late;
 #[path = "../engine_exchanges/line.rs"]
 #[allow(dead_code, reason = "each test binary uses its own part")]
 mod line;
+mod masked;
 mod restarted;
 #[path = "../rig/mod.rs"]
 mod rig;

@@ -19,7 +19,7 @@ fn framed(address: u8, pdu: &[u8]) -> Vec<u8> {
 }
 
 fn operation() -> impl Strategy<Value = Operation> {
-    (0..9_u8, 0..60_u16, 1..=40_u16, 1..=40_u16).prop_map(|(which, address, count, writes)| match which {
+    (0..10_u8, 0..60_u16, 1..=40_u16, 1..=40_u16).prop_map(|(which, address, count, writes)| match which {
         0 => Operation::ReadCoils { address, count },
         1 => Operation::ReadDiscreteInputs { address, count },
         2 => Operation::ReadHoldingRegisters { address, count },
@@ -28,6 +28,7 @@ fn operation() -> impl Strategy<Value = Operation> {
         5 => Operation::WriteRegister { address },
         6 => Operation::WriteCoils { address, count },
         7 => Operation::WriteRegisters { address, count },
+        8 => Operation::MaskWriteRegister { address, mask: writes.wrapping_mul(0x1357) },
         _ => Operation::ReadWriteRegisters {
             read_address: address,
             read_count: count,
@@ -47,6 +48,7 @@ fn good_reply(request: &[u8], seed: u8) -> Vec<u8> {
     let pdu: Vec<u8> = match request[1] {
         1 | 2 => data(count.div_ceil(8)),
         3 | 4 | 23 => data(count * 2),
+        22 => request[1..8].to_vec(),
         _ => request[1..6].to_vec(),
     };
     framed(request[0], &pdu)

@@ -159,12 +159,14 @@ fn lengths(bytes: &[u8]) -> Vec<usize> {
     let request = match bytes.get(1) {
         Some(1..=6) => Some(8),
         Some(15 | 16) => counted(6),
+        Some(22) => Some(10),
         Some(23) => counted(10),
         _ => None,
     };
     let reply = match bytes.get(1) {
         Some(1..=4 | 23) => counted(2),
         Some(5 | 6 | 15 | 16) => Some(8),
+        Some(22) => Some(10),
         Some(0x80..) => Some(5),
         _ => None,
     };
@@ -193,7 +195,7 @@ fn readings(bytes: &[u8]) -> Vec<Vec<&[u8]>> {
 }
 
 fn deeds(frames: &[&[u8]]) -> Deeds {
-    let to_all = frames.iter().filter(|frame| matches!(frame, [] | [0, 5 | 6 | 15 | 16, ..]));
+    let to_all = frames.iter().filter(|frame| matches!(frame, [] | [0, 5 | 6 | 15 | 16 | 22, ..]));
     let last = frames.last().filter(|frame| frame.first() == Some(&OWN));
     (to_all.map(|frame| frame.to_vec()).collect(), last.map(|frame| frame.to_vec()))
 }

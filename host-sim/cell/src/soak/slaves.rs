@@ -8,7 +8,7 @@
 use std::collections::BTreeMap;
 
 use proto_core::config::{Bus, GatewayConfig, Port, Talk};
-use proto_core::modbus::rtu::{BROADCAST, Echo, MAX_ADU, Slave, Table, Timing};
+use proto_core::modbus::rtu::{BROADCAST, Echo, MAX_ADU, Operation, Slave, Table, Timing};
 use proto_core::modbus::server::RegisterBank;
 use proto_core::modbus::{Coils, Exception, Registers};
 use proto_core::time::{Duration, Instant};
@@ -47,6 +47,8 @@ struct Bank {
     input: BTreeMap<u16, u16>,
     /// What only the master changes.
     written: Vec<(bool, u16)>,
+    /// The bits of registers that another master changes.
+    others: BTreeMap<u16, u16>,
     refuses: bool,
     read: std::cell::Cell<Option<(u16, u16)>>,
     wrote: Option<Done>,
@@ -194,7 +196,7 @@ impl OneSlave {
 }
 
 impl Bank {
-    fn add(&mut self, operation: &proto_core::modbus::rtu::Operation) {
+    fn add(&mut self, operation: &Operation) {
         let (table, first, count) = operation.place();
         let is_written = operation.written_len() > 0;
         for address in first..first.saturating_add(count) {
@@ -205,14 +207,23 @@ impl Bank {
                 Table::InputRegisters => (&mut self.input, false),
             };
             places.entry(address).or_default();
+            if let Operation::MaskWriteRegister { mask, .. } = operation {
+                *self.others.entry(address).or_insert(u16::MAX) &= !mask;
+            } else if is_written && !is_coil {
+                self.others.insert(address, 0);
+            }
             if is_written && !self.written.contains(&(is_coil, address)) {
                 self.written.push((is_coil, address));
             }
         }
     }
 
-    /// Time goes by: some of what the slave measures has other values.
+    /// Time goes by: some of what the slave measures has other values, and another master has written bits.
     fn change(&mut self, rng: &mut Rng) {
+        for (address, bits) in self.others.iter().filter(|(_, bits)| **bits != 0) {
+            let value = self.holding.entry(*address).or_default();
+            *value = *value & !bits | rng.below(65_536) as u16 & bits;
+        }
         let Self { coils, discrete, holding, input, written, .. } = self;
         for (places, is_coil) in [(coils, true), (discrete, true), (holding, false), (input, false)] {
             for (address, value) in places {
@@ -302,6 +313,13 @@ impl RegisterBank for Bank {
 
     fn write_holding(&mut self, address: u16, registers: Registers<'_>) -> Result<(), Exception> {
         self.put(false, address, registers.iter().collect())
+    }
+
+    fn mask_holding(&mut self, address: u16, keep: u16, value: u16) -> Result<(), Exception> {
+        let [register] = self.get(&self.holding, address, 1)?[..] else {
+            return Err(Exception::DeviceFailure);
+        };
+        self.put(false, address, vec![register & keep | value])
     }
 
     fn read_discrete(&self, address: u16, count: u16, packed: &mut [u8]) -> Result<(), Exception> {

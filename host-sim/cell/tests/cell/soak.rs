@@ -2,7 +2,11 @@
 
 use std::sync::Arc;
 
+use proto_core::config::{FieldSpec, Talk};
+use proto_core::device::Encoding;
+use proto_core::modbus::rtu::Operation;
 use proto_core::time::Duration;
+use proto_core::wire::scalar::ScalarType;
 use recipe_cell::Invariant;
 use recipe_cell::soak::{Batch, Level, Part, PartFailure, Scenario, Share, Soak, Total};
 
@@ -108,6 +112,33 @@ fn devices_that_are_asked_are_judged_at_what_they_have_and_at_the_robot() {
         assert!(level == Level::Harsh || looked_at(Invariant::Told) > 10, "{report:?}");
         let (_, received, sent) = report.ports[0];
         assert!(received > 1_000 && sent > 1_000, "{report:?}");
+    }
+}
+
+/// The lamp of one slave and the shift of all of them are bits of registers of which another master has the others.
+#[test]
+fn bits_of_shared_registers_are_judged() {
+    for (level, seed) in [(Level::None, 12), (Level::Harsh, 12), (Level::Harsh, 13)] {
+        let mut scenario = Scenario::named("modbus-line").unwrap().unwrap();
+        let config = &mut scenario.gateway;
+        let mut masked = 0;
+        for exchange in &mut config.exchanges {
+            let Talk::Rtu { operation, written, .. } = &mut exchange.talk else { continue };
+            let Operation::WriteRegister { address } = *operation else { continue };
+            *operation = Operation::MaskWriteRegister { address, mask: 0x7FF8 };
+            let field = &mut config.fields[usize::from(written.start)];
+            let FieldSpec::DeviceOutput { encoding, .. } = field else { panic!("{field:?}") };
+            *encoding = Encoding::bits(ScalarType::Word, 3..=14).big_endian();
+            masked += 1;
+        }
+        config.validate().unwrap();
+        assert_eq!(masked, 2);
+        let mut soak = Soak::new(&scenario, seed, level).unwrap();
+        soak.run_to(Duration::from_secs(120));
+        let report = soak.report();
+        assert_eq!(report.violation, None);
+        assert!(report.checks[&Invariant::Carried] > 200, "{report:?}");
+        assert!(level == Level::Harsh || report.checks[&Invariant::Told] > 10, "{report:?}");
     }
 }
 

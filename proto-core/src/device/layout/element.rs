@@ -79,19 +79,19 @@ impl Element {
         }
     }
 
-    pub(super) fn bits(&self) -> Option<Bits> {
+    pub(crate) fn bits(&self) -> Option<Bits> {
         match self.encoding()?.kind {
             Kind::Bits(bits) => Some(bits),
             _ => None,
         }
     }
 
-    pub(super) fn is_shared(&self) -> bool {
+    pub(crate) fn is_shared(&self) -> bool {
         self.encoding().is_some_and(|encoding| encoding.shared)
     }
 
     /// Number of bytes on the wire; `None` if it varies.
-    pub(super) fn len(&self) -> Option<usize> {
+    pub(crate) fn len(&self) -> Option<usize> {
         match self {
             Self::Padding { len, .. } => Some(usize::from(*len)),
             Self::Value { encoding, .. } | Self::Fixed { encoding, .. } => encoding.size(),

@@ -135,7 +135,7 @@ pub(super) fn seal(frame: &mut [u8], len: usize) -> Option<usize> {
     len.checked_add(CRC_LEN)
 }
 
-/// The length of a request by its first bytes, address first: function codes 1-6, 15, 16 and 23.
+/// The length of a request by its first bytes, address first: function codes 1-6, 15, 16, 22 and 23.
 pub fn request_len(frame: &[u8]) -> FrameLen {
     match frame.get(1) {
         None => FrameLen::NeedsBytes(2),
@@ -149,11 +149,12 @@ pub fn request_len(frame: &[u8]) -> FrameLen {
         ) => FrameLen::Known(8),
         Some(&(function::WRITE_COILS | function::WRITE_REGISTERS)) => counted(frame, 6),
         Some(&function::READ_WRITE_REGISTERS) => counted(frame, 10),
+        Some(&function::MASK_WRITE_REGISTER) => FrameLen::Known(10),
         Some(_) => FrameLen::Unknown,
     }
 }
 
-/// The length of a reply by its first bytes, address first: function codes 1-6, 15, 16 and 23, and
+/// The length of a reply by its first bytes, address first: function codes 1-6, 15, 16, 22 and 23, and
 /// exceptions.
 pub fn reply_len(frame: &[u8]) -> FrameLen {
     match frame.get(1) {
@@ -171,6 +172,7 @@ pub fn reply_len(frame: &[u8]) -> FrameLen {
             | function::WRITE_COILS
             | function::WRITE_REGISTERS),
         ) => FrameLen::Known(8),
+        Some(&function::MASK_WRITE_REGISTER) => FrameLen::Known(10),
         Some(code) if code & function::EXCEPTION_FLAG != 0 => FrameLen::Known(5),
         Some(_) => FrameLen::Unknown,
     }

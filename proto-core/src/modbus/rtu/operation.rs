@@ -81,6 +81,13 @@ pub enum Operation {
         /// 1..=121.
         write_count: u16,
     },
+    /// FC 22: writes bits of one register; the slave keeps the others.
+    MaskWriteRegister {
+        /// The register.
+        address: u16,
+        /// The bits that are written.
+        mask: u16,
+    },
 }
 
 /// A count that a function does not allow.
@@ -123,7 +130,7 @@ pub enum Reply<'a> {
     Coils(Coils<'a>),
     /// FC 3, 4 and 23: as many registers as were asked for.
     Registers(Registers<'a>),
-    /// FC 5, 6, 15 and 16: the slave has taken what was written.
+    /// FC 5, 6, 15, 16 and 22: the slave has taken what was written.
     Written,
 }
 
@@ -140,7 +147,13 @@ impl Operation {
             Self::WriteCoils { .. } => function::WRITE_COILS,
             Self::WriteRegisters { .. } => function::WRITE_REGISTERS,
             Self::ReadWriteRegisters { .. } => function::READ_WRITE_REGISTERS,
+            Self::MaskWriteRegister { .. } => function::MASK_WRITE_REGISTER,
         }
+    }
+
+    /// Whether the bytes of a good reply are those of the request, as an echo of the line has them.
+    pub const fn is_repeated_by_reply(&self) -> bool {
+        matches!(self, Self::WriteCoil { .. } | Self::WriteRegister { .. } | Self::MaskWriteRegister { .. })
     }
 
     /// Whether the reply carries data; such a request cannot be a broadcast.
@@ -158,7 +171,7 @@ impl Operation {
             Self::ReadHoldingRegisters { count, .. } | Self::ReadInputRegisters { count, .. } => {
                 (count, MAX_READ_REGISTERS)
             }
-            Self::WriteCoil { .. } | Self::WriteRegister { .. } => (1, 1),
+            Self::WriteCoil { .. } | Self::WriteRegister { .. } | Self::MaskWriteRegister { .. } => (1, 1),
             Self::WriteCoils { count, .. } => (count, MAX_WRITE_COILS),
             Self::WriteRegisters { count, .. } => (count, MAX_WRITE_REGISTERS),
             Self::ReadWriteRegisters { read_count, write_count, .. } => {
@@ -174,11 +187,11 @@ impl Operation {
 
     /// Bytes of data that a request needs: 0 for a read; 1 for one coil, whose lowest bit counts;
     /// coils packed eight per byte with the first in the lowest bit; two bytes a register, high
-    /// byte first.
+    /// byte first. Of FC 22 the register with those bits that are written.
     pub const fn written_len(&self) -> usize {
         match *self {
             Self::WriteCoil { .. } => 1,
-            Self::WriteRegister { .. } => 2,
+            Self::WriteRegister { .. } | Self::MaskWriteRegister { .. } => 2,
             Self::WriteCoils { count, .. } => packed_len(count),
             Self::WriteRegisters { count, .. } | Self::ReadWriteRegisters { write_count: count, .. } => {
                 (count as usize).saturating_mul(2)
@@ -205,7 +218,9 @@ impl Operation {
         };
         let (address, count) = self.head();
         match self {
-            Self::WriteCoil { .. } | Self::WriteRegister { .. } => (table, address, 1),
+            Self::WriteCoil { .. } | Self::WriteRegister { .. } | Self::MaskWriteRegister { .. } => {
+                (table, address, 1)
+            }
             _ => (table, address, count),
         }
     }
@@ -215,6 +230,7 @@ impl Operation {
         match self {
             Self::WriteCoils { .. } | Self::WriteRegisters { .. } => self.written_len().saturating_add(9),
             Self::ReadWriteRegisters { .. } => self.written_len().saturating_add(13),
+            Self::MaskWriteRegister { .. } => MASK_WRITE_LEN,
             _ => 8,
         }
     }
@@ -223,7 +239,7 @@ impl Operation {
     pub const fn reply_len(&self) -> usize {
         match self.reply_data_len() {
             Some(len) => len.saturating_add(5),
-            None => 8,
+            None => repeated_len(self.function()).saturating_add(4),
         }
     }
 
@@ -238,7 +254,8 @@ impl Operation {
         }
     }
 
-    /// First address and count as they are in the request; FC 5 and 6 have the value there.
+    /// First address and count as they are in the request; FC 5 and 6 have the value there, FC 22 the bits that the
+    /// slave keeps.
     const fn head(&self) -> (u16, u16) {
         match *self {
             Self::ReadCoils { address, count }
@@ -249,6 +266,7 @@ impl Operation {
             | Self::WriteRegisters { address, count } => (address, count),
             Self::WriteCoil { address } | Self::WriteRegister { address } => (address, 0),
             Self::ReadWriteRegisters { read_address, read_count, .. } => (read_address, read_count),
+            Self::MaskWriteRegister { address, mask } => (address, !mask),
         }
     }
 
@@ -301,6 +319,14 @@ impl Operation {
                 if !fill(behind_count(rest, len)?) {
                     return None;
                 }
+            }
+            Self::MaskWriteRegister { mask, .. } => {
+                let bits = rest.first_chunk_mut::<2>()?;
+                *bits = [0; 2];
+                if !fill(bits) {
+                    return None;
+                }
+                *bits = (u16::from_be_bytes(*bits) & mask).to_be_bytes();
             }
             _ => {}
         }
@@ -359,8 +385,13 @@ pub(crate) struct Expected {
 enum Body {
     /// So many bytes of data behind their count.
     Data(u8),
-    /// The same four bytes as in the request.
-    Echo([u8; 4]),
+    /// The same bytes as in the request: four, of FC 22 six.
+    Echo([u8; 6]),
+}
+
+/// How many bytes of a request behind its function are in the reply too, if that has no data.
+const fn repeated_len(function: u8) -> usize {
+    if function == function::MASK_WRITE_REGISTER { 6 } else { 4 }
 }
 
 /// What bytes are to a master that waits for a reply.
@@ -388,9 +419,15 @@ impl Expected {
         let body = match operation.reply_data_len() {
             // At most 250 by the limits of the counts.
             Some(len) => Body::Data(len as u8),
+            // Of four bytes, what is behind them is not looked at; every request has a CRC there.
             None => Body::Echo(*rest.first_chunk()?),
         };
         Some(Self { slave, function, body })
+    }
+
+    /// The bytes behind the function that are those of the request, of a reply without data.
+    fn repeated<'a>(&self, head: &'a [u8; 6]) -> &'a [u8] {
+        head.get(..repeated_len(self.function)).unwrap_or(head)
     }
 
     /// Whether `bytes` begin with the slave and the function that were asked.
@@ -403,7 +440,7 @@ impl Expected {
         match (bytes.get(1), self.body) {
             (Some(function), _) if *function == self.function | function::EXCEPTION_FLAG => REFUSAL_LEN,
             (_, Body::Data(len)) => usize::from(len).saturating_add(5),
-            (_, Body::Echo(_)) => 8,
+            (_, Body::Echo(_)) => repeated_len(self.function).saturating_add(4),
         }
     }
 
@@ -421,7 +458,7 @@ impl Expected {
             Body::Data(len) => rest
                 .split_first()
                 .is_some_and(|(count, data)| *count == len && data.len() == usize::from(len)),
-            Body::Echo(head) => rest == head,
+            Body::Echo(head) => rest == self.repeated(&head),
         };
         (function == self.function && fits).then_some(true)
     }
@@ -445,7 +482,10 @@ impl Expected {
         }
         let (fits, len) = match self.body {
             Body::Data(len) => (rest.first().is_none_or(|count| *count == len), usize::from(len) + 5),
-            Body::Echo(head) => (rest.iter().zip(&head).all(|(byte, wanted)| byte == wanted), 8),
+            Body::Echo(head) => {
+                let head = self.repeated(&head);
+                (rest.iter().zip(head).all(|(byte, wanted)| byte == wanted), head.len().saturating_add(4))
+            }
         };
         match bytes.get(..len) {
             _ if !fits => Probe::No,
@@ -458,6 +498,9 @@ impl Expected {
 
 /// Length of the frame of an exception.
 pub(crate) const REFUSAL_LEN: usize = 5;
+
+/// Length of the frame of a request with FC 22, and of its good reply.
+const MASK_WRITE_LEN: usize = 10;
 
 /// High byte of the value that switches a coil on.
 const COIL_ON: u8 = 0xFF;

@@ -297,7 +297,8 @@ fn writes(pdu: &[u8]) -> bool {
             &(function::WRITE_COIL
                 | function::WRITE_REGISTER
                 | function::WRITE_COILS
-                | function::WRITE_REGISTERS)
+                | function::WRITE_REGISTERS
+                | function::MASK_WRITE_REGISTER)
         )
     )
 }

@@ -159,7 +159,7 @@ impl Oracle {
         for (at, frame) in (1..).zip(&burst.frames) {
             let pdu = &frame[1..frame.len() - 2];
             match frame[0] {
-                0 if matches!(pdu[0], 5 | 6 | 15 | 16) => drop(self.carry_out(nth, pdu, now)),
+                0 if matches!(pdu[0], 5 | 6 | 15 | 16 | 22) => drop(self.carry_out(nth, pdu, now)),
                 address if address == own => {
                     // Behind an earlier request, its master no longer waits.
                     if at == burst.frames.len() && burst.rest.is_empty() && !too_many {
@@ -395,6 +395,7 @@ fn first_frame(bytes: &[u8], own: u8, is_bare: bool) -> Option<(usize, bool)> {
         1..=4 => (Some(8), counted(2, 5)),
         5 | 6 => (Some(8), Some(8)),
         15 | 16 => (counted(6, 9), Some(8)),
+        22 => (Some(10), Some(10)),
         23 => (counted(10, 13), counted(2, 5)),
         0x80.. => (None, Some(5)),
         _ => (None, None),

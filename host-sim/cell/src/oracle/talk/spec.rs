@@ -48,6 +48,8 @@ pub(in crate::oracle) struct RowSpec {
     pub count: u16,
     /// The first register or coil that is written.
     pub written: Option<u16>,
+    /// The bits of a register that are written.
+    pub mask: u16,
     pub every: Option<Duration>,
     pub at_start: bool,
     pub on_change: bool,
@@ -242,6 +244,7 @@ impl RowSpec {
             address: 0,
             count: 0,
             written: None,
+            mask: u16::MAX,
             every: exchange.when.every,
             at_start: exchange.when.start,
             on_change: exchange.when.change,
@@ -272,7 +275,8 @@ impl RowSpec {
             },
             _ => {
                 let is_same = self.function == other.function && self.reply_data() == other.reply_data();
-                let is_there = (self.address, self.count) == (other.address, other.count);
+                let place = |row: &Self| (row.address, row.count, row.mask);
+                let is_there = place(self) == place(other);
                 is_same && (self.reply_data().is_some() || is_there)
             }
         }
@@ -307,6 +311,10 @@ impl RowSpec {
             Operation::ReadInputRegisters { address, count } => (4, vec![address, count], None),
             Operation::WriteCoil { address } => (5, vec![address], Some((address, 1))),
             Operation::WriteRegister { address } => (6, vec![address], Some((address, 1))),
+            Operation::MaskWriteRegister { address, mask } => {
+                self.mask = mask;
+                (22, vec![address], Some((address, 1)))
+            }
             Operation::WriteCoils { address, count } => (15, vec![address, count], Some((address, count))),
             Operation::WriteRegisters { address, count } => {
                 (16, vec![address, count], Some((address, count)))
@@ -324,6 +332,7 @@ impl RowSpec {
         self.head.extend(words.iter().flat_map(|word| word.to_be_bytes()));
         match (function, write) {
             (15, Some((_, count))) => self.head.push(count.div_ceil(8) as u8),
+            (22, _) => self.head.extend((!self.mask).to_be_bytes()),
             (16 | 23, Some((_, count))) => self.head.push((2 * count) as u8),
             _ => {}
         }
@@ -337,7 +346,7 @@ impl RowSpec {
     fn data_len(&self) -> usize {
         match self.function {
             1..=4 => 0,
-            5 | 6 => 2,
+            5 | 6 | 22 => 2,
             _ => usize::from(self.head.last().copied().unwrap_or(0)),
         }
     }
@@ -358,11 +367,16 @@ impl RowSpec {
         }
     }
 
+    /// How many bytes of the request a reply without data repeats.
+    fn repeated(&self) -> usize {
+        if self.function == 22 { 8 } else { 6 }
+    }
+
     fn reply_len(&self) -> usize {
         if let Some(frames) = &self.frames {
             return frames.reply.as_ref().map_or(0, Frame::len);
         }
-        self.reply_data().map_or(8, |len| len + 5)
+        self.reply_data().map_or(self.repeated() + 2, |len| len + 5)
     }
 
     /// The data of a request, as its fields have it: one coil in the lowest bit. Of a device's own frame,
@@ -443,7 +457,7 @@ impl RowSpec {
         let head = match self.reply_data() {
             Some(len) => vec![self.slave, self.function, len as u8],
             // One register or coil is in the reply with its value.
-            None => request[..6].to_vec(),
+            None => request[..self.repeated()].to_vec(),
         };
         let seen = bytes.len().min(head.len());
         if bytes[..seen] != head[..seen] {

@@ -247,10 +247,13 @@ impl Truth {
         let line = self.lines.entry(nth).or_default();
         let is_it = |(at, row, asked, by): &&mut (Instant, usize, Vec<u16>, BTreeSet<u8>)| {
             let row = &talk.rows[*row];
+            // The other bits of a register are what its slave had.
+            let is_asked = asked.len() == values.len()
+                && asked.iter().zip(values).all(|(asked, value)| *asked == value & row.mask);
             let is_to_it = row.slave == slave || row.slave == 0;
             let is_there = is_of(row);
             let is_now = now.saturating_since(*at) <= ON_THE_LINE;
-            is_to_it && is_there && asked == values && is_now && !by.contains(&slave)
+            is_to_it && is_there && is_asked && is_now && !by.contains(&slave)
         };
         let Some((at, row, _, by)) = line.requests.iter_mut().rev().find(is_it) else {
             let what = format!("device {slave} took {values:?}, which nobody asked for just now");
