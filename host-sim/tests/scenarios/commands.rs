@@ -1,7 +1,7 @@
 //! Commands that would start something late, a stop that must not wait, and commands for what is so already.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use recipe_test_kit::toml;
@@ -220,7 +220,22 @@ fn already(case: &Case) {
     const SOON: Duration = Duration::from_secs(5);
     let robot = case.robot_of(&ENDLESS.replace("[robot]", "[robot]\ndialect = \"v2.6\"")).start();
     let table = r#"1 = "poweron", 2 = "enable", 3 = "run(endless.jspf)", 8 = "disable", 9 = "stop""#;
-    let mut gateway = case.gateway_of(&toml::panel(table, 1_000)).robot(&robot).start();
+    // What the controller answers, as it is on the wire.
+    let answers = Arc::<Mutex<Vec<u8>>>::default();
+    let mut way = Network::default();
+    let command = way.tcp_through(robot.address("command"), {
+        let answers = Arc::clone(&answers);
+        move |_| {
+            let answers = Arc::clone(&answers);
+            let to_client: Box<Filter> = Box::new(move |bytes| {
+                answers.lock().unwrap().extend_from_slice(bytes);
+                Pass::On
+            });
+            [Box::new(|_: &mut Vec<u8>| Pass::On), to_client]
+        }
+    });
+    let plan = case.gateway_of(&toml::panel(table, 1_000)).robot(&robot).server_at("command", command);
+    let mut gateway = plan.start();
     gateway.until_up(Link::Command, 1);
     gateway.until_up(Link::Urgent, 1);
     let mut panel = gateway.line("device");
@@ -255,5 +270,9 @@ fn already(case: &Case) {
     assert!(links.iter().all(|link| link.is_up && link.connects == 1), "{links:?}");
     // Each once: three, three times off, and two again.
     assert_eq!((robot.count("/command/requests"), robot.count("/command/refusals")), (8, 0));
+    let answers = String::from_utf8_lossy(&answers.lock().unwrap()).into_owned();
+    let already =
+        ["poweron", "enable", "disable"].map(|what| answers.matches(&format!("already {what}")).count());
+    assert_eq!(already, [1, 1, 2], "{answers:?}");
     gateway.must_run();
 }
