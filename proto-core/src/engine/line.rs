@@ -452,7 +452,14 @@ impl Line {
         let ended = if flight.is_ambiguous { Ended::Unclear } else { ended };
         // The reply may be a late one to the first of the requests. Then that to the repetition is still to come.
         let sent = if matches!(self.phase, Phase::Sending(_)) { now } else { self.sent };
-        leave_outstanding(talks, flight, flight.repeated, sent, now);
+        if flight.is_ambiguous {
+            // Its own may be still to come.
+            if let Some(row) = talks.row_of(flight) {
+                row.leaves_outstanding(flight.repeated.saturating_add(1), sent + row.late(), now);
+            }
+        } else {
+            leave_outstanding(talks, flight, flight.repeated, sent, now);
+        }
         let news =
             self.turns(talks, |turns| turns.answered(usize::from(flight.exchange), flight.cause, ended, now));
         self.rest(times.pause, now);
@@ -485,6 +492,8 @@ impl Line {
         times: Times,
         now: Instant,
     ) -> Over {
+        // A write that stops does not wait for repetitions.
+        let yields = talks.rows.iter().any(|row| row.stop_at().is_some_and(|at| at <= now));
         let sent = self.sent;
         let Some(peer) = talks.peer_of(flight) else { return Over::GivenUp(News::Nothing) };
         let counters = &mut peer.counters;
@@ -511,7 +520,8 @@ impl Line {
         let unanswered =
             if failure == Failure::Checksum { flight.unanswered } else { flight.unanswered.min(sent) };
         // The peer has the request of which it said that it is at it.
-        if peer.turn.presence() == Presence::Up && flight.repeated < retries && !flight.is_pending {
+        if peer.turn.presence() == Presence::Up && flight.repeated < retries && !flight.is_pending && !yields
+        {
             counters.retries = counters.retries.wrapping_add(1);
             let repeated = flight.repeated.saturating_add(1);
             let was_wrong = flight.was_wrong || failure == Failure::Checksum;

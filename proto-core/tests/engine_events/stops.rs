@@ -144,3 +144,81 @@ fn a_device_that_was_away_is_stopped_once_when_it_is_back() {
     axis.run(3_000, good);
     assert_eq!(stops(&mut axis).len(), 1, "whichever of them was answered, it has stopped since");
 }
+
+#[test]
+fn a_stop_goes_before_the_repetition_of_another_request() {
+    let mut axis = axis(|cell, _, _| {
+        let mut slow = reads_at(cell, 3, 0x30, "WordInputReg[2]", MS(300));
+        slow.retries = 5;
+        vec![slow]
+    });
+    let deaf = |request: &[u8]| if request[3] == 0x30 { None } else { good(request) };
+    while axis
+        .line
+        .run(MS(1), |request| Some((MS(2), deaf(request)?)))
+        .iter()
+        .all(|(_, asked)| asked[3] != 0x30)
+    {}
+    axis.line.bit(1, true);
+    let asked = axis.line.run(MS(400), |request| Some((MS(2), deaf(request)?)));
+    let next = &asked[0].1;
+    assert_eq!(
+        write_in(next),
+        Some((STOP, 1)),
+        "{next:?}: the read waits for its reply, and not for five more"
+    );
+    let stopped = asked[0].0;
+    axis.note(asked);
+    assert_eq!(stops(&mut axis), [stopped]);
+}
+
+#[test]
+fn a_stop_that_another_reply_seemed_to_answer_may_still_be_answered() {
+    // Start and stop write the same register: the replies to both are the same.
+    let mut axis = axis(|cell, start, stop| {
+        start.late = None;
+        stop.late = None;
+        let field = FieldSpec::DeviceOutput {
+            encoding: word(),
+            overflow: Overflow::Usual,
+            from: OutputBinding::Constant(0.0),
+        };
+        let written = cell.fields([field]);
+        let operation = Operation::WriteRegisters { address: TARGET, count: 1 };
+        stop.talk = Talk::Rtu { operation, written, read: Span::default() };
+        vec![]
+    });
+    axis.run(1_000, good);
+    axis.line.bit(0, true);
+    let stops = std::cell::Cell::new(0);
+    let slow = |request: &[u8]| {
+        let delay = match write_in(request) {
+            // Of the first start and the first stop: the start's comes while the stop is on its way.
+            Some((TARGET, 1_000)) => MS(250),
+            Some((TARGET, 0)) => {
+                stops.set(stops.get() + 1);
+                if stops.get() == 1 { MS(950) } else { MS(2) }
+            }
+            _ => MS(2),
+        };
+        Some((delay, answer(request, |_| 7)))
+    };
+    axis.line.run(MS(170), slow);
+    axis.line.bit(1, true);
+    axis.line.bit(0, false);
+    axis.line.run(MS(940), slow);
+    assert!(stops.get() > 1);
+    // The device ignores this one.
+    axis.line.bit(0, true);
+    let asked = axis.line.run(MS(1_000), |request| {
+        if write_in(request).is_some_and(|(_, value)| value != 0) { None } else { slow(request) }
+    });
+    axis.note(asked);
+    assert!(axis.taken().iter().filter(|value| **value != 0).count() <= 1);
+    assert_ne!(axis.told()[0], 2, "the late reply to the stop is none to the start");
+    axis.line.bit(0, false);
+    axis.run(3_000, good);
+    axis.taken();
+    axis.pulse(good);
+    assert_eq!((axis.taken(), axis.told()[0]), (vec![1_000], 2), "it may move again");
+}
