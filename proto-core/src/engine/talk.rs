@@ -575,7 +575,9 @@ fn learn_echo(line: &mut Line, talks: &mut Talks<'_>, has_echo: bool, now: Insta
     if !line.learn_echo(has_echo) {
         return;
     }
-    for nth in 0..talks.rows.len() {
+    // The answer to the request on its way tells what became of that.
+    let own = line.flight().map(|flight| usize::from(flight.exchange));
+    for nth in (0..talks.rows.len()).filter(|nth| Some(*nth) != own) {
         let Some(row) = talks.rows.get_mut(nth) else { break };
         let was_unconfirmed = core::mem::take(&mut row.is_unconfirmed);
         if was_unconfirmed && has_echo && row.is_state() {
