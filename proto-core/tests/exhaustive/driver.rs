@@ -10,8 +10,10 @@ use proto_core::time::{Duration, Instant};
 use crate::rig::MS;
 use crate::scribe::Scribe;
 
-/// Room for one field port beside a listening port, one recipe link and a few fields.
-pub type Small = Engine<2, 1, 4, 0, 0>;
+/// Room for one field port beside a listening port, one recipe link, a few fields and so many exchanges.
+pub type Room<const EXCHANGES: usize> = Engine<2, 1, 4, 0, EXCHANGES>;
+/// The same without exchanges.
+pub type Small = Room<0>;
 /// A promise that was broken, in words.
 pub type Broken = String;
 
@@ -70,7 +72,7 @@ pub struct UnderWay {
 pub struct Conns(pub Vec<Conn>);
 
 /// What a cell knows of the promises.
-pub trait Judge {
+pub trait Judge<const EXCHANGES: usize = 0> {
     /// An input is about to be told, other than that a connection is lost.
     fn told(&mut self, now: Instant, input: &Input<'_>, conns: &mut Conns);
     /// The driver reports that a connection is gone or could not be opened; [`Self::lost`] came before.
@@ -97,15 +99,15 @@ pub trait Judge {
         &mut self,
         now: Instant,
         until: Instant,
-        engine: &Small,
+        engine: &Room<EXCHANGES>,
         conns: &Conns,
         is_late: bool,
     ) -> Result<(), Broken>;
 }
 
 #[derive(Debug, Clone)]
-pub struct Gateway {
-    pub engine: Box<Small>,
+pub struct Gateway<const EXCHANGES: usize = 0> {
+    pub engine: Box<Room<EXCHANGES>>,
     pub conns: Conns,
     pub now: Instant,
     /// When the engine was called last, and when it wants to be called at the latest.
@@ -199,8 +201,8 @@ impl Conns {
     }
 }
 
-impl Gateway {
-    pub fn new(engine: Small, conns: Conns, now: Instant) -> Self {
+impl<const EXCHANGES: usize> Gateway<EXCHANGES> {
+    pub fn new(engine: Room<EXCHANGES>, conns: Conns, now: Instant) -> Self {
         Self { engine: Box::new(engine), conns, now, called: Instant::ZERO, until: Instant::ZERO }
     }
 
@@ -210,7 +212,7 @@ impl Gateway {
     }
 
     /// One input, and all that follows from it at this instant.
-    pub fn tell(&mut self, input: Input<'_>, judge: &mut impl Judge) -> Result<(), Broken> {
+    pub fn tell(&mut self, input: Input<'_>, judge: &mut impl Judge<EXCHANGES>) -> Result<(), Broken> {
         let now = self.now;
         let is_tick = matches!(input, Input::Tick);
         let is_late = self.is_late() && !is_tick;
@@ -259,7 +261,7 @@ impl Gateway {
     }
 
     /// What the engine answers, until it sleeps.
-    fn drain(&mut self, judge: &mut impl Judge, is_late: bool) -> Result<Instant, Broken> {
+    fn drain(&mut self, judge: &mut impl Judge<EXCHANGES>, is_late: bool) -> Result<Instant, Broken> {
         let now = self.now;
         let mut buf = [0xA5; OUTPUT_BUFFER];
         for _ in 0..=MOST_OUTPUTS {
@@ -333,7 +335,7 @@ impl Gateway {
     }
 }
 
-impl Gateway {
+impl<const EXCHANGES: usize> Gateway<EXCHANGES> {
     /// The instant for which the engine asked.
     pub fn wait_until_due(&mut self) {
         self.now = self.now.max(self.until);

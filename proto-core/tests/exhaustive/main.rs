@@ -11,6 +11,8 @@ mod rig;
 mod command_cell;
 mod command_judge;
 mod driver;
+mod exchange_cell;
+mod exchange_judge;
 mod orders;
 mod recipe_cell;
 mod recipe_judge;
@@ -19,6 +21,7 @@ mod search;
 mod values;
 
 use command_cell::CommandCell;
+use exchange_cell::{Adapter, ExchangeCell};
 use proto_core::engine::LinkId;
 use proto_core::time::Instant;
 use recipe_cell::{RecipeCell, Way};
@@ -154,6 +157,45 @@ fn a_float_and_a_bit_by_tcp() {
     check("a float and a bit by TCP", &recipe_roots(Way::Tcp, START), &size((5, 4_900), (7, 122_000)));
 }
 
+fn exchange_roots(adapter: Adapter, start: Instant) -> Vec<Root<ExchangeCell>> {
+    use exchange_cell::Event::*;
+    use exchange_judge::Answer::Good;
+    let cold = ExchangeCell::new(adapter, start).after(&[Tick]);
+    let working = cold.clone().after(&[Back, Up, Frame(0)]).after(&[Step; 5]);
+    let working = working.after(&[Newest(Good), Newest(Good), Frame(0)]);
+    // The first register is asked.
+    let asked = working.clone().after(&[Step, Step, Step]);
+    // A rise waits for that.
+    let rising = asked.clone().after(&[Frame(0), Frame(1)]);
+    // It was asked twice in vain, and both replies may come.
+    let outstanding = asked.clone().after(&[Step; 4]).after(&[Frame(0)]);
+    // The slave has started, and did not say so.
+    let started = working.clone().after(&[Frame(1), Step, Step, Frame(0)]);
+    // Nobody confirms the stop.
+    let stopping = working.clone().after(&[Frame(3)]).after(&[Step; 4]);
+    // Neither register was answered, for long.
+    let away = (0..10).fold(outstanding.clone(), |cell, _| cell.after(&[Step, Step, Frame(0)]));
+    vec![
+        root("working", working, 0),
+        root("cold", cold, 1),
+        root("rising", rising, 1),
+        root("outstanding", outstanding, 1),
+        root("started", started, 1),
+        root("stopping", stopping, 1),
+        root("away", away, 1),
+    ]
+}
+
+#[test]
+fn a_slave_that_is_read_started_and_stopped() {
+    check("a slave", &exchange_roots(Adapter::Silent, START), &size((5, 7_800), (6, 45_500)));
+}
+
+#[test]
+fn a_slave_behind_an_adapter_that_echoes() {
+    check("a slave with echo", &exchange_roots(Adapter::Echoes, START), &size((4, 1_150), (6, 48_000)));
+}
+
 #[track_caller]
 fn compare<W: World>(roots: &[Root<W>], later: &[Root<W>]) {
     for (root, later) in roots.iter().zip(later) {
@@ -185,5 +227,8 @@ fn states_that_are_merged_behave_alike() {
     compare(&command_roots(START), &command_roots(later));
     for way in [Way::Udp, Way::UdpBoth, Way::Held, Way::Tcp] {
         compare(&recipe_roots(way, START), &recipe_roots(way, later));
+    }
+    for adapter in [Adapter::Silent, Adapter::Echoes] {
+        compare(&exchange_roots(adapter, START), &exchange_roots(adapter, later));
     }
 }

@@ -21,6 +21,9 @@
 //! - What only the status shows: latency, the newest rejection, states and commands, and since when
 //!   something waits.
 //! - Layouts and dialects: computed from the configuration, never changed.
+//! - Of exchanges: what only a start of the device needs, which no cell has; when a request was taken last,
+//!   but for which of two neighbours was first; the kept request of an event, when a request left and how
+//!   long the line has been silent, which the judge has while they matter; what a framer holds.
 
 use std::fmt::{Debug, Write};
 
@@ -29,7 +32,7 @@ use proto_core::time::{Duration, Instant};
 pub struct Scribe {
     hash: u64,
     now: u64,
-    /// How many commands the port has picked.
+    /// How many commands the port has picked, or connections the controller has made.
     commands: u64,
     look_back: LookBack,
     /// Mixed in where states must not be merged.
@@ -45,6 +48,8 @@ pub struct Scribe {
     buffer_is_empty: bool,
     silence_is_normal: bool,
     is_deaf: bool,
+    /// The instant or the number before, of those that are written with the next one.
+    before: u64,
 }
 
 /// The longest times for which a configuration looks back; what is longer ago is all alike.
@@ -106,6 +111,14 @@ enum Field {
     IsDeaf,
     DeafUntil,
     WayMade,
+    /// Has it come, and when will it?
+    Until,
+    /// Of replies that may come: how many, until when.
+    Outstanding,
+    Taken,
+    Connection,
+    Failures,
+    Start,
 }
 
 /// Structs whose fields' names say too little.
@@ -125,6 +138,10 @@ enum Kind {
     Client,
     /// What gathers frames or packets.
     Gatherer,
+    /// The same of a line with exchanges.
+    Framer,
+    /// A bit as it was read last.
+    Reading,
 }
 
 const NEVER: u64 = u64::MAX;
@@ -133,6 +150,8 @@ const NEVER: u64 = u64::MAX;
 const TOGETHER: u64 = 1_000_000;
 /// And had it been up for this long?
 const SETTLED: u64 = 5_000_000;
+/// The longest wait of an exchange grows no more.
+const MOST_FAILURES: u64 = 6;
 /// The shortest wait of a link.
 const SHORTEST_WAIT: u64 = 100_000;
 
@@ -155,6 +174,7 @@ impl Scribe {
             buffer_is_empty: false,
             silence_is_normal: false,
             is_deaf: false,
+            before: 0,
         }
     }
 
@@ -192,6 +212,17 @@ impl Scribe {
         if self.field == Field::Shown {
             return;
         }
+        match self.field {
+            Field::Until if at != NEVER => return self.mix(at.saturating_sub(self.now)),
+            // How many there were does not matter any more.
+            Field::Outstanding if at <= self.now => return self.mix(0),
+            Field::Outstanding => self.mix(self.before),
+            Field::Taken => {
+                let before = std::mem::replace(&mut self.before, at);
+                return self.mix(u64::from(before < at) + 2 * u64::from(before > at));
+            }
+            _ => {}
+        }
         if at == NEVER || at == 0 {
             return self.mix(at ^ 0x5555);
         }
@@ -214,7 +245,7 @@ impl Scribe {
             (Field::At, Kind::Bit) => ago.min(self.look_back.bits.as_micros() + 1),
             (Field::Unconfirmed, _) => ago.min(self.look_back.unconfirmed.as_micros() + 1),
             (Field::Confirmed, _) => ago.min(self.look_back.confirmed.as_micros() + 1),
-            (Field::Stamps, _) => ago.min(self.look_back.stamps.as_micros() + 1),
+            (Field::Stamps, _) | (Field::At, Kind::Reading) => ago.min(self.look_back.stamps.as_micros() + 1),
             _ => ago,
         };
         self.mix(ago);
@@ -235,6 +266,8 @@ impl Scribe {
                 self.total = number;
                 return;
             }
+            // What it holds is the damaged reply of which the judge knows.
+            (Field::End, Kind::Framer) => return self.mix(number - self.before),
             (Field::End, _) => return self.mix(u64::from(self.total.wrapping_sub(number) as u32)),
             (Field::Len, Kind::Client) => {
                 self.len = number;
@@ -247,6 +280,12 @@ impl Scribe {
                 }
                 return;
             }
+            (Field::Outstanding, _) | (Field::Start, Kind::Framer) => {
+                self.before = number;
+                return;
+            }
+            (Field::Connection, _) => return self.mix(self.commands.wrapping_sub(number).min(1)),
+            (Field::Failures, _) => return self.mix(number.min(MOST_FAILURES)),
             (Field::Len | Field::Filled, Kind::Gatherer) if number != 0 => return self.mix(self.unique),
             (Field::Backoff, _) => {
                 let most = if number == SHORTEST_WAIT { TOGETHER } else { SETTLED };
@@ -278,20 +317,25 @@ impl Scribe {
         self.word = match text {
             b"Instant" => Word::Instant,
             b"PortCounters" | b"LinkCounters" | b"LinkHistory" | b"DeframerStats" | b"StreamLayout"
-            | b"CanLayout" | b"Dialect" | b"Latency" | b"Tap" => Word::Struct(Kind::LeftOut),
+            | b"CanLayout" | b"Dialect" | b"Latency" | b"Tap" | b"PeerCounters" | b"Times" | b"RowTimes"
+            | b"RowKind" | b"DeviceFormat" | b"FramerStats" | b"Told" | b"OutcomeTo" => {
+                Word::Struct(Kind::LeftOut)
+            }
             b"Sent" => Word::Struct(Kind::Sent),
             b"Up" => Word::Struct(Kind::Up),
             b"LineTiming" => Word::Struct(Kind::Line),
             b"BitSlot" | b"Edge" => Word::Struct(Kind::Bit),
             b"CommandClient" => Word::Struct(Kind::Client),
+            b"Framer" => Word::Struct(Kind::Framer),
+            b"Reading" => Word::Struct(Kind::Reading),
             b"Deframer" | b"StateStream" | b"AduReader" => Word::Struct(Kind::Gatherer),
             _ if text[0].is_ascii_uppercase() => Word::Struct(Kind::Other),
             b"transaction" | b"stale" | b"sleeps" | b"frames_sent" | b"packets" | b"misaligned"
-            | b"dropped" | b"counted" => Word::Field(Field::Counter),
-            b"bytes" | b"group" | b"ring" | b"buffer" | b"mask" | b"codes" | b"picked" => {
+            | b"dropped" | b"counted" | b"credit" | b"missed" => Word::Field(Field::Counter),
+            b"bytes" | b"group" | b"ring" | b"buffer" | b"mask" | b"codes" | b"picked" | b"written" => {
                 Word::Field(Field::Buffer)
             }
-            b"last_rejection" | b"last_text" | b"offered" | b"due_since" | b"born" => {
+            b"last_rejection" | b"last_text" | b"offered" | b"due_since" | b"born" | b"failing" | b"sent" => {
                 Word::Field(Field::Shown)
             }
             b"stamps" | b"packet_at" | b"source_at" | b"frame_at" => Word::Field(Field::Stamps),
@@ -310,6 +354,12 @@ impl Scribe {
             b"silence" => Word::Field(Field::Silence),
             b"backoff" => Word::Field(Field::Backoff),
             b"is_deaf" => Word::Field(Field::IsDeaf),
+            b"former" | b"look_at" | b"expires_at" => Word::Field(Field::Until),
+            b"outstanding" => Word::Field(Field::Outstanding),
+            b"taken" => Word::Field(Field::Taken),
+            b"connection" => Word::Field(Field::Connection),
+            b"failures" => Word::Field(Field::Failures),
+            b"start" => Word::Field(Field::Start),
             b"way_made_until" => Word::Field(Field::WayMade),
             b"deaf_until" => Word::Field(Field::DeafUntil),
             _ => Word::Field(Field::Other),
