@@ -17,8 +17,6 @@ pub(super) fn rules() -> Rules {
     let mut rules = Rules::new(moves, &values, TIMEOUT).limit("WordOutputReg[1]", 50_000);
     rules.moves.1 = trigger;
     rules.step = Some((vec![word("WordOutputReg[4]")], trigger));
-    // Nothing is awaited after the start, and a request fails at once when its connection is lost.
-    rules.first_failures = Duration::ZERO;
     rules.transport = Duration::from_secs(2);
     rules
 }
