@@ -7,7 +7,6 @@ use proto_core::command::{Action, Keyword, Request};
 use proto_core::config::{
     Bus, Echo, Exchange, FieldSpec, GatewayConfig, InputBinding, Port, Recipe, Span, Talk,
 };
-use proto_core::modbus::rtu::Operation;
 use proto_core::sysvar::Direction;
 use proto_core::time::Duration;
 use proto_core::wire::can::CanId;
@@ -95,9 +94,7 @@ impl PortChanges<'_> {
     fn echo(&mut self) {
         let Bus::Rs485(line) = &self.port.bus else { return };
         let may_be_echo = |exchange: &Exchange| match exchange.talk {
-            Talk::Rtu { operation, .. } => {
-                matches!(operation, Operation::WriteCoil { .. } | Operation::WriteRegister { .. })
-            }
+            Talk::Rtu { operation, .. } => operation.is_repeated_by_reply(),
             _ => true,
         };
         let concerned = |exchange: &Exchange| exchange.is_answered() && may_be_echo(exchange);

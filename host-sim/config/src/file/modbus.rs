@@ -4,7 +4,7 @@
 //! `kind = "modbus-rtu-slave"`. Out: [`FileExchange`]s. The numbers of registers and coils follow
 //! from the fields.
 
-use proto_core::config::{DeviceFrame, ExchangeError, ExchangeKey};
+use proto_core::config::{DeviceFrame, ExchangeError, ExchangeKey, register_bits};
 use proto_core::device::Carrier;
 use proto_core::modbus::rtu::{self, BROADCAST, Operation};
 use proto_core::sysvar::Direction;
@@ -30,10 +30,11 @@ pub(crate) enum Function {
     WriteCoils,
     WriteRegisters,
     ReadWriteRegisters,
+    MaskWriteRegister,
 }
 
 /// The names, the numbers and the functions of `function`.
-pub(crate) const FUNCTIONS: [(&str, i64, Function); 9] = [
+pub(crate) const FUNCTIONS: [(&str, i64, Function); 10] = [
     ("read-coils", 1, Function::ReadCoils),
     ("read-discrete-inputs", 2, Function::ReadDiscreteInputs),
     ("read-holding-registers", 3, Function::ReadHoldingRegisters),
@@ -42,6 +43,7 @@ pub(crate) const FUNCTIONS: [(&str, i64, Function); 9] = [
     ("write-register", 6, Function::WriteRegister),
     ("write-coils", 15, Function::WriteCoils),
     ("write-registers", 16, Function::WriteRegisters),
+    ("mask-write-register", 22, Function::MaskWriteRegister),
     ("read-write-registers", 23, Function::ReadWriteRegisters),
 ];
 
@@ -149,7 +151,20 @@ fn read_exchange(table: &Reader<'_>, names: &[Option<String>]) -> Result<FileExc
             count(&write)
         )));
     }
-    let operation = function.operation((first, count(&read)), (write_first, count(&write)));
+    let mask = write.as_ref().map_or(0, List::bits);
+    if function == Function::MaskWriteRegister {
+        let list = table.required("write", "")?;
+        if count(&write) != 1 {
+            return Err(list.error(format!(
+                "this function writes bits of one register, not of {}; fields of the same type with bits share it",
+                count(&write)
+            )));
+        }
+        if matches!(mask, 0 | u16::MAX) {
+            return Err(list.error(ExchangeError::Mask));
+        }
+    }
+    let operation = function.operation((first, count(&read)), (write_first, count(&write)), mask);
     check(table, &operation, &read, &write)?;
     let timing = AskTiming::read(table, names)?;
     if !function.reads() {
@@ -195,7 +210,7 @@ fn read_block(table: &Reader<'_>, peer: u8) -> Result<FileExchange> {
         (Table::HoldingRegisters, Direction::Output) => Function::ReadHoldingRegisters,
         (Table::InputRegisters, _) => Function::ReadInputRegisters,
     };
-    let operation = function.operation((first, count), (first, count));
+    let operation = function.operation((first, count), (first, count), 0);
     let list = Some(list);
     match direction {
         Direction::Input => check(table, &operation, &None, &list)?,
@@ -305,6 +320,11 @@ impl<'a> List<'a> {
         if !is_coils { list.with_registers(direction) } else { Ok(list) }
     }
 
+    /// The bits of a register that have a field.
+    fn bits(&self) -> u16 {
+        register_bits(&self.part.fields().iter().map(FileField::spec).collect::<Vec<_>>())
+    }
+
     /// Counts the registers.
     fn with_registers(mut self, direction: Direction) -> Result<Self> {
         let specs: Vec<_> = self.part.fields().iter().map(FileField::spec).collect();
@@ -374,6 +394,7 @@ impl Function {
             Self::ReadHoldingRegisters
             | Self::WriteRegister
             | Self::WriteRegisters
+            | Self::MaskWriteRegister
             | Self::ReadWriteRegisters => Table::HoldingRegisters,
         }
     }
@@ -383,15 +404,22 @@ impl Function {
     }
 
     fn reads(self) -> bool {
-        !matches!(self, Self::WriteCoil | Self::WriteRegister | Self::WriteCoils | Self::WriteRegisters)
+        !matches!(
+            self,
+            Self::WriteCoil
+                | Self::WriteRegister
+                | Self::WriteCoils
+                | Self::WriteRegisters
+                | Self::MaskWriteRegister
+        )
     }
 
     fn writes(self) -> bool {
         !self.reads() || self == Self::ReadWriteRegisters
     }
 
-    /// With addresses and counts.
-    fn operation(self, read: (u16, u16), write: (u16, u16)) -> Operation {
+    /// With addresses and counts, and the bits that are written of one register.
+    fn operation(self, read: (u16, u16), write: (u16, u16), mask: u16) -> Operation {
         let ((address, count), (write_address, write_count)) =
             if self.reads() { (read, write) } else { (write, write) };
         match self {
@@ -403,6 +431,7 @@ impl Function {
             Self::WriteRegister => Operation::WriteRegister { address },
             Self::WriteCoils => Operation::WriteCoils { address, count },
             Self::WriteRegisters => Operation::WriteRegisters { address, count },
+            Self::MaskWriteRegister => Operation::MaskWriteRegister { address, mask },
             Self::ReadWriteRegisters => Operation::ReadWriteRegisters {
                 read_address: address,
                 read_count: count,

@@ -23,9 +23,7 @@ pub(super) fn frames(
         return [Some(request), None, None];
     }
     let reply = match operation {
-        Operation::WriteCoil { .. } | Operation::WriteRegister { .. } => {
-            frame.clone().request(operation, written)
-        }
+        _ if operation.is_repeated_by_reply() => frame.clone().request(operation, written),
         Operation::WriteCoils { address, count } | Operation::WriteRegisters { address, count } => {
             frame.clone().words(&[("address", *address), ("count", *count)])
         }
@@ -78,6 +76,9 @@ impl Frame {
                 let mut frame = self.words(&[("address", address)]).fields(&coils);
                 frame.byte("", 0);
                 frame
+            }
+            Operation::MaskWriteRegister { address, mask } => {
+                self.words(&[("address", address), ("keep", !mask)]).fields(written)
             }
             Operation::WriteRegister { address } => self.words(&[("address", address)]).fields(written),
             Operation::WriteCoils { address, count } | Operation::WriteRegisters { address, count } => {

@@ -177,7 +177,7 @@ pub const SLAVE: Key = Key::integer("slave", 0, 255)
 /// What is asked of it.
 pub const FUNCTION: Key = Key::new(
     "function",
-    Shape::Either(&[Shape::Words(words!(FUNCTIONS)), Shape::Codes(&[1, 2, 3, 4, 5, 6, 15, 16, 23])]),
+    Shape::Either(&[Shape::Words(words!(FUNCTIONS)), Shape::Codes(&[1, 2, 3, 4, 5, 6, 15, 16, 22, 23])]),
 )
 .required()
 .tells("a name or a number, see below");
@@ -218,7 +218,11 @@ pub const OF_MODBUS: Table =
             keys: &[&[WORD_ORDER_OF_REGISTERS, READ], TIMING, OF_REPLY],
         },
         Case {
-            when: &[When::Is("function", &["write-register", "write-registers"], &[6, 16])],
+            when: &[When::Is(
+                "function",
+                &["write-register", "write-registers", "mask-write-register"],
+                &[6, 16, 22],
+            )],
             keys: &[&[WORD_ORDER_OF_REGISTERS, WRITE], TIMING],
         },
         Case {

@@ -258,6 +258,8 @@ fn what_events_may_cost_is_told() {
     let told = warnings(&recipe(&format!("{rises}\nretries = 1")), port);
     assert!(told.iter().any(|said| said.contains("may carry it out twice")), "{told:?}");
     assert!(warnings(&with_stop, MODBUS).iter().any(|said| said.contains("write echo = false")));
+    let bits = with_stop.replace("\"write-register\"", "22").replace("value = 1", "bits = 3, value = 1");
+    assert!(warnings(&bits, MODBUS).iter().any(|said| said.contains("write echo = false")));
     let slow = "kind = \"modbus-rtu\"\n[[recipe.exchange]]\nslave = 1\nfunction = \"read-holding-registers\"\naddress = \
                 0\nevery_ms = 1000\nread = [{ pad = 248 }, { name = \"v\", type = \"word\", to = \"WordInputReg[1]\" }]\n";
     let told = warnings(slow, "bus = \"modbus-rtu\"\nbaud = 9600\ntimeout_ms = 3000");

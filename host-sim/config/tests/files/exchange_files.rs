@@ -75,6 +75,32 @@ fn a_master_has_its_registers() {
 }
 
 #[test]
+fn bits_of_a_register_leave_the_others_as_they_are() {
+    let fields = "write = [{ name = \"light\", type = \"word\", bits = 2, from = \"BitOutputReg[3].1\" }, \
+                  { name = \"level\", type = \"word\", bits = \"8..11\", from = \"WordOutputReg[2]\" }]";
+    let speed = "write = [{ name = \"speed\", type = \"word\", from = \"WordOutputReg[3]\" }]";
+    for function in ["\"mask-write-register\"", "22"] {
+        let toml = LINE.replace(speed, fields).replace("\"write-register\"", function);
+        let config = parse_gateway(Text { name: "line.toml", toml: &toml }, &[]).unwrap();
+        let (operation, written, read) = rtu(&config, 5);
+        assert_eq!(operation, Operation::MaskWriteRegister { address: 1, mask: 0x0F04 });
+        assert_eq!((written.len(), read.len()), (2, 0));
+        // As tools show it: address and function, where, what is kept, the bits, the CRC.
+        let recipes = parse_recipes(Text { name: "line.toml", toml: &toml }, &[]).unwrap();
+        let recipe_config::AnyRecipe::Device(recipe) = &recipes[0] else { panic!() };
+        let exchange = &recipe.exchanges[5];
+        for frame in [&exchange.request, &exchange.reply] {
+            let frame =
+                frame.as_ref().unwrap().lay_out(recipe.carrier, proto_core::sysvar::Direction::Output);
+            let (frame, mut out) = (frame.unwrap(), [0; 16]);
+            let bits = |nth: usize| if nth == 4 { 1.0 } else { 5.0 };
+            assert_eq!(frame.layout.encode(&frame.elements, bits, &mut out), Some(10));
+            assert_eq!(out[..8], [6, 22, 0, 1, 0xF0, 0xFB, 0x05, 0x04]);
+        }
+    }
+}
+
+#[test]
 fn coils_share_bytes_lowest_first() {
     let config = line();
     let (operation, _, read) = rtu(&config, 2);

@@ -28,6 +28,7 @@ const CASES: &[Case] = &[
     line("an exchange that is no table", "[[recipe]]\nname = \"plc\"", "[[recipe]]\nname = \"empty\"\nkind = \"modbus-rtu\"\nexchange = 3\n[[recipe]]\nname = \"plc\""),
     // Ports.
     line("a master's recipe on a plain line", "bus = \"modbus-rtu\"\n", "bus = \"rs485\"\n"),
+    line("Modbus ASCII", "bus = \"modbus-rtu\"\n", "bus = \"modbus-ascii\"\n"),
     line("a master's recipe on a slave's line", "bus = \"modbus-rtu\"\n", "bus = \"modbus-rtu-slave\"\n"),
     line("a plain recipe on a master's line", "bus = \"rs485\"", "bus = \"modbus-rtu\""),
     line("a CAN recipe on a slave's line", "bus = \"can\"", "bus = \"modbus-rtu-slave\""),
@@ -57,6 +58,8 @@ const CASES: &[Case] = &[
     line("a list that is no list", "write = [{ name = \"lamp\", from = \"WordOutputReg[2]\" }]", "write = 5"),
     line("a read of all slaves", "slave = 5\nfunction = \"read-coils\"", "slave = 0\nfunction = \"read-coils\""),
     line("a timeout where nobody answers", "slave = 0\n", "slave = 0\ntimeout_ms = 10\n"),
+    line("all bits of a register with function 22", "function = \"write-register\"", "function = 22"),
+    line("bits of two registers", "function = \"write-register\"\naddress = 1\nevery_ms = 500\nwrite = [{ name = \"speed\", type = \"word\",", "function = 22\naddress = 1\nevery_ms = 500\nwrite = [{ name = \"speed\", type = \"dword\", bits = 3,"),
     line("an exchange that is never asked", "every_ms = 500\n", ""),
     line("half a register", "    { pad = 1 },\n    { type = \"word\", equals = 7 }", "    { type = \"word\", equals = 7 }"),
     line("a text without a length in registers", "{ name = \"order\", type = \"word\", bits = \"4..7\" },", "{ name = \"order\", type = \"text\", to = \"WordInputReg[20..21]\" },"),
