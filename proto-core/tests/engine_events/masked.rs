@@ -150,7 +150,9 @@ fn replies_are_told_apart_by_the_bits_and_like_ones_wait() {
         is_low.then_some((MS(130), reply))
     });
     let after = line.peer(3).counters;
-    assert!(asked.iter().any(|(_, request)| request[4] == 0xF0), "the others are not held back");
+    // The others are not held back until the late reply has come.
+    let at = |keeps: u8| asked.iter().find(|(_, request)| request[4] == keeps).unwrap().0;
+    assert!(at(0xFF) < at(0xF0) && at(0xF0) < at(0xFF) + MS(130), "{asked:02X?}");
     assert_eq!(after.replies, before.replies, "none was in time: {asked:02X?}");
     assert!(after.late_replies > before.late_replies);
 }
