@@ -452,11 +452,9 @@ impl Line {
         let ended = if flight.is_ambiguous { Ended::Unclear } else { ended };
         // The reply may be a late one to the first of the requests. Then that to the repetition is still to come.
         let sent = if matches!(self.phase, Phase::Sending(_)) { now } else { self.sent };
-        if flight.is_ambiguous {
-            // Its own may be still to come.
-            if let Some(row) = talks.row_of(flight) {
-                row.leaves_outstanding(flight.repeated.saturating_add(1), sent + row.late(), now);
-            }
+        if let Some(row) = talks.row_of(flight).filter(|row| flight.is_ambiguous || row.is_outstanding(now)) {
+            // What came may be another's reply, or that of a stop to an earlier transmission: its own is to come then.
+            row.leaves_outstanding(flight.repeated.saturating_add(1), sent + row.late(), now);
         } else {
             leave_outstanding(talks, flight, flight.repeated, sent, now);
         }
