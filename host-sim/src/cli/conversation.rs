@@ -1,6 +1,6 @@
 //! The exchanges of a recipe as `check` draws them: what is asked when, its bytes, and its time.
 
-use proto_core::config::{AskWhen, Bus, Exchange, GatewayConfig, Port};
+use proto_core::config::{self, AskWhen, Bus, Exchange, GatewayConfig, Port, register_bits};
 use proto_core::device::Carrier;
 use proto_core::engine::{Plan, Source};
 use proto_core::modbus::rtu::{BROADCAST, Operation, Table};
@@ -36,6 +36,9 @@ pub(super) struct Talk {
     /// The shortest pulse of its bit that is seen for sure.
     #[serde(skip_serializing_if = "Option::is_none")]
     pulse_ms: Option<f64>,
+    /// Bits of a register that it writes as 0, because they have no field.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    zeroed_bits: Option<String>,
     /// It is an event on CAN: Linux' own driver cannot take a frame back that waits in the adapter.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     may_leave_late: bool,
@@ -126,6 +129,7 @@ impl Talk {
             late_ms: (!held_back.is_empty()).then(|| millis(exchange.late())),
             held_back,
             pulse_ms: shortest_pulse(config, port, exchange).map(millis),
+            zeroed_bits: zeroed_bits(config, exchange).map(|bits| format!("{bits:#06X}")),
             may_leave_late: exchange.when.rising.is_some() && matches!(port.bus, Bus::Can { .. }),
             percent: exchange
                 .when
@@ -155,6 +159,10 @@ impl Talk {
         }
         if let Some(pulse) = self.pulse_ms {
             report += &format!("    a pulse of {pulse} ms or more is seen for sure\n");
+        }
+        if let Some(bits) = &self.zeroed_bits {
+            report +=
+                &format!("    bits {bits} are written as 0; mask-write-register leaves them as they are\n");
         }
         if self.may_leave_late {
             report += "    with socketcan:, a frame that waits in the adapter leaves late\n";
@@ -190,6 +198,9 @@ fn subject(named: &NamedExchange) -> String {
                     format!(
                         "{slave}, {function}, {read_count} from {read_address:#06X}, {write_count} to {write_address:#06X}"
                     )
+                }
+                Operation::MaskWriteRegister { address, mask } => {
+                    format!("{slave}, {function}, bits {mask:#06X} at {address:#06X}")
                 }
                 _ => {
                     let (_, address, count) = operation.place();
@@ -227,6 +238,15 @@ fn times(exchange: &Exchange, named: &NamedExchange) -> String {
         _ if times.is_empty() => "comes unasked".to_owned(),
         _ => times.join(", "),
     }
+}
+
+/// The bits of one register that have no field, if others have.
+fn zeroed_bits(config: &GatewayConfig, exchange: &Exchange) -> Option<u16> {
+    let config::Talk::Rtu { operation, written, .. } = exchange.talk else { return None };
+    let is_one =
+        matches!(operation, Operation::WriteRegister { .. } | Operation::WriteRegisters { count: 1, .. });
+    let bits = !register_bits(written.of(&config.fields));
+    (is_one && !matches!(bits, 0 | u16::MAX)).then_some(bits)
 }
 
 /// The shortest pulse of the bit of an exchange that is read as 1, whenever it comes: two readings, of which one may be

@@ -295,6 +295,43 @@ fn keys(value: &Value, all: &mut std::collections::BTreeSet<String>) {
 }
 
 #[test]
+fn bits_of_a_register_that_are_written_as_0_are_told() {
+    let shown = |function: &str, keys: &str| {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("line.toml");
+        let toml = format!(
+            "controller = {{ address = \"127.0.0.1\" }}
+            [[recipe]]
+            name = \"r\"
+            kind = \"modbus-rtu\"
+            [[recipe.exchange]]
+            slave = 6
+            function = \"{function}\"
+            address = 256
+            on = [\"change\"]
+            write = [{{ name = \"light\", type = \"word\", {keys} from = \"WordOutputReg[2]\" }}]
+            [[port]]
+            name = \"line\"
+            bus = \"modbus-rtu\"
+            recipe = \"r\""
+        );
+        std::fs::write(&path, toml).unwrap();
+        let path = path.to_str().unwrap();
+        let text = String::from_utf8(host_sim(&["check", path]).stdout).unwrap();
+        let exchange = json(&["check", "--json", path]).1["ports"][0]["exchanges"][0].clone();
+        let is_told =
+            text.contains("bits 0xFFFB are written as 0; mask-write-register leaves them as they are");
+        assert_eq!(is_told, exchange["zeroed_bits"] == "0xFFFB", "{text}");
+        (is_told, exchange["what"].as_str().unwrap().to_owned())
+    };
+    let (function, bits) = ("write-register", "bits = 2,");
+    assert_eq!(shown(function, bits), (true, "slave 6, write-register (6), 1 at 0x0100".into()));
+    assert!(shown("write-registers", bits).0 && !shown(function, "").0);
+    let what = "slave 6, mask-write-register (22), bits 0x0004 at 0x0100";
+    assert_eq!(shown("mask-write-register", bits), (false, what.into()));
+}
+
+#[test]
 fn every_key_of_the_json_is_documented() {
     let page = std::fs::read_to_string(recipe_test_kit::repository().join("docs/checking.md")).unwrap();
     let mut all = std::collections::BTreeSet::new();
