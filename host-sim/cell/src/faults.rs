@@ -132,7 +132,7 @@ impl Cell {
 
     fn note(&mut self, link: LinkId) {
         self.trace.add(self.now, What::Fault, link.0.into(), &[]);
-        self.device_link_disturbed(link);
+        self.device_link_fault(link);
         self.disturb(Some(link));
     }
 

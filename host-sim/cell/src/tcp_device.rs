@@ -209,6 +209,14 @@ impl Cell {
         }
     }
 
+    /// A fault of a link begins or ends: an attempt to connect may have failed by it.
+    pub(super) fn device_link_fault(&mut self, link: LinkId) {
+        if let Some(device) = self.servers.get_mut(&link) {
+            device.missed_since = None;
+        }
+        self.device_link_disturbed(link);
+    }
+
     /// Something happens to a link: the judge is told if it is a device's.
     pub(super) fn device_link_disturbed(&mut self, link: LinkId) {
         if let Some(judge) = self.judge.as_mut().filter(|_| self.servers.contains_key(&link)) {

@@ -108,7 +108,7 @@ impl Units {
         if self.leaving.is_empty() && rng.below(8) == 0 {
             let rest = reply.split_off(rng.between(1, reply.len() as u64 - 1) as usize);
             self.leaving.push((at, Served::Bytes(reply, None)));
-            at = at + rng.up_to(LONGEST_GAP);
+            at += rng.up_to(LONGEST_GAP);
             (reply, self.not_before, in_time) = (rest, at, false);
         }
         // Modbus TCP has no echo.

@@ -138,7 +138,8 @@ fn a_device_is_asked_over_one_connection_whatever_its_pieces() {
 fn a_connection_that_is_refused_swallowed_reset_or_cut_is_there_again() {
     let (mut cell, desk) = cell();
     reaches(&mut cell, &desk, 1, 500);
-    let faults: [(fn(&mut Cell), fn(&mut Cell)); 5] = [
+    type Fault = fn(&mut Cell);
+    let faults: [(Fault, Fault); 5] = [
         (|cell| (cell.refuse(LINK), cell.reset(LINK)).1, |cell| cell.admit(LINK)),
         (|cell| (cell.black_hole(LINK), cell.half_open(LINK)).1, |cell| cell.admit(LINK)),
         (|cell| cell.cut_cable(LINK), |cell| cell.repair_cable(LINK)),
