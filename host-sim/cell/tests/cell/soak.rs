@@ -47,7 +47,7 @@ fn shared(cells: &[&str], level: Level, span: Duration) -> ([Part; 3], Part) {
 /// The hashes of these runs on every machine. Only a change of what the engine, the controller or the cell
 /// does, or when, may change them; then enter the new ones here.
 const HASHES: [(Level, u64); 2] =
-    [(Level::None, 0xBEEC_E7B8_93FF_3222), (Level::Harsh, 0x4652_20B7_31FE_36D8)];
+    [(Level::None, 0x9713_580D_9A44_A969), (Level::Harsh, 0xB0E4_949E_8EF3_2B27)];
 
 #[test]
 fn a_seed_means_the_same_trace_on_every_machine() {
