@@ -509,20 +509,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 self.store.image.assign(var, group);
             }
         }
-        let timings = match kind {
-            // The controller's client may connect only after days: that is not a failure.
-            LinkKind::RecipeTcpListen { .. } | LinkKind::RecipeUdpListen { .. } => LinkTimings {
-                connect_timeout: Duration::MAX,
-                backoff_max: LinkTimings::TCP.backoff_min,
-                ..LinkTimings::TCP
-            },
-            _ => LinkTimings::TCP,
-        };
-        let timings = match kind {
-            LinkKind::RecipeTcpListen { .. } | LinkKind::RecipeUdpListen { .. } if output.is_some() => {
-                timings.with_silence(Duration::from_secs(2))
-            }
-            _ => timings,
+        let listens = matches!(kind, LinkKind::RecipeTcpListen { .. } | LinkKind::RecipeUdpListen { .. });
+        let timings = match (listens, output.is_some()) {
+            (true, true) => const { &LinkTimings::LISTENING.with_silence(Duration::from_secs(2)) },
+            (true, false) => &LinkTimings::LISTENING,
+            (false, _) => &LinkTimings::TCP,
         };
         let set: InputSet = config.written_by(recipe).collect();
         let writes: InputSet =

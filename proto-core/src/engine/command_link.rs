@@ -97,7 +97,7 @@ impl CommandLink {
     /// The newest text of a connection that no command got as its reply.
     pub(super) fn other_text_of<'a>(&'a self, session: &'a Session) -> Option<OtherText<'a>> {
         let last = session.last_text.as_ref()?;
-        let command = last.command.and_then(|(entry, value)| self.text(entry, value));
+        let command = last.entry.and_then(|entry| self.text(entry, last.value));
         Some(OtherText { at: last.at, text: &last.text, command })
     }
 

@@ -39,7 +39,7 @@ impl DeviceLink {
             name,
             host,
             tcp_port,
-            supervisor: Supervisor::new(LinkTimings::TCP),
+            supervisor: Supervisor::new(&LinkTimings::TCP),
             counters: LinkCounters::ZERO,
             due_at: Instant::NEVER,
         }

@@ -126,7 +126,7 @@ impl ModbusLink {
 
     pub(super) fn new(port: u16, unit: u8, writes: InputSet) -> Self {
         Self {
-            supervisor: Supervisor::new(LinkTimings::TCP),
+            supervisor: Supervisor::new(&LinkTimings::TCP),
             counters: LinkCounters::default(),
             port,
             client: Client::new(unit),

@@ -8,7 +8,7 @@ use crate::config::CommandText;
 use crate::time::Instant;
 
 /// Maximum length of a text that is kept, in bytes; the rest is cut off.
-pub const MAX_OTHER_TEXT: usize = 64;
+pub const MAX_OTHER_TEXT: usize = 48;
 
 /// A text that no command got as its reply, and the command whose reply it may be.
 #[derive(Debug, Clone, Copy)]
@@ -29,8 +29,9 @@ pub struct OtherText<'a> {
 pub(super) struct LastText {
     pub at: Instant,
     pub text: String<MAX_OTHER_TEXT>,
-    /// Entry and value of the command.
-    pub command: Option<(u16, i64)>,
+    /// The entry of the command, and its value.
+    pub entry: Option<u16>,
+    pub value: i64,
 }
 
 impl LastText {
@@ -47,7 +48,8 @@ impl LastText {
                 break;
             }
         }
-        Self { at, text, command: command.map(|command| (command.entry, command.value)) }
+        let entry = command.map(|command| command.entry);
+        Self { at, text, entry, value: command.map_or(0, |command| command.value) }
     }
 }
 

@@ -21,8 +21,8 @@ use crate::wire::scalar::{Scalar, ScalarType};
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Rule {
     is: Is,
-    high: u32,
-    low: u32,
+    /// As bytes, which need no alignment: a binding stays small.
+    bits: [u8; 8],
 }
 
 /// What a word is.
@@ -58,15 +58,20 @@ enum Is {
 
 impl Rule {
     const fn new(is: Is, number: u64) -> Self {
-        Self { is, high: number.unbounded_shr(32) as u32, low: number as u32 }
+        Self { is, bits: number.to_be_bytes() }
     }
 
     const fn bits(self) -> u64 {
-        (self.high as u64).unbounded_shl(32) | self.low as u64
+        u64::from_be_bytes(self.bits)
     }
 
     const fn number(self) -> f64 {
         f64::from_bits(self.bits())
+    }
+
+    /// Its two halves.
+    const fn halves(self) -> [u32; 2] {
+        [self.bits().unbounded_shr(32) as u32, self.bits() as u32]
     }
 
     fn to_bind(self) -> InputBind {
@@ -113,8 +118,8 @@ pub(super) fn words_of(field: &FieldSpec) -> impl Iterator<Item = InputBind> + u
 
 /// The word that begins the rules of a variable.
 pub(super) fn scale_word(scale: f32, offset: f32) -> InputBind {
-    let (high, low) = (scale.to_bits(), offset.to_bits());
-    Rule { is: Is::Scale, high, low }.to_bind()
+    let high = u64::from(scale.to_bits()).unbounded_shl(32);
+    Rule::new(Is::Scale, high | u64::from(offset.to_bits())).to_bind()
 }
 
 /// What becomes of the value of an input field that writes a variable.
@@ -201,7 +206,8 @@ impl<'a> Rules<'a> {
     /// The variable, or the bits of it, that tells whether a value was taken.
     pub(super) fn valid_to(self) -> Option<(SysVar, u8)> {
         let rule = self.find(Is::ValidTo)?;
-        SysVar::from_ordinal(rule.low as usize).map(|var| (var, rule.high as u8))
+        let [mask, var] = rule.halves();
+        SysVar::from_ordinal(var as usize).map(|var| (var, mask as u8))
     }
 
     /// The lowest and the highest number that limits let pass.
@@ -275,7 +281,7 @@ impl<'a> Rules<'a> {
     }
 
     pub(super) fn scale(self) -> (f32, f32) {
-        self.find(Is::Scale).map_or((1.0, 0.0), |rule| (f32::from_bits(rule.high), f32::from_bits(rule.low)))
+        self.find(Is::Scale).map_or((1.0, 0.0), |rule| rule.halves().map(f32::from_bits).into())
     }
 
     fn limited(self, number: f64) -> Option<f64> {

@@ -51,7 +51,7 @@ pub(super) struct Session {
 impl Session {
     pub(super) const fn new() -> Self {
         Self {
-            supervisor: Supervisor::new(LinkTimings::TCP),
+            supervisor: Supervisor::new(&LinkTimings::TCP),
             counters: LinkCounters::ZERO,
             client: CommandClient::new(),
             in_flight: None,

@@ -64,7 +64,7 @@ impl Kept {
 impl StateLink {
     pub(super) fn new(port: u16, dialect: Dialect, group: GroupId, read_back: InputSet) -> Self {
         Self {
-            supervisor: Supervisor::new(LinkTimings::TCP.with_silence(SILENCE)),
+            supervisor: Supervisor::new(const { &LinkTimings::TCP.with_silence(SILENCE) }),
             counters: LinkCounters::default(),
             port,
             dialect,

@@ -79,7 +79,7 @@ pub(super) struct UplinkSetup {
     pub kind: LinkKind,
     pub name: Option<Name>,
     pub transport: Transport,
-    pub timings: LinkTimings,
+    pub timings: &'static LinkTimings,
     pub input: Option<StreamLayout>,
     pub output: Option<StreamLayout>,
     /// Variables in the frames up, and those of them that are written here.

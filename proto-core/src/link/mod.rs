@@ -30,6 +30,10 @@ impl LinkTimings {
         silence: None,
     };
 
+    /// For links that the controller opens: it may do so only after days, and that is no failure.
+    pub(crate) const LISTENING: Self =
+        Self { connect_timeout: Duration::MAX, backoff_max: Self::TCP.backoff_min, ..Self::TCP };
+
     /// Same, but closed after `silence` without a byte.
     #[must_use]
     pub(crate) const fn with_silence(self, silence: Duration) -> Self {
@@ -100,9 +104,10 @@ pub struct LinkHistory {
 /// Supervisor of one link.
 #[derive(Debug, Clone)]
 pub(crate) struct Supervisor {
-    timings: LinkTimings,
+    timings: &'static LinkTimings,
     state: LinkState,
-    backoff: Duration,
+    /// How often the wait has doubled.
+    doubled: u8,
     heard: Instant,
     action: Option<LinkAction>,
     history: LinkHistory,
@@ -110,11 +115,11 @@ pub(crate) struct Supervisor {
 
 impl Supervisor {
     /// The supervisor of a link that is to be opened at once.
-    pub(crate) const fn new(timings: LinkTimings) -> Self {
+    pub(crate) const fn new(timings: &'static LinkTimings) -> Self {
         Self {
             timings,
             state: LinkState::Down { retry_at: Instant::ZERO },
-            backoff: timings.backoff_min,
+            doubled: 0,
             heard: Instant::ZERO,
             action: None,
             history: LinkHistory { connects: 0, losses: 0, failed_opens: 0, silences: 0 },
@@ -188,8 +193,8 @@ impl Supervisor {
     /// The link carries its own traffic again; it is opened after the shortest wait.
     pub(crate) fn unshare(&mut self, now: Instant) {
         if self.state == LinkState::Shared {
-            self.backoff = self.timings.backoff_min;
-            self.state = LinkState::Down { retry_at: now + self.backoff };
+            self.doubled = 0;
+            self.state = LinkState::Down { retry_at: now + self.backoff() };
         }
     }
 
@@ -237,13 +242,19 @@ impl Supervisor {
             LinkState::Up { since } => {
                 self.history.losses = self.history.losses.saturating_add(1);
                 if now.saturating_since(since) >= self.timings.settled_after {
-                    self.backoff = self.timings.backoff_min;
+                    self.doubled = 0;
                 }
             }
             _ => self.history.failed_opens = self.history.failed_opens.saturating_add(1),
         }
-        self.state = LinkState::Down { retry_at: now + self.backoff };
-        self.backoff = self.backoff.saturating_mul(2).min(self.timings.backoff_max);
+        self.state = LinkState::Down { retry_at: now + self.backoff() };
+        self.doubled = self.doubled.saturating_add(1);
+    }
+
+    /// The wait after the next loss.
+    fn backoff(&self) -> Duration {
+        let times = 1_u64.checked_shl(self.doubled.into()).unwrap_or(u64::MAX);
+        self.timings.backoff_min.saturating_mul(times).min(self.timings.backoff_max)
     }
 }
 
@@ -254,7 +265,7 @@ mod tests {
     const MS: fn(u64) -> Instant = Instant::from_millis;
 
     fn opened(at: Instant) -> Supervisor {
-        let mut link = Supervisor::new(LinkTimings::TCP.with_silence(Duration::from_secs(2)));
+        let mut link = Supervisor::new(const { &LinkTimings::TCP.with_silence(Duration::from_secs(2)) });
         link.advance(at);
         assert_eq!(link.take_action(), Some(LinkAction::Open));
         assert_eq!(link.take_action(), None, "an action is told once");
@@ -298,7 +309,7 @@ mod tests {
 
     #[test]
     fn a_report_from_before_it_is_opened_says_nothing() {
-        let mut link = Supervisor::new(LinkTimings::TCP);
+        let mut link = Supervisor::new(&LinkTimings::TCP);
         link.advance(MS(0));
         assert!(!link.down(MS(0)) && !link.up(MS(0)));
         assert_eq!((link.take_action(), link.state().name()), (Some(LinkAction::Open), "opening"));
