@@ -140,7 +140,7 @@ fn help_and_refusals() {
         refused(&["--shard", "4/3", "--json"]),
         refused(&["--shard", "1/3"]),
         refused(&["--shard", "1/3", "--json", "--replay", "9@2"]),
-        refused(&["--shard", "3/22", "--json"]),
+        refused(&["--shard", "3/23", "--json"]),
         refused(&["--seed", "1", "merge", "no-such.json"]),
     ];
     insta::assert_snapshot!("refused", messages.join("\n"));
