@@ -326,7 +326,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             self.advance_talk(now);
         }
         self.links.advance(&mut self.store);
-        self.carry_connections(now);
+        if !self.links.devices.is_empty() {
+            self.advance_connections(now);
+        }
         self.carry_results();
     }
 

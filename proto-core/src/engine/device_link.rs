@@ -188,10 +188,17 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
     }
 
-    /// A port is there while its connection is.
+    /// Handles the clock.
     #[cold]
     #[inline(never)]
-    pub(super) fn carry_connections(&mut self, now: Instant) {
+    pub(super) fn advance_connections(&mut self, now: Instant) {
+        self.links.devices.iter_mut().for_each(|link| link.advance(now));
+        self.carry_connections(now);
+    }
+
+    /// A port is there while its connection is.
+    #[inline(never)]
+    fn carry_connections(&mut self, now: Instant) {
         for nth in 0..self.links.devices.len() {
             let Some(link) = self.links.devices.get(nth) else { break };
             let (id, is_up) = (link.port, link.supervisor.is_up());

@@ -251,7 +251,6 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
                 link.lost(store);
             }
         });
-        self.devices.iter_mut().for_each(|link| link.advance(now));
     }
 
     /// The gateway itself slept: the age of data on its connections is unknown, so all of them are
