@@ -365,10 +365,10 @@ fn the_newest_words_are_kept_with_and_without_a_command() {
     rig.link_bytes(COMMAND, &[b'x'; 200]);
     rig.run(MS(20));
     let (_, text, command) = other_text(&rig, COMMAND).unwrap();
-    assert_eq!((text, command.as_deref()), ("x".repeat(64), Some("poweron")), "cut");
+    assert_eq!((text, command.as_deref()), ("x".repeat(48), Some("poweron")), "cut");
     assert_eq!(other_text(&rig, URGENT), None);
     // It stays over the loss of the connection, for whoever looks later.
     rig.input(Input::LinkDown { link: COMMAND });
     rig.run(MS(1_000));
-    assert_eq!(other_text(&rig, COMMAND).unwrap().1.len(), 64);
+    assert_eq!(other_text(&rig, COMMAND).unwrap().1.len(), 48);
 }
