@@ -23,8 +23,8 @@ pub(super) fn device(rng: Rng, start: Instant) -> Slave {
     Slave::new(Machine::new(rng, start, TIMEOUT, false), 5, &PLACES)
 }
 
-const TIMEOUT: Duration = Duration::from_millis(80);
-const PLACES: [Place; 7] = [
+pub(super) const TIMEOUT: Duration = Duration::from_millis(80);
+pub(super) const PLACES: [Place; 7] = [
     Place { function: 6, address: 0x0200, count: 1, is: What::Order(Order::Start) },
     Place { function: 5, address: 0x0001, count: 1, is: What::Order(Order::Stop) },
     Place { function: 16, address: 0x0210, count: 3, is: What::Order(Order::Move) },

@@ -402,13 +402,10 @@ impl Judge {
         }
     }
 
-    fn is_absent(&self, since: Instant, now: Instant) -> bool {
-        now.saturating_since(since) + SLACK >= self.rules.absent
-    }
-
     /// Whether nothing was heard of it for so long that it has started, to the gateway.
     fn is_away(&self, now: Instant) -> bool {
-        self.is_absent(self.replied.unwrap_or(self.began), now)
+        let unheard = now.saturating_since(self.replied.unwrap_or(self.began));
+        unheard + SLACK >= self.rules.absent
     }
 
     fn replies(&mut self, is_whole: bool, tells: bool, now: Instant) {

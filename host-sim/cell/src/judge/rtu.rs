@@ -38,34 +38,47 @@ impl Slave {
     }
 
     fn handle(&mut self, frame: &[u8], now: Instant) {
-        let word = |at: usize| u16::from_be_bytes([frame[at], frame[at + 1]]);
-        let (function, address) = (frame[1], word(2));
-        let count = if matches!(function, 5 | 6) { 1 } else { word(4) };
-        let place = self
-            .places
-            .iter()
-            .find(|place| (place.function, place.address, place.count) == (function, address, count));
-        let refusal = |code: u8| sealed(&[frame[0], function | 0x80, code]);
-        let reply = match place.map(|place| place.is) {
-            None => refusal(2),
-            Some(What::Value(nth)) => {
-                let [high, low] = self.machine.value(nth).to_be_bytes();
-                sealed(&[frame[0], function, 2, high, low])
-            }
-            Some(What::Order(order)) => {
-                let values = match function {
-                    5 => vec![u32::from(frame[4] == 0xFF)],
-                    6 => vec![u32::from(word(4))],
-                    _ => (0..usize::from(count)).map(|nth| u32::from(word(7 + 2 * nth))).collect(),
-                };
-                match self.machine.order(order, values, true) {
-                    Answer::Good => sealed(&frame[..6]),
-                    Answer::Refused(code) => refusal(code),
-                }
-            }
-        };
+        let pdu = &frame[1..frame.len() - 2];
+        let answer = answer(&mut self.machine, self.places, pdu);
+        let reply = sealed(&[&[frame[0]], &answer[..]].concat());
         let tells = reply != frame;
         self.machine.reply(reply, tells, now);
+    }
+}
+
+/// What a device with these places answers to a request, which is carried out.
+pub(super) fn answer(machine: &mut Machine, places: &[Place], pdu: &[u8]) -> Vec<u8> {
+    carry_out(machine, places, pdu).unwrap_or_else(|code| vec![pdu[0] | 0x80, code])
+}
+
+fn carry_out(machine: &mut Machine, places: &[Place], pdu: &[u8]) -> Result<Vec<u8>, u8> {
+    let word = |at: usize| pdu.get(at..at + 2).map(|two| u16::from_be_bytes([two[0], two[1]]));
+    let (function, Some(address), Some(second)) = (pdu[0], word(1), word(3)) else { return Err(3) };
+    let count = if matches!(function, 5 | 6) { 1 } else { second };
+    let is_whole = match function {
+        15 | 16 => pdu.len() == 6 + usize::from(*pdu.get(5).unwrap_or(&0)),
+        _ => pdu.len() == 5,
+    };
+    if !is_whole {
+        return Err(3);
+    }
+    let is_it = |place: &&Place| (place.function, place.address, place.count) == (function, address, count);
+    match places.iter().find(is_it).ok_or(2)?.is {
+        What::Value(nth) => {
+            let [high, low] = machine.value(nth).to_be_bytes();
+            Ok(vec![function, 2, high, low])
+        }
+        What::Order(order) => {
+            let values = match function {
+                5 => vec![u32::from(second == 0xFF00)],
+                6 => vec![u32::from(second)],
+                _ => (0..usize::from(count)).filter_map(|nth| word(6 + 2 * nth)).map(u32::from).collect(),
+            };
+            match machine.order(order, values, true) {
+                Answer::Good => Ok(pdu[..5].to_vec()),
+                Answer::Refused(code) => Err(code),
+            }
+        }
     }
 }
 

@@ -4,8 +4,8 @@
 use proto_core::time::{Duration, Instant};
 
 use super::Act;
-use super::device::{Answer, Fate, Machine};
-use super::rtu::{Place, What};
+use super::device::{Fate, Machine};
+use super::rtu::{Place, answer};
 use crate::device::{Served, Server};
 use crate::{Rng, SlaveDone};
 
@@ -44,43 +44,8 @@ impl Units {
             // A gateway that has no path to it.
             return self.leave(frame, vec![pdu[0] | 0x80, 0x0A], false, now);
         };
-        let reply = match self.carry_out(unit, pdu) {
-            Ok(reply) => reply,
-            Err(code) => vec![pdu[0] | 0x80, code],
-        };
+        let reply = answer(&mut self.machine, unit.places, pdu);
         self.leave(frame, reply, unit.is_told, now);
-    }
-
-    fn carry_out(&mut self, unit: &Unit, pdu: &[u8]) -> Result<Vec<u8>, u8> {
-        let word = |at: usize| pdu.get(at..at + 2).map(|two| u16::from_be_bytes([two[0], two[1]]));
-        let (function, Some(address), Some(second)) = (pdu[0], word(1), word(3)) else { return Err(3) };
-        let count = if matches!(function, 5 | 6) { 1 } else { second };
-        let is_whole = match function {
-            15 | 16 => pdu.len() == 6 + usize::from(*pdu.get(5).unwrap_or(&0)),
-            _ => pdu.len() == 5,
-        };
-        if !is_whole {
-            return Err(3);
-        }
-        let is_it =
-            |place: &&Place| (place.function, place.address, place.count) == (function, address, count);
-        match unit.places.iter().find(is_it).ok_or(2)?.is {
-            What::Value(nth) => {
-                let [high, low] = self.machine.value(nth).to_be_bytes();
-                Ok(vec![function, 2, high, low])
-            }
-            What::Order(order) => {
-                let values = match function {
-                    5 => vec![u32::from(second == 0xFF00)],
-                    6 => vec![u32::from(second)],
-                    _ => (0..usize::from(count)).filter_map(|nth| word(6 + 2 * nth)).map(u32::from).collect(),
-                };
-                match self.machine.order(order, values, true) {
-                    Answer::Good => Ok(pdu[..5].to_vec()),
-                    Answer::Refused(code) => Err(code),
-                }
-            }
-        }
     }
 
     /// A reply leaves, as the mood is. `is_told`: it is in the log.
