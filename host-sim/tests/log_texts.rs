@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 
 /// Folders of tests, and the folders of the programs that they run.
 const TESTS: [(&str, &[&str]); 7] = [
-    ("firmware/chip/tests", &["firmware/src", "proto-core/src"]),
+    ("firmware/chip-model/tests", &["firmware/src", "proto-core/src"]),
     ("firmware/tests", &["firmware/src", "proto-core/src"]),
     ("host-sim/tests/scenarios", &["firmware/src", "host-sim", "proto-core/src"]),
     ("host-sim/tests/usb_can", &["host-sim", "proto-core/src"]),

@@ -1,4 +1,4 @@
-//! The proof that nothing in proto-core, recipe-store, recipe-update, recipe-remote or recipe-sparkplug panics: an image
+//! The proof that nothing in proto-core, recipe-store, recipe-update, recipe-api or recipe-sparkplug panics: an image
 //! in which every entry of theirs that sees what a device, a peer, a file or flash sent is called with values that the
 //! compiler knows nothing about, and whose panic handler needs a symbol that does not exist. It links only when the
 //! optimiser has removed every panic. With recipe-update, whose signatures are a library's, every call of a panic is

@@ -4,7 +4,7 @@
 use core::cell::{Cell, RefCell};
 use std::rc::Rc;
 
-use chip::device::{Clocks, Context, Functions, Peripheral, Picos, Pin, Refusal};
+use recipe_chip_model::device::{Clocks, Context, Functions, Peripheral, Picos, Pin, Refusal};
 
 /// A peripheral with its clocks and pins.
 pub(crate) struct Device<P> {

@@ -1,7 +1,7 @@
 //! Changes what the board keeps: configurations, their marks, and the key.
 //!
 //! In: what a client of the console asks for, and the end of a trial. Out: what is written to the store, a view for
-//! readers, and that the board is to be restarted. What happens when is decided in `recipe_remote::revisions`.
+//! readers, and that the board is to be restarted. What happens when is decided in `recipe_api::revisions`.
 //! Another configuration is only run by a restart: the start has the memory for it, and counts what it tries.
 
 mod desk;
@@ -13,7 +13,7 @@ use embassy_futures::select::{Either4, select4};
 use embassy_time::{Duration, Instant, Timer};
 use heapless::Vec;
 use proto_core::time::Duration as Span;
-use recipe_remote::revisions::{Ended, Output, Refused, Result as Done, Revision, Revisions, Stored};
+use recipe_api::revisions::{Ended, Output, Refused, Result as Done, Revision, Revisions, Stored};
 use recipe_store::{KeepError, Store};
 use recipe_update::SlotFlash;
 

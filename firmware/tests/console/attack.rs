@@ -1,7 +1,7 @@
 //! A cell whose board's console is attacked, beside the same cell a moment before: nothing that a device sends is lost.
 //!
 //! QEMU's time is the host's, so how late things are depends on what else the host does: the figures are printed. Exact
-//! ones are those of the NUCLEO's binary in virtual time (firmware/chip/tests/nucleo/attack.rs).
+//! ones are those of the NUCLEO's binary in virtual time (firmware/chip-model/tests/nucleo/attack.rs).
 
 use std::io::{Read, Write};
 use std::os::unix::net::UnixStream;

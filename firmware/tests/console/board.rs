@@ -5,7 +5,7 @@ use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
-use recipe_remote::key::Key;
+use recipe_api::key::Key;
 use recipe_test_kit::http::{Client, Response};
 use recipe_test_kit::until;
 use serde_json::Value;

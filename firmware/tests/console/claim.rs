@@ -1,6 +1,6 @@
 //! A board without a key, and how it gets one.
 
-use recipe_remote::key::Key;
+use recipe_api::key::Key;
 
 use crate::board::{Board, KEY, panel};
 

@@ -4,7 +4,7 @@ use std::io::{ErrorKind, Read, Write};
 use std::net::TcpStream;
 use std::time::{Duration, Instant};
 
-use recipe_remote::key::Key;
+use recipe_api::key::Key;
 use recipe_test_kit::{PATIENCE, until};
 use serde_json::Value;
 

@@ -10,10 +10,10 @@ use recipe_test_kit::repository;
 const TESTS: [&str; 6] = [
     "host-sim/controller",
     "host-sim/config",
-    "host-sim/shell",
+    "host-sim/runtime",
     "proto-core/src",
     "proto-core/tests",
-    "host-sim/device",
+    "host-sim/io",
 ];
 /// The head of the tables that are looked at.
 const HEAD: &str = "| statement | where | test |";

@@ -9,7 +9,7 @@ use std::io::ErrorKind;
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use recipe_remote::key::{BodyHash, Hex, Key, SCHEME, Signed};
+use recipe_api::key::{BodyHash, Hex, Key, SCHEME, Signed};
 use serde_json::Value;
 
 use crate::address::Address;

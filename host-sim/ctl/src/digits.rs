@@ -6,7 +6,7 @@ use std::io::{self, Write};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 
-use recipe_device::files::{Beside, read_private};
+use recipe_io::files::{Beside, read_private};
 
 use crate::failure::Failure;
 

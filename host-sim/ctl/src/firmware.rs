@@ -6,7 +6,7 @@ use object::LittleEndian;
 use object::elf::{FileHeader32, PT_LOAD};
 use object::read::elf::{FileHeader, ProgramHeader};
 use proto_core::config::image;
-use recipe_remote::key::Hex;
+use recipe_api::key::Hex;
 use recipe_update::{
     BoardName, Formats, HEADER, Header, IMAGE_OFFSET, Layout, Link, Parts, PublicKey, Slot, UpdateFile,
     Version, file_head, link_padding,

@@ -8,8 +8,8 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 use std::time::Duration;
 
+use recipe_api::key::Key;
 use recipe_config::file::load_inventory;
-use recipe_remote::key::Key;
 use serde_json::{Map, Value, json};
 
 use crate::address::Address;

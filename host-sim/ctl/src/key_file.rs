@@ -3,8 +3,8 @@
 use std::io;
 use std::path::Path;
 
-use recipe_device::random::random;
-use recipe_remote::key::{Hex, KEY_LEN, Key};
+use recipe_api::key::{Hex, KEY_LEN, Key};
+use recipe_io::random::random;
 
 use crate::digits::{self, wrong};
 use crate::failure::Failure;

@@ -5,8 +5,8 @@ use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-use recipe_device::random::random;
-use recipe_remote::key::Hex;
+use recipe_api::key::Hex;
+use recipe_io::random::random;
 use recipe_update::PublicKey;
 
 use crate::digits::{self, MAX_FILE, exists, write_new, wrong};

@@ -5,9 +5,9 @@ use std::net::{TcpListener, TcpStream};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use recipe_api::key::Hex;
 use recipe_ctl::update::{Downgrade, Plan, update};
 use recipe_ctl::{Client, Failure, Stop, Update, Verdict};
-use recipe_remote::key::Hex;
 use recipe_update::{
     BoardName, FILE_HEAD, Formats, HEADER, Header, Parts, PublicKey, Slot, Version, file_head, link_padding,
 };

@@ -6,8 +6,8 @@ use proto_core::link::LinkState;
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::state::{LEN, StatePacket};
+use recipe_api::documents::{Document, Pieces};
 use recipe_config::file::{self, Text};
-use recipe_remote::documents::{Document, Pieces};
 
 use super::*;
 

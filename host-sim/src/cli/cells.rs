@@ -8,11 +8,11 @@ use std::thread::available_parallelism;
 use super::check;
 use super::run::Run;
 use recipe_capture::Watch;
-use recipe_device::bind::Bind;
-use recipe_shell::console::{ConfigFile, ConsoleOptions};
-use recipe_shell::gateway::cells::Cell;
-use recipe_shell::log::Log;
-use recipe_shell::{RunOptions, StartError};
+use recipe_io::bind::Bind;
+use recipe_runtime::console::{ConfigFile, ConsoleOptions};
+use recipe_runtime::gateway::cells::Cell;
+use recipe_runtime::log::Log;
+use recipe_runtime::{RunOptions, StartError};
 
 /// The number of threads: one for each processor, if it is not said.
 pub(super) fn threads(asked: Option<NonZeroUsize>) -> NonZeroUsize {

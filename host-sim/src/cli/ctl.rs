@@ -15,8 +15,8 @@ use std::time::Duration;
 
 use clap::Args;
 use recipe_ctl::{Address, Client, Failure, Member, Stop, Verdict, View, key_file};
-use recipe_shell::Signals;
-use recipe_shell::out::print_stderr;
+use recipe_runtime::Signals;
+use recipe_runtime::out::print_stderr;
 
 use super::run::parse_time;
 use super::{Out, Printed, wrong};

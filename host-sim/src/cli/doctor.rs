@@ -9,9 +9,9 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::Args;
-use recipe_device::bind::Bind;
 use recipe_doctor::{FILE, Finding, Severity};
-use recipe_shell::out::{Printed, print_stderr};
+use recipe_io::bind::Bind;
+use recipe_runtime::out::{Printed, print_stderr};
 use serde_json::json;
 
 use super::run::parse_time;
@@ -64,7 +64,7 @@ pub(super) fn run(args: DoctorArgs) -> ExitCode {
         Ok(config) => config,
         Err(error) => return wrong(error),
     };
-    let findings = match recipe_shell::gateway::listen(*config, args.bind, args.time, args.ask) {
+    let findings = match recipe_runtime::gateway::listen(*config, args.bind, args.time, args.ask) {
         Ok(findings) => {
             findings.into_iter().map(|finding| with_file(finding, &args.config)).collect::<Vec<_>>()
         }

@@ -9,7 +9,7 @@ use std::path::PathBuf;
 use clap::{Args, Subcommand, ValueEnum};
 use recipe_config::FileKind;
 use recipe_export::{Model, dbc, lua, map};
-use recipe_shell::out::print_stderr;
+use recipe_runtime::out::print_stderr;
 
 use super::output::Written;
 use super::{Outcome, Overrides};

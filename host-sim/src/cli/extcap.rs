@@ -12,7 +12,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::Args;
-use recipe_shell::out::{Out, Printed, is_broken_pipe};
+use recipe_runtime::out::{Out, Printed, is_broken_pipe};
 use serde_json::Value;
 
 use super::wrong;

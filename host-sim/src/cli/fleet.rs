@@ -7,10 +7,10 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::Args;
-use recipe_fleet::broker::Broker;
-use recipe_fleet::file::read_login;
-use recipe_fleet::simulated::{Fleet, NODE_BYTES, Totals};
-use recipe_shell::out::{Out, print_stderr};
+use recipe_edge_node::broker::Broker;
+use recipe_edge_node::file::read_login;
+use recipe_edge_node::simulated::{Fleet, NODE_BYTES, Totals};
+use recipe_runtime::out::{Out, print_stderr};
 use recipe_sparkplug::topic::Id;
 
 use super::run::parse_time;

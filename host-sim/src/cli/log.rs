@@ -2,7 +2,7 @@
 
 use std::io::{self, IsTerminal, Write, stderr};
 
-use recipe_shell::log::Log;
+use recipe_runtime::log::Log;
 use tracing_subscriber::EnvFilter;
 
 /// Logs warnings; with `-v` events, with `-vv` every frame. `RUST_LOG` overrides this.

@@ -40,7 +40,7 @@ use proto_core::sysvar::Direction;
 
 use codec::TalkPart;
 use recipe_config::file;
-use recipe_shell::out::{Out, Printed, print_stderr};
+use recipe_runtime::out::{Out, Printed, print_stderr};
 
 /// The arguments of `host-sim`.
 #[derive(Debug, Parser)]

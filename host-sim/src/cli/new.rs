@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 
 use super::Outcome;
-use recipe_device::files::Beside;
+use recipe_io::files::Beside;
 use templates::{ALL, Template};
 
 /// Arguments of `new`.

@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use std::os::unix::fs::FileTypeExt;
 use std::path::Path;
 
-use recipe_device::files::{Beside, Identity};
+use recipe_io::files::{Beside, Identity};
 
 /// What a command writes.
 pub(super) struct Written<'a> {

@@ -16,7 +16,7 @@ use clap::Args;
 use serde_json::{Value, json};
 
 use super::{Out, Printed, wrong};
-use recipe_shell::out::print_stderr;
+use recipe_runtime::out::print_stderr;
 pub(super) use request::Act;
 use socket::Socket;
 

@@ -8,7 +8,7 @@ use recipe_capture::pcapng::Scope;
 use recipe_capture::recording::{MIN_FILE, RecordOptions, Recording};
 use recipe_capture::{CaptureFile, Decoder, Target, Watch};
 use recipe_export::Model;
-use recipe_shell::StartError;
+use recipe_runtime::StartError;
 
 /// Arguments of captures and recordings.
 #[derive(Debug, Args)]

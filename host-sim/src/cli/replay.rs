@@ -9,7 +9,7 @@ use std::process::ExitCode;
 
 use clap::Args;
 use recipe_capture::replay::{Report, Stopped, replay};
-use recipe_shell::out::{Out, Printed};
+use recipe_runtime::out::{Out, Printed};
 
 use super::wrong;
 

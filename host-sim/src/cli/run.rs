@@ -12,12 +12,12 @@ use super::record::WatchArgs;
 use super::{Overrides, cells, check, wrong};
 use recipe_config::SimConfig;
 use recipe_controller::timeline::Timeline;
-use recipe_device::bind::Bind;
-use recipe_shell::console::{self, ConfigFile, ConsoleOptions};
-use recipe_shell::controller::{ControllerOptions, MAX_FACTOR, MIN_FACTOR, Pace};
-use recipe_shell::log::Log;
-use recipe_shell::out::print_stderr;
-use recipe_shell::{self as shell, EventsFile, ReadyFile, RunOptions, Scheduling, StartError, Telling};
+use recipe_io::bind::Bind;
+use recipe_runtime::console::{self, ConfigFile, ConsoleOptions};
+use recipe_runtime::controller::{ControllerOptions, MAX_FACTOR, MIN_FACTOR, Pace};
+use recipe_runtime::log::Log;
+use recipe_runtime::out::print_stderr;
+use recipe_runtime::{self as shell, EventsFile, ReadyFile, RunOptions, Scheduling, StartError, Telling};
 
 /// Arguments of `controller` and `gateway`.
 #[derive(Debug, Args)]

@@ -19,7 +19,7 @@ use tokio::signal::unix::{Signal, SignalKind, signal};
 use super::wrong;
 use recipe_cell::Cell;
 use recipe_cell::soak::{Batch, Level, Part, PartFailure, Progress, Scenario, Share, Soak, show_trace};
-use recipe_shell::out::print_stderr;
+use recipe_runtime::out::print_stderr;
 use table::{failure, progress_line, rare_outcomes, show_seconds, table};
 
 pub(super) const EXAMPLES: &str = "\

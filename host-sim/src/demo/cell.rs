@@ -14,8 +14,8 @@ use serde_json::Value;
 
 use super::device::{FieldStream, PATIENCE};
 use recipe_config::file::{self, Text};
-use recipe_device::bind::Bind;
-use recipe_shell::{self as shell, Handle};
+use recipe_io::bind::Bind;
+use recipe_runtime::{self as shell, Handle};
 
 /// An example file, embedded.
 #[derive(Clone, Copy)]

@@ -13,9 +13,9 @@ use std::sync::mpsc;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use recipe_device::random::random;
-use recipe_shell::Signals;
-use recipe_shell::out::print_stderr;
+use recipe_io::random::random;
+use recipe_runtime::Signals;
+use recipe_runtime::out::print_stderr;
 use serde_json::Value;
 
 use super::folder::Folder;

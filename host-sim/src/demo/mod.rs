@@ -16,8 +16,8 @@ use std::time::Instant;
 
 use folder::Folder;
 pub use living::run_living;
-use recipe_shell::Signals;
-use recipe_shell::out::print_stderr;
+use recipe_runtime::Signals;
+use recipe_runtime::out::print_stderr;
 use show::Show;
 
 /// Runs the cell and prints what it does, until the reader is gone; success if all examples that were run

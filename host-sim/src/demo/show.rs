@@ -8,7 +8,7 @@ use std::process::ExitCode;
 use anstream::AutoStream;
 use anstyle::{AnsiColor, Style};
 
-use recipe_shell::out::Out;
+use recipe_runtime::out::Out;
 
 use super::cell::gateways_held_up;
 

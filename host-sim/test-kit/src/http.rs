@@ -3,7 +3,7 @@
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
 
-use recipe_remote::key::{BodyHash, Hex, Key, SCHEME, Signed};
+use recipe_api::key::{BodyHash, Hex, Key, SCHEME, Signed};
 use serde_json::Value;
 
 use crate::PATIENCE;

@@ -1,8 +1,8 @@
 //! docs/api/openapi.json is what the server does: every path and method of the table of routes, and every
 //! answer as its schema says.
 
-use recipe_remote::request::Method;
-use recipe_remote::route::{Access, BodyType, ROUTES, Route, Served};
+use recipe_api::request::Method;
+use recipe_api::route::{Access, BodyType, ROUTES, Route, Served};
 use recipe_test_kit::repository;
 use serde_json::{Value, json};
 

@@ -4,7 +4,7 @@ use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
 use std::path::PathBuf;
 
-use recipe_remote::key::{BodyHash, Hex, Key, SCHEME, Signed};
+use recipe_api::key::{BodyHash, Hex, Key, SCHEME, Signed};
 use recipe_test_kit::{Binary, HostSim, PATIENCE, toml, until};
 use serde_json::Value;
 use tempfile::TempDir;

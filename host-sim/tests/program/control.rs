@@ -11,7 +11,7 @@ use clap::CommandFactory;
 use host_sim::cli::Cli;
 use recipe_controller::KINDS;
 use recipe_controller::operations::Operation;
-use recipe_net::realtime::{self, Scheduling};
+use recipe_io::realtime::{self, Scheduling};
 use recipe_test_kit::{HostSim, example, repository};
 
 /// Every key of an object and of what is in it, but for names from the file and of variables.

@@ -10,7 +10,7 @@
 //! * `HOST_SIM_FIRMWARE=ELF` names the firmware for QEMU (`qemu-system-arm` has to be installed). Without it
 //!   the cases of QEMU are counted as ignored.
 //! * `HOST_SIM_NUCLEO=ELF` names the firmware for the NUCLEO; `CHIP_UNICORN` the library that emulates its
-//!   instructions (docs/chip.md). Run `cargo build -p chip` before; `qemu-system-arm` is the network. Without
+//!   instructions (docs/chip.md). Run `cargo build -p recipe-chip-model` before; `qemu-system-arm` is the network. Without
 //!   it the cases of the NUCLEO are counted as ignored.
 //! * `HOST_SIM_NAMESPACES=required` fails if no user and network namespace can be made (Debian: util-linux,
 //!   iproute2). Otherwise the cases that need one are counted as ignored.
@@ -117,7 +117,7 @@ fn main() -> ExitCode {
             None => ignored("qemu", &scenario, "needs HOST_SIM_FIRMWARE"),
         });
     }
-    let emulator = Path::new(env!("CARGO_BIN_EXE_host-sim")).with_file_name("chip");
+    let emulator = Path::new(env!("CARGO_BIN_EXE_host-sim")).with_file_name("chip-model");
     let chip = nucleo::Nucleo { elf: nucleo.clone().unwrap_or_default(), emulator };
     let chip: Arc<dyn Environment> = Arc::new(chip);
     for scenario in scenarios(&*chip) {
@@ -182,8 +182,8 @@ fn nucleo() -> Result<PathBuf, Missing> {
     if std::env::var_os("CHIP_UNICORN").is_none() {
         return Err(Missing::Fail("HOST_SIM_NUCLEO needs CHIP_UNICORN (docs/chip.md)".into()));
     }
-    if !Path::new(env!("CARGO_BIN_EXE_host-sim")).with_file_name("chip").is_file() {
-        return Err(Missing::Fail("HOST_SIM_NUCLEO needs 'cargo build -p chip' before".into()));
+    if !Path::new(env!("CARGO_BIN_EXE_host-sim")).with_file_name("chip-model").is_file() {
+        return Err(Missing::Fail("HOST_SIM_NUCLEO needs 'cargo build -p recipe-chip-model' before".into()));
     }
     Ok(path)
 }

@@ -19,7 +19,7 @@ use super::refusal::Defect;
 /// The firmware for the board, on its modelled chip.
 pub(crate) struct Nucleo {
     pub(crate) elf: PathBuf,
-    /// The program of `firmware/chip`.
+    /// The program of `firmware/chip-model`.
     pub(crate) emulator: PathBuf,
 }
 

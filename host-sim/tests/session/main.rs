@@ -2,7 +2,7 @@
 //!
 //! It is written over [`target::Target`], so that it is the same for every kind of gateway: one on this host, the
 //! firmware in QEMU (Debian: qemu-system-arm; the ELF: firmware/README.md), and the NUCLEO's on its modelled chip, of
-//! which `cargo build -p chip` is the emulator (docs/chip.md has the other variables):
+//! which `cargo build -p recipe-chip-model` is the emulator (docs/chip.md has the other variables):
 //!
 //! `HOST_SIM_FIRMWARE=ELF cargo test -p host-sim --test session -- --include-ignored on_a_board`
 //! `HOST_SIM_NUCLEO=ELF cargo test -p host-sim --test session -- --include-ignored on_a_nucleo`

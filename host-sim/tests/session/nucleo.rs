@@ -19,8 +19,8 @@ pub(crate) fn control(around: &Surroundings) -> PathBuf {
 
 /// Starts the emulator with a program and the image of a configuration file, on the board's line and network.
 pub(crate) fn emulate(around: &Surroundings, elf: &Path, file: &Path, more: &[OsString]) -> Process {
-    // Beside this program's binary: `cargo build -p chip` has made it.
-    let mut command = Command::new(Path::new(env!("CARGO_BIN_EXE_host-sim")).with_file_name("chip"));
+    // Beside this program's binary: `cargo build -p recipe-chip-model` has made it.
+    let mut command = Command::new(Path::new(env!("CARGO_BIN_EXE_host-sim")).with_file_name("chip-model"));
     command.arg(elf).arg(around.image(file)).arg("--realtime");
     command.arg("--rs485").arg(around.path(LINE));
     command.arg("--control").arg(control(around));

@@ -3,7 +3,7 @@
 //! itself and prints its counters.
 //!
 //! `.ci/run capi` builds the programs and runs these tests; alone:
-//! `HOST_SIM=target/debug/host-sim CAPI_HOST=... CAPI_CORTEX_M7=... cargo test -p proto-core-capi -- --ignored`
+//! `HOST_SIM=target/debug/host-sim CAPI_HOST=... CAPI_CORTEX_M7=... cargo test -p recipe-capi -- --ignored`
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{Ipv4Addr, TcpListener, TcpStream};

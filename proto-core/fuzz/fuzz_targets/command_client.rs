@@ -1,4 +1,4 @@
 //! `proto-core/fuzz/run command_client`
 #![no_main]
 
-libfuzzer_sys::fuzz_target!(|input: &[u8]| (proto_core_fuzz::target("command_client").run)(input));
+libfuzzer_sys::fuzz_target!(|input: &[u8]| (recipe_fuzz::target("command_client").run)(input));

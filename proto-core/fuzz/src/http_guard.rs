@@ -4,10 +4,10 @@
 use std::net::{IpAddr, Ipv4Addr};
 
 use proto_core::time::{Duration, Instant};
-use recipe_remote::guard::{Guard, Site};
-use recipe_remote::key::{BodyHash, Hex, Key, SCHEME, Signed};
-use recipe_remote::request::HeadBuffer;
-use recipe_remote::route::Served;
+use recipe_api::guard::{Guard, Site};
+use recipe_api::key::{BodyHash, Hex, Key, SCHEME, Signed};
+use recipe_api::request::HeadBuffer;
+use recipe_api::route::Served;
 
 use crate::source::Source;
 

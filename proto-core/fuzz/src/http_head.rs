@@ -1,6 +1,6 @@
 //! Heads of HTTP requests: fields right, repeated and broken, in pieces, against a reader of whole lines.
 
-use recipe_remote::request::{Head, HeadBuffer, HeadError, MAX_HEAD, Method};
+use recipe_api::request::{Head, HeadBuffer, HeadError, MAX_HEAD, Method};
 
 use crate::source::Source;
 

@@ -1,4 +1,4 @@
-//! Fuzz targets of `proto-core`, `recipe-remote`, `recipe-sparkplug`, `recipe-store` and `recipe-update`
+//! Fuzz targets of `proto-core`, `recipe-api`, `recipe-sparkplug`, `recipe-store` and `recipe-update`
 //! (docs/fuzzing.md).
 //!
 //! In: bytes. They are read as a short program: a recipe, operations, received bytes and where they

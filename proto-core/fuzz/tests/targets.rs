@@ -9,13 +9,13 @@ macro_rules! targets {
             #[test]
             fn $name() {
                 let corpus = Path::new(env!("CARGO_MANIFEST_DIR")).join("corpus");
-                proto_core_fuzz::target(stringify!($name)).check(&corpus);
+                recipe_fuzz::target(stringify!($name)).check(&corpus);
             }
         )*
 
         #[test]
         fn none_is_forgotten() {
-            let names: Vec<_> = proto_core_fuzz::TARGETS.iter().map(|target| target.name).collect();
+            let names: Vec<_> = recipe_fuzz::TARGETS.iter().map(|target| target.name).collect();
             assert_eq!(names, [$(stringify!($name)),*]);
         }
     };

@@ -43,7 +43,7 @@ fn opened() -> Result<Slots<HostFlash>, &'static str> {
     Ok(Slots { running, key, own: open(running)?, free: open(running.other())? })
 }
 
-/// The public key of the loader, behind a mark (firmware/loader/loader.x).
+/// The public key of the loader, behind a mark (firmware/boot/loader.x).
 fn key() -> Option<[u8; 32]> {
     // SAFETY: memory for programs, which nobody writes; the program itself is elsewhere.
     let marked = unsafe { core::ptr::with_exposed_provenance::<[u8; 36]>(KEY).read_volatile() };

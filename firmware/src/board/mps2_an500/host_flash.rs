@@ -1,6 +1,6 @@
 //! Flash in a file of the host, with sectors and words as the NUCLEO has them. No word of it is ever torn.
 //!
-//! The loader has this file too (firmware/loader/src/board/mps2_an500/mod.rs).
+//! The loader has this file too (firmware/boot/src/board/mps2_an500/mod.rs).
 
 use core::cell::RefCell;
 use core::fmt;

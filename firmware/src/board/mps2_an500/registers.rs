@@ -1,6 +1,6 @@
 //! Addresses of the devices, and access to their registers.
 //!
-//! The loader has this file too (firmware/loader/src/board/mps2_an500/mod.rs).
+//! The loader has this file too (firmware/boot/src/board/mps2_an500/mod.rs).
 
 /// UART 0 to 4.
 pub(crate) const UARTS: [u32; 5] = [0x4000_4000, 0x4000_5000, 0x4000_6000, 0x4000_7000, 0x4000_9000];

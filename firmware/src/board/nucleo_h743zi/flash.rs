@@ -26,7 +26,7 @@ const _: () = assert!(FLASH_WORD == WORD);
 
 const FLASH_START: usize = 0x0800_0000;
 const BANK_SIZE: usize = 0x10_0000;
-/// Where the loader has its public key, behind this mark (firmware/loader/loader.x).
+/// Where the loader has its public key, behind this mark (firmware/boot/loader.x).
 const KEY: usize = FLASH_START + 0x400;
 const KEY_MARK: [u8; 4] = *b"RGUK";
 const KEYS: [u32; 2] = [0x4567_0123, 0xCDEF_89AB];

@@ -1,7 +1,7 @@
 //! Whether a word of the flash can be read: one that a power cut has torn, or that was programmed twice, has no valid
 //! error correction code, and reading it is a bus fault. RM0433, "Embedded Flash memory".
 //!
-//! The loader has this file too (firmware/loader/src/main.rs).
+//! The loader has this file too (firmware/boot/src/main.rs).
 
 use core::arch::asm;
 

@@ -9,9 +9,9 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::task::{Wake, Waker};
 use std::vec::Vec;
 
-use chip::device::{Clocks, MICRO, MILLI, Picos, Pin};
-use chip::models::can_bus::{BusFault, Frame as Wire};
-use chip::models::fdcan::Fdcan;
+use recipe_chip_model::device::{Clocks, MICRO, MILLI, Picos, Pin};
+use recipe_chip_model::models::can_bus::{BusFault, Frame as Wire};
+use recipe_chip_model::models::fdcan::Fdcan;
 
 use super::*;
 use crate::drivers::test_chip::Device;

@@ -11,10 +11,10 @@ use std::task::{Wake, Waker};
 use std::vec;
 use std::vec::Vec;
 
-use chip::device::{Clocks, Picos, Pin, SECOND};
-use chip::models::line::{Format, Line as Wires, Sent};
-use chip::models::usart::{Pins, Usart as Chip};
 use proto_core::time::Duration as CoreDuration;
+use recipe_chip_model::device::{Clocks, Picos, Pin, SECOND};
+use recipe_chip_model::models::line::{Format, Line as Wires, Sent};
+use recipe_chip_model::models::usart::{Pins, Usart as Chip};
 
 use super::*;
 use crate::drivers::test_chip::Device;

@@ -5,12 +5,12 @@ use core::fmt::{self, Display, Write};
 use embassy_net::tcp::TcpSocket;
 use embassy_time::{Instant, with_deadline};
 use heapless::Vec;
-use recipe_remote::guard::Refusal;
-use recipe_remote::json;
-use recipe_remote::key::SCHEME;
-use recipe_remote::nonces::NonceText;
-use recipe_remote::response::{Kind, LAST_CHUNK, Length, Response, Status};
-use recipe_remote::revisions::Revision;
+use recipe_api::guard::Refusal;
+use recipe_api::json;
+use recipe_api::key::SCHEME;
+use recipe_api::nonces::NonceText;
+use recipe_api::response::{Kind, LAST_CHUNK, Length, Response, Status};
+use recipe_api::revisions::Revision;
 
 use super::MAX_TIME;
 

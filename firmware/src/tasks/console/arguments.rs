@@ -1,9 +1,9 @@
 //! The arguments of the operations that change something.
 
 use proto_core::time::Duration as Span;
-use recipe_remote::arguments::{Value, each};
-use recipe_remote::key::{KEY_LEN, Key, from_hex};
-use recipe_remote::route::Operation;
+use recipe_api::arguments::{Value, each};
+use recipe_api::key::{KEY_LEN, Key, from_hex};
+use recipe_api::route::Operation;
 
 /// What a body asks for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

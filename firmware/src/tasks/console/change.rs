@@ -5,11 +5,11 @@ use core::fmt::Write;
 use embassy_futures::yield_now;
 use embassy_time::{Duration, Instant};
 use proto_core::config::image::{self, Scan};
-use recipe_remote::claim::{Claim, ClaimError};
-use recipe_remote::key::{KEY_LEN, Key};
-use recipe_remote::response::{Kind, Status};
-use recipe_remote::revisions::Refused;
-use recipe_remote::route::Operation;
+use recipe_api::claim::{Claim, ClaimError};
+use recipe_api::key::{KEY_LEN, Key};
+use recipe_api::response::{Kind, Status};
+use recipe_api::revisions::Refused;
+use recipe_api::route::Operation;
 use recipe_update::Downgrade;
 
 use super::answer::{Etag, Reply};

@@ -8,11 +8,11 @@ use embassy_futures::yield_now;
 use embassy_net::tcp::TcpSocket;
 use embassy_net::{IpAddress, Stack};
 use embassy_time::{Duration, Instant, Timer, with_deadline, with_timeout};
-use recipe_remote::guard::{Admitted, Site};
-use recipe_remote::key::BodyHash;
-use recipe_remote::request::{Head, HeadBuffer, HeadError, Method};
-use recipe_remote::response::{CONTINUE, Status};
-use recipe_remote::route::{Operation, Served};
+use recipe_api::guard::{Admitted, Site};
+use recipe_api::key::BodyHash;
+use recipe_api::request::{Head, HeadBuffer, HeadError, Method};
+use recipe_api::response::{CONTINUE, Status};
+use recipe_api::route::{Operation, Served};
 
 use super::answer::{Ended, Line, Outcome, Reply};
 use super::arguments::Arguments;

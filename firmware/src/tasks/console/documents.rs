@@ -3,9 +3,9 @@
 use embassy_futures::yield_now;
 use embassy_time::Instant;
 use proto_core::engine::Health;
-use recipe_remote::documents::{Document, Pieces};
-use recipe_remote::metrics::Families;
-use recipe_remote::response::{Kind, Length, Status};
+use recipe_api::documents::{Document, Pieces};
+use recipe_api::metrics::Families;
+use recipe_api::response::{Kind, Length, Status};
 
 use super::answer::{Ended, Line, Outcome, Reply, Room};
 use super::{Console, MAX_ANSWER, MAX_TIME};

@@ -2,8 +2,8 @@
 
 use core::fmt::{self, Write};
 
-use recipe_remote::json;
-use recipe_remote::response::{Kind, Status};
+use recipe_api::json;
+use recipe_api::response::{Kind, Status};
 use recipe_sparkplug::document::{Document, DocumentError};
 
 use super::Console;

@@ -3,9 +3,9 @@
 use core::fmt::{self, Write};
 
 use embassy_time::Instant;
-use recipe_remote::json;
-use recipe_remote::key::Hex;
-use recipe_remote::response::{Kind, Status};
+use recipe_api::json;
+use recipe_api::key::Hex;
+use recipe_api::response::{Kind, Status};
 use recipe_store::Ended;
 use recipe_update::{Header, Slot};
 

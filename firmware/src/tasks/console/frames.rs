@@ -4,8 +4,8 @@ use core::fmt::{self, Write};
 
 use proto_core::engine::{TapDirection, TapPlace, TapRecord, TapVerdict};
 use proto_core::wire::can::CanId;
-use recipe_remote::json;
-use recipe_remote::key::Hex;
+use recipe_api::json;
+use recipe_api::key::Hex;
 
 use super::Console;
 use super::answer::Room;

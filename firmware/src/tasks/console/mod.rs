@@ -1,7 +1,7 @@
 //! The console: the API of docs/api.md over HTTP.
 //!
 //! In: connections, a button. Out: answers, and what the keeper is asked for. Decides nothing about who may do what,
-//! which is `recipe_remote`'s, and knows no flash. There are as many tasks as connections ([`CONNECTIONS`]); each serves
+//! which is `recipe_api`'s, and knows no flash. There are as many tasks as connections ([`CONNECTIONS`]); each serves
 //! one request and closes. The engine is looked at in pieces: for each piece of a document a task borrows it, writes
 //! at most a port or 32 variables into its own memory, and lets the others run before the piece is sent. So nobody
 //! waits for a socket, and a document may show its parts at slightly different instants.
@@ -22,9 +22,9 @@ use core::pin::pin;
 
 use embassy_time::{Duration, Instant, Timer};
 use heapless::String;
-use recipe_remote::claim::Claim;
-use recipe_remote::guard::Guard;
-use recipe_remote::key::Key;
+use recipe_api::claim::Claim;
+use recipe_api::guard::Guard;
+use recipe_api::key::Key;
 use recipe_sparkplug::document::Document;
 
 use super::edge::Edge;

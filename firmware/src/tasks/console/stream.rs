@@ -7,8 +7,8 @@ use core::fmt::Write;
 use embassy_futures::select::{Either, select};
 use embassy_futures::yield_now;
 use embassy_time::{Duration, Instant, Timer};
-use recipe_remote::documents::Document;
-use recipe_remote::response::{Kind, Length, Status};
+use recipe_api::documents::Document;
+use recipe_api::response::{Kind, Length, Status};
 
 use super::answer::{Ended, Line, Outcome, Reply, Room};
 use super::connection::Request;

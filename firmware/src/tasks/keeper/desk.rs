@@ -9,7 +9,7 @@ use embassy_time::Instant;
 use heapless::String;
 use proto_core::config::image::MAX_IMAGE;
 use proto_core::time::Duration as Span;
-use recipe_remote::revisions::{Refused, Revision, Revisions};
+use recipe_api::revisions::{Refused, Revision, Revisions};
 use recipe_store::{KeepError, SlotMarks};
 use recipe_update::{BoardName, Downgrade, Header, Slot};
 

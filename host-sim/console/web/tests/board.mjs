@@ -93,7 +93,7 @@ function start(port) {
     const forward = `hostfwd=tcp:127.0.0.1:${port}-:80`;
     if (IS_NUCLEO) {
         const args = [ELF, image, "--realtime", "--rs485", join(folder, "line"), "--network", forward];
-        machine = spawn(join(ROOT, "target/debug/chip"), [...args, "--control", join(folder, "control")]);
+        machine = spawn(join(ROOT, "target/debug/chip-model"), [...args, "--control", join(folder, "control")]);
     } else {
         const files = ["first.img", "none", "store", "button"].map((file) => `arg=${file === "none" ? file : join(folder, file)}`).join(",");
         const args = `-M mps2-an500 -display none -monitor none -nic user,${forward} -serial unix:${folder}/line,server=on,wait=off -serial null -serial null -serial stdio`;

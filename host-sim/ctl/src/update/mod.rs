@@ -7,7 +7,7 @@ mod command;
 mod health;
 mod steps;
 
-use recipe_remote::key::{Hex, from_hex};
+use recipe_api::key::{Hex, from_hex};
 use recipe_update::{PublicKey, Slot};
 use serde_json::Value;
 

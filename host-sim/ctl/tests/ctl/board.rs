@@ -8,9 +8,9 @@ use std::time::Duration;
 use proto_core::config::{GatewayConfig, image};
 use proto_core::engine::{Engine, Input, OUTPUT_BUFFER, Output, PortId};
 use proto_core::time::{Duration as Span, Instant};
+use recipe_api::documents::{Document, Pieces};
 use recipe_config::file::{Text, parse_gateway};
 use recipe_ctl::{Configuration, Failure, Stored, Trial, Verdict};
-use recipe_remote::documents::{Document, Pieces};
 use recipe_test_kit::example;
 use serde_json::{Value, json};
 

@@ -6,8 +6,8 @@ use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use recipe_api::key::{BodyHash, Hex, Key, Signed};
 use recipe_ctl::{Client, Stop, View};
-use recipe_remote::key::{BodyHash, Hex, Key, Signed};
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -42,7 +42,7 @@ impl Asked {
         let body = Hex(&hash.finish()).to_string();
         let (nonce, target) = (value("nonce")?, format!("/api/v1/{}", self.path));
         let what = Signed { nonce, method: &self.method, target: &target, body: &body };
-        let mac = recipe_remote::key::from_hex(value("mac")?)?;
+        let mac = recipe_api::key::from_hex(value("mac")?)?;
         let is_right = value("body") == Some(&body) && Key::parse(KEY)?.verify(&what, &mac);
         is_right.then(|| nonce.to_owned())
     }

@@ -8,7 +8,7 @@ use std::time::Duration;
 use recipe_ctl::rollout::{self, Board, Plan, Report, Told};
 use recipe_ctl::update::Downgrade;
 use recipe_ctl::{Failure, Member, Rollout, Stop, Update, Verdict};
-use recipe_shell::out::print_stderr;
+use recipe_runtime::out::print_stderr;
 
 use super::Run;
 use super::work::write;

@@ -7,7 +7,7 @@ use recipe_ctl::{
     Answer, Client, Configuration, Failure, Firmware, Member, Names, Rollout, Stop, Trial, Update, Verdict,
     Watched, WithoutTrial, edge, key_file, signing_key, update,
 };
-use recipe_shell::out::print_stderr;
+use recipe_runtime::out::print_stderr;
 
 use super::Run;
 use super::act::Act;
@@ -165,7 +165,7 @@ impl Act {
             Self::Edge { file: None, off: false, .. } => rows(|client, _| edge::shown(client)),
             Self::Edge { file, restart, .. } => {
                 let settings = match file {
-                    Some(file) => recipe_fleet::board::settings(file).map_err(Failure::wrong)?,
+                    Some(file) => recipe_edge_node::board::settings(file).map_err(Failure::wrong)?,
                     None => recipe_sparkplug::document::OFF.to_vec(),
                 };
                 let from = if *restart { edge::From::Now } else { edge::From::NextStart };

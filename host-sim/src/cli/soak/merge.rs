@@ -8,7 +8,7 @@ use std::time::Duration as WallTime;
 
 use clap::Args;
 use recipe_cell::soak::{FORMAT, Level, Part};
-use recipe_shell::out::print_stderr;
+use recipe_runtime::out::print_stderr;
 use serde_json::Value;
 
 use super::table::{failure, rare_outcomes, table};

@@ -1,0 +1,93 @@
+//! Connections to a broker.
+
+use std::io;
+use std::net::ToSocketAddrs;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+use recipe_io::connect::connect;
+use rustls::pki_types::pem::PemObject;
+use rustls::pki_types::{CertificateDer, ServerName};
+use rustls::{ClientConfig, RootCertStore};
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
+use tokio_rustls::TlsConnector;
+
+/// A broker, and how it is spoken to.
+#[derive(Debug, Clone)]
+pub struct Broker {
+    host: String,
+    port: u16,
+    tls: Option<Arc<ClientConfig>>,
+}
+
+/// A connection, with or without TLS.
+pub(crate) trait Connection: AsyncRead + AsyncWrite + Unpin {}
+
+impl<T: AsyncRead + AsyncWrite + Unpin> Connection for T {}
+
+impl Broker {
+    /// A broker that is spoken to without TLS.
+    pub fn plain(host: impl Into<String>, port: u16) -> Self {
+        Self { host: host.into(), port, tls: None }
+    }
+
+    /// A broker with TLS 1.2 or 1.3, which proves with a certificate of one of these authorities that it is called
+    /// `host`.
+    ///
+    /// # Errors
+    /// If the file cannot be read or has no certificates; one message.
+    pub fn with_tls(host: impl Into<String>, port: u16, authorities: &Path) -> Result<Self, String> {
+        let refused = |why: &dyn std::fmt::Display| format!("{}: {why}", authorities.display());
+        let mut roots = RootCertStore::empty();
+        for certificate in CertificateDer::pem_file_iter(authorities).map_err(|error| refused(&error))? {
+            let certificate = certificate.map_err(|error| refused(&error))?;
+            roots.add(certificate).map_err(|error| refused(&error))?;
+        }
+        if roots.is_empty() {
+            return Err(refused(&"no certificate in it; allowed: PEM"));
+        }
+        let provider = Arc::new(rustls::crypto::ring::default_provider());
+        let config = ClientConfig::builder_with_provider(provider)
+            .with_safe_default_protocol_versions()
+            .map_err(|error| refused(&error))?
+            .with_root_certificates(roots)
+            .with_no_client_auth();
+        let host = host.into();
+        ServerName::try_from(host.as_str()).map_err(|error| format!("{host:?}: {error}"))?;
+        Ok(Self { host, port, tls: Some(Arc::new(config)) })
+    }
+
+    /// Where it is, for people.
+    pub fn address(&self) -> String {
+        format!("{}:{}", self.host, self.port)
+    }
+
+    /// Connects.
+    pub(crate) async fn connect(&self) -> io::Result<Box<dyn Connection>> {
+        let (host, port) = (self.host.clone(), self.port);
+        let resolve = move || (host.as_str(), port).to_socket_addrs();
+        let addresses: Vec<_> =
+            tokio::task::spawn_blocking(resolve).await.map_err(io::Error::other)??.collect();
+        let stream = connect(&addresses[..]).await?;
+        stream.set_nodelay(true)?;
+        let Some(config) = &self.tls else { return Ok(Box::new(stream)) };
+        let name = ServerName::try_from(self.host.clone()).map_err(io::Error::other)?;
+        let stream = TlsConnector::from(Arc::clone(config)).connect(name, stream).await?;
+        Ok(Box::new(stream))
+    }
+}
+
+/// Ends a connection so that what was sent arrives: a socket that is closed while it has something to read is reset.
+pub(crate) async fn close(mut stream: Box<dyn Connection>) {
+    let _ = tokio::time::timeout(CLOSE_TIME, async {
+        stream.shutdown().await?;
+        let mut rest = [0; 256];
+        while stream.read(&mut rest).await? > 0 {}
+        io::Result::Ok(())
+    })
+    .await;
+}
+
+/// How long the end of a connection may take.
+const CLOSE_TIME: Duration = Duration::from_millis(500);

@@ -1,0 +1,370 @@
+//! A CAN bus in user space (proto-core/docs/wire/slcan.md section 4), with one port and any number of slcan
+//! clients.
+
+mod clients;
+
+use std::cell::{Cell, RefCell};
+use std::collections::VecDeque;
+use std::future::pending;
+use std::io;
+use std::rc::Rc;
+
+use proto_core::time::Instant;
+use proto_core::wire::can::CanFrame;
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::Notify;
+
+use super::bind::{Device, Pace};
+use super::exchange::{Backlog, PortEvent, PortTx};
+use super::kept::{Held, HeldBus, Parked, ParkedBus};
+use super::pty::Pty;
+use super::stream;
+use super::wire::{Full, NodeId, Pacing, Transmitted, Wire};
+use crate::clock::Clock;
+use crate::timer::now;
+pub(crate) use clients::{Client, Clients, Session};
+use clients::{serve, serve_all};
+
+/// A bus; a clone is the same bus.
+#[derive(Debug, Clone)]
+pub struct CanBus {
+    shared: Rc<Shared>,
+}
+
+#[derive(Debug)]
+struct Shared {
+    wire: RefCell<Wire>,
+    nodes: RefCell<Vec<Rc<NodeState>>>,
+    deadline_moved: Notify,
+    clock: Clock,
+    /// For the counter of dropped frames.
+    tx: Rc<PortTx>,
+}
+
+#[derive(Debug)]
+struct NodeState {
+    id: NodeId,
+    /// Received frames, each with the time of its end.
+    queue: RefCell<VecDeque<(Instant, CanFrame)>>,
+    wake: Notify,
+    is_receiving: Cell<bool>,
+    dropped: Cell<u64>,
+    sent: Cell<Sent>,
+    sent_wake: Notify,
+}
+
+/// Transmissions of a node since the last report.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Sent {
+    /// Frames.
+    pub frames: u64,
+    /// Their data bytes.
+    pub bytes: u64,
+}
+
+impl CanBus {
+    /// A bus without nodes. Frames that they drop are counted at `tx`; they take their time on `clock`.
+    pub fn new(pacing: Pacing, tx: Rc<PortTx>, clock: Clock) -> Self {
+        let wire = RefCell::new(Wire::new(pacing));
+        let (nodes, deadline_moved) = (RefCell::default(), Notify::new());
+        Self { shared: Rc::new(Shared { wire, nodes, deadline_moved, clock, tx }) }
+    }
+
+    fn now(&self) -> Instant {
+        self.shared.clock.now()
+    }
+
+    /// Adds a node that receives all frames.
+    pub fn join(&self) -> Node {
+        let state = Rc::new(NodeState {
+            id: self.shared.wire.borrow_mut().join(),
+            queue: RefCell::default(),
+            wake: Notify::new(),
+            is_receiving: Cell::new(true),
+            dropped: Cell::new(0),
+            sent: Cell::default(),
+            sent_wake: Notify::new(),
+        });
+        self.shared.nodes.borrow_mut().push(Rc::clone(&state));
+        Node { bus: self.clone(), state }
+    }
+
+    /// Advances the bus with the clock until dropped.
+    ///
+    /// # Errors
+    /// As [`Clock::alarm`] and [`Alarm::expired`](crate::clock::Alarm::expired).
+    pub async fn run(&self) -> io::Result<()> {
+        let timer = self.shared.clock.alarm()?;
+        loop {
+            let deadline = self.shared.wire.borrow().deadline();
+            timer.arm(deadline)?;
+            tokio::select! {
+                expired = timer.expired() => {
+                    expired?;
+                    self.advance(self.now());
+                }
+                () = self.shared.deadline_moved.notified() => {}
+            }
+        }
+    }
+
+    /// Delivers the frames that were transmitted by now to every receiving node except the sender. A node
+    /// with [`MAX_WAITING`] frames waiting drops and counts a frame.
+    pub fn advance(&self, now: Instant) {
+        loop {
+            let transmitted = self.shared.wire.borrow_mut().poll(now);
+            let Some(Transmitted { from, frame, at }) = transmitted else { return };
+            for node in self.shared.nodes.borrow().iter() {
+                if node.id == from {
+                    let Sent { frames, bytes } = node.sent.get();
+                    node.sent.set(Sent { frames: frames + 1, bytes: bytes + frame.data().len() as u64 });
+                    node.sent_wake.notify_one();
+                    continue;
+                }
+                if !node.is_receiving.get() {
+                    continue;
+                }
+                let mut queue = node.queue.borrow_mut();
+                if queue.len() == MAX_WAITING {
+                    node.dropped.set(node.dropped.get() + 1);
+                    self.shared.tx.count(|counters| counters.dropped += 1);
+                } else {
+                    queue.push_back((at, frame));
+                    node.wake.notify_one();
+                }
+            }
+        }
+    }
+}
+
+/// A node of a bus. Dropping it removes it from the bus and drops its waiting frames.
+#[derive(Debug)]
+pub struct Node {
+    bus: CanBus,
+    state: Rc<NodeState>,
+}
+
+impl Node {
+    /// Queues a frame for transmission.
+    ///
+    /// # Errors
+    /// [`Full`] if too many wait.
+    pub fn send(&self, now: Instant, frame: CanFrame) -> Result<(), Full> {
+        let wire = &self.bus.shared.wire;
+        self.bus.advance(now);
+        let before = wire.borrow().deadline();
+        wire.borrow_mut().send(now, self.state.id, frame)?;
+        self.bus.advance(now);
+        if wire.borrow().deadline() != before {
+            self.bus.shared.deadline_moved.notify_one();
+        }
+        Ok(())
+    }
+
+    /// Whether the next frame would be refused.
+    pub fn is_full(&self) -> bool {
+        self.bus.shared.wire.borrow().is_full(self.state.id)
+    }
+
+    /// Number of frames of this node that have not been transmitted.
+    pub fn waiting(&self) -> usize {
+        self.bus.shared.wire.borrow().waiting(self.state.id)
+    }
+
+    /// Waits until frames of this node have been transmitted, and returns their number. Cancel safe.
+    pub async fn sent(&self) -> Sent {
+        loop {
+            let sent = self.state.sent.take();
+            if sent.frames > 0 {
+                return sent;
+            }
+            self.state.sent_wake.notified().await;
+        }
+    }
+
+    /// The next received frame, with the time of its end.
+    pub fn try_recv(&self) -> Option<(Instant, CanFrame)> {
+        self.state.queue.borrow_mut().pop_front()
+    }
+
+    /// Waits for the next frame. Cancel safe.
+    pub async fn recv(&self) -> (Instant, CanFrame) {
+        loop {
+            if let Some(frame) = self.try_recv() {
+                return frame;
+            }
+            self.state.wake.notified().await;
+        }
+    }
+
+    /// Starts or stops receiving frames of other nodes. Stopping drops those that wait.
+    pub fn set_receiving(&self, is_receiving: bool) {
+        self.state.is_receiving.set(is_receiving);
+        if !is_receiving {
+            self.state.queue.borrow_mut().clear();
+        }
+    }
+
+    /// Number of received frames dropped because too many waited.
+    pub fn dropped(&self) -> u64 {
+        self.state.dropped.get()
+    }
+}
+
+impl Drop for Node {
+    fn drop(&mut self) {
+        self.bus.shared.wire.borrow_mut().leave(self.state.id);
+        self.bus.shared.nodes.borrow_mut().retain(|node| !Rc::ptr_eq(node, &self.state));
+    }
+}
+
+/// A CAN port of the configuration, on a bus of its own that slcan clients connect to.
+#[derive(Debug)]
+pub(super) struct CanPort {
+    pty: Option<(Rc<Pty>, Rc<RefCell<Session>>)>,
+    listener: Option<Rc<TcpListener>>,
+    clients: Rc<Clients>,
+    /// Another owner had it before, and something may wait in it.
+    is_kept: bool,
+    bitrate: u32,
+    pacing: Pacing,
+    tx: Rc<PortTx>,
+    /// The clock of the bus.
+    pub(super) clock: Clock,
+}
+
+impl CanPort {
+    pub(super) async fn open(
+        device: &Device,
+        bitrate: u32,
+        tx: Rc<PortTx>,
+        kept: Option<Parked>,
+    ) -> io::Result<Self> {
+        let (link, listen, pace) = match device {
+            Device::SlcanPty { link, pace } => (Some(link), None, *pace),
+            Device::SlcanTcp { listen, link, pace } => (link.as_ref(), Some(listen), *pace),
+            _ => {
+                let what = format!("`{device}` is a serial device; the port is a CAN bus");
+                return Err(io::Error::new(io::ErrorKind::InvalidInput, what));
+            }
+        };
+        let is_kept = kept.is_some();
+        let (listener, pty, clients) = match kept {
+            Some(Parked::Bus(ParkedBus { pty, listener, clients, .. })) => {
+                let pty = pty.map(|(pty, session)| Ok::<_, io::Error>((pty.unpark()?, session)));
+                let client = |(stream, session)| {
+                    let stream = TcpStream::from_std(stream)?;
+                    Ok::<_, io::Error>(Rc::new(Client { stream, session: RefCell::new(session) }))
+                };
+                let clients = clients.into_iter().map(client).collect::<io::Result<_>>()?;
+                (listener.map(TcpListener::from_std).transpose()?, pty.transpose()?, clients)
+            }
+            _ => {
+                let listener = match listen {
+                    Some(at) => Some(stream::listen(at).await?),
+                    None => None,
+                };
+                let pty = link.map(|link| Pty::open(link)).transpose()?;
+                (listener, pty.map(|pty| (pty, Session::new(bitrate))), Vec::new())
+            }
+        };
+        let pty = pty.map(|(pty, session)| (Rc::new(pty), Rc::new(RefCell::new(session))));
+        let (listener, clients) = (listener.map(Rc::new), Rc::new(RefCell::new(clients)));
+        let pacing = match pace {
+            Pace::AtOnce => Pacing::AtOnce,
+            Pace::BitRate => Pacing::Bitrate(bitrate),
+        };
+        Ok(Self { pty, listener, clients, is_kept, bitrate, pacing, tx, clock: Clock::real() })
+    }
+
+    /// If there are a listener and a terminal, the listener's address: the terminal's link is in the
+    /// `--bind`.
+    pub(super) fn place(&self) -> String {
+        match (&self.listener, &self.pty) {
+            (Some(listener), _) => stream::address_of(listener),
+            (None, Some((pty, _))) => pty.link().display().to_string(),
+            (None, None) => String::new(),
+        }
+    }
+
+    /// What clients are connected to.
+    pub(super) fn held(&self) -> Held {
+        Held::Bus(HeldBus {
+            bitrate: self.bitrate,
+            pty: self.pty.clone(),
+            listener: self.listener.clone(),
+            clients: Rc::clone(&self.clients),
+        })
+    }
+
+    pub(super) async fn run(self, mut events: impl FnMut(PortEvent<'_>)) -> io::Result<()> {
+        let Self { pty, listener, clients, is_kept, bitrate, pacing, tx, clock } = self;
+        if is_kept {
+            tx.note_gap(now());
+        }
+        let bus = CanBus::new(pacing, Rc::clone(&tx), clock);
+        let node = bus.join();
+        tx.count(|counters| counters.ups += 1);
+        events(PortEvent::Up);
+        let on_terminal = async {
+            match &pty {
+                Some((pty, session)) => serve(&**pty, session, &bus.join(), &tx, Backlog::new(&tx)).await,
+                None => pending().await,
+            }
+        };
+        let on_tcp = async {
+            match listener {
+                Some(listener) => serve_all(&listener, &clients, &bus, bitrate, &tx).await,
+                None => pending().await,
+            }
+        };
+        tokio::select! {
+            () = port_node(&node, &tx, &mut events) => Ok(()),
+            ended = bus.run() => ended,
+            error = on_terminal => Err(error),
+            () = on_tcp => Ok(()),
+        }
+    }
+}
+
+/// The port's own node.
+async fn port_node(node: &Node, tx: &PortTx, events: &mut impl FnMut(PortEvent<'_>)) {
+    loop {
+        tokio::select! {
+            (_, frame) = node.recv() => {
+                tx.count(|counters| {
+                    counters.frames_in += 1;
+                    counters.bytes_in += frame.data().len() as u64;
+                });
+                events(PortEvent::Frame { frame });
+            }
+            () = tx.wake.notified() => hand_over(node, tx),
+            sent = node.sent() => {
+                tx.count(|counters| {
+                    counters.frames_out += sent.frames;
+                    counters.bytes_out += sent.bytes;
+                });
+                hand_over(node, tx);
+                if node.waiting() == 0 {
+                    events(PortEvent::Sent);
+                }
+            }
+        }
+    }
+}
+
+/// Queues as many of the port's frames as its node takes.
+fn hand_over(node: &Node, tx: &PortTx) {
+    while !node.is_full() {
+        let Some(frame) = tx.frames.borrow_mut().pop_front() else { return };
+        // It cannot fail: there is room.
+        let _ = node.send(node.bus.now(), frame);
+    }
+}
+
+/// Maximum number of received frames that wait at one node.
+pub const MAX_WAITING: usize = 256;
+
+#[cfg(test)]
+#[path = "can_bus_tests.rs"]
+mod tests;

@@ -1,0 +1,163 @@
+//! The device of one port, of any kind: opened as `--bind` says, driven by one task, used through a handle.
+//!
+//! The task reports events of the device as [`PortEvent`]s. The port's owner sends through [`PortTx`], which
+//! never waits: its queue is bounded.
+
+use std::io;
+use std::rc::Rc;
+
+use proto_core::config::Rs485;
+use proto_core::wire::can::CanId;
+
+use super::bind::Device;
+use super::can_bus::CanPort;
+use super::exchange::{PortEvent, PortTx};
+use super::kept::{Hold, Kept, Parked};
+use super::serial::SerialPort;
+use super::socketcan::KernelCan;
+use crate::clock::Clock;
+
+/// A port's bus and its settings, from the configuration.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum PortBus {
+    /// A serial line.
+    Serial(Rs485),
+    /// A CAN bus of this bit rate.
+    Can {
+        /// Bit/s.
+        bitrate: u32,
+    },
+}
+
+/// A port whose device is open.
+#[derive(Debug)]
+pub struct Port {
+    driver: Driver,
+    device: Device,
+    is_kept: bool,
+    tx: Rc<PortTx>,
+}
+
+#[derive(Debug)]
+enum Driver {
+    Serial(SerialPort),
+    Can(CanPort),
+    Kernel(KernelCan),
+}
+
+impl Port {
+    /// Opens the device in the current tokio runtime, which must be a current-thread one.
+    ///
+    /// # Errors
+    /// If the device does not suit the bus, does not exist, or cannot be opened.
+    pub async fn open(device: &Device, bus: PortBus) -> io::Result<Self> {
+        Self::open_or_adopt(device, bus, None).await
+    }
+
+    /// The same, or takes over what another owner has left: clients stay connected, and what they have sent
+    /// meanwhile is dropped. What does not suit device and bus is closed first.
+    ///
+    /// # Errors
+    /// As [`Self::open`].
+    pub async fn open_or_adopt(device: &Device, bus: PortBus, kept: Option<Kept>) -> io::Result<Self> {
+        let tx = Rc::new(PortTx::default());
+        let kept = kept.filter(|kept| kept.device == *device).map(|kept| kept.what);
+        let kept = kept.filter(|what| bus.suits(what));
+        let is_kept = kept.is_some();
+        let driver = match (bus, device) {
+            (PortBus::Serial(settings), _) => {
+                Driver::Serial(SerialPort::open(device, settings, Rc::clone(&tx), kept).await?)
+            }
+            (PortBus::Can { bitrate }, Device::SocketCan { interface }) => {
+                Driver::Kernel(KernelCan::open(interface, bitrate, Rc::clone(&tx))?)
+            }
+            (PortBus::Can { bitrate }, _) => {
+                Driver::Can(CanPort::open(device, bitrate, Rc::clone(&tx), kept).await?)
+            }
+        };
+        Ok(Self { driver, device: device.clone(), is_kept, tx })
+    }
+
+    /// Whether the device was taken over from another owner.
+    pub fn is_kept(&self) -> bool {
+        self.is_kept
+    }
+
+    /// What is needed to keep the device when the tasks of [`Self::run`] are gone; `None` if it is none that is
+    /// kept: nobody is connected to it, or it is opened again at no cost.
+    pub fn hold(&self) -> Option<Hold> {
+        let held = match &self.driver {
+            Driver::Serial(serial) => serial.held()?,
+            Driver::Can(can) => can.held(),
+            Driver::Kernel(_) => return None,
+        };
+        Some(Hold { device: self.device.clone(), held, tx: Rc::clone(&self.tx) })
+    }
+
+    /// Where a client finds the device: the link to a pseudoterminal, the address of a socket, the name of an
+    /// interface.
+    pub fn place(&self) -> String {
+        match &self.driver {
+            Driver::Serial(serial) => serial.place(),
+            Driver::Can(can) => can.place(),
+            Driver::Kernel(can) => can.place(),
+        }
+    }
+
+    /// Sets the CAN ids that are used in either direction. A CAN interface of the kernel then reports no
+    /// others; other devices report all frames, and so does an interface before this call.
+    pub fn listen_to(&mut self, ids: Vec<CanId>) {
+        if let Driver::Kernel(can) = &mut self.driver {
+            can.listen_to(ids);
+        }
+    }
+
+    /// Lets transmissions take their time on this clock, not on the machine's. Without effect on a CAN
+    /// interface of the kernel.
+    #[must_use]
+    pub fn on_clock(mut self, clock: &Clock) -> Self {
+        match &mut self.driver {
+            Driver::Serial(serial) => serial.clock = clock.clone(),
+            Driver::Can(can) => can.clock = clock.clone(),
+            Driver::Kernel(_) => {}
+        }
+        self
+    }
+
+    /// Whether the kernel says when something has left, not the clock of [`Self::on_clock`].
+    pub fn is_kernel_can(&self) -> bool {
+        matches!(self.driver, Driver::Kernel(_))
+    }
+
+    /// The handle to send with.
+    pub fn tx(&self) -> Rc<PortTx> {
+        Rc::clone(&self.tx)
+    }
+
+    /// Runs the device until the future is dropped, which closes it.
+    ///
+    /// # Errors
+    /// Only if the device fails permanently; otherwise this waits until it is back.
+    pub async fn run(self, events: impl FnMut(PortEvent<'_>)) -> io::Result<()> {
+        let tx = Rc::clone(&self.tx);
+        let ended = match self.driver {
+            Driver::Serial(serial) => serial.run(events).await,
+            Driver::Can(can) => can.run(events).await,
+            Driver::Kernel(can) => can.run(events).await,
+        };
+        tx.has_failed.set(true);
+        ended
+    }
+}
+
+impl PortBus {
+    /// Whether a port of this bus can use what another owner has left. The line's settings may be others; the
+    /// channels of slcan clients are for one bit rate.
+    fn suits(self, what: &Parked) -> bool {
+        match (self, what) {
+            (Self::Serial(_), Parked::Pty(_) | Parked::Listen(..)) => true,
+            (Self::Can { bitrate }, Parked::Bus(bus)) => bus.bitrate == bitrate,
+            _ => false,
+        }
+    }
+}

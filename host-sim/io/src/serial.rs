@@ -1,0 +1,540 @@
+//! A serial port on a pseudoterminal, a serial device or a TCP byte stream.
+//!
+//! Only a serial device has a real line. On the others a transmission takes as long as on a line: `Sent` is
+//! reported when the last stop bit would have left, so that cycles have the same timing everywhere.
+
+use std::cell::RefCell;
+use std::io;
+use std::rc::Rc;
+use std::time::Duration as StdDuration;
+
+use proto_core::config::{Parity, Rs485};
+use proto_core::time::{Duration, Instant};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::task::yield_now;
+use tokio_serial::{SerialPortBuilderExt, SerialStream};
+use tracing::{debug, info, warn};
+
+use super::bind::{Device, HostPort, Pace};
+use super::exchange::{Backlog, PortEvent, PortTx};
+use super::kept::{Held, Parked};
+use super::pty::Pty;
+use super::stream::{self, ByteStream, accept};
+use crate::backoff::Backoff;
+use crate::clock::{Alarm, Clock};
+use crate::connect::connect;
+use crate::fairness::{Either, Order, either, give_way, yield_fairly};
+use crate::tcp_options;
+use crate::timer::now;
+
+/// A serial port's device.
+#[derive(Debug)]
+pub(super) struct SerialPort {
+    source: Source,
+    /// Another owner had it before, and something may wait in it.
+    is_kept: bool,
+    settings: Rs485,
+    tx: Rc<PortTx>,
+    /// The clock of the line: when its last bit has left.
+    pub(super) clock: Clock,
+}
+
+#[derive(Debug)]
+enum Source {
+    Pty(Rc<Pty>, Pace),
+    Serial(String, SerialStream),
+    Connect(HostPort),
+    Listen(Rc<TcpListener>, Rc<RefCell<Option<Rc<TcpStream>>>>),
+}
+
+impl SerialPort {
+    pub(super) async fn open(
+        device: &Device,
+        settings: Rs485,
+        tx: Rc<PortTx>,
+        kept: Option<Parked>,
+    ) -> io::Result<Self> {
+        let is_kept = kept.is_some();
+        let source = match device {
+            Device::Pty { link, pace } => {
+                let pty = match kept {
+                    Some(Parked::Pty(parked)) => parked.unpark()?,
+                    _ => Pty::open(link)?,
+                };
+                Source::Pty(Rc::new(pty), *pace)
+            }
+            Device::Serial { path } => {
+                let path = path.display().to_string();
+                let stream = open_serial(&path, settings)
+                    .map_err(|error| io::Error::new(error.kind(), format!("{path}: {error}")))?;
+                Source::Serial(path, stream)
+            }
+            Device::Tcp { to } => Source::Connect(to.clone()),
+            Device::TcpListen { listen } => {
+                let (listener, client) = match kept {
+                    Some(Parked::Listen(listener, client)) => {
+                        let client = client.map(TcpStream::from_std).transpose()?;
+                        (TcpListener::from_std(listener)?, client.map(Rc::new))
+                    }
+                    _ => (stream::listen(listen).await?, None),
+                };
+                Source::Listen(Rc::new(listener), Rc::new(RefCell::new(client)))
+            }
+            Device::SocketCan { .. } | Device::SlcanPty { .. } | Device::SlcanTcp { .. } => {
+                let what = format!("`{device}` is a CAN device; the port is a serial line");
+                return Err(io::Error::new(io::ErrorKind::InvalidInput, what));
+            }
+        };
+        Ok(Self { source, is_kept, settings, tx, clock: Clock::real() })
+    }
+
+    pub(super) fn place(&self) -> String {
+        match &self.source {
+            Source::Pty(pty, _) => pty.link().display().to_string(),
+            Source::Serial(path, _) => path.clone(),
+            Source::Connect(to) => to.to_string(),
+            Source::Listen(listener, _) => stream::address_of(listener),
+        }
+    }
+
+    /// What clients are connected to.
+    pub(super) fn held(&self) -> Option<Held> {
+        match &self.source {
+            Source::Pty(pty, _) => Some(Held::Pty(Rc::clone(pty))),
+            Source::Listen(listener, client) => Some(Held::Listen(Rc::clone(listener), Rc::clone(client))),
+            Source::Serial(..) | Source::Connect(_) => None,
+        }
+    }
+
+    pub(super) async fn run(self, mut events: impl FnMut(PortEvent<'_>)) -> io::Result<()> {
+        let Self { source, is_kept, settings, tx, clock } = self;
+        let mut sender = Sender::new(settings, Rc::clone(&tx), clock)?;
+        match source {
+            Source::Pty(pty, pace) => {
+                sender.paced = pace == Pace::BitRate;
+                if is_kept {
+                    drain(&*pty, &tx).await?;
+                }
+                sender.up(&mut events);
+                let backlog = Backlog::new(&tx);
+                Err(pump(&*pty, &mut sender, backlog, &mut events).await)
+            }
+            Source::Serial(path, stream) => {
+                let mut stream = Some(stream);
+                let mut backoff = Backoff::new(StdDuration::from_millis(100), StdDuration::from_secs(2));
+                loop {
+                    let device = match stream.take().map_or_else(|| open_serial(&path, settings), Ok) {
+                        Ok(device) => RefCell::new(device),
+                        Err(error) => {
+                            debug!(%path, %error, "cannot open the device");
+                            backoff.wait().await;
+                            continue;
+                        }
+                    };
+                    backoff.reset();
+                    sender.up(&mut events);
+                    let error = pump(&device, &mut sender, Backlog::new(&tx), &mut events).await;
+                    warn!(%path, %error, "device lost, will be reopened");
+                    sender.down(&mut events);
+                }
+            }
+            Source::Connect(to) => {
+                let mut backoff = Backoff::new(StdDuration::from_millis(20), StdDuration::from_secs(2));
+                loop {
+                    let known = tx.sleeps();
+                    match connect((to.host.as_str(), to.port)).await {
+                        Ok(stream) => {
+                            info!(%to, "connected");
+                            backoff.reset();
+                            tcp_options::deliver_in_time(&stream, DELIVERY);
+                            sender.up(&mut events);
+                            let backlog = Backlog::accepted(&tx, known);
+                            let error = pump(&stream, &mut sender, backlog, &mut events).await;
+                            info!(%to, %error, "connection lost");
+                            sender.down(&mut events);
+                        }
+                        Err(error) => debug!(%to, %error, "cannot connect"),
+                    }
+                    backoff.wait().await;
+                }
+            }
+            Source::Listen(listener, client) => {
+                let mut kept = client.borrow().clone();
+                let mut known = tx.sleeps();
+                loop {
+                    let (stream, backlog) = match kept.take() {
+                        Some(stream) => match drain(&*stream, &tx).await {
+                            Ok(()) => (stream, Backlog::new(&tx)),
+                            Err(error) => {
+                                info!(%error, "the client disconnected meanwhile");
+                                client.take();
+                                continue;
+                            }
+                        },
+                        None => {
+                            let (stream, peer) = accept(&listener, &tx).await;
+                            info!(%peer, "client connected");
+                            tcp_options::deliver_in_time(&stream, DELIVERY);
+                            let stream = Rc::new(stream);
+                            client.replace(Some(Rc::clone(&stream)));
+                            (stream, Backlog::accepted(&tx, known))
+                        }
+                    };
+                    known = tx.sleeps();
+                    sender.up(&mut events);
+                    tokio::select! {
+                        error = pump(&*stream, &mut sender, backlog, &mut events) => {
+                            info!(peer = %stream::peer_of(&stream), %error, "client disconnected");
+                        }
+                        () = refuse_all(&listener, &tx) => {}
+                    }
+                    client.take();
+                    sender.down(&mut events);
+                }
+            }
+        }
+    }
+}
+
+async fn refuse_all(listener: &TcpListener, tx: &PortTx) {
+    loop {
+        let (stream, peer) = accept(listener, tx).await;
+        drop(stream);
+        tx.count(|counters| counters.refused += 1);
+        if let Some(more) = tx.log_limit.allow(now()) {
+            warn!(%peer, more, "refused: the line already has a client");
+        }
+        yield_fairly().await;
+    }
+}
+
+fn open_serial(path: &str, settings: Rs485) -> io::Result<SerialStream> {
+    let parity = match settings.parity {
+        Parity::None => tokio_serial::Parity::None,
+        Parity::Even => tokio_serial::Parity::Even,
+        Parity::Odd => tokio_serial::Parity::Odd,
+    };
+    let stop_bits =
+        if settings.stop_bits == 2 { tokio_serial::StopBits::Two } else { tokio_serial::StopBits::One };
+    let builder = tokio_serial::new(path, settings.baud).stop_bits(stop_bits);
+    match builder.clone().parity(parity).open_native_async() {
+        // A pseudoterminal has no parity bit; some systems refuse one instead of ignoring it.
+        Err(_) if settings.parity != Parity::None => {
+            let stream = builder.open_native_async()?;
+            warn!(path, "the device does not support parity; used without");
+            Ok(stream)
+        }
+        opened => Ok(opened?),
+    }
+}
+
+/// Moves bytes in both directions until the device fails.
+async fn pump<D: ByteStream>(
+    device: &D,
+    sender: &mut Sender,
+    mut backlog: Backlog,
+    events: &mut impl FnMut(PortEvent<'_>),
+) -> io::Error {
+    let mut buf = vec![0; BACKLOG_CHUNK];
+    // Nothing is asked before a frame, unless what came last was one too: a line that never pauses would be all there is.
+    let mut order = Order::LeftFirst;
+    loop {
+        if backlog.has_slept(&sender.tx) {
+            discard_backlog(device, &sender.tx, &mut backlog, &mut buf, events);
+        }
+        let most = if backlog.is_open(&sender.tx) { BACKLOG_CHUNK } else { CHUNK };
+        let next = either(device.receive(&mut buf[..most]), other(device, sender), order).await;
+        order = if matches!(next, Either::Left(_)) { Order::RightFirst } else { Order::LeftFirst };
+        let done = match next {
+            Either::Left(Ok(0)) => Err(io::ErrorKind::UnexpectedEof.into()),
+            Either::Left(Ok(count)) => {
+                let is_full = count == most;
+                take(&buf[..count], is_full, &sender.tx, &mut backlog, events);
+                // A device that never pauses must not delay other tasks. Bytes that the engine discards
+                // take little time, and must be read before it accepts input again.
+                let is_much = is_full && !sender.tx.is_stale();
+                if is_much {
+                    yield_fairly().await
+                } else {
+                    give_way().await
+                }
+                Ok(())
+            }
+            Either::Left(Err(error)) if error.kind() == io::ErrorKind::Interrupted => Ok(()),
+            Either::Left(Err(error)) => Err(error),
+            Either::Right(Other::Slept) => Ok(()),
+            Either::Right(Other::Looked) => look(device, &sender.tx, &mut backlog, &mut buf[..most], events),
+            Either::Right(Other::HandedOver) => sender.begin(device, events),
+            Either::Right(Other::Due(due)) => due.and_then(|()| sender.advance(device, events)),
+            Either::Right(Other::MayHaveGone) => {
+                device.has_client();
+                Ok(())
+            }
+        };
+        if let Err(error) = done {
+            return error;
+        }
+    }
+}
+
+/// What a port waits for, other than bytes.
+enum Other {
+    /// The process slept.
+    Slept,
+    /// Received bytes are asked for.
+    Looked,
+    /// There is something to send.
+    HandedOver,
+    /// The transmission can go on.
+    Due(io::Result<()>),
+    /// A client may have gone and left bytes unread.
+    MayHaveGone,
+}
+
+async fn other<D: ByteStream>(device: &D, sender: &Sender) -> Other {
+    tokio::select! {
+        () = sender.tx.slept.notified() => Other::Slept,
+        () = sender.tx.looked.notified(), if D::LATE => Other::Looked,
+        () = sender.tx.wake.notified(), if !sender.sending => Other::HandedOver,
+        expired = sender.timer.expired(), if sender.sending && !sender.blocked => Other::Due(expired),
+        ready = device.writable(), if sender.blocked => Other::Due(ready),
+        () = tokio::time::sleep(CLIENT_POLL), if device.may_hold_unread() => Other::MayHaveGone,
+    }
+}
+
+/// Reads and drops what clients sent while nobody read: its age is unknown. That takes [`STALE`](super::exchange::STALE), and longer
+/// while there is more than can be read at once, as after sleep.
+async fn drain(device: &impl ByteStream, tx: &PortTx) -> io::Result<()> {
+    let mut buf = vec![0; BACKLOG_CHUNK];
+    let mut backlog = Backlog::new(tx);
+    tx.note_gap(now());
+    while backlog.is_open(tx) {
+        tokio::select! {
+            read = device.receive(&mut buf) => match read {
+                Ok(0) => return Err(io::ErrorKind::UnexpectedEof.into()),
+                Ok(count) => {
+                    tx.count(|counters| {
+                        counters.bytes_in += count as u64;
+                        counters.dropped += count as u64;
+                    });
+                    backlog.has(tx, count == BACKLOG_CHUNK);
+                    yield_now().await;
+                }
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+                Err(error) => return Err(error),
+            },
+            () = tokio::time::sleep(DRAIN_LOOK) => {
+                if !tx.is_stale() {
+                    backlog.has(tx, false);
+                }
+            }
+        }
+    }
+    device.discard_unread();
+    Ok(())
+}
+
+/// Reports bytes just read, or drops them if they may have waited while the process slept and the engine does not
+/// discard them any more.
+fn take(
+    bytes: &[u8],
+    is_full: bool,
+    tx: &PortTx,
+    backlog: &mut Backlog,
+    events: &mut impl FnMut(PortEvent<'_>),
+) {
+    tx.count(|counters| counters.bytes_in += bytes.len() as u64);
+    if backlog.has(tx, is_full) {
+        tx.count(|counters| counters.dropped += bytes.len() as u64);
+    } else {
+        events(PortEvent::Bytes(bytes));
+    }
+}
+
+/// Reports what can be read now.
+fn look(
+    device: &impl ByteStream,
+    tx: &PortTx,
+    backlog: &mut Backlog,
+    buf: &mut [u8],
+    events: &mut impl FnMut(PortEvent<'_>),
+) -> io::Result<()> {
+    match device.try_read(buf) {
+        Ok(0) => Err(io::ErrorKind::UnexpectedEof.into()),
+        Ok(count) => {
+            take(buf.get(..count).unwrap_or(buf), count == buf.len(), tx, backlog, events);
+            Ok(())
+        }
+        Err(error) if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::Interrupted) => {
+            Ok(())
+        }
+        Err(error) => Err(error),
+    }
+}
+
+/// Reads what waited while the process slept, so that the engine counts and discards it, and drops the
+/// rest: the kernel makes a terminal's bytes readable in pieces, some of them later.
+fn discard_backlog(
+    device: &impl ByteStream,
+    tx: &PortTx,
+    backlog: &mut Backlog,
+    buf: &mut [u8],
+    events: &mut impl FnMut(PortEvent<'_>),
+) {
+    for _ in 0..MAX_BACKLOG_READS {
+        let Ok(count @ 1..) = device.try_read(buf) else { break };
+        take(&buf[..count], count == buf.len(), tx, backlog, events);
+    }
+    device.discard_unread();
+    // The runtime may not know yet what the system has.
+    backlog.note(tx, device.has_unread());
+}
+
+/// The transmission in progress, and its timing.
+struct Sender {
+    tx: Rc<PortTx>,
+    settings: Rs485,
+    clock: Clock,
+    timer: Alarm,
+    paced: bool,
+    bytes: Vec<u8>,
+    written: usize,
+    start: Instant,
+    sending: bool,
+    blocked: bool,
+}
+
+impl Sender {
+    fn new(settings: Rs485, tx: Rc<PortTx>, clock: Clock) -> io::Result<Self> {
+        Ok(Self {
+            tx,
+            settings,
+            timer: clock.alarm()?,
+            clock,
+            paced: false,
+            bytes: Vec::new(),
+            written: 0,
+            start: Instant::ZERO,
+            sending: false,
+            blocked: false,
+        })
+    }
+
+    fn up(&mut self, events: &mut impl FnMut(PortEvent<'_>)) {
+        self.tx.bytes.borrow_mut().clear();
+        self.tx.count(|counters| counters.ups += 1);
+        events(PortEvent::Up);
+    }
+
+    fn down(&mut self, events: &mut impl FnMut(PortEvent<'_>)) {
+        self.sending = false;
+        self.blocked = false;
+        // Disarming cannot fail. A deadline that nobody waits for would keep a stepped clock from moving.
+        let _ = self.timer.arm(Instant::NEVER);
+        events(PortEvent::Down);
+    }
+
+    /// Starts a transmission of everything handed over so far.
+    fn begin(&mut self, device: &impl ByteStream, events: &mut impl FnMut(PortEvent<'_>)) -> io::Result<()> {
+        self.bytes.clear();
+        self.bytes.append(&mut self.tx.bytes.borrow_mut());
+        if self.bytes.is_empty() {
+            return Ok(());
+        }
+        self.written = 0;
+        self.start = self.clock.now();
+        self.sending = true;
+        self.advance(device, events)
+    }
+
+    /// Writes what is due and sets the timer for the next step.
+    fn advance(
+        &mut self,
+        device: &impl ByteStream,
+        events: &mut impl FnMut(PortEvent<'_>),
+    ) -> io::Result<()> {
+        let at = self.clock.now();
+        let end = self.start + self.settings.time_on_line(self.bytes.len());
+        let due = match self.paced {
+            true => bytes_in(&self.settings, at.saturating_since(self.start)).min(self.bytes.len()),
+            false => self.bytes.len(),
+        };
+        self.write_up_to(due, device)?;
+        if self.blocked {
+            return Ok(());
+        }
+        if self.written < self.bytes.len() {
+            let next = self.start + self.settings.time_on_line(self.written + 1);
+            return self.timer.arm(next.max(at + MIN_WRITE_INTERVAL).min(end));
+        }
+        if at < end {
+            return self.timer.arm(end);
+        }
+        if device.is_draining() {
+            return self.timer.arm(at + DRAIN_POLL);
+        }
+        self.sending = false;
+        if self.tx.bytes.borrow().is_empty() {
+            events(PortEvent::Sent);
+        } else {
+            self.tx.wake.notify_one();
+        }
+        Ok(())
+    }
+
+    fn write_up_to<D: ByteStream>(&mut self, due: usize, device: &D) -> io::Result<()> {
+        self.blocked = false;
+        if self.written < due && !device.has_client() {
+            let lost = (due - self.written) as u64;
+            self.tx.count(|counters| counters.unheard += lost);
+            self.written = due;
+        }
+        while self.written < due {
+            match device.try_write(&self.bytes[self.written..due]) {
+                Ok(count) => {
+                    self.tx.count(|counters| counters.bytes_out += count as u64);
+                    self.written += count;
+                }
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
+                    if !D::LOSSY {
+                        self.blocked = true;
+                        return Ok(());
+                    }
+                    let lost = (due - self.written) as u64;
+                    self.tx.count(|counters| counters.dropped += lost);
+                    self.written = due;
+                }
+                Err(error) => return Err(error),
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Number of bytes that have left the line after `time`.
+fn bytes_in(settings: &Rs485, time: Duration) -> usize {
+    let bits = u128::from(time.as_micros()) * u128::from(settings.baud) / 1_000_000;
+    usize::try_from(bits / u128::from(settings.bits_per_character())).unwrap_or(usize::MAX)
+}
+
+/// Maximum number of bytes per read: the engine handles all frames in them before another task runs.
+const CHUNK: usize = 512;
+/// The same for bytes that waited while the process slept.
+const BACKLOG_CHUNK: usize = 16 * 1_024;
+/// Interval at which a drained device is looked at while nothing comes.
+const DRAIN_LOOK: StdDuration = StdDuration::from_millis(10);
+/// Maximum number of reads after a sleep before other tasks run.
+const MAX_BACKLOG_READS: usize = 64;
+/// What is sent over TCP arrives within this time, or is dropped with its connection: an event has at most so long.
+const DELIVERY: StdDuration = StdDuration::from_secs(1);
+/// Paced bytes closer together than this are written together, as if from a UART's FIFO.
+const MIN_WRITE_INTERVAL: Duration = Duration::from_micros(500);
+/// Interval at which a serial device's output buffer is checked.
+const DRAIN_POLL: Duration = Duration::from_micros(200);
+/// Interval at which is checked whether a client has gone and left bytes unread.
+const CLIENT_POLL: StdDuration = StdDuration::from_millis(100);
+
+#[cfg(test)]
+#[path = "serial_tests.rs"]
+mod tests;

@@ -1,0 +1,180 @@
+//! The byte stream of a serial port or an slcan client: a pseudoterminal, a serial device or a TCP
+//! connection; and how TCP clients are accepted.
+
+use std::cell::RefCell;
+use std::future::poll_fn;
+use std::io;
+use std::pin::Pin;
+use std::time::Duration as StdDuration;
+
+use rustix::io::ioctl_fionread;
+use tokio::io::{AsyncRead, ReadBuf};
+use tokio::net::{TcpListener, TcpStream};
+use tokio_serial::{ClearBuffer, SerialPort, SerialStream};
+use tracing::warn;
+
+use super::bind::HostPort;
+use super::exchange::PortTx;
+use super::pty::Pty;
+use crate::tcp_options;
+use crate::timer::now;
+
+/// A connected device or client: what differs between the three kinds.
+pub(super) trait ByteStream {
+    /// Whether bytes that cannot be written at once are lost, as on a line, instead of waiting.
+    const LOSSY: bool;
+    /// Whether the system may pass on received bytes late, unless they are asked for.
+    const LATE: bool = false;
+
+    /// Waits for bytes. Cancel safe.
+    async fn receive(&self, buf: &mut [u8]) -> io::Result<usize>;
+    fn try_read(&self, buf: &mut [u8]) -> io::Result<usize>;
+    async fn writable(&self) -> io::Result<()>;
+    fn try_write(&self, bytes: &[u8]) -> io::Result<usize>;
+
+    /// Whether the system holds bytes that were not read, also if the runtime does not know of them yet; so if the
+    /// system does not say.
+    fn has_unread(&self) -> bool;
+
+    /// Drops bytes that have arrived and were not read, if the system can.
+    fn discard_unread(&self) {}
+
+    /// Whether the device has not yet sent all written bytes.
+    fn is_draining(&self) -> bool {
+        false
+    }
+
+    /// Whether a client can receive.
+    fn has_client(&self) -> bool {
+        true
+    }
+
+    /// Whether a client may have left bytes unread: then `has_client` must be called at times, because it
+    /// drops them.
+    fn may_hold_unread(&self) -> bool {
+        false
+    }
+}
+
+impl ByteStream for Pty {
+    const LOSSY: bool = true;
+    const LATE: bool = true;
+
+    async fn receive(&self, buf: &mut [u8]) -> io::Result<usize> {
+        loop {
+            self.readable().await?;
+            match self.try_read(buf) {
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
+                read => return read,
+            }
+        }
+    }
+    fn try_read(&self, buf: &mut [u8]) -> io::Result<usize> {
+        Self::try_read(self, buf)
+    }
+    async fn writable(&self) -> io::Result<()> {
+        Self::writable(self).await
+    }
+    fn try_write(&self, bytes: &[u8]) -> io::Result<usize> {
+        Self::try_write(self, bytes)
+    }
+    fn has_unread(&self) -> bool {
+        Self::has_unread(self)
+    }
+    fn discard_unread(&self) {
+        Self::discard_unread(self);
+    }
+    fn has_client(&self) -> bool {
+        Self::has_client(self)
+    }
+    fn may_hold_unread(&self) -> bool {
+        Self::may_hold_unread(self)
+    }
+}
+
+impl ByteStream for RefCell<SerialStream> {
+    const LOSSY: bool = false;
+
+    async fn receive(&self, buf: &mut [u8]) -> io::Result<usize> {
+        // The stream's own `readable` and `try_read` never clear the readiness.
+        let mut buf = ReadBuf::new(buf);
+        poll_fn(|cx| Pin::new(&mut *self.borrow_mut()).poll_read(cx, &mut buf)).await?;
+        Ok(buf.filled().len())
+    }
+    fn try_read(&self, buf: &mut [u8]) -> io::Result<usize> {
+        self.borrow_mut().try_read(buf)
+    }
+    async fn writable(&self) -> io::Result<()> {
+        // A frame usually fits the system's buffer; if not, the buffer empties at the baud rate.
+        tokio::time::sleep(StdDuration::from_millis(1)).await;
+        Ok(())
+    }
+    fn try_write(&self, bytes: &[u8]) -> io::Result<usize> {
+        self.borrow_mut().try_write(bytes)
+    }
+    fn has_unread(&self) -> bool {
+        !matches!(self.borrow().bytes_to_read(), Ok(0))
+    }
+    fn discard_unread(&self) {
+        let _ = self.borrow().clear(ClearBuffer::Input);
+    }
+    fn is_draining(&self) -> bool {
+        self.borrow().bytes_to_write().is_ok_and(|left| left > 0)
+    }
+}
+
+impl ByteStream for TcpStream {
+    const LOSSY: bool = false;
+
+    async fn receive(&self, buf: &mut [u8]) -> io::Result<usize> {
+        loop {
+            self.readable().await?;
+            match self.try_read(buf) {
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
+                read => return read,
+            }
+        }
+    }
+    fn try_read(&self, buf: &mut [u8]) -> io::Result<usize> {
+        Self::try_read(self, buf)
+    }
+    async fn writable(&self) -> io::Result<()> {
+        Self::writable(self).await
+    }
+    fn try_write(&self, bytes: &[u8]) -> io::Result<usize> {
+        Self::try_write(self, bytes)
+    }
+    fn has_unread(&self) -> bool {
+        ioctl_fionread(self) != Ok(0)
+    }
+}
+
+/// Listens at `at`, with limited buffers for each client: what waits in the kernel becomes old, and nothing
+/// counts it.
+pub(super) async fn listen(at: &HostPort) -> io::Result<TcpListener> {
+    let listener = TcpListener::bind((at.host.as_str(), at.port)).await;
+    let listener = listener.map_err(|error| io::Error::new(error.kind(), format!("{at}: {error}")))?;
+    tcp_options::limit_buffers(&listener);
+    Ok(listener)
+}
+
+/// The address of a listening socket, as text; empty if the system does not say.
+pub(super) fn address_of(listener: &TcpListener) -> String {
+    listener.local_addr().map_or_else(|_| String::new(), |at| at.to_string())
+}
+
+/// The address of a client, as text; empty if it has gone.
+pub(super) fn peer_of(stream: &TcpStream) -> String {
+    stream.peer_addr().map_or_else(|_| String::new(), |at| at.to_string())
+}
+
+/// Accepts one client. Errors of the system, such as too few descriptors, are waited out.
+pub(super) async fn accept(listener: &TcpListener, tx: &PortTx) -> (TcpStream, std::net::SocketAddr) {
+    let failed = |error: &io::Error| {
+        tx.count(|counters| counters.accept_failures += 1);
+        if let Some(more) = tx.log_limit.allow(now()) {
+            warn!(%error, more, "cannot accept a client");
+        }
+    };
+    tcp_options::accept(listener, failed).await
+}

@@ -1,0 +1,325 @@
+//! The endpoints: what each operation answers.
+
+use std::ops::RangeInclusive;
+use std::rc::Rc;
+
+use proto_core::time::Duration;
+use recipe_api::key::SCHEME;
+use recipe_api::nonces::MAX_AGE;
+use recipe_api::response::{Kind, Status};
+use recipe_api::revisions::{Refused, Revision, TRIAL};
+use recipe_api::route::Operation;
+use recipe_io::timer::now;
+use serde::Deserialize;
+use serde_json::{Value, json};
+use tokio::sync::oneshot;
+use tracing::{info, warn};
+
+use super::http::{Reply, Request};
+use super::reading::host_name;
+use super::supervisor::{Command, Failed, View, What, left_of};
+use super::{Server, Source, check, pendant};
+
+impl Server {
+    /// Carries out a request.
+    pub(super) async fn carry_out(&self, request: Request<'_>) -> Reply {
+        match (request.admitted.operation, &self.source) {
+            (Operation::Page, _) => Reply::page(request.head.if_none_match),
+            (Operation::Nonce, _) => {
+                let nonce = self.guard.borrow_mut().nonce(now());
+                let age = MAX_AGE.as_millis() / 1_000;
+                Reply::json(
+                    Status::OK,
+                    &json!({ "nonce": nonce.as_str(), "scheme": SCHEME, "max_age_s": age }),
+                )
+            }
+            (Operation::Check, _) => match std::str::from_utf8(&request.body) {
+                Ok(toml) => match request.head.query("image") {
+                    None => Reply::json(Status::OK, &check::report(toml)),
+                    Some("1") => image(toml),
+                    Some(_) => Reply::error(Status::BAD_REQUEST, "image is out of range; allowed: 1"),
+                },
+                Err(error) => Reply::error(Status::BAD_REQUEST, &format!("not UTF-8: {error}")),
+            },
+            (Operation::Config, Source::Gateway { shared, .. }) => config(&shared.view(), &request),
+            (Operation::Revisions, Source::Gateway { shared, .. }) => {
+                Reply::json(Status::OK, &revisions(&shared.view()))
+            }
+            (Operation::Pendant, Source::Controller { control, .. }) => {
+                info!(peer = %request.peer, body = %String::from_utf8_lossy(&request.body), "pendant");
+                pendant::operate(*control, &request.body).await
+            }
+            (Operation::Identify, Source::Gateway { .. }) => self.identify(&request),
+            (
+                Operation::Update
+                | Operation::PutUpdate
+                | Operation::TryUpdate
+                | Operation::ConfirmUpdate
+                | Operation::EndUpdate,
+                _,
+            ) => Reply::error(
+                Status::NOT_IMPLEMENTED,
+                "this gateway is a program; it is updated as a package, as it was installed",
+            ),
+            (Operation::Edge | Operation::PutEdge, _) => Reply::error(
+                Status::NOT_IMPLEMENTED,
+                "this gateway is a program; its edge node is given with --sparkplug, and its log says how it does",
+            ),
+            (
+                operation @ (Operation::PutConfig
+                | Operation::Apply
+                | Operation::Confirm
+                | Operation::Rollback),
+                Source::Gateway { .. },
+            ) => self.change(operation, request).await,
+            (operation, _) => self.read(operation, &request.head).await,
+        }
+    }
+
+    /// Tells a person beside several machines which one this is.
+    fn identify(&self, request: &Request<'_>) -> Reply {
+        let IdentifyArguments { s } = match arguments(&request.body) {
+            Ok(arguments) => arguments,
+            Err(reply) => return reply,
+        };
+        if !IDENTIFY.contains(&s) {
+            let text = format!("s is out of range; allowed: {}..={}", IDENTIFY.start(), IDENTIFY.end());
+            return Reply::error(Status::BAD_REQUEST, &text);
+        }
+        let name = host_name().unwrap_or_default();
+        let peer = request.peer.ip().to_canonical();
+        warn!(%peer, name, console = %self.address, "this is the gateway that somebody looks for");
+        Reply::json(Status::OK, &json!({}))
+    }
+
+    /// Requests that change the configuration, or what runs.
+    async fn change(&self, operation: Operation, request: Request<'_>) -> Reply {
+        let Source::Gateway { shared, commands, .. } = &self.source else { return nothing_runs() };
+        let what = match operation {
+            Operation::PutConfig => {
+                // The view must not be held while a text is read and an engine is built of it.
+                let overrides = shared.view().overrides.clone();
+                match put(&request, &overrides) {
+                    Ok(what) => what,
+                    Err(reply) => return reply,
+                }
+            }
+            Operation::Apply => match arguments::<ApplyArguments>(&request.body) {
+                Ok(ApplyArguments { confirm_s, revision }) => {
+                    What::Apply { number: revision, trial: Duration::from_millis((confirm_s * 1e3) as u64) }
+                }
+                Err(reply) => return reply,
+            },
+            Operation::Confirm | Operation::Rollback => match arguments::<NoArguments>(&request.body) {
+                Ok(NoArguments {}) if operation == Operation::Confirm => What::Confirm,
+                Ok(NoArguments {}) => What::RollBack,
+                Err(reply) => return reply,
+            },
+            _ => return Reply::error(Status::NOT_FOUND, "there is no such path"),
+        };
+        let (answer, answered) = oneshot::channel();
+        let peer = request.peer.ip().to_canonical();
+        let done = match commands.send(Command { peer, what, answer }) {
+            Ok(()) => answered.await.ok(),
+            Err(_) => None,
+        };
+        let done = done.unwrap_or_else(|| Err(Failed::Tried("the gateway is ending".to_owned())));
+        let view = shared.view();
+        match done {
+            Ok(revision) => {
+                // At the level that is shown if nobody asks for another: a person has to see it.
+                warn!(%peer, revision, what = name(operation), "done for a client of the console");
+                let status = if operation == Operation::PutConfig { Status::CREATED } else { Status::OK };
+                let mut shown = revisions(&view);
+                shown["revision"] = json!(revision);
+                let reply = Reply::json(status, &shown);
+                match view.revisions.as_ref().and_then(|revisions| revisions.revision(revision)) {
+                    Some(revision) => reply.with("ETag", etag(revision)),
+                    None => reply,
+                }
+            }
+            Err(Failed::Refused(refused)) => {
+                warn!(%peer, what = name(operation), ?refused, "refused to a client of the console");
+                refusal(refused)
+            }
+            Err(Failed::Tried(why)) => {
+                let mut shown = revisions(&view);
+                shown["error"] = json!(why);
+                Reply::json(
+                    if operation == Operation::Apply { Status::CONFLICT } else { Status::INTERNAL },
+                    &shown,
+                )
+            }
+        }
+    }
+}
+
+/// The image of a text for a board, or its first mistake.
+fn image(toml: &str) -> Reply {
+    match check::image(toml) {
+        Ok(bytes) => Reply::image(bytes),
+        Err(mistake) => Reply::json(Status::UNPROCESSABLE, &Value::Object(mistake.json())),
+    }
+}
+
+/// The text of the configuration that runs, or of the one that was asked for.
+fn config(view: &View, request: &Request<'_>) -> Reply {
+    let Some(revisions) = &view.revisions else { return nothing_runs() };
+    let number = match request.head.query("revision").map(str::parse) {
+        None => revisions.running().unwrap_or(revisions.live()),
+        Some(Ok(number)) => number,
+        Some(Err(_)) => return Reply::error(Status::BAD_REQUEST, "revision must be a number"),
+    };
+    match (revisions.revision(number), view.texts.get(&number)) {
+        (Some(revision), _) if request.head.if_none_match == Some(etag(revision).as_str()) => {
+            let reply =
+                Reply { status: Status::NOT_MODIFIED, kind: Kind::Toml, body: "".into(), fields: Vec::new() };
+            reply.with("ETag", etag(revision))
+        }
+        (Some(revision), Some(text)) => {
+            Reply::text(Kind::Toml, Rc::from(&**text)).with("ETag", etag(revision))
+        }
+        _ => refusal(Refused::Unknown),
+    }
+}
+
+/// The revisions, and what happens to them.
+pub(super) fn revisions(view: &View) -> Value {
+    let Some(revisions) = &view.revisions else { return json!({ "kept": [] }) };
+    let kept: Vec<_> = view
+        .entries
+        .iter()
+        .map(|entry| {
+            let etag = revisions.revision(entry.number).map(etag);
+            json!({ "revision": entry.number, "etag": etag, "stored_at": entry.stored_at, "from": entry.from })
+        })
+        .collect();
+    let mut shown = json!({ "live": revisions.live(), "kept": kept });
+    let mut show = |key: &str, value: Option<Value>| {
+        if let Some(value) = value {
+            shown[key] = value;
+        }
+    };
+    show("running", revisions.running().map(Value::from));
+    show("previous", revisions.previous().map(Value::from));
+    show("waiting", revisions.waiting().map(Value::from));
+    let trial = left_of(revisions.trial());
+    show("trial", trial.map(|(number, left_s)| json!({ "revision": number, "left_s": left_s })));
+    show("base", revisions.base().map(|base| Value::from(etag(base))));
+    show(
+        "last",
+        revisions.last().map(|(number, ended)| json!({ "revision": number, "ended": ended.name() })),
+    );
+    show("failure", view.failure.clone().map(Value::from));
+    shown
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct ApplyArguments {
+    #[serde(default = "default_trial")]
+    confirm_s: f64,
+    revision: Option<u32>,
+}
+
+fn default_trial() -> f64 {
+    60.0
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct NoArguments {}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct IdentifyArguments {
+    #[serde(default = "default_identify")]
+    s: u32,
+}
+
+fn default_identify() -> u32 {
+    10
+}
+
+/// For how many seconds a board shows itself. A host writes one line to its log.
+const IDENTIFY: RangeInclusive<u32> = 1..=600;
+
+/// The arguments in a body; none at all is an empty object.
+fn arguments<T: serde::de::DeserializeOwned>(body: &[u8]) -> Result<T, Reply> {
+    let body = if body.is_empty() { b"{}" } else { body };
+    // Else an array would be taken for the values of an object.
+    let object = serde_json::from_slice(body).map(Value::Object);
+    object
+        .and_then(serde_json::from_value)
+        .map_err(|error| Reply::error(Status::BAD_REQUEST, &error.to_string()))
+}
+
+/// A configuration to store: refused here if it could not run.
+fn put(request: &Request<'_>, overrides: &[String]) -> Result<What, Reply> {
+    let Some(base) = request.head.if_match else {
+        let text = "If-Match is needed: the ETag of the revision that this one was made from";
+        return Err(Reply::error(Status::PRECONDITION_REQUIRED, text));
+    };
+    let Some(base) = parse_etag(base) else {
+        return Err(Reply::error(
+            Status::PRECONDITION_FAILED,
+            "If-Match must be one ETag, such as \"3-0badcafe\"",
+        ));
+    };
+    let toml = String::from_utf8(request.body.clone());
+    let toml = toml.map_err(|error| Reply::error(Status::UNPROCESSABLE, &format!("not UTF-8: {error}")))?;
+    match check::gateway(check::NAME, &toml, overrides) {
+        Ok(_) => Ok(What::Put { base, toml }),
+        Err(mistake) => Err(Reply::json(Status::UNPROCESSABLE, &Value::Object(mistake.json()))),
+    }
+}
+
+fn etag(revision: Revision) -> String {
+    format!("\"{}-{:08x}\"", revision.number, revision.digest)
+}
+
+fn parse_etag(text: &str) -> Option<Revision> {
+    let (number, digest) = text.strip_prefix('"')?.strip_suffix('"')?.split_once('-')?;
+    let revision = Revision { number: number.parse().ok()?, digest: u32::from_str_radix(digest, 16).ok()? };
+    (etag(revision) == text).then_some(revision)
+}
+
+fn refusal(refused: Refused) -> Reply {
+    let (status, text) = match refused {
+        Refused::Busy => (Status::CONFLICT, "something else is being done; try again".to_owned()),
+        Refused::OnTrial => {
+            (Status::CONFLICT, "a revision is on trial; confirm it or roll it back first".to_owned())
+        }
+        Refused::NotOnTrial => (Status::CONFLICT, "no revision is on trial".to_owned()),
+        Refused::Changed(base) => {
+            let text = format!("the configuration was changed meanwhile; the newest is {}", etag(base));
+            return Reply::error(Status::PRECONDITION_FAILED, &text).with("ETag", etag(base));
+        }
+        Refused::NothingWaits => (Status::CONFLICT, "no stored revision waits; name one".to_owned()),
+        Refused::Unknown => (Status::NOT_FOUND, "there is no such revision".to_owned()),
+        Refused::Runs => (Status::CONFLICT, "it is live already".to_owned()),
+        Refused::Trial => {
+            let seconds = |at: &Duration| at.as_millis() / 1_000;
+            let (min, max) = (seconds(TRIAL.start()), seconds(TRIAL.end()));
+            (Status::BAD_REQUEST, format!("confirm_s is out of range; allowed: {min}..={max}"))
+        }
+        Refused::NoPrevious => (Status::CONFLICT, "no other revision was live before".to_owned()),
+        other => (Status::CONFLICT, format!("refused: {other:?}")),
+    };
+    Reply::error(status, &text)
+}
+
+pub(super) fn nothing_runs() -> Reply {
+    Reply::error(Status::UNAVAILABLE, "nothing runs at the moment; try again")
+}
+
+/// For the log.
+fn name(operation: Operation) -> &'static str {
+    match operation {
+        Operation::PutConfig => "store",
+        Operation::Apply => "apply",
+        Operation::Confirm => "confirm",
+        Operation::Rollback => "roll back",
+        _ => "",
+    }
+}

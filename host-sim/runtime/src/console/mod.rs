@@ -1,0 +1,258 @@
+//! The console's server: the API of docs/api.md over HTTP, for the gateway and the simulated controller.
+//!
+//! It runs on an ordinary thread of its own. Of the thread that runs the engine it only asks for copies
+//! (its window), at most ten times a second for all readers together, and never lets it wait.
+
+mod api;
+mod check;
+mod frames;
+mod http;
+mod key_file;
+mod pendant;
+mod reading;
+mod snapshots;
+mod store;
+mod stream;
+mod supervisor;
+pub(crate) mod window;
+
+use std::cell::{Cell, RefCell};
+use std::net::{SocketAddr, TcpListener};
+use std::path::PathBuf;
+use std::rc::Rc;
+use std::sync::{Arc, mpsc as blocking};
+use std::thread::JoinHandle;
+
+use recipe_api::guard::Guard;
+use recipe_api::key::Key;
+use recipe_api::route::Served;
+use recipe_capture::Watch;
+use recipe_io::log_limit::LogLimit;
+use recipe_io::random::random;
+use recipe_io::timer::now;
+use serde_json::{Value, json};
+use tokio::sync::Notify;
+use tracing::{Span, info};
+
+use crate::StartError;
+use crate::host::{Asker, Handle, Running};
+use crate::log::Log;
+pub use key_file::read_key;
+use snapshots::Snapshots;
+pub use supervisor::ConfigFile;
+pub(crate) use supervisor::Supervised;
+
+/// Stack of a thread that builds engines, which is done by value.
+const STACK: usize = 16 << 20;
+
+/// How far the console's thread stands back behind others.
+const NICENESS: i32 = 10;
+
+/// Options of a console.
+#[derive(Debug, Clone)]
+pub struct ConsoleOptions {
+    /// The address to listen on; port 0: any.
+    pub address: SocketAddr,
+    /// The key. Without one nothing can be changed, and only this machine is served.
+    pub key: Option<Key>,
+    /// The folder that keeps the last revisions of the configuration; without one they end with the process.
+    pub state: Option<PathBuf>,
+    /// The port of the other half's console on this machine: the controller's for a gateway, and the reverse.
+    pub peer: Option<u16>,
+}
+
+/// A socket that listens and is not served yet.
+#[derive(Debug)]
+pub(crate) struct Bound {
+    listener: TcpListener,
+    address: SocketAddr,
+    key: Option<Key>,
+    peer: Option<u16>,
+}
+
+impl ConsoleOptions {
+    /// Opens the socket.
+    pub(crate) fn bind(&self) -> Result<Bound, StartError> {
+        let refused =
+            |why: &dyn std::fmt::Display| StartError::new(format!("--console {}: {why}", self.address));
+        if !self.address.ip().to_canonical().is_loopback() && self.key.is_none() {
+            return Err(refused(&"other machines are served only with a key; add --console-key FILE"));
+        }
+        let bound = TcpListener::bind(self.address).and_then(|listener| {
+            listener.set_nonblocking(true)?;
+            let address = listener.local_addr()?;
+            Ok(Bound { listener, address, key: self.key.clone(), peer: self.peer })
+        });
+        bound.map_err(|error| refused(&error))
+    }
+}
+
+/// What a console serves.
+#[derive(Debug)]
+pub(crate) enum Source {
+    /// A gateway that can be given another configuration.
+    Gateway { shared: Arc<supervisor::Shared>, commands: blocking::Sender<supervisor::Command>, watch: Watch },
+    /// A simulated controller, and the address of its control socket.
+    Controller { asker: Asker, control: SocketAddr },
+}
+
+impl Source {
+    fn served(&self) -> Served {
+        match self {
+            Self::Gateway { .. } => Served::Gateway,
+            Self::Controller { .. } => Served::Controller,
+        }
+    }
+}
+
+/// A console that is being served until it is dropped.
+#[derive(Debug)]
+pub(crate) struct Console {
+    address: SocketAddr,
+    end: Arc<Notify>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Console {
+    /// Serves a socket on a thread of its own.
+    pub(crate) fn start(bound: Bound, source: Source, log: Option<Log>) -> Result<Self, StartError> {
+        let refused = |error: std::io::Error| StartError::new(format!("console: {error}"));
+        let Bound { listener, address, key, peer } = bound;
+        let end = Arc::new(Notify::new());
+        let ended = Arc::clone(&end);
+        let guard = Guard::new(key, random().map_err(refused)?);
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(refused)?;
+        let listener = {
+            let _inside = runtime.enter();
+            tokio::net::TcpListener::from_std(listener).map_err(refused)?
+        };
+        let span = Span::current();
+        let serve = move || {
+            let _of = span.entered();
+            // Where the gateway's thread has no better right, it still goes first.
+            let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), NICENESS);
+            let server = Rc::new(Server {
+                address,
+                peer,
+                source,
+                guard: RefCell::new(guard),
+                snapshots: Snapshots::default(),
+                connections: Cell::new(0),
+                streams: Cell::new(0),
+                counters: Cell::default(),
+                log,
+                log_limit: LogLimit::default(),
+                started: now(),
+            });
+            let local = tokio::task::LocalSet::new();
+            local.block_on(&runtime, async {
+                tokio::select! {
+                    () = server.accept(listener) => {}
+                    () = ended.notified() => {}
+                }
+            });
+        };
+        let thread = std::thread::Builder::new().name("console".to_owned()).stack_size(STACK).spawn(serve);
+        let thread = Some(thread.map_err(refused)?);
+        info!(%address, "the console is served");
+        Ok(Self { address, end, thread })
+    }
+
+    /// Its address.
+    pub(crate) fn address(&self) -> SocketAddr {
+        self.address
+    }
+}
+
+impl Drop for Console {
+    fn drop(&mut self) {
+        self.end.notify_one();
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+/// A simulated controller with a console.
+#[derive(Debug)]
+pub(crate) struct Consoled {
+    ready: Value,
+    /// Ended first, so that nobody is answered any more.
+    console: Option<Console>,
+    handle: Handle,
+}
+
+impl Consoled {
+    /// Serves a console for a controller that runs.
+    pub(crate) fn start(bound: Bound, handle: Handle, log: Option<Log>) -> Result<Self, StartError> {
+        let control = handle.place("control").parse();
+        let control = control.map_err(|error| StartError::new(format!("control socket: {error}")))?;
+        let console = Console::start(bound, Source::Controller { asker: handle.asker(), control }, log)?;
+        let mut ready = handle.ready().clone();
+        ready["console"] = json!(console.address());
+        Ok(Self { ready, console: Some(console), handle })
+    }
+}
+
+impl Running for Consoled {
+    fn ready(&self) -> &Value {
+        &self.ready
+    }
+
+    fn stats(&self) -> Option<Value> {
+        self.handle.stats()
+    }
+
+    fn askers(&self) -> Vec<Asker> {
+        vec![self.handle.asker()]
+    }
+
+    fn has_ended(&self) -> bool {
+        self.handle.has_ended()
+    }
+
+    fn shutdown(mut self: Box<Self>) -> Result<(), StartError> {
+        self.console = None;
+        self.handle.shutdown()
+    }
+}
+
+/// Everything that the connections share.
+struct Server {
+    address: SocketAddr,
+    peer: Option<u16>,
+    source: Source,
+    guard: RefCell<Guard>,
+    snapshots: Snapshots,
+    connections: Cell<usize>,
+    streams: Cell<usize>,
+    counters: Cell<ServerCounters>,
+    log: Option<Log>,
+    log_limit: LogLimit,
+    started: proto_core::time::Instant,
+}
+
+/// Counters of connections.
+#[derive(Debug, Clone, Copy, Default, serde::Serialize)]
+struct ServerCounters {
+    /// Connections.
+    connections: u64,
+    /// Connections turned away because there were too many.
+    turned_away: u64,
+    /// Requests that did not arrive in time, or were cut off.
+    incomplete: u64,
+    /// Responses and streams ended because the client did not read.
+    slow_readers: u64,
+    /// Events that streams left out because their client reads slowly.
+    lost_events: u64,
+    /// Frames that streams left out.
+    lost_frames: u64,
+}
+
+impl Server {
+    fn count(&self, change: impl FnOnce(&mut ServerCounters)) {
+        let mut counters = self.counters.get();
+        change(&mut counters);
+        self.counters.set(counters);
+    }
+}

@@ -1,0 +1,185 @@
+//! What readers are shown: one copy of the engine for all of them, at most ten times a second.
+
+use std::cell::{Cell, OnceCell, RefCell};
+use std::rc::Rc;
+use std::sync::Arc;
+use std::time::Duration as StdDuration;
+
+use proto_core::config::GatewayConfig;
+use proto_core::time::{Duration, Instant};
+use proto_core::wire::state::States;
+use recipe_api::documents::{Document, Pieces};
+use recipe_api::json;
+use recipe_api::metrics::Families;
+use recipe_doctor::{Case, Finding, examine};
+use recipe_io::timer::now;
+use serde_json::Value;
+
+use super::Source;
+use super::window::{Shot, Window};
+use crate::gateway::{look_at_states, unexplained};
+
+/// The newest snapshot.
+#[derive(Default)]
+pub(super) struct Snapshots {
+    newest: RefCell<Option<Rc<Snapshot>>>,
+    /// Room that the next copy is made in.
+    room: RefCell<Option<Box<Shot>>>,
+    /// Those who ask at the same time get the same copy.
+    turn: tokio::sync::Mutex<()>,
+    /// The controller's states after a command had failed at that instant, if they could be seen.
+    looked: Cell<Option<(Instant, Option<States>)>>,
+}
+
+/// State, counters and values at one instant. Each text is made when somebody wants it, and once.
+pub(super) struct Snapshot {
+    taken: Instant,
+    what: Taken,
+    status: OnceCell<Rc<str>>,
+    values: OnceCell<Rc<str>>,
+    metrics: OnceCell<Rc<str>>,
+}
+
+enum Taken {
+    Gateway(Box<Shot>, Arc<GatewayConfig>),
+    Controller(Value),
+}
+
+impl Snapshots {
+    /// A snapshot that is young enough; `None` while nothing runs.
+    pub(super) async fn newest(&self, source: &Source) -> Option<Rc<Snapshot>> {
+        let _turn = self.turn.lock().await;
+        if let Some(newest) = self.newest.borrow().as_ref()
+            && now().saturating_since(newest.taken) < MAX_AGE
+        {
+            return Some(Rc::clone(newest));
+        }
+        let what = match source {
+            Source::Gateway { shared, .. } => {
+                let (window, config) = shared.running()?;
+                Taken::Gateway(self.copy(&window).await?, config)
+            }
+            Source::Controller { asker, .. } => {
+                let asker = asker.clone();
+                Taken::Controller(tokio::task::spawn_blocking(move || asker.stats()).await.ok()??)
+            }
+        };
+        let snapshot = Rc::new(Snapshot {
+            taken: now(),
+            what,
+            status: OnceCell::new(),
+            values: OnceCell::new(),
+            metrics: OnceCell::new(),
+        });
+        let before = self.newest.replace(Some(Rc::clone(&snapshot)));
+        // Its room is used again, if no stream is still reading.
+        if let Some(Snapshot { what: Taken::Gateway(shot, _), .. }) = before.and_then(Rc::into_inner) {
+            self.room.replace(Some(shot));
+        }
+        Some(snapshot)
+    }
+
+    /// The controller's states, looked at once for each command that failed; `None` if they do not show in time.
+    pub(super) async fn look_at_controller(&self, failed: Instant, snapshot: &Snapshot) -> Option<States> {
+        let Taken::Gateway(_, config) = &snapshot.what else { return None };
+        if let Some((at, states)) = self.looked.get()
+            && at >= failed
+        {
+            return states;
+        }
+        let config = Arc::clone(config);
+        let looking = tokio::task::spawn_blocking(move || look_at_states(&config.controller));
+        let states = tokio::time::timeout(MAX_LOOK, looking).await.ok()?.ok()?;
+        self.looked.set(Some((failed, states)));
+        states
+    }
+
+    async fn copy(&self, window: &Arc<Window>) -> Option<Box<Shot>> {
+        let room = self.room.take().unwrap_or_else(Shot::empty);
+        match window.look(room).await {
+            Ok(shot) => Some(shot),
+            Err(room) => {
+                self.room.replace(room);
+                None
+            }
+        }
+    }
+}
+
+impl Snapshot {
+    /// The document `status`.
+    pub(super) fn status(&self) -> Rc<str> {
+        let make = || match &self.what {
+            Taken::Controller(stats) => stats.to_string(),
+            Taken::Gateway(shot, _) => status_of(shot),
+        };
+        Rc::clone(self.status.get_or_init(|| make().into()))
+    }
+
+    /// The document `values`.
+    pub(super) fn values(&self) -> Option<Rc<str>> {
+        let Taken::Gateway(shot, _) = &self.what else { return None };
+        let make =
+            || written(|text| Pieces::of(Document::Values).write_all(shot.engine.status(shot.at), text));
+        Some(Rc::clone(self.values.get_or_init(|| make().into())))
+    }
+
+    /// The metrics.
+    pub(super) fn metrics(&self) -> Option<Rc<str>> {
+        let Taken::Gateway(shot, _) = &self.what else { return None };
+        let make = || written(|text| Families::new().write_all(shot.engine.status(shot.at), text));
+        Some(Rc::clone(self.metrics.get_or_init(|| make().into())))
+    }
+
+    /// Since when a command has failed for which nobody saw the controller's states.
+    pub(super) fn unexplained(&self) -> Option<Instant> {
+        let Taken::Gateway(shot, _) = &self.what else { return None };
+        unexplained(shot.engine.status(shot.at))
+    }
+
+    /// What is wrong. `looked` are the controller's states, if somebody else than the engine has looked.
+    pub(super) fn findings(&self, looked: Option<States>) -> Option<Vec<Finding>> {
+        let Taken::Gateway(shot, config) = &self.what else { return None };
+        Some(examine(&Case {
+            config: config.view(),
+            status: shot.engine.status(shot.at).into(),
+            ports: shot.records(),
+            links: &shot.links,
+            running: shot.running,
+            looked,
+        }))
+    }
+}
+
+/// The document `status`, with the counters of the devices, which the engine does not know.
+fn status_of(shot: &Shot) -> String {
+    let status = shot.engine.status(shot.at);
+    written(|text| {
+        let _ = Pieces::of(Document::Status).write_all(status, text);
+        text.pop();
+        text.push_str(",\"devices\":{");
+        let mut separator = "";
+        for port in status.ports() {
+            if let Some(counters) = shot.devices.get(usize::from(port.id.0)).and_then(Option::as_ref) {
+                text.push_str(separator);
+                let _ = json::write_text(text, port.name);
+                text.push(':');
+                let _ = json::write(text, counters);
+                separator = ",";
+            }
+        }
+        text.push_str("}}");
+    })
+}
+
+/// The text that is written; a `String` has room for everything.
+fn written<R>(write: impl FnOnce(&mut String) -> R) -> String {
+    let mut text = String::new();
+    let _ = write(&mut text);
+    text
+}
+
+/// How long the controller's states are waited for.
+const MAX_LOOK: StdDuration = StdDuration::from_secs(3);
+/// The age at which a snapshot is replaced if somebody asks.
+const MAX_AGE: Duration = Duration::from_millis(100);

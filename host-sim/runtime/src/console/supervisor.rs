@@ -1,0 +1,477 @@
+//! The gateway's configurations: runs one, tries another, returns to the one before.
+//!
+//! In: commands of the console. Out: gateways that are started and ended, files, and a view for readers. What
+//! happens when is decided in `recipe_api::revisions`; here it is carried out, on a thread of its own,
+//! since starting and ending a gateway takes its time.
+
+use std::collections::BTreeMap;
+use std::net::IpAddr;
+use std::path::{Path, PathBuf};
+use std::sync::mpsc::RecvTimeoutError;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc as blocking};
+use std::thread::JoinHandle;
+use std::time::Duration as StdDuration;
+
+use proto_core::config::GatewayConfig;
+use proto_core::time::{Duration, Instant};
+use recipe_api::revisions::{Ended, Output, Refused, Result as Done, Revision, Revisions};
+use recipe_io::bind::Bind;
+use recipe_io::kept::Shelf;
+use recipe_io::realtime::Scheduling;
+use recipe_io::timer::now;
+use serde_json::{Value, json};
+use tokio::sync::oneshot;
+use tracing::{error, info, warn};
+
+use super::check::{self, Prepared};
+use super::store::{Entry, Store, digest};
+use super::window::Window;
+use super::{Bound, Console, ConsoleOptions, Source};
+use crate::gateway::{self, Observers};
+use crate::host::{Asker, Handle, Running};
+use crate::telling::Glimpse;
+use crate::worker::Place;
+use crate::{RunOptions, StartError};
+
+/// The configuration that a gateway was started with.
+#[derive(Debug, Clone)]
+pub struct ConfigFile {
+    /// Its name.
+    pub name: String,
+    /// Its text.
+    pub toml: String,
+    /// Overrides, which apply to every revision.
+    pub overrides: Vec<String>,
+}
+
+impl ConfigFile {
+    /// Reads a file.
+    ///
+    /// # Errors
+    /// If it cannot be read.
+    pub fn read(path: &Path, overrides: Vec<String>) -> Result<Self, StartError> {
+        let name = path.display().to_string();
+        match std::fs::read_to_string(path) {
+            Ok(toml) => Ok(Self { name, toml, overrides }),
+            Err(error) => Err(StartError::new(format!("{name}: cannot be read: {error}"))),
+        }
+    }
+}
+
+/// What somebody asks for.
+#[derive(Debug)]
+pub(crate) struct Command {
+    /// Who.
+    pub(super) peer: IpAddr,
+    /// What.
+    pub(super) what: What,
+    /// Gets the number of the revision.
+    pub(super) answer: oneshot::Sender<Result<u32, Failed>>,
+}
+
+/// What somebody asks for.
+#[derive(Debug)]
+pub(super) enum What {
+    /// Keep a text that was made from a revision.
+    Put { base: Revision, toml: String },
+    /// Run one on trial.
+    Apply { number: Option<u32>, trial: Duration },
+    /// Keep what is on trial.
+    Confirm,
+    /// Return.
+    RollBack,
+    /// End.
+    Shutdown,
+}
+
+/// Why nothing was done.
+#[derive(Debug)]
+pub(super) enum Failed {
+    /// It is refused.
+    Refused(Refused),
+    /// It was tried.
+    Tried(String),
+}
+
+/// What readers see.
+#[derive(Debug, Default)]
+pub(crate) struct View {
+    /// The revisions.
+    pub(super) revisions: Option<Revisions>,
+    /// What is known about each, the oldest first.
+    pub(super) entries: Vec<Entry>,
+    /// Their texts.
+    pub(super) texts: BTreeMap<u32, Arc<str>>,
+    /// The addresses of what runs, as in the line `ready`.
+    pub(super) ready: Value,
+    /// Why the newest revision that did not start did not.
+    pub(super) failure: Option<String>,
+    /// Overrides, which apply to every revision.
+    pub(super) overrides: Vec<String>,
+    /// What runs.
+    pub(super) config: Option<Arc<GatewayConfig>>,
+    asker: Option<Asker>,
+    window: Option<Arc<Window>>,
+}
+
+impl View {
+    /// The text of the configuration that runs.
+    pub(super) fn running_text(&self) -> Option<Arc<str>> {
+        self.config.as_ref()?;
+        self.texts.get(&self.revisions.as_ref()?.running()?).cloned()
+    }
+}
+
+/// Between the supervisor and its readers.
+#[derive(Debug, Default)]
+pub(crate) struct Shared(Mutex<View>);
+
+impl Shared {
+    pub(super) fn view(&self) -> MutexGuard<'_, View> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The gateway that runs: its window, and its configuration.
+    pub(super) fn running(&self) -> Option<(Arc<Window>, Arc<GatewayConfig>)> {
+        let view = self.view();
+        view.window.clone().zip(view.config.clone())
+    }
+}
+
+/// A gateway with a console. Dropping it ends both.
+#[derive(Debug)]
+pub(crate) struct Supervised {
+    ready: Value,
+    shared: Arc<Shared>,
+    commands: blocking::Sender<Command>,
+    thread: Option<JoinHandle<Result<(), StartError>>>,
+    /// Ended first, so that nobody is answered any more.
+    console: Option<Console>,
+}
+
+impl Supervised {
+    /// Starts a gateway with its console.
+    pub(crate) fn start(
+        file: ConfigFile,
+        options: &RunOptions,
+        console: &ConsoleOptions,
+        glimpse: Option<Glimpse>,
+        place: Place,
+    ) -> Result<Self, StartError> {
+        let bound = console.bind()?;
+        let store = Store::open(console.state.as_deref(), (&file.name, &file.toml))?;
+        let Some(revisions) = store.revisions() else {
+            return Err(StartError::new("--console-state: the revisions make no sense"));
+        };
+        let shared = Arc::<Shared>::default();
+        let (commands, inbox) = blocking::channel();
+        let supervisor = Supervisor {
+            store,
+            revisions,
+            running: None,
+            shared: Arc::clone(&shared),
+            overrides: file.overrides,
+            state: console.state.clone(),
+            binds: options.binds.clone(),
+            scheduling: options.scheduling,
+            shelf: Shelf::default(),
+            place,
+            observers: Observers { glimpse, ..Observers::of(options) },
+            put: None,
+            failure: None,
+        };
+        let (opened, outcome) = blocking::channel();
+        let thread = std::thread::Builder::new().name("supervisor".to_owned()).stack_size(super::STACK);
+        let thread = thread.spawn(move || {
+            let _of = supervisor.place.span.clone().entered();
+            supervisor.run(&opened, &inbox)
+        });
+        let thread = thread.map_err(|error| StartError::new(format!("cannot start a thread: {error}")))?;
+        match outcome.recv() {
+            Ok(Ok(())) => {}
+            Ok(Err(error)) => return Err(error),
+            Err(_) => return Err(StartError::new("the supervisor ended")),
+        }
+        let mut running = Self { ready: Value::Null, shared, commands, thread: Some(thread), console: None };
+        running.serve(bound, options)?;
+        Ok(running)
+    }
+
+    fn serve(&mut self, bound: Bound, options: &RunOptions) -> Result<(), StartError> {
+        let (shared, commands) = (Arc::clone(&self.shared), self.commands.clone());
+        let source = Source::Gateway { shared, commands, watch: options.watch.clone() };
+        let console = Console::start(bound, source, options.log.clone())?;
+        self.ready = self.shared.view().ready.clone();
+        self.ready["console"] = json!(console.address());
+        self.console = Some(console);
+        Ok(())
+    }
+
+    fn end(&mut self) -> Result<(), StartError> {
+        self.console = None;
+        let (answer, _) = oneshot::channel();
+        let peer = IpAddr::V4(std::net::Ipv4Addr::LOCALHOST);
+        let _ = self.commands.send(Command { peer, what: What::Shutdown, answer });
+        let Some(thread) = self.thread.take() else { return Ok(()) };
+        thread.join().unwrap_or_else(|_| Err(StartError::new("a thread panicked").after_start()))
+    }
+}
+
+impl Drop for Supervised {
+    fn drop(&mut self) {
+        let _ = self.end();
+    }
+}
+
+impl Running for Supervised {
+    fn ready(&self) -> &Value {
+        &self.ready
+    }
+
+    fn stats(&self) -> Option<Value> {
+        let asker = self.shared.view().asker.clone();
+        asker?.stats()
+    }
+
+    fn askers(&self) -> Vec<Asker> {
+        self.shared.view().asker.clone().into_iter().collect()
+    }
+
+    fn has_ended(&self) -> bool {
+        self.thread.as_ref().is_none_or(JoinHandle::is_finished)
+    }
+
+    fn shutdown(mut self: Box<Self>) -> Result<(), StartError> {
+        self.end()
+    }
+}
+
+/// A gateway that another one may take the place of.
+struct Replaceable {
+    /// The number of its revision.
+    number: u32,
+    handle: Handle,
+    window: Arc<Window>,
+    config: Arc<GatewayConfig>,
+}
+
+struct Supervisor {
+    store: Store,
+    revisions: Revisions,
+    running: Option<Replaceable>,
+    shared: Arc<Shared>,
+    overrides: Vec<String>,
+    state: Option<PathBuf>,
+    binds: Vec<Bind>,
+    scheduling: Scheduling,
+    /// Devices on the way from one gateway to the next.
+    shelf: Shelf,
+    /// Where each gateway runs.
+    place: Place,
+    /// Who looks at each gateway, but for the console.
+    observers: Observers,
+    /// The text that is to be kept, and who sent it.
+    put: Option<(String, String)>,
+    failure: Option<String>,
+}
+
+impl Supervisor {
+    fn run(
+        mut self,
+        opened: &blocking::Sender<Result<(), StartError>>,
+        inbox: &blocking::Receiver<Command>,
+    ) -> Result<(), StartError> {
+        let live = self.revisions.live();
+        if let Some(folder) = &self.state {
+            info!(revision = live, folder = %folder.display(), "running this revision");
+        }
+        let started = self.prepare(live).and_then(|prepared| self.start(live, prepared));
+        let started = started.and_then(|()| self.store.has_started());
+        let is_open = started.is_ok();
+        self.show();
+        let _ = opened.send(started);
+        if !is_open {
+            return Ok(());
+        }
+        loop {
+            self.drain();
+            match inbox.recv_timeout(LOOK_INTERVAL) {
+                Ok(Command { what: What::Shutdown, .. }) | Err(RecvTimeoutError::Disconnected) => {
+                    return self.running.take().map_or(Ok(()), |running| running.handle.shutdown());
+                }
+                Ok(command) => self.carry_out(command),
+                Err(RecvTimeoutError::Timeout) => {}
+            }
+            if self.running.as_ref().is_some_and(|running| running.handle.has_ended()) {
+                self.has_ended()?;
+            }
+        }
+    }
+
+    /// The gateway has ended by itself. What was live ends the process, as it does without a console.
+    fn has_ended(&mut self) -> Result<(), StartError> {
+        let Some(running) = self.running.take() else { return Ok(()) };
+        let ended = running.handle.shutdown();
+        let Some((number, _)) = self.revisions.trial() else { return ended };
+        let why = ended.err().map_or_else(|| "it ended".to_owned(), |error| error.to_string());
+        warn!(revision = number, why, "the revision on trial ended by itself");
+        self.failure = Some(why);
+        self.revisions.handle(now(), Done::Ended);
+        Ok(())
+    }
+
+    fn carry_out(&mut self, command: Command) {
+        let Command { peer, what, answer } = command;
+        let at = now();
+        let done = match what {
+            What::Put { base, toml } => {
+                let put = self.revisions.put(base, digest(&toml));
+                self.put = Some((toml, peer.to_string()));
+                put
+            }
+            What::Apply { number, trial } => self.revisions.apply(number, trial),
+            What::Confirm => self.revisions.confirm(at),
+            What::RollBack => self.revisions.roll_back(),
+            What::Shutdown => return,
+        };
+        let result = match done {
+            Ok(number) => self.drain().map_or(Ok(number), |failed| Err(Failed::Tried(failed))),
+            Err(refused) => Err(Failed::Refused(refused)),
+        };
+        let _ = answer.send(result);
+    }
+
+    /// Does what the machine asks for. Returns why something failed.
+    fn drain(&mut self) -> Option<String> {
+        let (mut failed, mut is_changed) = (None, false);
+        loop {
+            let before = self.revisions.last();
+            let output = self.revisions.poll_output(now());
+            if let (Some((number, Ended::NotConfirmed)), true) =
+                (self.revisions.last(), self.revisions.last() != before)
+            {
+                warn!(
+                    revision = number,
+                    "nobody confirmed the revision in time; returning to the one before"
+                );
+            }
+            let result = match output {
+                Output::Sleep { .. } => break,
+                Output::Store { revision, forget } => {
+                    Done::Stored(self.keep(revision.number, forget, &mut failed))
+                }
+                Output::Run { number } => {
+                    let started = self.replace_by(number);
+                    if let Err(error) = &started {
+                        error!(revision = number, %error, "the revision does not start");
+                        self.failure = Some(error.to_string());
+                        failed.get_or_insert(format!("revision {number} does not start: {error}"));
+                    } else {
+                        info!(revision = number, "running this revision");
+                    }
+                    Done::Started(started.is_ok())
+                }
+                Output::Mark { live, previous } => {
+                    let marked = self.store.mark(live, previous);
+                    if let Err(error) = &marked {
+                        error!(revision = live, %error, "cannot mark the revision as live");
+                        failed.get_or_insert(format!("cannot be marked as live: {error}"));
+                    }
+                    Done::Marked(marked.is_ok())
+                }
+            };
+            self.revisions.handle(now(), result);
+            is_changed = true;
+        }
+        if is_changed {
+            self.show();
+        }
+        failed
+    }
+
+    fn keep(&mut self, number: u32, forget: Option<u32>, failed: &mut Option<String>) -> bool {
+        let Some((text, from)) = self.put.take() else { return false };
+        let kept = self.store.keep(number, &text, &from, forget);
+        if let Err(error) = &kept {
+            error!(revision = number, %error, "cannot keep the revision");
+            failed.get_or_insert(format!("cannot be kept: {error}"));
+        }
+        kept.is_ok()
+    }
+
+    /// Runs a revision instead of what runs. What is wrong with it shows before anything is stopped.
+    fn replace_by(&mut self, number: u32) -> Result<(), StartError> {
+        if self.running.as_ref().is_some_and(|running| running.number == number) {
+            // The one that was to take its place could not be prepared.
+            return Ok(());
+        }
+        let prepared = self.prepare(number)?;
+        self.stop();
+        self.start(number, prepared)
+    }
+
+    fn prepare(&self, number: u32) -> Result<Prepared, StartError> {
+        let text = self.store.text(number).map_or("", |text| text);
+        let name = format!("revision {number}");
+        check::prepare(&name, text, &self.overrides)
+            .map_err(|mistake| StartError::new(format!("{name}: {mistake}")))
+    }
+
+    /// Brings the safe values out and ends what runs.
+    fn stop(&mut self) {
+        let Some(Replaceable { handle, window, .. }) = self.running.take() else { return };
+        // From here on nothing runs.
+        self.show();
+        window.make_safe();
+        if let Err(error) = handle.shutdown() {
+            warn!(%error, "the gateway had ended by itself");
+        }
+    }
+
+    fn start(&mut self, number: u32, prepared: Prepared) -> Result<(), StartError> {
+        let window = Arc::new(Window::new());
+        let Prepared { config, decoder } = prepared;
+        let observers = Observers { window: Some(Arc::clone(&window)), decoder, ..self.observers.clone() };
+        let copy = (*config).clone();
+        let binds = self.binds_of(number, &config);
+        let handle =
+            gateway::spawn(copy, binds, self.scheduling, observers, self.shelf.clone(), &self.place)?;
+        self.running = Some(Replaceable { number, handle, window, config });
+        Ok(())
+    }
+
+    /// The devices of the ports that a revision has. Those of other ports are kept for when they come.
+    fn binds_of(&self, number: u32, config: &GatewayConfig) -> Vec<Bind> {
+        let has =
+            |bind: &&Bind| config.view().field_ports().any(|(_, port, _)| port.name == bind.port.as_str());
+        let (used, spare): (Vec<_>, Vec<_>) = self.binds.iter().partition(has);
+        for bind in spare {
+            warn!(revision = number, %bind, "--bind is not used: the revision has no such port");
+        }
+        used.into_iter().cloned().collect()
+    }
+
+    /// Shows readers how it is now.
+    fn show(&self) {
+        let mut view = self.shared.view();
+        view.revisions = Some(self.revisions.clone());
+        view.entries = self.store.entries().to_vec();
+        view.texts = self.store.texts().clone();
+        view.failure = self.failure.clone();
+        view.overrides = self.overrides.clone();
+        let running = self.running.as_ref();
+        view.asker = running.map(|running| running.handle.asker());
+        view.window = running.map(|running| Arc::clone(&running.window));
+        view.config = running.map(|running| Arc::clone(&running.config));
+        view.ready = running.map_or(Value::Null, |running| running.handle.ready().clone());
+    }
+}
+
+/// How often is looked for the end of a trial, and of a gateway.
+const LOOK_INTERVAL: StdDuration = StdDuration::from_millis(100);
+
+/// The trial that is running: its revision and what is left of it.
+pub(super) fn left_of(trial: Option<(u32, Instant)>) -> Option<(u32, f64)> {
+    let (number, until) = trial?;
+    Some((number, until.saturating_since(now()).as_millis() as f64 / 1_000.0))
+}

@@ -1,0 +1,210 @@
+//! Opening the controller's devices, listening sockets and tasks.
+
+use std::cell::{Cell, RefCell};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::rc::Rc;
+
+use serde_json::json;
+use tokio::net::{TcpListener, UdpSocket};
+use tokio::sync::Notify;
+use tokio::task::JoinSet;
+
+use super::modbus::Modbus;
+use super::model::Shared;
+use super::{ControllerOptions, ControllerShell, Outward, Running};
+use crate::{EventsFile, StartError, udp};
+use recipe_config::{SimBus, SimConfig, SimParts};
+use recipe_controller::{Controller, ControllerInput, Link};
+use recipe_io::bind::Bind;
+use recipe_io::clock::Clock;
+use recipe_io::log_limit::LogLimit;
+use recipe_io::port::{Port, PortBus};
+
+impl Running {
+    pub(super) async fn open(config: SimConfig, options: ControllerOptions) -> Result<Self, StartError> {
+        let mut controller = Controller::new(&config).map_err(|error| StartError::new(error.to_string()))?;
+        if let Some(seed) = options.seed {
+            controller.seed(seed);
+        }
+        controller.record_events();
+        let clock = Clock::new(options.pace);
+        let devices = open_devices(&config, &options.run.binds, &clock).await?;
+        let address = config.listen.address;
+        let listen = async |key: &str, address: IpAddr, port: u16| {
+            let listener = TcpListener::bind((address, port)).await;
+            let local = listener.and_then(|listener| Ok((listener.local_addr()?, listener)));
+            local.map_err(|error| not_listening(key, SocketAddr::new(address, port), &error))
+        };
+        let (command_at, command) = listen("command", address, config.listen.command).await?;
+        let (state_at, state) = listen("state", address, config.listen.state).await?;
+        let (modbus_at, modbus) = listen("modbus", address, config.listen.modbus).await?;
+        let loopback = IpAddr::V4(Ipv4Addr::LOCALHOST);
+        let (control_at, control) = listen("control", loopback, config.listen.control).await?;
+        let udp_wanted = SocketAddr::new(address, config.listen.udp2011);
+        let udp = UdpSocket::bind(udp_wanted).await;
+        let (udp, udp_at) = udp
+            .and_then(|udp| {
+                udp::keep_errors(&udp)?;
+                let at = udp.local_addr()?;
+                Ok((udp, at))
+            })
+            .map_err(|error| not_listening("udp2011", udp_wanted, &error))?;
+        let mut places = serde_json::Map::new();
+        let mut ports = Vec::new();
+        for (port, device) in config.ports.iter().zip(&devices) {
+            let (outward, place) = match (&port.bus, device) {
+                (_, Some(device)) => (Outward::Device(device.tx()), device.place()),
+                (SimBus::TcpClient { to }, _) => (Outward::Tcp(RefCell::default()), to.clone()),
+                (SimBus::UdpClient { to }, _) => (Outward::Udp(RefCell::default()), to.clone()),
+                _ => (Outward::UdpServer, udp_at.to_string()),
+            };
+            ports.push(outward);
+            places.insert(port.name.clone(), json!(place));
+        }
+        let is_kernel_can = |device: &Option<Port>| device.as_ref().is_some_and(Port::is_kernel_can);
+        let kernel_can = (0..devices.len()).filter(|&nth| is_kernel_can(&devices[nth])).collect();
+        let alarm =
+            || clock.alarm().map_err(|error| StartError::new(format!("cannot create a timer: {error}")));
+        let (timer, timeline_alarm) = (alarm()?, alarm()?);
+        let controller = Shared::new(controller)
+            .map_err(|error| StartError::new(format!("cannot share the controller: {error}")))?;
+        let modbus_thread = clock.time().map(|time| Modbus::start(&controller, time, options.run.scheduling));
+        let modbus_thread = modbus_thread.transpose()?;
+        // The last that can fail: an earlier run's file is kept if this one cannot start.
+        let events_file = options.events.as_ref().map(EventsFile::create).transpose()?;
+        let ready = json!({
+            "command": command_at,
+            "state": state_at,
+            "modbus": modbus_at,
+            "udp2011": udp_at,
+            "control": control_at,
+            "ports": places,
+        });
+        let shell = Rc::new(ControllerShell {
+            controller,
+            modbus: modbus_thread,
+            connections: RefCell::default(),
+            next_connection: Cell::new(0),
+            udp,
+            ports,
+            port_names: config.ports.iter().map(|port| port.name.clone()).collect(),
+            reports: RefCell::default(),
+            lingering: RefCell::default(),
+            busy: Cell::new(false),
+            timer,
+            clock,
+            waits: RefCell::default(),
+            moved: Notify::new(),
+            kernel_can,
+            kernel_sends: RefCell::default(),
+            activity: Cell::new(0),
+            timeline: RefCell::new(options.timeline),
+            timeline_alarm,
+            is_playing: Cell::new(false),
+            told: Cell::new(0),
+            events_file,
+            control_clients: RefCell::default(),
+            refused_control_clients: Cell::new(0),
+            ended: Notify::new(),
+            refusal_log: LogLimit::default(),
+            log_limit: LogLimit::default(),
+        });
+        let mut tasks = JoinSet::new();
+        tasks.spawn_local(Rc::clone(&shell).serve(Link::Command, command));
+        tasks.spawn_local(Rc::clone(&shell).serve(Link::State, state));
+        tasks.spawn_local(Rc::clone(&shell).serve(Link::Modbus, modbus));
+        tasks.spawn_local(Rc::clone(&shell).serve_udp());
+        tasks.spawn_local(Rc::clone(&shell).serve_control(control));
+        tasks.spawn_local(Rc::clone(&shell).follow_modbus());
+        tasks.spawn_local(Rc::clone(&shell).keep_time());
+        tasks.spawn_local(Rc::clone(&shell).keep_timeline());
+        if shell.clock.is_stepped() {
+            tasks.spawn_local(Rc::clone(&shell).keep_stepping());
+        }
+        for (index, (port, device)) in config.ports.into_iter().zip(devices).enumerate() {
+            let shell = Rc::clone(&shell);
+            match (port.bus, device) {
+                (_, Some(device)) => drop(tasks.spawn_local(shell.drive(index, device))),
+                (SimBus::TcpClient { to }, _) => drop(tasks.spawn_local(shell.connect_out(index, to))),
+                (SimBus::UdpClient { to }, _) => drop(tasks.spawn_local(shell.send_out(index, to))),
+                _ => {}
+            }
+        }
+        shell.input(ControllerInput::Tick);
+        Ok(Self { shell, tasks, ready })
+    }
+}
+
+/// Opens the devices; `None` for a port that needs none.
+async fn open_devices(
+    config: &SimConfig,
+    binds: &[Bind],
+    clock: &Clock,
+) -> Result<Vec<Option<Port>>, StartError> {
+    for (index, bind) in binds.iter().enumerate() {
+        let refused = |why: &str| Err(StartError::new(format!("--bind {bind}: {why}")));
+        match config.ports.iter().find(|port| port.name == bind.port) {
+            None => return refused(&format!("there is no such port; {}", bindable(config))),
+            Some(port) if bus_of(&port.bus).is_none() => {
+                return refused("this port is reached over the network and takes no device");
+            }
+            Some(_) if binds[..index].iter().any(|other| other.port == bind.port) => {
+                return refused("the port is already bound");
+            }
+            Some(_) => {}
+        }
+    }
+    let mut devices = Vec::new();
+    for port in &config.ports {
+        devices.push(match bus_of(&port.bus) {
+            Some(bus) => {
+                let mut device = open_device(&port.name, bus, binds).await?.on_clock(clock);
+                let recipe = port.recipe.and_then(|recipe| config.recipes.get(recipe));
+                if let Some(SimParts::Can { input, output }) = recipe.map(|recipe| &recipe.parts) {
+                    device.listen_to(input.iter().chain(output).map(|frame| frame.id).collect());
+                }
+                Some(device)
+            }
+            None => None,
+        });
+    }
+    Ok(devices)
+}
+
+async fn open_device(name: &str, bus: PortBus, binds: &[Bind]) -> Result<Port, StartError> {
+    let Some(bind) = binds.iter().find(|bind| bind.port == name) else {
+        let (kind, forms) = match bus {
+            PortBus::Serial(_) => {
+                ("serial line", "pty:PATH, serial:PATH, tcp:HOST:PORT or tcp-listen:HOST:PORT")
+            }
+            PortBus::Can { .. } => ("CAN bus", "socketcan:INTERFACE, slcan-pty:PATH or slcan-tcp:HOST:PORT"),
+        };
+        return Err(StartError::new(format!(
+            "port {name} is a {kind} without a device: add --bind {name}=DEVICE, where DEVICE is {forms}"
+        )));
+    };
+    let opened = Port::open(&bind.device, bus).await;
+    opened.map_err(|error| StartError::new(format!("--bind {bind}: {error}")))
+}
+
+fn bindable(config: &SimConfig) -> String {
+    let ports = config.ports.iter().filter(|port| bus_of(&port.bus).is_some());
+    let names: Vec<_> = ports.map(|port| port.name.as_str()).collect();
+    if names.is_empty() {
+        "no port takes a device".to_owned()
+    } else {
+        format!("ports that take a device: {}", names.join(", "))
+    }
+}
+
+fn not_listening(key: &str, address: SocketAddr, error: &std::io::Error) -> StartError {
+    StartError::new(format!("listen.{key}: {address}: {error}"))
+}
+
+fn bus_of(bus: &SimBus) -> Option<PortBus> {
+    match bus {
+        SimBus::Rs485(settings) => Some(PortBus::Serial(*settings)),
+        SimBus::Can { bitrate } => Some(PortBus::Can { bitrate: *bitrate }),
+        SimBus::UdpServer | SimBus::TcpClient { .. } | SimBus::UdpClient { .. } => None,
+    }
+}

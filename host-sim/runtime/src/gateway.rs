@@ -1,0 +1,546 @@
+//! The gateway's engine on real sockets and devices.
+//!
+//! The engine, devices and sockets are on one thread. Input of a device or socket is reported to the engine at once, and the
+//! outputs are carried out before anything else is read. So only one call of the engine is between the last
+//! byte of a field frame and the request to the controller.
+
+pub mod cells;
+mod doctor;
+mod open;
+mod shown;
+mod tapping;
+
+use std::cell::{Cell, RefCell};
+use std::collections::{BTreeMap, BTreeSet};
+use std::rc::Rc;
+use std::sync::Arc;
+
+use proto_core::config::GatewayConfig;
+use proto_core::engine::{Input, LinkId, LinkKind, OUTPUT_BUFFER, Output, PortId};
+use proto_core::time::Instant;
+use serde_json::{Value, json};
+use tokio::sync::Notify;
+use tokio::task::JoinSet;
+use tracing::{info, trace, warn};
+
+use doctor::Doctor;
+pub(crate) use doctor::Told;
+pub use doctor::listen;
+pub(crate) use doctor::{look_at_states, unexplained};
+use open::Devices;
+
+use super::console::window::{MAX_SAFE, Window};
+use super::console::{ConfigFile, ConsoleOptions, Supervised};
+use super::host::{self, Handle, Shell};
+use super::link::{self, Endpoint, LinkControl, LinkEvent};
+use super::telling::{Glimpse, Teller};
+use super::worker::Place;
+use super::{RunOptions, StartError};
+use recipe_capture::{Decoder, Watch};
+use recipe_doctor::PortRecord;
+use recipe_io::bind::Bind;
+use recipe_io::exchange::{PortEvent, PortTx};
+use recipe_io::fairness;
+use recipe_io::kept::Shelf;
+use recipe_io::port::Port;
+use recipe_io::realtime::{self, Scheduling};
+use recipe_io::timer::{Timer, now};
+use shown::Shown;
+use tapping::{TAP, Tapping};
+
+/// The engine with room for a tap.
+pub(crate) type Engine = proto_core::engine::Engine<8, 4, 512, TAP>;
+
+/// Who looks at a gateway.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Observers {
+    /// Captures and recordings.
+    pub watch: Watch,
+    /// What frames mean, for them.
+    pub decoder: Arc<Decoder>,
+    /// A console.
+    pub window: Option<Arc<Window>>,
+    /// An edge node.
+    pub glimpse: Option<Glimpse>,
+    /// Whoever reads the log or the statistics, where findings are told.
+    pub readers: bool,
+}
+
+impl Observers {
+    pub(crate) fn of(options: &RunOptions) -> Self {
+        let readers = options.stats.is_some() || tracing::enabled!(tracing::Level::INFO);
+        Self {
+            watch: options.watch.clone(),
+            decoder: Arc::clone(&options.decoder),
+            window: None,
+            glimpse: None,
+            readers,
+        }
+    }
+}
+
+/// A gateway with its ports and links, before it runs.
+struct Gateway {
+    core: Rc<Core>,
+    ports: Vec<(PortId, Port)>,
+    links: Vec<(LinkId, LinkKind, Endpoint)>,
+    ready: Value,
+    window: Option<Arc<Window>>,
+    /// That of an edge node.
+    glimpse: Option<Arc<Window>>,
+    /// Who looks at it once a second, if somebody does.
+    doctor: Option<Doctor>,
+}
+
+/// What the gateway may send.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Voice {
+    /// Everything.
+    Full,
+    /// Nothing, neither to the controller nor to the field.
+    Silent,
+    /// Nothing to the controller; to the field, what ports with exchanges send.
+    Asking,
+}
+
+/// Shared by all tasks of the gateway.
+struct Core {
+    engine: RefCell<Box<Engine>>,
+    tapping: RefCell<Tapping>,
+    ports: BTreeMap<PortId, (String, Rc<PortTx>)>,
+    links: BTreeMap<LinkId, Rc<LinkControl>>,
+    deadline: Cell<Instant>,
+    /// The engine's count of sleeps at the last call.
+    sleeps: Cell<u32>,
+    /// Links that were told of as missing.
+    unreachable: RefCell<BTreeSet<LinkId>>,
+    deadline_moved: Notify,
+    /// Another gateway takes its place: its devices are not listened to any more.
+    is_ending: Cell<bool>,
+    voice: Voice,
+    /// Ports with exchanges.
+    asks: BTreeSet<PortId>,
+    started: Instant,
+    /// What came in at each port lately.
+    records: RefCell<Vec<PortRecord>>,
+}
+
+impl Gateway {
+    async fn drive(self) -> Result<(), StartError> {
+        let Self { core: shared, ports, links, window, glimpse, doctor, .. } = self;
+        let mut tasks = JoinSet::new();
+        if let Some(window) = window {
+            let core = Rc::clone(&shared);
+            tasks.spawn_local(async move { core.show(&window).await });
+            if doctor.is_none() {
+                let core = Rc::clone(&shared);
+                tasks.spawn_local(async move { core.keep_notes().await });
+            }
+        }
+        if let Some(glimpse) = glimpse {
+            let core = Rc::clone(&shared);
+            tasks.spawn_local(async move { core.show(&glimpse).await });
+        }
+        for (id, port) in ports {
+            let core = Rc::clone(&shared);
+            tasks.spawn_local(async move {
+                let name = core.ports.get(&id).map_or("", |(name, _)| name).to_owned();
+                let result = port.run(|event| core.port_event(id, event)).await;
+                result.map_err(|error| StartError::new(format!("port {name}: {error}")))
+            });
+        }
+        for (id, kind, endpoint) in links {
+            let core = Rc::clone(&shared);
+            let Some(control) = core.links.get(&id).cloned() else { continue };
+            tasks.spawn_local(async move {
+                let is_frame = |datagram: &[u8]| core.engine.borrow().is_frame(id, datagram);
+                let events = |event: LinkEvent<'_>| core.link_event(id, event);
+                if !core.may_open(id) {
+                    link::probe(kind.name(), &endpoint, &control, is_frame).await;
+                    return std::future::pending().await;
+                }
+                link::run(kind.name(), &endpoint, &control, is_frame, events).await;
+                Ok(())
+            });
+        }
+        if let Some(doctor) = doctor {
+            let core = Rc::clone(&shared);
+            tasks.spawn_local(async move { core.be_watched(doctor).await });
+        }
+        tasks.spawn_local(async move { shared.keep_time().await });
+        while let Some(ended) = tasks.join_next().await {
+            match ended {
+                Ok(done) => done?,
+                Err(error) => return Err(StartError::new(format!("a task ended: {error}"))),
+            }
+        }
+        Ok(())
+    }
+}
+
+impl Shell for Gateway {
+    fn ready(&self) -> Value {
+        self.ready.clone()
+    }
+
+    fn stats(&self) -> impl Fn() -> Value + 'static {
+        let core = Rc::clone(&self.core);
+        move || core.stats()
+    }
+
+    async fn run(self) -> Result<(), StartError> {
+        self.drive().await
+    }
+}
+
+impl Core {
+    /// Calls the engine at its deadlines.
+    async fn keep_time(&self) -> Result<(), StartError> {
+        let clock = |error| StartError::new(format!("timerfd: {error}"));
+        let timer = Timer::new().map_err(clock)?;
+        self.input(Input::Tick);
+        loop {
+            timer.arm(self.deadline.get()).map_err(clock)?;
+            fairness::set_deadline(self.deadline.get());
+            tokio::select! {
+                expired = timer.expired() => {
+                    expired.map_err(clock)?;
+                    // Input that had arrived by the deadline is not overdue.
+                    fairness::let_others_run().await;
+                    self.input(Input::Tick);
+                }
+                () = self.deadline_moved.notified() => {}
+            }
+        }
+    }
+
+    /// Fills a window when somebody asks, and brings the safe values out when it wants to end this gateway.
+    async fn show(&self, window: &Window) -> Result<(), StartError> {
+        loop {
+            tokio::select! {
+                () = window.wanted.notified() => window.fill(|shot| {
+                    shot.engine.clone_from(&self.engine.borrow());
+                    shot.at = now();
+                    shot.running = shot.at.saturating_since(self.started);
+                    shot.keep_records(&self.records.borrow());
+                    shot.links.clear();
+                    shot.links.extend(self.engine.borrow().links().map(|info| self.facts_of(info.id)));
+                    shot.devices = Default::default();
+                    for (port, (_, tx)) in &self.ports {
+                        if let Some(counters) = shot.devices.get_mut(usize::from(port.0)) {
+                            *counters = Some(tx.counters());
+                        }
+                    }
+                }),
+                () = window.ending.notified() => {
+                    self.is_ending.set(true);
+                    self.engine.borrow_mut().make_safe();
+                    self.tapping.borrow_mut().make_safe(now());
+                    self.input(Input::Tick);
+                    let is_safe = async {
+                        while !self.engine.borrow().is_safe() {
+                            tokio::time::sleep(SAFE_CHECK).await;
+                        }
+                    };
+                    if tokio::time::timeout(MAX_SAFE, is_safe).await.is_err() {
+                        warn!("the controller does not show all safe values; ending all the same");
+                    }
+                    window.is_safe();
+                }
+            }
+        }
+    }
+
+    fn port_event(&self, port: PortId, event: PortEvent<'_>) {
+        if self.is_ending.get() && event != PortEvent::Sent {
+            return;
+        }
+        // The engine first: what comes of it is on its way before anything is noted.
+        match event {
+            PortEvent::Up => self.input(Input::PortUp { port }),
+            PortEvent::Down => self.input(Input::PortDown { port }),
+            PortEvent::Bytes(bytes) => {
+                self.input(Input::PortBytes { port, bytes });
+                self.record(port, |record| record.heard(bytes));
+            }
+            PortEvent::Frame { frame } => {
+                self.input(Input::PortCan { port, frame });
+                self.record(port, |record| record.frame(&frame));
+            }
+            PortEvent::Bus(state) => self.input(Input::PortBus { port, state }),
+            PortEvent::Sent => self.input(Input::PortSent { port }),
+        }
+    }
+
+    fn record(&self, port: PortId, note: impl FnOnce(&mut PortRecord)) {
+        if let Some(record) = self.records.borrow_mut().iter_mut().find(|record| record.port == port) {
+            note(record);
+        }
+    }
+
+    fn link_event(&self, link: LinkId, event: LinkEvent<'_>) {
+        match event {
+            LinkEvent::Up => {
+                self.tell_link(link, true);
+                self.input(Input::LinkUp { link });
+            }
+            LinkEvent::Down => {
+                self.tell_link(link, false);
+                self.input(Input::LinkDown { link });
+            }
+            LinkEvent::Bytes(bytes) => self.input(Input::LinkBytes { link, bytes }),
+            LinkEvent::Sent => self.input(Input::LinkSent { link }),
+            LinkEvent::Acked(left) => self.input(Input::LinkAcked { link, left }),
+        }
+    }
+
+    /// Tells once when a connection to the controller is missing, and when it is back. What the
+    /// controller opens by itself may take days, and some controllers take no second connection for
+    /// urgent commands.
+    fn tell_link(&self, id: LinkId, is_up: bool) {
+        if id == LinkId::URGENT {
+            return;
+        }
+        let engine = self.engine.borrow();
+        let Some(info) = engine.links().find(|link| link.id == id) else { return };
+        if matches!(info.kind, LinkKind::RecipeTcpListen { .. } | LinkKind::RecipeUdpListen { .. }) {
+            return;
+        }
+        let mut unreachable = self.unreachable.borrow_mut();
+        if let LinkKind::ModbusDevice { .. } = info.kind {
+            if is_up && unreachable.remove(&id) {
+                warn!(port = info.name, "connected to the device again");
+            } else if is_up {
+                info!(port = info.name, "connected to the device");
+            } else if unreachable.insert(id) {
+                warn!(port = info.name, "no connection to the device; trying again");
+            }
+        } else if is_up && unreachable.remove(&id) {
+            warn!(link = info.name, "connected to the controller again");
+        } else if is_up {
+            info!(link = info.name, "connected to the controller");
+        } else if unreachable.insert(id) {
+            warn!(link = info.name, "no connection to the controller; trying again");
+        }
+    }
+
+    /// Reports one input and carries out all outputs.
+    fn input(&self, input: Input<'_>) {
+        let at = now();
+        trace!(input = %Shown(&input), "in");
+        let mut engine = self.engine.borrow_mut();
+        let mut tapping = self.tapping.borrow_mut();
+        tapping.before(engine.tap(), at, input);
+        engine.handle(at, input);
+        let sleeps = engine.sleeps();
+        if self.sleeps.replace(sleeps) != sleeps {
+            warn!(sleeps, "the gateway slept: waiting input is discarded");
+            for (_, tx) in self.ports.values() {
+                tx.note_sleep(at);
+            }
+        }
+        let mut buf = [0; OUTPUT_BUFFER];
+        loop {
+            let output = engine.poll_output(at, &mut buf);
+            tapping.output(output);
+            match output {
+                Output::Sleep { until } => {
+                    tapping.behind(engine.tap());
+                    if self.deadline.replace(until) != until {
+                        self.deadline_moved.notify_one();
+                    }
+                    return;
+                }
+                _ => trace!(output = %Shown(&output), "out"),
+            }
+            if !self.may(&output) {
+                continue;
+            }
+            match output {
+                Output::PortSend { port, bytes } => self.with_port(port, |tx| tx.send(bytes)),
+                Output::PortSendCan { port, frame } => self.with_port(port, |tx| tx.send_frame(frame)),
+                Output::LinkOpen { link, .. } => self.with_link(link, LinkControl::open),
+                Output::LinkClose { link } => self.with_link(link, LinkControl::close),
+                Output::LinkSend { link, bytes } => self.with_link(link, |control| control.send(bytes)),
+                _ => {}
+            }
+        }
+    }
+
+    /// Whether an output may be carried out: the one gate for a gateway that only listens.
+    fn may(&self, output: &Output<'_>) -> bool {
+        match (self.voice, output) {
+            (Voice::Full, _) => true,
+            (Voice::Asking, Output::PortSend { port, .. } | Output::PortSendCan { port, .. }) => {
+                self.asks.contains(port)
+            }
+            (Voice::Asking, Output::LinkSend { link, .. }) => self.asks_over(*link),
+            (_, &Output::LinkOpen { link, .. }) => self.may_open(link),
+            (_, Output::LinkClose { .. }) => true,
+            _ => false,
+        }
+    }
+
+    /// Whether a link may be opened. A gateway that only listens reads the state stream, on which nothing
+    /// is ever sent; one that asks also has the connections to devices.
+    fn may_open(&self, link: LinkId) -> bool {
+        let asks = self.voice == Voice::Asking && self.asks_over(link);
+        self.voice == Voice::Full || link == LinkId::STATE || asks
+    }
+
+    /// Whether a link is the connection to devices that are asked.
+    fn asks_over(&self, link: LinkId) -> bool {
+        link.port().is_some_and(|port| self.asks.contains(&port))
+    }
+
+    fn with_port(&self, id: PortId, act: impl FnOnce(&PortTx)) {
+        match self.ports.get(&id) {
+            Some((_, tx)) => act(tx),
+            None => warn!(?id, "the engine sends on an unknown port"),
+        }
+    }
+
+    fn with_link(&self, id: LinkId, act: impl FnOnce(&LinkControl)) {
+        match self.links.get(&id) {
+            Some(control) => act(control),
+            None => warn!(?id, "the engine uses an unknown link"),
+        }
+    }
+
+    /// One line of statistics: the engine's status, and the counters of devices and sockets.
+    fn stats(&self) -> Value {
+        let engine = self.engine.borrow();
+        let status = engine.status(now());
+        let mut stats = json!(status);
+        let values = stats["values"].take();
+        let ages = values.as_object().into_iter().flatten();
+        let ages = ages.map(|(var, known)| (var.clone(), known["age_ms"].clone()));
+        stats["age_ms"] = Value::Object(ages.collect());
+        stats["values"] = values;
+        for port in status.ports() {
+            let shown = &mut stats["ports"][port.name];
+            lift(shown, "counters");
+            if let Some((_, tx)) = self.ports.get(&port.id) {
+                shown["device"] = json!(tx.counters());
+            }
+        }
+        for link in status.links() {
+            let shown = &mut stats["links"][link.name];
+            lift(shown, "history");
+            lift(shown, "counters");
+            shown["reconnects"] = json!(link.history.connects.saturating_sub(1));
+            if let LinkKind::RecipeTcpListen { .. } | LinkKind::RecipeUdpListen { .. } = link.kind
+                && let Some(control) = self.links.get(&link.id)
+            {
+                shown["turned_away"] = json!(control.refusals());
+                lift(shown, "turned_away");
+            }
+        }
+        stats
+    }
+}
+
+impl Drop for Core {
+    fn drop(&mut self) {
+        self.tapping.get_mut().end(self.engine.get_mut(), now());
+    }
+}
+
+/// Moves the entries of the inner object `key` to the outer one.
+fn lift(outer: &mut Value, key: &str) {
+    if let Some(outer) = outer.as_object_mut()
+        && let Some(Value::Object(inner)) = outer.remove(key)
+    {
+        outer.extend(inner);
+    }
+}
+
+/// Runs the gateway until Ctrl-C, SIGTERM or SIGHUP. Everything that it tells [`RunOptions::watch`] has been
+/// given when this returns.
+///
+/// # Errors
+/// The reason why it could not start; nothing is left behind then.
+pub fn run(config: GatewayConfig, options: RunOptions) -> Result<(), StartError> {
+    let teller = options.sparkplug.clone().map(Teller::start).transpose()?;
+    let glimpse = teller.as_ref().map(Teller::glimpse);
+    let observers = Observers { glimpse, ..Observers::of(&options) };
+    let (binds, shelf) = (options.binds.clone(), Shelf::default());
+    let handle = spawn(config, binds, options.scheduling, observers, shelf, &Place::alone())?;
+    host::foreground(Box::new(handle), &options)
+}
+
+/// Same, with a console that can give it another configuration.
+///
+/// # Errors
+/// The reason why it could not start; nothing is left behind then.
+pub fn run_with_console(
+    file: ConfigFile,
+    console: &ConsoleOptions,
+    options: &RunOptions,
+) -> Result<(), StartError> {
+    let teller = options.sparkplug.clone().map(Teller::start).transpose()?;
+    let glimpse = teller.as_ref().map(Teller::glimpse);
+    let supervised = Supervised::start(file, options, console, glimpse, Place::alone())?;
+    host::foreground(Box::new(supervised), options)
+}
+
+/// Starts the gateway on a thread of its own; dropping the handle ends it.
+///
+/// # Errors
+/// The reason why it could not start; nothing is left behind then.
+pub fn start(config: GatewayConfig, binds: Vec<Bind>) -> Result<Handle, StartError> {
+    start_watched(config, binds, &Watch::new())
+}
+
+/// Same as [`start`], for whoever has subscribed to `watch`, which tells of several gateways one after the
+/// other if it is given again.
+///
+/// # Errors
+/// The reason why it could not start; nothing is left behind then.
+pub fn start_watched(config: GatewayConfig, binds: Vec<Bind>, watch: &Watch) -> Result<Handle, StartError> {
+    let observers = Observers { watch: watch.clone(), ..Observers::default() };
+    spawn(config, binds, Scheduling::Ordinary, observers, Shelf::default(), &Place::alone())
+}
+
+/// Starts the gateway at a place, with those who look at it. Devices that another one has left are on the shelf, and this
+/// one leaves its own there.
+pub(crate) fn spawn(
+    config: GatewayConfig,
+    binds: Vec<Bind>,
+    scheduling: Scheduling,
+    observers: Observers,
+    shelf: Shelf,
+    place: &Place,
+) -> Result<Handle, StartError> {
+    let watch = observers.watch.clone();
+    let (doctor, told) = match observers.readers {
+        true => {
+            let (doctor, told) = doctor::start(config.clone(), &binds, place.span.clone())?;
+            (Some(doctor), Some(told))
+        }
+        false => (None, None),
+    };
+    let glimpse = observers.glimpse.as_ref().map(|glimpse| glimpse.open(&config));
+    let handle = host::start(place, "gateway", async move |at_end| {
+        let devices = Devices { binds: &binds, left: Some((shelf, at_end)) };
+        let mut gateway = Gateway::open(&config, devices, Voice::Full, &observers).await?;
+        gateway.window = observers.window;
+        gateway.glimpse = glimpse;
+        if doctor.is_some() || gateway.window.is_some() {
+            gateway.core.keep_records(&config, &binds);
+        }
+        gateway.doctor = doctor;
+        // Not as an argument of the log, which is not evaluated unless it is printed.
+        let scheduling = realtime::apply(scheduling);
+        info!(%scheduling, "the gateway is running");
+        Ok(gateway)
+    })?;
+    Ok(handle.with_watch(watch).with_findings(told))
+}
+
+/// How often is looked whether the safe values have arrived.
+const SAFE_CHECK: std::time::Duration = std::time::Duration::from_millis(5);
+
+#[cfg(test)]
+#[path = "gateway_tests.rs"]
+mod tests;

@@ -1,0 +1,132 @@
+//! Several gateways in one process, on as few threads as are asked for.
+//!
+//! Each one has its own engine, devices, connections and console, and none knows of the others. They share the
+//! threads, because a gateway sleeps several times in 4 ms, and a sleep costs more than what is done in between.
+
+use std::num::NonZeroUsize;
+use std::sync::Arc;
+
+use proto_core::config::GatewayConfig;
+use proto_core::time::Duration;
+use recipe_io::kept::Shelf;
+use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
+use serde_json::{Map, Value, json};
+use tracing::{error_span, warn};
+
+use super::{Observers, spawn};
+use crate::console::{ConfigFile, Supervised};
+use crate::host::{self, Asker, Running};
+use crate::worker::{Begin, Place, Worker};
+use crate::{RunOptions, StartError};
+
+/// A cell of a process that serves several.
+#[derive(Debug)]
+pub struct Cell {
+    /// What `ready`, the statistics and the log call it; different from all others.
+    pub name: String,
+    /// Its configuration.
+    pub config: Box<GatewayConfig>,
+    /// The file it comes from, which a console needs.
+    pub file: ConfigFile,
+    /// Its own options: devices, console. Those of the foreground have no effect.
+    pub options: RunOptions,
+}
+
+/// Runs the gateways of several cells until Ctrl-C, SIGTERM or SIGHUP, on so many threads. None of them does anything
+/// before all are listening; if one of them ends by itself, all end.
+///
+/// # Errors
+/// The reason why one of them could not start, with its name; nothing is left behind then.
+pub fn run(cells: Vec<Cell>, threads: NonZeroUsize, options: &RunOptions) -> Result<(), StartError> {
+    raise_file_limit();
+    let workers: Vec<_> =
+        (0..threads.get().min(cells.len())).map(|_| Worker::start("gateways")).collect::<Result<_, _>>()?;
+    let (begins, begin) = Begin::channel();
+    let count = cells.len() as u64;
+    let mut started = Vec::with_capacity(cells.len());
+    for ((nth, cell), worker) in (0..).zip(cells).zip(workers.iter().cycle()) {
+        let span = error_span!("cell", name = cell.name);
+        let begin = begin.and_later(Duration::from_micros(nth * CYCLE.as_micros() / count));
+        let place = Place::among(Arc::clone(worker), begin, span);
+        let name = cell.name.clone();
+        let run = start(cell, place).map_err(|error| error.of(&name))?;
+        started.push((name, run));
+    }
+    // Their cells hold them.
+    drop(workers);
+    // Everything listens.
+    let _ = begins.send(true);
+    host::foreground(Box::new(Cells::new(started)), options)
+}
+
+/// The cells' cycles begin one after the other within the usual one, so that they do not wait for each other each time.
+const CYCLE: Duration = Duration::from_millis(4);
+
+fn start(cell: Cell, place: Place) -> Result<Box<dyn Running>, StartError> {
+    let Cell { config, file, options, .. } = cell;
+    // For threads that are started here.
+    let _of = place.span.clone().entered();
+    if let Some(console) = &options.console {
+        return Ok(Box::new(Supervised::start(file, &options, console, None, place)?));
+    }
+    let observers = Observers::of(&options);
+    let handle = spawn(*config, options.binds, options.scheduling, observers, Shelf::default(), &place)?;
+    Ok(Box::new(handle))
+}
+
+/// The gateways of all cells, by their names.
+struct Cells {
+    ready: Value,
+    cells: Vec<(String, Box<dyn Running>)>,
+}
+
+impl Cells {
+    fn new(cells: Vec<(String, Box<dyn Running>)>) -> Self {
+        let ready = cells.iter().map(|(name, run)| (name.clone(), run.ready().clone()));
+        Self { ready: by_name(ready), cells }
+    }
+}
+
+impl Running for Cells {
+    fn ready(&self) -> &Value {
+        &self.ready
+    }
+
+    fn stats(&self) -> Option<Value> {
+        let stats = self.cells.iter().filter_map(|(name, run)| Some((name.clone(), run.stats()?)));
+        Some(by_name(stats))
+    }
+
+    fn askers(&self) -> Vec<Asker> {
+        let askers: Vec<_> = self.cells.iter().map(|(_, run)| run.askers()).collect();
+        match askers.iter().any(Vec::is_empty) {
+            true => Vec::new(),
+            false => askers.concat(),
+        }
+    }
+
+    fn has_ended(&self) -> bool {
+        self.cells.iter().any(|(_, run)| run.has_ended())
+    }
+
+    fn shutdown(self: Box<Self>) -> Result<(), StartError> {
+        let mut result = Ok(());
+        for (name, run) in self.cells {
+            result = result.and(run.shutdown().map_err(|error| error.of(&name)));
+        }
+        result
+    }
+}
+
+fn by_name(cells: impl Iterator<Item = (String, Value)>) -> Value {
+    json!({ "cells": Map::from_iter(cells) })
+}
+
+/// A cell has more than ten files open, and a process of a login may have 1024, unless it asks for more.
+fn raise_file_limit() {
+    let limit = getrlimit(Resource::Nofile);
+    let raised = Rlimit { current: limit.maximum, ..limit };
+    if let Err(error) = setrlimit(Resource::Nofile, raised) {
+        warn!(%error, "cannot raise the limit of open files");
+    }
+}

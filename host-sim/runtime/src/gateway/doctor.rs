@@ -1,0 +1,314 @@
+//! Findings of a running gateway, and of one that only listens.
+//!
+//! A running gateway is looked at once a second, if somebody reads what is found. The gateway's thread
+//! copies the engine and the records into a room; another thread looks at them, logs, and gives the room
+//! back. While it has not, nothing is copied.
+//!
+//! A gateway that only listens gives nothing to the controller, and nothing to the field unless it is to
+//! ask: [`super::Voice`] is the one gate that every output passes. Its engine is told of no link but the
+//! state stream, on which it never sends, so it has nothing to say either.
+
+use std::net::{TcpStream, ToSocketAddrs};
+use std::rc::Rc;
+use std::sync::mpsc::{Receiver, Sender, SyncSender, TryRecvError, channel, sync_channel};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration as StdDuration;
+
+use proto_core::config::{ControllerLink, GatewayConfig};
+use proto_core::engine::{LinkId, PortId, ReplyCode, Status};
+use proto_core::time::{Duration, Instant};
+use proto_core::wire::dialect::Dialect;
+use proto_core::wire::state::{StateStream, States};
+use recipe_doctor::{Case, Change, Finding, LinkFacts, PortRecord, Watch, examine, has_commands};
+use serde_json::{Value, json};
+use tracing::{Span, info};
+
+use super::open::Devices;
+use super::{Core, Engine, Gateway, Observers, Voice};
+use crate::host::{self, Shell};
+use crate::worker::Place;
+use crate::{Signals, StartError};
+use recipe_io::bind::Bind;
+use recipe_io::timer::now;
+
+/// The words of the newest findings of a gateway that is looked at.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Told(Arc<Mutex<Vec<String>>>);
+
+impl Told {
+    pub(crate) fn words(&self) -> Value {
+        json!(*self.0.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    fn replace(&self, findings: &[Finding]) {
+        let words = findings.iter().map(Finding::to_string).collect();
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = words;
+    }
+}
+
+/// The thread that looks, as the gateway's thread sees it.
+pub(super) struct Doctor {
+    rooms: Receiver<Box<Snapshot>>,
+    filled: SyncSender<Box<Snapshot>>,
+}
+
+/// A gateway at one instant.
+pub(super) struct Snapshot {
+    at: Instant,
+    running: Duration,
+    engine: Box<Engine>,
+    ports: Vec<PortRecord>,
+    links: Vec<LinkFacts>,
+}
+
+impl Snapshot {
+    /// Room for a copy of a gateway with these records.
+    fn room(ports: Vec<PortRecord>) -> Box<Self> {
+        let engine = Box::new(Engine::idle());
+        let links = Vec::with_capacity(Engine::MAX_LINKS);
+        Box::new(Self { at: Instant::ZERO, running: Duration::ZERO, engine, ports, links })
+    }
+
+    fn findings(&self, config: &GatewayConfig, looked: Option<States>) -> Vec<Finding> {
+        examine(&Case {
+            config: config.view(),
+            status: self.engine.status(self.at).into(),
+            ports: &self.ports,
+            links: &self.links,
+            running: self.running,
+            looked,
+        })
+    }
+}
+
+/// Since when a command has failed for which nobody saw the controller's states.
+pub(crate) fn unexplained(status: Status<'_>) -> Option<Instant> {
+    let failed = status.ports().filter(|port| port.reply == ReplyCode::Fail);
+    let failed = failed.filter_map(|port| port.last_failed);
+    failed.filter(|failed| failed.controller.is_none()).map(|failed| failed.at).max()
+}
+
+impl Core {
+    /// Begins to keep what comes in at each port.
+    pub(super) fn keep_records(&self, config: &GatewayConfig, binds: &[Bind]) {
+        self.records.replace(records(config, binds));
+    }
+
+    /// Notes the counters of this instant.
+    fn note(&self, at: Instant) {
+        let engine = self.engine.borrow();
+        let mut records = self.records.borrow_mut();
+        for port in engine.status(at).ports() {
+            if let Some(record) = records.iter_mut().find(|record| record.port == port.id) {
+                record.note(at, port.counters);
+                record.fd_frames = self.ports.get(&port.id).map_or(0, |(_, tx)| tx.counters().fd_frames);
+            }
+        }
+    }
+
+    /// Copies everything that findings are made of.
+    fn copy_to(&self, room: &mut Snapshot, at: Instant) {
+        let Snapshot { at: taken, running, engine, ports, links } = room;
+        (*taken, *running) = (at, at.saturating_since(self.started));
+        engine.clone_from(&self.engine.borrow());
+        ports.clone_from(&self.records.borrow());
+        links.clear();
+        links.extend(engine.links().map(|info| self.facts_of(info.id)));
+    }
+
+    /// What is known of a link beyond the engine's status.
+    pub(super) fn facts_of(&self, link: LinkId) -> LinkFacts {
+        let control = self.links.get(&link);
+        LinkFacts {
+            link,
+            reach: control.and_then(|control| control.reach()),
+            strangers: control.map_or(0, |control| control.refusals().strangers),
+        }
+    }
+
+    /// Notes the counters once a second. Never returns.
+    pub(super) async fn keep_notes(&self) -> Result<(), StartError> {
+        let mut ticks = tokio::time::interval(LOOK);
+        ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+        loop {
+            ticks.tick().await;
+            self.note(now());
+        }
+    }
+
+    /// Has the gateway looked at once a second.
+    pub(super) async fn be_watched(&self, doctor: Doctor) -> Result<(), StartError> {
+        let mut ticks = tokio::time::interval(LOOK);
+        ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+        loop {
+            ticks.tick().await;
+            let at = now();
+            self.note(at);
+            let mut room = match doctor.rooms.try_recv() {
+                Ok(room) => room,
+                // A busy machine has looked at the one before not yet.
+                Err(TryRecvError::Empty) => continue,
+                Err(TryRecvError::Disconnected) => return std::future::pending().await,
+            };
+            self.copy_to(&mut room, at);
+            // There is one room, so there is place for it.
+            let _ = doctor.filled.try_send(room);
+        }
+    }
+}
+
+/// Starts the thread that looks at snapshots and logs what begins and ends.
+pub(super) fn start(config: GatewayConfig, binds: &[Bind], span: Span) -> Result<(Doctor, Told), StartError> {
+    let (filled, inbox) = sync_channel(1);
+    let (empty, rooms) = sync_channel(1);
+    let room = Snapshot::room(records(&config, binds));
+    let told = Told::default();
+    let own = told.clone();
+    let thread = std::thread::Builder::new().name("doctor".to_owned());
+    thread
+        .spawn(move || {
+            // The gateway's thread is there until both ends of this one are.
+            let _ = empty.send(room);
+            let _of = span.entered();
+            log_changes(&config, &inbox, &empty, &own);
+        })
+        .map_err(|error| StartError::new(format!("cannot start a thread: {error}")))?;
+    Ok((Doctor { rooms, filled }, told))
+}
+
+/// An empty record of each port.
+fn records(config: &GatewayConfig, binds: &[Bind]) -> Vec<PortRecord> {
+    let record = config.view().field_ports().map(|(index, port, _)| {
+        let mut record = PortRecord::new(PortId(index));
+        let bind = binds.iter().find(|bind| port.name == bind.port.as_str());
+        record.device = bind.map(|bind| bind.device.to_string()).unwrap_or_default();
+        record
+    });
+    record.collect()
+}
+
+fn log_changes(
+    config: &GatewayConfig,
+    inbox: &Receiver<Box<Snapshot>>,
+    empty: &SyncSender<Box<Snapshot>>,
+    told: &Told,
+) {
+    let mut watch = Watch::new();
+    let mut looked: Option<(Instant, Option<States>)> = None;
+    for snapshot in inbox {
+        let failed = unexplained(snapshot.engine.status(snapshot.at));
+        if let Some(failed_at) = failed
+            && looked.is_none_or(|(at, _)| at < failed_at)
+        {
+            looked = Some((failed_at, look_at_states(&config.controller)));
+        }
+        let states = failed.and(looked).and_then(|(_, states)| states);
+        let findings = snapshot.findings(config, states);
+        for change in watch.update(snapshot.at, &findings) {
+            match change {
+                Change::Begins(finding) => info!(severity = finding.severity.name(), "{finding}"),
+                Change::Ends { place, cause } => info!("{place}: over: {}", cause.name().replace('_', " ")),
+            }
+        }
+        told.replace(&findings);
+        // Nobody takes it if the gateway has ended.
+        let _ = empty.try_send(snapshot);
+    }
+}
+
+/// The controller's states: one packet of its state stream. Nothing is sent to it.
+pub(crate) fn look_at_states(controller: &ControllerLink) -> Option<States> {
+    let dialect = Dialect::named(&controller.dialect)?;
+    let place = (controller.address.as_str(), controller.state_port).to_socket_addrs().ok()?.next()?;
+    let mut connection = TcpStream::connect_timeout(&place, MAX_LOOK).ok()?;
+    connection.set_read_timeout(Some(MAX_LOOK)).ok()?;
+    let (mut stream, mut chunk) = (StateStream::new(), [0; 2048]);
+    for _ in 0..MAX_READS {
+        let len = std::io::Read::read(&mut connection, &mut chunk).ok().filter(|len| *len > 0)?;
+        let mut rest = &chunk[..len];
+        while let Some(packet) = stream.next_packet(&mut rest) {
+            if let Ok(view) = packet {
+                return Some(view.states(&dialect));
+            }
+        }
+    }
+    None
+}
+
+/// What a gateway with this configuration would find, from listening for `time`.
+///
+/// Nothing is sent to the controller: its ports are connected to and closed, only its state stream is
+/// read. Nothing is sent to the field, unless `ask`: then ports with exchanges send what their file says.
+/// A signal that ends programs ends the listening early.
+///
+/// # Errors
+/// The reason why it could not start; nothing is left behind then.
+pub fn listen(
+    config: GatewayConfig,
+    binds: Vec<Bind>,
+    time: StdDuration,
+    ask: bool,
+) -> Result<Vec<Finding>, StartError> {
+    let (sender, findings) = channel();
+    let voice = if ask { Voice::Asking } else { Voice::Silent };
+    let handle = host::start(&Place::alone(), "doctor", async move |_| {
+        let gateway = Gateway::open(&config, Devices::own(&binds), voice, &Observers::default()).await?;
+        gateway.core.keep_records(&config, &binds);
+        Ok(Listener { gateway, config, time, sender })
+    })?;
+    // It is dropped at the end of the run.
+    let findings = findings.recv().ok();
+    let ended = handle.shutdown();
+    match findings {
+        Some(findings) => Ok(findings),
+        None => Err(ended.err().unwrap_or_else(|| StartError::new("the doctor ended early").after_start())),
+    }
+}
+
+/// A gateway that listens for some time.
+struct Listener {
+    gateway: Gateway,
+    config: GatewayConfig,
+    time: StdDuration,
+    sender: Sender<Vec<Finding>>,
+}
+
+impl Shell for Listener {
+    fn ready(&self) -> Value {
+        self.gateway.ready.clone()
+    }
+
+    fn stats(&self) -> impl Fn() -> Value + 'static {
+        || Value::Null
+    }
+
+    async fn run(self) -> Result<(), StartError> {
+        let core = Rc::clone(&self.gateway.core);
+        let mut signals = Signals::catch().map_err(|error| StartError::new(format!("signals: {error}")))?;
+        tokio::select! {
+            ended = self.gateway.drive() => ended?,
+            ended = core.keep_notes() => ended?,
+            () = tokio::time::sleep(self.time) => {}
+            _ = signals.next() => {}
+        }
+        let at = now();
+        core.note(at);
+        let mut snapshot = Snapshot::room(Vec::new());
+        core.copy_to(&mut snapshot, at);
+        let has_states = snapshot.engine.status(snapshot.at).controller().is_some();
+        let looked = match !has_states && has_commands(self.config.view()) {
+            true => look_at_states(&self.config.controller),
+            false => None,
+        };
+        // Nobody listens if the caller is gone.
+        let _ = self.sender.send(snapshot.findings(&self.config, looked));
+        Ok(())
+    }
+}
+
+/// Interval at which a gateway is looked at.
+const LOOK: StdDuration = StdDuration::from_secs(1);
+/// How long a connection and a packet of the state stream may take.
+const MAX_LOOK: StdDuration = StdDuration::from_secs(1);
+/// More reads than a few packets need.
+const MAX_READS: usize = 16;

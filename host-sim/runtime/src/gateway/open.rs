@@ -1,0 +1,224 @@
+//! Opening the gateway's devices, listening sockets and what is told to whoever watches.
+
+use std::cell::{Cell, RefCell};
+use std::collections::BTreeSet;
+use std::rc::Rc;
+use std::sync::Arc;
+use std::time::SystemTime;
+
+use proto_core::config::{Bus, GatewayConfig, Parts, Port as PortConfig, image};
+use proto_core::engine::{Endpoint as To, LinkKind, PortId, Transport};
+use proto_core::sysvar::Direction;
+use proto_core::time::Instant;
+use serde_json::json;
+use tokio::net::{TcpListener, UdpSocket};
+use tokio::sync::Notify;
+use tracing::info;
+
+use super::tapping::Tapping;
+use super::{Core, Engine, Gateway, Observers, Voice};
+use crate::StartError;
+use crate::host::AtEnd;
+use crate::link::Endpoint;
+use recipe_capture::{Cell as Watched, Epoch};
+use recipe_io::bind::Bind;
+use recipe_io::kept::{Kept, Shelf};
+use recipe_io::port::{Port, PortBus};
+use recipe_io::tcp_options;
+use recipe_io::timer::now;
+
+/// What ports are bound to.
+pub(super) struct Devices<'a> {
+    pub(super) binds: &'a [Bind],
+    /// What another gateway has left, and where this one leaves its own; `None` if it closes them.
+    pub(super) left: Option<(Shelf, &'a AtEnd)>,
+}
+
+impl<'a> Devices<'a> {
+    /// Devices that belong to one gateway only.
+    pub(super) fn own(binds: &'a [Bind]) -> Self {
+        Self { binds, left: None }
+    }
+
+    /// Opens a port's device, or takes over what another gateway has left of it.
+    async fn open(&self, port: &PortConfig) -> Result<Port, StartError> {
+        let kept = self.left.as_ref().and_then(|(shelf, _)| shelf.take(&port.name));
+        let device = open_port(port, self.binds, kept).await?;
+        if let Some((shelf, at_end)) = &self.left
+            && let Some(hold) = device.hold()
+        {
+            let (shelf, name) = (shelf.clone(), port.name.to_string());
+            at_end.add(move || {
+                if let Some(kept) = hold.release() {
+                    shelf.put(&name, kept);
+                }
+            });
+        }
+        Ok(device)
+    }
+}
+
+impl Gateway {
+    /// Opens devices and listening sockets.
+    pub(super) async fn open(
+        config: &GatewayConfig,
+        devices: Devices<'_>,
+        voice: Voice,
+        observers: &Observers,
+    ) -> Result<Self, StartError> {
+        let engine: Box<Engine> =
+            Box::new(Engine::new(config).map_err(|error| StartError::new(error.to_string()))?);
+        // Those of Modbus TCP have links.
+        let has_device = |port: &PortConfig| !matches!(port.bus, Bus::ModbusTcp { .. });
+        let field = || config.view().field_ports().map(|(_, port, _)| port).filter(|port| has_device(port));
+        if let Some(bind) =
+            devices.binds.iter().find(|bind| field().all(|port| port.name != bind.port.as_str()))
+        {
+            let names: Vec<_> = field().map(|port| port.name.as_str()).collect();
+            let message = format!("--bind {bind}: there is no such port; there are {}", names.join(", "));
+            return Err(StartError::new(message));
+        }
+        let (mut ports, mut asks) = (Vec::new(), BTreeSet::new());
+        for (index, port, recipe) in config.view().field_ports() {
+            if recipe.exchanges.len > 0 {
+                asks.insert(PortId(index));
+            }
+            if !has_device(port) {
+                continue;
+            }
+            let mut device = devices.open(port).await?;
+            if matches!(recipe.parts, Parts::Can { .. }) {
+                let ids = |part| config.view().can_ids(recipe, part);
+                device.listen_to(ids(Direction::Input).chain(ids(Direction::Output)).collect());
+            }
+            ports.push((PortId(index), device));
+        }
+        let mut links = Vec::new();
+        for info in engine.links() {
+            links.push((info.id, info.kind, open_endpoint(info.endpoint).await?));
+        }
+        let name = |id: PortId| config.ports.get(usize::from(id.0)).map_or("", |port| port.name.as_str());
+        let mut places = serde_json::Map::new();
+        for (id, port) in &ports {
+            places.insert(name(*id).to_owned(), json!(port.place()));
+        }
+        for (_, kind, endpoint) in &links {
+            if let LinkKind::RecipeTcpListen { port }
+            | LinkKind::RecipeUdpListen { port }
+            | LinkKind::ModbusDevice { port } = kind
+            {
+                places.insert(name(*port).to_owned(), json!(endpoint.place()));
+            }
+        }
+        let tapping = begin_tapping(config, &engine, observers)?;
+        let core = Rc::new(Core {
+            tapping: RefCell::new(tapping),
+            ports: ports.iter().map(|(id, port)| (*id, (name(*id).to_owned(), port.tx()))).collect(),
+            links: links.iter().map(|(id, ..)| (*id, Rc::default())).collect(),
+            engine: RefCell::new(engine),
+            deadline: Cell::new(Instant::NEVER),
+            sleeps: Cell::new(0),
+            unreachable: RefCell::default(),
+            deadline_moved: Notify::new(),
+            is_ending: Cell::new(false),
+            voice,
+            asks,
+            started: now(),
+            records: RefCell::default(),
+        });
+        Ok(Self {
+            core,
+            ports,
+            links,
+            ready: json!({ "ports": places }),
+            window: None,
+            glimpse: None,
+            doctor: None,
+        })
+    }
+}
+
+/// Begins to tell whoever watches.
+fn begin_tapping(
+    config: &GatewayConfig,
+    engine: &Engine,
+    Observers { watch, decoder, .. }: &Observers,
+) -> Result<Tapping, StartError> {
+    let at = now();
+    let cell = Watched::new(config, engine, Epoch { at, wall: SystemTime::now() }, Arc::clone(decoder));
+    // Only a recording begins with it: a long configuration has none.
+    let image = watch.wanted().passes.then(|| encoded(config)).transpose()?;
+    Tapping::begin(watch, cell, at, image.as_deref())
+        .map_err(|error| StartError::new(format!("cannot start a thread: {error}")))
+}
+
+/// The configuration image.
+fn encoded(config: &GatewayConfig) -> Result<Vec<u8>, StartError> {
+    let mut bytes = vec![0; image::MAX_IMAGE];
+    let len = image::encode(config, &mut bytes).map_err(|error| StartError::new(error.to_string()))?;
+    bytes.truncate(len);
+    Ok(bytes)
+}
+
+async fn open_port(port: &PortConfig, binds: &[Bind], kept: Option<Kept>) -> Result<Port, StartError> {
+    let name = port.name.as_str();
+    let bus = match port.bus {
+        Bus::Rs485(settings) => PortBus::Serial(settings),
+        Bus::Can { bitrate } => PortBus::Can { bitrate },
+        Bus::ModbusTcp { .. } | Bus::TcpListen { .. } | Bus::UdpListen { .. } => {
+            return Err(StartError::new(format!("port {name} is not a field port")));
+        }
+    };
+    let mut own = binds.iter().filter(|bind| bind.port == name);
+    let (Some(bind), None) = (own.next(), own.next()) else {
+        let examples = match bus {
+            PortBus::Serial(_) => "pty:PATH or serial:/dev/ttyUSB0",
+            PortBus::Can { .. } => "socketcan:can0, slcan-tcp:127.0.0.1:0 or slcan-pty:PATH",
+        };
+        return Err(StartError::new(format!(
+            "port {name} needs exactly one device: --bind {name}=DEVICE, such as {examples}"
+        )));
+    };
+    let opened = Port::open_or_adopt(&bind.device, bus, kept).await;
+    let device =
+        opened.map_err(|error| StartError::new(format!("--bind {name}={}: {error}", bind.device)))?;
+    if device.is_kept() {
+        info!(port = name, "the device stays open; its clients stay connected");
+    }
+    Ok(device)
+}
+
+async fn open_endpoint(to: To<'_>) -> Result<Endpoint, StartError> {
+    if to.host.is_empty() {
+        let message = "controller.address is needed: the controller's address or host name";
+        return Err(StartError::new(message));
+    }
+    let host = to.host.to_owned();
+    let refused = |address, error| StartError::new(format!("cannot listen on {address}: {error}"));
+    Ok(match to.transport {
+        Transport::Tcp { port } => Endpoint::Tcp { host, port },
+        Transport::Udp { port } => Endpoint::Udp { host, port },
+        Transport::TcpListen { local } => {
+            let listener = TcpListener::bind(local).await.map_err(|error| refused(local, error))?;
+            tcp_options::limit_buffers(&listener);
+            Endpoint::TcpListen { listener, controller: host }
+        }
+        Transport::UdpListen { local } => {
+            let socket = UdpSocket::bind(local).await.map_err(|error| refused(local, error))?;
+            Endpoint::UdpListen { socket, controller: host }
+        }
+        other => return Err(StartError::new(format!("unknown kind of link: {other:?}"))),
+    })
+}
+
+impl Endpoint {
+    /// The address of a listening link.
+    fn place(&self) -> String {
+        let address = match self {
+            Self::TcpListen { listener, .. } => listener.local_addr(),
+            Self::UdpListen { socket, .. } => socket.local_addr(),
+            Self::Tcp { host, port } | Self::Udp { host, port } => return format!("{host}:{port}"),
+        };
+        address.map_or_else(|_| String::new(), |address| address.to_string())
+    }
+}

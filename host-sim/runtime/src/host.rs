@@ -1,0 +1,436 @@
+//! What every shell needs: a thread with a runtime, a handle, and in the foreground the `ready` line,
+//! statistics and a clean end.
+//!
+//! A shell has a thread of its own with a runtime, or shares a [`Worker`] with others and has a [`LocalSet`] there. Either
+//! way its tasks end with it.
+
+use std::cell::RefCell;
+use std::io;
+use std::pin::Pin;
+use std::rc::Rc;
+use std::sync::mpsc as blocking;
+use std::thread::JoinHandle;
+
+use recipe_capture::Watch;
+use recipe_io::fairness;
+use serde_json::Value;
+use tokio::sync::{mpsc, oneshot};
+use tokio::task::{LocalSet, spawn_local};
+use tracing::warn;
+
+use super::service::Service;
+use super::{RunOptions, Signals, StartError};
+use crate::gateway::Told;
+use crate::out::print_stderr;
+use crate::stdout::{Failure, Stdout};
+use crate::worker::{Place, Shared};
+
+/// Stack size: an engine is built by value, and unoptimised code has several copies of it on the stack.
+pub(super) const STACK: usize = 16 << 20;
+
+/// A gateway or a controller that runs on one thread until it is dropped.
+pub(super) trait Shell: 'static {
+    /// The addresses and paths for the `ready` line, by name.
+    fn ready(&self) -> Value;
+    /// A function that returns one line of statistics while the shell runs.
+    fn stats(&self) -> impl Fn() -> Value + 'static;
+    /// Runs where tasks can be spawned that stay on this thread; returns only if something fails permanently, or after a
+    /// shutdown command.
+    fn run(self) -> impl Future<Output = Result<(), StartError>>;
+}
+
+/// A shell that runs on a thread of its own or a shared one. Dropping it ends the shell and waits until its sockets
+/// are closed and its links removed.
+#[derive(Debug)]
+pub struct Handle {
+    ready: Value,
+    requests: mpsc::UnboundedSender<Request>,
+    watch: Watch,
+    findings: Option<Told>,
+    home: Option<Home>,
+}
+
+/// Where a shell runs.
+#[derive(Debug)]
+enum Home {
+    /// On a thread of its own.
+    Alone(JoinHandle<Result<(), StartError>>),
+    /// Among others.
+    Among(Shared),
+}
+
+/// Something that runs and can be asked, in the foreground.
+pub(crate) trait Running {
+    /// The actual addresses and paths.
+    fn ready(&self) -> &Value;
+    /// One line of statistics; `None` if there is none at the moment.
+    fn stats(&self) -> Option<Value>;
+    /// Ask the threads that move the data; none if one of them is missing at the moment.
+    fn askers(&self) -> Vec<Asker>;
+    /// Whether it has ended by itself.
+    fn has_ended(&self) -> bool;
+    /// Ends it and waits for it. If it had ended by itself, the reason is the error.
+    fn shutdown(self: Box<Self>) -> Result<(), StartError>;
+}
+
+/// Asks a shell, from any thread.
+#[derive(Debug, Clone)]
+pub(crate) struct Asker {
+    requests: mpsc::UnboundedSender<Request>,
+    /// What is found by another thread than the one that is asked.
+    findings: Option<Told>,
+}
+
+impl Asker {
+    /// One line of statistics; `None` if the shell has ended.
+    pub(crate) fn stats(&self) -> Option<Value> {
+        let (answer, stats) = blocking::channel();
+        self.requests.send(Request::Stats(answer)).ok()?;
+        let mut stats = stats.recv().ok()?;
+        if let Some(findings) = &self.findings {
+            stats["findings"] = findings.words();
+        }
+        Some(stats)
+    }
+
+    /// Waits until it answers; false if it has ended.
+    pub(crate) async fn answers(&self) -> bool {
+        let (answer, answered) = oneshot::channel();
+        self.requests.send(Request::Ping(answer)).is_ok() && answered.await.is_ok()
+    }
+
+    /// One whose questions come out at the other end.
+    #[cfg(test)]
+    pub(super) fn channel() -> (Self, mpsc::UnboundedReceiver<Request>) {
+        let (requests, inbox) = mpsc::unbounded_channel();
+        (Self { requests, findings: None }, inbox)
+    }
+}
+
+/// What the thread of a shell does at its end, after all tasks are gone. A clone is the same.
+#[derive(Default, Clone)]
+pub(super) struct AtEnd(Rc<RefCell<Vec<Act>>>);
+
+type Act = Box<dyn FnOnce()>;
+
+impl AtEnd {
+    /// Adds something to do. What fails to open ends too.
+    pub(super) fn add(&self, act: impl FnOnce() + 'static) {
+        self.0.borrow_mut().push(Box::new(act));
+    }
+
+    fn run(self) {
+        self.0.take().into_iter().for_each(|act| act());
+    }
+}
+
+#[derive(Debug)]
+pub(super) enum Request {
+    Stats(blocking::Sender<Value>),
+    /// Whether the thread works.
+    Ping(oneshot::Sender<()>),
+    Shutdown,
+}
+
+/// Opens a shell and waits until everything is listening.
+pub(super) fn start<S: Shell>(
+    place: &Place,
+    name: &str,
+    open: impl AsyncFnOnce(&AtEnd) -> Result<S, StartError> + Send + 'static,
+) -> Result<Handle, StartError> {
+    let (requests, inbox) = mpsc::unbounded_channel();
+    let (opened, outcome) = blocking::channel();
+    let open = Box::new(open);
+    let opening = Opening { open: Box::new(|at_end| Box::pin(open(at_end))), opened, inbox };
+    let home = match place.shared() {
+        None => Home::Alone(alone(name, opening)?),
+        Some((worker, begin)) => Home::Among(worker.run(place.span.clone(), move || async move {
+            let (local, at_end) = (LocalSet::new(), AtEnd::default());
+            let ended = fairness::apart(local.run_until(opening.run_as_task(&at_end, begin.wait()))).await;
+            drop(local);
+            at_end.run();
+            ended
+        })?),
+    };
+    match outcome.recv() {
+        Ok(Ok(ready)) => {
+            Ok(Handle { ready, requests, watch: Watch::new(), findings: None, home: Some(home) })
+        }
+        Ok(Err(error)) => {
+            // Whoever tries again finds nothing open.
+            let _ = home.ended();
+            Err(error)
+        }
+        // The thread ended before it sent a result; its own result says why.
+        Err(_) => Err(home.ended().err().unwrap_or_else(|| StartError::new(format!("{name} ended")))),
+    }
+}
+
+fn alone<S: Shell>(
+    name: &str,
+    opening: Opening<S>,
+) -> Result<JoinHandle<Result<(), StartError>>, StartError> {
+    let thread = std::thread::Builder::new().name(name.to_owned()).stack_size(STACK).spawn(move || {
+        let runtime =
+            tokio::runtime::Builder::new_current_thread().enable_all().build_local(Default::default());
+        let runtime = runtime.map_err(no_runtime)?;
+        let at_end = AtEnd::default();
+        let ended = runtime.block_on(opening.run_as_task(&at_end, std::future::ready(())));
+        // With it go its tasks.
+        drop(runtime);
+        at_end.run();
+        ended
+    });
+    thread.map_err(|error| StartError::new(format!("cannot start a thread: {error}")))
+}
+
+/// The runtime of a thread.
+pub(super) fn runtime() -> Result<tokio::runtime::Runtime, StartError> {
+    tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(no_runtime)
+}
+
+fn no_runtime(error: io::Error) -> StartError {
+    StartError::new(format!("cannot start the runtime: {error}"))
+}
+
+/// A shell that is to be opened.
+struct Opening<S> {
+    open: Open<S>,
+    opened: blocking::Sender<Result<Value, StartError>>,
+    inbox: mpsc::UnboundedReceiver<Request>,
+}
+
+/// Opens a shell. It is called through a pointer, and so is its future: what it needs on the stack, with room for an
+/// engine and a configuration, would else be touched at every wake of the shell.
+type Open<S> =
+    Box<dyn for<'a> FnOnce(&'a AtEnd) -> Pin<Box<dyn Future<Output = Result<S, StartError>> + 'a>> + Send>;
+
+impl<S: Shell> Opening<S> {
+    /// The same as [`Self::run`], in a task of its own: what is run around the tasks is polled at each wake of any of
+    /// them.
+    async fn run_as_task(
+        self,
+        at_end: &AtEnd,
+        begin: impl Future<Output = ()> + 'static,
+    ) -> Result<(), StartError> {
+        spawn_local(self.run(at_end.clone(), begin)).await.unwrap_or_else(|_| Err(panicked()))
+    }
+
+    /// Opens it, and runs it when it may begin.
+    async fn run(self, at_end: AtEnd, begin: impl Future<Output = ()>) -> Result<(), StartError> {
+        let Self { open, opened, inbox } = self;
+        let shell = match open(&at_end).await {
+            Ok(shell) => shell,
+            Err(error) => {
+                let _ = opened.send(Err(error));
+                return Ok(());
+            }
+        };
+        let stats = shell.stats();
+        let _ = opened.send(Ok(shell.ready()));
+        let run = async {
+            begin.await;
+            shell.run().await.map_err(StartError::after_start)
+        };
+        tokio::select! {
+            ended = run => ended,
+            () = serve(inbox, stats) => Ok(()),
+        }
+    }
+}
+
+/// Answers requests until one asks for the end.
+async fn serve(mut inbox: mpsc::UnboundedReceiver<Request>, stats: impl Fn() -> Value) {
+    while let Some(request) = inbox.recv().await {
+        match request {
+            Request::Stats(answer) => {
+                let _ = answer.send(stats());
+            }
+            Request::Ping(answer) => {
+                let _ = answer.send(());
+            }
+            Request::Shutdown => return,
+        }
+    }
+}
+
+impl Handle {
+    /// The actual addresses and paths.
+    pub fn ready(&self) -> &Value {
+        &self.ready
+    }
+
+    /// The address or path called `name` (`"command"`, `"ports/rs485"`); empty if there is none.
+    pub fn place(&self, name: &str) -> &str {
+        self.ready.pointer(&format!("/{name}")).and_then(Value::as_str).unwrap_or("")
+    }
+
+    /// One line of statistics; `None` if the shell has ended.
+    pub fn stats(&self) -> Option<Value> {
+        self.asker().stats()
+    }
+
+    pub(crate) fn asker(&self) -> Asker {
+        Asker { requests: self.requests.clone(), findings: self.findings.clone() }
+    }
+
+    /// What is seen at the gateway's ports and links, for any number of subscribers; a controller tells
+    /// nothing.
+    pub fn watch(&self) -> &Watch {
+        &self.watch
+    }
+
+    pub(super) fn with_watch(self, watch: Watch) -> Self {
+        // Not by an update: a handle ends its shell when it is dropped.
+        let mut handle = self;
+        handle.watch = watch;
+        handle
+    }
+
+    /// What another thread finds belongs to the statistics.
+    pub(super) fn with_findings(self, findings: Option<Told>) -> Self {
+        let mut handle = self;
+        handle.findings = findings;
+        handle
+    }
+
+    /// Whether the shell has ended by itself.
+    pub fn has_ended(&self) -> bool {
+        self.home.as_ref().is_none_or(Home::has_ended)
+    }
+
+    /// Ends the shell and waits for it.
+    ///
+    /// # Errors
+    /// If it had ended by itself, the reason.
+    pub fn shutdown(mut self) -> Result<(), StartError> {
+        self.end()
+    }
+
+    fn end(&mut self) -> Result<(), StartError> {
+        let _ = self.requests.send(Request::Shutdown);
+        self.home.take().map_or(Ok(()), Home::ended)
+    }
+}
+
+impl Running for Handle {
+    fn ready(&self) -> &Value {
+        self.ready()
+    }
+
+    fn stats(&self) -> Option<Value> {
+        self.stats()
+    }
+
+    fn askers(&self) -> Vec<Asker> {
+        vec![self.asker()]
+    }
+
+    fn has_ended(&self) -> bool {
+        self.has_ended()
+    }
+
+    fn shutdown(self: Box<Self>) -> Result<(), StartError> {
+        Self::shutdown(*self)
+    }
+}
+
+impl Drop for Handle {
+    fn drop(&mut self) {
+        let _ = self.end();
+    }
+}
+
+impl Home {
+    fn has_ended(&self) -> bool {
+        match self {
+            Self::Alone(thread) => thread.is_finished(),
+            Self::Among(shared) => shared.has_ended(),
+        }
+    }
+
+    /// Waits for its end.
+    fn ended(self) -> Result<(), StartError> {
+        match self {
+            Self::Alone(thread) => thread.join().unwrap_or_else(|_| Err(panicked())),
+            Self::Among(shared) => shared.ended(),
+        }
+    }
+}
+
+/// A thread or a shell panicked.
+pub(super) fn panicked() -> StartError {
+    StartError::new("a thread panicked").after_start()
+}
+
+/// Prints `ready` and statistics, and ends on a signal.
+pub(super) fn foreground(handle: Box<dyn Running>, options: &RunOptions) -> Result<(), StartError> {
+    let runtime = runtime()?;
+    let mut stdout = Stdout::start()
+        .map_err(|error| StartError::new(format!("cannot start the thread for statistics: {error}")))?;
+    let result = runtime.block_on(async {
+        // Signals are handled before `ready` is printed.
+        let refused = |error: io::Error| StartError::new(format!("signals: {error}"));
+        let mut signals = Signals::catch().map_err(refused)?;
+        let ready = options.ready.as_ref().map(|file| file.write(handle.ready())).transpose()?;
+        let line = format!("ready {}", handle.ready());
+        if options.stdout_is_taken {
+            print_stderr(line);
+        } else {
+            stdout.print(line);
+        }
+        let service = Service::from_environment();
+        service.is_ready();
+        let mut ticks = options.stats.map(tokio::time::interval);
+        let mut check = tokio::time::interval(CHECK_INTERVAL);
+        let result = {
+            let mut alive = std::pin::pin!(service.keep_alive(|| handle.askers()));
+            loop {
+                tokio::select! {
+                    _ = signals.next() => break Ok(()),
+                    () = &mut alive => {}
+                    () = tick(&mut ticks) => {
+                        if let Some(mut stats) = handle.stats() {
+                            stats["lost_lines"] = stdout.lost().into();
+                            stdout.print(stats.to_string());
+                        }
+                    }
+                    Some(failure) = stdout.failures.recv() => match failure {
+                        Failure::Closed if options.stats.is_some() => {
+                            print_stderr("stdout was closed; ended, because nobody reads the statistics");
+                            break Ok(());
+                        }
+                        // Nothing more would be printed.
+                        Failure::Closed => {}
+                        Failure::NotReady(error) => {
+                            break Err(StartError::new(format!("stdout: {error}")).after_start());
+                        }
+                        Failure::Lost(error) => warn!(%error, "cannot write statistics to stdout"),
+                    },
+                    _ = check.tick() => {
+                        if handle.has_ended() {
+                            break Ok(());
+                        }
+                    }
+                }
+            }
+        };
+        drop(ready);
+        service.is_stopping();
+        result.and(handle.shutdown())
+    });
+    stdout.finish();
+    result
+}
+
+/// Interval at which the foreground checks that the shell still runs.
+const CHECK_INTERVAL: std::time::Duration = std::time::Duration::from_millis(100);
+
+async fn tick(ticks: &mut Option<tokio::time::Interval>) {
+    match ticks {
+        Some(ticks) => {
+            ticks.tick().await;
+        }
+        None => std::future::pending().await,
+    }
+}

@@ -1,0 +1,100 @@
+//! The tokio shells, which connect the engine and the simulated controller to sockets, devices and the clock.
+//!
+//! A shell is one thread with a current-thread runtime. It owns all its sockets and devices, reports received
+//! data to the state machine, and carries out its outputs. It does not know protocols. The simulated controller's
+//! Modbus connections have a thread beside it, which does the same for them.
+
+pub mod console;
+pub mod controller;
+mod events_file;
+pub mod gateway;
+mod host;
+mod link;
+pub mod log;
+pub mod out;
+mod ready;
+mod service;
+mod signals;
+mod stdout;
+mod tcp;
+mod telling;
+mod udp;
+mod worker;
+
+use std::fmt;
+use std::sync::Arc;
+use std::time::Duration;
+
+pub use events_file::EventsFile;
+pub use host::Handle;
+pub use ready::ReadyFile;
+pub use signals::Signals;
+
+use recipe_capture::{Decoder, Watch};
+pub use recipe_edge_node::file::Telling;
+use recipe_io::bind::Bind;
+pub use recipe_io::realtime::Scheduling;
+
+/// Options of a run beside its file.
+#[derive(Debug, Clone, Default)]
+pub struct RunOptions {
+    /// The device that each serial or CAN port is bound to.
+    pub binds: Vec<Bind>,
+    /// The file for the addresses, written when everything is listening.
+    pub ready: Option<ReadyFile>,
+    /// Interval at which a line of counters is printed.
+    pub stats: Option<Duration>,
+    /// The scheduling of the run's thread.
+    pub scheduling: Scheduling,
+    /// The console.
+    pub console: Option<console::ConsoleOptions>,
+    /// Where and how a gateway tells what it knows.
+    pub sparkplug: Option<Telling>,
+    /// What is seen of a gateway, for who has subscribed.
+    pub watch: Watch,
+    /// The frames of its file by name, for who has subscribed. A gateway with a console has those of what it runs.
+    pub decoder: Arc<Decoder>,
+    /// The log, whose newest lines a console shows.
+    pub log: Option<log::Log>,
+    /// `ready` goes to stderr: stdout is for a capture.
+    pub stdout_is_taken: bool,
+}
+
+/// Why a run could not start or continue: one message. Nothing is left behind.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct StartError {
+    message: String,
+    had_started: bool,
+}
+
+impl StartError {
+    /// The run could not start.
+    pub fn new(message: impl Into<String>) -> Self {
+        Self { message: message.into(), had_started: false }
+    }
+
+    /// The same error, of a run that had started.
+    #[must_use]
+    pub fn after_start(self) -> Self {
+        Self { had_started: true, ..self }
+    }
+
+    /// The same error, of one of several cells.
+    #[must_use]
+    pub(crate) fn of(self, cell: &str) -> Self {
+        Self { message: format!("{cell}: {}", self.message), ..self }
+    }
+
+    /// 2 if nothing was started, 1 if the run failed later.
+    pub const fn exit_code(&self) -> u8 {
+        if self.had_started { 1 } else { 2 }
+    }
+}
+
+impl fmt::Display for StartError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.message)
+    }
+}
+
+impl std::error::Error for StartError {}

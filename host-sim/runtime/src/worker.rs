@@ -1,0 +1,275 @@
+//! A thread that several shells share: what has become ready for one of them is found together with the rest, so that
+//! all of them sleep less often than each one alone.
+
+use std::pin::Pin;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
+
+use proto_core::time::Duration;
+use recipe_io::timer::{Timer, now};
+use tokio::sync::{mpsc, watch};
+use tokio::task::{LocalSet, spawn_local};
+use tracing::{Instrument, Span};
+
+use crate::StartError;
+use crate::host::{STACK, panicked, runtime};
+
+/// Where a shell runs.
+#[derive(Debug, Clone)]
+pub(crate) struct Place {
+    /// What the log calls it.
+    pub(crate) span: Span,
+    shared: Option<(Arc<Worker>, Begin)>,
+}
+
+impl Place {
+    /// On a thread of its own.
+    pub(crate) fn alone() -> Self {
+        Self { span: Span::none(), shared: None }
+    }
+
+    /// On a thread with others. It is opened at once, and runs when all others have been.
+    pub(crate) const fn among(worker: Arc<Worker>, begin: Begin, span: Span) -> Self {
+        Self { span, shared: Some((worker, begin)) }
+    }
+
+    pub(super) fn shared(&self) -> Option<(Arc<Worker>, Begin)> {
+        self.shared.clone()
+    }
+}
+
+/// When shells may run that have been opened.
+#[derive(Debug, Clone)]
+pub(crate) struct Begin {
+    begins: watch::Receiver<bool>,
+    after: Duration,
+}
+
+impl Begin {
+    /// It begins when `true` is sent. If the sender is gone before, it never does.
+    pub(crate) fn channel() -> (watch::Sender<bool>, Self) {
+        let (begins, begin) = watch::channel(false);
+        (begins, Self { begins: begin, after: Duration::ZERO })
+    }
+
+    /// The same, and so much later.
+    pub(crate) fn and_later(&self, after: Duration) -> Self {
+        Self { begins: self.begins.clone(), after }
+    }
+
+    pub(super) async fn wait(mut self) {
+        if self.begins.wait_for(|begins| *begins).await.is_err() {
+            std::future::pending().await
+        }
+        if self.after > Duration::ZERO
+            && let Ok(timer) = Timer::new()
+            && timer.arm(now() + self.after).is_ok()
+        {
+            // Without the timer it begins at once.
+            let _ = timer.expired().await;
+        }
+    }
+}
+
+type Job = Box<dyn FnOnce() -> Pin<Box<dyn Future<Output = ()>>> + Send>;
+
+/// A thread on which any number of shells run. It ends with the last of them, when nobody has it any more.
+#[derive(Debug)]
+pub(crate) struct Worker {
+    jobs: Option<mpsc::UnboundedSender<Job>>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Worker {
+    /// Starts a thread.
+    pub(crate) fn start(name: &str) -> Result<Arc<Self>, StartError> {
+        let (jobs, mut inbox) = mpsc::unbounded_channel::<Job>();
+        // Here, where an error can be told.
+        let runtime = runtime()?;
+        let thread = std::thread::Builder::new().name(name.to_owned()).stack_size(STACK).spawn(move || {
+            LocalSet::new().block_on(&runtime, async {
+                while let Some(job) = inbox.recv().await {
+                    spawn_local(job());
+                }
+            });
+        });
+        let thread = thread.map_err(|error| StartError::new(format!("cannot start a thread: {error}")))?;
+        Ok(Arc::new(Self { jobs: Some(jobs), thread: Some(thread) }))
+    }
+
+    /// Runs a shell on it.
+    pub(super) fn run<F>(
+        self: Arc<Self>,
+        span: Span,
+        shell: impl FnOnce() -> F + Send + 'static,
+    ) -> Result<Shared, StartError>
+    where
+        F: Future<Output = Result<(), StartError>> + 'static,
+    {
+        let end = Arc::<End>::default();
+        let outcome = Outcome(Arc::clone(&end));
+        let job: Job = Box::new(move || {
+            Box::pin(
+                async move {
+                    let ended = shell().await;
+                    outcome.is(ended);
+                }
+                .instrument(span),
+            )
+        });
+        let sent = self.jobs.as_ref().is_some_and(|jobs| jobs.send(job).is_ok());
+        match sent {
+            true => Ok(Shared { end, _worker: self }),
+            false => Err(panicked()),
+        }
+    }
+}
+
+impl Drop for Worker {
+    fn drop(&mut self) {
+        self.jobs = None;
+        if let Some(thread) = self.thread.take() {
+            // A panic of a shell is its own outcome.
+            let _ = thread.join();
+        }
+    }
+}
+
+/// A shell on a worker.
+#[derive(Debug)]
+pub(super) struct Shared {
+    end: Arc<End>,
+    /// Held as long as the shell runs.
+    _worker: Arc<Worker>,
+}
+
+impl Shared {
+    pub(super) fn has_ended(&self) -> bool {
+        self.end.result().is_some()
+    }
+
+    /// Waits for its end.
+    pub(super) fn ended(self) -> Result<(), StartError> {
+        let result = self.end.result();
+        let mut result = self
+            .end
+            .ended
+            .wait_while(result, |result| result.is_none())
+            .unwrap_or_else(PoisonError::into_inner);
+        result.take().unwrap_or(Ok(()))
+    }
+}
+
+/// How a shell ended, once it has.
+#[derive(Debug, Default)]
+struct End {
+    result: Mutex<Option<Result<(), StartError>>>,
+    ended: Condvar,
+}
+
+impl End {
+    fn result(&self) -> MutexGuard<'_, Option<Result<(), StartError>>> {
+        self.result.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn set(&self, result: Result<(), StartError>) {
+        self.result().get_or_insert(result);
+        self.ended.notify_all();
+    }
+}
+
+/// Tells the end of a shell, even if that panics.
+struct Outcome(Arc<End>);
+
+impl Outcome {
+    fn is(self, result: Result<(), StartError>) {
+        self.0.set(result);
+    }
+}
+
+impl Drop for Outcome {
+    fn drop(&mut self) {
+        self.0.set(Err(panicked()));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::host::{self, Handle, Shell};
+    use serde_json::{Value, json};
+    use std::sync::mpsc::{Receiver, Sender, channel};
+
+    /// Tells when it runs, and then does nothing, or panics.
+    struct Told {
+        runs: Sender<()>,
+        panics: bool,
+    }
+
+    impl Shell for Told {
+        fn ready(&self) -> Value {
+            Value::Null
+        }
+
+        fn stats(&self) -> impl Fn() -> Value + 'static {
+            || json!("alive")
+        }
+
+        async fn run(self) -> Result<(), StartError> {
+            let _ = self.runs.send(());
+            assert!(!self.panics, "as it was told to");
+            std::future::pending().await
+        }
+    }
+
+    fn opened(worker: &Arc<Worker>, begin: &Begin, panics: bool) -> (Handle, Receiver<()>) {
+        let (runs, has_run) = channel();
+        let place = Place::among(Arc::clone(worker), begin.clone(), Span::none());
+        let handle = host::start(&place, "told", async move |_| Ok(Told { runs, panics })).unwrap();
+        (handle, has_run)
+    }
+
+    #[test]
+    fn none_runs_before_all_are_open_and_each_ends_alone() {
+        let worker = Worker::start("test").unwrap();
+        let (begins, begin) = Begin::channel();
+        let (left, left_runs) = opened(&worker, &begin, false);
+        let (right, right_runs) = opened(&worker, &begin, false);
+        for _ in 0..2 {
+            assert_eq!((left.stats(), right.stats()), (Some(json!("alive")), Some(json!("alive"))));
+        }
+        assert!(left_runs.try_recv().is_err() && right_runs.try_recv().is_err(), "not yet");
+        begins.send(true).unwrap();
+        left_runs.recv().unwrap();
+        right_runs.recv().unwrap();
+        left.shutdown().unwrap();
+        assert!(!right.has_ended());
+        assert_eq!(right.stats(), Some(json!("alive")));
+        drop(worker);
+        assert_eq!(right.stats(), Some(json!("alive")), "its thread is there as long as it is");
+        right.shutdown().unwrap();
+    }
+
+    #[test]
+    fn one_that_panics_ends_with_an_error_and_the_others_go_on() {
+        let worker = Worker::start("test").unwrap();
+        let (begins, begin) = Begin::channel();
+        let (left, left_runs) = opened(&worker, &begin, true);
+        let (right, right_runs) = opened(&worker, &begin, false);
+        begins.send(true).unwrap();
+        left_runs.recv().unwrap();
+        right_runs.recv().unwrap();
+        assert_eq!(left.shutdown(), Err(panicked()));
+        assert_eq!(right.stats(), Some(json!("alive")));
+        right.shutdown().unwrap();
+    }
+
+    #[test]
+    fn one_that_does_not_open_says_why() {
+        let worker = Worker::start("test").unwrap();
+        let (_begins, begin) = Begin::channel();
+        let place = Place::among(worker, begin, Span::none());
+        let refused = host::start(&place, "told", async |_| Err::<Told, _>(StartError::new("no device")));
+        assert_eq!(refused.unwrap_err().to_string(), "no device");
+    }
+}
