@@ -12,7 +12,7 @@ use proto_core::config::image::{
 };
 use proto_core::config::{
     BoardAddress, Bus, CommandWhen, Echo, FieldSpec, GatewayConfig, InputBinding, InputRule, LinkSource,
-    OnStale, OutputBinding, Outside, Parity, Parts, PortValue, SendOn, Talk,
+    OnStale, OutputBinding, Outside, Parity, Parts, PortValue, SendOn, Transaction,
 };
 use proto_core::device::{Algorithm, Boundary, ByteOrder, Counts, Escape, Kind, Overflow, TextWidth, Width};
 use proto_core::modbus::rtu::Operation;
@@ -177,7 +177,7 @@ fn serialized_types_are_those_of_the_version() {
         Counts,
         TextWidth,
         Operation,
-        Talk,
+        Transaction,
         GatewayConfig,
     );
     let mut said = String::new();

@@ -150,7 +150,7 @@ fn frames_with_one_id_that_no_constant_tells_apart_are_refused() {
         cell.0.validate().err()
     };
     let error = |part, frame, first| {
-        let error = PartError::NotToldApart { frame, first, id: CanId::Standard(5) };
+        let error = PartError::Indistinguishable { frame, first, id: CanId::Standard(5) };
         let place = Place::Frame { recipe: 0, part, frame };
         Some(ConfigError { place, kind: ConfigErrorKind::Part(error) })
     };
@@ -201,10 +201,10 @@ fn a_port_hears_the_ids_of_its_exchanges() {
     let reply = frame(0x581, vec![fixed(0x43), input(T::Byte, to("WordInputReg[2]"))]);
     let refusal = frame(0x581, vec![fixed(0x80), input(T::Byte, InputBinding::Unused)]);
     let heartbeat = frame(0x701, vec![input(T::Byte, to("WordInputReg[3]"))]);
-    let asked = Talk::Frames { request, reply, refusal };
-    let unasked = Talk::Frames { request: None, reply: heartbeat, refusal: None };
-    cell.0.exchanges.push(Exchange::new(0, asked, AskWhen::every(MS(100)))).unwrap();
-    cell.0.exchanges.push(Exchange::new(0, unasked, AskWhen::NEVER)).unwrap();
+    let asked = Transaction::Frames { request, reply, refusal };
+    let unasked = Transaction::Frames { request: None, reply: heartbeat, refusal: None };
+    cell.0.exchanges.push(Exchange::new(0, asked, Triggers::every(MS(100)))).unwrap();
+    cell.0.exchanges.push(Exchange::new(0, unasked, Triggers::NEVER)).unwrap();
     cell.last_recipe().exchanges = Span { start: 0, len: 2 };
     cell.0.validate().unwrap();
     let view = cell.0.view();
@@ -217,7 +217,7 @@ fn a_port_hears_the_ids_of_its_exchanges() {
         Err(ConfigError { place: Place::Exchange { exchange, key, .. }, kind }) => (exchange, key, kind),
         other => panic!("{other:?}"),
     };
-    let kind = |id| ConfigErrorKind::Exchange(ExchangeError::NotToldApart { id: CanId::Standard(id) });
+    let kind = |id| ConfigErrorKind::Exchange(ExchangeError::Indistinguishable { id: CanId::Standard(id) });
     let mut same = Cell(cell.0.clone());
     let fields = same.fields([fixed(0x43), input(T::Byte, InputBinding::Unused)]);
     same.0.frames[usize::from(refusal.unwrap())].fields = fields;
@@ -473,8 +473,8 @@ fn a_request_on_can_may_be_without_data() {
     let fields = cell.fields([]);
     let (id, head, tail) = (Some(CanId::Standard(0x80)), Delimiter::new(), Delimiter::new());
     cell.0.frames.push(FrameSpec { id, remote: false, head, tail, fields }).unwrap();
-    let sync = Talk::Frames { request: Some(0), reply: None, refusal: None };
-    cell.0.exchanges.push(Exchange::new(0, sync, AskWhen::every(MS(20)))).unwrap();
+    let sync = Transaction::Frames { request: Some(0), reply: None, refusal: None };
+    cell.0.exchanges.push(Exchange::new(0, sync, Triggers::every(MS(20)))).unwrap();
     cell.last_recipe().exchanges = Span { start: 0, len: 1 };
     let mut rig = cell.rig();
     rig.run(MS(300));

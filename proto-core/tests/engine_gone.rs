@@ -109,7 +109,7 @@ fn a_bus_that_is_off_takes_its_commands_with_it() {
 }
 
 #[test]
-fn a_frame_that_is_overdue_takes_its_commands_with_it() {
+fn a_frame_that_is_overduetakes_its_commands_with_it() {
     let mut rig = busy(BUS);
     rig.run(MS(50));
     rig.can(BUS, IDS[1], &[NOTHING]);
@@ -121,7 +121,7 @@ fn a_frame_that_is_overdue_takes_its_commands_with_it() {
 }
 
 #[test]
-fn a_frame_that_is_overdue_leaves_those_of_the_other_id() {
+fn a_frame_that_is_overdueleaves_those_of_the_other_id() {
     let mut rig = panels();
     rig.can(BUS, IDS[0], &[RUN]);
     rig.run(MS(50));

@@ -24,12 +24,12 @@ use rig::*;
 /// Bit 0 of this byte starts, bit 1 stops.
 const BITS: &str = "BitOutputReg[3]";
 
-fn rising(bit: u8) -> AskWhen {
-    AskWhen { rising: Some((var(BITS), bit)), ..AskWhen::NEVER }
+fn rising(bit: u8) -> Triggers {
+    Triggers { rising: Some((var(BITS), bit)), ..Triggers::NEVER }
 }
 
-fn every(millis: u64) -> AskWhen {
-    AskWhen::every(MS(millis))
+fn every(millis: u64) -> Triggers {
+    Triggers::every(MS(millis))
 }
 
 fn place_of(name: &str) -> usize {
@@ -190,7 +190,7 @@ fn axis(cell: &mut Cell) -> Vec<Exchange> {
     let mut start = writes(cell, 3, &["WordOutputReg[1]"], rising(0));
     start.outcome = OutcomeTo { to: Some(var("WordInputReg[5]")), ..OutcomeTo::NONE };
     let mut stop = writes(cell, 3, &["WordOutputReg[2]"], rising(1));
-    let Talk::Rtu { operation, .. } = &mut stop.talk else { panic!() };
+    let Transaction::Rtu { operation, .. } = &mut stop.transaction else { panic!() };
     (*operation, stop.stop) = (Operation::WriteRegisters { address: 0x30, count: 1 }, true);
     vec![reads(cell, 3, &["WordInputReg[1]"], every(50)), start, stop]
 }
@@ -206,7 +206,7 @@ fn bits_of_a_register_are_confirmed_by_all_of_their_request() {
         let mut device = Device::new(|cell| {
             let mut write = writes(cell, 3, &["WordOutputReg[1]"], rising(0));
             write.outcome = OutcomeTo { to: Some(var("WordInputReg[5]")), ..OutcomeTo::NONE };
-            let Talk::Rtu { operation, written, .. } = &mut write.talk else { panic!() };
+            let Transaction::Rtu { operation, written, .. } = &mut write.transaction else { panic!() };
             *operation = Operation::MaskWriteRegister { address: 0x20, mask: 0x0FF0 };
             let FieldSpec::DeviceOutput { encoding, .. } = &mut cell.0.fields[usize::from(written.start)]
             else {
@@ -228,7 +228,7 @@ fn bits_of_a_register_are_confirmed_by_all_of_their_request() {
 #[test]
 fn a_register_of_the_device_reaches_the_robot_and_back() {
     let mut device = Device::new(|cell| {
-        let change = AskWhen { change: true, ..AskWhen::NEVER };
+        let change = Triggers { change: true, ..Triggers::NEVER };
         vec![
             reads(cell, 3, &["WordInputReg[1]", "WordInputReg[2]"], every(50)),
             writes(cell, 4, &["WordOutputReg[1]"], change),
@@ -253,7 +253,7 @@ fn a_late_reply_is_counted_and_nothing_waits_for_it() {
     let mut device = Device::new(|cell| {
         let mut polls = ["WordInputReg[1]", "WordInputReg[2]"].map(|name| reads(cell, 3, &[name], every(20)));
         for (nth, poll) in polls.iter_mut().enumerate() {
-            let Talk::Rtu { operation, .. } = &mut poll.talk else { panic!() };
+            let Transaction::Rtu { operation, .. } = &mut poll.transaction else { panic!() };
             *operation = Operation::ReadHoldingRegisters { address: nth as u16, count: 1 };
             (poll.timeout, poll.late, poll.retries) = (MS(30), None, 0);
         }
@@ -346,7 +346,7 @@ fn a_value_is_as_old_as_its_own_reply() {
 #[test]
 fn a_repetition_has_the_newest_value() {
     let mut device = Device::new(|cell| {
-        let change = AskWhen { change: true, ..AskWhen::NEVER };
+        let change = Triggers { change: true, ..Triggers::NEVER };
         vec![writes(cell, 3, &["WordOutputReg[1]"], change)]
     });
     device.set("WordOutputReg[1]", 1);
@@ -447,7 +447,7 @@ fn half_a_frame_that_ends_later_is_still_the_same_frame() {
     let mut device = Device::new(|cell| {
         let mut polls = ["WordInputReg[1]", "WordInputReg[2]"].map(|name| reads(cell, 3, &[name], every(50)));
         for (nth, poll) in polls.iter_mut().enumerate() {
-            let Talk::Rtu { operation, .. } = &mut poll.talk else { panic!() };
+            let Transaction::Rtu { operation, .. } = &mut poll.transaction else { panic!() };
             *operation = Operation::ReadHoldingRegisters { address: nth as u16, count: 1 };
             (poll.timeout, poll.retries) = (MS([30, 100][nth]), 0);
         }
@@ -618,7 +618,7 @@ fn a_stop_goes_first_and_survives_the_loss_of_its_connection() {
 fn a_connection_that_is_back_soon_starts_nothing_again_and_an_absence_does() {
     let mut device = Device::new(|cell| {
         let poll = reads(cell, 3, &["WordInputReg[1]"], every(50));
-        let start = AskWhen { start: true, ..AskWhen::NEVER };
+        let start = Triggers { start: true, ..Triggers::NEVER };
         vec![poll, writes(cell, 3, &["WordOutputReg[1]"], start)]
     });
     device.set("WordOutputReg[1]", 1);
@@ -639,7 +639,7 @@ fn a_connection_that_is_back_soon_starts_nothing_again_and_an_absence_does() {
 #[test]
 fn a_value_that_waits_is_written_on_the_next_connection() {
     let mut device = Device::new(|cell| {
-        let change = AskWhen { change: true, ..AskWhen::NEVER };
+        let change = Triggers { change: true, ..Triggers::NEVER };
         vec![writes(cell, 3, &["WordOutputReg[1]"], change)]
     });
     device.set("WordOutputReg[1]", 1);

@@ -544,7 +544,7 @@ fn mistakes_are_refused() {
         assert_eq!(kind(&with(name)), Kind::NotForHealth { var: var(name) });
     }
     assert_eq!(kind(&with("WordInputReg[1]")), Kind::HealthTwice { var: var("WordInputReg[1]") });
-    let no_way = Kind::NoWayUp { var: var("FloatInputReg[1]"), port: 0 };
+    let no_way = Kind::NoRoute { var: var("FloatInputReg[1]"), port: 0 };
     assert_eq!(kind(&with("FloatInputReg[1]")), no_way);
     let twice = port(&|port| {
         (port.health.alive, port.health.age) = (Some(var("WordInputReg[2]")), Some(var("WordInputReg[2]")));

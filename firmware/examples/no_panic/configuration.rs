@@ -97,7 +97,7 @@ fn config_questions(config: &GatewayConfig) {
 fn plan_new(config: &GatewayConfig) {
     if let Ok(plan) = Plan::new(config) {
         for var in SysVar::all() {
-            black_box((plan.owner(var), plan.way_up(var), plan.source(var)));
+            black_box((plan.owner(var), plan.route(var), plan.source(var)));
         }
     }
 }

@@ -46,7 +46,7 @@ pub(crate) fn all() {
     say(any(image::NoSpace { available: 0 }));
     let Ok(var) = any(SysVar::parse("DI[1]")) else { return };
     say(var);
-    say(any(PlanError::NoWayUp { var, port: proto_core::engine::PortId(0) }));
+    say(any(PlanError::NoRoute { var, port: proto_core::engine::PortId(0) }));
     say(any(sysvar::ParseError::Syntax));
     say(any(Duration::ZERO));
     say(any(ScalarType::Byte));

@@ -125,7 +125,7 @@ pub enum Done {
 /// Sends at a rate: the n-th message is `make(n)` and leaves at `start + n * 1 s / rate`, rounded down
 /// to the microsecond. No rounding errors accumulate.
 #[derive(Debug, Clone)]
-pub struct Talker<F> {
+pub struct PeriodicSender<F> {
     start: Instant,
     per_second: u64,
     sent: u64,
@@ -133,7 +133,7 @@ pub struct Talker<F> {
     make: F,
 }
 
-impl<F> Talker<F> {
+impl<F> PeriodicSender<F> {
     /// `per_second` messages per second from `start` on, `count` in total.
     ///
     /// The rate must be from 1 to 1 000 000.
@@ -143,7 +143,7 @@ impl<F> Talker<F> {
     }
 }
 
-impl<M, F: FnMut(u64) -> M> Device<M> for Talker<F> {
+impl<M, F: FnMut(u64) -> M> Device<M> for PeriodicSender<F> {
     fn deadline(&self) -> Instant {
         if self.sent >= self.count {
             return Instant::NEVER;

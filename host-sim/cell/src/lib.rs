@@ -62,7 +62,7 @@ use proto_core::engine::{BuildError as EngineError, Engine, LinkId, OUTPUT_BUFFE
 use proto_core::time::{Duration, Instant};
 
 pub use can::{BusCounters, CanBus};
-pub use device::{Device, Done, Responder, Served, Server, SlaveDone, Talker};
+pub use device::{Device, Done, PeriodicSender, Responder, Served, Server, SlaveDone};
 pub use injector::{FaultInjector, FaultKind};
 pub use judge::{Act, Kind, OUTCOMES, Order};
 pub use line::{Chunking, Line, LineCounters, MAX_HEARD, Wiring};

@@ -122,7 +122,7 @@ fn a_peer_that_acknowledges_late_slows_nothing_and_one_that_does_not_is_given_up
     cell.run_ms(505);
     let line = cell.line_of("rs485-1");
     let frame = |n: u64| vec![0xFF, 0xFF, n as u8, 0xEE, 0xEE];
-    cell.attach(line, Talker::new(cell.now(), 250, 2_500, frame));
+    cell.attach(line, PeriodicSender::new(cell.now(), 250, 2_500, frame));
     cell.run_ms(5_000);
     let link = cell.link(CLIENT);
     assert_eq!((link.history.losses, link.counters.unacknowledged), (0, 0));
@@ -163,7 +163,7 @@ fn a_full_transport_takes_the_next_when_there_is_room() {
     cell.network(CLIENT).delay = Duration::from_millis(10);
     let line = cell.line_of("rs485-1");
     let frame = |n: u64| vec![0xFF, 0xFF, n as u8, 0xEE, 0xEE];
-    cell.attach(line, Talker::new(cell.now(), 250, u64::MAX, frame));
+    cell.attach(line, PeriodicSender::new(cell.now(), 250, u64::MAX, frame));
     let before = cell.link(CLIENT).counters.sent;
     cell.run_ms(2_000);
     // Two frames of five bytes in each round trip of 20 ms.

@@ -22,7 +22,7 @@ fn system(chunking: Chunking) -> (Cell, LineId) {
 fn what_comes_in_a_short_stall_is_told_before_time_passes() {
     let (mut cell, line) = system(Chunking::Pieces(3));
     let frame = |n: u64| vec![0xFF, 0xFF, (n & 1) as u8, 0xEE, 0xEE];
-    cell.attach(line, Talker::new(cell.now(), 50, u64::MAX, frame));
+    cell.attach(line, PeriodicSender::new(cell.now(), 50, u64::MAX, frame));
     cell.run_ms(200);
     let before = *cell.port("rs485-1");
     cell.stall_gateway(Duration::from_millis(490));

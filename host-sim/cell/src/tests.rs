@@ -27,7 +27,10 @@ fn the_same_seed_is_the_same_run_and_another_is_not() {
         let line = cell.line_of("rs485-1");
         cell.line(line).noise_ppm = 5_000;
         cell.line(line).chunking = Chunking::Random(4);
-        cell.attach(line, Talker::new(cell.now(), 50, 200, |n| vec![0xFF, 0xFF, (n & 1) as u8, 0xEE, 0xEE]));
+        cell.attach(
+            line,
+            PeriodicSender::new(cell.now(), 50, 200, |n| vec![0xFF, 0xFF, (n & 1) as u8, 0xEE, 0xEE]),
+        );
         cell.run(Duration::from_secs(4));
         (cell.trace().digest(), cell.trace().count())
     };
@@ -157,11 +160,11 @@ fn every_kind_of_fault_and_the_cell_recovers() {
         let start = cell.now();
         if let Some(line) = cell.lines().next() {
             let frame = |n: u64| vec![0xFF, 0xFF, (n & 1) as u8, 0xEE, 0xEE];
-            cell.attach(line, Talker::new(start, 20, u64::MAX, frame));
+            cell.attach(line, PeriodicSender::new(start, 20, u64::MAX, frame));
         }
         if let Some(bus) = cell.buses().next() {
             let frame = |n: u64| CanFrame::new(CanId::Standard(1), &[(n & 1) as u8]).unwrap();
-            cell.attach_can(bus, Talker::new(start, 20, u64::MAX, frame));
+            cell.attach_can(bus, PeriodicSender::new(start, 20, u64::MAX, frame));
         }
         let mut injector = FaultInjector::new(&mut cell, &FaultKind::ALL, Duration::from_millis(300));
         injector.run(&mut cell, Duration::from_secs(80));

@@ -5,7 +5,7 @@
 
 use proto_core::command::{Action, Keyword, Request};
 use proto_core::config::{
-    Bus, Echo, Exchange, FieldSpec, GatewayConfig, InputBinding, Port, Recipe, Span, Talk,
+    Bus, Echo, Exchange, FieldSpec, GatewayConfig, InputBinding, Port, Recipe, Span, Transaction,
 };
 use proto_core::sysvar::Direction;
 use proto_core::time::Duration;
@@ -93,8 +93,8 @@ impl PortChanges<'_> {
 
     fn echo(&mut self) {
         let Bus::Rs485(line) = &self.port.bus else { return };
-        let may_be_echo = |exchange: &Exchange| match exchange.talk {
-            Talk::Rtu { operation, .. } => operation.is_repeated_by_reply(),
+        let may_be_echo = |exchange: &Exchange| match exchange.transaction {
+            Transaction::Rtu { operation, .. } => operation.is_repeated_by_reply(),
             _ => true,
         };
         let concerned = |exchange: &Exchange| exchange.is_answered() && may_be_echo(exchange);
@@ -144,7 +144,7 @@ impl PortChanges<'_> {
         if let Some(reply) = named.and_then(|named| named.reply.as_ref())
             && let Some(said) = self.rejects(reply, exchange.overdue.unwrap_or(self.port.timeout))
         {
-            let is_modbus = matches!(exchange.talk, Talk::Rtu { .. });
+            let is_modbus = matches!(exchange.transaction, Transaction::Rtu { .. });
             self.tell_of(nth, if is_modbus { "read" } else { "reply" }, &said);
         }
         if exchange.is_answered() && named.is_some_and(is_sdo_without_refusal) {
@@ -237,7 +237,8 @@ impl PortChanges<'_> {
     }
 
     fn refusals(&mut self, nth: usize, exchange: &Exchange) {
-        let writes = matches!(exchange.talk, Talk::Rtu { operation, .. } if operation.written_len() > 0);
+        let writes =
+            matches!(exchange.transaction, Transaction::Rtu { operation, .. } if operation.written_len() > 0);
         let is_state = exchange.when.change && exchange.when.every.is_none() && !exchange.stop;
         if writes && is_state && exchange.is_answered() {
             self.tell_of(
@@ -257,7 +258,8 @@ impl PortChanges<'_> {
         };
         let first = self.exchanges.iter().position(|one| one.is_answered() && answered(one.peer) > 1);
         if let Some(first) = first {
-            let is_modbus = self.exchanges.iter().any(|one| matches!(one.talk, Talk::Rtu { .. }));
+            let is_modbus =
+                self.exchanges.iter().any(|one| matches!(one.transaction, Transaction::Rtu { .. }));
             self.tell_of(
                 first,
                 if is_modbus { "slave" } else { "peer" },

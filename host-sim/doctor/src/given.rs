@@ -1,7 +1,7 @@
 //! Findings about values that gave no command, and about presses that may be among discarded input.
 
 use proto_core::config::{ConfigView, FieldSpec, InputBinding, Recipe};
-use proto_core::engine::{NotGiven, Rejection};
+use proto_core::engine::{DropReason, Rejection};
 use proto_core::sysvar::Direction;
 
 use crate::bytes::count;
@@ -45,7 +45,7 @@ fn no_command(seen: &Seen<'_>, withheld: &Withheld) -> Option<Finding> {
     let (value, age) = (format!("value {value}"), ago(age));
     let warning = |cause, words| Some(seen.found(Severity::Warning, cause, words));
     match why? {
-        NotGiven::Based => warning(
+        DropReason::Based => warning(
             Cause::FirstValue,
             [
                 format!("{value} gave no command{age}: it was the first after the start, silence, sleep or a lost device"),
@@ -56,7 +56,7 @@ fn no_command(seen: &Seen<'_>, withheld: &Withheld) -> Option<Finding> {
                     .into(),
             ],
         ),
-        NotGiven::Unknown => warning(
+        DropReason::Unknown => warning(
             Cause::UnknownValue,
             [
                 format!("{value} gave no command{age}: it is in no entry of the table"),

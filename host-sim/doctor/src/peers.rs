@@ -1,6 +1,6 @@
 //! Findings about slaves and other peers that a port asks.
 
-use proto_core::config::{Exchange, Talk};
+use proto_core::config::{Exchange, Transaction};
 use proto_core::device::{Algorithm, ByteOrder};
 use proto_core::modbus::Exception;
 use proto_core::schedule::Presence;
@@ -13,12 +13,13 @@ use crate::state::Peer;
 /// Looks at each peer.
 pub(crate) fn examine(seen: &Seen<'_>, findings: &mut Vec<Finding>) {
     let exchanges = seen.case.config.exchanges_of(seen.recipe);
-    let is_served = exchanges.iter().any(|exchange| matches!(exchange.talk, Talk::Served { .. }));
+    let is_served =
+        exchanges.iter().any(|exchange| matches!(exchange.transaction, Transaction::Served { .. }));
     if is_served {
         served(seen, exchanges, findings);
         return;
     }
-    let is_modbus = exchanges.iter().any(|exchange| matches!(exchange.talk, Talk::Rtu { .. }));
+    let is_modbus = exchanges.iter().any(|exchange| matches!(exchange.transaction, Transaction::Rtu { .. }));
     for &peer in &seen.status.peers {
         let counters = peer.counters;
         if peer.presence == Presence::Down && counters.requests >= 2 {

@@ -1,7 +1,7 @@
 //! What a gateway says of itself, in a form of its own: taken from an engine, or read from the documents of the API.
 
 use proto_core::engine::{
-    FieldBus, LinkCounters, LinkId, LinkKind, NotGiven, PeerCounters, PortCounters, PortId, PortState,
+    DropReason, FieldBus, LinkCounters, LinkId, LinkKind, PeerCounters, PortCounters, PortId, PortState,
     Rejection, ReplyCode, Status, Transport,
 };
 use proto_core::link::{LinkHistory, LinkState};
@@ -44,7 +44,7 @@ pub(crate) struct Port {
 #[derive(Debug, Clone)]
 pub(crate) struct Withheld {
     /// The reason, if it is one that this program knows.
-    pub(crate) why: Option<NotGiven>,
+    pub(crate) why: Option<DropReason>,
     /// The reason in words.
     pub(crate) text: String,
     pub(crate) value: i64,
@@ -120,7 +120,7 @@ impl From<Status<'_>> for State {
             overdue: port.overdue,
             reply: port.reply,
             command: port.command.map(|command| command.to_string()),
-            not_given: port.last_not_given.map(|last| Withheld {
+            not_given: port.last_dropped.map(|last| Withheld {
                 why: Some(last.why),
                 text: last.why.text().to_owned(),
                 value: last.value,

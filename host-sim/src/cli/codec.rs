@@ -92,7 +92,7 @@ impl Part {
         recipes: &[AnyRecipe],
         name: Option<&str>,
         number: Option<usize>,
-        talk: Option<TalkPart>,
+        part: Option<ExchangePart>,
     ) -> Result<Self, String> {
         let recipe = choose_recipe(recipes, name)?;
         let name = recipe.name();
@@ -113,20 +113,20 @@ impl Part {
                 format!("there is no exchange {number} in recipe {name:?}; allowed: 1..={}", all.len())
             })?,
         };
-        let all = [TalkPart::Request, TalkPart::Reply, TalkPart::Pending, TalkPart::Refusal];
+        let all = [ExchangePart::Request, ExchangePart::Reply, ExchangePart::Pending, ExchangePart::Refusal];
         let there: Vec<_> = all.into_iter().filter(|part| part.of(exchange).is_some()).collect();
         let names = || there.iter().map(|part| part.name()).collect::<Vec<_>>().join(", ");
-        let talk = match (talk, &there[..]) {
-            (Some(talk), _) => talk,
+        let part = match (part, &there[..]) {
+            (Some(part), _) => part,
             (None, [only]) => *only,
             (None, _) => {
                 return Err(format!("the exchange has several frames; choose one with --part: {}", names()));
             }
         };
-        let frame = talk
+        let frame = part
             .of(exchange)
-            .ok_or_else(|| format!("the exchange has no {}; there are {}", talk.name(), names()))?;
-        let device = DevicePart::of_exchange(exchange, frame, talk == TalkPart::Request)?;
+            .ok_or_else(|| format!("the exchange has no {}; there are {}", part.name(), names()))?;
+        let device = DevicePart::of_exchange(exchange, frame, part == ExchangePart::Request)?;
         Ok(Self::of_device(device))
     }
 
@@ -227,14 +227,14 @@ fn choose_recipe<'r>(recipes: &'r [AnyRecipe], name: Option<&str>) -> Result<&'r
 
 /// A frame of an exchange.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum TalkPart {
+pub(super) enum ExchangePart {
     Request,
     Reply,
     Pending,
     Refusal,
 }
 
-impl TalkPart {
+impl ExchangePart {
     fn name(self) -> &'static str {
         match self {
             Self::Request => "request",

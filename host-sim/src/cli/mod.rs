@@ -7,10 +7,10 @@
 mod cells;
 mod check;
 mod codec;
-mod conversation;
 mod convert;
 mod ctl;
 mod doctor;
+mod exchange_report;
 mod export;
 mod extcap;
 mod fleet;
@@ -38,7 +38,7 @@ use std::process::ExitCode;
 use clap::{Args, CommandFactory, Parser, Subcommand, ValueEnum};
 use proto_core::sysvar::Direction;
 
-use codec::TalkPart;
+use codec::ExchangePart;
 use recipe_config::file;
 use recipe_runtime::out::{Out, Printed, print_stderr};
 
@@ -286,7 +286,7 @@ enum PartName {
 /// A part of a recipe, or of one of its exchanges.
 enum Chosen {
     Part(Direction),
-    Talk(TalkPart),
+    Exchange(ExchangePart),
 }
 
 impl From<PartName> for Chosen {
@@ -294,10 +294,10 @@ impl From<PartName> for Chosen {
         match part {
             PartName::Input => Self::Part(Direction::Input),
             PartName::Output => Self::Part(Direction::Output),
-            PartName::Request => Self::Talk(TalkPart::Request),
-            PartName::Reply => Self::Talk(TalkPart::Reply),
-            PartName::Pending => Self::Talk(TalkPart::Pending),
-            PartName::Refusal => Self::Talk(TalkPart::Refusal),
+            PartName::Request => Self::Exchange(ExchangePart::Request),
+            PartName::Reply => Self::Exchange(ExchangePart::Reply),
+            PartName::Pending => Self::Exchange(ExchangePart::Pending),
+            PartName::Refusal => Self::Exchange(ExchangePart::Refusal),
         }
     }
 }
@@ -429,8 +429,8 @@ fn decode(args: &DecodeArgs, out: &mut dyn Write) -> Outcome {
 impl Which {
     /// Whether a frame of an exchange was asked for.
     fn is_of_exchange(&self) -> bool {
-        let is_talk = matches!(self.part.map(Chosen::from), Some(Chosen::Talk(_)));
-        is_talk || self.exchange.is_some()
+        let is_exchange = matches!(self.part.map(Chosen::from), Some(Chosen::Exchange(_)));
+        is_exchange || self.exchange.is_some()
     }
 
     fn part(&self) -> Result<codec::Part, String> {
@@ -444,8 +444,8 @@ impl Which {
             }
             (Some(Chosen::Part(part)), None) => codec::Part::choose(&recipes, recipe, Some(part)),
             (None, None) => codec::Part::choose(&recipes, recipe, None),
-            (Some(Chosen::Talk(talk)), number) => {
-                codec::Part::choose_exchange(&recipes, recipe, number, Some(talk))
+            (Some(Chosen::Exchange(part)), number) => {
+                codec::Part::choose_exchange(&recipes, recipe, number, Some(part))
             }
             (None, number) => codec::Part::choose_exchange(&recipes, recipe, number, None),
         };

@@ -1,7 +1,7 @@
 //! The way up or the source of each variable, as `check` prints it.
 
 use proto_core::config::{Bus, FieldSpec, GatewayConfig, InputBinding, LinkSource, OutputBinding, SendOn};
-use proto_core::engine::{LinkId, Plan, PortId, Source, WayUp};
+use proto_core::engine::{LinkId, Plan, PortId, Route, Source};
 use proto_core::sysvar::{Direction, ModbusPlace, SysVar, VarBit};
 use serde::Serialize;
 
@@ -23,14 +23,14 @@ pub(super) fn ways(config: &GatewayConfig) -> Vec<Way> {
     let Ok(plan) = Plan::new(config) else { return Vec::new() };
     let mut lines: Vec<(String, String, String)> = Vec::new();
     for (_, port, recipe) in config.view().field_ports() {
-        let up = config.view().written_by(recipe).map(|var| (var, way_up(config, &plan, var)));
+        let up = config.view().written_by(recipe).map(|var| (var, route(config, &plan, var)));
         add(&mut lines, &port.name, up);
         add_bits(&mut lines, &port.name, config.view().bits_written_by(recipe), |bit| {
-            way_up(config, &plan, bit.var)
+            route(config, &plan, bit.var)
         });
         for (value, var) in port.health.iter() {
             let what = format!("{} in {var}", value.name());
-            lines.push((port.name.to_string(), what, way_up(config, &plan, var)));
+            lines.push((port.name.to_string(), what, route(config, &plan, var)));
         }
         let commands: u16 = config
             .view()
@@ -145,10 +145,10 @@ fn add_bits(
     }
 }
 
-fn way_up(config: &GatewayConfig, plan: &Plan, var: SysVar) -> String {
-    match plan.way_up(var) {
-        Some(WayUp::Recipe(link)) => format!("-> controller: {}", link_name(config, link)),
-        Some(WayUp::Modbus) => format!("-> controller: Modbus {}", modbus_kind(var)),
+fn route(config: &GatewayConfig, plan: &Plan, var: SysVar) -> String {
+    match plan.route(var) {
+        Some(Route::Recipe(link)) => format!("-> controller: {}", link_name(config, link)),
+        Some(Route::Modbus) => format!("-> controller: Modbus {}", modbus_kind(var)),
         None => "-> nowhere".into(),
     }
 }

@@ -1,6 +1,6 @@
 //! The documents of a gateway, compared with what serde makes of the same status.
 
-use proto_core::config::{Ask, GatewayConfig, InputField, Port, Recipe};
+use proto_core::config::{ExchangeBuilder, GatewayConfig, InputField, Port, Recipe};
 use proto_core::engine::{Engine, Input, LinkId, OUTPUT_BUFFER, Output, PortId};
 use proto_core::time::{Duration, Instant};
 use recipe_api::documents::{Document, Pieces};
@@ -90,7 +90,9 @@ fn a_piece_is_small_and_later_pieces_may_be_of_a_later_instant() {
 fn the_peers_of_a_port_are_pieces_too() {
     let padding = [InputField::padding(2)];
     let asks: Vec<_> = (1..=20)
-        .map(|slave| Ask::read_holding_registers(slave, 0, &padding).every(Duration::from_millis(1_000)))
+        .map(|slave| {
+            ExchangeBuilder::read_holding_registers(slave, 0, &padding).every(Duration::from_millis(1_000))
+        })
         .collect();
     let config: GatewayConfig = GatewayConfig::builder()
         .controller("127.0.0.1")

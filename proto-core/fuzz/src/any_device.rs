@@ -3,9 +3,9 @@
 //! Most of them are right, because a wrong one is refused before anything happens. Some are not.
 
 use proto_core::config::{
-    AskWhen, Bus, CanFramePart, CommandWhen, Delimiter, Echo, Exchange, FieldSpec, FrameSpec, InputBinding,
-    InputRule, Limits, LinkSource, MapEntry, NoText, OutputBinding, Outside, Parts, PortValue, Restarted,
-    Span, StateValue, StreamPart, Talk, Words,
+    Bus, CanFramePart, CommandWhen, Delimiter, Echo, Exchange, FieldSpec, FrameSpec, InputBinding, InputRule,
+    Limits, LinkSource, MapEntry, NoText, OutputBinding, Outside, Parts, PortValue, Restarted, Span,
+    StateValue, StreamPart, Transaction, Triggers, Words,
 };
 use proto_core::device::{
     Algorithm, Bits, Boundary, ByteOrder, Checksum, Counts, Encoding, Escape, Ignored, Kind, Length,
@@ -305,10 +305,10 @@ fn coils(input: &mut Source<'_>, direction: Direction, table: Span) -> (Vec<Fiel
     (specs.collect(), count.into())
 }
 
-fn when(input: &mut Source<'_>) -> AskWhen {
+fn when(input: &mut Source<'_>) -> Triggers {
     let kind = input.u8();
     let every = [Some(5), Some(20), Some(100), None][usize::from(kind & 3)].map(Duration::from_millis);
-    AskWhen {
+    Triggers {
         every,
         start: every.is_none() || kind & 4 != 0,
         change: kind & 8 != 0,
@@ -316,13 +316,13 @@ fn when(input: &mut Source<'_>) -> AskWhen {
     }
 }
 
-fn exchange(input: &mut Source<'_>, peer: u8, talk: Talk, when: AskWhen) -> Exchange {
+fn exchange(input: &mut Source<'_>, peer: u8, transaction: Transaction, when: Triggers) -> Exchange {
     let kind = input.u8();
     Exchange {
         timeout: Duration::from_millis([5, 20, 100, 1_000][usize::from(kind & 3)]),
         retries: kind >> 2 & 3,
         pause: Duration::from_millis([0, 0, 3, 50][usize::from(kind >> 4 & 3)]),
-        ..Exchange::new(peer, talk, when)
+        ..Exchange::new(peer, transaction, when)
     }
 }
 
@@ -374,7 +374,7 @@ fn asked(cell: &mut Cell, input: &mut Source<'_>, table: Span, nth: u16) -> Opti
     let when = when(input);
     // Two slaves, and a broadcast where nothing is read.
     let peer = if kind >= 0xE0 && !operation.reads() { 0 } else { 7 + (kind >> 6 & 1) };
-    Some(exchange(input, peer, Talk::Rtu { operation, written, read }, when))
+    Some(exchange(input, peer, Transaction::Rtu { operation, written, read }, when))
 }
 
 /// As a slave of a line.
@@ -399,7 +399,7 @@ fn served(cell: &mut Cell, input: &mut Source<'_>, table: Span, nth: u16) -> Opt
     };
     let (span, none) = (room(cell, specs)?, Span::default());
     let (written, read) = if is_written { (span, none) } else { (none, span) };
-    Some(Exchange::new(5, Talk::Served { operation, written, read }, AskWhen::NEVER))
+    Some(Exchange::new(5, Transaction::Served { operation, written, read }, Triggers::NEVER))
 }
 
 /// With frames of the device's own.
@@ -443,7 +443,7 @@ fn frames(
     };
     let pending = other(input, 80, kind & 15 == 15)?;
     let refusal = other(input, 60, kind & 7 == 7)?;
-    let when = if request.is_some() { when(input) } else { AskWhen::NEVER };
+    let when = if request.is_some() { when(input) } else { Triggers::NEVER };
     for nth in [pending, refusal].into_iter().flatten() {
         // They pick no commands, and have no counter.
         let span = cell.0.frames[usize::from(nth)].fields;
@@ -456,8 +456,8 @@ fn frames(
             }
         }
     }
-    let talk = Talk::Frames { request, reply, refusal };
-    let mut exchange = Exchange { pending, ..exchange(input, kind >> 6, talk, when) };
+    let transaction = Transaction::Frames { request, reply, refusal };
+    let mut exchange = Exchange { pending, ..exchange(input, kind >> 6, transaction, when) };
     let restarted = input.u8();
     if restarted & 3 == 0 {
         exchange.restarted = Some(Restarted { field: restarted >> 6, value: f64::from(restarted >> 2 & 15) });
@@ -471,7 +471,8 @@ pub(crate) fn line(cell: &mut Cell, input: &mut Source<'_>) {
     let recipe = usize::from(cell.last_port().recipe);
     let exchanges = cell.0.recipes[recipe].exchanges.of(&cell.0.exchanges);
     let has_exchanges = !exchanges.is_empty();
-    let is_master = has_exchanges && exchanges.iter().all(|one| matches!(one.talk, Talk::Rtu { .. }));
+    let is_master =
+        has_exchanges && exchanges.iter().all(|one| matches!(one.transaction, Transaction::Rtu { .. }));
     let port = cell.last_port();
     if let Bus::Rs485(line) = &mut port.bus {
         line.echo = match kind {

@@ -4,7 +4,8 @@
 //! to it is looked at byte by byte.
 
 use proto_core::config::{
-    Bus, DeviceFrame, Echo, Exchange, FieldSpec, FrameSpec, GatewayConfig, Parts, Recipe, StreamPart, Talk,
+    Bus, DeviceFrame, Echo, Exchange, FieldSpec, FrameSpec, GatewayConfig, Parts, Recipe, StreamPart,
+    Transaction,
 };
 use proto_core::device::{Carrier, Escape};
 use proto_core::modbus::rtu::Operation;
@@ -61,7 +62,7 @@ pub(crate) fn over_tcp(frame: &[u8], said: &Said, op: u8) -> Vec<u8> {
 /// The shortest time for which a reply is waited on this port; `None` without a master of Modbus there.
 pub(crate) fn shortest_wait(config: &GatewayConfig, port: usize) -> Option<Duration> {
     let exchanges = exchanges(config, port).iter();
-    let rtu = exchanges.filter(|exchange| matches!(exchange.talk, Talk::Rtu { .. }));
+    let rtu = exchanges.filter(|exchange| matches!(exchange.transaction, Transaction::Rtu { .. }));
     rtu.map(|exchange| exchange.timeout).min()
 }
 
@@ -85,14 +86,16 @@ pub(crate) fn bytes(
         return part_frame(config, part, input);
     }
     let exchange = exchanges.get(usize::from(which >> 1) % exchanges.len().max(1))?;
-    let frame = match exchange.talk {
-        Talk::Frames { reply, refusal, .. } => {
+    let frame = match exchange.transaction {
+        Transaction::Frames { reply, refusal, .. } => {
             let nth = answer(which, [reply, exchange.pending, refusal]);
             let spec = config.frames.get(usize::from(nth?))?;
             own_frame(config, spec, Carrier::Stream, input)?
         }
-        Talk::Rtu { .. } => slaves_reply(&said.sent, which, input)?,
-        Talk::Served { operation, .. } => with_crc(&masters_request(exchange.peer, operation, which, input)),
+        Transaction::Rtu { .. } => slaves_reply(&said.sent, which, input)?,
+        Transaction::Served { operation, .. } => {
+            with_crc(&masters_request(exchange.peer, operation, which, input))
+        }
     };
     let has_echo = matches!(&config.ports.get(port)?.bus, Bus::Rs485(line) if line.echo == Echo::Yes);
     Some(if has_echo && which & 0x40 == 0 { [&said.sent[..], &frame].concat() } else { frame })
@@ -103,7 +106,7 @@ pub(crate) fn can(config: &GatewayConfig, port: usize, input: &mut Source<'_>) -
     let which = input.u8();
     let exchanges = exchanges(config, port);
     let exchange = exchanges.get(usize::from(which >> 1) % exchanges.len().max(1))?;
-    let Talk::Frames { reply, refusal, .. } = exchange.talk else { return None };
+    let Transaction::Frames { reply, refusal, .. } = exchange.transaction else { return None };
     let nth = answer(which, [reply, exchange.pending, refusal]);
     let spec = config.frames.get(usize::from(nth?))?;
     CanFrame::new(spec.id?, &own_frame(config, spec, Carrier::Can, input)?)
@@ -206,14 +209,16 @@ pub(crate) fn may_be_sent(config: &GatewayConfig, port: usize, bytes: &[u8]) -> 
     {
         return true;
     }
-    exchanges(config, port).iter().any(|exchange| match exchange.talk {
-        Talk::Frames { request, .. } => {
+    exchanges(config, port).iter().any(|exchange| match exchange.transaction {
+        Transaction::Frames { request, .. } => {
             let spec = request.and_then(|nth| config.frames.get(usize::from(nth)));
             spec.is_some_and(|spec| bytes.starts_with(&spec.head) && bytes.ends_with(&spec.tail))
         }
-        Talk::Rtu { operation, .. } => has_right_crc(bytes) && is_request(exchange.peer, operation, bytes),
+        Transaction::Rtu { operation, .. } => {
+            has_right_crc(bytes) && is_request(exchange.peer, operation, bytes)
+        }
         // A reply is of the own address.
-        Talk::Served { .. } => has_right_crc(bytes) && bytes[0] == exchange.peer,
+        Transaction::Served { .. } => has_right_crc(bytes) && bytes[0] == exchange.peer,
     })
 }
 
@@ -226,7 +231,7 @@ pub(crate) fn may_be_sent_can(config: &GatewayConfig, port: usize, frame: &CanFr
         return true;
     }
     exchanges(config, port).iter().any(|exchange| {
-        let Talk::Frames { request: Some(request), .. } = exchange.talk else { return false };
+        let Transaction::Frames { request: Some(request), .. } = exchange.transaction else { return false };
         let spec = config.frames.get(usize::from(request));
         spec.is_some_and(|spec| spec.id == Some(frame.id()) && spec.remote == frame.is_remote())
     })

@@ -7,9 +7,9 @@
 use heapless::{String, Vec};
 
 use super::add_exchange::FrameNumbers;
-use super::ask::Ask;
 use super::draft::{ControllerBuilder, Counts, PartFields, PortBuilder, PortBus, RecipeBuilder, Trigger};
 use super::error::{ConfigError, ConfigErrorKind as Kind, ControllerKey, Counted, Place, PortKey, RecipeKey};
+use super::exchange_builder::ExchangeBuilder;
 use super::fields::{CanFields, Does, Entries, Fields, InputField, OutputField, Sends, plain};
 use super::rules::{check_bit, check_name, check_room, text};
 use super::view::ConfigMut;
@@ -151,7 +151,9 @@ impl ConfigMut<'_> {
             | (PartFields::Stream { .. }, PartFields::Can(_)) => {
                 return Err(ConfigError { place: at(RecipeKey::Whole), kind: Kind::MixedParts });
             }
-            (PartFields::Absent, PartFields::Absent) if from.exchanges.iter().any(Ask::is_can) => {
+            (PartFields::Absent, PartFields::Absent)
+                if from.exchanges.iter().any(ExchangeBuilder::is_can) =>
+            {
                 Parts::Can { input: Vec::new(), output: Vec::new() }
             }
             (input, output) => Parts::Stream {

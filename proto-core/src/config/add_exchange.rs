@@ -1,15 +1,15 @@
 //! Exchanges are added to a configuration with their recipe.
 //!
-//! In: what a program wrote ([`Ask`]). Out: entries of the configuration's lists. Coils are packed into
+//! In: what a program wrote ([`ExchangeBuilder`]). Out: entries of the configuration's lists. Coils are packed into
 //! bytes, and registers and coils counted. Room was checked when the recipe was begun.
 
-use super::ask::{Ask, AskFrame, AskTalk, of_block};
 use super::device::register_bits;
 use super::error::{ConfigError, ConfigErrorKind as Kind, ExchangeKey, Place};
-use super::exchange::{Exchange, FrameSpec, Talk, has_values};
+use super::exchange::{Exchange, FrameSpec, Transaction, has_values};
+use super::exchange_builder::{ExchangeBuilder, ExchangeFrame, TransactionDraft, of_block};
 use super::fields::{Fields, Var};
 use super::view::ConfigMut;
-use super::{AskWhen, Delimiter, ExchangeError, FieldSpec, OutcomeTo, Span};
+use super::{Delimiter, ExchangeError, FieldSpec, OutcomeTo, Span, Triggers};
 use crate::device::{Bits, ByteOrder, Encoding, Kind as EncodingKind, Overflow};
 use crate::modbus::rtu::{Operation, Table};
 use crate::recipe::model::MAX_DELIMITER;
@@ -38,21 +38,31 @@ impl ConfigMut<'_> {
     pub(super) fn add_exchanges(
         &mut self,
         recipe: u8,
-        asks: &[Ask<'_>],
+        asks: &[ExchangeBuilder<'_>],
         mut frames: FrameNumbers,
     ) -> Result<Span, ConfigError> {
         let start = self.exchanges.len();
         for (nth, ask) in asks.iter().enumerate() {
             let at = |key| Place::Exchange { recipe, exchange: nth as u8, key };
-            let (talk, pending) = self.talk(recipe, ask, &at, &mut frames)?;
-            let mut when = AskWhen { rising: None, ..ask.when };
+            let (transaction, pending) = self.transaction(recipe, ask, &at, &mut frames)?;
+            let mut when = Triggers { rising: None, ..ask.when };
             if let Some((var, bit)) = ask.rising {
                 let place = at(ExchangeKey::Rising);
                 let var = var.read().map_err(|error| ConfigError { place, kind: Kind::Variable(error) })?;
                 when.rising = Some((var, bit));
             }
-            let Ask {
-                peer, timeout, retries, pause, trigger, late, stop, follow, overdue, restarted, ..
+            let ExchangeBuilder {
+                peer,
+                timeout,
+                retries,
+                pause,
+                trigger,
+                late,
+                stop,
+                follow,
+                overdue,
+                restarted,
+                ..
             } = *ask;
             let outcome = outcome(&ask.outcome).map_err(|error| ConfigError {
                 place: at(ExchangeKey::Outcome),
@@ -69,23 +79,23 @@ impl ConfigMut<'_> {
                 outcome,
                 pending,
                 restarted,
-                ..Exchange::new(peer, talk, when)
+                ..Exchange::new(peer, transaction, when)
             };
             let _ = self.exchanges.push(exchange.repeated(retries));
         }
         Ok(super::add::span(start, self.exchanges.len()))
     }
 
-    fn talk(
+    fn transaction(
         &mut self,
         recipe: u8,
-        ask: &Ask<'_>,
+        ask: &ExchangeBuilder<'_>,
         at: &impl Fn(ExchangeKey) -> Place,
         frames: &mut FrameNumbers,
-    ) -> Result<(Talk, Option<u8>), ConfigError> {
+    ) -> Result<(Transaction, Option<u8>), ConfigError> {
         let refused = |kind| ConfigError { place: at(ExchangeKey::Registers), kind };
-        match &ask.talk {
-            AskTalk::Rtu { operation, written, read } => {
+        match &ask.transaction {
+            TransactionDraft::Rtu { operation, written, read } => {
                 let is_of_coils = matches!(operation.place().0, Table::Coils | Table::DiscreteInputs);
                 let mut add = |fields: &Option<Fields<'_>>, part: Direction| match fields {
                     Some(fields) => {
@@ -100,9 +110,9 @@ impl ConfigMut<'_> {
                 if let Operation::MaskWriteRegister { mask, .. } = &mut operation {
                     *mask = register_bits(written.of(self.fields));
                 }
-                Ok((Talk::Rtu { operation, written, read }, None))
+                Ok((Transaction::Rtu { operation, written, read }, None))
             }
-            &AskTalk::Served { table, address, fields } => {
+            &TransactionDraft::Served { table, address, fields } => {
                 let part = match fields {
                     Fields::Inputs(_) => Direction::Input,
                     Fields::Outputs(_) => Direction::Output,
@@ -116,9 +126,9 @@ impl ConfigMut<'_> {
                 let operation = with_counts(of_block(table, address, part), count, count);
                 let none = Span::default();
                 let (written, read) = if part == Direction::Input { (span, none) } else { (none, span) };
-                Ok((Talk::Served { operation, written, read }, None))
+                Ok((Transaction::Served { operation, written, read }, None))
             }
-            AskTalk::Frames([request, reply, refusal]) => {
+            TransactionDraft::Frames([request, reply, refusal]) => {
                 let all = [
                     (request, Direction::Output, ExchangeKey::Request),
                     (reply, Direction::Input, ExchangeKey::Reply),
@@ -137,7 +147,7 @@ impl ConfigMut<'_> {
                     *added = Some(index);
                 }
                 let [request, reply, pending, refusal] = added;
-                Ok((Talk::Frames { request, reply, refusal }, pending))
+                Ok((Transaction::Frames { request, reply, refusal }, pending))
             }
         }
     }
@@ -145,7 +155,7 @@ impl ConfigMut<'_> {
     fn add_frame(
         &mut self,
         (recipe, part): (u8, Direction),
-        from: &AskFrame<'_>,
+        from: &ExchangeFrame<'_>,
         place: Place,
         frames: &FrameNumbers,
     ) -> Result<u8, ConfigError> {

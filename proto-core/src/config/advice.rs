@@ -6,7 +6,7 @@
 
 use super::{
     Bus, CommandEntry, CommandWhen, ConfigView, Echo, Exchange, FieldSpec, InputBinding, Port, Recipe, Span,
-    Talk, Warning,
+    Transaction, Warning,
 };
 use crate::command::Request;
 use crate::device::Kind;
@@ -64,8 +64,8 @@ impl<'c> ConfigView<'c> {
             let all = self.exchanges_of(of);
             let writes = |one: &Exchange| {
                 one.when.rising.is_some()
-                    && match one.talk {
-                        Talk::Rtu { operation, .. } => operation.written_len() > 0,
+                    && match one.transaction {
+                        Transaction::Rtu { operation, .. } => operation.written_len() > 0,
                         _ => true,
                     }
             };
@@ -96,9 +96,9 @@ impl<'c> ConfigView<'c> {
 
     /// Whether the reply of an exchange can have the bytes of its request.
     fn may_be_echo(self, exchange: &Exchange) -> bool {
-        match exchange.talk {
-            Talk::Rtu { operation, .. } => operation.is_repeated_by_reply(),
-            Talk::Frames { request: Some(request), reply: Some(reply), .. } => {
+        match exchange.transaction {
+            Transaction::Rtu { operation, .. } => operation.is_repeated_by_reply(),
+            Transaction::Frames { request: Some(request), reply: Some(reply), .. } => {
                 let frame = |nth: u8| self.frames.get(usize::from(nth));
                 frame(request).zip(frame(reply)).is_none_or(|(request, reply)| reply.may_echo(request, self))
             }
@@ -129,7 +129,7 @@ impl<'c> ConfigView<'c> {
         (0..).zip(self.recipes).flat_map(move |(recipe, of)| {
             let all = self.exchanges_of(of);
             let told = (0..).zip(all).filter(|(_, one)| {
-                let is_to_all = matches!(one.talk, Talk::Rtu { .. }) && one.peer == BROADCAST;
+                let is_to_all = matches!(one.transaction, Transaction::Rtu { .. }) && one.peer == BROADCAST;
                 (one.when.start || one.when.change) && !is_to_all
             });
             told.filter_map(move |(exchange, one)| {
@@ -215,9 +215,9 @@ impl<'c> ConfigView<'c> {
 
 /// The addresses of an exchange, each with its table.
 const fn addresses(exchange: &Exchange) -> [Option<(Table, u16)>; 2] {
-    let operation = match exchange.talk {
-        Talk::Rtu { operation, .. } | Talk::Served { operation, .. } => operation,
-        Talk::Frames { .. } => return [None, None],
+    let operation = match exchange.transaction {
+        Transaction::Rtu { operation, .. } | Transaction::Served { operation, .. } => operation,
+        Transaction::Frames { .. } => return [None, None],
     };
     let (table, address, _) = operation.place();
     let written = match operation {

@@ -5,7 +5,9 @@
 
 use core::fmt;
 
-use super::{Bus, ConfigView, Echo, Exchange, FieldSpec, Parity, Parts, Port, Recipe, Rs485, Span, Talk};
+use super::{
+    Bus, ConfigView, Echo, Exchange, FieldSpec, Parity, Parts, Port, Recipe, Rs485, Span, Transaction,
+};
 use crate::modbus::rtu::{self, Slave, Timing};
 use crate::sysvar::{Direction, SysVar};
 use crate::time::Duration;
@@ -353,8 +355,8 @@ impl fmt::Display for DescribedWarning<'_> {
             Warning::NeverLookedFor { recipe, exchange, peer } => {
                 let of = self.config.recipes.get(usize::from(recipe));
                 let asked = of.and_then(|of| self.config.exchanges_of(of).get(usize::from(exchange)));
-                let device = match asked.map(|asked| asked.talk) {
-                    Some(Talk::Rtu { .. }) => "slave",
+                let device = match asked.map(|asked| asked.transaction) {
+                    Some(Transaction::Rtu { .. }) => "slave",
                     _ => "device",
                 };
                 write!(

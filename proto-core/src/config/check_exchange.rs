@@ -4,7 +4,7 @@ use core::fmt;
 
 use super::device::register_bits;
 use super::error::{ConfigErrorKind as Kind, ExchangeKey as Key, Place};
-use super::exchange::{Exchange, FrameSpec, Talk};
+use super::exchange::{Exchange, FrameSpec, Transaction};
 use super::input_rule::check_read;
 use super::rules::{Check, MAX_TIME, check_pool, check_time, fail};
 use super::{
@@ -109,7 +109,7 @@ pub enum ExchangeError {
     },
     /// A frame with the id of another one that can come at the same time, and no constant that tells
     /// them apart.
-    NotToldApart {
+    Indistinguishable {
         /// Their id.
         id: CanId,
     },
@@ -200,7 +200,7 @@ impl fmt::Display for ExchangeError {
             Self::Unasked => f.write_str("there is no request to send; remove every_ms and on"),
             Self::RemoteFields => f.write_str("a remote request has no fields"),
             Self::RemoteReply => f.write_str("only a request can be remote"),
-            Self::NotToldApart { id } => write!(
+            Self::Indistinguishable { id } => write!(
                 f,
                 "another frame that can come at the same time has id {id}, too, and nothing tells the two apart; give \
                  both a constant at the same place, with another value"
@@ -276,7 +276,7 @@ impl<'a> ExchangeCheck<'a> {
             self.check_one(nth, exchange)?;
             if let Some(seen) = peers.get_mut(usize::from(exchange.peer))
                 && !core::mem::replace(seen, true)
-                && !matches!(exchange.talk, Talk::Rtu { .. } if exchange.peer == BROADCAST)
+                && !matches!(exchange.transaction, Transaction::Rtu { .. } if exchange.peer == BROADCAST)
             {
                 count = count.saturating_add(1);
             }
@@ -286,7 +286,9 @@ impl<'a> ExchangeCheck<'a> {
             self.check_ids(nth, exchange)?;
             let earlier = exchanges.iter().take(usize::from(nth));
             for before in earlier {
-                if core::mem::discriminant(&before.talk) != core::mem::discriminant(&exchange.talk) {
+                if core::mem::discriminant(&before.transaction)
+                    != core::mem::discriminant(&exchange.transaction)
+                {
                     return self.refuse(nth, Key::Whole, ExchangeError::Mixed);
                 }
                 if overlap(before, exchange) {
@@ -362,7 +364,7 @@ impl<'a> ExchangeCheck<'a> {
     /// Whether the frames that the exchange takes are told from all others that can come while they are
     /// awaited: those of one exchange, and those that come unasked.
     fn check_ids(&self, nth: u8, exchange: &Exchange) -> Check {
-        let Talk::Frames { request, reply, refusal } = exchange.talk else { return Ok(()) };
+        let Transaction::Frames { request, reply, refusal } = exchange.transaction else { return Ok(()) };
         let spec = |index: u8| self.config.frames.get(usize::from(index));
         let answers = [(Key::Reply, reply), (Key::Pending, exchange.pending), (Key::Refusal, refusal)];
         for (place, (key, own)) in answers.into_iter().enumerate() {
@@ -392,14 +394,15 @@ impl<'a> ExchangeCheck<'a> {
         for (key, own) in answers {
             let Some((id, fields)) = own.and_then(frame) else { continue };
             let earlier = self.config.exchanges_of(self.recipe).iter().take(usize::from(nth));
-            let earlier = earlier
-                .filter(|earlier| is_unasked || matches!(earlier.talk, Talk::Frames { request: None, .. }));
+            let earlier = earlier.filter(|earlier| {
+                is_unasked || matches!(earlier.transaction, Transaction::Frames { request: None, .. })
+            });
             let earlier = earlier.flat_map(|earlier| earlier.frames(Direction::Input));
             let others = part.iter().map(|frame| (frame.id, frame.fields)).chain(earlier.filter_map(frame));
             let constants = |fields: Span| Constants::of(fields.of(self.config.fields), Direction::Input);
             let mut same_id = others.filter(|(other, _)| *other == id).map(|(_, fields)| fields);
             if same_id.any(|other| !constants(other).differ(&constants(fields))) {
-                return self.refuse(nth, key, ExchangeError::NotToldApart { id });
+                return self.refuse(nth, key, ExchangeError::Indistinguishable { id });
             }
         }
         Ok(())
@@ -419,11 +422,11 @@ impl<'a> ExchangeCheck<'a> {
         }
         let is_alone = matches!(self.recipe.parts, Parts::Stream { input: None, output: None });
         let (peer, is_never) = (exchange.peer, exchange.is_never());
-        match exchange.talk {
-            Talk::Rtu { .. } | Talk::Served { .. } if !is_alone => {
+        match exchange.transaction {
+            Transaction::Rtu { .. } | Transaction::Served { .. } if !is_alone => {
                 self.refuse(nth, Key::Whole, ExchangeError::PartsBesideModbus)
             }
-            Talk::Rtu { operation, written, read } => {
+            Transaction::Rtu { operation, written, read } => {
                 if peer > MAX_ADDRESS && !self.is_only_over_tcp() {
                     return self.refuse(nth, Key::Peer, ExchangeError::Slave { address: peer });
                 }
@@ -435,7 +438,7 @@ impl<'a> ExchangeCheck<'a> {
                 }
                 self.check_operation(nth, operation, [(Direction::Output, written), (Direction::Input, read)])
             }
-            Talk::Served { operation, written, read } => {
+            Transaction::Served { operation, written, read } => {
                 if peer == BROADCAST || peer > MAX_ADDRESS {
                     return self.refuse(nth, Key::Peer, ExchangeError::OwnAddress { address: peer });
                 }
@@ -459,7 +462,7 @@ impl<'a> ExchangeCheck<'a> {
                     }
                 }
             }
-            Talk::Frames { request, reply, refusal } => {
+            Transaction::Frames { request, reply, refusal } => {
                 self.check_frames(nth, is_never, [request, reply, exchange.pending, refusal])
             }
         }
@@ -632,8 +635,8 @@ fn is_command_or_counter(field: &FieldSpec) -> bool {
 
 /// Whether two blocks of a slave have a register or coil in common.
 fn overlap(one: &Exchange, other: &Exchange) -> bool {
-    let (Talk::Served { operation: one, .. }, Talk::Served { operation: other, .. }) =
-        (&one.talk, &other.talk)
+    let (Transaction::Served { operation: one, .. }, Transaction::Served { operation: other, .. }) =
+        (&one.transaction, &other.transaction)
     else {
         return false;
     };

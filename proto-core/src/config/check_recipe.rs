@@ -328,7 +328,7 @@ impl<'a> RecipeCheck<'a> {
             let earlier = (0..nth).zip(frames).filter(same_id).find(is_same);
             let error = match earlier {
                 _ if !id.is_valid() => PartError::InvalidId { frame: nth, id },
-                Some((first, _)) => PartError::NotToldApart { frame: nth, first, id },
+                Some((first, _)) => PartError::Indistinguishable { frame: nth, first, id },
                 None => continue,
             };
             return fail(Place::Frame { recipe, part, frame: nth }, Kind::Part(error));

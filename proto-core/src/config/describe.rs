@@ -433,7 +433,7 @@ impl fmt::Display for DescribedKind<'_> {
                 port_name(other),
                 bit.var
             ),
-            Kind::NoWayUp { var, port } => write!(
+            Kind::NoRoute { var, port } => write!(
                 f,
                 "{} writes {var}, which only the controller's own recipe ports can carry; add it to the input of \
                  the recipe of controller.recipe_link or of a tcp-listen or udp-listen port",

@@ -4,8 +4,8 @@
 //! that of the file (docs/configuration.md). [`GatewayConfig`](super::GatewayConfig) takes them
 //! with `add_recipe` and `add_port`, in a builder or in place, and reports mistakes.
 
-use super::ask::Ask;
 use super::error::ConfigErrorKind as Kind;
+use super::exchange_builder::ExchangeBuilder;
 use super::fields::{CanFields, Fields, Var};
 use super::rules::text;
 use super::{Bus, Echo, OnStale, Parity, Port, PortHealth, Recipe, Rs485, SafeValue, SendOn};
@@ -66,7 +66,7 @@ pub struct RecipeBuilder<'a> {
     pub(super) output: PartFields<'a>,
     pub(super) on_stale: OnStale,
     pub(super) trigger: Trigger<'a>,
-    pub(super) exchanges: &'a [Ask<'a>],
+    pub(super) exchanges: &'a [ExchangeBuilder<'a>],
 }
 
 /// What a recipe takes of the configuration's lists.
@@ -167,9 +167,9 @@ impl<'a> RecipeBuilder<'a> {
         self
     }
 
-    /// What is asked of devices beside the parts, or all that a recipe of Modbus has; see [`Ask`]. Of a
+    /// What is asked of devices beside the parts, or all that a recipe of Modbus has; see [`ExchangeBuilder`]. Of a
     /// user-defined recipe.
-    pub const fn exchanges(mut self, exchanges: &'a [Ask<'a>]) -> Self {
+    pub const fn exchanges(mut self, exchanges: &'a [ExchangeBuilder<'a>]) -> Self {
         self.exchanges = exchanges;
         self
     }
@@ -201,7 +201,7 @@ impl<'a> RecipeBuilder<'a> {
             counts.fields = counts.fields.saturating_add(fields);
             counts.commands = counts.commands.saturating_add(commands);
         };
-        self.exchanges.iter().flat_map(Ask::fields).for_each(&mut add);
+        self.exchanges.iter().flat_map(ExchangeBuilder::fields).for_each(&mut add);
         for part in [&self.input, &self.output] {
             match part {
                 PartFields::Absent => {}

@@ -530,7 +530,7 @@ pub enum ConfigErrorKind {
         other: u8,
     },
     /// A port writes a variable that no configured way up can carry (D15).
-    NoWayUp {
+    NoRoute {
         /// The variable.
         var: SysVar,
         /// Index of the port.

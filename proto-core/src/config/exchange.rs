@@ -19,9 +19,9 @@ pub struct Exchange {
     /// peer share what is known of it: one that does not answer is asked less often.
     pub peer: u8,
     /// The frames.
-    pub talk: Talk,
+    pub transaction: Transaction,
     /// When it is asked.
-    pub when: AskWhen,
+    pub when: Triggers,
     /// How long the reply may take, from the end of the request to the end of the reply.
     pub timeout: Duration,
     /// How often a request without a good reply is repeated at once: a period, or a value that is written until the
@@ -107,7 +107,7 @@ impl OutcomeTo {
 /// The frames of an exchange.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
-pub enum Talk {
+pub enum Transaction {
     /// The gateway is master of a Modbus RTU line. The operation's counts are those of the fields.
     Rtu {
         /// What is asked.
@@ -157,7 +157,7 @@ pub struct FrameSpec {
 /// When an exchange is asked; several may be set.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
-pub struct AskWhen {
+pub struct Triggers {
     /// With this period.
     pub every: Option<Duration>,
     /// Once at the start of the gateway, and again when the peer has started.
@@ -169,7 +169,7 @@ pub struct AskWhen {
     pub rising: Option<(SysVar, u8)>,
 }
 
-impl AskWhen {
+impl Triggers {
     /// Never by itself: as for a frame that comes unasked.
     pub const NEVER: Self = Self { every: None, start: false, change: false, rising: None };
 
@@ -193,10 +193,10 @@ pub const MAX_TRIGGER: Duration = Duration::from_secs(1);
 
 impl Exchange {
     /// An exchange with the defaults of a file: a timeout of 100 ms, one repetition but none of an event, no pause.
-    pub const fn new(peer: u8, talk: Talk, when: AskWhen) -> Self {
+    pub const fn new(peer: u8, transaction: Transaction, when: Triggers) -> Self {
         Self {
             peer,
-            talk,
+            transaction,
             when,
             timeout: DEFAULT_REPLY_TIMEOUT,
             retries: 1,
@@ -232,8 +232,9 @@ impl Exchange {
     /// Whether its start is an event: it is asked at the start and for no other reason, and may do something there. What
     /// is only read is read again until it is answered.
     pub const fn is_start_event(&self) -> bool {
-        let AskWhen { every, start, change, rising } = self.when;
-        let reads = matches!(self.talk, Talk::Rtu { operation, .. } if operation.written_len() == 0);
+        let Triggers { every, start, change, rising } = self.when;
+        let reads =
+            matches!(self.transaction, Transaction::Rtu { operation, .. } if operation.written_len() == 0);
         start && every.is_none() && !change && rising.is_none() && !reads
     }
 
@@ -249,16 +250,16 @@ impl Exchange {
 
     /// Whether it is asked and has a reply.
     pub const fn is_answered(&self) -> bool {
-        match self.talk {
-            Talk::Rtu { .. } => self.peer != crate::modbus::rtu::BROADCAST,
-            Talk::Served { .. } => false,
-            Talk::Frames { request, reply, .. } => request.is_some() && reply.is_some(),
+        match self.transaction {
+            Transaction::Rtu { .. } => self.peer != crate::modbus::rtu::BROADCAST,
+            Transaction::Served { .. } => false,
+            Transaction::Frames { request, reply, .. } => request.is_some() && reply.is_some(),
         }
     }
 
     /// Whether a master asks, and the gateway answers.
     pub(crate) const fn is_served(&self) -> bool {
-        matches!(self.talk, Talk::Served { .. })
+        matches!(self.transaction, Transaction::Served { .. })
     }
 
     /// Its frames of a device's own that come from the device (input): a reply, a pending answer, a refusal; or that go
@@ -269,7 +270,7 @@ impl Exchange {
 
     #[inline(never)]
     fn frame(&self, part: Direction, nth: u8) -> Option<u8> {
-        let Talk::Frames { request, reply, refusal } = self.talk else { return None };
+        let Transaction::Frames { request, reply, refusal } = self.transaction else { return None };
         match (part, nth) {
             (Direction::Input, 0) => reply,
             (Direction::Input, 1) => self.pending,
@@ -281,13 +282,13 @@ impl Exchange {
 
     /// The fields that come from the device (input) with a reply, or go to it (output); `None` if it has no such frame.
     pub(crate) fn fields(&self, frames: &[FrameSpec], part: Direction) -> Option<Span> {
-        let span = match (self.talk, part) {
-            (Talk::Rtu { read, .. }, Direction::Input) => read,
-            (Talk::Rtu { written, .. }, Direction::Output) => written,
-            (Talk::Served { written, .. }, Direction::Input) => written,
-            (Talk::Served { read, .. }, Direction::Output) => read,
-            (Talk::Frames { reply: nth, .. }, Direction::Input)
-            | (Talk::Frames { request: nth, .. }, Direction::Output) => {
+        let span = match (self.transaction, part) {
+            (Transaction::Rtu { read, .. }, Direction::Input) => read,
+            (Transaction::Rtu { written, .. }, Direction::Output) => written,
+            (Transaction::Served { written, .. }, Direction::Input) => written,
+            (Transaction::Served { read, .. }, Direction::Output) => read,
+            (Transaction::Frames { reply: nth, .. }, Direction::Input)
+            | (Transaction::Frames { request: nth, .. }, Direction::Output) => {
                 return Some(frames.get(usize::from(nth?))?.fields);
             }
         };

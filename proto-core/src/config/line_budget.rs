@@ -3,7 +3,7 @@
 //! In: a configuration. Out: times. Nothing is refused here.
 
 use super::budget::can_frame_time;
-use super::exchange::{Exchange, FrameSpec, Talk};
+use super::exchange::{Exchange, FrameSpec, Transaction};
 use super::{Bus, ConfigView, FieldSpec, Port, Recipe, SendOn};
 use crate::modbus::rtu::{BROADCAST, Timing};
 use crate::sysvar::Direction;
@@ -31,14 +31,14 @@ impl ConfigView<'_> {
     pub fn exchange_budget(self, port: &Port, exchange: &Exchange) -> ExchangeBudget {
         let frame = |nth: Option<u8>| self.frames.get(usize::from(nth?));
         let bytes = |frame: Option<&FrameSpec>| frame.map_or(0, |frame| self.bytes_of(frame));
-        let (request, reply, ids) = match exchange.talk {
-            Talk::Rtu { operation, .. } if exchange.peer == BROADCAST => {
+        let (request, reply, ids) = match exchange.transaction {
+            Transaction::Rtu { operation, .. } if exchange.peer == BROADCAST => {
                 (operation.request_len(), 0, [None; 2])
             }
-            Talk::Rtu { operation, .. } | Talk::Served { operation, .. } => {
+            Transaction::Rtu { operation, .. } | Transaction::Served { operation, .. } => {
                 (operation.request_len(), operation.reply_len(), [None; 2])
             }
-            Talk::Frames { request, reply, .. } => {
+            Transaction::Frames { request, reply, .. } => {
                 let (request, reply) = (frame(request), frame(reply));
                 let id = |frame: Option<&FrameSpec>| frame.and_then(|frame| frame.id);
                 (bytes(request), bytes(reply), [id(request), id(reply)])
@@ -87,11 +87,11 @@ impl ConfigView<'_> {
         own.peer == other.peer
             && own.is_answered()
             && other.is_answered()
-            && match (own.talk, other.talk) {
-                (Talk::Rtu { operation: own, .. }, Talk::Rtu { operation: other, .. }) => {
+            && match (own.transaction, other.transaction) {
+                (Transaction::Rtu { operation: own, .. }, Transaction::Rtu { operation: other, .. }) => {
                     own.is_answered_like(&other)
                 }
-                (Talk::Frames { .. }, Talk::Frames { reply: other, .. }) => {
+                (Transaction::Frames { .. }, Transaction::Frames { reply: other, .. }) => {
                     let Some(other) = frame(other) else { return true };
                     let mut answers = own.frames(Direction::Input).filter_map(|nth| frame(Some(nth)));
                     answers.any(|own| core::ptr::eq(own, other) || !own.is_told_from(other, self))
@@ -140,9 +140,9 @@ impl ConfigView<'_> {
 
 /// The silence before a frame of an exchange.
 fn silence(port: &Port, exchange: &Exchange) -> Duration {
-    match (&port.bus, exchange.talk) {
+    match (&port.bus, exchange.transaction) {
         // A slave answers when the silence behind the request has ended it.
-        (Bus::Rs485(line), Talk::Served { .. }) => line.turnaround.max(line.idle_gap),
+        (Bus::Rs485(line), Transaction::Served { .. }) => line.turnaround.max(line.idle_gap),
         (Bus::Rs485(line), _) => line.turnaround,
         _ => Duration::ZERO,
     }
@@ -159,7 +159,7 @@ fn on_line(port: &Port, exchange: &Exchange, len: usize, id: Option<CanId>) -> D
 
 /// A request, and the time that the slaves have after one to all of them.
 fn request_on_line(port: &Port, exchange: &Exchange, len: usize, id: Option<CanId>) -> Duration {
-    let is_broadcast = matches!(exchange.talk, Talk::Rtu { .. }) && exchange.peer == BROADCAST;
+    let is_broadcast = matches!(exchange.transaction, Transaction::Rtu { .. }) && exchange.peer == BROADCAST;
     let rest = if is_broadcast { Timing::TURNAROUND } else { Duration::ZERO };
     on_line(port, exchange, len, id) + rest
 }

@@ -9,7 +9,6 @@
 mod add;
 mod add_exchange;
 mod advice;
-mod ask;
 mod budget;
 mod builder;
 mod check_exchange;
@@ -20,6 +19,7 @@ mod device;
 mod draft;
 mod error;
 mod exchange;
+mod exchange_builder;
 mod fields;
 mod fitting;
 #[cfg(feature = "image")]
@@ -28,6 +28,7 @@ mod input_rule;
 mod keys;
 mod line_budget;
 mod listen;
+mod multiplexing;
 mod network;
 mod port;
 mod recipe;
@@ -35,12 +36,10 @@ mod rules;
 mod safe_value;
 mod sendable;
 mod source;
-mod told_apart;
 mod validate;
 mod view;
 mod walk;
 
-pub use ask::{Ask, AskFrame, Coil};
 pub use budget::{PartBudget, Warning, can_frame_time};
 pub use builder::ConfigBuilder;
 pub use check_exchange::ExchangeError;
@@ -56,15 +55,17 @@ pub use error::{
 };
 pub(crate) use exchange::has_values;
 pub use exchange::{
-    AskWhen, DEFAULT_LATE, DEFAULT_REPLY_TIMEOUT, Exchange, FrameSpec, MAX_TRIGGER, OutcomeTo, Restarted,
-    Talk,
+    DEFAULT_LATE, DEFAULT_REPLY_TIMEOUT, Exchange, FrameSpec, MAX_TRIGGER, OutcomeTo, Restarted, Transaction,
+    Triggers,
 };
+pub use exchange_builder::{Coil, ExchangeBuilder, ExchangeFrame};
 pub use fields::{CanFields, Fields, InputField, OutputField, Sum, Var};
 pub use fitting::Fitting;
 pub(crate) use fitting::fitting_numbers;
 pub use input_rule::{InputRule, NO_TEXT, NoText};
 pub use line_budget::ExchangeBudget;
 pub use listen::listen_address;
+pub use multiplexing::Constants;
 pub use network::{BoardAddress, Network};
 pub(crate) use port::MIN_CYCLE;
 pub use port::{Bus, Echo, Parity, Port, Rs485};
@@ -76,7 +77,6 @@ pub use rules::{check_address, check_bit, check_bitrate, check_cycle, check_name
 pub use safe_value::SafeValue;
 pub use sendable::{Limits, MAX_SENDABLE, MapEntry, Outside, check_sent};
 pub use source::{LinkSource, PortHealth, PortValue, StateValue, StateValueError};
-pub use told_apart::Constants;
 pub(crate) use view::ConfigMut;
 pub use view::ConfigView;
 

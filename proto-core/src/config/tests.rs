@@ -235,7 +235,7 @@ fn what_only_recipe_ports_carry_needs_one() {
     Builder::new()
         .stream(&["ForceEnd[1]"], &[])
         .rs485(0)
-        .refused(field(0, Direction::Input, 0), ConfigErrorKind::NoWayUp { var: force, port: 0 });
+        .refused(field(0, Direction::Input, 0), ConfigErrorKind::NoRoute { var: force, port: 0 });
     Builder::new().stream(&["ForceEnd[1]"], &[]).rs485(0).link(0).valid();
     Builder::new()
         .stream(&["ForceEnd[1]"], &[])
@@ -302,20 +302,24 @@ fn add_exchanges(config: &mut GatewayConfig) {
     let state = [InputField::variable(ScalarType::Byte, "WordInputReg[12]")];
     let job = [InputField::variable(ScalarType::Word, "WordInputReg[13]")];
     let master = [
-        Ask::read_input_registers(9, 16, &read).every(time).retries(2),
-        Ask::write_coils(0, 8, &coils).on_rising("BitOutputReg[3]", 7),
+        ExchangeBuilder::read_input_registers(9, 16, &read).every(time).retries(2),
+        ExchangeBuilder::write_coils(0, 8, &coils).on_rising("BitOutputReg[3]", 7),
     ];
-    let slave =
-        [Ask::served(5, Table::HoldingRegisters, 0, &sent), Ask::served(5, Table::HoldingRegisters, 1, &job)];
-    let talk = [Ask::request(AskFrame::stream(&[2], &[3], &sent))
-        .reply(AskFrame::stream(&[2], &[3], &answer))
-        .refusal(AskFrame::stream(&[], &[], &byte))
+    let slave = [
+        ExchangeBuilder::served(5, Table::HoldingRegisters, 0, &sent),
+        ExchangeBuilder::served(5, Table::HoldingRegisters, 1, &job),
+    ];
+    let transaction = [ExchangeBuilder::request(ExchangeFrame::stream(&[2], &[3], &sent))
+        .reply(ExchangeFrame::stream(&[2], &[3], &answer))
+        .refusal(ExchangeFrame::stream(&[], &[], &byte))
         .peer(3)
         .at_start()
         .on_change()];
-    let remote =
-        [Ask::request(AskFrame::remote(id)).reply(AskFrame::can(id, &state)).every(time).pause(time)];
-    for (name, asks) in [("master", &master[..]), ("slave", &slave), ("talk", &talk)] {
+    let remote = [ExchangeBuilder::request(ExchangeFrame::remote(id))
+        .reply(ExchangeFrame::can(id, &state))
+        .every(time)
+        .pause(time)];
+    for (name, asks) in [("master", &master[..]), ("slave", &slave), ("talk", &transaction)] {
         config.add_recipe(&Recipe::user(name).exchanges(asks)).unwrap();
         config.add_port(&Port::modbus_rtu(name, name).echo(Echo::Yes)).unwrap();
     }

@@ -15,7 +15,7 @@ use super::rules::{
 };
 use super::{
     Bus, ConfigView, Echo, ExchangeError, MAX_ALL_FIELDS, MAX_COMMANDS, MAX_EXCHANGES, MAX_PORTS,
-    MAX_RECIPES, MAX_SAFE_VALUES, Parts, Port, PortHealth, Recipe, SafeValue, SendOn, Talk,
+    MAX_RECIPES, MAX_SAFE_VALUES, Parts, Port, PortHealth, Recipe, SafeValue, SendOn, Transaction,
 };
 use crate::image::BitSet;
 use crate::modbus::rtu::BROADCAST;
@@ -40,7 +40,7 @@ impl<'c> ConfigView<'c> {
             self.check_port(index, port)?;
         }
         self.check_owners()?;
-        self.check_ways_up()?;
+        self.check_routes()?;
         self.check_sources()?;
         self.check_safe_values()
     }
@@ -173,7 +173,9 @@ impl<'c> ConfigView<'c> {
     /// A recipe for Modbus TCP: that of a Modbus master, without a broadcast.
     fn check_master(&self, place: Place, index: u8, recipe: &Recipe) -> Check {
         let exchanges = self.exchanges_of(recipe);
-        if exchanges.is_empty() || exchanges.iter().any(|one| !matches!(one.talk, Talk::Rtu { .. })) {
+        if exchanges.is_empty()
+            || exchanges.iter().any(|one| !matches!(one.transaction, Transaction::Rtu { .. }))
+        {
             return fail(place, Kind::NeedsModbusMaster { recipe: index });
         }
         let to_all = (0..).zip(exchanges).find(|(_, one)| one.peer == BROADCAST);
@@ -275,21 +277,21 @@ impl<'c> ConfigView<'c> {
 
     /// Every variable that a port writes can be carried, and everything that is carried has a
     /// value.
-    fn check_ways_up(&self) -> Check {
+    fn check_routes(&self) -> Check {
         for (port, port_config, recipe) in self.field_ports() {
             for (frame, field, spec) in self.fields_of(recipe, Direction::Input) {
                 let is_lost = |var: &SysVar| var.modbus().is_none() && !self.carried(Direction::Input, *var);
                 if let Some(var) = spec.variables().find(is_lost) {
                     let recipe = port_config.recipe;
                     let place = Place::Field { recipe, part: Direction::Input, frame, field };
-                    return fail(place, Kind::NoWayUp { var, port });
+                    return fail(place, Kind::NoRoute { var, port });
                 }
             }
         }
         for (port, port_config, recipe) in self.field_ports() {
             for (place, var) in self.told_by(port, port_config, recipe) {
                 if var.modbus().is_none() && !self.carried(Direction::Input, var) {
-                    return fail(place, Kind::NoWayUp { var, port });
+                    return fail(place, Kind::NoRoute { var, port });
                 }
             }
         }

@@ -22,7 +22,7 @@ use super::line_timing::LineTiming;
 use super::links::Links;
 use super::modbus_link::{MAX_POLL_BLOCKS, ModbusLink};
 use super::outbox::EdgeQueue;
-use super::plan::{Plan, Source, WayUp, sent_by, shown_by, uplinks};
+use super::plan::{Plan, Route, Source, sent_by, shown_by, uplinks};
 use super::port_health::PortsHealth;
 use super::rules::{scale_word, words_of};
 use super::sender::Sender;
@@ -166,7 +166,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             let _ = self.links.state.push(link);
         }
         if plan.needs_modbus() {
-            let writes = SysVar::all().filter(|&var| plan.way_up(var) == Some(WayUp::Modbus)).collect();
+            let writes = SysVar::all().filter(|&var| plan.route(var) == Some(Route::Modbus)).collect();
             let link = ModbusLink::new(config.controller.modbus_port, dialect.modbus_unit, writes);
             let _ = self.links.modbus.push(link);
         }
@@ -238,7 +238,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         };
         let first_frame = self.store.frames.len() as u8;
         if port.safe_at_start {
-            self.store.is_overdue_from_start();
+            self.store.is_overduefrom_start();
         }
         let mut next_binding = self.bindings.inputs.len() as u16;
         let mut frames = config.frames_of(recipe, Direction::Input);
@@ -516,8 +516,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             (false, _) => &LinkTimings::TCP,
         };
         let set: InputSet = config.written_by(recipe).collect();
-        let writes: InputSet =
-            set.iter().filter(|&var| plan.way_up(var) == Some(WayUp::Recipe(id))).collect();
+        let writes: InputSet = set.iter().filter(|&var| plan.route(var) == Some(Route::Recipe(id))).collect();
         self.store.unanswered = self.store.unanswered.or(&writes);
         let owners = writes.iter().flat_map(|var| plan.owners(var));
         let timeouts =

@@ -21,7 +21,7 @@ const HEARTBEAT: Duration = Duration::from_millis(250);
 
 /// After sleep, input from the field is discarded for this long, and until the next tick: drivers
 /// read what waits in devices in pieces.
-const DEAF: Duration = Duration::from_millis(50);
+const AFTER_SLEEP: Duration = Duration::from_millis(50);
 
 /// The clock's last instant. [`Instant::NEVER`] is after it, so that "no deadline" never comes.
 const LAST: Instant = Instant::from_micros(u64::MAX - 1);
@@ -39,7 +39,7 @@ pub(super) struct Clock {
     pub now: Instant,
     /// A deadline has come and its tick has not been reported. Expired data may still wait, so
     /// nothing is sent before that tick.
-    pub is_late: bool,
+    pub is_overdue: bool,
     /// The instant of the newest [`Output::Sleep`]; it stays while its tick is not reported.
     pub announced: Instant,
     /// The engine asks to be called by then, because calls further apart than [`ASLEEP`] mean
@@ -48,13 +48,13 @@ pub(super) struct Clock {
     /// Number of times that the gateway slept.
     pub sleeps: u32,
     /// Input from field ports is discarded, because it waited while the gateway slept.
-    pub is_deaf: bool,
-    pub deaf_until: Instant,
+    pub has_slept: bool,
+    pub slept_until: Instant,
     /// What [`Engine::poll_output`] asks before it sleeps.
-    pub ask: Ask,
+    pub dirty: Dirty,
     /// The engine sleeps, as announced, until then, and the newest call was before: what sets no deadline, and asks
     /// nobody, leaves everything as it is. [`Instant::ZERO`] if that is not known.
-    pub calm_until: Instant,
+    pub idle_until: Instant,
 }
 
 impl Clock {
@@ -63,34 +63,34 @@ impl Clock {
         timer_at: Instant::ZERO,
         partial_at: Instant::ZERO,
         now: Instant::ZERO,
-        is_late: false,
+        is_overdue: false,
         announced: Instant::ZERO,
         beat_at: Instant::ZERO,
         sleeps: 0,
-        is_deaf: false,
-        deaf_until: Instant::ZERO,
-        ask: Ask::NONE,
-        calm_until: Instant::ZERO,
+        has_slept: false,
+        slept_until: Instant::ZERO,
+        dirty: Dirty::NONE,
+        idle_until: Instant::ZERO,
     };
 }
 
 impl Clock {
     /// Whether an input at `now` finds the engine asleep, and no deadline or beat has come.
     #[inline(always)]
-    pub(super) fn is_calm(&self, now: Instant) -> bool {
-        now >= self.now && now < self.calm_until
+    pub(super) fn is_idle(&self, now: Instant) -> bool {
+        now >= self.now && now < self.idle_until
     }
 
     /// The same of an engine without ports, too, which is not called at every beat.
     #[inline(always)]
     pub(super) fn is_asleep(&self, now: Instant) -> bool {
-        self.is_calm(now) && now < self.beat_at
+        self.is_idle(now) && now < self.beat_at
     }
 
     /// Whether a call at `now` finds nothing to do, and the timer is right.
     #[inline(always)]
     pub(super) fn is_quiet(&self, now: Instant) -> bool {
-        self.ask == Ask::ARMED && now.max(self.now) < self.timer_at
+        self.dirty == Dirty::ARMED && now.max(self.now) < self.timer_at
     }
 }
 
@@ -98,9 +98,9 @@ impl Clock {
 /// asked again until something happens to it, a deadline comes, or the next beat.
 // As bits, so that one comparison tells that there is nothing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Ask(u8);
+pub(super) struct Dirty(u8);
 
-impl Ask {
+impl Dirty {
     pub(super) const NONE: Self = Self(0);
     /// Links that may send; the command link is only asked with the others.
     pub(super) const LINKS: Self = Self(1 | 16 | 32);
@@ -148,8 +148,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 {
     /// The deadlines up to `now` pass.
     pub(super) fn tick(&mut self, now: Instant) {
-        (self.clock.is_late, self.clock.announced) = (false, Instant::NEVER);
-        self.clock.is_deaf &= now < self.clock.deaf_until;
+        (self.clock.is_overdue, self.clock.announced) = (false, Instant::NEVER);
+        self.clock.has_slept &= now < self.clock.slept_until;
         if now >= self.clock.timer_at || now >= self.clock.partial_at && self.ends_partial(now) {
             self.advance(now);
         }
@@ -180,16 +180,16 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         for port in &self.ports {
             (firm, partial) = (firm.min(port.send_deadline()), partial.min(port.partial_until()));
         }
-        let hears_at = if self.clock.is_deaf { self.clock.deaf_until } else { Instant::NEVER };
+        let hears_at = if self.clock.has_slept { self.clock.slept_until } else { Instant::NEVER };
         let firm = firm.min(self.links.deadline()).min(self.store.deadline()).min(hears_at);
-        (if self.exchanges.is_used() { firm.min(self.talk_deadline()) } else { firm }, partial)
+        (if self.exchanges.is_used() { firm.min(self.exchange_deadline()) } else { firm }, partial)
     }
 
     /// Nothing is to be done until the next deadline or beat.
     #[inline(always)]
     pub(super) fn poll_sleep<'b>(&mut self) -> Output<'b> {
-        if !self.clock.ask.has(Ask::ARMED) {
-            self.clock.ask.add(Ask::ARMED);
+        if !self.clock.dirty.has(Dirty::ARMED) {
+            self.clock.dirty.add(Dirty::ARMED);
             (self.clock.timer_at, self.clock.partial_at) = self.deadlines();
         }
         self.sleep()
@@ -199,7 +199,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[inline(always)]
     pub(super) fn announce_anew(&mut self) {
         let until = self.next_call();
-        (self.clock.announced, self.clock.calm_until) = (until, until);
+        (self.clock.announced, self.clock.idle_until) = (until, until);
     }
 
     /// The next deadline or beat; the timer is right.
@@ -220,8 +220,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
         let until = self.clock.announced.min(until);
         self.clock.announced = until;
-        if self.clock.ask == Ask::ARMED && self.clock.now < until && !self.clock.is_deaf {
-            self.clock.calm_until = until;
+        if self.clock.dirty == Dirty::ARMED && self.clock.now < until && !self.clock.has_slept {
+            self.clock.idle_until = until;
         }
         Output::Sleep { until }
     }
@@ -229,14 +229,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     /// An input has come: the present. An engine that is asleep has nothing late, and no beat to look at.
     #[inline(always)]
     pub(super) fn begin(&mut self, was_asleep: bool, now: Instant) -> Instant {
-        self.clock.calm_until = Instant::ZERO;
+        self.clock.idle_until = Instant::ZERO;
         if was_asleep {
-            debug_assert!(!self.clock.is_late && !self.clock.is_deaf);
+            debug_assert!(!self.clock.is_overdue && !self.clock.has_slept);
             (self.clock.now, self.store.now) = (now, now);
             return now;
         }
         let now = self.present(now);
-        self.clock.is_late = now >= self.clock.announced;
+        self.clock.is_overdue = now >= self.clock.announced;
         now
     }
 
@@ -244,10 +244,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[inline(always)]
     pub(super) fn end(&mut self, was_asleep: bool) -> Handled {
         if was_asleep
-            && self.clock.ask == Ask::ARMED
+            && self.clock.dirty == Dirty::ARMED
             && self.clock.timer_at.min(self.clock.partial_at) >= self.clock.announced
         {
-            self.clock.calm_until = self.clock.announced;
+            self.clock.idle_until = self.clock.announced;
             return Handled::Asleep;
         }
         Handled::Poll
@@ -264,7 +264,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 self.wake(now);
             }
             self.clock.beat_at = now + HEARTBEAT;
-            self.clock.ask.add(Ask::ALL);
+            self.clock.dirty.add(Dirty::ALL);
         }
         self.clock.now = now;
         now
@@ -287,12 +287,12 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.clock.sleeps = self.clock.sleeps.wrapping_add(1);
         // Before deadlines pass: one of them may be to open a link that has been down.
         self.links.slept(&mut self.store);
-        self.clock.is_deaf = true;
+        self.clock.has_slept = true;
         self.advance(now);
         self.ports.iter_mut().for_each(|port| port.slept(&mut self.tap, now));
-        self.talk_slept();
-        self.clock.deaf_until = now + DEAF;
-        self.arm(self.clock.deaf_until);
+        self.exchanges_slept();
+        self.clock.slept_until = now + AFTER_SLEEP;
+        self.arm(self.clock.slept_until);
     }
 
     /// Something depends on the clock from `at` on. If it is due already, it is handled before the
@@ -312,8 +312,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     fn advance(&mut self, now: Instant) {
         // At one instant the clock is checked once: what is done now is due later.
         self.clock.timer_at = now + Duration::from_micros(1);
-        self.clock.ask.add(Ask::ALL);
-        self.clock.ask.remove(Ask::ARMED);
+        self.clock.dirty.add(Dirty::ALL);
+        self.clock.dirty.remove(Dirty::ARMED);
         self.expire_frames(now);
         let mut is_ended = false;
         for port in &mut self.ports {
@@ -323,7 +323,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             self.read_ended(now);
         }
         if self.exchanges.is_used() {
-            self.advance_talk(now);
+            self.advance_exchange(now);
         }
         self.links.advance(&mut self.store);
         if !self.links.devices.is_empty() {

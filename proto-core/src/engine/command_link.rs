@@ -8,9 +8,9 @@
 use heapless::{Deque, Vec};
 
 use super::command_tables::{CommandField, Entry, MAX_COMMAND_FIELDS, Picked, Tables, is_asked};
+use super::dropped::{DropReason, DroppedCommand};
 use super::failed::FailedCommands;
 use super::io::{LinkId, PortId, ReplyCode, Transport};
-use super::not_given::{LastNotGiven, NotGiven};
 use super::other_text::OtherText;
 use super::outcome::Outcomes;
 use super::session::{Event, Sent, Session, may_go_at};
@@ -56,7 +56,7 @@ pub(super) struct CommandLink {
     /// The newest command that each port's values picked, and the value.
     picked: [Option<(u16, i64)>; MAX_PORTS],
     /// Likewise the newest value that gave no command.
-    not_given: [Option<LastNotGiven>; MAX_PORTS],
+    dropped: [Option<DroppedCommand>; MAX_PORTS],
     /// Commands that the controller replied to with a failure.
     pub failed: FailedCommands,
     /// Results of commands since the engine asked last.
@@ -82,7 +82,7 @@ impl CommandLink {
             struck_at: None,
             way_made_until: Instant::ZERO,
             picked: [None; MAX_PORTS],
-            not_given: [None; MAX_PORTS],
+            dropped: [None; MAX_PORTS],
             failed: FailedCommands::NONE,
             outcomes: Outcomes::new(),
         })
@@ -107,8 +107,8 @@ impl CommandLink {
     }
 
     /// The newest value of a port that gave no command.
-    pub(super) fn not_given_of(&self, port: PortId) -> Option<&LastNotGiven> {
-        self.not_given.get(usize::from(port.0))?.as_ref()
+    pub(super) fn dropped_by(&self, port: PortId) -> Option<&DroppedCommand> {
+        self.dropped.get(usize::from(port.0))?.as_ref()
     }
 
     pub(super) fn transport(&self) -> Transport {
@@ -151,7 +151,7 @@ impl CommandLink {
             if value == 0 && !names_idle {
                 return Picked::Nothing;
             }
-            self.tell(port, NotGiven::Unknown, (field, value), now);
+            self.tell(port, DropReason::Unknown, (field, value), now);
             return Picked::Unknown;
         };
         if len == 0 {
@@ -160,7 +160,7 @@ impl CommandLink {
         // The press of a stop button may be among what was discarded after sleep; a stop too many does no harm.
         let is_held_stop = woke && keyword.is_urgent();
         if !acts && !is_held_stop {
-            self.tell(port, NotGiven::Based, (field, value), now);
+            self.tell(port, DropReason::Based, (field, value), now);
             return Picked::Based;
         }
         let mut waiting = Waiting { port, entry, field, value, since: now, nth };
@@ -179,8 +179,8 @@ impl CommandLink {
             self.is_newest(&waiting);
         }
         let why = match self.ordinary.supervisor.is_up() {
-            true => self.queue.push_back(waiting).err().map(|_| NotGiven::QueueFull),
-            false => Some(NotGiven::NoLink),
+            true => self.queue.push_back(waiting).err().map(|_| DropReason::QueueFull),
+            false => Some(DropReason::NoLink),
         };
         if let Some(why) = why {
             self.tell(port, why, (field, value), now);
@@ -198,21 +198,21 @@ impl CommandLink {
     }
 
     /// Notes why a value gave no command.
-    fn tell(&mut self, port: PortId, why: NotGiven, (field, value): (u8, i64), now: Instant) {
+    fn tell(&mut self, port: PortId, why: DropReason, (field, value): (u8, i64), now: Instant) {
         let place = self.fields.get(usize::from(field)).map_or((0, 0), |field| field.place);
-        if let Some(last) = self.not_given.get_mut(usize::from(port.0)) {
-            *last = Some(LastNotGiven { at: now, why, frame: place.0, field: place.1, value });
+        if let Some(last) = self.dropped.get_mut(usize::from(port.0)) {
+            *last = Some(DroppedCommand { at: now, why, frame: place.0, field: place.1, value });
         }
     }
 
     /// A command that waited is not sent.
-    fn drop_command(&mut self, command: Waiting, why: NotGiven, now: Instant) {
+    fn drop_command(&mut self, command: Waiting, why: DropReason, now: Instant) {
         self.tell(command.port, why, (command.field, command.value), now);
         self.outcomes.push(command, ReplyCode::NotSent);
     }
 
     /// All other commands than urgent ones that wait are not sent.
-    fn drop_queue(&mut self, why: NotGiven, now: Instant) {
+    fn drop_queue(&mut self, why: DropReason, now: Instant) {
         while let Some(waiting) = self.queue.pop_front() {
             self.drop_command(waiting, why, now);
         }
@@ -230,7 +230,7 @@ impl CommandLink {
     pub(super) fn drop_overtaken(&mut self, now: Instant) {
         for _ in 0..core::mem::take(&mut self.overtaken) {
             if let Some(waiting) = self.queue.pop_front() {
-                self.drop_command(waiting, NotGiven::Overtaken, now);
+                self.drop_command(waiting, DropReason::Overtaken, now);
             }
         }
     }
@@ -258,7 +258,7 @@ impl CommandLink {
             let is_there = self.fields.get(usize::from(waiting.field)).is_some_and(|f| f.last.is_some());
             // The queue has moved up by one.
             if !is_there || self.queue.push_back(waiting).is_err() {
-                self.drop_command(waiting, NotGiven::DeviceGone, now);
+                self.drop_command(waiting, DropReason::DeviceGone, now);
             }
         }
     }
@@ -340,7 +340,7 @@ impl CommandLink {
             }
         }
         if link == LinkId::COMMAND {
-            self.drop_queue(NotGiven::NoLink, now);
+            self.drop_queue(DropReason::NoLink, now);
         }
     }
 
@@ -352,7 +352,7 @@ impl CommandLink {
     /// the device still asks for it.
     pub(super) fn slept(&mut self, now: Instant) {
         self.fields.iter_mut().for_each(CommandField::slept);
-        self.drop_queue(NotGiven::Asleep, now);
+        self.drop_queue(DropReason::Asleep, now);
         for link in [LinkId::COMMAND, LinkId::URGENT] {
             if let Some(session) = self.session(link) {
                 session.supervisor.give_up(now);
@@ -360,7 +360,7 @@ impl CommandLink {
             self.lost(link, now);
         }
         while let Some((_, waiting)) = self.stops.pop(|_| true) {
-            self.drop_command(waiting, NotGiven::Asleep, now);
+            self.drop_command(waiting, DropReason::Asleep, now);
         }
     }
 
@@ -422,10 +422,10 @@ impl CommandLink {
             && now >= waiting.since + COMMAND_TTL
         {
             self.queue.pop_front();
-            self.drop_command(waiting, NotGiven::TooOld, now);
+            self.drop_command(waiting, DropReason::TooOld, now);
         }
         while let Some(old) = self.stops.pop_old(now, |waiting| is_asked(&self.fields, waiting)) {
-            self.drop_command(old, NotGiven::TooOld, now);
+            self.drop_command(old, DropReason::TooOld, now);
         }
     }
 
@@ -540,7 +540,7 @@ impl CommandLink {
                 .and_then(|text| session.send(command, &text, &self.dialect, out, times).ok()),
         };
         if sent.is_none() {
-            self.drop_command(command.1, NotGiven::Unwritable, times.0);
+            self.drop_command(command.1, DropReason::Unwritable, times.0);
         }
         sent
     }

@@ -1,4 +1,4 @@
-//! Whether the controller has the safe values: what confirms them, what casts doubt on them, and when they are
+//! Whether the controller has the safe values: what confirms them, what casts unconfirm on them, and when they are
 //! written again.
 //!
 //! In: values that the controller shows, answers of links, gaps in what it sends. Out: the safe values that are
@@ -50,16 +50,16 @@ impl<const PORTS: usize> Store<PORTS> {
     }
 
     /// Compares the safe values of a byte's bits with what the controller shows.
-    pub(super) fn compare_bits(&mut self, var: SysVar, shown: u8, may_confirm: bool, may_doubt: bool) {
+    pub(super) fn compare_bits(&mut self, var: SysVar, shown: u8, may_confirm: bool, may_unconfirm: bool) {
         let (safe, unconfirmed) = (self.bits.safe.byte(var), self.bits.unconfirmed.byte(var));
         let is_there = !(shown ^ self.image.byte(var));
         if may_confirm {
             self.confirm_bits(var, unconfirmed & is_there);
         }
-        let doubted = BitSet::of(var, safe & !unconfirmed & !is_there);
-        if may_doubt && !doubted.is_empty() && self.unanswered.contains(var) {
-            self.bits.unconfirmed = self.bits.unconfirmed.or(doubted);
-            self.bits_again(doubted);
+        let refuted = BitSet::of(var, safe & !unconfirmed & !is_there);
+        if may_unconfirm && !refuted.is_empty() && self.unanswered.contains(var) {
+            self.bits.unconfirmed = self.bits.unconfirmed.or(refuted);
+            self.bits_again(refuted);
         }
     }
 
@@ -72,13 +72,13 @@ impl<const PORTS: usize> Store<PORTS> {
 
     /// Whether the controller can have had this other value all along. Later another master has
     /// written it.
-    pub(super) fn may_doubt(&self) -> bool {
+    pub(super) fn may_unconfirm(&self) -> bool {
         self.now < self.confirmed_at + DOUBT
     }
 
     /// Outputs that have just arrived show another value than the safe one.
-    pub(super) fn doubt_by_witnesses(&mut self) {
-        if !self.may_doubt() {
+    pub(super) fn unconfirm_by_witnesses(&mut self) {
+        if !self.may_unconfirm() {
             return;
         }
         for var in self.safe.and(&self.bits.bytes).iter() {
@@ -94,13 +94,13 @@ impl<const PORTS: usize> Store<PORTS> {
                 && self.image.known_since(witness) == Some(self.now)
                 && self.image.value(witness) != self.image.value(var)
             {
-                self.doubt(var);
+                self.unconfirm(var);
             }
         }
     }
 
     /// The controller does not have a safe value that a recipe link has sent.
-    pub(super) fn doubt(&mut self, var: SysVar) {
+    pub(super) fn unconfirm(&mut self, var: SysVar) {
         if self.unanswered.contains(var) {
             self.unconfirmed.insert(var);
             self.again(&InputSet::from_iter([var]));

@@ -6,7 +6,7 @@
 use heapless::String;
 
 use super::Engine;
-use super::clock::Ask;
+use super::clock::Dirty;
 use super::counters::{LinkCounters, add, bump};
 use super::events::Event;
 use super::field_port::find_port;
@@ -148,7 +148,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         link.supervisor.heard(now);
         add(&mut link.counters.bytes_in, bytes.len());
         let port = link.port;
-        self.talk_bytes(port, bytes, now);
+        self.exchange_bytes(port, bytes, now);
         let line = find_port(&mut self.ports, port).and_then(|port| port.line_mut());
         let is_lost = line.and_then(|line| line.transactions.as_ref()).is_some_and(|all| all.is_lost);
         if is_lost && let Some(link) = self.device_link(id) {
@@ -181,7 +181,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 
     fn after_device(&mut self, id: LinkId, now: Instant) {
         self.carry_connections(now);
-        self.clock.ask.add(Ask::ACTIONS);
+        self.clock.dirty.add(Dirty::ACTIONS);
         if let Some(link) = self.device_link(id) {
             let deadline = link.deadline();
             self.arm(deadline);

@@ -7,7 +7,7 @@
 //! from the bit come from a read that was answered after the one that showed the rise.
 
 use super::exchanges::{Item, Piece};
-use super::line::{EventCounters, Line, Talks};
+use super::line::{EventCounters, ExchangeTable, Line};
 use super::requests::Maker;
 use super::turns::{Ended, News, Turns};
 use crate::image::GroupId;
@@ -172,7 +172,7 @@ pub(super) struct Sources<C> {
 /// The events of one line.
 pub(super) struct Events<'a, 't> {
     pub items: &'a mut [Item],
-    pub talks: &'a mut Talks<'t>,
+    pub table: &'a mut ExchangeTable<'t>,
     pub line: &'a mut Line,
     pub now: Instant,
 }
@@ -217,11 +217,11 @@ impl Events<'_, '_> {
 
     /// A write that stops its peer is wanted: it goes first, and what waits for the peer is cancelled.
     pub(super) fn stop(&mut self, nth: usize) {
-        self.line.request(self.talks, nth, self.now);
-        self.line.yield_to_stops(self.talks, self.now);
-        let Some(peer) = self.talks.rows.get(nth).map(|row| row.peer) else { return };
+        self.line.request(self.table, nth, self.now);
+        self.line.yield_to_stops(self.table, self.now);
+        let Some(peer) = self.table.rows.get(nth).map(|row| row.peer) else { return };
         for other in 0..self.items.len() {
-            let is_of_peer = self.talks.rows.get(other).is_some_and(|row| row.peer == peer);
+            let is_of_peer = self.table.rows.get(other).is_some_and(|row| row.peer == peer);
             if is_of_peer && self.items.get(other).is_some_and(|item| item.event.waits()) {
                 self.end(other, Outcome::Stopped, 0);
             }
@@ -241,8 +241,8 @@ impl Events<'_, '_> {
         }
         let until = self.now + item.window;
         self.open(nth, Event::Risen { at, until });
-        let Some(peer) = self.talks.rows.get(nth).map(|row| row.peer) else { return };
-        let is_away = self.line.turns(self.talks, |turns| turns.is_known_to_be_away(peer));
+        let Some(peer) = self.table.rows.get(nth).map(|row| row.peer) else { return };
+        let is_away = self.line.turns(self.table, |turns| turns.is_known_to_be_away(peer));
         if is_away || !is_usable {
             self.end(nth, Outcome::Away, 0);
         } else if self.is_stopping(peer) {
@@ -252,9 +252,9 @@ impl Events<'_, '_> {
 
     fn is_stopping(&mut self, peer: u8) -> bool {
         let on_its_way =
-            self.line.occupied_by().and_then(|flight| self.talks.rows.get(usize::from(flight.exchange)));
+            self.line.occupied_by().and_then(|flight| self.table.rows.get(usize::from(flight.exchange)));
         on_its_way.is_some_and(|row| row.stops() && row.peer == peer)
-            || self.line.turns(self.talks, |turns: &mut Turns<'_>| turns.is_stopping(peer))
+            || self.line.turns(self.table, |turns: &mut Turns<'_>| turns.is_stopping(peer))
     }
 
     fn open(&mut self, nth: usize, event: Event) {
@@ -297,12 +297,12 @@ impl Events<'_, '_> {
         let steps = steps.get(..count).unwrap_or(&[]);
         for &step in steps {
             let Some(item) = self.items.get(usize::from(step)) else { continue };
-            let is_awaited = |group: GroupId| {
+            let is_pending = |group: GroupId| {
                 group.0 >= sources.first_of_links
                     && Some(group) != bit_group
                     && maker.image.stamp_of(group).is_none_or(|stamp| stamp <= at)
             };
-            if maker.groups_of(item).any(is_awaited) {
+            if maker.groups_of(item).any(is_pending) {
                 return;
             }
         }
@@ -331,7 +331,7 @@ impl Events<'_, '_> {
 
     fn ready(&mut self, nth: usize) {
         let now = self.now;
-        self.line.turns(self.talks, |turns| turns.set_event(nth, Some(now)));
+        self.line.turns(self.table, |turns| turns.set_event(nth, Some(now)));
         self.line.look(now);
     }
 
@@ -372,7 +372,7 @@ impl Events<'_, '_> {
     /// The steps behind an exchange that is done. Those behind an event were made with it, unless they have ended since,
     /// such as by a stop.
     fn follow(&mut self, nth: usize, is_event: bool) {
-        let peer = self.talks.rows.get(nth).map(|row| row.peer);
+        let peer = self.table.rows.get(nth).map(|row| row.peer);
         let is_stopping = peer.is_some_and(|peer| self.is_stopping(peer));
         for other in 0..self.items.len() {
             let Some(item) = self.items.get_mut(other).filter(|item| item.follow == Some(nth as u8)) else {
@@ -407,7 +407,7 @@ impl Events<'_, '_> {
         (item.told.outcome, item.told.code) = (outcome, code);
         item.told.ended = item.told.ended.wrapping_add(1);
         item.is_news = true;
-        self.line.turns(self.talks, |turns| turns.set_event(nth, None));
+        self.line.turns(self.table, |turns| turns.set_event(nth, None));
         self.count(nth, outcome);
         if outcome == Outcome::Done {
             return;
@@ -441,18 +441,18 @@ impl Events<'_, '_> {
 
     /// What a failure or a sign of life means for the peer of an exchange.
     pub(super) fn note(&mut self, nth: usize, news: News) {
-        let Some(which) = self.talks.rows.get(nth).map(|row| row.peer) else { return };
+        let Some(which) = self.table.rows.get(nth).map(|row| row.peer) else { return };
         match news {
             News::Nothing => {}
             News::Away => self.end_waiting(Some(which), Outcome::Away),
             News::Started => {
-                for (item, row) in self.items.iter_mut().zip(self.talks.rows.iter()) {
+                for (item, row) in self.items.iter_mut().zip(self.table.rows.iter()) {
                     // What it said before says nothing any more.
                     if let Some(sign) = item.restart.as_mut().filter(|_| row.peer == which) {
                         sign.was_there = None;
                     }
                 }
-                if let Some(peer) = self.talks.peers.get_mut(usize::from(which)) {
+                if let Some(peer) = self.table.peers.get_mut(usize::from(which)) {
                     peer.counters.starts = peer.counters.starts.wrapping_add(1);
                 }
             }
@@ -460,8 +460,8 @@ impl Events<'_, '_> {
     }
 
     fn count(&mut self, nth: usize, outcome: Outcome) {
-        let Some(peer) = self.talks.rows.get(nth).map(|row| usize::from(row.peer)) else { return };
-        if let Some(peer) = self.talks.peers.get_mut(peer) {
+        let Some(peer) = self.table.rows.get(nth).map(|row| usize::from(row.peer)) else { return };
+        if let Some(peer) = self.table.peers.get_mut(peer) {
             peer.counters.events.count(outcome);
         }
     }
@@ -470,7 +470,7 @@ impl Events<'_, '_> {
     pub(super) fn end_waiting(&mut self, peer: Option<u8>, outcome: Outcome) {
         for nth in 0..self.items.len() {
             let is_of_peer =
-                self.talks.rows.get(nth).is_some_and(|row| peer.is_none_or(|peer| row.peer == peer));
+                self.table.rows.get(nth).is_some_and(|row| peer.is_none_or(|peer| row.peer == peer));
             if is_of_peer && self.items.get(nth).is_some_and(|item| item.event.waits()) {
                 self.end(nth, outcome, 0);
             }

@@ -9,13 +9,13 @@ use super::Engine;
 use super::build_error::{BuildError, one_too_many};
 use super::device_port::DeviceFormat;
 use super::events::{Event, Told, Trigger};
-use super::line::{Line, PeerCounters, PeerState, Talks, Times};
-use super::transactions::Transactions;
+use super::line::{ExchangeTable, Line, PeerCounters, PeerState, Times};
+use super::modbus_tcp::Transactions;
 use super::turns::{Row, RowKind, RowTimes, Turn};
 use super::user::{InputBind, InputTo};
 use crate::config::{
     Bus, ConfigView, Counted, DeviceFrame, Echo, Exchange, FieldSpec, FrameSpec, OutcomeTo, Port, Recipe,
-    Restarted, Span, Talk, has_values,
+    Restarted, Span, Transaction, has_values,
 };
 use crate::device::{Carrier, LayoutError};
 use crate::modbus::rtu::{BROADCAST, Operation, Table, Timing};
@@ -159,13 +159,13 @@ impl<const N: usize> Exchanges<N> {
 
 impl View<'_> {
     /// The exchanges of a port.
-    pub(super) fn of(&mut self, line: &Line) -> (&mut [Item], Talks<'_>) {
-        let (items, talks, _) = self.served(line);
-        (items, talks)
+    pub(super) fn of(&mut self, line: &Line) -> (&mut [Item], ExchangeTable<'_>) {
+        let (items, table, _) = self.served(line);
+        (items, table)
     }
 
     /// The same, and what masters have written on all ports.
-    pub(super) fn served(&mut self, line: &Line) -> (&mut [Item], Talks<'_>, &mut [Piece]) {
+    pub(super) fn served(&mut self, line: &Line) -> (&mut [Item], ExchangeTable<'_>, &mut [Piece]) {
         let range = |span: Span| {
             let start = usize::from(span.start);
             start..start.saturating_add(usize::from(span.len))
@@ -173,7 +173,7 @@ impl View<'_> {
         let (exchanges, peers) = (range(line.exchanges), range(line.peers));
         (
             self.items.get_mut(exchanges.clone()).unwrap_or(&mut []),
-            Talks {
+            ExchangeTable {
                 rows: self.rows.get_mut(exchanges).unwrap_or(&mut []),
                 peers: self.peers.get_mut(peers).unwrap_or(&mut []),
             },
@@ -330,8 +330,8 @@ impl Formats<'_> {
             pieces: Span::default(),
             is_written: false,
         };
-        match exchange.talk {
-            Talk::Rtu { operation, written, read } => {
+        match exchange.transaction {
+            Transaction::Rtu { operation, written, read } => {
                 item.asks = Asks::Rtu { slave: exchange.peer, operation };
                 item.times.is_answered = exchange.peer != BROADCAST;
                 if !item.times.is_answered {
@@ -341,13 +341,13 @@ impl Formats<'_> {
                 item.request = self.data_out(written)?;
                 item.reply = self.data_in(read)?;
             }
-            Talk::Served { operation, written, read } => {
+            Transaction::Served { operation, written, read } => {
                 let (table, address, count) = operation.place();
                 item.asks = Asks::Served { table, address, count };
                 item.request = self.data_out(read)?;
                 item.reply = self.data_in(written)?;
             }
-            Talk::Frames { request, reply, refusal } => {
+            Transaction::Frames { request, reply, refusal } => {
                 let config = self.config;
                 let frame = |nth: Option<u8>| config.frames.get(usize::from(nth?));
                 if let Some(request) = frame(request) {

@@ -3,7 +3,7 @@
 //! In: bytes and CAN frames. Out: values in the store, and frames when they are due. Does not know
 //! how values reach the controller.
 
-use super::clock::Ask;
+use super::clock::Dirty;
 use super::command_link::CommandLink;
 use super::counters::{PortCounters, add, bump};
 use super::device_port::DeviceCodec;
@@ -347,9 +347,9 @@ impl FieldPort {
     /// The same after something was heard, if that has begun a frame or made one due; other deadlines stay as they
     /// were. A port that may have an output is to be asked.
     #[inline(always)]
-    pub(super) fn deadline_of_heard(&self, ask: &mut Ask) -> Option<Instant> {
+    pub(super) fn deadline_of_heard(&self, ask: &mut Dirty) -> Option<Instant> {
         let is_due = self.sender.is_due();
-        ask.add(Ask::PORTS.when(is_due));
+        ask.add(Dirty::PORTS.when(is_due));
         (is_due || self.is_partial).then(|| self.deadline())
     }
 

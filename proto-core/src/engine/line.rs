@@ -4,8 +4,8 @@
 //! again. Does not know frames.
 
 use super::line_timing::LineTiming;
+use super::modbus_tcp::Transactions;
 use super::sender::{DIGEST_SEED, digest};
-use super::transactions::Transactions;
 use super::turns::{Cause, Ended, News, Row, Turn, Turns};
 use crate::config::{Echo, Span};
 use crate::device::Probe;
@@ -219,7 +219,7 @@ impl OwnRequest {
 }
 
 /// The exchanges and peers of one port.
-pub(super) struct Talks<'a> {
+pub(super) struct ExchangeTable<'a> {
     pub rows: &'a mut [Row],
     pub peers: &'a mut [PeerState],
 }
@@ -242,7 +242,7 @@ impl Flight {
     }
 }
 
-impl Talks<'_> {
+impl ExchangeTable<'_> {
     /// The peer that a request is to.
     pub(super) fn peer_of(&mut self, flight: Flight) -> Option<&mut PeerState> {
         let peer = self.rows.get(usize::from(flight.exchange)).map_or(0, |row| row.peer);
@@ -306,14 +306,14 @@ impl Line {
 
     /// The exchange whose request is to be made now; `None` until the line is to be looked at again.
     /// It has the line if [`Self::handed_over`] follows, else the next is asked for.
-    pub(super) fn next(&mut self, talks: &mut Talks<'_>, now: Instant) -> Option<Flight> {
+    pub(super) fn next(&mut self, table: &mut ExchangeTable<'_>, now: Instant) -> Option<Flight> {
         if let Phase::Repeat(flight) = self.phase {
             self.phase = Phase::Idle;
             return Some(flight);
         }
-        match self.turns(talks, |turns| turns.choose(now)) {
+        match self.turns(table, |turns| turns.choose(now)) {
             Ok(exchange) => {
-                let cause = self.turns(talks, |turns| turns.take(exchange, now));
+                let cause = self.turns(table, |turns| turns.take(exchange, now));
                 Some(Flight {
                     exchange: exchange as u8,
                     cause,
@@ -341,7 +341,7 @@ impl Line {
     /// The request was handed over.
     pub(super) fn handed_over(
         &mut self,
-        talks: &mut Talks<'_>,
+        table: &mut ExchangeTable<'_>,
         flight: Flight,
         (expected, sdo): (Option<Expected>, Option<[u8; 3]>),
         request: &[u8],
@@ -351,8 +351,8 @@ impl Line {
             self.echo = OwnRequest::new(request);
         }
         let nth = usize::from(flight.exchange);
-        let is_ambiguous = self.turns(talks, |turns| turns.is_ambiguous(nth, now));
-        if let Some(row) = talks.rows.get_mut(nth) {
+        let is_ambiguous = self.turns(table, |turns| turns.is_ambiguous(nth, now));
+        if let Some(row) = table.rows.get_mut(nth) {
             row.expected = expected;
         }
         let digest = digest(DIGEST_SEED, request);
@@ -407,7 +407,7 @@ impl Line {
     }
 
     /// The peer is at it: its answer is awaited anew, as if the request had left now. Writes that stop do not wait for it.
-    pub(super) fn heard_pending(&mut self, talks: &Talks<'_>, timeout: Duration, now: Instant) {
+    pub(super) fn heard_pending(&mut self, table: &ExchangeTable<'_>, timeout: Duration, now: Instant) {
         if let Phase::Sending(flight) | Phase::Waiting(flight) = &mut self.phase {
             (flight.is_pending, flight.is_wrong) = (true, false);
             flight.until = (now + timeout).min(flight.latest);
@@ -415,16 +415,16 @@ impl Line {
         if matches!(self.phase, Phase::Waiting(_)) {
             self.sent = now;
         }
-        self.yield_to_stops(talks, now);
+        self.yield_to_stops(table, now);
     }
 
     /// What is pending is not waited for beyond the turn of a write that stops.
-    pub(super) fn yield_to_stops(&mut self, talks: &Talks<'_>, now: Instant) {
+    pub(super) fn yield_to_stops(&mut self, table: &ExchangeTable<'_>, now: Instant) {
         let Phase::Waiting(flight) = &mut self.phase else { return };
         if !flight.is_pending {
             return;
         }
-        let others = (0_u8..).zip(talks.rows.iter()).filter(|(nth, _)| *nth != flight.exchange);
+        let others = (0_u8..).zip(table.rows.iter()).filter(|(nth, _)| *nth != flight.exchange);
         if let Some(stop) = others.filter_map(|(_, row)| row.stop_at()).min() {
             flight.until = flight.until.min(stop.max(now));
         }
@@ -443,7 +443,7 @@ impl Line {
     /// [`Ended::Unclear`].
     pub(super) fn answered(
         &mut self,
-        talks: &mut Talks<'_>,
+        table: &mut ExchangeTable<'_>,
         flight: Flight,
         ended: Ended,
         times: Times,
@@ -452,14 +452,14 @@ impl Line {
         let ended = if flight.is_ambiguous { Ended::Unclear } else { ended };
         // The reply may be a late one to the first of the requests. Then that to the repetition is still to come.
         let sent = if matches!(self.phase, Phase::Sending(_)) { now } else { self.sent };
-        if let Some(row) = talks.row_of(flight).filter(|row| flight.is_ambiguous || row.is_outstanding(now)) {
+        if let Some(row) = table.row_of(flight).filter(|row| flight.is_ambiguous || row.is_outstanding(now)) {
             // What came may be another's reply, or that of a stop to an earlier transmission: its own is to come then.
             row.leaves_outstanding(flight.repeated.saturating_add(1), sent + row.late(), now);
         } else {
-            leave_outstanding(talks, flight, flight.repeated, sent, now);
+            leave_outstanding(table, flight, flight.repeated, sent, now);
         }
         let news =
-            self.turns(talks, |turns| turns.answered(usize::from(flight.exchange), flight.cause, ended, now));
+            self.turns(table, |turns| turns.answered(usize::from(flight.exchange), flight.cause, ended, now));
         self.rest(times.pause, now);
         (ended, news)
     }
@@ -485,15 +485,15 @@ impl Line {
     /// Repeats the request, or gives it up.
     pub(super) fn failed(
         &mut self,
-        talks: &mut Talks<'_>,
+        table: &mut ExchangeTable<'_>,
         (flight, failure): (Flight, Failure),
         times: Times,
         now: Instant,
     ) -> Over {
         // A write that stops does not wait for repetitions.
-        let yields = talks.rows.iter().any(|row| row.stop_at().is_some_and(|at| at <= now));
+        let yields = table.rows.iter().any(|row| row.stop_at().is_some_and(|at| at <= now));
         let sent = self.sent;
-        let Some(peer) = talks.peer_of(flight) else { return Over::GivenUp(News::Nothing) };
+        let Some(peer) = table.peer_of(flight) else { return Over::GivenUp(News::Nothing) };
         let counters = &mut peer.counters;
         let counter = match failure {
             Failure::Timeout | Failure::Pending => &mut counters.timeouts,
@@ -505,9 +505,9 @@ impl Line {
             // What came may have been the echo, and the reply is still to come.
             let unanswered = flight.unanswered.min(sent);
             let count = flight.repeated.saturating_add(1);
-            leave_outstanding(talks, Flight { unanswered, ..flight }, count, sent, now);
+            leave_outstanding(table, Flight { unanswered, ..flight }, count, sent, now);
             let nth = usize::from(flight.exchange);
-            self.turns(talks, |turns| turns.answered(nth, flight.cause, Ended::Unconfirmed, now));
+            self.turns(table, |turns| turns.answered(nth, flight.cause, Ended::Unconfirmed, now));
             self.rest(times.pause, now);
             return Over::Unconfirmed;
         }
@@ -532,22 +532,22 @@ impl Line {
             self.has_echo = None;
         }
         let was_wrong = flight.was_wrong || failure == Failure::Checksum;
-        Over::GivenUp(self.give_up(talks, Flight { unanswered, was_wrong, ..flight }, failure, times, now))
+        Over::GivenUp(self.give_up(table, Flight { unanswered, was_wrong, ..flight }, failure, times, now))
     }
 
     /// The request has failed and is not repeated.
     pub(super) fn give_up(
         &mut self,
-        talks: &mut Talks<'_>,
+        table: &mut ExchangeTable<'_>,
         flight: Flight,
         failure: Failure,
         times: Times,
         now: Instant,
     ) -> News {
         let sent = self.sent;
-        leave_outstanding(talks, flight, flight.repeated.saturating_add(1), sent, now);
+        leave_outstanding(table, flight, flight.repeated.saturating_add(1), sent, now);
         let nth = usize::from(flight.exchange);
-        let news = self.turns(talks, |turns| match failure {
+        let news = self.turns(table, |turns| match failure {
             Failure::Timeout => turns.failed(nth, flight.cause, now, flight.unanswered.min(sent)),
             // It said something, and nobody knows what.
             _ => turns.answered(nth, flight.cause, Ended::Unclear, now),
@@ -572,18 +572,18 @@ impl Line {
     }
 
     /// The exchange is asked as soon as the line is free.
-    pub(super) fn request(&mut self, talks: &mut Talks<'_>, exchange: usize, now: Instant) {
-        self.turns(talks, |turns| turns.request(exchange, now));
+    pub(super) fn request(&mut self, table: &mut ExchangeTable<'_>, exchange: usize, now: Instant) {
+        self.turns(table, |turns| turns.request(exchange, now));
         self.look_at = now;
     }
 
     /// What has begun is not continued: the device is gone, or the gateway slept. Returns the request that was on its
     /// way.
-    pub(super) fn abandon(&mut self, talks: &mut Talks<'_>, now: Instant) -> Option<Flight> {
+    pub(super) fn abandon(&mut self, table: &mut ExchangeTable<'_>, now: Instant) -> Option<Flight> {
         let flight = self.occupied_by();
         if let Some(all) = &mut self.transactions {
             all.forget();
-            self.turns(talks, |turns| {
+            self.turns(table, |turns| {
                 turns.lost(flight.map(|flight| (usize::from(flight.exchange), flight.cause)), now)
             });
             (self.phase, self.look_at) = (Phase::Idle, now);
@@ -591,12 +591,12 @@ impl Line {
         }
         // One without a reply is sent once, whether it is heard or not.
         if let Some(Flight { exchange, cause: Cause::State(Some(_)), .. }) = flight
-            && talks.rows.get(usize::from(exchange)).is_some_and(Row::is_answered)
+            && table.rows.get(usize::from(exchange)).is_some_and(Row::is_answered)
         {
-            self.turns(talks, |turns| turns.request(usize::from(exchange), now));
+            self.turns(table, |turns| turns.request(usize::from(exchange), now));
         }
         if let Some(flight) = flight
-            && let Some(row) = talks.row_of(flight).filter(|row| row.is_answered())
+            && let Some(row) = table.row_of(flight).filter(|row| row.is_answered())
         {
             row.leaves_outstanding(flight.repeated.saturating_add(1), now + row.late(), now);
         }
@@ -608,11 +608,11 @@ impl Line {
 
     /// The device is there, perhaps another one: what is asked at the start is asked. A connection of Modbus TCP that is
     /// there again says nothing about its devices.
-    pub(super) fn begin(&mut self, talks: &mut Talks<'_>, now: Instant) {
-        self.abandon(talks, now);
+    pub(super) fn begin(&mut self, table: &mut ExchangeTable<'_>, now: Instant) {
+        self.abandon(table, now);
         let is_resumed =
             self.transactions.as_mut().is_some_and(|all| core::mem::replace(&mut all.was_open, true));
-        self.turns(talks, |turns| if is_resumed { turns.resume(now) } else { turns.begin(now) });
+        self.turns(table, |turns| if is_resumed { turns.resume(now) } else { turns.begin(now) });
         self.has_echo = self.echo_setting.known();
     }
 
@@ -630,8 +630,12 @@ impl Line {
         looks.min(next)
     }
 
-    pub(super) fn turns<T>(&mut self, talks: &mut Talks<'_>, ask: impl FnOnce(&mut Turns<'_>) -> T) -> T {
-        ask(&mut Turns { rows: talks.rows, peers: talks.peers, run: &mut self.run })
+    pub(super) fn turns<T>(
+        &mut self,
+        table: &mut ExchangeTable<'_>,
+        ask: impl FnOnce(&mut Turns<'_>) -> T,
+    ) -> T {
+        ask(&mut Turns { rows: table.rows, peers: table.peers, run: &mut self.run })
     }
 }
 
@@ -644,8 +648,8 @@ impl PeerState {
 
 /// A reply to an earlier transmission may still come. Behind what had a wrong checksum, and may have been noise, it is
 /// not later than two timeouts.
-fn leave_outstanding(talks: &mut Talks<'_>, flight: Flight, count: u8, sent: Instant, now: Instant) {
-    let Some(row) = talks.row_of(flight) else { return };
+fn leave_outstanding(table: &mut ExchangeTable<'_>, flight: Flight, count: u8, sent: Instant, now: Instant) {
+    let Some(row) = table.row_of(flight) else { return };
     if flight.unanswered().is_some() {
         row.leaves_outstanding(count, sent + row.late(), now);
     } else if flight.was_wrong && row.alike.count_ones() > 1 {

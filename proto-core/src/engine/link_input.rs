@@ -4,7 +4,7 @@
 //! and which ports and links may have an output now. Does not know what travels on a link.
 
 use super::Engine;
-use super::clock::Ask;
+use super::clock::Dirty;
 use super::io::LinkId;
 use crate::time::Instant;
 
@@ -36,7 +36,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             return self.device_sent(link);
         }
         let deadline = self.links.sent(link);
-        self.clock.ask.add(self.links.ask_of(link));
+        self.clock.dirty.add(self.links.ask_of(link));
         self.arm(deadline);
     }
 
@@ -46,7 +46,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             return self.device_acked(link, left);
         }
         self.links.acked(link, left, &mut self.store);
-        self.clock.ask.add(self.links.ask_of(link));
+        self.clock.dirty.add(self.links.ask_of(link));
         self.arm(self.links.deadline_of(link));
     }
 
@@ -67,7 +67,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             self.carry_results();
             let dirty = self.store.outbox.dirty();
             let (asked, deadline) = self.links.asked_by_bytes(link, &dirty, now);
-            self.clock.ask.add(self.links.ask_for(&dirty, asked));
+            self.clock.dirty.add(self.links.ask_for(&dirty, asked));
             self.arm(deadline);
             self.image_changed();
             if rest.is_empty() {
@@ -78,8 +78,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 
     /// Something happened on a link that may change its deadline, or close it.
     fn arm_link(&mut self, link: LinkId) {
-        self.clock.ask.add(Ask::LINKS);
-        self.clock.ask.add(Ask::ACTIONS);
+        self.clock.dirty.add(Dirty::LINKS);
+        self.clock.dirty.add(Dirty::ACTIONS);
         self.arm(self.links.deadline_of(link));
     }
 }

@@ -5,7 +5,7 @@
 
 use heapless::{String, Vec};
 
-use super::clock::Ask;
+use super::clock::Dirty;
 use super::command_link::CommandLink;
 use super::connection::Connection;
 use super::counters::{LinkCounters, add};
@@ -392,7 +392,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
     #[inline(always)]
     pub(super) fn next_upward<const PORTS: usize>(
         &mut self,
-        ask: &mut Ask,
+        ask: &mut Dirty,
         store: &mut Store<PORTS>,
         out: &mut [u8],
     ) -> Option<(LinkId, usize, Instant)> {
@@ -401,7 +401,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         {
             return Some((id, len, link.deadline()));
         }
-        if ask.has(Ask::RECIPES) {
+        if ask.has(Dirty::RECIPES) {
             let state = self.state.first().map(|state| state.group);
             let mut left = self.recipes.len();
             for link in &mut self.recipes {
@@ -409,16 +409,16 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
                 if let Some(len) = link.next_frame(store, state, out) {
                     // It is busy now, and those before it had nothing.
                     if left == 0 {
-                        ask.remove(Ask::RECIPES);
+                        ask.remove(Dirty::RECIPES);
                     }
                     return Some((link.id, len, link.deadline()));
                 }
             }
-            ask.remove(Ask::RECIPES);
+            ask.remove(Dirty::RECIPES);
         }
-        if ask.has(Ask::MODBUS) {
+        if ask.has(Dirty::MODBUS) {
             // One transaction at a time.
-            ask.remove(Ask::MODBUS);
+            ask.remove(Dirty::MODBUS);
             if let Some(link) = self.modbus.first_mut()
                 && let Some(len) = link.next_request(store, out)
             {
@@ -432,53 +432,58 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
     /// What may have an output when something has happened to this link. Beside a command link, which looks at what the
     /// others do, all.
     #[inline(always)]
-    pub(super) fn ask_of(&self, link: LinkId) -> Ask {
+    pub(super) fn ask_of(&self, link: LinkId) -> Dirty {
         if !self.command.is_empty() {
-            return Ask::LINKS;
+            return Dirty::LINKS;
         }
         match link {
-            LinkId::STATE => Ask::NONE,
-            LinkId::MODBUS => Ask::MODBUS,
-            _ => Ask::RECIPES,
+            LinkId::STATE => Dirty::NONE,
+            LinkId::MODBUS => Dirty::MODBUS,
+            _ => Dirty::RECIPES,
         }
     }
 
     /// What may have an output after bytes came on this link, and the earliest of its deadlines that may have come
     /// earlier.
     #[inline(always)]
-    pub(super) fn asked_by_bytes(&mut self, id: LinkId, waiting: &InputSet, now: Instant) -> (Ask, Instant) {
+    pub(super) fn asked_by_bytes(
+        &mut self,
+        id: LinkId,
+        waiting: &InputSet,
+        now: Instant,
+    ) -> (Dirty, Instant) {
         if self.command.is_empty() {
             match id {
                 // Its only deadline is that of silence.
                 LinkId::STATE if self.state.first().is_some_and(|link| link.supervisor.is_up()) => {
-                    return (Ask::NONE, Instant::NEVER);
+                    return (Dirty::NONE, Instant::NEVER);
                 }
                 LinkId::MODBUS => {
                     if let Some(link) = self.modbus.first_mut()
                         && link.supervisor.is_up()
                     {
-                        return (Ask::MODBUS.when(link.may_ask(waiting, now)), link.deadline());
+                        return (Dirty::MODBUS.when(link.may_ask(waiting, now)), link.deadline());
                     }
                 }
                 _ => {}
             }
         }
         let mut asked = self.ask_of(id);
-        asked.add(Ask::ACTIONS);
+        asked.add(Dirty::ACTIONS);
         (asked, self.deadline_of(id))
     }
 
     /// The same, and the links that write one of these variables, which wait.
     #[inline(always)]
-    pub(super) fn ask_for(&self, waiting: &InputSet, asked: Ask) -> Ask {
+    pub(super) fn ask_for(&self, waiting: &InputSet, asked: Dirty) -> Dirty {
         if waiting.is_empty() { asked } else { self.ask_writers(waiting, asked) }
     }
 
     #[inline(never)]
-    fn ask_writers(&self, waiting: &InputSet, mut asked: Ask) -> Ask {
+    fn ask_writers(&self, waiting: &InputSet, mut asked: Dirty) -> Dirty {
         let is_wanted = |writes: &InputSet| !waiting.and(writes).is_empty();
-        asked.add(Ask::RECIPES.when(self.recipes.iter().any(|link| is_wanted(&link.writes))));
-        asked.add(Ask::MODBUS.when(self.modbus.first().is_some_and(|link| is_wanted(&link.writes))));
+        asked.add(Dirty::RECIPES.when(self.recipes.iter().any(|link| is_wanted(&link.writes))));
+        asked.add(Dirty::MODBUS.when(self.modbus.first().is_some_and(|link| is_wanted(&link.writes))));
         asked
     }
 

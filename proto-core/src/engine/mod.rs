@@ -12,7 +12,7 @@
 //! Errors of a device or of the controller are counted and skipped. They are never an error of the
 //! run loop. Nothing is applied in part, but for frames of devices, whose fields are judged one by one.
 
-mod awaited;
+mod accessors;
 mod bits;
 mod build;
 mod build_error;
@@ -27,9 +27,12 @@ mod counts;
 mod device_frame;
 mod device_link;
 mod device_port;
+mod dropped;
 mod events;
+mod exchange;
 mod exchanges;
 mod failed;
+mod fast_path;
 mod field_output;
 mod field_port;
 mod flight;
@@ -42,29 +45,26 @@ mod link_input;
 mod links;
 mod modbus_link;
 mod modbus_poll;
-mod not_given;
+mod modbus_tcp;
 mod other_text;
 mod outbox;
 mod outcome;
+mod pending;
 mod plan;
 mod port_health;
-mod questions;
 mod rejection;
 mod requests;
 mod rules;
 mod sender;
 mod served;
 mod session;
-mod short_way;
 mod state_link;
 mod status;
 #[cfg(feature = "serde")]
 mod status_serde;
 mod stops;
 mod store;
-mod talk;
 mod tap;
-mod transactions;
 mod turns;
 mod uplink;
 mod user;
@@ -74,6 +74,7 @@ mod withheld;
 pub use build_error::BuildError;
 pub use clock::ASLEEP;
 pub use counters::{LinkCounters, PortCounters};
+pub use dropped::{DropReason, DroppedCommand};
 pub use events::Outcome;
 pub use failed::FailedCommand;
 pub use io::{
@@ -82,9 +83,8 @@ pub use io::{
 pub use latency::Latency;
 pub use line::{EventCounters, PeerCounters};
 pub use links::LinkInfo;
-pub use not_given::{LastNotGiven, NotGiven};
 pub use other_text::{MAX_OTHER_TEXT, OtherText};
-pub use plan::{Plan, PlanError, Source, WayUp};
+pub use plan::{Plan, PlanError, Route, Source};
 pub use rejection::{KEPT_BYTES, LastRejection, RejectedField, Rejection};
 pub use rules::{Taken, judge_field};
 pub use status::{ControllerStatus, FieldBus, Health, PeerStatus, PortStatus, Status, VariableStatus};
@@ -93,15 +93,15 @@ pub use tap::{MAX_TAPPED, TAP_OVERHEAD, Tap, TapDirection, TapPlace, TapRecord, 
 
 use heapless::Vec;
 
-use clock::{Ask, Clock};
+use clock::{Clock, Dirty};
 use counters::add;
 use exchanges::Exchanges;
+use fast_path::SHORT;
 use field_output::Downward;
 use field_port::{FieldPort, find_port};
 use frames::Accepted;
 use links::Links;
 use port_health::PortsHealth;
-use short_way::SHORT;
 use store::{SafeBytes, Store};
 use user::Bindings;
 
@@ -167,7 +167,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     pub fn handle(&mut self, now: Instant, input: Input<'_>) -> Handled {
         // Most bytes of a busy line continue a frame and do not end it: nothing comes of them.
         if let Input::PortBytes { port, bytes: &[byte] } = input
-            && self.clock.is_calm(now)
+            && self.clock.is_idle(now)
             && let Some(port) = find_port(&mut self.ports, port)
             && port.hold_byte(byte, now)
         {
@@ -211,13 +211,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     // function of its own around this one (firmware/engine): one call is enough there.
     #[cfg_attr(not(target_os = "none"), inline(never))]
     pub fn poll_output<'b>(&mut self, now: Instant, buf: &'b mut [u8; OUTPUT_BUFFER]) -> Output<'b> {
-        if now < self.clock.calm_until {
-            debug_assert!(self.clock.is_quiet(now) && !self.clock.is_late);
+        if now < self.clock.idle_until {
+            debug_assert!(self.clock.is_quiet(now) && !self.clock.is_overdue);
             debug_assert!(self.all_are_silent(&mut buf[..], now), "a sleeping engine has an output");
-            return Output::Sleep { until: self.clock.calm_until };
+            return Output::Sleep { until: self.clock.idle_until };
         }
-        match self.clock.ask {
-            Ask::ARMED => self.poll_any(now, buf),
+        match self.clock.dirty {
+            Dirty::ARMED => self.poll_any(now, buf),
             _ => self.poll_work(now, buf),
         }
     }
@@ -233,16 +233,16 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     /// The next output, if something may have one.
     #[inline(never)]
     fn poll_work<'b>(&mut self, now: Instant, buf: &'b mut [u8; OUTPUT_BUFFER]) -> Output<'b> {
-        self.clock.calm_until = Instant::ZERO;
+        self.clock.idle_until = Instant::ZERO;
         let now = self.forward(now);
         if now >= self.clock.timer_at {
             self.ask_all();
         }
-        if self.clock.ask.has(Ask::LINKS) && !self.clock.is_late {
+        if self.clock.dirty.has(Dirty::LINKS) && !self.clock.is_overdue {
             // To send a command, a connection may have to be closed first.
-            self.clock.ask.add(Ask::ACTIONS.when(!self.links.command.is_empty()));
+            self.clock.dirty.add(Dirty::ACTIONS.when(!self.links.command.is_empty()));
             self.store.now = now;
-            let upward = self.links.next_upward(&mut self.clock.ask, &mut self.store, &mut buf[..]);
+            let upward = self.links.next_upward(&mut self.clock.dirty, &mut self.store, &mut buf[..]);
             self.carry_outcomes();
             if let Some((link, len, deadline)) = upward {
                 self.arm(deadline);
@@ -251,10 +251,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 return Output::LinkSend { link, bytes };
             }
             // Commands that stop the robot are checked in every call, even before their deadline.
-            self.clock.ask.remove(Ask::LINKS);
-            self.clock.ask.add(Ask::LINKS.when(self.links.has_stops()));
+            self.clock.dirty.remove(Dirty::LINKS);
+            self.clock.dirty.add(Dirty::LINKS.when(self.links.has_stops()));
         }
-        if self.clock.ask.has(Ask::ACTIONS) {
+        if self.clock.dirty.has(Dirty::ACTIONS) {
             if let Some((link, action)) = self.links.next_action() {
                 return match action {
                     LinkAction::Open => {
@@ -263,9 +263,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                     LinkAction::Close => Output::LinkClose { link },
                 };
             }
-            self.clock.ask.remove(Ask::ACTIONS);
+            self.clock.dirty.remove(Dirty::ACTIONS);
         }
-        if self.clock.ask.has(Ask::PORTS) && !self.clock.is_late {
+        if self.clock.dirty.has(Dirty::PORTS) && !self.clock.is_overdue {
             match self.next_downward(&mut buf[..], now) {
                 Some((port, Downward::Bytes(len))) => {
                     let bytes = buf.get(..len).unwrap_or(&[]);
@@ -278,11 +278,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 }
                 // On its own, so that nothing else pays for its registers.
                 None if self.exchanges.is_used() => return self.poll_request(now, buf),
-                None => self.clock.ask.remove(Ask::PORTS),
+                None => self.clock.dirty.remove(Dirty::PORTS),
             }
         }
         debug_assert!(
-            self.clock.is_late || self.all_are_silent(&mut buf[..], now),
+            self.clock.is_overdue || self.all_are_silent(&mut buf[..], now),
             "a port or link that was not asked has an output"
         );
         self.poll_sleep()
@@ -291,7 +291,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     // On its own, so that what is asked is read only once, behind it.
     #[inline(never)]
     fn ask_all(&mut self) {
-        self.clock.ask.add(Ask::ALL);
+        self.clock.dirty.add(Dirty::ALL);
     }
 
     /// The next request to a device, or sleep.
@@ -301,14 +301,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         if let Some(request) = self.next_request(&mut buf[..], now) {
             return self.request_output(request, buf, now);
         }
-        self.clock.ask.remove(Ask::PORTS);
+        self.clock.dirty.remove(Dirty::PORTS);
         debug_assert!(self.all_are_silent(&mut buf[..], now), "a port that was asked has an output");
         self.poll_sleep()
     }
 
     /// Whether ports and links that are not asked really have no output.
     fn all_are_silent(&mut self, out: &mut [u8], now: Instant) -> bool {
-        self.links.next_upward(&mut { Ask::ALL }, &mut self.store, out).is_none()
+        self.links.next_upward(&mut { Dirty::ALL }, &mut self.store, out).is_none()
             && self.links.next_action().is_none()
             && self.next_downward(out, now).is_none()
             && !(self.exchanges.is_used() && self.next_request(out, now).is_some())
@@ -323,7 +323,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let now = self.begin(was_asleep, now);
         // If it was asleep, they could not be held.
         let is_held = !was_asleep && bytes.len() <= SHORT && self.hold(id, bytes, now);
-        let is_taken = is_held || self.exchanges.is_used() && self.talk_bytes(id, bytes, now);
+        let is_taken = is_held || self.exchanges.is_used() && self.exchange_bytes(id, bytes, now);
         if !is_taken {
             self.port_bytes(id, bytes, now);
         }
@@ -337,14 +337,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             let (store, command) = (&mut self.store, self.links.command.first_mut());
             let Some(port) = find_port(&mut self.ports, id) else { return };
             if is_first {
-                if self.clock.is_deaf {
+                if self.clock.has_slept {
                     return port.discard(bytes, None, &mut self.tap, now);
                 }
                 port.heard(bytes, now);
                 is_first = false;
             }
             let accepted = port.frames(&mut rest, &self.bindings.inputs, store, command, &mut self.tap);
-            if let Some(deadline) = port.deadline_of_heard(&mut self.clock.ask) {
+            if let Some(deadline) = port.deadline_of_heard(&mut self.clock.dirty) {
                 self.arm(deadline);
             }
             self.after_frame(id, &accepted, now);
@@ -358,7 +358,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[cold]
     #[inline(never)]
     fn port_silent(&mut self, id: PortId, now: Instant) {
-        if self.clock.is_deaf {
+        if self.clock.has_slept {
             // Nobody knows how long it has waited.
             if let Some(port) = find_port(&mut self.ports, id) {
                 port.discard_partial(&mut self.tap, now);
@@ -381,7 +381,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let was_asleep =
             if found == Found::NOT_LOOKED_UP { self.clock.is_asleep(now) } else { now < self.clock.beat_at };
         let now = self.begin(was_asleep, now);
-        if !(self.exchanges.is_used() && self.talk_can(id, frame, now)) {
+        if !(self.exchanges.is_used() && self.exchange_can(id, frame, now)) {
             self.port_can(id, frame, found, now);
         }
         self.end(was_asleep)
@@ -391,7 +391,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     fn port_can(&mut self, id: PortId, frame: &CanFrame, found: Found, now: Instant) {
         let (store, command) = (&mut self.store, self.links.command.first_mut());
         let Some(port) = find_port(&mut self.ports, id) else { return };
-        if self.clock.is_deaf {
+        if self.clock.has_slept {
             return port.discard(frame.data(), Some(frame.id()), &mut self.tap, now);
         }
         let accepted = port.can((frame, found), &self.bindings.inputs, store, command, &mut self.tap);
@@ -399,7 +399,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             // Most are for other nodes of the bus.
             return;
         }
-        if let Some(deadline) = port.deadline_of_heard(&mut self.clock.ask) {
+        if let Some(deadline) = port.deadline_of_heard(&mut self.clock.dirty) {
             self.arm(deadline);
         }
         self.after_frame(id, &accepted, now);
@@ -417,22 +417,22 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[inline(never)]
     fn sent_beside_exchanges(&mut self, id: PortId) {
         self.change_port(id, |port| port.sender.sent());
-        self.talk_sent(id);
+        self.exchange_sent(id);
     }
 
     #[cold]
     fn port_up(&mut self, id: PortId) {
         self.change_port(id, FieldPort::up);
-        self.talk_begins(id);
+        self.exchanges_begin(id);
         self.tell_alive(self.clock.now);
     }
 
     #[cold]
     fn port_down(&mut self, id: PortId, now: Instant) {
         let Some(port) = find_port(&mut self.ports, id) else { return };
-        self.clock.ask.add(Ask::ALL);
+        self.clock.dirty.add(Dirty::ALL);
         port.down(&self.bindings.inputs, self.links.command.first_mut(), &mut self.tap, now);
-        self.talk_ends(id);
+        self.exchanges_end(id);
         self.drop_forgotten(now);
         self.tell_alive(now);
     }
@@ -440,14 +440,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[cold]
     fn port_bus(&mut self, id: PortId, state: BusState, now: Instant) {
         let Some(port) = find_port(&mut self.ports, id) else { return };
-        self.clock.ask.add(Ask::ALL);
+        self.clock.dirty.add(Dirty::ALL);
         let was_off = port.bus == BusState::BusOff;
         port.bus_state(state, &self.bindings.inputs, self.links.command.first_mut(), now);
         let deadline = port.deadline();
         self.arm(deadline);
         match (was_off, state == BusState::BusOff) {
-            (false, true) => self.talk_ends(id),
-            (true, false) => self.talk_begins(id),
+            (false, true) => self.exchanges_end(id),
+            (true, false) => self.exchanges_begin(id),
             _ => {}
         }
         self.drop_forgotten(now);
@@ -467,7 +467,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     fn change_port(&mut self, id: PortId, change: impl FnOnce(&mut FieldPort)) {
         if let Some(port) = find_port(&mut self.ports, id) {
             change(port);
-            self.clock.ask.add(Ask::PORTS);
+            self.clock.dirty.add(Dirty::PORTS);
             let deadline = port.deadline();
             self.arm(deadline);
         }
@@ -503,7 +503,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         if accepted.frames == 0 {
             return;
         }
-        self.clock.ask.add(Ask::LINKS.when(!self.links.command.is_empty()));
+        self.clock.dirty.add(Dirty::LINKS.when(!self.links.command.is_empty()));
         let mut deadline = self.store.deadline();
         if deadline <= now {
             self.expire_waiting();
@@ -524,7 +524,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             if wanted.is_empty() {
                 continue;
             }
-            self.clock.ask.add(Ask::RECIPES);
+            self.clock.dirty.add(Dirty::RECIPES);
             if !wanted.and(&accepted.set).is_empty() {
                 link.offered.or_at(now);
                 let state = || state.first().map(|state| state.group);
@@ -533,7 +533,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
         if let Some(link) = self.links.modbus.first_mut() {
             let wanted = dirty.and(&link.writes);
-            self.clock.ask.add(Ask::MODBUS.when(!wanted.is_empty()));
+            self.clock.dirty.add(Dirty::MODBUS.when(!wanted.is_empty()));
             if !wanted.and(&accepted.set).is_empty() {
                 link.offered.or_at(now);
             }
@@ -557,7 +557,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         if self.exchanges.is_used() {
             self.check_events();
         }
-        self.clock.ask.add(Ask::PORTS);
+        self.clock.dirty.add(Dirty::PORTS);
         let mut first = Instant::NEVER;
         for port in &mut self.ports {
             let usable = port.is_usable();
@@ -579,7 +579,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 port.sender.take_due_since().record(now, &mut self.store.latency.lateness);
                 // Those before it had nothing.
                 if left == 0 && !port.sender.is_due() && !self.exchanges.is_used() {
-                    self.clock.ask.remove(Ask::PORTS);
+                    self.clock.dirty.remove(Dirty::PORTS);
                 }
                 return Some((port.id, downward));
             }

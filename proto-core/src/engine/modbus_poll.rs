@@ -26,7 +26,7 @@ pub(super) fn take_poll<const PORTS: usize>(
         });
     }
     store.image.stamp(block.group, store.now);
-    store.doubt_by_witnesses();
+    store.unconfirm_by_witnesses();
 }
 
 /// The same where bits have owners.

@@ -12,7 +12,7 @@ use crate::sysvar::{BIT_INPUT_COUNT, COUNT, Direction, INPUT_COUNT, ModbusPlace,
 
 /// How an input variable reaches the controller.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum WayUp {
+pub enum Route {
     /// In frames of a recipe link.
     Recipe(LinkId),
     /// By Modbus writes.
@@ -36,7 +36,7 @@ pub enum Source {
 #[derive(Debug, Clone)]
 pub struct Plan {
     owners: [Option<PortId>; INPUT_COUNT],
-    ways: [Option<WayUp>; INPUT_COUNT],
+    ways: [Option<Route>; INPUT_COUNT],
     sources: [Option<Source>; COUNT],
     read_back: InputSet,
     /// The owners of single bits of byte variables.
@@ -76,7 +76,7 @@ pub enum PlanError {
         part: PortId,
     },
     /// No configured way up can carry the input variable (D15).
-    NoWayUp {
+    NoRoute {
         /// The variable.
         var: SysVar,
         /// The port that writes it.
@@ -124,7 +124,7 @@ impl fmt::Display for PlanError {
                     bit.var, whole.0, part.0
                 )
             }
-            Self::NoWayUp { var, .. } => {
+            Self::NoRoute { var, .. } => {
                 write!(f, "{var} can be written only through a recipe link whose input part carries it")
             }
             Self::NoSource { var, .. } => {
@@ -212,7 +212,7 @@ impl Plan {
     }
 
     /// How an input variable that is owned, or some of whose bits are, reaches the controller.
-    pub fn way_up(&self, var: SysVar) -> Option<WayUp> {
+    pub fn route(&self, var: SysVar) -> Option<Route> {
         self.ways.get(var.ordinal()).copied().flatten()
     }
 
@@ -234,7 +234,7 @@ impl Plan {
 
     /// Whether Modbus is needed.
     pub(super) fn needs_modbus(&self) -> bool {
-        self.ways.contains(&Some(WayUp::Modbus)) || self.sources.contains(&Some(Source::Modbus))
+        self.ways.contains(&Some(Route::Modbus)) || self.sources.contains(&Some(Source::Modbus))
     }
 
     fn claim(&mut self, config: ConfigView<'_>, var: SysVar, port: PortId) -> Result<(), PlanError> {
@@ -243,7 +243,7 @@ impl Plan {
             Some(first) if first != port => return Err(PlanError::TwoOwners { var, first, second: port }),
             _ => *owner = Some(port),
         }
-        self.find_way_up(config, var, port)
+        self.find_route(config, var, port)
     }
 
     fn claim_bit(&mut self, config: ConfigView<'_>, bit: VarBit, port: PortId) -> Result<(), PlanError> {
@@ -258,15 +258,15 @@ impl Plan {
             }
             _ => *owner = Some(port),
         }
-        self.find_way_up(config, bit.var, port)
+        self.find_route(config, bit.var, port)
     }
 
-    fn find_way_up(&mut self, config: ConfigView<'_>, var: SysVar, port: PortId) -> Result<(), PlanError> {
+    fn find_route(&mut self, config: ConfigView<'_>, var: SysVar, port: PortId) -> Result<(), PlanError> {
         let way = uplinks(config)
             .find(|&(_, recipe)| config.carries(recipe, Direction::Input, var))
-            .map(|(link, _)| WayUp::Recipe(link))
-            .or_else(|| is_exact_modbus(var).then_some(WayUp::Modbus))
-            .ok_or(PlanError::NoWayUp { var, port })?;
+            .map(|(link, _)| Route::Recipe(link))
+            .or_else(|| is_exact_modbus(var).then_some(Route::Modbus))
+            .ok_or(PlanError::NoRoute { var, port })?;
         if let Some(slot) = self.ways.get_mut(var.ordinal()) {
             *slot = Some(way);
         }

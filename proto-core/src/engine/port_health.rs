@@ -9,7 +9,7 @@ use heapless::Vec;
 use super::Engine;
 use super::build::Groups;
 use super::build_error::{BuildError, one_too_many};
-use super::clock::Ask;
+use super::clock::Dirty;
 use super::io::{LinkId, PortId, PortState};
 use super::state_link::Kept;
 use super::user::wrapping_count;
@@ -308,7 +308,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
         if !news.is_empty() {
             self.store.tell(&news);
-            self.clock.ask.add(Ask::LINKS);
+            self.clock.dirty.add(Dirty::LINKS);
         }
     }
 }

@@ -8,7 +8,7 @@ use super::device_port::DeviceCodec;
 use super::events::{Event, Outcome};
 use super::exchanges::{Asks, Item, Piece};
 use super::io::ReplyCode;
-use super::line::{Failure, Line, Talks};
+use super::line::{ExchangeTable, Failure, Line};
 use super::sender::{DIGEST_SEED, Sender, digest};
 use super::turns::Cause;
 use super::user::{OutputBind, Outputs};
@@ -36,7 +36,7 @@ impl Maker<'_> {
     pub(super) fn next(
         &self,
         line: &mut Line,
-        (items, talks, kept): (&mut [Item], &mut Talks<'_>, &[Piece]),
+        (items, table, kept): (&mut [Item], &mut ExchangeTable<'_>, &[Piece]),
         counters: &mut PortCounters,
         is_busy: bool,
         out: &mut [u8],
@@ -45,7 +45,7 @@ impl Maker<'_> {
         if line.looks.as_mut().is_some_and(|grid| grid.due(now).is_some()) {
             for (nth, item) in items.iter_mut().enumerate() {
                 if self.is_wanted(item, out) {
-                    line.request(talks, nth, now);
+                    line.request(table, nth, now);
                 }
             }
         }
@@ -56,7 +56,7 @@ impl Maker<'_> {
             if is_busy || !line.may_ask() {
                 return None;
             }
-            let flight = line.next(talks, now)?;
+            let flight = line.next(table, now)?;
             let nth = usize::from(flight.exchange);
             let item = items.get_mut(nth)?;
             let made = match (flight.cause, item.event) {
@@ -70,15 +70,15 @@ impl Maker<'_> {
                     self.make(item, body).map(|len| (len, content))
                 }
             };
-            let peer = talks.peer_of(flight)?;
+            let peer = table.peer_of(flight)?;
             let Some((len, content)) = made else {
                 bump(&mut peer.counters.unprepared);
                 if flight.is_repetition() {
                     bump(&mut counters.unanswered);
-                    line.give_up(talks, flight, Failure::Timeout, item.times, now);
+                    line.give_up(table, flight, Failure::Timeout, item.times, now);
                 } else {
                     item.is_owed |= matches!(flight.cause, Cause::State(Some(_)));
-                    line.turns(talks, |turns| turns.not_sent(nth, flight.cause, now));
+                    line.turns(table, |turns| turns.not_sent(nth, flight.cause, now));
                 }
                 continue;
             };
@@ -86,7 +86,7 @@ impl Maker<'_> {
             if line.transactions.is_none() && !flight.may_repeat(request) {
                 // A reply to the old value must not confirm the new one. The exchange is asked again when none can come.
                 bump(&mut counters.unanswered);
-                line.give_up(talks, flight, Failure::Timeout, item.times, now);
+                line.give_up(table, flight, Failure::Timeout, item.times, now);
                 continue;
             }
             bump(&mut peer.counters.requests);
@@ -104,7 +104,7 @@ impl Maker<'_> {
                 item.digest = content;
             }
             let told_by = (expected, sdo_of(item, request));
-            line.handed_over(talks, flight, told_by, request, now);
+            line.handed_over(table, flight, told_by, request, now);
             let len = match &mut line.transactions {
                 Some(all) => all.begin(flight.exchange, len, out)?,
                 None => len,

@@ -199,7 +199,7 @@ impl FieldPort {
         else {
             return accepted;
         };
-        let (items, talks, written) = view.served(line);
+        let (items, table, written) = view.served(line);
         let frames =
             Frames::new((self.id, self.mode), &mut self.reply, &mut self.counters, inputs, store, commands);
         let sender = &self.sender;
@@ -212,7 +212,7 @@ impl FieldPort {
         if let Some(len) = len {
             slave.keep(reply.get(..len).unwrap_or(&[]));
         }
-        if let Some(peer) = talks.peers.first_mut() {
+        if let Some(peer) = table.peers.first_mut() {
             peer.counters.requests = after.answered;
             peer.counters.replies = after.answered.wrapping_sub(after.refused);
             peer.counters.refused = after.refused;

@@ -222,18 +222,18 @@ fn keep(kept: &[Kept], view: &StateView<'_>, image: &mut Image) -> usize {
 /// Confirms safe values that the controller shows. A value shown by an old packet, or overwritten
 /// by late data, loses its confirmation.
 fn compare_safe<const PORTS: usize>(view: &StateView<'_>, store: &mut Store<PORTS>) {
-    let (may_confirm, may_doubt) = (store.may_confirm(), store.may_doubt());
+    let (may_confirm, may_unconfirm) = (store.may_confirm(), store.may_unconfirm());
     for var in store.safe.iter() {
         let Some(shown) = view.read_var(var) else { continue };
         if store.bits.bytes.contains(var) {
             let Scalar::Byte(shown) = shown else { continue };
-            store.compare_bits(var, shown, may_confirm, may_doubt);
+            store.compare_bits(var, shown, may_confirm, may_unconfirm);
             continue;
         }
         let is_there = shown == store.image.value(var);
         match store.unconfirmed.contains(var) {
             true if is_there && may_confirm => store.confirm(&InputSet::from_iter([var])),
-            false if !is_there && may_doubt => store.doubt(var),
+            false if !is_there && may_unconfirm => store.unconfirm(var),
             _ => {}
         }
     }

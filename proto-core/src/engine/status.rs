@@ -9,13 +9,13 @@ use core::fmt;
 
 use super::bits::Bits;
 use super::counters::PortCounters;
+use super::dropped::DroppedCommand;
 use super::failed::FailedCommand;
 use super::field_port::{Codec, FieldPort};
 use super::io::{BusState, LinkKind, PortId, PortState, ReplyCode};
 use super::latency::Latency;
 use super::line::{PeerCounters, PeerState};
 use super::links::{LinkInfo, LinksView};
-use super::not_given::LastNotGiven;
 use super::port_health::PortsHealth;
 use super::rejection::{LastRejection, RejectedField};
 use super::rules::allowed;
@@ -114,7 +114,7 @@ pub struct PortStatus<'a> {
     /// That command, such as `run(pick.jspf)`.
     pub command: Option<CommandText<'a>>,
     /// The newest value that gave no command, and why.
-    pub last_not_given: Option<&'a LastNotGiven>,
+    pub last_dropped: Option<&'a DroppedCommand>,
     /// The newest of its commands that the controller replied to with a failure.
     pub last_failed: Option<FailedCommand<'a>>,
     /// The newest rejection. A CAN frame with an unknown id replaces no other rejection: on a
@@ -382,7 +382,7 @@ impl<'a> Status<'a> {
             overdue,
             reply: port.reply,
             command: self.links.command.and_then(|link| link.newest_of(port.id)),
-            last_not_given: self.links.command.and_then(|link| link.not_given_of(port.id)),
+            last_dropped: self.links.command.and_then(|link| link.dropped_by(port.id)),
             last_failed: self.last_failed(port.id),
             last_rejection: port.last_rejection.as_ref(),
             rejected_field: port.last_rejection.as_ref().and_then(|last| self.rejected(index, last)),

@@ -20,9 +20,9 @@ use core::fmt;
 
 use serde::ser::{Serialize, SerializeMap, Serializer};
 
+use super::dropped::DroppedCommand;
 use super::failed::FailedCommand;
 use super::links::LinkInfo;
-use super::not_given::LastNotGiven;
 use super::other_text::OtherText;
 use super::rejection::{LastRejection, RejectedField};
 use super::status::{ControllerStatus, FieldBus, PeerStatus, PortStatus, Status, VariableStatus};
@@ -164,7 +164,7 @@ impl Serialize for PortStatus<'_> {
         if let Some(command) = port.command {
             map.serialize_entry("command", &Text(command))?;
         }
-        if let Some(last) = port.last_not_given {
+        if let Some(last) = port.last_dropped {
             map.serialize_entry("last_not_given", &At(last, at))?;
         }
         if let Some(failed) = &port.last_failed {
@@ -191,7 +191,7 @@ impl Serialize for PeerStatus {
     }
 }
 
-impl Serialize for At<&LastNotGiven> {
+impl Serialize for At<&DroppedCommand> {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let &Self(last, at) = self;
         let mut map = serializer.serialize_map(None)?;

@@ -395,7 +395,7 @@ impl<const PORTS: usize> Store<PORTS> {
     }
 
     /// At the first tick, the frames that are overdue from the start are handled.
-    pub(super) fn is_overdue_from_start(&mut self) {
+    pub(super) fn is_overduefrom_start(&mut self) {
         self.next_overdue = Stamp::at(Instant::ZERO);
     }
 

@@ -326,7 +326,7 @@ impl Connection for Uplink {
                 store.controller_was_away();
             }
             store.image.stamp(group, now);
-            store.doubt_by_witnesses();
+            store.unconfirm_by_witnesses();
             if self.greets() {
                 self.greet_at = now + GREET_EVERY;
             }

@@ -297,7 +297,7 @@ impl FieldPort {
     ) -> Accepted {
         let mut accepted = Accepted::default();
         let (now, usable, bytes) = (store.now, self.is_usable(), *rest);
-        let is_late = |heard: Instant, idle_gap: Duration| now >= heard + idle_gap;
+        let is_overdue = |heard: Instant, idle_gap: Duration| now >= heard + idle_gap;
         let Codec::Device(DeviceCodec { reader: Some(Reader::Whole { cutter, heard }), .. }) = &self.codec
         else {
             return accepted;
@@ -305,7 +305,7 @@ impl FieldPort {
         if cutter.ends_by_silence()
             && cutter.has_begun()
             && !bytes.is_empty()
-            && is_late(*heard, self.line.idle_gap)
+            && is_overdue(*heard, self.line.idle_gap)
         {
             // These bytes may have waited: nobody knows whether there was silence before them.
             self.discard_partial(tap, now);

@@ -7,7 +7,7 @@
 //! Work is linear in the bytes received, whatever they are: each byte costs at most a few
 //! comparisons with the up to eight bytes of head and tail and a few copies, which a test counts.
 
-use self::disturbed::Completed;
+use self::resync::Completed;
 use super::delimiter::Head;
 use super::error::DatagramError;
 use super::model::{MAX_DELIMITER, MAX_STREAM_FRAME};
@@ -55,7 +55,7 @@ enum Held {
     /// The chunk is used up.
     Partial,
     /// Each byte has to be looked at; nothing was taken.
-    Disturbed,
+    Resync,
 }
 
 /// Whether a chunk had a frame. Where that is is told elsewhere: a caller's branch on this alone can be decided where it
@@ -124,7 +124,7 @@ impl Deframer {
         match self.go_on(layout, chunk) {
             Held::Whole(len) => return Found::of(self.ring.get(..len), frame),
             Held::Partial => return Found::Nothing,
-            Held::Disturbed => {}
+            Held::Resync => {}
         }
         match self.complete(layout, chunk) {
             Completed::Frame { at, taken } => {
@@ -150,9 +150,9 @@ impl Deframer {
     fn go_on(&mut self, layout: &StreamLayout, chunk: &mut &[u8]) -> Held {
         let (held, frame_len) = (self.pending(), layout.frame_len());
         if self.hold_until != hold_until(layout) {
-            return Held::Disturbed;
+            return Held::Resync;
         }
-        let Some(missing) = self.ring.get_mut(held..frame_len) else { return Held::Disturbed };
+        let Some(missing) = self.ring.get_mut(held..frame_len) else { return Held::Resync };
         let Some((more, after)) = chunk.split_at_checked(missing.len()) else {
             self.put(held, chunk);
             self.len = self.len.wrapping_add(chunk.len() as u16);
@@ -163,7 +163,7 @@ impl Deframer {
         copy(missing, more);
         if !self.ring.get(..frame_len).is_some_and(|frame| layout.tail_word().ends(frame)) {
             // The bytes after the held ones do not count.
-            return Held::Disturbed;
+            return Held::Resync;
         }
         self.stats.frames = self.stats.frames.wrapping_add(1);
         self.len = 0;
@@ -183,7 +183,7 @@ impl Deframer {
             match self.go_on(layout, chunk) {
                 Held::Whole(len) => return self.ring.get(..len),
                 Held::Partial => return None,
-                Held::Disturbed => {}
+                Held::Resync => {}
             }
             match self.complete(layout, chunk) {
                 Completed::Frame { at, taken } => {
@@ -450,7 +450,7 @@ pub fn datagram<'d>(layout: &StreamLayout, bytes: &'d [u8]) -> Result<&'d [u8], 
     layout.payload_of(bytes).ok_or(length)
 }
 
-mod disturbed;
+mod resync;
 
 #[cfg(not(test))]
 #[inline(always)]

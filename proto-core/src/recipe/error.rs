@@ -95,7 +95,7 @@ pub enum PartError {
         id: CanId,
     },
     /// Two frames of a device with one id, and no constant that tells them apart.
-    NotToldApart {
+    Indistinguishable {
         /// The second of the two.
         frame: u8,
         /// The first of the two.
@@ -132,7 +132,7 @@ impl PartError {
             Self::NoFields { frame } => frame,
             Self::CanFrameTooLong { frame, .. }
             | Self::InvalidId { frame, .. }
-            | Self::NotToldApart { frame, .. }
+            | Self::Indistinguishable { frame, .. }
             | Self::DuplicateId { frame, .. } => Some(frame),
             Self::TooManyFrames => Some(MAX_CAN_IDS as u8),
             _ => match self.field() {
@@ -203,7 +203,7 @@ impl fmt::Display for PartError {
             Self::InvalidId { id: CanId::Extended(id), .. } => {
                 write!(f, "id {id:#010x} does not fit in 29 bits (0x00000000..=0x1fffffff)")
             }
-            Self::NotToldApart { first, id, .. } => {
+            Self::Indistinguishable { first, id, .. } => {
                 let first = u16::from(first).saturating_add(1);
                 write!(
                     f,

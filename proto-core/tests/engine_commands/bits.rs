@@ -56,7 +56,7 @@ fn of_start_and_stop_in_one_frame_only_stop_is_sent_and_its_result_is_told() {
         assert_eq!(sent(&mut rig, LinkId::COMMAND), [""; 0]);
         let counters = rig.counters(port);
         assert_eq!((counters.commands, counters.commands_dropped), (2, 1));
-        assert_eq!(not_given(&rig), Some((NotGiven::Overtaken, nth as u8, 1)));
+        assert_eq!(not_given(&rig), Some((DropReason::Overtaken, nth as u8, 1)));
     }
 }
 
@@ -144,7 +144,7 @@ fn a_value_in_no_table_is_counted_once_and_told() {
         rig.bytes(port, &[0xA5, 9, value]);
     }
     assert_eq!(rig.counters(port).commands_unknown, 1);
-    assert_eq!(not_given(&rig), Some((NotGiven::Unknown, 1, 3)));
+    assert_eq!(not_given(&rig), Some((DropReason::Unknown, 1, 3)));
     assert_eq!(rig.counters(port).commands, 1);
 }
 
@@ -161,5 +161,5 @@ fn the_idle_value_may_be_another_than_0() {
     }
     let counters = rig.counters(port);
     assert_eq!((counters.commands, counters.commands_unknown), (1, 2), "each frame counts");
-    assert_eq!(not_given(&rig), Some((NotGiven::Unknown, 0, 0)));
+    assert_eq!(not_given(&rig), Some((DropReason::Unknown, 0, 0)));
 }

@@ -9,7 +9,7 @@ mod silence;
 
 use proto_core::config::*;
 use proto_core::device::{Bits, ByteOrder, Encoding, Kind, Overflow};
-use proto_core::engine::{LastNotGiven, LinkId, NotGiven, PortId, ReplyCode};
+use proto_core::engine::{DropReason, DroppedCommand, LinkId, PortId, ReplyCode};
 use proto_core::recipe::model::Mode;
 use rig::*;
 
@@ -51,10 +51,10 @@ fn reply(rig: &Rig, port: PortId) -> ReplyCode {
 }
 
 /// Why a value of the first port gave no command: the reason, the field and the value.
-fn not_given(rig: &Rig) -> Option<(NotGiven, u8, i64)> {
+fn not_given(rig: &Rig) -> Option<(DropReason, u8, i64)> {
     let status = rig.engine.status(rig.now);
-    let last = status.ports().next().unwrap().last_not_given.copied();
-    last.map(|LastNotGiven { why, field, value, .. }| (why, field, value))
+    let last = status.ports().next().unwrap().last_dropped.copied();
+    last.map(|DroppedCommand { why, field, value, .. }| (why, field, value))
 }
 
 /// The newest command that a value of the first port picked.

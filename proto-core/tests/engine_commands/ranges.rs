@@ -30,7 +30,7 @@ fn the_value_is_in_the_command() {
         assert_eq!(reply(&rig, port), ReplyCode::Success);
     }
     rig.bytes(port, &[0xA5, 121]);
-    assert_eq!(not_given(&rig), Some((NotGiven::Unknown, 0, 121)));
+    assert_eq!(not_given(&rig), Some((DropReason::Unknown, 0, 121)));
 }
 
 #[test]

@@ -50,7 +50,7 @@ fn without_it_the_value_after_silence_is_counted_and_told() {
     rig.bytes(port, &[0xA5, 1, 2]);
     assert_eq!(sent(&mut rig, LinkId::COMMAND), [""; 0]);
     assert_eq!((rig.counters(port).commands_based, rig.counters(port).commands), (1, 0));
-    assert_eq!(not_given(&rig), Some((NotGiven::Based, 0, 1)));
+    assert_eq!(not_given(&rig), Some((DropReason::Based, 0, 1)));
     // A value at rest is no news.
     rig.run(MS(500));
     rig.bytes(port, &[0xA5, 0, 2]);
@@ -71,7 +71,7 @@ fn a_device_that_was_gone_only_sets_the_base() {
         }
         rig.bytes(port, &[0xA5, 1, 1]);
         assert_eq!(sent(&mut rig, LinkId::COMMAND), [""; 0]);
-        assert_eq!(not_given(&rig), Some((NotGiven::Based, 0, 1)));
+        assert_eq!(not_given(&rig), Some((DropReason::Based, 0, 1)));
         rig.bytes(port, &[0xA5, 3, 1]);
         assert_eq!(sent(&mut rig, LinkId::COMMAND), ["resume"]);
     }
@@ -105,7 +105,7 @@ fn a_stop_is_asked_for_until_the_device_says_otherwise() {
         let all = [sent(&mut rig, LinkId::COMMAND), sent(&mut rig, LinkId::URGENT)].concat();
         assert_eq!(all.first().is_some_and(|text| text == "stop"), is_sent, "{when:?}: {all:?}");
         if !is_sent {
-            assert_eq!(not_given(&rig), Some((NotGiven::TooOld, 0, 2)));
+            assert_eq!(not_given(&rig), Some((DropReason::TooOld, 0, 2)));
         }
     }
 }
@@ -119,13 +119,13 @@ fn any_other_command_waits_1_s_at_most() {
         }
         assert_eq!(sent(&mut rig, LinkId::COMMAND), ["resume"]);
         rig.run(MS(500));
-        let why = (when == CommandWhen::Change).then_some((NotGiven::DeviceGone, 0, 1));
+        let why = (when == CommandWhen::Change).then_some((DropReason::DeviceGone, 0, 1));
         assert_eq!(not_given(&rig), why, "{when:?}");
         rig.run(MS(501));
         rig.link_bytes(LinkId::COMMAND, b"resume success");
         assert_eq!(sent(&mut rig, LinkId::COMMAND), [""; 0]);
         assert_eq!(rig.counters(port).commands_dropped, 1);
-        let why = if when == CommandWhen::Kept { NotGiven::TooOld } else { NotGiven::DeviceGone };
+        let why = if when == CommandWhen::Kept { DropReason::TooOld } else { DropReason::DeviceGone };
         assert_eq!(not_given(&rig), Some((why, 0, 1)));
     }
 }
@@ -136,16 +136,16 @@ fn every_other_reason_is_told_too() {
     for _ in 0..10 {
         rig.bytes(port, &[0xA5, 3, 1]);
     }
-    assert_eq!(not_given(&rig), Some((NotGiven::QueueFull, 0, 3)));
+    assert_eq!(not_given(&rig), Some((DropReason::QueueFull, 0, 3)));
     rig.reachable.clear();
     rig.input(Input::LinkDown { link: LinkId::COMMAND });
-    assert_eq!(not_given(&rig), Some((NotGiven::NoLink, 0, 3)), "lost while they waited");
+    assert_eq!(not_given(&rig), Some((DropReason::NoLink, 0, 3)), "lost while they waited");
     rig.bytes(port, &[0xA5, 1, 1]);
-    assert_eq!(not_given(&rig), Some((NotGiven::NoLink, 0, 1)));
+    assert_eq!(not_given(&rig), Some((DropReason::NoLink, 0, 1)));
     rig.bytes(port, &[0xA5, 2, 1]);
     rig.now += Duration::from_secs(60);
     rig.input(Input::Tick);
-    let texts: Vec<_> = NotGiven::ALL.map(NotGiven::text).to_vec();
+    let texts: Vec<_> = DropReason::ALL.map(DropReason::text).to_vec();
     assert!(texts.iter().all(|text| texts.iter().filter(|other| *other == text).count() == 1));
 }
 

@@ -39,13 +39,14 @@ impl Device {
         let value = frame(&mut cell, None, b"V", vec![byte_to("WordInputReg[1]")]);
         let halt = frame(&mut cell, None, b"H", vec![fixed(7)]);
         let halted = frame(&mut cell, None, b"T", vec![fixed(0)]);
-        let talk = |request, reply| Talk::Frames { request, reply, refusal: None };
-        let mut start = Exchange::new(1, Talk::Frames { request: go, reply: done, refusal }, rising(0));
+        let talk = |request, reply| Transaction::Frames { request, reply, refusal: None };
+        let mut start =
+            Exchange::new(1, Transaction::Frames { request: go, reply: done, refusal }, rising(0));
         start.pending = pending;
         start.late = Some(Duration::ZERO);
         start.outcome = OutcomeTo { to: Some(var("WordInputReg[2]")), ..OutcomeTo::NONE };
         change(&mut start);
-        let poll = never_late(Exchange::new(2, talk(ask, value), AskWhen::every(MS(50))));
+        let poll = never_late(Exchange::new(2, talk(ask, value), Triggers::every(MS(50))));
         let mut stop = never_late(Exchange::new(1, talk(halt, halted), rising(1)));
         stop.stop = true;
         let port = talking(&mut cell, &[start, poll, stop]);
@@ -160,8 +161,8 @@ fn alone() -> Line {
     let request = frame(&mut cell, None, b"G", vec![fixed(7)]);
     let reply = frame(&mut cell, None, b"S", vec![fixed(0)]);
     let pending = frame(&mut cell, None, b"S", vec![fixed(1)]);
-    let talk = Talk::Frames { request, reply, refusal: None };
-    let exchange = Exchange { pending, ..Exchange::new(1, talk, AskWhen::every(MS(50))) };
+    let talk = Transaction::Frames { request, reply, refusal: None };
+    let exchange = Exchange { pending, ..Exchange::new(1, talk, Triggers::every(MS(50))) };
     let port = talking(&mut cell, &[never_late(exchange)]);
     Line::new(&cell, port)
 }
@@ -203,7 +204,7 @@ fn a_device_that_is_pending_for_ever_does_not_hold_the_line() {
 #[test]
 fn a_state_that_stays_pending_is_written_again_later() {
     let mut device = Device::new(|start| {
-        start.when = AskWhen { change: true, ..AskWhen::NEVER };
+        start.when = Triggers { change: true, ..Triggers::NEVER };
         start.outcome = OutcomeTo::NONE;
         start.retries = 3;
     });
@@ -255,13 +256,13 @@ fn a_stop_does_not_wait_for_what_is_pending() {
 #[test]
 fn a_stop_that_is_not_confirmed_yet_has_its_turns() {
     let mut cell = Cell::new();
-    let talk = |request, reply| Talk::Frames { request, reply, refusal: None };
+    let talk = |request, reply| Transaction::Frames { request, reply, refusal: None };
     let (go, done) =
         (frame(&mut cell, None, b"G", vec![fixed(7)]), frame(&mut cell, None, b"S", vec![fixed(0)]));
     let pending = frame(&mut cell, None, b"S", vec![fixed(1)]);
     let (halt, halted) =
         (frame(&mut cell, None, b"H", vec![fixed(7)]), frame(&mut cell, None, b"T", vec![fixed(0)]));
-    let start = Exchange { pending, ..never_late(Exchange::new(1, talk(go, done), AskWhen::every(MS(50)))) };
+    let start = Exchange { pending, ..never_late(Exchange::new(1, talk(go, done), Triggers::every(MS(50)))) };
     let mut stop = never_late(Exchange::new(2, talk(halt, halted), rising(1)));
     stop.stop = true;
     let port = talking(&mut cell, &[start, stop]);
@@ -330,13 +331,13 @@ fn two(first: [&[u8]; 2], second: [Option<&[u8]>; 2]) -> Line {
         let request = frame(&mut cell, None, request, vec![fixed(7)]);
         let [reply, pending] =
             answers.map(|head| head.and_then(|head| frame(&mut cell, None, head, vec![fixed(0)])));
-        let talk = Talk::Frames { request, reply, refusal: None };
+        let talk = Transaction::Frames { request, reply, refusal: None };
         Exchange { late: Some(MS(1_000)), retries: 0, pending, ..Exchange::new(1, talk, when) }
     };
-    let first = exchange(b"A", first.map(Some), AskWhen::every(MS(10_000)));
+    let first = exchange(b"A", first.map(Some), Triggers::every(MS(10_000)));
     let mut second = exchange(b"C", second, rising(0));
     (second.outcome.to, second.trigger) = (Some(var("WordInputReg[2]")), Some(MS(3_000)));
-    let poll = exchange(b"Q", [Some(b"V"), None], AskWhen::every(MS(50)));
+    let poll = exchange(b"Q", [Some(b"V"), None], Triggers::every(MS(50)));
     let port = talking(&mut cell, &[first, second, poll]);
     let mut line = Line::new(&cell, port);
     // Behind the start, in which any reply may be late. The first is asked and not answered.
@@ -389,7 +390,7 @@ fn answers_with_one_id_on_can() {
     let reply = frame(&mut cell, Some(0x201), &[], vec![fixed(9), fixed(0)]);
     let pending = frame(&mut cell, Some(0x201), &[], vec![fixed(9), fixed(1)]);
     let refusal = frame(&mut cell, Some(0x201), &[], vec![fixed(9), byte_to(CODE)]);
-    let talk = Talk::Frames { request, reply, refusal };
+    let talk = Transaction::Frames { request, reply, refusal };
     let mut exchange = Exchange { pending, ..never_late(Exchange::new(1, talk, rising(0))) };
     exchange.outcome.to = Some(var("WordInputReg[2]"));
     let parts = Parts::Can { input: Default::default(), output: Default::default() };

@@ -5,7 +5,7 @@ use super::*;
 /// Two steps: the target, and the start.
 fn axis(is_named: bool) -> Axis {
     Axis::new(|cell, start| {
-        let when = if is_named { AskWhen::NEVER } else { rising(0) };
+        let when = if is_named { Triggers::NEVER } else { rising(0) };
         let mut go = sets(cell, 3, 0x90, None, 1.0, when);
         // The poll is the first exchange, the target the second but one.
         go.follow = is_named.then_some(2);

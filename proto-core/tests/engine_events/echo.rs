@@ -5,9 +5,9 @@ use super::*;
 /// A register is written when it changes; with `reads`, another one is read.
 fn cell(reads: bool, echo: Echo) -> (Cell, PortId) {
     let mut cell = Cell::new();
-    let when = AskWhen { change: true, ..AskWhen::NEVER };
+    let when = Triggers { change: true, ..Triggers::NEVER };
     let mut write = sets(&mut cell, 3, 0x20, Some("WordOutputReg[1]"), 0.0, when);
-    let Talk::Rtu { operation, .. } = &mut write.talk else { panic!() };
+    let Transaction::Rtu { operation, .. } = &mut write.transaction else { panic!() };
     *operation = Operation::WriteRegister { address: 0x20 };
     let mut table = vec![write];
     if reads {
@@ -104,7 +104,7 @@ fn a_line_without_an_echo_confirms() {
 fn an_event_that_may_have_been_echoed_is_of_unknown_outcome() {
     let mut cell = Cell::new();
     let mut start = sets(&mut cell, 3, 0x20, Some("WordOutputReg[1]"), 0.0, rising(0));
-    let Talk::Rtu { operation, .. } = &mut start.talk else { panic!() };
+    let Transaction::Rtu { operation, .. } = &mut start.transaction else { panic!() };
     *operation = Operation::WriteRegister { address: 0x20 };
     start.outcome.to = Some(var("WordInputReg[5]"));
     let port = talking(&mut cell, &[start]);

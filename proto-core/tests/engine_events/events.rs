@@ -239,7 +239,7 @@ fn each_exception_has_its_meaning() {
 fn a_busy_device_gets_a_value_that_changed() {
     let mut cell = Cell::new();
     let poll = reads_at(&mut cell, 3, 0x10, "WordInputReg[1]", MS(50));
-    let when = AskWhen { change: true, ..AskWhen::NEVER };
+    let when = Triggers { change: true, ..Triggers::NEVER };
     let speed = sets(&mut cell, 3, 0x20, Some("WordOutputReg[1]"), 0.0, when);
     let port = talking(&mut cell, &[poll, speed]);
     for code in [4, 6, 8, 10, 11] {

@@ -79,7 +79,7 @@ fn only_what_cannot_be_told_apart_waits_for_a_late_reply() {
     let mut like =
         [1, 2].map(|nth: u16| reads_at(&mut cell, 5, nth, &format!("WordInputReg[{nth}]"), MS(20)));
     like.iter_mut().for_each(|poll| (poll.timeout, poll.late) = (MS(30), None));
-    let mut longer = reads(&mut cell, 5, &["WordInputReg[3]", "WordInputReg[4]"], AskWhen::every(MS(20)));
+    let mut longer = reads(&mut cell, 5, &["WordInputReg[3]", "WordInputReg[4]"], Triggers::every(MS(20)));
     (longer.timeout, longer.late) = (MS(30), None);
     let mut other = reads_at(&mut cell, 6, 1, "WordInputReg[5]", MS(20));
     (other.timeout, other.late) = (MS(30), None);
@@ -128,7 +128,7 @@ fn a_late_reply_is_counted_and_frees_its_exchange() {
 #[test]
 fn a_late_reply_to_an_old_value_does_not_confirm_the_new_one() {
     let mut cell = Cell::new();
-    let when = AskWhen { change: true, ..AskWhen::NEVER };
+    let when = Triggers { change: true, ..Triggers::NEVER };
     let mut speed = sets(&mut cell, 3, 0x20, Some("WordOutputReg[1]"), 0.0, when);
     speed.late = None;
     let port = talking(&mut cell, &[speed]);

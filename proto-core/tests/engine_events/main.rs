@@ -30,8 +30,8 @@ use rig::*;
 /// Bit 0 of this byte starts, bit 1 stops.
 const BITS: &str = "BitOutputReg[3]";
 
-fn rising(bit: u8) -> AskWhen {
-    AskWhen { rising: Some((var(BITS), bit)), ..AskWhen::NEVER }
+fn rising(bit: u8) -> Triggers {
+    Triggers { rising: Some((var(BITS), bit)), ..Triggers::NEVER }
 }
 
 fn register_of(name: &str) -> usize {
@@ -50,7 +50,7 @@ fn sets(
     address: u16,
     from_var: Option<&str>,
     value: f64,
-    when: AskWhen,
+    when: Triggers,
 ) -> Exchange {
     let source = from_var.map_or(OutputBinding::Constant(value), from);
     let field = FieldSpec::DeviceOutput { encoding: word(), overflow: Overflow::Usual, from: source };
@@ -60,13 +60,13 @@ fn sets(
         None => cell.fields([field]),
     };
     let operation = Operation::WriteRegisters { address, count: 1 };
-    never_late(Exchange::new(slave, Talk::Rtu { operation, written, read: Span::default() }, when))
+    never_late(Exchange::new(slave, Transaction::Rtu { operation, written, read: Span::default() }, when))
 }
 
 /// Reads one register at an address.
 fn reads_at(cell: &mut Cell, slave: u8, address: u16, name: &str, every: Duration) -> Exchange {
-    let mut exchange = reads(cell, slave, &[name], AskWhen::every(every));
-    let Talk::Rtu { operation, .. } = &mut exchange.talk else { panic!() };
+    let mut exchange = reads(cell, slave, &[name], Triggers::every(every));
+    let Transaction::Rtu { operation, .. } = &mut exchange.transaction else { panic!() };
     *operation = Operation::ReadHoldingRegisters { address, count: 1 };
     exchange
 }

@@ -20,13 +20,13 @@ impl Register {
 }
 
 /// Writes these bits of the register from a variable.
-fn masks(cell: &mut Cell, (first, count): (u8, u8), from_var: &str, when: AskWhen) -> Exchange {
+fn masks(cell: &mut Cell, (first, count): (u8, u8), from_var: &str, when: Triggers) -> Exchange {
     let bits = Encoding::bits(T::Word, first..=first + count - 1).big_endian();
     let field = FieldSpec::DeviceOutput { encoding: bits, overflow: Overflow::Usual, from: from(from_var) };
     let written = cell.fields([field]);
     let mask = ((1 << count) - 1) << first;
     let operation = Operation::MaskWriteRegister { address: SHARED, mask };
-    never_late(Exchange::new(3, Talk::Rtu { operation, written, read: Span::default() }, when))
+    never_late(Exchange::new(3, Transaction::Rtu { operation, written, read: Span::default() }, when))
 }
 
 /// A line on which nothing echoes.
@@ -37,7 +37,7 @@ fn line_with(mut cell: Cell, exchanges: &[Exchange]) -> Line {
     Line::new(&cell, port)
 }
 
-const CHANGE: AskWhen = AskWhen { change: true, ..AskWhen::NEVER };
+const CHANGE: Triggers = Triggers { change: true, ..Triggers::NEVER };
 
 #[test]
 fn the_bits_of_others_stay_as_another_master_has_set_them() {
@@ -64,7 +64,7 @@ fn the_bits_of_others_stay_as_another_master_has_set_them() {
 #[test]
 fn a_period_writes_them_again_and_again() {
     let mut cell = Cell::new();
-    let write = masks(&mut cell, (0, 1), "WordOutputReg[1]", AskWhen::every(MS(50)));
+    let write = masks(&mut cell, (0, 1), "WordOutputReg[1]", Triggers::every(MS(50)));
     let mut line = line_with(cell, &[write]);
     line.word("WordOutputReg[1]", 1);
     let mut register = Register(0);

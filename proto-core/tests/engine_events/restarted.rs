@@ -7,7 +7,7 @@ const ACTIVATE: u16 = 0x03E8;
 /// An activation at the start, and a status that is read each 50 ms and is 0 behind a restart.
 fn cell() -> (Cell, PortId) {
     let mut cell = Cell::new();
-    let start = AskWhen { start: true, ..AskWhen::NEVER };
+    let start = Triggers { start: true, ..Triggers::NEVER };
     let activate = sets(&mut cell, 9, ACTIVATE, None, 1.0, start);
     let mut status = reads_at(&mut cell, 9, 0x10, "WordInputReg[1]", MS(50));
     status.restarted = Some(Restarted { field: 0, value: 0.0 });
@@ -129,10 +129,10 @@ fn a_frame_that_comes_unasked_tells_of_a_restart() {
     let unused =
         FieldSpec::DeviceInput { encoding: bits, overflow: Overflow::Usual, to: InputBinding::Unused };
     let (go, done, state) = (frame(b"G", fixed), frame(b"D", fixed), frame(b"E", unused));
-    let talk = |request, reply| Talk::Frames { request, reply, refusal: None };
-    let start = AskWhen { start: true, ..AskWhen::NEVER };
+    let talk = |request, reply| Transaction::Frames { request, reply, refusal: None };
+    let start = Triggers { start: true, ..Triggers::NEVER };
     let start = never_late(Exchange::new(1, talk(go, done), start));
-    let mut unasked = never_late(Exchange::new(1, talk(None, state), AskWhen::NEVER));
+    let mut unasked = never_late(Exchange::new(1, talk(None, state), Triggers::NEVER));
     unasked.restarted = Some(Restarted { field: 0, value: 1.0 });
     let port = talking(&mut cell, &[start, unasked]);
     let mut line = Line::new(&cell, port);

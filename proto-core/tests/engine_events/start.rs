@@ -10,14 +10,14 @@ const ACTIVATE: u16 = 0x03E8;
 /// An activation at the start, a register that is read, and one that the device never answers.
 fn cell(is_dead: bool) -> (Cell, PortId) {
     let mut cell = Cell::new();
-    let start = AskWhen { start: true, ..AskWhen::NEVER };
+    let start = Triggers { start: true, ..Triggers::NEVER };
     let mut activate = sets(&mut cell, 9, ACTIVATE, None, 1.0, start);
     let mut status = reads_at(&mut cell, 9, 0x10, "WordInputReg[1]", MS(50));
     (activate.late, status.late) = (None, None);
     let mut table = vec![activate, status];
     if is_dead {
         // Its reply is told from the other's by its length.
-        let mut dead = reads(&mut cell, 9, &["WordInputReg[2]", "WordInputReg[3]"], AskWhen::every(MS(100)));
+        let mut dead = reads(&mut cell, 9, &["WordInputReg[2]", "WordInputReg[3]"], Triggers::every(MS(100)));
         dead.late = None;
         table.push(dead);
     }
@@ -177,10 +177,10 @@ fn node() -> (Cell, PortId) {
     let read = frame(0x605, vec![byte(0x40), byte(0x01), byte(0x10), byte(0), pad(4)]);
     let is_read = frame(0x585, vec![byte(0x4F), byte(0x01), byte(0x10), byte(0), value, pad(3)]);
     let exchange = |request, reply, when| {
-        never_late(Exchange::new(5, Talk::Frames { request, reply, refusal: None }, when))
+        never_late(Exchange::new(5, Transaction::Frames { request, reply, refusal: None }, when))
     };
-    let start = AskWhen { start: true, ..AskWhen::NEVER };
-    let table = [exchange(set, is_set, start), exchange(read, is_read, AskWhen::every(MS(50)))];
+    let start = Triggers { start: true, ..Triggers::NEVER };
+    let table = [exchange(set, is_set, start), exchange(read, is_read, Triggers::every(MS(50)))];
     let parts = Parts::Can { input: Default::default(), output: Default::default() };
     let recipe = cell.recipe(Mode::User, parts);
     cell.0.exchanges.extend(table);

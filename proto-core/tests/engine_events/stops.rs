@@ -103,7 +103,7 @@ fn a_reply_that_may_be_late_does_not_confirm_a_stop() {
         };
         let written = cell.fields([field]);
         let operation = Operation::WriteRegisters { address: TARGET, count: 1 };
-        stop.talk = Talk::Rtu { operation, written, read: Span::default() };
+        stop.transaction = Transaction::Rtu { operation, written, read: Span::default() };
         stop.late = None;
         vec![]
     });
@@ -185,7 +185,7 @@ fn a_stop_that_another_reply_seemed_to_answer_may_still_be_answered() {
         };
         let written = cell.fields([field]);
         let operation = Operation::WriteRegisters { address: TARGET, count: 1 };
-        stop.talk = Talk::Rtu { operation, written, read: Span::default() };
+        stop.transaction = Transaction::Rtu { operation, written, read: Span::default() };
         vec![]
     });
     axis.run(1_000, good);

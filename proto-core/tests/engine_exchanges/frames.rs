@@ -15,8 +15,8 @@ fn byte_to_nothing() -> FieldSpec {
     FieldSpec::DeviceInput { encoding: byte(), overflow: Overflow::Usual, to: InputBinding::Unused }
 }
 
-fn asks(request: Option<u8>, reply: Option<u8>, refusal: Option<u8>, when: AskWhen) -> Exchange {
-    never_late(Exchange::new(0, Talk::Frames { request, reply, refusal }, when))
+fn asks(request: Option<u8>, reply: Option<u8>, refusal: Option<u8>, when: Triggers) -> Exchange {
+    never_late(Exchange::new(0, Transaction::Frames { request, reply, refusal }, when))
 }
 
 /// A screwdriver: `Q` asks for torque and angle, which `A` answers and `N` refuses with a code. It says
@@ -28,7 +28,7 @@ fn screwdriver(cell: &mut Cell) -> PortId {
     let refusal = frame_of(cell, None, b"N", b"\r", vec![FieldSpec::Padding { len: 1, fill: 0 }]);
     let event = frame_of(cell, None, b"E", b"\r", vec![byte_to("WordInputReg[4]")]);
     let table =
-        [asks(request, reply, refusal, AskWhen::every(MS(50))), asks(None, event, None, AskWhen::NEVER)];
+        [asks(request, reply, refusal, Triggers::every(MS(50))), asks(None, event, None, Triggers::NEVER)];
     talking(cell, &table)
 }
 
@@ -72,7 +72,7 @@ fn a_refusal_that_begins_as_a_shorter_frame_of_another_device_is_taken() {
     let request = frame_of(&mut cell, None, b"Q", b"", vec![fixed(1), sum()]);
     let reply = frame_of(&mut cell, None, b"A", b"", vec![fixed(0x20), sum()]);
     let refusal = frame_of(&mut cell, None, b"A", b"", vec![fixed(0xA0), byte_to_nothing(), sum()]);
-    let table = [asks(request, reply, refusal, AskWhen::every(MS(50)))];
+    let table = [asks(request, reply, refusal, Triggers::every(MS(50)))];
     let port = talking(&mut cell, &table);
     let mut line = Line::new(&cell, port);
     let seal = |bytes: &[u8]| {
@@ -99,7 +99,7 @@ fn a_request_that_failed_while_it_was_leaving_is_repeated_at_once() {
     let sum = || FieldSpec::Checksum(Checksum::standard(Algorithm::CRC16_MODBUS).over(1, None));
     let request = frame_of(&mut cell, None, b"Q", b"", vec![fixed(1), sum()]);
     let reply = frame_of(&mut cell, None, b"A", b"", vec![fixed(0x20), byte_to("WordInputReg[1]"), sum()]);
-    let exchange = asks(request, reply, None, AskWhen::every(MS(200)));
+    let exchange = asks(request, reply, None, Triggers::every(MS(200)));
     let port = talking(&mut cell, &[Exchange { timeout: MS(100), ..exchange }]);
     let mut rig = cell.rig();
     rig.reports_sent = false;
@@ -128,7 +128,7 @@ fn a_request_that_failed_while_it_was_leaving_is_repeated_at_once() {
 fn an_echo_behind_a_late_reply_is_no_reply() {
     let mut cell = Cell::new();
     let both = [0, 1].map(|_| frame_of(&mut cell, None, b"Q", b"", vec![fixed(1)]));
-    let port = talking(&mut cell, &[asks(both[0], both[1], None, AskWhen::every(MS(50)))]);
+    let port = talking(&mut cell, &[asks(both[0], both[1], None, Triggers::every(MS(50)))]);
     let Bus::Rs485(settings) = &mut cell.last_port().bus else { panic!() };
     settings.echo = Echo::Yes;
     let mut line = Line::new(&cell, port);
@@ -146,7 +146,7 @@ fn a_request_and_its_reply_may_be_a_head_alone() {
     let sum = || vec![FieldSpec::Checksum(Checksum::standard(Algorithm::CRC16_MODBUS))];
     let request = frame_of(&mut cell, None, &[1, 3], b"", sum());
     let reply = frame_of(&mut cell, None, b"OK", b"\r", vec![]);
-    let port = talking(&mut cell, &[asks(request, reply, None, AskWhen::every(MS(50)))]);
+    let port = talking(&mut cell, &[asks(request, reply, None, Triggers::every(MS(50)))]);
     let mut line = Line::new(&cell, port);
     let asked = line.run(MS(220), |_| Some((MS(3), b"OK\r".to_vec())));
     assert!(asked.len() >= 4 && asked.iter().all(|(_, sent)| *sent == with_crc(&[1, 3])), "{asked:02X?}");
@@ -162,7 +162,7 @@ fn a_request_waits_for_a_frame_of_the_part_to_leave_and_the_part_for_the_reply()
     let lamp = cell.fields([fixed(0x4C), fixed(1)]);
     let output = cell.part(&[], &[], lamp);
     let recipe = cell.recipe(Mode::User, Parts::Stream { input: None, output });
-    cell.0.exchanges.push(asks(request, reply, None, AskWhen::every(MS(10)))).unwrap();
+    cell.0.exchanges.push(asks(request, reply, None, Triggers::every(MS(10)))).unwrap();
     cell.last_recipe().exchanges = Span { start: 0, len: 1 };
     let port = cell.rs485(recipe);
     let mut rig = cell.rig();
@@ -207,11 +207,11 @@ fn encoder(cell: &mut Cell) -> PortId {
     let abort = vec![fixed(0x80), fixed(4), fixed(0x60), fixed(0), FieldSpec::Padding { len: 4, fill: 0 }];
     let refusal = frame_of(cell, Some(0x585), &[], &[], abort);
     let heartbeat = frame_of(cell, Some(0x705), &[], &[], vec![byte_to("WordInputReg[2]")]);
-    let once = AskWhen { start: true, ..AskWhen::NEVER };
+    let once = Triggers { start: true, ..Triggers::NEVER };
     let table = [
         asks(start, None, None, once),
-        asks(request, reply, refusal, AskWhen::every(MS(20))),
-        asks(None, heartbeat, None, AskWhen::NEVER),
+        asks(request, reply, refusal, Triggers::every(MS(20))),
+        asks(None, heartbeat, None, Triggers::NEVER),
     ];
     let parts = Parts::Can { input: Default::default(), output: Default::default() };
     let recipe = cell.recipe(Mode::User, parts);
@@ -275,7 +275,7 @@ fn a_remote_request_polls_a_node() {
     let reply = frame_of(&mut cell, Some(0x181), &[], &[], vec![byte_to("WordInputReg[1]")]);
     let recipe =
         cell.recipe(Mode::User, Parts::Can { input: Default::default(), output: Default::default() });
-    cell.0.exchanges.push(asks(poll, reply, None, AskWhen::every(MS(15)))).unwrap();
+    cell.0.exchanges.push(asks(poll, reply, None, Triggers::every(MS(15)))).unwrap();
     cell.last_recipe().exchanges = Span { start: 0, len: 1 };
     let port = cell.can_port(recipe);
     let mut rig = cell.rig();
@@ -308,7 +308,7 @@ fn a_frame_on_its_way_still_is_when_a_node_does_not_answer() {
     let mut output = heapless::Vec::new();
     output.push(CanFramePart { id: CanId::Standard(0x201), fields }).unwrap();
     let recipe = cell.recipe(Mode::User, Parts::Can { input: Default::default(), output });
-    let silent = asks(poll, reply, None, AskWhen::every(MS(50)));
+    let silent = asks(poll, reply, None, Triggers::every(MS(50)));
     cell.0.exchanges.push(Exchange { timeout: MS(5), ..silent }).unwrap();
     cell.last_recipe().exchanges = Span { start: 0, len: 1 };
     let port = cell.can_port(recipe);
@@ -334,7 +334,7 @@ fn the_line_is_silent_between_requests_that_nobody_answers() {
     let mut cell = Cell::new();
     let table = [0x51, 0x52].map(|letter| {
         let request = frame_of(&mut cell, None, &[], b"\r", vec![fixed(letter)]);
-        asks(request, None, None, AskWhen::every(MS(20)))
+        asks(request, None, None, Triggers::every(MS(20)))
     });
     let port = talking(&mut cell, &table);
     let Bus::Rs485(settings) = &mut cell.last_port().bus else { panic!() };

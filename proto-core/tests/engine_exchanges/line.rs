@@ -71,10 +71,10 @@ pub fn talking(cell: &mut Cell, exchanges: &[Exchange]) -> PortId {
 }
 
 /// Reads holding registers from 0x10 on into these variables.
-pub fn reads(cell: &mut Cell, slave: u8, names: &[&str], when: AskWhen) -> Exchange {
+pub fn reads(cell: &mut Cell, slave: u8, names: &[&str], when: Triggers) -> Exchange {
     let read = cell.fields(names.iter().map(|name| register_to(name)));
     let operation = Operation::ReadHoldingRegisters { address: 0x10, count: names.len() as u16 };
-    never_late(Exchange::new(slave, Talk::Rtu { operation, written: Span::default(), read }, when))
+    never_late(Exchange::new(slave, Transaction::Rtu { operation, written: Span::default(), read }, when))
 }
 
 /// No reply comes behind the timeout: nothing is waited for at the start, or behind a request without a reply.
@@ -83,10 +83,10 @@ pub fn never_late(exchange: Exchange) -> Exchange {
 }
 
 /// Writes these variables to the registers from 0x20 on.
-pub fn writes(cell: &mut Cell, slave: u8, names: &[&str], when: AskWhen) -> Exchange {
+pub fn writes(cell: &mut Cell, slave: u8, names: &[&str], when: Triggers) -> Exchange {
     let written = cell.fields(names.iter().map(|name| register_from(name)));
     let operation = Operation::WriteRegisters { address: 0x20, count: names.len() as u16 };
-    never_late(Exchange::new(slave, Talk::Rtu { operation, written, read: Span::default() }, when))
+    never_late(Exchange::new(slave, Transaction::Rtu { operation, written, read: Span::default() }, when))
 }
 
 /// The reply of a slave whose registers hold these words.

@@ -80,11 +80,11 @@ fn cell(table: &Table) -> (Cell, PortId) {
         .zip(&table.polls)
         .map(|(nth, &(slave, every, retries, pause))| {
             let name = format!("WordInputReg[{}]", nth + 1);
-            let poll = reads(&mut cell, slave, &[&name], AskWhen::every(MS(every)));
-            let Talk::Rtu { read, written, .. } = poll.talk else { panic!() };
+            let poll = reads(&mut cell, slave, &[&name], Triggers::every(MS(every)));
+            let Transaction::Rtu { read, written, .. } = poll.transaction else { panic!() };
             let operation = Operation::ReadHoldingRegisters { address: FIRST + nth, count: 1 };
-            let talk = Talk::Rtu { operation, written, read };
-            Exchange { talk, timeout: TIMEOUT, late: None, retries, pause: MS(pause), ..poll }
+            let transaction = Transaction::Rtu { operation, written, read };
+            Exchange { transaction, timeout: TIMEOUT, late: None, retries, pause: MS(pause), ..poll }
         })
         .collect();
     let port = talking(&mut cell, &exchanges);

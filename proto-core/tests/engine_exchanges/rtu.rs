@@ -11,14 +11,14 @@ use crate::rig::*;
 /// One slave whose register 0x10 is read each 20 ms.
 fn scale() -> Line {
     let mut cell = Cell::new();
-    let weight = reads(&mut cell, 9, &["WordInputReg[1]"], AskWhen::every(MS(20)));
+    let weight = reads(&mut cell, 9, &["WordInputReg[1]"], Triggers::every(MS(20)));
     let port = talking(&mut cell, &[weight]);
     cell.safe("WordInputReg[1]", 7.0);
     Line::new(&cell, port)
 }
 
 /// Writes 3 to register 1.
-fn sets_mode(cell: &mut Cell, slave: u8, when: AskWhen) -> Exchange {
+fn sets_mode(cell: &mut Cell, slave: u8, when: Triggers) -> Exchange {
     let order = proto_core::device::ByteOrder::Big;
     let word = proto_core::device::Encoding::scalar(proto_core::wire::scalar::ScalarType::Word);
     let written = cell.fields([FieldSpec::DeviceOutput {
@@ -27,7 +27,7 @@ fn sets_mode(cell: &mut Cell, slave: u8, when: AskWhen) -> Exchange {
         from: OutputBinding::Constant(3.0),
     }]);
     let operation = Operation::WriteRegister { address: 1 };
-    never_late(Exchange::new(slave, Talk::Rtu { operation, written, read: Span::default() }, when))
+    never_late(Exchange::new(slave, Transaction::Rtu { operation, written, read: Span::default() }, when))
 }
 
 #[test]
@@ -103,7 +103,7 @@ fn a_refusal_is_told_and_the_line_goes_on() {
 #[test]
 fn a_changed_value_is_written_once_and_not_before_it_is_known() {
     let mut cell = Cell::new();
-    let when = AskWhen { change: true, ..AskWhen::NEVER };
+    let when = Triggers { change: true, ..Triggers::NEVER };
     let speed = writes(&mut cell, 3, &["WordOutputReg[1]"], when);
     let port = talking(&mut cell, &[speed]);
     let mut line = Line::new(&cell, port);
@@ -135,8 +135,8 @@ fn a_changed_value_is_written_once_and_not_before_it_is_known() {
 #[test]
 fn what_is_asked_at_the_start_is_asked_again_when_the_slave_or_the_port_is_back() {
     let mut cell = Cell::new();
-    let mode = sets_mode(&mut cell, 4, AskWhen { start: true, ..AskWhen::NEVER });
-    let poll = reads(&mut cell, 4, &["WordInputReg[1]"], AskWhen::every(MS(50)));
+    let mode = sets_mode(&mut cell, 4, Triggers { start: true, ..Triggers::NEVER });
+    let poll = reads(&mut cell, 4, &["WordInputReg[1]"], Triggers::every(MS(50)));
     let port = talking(&mut cell, &[mode, poll]);
     let mut line = Line::new(&cell, port);
     let setting = with_crc(&[4, 6, 0, 1, 0, 3]);
@@ -176,7 +176,7 @@ fn eight_slaves_of_which_two_are_dead_keep_their_periods() {
         .zip(periods)
         .map(|(slave, every)| {
             let name = format!("WordInputReg[{slave}]");
-            let poll = reads(&mut cell, slave, &[&name], AskWhen::every(MS(every)));
+            let poll = reads(&mut cell, slave, &[&name], Triggers::every(MS(every)));
             Exchange { timeout: MS(10), retries: 0, ..poll }
         })
         .collect();
@@ -214,9 +214,9 @@ fn eight_slaves_of_which_two_are_dead_keep_their_periods() {
 #[test]
 fn the_echo_of_a_request_is_no_reply() {
     let mut cell = Cell::new();
-    let when = AskWhen { start: true, ..AskWhen::NEVER };
+    let when = Triggers { start: true, ..Triggers::NEVER };
     let mut write = reads(&mut cell, 3, &["WordInputReg[1]"], when);
-    write.when = AskWhen::every(MS(20));
+    write.when = Triggers::every(MS(20));
     let port = talking(&mut cell, &[write]);
     let Bus::Rs485(settings) = &mut cell.last_port().bus else { panic!() };
     settings.echo = Echo::Yes;
@@ -236,8 +236,8 @@ fn a_late_reply_is_not_taken_for_another_exchange() {
     // Two blocks of one slave whose replies look alike.
     let mut cell = Cell::new();
     let late = |cell: &mut Cell, name, address| {
-        let mut exchange = reads(cell, 5, &[name], AskWhen::every(MS(40)));
-        let Talk::Rtu { operation, .. } = &mut exchange.talk else { panic!() };
+        let mut exchange = reads(cell, 5, &[name], Triggers::every(MS(40)));
+        let Transaction::Rtu { operation, .. } = &mut exchange.transaction else { panic!() };
         *operation = Operation::ReadHoldingRegisters { address, count: 1 };
         Exchange { timeout: MS(30), late: None, ..exchange }
     };
@@ -264,8 +264,8 @@ fn what_was_asked_before_the_start_may_be_answered_before_anything_is_asked() {
     let mut cell = Cell::new();
     let table = [1, 2].map(|address| {
         let name = format!("WordInputReg[{address}]");
-        let mut exchange = reads(&mut cell, 5, &[&name], AskWhen::every(MS(40)));
-        let Talk::Rtu { operation, .. } = &mut exchange.talk else { panic!() };
+        let mut exchange = reads(&mut cell, 5, &[&name], Triggers::every(MS(40)));
+        let Transaction::Rtu { operation, .. } = &mut exchange.transaction else { panic!() };
         *operation = Operation::ReadHoldingRegisters { address, count: 1 };
         Exchange { timeout: MS(30), late: None, ..exchange }
     });
@@ -307,8 +307,8 @@ fn replies_come_late(noise: Option<Vec<u8>>) {
     let mut cell = Cell::new();
     let mut table = [1, 2].map(|address| {
         let name = format!("WordInputReg[{address}]");
-        let mut exchange = reads(&mut cell, 5, &[&name], AskWhen::every(MS(40)));
-        let Talk::Rtu { operation, .. } = &mut exchange.talk else { panic!() };
+        let mut exchange = reads(&mut cell, 5, &[&name], Triggers::every(MS(40)));
+        let Transaction::Rtu { operation, .. } = &mut exchange.transaction else { panic!() };
         *operation = Operation::ReadHoldingRegisters { address, count: 1 };
         exchange
     });
@@ -356,9 +356,9 @@ fn a_reply_is_not_taken_for_another_exchange_when_the_repetition_cannot_be_made(
     // Two blocks of one slave whose replies look alike. The first request shows a value of the controller.
     let mut cell = Cell::new();
     let exchange = |cell: &mut Cell, shown, to, address| {
-        let poll = reads(cell, 5, &[to], AskWhen::every(MS(40)));
-        let Talk::Rtu { read, .. } = poll.talk else { panic!() };
-        let Talk::Rtu { written, .. } = shown else { panic!() };
+        let poll = reads(cell, 5, &[to], Triggers::every(MS(40)));
+        let Transaction::Rtu { read, .. } = poll.transaction else { panic!() };
+        let Transaction::Rtu { written, .. } = shown else { panic!() };
         let (read_address, write_address) = (address, address + 0x20);
         let operation =
             Operation::ReadWriteRegisters { read_address, read_count: 1, write_address, write_count: 1 };
@@ -366,12 +366,12 @@ fn a_reply_is_not_taken_for_another_exchange_when_the_repetition_cannot_be_made(
             timeout: MS(30),
             late: None,
             retries: 3,
-            talk: Talk::Rtu { operation, written, read },
+            transaction: Transaction::Rtu { operation, written, read },
             ..poll
         }
     };
-    let shown = writes(&mut cell, 5, &["WordOutputReg[1]"], AskWhen::NEVER).talk;
-    let constant = sets_mode(&mut cell, 5, AskWhen::NEVER).talk;
+    let shown = writes(&mut cell, 5, &["WordOutputReg[1]"], Triggers::NEVER).transaction;
+    let constant = sets_mode(&mut cell, 5, Triggers::NEVER).transaction;
     let table = [
         exchange(&mut cell, shown, "WordInputReg[1]", 1),
         exchange(&mut cell, constant, "WordInputReg[2]", 2),
@@ -408,8 +408,8 @@ fn a_reply_is_not_taken_for_another_exchange_when_the_repetition_cannot_be_made(
 #[test]
 fn nothing_is_sent_for_a_while_after_a_request_to_all() {
     let mut cell = Cell::new();
-    let shift = sets_mode(&mut cell, 0, AskWhen::every(MS(300)));
-    let poll = reads(&mut cell, 4, &["WordInputReg[1]"], AskWhen::every(MS(20)));
+    let shift = sets_mode(&mut cell, 0, Triggers::every(MS(300)));
+    let poll = reads(&mut cell, 4, &["WordInputReg[1]"], Triggers::every(MS(20)));
     let port = talking(&mut cell, &[shift, poll]);
     let mut line = Line::new(&cell, port);
     let asked = line.run(MS(2_000), |request| (request[0] == 4).then(|| (MS(2), registers(4, &[1]))));
@@ -424,7 +424,7 @@ fn nothing_is_sent_for_a_while_after_a_request_to_all() {
 #[test]
 fn a_value_that_is_asked_once_is_not_missed_later() {
     let mut cell = Cell::new();
-    let start = AskWhen { start: true, ..AskWhen::NEVER };
+    let start = Triggers { start: true, ..Triggers::NEVER };
     let version = reads(&mut cell, 4, &["WordInputReg[1]"], start);
     let port = talking(&mut cell, &[version]);
     let mut line = Line::new(&cell, port);
@@ -441,22 +441,22 @@ fn a_value_that_is_asked_once_is_not_missed_later() {
 #[test]
 fn what_a_slave_is_asked_at_its_start_comes_first_and_in_order() {
     let mut cell = Cell::new();
-    let start = AskWhen { start: true, ..AskWhen::NEVER };
+    let start = Triggers { start: true, ..Triggers::NEVER };
     let at_start = |cell: &mut Cell, name, address| {
         let mut exchange = reads(cell, 4, &[name], start);
-        let Talk::Rtu { operation, .. } = &mut exchange.talk else { panic!() };
+        let Transaction::Rtu { operation, .. } = &mut exchange.transaction else { panic!() };
         *operation = Operation::ReadHoldingRegisters { address, count: 1 };
         exchange
     };
-    let command = writes(&mut cell, 4, &["WordOutputReg[1]"], AskWhen { change: true, ..start });
-    let poll = reads(&mut cell, 4, &["WordInputReg[1]"], AskWhen::every(MS(5)));
+    let command = writes(&mut cell, 4, &["WordOutputReg[1]"], Triggers { change: true, ..start });
+    let poll = reads(&mut cell, 4, &["WordInputReg[1]"], Triggers::every(MS(5)));
     let table = [
         poll,
         at_start(&mut cell, "WordInputReg[2]", 0xA0),
         at_start(&mut cell, "WordInputReg[3]", 0xA1),
         command,
         // Another slave is not held up.
-        reads(&mut cell, 5, &["WordInputReg[4]"], AskWhen::every(MS(50))),
+        reads(&mut cell, 5, &["WordInputReg[4]"], Triggers::every(MS(50))),
     ];
     let port = talking(&mut cell, &table);
     (cell.last_port().timeout, cell.last_port().absent) = (MS(500), MS(500));
@@ -487,11 +487,11 @@ fn what_a_slave_is_asked_at_its_start_comes_first_and_in_order() {
 
 #[test]
 fn what_is_asked_at_the_start_waits_until_its_values_are_fresh() {
-    let start = AskWhen { start: true, ..AskWhen::NEVER };
-    for when in [start, AskWhen { change: true, ..start }] {
+    let start = Triggers { start: true, ..Triggers::NEVER };
+    for when in [start, Triggers { change: true, ..start }] {
         let mut cell = Cell::new();
         let lamp = writes(&mut cell, 4, &["WordOutputReg[1]"], when);
-        let poll = reads(&mut cell, 4, &["WordInputReg[1]"], AskWhen::every(MS(50)));
+        let poll = reads(&mut cell, 4, &["WordInputReg[1]"], Triggers::every(MS(50)));
         let port = talking(&mut cell, &[lamp, poll]);
         cell.last_recipe().on_stale = OnStale::Stop;
         cell.last_port().stale_after = MS(200);
@@ -520,7 +520,7 @@ fn a_slow_slave_that_is_dead_does_not_hide_a_fast_one() {
         .into_iter()
         .map(|(slave, timeout, every)| {
             let poll =
-                reads(&mut cell, slave, &[&format!("WordInputReg[{slave}]")], AskWhen::every(MS(every)));
+                reads(&mut cell, slave, &[&format!("WordInputReg[{slave}]")], Triggers::every(MS(every)));
             Exchange { timeout: MS(timeout), retries: 0, ..poll }
         })
         .collect();

@@ -13,7 +13,7 @@ use crate::line::*;
 use crate::rig::*;
 
 fn serves(operation: Operation, written: Span, read: Span) -> Exchange {
-    Exchange::new(5, Talk::Served { operation, written, read }, AskWhen::NEVER)
+    Exchange::new(5, Transaction::Served { operation, written, read }, Triggers::NEVER)
 }
 
 fn coil(nth: u8, to: InputBinding) -> FieldSpec {

@@ -17,9 +17,9 @@ fn asked_by(cell: &mut Cell, bit: u8, address: u16) -> Exchange {
         overflow: proto_core::device::Overflow::Usual,
         from: OutputBinding::Constant(1.0),
     }]);
-    let when = AskWhen { rising: Some((var("BitOutputReg[3]"), bit)), ..AskWhen::NEVER };
+    let when = Triggers { rising: Some((var("BitOutputReg[3]"), bit)), ..Triggers::NEVER };
     let operation = Operation::WriteRegister { address };
-    never_late(Exchange::new(9, Talk::Rtu { operation, written, read: Span::default() }, when))
+    never_late(Exchange::new(9, Transaction::Rtu { operation, written, read: Span::default() }, when))
 }
 
 /// A motion in two steps that bit 0 asks for, and a stop by bit 1: registers 1, 2 and 3. A register is read, so that it
@@ -29,7 +29,7 @@ fn axis() -> (Line, PortId) {
     let first = asked_by(&mut cell, 0, 1);
     let second = asked_by(&mut cell, 0, 2);
     let stop = Exchange { stop: true, ..asked_by(&mut cell, 1, 3) };
-    let position = reads(&mut cell, 9, &["WordInputReg[1]"], AskWhen::every(MS(500)));
+    let position = reads(&mut cell, 9, &["WordInputReg[1]"], Triggers::every(MS(500)));
     let port = talking(&mut cell, &[first, second, stop, position]);
     let mut line = Line::new(&cell, port);
     line.run(MS(100), |request| Some((MS(2), answer(request))));
@@ -87,7 +87,7 @@ fn a_stop_on_its_way_is_sent_again_when_the_port_is_reported_again() {
 fn an_event_that_only_an_echo_answered_is_not_sent_again_when_the_echo_is_learned() {
     let mut cell = Cell::new();
     let event = asked_by(&mut cell, 0, 1);
-    let other = reads(&mut cell, 8, &["WordInputReg[1]"], AskWhen::every(MS(100)));
+    let other = reads(&mut cell, 8, &["WordInputReg[1]"], Triggers::every(MS(100)));
     let port = talking(&mut cell, &[event, other]);
     let mut line = Line::new(&cell, port);
     line.run(MS(100), |_| None);

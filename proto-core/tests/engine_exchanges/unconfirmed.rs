@@ -9,38 +9,38 @@ use proto_core::wire::scalar::ScalarType as T;
 use crate::line::*;
 use crate::rig::*;
 
-const ON_START: AskWhen = AskWhen { start: true, ..AskWhen::NEVER };
-const ON_CHANGE: AskWhen = AskWhen { change: true, ..AskWhen::NEVER };
-const ON_BOTH: AskWhen = AskWhen { start: true, ..ON_CHANGE };
+const ON_START: Triggers = Triggers { start: true, ..Triggers::NEVER };
+const ON_CHANGE: Triggers = Triggers { change: true, ..Triggers::NEVER };
+const ON_BOTH: Triggers = Triggers { start: true, ..ON_CHANGE };
 
 fn frame(cell: &mut Cell, head: &[u8], fields: Vec<FieldSpec>) -> Option<u8> {
     frame_of(cell, None, head, b"\r", fields)
 }
 
 /// `C` and the command, which the gripper does not confirm.
-fn command(cell: &mut Cell, when: AskWhen) -> Exchange {
+fn command(cell: &mut Cell, when: Triggers) -> Exchange {
     let encoding = Encoding { order: ByteOrder::Big, ..Encoding::scalar(T::Word) };
     let field =
         FieldSpec::DeviceOutput { encoding, overflow: Overflow::Usual, from: from("WordOutputReg[1]") };
     let request = frame(cell, b"C", vec![field]);
-    never_late(Exchange::new(1, Talk::Frames { request, reply: None, refusal: None }, when))
+    never_late(Exchange::new(1, Transaction::Frames { request, reply: None, refusal: None }, when))
 }
 
 /// A letter alone, confirmed with the same small letter or not at all.
-fn letter(cell: &mut Cell, letter: u8, is_answered: bool, when: AskWhen) -> Exchange {
+fn letter(cell: &mut Cell, letter: u8, is_answered: bool, when: Triggers) -> Exchange {
     let fixed =
         |value: u8| vec![FieldSpec::Fixed { encoding: Encoding::scalar(T::Byte), value: value.into() }];
     let request = frame(cell, &[], fixed(letter));
     let small = fixed(letter.to_ascii_lowercase());
     let reply = is_answered.then(|| frame(cell, &[], small)).flatten();
-    never_late(Exchange::new(1, Talk::Frames { request, reply, refusal: None }, when))
+    never_late(Exchange::new(1, Transaction::Frames { request, reply, refusal: None }, when))
 }
 
 /// A gripper that takes commands, and is asked for its position each 100 ms.
-fn gripper(when: AskWhen) -> Line {
+fn gripper(when: Triggers) -> Line {
     let mut cell = Cell::new();
     let commands = command(&mut cell, when);
-    let position = letter(&mut cell, b'Q', true, AskWhen::every(MS(100)));
+    let position = letter(&mut cell, b'Q', true, Triggers::every(MS(100)));
     let port = talking(&mut cell, &[commands, position]);
     cell.last_port().absent = MS(1_000);
     let mut line = Line::new(&cell, port);
@@ -92,8 +92,9 @@ fn a_counter_in_a_request_is_no_change() {
     let counter =
         FieldSpec::DeviceOutput { encoding, overflow: Overflow::Usual, from: OutputBinding::Counter };
     let request = frame(&mut cell, b"C", vec![value, counter]);
-    let each = never_late(Exchange::new(1, Talk::Frames { request, reply: None, refusal: None }, ON_CHANGE));
-    let position = letter(&mut cell, b'Q', true, AskWhen::every(MS(100)));
+    let each =
+        never_late(Exchange::new(1, Transaction::Frames { request, reply: None, refusal: None }, ON_CHANGE));
+    let position = letter(&mut cell, b'Q', true, Triggers::every(MS(100)));
     let port = talking(&mut cell, &[each, position]);
     let mut line = Line::new(&cell, port);
     for value in [1, 2, 3] {
@@ -128,7 +129,7 @@ fn what_comes_first_at_the_start_comes_first_when_the_device_is_back() {
         letter(&mut cell, b'R', false, ON_START),
         letter(&mut cell, b'S', true, ON_START),
         letter(&mut cell, b'T', false, ON_START),
-        letter(&mut cell, b'Q', true, AskWhen::every(MS(100))),
+        letter(&mut cell, b'Q', true, Triggers::every(MS(100))),
     ];
     let port = talking(&mut cell, &table);
     cell.last_port().absent = MS(1_000);
@@ -146,7 +147,7 @@ fn what_comes_first_at_the_start_comes_first_when_the_device_is_back() {
 #[test]
 fn a_device_that_never_answers_anything_is_told_each_period() {
     let mut cell = Cell::new();
-    let lamp = letter(&mut cell, b'L', false, AskWhen::every(MS(100)));
+    let lamp = letter(&mut cell, b'L', false, Triggers::every(MS(100)));
     let port = talking(&mut cell, &[lamp]);
     let mut line = Line::new(&cell, port);
     let count = told(&mut line, MS(1_000), false).len();
@@ -156,7 +157,7 @@ fn a_device_that_never_answers_anything_is_told_each_period() {
 #[test]
 fn a_value_that_has_been_sent_is_no_change() {
     let mut cell = Cell::new();
-    let when = AskWhen { every: Some(MS(70)), ..ON_CHANGE };
+    let when = Triggers { every: Some(MS(70)), ..ON_CHANGE };
     let each = command(&mut cell, when);
     let port = talking(&mut cell, &[each]);
     // Changes are looked for seldom, so that the period sends one first; the other port has it polled often.

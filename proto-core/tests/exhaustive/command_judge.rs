@@ -5,7 +5,7 @@ use proto_core::time::{Duration, Instant};
 use proto_core::wire::can::CanFrame;
 use proto_core::wire::scalar::Scalar;
 
-use crate::driver::{Broken, Conns, DEAF, Is, Judge, PORT, Small};
+use crate::driver::{AFTER_SLEEP, Broken, Conns, Is, Judge, PORT, Small};
 use crate::orders::{Order, Orders};
 use crate::rig::var;
 use crate::values::Bits;
@@ -29,7 +29,7 @@ pub struct Facts {
     /// The device's newest frame.
     pub repeats: Option<u8>,
     pub is_bus_off: bool,
-    deaf_until: Option<Instant>,
+    slept_until: Option<Instant>,
     bits: Bits,
     pub orders: Orders,
     /// The write that is unanswered: whether it is of the safe value, and since when.
@@ -62,7 +62,7 @@ impl Facts {
             is_up: false,
             repeats: None,
             is_bus_off: false,
-            deaf_until: None,
+            slept_until: None,
             bits: Bits::new(SAFE),
             orders: Orders::new(),
             asked: None,
@@ -101,7 +101,7 @@ impl Facts {
     }
 
     fn frame(&mut self, now: Instant, frame: &CanFrame, conns: &Conns) {
-        if self.deaf_until.is_some() {
+        if self.slept_until.is_some() {
             self.counted[1] += 1;
             return;
         }
@@ -115,7 +115,7 @@ impl Facts {
 impl Judge for Facts {
     fn told(&mut self, now: Instant, input: &Input<'_>, conns: &mut Conns) {
         match *input {
-            Input::Tick => self.deaf_until = self.deaf_until.filter(|&until| now < until),
+            Input::Tick => self.slept_until = self.slept_until.filter(|&until| now < until),
             Input::PortCan { frame, .. } => self.frame(now, &frame, conns),
             Input::PortUp { .. } => self.is_up = true,
             Input::PortDown { .. } => {
@@ -190,7 +190,7 @@ impl Judge for Facts {
 
     fn slept(&mut self, now: Instant) {
         self.orders.slept();
-        self.deaf_until = Some(now + DEAF);
+        self.slept_until = Some(now + AFTER_SLEEP);
     }
 
     fn sent(

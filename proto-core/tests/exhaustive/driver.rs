@@ -22,7 +22,7 @@ const ASLEEP: Duration = Duration::from_millis(500);
 /// The engine asks to be called at least so often.
 const HEARTBEAT: Duration = Duration::from_millis(250);
 /// What waited while the gateway was asleep may be read for so long after it.
-pub const DEAF: Duration = Duration::from_millis(50);
+pub const AFTER_SLEEP: Duration = Duration::from_millis(50);
 /// A device repeats a frame so often that it is never overdue.
 pub const STEADY: Duration = Duration::from_millis(90);
 /// More than a cell of one port and three links can have to say after one input: each link closed,

@@ -71,8 +71,8 @@ fn config(adapter: Adapter) -> GatewayConfig {
         let to = InputBinding::Variable { var: var(READ[what as usize]), scale: 1.0, offset: 0.0 };
         let read = cell.fields([FieldSpec::DeviceInput { encoding: word, overflow: Overflow::Usual, to }]);
         let operation = Operation::ReadHoldingRegisters { address: what.address(), count: 1 };
-        let talk = Talk::Rtu { operation, written: Span::default(), read };
-        Exchange::new(SLAVE, talk, AskWhen::every(PERIOD))
+        let talk = Transaction::Rtu { operation, written: Span::default(), read };
+        Exchange::new(SLAVE, talk, Triggers::every(PERIOD))
     };
     let reads = [read(What::First), read(What::Second)];
     let mut write = |from, bit: u8| {
@@ -84,8 +84,8 @@ fn config(adapter: Adapter) -> GatewayConfig {
             Adapter::Silent => Operation::WriteRegisters { address, count: 1 },
             Adapter::Echoes => Operation::WriteRegister { address },
         };
-        let when = AskWhen { rising: Some((var(BITS), bit)), ..AskWhen::NEVER };
-        Exchange::new(SLAVE, Talk::Rtu { operation, written, read: Span::default() }, when)
+        let when = Triggers { rising: Some((var(BITS), bit)), ..Triggers::NEVER };
+        Exchange::new(SLAVE, Transaction::Rtu { operation, written, read: Span::default() }, when)
     };
     let mut start = write(OutputBinding::Variable { var: var(TARGET), scale: 1.0, offset: 0.0 }, 0);
     start.trigger = Some(TRIGGER);

@@ -8,7 +8,7 @@ use proto_core::engine::{Input, LinkId};
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::scalar::Scalar;
 
-use crate::driver::{Broken, Conns, DEAF, Is, Judge, Room};
+use crate::driver::{AFTER_SLEEP, Broken, Conns, Is, Judge, Room};
 use crate::exchange_cell::{Adapter, LINK};
 use crate::rig::var;
 
@@ -113,7 +113,7 @@ enum End {
 pub struct Facts {
     adapter: Adapter,
     pub is_up: bool,
-    deaf_until: Option<Instant>,
+    slept_until: Option<Instant>,
     pub asked: Vec<Asked>,
     /// What the adapter gives back.
     pub echo: Option<Vec<u8>>,
@@ -190,7 +190,7 @@ impl Facts {
         Self {
             adapter,
             is_up: false,
-            deaf_until: None,
+            slept_until: None,
             asked: Vec::new(),
             echo: None,
             coming: None,
@@ -229,7 +229,7 @@ impl Facts {
     }
 
     fn is_usable(&self) -> bool {
-        self.is_up && self.deaf_until.is_none()
+        self.is_up && self.slept_until.is_none()
     }
 
     /// What is over makes no difference any more.
@@ -418,7 +418,7 @@ impl Judge<EXCHANGES> for Facts {
     fn told(&mut self, now: Instant, input: &Input<'_>, conns: &mut Conns) {
         self.forget(now);
         match *input {
-            Input::Tick => self.deaf_until = self.deaf_until.filter(|&until| now < until),
+            Input::Tick => self.slept_until = self.slept_until.filter(|&until| now < until),
             Input::PortBytes { .. } => {
                 if let Some((asked, answer)) = self.coming.take() {
                     self.heard(now, &asked, answer);
@@ -462,7 +462,7 @@ impl Judge<EXCHANGES> for Facts {
         // Its deadlines have passed before.
         self.passes(now);
         self.abandon();
-        self.deaf_until = Some(now + DEAF);
+        self.slept_until = Some(now + AFTER_SLEEP);
     }
 
     fn sent(&mut self, now: Instant, _: LinkId, bytes: &[u8], _: &mut Conns) -> Result<Instant, Broken> {

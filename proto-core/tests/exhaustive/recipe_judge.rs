@@ -4,7 +4,7 @@ use proto_core::engine::{Input, LinkId, PortState};
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::scalar::Scalar;
 
-use crate::driver::{Broken, Conns, DEAF, Is, Judge, PORT, Small};
+use crate::driver::{AFTER_SLEEP, Broken, Conns, Is, Judge, PORT, Small};
 use crate::recipe_cell::Way;
 use crate::rig::var;
 use crate::values::{Bits, Float, Instead};
@@ -44,7 +44,7 @@ pub struct Facts {
     pub is_up: bool,
     /// The device's newest frame.
     pub repeats: Option<u8>,
-    deaf_until: Option<Instant>,
+    slept_until: Option<Instant>,
     bits: Bits,
     float: Float,
     /// What the controller showed before there was a value of the bit's owner.
@@ -80,7 +80,7 @@ impl Facts {
             way,
             is_up: false,
             repeats: None,
-            deaf_until: None,
+            slept_until: None,
             bits: Bits::new(SAFE_BIT),
             float: Float::new(match way {
                 Way::Udp | Way::UdpBoth => Instead::Shown,
@@ -106,7 +106,7 @@ impl Facts {
 
     /// A frame of the device came whole, with both values or one of them.
     fn frame(&mut self, now: Instant, (float, bits): (Option<f32>, Option<u8>), conns: &Conns) {
-        if self.deaf_until.is_some() {
+        if self.slept_until.is_some() {
             self.counted[2] += 1;
             return;
         }
@@ -200,7 +200,7 @@ impl Judge for Facts {
     fn told(&mut self, now: Instant, input: &Input<'_>, conns: &mut Conns) {
         self.look_for_controller(now);
         match *input {
-            Input::Tick => self.deaf_until = self.deaf_until.filter(|&until| now < until),
+            Input::Tick => self.slept_until = self.slept_until.filter(|&until| now < until),
             Input::PortBytes { bytes, .. } => {
                 self.frame(now, (Some(float_at(bytes, 2)), Some(bytes[6])), conns);
             }
@@ -280,7 +280,7 @@ impl Judge for Facts {
 
     fn slept(&mut self, now: Instant) {
         self.is_due = false;
-        self.deaf_until = Some(now + DEAF);
+        self.slept_until = Some(now + AFTER_SLEEP);
     }
 
     fn sent(&mut self, now: Instant, _: LinkId, bytes: &[u8], conns: &mut Conns) -> Result<Instant, Broken> {

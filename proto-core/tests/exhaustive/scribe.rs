@@ -47,7 +47,7 @@ pub struct Scribe {
     up_for: u64,
     buffer_is_empty: bool,
     silence_is_normal: bool,
-    is_deaf: bool,
+    has_slept: bool,
     /// The instant or the number before, of those that are written with the next one.
     before: u64,
 }
@@ -173,7 +173,7 @@ impl Scribe {
             up_for: 0,
             buffer_is_empty: false,
             silence_is_normal: false,
-            is_deaf: false,
+            has_slept: false,
             before: 0,
         }
     }
@@ -234,7 +234,7 @@ impl Scribe {
             (Field::Heard, Kind::Line) => return,
             (Field::Heard, _) if self.silence_is_normal => return,
             (Field::Newest, Kind::Client) if self.buffer_is_empty => return,
-            (Field::DeafUntil, _) if !self.is_deaf => return,
+            (Field::DeafUntil, _) if !self.has_slept => return,
             // Has it come?
             (Field::WayMade, _) => ago.min(1),
             // Looked at with the backoff, which follows.
@@ -310,7 +310,7 @@ impl Scribe {
         // The next word is the name of the next field.
         match std::mem::replace(&mut self.field, Field::Other) {
             Field::Silence => self.silence_is_normal = text == b"None",
-            Field::IsDeaf => self.is_deaf = text == b"true",
+            Field::IsDeaf => self.has_slept = text == b"true",
             field => self.field = field,
         }
         self.bytes(text);
@@ -353,7 +353,7 @@ impl Scribe {
             b"filled" => Word::Field(Field::Filled),
             b"silence" => Word::Field(Field::Silence),
             b"backoff" => Word::Field(Field::Backoff),
-            b"is_deaf" => Word::Field(Field::IsDeaf),
+            b"has_slept" => Word::Field(Field::IsDeaf),
             b"former" | b"look_at" | b"expires_at" => Word::Field(Field::Until),
             b"outstanding" => Word::Field(Field::Outstanding),
             b"taken" => Word::Field(Field::Taken),
@@ -361,7 +361,7 @@ impl Scribe {
             b"failures" => Word::Field(Field::Failures),
             b"start" => Word::Field(Field::Start),
             b"way_made_until" => Word::Field(Field::WayMade),
-            b"deaf_until" => Word::Field(Field::DeafUntil),
+            b"slept_until" => Word::Field(Field::DeafUntil),
             _ => Word::Field(Field::Other),
         };
     }

@@ -77,7 +77,7 @@ pub(super) fn shares(config: &GatewayConfig, ports: &[PortSpec]) -> Vec<Share> {
 /// Why the bits of a configuration cannot be judged, if they cannot.
 pub(super) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
     let spec = Spec::new(config);
-    if let Some(reason) = super::talk::spec::ambiguous(&spec.ports) {
+    if let Some(reason) = super::exchanges::spec::ambiguous(&spec.ports) {
         return Some(reason);
     }
     let carries = |link: &LinkSpec, var| link.input.as_ref().is_some_and(|up: &Frame| up.has(var));

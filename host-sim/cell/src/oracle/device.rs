@@ -231,7 +231,7 @@ pub(crate) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
     if config.ports.iter().any(|port| matches!(port.bus, Bus::ModbusTcp { .. })) {
         return Some("a soak cannot judge ports of Modbus TCP");
     }
-    if let Some(reason) = super::talk::spec::unmodelled(config) {
+    if let Some(reason) = super::exchanges::spec::unmodelled(config) {
         return Some(reason);
     }
     if let Some(reason) = varying::unmodelled(config) {

@@ -23,8 +23,8 @@ pub(super) struct Leaving<'a> {
 }
 
 impl Oracle {
-    /// Handles deadlines that have passed; `is_deaf` says that what waited is not read.
-    pub(super) fn pass(&mut self, is_deaf: bool, now: Instant) {
+    /// Handles deadlines that have passed; `has_slept` says that what waited is not read.
+    pub(super) fn pass(&mut self, has_slept: bool, now: Instant) {
         let overdue = self.up.overdue(&self.spec, now);
         for &(nth, frame) in &overdue {
             self.forget_commands(nth, Some(frame), now);
@@ -42,10 +42,10 @@ impl Oracle {
             watch.down.tick(port, now);
         }
         for nth in 0..self.ports.len() {
-            self.line_silent(nth, is_deaf, now);
+            self.line_silent(nth, has_slept, now);
         }
         for nth in 0..self.ports.len() {
-            self.talk_tick(nth, now);
+            self.exchange_tick(nth, now);
             self.served_tick(nth, now);
         }
         if now >= self.rewrite_at {
@@ -61,11 +61,11 @@ impl Oracle {
         for (watch, port) in self.ports.iter_mut().zip(&self.spec.ports) {
             watch.down.slept();
             watch.line.discard_of(port);
-            if watch.talk.waits() && !port.is_can {
+            if watch.exchanges.waits() && !port.is_can {
                 watch.down.sent();
             }
-            watch.talk.abandon(port.talk.as_ref(), now);
-            watch.talk.disturbed_at = now + DISCARD_AFTER_SLEEP;
+            watch.exchanges.abandon(port.exchanges.as_ref(), now);
+            watch.exchanges.disturbed_at = now + DISCARD_AFTER_SLEEP;
         }
         self.discards_until = Some(now + DISCARD_AFTER_SLEEP);
     }
@@ -125,7 +125,7 @@ impl Oracle {
 
     /// Shown values may have changed: looks for rising bits that trigger a port.
     pub(super) fn values_changed(&mut self, now: Instant) {
-        self.talk_values_changed(now);
+        self.exchange_values_changed(now);
         if !self.spec.has_triggers {
             return;
         }
@@ -139,12 +139,12 @@ impl Oracle {
         let watch = &mut self.ports[nth];
         watch.counters.bytes_in = watch.counters.bytes_in.wrapping_add(bytes.len() as u32);
         watch.down.heard = now;
-        if port.talk.is_some() || port.served.is_some() {
+        if port.exchanges.is_some() || port.served.is_some() {
             watch.line.heard = now;
             if self.discards_until.is_none() {
                 return match port.served {
                     Some(_) => self.served_bytes(nth, bytes, now),
-                    None => self.talk_bytes(nth, bytes, now),
+                    None => self.exchange_bytes(nth, bytes, now),
                 };
             }
             watch.counters.asleep += 1;
@@ -180,8 +180,8 @@ impl Oracle {
             self.waited_in_sleep(verdict.ok());
             return;
         }
-        if port.talk.is_some() {
-            return self.talk_can(nth, frame, now);
+        if port.exchanges.is_some() {
+            return self.exchange_can(nth, frame, now);
         }
         if port.inputs.is_empty() {
             counters.rejected_no_input += 1;
@@ -204,23 +204,23 @@ impl Oracle {
     /// The device of a port is there.
     pub(super) fn port_up(&mut self, nth: usize, now: Instant) {
         self.ports[nth].down.is_up = true;
-        self.begin_talk(nth, now);
+        self.begin_exchanges(nth, now);
     }
 
     /// A conversation begins anew.
-    pub(super) fn begin_talk(&mut self, nth: usize, now: Instant) {
+    pub(super) fn begin_exchanges(&mut self, nth: usize, now: Instant) {
         let watch = &mut self.ports[nth];
         watch.line.discarded += watch.served.discard();
-        if watch.talk.waits() && !self.spec.ports[nth].is_can {
+        if watch.exchanges.waits() && !self.spec.ports[nth].is_can {
             watch.down.sent();
         }
-        watch.talk.begin(self.spec.ports[nth].talk.as_ref(), now);
+        watch.exchanges.begin(self.spec.ports[nth].exchanges.as_ref(), now);
         // What rises from now on asks.
-        self.talk_values_changed(now);
+        self.exchange_values_changed(now);
     }
 
     /// Silence may have ended a frame, or cut one off.
-    fn line_silent(&mut self, nth: usize, is_deaf: bool, now: Instant) {
+    fn line_silent(&mut self, nth: usize, has_slept: bool, now: Instant) {
         let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
         let framing = port.framing;
         let is_over = now >= watch.down.heard + port.idle_gap;
@@ -230,7 +230,7 @@ impl Oracle {
         if framing == Boundary::Tail {
             return watch.line.cut_off();
         }
-        if is_deaf {
+        if has_slept {
             // Nobody knows how long it has waited.
             watch.line.cut_off();
             watch.down.heard = now;
@@ -361,11 +361,11 @@ impl Oracle {
             let result = self.served_send(nth, sent, now);
             return self.judge(now, &[Invariant::Shown, Invariant::Line, Invariant::Cycle], result);
         }
-        let is_asked = spec.talk.as_ref().is_some_and(|talk| {
-            spec.outputs.is_empty() || talk.row_of((sent.id, sent.is_remote), sent.bytes).is_some()
+        let is_asked = spec.exchanges.as_ref().is_some_and(|exchanges| {
+            spec.outputs.is_empty() || exchanges.row_of((sent.id, sent.is_remote), sent.bytes).is_some()
         });
         if is_asked {
-            let result = self.talk_send(nth, sent, now);
+            let result = self.exchange_send(nth, sent, now);
             let invariants = [Invariant::Known, Invariant::Age, Invariant::Shown, Invariant::Line];
             return self.judge(now, &invariants, result);
         }
@@ -384,7 +384,7 @@ impl Oracle {
     /// Compares the engine's counters with the model's.
     pub(super) fn count(&mut self, nth: usize, engine: &Engine) -> Result<(), Wrong> {
         let Some(actual) = engine.port_counters(PortId(nth as u8)) else { return Ok(()) };
-        let PortWatch { line, down, counters, talk, .. } = &self.ports[nth];
+        let PortWatch { line, down, counters, exchanges, .. } = &self.ports[nth];
         let up = self.up.counted[nth];
         let commands = self.commands.counted[nth];
         let mut expected = *counters;
@@ -395,8 +395,8 @@ impl Oracle {
         expected.bytes_out = down.bytes_out;
         expected.skipped_cycles = down.skipped;
         expected.stale_cycles = down.stale;
-        expected.unanswered = talk.unanswered;
-        expected.refused = counters.refused.wrapping_add(talk.refused);
+        expected.unanswered = exchanges.unanswered;
+        expected.refused = counters.refused.wrapping_add(exchanges.refused);
         expected.edges_lost = up.edges_lost;
         expected.values_expired = up.values_expired;
         expected.undelivered = up.undelivered;
@@ -414,7 +414,7 @@ impl Oracle {
         }
         let accounted = line.frame_bytes + line.dropped + line.discarded + line.held.len() as u64;
         let spec = &self.spec.ports[nth];
-        let reads = !spec.inputs.is_empty() || spec.talk.is_some();
+        let reads = !spec.inputs.is_empty() || spec.exchanges.is_some();
         if !spec.is_can && spec.served.is_none() && reads && accounted as u32 != actual.bytes_in {
             let what =
                 format!("port {nth} received {} bytes, {accounted} are accounted for", actual.bytes_in);

@@ -15,6 +15,7 @@ mod commands;
 mod counters;
 pub(crate) mod device;
 mod downward;
+mod exchanges;
 mod field;
 mod gateway;
 mod invariant;
@@ -23,7 +24,6 @@ mod robot;
 mod safe;
 mod spec;
 mod stream;
-mod talk;
 mod upward;
 mod varying;
 mod wire;
@@ -37,15 +37,15 @@ use proto_core::time::{Duration, Instant};
 
 use commands::Commands;
 use downward::Downward;
+use exchanges::line::ExchangesWatch;
+use exchanges::served::ServedWatch;
+use exchanges::truth::Truth;
 use field::LineWatch;
 use gateway::Leaving;
 pub use invariant::{Invariant, Violation};
 pub(super) use robot::Path;
 use robot::Robot;
 use spec::Spec;
-use talk::line::TalkWatch;
-use talk::served::ServedWatch;
-use talk::truth::Truth;
 use upward::{Upward, Wrong};
 use wire::{Controller, Map, Modbus, Safe};
 pub(super) use wire::{Inputs, copied_inputs, inputs_of};
@@ -56,7 +56,7 @@ struct PortWatch {
     line: LineWatch,
     down: Downward,
     counters: PortCounters,
-    talk: TalkWatch,
+    exchanges: ExchangesWatch,
     served: ServedWatch,
 }
 
@@ -133,7 +133,7 @@ impl Oracle {
     pub(super) fn new(config: &GatewayConfig) -> Self {
         let spec = Spec::new(config);
         let of_port = |port: &spec::PortSpec| {
-            port.outputs.len() + usize::from(port.talk.is_some() || port.served.is_some())
+            port.outputs.len() + usize::from(port.exchanges.is_some() || port.served.is_some())
         };
         let parts: usize = spec.ports.iter().map(of_port).sum();
         Self {
@@ -175,7 +175,7 @@ impl Oracle {
         for port in engine.field_ports() {
             let watch = &mut self.ports[usize::from(port.0)];
             watch.down.is_up = true;
-            watch.talk.begin(self.spec.ports[usize::from(port.0)].talk.as_ref(), now);
+            watch.exchanges.begin(self.spec.ports[usize::from(port.0)].exchanges.as_ref(), now);
         }
     }
 
@@ -244,8 +244,8 @@ impl Oracle {
             self.find_lost_links(engine, None, now);
         }
         if is_tick || has_slept {
-            let is_deaf = has_slept || self.discards_until.is_some_and(|until| now < until);
-            self.pass(is_deaf, now);
+            let has_slept = has_slept || self.discards_until.is_some_and(|until| now < until);
+            self.pass(has_slept, now);
         }
         if has_slept {
             self.slept(now);
@@ -274,7 +274,7 @@ impl Oracle {
                 watch.down.reset();
                 watch.line.discard_of(&self.spec.ports[nth]);
                 watch.line.discarded += watch.served.discard();
-                watch.talk.gone(self.spec.ports[nth].talk.as_ref(), now);
+                watch.exchanges.gone(self.spec.ports[nth].exchanges.as_ref(), now);
                 self.forget_commands(nth, None, now);
             }
             Input::PortBus { port, state } => {
@@ -286,10 +286,10 @@ impl Oracle {
                 if is_news {
                     watch.counters.bus_offs += 1;
                     watch.down.reset();
-                    watch.talk.gone(self.spec.ports[nth].talk.as_ref(), now);
+                    watch.exchanges.gone(self.spec.ports[nth].exchanges.as_ref(), now);
                     self.forget_commands(nth, None, now);
                 } else if was_off && !is_off {
-                    self.begin_talk(nth, now);
+                    self.begin_exchanges(nth, now);
                 }
             }
             Input::LinkUp { link } => {
@@ -361,7 +361,7 @@ impl Oracle {
                     let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
                     let result = watch.down.rest(port, &self.up, now);
                     let result = result.and_then(|()| self.served_rests(nth, now));
-                    let result = result.and_then(|()| self.talk_rests(nth, now));
+                    let result = result.and_then(|()| self.exchange_rests(nth, now));
                     self.judge(now, &[Invariant::Cycle], result);
                 }
                 let result = self.count(nth, engine);

@@ -10,7 +10,7 @@ use super::*;
 use crate::network::Sender;
 use crate::soak::Scenario;
 use crate::tamper::{Forged, Outward};
-use crate::{Cell, LineId, Talker, Way};
+use crate::{Cell, LineId, PeriodicSender, Way};
 use recipe_test_kit::toml;
 
 /// A panel that starts and stops, and a variable with a safe value.
@@ -281,7 +281,7 @@ fn a_value_of_our_own_that_is_older_than_promised() {
 #[test]
 fn a_timeout_of_a_device_that_was_not_silent() {
     let (mut cell, line) = ready(&panel_cell(), &panel(0, 1));
-    cell.attach(line, Talker::new(cell.now(), 40, u64::MAX, |_| panel(0, 1)));
+    cell.attach(line, PeriodicSender::new(cell.now(), 40, u64::MAX, |_| panel(0, 1)));
     cell.run_ms(200);
     cell.stall_gateway(Duration::from_millis(300));
     let wakes = cell.now() + Duration::from_millis(300);

@@ -16,8 +16,8 @@ use proto_core::wire::can::CanId;
 use super::Invariant;
 use super::bits::{self, Share};
 use super::device::DeviceSpec;
-use super::talk::served::ServedSpec;
-use super::talk::spec::TalkSpec;
+use super::exchanges::served::ServedSpec;
+use super::exchanges::spec::ExchangesSpec;
 use super::upward::Wrong;
 use super::varying;
 
@@ -85,7 +85,7 @@ pub(super) struct PortSpec {
     /// What tells the frames of its input part apart.
     pub framing: Boundary,
     /// What is asked of slaves or devices. The replies are behind the other inputs.
-    pub talk: Option<TalkSpec>,
+    pub exchanges: Option<ExchangesSpec>,
     /// What a master on a Modbus line may ask. What it writes is behind the other inputs.
     pub served: Option<ServedSpec>,
 }
@@ -94,7 +94,7 @@ impl PortSpec {
     /// The variables that its frames show, and its requests.
     fn shown(&self) -> impl Iterator<Item = SysVar> {
         let fields = self.outputs.iter().flat_map(|frame| &frame.shown).copied();
-        let rows = self.talk.iter().flat_map(|talk| &talk.rows);
+        let rows = self.exchanges.iter().flat_map(|exchanges| &exchanges.rows);
         let asked = rows.flat_map(|row| row.shown().chain(row.rising.map(|(var, _)| var)));
         fields.chain(asked).chain(self.served.iter().flat_map(ServedSpec::shown))
     }
@@ -394,7 +394,7 @@ fn frames(config: &GatewayConfig, recipe: &Recipe, direction: Direction) -> Vec<
 fn port_spec(config: &GatewayConfig, port: &proto_core::config::Port) -> PortSpec {
     let recipe = &config.recipes[usize::from(port.recipe)];
     let mut inputs = frames(config, recipe, Direction::Input);
-    let (mut talk, mut served) = (None, None);
+    let (mut exchanges, mut served) = (None, None);
     let (idle_gap, turnaround) = match port.bus {
         Bus::Rs485(line) => {
             // 3.5 characters: a start bit, eight bits, parity, stop bits (D19).
@@ -403,12 +403,12 @@ fn port_spec(config: &GatewayConfig, port: &proto_core::config::Port) -> PortSpe
             let characters = (half_bits * 1_000_000).div_ceil(2 * u64::from(line.baud));
             let characters = Duration::from_micros(characters);
             let silence = line.turnaround.max(characters);
-            talk = TalkSpec::new(config, recipe, (port, Some(&line), silence), &mut inputs);
+            exchanges = ExchangesSpec::new(config, recipe, (port, Some(&line), silence), &mut inputs);
             served = ServedSpec::new(config, recipe, line, &mut inputs);
             (line.idle_gap.max(characters), line.turnaround)
         }
         Bus::Can { .. } => {
-            talk = TalkSpec::new(config, recipe, (port, None, Duration::ZERO), &mut inputs);
+            exchanges = ExchangesSpec::new(config, recipe, (port, None, Duration::ZERO), &mut inputs);
             (Duration::MAX, Duration::ZERO)
         }
         _ => (Duration::MAX, Duration::ZERO),
@@ -439,7 +439,7 @@ fn port_spec(config: &GatewayConfig, port: &proto_core::config::Port) -> PortSpe
             Parts::Stream { input: Some(part), .. } => part.framing,
             _ => Boundary::Fields,
         },
-        talk,
+        exchanges,
         served,
     }
 }

@@ -11,7 +11,7 @@ use proto_core::time::{Duration, Instant};
 use super::*;
 use crate::soak::Scenario;
 use crate::tamper::{Forged, Inward, Outward};
-use crate::{Cell, Talker};
+use crate::{Cell, PeriodicSender};
 use recipe_config::SimConfig;
 use recipe_test_kit::toml;
 
@@ -81,7 +81,7 @@ pub(super) fn frame(n: u64) -> Vec<u8> {
 /// 25 frames a second for two seconds, and a second of silence.
 fn run(mut cell: Cell) -> Option<Violation> {
     let line = cell.line_of("device");
-    cell.attach(line, Talker::new(cell.now() + Duration::from_millis(510), 25, 50, frame));
+    cell.attach(line, PeriodicSender::new(cell.now() + Duration::from_millis(510), 25, 50, frame));
     for nth in 0..6 {
         cell.set_value("FloatOutputReg[1]", f64::from(nth));
         cell.run_ms(500);
@@ -157,7 +157,7 @@ fn a_write_repeated_after_a_reconnect() {
         })),
     );
     let line = cell.line_of("device");
-    cell.attach(line, Talker::new(cell.now() + Duration::from_millis(510), 25, 25, frame));
+    cell.attach(line, PeriodicSender::new(cell.now() + Duration::from_millis(510), 25, 25, frame));
     cell.run_ms(1_500);
     assert_eq!(cell.violation(), None);
     cell.reset(LinkId::MODBUS);

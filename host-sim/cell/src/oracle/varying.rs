@@ -6,7 +6,7 @@
 
 use std::ops::Range;
 
-use proto_core::config::{FieldSpec, GatewayConfig, Parts, Talk, Words};
+use proto_core::config::{FieldSpec, GatewayConfig, Parts, Transaction, Words};
 use proto_core::device::{Boundary, ByteOrder, Counts, Encoding, Kind, Text, TextWidth, Width};
 use proto_core::sysvar::SysVar;
 
@@ -366,9 +366,11 @@ pub(super) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
     let is_text = |field: &FieldSpec| {
         matches!(field, FieldSpec::TextInput { .. } | FieldSpec::TextOutput { .. }) || varies(field)
     };
-    let asked = config.exchanges.iter().flat_map(|exchange| match exchange.talk {
-        Talk::Rtu { written, read, .. } | Talk::Served { written, read, .. } => vec![written, read],
-        Talk::Frames { .. } => Vec::new(),
+    let asked = config.exchanges.iter().flat_map(|exchange| match exchange.transaction {
+        Transaction::Rtu { written, read, .. } | Transaction::Served { written, read, .. } => {
+            vec![written, read]
+        }
+        Transaction::Frames { .. } => Vec::new(),
     });
     let asked = asked.chain(config.frames.iter().map(|frame| frame.fields));
     let on_can = config.recipes.iter().flat_map(|recipe| match &recipe.parts {

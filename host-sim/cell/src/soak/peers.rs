@@ -5,7 +5,9 @@
 //! dead, or with replies that are damaged, cut short, lost, behind noise, or to another question. None
 //! takes three times its timeout for a reply, behind which no master could tell it from one to the next request.
 
-use proto_core::config::{Bus, DeviceFrame, FieldSpec, GatewayConfig, OutputBinding, Parts, Port, Talk};
+use proto_core::config::{
+    Bus, DeviceFrame, FieldSpec, GatewayConfig, OutputBinding, Parts, Port, Transaction,
+};
 use proto_core::device::{Carrier, Probe};
 use proto_core::sysvar::Direction;
 use proto_core::time::{Duration, Instant};
@@ -94,7 +96,7 @@ impl Peers {
         }
         let (mut peers, mut asks): (Vec<Peer>, Vec<Ask>) = (Vec::new(), Vec::new());
         for (exchange, spec) in config.view().exchanges_of(recipe).iter().enumerate() {
-            let Talk::Frames { request, reply, refusal } = spec.talk else { return None };
+            let Transaction::Frames { request, reply, refusal } = spec.transaction else { return None };
             let frame = |nth: Option<u8>| config.frames.get(usize::from(nth?));
             let sends = |nth: Option<u8>| {
                 let frame = frame(nth)?;

@@ -3,7 +3,7 @@
 //! In: the blocks of a port's recipe and a seed. Out: requests at random times, most of them for what the
 //! blocks have, some for what they have not, to other slaves, to all, or damaged.
 
-use proto_core::config::{Bus, GatewayConfig, Port, Talk};
+use proto_core::config::{Bus, GatewayConfig, Port, Transaction};
 use proto_core::modbus::rtu::Table;
 use proto_core::time::{Duration, Instant};
 
@@ -51,7 +51,7 @@ impl Plc {
         let exchanges = config.view().exchanges_of(recipe);
         let mut blocks = Vec::new();
         for exchange in exchanges {
-            let Talk::Served { operation, written, .. } = exchange.talk else { return None };
+            let Transaction::Served { operation, written, .. } = exchange.transaction else { return None };
             let (table, first, count) = operation.place();
             let values = vec![0; usize::from(count)];
             blocks.push(Block { table, first, count, is_written: written.len > 0, values });

@@ -7,7 +7,7 @@
 
 use std::collections::BTreeMap;
 
-use proto_core::config::{Bus, GatewayConfig, Port, Talk};
+use proto_core::config::{Bus, GatewayConfig, Port, Transaction};
 use proto_core::modbus::rtu::{BROADCAST, Echo, MAX_ADU, Operation, Slave, Table, Timing};
 use proto_core::modbus::server::RegisterBank;
 use proto_core::modbus::{Coils, Exception, Registers};
@@ -64,7 +64,7 @@ impl Slaves {
         let mut slaves: Vec<OneSlave> = Vec::new();
         let mut to_all = Vec::new();
         for exchange in config.view().exchanges_of(recipe) {
-            let Talk::Rtu { operation, .. } = exchange.talk else { return None };
+            let Transaction::Rtu { operation, .. } = exchange.transaction else { return None };
             if exchange.peer == BROADCAST {
                 to_all.push(operation);
                 continue;

@@ -5,7 +5,7 @@ use proto_core::engine::{LinkId, PortId};
 use proto_core::link::LinkState;
 use proto_core::modbus::Exception;
 use proto_core::time::Duration;
-use recipe_cell::{Cell, LineId, Talker, Way};
+use recipe_cell::{Cell, LineId, PeriodicSender, Way};
 use recipe_controller::Link;
 
 use crate::kit::*;
@@ -372,7 +372,7 @@ fn datagrams_that_get_lost_cost_only_themselves() {
     let line = cell.line_of("force");
     cell.network(LinkId::RECIPE_UDP).loss_ppm = 300_000;
     let value = |n: u64| n as f32 + 0.5;
-    cell.attach(line, Talker::new(cell.now(), 500, 1_000, move |n| force_frame([value(n); 6])));
+    cell.attach(line, PeriodicSender::new(cell.now(), 500, 1_000, move |n| force_frame([value(n); 6])));
     cell.run_ms(2_005);
     let arrived = cell.controller().counters().ports["udp2011"];
     assert!((600..800).contains(&arrived.frames_in), "{arrived:?}");

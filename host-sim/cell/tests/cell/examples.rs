@@ -4,7 +4,7 @@
 use proto_core::config::Bus;
 use proto_core::engine::{LinkId, PortId, ReplyCode};
 use proto_core::time::Duration;
-use recipe_cell::{Cell, Talker, What};
+use recipe_cell::{Cell, PeriodicSender, What};
 
 use crate::kit::*;
 
@@ -165,7 +165,7 @@ fn the_force_sensor_at_960_frames_a_second_loses_nothing_in_ten_seconds() {
     let sent_before = cell.link(LinkId::RECIPE_UDP).counters.sent;
     cell.keep_trace(200_000);
     let start = cell.now();
-    cell.attach(line, Talker::new(start, 960, FRAMES, move |n| force_frame(values(n))));
+    cell.attach(line, PeriodicSender::new(start, 960, FRAMES, move |n| force_frame(values(n))));
     cell.run(Duration::from_secs(10) + Duration::from_millis(5));
 
     let on_the_line = cell.line(line).time_of(28);
@@ -209,7 +209,7 @@ fn the_hand_moves_reports_and_is_missed() {
     assert_eq!(cell.send_command("run(grip.jspf)"), "run start");
     cell.run_ms(300);
     cell.bus(bus).take_heard();
-    cell.attach_can(bus, Talker::new(cell.now(), 50, 25, |n| can(0x502, &[2, 0, n as u8, 1])));
+    cell.attach_can(bus, PeriodicSender::new(cell.now(), 50, 25, |n| can(0x502, &[2, 0, n as u8, 1])));
     cell.run_ms(499);
     let frames = cell.bus(bus).take_heard();
     assert!((24..=25).contains(&frames.len()), "one each 20 ms: {}", frames.len());

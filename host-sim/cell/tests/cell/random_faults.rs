@@ -4,7 +4,7 @@
 use proto_core::engine::{LinkId, LinkKind};
 use proto_core::link::LinkState;
 use proto_core::time::Duration;
-use recipe_cell::{Cell, FaultInjector, FaultKind, LineId, Talker};
+use recipe_cell::{Cell, FaultInjector, FaultKind, LineId, PeriodicSender};
 use recipe_test_kit::toml;
 
 use crate::kit::*;
@@ -82,7 +82,7 @@ timeout_ms = 100
 fn counting(seed: u64) -> (Cell, LineId) {
     let mut cell = Cell::new(&toml::gateway(COUNTING), &recipe_config::SimConfig::default(), seed).unwrap();
     let line = cell.line_of("count");
-    cell.attach(line, Talker::new(cell.now(), 40, u64::MAX, count_frame));
+    cell.attach(line, PeriodicSender::new(cell.now(), 40, u64::MAX, count_frame));
     (cell, line)
 }
 
@@ -141,7 +141,7 @@ fn every_example_survives_everything_and_works_again() {
                 _ => outputs(3).to_vec(),
             };
             // Often enough for the force sensor's timeout of 20 ms, even if single frames are damaged.
-            let device = Talker::new(cell.now(), 150, u64::MAX, move |_| match rng.below(20) {
+            let device = PeriodicSender::new(cell.now(), 150, u64::MAX, move |_| match rng.below(20) {
                 0 => rng.bytes(9),
                 _ => frame.clone(),
             });
@@ -175,7 +175,7 @@ fn can_cells_survive_everything_and_work_again() {
                 _ => can(1, &[3]),
             };
             let mut rng = cell.fork_rng();
-            let device = Talker::new(cell.now(), 30, u64::MAX, move |_| match rng.below(20) {
+            let device = PeriodicSender::new(cell.now(), 30, u64::MAX, move |_| match rng.below(20) {
                 0 => can(rng.below(0x800) as u16 | 0x400, &rng.bytes(3)),
                 _ => frame,
             });

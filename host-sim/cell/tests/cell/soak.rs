@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use proto_core::config::{FieldSpec, Talk};
+use proto_core::config::{FieldSpec, Transaction};
 use proto_core::device::Encoding;
 use proto_core::modbus::rtu::Operation;
 use proto_core::time::Duration;
@@ -123,7 +123,7 @@ fn bits_of_shared_registers_are_judged() {
         let config = &mut scenario.gateway;
         let mut masked = 0;
         for exchange in &mut config.exchanges {
-            let Talk::Rtu { operation, written, .. } = &mut exchange.talk else { continue };
+            let Transaction::Rtu { operation, written, .. } = &mut exchange.transaction else { continue };
             let Operation::WriteRegister { address } = *operation else { continue };
             *operation = Operation::MaskWriteRegister { address, mask: 0x7FF8 };
             let field = &mut config.fields[usize::from(written.start)];

@@ -1,7 +1,7 @@
 //! The controller's state and the health of ports, from the simulated controller to the field and back.
 
 use proto_core::wire::state::OperationMode;
-use recipe_cell::{Cell, Talker};
+use recipe_cell::{Cell, PeriodicSender};
 use recipe_config::file;
 use recipe_test_kit::{example, toml};
 
@@ -90,7 +90,7 @@ fn a_device_that_is_dead_from_the_start_is_told_and_safe() {
     assert_eq!(shown(&mut cell)[2], 0);
 
     let line = cell.line_of("sensor-1");
-    cell.attach(line, Talker::new(cell.now(), 50, 50, |_| vec![255, 255, 7, 238, 238]));
+    cell.attach(line, PeriodicSender::new(cell.now(), 50, 50, |_| vec![255, 255, 7, 238, 238]));
     cell.run_ms(900);
     let [value, alive, frames, age] = seen(&cell);
     assert_eq!((value, alive), (7.0, 1.0));

@@ -3,7 +3,7 @@
 
 use proto_core::time::Duration;
 use proto_core::wire::can::CanFrame;
-use recipe_cell::{Cell, Rng, Talker};
+use recipe_cell::{Cell, PeriodicSender, Rng};
 use recipe_test_kit::toml;
 
 use crate::cells::{can, recorded};
@@ -123,7 +123,7 @@ pub(crate) fn record() -> Vec<u8> {
     let mut numbers = rng.fork();
     let bus = cell.bus_of("numbers");
     let start = cell.now() + Duration::from_millis(100);
-    cell.attach_can(bus, Talker::new(start, 2_000, u64::MAX, move |nth| frame(nth, &mut numbers)));
+    cell.attach_can(bus, PeriodicSender::new(start, 2_000, u64::MAX, move |nth| frame(nth, &mut numbers)));
     for _ in 0..500 {
         show(&mut cell, &mut rng);
         cell.run_ms(4);

@@ -4,7 +4,7 @@ use proto_core::config::GatewayConfig;
 use proto_core::time::Duration;
 use proto_core::wire::can::CanFrame;
 use proto_core::wire::can::CanId;
-use recipe_cell::{Cell, Chunking, FaultInjector, FaultKind, Rng, Talker};
+use recipe_cell::{Cell, Chunking, FaultInjector, FaultKind, PeriodicSender, Rng};
 use recipe_config::SimConfig;
 use recipe_config::file;
 use recipe_test_kit::{example, repository, toml};
@@ -98,7 +98,7 @@ fn talking(name: &str, chunking: Chunking) -> Cell {
             let line = cell.lines().next().expect("a line");
             cell.line(line).chunking = chunking;
             let frame = move |_| [&head[..], &rng.bytes(payload), &tail].concat();
-            cell.attach(line, Talker::new(start, *rate, u64::MAX, frame));
+            cell.attach(line, PeriodicSender::new(start, *rate, u64::MAX, frame));
         }
         Frames::Can { id, payload } => {
             let bus = cell.buses().next().expect("a bus");
@@ -108,7 +108,7 @@ fn talking(name: &str, chunking: Chunking) -> Cell {
                 15 => can(id, &rng.bytes(payload + 1)),
                 _ => can(id, &rng.bytes(payload)),
             };
-            cell.attach_can(bus, Talker::new(start, *rate, u64::MAX, frame));
+            cell.attach_can(bus, PeriodicSender::new(start, *rate, u64::MAX, frame));
         }
     }
     cell
@@ -129,11 +129,11 @@ fn four_ports(chunking: Chunking) -> Cell {
         cell.line(line).chunking = chunking;
         let mut rng = rng.fork();
         let frame = move |_| [&head[..], &rng.bytes(24), &tail].concat();
-        cell.attach(line, Talker::new(start, rate, u64::MAX, frame));
+        cell.attach(line, PeriodicSender::new(start, rate, u64::MAX, frame));
     }
     let bus = cell.bus_of("devices");
     let frame = move |_| can(0x500 + rng.below(14) as u16, &rng.bytes(2));
-    cell.attach_can(bus, Talker::new(start, 500, u64::MAX, frame));
+    cell.attach_can(bus, PeriodicSender::new(start, 500, u64::MAX, frame));
     cell
 }
 
@@ -157,10 +157,10 @@ recipe = "up"
 fn silence(cell: &mut Cell) {
     let start = cell.now();
     for line in cell.lines().collect::<Vec<_>>() {
-        cell.attach(line, Talker::new(start, 1, 0, |_| Vec::new()));
+        cell.attach(line, PeriodicSender::new(start, 1, 0, |_| Vec::new()));
     }
     for bus in cell.buses().collect::<Vec<_>>() {
-        cell.attach_can(bus, Talker::new(start, 1, 0, |_| can(0, &[])));
+        cell.attach_can(bus, PeriodicSender::new(start, 1, 0, |_| can(0, &[])));
     }
 }
 

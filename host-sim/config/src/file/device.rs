@@ -385,7 +385,7 @@ impl FilePart {
             let is_same = |(_, earlier): &(u8, &FileFrame)| !earlier.differs(frame, part);
             let earlier = (0..nth).zip(&self.frames).filter(same_id).find(is_same);
             if let Some((first, _)) = earlier {
-                return refused(PartError::NotToldApart { frame: nth, first, id: frame.id });
+                return refused(PartError::Indistinguishable { frame: nth, first, id: frame.id });
             }
         }
         Ok(())

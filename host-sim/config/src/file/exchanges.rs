@@ -4,7 +4,7 @@
 //! frames here are a device's own; those of Modbus are in `modbus`.
 
 use proto_core::config::{
-    AskWhen, DEFAULT_REPLY_TIMEOUT, ExchangeError, ExchangeKey, OutcomeTo, Port, Restarted,
+    DEFAULT_REPLY_TIMEOUT, ExchangeError, ExchangeKey, OutcomeTo, Port, Restarted, Triggers,
 };
 use proto_core::device::{Boundary, Carrier, Element};
 use proto_core::recipe::model::{Mode, Rules};
@@ -47,7 +47,7 @@ pub(super) struct FileExchange {
 
 /// When an exchange is asked, and how long it may take.
 pub(super) struct AskTiming {
-    pub(super) when: AskWhen,
+    pub(super) when: Triggers,
     pub(super) timeout: Duration,
     pub(super) retries: Option<u8>,
     pub(super) pause: Duration,
@@ -324,7 +324,7 @@ impl FileFrame {
 impl AskTiming {
     /// Of what is never asked.
     pub(super) const NEVER: Self = Self {
-        when: AskWhen::NEVER,
+        when: Triggers::NEVER,
         timeout: DEFAULT_REPLY_TIMEOUT,
         retries: None,
         pause: Duration::ZERO,
@@ -337,7 +337,7 @@ impl AskTiming {
 
     /// `names` are those of all exchanges of the recipe.
     pub(super) fn read(table: &Reader<'_>, names: &[Option<String>]) -> Result<Self> {
-        let mut when = AskWhen { every: table.time(&exchange::EVERY)?, ..AskWhen::NEVER };
+        let mut when = Triggers { every: table.time(&exchange::EVERY)?, ..Triggers::NEVER };
         if let Some(on) = table.optional("on") {
             let list = on.array("such as [\"start\", \"change\"]")?;
             if list.is_empty() {
@@ -403,7 +403,7 @@ fn read_outcome(item: &Item<'_>) -> Result<OutcomeTo> {
 }
 
 /// One entry of `on`.
-fn read_on(item: &Item<'_>, when: &mut AskWhen) -> Result<()> {
+fn read_on(item: &Item<'_>, when: &mut Triggers) -> Result<()> {
     let text = item.string()?;
     let flag =
         match text {

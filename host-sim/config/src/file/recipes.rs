@@ -502,9 +502,9 @@ impl FilePart {
             self.frames.get(usize::from(at.frame.unwrap_or(0)))?.fields.get(usize::from(at.field))
         });
         match error {
-            PartError::InvalidId { .. } | PartError::DuplicateId { .. } | PartError::NotToldApart { .. } => {
-                frame.map(|frame| &frame.id_spot)
-            }
+            PartError::InvalidId { .. }
+            | PartError::DuplicateId { .. }
+            | PartError::Indistinguishable { .. } => frame.map(|frame| &frame.id_spot),
             _ => delimiter.or(field.map(|field| &field.spot)).or(frame.map(|frame| &frame.spot)),
         }
         .unwrap_or(&self.spot)

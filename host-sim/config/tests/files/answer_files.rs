@@ -1,6 +1,6 @@
 //! What several answers to one request mean in the configuration, what tells of a restart, and every mistake in them.
 
-use proto_core::config::{Exchange, GatewayConfig, Restarted, Talk};
+use proto_core::config::{Exchange, GatewayConfig, Restarted, Transaction};
 use recipe_config::file::{Text, parse_gateway};
 
 use super::wrong_files::{Case, messages};
@@ -19,12 +19,12 @@ fn exchanges(config: &GatewayConfig, recipe: usize) -> &[Exchange] {
 fn answers_and_their_values() {
     let config = parse(ANSWERS);
     let [start, ..] = exchanges(&config, 0) else { panic!() };
-    let Talk::Frames { request, reply, refusal } = start.talk else { panic!() };
+    let Transaction::Frames { request, reply, refusal } = start.transaction else { panic!() };
     assert_eq!([request, reply, start.pending, refusal], [Some(0), Some(1), Some(2), Some(3)]);
     let written: Vec<_> = config.view().written_by(&config.recipes[0]).map(|var| var.to_string()).collect();
     assert_eq!(written, ["WordInputReg[1]", "WordInputReg[2]", "WordInputReg[3]"]);
     let home = exchanges(&config, 1)[0];
-    let Talk::Frames { refusal, .. } = home.talk else { panic!() };
+    let Transaction::Frames { refusal, .. } = home.transaction else { panic!() };
     assert!(home.pending.is_some() && refusal.is_some());
 }
 

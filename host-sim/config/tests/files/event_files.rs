@@ -1,6 +1,6 @@
 //! What the keys of events mean in the configuration, and every mistake in them.
 
-use proto_core::config::{AskWhen, Bus, Echo, Exchange, GatewayConfig, OutcomeTo, Port};
+use proto_core::config::{Bus, Echo, Exchange, GatewayConfig, OutcomeTo, Port, Triggers};
 use proto_core::sysvar::SysVar;
 use proto_core::time::Duration;
 use recipe_config::file::{Text, parse_gateway};
@@ -38,7 +38,7 @@ fn keys_of_events() {
     };
     assert_eq!((force.outcome, force.stop, force.follow), (outcome, false, None));
 
-    assert_eq!((go.when, go.follow, go.trigger), (AskWhen::NEVER, Some(0), None));
+    assert_eq!((go.when, go.follow, go.trigger), (Triggers::NEVER, Some(0), None));
     assert_eq!(go.outcome, OutcomeTo { to: var("WordInputReg[23]"), ..OutcomeTo::NONE });
     // Events are not repeated unless the file says so.
     assert_eq!((go.retries, go.event_retries), (1, 0));

@@ -1,9 +1,9 @@
 //! What the keys of exchanges and of Modbus mean in the configuration.
 
 use proto_core::config::{
-    Ask, AskFrame, AskWhen, Bus, CanFields, Coil, Echo, Exchange, FieldSpec, GatewayConfig, InputBinding,
-    InputField, OnStale, OutputBinding, OutputField, Parity, Parts, Port, Recipe, Rs485, Span, StateValue,
-    Talk,
+    Bus, CanFields, Coil, Echo, Exchange, ExchangeBuilder, ExchangeFrame, FieldSpec, GatewayConfig,
+    InputBinding, InputField, OnStale, OutputBinding, OutputField, Parity, Parts, Port, Recipe, Rs485, Span,
+    StateValue, Transaction, Triggers,
 };
 use proto_core::device::{Algorithm, Bits, ByteOrder, Checksum, Encoding, Kind};
 use proto_core::modbus::rtu::{Operation, Table};
@@ -33,8 +33,8 @@ fn to(name: &str) -> InputBinding {
 }
 
 fn rtu(config: &GatewayConfig, nth: usize) -> (Operation, &[FieldSpec], &[FieldSpec]) {
-    match exchanges(config, 0)[nth].talk {
-        Talk::Rtu { operation, written, read } => {
+    match exchanges(config, 0)[nth].transaction {
+        Transaction::Rtu { operation, written, read } => {
             (operation, written.of(&config.fields), read.of(&config.fields))
         }
         other => panic!("{other:?}"),
@@ -52,7 +52,7 @@ fn a_master_has_its_registers() {
     assert_eq!(config.recipes[0].parts, Parts::Stream { input: None, output: None });
     let first = exchanges(&config, 0)[0];
     assert_eq!((first.peer, first.timeout, first.retries, first.pause), (9, ms(50), 2, ms(5)));
-    assert_eq!(first.when, AskWhen::every(ms(100)));
+    assert_eq!(first.when, Triggers::every(ms(100)));
     let (operation, written, read) = rtu(&config, 0);
     assert_eq!(operation, Operation::ReadInputRegisters { address: 0x07D0, count: 5 });
     assert!(written.is_empty());
@@ -69,7 +69,7 @@ fn a_master_has_its_registers() {
     assert_eq!((order(&read[0]), written.len()), (Some(ByteOrder::Big), 2));
     let second = exchanges(&config, 0)[1];
     let rising = Some((SysVar::parse("BitOutputReg[3]").unwrap(), 0));
-    assert_eq!(second.when, AskWhen { every: None, start: true, change: true, rising });
+    assert_eq!(second.when, Triggers { every: None, start: true, change: true, rising });
     assert_eq!((second.timeout, second.retries, second.pause), (ms(100), 1, ms(0)), "the defaults");
     assert_eq!(rtu(&config, 5).0, Operation::WriteRegister { address: 1 });
 }
@@ -148,8 +148,10 @@ fn a_slave_serves_its_blocks() {
     let blocks = exchanges(&config, 1);
     let operations: Vec<_> = blocks
         .iter()
-        .map(|block| match block.talk {
-            Talk::Served { operation, written, read } => (block.peer, operation, written.len, read.len),
+        .map(|block| match block.transaction {
+            Transaction::Served { operation, written, read } => {
+                (block.peer, operation, written.len, read.len)
+            }
             other => panic!("{other:?}"),
         })
         .collect();
@@ -169,17 +171,22 @@ fn a_slave_serves_its_blocks() {
 fn a_conversation_has_frames_of_its_own() {
     let config = line();
     let talk = exchanges(&config, 2);
-    assert_eq!((talk[0].peer, talk[0].when), (3, AskWhen::every(ms(50))));
-    assert_eq!(talk[0].talk, Talk::Frames { request: Some(0), reply: Some(1), refusal: Some(2) });
-    assert_eq!(talk[1].talk, Talk::Frames { request: None, reply: Some(3), refusal: None });
-    assert_eq!(talk[2].talk, Talk::Frames { request: Some(4), reply: None, refusal: None });
+    assert_eq!((talk[0].peer, talk[0].when), (3, Triggers::every(ms(50))));
+    assert_eq!(
+        talk[0].transaction,
+        Transaction::Frames { request: Some(0), reply: Some(1), refusal: Some(2) }
+    );
+    assert_eq!(talk[1].transaction, Transaction::Frames { request: None, reply: Some(3), refusal: None });
+    assert_eq!(talk[2].transaction, Transaction::Frames { request: Some(4), reply: None, refusal: None });
     assert_eq!(talk[2].pause, ms(10));
     let reply = &config.frames[1];
     assert_eq!((&reply.head[..], &reply.tail[..], reply.id, reply.remote), (&[2][..], &[3][..], None, false));
 
     let drive = exchanges(&config, 3);
-    assert_eq!(drive[0].when, AskWhen { start: true, ..AskWhen::NEVER });
-    let Talk::Frames { request: Some(request), .. } = drive[1].talk else { panic!("{:?}", drive[1]) };
+    assert_eq!(drive[0].when, Triggers { start: true, ..Triggers::NEVER });
+    let Transaction::Frames { request: Some(request), .. } = drive[1].transaction else {
+        panic!("{:?}", drive[1])
+    };
     let request = &config.frames[usize::from(request)];
     assert_eq!((request.id, request.remote), (Some(CanId::Standard(0x701)), true));
     assert_eq!(request.fields.len, 0);
@@ -234,7 +241,7 @@ fn a_program_writes_what_a_file_says() {
         .controller("192.168.12.138")
         .recipe(
             Recipe::user("line").exchanges(&[
-                Ask::read_input_registers(
+                ExchangeBuilder::read_input_registers(
                     9,
                     0x07D0,
                     &[
@@ -250,7 +257,7 @@ fn a_program_writes_what_a_file_says() {
                 .timeout(ms(50))
                 .retries(2)
                 .pause(ms(5)),
-                Ask::read_write_registers(
+                ExchangeBuilder::read_write_registers(
                     9,
                     (0x10, &[InputField::variable(position, "WordInputReg[3]")]),
                     (
@@ -264,7 +271,7 @@ fn a_program_writes_what_a_file_says() {
                 .at_start()
                 .on_change()
                 .on_rising("BitOutputReg[3]", 0),
-                Ask::read_coils(
+                ExchangeBuilder::read_coils(
                     5,
                     0,
                     &[
@@ -278,8 +285,9 @@ fn a_program_writes_what_a_file_says() {
                     ],
                 )
                 .every(ms(20)),
-                Ask::write_coil(5, 0xAC, &[OutputField::variable(coil, "WordOutputReg[2]")]).on_change(),
-                Ask::write_coils(
+                ExchangeBuilder::write_coil(5, 0xAC, &[OutputField::variable(coil, "WordOutputReg[2]")])
+                    .on_change(),
+                ExchangeBuilder::write_coils(
                     0,
                     0,
                     &[
@@ -289,12 +297,16 @@ fn a_program_writes_what_a_file_says() {
                     ],
                 )
                 .every(ms(1000)),
-                Ask::write_register(6, 1, &[OutputField::variable(ScalarType::Word, "WordOutputReg[3]")])
-                    .every(ms(500)),
+                ExchangeBuilder::write_register(
+                    6,
+                    1,
+                    &[OutputField::variable(ScalarType::Word, "WordOutputReg[3]")],
+                )
+                .every(ms(500)),
             ]),
         )
         .recipe(Recipe::user("plc").exchanges(&[
-            Ask::served(
+            ExchangeBuilder::served(
                 5,
                 Table::HoldingRegisters,
                 0,
@@ -303,8 +315,13 @@ fn a_program_writes_what_a_file_says() {
                     OutputField::constant(ScalarType::Word, 1.0),
                 ],
             ),
-            Ask::served(5, Table::HoldingRegisters, 100, &[InputField::variable(total, "WordInputReg[10]")]),
-            Ask::served(
+            ExchangeBuilder::served(
+                5,
+                Table::HoldingRegisters,
+                100,
+                &[InputField::variable(total, "WordInputReg[10]")],
+            ),
+            ExchangeBuilder::served(
                 5,
                 Table::DiscreteInputs,
                 0,
@@ -314,10 +331,10 @@ fn a_program_writes_what_a_file_says() {
                     OutputField::constant(coil, 1.0),
                 ],
             ),
-            Ask::served(5, Table::Coils, 7, &[InputField::commands(coil, &[(1, "stop")])]),
+            ExchangeBuilder::served(5, Table::Coils, 7, &[InputField::commands(coil, &[(1, "stop")])]),
         ]))
         .recipe(
-            Recipe::user("talk").exchanges(&[Ask::request(AskFrame::stream(
+            Recipe::user("talk").exchanges(&[ExchangeBuilder::request(ExchangeFrame::stream(
                 &[2],
                 &[3],
                 &[
@@ -326,7 +343,7 @@ fn a_program_writes_what_a_file_says() {
                     OutputField::checksum(crc),
                 ],
             ))
-            .reply(AskFrame::stream(
+            .reply(ExchangeFrame::stream(
                 &[2],
                 &[3],
                 &[
@@ -335,7 +352,7 @@ fn a_program_writes_what_a_file_says() {
                     InputField::checksum(crc),
                 ],
             ))
-            .refusal(AskFrame::stream(
+            .refusal(ExchangeFrame::stream(
                 &[],
                 &[],
                 &[InputField::constant(ScalarType::Byte, 0x15), InputField::unused(ScalarType::Byte)],
@@ -349,8 +366,8 @@ fn a_program_writes_what_a_file_says() {
                     0x181,
                     &[InputField::variable(ScalarType::Word, "WordInputReg[13]")],
                 )])
-                .exchanges(&[Ask::request(AskFrame::remote(CanId::Standard(0x701)))
-                    .reply(AskFrame::can(
+                .exchanges(&[ExchangeBuilder::request(ExchangeFrame::remote(CanId::Standard(0x701)))
+                    .reply(ExchangeFrame::can(
                         CanId::Standard(0x701),
                         &[InputField::variable(ScalarType::Byte, "WordInputReg[15]")],
                     ))
@@ -392,11 +409,12 @@ fn shown(config: &GatewayConfig, recipe: usize) -> Vec<String> {
     };
     let show = |exchange: &Exchange| {
         let timing = (exchange.peer, exchange.when, exchange.timeout, exchange.retries, exchange.pause);
-        match exchange.talk {
-            Talk::Rtu { operation, written, read } | Talk::Served { operation, written, read } => {
+        match exchange.transaction {
+            Transaction::Rtu { operation, written, read }
+            | Transaction::Served { operation, written, read } => {
                 format!("{timing:?} {operation:?} {:?} {:?}", fields(written), fields(read))
             }
-            Talk::Frames { request, reply, refusal } => {
+            Transaction::Frames { request, reply, refusal } => {
                 format!(
                     "{timing:?} {:?} {:?} {:?} {:?}",
                     frame(request),

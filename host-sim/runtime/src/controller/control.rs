@@ -129,7 +129,7 @@ impl ControllerShell {
         }
         let is_refused = client.has_ended.get();
         spawn_local(async move {
-            let ended = self.talk(stream, &client).await;
+            let ended = self.read_lines(stream, &client).await;
             debug!(?ended, "control client disconnected");
             self.control_clients.borrow_mut().retain(|other| !Rc::ptr_eq(other, &client));
             if is_refused {
@@ -139,7 +139,7 @@ impl ControllerShell {
     }
 
     /// Talks with a client until it leaves.
-    async fn talk(&self, stream: TcpStream, client: &ControlClient) -> io::Result<()> {
+    async fn read_lines(&self, stream: TcpStream, client: &ControlClient) -> io::Result<()> {
         tcp_options::enable_keepalive(&stream);
         let (read, mut write) = stream.into_split();
         let mut read = BufReader::new(read);

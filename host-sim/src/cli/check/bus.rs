@@ -3,7 +3,7 @@
 //! In: a checked configuration, and which ports share a bus. Out: a load in percent for each bus, and what cannot go
 //! together on one. Only frames with a period count: an input part counts as one frame of each id a cycle.
 
-use proto_core::config::{Bus, GatewayConfig, Parts, Port, SendOn, Talk};
+use proto_core::config::{Bus, GatewayConfig, Parts, Port, SendOn, Transaction};
 use proto_core::device::Carrier;
 use proto_core::sysvar::Direction;
 use proto_core::time::Duration;
@@ -171,7 +171,7 @@ fn add_exchanges(
             not_counted.push(format!("exchange {number} of {}, which has no period", port.name));
             continue;
         };
-        let Talk::Frames { request, reply, .. } = exchange.talk else { continue };
+        let Transaction::Frames { request, reply, .. } = exchange.transaction else { continue };
         let budget = config.view().exchange_budget(port, exchange);
         let id = |nth: Option<u8>| config.frames.get(usize::from(nth?))?.id;
         let both = [(id(request), budget.request), (id(reply), budget.reply)];
@@ -285,9 +285,9 @@ fn received(config: &GatewayConfig, port: &Port) -> impl Iterator<Item = CanId> 
         _ => &[],
     };
     let exchanges = recipe.map_or(&[][..], |recipe| config.view().exchanges_of(recipe));
-    let replies = exchanges.iter().flat_map(|exchange| match exchange.talk {
+    let replies = exchanges.iter().flat_map(|exchange| match exchange.transaction {
         // A remote request has the id of its reply.
-        Talk::Frames { request, reply, refusal } if !is_remote(config, request) => {
+        Transaction::Frames { request, reply, refusal } if !is_remote(config, request) => {
             [reply, exchange.pending, refusal]
         }
         _ => [None; 3],
@@ -310,8 +310,8 @@ fn sent(config: &GatewayConfig, port: &Port) -> impl Iterator<Item = CanId> {
     };
     let view = config.view();
     let exchanges = recipe.map_or(&[][..], |recipe| view.exchanges_of(recipe));
-    let requests = exchanges.iter().filter_map(|exchange| match exchange.talk {
-        Talk::Frames { request, .. } if !is_remote(config, request) => {
+    let requests = exchanges.iter().filter_map(|exchange| match exchange.transaction {
+        Transaction::Frames { request, .. } if !is_remote(config, request) => {
             config.frames.get(usize::from(request?))?.id
         }
         _ => None,

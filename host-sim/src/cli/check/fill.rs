@@ -1,6 +1,6 @@
 //! From a checked file to the report on it.
 
-use proto_core::config::{Bus, GatewayConfig, PartBudget, Port, Talk, Warning, can_frame_time};
+use proto_core::config::{Bus, GatewayConfig, PartBudget, Port, Transaction, Warning, can_frame_time};
 use proto_core::device::{Boundary, Carrier};
 use proto_core::recipe::model::{Field, Mode};
 use proto_core::sysvar::{Direction, SysVar};
@@ -12,7 +12,7 @@ use recipe_config::{
 };
 
 use super::super::values::Times;
-use super::super::{conversation, frame, plan, text, values};
+use super::super::{exchange_report, frame, plan, text, values};
 use super::report::{self, Part, PendantLink, PendantPart, PendantRecipe, Report, Servers, name_of};
 
 /// A key as a path, and a sentence.
@@ -88,7 +88,7 @@ fn gateway_port(
         recipe: Some(recipe.map_or("", |recipe| recipe.name()).to_owned()),
         cycle_ms: port.cycle,
         parts: parts.collect(),
-        exchanges: frames.map_or_else(Vec::new, |recipe| conversation::all(config, port, recipe)),
+        exchanges: frames.map_or_else(Vec::new, |recipe| exchange_report::all(config, port, recipe)),
         exchanges_percent: config.view().line_share(port).filter(|_| frames.is_some() && !is_tcp),
         commands: frames.map_or_else(Vec::new, values::commands),
         times: values::times(config, port),
@@ -131,7 +131,7 @@ pub(super) fn warnings(config: &GatewayConfig) -> Vec<Placed> {
         Warning::ManualAddress { recipe: nth, exchange, .. } => {
             let of = config.recipes.get(usize::from(nth)).map(|recipe| view.exchanges_of(recipe));
             let exchanged = of.and_then(|of| of.get(usize::from(exchange)));
-            let list = if exchanged.is_some_and(|one| matches!(one.talk, Talk::Served { .. })) {
+            let list = if exchanged.is_some_and(|one| matches!(one.transaction, Transaction::Served { .. })) {
                 "block"
             } else {
                 "exchange"

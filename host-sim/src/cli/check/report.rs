@@ -8,7 +8,7 @@ use proto_core::time::Duration;
 use recipe_config::file::{FileError, Source};
 use serde::Serialize;
 
-use super::super::conversation::Talk;
+use super::super::exchange_report::ExchangeReport;
 use super::super::frame::Picture;
 use super::super::plan::{self, Way};
 use super::super::values::{self, Picks, Times};
@@ -77,7 +77,7 @@ pub(super) struct Port {
     pub(super) cycle_ms: Duration,
     pub(super) parts: Vec<Part>,
     #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub(super) exchanges: Vec<Talk>,
+    pub(super) exchanges: Vec<ExchangeReport>,
     /// What all exchanges with a period take of the line.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) exchanges_percent: Option<u32>,
@@ -349,7 +349,7 @@ impl Port {
             report += "  no recipe: idle\n";
         }
         report.extend(self.parts.iter().map(Part::show));
-        report.extend(self.exchanges.iter().map(Talk::show));
+        report.extend(self.exchanges.iter().map(ExchangeReport::show));
         if let Some(percent) = self.exchanges_percent {
             let what = if matches!(self.bus, Bus::Can { .. }) { "bus" } else { "line" };
             report += &format!("  all of them with a period take {percent} % of the {what}\n");

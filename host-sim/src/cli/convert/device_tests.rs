@@ -6,7 +6,7 @@ use proto_core::sysvar::Direction;
 use recipe_config::file::{Text, load_recipes, parse_recipes};
 use recipe_test_kit::example;
 
-use super::super::codec::TalkPart;
+use super::super::codec::ExchangePart;
 use super::tests::{decoded, encoded, from_values};
 use super::*;
 
@@ -15,16 +15,16 @@ fn example_part(file: &str, recipe: Option<&str>, part: Direction) -> Part {
 }
 
 /// A frame of an exchange of an example, which has one recipe.
-fn exchange_part(file: &str, number: usize, talk: TalkPart) -> Part {
+fn exchange_part(file: &str, number: usize, part: ExchangePart) -> Part {
     let recipes = load_recipes(&example(file), &[]).unwrap();
-    Part::choose_exchange(&recipes, None, Some(number), Some(talk)).unwrap()
+    Part::choose_exchange(&recipes, None, Some(number), Some(part)).unwrap()
 }
 
 const REPLY: &str = "09 17 06 F9 00 00 DC D0 1E 4E 11";
 
 #[test]
 fn the_grippers_reply_has_its_values() {
-    let part = exchange_part("gripper.toml", 1, TalkPart::Reply);
+    let part = exchange_part("gripper.toml", 1, ExchangePart::Reply);
     let values = "activated=1 going=1 status=3 object=3 fault=0 wanted=220 position=208 current=30\n";
     assert_eq!(decoded(&part, REPLY), (values.into(), String::new()));
     assert_eq!(encoded(&part, values).unwrap().trim_end(), REPLY);
@@ -46,7 +46,7 @@ fn the_grippers_reply_has_its_values() {
 
 #[test]
 fn the_grippers_request_needs_no_constants() {
-    let part = exchange_part("gripper.toml", 1, TalkPart::Request);
+    let part = exchange_part("gripper.toml", 1, ExchangePart::Request);
     let request = "09 17 07 D0 00 03 03 E8 00 03 06 09 00 00 DC FF 96 D7 DA";
     assert_eq!(from_values(&part, None, &["220", "255", "150"]).unwrap(), request);
     assert_eq!(from_values(&part, None, &["force=150", "position=220", "speed=255"]).unwrap(), request);
@@ -64,7 +64,7 @@ fn the_grippers_request_needs_no_constants() {
 
 #[test]
 fn a_wrong_checksum_is_told_with_the_right_one() {
-    let part = exchange_part("gripper.toml", 1, TalkPart::Reply);
+    let part = exchange_part("gripper.toml", 1, ExchangePart::Reply);
     let wrong = REPLY.replace("1E 4E", "1F 4E");
     let (values, notes) = decoded(&part, &format!("{wrong}\n{REPLY}\n"));
     assert_eq!(values.lines().count(), 1);
@@ -89,28 +89,30 @@ fn a_wrong_checksum_is_told_with_the_right_one() {
 
 #[test]
 fn frames_of_exchanges_are_whole() {
-    for (number, talk, values, bytes) in [
-        (1, TalkPart::Request, &[][..], "01 02 00 00 00 08 79 CC"),
-        (1, TalkPart::Reply, &["1", "0", "0", "1"], "01 02 01 81 61 E8"),
-        (1, TalkPart::Refusal, &["2"], "01 82 02 C1 61"),
-        (2, TalkPart::Request, &["1", "0", "1"], "01 0F 00 00 00 04 01 0D FF 53"),
-        (2, TalkPart::Reply, &[], "01 0F 00 00 00 04 54 08"),
-        (4, TalkPart::Request, &["zero=1"], "02 05 01 00 FF 00 8D F5"),
-        (4, TalkPart::Reply, &["zero=0"], "02 05 01 00 00 00 CC 05"),
-        (13, TalkPart::Request, &["3"], "00 06 00 F0 00 03 C8 29"),
+    for (number, frame, values, bytes) in [
+        (1, ExchangePart::Request, &[][..], "01 02 00 00 00 08 79 CC"),
+        (1, ExchangePart::Reply, &["1", "0", "0", "1"], "01 02 01 81 61 E8"),
+        (1, ExchangePart::Refusal, &["2"], "01 82 02 C1 61"),
+        (2, ExchangePart::Request, &["1", "0", "1"], "01 0F 00 00 00 04 01 0D FF 53"),
+        (2, ExchangePart::Reply, &[], "01 0F 00 00 00 04 54 08"),
+        (4, ExchangePart::Request, &["zero=1"], "02 05 01 00 FF 00 8D F5"),
+        (4, ExchangePart::Reply, &["zero=0"], "02 05 01 00 00 00 CC 05"),
+        (13, ExchangePart::Request, &["3"], "00 06 00 F0 00 03 C8 29"),
     ] {
-        let part = exchange_part("modbus-line.toml", number, talk);
+        let part = exchange_part("modbus-line.toml", number, frame);
         let found = from_values(&part, None, values).unwrap();
         assert_eq!(found, bytes, "exchange {number}");
         let (values, notes) = decoded(&part, &found);
         assert_eq!((encoded(&part, &values).unwrap(), notes.as_str()), (found + "\n", ""), "{values}");
-        let needs_values =
-            matches!((number, talk), (1, TalkPart::Reply | TalkPart::Refusal) | (2 | 13, TalkPart::Request));
+        let needs_values = matches!(
+            (number, frame),
+            (1, ExchangePart::Reply | ExchangePart::Refusal) | (2 | 13, ExchangePart::Request)
+        );
         assert_eq!(part.is_constant(), !needs_values, "{values}");
     }
     let recipes = load_recipes(&example("modbus-line.toml"), &[]).unwrap();
-    let refused = |number, talk| Part::choose_exchange(&recipes, None, number, talk).unwrap_err();
-    assert_eq!(refused(Some(13), Some(TalkPart::Reply)), "the exchange has no reply; there are request");
+    let refused = |number, part| Part::choose_exchange(&recipes, None, number, part).unwrap_err();
+    assert_eq!(refused(Some(13), Some(ExchangePart::Reply)), "the exchange has no reply; there are request");
     assert_eq!(refused(Some(14), None), "there is no exchange 14 in recipe \"line\"; allowed: 1..=13");
     assert_eq!(refused(Some(0), None), "there is no exchange 0 in recipe \"line\"; allowed: 1..=13");
     assert_eq!(
@@ -142,25 +144,25 @@ fn the_worked_bytes_of_conversations_are_right() {
         (
             "Conversations",
             "[[recipe]]\nname = \"r\"\nkind = \"stream\"\nmode = \"user\"\n",
-            &[(1, TalkPart::Request, ""), (1, TalkPart::Reply, "1000")][..],
+            &[(1, ExchangePart::Request, ""), (1, ExchangePart::Reply, "1000")][..],
         ),
         (
             "Modbus RTU master",
             "[[recipe]]\nname = \"r\"\nkind = \"modbus-rtu\"\n",
             &[
-                (1, TalkPart::Request, ""),
-                (1, TalkPart::Reply, "1000"),
-                (2, TalkPart::Request, "1 1"),
-                (2, TalkPart::Refusal, "2"),
+                (1, ExchangePart::Request, ""),
+                (1, ExchangePart::Reply, "1000"),
+                (2, ExchangePart::Request, "1 1"),
+                (2, ExchangePart::Refusal, "2"),
             ],
         ),
-        ("Modbus RTU slave", "", &[(2, TalkPart::Request, ""), (2, TalkPart::Reply, "0.5")]),
+        ("Modbus RTU slave", "", &[(2, ExchangePart::Request, ""), (2, ExchangePart::Reply, "0.5")]),
     ] {
         let (blocks, text) = documented(title);
         let toml = format!("[controller]\naddress = \"a\"\n{recipe}{blocks}");
         let recipes = parse_recipes(Text { name: title, toml: &toml }, &[]).unwrap();
-        for &(number, talk, values) in frames {
-            let part = Part::choose_exchange(&recipes, None, Some(number), Some(talk)).unwrap();
+        for &(number, part, values) in frames {
+            let part = Part::choose_exchange(&recipes, None, Some(number), Some(part)).unwrap();
             let values: Vec<_> = values.split_whitespace().collect();
             let bytes = from_values(&part, None, &values).unwrap();
             assert!(text.contains(&format!("`{bytes}`")), "{title}, {number}: {bytes}");
@@ -382,7 +384,7 @@ proptest! {
     #[test]
     fn any_bytes_are_decoded_or_told_of(bytes in prop::collection::vec(any::<u8>(), 0..80)) {
         let parts = [
-            exchange_part("gripper.toml", 1, TalkPart::Reply),
+            exchange_part("gripper.toml", 1, ExchangePart::Reply),
             example_part("force-sensor-crc.toml", Some("force-sensor"), Direction::Input),
             example_part("scale.toml", None, Direction::Input),
         ];

@@ -6,7 +6,7 @@ use serde::Deserialize;
 
 use super::{ConfigMut, ImageError, item, items, v4};
 use crate::config::error::Counted;
-use crate::config::{self, AskWhen, Bus, Name, PortHealth, Span, Talk};
+use crate::config::{self, Bus, Name, PortHealth, Span, Transaction, Triggers};
 use crate::time::Duration;
 
 pub(super) fn read_head(rest: &mut &[u8], config: &mut ConfigMut<'_>) -> Result<(), ImageError> {
@@ -77,15 +77,15 @@ impl From<Port> for config::Port {
 #[derive(Deserialize)]
 struct Exchange {
     peer: u8,
-    talk: Talk,
-    when: AskWhen,
+    transaction: Transaction,
+    when: Triggers,
     timeout: Duration,
     retries: u8,
     pause: Duration,
 }
 
 impl From<Exchange> for config::Exchange {
-    fn from(Exchange { peer, talk, when, timeout, retries, pause }: Exchange) -> Self {
-        Self { timeout, retries, pause, ..Self::new(peer, talk, when) }
+    fn from(Exchange { peer, transaction, when, timeout, retries, pause }: Exchange) -> Self {
+        Self { timeout, retries, pause, ..Self::new(peer, transaction, when) }
     }
 }

@@ -4,7 +4,7 @@
 //! In: the content of each transmission, when it arrives, and which paths to the controller work.
 //! Does not know what the engine considers delivered.
 
-mod must_arrive;
+mod due;
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -12,7 +12,7 @@ use proto_core::engine::LinkId;
 use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 
-use must_arrive::SAFE_ARRIVES;
+use due::SAFE_ARRIVES;
 
 use super::commands::Command;
 use super::field::show;
@@ -369,9 +369,11 @@ impl Oracle {
             let (Carried::Of { timeout, .. }, Some(owned)) = (carried, self.spec.owned[var.ordinal()]) else {
                 continue;
             };
-            let Some(talk) = &self.spec.ports[owned.port].talk else { continue };
+            let Some(exchanges) = &self.spec.ports[owned.port].exchanges else { continue };
             // Nobody tells what the frames of the input part beside the exchanges had.
-            let Some(row) = talk.rows.iter().find(|row| row.reply == Some(owned.frame)) else { continue };
+            let Some(row) = exchanges.rows.iter().find(|row| row.reply == Some(owned.frame)) else {
+                continue;
+            };
             self.checks[Invariant::Held as usize] += 1;
             // A reply was made at most so long before it is taken.
             let asked = row.timeout.saturating_mul(u64::from(row.retries) + 3);

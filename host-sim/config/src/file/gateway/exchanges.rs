@@ -1,6 +1,6 @@
 //! The exchanges of a recipe, as the configuration has them.
 
-use proto_core::config::{Exchange, FrameSpec, MAX_EXCHANGES, Place, Span, Talk};
+use proto_core::config::{Exchange, FrameSpec, MAX_EXCHANGES, Place, Span, Transaction};
 use proto_core::sysvar::Direction;
 
 use super::super::exchanges::FileExchange;
@@ -20,7 +20,7 @@ impl Builder<'_> {
                 let place = Place::Exchange { recipe, exchange: number, key: *key };
                 self.spots.insert(place, spot.clone());
             }
-            let (talk, pending) = self.talk(recipe, exchange, &mut numbers)?;
+            let (transaction, pending) = self.transaction(recipe, exchange, &mut numbers)?;
             let timing = &exchange.timing;
             let added = Exchange {
                 timeout: timing.timeout,
@@ -33,7 +33,7 @@ impl Builder<'_> {
                 outcome: timing.outcome,
                 pending,
                 restarted: exchange.restarted,
-                ..Exchange::new(exchange.peer, talk, timing.when)
+                ..Exchange::new(exchange.peer, transaction, timing.when)
             };
             if self.config.exchanges.push(added.repeated(timing.retries)).is_err() {
                 return Err(self.too_many(exchange));
@@ -50,7 +50,12 @@ impl Builder<'_> {
     }
 
     /// The frames, and the pending answer.
-    fn talk(&mut self, recipe: u8, from: &FileExchange, numbers: &mut [u8; 2]) -> Result<(Talk, Option<u8>)> {
+    fn transaction(
+        &mut self,
+        recipe: u8,
+        from: &FileExchange,
+        numbers: &mut [u8; 2],
+    ) -> Result<(Transaction, Option<u8>)> {
         let [inputs, outputs] = numbers;
         let output = self.frame_fields(recipe, Direction::Output, from.output.as_ref(), outputs)?;
         let input = self.frame_fields(recipe, Direction::Input, from.input.as_ref(), inputs)?;
@@ -58,10 +63,16 @@ impl Builder<'_> {
         match from.kind {
             ExchangeKind::Frames => {}
             ExchangeKind::Master(operation) => {
-                return Ok((Talk::Rtu { operation, written: fields(output), read: fields(input) }, None));
+                return Ok((
+                    Transaction::Rtu { operation, written: fields(output), read: fields(input) },
+                    None,
+                ));
             }
             ExchangeKind::Slave(operation) => {
-                return Ok((Talk::Served { operation, written: fields(input), read: fields(output) }, None));
+                return Ok((
+                    Transaction::Served { operation, written: fields(input), read: fields(output) },
+                    None,
+                ));
             }
         }
         let pending = self.other_fields(recipe, from.pending.as_ref(), inputs)?;
@@ -70,7 +81,7 @@ impl Builder<'_> {
         let reply = self.add_frame(from, from.input.as_ref(), input, false)?;
         let pending = self.add_frame(from, from.pending.as_ref(), pending, false)?;
         let refusal = self.add_frame(from, from.refusal.as_ref(), refusal, false)?;
-        Ok((Talk::Frames { request, reply, refusal }, pending))
+        Ok((Transaction::Frames { request, reply, refusal }, pending))
     }
 
     /// The fields of a pending answer or a refusal. Without values, nothing of it has a place of its own in later

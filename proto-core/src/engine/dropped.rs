@@ -7,7 +7,7 @@ use crate::time::Instant;
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(rename_all = "snake_case"))]
 #[non_exhaustive]
-pub enum NotGiven {
+pub enum DropReason {
     /// The value is in no entry of the field's table.
     Unknown,
     /// The value was the first one after the start, silence, sleep or a lost device: it only set the base.
@@ -28,7 +28,7 @@ pub enum NotGiven {
     Unwritable,
 }
 
-impl NotGiven {
+impl DropReason {
     /// All reasons.
     pub const ALL: [Self; 9] = [
         Self::Unknown,
@@ -60,11 +60,11 @@ impl NotGiven {
 
 /// The newest value of a port that gave no command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct LastNotGiven {
+pub struct DroppedCommand {
     /// When this was known.
     pub at: Instant,
     /// The reason.
-    pub why: NotGiven,
+    pub why: DropReason,
     /// Index of the input frame; 0 in a stream recipe.
     pub frame: u8,
     /// Index of the field in the frame.

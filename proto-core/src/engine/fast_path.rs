@@ -33,14 +33,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[inline(never)]
     fn handle_chunk(&mut self, now: Instant, input: &Input<'_>) -> Handled {
         if let Input::PortBytes { port, bytes } = *input
-            && self.clock.is_calm(now)
+            && self.clock.is_idle(now)
             && let Some(port) = find_port(&mut self.ports, port)
             && let Some(deadline) = port.hold(bytes, now)
         {
             self.clock.now = now;
             self.clock.partial_at = self.clock.partial_at.min(deadline);
-            if deadline < self.clock.calm_until {
-                self.clock.calm_until = Instant::ZERO;
+            if deadline < self.clock.idle_until {
+                self.clock.idle_until = Instant::ZERO;
                 return Handled::Poll;
             }
             return Handled::Asleep;
@@ -52,7 +52,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[inline(never)]
     fn handle_can(&mut self, now: Instant, input: &Input<'_>) -> Handled {
         if let Input::PortCan { port, ref frame } = *input
-            && self.clock.is_calm(now)
+            && self.clock.is_idle(now)
             && !self.tap.is_listening()
             && let Some(port) = find_port(&mut self.ports, port)
             && let Some(found) = port.find_can(frame)
@@ -77,7 +77,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[inline(never)]
     fn handle_state(&mut self, now: Instant, input: &Input<'_>) -> Handled {
         if let Input::LinkBytes { bytes, .. } = *input
-            && self.clock.is_calm(now)
+            && self.clock.is_idle(now)
             && !self.tap.is_listening()
             && let Some(link) = self.links.state.first_mut()
             && link.hold(bytes, now)
@@ -91,7 +91,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     /// Most ticks come before anything is due.
     #[inline(never)]
     fn handle_tick(&mut self, now: Instant, input: &Input<'_>) -> Handled {
-        if self.clock.is_calm(now) {
+        if self.clock.is_idle(now) {
             self.clock.now = now;
             self.announce_anew();
             return Handled::Poll;
@@ -120,7 +120,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         if let Input::LinkSent { link } = *input
             && self.clock.is_asleep(now)
             && let Some(deadline) =
-                self.links.sent_before_next(link, &self.store.outbox, self.clock.calm_until)
+                self.links.sent_before_next(link, &self.store.outbox, self.clock.idle_until)
         {
             self.clock.now = now;
             self.arm(deadline);
@@ -133,7 +133,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     /// `false` if they have to be looked at; then nothing was taken.
     #[inline(never)]
     pub(super) fn hold(&mut self, id: PortId, bytes: &[u8], now: Instant) -> bool {
-        if self.clock.is_deaf {
+        if self.clock.has_slept {
             return false;
         }
         let Some(port) = find_port(&mut self.ports, id) else { return false };

@@ -1,7 +1,7 @@
 //! What can be asked about a running engine, and the tap.
 
 use super::Engine;
-use super::clock::Ask;
+use super::clock::Dirty;
 use super::counters::PortCounters;
 use super::io::{LinkId, PortId, PortState, ReplyCode};
 use super::latency::Latency;
@@ -72,8 +72,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     pub fn make_safe(&mut self) {
         self.store.all_overdue();
         self.clock.timer_at = Instant::ZERO;
-        self.clock.calm_until = Instant::ZERO;
-        self.clock.ask.add(Ask::ALL);
+        self.clock.idle_until = Instant::ZERO;
+        self.clock.dirty.add(Dirty::ALL);
     }
 
     /// Whether the controller is known to have every safe value that was sent to it. Where nothing shows a

@@ -12,8 +12,8 @@ pub(super) mod truth;
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::can::CanFrame;
 
-use self::line::{Ended, TalkWatch};
-use self::spec::{Kind, RowSpec, Seen, TalkSpec};
+use self::line::{Ended, ExchangesWatch};
+use self::spec::{ExchangesSpec, Kind, RowSpec, Seen};
 use super::device::{Look, look};
 use super::downward::Downward;
 use super::field::{Accepted, Verdict};
@@ -25,35 +25,35 @@ use crate::SlaveDone;
 
 impl Oracle {
     /// Bytes of a line came.
-    pub(super) fn talk_bytes(&mut self, nth: usize, bytes: &[u8], now: Instant) {
+    pub(super) fn exchange_bytes(&mut self, nth: usize, bytes: &[u8], now: Instant) {
         self.ports[nth].line.heard = now;
         let mut verdicts = Vec::new();
         // One by one: a frame that is complete is taken before the next byte is looked at.
         for &byte in bytes {
             self.ports[nth].line.held.push(byte);
-            self.talk_held(nth, &mut verdicts, now);
+            self.exchange_held(nth, &mut verdicts, now);
         }
         self.take(nth, verdicts, now);
     }
 
     /// Looks for frames in the bytes that are held.
-    fn talk_held(&mut self, nth: usize, verdicts: &mut Vec<Verdict>, now: Instant) {
+    fn exchange_held(&mut self, nth: usize, verdicts: &mut Vec<Verdict>, now: Instant) {
         loop {
             let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
-            let Some(talk) = &port.talk else { return };
+            let Some(exchanges) = &port.exchanges else { return };
             if watch.line.held.is_empty() {
                 return;
             }
-            match watch.talk.see(port, talk, &watch.line.held, now) {
+            match watch.exchanges.see(port, exchanges, &watch.line.held, now) {
                 Seen::Begins { .. } => return,
                 Seen::No => watch.line.drop_one(),
                 Seen::Echo(len) => {
                     watch.line.take_front(len);
-                    watch.talk.echoed();
+                    watch.exchanges.echoed();
                 }
                 Seen::Wrong(len) => {
                     if watch.line.drop_wrong(len, true) {
-                        watch.talk.heard_wrong();
+                        watch.exchanges.heard_wrong();
                         verdicts.push(Verdict::WrongChecksum);
                     }
                 }
@@ -63,27 +63,28 @@ impl Oracle {
                 }
                 Seen::ReplyOrEcho(len) => {
                     watch.line.take_front(len);
-                    watch.talk.heard_reply_or_echo();
+                    watch.exchanges.heard_reply_or_echo();
                 }
                 Seen::Late(len, row) => {
                     watch.line.take_front(len);
-                    let started = watch.talk.came_late(talk, row, now);
+                    let started = watch.exchanges.came_late(exchanges, row, now);
                     self.started(nth, started);
                 }
                 Seen::Ambiguous(len) => {
                     watch.line.take_front(len);
-                    let started = watch.talk.came_ambiguous(talk, now);
+                    let started = watch.exchanges.came_ambiguous(exchanges, now);
                     self.started(nth, started);
                 }
                 Seen::Unasked(len, frame) => {
                     let whole = watch.line.take_front(len);
                     verdicts.push(watch.line.judge(&port.inputs[frame], frame, &whole));
-                    let started = heard_unasked(&mut watch.talk, talk, frame, now);
+                    let started = heard_unasked(&mut watch.exchanges, exchanges, frame, now);
                     self.started(nth, started);
                 }
                 Seen::Refusal(len) => {
                     let refusal = watch.line.take_front(len);
-                    let is_modbus = watch.talk.awaits(talk).is_some_and(|(row, _)| row.frames.is_none());
+                    let is_modbus =
+                        watch.exchanges.awaits(exchanges).is_some_and(|(row, _)| row.frames.is_none());
                     let ended = Ended::refused(refusal.get(2).copied().unwrap_or(0), is_modbus);
                     self.answered(nth, &refusal, ended, now);
                 }
@@ -96,23 +97,23 @@ impl Oracle {
     }
 
     /// A frame came on a bus.
-    pub(super) fn talk_can(&mut self, nth: usize, frame: &CanFrame, now: Instant) {
+    pub(super) fn exchange_can(&mut self, nth: usize, frame: &CanFrame, now: Instant) {
         let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
-        let Some(talk) = &port.talk else { return };
+        let Some(exchanges) = &port.exchanges else { return };
         if frame.is_remote() {
             watch.counters.rejected_remote += 1;
             return;
         }
-        let booted = talk.booted(frame.id(), frame.data());
+        let booted = exchanges.booted(frame.id(), frame.data());
         if let Some(slave) = booted {
-            watch.talk.booted(talk, slave, now);
+            watch.exchanges.booted(exchanges, slave, now);
             self.truth.started(nth, slave);
         }
         let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
         let is_it = |own: &super::spec::Frame| {
             own.id == Some(frame.id()) && look(own, frame.data()) == Look::Frame(frame.data().len())
         };
-        let awaited = watch.talk.awaits(talk);
+        let awaited = watch.exchanges.awaits(exchanges);
         let frames = awaited.and_then(|(row, _)| row.frames.as_ref());
         let is_reply = frames.and_then(|frames| frames.reply.as_ref()).is_some_and(is_it);
         let is_refusal = frames.and_then(|frames| frames.refusal.as_ref()).is_some_and(is_it)
@@ -121,7 +122,7 @@ impl Oracle {
             let frames = row.frames.as_ref().filter(|frames| frames.is_asked);
             frames.is_some_and(|frames| frames.reply.iter().chain(&frames.refusal).any(is_it))
         };
-        let late = watch.talk.late_of(talk, is_answer, now).filter(|_| !is_reply);
+        let late = watch.exchanges.late_of(exchanges, is_answer, now).filter(|_| !is_reply);
         match (is_reply || is_refusal, late) {
             (true, None) => {
                 let ended = if is_reply { Ended::Good } else { Ended::Refused };
@@ -129,22 +130,22 @@ impl Oracle {
                 return self.take(nth, verdict, now);
             }
             (true, Some(_)) => {
-                let started = watch.talk.came_ambiguous(talk, now);
+                let started = watch.exchanges.came_ambiguous(exchanges, now);
                 return self.started(nth, started);
             }
             (false, Some(row)) => {
-                let started = watch.talk.came_late(talk, row, now);
+                let started = watch.exchanges.came_late(exchanges, row, now);
                 return self.started(nth, started);
             }
             (false, None) => {}
         }
         let answers = frames.into_iter().flat_map(|frames| frames.reply.iter().chain(&frames.refusal));
         let answers = answers.map(|own| (usize::MAX, own));
-        let unasked = talk.unasked.iter().map(|&unasked| (unasked, &port.inputs[unasked]));
-        let which = talk.unasked.iter().copied().find(|&unasked| is_it(&port.inputs[unasked]));
+        let unasked = exchanges.unasked.iter().map(|&unasked| (unasked, &port.inputs[unasked]));
+        let which = exchanges.unasked.iter().copied().find(|&unasked| is_it(&port.inputs[unasked]));
         let verdict = super::field::can_of(answers.chain(unasked), port.mode, &mut watch.line, frame);
         if let (Ok(Verdict::Accepted(_)), Some(which)) = (&verdict, which) {
-            let started = heard_unasked(&mut watch.talk, talk, which, now);
+            let started = heard_unasked(&mut watch.exchanges, exchanges, which, now);
             self.started(nth, started);
         }
         self.take_can(nth, verdict, now);
@@ -160,13 +161,13 @@ impl Oracle {
     /// A device has answered; returns what becomes of its values.
     fn answered(&mut self, nth: usize, reply: &[u8], ended: Ended, now: Instant) -> Option<Verdict> {
         let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
-        let talk = port.talk.as_ref()?;
-        let waits = watch.talk.waits();
-        let (flight, started) = watch.talk.answered(talk, ended, now)?;
+        let exchanges = port.exchanges.as_ref()?;
+        let waits = watch.exchanges.waits();
+        let (flight, started) = watch.exchanges.answered(exchanges, ended, now)?;
         if waits && !port.is_can {
             watch.down.sent();
         }
-        let row = &talk.rows[flight.row];
+        let row = &exchanges.rows[flight.row];
         let result = self.truth.taken((nth, port), row, &flight, reply, now);
         let verdict = row.reply.filter(|_| ended == Ended::Good).map(|frame| match row.frames {
             Some(_) => watch.line.judge(&port.inputs[frame], frame, reply),
@@ -181,15 +182,20 @@ impl Oracle {
     }
 
     /// The gateway asks.
-    pub(super) fn talk_send(&mut self, nth: usize, sent: &Leaving<'_>, now: Instant) -> Result<(), Wrong> {
+    pub(super) fn exchange_send(
+        &mut self,
+        nth: usize,
+        sent: &Leaving<'_>,
+        now: Instant,
+    ) -> Result<(), Wrong> {
         let bytes = sent.bytes;
-        let asked = |talk: &TalkSpec| talk.row_of((sent.id, sent.is_remote), bytes);
-        let row = self.spec.ports[nth].talk.as_ref().and_then(asked);
-        if self.ports[nth].talk.repeated_request().is_some_and(|failed| failed != bytes) {
+        let asked = |exchanges: &ExchangesSpec| exchanges.row_of((sent.id, sent.is_remote), bytes);
+        let row = self.spec.ports[nth].exchanges.as_ref().and_then(asked);
+        if self.ports[nth].exchanges.repeated_request().is_some_and(|failed| failed != bytes) {
             self.gives_up(nth, now);
         }
         let port = &self.spec.ports[nth];
-        let Some(talk) = &port.talk else { return Ok(()) };
+        let Some(exchanges) = &port.exchanges else { return Ok(()) };
         let (robot, watch) = (&self.robot, &mut self.ports[nth]);
         if !watch.down.is_usable() {
             return Err((Invariant::Line, "asked while the line was gone".to_owned()));
@@ -197,20 +203,20 @@ impl Oracle {
         let Some(row) = row else {
             return Err((Invariant::Shown, format!("asked {bytes:02x?}, which no exchange asks")));
         };
-        if talk.unasked.is_empty() {
+        if exchanges.unasked.is_empty() {
             // What is held is too old to be the reply.
             watch.line.discard();
         }
         let stalled = |since| robot.stalled_since(since, now);
         let line = (watch.line.heard, watch.down.is_busy());
         self.checks[Invariant::Periods as usize] +=
-            watch.talk.keeps_periods(port, talk, line, stalled, now)?;
+            watch.exchanges.keeps_periods(port, exchanges, line, stalled, now)?;
         self.checks[Invariant::Cycle as usize] += 1;
-        look_at_opening(&mut watch.talk, port, |row| {
+        look_at_opening(&mut watch.exchanges, port, |row| {
             Downward::may_show_all(port, &self.up, row.shown(), now).is_ok()
         });
-        watch.talk.hands_over(port, talk, (row, bytes), line, now)?;
-        let asked = &talk.rows[row];
+        watch.exchanges.hands_over(port, exchanges, (row, bytes), line, now)?;
+        let asked = &exchanges.rows[row];
         // What an event says was decided when it happened.
         if let Some(request) = asked.request.as_ref().filter(|_| asked.kind != Kind::Event) {
             let hidden = Downward::may_show_all(port, &self.up, asked.shown(), now);
@@ -229,9 +235,9 @@ impl Oracle {
     pub(super) fn port_sent(&mut self, nth: usize, now: Instant) {
         let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
         watch.down.sent();
-        if let Some(talk) = &port.talk {
-            watch.talk.left(talk, port.turnaround, now);
-            if watch.talk.waits() && !port.is_can {
+        if let Some(exchanges) = &port.exchanges {
+            watch.exchanges.left(exchanges, port.turnaround, now);
+            if watch.exchanges.waits() && !port.is_can {
                 // The line is the device's until it has answered.
                 watch.down.hold();
             }
@@ -239,18 +245,18 @@ impl Oracle {
     }
 
     /// Replies that have not come in time fail.
-    pub(super) fn talk_tick(&mut self, nth: usize, now: Instant) {
-        let Some(talk) = &self.spec.ports[nth].talk else { return };
+    pub(super) fn exchange_tick(&mut self, nth: usize, now: Instant) {
+        let Some(exchanges) = &self.spec.ports[nth].exchanges else { return };
         let watch = &mut self.ports[nth];
-        look_at_opening(&mut watch.talk, &self.spec.ports[nth], |row| {
+        look_at_opening(&mut watch.exchanges, &self.spec.ports[nth], |row| {
             Downward::may_show_all(&self.spec.ports[nth], &self.up, row.shown(), now).is_ok()
         });
-        let waited = watch.talk.waits();
-        let started = watch.talk.tick(talk, watch.line.heard, now);
+        let waited = watch.exchanges.waits();
+        let started = watch.exchanges.tick(exchanges, watch.line.heard, now);
         if let Some(slave) = started {
             self.truth.started(nth, slave);
         }
-        if waited && !watch.talk.waits() && !self.spec.ports[nth].is_can {
+        if waited && !watch.exchanges.waits() && !self.spec.ports[nth].is_can {
             watch.down.sent();
         }
     }
@@ -259,27 +265,29 @@ impl Oracle {
     /// whether it is given up.
     fn gives_up(&mut self, nth: usize, now: Instant) -> bool {
         let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
-        let Some((talk, failed)) = port.talk.as_ref().zip(watch.talk.repeats()) else { return false };
-        let row = &talk.rows[failed];
+        let Some((exchanges, failed)) = port.exchanges.as_ref().zip(watch.exchanges.repeats()) else {
+            return false;
+        };
+        let row = &exchanges.rows[failed];
         let is_same = |request: &[u8]| {
             row.request.as_ref().is_none_or(|own| agrees(&watch.down, row, own, &self.up, request))
         };
         let is_event = row.kind == Kind::Event;
         if is_event
             || Downward::may_show_all(port, &self.up, row.shown(), now).is_ok()
-                && watch.talk.repeated_request().is_some_and(is_same)
+                && watch.exchanges.repeated_request().is_some_and(is_same)
         {
             return false;
         }
-        let started = watch.talk.is_not_repeated(talk, now);
+        let started = watch.exchanges.is_not_repeated(exchanges, now);
         self.started(nth, started);
         true
     }
 
     /// The engine has nothing to do: checks that no repetition waits that could be sent.
-    pub(super) fn talk_rests(&mut self, nth: usize, now: Instant) -> Result<(), Wrong> {
+    pub(super) fn exchange_rests(&mut self, nth: usize, now: Instant) -> Result<(), Wrong> {
         let (port, watch) = (&self.spec.ports[nth], &self.ports[nth]);
-        if watch.talk.repeats().is_none() {
+        if watch.exchanges.repeats().is_none() {
             return Ok(());
         }
         let is_free = watch.down.is_usable()
@@ -293,17 +301,17 @@ impl Oracle {
     }
 
     /// A value may have changed: looks for bits that ask.
-    pub(super) fn talk_values_changed(&mut self, now: Instant) {
+    pub(super) fn exchange_values_changed(&mut self, now: Instant) {
         for (watch, port) in self.ports.iter_mut().zip(&self.spec.ports) {
-            let Some(talk) = &port.talk else { continue };
-            look_at_opening(&mut watch.talk, port, |row| {
+            let Some(exchanges) = &port.exchanges else { continue };
+            look_at_opening(&mut watch.exchanges, port, |row| {
                 Downward::may_show_all(port, &self.up, row.shown(), now).is_ok()
             });
             let is_on = |row: &RowSpec| {
                 let (var, bit) = row.rising?;
                 self.up.known(var).value.map(|(raw, _)| raw[0] >> bit & 1 == 1)
             };
-            watch.talk.watch(talk, is_on, now);
+            watch.exchanges.watch(exchanges, is_on, now);
         }
     }
 
@@ -335,23 +343,30 @@ impl Oracle {
     }
 
     /// Checks periods, and what slaves must have been told. Called at intervals.
-    pub(super) fn survey_talks(&mut self, now: Instant) {
+    pub(super) fn survey_exchanges(&mut self, now: Instant) {
         for nth in 0..self.ports.len() {
             let port = &self.spec.ports[nth];
-            let Some(talk) = &port.talk else { continue };
+            let Some(exchanges) = &port.exchanges else { continue };
             let (robot, watch) = (&self.robot, &mut self.ports[nth]);
             if self.discards_until.is_some() || !watch.down.is_usable() || robot.is_stalled(now) {
-                watch.talk.disturbed_at = watch.talk.disturbed_at.max(now);
+                watch.exchanges.disturbed_at = watch.exchanges.disturbed_at.max(now);
                 continue;
             }
             let stalled = |since| robot.stalled_since(since, now);
-            let mut result =
-                watch.talk.keeps_periods(port, talk, (watch.line.heard, watch.down.is_busy()), stalled, now);
+            let mut result = watch.exchanges.keeps_periods(
+                port,
+                exchanges,
+                (watch.line.heard, watch.down.is_busy()),
+                stalled,
+                now,
+            );
             self.checks[Invariant::Periods as usize] += *result.as_ref().unwrap_or(&1);
             let all = robot.all_sound_since();
-            for (row, exchange) in talk.rows.iter().enumerate() {
+            for (row, exchange) in exchanges.rows.iter().enumerate() {
                 let is_told = exchange.on_change || exchange.every.is_some();
-                let (true, Some(all), Some(could)) = (is_told, all, watch.talk.could_ask(talk, row)) else {
+                let (true, Some(all), Some(could)) =
+                    (is_told, all, watch.exchanges.could_ask(exchanges, row))
+                else {
                     continue;
                 };
                 let settle = SETTLE + exchange.every.unwrap_or_default();
@@ -368,9 +383,14 @@ impl Oracle {
 }
 
 /// A frame came that nobody asked for: a sign of life if it is of an exchange.
-fn heard_unasked(watch: &mut TalkWatch, talk: &TalkSpec, frame: usize, now: Instant) -> Option<u8> {
-    let row = talk.rows.iter().find(|row| row.reply == Some(frame))?;
-    watch.heard(talk, row.slave, now)
+fn heard_unasked(
+    watch: &mut ExchangesWatch,
+    exchanges: &ExchangesSpec,
+    frame: usize,
+    now: Instant,
+) -> Option<u8> {
+    let row = exchanges.rows.iter().find(|row| row.reply == Some(frame))?;
+    watch.heard(exchanges, row.slave, now)
 }
 
 /// Whether a request has the newest values.
@@ -381,8 +401,8 @@ fn agrees(down: &Downward, row: &RowSpec, request: &Frame, up: &Upward, bytes: &
 }
 
 /// Looks for exchanges that are to be asked at the start, and whose values cannot be shown.
-fn look_at_opening(watch: &mut TalkWatch, port: &PortSpec, can_ask: impl Fn(&RowSpec) -> bool) {
-    let rows = port.talk.as_ref().map_or(&[][..], |talk: &TalkSpec| &talk.rows);
+fn look_at_opening(watch: &mut ExchangesWatch, port: &PortSpec, can_ask: impl Fn(&RowSpec) -> bool) {
+    let rows = port.exchanges.as_ref().map_or(&[][..], |exchanges: &ExchangesSpec| &exchanges.rows);
     watch.look_at_opening(|row| rows.get(row).is_some_and(&can_ask));
 }
 

@@ -34,7 +34,7 @@ pub(super) enum Heard<'i> {
 
 /// What may come now.
 #[derive(Clone, Copy)]
-pub(super) struct Awaited<'i> {
+pub(super) struct PendingReplies<'i> {
     /// The frames of the recipe's part.
     pub formats: &'i [DeviceFormat],
     pub first_frame: u8,
@@ -49,7 +49,7 @@ pub(super) struct Awaited<'i> {
     pub now: Instant,
 }
 
-impl<'i> Awaited<'i> {
+impl<'i> PendingReplies<'i> {
     pub(super) fn asked(&self) -> Option<&'i Item> {
         self.items.get(usize::from(self.flight?.exchange))
     }

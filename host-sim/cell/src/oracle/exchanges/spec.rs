@@ -5,7 +5,7 @@
 
 use proto_core::config::{
     Bus, ConfigView, Echo, Exchange, FieldSpec, GatewayConfig, OutputBinding, Outside, Port, Recipe, Rs485,
-    Talk,
+    Transaction,
 };
 use proto_core::modbus::rtu::Operation;
 use proto_core::sysvar::SysVar;
@@ -19,7 +19,7 @@ use crate::rtu::is_right;
 
 /// The conversation of a port.
 #[derive(Debug, Clone)]
-pub(in crate::oracle) struct TalkSpec {
+pub(in crate::oracle) struct ExchangesSpec {
     pub rows: Vec<RowSpec>,
     /// After this long without a byte, what was sent is complete.
     pub silence: Duration,
@@ -112,7 +112,7 @@ pub(in crate::oracle) enum Seen {
     Wrong(usize),
 }
 
-impl TalkSpec {
+impl ExchangesSpec {
     /// The device whose CANopen node says with this frame that it has booted: 0 with id 0x700 + node, of a node that is
     /// asked with SDO.
     pub(super) fn booted(&self, id: CanId, data: &[u8]) -> Option<u8> {
@@ -134,8 +134,8 @@ impl TalkSpec {
         let mut unasked: Vec<usize> = (0..inputs.len()).collect();
         for exchange in config.view().exchanges_of(recipe) {
             let mut row = RowSpec::new(rows.len(), exchange, port.timeout);
-            match exchange.talk {
-                Talk::Rtu { operation, written, read } => {
+            match exchange.transaction {
+                Transaction::Rtu { operation, written, read } => {
                     let data = |fields: &[FieldSpec]| {
                         (!fields.is_empty()).then(|| device_frame(&[], &[], None, fields))
                     };
@@ -146,7 +146,7 @@ impl TalkSpec {
                     }
                     row.begin(&operation);
                 }
-                Talk::Frames { request, reply, refusal } => {
+                Transaction::Frames { request, reply, refusal } => {
                     let frame = |nth: Option<u8>| frame_of(config, nth?);
                     let request = frame(request);
                     let remote =
@@ -164,7 +164,7 @@ impl TalkSpec {
                     }
                     row.frames = Some(FramesSpec { is_asked, remote, reply, refusal });
                 }
-                Talk::Served { .. } => return None,
+                Transaction::Served { .. } => return None,
             }
             let bytes = row.request_len() + row.reply_len();
             let on_line = line.map_or(ON_A_BUS, |line| line.time_on_line(bytes));
@@ -225,7 +225,7 @@ impl TalkSpec {
 impl RowSpec {
     fn new(nth: usize, exchange: &Exchange, port_timeout: Duration) -> Self {
         let when = &exchange.when;
-        let reads = matches!(exchange.talk, Talk::Rtu { written, .. } if written.len == 0);
+        let reads = matches!(exchange.transaction, Transaction::Rtu { written, .. } if written.len == 0);
         let kind = match (when.rising, when.every.is_some() || when.change) {
             (Some(_), _) => Kind::Event,
             (None, false) if when.start && !reads => Kind::Start,
@@ -478,15 +478,17 @@ pub(in crate::oracle) fn unmodelled(config: &GatewayConfig) -> Option<&'static s
     }
     let serves = |port: &&Port| {
         let exchanges = config.view().exchanges_of(recipe_of(config.view(), port));
-        exchanges.iter().any(|exchange| matches!(exchange.talk, Talk::Served { .. }))
+        exchanges.iter().any(|exchange| matches!(exchange.transaction, Transaction::Served { .. }))
     };
     let has_echo = |port: &Port| matches!(&port.bus, Bus::Rs485(line) if line.echo == Echo::Yes);
     if config.ports.iter().filter(serves).any(has_echo) {
         return Some("a soak cannot judge a gateway that is a slave on a line that echoes");
     }
-    let requests = config.exchanges.iter().filter_map(|exchange| match exchange.talk {
-        Talk::Rtu { written, .. } => Some(written),
-        Talk::Frames { request, .. } => config.frames.get(usize::from(request?)).map(|frame| frame.fields),
+    let requests = config.exchanges.iter().filter_map(|exchange| match exchange.transaction {
+        Transaction::Rtu { written, .. } => Some(written),
+        Transaction::Frames { request, .. } => {
+            config.frames.get(usize::from(request?)).map(|frame| frame.fields)
+        }
         _ => None,
     });
     let may_refuse = |field: &FieldSpec| match field {
@@ -509,8 +511,8 @@ pub(in crate::oracle) fn unmodelled(config: &GatewayConfig) -> Option<&'static s
             own.when.rising.is_some() && exchanges[..nth].iter().any(is_same)
         })
     };
-    let has_values = |exchange: &Exchange| match exchange.talk {
-        Talk::Frames { refusal: Some(refusal), .. } => {
+    let has_values = |exchange: &Exchange| match exchange.transaction {
+        Transaction::Frames { refusal: Some(refusal), .. } => {
             let fields = config.frames.get(usize::from(refusal)).map(|frame| frame.fields.of(&config.fields));
             fields.is_some_and(|fields| fields.iter().any(FieldSpec::has_value))
         }
@@ -544,7 +546,7 @@ pub(in crate::oracle) fn unmodelled(config: &GatewayConfig) -> Option<&'static s
 /// The same, of what only the laid out requests show.
 pub(in crate::oracle) fn ambiguous(ports: &[PortSpec]) -> Option<&'static str> {
     let is_twice = |port: &PortSpec| {
-        let rows = port.talk.iter().flat_map(|talk| &talk.rows);
+        let rows = port.exchanges.iter().flat_map(|exchanges| &exchanges.rows);
         let requests: Vec<&RowSpec> =
             rows.filter(|row| row.frames.as_ref().is_none_or(|it| it.is_asked)).collect();
         let is_same = |one: &RowSpec, other: &RowSpec| match (&one.frames, &other.frames) {

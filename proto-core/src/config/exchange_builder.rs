@@ -4,7 +4,7 @@
 //! is that of the file (docs/configuration.md). [`Recipe::user`](super::Recipe::user) takes them with
 //! [`RecipeBuilder::exchanges`](super::RecipeBuilder::exchanges).
 
-use super::exchange::{AskWhen, DEFAULT_REPLY_TIMEOUT, Restarted};
+use super::exchange::{DEFAULT_REPLY_TIMEOUT, Restarted, Triggers};
 use super::fields::{Fields, InputField, OutputField, Var};
 use crate::device::Encoding;
 use crate::modbus::rtu::{Operation, Table};
@@ -20,7 +20,7 @@ use crate::wire::scalar::ScalarType;
 /// the type [`Coil`], and padding skips so many coils.
 ///
 /// ```
-/// use proto_core::config::{Ask, Coil, GatewayConfig, InputField, OutputField, Port, Recipe};
+/// use proto_core::config::{ExchangeBuilder, Coil, GatewayConfig, InputField, OutputField, Port, Recipe};
 /// use proto_core::time::Duration;
 /// use proto_core::wire::scalar::ScalarType::Word;
 ///
@@ -28,14 +28,14 @@ use crate::wire::scalar::ScalarType;
 ///     .controller("192.168.12.138")
 ///     .recipe(Recipe::user("line").exchanges(&[
 ///         // Slave 9: two registers from 0x07D0, every 100 ms.
-///         Ask::read_input_registers(
+///         ExchangeBuilder::read_input_registers(
 ///             9,
 ///             0x07D0,
 ///             &[InputField::variable(Word, "WordInputReg[1]"), InputField::padding(2)],
 ///         )
 ///         .every(Duration::from_millis(100)),
 ///         // Slave 5: two coils from 8, when one of them changes.
-///         Ask::write_coils(
+///         ExchangeBuilder::write_coils(
 ///             5,
 ///             8,
 ///             &[
@@ -51,10 +51,10 @@ use crate::wire::scalar::ScalarType;
 /// # Ok::<(), proto_core::config::ConfigError>(())
 /// ```
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Ask<'a> {
+pub struct ExchangeBuilder<'a> {
     pub(super) peer: u8,
-    pub(super) talk: AskTalk<'a>,
-    pub(super) when: AskWhen,
+    pub(super) transaction: TransactionDraft<'a>,
+    pub(super) when: Triggers,
     pub(super) rising: Option<(Var<'a>, u8)>,
     pub(super) timeout: Duration,
     pub(super) retries: Option<u8>,
@@ -65,13 +65,13 @@ pub struct Ask<'a> {
     pub(super) follow: Option<u8>,
     pub(super) overdue: Option<Duration>,
     pub(super) outcome: [Option<Var<'a>>; 3],
-    pub(super) pending: Option<AskFrame<'a>>,
+    pub(super) pending: Option<ExchangeFrame<'a>>,
     pub(super) restarted: Option<Restarted>,
 }
 
 /// Operations have counts of 0 here.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum AskTalk<'a> {
+pub(super) enum TransactionDraft<'a> {
     Rtu {
         operation: Operation,
         written: Option<Fields<'a>>,
@@ -83,12 +83,12 @@ pub(super) enum AskTalk<'a> {
         fields: Fields<'a>,
     },
     /// A request, a reply and a refusal.
-    Frames([Option<AskFrame<'a>>; 3]),
+    Frames([Option<ExchangeFrame<'a>>; 3]),
 }
 
 /// A frame of an exchange.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct AskFrame<'a> {
+pub struct ExchangeFrame<'a> {
     pub(super) id: Option<CanId>,
     pub(super) remote: bool,
     pub(super) head: &'a [u8],
@@ -96,7 +96,7 @@ pub struct AskFrame<'a> {
     pub(super) fields: Fields<'a>,
 }
 
-impl<'a> AskFrame<'a> {
+impl<'a> ExchangeFrame<'a> {
     /// A frame on a line: head, tail, at most 8 bytes each, and the fields.
     pub fn stream(head: &'a [u8], tail: &'a [u8], fields: impl Into<Fields<'a>>) -> Self {
         Self { id: None, remote: false, head, tail, fields: fields.into() }
@@ -123,7 +123,7 @@ impl From<Coil> for Encoding {
     }
 }
 
-impl<'a> Ask<'a> {
+impl<'a> ExchangeBuilder<'a> {
     /// FC 1: reads coils of a slave, 1..=247.
     pub fn read_coils(slave: u8, address: u16, coils: &'a [InputField<'a>]) -> Self {
         Self::read(slave, Operation::ReadCoils { address, count: 0 }, coils)
@@ -178,38 +178,41 @@ impl<'a> Ask<'a> {
         let (read_count, write_count) = (0, 0);
         let operation =
             Operation::ReadWriteRegisters { read_address, read_count, write_address, write_count };
-        Self::new(slave, AskTalk::Rtu { operation, written: Some(written.into()), read: Some(read.into()) })
+        Self::new(
+            slave,
+            TransactionDraft::Rtu { operation, written: Some(written.into()), read: Some(read.into()) },
+        )
     }
 
     /// A block of the gateway as a slave with this address, 1..=247: input fields are written by the
     /// master, output fields are read by it.
     pub fn served(own: u8, table: Table, address: u16, fields: impl Into<Fields<'a>>) -> Self {
-        Self::new(own, AskTalk::Served { table, address, fields: fields.into() })
+        Self::new(own, TransactionDraft::Served { table, address, fields: fields.into() })
     }
 
     /// A request of a device's own; of device 0, unless [`Self::peer`] says otherwise.
-    pub fn request(request: AskFrame<'a>) -> Self {
-        Self::new(0, AskTalk::Frames([Some(request), None, None]))
+    pub fn request(request: ExchangeFrame<'a>) -> Self {
+        Self::new(0, TransactionDraft::Frames([Some(request), None, None]))
     }
 
     /// A frame that may come at any time.
-    pub fn unasked(frame: AskFrame<'a>) -> Self {
-        Self::new(0, AskTalk::Frames([None, Some(frame), None]))
+    pub fn unasked(frame: ExchangeFrame<'a>) -> Self {
+        Self::new(0, TransactionDraft::Frames([None, Some(frame), None]))
     }
 
     fn read(slave: u8, operation: Operation, fields: &'a [InputField<'a>]) -> Self {
-        Self::new(slave, AskTalk::Rtu { operation, written: None, read: Some(fields.into()) })
+        Self::new(slave, TransactionDraft::Rtu { operation, written: None, read: Some(fields.into()) })
     }
 
     fn write(slave: u8, operation: Operation, fields: &'a [OutputField<'a>]) -> Self {
-        Self::new(slave, AskTalk::Rtu { operation, written: Some(fields.into()), read: None })
+        Self::new(slave, TransactionDraft::Rtu { operation, written: Some(fields.into()), read: None })
     }
 
-    const fn new(peer: u8, talk: AskTalk<'a>) -> Self {
-        let (when, timeout, pause) = (AskWhen::NEVER, DEFAULT_REPLY_TIMEOUT, Duration::ZERO);
+    const fn new(peer: u8, transaction: TransactionDraft<'a>) -> Self {
+        let (when, timeout, pause) = (Triggers::NEVER, DEFAULT_REPLY_TIMEOUT, Duration::ZERO);
         Self {
             peer,
-            talk,
+            transaction,
             when,
             rising: None,
             timeout,
@@ -227,24 +230,24 @@ impl<'a> Ask<'a> {
     }
 
     /// What answers the request. No effect on Modbus, whose replies are known.
-    pub fn reply(mut self, frame: AskFrame<'a>) -> Self {
-        if let AskTalk::Frames([_, reply, _]) = &mut self.talk {
+    pub fn reply(mut self, frame: ExchangeFrame<'a>) -> Self {
+        if let TransactionDraft::Frames([_, reply, _]) = &mut self.transaction {
             *reply = Some(frame);
         }
         self
     }
 
     /// What the device sends while it is at it: its answer is awaited anew. No effect on Modbus.
-    pub fn pending(mut self, frame: AskFrame<'a>) -> Self {
-        if matches!(self.talk, AskTalk::Frames(_)) {
+    pub fn pending(mut self, frame: ExchangeFrame<'a>) -> Self {
+        if matches!(self.transaction, TransactionDraft::Frames(_)) {
             self.pending = Some(frame);
         }
         self
     }
 
     /// What the device sends if it refuses the request. No effect on Modbus.
-    pub fn refusal(mut self, frame: AskFrame<'a>) -> Self {
-        if let AskTalk::Frames([_, _, refusal]) = &mut self.talk {
+    pub fn refusal(mut self, frame: ExchangeFrame<'a>) -> Self {
+        if let TransactionDraft::Frames([_, _, refusal]) = &mut self.transaction {
             *refusal = Some(frame);
         }
         self
@@ -363,20 +366,20 @@ impl<'a> Ask<'a> {
     }
 
     /// The frames of a device's own.
-    pub(super) fn frames(&self) -> impl Iterator<Item = &AskFrame<'a>> {
-        let frames = match &self.talk {
-            AskTalk::Frames(frames) => &frames[..],
-            AskTalk::Rtu { .. } | AskTalk::Served { .. } => &[],
+    pub(super) fn frames(&self) -> impl Iterator<Item = &ExchangeFrame<'a>> {
+        let frames = match &self.transaction {
+            TransactionDraft::Frames(frames) => &frames[..],
+            TransactionDraft::Rtu { .. } | TransactionDraft::Served { .. } => &[],
         };
         frames.iter().chain([&self.pending]).flatten()
     }
 
     /// All lists of fields.
     pub(super) fn fields(&self) -> impl Iterator<Item = &Fields<'a>> {
-        let own = match &self.talk {
-            AskTalk::Rtu { written, read, .. } => [written.as_ref(), read.as_ref()],
-            AskTalk::Served { fields, .. } => [Some(fields), None],
-            AskTalk::Frames(_) => [None; 2],
+        let own = match &self.transaction {
+            TransactionDraft::Rtu { written, read, .. } => [written.as_ref(), read.as_ref()],
+            TransactionDraft::Served { fields, .. } => [Some(fields), None],
+            TransactionDraft::Frames(_) => [None; 2],
         };
         own.into_iter().flatten().chain(self.frames().map(|frame| &frame.fields))
     }

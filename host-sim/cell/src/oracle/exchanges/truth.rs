@@ -12,7 +12,7 @@ use proto_core::sysvar::{ModbusPlace, SysVar};
 use proto_core::time::{Duration, Instant};
 
 use super::line::{Flight, name};
-use super::spec::{Kind, RowSpec, TalkSpec};
+use super::spec::{ExchangesSpec, Kind, RowSpec};
 use crate::oracle::Invariant;
 use crate::oracle::device::{self, Look};
 use crate::oracle::field::{LineWatch, Verdict, as_number, show};
@@ -69,7 +69,11 @@ struct Answer {
 
 impl Truth {
     pub(in crate::oracle) fn new(spec: &Spec) -> Self {
-        let rows = spec.ports.iter().filter_map(|port| port.talk.as_ref()).flat_map(|talk| &talk.rows);
+        let rows = spec
+            .ports
+            .iter()
+            .filter_map(|port| port.exchanges.as_ref())
+            .flat_map(|exchanges| &exchanges.rows);
         let mut told: Vec<SysVar> = rows.flat_map(RowSpec::shown).collect();
         told.sort_by_key(|var| var.ordinal());
         told.dedup();
@@ -162,7 +166,7 @@ impl Truth {
         now: Instant,
     ) -> (u64, Result<(), Wrong>) {
         let port = &spec.ports[nth];
-        let Some(talk) = &port.talk else { return (0, Ok(())) };
+        let Some(exchanges) = &port.exchanges else { return (0, Ok(())) };
         let slave = done.slave;
         self.forget_old(now);
         match done.what {
@@ -170,12 +174,12 @@ impl Truth {
             Done::Forgot => {
                 let line = self.lines.entry(nth).or_default();
                 line.memory.retain(|(of, ..), _| *of != slave);
-                line.took.retain(|row, _| talk.rows.get(*row).is_some_and(|row| row.slave != slave));
+                line.took.retain(|row, _| exchanges.rows.get(*row).is_some_and(|row| row.slave != slave));
                 line.forgot.insert(slave);
                 (0, Ok(()))
             }
             Done::Answered { address, count, reply } => {
-                for (_, row) in talk.rows_of(slave).filter(|(_, row)| {
+                for (_, row) in exchanges.rows_of(slave).filter(|(_, row)| {
                     row.function == reply[1] && (row.address, row.count) == (address, count)
                 }) {
                     for (var, raw) in values_of(port, row, &reply) {
@@ -186,7 +190,7 @@ impl Truth {
                 (0, Ok(()))
             }
             Done::Replied { exchange, frame } => {
-                let Some(row) = talk.rows.get(exchange) else { return (0, Ok(())) };
+                let Some(row) = exchanges.rows.get(exchange) else { return (0, Ok(())) };
                 for (var, raw) in values_of(port, row, &frame) {
                     self.holds(nth, var, raw, now);
                 }
@@ -195,18 +199,18 @@ impl Truth {
                 (0, Ok(()))
             }
             Done::Took { exchange, request } => {
-                if !talk.rows.get(exchange).is_some_and(RowSpec::is_written) {
+                if !exchanges.rows.get(exchange).is_some_and(RowSpec::is_written) {
                     return (0, Ok(()));
                 }
                 let values: Vec<u16> = request.iter().copied().map(u16::from).collect();
                 let is_it = |row: &RowSpec| row.nth == exchange;
-                let result = self.wrote(spec, (nth, talk), (slave, &is_it), &values, stalled, now);
+                let result = self.wrote(spec, (nth, exchanges), (slave, &is_it), &values, stalled, now);
                 self.lines.entry(nth).or_default().took.insert(exchange, request);
                 (1, result)
             }
             Done::Wrote { coils, address, values } => {
                 let is_it = |row: &RowSpec| row.written == Some(address) && row.is_coils() == coils;
-                let result = self.wrote(spec, (nth, talk), (slave, &is_it), &values, stalled, now);
+                let result = self.wrote(spec, (nth, exchanges), (slave, &is_it), &values, stalled, now);
                 let line = self.lines.entry(nth).or_default();
                 for (at, value) in (address..).zip(values) {
                     line.memory.insert((slave, coils, at), value);
@@ -237,7 +241,7 @@ impl Truth {
     fn wrote(
         &mut self,
         spec: &Spec,
-        (nth, talk): (usize, &TalkSpec),
+        (nth, exchanges): (usize, &ExchangesSpec),
         (slave, is_of): (u8, &dyn Fn(&RowSpec) -> bool),
         values: &[u16],
         stalled: impl Fn(Instant) -> Duration,
@@ -246,7 +250,7 @@ impl Truth {
         let is_excused = self.is_excused(nth, now);
         let line = self.lines.entry(nth).or_default();
         let is_it = |(at, row, asked, by): &&mut (Instant, usize, Vec<u16>, BTreeSet<u8>)| {
-            let row = &talk.rows[*row];
+            let row = &exchanges.rows[*row];
             // The other bits of a register are what its slave had.
             let is_asked = asked.len() == values.len()
                 && asked.iter().zip(values).all(|(asked, value)| *asked == value & row.mask);
@@ -260,7 +264,7 @@ impl Truth {
             return if is_excused { Ok(()) } else { Err((Invariant::Carried, what)) };
         };
         by.insert(slave);
-        let (at, row) = (*at, &talk.rows[*row]);
+        let (at, row) = (*at, &exchanges.rows[*row]);
         self.were_had(spec, &spec.ports[nth], row, values, at, stalled(at))
     }
 

@@ -4,7 +4,7 @@
 //! In: requests without a header, and what came on the connection. Out: frames, and what they are. A reply belongs to
 //! the request with its transaction id, so nothing waits for late replies here.
 
-use super::awaited::{Awaited, Heard};
+use super::pending::{Heard, PendingReplies};
 use crate::device::Probe;
 use crate::modbus::adu::{PREFIX_LEN, frame_len};
 use crate::modbus::rtu::CRC_LEN;
@@ -54,7 +54,7 @@ impl Transactions {
     }
 
     /// What a frame is that [`probe`] has found; `None` if it answers no request.
-    pub(super) fn heard<'i>(&mut self, awaited: &Awaited<'i>, frame: &[u8]) -> Option<Heard<'i>> {
+    pub(super) fn heard<'i>(&mut self, awaited: &PendingReplies<'i>, frame: &[u8]) -> Option<Heard<'i>> {
         let (&[t1, t0, ..], body) = frame.split_first_chunk::<PREFIX_LEN>()?;
         let id = u16::from_be_bytes([t1, t0]);
         if id != self.newest || awaited.flight.is_none() {

@@ -4,8 +4,7 @@
 //! and requests. Which exchange is next is the line's business ([`super::line`]); ports without
 //! exchanges do not come here.
 
-use super::awaited::{Awaited, Heard};
-use super::clock::Ask;
+use super::clock::Dirty;
 use super::command_link::CommandLink;
 use super::counters::{PortCounters, add, bump};
 use super::device_port::{DeviceCodec, DeviceFormat, elements, judge_can};
@@ -15,12 +14,13 @@ use super::field_output::Downward;
 use super::field_port::{Codec, FieldPort, came, keep_why};
 use super::frames::{Accepted, Frames};
 use super::io::{LinkId, Output, PortId};
-use super::line::{Flight, Line, Over, Phase, Talks, Times};
+use super::line::{ExchangeTable, Flight, Line, Over, Phase, Times};
+use super::modbus_tcp;
+use super::pending::{Heard, PendingReplies};
 use super::rejection::Rejection;
 use super::requests::Maker;
 use super::store::Store;
 use super::tap::{Tap, TapPlace};
-use super::transactions;
 use super::turns::{Cause, Ended, News};
 use super::user::{InputBind, Outputs, wrapping_count};
 use super::whole_port::{Reader, TextBind};
@@ -52,7 +52,7 @@ impl FieldPort {
     }
 
     /// When its conversation has something to do without an input.
-    pub(super) fn talk_deadline(&self) -> Instant {
+    pub(super) fn exchange_deadline(&self) -> Instant {
         match self.line() {
             Some(line) if self.is_usable() => {
                 let deadline = line.deadline(&self.line);
@@ -86,7 +86,7 @@ impl FieldPort {
 
     /// Reads the frames in `rest`; stops after the first accepted one if the image is to be checked
     /// after each frame.
-    fn talk_frames<const PORTS: usize, const TAP: usize>(
+    fn exchange_frames<const PORTS: usize, const TAP: usize>(
         &mut self,
         rest: &mut &[u8],
         bindings: &[InputBind],
@@ -110,16 +110,16 @@ impl FieldPort {
             return accepted;
         };
         let formats = formats.get(..usize::from(*inputs)).unwrap_or(&[]);
-        let (items, mut talks) = view.of(line);
+        let (items, mut table) = view.of(line);
         let mut frames =
             Frames::new((self.id, self.mode), &mut self.reply, &mut self.counters, bindings, store, commands);
         let first_frame = self.first_frame;
         loop {
-            let awaited = Awaited {
+            let awaited = PendingReplies {
                 formats,
                 first_frame,
                 items,
-                rows: talks.rows,
+                rows: table.rows,
                 flight: line.flight(),
                 echo: line.echo,
                 has_echo: line.has_echo == Some(true),
@@ -131,7 +131,7 @@ impl FieldPort {
                 .map(|format| format.layout.lengths().1.saturating_add(usize::from(format.bindings.len)))
                 .fold(MAX_ADU, usize::saturating_add);
             let is_tcp = line.transactions.is_some();
-            let probe = |bytes: &[u8]| if is_tcp { transactions::probe(bytes) } else { awaited.probe(bytes) };
+            let probe = |bytes: &[u8]| if is_tcp { modbus_tcp::probe(bytes) } else { awaited.probe(bytes) };
             let Some(found) = framer.next_frame(&mut left, effort, probe) else { break };
             let (frame, what) = match (found, &mut line.transactions) {
                 (Found::Frame(frame), None) => (frame, Ok(awaited.heard(frame))),
@@ -158,14 +158,14 @@ impl FieldPort {
             };
             if let Some(Heard::Echo) = what {
                 line.echo = None;
-                learn_echo(line, &mut talks, true, now);
+                learn_echo(line, &mut table, true, now);
                 continue;
             }
             let expected = awaited.expected();
             let (flight, times) = (awaited.flight, awaited.asked().map(|item| item.times));
             // Of a Modbus frame.
             let (data, code) = match is_tcp {
-                true => transactions::content(frame),
+                true => modbus_tcp::content(frame),
                 false => (frame.get(3..frame.len().saturating_sub(2)).unwrap_or(&[]), frame.get(2).copied()),
             };
             let before = accepted.frames;
@@ -216,25 +216,25 @@ impl FieldPort {
                 Some(Heard::Echo) | None => (Err(Rejection::NoFrame), Sign::Nothing),
             };
             if let Some(told) = told.filter(|_| verdict.is_ok()) {
-                look_for_restart(line, items, &mut talks, bindings, told, now);
+                look_for_restart(line, items, &mut table, bindings, told, now);
             }
             match (sign, flight, times) {
                 (Sign::Pending, Some(flight), Some(times)) => {
-                    goes_on(line, items, &mut talks, (flight, times), now);
+                    goes_on(line, items, &mut table, (flight, times), now);
                 }
                 (Sign::Answer(ended, code), Some(flight), Some(times)) => {
                     // Of a repetition, two copies may be the replies to both requests.
-                    let is_sure = !flight.is_repetition() && !is_outstanding(&talks, flight, now);
+                    let is_sure = !flight.is_repetition() && !is_outstanding(&table, flight, now);
                     if is_sure && (flight.may_be_echo || line.echo.is_some()) {
-                        learn_echo(line, &mut talks, flight.may_be_echo, now);
+                        learn_echo(line, &mut table, flight.may_be_echo, now);
                     }
                     if matches!(line.phase, Phase::Waiting(_)) {
                         self.sender.sent();
                     }
-                    answered(line, items, &mut talks, frames.counters, (flight, times), (ended, code), now);
+                    answered(line, items, &mut table, frames.counters, (flight, times), (ended, code), now);
                 }
                 (Sign::ReplyOrEcho, ..) => line.heard_reply_or_echo(),
-                (sign, ..) => signs(line, items, &mut talks, sign, now),
+                (sign, ..) => signs(line, items, &mut table, sign, now),
             }
             tap.record(|| came(self.id, now, verdict, None, [frame, &[], &[]]));
             keep_why(&mut self.last_rejection, verdict, frames.store, None, frame);
@@ -251,7 +251,7 @@ impl FieldPort {
     }
 
     /// A frame from the bus.
-    fn talk_frame<const PORTS: usize>(
+    fn exchange_frame<const PORTS: usize>(
         &mut self,
         frame: &CanFrame,
         bindings: &[InputBind],
@@ -267,22 +267,31 @@ impl FieldPort {
             return Ok(());
         };
         let formats = formats.get(..usize::from(*inputs)).unwrap_or(&[]);
-        let (items, mut talks) = view.of(line);
+        let (items, mut table) = view.of(line);
         let mut frames =
             Frames::new((self.id, self.mode), &mut self.reply, &mut self.counters, bindings, store, commands);
         if frame.is_remote() {
             return frames.rejected(Rejection::Remote);
         }
-        if let Some(which) = booted_peer(items, &talks, frame) {
-            let nth = talks.rows.iter().position(|row| row.peer == which).unwrap_or(0);
-            line.turns(&mut talks, |turns| turns.started(which, None, now));
-            has_restarted(line, items, &mut talks, (nth, which), now);
+        if let Some(which) = booted_peer(items, &table, frame) {
+            let nth = table.rows.iter().position(|row| row.peer == which).unwrap_or(0);
+            line.turns(&mut table, |turns| turns.started(which, None, now));
+            has_restarted(line, items, &mut table, (nth, which), now);
         }
         let flight = line.flight();
         let first_frame = self.first_frame;
         let (echo, has_echo) = (None, false);
-        let awaited =
-            Awaited { formats, first_frame, items, rows: talks.rows, flight, echo, has_echo, bindings, now };
+        let awaited = PendingReplies {
+            formats,
+            first_frame,
+            items,
+            rows: table.rows,
+            flight,
+            echo,
+            has_echo,
+            bindings,
+            now,
+        };
         let is = |format: &DeviceFormat| {
             let fields = elements(format.bindings.of(bindings));
             format.id == frame.id()
@@ -329,24 +338,24 @@ impl FieldPort {
                 let (slot, nth) = place.unwrap_or((usize::MAX, None));
                 frames.take_device(format, texts, frame.data(), slot, accepted)?;
                 if let Some(nth) = nth {
-                    look_for_restart(line, items, &mut talks, bindings, (nth, frame.data()), now);
+                    look_for_restart(line, items, &mut table, bindings, (nth, frame.data()), now);
                 }
-                signs(line, items, &mut talks, Sign::Unasked(nth), now);
+                signs(line, items, &mut table, Sign::Unasked(nth), now);
                 self.sender.frames_accepted(1, usable, &mut self.counters, now);
                 return Ok(());
             }
         };
         if let Some(told) = told.filter(|_| verdict.is_ok()) {
-            look_for_restart(line, items, &mut talks, bindings, told, now);
+            look_for_restart(line, items, &mut table, bindings, told, now);
         }
         match (sign, flight, times) {
             (Sign::Pending, Some(flight), Some(times)) => {
-                goes_on(line, items, &mut talks, (flight, times), now);
+                goes_on(line, items, &mut table, (flight, times), now);
             }
             (Sign::Answer(ended, code), Some(flight), Some(times)) => {
-                answered(line, items, &mut talks, frames.counters, (flight, times), (ended, code), now);
+                answered(line, items, &mut table, frames.counters, (flight, times), (ended, code), now);
             }
-            (sign, ..) => signs(line, items, &mut talks, sign, now),
+            (sign, ..) => signs(line, items, &mut table, sign, now),
         }
         verdict
     }
@@ -367,9 +376,9 @@ impl FieldPort {
         let Codec::Device(codec) = &mut self.codec else { return None };
         // Apart from the rest of the codec, which makes the frames.
         let mut line = codec.line.take()?;
-        let (items, mut talks, kept) = view.served(&line);
+        let (items, mut table, kept) = view.served(&line);
         let maker = Maker { image, bindings, codec, sender: &self.sender, reply: self.reply, now };
-        let request = maker.next(&mut line, (items, &mut talks, kept), &mut self.counters, is_busy, out);
+        let request = maker.next(&mut line, (items, &mut table, kept), &mut self.counters, is_busy, out);
         let is_on_can = codec.reader.is_none();
         if let (Some(_), Some(Reader::Search(framer))) = (&request, &mut codec.reader)
             && !line.hears_unasked
@@ -396,44 +405,44 @@ impl FieldPort {
     }
 
     /// The request has left.
-    fn talk_sent(&mut self, mut view: View<'_>, now: Instant) {
+    fn exchange_sent(&mut self, mut view: View<'_>, now: Instant) {
         let (timing, is_on_can) = (self.line, self.is_on_can());
         let Some(line) = self.line_mut() else { return };
-        let (items, mut talks) = view.of(line);
+        let (items, mut table) = view.of(line);
         let times = |nth: u8| items.get(usize::from(nth)).map(|item| item.times);
         let flight = line.flight();
         // A bus is free for others while a reply is awaited.
-        let is_awaited = line.sent(times, &timing, now);
-        if let Some(flight) = flight.filter(|_| !is_awaited) {
+        let is_pending = line.sent(times, &timing, now);
+        if let Some(flight) = flight.filter(|_| !is_pending) {
             // Nobody says whether it was heard. What follows it is sent behind it.
             let nth = usize::from(flight.exchange);
-            let mut events = Events { items, talks: &mut talks, line, now };
+            let mut events = Events { items, table: &mut table, line, now };
             if flight.cause == Cause::Event {
                 events.end_unanswered(nth);
             }
         }
-        if is_awaited && !is_on_can {
+        if is_pending && !is_on_can {
             self.sender.hold();
         }
     }
 
     /// Pauses end, replies that have not come fail, and events expire.
-    fn advance_talk(&mut self, mut view: View<'_>, now: Instant) {
+    fn advance_exchange(&mut self, mut view: View<'_>, now: Instant) {
         let (timing, is_on_can) = (self.line, self.is_on_can());
         let Some(line) = self.line_mut() else { return };
         line.advance(now);
-        let (items, mut talks) = view.of(line);
-        Events { items, talks: &mut talks, line, now }.expire();
+        let (items, mut table) = view.of(line);
+        Events { items, table: &mut table, line, now }.expire();
         let Some(failure) = line.failure(&timing, now) else { return };
         let Some(times) = items.get(usize::from(failure.0.exchange)).map(|item| item.times) else { return };
-        let over = line.failed(&mut talks, failure, times, now);
+        let over = line.failed(&mut table, failure, times, now);
         let (nth, is_event) = (usize::from(failure.0.exchange), failure.0.cause == Cause::Event);
         let ended = match over {
             Over::Repeated => None,
             Over::GivenUp(_) => Some(Ended::Unclear),
             Over::Unconfirmed => Some(Ended::Unconfirmed),
         };
-        let mut events = Events { items, talks: &mut talks, line, now };
+        let mut events = Events { items, table: &mut table, line, now };
         if let Some(ended) = ended {
             events.ended(nth, is_event, ended, 0);
         }
@@ -449,18 +458,18 @@ impl FieldPort {
         }
     }
 
-    fn abandon_talk(&mut self, mut view: View<'_>, now: Instant) {
+    fn abandon_exchange(&mut self, mut view: View<'_>, now: Instant) {
         let is_on_can = self.is_on_can();
         let Some(line) = self.line_mut() else { return };
         let was_waiting = matches!(line.phase, Phase::Waiting(_));
-        let (items, mut talks) = view.of(line);
-        let flight = line.abandon(&mut talks, now);
+        let (items, mut table) = view.of(line);
+        let flight = line.abandon(&mut table, now);
         for item in &mut *items {
             if let Some(trigger) = &mut item.trigger {
                 trigger.forget();
             }
         }
-        let mut events = Events { items, talks: &mut talks, line, now };
+        let mut events = Events { items, table: &mut table, line, now };
         if let Some(flight) = flight.filter(|flight| flight.cause == Cause::Event) {
             events.end(usize::from(flight.exchange), Outcome::Unknown, 0);
         }
@@ -482,16 +491,16 @@ impl FieldPort {
         let is_usable = self.is_usable();
         let Codec::Device(codec) = &mut self.codec else { return };
         let Some(mut line) = codec.line.take() else { return };
-        let (items, mut talks, kept) = view.served(&line);
+        let (items, mut table, kept) = view.served(&line);
         let stale_after = self.sender.stale_after();
         let maker = Maker { image, bindings, codec, sender: &self.sender, reply: self.reply, now };
         let sources = Sources { first_of_links, up_since, stale_after, is_usable };
-        let mut events = Events { items, talks: &mut talks, line: &mut line, now };
+        let mut events = Events { items, table: &mut table, line: &mut line, now };
         events.image_changed(&maker, &sources, kept);
         codec.line = Some(line);
     }
 
-    fn begin_talk(&mut self, mut view: View<'_>, now: Instant) {
+    fn begin_exchange(&mut self, mut view: View<'_>, now: Instant) {
         if let Codec::Device(DeviceCodec { reader: Some(Reader::Slave(slave)), .. }) = &mut self.codec {
             // What came while the line was not there is too old to be answered.
             add(&mut self.counters.discarded_bytes, slave.discard());
@@ -499,14 +508,14 @@ impl FieldPort {
         let is_on_can = self.is_on_can();
         let Some(line) = self.line_mut() else { return };
         let was_waiting = matches!(line.phase, Phase::Waiting(_));
-        let (items, mut talks) = view.of(line);
+        let (items, mut table) = view.of(line);
         for item in items {
             (item.digest, item.is_owed) = (None, false);
             if let Some(sign) = &mut item.restart {
                 sign.was_there = None;
             }
         }
-        line.begin(&mut talks, now);
+        line.begin(&mut table, now);
         line.looks = line.looks.map(|grid| crate::schedule::Grid::starting_at(now, grid.period()));
         // Nobody has said that the port was gone, and its reply is not awaited any more.
         if was_waiting && !is_on_can {
@@ -549,16 +558,16 @@ const fn refused_with(code: u8, is_modbus: bool) -> Ended {
 }
 
 /// The peer whose CANopen node says that it has booted: its object dictionary is asked with SDO in one of the exchanges.
-fn booted_peer(items: &[Item], talks: &Talks<'_>, frame: &CanFrame) -> Option<u8> {
+fn booted_peer(items: &[Item], table: &ExchangeTable<'_>, frame: &CanFrame) -> Option<u8> {
     let (CanId::Standard(id @ 0x701..=0x77F), [0]) = (frame.id(), frame.data()) else { return None };
     let sdo = CanId::Standard(id.wrapping_sub(0x100));
     let is_of_node = |item: &Item| item.request.as_ref().is_some_and(|request| request.id == sdo);
     let nth = items.iter().position(is_of_node)?;
-    talks.rows.get(nth).map(|row| row.peer)
+    table.rows.get(nth).map(|row| row.peer)
 }
 
 /// The code of an SDO abort, the low half, if the frame is one for the request on its way.
-fn sdo_abort(awaited: &Awaited<'_>, frame: &CanFrame) -> Option<u16> {
+fn sdo_abort(awaited: &PendingReplies<'_>, frame: &CanFrame) -> Option<u16> {
     let multiplexer = awaited.flight?.sdo?;
     let reply = awaited.asked()?.reply.as_ref()?;
     let &[0x80, a, b, c, low, high, _, _] = frame.data().first_chunk::<8>()? else { return None };
@@ -566,22 +575,22 @@ fn sdo_abort(awaited: &Awaited<'_>, frame: &CanFrame) -> Option<u16> {
 }
 
 /// Whether a reply to an earlier request of the same exchange may still come.
-fn is_outstanding(talks: &Talks<'_>, flight: Flight, now: Instant) -> bool {
-    talks.rows.get(usize::from(flight.exchange)).is_some_and(|row| row.is_outstanding(now))
+fn is_outstanding(table: &ExchangeTable<'_>, flight: Flight, now: Instant) -> bool {
+    table.rows.get(usize::from(flight.exchange)).is_some_and(|row| row.is_outstanding(now))
 }
 
 /// Own bytes are heard, or are not: what was not confirmed for that reason is, or is written again.
-fn learn_echo(line: &mut Line, talks: &mut Talks<'_>, has_echo: bool, now: Instant) {
+fn learn_echo(line: &mut Line, table: &mut ExchangeTable<'_>, has_echo: bool, now: Instant) {
     if !line.learn_echo(has_echo) {
         return;
     }
     // The answer to the request on its way tells what became of that.
     let own = line.flight().map(|flight| usize::from(flight.exchange));
-    for nth in (0..talks.rows.len()).filter(|nth| Some(*nth) != own) {
-        let Some(row) = talks.rows.get_mut(nth) else { break };
+    for nth in (0..table.rows.len()).filter(|nth| Some(*nth) != own) {
+        let Some(row) = table.rows.get_mut(nth) else { break };
         let was_unconfirmed = core::mem::take(&mut row.is_unconfirmed);
         if was_unconfirmed && has_echo && row.is_state() {
-            line.request(talks, nth, now);
+            line.request(table, nth, now);
         }
     }
 }
@@ -590,7 +599,7 @@ fn learn_echo(line: &mut Line, talks: &mut Talks<'_>, has_echo: bool, now: Insta
 fn answered(
     line: &mut Line,
     items: &mut [Item],
-    talks: &mut Talks<'_>,
+    table: &mut ExchangeTable<'_>,
     counters: &mut PortCounters,
     (flight, times): (Flight, Times),
     (ended, code): (Ended, u16),
@@ -600,7 +609,7 @@ fn answered(
     if is_refused {
         bump(&mut counters.refused);
     }
-    if let Some(peer) = talks.peer_of(flight) {
+    if let Some(peer) = table.peer_of(flight) {
         if is_refused {
             bump(&mut peer.counters.refused);
             peer.counters.refusal = code as u8;
@@ -608,9 +617,9 @@ fn answered(
             bump(&mut peer.counters.replies);
         }
     }
-    let (ended, news) = line.answered(talks, flight, ended, times, now);
+    let (ended, news) = line.answered(table, flight, ended, times, now);
     let nth = usize::from(flight.exchange);
-    let mut events = Events { items, talks, line, now };
+    let mut events = Events { items, table, line, now };
     events.note(nth, news);
     events.ended(nth, flight.cause == Cause::Event, ended, code);
 }
@@ -621,15 +630,15 @@ fn answered(
 fn goes_on(
     line: &mut Line,
     items: &mut [Item],
-    talks: &mut Talks<'_>,
+    table: &mut ExchangeTable<'_>,
     (flight, times): (Flight, Times),
     now: Instant,
 ) {
-    line.heard_pending(talks, times.timeout, now);
+    line.heard_pending(table, times.timeout, now);
     let nth = usize::from(flight.exchange);
-    let Some(which) = talks.rows.get(nth).map(|row| row.peer) else { return };
-    let news = line.turns(talks, |turns| turns.heard(which, Some(nth), now));
-    Events { items, talks, line, now }.note(nth, news);
+    let Some(which) = table.rows.get(nth).map(|row| row.peer) else { return };
+    let news = line.turns(table, |turns| turns.heard(which, Some(nth), now));
+    Events { items, table, line, now }.note(nth, news);
 }
 
 /// Takes the values of a pending answer or a refusal, if it has any.
@@ -655,7 +664,7 @@ fn take_other<const PORTS: usize>(
 fn look_for_restart(
     line: &mut Line,
     items: &mut [Item],
-    talks: &mut Talks<'_>,
+    table: &mut ExchangeTable<'_>,
     bindings: &[InputBind],
     (exchange, data): (u8, &[u8]),
     now: Instant,
@@ -669,54 +678,54 @@ fn look_for_restart(
     if sign.was_there.replace(is_there) != Some(false) || !is_there {
         return;
     }
-    let Some(which) = talks.rows.get(nth).map(|row| row.peer) else { return };
+    let Some(which) = table.rows.get(nth).map(|row| row.peer) else { return };
     let own = line.flight().map(|flight| usize::from(flight.exchange)).filter(|own| *own == nth);
-    line.turns(talks, |turns| {
+    line.turns(table, |turns| {
         // What its failures say is one start with this.
         if turns.heard(which, own, now) != News::Started {
             turns.started(which, own, now);
         }
     });
-    has_restarted(line, items, talks, (nth, which), now);
+    has_restarted(line, items, table, (nth, which), now);
 }
 
 /// The peer of this exchange has said that it has restarted, and its turns know it.
 fn has_restarted(
     line: &mut Line,
     items: &mut [Item],
-    talks: &mut Talks<'_>,
+    table: &mut ExchangeTable<'_>,
     (nth, which): (usize, u8),
     now: Instant,
 ) {
     line.look(now);
-    let mut events = Events { items, talks, line, now };
+    let mut events = Events { items, table, line, now };
     events.note(nth, News::Started);
     // What it was to do, it has forgotten.
     events.end_waiting(Some(which), Outcome::Away);
 }
 
 /// A frame that is no answer to the request on its way is a sign of life of its peer.
-fn signs(line: &mut Line, items: &mut [Item], talks: &mut Talks<'_>, sign: Sign, now: Instant) {
+fn signs(line: &mut Line, items: &mut [Item], table: &mut ExchangeTable<'_>, sign: Sign, now: Instant) {
     let nth = match (sign, line.flight()) {
         (Sign::Late { exchange, .. }, _) | (Sign::Unasked(Some(exchange)), _) => usize::from(exchange),
         (Sign::Ambiguous, Some(flight)) => usize::from(flight.exchange),
         _ => return,
     };
-    let Some(row) = talks.rows.get_mut(nth) else { return };
+    let Some(row) = table.rows.get_mut(nth) else { return };
     let which = row.peer;
     if matches!(sign, Sign::Late { is_pending: false, .. }) {
         row.late_reply_came();
     }
     if !matches!(sign, Sign::Unasked(_))
-        && let Some(peer) = talks.peers.get_mut(usize::from(which))
+        && let Some(peer) = table.peers.get_mut(usize::from(which))
     {
         bump(&mut peer.counters.late_replies);
     }
     // The peer has carried out what its late reply is to.
     let own = matches!(sign, Sign::Late { is_pending: false, .. }).then_some(nth);
-    let news = line.turns(talks, |turns| turns.heard(which, own, now));
+    let news = line.turns(table, |turns| turns.heard(which, own, now));
     line.look(now);
-    Events { items, talks, line, now }.note(nth, news);
+    Events { items, table, line, now }.note(nth, news);
 }
 
 impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize, const EXCHANGES: usize>
@@ -750,18 +759,18 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     /// Takes bytes; false if the port's recipe has no exchanges.
     #[cold]
     #[inline(never)]
-    pub(super) fn talk_bytes(&mut self, id: PortId, bytes: &[u8], now: Instant) -> bool {
+    pub(super) fn exchange_bytes(&mut self, id: PortId, bytes: &[u8], now: Instant) -> bool {
         let Some(port) = find_port(&mut self.ports, id) else { return false };
         if port.line().is_none() {
             return false;
         }
-        if self.clock.is_deaf {
+        if self.clock.has_slept {
             port.discard(bytes, None, &mut self.tap, now);
             return true;
         }
         port.heard(bytes, now);
         if port.hears_master(bytes, now) {
-            self.after_talk(id);
+            self.after_exchange(id);
             return true;
         }
         let mut rest = bytes;
@@ -769,8 +778,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             let (store, command) = (&mut self.store, self.links.command.first_mut());
             let Some(port) = find_port(&mut self.ports, id) else { return true };
             let (inputs, view) = (&self.bindings.inputs, self.exchanges.view());
-            let accepted = port.talk_frames(&mut rest, inputs, store, command, &mut self.tap, view);
-            self.after_talk(id);
+            let accepted = port.exchange_frames(&mut rest, inputs, store, command, &mut self.tap, view);
+            self.after_exchange(id);
             self.note_overdue();
             self.after_field(id, &accepted, now);
             if rest.is_empty() {
@@ -782,24 +791,24 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     /// Takes a frame; false if the port's recipe has no exchanges.
     #[cold]
     #[inline(never)]
-    pub(super) fn talk_can(&mut self, id: PortId, frame: &CanFrame, now: Instant) -> bool {
+    pub(super) fn exchange_can(&mut self, id: PortId, frame: &CanFrame, now: Instant) -> bool {
         let (store, command) = (&mut self.store, self.links.command.first_mut());
         let Some(port) = find_port(&mut self.ports, id) else { return false };
         if port.line().is_none() {
             return false;
         }
-        if self.clock.is_deaf {
+        if self.clock.has_slept {
             port.discard(frame.data(), Some(frame.id()), &mut self.tap, now);
             return true;
         }
         let mut accepted = Accepted::default();
         let (inputs, view) = (&self.bindings.inputs, self.exchanges.view());
-        let verdict = port.talk_frame(frame, inputs, store, command, view, &mut accepted);
+        let verdict = port.exchange_frame(frame, inputs, store, command, view, &mut accepted);
         self.tap.record(|| came(id, now, verdict, Some(frame.id()), [frame.data(), &[], &[]]));
         if verdict.is_ok() || verdict.is_err_and(|why| port.is_news(why, now)) {
             keep_why(&mut port.last_rejection, verdict, &mut self.store, Some(frame.id()), frame.data());
         }
-        self.after_talk(id);
+        self.after_exchange(id);
         self.note_overdue();
         self.after_field(id, &accepted, now);
         true
@@ -824,9 +833,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             port.triggers(image, self.bindings.outputs(), view, (first_of_links, up_since), now);
             if !was_due && port.has_failed(now) {
                 // What is pending yields to a stop.
-                port.advance_talk(self.exchanges.view(), now);
+                port.advance_exchange(self.exchanges.view(), now);
             }
-            self.after_talk(id);
+            self.after_exchange(id);
         }
     }
 
@@ -852,19 +861,19 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
         if !told.is_empty() {
             self.store.tell(&told);
-            self.clock.ask.add(Ask::LINKS);
+            self.clock.dirty.add(Dirty::LINKS);
         }
     }
 
     /// The line may be free, or wait for something else.
-    fn after_talk(&mut self, id: PortId) {
+    fn after_exchange(&mut self, id: PortId) {
         self.tell_outcomes(false);
-        self.clock.ask.add(Ask::PORTS);
+        self.clock.dirty.add(Dirty::PORTS);
         if let Some(port) = find_port(&mut self.ports, id) {
             port.note_partial();
             // Each by itself: what is due already must not hide the other.
             let (deadlines, has_failed) =
-                ([port.deadline(), port.talk_deadline()], port.has_failed(self.clock.now));
+                ([port.deadline(), port.exchange_deadline()], port.has_failed(self.clock.now));
             deadlines.into_iter().for_each(|at| self.arm(at));
             if has_failed {
                 // A wrong reply came before the request had left, and the line is silent already.
@@ -882,41 +891,41 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 
     #[cold]
     #[inline(never)]
-    pub(super) fn talk_sent(&mut self, id: PortId) {
+    pub(super) fn exchange_sent(&mut self, id: PortId) {
         if let Some(port) = find_port(&mut self.ports, id) {
-            port.talk_sent(self.exchanges.view(), self.clock.now);
-            self.after_talk(id);
+            port.exchange_sent(self.exchanges.view(), self.clock.now);
+            self.after_exchange(id);
         }
     }
 
     /// The device is there.
-    pub(super) fn talk_begins(&mut self, id: PortId) {
+    pub(super) fn exchanges_begin(&mut self, id: PortId) {
         if let Some(port) = find_port(&mut self.ports, id) {
-            port.begin_talk(self.exchanges.view(), self.clock.now);
-            self.after_talk(id);
+            port.begin_exchange(self.exchanges.view(), self.clock.now);
+            self.after_exchange(id);
         }
     }
 
     /// The device is gone.
-    pub(super) fn talk_ends(&mut self, id: PortId) {
+    pub(super) fn exchanges_end(&mut self, id: PortId) {
         if let Some(port) = find_port(&mut self.ports, id) {
-            port.abandon_talk(self.exchanges.view(), self.clock.now);
+            port.abandon_exchange(self.exchanges.view(), self.clock.now);
         }
     }
 
     /// The gateway slept.
-    pub(super) fn talk_slept(&mut self) {
+    pub(super) fn exchanges_slept(&mut self) {
         for port in &mut self.ports {
-            port.abandon_talk(self.exchanges.view(), self.clock.now);
+            port.abandon_exchange(self.exchanges.view(), self.clock.now);
         }
     }
 
     #[cold]
     #[inline(never)]
-    pub(super) fn advance_talk(&mut self, now: Instant) {
+    pub(super) fn advance_exchange(&mut self, now: Instant) {
         for index in 0..self.ports.len() {
             let Some(port) = self.ports.get_mut(index) else { break };
-            port.advance_talk(self.exchanges.view(), now);
+            port.advance_exchange(self.exchanges.view(), now);
             if port.is_asked(now) {
                 let id = port.id;
                 self.serve(id, now);
@@ -929,29 +938,29 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.show_health(now);
         let (store, command) = (&mut self.store, self.links.command.first_mut());
         let Some(port) = find_port(&mut self.ports, id) else { return };
-        if self.clock.is_deaf {
+        if self.clock.has_slept {
             return port.discard_partial(&mut self.tap, now);
         }
         let bindings = (&self.bindings.inputs[..], self.bindings.outputs());
         let accepted = port.serve(bindings, store, command, &mut self.tap, self.exchanges.view());
-        self.after_talk(id);
+        self.after_exchange(id);
         self.after_field(id, &accepted, now);
     }
 
     #[cold]
     #[inline(never)]
-    pub(super) fn talk_deadline(&self) -> Instant {
-        if self.clock.is_deaf {
+    pub(super) fn exchange_deadline(&self) -> Instant {
+        if self.clock.has_slept {
             return Instant::NEVER;
         }
-        self.ports.iter().map(FieldPort::talk_deadline).min().unwrap_or(Instant::NEVER)
+        self.ports.iter().map(FieldPort::exchange_deadline).min().unwrap_or(Instant::NEVER)
     }
 
     /// The next request of a port.
     #[cold]
     #[inline(never)]
     pub(super) fn next_request(&mut self, out: &mut [u8], now: Instant) -> Option<(PortId, Downward)> {
-        if self.clock.is_deaf {
+        if self.clock.has_slept {
             return None;
         }
         if self.ports.iter().any(|port| port.line().is_some_and(|line| line.is_free(now))) {
@@ -972,7 +981,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             let request = port.next_request(&self.store.image, self.bindings.outputs(), view, out, now);
             found = request.map(|downward| (port.id, downward));
             // What is due already must not hide another port's.
-            first = Some(port.talk_deadline()).filter(|at| *at > now).map_or(first, |at| first.min(at));
+            first = Some(port.exchange_deadline()).filter(|at| *at > now).map_or(first, |at| first.min(at));
         }
         self.arm(first);
         found

@@ -12,7 +12,7 @@ use super::super::{Invariant, Oracle, copied_inputs};
 use crate::due::Due;
 use crate::rtu::sealed;
 use crate::tamper::{Forged, Outward};
-use crate::{Cell, Device, Done, SlaveDone, Talker, Violation};
+use crate::{Cell, Device, Done, PeriodicSender, SlaveDone, Violation};
 use recipe_config::InitialTarget;
 use recipe_controller::ControllerInput;
 
@@ -370,7 +370,7 @@ fn shown(pairs: &[(u16, u16)]) -> (Oracle, Instant) {
 /// What the model says of a slave that takes these values after the gateway has asked for them.
 fn taken(oracle: &mut Oracle, values: [u8; 2], now: Instant) -> Option<Invariant> {
     let request = sealed(&[2, 16, 0, 0x30, 0, 2, 4, 0, values[0], 0, values[1]]);
-    let row = oracle.spec.ports[0].talk.as_ref().unwrap().rows[2].clone();
+    let row = oracle.spec.ports[0].exchanges.as_ref().unwrap().rows[2].clone();
     oracle.truth.asks(0, 2, &row, &request, now);
     let values = values.map(u16::from).to_vec();
     let what = Done::Wrote { coils: false, address: 0x30, values };
@@ -482,7 +482,7 @@ fn asked_by_a_master(outward: Option<Outward>) -> Cell {
     let start = cell.now() + MS(500);
     cell.attach(
         line,
-        Talker::new(start, 20, 30, |n| match n % 2 {
+        PeriodicSender::new(start, 20, 30, |n| match n % 2 {
             0 => sealed(&[5, 4, 0, 0, 0, 1]),
             _ => sealed(&[5, 6, 0, 9, 0, n as u8]),
         }),

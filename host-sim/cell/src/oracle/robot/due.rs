@@ -132,7 +132,7 @@ impl Oracle {
             self.checks[Invariant::SafeArrives as usize] += *result.as_ref().unwrap_or(&1);
             self.judge(now, &[], result.map(drop));
         }
-        self.survey_talks(now);
+        self.survey_exchanges(now);
     }
 }
 

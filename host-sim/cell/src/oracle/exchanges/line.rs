@@ -9,14 +9,14 @@ use std::collections::{BTreeMap, BTreeSet};
 use proto_core::config::Echo;
 use proto_core::time::{Duration, Instant};
 
-use super::spec::{Kind, RowSpec, Seen, TalkSpec};
+use super::spec::{ExchangesSpec, Kind, RowSpec, Seen};
 use crate::oracle::Invariant;
 use crate::oracle::spec::PortSpec;
 use crate::oracle::upward::Wrong;
 
 /// The model of one line.
 #[derive(Debug, Clone, Default)]
-pub(in crate::oracle) struct TalkWatch {
+pub(in crate::oracle) struct ExchangesWatch {
     flight: Option<Flight>,
     /// A request that was handed over has not left.
     leaving: bool,
@@ -147,16 +147,16 @@ impl RowWatch {
     }
 }
 
-impl TalkWatch {
+impl ExchangesWatch {
     /// The device of the port is there, perhaps another one.
-    pub(in crate::oracle) fn begin(&mut self, talk: Option<&TalkSpec>, now: Instant) {
-        let Some(talk) = talk else { return };
-        self.abandon(Some(talk), now);
+    pub(in crate::oracle) fn begin(&mut self, exchanges: Option<&ExchangesSpec>, now: Instant) {
+        let Some(exchanges) = exchanges else { return };
+        self.abandon(Some(exchanges), now);
         self.slaves.clear();
         self.opening.clear();
         self.passed.clear();
-        self.rows = vec![RowWatch::default(); talk.rows.len()];
-        for (watch, row) in self.rows.iter_mut().zip(&talk.rows) {
+        self.rows = vec![RowWatch::default(); exchanges.rows.len()];
+        for (watch, row) in self.rows.iter_mut().zip(&exchanges.rows) {
             watch.starts = row.kind == Kind::Start;
             if row.at_start {
                 self.opening.entry(row.slave).or_default().insert(row.nth);
@@ -167,25 +167,25 @@ impl TalkWatch {
                 watch.blocked_until = now + row.late;
             }
         }
-        self.has_echo = known(talk.echo);
+        self.has_echo = known(exchanges.echo);
         (self.began, self.disturbed_at) = (now, now);
     }
 
     /// What has begun is not continued.
-    pub(in crate::oracle) fn abandon(&mut self, talk: Option<&TalkSpec>, now: Instant) {
+    pub(in crate::oracle) fn abandon(&mut self, exchanges: Option<&ExchangesSpec>, now: Instant) {
         // A request that is about to be repeated counts as one that was.
         let flight = self.flight.take().or(self.repeat.take().map(|mut flight| {
             flight.repeated += 1;
             flight
         }));
-        if let Some((flight, talk)) = flight.zip(talk)
-            && talk.rows[flight.row].is_answered()
+        if let Some((flight, exchanges)) = flight.zip(exchanges)
+            && exchanges.rows[flight.row].is_answered()
         {
             // Behind the newest transmission that has left; one that has not may wait as long from now on.
-            let late = talk.rows[flight.row].late;
+            let late = exchanges.rows[flight.row].late;
             match flight.sent {
-                Some(sent) => self.leaves(talk, flight.row, flight.repeated + 1, sent + late, now),
-                None => self.leaves(talk, flight.row, 0, now + late, now),
+                Some(sent) => self.leaves(exchanges, flight.row, flight.repeated + 1, sent + late, now),
+                None => self.leaves(exchanges, flight.row, 0, now + late, now),
             }
         }
         for row in &mut self.rows {
@@ -195,15 +195,15 @@ impl TalkWatch {
     }
 
     /// The port is gone.
-    pub(in crate::oracle) fn gone(&mut self, talk: Option<&TalkSpec>, now: Instant) {
-        self.abandon(talk, now);
+    pub(in crate::oracle) fn gone(&mut self, exchanges: Option<&ExchangesSpec>, now: Instant) {
+        self.abandon(exchanges, now);
         self.leaving = false;
     }
 
     /// Replies to an exchange may come until then.
-    fn leaves(&mut self, talk: &TalkSpec, row: usize, count: u8, until: Instant, now: Instant) {
+    fn leaves(&mut self, exchanges: &ExchangesSpec, row: usize, count: u8, until: Instant, now: Instant) {
         self.rows[row].leaves(count, until, now);
-        for &other in &talk.rows[row].alike {
+        for &other in &exchanges.rows[row].alike {
             self.rows[other].blocked_until = self.rows[other].blocked_until.max(until);
         }
     }
@@ -220,8 +220,14 @@ impl TalkWatch {
     }
 
     /// Bits that ask have changed. A rise needs a 0 that was read before.
-    pub(super) fn watch(&mut self, talk: &TalkSpec, bit: impl Fn(&RowSpec) -> Option<bool>, now: Instant) {
-        for (watch, row) in self.rows.iter_mut().zip(&talk.rows).filter(|(_, row)| row.rising.is_some()) {
+    pub(super) fn watch(
+        &mut self,
+        exchanges: &ExchangesSpec,
+        bit: impl Fn(&RowSpec) -> Option<bool>,
+        now: Instant,
+    ) {
+        for (watch, row) in self.rows.iter_mut().zip(&exchanges.rows).filter(|(_, row)| row.rising.is_some())
+        {
             let on = bit(row);
             let before = std::mem::replace(&mut watch.last_bit, on);
             if on == Some(true) && before == Some(false) {
@@ -234,12 +240,12 @@ impl TalkWatch {
     pub(super) fn hands_over(
         &mut self,
         port: &PortSpec,
-        talk: &TalkSpec,
+        exchanges: &ExchangesSpec,
         (row, request): (usize, &[u8]),
         (heard, is_busy): (Instant, bool),
         now: Instant,
     ) -> Result<(), Wrong> {
-        let spec = &talk.rows[row];
+        let spec = &exchanges.rows[row];
         let wrong = |what: &str| Err((Invariant::Line, format!("{}: {what}", name(spec))));
         if self.leaving || self.flight.is_some() || is_busy {
             return wrong("asked while another transmission is on its way");
@@ -251,7 +257,7 @@ impl TalkWatch {
             return wrong("asked before the pause of the exchange before it was over");
         }
         if let Some(failed) = self.repeats().filter(|failed| *failed != row) {
-            let what = format!("asked before {} is repeated", name(&talk.rows[failed]));
+            let what = format!("asked before {} is repeated", name(&exchanges.rows[failed]));
             return wrong(&what);
         }
         let repeated = self.repeat.take();
@@ -265,14 +271,14 @@ impl TalkWatch {
         }
         // What was away for long enough may be asked before it is heard.
         let failing = self.slaves.get(&spec.slave).and_then(|slave| slave.failing);
-        let is_away = failing.is_some_and(|(since, _)| now.saturating_since(since) >= talk.absent);
+        let is_away = failing.is_some_and(|(since, _)| now.saturating_since(since) >= exchanges.absent);
         let starts = std::mem::take(&mut self.rows[row].starts) || is_away;
         if repeated.is_none() && spec.kind == Kind::Start && !starts {
             let what = format!("{}: asked although its device has not started", name(spec));
             return Err((Invariant::Cycle, what));
         }
         let was_heard = self.slaves.get(&spec.slave).is_some_and(|slave| slave.was_heard);
-        if repeated.is_none() && self.start_waits(talk, row) && (was_heard || !is_away) {
+        if repeated.is_none() && self.start_waits(exchanges, row) && (was_heard || !is_away) {
             let what = format!("{}: asked, and nothing tells that its device is there", name(spec));
             return Err((Invariant::Cycle, what));
         }
@@ -281,7 +287,8 @@ impl TalkWatch {
                 spec.alike.iter().copied().find(|&other| self.rows[other].is_outstanding(now))
         {
             let left = self.rows[other].outstanding.1.saturating_since(now);
-            let what = format!("asked {left} before the replies to {} are over", name(&talk.rows[other]));
+            let what =
+                format!("asked {left} before the replies to {} are over", name(&exchanges.rows[other]));
             return wrong(&what);
         }
         let slave = self.slaves.entry(spec.slave).or_default();
@@ -289,8 +296,9 @@ impl TalkWatch {
             let what = format!("{}: asked, and its slave does not answer", name(spec));
             return Err((Invariant::Periods, what));
         }
-        let not_before =
-            slave.failing.map(|(_, newest)| newest + wait(talk.shortest(spec.slave), slave.failures).half());
+        let not_before = slave
+            .failing
+            .map(|(_, newest)| newest + wait(exchanges.shortest(spec.slave), slave.failures).half());
         if let Some(left) = not_before.filter(|_| slave.presence == Presence::Down && repeated.is_none())
             && now < left
         {
@@ -302,8 +310,9 @@ impl TalkWatch {
             return Err((Invariant::Periods, what));
         }
         slave.asked = now;
-        if let Some(first) = self.comes_first(talk, spec.slave, row) {
-            let what = format!("{}: asked before {}, which comes first", name(spec), name(&talk.rows[first]));
+        if let Some(first) = self.comes_first(exchanges, spec.slave, row) {
+            let what =
+                format!("{}: asked before {}, which comes first", name(spec), name(&exchanges.rows[first]));
             return Err((Invariant::Cycle, what));
         }
         self.is_opened(spec.slave, row);
@@ -348,23 +357,24 @@ impl TalkWatch {
     }
 
     /// What is to be asked at the start of a slave before this exchange, and could be.
-    fn comes_first(&self, talk: &TalkSpec, slave: u8, row: usize) -> Option<usize> {
+    fn comes_first(&self, exchanges: &ExchangesSpec, slave: u8, row: usize) -> Option<usize> {
         let opening = self.opening.get(&slave)?;
         // What nobody answers waits for a slave that does not.
         let is_down = self.slaves.get(&slave).is_some_and(|slave| slave.presence == Presence::Down);
-        let may_be =
-            |nth: &usize| (!is_down || talk.rows[*nth].is_answered()) && !self.start_waits(talk, *nth);
+        let may_be = |nth: &usize| {
+            (!is_down || exchanges.rows[*nth].is_answered()) && !self.start_waits(exchanges, *nth)
+        };
         let first = *opening.iter().find(|nth| !self.passed.contains(*nth) && may_be(nth))?;
         let is_itself = first == row || opening.contains(&row) && row < first;
         (!is_itself).then_some(first)
     }
 
     /// Whether a start waits for a sign of life of its slave, for which another exchange asks.
-    fn start_waits(&self, talk: &TalkSpec, row: usize) -> bool {
-        let spec = &talk.rows[row];
+    fn start_waits(&self, exchanges: &ExchangesSpec, row: usize) -> bool {
+        let spec = &exchanges.rows[row];
         let is_up = self.slaves.get(&spec.slave).is_some_and(|slave| slave.presence == Presence::Up);
         let tells = |row: &RowSpec| row.is_answered() && row.every.is_some();
-        spec.kind == Kind::Start && !is_up && talk.rows_of(spec.slave).any(|(_, row)| tells(row))
+        spec.kind == Kind::Start && !is_up && exchanges.rows_of(spec.slave).any(|(_, row)| tells(row))
     }
 
     fn is_opened(&mut self, slave: u8, row: usize) {
@@ -375,10 +385,10 @@ impl TalkWatch {
     }
 
     /// The request has left.
-    pub(in crate::oracle) fn left(&mut self, talk: &TalkSpec, turnaround: Duration, now: Instant) {
+    pub(in crate::oracle) fn left(&mut self, exchanges: &ExchangesSpec, turnaround: Duration, now: Instant) {
         self.leaving = false;
         let Some(flight) = self.flight.as_mut().filter(|flight| flight.sent.is_none()) else { return };
-        let spec = &talk.rows[flight.row];
+        let spec = &exchanges.rows[flight.row];
         if spec.is_answered() {
             flight.sent = Some(now);
         } else {
@@ -400,7 +410,7 @@ impl TalkWatch {
     }
 
     /// What the bytes that are held begin with.
-    pub(super) fn see(&self, port: &PortSpec, talk: &TalkSpec, bytes: &[u8], now: Instant) -> Seen {
+    pub(super) fn see(&self, port: &PortSpec, exchanges: &ExchangesSpec, bytes: &[u8], now: Instant) -> Seen {
         let echo = match &self.echo {
             None => Seen::No,
             Some(own) => match bytes.get(..own.len()) {
@@ -413,13 +423,13 @@ impl TalkWatch {
             // The reply is looked for behind the echo.
             _ if self.has_echo == Some(true) && self.echo.is_some() => Seen::No,
             // Nobody answers what is for all.
-            Some(flight) if talk.rows[flight.row].is_answered() => {
-                talk.rows[flight.row].see(&flight.request, bytes)
+            Some(flight) if exchanges.rows[flight.row].is_answered() => {
+                exchanges.rows[flight.row].see(&flight.request, bytes)
             }
             _ => Seen::No,
         };
         let late = self.late_rows(now).fold(Seen::No, |seen, (nth, row)| {
-            seen.or(talk.rows[nth].see_late(row.request.as_deref(), bytes).late(nth))
+            seen.or(exchanges.rows[nth].see_late(row.request.as_deref(), bytes).late(nth))
         });
         let answer = match (answer, echo) {
             (Seen::Reply(len), Seen::Echo(own)) if own == len => Seen::ReplyOrEcho(len),
@@ -428,36 +438,36 @@ impl TalkWatch {
         match (answer, late) {
             // It may be one to an earlier request.
             (Seen::Refusal(len), Seen::Late(other, _)) if other == len => Seen::Ambiguous(len),
-            _ => answer.or(late).or(talk.see_unasked(port, bytes)),
+            _ => answer.or(late).or(exchanges.see_unasked(port, bytes)),
         }
     }
 
     /// The exchange that a reply is awaited to, and the request.
-    pub(super) fn awaits<'t>(&self, talk: &'t TalkSpec) -> Option<(&'t RowSpec, &[u8])> {
-        self.flight.as_ref().map(|flight| (&talk.rows[flight.row], &flight.request[..]))
+    pub(super) fn awaits<'t>(&self, exchanges: &'t ExchangesSpec) -> Option<(&'t RowSpec, &[u8])> {
+        self.flight.as_ref().map(|flight| (&exchanges.rows[flight.row], &flight.request[..]))
     }
 
     /// The exchange that was not answered in time, and that `is` a reply to.
     pub(super) fn late_of(
         &self,
-        talk: &TalkSpec,
+        exchanges: &ExchangesSpec,
         is: impl Fn(&RowSpec) -> bool,
         now: Instant,
     ) -> Option<usize> {
-        self.late_rows(now).map(|(nth, _)| nth).find(|&nth| is(&talk.rows[nth]))
+        self.late_rows(now).map(|(nth, _)| nth).find(|&nth| is(&exchanges.rows[nth]))
     }
 
     /// A late reply to this exchange came. Returns the slave if it has started.
-    pub(super) fn came_late(&mut self, talk: &TalkSpec, row: usize, now: Instant) -> Option<u8> {
+    pub(super) fn came_late(&mut self, exchanges: &ExchangesSpec, row: usize, now: Instant) -> Option<u8> {
         let outstanding = &mut self.rows[row].outstanding;
         outstanding.0 = outstanding.0.saturating_sub(1);
-        self.heard(talk, talk.rows[row].slave, now)
+        self.heard(exchanges, exchanges.rows[row].slave, now)
     }
 
     /// An answer came that may belong to one of several requests.
-    pub(super) fn came_ambiguous(&mut self, talk: &TalkSpec, now: Instant) -> Option<u8> {
-        let slave = talk.rows[self.flight.as_ref()?.row].slave;
-        self.heard(talk, slave, now)
+    pub(super) fn came_ambiguous(&mut self, exchanges: &ExchangesSpec, now: Instant) -> Option<u8> {
+        let slave = exchanges.rows[self.flight.as_ref()?.row].slave;
+        self.heard(exchanges, slave, now)
     }
 
     pub(super) fn heard_wrong(&mut self) {
@@ -469,12 +479,12 @@ impl TalkWatch {
     /// The slave has answered. Returns the request, and the slave if it has started.
     pub(super) fn answered(
         &mut self,
-        talk: &TalkSpec,
+        exchanges: &ExchangesSpec,
         ended: Ended,
         now: Instant,
     ) -> Option<(Flight, Option<u8>)> {
         let flight = self.flight.take()?;
-        let spec = &talk.rows[flight.row];
+        let spec = &exchanges.rows[flight.row];
         // Two copies behind a repetition, or behind a request whose earlier reply may still come, may be two replies.
         let is_sure = flight.repeated == 0 && !self.rows[flight.row].is_outstanding(now);
         if is_sure && (flight.may_be_echo || self.echo.is_some()) {
@@ -482,8 +492,8 @@ impl TalkWatch {
         }
         self.refused = self.refused.wrapping_add(u32::from(ended != Ended::Good));
         self.rest(spec.pause, now);
-        self.leaves_of(talk, &flight, flight.repeated, flight.sent.unwrap_or(now), now);
-        let started = self.ended(talk, &flight, ended, now);
+        self.leaves_of(exchanges, &flight, flight.repeated, flight.sent.unwrap_or(now), now);
+        let started = self.ended(exchanges, &flight, ended, now);
         self.rows[flight.row].is_refused = ended == Ended::Refused;
         Some((flight, started))
     }
@@ -494,19 +504,38 @@ impl TalkWatch {
     }
 
     /// So many replies to a request may still come.
-    fn leaves_of(&mut self, talk: &TalkSpec, flight: &Flight, count: u8, sent: Instant, now: Instant) {
-        let spec = &talk.rows[flight.row];
+    fn leaves_of(
+        &mut self,
+        exchanges: &ExchangesSpec,
+        flight: &Flight,
+        count: u8,
+        sent: Instant,
+        now: Instant,
+    ) {
+        let spec = &exchanges.rows[flight.row];
         if flight.timed_out.is_some() {
-            self.leaves(talk, flight.row, count, sent + spec.late, now);
+            self.leaves(exchanges, flight.row, count, sent + spec.late, now);
         } else if flight.was_wrong && spec.alike.len() > 1 {
             // It may have been noise, with the reply behind it.
-            self.leaves(talk, flight.row, count, sent + spec.late.min(spec.timeout.saturating_mul(2)), now);
+            self.leaves(
+                exchanges,
+                flight.row,
+                count,
+                sent + spec.late.min(spec.timeout.saturating_mul(2)),
+                now,
+            );
         }
     }
 
     /// A request has ended with a sign of its slave.
-    fn ended(&mut self, talk: &TalkSpec, flight: &Flight, ended: Ended, now: Instant) -> Option<u8> {
-        let spec = &talk.rows[flight.row];
+    fn ended(
+        &mut self,
+        exchanges: &ExchangesSpec,
+        flight: &Flight,
+        ended: Ended,
+        now: Instant,
+    ) -> Option<u8> {
+        let spec = &exchanges.rows[flight.row];
         let watch = &mut self.rows[flight.row];
         (watch.was_answered, watch.is_unconfirmed) = (true, false);
         if spec.at_start && watch.failures > 0 {
@@ -522,19 +551,19 @@ impl TalkWatch {
             watch.starts |= spec.kind == Kind::Start;
             watch.risen = watch.risen.or(flight.expires);
         }
-        self.heard(talk, spec.slave, now)
+        self.heard(exchanges, spec.slave, now)
     }
 
     /// A sign of life of a slave. Returns it if it has started: what is asked at its start is asked again.
-    pub(super) fn heard(&mut self, talk: &TalkSpec, number: u8, now: Instant) -> Option<u8> {
+    pub(super) fn heard(&mut self, exchanges: &ExchangesSpec, number: u8, now: Instant) -> Option<u8> {
         let slave = self.slaves.entry(number).or_default();
         let has_started =
-            slave.failing.is_some_and(|(since, newest)| newest.saturating_since(since) >= talk.absent);
+            slave.failing.is_some_and(|(since, newest)| newest.saturating_since(since) >= exchanges.absent);
         if slave.presence != Presence::Up {
             (slave.presence, slave.since) = (Presence::Up, now);
         }
         (slave.was_heard, slave.failing, slave.failures) = (true, None, 0);
-        for (watch, row) in self.rows.iter_mut().zip(&talk.rows).filter(|(_, row)| row.slave == number) {
+        for (watch, row) in self.rows.iter_mut().zip(&exchanges.rows).filter(|(_, row)| row.slave == number) {
             watch.is_missed = false;
             watch.starts |= has_started && row.kind == Kind::Start;
         }
@@ -545,19 +574,19 @@ impl TalkWatch {
     }
 
     /// A CANopen node said that it has booted: what is asked at its start is asked again.
-    pub(super) fn booted(&mut self, talk: &TalkSpec, number: u8, now: Instant) {
-        for (watch, row) in self.rows.iter_mut().zip(&talk.rows).filter(|(_, row)| row.slave == number) {
+    pub(super) fn booted(&mut self, exchanges: &ExchangesSpec, number: u8, now: Instant) {
+        for (watch, row) in self.rows.iter_mut().zip(&exchanges.rows).filter(|(_, row)| row.slave == number) {
             watch.starts |= row.kind == Kind::Start;
         }
         self.slaves.entry(number).or_default().started = now;
     }
 
     /// A deadline may have passed: replies that have not come fail.
-    pub(super) fn tick(&mut self, talk: &TalkSpec, heard: Instant, now: Instant) -> Option<u8> {
+    pub(super) fn tick(&mut self, exchanges: &ExchangesSpec, heard: Instant, now: Instant) -> Option<u8> {
         let flight = self.flight.as_ref()?;
-        let spec = &talk.rows[flight.row];
+        let spec = &exchanges.rows[flight.row];
         let until = flight.sent? + spec.timeout;
-        let ends = if flight.is_wrong { until.min(heard + talk.silence) } else { until };
+        let ends = if flight.is_wrong { until.min(heard + exchanges.silence) } else { until };
         if now < ends {
             return None;
         }
@@ -584,10 +613,10 @@ impl TalkWatch {
             self.repeat = Some(flight);
             return None;
         }
-        if !flight.is_wrong && talk.echo == Echo::Auto {
+        if !flight.is_wrong && exchanges.echo == Echo::Auto {
             self.has_echo = None;
         }
-        self.fails(talk, &flight, flight.is_wrong, now)
+        self.fails(exchanges, &flight, flight.is_wrong, now)
     }
 
     /// The exchange whose request is to be repeated.
@@ -601,27 +630,33 @@ impl TalkWatch {
     }
 
     /// The request cannot be repeated. Returns the slave if it has started.
-    pub(super) fn is_not_repeated(&mut self, talk: &TalkSpec, now: Instant) -> Option<u8> {
+    pub(super) fn is_not_repeated(&mut self, exchanges: &ExchangesSpec, now: Instant) -> Option<u8> {
         let mut failed = self.repeat.take()?;
         // It counts as repeated.
         failed.repeated += 1;
-        self.fails(talk, &failed, false, now)
+        self.fails(exchanges, &failed, false, now)
     }
 
-    fn fails(&mut self, talk: &TalkSpec, flight: &Flight, is_wrong: bool, now: Instant) -> Option<u8> {
-        let spec = &talk.rows[flight.row];
+    fn fails(
+        &mut self,
+        exchanges: &ExchangesSpec,
+        flight: &Flight,
+        is_wrong: bool,
+        now: Instant,
+    ) -> Option<u8> {
+        let spec = &exchanges.rows[flight.row];
         self.unanswered = self.unanswered.wrapping_add(1);
         self.rest(spec.pause, now);
         let sent = flight.sent.unwrap_or(now);
-        self.leaves_of(talk, flight, flight.repeated + 1, sent, now);
+        self.leaves_of(exchanges, flight, flight.repeated + 1, sent, now);
         if is_wrong {
             // It said something, and nobody knows what.
-            return self.ended(talk, flight, Ended::Unclear, now);
+            return self.ended(exchanges, flight, Ended::Unclear, now);
         }
         let watch = &mut self.rows[flight.row];
         watch.is_missed = true;
         watch.waits_longer(spec.timeout, now);
-        let is_silent = self.is_silent(talk, spec.slave);
+        let is_silent = self.is_silent(exchanges, spec.slave);
         let slave = self.slaves.entry(spec.slave).or_default();
         let first = flight.timed_out.unwrap_or(sent);
         slave.failing = Some((slave.failing.map_or(first, |(since, _)| since), now));
@@ -634,8 +669,8 @@ impl TalkWatch {
 
     /// Whether a slave is away: each of its exchanges that used to be answered, or two of them, failed since it was
     /// heard; all of them count if none ever was. If one of those has a period, only those with one count.
-    fn is_silent(&self, talk: &TalkSpec, number: u8) -> bool {
-        let rows = talk.rows_of(number).filter(|(_, row)| row.is_answered());
+    fn is_silent(&self, exchanges: &ExchangesSpec, number: u8) -> bool {
+        let rows = exchanges.rows_of(number).filter(|(_, row)| row.is_answered());
         let rows: Vec<_> = rows.map(|(nth, row)| (row.every.is_some(), &self.rows[nth])).collect();
         let was_answered = rows.iter().any(|(_, row)| row.was_answered);
         let mut telling = rows;
@@ -653,23 +688,23 @@ impl TalkWatch {
     pub(super) fn keeps_periods(
         &self,
         port: &PortSpec,
-        talk: &TalkSpec,
+        exchanges: &ExchangesSpec,
         (heard, is_busy): (Instant, bool),
         stalled: impl Fn(Instant) -> Duration,
         now: Instant,
     ) -> Result<u64, Wrong> {
         let mut checked = 0;
         let free = self.free_at.max(heard + port.turnaround).max(self.disturbed_at);
-        for ((nth, row), watch) in talk.rows.iter().enumerate().zip(&self.rows) {
+        for ((nth, row), watch) in exchanges.rows.iter().enumerate().zip(&self.rows) {
             let (Some(every), Some(asked), true) = (row.every, watch.asked, row.is_always_ready()) else {
                 continue;
             };
             let Some(slave) = self.slaves.get(&row.slave) else { continue };
             // Nothing is known of a device that nobody expects an answer of.
             let is_mute = slave.presence == Presence::Unknown
-                && talk.rows_of(row.slave).all(|(_, row)| !row.is_answered());
+                && exchanges.rows_of(row.slave).all(|(_, row)| !row.is_answered());
             let is_calm = slave.presence == Presence::Up && slave.failing.is_none();
-            if !is_calm && !is_mute || self.is_opening(talk, row.slave, slave) {
+            if !is_calm && !is_mute || self.is_opening(exchanges, row.slave, slave) {
                 continue;
             }
             checked += 1;
@@ -682,23 +717,23 @@ impl TalkWatch {
             }
             let from = asked.max(self.disturbed_at).max(ready);
             let waits = now.saturating_since(from);
-            if waits > every.saturating_mul(2) + talk.all_costs + stalled(from) {
-                let what = format!("{}: not asked for {waits}", name(&talk.rows[nth]));
+            if waits > every.saturating_mul(2) + exchanges.all_costs + stalled(from) {
+                let what = format!("{}: not asked for {waits}", name(&exchanges.rows[nth]));
                 return Err((Invariant::Periods, what));
             }
         }
         // A request with values is not sent as long as one is unknown or stale.
         let is_asked = |row: &RowSpec| row.every.is_some() && row.is_always_ready() && row.is_answered();
-        let is_wanted = |number: u8| talk.rows_of(number).any(|(_, row)| is_asked(row));
+        let is_wanted = |number: u8| exchanges.rows_of(number).any(|(_, row)| is_asked(row));
         let are_down = self.slaves.iter().filter(|(_, slave)| slave.presence == Presence::Down);
         for (&number, slave) in are_down.filter(|(number, _)| is_wanted(**number)) {
             checked += 1;
-            let rows = || talk.rows_of(number).map(|(_, row)| row);
+            let rows = || exchanges.rows_of(number).map(|(_, row)| row);
             let longest = rows().map(|row| row.timeout).max().unwrap_or_default();
             let late = rows().map(|row| row.late).max().unwrap_or_default();
             let from = slave.asked.max(self.began);
             let waits = now.saturating_since(from);
-            let costs = talk.all_costs.saturating_mul(2) + late;
+            let costs = exchanges.all_costs.saturating_mul(2) + late;
             if waits > wait(longest, 6).saturating_mul(2) + costs + stalled(from) {
                 return Err((Invariant::Periods, format!("slave {number} is not looked for since {waits}")));
             }
@@ -707,25 +742,25 @@ impl TalkWatch {
     }
 
     /// Whether something may have to come first at the start of a slave.
-    fn is_opening(&self, talk: &TalkSpec, number: u8, slave: &SlaveWatch) -> bool {
+    fn is_opening(&self, exchanges: &ExchangesSpec, number: u8, slave: &SlaveWatch) -> bool {
         let starts = |(nth, row): (usize, &RowSpec)| {
             let watch = &self.rows[nth];
             let was_asked = watch.asked.is_some_and(|asked| asked > slave.started.max(self.began));
             row.at_start && (!was_asked || watch.failures > 0)
         };
         self.opening.get(&number).is_some_and(|opening| !opening.is_empty())
-            || talk.rows_of(number).any(starts)
+            || exchanges.rows_of(number).any(starts)
     }
 
     /// Since when the exchange could be carried out without any failure on the line; `None` if it cannot.
-    pub(super) fn could_ask(&self, talk: &TalkSpec, row: usize) -> Option<Instant> {
-        let number = talk.rows[row].slave;
+    pub(super) fn could_ask(&self, exchanges: &ExchangesSpec, row: usize) -> Option<Instant> {
+        let number = exchanges.rows[row].slave;
         let (slave, watch) = (self.slaves.get(&number)?, &self.rows[row]);
         let is_up = slave.presence == Presence::Up && slave.failing.is_none();
         let is_taken = !watch.is_refused && !watch.is_unconfirmed && watch.failures == 0;
         let since = slave.since.max(self.disturbed_at).max(watch.blocked_until).max(slave.opened);
         let since = since.max(slave.started);
-        (is_up && is_taken && !self.is_opening(talk, number, slave)).then_some(since.max(self.began))
+        (is_up && is_taken && !self.is_opening(exchanges, number, slave)).then_some(since.max(self.began))
     }
 }
 

@@ -1,6 +1,6 @@
 //! The exchanges of a recipe as `check` draws them: what is asked when, its bytes, and its time.
 
-use proto_core::config::{self, AskWhen, Bus, Exchange, GatewayConfig, Port, register_bits};
+use proto_core::config::{self, Bus, Exchange, GatewayConfig, Port, Triggers, register_bits};
 use proto_core::device::Carrier;
 use proto_core::engine::{Plan, Source};
 use proto_core::modbus::rtu::{BROADCAST, Operation, Table};
@@ -14,7 +14,7 @@ use super::text;
 
 /// One exchange, or one block of a slave.
 #[derive(Debug, Serialize)]
-pub(super) struct Talk {
+pub(super) struct ExchangeReport {
     /// From 1.
     number: usize,
     /// `exchange` or `block`.
@@ -23,7 +23,7 @@ pub(super) struct Talk {
     what: String,
     /// When it is asked.
     when: String,
-    frames: Vec<TalkFrame>,
+    frames: Vec<FrameReport>,
     /// On the line, with silences and pause.
     takes_us: u64,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -48,7 +48,7 @@ pub(super) struct Talk {
 }
 
 #[derive(Debug, Serialize)]
-struct TalkFrame {
+struct FrameReport {
     /// `request`, `reply`, `pending` or `refusal`.
     frame: &'static str,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -60,17 +60,17 @@ struct TalkFrame {
 }
 
 /// All exchanges of a port's recipe.
-pub(super) fn all(config: &GatewayConfig, port: &Port, recipe: &DeviceRecipe) -> Vec<Talk> {
+pub(super) fn all(config: &GatewayConfig, port: &Port, recipe: &DeviceRecipe) -> Vec<ExchangeReport> {
     let exchanges =
         config.recipes.get(usize::from(port.recipe)).map(|recipe| config.view().exchanges_of(recipe));
     let pairs = exchanges.unwrap_or(&[]).iter().zip(&recipe.exchanges);
     (1..)
         .zip(pairs)
-        .map(|(number, (exchange, named))| Talk::new(config, port, number, exchange, named))
+        .map(|(number, (exchange, named))| ExchangeReport::new(config, port, number, exchange, named))
         .collect()
 }
 
-impl Talk {
+impl ExchangeReport {
     fn new(
         config: &GatewayConfig,
         port: &Port,
@@ -102,7 +102,7 @@ impl Talk {
             let remote = named.remote && name == "request";
             let carrier = if frame.id.is_some() { Carrier::Can } else { Carrier::Stream };
             let rows = frame::rows(frame, carrier, part);
-            frames.push(TalkFrame {
+            frames.push(FrameReport {
                 frame: name,
                 id: frame.id.map(text::show_id),
                 bytes: len.filter(|_| !remote),
@@ -143,7 +143,7 @@ impl Talk {
     pub(super) fn show(&self) -> String {
         let when = if self.when.is_empty() { String::new() } else { format!(", {}", self.when) };
         let mut report = format!("  {} {}: {}{when}\n", self.kind, self.number, self.what);
-        report.extend(self.frames.iter().map(TalkFrame::show));
+        report.extend(self.frames.iter().map(FrameReport::show));
         let lost = self.without_reply_us.map(|longest| format!(", {} without a reply", show_time(longest)));
         let own = self.percent.map(|percent| format!(", {percent} % of the time"));
         // A network takes what it takes.
@@ -171,7 +171,7 @@ impl Talk {
     }
 }
 
-impl TalkFrame {
+impl FrameReport {
     fn show(&self) -> String {
         let id = self.id.as_ref().map_or(String::new(), |id| format!(", id {id}"));
         let size = match self.bytes {
@@ -227,7 +227,7 @@ fn subject(named: &NamedExchange) -> String {
 }
 
 fn times(exchange: &Exchange, named: &NamedExchange) -> String {
-    let AskWhen { every, start, change, rising } = exchange.when;
+    let Triggers { every, start, change, rising } = exchange.when;
     let mut times = Vec::new();
     times.extend(every.map(|every| format!("every {every}")));
     times.extend(start.then(|| "at the start".to_owned()));
@@ -242,7 +242,7 @@ fn times(exchange: &Exchange, named: &NamedExchange) -> String {
 
 /// The bits of one register that have no field, if others have.
 fn zeroed_bits(config: &GatewayConfig, exchange: &Exchange) -> Option<u16> {
-    let config::Talk::Rtu { operation, written, .. } = exchange.talk else { return None };
+    let config::Transaction::Rtu { operation, written, .. } = exchange.transaction else { return None };
     let is_one =
         matches!(operation, Operation::WriteRegister { .. } | Operation::WriteRegisters { count: 1, .. });
     let bits = !register_bits(written.of(&config.fields));

@@ -6,7 +6,7 @@
 
 use std::collections::BTreeMap;
 
-use proto_core::config::{FieldSpec, GatewayConfig, OutputBinding, Recipe, Rs485, Talk};
+use proto_core::config::{FieldSpec, GatewayConfig, OutputBinding, Recipe, Rs485, Transaction};
 use proto_core::modbus::rtu::Table;
 use proto_core::sysvar::SysVar;
 use proto_core::time::Instant;
@@ -73,7 +73,7 @@ impl ServedSpec {
         let mut blocks = Vec::new();
         let exchanges = config.view().exchanges_of(recipe);
         for exchange in exchanges {
-            let Talk::Served { operation, written, read } = exchange.talk else { return None };
+            let Transaction::Served { operation, written, read } = exchange.transaction else { return None };
             let (table, first, count) = operation.place();
             let frame = |fields: &[FieldSpec]| device_frame(&[], &[], None, fields);
             let mut block = Block { table, first, count, input: None, output: None };
@@ -345,8 +345,8 @@ impl Oracle {
 
 /// Why the blocks of a configuration cannot be judged, if they cannot.
 pub(super) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
-    let served = config.exchanges.iter().filter_map(|exchange| match exchange.talk {
-        Talk::Served { read, written, .. } => Some([read, written]),
+    let served = config.exchanges.iter().filter_map(|exchange| match exchange.transaction {
+        Transaction::Served { read, written, .. } => Some([read, written]),
         _ => None,
     });
     let mut fields = served.flatten().flat_map(|span| span.of(&config.fields));
