@@ -1,10 +1,8 @@
-//! A Modbus RTU master or slave on the line at its standard input and output, for tests with other
-//! programs: `modbus_rtu master` or `modbus_rtu slave ADDRESS`, where both are one pseudoterminal.
+//! A Modbus RTU slave on the line at its standard input and output, for tests with other programs:
+//! `modbus_rtu ADDRESS`, where both are one pseudoterminal.
 //!
-//! It shows `proto_core::modbus::rtu` alone, without an engine. A gateway with such ports needs only a
+//! It shows `proto_core::modbus::rtu::Slave` alone, without an engine. A gateway with such ports needs only a
 //! configuration (docs/configuration.md section 4).
-//!
-//! The master asks slave 5 for registers and coils, writes others, and prints what it hears.
 
 use std::fs::File;
 use std::io::{self, Read, Write};
@@ -13,9 +11,7 @@ use std::sync::mpsc::{self, Receiver, RecvTimeoutError};
 use std::thread;
 use std::time;
 
-use proto_core::modbus::rtu::{
-    Echo, Exchange, MAX_ADU, Master, Operation, Output, Presence, Reply, Slave, Timing, When,
-};
+use proto_core::modbus::rtu::{Echo, MAX_ADU, Slave, Timing};
 use proto_core::modbus::server::RegisterBank;
 use proto_core::modbus::{Coils, Exception, Registers};
 use proto_core::time::{Duration, Instant};
@@ -27,12 +23,11 @@ fn main() -> io::Result<()> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let line = Line::open()?;
     match &arguments.iter().map(String::as_str).collect::<Vec<_>>()[..] {
-        ["master"] => master(line),
-        ["slave", address] => {
+        [address] => {
             let address = address.parse().ok().and_then(|address| Slave::new(TIMING, Echo::Absent, address));
             slave(line, address.ok_or_else(|| io::Error::other("an address of 1..=247 is needed"))?)
         }
-        _ => Err(io::Error::other("usage: modbus_rtu master | modbus_rtu slave ADDRESS")),
+        _ => Err(io::Error::other("usage: modbus_rtu ADDRESS")),
     }
 }
 
@@ -70,93 +65,6 @@ impl Line {
             Err(RecvTimeoutError::Disconnected) => None,
         }
     }
-}
-
-const HOLDING: usize = 0;
-const INPUTS: usize = 1;
-const COUNTER: usize = 6;
-
-fn master(mut line: Line) -> io::Result<()> {
-    let row = |operation, when| Exchange {
-        slave: 5,
-        operation,
-        when,
-        timeout: Duration::from_millis(300),
-        retries: 1,
-    };
-    let cyclic = When::every(Duration::from_millis(100));
-    let table = [
-        row(Operation::ReadHoldingRegisters { address: 0, count: 4 }, cyclic),
-        row(Operation::ReadInputRegisters { address: 10, count: 2 }, cyclic),
-        row(Operation::ReadCoils { address: 0, count: 10 }, cyclic),
-        row(Operation::ReadDiscreteInputs { address: 3, count: 3 }, cyclic),
-        row(Operation::WriteRegisters { address: 20, count: 3 }, When::START),
-        row(Operation::WriteCoils { address: 20, count: 10 }, When::START),
-        row(Operation::WriteRegister { address: 30 }, When::REQUESTED),
-        row(Operation::WriteCoil { address: 31 }, When::START),
-        row(
-            Operation::ReadWriteRegisters {
-                read_address: 20,
-                read_count: 4,
-                write_address: 23,
-                write_count: 1,
-            },
-            When::START,
-        ),
-        // What was written.
-        row(Operation::ReadHoldingRegisters { address: 20, count: 4 }, cyclic),
-        row(Operation::ReadCoils { address: 20, count: 12 }, cyclic),
-        row(Operation::ReadHoldingRegisters { address: 30, count: 1 }, cyclic),
-    ];
-    let mut master = Master::<12>::new(TIMING, Echo::Absent, &table, line.now()).map_err(io::Error::other)?;
-    let (mut out, mut counter, mut presence) = ([0; MAX_ADU], 0_u16, Presence::Unknown);
-    let mut deadline = master.deadline();
-    while let Some(bytes) = line.wait(deadline) {
-        master.received(&bytes, line.now());
-        let values = |exchange: usize, data: &mut [u8]| {
-            match exchange {
-                COUNTER => data.copy_from_slice(&counter.to_be_bytes()),
-                _ => data.iter_mut().zip(0x31..).for_each(|(byte, value)| *byte = value),
-            }
-            true
-        };
-        let mut answered = None;
-        while let Some(output) = master.poll(line.now(), values, &mut out) {
-            match output {
-                Output::Send(len) => line.out.write_all(&out[..len])?,
-                Output::Reply { exchange, reply } => {
-                    match reply {
-                        Reply::Registers(words) => {
-                            eprintln!("{exchange} registers {:?}", words.iter().collect::<Vec<_>>());
-                        }
-                        Reply::Coils(coils) => {
-                            let coils = coils.iter().map(u8::from).collect::<Vec<_>>();
-                            eprintln!("{exchange} coils {coils:?}");
-                        }
-                        Reply::Written => eprintln!("{exchange} written"),
-                    }
-                    answered = Some(exchange);
-                }
-                other => eprintln!("{other:?}"),
-            }
-        }
-        // A value that changes: written at once.
-        if answered == Some(INPUTS) {
-            counter += 1;
-            master.request(COUNTER, line.now());
-        }
-        if answered == Some(HOLDING) {
-            let status = master.slaves().next();
-            eprintln!("status {:?}", status.map(|status| status.counters));
-        }
-        let newest = master.slaves().next().map_or(Presence::Unknown, |status| status.presence);
-        if newest != presence {
-            eprintln!("slave {newest:?}");
-            presence = newest;
-        }
-        deadline = master.deadline();
-    }
-    Ok(())
 }
 
 fn slave(mut line: Line, mut slave: Slave) -> io::Result<()> {

@@ -3,7 +3,7 @@
 use core::hint::black_box;
 
 use proto_core::modbus::rtu::{
-    Adu, Echo, Exchange, MAX_ADU, Master, Operation, Slave, Timing, When, checksum, reply_len, request_len,
+    Adu, Echo, MAX_ADU, Operation, Slave, Timing, checksum, reply_len, request_len,
 };
 use proto_core::time::{Duration, Instant};
 
@@ -13,7 +13,6 @@ use crate::{any, bytes, room};
 pub(crate) fn all() {
     rtu_frames();
     rtu_operations(any(Operation::ReadCoils { address: 0, count: 1 }));
-    rtu_master();
     rtu_slave();
 }
 
@@ -40,31 +39,6 @@ fn rtu_operations(operation: Operation) {
     black_box((operation.function(), operation.reads(), operation.place()));
     black_box((operation.request_len(), operation.reply_len()));
     black_box((operation.written_len(), operation.read_len()));
-}
-
-#[inline(never)]
-fn rtu_master() {
-    static TABLE: [Exchange; 4] = [Exchange {
-        slave: 1,
-        operation: Operation::ReadCoils { address: 0, count: 1 },
-        when: When::START,
-        timeout: Duration::ZERO,
-        retries: 0,
-    }; 4];
-    let (table, now) = (black_box(&TABLE[..]), any(Instant::ZERO));
-    let Ok(mut master) = Master::<4>::new(timing(), any(Echo::Absent), table, now) else { return };
-    let (master, mut out) = (black_box(&mut master), [0; MAX_ADU]);
-    master.received(bytes(), any(now));
-    black_box(master.request(any(3), any(now)));
-    let fill = |nth, data: &mut [u8]| {
-        black_box((nth, data));
-        any(true)
-    };
-    while let Some(output) = master.poll(any(now), fill, &mut out) {
-        black_box(output);
-    }
-    master.slaves().for_each(|slave| _ = black_box(slave));
-    black_box((master.deadline(), master.stray_bytes()));
 }
 
 #[inline(never)]

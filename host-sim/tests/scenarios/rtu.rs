@@ -3,11 +3,9 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::thread::JoinHandle;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use proto_core::modbus::rtu::{
-    Echo, Exchange, MAX_ADU, Master, Operation, Output, Reply, Slave, Timing, When,
-};
+use proto_core::modbus::rtu::{Adu, Echo, MAX_ADU, Slave, Timing};
 use proto_core::modbus::server::RegisterBank;
 use proto_core::modbus::{Coils, Exception, Registers};
 use proto_core::time;
@@ -314,35 +312,30 @@ impl RegisterBank for Inside {
     }
 }
 
-/// A PLC that writes a block and reads another, again and again.
+/// A PLC that writes a block and reads another, in turn. It repeats a request that has no reply.
 struct Plc {
     line: LineClient,
-    clock: Clock,
-    master: Master<2>,
     block: [u16; 3],
     read: Vec<u16>,
-    /// A request was sent and has no reply yet.
-    is_waiting: bool,
+    request: Option<Request>,
+    /// The newest request was a write.
+    has_written: bool,
     /// The line gives a byte when its direction changes.
     is_noisy: bool,
 }
 
+/// A request without a reply yet.
+struct Request {
+    frame: Vec<u8>,
+    at: Instant,
+    received: Vec<u8>,
+}
+
 impl Plc {
+    const TIMEOUT: Duration = Duration::from_millis(500);
+
     fn on(line: LineClient) -> Self {
-        let row = |operation| Exchange {
-            slave: 5,
-            operation,
-            when: When::every(time::Duration::from_millis(200)),
-            timeout: time::Duration::from_millis(500),
-            retries: 1,
-        };
-        let table = [
-            row(Operation::WriteRegisters { address: 100, count: 3 }),
-            row(Operation::ReadInputRegisters { address: 0, count: 1 }),
-        ];
-        let clock = Clock(std::time::Instant::now());
-        let master = Master::new(timing(), Echo::Absent, &table, clock.now()).unwrap();
-        Self { line, clock, master, block: [0; 3], read: Vec::new(), is_waiting: false, is_noisy: false }
+        Self { line, block: [0; 3], read: Vec::new(), request: None, has_written: false, is_noisy: false }
     }
 
     /// Asks until the robot, and what was read last, are as wanted. Then the line is silent.
@@ -356,41 +349,58 @@ impl Plc {
     ) {
         until(what, || {
             gateway.must_run();
-            self.ask();
-            (!self.is_waiting && found(robot, &self.read)).then_some(())
+            self.turn();
+            (self.request.is_none() && found(robot, &self.read)).then_some(())
         });
     }
 
-    fn ask(&mut self) {
-        let mut out = [0; MAX_ADU];
+    /// Sends a request, or looks for the reply to it.
+    fn turn(&mut self) {
         let bytes = self.line.take_some(PIECE);
-        self.master.received(&bytes, self.clock.now());
-        let block = self.block;
-        let values = |_: usize, data: &mut [u8]| {
-            data.iter_mut().zip(block.iter().flat_map(|word| word.to_be_bytes())).for_each(|(d, b)| *d = b);
-            true
+        let Some(request) = &mut self.request else {
+            self.has_written = !self.has_written;
+            let pdu = if self.has_written {
+                let values = self.block.iter().flat_map(|word| word.to_be_bytes());
+                [16, 0, 100, 0, 3, 6].into_iter().chain(values).collect()
+            } else {
+                vec![4, 0, 0, 0, 1]
+            };
+            return self.send(&framed(&pdu));
         };
-        while let Some(output) = self.master.poll(self.clock.now(), values, &mut out) {
-            match output {
-                Output::Send(len) => {
-                    let frame = &out[..len];
-                    if self.is_noisy {
-                        self.line.send(&[&[0], frame, &[0xFF]].concat());
-                    } else {
-                        self.line.send(frame);
-                    }
-                    self.is_waiting = true;
-                }
-                Output::Reply { reply, .. } => {
-                    self.is_waiting = false;
-                    if let Reply::Registers(words) = reply {
-                        self.read = words.iter().collect();
-                    }
-                }
-                _ => {}
+        request.received.extend(bytes);
+        let (len, words) = if self.has_written { (8, None) } else { (7, Some(3..5)) };
+        let reply =
+            request.received.windows(len).find(|bytes| bytes[0] == SLAVE && Adu::parse(bytes).is_ok());
+        if let Some(reply) = reply {
+            if let Some(words) = words {
+                self.read =
+                    reply[words].chunks(2).map(|word| u16::from_be_bytes([word[0], word[1]])).collect();
             }
+            self.request = None;
+        } else if request.at.elapsed() > Self::TIMEOUT {
+            let frame = std::mem::take(&mut request.frame);
+            self.send(&frame);
         }
     }
+
+    fn send(&mut self, frame: &[u8]) {
+        if self.is_noisy {
+            self.line.send(&[&[0], frame, &[0xFF]].concat());
+        } else {
+            self.line.send(frame);
+        }
+        self.request = Some(Request { frame: frame.to_vec(), at: Instant::now(), received: Vec::new() });
+    }
+}
+
+/// The gateway's address.
+const SLAVE: u8 = 5;
+
+/// A request to the gateway.
+fn framed(pdu: &[u8]) -> Vec<u8> {
+    let mut frame = [0; MAX_ADU];
+    let len = Adu { address: SLAVE, pdu }.encode(&mut frame).unwrap();
+    frame[..len].to_vec()
 }
 
 /// Longest wait for bytes, so that silences are noticed.

@@ -1,7 +1,5 @@
-//! Modbus RTU in virtual time: a master and slaves on one line, with what goes wrong on real ones.
+//! A Modbus RTU slave in virtual time, with what goes wrong on real lines.
 
-mod faults;
-mod line;
-mod periods;
+mod bank;
 mod properties;
 mod stray;

@@ -6,7 +6,7 @@ use proptest::prelude::*;
 use proto_core::modbus::rtu::{Echo, MAX_ADU, Slave, Timing};
 use proto_core::time::Instant;
 
-use crate::line::{Bank, MS};
+use crate::bank::{Bank, MS};
 
 const TIMING: Timing = Timing::new(115_200, 11);
 const OWN: u8 = 17;

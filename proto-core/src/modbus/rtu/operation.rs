@@ -10,7 +10,7 @@ use super::super::pdu::{
     MAX_READ_COILS, MAX_READ_REGISTERS, MAX_READ_WRITE_REGISTERS, MAX_WRITE_COILS, MAX_WRITE_REGISTERS,
     function,
 };
-use super::super::values::{Coils, Registers, last_mask, packed_len};
+use super::super::values::{last_mask, packed_len};
 use super::adu::{BROADCAST, MAX_ADU, is_right, seal};
 
 /// A function with its addresses and counts, and without values.
@@ -120,18 +120,6 @@ pub enum Table {
     HoldingRegisters,
     /// Registers.
     InputRegisters,
-}
-
-/// The content of a reply.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[cfg_attr(feature = "defmt", derive(defmt::Format))]
-pub enum Reply<'a> {
-    /// FC 1 and 2: as many coils or inputs as were asked for.
-    Coils(Coils<'a>),
-    /// FC 3, 4 and 23: as many registers as were asked for.
-    Registers(Registers<'a>),
-    /// FC 5, 6, 15, 16 and 22: the slave has taken what was written.
-    Written,
 }
 
 impl Operation {
@@ -332,21 +320,6 @@ impl Operation {
         }
         seal(out, self.request_len().saturating_sub(2))
     }
-
-    /// The content of a reply's frame that [`Expected::probe`] has found.
-    pub(super) fn reply<'a>(&self, frame: &'a [u8]) -> Option<Reply<'a>> {
-        let data = |len: usize| frame.get(3..)?.get(..len);
-        let len = self.reply_data_len().unwrap_or(0);
-        match *self {
-            Self::ReadCoils { count, .. } | Self::ReadDiscreteInputs { count, .. } => {
-                Coils::new(data(len)?, count).map(Reply::Coils)
-            }
-            Self::ReadHoldingRegisters { .. }
-            | Self::ReadInputRegisters { .. }
-            | Self::ReadWriteRegisters { .. } => Registers::new(data(len)?).map(Reply::Registers),
-            _ => Some(Reply::Written),
-        }
-    }
 }
 
 /// The byte count and the zeroed place of `len` bytes of data behind it.
@@ -428,11 +401,6 @@ impl Expected {
     /// The bytes behind the function that are those of the request, of a reply without data.
     fn repeated<'a>(&self, head: &'a [u8; 6]) -> &'a [u8] {
         head.get(..repeated_len(self.function)).unwrap_or(head)
-    }
-
-    /// Whether `bytes` begin with the slave and the function that were asked.
-    pub(super) fn is_from(&self, bytes: &[u8]) -> bool {
-        bytes.starts_with(&[self.slave, self.function])
     }
 
     /// Length of the frame that `bytes` begin, if it is not refused.

@@ -5,8 +5,8 @@ use super::adu::seal;
 use super::operation::{Expected, Probe};
 use super::*;
 use crate::modbus::pdu::EncodeError;
-use crate::modbus::{Coils, Exception, Registers};
-use crate::time::{Duration, Instant};
+use crate::modbus::Exception;
+use crate::time::Duration;
 
 /// The example of the standard's appendix on the CRC: slave 2, function 7.
 #[test]
@@ -140,12 +140,6 @@ fn requests_and_replies_are_the_standards_examples() {
         let refused = framed(17, &[operation.function() | 0x80, 0x02]);
         assert_eq!(expected.probe(&refused), Probe::Refused(Exception::IllegalDataAddress));
         assert_eq!(reply_len(&refused), FrameLen::Known(5));
-        let content = match reply_pdu {
-            [1 | 2, _, packed @ ..] => Reply::Coils(Coils::new(packed, request_pdu[4].into()).unwrap()),
-            [3 | 4 | 23, _, words @ ..] => Reply::Registers(Registers::new(words).unwrap()),
-            _ => Reply::Written,
-        };
-        assert_eq!(operation.reply(&reply), Some(content));
         assert!(Expected::of(&operation, &request(&operation, 0, data)).is_none(), "a broadcast");
     }
 }
@@ -192,30 +186,7 @@ fn silences_are_the_standards() {
 }
 
 #[test]
-fn a_table_that_cannot_be_asked_is_refused() {
-    let row = |slave, operation| Exchange {
-        slave,
-        operation,
-        when: When::REQUESTED,
-        timeout: Duration::from_millis(10),
-        retries: 0,
-    };
-    let refused = |table: &[Exchange]| {
-        Master::<40>::new(Timing::new(9_600, 11), Echo::Absent, table, Instant::ZERO).err()
-    };
-    let read = Operation::ReadCoils { address: 0, count: 1 };
-    let all: Vec<Exchange> = (1..=32).map(|slave| row(slave, read)).collect();
-    let write_all = row(0, Operation::WriteCoil { address: 0 });
-    assert_eq!(refused(&[&all[..], &[write_all]].concat()), None);
-    assert_eq!(refused(&[&all[..], &[row(33, read)]].concat()), Some(TableError::TooManySlaves));
-    assert_eq!(
-        refused(&[&[write_all], &all[..], &[row(33, read)]].concat()),
-        Some(TableError::TooManySlaves)
-    );
-    let many = TableError::TooManyExchanges { needed: 41, available: 40 };
-    assert_eq!(refused(&vec![row(1, read); 41]), Some(many));
-    assert_eq!(refused(&[row(248, read)]), Some(TableError::Slave { exchange: 0, address: 248 }));
-    assert_eq!(refused(&[all[0], row(0, read)]), Some(TableError::BroadcastRead { exchange: 1 }));
+fn a_count_is_within_the_functions_limits() {
     let limits = [
         (Operation::ReadCoils { address: 0, count: 2001 }, 2001, 2000),
         (Operation::ReadDiscreteInputs { address: 0, count: 0 }, 0, 2000),
@@ -227,10 +198,9 @@ fn a_table_that_cannot_be_asked_is_refused() {
         (read_write(0, 0), 0, 121),
     ];
     for (operation, count, max) in limits {
-        let error = CountError { count, max };
-        assert_eq!(refused(&[row(1, operation)]), Some(TableError::Count { exchange: 0, error }));
+        assert_eq!(operation.check(), Err(CountError { count, max }));
     }
-    assert_eq!(refused(&[row(1, read_write(125, 121))]), None);
+    assert_eq!(read_write(125, 121).check(), Ok(()));
 }
 
 fn read_write(read_count: u16, write_count: u16) -> Operation {

@@ -3,11 +3,6 @@
 //! In: the present instant. Out: whether the period is due, and how many whole periods went by
 //! unserved. Refuses to know what is done each period.
 
-mod turns;
-
-pub use turns::Presence;
-pub(crate) use turns::{Peer, Row, Taken, Turns};
-
 use crate::time::{Duration, Instant};
 
 /// A period with an absolute grid: the n-th deadline is `start + n * period`, however late each
@@ -49,6 +44,30 @@ impl Grid {
         let missed = late.checked_div(self.period.as_micros()).unwrap_or(0);
         self.next += self.period.saturating_mul(missed.saturating_add(1));
         Some(missed)
+    }
+}
+
+/// Whether a slave answers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
+pub enum Presence {
+    /// It has not been asked yet.
+    Unknown,
+    /// It answered when it was last asked.
+    Up,
+    /// It did not answer when it was last asked.
+    Down,
+}
+
+impl Presence {
+    /// Its name in statistics: `unknown`, `up` or `down`.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Unknown => "unknown",
+            Self::Up => "up",
+            Self::Down => "down",
+        }
     }
 }
 
