@@ -4,8 +4,8 @@ use std::vec::Vec;
 use super::adu::seal;
 use super::operation::{Expected, Probe};
 use super::*;
-use crate::modbus::pdu::EncodeError;
 use crate::modbus::Exception;
+use crate::modbus::pdu::EncodeError;
 use crate::time::Duration;
 
 /// The example of the standard's appendix on the CRC: slave 2, function 7.
