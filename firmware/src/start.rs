@@ -18,9 +18,9 @@ use firmware::tasks::console::{self, CONNECTIONS, Console, NodeView};
 use firmware::tasks::edge::{self, Cannot, Edge};
 use firmware::tasks::fair::Fair;
 use firmware::tasks::gateway::{Gateway, MAX_LINKS};
-use firmware::tasks::keeper::{self, Desk};
 use firmware::tasks::led::Condition;
 use firmware::tasks::link::{Buffers, Endpoint};
+use firmware::tasks::store::{self, StoreHandle};
 use firmware::tasks::time::{self, WallClock};
 use firmware::tasks::watchdog::{Pulse, TaskName};
 use firmware::tasks::{can, led, link, serial, watchdog};
@@ -65,7 +65,7 @@ pub(crate) fn start(spawner: Spawner, mut board: Board) -> Tasks {
     static OVERLAY: ConstStaticCell<Overlay> = ConstStaticCell::new(Overlay::ZEROED);
     let (gateway, overlay) = (GATEWAY.take(), OVERLAY.take());
     let mut kept = open_store(&mut board);
-    let mut work = keeper::Work::default();
+    let mut work = store::Work::default();
     let mut failure = None;
     let config = overlay.configuration();
     let loaded = load(&mut board, kept.as_deref_mut(), gateway, config, &mut work, &mut failure);
@@ -77,12 +77,12 @@ pub(crate) fn start(spawner: Spawner, mut board: Board) -> Tasks {
     let telling = make_edge(kept.as_deref_mut(), gateway, loaded.is_ok().then_some(&*config), board.seed());
     let key = kept.as_ref().and_then(|kept| kept.access_key());
     let slots = board.slots();
-    let desk = kept.and_then(|kept| open_desk(&tasks, gateway, kept, slots, work, failure));
+    let store = kept.and_then(|kept| start_store_task(&tasks, gateway, kept, slots, work, failure));
     let ran = loaded.and_then(|_| run_ports(&tasks, &mut board, gateway, &wiring));
     if ran.is_err() {
         wiring.links.clear();
     }
-    let connected = connect(&tasks, &mut board, gateway, desk, key, &wiring, telling, overlay.links());
+    let connected = connect(&tasks, &mut board, gateway, store, key, &wiring, telling, overlay.links());
     let console = connected.as_ref().ok().copied().flatten();
     let refused_why = ran.err().or(connected.err());
     let shown = Shown { gateway: refused_why.is_none().then_some(gateway), console };
@@ -150,26 +150,26 @@ fn make_edge(
     telling
 }
 
-/// Starts the keeper.
+/// Starts the store task.
 #[inline(never)]
-fn open_desk(
+fn start_store_task(
     tasks: &Tasks,
     gateway: &'static Gateway,
     kept: &'static mut Kept<Flash>,
     slots: Site<BoardSlot>,
-    work: keeper::Work<'static>,
+    work: store::Work<'static>,
     failure: Option<Refused>,
-) -> Option<&'static Desk> {
+) -> Option<&'static StoreHandle> {
     static UPDATES: StaticCell<Updates<BoardSlot>> = StaticCell::new();
     let updates = UPDATES.init(Updates::new(slots)?);
     static IMAGE: ConstStaticCell<[u8; MAX_IMAGE]> = ConstStaticCell::new([0; MAX_IMAGE]);
-    static DESK: StaticCell<Desk> = StaticCell::new();
-    let desk: &'static Desk = DESK.init_with(|| Desk::new(IMAGE.take()));
+    static HANDLE: StaticCell<StoreHandle> = StaticCell::new();
+    let store: &'static StoreHandle = HANDLE.init_with(|| StoreHandle::new(IMAGE.take()));
     if let Some(failure) = failure {
-        desk.failed(&failure);
+        store.failed(&failure);
     }
-    tasks.spawn(TaskName::Keeper, |pulse| keep(pulse, gateway, desk, kept, updates, work));
-    Some(desk)
+    tasks.spawn(TaskName::Store, |pulse| store_task(pulse, gateway, store, kept, updates, work));
+    Some(store)
 }
 
 /// Starts tasks. All tasks are started through it, so the watchdog knows all of them.
@@ -292,7 +292,7 @@ fn connect(
     tasks: &Tasks,
     board: &mut Board,
     gateway: &'static Gateway,
-    desk: Option<&'static Desk>,
+    store: Option<&'static StoreHandle>,
     key: Option<[u8; 16]>,
     wiring: &Wiring,
     telling: Telling,
@@ -316,16 +316,16 @@ fn connect(
         });
     }
     let view = telling.view;
-    if let (Some(node), Some(desk)) = (telling.node, desk) {
+    if let (Some(node), Some(store)) = (telling.node, store) {
         if let Some(server) = view.document.and_then(|document| document.time_server.as_ref()) {
             let (host, port) = (server.0.as_str(), server.1);
             tasks.spawn(TaskName::Time, |pulse| {
                 time_server(pulse, stack, host, port, view.clock, telling.seed)
             });
         }
-        tasks.spawn(TaskName::Edge, |pulse| edge_node(pulse, gateway, stack, desk, view, node));
+        tasks.spawn(TaskName::Edge, |pulse| edge_node(pulse, gateway, stack, store, view, node));
     }
-    Ok(start_console(tasks, board, gateway, desk, key, view, name, stack, memory))
+    Ok(start_console(tasks, board, gateway, store, key, view, name, stack, memory))
 }
 
 /// Starts the console; `None` if the board cannot have one.
@@ -335,7 +335,7 @@ fn start_console(
     tasks: &Tasks,
     board: &mut Board,
     gateway: &'static Gateway,
-    desk: Option<&'static Desk>,
+    store: Option<&'static StoreHandle>,
     key: Option<[u8; 16]>,
     node: NodeView,
     name: heapless::String<{ identity::NAME }>,
@@ -349,7 +349,7 @@ fn start_console(
     info!("name {}", name.as_str());
     static CONSOLE: StaticCell<Console> = StaticCell::new();
     let console: &'static Console =
-        CONSOLE.init_with(|| Console::new(gateway, desk, PORTS, node, name, key, secret));
+        CONSOLE.init_with(|| Console::new(gateway, store, PORTS, node, name, key, secret));
     for nth in 0..CONNECTIONS {
         let buffers = console::Buffers::take(&mut memory).expect("there is room for CONNECTIONS");
         tasks.spawn(TaskName::Console(nth as u8), |pulse| connection(pulse, console, stack, buffers));
@@ -467,11 +467,11 @@ async fn edge_node(
     pulse: &'static Pulse,
     gateway: &'static Gateway,
     stack: Stack<'static>,
-    desk: &'static Desk,
+    store: &'static StoreHandle,
     view: NodeView,
     node: &'static mut edge::Node,
 ) -> ! {
-    pulse.run(pin!(node.run(gateway, pulse, stack, desk, view.edge, view.clock))).await
+    pulse.run(pin!(node.run(gateway, pulse, stack, store, view.edge, view.clock))).await
 }
 
 /// Asks a server for UTC.
@@ -512,15 +512,15 @@ async fn status(pulse: &'static Pulse, gateway: &'static Gateway) -> ! {
 
 /// Changes the store while a configuration runs, and restarts the board for another one.
 #[embassy_executor::task]
-async fn keep(
+async fn store_task(
     pulse: &'static Pulse,
     gateway: &'static Gateway,
-    desk: &'static Desk,
+    store: &'static StoreHandle,
     kept: &'static mut Kept<Flash>,
     updates: &'static mut Updates<BoardSlot>,
-    work: keeper::Work<'static>,
+    work: store::Work<'static>,
 ) -> ! {
-    pulse.run(pin!(keeper::run(gateway, pulse, desk, kept, updates, work))).await;
+    pulse.run(pin!(store::run(gateway, pulse, store, kept, updates, work))).await;
     cortex_m::peripheral::SCB::sys_reset()
 }
 
@@ -541,6 +541,6 @@ async fn refused(pulse: &'static Pulse, reason: Refused) -> ! {
 const SOCKETS: usize = MAX_LINKS + CONNECTIONS + 4;
 /// Interval of that log line.
 const REPEAT: Duration = Duration::from_secs(10);
-/// A task for each port, link and connection, and: engine, network, address, status, LED, refused, keeper, button,
+/// A task for each port, link and connection, and: engine, network, address, status, LED, refused, store, button,
 /// edge node, time, the board's own.
 const MAX_TASKS: usize = SERIAL_PORTS + CAN_PORTS + MAX_LINKS + CONNECTIONS + 11;

@@ -4,7 +4,7 @@ use firmware::fmt::Text;
 use firmware::kept::{self, EndedName, Kept, RoleName};
 use firmware::platform::{self, Board as _, NoDevice};
 use firmware::tasks::gateway::Gateway;
-use firmware::tasks::keeper;
+use firmware::tasks::store;
 use firmware::{error, info};
 use proto_core::config::{GatewayConfig, image};
 use recipe_store::Role;
@@ -39,7 +39,7 @@ impl core::fmt::Display for Refused {
 
 /// Runs the first configuration that can run: the image that was put on the board since the last start; of the store
 /// the one on trial, the live one, the one before; or else the image on the board, which was run before. Returns the
-/// length of its image, or why none runs; leaves to the keeper what is to be done with the store, and in `failure` why
+/// length of its image, or why none runs; leaves to the store task what is to be done with the store, and in `failure` why
 /// the first one that was tried does not run.
 ///
 /// Nothing is written but the start of a trial, so that the start takes no longer than without a store.
@@ -51,7 +51,7 @@ pub(super) fn load(
     kept: Option<&mut Kept<Flash>>,
     gateway: &mut Gateway,
     config: &mut GatewayConfig,
-    work: &mut keeper::Work<'static>,
+    work: &mut store::Work<'static>,
     failure: &mut Option<Refused>,
 ) -> Result<usize, Refused> {
     let own = board.configuration().map_err(Refused::Storage).map(whole);

@@ -1,7 +1,7 @@
 //! The edge node of Sparkplug: tells a broker what the gateway knows (docs/fleet.md section 6).
 //!
 //! In: the status of the gateway, in parts between which the other tasks run; bytes of the broker; UTC. Out: bytes for
-//! the broker, the number of each session for the keeper, a view for the console. What is told when is decided in
+//! the broker, the number of each session for the store task, a view for the console. What is told when is decided in
 //! `recipe_sparkplug`. It has a socket and memory of its own and never waits for the engine: a broker that is away,
 //! slow or hostile costs the cell nothing.
 
@@ -23,8 +23,8 @@ use recipe_sparkplug::node::{Counters, EdgeNode, Failure, Input, MIN_BUFFER, Nod
 use recipe_sparkplug::value::Value;
 
 use super::gateway::Gateway;
-use super::keeper::Desk;
 use super::link::resolve;
+use super::store::StoreHandle;
 use super::time::WallClock;
 use super::watchdog::Pulse;
 use crate::clock::now;
@@ -199,7 +199,7 @@ impl Node {
         gateway: &Gateway,
         pulse: &Pulse,
         stack: Stack<'_>,
-        desk: &Desk,
+        store: &StoreHandle,
         edge: &Edge,
         clock: &WallClock,
     ) -> ! {
@@ -209,7 +209,7 @@ impl Node {
         let mut driver = Driver {
             gateway,
             pulse,
-            desk,
+            store,
             edge,
             clock,
             catalog,
@@ -266,7 +266,7 @@ enum Next {
 struct Driver<'a> {
     gateway: &'a Gateway,
     pulse: &'a Pulse,
-    desk: &'a Desk,
+    store: &'a StoreHandle,
     edge: &'a Edge,
     clock: &'a WallClock,
     catalog: &'a Catalog,
@@ -310,7 +310,7 @@ impl Driver<'_> {
                 Output::Sleep { until } => return Next::Sleep { until },
                 Output::Busy => true,
                 Output::Keep { bd_seq } => {
-                    if !self.pulse.idle(pin!(self.desk.keep_session(bd_seq))).await {
+                    if !self.pulse.idle(pin!(self.store.keep_session(bd_seq))).await {
                         warn!("edge node: the number of the session cannot be kept");
                     }
                     true

@@ -7,12 +7,12 @@ pub(crate) mod control;
 pub mod edge;
 pub mod fair;
 pub mod gateway;
-pub mod keeper;
 pub mod led;
 pub mod link;
 mod notify;
 pub mod serial;
 pub mod status;
+pub mod store;
 pub mod time;
 pub mod watchdog;
 

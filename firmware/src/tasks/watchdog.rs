@@ -42,7 +42,7 @@ pub enum TaskName {
     /// A task of the board's own.
     Board(u8),
     /// Changes the store.
-    Keeper,
+    Store,
     /// A connection of the console.
     Console(u8),
     /// Looks at the button.
@@ -75,7 +75,7 @@ impl TaskName {
             Self::Link(LinkKind::Urgent) => (16, 0),
             Self::Link(LinkKind::ModbusDevice { port }) => (23, port.0),
             Self::Link(_) => (17, 0),
-            Self::Keeper => (18, 0),
+            Self::Store => (18, 0),
             Self::Console(number) => (19, number),
             Self::Button => (20, 0),
             Self::Edge => (21, 0),
@@ -104,7 +104,7 @@ impl TaskName {
             Self::Refused,
             Self::Board(number),
             Self::Link(LinkKind::Urgent),
-            Self::Keeper,
+            Self::Store,
             Self::Console(number),
             Self::Button,
             Self::Edge,
@@ -128,7 +128,7 @@ impl fmt::Display for TaskName {
             Self::Led => f.write_str("LED"),
             Self::Refused => f.write_str("refused"),
             Self::Board(number) => write!(f, "board {number}"),
-            Self::Keeper => f.write_str("keeper"),
+            Self::Store => f.write_str("store"),
             Self::Console(number) => write!(f, "console {number}"),
             Self::Button => f.write_str("button"),
             Self::Edge => f.write_str("edge node"),

@@ -18,7 +18,7 @@ use super::connection::Request;
 use super::{Console, edge};
 use crate::clock::now;
 use crate::fmt::Text;
-use crate::tasks::keeper::{Ask, Failed, Turn};
+use crate::tasks::store::{Ask, Failed, Turn};
 use crate::warn;
 
 impl Console {
@@ -92,7 +92,7 @@ impl Console {
         Some(Reply::error(room, Status::UNPROCESSABLE, missing))
     }
 
-    /// What the keeper is to be asked for; or the answer, if it is not.
+    /// What the store task is to be asked for; or the answer, if it is not.
     #[inline(never)]
     fn prepare<'a>(&'a self, room: &mut [u8], request: Request<'a>) -> Result<(Ask, Turn<'a>), Reply> {
         let ask = match request.arguments {
@@ -117,8 +117,8 @@ impl Console {
             }
             Arguments::None => return put(room, request),
         };
-        let Some(desk) = self.desk else { return Err(nothing_kept(room)) };
-        desk.take().map(|turn| (ask, turn)).ok_or_else(|| busy(room))
+        let Some(store) = self.store else { return Err(nothing_kept(room)) };
+        store.take().map(|turn| (ask, turn)).ok_or_else(|| busy(room))
     }
 
     /// Takes a key, if the button was pressed.
@@ -128,9 +128,11 @@ impl Console {
         key: [u8; KEY_LEN],
         request: &Request<'_>,
     ) -> Result<(Ask, Turn<'_>), Reply> {
-        let Some(desk) = self.desk else { return Err(nothing_kept(room)) };
+        let Some(store) = self.store else { return Err(nothing_kept(room)) };
         // Before the claim, which waits for its end otherwise. A board that reads its store takes no key yet.
-        let Some(turn) = desk.take().filter(|_| desk.look(|_| ()).is_some()) else { return Err(busy(room)) };
+        let Some(turn) = store.take().filter(|_| store.look(|_| ()).is_some()) else {
+            return Err(busy(room));
+        };
         let mut claim = self.claim.get();
         let offered = claim.offered(now());
         self.claim.set(claim);

@@ -19,7 +19,7 @@ use super::arguments::Arguments;
 use super::change::{busy, nothing_kept};
 use super::{Console, MAX_TIME, OneMore, PORT};
 use crate::clock::now;
-use crate::tasks::keeper::Turn;
+use crate::tasks::store::Turn;
 use crate::tasks::watchdog::Pulse;
 
 /// The memory of a connection.
@@ -48,7 +48,7 @@ pub(super) struct Request<'a> {
     pub(super) head: Head<'a>,
     pub(super) operation: Operation,
     pub(super) arguments: Arguments,
-    /// The image that was sent, at the desk: its length, and the right to store it.
+    /// The image that was sent, in the buffer of the store handle: its length, and the right to store it.
     pub(super) image: Option<(usize, Turn<'a>)>,
     pub(super) peer: Ipv4Addr,
 }
@@ -187,12 +187,12 @@ impl Console {
         }
         let operation = admitted.operation;
         let mut request = Request { head, operation, arguments: Arguments::None, image: None, peer };
-        if let Some(desk) = self.desk {
-            desk.was_asked();
+        if let Some(store) = self.store {
+            store.was_asked();
         }
         if matches!(operation, Operation::PutConfig | Operation::PutUpdate | Operation::PutEdge) {
-            let Some(desk) = self.desk else { return Err(nothing_kept(line.room)) };
-            let Some(turn) = desk.take() else { return Err(busy(line.room)) };
+            let Some(store) = self.store else { return Err(nothing_kept(line.room)) };
+            let Some(turn) = store.take() else { return Err(busy(line.room)) };
             // The guard has limited it.
             request.image = Some((usize::try_from(admitted.length).unwrap_or(0), turn));
         }

@@ -12,7 +12,7 @@ use super::change::busy;
 use super::connection::Request;
 use crate::fmt::Text;
 use crate::tasks::edge::View;
-use crate::tasks::keeper::{Ask, Turn};
+use crate::tasks::store::{Ask, Turn};
 use crate::warn;
 
 impl Console {
@@ -97,7 +97,7 @@ impl Console {
     }
 }
 
-/// What the keeper is asked for with the settings that were sent, and whether they tell anything; or the answer.
+/// What the store task is asked for with the settings that were sent, and whether they tell anything; or the answer.
 #[inline(never)]
 pub(super) fn settings<'a>(room: &mut [u8], request: Request<'a>) -> Result<(Ask, Turn<'a>), Reply> {
     let restart = match request.head.query("restart") {
@@ -114,7 +114,7 @@ pub(super) fn settings<'a>(room: &mut [u8], request: Request<'a>) -> Result<(Ask
     }
 }
 
-/// Not inlined, so that its stack frame is free when the keeper is asked.
+/// Not inlined, so that its stack frame is free when the store task is asked.
 #[inline(never)]
 fn read(bytes: &[u8]) -> Result<bool, DocumentError> {
     Document::empty().decode(bytes)

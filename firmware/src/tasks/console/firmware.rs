@@ -12,17 +12,17 @@ use recipe_update::{Header, Slot};
 use super::Console;
 use super::answer::{Reply, Room};
 use super::change::{busy, nothing_kept};
-use crate::tasks::keeper::{Desk, FirmwareView};
+use crate::tasks::store::{FirmwareView, StoreHandle};
 use crate::update::{Incoming, Stage, build_of, whole_length};
 
 impl Console {
     /// The document, with this status.
     #[inline(never)]
     pub(super) fn firmware(&self, room: &mut [u8], status: Status) -> Reply {
-        if self.desk.is_none() {
+        if self.store.is_none() {
             return nothing_kept(room);
         }
-        match self.desk.and_then(Desk::firmware) {
+        match self.store.and_then(StoreHandle::firmware) {
             Some(view) => Reply::new(room, status, Kind::Json, |out| write(out, &view)),
             // The store is being read or moved.
             None => busy(room),

@@ -1,6 +1,6 @@
 //! The console: the API of docs/api.md over HTTP.
 //!
-//! In: connections, a button. Out: answers, and what the keeper is asked for. Decides nothing about who may do what,
+//! In: connections, a button. Out: answers, and what the store task is asked for. Decides nothing about who may do what,
 //! which is `recipe_api`'s, and knows no flash. There are as many tasks as connections ([`CONNECTIONS`]); each serves
 //! one request and closes. The engine is looked at in pieces: for each piece of a document a task borrows it, writes
 //! at most a port or 32 variables into its own memory, and lets the others run before the piece is sent. So nobody
@@ -29,7 +29,7 @@ use recipe_sparkplug::document::Document;
 
 use super::edge::Edge;
 use super::gateway::Gateway;
-use super::keeper::Desk;
+use super::store::StoreHandle;
 use super::time::WallClock;
 use super::watchdog::Pulse;
 use crate::clock::now;
@@ -49,7 +49,7 @@ pub const PORT: u16 = 80;
 pub struct Console {
     gateway: &'static Gateway,
     /// `None` if the board keeps nothing.
-    desk: Option<&'static Desk>,
+    store: Option<&'static StoreHandle>,
     /// Those of the board.
     ports: Ports,
     node: NodeView,
@@ -96,7 +96,7 @@ impl Console {
     /// For this gateway, which may run nothing. `secret` is random.
     pub fn new(
         gateway: &'static Gateway,
-        desk: Option<&'static Desk>,
+        store: Option<&'static StoreHandle>,
         ports: Ports,
         node: NodeView,
         name: String<NAME>,
@@ -105,7 +105,7 @@ impl Console {
     ) -> Self {
         Self {
             gateway,
-            desk,
+            store,
             ports,
             node,
             name,

@@ -24,7 +24,7 @@ use super::{Console, MAX_ANSWER, MAX_TIME};
 use crate::clock::now;
 use crate::journal;
 use crate::platform::Ports;
-use crate::tasks::keeper::{Desk, NOTHING, PART};
+use crate::tasks::store::{NOTHING, PART, StoreHandle};
 
 impl Console {
     /// Carries out a request.
@@ -75,7 +75,7 @@ impl Console {
             if let Claim::Open { until } = claim {
                 write!(out, ",\"claim_left_s\":{}", until.saturating_since(now()).as_millis() / 1_000)?;
             }
-            if let Some(running) = self.desk.and_then(Desk::running) {
+            if let Some(running) = self.store.and_then(StoreHandle::running) {
                 write!(out, ",\"revision\":{running}")?;
             }
             let Ports { lines, buses } = self.ports;
@@ -106,10 +106,10 @@ impl Console {
     /// The revisions, and what happens to them; `changed` is the one that a change was about.
     #[inline(never)]
     pub(super) fn revisions(&self, room: &mut [u8], status: Status, changed: Option<u32>) -> Reply {
-        let Some(desk) = self.desk else { return nothing_kept(room) };
-        let reply = desk.look(|revisions| {
+        let Some(store) = self.store else { return nothing_kept(room) };
+        let reply = store.look(|revisions| {
             let etag = changed.and_then(|number| revisions.revision(number));
-            let write = |out: &mut Room<'_>| write_revisions(out, desk, revisions, changed);
+            let write = |out: &mut Room<'_>| write_revisions(out, store, revisions, changed);
             Reply::new(room, status, Kind::Json, write).about(etag)
         });
         // The store is being read, or an image is taken over.
@@ -118,7 +118,7 @@ impl Console {
 
     /// The image of what runs, or of the one that was asked for.
     async fn config(&self, line: &mut Line<'_, '_>, request: &Request<'_>) -> Result<Outcome, Ended> {
-        let (desk, revision) = match self.asked_revision(line.room, request) {
+        let (store, revision) = match self.asked_revision(line.room, request) {
             Ok(found) => found,
             Err(reply) => return Ok(Outcome::Reply(reply)),
         };
@@ -127,7 +127,7 @@ impl Console {
         }
         let mut offset = 0;
         loop {
-            let len = desk.part(revision.number, offset, line.room).await.ok_or(Ended::Gone)?;
+            let len = store.part(revision.number, offset, line.room).await.ok_or(Ended::Gone)?;
             line.chunk(len, Instant::now() + MAX_TIME).await?;
             offset = offset.saturating_add(PART);
             if len < PART {
@@ -142,16 +142,16 @@ impl Console {
         &self,
         room: &mut [u8],
         request: &Request<'_>,
-    ) -> Result<(&'static Desk, Revision), Reply> {
-        let Some(desk) = self.desk else { return Err(nothing_kept(room)) };
+    ) -> Result<(&'static StoreHandle, Revision), Reply> {
+        let Some(store) = self.store else { return Err(nothing_kept(room)) };
         let number = match request.head.query("revision").map(str::parse) {
-            None => desk.running(),
+            None => store.running(),
             Some(Ok(number)) => Some(number),
             Some(Err(_)) => {
                 return Err(Reply::error(room, Status::BAD_REQUEST, "revision must be a number"));
             }
         };
-        let revision = number.and_then(|number| desk.look(|kept| kept.revision(number)).flatten());
+        let revision = number.and_then(|number| store.look(|kept| kept.revision(number)).flatten());
         let Some(revision) = revision.filter(|revision| *revision != NOTHING) else {
             return Err(Reply::error(room, Status::NOT_FOUND, "there is no such revision"));
         };
@@ -159,7 +159,7 @@ impl Console {
             let unchanged = Reply::new(room, Status::NOT_MODIFIED, Kind::Image, |_| Ok(()));
             return Err(unchanged.about(Some(revision)));
         }
-        Ok((desk, revision))
+        Ok((store, revision))
     }
 }
 
@@ -211,7 +211,7 @@ async fn page(line: &mut Line<'_, '_>, request: &Request<'_>) -> Result<Outcome,
 /// Writes the document `revisions`.
 fn write_revisions(
     out: &mut Room<'_>,
-    desk: &Desk,
+    store: &StoreHandle,
     revisions: &Revisions,
     changed: Option<u32>,
 ) -> fmt::Result {
@@ -226,7 +226,7 @@ fn write_revisions(
     out.write_char(']')?;
     let real = |number: Option<u32>| number.filter(|number| *number != NOTHING.number);
     let numbers = [
-        ("running", desk.running()),
+        ("running", store.running()),
         ("live", real(Some(revisions.live()))),
         ("previous", real(revisions.previous())),
         ("waiting", revisions.waiting()),
@@ -249,7 +249,7 @@ fn write_revisions(
     if let Some((number, ended)) = revisions.last() {
         write!(out, ",\"last\":{{\"revision\":{number},\"ended\":\"{}\"}}", ended.name())?;
     }
-    desk.failure(|failure| {
+    store.failure(|failure| {
         if failure.is_empty() {
             return Ok(());
         }

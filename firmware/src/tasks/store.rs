@@ -4,8 +4,8 @@
 //! readers, and that the board is to be restarted. What happens when is decided in `recipe_api::revisions`.
 //! Another configuration is only run by a restart: the start has the memory for it, and counts what it tries.
 
-mod desk;
 mod firmware;
+mod handle;
 
 use core::pin::pin;
 
@@ -17,8 +17,8 @@ use recipe_api::revisions::{Ended, Output, Refused, Result as Done, Revision, Re
 use recipe_store::{KeepError, Store};
 use recipe_update::SlotFlash;
 
-pub use desk::{Ask, Desk, Failed, FirmwareView, MAX_FAILURE, PART, Turn};
 use firmware::Judged;
+pub use handle::{Ask, Failed, FirmwareView, MAX_FAILURE, PART, StoreHandle, Turn};
 
 use super::gateway::Gateway;
 use super::watchdog::Pulse;
@@ -28,7 +28,7 @@ use crate::kept::{Kept, StoreFlash};
 use crate::update::{self, Updates, Works};
 use crate::{error, info, warn};
 
-/// What the start leaves to the keeper.
+/// What the start leaves to the store task.
 #[derive(Debug, Default)]
 pub struct Work<'d> {
     /// This image came from outside the store, with this digest: it becomes the live one.
@@ -41,11 +41,11 @@ pub struct Work<'d> {
     pub trial_failed: bool,
 }
 
-/// Works for the desk until the board has to be restarted; then the safe values are out.
+/// Serves requests until the board has to be restarted; the safe values have then been sent.
 pub async fn run<F: StoreFlash, S: SlotFlash>(
     gateway: &Gateway,
     pulse: &Pulse,
-    desk: &Desk,
+    handle: &StoreHandle,
     kept: &mut Kept<F>,
     updates: &mut Updates<S>,
     work: Work<'_>,
@@ -83,19 +83,19 @@ pub async fn run<F: StoreFlash, S: SlotFlash>(
         pulse.idle(pin!(core::future::pending::<()>())).await;
         return;
     };
-    desk.running.set(running);
-    desk.revisions.replace(Some(revisions));
+    handle.running.set(running);
+    handle.revisions.replace(Some(revisions));
     let marks = kept.slots();
     let trial = marks.trial.filter(|trial| updates.running() == Some(trial.slot));
     let trial = trial.map(|trial| {
         warn!("this firmware is on trial for {} s", trial.confirm_s);
         update::Trial::new(Instant::now(), trial.confirm_s, Works::of_code(trial.before))
     });
-    Keeper { desk, kept, updates, trial, trial_s: None }.work(gateway, pulse).await;
+    StoreTask { handle, kept, updates, trial, trial_s: None }.work(gateway, pulse).await;
 }
 
-struct Keeper<'a, F, S> {
-    desk: &'a Desk,
+struct StoreTask<'a, F, S> {
+    handle: &'a StoreHandle,
     kept: &'a mut Kept<F>,
     updates: &'a mut Updates<S>,
     /// The firmware that runs is on trial.
@@ -110,7 +110,7 @@ enum Next {
     Restart,
 }
 
-impl<F: StoreFlash, S: SlotFlash> Keeper<'_, F, S> {
+impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
     async fn work(&mut self, gateway: &Gateway, pulse: &Pulse) {
         loop {
             let drained = pulse.idle(pin!(self.drain(0, &mut None))).await;
@@ -133,28 +133,29 @@ impl<F: StoreFlash, S: SlotFlash> Keeper<'_, F, S> {
                 until = Instant::now();
             }
             self.show(waits_for);
-            let desk = self.desk;
-            let next = select4(desk.asked.wait(), desk.wanted.wait(), desk.session.wait(), Timer::at(until));
+            let handle = self.handle;
+            let next =
+                select4(handle.asked.wait(), handle.wanted.wait(), handle.session.wait(), Timer::at(until));
             let next = pulse.idle(pin!(next)).await;
             match next {
                 Either4::First(ask) => {
                     let (result, is_restart) = pulse.idle(pin!(self.carry_out(gateway, ask))).await;
                     self.show(waits_for);
-                    desk.done.signal(result);
+                    handle.done.signal(result);
                     if is_restart {
-                        // Nobody gets the desk any more.
+                        // Nobody gets the lock any more.
                         return self.end(gateway, pulse).await;
                     }
-                    desk.is_taken.set(false);
+                    handle.is_taken.set(false);
                 }
                 Either4::Second((number, offset)) => {
-                    let mut part = desk.part.borrow_mut();
+                    let mut part = handle.part.borrow_mut();
                     let len = self.kept.image_part(number, offset, &mut part[..]).map(<[u8]>::len);
-                    desk.part_len.signal(len);
+                    handle.part_len.signal(len);
                 }
                 Either4::Third(bd_seq) => {
                     let kept = pulse.idle(pin!(self.kept.set_session(bd_seq))).await;
-                    desk.session_kept.signal(kept.is_ok());
+                    handle.session_kept.signal(kept.is_ok());
                 }
                 Either4::Fourth(()) => {}
             }
@@ -163,12 +164,12 @@ impl<F: StoreFlash, S: SlotFlash> Keeper<'_, F, S> {
 
     /// Brings the safe values out. The answer to who asked leaves meanwhile.
     async fn end(&self, gateway: &Gateway, pulse: &Pulse) {
-        pulse.idle(pin!(Timer::after(LAST_WORDS))).await;
+        pulse.idle(pin!(Timer::after(LOG_TIME))).await;
         if !pulse.idle(pin!(gateway.make_safe(MAX_SAFE))).await {
             warn!("the controller does not show all safe values; restarting all the same");
         }
         info!("restarting");
-        pulse.idle(pin!(Timer::after(LAST_WORDS))).await;
+        pulse.idle(pin!(Timer::after(LOG_TIME))).await;
     }
 
     /// Returns the result, and whether the board has to be restarted.
@@ -181,7 +182,7 @@ impl<F: StoreFlash, S: SlotFlash> Keeper<'_, F, S> {
         }
         let mut image_len = 0;
         let decided = {
-            let mut revisions = self.desk.revisions.borrow_mut();
+            let mut revisions = self.handle.revisions.borrow_mut();
             let Some(revisions) = revisions.as_mut() else {
                 return (Err(Failed::Refused(Refused::Busy)), false);
             };
@@ -223,13 +224,13 @@ impl<F: StoreFlash, S: SlotFlash> Keeper<'_, F, S> {
     }
 
     /// Keeps settings of the edge node. A trial is not cut short for a restart.
-    #[allow(clippy::await_holding_refcell_ref, reason = "who has the desk waits for the keeper")]
+    #[allow(clippy::await_holding_refcell_ref, reason = "the holder of the lock waits for the store task")]
     async fn keep_edge(&mut self, len: usize, restart: bool) -> (Result<u32, Failed>, bool) {
-        let is_on_trial = self.desk.look(|revisions| revisions.trial().is_some()) == Some(true);
+        let is_on_trial = self.handle.look(|revisions| revisions.trial().is_some()) == Some(true);
         if restart && (is_on_trial || self.trial.is_some()) {
             return (Err(Failed::Refused(Refused::OnTrial)), false);
         }
-        let image = self.desk.image.borrow();
+        let image = self.handle.image.borrow();
         let kept = self.kept.set_edge(image.get(..len).unwrap_or(&[])).await;
         let is_restart = restart && kept.is_ok();
         (kept.map(|()| 0).map_err(Failed::Store), is_restart)
@@ -237,8 +238,8 @@ impl<F: StoreFlash, S: SlotFlash> Keeper<'_, F, S> {
 
     /// What the revisions ask for.
     fn next_output(&self) -> Output {
-        let mut revisions = self.desk.revisions.borrow_mut();
-        // They are there as long as the keeper works.
+        let mut revisions = self.handle.revisions.borrow_mut();
+        // They are there as long as the store task works.
         let Some(revisions) = revisions.as_mut() else {
             return Output::Sleep { until: proto_core::time::Instant::NEVER };
         };
@@ -253,18 +254,18 @@ impl<F: StoreFlash, S: SlotFlash> Keeper<'_, F, S> {
     }
 
     /// Does what the revisions ask for, and notes what failed.
-    #[allow(clippy::await_holding_refcell_ref, reason = "who has the desk waits for the keeper")]
+    #[allow(clippy::await_holding_refcell_ref, reason = "the holder of the lock waits for the store task")]
     async fn drain(&mut self, image_len: usize, failed: &mut Option<KeepError>) -> Next {
         loop {
             let output = self.next_output();
             let (written, result) = match output {
                 Output::Sleep { until } => return Next::Sleep { until },
                 Output::Store { revision: Revision { number, digest }, forget } => {
-                    let image = self.desk.image.borrow();
+                    let image = self.handle.image.borrow();
                     let image = image.get(..image_len).unwrap_or(&[]);
                     let written = self.kept.keep(number, digest, image, forget).await;
                     // Room for it was made of others.
-                    if let Some(revisions) = self.desk.revisions.borrow_mut().as_mut() {
+                    if let Some(revisions) = self.handle.revisions.borrow_mut().as_mut() {
                         revisions.keep_only(|number| {
                             number == NOTHING.number || self.kept.store().revision(number).is_some()
                         });
@@ -303,19 +304,19 @@ impl<F: StoreFlash, S: SlotFlash> Keeper<'_, F, S> {
                 error!("the store: {}", Text(&error));
                 failed.get_or_insert(error);
             }
-            if let Some(revisions) = self.desk.revisions.borrow_mut().as_mut() {
+            if let Some(revisions) = self.handle.revisions.borrow_mut().as_mut() {
                 revisions.handle(now(), result);
             }
         }
     }
 
     fn is_running(&self, number: u32) -> bool {
-        self.desk.running.get().unwrap_or(NOTHING.number) == number
+        self.handle.running.get().unwrap_or(NOTHING.number) == number
     }
 
     /// The live one, and how the newest trial ended.
     fn live_and_ended(&self) -> (u32, recipe_store::Ended) {
-        let revisions = self.desk.revisions.borrow();
+        let revisions = self.handle.revisions.borrow();
         let revisions = revisions.as_ref();
         let ended = match revisions.and_then(Revisions::last) {
             Some((_, Ended::NotConfirmed)) => recipe_store::Ended::NotConfirmed,
@@ -358,6 +359,6 @@ pub const NOTHING: Revision = Revision { number: 0, digest: 0 };
 /// How often the trial of a firmware is looked at.
 const LOOK: Duration = Duration::from_secs(1);
 /// For an answer, and for the log.
-const LAST_WORDS: Duration = Duration::from_millis(200);
+const LOG_TIME: Duration = Duration::from_millis(200);
 /// How long safe values may take: so long they are repeated where nothing shows them (proto-core/docs/engine.md section 6).
 const MAX_SAFE: Duration = Duration::from_secs(1);

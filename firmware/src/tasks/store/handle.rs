@@ -1,4 +1,4 @@
-//! Where the keeper is asked: by the console and by the edge node, which wait here for what it has done.
+//! Where the store task is asked: by the console and by the edge node, which wait here for what it has done.
 
 use core::cell::{Cell, RefCell};
 
@@ -18,7 +18,7 @@ use crate::update::{self, Build, Incoming, WaitsFor};
 /// What a client asks for.
 #[derive(Debug, Clone)]
 pub enum Ask {
-    /// Keep the image of this length in `Desk::image`, which was made from a revision.
+    /// Keep the image of this length in `StoreHandle::image`, which was made from a revision.
     Put {
         /// That revision.
         base: Revision,
@@ -40,7 +40,7 @@ pub enum Ask {
     RollBack,
     /// Take this key.
     Claim([u8; 16]),
-    /// Take the piece of a firmware of this length in `Desk::image`.
+    /// Take the piece of a firmware of this length in `StoreHandle::image`.
     Piece {
         /// Where it begins, counted from the beginning of the header.
         offset: u32,
@@ -60,7 +60,7 @@ pub enum Ask {
     ConfirmFirmware,
     /// Return to the firmware before.
     EndFirmware,
-    /// Keep the settings of the edge node of this length in `Desk::image`.
+    /// Keep the settings of the edge node of this length in `StoreHandle::image`.
     Edge {
         /// Their length in bytes.
         len: usize,
@@ -110,13 +110,13 @@ pub const MAX_FAILURE: usize = 160;
 /// Bytes of an image that are read at once: a multiple of a flash word.
 pub const PART: usize = 512;
 
-/// Between the keeper and those who ask.
-pub struct Desk {
+/// Between the store task and those who ask.
+pub struct StoreHandle {
     pub(super) revisions: RefCell<Option<Revisions>>,
     /// The configuration that runs.
     pub(super) running: Cell<Option<u32>>,
     pub(super) failure: RefCell<String<MAX_FAILURE>>,
-    /// Somebody has the desk: changes are made one after the other.
+    /// A change holds the lock: changes are made one after the other.
     pub(super) is_taken: Cell<bool>,
     pub(super) image: RefCell<&'static mut [u8; MAX_IMAGE]>,
     pub(super) asked: Signal<NoopRawMutex, Ask>,
@@ -133,8 +133,8 @@ pub struct Desk {
     pub(super) was_asked: Cell<bool>,
 }
 
-impl Desk {
-    /// A desk at which nobody works yet. The room is for an image on its way to the store.
+impl StoreHandle {
+    /// Without a store task yet. `image` is the buffer for an image on its way to the store.
     pub fn new(image: &'static mut [u8; MAX_IMAGE]) -> Self {
         Self {
             revisions: RefCell::new(None),
@@ -188,9 +188,9 @@ impl Desk {
         let _ = core::fmt::Write::write_fmt(&mut Cut(&mut failure), format_args!("{why}"));
     }
 
-    /// Takes the desk for a change; `None` if somebody else has it.
+    /// Takes the lock for a change; `None` if another change holds it.
     pub fn take(&self) -> Option<Turn<'_>> {
-        (!self.is_taken.replace(true)).then_some(Turn { desk: self, is_asked: false })
+        (!self.is_taken.replace(true)).then_some(Turn { handle: self, is_asked: false })
     }
 
     /// Keeps the number of a session of the edge node, which alone calls this. Returns whether it is kept. Waits while
@@ -216,15 +216,15 @@ impl Desk {
 
 /// The right to make a change.
 pub struct Turn<'a> {
-    desk: &'a Desk,
-    /// From then on the keeper gives the desk free.
+    handle: &'a StoreHandle,
+    /// From then on the store task releases the lock.
     is_asked: bool,
 }
 
 impl Turn<'_> {
     /// Writes to the room for an image.
     pub fn fill(&mut self, offset: usize, bytes: &[u8]) {
-        let mut image = self.desk.image.borrow_mut();
+        let mut image = self.handle.image.borrow_mut();
         for (place, byte) in image.iter_mut().skip(offset).zip(bytes) {
             *place = *byte;
         }
@@ -232,7 +232,7 @@ impl Turn<'_> {
 
     /// Passes the first bytes of the image to `look`.
     pub fn look<R>(&self, len: usize, look: impl FnOnce(&[u8]) -> R) -> R {
-        look(self.desk.image.borrow().get(..len).unwrap_or(&[]))
+        look(self.handle.image.borrow().get(..len).unwrap_or(&[]))
     }
 
     /// Asks for a change and waits until it is made, or refused. Returns the number of the revision.
@@ -240,17 +240,17 @@ impl Turn<'_> {
     /// # Errors
     /// Why nothing was changed.
     pub async fn ask(mut self, what: Ask) -> Result<u32, Failed> {
-        self.desk.done.reset();
+        self.handle.done.reset();
         self.is_asked = true;
-        self.desk.asked.signal(what);
-        self.desk.done.wait().await
+        self.handle.asked.signal(what);
+        self.handle.done.wait().await
     }
 }
 
 impl Drop for Turn<'_> {
     fn drop(&mut self) {
         if !self.is_asked {
-            self.desk.is_taken.set(false);
+            self.handle.is_taken.set(false);
         }
     }
 }

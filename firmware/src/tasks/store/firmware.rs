@@ -1,4 +1,4 @@
-//! The keeper's part of updates: pieces of a firmware, its trial, and the end of one.
+//! The store task's part of updates: pieces of a firmware, its trial, and the end of one.
 
 use embassy_time::Instant;
 use proto_core::engine::PortState;
@@ -7,7 +7,7 @@ use recipe_store::{Ended, SlotMarks};
 use recipe_update::{SlotFlash, begin_trial, confirm, end_trial};
 
 use super::super::gateway::Gateway;
-use super::{Ask, Failed, FirmwareView, Keeper, MAX_SAFE};
+use super::{Ask, Failed, FirmwareView, MAX_SAFE, StoreTask};
 use crate::fmt::Text;
 use crate::kept::{StoreFlash, image_version};
 use crate::update::{Refused, Verdict, WaitsFor, Works};
@@ -34,11 +34,11 @@ fn works(gateway: &Gateway) -> Works {
     })
 }
 
-impl<F: StoreFlash, S: SlotFlash> Keeper<'_, F, S> {
+impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
     /// Looks at the trial of the firmware that runs, and confirms or ends it.
     pub(super) async fn judge(&mut self, gateway: &Gateway) -> Judged {
         let Some(trial) = &mut self.trial else { return Judged::Settled };
-        match trial.look(Instant::now(), works(gateway), self.desk.was_asked.get()) {
+        match trial.look(Instant::now(), works(gateway), self.handle.was_asked.get()) {
             Verdict::Waits(waits_for) => Judged::OnTrial(waits_for),
             Verdict::Confirmed => match self.confirm_firmware().await {
                 Ok(_) => Judged::Settled,
@@ -82,7 +82,7 @@ impl<F: StoreFlash, S: SlotFlash> Keeper<'_, F, S> {
     pub(super) fn show(&self, waits_for: Option<WaitsFor>) {
         let updates = &self.updates;
         let trial = self.trial.map(|trial| (trial.until(), waits_for.unwrap_or(WaitsFor::Time)));
-        self.desk.firmware.set(Some(FirmwareView {
+        self.handle.firmware.set(Some(FirmwareView {
             board: *updates.board(),
             slot: updates.running(),
             build: updates.build(),
@@ -95,7 +95,7 @@ impl<F: StoreFlash, S: SlotFlash> Keeper<'_, F, S> {
         }));
     }
 
-    /// Carries out what is about the firmware; `None` if it is not. Returns as the keeper's own does.
+    /// Carries out what is about the firmware; `None` if it is not. Returns as the store task's own does.
     pub(super) async fn of_firmware(
         &mut self,
         gateway: &Gateway,
@@ -105,7 +105,7 @@ impl<F: StoreFlash, S: SlotFlash> Keeper<'_, F, S> {
         let marks = self.kept.slots();
         match ask {
             Ask::Put { len, .. } => {
-                let version = image_version(self.desk.image.borrow().get(..*len).unwrap_or(&[]));
+                let version = image_version(self.handle.image.borrow().get(..*len).unwrap_or(&[]));
                 match self.updates.may_keep(version.unwrap_or(0), marks) {
                     Ok(()) => None,
                     Err(why) => refused(why),
@@ -115,7 +115,7 @@ impl<F: StoreFlash, S: SlotFlash> Keeper<'_, F, S> {
                 Some((self.take_piece(*offset, *len, marks, *downgrade).await, false))
             }
             Ask::TryFirmware { confirm_s, downgrade } => {
-                if self.desk.look(|revisions| revisions.trial().is_some()) != Some(false) {
+                if self.handle.look(|revisions| revisions.trial().is_some()) != Some(false) {
                     return refused(Refused::Unsettled);
                 }
                 let header = match self.updates.ready(self.kept.versions(), marks, *downgrade) {
@@ -146,7 +146,7 @@ impl<F: StoreFlash, S: SlotFlash> Keeper<'_, F, S> {
         }
     }
 
-    #[allow(clippy::await_holding_refcell_ref, reason = "who has the desk waits for the keeper")]
+    #[allow(clippy::await_holding_refcell_ref, reason = "the holder of the lock waits for the store task")]
     async fn take_piece(
         &mut self,
         offset: u32,
@@ -155,7 +155,7 @@ impl<F: StoreFlash, S: SlotFlash> Keeper<'_, F, S> {
         downgrade: recipe_update::Downgrade,
     ) -> Result<u32, Failed> {
         let kept = self.kept.versions();
-        let image = self.desk.image.borrow();
+        let image = self.handle.image.borrow();
         let bytes = image.get(..len).unwrap_or(&[]);
         self.updates.take(offset, bytes, kept, marks, downgrade).await.map_err(Failed::Firmware)?;
         Ok(0)
