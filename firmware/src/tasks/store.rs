@@ -18,7 +18,7 @@ use recipe_store::{KeepError, Store};
 use recipe_update::SlotFlash;
 
 use firmware::Judged;
-pub use handle::{Ask, Failed, FirmwareView, MAX_FAILURE, PART, StoreHandle, Turn};
+pub use handle::{Failed, FirmwareView, MAX_FAILURE, PART, StoreHandle, StoreLock, StoreRequest};
 
 use super::gateway::Gateway;
 use super::watchdog::Pulse;
@@ -100,7 +100,7 @@ struct StoreTask<'a, F, S> {
     updates: &'a mut Updates<S>,
     /// The firmware that runs is on trial.
     trial: Option<update::Trial>,
-    /// How long the trial that is asked for is, in seconds.
+    /// Length of the requested trial, in seconds.
     trial_s: Option<u16>,
 }
 
@@ -128,18 +128,22 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
                 Judged::Settled => None,
             };
             if self.updates.is_working() {
-                // One step, and then whoever asks.
+                // One step, then the next request.
                 pulse.idle(pin!(self.updates.work())).await;
                 until = Instant::now();
             }
             self.show(waits_for);
             let handle = self.handle;
-            let next =
-                select4(handle.asked.wait(), handle.wanted.wait(), handle.session.wait(), Timer::at(until));
+            let next = select4(
+                handle.requests.wait(),
+                handle.part_requests.wait(),
+                handle.session.wait(),
+                Timer::at(until),
+            );
             let next = pulse.idle(pin!(next)).await;
             match next {
-                Either4::First(ask) => {
-                    let (result, is_restart) = pulse.idle(pin!(self.carry_out(gateway, ask))).await;
+                Either4::First(request) => {
+                    let (result, is_restart) = pulse.idle(pin!(self.execute(gateway, request))).await;
                     self.show(waits_for);
                     handle.done.signal(result);
                     if is_restart {
@@ -162,7 +166,7 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
         }
     }
 
-    /// Brings the safe values out. The answer to who asked leaves meanwhile.
+    /// Sends the safe values, after the answer to the last request.
     async fn end(&self, gateway: &Gateway, pulse: &Pulse) {
         pulse.idle(pin!(Timer::after(LOG_TIME))).await;
         if !pulse.idle(pin!(gateway.make_safe(MAX_SAFE))).await {
@@ -173,11 +177,11 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
     }
 
     /// Returns the result, and whether the board has to be restarted.
-    async fn carry_out(&mut self, gateway: &Gateway, ask: Ask) -> (Result<u32, Failed>, bool) {
-        if let Some(done) = self.of_firmware(gateway, &ask).await {
+    async fn execute(&mut self, gateway: &Gateway, request: StoreRequest) -> (Result<u32, Failed>, bool) {
+        if let Some(done) = self.of_firmware(gateway, &request).await {
             return done;
         }
-        if let Ask::Edge { len, restart, .. } = ask {
+        if let StoreRequest::Edge { len, restart, .. } = request {
             return self.keep_edge(len, restart).await;
         }
         let mut image_len = 0;
@@ -186,27 +190,27 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
             let Some(revisions) = revisions.as_mut() else {
                 return (Err(Failed::Refused(Refused::Busy)), false);
             };
-            match ask {
-                Ask::Claim(_)
-                | Ask::Piece { .. }
-                | Ask::TryFirmware { .. }
-                | Ask::ConfirmFirmware
-                | Ask::EndFirmware
-                | Ask::Edge { .. } => Ok(0),
-                Ask::Put { base, digest, len } => {
+            match request {
+                StoreRequest::Claim(_)
+                | StoreRequest::Piece { .. }
+                | StoreRequest::TryFirmware { .. }
+                | StoreRequest::ConfirmFirmware
+                | StoreRequest::EndFirmware
+                | StoreRequest::Edge { .. } => Ok(0),
+                StoreRequest::Put { base, digest, len } => {
                     image_len = len;
                     revisions.put(base, digest)
                 }
-                Ask::Apply { number, trial } => {
+                StoreRequest::Apply { number, trial } => {
                     let seconds = trial.as_millis().div_ceil(1_000);
                     self.trial_s = Some(u16::try_from(seconds).unwrap_or(u16::MAX));
                     revisions.apply(number, trial)
                 }
-                Ask::Confirm => revisions.confirm(now()),
-                Ask::RollBack => revisions.roll_back(),
+                StoreRequest::Confirm => revisions.confirm(now()),
+                StoreRequest::RollBack => revisions.roll_back(),
             }
         };
-        if let Ask::Claim(key) = ask {
+        if let StoreRequest::Claim(key) = request {
             let taken = self.kept.set_access_key(&key).await;
             return (taken.map(|()| 0).map_err(Failed::Store), false);
         }
@@ -236,7 +240,7 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
         (kept.map(|()| 0).map_err(Failed::Store), is_restart)
     }
 
-    /// What the revisions ask for.
+    /// The next output of the revisions.
     fn next_output(&self) -> Output {
         let mut revisions = self.handle.revisions.borrow_mut();
         // They are there as long as the store task works.
@@ -253,7 +257,7 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
         output
     }
 
-    /// Does what the revisions ask for, and notes what failed.
+    /// Executes the outputs of the revisions; keeps the first failure.
     #[allow(clippy::await_holding_refcell_ref, reason = "the holder of the lock waits for the store task")]
     async fn drain(&mut self, image_len: usize, failed: &mut Option<KeepError>) -> Next {
         loop {
@@ -354,7 +358,7 @@ fn revisions_of(store: &Store) -> Option<Revisions> {
     Some(revisions)
 }
 
-/// Stands for no configuration, where a live one is asked for: what is made for an empty board is based on it.
+/// Stands for no configuration: the base revision of the first configuration of an empty board.
 pub const NOTHING: Revision = Revision { number: 0, digest: 0 };
 /// How often the trial of a firmware is looked at.
 const LOOK: Duration = Duration::from_secs(1);

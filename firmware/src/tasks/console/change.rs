@@ -18,7 +18,7 @@ use super::connection::Request;
 use super::{Console, edge};
 use crate::clock::now;
 use crate::fmt::Text;
-use crate::tasks::store::{Ask, Failed, Turn};
+use crate::tasks::store::{Failed, StoreLock, StoreRequest};
 use crate::warn;
 
 impl Console {
@@ -26,18 +26,18 @@ impl Console {
     pub(super) async fn change<'a>(&'a self, room: &mut [u8], request: Request<'a>) -> Reply {
         let Request { operation, peer, .. } = request;
         if operation == Operation::PutConfig
-            && let Some((len, turn)) = &request.image
-            && let Some(refused) = self.look_through(room, *len, turn).await
+            && let Some((len, lock)) = &request.image
+            && let Some(refused) = self.look_through(room, *len, lock).await
         {
             return refused;
         }
-        let (ask, turn) = match self.prepare(room, request) {
+        let (change, lock) = match self.prepare(room, request) {
             Ok(prepared) => prepared,
             Err(reply) => return reply,
         };
-        let done = turn.ask(ask.clone()).await;
-        match (done, ask) {
-            (Ok(_), Ask::Claim(key)) => {
+        let done = lock.request(change.clone()).await;
+        match (done, change) {
+            (Ok(_), StoreRequest::Claim(key)) => {
                 self.is_claimed(Some(key));
                 warn!("claimed by {}", Text(&peer));
                 let name = &self.name;
@@ -45,21 +45,23 @@ impl Console {
                     write!(out, "{{\"name\":\"{name}\",\"claimed\":true}}")
                 })
             }
-            (Err(_), Ask::Claim(_)) => {
+            (Err(_), StoreRequest::Claim(_)) => {
                 self.is_claimed(None);
                 Reply::error(room, Status::INTERNAL, "the key cannot be kept")
             }
             // A piece is one of many.
-            (Ok(_), Ask::Piece { .. }) => self.firmware(room, Status::OK),
-            (Ok(_), Ask::ConfirmFirmware) => {
+            (Ok(_), StoreRequest::Piece { .. }) => self.firmware(room, Status::OK),
+            (Ok(_), StoreRequest::ConfirmFirmware) => {
                 warn!("the firmware is confirmed for {}", Text(&peer));
                 self.firmware(room, Status::OK)
             }
-            (Ok(_), Ask::TryFirmware { .. } | Ask::EndFirmware) => {
+            (Ok(_), StoreRequest::TryFirmware { .. } | StoreRequest::EndFirmware) => {
                 warn!("another firmware is to run for {}", Text(&peer));
                 self.firmware(room, Status::ACCEPTED)
             }
-            (Ok(_), Ask::Edge { tells, restart, .. }) => self.edge_is_kept(room, peer, tells, restart),
+            (Ok(_), StoreRequest::Edge { tells, restart, .. }) => {
+                self.edge_is_kept(room, peer, tells, restart)
+            }
             (Err(Failed::Firmware(why)), _) => {
                 warn!("{} refused to {}: {}", name(operation), Text(&peer), Text(&why));
                 let status = if why.is_wrong() { Status::UNPROCESSABLE } else { Status::CONFLICT };
@@ -79,10 +81,10 @@ impl Console {
     }
 
     /// Reads the whole image that was sent, in pieces between which others run. Returns the answer if it is refused.
-    async fn look_through(&self, room: &mut [u8], len: usize, turn: &Turn<'_>) -> Option<Reply> {
+    async fn look_through(&self, room: &mut [u8], len: usize, lock: &StoreLock<'_>) -> Option<Reply> {
         let mut scan = Scan::new();
         loop {
-            match turn.look(len, |bytes| scan.step(bytes)) {
+            match lock.look(len, |bytes| scan.step(bytes)) {
                 Ok(true) => yield_now().await,
                 Ok(false) => break,
                 Err(error) => return Some(Reply::error(room, Status::UNPROCESSABLE, error)),
@@ -92,10 +94,14 @@ impl Console {
         Some(Reply::error(room, Status::UNPROCESSABLE, missing))
     }
 
-    /// What the store task is to be asked for; or the answer, if it is not.
+    /// The request for the store task, or the reply if there is none.
     #[inline(never)]
-    fn prepare<'a>(&'a self, room: &mut [u8], request: Request<'a>) -> Result<(Ask, Turn<'a>), Reply> {
-        let ask = match request.arguments {
+    fn prepare<'a>(
+        &'a self,
+        room: &mut [u8],
+        request: Request<'a>,
+    ) -> Result<(StoreRequest, StoreLock<'a>), Reply> {
+        let change = match request.arguments {
             Arguments::Wrong(text) => return Err(Reply::error(room, Status::BAD_REQUEST, text)),
             Arguments::Seconds(seconds) => {
                 self.identify_until.set(Instant::now() + Duration::from_secs(seconds.into()));
@@ -103,13 +109,13 @@ impl Console {
                 return Err(Reply::new(room, Status::OK, Kind::Json, |out| out.write_str("{}")));
             }
             Arguments::Key(key) => return self.take_key(room, key, &request),
-            Arguments::Apply { number, trial } => Ask::Apply { number, trial },
-            Arguments::None if request.operation == Operation::Confirm => Ask::Confirm,
-            Arguments::None if request.operation == Operation::Rollback => Ask::RollBack,
-            Arguments::None if request.operation == Operation::ConfirmUpdate => Ask::ConfirmFirmware,
-            Arguments::None if request.operation == Operation::EndUpdate => Ask::EndFirmware,
+            Arguments::Apply { number, trial } => StoreRequest::Apply { number, trial },
+            Arguments::None if request.operation == Operation::Confirm => StoreRequest::Confirm,
+            Arguments::None if request.operation == Operation::Rollback => StoreRequest::RollBack,
+            Arguments::None if request.operation == Operation::ConfirmUpdate => StoreRequest::ConfirmFirmware,
+            Arguments::None if request.operation == Operation::EndUpdate => StoreRequest::EndFirmware,
             Arguments::Try(confirm_s) => {
-                Ask::TryFirmware { confirm_s, downgrade: downgrade(room, &request)? }
+                StoreRequest::TryFirmware { confirm_s, downgrade: downgrade(room, &request)? }
             }
             Arguments::None if request.operation == Operation::PutUpdate => return put_piece(room, request),
             Arguments::None if request.operation == Operation::PutEdge => {
@@ -118,7 +124,7 @@ impl Console {
             Arguments::None => return put(room, request),
         };
         let Some(store) = self.store else { return Err(nothing_kept(room)) };
-        store.take().map(|turn| (ask, turn)).ok_or_else(|| busy(room))
+        store.take().map(|lock| (change, lock)).ok_or_else(|| busy(room))
     }
 
     /// Takes a key, if the button was pressed.
@@ -127,17 +133,17 @@ impl Console {
         room: &mut [u8],
         key: [u8; KEY_LEN],
         request: &Request<'_>,
-    ) -> Result<(Ask, Turn<'_>), Reply> {
+    ) -> Result<(StoreRequest, StoreLock<'_>), Reply> {
         let Some(store) = self.store else { return Err(nothing_kept(room)) };
         // Before the claim, which waits for its end otherwise. A board that reads its store takes no key yet.
-        let Some(turn) = store.take().filter(|_| store.look(|_| ()).is_some()) else {
+        let Some(lock) = store.take().filter(|_| store.look(|_| ()).is_some()) else {
             return Err(busy(room));
         };
         let mut claim = self.claim.get();
         let offered = claim.offered(now());
         self.claim.set(claim);
         let (status, text) = match offered {
-            Ok(()) => return Ok((Ask::Claim(key), turn)),
+            Ok(()) => return Ok((StoreRequest::Claim(key), lock)),
             Err(ClaimError::NotPressed) => {
                 (Status::FORBIDDEN, "press the button of the board first; a key is taken for 60 s then")
             }
@@ -159,7 +165,7 @@ impl Console {
     }
 }
 
-/// Whether somebody has asked for an older firmware.
+/// Whether the request allows an older firmware.
 fn downgrade(room: &mut [u8], request: &Request<'_>) -> Result<Downgrade, Reply> {
     match request.head.query("downgrade") {
         None => Ok(Downgrade::Refused),
@@ -168,18 +174,18 @@ fn downgrade(room: &mut [u8], request: &Request<'_>) -> Result<Downgrade, Reply>
     }
 }
 
-fn put_piece<'a>(room: &mut [u8], request: Request<'a>) -> Result<(Ask, Turn<'a>), Reply> {
+fn put_piece<'a>(room: &mut [u8], request: Request<'a>) -> Result<(StoreRequest, StoreLock<'a>), Reply> {
     let downgrade = downgrade(room, &request)?;
-    let Some((len, turn)) = request.image else { return Err(busy(room)) };
+    let Some((len, lock)) = request.image else { return Err(busy(room)) };
     let Some(Ok(offset)) = request.head.query("offset").map(str::parse) else {
         let text = "offset must be a number: where the piece begins in header and image";
         return Err(Reply::error(room, Status::BAD_REQUEST, text));
     };
-    Ok((Ask::Piece { offset, len, downgrade }, turn))
+    Ok((StoreRequest::Piece { offset, len, downgrade }, lock))
 }
 
-fn put<'a>(room: &mut [u8], request: Request<'a>) -> Result<(Ask, Turn<'a>), Reply> {
-    let Some((len, turn)) = request.image else { return Err(busy(room)) };
+fn put<'a>(room: &mut [u8], request: Request<'a>) -> Result<(StoreRequest, StoreLock<'a>), Reply> {
+    let Some((len, lock)) = request.image else { return Err(busy(room)) };
     let (status, text) = match request.head.if_match.map(Etag::parse) {
         None => {
             let text = "If-Match is needed: the ETag of the revision that this one was made from";
@@ -188,9 +194,9 @@ fn put<'a>(room: &mut [u8], request: Request<'a>) -> Result<(Ask, Turn<'a>), Rep
         Some(None) => (Status::PRECONDITION_FAILED, "If-Match must be one ETag, such as \"3-0badcafe\""),
         Some(Some(base)) => {
             // Bytes behind the image would be kept for nothing.
-            let whole = turn.look(len, |bytes| Ok((image::intact(bytes)?, image::image_len(bytes)?)));
+            let whole = lock.look(len, |bytes| Ok((image::intact(bytes)?, image::image_len(bytes)?)));
             return match whole {
-                Ok((digest, len)) => Ok((Ask::Put { base, digest, len }, turn)),
+                Ok((digest, len)) => Ok((StoreRequest::Put { base, digest, len }, lock)),
                 Err(error) => {
                     let error: image::ImageError = error;
                     Err(Reply::error(room, Status::UNPROCESSABLE, error))

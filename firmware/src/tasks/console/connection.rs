@@ -19,7 +19,7 @@ use super::arguments::Arguments;
 use super::change::{busy, nothing_kept};
 use super::{Console, MAX_TIME, OneMore, PORT};
 use crate::clock::now;
-use crate::tasks::store::Turn;
+use crate::tasks::store::StoreLock;
 use crate::tasks::watchdog::Pulse;
 
 /// The memory of a connection.
@@ -49,7 +49,7 @@ pub(super) struct Request<'a> {
     pub(super) operation: Operation,
     pub(super) arguments: Arguments,
     /// The image that was sent, in the buffer of the store handle: its length, and the right to store it.
-    pub(super) image: Option<(usize, Turn<'a>)>,
+    pub(super) image: Option<(usize, StoreLock<'a>)>,
     pub(super) peer: Ipv4Addr,
 }
 
@@ -188,13 +188,13 @@ impl Console {
         let operation = admitted.operation;
         let mut request = Request { head, operation, arguments: Arguments::None, image: None, peer };
         if let Some(store) = self.store {
-            store.was_asked();
+            store.note_reached();
         }
         if matches!(operation, Operation::PutConfig | Operation::PutUpdate | Operation::PutEdge) {
             let Some(store) = self.store else { return Err(nothing_kept(line.room)) };
-            let Some(turn) = store.take() else { return Err(busy(line.room)) };
+            let Some(lock) = store.take() else { return Err(busy(line.room)) };
             // The guard has limited it.
-            request.image = Some((usize::try_from(admitted.length).unwrap_or(0), turn));
+            request.image = Some((usize::try_from(admitted.length).unwrap_or(0), lock));
         }
         Ok((admitted, request))
     }
@@ -221,7 +221,7 @@ impl Console {
             let bytes = line.room.get(from..from.saturating_add(piece)).unwrap_or(&[]);
             hash.update(bytes);
             match &mut request.image {
-                Some((_, turn)) => turn.fill(received, bytes),
+                Some((_, lock)) => lock.fill(received, bytes),
                 // Arguments are short enough to stay in the room.
                 None => from = from.saturating_add(piece),
             }

@@ -12,7 +12,7 @@ use super::change::busy;
 use super::connection::Request;
 use crate::fmt::Text;
 use crate::tasks::edge::View;
-use crate::tasks::store::{Ask, Turn};
+use crate::tasks::store::{StoreLock, StoreRequest};
 use crate::warn;
 
 impl Console {
@@ -97,9 +97,12 @@ impl Console {
     }
 }
 
-/// What the store task is asked for with the settings that were sent, and whether they tell anything; or the answer.
+/// The request that stores the settings that were sent, or the reply if they are refused.
 #[inline(never)]
-pub(super) fn settings<'a>(room: &mut [u8], request: Request<'a>) -> Result<(Ask, Turn<'a>), Reply> {
+pub(super) fn settings<'a>(
+    room: &mut [u8],
+    request: Request<'a>,
+) -> Result<(StoreRequest, StoreLock<'a>), Reply> {
     let restart = match request.head.query("restart") {
         None => false,
         Some("yes") => true,
@@ -107,14 +110,14 @@ pub(super) fn settings<'a>(room: &mut [u8], request: Request<'a>) -> Result<(Ask
             return Err(Reply::error(room, Status::BAD_REQUEST, "restart is out of range; allowed: yes"));
         }
     };
-    let Some((len, turn)) = request.image else { return Err(busy(room)) };
-    match turn.look(len, read) {
-        Ok(tells) => Ok((Ask::Edge { len, tells, restart }, turn)),
+    let Some((len, lock)) = request.image else { return Err(busy(room)) };
+    match lock.look(len, read) {
+        Ok(tells) => Ok((StoreRequest::Edge { len, tells, restart }, lock)),
         Err(error) => Err(Reply::error(room, Status::UNPROCESSABLE, error)),
     }
 }
 
-/// Not inlined, so that its stack frame is free when the store task is asked.
+/// Not inlined, so that its stack frame is free during the request to the store task.
 #[inline(never)]
 fn read(bytes: &[u8]) -> Result<bool, DocumentError> {
     Document::empty().decode(bytes)

@@ -1,6 +1,6 @@
 //! The console: the API of docs/api.md over HTTP.
 //!
-//! In: connections, a button. Out: answers, and what the store task is asked for. Decides nothing about who may do what,
+//! In: connections, a button. Out: answers, and requests to the store task. Decides nothing about who may do what,
 //! which is `recipe_api`'s, and knows no flash. There are as many tasks as connections ([`CONNECTIONS`]); each serves
 //! one request and closes. The engine is looked at in pieces: for each piece of a document a task borrows it, writes
 //! at most a port or 32 variables into its own memory, and lets the others run before the piece is sent. So nobody

@@ -116,9 +116,9 @@ impl Console {
         reply.unwrap_or_else(|| busy(room))
     }
 
-    /// The image of what runs, or of the one that was asked for.
+    /// The image of what runs, or of the requested revision.
     async fn config(&self, line: &mut Line<'_, '_>, request: &Request<'_>) -> Result<Outcome, Ended> {
-        let (store, revision) = match self.asked_revision(line.room, request) {
+        let (store, revision) = match self.requested_revision(line.room, request) {
             Ok(found) => found,
             Err(reply) => return Ok(Outcome::Reply(reply)),
         };
@@ -138,7 +138,7 @@ impl Console {
         }
     }
 
-    fn asked_revision(
+    fn requested_revision(
         &self,
         room: &mut [u8],
         request: &Request<'_>,

@@ -7,7 +7,7 @@ use recipe_store::{Ended, SlotMarks};
 use recipe_update::{SlotFlash, begin_trial, confirm, end_trial};
 
 use super::super::gateway::Gateway;
-use super::{Ask, Failed, FirmwareView, MAX_SAFE, StoreTask};
+use super::{Failed, FirmwareView, MAX_SAFE, StoreRequest, StoreTask};
 use crate::fmt::Text;
 use crate::kept::{StoreFlash, image_version};
 use crate::update::{Refused, Verdict, WaitsFor, Works};
@@ -38,7 +38,7 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
     /// Looks at the trial of the firmware that runs, and confirms or ends it.
     pub(super) async fn judge(&mut self, gateway: &Gateway) -> Judged {
         let Some(trial) = &mut self.trial else { return Judged::Settled };
-        match trial.look(Instant::now(), works(gateway), self.handle.was_asked.get()) {
+        match trial.look(Instant::now(), works(gateway), self.handle.was_reached.get()) {
             Verdict::Waits(waits_for) => Judged::OnTrial(waits_for),
             Verdict::Confirmed => match self.confirm_firmware().await {
                 Ok(_) => Judged::Settled,
@@ -99,22 +99,22 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
     pub(super) async fn of_firmware(
         &mut self,
         gateway: &Gateway,
-        ask: &Ask,
+        request: &StoreRequest,
     ) -> Option<(Result<u32, Failed>, bool)> {
         let refused = |why| Some((Err(Failed::Firmware(why)), false));
         let marks = self.kept.slots();
-        match ask {
-            Ask::Put { len, .. } => {
+        match request {
+            StoreRequest::Put { len, .. } => {
                 let version = image_version(self.handle.image.borrow().get(..*len).unwrap_or(&[]));
                 match self.updates.may_keep(version.unwrap_or(0), marks) {
                     Ok(()) => None,
                     Err(why) => refused(why),
                 }
             }
-            Ask::Piece { offset, len, downgrade } => {
+            StoreRequest::Piece { offset, len, downgrade } => {
                 Some((self.take_piece(*offset, *len, marks, *downgrade).await, false))
             }
-            Ask::TryFirmware { confirm_s, downgrade } => {
+            StoreRequest::TryFirmware { confirm_s, downgrade } => {
                 if self.handle.look(|revisions| revisions.trial().is_some()) != Some(false) {
                     return refused(Refused::Unsettled);
                 }
@@ -136,13 +136,17 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
                 let marked = self.kept.mark_slots(marks).await;
                 Some((marked.map(|()| 0).map_err(Failed::Store), true))
             }
-            Ask::ConfirmFirmware => Some((self.confirm_firmware().await, false)),
-            Ask::EndFirmware if self.trial.is_none() => refused(Refused::NotOnTrial),
-            Ask::EndFirmware => {
+            StoreRequest::ConfirmFirmware => Some((self.confirm_firmware().await, false)),
+            StoreRequest::EndFirmware if self.trial.is_none() => refused(Refused::NotOnTrial),
+            StoreRequest::EndFirmware => {
                 self.over(Ended::TakenBack).await;
                 Some((Ok(0), true))
             }
-            Ask::Apply { .. } | Ask::Confirm | Ask::RollBack | Ask::Claim(_) | Ask::Edge { .. } => None,
+            StoreRequest::Apply { .. }
+            | StoreRequest::Confirm
+            | StoreRequest::RollBack
+            | StoreRequest::Claim(_)
+            | StoreRequest::Edge { .. } => None,
         }
     }
 

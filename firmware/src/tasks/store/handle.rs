@@ -1,4 +1,4 @@
-//! Where the store task is asked: by the console and by the edge node, which wait here for what it has done.
+//! Request queue of the store task, for the console and the edge node; they wait here for the result.
 
 use core::cell::{Cell, RefCell};
 
@@ -17,7 +17,7 @@ use crate::update::{self, Build, Incoming, WaitsFor};
 
 /// What a client asks for.
 #[derive(Debug, Clone)]
-pub enum Ask {
+pub enum StoreRequest {
     /// Keep the image of this length in `StoreHandle::image`, which was made from a revision.
     Put {
         /// That revision.
@@ -110,7 +110,7 @@ pub const MAX_FAILURE: usize = 160;
 /// Bytes of an image that are read at once: a multiple of a flash word.
 pub const PART: usize = 512;
 
-/// Between the store task and those who ask.
+/// Shared by the store task and its clients.
 pub struct StoreHandle {
     pub(super) revisions: RefCell<Option<Revisions>>,
     /// The configuration that runs.
@@ -119,9 +119,9 @@ pub struct StoreHandle {
     /// A change holds the lock: changes are made one after the other.
     pub(super) is_taken: Cell<bool>,
     pub(super) image: RefCell<&'static mut [u8; MAX_IMAGE]>,
-    pub(super) asked: Signal<NoopRawMutex, Ask>,
+    pub(super) requests: Signal<NoopRawMutex, StoreRequest>,
     pub(super) done: Signal<NoopRawMutex, Result<u32, Failed>>,
-    pub(super) wanted: Signal<NoopRawMutex, (u32, usize)>,
+    pub(super) part_requests: Signal<NoopRawMutex, (u32, usize)>,
     pub(super) part: RefCell<[u8; PART]>,
     pub(super) part_len: Signal<NoopRawMutex, Option<usize>>,
     /// The number of a session that begins, and whether it is kept.
@@ -130,7 +130,7 @@ pub struct StoreHandle {
     pub(super) readers: Mutex<NoopRawMutex, ()>,
     pub(super) firmware: Cell<Option<FirmwareView>>,
     /// A request was admitted since the start.
-    pub(super) was_asked: Cell<bool>,
+    pub(super) was_reached: Cell<bool>,
 }
 
 impl StoreHandle {
@@ -142,16 +142,16 @@ impl StoreHandle {
             failure: RefCell::new(String::new()),
             is_taken: Cell::new(false),
             image: RefCell::new(image),
-            asked: Signal::new(),
+            requests: Signal::new(),
             done: Signal::new(),
-            wanted: Signal::new(),
+            part_requests: Signal::new(),
             part: RefCell::new([0; PART]),
             part_len: Signal::new(),
             session: Signal::new(),
             session_kept: Signal::new(),
             readers: Mutex::new(()),
             firmware: Cell::new(None),
-            was_asked: Cell::new(false),
+            was_reached: Cell::new(false),
         }
     }
 
@@ -170,9 +170,9 @@ impl StoreHandle {
         self.firmware.get()
     }
 
-    /// Notes that somebody reaches this board, and may change it.
-    pub fn was_asked(&self) {
-        self.was_asked.set(true);
+    /// Notes that an admitted request has reached this board.
+    pub fn note_reached(&self) {
+        self.was_reached.set(true);
     }
 
     /// Passes to `look` why the newest configuration that did not run did not; empty if all ran.
@@ -189,8 +189,8 @@ impl StoreHandle {
     }
 
     /// Takes the lock for a change; `None` if another change holds it.
-    pub fn take(&self) -> Option<Turn<'_>> {
-        (!self.is_taken.replace(true)).then_some(Turn { handle: self, is_asked: false })
+    pub fn take(&self) -> Option<StoreLock<'_>> {
+        (!self.is_taken.replace(true)).then_some(StoreLock { handle: self, is_asked: false })
     }
 
     /// Keeps the number of a session of the edge node, which alone calls this. Returns whether it is kept. Waits while
@@ -204,9 +204,9 @@ impl StoreHandle {
     /// Copies the image of a configuration from `offset` on, a multiple of [`PART`], and returns the number of bytes:
     /// at most [`PART`], fewer at its end. `None` if it is not kept. Waits while the store is being written.
     pub async fn part(&self, number: u32, offset: usize, into: &mut [u8]) -> Option<usize> {
-        let _turn = self.readers.lock().await;
+        let _guard = self.readers.lock().await;
         self.part_len.reset();
-        self.wanted.signal((number, offset));
+        self.part_requests.signal((number, offset));
         let len = self.part_len.wait().await?;
         let part = self.part.borrow();
         into.iter_mut().zip(part.iter().take(len)).for_each(|(place, byte)| *place = *byte);
@@ -215,13 +215,13 @@ impl StoreHandle {
 }
 
 /// The right to make a change.
-pub struct Turn<'a> {
+pub struct StoreLock<'a> {
     handle: &'a StoreHandle,
     /// From then on the store task releases the lock.
     is_asked: bool,
 }
 
-impl Turn<'_> {
+impl StoreLock<'_> {
     /// Writes to the room for an image.
     pub fn fill(&mut self, offset: usize, bytes: &[u8]) {
         let mut image = self.handle.image.borrow_mut();
@@ -239,15 +239,15 @@ impl Turn<'_> {
     ///
     /// # Errors
     /// Why nothing was changed.
-    pub async fn ask(mut self, what: Ask) -> Result<u32, Failed> {
+    pub async fn request(mut self, request: StoreRequest) -> Result<u32, Failed> {
         self.handle.done.reset();
         self.is_asked = true;
-        self.handle.asked.signal(what);
+        self.handle.requests.signal(request);
         self.handle.done.wait().await
     }
 }
 
-impl Drop for Turn<'_> {
+impl Drop for StoreLock<'_> {
     fn drop(&mut self) {
         if !self.is_asked {
             self.handle.is_taken.set(false);
