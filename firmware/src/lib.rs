@@ -12,8 +12,8 @@ pub mod drivers;
 pub mod fmt;
 pub mod identity;
 pub mod journal;
-pub mod kept;
 pub mod platform;
+pub mod stored;
 pub mod tasks;
 pub mod update;
 

@@ -13,7 +13,7 @@ use recipe_update::SlotFlash;
 
 use crate::drivers::can_port::CanPort;
 use crate::drivers::line::Line;
-use crate::kept::{Places, StoreFlash};
+use crate::stored::{Places, StoreFlash};
 use crate::update::Site;
 
 /// Numbers of field ports that a board has.

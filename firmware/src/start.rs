@@ -12,8 +12,8 @@ use embassy_net_driver::{Driver as _, HardwareAddress};
 use embassy_time::{Duration, Timer};
 use firmware::fmt::Text;
 use firmware::identity;
-use firmware::kept::Kept;
 use firmware::platform::{self, FeedWatchdog as _, NoDevice, Ports, StatusLed as _};
+use firmware::stored::StoredConfig;
 use firmware::tasks::console::{self, CONNECTIONS, Console, NodeView};
 use firmware::tasks::edge::{self, Cannot, Edge};
 use firmware::tasks::fair::Fair;
@@ -64,20 +64,20 @@ pub(crate) fn start(spawner: Spawner, mut board: Board) -> Tasks {
     static GATEWAY: ConstStaticCell<Gateway> = ConstStaticCell::new(Gateway::idle());
     static OVERLAY: ConstStaticCell<Overlay> = ConstStaticCell::new(Overlay::ZEROED);
     let (gateway, overlay) = (GATEWAY.take(), OVERLAY.take());
-    let mut kept = open_store(&mut board);
+    let mut stored = open_store(&mut board);
     let mut work = store::Work::default();
     let mut failure = None;
     let config = overlay.configuration();
-    let loaded = load(&mut board, kept.as_deref_mut(), gateway, config, &mut work, &mut failure);
+    let loaded = load(&mut board, stored.as_deref_mut(), gateway, config, &mut work, &mut failure);
     let mut wiring = Wiring { ports: heapless::Vec::new(), links: heapless::Vec::new(), network: None };
     if let Ok(len) = loaded {
         wire(len, gateway, config, &mut wiring);
     }
     let gateway: &'static Gateway = gateway;
-    let telling = make_edge(kept.as_deref_mut(), gateway, loaded.is_ok().then_some(&*config), board.seed());
-    let key = kept.as_ref().and_then(|kept| kept.access_key());
+    let telling = make_edge(stored.as_deref_mut(), gateway, loaded.is_ok().then_some(&*config), board.seed());
+    let key = stored.as_ref().and_then(|stored| stored.access_key());
     let slots = board.slots();
-    let store = kept.and_then(|kept| start_store_task(&tasks, gateway, kept, slots, work, failure));
+    let store = stored.and_then(|stored| start_store_task(&tasks, gateway, stored, slots, work, failure));
     let ran = loaded.and_then(|_| run_ports(&tasks, &mut board, gateway, &wiring));
     if ran.is_err() {
         wiring.links.clear();
@@ -95,11 +95,11 @@ pub(crate) fn start(spawner: Spawner, mut board: Board) -> Tasks {
 
 /// Reads the store; `None` if the board has none, or none that this program may use.
 #[inline(never)]
-fn open_store(board: &mut Board) -> Option<&'static mut Kept<Flash>> {
-    static KEPT: StaticCell<Kept<Flash>> = StaticCell::new();
+fn open_store(board: &mut Board) -> Option<&'static mut StoredConfig<Flash>> {
+    static STORED: StaticCell<StoredConfig<Flash>> = StaticCell::new();
     let places = board.flash()?;
-    let kept = Kept::open(places).inspect_err(|error| error!("{}", Text(error))).ok()?;
-    Some(KEPT.init(kept))
+    let stored = StoredConfig::open(places).inspect_err(|error| error!("{}", Text(error))).ok()?;
+    Some(STORED.init(stored))
 }
 
 /// The edge node, if there are settings for one.
@@ -112,7 +112,7 @@ struct Telling {
 /// Makes the edge node of what runs, while its configuration is there.
 #[inline(never)]
 fn make_edge(
-    kept: Option<&mut Kept<Flash>>,
+    stored: Option<&mut StoredConfig<Flash>>,
     gateway: &Gateway,
     config: Option<&GatewayConfig>,
     seed: u64,
@@ -125,8 +125,8 @@ fn make_edge(
     let mut telling =
         Telling { view: NodeView { edge, document: None, clock: CLOCK.take() }, node: None, seed };
     let edge::Memory { document, rest } = MEMORY.take();
-    let bd_seq = kept.as_ref().and_then(|kept| kept.store().birth_sequence());
-    match kept.and_then(|kept| kept.edge(document)) {
+    let bd_seq = stored.as_ref().and_then(|stored| stored.store().birth_sequence());
+    match stored.and_then(|stored| stored.edge(document)) {
         None | Some(Ok(false)) => return telling,
         Some(Ok(true)) => {}
         Some(Err(error)) => {
@@ -155,7 +155,7 @@ fn make_edge(
 fn start_store_task(
     tasks: &Tasks,
     gateway: &'static Gateway,
-    kept: &'static mut Kept<Flash>,
+    stored: &'static mut StoredConfig<Flash>,
     slots: Site<BoardSlot>,
     work: store::Work<'static>,
     failure: Option<Refused>,
@@ -168,7 +168,7 @@ fn start_store_task(
     if let Some(failure) = failure {
         store.failed(&failure);
     }
-    tasks.spawn(TaskName::Store, |pulse| store_task(pulse, gateway, store, kept, updates, work));
+    tasks.spawn(TaskName::Store, |pulse| store_task(pulse, gateway, store, stored, updates, work));
     Some(store)
 }
 
@@ -516,11 +516,11 @@ async fn store_task(
     pulse: &'static Pulse,
     gateway: &'static Gateway,
     store: &'static StoreHandle,
-    kept: &'static mut Kept<Flash>,
+    stored: &'static mut StoredConfig<Flash>,
     updates: &'static mut Updates<BoardSlot>,
     work: store::Work<'static>,
 ) -> ! {
-    pulse.run(pin!(store::run(gateway, pulse, store, kept, updates, work))).await;
+    pulse.run(pin!(store::run(gateway, pulse, store, stored, updates, work))).await;
     cortex_m::peripheral::SCB::sys_reset()
 }
 

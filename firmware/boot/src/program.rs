@@ -34,36 +34,36 @@ fn main() -> ! {
 fn chosen() -> Option<u32> {
     // SAFETY: called once.
     let (slots, stores) = unsafe { (board::slots()?, board::stores()) };
-    let mut board = Board { slots, store: stores.and_then(mounted) };
-    let marks = board.store.as_ref().map(|kept| kept.store.slots());
+    let mut board = Board { slots, store: stores.and_then(mount) };
+    let marks = board.store.as_ref().map(|mounted| mounted.store.slots());
     let name = BoardName::parse(BOARD.board)?;
     let key = PublicKey::parse(&KEY.key)?;
     let chosen = choose(&mut board, marks, &name, &key)?;
     board::load(&chosen, &board.slots)
 }
 
-/// The store that counts, and where it is.
-struct Kept {
+/// The valid store and its flash.
+struct MountedStore {
     store: Store,
     flash: Area,
 }
 
 /// A board with one bank has one place.
-fn mounted((first, second): (Area, Option<Area>)) -> Option<Kept> {
+fn mount((first, second): (Area, Option<Area>)) -> Option<MountedStore> {
     let Some(second) = second else {
-        return Some(Kept { store: Store::mount(&first).ok()?, flash: first });
+        return Some(MountedStore { store: Store::mount(&first).ok()?, flash: first });
     };
     let Newest { store, side, .. } = newest(&first, &second).ok()?;
     let flash = match side {
         Side::First => first,
         Side::Second => second,
     };
-    Some(Kept { store, flash })
+    Some(MountedStore { store, flash })
 }
 
 struct Board {
     slots: [Area; 2],
-    store: Option<Kept>,
+    store: Option<MountedStore>,
 }
 
 impl Machine for Board {
@@ -78,7 +78,7 @@ impl Machine for Board {
     }
 
     fn mark(&mut self, marks: SlotMarks) -> bool {
-        let Some(Kept { store, flash }) = &mut self.store else { return false };
+        let Some(MountedStore { store, flash }) = &mut self.store else { return false };
         // Nothing in it waits for anything but the flash, and the flash is waited for in place.
         store.mark_slots(marks).is_ok_and(|put| block_on(put.carry_out(flash)).is_ok())
     }

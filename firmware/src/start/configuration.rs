@@ -1,8 +1,8 @@
 //! Which configuration runs, and why none does.
 
 use firmware::fmt::Text;
-use firmware::kept::{self, EndedName, Kept, RoleName};
 use firmware::platform::{self, Board as _, NoDevice};
+use firmware::stored::{self, EndedName, RoleName, StoredConfig};
 use firmware::tasks::gateway::Gateway;
 use firmware::tasks::store;
 use firmware::{error, info};
@@ -48,21 +48,21 @@ impl core::fmt::Display for Refused {
 #[inline(never)]
 pub(super) fn load(
     board: &mut Board,
-    kept: Option<&mut Kept<Flash>>,
+    stored: Option<&mut StoredConfig<Flash>>,
     gateway: &mut Gateway,
     config: &mut GatewayConfig,
     work: &mut store::Work<'static>,
     failure: &mut Option<Refused>,
 ) -> Result<usize, Refused> {
     let own = board.configuration().map_err(Refused::Storage).map(whole);
-    let Some(kept) = kept else {
+    let Some(stored) = stored else {
         let (image, _) = own?;
         return configure(image, gateway, config);
     };
     // An empty place is no failure where the store has something.
     let mut why = own.err();
     if let Ok((image, digest)) = own
-        && !kept.store().is_adopted(digest, image.len())
+        && !stored.store().is_adopted(digest, image.len())
     {
         match configure(image, gateway, config) {
             Ok(len) => {
@@ -73,20 +73,20 @@ pub(super) fn load(
         }
     }
     let mut candidates = heapless::Vec::new();
-    if let Err(error) = board.block_on(kept.candidates(&mut candidates)) {
+    if let Err(error) = board.block_on(stored.candidates(&mut candidates)) {
         error!("the store: {}", Text(&error));
     }
     // A trial ends by a restart, whose log is the only one that somebody may look at.
-    if let Some((number, ended)) = kept.store().marks().last {
+    if let Some((number, ended)) = stored.store().marks().last {
         info!("the last trial was of configuration {}: {}", number, Text(&EndedName(ended)));
     }
     let mut is_first = true;
     for (revision, role) in candidates {
-        let Some(image) = kept.image(revision) else { continue };
+        let Some(image) = stored.image(revision) else { continue };
         match configure(image, gateway, config) {
             Ok(len) => {
                 info!("configuration {} of the store, {}", revision.number, Text(&RoleName(role)));
-                work.trial = kept::trial_time(role);
+                work.trial = stored::trial_time(role);
                 work.running = Some(revision.number);
                 return Ok(len);
             }

@@ -24,7 +24,7 @@ use super::gateway::Gateway;
 use super::watchdog::Pulse;
 use crate::clock::now;
 use crate::fmt::Text;
-use crate::kept::{Kept, StoreFlash};
+use crate::stored::{StoreFlash, StoredConfig};
 use crate::update::{self, Updates, Works};
 use crate::{error, info, warn};
 
@@ -46,35 +46,35 @@ pub async fn run<F: StoreFlash, S: SlotFlash>(
     gateway: &Gateway,
     pulse: &Pulse,
     handle: &StoreHandle,
-    kept: &mut Kept<F>,
+    stored: &mut StoredConfig<F>,
     updates: &mut Updates<S>,
     work: Work<'_>,
 ) {
     let mut running = work.running;
-    if kept.is_to_be_moved() {
+    if stored.is_to_be_moved() {
         info!("the store is moved out of the bank that the program runs from");
-        let moved = pulse.idle(pin!(kept.move_home())).await;
+        let moved = pulse.idle(pin!(stored.move_home())).await;
         if let Err(error) = moved {
             error!("the store stays where it is: {}", Text(&error));
         }
     }
     if let Some((digest, image)) = work.adopt {
-        let adopted = pulse.idle(pin!(kept.adopt(digest, image))).await;
+        let adopted = pulse.idle(pin!(stored.adopt(digest, image))).await;
         match adopted {
             Ok(_) => {
                 info!("the store has taken over the configuration");
-                running = kept.store().marks().live;
+                running = stored.store().marks().live;
             }
             Err(error) => error!("the store: {}", Text(&error)),
         }
     }
     if work.trial_failed {
-        let ended = pulse.idle(pin!(kept.end_trial(recipe_store::Ended::Failed))).await;
+        let ended = pulse.idle(pin!(stored.end_trial(recipe_store::Ended::Failed))).await;
         if let Err(error) = ended {
             error!("the store: {}", Text(&error));
         }
     }
-    let mut revisions = revisions_of(kept.store());
+    let mut revisions = revisions_of(stored.store());
     if let (Some(revisions), Some(time), Some(number)) = (&mut revisions, work.trial, running) {
         revisions.resume_trial(number, now() + Span::from_micros(time.as_micros()));
     }
@@ -85,18 +85,18 @@ pub async fn run<F: StoreFlash, S: SlotFlash>(
     };
     handle.running.set(running);
     handle.revisions.replace(Some(revisions));
-    let marks = kept.slots();
+    let marks = stored.slots();
     let trial = marks.trial.filter(|trial| updates.running() == Some(trial.slot));
     let trial = trial.map(|trial| {
         warn!("this firmware is on trial for {} s", trial.confirm_s);
         update::Trial::new(Instant::now(), trial.confirm_s, Works::of_code(trial.before))
     });
-    StoreTask { handle, kept, updates, trial, trial_s: None }.work(gateway, pulse).await;
+    StoreTask { handle, stored, updates, trial, trial_s: None }.work(gateway, pulse).await;
 }
 
 struct StoreTask<'a, F, S> {
     handle: &'a StoreHandle,
-    kept: &'a mut Kept<F>,
+    stored: &'a mut StoredConfig<F>,
     updates: &'a mut Updates<S>,
     /// The firmware that runs is on trial.
     trial: Option<update::Trial>,
@@ -154,12 +154,12 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
                 }
                 Either4::Second((number, offset)) => {
                     let mut part = handle.part.borrow_mut();
-                    let len = self.kept.image_part(number, offset, &mut part[..]).map(<[u8]>::len);
+                    let len = self.stored.image_part(number, offset, &mut part[..]).map(<[u8]>::len);
                     handle.part_len.signal(len);
                 }
                 Either4::Third(bd_seq) => {
-                    let kept = pulse.idle(pin!(self.kept.set_session(bd_seq))).await;
-                    handle.session_kept.signal(kept.is_ok());
+                    let written = pulse.idle(pin!(self.stored.set_session(bd_seq))).await;
+                    handle.session_kept.signal(written.is_ok());
                 }
                 Either4::Fourth(()) => {}
             }
@@ -211,7 +211,7 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
             }
         };
         if let StoreRequest::Claim(key) = request {
-            let taken = self.kept.set_access_key(&key).await;
+            let taken = self.stored.set_access_key(&key).await;
             return (taken.map(|()| 0).map_err(Failed::Store), false);
         }
         let number = match decided {
@@ -235,9 +235,9 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
             return (Err(Failed::Refused(Refused::OnTrial)), false);
         }
         let image = self.handle.image.borrow();
-        let kept = self.kept.set_edge(image.get(..len).unwrap_or(&[])).await;
-        let is_restart = restart && kept.is_ok();
-        (kept.map(|()| 0).map_err(Failed::Store), is_restart)
+        let written = self.stored.set_edge(image.get(..len).unwrap_or(&[])).await;
+        let is_restart = restart && written.is_ok();
+        (written.map(|()| 0).map_err(Failed::Store), is_restart)
     }
 
     /// The next output of the revisions.
@@ -267,11 +267,11 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
                 Output::Store { revision: Revision { number, digest }, forget } => {
                     let image = self.handle.image.borrow();
                     let image = image.get(..image_len).unwrap_or(&[]);
-                    let written = self.kept.keep(number, digest, image, forget).await;
+                    let written = self.stored.keep(number, digest, image, forget).await;
                     // Room for it was made of others.
                     if let Some(revisions) = self.handle.revisions.borrow_mut().as_mut() {
                         revisions.keep_only(|number| {
-                            number == NOTHING.number || self.kept.store().revision(number).is_some()
+                            number == NOTHING.number || self.stored.store().revision(number).is_some()
                         });
                     }
                     let is_done = written.is_ok();
@@ -279,7 +279,7 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
                 }
                 Output::Mark { live, previous } => {
                     let written =
-                        self.kept.make_live(live, (previous != NOTHING.number).then_some(previous)).await;
+                        self.stored.make_live(live, (previous != NOTHING.number).then_some(previous)).await;
                     let is_done = written.is_ok();
                     (written, Done::Marked(is_done))
                 }
@@ -288,15 +288,15 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
                 Output::Run { number } => {
                     let (live, ended) = self.live_and_ended();
                     let written = match self.trial_s.take() {
-                        Some(confirm_s) => self.kept.begin_trial(number, confirm_s).await,
+                        Some(confirm_s) => self.stored.begin_trial(number, confirm_s).await,
                         None if number == live => {
                             // The starts of a trial are counted, so it ends also if this cannot be written.
-                            if let Err(error) = self.kept.end_trial(ended).await {
+                            if let Err(error) = self.stored.end_trial(ended).await {
                                 error!("the store: {}", Text(&error));
                             }
                             return Next::Restart;
                         }
-                        None => self.kept.make_live(number, Some(live)).await,
+                        None => self.stored.make_live(number, Some(live)).await,
                     };
                     if written.is_ok() {
                         return Next::Restart;

@@ -1,7 +1,7 @@
 //! The flash of the store, a file of the host that the fourth semihosting argument names, and that of the slots, which
 //! the sixth one names. Without the fourth there is no store.
 
-use firmware::kept::StoreFlash;
+use firmware::stored::StoreFlash;
 use firmware::update::{Site, Slots};
 use recipe_store::{Flash, Found, Geometry, MAX_DATA, Place, WORD, Word};
 use recipe_update::{MPS2_AN500 as BOARD, Slot};

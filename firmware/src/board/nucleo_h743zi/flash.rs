@@ -13,7 +13,7 @@ use core::task::{Context, Poll, Waker};
 use embassy_stm32::pac::FLASH;
 use embassy_stm32::pac::flash::regs::{Ccr, Cr};
 use embassy_time::{Duration, Instant, Timer};
-use firmware::kept::{Places, StoreFlash};
+use firmware::stored::{Places, StoreFlash};
 use firmware::update::{Site, Slots};
 use recipe_store::{Found, Geometry, Place, Side, WORD, Word};
 use recipe_update::{NUCLEO_H743ZI as BOARD, NUCLEO_H743ZI_STORES as STORES, Slot, SlotFlash, Stores};

@@ -22,7 +22,7 @@ use embassy_executor::Executor;
 use embassy_stm32::{bind_interrupts, eth};
 use embassy_time::Duration;
 use firmware::fmt::Text;
-use firmware::kept::Places;
+use firmware::stored::Places;
 use firmware::update::Site;
 use firmware::{error, info, platform, warn};
 use panic_probe as _;

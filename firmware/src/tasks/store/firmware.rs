@@ -9,7 +9,7 @@ use recipe_update::{SlotFlash, begin_trial, confirm, end_trial};
 use super::super::gateway::Gateway;
 use super::{Failed, FirmwareView, MAX_SAFE, StoreRequest, StoreTask};
 use crate::fmt::Text;
-use crate::kept::{StoreFlash, image_version};
+use crate::stored::{StoreFlash, image_version};
 use crate::update::{Refused, Verdict, WaitsFor, Works};
 use crate::{error, info, warn};
 
@@ -57,8 +57,8 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
 
     async fn over(&mut self, ended: Ended) -> Judged {
         // The starts of a trial are counted, so it ends also if this cannot be written.
-        if let Some(marks) = end_trial(self.kept.slots(), ended)
-            && let Err(error) = self.kept.mark_slots(marks).await
+        if let Some(marks) = end_trial(self.stored.slots(), ended)
+            && let Err(error) = self.stored.mark_slots(marks).await
         {
             error!("the store: {}", Text(&error));
         }
@@ -67,9 +67,9 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
 
     async fn confirm_firmware(&mut self) -> Result<u32, Failed> {
         let running = self.updates.running();
-        let marks = running.and_then(|running| confirm(self.kept.slots(), running));
+        let marks = running.and_then(|running| confirm(self.stored.slots(), running));
         let marks = marks.ok_or(Failed::Firmware(Refused::NotOnTrial))?;
-        self.kept.mark_slots(marks).await.map_err(|error| {
+        self.stored.mark_slots(marks).await.map_err(|error| {
             error!("the store: {}", Text(&error));
             Failed::Store(error)
         })?;
@@ -88,7 +88,7 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
             build: updates.build(),
             cannot: updates.cannot(),
             key: updates.key(),
-            marks: self.kept.slots(),
+            marks: self.stored.slots(),
             trial,
             other: updates.other().copied(),
             incoming: updates.incoming(),
@@ -102,7 +102,7 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
         request: &StoreRequest,
     ) -> Option<(Result<u32, Failed>, bool)> {
         let refused = |why| Some((Err(Failed::Firmware(why)), false));
-        let marks = self.kept.slots();
+        let marks = self.stored.slots();
         match request {
             StoreRequest::Put { len, .. } => {
                 let version = image_version(self.handle.image.borrow().get(..*len).unwrap_or(&[]));
@@ -118,7 +118,7 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
                 if self.handle.look(|revisions| revisions.trial().is_some()) != Some(false) {
                     return refused(Refused::Unsettled);
                 }
-                let header = match self.updates.ready(self.kept.versions(), marks, *downgrade) {
+                let header = match self.updates.ready(self.stored.versions(), marks, *downgrade) {
                     Ok(header) => header,
                     Err(why) => return refused(why),
                 };
@@ -133,7 +133,7 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
                     return Some((Err(Failed::Firmware(why)), true));
                 }
                 let marks = begin_trial(marks, header.slot(), *confirm_s, before);
-                let marked = self.kept.mark_slots(marks).await;
+                let marked = self.stored.mark_slots(marks).await;
                 Some((marked.map(|()| 0).map_err(Failed::Store), true))
             }
             StoreRequest::ConfirmFirmware => Some((self.confirm_firmware().await, false)),
@@ -158,10 +158,10 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
         marks: SlotMarks,
         downgrade: recipe_update::Downgrade,
     ) -> Result<u32, Failed> {
-        let kept = self.kept.versions();
+        let versions = self.stored.versions();
         let image = self.handle.image.borrow();
         let bytes = image.get(..len).unwrap_or(&[]);
-        self.updates.take(offset, bytes, kept, marks, downgrade).await.map_err(Failed::Firmware)?;
+        self.updates.take(offset, bytes, versions, marks, downgrade).await.map_err(Failed::Firmware)?;
         Ok(0)
     }
 }

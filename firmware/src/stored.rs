@@ -41,7 +41,7 @@ impl<F> Places<F> {
 
 /// A store and its flash.
 #[derive(Debug)]
-pub struct Kept<F> {
+pub struct StoredConfig<F> {
     store: Store,
     /// Where it is.
     flash: F,
@@ -78,7 +78,7 @@ impl fmt::Display for EndedName {
     }
 }
 
-impl<F: StoreFlash> Kept<F> {
+impl<F: StoreFlash> StoredConfig<F> {
     /// Reads the flash.
     ///
     /// # Errors
