@@ -102,7 +102,7 @@ impl Bench {
     pub(crate) fn mark(&mut self, marks: SlotMarks) {
         let mut first = self.place(Side::First);
         let mut store = recipe_store::Store::mount(&first).expect("it can be one");
-        block_on(store.mark_slots(marks).expect("there is room").carry_out(&mut first)).expect("it is flash");
+        block_on(store.mark_slots(marks).expect("there is room").execute(&mut first)).expect("it is flash");
         for (start, words) in STORES.sectors(Side::First).into_iter().zip(first.0.chunks(WORDS.into())) {
             self.chip.load(start, words.as_flattened());
         }
@@ -149,7 +149,7 @@ impl Bench {
     }
 
     /// When LD3 was switched.
-    pub(crate) fn red_lamp(&mut self) -> Vec<(Picos, bool)> {
+    pub(crate) fn red_led(&mut self) -> Vec<(Picos, bool)> {
         self.chip.devices().led(recipe_chip_model::Led::Red).collect()
     }
 }

@@ -80,11 +80,11 @@ fn where_nothing_can_run_the_lamp_blinks() {
     let mut bench = Bench::new();
     bench.chip.tear(BOARD.slot(Slot::A)).expect("there is flash");
     bench.run(2 * SECOND);
-    let lamp = bench.red_lamp();
-    assert!(lamp.len() > 3 && lamp.windows(2).all(|pair| pair[0].1 != pair[1].1), "{lamp:?}");
+    let led = bench.red_led();
+    assert!(led.len() > 3 && led.windows(2).all(|pair| pair[0].1 != pair[1].1), "{led:?}");
     assert!(
-        lamp.windows(2).all(|pair| (200 * MILLI..700 * MILLI).contains(&(pair[1].0 - pair[0].0))),
-        "{lamp:?}"
+        led.windows(2).all(|pair| (200 * MILLI..700 * MILLI).contains(&(pair[1].0 - pair[0].0))),
+        "{led:?}"
     );
     assert!(bench.chip.resets.is_empty());
 }

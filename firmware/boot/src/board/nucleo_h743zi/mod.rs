@@ -1,7 +1,7 @@
 //! The NUCLEO-H743ZI2: slots and stores in the chip's flash, a slot runs where it is, and there is no log.
 
 mod flash;
-mod lamp;
+mod led;
 #[path = "../../../../src/board/nucleo_h743zi/readable.rs"]
 mod readable;
 mod register;
@@ -14,7 +14,7 @@ pub(crate) use recipe_update::NUCLEO_H743ZI as BOARD;
 use recipe_update::{Chosen, IMAGE_OFFSET, Slot};
 
 pub(crate) use flash::Area;
-pub(crate) use lamp::blink as nothing_runs;
+pub(crate) use led::blink as nothing_runs;
 
 /// Before anything is read.
 pub(crate) fn start() {

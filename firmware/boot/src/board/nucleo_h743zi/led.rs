@@ -1,4 +1,4 @@
-//! LD3, the red lamp, at PB14: nothing can run.
+//! LD3, the red LED, at PB14: no slot can run.
 
 use super::register::Register;
 use super::watchdog;
