@@ -108,7 +108,7 @@ impl<F: StoreFlash> StoredConfig<F> {
     /// It stays where it was.
     pub async fn move_home(&mut self) -> Result<(), PutError> {
         let Some(mut to) = self.to.take() else { return Ok(()) };
-        self.store = self.store.relocate().carry_out(&self.flash, &mut to).await?;
+        self.store = self.store.relocate().execute(&self.flash, &mut to).await?;
         self.flash = to;
         Ok(())
     }
@@ -123,7 +123,7 @@ impl<F: StoreFlash> StoredConfig<F> {
     /// # Errors
     /// The marks cannot be written; those before count.
     pub async fn mark_slots(&mut self, marks: SlotMarks) -> Result<(), KeepError> {
-        Ok(self.store.mark_slots(marks)?.carry_out(&mut self.flash).await?)
+        Ok(self.store.mark_slots(marks)?.execute(&mut self.flash).await?)
     }
 
     /// The oldest and the newest version of the images that may have to run after an update: the live one, the one
@@ -159,7 +159,7 @@ impl<F: StoreFlash> StoredConfig<F> {
         // An image, its mark, a note: each once. Before that, room for the image.
         for _ in 0..4 + MAX_REVISIONS {
             match self.store.adopt(digest, image) {
-                Ok(Adoption::Write(put)) => put.carry_out(&mut self.flash).await?,
+                Ok(Adoption::Write(put)) => put.execute(&mut self.flash).await?,
                 Ok(Adoption::Done) => break,
                 Err(full) => {
                     self.make_room(full, None).await?;
@@ -236,11 +236,11 @@ impl<F: StoreFlash> StoredConfig<F> {
         let mut forget = forget;
         for _ in 0..MAX_REVISIONS {
             match self.store.keep(number, digest, image, forget) {
-                Ok(put) => return Ok(put.carry_out(&mut self.flash).await?),
+                Ok(put) => return Ok(put.execute(&mut self.flash).await?),
                 Err(full) => self.make_room(full, forget.take()).await?,
             }
         }
-        Ok(self.store.keep(number, digest, image, None)?.carry_out(&mut self.flash).await?)
+        Ok(self.store.keep(number, digest, image, None)?.execute(&mut self.flash).await?)
     }
 
     /// Forgets a configuration, if the store is full: this one, or the oldest that may be.
@@ -249,7 +249,7 @@ impl<F: StoreFlash> StoredConfig<F> {
             return Err(why);
         }
         let put = self.store.forget(forget)?.ok_or(why)?;
-        Ok(put.carry_out(&mut self.flash).await?)
+        Ok(put.execute(&mut self.flash).await?)
     }
 
     /// The key of the API.
@@ -262,7 +262,7 @@ impl<F: StoreFlash> StoredConfig<F> {
     /// # Errors
     /// It cannot be written.
     pub async fn set_access_key(&mut self, key: &[u8; 16]) -> Result<(), KeepError> {
-        Ok(self.store.set_access_key(key)?.carry_out(&mut self.flash).await?)
+        Ok(self.store.set_access_key(key)?.execute(&mut self.flash).await?)
     }
 
     /// Reads the settings of the edge node into `document`. Returns whether it tells; `None` if there are none.
@@ -279,11 +279,11 @@ impl<F: StoreFlash> StoredConfig<F> {
     pub async fn set_edge(&mut self, settings: &[u8]) -> Result<(), KeepError> {
         for _ in 0..MAX_REVISIONS {
             match self.store.set_edge(settings) {
-                Ok(put) => return Ok(put.carry_out(&mut self.flash).await?),
+                Ok(put) => return Ok(put.execute(&mut self.flash).await?),
                 Err(full) => self.make_room(full.into(), None).await?,
             }
         }
-        Ok(self.store.set_edge(settings)?.carry_out(&mut self.flash).await?)
+        Ok(self.store.set_edge(settings)?.execute(&mut self.flash).await?)
     }
 
     /// Keeps the number of the edge node's session.
@@ -291,11 +291,11 @@ impl<F: StoreFlash> StoredConfig<F> {
     /// # Errors
     /// It cannot be written.
     pub async fn set_session(&mut self, bd_seq: u8) -> Result<(), KeepError> {
-        Ok(self.store.set_birth_sequence(bd_seq)?.carry_out(&mut self.flash).await?)
+        Ok(self.store.set_birth_sequence(bd_seq)?.execute(&mut self.flash).await?)
     }
 
     async fn mark(&mut self, marks: Marks) -> Result<(), KeepError> {
-        Ok(self.store.mark(marks)?.carry_out(&mut self.flash).await?)
+        Ok(self.store.mark(marks)?.execute(&mut self.flash).await?)
     }
 
     /// Bytes of an image from `offset` on, which is a multiple of [`WORD`]: as many as there are and as `out` has

@@ -433,10 +433,10 @@ fn the_store_keeps_what_runs_and_a_trial_ends() {
     let bytes = std::fs::read(&image).unwrap();
     let [live] = store.revisions()[..] else { panic!("one is kept") };
     assert_eq!((live.number, live.len), (1, bytes.len()));
-    block_on(store.keep(2, 2, &bytes, None).unwrap().carry_out(&mut file)).unwrap();
+    block_on(store.keep(2, 2, &bytes, None).unwrap().execute(&mut file)).unwrap();
     let trial = Some(Trial { number: 2, attempts: 3, confirm_s: 1 });
     let marks = Marks { live: Some(1), trial, ..Marks::default() };
-    block_on(store.mark(marks).unwrap().carry_out(&mut file)).unwrap();
+    block_on(store.mark(marks).unwrap().execute(&mut file)).unwrap();
     file.save();
     let mut machine = Machine::with_store(nothing(), &path);
     machine.until("configuration 2 of the store, on trial for 1 s");

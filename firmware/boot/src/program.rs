@@ -80,7 +80,7 @@ impl Machine for Board {
     fn mark(&mut self, marks: SlotMarks) -> bool {
         let Some(MountedStore { store, flash }) = &mut self.store else { return false };
         // Nothing in it waits for anything but the flash, and the flash is waited for in place.
-        store.mark_slots(marks).is_ok_and(|put| block_on(put.carry_out(flash)).is_ok())
+        store.mark_slots(marks).is_ok_and(|put| block_on(put.execute(flash)).is_ok())
     }
 
     fn passed_over(&mut self, slot: Slot, why: &dyn fmt::Display) {

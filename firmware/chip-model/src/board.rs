@@ -145,7 +145,7 @@ impl Board {
         self.deadline
     }
 
-    /// Lets all devices carry out what is due.
+    /// Lets all devices do what is due.
     pub(crate) fn advance(&mut self, core: Engine) {
         self.advance_those(core, |_, _| true);
     }

@@ -202,7 +202,7 @@ pub trait Peripheral {
     /// # Errors
     /// As above.
     fn write(&mut self, offset: u32, value: u32, at: &Context<'_>) -> Result<(), Refusal>;
-    /// Carries out everything due up to now.
+    /// Does everything due up to now.
     ///
     /// # Errors
     /// The program's settings make it impossible.

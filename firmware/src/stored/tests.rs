@@ -62,7 +62,7 @@ impl StoredConfig<Plain> {
     }
 
     fn write(&mut self, put: impl FnOnce(&mut Store) -> Put<'_, 'static>) {
-        block_on(put(&mut self.store).carry_out(&mut self.flash)).unwrap();
+        block_on(put(&mut self.store).execute(&mut self.flash)).unwrap();
     }
 
     /// Numbers and roles of a start.

@@ -1,6 +1,6 @@
 //! A CAN port's task.
 //!
-//! The task receives, sends what the engine hands over, and restarts the controller after bus-off. It never waits
+//! The task receives, sends what the engine sends, and restarts the controller after bus-off. It never waits
 //! for one direction only, and yields after some events in a row, however busy the bus is.
 
 use core::pin::pin;
@@ -42,7 +42,7 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, can: impl CanPo
 enum Phase {
     /// Frames to send.
     Idle,
-    /// Frames handed over must leave the controller until then.
+    /// Frames sent by the engine must leave the controller until then.
     Sending { until: Instant },
     /// Bus-off: no restart until then.
     Off { until: Instant },
@@ -124,7 +124,7 @@ impl<C: CanPort> Task<'_, C> {
         }
     }
 
-    /// Sends what the engine handed over.
+    /// Sends what the engine sent.
     async fn send_waiting(&mut self) {
         let mut frames = 0_u32;
         while let Some(frame) = self.control.next_frame() {

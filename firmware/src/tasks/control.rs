@@ -52,7 +52,7 @@ impl PortControl {
         self.changed.notify();
     }
 
-    /// Takes a frame from the engine, which hands over at most as many as there is room for.
+    /// Takes a frame from the engine, which sends at most as many as fit.
     pub(crate) fn put_frame(&self, frame: CanFrame) {
         let _ = self.frames.borrow_mut().push_back(frame);
         self.changed.notify();

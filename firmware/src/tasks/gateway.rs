@@ -1,6 +1,6 @@
 //! The engine, shared by the tasks.
 //!
-//! A driver's input is handled at once, and the engine's outputs are carried out before anything else is read:
+//! A driver's input is handled at once, and the engine's outputs are executed before anything else is read:
 //! there is one engine pass between the last byte of a field frame and the request to the controller. All tasks
 //! run on one executor, so the engine is never entered twice. Each port and link has one outbox, from which its
 //! task takes data.

@@ -184,7 +184,7 @@ const RX: usize = INPUT_BUFFER;
 const CHUNK: usize = INPUT_BUFFER;
 /// Receive buffer of a connection for recipe frames: two of the longest. The rest of the memory is the transmit
 /// buffer, so that a controller that acknowledges late does not slow the frames down: 64 frames of 72 bytes, as
-/// many as the engine hands over, or 70 ms of frames of 256 bytes.
+/// many as the engine sends, or 70 ms of frames of 256 bytes.
 const RX_FRAMES: usize = 1024;
 const CHUNK_FRAMES: usize = 512;
 

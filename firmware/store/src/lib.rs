@@ -22,7 +22,7 @@
 //!
 //! [`Store::mount`] looks at the flash. What changes it is a [`Put`], a state machine: [`Put::next`] says what
 //! to do with the flash, until it ends. So the same code waits for the flash or lets other tasks run meanwhile:
-//! [`Put::carry_out`] is the loop for a [`Flash`] with futures.
+//! [`Put::execute`] is the loop for a [`Flash`] with futures.
 //!
 //! A board whose program can be updated has two places for a store, because flash cannot be read while a sector
 //! of the same bank is erased: [`newest`] says which one counts, a [`Move`] changes the place.
@@ -46,8 +46,8 @@
 //! # embassy_futures::block_on(async {
 //! let mut store = Store::mount(&flash)?;
 //! let image = b"a configuration";
-//! store.keep(1, 0xC0FFEE, image, None)?.carry_out(&mut flash).await?;
-//! store.mark(Marks { live: Some(1), ..Marks::default() })?.carry_out(&mut flash).await?;
+//! store.keep(1, 0xC0FFEE, image, None)?.execute(&mut flash).await?;
+//! store.mark(Marks { live: Some(1), ..Marks::default() })?.execute(&mut flash).await?;
 //!
 //! // After a restart.
 //! let store = Store::mount(&flash)?;

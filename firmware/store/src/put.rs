@@ -13,7 +13,7 @@ use crate::{BLANK, Flash, Found, Key, Place, Store, Word};
 
 /// A record that is being written. Dropped before it has ended, it leaves the old record or the new one; the
 /// operation of flash that was begun has to end before the next.
-#[must_use = "nothing is written until `next` or `carry_out` is called"]
+#[must_use = "nothing is written until `next` or `execute` is called"]
 #[derive(Debug)]
 pub struct Put<'s, 'd> {
     store: &'s mut Store,
@@ -210,7 +210,7 @@ impl Put<'_, '_> {
     ///
     /// # Errors
     /// Why the record is not there; the one before is.
-    pub async fn carry_out(mut self, flash: &mut impl Flash) -> Result<(), PutError> {
+    pub async fn execute(mut self, flash: &mut impl Flash) -> Result<(), PutError> {
         loop {
             match self.next(flash) {
                 Step::Erase(sector) => flash.erase(sector).await,

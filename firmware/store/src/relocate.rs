@@ -47,7 +47,7 @@ pub fn newest(first: &impl Flash, second: &impl Flash) -> Result<Newest, MountEr
 }
 
 /// A store that is being moved. Dropped or cut before it has ended, it leaves the store where it was.
-#[must_use = "nothing is moved until `next` or `carry_out` is called"]
+#[must_use = "nothing is moved until `next` or `execute` is called"]
 #[derive(Debug)]
 pub struct Move<'s> {
     from: &'s Store,
@@ -157,7 +157,7 @@ impl Move<'_> {
     ///
     /// # Errors
     /// Why it stays where it was.
-    pub async fn carry_out(mut self, from: &impl Flash, to: &mut impl Flash) -> Result<Store, PutError> {
+    pub async fn execute(mut self, from: &impl Flash, to: &mut impl Flash) -> Result<Store, PutError> {
         loop {
             match self.next(from, to) {
                 Step::Erase(sector) => to.erase(sector).await,

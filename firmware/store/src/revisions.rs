@@ -294,7 +294,7 @@ impl Store {
     }
 
     /// Takes over an image from outside the store: it is kept, becomes the live one, and that it was taken over
-    /// is noted, so that it happens once. Called again after each [`Adoption::Write`] that was carried out; after
+    /// is noted, so that it happens once. Called again after each [`Adoption::Write`] that was executed; after
     /// a power cut it goes on where it was.
     ///
     /// # Errors

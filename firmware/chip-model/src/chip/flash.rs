@@ -100,7 +100,7 @@ impl Chip {
         }
     }
 
-    /// An instruction was carried out here.
+    /// An instruction was executed here.
     fn pass(&mut self, len: u32) {
         self.pc += len;
         // After one refused access the emulator lets the next ones through.

@@ -282,7 +282,7 @@ impl Flash {
     }
 
     fn finish(&mut self, operation: &Operation) {
-        self.contents.carry_out(operation);
+        self.contents.execute(operation);
         match *operation {
             Operation::Erase { first } => {
                 self.changed.push((first, SECTOR));

@@ -238,7 +238,7 @@ impl Scs {
         self.wants_reset
     }
 
-    /// Lets SysTick carry out what is due.
+    /// Lets SysTick do what is due.
     pub fn advance(&mut self, at: &Context<'_>) {
         while let Some(next) = self.ticks
             && at.now >= next

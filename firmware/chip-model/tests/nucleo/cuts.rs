@@ -201,7 +201,7 @@ fn the_power_is_cut_in_each_operation_of_an_update() {
                 starts += 1;
             }
         }
-        flash.carry_out(operation);
+        flash.execute(operation);
     }
     println!("{} operations, {starts} cuts: {cuts:?}", recorded.operations.len());
     assert!(cuts.len() == 7 || from > 0, "a stage was not cut");

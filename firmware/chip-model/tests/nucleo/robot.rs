@@ -133,7 +133,7 @@ impl Robot {
         self.controller.counters()
     }
 
-    /// Moves frames both ways, and lets the controller carry out what is due.
+    /// Moves frames both ways, and lets the controller do what is due.
     pub(crate) fn exchange(&mut self, now: Picos, board: &mut Ethernet) {
         let time = Instant::from_micros(now / MICRO);
         let has_frames = !board.sent.is_empty();

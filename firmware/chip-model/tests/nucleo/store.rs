@@ -75,10 +75,10 @@ fn store_with(images: &[Vec<u8>], marks: Marks) -> Copy {
     let mut flash = Copy::blank();
     let mut store = Store::mount(&flash).expect("it is empty");
     for (number, image) in (1..).zip(images) {
-        block_on(store.keep(number, number, image, None).expect("there is room").carry_out(&mut flash))
+        block_on(store.keep(number, number, image, None).expect("there is room").execute(&mut flash))
             .expect("it is flash");
     }
-    block_on(store.mark(marks).expect("they are kept").carry_out(&mut flash)).expect("it is flash");
+    block_on(store.mark(marks).expect("they are kept").execute(&mut flash)).expect("it is flash");
     flash
 }
 
@@ -89,7 +89,7 @@ fn full_store(images: &[Vec<u8>], marks: Marks) -> Copy {
     let mut count = 0;
     while flash.0[Copy::at(Place { sector: 1, word: WORDS - 6 })] == BLANK {
         count += 1;
-        block_on(store.set_counter(0, count).expect("there is room").carry_out(&mut flash))
+        block_on(store.set_counter(0, count).expect("there is room").execute(&mut flash))
             .expect("it is flash");
     }
     flash

@@ -22,7 +22,7 @@ use crate::tasks::store::{Failed, StoreLock, StoreRequest};
 use crate::warn;
 
 impl Console {
-    /// Carries out a change.
+    /// Executes a change.
     pub(super) async fn change<'a>(&'a self, room: &mut [u8], request: Request<'a>) -> Reply {
         let Request { operation, peer, .. } = request;
         if operation == Operation::PutConfig

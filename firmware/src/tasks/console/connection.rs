@@ -110,7 +110,7 @@ impl Console {
         let reply = match self.admit(&mut line, buffer) {
             Ok((admitted, mut request)) => {
                 match self.receive_body(&mut line, &admitted, &mut request, rest, deadline).await? {
-                    Body::Whole => match self.carry_out(&mut line, request).await? {
+                    Body::Whole => match self.execute(&mut line, request).await? {
                         Outcome::Sent => return Ok(()),
                         Outcome::Reply(reply) => reply,
                     },

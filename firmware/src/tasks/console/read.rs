@@ -27,8 +27,8 @@ use crate::platform::Ports;
 use crate::tasks::store::{NOTHING, PART, StoreHandle};
 
 impl Console {
-    /// Carries out a request.
-    pub(super) async fn carry_out<'a>(
+    /// Executes a request.
+    pub(super) async fn execute<'a>(
         &'a self,
         line: &mut Line<'_, '_>,
         request: Request<'a>,

@@ -110,7 +110,7 @@ impl Driver<'_> {
     /// Reports acknowledgements to the engine while something is unacknowledged.
     async fn watch_acknowledgements(&self, turn: u32, outgoing: &Outgoing<'_>) {
         loop {
-            // Needs no waker: data handed over wakes this task.
+            // Needs no waker: data from the engine wakes this task.
             poll_fn(|_| if self.control.unacknowledged() > 0 { Poll::Ready(()) } else { Poll::Pending })
                 .await;
             Timer::after(ACK_PERIOD).await;

@@ -95,7 +95,7 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
         }));
     }
 
-    /// Carries out what is about the firmware; `None` if it is not. Returns as the store task's own does.
+    /// Executes a request about the firmware; `None` if it is about something else. Returns what `execute` returns.
     pub(super) async fn of_firmware(
         &mut self,
         gateway: &Gateway,

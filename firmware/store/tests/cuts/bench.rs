@@ -102,19 +102,17 @@ impl Operation {
     pub(crate) fn attempt(&self, store: &mut Store, flash: &mut Nor) -> bool {
         let done = match self {
             Self::Keep { number, image } => {
-                block_on(store.keep(*number, !number, image, None).expect("it is allowed").carry_out(flash))
+                block_on(store.keep(*number, !number, image, None).expect("it is allowed").execute(flash))
             }
-            Self::Mark(marks) => block_on(store.mark(*marks).expect("all are kept").carry_out(flash)),
+            Self::Mark(marks) => block_on(store.mark(*marks).expect("all are kept").execute(flash)),
             Self::Counter(number, value) => {
-                block_on(store.set_counter(*number, *value).expect("there is room").carry_out(flash))
+                block_on(store.set_counter(*number, *value).expect("there is room").execute(flash))
             }
             Self::BirthSequence(value) => {
-                block_on(store.set_birth_sequence(*value).expect("there is room").carry_out(flash))
+                block_on(store.set_birth_sequence(*value).expect("there is room").execute(flash))
             }
-            Self::Edge(settings) => {
-                block_on(store.set_edge(settings).expect("there is room").carry_out(flash))
-            }
-            Self::Key(key) => block_on(store.set_access_key(key).expect("there is room").carry_out(flash)),
+            Self::Edge(settings) => block_on(store.set_edge(settings).expect("there is room").execute(flash)),
+            Self::Key(key) => block_on(store.set_access_key(key).expect("there is room").execute(flash)),
         };
         done.is_ok()
     }
@@ -186,7 +184,7 @@ impl Bench {
 
     /// With power: it has to succeed, now and after a restart.
     #[track_caller]
-    pub(crate) fn carry_out(&mut self, change: &Operation) {
+    pub(crate) fn execute(&mut self, change: &Operation) {
         assert!(self.attempt(change), "{change:?}");
         self.expected = self.expected.after(change);
         self.check();
@@ -252,12 +250,12 @@ impl Bench {
                     twice.expected = twice.expected.after(change);
                 }
                 if twice.is_possible(change) {
-                    twice.carry_out(change);
+                    twice.execute(change);
                 }
                 totals.refused += twice.flash.refused;
             }
             if dead.is_possible(change) {
-                dead.carry_out(change);
+                dead.execute(change);
                 // The word at which the one cut was is left out, unless the start before left it out too.
                 assert!(restarts || dead.flash.refused == 0, "{change:?}, cut {cut}");
             }

@@ -27,7 +27,7 @@ fn cut_everywhere(name: &str, geometry: Geometry, changes: &[Operation], restart
                 bench.restart();
             }
             bench.cut_everywhere(change, changes.get(nth + 1), nth as u64, restarts, &mut totals);
-            bench.carry_out(change);
+            bench.execute(change);
         }
     }
     println!("{name}: {totals}");

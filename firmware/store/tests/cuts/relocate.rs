@@ -69,7 +69,7 @@ impl Board {
     fn mark(&mut self, marks: SlotMarks) {
         let mut found = self.start();
         let put = found.store.mark_slots(marks).expect("there is room");
-        block_on(put.carry_out(&mut self.places[index(found.side)])).expect("there is power");
+        block_on(put.execute(&mut self.places[index(found.side)])).expect("there is power");
         self.slots = marks;
         self.start();
     }
@@ -83,7 +83,7 @@ impl Board {
             Side::First => (first, second),
             Side::Second => (second, first),
         };
-        let moved = block_on(found.store.relocate().carry_out(from, to));
+        let moved = block_on(found.store.relocate().execute(from, to));
         let Ok(moved) = moved else { return false };
         if !to.is_off() {
             assert_eq!(Contents::read(&moved, to), self.expected);
@@ -186,7 +186,7 @@ fn a_store_that_was_never_moved_is_found_in_the_first_place() {
     assert_eq!(board.start().side, Side::First);
     // Something of another life lies in the second one.
     let mut other = Store::mount(&board.places[1]).unwrap();
-    block_on(other.set_counter(0, 9).unwrap().carry_out(&mut board.places[1])).unwrap();
+    block_on(other.set_counter(0, 9).unwrap().execute(&mut board.places[1])).unwrap();
     board.change(&Operation::Counter(0, 5));
     board.relocate();
     assert_eq!(board.start().store.counter(0), 5);
@@ -221,7 +221,7 @@ fn a_place_that_cannot_be_erased_leaves_the_store_where_it_was() {
     let found = board.start();
     let (from, mut to) = (board.places[0].clone(), board.places[1].clone());
     to.wear_out(2);
-    let error = block_on(found.store.relocate().carry_out(&from, &mut to)).unwrap_err();
+    let error = block_on(found.store.relocate().execute(&from, &mut to)).unwrap_err();
     println!("{error}");
     let found = newest(&from, &to).unwrap();
     assert_eq!((found.side, found.store.find(Key::Generation)), (Side::First, None));

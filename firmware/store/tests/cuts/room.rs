@@ -21,7 +21,7 @@ fn wear(count: u32, len: usize) -> f64 {
         let image = image(number, len);
         while let Err(KeepError::Put(PutError::Full { .. })) = bench.store.keep(number, 0, &image, None) {
             let put = bench.store.forget(None).unwrap().expect("an old one");
-            block_on(put.carry_out(&mut bench.flash)).unwrap();
+            block_on(put.execute(&mut bench.flash)).unwrap();
         }
         assert!(bench.attempt(&Operation::Keep { number, image }));
         assert!(bench.attempt(&Operation::Mark(trial(3))) && bench.attempt(&Operation::Mark(trial(2))));
@@ -39,18 +39,18 @@ fn seven_of_the_longest_images_are_kept_and_the_oldest_gives_way() {
         loop {
             match bench.store.keep(number, 0, &image, None) {
                 Ok(put) => {
-                    block_on(put.carry_out(&mut bench.flash)).unwrap();
+                    block_on(put.execute(&mut bench.flash)).unwrap();
                     break;
                 }
                 Err(KeepError::Put(PutError::Full { .. })) => {
                     let put = bench.store.forget(None).unwrap().expect("an old one");
-                    block_on(put.carry_out(&mut bench.flash)).unwrap();
+                    block_on(put.execute(&mut bench.flash)).unwrap();
                 }
                 Err(error) => panic!("{number}: {error}"),
             }
         }
         let marks = Marks { live: Some(number), previous: bench.store.marks().live, ..Marks::default() };
-        block_on(bench.store.mark(marks).unwrap().carry_out(&mut bench.flash)).unwrap();
+        block_on(bench.store.mark(marks).unwrap().execute(&mut bench.flash)).unwrap();
     }
     let numbers = |store: &Store| -> Vec<u32> { store.revisions().iter().map(|kept| kept.number).collect() };
     assert_eq!(numbers(&bench.store), [24, 25, 26, 27, 28, 29, 30]);
@@ -84,7 +84,7 @@ fn what_does_not_fit_is_refused_before_anything_is_erased() {
         let image = image(number, 1_500);
         match bench.store.keep(number, 0, &image, None) {
             Ok(put) => {
-                block_on(put.carry_out(&mut bench.flash)).unwrap();
+                block_on(put.execute(&mut bench.flash)).unwrap();
                 None
             }
             Err(error) => Some((number, error)),
@@ -113,10 +113,10 @@ fn what_does_not_fit_is_refused_before_anything_is_erased() {
 fn what_is_in_use_is_not_forgotten() {
     let mut bench = Bench::new(SMALL, Torn::Fault);
     for number in 1..=8 {
-        bench.carry_out(&Operation::Keep { number, image: image(number, 10) });
+        bench.execute(&Operation::Keep { number, image: image(number, 10) });
     }
     let trial = Some(Trial { number: 2, attempts: 1, confirm_s: 30 });
-    bench.carry_out(&Operation::Mark(Marks { live: Some(1), previous: Some(3), trial, last: None }));
+    bench.execute(&Operation::Mark(Marks { live: Some(1), previous: Some(3), trial, last: None }));
     for number in 1..=3 {
         assert_eq!(bench.store.keep(9, 0, &[], Some(number)).unwrap_err(), KeepError::Needed { number });
         assert_eq!(bench.store.keep(number, 0, &[], None).unwrap_err(), KeepError::Needed { number });
@@ -124,8 +124,8 @@ fn what_is_in_use_is_not_forgotten() {
     assert_eq!(bench.store.keep(9, 0, &[], Some(20)).unwrap_err(), KeepError::Unknown { number: 20 });
     let unknown = Marks { live: Some(30), ..Marks::default() };
     assert_eq!(bench.store.mark(unknown).unwrap_err(), KeepError::Unknown { number: 30 });
-    block_on(bench.store.keep(9, 0, b"nine", Some(6)).unwrap().carry_out(&mut bench.flash)).unwrap();
-    block_on(bench.store.keep(10, 0, b"ten", None).unwrap().carry_out(&mut bench.flash)).unwrap();
+    block_on(bench.store.keep(9, 0, b"nine", Some(6)).unwrap().execute(&mut bench.flash)).unwrap();
+    block_on(bench.store.keep(10, 0, b"ten", None).unwrap().execute(&mut bench.flash)).unwrap();
     let numbers: Vec<u32> = bench.store.revisions().iter().map(|kept| kept.number).collect();
     assert_eq!(numbers, [1, 2, 3, 5, 7, 8, 9, 10], "6 was named, 4 is the oldest");
 }
@@ -134,15 +134,15 @@ fn what_is_in_use_is_not_forgotten() {
 fn a_trial_has_so_many_starts() {
     let mut bench = Bench::new(SMALL, Torn::Fault);
     for number in 1..=3 {
-        bench.carry_out(&Operation::Keep { number, image: image(number, 10) });
+        bench.execute(&Operation::Keep { number, image: image(number, 10) });
     }
     let trial = Some(Trial { number: 3, attempts: 2, confirm_s: 30 });
-    bench.carry_out(&Operation::Mark(Marks { live: Some(2), previous: Some(1), trial, last: None }));
+    bench.execute(&Operation::Mark(Marks { live: Some(2), previous: Some(1), trial, last: None }));
     let run = |bench: &mut Bench| -> Vec<(u32, Role)> {
         bench.restart();
         let start = bench.store.at_start();
         if let Some(marks) = start.marks {
-            bench.carry_out(&Operation::Mark(marks));
+            bench.execute(&Operation::Mark(marks));
         }
         start.candidates.iter().map(|(kept, role)| (kept.number, *role)).collect()
     };
@@ -160,7 +160,7 @@ fn a_trial_has_so_many_starts() {
 fn a_damaged_record_is_not_there_and_the_others_are() {
     let mut bench = Bench::new(SMALL, Torn::Fault);
     for number in 1..=3 {
-        bench.carry_out(&Operation::Keep { number, image: image(number, 100) });
+        bench.execute(&Operation::Keep { number, image: image(number, 100) });
     }
     let found = bench.store.find(bench.store.revision(2).unwrap().key()).unwrap();
     bench.flash.damage(found.data);

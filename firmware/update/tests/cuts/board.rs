@@ -143,9 +143,9 @@ impl Board {
         board.probe(Slot::A, V1);
         let mut found = board.newest();
         let part = board.store_mut(&found);
-        block_on(found.store.keep(1, 7, CONFIGURATION, None).unwrap().carry_out(part)).unwrap();
+        block_on(found.store.keep(1, 7, CONFIGURATION, None).unwrap().execute(part)).unwrap();
         let marks = Marks { live: Some(1), ..Marks::default() };
-        block_on(found.store.mark(marks).unwrap().carry_out(part)).unwrap();
+        block_on(found.store.mark(marks).unwrap().execute(part)).unwrap();
         assert_eq!(board.start().slot, Slot::A);
         board
     }
@@ -191,7 +191,7 @@ impl Board {
     pub(crate) fn write_marks(&mut self, marks: SlotMarks) -> bool {
         let mut found = self.newest();
         let part = self.store_mut(&found);
-        found.store.mark_slots(marks).is_ok_and(|put| block_on(put.carry_out(part)).is_ok()) && !self.is_off()
+        found.store.mark_slots(marks).is_ok_and(|put| block_on(put.execute(part)).is_ok()) && !self.is_off()
     }
 
     pub(crate) fn cut_after(&mut self, left: u32, seed: u64) {
@@ -250,7 +250,7 @@ impl Board {
         };
         if found.side != Stores::of(slot) {
             assert!(found.may_move);
-            let _ = block_on(found.store.relocate().carry_out(from, to));
+            let _ = block_on(found.store.relocate().execute(from, to));
         }
     }
 

@@ -52,7 +52,7 @@ impl Contents {
     }
 
     /// An operation comes to its end.
-    pub fn carry_out(&mut self, operation: &Operation) {
+    pub fn execute(&mut self, operation: &Operation) {
         match *operation {
             Operation::Erase { first } => self.blank(first, SECTOR),
             Operation::Program { address, bytes } => {
