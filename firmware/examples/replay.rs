@@ -13,11 +13,11 @@ use semihosting::io::Write;
 use static_cell::ConstStaticCell;
 
 /// Longest recording.
-const ROOM: usize = 3 * 512 * 1024;
+const CAPACITY: usize = 3 * 512 * 1024;
 
 #[cortex_m_rt::entry]
 fn main() -> ! {
-    static RECORDING: ConstStaticCell<[u8; ROOM]> = ConstStaticCell::new([0; ROOM]);
+    static RECORDING: ConstStaticCell<[u8; CAPACITY]> = ConstStaticCell::new([0; CAPACITY]);
     static ENGINE: ConstStaticCell<Engine> = ConstStaticCell::new(Engine::idle());
     static CONFIG: ConstStaticCell<GatewayConfig> = ConstStaticCell::new(GatewayConfig::empty());
     static BUFFER: ConstStaticCell<[u8; 8192]> = ConstStaticCell::new([0; 8192]);
@@ -47,9 +47,9 @@ struct Buffered {
 impl Buffered {
     fn write(&mut self, mut piece: &[u8]) {
         while !piece.is_empty() {
-            let room = &mut self.buffer[self.len..];
-            let count = room.len().min(piece.len());
-            room[..count].copy_from_slice(&piece[..count]);
+            let buf = &mut self.buffer[self.len..];
+            let count = buf.len().min(piece.len());
+            buf[..count].copy_from_slice(&piece[..count]);
             self.len += count;
             piece = &piece[count..];
             if self.len == self.buffer.len() {

@@ -21,13 +21,13 @@ pub enum Level {
 }
 
 /// Bytes that are kept.
-pub const ROOM: usize = 4096;
+pub const CAPACITY: usize = 4096;
 /// Maximum length of a line in bytes, with its end.
 pub const MAX_LINE: usize = 192;
 
 /// The lines.
 struct Ring {
-    bytes: Deque<u8, ROOM>,
+    bytes: Deque<u8, CAPACITY>,
     /// Number of bytes that were dropped since the start; it wraps.
     dropped: u32,
 }
@@ -96,7 +96,7 @@ impl Ring {
     fn read(&self, from: u32, into: &mut [u8]) -> (usize, u32) {
         // Behind what was dropped; more than the ring is a place before it.
         let skipped = from.wrapping_sub(self.dropped);
-        let skipped = if skipped as usize > ROOM { 0 } else { skipped };
+        let skipped = if skipped as usize > CAPACITY { 0 } else { skipped };
         let mut count = 0_usize;
         for (place, byte) in into.iter_mut().zip(self.bytes.iter().skip(skipped as usize)) {
             *place = *byte;

@@ -22,8 +22,8 @@ pub(crate) fn with_path<T>(nth: usize, then: impl FnOnce(&CStr) -> T) -> T {
     if path.is_empty() {
         fail("arguments", &"a path is missing");
     }
-    if let Some(room) = name.get_mut(..path.len()) {
-        room.copy_from_slice(path.as_bytes());
+    if let Some(buf) = name.get_mut(..path.len()) {
+        buf.copy_from_slice(path.as_bytes());
     }
     match CStr::from_bytes_until_nul(&name) {
         Ok(name) => then(name),
@@ -40,13 +40,13 @@ pub(crate) fn is_argument(nth: usize, is_true: impl FnOnce(&str) -> bool) -> boo
 
 /// Reads the file that the `nth` argument names.
 #[allow(dead_code, reason = "not every program reads one")]
-pub(crate) fn read_file(nth: usize, room: &'static mut [u8]) -> &'static [u8] {
+pub(crate) fn read_file(nth: usize, buf: &'static mut [u8]) -> &'static [u8] {
     let Ok(mut file) = with_path(nth, |path| File::open(path)) else { fail("file", &"cannot be opened") };
     let mut len = 0;
     loop {
-        let Some(free @ [_, ..]) = room.get_mut(len..) else { fail("file", &"longer than the room for it") };
+        let Some(free @ [_, ..]) = buf.get_mut(len..) else { fail("file", &"longer than the room for it") };
         match file.read(free) {
-            Ok(0) => return &room[..len],
+            Ok(0) => return &buf[..len],
             Ok(count) => len += count,
             Err(_) => fail("file", &"cannot be read"),
         }

@@ -13,7 +13,7 @@ use proto_core::wire::dialect::{Dialect, Motion};
 use proto_core::wire::scalar::{Scalar, ScalarType};
 use proto_core::wire::state::{OperationMode, RobotState, SafetyState};
 
-use crate::{any, bytes, room};
+use crate::{any, bytes, out_buf};
 
 pub(crate) fn all() {
     let mut config = GatewayConfig::empty();
@@ -46,7 +46,7 @@ fn config_image_decode_whole() {
 #[inline(never)]
 fn config_image_encode(config: &GatewayConfig) {
     let mut out = [0; 64];
-    let _ = black_box(image::encode(config, room(&mut out)));
+    let _ = black_box(image::encode(config, out_buf(&mut out)));
 }
 
 #[inline(never)]
@@ -127,7 +127,7 @@ fn names_and_numbers() {
     }
     let mut out = [0; 8];
     let value = any(Scalar::Byte(0));
-    black_box((value.encode(room(&mut out)), value.as_f64(), value.is_finite()));
+    black_box((value.encode(out_buf(&mut out)), value.as_f64(), value.is_finite()));
 }
 
 #[inline(never)]

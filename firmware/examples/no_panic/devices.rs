@@ -10,7 +10,7 @@ use proto_core::device::{
 use proto_core::sysvar::Direction;
 use proto_core::wire::scalar::ScalarType;
 
-use crate::{any, bytes, room};
+use crate::{any, bytes, out_buf};
 
 pub(crate) fn all() {
     device_encoding(any(Encoding::scalar(ScalarType::Byte)));
@@ -39,17 +39,17 @@ fn device_encoding(encoding: Encoding) {
     black_box((encoding.size(), encoding.until(), encoding.is_integer(), encoding.range()));
     let _ = black_box(encoding.read(bytes()));
     if let Some(value) = encoding.fit(any(0.5), any(Overflow::Wrap)) {
-        black_box(encoding.write(value, room(&mut out)));
+        black_box(encoding.write(value, out_buf(&mut out)));
     }
     // What fits in none of its kinds.
-    black_box(encoding.write(any(f64::INFINITY), room(&mut out)));
+    black_box(encoding.write(any(f64::INFINITY), out_buf(&mut out)));
 }
 
 #[inline(never)]
 fn device_order(order: ByteOrder) {
     let mut out = [0; 8];
     black_box((order.read(bytes()), order.swaps_words()));
-    order.write(any(7), room(&mut out));
+    order.write(any(7), out_buf(&mut out));
 }
 
 #[inline(never)]
@@ -84,8 +84,8 @@ fn device_codec(layout: &FrameLayout) {
     black_box(layout.text(elements(), bytes(), any(1)));
     layout.parts(elements(), |part, place| _ = black_box((part, place)));
     black_box((layout.checksums(elements(), bytes()), layout.tail()));
-    black_box(layout.encode(elements(), |_| any(0.5), room(&mut out)));
-    black_box(layout.encode_with(elements(), |_| any(0.5), |_, _| any(Some(3)), room(&mut out)));
+    black_box(layout.encode(elements(), |_| any(0.5), out_buf(&mut out)));
+    black_box(layout.encode_with(elements(), |_| any(0.5), |_, _| any(Some(3)), out_buf(&mut out)));
 }
 
 #[inline(never)]
@@ -124,7 +124,7 @@ fn device_cutter() {
     black_box((cutter.held(), cutter.has_begun(), cutter.ends_by_silence()));
     black_box((cutter.discard(), cutter.skipped_bytes()));
     let escape = any(Escape::Slip);
-    black_box((escape.longest(any(7)), escape.stuff(any(7), room(&mut out))));
+    black_box((escape.longest(any(7)), escape.stuff(any(7), out_buf(&mut out))));
 }
 
 #[inline(never)]

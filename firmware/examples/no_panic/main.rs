@@ -35,8 +35,8 @@ fn any<T>(value: T) -> T {
     black_box(value)
 }
 
-/// Room of a length that is not known.
-fn room(buffer: &mut [u8]) -> &mut [u8] {
+/// A buffer of unknown length.
+fn out_buf(buffer: &mut [u8]) -> &mut [u8] {
     black_box(buffer)
 }
 

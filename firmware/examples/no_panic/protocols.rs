@@ -16,7 +16,7 @@ use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::dialect::Dialect;
 use proto_core::wire::{slcan, state};
 
-use crate::{any, bytes, room};
+use crate::{any, bytes, out_buf};
 
 pub(crate) fn all() {
     modbus_client();
@@ -35,7 +35,7 @@ fn modbus_client() {
     let client = black_box(&mut client);
     let mut out = [0; MAX_ADU];
     let request = any(Request::ReadCoils { address: 0, count: 1 });
-    let _ = black_box(client.start(request, room(&mut out)));
+    let _ = black_box(client.start(request, out_buf(&mut out)));
     let mut chunk = bytes();
     while let Some(event) = client.receive(&mut chunk) {
         let _ = black_box(event);
@@ -103,12 +103,12 @@ fn modbus_pdus() {
     }
     if let Ok(request) = any(Request::parse(bytes())) {
         black_box((request.head(), request.encoded_len()));
-        let _ = black_box(request.encode(room(&mut out)));
+        let _ = black_box(request.encode(out_buf(&mut out)));
     }
     let head = any(RequestHead::from_request());
     if let Ok(Ok(response)) = any(Response::parse(head, bytes())) {
         black_box(response.encoded_len());
-        let _ = black_box(response.encode(room(&mut out)));
+        let _ = black_box(response.encode(out_buf(&mut out)));
     }
     black_box(exception_pdu(any(3), Exception::from_code(any(1))));
 }
@@ -130,16 +130,16 @@ fn modbus_values() {
     if let Some(coils) = any(Coils::new(bytes(), any(9))) {
         black_box((coils.coil(any(3)), coils.byte(any(3)), coils.last_mask(), coils == any(coils)));
         coils.iter().for_each(|coil| _ = black_box(coil));
-        black_box(coils.copy_to(room(&mut out)));
+        black_box(coils.copy_to(out_buf(&mut out)));
     }
-    black_box(Coils::pack(bytes().iter().map(|byte| byte & 1 != 0), room(&mut out)));
+    black_box(Coils::pack(bytes().iter().map(|byte| byte & 1 != 0), out_buf(&mut out)));
     if let Some(registers) = any(Registers::new(bytes())) {
         black_box((registers.register(any(3)), registers.count()));
         registers.iter().rev().for_each(|register| _ = black_box(register));
         black_box(registers.copy_to(black_box(&mut [0; 128][..])));
     }
-    black_box(Registers::pack(bytes().iter().map(|&byte| u16::from(byte)), room(&mut out)));
-    black_box(Registers::from_little_endian(bytes(), room(&mut out)));
+    black_box(Registers::pack(bytes().iter().map(|&byte| u16::from(byte)), out_buf(&mut out)));
+    black_box(Registers::from_little_endian(bytes(), out_buf(&mut out)));
     for space in [Space::Coils, Space::Holding] {
         let _ = black_box(map::check_read(space, any(0), any(1)));
         let _ = black_box(map::check_write(space, any(0), any(1)));
@@ -156,8 +156,8 @@ fn command_client() {
     let mut client = CommandClient::new();
     let (client, now) = (black_box(&mut client), any(Instant::ZERO));
     let mut out = [0; 320];
-    let _ = black_box(client.start(now, bytes(), &dialect(), room(&mut out)));
-    let _ = black_box(client.start_beside(now, bytes(), &dialect(), room(&mut out)));
+    let _ = black_box(client.start(now, bytes(), &dialect(), out_buf(&mut out)));
+    let _ = black_box(client.start_beside(now, bytes(), &dialect(), out_buf(&mut out)));
     let mut chunk = bytes();
     while let Some(event) = client.receive(now, &mut chunk) {
         black_box(event);
@@ -186,11 +186,11 @@ fn command_texts() {
     let _ = black_box(Command::parse_strict(bytes()));
     if let Ok(command) = any(Command::parse(bytes())) {
         black_box(command.keyword());
-        let _ = black_box(command.encode(&dialect(), room(&mut out)));
+        let _ = black_box(command.encode(&dialect(), out_buf(&mut out)));
     }
     if let Some(reply) = any(Reply::parse(any(Keyword::Do(Action::Stop)), bytes())) {
         black_box(reply.kind());
-        let _ = black_box(reply.encode(&dialect(), room(&mut out)));
+        let _ = black_box(reply.encode(&dialect(), out_buf(&mut out)));
     }
     if let Some(percent) = any(Percent::new(any(12.5))) {
         black_box((percent.value(), Percent::parse(any("12.5"))));

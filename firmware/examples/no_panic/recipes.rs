@@ -10,7 +10,7 @@ use proto_core::sysvar::{Direction, IMAGE_BYTES};
 use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::{Scalar, ScalarType};
 
-use crate::{any, bytes, room};
+use crate::{any, bytes, out_buf};
 
 const RULES: Rules = Rules { mode: Mode::User, direction: Direction::Input };
 
@@ -60,8 +60,8 @@ fn stream_codec(layout: &StreamLayout) {
     let _ = black_box(layout.apply(bytes(), image));
     layout.values(bytes()).for_each(|value| _ = black_box(value));
     layout.fields().for_each(|field| _ = black_box(field));
-    let _ = black_box(layout.encode(image, room(&mut out)));
-    let _ = black_box(layout.encode_values(values(), room(&mut out)));
+    let _ = black_box(layout.encode(image, out_buf(&mut out)));
+    let _ = black_box(layout.encode_values(values(), out_buf(&mut out)));
     black_box((layout.head(), layout.tail(), layout.rules()));
 }
 

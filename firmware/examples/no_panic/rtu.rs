@@ -8,7 +8,7 @@ use proto_core::modbus::rtu::{
 use proto_core::time::{Duration, Instant};
 
 use crate::protocols::Bank;
-use crate::{any, bytes, room};
+use crate::{any, bytes, out_buf};
 
 pub(crate) fn all() {
     rtu_frames();
@@ -27,7 +27,7 @@ fn rtu_frames() {
     let _ = black_box(Adu::parse(bytes()));
     let adu = any(Adu { address: 1, pdu: bytes() });
     black_box(adu.encoded_len());
-    let _ = black_box(adu.encode(room(&mut out)));
+    let _ = black_box(adu.encode(out_buf(&mut out)));
     black_box((checksum(bytes()), request_len(bytes()), reply_len(bytes())));
     let timing = timing();
     black_box((timing.t1_5(), timing.silence(), timing.turnaround(), timing.of(any(7))));

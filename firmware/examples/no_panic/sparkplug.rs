@@ -12,7 +12,7 @@ use recipe_sparkplug::sntp::Sntp;
 use recipe_sparkplug::value::Value;
 use static_cell::ConstStaticCell;
 
-use crate::{any, bytes, room};
+use crate::{any, bytes, out_buf};
 
 type Engine = proto_core::engine::Engine<2, 1, 32, 0, 4>;
 type Catalog = GatewayCatalog<'static, 64>;
@@ -52,7 +52,7 @@ fn sparkplug_time() {
 fn sparkplug_document(document: &mut Document) {
     let _ = black_box(document.decode(bytes()));
     let mut out = [0; 256];
-    let _ = black_box(document.encode(room(&mut out)));
+    let _ = black_box(document.encode(out_buf(&mut out)));
 }
 
 #[inline(never)]
@@ -96,6 +96,6 @@ fn sparkplug_node(node: &mut Node, catalog: &Catalog) {
         node.handle(now, any(input), catalog);
     }
     let mut piece = [0; MIN_BUFFER];
-    black_box(node.poll_output(now, catalog, room(&mut piece)));
+    black_box(node.poll_output(now, catalog, out_buf(&mut piece)));
     black_box((node.counters(), node.failure(), node.is_online(), node.bd_seq()));
 }

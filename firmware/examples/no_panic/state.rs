@@ -6,7 +6,7 @@ use proto_core::sysvar::{IMAGE_BYTES, SysVar};
 use proto_core::wire::dialect::Dialect;
 use proto_core::wire::state::{LEN, StatePacket, StateStream, StateView};
 
-use crate::{any, bytes, room};
+use crate::{any, bytes, out_buf};
 
 pub(crate) fn all() {
     state_stream();
@@ -48,7 +48,7 @@ fn state_packet() {
         view.read_into(packet);
     }
     let mut out = [0; LEN];
-    let _ = black_box(packet.encode(room(&mut out)));
+    let _ = black_box(packet.encode(out_buf(&mut out)));
     let _ = black_box(StatePacket::parse(bytes()));
     black_box(packet.to_bytes());
 }

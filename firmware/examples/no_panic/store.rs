@@ -7,7 +7,7 @@ use recipe_store::{
     newest,
 };
 
-use crate::{any, bytes, room};
+use crate::{any, bytes, out_buf};
 
 /// Flash of a size and contents that the compiler knows nothing about.
 pub(crate) struct Any;
@@ -47,8 +47,8 @@ fn store_mount() -> Option<Store> {
 #[inline(never)]
 fn store_questions(store: &Store) {
     let mut out = [0; 64];
-    black_box(store.get(&Any, any(Key::Image(3)), room(&mut out)));
-    black_box(store.image(&Any, any(7), room(&mut out)));
+    black_box(store.get(&Any, any(Key::Image(3)), out_buf(&mut out)));
+    black_box(store.image(&Any, any(7), out_buf(&mut out)));
     black_box((store.revisions(), store.revision(any(7)), store.marks(), store.at_start()));
     black_box((store.access_key(&Any), store.counter(any(1)), store.birth_sequence()));
     black_box(store.is_adopted(any(1), any(2)));

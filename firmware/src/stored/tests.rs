@@ -144,12 +144,12 @@ fn an_image_is_read_in_parts_and_the_key_is_kept() {
     let image: List<u8> = (0..1_000_u16).map(|nth| nth as u8).collect();
     block_on(stored.keep(1, 1, &image, None)).unwrap();
     let mut read = List::new();
-    let mut room = [0; 96];
-    while let Some(part @ [_, ..]) = stored.image_part(1, read.len(), &mut room) {
+    let mut buf = [0; 96];
+    while let Some(part @ [_, ..]) = stored.image_part(1, read.len(), &mut buf) {
         read.extend_from_slice(part);
     }
     assert_eq!(read, image);
-    assert_eq!(stored.image_part(2, 0, &mut room), None);
+    assert_eq!(stored.image_part(2, 0, &mut buf), None);
     assert_eq!(stored.access_key(), None);
     block_on(stored.set_access_key(&[7; 16])).unwrap();
     stored.restart();

@@ -52,8 +52,8 @@
 //! // After a restart.
 //! let store = Store::mount(&flash)?;
 //! let [(live, _)] = store.at_start().candidates[..] else { panic!("one is live") };
-//! let mut room = [0; 64];
-//! assert_eq!(store.image(&flash, live.number, &mut room), Some(&image[..]));
+//! let mut buf = [0; 64];
+//! assert_eq!(store.image(&flash, live.number, &mut buf), Some(&image[..]));
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! # }).unwrap();
 //! ```

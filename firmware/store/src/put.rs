@@ -132,7 +132,7 @@ enum Written {
     Step(Step),
     /// It begins here.
     At(u16),
-    NoRoom,
+    Full,
     Worn,
 }
 
@@ -247,7 +247,7 @@ impl Work {
                             }
                             self.phase = Phase::End(Ok(()));
                         }
-                        Written::NoRoom => self.phase = Phase::Place,
+                        Written::Full => self.phase = Phase::Place,
                         Written::Worn => self.phase = Phase::End(Err(PutError::Worn)),
                     }
                 }
@@ -274,7 +274,7 @@ impl Work {
                             }
                             self.phase = Phase::Copy { key: key.saturating_add(1) };
                         }
-                        Written::NoRoom | Written::Worn => self.phase = Phase::End(Err(PutError::Worn)),
+                        Written::Full | Written::Worn => self.phase = Phase::End(Err(PutError::Worn)),
                     }
                 }
                 Phase::Begin => {
@@ -353,7 +353,7 @@ impl Work {
                 Writing::Head => {
                     let free = if into == Into::Next { self.fill } else { store.end };
                     if !store.has_room(free, head.extent()) {
-                        return Written::NoRoom;
+                        return Written::Full;
                     }
                     self.set_end(store, into, free.saturating_add(1));
                     self.writing = Writing::CheckHead { at: free };

@@ -59,8 +59,8 @@ impl Hostile {
             // Nothing at all.
             _ => (Vec::new(), false, held),
         };
-        let room = if reads { WIDE } else { 1024 };
-        Self { handle: open(bench, room), says: Some(says), reads, ends: bench.now() + held }
+        let size = if reads { WIDE } else { 1024 };
+        Self { handle: open(bench, size), says: Some(says), reads, ends: bench.now() + held }
     }
 
     /// Returns whether it goes on.

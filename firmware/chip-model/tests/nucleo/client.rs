@@ -15,9 +15,9 @@ const BOARD: IpEndpoint = IpEndpoint { addr: IpAddress::Ipv4(Ipv4Address::new(19
 pub(crate) const WIDE: usize = 64 << 10;
 const KEY: &str = "00112233445566778899aabbccddeeff";
 
-/// Begins a connection; `room` bytes are taken before somebody reads.
-pub(crate) fn open(bench: &mut Bench, room: usize) -> SocketHandle {
-    bench.robot.as_mut().expect("there is one").connect(BOARD, room)
+/// Begins a connection; `size` bytes are buffered for reading.
+pub(crate) fn open(bench: &mut Bench, size: usize) -> SocketHandle {
+    bench.robot.as_mut().expect("there is one").connect(BOARD, size)
 }
 
 pub(crate) fn connection(bench: &mut Bench, handle: SocketHandle) -> &mut tcp::Socket<'static> {
@@ -33,8 +33,8 @@ pub(crate) fn read(bench: &mut Bench, handle: SocketHandle, most: usize, into: &
 
 /// A connection over which this was sent.
 #[track_caller]
-pub(crate) fn ask(bench: &mut Bench, request: &[u8], room: usize) -> SocketHandle {
-    let handle = open(bench, room);
+pub(crate) fn ask(bench: &mut Bench, request: &[u8], size: usize) -> SocketHandle {
+    let handle = open(bench, size);
     bench.until("a connection", SECOND, |bench| connection(bench, handle).may_send());
     connection(bench, handle).send_slice(request).expect("there is room");
     handle
@@ -47,7 +47,7 @@ pub(crate) fn exchange(bench: &mut Bench, request: &[u8]) -> Response {
     bench.until("a connection", SECOND, |bench| connection(bench, handle).may_send());
     let (mut bytes, mut rest) = (Vec::new(), request);
     bench.until("the end of an answer", 5 * SECOND, |bench| {
-        // More than the room of a socket.
+        // More than the buffer of a socket.
         let sent = connection(bench, handle).send_slice(rest).unwrap_or(0);
         rest = &rest[sent..];
         read(bench, handle, WIDE, &mut bytes);

@@ -87,10 +87,10 @@ impl Robot {
         }
     }
 
-    /// Opens a connection to the board. `room` bytes are taken before somebody reads.
-    pub(crate) fn connect(&mut self, to: IpEndpoint, room: usize) -> SocketHandle {
+    /// Opens a connection to the board. `size` bytes are buffered for reading.
+    pub(crate) fn connect(&mut self, to: IpEndpoint, size: usize) -> SocketHandle {
         let buffer = |len| tcp::SocketBuffer::new(vec![0; len]);
-        let mut socket = tcp::Socket::new(buffer(room), buffer(8192));
+        let mut socket = tcp::Socket::new(buffer(size), buffer(8192));
         socket.connect(self.interface.context(), to, self.next_port).expect("it is new");
         self.next_port += 1;
         self.sockets.add(socket)

@@ -99,9 +99,9 @@ fn full_store(images: &[Vec<u8>], marks: Marks) -> Copy {
 fn live(bench: &mut Bench) -> Vec<Vec<u8>> {
     let flash = Copy::of(bench);
     let store = Store::mount(&flash).expect("it was written");
-    let mut room = [0; recipe_store::MAX_DATA];
+    let mut buf = [0; recipe_store::MAX_DATA];
     let candidates = store.at_start().candidates;
-    let mut image = |number| store.image(&flash, number, &mut room).expect("it is kept").to_vec();
+    let mut image = |number| store.image(&flash, number, &mut buf).expect("it is kept").to_vec();
     candidates.iter().map(|(kept, _)| image(kept.number)).collect()
 }
 

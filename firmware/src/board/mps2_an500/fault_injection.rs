@@ -65,8 +65,8 @@ async fn make(pulse: &'static Pulse, fault: InjectedFault) -> ! {
 
 #[allow(unconditional_recursion, reason = "overflows the stack")]
 fn overflow(depth: u32) -> u32 {
-    let room = black_box([depth; 64]);
-    overflow(depth + 1) + room[0]
+    let buf = black_box([depth; 64]);
+    overflow(depth + 1) + buf[0]
 }
 
 /// Time from the start to the fault.

@@ -70,8 +70,8 @@ impl HostFlash {
         let mut file = self.file.borrow_mut();
         let mut len = 0;
         if file.seek(SeekFrom::Start(offset)).is_ok() {
-            while let Some(room @ [_, ..]) = bytes.get_mut(len..) {
-                match file.read(room) {
+            while let Some(buf @ [_, ..]) = bytes.get_mut(len..) {
+                match file.read(buf) {
                     Ok(count @ 1..) => len += count,
                     _ => break,
                 }

@@ -40,8 +40,8 @@ pub(super) fn read() -> Result<&'static [u8], StorageError> {
     let mut file = File::open(name.as_c_str()).map_err(|_| StorageError::Unreadable)?;
     let image = IMAGE.take();
     let mut len = 0;
-    while let Some(room @ [_, ..]) = image.get_mut(len..) {
-        match file.read(room) {
+    while let Some(buf @ [_, ..]) = image.get_mut(len..) {
+        match file.read(buf) {
             Ok(0) => break,
             Ok(count) => len += count,
             Err(_) => return Err(StorageError::Unreadable),
@@ -55,8 +55,8 @@ pub(super) fn random() -> Option<[u8; 32]> {
     let mut file = File::open(c"/dev/urandom").ok()?;
     let mut bytes = [0; 32];
     let mut len = 0;
-    while let Some(room @ [_, ..]) = bytes.get_mut(len..) {
-        len += file.read(room).ok().filter(|count| *count > 0)?;
+    while let Some(buf @ [_, ..]) = bytes.get_mut(len..) {
+        len += file.read(buf).ok().filter(|count| *count > 0)?;
     }
     Some(bytes)
 }

@@ -11,14 +11,14 @@ use firmware::identity::hash;
 use firmware::tasks::watchdog::running;
 use firmware::warn;
 
-const ROOM: usize = 128;
+const MAX_TEXT: usize = 128;
 
 /// Undefined after power-on.
 #[unsafe(link_section = ".uninit.crash_record")]
 static RECORD: Record = Record {
     len: AtomicU32::new(0),
     sum: AtomicU32::new(0),
-    text: [const { AtomicU8::new(0) }; ROOM],
+    text: [const { AtomicU8::new(0) }; MAX_TEXT],
     after: AtomicU32::new(0),
 };
 
@@ -28,7 +28,7 @@ struct Record {
     len: AtomicU32,
     /// Hash of the text.
     sum: AtomicU32,
-    text: [AtomicU8; ROOM],
+    text: [AtomicU8; MAX_TEXT],
     /// Written last: the RAM's controller holds an incomplete 64-bit word until the next write, and a reset would
     /// lose it.
     after: AtomicU32,
@@ -101,7 +101,7 @@ pub(super) fn clear() {
 /// Logs the record, and clears it.
 pub(super) fn log() {
     let len = record().len.swap(0, Ordering::Relaxed) as usize;
-    if !(1..=ROOM).contains(&len) {
+    if !(1..=MAX_TEXT).contains(&len) {
         return;
     }
     let bytes = text(len);
@@ -112,8 +112,8 @@ pub(super) fn log() {
     }
 }
 
-fn text(len: usize) -> [u8; ROOM] {
-    let mut bytes = [0; ROOM];
+fn text(len: usize) -> [u8; MAX_TEXT] {
+    let mut bytes = [0; MAX_TEXT];
     for (place, byte) in bytes.iter_mut().zip(&record().text).take(len) {
         *place = byte.load(Ordering::Relaxed);
     }

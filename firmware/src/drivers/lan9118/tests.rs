@@ -214,9 +214,9 @@ fn a_frame_goes_out_behind_its_two_command_words() {
     for length in [1, 42, 60, MTU] {
         driver.regs.0.borrow_mut().tx_words.clear();
         let token = driver.transmit(&mut Context::from_waker(Waker::noop())).unwrap();
-        token.consume(length, |room| {
-            assert_eq!(room.len(), length);
-            room.copy_from_slice(&frame(length));
+        token.consume(length, |buf| {
+            assert_eq!(buf.len(), length);
+            buf.copy_from_slice(&frame(length));
         });
         let model = driver.regs.0.borrow();
         let (command, data) = model.tx_words.split_at(2);

@@ -21,11 +21,11 @@ pub(super) enum Ended {
     Gone,
     /// It did not read in time.
     Slow,
-    /// A piece is longer than its room.
+    /// A piece does not fit into the buffer.
     TooLong,
 }
 
-/// An answer whose body is in the room of its connection. It is made without waiting and sent in one place, since each
+/// A reply whose body is in the buffer of its connection. It is made without waiting and sent in one place, since each
 /// place that waits takes flash.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Reply {
@@ -34,26 +34,26 @@ pub(super) struct Reply {
     etag: Option<Revision>,
     allow: Option<&'static str>,
     retry_after_s: Option<u64>,
-    /// Length of the body; `None` if it had no room.
+    /// Length of the body; `None` if it did not fit.
     len: Option<usize>,
 }
 
 impl Reply {
     /// An answer whose body `write` writes.
     pub(super) fn new(
-        room: &mut [u8],
+        buf: &mut [u8],
         status: Status,
         kind: Kind,
-        write: impl FnOnce(&mut Room<'_>) -> fmt::Result,
+        write: impl FnOnce(&mut TextBuffer<'_>) -> fmt::Result,
     ) -> Self {
-        let mut room = Room::new(room);
-        let len = write(&mut room).is_ok().then_some(room.len);
+        let mut buf = TextBuffer::new(buf);
+        let len = write(&mut buf).is_ok().then_some(buf.len);
         Self { status, kind, etag: None, allow: None, retry_after_s: None, len }
     }
 
     /// An object with `error`.
-    pub(super) fn error(room: &mut [u8], status: Status, text: impl Display) -> Self {
-        Self::refusing(room, status, &text)
+    pub(super) fn error(buf: &mut [u8], status: Status, text: impl Display) -> Self {
+        Self::refusing(buf, status, &text)
     }
 
     /// With the ETag of this revision.
@@ -61,16 +61,16 @@ impl Reply {
         Self { etag, ..self }
     }
 
-    fn refusing(room: &mut [u8], status: Status, text: &dyn Display) -> Self {
-        Self::new(room, status, Kind::Json, |out| {
+    fn refusing(buf: &mut [u8], status: Status, text: &dyn Display) -> Self {
+        Self::new(buf, status, Kind::Json, |out| {
             out.write_str("{\"error\":")?;
             json::write_text(out, text)?;
             out.write_char('}')
         })
     }
 
-    pub(super) fn refused(room: &mut [u8], refusal: &Refusal) -> Self {
-        let reply = Self::error(room, refusal.status, refusal.text);
+    pub(super) fn refused(buf: &mut [u8], refusal: &Refusal) -> Self {
+        let reply = Self::error(buf, refusal.status, refusal.text);
         Self { allow: refusal.allow, retry_after_s: refusal.retry_after_s, ..reply }
     }
 }
@@ -86,8 +86,8 @@ pub(super) enum Outcome {
 /// The end of a connection that is written to.
 pub(super) struct Line<'s, 'a> {
     pub(super) socket: &'s mut TcpSocket<'a>,
-    /// Room for a piece of an answer, and for its head.
-    pub(super) room: &'s mut [u8],
+    /// Holds one piece of a reply, or its head and a short body.
+    pub(super) buf: &'s mut [u8],
     pub(super) is_head: bool,
     /// The next nonce for this client, if it signs its requests, or has to.
     pub(super) nonce: Option<NonceText>,
@@ -106,10 +106,10 @@ impl Line<'_, '_> {
         Ok(())
     }
 
-    /// Sends some bytes of the room.
-    pub(super) async fn send_room(&mut self, from: usize, to: usize, until: Instant) -> Result<(), Ended> {
+    /// Sends part of the buffer.
+    pub(super) async fn send_part(&mut self, from: usize, to: usize, until: Instant) -> Result<(), Ended> {
         let mut sent = from;
-        while let Some(rest @ [_, ..]) = self.room.get(sent..to) {
+        while let Some(rest @ [_, ..]) = self.buf.get(sent..to) {
             match with_deadline(until, self.socket.write(rest)).await {
                 Ok(Ok(count @ 1..)) => sent = sent.saturating_add(count),
                 Ok(_) => return Err(Ended::Gone),
@@ -125,8 +125,8 @@ impl Line<'_, '_> {
         // Behind the body, as it has its length.
         let head = self.write_head(body, Length::Bytes(body as u64), reply).ok_or(Ended::TooLong)?;
         let until = Instant::now() + MAX_TIME;
-        self.send_room(body, body.saturating_add(head), until).await?;
-        self.send_room(0, if self.is_head { 0 } else { body }, until).await
+        self.send_part(body, body.saturating_add(head), until).await?;
+        self.send_part(0, if self.is_head { 0 } else { body }, until).await
     }
 
     /// Sends the head of an answer whose body follows in pieces. Returns whether it is wanted.
@@ -136,13 +136,13 @@ impl Line<'_, '_> {
         length: Length,
         etag: Option<Revision>,
     ) -> Result<bool, Ended> {
-        let reply = Reply::new(self.room, Status::OK, kind, |_| Ok(())).about(etag);
+        let reply = Reply::new(self.buf, Status::OK, kind, |_| Ok(())).about(etag);
         let head = self.write_head(0, length, &reply).ok_or(Ended::TooLong)?;
-        self.send_room(0, head, Instant::now() + MAX_TIME).await?;
+        self.send_part(0, head, Instant::now() + MAX_TIME).await?;
         Ok(!self.is_head)
     }
 
-    /// Writes a head behind the first `from` bytes of the room; returns its length.
+    /// Writes a head behind the first `from` bytes of the buffer; returns its length.
     #[inline(never)]
     fn write_head(&mut self, from: usize, length: Length, reply: &Reply) -> Option<usize> {
         let etag = reply.etag.map(Etag);
@@ -165,12 +165,12 @@ impl Line<'_, '_> {
             (_, Some(nonce)) => drop(fields.push(("Next-Nonce", nonce))),
             _ => {}
         }
-        let mut room = Room::new(self.room.get_mut(from..)?);
-        Response::new(reply.status, reply.kind, length).with(&fields).write(&mut room).ok()?;
-        Some(room.len)
+        let mut buf = TextBuffer::new(self.buf.get_mut(from..)?);
+        Response::new(reply.status, reply.kind, length).with(&fields).write(&mut buf).ok()?;
+        Some(buf.len)
     }
 
-    /// Sends the first bytes of the room as a chunk, before `until`.
+    /// Sends the first bytes of the buffer as a chunk, before `until`.
     pub(super) async fn chunk(&mut self, len: usize, until: Instant) -> Result<(), Ended> {
         if len == 0 {
             return Ok(());
@@ -178,7 +178,7 @@ impl Line<'_, '_> {
         let mut head = heapless::String::<12>::new();
         write!(head, "{len:x}\r\n").map_err(|_| Ended::TooLong)?;
         self.send(head.as_bytes(), until).await?;
-        self.send_room(0, len, until).await?;
+        self.send_part(0, len, until).await?;
         self.send(b"\r\n", until).await
     }
 
@@ -188,24 +188,24 @@ impl Line<'_, '_> {
     }
 }
 
-/// A text that is being written.
-pub(super) struct Room<'r> {
+/// Writes text into a byte buffer.
+pub(super) struct TextBuffer<'r> {
     bytes: &'r mut [u8],
     pub(super) len: usize,
 }
 
-impl<'r> Room<'r> {
+impl<'r> TextBuffer<'r> {
     pub(super) fn new(bytes: &'r mut [u8]) -> Self {
         Self { bytes, len: 0 }
     }
 
-    /// Bytes that there is room for.
+    /// Free bytes.
     pub(super) fn left(&self) -> usize {
         self.bytes.len().saturating_sub(self.len)
     }
 }
 
-impl Write for Room<'_> {
+impl Write for TextBuffer<'_> {
     fn write_str(&mut self, text: &str) -> fmt::Result {
         let end = self.len.saturating_add(text.len());
         let place = self.bytes.get_mut(self.len..end).ok_or(fmt::Error)?;
@@ -275,8 +275,8 @@ mod tests {
     #[test]
     fn what_has_no_room_is_noticed_and_nothing_is_written_behind_it() {
         let mut bytes = [0xA5; 8];
-        let mut room = Room::new(&mut bytes[..6]);
-        assert!(room.write_str("12345").is_ok() && room.write_str("67").is_err());
-        assert_eq!((room.len, room.left(), bytes), (5, 1, *b"12345\xA5\xA5\xA5"));
+        let mut buf = TextBuffer::new(&mut bytes[..6]);
+        assert!(buf.write_str("12345").is_ok() && buf.write_str("67").is_err());
+        assert_eq!((buf.len, buf.left(), bytes), (5, 1, *b"12345\xA5\xA5\xA5"));
     }
 }

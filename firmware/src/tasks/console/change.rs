@@ -23,15 +23,15 @@ use crate::warn;
 
 impl Console {
     /// Executes a change.
-    pub(super) async fn change<'a>(&'a self, room: &mut [u8], request: Request<'a>) -> Reply {
+    pub(super) async fn change<'a>(&'a self, buf: &mut [u8], request: Request<'a>) -> Reply {
         let Request { operation, peer, .. } = request;
         if operation == Operation::PutConfig
             && let Some((len, lock)) = &request.image
-            && let Some(refused) = self.look_through(room, *len, lock).await
+            && let Some(refused) = self.look_through(buf, *len, lock).await
         {
             return refused;
         }
-        let (change, lock) = match self.prepare(room, request) {
+        let (change, lock) = match self.prepare(buf, request) {
             Ok(prepared) => prepared,
             Err(reply) => return reply,
         };
@@ -41,103 +41,103 @@ impl Console {
                 self.is_claimed(Some(key));
                 warn!("claimed by {}", Text(&peer));
                 let name = &self.name;
-                Reply::new(room, Status::OK, Kind::Json, |out| {
+                Reply::new(buf, Status::OK, Kind::Json, |out| {
                     write!(out, "{{\"name\":\"{name}\",\"claimed\":true}}")
                 })
             }
             (Err(_), StoreRequest::Claim(_)) => {
                 self.is_claimed(None);
-                Reply::error(room, Status::INTERNAL, "the key cannot be kept")
+                Reply::error(buf, Status::INTERNAL, "the key cannot be kept")
             }
             // A piece is one of many.
-            (Ok(_), StoreRequest::Piece { .. }) => self.firmware(room, Status::OK),
+            (Ok(_), StoreRequest::Piece { .. }) => self.firmware(buf, Status::OK),
             (Ok(_), StoreRequest::ConfirmFirmware) => {
                 warn!("the firmware is confirmed for {}", Text(&peer));
-                self.firmware(room, Status::OK)
+                self.firmware(buf, Status::OK)
             }
             (Ok(_), StoreRequest::TryFirmware { .. } | StoreRequest::EndFirmware) => {
                 warn!("another firmware is to run for {}", Text(&peer));
-                self.firmware(room, Status::ACCEPTED)
+                self.firmware(buf, Status::ACCEPTED)
             }
             (Ok(_), StoreRequest::Edge { tells, restart, .. }) => {
-                self.edge_is_kept(room, peer, tells, restart)
+                self.edge_is_kept(buf, peer, tells, restart)
             }
             (Err(Failed::Firmware(why)), _) => {
                 warn!("{} refused to {}: {}", name(operation), Text(&peer), Text(&why));
                 let status = if why.is_wrong() { Status::UNPROCESSABLE } else { Status::CONFLICT };
-                Reply::error(room, status, why)
+                Reply::error(buf, status, why)
             }
             (Ok(number), _) => {
                 warn!("{} for {}: revision {}", name(operation), Text(&peer), number);
                 let status = if operation == Operation::PutConfig { Status::CREATED } else { Status::OK };
-                self.revisions(room, status, Some(number))
+                self.revisions(buf, status, Some(number))
             }
             (Err(Failed::Refused(refused)), _) => {
                 warn!("{} refused to {}", name(operation), Text(&peer));
-                refuse(room, refused)
+                refuse(buf, refused)
             }
-            (Err(Failed::Store(why)), _) => Reply::error(room, Status::INTERNAL, why),
+            (Err(Failed::Store(why)), _) => Reply::error(buf, Status::INTERNAL, why),
         }
     }
 
     /// Reads the whole image that was sent, in pieces between which others run. Returns the answer if it is refused.
-    async fn look_through(&self, room: &mut [u8], len: usize, lock: &StoreLock<'_>) -> Option<Reply> {
+    async fn look_through(&self, buf: &mut [u8], len: usize, lock: &StoreLock<'_>) -> Option<Reply> {
         let mut scan = Scan::new();
         loop {
             match lock.look(len, |bytes| scan.step(bytes)) {
                 Ok(true) => yield_now().await,
                 Ok(false) => break,
-                Err(error) => return Some(Reply::error(room, Status::UNPROCESSABLE, error)),
+                Err(error) => return Some(Reply::error(buf, Status::UNPROCESSABLE, error)),
             }
         }
         let missing = self.ports.have(scan.buses().iter()).err()?;
-        Some(Reply::error(room, Status::UNPROCESSABLE, missing))
+        Some(Reply::error(buf, Status::UNPROCESSABLE, missing))
     }
 
     /// The request for the store task, or the reply if there is none.
     #[inline(never)]
     fn prepare<'a>(
         &'a self,
-        room: &mut [u8],
+        buf: &mut [u8],
         request: Request<'a>,
     ) -> Result<(StoreRequest, StoreLock<'a>), Reply> {
         let change = match request.arguments {
-            Arguments::Wrong(text) => return Err(Reply::error(room, Status::BAD_REQUEST, text)),
+            Arguments::Wrong(text) => return Err(Reply::error(buf, Status::BAD_REQUEST, text)),
             Arguments::Seconds(seconds) => {
                 self.identify_until.set(Instant::now() + Duration::from_secs(seconds.into()));
                 warn!("{} looks for this board: its LED shows it for {} s", Text(&request.peer), seconds);
-                return Err(Reply::new(room, Status::OK, Kind::Json, |out| out.write_str("{}")));
+                return Err(Reply::new(buf, Status::OK, Kind::Json, |out| out.write_str("{}")));
             }
-            Arguments::Key(key) => return self.take_key(room, key, &request),
+            Arguments::Key(key) => return self.take_key(buf, key, &request),
             Arguments::Apply { number, trial } => StoreRequest::Apply { number, trial },
             Arguments::None if request.operation == Operation::Confirm => StoreRequest::Confirm,
             Arguments::None if request.operation == Operation::Rollback => StoreRequest::RollBack,
             Arguments::None if request.operation == Operation::ConfirmUpdate => StoreRequest::ConfirmFirmware,
             Arguments::None if request.operation == Operation::EndUpdate => StoreRequest::EndFirmware,
             Arguments::Try(confirm_s) => {
-                StoreRequest::TryFirmware { confirm_s, downgrade: downgrade(room, &request)? }
+                StoreRequest::TryFirmware { confirm_s, downgrade: downgrade(buf, &request)? }
             }
-            Arguments::None if request.operation == Operation::PutUpdate => return put_piece(room, request),
+            Arguments::None if request.operation == Operation::PutUpdate => return put_piece(buf, request),
             Arguments::None if request.operation == Operation::PutEdge => {
-                return edge::settings(room, request);
+                return edge::settings(buf, request);
             }
-            Arguments::None => return put(room, request),
+            Arguments::None => return put(buf, request),
         };
-        let Some(store) = self.store else { return Err(nothing_kept(room)) };
-        store.take().map(|lock| (change, lock)).ok_or_else(|| busy(room))
+        let Some(store) = self.store else { return Err(nothing_kept(buf)) };
+        store.take().map(|lock| (change, lock)).ok_or_else(|| busy(buf))
     }
 
     /// Takes a key, if the button was pressed.
     fn take_key(
         &self,
-        room: &mut [u8],
+        buf: &mut [u8],
         key: [u8; KEY_LEN],
         request: &Request<'_>,
     ) -> Result<(StoreRequest, StoreLock<'_>), Reply> {
-        let Some(store) = self.store else { return Err(nothing_kept(room)) };
+        let Some(store) = self.store else { return Err(nothing_kept(buf)) };
         // Before the claim, which waits for its end otherwise. A board that reads its store takes no key yet.
         let Some(lock) = store.take().filter(|_| store.look(|_| ()).is_some()) else {
-            return Err(busy(room));
+            return Err(busy(buf));
         };
         let mut claim = self.claim.get();
         let offered = claim.offered(now());
@@ -151,7 +151,7 @@ impl Console {
             Err(ClaimError::Claimed) => (Status::FORBIDDEN, "this board has a key already"),
         };
         warn!("claim refused to {}", Text(&request.peer));
-        Err(Reply::error(room, status, text))
+        Err(Reply::error(buf, status, text))
     }
 
     /// The key is kept, or could not be.
@@ -166,26 +166,26 @@ impl Console {
 }
 
 /// Whether the request allows an older firmware.
-fn downgrade(room: &mut [u8], request: &Request<'_>) -> Result<Downgrade, Reply> {
+fn downgrade(buf: &mut [u8], request: &Request<'_>) -> Result<Downgrade, Reply> {
     match request.head.query("downgrade") {
         None => Ok(Downgrade::Refused),
         Some("yes") => Ok(Downgrade::Allowed),
-        Some(_) => Err(Reply::error(room, Status::BAD_REQUEST, "downgrade is out of range; allowed: yes")),
+        Some(_) => Err(Reply::error(buf, Status::BAD_REQUEST, "downgrade is out of range; allowed: yes")),
     }
 }
 
-fn put_piece<'a>(room: &mut [u8], request: Request<'a>) -> Result<(StoreRequest, StoreLock<'a>), Reply> {
-    let downgrade = downgrade(room, &request)?;
-    let Some((len, lock)) = request.image else { return Err(busy(room)) };
+fn put_piece<'a>(buf: &mut [u8], request: Request<'a>) -> Result<(StoreRequest, StoreLock<'a>), Reply> {
+    let downgrade = downgrade(buf, &request)?;
+    let Some((len, lock)) = request.image else { return Err(busy(buf)) };
     let Some(Ok(offset)) = request.head.query("offset").map(str::parse) else {
         let text = "offset must be a number: where the piece begins in header and image";
-        return Err(Reply::error(room, Status::BAD_REQUEST, text));
+        return Err(Reply::error(buf, Status::BAD_REQUEST, text));
     };
     Ok((StoreRequest::Piece { offset, len, downgrade }, lock))
 }
 
-fn put<'a>(room: &mut [u8], request: Request<'a>) -> Result<(StoreRequest, StoreLock<'a>), Reply> {
-    let Some((len, lock)) = request.image else { return Err(busy(room)) };
+fn put<'a>(buf: &mut [u8], request: Request<'a>) -> Result<(StoreRequest, StoreLock<'a>), Reply> {
+    let Some((len, lock)) = request.image else { return Err(busy(buf)) };
     let (status, text) = match request.head.if_match.map(Etag::parse) {
         None => {
             let text = "If-Match is needed: the ETag of the revision that this one was made from";
@@ -199,19 +199,19 @@ fn put<'a>(room: &mut [u8], request: Request<'a>) -> Result<(StoreRequest, Store
                 Ok((digest, len)) => Ok((StoreRequest::Put { base, digest, len }, lock)),
                 Err(error) => {
                     let error: image::ImageError = error;
-                    Err(Reply::error(room, Status::UNPROCESSABLE, error))
+                    Err(Reply::error(buf, Status::UNPROCESSABLE, error))
                 }
             };
         }
     };
-    Err(Reply::error(room, status, text))
+    Err(Reply::error(buf, status, text))
 }
 
-fn refuse(room: &mut [u8], refused: Refused) -> Reply {
+fn refuse(buf: &mut [u8], refused: Refused) -> Reply {
     let (status, text) = match refused {
         Refused::Changed(base) => {
             let text = format_args!("the configuration was changed meanwhile; the newest is {}", Etag(base));
-            return Reply::error(room, Status::PRECONDITION_FAILED, text).about(Some(base));
+            return Reply::error(buf, Status::PRECONDITION_FAILED, text).about(Some(base));
         }
         Refused::OnTrial => (Status::CONFLICT, "a revision is on trial; confirm it or roll it back first"),
         Refused::NotOnTrial => (Status::CONFLICT, "no revision is on trial"),
@@ -220,17 +220,17 @@ fn refuse(room: &mut [u8], refused: Refused) -> Reply {
         Refused::Runs => (Status::CONFLICT, "it is live already"),
         Refused::Trial => (Status::BAD_REQUEST, "confirm_s is out of range; allowed: 1..=3600"),
         Refused::NoPrevious => (Status::CONFLICT, "no other revision was live before"),
-        _ => return busy(room),
+        _ => return busy(buf),
     };
-    Reply::error(room, status, text)
+    Reply::error(buf, status, text)
 }
 
-pub(super) fn busy(room: &mut [u8]) -> Reply {
-    Reply::error(room, Status::CONFLICT, "something else is being done; try again")
+pub(super) fn busy(buf: &mut [u8]) -> Reply {
+    Reply::error(buf, Status::CONFLICT, "something else is being done; try again")
 }
 
-pub(super) fn nothing_kept(room: &mut [u8]) -> Reply {
-    Reply::error(room, Status::UNAVAILABLE, "this board has no store, so it keeps nothing")
+pub(super) fn nothing_kept(buf: &mut [u8]) -> Reply {
+    Reply::error(buf, Status::UNAVAILABLE, "this board has no store, so it keeps nothing")
 }
 
 /// For the log.

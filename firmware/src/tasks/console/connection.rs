@@ -27,19 +27,19 @@ use crate::tasks::watchdog::Pulse;
 pub struct Buffers<'a> {
     rx: &'a mut [u8],
     tx: &'a mut [u8],
-    room: &'a mut [u8],
+    buf: &'a mut [u8],
 }
 
 impl<'a> Buffers<'a> {
     /// Size in bytes.
-    pub const SIZE: usize = RX + TX + ROOM;
+    pub const SIZE: usize = RX + TX + BUFFER;
 
     /// Takes [`Buffers::SIZE`] bytes from the front of `memory`; `None` if there are fewer.
     pub fn take(memory: &mut &'a mut [u8]) -> Option<Self> {
         let memory = memory.split_off_mut(..Self::SIZE)?;
         let (rx, rest) = memory.split_at_mut_checked(RX)?;
-        let (tx, room) = rest.split_at_mut_checked(TX)?;
-        Some(Self { rx, tx, room })
+        let (tx, buf) = rest.split_at_mut_checked(TX)?;
+        Some(Self { rx, tx, buf })
     }
 }
 
@@ -56,7 +56,7 @@ pub(super) struct Request<'a> {
 impl Console {
     /// Serves connections with one socket, for ever.
     pub async fn serve(&self, pulse: &Pulse, stack: Stack<'_>, buffers: Buffers<'_>) -> ! {
-        let Buffers { rx, tx, room } = buffers;
+        let Buffers { rx, tx, buf } = buffers;
         let mut head = HeadBuffer::new();
         loop {
             let mut socket = TcpSocket::new(stack, rx, tx);
@@ -73,15 +73,14 @@ impl Console {
                 let _one = OneMore::of(&self.connections, usize::MAX);
                 self.count(|counters| &mut counters.connections);
                 head.clear();
-                match self.connection(&mut socket, &mut head, room).await {
+                match self.connection(&mut socket, &mut head, buf).await {
                     Err(Ended::Slow) => self.count(|counters| &mut counters.slow_readers),
                     Err(Ended::TooLong) => self.count(|counters| &mut counters.cut_off),
                     Ok(()) => {
                         socket.close();
                         if with_timeout(MAX_TIME, socket.flush()).await.is_ok() {
                             // What is left of a request: a reset before it was taken would hide the answer.
-                            let rest =
-                                async { while socket.read(room).await.is_ok_and(|count| count > 0) {} };
+                            let rest = async { while socket.read(buf).await.is_ok_and(|count| count > 0) {} };
                             let _ = with_timeout(LINGER, rest).await;
                         }
                     }
@@ -99,9 +98,9 @@ impl Console {
         &'a self,
         socket: &mut TcpSocket<'_>,
         buffer: &'a mut HeadBuffer,
-        room: &mut [u8],
+        buf: &mut [u8],
     ) -> Result<(), Ended> {
-        let mut line = Line { socket, room, is_head: false, nonce: None };
+        let mut line = Line { socket, buf, is_head: false, nonce: None };
         let deadline = Instant::now() + MAX_TIME;
         let rest = match self.receive_head(&mut line, buffer, deadline).await? {
             Some(rest) => rest,
@@ -116,7 +115,7 @@ impl Console {
                     },
                     Body::Other => {
                         let text = "the body is not the one that was signed";
-                        Reply::error(line.room, Status::UNAUTHORIZED, text)
+                        Reply::error(line.buf, Status::UNAUTHORIZED, text)
                     }
                     Body::Incomplete => return self.was_incomplete(&mut line).await,
                 }
@@ -128,11 +127,11 @@ impl Console {
 
     async fn was_incomplete(&self, line: &mut Line<'_, '_>) -> Result<(), Ended> {
         self.count(|counters| &mut counters.incomplete);
-        let reply = Reply::refused(line.room, &HeadError::Incomplete.into());
+        let reply = Reply::refused(line.buf, &HeadError::Incomplete.into());
         line.answer(&reply).await
     }
 
-    /// Waits for the head. Returns where in the room the beginning of the body is; `None` if it did not arrive in time.
+    /// Waits for the head. Returns the range of the buffer with the beginning of the body; `None` if it did not arrive in time.
     async fn receive_head(
         &self,
         line: &mut Line<'_, '_>,
@@ -140,7 +139,7 @@ impl Console {
         deadline: Instant,
     ) -> Result<Option<Range<usize>>, Ended> {
         loop {
-            let chunk = line.room.get_mut(..CHUNK).unwrap_or(&mut []);
+            let chunk = line.buf.get_mut(..CHUNK).unwrap_or(&mut []);
             let count = match with_deadline(deadline, line.socket.read(chunk)).await {
                 Ok(Ok(count @ 1..)) => count,
                 // A browser opens connections that it may never use.
@@ -151,7 +150,7 @@ impl Console {
                     return Err(Ended::Gone);
                 }
             };
-            let taken = buffer.push(line.room.get(..count).unwrap_or(&[]));
+            let taken = buffer.push(line.buf.get(..count).unwrap_or(&[]));
             if buffer.head() != Err(HeadError::Incomplete) {
                 return Ok(Some(taken..count));
             }
@@ -179,7 +178,7 @@ impl Console {
             if refusal.status == Status::UNAUTHORIZED {
                 line.nonce = Some(guard.nonce(now()));
             }
-            Reply::refused(line.room, &refusal)
+            Reply::refused(line.buf, &refusal)
         })?;
         line.is_head = admitted.is_head;
         if admitted.is_signed() {
@@ -191,8 +190,8 @@ impl Console {
             store.note_reached();
         }
         if matches!(operation, Operation::PutConfig | Operation::PutUpdate | Operation::PutEdge) {
-            let Some(store) = self.store else { return Err(nothing_kept(line.room)) };
-            let Some(lock) = store.take() else { return Err(busy(line.room)) };
+            let Some(store) = self.store else { return Err(nothing_kept(line.buf)) };
+            let Some(lock) = store.take() else { return Err(busy(line.buf)) };
             // The guard has limited it.
             request.image = Some((usize::try_from(admitted.length).unwrap_or(0), lock));
         }
@@ -212,17 +211,17 @@ impl Console {
         let mut hash = BodyHash::new();
         // What is behind the body is another request, which is not looked at.
         let mut piece = rest.len().min(length);
-        line.room.copy_within(rest.start..rest.start.saturating_add(piece), 0);
+        line.buf.copy_within(rest.start..rest.start.saturating_add(piece), 0);
         if admitted.expects_continue && piece < length {
             line.send(CONTINUE.as_bytes(), deadline).await?;
         }
         let (mut received, mut from) = (0_usize, 0_usize);
         loop {
-            let bytes = line.room.get(from..from.saturating_add(piece)).unwrap_or(&[]);
+            let bytes = line.buf.get(from..from.saturating_add(piece)).unwrap_or(&[]);
             hash.update(bytes);
             match &mut request.image {
                 Some((_, lock)) => lock.fill(received, bytes),
-                // Arguments are short enough to stay in the room.
+                // Arguments are short enough to stay in the buffer.
                 None => from = from.saturating_add(piece),
             }
             received = received.saturating_add(piece);
@@ -230,7 +229,7 @@ impl Console {
             if left == 0 {
                 break;
             }
-            let chunk = line.room.get_mut(from..from.saturating_add(left.min(CHUNK))).unwrap_or(&mut []);
+            let chunk = line.buf.get_mut(from..from.saturating_add(left.min(CHUNK))).unwrap_or(&mut []);
             piece = match with_deadline(deadline, line.socket.read(chunk)).await {
                 Ok(Ok(count @ 1..)) => count,
                 Err(_) => return Ok(Body::Incomplete),
@@ -246,7 +245,7 @@ impl Console {
             return Ok(Body::Other);
         }
         if request.image.is_none() && request.head.method == Method::Post {
-            let body = line.room.get(..length).unwrap_or(&[]);
+            let body = line.buf.get(..length).unwrap_or(&[]);
             request.arguments = Arguments::parse(request.operation, body);
         }
         Ok(Body::Whole)
@@ -272,8 +271,8 @@ fn address(address: IpAddress) -> Ipv4Addr {
 const RX: usize = 1024;
 /// Transmit buffer: what a client far away has not acknowledged.
 const TX: usize = 1536;
-/// Room for the longest piece of an answer, or for its head and a short body.
-const ROOM: usize = 3328;
+/// Buffer of a connection: the longest piece of a reply, or its head and a short body.
+const BUFFER: usize = 3328;
 /// Bytes that are read at once; an image's are hashed before others run.
 const CHUNK: usize = 512;
 /// How long a client may go on sending after its answer.

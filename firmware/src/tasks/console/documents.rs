@@ -7,7 +7,7 @@ use recipe_api::documents::{Document, Pieces};
 use recipe_api::metrics::Families;
 use recipe_api::response::{Kind, Length, Status};
 
-use super::answer::{Ended, Line, Outcome, Reply, Room};
+use super::answer::{Ended, Line, Outcome, Reply, TextBuffer};
 use super::{Console, MAX_ANSWER, MAX_TIME};
 
 /// What is sent.
@@ -33,7 +33,7 @@ impl Console {
     ) -> Result<Outcome, Ended> {
         if self.is_idle() {
             let text = "nothing runs at the moment; try again";
-            return Ok(Outcome::Reply(Reply::error(line.room, Status::UNAVAILABLE, text)));
+            return Ok(Outcome::Reply(Reply::error(line.buf, Status::UNAVAILABLE, text)));
         }
         if !line.begin(kind, Length::Chunked, None).await? {
             return Ok(Outcome::Sent);
@@ -47,14 +47,14 @@ impl Console {
         Ok(Outcome::Sent)
     }
 
-    /// Writes the next piece into the room; returns its length. The engine is borrowed only here.
+    /// Writes the next piece into the buffer; returns its length. The engine is borrowed only here.
     pub(super) fn piece(&self, line: &mut Line<'_, '_>, source: &mut Source) -> Result<Option<usize>, Ended> {
-        let mut room = Room::new(line.room);
+        let mut buf = TextBuffer::new(line.buf);
         let is_more = self.gateway.report(|status| match source {
-            Source::Pieces(pieces) => pieces.write_next(status, &mut room).map_err(|_| Ended::TooLong),
-            Source::Metrics(families) => families.write_next(status, &mut room).map_err(|_| Ended::TooLong),
+            Source::Pieces(pieces) => pieces.write_next(status, &mut buf).map_err(|_| Ended::TooLong),
+            Source::Metrics(families) => families.write_next(status, &mut buf).map_err(|_| Ended::TooLong),
         })?;
-        Ok(is_more.then_some(room.len))
+        Ok(is_more.then_some(buf.len))
     }
 
     /// Whether nothing runs.

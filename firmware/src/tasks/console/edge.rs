@@ -7,7 +7,7 @@ use recipe_api::response::{Kind, Status};
 use recipe_sparkplug::document::{Document, DocumentError};
 
 use super::Console;
-use super::answer::{Reply, Room};
+use super::answer::{Reply, TextBuffer};
 use super::change::busy;
 use super::connection::Request;
 use crate::fmt::Text;
@@ -18,11 +18,11 @@ use crate::warn;
 impl Console {
     /// The document, with this status.
     #[inline(never)]
-    pub(super) fn edge(&self, room: &mut [u8], status: Status) -> Reply {
-        Reply::new(room, status, Kind::Json, |out| self.write_edge(out))
+    pub(super) fn edge(&self, buf: &mut [u8], status: Status) -> Reply {
+        Reply::new(buf, status, Kind::Json, |out| self.write_edge(out))
     }
 
-    fn write_edge(&self, out: &mut Room<'_>) -> fmt::Result {
+    fn write_edge(&self, out: &mut TextBuffer<'_>) -> fmt::Result {
         let node = &self.node;
         let state = match node.edge.view() {
             View::Off => "off",
@@ -86,34 +86,34 @@ impl Console {
     /// Settings were kept.
     pub(super) fn edge_is_kept(
         &self,
-        room: &mut [u8],
+        buf: &mut [u8],
         peer: core::net::Ipv4Addr,
         tells: bool,
         restart: bool,
     ) -> Reply {
         self.node.edge.keeps(tells);
         warn!("{} has changed the settings of the edge node", Text(&peer));
-        self.edge(room, if restart { Status::ACCEPTED } else { Status::OK })
+        self.edge(buf, if restart { Status::ACCEPTED } else { Status::OK })
     }
 }
 
 /// The request that stores the settings that were sent, or the reply if they are refused.
 #[inline(never)]
 pub(super) fn settings<'a>(
-    room: &mut [u8],
+    buf: &mut [u8],
     request: Request<'a>,
 ) -> Result<(StoreRequest, StoreLock<'a>), Reply> {
     let restart = match request.head.query("restart") {
         None => false,
         Some("yes") => true,
         Some(_) => {
-            return Err(Reply::error(room, Status::BAD_REQUEST, "restart is out of range; allowed: yes"));
+            return Err(Reply::error(buf, Status::BAD_REQUEST, "restart is out of range; allowed: yes"));
         }
     };
-    let Some((len, lock)) = request.image else { return Err(busy(room)) };
+    let Some((len, lock)) = request.image else { return Err(busy(buf)) };
     match lock.look(len, read) {
         Ok(tells) => Ok((StoreRequest::Edge { len, tells, restart }, lock)),
-        Err(error) => Err(Reply::error(room, Status::UNPROCESSABLE, error)),
+        Err(error) => Err(Reply::error(buf, Status::UNPROCESSABLE, error)),
     }
 }
 
@@ -123,7 +123,7 @@ fn read(bytes: &[u8]) -> Result<bool, DocumentError> {
     Document::empty().decode(bytes)
 }
 
-fn write_why(out: &mut Room<'_>, why: &dyn fmt::Display) -> fmt::Result {
+fn write_why(out: &mut TextBuffer<'_>, why: &dyn fmt::Display) -> fmt::Result {
     out.write_str(",\"why\":")?;
     json::write_text(out, why)
 }

@@ -10,7 +10,7 @@ use recipe_store::Ended;
 use recipe_update::{Header, Slot};
 
 use super::Console;
-use super::answer::{Reply, Room};
+use super::answer::{Reply, TextBuffer};
 use super::change::{busy, nothing_kept};
 use crate::tasks::store::{FirmwareView, StoreHandle};
 use crate::update::{Incoming, Stage, build_of, whole_length};
@@ -18,19 +18,19 @@ use crate::update::{Incoming, Stage, build_of, whole_length};
 impl Console {
     /// The document, with this status.
     #[inline(never)]
-    pub(super) fn firmware(&self, room: &mut [u8], status: Status) -> Reply {
+    pub(super) fn firmware(&self, buf: &mut [u8], status: Status) -> Reply {
         if self.store.is_none() {
-            return nothing_kept(room);
+            return nothing_kept(buf);
         }
         match self.store.and_then(StoreHandle::firmware) {
-            Some(view) => Reply::new(room, status, Kind::Json, |out| write(out, &view)),
+            Some(view) => Reply::new(buf, status, Kind::Json, |out| write(out, &view)),
             // The store is being read or moved.
-            None => busy(room),
+            None => busy(buf),
         }
     }
 }
 
-fn write(out: &mut Room<'_>, view: &FirmwareView) -> fmt::Result {
+fn write(out: &mut TextBuffer<'_>, view: &FirmwareView) -> fmt::Result {
     write!(out, "{{\"board\":\"{}\",\"version\":\"{}\"", view.board, env!("CARGO_PKG_VERSION"))?;
     if let Some(build) = &view.build {
         write!(out, ",\"sha512\":\"{}\"", Hex(build))?;
@@ -92,7 +92,7 @@ fn write(out: &mut Room<'_>, view: &FirmwareView) -> fmt::Result {
     out.write_char('}')
 }
 
-fn write_header(out: &mut Room<'_>, header: &Header) -> fmt::Result {
+fn write_header(out: &mut TextBuffer<'_>, header: &Header) -> fmt::Result {
     write!(out, "\"version\":\"{}\",\"sha512\":\"{}\"", header.version(), Hex(&build_of(header)))
 }
 

@@ -8,14 +8,14 @@ use recipe_api::json;
 use recipe_api::key::Hex;
 
 use super::Console;
-use super::answer::Room;
+use super::answer::TextBuffer;
 
 /// Follows the frames as long as it exists.
 pub(super) struct Follower<'c> {
     console: &'c Console,
     /// Only of this port.
     port: Option<&'c str>,
-    /// Records that found no room, and were not told yet.
+    /// Records dropped because the queue was full, not yet reported.
     lost: u32,
 }
 
@@ -38,13 +38,13 @@ impl Drop for Follower<'_> {
 }
 
 impl Follower<'_> {
-    /// Writes an event with as many frames as there is room for; nothing if there are none.
-    pub(super) fn write(&mut self, out: &mut Room<'_>) -> fmt::Result {
+    /// Writes an event with as many frames as fit; nothing if there are none.
+    pub(super) fn write(&mut self, out: &mut TextBuffer<'_>) -> fmt::Result {
         let mut count = 0_usize;
         while out.left() > LONGEST {
             let mut bytes = [0; MOST_BYTES];
-            let room = &mut bytes;
-            let Some(record) = self.console.gateway.tap(move |tap| tap.next(room)) else { break };
+            let buf = &mut bytes;
+            let Some(record) = self.console.gateway.tap(move |tap| tap.next(buf)) else { break };
             self.lost = self.lost.saturating_add(record.lost);
             let TapPlace::Port(id) = record.place else { continue };
             self.console.gateway.report(|status| {
@@ -65,7 +65,7 @@ impl Follower<'_> {
 }
 
 /// The same keys as those of a host, but for what it decodes.
-fn write(out: &mut Room<'_>, record: &TapRecord<'_>, port: &str) -> fmt::Result {
+fn write(out: &mut TextBuffer<'_>, record: &TapRecord<'_>, port: &str) -> fmt::Result {
     write!(out, "{{\"time_us\":{},\"port\":", record.at.as_micros())?;
     json::write_text(out, port)?;
     let direction = match record.direction {

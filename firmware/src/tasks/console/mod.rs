@@ -88,7 +88,7 @@ struct Counters {
     slow_readers: u32,
     /// Events that streams left out because their client reads slowly.
     lost_events: u32,
-    /// Answers that had no room, and were cut off.
+    /// Replies that did not fit into the buffer and were cut off.
     cut_off: u32,
 }
 

@@ -16,7 +16,7 @@ use recipe_api::revisions::{Revision, Revisions};
 use recipe_api::route::Operation;
 use serde::Serialize;
 
-use super::answer::{Ended, Etag, Line, Outcome, Reply, Room};
+use super::answer::{Ended, Etag, Line, Outcome, Reply, TextBuffer};
 use super::change::{busy, nothing_kept};
 use super::connection::Request;
 use super::documents::Source;
@@ -34,11 +34,11 @@ impl Console {
         request: Request<'a>,
     ) -> Result<Outcome, Ended> {
         let reply = match request.operation {
-            Operation::Info => self.info(line.room),
-            Operation::Nonce => self.nonce(line.room),
-            Operation::Revisions => self.revisions(line.room, Status::OK, None),
-            Operation::Edge => self.edge(line.room, Status::OK),
-            Operation::Update => self.firmware(line.room, Status::OK),
+            Operation::Info => self.info(line.buf),
+            Operation::Nonce => self.nonce(line.buf),
+            Operation::Revisions => self.revisions(line.buf, Status::OK, None),
+            Operation::Edge => self.edge(line.buf, Status::OK),
+            Operation::Update => self.firmware(line.buf, Status::OK),
             Operation::Status => return self.document(line, Kind::Json, Source::of(Document::Status)).await,
             Operation::Values => return self.document(line, Kind::Json, Source::of(Document::Values)).await,
             Operation::Metrics => {
@@ -48,22 +48,22 @@ impl Console {
             Operation::Log => return log(line, &request).await,
             Operation::Page => return page(line, &request).await,
             Operation::Config => return self.config(line, &request).await,
-            _ => self.change(line.room, request).await,
+            _ => self.change(line.buf, request).await,
         };
         Ok(Outcome::Reply(reply))
     }
 
-    fn nonce(&self, room: &mut [u8]) -> Reply {
+    fn nonce(&self, buf: &mut [u8]) -> Reply {
         let nonce = self.guard.borrow_mut().nonce(now());
         let age = MAX_AGE.as_millis() / 1_000;
-        Reply::new(room, Status::OK, Kind::Json, |out| {
+        Reply::new(buf, Status::OK, Kind::Json, |out| {
             write!(out, "{{\"max_age_s\":{age},\"nonce\":\"{nonce}\",\"scheme\":\"{SCHEME}\"}}")
         })
     }
 
     #[inline(never)]
-    fn info(&self, room: &mut [u8]) -> Reply {
-        Reply::new(room, Status::OK, Kind::Json, |out| {
+    fn info(&self, buf: &mut [u8]) -> Reply {
+        Reply::new(buf, Status::OK, Kind::Json, |out| {
             let name = &self.name;
             let version = env!("CARGO_PKG_VERSION");
             write!(out, "{{\"role\":\"board\",\"name\":\"{name}\",\"version\":\"{version}\",\"api\":\"v1\"")?;
@@ -105,20 +105,20 @@ impl Console {
 
     /// The revisions, and what happens to them; `changed` is the one that a change was about.
     #[inline(never)]
-    pub(super) fn revisions(&self, room: &mut [u8], status: Status, changed: Option<u32>) -> Reply {
-        let Some(store) = self.store else { return nothing_kept(room) };
+    pub(super) fn revisions(&self, buf: &mut [u8], status: Status, changed: Option<u32>) -> Reply {
+        let Some(store) = self.store else { return nothing_kept(buf) };
         let reply = store.look(|revisions| {
             let etag = changed.and_then(|number| revisions.revision(number));
-            let write = |out: &mut Room<'_>| write_revisions(out, store, revisions, changed);
-            Reply::new(room, status, Kind::Json, write).about(etag)
+            let write = |out: &mut TextBuffer<'_>| write_revisions(out, store, revisions, changed);
+            Reply::new(buf, status, Kind::Json, write).about(etag)
         });
         // The store is being read, or an image is taken over.
-        reply.unwrap_or_else(|| busy(room))
+        reply.unwrap_or_else(|| busy(buf))
     }
 
     /// The image of what runs, or of the requested revision.
     async fn config(&self, line: &mut Line<'_, '_>, request: &Request<'_>) -> Result<Outcome, Ended> {
-        let (store, revision) = match self.requested_revision(line.room, request) {
+        let (store, revision) = match self.requested_revision(line.buf, request) {
             Ok(found) => found,
             Err(reply) => return Ok(Outcome::Reply(reply)),
         };
@@ -127,7 +127,7 @@ impl Console {
         }
         let mut offset = 0;
         loop {
-            let len = store.part(revision.number, offset, line.room).await.ok_or(Ended::Gone)?;
+            let len = store.part(revision.number, offset, line.buf).await.ok_or(Ended::Gone)?;
             line.chunk(len, Instant::now() + MAX_TIME).await?;
             offset = offset.saturating_add(PART);
             if len < PART {
@@ -140,23 +140,23 @@ impl Console {
 
     fn requested_revision(
         &self,
-        room: &mut [u8],
+        buf: &mut [u8],
         request: &Request<'_>,
     ) -> Result<(&'static StoreHandle, Revision), Reply> {
-        let Some(store) = self.store else { return Err(nothing_kept(room)) };
+        let Some(store) = self.store else { return Err(nothing_kept(buf)) };
         let number = match request.head.query("revision").map(str::parse) {
             None => store.running(),
             Some(Ok(number)) => Some(number),
             Some(Err(_)) => {
-                return Err(Reply::error(room, Status::BAD_REQUEST, "revision must be a number"));
+                return Err(Reply::error(buf, Status::BAD_REQUEST, "revision must be a number"));
             }
         };
         let revision = number.and_then(|number| store.look(|kept| kept.revision(number)).flatten());
         let Some(revision) = revision.filter(|revision| *revision != NOTHING) else {
-            return Err(Reply::error(room, Status::NOT_FOUND, "there is no such revision"));
+            return Err(Reply::error(buf, Status::NOT_FOUND, "there is no such revision"));
         };
         if request.head.if_none_match.and_then(Etag::parse) == Some(revision) {
-            let unchanged = Reply::new(room, Status::NOT_MODIFIED, Kind::Image, |_| Ok(()));
+            let unchanged = Reply::new(buf, Status::NOT_MODIFIED, Kind::Image, |_| Ok(()));
             return Err(unchanged.about(Some(revision)));
         }
         Ok((store, revision))
@@ -170,7 +170,7 @@ async fn log(line: &mut Line<'_, '_>, request: &Request<'_>) -> Result<Outcome, 
         Some(Ok(lines @ 1..=MAX_LINES)) => lines,
         Some(_) => {
             let text = "lines is out of range; allowed: 1..=256";
-            return Ok(Outcome::Reply(Reply::error(line.room, Status::BAD_REQUEST, text)));
+            return Ok(Outcome::Reply(Reply::error(line.buf, Status::BAD_REQUEST, text)));
         }
     };
     if !line.begin(Kind::Text, Length::Chunked, None).await? {
@@ -178,8 +178,8 @@ async fn log(line: &mut Line<'_, '_>, request: &Request<'_>) -> Result<Outcome, 
     }
     let mut place = journal::last(lines);
     // More than the journal has is what came meanwhile.
-    for _ in 0..journal::ROOM.div_ceil(LOG_PIECE) {
-        let (len, behind) = journal::read(place, line.room.get_mut(..LOG_PIECE).unwrap_or(&mut []));
+    for _ in 0..journal::CAPACITY.div_ceil(LOG_PIECE) {
+        let (len, behind) = journal::read(place, line.buf.get_mut(..LOG_PIECE).unwrap_or(&mut []));
         if len == 0 {
             break;
         }
@@ -194,10 +194,10 @@ async fn log(line: &mut Line<'_, '_>, request: &Request<'_>) -> Result<Outcome, 
 /// Sends the page for people, unless the client has it.
 async fn page(line: &mut Line<'_, '_>, request: &Request<'_>) -> Result<Outcome, Ended> {
     let status = PAGE.status(request.head.if_none_match);
-    let mut room = Room::new(line.room);
-    PAGE.write_head(status, &mut room).map_err(|_| Ended::TooLong)?;
-    let (head, until) = (room.len, Instant::now() + MAX_ANSWER);
-    line.send_room(0, head, until.min(Instant::now() + MAX_TIME)).await?;
+    let mut buf = TextBuffer::new(line.buf);
+    PAGE.write_head(status, &mut buf).map_err(|_| Ended::TooLong)?;
+    let (head, until) = (buf.len, Instant::now() + MAX_ANSWER);
+    line.send_part(0, head, until.min(Instant::now() + MAX_TIME)).await?;
     if line.is_head || status != Status::OK {
         return Ok(Outcome::Sent);
     }
@@ -210,7 +210,7 @@ async fn page(line: &mut Line<'_, '_>, request: &Request<'_>) -> Result<Outcome,
 
 /// Writes the document `revisions`.
 fn write_revisions(
-    out: &mut Room<'_>,
+    out: &mut TextBuffer<'_>,
     store: &StoreHandle,
     revisions: &Revisions,
     changed: Option<u32>,
@@ -260,11 +260,11 @@ fn write_revisions(
 }
 
 /// In a string of JSON: with its quotes escaped.
-fn write_etag(out: &mut Room<'_>, revision: Revision) -> fmt::Result {
+fn write_etag(out: &mut TextBuffer<'_>, revision: Revision) -> fmt::Result {
     write!(out, "\\\"{}-{:08x}\\\"", revision.number, revision.digest)
 }
 
-fn write_json(out: &mut Room<'_>, value: &impl Serialize) -> fmt::Result {
+fn write_json(out: &mut TextBuffer<'_>, value: &impl Serialize) -> fmt::Result {
     json::write(out, value).map_err(|_| fmt::Error)
 }
 

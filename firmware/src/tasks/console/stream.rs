@@ -10,7 +10,7 @@ use embassy_time::{Duration, Instant, Timer};
 use recipe_api::documents::Document;
 use recipe_api::response::{Kind, Length, Status};
 
-use super::answer::{Ended, Line, Outcome, Reply, Room};
+use super::answer::{Ended, Line, Outcome, Reply, TextBuffer};
 use super::connection::Request;
 use super::documents::Source;
 use super::{Console, MAX_TIME, OneMore, STREAMS};
@@ -25,7 +25,7 @@ impl Console {
         let Some(_one) = OneMore::of(&self.streams, STREAMS) else {
             self.count(|counters| &mut counters.turned_away);
             let text = "too many streams; poll /api/v1/status instead";
-            return Ok(Outcome::Reply(Reply::error(line.room, Status::UNAVAILABLE, text)));
+            return Ok(Outcome::Reply(Reply::error(line.buf, Status::UNAVAILABLE, text)));
         };
         let port = request.head.query("port");
         let mut follower = None;
@@ -33,7 +33,7 @@ impl Console {
             follower = self.follow(port);
             if follower.is_none() {
                 let text = "another client follows the frames; a board has room for one";
-                return Ok(Outcome::Reply(Reply::error(line.room, Status::UNAVAILABLE, text)));
+                return Ok(Outcome::Reply(Reply::error(line.buf, Status::UNAVAILABLE, text)));
             }
         }
         line.begin(Kind::Events, Length::Endless, None).await?;
@@ -41,11 +41,11 @@ impl Console {
         loop {
             if let Some(follower) = &mut follower {
                 loop {
-                    let mut room = Room::new(line.room);
-                    follower.write(&mut room).map_err(|_| Ended::TooLong)?;
-                    match room.len {
+                    let mut buf = TextBuffer::new(line.buf);
+                    follower.write(&mut buf).map_err(|_| Ended::TooLong)?;
+                    match buf.len {
                         0 => break,
-                        len => line.send_room(0, len, Instant::now() + MAX_TIME).await?,
+                        len => line.send_part(0, len, Instant::now() + MAX_TIME).await?,
                     }
                     yield_now().await;
                 }
@@ -83,7 +83,7 @@ impl Console {
             line.send(text.as_bytes(), until).await?;
         }
         while let Some(len) = self.piece(line, &mut source)? {
-            line.send_room(0, len, until).await?;
+            line.send_part(0, len, until).await?;
             yield_now().await;
         }
         line.send(b"\n\n", until).await

@@ -222,7 +222,7 @@ pub struct StoreLock<'a> {
 }
 
 impl StoreLock<'_> {
-    /// Writes to the room for an image.
+    /// Writes to the buffer of the image.
     pub fn fill(&mut self, offset: usize, bytes: &[u8]) {
         let mut image = self.handle.image.borrow_mut();
         for (place, byte) in image.iter_mut().skip(offset).zip(bytes) {

@@ -121,9 +121,9 @@ impl Operation {
 impl Contents {
     /// What the store says that it holds.
     pub(crate) fn read(store: &Store, flash: &Nor) -> Self {
-        let mut room = vec![0; recipe_store::MAX_DATA];
+        let mut buf = vec![0; recipe_store::MAX_DATA];
         let images = store.revisions().into_iter().map(|kept| {
-            let image = store.image(flash, kept.number, &mut room).expect("it is kept").to_vec();
+            let image = store.image(flash, kept.number, &mut buf).expect("it is kept").to_vec();
             (kept.number, (kept.digest, image))
         });
         let images = images.collect();
@@ -131,7 +131,7 @@ impl Contents {
             images,
             marks: store.marks(),
             counters: std::array::from_fn(|number| store.counter(number as u8)),
-            edge: store.get(flash, recipe_store::Key::Edge, &mut room).unwrap_or_default().to_vec(),
+            edge: store.get(flash, recipe_store::Key::Edge, &mut buf).unwrap_or_default().to_vec(),
             birth: store.birth_sequence(),
             key: store.access_key(flash),
         }

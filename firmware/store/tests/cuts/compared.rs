@@ -94,12 +94,12 @@ struct Outcome {
 fn cut_everywhere(torn: Torn, changes: u32, len: usize) -> Outcome {
     let mut flash = Adapter(Nor::new(SECTORS, torn));
     flash.0.allow_rewrites();
-    let (mut room, mut outcome) = (vec![0; 8_192], Outcome::default());
+    let (mut buf, mut outcome) = (vec![0; 8_192], Outcome::default());
     for number in 0..changes {
         let (key, new) = ((number % 2) as u8, image(number, len));
         let old = number.checked_sub(2).map(|number| image(number, len));
         let mut whole = open(flash.clone());
-        block_on(whole.store_item(&mut room, &key, &&new[..])).expect("there is power");
+        block_on(whole.store_item(&mut buf, &key, &&new[..])).expect("there is power");
         let (after, _) = whole.destroy();
         let steps = after.0.operations() - flash.0.operations();
         for cut in (0..steps).step_by(3) {
@@ -107,14 +107,14 @@ fn cut_everywhere(torn: Torn, changes: u32, len: usize) -> Outcome {
             let mut dead = flash.clone();
             dead.0.cut_after(cut, u64::from(number) << 32 | u64::from(cut));
             let mut map = open(dead);
-            let _ = block_on(map.store_item(&mut room, &key, &&new[..]));
+            let _ = block_on(map.store_item(&mut buf, &key, &&new[..]));
             let (mut dead, _) = map.destroy();
             dead.0.power();
             let mut map = open(dead);
-            let found = block_on(map.fetch_item::<&[u8]>(&mut room, &key)).ok().flatten().map(<[u8]>::to_vec);
+            let found = block_on(map.fetch_item::<&[u8]>(&mut buf, &key)).ok().flatten().map(<[u8]>::to_vec);
             outcome.lost += u32::from(found != old && found.as_ref() != Some(&new));
-            let again = block_on(map.store_item(&mut room, &key, &&new[..]));
-            let found = block_on(map.fetch_item::<&[u8]>(&mut room, &key)).ok().flatten();
+            let again = block_on(map.store_item(&mut buf, &key, &&new[..]));
+            let found = block_on(map.fetch_item::<&[u8]>(&mut buf, &key)).ok().flatten();
             match again {
                 Err(_) => outcome.fails += 1,
                 Ok(()) if found != Some(&new[..]) => outcome.not_there += 1,

@@ -219,9 +219,9 @@ impl Board {
         let chosen = self.try_start().expect("something always runs");
         let found = self.newest();
         let part = self.store_mut(&found).clone();
-        let mut room = [0; 100];
+        let mut buf = [0; 100];
         let live = found.store.at_start().candidates.first().expect("a configuration").0.number;
-        assert_eq!(found.store.image(&part, live, &mut room), Some(CONFIGURATION));
+        assert_eq!(found.store.image(&part, live, &mut buf), Some(CONFIGURATION));
         let Chosen { slot, header, .. } = chosen;
         let image = image(slot, header.version(), self.len);
         let part = &self.slots[usize::from(slot.number())];
