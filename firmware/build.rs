@@ -36,17 +36,18 @@ const SIZE: u32 = 640 << 10;
 const HEADER: u32 = 1 << 10;
 
 /// Where a board has its programs.
-struct Places {
+struct ImagePlaces {
     /// Addresses of the slots A and B. `host-sim ctl sign` compares with its own table of them.
     slots: [u32; 2],
     /// Of a program without a slot: address, and the room up to what is something else.
     whole: (u32, u32),
 }
 
-const NUCLEO_H743ZI: Places = Places { slots: [0x0802_0000, 0x0810_0000], whole: (0x0800_0000, 768 << 10) };
-const MPS2_AN500: Places = Places { slots: [0x0010_0000, 0x0020_0000], whole: (0, 4 << 20) };
+const NUCLEO_H743ZI: ImagePlaces =
+    ImagePlaces { slots: [0x0802_0000, 0x0810_0000], whole: (0x0800_0000, 768 << 10) };
+const MPS2_AN500: ImagePlaces = ImagePlaces { slots: [0x0010_0000, 0x0020_0000], whole: (0, 4 << 20) };
 
-impl Places {
+impl ImagePlaces {
     /// Writes program.x, which the board's script includes: for the slot of the environment, and into the folders
     /// slot-a and slot-b for each, of which link-slots makes use.
     fn place_program(&self, out: &Path) {

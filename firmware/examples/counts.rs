@@ -40,11 +40,11 @@ const CYCLE: Duration = Duration::from_millis(4);
 const STATE_EACH: u32 = 16;
 
 /// Does something once and returns the ticks of what is counted of it.
-type Work = fn(&mut Bench) -> u32;
+type Measurement = fn(&mut EngineBench) -> u32;
 
 /// What it is called, the ports that send each cycle, what is done.
-const WORKS: [(&str, &[PortId], Work); 14] = [
-    ("28-byte stream frame to its frame over UDP", &[], Bench::sensor_frame),
+const MEASUREMENTS: [(&str, &[PortId], Measurement); 14] = [
+    ("28-byte stream frame to its frame over UDP", &[], EngineBench::sensor_frame),
     ("the same frame in four chunks", &[], |bench| bench.sensor_chunks(7)),
     ("the same frame byte by byte", &[], |bench| bench.sensor_chunks(1)),
     ("28-byte stream frame to its Modbus request", &[], |bench| bench.plc_frame().0),
@@ -55,10 +55,10 @@ const WORKS: [(&str, &[PortId], Work); 14] = [
     }),
     ("CAN frame to its Modbus request", &[], |bench| bench.can_frame(0x50D)),
     ("CAN frame of an id that no recipe has", &[], |bench| bench.can_frame(0x50E)),
-    ("state packet of 1468 bytes", &[], Bench::state_packet),
-    ("state packet in three segments", &[], Bench::state_segments),
-    ("idle cycle, nothing due", &[], Bench::idle),
-    ("transport took what was sent", &[], Bench::taken),
+    ("state packet of 1468 bytes", &[], EngineBench::state_packet),
+    ("state packet in three segments", &[], EngineBench::state_segments),
+    ("idle cycle, nothing due", &[], EngineBench::idle),
+    ("transport took what was sent", &[], EngineBench::taken),
     ("output cycle of an RS-485 port, 28 bytes", &[DISPLAY], |bench| bench.cycle(DISPLAY)),
     ("output cycle of a CAN port, 3 frames", &[DEVICES], |bench| bench.cycle(DEVICES)),
 ];
@@ -70,7 +70,7 @@ const STATE_PACKET: [u8; 1468] = {
     packet
 };
 
-struct Bench {
+struct EngineBench {
     engine: &'static mut Engine,
     out: [u8; OUTPUT_BUFFER],
     packet: [u8; 1468],
@@ -89,7 +89,7 @@ fn main() -> ! {
     calibrate();
     let image = bare::read_file(1, IMAGE.take());
     let config = CONFIG.take();
-    let mut bench = Bench {
+    let mut bench = EngineBench {
         engine: ENGINE.take(),
         out: [0; OUTPUT_BUFFER],
         packet: STATE_PACKET,
@@ -99,7 +99,7 @@ fn main() -> ! {
     };
     let is_profile = bare::is_argument(2, |_| true);
     let passes = if is_profile { PROFILED } else { PASSES };
-    for (name, cycles, work) in WORKS {
+    for (name, cycles, work) in MEASUREMENTS {
         if is_profile && !bare::is_argument(2, |wanted| is_called(name, wanted)) {
             continue;
         }
@@ -132,7 +132,7 @@ fn print(name: &str, mean: u64, most: u64) {
     semihosting::println!("{}\t{}\t{name}", instructions(mean), instructions(most));
 }
 
-impl Bench {
+impl EngineBench {
     /// An engine that knows nothing yet, of ports of which some send each cycle.
     fn set_up(&mut self, image: &[u8], config: &mut GatewayConfig, cycles: &[PortId]) {
         if let Err(error) = image::decode_into(image, config) {

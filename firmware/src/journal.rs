@@ -37,7 +37,7 @@ static RING: Mutex<RefCell<Ring>> = Mutex::new(RefCell::new(Ring { bytes: Deque:
 /// Keeps a line. Not from an interrupt that is not to be held up.
 #[inline(never)]
 pub fn note(level: Level, message: fmt::Arguments<'_>) {
-    let mut line = Line(String::new());
+    let mut line = LineBuffer(String::new());
     let micros = embassy_time::Instant::now().as_micros();
     let (seconds, rest) = (micros / 1_000_000, micros % 1_000_000);
     let level = match level {
@@ -107,9 +107,9 @@ impl Ring {
 }
 
 /// A line that is cut where it is full.
-struct Line(String<{ MAX_LINE - 1 }>);
+struct LineBuffer(String<{ MAX_LINE - 1 }>);
 
-impl Write for Line {
+impl Write for LineBuffer {
     fn write_str(&mut self, text: &str) -> fmt::Result {
         for letter in text.chars() {
             self.0.push(letter).map_err(|_| fmt::Error)?;
@@ -178,7 +178,7 @@ mod tests {
         let mut ring = ring();
         ring.push(b"two\r\nlines");
         assert_eq!(all::<64>(&ring, 0), "two  lines\n");
-        let mut long = Line(String::new());
+        let mut long = LineBuffer(String::new());
         assert!(write!(long, "{}", "x".repeat(500)).is_err());
         assert_eq!(long.0.len(), MAX_LINE - 1);
     }

@@ -15,7 +15,7 @@ use firmware::identity;
 use firmware::platform::{self, FeedWatchdog as _, NoDevice, Ports, StatusLed as _};
 use firmware::stored::StoredConfig;
 use firmware::tasks::console::{self, CONNECTIONS, Console, NodeView};
-use firmware::tasks::edge::{self, Cannot, Edge};
+use firmware::tasks::edge::{self, Edge, EdgeError};
 use firmware::tasks::fair::Fair;
 use firmware::tasks::gateway::{Gateway, MAX_LINKS};
 use firmware::tasks::led::Condition;
@@ -32,7 +32,7 @@ use proto_core::engine::{LinkId, LinkKind, PortId};
 use static_cell::{ConstStaticCell, StaticCell};
 
 use crate::board::Board;
-use configuration::{Refused, load};
+use configuration::{CannotRun, load};
 use firmware::platform::Board as _;
 
 // The devices of the chosen board.
@@ -65,7 +65,7 @@ pub(crate) fn start(spawner: Spawner, mut board: Board) -> Tasks {
     static OVERLAY: ConstStaticCell<Overlay> = ConstStaticCell::new(Overlay::ZEROED);
     let (gateway, overlay) = (GATEWAY.take(), OVERLAY.take());
     let mut stored = open_store(&mut board);
-    let mut work = store::Work::default();
+    let mut work = store::StartWork::default();
     let mut failure = None;
     let config = overlay.configuration();
     let loaded = load(&mut board, stored.as_deref_mut(), gateway, config, &mut work, &mut failure);
@@ -74,7 +74,8 @@ pub(crate) fn start(spawner: Spawner, mut board: Board) -> Tasks {
         wire(len, gateway, config, &mut wiring);
     }
     let gateway: &'static Gateway = gateway;
-    let telling = make_edge(stored.as_deref_mut(), gateway, loaded.is_ok().then_some(&*config), board.seed());
+    let edge_setup =
+        make_edge(stored.as_deref_mut(), gateway, loaded.is_ok().then_some(&*config), board.seed());
     let key = stored.as_ref().and_then(|stored| stored.access_key());
     let slots = board.slots();
     let store = stored.and_then(|stored| start_store_task(&tasks, gateway, stored, slots, work, failure));
@@ -82,10 +83,10 @@ pub(crate) fn start(spawner: Spawner, mut board: Board) -> Tasks {
     if ran.is_err() {
         wiring.links.clear();
     }
-    let connected = connect(&tasks, &mut board, gateway, store, key, &wiring, telling, overlay.links());
+    let connected = connect(&tasks, &mut board, gateway, store, key, &wiring, edge_setup, overlay.links());
     let console = connected.as_ref().ok().copied().flatten();
     let refused_why = ran.err().or(connected.err());
-    let shown = Shown { gateway: refused_why.is_none().then_some(gateway), console };
+    let shown = LedSources { gateway: refused_why.is_none().then_some(gateway), console };
     tasks.spawn(TaskName::Led, |pulse| status_led(pulse, shown, led));
     if let Some(reason) = refused_why {
         tasks.spawn(TaskName::Refused, |pulse| refused(pulse, reason));
@@ -103,7 +104,7 @@ fn open_store(board: &mut Board) -> Option<&'static mut StoredConfig<Flash>> {
 }
 
 /// The edge node, if there are settings for one.
-struct Telling {
+struct EdgeSetup {
     view: NodeView,
     node: Option<&'static mut edge::Node>,
     seed: u64,
@@ -116,38 +117,38 @@ fn make_edge(
     gateway: &Gateway,
     config: Option<&GatewayConfig>,
     seed: u64,
-) -> Telling {
+) -> EdgeSetup {
     static EDGE: StaticCell<Edge> = StaticCell::new();
     static CLOCK: ConstStaticCell<WallClock> = ConstStaticCell::new(WallClock::unknown());
-    static MEMORY: ConstStaticCell<edge::Memory> = ConstStaticCell::new(edge::Memory::ZEROED);
+    static MEMORY: ConstStaticCell<edge::NodeMemory> = ConstStaticCell::new(edge::NodeMemory::ZEROED);
     static NODE: StaticCell<edge::Node> = StaticCell::new();
     let edge: &'static Edge = EDGE.init(Edge::off());
-    let mut telling =
-        Telling { view: NodeView { edge, document: None, clock: CLOCK.take() }, node: None, seed };
-    let edge::Memory { document, rest } = MEMORY.take();
+    let mut edge_setup =
+        EdgeSetup { view: NodeView { edge, document: None, clock: CLOCK.take() }, node: None, seed };
+    let edge::NodeMemory { document, rest } = MEMORY.take();
     let bd_seq = stored.as_ref().and_then(|stored| stored.store().birth_sequence());
     match stored.and_then(|stored| stored.edge(document)) {
-        None | Some(Ok(false)) => return telling,
+        None | Some(Ok(false)) => return edge_setup,
         Some(Ok(true)) => {}
         Some(Err(error)) => {
             error!("edge node: {}", Text(&error));
-            edge.cannot(Cannot::Settings(error));
-            return telling;
+            edge.cannot(EdgeError::Settings(error));
+            return edge_setup;
         }
     }
     let document: &'static edge::Document = document;
-    telling.view.document = Some(document);
+    edge_setup.view.document = Some(document);
     let made = config
-        .ok_or(Cannot::NothingRuns)
+        .ok_or(EdgeError::NothingRuns)
         .and_then(|config| edge::Node::make(document, rest, gateway, config.view(), bd_seq, seed));
     match made {
-        Ok(node) => telling.node = Some(NODE.init(node)),
+        Ok(node) => edge_setup.node = Some(NODE.init(node)),
         Err(why) => {
             error!("edge node: {}", Text(&why));
             edge.cannot(why);
         }
     }
-    telling
+    edge_setup
 }
 
 /// Starts the store task.
@@ -157,8 +158,8 @@ fn start_store_task(
     gateway: &'static Gateway,
     stored: &'static mut StoredConfig<Flash>,
     slots: Site<BoardSlot>,
-    work: store::Work<'static>,
-    failure: Option<Refused>,
+    work: store::StartWork<'static>,
+    failure: Option<CannotRun>,
 ) -> Option<&'static StoreHandle> {
     static UPDATES: StaticCell<Updates<BoardSlot>> = StaticCell::new();
     let updates = UPDATES.init(Updates::new(slots)?);
@@ -252,7 +253,7 @@ fn run_ports(
     board: &mut Board,
     gateway: &'static Gateway,
     wiring: &Wiring,
-) -> Result<(), Refused> {
+) -> Result<(), CannotRun> {
     // All devices are claimed before anything runs.
     let mut serial_ports: heapless::Vec<_, SERIAL_PORTS> = heapless::Vec::new();
     let mut can_ports: heapless::Vec<_, CAN_PORTS> = heapless::Vec::new();
@@ -261,12 +262,12 @@ fn run_ports(
             Bus::Rs485(settings) => {
                 let line = board.serial(settings);
                 let missing =
-                    Refused::NoDevice(NoDevice { port: id.0, bus: "RS-485", available: SERIAL_PORTS });
+                    CannotRun::NoDevice(NoDevice { port: id.0, bus: "RS-485", available: SERIAL_PORTS });
                 let line = line.ok_or(missing)?;
                 let _ = serial_ports.push((*id, line, settings.baud));
             }
             Bus::Can { bitrate } => {
-                let missing = Refused::NoDevice(NoDevice { port: id.0, bus: "CAN", available: CAN_PORTS });
+                let missing = CannotRun::NoDevice(NoDevice { port: id.0, bus: "CAN", available: CAN_PORTS });
                 let _ = can_ports.push((*id, board.can(*bitrate).ok_or(missing)?));
             }
             // These have links.
@@ -295,10 +296,10 @@ fn connect(
     store: Option<&'static StoreHandle>,
     key: Option<[u8; 16]>,
     wiring: &Wiring,
-    telling: Telling,
+    edge_setup: EdgeSetup,
     mut memory: &'static mut [u8],
-) -> Result<Option<&'static Console>, Refused> {
-    let ethernet = board.ethernet().map_err(Refused::Ethernet)?;
+) -> Result<Option<&'static Console>, CannotRun> {
+    let ethernet = board.ethernet().map_err(CannotRun::Ethernet)?;
     let name = match ethernet.hardware_address() {
         HardwareAddress::Ethernet(address) => identity::host_name(address),
         _ => identity::host_name([0; 6]),
@@ -315,12 +316,12 @@ fn connect(
             controller_link(pulse, gateway, id, stack, endpoint, buffers)
         });
     }
-    let view = telling.view;
-    if let (Some(node), Some(store)) = (telling.node, store) {
+    let view = edge_setup.view;
+    if let (Some(node), Some(store)) = (edge_setup.node, store) {
         if let Some(server) = view.document.and_then(|document| document.time_server.as_ref()) {
             let (host, port) = (server.0.as_str(), server.1);
             tasks.spawn(TaskName::Time, |pulse| {
-                time_server(pulse, stack, host, port, view.clock, telling.seed)
+                time_server(pulse, stack, host, port, view.clock, edge_setup.seed)
             });
         }
         tasks.spawn(TaskName::Edge, |pulse| edge_node(pulse, gateway, stack, store, view, node));
@@ -431,14 +432,14 @@ async fn network(pulse: &'static Pulse, mut runner: Runner<'static, Fair<'static
 
 /// What the LED shows.
 #[derive(Clone, Copy)]
-struct Shown {
+struct LedSources {
     /// `None` if nothing runs, or there is no Ethernet.
     gateway: Option<&'static Gateway>,
     console: Option<&'static Console>,
 }
 
 #[embassy_executor::task]
-async fn status_led(pulse: &'static Pulse, shown: Shown, mut led: Led) -> ! {
+async fn status_led(pulse: &'static Pulse, shown: LedSources, mut led: Led) -> ! {
     let condition = || match shown.console {
         Some(console) if console.is_identifying() => Condition::Identify,
         _ => shown.gateway.map_or(Condition::Refused, Gateway::condition),
@@ -490,7 +491,7 @@ async fn time_server(
 /// Logs the board's address whenever it changes.
 #[embassy_executor::task]
 async fn address(pulse: &'static Pulse, stack: Stack<'static>) -> ! {
-    let telling = async {
+    let log = async {
         loop {
             // A fixed address exists before the link is up, but cannot be reached yet.
             pulse.idle(pin!(stack.wait_link_up())).await;
@@ -502,7 +503,7 @@ async fn address(pulse: &'static Pulse, stack: Stack<'static>) -> ! {
             warn!("no address");
         }
     };
-    pulse.run(pin!(telling)).await
+    pulse.run(pin!(log)).await
 }
 
 #[embassy_executor::task]
@@ -518,7 +519,7 @@ async fn store_task(
     store: &'static StoreHandle,
     stored: &'static mut StoredConfig<Flash>,
     updates: &'static mut Updates<BoardSlot>,
-    work: store::Work<'static>,
+    work: store::StartWork<'static>,
 ) -> ! {
     pulse.run(pin!(store::run(gateway, pulse, store, stored, updates, work))).await;
     cortex_m::peripheral::SCB::sys_reset()
@@ -526,15 +527,15 @@ async fn store_task(
 
 /// Logs the reason repeatedly, because the log may be read late.
 #[embassy_executor::task]
-async fn refused(pulse: &'static Pulse, reason: Refused) -> ! {
-    let what = if matches!(reason, Refused::Ethernet(_)) { "no controller" } else { "nothing runs" };
-    let telling = async {
+async fn refused(pulse: &'static Pulse, reason: CannotRun) -> ! {
+    let what = if matches!(reason, CannotRun::Ethernet(_)) { "no controller" } else { "nothing runs" };
+    let log = async {
         loop {
             error!("{}: {}", what, Text(&reason));
             pulse.idle(pin!(Timer::after(REPEAT))).await;
         }
     };
-    pulse.run(pin!(telling)).await
+    pulse.run(pin!(log)).await
 }
 
 /// One for each link and connection, the broker, the time server, DHCP and DNS.

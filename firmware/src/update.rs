@@ -106,7 +106,7 @@ impl fmt::Display for Refused {
 
 /// How far a firmware has come.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Stage {
+pub enum UpdateStage {
     /// The slot is being erased.
     Erasing,
     /// The next piece is awaited.
@@ -125,7 +125,7 @@ pub struct Incoming {
     /// What it is.
     pub header: Header,
     /// How far it has come.
-    pub stage: Stage,
+    pub stage: UpdateStage,
     /// Where the next piece begins, counted from the beginning of the header.
     pub received: u32,
 }
@@ -235,7 +235,7 @@ impl<S: SlotFlash> Updates<S> {
             Receive::begin(header, running, marks, downgrade, &slots.free).map_err(Refused::Rule)?;
         if let Some(Incoming { header: before, stage, .. }) = self.incoming
             && before == header
-            && !matches!(stage, Stage::Failed(_))
+            && !matches!(stage, UpdateStage::Failed(_))
         {
             return Ok(());
         }
@@ -244,11 +244,11 @@ impl<S: SlotFlash> Updates<S> {
         }
         if self.other == Some(header) {
             let received = whole_length(&header);
-            self.incoming = Some(Incoming { header, stage: Stage::Ready, received });
+            self.incoming = Some(Incoming { header, stage: UpdateStage::Ready, received });
             return Ok(());
         }
         self.receive = Some(receive);
-        self.incoming = Some(Incoming { header, stage: Stage::Erasing, received: HEADER as u32 });
+        self.incoming = Some(Incoming { header, stage: UpdateStage::Erasing, received: HEADER as u32 });
         Ok(())
     }
 
@@ -256,10 +256,10 @@ impl<S: SlotFlash> Updates<S> {
         let slots = self.slots.as_mut().map_err(|why| Refused::Cannot(why))?;
         let Some(incoming) = &mut self.incoming else { return Err(Refused::NoHeader) };
         match incoming.stage {
-            Stage::Receiving => {}
-            Stage::Erasing | Stage::Checking => return Err(Refused::Busy),
-            Stage::Ready => return Err(Refused::Gap { expected: incoming.received }),
-            Stage::Failed(error) => return Err(Refused::Failed(error)),
+            UpdateStage::Receiving => {}
+            UpdateStage::Erasing | UpdateStage::Checking => return Err(Refused::Busy),
+            UpdateStage::Ready => return Err(Refused::Gap { expected: incoming.received }),
+            UpdateStage::Failed(error) => return Err(Refused::Failed(error)),
         }
         let Some(receive) = &mut self.receive else { return Err(Refused::NoHeader) };
         if offset != incoming.received {
@@ -275,18 +275,18 @@ impl<S: SlotFlash> Updates<S> {
                 Step::Write(place, word) => slots.free.write(place, &word).await,
                 Step::Erase(sector) => slots.free.erase(sector).await,
                 Step::Again => {
-                    incoming.stage = Stage::Checking;
+                    incoming.stage = UpdateStage::Checking;
                     break;
                 }
                 // A short one is checked at once.
                 Step::End(Ok(())) => {
-                    incoming.stage = Stage::Ready;
+                    incoming.stage = UpdateStage::Ready;
                     self.receive = None;
                     self.look();
                     break;
                 }
                 Step::End(Err(error)) => {
-                    incoming.stage = Stage::Failed(error);
+                    incoming.stage = UpdateStage::Failed(error);
                     return Err(Refused::Failed(error));
                 }
             }
@@ -299,7 +299,8 @@ impl<S: SlotFlash> Updates<S> {
 
     /// Whether [`Updates::work`] has something to do.
     pub fn is_working(&self) -> bool {
-        self.incoming.is_some_and(|incoming| matches!(incoming.stage, Stage::Erasing | Stage::Checking))
+        self.incoming
+            .is_some_and(|incoming| matches!(incoming.stage, UpdateStage::Erasing | UpdateStage::Checking))
     }
 
     /// Erases a sector, or looks at some KiB of what was received.
@@ -314,15 +315,15 @@ impl<S: SlotFlash> Updates<S> {
         match receive.next(&slots.free) {
             Step::Erase(sector) => slots.free.erase(sector).await,
             Step::Write(place, word) => slots.free.write(place, &word).await,
-            Step::Take { .. } => incoming.stage = Stage::Receiving,
+            Step::Take { .. } => incoming.stage = UpdateStage::Receiving,
             Step::Again => yield_now().await,
             Step::End(Ok(())) => {
-                incoming.stage = Stage::Ready;
+                incoming.stage = UpdateStage::Ready;
                 self.receive = None;
                 self.look();
             }
             Step::End(Err(error)) => {
-                incoming.stage = Stage::Failed(error);
+                incoming.stage = UpdateStage::Failed(error);
                 self.receive = None;
             }
         }

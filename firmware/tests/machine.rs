@@ -16,7 +16,7 @@ use recipe_store::{Ended, Flash, Geometry, Marks, Place, Store, Trial, WORD, Wor
 use recipe_test_kit::{qemu, until};
 
 /// A running machine, with the lines of its log.
-struct Machine {
+struct QemuMachine {
     qemu: Child,
     lines: Receiver<String>,
     log: String,
@@ -24,7 +24,7 @@ struct Machine {
     monitor: tempfile::TempDir,
 }
 
-impl Machine {
+impl QemuMachine {
     /// Starts it with an image (or the name of a missing file), a fault to inject, and more options.
     fn start(image: &Path, fault: &str, options: &[&str]) -> Self {
         Self::start_with(&format!("arg={},arg={fault}", image.display()), options)
@@ -147,7 +147,7 @@ impl Machine {
     }
 }
 
-impl Drop for Machine {
+impl Drop for QemuMachine {
     fn drop(&mut self) {
         let _ = self.qemu.kill();
         let _ = self.qemu.wait();
@@ -253,7 +253,7 @@ fn assert_said(log: &str, words: &[&str]) {
 #[test]
 #[ignore = "needs QEMU and the firmware"]
 fn a_task_that_hangs_is_named_and_then_the_machine_is_reset() {
-    let (status, log) = Machine::start(nothing(), "stall", &["-no-reboot"]).end();
+    let (status, log) = QemuMachine::start(nothing(), "stall", &["-no-reboot"]).end();
     assert_said(
         &log,
         &[
@@ -270,7 +270,7 @@ fn a_task_that_hangs_is_named_and_then_the_machine_is_reset() {
 #[test]
 #[ignore = "needs QEMU and the firmware"]
 fn a_task_that_keeps_the_processor_is_named_and_after_the_reset_all_begins_again() {
-    let mut machine = Machine::start(nothing(), "spin", &[]);
+    let mut machine = QemuMachine::start(nothing(), "spin", &[]);
     machine.until("recipe gateway");
     machine.until("the watchdog was not fed");
     machine.until(&format!("task {FAULTY_TASK} was running"));
@@ -281,7 +281,7 @@ fn a_task_that_keeps_the_processor_is_named_and_after_the_reset_all_begins_again
 #[test]
 #[ignore = "needs QEMU and the firmware"]
 fn the_led_blinks_when_nothing_runs() {
-    let mut machine = Machine::start(nothing(), "none", &["-nic", "user"]);
+    let mut machine = QemuMachine::start(nothing(), "none", &["-nic", "user"]);
     machine.until("nothing runs");
     for _ in 0..3 {
         machine.until_seen(FPGAIO_LED, &[0, 1]);
@@ -297,7 +297,7 @@ fn with_an_address_of_its_own_the_board_finds_the_controller_by_name() {
     let sets = ["controller.address=robot.cell", "network.address=10.9.0.2/24", "network.dns=10.9.0.1"];
     let image = image(&folder, "rs485-system.toml", &sets);
     let cable = Cable::new();
-    let mut machine = Machine::start(&image, "none", &["-nic", &cable.option()]);
+    let mut machine = QemuMachine::start(&image, "none", &["-nic", &cable.option()]);
     machine.until("address 10.9.0.2/24");
     let mut asked = 0;
     loop {
@@ -330,7 +330,7 @@ fn what_came_on_a_line_before_the_start_is_taken_at_once() {
     let bus = qemu::line("can", &path);
     let arguments = format!("arg={},arg=none", image.display());
     let options = [&qemu::MACHINE[..], &["-S", "-nic", "user"]].concat();
-    let mut machine = Machine::start_on(&bus.each_ref().map(String::as_str), &arguments, &options);
+    let mut machine = QemuMachine::start_on(&bus.each_ref().map(String::as_str), &arguments, &options);
     let mut client = until("QEMU's socket", || UnixStream::connect(&path).ok());
     client.set_read_timeout(Some(PATIENCE)).unwrap();
     client.write_all(b"O\r").unwrap();
@@ -347,7 +347,7 @@ fn what_came_on_a_line_before_the_start_is_taken_at_once() {
 fn a_run_without_trouble_never_starves_the_watchdog() {
     let folder = tempfile::tempdir().unwrap();
     let image = image(&folder, "force-sensor.toml", &["controller.address=10.0.2.2"]);
-    let mut machine = Machine::start(&image, "none", &["-nic", "user"]);
+    let mut machine = QemuMachine::start(&image, "none", &["-nic", "user"]);
     machine.until("address 10.0.2.15");
     let log = machine.listen(Duration::from_secs(12));
     assert_eq!(log.matches("recipe gateway").count(), 1, "{log}");
@@ -362,7 +362,7 @@ fn a_run_without_trouble_never_starves_the_watchdog() {
 #[test]
 #[ignore = "needs QEMU and the firmware"]
 fn a_panic_says_where_and_ends_with_101() {
-    let (status, log) = Machine::start(nothing(), "panic", &[]).end();
+    let (status, log) = QemuMachine::start(nothing(), "panic", &[]).end();
     assert_said(&log, &["panicked at", "as asked", &format!("task {FAULTY_TASK} was running")]);
     assert_eq!(status.code(), Some(101));
 }
@@ -371,7 +371,7 @@ fn a_panic_says_where_and_ends_with_101() {
 #[ignore = "needs QEMU and the firmware"]
 fn a_stack_overflow_and_a_read_of_nothing_fault_and_end_with_102() {
     for fault in ["overflow", "fault"] {
-        let (status, log) = Machine::start(nothing(), fault, &[]).end();
+        let (status, log) = QemuMachine::start(nothing(), fault, &[]).end();
         assert_said(&log, &["hard fault", &format!("task {FAULTY_TASK} was running")]);
         assert!(!log.contains("panicked"), "{log}");
         assert_eq!(status.code(), Some(102), "{fault}");
@@ -379,11 +379,11 @@ fn a_stack_overflow_and_a_read_of_nothing_fault_and_end_with_102() {
 }
 
 /// Flash of three sectors of 128 KiB, as the file of the store.
-struct StoreFile(PathBuf, Vec<u8>);
+struct MappedStore(PathBuf, Vec<u8>);
 
 const STORE_SECTOR: usize = 128 * 1024;
 
-impl StoreFile {
+impl MappedStore {
     fn offset(place: Place) -> usize {
         usize::from(place.sector) * STORE_SECTOR + usize::from(place.word) * WORD
     }
@@ -399,7 +399,7 @@ impl StoreFile {
     }
 }
 
-impl Flash for StoreFile {
+impl Flash for MappedStore {
     fn geometry(&self) -> Geometry {
         Geometry { sectors: 2, words: (STORE_SECTOR / WORD) as u16 }
     }
@@ -425,10 +425,10 @@ fn the_store_keeps_what_runs_and_a_trial_ends() {
     let path = folder.path().join("cell.store");
     let image = image(&folder, "force-sensor.toml", &["controller.address=10.0.2.2"]);
     let taken_over = "the store has taken over the configuration";
-    Machine::with_store(&image, &path).until(taken_over);
-    Machine::with_store(nothing(), &path).until("configuration 1 of the store, the live one");
+    QemuMachine::with_store(&image, &path).until(taken_over);
+    QemuMachine::with_store(nothing(), &path).until("configuration 1 of the store, the live one");
 
-    let mut file = StoreFile::read(&path);
+    let mut file = MappedStore::read(&path);
     let mut store = Store::mount(&file).unwrap();
     let bytes = std::fs::read(&image).unwrap();
     let [live] = store.revisions()[..] else { panic!("one is kept") };
@@ -438,7 +438,7 @@ fn the_store_keeps_what_runs_and_a_trial_ends() {
     let marks = Marks { live: Some(1), trial, ..Marks::default() };
     block_on(store.mark(marks).unwrap().execute(&mut file)).unwrap();
     file.save();
-    let mut machine = Machine::with_store(nothing(), &path);
+    let mut machine = QemuMachine::with_store(nothing(), &path);
     machine.until("configuration 2 of the store, on trial for 1 s");
     machine.until("was not confirmed in time");
     // By a restart of its own.
@@ -446,7 +446,7 @@ fn the_store_keeps_what_runs_and_a_trial_ends() {
     machine.until("configuration 1 of the store, the live one");
     drop(machine);
     assert_eq!(
-        Store::mount(&StoreFile::read(&path)).unwrap().marks(),
+        Store::mount(&MappedStore::read(&path)).unwrap().marks(),
         Marks { trial: None, last: Some((2, Ended::NotConfirmed)), ..marks }
     );
 }

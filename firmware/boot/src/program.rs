@@ -34,7 +34,7 @@ fn main() -> ! {
 fn chosen() -> Option<u32> {
     // SAFETY: called once.
     let (slots, stores) = unsafe { (board::slots()?, board::stores()) };
-    let mut board = Board { slots, store: stores.and_then(mount) };
+    let mut board = LoaderBoard { slots, store: stores.and_then(mount) };
     let marks = board.store.as_ref().map(|mounted| mounted.store.slots());
     let name = BoardName::parse(BOARD.board)?;
     let key = PublicKey::parse(&KEY.key)?;
@@ -61,12 +61,12 @@ fn mount((first, second): (Area, Option<Area>)) -> Option<MountedStore> {
     Some(MountedStore { store, flash })
 }
 
-struct Board {
+struct LoaderBoard {
     slots: [Area; 2],
     store: Option<MountedStore>,
 }
 
-impl Machine for Board {
+impl Machine for LoaderBoard {
     type Flash = Area;
 
     fn flash(&self, slot: Slot) -> &Area {

@@ -9,7 +9,7 @@ use std::collections::VecDeque;
 use self::blocks::ENDLESS;
 use crate::access::{Access, Violation};
 use crate::device::*;
-use crate::devices::{CAN, Devices, Id, MAP, Place};
+use crate::devices::{CAN, DeviceEntry, Devices, Id, MAP};
 use crate::exception::masks;
 use crate::models::rcc::Cause;
 use crate::models::scs::Scs;
@@ -113,7 +113,7 @@ impl Board {
     }
 
     /// The same, where only these can have changed.
-    fn refresh_those(&mut self, is_meant: impl Fn(&Place, Picos) -> bool) {
+    fn refresh_those(&mut self, is_meant: impl Fn(&DeviceEntry, Picos) -> bool) {
         let mut next = self.next;
         let (deadline, has_pending) = self.with_devices(|devices, scs, at| {
             let mut deadline = scs.deadline().unwrap_or(Picos::MAX);
@@ -156,7 +156,7 @@ impl Board {
         self.advance_those(core, |_, next| next <= now);
     }
 
-    fn advance_those(&mut self, core: Engine, is_meant: impl Fn(&Place, Picos) -> bool) {
+    fn advance_those(&mut self, core: Engine, is_meant: impl Fn(&DeviceEntry, Picos) -> bool) {
         let next = self.next;
         let refused = self.with_devices(|devices, scs, at| {
             scs.advance(at);
@@ -225,7 +225,7 @@ impl Board {
     }
 
     fn access(&mut self, core: Engine, address: u32, size: u32, value: Option<u32>) -> u32 {
-        let holds = |place: &&Place| (place.base..place.base + place.size).contains(&address);
+        let holds = |place: &&DeviceEntry| (place.base..place.base + place.size).contains(&address);
         let place = if address >= SYSTEM { None } else { MAP.iter().find(holds) };
         let (name, register, result) = if address >= SYSTEM {
             let offset = address.wrapping_sub(0xE000_E000);
@@ -253,7 +253,7 @@ impl Board {
         }
         self.record(access);
         let accessed = place.map(|place| if place.id == Id::CanRam { Id::Can } else { place.id });
-        let is_accessed = |place: &Place| Some(place.id) == accessed;
+        let is_accessed = |place: &DeviceEntry| Some(place.id) == accessed;
         let now = self.now;
         match accessed {
             _ if !is_write => self.refresh_those(|place, _| is_accessed(place)),
@@ -276,7 +276,7 @@ impl Board {
 
     fn access_device(
         &mut self,
-        place: Option<&Place>,
+        place: Option<&DeviceEntry>,
         address: u32,
         size: u32,
         value: Option<u32>,

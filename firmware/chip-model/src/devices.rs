@@ -32,7 +32,7 @@ pub(crate) enum Id {
     Rng,
 }
 
-pub(crate) struct Place {
+pub(crate) struct DeviceEntry {
     pub(crate) base: u32,
     pub(crate) size: u32,
     pub(crate) name: &'static str,
@@ -42,7 +42,7 @@ pub(crate) struct Place {
     pub(crate) line: Option<u16>,
 }
 
-impl Place {
+impl DeviceEntry {
     /// Whether it has to be advanced when time passes.
     pub(crate) fn changes_with_time(&self) -> bool {
         !matches!(self.id, Id::Gpio(_) | Id::CanRam)
@@ -56,22 +56,22 @@ const fn place(
     gate: Option<Gate>,
     id: Id,
     line: Option<u16>,
-) -> Place {
-    Place { base, size, name, gate, id, line }
+) -> DeviceEntry {
+    DeviceEntry { base, size, name, gate, id, line }
 }
 
 const fn gate(enable: u32, bits: u32) -> Option<Gate> {
     Some(Gate { enable, bits })
 }
 
-const fn port(index: usize, name: &'static str) -> Place {
+const fn port(index: usize, name: &'static str) -> DeviceEntry {
     place(0x5802_0000 + 0x400 * index as u32, 0x400, name, gate(0xE0, 1 << index), Id::Gpio(index), None)
 }
 
 /// Clock gate of FDCAN1 and its message RAM.
 pub(crate) const CAN: Option<Gate> = gate(0xEC, 1 << 8);
 /// The memory map. An access outside of it ends the run.
-pub(crate) static MAP: [Place; 25] = [
+pub(crate) static MAP: [DeviceEntry; 25] = [
     place(0x4000_1800, 0x400, "TIM12", gate(0xE8, 1 << 6), Id::Tim12, Some(43)),
     place(0x4000_4400, 0x400, "USART2", gate(0xE8, 1 << 17), Id::Usart2, Some(38)),
     place(0x4000_7800, 0x400, "UART7", gate(0xE8, 1 << 30), Id::Uart7, Some(82)),

@@ -13,7 +13,7 @@ use std::process::ExitCode;
 use std::time::Instant;
 
 use recipe_chip_model::device::{MILLI, SECOND};
-use recipe_chip_model::realtime::{Ended, Runner, Wiring, exec_if_requested};
+use recipe_chip_model::realtime::{Backends, RunEnd, Runner, exec_if_requested};
 use recipe_chip_model::{Chip, Program, Stopped};
 use signal_hook::consts::{SIGINT, SIGTERM};
 
@@ -38,7 +38,7 @@ struct Options {
     known: Vec<String>,
     ms: u64,
     last: usize,
-    wiring: Option<Wiring>,
+    wiring: Option<Backends>,
 }
 
 fn options(mut args: impl Iterator<Item = String>) -> Result<Options, String> {
@@ -50,7 +50,7 @@ fn options(mut args: impl Iterator<Item = String>) -> Result<Options, String> {
         last: 20,
         wiring: None,
     };
-    let (mut wiring, mut is_wired) = (Wiring::default(), false);
+    let (mut wiring, mut is_wired) = (Backends::default(), false);
     while let Some(arg) = args.next() {
         let mut value = || args.next().ok_or_else(|| format!("{arg} needs a value"));
         let number = |value: String| value.parse().map_err(|_| format!("{value}: not a number"));
@@ -60,7 +60,7 @@ fn options(mut args: impl Iterator<Item = String>) -> Result<Options, String> {
             "--knows" => options.known.push(value()?),
             "--ms" => options.ms = number(value()?)?,
             "--last" => options.last = number(value()?)? as usize,
-            "--realtime" => options.wiring = Some(Wiring::default()),
+            "--realtime" => options.wiring = Some(Backends::default()),
             "--rs485" => wiring.serial.push(value()?),
             "--can" => wiring.can = Some(value()?),
             "--network" => wiring.network = Some(value()?),
@@ -110,7 +110,7 @@ fn run() -> Result<ExitCode, String> {
     }
 }
 
-fn in_real_time(chip: Chip, wiring: &Wiring, last: usize) -> Result<ExitCode, String> {
+fn in_real_time(chip: Chip, wiring: &Backends, last: usize) -> Result<ExitCode, String> {
     let failed = |error: std::io::Error| error.to_string();
     let (end, signal) = UnixStream::pair().map_err(failed)?;
     for number in [SIGINT, SIGTERM] {
@@ -124,11 +124,11 @@ fn in_real_time(chip: Chip, wiring: &Wiring, last: usize) -> Result<ExitCode, St
     let _ = writeln!(out, "{figures}");
     Ok(match ended {
         Ok(()) => ExitCode::SUCCESS,
-        Err(Ended::Lost(reason)) => {
+        Err(RunEnd::Lost(reason)) => {
             eprintln!("{reason}");
             ExitCode::FAILURE
         }
-        Err(Ended::Stopped(stopped)) => {
+        Err(RunEnd::Stopped(stopped)) => {
             show_end(runner.chip(), last, &mut std::io::stderr());
             eprintln!("not allowed: {stopped}");
             ExitCode::FAILURE

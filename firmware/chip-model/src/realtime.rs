@@ -25,7 +25,7 @@ use socket::{Client, Listener};
 
 /// What the board is connected to. Addresses are `HOST:PORT` or the path of a socket.
 #[derive(Debug, Default)]
-pub struct Wiring {
+pub struct Backends {
     /// RS-485 A and B.
     pub serial: Vec<String>,
     /// CAN, as slcan.
@@ -95,7 +95,7 @@ impl fmt::Display for Figures {
 
 /// Why a run ended by itself.
 #[derive(Debug)]
-pub enum Ended {
+pub enum RunEnd {
     /// A violation of the program.
     Stopped(Stopped),
     /// Something that it needs is gone.
@@ -152,7 +152,7 @@ impl Runner {
     ///
     /// # Errors
     /// A socket cannot be opened, or QEMU cannot be started.
-    pub fn new(chip: Chip, wiring: &Wiring) -> Result<Self, String> {
+    pub fn new(chip: Chip, wiring: &Backends) -> Result<Self, String> {
         let listen = |place: &String| Listener::new(place);
         let serial = wiring.serial.iter().map(|place| listen(place).map(Serial::new));
         Ok(Self {
@@ -175,7 +175,7 @@ impl Runner {
     ///
     /// # Errors
     /// The run ended by itself.
-    pub fn run(&mut self, end: &UnixStream, log: &mut dyn Write) -> Result<(), Ended> {
+    pub fn run(&mut self, end: &UnixStream, log: &mut dyn Write) -> Result<(), RunEnd> {
         self.pace = Pace { begin: Instant::now(), stopped: None };
         loop {
             // While the core sleeps, the sockets need no look before its next event.
@@ -184,11 +184,11 @@ impl Runner {
             let result = if target > self.chip.now() { self.chip.run_until(target) } else { Ok(()) };
             for (at, line) in self.chip.log.drain(..) {
                 let written = writeln!(log, "{:12.3} ms  {line}", at as f64 / MILLI as f64);
-                written.map_err(|error| Ended::Lost(format!("its log: {error}")))?;
+                written.map_err(|error| RunEnd::Lost(format!("its log: {error}")))?;
             }
-            result.map_err(Ended::Stopped)?;
+            result.map_err(RunEnd::Stopped)?;
             self.update_figures();
-            self.exchange().map_err(Ended::Lost)?;
+            self.exchange().map_err(RunEnd::Lost)?;
             if self.wait(end) {
                 return Ok(());
             }

@@ -182,10 +182,10 @@ impl Engine {
 pub struct Core {
     engine: Engine,
     /// Boxed, because the callbacks get its address.
-    shared: Box<Shared>,
+    shared: Box<HookState>,
 }
 
-struct Shared {
+struct HookState {
     api: &'static Api,
     handler: Cell<Option<*mut (dyn Handler + 'static)>>,
     exit: Cell<Option<Exit>>,
@@ -208,7 +208,7 @@ impl Core {
         checked("uc_open", unsafe { (api.open)(ARM, THUMB, &raw mut uc) })?;
         let core = Self {
             engine: Engine { api, uc },
-            shared: Box::new(Shared { api, handler: Cell::new(None), exit: Cell::new(None) }),
+            shared: Box::new(HookState { api, handler: Cell::new(None), exit: Cell::new(None) }),
         };
         // SAFETY: this request takes the model's number.
         checked("uc_ctl", unsafe { (api.ctl)(uc, SET_MODEL, CORTEX_M7) })?;

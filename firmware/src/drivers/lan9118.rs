@@ -40,7 +40,7 @@ pub struct Lan9118<R> {
 /// Why the controller does not start.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
-pub enum StartError {
+pub enum Lan9118Error {
     /// The byte order register has a wrong value: no LAN9118.
     NoController {
         /// The register's value.
@@ -53,7 +53,7 @@ pub enum StartError {
     },
 }
 
-impl core::fmt::Display for StartError {
+impl core::fmt::Display for Lan9118Error {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         match self {
             Self::NoController { found } => write!(f, "no LAN9118: its byte test reads {found:08X}"),
@@ -62,18 +62,18 @@ impl core::fmt::Display for StartError {
     }
 }
 
-impl core::error::Error for StartError {}
+impl core::error::Error for Lan9118Error {}
 
 impl<R: Registers> Lan9118<R> {
     /// Resets and starts the controller, with its interrupts disabled.
     ///
     /// # Errors
-    /// See [`StartError`]. A missing controller does not hang the board.
-    pub fn start(regs: R, waker: &'static AtomicWaker) -> Result<Self, StartError> {
+    /// See [`Lan9118Error`]. A missing controller does not hang the board.
+    pub fn start(regs: R, waker: &'static AtomicWaker) -> Result<Self, Lan9118Error> {
         wait(&regs, PMT_CTRL, |value| value & 1 != 0)?;
         match regs.read(BYTE_TEST) {
             0x8765_4321 => {}
-            found => return Err(StartError::NoController { found }),
+            found => return Err(Lan9118Error::NoController { found }),
         }
         regs.write(HW_CFG, HW_CFG_RESET);
         wait(&regs, HW_CFG, |value| value & HW_CFG_RESET == 0)?;
@@ -152,7 +152,7 @@ impl<R: Registers> Lan9118<R> {
     }
 
     /// Asks the PHY, and acknowledges its interrupt first, so that a change after this is not missed.
-    fn read_link(&self) -> Result<bool, StartError> {
+    fn read_link(&self) -> Result<bool, Lan9118Error> {
         self.regs.write(INT_STS, INT_PHY);
         self.phy_read(PHY_INT_SOURCE)?;
         // The bit latches a loss until it is read.
@@ -164,39 +164,39 @@ impl<R: Registers> Lan9118<R> {
         self.regs.write(INT_EN, INT_RX_STATUS | INT_PHY);
     }
 
-    fn mac_wait(&self) -> Result<(), StartError> {
+    fn mac_wait(&self) -> Result<(), Lan9118Error> {
         wait(&self.regs, MAC_CMD, |value| value & BUSY == 0)
     }
 
-    fn mac_read(&self, register: u32) -> Result<u32, StartError> {
+    fn mac_read(&self, register: u32) -> Result<u32, Lan9118Error> {
         self.mac_wait()?;
         self.regs.write(MAC_CMD, BUSY | MAC_READ | register);
         self.mac_wait()?;
         Ok(self.regs.read(MAC_DATA))
     }
 
-    fn mac_write(&self, register: u32, value: u32) -> Result<(), StartError> {
+    fn mac_write(&self, register: u32, value: u32) -> Result<(), Lan9118Error> {
         self.mac_wait()?;
         self.regs.write(MAC_DATA, value);
         self.regs.write(MAC_CMD, BUSY | register);
         self.mac_wait()
     }
 
-    fn phy_read(&self, register: u32) -> Result<u32, StartError> {
+    fn phy_read(&self, register: u32) -> Result<u32, Lan9118Error> {
         self.mac_write(MAC_MII_ACC, PHY_ADDRESS | register << 6 | MII_BUSY)?;
         self.mac_read(MAC_MII_DATA)
     }
 
-    fn phy_write(&self, register: u32, value: u32) -> Result<(), StartError> {
+    fn phy_write(&self, register: u32, value: u32) -> Result<(), Lan9118Error> {
         self.mac_write(MAC_MII_DATA, value)?;
         self.mac_write(MAC_MII_ACC, PHY_ADDRESS | register << 6 | MII_WRITE | MII_BUSY)
     }
 }
 
 /// Polls a register with a limit.
-fn wait(regs: &impl Registers, offset: u16, done: impl Fn(u32) -> bool) -> Result<(), StartError> {
+fn wait(regs: &impl Registers, offset: u16, done: impl Fn(u32) -> bool) -> Result<(), Lan9118Error> {
     let is_done = (0..MAX_POLLS).any(|_| done(regs.read(offset)));
-    if is_done { Ok(()) } else { Err(StartError::Stuck { offset }) }
+    if is_done { Ok(()) } else { Err(Lan9118Error::Stuck { offset }) }
 }
 
 impl<R: Registers> Driver for Lan9118<R> {

@@ -56,7 +56,7 @@ pub struct Mcan<R> {
 /// Why the controller does not start.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
-pub enum StartError {
+pub enum McanError {
     /// The endian register has a wrong value: no M_CAN, or one without a clock.
     NoController {
         /// The register's value.
@@ -66,7 +66,7 @@ pub enum StartError {
     Bitrate(BitrateError),
 }
 
-impl core::fmt::Display for StartError {
+impl core::fmt::Display for McanError {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         match self {
             Self::NoController { found } => write!(f, "no M_CAN: its byte test reads {found:08X}"),
@@ -75,26 +75,26 @@ impl core::fmt::Display for StartError {
     }
 }
 
-impl core::error::Error for StartError {}
+impl core::error::Error for McanError {}
 
 impl<R: Registers> Mcan<R> {
     /// Configures the controller after its reset. `clock` is its kernel clock in Hz; `ram_offset` is the start of
     /// its part of the message RAM, in words. It joins the bus when its filters are set.
     ///
     /// # Errors
-    /// See [`StartError`]. A missing controller does not hang the board.
+    /// See [`McanError`]. A missing controller does not hang the board.
     pub fn start(
         regs: R,
         ram_offset: u16,
         waker: &'static AtomicWaker,
         bitrate: u32,
         clock: u32,
-    ) -> Result<Self, StartError> {
+    ) -> Result<Self, McanError> {
         match regs.read(ENDN) {
             0x8765_4321 => {}
-            found => return Err(StartError::NoController { found }),
+            found => return Err(McanError::NoController { found }),
         }
-        let timing = BitTiming::of(bitrate, clock).map_err(StartError::Bitrate)?;
+        let timing = BitTiming::of(bitrate, clock).map_err(McanError::Bitrate)?;
         let mcan = Self {
             regs,
             waker,

@@ -7,14 +7,14 @@ use std::rc::Rc;
 use recipe_chip_model::device::{Clocks, Context, Functions, Peripheral, Picos, Pin, Refusal};
 
 /// A peripheral with its clocks and pins.
-pub(crate) struct Device<P> {
+pub(crate) struct TestDevice<P> {
     model: RefCell<P>,
     now: Cell<Picos>,
     clocks: Clocks,
     functions: Functions,
 }
 
-impl<P: Peripheral> Device<P> {
+impl<P: Peripheral> TestDevice<P> {
     /// A peripheral after a reset, with its pins configured.
     pub(crate) fn new(model: P, clocks: Clocks, pins: &[Pin], function: u8) -> Rc<Self> {
         let mut functions = Functions::default();

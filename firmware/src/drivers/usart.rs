@@ -31,12 +31,12 @@ pub trait Registers {
 }
 
 /// State shared by a line and its interrupt handler.
-pub struct Shared(Mutex<RefCell<State>>);
+pub struct UsartShared(Mutex<RefCell<UsartState>>);
 
-impl Shared {
+impl UsartShared {
     /// The state of a line that is not started.
     pub const fn new() -> Self {
-        Self(Mutex::new(RefCell::new(State {
+        Self(Mutex::new(RefCell::new(UsartState {
             received: Deque::new(),
             waiting: Deque::new(),
             reader: WakerRegistration::new(),
@@ -46,7 +46,7 @@ impl Shared {
     }
 }
 
-impl Default for Shared {
+impl Default for UsartShared {
     fn default() -> Self {
         Self::new()
     }
@@ -72,7 +72,7 @@ impl core::error::Error for BaudError {}
 /// An RS-485 line.
 pub struct Usart<R: 'static> {
     regs: R,
-    shared: &'static Shared,
+    shared: &'static UsartShared,
 }
 
 impl<R: Registers> Usart<R> {
@@ -81,7 +81,7 @@ impl<R: Registers> Usart<R> {
     ///
     /// # Errors
     /// [`BaudError`] if no divider gives the baud rate within 1 %.
-    pub fn start(regs: R, shared: &'static Shared, line: &Rs485, clock: u32) -> Result<Self, BaudError> {
+    pub fn start(regs: R, shared: &'static UsartShared, line: &Rs485, clock: u32) -> Result<Self, BaudError> {
         let speed = Speed::of(line.baud, clock)?;
         regs.write(CR1, 0);
         regs.write(PRESC, speed.prescaler);
@@ -101,7 +101,7 @@ impl<R: Registers> Usart<R> {
     }
 
     /// The interrupt handler.
-    pub fn interrupt(regs: &R, shared: &Shared) {
+    pub fn interrupt(regs: &R, shared: &UsartShared) {
         with(regs, shared, |line| {
             line.receive();
             if !line.state.received.is_empty() {
@@ -111,17 +111,17 @@ impl<R: Registers> Usart<R> {
         });
     }
 
-    fn with<T>(&self, f: impl FnOnce(&mut Access<'_, R>) -> T) -> T {
+    fn with<T>(&self, f: impl FnOnce(&mut UsartAccess<'_, R>) -> T) -> T {
         with(&self.regs, self.shared, f)
     }
 }
 
 /// Calls `f` with the registers and the shared state, in a critical section.
-fn with<R, T>(regs: &R, shared: &Shared, f: impl FnOnce(&mut Access<'_, R>) -> T) -> T {
-    critical_section::with(|cs| f(&mut Access { regs, state: &mut shared.0.borrow_ref_mut(cs) }))
+fn with<R, T>(regs: &R, shared: &UsartShared, f: impl FnOnce(&mut UsartAccess<'_, R>) -> T) -> T {
+    critical_section::with(|cs| f(&mut UsartAccess { regs, state: &mut shared.0.borrow_ref_mut(cs) }))
 }
 
-struct State {
+struct UsartState {
     received: Deque<u8, RX_RING>,
     waiting: Deque<u8, TX_RING>,
     reader: WakerRegistration,
@@ -129,12 +129,12 @@ struct State {
     errors: LineErrors,
 }
 
-struct Access<'a, R> {
+struct UsartAccess<'a, R> {
     regs: &'a R,
-    state: &'a mut State,
+    state: &'a mut UsartState,
 }
 
-impl<R: Registers> Access<'_, R> {
+impl<R: Registers> UsartAccess<'_, R> {
     fn set(&self, register: u8, bits: u32) {
         self.regs.write(register, self.regs.read(register) | bits);
     }

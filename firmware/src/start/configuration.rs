@@ -14,7 +14,7 @@ use crate::board::Board;
 
 /// Why nothing runs.
 #[derive(Debug, Clone, Copy)]
-pub(super) enum Refused {
+pub(super) enum CannotRun {
     Storage(<Board as platform::Board>::StorageError),
     Image(image::ImageError),
     Build(proto_core::engine::BuildError),
@@ -24,7 +24,7 @@ pub(super) enum Refused {
     Ethernet(<Board as platform::Board>::EthernetError),
 }
 
-impl core::fmt::Display for Refused {
+impl core::fmt::Display for CannotRun {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         match self {
             Self::Storage(error) => error.fmt(f),
@@ -51,10 +51,10 @@ pub(super) fn load(
     stored: Option<&mut StoredConfig<Flash>>,
     gateway: &mut Gateway,
     config: &mut GatewayConfig,
-    work: &mut store::Work<'static>,
-    failure: &mut Option<Refused>,
-) -> Result<usize, Refused> {
-    let own = board.configuration().map_err(Refused::Storage).map(whole);
+    work: &mut store::StartWork<'static>,
+    failure: &mut Option<CannotRun>,
+) -> Result<usize, CannotRun> {
+    let own = board.configuration().map_err(CannotRun::Storage).map(whole);
     let Some(stored) = stored else {
         let (image, _) = own?;
         return configure(image, gateway, config);
@@ -106,7 +106,7 @@ pub(super) fn load(
     {
         return Ok(len);
     }
-    Err(why.unwrap_or(Refused::Empty))
+    Err(why.unwrap_or(CannotRun::Empty))
 }
 
 /// The image without what follows it, and its CRC.
@@ -118,15 +118,15 @@ fn whole(bytes: &'static [u8]) -> (&'static [u8], u32) {
 
 /// Runs the configuration of an image; returns the image's length. Not inlined: it is called in several places.
 #[inline(never)]
-fn configure(bytes: &[u8], gateway: &mut Gateway, config: &mut GatewayConfig) -> Result<usize, Refused> {
+fn configure(bytes: &[u8], gateway: &mut Gateway, config: &mut GatewayConfig) -> Result<usize, CannotRun> {
     decode(bytes, config)?;
-    gateway.configure(config).map_err(Refused::Build)?;
+    gateway.configure(config).map_err(CannotRun::Build)?;
     Ok(bytes.len())
 }
 
 /// Reads an image whose ports this board has. Not inlined, so that its stack frame is free when the engine is built.
 #[inline(never)]
-fn decode(bytes: &[u8], config: &mut GatewayConfig) -> Result<(), Refused> {
-    image::decode_into(bytes, config).map_err(Refused::Image)?;
-    PORTS.have(config.ports.iter().map(|port| &port.bus)).map_err(Refused::NoDevice)
+fn decode(bytes: &[u8], config: &mut GatewayConfig) -> Result<(), CannotRun> {
+    image::decode_into(bytes, config).map_err(CannotRun::Image)?;
+    PORTS.have(config.ports.iter().map(|port| &port.bus)).map_err(CannotRun::NoDevice)
 }

@@ -8,7 +8,7 @@ use super::*;
 
 /// Flash without faults.
 #[derive(Debug, Clone)]
-struct Plain {
+struct PlainFlash {
     words: List<Word>,
     bytes: List<u8>,
     /// From here on nothing is written.
@@ -18,7 +18,7 @@ struct Plain {
 
 const WORDS: u16 = 256;
 
-impl Plain {
+impl PlainFlash {
     fn new() -> Self {
         Self { words: vec![BLANK; 2 * usize::from(WORDS)], bytes: List::new(), is_broken: false, writes: 0 }
     }
@@ -28,7 +28,7 @@ impl Plain {
     }
 }
 
-impl Flash for Plain {
+impl Flash for PlainFlash {
     fn geometry(&self) -> Geometry {
         Geometry { sectors: 2, words: WORDS }
     }
@@ -49,14 +49,14 @@ impl Flash for Plain {
     }
 }
 
-impl StoreFlash for Plain {
+impl StoreFlash for PlainFlash {
     fn bytes(&mut self, found: Found) -> Option<&[u8]> {
         self.bytes = self.words[Self::at(found.data)..].as_flattened().get(..found.len)?.to_vec();
         Some(&self.bytes)
     }
 }
 
-impl StoredConfig<Plain> {
+impl StoredConfig<PlainFlash> {
     fn restart(&mut self) {
         *self = StoredConfig::open(Places::one(self.flash.clone())).unwrap();
     }
@@ -74,8 +74,8 @@ impl StoredConfig<Plain> {
     }
 }
 
-fn blank() -> StoredConfig<Plain> {
-    StoredConfig::open(Places::one(Plain::new())).unwrap()
+fn blank() -> StoredConfig<PlainFlash> {
+    StoredConfig::open(Places::one(PlainFlash::new())).unwrap()
 }
 
 #[test]
@@ -175,7 +175,7 @@ fn a_store_in_the_bank_of_the_program_is_moved_once() {
     let mut stored = blank();
     block_on(stored.keep(1, 1, &image(1), None)).unwrap();
     block_on(stored.make_live(1, None)).unwrap();
-    let (first, second) = (stored.flash.clone(), Plain::new());
+    let (first, second) = (stored.flash.clone(), PlainFlash::new());
     let open =
         |own| StoredConfig::open(Places { first: first.clone(), second: Some(second.clone()), own }).unwrap();
     assert!(!open(Side::First).is_to_be_moved());

@@ -21,13 +21,13 @@ use crate::{info, warn};
 /// Drives the port for ever.
 pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, can: impl CanPort) -> ! {
     let Some(control) = gateway.port(port) else { core::future::pending().await };
-    let task = Task {
+    let task = CanTask {
         gateway,
         pulse,
         port,
         control,
         can,
-        phase: Phase::Idle,
+        phase: CanPhase::Idle,
         is_failing: false,
         backoff: BACKOFF_MIN,
         recovered: Instant::MIN,
@@ -39,7 +39,7 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, can: impl CanPo
 
 /// What the task waits for, besides frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Phase {
+enum CanPhase {
     /// Frames to send.
     Idle,
     /// Frames sent by the engine must leave the controller until then.
@@ -50,13 +50,13 @@ enum Phase {
     Recovering { until: Instant },
 }
 
-struct Task<'a, C> {
+struct CanTask<'a, C> {
     gateway: &'a Gateway,
     pulse: &'a Pulse,
     port: PortId,
     control: &'a PortControl,
     can: C,
-    phase: Phase,
+    phase: CanPhase,
     /// The last attempt to send failed.
     is_failing: bool,
     /// Wait after the next bus-off.
@@ -68,7 +68,7 @@ struct Task<'a, C> {
     lost_logged: Instant,
 }
 
-impl<C: CanPort> Task<'_, C> {
+impl<C: CanPort> CanTask<'_, C> {
     async fn run(mut self) -> ! {
         self.can.set_filters(self.control.ids());
         self.gateway.input(Input::PortUp { port: self.port });
@@ -93,8 +93,8 @@ impl<C: CanPort> Task<'_, C> {
 
     fn deadline(&self) -> Instant {
         match self.phase {
-            Phase::Idle => Instant::MAX,
-            Phase::Sending { until } | Phase::Off { until } | Phase::Recovering { until } => until,
+            CanPhase::Idle => Instant::MAX,
+            CanPhase::Sending { until } | CanPhase::Off { until } | CanPhase::Recovering { until } => until,
         }
     }
 
@@ -108,15 +108,15 @@ impl<C: CanPort> Task<'_, C> {
             CanEvent::Bus(BusState::BusOff) => self.bus_off(),
             CanEvent::Bus(state) => {
                 self.log_state(state);
-                if matches!(self.phase, Phase::Off { .. } | Phase::Recovering { .. }) {
+                if matches!(self.phase, CanPhase::Off { .. } | CanPhase::Recovering { .. }) {
                     self.recovered = Instant::now();
-                    self.phase = Phase::Idle;
+                    self.phase = CanPhase::Idle;
                 }
                 self.gateway.input(Input::PortBus { port: self.port, state });
             }
             CanEvent::Sent => {
-                if let Phase::Sending { .. } = self.phase {
-                    self.phase = Phase::Idle;
+                if let CanPhase::Sending { .. } = self.phase {
+                    self.phase = CanPhase::Idle;
                     self.is_failing = false;
                     self.gateway.input(Input::PortSent { port: self.port });
                 }
@@ -128,7 +128,7 @@ impl<C: CanPort> Task<'_, C> {
     async fn send_waiting(&mut self) {
         let mut frames = 0_u32;
         while let Some(frame) = self.control.next_frame() {
-            if matches!(self.phase, Phase::Off { .. } | Phase::Recovering { .. }) {
+            if matches!(self.phase, CanPhase::Off { .. } | CanPhase::Recovering { .. }) {
                 // The engine knows the state of the bus; earlier frames are dropped.
                 continue;
             }
@@ -141,7 +141,7 @@ impl<C: CanPort> Task<'_, C> {
             let sent = self.pulse.idle(pin!(with_timeout(timeout, sending))).await;
             match sent {
                 Ok(Either::First(Ok(()))) => {
-                    self.phase = Phase::Sending { until: Instant::now() + timeout };
+                    self.phase = CanPhase::Sending { until: Instant::now() + timeout };
                 }
                 Ok(Either::First(Err(BusOff))) => self.bus_off(),
                 Ok(Either::Second(())) => self.drop_waiting(),
@@ -152,11 +152,11 @@ impl<C: CanPort> Task<'_, C> {
 
     fn expired(&mut self) {
         match self.phase {
-            Phase::Idle => {}
-            Phase::Sending { .. } => self.give_up(),
-            Phase::Off { .. } | Phase::Recovering { .. } => {
+            CanPhase::Idle => {}
+            CanPhase::Sending { .. } => self.give_up(),
+            CanPhase::Off { .. } | CanPhase::Recovering { .. } => {
                 self.can.recover();
-                self.phase = Phase::Recovering { until: Instant::now() + RECOVERY };
+                self.phase = CanPhase::Recovering { until: Instant::now() + RECOVERY };
             }
         }
     }
@@ -178,21 +178,21 @@ impl<C: CanPort> Task<'_, C> {
     fn drop_waiting(&mut self) {
         self.can.recover();
         self.control.clear();
-        self.phase = Phase::Idle;
+        self.phase = CanPhase::Idle;
         self.gateway.input(Input::PortDown { port: self.port });
         self.gateway.input(Input::PortUp { port: self.port });
     }
 
     fn bus_off(&mut self) {
         let now = Instant::now();
-        if matches!(self.phase, Phase::Off { .. }) {
+        if matches!(self.phase, CanPhase::Off { .. }) {
             return;
         }
         if now.saturating_duration_since(self.recovered) >= HEALTHY {
             self.backoff = BACKOFF_MIN;
         }
         warn!("port {}: bus-off; restart in {} ms", self.port.0, self.backoff.as_millis());
-        self.phase = Phase::Off { until: now + self.backoff };
+        self.phase = CanPhase::Off { until: now + self.backoff };
         self.backoff = (self.backoff * 2).min(BACKOFF_MAX);
         self.gateway.input(Input::PortBus { port: self.port, state: BusState::BusOff });
         self.control.clear();

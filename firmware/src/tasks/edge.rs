@@ -39,15 +39,15 @@ pub const HISTORY: usize = 192;
 type Catalog = GatewayCatalog<'static, METRICS>;
 
 /// The memory of the node; all zeros, so that it takes no flash.
-pub struct Memory {
+pub struct NodeMemory {
     /// The settings.
     pub document: Document,
     /// What the node needs beside them.
-    pub rest: Rest,
+    pub rest: NodeBuffers,
 }
 
 /// The memory of the node without its settings.
-pub struct Rest {
+pub struct NodeBuffers {
     node: EdgeNode<METRICS, HISTORY>,
     values: Vec<Option<Value>, METRICS>,
     rx: [u8; RX],
@@ -57,11 +57,11 @@ pub struct Rest {
     read: [u8; READ],
 }
 
-impl Memory {
+impl NodeMemory {
     /// Before the settings are known.
     pub const ZEROED: Self = Self {
         document: Document::empty(),
-        rest: Rest {
+        rest: NodeBuffers {
             node: EdgeNode::idle(),
             values: Vec::new(),
             rx: [0; RX],
@@ -74,7 +74,7 @@ impl Memory {
 
 /// Why a board with settings does not tell.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Cannot {
+pub enum EdgeError {
     /// No configuration runs.
     NothingRuns,
     /// The settings cannot be read.
@@ -85,7 +85,7 @@ pub enum Cannot {
     Node(NodeError),
 }
 
-impl core::fmt::Display for Cannot {
+impl core::fmt::Display for EdgeError {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         match self {
             Self::NothingRuns => f.write_str("no configuration runs"),
@@ -106,14 +106,14 @@ pub enum View {
     /// There are no settings.
     Off,
     /// There are, but nothing is told.
-    Cannot(Cannot),
+    Cannot(EdgeError),
     /// It tells, or tries to.
-    Runs(Telling),
+    Runs(EdgeStatus),
 }
 
 /// How a node does.
 #[derive(Debug, Clone, Copy)]
-pub struct Telling {
+pub struct EdgeStatus {
     /// Whether there is a session.
     pub is_online: bool,
     /// Why not.
@@ -145,7 +145,7 @@ impl Edge {
     }
 
     /// Notes why there is no node.
-    pub fn cannot(&self, why: Cannot) {
+    pub fn cannot(&self, why: EdgeError) {
         self.view.set(View::Cannot(why));
     }
 
@@ -164,7 +164,7 @@ impl Edge {
 pub struct Node {
     document: &'static Document,
     catalog: Catalog,
-    rest: &'static mut Rest,
+    rest: &'static mut NodeBuffers,
 }
 
 impl Node {
@@ -174,12 +174,12 @@ impl Node {
     /// Why there is none.
     pub fn make(
         document: &'static Document,
-        rest: &'static mut Rest,
+        rest: &'static mut NodeBuffers,
         gateway: &Gateway,
         config: ConfigView<'_>,
         bd_seq: Option<u8>,
         seed: u64,
-    ) -> Result<Self, Cannot> {
+    ) -> Result<Self, EdgeError> {
         let rates = Rates {
             min_interval: document.interval,
             counter_interval: document.counter_interval,
@@ -187,8 +187,8 @@ impl Node {
             values: &document.values,
         };
         let catalog = gateway.report(|status| Catalog::new(config, status, rates, env!("CARGO_PKG_VERSION")));
-        let catalog = catalog.map_err(|_| Cannot::Metrics)?;
-        rest.node.configure(&document.settings, &catalog, bd_seq, seed).map_err(Cannot::Node)?;
+        let catalog = catalog.map_err(|_| EdgeError::Metrics)?;
+        rest.node.configure(&document.settings, &catalog, bd_seq, seed).map_err(EdgeError::Node)?;
         let _ = rest.values.resize(catalog.len(), None);
         Ok(Self { document, catalog, rest })
     }
@@ -203,10 +203,10 @@ impl Node {
         edge: &Edge,
         clock: &WallClock,
     ) -> ! {
-        let Self { document, catalog, rest: Rest { node, values, rx, tx, piece, read } } = self;
+        let Self { document, catalog, rest: NodeBuffers { node, values, rx, tx, piece, read } } = self;
         let mut socket = TcpSocket::new(stack, rx, tx);
         socket.set_timeout(Some(SILENT));
-        let mut driver = Driver {
+        let mut driver = NodeDriver {
             gateway,
             pulse,
             store,
@@ -226,11 +226,11 @@ impl Node {
             let next = driver.drain(&mut socket, piece).await;
             driver.tell(document);
             let until = match next {
-                Next::Open => {
+                NodeStep::Open => {
                     driver.open(stack, document, &mut socket).await;
                     continue;
                 }
-                Next::Sleep { until } => Instant::from_micros(until.as_micros()).min(driver.sample_at),
+                NodeStep::Sleep { until } => Instant::from_micros(until.as_micros()).min(driver.sample_at),
             };
             let is_connected = driver.node.is_connected();
             let reading = async {
@@ -258,12 +258,12 @@ impl Node {
 }
 
 /// What comes of outputs.
-enum Next {
+enum NodeStep {
     Open,
     Sleep { until: Time },
 }
 
-struct Driver<'a> {
+struct NodeDriver<'a> {
     gateway: &'a Gateway,
     pulse: &'a Pulse,
     store: &'a StoreHandle,
@@ -278,7 +278,7 @@ struct Driver<'a> {
     told: Option<Failure>,
 }
 
-impl Driver<'_> {
+impl NodeDriver<'_> {
     /// Looks at the gateway, part by part, and gives the node what it has seen.
     async fn sample(&mut self) {
         // After a pause the next one is a period later: values are of now, not of then.
@@ -303,11 +303,11 @@ impl Driver<'_> {
     }
 
     /// Does what the node asks for, until it waits.
-    async fn drain(&mut self, socket: &mut TcpSocket<'_>, piece: &mut [u8]) -> Next {
+    async fn drain(&mut self, socket: &mut TcpSocket<'_>, piece: &mut [u8]) -> NodeStep {
         loop {
             let is_written = match self.node.poll_output(now(), self.catalog, piece) {
-                Output::Open => return Next::Open,
-                Output::Sleep { until } => return Next::Sleep { until },
+                Output::Open => return NodeStep::Open,
+                Output::Sleep { until } => return NodeStep::Sleep { until },
                 Output::Busy => true,
                 Output::Keep { bd_seq } => {
                     if !self.pulse.idle(pin!(self.store.keep_session(bd_seq))).await {
@@ -366,7 +366,7 @@ impl Driver<'_> {
     fn tell(&mut self, document: &Document) {
         let is_online = self.node.is_online();
         let failure = self.node.failure();
-        self.edge.view.set(View::Runs(Telling {
+        self.edge.view.set(View::Runs(EdgeStatus {
             is_online,
             failure,
             bd_seq: self.node.bd_seq(),

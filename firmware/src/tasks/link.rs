@@ -124,14 +124,18 @@ pub async fn run(
 ) -> ! {
     let buffers = &mut buffers;
     let Some(control) = gateway.link(link) else { core::future::pending().await };
-    let driver = Driver { gateway, pulse, link, control, stack };
+    let driver = LinkDriver { gateway, pulse, link, control, stack };
     loop {
         let turn = pulse.idle(pin!(control.opened())).await;
         match endpoint {
-            Endpoint::Tcp { host, port } => driver.tcp(turn, host, Role::Client(*port), buffers).await,
-            Endpoint::TcpListen { port, host } => driver.tcp(turn, host, Role::Server(*port), buffers).await,
-            Endpoint::Udp { host, port } => driver.udp(turn, host, Role::Client(*port), buffers).await,
-            Endpoint::UdpListen { port, host } => driver.udp(turn, host, Role::Server(*port), buffers).await,
+            Endpoint::Tcp { host, port } => driver.tcp(turn, host, LinkRole::Client(*port), buffers).await,
+            Endpoint::TcpListen { port, host } => {
+                driver.tcp(turn, host, LinkRole::Server(*port), buffers).await
+            }
+            Endpoint::Udp { host, port } => driver.udp(turn, host, LinkRole::Client(*port), buffers).await,
+            Endpoint::UdpListen { port, host } => {
+                driver.udp(turn, host, LinkRole::Server(*port), buffers).await
+            }
         }
         // If the turn is over, the engine has closed the link itself and expects no report.
         if control.is_turn(turn) {
@@ -143,14 +147,14 @@ pub async fn run(
 
 /// Which side connects, and to which port.
 #[derive(Clone, Copy)]
-enum Role {
+enum LinkRole {
     /// The board connects to this port of the controller or device.
     Client(u16),
     /// The controller connects to this port of the board.
     Server(u16),
 }
 
-struct Driver<'a> {
+struct LinkDriver<'a> {
     gateway: &'a Gateway,
     pulse: &'a Pulse,
     link: LinkId,
@@ -158,7 +162,7 @@ struct Driver<'a> {
     stack: Stack<'a>,
 }
 
-impl Driver<'_> {
+impl LinkDriver<'_> {
     /// Reports to the engine if the turn is not over; returns whether it goes on.
     fn report(&self, turn: u32, input: Input<'_>) -> bool {
         if self.control.is_turn(turn) {

@@ -23,14 +23,14 @@ use crate::warn;
 /// Drives the port for ever.
 pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, line: impl Line, baud: u32) -> ! {
     let Some(control) = gateway.port(port) else { core::future::pending().await };
-    let mut task = Task { gateway, port, control, line, chunk: [0; CHUNK] };
+    let mut task = SerialTask { gateway, port, control, line, chunk: [0; CHUNK] };
     let mut is_failing = false;
     let mut errors = LoggedErrors { errors: LineErrors::NONE, next_check: Instant::MIN };
     loop {
         gateway.input(Input::PortUp { port });
         let mut full_chunks = 0_usize;
         let failed = loop {
-            let Task { line, chunk, .. } = &mut task;
+            let SerialTask { line, chunk, .. } = &mut task;
             let next = select3(line.read(chunk), control.next_bytes(), Timer::at(errors.next_check));
             let next = pulse.idle(pin!(next)).await;
             let frame = match next {
@@ -91,7 +91,7 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, line: impl Line
     }
 }
 
-struct Task<'a, L> {
+struct SerialTask<'a, L> {
     gateway: &'a Gateway,
     port: PortId,
     control: &'a PortControl,
@@ -99,7 +99,7 @@ struct Task<'a, L> {
     chunk: [u8; CHUNK],
 }
 
-impl<L: Line> Task<'_, L> {
+impl<L: Line> SerialTask<'_, L> {
     /// Reports the first `len` bytes of the chunk to the engine.
     fn report(&self, len: usize) {
         let bytes = self.chunk.get(..len).unwrap_or(&[]);

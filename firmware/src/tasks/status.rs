@@ -11,7 +11,7 @@ use crate::{info, traffic, warn};
 
 /// Logs changes of the status, for ever.
 pub async fn run(gateway: &Gateway, pulse: &Pulse) -> ! {
-    let mut links = [(0, Shown::Down); MAX_LINKS];
+    let mut links = [(0, LoggedState::Down); MAX_LINKS];
     let mut ports = [[0; 6]; MAX_FIELD_PORTS];
     let mut refused_peers = [0; MAX_LINKS];
     let mut sleeps = 0;
@@ -20,18 +20,18 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse) -> ! {
             gateway.report(|status| {
                 for (link, (connects, before)) in status.links().zip(&mut links) {
                     let shown = match link.state {
-                        LinkState::Up { .. } => Shown::Up,
-                        LinkState::Shared => Shown::Shared,
-                        LinkState::Down { .. } | LinkState::Opening { .. } => Shown::Down,
+                        LinkState::Up { .. } => LoggedState::Up,
+                        LinkState::Shared => LoggedState::Shared,
+                        LinkState::Down { .. } | LinkState::Opening { .. } => LoggedState::Down,
                     };
                     let name = link.name;
                     if *connects != link.history.connects {
                         *connects = link.history.connects;
                         info!("link {}: up ({})", name, connects);
-                    } else if *before == Shown::Up && shown == Shown::Down {
+                    } else if *before == LoggedState::Up && shown == LoggedState::Down {
                         warn!("link {}: lost", name);
                     }
-                    if *before != Shown::Shared && shown == Shown::Shared {
+                    if *before != LoggedState::Shared && shown == LoggedState::Shared {
                         info!(
                             "link {}: the controller takes only one connection; the command link carries its commands",
                             name
@@ -78,7 +78,7 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse) -> ! {
 
 /// A link's state in the log.
 #[derive(Clone, Copy, PartialEq, Eq)]
-enum Shown {
+enum LoggedState {
     Down,
     Up,
     Shared,

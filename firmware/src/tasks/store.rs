@@ -17,7 +17,7 @@ use recipe_api::revisions::{Ended, Output, Refused, Result as Done, Revision, Re
 use recipe_store::{KeepError, Store};
 use recipe_update::SlotFlash;
 
-use firmware::Judged;
+use firmware::TrialState;
 pub use handle::{Failed, FirmwareView, MAX_FAILURE, PART, StoreHandle, StoreLock, StoreRequest};
 
 use super::gateway::Gateway;
@@ -30,7 +30,7 @@ use crate::{error, info, warn};
 
 /// What the start leaves to the store task.
 #[derive(Debug, Default)]
-pub struct Work<'d> {
+pub struct StartWork<'d> {
     /// This image came from outside the store, with this digest: it becomes the live one.
     pub adopt: Option<(u32, &'d [u8])>,
     /// What runs is on trial for this long.
@@ -48,7 +48,7 @@ pub async fn run<F: StoreFlash, S: SlotFlash>(
     handle: &StoreHandle,
     stored: &mut StoredConfig<F>,
     updates: &mut Updates<S>,
-    work: Work<'_>,
+    work: StartWork<'_>,
 ) {
     let mut running = work.running;
     if stored.is_to_be_moved() {
@@ -105,7 +105,7 @@ struct StoreTask<'a, F, S> {
 }
 
 /// What comes of outputs.
-enum Next {
+enum DrainResult {
     Sleep { until: proto_core::time::Instant },
     Restart,
 }
@@ -115,17 +115,17 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
         loop {
             let drained = pulse.idle(pin!(self.drain(0, &mut None))).await;
             let mut until = match drained {
-                Next::Restart => return self.end(gateway, pulse).await,
-                Next::Sleep { until } => Instant::from_micros(until.as_micros()),
+                DrainResult::Restart => return self.end(gateway, pulse).await,
+                DrainResult::Sleep { until } => Instant::from_micros(until.as_micros()),
             };
             let judged = pulse.idle(pin!(self.judge(gateway))).await;
             let waits_for = match judged {
-                Judged::Restart => return self.end(gateway, pulse).await,
-                Judged::OnTrial(waits_for) => {
+                TrialState::Restart => return self.end(gateway, pulse).await,
+                TrialState::OnTrial(waits_for) => {
                     until = until.min(Instant::now() + LOOK);
                     Some(waits_for)
                 }
-                Judged::Settled => None,
+                TrialState::Settled => None,
             };
             if self.updates.is_working() {
                 // One step, then the next request.
@@ -224,7 +224,7 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
         let mut failed = None;
         let next = self.drain(image_len, &mut failed).await;
         let result = failed.map_or(Ok(number), |why| Err(Failed::Store(why)));
-        (result, matches!(next, Next::Restart))
+        (result, matches!(next, DrainResult::Restart))
     }
 
     /// Keeps settings of the edge node. A trial is not cut short for a restart.
@@ -259,11 +259,11 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
 
     /// Executes the outputs of the revisions; keeps the first failure.
     #[allow(clippy::await_holding_refcell_ref, reason = "the holder of the lock waits for the store task")]
-    async fn drain(&mut self, image_len: usize, failed: &mut Option<KeepError>) -> Next {
+    async fn drain(&mut self, image_len: usize, failed: &mut Option<KeepError>) -> DrainResult {
         loop {
             let output = self.next_output();
             let (written, result) = match output {
-                Output::Sleep { until } => return Next::Sleep { until },
+                Output::Sleep { until } => return DrainResult::Sleep { until },
                 Output::Store { revision: Revision { number, digest }, forget } => {
                     let image = self.handle.image.borrow();
                     let image = image.get(..image_len).unwrap_or(&[]);
@@ -294,12 +294,12 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
                             if let Err(error) = self.stored.end_trial(ended).await {
                                 error!("the store: {}", Text(&error));
                             }
-                            return Next::Restart;
+                            return DrainResult::Restart;
                         }
                         None => self.stored.make_live(number, Some(live)).await,
                     };
                     if written.is_ok() {
-                        return Next::Restart;
+                        return DrainResult::Restart;
                     }
                     (written, Done::Started(false))
                 }

@@ -11,12 +11,12 @@ use std::vec::Vec;
 
 /// An executor whose tasks may live as long as `'a`.
 pub(crate) struct Executor<'a> {
-    tasks: Vec<(Running<'a>, Waker)>,
+    tasks: Vec<(BoxedTask<'a>, Waker)>,
     woken: Arc<Mutex<Vec<usize>>>,
     order: Order,
 }
 
-type Running<'a> = Pin<Box<dyn Future<Output = ()> + 'a>>;
+type BoxedTask<'a> = Pin<Box<dyn Future<Output = ()> + 'a>>;
 
 /// The order of the woken tasks, on which nothing may depend.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

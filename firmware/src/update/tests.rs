@@ -85,7 +85,7 @@ fn put(updates: &mut Updates<Ram>, offset: u32, bytes: &[u8]) -> Result<(), Refu
     block_on(updates.take(offset, bytes, Some((FORMATS.oldest, FORMATS.newest)), GOOD_A, Downgrade::Refused))
 }
 
-fn stage(updates: &Updates<Ram>) -> (Stage, u32) {
+fn stage(updates: &Updates<Ram>) -> (UpdateStage, u32) {
     let incoming = updates.incoming().unwrap();
     (incoming.stage, incoming.received)
 }
@@ -112,11 +112,11 @@ fn a_firmware_comes_in_pieces_and_is_whole() {
     for piece in [1_000, 4_096, 9_001] {
         let mut updates = board();
         put(&mut updates, 0, &header(&SEED).encode()).unwrap();
-        assert_eq!(stage(&updates), (Stage::Erasing, HEADER as u32));
+        assert_eq!(stage(&updates), (UpdateStage::Erasing, HEADER as u32));
         assert_eq!(put(&mut updates, HEADER as u32, &image()[..64]), Err(Refused::Busy));
         work(&mut updates);
         send(&mut updates, piece).unwrap();
-        assert_eq!(stage(&updates), (Stage::Ready, whole_length(&header(&SEED))));
+        assert_eq!(stage(&updates), (UpdateStage::Ready, whole_length(&header(&SEED))));
         assert_eq!(updates.ready(None, GOOD_A, Downgrade::Refused), Ok(header(&SEED)));
         assert_eq!(updates.verify(&header(&SEED)), Ok(()));
     }
@@ -130,7 +130,7 @@ fn a_short_firmware_is_ready_with_its_last_piece() {
     put(&mut updates, 0, &head.encode()).unwrap();
     work(&mut updates);
     put(&mut updates, HEADER as u32, image).unwrap();
-    assert_eq!(stage(&updates), (Stage::Ready, whole_length(&head)));
+    assert_eq!(stage(&updates), (UpdateStage::Ready, whole_length(&head)));
     assert_eq!(updates.ready(None, GOOD_A, Downgrade::Refused), Ok(head));
 }
 
@@ -144,16 +144,16 @@ fn a_lost_connection_goes_on_and_nothing_is_erased_again() {
     assert_eq!(put(&mut updates, 400, &image()[..64]), Err(Refused::Gap { expected: 5_192 }));
     let erased = updates.slots.as_ref().unwrap().free.erases;
     put(&mut updates, 0, &head).unwrap();
-    assert_eq!(stage(&updates), (Stage::Receiving, 5_192));
+    assert_eq!(stage(&updates), (UpdateStage::Receiving, 5_192));
     put(&mut updates, 5_192, &image()[5_000..]).unwrap();
     work(&mut updates);
-    assert_eq!(stage(&updates).0, Stage::Ready);
+    assert_eq!(stage(&updates).0, UpdateStage::Ready);
     // Also after a restart: it is in its slot.
     let slots = updates.slots.unwrap();
     assert_eq!(slots.free.erases, erased);
     let mut updates = Updates::new(Site { board: "test", slots: Ok(slots) }).unwrap();
     put(&mut updates, 0, &head).unwrap();
-    assert_eq!(stage(&updates).0, Stage::Ready);
+    assert_eq!(stage(&updates).0, UpdateStage::Ready);
     assert_eq!(updates.slots.as_ref().unwrap().free.erases, erased);
 }
 
@@ -179,13 +179,13 @@ fn what_is_wrong_is_refused_and_says_why() {
     changed[4_000] ^= 1;
     put(&mut updates, HEADER as u32, &changed).unwrap();
     work(&mut updates);
-    assert!(matches!(stage(&updates).0, Stage::Failed(_)), "{:?}", stage(&updates));
+    assert!(matches!(stage(&updates).0, UpdateStage::Failed(_)), "{:?}", stage(&updates));
     assert_eq!(updates.ready(None, GOOD_A, Downgrade::Refused), Err(Refused::NotReady));
     // It begins anew.
     put(&mut updates, 0, &head).unwrap();
     work(&mut updates);
     send(&mut updates, 3_000).unwrap();
-    assert_eq!(stage(&updates).0, Stage::Ready);
+    assert_eq!(stage(&updates).0, UpdateStage::Ready);
     // Of another key.
     let foreign = header(&[9; 32]);
     put(&mut updates, 0, &foreign.encode()).unwrap();

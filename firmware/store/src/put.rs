@@ -25,8 +25,8 @@ pub struct Put<'s, 'd> {
 #[derive(Debug)]
 pub(crate) struct Work {
     head: Head,
-    phase: Phase,
-    writing: Writing,
+    phase: PutPhase,
+    writing: WordWriter,
     /// The next free word of the sector that is copied into.
     fill: u16,
     /// Where the copies are, by key.
@@ -94,7 +94,7 @@ impl fmt::Display for PutError {
 impl core::error::Error for PutError {}
 
 #[derive(Debug, Clone, Copy)]
-enum Phase {
+enum PutPhase {
     /// Look for room.
     Place,
     Append,
@@ -120,7 +120,7 @@ enum Phase {
 
 /// How far a record is written.
 #[derive(Debug, Clone, Copy)]
-enum Writing {
+enum WordWriter {
     Head,
     CheckHead { at: u16 },
     Data { at: u16, nth: u16 },
@@ -128,7 +128,7 @@ enum Writing {
 }
 
 /// What writing a record asks for.
-enum Written {
+enum WriteProgress {
     Step(Step),
     /// It begins here.
     At(u16),
@@ -137,12 +137,12 @@ enum Written {
 }
 
 /// Where the data of a record come from.
-pub(crate) enum Source<'d, F> {
+pub(crate) enum RecordSource<'d, F> {
     Bytes(&'d [u8]),
     Flash(&'d F, Found),
 }
 
-impl<F: Flash> Source<'_, F> {
+impl<F: Flash> RecordSource<'_, F> {
     fn part(&self, nth: u16) -> Word {
         match self {
             Self::Bytes(data) => part(data, nth),
@@ -155,7 +155,7 @@ impl<F: Flash> Source<'_, F> {
 
 /// The sector that a record is written to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Into {
+enum PutTarget {
     /// The one that is being filled.
     Filled,
     /// The one that is copied into.
@@ -189,8 +189,8 @@ impl Store {
         }
         Ok(Work {
             head,
-            phase: Phase::Place,
-            writing: Writing::Head,
+            phase: PutPhase::Place,
+            writing: WordWriter::Head,
             fill: 0,
             copies: [0; KEYS],
             turns: self.geometry.sectors,
@@ -203,7 +203,7 @@ impl Store {
 impl Put<'_, '_> {
     /// What to do next; called again when that is done, until it is [`Step::End`].
     pub fn next<F: Flash>(&mut self, flash: &F) -> Step {
-        self.work.next(self.store, &Source::<F>::Bytes(self.data), flash)
+        self.work.next(self.store, &RecordSource::<F>::Bytes(self.data), flash)
     }
 
     /// Does all steps.
@@ -231,74 +231,77 @@ impl Work {
     pub(crate) fn next<F: Flash>(
         &mut self,
         store: &mut Store,
-        source: &Source<'_, impl Flash>,
+        source: &RecordSource<'_, impl Flash>,
         flash: &F,
     ) -> Step {
         loop {
             match self.phase {
-                Phase::Place => self.find_place(store),
-                Phase::Append => {
+                PutPhase::Place => self.find_place(store),
+                PutPhase::Append => {
                     let head = self.head;
-                    match self.write(store, flash, &head, source, Into::Filled) {
-                        Written::Step(step) => return step,
-                        Written::At(word) => {
+                    match self.write(store, flash, &head, source, PutTarget::Filled) {
+                        WriteProgress::Step(step) => return step,
+                        WriteProgress::At(word) => {
                             if let Some((sector, _)) = store.head {
                                 store.enter(Place { sector, word }, &head);
                             }
-                            self.phase = Phase::End(Ok(()));
+                            self.phase = PutPhase::End(Ok(()));
                         }
-                        Written::Full => self.phase = Phase::Place,
-                        Written::Worn => self.phase = Phase::End(Err(PutError::Worn)),
+                        WriteProgress::Full => self.phase = PutPhase::Place,
+                        WriteProgress::Worn => self.phase = PutPhase::End(Err(PutError::Worn)),
                     }
                 }
-                Phase::Erase { tries } => {
-                    self.phase = Phase::Erased { tries: tries.saturating_sub(1) };
+                PutPhase::Erase { tries } => {
+                    self.phase = PutPhase::Erased { tries: tries.saturating_sub(1) };
                     return Step::Erase(next_sector(store));
                 }
-                Phase::Erased { tries } => {
+                PutPhase::Erased { tries } => {
                     let sector = next_sector(store);
                     self.fill = 1;
                     self.phase = match (is_blank(flash, sector), tries) {
-                        (true, _) => Phase::Copy { key: 0 },
-                        (false, 0) => Phase::End(Err(PutError::Sector(sector))),
-                        (false, tries) => Phase::Erase { tries },
+                        (true, _) => PutPhase::Copy { key: 0 },
+                        (false, 0) => PutPhase::End(Err(PutError::Sector(sector))),
+                        (false, tries) => PutPhase::Erase { tries },
                     };
                 }
-                Phase::Copy { key } => self.copy(store, flash, key),
-                Phase::Copying { key, head, from } => {
-                    match self.write(store, flash, &head, &Source::Flash(flash, from), Into::Next) {
-                        Written::Step(step) => return step,
-                        Written::At(word) => {
+                PutPhase::Copy { key } => self.copy(store, flash, key),
+                PutPhase::Copying { key, head, from } => {
+                    match self.write(store, flash, &head, &RecordSource::Flash(flash, from), PutTarget::Next)
+                    {
+                        WriteProgress::Step(step) => return step,
+                        WriteProgress::At(word) => {
                             if let Some(copy) = self.copies.get_mut(usize::from(key)) {
                                 *copy = word;
                             }
-                            self.phase = Phase::Copy { key: key.saturating_add(1) };
+                            self.phase = PutPhase::Copy { key: key.saturating_add(1) };
                         }
-                        Written::Full | Written::Worn => self.phase = Phase::End(Err(PutError::Worn)),
+                        WriteProgress::Full | WriteProgress::Worn => {
+                            self.phase = PutPhase::End(Err(PutError::Worn))
+                        }
                     }
                 }
-                Phase::Begin => {
+                PutPhase::Begin => {
                     let place = Place { sector: next_sector(store), word: 0 };
-                    self.phase = Phase::Begun;
+                    self.phase = PutPhase::Begun;
                     return Step::Write(place, SectorHead::word(next_sequence(store)));
                 }
-                Phase::Begun => self.begun(store, flash),
-                Phase::End(result) => return Step::End(result),
+                PutPhase::Begun => self.begun(store, flash),
+                PutPhase::End(result) => return Step::End(result),
             }
         }
     }
 
     fn find_place(&mut self, store: &Store) {
-        self.writing = Writing::Head;
+        self.writing = WordWriter::Head;
         self.phase = if store.head.is_some() && store.has_room(store.end, self.head.extent()) {
-            Phase::Append
+            PutPhase::Append
         } else if let Some(left) = self.turns.checked_sub(1) {
             self.turns = left;
             self.copies = [0; KEYS];
-            if self.is_erased { Phase::Erased { tries: 2 } } else { Phase::Erase { tries: 2 } }
+            if self.is_erased { PutPhase::Erased { tries: 2 } } else { PutPhase::Erase { tries: 2 } }
         } else {
             // More was written again than there is room.
-            Phase::End(Err(PutError::Worn))
+            PutPhase::End(Err(PutError::Worn))
         };
     }
 
@@ -307,14 +310,14 @@ impl Work {
         let old = behind(store, next_sector(store));
         let found = (from..KEYS as u8)
             .find_map(|key| Some((key, store.entry(key).filter(|found| found.data.sector == old)?)));
-        self.writing = Writing::Head;
+        self.writing = WordWriter::Head;
         self.phase = match found {
             Some((key, from)) => match head_of(flash, from) {
-                Some(head) => Phase::Copying { key, head, from },
+                Some(head) => PutPhase::Copying { key, head, from },
                 // It was read at the start, and is not written.
-                None => Phase::End(Err(PutError::Worn)),
+                None => PutPhase::End(Err(PutError::Worn)),
             },
-            None => Phase::Begin,
+            None => PutPhase::Begin,
         };
     }
 
@@ -322,7 +325,7 @@ impl Work {
     fn begun(&mut self, store: &mut Store, flash: &impl Flash) {
         let (sector, sequence) = (next_sector(store), next_sequence(store));
         if flash.read(Place { sector, word: 0 }) != SectorHead::word(sequence) {
-            self.phase = Phase::End(Err(PutError::Sector(sector)));
+            self.phase = PutPhase::End(Err(PutError::Sector(sector)));
             return;
         }
         store.head = Some((sector, sequence));
@@ -332,7 +335,7 @@ impl Work {
                 store.moved(key, Place { sector, word });
             }
         }
-        self.phase = Phase::Place;
+        self.phase = PutPhase::Place;
     }
 
     /// The next step of a record, at the end of a sector.
@@ -341,49 +344,49 @@ impl Work {
         store: &mut Store,
         flash: &impl Flash,
         head: &Head,
-        source: &Source<'_, impl Flash>,
-        into: Into,
-    ) -> Written {
+        source: &RecordSource<'_, impl Flash>,
+        into: PutTarget,
+    ) -> WriteProgress {
         let sector = match store.head {
-            Some((sector, _)) if into == Into::Filled => sector,
+            Some((sector, _)) if into == PutTarget::Filled => sector,
             _ => next_sector(store),
         };
         loop {
             match self.writing {
-                Writing::Head => {
-                    let free = if into == Into::Next { self.fill } else { store.end };
+                WordWriter::Head => {
+                    let free = if into == PutTarget::Next { self.fill } else { store.end };
                     if !store.has_room(free, head.extent()) {
-                        return Written::Full;
+                        return WriteProgress::Full;
                     }
                     self.set_end(store, into, free.saturating_add(1));
-                    self.writing = Writing::CheckHead { at: free };
-                    return Written::Step(Step::Write(Place { sector, word: free }, head.word()));
+                    self.writing = WordWriter::CheckHead { at: free };
+                    return WriteProgress::Step(Step::Write(Place { sector, word: free }, head.word()));
                 }
                 // Data only behind a head that can be read: without it they could be taken for records.
-                Writing::CheckHead { at } => {
+                WordWriter::CheckHead { at } => {
                     if flash.read(Place { sector, word: at }) == head.word() {
                         self.set_end(store, into, at.saturating_add(head.extent()));
-                        self.writing = Writing::Data { at, nth: 0 };
+                        self.writing = WordWriter::Data { at, nth: 0 };
                     } else if !self.again() {
-                        return Written::Worn;
+                        return WriteProgress::Worn;
                     }
                 }
-                Writing::Data { at, nth } => {
+                WordWriter::Data { at, nth } => {
                     let place = Place { sector, word: at.saturating_add(1).saturating_add(nth) };
                     if nth < head.extent().saturating_sub(2) {
-                        self.writing = Writing::Data { at, nth: nth.saturating_add(1) };
-                        return Written::Step(Step::Write(place, source.part(nth)));
+                        self.writing = WordWriter::Data { at, nth: nth.saturating_add(1) };
+                        return WriteProgress::Step(Step::Write(place, source.part(nth)));
                     }
-                    self.writing = Writing::Check { at };
-                    return Written::Step(Step::Write(place, head.word()));
+                    self.writing = WordWriter::Check { at };
+                    return WriteProgress::Step(Step::Write(place, head.word()));
                 }
-                Writing::Check { at } => {
+                WordWriter::Check { at } => {
                     let place = Place { sector, word: at };
                     if flash.read(place) == head.word() && is_whole(flash, place, head) {
-                        return Written::At(at);
+                        return WriteProgress::At(at);
                     }
                     if !self.again() {
-                        return Written::Worn;
+                        return WriteProgress::Worn;
                     }
                 }
             }
@@ -394,12 +397,12 @@ impl Work {
     fn again(&mut self) -> bool {
         let Some(left) = self.tries.checked_sub(1) else { return false };
         self.tries = left;
-        self.writing = Writing::Head;
+        self.writing = WordWriter::Head;
         true
     }
 
-    fn set_end(&mut self, store: &mut Store, into: Into, word: u16) {
-        *(if into == Into::Next { &mut self.fill } else { &mut store.end }) = word;
+    fn set_end(&mut self, store: &mut Store, into: PutTarget, word: u16) {
+        *(if into == PutTarget::Next { &mut self.fill } else { &mut store.end }) = word;
     }
 }
 

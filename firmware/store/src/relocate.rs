@@ -5,7 +5,7 @@
 //! the place before counts, and a move that was cut short is begun anew. The place before is not written.
 
 use crate::mount::MountError;
-use crate::put::{Source, Work, head_of, is_blank};
+use crate::put::{RecordSource, Work, head_of, is_blank};
 use crate::record::{Head, KEYS, sum};
 use crate::{Flash, Found, Key, PutError, Step, Store};
 
@@ -52,11 +52,11 @@ pub fn newest(first: &impl Flash, second: &impl Flash) -> Result<Newest, MountEr
 pub struct Move<'s> {
     from: &'s Store,
     to: Store,
-    phase: Phase,
+    phase: RelocatePhase,
 }
 
 #[derive(Debug)]
-enum Phase {
+enum RelocatePhase {
     Erase {
         sector: u8,
         tries: u8,
@@ -86,7 +86,7 @@ impl Store {
     /// the changes are not in the new place.
     pub fn relocate(&self) -> Move<'_> {
         let to = Self::empty(self.geometry, self.sequence);
-        Move { from: self, to, phase: Phase::Erase { sector: 0, tries: ERASES } }
+        Move { from: self, to, phase: RelocatePhase::Erase { sector: 0, tries: ERASES } }
     }
 }
 
@@ -95,62 +95,69 @@ impl Move<'_> {
     pub fn next<F: Flash>(&mut self, from: &impl Flash, to: &F) -> Step {
         loop {
             match &mut self.phase {
-                Phase::Erase { sector, tries } => {
+                RelocatePhase::Erase { sector, tries } => {
                     let (sector, tries) = (*sector, tries.saturating_sub(1));
-                    self.phase = Phase::Erased { sector, tries };
+                    self.phase = RelocatePhase::Erased { sector, tries };
                     return Step::Erase(sector);
                 }
-                Phase::Erased { sector, tries } => {
+                RelocatePhase::Erased { sector, tries } => {
                     let (sector, tries) = (*sector, *tries);
                     let next = sector.saturating_add(1);
                     self.phase = if is_blank(to, sector) {
                         let is_last = next >= self.to.geometry.sectors;
-                        if is_last { Phase::Key(0) } else { Phase::Erase { sector: next, tries: ERASES } }
+                        if is_last {
+                            RelocatePhase::Key(0)
+                        } else {
+                            RelocatePhase::Erase { sector: next, tries: ERASES }
+                        }
                     } else if tries > 0 {
-                        Phase::Erase { sector, tries }
+                        RelocatePhase::Erase { sector, tries }
                     } else {
-                        Phase::End(Err(PutError::Sector(sector)))
+                        RelocatePhase::End(Err(PutError::Sector(sector)))
                     };
                 }
-                Phase::Key(first) => {
+                RelocatePhase::Key(first) => {
                     let first = *first;
-                    self.phase = self.record(from, first).unwrap_or_else(|error| Phase::End(Err(error)));
+                    self.phase =
+                        self.record(from, first).unwrap_or_else(|error| RelocatePhase::End(Err(error)));
                 }
-                Phase::Copying { key, from: found, work } => {
-                    match work.next(&mut self.to, &Source::Flash(from, *found), to) {
-                        Step::End(Ok(())) => self.phase = Phase::Key(key.saturating_add(1)),
-                        Step::End(Err(error)) => self.phase = Phase::End(Err(error)),
+                RelocatePhase::Copying { key, from: found, work } => {
+                    match work.next(&mut self.to, &RecordSource::Flash(from, *found), to) {
+                        Step::End(Ok(())) => self.phase = RelocatePhase::Key(key.saturating_add(1)),
+                        Step::End(Err(error)) => self.phase = RelocatePhase::End(Err(error)),
                         step => return step,
                     }
                 }
-                Phase::Generation(work) => match work.next(&mut self.to, &Source::<F>::Bytes(&[]), to) {
-                    Step::End(result) => self.phase = Phase::End(result),
-                    step => return step,
-                },
-                Phase::End(result) => return Step::End(*result),
+                RelocatePhase::Generation(work) => {
+                    match work.next(&mut self.to, &RecordSource::<F>::Bytes(&[]), to) {
+                        Step::End(result) => self.phase = RelocatePhase::End(result),
+                        step => return step,
+                    }
+                }
+                RelocatePhase::End(result) => return Step::End(*result),
             }
         }
     }
 
     /// The first record from this key on, or the number of the move behind all others.
-    fn record(&mut self, from: &impl Flash, first: u8) -> Result<Phase, PutError> {
+    fn record(&mut self, from: &impl Flash, first: u8) -> Result<RelocatePhase, PutError> {
         let is_copied = |key: &u8| Key::Generation.code() != Some(*key);
         let found = (first..KEYS as u8).filter(is_copied).find_map(|key| Some((key, self.from.entry(key)?)));
         if let Some((key, found)) = found {
             // It was read at the start, and is not written.
             let head = head_of(from, found).ok_or(PutError::Worn)?;
-            return Ok(Phase::Copying { key, from: found, work: self.to.begin(head)?.in_erased() });
+            return Ok(RelocatePhase::Copying { key, from: found, work: self.to.begin(head)?.in_erased() });
         }
         let key = Key::Generation.code().ok_or(PutError::Key)?;
         let tag = self.from.generation().saturating_add(1);
         let head = Head { key, sequence: self.to.sequence, len: 0, tag, sum: sum(&[]) };
         self.to.sequence = self.to.sequence.saturating_add(1);
-        Ok(Phase::Generation(self.to.begin(head)?.in_erased()))
+        Ok(RelocatePhase::Generation(self.to.begin(head)?.in_erased()))
     }
 
     /// The store in its new place, after [`Step::End`] without an error; `None` otherwise.
     pub fn moved(self) -> Option<Store> {
-        matches!(self.phase, Phase::End(Ok(()))).then_some(self.to)
+        matches!(self.phase, RelocatePhase::End(Ok(()))).then_some(self.to)
     }
 
     /// Does all steps; returns the store in its new place.

@@ -14,7 +14,7 @@ use recipe_test_kit::http::Client;
 use recipe_test_kit::{Binary, HostSim, example, until};
 use serde_json::Value;
 
-use crate::board::{Board, variable};
+use crate::board::{QemuBoard, variable};
 
 /// Connections of the attack.
 const CONNECTIONS: u32 = 1_000;
@@ -64,13 +64,13 @@ timeout_ms = 2000
 }
 
 /// The device.
-struct Device {
+struct ChattyDevice {
     stop: Arc<AtomicBool>,
     sent: Arc<AtomicU32>,
     threads: Vec<JoinHandle<()>>,
 }
 
-impl Device {
+impl ChattyDevice {
     fn start(mut line: UnixStream) -> Self {
         let (stop, sent) = (Arc::<AtomicBool>::default(), Arc::<AtomicU32>::default());
         let mut back = line.try_clone().unwrap();
@@ -105,7 +105,7 @@ impl Device {
     }
 }
 
-impl Drop for Device {
+impl Drop for ChattyDevice {
     fn drop(&mut self) {
         self.stop.store(true, Relaxed);
     }
@@ -133,7 +133,7 @@ fn hostile(board: &Client, nth: u32) -> Option<()> {
 }
 
 /// The document; the board may have no place at the moment.
-fn status(board: &Board) -> Value {
+fn status(board: &QemuBoard) -> Value {
     until("the status", || board.client.try_get("status")).json()
 }
 
@@ -151,8 +151,8 @@ fn grown(before: &Value, after: &Value, path: &str) -> u64 {
 fn a_thousand_hostile_connections_cost_the_cell_no_frame_and_no_link() {
     let program = Binary(variable("HOST_SIM").display().to_string().leak());
     let robot = program.controller(&example("force-sensor-controller.toml"), &[]);
-    let board = Board::claimed(&cell(&robot));
-    let mut device = Device::start(board.line());
+    let board = QemuBoard::claimed(&cell(&robot));
+    let mut device = ChattyDevice::start(board.line());
     let value = |number: u32| {
         robot.stats("a value", |stats| stats["registers"]["WordInputReg[1]"].as_u64() >= Some(number.into()));
     };

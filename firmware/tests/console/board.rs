@@ -19,14 +19,14 @@ const NO_IMAGE: &str = "/nowhere/cell.img";
 const PRESSED: &str = "the button was pressed: a key is taken for 60 s";
 
 /// The board, its files, and how to reach it.
-pub(crate) struct Board {
+pub(crate) struct QemuBoard {
     qemu: Option<Child>,
     pub(crate) folder: TempDir,
     pub(crate) client: Client,
     image: PathBuf,
 }
 
-impl Board {
+impl QemuBoard {
     /// Starts one with this configuration and an empty store.
     pub(crate) fn new(toml: &str) -> Self {
         let folder = tempfile::tempdir().unwrap();
@@ -158,7 +158,7 @@ impl Board {
     }
 }
 
-impl Drop for Board {
+impl Drop for QemuBoard {
     fn drop(&mut self) {
         if std::thread::panicking() {
             eprintln!("the board's log:\n{}", self.log());

@@ -5,12 +5,12 @@ use proto_core::config::image;
 use recipe_test_kit::http::Response;
 use serde_json::{Value, json};
 
-use crate::board::{Board, make_image, panel};
+use crate::board::{QemuBoard, make_image, panel};
 
 #[test]
 #[ignore = "needs QEMU and the firmware"]
 fn what_is_confirmed_runs_after_a_restart_and_what_is_not_does_not() {
-    let mut board = Board::claimed(&panel(500));
+    let mut board = QemuBoard::claimed(&panel(500));
     assert_eq!(board.put(&panel(600)), 2);
     let revisions = board.revisions();
     assert_eq!((&revisions["waiting"], &revisions["running"]), (&json!(2), &json!(1)));
@@ -51,7 +51,7 @@ fn what_is_confirmed_runs_after_a_restart_and_what_is_not_does_not() {
 #[test]
 #[ignore = "needs QEMU and the firmware"]
 fn what_cannot_run_gives_way_at_once_and_says_why() {
-    let board = Board::claimed(&panel(500));
+    let board = QemuBoard::claimed(&panel(500));
     let image = std::fs::read(make_image(board.folder.path(), "next", &panel(600))).unwrap();
     let mut config = image::decode(&image).unwrap();
     config.ports[0].recipe = 7;
@@ -68,7 +68,7 @@ fn what_cannot_run_gives_way_at_once_and_says_why() {
 #[test]
 #[ignore = "needs QEMU and the firmware"]
 fn an_empty_board_is_claimed_and_gets_its_first_configuration() {
-    let mut board = Board::empty();
+    let mut board = QemuBoard::empty();
     board.until_log("nothing runs: ");
     board.claim();
     let revisions = board.revisions();
@@ -93,7 +93,7 @@ fn an_empty_board_is_claimed_and_gets_its_first_configuration() {
 #[test]
 #[ignore = "needs QEMU and the firmware"]
 fn wrong_images_are_refused_with_a_reason_and_nothing_is_kept() {
-    let board = Board::claimed(&panel(500));
+    let board = QemuBoard::claimed(&panel(500));
     let right_one = std::fs::read(make_image(board.folder.path(), "next", &panel(600))).unwrap();
     let base = board.revisions()["base"].as_str().unwrap().to_owned();
     // What only the configuration itself shows, behind a right checksum: entries that are none, and ports that the

@@ -2,14 +2,14 @@
 
 use recipe_api::key::Key;
 
-use crate::board::{Board, KEY, panel};
+use crate::board::{KEY, QemuBoard, panel};
 
 const JSON: &str = "Content-Type: application/json";
 
 #[test]
 #[ignore = "needs QEMU and the firmware"]
 fn a_board_takes_a_key_once_and_only_after_a_press_of_its_button() {
-    let mut board = Board::new(&panel(500));
+    let mut board = QemuBoard::new(&panel(500));
     let info = board.client.request("GET /api/v1/info", "", b"").must_be(200).json();
     assert_eq!((&info["role"], &info["name"]), (&"board".into(), &"rgw-123456".into()));
     assert_eq!((&info["claimed"], &info["claim_left_s"]), (&false.into(), &serde_json::Value::Null));

@@ -8,12 +8,12 @@ use recipe_api::key::Key;
 use recipe_test_kit::{PATIENCE, until};
 use serde_json::Value;
 
-use crate::board::{Board, KEY, panel};
+use crate::board::{KEY, QemuBoard, panel};
 use crate::stream::Events;
 
 /// What the board counts. A connection that finds all places taken, for as long as others end, is reset: then the
 /// client tries again.
-fn console(board: &Board) -> Value {
+fn console(board: &QemuBoard) -> Value {
     until("an answer", || {
         let nonce = board.client.try_request("GET /api/v1/nonce", "", b"")?.json();
         let line = "GET /api/v1/info";
@@ -25,7 +25,7 @@ fn console(board: &Board) -> Value {
 #[test]
 #[ignore = "needs QEMU and the firmware"]
 fn wrong_and_repeated_signatures_are_refused_and_counted() {
-    let mut board = Board::claimed(&panel(500));
+    let mut board = QemuBoard::claimed(&panel(500));
     let body = b"{\"confirm_s\": 60}";
     let line = "POST /api/v1/apply";
     let json = "Content-Type: application/json";
@@ -60,7 +60,7 @@ fn wrong_and_repeated_signatures_are_refused_and_counted() {
 #[test]
 #[ignore = "needs QEMU and the firmware"]
 fn requests_that_are_none_are_refused() {
-    let board = Board::claimed(&panel(500));
+    let board = QemuBoard::claimed(&panel(500));
     let host = &board.client.host;
     let status = |text: &str| {
         let answer = board.client.exchange(text.as_bytes()).unwrap();
@@ -91,7 +91,7 @@ fn requests_that_are_none_are_refused() {
 #[test]
 #[ignore = "needs QEMU and the firmware"]
 fn stalled_clients_hold_their_places_for_seconds_and_nobody_elses() {
-    let board = Board::claimed(&panel(500));
+    let board = QemuBoard::claimed(&panel(500));
     let half = format!("GET /api/v1/info HTTP/1.1\r\nHost: {}\r\n", board.client.host);
     let stalled = || {
         let mut stream = TcpStream::connect(board.client.to).unwrap();
@@ -128,7 +128,7 @@ fn stalled_clients_hold_their_places_for_seconds_and_nobody_elses() {
 #[test]
 #[ignore = "needs QEMU and the firmware"]
 fn streams_leave_two_places() {
-    let board = Board::claimed(&panel(500));
+    let board = QemuBoard::claimed(&panel(500));
     let (_first, mut second) = (Events::of(&board, ""), Events::of(&board, ""));
     let refused = board.client.get("stream").must_be(503);
     assert!(refused.text().contains("too many streams"), "{}", refused.text());

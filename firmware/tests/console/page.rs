@@ -7,14 +7,14 @@ use std::time::{Duration, Instant};
 use recipe_test_kit::http::Response;
 use recipe_test_kit::{PATIENCE, until};
 
-use crate::board::{Board, panel};
+use crate::board::{QemuBoard, panel};
 use crate::stream::Events;
 
 /// It needs no key, so a board that has none yet shows it too.
 #[test]
 #[ignore = "needs QEMU and the firmware"]
 fn the_page_is_the_built_one_and_is_not_sent_to_who_has_it() {
-    let board = Board::new(&panel(500));
+    let board = QemuBoard::new(&panel(500));
     let page = board.client.request("GET /", "", b"").must_be(200);
     assert!(page.body == recipe_console::PAGE, "{} bytes", page.body.len());
     let etag = recipe_console::ETAG;
@@ -49,7 +49,7 @@ fn the_page_is_the_built_one_and_is_not_sent_to_who_has_it() {
 #[test]
 #[ignore = "needs QEMU and the firmware"]
 fn three_pages_at_once_are_whole() {
-    let board = Board::claimed(&panel(500));
+    let board = QemuBoard::claimed(&panel(500));
     // A place is free a moment after its answer; a connection that finds none is reset.
     let is_alone = || (connections(&board)? == 1).then_some(());
     until("all others have ended", is_alone);
@@ -95,7 +95,7 @@ fn three_pages_at_once_are_whole() {
 #[test]
 #[ignore = "needs QEMU and the firmware"]
 fn a_client_that_does_not_read_its_page_holds_up_nobody() {
-    let board = Board::claimed(&panel(500));
+    let board = QemuBoard::claimed(&panel(500));
     let mut silent = board.client.narrow_connection().unwrap();
     silent.write_all(&board.client.bytes("GET /", "", b"")).unwrap();
     let mut events = Events::of(&board, "");
@@ -110,6 +110,6 @@ fn a_client_that_does_not_read_its_page_holds_up_nobody() {
 }
 
 /// How many there are, with the one that asks.
-fn connections(board: &Board) -> Option<u64> {
+fn connections(board: &QemuBoard) -> Option<u64> {
     board.client.try_get("info")?.json()["console"]["connections"].as_u64()
 }

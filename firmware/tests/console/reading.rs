@@ -1,11 +1,11 @@
 //! The endpoints that read.
 
-use crate::board::{Board, panel};
+use crate::board::{QemuBoard, panel};
 
 #[test]
 #[ignore = "needs QEMU and the firmware"]
 fn each_document_is_whole_and_what_the_host_shows() {
-    let board = Board::claimed(&panel(500));
+    let board = QemuBoard::claimed(&panel(500));
     let info = board.client.get("info").must_be(200).json();
     assert_eq!(info["places"]["ports"]["device"], "rs485");
     assert_eq!((&info["has"]["rs485"], &info["has"]["can"]), (&2.into(), &1.into()));
@@ -36,7 +36,7 @@ fn each_document_is_whole_and_what_the_host_shows() {
 #[test]
 #[ignore = "needs QEMU and the firmware"]
 fn the_configuration_comes_back_as_it_was_put_there() {
-    let board = Board::claimed(&panel(500));
+    let board = QemuBoard::claimed(&panel(500));
     let revisions = board.revisions();
     assert_eq!((&revisions["running"], &revisions["live"]), (&1.into(), &1.into()));
     assert_eq!(revisions["kept"].as_array().unwrap().len(), 1);
@@ -54,7 +54,7 @@ fn the_configuration_comes_back_as_it_was_put_there() {
 #[test]
 #[ignore = "needs QEMU and the firmware"]
 fn identify_is_shown_by_the_led_and_the_log() {
-    let board = Board::claimed(&panel(500));
+    let board = QemuBoard::claimed(&panel(500));
     board.client.post("identify", "{\"s\": 3}").must_be(200);
     board.until_log("looks for this board: its LED shows it for 3 s");
     for wrong in ["{\"s\": 0}", "{\"s\": 601}", "{\"seconds\": 1}", "[]"] {

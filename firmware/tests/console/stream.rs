@@ -6,14 +6,14 @@ use std::net::TcpStream;
 use recipe_test_kit::{PATIENCE, until};
 use serde_json::Value;
 
-use crate::board::{Board, panel};
+use crate::board::{QemuBoard, panel};
 
 /// The events of a stream.
 pub(crate) struct Events(BufReader<TcpStream>);
 
 impl Events {
     /// Follows a stream with this query.
-    pub(crate) fn of(board: &Board, query: &str) -> Self {
+    pub(crate) fn of(board: &QemuBoard, query: &str) -> Self {
         let line = format!("GET /api/v1/stream{query}");
         let fields = board.client.signature(&board.client.nonce(), &line, b"");
         let mut stream = board.client.narrow_connection().unwrap();
@@ -44,7 +44,7 @@ impl Events {
 #[test]
 #[ignore = "needs QEMU and the firmware"]
 fn state_and_values_come_several_times_a_second_and_frames_for_who_asks() {
-    let board = Board::claimed(&panel(500));
+    let board = QemuBoard::claimed(&panel(500));
     let mut plain = Events::of(&board, "");
     let mut names = Vec::new();
     let mut times = Vec::new();

@@ -17,7 +17,7 @@ use crate::{FIRST_WORD, SlotFlash, place};
 #[derive(Debug)]
 pub struct Receive {
     header: Header,
-    phase: Phase,
+    phase: ReceivePhase,
     /// Bytes of the image that were taken.
     taken: u32,
     /// The word that they are collected in.
@@ -84,7 +84,7 @@ impl core::error::Error for Gap {}
 
 #[derive(Debug)]
 #[allow(clippy::large_enum_variant, reason = "there is no heap")]
-enum Phase {
+enum ReceivePhase {
     /// From this sector on: the first one has the header.
     Erase {
         sector: u8,
@@ -122,7 +122,7 @@ impl Receive {
         let bytes = u32::from(flash.geometry().words).saturating_mul(WORD as u32);
         let sectors = header.length().saturating_add(IMAGE_OFFSET).div_ceil(bytes.max(1));
         let end = u8::try_from(sectors).unwrap_or(u8::MAX);
-        Ok(Self { header, phase: Phase::Erase { sector: 0, end }, taken: 0, word: FILL, collected: 0 })
+        Ok(Self { header, phase: ReceivePhase::Erase { sector: 0, end }, taken: 0, word: FILL, collected: 0 })
     }
 
     /// What is received.
@@ -144,7 +144,7 @@ impl Receive {
         if offset != self.taken {
             return Err(Gap { expected: self.taken });
         }
-        if !matches!(self.phase, Phase::Fill) || self.is_full() {
+        if !matches!(self.phase, ReceivePhase::Fill) || self.is_full() {
             return Ok(0);
         }
         let left = self.header.length().saturating_sub(self.taken);
@@ -168,62 +168,62 @@ impl Receive {
     pub fn next(&mut self, flash: &impl SlotFlash) -> Step {
         loop {
             match &mut self.phase {
-                Phase::Erase { sector, end } => {
+                ReceivePhase::Erase { sector, end } => {
                     if sector < end {
                         let erased = *sector;
                         *sector = sector.saturating_add(1);
                         return Step::Erase(erased);
                     }
-                    self.phase = Phase::Fill;
+                    self.phase = ReceivePhase::Fill;
                 }
-                Phase::Fill => {
+                ReceivePhase::Fill => {
                     if !self.is_full() {
                         return Step::Take { offset: self.taken };
                     }
                     let word = self.taken.saturating_sub(1).checked_div(WORD as u32).unwrap_or(0);
                     // It was checked that the image has room.
                     let Some(at) = place(flash, FIRST_WORD.saturating_add(word)) else {
-                        self.phase = Phase::End(Err(ReceiveError::Bad(Bad::Crc)));
+                        self.phase = ReceivePhase::End(Err(ReceiveError::Bad(Bad::Crc)));
                         continue;
                     };
-                    self.phase = Phase::Written(at);
+                    self.phase = ReceivePhase::Written(at);
                     return Step::Write(at, self.word);
                 }
-                Phase::Written(at) => {
+                ReceivePhase::Written(at) => {
                     let at = *at;
                     self.phase = if flash.whole(at) != Some(self.word) {
-                        Phase::End(Err(ReceiveError::Worn(at)))
+                        ReceivePhase::End(Err(ReceiveError::Worn(at)))
                     } else if self.taken == self.header.length() {
-                        Phase::Hash(Check::contents(self.header))
+                        ReceivePhase::Hash(Check::contents(self.header))
                     } else {
                         (self.word, self.collected) = (FILL, 0);
-                        Phase::Fill
+                        ReceivePhase::Fill
                     };
                 }
-                Phase::Hash(check) => match check.step(flash, AT_ONCE) {
+                ReceivePhase::Hash(check) => match check.step(flash, AT_ONCE) {
                     None => return Step::Again,
-                    Some(Ok(())) => self.phase = Phase::Header { nth: 0 },
-                    Some(Err(bad)) => self.phase = Phase::End(Err(ReceiveError::Bad(bad))),
+                    Some(Ok(())) => self.phase = ReceivePhase::Header { nth: 0 },
+                    Some(Err(bad)) => self.phase = ReceivePhase::End(Err(ReceiveError::Bad(bad))),
                 },
-                Phase::Header { nth } => {
+                ReceivePhase::Header { nth } => {
                     let nth = *nth;
                     let Some((at, word)) = self.header_word(nth) else {
-                        self.phase = Phase::End(Ok(()));
+                        self.phase = ReceivePhase::End(Ok(()));
                         continue;
                     };
-                    self.phase = Phase::HeaderWritten { nth };
+                    self.phase = ReceivePhase::HeaderWritten { nth };
                     return Step::Write(at, word);
                 }
-                Phase::HeaderWritten { nth } => {
+                ReceivePhase::HeaderWritten { nth } => {
                     let nth = *nth;
                     self.phase = match self.header_word(nth) {
                         Some((at, word)) if flash.whole(at) != Some(word) => {
-                            Phase::End(Err(ReceiveError::Worn(at)))
+                            ReceivePhase::End(Err(ReceiveError::Worn(at)))
                         }
-                        _ => Phase::Header { nth: nth.saturating_add(1) },
+                        _ => ReceivePhase::Header { nth: nth.saturating_add(1) },
                     };
                 }
-                Phase::End(result) => return Step::End(*result),
+                ReceivePhase::End(result) => return Step::End(*result),
             }
         }
     }

@@ -79,7 +79,7 @@ impl Chip {
             self.board.scs.record_fault(PRECISE_BUS, address, false);
         }
         match plain(self.engine(), self.pc) {
-            Some(Plain { loads: Some((register, size)), len }) => {
+            Some(SimpleAccess { loads: Some((register, size)), len }) => {
                 let mut bytes = [0; 4];
                 self.engine().read(address, &mut bytes[..size]);
                 self.engine().set_general(register, u32::from_le_bytes(bytes));
@@ -95,7 +95,7 @@ impl Chip {
         let bytes = &value.to_le_bytes()[..size as usize];
         self.board.program_flash(self.pc, address - FLASH, bytes);
         match plain(self.engine(), self.pc) {
-            Some(Plain { loads: None, len }) => self.pass(len),
+            Some(SimpleAccess { loads: None, len }) => self.pass(len),
             _ => self.step_in_page(address),
         }
     }
@@ -121,7 +121,7 @@ impl Chip {
 }
 
 /// A load or store of one register that changes no other and is in no IT block: it needs no emulator.
-struct Plain {
+struct SimpleAccess {
     /// Length of the instruction.
     len: u32,
     /// Of a load, the register and the number of bytes, which are extended with zeros.
@@ -129,7 +129,7 @@ struct Plain {
 }
 
 /// The present instruction, if it is one: LDR, LDRH, LDRB or STR with an offset (Armv7-M ARM A5.2.4, A5.3.7, A5.3.10).
-fn plain(engine: Engine, pc: u32) -> Option<Plain> {
+fn plain(engine: Engine, pc: u32) -> Option<SimpleAccess> {
     let word = engine.word(pc);
     let (low, high) = (word & 7, word >> 28);
     let (len, loads) = match word as u16 {
@@ -146,7 +146,7 @@ fn plain(engine: Engine, pc: u32) -> Option<Plain> {
     };
     // Into the stack pointer, the link register or the program counter.
     let is_special = loads.is_some_and(|(register, _)| register > 12);
-    (!is_special).then_some(Plain { len, loads })
+    (!is_special).then_some(SimpleAccess { len, loads })
 }
 
 /// What the emulator lets the program do with a page, if that is not to read it alone.

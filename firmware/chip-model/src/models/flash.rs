@@ -8,7 +8,7 @@
 
 mod contents;
 
-pub use contents::{Contents, Operation};
+pub use contents::{Contents, FlashOperation};
 
 use crate::device::*;
 
@@ -65,8 +65,8 @@ pub enum Torn {
 
 /// An operation of a bank.
 #[derive(Debug, Clone, PartialEq, Eq)]
-struct Work {
-    operation: Operation,
+struct BankOperation {
+    operation: FlashOperation,
     until: Picos,
 }
 
@@ -76,7 +76,7 @@ struct Half {
     keys: Option<usize>,
     is_locked_out: bool,
     flags: u32,
-    work: Option<Work>,
+    work: Option<BankOperation>,
     /// The write buffer: address of the flash word, its bytes, and which of them were written.
     collected: Option<(u32, [u8; 32], u32)>,
 }
@@ -93,7 +93,7 @@ pub struct Flash {
     pub fails_during: Option<u64>,
     operations: u64,
     /// If it is there, each operation is noted in it when it begins.
-    pub journal: Option<Vec<Operation>>,
+    pub journal: Option<Vec<FlashOperation>>,
     /// Ranges that have changed since [`Flash::take_changed`].
     changed: Vec<(u32, u32)>,
     /// Number of erased sectors.
@@ -174,7 +174,7 @@ impl Flash {
     /// before, some erased, and the others torn.
     pub fn lose_power(&mut self) {
         for half in &mut self.halves {
-            if let Some(Work { operation, .. }) = half.work.take() {
+            if let Some(BankOperation { operation, .. }) = half.work.take() {
                 self.contents.interrupt(&operation, self.leaves, self.operations as u32);
             }
         }
@@ -229,7 +229,7 @@ impl Flash {
         if !self.contents.takes_a_write(word) {
             return refuse("the flash word was written before; it is to be erased first");
         }
-        self.begin(index, Operation::Program { address: word, bytes: content }, now + PROGRAM);
+        self.begin(index, FlashOperation::Program { address: word, bytes: content }, now + PROGRAM);
         Ok(())
     }
 
@@ -251,7 +251,7 @@ impl Flash {
             (false, _) => Ok(()),
             (true, SER) => {
                 let first = BANK * index as u32 + SECTOR * (value >> 8 & 7);
-                self.begin(index, Operation::Erase { first }, now + ERASE);
+                self.begin(index, FlashOperation::Erase { first }, now + ERASE);
                 Ok(())
             }
             _ => refuse("START without SER alone is not modelled"),
@@ -273,22 +273,22 @@ impl Flash {
         Ok(())
     }
 
-    fn begin(&mut self, index: usize, operation: Operation, until: Picos) {
-        self.halves[index].work = Some(Work { operation, until });
+    fn begin(&mut self, index: usize, operation: FlashOperation, until: Picos) {
+        self.halves[index].work = Some(BankOperation { operation, until });
         self.operations += 1;
         if let Some(journal) = &mut self.journal {
             journal.push(operation);
         }
     }
 
-    fn finish(&mut self, operation: &Operation) {
+    fn finish(&mut self, operation: &FlashOperation) {
         self.contents.execute(operation);
         match *operation {
-            Operation::Erase { first } => {
+            FlashOperation::Erase { first } => {
                 self.changed.push((first, SECTOR));
                 self.erases += 1;
             }
-            Operation::Program { address, .. } => self.changed.push((address, WORD)),
+            FlashOperation::Program { address, .. } => self.changed.push((address, WORD)),
         }
     }
 }

@@ -3,16 +3,16 @@
 use std::ffi::{c_int, c_void};
 
 use super::library::Uc;
-use super::{Engine, Exit, Flow, Handler, Shared};
+use super::{Engine, Exit, Flow, Handler, HookState};
 
 /// Calls the handler of the present run.
 fn with<T>(
     uc: Uc,
     user: *mut c_void,
-    call: impl FnOnce(&mut dyn Handler, Engine, &Shared) -> T,
+    call: impl FnOnce(&mut dyn Handler, Engine, &HookState) -> T,
 ) -> Option<T> {
     // SAFETY: `user` is the core's `shared`, which lives as long as the engine.
-    let shared = unsafe { &*user.cast::<Shared>() };
+    let shared = unsafe { &*user.cast::<HookState>() };
     let handler = shared.handler.get()?;
     // SAFETY: it is borrowed by `run`, which has not returned; callbacks do not nest.
     let handler = unsafe { &mut *handler };

@@ -30,12 +30,12 @@ fn program() -> &'static Program {
 }
 
 /// The contents of a place for the store. It takes a write anywhere, like a debugger.
-struct Copy(Vec<Word>);
+struct FlashCopy(Vec<Word>);
 
 const WORDS: u16 = 4096;
 const FLASH: u32 = 0x0800_0000;
 
-impl Flash for Copy {
+impl Flash for FlashCopy {
     fn geometry(&self) -> Geometry {
         Geometry { sectors: 2, words: WORDS }
     }
@@ -53,11 +53,11 @@ impl Flash for Copy {
     }
 }
 
-pub(crate) struct Bench {
+pub(crate) struct LoaderBench {
     pub(crate) chip: Chip,
 }
 
-impl Bench {
+impl LoaderBench {
     pub(crate) fn new() -> Self {
         Self { chip: Chip::new(program(), &[]).unwrap_or_else(|error| panic!("{error}")) }
     }
@@ -81,7 +81,7 @@ impl Bench {
         }
     }
 
-    fn place(&mut self, side: Side) -> Copy {
+    fn place(&mut self, side: Side) -> FlashCopy {
         let flash = &self.chip.devices().flash;
         let torn: Vec<u32> = flash.torn().collect();
         let words = STORES.sectors(side).into_iter().flat_map(|start| {
@@ -89,7 +89,7 @@ impl Bench {
             let bytes = &flash.cells()[first as usize..][..BOARD.sector as usize];
             (first..).step_by(WORD).zip(bytes.as_chunks().0)
         });
-        Copy(words.map(|(at, word)| if torn.contains(&at) { [0; WORD] } else { *word }).collect())
+        FlashCopy(words.map(|(at, word)| if torn.contains(&at) { [0; WORD] } else { *word }).collect())
     }
 
     /// The marks of the store.

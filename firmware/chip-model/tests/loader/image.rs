@@ -13,7 +13,7 @@ pub(crate) const STACK: u32 = 0x2401_0000;
 
 /// What a program does.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Does {
+pub(crate) enum ProgramKind {
     /// Says that it is there, and goes on for ever.
     Stay,
     /// Asks for a reset.
@@ -34,11 +34,11 @@ pub(crate) fn mark(slot: Slot) -> u32 {
 }
 
 /// Instructions and, behind them, the words that they load (Armv7-M ARM A7.7).
-fn code(does: Does, slot: Slot) -> (Vec<u16>, Vec<u32>) {
+fn code(does: ProgramKind, slot: Slot) -> (Vec<u16>, Vec<u32>) {
     // ldr r0, the first; ldr r1, the second; str r1, [r0]
     let begin = [(0, 0), (1, 1)];
     match does {
-        Does::Stay => {
+        ProgramKind::Stay => {
             let mut code = loads(&begin, 10);
             // str r1, [r0]; ldr r2, the third; ldr r1, [r2]; str r1, [r0, #4]; mov r1, sp; str r1, [r0, #8]; b .
             code.push(0x6001);
@@ -46,12 +46,12 @@ fn code(does: Does, slot: Slot) -> (Vec<u16>, Vec<u32>) {
             code.extend([0x6811, 0x6041, 0x4669, 0x6081, 0xE7FE, 0xBF00]);
             (code, vec![LEAVES, mark(slot), 0xE000_ED08])
         }
-        Does::Restart => {
+        ProgramKind::Restart => {
             let mut code = loads(&begin, 4);
             code.extend([0x6001, 0xE7FE]);
             (code, vec![0xE000_ED0C, 0x05FA_0004])
         }
-        Does::Hang => {
+        ProgramKind::Hang => {
             let mut code = loads(&begin, 8);
             // str r1, [r0]; movs r1, #0; str r1, [r0, #4]; movs r1, #15; str r1, [r0, #8]; b .
             code.extend([0x6001, 0x2100, 0x6041, 0x210F, 0x6081, 0xE7FE]);
@@ -72,7 +72,7 @@ fn load(register: u16, nth: usize, at: usize, len: usize) -> u16 {
 }
 
 impl Image {
-    pub(crate) fn new(slot: Slot, does: Does) -> Self {
+    pub(crate) fn new(slot: Slot, does: ProgramKind) -> Self {
         let start = BOARD.slot(slot) + IMAGE_OFFSET;
         let (code, words) = code(does, slot);
         let mut bytes: Vec<u8> = [STACK, start + 8 + 1].iter().flat_map(|word| word.to_le_bytes()).collect();

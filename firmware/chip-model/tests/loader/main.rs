@@ -4,8 +4,8 @@
 mod bench;
 mod image;
 
-use bench::{Bench, GOOD_A, mark_b};
-use image::{Does, Image};
+use bench::{GOOD_A, LoaderBench, mark_b};
+use image::{Image, ProgramKind};
 use recipe_chip_model::device::{MILLI, SECOND};
 use recipe_chip_model::models::flash::Torn;
 use recipe_update::{Ended, NUCLEO_H743ZI as BOARD, Slot, SlotMarks};
@@ -13,8 +13,8 @@ use recipe_update::{Ended, NUCLEO_H743ZI as BOARD, Slot, SlotMarks};
 #[test]
 #[ignore = "needs CHIP_UNICORN and CHIP_LOADER"]
 fn the_good_slot_runs_as_after_a_reset() {
-    let mut bench = Bench::new();
-    bench.put(Slot::A, &Image::new(Slot::A, Does::Stay));
+    let mut bench = LoaderBench::new();
+    bench.put(Slot::A, &Image::new(Slot::A, ProgramKind::Stay));
     bench.mark(GOOD_A);
     assert_eq!(bench.runs(), Slot::A);
     let [_, vectors, stack] = bench.left();
@@ -30,8 +30,8 @@ fn the_good_slot_runs_as_after_a_reset() {
 #[ignore = "needs CHIP_UNICORN and CHIP_LOADER"]
 fn the_first_firmware_becomes_the_good_one() {
     for slot in Slot::ALL {
-        let mut bench = Bench::new();
-        bench.put(slot, &Image::new(slot, Does::Stay));
+        let mut bench = LoaderBench::new();
+        bench.put(slot, &Image::new(slot, ProgramKind::Stay));
         assert_eq!(bench.runs(), slot);
         let took = bench.chip.now();
         println!("{} ms until it runs, {} instructions", took / MILLI, bench.chip.instructions());
@@ -42,13 +42,13 @@ fn the_first_firmware_becomes_the_good_one() {
 #[test]
 #[ignore = "needs CHIP_UNICORN and CHIP_LOADER"]
 fn a_firmware_that_restarts_or_hangs_on_trial_has_three_starts() {
-    for does in [Does::Restart, Does::Hang] {
-        let mut bench = Bench::new();
-        bench.put(Slot::A, &Image::new(Slot::A, Does::Stay));
+    for does in [ProgramKind::Restart, ProgramKind::Hang] {
+        let mut bench = LoaderBench::new();
+        bench.put(Slot::A, &Image::new(Slot::A, ProgramKind::Stay));
         bench.put(Slot::B, &Image::new(Slot::B, does));
         bench.mark(mark_b(3));
         assert_eq!(bench.runs(), Slot::A);
-        let ended = if does == Does::Hang { &bench.chip.resets } else { &bench.chip.restarts };
+        let ended = if does == ProgramKind::Hang { &bench.chip.resets } else { &bench.chip.restarts };
         assert_eq!(ended.len(), 3);
         let last = Some((Slot::B, Ended::Failed));
         assert_eq!(bench.marks(), SlotMarks { good: Some(Slot::A), trial: None, last });
@@ -58,16 +58,16 @@ fn a_firmware_that_restarts_or_hangs_on_trial_has_three_starts() {
 #[test]
 #[ignore = "needs CHIP_UNICORN and CHIP_LOADER"]
 fn what_is_damaged_or_foreign_is_passed_over() {
-    let mut bench = Bench::new();
-    let mut foreign = Image::new(Slot::B, Does::Stay);
+    let mut bench = LoaderBench::new();
+    let mut foreign = Image::new(Slot::B, ProgramKind::Stay);
     foreign.sign(&[9; 32]);
-    bench.put(Slot::A, &Image::new(Slot::A, Does::Stay));
+    bench.put(Slot::A, &Image::new(Slot::A, ProgramKind::Stay));
     bench.put(Slot::B, &foreign);
     bench.mark(mark_b(3));
     assert_eq!(bench.runs(), Slot::A);
     assert_eq!(bench.marks().last, Some((Slot::B, Ended::Failed)));
     // A word of the good one cannot be read.
-    bench.put(Slot::B, &Image::new(Slot::B, Does::Stay));
+    bench.put(Slot::B, &Image::new(Slot::B, ProgramKind::Stay));
     bench.chip.tear(BOARD.slot(Slot::A) + 1024 + 20 * 32).expect("there is flash");
     bench.begin_again();
     assert_eq!(bench.runs(), Slot::B);
@@ -77,7 +77,7 @@ fn what_is_damaged_or_foreign_is_passed_over() {
 #[test]
 #[ignore = "needs CHIP_UNICORN and CHIP_LOADER"]
 fn where_nothing_can_run_the_lamp_blinks() {
-    let mut bench = Bench::new();
+    let mut bench = LoaderBench::new();
     bench.chip.tear(BOARD.slot(Slot::A)).expect("there is flash");
     bench.run(2 * SECOND);
     let led = bench.red_led();
@@ -93,9 +93,10 @@ fn where_nothing_can_run_the_lamp_blinks() {
 #[ignore = "needs CHIP_UNICORN and CHIP_LOADER"]
 fn the_power_is_cut_at_every_operation_of_a_trial() {
     // One chip for all: a new one would translate the loader again.
-    let mut bench = Bench::new();
-    let (stays, restarts) = (Image::new(Slot::A, Does::Stay), Image::new(Slot::B, Does::Restart));
-    let prepare = |bench: &mut Bench| {
+    let mut bench = LoaderBench::new();
+    let (stays, restarts) =
+        (Image::new(Slot::A, ProgramKind::Stay), Image::new(Slot::B, ProgramKind::Restart));
+    let prepare = |bench: &mut LoaderBench| {
         bench.blank();
         bench.put(Slot::A, &stays);
         bench.put(Slot::B, &restarts);

@@ -13,7 +13,7 @@ const FORMAT: Format = Format { baud: 115_200, odd_parity: None, stop_bits: 1 };
 
 /// How a broker behaves.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Mood {
+pub(crate) enum BrokerMode {
     /// As it should.
     Well,
     /// It refuses CONNECT with this code.
@@ -30,7 +30,7 @@ pub(crate) enum Mood {
 
 /// A publication.
 #[derive(Debug, Clone)]
-pub(crate) struct Told {
+pub(crate) struct EdgeMessages {
     pub(crate) topic: String,
     pub(crate) metrics: Vec<Metric>,
     pub(crate) seq: Option<u64>,
@@ -50,9 +50,9 @@ pub(crate) struct Metric {
 pub(crate) struct Broker {
     listening: SocketHandle,
     datagrams: SocketHandle,
-    pub(crate) mood: Mood,
+    pub(crate) mood: BrokerMode,
     bytes: Vec<u8>,
-    pub(crate) told: Vec<Told>,
+    pub(crate) told: Vec<EdgeMessages>,
     /// User, password and the number in the will, of each CONNECT.
     pub(crate) connects: Vec<(String, String, u64)>,
     pub(crate) pings: usize,
@@ -69,7 +69,7 @@ impl Broker {
         Self {
             listening: robot.add_server(),
             datagrams: robot.add_datagrams(123),
-            mood: Mood::Well,
+            mood: BrokerMode::Well,
             bytes: Vec::new(),
             told: Vec::new(),
             connects: Vec::new(),
@@ -113,7 +113,7 @@ impl Broker {
         let socket = connection(bench, self.listening);
         if !socket.is_open() {
             self.bytes.clear();
-            if mood != Mood::Gone {
+            if mood != BrokerMode::Gone {
                 socket.listen(1883).expect("it is closed");
             }
             return;
@@ -126,8 +126,8 @@ impl Broker {
             return;
         }
         match mood {
-            Mood::Full => return,
-            Mood::Garbage if socket.can_recv() => {
+            BrokerMode::Full => return,
+            BrokerMode::Garbage if socket.can_recv() => {
                 let _ = socket.recv(|bytes| (bytes.len(), ()));
                 let _ = socket.send_slice(&[0xA5; 700]);
                 return;
@@ -142,7 +142,7 @@ impl Broker {
                 1 => {
                     self.connects.push(connect(&body));
                     match mood {
-                        Mood::Refuses(code) => &[0x20, 2, 0, code],
+                        BrokerMode::Refuses(code) => &[0x20, 2, 0, code],
                         _ => &[0x20, 2, 0, 0],
                     }
                 }
@@ -157,7 +157,7 @@ impl Broker {
                 }
                 _ => &[],
             };
-            if mood != Mood::Silent {
+            if mood != BrokerMode::Silent {
                 let _ = connection(bench, self.listening).send_slice(answer);
             }
         }
@@ -217,11 +217,11 @@ fn connect(body: &[u8]) -> (String, String, u64) {
     (user, password, number)
 }
 
-fn told(body: &[u8]) -> Told {
+fn told(body: &[u8]) -> EdgeMessages {
     let mut rest = body;
     let topic = String::from_utf8(text(&mut rest).to_vec()).expect("a text");
     let (metrics, seq) = payload(rest);
-    Told { topic, metrics, seq }
+    EdgeMessages { topic, metrics, seq }
 }
 
 fn payload(bytes: &[u8]) -> (Vec<Metric>, Option<u64>) {

@@ -12,7 +12,7 @@
 use std::collections::BTreeSet;
 
 use recipe_chip_model::device::{MILLI, SECOND};
-use recipe_chip_model::models::flash::{Contents, Operation, Torn};
+use recipe_chip_model::models::flash::{Contents, FlashOperation, Torn};
 use recipe_update::{IMAGE_OFFSET, NUCLEO_H743ZI as BOARD, Slot};
 
 use crate::Bench;
@@ -29,7 +29,7 @@ const FLASH: u32 = 0x0800_0000;
 
 /// What an operation belongs to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-enum Stage {
+enum CutStage {
     /// The slot is erased.
     Erase,
     /// A word of the image.
@@ -49,7 +49,7 @@ enum Stage {
 /// An update.
 struct Recorded {
     before: Contents,
-    operations: Vec<Operation>,
+    operations: Vec<FlashOperation>,
     /// So many operations until the firmware was whole, until it was to be tried, and until the trial ran.
     whole: usize,
     marked: usize,
@@ -78,27 +78,27 @@ impl Recorded {
         Self { before, operations, whole, marked, moved }
     }
 
-    fn stage(&self, nth: usize) -> Stage {
+    fn stage(&self, nth: usize) -> CutStage {
         let image = BOARD.slot(Slot::B) + IMAGE_OFFSET - FLASH;
-        let first_of_move = |operation: &Operation| matches!(operation, Operation::Erase { .. });
+        let first_of_move = |operation: &FlashOperation| matches!(operation, FlashOperation::Erase { .. });
         let counted = self.operations[self.marked..].iter().position(first_of_move).expect("it is moved");
         match self.operations[nth] {
-            _ if nth >= self.moved => Stage::Confirm,
-            _ if nth >= self.marked + counted => Stage::Move,
-            _ if nth >= self.marked => Stage::Start,
-            _ if nth >= self.whole => Stage::Mark,
-            Operation::Erase { .. } => Stage::Erase,
-            Operation::Program { address, .. } if address < image => Stage::Header,
-            Operation::Program { .. } => Stage::Image,
+            _ if nth >= self.moved => CutStage::Confirm,
+            _ if nth >= self.marked + counted => CutStage::Move,
+            _ if nth >= self.marked => CutStage::Start,
+            _ if nth >= self.whole => CutStage::Mark,
+            FlashOperation::Erase { .. } => CutStage::Erase,
+            FlashOperation::Program { address, .. } if address < image => CutStage::Header,
+            FlashOperation::Program { .. } => CutStage::Image,
         }
     }
 
     /// Those that are cut, in their order: all, or those for `.ci/run`.
     fn chosen(&self, words: Option<usize>) -> BTreeSet<usize> {
-        let is_image = |nth: &usize| self.stage(*nth) == Stage::Image;
+        let is_image = |nth: &usize| self.stage(*nth) == CutStage::Image;
         let (image, others): (Vec<_>, Vec<_>) = (0..self.operations.len()).partition(is_image);
         let is_last = |nth: usize| self.operations.len() == nth + 1 || self.stage(nth + 1) != self.stage(nth);
-        let is_cut = |nth: &usize| words.is_some() || self.stage(*nth) < Stage::Start || is_last(*nth);
+        let is_cut = |nth: &usize| words.is_some() || self.stage(*nth) < CutStage::Start || is_last(*nth);
         let mut chosen: BTreeSet<_> = others.into_iter().filter(is_cut).collect();
         // The first word, the last one, and any others.
         chosen.extend(image.first().into_iter().chain(image.last()));
@@ -112,9 +112,9 @@ impl Recorded {
 }
 
 /// Says what was cut when a check fails.
-struct Telling(String);
+struct PrintOnPanic(String);
 
-impl Drop for Telling {
+impl Drop for PrintOnPanic {
     fn drop(&mut self) {
         if std::thread::panicking() {
             eprintln!("{}", self.0);
@@ -177,13 +177,13 @@ fn the_power_is_cut_in_each_operation_of_an_update() {
     let recorded = Recorded::new(&mut bench);
     let chosen = recorded.chosen(words);
     let (mut flash, mut starts, mut finished) = (recorded.before.clone(), 0, BTreeSet::new());
-    let mut cuts = std::collections::BTreeMap::<Stage, u32>::new();
+    let mut cuts = std::collections::BTreeMap::<CutStage, u32>::new();
     for (operation, nth) in recorded.operations.iter().zip(0..) {
         if nth >= from && chosen.contains(&nth) {
             let kinds = if words.is_some() { &KINDS[..] } else { &KINDS[nth % KINDS.len()..][..1] };
             for leaves in kinds {
                 let stage = recorded.stage(nth);
-                let _telling = Telling(format!("cut {nth}, {stage:?}, {leaves:?}: {operation:X?}"));
+                let _telling = PrintOnPanic(format!("cut {nth}, {stage:?}, {leaves:?}: {operation:X?}"));
                 let mut cut = flash.clone();
                 cut.interrupt(operation, *leaves, nth as u32);
                 start_with(&mut bench, &cut);
@@ -191,8 +191,8 @@ fn the_power_is_cut_in_each_operation_of_an_update() {
                 // Without the variable one of which all is missing, and each that is on trial.
                 let is_to_finish = match words {
                     Some(_) => finished.insert((stage, format!("{leaves:?}"))),
-                    None if stage == Stage::Image => finished.insert((stage, String::new())),
-                    None => stage >= Stage::Start,
+                    None if stage == CutStage::Image => finished.insert((stage, String::new())),
+                    None => stage >= CutStage::Start,
                 };
                 if is_to_finish {
                     finish(&mut bench);

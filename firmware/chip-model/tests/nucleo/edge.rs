@@ -13,7 +13,7 @@ use recipe_test_kit::http::Response;
 use serde_json::Value;
 
 use crate::Bench;
-use crate::broker::{Broker, Mood, Told};
+use crate::broker::{Broker, BrokerMode, EdgeMessages};
 use crate::client::{ask_signed, claim, exchange, signed_with};
 use crate::load::work;
 use crate::page::cyclic;
@@ -90,7 +90,7 @@ fn until_told(
     broker: &mut Broker,
     from: usize,
     what: &str,
-    is_it: impl Fn(&Told) -> bool,
+    is_it: impl Fn(&EdgeMessages) -> bool,
 ) -> usize {
     let mut found = None;
     bench.until(what, 60 * SECOND, |bench| {
@@ -139,7 +139,7 @@ fn a_plant_reads_the_board_from_birth_to_the_next_session() {
     assert_eq!(broker.connects, [("press".into(), "cold steel".into(), 0)]);
     let told = broker.told[birth].clone();
     assert_eq!((told.topic.as_str(), told.seq), ("spBv1.0/hall/NBIRTH/press", Some(0)));
-    let metric = |told: &Told, name: &str| {
+    let metric = |told: &EdgeMessages, name: &str| {
         let found = told.metrics.iter().find(|metric| metric.name.as_deref() == Some(name));
         found.unwrap_or_else(|| panic!("{name}: {told:?}")).clone()
     };
@@ -199,11 +199,11 @@ fn why_nothing_is_told_is_said_and_the_node_comes_back() {
     let (mut bench, mut broker) = restarted(claimed(), &settings());
     until_verb(&mut bench, &mut broker, 0, "NBIRTH");
     for (mood, why) in [
-        (Mood::Gone, "no connection"),
-        (Mood::Refuses(4), "the broker refuses the user or the password"),
-        (Mood::Refuses(5), "the broker does not allow this client"),
-        (Mood::Silent, "the broker does not answer"),
-        (Mood::Garbage, "the broker does not speak MQTT 3.1.1"),
+        (BrokerMode::Gone, "no connection"),
+        (BrokerMode::Refuses(4), "the broker refuses the user or the password"),
+        (BrokerMode::Refuses(5), "the broker does not allow this client"),
+        (BrokerMode::Silent, "the broker does not answer"),
+        (BrokerMode::Garbage, "the broker does not speak MQTT 3.1.1"),
     ] {
         broker.mood = mood;
         broker.kill(&mut bench);
@@ -214,7 +214,7 @@ fn why_nothing_is_told_is_said_and_the_node_comes_back() {
     broker.device = Some(77);
     run(&mut bench, &mut broker, SECOND);
     let from = broker.told.len();
-    broker.mood = Mood::Well;
+    broker.mood = BrokerMode::Well;
     broker.kill(&mut bench);
     let birth = until_verb(&mut bench, &mut broker, from, "NBIRTH");
     until_told(&mut bench, &mut broker, birth, "the past", |told| {
@@ -236,12 +236,12 @@ fn a_broker_that_dies_and_comes_back_costs_the_cell_no_frame_and_no_cycle() {
     let begin = bench.now();
     // All moods, one after the other; a node that has failed waits two seconds at most before it tries again.
     let moods = [
-        (0, Mood::Well),
-        (1_500, Mood::Full),
-        (2_500, Mood::Gone),
-        (3_000, Mood::Garbage),
-        (4_500, Mood::Silent),
-        (5_000, Mood::Well),
+        (0, BrokerMode::Well),
+        (1_500, BrokerMode::Full),
+        (2_500, BrokerMode::Gone),
+        (3_000, BrokerMode::Garbage),
+        (4_500, BrokerMode::Silent),
+        (5_000, BrokerMode::Well),
     ];
     let mut asked = 0;
     let edge = work(&mut bench, span, |bench| {
@@ -252,7 +252,7 @@ fn a_broker_that_dies_and_comes_back_costs_the_cell_no_frame_and_no_cycle() {
         }
         broker.go_on(bench);
         // Births again and again.
-        if mood == Mood::Well && broker.is_connected(bench) && ms / 300 != asked {
+        if mood == BrokerMode::Well && broker.is_connected(bench) && ms / 300 != asked {
             asked = ms / 300;
             broker.publish(bench, "spBv1.0/hall/NCMD/press", REBIRTH);
         }

@@ -15,7 +15,7 @@ const COUNTERS: [&str; 5] = ["frames_in", "skipped_cycles", "resync_bytes", "dis
 const FORMAT: Format = Format { baud: 115_200, odd_parity: None, stop_bits: 1 };
 
 /// What a cell did in the time.
-pub(crate) struct Did {
+pub(crate) struct LoadReport {
     span: Picos,
     /// Of each bus: frames that left, and how much one was off its time at most.
     out: [(&'static str, usize, Picos); 2],
@@ -34,7 +34,7 @@ fn align(bench: &mut Bench) {
 }
 
 /// Frames come on the line every 8 ms and on CAN every 2 ms; `others` do what they do in between.
-pub(crate) fn work(bench: &mut Bench, span: Picos, mut others: impl FnMut(&mut Bench)) -> Did {
+pub(crate) fn work(bench: &mut Bench, span: Picos, mut others: impl FnMut(&mut Bench)) -> LoadReport {
     align(bench);
     let (begin, instructions) = (bench.now(), bench.chip.instructions());
     let mut number = 0_u8;
@@ -56,10 +56,10 @@ pub(crate) fn work(bench: &mut Bench, span: Picos, mut others: impl FnMut(&mut B
     // Connections of the others are gone, or given up.
     bench.run(7 * SECOND);
     let status = ask_signed(bench, "GET /api/v1/status").json();
-    Did { span, out, status, instructions }
+    LoadReport { span, out, status, instructions }
 }
 
-impl Did {
+impl LoadReport {
     fn print(&self, what: &str) {
         let millions = self.instructions as f64 * SECOND as f64 / self.span as f64 / 1e6;
         println!("{what}: {millions:.1} million instructions a second");

@@ -68,12 +68,12 @@ fn until<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
 }
 
 /// The running program; killed if it has not ended.
-struct Board {
+struct RealtimeProcess {
     child: Child,
     folder: TempDir,
 }
 
-impl Board {
+impl RealtimeProcess {
     fn start() -> Self {
         let folder = tempfile::tempdir().unwrap();
         let place = |name: &str| folder.path().join(name);
@@ -137,7 +137,7 @@ impl Board {
     }
 }
 
-impl Drop for Board {
+impl Drop for RealtimeProcess {
     fn drop(&mut self) {
         let _ = self.child.kill();
         let _ = self.child.wait();
@@ -156,7 +156,7 @@ fn until_gone(process: &Path) {
 #[test]
 #[ignore = "needs CHIP_UNICORN and CHIP_ELF"]
 fn a_line_has_its_speed_and_virtual_time_is_never_ahead() {
-    let board = Board::start();
+    let board = RealtimeProcess::start();
     board.until_log("configuration: ");
     let mut line = board.connect("line");
     // The connection may begin in the middle of a frame.
@@ -184,7 +184,7 @@ fn a_line_has_its_speed_and_virtual_time_is_never_ahead() {
 #[test]
 #[ignore = "needs CHIP_UNICORN and CHIP_ELF"]
 fn clients_acknowledge_and_hear_each_other() {
-    let board = Board::start();
+    let board = RealtimeProcess::start();
     board.until_log("frames are not acknowledged by any node");
     let mut clients = [board.connect("bus"), board.connect("bus")];
     for client in &mut clients {
@@ -226,7 +226,7 @@ fn clients_acknowledge_and_hear_each_other() {
 #[test]
 #[ignore = "needs CHIP_UNICORN and CHIP_ELF"]
 fn time_can_be_stopped() {
-    let board = Board::start();
+    let board = RealtimeProcess::start();
     board.until_log("configuration: ");
     let now = || board.figures()["virtual_s"].as_f64().unwrap();
     assert_eq!(board.ask("stop"), "done");
@@ -250,7 +250,7 @@ fn time_can_be_stopped() {
 #[test]
 #[ignore = "needs CHIP_UNICORN and CHIP_ELF"]
 fn the_button_can_be_pressed_and_the_leds_seen() {
-    let board = Board::start();
+    let board = RealtimeProcess::start();
     board.until_log("configuration: ");
     assert_eq!(board.ask("press 200"), "done");
     assert_eq!(board.ask("press long"), "a number of milliseconds is needed: press long");
@@ -268,7 +268,7 @@ fn the_button_can_be_pressed_and_the_leds_seen() {
 #[test]
 #[ignore = "needs CHIP_UNICORN and CHIP_ELF"]
 fn ctrl_c_ends_it_and_leaves_nothing() {
-    let mut board = Board::start();
+    let mut board = RealtimeProcess::start();
     board.until_log(" address 10.0.2.15");
     let qemu = board.qemu();
     board.signal(Signal::INT);
@@ -285,7 +285,7 @@ fn ctrl_c_ends_it_and_leaves_nothing() {
 #[test]
 #[ignore = "needs CHIP_UNICORN and CHIP_ELF"]
 fn killed_it_takes_qemu_with_it() {
-    let mut board = Board::start();
+    let mut board = RealtimeProcess::start();
     board.until_log(" address 10.0.2.15");
     let qemu = board.qemu();
     board.signal(Signal::KILL);

@@ -17,9 +17,9 @@ const WORDS: u16 = 4096;
 const FLASH: u32 = 0x0800_0000;
 
 /// The contents of the two sectors. It takes a write anywhere, like a debugger.
-struct Copy(Vec<Word>);
+struct FlashCopy(Vec<Word>);
 
-impl Copy {
+impl FlashCopy {
     fn blank() -> Self {
         Self(vec![BLANK; 2 * usize::from(WORDS)])
     }
@@ -47,7 +47,7 @@ impl Copy {
     }
 }
 
-impl Flash for Copy {
+impl Flash for FlashCopy {
     fn geometry(&self) -> Geometry {
         Geometry { sectors: 2, words: WORDS }
     }
@@ -71,8 +71,8 @@ fn cell(constant: u8) -> Vec<u8> {
 }
 
 /// A store with these images kept in order, and these marks.
-fn store_with(images: &[Vec<u8>], marks: Marks) -> Copy {
-    let mut flash = Copy::blank();
+fn store_with(images: &[Vec<u8>], marks: Marks) -> FlashCopy {
+    let mut flash = FlashCopy::blank();
     let mut store = Store::mount(&flash).expect("it is empty");
     for (number, image) in (1..).zip(images) {
         block_on(store.keep(number, number, image, None).expect("there is room").execute(&mut flash))
@@ -83,11 +83,11 @@ fn store_with(images: &[Vec<u8>], marks: Marks) -> Copy {
 }
 
 /// A store that is so full that the next configuration begins another sector.
-fn full_store(images: &[Vec<u8>], marks: Marks) -> Copy {
+fn full_store(images: &[Vec<u8>], marks: Marks) -> FlashCopy {
     let mut flash = store_with(images, marks);
     let mut store = Store::mount(&flash).expect("it was written");
     let mut count = 0;
-    while flash.0[Copy::at(Place { sector: 1, word: WORDS - 6 })] == BLANK {
+    while flash.0[FlashCopy::at(Place { sector: 1, word: WORDS - 6 })] == BLANK {
         count += 1;
         block_on(store.set_counter(0, count).expect("there is room").execute(&mut flash))
             .expect("it is flash");
@@ -97,7 +97,7 @@ fn full_store(images: &[Vec<u8>], marks: Marks) -> Copy {
 
 /// The images that the store on the board holds as live, and before it.
 fn live(bench: &mut Bench) -> Vec<Vec<u8>> {
-    let flash = Copy::of(bench);
+    let flash = FlashCopy::of(bench);
     let store = Store::mount(&flash).expect("it was written");
     let mut buf = [0; recipe_store::MAX_DATA];
     let candidates = store.at_start().candidates;
@@ -124,7 +124,7 @@ const TAKEN_OVER: &str = "the store has taken over the configuration";
 /// kind of torn word, and a second cut in the start after it. Each time the board runs a configuration at once, the
 /// store holds one of `whole` as the live one (none, if it was `prepared` without one), and at last the first of
 /// them.
-fn cut_everywhere(prepared: &Copy, image: &[u8], whole: &[&[u8]]) -> u64 {
+fn cut_everywhere(prepared: &FlashCopy, image: &[u8], whole: &[&[u8]]) -> u64 {
     // One chip for all: a new one would translate the program again.
     let mut bench = Bench::with_image(image);
     let start = |bench: &mut Bench| {
@@ -201,7 +201,7 @@ fn what_a_probe_wrote_is_taken_over_once() {
 #[ignore = "needs CHIP_UNICORN and CHIP_ELF"]
 fn the_power_is_cut_at_every_operation_of_the_first_start() {
     let image = cell(1);
-    let operations = cut_everywhere(&Copy::blank(), &image, &[&image]);
+    let operations = cut_everywhere(&FlashCopy::blank(), &image, &[&image]);
     println!("{operations} operations");
 }
 

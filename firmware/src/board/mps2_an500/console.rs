@@ -17,9 +17,9 @@ pub(crate) fn start() {
     write(UART + 0x8, 1);
 }
 
-struct Console;
+struct ConsoleUart;
 
-impl Write for Console {
+impl Write for ConsoleUart {
     fn write_str(&mut self, text: &str) -> fmt::Result {
         for byte in text.bytes() {
             if read(STATE) & STATE_TX_FULL == 0 {
@@ -32,5 +32,5 @@ impl Write for Console {
 
 /// Prints.
 pub(crate) fn print(text: fmt::Arguments<'_>) {
-    let _ = Console.write_fmt(text);
+    let _ = ConsoleUart.write_fmt(text);
 }

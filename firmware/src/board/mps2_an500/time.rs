@@ -24,19 +24,19 @@ const CYCLES_PER_MICRO: u64 = 25;
 /// Longest alarm: a later one is set in steps. It also ensures that no overflow of the counter is missed.
 const LONGEST: u64 = 60_000_000;
 
-struct Clock {
-    state: Mutex<RefCell<State>>,
+struct TimerDriver {
+    state: Mutex<RefCell<TimerState>>,
 }
 
-struct State {
+struct TimerState {
     queue: Queue,
     /// The last value of the counter, and its number of overflows.
     last: u32,
     rounds: u32,
 }
 
-embassy_time_driver::time_driver_impl!(static CLOCK: Clock = Clock {
-    state: Mutex::new(RefCell::new(State { queue: Queue::new(), last: 0, rounds: 0 })),
+embassy_time_driver::time_driver_impl!(static CLOCK: TimerDriver = TimerDriver {
+    state: Mutex::new(RefCell::new(TimerState { queue: Queue::new(), last: 0, rounds: 0 })),
 });
 
 /// Starts the counter.
@@ -49,7 +49,7 @@ pub(super) fn start() {
     on_alarm();
 }
 
-impl State {
+impl TimerState {
     fn now(&mut self) -> u64 {
         let counter = read(COUNTER);
         if counter < self.last {
@@ -69,15 +69,15 @@ impl State {
     }
 }
 
-impl Clock {
-    fn with<T>(&self, f: impl FnOnce(&mut State) -> T) -> T {
+impl TimerDriver {
+    fn with<T>(&self, f: impl FnOnce(&mut TimerState) -> T) -> T {
         critical_section::with(|cs: CriticalSection<'_>| f(&mut self.state.borrow_ref_mut(cs)))
     }
 }
 
-impl Driver for Clock {
+impl Driver for TimerDriver {
     fn now(&self) -> u64 {
-        self.with(State::now)
+        self.with(TimerState::now)
     }
 
     fn schedule_wake(&self, at: u64, waker: &Waker) {
@@ -92,7 +92,7 @@ impl Driver for Clock {
 /// The alarm's interrupt.
 pub(super) fn on_alarm() {
     write(INTCLEAR, 1);
-    CLOCK.with(State::rearm);
+    CLOCK.with(TimerState::rearm);
 }
 
 /// Lets a timer of the emulator expire soon ([`super::LanRegisters`]).

@@ -40,23 +40,24 @@ const INT_RX: u32 = 2;
 #[derive(Debug)]
 pub(crate) struct Uart(usize);
 
-struct State {
+struct UartState {
     received: Deque<u8, RING>,
     waiting: Deque<u8, RING>,
     reader: WakerRegistration,
     writer: WakerRegistration,
 }
 
-static STATES: [Mutex<RefCell<State>>; COUNT] = [const { Mutex::new(RefCell::new(State::new())) }; COUNT];
+static STATES: [Mutex<RefCell<UartState>>; COUNT] =
+    [const { Mutex::new(RefCell::new(UartState::new())) }; COUNT];
 
 /// Calls `f` with the registers and the shared state, in a critical section.
-fn with<T>(port: usize, f: impl FnOnce(&mut Access<'_>) -> T) -> T {
+fn with<T>(port: usize, f: impl FnOnce(&mut UartAccess<'_>) -> T) -> T {
     critical_section::with(|cs| {
-        f(&mut Access { base: UARTS[port], state: &mut STATES[port].borrow_ref_mut(cs) })
+        f(&mut UartAccess { base: UARTS[port], state: &mut STATES[port].borrow_ref_mut(cs) })
     })
 }
 
-impl State {
+impl UartState {
     const fn new() -> Self {
         Self {
             received: Deque::new(),
@@ -67,12 +68,12 @@ impl State {
     }
 }
 
-struct Access<'a> {
+struct UartAccess<'a> {
     base: u32,
-    state: &'a mut State,
+    state: &'a mut UartState,
 }
 
-impl Access<'_> {
+impl UartAccess<'_> {
     fn set(&self, bit: u32) {
         write(self.base + CTRL, read(self.base + CTRL) | bit);
     }

@@ -63,10 +63,10 @@ fn bypass_calibration() {
 }
 
 /// Receive and transmit.
-pub(super) type Pins = (Peri<'static, PD0>, Peri<'static, PD1>);
+pub(super) type CanPins = (Peri<'static, PD0>, Peri<'static, PD1>);
 
 /// Starts the controller.
-pub(super) fn start(pins: Pins, bitrate: u32) -> Result<CanDevice, StartError> {
+pub(super) fn start(pins: CanPins, bitrate: u32) -> Result<CanDevice, StartError> {
     const FUNCTION: u8 = 9;
     let (mut rx, mut tx) = (Flex::new(pins.0), Flex::new(pins.1));
     rx.set_as_af_unchecked(FUNCTION, AfType::input(Pull::Up));

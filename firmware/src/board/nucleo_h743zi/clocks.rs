@@ -11,7 +11,7 @@ use embassy_stm32::time::Hertz;
 
 /// The source of the clocks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Source {
+pub(super) enum ClockSource {
     /// The 8 MHz of the debugger's crystal.
     External,
     /// The chip's own 64 MHz, within 1 %: good enough for everything but CAN.
@@ -19,22 +19,22 @@ pub(super) enum Source {
 }
 
 /// Checks for the external clock; the initialisation would wait for it for ever.
-pub(super) fn source() -> Source {
+pub(super) fn source() -> ClockSource {
     RCC.cr().modify(|w| w.set_hsebyp(true));
     RCC.cr().modify(|w| w.set_hseon(true));
     // It is ready after a few of its cycles; this waits for some milliseconds.
     for _ in 0..50_000 {
         if RCC.cr().read().hserdy() {
-            return Source::External;
+            return ClockSource::External;
         }
     }
     RCC.cr().modify(|w| w.set_hseon(false));
     RCC.cr().modify(|w| w.set_hsebyp(false));
-    Source::Internal
+    ClockSource::Internal
 }
 
 /// The chip's configuration.
-pub(super) fn config(source: Source) -> Config {
+pub(super) fn config(source: ClockSource) -> Config {
     let mut config = Config::default();
     let rcc = &mut config.rcc;
     rcc.hsi = Some(HSIPrescaler::DIV1);
@@ -42,11 +42,11 @@ pub(super) fn config(source: Source) -> Config {
     rcc.hsi48 = Some(Default::default());
     // 2 MHz times 400, divided by 2 and by 10.
     let (source, prediv) = match source {
-        Source::External => {
+        ClockSource::External => {
             rcc.hse = Some(Hse { freq: Hertz(8_000_000), mode: HseMode::Bypass });
             (PllSource::HSE, PllPreDiv::DIV4)
         }
-        Source::Internal => (PllSource::HSI, PllPreDiv::DIV32),
+        ClockSource::Internal => (PllSource::HSI, PllPreDiv::DIV32),
     };
     rcc.pll1 = Some(Pll {
         source,

@@ -48,7 +48,7 @@ impl fmt::Display for EthernetError {
 }
 
 /// The controller and its pins.
-pub(super) struct Parts {
+pub(super) struct EthernetParts {
     pub(super) mac: Peri<'static, peripherals::ETH>,
     pub(super) sma: Peri<'static, ETH_SMA>,
     pub(super) ref_clk: Peri<'static, PA1>,
@@ -62,7 +62,7 @@ pub(super) struct Parts {
     pub(super) txd1: Peri<'static, PB13>,
 }
 
-impl Parts {
+impl EthernetParts {
     /// Starts the controller. Takes half a second at most, if the PHY provides its clock but does not answer.
     pub(super) fn start<I>(mut self, irqs: I, address: [u8; 6], led: Led) -> Result<Ethernet, EthernetError>
     where

@@ -148,7 +148,7 @@ fn main() -> ! {
         watchdog::supervise(&mut core.SYST);
     }
     let board = Board {
-        serial: serial::Lines::new(serial::Pins {
+        serial: serial::Lines::new(serial::UartPins {
             usart2: (p.PD5, p.PD6, p.PD4),
             uart7: (p.PE8, p.PE7, p.PE9),
         }),

@@ -5,7 +5,7 @@ use embassy_stm32::interrupt::typelevel::{self, Handler, Interrupt};
 use embassy_stm32::pac::{UART7, USART2, usart};
 use embassy_stm32::peripherals::{PD4, PD5, PD6, PE7, PE8, PE9};
 use embassy_stm32::{Peri, peripherals, rcc};
-use firmware::drivers::usart::{BaudError, Registers, Shared, Usart};
+use firmware::drivers::usart::{BaudError, Registers, Usart, UsartShared};
 use proto_core::config::Rs485;
 
 /// An RS-485 line.
@@ -27,8 +27,8 @@ impl Registers for UsartRegisters {
     }
 }
 
-static USART2_STATE: Shared = Shared::new();
-static UART7_STATE: Shared = Shared::new();
+static USART2_STATE: UsartShared = UsartShared::new();
+static UART7_STATE: UsartShared = UsartShared::new();
 
 /// USART2's interrupt.
 pub(super) struct Usart2Interrupt;
@@ -48,7 +48,7 @@ impl Handler<typelevel::UART7> for Uart7Interrupt {
 }
 
 /// The pins of both lines: transmit, receive, driver-enable.
-pub(super) struct Pins {
+pub(super) struct UartPins {
     pub(super) usart2: (Peri<'static, PD5>, Peri<'static, PD6>, Peri<'static, PD4>),
     pub(super) uart7: (Peri<'static, PE8>, Peri<'static, PE7>, Peri<'static, PE9>),
 }
@@ -60,8 +60,8 @@ pub(super) struct Lines {
 }
 
 impl Lines {
-    pub(super) fn new(pins: Pins) -> Self {
-        let Pins { usart2: (tx, rx, de), uart7 } = pins;
+    pub(super) fn new(pins: UartPins) -> Self {
+        let UartPins { usart2: (tx, rx, de), uart7 } = pins;
         Self {
             usart2: Some([Flex::new(tx), Flex::new(rx), Flex::new(de)]),
             uart7: Some([Flex::new(uart7.0), Flex::new(uart7.1), Flex::new(uart7.2)]),

@@ -146,8 +146,8 @@ fn another_chip_or_none_is_refused_in_bounded_time() {
     }
     static WAKER: AtomicWaker = AtomicWaker::new();
     let error = |value| Lan9118::start(Nothing(value), &WAKER).err();
-    assert_eq!(error(0), Some(StartError::Stuck { offset: PMT_CTRL }));
-    assert_eq!(error(u32::MAX), Some(StartError::NoController { found: u32::MAX }));
+    assert_eq!(error(0), Some(Lan9118Error::Stuck { offset: PMT_CTRL }));
+    assert_eq!(error(u32::MAX), Some(Lan9118Error::NoController { found: u32::MAX }));
 }
 
 #[test]

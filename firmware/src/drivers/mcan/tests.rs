@@ -14,22 +14,22 @@ use recipe_chip_model::models::can_bus::{BusFault, Frame as Wire};
 use recipe_chip_model::models::fdcan::Fdcan;
 
 use super::*;
-use crate::drivers::test_chip::Device;
+use crate::drivers::test_chip::TestDevice;
 
 const CLOCK: u32 = 80_000_000;
 const BIT: Picos = 2 * MICRO;
 /// Not 0, so that a missing offset is noticed.
 const OFFSET: u16 = 0x300;
 
-type Model = Rc<Device<Fdcan>>;
+type Model = Rc<TestDevice<Fdcan>>;
 
 impl Registers for Model {
     fn read(&self, offset: u8) -> u32 {
-        Device::read(self, offset.into())
+        TestDevice::read(self, offset.into())
     }
 
     fn write(&self, offset: u8, value: u32) {
-        Device::write(self, offset.into(), value);
+        TestDevice::write(self, offset.into(), value);
     }
 
     fn ram_read(&self, word: u16) -> u32 {
@@ -43,7 +43,7 @@ impl Registers for Model {
     }
 }
 
-struct Bench {
+struct McanBench {
     model: Model,
     mcan: Mcan<Model>,
     waker: &'static AtomicWaker,
@@ -51,22 +51,22 @@ struct Bench {
 
 fn reset() -> Model {
     let clocks = Clocks { fdcan: CLOCK, ..Clocks::default() };
-    Device::new(Fdcan::new(), clocks, &[Pin('D', 0), Pin('D', 1)], 9)
+    TestDevice::new(Fdcan::new(), clocks, &[Pin('D', 0), Pin('D', 1)], 9)
 }
 
 /// On the bus, with filters for these ids.
-fn on_the_bus(ids: &[CanId]) -> Bench {
+fn on_the_bus(ids: &[CanId]) -> McanBench {
     let (model, waker) = (reset(), &*Box::leak(Box::new(AtomicWaker::new())));
     // The bit rate of the other nodes.
     model.with(|can| can.bus.bitrate = 500_000);
     let mut mcan = Mcan::start(Rc::clone(&model), OFFSET, waker, 500_000, CLOCK).unwrap();
     // The board bypasses the clock calibration unit.
-    Device::write(&model, 0x804, Device::read(&model, 0x804) | 1 << 6);
+    TestDevice::write(&model, 0x804, TestDevice::read(&model, 0x804) | 1 << 6);
     let is_on_bus = || model.with(|can| can.is_on_bus());
     assert!(!is_on_bus());
     mcan.set_filters(ids);
     assert!(is_on_bus());
-    Bench { model, mcan, waker }
+    McanBench { model, mcan, waker }
 }
 
 /// A data frame of another node; the bytes after its data are not 0.
@@ -80,7 +80,7 @@ fn wire(id: CanId, data: &[u8]) -> Wire {
     Wire { id, is_extended, is_remote: false, len: data.len() as u8, data: bytes }
 }
 
-impl Bench {
+impl McanBench {
     /// The next event, if there is one now.
     fn next(&mut self) -> Option<CanEvent<CanFrame>> {
         let mut receiving = pin!(self.mcan.receive());
@@ -434,7 +434,7 @@ fn the_interrupt_wakes_who_waits_and_falls_silent_whatever_happened() {
     }
     let mut cell = on_the_bus(&[A, B]);
     let (wakes, waker) = (Arc::new(Wakes::default()), cell.waker);
-    let interrupted = |cell: &mut Bench, happens: &dyn Fn(&Bench)| {
+    let interrupted = |cell: &mut McanBench, happens: &dyn Fn(&McanBench)| {
         let before = wakes.0.load(Ordering::Relaxed);
         {
             let task = Waker::from(Arc::clone(&wakes));
@@ -448,7 +448,7 @@ fn the_interrupt_wakes_who_waits_and_falls_silent_whatever_happened() {
         assert_eq!(wakes.0.load(Ordering::Relaxed), before + 1);
         core::iter::from_fn(|| cell.next()).last()
     };
-    let comes = |cell: &Bench| {
+    let comes = |cell: &McanBench| {
         let end = cell.model.now() + 10 * MILLI;
         while !cell.model.interrupt_line() && cell.model.hop(end) {}
     };
@@ -489,8 +489,8 @@ fn no_controller_or_no_clock_is_refused() {
     }
     static WAKER: AtomicWaker = AtomicWaker::new();
     let started = Mcan::start(Dead, 0, &WAKER, 500_000, CLOCK).map(|_| ());
-    assert_eq!(started, Err(StartError::NoController { found: 0 }));
+    assert_eq!(started, Err(McanError::NoController { found: 0 }));
     let refused = Mcan::start(reset(), 0, &WAKER, 990_000, CLOCK).map(|_| ());
     let error = BitrateError { bitrate: 990_000, clock: CLOCK };
-    assert_eq!(refused, Err(StartError::Bitrate(error)));
+    assert_eq!(refused, Err(McanError::Bitrate(error)));
 }

@@ -17,19 +17,19 @@ use recipe_chip_model::models::line::{Format, Line as Wires, Sent};
 use recipe_chip_model::models::usart::{Pins, Usart as Chip};
 
 use super::*;
-use crate::drivers::test_chip::Device;
+use crate::drivers::test_chip::TestDevice;
 
 const CLOCK: u32 = 100_000_000;
 
-type Model = Rc<Device<Chip>>;
+type Model = Rc<TestDevice<Chip>>;
 
 impl Registers for Model {
     fn read(&self, offset: u8) -> u32 {
-        Device::read(self, offset.into())
+        TestDevice::read(self, offset.into())
     }
 
     fn write(&self, offset: u8, value: u32) {
-        Device::write(self, offset.into(), value);
+        TestDevice::write(self, offset.into(), value);
     }
 }
 
@@ -42,7 +42,7 @@ impl Wake for Wakes {
     }
 }
 
-struct Bench {
+struct UsartBench {
     model: Model,
     line: Usart<Model>,
     wakes: Arc<Wakes>,
@@ -61,12 +61,12 @@ fn settings(baud: u32, parity: Parity, stop_bits: u8) -> Rs485 {
     }
 }
 
-impl Bench {
+impl UsartBench {
     fn start(line: Rs485) -> Self {
         let [tx, rx, de] = [Pin('D', 5), Pin('D', 6), Pin('D', 4)];
         let clocks = Clocks { usart: CLOCK, ..Clocks::default() };
-        let model = Device::new(Chip::new(Pins { tx, rx, de, function: 7 }), clocks, &[tx, rx, de], 7);
-        let shared = &*Box::leak(Box::new(Shared::new()));
+        let model = TestDevice::new(Chip::new(Pins { tx, rx, de, function: 7 }), clocks, &[tx, rx, de], 7);
+        let shared = &*Box::leak(Box::new(UsartShared::new()));
         let odd_parity = match line.parity {
             Parity::None => None,
             parity => Some(parity == Parity::Odd),
@@ -199,7 +199,7 @@ fn speed_parity_and_stop_bits_are_the_configurations() {
         (settings(1_200, Parity::None, 2), 41_667, 1, 0, 2 << 12),
         (settings(4_000_000, Parity::None, 1), 25, 0, 0, 0),
     ] {
-        let mut bench = Bench::start(line);
+        let mut bench = UsartBench::start(line);
         assert_eq!((bench.get(BRR), bench.get(PRESC)), (divider, prescaler), "{} baud", line.baud);
         assert_eq!(bench.get(CR1) & (CR1_NINE_BITS | CR1_PARITY | CR1_ODD), cr1);
         assert_eq!(bench.get(CR2), cr2);
@@ -246,7 +246,7 @@ fn every_speed_that_a_file_can_have_is_within_two_per_cent_or_refused() {
 
 #[test]
 fn a_frame_of_any_length_is_there_after_one_character_of_silence() {
-    let mut bench = Bench::new();
+    let mut bench = UsartBench::new();
     for len in 1..=60 {
         assert!(bench.read().is_empty());
         let wakes = bench.wakes();
@@ -261,7 +261,7 @@ fn a_frame_of_any_length_is_there_after_one_character_of_silence() {
 
 #[test]
 fn a_line_that_never_falls_silent_wakes_its_reader_each_quarter_of_the_fifo() {
-    let mut bench = Bench::new();
+    let mut bench = UsartBench::new();
     for _ in 0..8 {
         assert!(bench.read().is_empty());
         let wakes = bench.wakes();
@@ -275,7 +275,7 @@ fn a_line_that_never_falls_silent_wakes_its_reader_each_quarter_of_the_fifo() {
 
 #[test]
 fn whoever_reads_has_what_interrupted_nobody_yet() {
-    let mut bench = Bench::new();
+    let mut bench = UsartBench::new();
     bench.arrive(0..7);
     assert_eq!(bench.read(), [0, 1, 2, 3, 4, 5, 6]);
     bench.arrive(7..9);
@@ -289,7 +289,7 @@ fn whoever_reads_has_what_interrupted_nobody_yet() {
 
 #[test]
 fn a_character_with_an_error_is_left_out_by_itself() {
-    let mut bench = Bench::start(settings(115_200, Parity::Even, 1));
+    let mut bench = UsartBench::start(settings(115_200, Parity::Even, 1));
     let noise = FRAMING_ERROR | PARITY_ERROR | NOISE;
     for (byte, errors) in [(1, 0), (2, PARITY_ERROR), (3, 0), (4, noise), (5, NOISE), (6, 0)] {
         bench.damaged(byte, errors);
@@ -306,7 +306,7 @@ fn a_character_with_an_error_is_left_out_by_itself() {
 
 #[test]
 fn garbage_without_end_does_not_stop_what_is_behind_it() {
-    let mut bench = Bench::new();
+    let mut bench = UsartBench::new();
     for _ in 0..1_000 {
         bench.damaged(0, FRAMING_ERROR);
         bench.interrupts();
@@ -319,7 +319,7 @@ fn garbage_without_end_does_not_stop_what_is_behind_it() {
 
 #[test]
 fn an_overrun_is_counted_and_reception_goes_on() {
-    let mut bench = Bench::new();
+    let mut bench = UsartBench::new();
     // Interrupts are disabled for 20 characters.
     (0..20).for_each(|byte| bench.damaged(byte, 0));
     bench.interrupts();
@@ -332,7 +332,7 @@ fn an_overrun_is_counted_and_reception_goes_on() {
 
 #[test]
 fn nobody_reads_and_the_newest_is_lost_and_counted() {
-    let mut bench = Bench::new();
+    let mut bench = UsartBench::new();
     bench.arrive((0..RX_RING + 12).map(|n| n as u8));
     bench.silence();
     assert_eq!(bench.line.errors().unread, 12);
@@ -343,7 +343,7 @@ fn nobody_reads_and_the_newest_is_lost_and_counted() {
 
 #[test]
 fn a_frame_longer_than_everything_leaves_whole_and_without_a_gap() {
-    let mut bench = Bench::new();
+    let mut bench = UsartBench::new();
     let frame: Vec<u8> = (0..1_500_u32).map(|n| (n / 3) as u8).collect();
     let mut rest = &frame[..];
     while !rest.is_empty() {
@@ -368,7 +368,7 @@ fn a_frame_longer_than_everything_leaves_whole_and_without_a_gap() {
 
 #[test]
 fn flushed_is_when_the_last_character_has_left_and_who_waits_is_woken() {
-    let mut bench = Bench::new();
+    let mut bench = UsartBench::new();
     // Nothing to flush.
     assert!(bench.is_flushed());
     for frame in [&[1][..], &[2, 3], &[4; 17], &[5; 40]] {
@@ -393,7 +393,7 @@ fn flushed_is_when_the_last_character_has_left_and_who_waits_is_woken() {
 
 #[test]
 fn what_arrives_while_sending_is_kept() {
-    let mut bench = Bench::new();
+    let mut bench = UsartBench::new();
     bench.wires(|line| line.has_four_wires = true);
     assert_eq!(bench.write(&[1; 30]), Some(30));
     let bytes: Vec<u8> = (0..30).collect();

@@ -137,13 +137,13 @@ impl Wake for Woken {
 }
 
 /// A future that is polled only when it was woken, like a task.
-struct Running {
+struct RunningPort {
     future: Pin<Box<dyn Future<Output = ()>>>,
     woken: Arc<Woken>,
     polls: usize,
 }
 
-impl Running {
+impl RunningPort {
     fn new(future: impl Future<Output = ()> + 'static) -> Self {
         Self { future: Box::pin(future), woken: Arc::new(Woken(AtomicBool::new(true))), polls: 0 }
     }
@@ -163,8 +163,8 @@ impl Running {
 struct Cell {
     gateway: &'static Gateway,
     controller: Rc<RefCell<Controller>>,
-    engine: Running,
-    task: Running,
+    engine: RunningPort,
+    task: RunningPort,
     _clock: Clock,
 }
 
@@ -185,8 +185,8 @@ impl Cell {
         let mut cell = Self {
             gateway,
             controller,
-            engine: Running::new(async move { gateway.keep_time(pulses[0]).await }),
-            task: Running::new(async move { run(gateway, pulses[1], PORT, fake).await }),
+            engine: RunningPort::new(async move { gateway.keep_time(pulses[0]).await }),
+            task: RunningPort::new(async move { run(gateway, pulses[1], PORT, fake).await }),
             _clock: clock,
         };
         cell.settle();

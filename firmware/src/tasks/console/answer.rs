@@ -16,7 +16,7 @@ use super::MAX_TIME;
 
 /// Why a connection ended before its answer was sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Ended {
+pub(super) enum SendError {
     /// The client has gone.
     Gone,
     /// It did not read in time.
@@ -84,7 +84,7 @@ pub(super) enum Outcome {
 }
 
 /// The end of a connection that is written to.
-pub(super) struct Line<'s, 'a> {
+pub(super) struct Responder<'s, 'a> {
     pub(super) socket: &'s mut TcpSocket<'a>,
     /// Holds one piece of a reply, or its head and a short body.
     pub(super) buf: &'s mut [u8],
@@ -93,37 +93,42 @@ pub(super) struct Line<'s, 'a> {
     pub(super) nonce: Option<NonceText>,
 }
 
-impl Line<'_, '_> {
+impl Responder<'_, '_> {
     /// Sends bytes, before `until`.
-    pub(super) async fn send(&mut self, mut bytes: &[u8], until: Instant) -> Result<(), Ended> {
+    pub(super) async fn send(&mut self, mut bytes: &[u8], until: Instant) -> Result<(), SendError> {
         while !bytes.is_empty() {
             match with_deadline(until, self.socket.write(bytes)).await {
                 Ok(Ok(count @ 1..)) => bytes = bytes.get(count..).unwrap_or(&[]),
-                Ok(_) => return Err(Ended::Gone),
-                Err(_) => return Err(Ended::Slow),
+                Ok(_) => return Err(SendError::Gone),
+                Err(_) => return Err(SendError::Slow),
             }
         }
         Ok(())
     }
 
     /// Sends part of the buffer.
-    pub(super) async fn send_part(&mut self, from: usize, to: usize, until: Instant) -> Result<(), Ended> {
+    pub(super) async fn send_part(
+        &mut self,
+        from: usize,
+        to: usize,
+        until: Instant,
+    ) -> Result<(), SendError> {
         let mut sent = from;
         while let Some(rest @ [_, ..]) = self.buf.get(sent..to) {
             match with_deadline(until, self.socket.write(rest)).await {
                 Ok(Ok(count @ 1..)) => sent = sent.saturating_add(count),
-                Ok(_) => return Err(Ended::Gone),
-                Err(_) => return Err(Ended::Slow),
+                Ok(_) => return Err(SendError::Gone),
+                Err(_) => return Err(SendError::Slow),
             }
         }
         Ok(())
     }
 
     /// Sends a whole answer.
-    pub(super) async fn answer(&mut self, reply: &Reply) -> Result<(), Ended> {
-        let body = reply.len.ok_or(Ended::TooLong)?;
+    pub(super) async fn answer(&mut self, reply: &Reply) -> Result<(), SendError> {
+        let body = reply.len.ok_or(SendError::TooLong)?;
         // Behind the body, as it has its length.
-        let head = self.write_head(body, Length::Bytes(body as u64), reply).ok_or(Ended::TooLong)?;
+        let head = self.write_head(body, Length::Bytes(body as u64), reply).ok_or(SendError::TooLong)?;
         let until = Instant::now() + MAX_TIME;
         self.send_part(body, body.saturating_add(head), until).await?;
         self.send_part(0, if self.is_head { 0 } else { body }, until).await
@@ -135,9 +140,9 @@ impl Line<'_, '_> {
         kind: Kind,
         length: Length,
         etag: Option<Revision>,
-    ) -> Result<bool, Ended> {
+    ) -> Result<bool, SendError> {
         let reply = Reply::new(self.buf, Status::OK, kind, |_| Ok(())).about(etag);
-        let head = self.write_head(0, length, &reply).ok_or(Ended::TooLong)?;
+        let head = self.write_head(0, length, &reply).ok_or(SendError::TooLong)?;
         self.send_part(0, head, Instant::now() + MAX_TIME).await?;
         Ok(!self.is_head)
     }
@@ -171,19 +176,19 @@ impl Line<'_, '_> {
     }
 
     /// Sends the first bytes of the buffer as a chunk, before `until`.
-    pub(super) async fn chunk(&mut self, len: usize, until: Instant) -> Result<(), Ended> {
+    pub(super) async fn chunk(&mut self, len: usize, until: Instant) -> Result<(), SendError> {
         if len == 0 {
             return Ok(());
         }
         let mut head = heapless::String::<12>::new();
-        write!(head, "{len:x}\r\n").map_err(|_| Ended::TooLong)?;
+        write!(head, "{len:x}\r\n").map_err(|_| SendError::TooLong)?;
         self.send(head.as_bytes(), until).await?;
         self.send_part(0, len, until).await?;
         self.send(b"\r\n", until).await
     }
 
     /// Ends a body of chunks.
-    pub(super) async fn last_chunk(&mut self) -> Result<(), Ended> {
+    pub(super) async fn last_chunk(&mut self) -> Result<(), SendError> {
         self.send(LAST_CHUNK.as_bytes(), Instant::now() + MAX_TIME).await
     }
 }

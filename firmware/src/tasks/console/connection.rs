@@ -14,10 +14,10 @@ use recipe_api::request::{Head, HeadBuffer, HeadError, Method};
 use recipe_api::response::{CONTINUE, Status};
 use recipe_api::route::{Operation, Served};
 
-use super::answer::{Ended, Line, Outcome, Reply};
+use super::answer::{Outcome, Reply, Responder, SendError};
 use super::arguments::Arguments;
 use super::change::{busy, nothing_kept};
-use super::{Console, MAX_TIME, OneMore, PORT};
+use super::{ConnectionPermit, Console, MAX_TIME, PORT};
 use crate::clock::now;
 use crate::tasks::store::StoreLock;
 use crate::tasks::watchdog::Pulse;
@@ -70,12 +70,12 @@ impl Console {
                 // Nor one that is switched off. Longer than all other limits, or they would have no say.
                 socket.set_timeout(Some(SILENT));
                 // Without limit, as the number of tasks is one.
-                let _one = OneMore::of(&self.connections, usize::MAX);
+                let _one = ConnectionPermit::of(&self.connections, usize::MAX);
                 self.count(|counters| &mut counters.connections);
                 head.clear();
                 match self.connection(&mut socket, &mut head, buf).await {
-                    Err(Ended::Slow) => self.count(|counters| &mut counters.slow_readers),
-                    Err(Ended::TooLong) => self.count(|counters| &mut counters.cut_off),
+                    Err(SendError::Slow) => self.count(|counters| &mut counters.slow_readers),
+                    Err(SendError::TooLong) => self.count(|counters| &mut counters.cut_off),
                     Ok(()) => {
                         socket.close();
                         if with_timeout(MAX_TIME, socket.flush()).await.is_ok() {
@@ -84,7 +84,7 @@ impl Console {
                             let _ = with_timeout(LINGER, rest).await;
                         }
                     }
-                    Err(Ended::Gone) => {}
+                    Err(SendError::Gone) => {}
                 }
             };
             pulse.idle(pin!(connection)).await;
@@ -99,8 +99,8 @@ impl Console {
         socket: &mut TcpSocket<'_>,
         buffer: &'a mut HeadBuffer,
         buf: &mut [u8],
-    ) -> Result<(), Ended> {
-        let mut line = Line { socket, buf, is_head: false, nonce: None };
+    ) -> Result<(), SendError> {
+        let mut line = Responder { socket, buf, is_head: false, nonce: None };
         let deadline = Instant::now() + MAX_TIME;
         let rest = match self.receive_head(&mut line, buffer, deadline).await? {
             Some(rest) => rest,
@@ -125,7 +125,7 @@ impl Console {
         line.answer(&reply).await
     }
 
-    async fn was_incomplete(&self, line: &mut Line<'_, '_>) -> Result<(), Ended> {
+    async fn was_incomplete(&self, line: &mut Responder<'_, '_>) -> Result<(), SendError> {
         self.count(|counters| &mut counters.incomplete);
         let reply = Reply::refused(line.buf, &HeadError::Incomplete.into());
         line.answer(&reply).await
@@ -134,20 +134,20 @@ impl Console {
     /// Waits for the head. Returns the range of the buffer with the beginning of the body; `None` if it did not arrive in time.
     async fn receive_head(
         &self,
-        line: &mut Line<'_, '_>,
+        line: &mut Responder<'_, '_>,
         buffer: &mut HeadBuffer,
         deadline: Instant,
-    ) -> Result<Option<Range<usize>>, Ended> {
+    ) -> Result<Option<Range<usize>>, SendError> {
         loop {
             let chunk = line.buf.get_mut(..CHUNK).unwrap_or(&mut []);
             let count = match with_deadline(deadline, line.socket.read(chunk)).await {
                 Ok(Ok(count @ 1..)) => count,
                 // A browser opens connections that it may never use.
-                _ if buffer.is_empty() => return Err(Ended::Gone),
+                _ if buffer.is_empty() => return Err(SendError::Gone),
                 Err(_) => return Ok(None),
                 Ok(_) => {
                     self.count(|counters| &mut counters.incomplete);
-                    return Err(Ended::Gone);
+                    return Err(SendError::Gone);
                 }
             };
             let taken = buffer.push(line.buf.get(..count).unwrap_or(&[]));
@@ -161,7 +161,7 @@ impl Console {
     #[inline(never)]
     fn admit<'a>(
         &'a self,
-        line: &mut Line<'_, '_>,
+        line: &mut Responder<'_, '_>,
         buffer: &'a HeadBuffer,
     ) -> Result<(Admitted, Request<'a>), Reply> {
         let (local, peer) = match (line.socket.local_endpoint(), line.socket.remote_endpoint()) {
@@ -201,12 +201,12 @@ impl Console {
     /// Takes the body, of which a part came with the head.
     async fn receive_body(
         &self,
-        line: &mut Line<'_, '_>,
+        line: &mut Responder<'_, '_>,
         admitted: &Admitted,
         request: &mut Request<'_>,
         rest: Range<usize>,
         deadline: Instant,
-    ) -> Result<Body, Ended> {
+    ) -> Result<Body, SendError> {
         let length = usize::try_from(admitted.length).unwrap_or(0);
         let mut hash = BodyHash::new();
         // What is behind the body is another request, which is not looked at.
@@ -235,7 +235,7 @@ impl Console {
                 Err(_) => return Ok(Body::Incomplete),
                 Ok(_) => {
                     self.count(|counters| &mut counters.incomplete);
-                    return Err(Ended::Gone);
+                    return Err(SendError::Gone);
                 }
             };
             // Hashing takes its time.

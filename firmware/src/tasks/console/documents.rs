@@ -7,17 +7,17 @@ use recipe_api::documents::{Document, Pieces};
 use recipe_api::metrics::Families;
 use recipe_api::response::{Kind, Length, Status};
 
-use super::answer::{Ended, Line, Outcome, Reply, TextBuffer};
+use super::answer::{Outcome, Reply, Responder, SendError, TextBuffer};
 use super::{Console, MAX_ANSWER, MAX_TIME};
 
 /// What is sent.
 #[derive(Debug, Clone)]
-pub(super) enum Source {
+pub(super) enum DocumentSource {
     Pieces(Pieces),
     Metrics(Families),
 }
 
-impl Source {
+impl DocumentSource {
     pub(super) fn of(document: Document) -> Self {
         Self::Pieces(Pieces::of(document))
     }
@@ -27,10 +27,10 @@ impl Console {
     /// Sends a whole document as the body of an answer.
     pub(super) async fn document(
         &self,
-        line: &mut Line<'_, '_>,
+        line: &mut Responder<'_, '_>,
         kind: Kind,
-        mut source: Source,
-    ) -> Result<Outcome, Ended> {
+        mut source: DocumentSource,
+    ) -> Result<Outcome, SendError> {
         if self.is_idle() {
             let text = "nothing runs at the moment; try again";
             return Ok(Outcome::Reply(Reply::error(line.buf, Status::UNAVAILABLE, text)));
@@ -48,11 +48,19 @@ impl Console {
     }
 
     /// Writes the next piece into the buffer; returns its length. The engine is borrowed only here.
-    pub(super) fn piece(&self, line: &mut Line<'_, '_>, source: &mut Source) -> Result<Option<usize>, Ended> {
+    pub(super) fn piece(
+        &self,
+        line: &mut Responder<'_, '_>,
+        source: &mut DocumentSource,
+    ) -> Result<Option<usize>, SendError> {
         let mut buf = TextBuffer::new(line.buf);
         let is_more = self.gateway.report(|status| match source {
-            Source::Pieces(pieces) => pieces.write_next(status, &mut buf).map_err(|_| Ended::TooLong),
-            Source::Metrics(families) => families.write_next(status, &mut buf).map_err(|_| Ended::TooLong),
+            DocumentSource::Pieces(pieces) => {
+                pieces.write_next(status, &mut buf).map_err(|_| SendError::TooLong)
+            }
+            DocumentSource::Metrics(families) => {
+                families.write_next(status, &mut buf).map_err(|_| SendError::TooLong)
+            }
         })?;
         Ok(is_more.then_some(buf.len))
     }

@@ -13,7 +13,7 @@ use super::Console;
 use super::answer::{Reply, TextBuffer};
 use super::change::{busy, nothing_kept};
 use crate::tasks::store::{FirmwareView, StoreHandle};
-use crate::update::{Incoming, Stage, build_of, whole_length};
+use crate::update::{Incoming, UpdateStage, build_of, whole_length};
 
 impl Console {
     /// The document, with this status.
@@ -65,16 +65,16 @@ fn write(out: &mut TextBuffer<'_>, view: &FirmwareView) -> fmt::Result {
     }
     if let Some(Incoming { header, stage, received }) = &view.incoming {
         let state = match stage {
-            Stage::Erasing => "erasing",
-            Stage::Receiving => "receiving",
-            Stage::Checking => "checking",
-            Stage::Ready => "ready",
-            Stage::Failed(_) => "failed",
+            UpdateStage::Erasing => "erasing",
+            UpdateStage::Receiving => "receiving",
+            UpdateStage::Checking => "checking",
+            UpdateStage::Ready => "ready",
+            UpdateStage::Failed(_) => "failed",
         };
         write!(out, ",\"incoming\":{{\"state\":\"{state}\",")?;
         write_header(out, header)?;
         write!(out, ",\"length\":{},\"received\":{received}", whole_length(header))?;
-        if let Stage::Failed(why) = stage {
+        if let UpdateStage::Failed(why) = stage {
             out.write_str(",\"why\":")?;
             json::write_text(out, why)?;
         }

@@ -157,9 +157,9 @@ impl Console {
 }
 
 /// One more, as long as it exists.
-struct OneMore<'a>(&'a Cell<usize>);
+struct ConnectionPermit<'a>(&'a Cell<usize>);
 
-impl<'a> OneMore<'a> {
+impl<'a> ConnectionPermit<'a> {
     /// Unless there are `most`.
     fn of(count: &'a Cell<usize>, most: usize) -> Option<Self> {
         (count.get() < most).then(|| {
@@ -169,7 +169,7 @@ impl<'a> OneMore<'a> {
     }
 }
 
-impl Drop for OneMore<'_> {
+impl Drop for ConnectionPermit<'_> {
     fn drop(&mut self) {
         self.0.set(self.0.get().saturating_sub(1));
     }

@@ -16,10 +16,10 @@ use recipe_api::revisions::{Revision, Revisions};
 use recipe_api::route::Operation;
 use serde::Serialize;
 
-use super::answer::{Ended, Etag, Line, Outcome, Reply, TextBuffer};
+use super::answer::{Etag, Outcome, Reply, Responder, SendError, TextBuffer};
 use super::change::{busy, nothing_kept};
 use super::connection::Request;
-use super::documents::Source;
+use super::documents::DocumentSource;
 use super::{Console, MAX_ANSWER, MAX_TIME};
 use crate::clock::now;
 use crate::journal;
@@ -30,19 +30,23 @@ impl Console {
     /// Executes a request.
     pub(super) async fn execute<'a>(
         &'a self,
-        line: &mut Line<'_, '_>,
+        line: &mut Responder<'_, '_>,
         request: Request<'a>,
-    ) -> Result<Outcome, Ended> {
+    ) -> Result<Outcome, SendError> {
         let reply = match request.operation {
             Operation::Info => self.info(line.buf),
             Operation::Nonce => self.nonce(line.buf),
             Operation::Revisions => self.revisions(line.buf, Status::OK, None),
             Operation::Edge => self.edge(line.buf, Status::OK),
             Operation::Update => self.firmware(line.buf, Status::OK),
-            Operation::Status => return self.document(line, Kind::Json, Source::of(Document::Status)).await,
-            Operation::Values => return self.document(line, Kind::Json, Source::of(Document::Values)).await,
+            Operation::Status => {
+                return self.document(line, Kind::Json, DocumentSource::of(Document::Status)).await;
+            }
+            Operation::Values => {
+                return self.document(line, Kind::Json, DocumentSource::of(Document::Values)).await;
+            }
             Operation::Metrics => {
-                return self.document(line, Kind::Metrics, Source::Metrics(Families::new())).await;
+                return self.document(line, Kind::Metrics, DocumentSource::Metrics(Families::new())).await;
             }
             Operation::Stream => return self.stream(line, &request).await,
             Operation::Log => return log(line, &request).await,
@@ -117,7 +121,11 @@ impl Console {
     }
 
     /// The image of what runs, or of the requested revision.
-    async fn config(&self, line: &mut Line<'_, '_>, request: &Request<'_>) -> Result<Outcome, Ended> {
+    async fn config(
+        &self,
+        line: &mut Responder<'_, '_>,
+        request: &Request<'_>,
+    ) -> Result<Outcome, SendError> {
         let (store, revision) = match self.requested_revision(line.buf, request) {
             Ok(found) => found,
             Err(reply) => return Ok(Outcome::Reply(reply)),
@@ -127,7 +135,7 @@ impl Console {
         }
         let mut offset = 0;
         loop {
-            let len = store.part(revision.number, offset, line.buf).await.ok_or(Ended::Gone)?;
+            let len = store.part(revision.number, offset, line.buf).await.ok_or(SendError::Gone)?;
             line.chunk(len, Instant::now() + MAX_TIME).await?;
             offset = offset.saturating_add(PART);
             if len < PART {
@@ -164,7 +172,7 @@ impl Console {
 }
 
 /// Sends the newest lines of the log.
-async fn log(line: &mut Line<'_, '_>, request: &Request<'_>) -> Result<Outcome, Ended> {
+async fn log(line: &mut Responder<'_, '_>, request: &Request<'_>) -> Result<Outcome, SendError> {
     let lines = match request.head.query("lines").map(str::parse) {
         None => MAX_LINES,
         Some(Ok(lines @ 1..=MAX_LINES)) => lines,
@@ -192,10 +200,10 @@ async fn log(line: &mut Line<'_, '_>, request: &Request<'_>) -> Result<Outcome, 
 }
 
 /// Sends the page for people, unless the client has it.
-async fn page(line: &mut Line<'_, '_>, request: &Request<'_>) -> Result<Outcome, Ended> {
+async fn page(line: &mut Responder<'_, '_>, request: &Request<'_>) -> Result<Outcome, SendError> {
     let status = PAGE.status(request.head.if_none_match);
     let mut buf = TextBuffer::new(line.buf);
-    PAGE.write_head(status, &mut buf).map_err(|_| Ended::TooLong)?;
+    PAGE.write_head(status, &mut buf).map_err(|_| SendError::TooLong)?;
     let (head, until) = (buf.len, Instant::now() + MAX_ANSWER);
     line.send_part(0, head, until.min(Instant::now() + MAX_TIME)).await?;
     if line.is_head || status != Status::OK {

@@ -10,19 +10,19 @@ use embassy_time::{Duration, Instant, Timer};
 use recipe_api::documents::Document;
 use recipe_api::response::{Kind, Length, Status};
 
-use super::answer::{Ended, Line, Outcome, Reply, TextBuffer};
+use super::answer::{Outcome, Reply, Responder, SendError, TextBuffer};
 use super::connection::Request;
-use super::documents::Source;
-use super::{Console, MAX_TIME, OneMore, STREAMS};
+use super::documents::DocumentSource;
+use super::{ConnectionPermit, Console, MAX_TIME, STREAMS};
 
 impl Console {
     /// Serves a stream until its client leaves or does not read.
     pub(super) async fn stream(
         &self,
-        line: &mut Line<'_, '_>,
+        line: &mut Responder<'_, '_>,
         request: &Request<'_>,
-    ) -> Result<Outcome, Ended> {
-        let Some(_one) = OneMore::of(&self.streams, STREAMS) else {
+    ) -> Result<Outcome, SendError> {
+        let Some(_one) = ConnectionPermit::of(&self.streams, STREAMS) else {
             self.count(|counters| &mut counters.turned_away);
             let text = "too many streams; poll /api/v1/status instead";
             return Ok(Outcome::Reply(Reply::error(line.buf, Status::UNAVAILABLE, text)));
@@ -42,7 +42,7 @@ impl Console {
             if let Some(follower) = &mut follower {
                 loop {
                     let mut buf = TextBuffer::new(line.buf);
-                    follower.write(&mut buf).map_err(|_| Ended::TooLong)?;
+                    follower.write(&mut buf).map_err(|_| SendError::TooLong)?;
                     match buf.len {
                         0 => break,
                         len => line.send_part(0, len, Instant::now() + MAX_TIME).await?,
@@ -66,19 +66,24 @@ impl Console {
             let mut said = [0; 32];
             match select(Timer::at(wake), line.socket.read(&mut said)).await {
                 Either::First(()) | Either::Second(Ok(1..)) => {}
-                Either::Second(_) => return Err(Ended::Gone),
+                Either::Second(_) => return Err(SendError::Gone),
             }
             yield_now().await;
         }
     }
 
-    async fn event(&self, line: &mut Line<'_, '_>, name: &str, document: Document) -> Result<(), Ended> {
+    async fn event(
+        &self,
+        line: &mut Responder<'_, '_>,
+        name: &str,
+        document: Document,
+    ) -> Result<(), SendError> {
         let until = Instant::now() + MAX_TIME;
         if self.is_idle() {
             // Nothing runs. A comment shows that the stream is still there.
             return line.send(b":\n\n", until).await;
         }
-        let mut source = Source::of(document);
+        let mut source = DocumentSource::of(document);
         for text in ["event: ", name, "\ndata: "] {
             line.send(text.as_bytes(), until).await?;
         }
@@ -89,12 +94,12 @@ impl Console {
         line.send(b"\n\n", until).await
     }
 
-    async fn lose(&self, line: &mut Line<'_, '_>, lost: u64) -> Result<(), Ended> {
+    async fn lose(&self, line: &mut Responder<'_, '_>, lost: u64) -> Result<(), SendError> {
         for _ in 0..lost.min(1_000) {
             self.count(|counters| &mut counters.lost_events);
         }
         let mut text = heapless::String::<64>::new();
-        write!(text, "event: lost\ndata: {{\"count\":{lost}}}\n\n").map_err(|_| Ended::TooLong)?;
+        write!(text, "event: lost\ndata: {{\"count\":{lost}}}\n\n").map_err(|_| SendError::TooLong)?;
         line.send(text.as_bytes(), Instant::now() + MAX_TIME).await
     }
 }

@@ -11,18 +11,18 @@ use embassy_net::{IpAddress, IpEndpoint};
 use embassy_time::{Duration, Timer, with_timeout};
 use proto_core::engine::Input;
 
-use super::{Buffers, Driver, Role, resolve};
+use super::{Buffers, LinkDriver, LinkRole, resolve};
 
-impl Driver<'_> {
+impl LinkDriver<'_> {
     /// One connection, until the peer closes it, it fails, or the turn is over.
-    pub(super) async fn tcp(&self, turn: u32, controller: &str, role: Role, buffers: &mut Buffers<'_>) {
+    pub(super) async fn tcp(&self, turn: u32, controller: &str, role: LinkRole, buffers: &mut Buffers<'_>) {
         let mut socket = TcpSocket::new(self.stack, buffers.rx, buffers.tx);
         socket.set_nagle_enabled(false);
         let opening = async {
             let Some(address) = resolve(self.stack, controller).await else { return false };
             match role {
-                Role::Client(port) => socket.connect(IpEndpoint::new(address, port)).await.is_ok(),
-                Role::Server(port) => self.accept(&mut socket, port, address).await,
+                LinkRole::Client(port) => socket.connect(IpEndpoint::new(address, port)).await.is_ok(),
+                LinkRole::Server(port) => self.accept(&mut socket, port, address).await,
             }
         };
         let opened = self.pulse.idle(pin!(select(self.control.over(turn), opening))).await;

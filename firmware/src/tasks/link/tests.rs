@@ -224,7 +224,7 @@ fn rs485() -> Bus {
 }
 
 /// A field port, and the listening port to which its frames are forwarded.
-fn config(bus: Bus, controller: Speaks) -> GatewayConfig {
+fn config(bus: Bus, controller: FirstSpeaker) -> GatewayConfig {
     let mut config = controller_only();
     let mut field = |name: &str| {
         config.fields.push(FieldSpec::System(SysVar::parse(name).unwrap())).unwrap();
@@ -239,7 +239,7 @@ fn config(bus: Bus, controller: Speaks) -> GatewayConfig {
     field("DigitalSignalStatus[1]");
     let (up, down) = (Span { start: 0, len: 49 }, Span { start: 49, len: 1 });
     add_recipe(&mut config, Mode::Realtime, Some(up), None);
-    add_recipe(&mut config, Mode::Realtime, Some(up), (controller == Speaks::Frames).then_some(down));
+    add_recipe(&mut config, Mode::Realtime, Some(up), (controller == FirstSpeaker::Frames).then_some(down));
     add_port(&mut config, "field", rs485(), 0);
     add_port(&mut config, "up", bus, 1);
     config.validate().unwrap();
@@ -248,7 +248,7 @@ fn config(bus: Bus, controller: Speaks) -> GatewayConfig {
 
 /// Whether the controller's client sends frames of its own.
 #[derive(Clone, Copy, PartialEq, Eq)]
-enum Speaks {
+enum FirstSpeaker {
     Nothing,
     Frames,
 }

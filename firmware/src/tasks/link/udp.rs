@@ -9,19 +9,19 @@ use embassy_net::{IpAddress, IpEndpoint};
 use embassy_time::{Duration, Timer};
 use proto_core::engine::Input;
 
-use super::{Buffers, Driver, Role, resolve};
+use super::{Buffers, LinkDriver, LinkRole, resolve};
 
-impl Driver<'_> {
+impl LinkDriver<'_> {
     /// Datagrams both ways; on a listening socket, answers go to the sender of the controller's
     /// newest frame.
-    pub(super) async fn udp(&self, turn: u32, controller: &str, role: Role, buffers: &mut Buffers<'_>) {
+    pub(super) async fn udp(&self, turn: u32, controller: &str, role: LinkRole, buffers: &mut Buffers<'_>) {
         let mut received = [PacketMetadata::EMPTY; DATAGRAMS];
         // One datagram at a time, so that it is known when it has left.
         let mut waiting = [PacketMetadata::EMPTY; 1];
         let mut socket = UdpSocket::new(self.stack, &mut received, buffers.rx, &mut waiting, buffers.tx);
         let own = match role {
-            Role::Client(_) => 0,
-            Role::Server(port) => port,
+            LinkRole::Client(_) => 0,
+            LinkRole::Server(port) => port,
         };
         if socket.bind(own).is_err() {
             return;
@@ -30,8 +30,8 @@ impl Driver<'_> {
         let resolving = select(self.control.over(turn), resolve(self.stack, controller));
         let Either::Second(Some(address)) = self.pulse.idle(pin!(resolving)).await else { return };
         let fixed = match role {
-            Role::Client(port) => Some(IpEndpoint::new(address, port)),
-            Role::Server(_) => None,
+            LinkRole::Client(port) => Some(IpEndpoint::new(address, port)),
+            LinkRole::Server(_) => None,
         };
         let peer = Cell::new(fixed);
         if fixed.is_some() && !self.report(turn, Input::LinkUp { link: self.link }) {
@@ -40,17 +40,17 @@ impl Driver<'_> {
         loop {
             let over = async {
                 self.receive(turn, &socket, fixed, address, &peer, buffers.chunk).await;
-                Next::End
+                SocketEnd::End
             };
             let sending = self.send(turn, &socket, &peer);
             let after = match self.pulse.idle(pin!(select(over, sending))).await {
                 Either::First(after) | Either::Second(after) => after,
             };
             match after {
-                Next::End => return,
+                SocketEnd::End => return,
                 // The peer is not found on the network. The waiting datagram would be sent when it comes back,
                 // however old it is then.
-                Next::Reopen => {
+                SocketEnd::Reopen => {
                     socket.close();
                     if socket.bind(own).is_err() || !self.report(turn, Input::LinkSent { link: self.link }) {
                         return;
@@ -100,30 +100,30 @@ impl Driver<'_> {
         }
     }
 
-    async fn send(&self, turn: u32, socket: &UdpSocket<'_>, peer: &Cell<Option<IpEndpoint>>) -> Next {
+    async fn send(&self, turn: u32, socket: &UdpSocket<'_>, peer: &Cell<Option<IpEndpoint>>) -> SocketEnd {
         while let Some(datagram) = self.control.next(turn).await {
             if let Some(peer) = peer.get() {
                 if socket.send_to(&datagram, peer).await.is_err() {
-                    return Next::End;
+                    return SocketEnd::End;
                 }
                 let left =
                     select3(self.control.over(turn), socket.wait_send_ready(), Timer::after(SEND_TIMEOUT));
                 match left.await {
-                    Either3::First(()) => return Next::End,
+                    Either3::First(()) => return SocketEnd::End,
                     Either3::Second(()) => {}
-                    Either3::Third(()) => return Next::Reopen,
+                    Either3::Third(()) => return SocketEnd::Reopen,
                 }
             }
             if !self.report(turn, Input::LinkSent { link: self.link }) {
-                return Next::End;
+                return SocketEnd::End;
             }
         }
-        Next::End
+        SocketEnd::End
     }
 }
 
 /// How to continue.
-enum Next {
+enum SocketEnd {
     /// The turn is over, or the socket has failed.
     End,
     /// A datagram cannot be sent: open the socket again.

@@ -28,7 +28,7 @@ const BAUD: u32 = 115_200;
 
 /// State of a device.
 #[derive(Default)]
-struct Device {
+struct ScriptedDevice {
     received: VecDeque<u8>,
     /// Sent bytes do not leave.
     is_stuck: bool,
@@ -39,7 +39,7 @@ struct Device {
     writer: Option<Waker>,
 }
 
-struct Script(Rc<RefCell<Device>>);
+struct Script(Rc<RefCell<ScriptedDevice>>);
 
 impl ErrorType for Script {
     type Error = Infallible;
@@ -109,16 +109,16 @@ fn config(send: SendOn) -> GatewayConfig {
 }
 
 /// The port, its task and the engine's.
-struct Bench {
+struct SerialBench {
     gateway: &'static Gateway,
-    device: Rc<RefCell<Device>>,
+    device: Rc<RefCell<ScriptedDevice>>,
     executor: Executor<'static>,
     _clock: Clock,
 }
 
-impl Bench {
+impl SerialBench {
     fn new(order: Order, send: SendOn, baud: u32) -> Self {
-        let device = Rc::new(RefCell::new(Device::default()));
+        let device = Rc::new(RefCell::new(ScriptedDevice::default()));
         Self::with_line(order, send, baud, Script(Rc::clone(&device)), device)
     }
 
@@ -127,7 +127,7 @@ impl Bench {
         send: SendOn,
         baud: u32,
         line: impl Line + 'static,
-        device: Rc<RefCell<Device>>,
+        device: Rc<RefCell<ScriptedDevice>>,
     ) -> Self {
         let clock = Clock::take();
         let gateway = Box::leak(Box::new(Gateway::idle()));
@@ -182,7 +182,7 @@ impl Bench {
 #[test]
 fn bytes_that_wait_for_a_busy_processor_do_not_make_a_silence() {
     for order in Order::ALL {
-        let mut bench = Bench::new(order, SendOn::Period, BAUD);
+        let mut bench = SerialBench::new(order, SendOn::Period, BAUD);
         bench.arrive(FRAME[..3].iter().copied());
         bench.wait(Duration::from_millis(1));
         bench.arrive(FRAME[3..].iter().copied());
@@ -200,7 +200,7 @@ fn bytes_that_wait_for_a_busy_processor_do_not_make_a_silence() {
 #[test]
 fn all_that_waits_in_a_device_is_heard_before_a_frame_is_overdue() {
     for order in Order::ALL {
-        let mut bench = Bench::new(order, SendOn::Period, BAUD);
+        let mut bench = SerialBench::new(order, SendOn::Period, BAUD);
         bench.arrive(FRAME);
         bench.wait(Duration::from_millis(1));
         assert_eq!(bench.counters().frames_in, 1);
@@ -217,7 +217,7 @@ fn all_that_waits_in_a_device_is_heard_before_a_frame_is_overdue() {
 #[test]
 fn what_a_device_has_woken_nobody_for_is_heard_before_a_frame_is_overdue() {
     for order in Order::ALL {
-        let mut bench = Bench::new(order, SendOn::Period, BAUD);
+        let mut bench = SerialBench::new(order, SendOn::Period, BAUD);
         for round in 1..5 {
             // As long as less than a quarter of its FIFO is full.
             bench.device.borrow_mut().received.extend(FRAME);
@@ -231,7 +231,7 @@ fn what_a_device_has_woken_nobody_for_is_heard_before_a_frame_is_overdue() {
 #[test]
 fn what_waits_is_heard_before_anything_is_sent() {
     for order in Order::ALL {
-        let mut bench = Bench::new(order, SendOn::Frame, BAUD);
+        let mut bench = SerialBench::new(order, SendOn::Frame, BAUD);
         bench.wait(Duration::from_millis(1));
         // An answer is due after the first of them.
         bench.arrive(FRAME.into_iter().chain([0; 1_000]).chain(FRAME));
@@ -245,7 +245,7 @@ fn what_waits_is_heard_before_anything_is_sent() {
 fn what_waited_while_the_processor_was_stopped_is_not_heard_of_only_when_a_frame_has_left() {
     for order in Order::ALL {
         // At this baud rate a frame takes seconds.
-        let mut bench = Bench::new(order, SendOn::Period, 10);
+        let mut bench = SerialBench::new(order, SendOn::Period, 10);
         bench.stick(true);
         bench.wait_until_it_sends();
         // The processor is stopped while the device goes on receiving.
@@ -267,7 +267,7 @@ fn what_waited_while_the_processor_was_stopped_is_not_heard_of_only_when_a_frame
 #[test]
 fn a_line_that_takes_nothing_is_given_up_and_heard_all_the_same() {
     for order in Order::ALL {
-        let mut bench = Bench::new(order, SendOn::Period, BAUD);
+        let mut bench = SerialBench::new(order, SendOn::Period, BAUD);
         bench.stick(true);
         bench.wait_until_it_sends();
         bench.wait(Duration::from_millis(10));
@@ -339,9 +339,9 @@ impl Line for FloodAndScript {}
 fn a_line_that_never_falls_silent_keeps_neither_the_time_nor_what_is_to_be_sent() {
     for order in Order::ALL {
         let reads = Rc::new(Cell::new(0));
-        let device = Rc::new(RefCell::new(Device::default()));
+        let device = Rc::new(RefCell::new(ScriptedDevice::default()));
         let line = FloodAndScript(Script(Rc::clone(&device)), Rc::clone(&reads));
-        let mut bench = Bench::with_line(order, SendOn::Period, BAUD, line, device);
+        let mut bench = SerialBench::with_line(order, SendOn::Period, BAUD, line, device);
         bench.arrive(FRAME);
         bench.wait(Duration::from_millis(1));
         assert_eq!(bench.counters().frames_in, 1);
@@ -351,7 +351,7 @@ fn a_line_that_never_falls_silent_keeps_neither_the_time_nor_what_is_to_be_sent(
         let rounds = (0..99).take_while(|_| bench.counters().timeouts == 0 && bench.executor.round()).count();
         assert!((3..=25).contains(&rounds), "a tick in {rounds} rounds");
         let sends =
-            |bench: &mut Bench| bench.device.borrow().read_before.is_empty() && bench.executor.round();
+            |bench: &mut SerialBench| bench.device.borrow().read_before.is_empty() && bench.executor.round();
         let rounds = (0..99).take_while(|_| sends(&mut bench)).count();
         assert!(rounds <= 15, "sent after {rounds} rounds");
         assert!(reads.get() > 0);

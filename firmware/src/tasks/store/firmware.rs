@@ -14,7 +14,7 @@ use crate::update::{Refused, Verdict, WaitsFor, Works};
 use crate::{error, info, warn};
 
 /// What comes of a look at the firmware's trial.
-pub(super) enum Judged {
+pub(super) enum TrialState {
     /// Nothing is on trial.
     Settled,
     /// It goes on.
@@ -36,15 +36,15 @@ fn works(gateway: &Gateway) -> Works {
 
 impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
     /// Looks at the trial of the firmware that runs, and confirms or ends it.
-    pub(super) async fn judge(&mut self, gateway: &Gateway) -> Judged {
-        let Some(trial) = &mut self.trial else { return Judged::Settled };
+    pub(super) async fn judge(&mut self, gateway: &Gateway) -> TrialState {
+        let Some(trial) = &mut self.trial else { return TrialState::Settled };
         match trial.look(Instant::now(), works(gateway), self.handle.was_reached.get()) {
-            Verdict::Waits(waits_for) => Judged::OnTrial(waits_for),
+            Verdict::Waits(waits_for) => TrialState::OnTrial(waits_for),
             Verdict::Confirmed => match self.confirm_firmware().await {
-                Ok(_) => Judged::Settled,
+                Ok(_) => TrialState::Settled,
                 // Tried again by the next look, until the time is over.
                 Err(_) if self.trial.is_some_and(|trial| Instant::now() < trial.until()) => {
-                    Judged::OnTrial(WaitsFor::Time)
+                    TrialState::OnTrial(WaitsFor::Time)
                 }
                 Err(_) => self.over(Ended::NotConfirmed).await,
             },
@@ -55,14 +55,14 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
         }
     }
 
-    async fn over(&mut self, ended: Ended) -> Judged {
+    async fn over(&mut self, ended: Ended) -> TrialState {
         // The starts of a trial are counted, so it ends also if this cannot be written.
         if let Some(marks) = end_trial(self.stored.slots(), ended)
             && let Err(error) = self.stored.mark_slots(marks).await
         {
             error!("the store: {}", Text(&error));
         }
-        Judged::Restart
+        TrialState::Restart
     }
 
     async fn confirm_firmware(&mut self) -> Result<u32, Failed> {

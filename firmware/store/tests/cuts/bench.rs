@@ -10,7 +10,7 @@ use crate::model::{Nor, Torn};
 
 /// A change of the store.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) enum Operation {
+pub(crate) enum Change {
     Keep { number: u32, image: Vec<u8> },
     Mark(Marks),
     Counter(u8, u64),
@@ -21,7 +21,7 @@ pub(crate) enum Operation {
 
 /// Everything a store holds.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub(crate) struct Contents {
+pub(crate) struct StoreContents {
     images: BTreeMap<u32, (u32, Vec<u8>)>,
     marks: Marks,
     counters: [u64; 3],
@@ -51,10 +51,10 @@ impl fmt::Display for Totals {
 }
 
 #[derive(Debug, Clone)]
-pub(crate) struct Bench {
+pub(crate) struct StoreBench {
     pub(crate) flash: Nor,
     pub(crate) store: Store,
-    pub(crate) expected: Contents,
+    pub(crate) expected: StoreContents,
 }
 
 /// Contents of an image that tell every byte's place and the image's number.
@@ -65,29 +65,26 @@ pub(crate) fn image(number: u32, len: usize) -> Vec<u8> {
 }
 
 /// The changes in the life of a board: images of these lengths are kept, tried, confirmed or taken back.
-pub(crate) fn life(changes: usize, lens: &[usize]) -> Vec<Operation> {
-    let (mut all, mut live, mut previous) = (vec![Operation::Key([7; 16])], None, None);
+pub(crate) fn life(changes: usize, lens: &[usize]) -> Vec<Change> {
+    let (mut all, mut live, mut previous) = (vec![Change::Key([7; 16])], None, None);
     let mut last = None;
     let mut lens = lens.iter().cycle();
     for number in 1.. {
         let len = *lens.next().expect("it is a cycle");
-        all.push(Operation::Keep { number, image: image(number, len) });
+        all.push(Change::Keep { number, image: image(number, len) });
         let trial =
             |attempts| Marks { live, previous, trial: Some(Trial { number, attempts, confirm_s: 60 }), last };
-        all.extend([Operation::Mark(trial(2)), Operation::Mark(trial(1))]);
+        all.extend([Change::Mark(trial(2)), Change::Mark(trial(1))]);
         if number % 3 == 0 {
             last = Some((number, Ended::TakenBack));
-            all.push(Operation::Mark(Marks { live, previous, trial: None, last }));
+            all.push(Change::Mark(Marks { live, previous, trial: None, last }));
         } else {
             (live, previous, last) = (Some(number), live, Some((number, Ended::Confirmed)));
-            all.push(Operation::Mark(Marks { live, previous, trial: None, last }));
+            all.push(Change::Mark(Marks { live, previous, trial: None, last }));
         }
-        all.extend([
-            Operation::BirthSequence(number as u8),
-            Operation::Counter(number as u8 % 3, number.into()),
-        ]);
+        all.extend([Change::BirthSequence(number as u8), Change::Counter(number as u8 % 3, number.into())]);
         if number % 4 == 1 {
-            all.push(Operation::Edge(image(!number, number as usize * 7 % 150)));
+            all.push(Change::Edge(image(!number, number as usize * 7 % 150)));
         }
         if all.len() >= changes {
             all.truncate(changes);
@@ -97,7 +94,7 @@ pub(crate) fn life(changes: usize, lens: &[usize]) -> Vec<Operation> {
     unreachable!()
 }
 
-impl Operation {
+impl Change {
     /// Whether it succeeded.
     pub(crate) fn attempt(&self, store: &mut Store, flash: &mut Nor) -> bool {
         let done = match self {
@@ -118,7 +115,7 @@ impl Operation {
     }
 }
 
-impl Contents {
+impl StoreContents {
     /// What the store says that it holds.
     pub(crate) fn read(store: &Store, flash: &Nor) -> Self {
         let mut buf = vec![0; recipe_store::MAX_DATA];
@@ -138,10 +135,10 @@ impl Contents {
     }
 
     /// After a change, with what the store has forgotten for it.
-    pub(crate) fn after(&self, change: &Operation) -> Self {
+    pub(crate) fn after(&self, change: &Change) -> Self {
         let mut new = self.clone();
         match change {
-            Operation::Keep { number, image } => {
+            Change::Keep { number, image } => {
                 if new.images.len() == 8 && !new.images.contains_key(number) {
                     let needed = new.marks.numbers();
                     let oldest = new.images.keys().copied().find(|number| !needed.contains(&Some(*number)));
@@ -149,21 +146,21 @@ impl Contents {
                 }
                 new.images.insert(*number, (!number, image.clone()));
             }
-            Operation::Mark(marks) => new.marks = *marks,
-            Operation::Counter(number, value) => new.counters[usize::from(*number)] = *value,
-            Operation::BirthSequence(value) => new.birth = Some(*value),
-            Operation::Key(key) => new.key = Some(*key),
-            Operation::Edge(settings) => new.edge.clone_from(settings),
+            Change::Mark(marks) => new.marks = *marks,
+            Change::Counter(number, value) => new.counters[usize::from(*number)] = *value,
+            Change::BirthSequence(value) => new.birth = Some(*value),
+            Change::Key(key) => new.key = Some(*key),
+            Change::Edge(settings) => new.edge.clone_from(settings),
         }
         new
     }
 }
 
-impl Bench {
+impl StoreBench {
     pub(crate) fn new(geometry: Geometry, torn: Torn) -> Self {
         let flash = Nor::new(geometry, torn);
         let store = Store::mount(&flash).expect("an empty one");
-        Self { flash, store, expected: Contents::default() }
+        Self { flash, store, expected: StoreContents::default() }
     }
 
     #[track_caller]
@@ -173,31 +170,31 @@ impl Bench {
     }
 
     /// Whether it succeeded.
-    pub(crate) fn attempt(&mut self, change: &Operation) -> bool {
+    pub(crate) fn attempt(&mut self, change: &Change) -> bool {
         change.attempt(&mut self.store, &mut self.flash)
     }
 
     #[track_caller]
     pub(crate) fn check(&self) {
-        assert_eq!(Contents::read(&self.store, &self.flash), self.expected);
+        assert_eq!(StoreContents::read(&self.store, &self.flash), self.expected);
     }
 
     /// With power: it has to succeed, now and after a restart.
     #[track_caller]
-    pub(crate) fn execute(&mut self, change: &Operation) {
+    pub(crate) fn execute(&mut self, change: &Change) {
         assert!(self.attempt(change), "{change:?}");
         self.expected = self.expected.after(change);
         self.check();
         let again = Store::mount(&self.flash).expect("it always starts");
-        assert_eq!(Contents::read(&again, &self.flash), self.expected);
+        assert_eq!(StoreContents::read(&again, &self.flash), self.expected);
     }
 
     /// After a cut: the old or the new, whole, and the images that are marked are kept. Whether it is the new.
     #[track_caller]
-    pub(crate) fn start_after_cut(&mut self, change: &Operation) -> bool {
+    pub(crate) fn start_after_cut(&mut self, change: &Change) -> bool {
         self.restart();
         let new = self.expected.after(change);
-        let found = Contents::read(&self.store, &self.flash);
+        let found = StoreContents::read(&self.store, &self.flash);
         let is_new = found == new;
         if is_new {
             self.expected = new;
@@ -213,8 +210,8 @@ impl Bench {
     #[track_caller]
     pub(crate) fn cut_everywhere(
         &self,
-        change: &Operation,
-        next: Option<&Operation>,
+        change: &Change,
+        next: Option<&Change>,
         seed: u64,
         restarts: bool,
         totals: &mut Totals,
@@ -265,10 +262,10 @@ impl Bench {
 
     /// Whether the store may accept it: what is kept already under this number, and in use, is not replaced, and
     /// only what is kept is marked.
-    pub(crate) fn is_possible(&self, change: &Operation) -> bool {
+    pub(crate) fn is_possible(&self, change: &Change) -> bool {
         match change {
-            Operation::Keep { number, .. } => !self.expected.marks.numbers().contains(&Some(*number)),
-            Operation::Mark(marks) => {
+            Change::Keep { number, .. } => !self.expected.marks.numbers().contains(&Some(*number)),
+            Change::Mark(marks) => {
                 marks.numbers().into_iter().flatten().all(|number| self.expected.images.contains_key(&number))
             }
             _ => true,

@@ -19,16 +19,16 @@ struct Adapter(Nor);
 
 /// The power is off.
 #[derive(Debug)]
-struct Off;
+struct PowerLoss;
 
-impl NorFlashError for Off {
+impl NorFlashError for PowerLoss {
     fn kind(&self) -> NorFlashErrorKind {
         NorFlashErrorKind::Other
     }
 }
 
 impl ErrorType for Adapter {
-    type Error = Off;
+    type Error = PowerLoss;
 }
 
 /// It needs three.
@@ -40,15 +40,15 @@ fn place(at: usize) -> Place {
 }
 
 impl Adapter {
-    fn powered(&self) -> Result<(), Off> {
-        if self.0.is_off() { Err(Off) } else { Ok(()) }
+    fn powered(&self) -> Result<(), PowerLoss> {
+        if self.0.is_off() { Err(PowerLoss) } else { Ok(()) }
     }
 }
 
 impl ReadNorFlash for Adapter {
     const READ_SIZE: usize = 1;
 
-    async fn read(&mut self, offset: u32, bytes: &mut [u8]) -> Result<(), Off> {
+    async fn read(&mut self, offset: u32, bytes: &mut [u8]) -> Result<(), PowerLoss> {
         for (at, byte) in (offset as usize..).zip(bytes) {
             *byte = self.0.read(place(at))[at % WORD];
         }
@@ -64,12 +64,12 @@ impl NorFlash for Adapter {
     const WRITE_SIZE: usize = WORD;
     const ERASE_SIZE: usize = SECTOR;
 
-    async fn erase(&mut self, from: u32, to: u32) -> Result<(), Off> {
+    async fn erase(&mut self, from: u32, to: u32) -> Result<(), PowerLoss> {
         (from as usize..to as usize).step_by(SECTOR).for_each(|at| self.0.erase_now(place(at).sector));
         self.powered()
     }
 
-    async fn write(&mut self, offset: u32, bytes: &[u8]) -> Result<(), Off> {
+    async fn write(&mut self, offset: u32, bytes: &[u8]) -> Result<(), PowerLoss> {
         for (at, word) in (offset as usize..).step_by(WORD).zip(bytes.as_chunks().0) {
             self.0.write_now(place(at), word);
         }
@@ -84,17 +84,17 @@ fn open(flash: Adapter) -> Map {
 }
 
 #[derive(Debug, Default)]
-struct Outcome {
+struct Comparison {
     cuts: u32,
     lost: u32,
     fails: u32,
     not_there: u32,
 }
 
-fn cut_everywhere(torn: Torn, changes: u32, len: usize) -> Outcome {
+fn cut_everywhere(torn: Torn, changes: u32, len: usize) -> Comparison {
     let mut flash = Adapter(Nor::new(SECTORS, torn));
     flash.0.allow_rewrites();
-    let (mut buf, mut outcome) = (vec![0; 8_192], Outcome::default());
+    let (mut buf, mut outcome) = (vec![0; 8_192], Comparison::default());
     for number in 0..changes {
         let (key, new) = ((number % 2) as u8, image(number, len));
         let old = number.checked_sub(2).map(|number| image(number, len));

@@ -7,7 +7,7 @@ mod random;
 mod relocate;
 mod room;
 
-use bench::{Bench, Operation, Totals, life};
+use bench::{Change, StoreBench, Totals, life};
 use model::TORN;
 use recipe_store::Geometry;
 
@@ -18,10 +18,10 @@ const SMALL: Geometry = Geometry { sectors: 3, words: 160 };
 const TWO: Geometry = Geometry { sectors: 2, words: 256 };
 
 /// Every operation of these changes, for every way in which a word can be torn.
-fn cut_everywhere(name: &str, geometry: Geometry, changes: &[Operation], restarts: bool) -> Totals {
+fn cut_everywhere(name: &str, geometry: Geometry, changes: &[Change], restarts: bool) -> Totals {
     let mut totals = Totals::default();
     for torn in TORN {
-        let mut bench = Bench::new(geometry, torn);
+        let mut bench = StoreBench::new(geometry, torn);
         for (nth, change) in changes.iter().enumerate() {
             if restarts {
                 bench.restart();

@@ -19,7 +19,7 @@ pub(crate) enum Torn {
 pub(crate) const TORN: [Torn; 4] = [Torn::Fault, Torn::Blank, Torn::Half, Torn::Mixed];
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum State {
+enum WordState {
     Erased,
     Written,
     Fault,
@@ -32,7 +32,7 @@ enum State {
 pub(crate) struct Nor {
     geometry: Geometry,
     words: Vec<Word>,
-    states: Vec<State>,
+    states: Vec<WordState>,
     torn: Torn,
     /// Number of operations until the power is cut, in the one after them.
     left: Option<u32>,
@@ -53,7 +53,7 @@ impl Nor {
         Self {
             geometry,
             words: vec![BLANK; words],
-            states: vec![State::Erased; words],
+            states: vec![WordState::Erased; words],
             torn,
             left: None,
             is_off: false,
@@ -125,14 +125,14 @@ impl Nor {
             kind => kind,
         };
         self.states[at] = match kind {
-            Torn::Fault => State::Fault,
-            Torn::Blank => State::LooksBlank,
+            Torn::Fault => WordState::Fault,
+            Torn::Blank => WordState::LooksBlank,
             _ => {
                 for (byte, new) in (0..WORD).zip(new) {
                     let missing = self.chance(256) as u8;
                     self.words[at][byte] = new | missing;
                 }
-                State::Half
+                WordState::Half
             }
         };
     }
@@ -152,9 +152,9 @@ impl Nor {
     pub(crate) fn read_or_fault(&self, place: Place) -> Option<Word> {
         let at = self.at(place);
         match self.states[at] {
-            State::Erased | State::LooksBlank => Some(BLANK),
-            State::Written | State::Half => Some(self.words[at]),
-            State::Fault => None,
+            WordState::Erased | WordState::LooksBlank => Some(BLANK),
+            WordState::Written | WordState::Half => Some(self.words[at]),
+            WordState::Fault => None,
         }
     }
 
@@ -168,17 +168,17 @@ impl Nor {
         let is_torn = is_cut && self.chance(8) > 0;
         let chance = self.chance(u64::MAX);
         match self.states[at] {
-            State::Erased if is_torn => self.tear(at, *word),
-            State::Erased if self.fails_of.is_some_and(|of| chance.is_multiple_of(of)) => {
+            WordState::Erased if is_torn => self.tear(at, *word),
+            WordState::Erased if self.fails_of.is_some_and(|of| chance.is_multiple_of(of)) => {
                 self.tear(at, *word)
             }
-            State::Erased => (self.words[at], self.states[at]) = (*word, State::Written),
-            State::LooksBlank => {
+            WordState::Erased => (self.words[at], self.states[at]) = (*word, WordState::Written),
+            WordState::LooksBlank => {
                 self.refused += 1;
-                self.states[at] = State::Fault;
+                self.states[at] = WordState::Fault;
             }
-            _ if self.may_rewrite => self.states[at] = State::Fault,
-            State::Written | State::Fault | State::Half => panic!("{place:?} is written twice"),
+            _ if self.may_rewrite => self.states[at] = WordState::Fault,
+            WordState::Written | WordState::Fault | WordState::Half => panic!("{place:?} is written twice"),
         }
     }
 
@@ -191,7 +191,7 @@ impl Nor {
         for word in 0..self.geometry.words {
             let at = self.at(Place { sector, word });
             match if is_cut { self.chance(4) } else { 0 } {
-                0 => self.states[at] = State::Erased,
+                0 => self.states[at] = WordState::Erased,
                 1 => {}
                 _ => self.tear(at, BLANK),
             }

@@ -1,11 +1,11 @@
 //! Random changes, cut at random, thousands of times in a row: what was acknowledged is never lost.
 
 use crate::SMALL;
-use crate::bench::{Bench, Operation, image, life};
+use crate::bench::{Change, StoreBench, image, life};
 use crate::model::TORN;
 
 fn run(seed: u64, starts: u32) -> (u32, u32) {
-    let mut bench = Bench::new(SMALL, TORN[seed as usize % TORN.len()]);
+    let mut bench = StoreBench::new(SMALL, TORN[seed as usize % TORN.len()]);
     let mut random = seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1;
     let mut next = |of: u64| {
         random ^= random << 13;
@@ -21,9 +21,9 @@ fn run(seed: u64, starts: u32) -> (u32, u32) {
         bench.flash.cut_after(left as u32, next(u64::MAX));
         loop {
             let change = match next(4) {
-                0 => Operation::Counter(next(3) as u8, next(u64::MAX)),
-                1 => Operation::BirthSequence(next(256) as u8),
-                _ => changes.next().unwrap_or_else(|| Operation::Keep {
+                0 => Change::Counter(next(3) as u8, next(u64::MAX)),
+                1 => Change::BirthSequence(next(256) as u8),
+                _ => changes.next().unwrap_or_else(|| Change::Keep {
                     number: 2_000 + next(100) as u32,
                     image: image(3, next(600) as usize),
                 }),
@@ -50,7 +50,7 @@ fn run(seed: u64, starts: u32) -> (u32, u32) {
 fn what_the_flash_does_not_keep_is_written_again() {
     let (mut done, mut failed) = (0, 0);
     for torn in TORN {
-        let mut bench = Bench::new(SMALL, torn);
+        let mut bench = StoreBench::new(SMALL, torn);
         bench.flash.wear_out(40);
         for change in life(300, &[10, 250, 90]) {
             if !bench.is_possible(&change) {

@@ -6,15 +6,15 @@ use recipe_store::{
     Store, newest,
 };
 
-use crate::bench::{Contents, Operation, image, life};
+use crate::bench::{Change, StoreContents, image, life};
 use crate::model::{Nor, TORN, Torn};
 use crate::{SECTORS, SMALL, TWO};
 
 /// Two places of flash with one supply, and what the store has to hold.
 #[derive(Debug, Clone)]
-struct Board {
+struct TwoPlaces {
     places: [Nor; 2],
-    expected: Contents,
+    expected: StoreContents,
     slots: SlotMarks,
     generation: u64,
 }
@@ -37,11 +37,11 @@ fn marks(number: u32) -> SlotMarks {
     }
 }
 
-impl Board {
+impl TwoPlaces {
     fn new(geometry: Geometry, torn: Torn) -> Self {
         Self {
             places: [Nor::new(geometry, torn), Nor::new(geometry, torn)],
-            expected: Contents::default(),
+            expected: StoreContents::default(),
             slots: SlotMarks::default(),
             generation: 0,
         }
@@ -52,13 +52,13 @@ impl Board {
         self.places.iter_mut().for_each(Nor::power);
         let [first, second] = &self.places;
         let found = newest(first, second).expect("it always starts");
-        assert_eq!(Contents::read(&found.store, &self.places[index(found.side)]), self.expected);
+        assert_eq!(StoreContents::read(&found.store, &self.places[index(found.side)]), self.expected);
         assert_eq!(found.store.slots(), self.slots);
         found
     }
 
     #[track_caller]
-    fn change(&mut self, change: &Operation) {
+    fn change(&mut self, change: &Change) {
         let mut found = self.start();
         assert!(change.attempt(&mut found.store, &mut self.places[index(found.side)]), "{change:?}");
         self.expected = self.expected.after(change);
@@ -86,7 +86,7 @@ impl Board {
         let moved = block_on(found.store.relocate().execute(from, to));
         let Ok(moved) = moved else { return false };
         if !to.is_off() {
-            assert_eq!(Contents::read(&moved, to), self.expected);
+            assert_eq!(StoreContents::read(&moved, to), self.expected);
         }
         true
     }
@@ -112,7 +112,7 @@ impl Board {
 }
 
 /// Cuts the power in each operation of a move, or in one of `stride`; then once more, in the move that follows.
-fn cut_everywhere(board: &Board, stride: usize, seed: u64) -> (u32, u32) {
+fn cut_everywhere(board: &TwoPlaces, stride: usize, seed: u64) -> (u32, u32) {
     let mut whole = board.clone();
     assert!(whole.attempt());
     let steps = whole.operations() - board.operations();
@@ -138,19 +138,19 @@ fn cut_everywhere(board: &Board, stride: usize, seed: u64) -> (u32, u32) {
             twice.start();
             // The store before is used, also by a loader.
             twice.mark(marks(cut));
-            twice.change(&Operation::Counter(1, u64::from(cut)));
+            twice.change(&Change::Counter(1, u64::from(cut)));
             twice.generation = twice.start().store.generation();
             twice.relocate();
-            twice.change(&Operation::Counter(1, u64::from(second)));
+            twice.change(&Change::Counter(1, u64::from(second)));
         }
     }
     cuts
 }
 
-fn moved_to_and_fro(name: &str, geometry: Geometry, changes: &[Operation], every: usize, stride: usize) {
+fn moved_to_and_fro(name: &str, geometry: Geometry, changes: &[Change], every: usize, stride: usize) {
     let mut total = (0, 0);
     for torn in TORN {
-        let mut board = Board::new(geometry, torn);
+        let mut board = TwoPlaces::new(geometry, torn);
         for (nth, change) in changes.iter().enumerate() {
             board.change(change);
             board.mark(marks(nth as u32));
@@ -182,24 +182,24 @@ fn the_sectors_of_the_chip() {
 
 #[test]
 fn a_store_that_was_never_moved_is_found_in_the_first_place() {
-    let mut board = Board::new(SMALL, Torn::Fault);
+    let mut board = TwoPlaces::new(SMALL, Torn::Fault);
     assert_eq!(board.start().side, Side::First);
     // Something of another life lies in the second one.
     let mut other = Store::mount(&board.places[1]).unwrap();
     block_on(other.set_counter(0, 9).unwrap().execute(&mut board.places[1])).unwrap();
-    board.change(&Operation::Counter(0, 5));
+    board.change(&Change::Counter(0, 5));
     board.relocate();
     assert_eq!(board.start().store.counter(0), 5);
-    board.change(&Operation::Keep { number: 1, image: image(1, 100) });
-    board.change(&Operation::Mark(Marks { live: Some(1), ..Marks::default() }));
+    board.change(&Change::Keep { number: 1, image: image(1, 100) });
+    board.change(&Change::Mark(Marks { live: Some(1), ..Marks::default() }));
     board.relocate();
     assert_eq!((board.start().side, board.start().store.generation()), (Side::First, 2));
 }
 
 #[test]
 fn a_place_of_a_newer_program_is_neither_used_nor_erased() {
-    let mut board = Board::new(SMALL, Torn::Fault);
-    board.change(&Operation::Counter(0, 5));
+    let mut board = TwoPlaces::new(SMALL, Torn::Fault);
+    board.change(&Change::Counter(0, 5));
     let mut head = [0; 32];
     head[..4].copy_from_slice(b"RGSs");
     head[4] = 2;
@@ -216,8 +216,8 @@ fn a_place_of_a_newer_program_is_neither_used_nor_erased() {
 
 #[test]
 fn a_place_that_cannot_be_erased_leaves_the_store_where_it_was() {
-    let mut board = Board::new(SMALL, Torn::Fault);
-    board.change(&Operation::Keep { number: 1, image: image(1, 700) });
+    let mut board = TwoPlaces::new(SMALL, Torn::Fault);
+    board.change(&Change::Keep { number: 1, image: image(1, 700) });
     let found = board.start();
     let (from, mut to) = (board.places[0].clone(), board.places[1].clone());
     to.wear_out(2);
@@ -225,6 +225,6 @@ fn a_place_that_cannot_be_erased_leaves_the_store_where_it_was() {
     println!("{error}");
     let found = newest(&from, &to).unwrap();
     assert_eq!((found.side, found.store.find(Key::Generation)), (Side::First, None));
-    assert_eq!(Contents::read(&found.store, &from), board.expected);
+    assert_eq!(StoreContents::read(&found.store, &from), board.expected);
     assert_eq!(from.geometry(), SMALL);
 }

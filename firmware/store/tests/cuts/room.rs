@@ -5,13 +5,13 @@ use recipe_store::{
     Ended, Geometry, KeepError, Key, MAX_DATA, Marks, MountError, Place, PutError, Role, Store, Trial,
 };
 
-use crate::bench::{Bench, Operation, image};
+use crate::bench::{Change, StoreBench, image};
 use crate::model::{Nor, Torn};
 use crate::{SECTORS, SMALL};
 
 /// Keeps, tries and confirms `count` images; returns how many for one erase of one sector.
 fn wear(count: u32, len: usize) -> f64 {
-    let mut bench = Bench::new(SECTORS, Torn::Fault);
+    let mut bench = StoreBench::new(SECTORS, Torn::Fault);
     let mut live = None;
     for number in 1..=count {
         let trial = |attempts| {
@@ -23,17 +23,17 @@ fn wear(count: u32, len: usize) -> f64 {
             let put = bench.store.forget(None).unwrap().expect("an old one");
             block_on(put.execute(&mut bench.flash)).unwrap();
         }
-        assert!(bench.attempt(&Operation::Keep { number, image }));
-        assert!(bench.attempt(&Operation::Mark(trial(3))) && bench.attempt(&Operation::Mark(trial(2))));
+        assert!(bench.attempt(&Change::Keep { number, image }));
+        assert!(bench.attempt(&Change::Mark(trial(3))) && bench.attempt(&Change::Mark(trial(2))));
         live = Some(number);
-        assert!(bench.attempt(&Operation::Mark(Marks { live, ..Marks::default() })));
+        assert!(bench.attempt(&Change::Mark(Marks { live, ..Marks::default() })));
     }
     f64::from(count) / (f64::from(bench.flash.erases) / f64::from(SECTORS.sectors))
 }
 
 #[test]
 fn seven_of_the_longest_images_are_kept_and_the_oldest_gives_way() {
-    let mut bench = Bench::new(SECTORS, Torn::Fault);
+    let mut bench = StoreBench::new(SECTORS, Torn::Fault);
     for number in 1..=30 {
         let image = image(number, MAX_DATA);
         loop {
@@ -69,9 +69,9 @@ fn sectors_last_for_ten_thousands_of_configurations() {
         println!("images of {len} bytes: {figure:.1} configurations for each erase of every sector");
         assert!(figure > least, "{len}: {figure}");
     }
-    let mut bench = Bench::new(SECTORS, Torn::Fault);
+    let mut bench = StoreBench::new(SECTORS, Torn::Fault);
     for number in 0..20_000 {
-        assert!(bench.attempt(&Operation::Counter(0, number)));
+        assert!(bench.attempt(&Change::Counter(0, number)));
     }
     println!("20,000 counts: {} erases of a sector", bench.flash.erases);
     assert!(bench.flash.erases < 15);
@@ -79,7 +79,7 @@ fn sectors_last_for_ten_thousands_of_configurations() {
 
 #[test]
 fn what_does_not_fit_is_refused_before_anything_is_erased() {
-    let mut bench = Bench::new(SMALL, Torn::Fault);
+    let mut bench = StoreBench::new(SMALL, Torn::Fault);
     let error = (0..8).find_map(|number| {
         let image = image(number, 1_500);
         match bench.store.keep(number, 0, &image, None) {
@@ -99,7 +99,7 @@ fn what_does_not_fit_is_refused_before_anything_is_erased() {
     let erases = bench.flash.erases;
     // What is there can still be changed.
     drop(bench.store.set_counter(1, 5).unwrap());
-    assert!(bench.attempt(&Operation::Counter(1, 6)));
+    assert!(bench.attempt(&Change::Counter(1, 6)));
     assert_eq!((bench.store.counter(1), bench.flash.erases), (6, erases));
     assert_eq!(
         bench.store.put(Key::Image(0), 0, &[0; MAX_DATA + 1]).unwrap_err(),
@@ -111,12 +111,12 @@ fn what_does_not_fit_is_refused_before_anything_is_erased() {
 
 #[test]
 fn what_is_in_use_is_not_forgotten() {
-    let mut bench = Bench::new(SMALL, Torn::Fault);
+    let mut bench = StoreBench::new(SMALL, Torn::Fault);
     for number in 1..=8 {
-        bench.execute(&Operation::Keep { number, image: image(number, 10) });
+        bench.execute(&Change::Keep { number, image: image(number, 10) });
     }
     let trial = Some(Trial { number: 2, attempts: 1, confirm_s: 30 });
-    bench.execute(&Operation::Mark(Marks { live: Some(1), previous: Some(3), trial, last: None }));
+    bench.execute(&Change::Mark(Marks { live: Some(1), previous: Some(3), trial, last: None }));
     for number in 1..=3 {
         assert_eq!(bench.store.keep(9, 0, &[], Some(number)).unwrap_err(), KeepError::Needed { number });
         assert_eq!(bench.store.keep(number, 0, &[], None).unwrap_err(), KeepError::Needed { number });
@@ -132,17 +132,17 @@ fn what_is_in_use_is_not_forgotten() {
 
 #[test]
 fn a_trial_has_so_many_starts() {
-    let mut bench = Bench::new(SMALL, Torn::Fault);
+    let mut bench = StoreBench::new(SMALL, Torn::Fault);
     for number in 1..=3 {
-        bench.execute(&Operation::Keep { number, image: image(number, 10) });
+        bench.execute(&Change::Keep { number, image: image(number, 10) });
     }
     let trial = Some(Trial { number: 3, attempts: 2, confirm_s: 30 });
-    bench.execute(&Operation::Mark(Marks { live: Some(2), previous: Some(1), trial, last: None }));
-    let run = |bench: &mut Bench| -> Vec<(u32, Role)> {
+    bench.execute(&Change::Mark(Marks { live: Some(2), previous: Some(1), trial, last: None }));
+    let run = |bench: &mut StoreBench| -> Vec<(u32, Role)> {
         bench.restart();
         let start = bench.store.at_start();
         if let Some(marks) = start.marks {
-            bench.execute(&Operation::Mark(marks));
+            bench.execute(&Change::Mark(marks));
         }
         start.candidates.iter().map(|(kept, role)| (kept.number, *role)).collect()
     };
@@ -158,9 +158,9 @@ fn a_trial_has_so_many_starts() {
 
 #[test]
 fn a_damaged_record_is_not_there_and_the_others_are() {
-    let mut bench = Bench::new(SMALL, Torn::Fault);
+    let mut bench = StoreBench::new(SMALL, Torn::Fault);
     for number in 1..=3 {
-        bench.execute(&Operation::Keep { number, image: image(number, 100) });
+        bench.execute(&Change::Keep { number, image: image(number, 100) });
     }
     let found = bench.store.find(bench.store.revision(2).unwrap().key()).unwrap();
     bench.flash.damage(found.data);

@@ -110,7 +110,7 @@ impl SlotFlash for Part {
 }
 
 #[derive(Debug)]
-pub(crate) struct Board {
+pub(crate) struct SimulatedBoard {
     pub(crate) slots: [Part; 2],
     pub(crate) stores: [Part; 2],
     power: Rc<Power>,
@@ -119,7 +119,7 @@ pub(crate) struct Board {
     pub(crate) told: Vec<String>,
 }
 
-impl Clone for Board {
+impl Clone for SimulatedBoard {
     fn clone(&self) -> Self {
         let power = Rc::new(Power::default());
         power.is_off.set(self.power.is_off.get());
@@ -133,7 +133,7 @@ impl Clone for Board {
 /// What the configuration of every board is.
 const CONFIGURATION: &[u8] = b"a configuration that must never be lost";
 
-impl Board {
+impl SimulatedBoard {
     /// With version 0.1.0 in slot A, and a configuration.
     pub(crate) fn new(slot: Geometry, store: Geometry, torn: Torn, len: usize) -> Self {
         let power = Rc::new(Power::default());
@@ -337,7 +337,7 @@ impl Board {
     }
 }
 
-impl Machine for Board {
+impl Machine for SimulatedBoard {
     type Flash = Part;
 
     fn flash(&self, slot: Slot) -> &Part {

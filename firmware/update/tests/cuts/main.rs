@@ -8,7 +8,7 @@ mod refused;
 mod slots;
 mod trial;
 
-use board::Board;
+use board::SimulatedBoard;
 use model::TORN;
 use recipe_store::Geometry;
 use recipe_update::Version;
@@ -24,7 +24,7 @@ const V3: Version = Version::new(0, 3, 0);
 
 /// Cuts the power at each operation of an update, or at one of `stride`, and in one of what follows; returns the
 /// numbers of first and second cuts.
-fn cut_everywhere(board: &Board, version: Version, stride: usize) -> (u32, u32) {
+fn cut_everywhere(board: &SimulatedBoard, version: Version, stride: usize) -> (u32, u32) {
     let mut whole = board.clone();
     let before = whole.operations();
     whole.live_until(version);
@@ -55,7 +55,7 @@ fn cut_everywhere(board: &Board, version: Version, stride: usize) -> (u32, u32) 
 fn the_power_is_cut_at_every_operation_of_an_update() {
     let mut total = (0, 0);
     for torn in TORN {
-        let mut board = Board::new(SMALL_SLOT, SMALL_STORE, torn, 1_900);
+        let mut board = SimulatedBoard::new(SMALL_SLOT, SMALL_STORE, torn, 1_900);
         for version in [V2, V3] {
             let cuts = cut_everywhere(&board, version, 1);
             total = (total.0 + cuts.0, total.1 + cuts.1);
@@ -69,7 +69,7 @@ fn the_power_is_cut_at_every_operation_of_an_update() {
 
 #[test]
 fn the_slots_of_the_chip() {
-    let mut board = Board::new(SLOT, STORE, model::Torn::Mixed, 300_000);
+    let mut board = SimulatedBoard::new(SLOT, STORE, model::Torn::Mixed, 300_000);
     let cuts = cut_everywhere(&board, V2, 997);
     println!("STM32H743: {} cuts, {} second cuts", cuts.0, cuts.1);
     board.live_until(V2);

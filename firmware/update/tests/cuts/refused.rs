@@ -7,7 +7,7 @@ use recipe_update::{
     Running, SlotMarks, Step, UpdateFile, Version, begin_trial, may_keep,
 };
 
-use crate::board::{Board, SEED, V1, file, image, parts};
+use crate::board::{SEED, SimulatedBoard, V1, file, image, parts};
 use crate::model::Torn;
 use crate::{SMALL_SLOT, SMALL_STORE, V2, V3};
 
@@ -25,13 +25,13 @@ fn refusal(
     marks: SlotMarks,
     downgrade: Downgrade,
 ) -> Option<Refused> {
-    let board = Board::new(SMALL_SLOT, SMALL_STORE, Torn::Fault, LEN);
+    let board = SimulatedBoard::new(SMALL_SLOT, SMALL_STORE, Torn::Fault, LEN);
     Receive::begin(signed(parts, len), running, marks, downgrade, &board.slots[1]).err()
 }
 
 #[test]
 fn updates_that_cannot_run_are_refused_before_anything_is_erased() {
-    let running = Board::running(Slot::A, V2);
+    let running = SimulatedBoard::running(Slot::A, V2);
     let good = SlotMarks { good: Some(Slot::A), ..SlotMarks::default() };
     let refused = |parts, len| refusal(parts, len, &running, good, Downgrade::Refused);
     let right = parts(Slot::B, V3);
@@ -49,7 +49,7 @@ fn updates_that_cannot_run_are_refused_before_anything_is_erased() {
 
 #[test]
 fn a_downgrade_has_to_be_asked_for() {
-    let running = Board::running(Slot::A, V2);
+    let running = SimulatedBoard::running(Slot::A, V2);
     let good = SlotMarks { good: Some(Slot::A), ..SlotMarks::default() };
     let older = parts(Slot::B, V1);
     let error = Refused::Older { offered: V1, running: V2 };
@@ -66,7 +66,7 @@ fn an_update_reads_every_configuration_that_may_run() {
     let good = SlotMarks { good: Some(Slot::A), ..SlotMarks::default() };
     let refused = |kept, oldest, newest, written| {
         let formats = Formats::new(oldest, newest, written).unwrap();
-        let running = Running { kept, ..Board::running(Slot::A, V2) };
+        let running = Running { kept, ..SimulatedBoard::running(Slot::A, V2) };
         refusal(Parts { formats, ..parts(Slot::B, V3) }, LEN, &running, good, Downgrade::Refused)
     };
     assert_eq!(refused(Some((1, 3)), 1, 4, 4), None);
@@ -95,7 +95,7 @@ fn while_a_firmware_is_on_trial_both_read_what_is_kept() {
 
 #[test]
 fn the_way_back_is_never_overwritten() {
-    let running = Board::running(Slot::A, V2);
+    let running = SimulatedBoard::running(Slot::A, V2);
     let good = SlotMarks { good: Some(Slot::A), ..SlotMarks::default() };
     let refused = |marks| refusal(parts(Slot::B, V3), LEN, &running, marks, Downgrade::Refused);
     assert_eq!(refused(begin_trial(good, Slot::B, 60, 0)), Some(Refused::OnTrial));
@@ -107,7 +107,7 @@ fn the_way_back_is_never_overwritten() {
 }
 
 /// Follows all steps with the bytes of this image; how it ended.
-fn follow(board: &mut Board, receive: &mut Receive, image: &[u8]) -> Result<(), ReceiveError> {
+fn follow(board: &mut SimulatedBoard, receive: &mut Receive, image: &[u8]) -> Result<(), ReceiveError> {
     let part = &mut board.slots[1];
     loop {
         match receive.next(part) {
@@ -128,9 +128,9 @@ fn follow(board: &mut Board, receive: &mut Receive, image: &[u8]) -> Result<(), 
     }
 }
 
-fn begun(len: usize) -> (Board, Receive) {
-    let board = Board::new(SMALL_SLOT, SMALL_STORE, Torn::Fault, len);
-    let running = Board::running(Slot::A, V1);
+fn begun(len: usize) -> (SimulatedBoard, Receive) {
+    let board = SimulatedBoard::new(SMALL_SLOT, SMALL_STORE, Torn::Fault, len);
+    let running = SimulatedBoard::running(Slot::A, V1);
     let header = signed(parts(Slot::B, V2), len);
     let receive =
         Receive::begin(header, &running, board.marks(), Downgrade::Refused, &board.slots[1]).unwrap();

@@ -3,17 +3,17 @@
 use recipe_store::{Ended, Place, Slot};
 use recipe_update::{Chosen, Header, SlotMarks, begin_trial};
 
-use crate::board::{Board, SEED, V1, image, parts};
+use crate::board::{SEED, SimulatedBoard, V1, image, parts};
 use crate::model::{Nor, Torn};
 use crate::{SMALL_SLOT, SMALL_STORE, V2, V3};
 
-fn both() -> Board {
-    let mut board = Board::new(SMALL_SLOT, SMALL_STORE, Torn::Fault, 1_500);
+fn both() -> SimulatedBoard {
+    let mut board = SimulatedBoard::new(SMALL_SLOT, SMALL_STORE, Torn::Fault, 1_500);
     board.probe(Slot::B, V2);
     board
 }
 
-fn blank(board: &mut Board) {
+fn blank(board: &mut SimulatedBoard) {
     board.stores.iter_mut().for_each(|part| part.nor = Nor::new(SMALL_STORE, Torn::Fault));
 }
 

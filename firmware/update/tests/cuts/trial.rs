@@ -3,12 +3,12 @@
 use recipe_store::{Ended, Slot};
 use recipe_update::{STARTS, begin_trial, confirm, end_trial};
 
-use crate::board::{Board, V1};
+use crate::board::{SimulatedBoard, V1};
 use crate::model::{TORN, Torn};
 use crate::{SMALL_SLOT, SMALL_STORE, V2};
 
-fn on_trial(torn: Torn) -> Board {
-    let mut board = Board::new(SMALL_SLOT, SMALL_STORE, torn, 1_500);
+fn on_trial(torn: Torn) -> SimulatedBoard {
+    let mut board = SimulatedBoard::new(SMALL_SLOT, SMALL_STORE, torn, 1_500);
     board.probe(Slot::B, V2);
     assert!(board.write_marks(begin_trial(board.marks(), Slot::B, 60, 0)));
     board

@@ -66,7 +66,7 @@ impl Flash for Area {
 
     async fn write(&mut self, place: Place, word: &Word) {
         let address = self.address(place);
-        let bank = Bank::of(address);
+        let bank = FlashBank::of(address);
         bank.unlock();
         bank.control(FASTEST | PROGRAM);
         barrier();
@@ -81,7 +81,7 @@ impl Flash for Area {
 
     async fn erase(&mut self, sector: u8) {
         let address = self.address(Place { sector, word: 0 });
-        let bank = Bank::of(address);
+        let bank = FlashBank::of(address);
         let number = (address as u32 % BANK) / BOARD.sector;
         bank.unlock();
         let control = FASTEST | ERASE_SECTOR | number << 8;
@@ -93,14 +93,14 @@ impl Flash for Area {
 }
 
 /// The registers of one of the two banks.
-struct Bank {
+struct FlashBank {
     keys: Register,
     control: Register,
     status: Register,
     clear: Register,
 }
 
-impl Bank {
+impl FlashBank {
     fn of(address: usize) -> Self {
         let base = FLASH_REGISTERS + if address as u32 & BANK == 0 { 0 } else { 0x100 };
         // SAFETY: the registers of the flash's banks, which the loader alone uses.

@@ -19,7 +19,7 @@ pub struct Contents {
 
 /// What changes flash.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Operation {
+pub enum FlashOperation {
     /// A sector is erased.
     Erase {
         /// Offset of its first word.
@@ -52,10 +52,10 @@ impl Contents {
     }
 
     /// An operation comes to its end.
-    pub fn execute(&mut self, operation: &Operation) {
+    pub fn execute(&mut self, operation: &FlashOperation) {
         match *operation {
-            Operation::Erase { first } => self.blank(first, SECTOR),
-            Operation::Program { address, bytes } => {
+            FlashOperation::Erase { first } => self.blank(first, SECTOR),
+            FlashOperation::Program { address, bytes } => {
                 if self.only_looks_blank.remove(&address) {
                     self.torn.insert(address);
                 }
@@ -66,10 +66,10 @@ impl Contents {
 
     /// The power fails during an operation. Of a sector that was being erased, some words are as before, some erased,
     /// and the others as `leaves` says; which ones depends on `salt`.
-    pub fn interrupt(&mut self, operation: &Operation, leaves: Torn, salt: u32) {
+    pub fn interrupt(&mut self, operation: &FlashOperation, leaves: Torn, salt: u32) {
         match operation {
-            Operation::Program { address, bytes } => self.interrupt_word(*address, bytes, leaves),
-            Operation::Erase { first } => {
+            FlashOperation::Program { address, bytes } => self.interrupt_word(*address, bytes, leaves),
+            FlashOperation::Erase { first } => {
                 for address in (*first..first + SECTOR).step_by(WORD as usize) {
                     // Neighbours differ, and each cut differs from the one before.
                     match (address / WORD).wrapping_add(salt).wrapping_mul(0x9E37_79B9) >> 30 {

@@ -24,7 +24,7 @@ async fn next(socket: &UdpSocket<'_>) -> u8 {
 
 #[test]
 fn frames_go_to_whoever_sent_a_frame_last_and_to_nobody_for_less() {
-    among(&config(udp_listen(), Speaks::Frames), listens, async |net| {
+    among(&config(udp_listen(), FirstSpeaker::Frames), listens, async |net| {
         let at = gateway_port();
         socket!(client, net, 1);
         socket!(other, net, 2);
@@ -61,7 +61,7 @@ fn frames_go_to_whoever_sent_a_frame_last_and_to_nobody_for_less() {
 
 #[test]
 fn what_waits_for_a_host_that_is_not_found_is_not_sent_when_it_is_old() {
-    among(&config(udp_listen(), Speaks::Nothing), listens, async |net| {
+    among(&config(udp_listen(), FirstSpeaker::Nothing), listens, async |net| {
         socket!(client, net, 1);
         client.send_to(&FRAME, gateway_port()).await.unwrap();
         net.seen(1, 0).await;

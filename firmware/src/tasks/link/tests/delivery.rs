@@ -33,7 +33,7 @@ async fn next(own: &mut TcpSocket<'_>) -> u8 {
 
 #[test]
 fn what_was_acknowledged_is_told_in_time_and_before_the_answer() {
-    let config = config(tcp_listen(), Speaks::Frames);
+    let config = config(tcp_listen(), FirstSpeaker::Frames);
     among(&config, listens, async |net| {
         let mut buffers = [[0; 512]; 2];
         let [rx, tx] = &mut buffers;
@@ -76,7 +76,7 @@ fn what_was_acknowledged_is_told_in_time_and_before_the_answer() {
 
 #[test]
 fn a_peer_that_acknowledges_late_slows_nothing() {
-    among(&config(tcp_listen(), Speaks::Nothing), listens, async |net| {
+    among(&config(tcp_listen(), FirstSpeaker::Nothing), listens, async |net| {
         let (mut rx, mut tx) = ([0; 8192], [0; 256]);
         let mut own = connected(&net, &mut rx, &mut tx).await;
         for _ in 0..5 {
@@ -102,7 +102,7 @@ fn a_peer_that_acknowledges_late_slows_nothing() {
 #[test]
 fn what_is_not_acknowledged_in_time_ends_in_a_reset_and_is_never_delivered() {
     for (no_receive, no_send) in [(CONTROLLER, 0), (0, CONTROLLER)] {
-        among(&config(tcp_listen(), Speaks::Nothing), listens, async |net| {
+        among(&config(tcp_listen(), FirstSpeaker::Nothing), listens, async |net| {
             let mut buffers = [[0; 512]; 2];
             let [rx, tx] = &mut buffers;
             let mut own = connected(&net, rx, tx).await;
@@ -140,7 +140,7 @@ fn what_is_not_acknowledged_in_time_ends_in_a_reset_and_is_never_delivered() {
 
 #[test]
 fn a_link_whose_task_waits_for_room_is_reset_all_the_same() {
-    among(&config(tcp_listen(), Speaks::Nothing), listens, async |net| {
+    among(&config(tcp_listen(), FirstSpeaker::Nothing), listens, async |net| {
         let mut buffers = [[0; 256]; 2];
         let [rx, tx] = &mut buffers;
         let mut own = connected(&net, rx, tx).await;
@@ -177,7 +177,7 @@ fn a_link_whose_task_waits_for_room_is_reset_all_the_same() {
 
 #[test]
 fn a_connection_that_the_peer_closes_is_closed_politely() {
-    among(&config(tcp_listen(), Speaks::Nothing), listens, async |net| {
+    among(&config(tcp_listen(), FirstSpeaker::Nothing), listens, async |net| {
         let mut buffers = [[0; 256]; 2];
         let [rx, tx] = &mut buffers;
         let mut own = connected(&net, rx, tx).await;
@@ -192,7 +192,7 @@ fn a_connection_that_the_peer_closes_is_closed_politely() {
 
 #[test]
 fn what_must_not_be_delivered_any_more_ends_a_polite_close() {
-    among(&config(tcp_listen(), Speaks::Nothing), listens, async |net| {
+    among(&config(tcp_listen(), FirstSpeaker::Nothing), listens, async |net| {
         let mut buffers = [[0; 256]; 2];
         let [rx, tx] = &mut buffers;
         let mut own = connected(&net, rx, tx).await;

@@ -22,7 +22,7 @@ async fn connect_after_refusals(socket: &mut TcpSocket<'_>, at: IpEndpoint) {
 
 #[test]
 fn a_tcp_listener_takes_the_controller_only() {
-    among(&config(tcp_listen(), Speaks::Nothing), listens, async |net| {
+    among(&config(tcp_listen(), FirstSpeaker::Nothing), listens, async |net| {
         let Net { controller, other_host, .. } = net;
         let at = gateway_port();
         let mut buffers = [[0; 256]; 4];
@@ -54,7 +54,7 @@ fn a_tcp_listener_takes_the_controller_only() {
 
 #[test]
 fn a_connection_that_never_comes_about_does_not_keep_the_listener() {
-    among(&config(tcp_listen(), Speaks::Nothing), listens, async |net| {
+    among(&config(tcp_listen(), FirstSpeaker::Nothing), listens, async |net| {
         let Net { controller, other_host, wire, .. } = net;
         let at = gateway_port();
         let mut buffers = [[0; 256]; 4];
@@ -79,7 +79,7 @@ fn a_connection_that_never_comes_about_does_not_keep_the_listener() {
 
 #[test]
 fn a_controller_that_was_switched_off_finds_the_listener_free_again() {
-    among(&config(tcp_listen(), Speaks::Nothing), listens, async |net| {
+    among(&config(tcp_listen(), FirstSpeaker::Nothing), listens, async |net| {
         let Net { controller, wire, .. } = net;
         let at = gateway_port();
         let mut buffers = [[0; 256]; 2];
@@ -99,7 +99,7 @@ fn a_controller_that_was_switched_off_finds_the_listener_free_again() {
 
 #[test]
 fn a_udp_listener_takes_the_controller_only() {
-    among(&config(udp_listen(), Speaks::Nothing), listens, async |net| {
+    among(&config(udp_listen(), FirstSpeaker::Nothing), listens, async |net| {
         let Net { controller, other_host, .. } = net;
         let at = gateway_port();
         let mut buffers = [[0; 256]; 4];

@@ -37,7 +37,7 @@ impl Pair<'_> {
 fn bytes_that_wait_in_the_ethernet_controller_are_heard_before_silence_is_too_long() {
     for order in Order::ALL {
         let _clock = Clock::take();
-        let config = config(tcp_listen(), Speaks::Frames);
+        let config = config(tcp_listen(), FirstSpeaker::Frames);
         let mut gateway = Box::new(Gateway::idle());
         gateway.configure(&config).unwrap();
         let gateway = &*gateway;
