@@ -19,7 +19,7 @@ use firmware::tasks::edge::{self, Edge, EdgeError};
 use firmware::tasks::fair::Fair;
 use firmware::tasks::gateway::{Gateway, MAX_LINKS};
 use firmware::tasks::led::Condition;
-use firmware::tasks::link::{Buffers, Endpoint};
+use firmware::tasks::link::{Endpoint, LinkBuffers};
 use firmware::tasks::store::{self, StoreHandle};
 use firmware::tasks::time::{self, WallClock};
 use firmware::tasks::watchdog::{Pulse, TaskName};
@@ -206,7 +206,9 @@ struct Wiring {
 #[repr(u8)]
 enum Overlay {
     Configuration(GatewayConfig),
-    Links(heapless::Vec<u8, { MAX_LINKS * Buffers::SIZE + CONNECTIONS * console::Buffers::SIZE }>),
+    Links(
+        heapless::Vec<u8, { MAX_LINKS * LinkBuffers::SIZE + CONNECTIONS * console::ConnectionBuffers::SIZE }>,
+    ),
 }
 
 impl Overlay {
@@ -311,7 +313,7 @@ fn connect(
     tasks.spawn(TaskName::Address, |pulse| address(pulse, stack));
     for (id, kind, endpoint) in &wiring.links {
         let (id, kind, endpoint) = (*id, *kind, endpoint.clone());
-        let buffers = Buffers::take(&mut memory, &endpoint).expect("there is room for MAX_LINKS");
+        let buffers = LinkBuffers::take(&mut memory, &endpoint).expect("there is room for MAX_LINKS");
         tasks.spawn(TaskName::Link(kind), |pulse| {
             controller_link(pulse, gateway, id, stack, endpoint, buffers)
         });
@@ -352,7 +354,7 @@ fn start_console(
     let console: &'static Console =
         CONSOLE.init_with(|| Console::new(gateway, store, PORTS, node, name, key, secret));
     for nth in 0..CONNECTIONS {
-        let buffers = console::Buffers::take(&mut memory).expect("there is room for CONNECTIONS");
+        let buffers = console::ConnectionBuffers::take(&mut memory).expect("there is room for CONNECTIONS");
         tasks.spawn(TaskName::Console(nth as u8), |pulse| connection(pulse, console, stack, buffers));
     }
     let button = board.button();
@@ -418,7 +420,7 @@ async fn controller_link(
     id: LinkId,
     stack: Stack<'static>,
     endpoint: Endpoint,
-    buffers: Buffers<'static>,
+    buffers: LinkBuffers<'static>,
 ) -> ! {
     pulse.run(pin!(link::run(gateway, pulse, id, stack, &endpoint, buffers))).await
 }
@@ -452,7 +454,7 @@ async fn connection(
     pulse: &'static Pulse,
     console: &'static Console,
     stack: Stack<'static>,
-    buffers: console::Buffers<'static>,
+    buffers: console::ConnectionBuffers<'static>,
 ) -> ! {
     pulse.run(pin!(console.serve(pulse, stack, buffers))).await
 }

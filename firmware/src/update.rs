@@ -11,7 +11,7 @@ use proto_core::config::image;
 use recipe_store::SlotMarks;
 use recipe_update::{
     BoardName, Downgrade, Foreign, Formats, Gap, HEADER, Header, HeaderError, PublicKey, Receive,
-    ReceiveError, Running, Slot, SlotFlash, Step, Version, header_of,
+    ReceiveError, ReceiveStep, Running, Slot, SlotFlash, Version, header_of,
 };
 
 /// What a board says of its slots.
@@ -38,7 +38,7 @@ pub struct Slots<S> {
 
 /// Why a request about the firmware is refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Refused {
+pub enum UpdateError {
     /// This firmware takes no update.
     Cannot(&'static str),
     /// What was sent is no header.
@@ -70,7 +70,7 @@ pub enum Refused {
     Format(u32),
 }
 
-impl Refused {
+impl UpdateError {
     /// Whether what was sent is wrong, and not only the moment.
     pub fn is_wrong(&self) -> bool {
         match self {
@@ -81,7 +81,7 @@ impl Refused {
     }
 }
 
-impl fmt::Display for Refused {
+impl fmt::Display for UpdateError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Cannot(why) => f.write_str(why),
@@ -196,8 +196,8 @@ impl<S: SlotFlash> Updates<S> {
         self.other.as_ref()
     }
 
-    fn rule(&self, kept: Option<(u32, u32)>) -> Result<Running, Refused> {
-        let slot = self.slots.as_ref().map_err(|why| Refused::Cannot(why))?.running;
+    fn rule(&self, kept: Option<(u32, u32)>) -> Result<Running, UpdateError> {
+        let slot = self.slots.as_ref().map_err(|why| UpdateError::Cannot(why))?.running;
         Ok(Running { board: self.board, slot, version: VERSION, kept })
     }
 
@@ -213,7 +213,7 @@ impl<S: SlotFlash> Updates<S> {
         kept: Option<(u32, u32)>,
         marks: SlotMarks,
         downgrade: Downgrade,
-    ) -> Result<(), Refused> {
+    ) -> Result<(), UpdateError> {
         let running = self.rule(kept)?;
         match offset {
             0 => self.begin(bytes, &running, marks, downgrade),
@@ -227,12 +227,12 @@ impl<S: SlotFlash> Updates<S> {
         running: &Running,
         marks: SlotMarks,
         downgrade: Downgrade,
-    ) -> Result<(), Refused> {
-        let slots = self.slots.as_ref().map_err(|why| Refused::Cannot(why))?;
-        let bytes: &[u8; HEADER] = bytes.try_into().map_err(|_| Refused::Alone)?;
-        let header = Header::parse(bytes).map_err(Refused::Header)?;
+    ) -> Result<(), UpdateError> {
+        let slots = self.slots.as_ref().map_err(|why| UpdateError::Cannot(why))?;
+        let bytes: &[u8; HEADER] = bytes.try_into().map_err(|_| UpdateError::Alone)?;
+        let header = Header::parse(bytes).map_err(UpdateError::Header)?;
         let receive =
-            Receive::begin(header, running, marks, downgrade, &slots.free).map_err(Refused::Rule)?;
+            Receive::begin(header, running, marks, downgrade, &slots.free).map_err(UpdateError::Rule)?;
         if let Some(Incoming { header: before, stage, .. }) = self.incoming
             && before == header
             && !matches!(stage, UpdateStage::Failed(_))
@@ -240,7 +240,7 @@ impl<S: SlotFlash> Updates<S> {
             return Ok(());
         }
         if self.is_working() {
-            return Err(Refused::Busy);
+            return Err(UpdateError::Busy);
         }
         if self.other == Some(header) {
             let received = whole_length(&header);
@@ -252,42 +252,42 @@ impl<S: SlotFlash> Updates<S> {
         Ok(())
     }
 
-    async fn fill(&mut self, offset: u32, mut bytes: &[u8]) -> Result<(), Refused> {
-        let slots = self.slots.as_mut().map_err(|why| Refused::Cannot(why))?;
-        let Some(incoming) = &mut self.incoming else { return Err(Refused::NoHeader) };
+    async fn fill(&mut self, offset: u32, mut bytes: &[u8]) -> Result<(), UpdateError> {
+        let slots = self.slots.as_mut().map_err(|why| UpdateError::Cannot(why))?;
+        let Some(incoming) = &mut self.incoming else { return Err(UpdateError::NoHeader) };
         match incoming.stage {
             UpdateStage::Receiving => {}
-            UpdateStage::Erasing | UpdateStage::Checking => return Err(Refused::Busy),
-            UpdateStage::Ready => return Err(Refused::Gap { expected: incoming.received }),
-            UpdateStage::Failed(error) => return Err(Refused::Failed(error)),
+            UpdateStage::Erasing | UpdateStage::Checking => return Err(UpdateError::Busy),
+            UpdateStage::Ready => return Err(UpdateError::Gap { expected: incoming.received }),
+            UpdateStage::Failed(error) => return Err(UpdateError::Failed(error)),
         }
-        let Some(receive) = &mut self.receive else { return Err(Refused::NoHeader) };
+        let Some(receive) = &mut self.receive else { return Err(UpdateError::NoHeader) };
         if offset != incoming.received {
-            return Err(Refused::Gap { expected: incoming.received });
+            return Err(UpdateError::Gap { expected: incoming.received });
         }
         for nth in 0_u32.. {
             match receive.next(&slots.free) {
-                Step::Take { offset } => {
+                ReceiveStep::Take { offset } => {
                     let Ok(count @ 1..) = receive.take(offset, bytes) else { break };
                     bytes = bytes.get(count..).unwrap_or(&[]);
                     incoming.received = receive.taken().saturating_add(HEADER as u32);
                 }
-                Step::Write(place, word) => slots.free.write(place, &word).await,
-                Step::Erase(sector) => slots.free.erase(sector).await,
-                Step::Again => {
+                ReceiveStep::Write(place, word) => slots.free.write(place, &word).await,
+                ReceiveStep::Erase(sector) => slots.free.erase(sector).await,
+                ReceiveStep::Again => {
                     incoming.stage = UpdateStage::Checking;
                     break;
                 }
                 // A short one is checked at once.
-                Step::End(Ok(())) => {
+                ReceiveStep::End(Ok(())) => {
                     incoming.stage = UpdateStage::Ready;
                     self.receive = None;
                     self.look();
                     break;
                 }
-                Step::End(Err(error)) => {
+                ReceiveStep::End(Err(error)) => {
                     incoming.stage = UpdateStage::Failed(error);
-                    return Err(Refused::Failed(error));
+                    return Err(UpdateError::Failed(error));
                 }
             }
             if nth % WORDS == 0 {
@@ -313,16 +313,16 @@ impl<S: SlotFlash> Updates<S> {
         // What the slot held is gone from here on.
         self.other = None;
         match receive.next(&slots.free) {
-            Step::Erase(sector) => slots.free.erase(sector).await,
-            Step::Write(place, word) => slots.free.write(place, &word).await,
-            Step::Take { .. } => incoming.stage = UpdateStage::Receiving,
-            Step::Again => yield_now().await,
-            Step::End(Ok(())) => {
+            ReceiveStep::Erase(sector) => slots.free.erase(sector).await,
+            ReceiveStep::Write(place, word) => slots.free.write(place, &word).await,
+            ReceiveStep::Take { .. } => incoming.stage = UpdateStage::Receiving,
+            ReceiveStep::Again => yield_now().await,
+            ReceiveStep::End(Ok(())) => {
                 incoming.stage = UpdateStage::Ready;
                 self.receive = None;
                 self.look();
             }
-            Step::End(Err(error)) => {
+            ReceiveStep::End(Err(error)) => {
                 incoming.stage = UpdateStage::Failed(error);
                 self.receive = None;
             }
@@ -338,11 +338,11 @@ impl<S: SlotFlash> Updates<S> {
         kept: Option<(u32, u32)>,
         marks: SlotMarks,
         downgrade: Downgrade,
-    ) -> Result<Header, Refused> {
+    ) -> Result<Header, UpdateError> {
         let running = self.rule(kept)?;
-        let slots = self.slots.as_ref().map_err(|why| Refused::Cannot(why))?;
-        let header = self.other.ok_or(Refused::NotReady)?;
-        running.accepts(&header, &slots.free, marks, downgrade).map_err(Refused::Rule)?;
+        let slots = self.slots.as_ref().map_err(|why| UpdateError::Cannot(why))?;
+        let header = self.other.ok_or(UpdateError::NotReady)?;
+        running.accepts(&header, &slots.free, marks, downgrade).map_err(UpdateError::Rule)?;
         Ok(header)
     }
 
@@ -351,21 +351,21 @@ impl<S: SlotFlash> Updates<S> {
     /// # Errors
     /// It was made with another key than the loader's.
     #[inline(never)]
-    pub fn verify(&self, header: &Header) -> Result<(), Refused> {
-        let slots = self.slots.as_ref().map_err(|why| Refused::Cannot(why))?;
-        let key = PublicKey::parse(&slots.key).ok_or(Refused::Foreign)?;
-        header.verify(&key).map_err(|_| Refused::Foreign)
+    pub fn verify(&self, header: &Header) -> Result<(), UpdateError> {
+        let slots = self.slots.as_ref().map_err(|why| UpdateError::Cannot(why))?;
+        let key = PublicKey::parse(&slots.key).ok_or(UpdateError::Foreign)?;
+        header.verify(&key).map_err(|_| UpdateError::Foreign)
     }
 
     /// Whether a configuration of this version may be kept.
     ///
     /// # Errors
     /// Why not.
-    pub fn may_keep(&self, version: u32, marks: SlotMarks) -> Result<(), Refused> {
+    pub fn may_keep(&self, version: u32, marks: SlotMarks) -> Result<(), UpdateError> {
         let before = self.other.map(|header| header.parts().formats);
         match recipe_update::may_keep(version, &FORMATS, before.as_ref(), marks) {
             true => Ok(()),
-            false => Err(Refused::Format(version)),
+            false => Err(UpdateError::Format(version)),
         }
     }
 }
@@ -431,7 +431,7 @@ impl WaitsFor {
 
 /// A firmware on trial: it confirms itself once the cell does as well as before.
 #[derive(Debug, Clone, Copy)]
-pub struct Trial {
+pub struct FirmwareTrial {
     until: Instant,
     before: Works,
     well_since: Option<Instant>,
@@ -448,7 +448,7 @@ pub enum Verdict {
     Over,
 }
 
-impl Trial {
+impl FirmwareTrial {
     /// From now on, for this long.
     pub fn new(now: Instant, confirm_s: u16, before: Works) -> Self {
         Self { until: now + Duration::from_secs(confirm_s.into()), before, well_since: None }

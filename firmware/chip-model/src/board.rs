@@ -14,7 +14,7 @@ use crate::exception::masks;
 use crate::models::rcc::Cause;
 use crate::models::scs::Scs;
 use crate::program::SEV;
-use crate::unicorn::{Engine, Flow, Handler, Reg, SYSTEM};
+use crate::unicorn::{Emulator, Flow, Handler, Reg, SYSTEM};
 
 /// Why a handler stopped the core.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -146,17 +146,17 @@ impl Board {
     }
 
     /// Lets all devices do what is due.
-    pub(crate) fn advance(&mut self, core: Engine) {
+    pub(crate) fn advance(&mut self, core: Emulator) {
         self.advance_those(core, |_, _| true);
     }
 
     /// The same, where nothing but time has changed since [`Board::advance`] or an access.
-    pub(crate) fn advance_due(&mut self, core: Engine) {
+    pub(crate) fn advance_due(&mut self, core: Emulator) {
         let now = self.now;
         self.advance_those(core, |_, next| next <= now);
     }
 
-    fn advance_those(&mut self, core: Engine, is_meant: impl Fn(&DeviceEntry, Picos) -> bool) {
+    fn advance_those(&mut self, core: Emulator, is_meant: impl Fn(&DeviceEntry, Picos) -> bool) {
         let next = self.next;
         let refused = self.with_devices(|devices, scs, at| {
             scs.advance(at);
@@ -224,7 +224,7 @@ impl Board {
         self.accesses.push_back(access);
     }
 
-    fn access(&mut self, core: Engine, address: u32, size: u32, value: Option<u32>) -> u32 {
+    fn access(&mut self, core: Emulator, address: u32, size: u32, value: Option<u32>) -> u32 {
         let holds = |place: &&DeviceEntry| (place.base..place.base + place.size).contains(&address);
         let place = if address >= SYSTEM { None } else { MAP.iter().find(holds) };
         let (name, register, result) = if address >= SYSTEM {
@@ -351,15 +351,15 @@ impl Board {
 }
 
 impl Handler for Board {
-    fn read(&mut self, core: Engine, address: u32, size: u32) -> u32 {
+    fn read(&mut self, core: Emulator, address: u32, size: u32) -> u32 {
         self.access(core, address, size, None)
     }
 
-    fn write(&mut self, core: Engine, address: u32, value: u32, size: u32) {
+    fn write(&mut self, core: Emulator, address: u32, value: u32, size: u32) {
         self.access(core, address, size, Some(value));
     }
 
-    fn block(&mut self, core: Engine, address: u32, len: u32) -> Flow {
+    fn block(&mut self, core: Emulator, address: u32, len: u32) -> Flow {
         let must_stop = self.violation.is_some() || self.halt.is_some() || self.guard_changed;
         let must_stop = must_stop || self.scs.wants_reset();
         // A program that asks the flash whether it is done, and reads it at once, has to see what it has written.
@@ -380,7 +380,7 @@ impl Handler for Board {
         Flow::Continue
     }
 
-    fn watched(&mut self, core: Engine, address: u32) -> Flow {
+    fn watched(&mut self, core: Emulator, address: u32) -> Flow {
         match core.word(address) as u16 {
             SEV => {
                 self.scs.event = true;

@@ -24,7 +24,7 @@ use crate::models::flash::Contents;
 use crate::models::rcc::Cause;
 use crate::models::scs::HARD_FAULT;
 use crate::program::Program;
-use crate::unicorn::{Core, Engine, Exit, MMIO, Reg};
+use crate::unicorn::{Core, Emulator, Exit, MMIO, Reg};
 
 /// Address of the configuration image.
 pub const CONFIG: u32 = 0x081C_0000;
@@ -45,7 +45,7 @@ pub struct Chip {
     /// Steps since the log was read.
     steps_unread: u32,
     /// Pages of flash that are not just read-only for the emulator.
-    pages: BTreeMap<u32, flash::Access>,
+    pages: BTreeMap<u32, flash::PageAccess>,
     /// The range of the MPU's guard region that is in effect.
     closed: Option<(u32, u32)>,
     /// Consecutive deadlines that were not in the future.
@@ -205,7 +205,7 @@ impl Chip {
     }
 
     /// Access to memory and the core's registers.
-    pub fn engine(&self) -> Engine {
+    pub fn engine(&self) -> Emulator {
         self.core.engine()
     }
 

@@ -5,7 +5,7 @@
 //! MSTKERR is set.
 
 use crate::models::scs::{Masks, Scs};
-use crate::unicorn::{Engine, Reg};
+use crate::unicorn::{Emulator, Reg};
 
 const FRAME: u32 = 0x20;
 const EXTENDED: u32 = 0x68;
@@ -22,7 +22,7 @@ pub(crate) const IT: u32 = 0x0600_FC00;
 const STACKED: [Reg; 6] = [Reg::R0, Reg::R1, Reg::R2, Reg::R3, Reg::R12, Reg::Lr];
 
 /// The core's mask registers.
-pub(crate) fn masks(core: Engine) -> Masks {
+pub(crate) fn masks(core: Emulator) -> Masks {
     Masks {
         primask: core.reg(Reg::Primask) & 1 != 0,
         faultmask: core.reg(Reg::Faultmask) & 1 != 0,
@@ -31,7 +31,7 @@ pub(crate) fn masks(core: Engine) -> Masks {
 }
 
 /// Enters an exception; returns the address of its handler.
-pub(crate) fn enter(core: Engine, scs: &mut Scs, number: u16, return_address: u32) -> u32 {
+pub(crate) fn enter(core: Emulator, scs: &mut Scs, number: u16, return_address: u32) -> u32 {
     let guard = scs.guard();
     let (control, status, stack) = (core.reg(Reg::Control), core.reg(Reg::Xpsr), core.reg(Reg::Sp));
     let has_floats = control & FLOATS_IN_USE != 0;
@@ -73,7 +73,7 @@ pub(crate) fn is_return(pc: u32) -> bool {
 }
 
 /// Returns from an exception with the EXC_RETURN `how`; returns the address to continue at.
-pub(crate) fn leave(core: Engine, scs: &mut Scs, how: u32) -> u32 {
+pub(crate) fn leave(core: Emulator, scs: &mut Scs, how: u32) -> u32 {
     let frame = core.reg(Reg::Sp);
     let has_floats = how & NO_FLOATS == 0;
     let mut basic = [0; FRAME as usize];

@@ -33,13 +33,13 @@ pub enum Flow {
 /// middle of an access would repeat the access.
 pub trait Handler {
     /// A read of a device.
-    fn read(&mut self, core: Engine, address: u32, size: u32) -> u32;
+    fn read(&mut self, core: Emulator, address: u32, size: u32) -> u32;
     /// A write to a device.
-    fn write(&mut self, core: Engine, address: u32, value: u32, size: u32);
+    fn write(&mut self, core: Emulator, address: u32, value: u32, size: u32);
     /// A basic block is about to be executed; [`Flow::Stop`] prevents it.
-    fn block(&mut self, core: Engine, address: u32, len: u32) -> Flow;
+    fn block(&mut self, core: Emulator, address: u32, len: u32) -> Flow;
     /// A watched instruction is about to be executed; [`Flow::Stop`] prevents it.
-    fn watched(&mut self, core: Engine, address: u32) -> Flow;
+    fn watched(&mut self, core: Emulator, address: u32) -> Flow;
 }
 
 /// Why the core stopped.
@@ -90,12 +90,12 @@ type Mmio = [usize; 2];
 
 /// Access to the core's registers and memory, also for a handler.
 #[derive(Clone, Copy)]
-pub struct Engine {
+pub struct Emulator {
     api: &'static Api,
     uc: Uc,
 }
 
-impl Engine {
+impl Emulator {
     /// The register's value.
     pub fn reg(self, reg: Reg) -> u32 {
         self.numbered(reg as i32)
@@ -180,7 +180,7 @@ impl Engine {
 
 /// An emulated Cortex-M7 with its memory.
 pub struct Core {
-    engine: Engine,
+    engine: Emulator,
     /// Boxed, because the callbacks get its address.
     shared: Box<HookState>,
 }
@@ -207,7 +207,7 @@ impl Core {
         // SAFETY: `uc` is valid for the handle.
         checked("uc_open", unsafe { (api.open)(ARM, THUMB, &raw mut uc) })?;
         let core = Self {
-            engine: Engine { api, uc },
+            engine: Emulator { api, uc },
             shared: Box::new(HookState { api, handler: Cell::new(None), exit: Cell::new(None) }),
         };
         // SAFETY: this request takes the model's number.
@@ -219,7 +219,7 @@ impl Core {
     }
 
     /// Its registers and memory.
-    pub fn engine(&self) -> Engine {
+    pub fn engine(&self) -> Emulator {
         self.engine
     }
 
@@ -244,7 +244,7 @@ impl Core {
     }
 
     fn set_access(&self, address: u32, size: u32, access: u32) -> Result<(), String> {
-        let Engine { api, uc } = self.engine;
+        let Emulator { api, uc } = self.engine;
         // SAFETY: as above.
         checked("uc_mem_protect", unsafe { (api.protect)(uc, address.into(), size.into(), access) })?;
         self.flush_rights()
@@ -256,7 +256,7 @@ impl Core {
     /// The library returns an error.
     pub fn flush_rights(&self) -> Result<(), String> {
         const FLUSH_TLB: c_int = 11 | 1 << 30;
-        let Engine { api, uc } = self.engine;
+        let Emulator { api, uc } = self.engine;
         // SAFETY: this request takes nothing.
         checked("uc_ctl", unsafe { (api.ctl)(uc, FLUSH_TLB) })
     }
@@ -295,7 +295,7 @@ impl Core {
 
     fn hook(&self, kind: c_int, callback: *mut c_void, begin: u64, end: u64) -> Result<(), String> {
         let mut handle = 0;
-        let Engine { api, uc } = self.engine;
+        let Emulator { api, uc } = self.engine;
         // SAFETY: each caller passes a callback of the type that unicorn.h has for the kind.
         checked("uc_hook_add", unsafe {
             (api.hook)(uc, &raw mut handle, kind, callback, self.user(), begin, end)
@@ -309,7 +309,7 @@ impl Core {
     /// Drops cached translations of memory that has changed.
     pub fn invalidate(&self, address: u32, len: u32) {
         const REMOVE_CACHE: c_int = 9 | 2 << 26 | 1 << 30;
-        let Engine { api, uc } = self.engine;
+        let Emulator { api, uc } = self.engine;
         // SAFETY: this request takes a range.
         unsafe { (api.ctl)(uc, REMOVE_CACHE, u64::from(address), u64::from(address) + u64::from(len)) };
     }
@@ -340,7 +340,7 @@ impl Core {
         let handler: *mut (dyn Handler + 'static) = unsafe { std::mem::transmute(handler) };
         self.shared.handler.set(Some(handler));
         self.shared.exit.set(None);
-        let Engine { api, uc } = self.engine;
+        let Emulator { api, uc } = self.engine;
         // No time limit: the library would start a thread for it.
         // SAFETY: the memory that the callbacks use is valid.
         let status = unsafe { (api.start)(uc, u64::from(pc | 1), NOWHERE, 0, count) };

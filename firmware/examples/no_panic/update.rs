@@ -5,8 +5,8 @@ use core::hint::black_box;
 
 use recipe_store::Slot;
 use recipe_update::{
-    BoardName, Check, Downgrade, Formats, HEADER, Header, Machine, Parts, PublicKey, Receive, Running,
-    SlotFlash, SlotMarks, SlotTrial, Step, UpdateFile, Version, begin_trial, choose, confirm, end_trial,
+    BoardName, Check, Downgrade, Formats, HEADER, Header, Machine, Parts, PublicKey, Receive, ReceiveStep,
+    Running, SlotFlash, SlotMarks, SlotTrial, UpdateFile, Version, begin_trial, choose, confirm, end_trial,
     header_of, may_keep,
 };
 
@@ -101,8 +101,8 @@ fn update_receive(header: Header, board: BoardName) {
     let Ok(mut receive) = begun else { return };
     loop {
         match black_box(receive.next(&Any)) {
-            Step::Take { offset } => _ = black_box(receive.take(offset, bytes())),
-            Step::End(_) => return,
+            ReceiveStep::Take { offset } => _ = black_box(receive.take(offset, bytes())),
+            ReceiveStep::End(_) => return,
             _ => {}
         }
     }

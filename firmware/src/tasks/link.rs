@@ -90,17 +90,17 @@ impl Endpoint {
 
 /// A link's socket buffers.
 #[derive(Debug)]
-pub struct Buffers<'a> {
+pub struct LinkBuffers<'a> {
     rx: &'a mut [u8],
     tx: &'a mut [u8],
     chunk: &'a mut [u8],
 }
 
-impl<'a> Buffers<'a> {
+impl<'a> LinkBuffers<'a> {
     /// Size in bytes.
     pub const SIZE: usize = 6 * 1024;
 
-    /// Takes [`Buffers::SIZE`] bytes from the front of `memory`; `None` if there are fewer.
+    /// Takes [`LinkBuffers::SIZE`] bytes from the front of `memory`; `None` if there are fewer.
     pub fn take(memory: &mut &'a mut [u8], endpoint: &Endpoint) -> Option<Self> {
         let memory = memory.split_off_mut(..Self::SIZE)?;
         let (rx, chunk) = match endpoint {
@@ -120,7 +120,7 @@ pub async fn run(
     link: LinkId,
     stack: Stack<'_>,
     endpoint: &Endpoint,
-    mut buffers: Buffers<'_>,
+    mut buffers: LinkBuffers<'_>,
 ) -> ! {
     let buffers = &mut buffers;
     let Some(control) = gateway.link(link) else { core::future::pending().await };

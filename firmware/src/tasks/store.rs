@@ -89,7 +89,7 @@ pub async fn run<F: StoreFlash, S: SlotFlash>(
     let trial = marks.trial.filter(|trial| updates.running() == Some(trial.slot));
     let trial = trial.map(|trial| {
         warn!("this firmware is on trial for {} s", trial.confirm_s);
-        update::Trial::new(Instant::now(), trial.confirm_s, Works::of_code(trial.before))
+        update::FirmwareTrial::new(Instant::now(), trial.confirm_s, Works::of_code(trial.before))
     });
     StoreTask { handle, stored, updates, trial, trial_s: None }.work(gateway, pulse).await;
 }
@@ -99,7 +99,7 @@ struct StoreTask<'a, F, S> {
     stored: &'a mut StoredConfig<F>,
     updates: &'a mut Updates<S>,
     /// The firmware that runs is on trial.
-    trial: Option<update::Trial>,
+    trial: Option<update::FirmwareTrial>,
     /// Length of the requested trial, in seconds.
     trial_s: Option<u16>,
 }

@@ -81,7 +81,7 @@ fn header(seed: &[u8; 32]) -> Header {
     Header::sign(parts, &image(), seed).unwrap()
 }
 
-fn put(updates: &mut Updates<Ram>, offset: u32, bytes: &[u8]) -> Result<(), Refused> {
+fn put(updates: &mut Updates<Ram>, offset: u32, bytes: &[u8]) -> Result<(), UpdateError> {
     block_on(updates.take(offset, bytes, Some((FORMATS.oldest, FORMATS.newest)), GOOD_A, Downgrade::Refused))
 }
 
@@ -97,7 +97,7 @@ fn work(updates: &mut Updates<Ram>) {
 }
 
 /// Sends what is missing in pieces of this length.
-fn send(updates: &mut Updates<Ram>, piece: usize) -> Result<(), Refused> {
+fn send(updates: &mut Updates<Ram>, piece: usize) -> Result<(), UpdateError> {
     for (bytes, at) in image().chunks(piece).zip((HEADER..).step_by(piece)) {
         if at as u32 >= stage(updates).1 {
             put(updates, at as u32, bytes)?;
@@ -113,7 +113,7 @@ fn a_firmware_comes_in_pieces_and_is_whole() {
         let mut updates = board();
         put(&mut updates, 0, &header(&SEED).encode()).unwrap();
         assert_eq!(stage(&updates), (UpdateStage::Erasing, HEADER as u32));
-        assert_eq!(put(&mut updates, HEADER as u32, &image()[..64]), Err(Refused::Busy));
+        assert_eq!(put(&mut updates, HEADER as u32, &image()[..64]), Err(UpdateError::Busy));
         work(&mut updates);
         send(&mut updates, piece).unwrap();
         assert_eq!(stage(&updates), (UpdateStage::Ready, whole_length(&header(&SEED))));
@@ -141,7 +141,7 @@ fn a_lost_connection_goes_on_and_nothing_is_erased_again() {
     put(&mut updates, 0, &head).unwrap();
     work(&mut updates);
     put(&mut updates, HEADER as u32, &image()[..5_000]).unwrap();
-    assert_eq!(put(&mut updates, 400, &image()[..64]), Err(Refused::Gap { expected: 5_192 }));
+    assert_eq!(put(&mut updates, 400, &image()[..64]), Err(UpdateError::Gap { expected: 5_192 }));
     let erased = updates.slots.as_ref().unwrap().free.erases;
     put(&mut updates, 0, &head).unwrap();
     assert_eq!(stage(&updates), (UpdateStage::Receiving, 5_192));
@@ -160,18 +160,18 @@ fn a_lost_connection_goes_on_and_nothing_is_erased_again() {
 #[test]
 fn what_is_wrong_is_refused_and_says_why() {
     let mut updates = board();
-    assert_eq!(put(&mut updates, 192, &[1]), Err(Refused::NoHeader));
-    assert_eq!(put(&mut updates, 0, &[1]), Err(Refused::Alone));
-    assert!(matches!(put(&mut updates, 0, &[1; HEADER]), Err(Refused::Header(_))));
+    assert_eq!(put(&mut updates, 192, &[1]), Err(UpdateError::NoHeader));
+    assert_eq!(put(&mut updates, 0, &[1]), Err(UpdateError::Alone));
+    assert!(matches!(put(&mut updates, 0, &[1; HEADER]), Err(UpdateError::Header(_))));
     let trial = Some(SlotTrial { slot: Slot::A, attempts: 1, confirm_s: 60, before: 0 });
     let marks = SlotMarks { trial, ..GOOD_A };
     let head = header(&SEED).encode();
     let on_trial = block_on(updates.take(0, &head, None, marks, Downgrade::Refused));
-    assert_eq!(on_trial, Err(Refused::Rule(recipe_update::Refused::OnTrial)));
+    assert_eq!(on_trial, Err(UpdateError::Rule(recipe_update::Refused::OnTrial)));
     let kept = block_on(updates.take(0, &head, Some((FORMATS.oldest, 99)), GOOD_A, Downgrade::Refused));
-    assert!(matches!(kept, Err(Refused::Rule(recipe_update::Refused::Format { kept: 99, .. }))));
+    assert!(matches!(kept, Err(UpdateError::Rule(recipe_update::Refused::Format { kept: 99, .. }))));
     assert_eq!(updates.slots.as_ref().unwrap().free.erases, 0, "nothing was erased");
-    assert_eq!(updates.ready(None, GOOD_A, Downgrade::Refused), Err(Refused::NotReady));
+    assert_eq!(updates.ready(None, GOOD_A, Downgrade::Refused), Err(UpdateError::NotReady));
     // Changed on the way.
     put(&mut updates, 0, &head).unwrap();
     work(&mut updates);
@@ -180,7 +180,7 @@ fn what_is_wrong_is_refused_and_says_why() {
     put(&mut updates, HEADER as u32, &changed).unwrap();
     work(&mut updates);
     assert!(matches!(stage(&updates).0, UpdateStage::Failed(_)), "{:?}", stage(&updates));
-    assert_eq!(updates.ready(None, GOOD_A, Downgrade::Refused), Err(Refused::NotReady));
+    assert_eq!(updates.ready(None, GOOD_A, Downgrade::Refused), Err(UpdateError::NotReady));
     // It begins anew.
     put(&mut updates, 0, &head).unwrap();
     work(&mut updates);
@@ -191,7 +191,7 @@ fn what_is_wrong_is_refused_and_says_why() {
     put(&mut updates, 0, &foreign.encode()).unwrap();
     work(&mut updates);
     send(&mut updates, 3_000).unwrap();
-    assert_eq!(updates.verify(&foreign), Err(Refused::Foreign));
+    assert_eq!(updates.verify(&foreign), Err(UpdateError::Foreign));
 }
 
 #[test]
@@ -200,7 +200,7 @@ fn flash_that_keeps_nothing_is_noticed() {
     updates.slots.as_mut().unwrap().free.worn = Some(40);
     put(&mut updates, 0, &header(&SEED).encode()).unwrap();
     work(&mut updates);
-    let worn = Refused::Failed(ReceiveError::Worn(Place { sector: 0, word: 40 }));
+    let worn = UpdateError::Failed(ReceiveError::Worn(Place { sector: 0, word: 40 }));
     assert_eq!(put(&mut updates, HEADER as u32, &image()), Err(worn));
     let received = stage(&updates).1;
     assert_eq!(put(&mut updates, received, &[1]), Err(worn));
@@ -209,7 +209,7 @@ fn flash_that_keeps_nothing_is_noticed() {
 #[test]
 fn a_board_without_slots_says_why() {
     let mut updates: Updates<Ram> = Updates::new(Site { board: "test", slots: Err("no loader") }).unwrap();
-    assert_eq!(put(&mut updates, 0, &header(&SEED).encode()), Err(Refused::Cannot("no loader")));
+    assert_eq!(put(&mut updates, 0, &header(&SEED).encode()), Err(UpdateError::Cannot("no loader")));
     assert_eq!(updates.cannot(), Some("no loader"));
     assert_eq!(updates.may_keep(3, GOOD_A), Ok(()));
 }
@@ -223,7 +223,7 @@ fn during_a_trial_only_what_the_firmware_before_reads_is_kept() {
     let trial = Some(SlotTrial { slot: Slot::A, attempts: 1, confirm_s: 60, before: 0 });
     let marks = SlotMarks { good: Some(Slot::B), trial, last: Some((Slot::A, Ended::Failed)) };
     assert_eq!(updates.may_keep(FORMATS.newest, marks), Ok(()));
-    assert_eq!(updates.may_keep(FORMATS.newest + 1, marks), Err(Refused::Format(FORMATS.newest + 1)));
+    assert_eq!(updates.may_keep(FORMATS.newest + 1, marks), Err(UpdateError::Format(FORMATS.newest + 1)));
 }
 
 #[test]
@@ -231,7 +231,7 @@ fn a_trial_is_confirmed_once_all_is_as_before_for_ten_seconds() {
     let at = |seconds: u64| Instant::from_secs(100 + seconds);
     let before = Works { links: 2, ports: 1 };
     assert_eq!(Works::of_code(before.code()), before);
-    let mut trial = Trial::new(at(0), 60, before);
+    let mut trial = FirmwareTrial::new(at(0), 60, before);
     let none = Works::default();
     assert_eq!(trial.look(at(1), none, true), Verdict::Waits(WaitsFor::Controller));
     assert_eq!(trial.look(at(2), Works { ports: 0, ..before }, true), Verdict::Waits(WaitsFor::Ports));
@@ -242,7 +242,7 @@ fn a_trial_is_confirmed_once_all_is_as_before_for_ten_seconds() {
     assert_eq!(trial.look(at(14), none, true), Verdict::Waits(WaitsFor::Controller));
     assert_eq!(trial.look(at(15), before, true), Verdict::Waits(WaitsFor::Time));
     assert_eq!(trial.look(at(25), Works { ports: 3, ..before }, true), Verdict::Confirmed);
-    let mut trial = Trial::new(at(0), 60, before);
+    let mut trial = FirmwareTrial::new(at(0), 60, before);
     assert_eq!(trial.look(at(59), none, true), Verdict::Waits(WaitsFor::Controller));
     assert_eq!(trial.look(at(60), none, true), Verdict::Over);
 }

@@ -5,7 +5,7 @@ use core::fmt;
 use recipe_store::{Ended, Slot, SlotMarks, SlotTrial};
 
 use crate::SlotFlash;
-use crate::check::{Bad, Check, header};
+use crate::check::{BadImage, Check, header};
 use crate::header::{BoardName, Header, PublicKey};
 
 /// Starts that a trial has: one, and two more after power cuts.
@@ -109,17 +109,22 @@ fn on_trial(
 }
 
 /// Checks a slot that is known to be good.
-fn damage(flash: &impl SlotFlash, slot: Slot, board: &BoardName) -> Result<Header, Bad> {
+fn damage(flash: &impl SlotFlash, slot: Slot, board: &BoardName) -> Result<Header, BadImage> {
     let header = header(flash, slot, board)?;
     Check::damage(header).whole(flash)?;
     Ok(header)
 }
 
 /// Checks a slot of which nothing is known.
-fn origin(flash: &impl SlotFlash, slot: Slot, board: &BoardName, key: &PublicKey) -> Result<Header, Bad> {
+fn origin(
+    flash: &impl SlotFlash,
+    slot: Slot,
+    board: &BoardName,
+    key: &PublicKey,
+) -> Result<Header, BadImage> {
     let header = header(flash, slot, board)?;
     // Shorter than the hash of an image, and says whether that matters.
-    header.verify(key).map_err(|_| Bad::Foreign)?;
+    header.verify(key).map_err(|_| BadImage::Foreign)?;
     Check::contents(header).whole(flash)?;
     Ok(header)
 }

@@ -12,7 +12,7 @@ use crate::{FIRST_WORD, SlotFlash, place, size};
 /// Why a slot cannot run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
-pub enum Bad {
+pub enum BadImage {
     /// It has no header.
     Header(HeaderError),
     /// It is linked for the other slot.
@@ -36,7 +36,7 @@ pub enum Bad {
     Foreign,
 }
 
-impl fmt::Display for Bad {
+impl fmt::Display for BadImage {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Header(error) => error.fmt(f),
@@ -55,7 +55,7 @@ impl fmt::Display for Bad {
     }
 }
 
-impl core::error::Error for Bad {}
+impl core::error::Error for BadImage {}
 
 /// An image that is being checked.
 pub struct Check {
@@ -79,13 +79,13 @@ impl fmt::Debug for Check {
 ///
 /// # Errors
 /// There is none, or it is not for here.
-pub fn header(flash: &impl SlotFlash, slot: Slot, board: &BoardName) -> Result<Header, Bad> {
+pub fn header(flash: &impl SlotFlash, slot: Slot, board: &BoardName) -> Result<Header, BadImage> {
     let mut bytes = [0; HEADER];
     for (part, word) in bytes.as_chunks_mut::<WORD>().0.iter_mut().zip(0..) {
         let at = Place { sector: 0, word };
-        *part = flash.whole(at).ok_or(Bad::Torn(at))?;
+        *part = flash.whole(at).ok_or(BadImage::Torn(at))?;
     }
-    let header = Header::parse(&bytes).map_err(Bad::Header)?;
+    let header = Header::parse(&bytes).map_err(BadImage::Header)?;
     fits(&header, flash, slot, board)?;
     Ok(header)
 }
@@ -99,16 +99,16 @@ pub(crate) fn fits(
     flash: &impl SlotFlash,
     slot: Slot,
     board: &BoardName,
-) -> Result<(), Bad> {
+) -> Result<(), BadImage> {
     let room = size(flash).saturating_sub(IMAGE_OFFSET);
     if header.parts().board != *board {
-        return Err(Bad::Board(header.parts().board));
+        return Err(BadImage::Board(header.parts().board));
     }
     if header.slot() != slot {
-        return Err(Bad::Slot);
+        return Err(BadImage::Slot);
     }
     if header.length() > room {
-        return Err(Bad::Long { length: header.length(), room });
+        return Err(BadImage::Long { length: header.length(), room });
     }
     Ok(())
 }
@@ -125,7 +125,7 @@ impl Check {
     }
 
     /// Reads so many more words; `None` if some are left.
-    pub fn step(&mut self, flash: &impl SlotFlash, words: u16) -> Option<Result<(), Bad>> {
+    pub fn step(&mut self, flash: &impl SlotFlash, words: u16) -> Option<Result<(), BadImage>> {
         for _ in 0..words {
             let read = self.done.saturating_mul(WORD as u32);
             let left = self.header.length().saturating_sub(read);
@@ -134,9 +134,9 @@ impl Check {
             }
             // The header was for this slot, so it ends before the slot does.
             let Some(at) = place(flash, FIRST_WORD.saturating_add(self.done)) else {
-                return Some(Err(Bad::Crc));
+                return Some(Err(BadImage::Crc));
             };
-            let Some(word) = flash.whole(at) else { return Some(Err(Bad::Torn(at))) };
+            let Some(word) = flash.whole(at) else { return Some(Err(BadImage::Torn(at))) };
             let part = word.get(..(left as usize).min(WORD)).unwrap_or(&word);
             self.crc.update(part);
             if let Some(hash) = &mut self.hash {
@@ -148,11 +148,11 @@ impl Check {
             return None;
         }
         if self.crc.clone().finalize() != self.header.crc() {
-            return Some(Err(Bad::Crc));
+            return Some(Err(BadImage::Crc));
         }
         let hash = self.hash.take().map(Sha512::finalize);
         Some(match hash {
-            Some(hash) if hash != *self.header.hash() => Err(Bad::Hash),
+            Some(hash) if hash != *self.header.hash() => Err(BadImage::Hash),
             _ => Ok(()),
         })
     }
@@ -161,7 +161,7 @@ impl Check {
     ///
     /// # Errors
     /// What is wrong with the image.
-    pub(crate) fn whole(mut self, flash: &impl SlotFlash) -> Result<(), Bad> {
+    pub(crate) fn whole(mut self, flash: &impl SlotFlash) -> Result<(), BadImage> {
         loop {
             if let Some(result) = self.step(flash, u16::MAX) {
                 return result;

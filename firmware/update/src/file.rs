@@ -7,7 +7,7 @@ use core::fmt;
 use recipe_store::{Slot, WORD};
 use salty::Sha512;
 
-use crate::check::Bad;
+use crate::check::BadImage;
 use crate::header::{CRC, HEADER, Header, HeaderError, Parts};
 
 /// Number of bytes before the first link.
@@ -189,14 +189,14 @@ impl Link<'_> {
     ///
     /// # Errors
     /// What is different.
-    pub fn check(&self) -> Result<(), Bad> {
+    pub fn check(&self) -> Result<(), BadImage> {
         if CRC.checksum(self.image) != self.header.crc() {
-            return Err(Bad::Crc);
+            return Err(BadImage::Crc);
         }
         let mut hash = Sha512::new();
         hash.update(self.image);
         if hash.finalize() != *self.header.hash() {
-            return Err(Bad::Hash);
+            return Err(BadImage::Hash);
         }
         Ok(())
     }

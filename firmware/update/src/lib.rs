@@ -46,13 +46,13 @@ mod receive;
 mod rules;
 
 pub use boot::{Chosen, Machine, STARTS, begin_trial, choose, confirm, end_trial};
-pub use check::{Bad, Check, header as header_of};
+pub use check::{BadImage, Check, header as header_of};
 pub use file::{FILE_HEAD, FileError, Link, UpdateFile, file_head, link_padding};
 pub use header::{
     BoardName, Foreign, Formats, HEADER, Header, HeaderError, IMAGE_OFFSET, Parts, PublicKey, SIGNED, Version,
 };
 pub use layout::{BOARDS, Layout, MPS2_AN500, NUCLEO_H743ZI, NUCLEO_H743ZI_STORES, Stores};
-pub use receive::{Gap, Receive, ReceiveError, Step};
+pub use receive::{Gap, Receive, ReceiveError, ReceiveStep};
 pub use recipe_store::{Ended, Side, Slot, SlotMarks, SlotTrial};
 pub use rules::{Downgrade, Refused, Running, may_keep};
 

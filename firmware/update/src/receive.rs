@@ -8,7 +8,7 @@ use core::fmt;
 
 use recipe_store::{Place, SlotMarks, WORD, Word};
 
-use crate::check::{Bad, Check};
+use crate::check::{BadImage, Check};
 use crate::header::{HEADER, Header, IMAGE_OFFSET};
 use crate::rules::{Downgrade, Refused, Running};
 use crate::{FIRST_WORD, SlotFlash, place};
@@ -28,7 +28,7 @@ pub struct Receive {
 
 /// What to do next.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Step {
+pub enum ReceiveStep {
     /// Erase this sector of the slot.
     Erase(u8),
     /// Write this word of the slot.
@@ -51,7 +51,7 @@ pub enum ReceiveError {
     /// A word reads differently than it was written.
     Worn(Place),
     /// What was received is not what was signed.
-    Bad(Bad),
+    Bad(BadImage),
 }
 
 impl fmt::Display for ReceiveError {
@@ -164,30 +164,30 @@ impl Receive {
         self.collected == WORD || self.collected > 0 && self.taken == self.header.length()
     }
 
-    /// What to do next; called again when that is done, until it is [`Step::End`].
-    pub fn next(&mut self, flash: &impl SlotFlash) -> Step {
+    /// What to do next; called again when that is done, until it is [`ReceiveStep::End`].
+    pub fn next(&mut self, flash: &impl SlotFlash) -> ReceiveStep {
         loop {
             match &mut self.phase {
                 ReceivePhase::Erase { sector, end } => {
                     if sector < end {
                         let erased = *sector;
                         *sector = sector.saturating_add(1);
-                        return Step::Erase(erased);
+                        return ReceiveStep::Erase(erased);
                     }
                     self.phase = ReceivePhase::Fill;
                 }
                 ReceivePhase::Fill => {
                     if !self.is_full() {
-                        return Step::Take { offset: self.taken };
+                        return ReceiveStep::Take { offset: self.taken };
                     }
                     let word = self.taken.saturating_sub(1).checked_div(WORD as u32).unwrap_or(0);
                     // It was checked that the image has room.
                     let Some(at) = place(flash, FIRST_WORD.saturating_add(word)) else {
-                        self.phase = ReceivePhase::End(Err(ReceiveError::Bad(Bad::Crc)));
+                        self.phase = ReceivePhase::End(Err(ReceiveError::Bad(BadImage::Crc)));
                         continue;
                     };
                     self.phase = ReceivePhase::Written(at);
-                    return Step::Write(at, self.word);
+                    return ReceiveStep::Write(at, self.word);
                 }
                 ReceivePhase::Written(at) => {
                     let at = *at;
@@ -201,7 +201,7 @@ impl Receive {
                     };
                 }
                 ReceivePhase::Hash(check) => match check.step(flash, AT_ONCE) {
-                    None => return Step::Again,
+                    None => return ReceiveStep::Again,
                     Some(Ok(())) => self.phase = ReceivePhase::Header { nth: 0 },
                     Some(Err(bad)) => self.phase = ReceivePhase::End(Err(ReceiveError::Bad(bad))),
                 },
@@ -212,7 +212,7 @@ impl Receive {
                         continue;
                     };
                     self.phase = ReceivePhase::HeaderWritten { nth };
-                    return Step::Write(at, word);
+                    return ReceiveStep::Write(at, word);
                 }
                 ReceivePhase::HeaderWritten { nth } => {
                     let nth = *nth;
@@ -223,7 +223,7 @@ impl Receive {
                         _ => ReceivePhase::Header { nth: nth.saturating_add(1) },
                     };
                 }
-                ReceivePhase::End(result) => return Step::End(*result),
+                ReceivePhase::End(result) => return ReceiveStep::End(*result),
             }
         }
     }

@@ -5,7 +5,7 @@ use core::fmt;
 use recipe_store::{Slot, SlotMarks};
 
 use crate::SlotFlash;
-use crate::check::{Bad, fits};
+use crate::check::{BadImage, fits};
 use crate::header::{BoardName, Formats, Header, Version};
 
 /// The firmware that receives an update.
@@ -36,7 +36,7 @@ pub enum Downgrade {
 #[non_exhaustive]
 pub enum Refused {
     /// It cannot run in the free slot of this board.
-    Bad(Bad),
+    Bad(BadImage),
     /// It is older than what runs.
     Older {
         /// Its version.

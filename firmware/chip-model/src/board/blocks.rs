@@ -1,11 +1,11 @@
 //! Counts the instructions of a basic block: virtual time is derived from them.
 
 use super::{Board, FLASH};
-use crate::unicorn::Engine;
+use crate::unicorn::Emulator;
 
 impl Board {
     /// The number of instructions of a block; [`ENDLESS`] if it only jumps to itself.
-    pub(super) fn count(&mut self, core: Engine, address: u32, len: u32) -> u64 {
+    pub(super) fn count(&mut self, core: Emulator, address: u32, len: u32) -> u64 {
         let place = address.wrapping_sub(FLASH) as usize / 2;
         if let Some(&(known, count)) = self.blocks.get(place)
             && u32::from(known) == len

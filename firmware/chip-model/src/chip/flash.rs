@@ -5,7 +5,7 @@ use super::{Chip, PRECISE_BUS};
 use crate::board::{FLASH, FLASH_SIZE};
 use crate::exception::{IT, masks};
 use crate::models::flash::WORD;
-use crate::unicorn::{Engine, Reg};
+use crate::unicorn::{Emulator, Reg};
 
 impl Chip {
     /// Whether the page of this address contains torn words.
@@ -19,9 +19,9 @@ impl Chip {
     pub(super) fn close_page(&mut self, address: u32) -> Result<(), String> {
         let page = page(address);
         match (self.has_torn(address), self.pages.get(&page)) {
-            (true, Some(Access::None)) | (false, None) => Ok(()),
+            (true, Some(PageAccess::None)) | (false, None) => Ok(()),
             (true, _) => {
-                self.pages.insert(page, Access::None);
+                self.pages.insert(page, PageAccess::None);
                 self.core.protect(page, PAGE, true)
             }
             (false, _) => {
@@ -52,7 +52,7 @@ impl Chip {
 
     /// Executes one instruction with full access to a page of flash. That costs the emulator all its translations.
     pub(super) fn step_in_page(&mut self, address: u32) {
-        self.pages.insert(page(address), Access::Full);
+        self.pages.insert(page(address), PageAccess::Full);
         self.core.protect(page(address), PAGE, false).expect("there is flash");
         // This block was translated without a stop after one instruction, and so was that of the next instruction if
         // a run has ever begun there.
@@ -129,7 +129,7 @@ struct SimpleAccess {
 }
 
 /// The present instruction, if it is one: LDR, LDRH, LDRB or STR with an offset (Armv7-M ARM A5.2.4, A5.3.7, A5.3.10).
-fn plain(engine: Engine, pc: u32) -> Option<SimpleAccess> {
+fn plain(engine: Emulator, pc: u32) -> Option<SimpleAccess> {
     let word = engine.word(pc);
     let (low, high) = (word & 7, word >> 28);
     let (len, loads) = match word as u16 {
@@ -151,7 +151,7 @@ fn plain(engine: Engine, pc: u32) -> Option<SimpleAccess> {
 
 /// What the emulator lets the program do with a page, if that is not to read it alone.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Access {
+pub(super) enum PageAccess {
     /// Nothing.
     None,
     /// Anything.

@@ -62,7 +62,7 @@ pub trait Memory {
 }
 
 #[cfg(feature = "emulator")]
-impl Memory for crate::unicorn::Engine {
+impl Memory for crate::unicorn::Emulator {
     fn fetch(&self, address: u32, bytes: &mut [u8]) -> bool {
         self.read(address, bytes)
     }

@@ -3,23 +3,23 @@
 use std::ffi::{c_int, c_void};
 
 use super::library::Uc;
-use super::{Engine, Exit, Flow, Handler, HookState};
+use super::{Emulator, Exit, Flow, Handler, HookState};
 
 /// Calls the handler of the present run.
 fn with<T>(
     uc: Uc,
     user: *mut c_void,
-    call: impl FnOnce(&mut dyn Handler, Engine, &HookState) -> T,
+    call: impl FnOnce(&mut dyn Handler, Emulator, &HookState) -> T,
 ) -> Option<T> {
     // SAFETY: `user` is the core's `shared`, which lives as long as the engine.
     let shared = unsafe { &*user.cast::<HookState>() };
     let handler = shared.handler.get()?;
     // SAFETY: it is borrowed by `run`, which has not returned; callbacks do not nest.
     let handler = unsafe { &mut *handler };
-    Some(call(handler, Engine { api: shared.api, uc }, shared))
+    Some(call(handler, Emulator { api: shared.api, uc }, shared))
 }
 
-fn follow(engine: Engine, flow: Flow) {
+fn follow(engine: Emulator, flow: Flow) {
     if flow == Flow::Stop {
         engine.stop();
     }

@@ -24,17 +24,17 @@ use crate::tasks::watchdog::Pulse;
 
 /// The memory of a connection.
 #[derive(Debug)]
-pub struct Buffers<'a> {
+pub struct ConnectionBuffers<'a> {
     rx: &'a mut [u8],
     tx: &'a mut [u8],
     buf: &'a mut [u8],
 }
 
-impl<'a> Buffers<'a> {
+impl<'a> ConnectionBuffers<'a> {
     /// Size in bytes.
     pub const SIZE: usize = RX + TX + BUFFER;
 
-    /// Takes [`Buffers::SIZE`] bytes from the front of `memory`; `None` if there are fewer.
+    /// Takes [`ConnectionBuffers::SIZE`] bytes from the front of `memory`; `None` if there are fewer.
     pub fn take(memory: &mut &'a mut [u8]) -> Option<Self> {
         let memory = memory.split_off_mut(..Self::SIZE)?;
         let (rx, rest) = memory.split_at_mut_checked(RX)?;
@@ -55,8 +55,8 @@ pub(super) struct Request<'a> {
 
 impl Console {
     /// Serves connections with one socket, for ever.
-    pub async fn serve(&self, pulse: &Pulse, stack: Stack<'_>, buffers: Buffers<'_>) -> ! {
-        let Buffers { rx, tx, buf } = buffers;
+    pub async fn serve(&self, pulse: &Pulse, stack: Stack<'_>, buffers: ConnectionBuffers<'_>) -> ! {
+        let ConnectionBuffers { rx, tx, buf } = buffers;
         let mut head = HeadBuffer::new();
         loop {
             let mut socket = TcpSocket::new(stack, rx, tx);
@@ -100,47 +100,47 @@ impl Console {
         buffer: &'a mut HeadBuffer,
         buf: &mut [u8],
     ) -> Result<(), SendError> {
-        let mut line = Responder { socket, buf, is_head: false, nonce: None };
+        let mut responder = Responder { socket, buf, is_head: false, nonce: None };
         let deadline = Instant::now() + MAX_TIME;
-        let rest = match self.receive_head(&mut line, buffer, deadline).await? {
+        let rest = match self.receive_head(&mut responder, buffer, deadline).await? {
             Some(rest) => rest,
-            None => return self.was_incomplete(&mut line).await,
+            None => return self.was_incomplete(&mut responder).await,
         };
-        let reply = match self.admit(&mut line, buffer) {
+        let reply = match self.admit(&mut responder, buffer) {
             Ok((admitted, mut request)) => {
-                match self.receive_body(&mut line, &admitted, &mut request, rest, deadline).await? {
-                    Body::Whole => match self.execute(&mut line, request).await? {
+                match self.receive_body(&mut responder, &admitted, &mut request, rest, deadline).await? {
+                    Body::Whole => match self.execute(&mut responder, request).await? {
                         Outcome::Sent => return Ok(()),
                         Outcome::Reply(reply) => reply,
                     },
                     Body::Other => {
                         let text = "the body is not the one that was signed";
-                        Reply::error(line.buf, Status::UNAUTHORIZED, text)
+                        Reply::error(responder.buf, Status::UNAUTHORIZED, text)
                     }
-                    Body::Incomplete => return self.was_incomplete(&mut line).await,
+                    Body::Incomplete => return self.was_incomplete(&mut responder).await,
                 }
             }
             Err(reply) => reply,
         };
-        line.answer(&reply).await
+        responder.answer(&reply).await
     }
 
-    async fn was_incomplete(&self, line: &mut Responder<'_, '_>) -> Result<(), SendError> {
+    async fn was_incomplete(&self, responder: &mut Responder<'_, '_>) -> Result<(), SendError> {
         self.count(|counters| &mut counters.incomplete);
-        let reply = Reply::refused(line.buf, &HeadError::Incomplete.into());
-        line.answer(&reply).await
+        let reply = Reply::refused(responder.buf, &HeadError::Incomplete.into());
+        responder.answer(&reply).await
     }
 
     /// Waits for the head. Returns the range of the buffer with the beginning of the body; `None` if it did not arrive in time.
     async fn receive_head(
         &self,
-        line: &mut Responder<'_, '_>,
+        responder: &mut Responder<'_, '_>,
         buffer: &mut HeadBuffer,
         deadline: Instant,
     ) -> Result<Option<Range<usize>>, SendError> {
         loop {
-            let chunk = line.buf.get_mut(..CHUNK).unwrap_or(&mut []);
-            let count = match with_deadline(deadline, line.socket.read(chunk)).await {
+            let chunk = responder.buf.get_mut(..CHUNK).unwrap_or(&mut []);
+            let count = match with_deadline(deadline, responder.socket.read(chunk)).await {
                 Ok(Ok(count @ 1..)) => count,
                 // A browser opens connections that it may never use.
                 _ if buffer.is_empty() => return Err(SendError::Gone),
@@ -150,7 +150,7 @@ impl Console {
                     return Err(SendError::Gone);
                 }
             };
-            let taken = buffer.push(line.buf.get(..count).unwrap_or(&[]));
+            let taken = buffer.push(responder.buf.get(..count).unwrap_or(&[]));
             if buffer.head() != Err(HeadError::Incomplete) {
                 return Ok(Some(taken..count));
             }
@@ -161,10 +161,10 @@ impl Console {
     #[inline(never)]
     fn admit<'a>(
         &'a self,
-        line: &mut Responder<'_, '_>,
+        responder: &mut Responder<'_, '_>,
         buffer: &'a HeadBuffer,
     ) -> Result<(Admitted, Request<'a>), Reply> {
-        let (local, peer) = match (line.socket.local_endpoint(), line.socket.remote_endpoint()) {
+        let (local, peer) = match (responder.socket.local_endpoint(), responder.socket.remote_endpoint()) {
             (Some(local), Some(peer)) => (address(local.addr), address(peer.addr)),
             _ => (Ipv4Addr::UNSPECIFIED, Ipv4Addr::UNSPECIFIED),
         };
@@ -176,13 +176,13 @@ impl Console {
         };
         let (head, admitted) = admitted.map_err(|refusal| {
             if refusal.status == Status::UNAUTHORIZED {
-                line.nonce = Some(guard.nonce(now()));
+                responder.nonce = Some(guard.nonce(now()));
             }
-            Reply::refused(line.buf, &refusal)
+            Reply::refused(responder.buf, &refusal)
         })?;
-        line.is_head = admitted.is_head;
+        responder.is_head = admitted.is_head;
         if admitted.is_signed() {
-            line.nonce = Some(guard.nonce(now()));
+            responder.nonce = Some(guard.nonce(now()));
         }
         let operation = admitted.operation;
         let mut request = Request { head, operation, arguments: Arguments::None, image: None, peer };
@@ -190,8 +190,8 @@ impl Console {
             store.note_reached();
         }
         if matches!(operation, Operation::PutConfig | Operation::PutUpdate | Operation::PutEdge) {
-            let Some(store) = self.store else { return Err(nothing_kept(line.buf)) };
-            let Some(lock) = store.take() else { return Err(busy(line.buf)) };
+            let Some(store) = self.store else { return Err(nothing_kept(responder.buf)) };
+            let Some(lock) = store.take() else { return Err(busy(responder.buf)) };
             // The guard has limited it.
             request.image = Some((usize::try_from(admitted.length).unwrap_or(0), lock));
         }
@@ -201,7 +201,7 @@ impl Console {
     /// Takes the body, of which a part came with the head.
     async fn receive_body(
         &self,
-        line: &mut Responder<'_, '_>,
+        responder: &mut Responder<'_, '_>,
         admitted: &Admitted,
         request: &mut Request<'_>,
         rest: Range<usize>,
@@ -211,13 +211,13 @@ impl Console {
         let mut hash = BodyHash::new();
         // What is behind the body is another request, which is not looked at.
         let mut piece = rest.len().min(length);
-        line.buf.copy_within(rest.start..rest.start.saturating_add(piece), 0);
+        responder.buf.copy_within(rest.start..rest.start.saturating_add(piece), 0);
         if admitted.expects_continue && piece < length {
-            line.send(CONTINUE.as_bytes(), deadline).await?;
+            responder.send(CONTINUE.as_bytes(), deadline).await?;
         }
         let (mut received, mut from) = (0_usize, 0_usize);
         loop {
-            let bytes = line.buf.get(from..from.saturating_add(piece)).unwrap_or(&[]);
+            let bytes = responder.buf.get(from..from.saturating_add(piece)).unwrap_or(&[]);
             hash.update(bytes);
             match &mut request.image {
                 Some((_, lock)) => lock.fill(received, bytes),
@@ -229,8 +229,8 @@ impl Console {
             if left == 0 {
                 break;
             }
-            let chunk = line.buf.get_mut(from..from.saturating_add(left.min(CHUNK))).unwrap_or(&mut []);
-            piece = match with_deadline(deadline, line.socket.read(chunk)).await {
+            let chunk = responder.buf.get_mut(from..from.saturating_add(left.min(CHUNK))).unwrap_or(&mut []);
+            piece = match with_deadline(deadline, responder.socket.read(chunk)).await {
                 Ok(Ok(count @ 1..)) => count,
                 Err(_) => return Ok(Body::Incomplete),
                 Ok(_) => {
@@ -245,7 +245,7 @@ impl Console {
             return Ok(Body::Other);
         }
         if request.image.is_none() && request.head.method == Method::Post {
-            let body = line.buf.get(..length).unwrap_or(&[]);
+            let body = responder.buf.get(..length).unwrap_or(&[]);
             request.arguments = Arguments::parse(request.operation, body);
         }
         Ok(Body::Whole)

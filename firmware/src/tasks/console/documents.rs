@@ -27,33 +27,33 @@ impl Console {
     /// Sends a whole document as the body of an answer.
     pub(super) async fn document(
         &self,
-        line: &mut Responder<'_, '_>,
+        responder: &mut Responder<'_, '_>,
         kind: Kind,
         mut source: DocumentSource,
     ) -> Result<Outcome, SendError> {
         if self.is_idle() {
             let text = "nothing runs at the moment; try again";
-            return Ok(Outcome::Reply(Reply::error(line.buf, Status::UNAVAILABLE, text)));
+            return Ok(Outcome::Reply(Reply::error(responder.buf, Status::UNAVAILABLE, text)));
         }
-        if !line.begin(kind, Length::Chunked, None).await? {
+        if !responder.begin(kind, Length::Chunked, None).await? {
             return Ok(Outcome::Sent);
         }
         let until = Instant::now() + MAX_ANSWER;
-        while let Some(len) = self.piece(line, &mut source)? {
-            line.chunk(len, until.min(Instant::now() + MAX_TIME)).await?;
+        while let Some(len) = self.piece(responder, &mut source)? {
+            responder.chunk(len, until.min(Instant::now() + MAX_TIME)).await?;
             yield_now().await;
         }
-        line.last_chunk().await?;
+        responder.last_chunk().await?;
         Ok(Outcome::Sent)
     }
 
     /// Writes the next piece into the buffer; returns its length. The engine is borrowed only here.
     pub(super) fn piece(
         &self,
-        line: &mut Responder<'_, '_>,
+        responder: &mut Responder<'_, '_>,
         source: &mut DocumentSource,
     ) -> Result<Option<usize>, SendError> {
-        let mut buf = TextBuffer::new(line.buf);
+        let mut buf = TextBuffer::new(responder.buf);
         let is_more = self.gateway.report(|status| match source {
             DocumentSource::Pieces(pieces) => {
                 pieces.write_next(status, &mut buf).map_err(|_| SendError::TooLong)

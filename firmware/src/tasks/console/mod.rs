@@ -36,7 +36,7 @@ use crate::clock::now;
 use crate::identity::NAME;
 use crate::info;
 use crate::platform::{Button, Ports};
-pub use connection::Buffers;
+pub use connection::ConnectionBuffers;
 
 /// Number of connections.
 pub const CONNECTIONS: usize = 4;

@@ -30,29 +30,31 @@ impl Console {
     /// Executes a request.
     pub(super) async fn execute<'a>(
         &'a self,
-        line: &mut Responder<'_, '_>,
+        responder: &mut Responder<'_, '_>,
         request: Request<'a>,
     ) -> Result<Outcome, SendError> {
         let reply = match request.operation {
-            Operation::Info => self.info(line.buf),
-            Operation::Nonce => self.nonce(line.buf),
-            Operation::Revisions => self.revisions(line.buf, Status::OK, None),
-            Operation::Edge => self.edge(line.buf, Status::OK),
-            Operation::Update => self.firmware(line.buf, Status::OK),
+            Operation::Info => self.info(responder.buf),
+            Operation::Nonce => self.nonce(responder.buf),
+            Operation::Revisions => self.revisions(responder.buf, Status::OK, None),
+            Operation::Edge => self.edge(responder.buf, Status::OK),
+            Operation::Update => self.firmware(responder.buf, Status::OK),
             Operation::Status => {
-                return self.document(line, Kind::Json, DocumentSource::of(Document::Status)).await;
+                return self.document(responder, Kind::Json, DocumentSource::of(Document::Status)).await;
             }
             Operation::Values => {
-                return self.document(line, Kind::Json, DocumentSource::of(Document::Values)).await;
+                return self.document(responder, Kind::Json, DocumentSource::of(Document::Values)).await;
             }
             Operation::Metrics => {
-                return self.document(line, Kind::Metrics, DocumentSource::Metrics(Families::new())).await;
+                return self
+                    .document(responder, Kind::Metrics, DocumentSource::Metrics(Families::new()))
+                    .await;
             }
-            Operation::Stream => return self.stream(line, &request).await,
-            Operation::Log => return log(line, &request).await,
-            Operation::Page => return page(line, &request).await,
-            Operation::Config => return self.config(line, &request).await,
-            _ => self.change(line.buf, request).await,
+            Operation::Stream => return self.stream(responder, &request).await,
+            Operation::Log => return log(responder, &request).await,
+            Operation::Page => return page(responder, &request).await,
+            Operation::Config => return self.config(responder, &request).await,
+            _ => self.change(responder.buf, request).await,
         };
         Ok(Outcome::Reply(reply))
     }
@@ -123,23 +125,23 @@ impl Console {
     /// The image of what runs, or of the requested revision.
     async fn config(
         &self,
-        line: &mut Responder<'_, '_>,
+        responder: &mut Responder<'_, '_>,
         request: &Request<'_>,
     ) -> Result<Outcome, SendError> {
-        let (store, revision) = match self.requested_revision(line.buf, request) {
+        let (store, revision) = match self.requested_revision(responder.buf, request) {
             Ok(found) => found,
             Err(reply) => return Ok(Outcome::Reply(reply)),
         };
-        if !line.begin(Kind::Image, Length::Chunked, Some(revision)).await? {
+        if !responder.begin(Kind::Image, Length::Chunked, Some(revision)).await? {
             return Ok(Outcome::Sent);
         }
         let mut offset = 0;
         loop {
-            let len = store.part(revision.number, offset, line.buf).await.ok_or(SendError::Gone)?;
-            line.chunk(len, Instant::now() + MAX_TIME).await?;
+            let len = store.part(revision.number, offset, responder.buf).await.ok_or(SendError::Gone)?;
+            responder.chunk(len, Instant::now() + MAX_TIME).await?;
             offset = offset.saturating_add(PART);
             if len < PART {
-                line.last_chunk().await?;
+                responder.last_chunk().await?;
                 return Ok(Outcome::Sent);
             }
             yield_now().await;
@@ -172,45 +174,45 @@ impl Console {
 }
 
 /// Sends the newest lines of the log.
-async fn log(line: &mut Responder<'_, '_>, request: &Request<'_>) -> Result<Outcome, SendError> {
+async fn log(responder: &mut Responder<'_, '_>, request: &Request<'_>) -> Result<Outcome, SendError> {
     let lines = match request.head.query("lines").map(str::parse) {
         None => MAX_LINES,
         Some(Ok(lines @ 1..=MAX_LINES)) => lines,
         Some(_) => {
             let text = "lines is out of range; allowed: 1..=256";
-            return Ok(Outcome::Reply(Reply::error(line.buf, Status::BAD_REQUEST, text)));
+            return Ok(Outcome::Reply(Reply::error(responder.buf, Status::BAD_REQUEST, text)));
         }
     };
-    if !line.begin(Kind::Text, Length::Chunked, None).await? {
+    if !responder.begin(Kind::Text, Length::Chunked, None).await? {
         return Ok(Outcome::Sent);
     }
     let mut place = journal::last(lines);
     // More than the journal has is what came meanwhile.
     for _ in 0..journal::CAPACITY.div_ceil(LOG_PIECE) {
-        let (len, behind) = journal::read(place, line.buf.get_mut(..LOG_PIECE).unwrap_or(&mut []));
+        let (len, behind) = journal::read(place, responder.buf.get_mut(..LOG_PIECE).unwrap_or(&mut []));
         if len == 0 {
             break;
         }
         place = behind;
-        line.chunk(len, Instant::now() + MAX_TIME).await?;
+        responder.chunk(len, Instant::now() + MAX_TIME).await?;
         yield_now().await;
     }
-    line.last_chunk().await?;
+    responder.last_chunk().await?;
     Ok(Outcome::Sent)
 }
 
 /// Sends the page for people, unless the client has it.
-async fn page(line: &mut Responder<'_, '_>, request: &Request<'_>) -> Result<Outcome, SendError> {
+async fn page(responder: &mut Responder<'_, '_>, request: &Request<'_>) -> Result<Outcome, SendError> {
     let status = PAGE.status(request.head.if_none_match);
-    let mut buf = TextBuffer::new(line.buf);
+    let mut buf = TextBuffer::new(responder.buf);
     PAGE.write_head(status, &mut buf).map_err(|_| SendError::TooLong)?;
     let (head, until) = (buf.len, Instant::now() + MAX_ANSWER);
-    line.send_part(0, head, until.min(Instant::now() + MAX_TIME)).await?;
-    if line.is_head || status != Status::OK {
+    responder.send_part(0, head, until.min(Instant::now() + MAX_TIME)).await?;
+    if responder.is_head || status != Status::OK {
         return Ok(Outcome::Sent);
     }
     for piece in PAGE.bytes.chunks(PAGE_PIECE) {
-        line.send(piece, until.min(Instant::now() + MAX_TIME)).await?;
+        responder.send(piece, until.min(Instant::now() + MAX_TIME)).await?;
         yield_now().await;
     }
     Ok(Outcome::Sent)

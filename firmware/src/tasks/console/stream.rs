@@ -19,13 +19,13 @@ impl Console {
     /// Serves a stream until its client leaves or does not read.
     pub(super) async fn stream(
         &self,
-        line: &mut Responder<'_, '_>,
+        responder: &mut Responder<'_, '_>,
         request: &Request<'_>,
     ) -> Result<Outcome, SendError> {
         let Some(_one) = ConnectionPermit::of(&self.streams, STREAMS) else {
             self.count(|counters| &mut counters.turned_away);
             let text = "too many streams; poll /api/v1/status instead";
-            return Ok(Outcome::Reply(Reply::error(line.buf, Status::UNAVAILABLE, text)));
+            return Ok(Outcome::Reply(Reply::error(responder.buf, Status::UNAVAILABLE, text)));
         };
         let port = request.head.query("port");
         let mut follower = None;
@@ -33,19 +33,19 @@ impl Console {
             follower = self.follow(port);
             if follower.is_none() {
                 let text = "another client follows the frames; a board has room for one";
-                return Ok(Outcome::Reply(Reply::error(line.buf, Status::UNAVAILABLE, text)));
+                return Ok(Outcome::Reply(Reply::error(responder.buf, Status::UNAVAILABLE, text)));
             }
         }
-        line.begin(Kind::Events, Length::Endless, None).await?;
+        responder.begin(Kind::Events, Length::Endless, None).await?;
         let mut next = Instant::now();
         loop {
             if let Some(follower) = &mut follower {
                 loop {
-                    let mut buf = TextBuffer::new(line.buf);
+                    let mut buf = TextBuffer::new(responder.buf);
                     follower.write(&mut buf).map_err(|_| SendError::TooLong)?;
                     match buf.len {
                         0 => break,
-                        len => line.send_part(0, len, Instant::now() + MAX_TIME).await?,
+                        len => responder.send_part(0, len, Instant::now() + MAX_TIME).await?,
                     }
                     yield_now().await;
                 }
@@ -56,15 +56,15 @@ impl Console {
                 next += PERIOD;
                 if lost > 0 {
                     next = now + PERIOD;
-                    self.lose(line, lost).await?;
+                    self.lose(responder, lost).await?;
                 }
-                self.event(line, "status", Document::Status).await?;
-                self.event(line, "values", Document::Values).await?;
+                self.event(responder, "status", Document::Status).await?;
+                self.event(responder, "values", Document::Values).await?;
             }
             let wake = if follower.is_some() { next.min(Instant::now() + FRAMES) } else { next };
             // It has nothing more to say; what it says all the same is not looked at.
             let mut said = [0; 32];
-            match select(Timer::at(wake), line.socket.read(&mut said)).await {
+            match select(Timer::at(wake), responder.socket.read(&mut said)).await {
                 Either::First(()) | Either::Second(Ok(1..)) => {}
                 Either::Second(_) => return Err(SendError::Gone),
             }
@@ -74,33 +74,33 @@ impl Console {
 
     async fn event(
         &self,
-        line: &mut Responder<'_, '_>,
+        responder: &mut Responder<'_, '_>,
         name: &str,
         document: Document,
     ) -> Result<(), SendError> {
         let until = Instant::now() + MAX_TIME;
         if self.is_idle() {
             // Nothing runs. A comment shows that the stream is still there.
-            return line.send(b":\n\n", until).await;
+            return responder.send(b":\n\n", until).await;
         }
         let mut source = DocumentSource::of(document);
         for text in ["event: ", name, "\ndata: "] {
-            line.send(text.as_bytes(), until).await?;
+            responder.send(text.as_bytes(), until).await?;
         }
-        while let Some(len) = self.piece(line, &mut source)? {
-            line.send_part(0, len, until).await?;
+        while let Some(len) = self.piece(responder, &mut source)? {
+            responder.send_part(0, len, until).await?;
             yield_now().await;
         }
-        line.send(b"\n\n", until).await
+        responder.send(b"\n\n", until).await
     }
 
-    async fn lose(&self, line: &mut Responder<'_, '_>, lost: u64) -> Result<(), SendError> {
+    async fn lose(&self, responder: &mut Responder<'_, '_>, lost: u64) -> Result<(), SendError> {
         for _ in 0..lost.min(1_000) {
             self.count(|counters| &mut counters.lost_events);
         }
         let mut text = heapless::String::<64>::new();
         write!(text, "event: lost\ndata: {{\"count\":{lost}}}\n\n").map_err(|_| SendError::TooLong)?;
-        line.send(text.as_bytes(), Instant::now() + MAX_TIME).await
+        responder.send(text.as_bytes(), Instant::now() + MAX_TIME).await
     }
 }
 

@@ -11,11 +11,17 @@ use embassy_net::{IpAddress, IpEndpoint};
 use embassy_time::{Duration, Timer, with_timeout};
 use proto_core::engine::Input;
 
-use super::{Buffers, LinkDriver, LinkRole, resolve};
+use super::{LinkBuffers, LinkDriver, LinkRole, resolve};
 
 impl LinkDriver<'_> {
     /// One connection, until the peer closes it, it fails, or the turn is over.
-    pub(super) async fn tcp(&self, turn: u32, controller: &str, role: LinkRole, buffers: &mut Buffers<'_>) {
+    pub(super) async fn tcp(
+        &self,
+        turn: u32,
+        controller: &str,
+        role: LinkRole,
+        buffers: &mut LinkBuffers<'_>,
+    ) {
         let mut socket = TcpSocket::new(self.stack, buffers.rx, buffers.tx);
         socket.set_nagle_enabled(false);
         let opening = async {

@@ -9,12 +9,18 @@ use embassy_net::{IpAddress, IpEndpoint};
 use embassy_time::{Duration, Timer};
 use proto_core::engine::Input;
 
-use super::{Buffers, LinkDriver, LinkRole, resolve};
+use super::{LinkBuffers, LinkDriver, LinkRole, resolve};
 
 impl LinkDriver<'_> {
     /// Datagrams both ways; on a listening socket, answers go to the sender of the controller's
     /// newest frame.
-    pub(super) async fn udp(&self, turn: u32, controller: &str, role: LinkRole, buffers: &mut Buffers<'_>) {
+    pub(super) async fn udp(
+        &self,
+        turn: u32,
+        controller: &str,
+        role: LinkRole,
+        buffers: &mut LinkBuffers<'_>,
+    ) {
         let mut received = [PacketMetadata::EMPTY; DATAGRAMS];
         // One datagram at a time, so that it is known when it has left.
         let mut waiting = [PacketMetadata::EMPTY; 1];

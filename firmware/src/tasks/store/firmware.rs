@@ -10,7 +10,7 @@ use super::super::gateway::Gateway;
 use super::{Failed, FirmwareView, MAX_SAFE, StoreRequest, StoreTask};
 use crate::fmt::Text;
 use crate::stored::{StoreFlash, image_version};
-use crate::update::{Refused, Verdict, WaitsFor, Works};
+use crate::update::{UpdateError, Verdict, WaitsFor, Works};
 use crate::{error, info, warn};
 
 /// What comes of a look at the firmware's trial.
@@ -68,7 +68,7 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
     async fn confirm_firmware(&mut self) -> Result<u32, Failed> {
         let running = self.updates.running();
         let marks = running.and_then(|running| confirm(self.stored.slots(), running));
-        let marks = marks.ok_or(Failed::Firmware(Refused::NotOnTrial))?;
+        let marks = marks.ok_or(Failed::Firmware(UpdateError::NotOnTrial))?;
         self.stored.mark_slots(marks).await.map_err(|error| {
             error!("the store: {}", Text(&error));
             Failed::Store(error)
@@ -116,7 +116,7 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
             }
             StoreRequest::TryFirmware { confirm_s, downgrade } => {
                 if self.handle.look(|revisions| revisions.trial().is_some()) != Some(false) {
-                    return refused(Refused::Unsettled);
+                    return refused(UpdateError::Unsettled);
                 }
                 let header = match self.updates.ready(self.stored.versions(), marks, *downgrade) {
                     Ok(header) => header,
@@ -137,7 +137,7 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
                 Some((marked.map(|()| 0).map_err(Failed::Store), true))
             }
             StoreRequest::ConfirmFirmware => Some((self.confirm_firmware().await, false)),
-            StoreRequest::EndFirmware if self.trial.is_none() => refused(Refused::NotOnTrial),
+            StoreRequest::EndFirmware if self.trial.is_none() => refused(UpdateError::NotOnTrial),
             StoreRequest::EndFirmware => {
                 self.over(Ended::TakenBack).await;
                 Some((Ok(0), true))

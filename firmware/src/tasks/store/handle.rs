@@ -77,7 +77,7 @@ pub enum Failed {
     /// It is refused.
     Refused(Refused),
     /// It is about the firmware, and refused.
-    Firmware(update::Refused),
+    Firmware(update::UpdateError),
     /// The store cannot be written.
     Store(KeepError),
 }

@@ -7,8 +7,8 @@ use std::rc::Rc;
 use embassy_futures::block_on;
 use recipe_store::{Flash, Geometry, Marks, Newest, Place, Side, SlotMarks, Word, newest};
 use recipe_update::{
-    BoardName, Chosen, Downgrade, Formats, Header, Machine, Parts, PublicKey, Receive, Running, Slot,
-    SlotFlash, Step, Stores, Version, begin_trial, choose, confirm, file_head, link_padding,
+    BoardName, Chosen, Downgrade, Formats, Header, Machine, Parts, PublicKey, Receive, ReceiveStep, Running,
+    Slot, SlotFlash, Stores, Version, begin_trial, choose, confirm, file_head, link_padding,
 };
 
 use crate::model::{Nor, Torn};
@@ -267,16 +267,16 @@ impl SimulatedBoard {
         let mut piece = 1;
         loop {
             match receive.next(part) {
-                Step::Erase(sector) => block_on(part.erase(sector)),
-                Step::Write(place, word) => block_on(part.write(place, &word)),
-                Step::Take { offset } => {
+                ReceiveStep::Erase(sector) => block_on(part.erase(sector)),
+                ReceiveStep::Write(place, word) => block_on(part.write(place, &word)),
+                ReceiveStep::Take { offset } => {
                     piece = piece * 5 % 97 + 1;
                     let rest = &image[offset as usize..];
                     let taken = receive.take(offset, &rest[..rest.len().min(piece)]).expect("the next ones");
                     assert!(taken > 0);
                 }
-                Step::Again => {}
-                Step::End(result) => return Ok(result.is_ok() && !part.power.is_off.get()),
+                ReceiveStep::Again => {}
+                ReceiveStep::End(result) => return Ok(result.is_ok() && !part.power.is_off.get()),
             }
             if part.power.is_off.get() {
                 return Ok(false);

@@ -3,8 +3,8 @@
 use embassy_futures::block_on;
 use recipe_store::{Flash as _, Place, Slot};
 use recipe_update::{
-    Bad, BoardName, Downgrade, FileError, Formats, Gap, Header, Parts, Receive, ReceiveError, Refused,
-    Running, SlotMarks, Step, UpdateFile, Version, begin_trial, may_keep,
+    BadImage, BoardName, Downgrade, FileError, Formats, Gap, Header, Parts, Receive, ReceiveError,
+    ReceiveStep, Refused, Running, SlotMarks, UpdateFile, Version, begin_trial, may_keep,
 };
 
 use crate::board::{SEED, SimulatedBoard, V1, file, image, parts};
@@ -37,12 +37,12 @@ fn updates_that_cannot_run_are_refused_before_anything_is_erased() {
     let right = parts(Slot::B, V3);
     assert_eq!(refused(right, LEN), None);
     assert_eq!(refused(parts(Slot::B, V2), LEN), None, "the same once more");
-    assert_eq!(refused(parts(Slot::A, V3), LEN), Some(Refused::Bad(Bad::Slot)));
+    assert_eq!(refused(parts(Slot::A, V3), LEN), Some(Refused::Bad(BadImage::Slot)));
     let board = BoardName::parse("mps2-an500").unwrap();
-    assert_eq!(refused(Parts { board, ..right }, LEN), Some(Refused::Bad(Bad::Board(board))));
+    assert_eq!(refused(Parts { board, ..right }, LEN), Some(Refused::Bad(BadImage::Board(board))));
     let room = 2 * 64 * 32 - 1024;
     assert_eq!(refused(right, room as usize), None);
-    let long = Bad::Long { length: room + 1, room };
+    let long = BadImage::Long { length: room + 1, room };
     assert_eq!(refused(right, room as usize + 1), Some(Refused::Bad(long)));
     assert_eq!(refused(Parts { store: 2, ..right }, LEN), Some(Refused::Store { offered: 2 }));
 }
@@ -111,9 +111,9 @@ fn follow(board: &mut SimulatedBoard, receive: &mut Receive, image: &[u8]) -> Re
     let part = &mut board.slots[1];
     loop {
         match receive.next(part) {
-            Step::Erase(sector) => block_on(part.erase(sector)),
-            Step::Write(place, word) => block_on(part.write(place, &word)),
-            Step::Take { offset } => {
+            ReceiveStep::Erase(sector) => block_on(part.erase(sector)),
+            ReceiveStep::Write(place, word) => block_on(part.write(place, &word)),
+            ReceiveStep::Take { offset } => {
                 assert_eq!(receive.take(offset + 1, image), Err(Gap { expected: offset }));
                 if offset > 0 {
                     assert_eq!(receive.take(offset - 1, image), Err(Gap { expected: offset }));
@@ -122,8 +122,8 @@ fn follow(board: &mut SimulatedBoard, receive: &mut Receive, image: &[u8]) -> Re
                 assert!((1..=32).contains(&taken));
                 assert_eq!(receive.taken(), offset + taken as u32);
             }
-            Step::Again => {}
-            Step::End(result) => return result,
+            ReceiveStep::Again => {}
+            ReceiveStep::End(result) => return result,
         }
     }
 }
@@ -153,8 +153,8 @@ fn another_image_has_no_header() {
     let (mut board, mut receive) = begun(LEN);
     let mut changed = image(Slot::B, V2, LEN);
     changed[LEN - 1] ^= 1;
-    assert_eq!(follow(&mut board, &mut receive, &changed), Err(ReceiveError::Bad(Bad::Crc)));
-    assert_eq!(receive.next(&board.slots[1]), Step::End(Err(ReceiveError::Bad(Bad::Crc))));
+    assert_eq!(follow(&mut board, &mut receive, &changed), Err(ReceiveError::Bad(BadImage::Crc)));
+    assert_eq!(receive.next(&board.slots[1]), ReceiveStep::End(Err(ReceiveError::Bad(BadImage::Crc))));
     let header = (0..6).map(|word| board.slots[1].read(Place { sector: 0, word }));
     assert!(header.into_iter().all(|word| word == [0xFF; 32]));
 }
@@ -199,6 +199,6 @@ fn a_file_has_the_same_firmware_for_each_slot() {
     let mut changed = bytes;
     changed[16 + 192 + 5] ^= 1;
     let read = UpdateFile::parse(&changed).unwrap();
-    assert_eq!(read.link(Slot::B).unwrap().check(), Err(Bad::Crc));
+    assert_eq!(read.link(Slot::B).unwrap().check(), Err(BadImage::Crc));
     assert_eq!(Version::parse("0.2.0"), Some(V2));
 }
