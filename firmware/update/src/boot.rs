@@ -22,7 +22,7 @@ pub trait Machine {
     /// Writes marks into the store; whether they are there.
     fn mark(&mut self, marks: SlotMarks) -> bool;
 
-    /// Is told what was found in a slot that is not run, for a log or a led.
+    /// Is told what was found in a slot that is not run, for a log or an LED.
     fn passed_over(&mut self, slot: Slot, why: &dyn fmt::Display);
 }
 

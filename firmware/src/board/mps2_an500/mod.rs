@@ -23,7 +23,7 @@ use cortex_m::interrupt::InterruptNumber;
 use cortex_m::peripheral::NVIC;
 use embassy_sync::waitqueue::AtomicWaker;
 use embassy_time::Duration;
-use firmware::drivers::lan9118::{Lan9118, Registers, StartError};
+use firmware::drivers::lan9118::{Lan9118, Lan9118Error, Registers};
 use firmware::drivers::slcan::SlcanPort;
 use firmware::platform::{self, StatusLed};
 use firmware::stored::Places;
@@ -55,7 +55,7 @@ impl platform::Board for Board {
     type Flash = flash::StoreFile;
     type Slot = host_flash::HostFlash;
     type StorageError = storage::StorageError;
-    type EthernetError = StartError;
+    type EthernetError = Lan9118Error;
 
     fn configuration(&mut self) -> Result<&'static [u8], Self::StorageError> {
         storage::read()
@@ -91,7 +91,7 @@ impl platform::Board for Board {
         })
     }
 
-    fn ethernet(&mut self) -> Result<Self::Ethernet, StartError> {
+    fn ethernet(&mut self) -> Result<Self::Ethernet, Lan9118Error> {
         let driver = Lan9118::start(LanRegisters, &LAN_WAKER)?;
         Irq::LAN9118.enable();
         Ok(driver)

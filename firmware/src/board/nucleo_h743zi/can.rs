@@ -6,7 +6,7 @@ use embassy_stm32::pac::{FDCAN1, FDCANRAM};
 use embassy_stm32::peripherals::{PD0, PD1};
 use embassy_stm32::{Peri, peripherals, rcc};
 use embassy_sync::waitqueue::AtomicWaker;
-use firmware::drivers::mcan::{MESSAGE_RAM_WORDS, Mcan, Registers, StartError};
+use firmware::drivers::mcan::{MESSAGE_RAM_WORDS, Mcan, McanError, Registers};
 
 /// The CAN controller.
 pub(crate) type CanDevice = Mcan<CanRegisters>;
@@ -66,7 +66,7 @@ fn bypass_calibration() {
 pub(super) type CanPins = (Peri<'static, PD0>, Peri<'static, PD1>);
 
 /// Starts the controller.
-pub(super) fn start(pins: CanPins, bitrate: u32) -> Result<CanDevice, StartError> {
+pub(super) fn start(pins: CanPins, bitrate: u32) -> Result<CanDevice, McanError> {
     const FUNCTION: u8 = 9;
     let (mut rx, mut tx) = (Flex::new(pins.0), Flex::new(pins.1));
     rx.set_as_af_unchecked(FUNCTION, AfType::input(Pull::Up));

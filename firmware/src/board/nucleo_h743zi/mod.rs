@@ -45,8 +45,8 @@ defmt::timestamp!("{=u64:us}", embassy_time::Instant::now().as_micros());
 /// The devices that were not handed out yet.
 pub(crate) struct Board {
     serial: serial::Lines,
-    can: Option<can::Pins>,
-    ethernet: Option<ethernet::Parts>,
+    can: Option<can::CanPins>,
+    ethernet: Option<ethernet::EthernetParts>,
     link: Option<Led>,
     status: Option<Led>,
     watchdog: Option<Watchdog>,
@@ -153,7 +153,7 @@ fn main() -> ! {
             uart7: (p.PE8, p.PE7, p.PE9),
         }),
         can: Some((p.PD0, p.PD1)),
-        ethernet: Some(ethernet::Parts {
+        ethernet: Some(ethernet::EthernetParts {
             mac: p.ETH,
             sma: p.ETH_SMA,
             ref_clk: p.PA1,
@@ -182,7 +182,7 @@ fn main() -> ! {
 }
 
 /// Logs why the board was reset, and a missing external clock.
-fn log_start(source: clocks::Source) {
+fn log_start(source: clocks::ClockSource) {
     let cause = embassy_stm32::pac::RCC.rsr().read();
     embassy_stm32::pac::RCC.rsr().modify(|w| w.set_rmvf(true));
     if cause.iwdg1rstf() {
@@ -191,7 +191,7 @@ fn log_start(source: clocks::Source) {
         info!("started");
     }
     crash_record::log();
-    if source == clocks::Source::Internal {
+    if source == clocks::ClockSource::Internal {
         warn!("no 8 MHz clock from the debugger: using the internal clock, too inaccurate for fast CAN");
     }
 }
