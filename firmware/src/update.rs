@@ -360,7 +360,7 @@ impl<S: SlotFlash> Updates<S> {
     /// Whether a configuration of this version may be kept.
     ///
     /// # Errors
-    /// Why not.
+    /// The last failure, if there is no session.
     pub fn may_keep(&self, version: u32, marks: SlotMarks) -> Result<(), UpdateError> {
         let before = self.other.map(|header| header.parts().formats);
         match recipe_update::may_keep(version, &FORMATS, before.as_ref(), marks) {
@@ -440,7 +440,7 @@ pub struct FirmwareTrial {
 /// What comes of a look at a trial.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Verdict {
-    /// It goes on.
+    /// The trial goes on.
     Waits(WaitsFor),
     /// It is to be confirmed.
     Confirmed,

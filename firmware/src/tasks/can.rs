@@ -1,7 +1,7 @@
 //! A CAN port's task.
 //!
-//! The task receives, sends what the engine sends, and restarts the controller after bus-off. It never waits
-//! for one direction only, and yields after some events in a row, however busy the bus is.
+//! The task receives frames, transmits those of the engine, and restarts the controller after bus-off. It never waits
+//! for one direction only, and yields after a bounded number of events however busy the bus is.
 
 use core::pin::pin;
 
@@ -18,7 +18,7 @@ use super::watchdog::Pulse;
 use crate::drivers::can_port::{BusOff, CanCounters, CanEvent, CanPort};
 use crate::{info, warn};
 
-/// Drives the port for ever.
+/// Runs the port forever.
 pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, can: impl CanPort) -> ! {
     let Some(control) = gateway.port(port) else { core::future::pending().await };
     let task = CanTask {
@@ -42,11 +42,11 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, can: impl CanPo
 enum CanPhase {
     /// Frames to send.
     Idle,
-    /// Frames sent by the engine must leave the controller until then.
+    /// Frames in the controller must be sent by then.
     Sending { until: Instant },
-    /// Bus-off: no restart until then.
+    /// Bus-off: restart at that time.
     Off { until: Instant },
-    /// The controller is on its way back to the bus; if it is not there by then, another try.
+    /// The controller is recovering; on timeout, recovery is retried.
     Recovering { until: Instant },
 }
 
@@ -61,9 +61,9 @@ struct CanTask<'a, C> {
     is_failing: bool,
     /// Wait after the next bus-off.
     backoff: Duration,
-    /// When the controller was back on the bus.
+    /// Time of the last recovery.
     recovered: Instant,
-    /// Number of lost frames in the last log line, and its time.
+    /// Lost frames reported by the last log line, and its time.
     lost: u32,
     lost_logged: Instant,
 }
@@ -82,7 +82,7 @@ impl<C: CanPort> CanTask<'_, C> {
                     Either3::Second(()) => {}
                     Either3::Third(()) => self.expired(),
                 }
-                // Also while the bus is never idle.
+                // Checked even if the bus is never idle.
                 self.send_waiting().await;
             }
             self.log_lost();
@@ -124,7 +124,7 @@ impl<C: CanPort> CanTask<'_, C> {
         }
     }
 
-    /// Sends what the engine sent.
+    /// Transmits the engine's frames.
     async fn send_waiting(&mut self) {
         let mut frames = 0_u32;
         while let Some(frame) = self.control.next_frame() {
@@ -163,7 +163,7 @@ impl<C: CanPort> CanTask<'_, C> {
 
     /// Frames are not acknowledged: no other node is connected. Waiting frames would be old when one is.
     fn give_up(&mut self) {
-        // Logged only the first time in a row.
+        // Only the first of consecutive failures is logged.
         if !self.is_failing {
             let errors = self.can.counters().transmit_errors;
             warn!(

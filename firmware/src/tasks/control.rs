@@ -33,8 +33,7 @@ impl PortControl {
         }
     }
 
-    /// Sets the ids of a CAN port, before its task starts. A configuration has no more than there is
-    /// room for.
+    /// Sets the CAN ids of the port before its task starts. A configuration has at most as many as fit.
     pub(crate) fn set_ids(&mut self, ids: impl Iterator<Item = CanId>) {
         for id in ids {
             let _ = self.ids.push(id);
@@ -52,13 +51,13 @@ impl PortControl {
         self.changed.notify();
     }
 
-    /// Takes a frame from the engine, which sends at most as many as fit.
+    /// Queues a frame. The engine sends at most as many as fit.
     pub(crate) fn put_frame(&self, frame: CanFrame) {
         let _ = self.frames.borrow_mut().push_back(frame);
         self.changed.notify();
     }
 
-    /// Wakes the task, because its device may hold data without having woken it.
+    /// Wakes the task: its device may hold data whose interrupt is pending.
     pub(crate) fn wake(&self) {
         self.changed.notify();
     }
@@ -125,7 +124,7 @@ pub(crate) struct LinkControl {
     /// Odd while the link is to be open; incremented by each opening and closing.
     turn: Cell<u32>,
     outbox: RefCell<Option<Transmission>>,
-    /// Bytes of this turn that are not acknowledged, as the engine knows.
+    /// Unacknowledged bytes of this turn, as last reported to the engine.
     unacknowledged: Cell<u32>,
     changed: Notify,
     refused_peers: Cell<u32>,
@@ -147,7 +146,7 @@ impl LinkControl {
         self.refused_peers.set(self.refused_peers.get().saturating_add(1));
     }
 
-    /// Number of refused connections and datagrams.
+    /// Refused connections and datagrams since the start.
     pub(crate) fn refused_peers(&self) -> u32 {
         self.refused_peers.get()
     }
@@ -187,8 +186,8 @@ impl LinkControl {
         self.unacknowledged.get()
     }
 
-    /// The task holds `left` bytes in addition to those that wait here. Returns the number for the
-    /// engine, if it has changed.
+    /// `left` is the number of bytes held by the task, besides those queued here. Returns the total for the engine if
+    /// it has changed.
     pub(crate) fn acknowledged(&self, left: usize) -> Option<u32> {
         let waiting = self.outbox.borrow().as_ref().map_or(0, |bytes| bytes.len());
         let left = left.saturating_add(waiting) as u32;
@@ -237,7 +236,7 @@ mod tests {
         link.open();
         link.put(&[0; 69]);
         assert_eq!((link.unacknowledged(), link.acknowledged(0)), (69, None));
-        // The task takes it, and has room for half.
+        // The task takes the transmission; its socket accepts half of it.
         assert!(link.outbox.take().is_some());
         assert_eq!((link.acknowledged(69), link.acknowledged(35)), (None, Some(35)));
         link.put(&[0; 100]);

@@ -1,9 +1,9 @@
-//! The edge node of Sparkplug: tells a broker what the gateway knows (docs/fleet.md section 6).
+//! The Sparkplug edge node: publishes the state of the gateway to a broker (docs/fleet.md section 6).
 //!
-//! In: the status of the gateway, in parts between which the other tasks run; bytes of the broker; UTC. Out: bytes for
-//! the broker, the number of each session for the store task, a view for the console. What is told when is decided in
-//! `recipe_sparkplug`. It has a socket and memory of its own and never waits for the engine: a broker that is away,
-//! slow or hostile costs the cell nothing.
+//! In: the status of the gateway, sampled in parts between which other tasks run; bytes from the broker; UTC. Out:
+//! bytes for the broker, the bdSeq of each session for the store task, a view for the console. `recipe_sparkplug`
+//! decides what is published and when. The node has its own socket and memory and never waits for the engine, so an
+//! absent, slow or hostile broker does not affect the cell.
 
 use core::cell::Cell;
 use core::pin::pin;
@@ -31,34 +31,34 @@ use crate::clock::now;
 use crate::fmt::Text;
 use crate::{info, warn};
 
-/// Room for metrics.
+/// Maximum number of metrics.
 pub const METRICS: usize = 256;
-/// Room for values while nobody listens.
+/// Capacity of the buffer for samples taken while offline.
 pub const HISTORY: usize = 192;
 
 type Catalog = GatewayCatalog<'static, METRICS>;
 
-/// The memory of the node; all zeros, so that it takes no flash.
+/// Memory of the node. All zeros, so it is placed in .bss.
 pub struct NodeMemory {
-    /// The settings.
+    /// The decoded settings.
     pub document: Document,
-    /// What the node needs beside them.
+    /// Everything else that the node needs.
     pub rest: NodeBuffers,
 }
 
-/// The memory of the node without its settings.
+/// Memory of the node except its settings.
 pub struct NodeBuffers {
     node: EdgeNode<METRICS, HISTORY>,
     values: Vec<Option<Value>, METRICS>,
     rx: [u8; RX],
     tx: [u8; TX],
-    /// A piece of what is sent, and of what was received.
+    /// Buffers for one piece of output and of input.
     piece: [u8; MIN_BUFFER],
     read: [u8; READ],
 }
 
 impl NodeMemory {
-    /// Before the settings are known.
+    /// Empty: the settings have not been read.
     pub const ZEROED: Self = Self {
         document: Document::empty(),
         rest: NodeBuffers {
@@ -72,16 +72,16 @@ impl NodeMemory {
     };
 }
 
-/// Why a board with settings does not tell.
+/// Why the edge node does not run although there are settings.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum EdgeError {
     /// No configuration runs.
     NothingRuns,
     /// The settings cannot be read.
     Settings(DocumentError),
-    /// There are more metrics than there is room for.
+    /// More than [`METRICS`] metrics.
     Metrics,
-    /// The configuration has names that a broker does not take.
+    /// The configuration contains names that are invalid in a topic.
     Node(NodeError),
 }
 
@@ -100,67 +100,67 @@ impl core::fmt::Display for EdgeError {
     }
 }
 
-/// What a client sees of the node.
+/// State of the edge node for clients of the API.
 #[derive(Debug, Clone, Copy)]
 pub enum View {
-    /// There are no settings.
+    /// No settings are stored.
     Off,
-    /// There are, but nothing is told.
+    /// There are settings, but the node cannot run.
     Cannot(EdgeError),
-    /// It tells, or tries to.
+    /// The node runs.
     Runs(EdgeStatus),
 }
 
-/// How a node does.
+/// Status of a running edge node.
 #[derive(Debug, Clone, Copy)]
 pub struct EdgeStatus {
-    /// Whether there is a session.
+    /// Whether a session with the broker is established.
     pub is_online: bool,
-    /// Why not.
+    /// The last failure, if there is no session.
     pub failure: Option<Failure>,
-    /// The number of the session.
+    /// bdSeq of the session.
     pub bd_seq: Option<u8>,
-    /// How many metrics there are.
+    /// Number of metrics.
     pub metrics: usize,
-    /// Counts since the start.
+    /// Counters since the start.
     pub counters: Counters,
 }
 
-/// Between the node and the console.
+/// Shared by the edge node and the console.
 pub struct Edge {
     view: Cell<View>,
-    /// What is kept for the next start, if it is not what runs: whether something will be told.
+    /// Set when settings were stored that take effect at the next start: whether they enable publishing.
     next: Cell<Option<bool>>,
 }
 
 impl Edge {
-    /// Of a board that tells nothing.
+    /// The state of a board without an edge node.
     pub const fn off() -> Self {
         Self { view: Cell::new(View::Off), next: Cell::new(None) }
     }
 
-    /// What a client sees.
+    /// The state for clients.
     pub fn view(&self) -> View {
         self.view.get()
     }
 
-    /// Notes why there is no node.
+    /// Records why there is no node.
     pub fn cannot(&self, why: EdgeError) {
         self.view.set(View::Cannot(why));
     }
 
-    /// What is kept for the next start, if it was sent since this one: whether something will be told.
+    /// Whether the node publishes after the next start; `None` if no settings were stored since this one.
     pub fn next(&self) -> Option<bool> {
         self.next.get()
     }
 
-    /// Notes what was kept for the next start.
+    /// Records that settings were stored for the next start.
     pub fn keeps(&self, tells: bool) {
         self.next.set(Some(tells));
     }
 }
 
-/// A node that was made, with everything that it needs.
+/// An edge node with its catalog and buffers.
 pub struct Node {
     document: &'static Document,
     catalog: Catalog,
@@ -168,10 +168,11 @@ pub struct Node {
 }
 
 impl Node {
-    /// Makes the node of what runs. `bd_seq` is the number of the last session; `seed` is another one at each start.
+    /// Creates the node for the running configuration. `bd_seq` is that of the last session; `seed` differs at each
+    /// start.
     ///
     /// # Errors
-    /// Why there is none.
+    /// See [`EdgeError`].
     pub fn make(
         document: &'static Document,
         rest: &'static mut NodeBuffers,
@@ -193,7 +194,7 @@ impl Node {
         Ok(Self { document, catalog, rest })
     }
 
-    /// Drives the node, for ever.
+    /// Runs the node forever.
     pub async fn run(
         &mut self,
         gateway: &Gateway,
@@ -220,7 +221,7 @@ impl Node {
             was_online: false,
             told: None,
         };
-        // Births have values and dates from the first one on.
+        // Sample first, so that even the first birth has values and timestamps.
         driver.sample().await;
         loop {
             let next = driver.drain(&mut socket, piece).await;
@@ -251,13 +252,13 @@ impl Node {
             if Instant::now() >= driver.sample_at {
                 driver.sample().await;
             }
-            // A broker that sends without end lets the others run.
+            // Yield, so that a broker that floods the board does not starve other tasks.
             pulse.idle(pin!(yield_now())).await;
         }
     }
 }
 
-/// What comes of outputs.
+/// What to do after the outputs were drained.
 enum NodeStep {
     Open,
     Sleep { until: Time },
@@ -279,9 +280,9 @@ struct NodeDriver<'a> {
 }
 
 impl NodeDriver<'_> {
-    /// Looks at the gateway, part by part, and gives the node what it has seen.
+    /// Samples the gateway in parts and passes the samples to the node.
     async fn sample(&mut self) {
-        // After a pause the next one is a period later: values are of now, not of then.
+        // Missed periods are skipped: samples have current values.
         self.sample_at = Instant::now() + self.period;
         let uptime = Span::from_micros(Instant::now().as_micros());
         let counters = self.node.counters();
@@ -302,7 +303,7 @@ impl NodeDriver<'_> {
         self.node.handle(at, Input::Sample { values: self.values, alive }, self.catalog);
     }
 
-    /// Does what the node asks for, until it waits.
+    /// Executes the outputs of the node until it sleeps.
     async fn drain(&mut self, socket: &mut TcpSocket<'_>, piece: &mut [u8]) -> NodeStep {
         loop {
             let is_written = match self.node.poll_output(now(), self.catalog, piece) {
@@ -326,16 +327,16 @@ impl NodeDriver<'_> {
             if !is_written {
                 self.lost(socket).await;
             }
-            // A birth is many pieces.
+            // A birth consists of many pieces.
             self.pulse.idle(pin!(yield_now())).await;
         }
     }
 
-    /// Makes the connection. Samples go on meanwhile.
+    /// Connects to the broker; sampling continues meanwhile.
     async fn open(&mut self, stack: Stack<'_>, document: &Document, socket: &mut TcpSocket<'_>) {
         let connected = {
             let connecting = async {
-                // Before it has an address every attempt fails at once.
+                // Without an address every attempt would fail at once.
                 stack.wait_config_up().await;
                 let address = resolve(stack, &document.host).await?;
                 socket.connect(IpEndpoint::new(address, document.port)).await.ok()
@@ -362,7 +363,7 @@ impl NodeDriver<'_> {
         self.node.handle(now(), Input::Closed, self.catalog);
     }
 
-    /// Shows how it does; a change is logged.
+    /// Publishes the status to the console and logs changes.
     fn tell(&mut self, document: &Document) {
         let is_online = self.node.is_online();
         let failure = self.node.failure();
@@ -387,7 +388,7 @@ impl NodeDriver<'_> {
     }
 }
 
-/// Gives all bytes to the network; false if it does not take them.
+/// Writes all bytes to the socket; false on timeout or error.
 async fn write(socket: &mut TcpSocket<'_>, mut bytes: &[u8]) -> bool {
     let writing = async {
         while !bytes.is_empty() {
@@ -406,21 +407,21 @@ async fn reset(socket: &mut TcpSocket<'_>) {
     let _ = with_timeout(RESET_TIME, socket.flush()).await;
 }
 
-/// Metrics that are looked at between two turns of the other tasks.
+/// Metrics sampled per borrow of the engine.
 const PLACES: usize = 32;
-/// Receive buffer of the socket: a broker has little to say.
+/// Receive buffer of the socket; a broker sends little.
 const RX: usize = 512;
-/// Transmit buffer: some pieces of a birth.
+/// Transmit buffer: several pieces of a birth.
 const TX: usize = 2_048;
-/// Bytes that are read at once.
+/// Bytes per read.
 const READ: usize = 256;
-/// How long a connection may take, with the board's address and the look-up of a name.
+/// Limit of connecting, including DHCP and DNS.
 const OPEN_TIME: Duration = Duration::from_secs(20);
-/// How long the broker may take nothing.
+/// Limit of a write that makes no progress.
 const WRITE_TIME: Duration = Duration::from_secs(10);
-/// How long its TCP may acknowledge nothing.
+/// TCP timeout: limit of unacknowledged data.
 const SILENT: Duration = Duration::from_secs(15);
-/// How long the end of a connection may take.
+/// Limit of closing a connection.
 const CLOSE_TIME: Duration = Duration::from_millis(500);
-/// For the reset of a connection.
+/// Time for the reset of a connection to be sent.
 const RESET_TIME: Duration = Duration::from_millis(100);

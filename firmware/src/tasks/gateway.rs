@@ -35,11 +35,11 @@ pub struct Gateway {
     output: RefCell<[u8; OUTPUT_BUFFER]>,
     deadline: Cell<Instant>,
     deadline_moved: Notify,
-    /// A task has yielded before it reported everything that waits.
+    /// A task has yielded before it reported all pending input.
     more_waits: Cell<bool>,
-    /// Number of sleeps that the ports' tasks have been told of.
+    /// Sleeps of which the ports' tasks were notified.
     sleeps: Cell<u32>,
-    /// The safe values go out, and what comes from the field is not reported any more.
+    /// Safe values are being sent; input from the field is ignored.
     is_ending: Cell<bool>,
 }
 
@@ -64,7 +64,7 @@ impl Gateway {
     /// # Errors
     /// The engine refuses it.
     pub fn configure(&mut self, config: &GatewayConfig) -> Result<(), BuildError> {
-        // Not in `idle`, which must be all zeros to take no flash.
+        // Not in `idle`, which must be all zeros (.bss).
         self.deadline.set(Instant::NEVER);
         let engine = self.engine.get_mut();
         engine.configure(config)?;
@@ -104,8 +104,8 @@ impl Gateway {
         look(self.engine.borrow_mut().tap())
     }
 
-    /// Brings the safe values out, as if all devices were silent from now on, and waits until the controller is known
-    /// to have them, or `limit` has passed. The gateway is to be ended then. Returns whether it has them.
+    /// Sends the safe values as if all devices had fallen silent, and waits until the controller shows them, at most
+    /// for `limit`. The gateway must be stopped afterwards. Returns whether the controller shows them.
     pub async fn make_safe(&self, limit: Duration) -> bool {
         self.is_ending.set(true);
         self.engine.borrow_mut().make_safe();
@@ -118,7 +118,7 @@ impl Gateway {
         with_timeout(limit, is_safe).await.is_ok()
     }
 
-    /// How often the gateway slept, so that waiting input was discarded.
+    /// Number of sleeps of the gateway, each of which discards pending input.
     pub fn sleeps(&self) -> u32 {
         self.sleeps.get()
     }
@@ -209,7 +209,7 @@ impl Gateway {
     /// In a round of the executor each woken task runs once, in no particular order. Data in the Ethernet controller
     /// reaches the network's task in one round and a link's task in the next.
     async fn drain_inputs(&self) {
-        // A device may hold data without having woken its task.
+        // A device may hold data whose interrupt is pending.
         self.ports.iter().for_each(|(_, control)| control.wake());
         let mut quiet = 0_u8;
         for _ in 0..MAX_ROUNDS {
@@ -222,7 +222,7 @@ impl Gateway {
         }
     }
 
-    /// A task yields and may have left something that must be reported.
+    /// Notes that a task yields with input that may not have been reported.
     pub(crate) fn more_waits(&self) {
         self.more_waits.set(true);
     }
@@ -241,7 +241,7 @@ impl Gateway {
     }
 }
 
-/// How often is looked whether the safe values have arrived.
+/// Polling interval for the safe values.
 const SAFE_CHECK: Duration = Duration::from_millis(5);
 /// One for a task whose interrupt occurs while the time is read, one for the network's task, and one for a link's
 /// task after it.

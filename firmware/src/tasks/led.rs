@@ -15,7 +15,7 @@ pub enum Condition {
     PortSilent,
     /// All links are up and all field ports are alive.
     Running,
-    /// Somebody looks for this board.
+    /// The operation `identify` is active.
     Identify,
 }
 
@@ -32,7 +32,7 @@ impl Condition {
     }
 }
 
-/// Shows the condition for ever; reads it before each round of the pattern.
+/// Shows the condition forever; it is read before each period of the pattern.
 pub async fn run(pulse: &Pulse, condition: impl Fn() -> Condition, mut set: impl FnMut(bool)) -> ! {
     loop {
         for &(lit, dark) in condition().pattern() {

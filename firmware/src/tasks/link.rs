@@ -4,9 +4,9 @@
 //! outbox. It knows no protocol and makes no decision: a link that fails reports this once and waits to be
 //! opened again.
 //!
-//! Handed over is not delivered. For a TCP link the engine gets two reports: that the socket has accepted
-//! everything, and how much the peer has not acknowledged. If the engine gives up a link, its connection is
-//! closed whatever the task waits for, and nothing but a reset is sent.
+//! Sent is not delivered. For a TCP link the engine gets two reports: that the socket has accepted everything, and how
+//! much the peer has not acknowledged. If the engine gives up a link, its connection is closed whatever the task waits
+//! for, and nothing but a reset is sent.
 
 mod tcp;
 mod udp;
@@ -113,7 +113,7 @@ impl<'a> LinkBuffers<'a> {
     }
 }
 
-/// Drives the link for ever.
+/// Runs the link forever.
 pub async fn run(
     gateway: &Gateway,
     pulse: &Pulse,

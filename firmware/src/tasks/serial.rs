@@ -20,7 +20,7 @@ use crate::drivers::line::{Line, LineDirection, LineErrors};
 use crate::fmt::Text;
 use crate::warn;
 
-/// Drives the port for ever.
+/// Runs the port forever.
 pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, line: impl Line, baud: u32) -> ! {
     let Some(control) = gateway.port(port) else { core::future::pending().await };
     let mut task = SerialTask { gateway, port, control, line, chunk: [0; CHUNK] };
@@ -76,7 +76,7 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, line: impl Line
                 Err(_) => break ErrorKind::TimedOut,
             }
         };
-        // Logged only the first time in a row.
+        // Only the first of consecutive failures is logged.
         if !is_failing {
             warn!("port {}: {}", port.0, Text(&failed));
         }

@@ -9,7 +9,7 @@ use super::gateway::{Gateway, MAX_FIELD_PORTS, MAX_LINKS};
 use super::watchdog::Pulse;
 use crate::{info, traffic, warn};
 
-/// Logs changes of the status, for ever.
+/// Logs changes of the status forever.
 pub async fn run(gateway: &Gateway, pulse: &Pulse) -> ! {
     let mut links = [(0, LoggedState::Down); MAX_LINKS];
     let mut ports = [[0; 6]; MAX_FIELD_PORTS];

@@ -1,8 +1,8 @@
-//! Changes what the board keeps: configurations, their marks, and the key.
+//! The store task: writes configurations, their marks, the access key and settings.
 //!
-//! In: what a client of the console asks for, and the end of a trial. Out: what is written to the store, a view for
-//! readers, and that the board is to be restarted. What happens when is decided in `recipe_api::revisions`.
-//! Another configuration is only run by a restart: the start has the memory for it, and counts what it tries.
+//! In: requests from the console and the edge node, and timeouts of trials. Out: writes to the store, a view for
+//! readers, and the request to restart. `recipe_api::revisions` decides what happens when. Another configuration runs
+//! only after a restart: only the start has the memory to load it, and it counts the attempts.
 
 mod firmware;
 mod handle;
@@ -28,16 +28,16 @@ use crate::stored::{StoreFlash, StoredConfig};
 use crate::update::{self, Updates, Works};
 use crate::{error, info, warn};
 
-/// What the start leaves to the store task.
+/// Work that the start leaves to the store task.
 #[derive(Debug, Default)]
 pub struct StartWork<'d> {
-    /// This image came from outside the store, with this digest: it becomes the live one.
+    /// Digest and bytes of an image from outside the store that becomes the live one.
     pub adopt: Option<(u32, &'d [u8])>,
-    /// What runs is on trial for this long.
+    /// Duration of the trial of the running configuration.
     pub trial: Option<Duration>,
     /// Number of the configuration that runs.
     pub running: Option<u32>,
-    /// The one on trial cannot run.
+    /// The configuration on trial cannot run.
     pub trial_failed: bool,
 }
 
@@ -98,13 +98,13 @@ struct StoreTask<'a, F, S> {
     handle: &'a StoreHandle,
     stored: &'a mut StoredConfig<F>,
     updates: &'a mut Updates<S>,
-    /// The firmware that runs is on trial.
+    /// Trial of the running firmware.
     trial: Option<update::FirmwareTrial>,
     /// Length of the requested trial, in seconds.
     trial_s: Option<u16>,
 }
 
-/// What comes of outputs.
+/// What to do after the outputs were drained.
 enum DrainResult {
     Sleep { until: proto_core::time::Instant },
     Restart,
@@ -147,7 +147,7 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
                     self.show(waits_for);
                     handle.done.signal(result);
                     if is_restart {
-                        // Nobody gets the lock any more.
+                        // The lock is not released before the restart.
                         return self.end(gateway, pulse).await;
                     }
                     handle.is_taken.set(false);
@@ -227,7 +227,7 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
         (result, matches!(next, DrainResult::Restart))
     }
 
-    /// Keeps settings of the edge node. A trial is not cut short for a restart.
+    /// Stores the settings of the edge node. A restart is refused during a trial.
     #[allow(clippy::await_holding_refcell_ref, reason = "the holder of the lock waits for the store task")]
     async fn keep_edge(&mut self, len: usize, restart: bool) -> (Result<u32, Failed>, bool) {
         let is_on_trial = self.handle.look(|revisions| revisions.trial().is_some()) == Some(true);
@@ -243,7 +243,7 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
     /// The next output of the revisions.
     fn next_output(&self) -> Output {
         let mut revisions = self.handle.revisions.borrow_mut();
-        // They are there as long as the store task works.
+        // Set while the store task runs.
         let Some(revisions) = revisions.as_mut() else {
             return Output::Sleep { until: proto_core::time::Instant::NEVER };
         };
@@ -268,7 +268,7 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
                     let image = self.handle.image.borrow();
                     let image = image.get(..image_len).unwrap_or(&[]);
                     let written = self.stored.keep(number, digest, image, forget).await;
-                    // Room for it was made of others.
+                    // Older ones may have been forgotten to make room.
                     if let Some(revisions) = self.handle.revisions.borrow_mut().as_mut() {
                         revisions.keep_only(|number| {
                             number == NOTHING.number || self.stored.store().revision(number).is_some()
@@ -283,14 +283,14 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
                     let is_done = written.is_ok();
                     (written, Done::Marked(is_done))
                 }
-                // What was begun was not, and what ran still runs.
+                // The trial was not started; the same configuration still runs.
                 Output::Run { number } if self.is_running(number) => (Ok(()), Done::Started(true)),
                 Output::Run { number } => {
                     let (live, ended) = self.live_and_ended();
                     let written = match self.trial_s.take() {
                         Some(confirm_s) => self.stored.begin_trial(number, confirm_s).await,
                         None if number == live => {
-                            // The starts of a trial are counted, so it ends also if this cannot be written.
+                            // Starts of a trial are counted, so it ends even if this write fails.
                             if let Err(error) = self.stored.end_trial(ended).await {
                                 error!("the store: {}", Text(&error));
                             }
@@ -318,7 +318,7 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
         self.handle.running.get().unwrap_or(NOTHING.number) == number
     }
 
-    /// The live one, and how the newest trial ended.
+    /// The live configuration, and how the last trial ended.
     fn live_and_ended(&self) -> (u32, recipe_store::Ended) {
         let revisions = self.handle.revisions.borrow();
         let revisions = revisions.as_ref();
@@ -331,7 +331,7 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
     }
 }
 
-/// What a store holds; before anything was confirmed, [`NOTHING`] is the live one.
+/// The revisions in a store; [`NOTHING`] is live until one is confirmed.
 fn revisions_of(store: &Store) -> Option<Revisions> {
     let marks = store.marks();
     let mut stored = Stored { kept: Vec::new(), live: NOTHING.number, previous: marks.previous };
@@ -340,7 +340,7 @@ fn revisions_of(store: &Store) -> Option<Revisions> {
         Some(live) => stored.live = live,
         None => stored.kept.push(NOTHING).ok()?,
     }
-    // Beside it there is room for one less; the oldest is left out.
+    // `NOTHING` takes one place; the oldest revision is left out.
     let left_out = all.len().saturating_sub(stored.kept.capacity().saturating_sub(stored.kept.len()));
     for kept in all.iter().skip(left_out) {
         stored.kept.push(Revision { number: kept.number, digest: kept.digest }).ok()?;
@@ -360,9 +360,10 @@ fn revisions_of(store: &Store) -> Option<Revisions> {
 
 /// Stands for no configuration: the base revision of the first configuration of an empty board.
 pub const NOTHING: Revision = Revision { number: 0, digest: 0 };
-/// How often the trial of a firmware is looked at.
+/// Polling interval of a firmware trial.
 const LOOK: Duration = Duration::from_secs(1);
-/// For an answer, and for the log.
+/// Time for replies and log lines to be sent.
 const LOG_TIME: Duration = Duration::from_millis(200);
-/// How long safe values may take: so long they are repeated where nothing shows them (proto-core/docs/engine.md section 6).
+/// Limit of sending safe values: how long they are repeated if nothing shows them (proto-core/docs/engine.md section
+/// 6).
 const MAX_SAFE: Duration = Duration::from_secs(1);

@@ -1,7 +1,7 @@
 //! UTC from a server of SNTP, for the edge node (docs/fleet.md section 6).
 //!
-//! In: datagrams of one server. Out: UTC. Which datagram is believed, and when the server is asked, is decided in
-//! `recipe_sparkplug::sntp`. The gateway itself never asks what time it is.
+//! In: datagrams of one server. Out: UTC. `recipe_sparkplug::sntp` decides which datagrams are accepted and when the
+//! server is queried. The engine does not use UTC.
 
 use core::cell::Cell;
 use core::pin::pin;
@@ -19,12 +19,12 @@ use crate::clock::now;
 use crate::fmt::Text;
 use crate::{info, warn};
 
-/// UTC, once a server has told it.
+/// UTC, known after the first reply of a server.
 #[derive(Debug)]
 pub struct WallClock(Cell<Option<(Time, u64)>>);
 
 impl WallClock {
-    /// Nobody has told it.
+    /// UTC is unknown.
     pub const fn unknown() -> Self {
         Self(Cell::new(None))
     }
@@ -35,13 +35,13 @@ impl WallClock {
         Some(utc_ms.saturating_add(at.saturating_since(then).as_millis()))
     }
 
-    /// Whether it is known.
+    /// Whether UTC is known.
     pub fn is_known(&self) -> bool {
         self.0.get().is_some()
     }
 }
 
-/// Asks the server, for ever.
+/// Queries the server forever.
 pub async fn run(
     pulse: &Pulse,
     stack: Stack<'_>,
@@ -58,14 +58,14 @@ pub async fn run(
         let until = Instant::from_micros(sntp.deadline().as_micros());
         pulse.idle(pin!(Timer::at(until))).await;
         pulse.idle(pin!(stack.wait_config_up())).await;
-        // Before the request is made: its way is measured.
+        // Taken before the request is built, to measure the round trip.
         let address = pulse.idle(pin!(resolve(stack, host))).await;
         let Some(request) = sntp.poll(now()) else { continue };
         let Some(address) = address else {
             warn!("time server: {} is not found", host);
             continue;
         };
-        // Another port for each request, as far as nobody can tell.
+        // An unpredictable source port for each request.
         socket.close();
         if socket.bind(0).is_err() {
             continue;
@@ -99,7 +99,7 @@ pub async fn run(
                     if told.replace(error) != Some(error) {
                         warn!("time server: {}", Text(&error));
                     }
-                    // Others may come without end.
+                    // Other hosts may send without limit.
                     if sntp.deadline() > at + LONG {
                         break;
                     }
@@ -110,7 +110,7 @@ pub async fn run(
     }
 }
 
-/// How long a reply is waited for; one that comes later says little.
+/// Timeout of a reply; a later one is too imprecise.
 const ANSWER_TIME: Duration = Duration::from_secs(2);
-/// A server that is asked later than this has said that it wants to be left alone.
+/// Longer intervals mean that the server has asked to be left alone (kiss-o'-death).
 const LONG: proto_core::time::Duration = proto_core::time::Duration::from_secs(1_800);

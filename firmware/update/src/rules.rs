@@ -93,7 +93,7 @@ impl Running {
     /// Whether an update may be written into the free slot.
     ///
     /// # Errors
-    /// Why not.
+    /// The last failure, if there is no session.
     pub fn accepts(
         &self,
         header: &Header,

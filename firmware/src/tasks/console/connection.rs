@@ -279,7 +279,7 @@ const CHUNK: usize = 512;
 const LINGER: Duration = Duration::from_millis(300);
 /// After so long without a packet a peer is gone.
 const SILENT: Duration = Duration::from_secs(15);
-/// For the reset of a connection.
+/// Time for the reset of a connection to be sent.
 const CLOSE: Duration = Duration::from_millis(100);
 /// After a socket that could not be listened with.
 const PAUSE: Duration = Duration::from_millis(100);

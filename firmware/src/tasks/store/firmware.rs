@@ -1,4 +1,4 @@
-//! The store task's part of updates: pieces of a firmware, its trial, and the end of one.
+//! Firmware updates in the store task: pieces, trials and their end.
 
 use embassy_time::Instant;
 use proto_core::engine::PortState;
@@ -13,17 +13,17 @@ use crate::stored::{StoreFlash, image_version};
 use crate::update::{UpdateError, Verdict, WaitsFor, Works};
 use crate::{error, info, warn};
 
-/// What comes of a look at the firmware's trial.
+/// State of the firmware's trial.
 pub(super) enum TrialState {
     /// Nothing is on trial.
     Settled,
-    /// It goes on.
+    /// The trial goes on.
     OnTrial(WaitsFor),
-    /// The board has to be restarted with the firmware before.
+    /// The board must restart with the previous firmware.
     Restart,
 }
 
-/// How much of the cell works.
+/// Counts the links and ports that work.
 fn works(gateway: &Gateway) -> Works {
     gateway.report(|status| {
         let is_up = |state| matches!(state, LinkState::Up { .. } | LinkState::Shared);
@@ -35,14 +35,14 @@ fn works(gateway: &Gateway) -> Works {
 }
 
 impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
-    /// Looks at the trial of the firmware that runs, and confirms or ends it.
+    /// Checks the trial of the running firmware; confirms or ends it.
     pub(super) async fn judge(&mut self, gateway: &Gateway) -> TrialState {
         let Some(trial) = &mut self.trial else { return TrialState::Settled };
         match trial.look(Instant::now(), works(gateway), self.handle.was_reached.get()) {
             Verdict::Waits(waits_for) => TrialState::OnTrial(waits_for),
             Verdict::Confirmed => match self.confirm_firmware().await {
                 Ok(_) => TrialState::Settled,
-                // Tried again by the next look, until the time is over.
+                // Retried at the next check until the trial expires.
                 Err(_) if self.trial.is_some_and(|trial| Instant::now() < trial.until()) => {
                     TrialState::OnTrial(WaitsFor::Time)
                 }
@@ -56,7 +56,7 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
     }
 
     async fn over(&mut self, ended: Ended) -> TrialState {
-        // The starts of a trial are counted, so it ends also if this cannot be written.
+        // Starts of a trial are counted, so it ends even if this write fails.
         if let Some(marks) = end_trial(self.stored.slots(), ended)
             && let Err(error) = self.stored.mark_slots(marks).await
         {
@@ -78,7 +78,7 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
         Ok(0)
     }
 
-    /// What readers see.
+    /// Updates the view for readers.
     pub(super) fn show(&self, waits_for: Option<WaitsFor>) {
         let updates = &self.updates;
         let trial = self.trial.map(|trial| (trial.until(), waits_for.unwrap_or(WaitsFor::Time)));
@@ -123,8 +123,8 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
                     Err(why) => return refused(why),
                 };
                 let before = works(gateway).code();
-                // From here on the board is restarted, whatever comes of it: nothing may wait while a signature is
-                // checked, and a gateway that has let its safe values out does not go on.
+                // From here on the board restarts whatever the result: checking a signature blocks all tasks, and a
+                // gateway that has sent its safe values cannot continue.
                 if !gateway.make_safe(MAX_SAFE).await {
                     warn!("the controller does not show all safe values");
                 }
