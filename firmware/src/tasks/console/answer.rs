@@ -1,4 +1,4 @@
-//! Answers: written into a connection's own memory, and sent from there.
+//! Replies, written into the buffer of a connection and sent from there.
 
 use core::fmt::{self, Display, Write};
 
@@ -14,10 +14,10 @@ use recipe_api::revisions::Revision;
 
 use super::MAX_TIME;
 
-/// Why a connection ended before its answer was sent.
+/// Why a reply could not be sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum SendError {
-    /// The client has gone.
+    /// The client has closed or reset the connection.
     Gone,
     /// It did not read in time.
     Slow,
@@ -25,8 +25,8 @@ pub(super) enum SendError {
     TooLong,
 }
 
-/// A reply whose body is in the buffer of its connection. It is made without waiting and sent in one place, since each
-/// place that waits takes flash.
+/// A reply whose body is in the buffer of its connection. It is built without awaiting and sent in one place: each
+/// await point costs flash.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Reply {
     status: Status,
@@ -39,7 +39,7 @@ pub(super) struct Reply {
 }
 
 impl Reply {
-    /// An answer whose body `write` writes.
+    /// A reply whose body is written by `write`.
     pub(super) fn new(
         buf: &mut [u8],
         status: Status,
@@ -51,12 +51,12 @@ impl Reply {
         Self { status, kind, etag: None, allow: None, retry_after_s: None, len }
     }
 
-    /// An object with `error`.
+    /// A JSON object with the key `error`.
     pub(super) fn error(buf: &mut [u8], status: Status, text: impl Display) -> Self {
         Self::refusing(buf, status, &text)
     }
 
-    /// With the ETag of this revision.
+    /// Adds the ETag of this revision.
     pub(super) fn about(self, etag: Option<Revision>) -> Self {
         Self { etag, ..self }
     }
@@ -75,26 +75,26 @@ impl Reply {
     }
 }
 
-/// What comes of a request.
+/// Result of executing a request.
 pub(super) enum Outcome {
-    /// To be sent.
+    /// A reply that remains to be sent.
     Reply(Reply),
-    /// It was sent, or the connection has ended.
+    /// The reply was sent.
     Sent,
 }
 
-/// The end of a connection that is written to.
+/// Sends the reply to a request.
 pub(super) struct Responder<'s, 'a> {
     pub(super) socket: &'s mut TcpSocket<'a>,
     /// Holds one piece of a reply, or its head and a short body.
     pub(super) buf: &'s mut [u8],
     pub(super) is_head: bool,
-    /// The next nonce for this client, if it signs its requests, or has to.
+    /// Next nonce for a client that signs its requests or must do so.
     pub(super) nonce: Option<NonceText>,
 }
 
 impl Responder<'_, '_> {
-    /// Sends bytes, before `until`.
+    /// Sends bytes; fails at `until`.
     pub(super) async fn send(&mut self, mut bytes: &[u8], until: Instant) -> Result<(), SendError> {
         while !bytes.is_empty() {
             match with_deadline(until, self.socket.write(bytes)).await {
@@ -124,17 +124,17 @@ impl Responder<'_, '_> {
         Ok(())
     }
 
-    /// Sends a whole answer.
+    /// Sends a reply with its body.
     pub(super) async fn answer(&mut self, reply: &Reply) -> Result<(), SendError> {
         let body = reply.len.ok_or(SendError::TooLong)?;
-        // Behind the body, as it has its length.
+        // Behind the body in the buffer, because it contains the body's length.
         let head = self.write_head(body, Length::Bytes(body as u64), reply).ok_or(SendError::TooLong)?;
         let until = Instant::now() + MAX_TIME;
         self.send_part(body, body.saturating_add(head), until).await?;
         self.send_part(0, if self.is_head { 0 } else { body }, until).await
     }
 
-    /// Sends the head of an answer whose body follows in pieces. Returns whether it is wanted.
+    /// Sends the head of a reply whose body follows in pieces. Returns whether the body is wanted (not for HEAD).
     pub(super) async fn begin(
         &mut self,
         kind: Kind,
@@ -153,7 +153,7 @@ impl Responder<'_, '_> {
         let etag = reply.etag.map(Etag);
         let challenge = self.nonce.as_ref().map(Challenge);
         let mut fields: Vec<(&str, &dyn Display), 4> = Vec::new();
-        // There is room for all of them.
+        // The capacity suffices for all fields.
         if let Some(etag) = &etag {
             let _ = fields.push(("ETag", etag));
         }
@@ -241,12 +241,12 @@ impl Display for Etag {
 }
 
 impl Etag {
-    /// The revision whose ETag this is.
+    /// The revision with this ETag.
     pub(super) fn parse(text: &str) -> Option<Revision> {
         let (number, digest) = text.strip_prefix('"')?.strip_suffix('"')?.split_once('-')?;
         let digest = u32::from_str_radix(digest, 16).ok()?;
         let revision = Revision { number: number.parse().ok()?, digest };
-        // One text for each revision.
+        // Only the canonical text is accepted.
         let mut same = heapless::String::<24>::new();
         write!(same, "{}", Self(revision)).ok()?;
         (same == text).then_some(revision)

@@ -1,29 +1,29 @@
-//! The arguments of the operations that change something.
+//! Arguments of operations that change something.
 
 use proto_core::time::Duration as Span;
 use recipe_api::arguments::{Value, each};
 use recipe_api::key::{KEY_LEN, Key, from_hex};
 use recipe_api::route::Operation;
 
-/// What a body asks for.
+/// Arguments parsed from a body.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Arguments {
-    /// Of an operation that takes none.
+    /// The operation takes no arguments.
     None,
-    /// Of `apply`.
+    /// Arguments of `apply`.
     Apply { number: Option<u32>, trial: Span },
-    /// Of `claim`.
+    /// The key of `claim`.
     Key([u8; KEY_LEN]),
-    /// Of `update/try`: how long, in seconds.
+    /// Duration of the trial of `update/try`, in seconds.
     Try(u16),
-    /// Of `identify`, in seconds.
+    /// Duration of `identify`, in seconds.
     Seconds(u32),
-    /// They are none of these; this is what is allowed.
+    /// Invalid; the text says what is allowed.
     Wrong(&'static str),
 }
 
 impl Arguments {
-    /// Those of a body.
+    /// Parses a body.
     #[inline(never)]
     pub(super) fn parse(operation: Operation, body: &[u8]) -> Self {
         match operation {

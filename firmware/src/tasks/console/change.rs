@@ -1,4 +1,4 @@
-//! The operations that change something.
+//! Operations that change something.
 
 use core::fmt::Write;
 
@@ -49,7 +49,7 @@ impl Console {
                 self.is_claimed(None);
                 Reply::error(buf, Status::INTERNAL, "the key cannot be kept")
             }
-            // A piece is one of many.
+            // Not logged: an update has many pieces.
             (Ok(_), StoreRequest::Piece { .. }) => self.firmware(buf, Status::OK),
             (Ok(_), StoreRequest::ConfirmFirmware) => {
                 warn!("the firmware is confirmed for {}", Text(&peer));
@@ -80,7 +80,7 @@ impl Console {
         }
     }
 
-    /// Reads the whole image that was sent, in pieces between which others run. Returns the answer if it is refused.
+    /// Validates the image that was sent, in steps between which other tasks run. Returns the reply if it is invalid.
     async fn look_through(&self, buf: &mut [u8], len: usize, lock: &StoreLock<'_>) -> Option<Reply> {
         let mut scan = Scan::new();
         loop {
@@ -127,7 +127,7 @@ impl Console {
         store.take().map(|lock| (change, lock)).ok_or_else(|| busy(buf))
     }
 
-    /// Takes a key, if the button was pressed.
+    /// Accepts a key if the button was pressed.
     fn take_key(
         &self,
         buf: &mut [u8],
@@ -135,7 +135,8 @@ impl Console {
         request: &Request<'_>,
     ) -> Result<(StoreRequest, StoreLock<'_>), Reply> {
         let Some(store) = self.store else { return Err(nothing_kept(buf)) };
-        // Before the claim, which waits for its end otherwise. A board that reads its store takes no key yet.
+        // Before the claim begins, which would otherwise have to be finished. While the store is being read no key is
+        // accepted.
         let Some(lock) = store.take().filter(|_| store.look(|_| ()).is_some()) else {
             return Err(busy(buf));
         };
@@ -154,7 +155,7 @@ impl Console {
         Err(Reply::error(buf, status, text))
     }
 
-    /// The key is kept, or could not be.
+    /// Ends a claim: the key was stored, or could not be.
     fn is_claimed(&self, key: Option<[u8; KEY_LEN]>) {
         let mut claim: Claim = self.claim.get();
         claim.written(now(), key.is_some());
@@ -193,7 +194,7 @@ fn put<'a>(buf: &mut [u8], request: Request<'a>) -> Result<(StoreRequest, StoreL
         }
         Some(None) => (Status::PRECONDITION_FAILED, "If-Match must be one ETag, such as \"3-0badcafe\""),
         Some(Some(base)) => {
-            // Bytes behind the image would be kept for nothing.
+            // Trailing bytes would waste flash.
             let whole = lock.look(len, |bytes| Ok((image::intact(bytes)?, image::image_len(bytes)?)));
             return match whole {
                 Ok((digest, len)) => Ok((StoreRequest::Put { base, digest, len }, lock)),
@@ -233,7 +234,7 @@ pub(super) fn nothing_kept(buf: &mut [u8]) -> Reply {
     Reply::error(buf, Status::UNAVAILABLE, "this board has no store, so it keeps nothing")
 }
 
-/// For the log.
+/// Name of the operation in the log.
 fn name(operation: Operation) -> &'static str {
     match operation {
         Operation::PutConfig => "store",

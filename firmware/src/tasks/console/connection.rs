@@ -22,7 +22,7 @@ use crate::clock::now;
 use crate::tasks::store::StoreLock;
 use crate::tasks::watchdog::Pulse;
 
-/// The memory of a connection.
+/// Buffers of a connection.
 #[derive(Debug)]
 pub struct ConnectionBuffers<'a> {
     rx: &'a mut [u8],
@@ -43,18 +43,18 @@ impl<'a> ConnectionBuffers<'a> {
     }
 }
 
-/// A request with what belongs to it.
+/// A parsed request.
 pub(super) struct Request<'a> {
     pub(super) head: Head<'a>,
     pub(super) operation: Operation,
     pub(super) arguments: Arguments,
-    /// The image that was sent, in the buffer of the store handle: its length, and the right to store it.
+    /// Length of the body in the image buffer of the store handle, and the lock on it.
     pub(super) image: Option<(usize, StoreLock<'a>)>,
     pub(super) peer: Ipv4Addr,
 }
 
 impl Console {
-    /// Serves connections with one socket, for ever.
+    /// Serves connections with one socket, forever.
     pub async fn serve(&self, pulse: &Pulse, stack: Stack<'_>, buffers: ConnectionBuffers<'_>) -> ! {
         let ConnectionBuffers { rx, tx, buf } = buffers;
         let mut head = HeadBuffer::new();
@@ -67,9 +67,9 @@ impl Console {
                     Timer::after(PAUSE).await;
                     return;
                 }
-                // Nor one that is switched off. Longer than all other limits, or they would have no say.
+                // Catches peers that lost power. Longest of all timeouts, so that the others take effect first.
                 socket.set_timeout(Some(SILENT));
-                // Without limit, as the number of tasks is one.
+                // No limit: the number of tasks is the limit.
                 let _one = ConnectionPermit::of(&self.connections, usize::MAX);
                 self.count(|counters| &mut counters.connections);
                 head.clear();
@@ -79,7 +79,7 @@ impl Console {
                     Ok(()) => {
                         socket.close();
                         if with_timeout(MAX_TIME, socket.flush()).await.is_ok() {
-                            // What is left of a request: a reset before it was taken would hide the answer.
+                            // Read the rest of the request: a reset because of unread data could destroy the reply.
                             let rest = async { while socket.read(buf).await.is_ok_and(|count| count > 0) {} };
                             let _ = with_timeout(LINGER, rest).await;
                         }
@@ -131,7 +131,7 @@ impl Console {
         responder.answer(&reply).await
     }
 
-    /// Waits for the head. Returns the range of the buffer with the beginning of the body; `None` if it did not arrive in time.
+    /// Waits for the head. Returns where the beginning of the body is in the buffer; `None` on timeout.
     async fn receive_head(
         &self,
         responder: &mut Responder<'_, '_>,
@@ -142,7 +142,7 @@ impl Console {
             let chunk = responder.buf.get_mut(..CHUNK).unwrap_or(&mut []);
             let count = match with_deadline(deadline, responder.socket.read(chunk)).await {
                 Ok(Ok(count @ 1..)) => count,
-                // A browser opens connections that it may never use.
+                // Browsers open connections that they may never use.
                 _ if buffer.is_empty() => return Err(SendError::Gone),
                 Err(_) => return Ok(None),
                 Ok(_) => {
@@ -157,7 +157,7 @@ impl Console {
         }
     }
 
-    /// Decides about a request by its head.
+    /// Admits or refuses a request by its head.
     #[inline(never)]
     fn admit<'a>(
         &'a self,
@@ -192,13 +192,13 @@ impl Console {
         if matches!(operation, Operation::PutConfig | Operation::PutUpdate | Operation::PutEdge) {
             let Some(store) = self.store else { return Err(nothing_kept(responder.buf)) };
             let Some(lock) = store.take() else { return Err(busy(responder.buf)) };
-            // The guard has limited it.
+            // The guard has checked the length.
             request.image = Some((usize::try_from(admitted.length).unwrap_or(0), lock));
         }
         Ok((admitted, request))
     }
 
-    /// Takes the body, of which a part came with the head.
+    /// Receives the body, part of which came with the head.
     async fn receive_body(
         &self,
         responder: &mut Responder<'_, '_>,
@@ -209,7 +209,7 @@ impl Console {
     ) -> Result<Body, SendError> {
         let length = usize::try_from(admitted.length).unwrap_or(0);
         let mut hash = BodyHash::new();
-        // What is behind the body is another request, which is not looked at.
+        // Bytes behind the body are another request, which is ignored.
         let mut piece = rest.len().min(length);
         responder.buf.copy_within(rest.start..rest.start.saturating_add(piece), 0);
         if admitted.expects_continue && piece < length {
@@ -238,7 +238,7 @@ impl Console {
                     return Err(SendError::Gone);
                 }
             };
-            // Hashing takes its time.
+            // Hashing takes long enough to let other tasks run.
             yield_now().await;
         }
         if admitted.is_signed() && !admitted.is_body(&hash.finish()) {
@@ -252,10 +252,10 @@ impl Console {
     }
 }
 
-/// What has arrived of a body.
+/// Result of receiving a body.
 enum Body {
     Whole,
-    /// It is not the one that was signed.
+    /// Its hash differs from the signed one.
     Other,
     /// It did not arrive in time.
     Incomplete,
@@ -269,17 +269,17 @@ fn address(address: IpAddress) -> Ipv4Addr {
 
 /// Receive buffer of a socket.
 const RX: usize = 1024;
-/// Transmit buffer: what a client far away has not acknowledged.
+/// Transmit buffer: unacknowledged data at a long round trip.
 const TX: usize = 1536;
 /// Buffer of a connection: the longest piece of a reply, or its head and a short body.
 const BUFFER: usize = 3328;
-/// Bytes that are read at once; an image's are hashed before others run.
+/// Bytes per read; each chunk of an image is hashed in one go.
 const CHUNK: usize = 512;
-/// How long a client may go on sending after its answer.
+/// Time for a client to stop sending after its reply.
 const LINGER: Duration = Duration::from_millis(300);
-/// After so long without a packet a peer is gone.
+/// TCP timeout of a silent peer.
 const SILENT: Duration = Duration::from_secs(15);
 /// Time for the reset of a connection to be sent.
 const CLOSE: Duration = Duration::from_millis(100);
-/// After a socket that could not be listened with.
+/// Pause after a failed accept.
 const PAUSE: Duration = Duration::from_millis(100);

@@ -10,7 +10,7 @@ use recipe_api::response::{Kind, Length, Status};
 use super::answer::{Outcome, Reply, Responder, SendError, TextBuffer};
 use super::{Console, MAX_ANSWER, MAX_TIME};
 
-/// What is sent.
+/// Source of a document.
 #[derive(Debug, Clone)]
 pub(super) enum DocumentSource {
     Pieces(Pieces),
@@ -24,7 +24,7 @@ impl DocumentSource {
 }
 
 impl Console {
-    /// Sends a whole document as the body of an answer.
+    /// Sends a document as the body of a reply.
     pub(super) async fn document(
         &self,
         responder: &mut Responder<'_, '_>,
@@ -65,7 +65,7 @@ impl Console {
         Ok(is_more.then_some(buf.len))
     }
 
-    /// Whether nothing runs.
+    /// Whether no configuration runs.
     pub(super) fn is_idle(&self) -> bool {
         self.gateway.report(|status| status.health()) == Health::Idle
     }

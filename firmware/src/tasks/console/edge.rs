@@ -1,4 +1,4 @@
-//! The document `edge`: how the edge node does, and new settings for it (docs/api.md section 10).
+//! The document `edge`: status and settings of the edge node (docs/api.md section 10).
 
 use core::fmt::{self, Write};
 
@@ -16,7 +16,7 @@ use crate::tasks::store::{StoreLock, StoreRequest};
 use crate::warn;
 
 impl Console {
-    /// The document, with this status.
+    /// Reply with the document and this status.
     #[inline(never)]
     pub(super) fn edge(&self, buf: &mut [u8], status: Status) -> Reply {
         Reply::new(buf, status, Kind::Json, |out| self.write_edge(out))
@@ -83,7 +83,7 @@ impl Console {
         out.write_char('}')
     }
 
-    /// Settings were kept.
+    /// Reply after settings were stored.
     pub(super) fn edge_is_kept(
         &self,
         buf: &mut [u8],
@@ -117,7 +117,7 @@ pub(super) fn settings<'a>(
     }
 }
 
-/// Not inlined, so that its stack frame is free during the request to the store task.
+/// Not inlined, to free its stack frame before the request to the store task.
 #[inline(never)]
 fn read(bytes: &[u8]) -> Result<bool, DocumentError> {
     Document::empty().decode(bytes)

@@ -1,4 +1,4 @@
-//! The document `update`: what runs, what is being received, and a trial (docs/api.md section 9).
+//! The document `update`: running and incoming firmware, and a trial (docs/api.md section 9).
 
 use core::fmt::{self, Write};
 
@@ -16,7 +16,7 @@ use crate::tasks::store::{FirmwareView, StoreHandle};
 use crate::update::{Incoming, UpdateStage, build_of, whole_length};
 
 impl Console {
-    /// The document, with this status.
+    /// Reply with the document and this status.
     #[inline(never)]
     pub(super) fn firmware(&self, buf: &mut [u8], status: Status) -> Reply {
         if self.store.is_none() {

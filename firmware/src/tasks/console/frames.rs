@@ -1,4 +1,4 @@
-//! The frames that went over field ports, as events of a stream.
+//! Frames on field ports as events of a stream.
 
 use core::fmt::{self, Write};
 
@@ -10,17 +10,17 @@ use recipe_api::key::Hex;
 use super::Console;
 use super::answer::TextBuffer;
 
-/// Follows the frames as long as it exists.
+/// The only reader of the frame tap; released on drop.
 pub(super) struct Follower<'c> {
     console: &'c Console,
-    /// Only of this port.
+    /// Restricts the frames to this port.
     port: Option<&'c str>,
     /// Records dropped because the queue was full, not yet reported.
     lost: u32,
 }
 
 impl Console {
-    /// Begins to follow the frames; `None` if somebody does already, as there is one ring.
+    /// Starts reading the tap; `None` if there is a reader already, because there is one ring.
     pub(super) fn follow<'c>(&'c self, port: Option<&'c str>) -> Option<Follower<'c>> {
         if self.is_followed.replace(true) {
             return None;
@@ -64,7 +64,7 @@ impl Follower<'_> {
     }
 }
 
-/// The same keys as those of a host, but for what it decodes.
+/// The keys of the host's events except decoded values.
 fn write(out: &mut TextBuffer<'_>, record: &TapRecord<'_>, port: &str) -> fmt::Result {
     write!(out, "{{\"time_us\":{},\"port\":", record.at.as_micros())?;
     json::write_text(out, port)?;
@@ -91,7 +91,7 @@ fn write(out: &mut TextBuffer<'_>, record: &TapRecord<'_>, port: &str) -> fmt::R
     write!(out, ",\"bytes\":\"{}\"}}", Hex(record.bytes))
 }
 
-/// Bytes that are shown of a frame.
+/// Maximum number of bytes shown of a frame.
 const MOST_BYTES: usize = 256;
-/// Length of the longest record: its bytes, a name of which each letter is escaped, and the rest.
+/// Maximum length of a record: its bytes, a name with every character escaped, and the keys.
 const LONGEST: usize = 2 * MOST_BYTES + 6 * 32 + 260;

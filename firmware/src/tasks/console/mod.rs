@@ -1,10 +1,10 @@
 //! The console: the API of docs/api.md over HTTP.
 //!
-//! In: connections, a button. Out: answers, and requests to the store task. Decides nothing about who may do what,
-//! which is `recipe_api`'s, and knows no flash. There are as many tasks as connections ([`CONNECTIONS`]); each serves
-//! one request and closes. The engine is looked at in pieces: for each piece of a document a task borrows it, writes
-//! at most a port or 32 variables into its own memory, and lets the others run before the piece is sent. So nobody
-//! waits for a socket, and a document may show its parts at slightly different instants.
+//! In: connections, a button. Out: replies, and requests to the store task. Access control is in `recipe_api`; flash is
+//! unknown here. There are [`CONNECTIONS`] tasks; each serves one request per connection. Documents are written in
+//! pieces: a task borrows the engine, writes at most a port or 32 variables into its buffer, and yields before it sends
+//! the piece. So the engine never waits for a socket, and the parts of a document may be of slightly different
+//! instants.
 
 mod answer;
 mod arguments;
@@ -40,17 +40,17 @@ pub use connection::ConnectionBuffers;
 
 /// Number of connections.
 pub const CONNECTIONS: usize = 4;
-/// Of them streams: the others are always for requests.
+/// Maximum number of streams; the other connections remain available for requests.
 pub const STREAMS: usize = 2;
 /// The TCP port.
 pub const PORT: u16 = 80;
 
-/// What all connections share.
+/// State shared by all connections.
 pub struct Console {
     gateway: &'static Gateway,
-    /// `None` if the board keeps nothing.
+    /// `None` if the board has no store.
     store: Option<&'static StoreHandle>,
-    /// Those of the board.
+    /// Field ports of the board.
     ports: Ports,
     node: NodeView,
     name: String<NAME>,
@@ -59,41 +59,41 @@ pub struct Console {
     counters: Cell<Counters>,
     connections: Cell<usize>,
     streams: Cell<usize>,
-    /// Somebody follows the frames.
+    /// The frame tap has a reader.
     is_followed: Cell<bool>,
     identify_until: Cell<Instant>,
 }
 
-/// The edge node, as far as clients see it.
+/// The edge node as seen by clients.
 #[derive(Clone, Copy)]
 pub struct NodeView {
-    /// How it does.
+    /// Its state.
     pub edge: &'static Edge,
-    /// Its settings, if it has some.
+    /// Its settings, if there are any.
     pub document: Option<&'static Document>,
-    /// Whether it knows UTC.
+    /// Its clock.
     pub clock: &'static WallClock,
 }
 
 /// Counters of connections. They wrap.
 #[derive(Debug, Clone, Copy, Default, serde::Serialize)]
 struct Counters {
-    /// Connections.
+    /// Accepted connections.
     connections: u32,
-    /// Streams that were refused, because there were too many.
+    /// Streams refused because of [`STREAMS`].
     turned_away: u32,
-    /// Requests that did not arrive in time, or were cut off.
+    /// Requests that timed out or were cut off.
     incomplete: u32,
-    /// Answers and streams that were ended because the client did not read.
+    /// Replies and streams aborted because the client did not read.
     slow_readers: u32,
-    /// Events that streams left out because their client reads slowly.
+    /// Events skipped because their client reads slowly.
     lost_events: u32,
     /// Replies that did not fit into the buffer and were cut off.
     cut_off: u32,
 }
 
 impl Console {
-    /// For this gateway, which may run nothing. `secret` is random.
+    /// Creates the console. `secret` must be random.
     pub fn new(
         gateway: &'static Gateway,
         store: Option<&'static StoreHandle>,
@@ -119,13 +119,13 @@ impl Console {
         }
     }
 
-    /// Whether somebody looks for this board, so that its LED has to show it.
+    /// Whether the LED has to identify the board.
     pub fn is_identifying(&self) -> bool {
         Instant::now() < self.identify_until.get()
     }
 
-    /// Looks at the button, for ever. Held down since the start it is not a press, as a button that is stuck, or not
-    /// there, would be one.
+    /// Polls the button forever. A button that is down at the start is ignored until released: it may be stuck or
+    /// missing.
     pub async fn watch(&self, pulse: &Pulse, mut button: impl Button) -> ! {
         let mut was_pressed = true;
         loop {
@@ -156,11 +156,11 @@ impl Console {
     }
 }
 
-/// One more, as long as it exists.
+/// Counts a connection or stream until dropped.
 struct ConnectionPermit<'a>(&'a Cell<usize>);
 
 impl<'a> ConnectionPermit<'a> {
-    /// Unless there are `most`.
+    /// `None` if there are `most` already.
     fn of(count: &'a Cell<usize>, most: usize) -> Option<Self> {
         (count.get() < most).then(|| {
             count.set(count.get().saturating_add(1));
@@ -175,9 +175,9 @@ impl Drop for ConnectionPermit<'_> {
     }
 }
 
-/// How often the button is looked at.
+/// Polling interval of the button.
 const BUTTON: Duration = Duration::from_millis(50);
-/// How long a request may take to arrive, and how long an answer may wait for its client.
+/// Limit of receiving a request, and of each write of a reply.
 const MAX_TIME: Duration = Duration::from_secs(5);
-/// How long an answer in pieces may take as a whole.
+/// Limit of a reply sent in pieces, in total.
 const MAX_ANSWER: Duration = Duration::from_secs(10);

@@ -1,4 +1,4 @@
-//! The operations that read.
+//! Operations that read.
 
 use core::fmt::{self, Write};
 
@@ -109,7 +109,7 @@ impl Console {
         })
     }
 
-    /// The revisions, and what happens to them; `changed` is the one that a change was about.
+    /// The revisions and their state; `changed` is the subject of a change.
     #[inline(never)]
     pub(super) fn revisions(&self, buf: &mut [u8], status: Status, changed: Option<u32>) -> Reply {
         let Some(store) = self.store else { return nothing_kept(buf) };
@@ -118,11 +118,11 @@ impl Console {
             let write = |out: &mut TextBuffer<'_>| write_revisions(out, store, revisions, changed);
             Reply::new(buf, status, Kind::Json, write).about(etag)
         });
-        // The store is being read, or an image is taken over.
+        // The store is being read, or an image is being adopted.
         reply.unwrap_or_else(|| busy(buf))
     }
 
-    /// The image of what runs, or of the requested revision.
+    /// The image of the running configuration or of the requested revision.
     async fn config(
         &self,
         responder: &mut Responder<'_, '_>,
@@ -187,7 +187,7 @@ async fn log(responder: &mut Responder<'_, '_>, request: &Request<'_>) -> Result
         return Ok(Outcome::Sent);
     }
     let mut place = journal::last(lines);
-    // More than the journal has is what came meanwhile.
+    // Lines added meanwhile are not sent.
     for _ in 0..journal::CAPACITY.div_ceil(LOG_PIECE) {
         let (len, behind) = journal::read(place, responder.buf.get_mut(..LOG_PIECE).unwrap_or(&mut []));
         if len == 0 {
@@ -201,7 +201,7 @@ async fn log(responder: &mut Responder<'_, '_>, request: &Request<'_>) -> Result
     Ok(Outcome::Sent)
 }
 
-/// Sends the page for people, unless the client has it.
+/// Sends the web page, unless the client has it cached.
 async fn page(responder: &mut Responder<'_, '_>, request: &Request<'_>) -> Result<Outcome, SendError> {
     let status = PAGE.status(request.head.if_none_match);
     let mut buf = TextBuffer::new(responder.buf);
@@ -269,7 +269,7 @@ fn write_revisions(
     out.write_char('}')
 }
 
-/// In a string of JSON: with its quotes escaped.
+/// Inside a JSON string: quotes escaped.
 fn write_etag(out: &mut TextBuffer<'_>, revision: Revision) -> fmt::Result {
     write!(out, "\\\"{}-{:08x}\\\"", revision.number, revision.digest)
 }
@@ -278,10 +278,10 @@ fn write_json(out: &mut TextBuffer<'_>, value: &impl Serialize) -> fmt::Result {
     json::write(out, value).map_err(|_| fmt::Error)
 }
 
-/// The page for people.
+/// The web page.
 const PAGE: Page =
     Page { bytes: &recipe_console::PAGE, policy: recipe_console::POLICY, etag: recipe_console::ETAG };
-/// Bytes of it that are given to the network at once.
+/// Bytes of it per write.
 const PAGE_PIECE: usize = 1024;
 const MAX_LINES: usize = 256;
 const LOG_PIECE: usize = 1024;

@@ -62,7 +62,7 @@ impl Console {
                 self.event(responder, "values", Document::Values).await?;
             }
             let wake = if follower.is_some() { next.min(Instant::now() + FRAMES) } else { next };
-            // It has nothing more to say; what it says all the same is not looked at.
+            // Further input is ignored.
             let mut said = [0; 32];
             match select(Timer::at(wake), responder.socket.read(&mut said)).await {
                 Either::First(()) | Either::Second(Ok(1..)) => {}
@@ -80,7 +80,7 @@ impl Console {
     ) -> Result<(), SendError> {
         let until = Instant::now() + MAX_TIME;
         if self.is_idle() {
-            // Nothing runs. A comment shows that the stream is still there.
+            // No configuration runs. A comment keeps the stream alive.
             return responder.send(b":\n\n", until).await;
         }
         let mut source = DocumentSource::of(document);
@@ -106,5 +106,5 @@ impl Console {
 
 /// Time between two events.
 const PERIOD: Duration = Duration::from_millis(200);
-/// Time between two looks at the frames: their ring holds little more.
+/// Polling interval of the tap, whose ring holds little more.
 const FRAMES: Duration = Duration::from_millis(20);

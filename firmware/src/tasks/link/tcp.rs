@@ -36,7 +36,7 @@ impl LinkDriver<'_> {
             && self.report(turn, Input::LinkUp { link: self.link })
         {
             self.exchange(turn, &mut socket, buffers.chunk).await;
-            // Closed by the peer or by an error.
+            // The peer closed the connection, or it failed.
             if self.control.is_turn(turn) {
                 socket.close();
                 let closing = select(self.control.over(turn), socket.flush());
@@ -86,7 +86,7 @@ impl LinkDriver<'_> {
 
     async fn read(&self, turn: u32, mut reader: TcpReader<'_>, outgoing: &Outgoing<'_>, chunk: &mut [u8]) {
         while let Ok(len) = reader.read(chunk).await {
-            // An answer comes with the acknowledgement of its request.
+            // A reply also acknowledges its request.
             let goes_on = self.report_acknowledged(turn, outgoing);
             let bytes = chunk.get(..len).unwrap_or(&[]);
             if !goes_on || bytes.is_empty() || !self.report(turn, Input::LinkBytes { link: self.link, bytes })
@@ -167,5 +167,5 @@ const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(2);
 const KEEP_ALIVE_PERIOD: Duration = Duration::from_secs(5);
 /// How long keep-alives may be unanswered.
 const KEEP_ALIVE_TIMEOUT: Duration = Duration::from_secs(20);
-/// How long to wait for a socket that closes.
+/// Limit of closing a socket.
 const CLOSE_TIMEOUT: Duration = Duration::from_millis(100);

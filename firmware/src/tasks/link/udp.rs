@@ -128,15 +128,15 @@ impl LinkDriver<'_> {
     }
 }
 
-/// How to continue.
+/// Why a socket's loop ended.
 enum SocketEnd {
-    /// The turn is over, or the socket has failed.
+    /// The turn is over or the socket failed.
     End,
     /// A datagram cannot be sent: open the socket again.
     Reopen,
 }
 
-/// Datagrams that wait to be read.
+/// Datagrams in the receive buffer.
 const DATAGRAMS: usize = 8;
 /// Maximum age of a datagram when it leaves: that of a frame on TCP when it is delivered.
 const SEND_TIMEOUT: Duration = Duration::from_millis(250);

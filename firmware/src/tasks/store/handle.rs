@@ -15,99 +15,99 @@ use recipe_update::{BoardName, Downgrade, Header, Slot};
 
 use crate::update::{self, Build, Incoming, WaitsFor};
 
-/// What a client asks for.
+/// A request to the store task.
 #[derive(Debug, Clone)]
 pub enum StoreRequest {
-    /// Keep the image of this length in `StoreHandle::image`, which was made from a revision.
+    /// Store the image in `StoreHandle::image`.
     Put {
-        /// That revision.
+        /// Revision that the image was derived from.
         base: Revision,
-        /// The image's digest.
+        /// CRC-32 of the image.
         digest: u32,
         /// Its length in bytes.
         len: usize,
     },
-    /// Run one on trial; without a number the one that waits.
+    /// Run a revision on trial.
     Apply {
-        /// Its number.
+        /// Number of the revision; `None` for the waiting one.
         number: Option<u32>,
-        /// How long.
+        /// Duration of the trial.
         trial: Span,
     },
-    /// Keep what is on trial.
+    /// Make the configuration on trial the live one.
     Confirm,
-    /// Return to what ran before.
+    /// End the trial; return to the live configuration.
     RollBack,
-    /// Take this key.
+    /// Store this access key.
     Claim([u8; 16]),
-    /// Take the piece of a firmware of this length in `StoreHandle::image`.
+    /// Write the piece of a firmware in `StoreHandle::image` to the free slot.
     Piece {
-        /// Where it begins, counted from the beginning of the header.
+        /// Offset from the beginning of the header, in bytes.
         offset: u32,
         /// Its length in bytes.
         len: usize,
-        /// Whether it may be older than what runs.
+        /// Whether it may be older than the running firmware.
         downgrade: Downgrade,
     },
-    /// Run the firmware that was received on trial.
+    /// Run the received firmware on trial.
     TryFirmware {
-        /// For so long, in seconds.
+        /// Duration of the trial, in seconds.
         confirm_s: u16,
-        /// Whether it may be older than what runs.
+        /// Whether it may be older than the running firmware.
         downgrade: Downgrade,
     },
-    /// Keep the firmware that is on trial.
+    /// Confirm the firmware on trial.
     ConfirmFirmware,
-    /// Return to the firmware before.
+    /// End the trial; return to the previous firmware.
     EndFirmware,
-    /// Keep the settings of the edge node of this length in `StoreHandle::image`.
+    /// Store the settings of the edge node in `StoreHandle::image`.
     Edge {
         /// Their length in bytes.
         len: usize,
-        /// Whether they say that something is told.
+        /// Whether they enable publishing.
         tells: bool,
-        /// Whether the board is to restart with them.
+        /// Whether the board restarts afterwards.
         restart: bool,
     },
 }
 
-/// Why nothing was done.
+/// Why a request failed; nothing has changed.
 #[derive(Debug, Clone, Copy)]
 pub enum Failed {
-    /// It is refused.
+    /// Refused by the rules for configurations.
     Refused(Refused),
-    /// It is about the firmware, and refused.
+    /// Refused by the rules for firmware.
     Firmware(update::UpdateError),
     /// The store cannot be written.
     Store(KeepError),
 }
 
-/// What readers see of the firmware.
+/// The firmware's state for readers.
 #[derive(Debug, Clone, Copy)]
 pub struct FirmwareView {
     /// The board's name.
     pub board: BoardName,
     /// The slot that the program runs in.
     pub slot: Option<Slot>,
-    /// Which build runs.
+    /// Build of the running firmware.
     pub build: Option<Build>,
-    /// Why it takes no update.
+    /// Why the firmware cannot be updated; `None` if it can.
     pub cannot: Option<&'static str>,
     /// The public key of the loader.
     pub key: Option<[u8; 32]>,
     /// The marks of the store.
     pub marks: SlotMarks,
-    /// When the trial of what runs is over, and what it waits for.
+    /// Deadline of the running firmware's trial, and what it waits for.
     pub trial: Option<(Instant, WaitsFor)>,
-    /// What the other slot holds, whole.
+    /// Header of the complete firmware in the other slot.
     pub other: Option<Header>,
-    /// What is being received, or was.
+    /// The firmware being received, or received last.
     pub incoming: Option<Incoming>,
 }
 
-/// Length of a text that says why a configuration does not run.
+/// Maximum length of the text of [`StoreHandle::failure`], in bytes.
 pub const MAX_FAILURE: usize = 160;
-/// Bytes of an image that are read at once: a multiple of a flash word.
+/// Bytes of an image per read; a multiple of a flash word.
 pub const PART: usize = 512;
 
 /// Shared by the store task and its clients.
@@ -116,7 +116,7 @@ pub struct StoreHandle {
     /// The configuration that runs.
     pub(super) running: Cell<Option<u32>>,
     pub(super) failure: RefCell<String<MAX_FAILURE>>,
-    /// A change holds the lock: changes are made one after the other.
+    /// The lock is taken; there is one change at a time.
     pub(super) is_taken: Cell<bool>,
     pub(super) image: RefCell<&'static mut [u8; MAX_IMAGE]>,
     pub(super) requests: Signal<NoopRawMutex, StoreRequest>,
@@ -124,17 +124,17 @@ pub struct StoreHandle {
     pub(super) part_requests: Signal<NoopRawMutex, (u32, usize)>,
     pub(super) part: RefCell<[u8; PART]>,
     pub(super) part_len: Signal<NoopRawMutex, Option<usize>>,
-    /// The number of a session that begins, and whether it is kept.
+    /// bdSeq of a session that begins, and whether it was stored.
     pub(super) session: Signal<NoopRawMutex, u8>,
     pub(super) session_kept: Signal<NoopRawMutex, bool>,
     pub(super) readers: Mutex<NoopRawMutex, ()>,
     pub(super) firmware: Cell<Option<FirmwareView>>,
-    /// A request was admitted since the start.
+    /// A request has been admitted since the start.
     pub(super) was_reached: Cell<bool>,
 }
 
 impl StoreHandle {
-    /// Without a store task yet. `image` is the buffer for an image on its way to the store.
+    /// A handle before its store task runs. `image` is the buffer for images to be stored.
     pub fn new(image: &'static mut [u8; MAX_IMAGE]) -> Self {
         Self {
             revisions: RefCell::new(None),
@@ -155,17 +155,17 @@ impl StoreHandle {
         }
     }
 
-    /// Passes the revisions to `look`; `None` if the board keeps nothing, or does not know yet what it keeps.
+    /// Passes the revisions to `look`; `None` until the store has been read, or if its marks are invalid.
     pub fn look<R>(&self, look: impl FnOnce(&Revisions) -> R) -> Option<R> {
         self.revisions.borrow().as_ref().map(look)
     }
 
-    /// Number of the configuration that runs; `None` if it is not one of the store.
+    /// Number of the running configuration; `None` if it is not in the store.
     pub fn running(&self) -> Option<u32> {
         self.running.get()
     }
 
-    /// What is known of the firmware; `None` while the store is being read.
+    /// The firmware's state; `None` while the store is being read.
     pub fn firmware(&self) -> Option<FirmwareView> {
         self.firmware.get()
     }
@@ -175,16 +175,16 @@ impl StoreHandle {
         self.was_reached.set(true);
     }
 
-    /// Passes to `look` why the newest configuration that did not run did not; empty if all ran.
+    /// Passes to `look` why the first configuration that was tried at the start does not run; empty if it runs.
     pub fn failure<R>(&self, look: impl FnOnce(&str) -> R) -> R {
         look(&self.failure.borrow())
     }
 
-    /// Notes why a configuration did not run.
+    /// Records why a configuration does not run.
     pub fn failed(&self, why: &impl core::fmt::Display) {
         let mut failure = self.failure.borrow_mut();
         failure.clear();
-        // What there is no room for is cut.
+        // Truncated to the capacity.
         let _ = core::fmt::Write::write_fmt(&mut Cut(&mut failure), format_args!("{why}"));
     }
 
@@ -193,16 +193,16 @@ impl StoreHandle {
         (!self.is_taken.replace(true)).then_some(StoreLock { handle: self, is_asked: false })
     }
 
-    /// Keeps the number of a session of the edge node, which alone calls this. Returns whether it is kept. Waits while
-    /// the store is being written.
+    /// Stores the bdSeq of a session; only the edge node calls this. Returns whether it was stored. Waits while the
+    /// store is being written.
     pub async fn keep_session(&self, bd_seq: u8) -> bool {
         self.session_kept.reset();
         self.session.signal(bd_seq);
         self.session_kept.wait().await
     }
 
-    /// Copies the image of a configuration from `offset` on, a multiple of [`PART`], and returns the number of bytes:
-    /// at most [`PART`], fewer at its end. `None` if it is not kept. Waits while the store is being written.
+    /// Copies part of an image from `offset` on, a multiple of [`PART`], and returns the number of bytes: [`PART`], or
+    /// fewer at the end. `None` if there is no such revision. Waits while the store is being written.
     pub async fn part(&self, number: u32, offset: usize, into: &mut [u8]) -> Option<usize> {
         let _guard = self.readers.lock().await;
         self.part_len.reset();
@@ -214,15 +214,15 @@ impl StoreHandle {
     }
 }
 
-/// The right to make a change.
+/// Permission to make one change.
 pub struct StoreLock<'a> {
     handle: &'a StoreHandle,
-    /// From then on the store task releases the lock.
+    /// The request was sent: the store task releases the lock.
     is_asked: bool,
 }
 
 impl StoreLock<'_> {
-    /// Writes to the buffer of the image.
+    /// Writes to the image buffer.
     pub fn fill(&mut self, offset: usize, bytes: &[u8]) {
         let mut image = self.handle.image.borrow_mut();
         for (place, byte) in image.iter_mut().skip(offset).zip(bytes) {
@@ -230,15 +230,15 @@ impl StoreLock<'_> {
         }
     }
 
-    /// Passes the first bytes of the image to `look`.
+    /// Passes the first `len` bytes of the image buffer to `look`.
     pub fn look<R>(&self, len: usize, look: impl FnOnce(&[u8]) -> R) -> R {
         look(self.handle.image.borrow().get(..len).unwrap_or(&[]))
     }
 
-    /// Asks for a change and waits until it is made, or refused. Returns the number of the revision.
+    /// Sends the request and waits for its result. Returns the number of the revision.
     ///
     /// # Errors
-    /// Why nothing was changed.
+    /// The request was refused or failed; nothing has changed.
     pub async fn request(mut self, request: StoreRequest) -> Result<u32, Failed> {
         self.handle.done.reset();
         self.is_asked = true;
@@ -255,7 +255,7 @@ impl Drop for StoreLock<'_> {
     }
 }
 
-/// A text that is cut where it is full.
+/// Writes text and truncates it at the capacity.
 struct Cut<'a>(&'a mut String<MAX_FAILURE>);
 
 impl core::fmt::Write for Cut<'_> {
