@@ -12,11 +12,11 @@ pub fn ethernet_address(unique: &[u8]) -> [u8; 6] {
     [first & !0b11 | 0b10, b, c, d, e, f]
 }
 
-/// The name that a board has in the network: `rgw-` and the last three bytes of its Ethernet address.
+/// Host name of a board: `rgw-` and the last three bytes of its Ethernet address.
 pub fn host_name(address: [u8; 6]) -> String<NAME> {
     let [.., a, b, c] = address;
     let mut name = String::new();
-    // It has room for all of them.
+    // The capacity suffices.
     let _ = write!(name, "rgw-{a:02x}{b:02x}{c:02x}");
     name
 }

@@ -1,7 +1,7 @@
 //! The newest lines of the log, for a client of the console.
 //!
 //! In: the messages of [`info!`](crate::info) to [`error!`](crate::error), on every board as text. Out: lines, the
-//! oldest first. Bounded: the oldest lines give way, and a message that is too long is cut.
+//! oldest first. Bounded: the oldest lines are dropped and long messages truncated.
 
 use core::cell::RefCell;
 use core::fmt::{self, Write};
@@ -9,10 +9,10 @@ use core::fmt::{self, Write};
 use critical_section::Mutex;
 use heapless::{Deque, String};
 
-/// How bad it is.
+/// Level of a line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Level {
-    /// Normal.
+    /// A normal event.
     Info,
     /// A fault that the firmware handles.
     Warn,
@@ -20,7 +20,7 @@ pub enum Level {
     Error,
 }
 
-/// Bytes that are kept.
+/// Capacity of the journal in bytes.
 pub const CAPACITY: usize = 4096;
 /// Maximum length of a line in bytes, with its end.
 pub const MAX_LINE: usize = 192;
@@ -34,7 +34,7 @@ struct Ring {
 
 static RING: Mutex<RefCell<Ring>> = Mutex::new(RefCell::new(Ring { bytes: Deque::new(), dropped: 0 }));
 
-/// Keeps a line. Not from an interrupt that is not to be held up.
+/// Appends a line. Takes a critical section; not for interrupts with tight deadlines.
 #[inline(never)]
 pub fn note(level: Level, message: fmt::Arguments<'_>) {
     let mut line = LineBuffer(String::new());
@@ -45,7 +45,7 @@ pub fn note(level: Level, message: fmt::Arguments<'_>) {
         Level::Warn => "WARN ",
         Level::Error => "ERROR",
     };
-    // What there is no room for is cut.
+    // Truncated to the capacity.
     let _ = write!(line, "{seconds:5}.{rest:06} {level} {message}");
     critical_section::with(|cs| {
         let mut ring = RING.borrow_ref_mut(cs);
@@ -53,13 +53,13 @@ pub fn note(level: Level, message: fmt::Arguments<'_>) {
     });
 }
 
-/// The place of the last `lines` lines.
+/// Position of the last `lines` lines.
 pub fn last(lines: usize) -> u32 {
     critical_section::with(|cs| RING.borrow_ref(cs).last(lines))
 }
 
-/// Copies bytes from a place on, as far as there is room, and returns their number and the place behind them. What was
-/// dropped meanwhile is left out.
+/// Copies bytes from a position on into `out` and returns their number and the position behind them. Bytes that were
+/// dropped meanwhile are skipped.
 pub fn read(from: u32, into: &mut [u8]) -> (usize, u32) {
     critical_section::with(|cs| RING.borrow_ref(cs).read(from, into))
 }
@@ -76,7 +76,7 @@ impl Ring {
             }
         }
         for &byte in line {
-            // A line end in a message would look like two messages.
+            // A line break in a message would look like two messages.
             let _ = self.bytes.push_back(if byte < b' ' { b' ' } else { byte });
         }
         let _ = self.bytes.push_back(b'\n');
@@ -94,7 +94,7 @@ impl Ring {
     }
 
     fn read(&self, from: u32, into: &mut [u8]) -> (usize, u32) {
-        // Behind what was dropped; more than the ring is a place before it.
+        // A distance above the ring's length is a dropped position.
         let skipped = from.wrapping_sub(self.dropped);
         let skipped = if skipped as usize > CAPACITY { 0 } else { skipped };
         let mut count = 0_usize;
@@ -106,7 +106,7 @@ impl Ring {
     }
 }
 
-/// A line that is cut where it is full.
+/// A line, truncated at its capacity.
 struct LineBuffer(String<{ MAX_LINE - 1 }>);
 
 impl Write for LineBuffer {
@@ -128,7 +128,7 @@ mod tests {
         Ring { bytes: Deque::new(), dropped: 0 }
     }
 
-    /// All from a place on, in pieces.
+    /// Reads everything from a position on, in pieces.
     fn all<const N: usize>(ring: &Ring, mut from: u32) -> Text {
         let mut text = Text::new();
         loop {

@@ -16,7 +16,7 @@ use crate::drivers::line::Line;
 use crate::stored::{Places, StoreFlash};
 use crate::update::Site;
 
-/// Numbers of field ports that a board has.
+/// Numbers of field ports of a board.
 #[derive(Debug, Clone, Copy)]
 pub struct Ports {
     /// RS-485 lines.
@@ -28,11 +28,11 @@ pub struct Ports {
 /// A configuration has more ports than the board.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct NoDevice {
-    /// The first port that there is none for, from 0.
+    /// Index of the first port without a device, from 0.
     pub port: u8,
-    /// Its bus.
+    /// Bus of the port.
     pub bus: &'static str,
-    /// How many of them the board has.
+    /// Number of ports of this bus on the board.
     pub available: usize,
 }
 
@@ -44,10 +44,10 @@ impl Display for NoDevice {
 }
 
 impl Ports {
-    /// Whether a board with these has one for each of the configuration's ports.
+    /// Checks that there is a device for each of the configuration's ports.
     ///
     /// # Errors
-    /// The first that it has none for.
+    /// The first port without a device.
     pub fn have<'c>(self, wanted: impl Iterator<Item = &'c Bus>) -> Result<(), NoDevice> {
         let (mut lines, mut buses) = (self.lines, self.buses);
         for (port, bus) in (0..).zip(wanted) {
@@ -68,7 +68,7 @@ impl Ports {
 /// are called during the start, before any device is used; `ethernet` is called last, so that the field buses
 /// run without a PHY.
 pub trait Board {
-    /// Its name, as updates of its firmware have it.
+    /// Name of the board in firmware headers.
     const NAME: &'static str;
     /// Number of RS-485 lines, assigned to the configuration's ports in order.
     const SERIAL_PORTS: usize;
@@ -99,15 +99,15 @@ pub trait Board {
     /// Why there is no Ethernet.
     type EthernetError: Debug + Display + Copy;
 
-    /// The configuration image that was put on the board from outside, and is taken over into the store; bytes
-    /// after it are ignored.
+    /// The configuration image written to the board by a probe or a file, which is adopted into the store. Trailing
+    /// bytes are ignored.
     ///
     /// # Errors
-    /// There is none, or it cannot be read. What the store holds then runs.
+    /// There is none, or it cannot be read. A configuration from the store then runs.
     fn configuration(&mut self) -> Result<&'static [u8], Self::StorageError>;
 
-    /// The flash of the store (docs/store.md); called once. `None` if the board has none: it keeps nothing, and
-    /// runs the image above.
+    /// The flash of the store (docs/store.md); called once. `None` if the board has none: it then only runs the image
+    /// above.
     fn flash(&mut self) -> Option<Places<Self::Flash>>;
 
     /// The slots of the firmware (docs/update.md); called once.
@@ -127,7 +127,7 @@ pub trait Board {
     /// The Ethernet controller.
     ///
     /// # Errors
-    /// It does not work. The field buses then run without a controller.
+    /// It does not work. The field ports then run without a controller.
     fn ethernet(&mut self) -> Result<Self::Ethernet, Self::EthernetError>;
 
     /// The watchdog; called once, before all others.
@@ -139,8 +139,8 @@ pub trait Board {
     /// A seed for local port numbers, different at each start.
     fn seed(&mut self) -> u64;
 
-    /// Random bytes that nobody can guess, for the console's nonces; `None` if the board cannot make them, and then it
-    /// has no console. Neither the clock nor the chip's number is a source of them.
+    /// Unpredictable random bytes for the console's nonces; `None` if the board has no source, and then no console. The
+    /// clock and the chip's serial number are no such sources.
     fn random(&mut self) -> Option<[u8; 32]>;
 
     /// The button; called once.
@@ -158,7 +158,7 @@ pub trait FeedWatchdog {
 
 /// A button.
 pub trait Button {
-    /// Whether it is pressed at the moment. Asked twenty times a second.
+    /// Whether it is pressed now. Polled twenty times a second.
     fn is_pressed(&mut self) -> bool;
 }
 

@@ -49,9 +49,8 @@ const CAN_PORTS: usize = <Board as platform::Board>::CAN_PORTS;
 const PORTS: Ports = Ports { lines: SERIAL_PORTS, buses: CAN_PORTS };
 const WATCHDOG_PERIOD: Duration = <Board as platform::Board>::WATCHDOG_PERIOD;
 
-/// Starts the tasks of the configuration, and returns what a board needs to start tasks of its own.
-/// Without a configuration that can run, the buses stay silent and the log says why; the console is there all the
-/// same, to give the board another one.
+/// Starts the tasks of the configuration, and returns what a board needs to start tasks of its own. Without a
+/// configuration that can run, the buses stay silent and the log says why; the console still accepts another one.
 pub(crate) fn start(spawner: Spawner, mut board: Board) -> Tasks {
     info!("recipe gateway {}", env!("CARGO_PKG_VERSION"));
     let mut led = board.led();
@@ -60,7 +59,7 @@ pub(crate) fn start(spawner: Spawner, mut board: Board) -> Tasks {
     let tasks = Tasks { spawner, watch: WATCH.init_with(Watch::new) };
     // First of all, so that the watchdog resets the board if anything later hangs.
     spawner.spawn(feeder(tasks.watch, board.watchdog()).expect("it is spawned once"));
-    // Both are all zeros, so they take no flash, and are not built on the stack.
+    // Both are all zeros: placed in .bss, not built on the stack.
     static GATEWAY: ConstStaticCell<Gateway> = ConstStaticCell::new(Gateway::idle());
     static OVERLAY: ConstStaticCell<Overlay> = ConstStaticCell::new(Overlay::ZEROED);
     let (gateway, overlay) = (GATEWAY.take(), OVERLAY.take());
@@ -94,7 +93,7 @@ pub(crate) fn start(spawner: Spawner, mut board: Board) -> Tasks {
     tasks
 }
 
-/// Reads the store; `None` if the board has none, or none that this program may use.
+/// Reads the store; `None` if there is none, or if a newer program wrote it.
 #[inline(never)]
 fn open_store(board: &mut Board) -> Option<&'static mut StoredConfig<Flash>> {
     static STORED: StaticCell<StoredConfig<Flash>> = StaticCell::new();
@@ -110,7 +109,7 @@ struct EdgeSetup {
     seed: u64,
 }
 
-/// Makes the edge node of what runs, while its configuration is there.
+/// Creates the edge node for the running configuration, which is in memory only during the start.
 #[inline(never)]
 fn make_edge(
     stored: Option<&mut StoredConfig<Flash>>,
@@ -173,7 +172,7 @@ fn start_store_task(
     Some(store)
 }
 
-/// Starts tasks. All tasks are started through it, so the watchdog knows all of them.
+/// Starts tasks and registers them with the watchdog.
 #[derive(Clone, Copy)]
 pub(crate) struct Tasks {
     spawner: Spawner,
@@ -362,7 +361,7 @@ fn start_console(
     Some(console)
 }
 
-/// Not inlined, so that its stack frame is free when links and console are started.
+/// Not inlined, to free its stack frame before links and console are started.
 #[inline(never)]
 fn network_stack(
     ethernet: Fair<'static, Ethernet>,
@@ -386,7 +385,7 @@ fn network_config(own: Option<Network>, name: &str) -> Config {
     })
 }
 
-/// The only task that is not watched.
+/// The only task without a pulse.
 #[embassy_executor::task]
 async fn feeder(watch: &'static Watch, mut dog: Watchdog) -> ! {
     watchdog::run(watch, WATCHDOG_PERIOD, || dog.feed()).await
@@ -427,12 +426,12 @@ async fn controller_link(
 
 #[embassy_executor::task]
 async fn network(pulse: &'static Pulse, mut runner: Runner<'static, Fair<'static, Ethernet>>) -> ! {
-    // The stack's own waits cannot be wrapped: that it is polled and returns is all that is checked.
+    // The stack's own waits cannot be wrapped; the check is only that polling it returns.
     let mut running = pin!(runner.run());
     pulse.run(pin!(pulse.idle(running.as_mut()))).await
 }
 
-/// What the LED shows.
+/// Sources of the LED's condition.
 #[derive(Clone, Copy)]
 struct LedSources {
     /// `None` if nothing runs, or there is no Ethernet.
@@ -464,7 +463,7 @@ async fn watch_button(pulse: &'static Pulse, console: &'static Console, button: 
     pulse.run(pin!(console.watch(pulse, button))).await
 }
 
-/// Tells a broker what the gateway knows.
+/// Publishes the state of the gateway to a broker.
 #[embassy_executor::task]
 async fn edge_node(
     pulse: &'static Pulse,
@@ -477,7 +476,7 @@ async fn edge_node(
     pulse.run(pin!(node.run(gateway, pulse, stack, store, view.edge, view.clock))).await
 }
 
-/// Asks a server for UTC.
+/// Queries a server for UTC.
 #[embassy_executor::task]
 async fn time_server(
     pulse: &'static Pulse,
@@ -513,7 +512,7 @@ async fn status(pulse: &'static Pulse, gateway: &'static Gateway) -> ! {
     pulse.run(pin!(firmware::tasks::status::run(gateway, pulse))).await
 }
 
-/// Changes the store while a configuration runs, and restarts the board for another one.
+/// Runs the store task, and resets the board when it ends.
 #[embassy_executor::task]
 async fn store_task(
     pulse: &'static Pulse,
@@ -527,7 +526,7 @@ async fn store_task(
     cortex_m::peripheral::SCB::sys_reset()
 }
 
-/// Logs the reason repeatedly, because the log may be read late.
+/// Logs the reason repeatedly: a reader of the log may come late.
 #[embassy_executor::task]
 async fn refused(pulse: &'static Pulse, reason: CannotRun) -> ! {
     let what = if matches!(reason, CannotRun::Ethernet(_)) { "no controller" } else { "nothing runs" };

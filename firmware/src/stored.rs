@@ -1,8 +1,7 @@
-//! The configuration that runs after a start, from the store (docs/store.md).
+//! Configurations stored on the board, and which one runs after a start (docs/store.md).
 //!
-//! In: the store's flash, and the image that a probe or a file left outside the store. Out: the images to be
-//! tried, in their order. What is written on the way is finished before anything runs, so a start that is cut
-//! short is repeated, and changes nothing twice.
+//! In: the store's flash, and an image from outside the store. Out: the images to try, in order. All writes are
+//! complete before anything runs, and each is idempotent: an interrupted start is repeated.
 
 use core::fmt;
 
@@ -15,9 +14,9 @@ use recipe_store::{
     Role, Side, SlotMarks, Store, Trial, WORD, newest,
 };
 
-/// Flash that hands out the bytes of a record.
+/// Flash that can lend the bytes of a record.
 pub trait StoreFlash: Flash {
-    /// The data of a record; `None` if they are no longer there.
+    /// The data of a record; `None` if it has been replaced.
     fn bytes(&mut self, found: Found) -> Option<&[u8]>;
 }
 
@@ -28,7 +27,7 @@ pub struct Places<F> {
     pub first: F,
     /// The second one, if the board has slots for its firmware.
     pub second: Option<F>,
-    /// The one in the bank that the program does not run from.
+    /// The place in the bank that the program does not run from.
     pub own: Side,
 }
 
@@ -43,13 +42,13 @@ impl<F> Places<F> {
 #[derive(Debug)]
 pub struct StoredConfig<F> {
     store: Store,
-    /// Where it is.
+    /// Flash of the store.
     flash: F,
-    /// The place for it, if it is in the wrong one.
+    /// Target of a move, if the store is in the wrong bank.
     to: Option<F>,
 }
 
-/// Why a configuration of the store is run, for the log.
+/// Text of a [`Role`] in the log.
 #[derive(Debug, Clone, Copy)]
 pub struct RoleName(pub Role);
 
@@ -63,7 +62,7 @@ impl fmt::Display for RoleName {
     }
 }
 
-/// How a trial ended, for the log.
+/// Text of an [`Ended`] in the log.
 #[derive(Debug, Clone, Copy)]
 pub struct EndedName(pub Ended);
 
@@ -82,7 +81,7 @@ impl<F: StoreFlash> StoredConfig<F> {
     /// Reads the flash.
     ///
     /// # Errors
-    /// There can be no store in it.
+    /// The flash is unsuitable, or a newer program wrote it.
     pub fn open(places: Places<F>) -> Result<Self, MountError> {
         let Places { first, second, own } = places;
         let Some(second) = second else {
@@ -96,16 +95,15 @@ impl<F: StoreFlash> StoredConfig<F> {
         Ok(Self { store, flash, to: (may_move && side != own).then_some(to) })
     }
 
-    /// Whether it is in the bank that the program runs from: while a sector of it is erased the program would stand
-    /// still.
+    /// Whether the store is in the bank that the program runs from, where erasing a sector would stall the program.
     pub fn is_to_be_moved(&self) -> bool {
         self.to.is_some()
     }
 
-    /// Moves it into its own place, once.
+    /// Moves the store to its own bank; does nothing if it is there.
     ///
     /// # Errors
-    /// It stays where it was.
+    /// The store stays where it was.
     pub async fn move_home(&mut self) -> Result<(), PutError> {
         let Some(mut to) = self.to.take() else { return Ok(()) };
         self.store = self.store.relocate().execute(&self.flash, &mut to).await?;
@@ -113,15 +111,15 @@ impl<F: StoreFlash> StoredConfig<F> {
         Ok(())
     }
 
-    /// Which slots of the firmware are good and on trial.
+    /// Marks of the firmware slots.
     pub fn slots(&self) -> SlotMarks {
         self.store.slots()
     }
 
-    /// Marks slots of the firmware.
+    /// Writes the marks of the firmware slots.
     ///
     /// # Errors
-    /// The marks cannot be written; those before count.
+    /// They cannot be written; the previous marks remain valid.
     pub async fn mark_slots(&mut self, marks: SlotMarks) -> Result<(), KeepError> {
         Ok(self.store.mark_slots(marks)?.execute(&mut self.flash).await?)
     }
@@ -145,18 +143,18 @@ impl<F: StoreFlash> StoredConfig<F> {
         range
     }
 
-    /// What is kept.
+    /// The mounted store.
     pub fn store(&self) -> &Store {
         &self.store
     }
 
-    /// Makes an image from outside the store the live one, once. Returns whether it did.
+    /// Adopts an image from outside the store as the live one, once. Returns whether it did.
     ///
     /// # Errors
-    /// It cannot be written; what was live before still is.
+    /// It cannot be written; the live configuration is unchanged.
     pub async fn adopt(&mut self, digest: u32, image: &[u8]) -> Result<bool, KeepError> {
         let mut is_new = false;
-        // An image, its mark, a note: each once. Before that, room for the image.
+        // Three writes: image, marks, note. Each may have to make room first.
         for _ in 0..4 + MAX_REVISIONS {
             match self.store.adopt(digest, image) {
                 Ok(Adoption::Write(put)) => put.execute(&mut self.flash).await?,
@@ -171,11 +169,11 @@ impl<F: StoreFlash> StoredConfig<F> {
         Ok(is_new)
     }
 
-    /// The configurations to be tried, in this order. A start of the one on trial is counted before it runs: what
-    /// crashes has no endless trials. If it cannot be counted, it is not tried.
+    /// The configurations to try, in order. A start of a trial is counted before it runs, to bound crashes; if it
+    /// cannot be counted, the trial is not run.
     ///
     /// # Errors
-    /// It could not be counted. The others are in `candidates` all the same.
+    /// The start could not be counted. `candidates` then has only the others.
     pub async fn candidates(&mut self, candidates: &mut Vec<(Revision, Role), 3>) -> Result<(), KeepError> {
         let start = self.store.at_start();
         *candidates = start.candidates;
@@ -190,7 +188,7 @@ impl<F: StoreFlash> StoredConfig<F> {
     /// Puts a configuration on trial: the next start runs it.
     ///
     /// # Errors
-    /// It cannot be written; the next start runs what is live.
+    /// It cannot be written; the next start runs the live configuration.
     pub async fn begin_trial(&mut self, number: u32, confirm_s: u16) -> Result<(), KeepError> {
         let trial = Some(Trial { number, attempts: STARTS, confirm_s });
         self.mark(Marks { trial, ..self.store.marks() }).await
@@ -199,25 +197,25 @@ impl<F: StoreFlash> StoredConfig<F> {
     /// Ends the trial: the next start runs the live one.
     ///
     /// # Errors
-    /// It cannot be written. The starts of a trial are counted, so it ends nevertheless.
+    /// It cannot be written. Starts of a trial are counted, so it ends nevertheless.
     pub async fn end_trial(&mut self, ended: Ended) -> Result<(), KeepError> {
         let marks = self.store.marks();
         let last = marks.trial.map(|trial| (trial.number, ended)).or(marks.last);
         self.mark(Marks { trial: None, last, ..marks }).await
     }
 
-    /// Makes a configuration the live one, and another the one before it. A trial ends with that.
+    /// Marks a configuration as live and another as the previous one. Confirms a trial.
     ///
     /// # Errors
-    /// It cannot be written; what was live before still is.
+    /// It cannot be written; the live configuration is unchanged.
     pub async fn make_live(&mut self, live: u32, previous: Option<u32>) -> Result<(), KeepError> {
         let marks = self.store.marks();
         let last = marks.trial.map(|trial| (trial.number, Ended::Confirmed)).or(marks.last);
         self.mark(Marks { live: Some(live), previous, trial: None, last }).await
     }
 
-    /// Keeps a configuration, in the place of `forget` or in a free one. If there is no room beside the others, the
-    /// oldest ones that no mark names are forgotten.
+    /// Stores a configuration in the place of `forget` or in a free one. If the store is full, the oldest unmarked ones
+    /// are forgotten.
     ///
     /// # Errors
     /// It cannot be written.
@@ -229,7 +227,7 @@ impl<F: StoreFlash> StoredConfig<F> {
         forget: Option<u32>,
     ) -> Result<(), KeepError> {
         let marks = self.store.marks();
-        // The mark names its place, where another one will be.
+        // The mark refers to the place, which gets another configuration.
         if forget.is_some() && marks.last.map(|(number, _)| number) == forget {
             self.mark(Marks { last: None, ..marks }).await?;
         }
@@ -243,7 +241,7 @@ impl<F: StoreFlash> StoredConfig<F> {
         Ok(self.store.keep(number, digest, image, None)?.execute(&mut self.flash).await?)
     }
 
-    /// Forgets a configuration, if the store is full: this one, or the oldest that may be.
+    /// Forgets `forget` or the oldest unmarked configuration, if `why` is that the store is full.
     async fn make_room(&mut self, why: KeepError, forget: Option<u32>) -> Result<(), KeepError> {
         if !matches!(why, KeepError::Put(PutError::Full { .. })) {
             return Err(why);
@@ -252,12 +250,12 @@ impl<F: StoreFlash> StoredConfig<F> {
         Ok(put.execute(&mut self.flash).await?)
     }
 
-    /// The key of the API.
+    /// The access key of the API.
     pub fn access_key(&self) -> Option<[u8; 16]> {
         self.store.access_key(&self.flash)
     }
 
-    /// Keeps the key of the API.
+    /// Stores the access key of the API.
     ///
     /// # Errors
     /// It cannot be written.
@@ -265,17 +263,17 @@ impl<F: StoreFlash> StoredConfig<F> {
         Ok(self.store.set_access_key(key)?.execute(&mut self.flash).await?)
     }
 
-    /// Reads the settings of the edge node into `document`. Returns whether it tells; `None` if there are none.
+    /// Decodes the settings of the edge node into `document`. Returns whether they enable publishing; `None` if there
+    /// are none.
     pub fn edge(&mut self, document: &mut Document) -> Option<Result<bool, DocumentError>> {
         let bytes = self.flash.bytes(self.store.edge()?)?;
         Some(document.decode(bytes))
     }
 
-    /// Keeps the settings of the edge node. If there is no room, the oldest configurations that no mark names are
-    /// forgotten.
+    /// Stores the settings of the edge node. If the store is full, the oldest unmarked configurations are forgotten.
     ///
     /// # Errors
-    /// They cannot be written; those before are kept.
+    /// They cannot be written; the previous settings remain.
     pub async fn set_edge(&mut self, settings: &[u8]) -> Result<(), KeepError> {
         for _ in 0..MAX_REVISIONS {
             match self.store.set_edge(settings) {
@@ -286,7 +284,7 @@ impl<F: StoreFlash> StoredConfig<F> {
         Ok(self.store.set_edge(settings)?.execute(&mut self.flash).await?)
     }
 
-    /// Keeps the number of the edge node's session.
+    /// Stores the bdSeq of the edge node's session.
     ///
     /// # Errors
     /// It cannot be written.
@@ -298,8 +296,8 @@ impl<F: StoreFlash> StoredConfig<F> {
         Ok(self.store.mark(marks)?.execute(&mut self.flash).await?)
     }
 
-    /// Bytes of an image from `offset` on, which is a multiple of [`WORD`]: as many as there are and as `out` has
-    /// room for. `None` if the configuration is not kept.
+    /// Reads bytes of an image from `offset` on, a multiple of [`WORD`], into `out`. `None` if there is no such
+    /// configuration.
     pub fn image_part<'o>(&self, number: u32, offset: usize, out: &'o mut [u8]) -> Option<&'o [u8]> {
         let found = self.store.find(self.store.revision(number)?.key())?;
         let len = found.len.saturating_sub(offset).min(out.len());
@@ -324,10 +322,10 @@ pub fn image_version(head: &[u8]) -> Option<u32> {
     head.get(image::MAGIC.len()..)?.first_chunk().map(|version| u32::from_le_bytes(*version))
 }
 
-/// Starts that a trial has: one, and two more after power cuts.
+/// Starts of a trial: one, and two more after power cuts.
 const STARTS: u8 = 3;
 
-/// How long a trial lasts.
+/// Duration of a trial.
 pub fn trial_time(role: Role) -> Option<Duration> {
     match role {
         Role::Trial { confirm_s } => Some(Duration::from_secs(confirm_s.into())),

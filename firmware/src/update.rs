@@ -1,7 +1,7 @@
-//! The firmware of this board: what is received into the free slot, and the one on trial (docs/update.md).
+//! Firmware updates: receiving into the free slot, and trials (docs/update.md).
 //!
-//! In: pieces of a firmware, marks, how well the cell does. Out: what is written into the free slot, why something is
-//! refused, and when a trial is confirmed. What may be taken is decided in `recipe-update`; who may ask, by the console.
+//! In: pieces of a firmware, marks, the number of links and ports that work. Out: writes to the free slot, refusals,
+//! and when a trial is confirmed. `recipe-update` decides what may be installed, the console who may ask.
 
 use core::fmt;
 
@@ -14,12 +14,12 @@ use recipe_update::{
     ReceiveError, ReceiveStep, Running, Slot, SlotFlash, Version, header_of,
 };
 
-/// What a board says of its slots.
+/// Slots of a board.
 #[derive(Debug)]
 pub struct Site<S> {
-    /// The board's name, as updates have it.
+    /// Name of the board in firmware headers.
     pub board: &'static str,
-    /// The slot that the program runs in, and what belongs to it; or why it takes no update.
+    /// The slots; or why the firmware cannot be updated.
     pub slots: Result<Slots<S>, &'static str>,
 }
 
@@ -30,48 +30,48 @@ pub struct Slots<S> {
     pub running: Slot,
     /// The public key of the loader.
     pub key: [u8; 32],
-    /// The flash of that slot: only read.
+    /// Flash of the running slot; only read.
     pub own: S,
-    /// The flash of the other slot.
+    /// Flash of the other slot.
     pub free: S,
 }
 
 /// Why a request about the firmware is refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum UpdateError {
-    /// This firmware takes no update.
+    /// This firmware cannot be updated.
     Cannot(&'static str),
-    /// What was sent is no header.
+    /// Invalid header.
     Header(HeaderError),
-    /// The header has to come alone.
+    /// The piece at offset 0 is not exactly the header.
     Alone,
-    /// It may not be taken.
+    /// The firmware may not be installed.
     Rule(recipe_update::Refused),
     /// The piece is not the next one.
     Gap {
-        /// Where the next one begins, counted from the beginning of the header.
+        /// Offset of the next piece from the beginning of the header, in bytes.
         expected: u32,
     },
     /// No header was sent.
     NoHeader,
     /// The slot is being erased, or its contents are being checked.
     Busy,
-    /// It could not be received.
+    /// Receiving failed.
     Failed(ReceiveError),
-    /// Nothing is ready to be tried.
+    /// No complete firmware is in the free slot.
     NotReady,
     /// Nothing is on trial.
     NotOnTrial,
-    /// It was signed with another key.
+    /// The firmware was signed with another key.
     Foreign,
     /// A configuration is on trial, or is being stored.
     Unsettled,
-    /// The firmware before the one on trial would not read this configuration.
+    /// The firmware before the one on trial cannot read configurations of this version.
     Format(u32),
 }
 
 impl UpdateError {
-    /// Whether what was sent is wrong, and not only the moment.
+    /// Whether the request itself is wrong, not only its moment.
     pub fn is_wrong(&self) -> bool {
         match self {
             Self::Rule(recipe_update::Refused::OnTrial | recipe_update::Refused::NotGood) => false,
@@ -104,46 +104,46 @@ impl fmt::Display for UpdateError {
     }
 }
 
-/// How far a firmware has come.
+/// Progress of receiving a firmware.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum UpdateStage {
     /// The slot is being erased.
     Erasing,
-    /// The next piece is awaited.
+    /// Waiting for the next piece.
     Receiving,
     /// The hash is being computed.
     Checking,
-    /// It is whole.
+    /// The firmware is complete.
     Ready,
-    /// It is not, and why.
+    /// Receiving failed.
     Failed(ReceiveError),
 }
 
-/// What is being received, or was.
+/// The firmware being received, or received last.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Incoming {
-    /// What it is.
+    /// Header of the firmware.
     pub header: Header,
-    /// How far it has come.
+    /// Progress.
     pub stage: UpdateStage,
-    /// Where the next piece begins, counted from the beginning of the header.
+    /// Offset of the next piece from the beginning of the header, in bytes.
     pub received: u32,
 }
 
-/// The update of this board.
+/// State of firmware updates.
 #[derive(Debug)]
 pub struct Updates<S> {
     board: BoardName,
     slots: Result<Slots<S>, &'static str>,
     receive: Option<Receive>,
     incoming: Option<Incoming>,
-    /// What the other slot holds, whole.
+    /// Header of the complete firmware in the other slot.
     other: Option<Header>,
     build: Option<Build>,
 }
 
 impl<S: SlotFlash> Updates<S> {
-    /// Nothing is being received; the other slot is looked at. `None` if the board's name is none.
+    /// Reads the headers of both slots. `None` if the name of the board is invalid.
     pub fn new(site: Site<S>) -> Option<Self> {
         let board = BoardName::parse(site.board)?;
         let slots = site.slots;
@@ -176,22 +176,22 @@ impl<S: SlotFlash> Updates<S> {
         self.slots.as_ref().ok().map(|slots| slots.key)
     }
 
-    /// Why this firmware takes no update.
+    /// Why this firmware cannot be updated.
     pub fn cannot(&self) -> Option<&'static str> {
         self.slots.as_ref().err().copied()
     }
 
-    /// Which build runs; `None` if its slot has no header.
+    /// Build of the running firmware; `None` if its slot has no header.
     pub fn build(&self) -> Option<Build> {
         self.build
     }
 
-    /// What is being received, or was.
+    /// The firmware being received, or received last.
     pub fn incoming(&self) -> Option<Incoming> {
         self.incoming
     }
 
-    /// What the other slot holds, whole.
+    /// Header of the complete firmware in the other slot.
     pub fn other(&self) -> Option<&Header> {
         self.other.as_ref()
     }
@@ -201,11 +201,11 @@ impl<S: SlotFlash> Updates<S> {
         Ok(Running { board: self.board, slot, version: VERSION, kept })
     }
 
-    /// Takes a piece. With `offset` 0 it is the header; that of what is being received, or is whole in its slot, changes
-    /// nothing.
+    /// Accepts a piece. At `offset` 0 it is the header; the header of the firmware that is being received, or is
+    /// complete in its slot, changes nothing.
     ///
     /// # Errors
-    /// Why it is not taken.
+    /// See [`UpdateError`].
     pub async fn take(
         &mut self,
         offset: u32,
@@ -278,7 +278,7 @@ impl<S: SlotFlash> Updates<S> {
                     incoming.stage = UpdateStage::Checking;
                     break;
                 }
-                // A short one is checked at once.
+                // A short firmware is checked at once.
                 ReceiveStep::End(Ok(())) => {
                     incoming.stage = UpdateStage::Ready;
                     self.receive = None;
@@ -303,14 +303,14 @@ impl<S: SlotFlash> Updates<S> {
             .is_some_and(|incoming| matches!(incoming.stage, UpdateStage::Erasing | UpdateStage::Checking))
     }
 
-    /// Erases a sector, or looks at some KiB of what was received.
+    /// Does one step: erases a sector, or checks some KiB of the received image.
     pub async fn work(&mut self) {
         let (Ok(slots), Some(receive), Some(incoming)) =
             (&mut self.slots, &mut self.receive, &mut self.incoming)
         else {
             return;
         };
-        // What the slot held is gone from here on.
+        // The slot's former contents are invalid from here on.
         self.other = None;
         match receive.next(&slots.free) {
             ReceiveStep::Erase(sector) => slots.free.erase(sector).await,
@@ -332,7 +332,7 @@ impl<S: SlotFlash> Updates<S> {
     /// The firmware that may be put on trial.
     ///
     /// # Errors
-    /// There is none, or it may not be taken.
+    /// There is none, or it may not be installed.
     pub fn ready(
         &self,
         kept: Option<(u32, u32)>,
@@ -346,10 +346,10 @@ impl<S: SlotFlash> Updates<S> {
         Ok(header)
     }
 
-    /// Checks a signature: some million instructions in one stretch, so nothing may wait for the board.
+    /// Checks a signature. Blocks all tasks for some million instructions.
     ///
     /// # Errors
-    /// It was made with another key than the loader's.
+    /// It was not made with the loader's key.
     #[inline(never)]
     pub fn verify(&self, header: &Header) -> Result<(), UpdateError> {
         let slots = self.slots.as_ref().map_err(|why| UpdateError::Cannot(why))?;
@@ -357,10 +357,10 @@ impl<S: SlotFlash> Updates<S> {
         header.verify(&key).map_err(|_| UpdateError::Foreign)
     }
 
-    /// Whether a configuration of this version may be kept.
+    /// Checks that a configuration of this version may be stored.
     ///
     /// # Errors
-    /// The last failure, if there is no session.
+    /// The firmware to fall back to cannot read it.
     pub fn may_keep(&self, version: u32, marks: SlotMarks) -> Result<(), UpdateError> {
         let before = self.other.map(|header| header.parts().formats);
         match recipe_update::may_keep(version, &FORMATS, before.as_ref(), marks) {
@@ -370,10 +370,10 @@ impl<S: SlotFlash> Updates<S> {
     }
 }
 
-/// The first bytes of the SHA-512 of an image. They tell builds of one version apart.
+/// First bytes of the image's SHA-512; distinguishes builds of one version.
 pub type Build = [u8; 8];
 
-/// The build that this header is of.
+/// The build of a header.
 pub fn build_of(header: &Header) -> Build {
     header.hash().first_chunk().copied().unwrap_or_default()
 }
@@ -383,7 +383,7 @@ pub fn whole_length(header: &Header) -> u32 {
     header.length().saturating_add(HEADER as u32)
 }
 
-/// How much of a cell works: so many links to the controller, and so many field ports.
+/// Number of links to the controller and of field ports that work.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Works {
     /// Links that are up.
@@ -393,12 +393,12 @@ pub struct Works {
 }
 
 impl Works {
-    /// As the mark of a trial keeps it: at most 15 of each.
+    /// Encodes the counts for the mark of a trial, each limited to 15.
     pub fn code(self) -> u8 {
         self.links.min(15) << 4 | self.ports.min(15)
     }
 
-    /// Of such a mark.
+    /// Decodes the counts of such a mark.
     pub fn of_code(code: u8) -> Self {
         Self { links: code >> 4, ports: code & 15 }
     }
@@ -411,14 +411,14 @@ pub enum WaitsFor {
     Controller,
     /// As many working ports as before.
     Ports,
-    /// A request that was admitted: a board that nobody can reach cannot be updated again.
+    /// An admitted request: an unreachable board could not be updated again.
     Request,
-    /// That all of it lasts.
+    /// All conditions to hold for [`LASTS`].
     Time,
 }
 
 impl WaitsFor {
-    /// As documents have it.
+    /// Name in JSON documents.
     pub fn name(self) -> &'static str {
         match self {
             Self::Controller => "controller",
@@ -429,7 +429,7 @@ impl WaitsFor {
     }
 }
 
-/// A firmware on trial: it confirms itself once the cell does as well as before.
+/// Trial of a firmware, which confirms itself once as many links and ports work as before.
 #[derive(Debug, Clone, Copy)]
 pub struct FirmwareTrial {
     until: Instant,
@@ -437,29 +437,29 @@ pub struct FirmwareTrial {
     well_since: Option<Instant>,
 }
 
-/// What comes of a look at a trial.
+/// Result of checking a trial.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Verdict {
     /// The trial goes on.
     Waits(WaitsFor),
-    /// It is to be confirmed.
+    /// All conditions have held long enough: confirm.
     Confirmed,
-    /// Its time is over.
+    /// The trial has expired.
     Over,
 }
 
 impl FirmwareTrial {
-    /// From now on, for this long.
+    /// Starts a trial of `confirm_s` seconds.
     pub fn new(now: Instant, confirm_s: u16, before: Works) -> Self {
         Self { until: now + Duration::from_secs(confirm_s.into()), before, well_since: None }
     }
 
-    /// When its time is over.
+    /// When the trial expires.
     pub fn until(&self) -> Instant {
         self.until
     }
 
-    /// Looks at it; called again within a second.
+    /// Checks the trial; to be called at least once a second.
     pub fn look(&mut self, now: Instant, works: Works, is_reached: bool) -> Verdict {
         let missing = if works.links < self.before.links {
             Some(WaitsFor::Controller)
@@ -498,12 +498,12 @@ const fn number(digits: &str) -> u16 {
     }
 }
 
-/// The configurations that it reads and writes.
+/// Configuration versions that this firmware reads and writes.
 pub const FORMATS: Formats =
     Formats { oldest: image::OLDEST_VERSION, newest: image::VERSION, written: image::VERSION };
-/// How long all has to be well until a trial is confirmed.
+/// How long all conditions must hold before a trial is confirmed.
 pub const LASTS: Duration = Duration::from_secs(10);
-/// Words that are written until others run, where writing does not wait.
+/// Words written before yielding, for flash whose writes complete at once.
 const WORDS: u32 = 16;
 
 #[cfg(test)]

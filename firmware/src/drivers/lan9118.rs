@@ -270,7 +270,7 @@ impl RxToken for Received<'_> {
     }
 }
 
-/// Room for one frame.
+/// Buffer for one frame.
 #[derive(Debug)]
 pub struct Transmit<'a, R> {
     regs: &'a R,

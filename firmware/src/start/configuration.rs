@@ -1,4 +1,4 @@
-//! Which configuration runs, and why none does.
+//! Chooses the configuration to run.
 
 use firmware::fmt::Text;
 use firmware::platform::{self, Board as _, NoDevice};
@@ -12,14 +12,14 @@ use recipe_store::Role;
 use super::{Flash, PORTS};
 use crate::board::Board;
 
-/// Why nothing runs.
+/// Why no configuration runs.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum CannotRun {
     Storage(<Board as platform::Board>::StorageError),
     Image(image::ImageError),
     Build(proto_core::engine::BuildError),
     NoDevice(NoDevice),
-    /// The store has no configuration, and the image on the board was taken over and is gone.
+    /// The store has no configuration, and there is no image outside it.
     Empty,
     Ethernet(<Board as platform::Board>::EthernetError),
 }
@@ -37,14 +37,14 @@ impl core::fmt::Display for CannotRun {
     }
 }
 
-/// Runs the first configuration that can run: the image that was put on the board since the last start; of the store
-/// the one on trial, the live one, the one before; or else the image on the board, which was run before. Returns the
-/// length of its image, or why none runs; leaves to the store task what is to be done with the store, and in `failure` why
-/// the first one that was tried does not run.
+/// Configures the gateway with the first configuration that can run: a new image outside the store; then, from the
+/// store, the one on trial, the live one, the previous one; then the image outside the store, although it was adopted
+/// before. Returns the length of the image. `work` gets the writes left to the store task, `failure` why the first
+/// candidate does not run.
 ///
-/// Nothing is written but the start of a trial, so that the start takes no longer than without a store.
+/// Writes only the start of a trial, so that the start takes no longer than without a store.
 ///
-/// Not inlined, so that its stack frame is free when the tasks run.
+/// Not inlined, to free its stack frame before the tasks run.
 #[inline(never)]
 pub(super) fn load(
     board: &mut Board,
@@ -59,7 +59,7 @@ pub(super) fn load(
         let (image, _) = own?;
         return configure(image, gateway, config);
     };
-    // An empty place is no failure where the store has something.
+    // A missing image is no failure if the store has a configuration.
     let mut why = own.err();
     if let Ok((image, digest)) = own
         && !stored.store().is_adopted(digest, image.len())
@@ -76,7 +76,7 @@ pub(super) fn load(
     if let Err(error) = board.block_on(stored.candidates(&mut candidates)) {
         error!("the store: {}", Text(&error));
     }
-    // A trial ends by a restart, whose log is the only one that somebody may look at.
+    // A trial ends by a restart; log its result where it can be read.
     if let Some((number, ended)) = stored.store().marks().last {
         info!("the last trial was of configuration {}: {}", number, Text(&EndedName(ended)));
     }
@@ -93,14 +93,14 @@ pub(super) fn load(
             Err(error) => {
                 error!("configuration {} of the store cannot run: {}", revision.number, Text(&error));
                 work.trial_failed |= matches!(role, Role::Trial { .. });
-                // It says more than an empty place.
+                // More useful than "no image".
                 if core::mem::take(&mut is_first) {
                     (why, *failure) = (Some(error), Some(error));
                 }
             }
         }
     }
-    // Nothing of the store: the image on the board, although it was taken over.
+    // Nothing from the store runs: fall back to the adopted image.
     if let Ok((image, _)) = own
         && let Ok(len) = configure(image, gateway, config)
     {
@@ -109,14 +109,14 @@ pub(super) fn load(
     Err(why.unwrap_or(CannotRun::Empty))
 }
 
-/// The image without what follows it, and its CRC.
+/// The image without trailing bytes, and its CRC.
 fn whole(bytes: &'static [u8]) -> (&'static [u8], u32) {
     let image = image::image_len(bytes).ok().and_then(|len| bytes.get(..len)).unwrap_or(bytes);
     let crc = image.get(image::HEADER - 4..).and_then(|rest| rest.first_chunk());
     (image, crc.map_or(0, |crc| u32::from_le_bytes(*crc)))
 }
 
-/// Runs the configuration of an image; returns the image's length. Not inlined: it is called in several places.
+/// Configures the gateway with an image; returns the image's length. Not inlined: it has several callers.
 #[inline(never)]
 fn configure(bytes: &[u8], gateway: &mut Gateway, config: &mut GatewayConfig) -> Result<usize, CannotRun> {
     decode(bytes, config)?;
@@ -124,7 +124,7 @@ fn configure(bytes: &[u8], gateway: &mut Gateway, config: &mut GatewayConfig) ->
     Ok(bytes.len())
 }
 
-/// Reads an image whose ports this board has. Not inlined, so that its stack frame is free when the engine is built.
+/// Decodes an image and checks its ports. Not inlined, to free its stack frame before the engine is built.
 #[inline(never)]
 fn decode(bytes: &[u8], config: &mut GatewayConfig) -> Result<(), CannotRun> {
     image::decode_into(bytes, config).map_err(CannotRun::Image)?;

@@ -49,7 +49,7 @@ pub enum TaskName {
     Button,
     /// The edge node.
     Edge,
-    /// Asks for UTC.
+    /// Queries a server for UTC.
     Time,
 }
 

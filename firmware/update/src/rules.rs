@@ -93,7 +93,7 @@ impl Running {
     /// Whether an update may be written into the free slot.
     ///
     /// # Errors
-    /// The last failure, if there is no session.
+    /// Why it may not be installed.
     pub fn accepts(
         &self,
         header: &Header,
