@@ -10,22 +10,22 @@
         clippy::arithmetic_side_effects
     )
 )]
-//! What a board keeps over restarts and power cuts: configurations, a key, settings, counters (docs/store.md).
+//! Storage that survives restarts and power cuts: configurations, a key, settings, counters (docs/store.md).
 //!
-//! In: the words of some sectors of flash, and what is to be kept. Out: which words are to be written and which
-//! sectors erased, and what is kept. Knows neither a chip nor what a configuration contains.
+//! In: the words of some sectors of flash, and records to store. Out: words to write and sectors to erase, and the
+//! stored records. Knows neither the chip nor the contents of a configuration.
 //!
 //! Made for flash whose words have an error correction code and are written once after an erase. A power cut
 //! leaves the word that was being written in one of three states: it cannot be read, or it reads as something
 //! between old and new, or it looks blank and takes no write. The store keeps what it had before, or has what
 //! was written, whole, in each of them.
 //!
-//! [`Store::mount`] looks at the flash. What changes it is a [`Put`], a state machine: [`Put::next`] says what
-//! to do with the flash, until it ends. So the same code waits for the flash or lets other tasks run meanwhile:
-//! [`Put::execute`] is the loop for a [`Flash`] with futures.
+//! [`Store::mount`] reads the flash. A [`Put`] changes it, as a state machine: [`Put::next`] returns the next flash
+//! operation until it ends, so the same code serves blocking and asynchronous flash. [`Put::execute`] is the loop for
+//! an asynchronous [`Flash`].
 //!
-//! A board whose program can be updated has two places for a store, because flash cannot be read while a sector
-//! of the same bank is erased: [`newest`] says which one counts, a [`Move`] changes the place.
+//! A board whose program can be updated has two places for a store, because flash cannot be read while a sector of the
+//! same bank is erased: [`newest`] finds the valid one, a [`Move`] changes the place.
 //!
 //! ```
 //! # use recipe_store::{Flash, Geometry, Place, Word};
@@ -88,13 +88,13 @@ pub const BLANK: Word = [0xFF; WORD];
 /// A word of the flash.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Place {
-    /// Number of the sector, from 0. The sectors need not be neighbours.
+    /// Index of the sector, from 0. Sectors need not be adjacent.
     pub sector: u8,
-    /// Number of the word in it, from 0.
+    /// Index of the word in the sector, from 0.
     pub word: u16,
 }
 
-/// How large the flash is.
+/// Size of the flash.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Geometry {
     /// Number of sectors: at least 2, at most 8. One of them is always free for the next turn.
@@ -105,10 +105,10 @@ pub struct Geometry {
 
 /// Flash for a [`Store`] or for a slot of the firmware, and for nothing else.
 ///
-/// Writing and erasing may take seconds, so they are futures; whoever has no other task blocks on them. They
-/// report no errors: whatever goes wrong shows when the words are read back.
+/// Writing and erasing may take seconds, so they are futures; a program without other tasks blocks on them. They report
+/// no errors: failures are found when the words are read back.
 pub trait Flash {
-    /// Its size; always the same.
+    /// Size of the flash; constant.
     fn geometry(&self) -> Geometry;
 
     /// The bytes of a word; zeros if it cannot be read, because it was torn by a power cut. It never fails: an

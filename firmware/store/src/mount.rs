@@ -1,19 +1,19 @@
-//! What the flash holds.
+//! The index of a store, read from flash.
 
 use core::fmt;
 
 use crate::record::{Head, KEYS, Key, SectorHead, digest};
 use crate::{BLANK, Flash, Geometry, Place, WORD, Word};
 
-/// The newest record of each key, and where the next one goes.
+/// The newest record of each key, and where the next record goes.
 #[derive(Debug, Clone)]
 pub struct Store {
     pub(crate) geometry: Geometry,
-    /// The sector that is being filled, and its sequence number.
+    /// The current sector and its sequence number.
     pub(crate) head: Option<(u8, u32)>,
-    /// The next word to be written there.
+    /// Next free word of the current sector.
     pub(crate) end: u16,
-    /// Of the next record.
+    /// Sequence number of the next record.
     pub(crate) sequence: u32,
     index: [Option<Found>; KEYS],
 }
@@ -21,11 +21,11 @@ pub struct Store {
 /// A record.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Found {
-    /// Its first word of data, at which `len` bytes begin. Valid until the next change of the store.
+    /// First word of the data, `len` bytes long. Valid until the next change of the store.
     pub data: Place,
     /// Length of the data in bytes.
     pub len: usize,
-    /// Its value beside the data.
+    /// Value stored in the head.
     pub tag: u64,
     pub(crate) sequence: u32,
 }
@@ -34,9 +34,9 @@ pub struct Found {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum MountError {
-    /// It was written by a newer program. Nothing is changed.
+    /// It was written by a newer program. It is left unchanged.
     Version {
-        /// Its version.
+        /// The version found.
         found: u32,
     },
     /// The flash has fewer than two sectors of eight words, or more than eight sectors.
@@ -59,29 +59,29 @@ impl fmt::Display for MountError {
 impl core::error::Error for MountError {}
 
 impl Store {
-    /// Reads the whole flash. One without a store is an empty one. Nothing is written: what a power cut left
-    /// behind is avoided by the next write.
+    /// Reads the whole flash; flash without a store is an empty store. Writes nothing: the next write skips what a
+    /// power cut left behind.
     ///
     /// # Errors
-    /// Why there can be no store.
+    /// The flash is unsuitable, or a newer program wrote it.
     pub fn mount(flash: &impl Flash) -> Result<Self, MountError> {
         let geometry = flash.geometry();
         if !(2..=8).contains(&geometry.sectors) || geometry.words < 8 {
             return Err(MountError::Geometry(geometry));
         }
         let mut store = Self::empty(geometry, 1);
-        // In the order in which they were begun: of two copies of a record, the later one counts, because the
-        // sector of the earlier one is the next to be erased.
+        // In the order in which they were begun: the later copy of a record is the valid one, because the sector of the
+        // earlier one is erased next.
         while let Some((sector, sequence)) = store.begun_next(flash)? {
             let end = store.walk(flash, sector);
             store.head = Some((sector, sequence));
-            // The word behind may only look blank.
+            // The next word may only look blank.
             store.end = end.saturating_add(1);
         }
         Ok(store)
     }
 
-    /// A store of blank flash, whose next record has this sequence number.
+    /// An empty store on blank flash, whose next record has this sequence number.
     pub(crate) fn empty(geometry: Geometry, sequence: u32) -> Self {
         Self { geometry, head: None, end: 0, sequence, index: [None; KEYS] }
     }
@@ -119,7 +119,7 @@ impl Store {
                         self.enter(place, &head);
                     }
                 }
-                // Its room is taken, also if it is not whole: what is inside is data and no record.
+                // An incomplete record takes its words too: they are data, not heads of records.
                 word = word.saturating_add(head.extent());
                 end = word;
             } else {
@@ -132,7 +132,7 @@ impl Store {
         end
     }
 
-    /// Whether so many words from `word` on are in a sector.
+    /// Whether `extent` words from `word` on fit into a sector.
     pub(crate) fn has_room(&self, word: u16, extent: u16) -> bool {
         word.checked_add(extent).is_some_and(|end| end <= self.geometry.words)
     }
@@ -166,7 +166,7 @@ impl Store {
         self.entry(key.code()?)
     }
 
-    /// Its data, in the beginning of `out`; `None` if there is none, or if `out` is too short.
+    /// Copies its data to the beginning of `out`; `None` if there is no record or `out` is too short.
     pub fn get<'o>(&self, flash: &impl Flash, key: Key, out: &'o mut [u8]) -> Option<&'o [u8]> {
         let found = self.find(key)?;
         let out = out.get_mut(..found.len)?;
@@ -180,7 +180,7 @@ impl Store {
         Some(out)
     }
 
-    /// Number of words that all records take, and the most that they may take when one of `extent` words is added.
+    /// Number of words of all records, and the limit when one of `extent` words is added.
     ///
     /// One sector is free, and the new record fits behind what is needed in at least one of the others.
     pub(crate) fn used(&self, extent: u16) -> (u32, u32) {
@@ -190,7 +190,7 @@ impl Store {
     }
 }
 
-/// Whether data and end belong to the head.
+/// Whether data and end match the head.
 pub(crate) fn is_whole(flash: &impl Flash, Place { sector, word }: Place, head: &Head) -> bool {
     let mut digest = digest();
     let end = word.saturating_add(head.extent()).saturating_sub(1);

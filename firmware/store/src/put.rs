@@ -11,8 +11,8 @@ use crate::mount::is_whole;
 use crate::record::{Head, KEYS, MAX_DATA, SectorHead, part, sum};
 use crate::{BLANK, Flash, Found, Key, Place, Store, Word};
 
-/// A record that is being written. Dropped before it has ended, it leaves the old record or the new one; the
-/// operation of flash that was begun has to end before the next.
+/// A record being written. Dropped before its end, it leaves either the old or the new record. A flash operation that
+/// was begun must end before the next one.
 #[must_use = "nothing is written until `next` or `execute` is called"]
 #[derive(Debug)]
 pub struct Put<'s, 'd> {
@@ -21,36 +21,36 @@ pub struct Put<'s, 'd> {
     work: Work,
 }
 
-/// What is being written, and how far it is.
+/// State of writing a record.
 #[derive(Debug)]
 pub(crate) struct Work {
     head: Head,
     phase: PutPhase,
     writing: WordWriter,
-    /// The next free word of the sector that is copied into.
+    /// Next free word of the sector that is the target of copying.
     fill: u16,
-    /// Where the copies are, by key.
+    /// Words of the copies, by key.
     copies: [u16; KEYS],
-    /// How often a sector may be begun.
+    /// Remaining attempts to begin a sector.
     turns: u8,
-    /// How often something may be written again.
+    /// Remaining rewrites.
     tries: u8,
     /// A sector that is blank is not erased again before it is begun.
     is_erased: bool,
 }
 
-/// What to do next.
+/// The next step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Step {
     /// Erase this sector.
     Erase(u8),
     /// Write a word.
     Write(Place, Word),
-    /// Nothing more. Until a put has ended well, what was there before counts; after that, what was put.
+    /// The end. Until a put has ended without an error the old record is valid, afterwards the new one.
     End(Result<(), PutError>),
 }
 
-/// Why a record is not there.
+/// Why a record was not written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum PutError {
@@ -59,11 +59,11 @@ pub enum PutError {
         /// Number of bytes.
         len: usize,
     },
-    /// There is no room beside what is kept.
+    /// Not enough space beside the stored records.
     Full {
-        /// Number of words that are taken.
+        /// Number of words in use.
         used: u32,
-        /// Number of words that may be taken when this record is added.
+        /// Limit of words in use when this record is added.
         available: u32,
     },
     /// No such key.
@@ -95,7 +95,7 @@ impl core::error::Error for PutError {}
 
 #[derive(Debug, Clone, Copy)]
 enum PutPhase {
-    /// Look for room.
+    /// Find space.
     Place,
     Append,
     Erase {
@@ -118,7 +118,7 @@ enum PutPhase {
     End(Result<(), PutError>),
 }
 
-/// How far a record is written.
+/// Progress of writing a record.
 #[derive(Debug, Clone, Copy)]
 enum WordWriter {
     Head,
@@ -127,16 +127,16 @@ enum WordWriter {
     Check { at: u16 },
 }
 
-/// What writing a record asks for.
+/// Result of one step of writing a record.
 enum WriteProgress {
     Step(Step),
-    /// It begins here.
+    /// The record begins here.
     At(u16),
     Full,
     Worn,
 }
 
-/// Where the data of a record come from.
+/// Source of a record's data.
 pub(crate) enum RecordSource<'d, F> {
     Bytes(&'d [u8]),
     Flash(&'d F, Found),
@@ -156,9 +156,9 @@ impl<F: Flash> RecordSource<'_, F> {
 /// The sector that a record is written to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum PutTarget {
-    /// The one that is being filled.
+    /// The current sector.
     Filled,
-    /// The one that is copied into.
+    /// The target of copying.
     Next,
 }
 
@@ -166,7 +166,7 @@ impl Store {
     /// Begins to write a record, which replaces the one of this key.
     ///
     /// # Errors
-    /// It cannot be kept.
+    /// It cannot be written; the previous value remains.
     pub fn put<'d>(&mut self, key: Key, tag: u64, data: &'d [u8]) -> Result<Put<'_, 'd>, PutError> {
         let code = key.code().ok_or(PutError::Key)?;
         let too_long = PutError::TooLong { len: data.len() };
@@ -176,12 +176,12 @@ impl Store {
         }
         let head = Head { key: code, sequence: self.sequence, len, tag, sum: sum(data) };
         let work = self.begin(head)?;
-        // Also if it fails: its words may be read as a record later.
+        // Even if it fails: its words may later be read as a record.
         self.sequence = self.sequence.saturating_add(1);
         Ok(Put { store: self, data, work })
     }
 
-    /// The work of writing the record with this head, if there is room.
+    /// Plans writing the record with this head, if there is space.
     pub(crate) fn begin(&self, head: Head) -> Result<Work, PutError> {
         let (used, available) = self.used(head.extent());
         if used > available {
@@ -201,15 +201,15 @@ impl Store {
 }
 
 impl Put<'_, '_> {
-    /// What to do next; called again when that is done, until it is [`Step::End`].
+    /// Returns the next step; called again when that is done, until [`Step::End`].
     pub fn next<F: Flash>(&mut self, flash: &F) -> Step {
         self.work.next(self.store, &RecordSource::<F>::Bytes(self.data), flash)
     }
 
-    /// Does all steps.
+    /// Executes all steps.
     ///
     /// # Errors
-    /// Why the record is not there; the one before is.
+    /// Why the record was not written; the previous one remains.
     pub async fn execute(mut self, flash: &mut impl Flash) -> Result<(), PutError> {
         loop {
             match self.next(flash) {
@@ -222,12 +222,12 @@ impl Put<'_, '_> {
 }
 
 impl Work {
-    /// In a flash whose sectors were all erased just now.
+    /// For flash whose sectors have all been erased.
     pub(crate) fn in_erased(self) -> Self {
         Self { is_erased: true, ..self }
     }
 
-    /// What to do next with `flash`, of which `store` is.
+    /// Returns the next step for the flash of `store`.
     pub(crate) fn next<F: Flash>(
         &mut self,
         store: &mut Store,
@@ -300,7 +300,7 @@ impl Work {
             self.copies = [0; KEYS];
             if self.is_erased { PutPhase::Erased { tries: 2 } } else { PutPhase::Erase { tries: 2 } }
         } else {
-            // More was written again than there is room.
+            // Rewrites have used up the space.
             PutPhase::End(Err(PutError::Worn))
         };
     }
@@ -314,14 +314,14 @@ impl Work {
         self.phase = match found {
             Some((key, from)) => match head_of(flash, from) {
                 Some(head) => PutPhase::Copying { key, head, from },
-                // It was read at the start, and is not written.
+                // The record was valid at mount and has not changed.
                 None => PutPhase::End(Err(PutError::Worn)),
             },
             None => PutPhase::Begin,
         };
     }
 
-    /// The sector is the one that counts, if its head is there.
+    /// Makes the new sector the current one if its head can be read.
     fn begun(&mut self, store: &mut Store, flash: &impl Flash) {
         let (sector, sequence) = (next_sector(store), next_sequence(store));
         if flash.read(Place { sector, word: 0 }) != SectorHead::word(sequence) {
@@ -362,7 +362,7 @@ impl Work {
                     self.writing = WordWriter::CheckHead { at: free };
                     return WriteProgress::Step(Step::Write(Place { sector, word: free }, head.word()));
                 }
-                // Data only behind a head that can be read: without it they could be taken for records.
+                // Data only after a readable head, or it could be taken for records.
                 WordWriter::CheckHead { at } => {
                     if flash.read(Place { sector, word: at }) == head.word() {
                         self.set_end(store, into, at.saturating_add(head.extent()));
@@ -393,7 +393,7 @@ impl Work {
         }
     }
 
-    /// The same once more, behind what is there now, if it may be.
+    /// Retries behind the words written so far, if attempts remain.
     fn again(&mut self) -> bool {
         let Some(left) = self.tries.checked_sub(1) else { return false };
         self.tries = left;
@@ -417,7 +417,7 @@ pub(crate) fn head_of(flash: &impl Flash, found: Found) -> Option<Head> {
     Head::parse(&flash.read(word))
 }
 
-/// The sector to be begun next.
+/// The next sector of the ring.
 fn next_sector(store: &Store) -> u8 {
     store.head.map_or(0, |(head, _)| behind(store, head))
 }
@@ -431,6 +431,6 @@ fn behind(store: &Store, sector: u8) -> u8 {
     if next < store.geometry.sectors { next } else { 0 }
 }
 
-/// How often words may read differently than they were written. After a power cut it happens once, where a word
-/// only looks blank; after several cuts in the same place, once for each.
+/// Limit of rewrites after failed verification. A power cut may cause one, at a word that only looks blank; several
+/// cuts at the same place cause one each.
 const TRIES: u8 = 8;

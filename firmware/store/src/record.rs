@@ -7,30 +7,30 @@ use crc::{CRC_32_ISO_HDLC, Crc, Digest, NoTable};
 
 use crate::{WORD, Word};
 
-/// Maximum length of a record's data in bytes: that of a configuration image.
+/// Maximum length of a record's data in bytes: the length of the longest configuration image.
 pub const MAX_DATA: usize = 16 * 1024;
 /// Number of counters.
 pub const COUNTERS: u8 = 3;
 /// Number of keys.
 pub(crate) const KEYS: usize = 18;
-/// Version of the layout of the store: another one is not read.
+/// Version of the store's layout; others are not read.
 pub const VERSION: u32 = 1;
 
 const SECTOR_MAGIC: [u8; 4] = *b"RGSs";
 const RECORD_MAGIC: [u8; 4] = *b"RGSr";
 
-/// What a record is. The newest record of a key replaces the ones before.
+/// Key of a record. The newest record of a key replaces earlier ones.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Key {
     /// A configuration image, in one of eight places.
     Image(u8),
-    /// Which images are live, before it, and on trial.
+    /// Marks: which images are live, previous and on trial.
     Marks,
     /// The key of the API.
     Access,
     /// Sparkplug's bdSeq.
     BirthSequence,
-    /// Which image was taken over from outside the store.
+    /// Which image was adopted from outside the store.
     Adopted,
     /// A counter, below [`COUNTERS`].
     Counter(u8),
@@ -38,7 +38,7 @@ pub enum Key {
     Edge,
     /// Which slots of the firmware are good and on trial.
     Slots,
-    /// How often the store was moved to another place.
+    /// Number of moves of the store to another place.
     Generation,
 }
 
@@ -63,13 +63,13 @@ impl Key {
 /// The head of a record.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Head {
-    /// Its key's code.
+    /// Code of the key.
     pub(crate) key: u8,
     /// Higher than that of all records written before; a copy keeps it.
     pub(crate) sequence: u32,
     /// Length of the data in bytes.
     pub(crate) len: u32,
-    /// A value of the key's own. A record with nothing else has no data.
+    /// Value whose meaning depends on the key; small records have no data.
     pub(crate) tag: u64,
     /// CRC-32 of the data, filled up to whole words.
     pub(crate) sum: u32,
@@ -122,14 +122,14 @@ pub(crate) fn extent(len: usize) -> u16 {
 
 /// The head of a sector.
 pub(crate) enum SectorHead {
-    /// Of this layout.
+    /// A sector of this layout.
     Known {
         /// Higher than that of all sectors that were begun before.
         sequence: u32,
     },
-    /// Of another layout.
+    /// A sector of another layout.
     Other {
-        /// Its version.
+        /// The version found.
         version: u32,
     },
 }
@@ -154,7 +154,7 @@ impl SectorHead {
     }
 }
 
-/// A word of these, with its check.
+/// Builds a head word with its CRC.
 fn finished(parts: [[u8; 4]; 7]) -> Word {
     let mut word = [0; WORD];
     for (place, byte) in word.iter_mut().zip(parts.as_flattened()) {
@@ -195,5 +195,5 @@ pub(crate) fn sum(data: &[u8]) -> u32 {
     digest.finalize()
 }
 
-/// Without a table, which would be another KiB of flash for some milliseconds of the start.
+/// Without a table: it would cost 1 KiB of flash and save some milliseconds of the start.
 static CRC: Crc<u32, NoTable> = Crc::<u32, NoTable>::new(&CRC_32_ISO_HDLC);

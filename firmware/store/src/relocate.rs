@@ -1,8 +1,8 @@
 //! Moves a store to another place of the flash.
 //!
-//! A board with two slots has a place for the store in each bank, and uses the one in the bank that it does not
-//! run from. A move erases the new place, copies all records, and writes the number of the move last: until then
-//! the place before counts, and a move that was cut short is begun anew. The place before is not written.
+//! A board with two slots has a place for the store in each bank, and uses the one in the bank that it does not run
+//! from. A move erases the new place, copies all records, and writes the number of the move last: until then the old
+//! place is valid, and an interrupted move is restarted. The old place is not written.
 
 use crate::mount::MountError;
 use crate::put::{RecordSource, Work, head_of, is_blank};
@@ -18,22 +18,21 @@ pub enum Side {
     Second,
 }
 
-/// The store that counts, of two places.
+/// The valid store of two places.
 #[derive(Debug, Clone)]
 pub struct Newest {
-    /// What it holds.
+    /// The mounted store.
     pub store: Store,
-    /// Where it is.
+    /// Its place.
     pub side: Side,
     /// Whether it may be moved to the other place; not if that one was written by a newer program.
     pub may_move: bool,
 }
 
-/// Reads both places: the one that was moved to last counts. If that cannot be said, because nothing was ever
-/// moved, it is the first.
+/// Reads both places: the target of the last move is valid; without any move, the first.
 ///
 /// # Errors
-/// Neither can be a store: why the first cannot.
+/// Neither is usable: the error of the first.
 pub fn newest(first: &impl Flash, second: &impl Flash) -> Result<Newest, MountError> {
     match (Store::mount(first), Store::mount(second)) {
         (Ok(one), Ok(other)) if one.generation() >= other.generation() => {
@@ -46,7 +45,7 @@ pub fn newest(first: &impl Flash, second: &impl Flash) -> Result<Newest, MountEr
     }
 }
 
-/// A store that is being moved. Dropped or cut before it has ended, it leaves the store where it was.
+/// A store being moved. Dropped or interrupted before its end, it leaves the store where it was.
 #[must_use = "nothing is moved until `next` or `execute` is called"]
 #[derive(Debug)]
 pub struct Move<'s> {
@@ -77,13 +76,12 @@ enum RelocatePhase {
 }
 
 impl Store {
-    /// How often it was moved.
+    /// Write the number of moves.
     pub fn generation(&self) -> u64 {
         self.find(Key::Generation).map_or(0, |found| found.tag)
     }
 
-    /// Begins to move it to another place of the same size. It must not be changed until the move has ended, or
-    /// the changes are not in the new place.
+    /// Begins a move to another place of the same size. Changes made to the store before the end of the move are lost.
     pub fn relocate(&self) -> Move<'_> {
         let to = Self::empty(self.geometry, self.sequence);
         Move { from: self, to, phase: RelocatePhase::Erase { sector: 0, tries: ERASES } }
@@ -91,7 +89,7 @@ impl Store {
 }
 
 impl Move<'_> {
-    /// What to do next in the new place; called again when that is done, until it is [`Step::End`].
+    /// Returns the next step for the new place; called again when that is done, until [`Step::End`].
     pub fn next<F: Flash>(&mut self, from: &impl Flash, to: &F) -> Step {
         loop {
             match &mut self.phase {
@@ -144,7 +142,7 @@ impl Move<'_> {
         let is_copied = |key: &u8| Key::Generation.code() != Some(*key);
         let found = (first..KEYS as u8).filter(is_copied).find_map(|key| Some((key, self.from.entry(key)?)));
         if let Some((key, found)) = found {
-            // It was read at the start, and is not written.
+            // The record was valid at mount and has not changed.
             let head = head_of(from, found).ok_or(PutError::Worn)?;
             return Ok(RelocatePhase::Copying { key, from: found, work: self.to.begin(head)?.in_erased() });
         }
@@ -160,10 +158,10 @@ impl Move<'_> {
         matches!(self.phase, RelocatePhase::End(Ok(()))).then_some(self.to)
     }
 
-    /// Does all steps; returns the store in its new place.
+    /// Executes all steps; returns the store in its new place.
     ///
     /// # Errors
-    /// Why it stays where it was.
+    /// Why the move failed; the old place remains valid.
     pub async fn execute(mut self, from: &impl Flash, to: &mut impl Flash) -> Result<Store, PutError> {
         loop {
             match self.next(from, to) {
@@ -176,5 +174,5 @@ impl Move<'_> {
     }
 }
 
-/// How often a sector is erased until it is given up.
+/// Maximum number of attempts to erase a sector.
 const ERASES: u8 = 2;

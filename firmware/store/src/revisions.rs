@@ -1,18 +1,18 @@
-//! Configurations: which are kept, which one is live, and which one is on trial.
+//! Configurations: stored, live and on trial.
 
 use core::fmt;
 
 use crate::{Flash, Key, Put, PutError, Store};
 
-/// Number of configurations that are kept.
+/// Maximum number of stored configurations.
 pub const MAX_REVISIONS: usize = 8;
 
-/// A configuration that is kept.
+/// A stored configuration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Revision {
-    /// Its number: higher than that of all before it.
+    /// Number of the revision; increases with each one.
     pub number: u32,
-    /// Tells it from other contents of the same number; the store does not compute it.
+    /// Distinguishes contents of the same number; not computed by the store.
     pub digest: u32,
     /// Length of its image in bytes.
     pub len: usize,
@@ -26,21 +26,21 @@ impl Revision {
     }
 }
 
-/// What the configurations are, changed in one step.
+/// Marks of the configurations, written atomically.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Marks {
-    /// Number of the one that runs after a restart.
+    /// Number of the configuration that runs after a restart.
     pub live: Option<u32>,
-    /// Number of the one that was live before.
+    /// Number of the previously live configuration.
     pub previous: Option<u32>,
     /// The one on trial.
     pub trial: Option<Trial>,
-    /// Number of the one whose trial ended last, and how.
+    /// Number of the configuration whose trial ended last, and how.
     pub last: Option<(u32, Ended)>,
 }
 
 impl Marks {
-    /// The configurations that it names, whose places are theirs.
+    /// Marked configurations, whose places must not be reused.
     pub fn numbers(&self) -> [Option<u32>; 4] {
         let last = self.last.map(|(number, _)| number);
         [self.live, self.previous, self.trial.map(|trial| trial.number), last]
@@ -73,24 +73,24 @@ impl Ended {
     }
 }
 
-/// A configuration that runs, and is not live.
+/// A trial of a configuration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Trial {
     /// Its number.
     pub number: u32,
-    /// How many more starts it has.
+    /// Remaining starts.
     pub attempts: u8,
-    /// How long it runs until it has to be confirmed, in seconds.
+    /// Time until it must be confirmed, in seconds.
     pub confirm_s: u16,
 }
 
-/// Why a configuration is not kept or marked.
+/// Why a configuration was not stored or marked.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum KeepError {
     /// It cannot be written.
     Put(PutError),
-    /// A mark names the one to be forgotten, or the one of this number.
+    /// The configuration to be forgotten or replaced is marked.
     Needed {
         /// Its number.
         number: u32,
@@ -120,12 +120,12 @@ impl From<PutError> for KeepError {
     }
 }
 
-/// Why a configuration is to be run.
+/// Role of a configuration at a start.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Role {
     /// It is on trial.
     Trial {
-        /// How long it runs until it has to be confirmed, in seconds.
+        /// Time until it must be confirmed, in seconds.
         confirm_s: u16,
     },
     /// It is the live one.
@@ -134,26 +134,26 @@ pub enum Role {
     Previous,
 }
 
-/// What to do at a start.
+/// Candidates at a start.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Start {
-    /// To be marked before anything runs: the trial has one start less, or is over.
+    /// Marks to write before anything runs: the trial has one start less, or is over.
     pub marks: Option<Marks>,
-    /// The first of them that can run is to be run.
+    /// Candidates in order; the first that can run is run.
     pub candidates: heapless::Vec<(Revision, Role), 3>,
 }
 
-/// The next thing to be written of an image that is taken over.
+/// Next step of adopting an image.
 #[derive(Debug)]
 pub enum Adoption<'s, 'd> {
-    /// This.
+    /// A record to write.
     Write(Put<'s, 'd>),
-    /// Nothing: it was taken over.
+    /// The image has been adopted.
     Done,
 }
 
 impl Store {
-    /// The configurations that are kept, by their numbers.
+    /// Stored configurations in the order of their numbers.
     pub fn revisions(&self) -> heapless::Vec<Revision, MAX_REVISIONS> {
         let mut all: heapless::Vec<Revision, MAX_REVISIONS> = heapless::Vec::new();
         let next = |after: Option<u32>| {
@@ -169,7 +169,7 @@ impl Store {
     }
 
     fn in_slot(&self, slot: u8) -> Option<Revision> {
-        // An empty one without a number is a place whose image was forgotten.
+        // An empty record without a number marks a forgotten image.
         let found = self.find(Key::Image(slot)).filter(|found| found.len > 0 || found.tag != 0)?;
         let [a, b, c, d, e, f, g, h] = found.tag.to_le_bytes();
         let number = u32::from_le_bytes([a, b, c, d]);
@@ -184,13 +184,12 @@ impl Store {
             .find(|revision| revision.number == number)
     }
 
-    /// The image of a configuration, in the beginning of `out`; `None` if it is not kept, or if `out` is too
-    /// short.
+    /// Copies the image of a configuration to the beginning of `out`; `None` if it is not stored or `out` is too short.
     pub fn image<'o>(&self, flash: &impl Flash, number: u32, out: &'o mut [u8]) -> Option<&'o [u8]> {
         self.get(flash, self.revision(number)?.key(), out)
     }
 
-    /// Which configurations are live, before it, and on trial.
+    /// Marks of the configurations.
     pub fn marks(&self) -> Marks {
         let Some(found) = self.find(Key::Marks) else { return Marks::default() };
         let [live, previous, trial, attempts, low, high, last, ended] = found.tag.to_le_bytes();
@@ -207,7 +206,7 @@ impl Store {
     /// Marks configurations.
     ///
     /// # Errors
-    /// One of them is not kept, or the marks cannot be written.
+    /// A marked configuration is not stored, or the marks cannot be written.
     pub fn mark(&mut self, marks: Marks) -> Result<Put<'_, 'static>, KeepError> {
         let slot = |number: Option<u32>| match number {
             Some(number) => {
@@ -225,11 +224,11 @@ impl Store {
         Ok(self.put(Key::Marks, tag, &[])?)
     }
 
-    /// Keeps a configuration, in the place of `forget`. Without that it is a free place, or that of the oldest one
-    /// that no mark names.
+    /// Stores a configuration in the place of `forget`; if that is `None`, in a free place or that of the oldest
+    /// unmarked one.
     ///
     /// # Errors
-    /// It is not kept, and `forget` is.
+    /// It cannot be written; `forget` remains.
     pub fn keep<'d>(
         &mut self,
         number: u32,
@@ -241,7 +240,7 @@ impl Store {
         let needed = marks.numbers();
         let is_needed = |number: u32| needed.contains(&Some(number));
         let revisions = self.revisions();
-        // One of the same number is replaced.
+        // A configuration of the same number is replaced.
         let same = revisions.iter().find(|revision| revision.number == number).map(|same| same.number);
         let free = (0..MAX_REVISIONS as u8).find(|slot| self.in_slot(*slot).is_none());
         let oldest = || revisions.iter().find(|kept| !is_needed(kept.number)).map(|kept| kept.slot);
@@ -254,10 +253,10 @@ impl Store {
         Ok(self.put(Key::Image(slot), tag, image)?)
     }
 
-    /// Forgets a configuration, for its room: `number`, or the oldest one that no mark names. `None` if there is none.
+    /// Forgets a configuration to free its space: `number`, or the oldest unmarked one. `None` if there is none.
     ///
     /// # Errors
-    /// A mark names it, or that cannot be written.
+    /// It is marked, or the flash cannot be written.
     pub fn forget(&mut self, number: Option<u32>) -> Result<Option<Put<'_, 'static>>, KeepError> {
         let needed = self.marks().numbers();
         let is_needed = |number: u32| needed.contains(&Some(number));
@@ -271,8 +270,7 @@ impl Store {
         Ok(Some(self.put(Key::Image(slot), 0, &[])?))
     }
 
-    /// What is to be run at a start: the configuration on trial while it has starts left, the live one, the one
-    /// before.
+    /// Candidates at a start: the configuration on trial while it has starts left, the live one, the previous one.
     pub fn at_start(&self) -> Start {
         let marks = self.marks();
         let mut start = Start { marks: None, candidates: heapless::Vec::new() };
@@ -293,9 +291,8 @@ impl Store {
         start
     }
 
-    /// Takes over an image from outside the store: it is kept, becomes the live one, and that it was taken over
-    /// is noted, so that it happens once. Called again after each [`Adoption::Write`] that was executed; after
-    /// a power cut it goes on where it was.
+    /// Adopts an image from outside the store: stores it, makes it the live one, and records the adoption, so that it
+    /// happens once. Call again after executing each [`Adoption::Write`]; it resumes after a power cut.
     ///
     /// # Errors
     /// It cannot be written.
@@ -317,13 +314,13 @@ impl Store {
         Ok(Adoption::Write(self.put(Key::Adopted, adopted(digest, image.len()), &[])?))
     }
 
-    /// Whether this is the image that was taken over last.
+    /// Whether this is the image that was adopted last.
     pub fn is_adopted(&self, digest: u32, len: usize) -> bool {
         self.find(Key::Adopted).is_some_and(|found| found.tag == adopted(digest, len))
     }
 }
 
-/// Tells an image that was taken over from others.
+/// Identifies an adopted image.
 fn adopted(digest: u32, len: usize) -> u64 {
     u64::from(digest) << 32 | u64::from(u32::try_from(len).unwrap_or(u32::MAX))
 }

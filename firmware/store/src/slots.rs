@@ -3,7 +3,7 @@
 use crate::revisions::Ended;
 use crate::{Key, Put, PutError, Store};
 
-/// A place for a firmware. Each image is linked for one of them.
+/// Place of a firmware. Each image is linked for one slot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Slot {
     /// The first one.
@@ -13,7 +13,7 @@ pub enum Slot {
 }
 
 impl Slot {
-    /// Both.
+    /// Both slots, A first.
     pub const ALL: [Self; 2] = [Self::A, Self::B];
 
     /// The other one.
@@ -38,32 +38,32 @@ impl Slot {
     }
 }
 
-/// What the slots are, changed in one step.
+/// Marks of the slots, written atomically.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct SlotMarks {
-    /// The one that was confirmed last, or was the first.
+    /// The slot that was confirmed last, or the first one.
     pub good: Option<Slot>,
     /// The one on trial.
     pub trial: Option<SlotTrial>,
-    /// The one whose trial ended last, and how.
+    /// The slot whose trial ended last, and how.
     pub last: Option<(Slot, Ended)>,
 }
 
-/// A firmware that runs, and was not confirmed.
+/// A trial of a firmware.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SlotTrial {
-    /// Where it is.
+    /// Its place.
     pub slot: Slot,
-    /// How many more starts it has.
+    /// Remaining starts.
     pub attempts: u8,
-    /// How long it runs until it has to be confirmed, in seconds.
+    /// Time until it must be confirmed, in seconds.
     pub confirm_s: u16,
-    /// How well the cell did before, in a code of the firmware's own.
+    /// State of the cell before the trial, encoded by the firmware.
     pub before: u8,
 }
 
 impl Store {
-    /// Which slots are good and on trial; nothing if no one has ever said.
+    /// Marks of the slots; empty if never written.
     pub fn slots(&self) -> SlotMarks {
         let Some(found) = self.find(Key::Slots) else { return SlotMarks::default() };
         let [good, trial, attempts, low, high, last, ended, before] = found.tag.to_le_bytes();

@@ -10,10 +10,10 @@ impl Store {
         (len == key.len()).then_some(key)
     }
 
-    /// Keeps the key of the API.
+    /// Stores the access key of the API.
     ///
     /// # Errors
-    /// It cannot be kept.
+    /// It cannot be written; the previous value remains.
     pub fn set_access_key<'d>(&mut self, key: &'d [u8; 16]) -> Result<Put<'_, 'd>, PutError> {
         self.put(Key::Access, 0, key)
     }
@@ -23,10 +23,10 @@ impl Store {
         self.find(Key::Counter(number)).map_or(0, |found| found.tag)
     }
 
-    /// Keeps the value of a counter.
+    /// Stores the value of a counter.
     ///
     /// # Errors
-    /// It cannot be kept, or there is no such counter.
+    /// It cannot be written, or there is no such counter.
     pub fn set_counter(&mut self, number: u8, value: u64) -> Result<Put<'_, 'static>, PutError> {
         self.put(Key::Counter(number), value, &[])
     }
@@ -36,23 +36,23 @@ impl Store {
         self.find(Key::BirthSequence).map(|found| found.tag.to_le_bytes()).map(|[low, ..]| low)
     }
 
-    /// Keeps the bdSeq of the session that begins.
+    /// Stores the bdSeq of the session that begins.
     ///
     /// # Errors
-    /// It cannot be kept.
+    /// It cannot be written; the previous value remains.
     pub fn set_birth_sequence(&mut self, value: u8) -> Result<Put<'_, 'static>, PutError> {
         self.put(Key::BirthSequence, value.into(), &[])
     }
 
-    /// Where the settings of the edge node are; `None` if there are none.
+    /// Record of the edge node's settings; `None` if there are none.
     pub fn edge(&self) -> Option<Found> {
         self.find(Key::Edge).filter(|found| found.len > 0)
     }
 
-    /// Keeps the settings of the edge node; no bytes are none.
+    /// Stores the settings of the edge node; empty settings delete them.
     ///
     /// # Errors
-    /// They cannot be kept; those before are.
+    /// They cannot be written; the previous settings remain.
     pub fn set_edge<'d>(&mut self, settings: &'d [u8]) -> Result<Put<'_, 'd>, PutError> {
         self.put(Key::Edge, 0, settings)
     }

@@ -11,7 +11,7 @@ use crate::header::{BoardName, Header, PublicKey};
 /// Starts that a trial has: one, and two more after power cuts.
 pub const STARTS: u8 = 3;
 
-/// What a loader has of its board.
+/// The loader's access to its board.
 pub trait Machine {
     /// The flash of a slot.
     type Flash: SlotFlash;
@@ -19,14 +19,14 @@ pub trait Machine {
     /// The flash of this slot.
     fn flash(&self, slot: Slot) -> &Self::Flash;
 
-    /// Writes marks into the store; whether they are there.
+    /// Writes marks to the store; returns whether that succeeded.
     fn mark(&mut self, marks: SlotMarks) -> bool;
 
-    /// Is told what was found in a slot that is not run, for a log or an LED.
+    /// Reports why a slot is not run, for a log or an LED.
     fn passed_over(&mut self, slot: Slot, why: &dyn fmt::Display);
 }
 
-/// The firmware to be run.
+/// The firmware to run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Chosen {
     /// Its slot.
@@ -37,10 +37,10 @@ pub struct Chosen {
     pub is_trial: bool,
 }
 
-/// Chooses the slot to be run: the one on trial if it has a start left, which is counted before; the good one; the
-/// other one. `None` if nothing can run. `marks` is `None` if there is no store: nothing is on trial then.
+/// Chooses the slot to run: the one on trial if it has a start left, which is counted first; the good one; the other
+/// one. `None` if no slot can run. `marks` is `None` if there is no store; then nothing is on trial.
 ///
-/// What is not known to be good is checked with its signature, the good one for damage.
+/// The good slot is checked for damage only, others also for their signature.
 pub fn choose(
     machine: &mut impl Machine,
     marks: Option<SlotMarks>,
@@ -123,7 +123,7 @@ fn origin(
     key: &PublicKey,
 ) -> Result<Header, BadImage> {
     let header = header(flash, slot, board)?;
-    // Shorter than the hash of an image, and says whether that matters.
+    // Before the hash of the image, which takes longer.
     header.verify(key).map_err(|_| BadImage::Foreign)?;
     Check::contents(header).whole(flash)?;
     Ok(header)

@@ -23,14 +23,14 @@ pub enum BadImage {
     Long {
         /// Its length in bytes.
         length: u32,
-        /// The room in bytes.
+        /// Maximum length in bytes.
         room: u32,
     },
     /// A word cannot be read.
     Torn(Place),
     /// A bit has changed since it was written.
     Crc,
-    /// The image is another one than that which was signed.
+    /// The image is not the one that was signed.
     Hash,
     /// It was signed with another key.
     Foreign,
@@ -57,7 +57,7 @@ impl fmt::Display for BadImage {
 
 impl core::error::Error for BadImage {}
 
-/// An image that is being checked.
+/// A check of an image, in steps.
 pub struct Check {
     header: Header,
     /// Words that were read.
@@ -78,7 +78,7 @@ impl fmt::Debug for Check {
 /// The header in the beginning of a slot, for this slot and board.
 ///
 /// # Errors
-/// There is none, or it is not for here.
+/// There is none, or it is for another slot or board.
 pub fn header(flash: &impl SlotFlash, slot: Slot, board: &BoardName) -> Result<Header, BadImage> {
     let mut bytes = [0; HEADER];
     for (part, word) in bytes.as_chunks_mut::<WORD>().0.iter_mut().zip(0..) {
@@ -93,7 +93,7 @@ pub fn header(flash: &impl SlotFlash, slot: Slot, board: &BoardName) -> Result<H
 /// Whether this header is for this slot and board.
 ///
 /// # Errors
-/// It is not, and why.
+/// Why not.
 pub(crate) fn fits(
     header: &Header,
     flash: &impl SlotFlash,
@@ -119,12 +119,12 @@ impl Check {
         Self { header, done: 0, crc: CRC.digest(), hash: None }
     }
 
-    /// The same, and compares with the hash that was signed.
+    /// Also compares the image with the signed hash.
     pub fn contents(header: Header) -> Self {
         Self { hash: Some(Sha512::new()), ..Self::damage(header) }
     }
 
-    /// Reads so many more words; `None` if some are left.
+    /// Checks up to `words` more words; `None` if some are left.
     pub fn step(&mut self, flash: &impl SlotFlash, words: u16) -> Option<Result<(), BadImage>> {
         for _ in 0..words {
             let read = self.done.saturating_mul(WORD as u32);
@@ -157,7 +157,7 @@ impl Check {
         })
     }
 
-    /// All of it.
+    /// Checks everything that is left.
     ///
     /// # Errors
     /// What is wrong with the image.

@@ -23,7 +23,7 @@ pub struct UpdateFile<'b> {
     links: [Option<Link<'b>>; LINKS],
 }
 
-/// The firmware for one slot.
+/// The firmware linked for one slot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Link<'b> {
     /// What it is.
@@ -34,27 +34,27 @@ pub struct Link<'b> {
     pub image: &'b [u8],
 }
 
-/// Why bytes are no update.
+/// Why a file is not an update.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum FileError {
-    /// It does not begin as one.
+    /// The magic number is missing.
     NotAnUpdate,
-    /// It was made by a newer program.
+    /// It was made for a newer version of the format.
     Version {
-        /// Its version.
+        /// The version found.
         found: u32,
     },
     /// It is cut short, or something follows it.
     Length {
-        /// The length that it says.
+        /// Length according to the file, in bytes.
         said: u32,
-        /// The length that it has.
+        /// Length of the file, in bytes.
         found: usize,
     },
     /// The number of links is wrong.
     Links {
-        /// That number.
+        /// Number of links.
         found: u32,
     },
     /// The header of a link is wrong.
@@ -64,7 +64,7 @@ pub enum FileError {
         /// Why.
         why: HeaderError,
     },
-    /// A link ends behind the file, or the bytes behind it are not the filler.
+    /// A link extends beyond the file, or is padded with bytes other than 0xFF.
     Image {
         /// The slot it is for.
         slot: Slot,
@@ -74,7 +74,7 @@ pub enum FileError {
         /// That slot.
         slot: Slot,
     },
-    /// The links are not of one firmware.
+    /// The links belong to different firmware versions.
     Different,
 }
 
@@ -104,7 +104,7 @@ impl fmt::Display for FileError {
 
 impl core::error::Error for FileError {}
 
-/// The beginning of a file with so many links, which has so many bytes in all.
+/// Head of a file with this number of links and this total length in bytes.
 pub fn file_head(links: u32, length: u32) -> [u8; FILE_HEAD] {
     let mut head = [0; FILE_HEAD];
     let parts = [MAGIC, VERSION.to_le_bytes(), links.to_le_bytes(), length.to_le_bytes()];
@@ -122,7 +122,7 @@ impl<'b> UpdateFile<'b> {
     /// ([`Link::check`]) nor their signatures ([`Header::verify`]).
     ///
     /// # Errors
-    /// Why it is none.
+    /// The bytes are malformed.
     pub fn parse(bytes: &'b [u8]) -> Result<Self, FileError> {
         let (head, mut rest) = bytes.split_first_chunk::<FILE_HEAD>().ok_or(FileError::NotAnUpdate)?;
         let &[magic, version, links, said] = head.as_chunks::<4>().0 else {
@@ -188,7 +188,7 @@ impl Link<'_> {
     /// Compares the image with CRC and hash of the header.
     ///
     /// # Errors
-    /// What is different.
+    /// Which of them differs.
     pub fn check(&self) -> Result<(), BadImage> {
         if CRC.checksum(self.image) != self.header.crc() {
             return Err(BadImage::Crc);

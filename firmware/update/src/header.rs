@@ -13,7 +13,7 @@ use salty::{Keypair, Sha512, Signature};
 pub const HEADER: usize = 192;
 /// Number of bytes that are signed: the header without the signature.
 pub const SIGNED: usize = 128;
-/// Where the image begins in a slot, in bytes: as far as a vector table of the Cortex-M7 has to be aligned.
+/// Offset of the image in a slot, in bytes: the alignment of a vector table of the Cortex-M7.
 pub const IMAGE_OFFSET: u32 = 1024;
 
 const SIGNATURE: usize = HEADER - SIGNED;
@@ -70,7 +70,7 @@ pub struct Version {
 }
 
 impl Version {
-    /// Of these numbers.
+    /// Builds a version.
     pub const fn new(major: u16, minor: u16, patch: u16) -> Self {
         Self { major, minor, patch }
     }
@@ -96,19 +96,19 @@ impl fmt::Display for Version {
     }
 }
 
-/// The versions of the configuration image that a firmware knows.
+/// Versions of the configuration image that a firmware supports.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Formats {
     /// The oldest that it reads.
     pub oldest: u32,
     /// The newest that it reads.
     pub newest: u32,
-    /// The one that it writes.
+    /// The version that it writes.
     pub written: u32,
 }
 
 impl Formats {
-    /// `None` unless what is written is read.
+    /// `None` unless `written` is between `oldest` and `newest`.
     pub fn new(oldest: u32, newest: u32, written: u32) -> Option<Self> {
         (oldest <= written && written <= newest).then_some(Self { oldest, newest, written })
     }
@@ -119,16 +119,16 @@ impl Formats {
     }
 }
 
-/// What a header says of an image that is not in the image.
+/// Facts about an image that the image does not contain.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Parts {
     /// The board it is for.
     pub board: BoardName,
     /// The slot it is linked for.
     pub slot: Slot,
-    /// Its version.
+    /// Version of the firmware.
     pub version: Version,
-    /// Its configurations.
+    /// Configuration versions that it supports.
     pub formats: Formats,
     /// The version of the store that it reads and writes.
     pub store: u32,
@@ -147,21 +147,21 @@ pub struct Header {
     signature: [u8; SIGNATURE],
 }
 
-/// Why bytes are no header.
+/// Why bytes are not a header.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum HeaderError {
-    /// It does not begin as one: there is no firmware.
+    /// The magic number is missing: there is no firmware.
     NotAHeader {
-        /// What is there in place of the magic number.
+        /// Found instead of the magic number.
         found: [u8; 4],
     },
-    /// It was made by a newer program.
+    /// It was made for a newer version of the format.
     Version {
-        /// Its version.
+        /// The version found.
         found: u32,
     },
-    /// A bit has changed.
+    /// The CRC does not match.
     Crc {
         /// The CRC in the header.
         stored: u32,
@@ -173,13 +173,13 @@ pub enum HeaderError {
         /// Its number.
         found: u32,
     },
-    /// The name of the board is none.
+    /// The name of the board is invalid.
     Board,
     /// The image is empty.
     Empty,
     /// The versions of the configuration contradict each other.
     Formats,
-    /// A byte that has no meaning is not zero.
+    /// A reserved byte is not zero.
     Reserved,
 }
 
@@ -219,17 +219,17 @@ impl fmt::Display for Foreign {
 
 impl core::error::Error for Foreign {}
 
-/// A key that signatures are checked with: Ed25519.
+/// Public key (Ed25519).
 #[derive(Debug, Clone, PartialEq)]
 pub struct PublicKey(salty::PublicKey);
 
 impl PublicKey {
-    /// `None` if the bytes are no point of the curve.
+    /// `None` if the bytes are not a point of the curve.
     pub fn parse(bytes: &[u8; 32]) -> Option<Self> {
         salty::PublicKey::try_from(bytes).ok().map(Self)
     }
 
-    /// Of the private key that is made of this seed.
+    /// The public key of the private key with this seed.
     pub fn of_seed(seed: &[u8; 32]) -> Self {
         Self(Keypair::from(seed).public)
     }
@@ -241,8 +241,8 @@ impl PublicKey {
 }
 
 impl Header {
-    /// The header of an image, signed with the key of this seed; `None` if the image is empty or longer than a
-    /// `u32` can say.
+    /// Builds the header of an image, signed with the key of this seed; `None` if the image is empty or its length
+    /// exceeds a `u32`.
     pub fn sign(parts: Parts, image: &[u8], seed: &[u8; 32]) -> Option<Self> {
         let length = u32::try_from(image.len()).ok().filter(|length| *length > 0)?;
         let mut hash = Sha512::new();
@@ -253,10 +253,10 @@ impl Header {
         Some(Self { signature, ..unsigned })
     }
 
-    /// Reads a header. Nothing is checked but its form.
+    /// Parses a header. Checks its form only, not the signature.
     ///
     /// # Errors
-    /// Why it is none.
+    /// The bytes are malformed.
     pub fn parse(bytes: &[u8; HEADER]) -> Result<Self, HeaderError> {
         let mut fields = Fields(bytes);
         let signature = fields.take();
@@ -322,8 +322,7 @@ impl Header {
         bytes
     }
 
-    /// Checks the signature. It takes some million instructions in one stretch: a board does it where no cell
-    /// waits.
+    /// Checks the signature. Blocks for some million instructions, so a board does it when no cell depends on it.
     ///
     /// # Errors
     /// It was signed with another key, or not at all.
@@ -331,7 +330,7 @@ impl Header {
         key.0.verify(&self.signed(), &Signature::from(&self.signature)).map_err(|_| Foreign)
     }
 
-    /// What it says beside length and hash.
+    /// Facts about the image except length and hash.
     pub fn parts(&self) -> &Parts {
         &self.parts
     }

@@ -1,4 +1,4 @@
-//! Where boards have their slots and stores: one table for loaders, firmware and the tool that signs.
+//! Flash layout of the boards: one table for loaders, firmware and the signing tool.
 
 use recipe_store::{Side, Slot};
 

@@ -13,44 +13,44 @@ use crate::header::{HEADER, Header, IMAGE_OFFSET};
 use crate::rules::{Downgrade, Refused, Running};
 use crate::{FIRST_WORD, SlotFlash, place};
 
-/// An update that is being received.
+/// An update being received.
 #[derive(Debug)]
 pub struct Receive {
     header: Header,
     phase: ReceivePhase,
-    /// Bytes of the image that were taken.
+    /// Bytes of the image received so far.
     taken: u32,
-    /// The word that they are collected in.
+    /// The word being filled.
     word: Word,
-    /// Number of bytes in it.
+    /// Number of bytes in `word`.
     collected: usize,
 }
 
-/// What to do next.
+/// The next step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ReceiveStep {
     /// Erase this sector of the slot.
     Erase(u8),
     /// Write this word of the slot.
     Write(Place, Word),
-    /// Give the bytes of the image from here on ([`Receive::take`]).
+    /// Supply bytes of the image from this offset on ([`Receive::take`]).
     Take {
-        /// Number of bytes that there are.
+        /// Number of bytes received so far.
         offset: u32,
     },
-    /// Nothing, but other tasks may be waiting.
+    /// Call again; a chance to let other tasks run.
     Again,
-    /// Nothing more: the slot holds the update, or nothing that can run.
+    /// The end: the slot holds the update, or nothing that can run.
     End(Result<(), ReceiveError>),
 }
 
-/// Why an update is not in its slot.
+/// Why receiving an update failed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum ReceiveError {
     /// A word reads differently than it was written.
     Worn(Place),
-    /// What was received is not what was signed.
+    /// The received image is not the signed one.
     Bad(BadImage),
 }
 
@@ -67,10 +67,10 @@ impl fmt::Display for ReceiveError {
 
 impl core::error::Error for ReceiveError {}
 
-/// Bytes came that are not the next ones.
+/// The bytes are not the next ones.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Gap {
-    /// Where the next ones begin.
+    /// Offset of the next bytes.
     pub expected: u32,
 }
 
@@ -105,12 +105,12 @@ enum ReceivePhase {
 }
 
 impl Receive {
-    /// Begins, if the update may be taken. `flash` is the slot that does not run.
+    /// Begins if the update may be installed. `flash` is the free slot.
     ///
-    /// The signature is not checked here but by [`Header::verify`], where it delays no cell, and by the loader.
+    /// The signature is checked elsewhere: by [`Header::verify`], when no cell depends on the board, and by the loader.
     ///
     /// # Errors
-    /// Why it is not taken; nothing was changed.
+    /// Why it may not be installed; nothing has changed.
     pub fn begin(
         header: Header,
         running: &Running,
@@ -125,21 +125,21 @@ impl Receive {
         Ok(Self { header, phase: ReceivePhase::Erase { sector: 0, end }, taken: 0, word: FILL, collected: 0 })
     }
 
-    /// What is received.
+    /// Header of the update.
     pub fn header(&self) -> &Header {
         &self.header
     }
 
-    /// Number of bytes of the image that were taken: where a lost connection goes on.
+    /// Number of bytes of the image received so far: where to resume.
     pub fn taken(&self) -> u32 {
         self.taken
     }
 
-    /// Takes bytes of the image, at most up to the next word, and returns how many. More are taken after
-    /// [`Receive::next`] was followed.
+    /// Accepts bytes of the image, at most up to the next word, and returns how many. [`Receive::next`] must be
+    /// followed before more are accepted.
     ///
     /// # Errors
-    /// They are not the next ones. Nothing was taken.
+    /// They are not the next ones. None were accepted.
     pub fn take(&mut self, offset: u32, bytes: &[u8]) -> Result<usize, Gap> {
         if offset != self.taken {
             return Err(Gap { expected: self.taken });
@@ -164,7 +164,7 @@ impl Receive {
         self.collected == WORD || self.collected > 0 && self.taken == self.header.length()
     }
 
-    /// What to do next; called again when that is done, until it is [`ReceiveStep::End`].
+    /// Returns the next step; called again when that is done, until [`ReceiveStep::End`].
     pub fn next(&mut self, flash: &impl SlotFlash) -> ReceiveStep {
         loop {
             match &mut self.phase {
@@ -181,7 +181,7 @@ impl Receive {
                         return ReceiveStep::Take { offset: self.taken };
                     }
                     let word = self.taken.saturating_sub(1).checked_div(WORD as u32).unwrap_or(0);
-                    // It was checked that the image has room.
+                    // The image was checked to fit into the slot.
                     let Some(at) = place(flash, FIRST_WORD.saturating_add(word)) else {
                         self.phase = ReceivePhase::End(Err(ReceiveError::Bad(BadImage::Crc)));
                         continue;

@@ -1,4 +1,4 @@
-//! Which update is refused before anything is erased, and which configurations a firmware on trial may keep.
+//! Rules for updates, checked before anything is erased, and for configurations stored during a trial.
 
 use core::fmt;
 
@@ -15,48 +15,48 @@ pub struct Running {
     pub board: BoardName,
     /// The slot it runs in.
     pub slot: Slot,
-    /// Its version.
+    /// Version of the running firmware.
     pub version: Version,
     /// The oldest and the newest version of the images in the store that may have to run after the update: the live
     /// one, the one before it, and the one on trial. `None` if there is none.
     pub kept: Option<(u32, u32)>,
 }
 
-/// What to do with an older firmware.
+/// Whether an older firmware is accepted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Downgrade {
     /// Refuse it.
     Refused,
-    /// Take it: somebody has asked for it.
+    /// Accept it: requested explicitly.
     Allowed,
 }
 
-/// Why an update is not taken.
+/// Why an update may not be installed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Refused {
     /// It cannot run in the free slot of this board.
     Bad(BadImage),
-    /// It is older than what runs.
+    /// It is older than the running firmware.
     Older {
-        /// Its version.
+        /// Version of the update.
         offered: Version,
-        /// The version that runs.
+        /// Version of the running firmware.
         running: Version,
     },
-    /// It would not read the configurations of this board.
+    /// It cannot read the configurations of this board.
     Format {
-        /// The version of a configuration that is kept.
+        /// Version of a stored configuration.
         kept: u32,
-        /// What the update reads.
+        /// Versions that the update reads.
         reads: Formats,
     },
-    /// It would not read the store of this board.
+    /// It cannot read the store of this board.
     Store {
         /// The version that it reads.
         offered: u32,
     },
-    /// A firmware is on trial: the other slot is the way back.
+    /// A firmware is on trial: the other slot is needed to fall back.
     OnTrial,
     /// The running slot is not marked as the good one. There is no loader, or something went wrong.
     NotGood,
@@ -90,7 +90,7 @@ impl fmt::Display for Refused {
 impl core::error::Error for Refused {}
 
 impl Running {
-    /// Whether an update may be written into the free slot.
+    /// Checks that an update may be written to the free slot.
     ///
     /// # Errors
     /// Why it may not be installed.
@@ -112,7 +112,7 @@ impl Running {
         if offered < running && downgrade == Downgrade::Refused {
             return Err(Refused::Older { offered, running });
         }
-        // Also if a downgrade was asked for: nobody asks for silent buses.
+        // Even for a requested downgrade: without a configuration the buses would be silent.
         let reads = header.parts().formats;
         if let Some((oldest, newest)) = self.kept {
             for kept in [oldest, newest] {
@@ -129,8 +129,8 @@ impl Running {
     }
 }
 
-/// Whether a configuration image of this version may be kept. While a firmware is on trial, the one before has to
-/// read it too: otherwise a roll back would leave the board without its configuration.
+/// Whether a configuration image of this version may be stored. During a trial the previous firmware must be able to
+/// read it too, or falling back would leave the board without its configuration.
 pub fn may_keep(version: u32, running: &Formats, before: Option<&Formats>, marks: SlotMarks) -> bool {
     let is_read_before = before.is_none_or(|before| before.reads(version));
     running.reads(version) && (marks.trial.is_none() || is_read_before)
