@@ -328,14 +328,14 @@ mod timer {
 
     pub(super) fn start() {
         for (register, value) in [(RELOAD, u32::MAX), (VALUE, u32::MAX), (CTRL, 1)] {
-            // SAFETY: registers of a timer that nobody else uses; it writes to no memory.
+            // SAFETY: registers of a timer that nothing else uses; it accesses no memory.
             unsafe { core::ptr::with_exposed_provenance_mut::<u32>(register).write_volatile(value) }
         }
     }
 
     #[inline(always)]
     pub(super) fn ticks() -> u32 {
-        // SAFETY: as above; reading it changes nothing.
+        // SAFETY: a register of a timer that nothing else uses; reading it has no effect.
         unsafe { core::ptr::with_exposed_provenance::<u32>(VALUE).read_volatile() }
     }
 

@@ -1,7 +1,7 @@
 //! The loader of a board: runs the firmware in one of two slots (docs/update.md section 4).
 //!
 //! In: the marks of the store, and what the slots hold. Out: a running firmware, with the watchdog started, or a
-//! LED or a line of text because nothing can run. What it decides is in `recipe-update`; here are the boards.
+//! LED or a line of text because nothing can run. The decisions are in `recipe-update`; the boards are here.
 #![cfg_attr(target_os = "none", no_std, no_main)]
 
 #[cfg(target_os = "none")]

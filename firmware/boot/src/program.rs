@@ -1,4 +1,4 @@
-//! The program.
+//! The loader's program.
 
 use core::fmt;
 use core::panic::PanicInfo;
@@ -9,7 +9,7 @@ use recipe_update::{BoardName, Machine, PublicKey, Slot, choose};
 
 use crate::board::{self, Area, BOARD};
 
-/// The public key that firmware is signed for, behind a mark: at a fixed place (loader.x), where the firmware reads it.
+/// Public key of the firmware, behind a mark, at a fixed address (loader.x) where the firmware reads it.
 #[unsafe(link_section = ".update_key")]
 #[used]
 static KEY: MarkedKey = MarkedKey { mark: *b"RGUK", key: include!(concat!(env!("OUT_DIR"), "/key.rs")) };
@@ -23,16 +23,16 @@ struct MarkedKey {
 #[cortex_m_rt::entry]
 fn main() -> ! {
     board::start();
-    match chosen() {
+    match vectors() {
         Some(vectors) => run(vectors),
         None => board::nothing_runs(),
     }
 }
 
-/// The vector table of the firmware to be run. Not inlined, so that the stack of the signature is free again.
+/// Vector table of the firmware to run. Not inlined, to free the stack of the signature check.
 #[inline(never)]
-fn chosen() -> Option<u32> {
-    // SAFETY: called once.
+fn vectors() -> Option<u32> {
+    // SAFETY: `vectors` is called once.
     let (slots, stores) = unsafe { (board::slots()?, board::stores()) };
     let mut board = LoaderBoard { slots, store: stores.and_then(mount) };
     let marks = board.store.as_ref().map(|mounted| mounted.store.slots());
@@ -48,7 +48,7 @@ struct MountedStore {
     flash: Area,
 }
 
-/// A board with one bank has one place.
+/// Mounts the store. A board with one bank has one place for it.
 fn mount((first, second): (Area, Option<Area>)) -> Option<MountedStore> {
     let Some(second) = second else {
         return Some(MountedStore { store: Store::mount(&first).ok()?, flash: first });
@@ -79,7 +79,7 @@ impl Machine for LoaderBoard {
 
     fn mark(&mut self, marks: SlotMarks) -> bool {
         let Some(MountedStore { store, flash }) = &mut self.store else { return false };
-        // Nothing in it waits for anything but the flash, and the flash is waited for in place.
+        // The future only waits for the flash, whose operations block.
         store.mark_slots(marks).is_ok_and(|put| block_on(put.execute(flash)).is_ok())
     }
 
@@ -88,11 +88,11 @@ impl Machine for LoaderBoard {
     }
 }
 
-/// Leaves the board to the firmware.
+/// Jumps to the firmware.
 fn run(vectors: u32) -> ! {
     board::leave();
-    // SAFETY: the image was checked, and nothing of the loader is used any more. The image begins with a vector table,
-    // which is aligned for the 166 vectors of the STM32H743, and for the fewer of QEMU's board.
+    // SAFETY: the image was checked, and nothing of the loader is used afterwards. The image begins with its vector
+    // table, aligned for the 166 vectors of the STM32H743 and the fewer ones of QEMU's board.
     unsafe {
         (*cortex_m::peripheral::SCB::PTR).vtor.write(vectors);
         cortex_m::asm::dsb();
@@ -101,7 +101,7 @@ fn run(vectors: u32) -> ! {
     }
 }
 
-/// The watchdog ends it, and a fault in the same way.
+/// Waits for the watchdog's reset, like a fault.
 #[panic_handler]
 fn panic(_: &PanicInfo<'_>) -> ! {
     loop {

@@ -135,7 +135,7 @@ impl Emulator {
 
     fn set_numbered(self, number: i32, value: u32) {
         let value = u64::from(value);
-        // SAFETY: as above.
+        // SAFETY: the library reads at most the 64 bits of `value`; all registers of `Reg` have 32.
         unsafe { (self.api.reg_write)(self.uc, number, (&raw const value).cast()) };
     }
 
@@ -245,7 +245,7 @@ impl Core {
 
     fn set_access(&self, address: u32, size: u32, access: u32) -> Result<(), String> {
         let Emulator { api, uc } = self.engine;
-        // SAFETY: as above.
+        // SAFETY: the library only changes rights of its own memory; a range that is not mapped is an error.
         checked("uc_mem_protect", unsafe { (api.protect)(uc, address.into(), size.into(), access) })?;
         self.flush_rights()
     }

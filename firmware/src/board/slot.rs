@@ -7,7 +7,7 @@ unsafe extern "C" {
     static _slot: u8;
 }
 
-/// `None` for a program that was linked for a board without a loader.
+/// The slot that the program was linked for; `None` without a loader.
 pub(super) fn running() -> Option<Slot> {
     match (&raw const _slot).addr() {
         1 => Some(Slot::A),

@@ -1,4 +1,4 @@
-//! The stack of any board: its guard, and how much of it was used. The linker script places both.
+//! Stack guard and measurement of stack use, for all boards. The linker script places the stack and its guard.
 
 use cortex_m::peripheral::MPU;
 

@@ -52,7 +52,7 @@ pub struct SlotMarks {
 /// A trial of a firmware.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SlotTrial {
-    /// Its place.
+    /// Slot on trial.
     pub slot: Slot,
     /// Remaining starts.
     pub attempts: u8,

@@ -1,4 +1,5 @@
-//! A broker, a time server and a device that the test plays; the first two are at the controller's address. Bytes are read
+//! A broker, a time server and a device that the test plays; the first two are at the controller's address. Bytes are
+//! read
 //! here by a reader that knows nothing of `recipe-sparkplug`.
 
 use recipe_chip_model::device::{MILLI, Picos};

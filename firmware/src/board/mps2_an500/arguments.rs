@@ -6,7 +6,7 @@ use core::ffi::CStr;
 
 use semihosting::experimental::env;
 
-/// Passes one of the arguments to `look`.
+/// Passes argument `nth` to `look`.
 pub(crate) fn argument<T>(nth: usize, look: impl FnOnce(&str) -> T) -> Option<T> {
     let args = env::args::<MAX_ARGUMENTS>().ok()?;
     (&args).nth(nth).and_then(Result::ok).map(look)
@@ -17,7 +17,7 @@ pub(crate) fn argument<T>(nth: usize, look: impl FnOnce(&str) -> T) -> Option<T>
 pub(crate) struct Name([u8; MAX_ARGUMENTS + 1]);
 
 impl Name {
-    /// That of an argument; `None` if there is none.
+    /// The name in an argument; `None` if there is none.
     pub(crate) fn argument(nth: usize) -> Option<Self> {
         let name = argument(nth, |path| {
             let mut name = [0; MAX_ARGUMENTS + 1];
@@ -27,7 +27,7 @@ impl Name {
         name.flatten()
     }
 
-    /// As files are opened by it.
+    /// The NUL-terminated name for semihosting.
     pub(crate) fn as_c_str(&self) -> &CStr {
         CStr::from_bytes_until_nul(&self.0).unwrap_or_default()
     }

@@ -7,7 +7,7 @@ use super::arguments::Name;
 
 /// The button.
 pub(crate) struct Button {
-    /// Without one there is no button.
+    /// `None` if no file is named: no button.
     name: Option<Name>,
 }
 

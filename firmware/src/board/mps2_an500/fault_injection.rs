@@ -13,7 +13,7 @@ use crate::start::Tasks;
 
 #[derive(Debug, Clone, Copy)]
 enum InjectedFault {
-    /// Waits for ever without answering the watchdog's checks.
+    /// Waits forever without answering the watchdog's checks.
     Stall,
     /// Never yields.
     Spin,
@@ -24,7 +24,7 @@ enum InjectedFault {
     Fault,
 }
 
-/// Starts the fault that was asked for.
+/// Starts the requested fault.
 pub(super) fn start(tasks: &Tasks) {
     let asked = argument(2, |name| {
         Some(match name {

@@ -11,13 +11,13 @@ use super::super::slot::running;
 use super::arguments::Name;
 use super::host_flash::HostFlash;
 
-/// The store: two sectors, as the NUCLEO has them.
+/// The store: two sectors like those of the NUCLEO.
 pub(crate) struct StoreFile {
     flash: HostFlash,
     record: &'static mut [u8; MAX_DATA],
 }
 
-/// Opens the store, or makes it; called once.
+/// Opens or creates the store; called once.
 pub(super) fn store() -> Option<StoreFile> {
     static RECORD: ConstStaticCell<[u8; MAX_DATA]> = ConstStaticCell::new([0; MAX_DATA]);
     let Some(flash) = HostFlash::open(&Name::argument(STORE)?, 0, STORE_SECTORS) else {

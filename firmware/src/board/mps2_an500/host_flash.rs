@@ -1,4 +1,4 @@
-//! Flash in a file of the host, with sectors and words as the NUCLEO has them. No word of it is ever torn.
+//! Flash in a file of the host, with the NUCLEO's sectors and words. Words are never torn.
 //!
 //! The loader has this file too (firmware/boot/src/board/mps2_an500/mod.rs).
 
@@ -14,7 +14,7 @@ use super::arguments::Name;
 
 /// Words of a sector.
 const WORDS: u16 = 4096;
-/// Words that are read at once: each access to the file is a trap.
+/// Words per read: each access to the file is a trap.
 const PAGE: usize = 32;
 
 /// A part of a file.
@@ -34,7 +34,7 @@ impl fmt::Debug for HostFlash {
 }
 
 impl HostFlash {
-    /// So many sectors of a file, which is made if it does not exist. `None` if it cannot be.
+    /// Opens `sectors` sectors of a file, which is created if it does not exist; `None` on failure.
     pub(crate) fn open(name: &Name, start: u32, sectors: u8) -> Option<Self> {
         let name = name.as_c_str();
         let opened = File::options().read(true).write(true).open(name);
@@ -64,7 +64,7 @@ impl HostFlash {
         true
     }
 
-    /// What is behind the end of the file is blank.
+    /// Bytes beyond the end of the file read as blank.
     fn read_page(&self, offset: u64) -> [u8; PAGE * WORD] {
         let mut bytes = [0xFF; PAGE * WORD];
         let mut file = self.file.borrow_mut();
@@ -98,10 +98,10 @@ impl Flash for HostFlash {
     }
 
     async fn write(&mut self, place: Place, word: &Word) {
-        // Bits of flash are only cleared: what is written twice reads as neither, and is found.
+        // As in flash, writing only clears bits, so a second write is detected.
         let mut kept = self.read(place);
         kept.iter_mut().zip(word).for_each(|(kept, byte)| *kept &= byte);
-        // What is missing shows when it is read back.
+        // A failed write is found when it is read back.
         let _ = self.write_at(self.offset(place), &kept);
     }
 

@@ -26,7 +26,7 @@ impl fmt::Display for StorageError {
             Self::NoName => f.write_str("no configuration: give its path as the second semihosting argument"),
             Self::Unreadable => {
                 f.write_str("cannot read the configuration file")?;
-                // The host still has the name.
+                // The user knows the name of the file.
                 argument(1, |path| write!(f, " {path}")).unwrap_or(Ok(()))
             }
         }

@@ -59,8 +59,8 @@ impl TimerState {
         u64::from(self.rounds) << 32 | u64::from(counter)
     }
 
-    /// Wakes what is due and sets the alarm for what is next: one access, since each one to this timer costs the emulator
-    /// some microseconds.
+    /// Wakes expired timers and sets the alarm for the next: one access, since each costs the emulator some
+    /// microseconds.
     fn rearm(&mut self) {
         let now = self.now();
         let next = self.queue.next_expiration(now);
@@ -95,7 +95,7 @@ pub(super) fn on_alarm() {
     CLOCK.with(TimerState::rearm);
 }
 
-/// Lets a timer of the emulator expire soon ([`super::LanRegisters`]).
+/// Makes a timer of the emulator expire soon ([`super::LanRegisters`]).
 pub(super) fn wake_emulator() {
     const LOAD: u32 = DUAL_TIMER;
     const CONTROL: u32 = DUAL_TIMER + 0x8;

@@ -36,7 +36,7 @@ const CTRL_RX_IRQ: u32 = 8;
 const INT_TX: u32 = 1;
 const INT_RX: u32 = 2;
 
-/// The only handle of a UART.
+/// The unique handle of a UART.
 #[derive(Debug)]
 pub(crate) struct Uart(usize);
 
@@ -131,8 +131,8 @@ impl Uart {
             write(uart.base + BAUDDIV, 16);
             write(uart.base + CTRL, CTRL_TX | CTRL_RX | CTRL_RX_IRQ);
             uart.drain();
-            // What a multiplexer of QEMU's has kept since before comes when the register is read, and else only behind the
-            // next byte.
+            // QEMU's multiplexer delivers input from before the start when the register is read, otherwise only after
+            // the next byte.
             let _ = read(uart.base + DATA);
         });
         let irq = 2 * port as u16;

@@ -41,7 +41,7 @@ impl FeedWatchdog for Watchdog {
     }
 }
 
-/// Half of the period has passed.
+/// First timeout: half of the period has passed.
 #[cortex_m_rt::exception]
 unsafe fn NonMaskableInt() {
     console::print(format_args!("the watchdog was not fed\r\n"));

@@ -10,7 +10,7 @@ pub(crate) struct Button(Input<'static>);
 
 impl Button {
     pub(super) fn new(pin: Peri<'static, PC13>) -> Self {
-        // Beside the board's own resistor, so that it reads low also where that one is missing.
+        // Additional pull-down: reads low even if the board's own resistor is missing.
         Self(Input::new(pin, Pull::Down))
     }
 }

@@ -21,7 +21,7 @@ impl Registers for CanRegisters {
     }
 
     fn write(&self, offset: u8, value: u32) {
-        // SAFETY: as above; the controller accesses no memory but its message RAM.
+        // SAFETY: a register at an aligned offset; the controller accesses no memory but its message RAM.
         unsafe { FDCAN1.as_ptr().cast::<u8>().add(usize::from(offset)).cast::<u32>().write_volatile(value) }
     }
 
@@ -31,7 +31,7 @@ impl Registers for CanRegisters {
     }
 
     fn ram_write(&self, word: u16, value: u32) {
-        // SAFETY: as above.
+        // SAFETY: within the message RAM (checked below), which only the driver and the controller use.
         unsafe { FDCANRAM.as_ptr().cast::<u32>().add(usize::from(word)).write_volatile(value) }
     }
 }
@@ -71,7 +71,7 @@ pub(super) fn start(pins: CanPins, bitrate: u32) -> Result<CanDevice, McanError>
     let (mut rx, mut tx) = (Flex::new(pins.0), Flex::new(pins.1));
     rx.set_as_af_unchecked(FUNCTION, AfType::input(Pull::Up));
     tx.set_as_af_unchecked(FUNCTION, AfType::output(OutputType::PushPull, Speed::High));
-    // Dropping them would disconnect the pins.
+    // Dropping the pins would disconnect them.
     core::mem::forget((rx, tx));
     rcc::enable_and_reset::<peripherals::FDCAN1>();
     let clock = rcc::frequency::<peripherals::FDCAN1>().0;

@@ -18,7 +18,7 @@ pub(super) enum ClockSource {
     Internal,
 }
 
-/// Checks for the external clock; the initialisation would wait for it for ever.
+/// Checks for the external clock, for which the initialisation would wait forever.
 pub(super) fn source() -> ClockSource {
     RCC.cr().modify(|w| w.set_hsebyp(true));
     RCC.cr().modify(|w| w.set_hseon(true));

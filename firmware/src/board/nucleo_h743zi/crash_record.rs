@@ -39,7 +39,7 @@ fn record() -> &'static Record {
     core::hint::black_box(&RECORD)
 }
 
-/// Writes the text, as far as there is room; holds its length.
+/// Writes text, truncated at the capacity; holds its length.
 struct Writer(usize);
 
 impl Write for Writer {

@@ -1,7 +1,7 @@
 //! Ethernet: RMII with the board's LAN8742A, 100 Mbit/s full duplex.
 //!
-//! The driver waits for ever for the MAC's reset, which needs the PHY's 50 MHz, and for a PHY that may be missing.
-//! Both are checked with a limit before the driver is started.
+//! The driver would wait forever for the MAC's reset, which needs the PHY's 50 MHz, and for a missing PHY. Both are
+//! checked with a limit before the driver is started.
 
 use core::fmt;
 use core::future::Future;

@@ -1,9 +1,8 @@
-//! The flash of the stores and of the slots. What is written, the stores and the slot that the program does not run in,
-//! is in the bank that it does not run from, so it goes on while a sector is erased; only a store that another firmware has left in the wrong bank is read
-//! where the program runs. RM0433, "Embedded Flash memory".
+//! The flash of the stores and of the slots. Only the bank that the program does not run from is written, so the
+//! program continues while a sector is erased; a store that another firmware has left in the program's bank is only
+//! read. RM0433, "Embedded Flash memory".
 //!
-//! Not by the driver of `embassy-stm32`: that one copies from flash words that a power cut has torn, which is a
-//! bus fault.
+//! Not the driver of `embassy-stm32`, which would copy torn flash words: a bus fault.
 
 use core::future::Future;
 use core::pin::pin;
@@ -38,7 +37,7 @@ const FASTEST: u8 = 3;
 const ERASE: Wait = Wait { look: Duration::from_millis(2), limit: Duration::from_secs(4) };
 const WRITE: Wait = Wait { look: Duration::from_micros(100), limit: Duration::from_millis(10) };
 
-/// How often to look whether the bank is done, and when to give up.
+/// Polling interval and limit of an operation.
 struct Wait {
     look: Duration,
     limit: Duration,
@@ -57,7 +56,7 @@ const _: () = assert!(BOARD.slot_sectors == 5);
 /// The places for the store.
 ///
 /// # Safety
-/// They are made once.
+/// To be called once.
 pub(super) unsafe fn stores() -> Places<Area> {
     let place = |side: Side| {
         let [first, second] = STORES.sectors(side);
@@ -66,7 +65,7 @@ pub(super) unsafe fn stores() -> Places<Area> {
     let first = place(Side::First);
     match running() {
         Some(slot) => Places { first, second: Some(place(Side::Second)), own: Stores::of(slot) },
-        // Slot A may have been filled behind the back of such a program, but nothing of it runs.
+        // Without a loader, slot A may hold a firmware, but it does not run.
         None => Places { first, second: None, own: Side::First },
     }
 }
@@ -74,7 +73,7 @@ pub(super) unsafe fn stores() -> Places<Area> {
 /// The slots.
 ///
 /// # Safety
-/// They are made once.
+/// To be called once.
 pub(super) unsafe fn slots() -> Site<Area> {
     let slots = match (running(), key()) {
         (Some(running), Some(key)) => {
@@ -107,7 +106,7 @@ fn key() -> Option<[u8; 32]> {
 }
 
 impl Area {
-    /// Address of a word; that of the first for one that there is not.
+    /// Address of a word; that of the first sector if the sector does not exist.
     fn address(&self, Place { sector, word }: Place) -> usize {
         let [first, ..] = self.sectors;
         let start = self.sectors.get(usize::from(sector)).copied().unwrap_or(first);
@@ -126,11 +125,11 @@ fn unlock(bank: usize) {
     if bank.cr().read().lock() {
         KEYS.into_iter().for_each(|key| bank.keyr().write_value(key));
     }
-    // Flags of an earlier operation, or of reading a torn word, would refuse this one.
+    // Error flags of an earlier operation or of reading a torn word would block this one.
     bank.ccr().write_value(ALL_FLAGS);
 }
 
-/// Waits for the bank, then locks it. If it does not end in time, what was written is missing when it is read.
+/// Waits for the bank, then locks it. An operation that does not end in time is found when the word is read back.
 async fn finish(bank: usize, wait: Wait) {
     let begun = Instant::now();
     loop {

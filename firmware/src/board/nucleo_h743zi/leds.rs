@@ -17,7 +17,7 @@ impl StatusLed for Led {
     }
 }
 
-/// The LEDs with an owner.
+/// LEDs that are handed out.
 pub(super) struct Leds {
     pub(super) status: Led,
     pub(super) link: Led,

@@ -42,7 +42,7 @@ bind_interrupts!(struct Irqs {
 
 defmt::timestamp!("{=u64:us}", embassy_time::Instant::now().as_micros());
 
-/// The devices that were not handed out yet.
+/// Devices that have not been handed out.
 pub(crate) struct Board {
     serial: serial::Lines,
     can: Option<can::CanPins>,
@@ -103,7 +103,7 @@ impl platform::Board for Board {
         parts.start(Irqs, identity::ethernet_address(), led)
     }
 
-    /// It has been running since the reset.
+    /// The watchdog has been running since the reset.
     fn watchdog(&mut self) -> Watchdog {
         self.watchdog.take().expect("asked for once")
     }
@@ -169,9 +169,9 @@ fn main() -> ! {
         link: Some(leds.link),
         status: Some(leds.status),
         watchdog: Some(watchdog),
-        // SAFETY: made here and nowhere else.
+        // SAFETY: the only call; `main` runs once.
         stores: Some(unsafe { flash::stores() }),
-        // SAFETY: as above; the stores are elsewhere.
+        // SAFETY: the only call; slots and stores do not overlap (a test of the layout).
         slots: Some(unsafe { flash::slots() }),
         button: Some(button::Button::new(p.PC13)),
     };
@@ -196,7 +196,7 @@ fn log_start(source: clocks::ClockSource) {
     }
 }
 
-/// Also the end of a panic. Waits for the watchdog's reset, so that a debugger can be attached.
+/// Also reached by panics. Waits for the watchdog's reset, so that a debugger can be attached.
 #[cortex_m_rt::exception]
 unsafe fn HardFault(frame: &cortex_m_rt::ExceptionFrame) -> ! {
     Watchdog::ensure_running();

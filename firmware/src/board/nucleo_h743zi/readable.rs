@@ -1,7 +1,7 @@
 //! Whether a word of the flash can be read: one that a power cut has torn, or that was programmed twice, has no valid
 //! error correction code, and reading it is a bus fault. RM0433, "Embedded Flash memory".
 //!
-//! The loader has this file too (firmware/boot/src/main.rs).
+//! The loader has this file too (firmware/boot/src/board/nucleo_h743zi/mod.rs).
 
 use core::arch::asm;
 
@@ -22,7 +22,7 @@ pub(super) fn can_read(address: usize) -> bool {
         cortex_m::asm::isb();
         core::ptr::with_exposed_provenance::<u32>(address).read_volatile();
         cortex_m::asm::dsb();
-        // No flag was set before: where faults are not ignored they end the program.
+        // No flag was set before: elsewhere bus faults are not ignored and end the program.
         let faults = scb.cfsr.read() & CFSR_BUS;
         if faults != 0 {
             scb.cfsr.write(faults);

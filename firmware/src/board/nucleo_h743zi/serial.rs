@@ -22,7 +22,7 @@ impl Registers for UsartRegisters {
     }
 
     fn write(&self, offset: u8, value: u32) {
-        // SAFETY: as above; without DMA a USART touches no memory.
+        // SAFETY: a register at an aligned offset; without DMA a USART accesses no memory.
         unsafe { self.0.as_ptr().cast::<u8>().add(usize::from(offset)).cast::<u32>().write_volatile(value) }
     }
 }
@@ -32,7 +32,7 @@ static UART7_STATE: UsartShared = UsartShared::new();
 
 /// USART2's interrupt.
 pub(super) struct Usart2Interrupt;
-/// UART7's.
+/// UART7's interrupt.
 pub(super) struct Uart7Interrupt;
 
 impl Handler<typelevel::USART2> for Usart2Interrupt {
@@ -53,7 +53,7 @@ pub(super) struct UartPins {
     pub(super) uart7: (Peri<'static, PE8>, Peri<'static, PE7>, Peri<'static, PE9>),
 }
 
-/// The lines that were not handed out yet.
+/// Lines that have not been handed out.
 pub(super) struct Lines {
     usart2: Option<[Flex<'static>; 3]>,
     uart7: Option<[Flex<'static>; 3]>,

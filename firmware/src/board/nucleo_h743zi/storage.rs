@@ -46,11 +46,11 @@ impl fmt::Display for StorageError {
 pub(super) fn read() -> Result<&'static [u8], StorageError> {
     let start = &raw const _config_start;
     check(start.addr(), FLASH_WORD)?;
-    // SAFETY: readable flash, which is not written.
+    // SAFETY: one flash word, found readable; nothing writes this sector.
     let header = unsafe { core::slice::from_raw_parts(start, FLASH_WORD) };
     let len = image_len(header).map_or(FLASH_WORD, |len| len.clamp(HEADER, MAX_IMAGE));
     check(start.addr(), len)?;
-    // SAFETY: as above; an image is shorter than the region.
+    // SAFETY: `len` bytes were found readable and are not written; an image is shorter than the region.
     Ok(unsafe { core::slice::from_raw_parts(start, len) })
 }
 

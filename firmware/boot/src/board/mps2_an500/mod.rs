@@ -21,7 +21,7 @@ use recipe_update::{Chosen, IMAGE_OFFSET, Slot, SlotFlash};
 use arguments::Name;
 pub(crate) use host_flash::HostFlash as Area;
 
-/// Before anything is read.
+/// Runs before anything is read.
 pub(crate) fn start() {
     watchdog::start();
     console::start();
@@ -30,7 +30,7 @@ pub(crate) fn start() {
 /// The slots, A first.
 ///
 /// # Safety
-/// Called once, as on the other boards.
+/// To be called once, as on the other board.
 pub(crate) unsafe fn slots() -> Option<[Area; 2]> {
     let open = |slot: Slot| {
         let name = Name::argument(SLOTS)?;
@@ -46,18 +46,18 @@ pub(crate) unsafe fn slots() -> Option<[Area; 2]> {
 /// The place for the store.
 ///
 /// # Safety
-/// Called once, as on the other boards.
+/// To be called once, as on the other board.
 pub(crate) unsafe fn stores() -> Option<(Area, Option<Area>)> {
     let store = Area::open(&Name::argument(STORE)?, 0, STORE_SECTORS)?;
     Some((store, None))
 }
 
-/// Into the log.
+/// Writes a line to the log.
 pub(crate) fn say(line: fmt::Arguments<'_>) {
     console::print(format_args!("loader: {line}\r\n"));
 }
 
-/// Copies what was chosen to its address; returns that of its vector table.
+/// Copies the chosen image to its address; returns the address of its vector table.
 pub(crate) fn load(chosen: &Chosen, slots: &[Area; 2]) -> Option<u32> {
     let [a, b] = slots;
     let slot = match chosen.slot {
@@ -73,8 +73,8 @@ pub(crate) fn load(chosen: &Chosen, slots: &[Area; 2]) -> Option<u32> {
         let place = Place { sector, word: u16::try_from(word.checked_rem(words)?).ok()? };
         let bytes = slot.whole(place)?;
         let address = start.checked_add(nth.checked_mul(WORD as u32)?)?;
-        // SAFETY: RAM for programs, within the slot, because the header was checked to be for it: the loader is in
-        // front of the slots, and nothing else is in them.
+        // SAFETY: program RAM within the slot, as the header was checked to be for this slot. The loader lies before
+        // the slots, and nothing else lies in them.
         unsafe { core::ptr::with_exposed_provenance_mut::<[u8; WORD]>(address as usize).write(bytes) }
     }
     let trial = if chosen.is_trial { " on trial" } else { "" };
@@ -82,12 +82,12 @@ pub(crate) fn load(chosen: &Chosen, slots: &[Area; 2]) -> Option<u32> {
     Some(start)
 }
 
-/// Leaves everything to the firmware but the watchdog, which goes on: what hangs before it feeds it has used a start.
+/// Prepares for the firmware. The watchdog keeps running: a firmware that hangs before it feeds it has used a start.
 pub(crate) fn leave() {
     watchdog::feed();
 }
 
-/// Only another file of the slots helps.
+/// No slot can run: waits forever.
 pub(crate) fn nothing_runs() -> ! {
     say(format_args!("no slot holds a firmware that can run"));
     loop {

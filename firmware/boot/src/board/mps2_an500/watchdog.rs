@@ -1,7 +1,7 @@
 //! The watchdog: a counter that raises a non-maskable interrupt at its first zero and resets the machine at its second.
 //!
-//! It runs from the first instruction on, also over the start of the firmware: a firmware on trial that hangs before
-//! it has a watchdog of its own comes to an end too.
+//! It runs from the first instruction of the loader on and during the start of the firmware, so a firmware on trial that
+//! hangs before it sets up its own watchdog is reset too.
 
 use super::registers::{WATCHDOG, write};
 
@@ -15,7 +15,7 @@ const CONTROL_ON: u32 = 0b11;
 /// Cycles of 25 MHz until the counter is zero: 4 s, as the firmware has it.
 const HALF: u32 = 100_000_000;
 
-/// Starts it, with 8 s until the reset.
+/// Starts the watchdog with a timeout of 8 s.
 pub(crate) fn start() {
     write(LOCK, UNLOCK);
     write(LOAD, HALF);
@@ -23,13 +23,13 @@ pub(crate) fn start() {
     write(LOCK, 0);
 }
 
-/// Begins its time anew.
+/// Restarts the timeout.
 pub(crate) fn feed() {
     write(LOCK, UNLOCK);
     write(INTCLEAR, 1);
     write(LOCK, 0);
 }
 
-/// The emulator's host may be busy: the second half is left.
+/// First timeout: ignored, because the emulator's host may be busy. The second one resets.
 #[cortex_m_rt::exception]
 unsafe fn NonMaskableInt() {}

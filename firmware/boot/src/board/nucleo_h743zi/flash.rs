@@ -1,8 +1,8 @@
 //! The flash of slots and stores. RM0433, "Embedded Flash memory".
 //!
 //! A word that a power cut has torn has no valid error correction code, and reading it is a bus fault, so each word
-//! is first read once with bus faults ignored. While a word of the first bank is written the core stands still: the
-//! loader has nothing else to do.
+//! is first read once with bus faults ignored. Writing to the bank that the loader runs from stalls the core, which
+//! does not matter here.
 
 use core::sync::atomic::{Ordering, fence};
 
@@ -22,7 +22,7 @@ pub(crate) struct Area {
 
 impl Area {
     /// # Safety
-    /// Nothing else is made for this slot.
+    /// No other `Area` of this slot may exist.
     pub(crate) unsafe fn slot(slot: Slot) -> Self {
         let start = BOARD.slot(slot);
         let sectors = [0, 1, 2, 3, 4].map(|nth: u32| start.saturating_add(nth.saturating_mul(BOARD.sector)));
@@ -30,13 +30,13 @@ impl Area {
     }
 
     /// # Safety
-    /// Nothing else is made for this place.
+    /// No other `Area` of this place may exist.
     pub(crate) unsafe fn store(side: Side) -> Self {
         let [first, second] = STORES.sectors(side);
         Self { sectors: [first, second, second, second, second], count: 2 }
     }
 
-    /// Address of a word; that of the first for one that there is not.
+    /// Address of a word; that of the first sector if the sector does not exist.
     fn address(&self, Place { sector, word }: Place) -> usize {
         let [first, ..] = self.sectors;
         let start = self.sectors.get(usize::from(sector)).copied().unwrap_or(first);
@@ -49,7 +49,7 @@ const _: () = assert!(BOARD.slot_sectors == 5);
 impl SlotFlash for Area {
     fn whole(&self, place: Place) -> Option<Word> {
         let address = self.address(place);
-        // SAFETY: a word of the flash, which was readable just now; it is not written meanwhile.
+        // SAFETY: a word of flash that was just found readable; nothing writes it meanwhile.
         can_read(address)
             .then(|| unsafe { core::ptr::with_exposed_provenance::<Word>(address).read_volatile() })
     }
@@ -72,7 +72,7 @@ impl Flash for Area {
         barrier();
         let start = core::ptr::with_exposed_provenance_mut::<u32>(address);
         for (nth, part) in word.as_chunks().0.iter().enumerate() {
-            // SAFETY: within the word, in flash that is this area's; its bank is unlocked for it.
+            // SAFETY: within one word of this area's flash, which only this area writes; the bank is unlocked.
             unsafe { start.add(nth).write_volatile(u32::from_le_bytes(*part)) }
         }
         barrier();
@@ -103,7 +103,7 @@ struct FlashBank {
 impl FlashBank {
     fn of(address: usize) -> Self {
         let base = FLASH_REGISTERS + if address as u32 & BANK == 0 { 0 } else { 0x100 };
-        // SAFETY: the registers of the flash's banks, which the loader alone uses.
+        // SAFETY: registers of the flash interface; only this module writes them.
         let at = |offset: usize| unsafe { Register::at(base + offset) };
         Self { keys: at(0x04), control: at(0x0C), status: at(0x10), clear: at(0x14) }
     }
@@ -113,7 +113,7 @@ impl FlashBank {
         if self.control.read() & LOCK != 0 {
             KEYS.into_iter().for_each(|key| self.keys.write(key));
         }
-        // Flags of reading a torn word would refuse the operation.
+        // Error flags of reading a torn word would block the operation.
         self.clear.write(ALL_FLAGS);
     }
 
@@ -121,8 +121,8 @@ impl FlashBank {
         self.control.write(value);
     }
 
-    /// Waits for the bank, then locks it. If it never ends, the watchdog does it; if it did not succeed, it shows when
-    /// the word is read.
+    /// Waits for the bank, then locks it. A hang ends by the watchdog; a failed operation is found when the word is
+    /// read back.
     fn finish(&self) {
         while self.status.read() & BUSY != 0 {}
         self.clear.write(ALL_FLAGS);

@@ -3,11 +3,11 @@
 use super::register::Register;
 use super::watchdog;
 
-// SAFETY: registers of RCC and GPIOB, which the loader alone uses.
+// SAFETY: RCC_AHB4ENR; nothing else runs while the loader does.
 const CLOCKS: Register = unsafe { Register::at(0x5802_44E0) };
-// SAFETY: as above.
+// SAFETY: GPIOB_MODER; only this module writes it.
 const MODE: Register = unsafe { Register::at(0x5802_0400) };
-// SAFETY: as above.
+// SAFETY: GPIOB_BSRR; only this module writes it.
 const SET: Register = unsafe { Register::at(0x5802_0418) };
 
 const GPIOB: u32 = 1 << 1;
@@ -16,7 +16,7 @@ const OUTPUT: u32 = 1;
 /// At least a quarter of a second at 64 MHz.
 const QUARTER: u32 = 16_000_000;
 
-/// Blinks once or twice a second for ever: only a probe helps.
+/// Blinks once or twice a second forever: only a debug probe can recover the board.
 pub(crate) fn blink() -> ! {
     CLOCKS.write(CLOCKS.read() | GPIOB);
     // Enabling the clock takes two cycles.

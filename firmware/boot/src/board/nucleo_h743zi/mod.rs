@@ -16,11 +16,11 @@ use recipe_update::{Chosen, IMAGE_OFFSET, Slot};
 pub(crate) use flash::Area;
 pub(crate) use led::blink as nothing_runs;
 
-/// Before anything is read.
+/// Runs before anything is read.
 pub(crate) fn start() {
     watchdog::start();
     if let Some(mut core) = cortex_m::Peripherals::take() {
-        // Reading flash takes seven wait states after a reset.
+        // After a reset flash has seven wait states.
         core.SCB.enable_icache();
     }
 }
@@ -28,7 +28,7 @@ pub(crate) fn start() {
 /// The slots, A first.
 ///
 /// # Safety
-/// Called once.
+/// To be called once.
 pub(crate) unsafe fn slots() -> Option<[Area; 2]> {
     // SAFETY: each area is made once, and they do not overlap (a test of the layout).
     Some(Slot::ALL.map(|slot| unsafe { Area::slot(slot) }))
@@ -37,14 +37,14 @@ pub(crate) unsafe fn slots() -> Option<[Area; 2]> {
 /// The places for the store.
 ///
 /// # Safety
-/// Called once.
+/// To be called once.
 pub(crate) unsafe fn stores() -> Option<(Area, Option<Area>)> {
-    // SAFETY: as above.
+    // SAFETY: each place is made once; places and slots do not overlap (a test of the layout).
     let [first, second] = [Side::First, Side::Second].map(|side| unsafe { Area::store(side) });
     Some((first, Some(second)))
 }
 
-/// What became of a trial is in the marks.
+/// No log: the marks say what became of a trial.
 pub(crate) fn say(_: fmt::Arguments<'_>) {}
 
 /// The address of the vector table of what was chosen.
@@ -52,9 +52,9 @@ pub(crate) fn load(chosen: &Chosen, _: &[Area; 2]) -> Option<u32> {
     Some(BOARD.slot(chosen.slot).saturating_add(IMAGE_OFFSET))
 }
 
-/// Leaves everything to the firmware but the watchdog, which goes on: what hangs before it feeds it has used a start.
+/// Prepares for the firmware. The watchdog keeps running: a firmware that hangs before it feeds it has used a start.
 pub(crate) fn leave() {
     watchdog::feed();
-    // SAFETY: the loader ends here, so nothing of it is used any more.
+    // SAFETY: nothing else of the loader uses the core peripherals, and it ends here.
     unsafe { cortex_m::Peripherals::steal() }.SCB.disable_icache();
 }

@@ -1,15 +1,15 @@
 //! The independent watchdog. RM0433, "Independent watchdog".
 //!
-//! It runs from the first instruction on, also over the start of the firmware: a firmware on trial that hangs before
-//! it has a watchdog of its own comes to an end too.
+//! It runs from the first instruction of the loader on and during the start of the firmware, so a firmware on trial that
+//! hangs before it sets up its own watchdog is reset too.
 
 use super::register::Register;
 
-// SAFETY: registers of IWDG1, which the loader alone uses.
+// SAFETY: IWDG_KR; only this module writes it.
 const KEY: Register = unsafe { Register::at(0x5800_4800) };
-// SAFETY: as above.
+// SAFETY: IWDG_PR; only this module writes it.
 const PRESCALER: Register = unsafe { Register::at(0x5800_4804) };
-// SAFETY: as above.
+// SAFETY: IWDG_SR, read-only.
 const STATUS: Register = unsafe { Register::at(0x5800_480C) };
 
 const START: u32 = 0xCCCC;
@@ -18,13 +18,13 @@ const UNLOCK: u32 = 0x5555;
 /// Cycles of LSI divided by 64: with the reload of a reset, 4096, that is 8.2 s.
 const BY_64: u32 = 4;
 
-/// Starts it, with 8 s until the reset.
+/// Starts the watchdog with a timeout of 8 s.
 pub(crate) fn start() {
     KEY.write(START);
     KEY.write(UNLOCK);
     PRESCALER.write(BY_64);
-    // The firmware writes it too, and may not before this was taken. It takes five cycles of LSI, and is looked for
-    // a thousand times as long: without LSI there is no watchdog, and a firmware all the same.
+    // Wait until the prescaler is taken over, because the firmware writes it too. That takes five cycles of LSI; the
+    // limit is about a thousand times as long. Without LSI there is no watchdog, and the firmware runs without it.
     for _ in 0..LOOKS {
         if STATUS.read() == 0 {
             break;
@@ -33,7 +33,7 @@ pub(crate) fn start() {
     feed();
 }
 
-/// Begins its time anew.
+/// Restarts the timeout.
 pub(crate) fn feed() {
     KEY.write(FEED);
 }
