@@ -31,15 +31,15 @@ fn main() {
 
 /// The slot to link for, a or b (docs/update.md section 2).
 const SLOT: &str = "FIRMWARE_SLOT";
-/// Size of a slot, and of what is before the image.
+/// Size of a slot, and of the header before the image.
 const SIZE: u32 = 640 << 10;
 const HEADER: u32 = 1 << 10;
 
-/// Where a board has its programs.
+/// Addresses of programs on a board.
 struct ImagePlaces {
     /// Addresses of the slots A and B. `host-sim ctl sign` compares with its own table of them.
     slots: [u32; 2],
-    /// Of a program without a slot: address, and the room up to what is something else.
+    /// A program without a slot: its address and maximum size.
     whole: (u32, u32),
 }
 
@@ -74,7 +74,7 @@ impl ImagePlaces {
     }
 }
 
-/// Where the program is. `_slot` is 1 for slot A, 2 for slot B, 0 without one.
+/// Address of the program. `_slot` is 1 for slot A, 2 for slot B, 0 without a slot.
 fn program(slot: u32, start: u32, length: u32) -> String {
     format!("MEMORY {{ FLASH : ORIGIN = {start:#010X}, LENGTH = {length} }}\n_slot = {slot};\n")
 }

@@ -1,12 +1,11 @@
 //! Counts the instructions of engine passes on a Cortex-M7: `counts IMAGE`, named as a semihosting
 //! argument; IMAGE is the configuration image of `counts.toml` (docs/performance.md section 2).
 //!
-//! `counts IMAGE NAME` does only what has this name, ten times: for a profile (`firmware/shares.py`). Blanks of the
-//! name are underscores there, because arguments end with a blank.
+//! `counts IMAGE NAME` runs only this measurement, ten times, for a profile (`firmware/shares.py`). Write blanks of the
+//! name as underscores, because arguments end at a blank.
 //!
-//! With `-icount shift=6` an instruction takes 64 ns of QEMU's time, which is 1.6 ticks of a 25 MHz
-//! timer: counts are right to the instruction and the same in every run. Each line that is printed has the
-//! mean of many passes, the most that one took, and what they did.
+//! With `-icount shift=6` an instruction takes 64 ns of QEMU's time, which is 1.6 ticks of a 25 MHz timer: counts are
+//! exact and reproducible. Each printed line has the mean and maximum of many passes, and their name.
 #![no_std]
 #![no_main]
 
@@ -29,20 +28,20 @@ const DEVICES: PortId = PortId(2);
 const DISPLAY: PortId = PortId(3);
 const UDP: LinkId = LinkId::RECIPE_UDP;
 
-/// Passes of each work: long enough that what happens now and then has its part in the mean.
+/// Passes per measurement: enough for rare events to count in the mean.
 const PASSES: u32 = 1000;
-/// The same for a profile, in which each instruction is a line.
+/// Passes for a profile, in which each instruction is a line.
 const PROFILED: u32 = 10;
-/// The time between two passes where it does not matter.
+/// Time between two passes.
 const STEP: Duration = Duration::from_micros(50);
 const CYCLE: Duration = Duration::from_millis(4);
-/// Fresh enough for what is sent to the field.
+/// Period of state packets: fresh enough for frames to the field.
 const STATE_EACH: u32 = 16;
 
-/// Does something once and returns the ticks of what is counted of it.
+/// Runs one pass and returns its ticks.
 type Measurement = fn(&mut EngineBench) -> u32;
 
-/// What it is called, the ports that send each cycle, what is done.
+/// Name, ports that send each cycle, pass.
 const MEASUREMENTS: [(&str, &[PortId], Measurement); 14] = [
     ("28-byte stream frame to its frame over UDP", &[], EngineBench::sensor_frame),
     ("the same frame in four chunks", &[], |bench| bench.sensor_chunks(7)),
@@ -133,7 +132,7 @@ fn print(name: &str, mean: u64, most: u64) {
 }
 
 impl EngineBench {
-    /// An engine that knows nothing yet, of ports of which some send each cycle.
+    /// An engine before any event; `ports` send each cycle.
     fn set_up(&mut self, image: &[u8], config: &mut GatewayConfig, cycles: &[PortId]) {
         if let Err(error) = image::decode_into(image, config) {
             bare::fail("configuration", &error);
@@ -148,7 +147,7 @@ impl EngineBench {
         self.connect();
     }
 
-    /// Everything is there and was heard of.
+    /// Brings up all links and ports.
     fn connect(&mut self) {
         self.pass(Input::Tick);
         for nth in 0..4 {
@@ -161,7 +160,7 @@ impl EngineBench {
         self.state_packet();
     }
 
-    /// One input and everything that comes of it, in ticks.
+    /// Ticks of one input and all its outputs.
     fn pass(&mut self, input: Input<'_>) -> u32 {
         self.now += STEP;
         self.sent = 0;
@@ -174,7 +173,7 @@ impl EngineBench {
         self.sensor_chunks(28)
     }
 
-    /// A frame in chunks of so many bytes: all of them together.
+    /// Ticks of a frame in chunks of `size` bytes.
     fn sensor_chunks(&mut self, len: usize) -> u32 {
         let frame: [u8; 28] = black_box(*b"\x48\xAA............floats......\x0D\x0A");
         let ticks = frame.chunks(len).map(|chunk| self.pass(Input::PortBytes { port: SENSOR, bytes: chunk }));
@@ -184,7 +183,7 @@ impl EngineBench {
         ticks
     }
 
-    /// A frame, and what becomes of the request that it led to.
+    /// Ticks of a frame and the completion of its request.
     fn plc_frame(&mut self) -> (u32, [u32; 2]) {
         let frame: [u8; 28] = black_box(*b"\xFF\xFF........twelve words....\xEE\xEE");
         let request = self.pass(Input::PortBytes { port: PLC, bytes: &frame });
@@ -201,7 +200,7 @@ impl EngineBench {
         request
     }
 
-    /// The transport took the request, and the controller did what it was asked to.
+    /// The request is sent and the controller confirms it.
     fn answer(&mut self) -> [u32; 2] {
         let report = self.pass(Input::LinkSent { link: LinkId::MODBUS });
         let mut answer = [0; 12];
@@ -215,7 +214,7 @@ impl EngineBench {
         self.pass(Input::LinkBytes { link: LinkId::STATE, bytes: &packet })
     }
 
-    /// As TCP brings it over Ethernet where a window is not a multiple of a packet.
+    /// Segments as TCP delivers them when a window is not a multiple of a packet.
     fn state_segments(&mut self) -> u32 {
         let packet = black_box(self.packet);
         let ticks =
@@ -231,7 +230,7 @@ impl EngineBench {
         self.pass(Input::LinkSent { link: UDP })
     }
 
-    /// The instant comes, and nothing else.
+    /// Ticks of a timer event alone.
     fn cycle(&mut self, port: PortId) -> u32 {
         if self.passes.is_multiple_of(STATE_EACH) {
             self.state_packet();
@@ -244,7 +243,7 @@ impl EngineBench {
         ticks
     }
 
-    /// What was counted was what the name says.
+    /// Checks that the pass did what its name says.
     fn look(&self, name: &str) {
         for link in self.engine.links() {
             let counters = link.counters;
@@ -263,7 +262,7 @@ impl EngineBench {
     }
 }
 
-/// As the firmware's gateway does it; not inlined, so that it is made for no input in particular.
+/// Like the firmware's gateway; not inlined, so that it is not specialised for an input.
 #[inline(never)]
 fn pass(
     engine: &mut Engine,
@@ -277,7 +276,7 @@ fn pass(
     }
     loop {
         match engine.poll_output(now, out) {
-            // As the firmware does it: the tick that is due comes behind what has arrived.
+            // Like the firmware: a due tick comes after received input.
             Output::Sleep { until } if until <= now => {
                 engine.handle(now, Input::Tick);
             }
@@ -293,7 +292,7 @@ fn pass(
 
 /// Ends the program when instructions are not counted.
 fn calibrate() {
-    // Written out, because the compiler has to know how long it is: it puts constants before and behind.
+    // Unrolled, so that its length is known: the compiler places constants around it.
     macro_rules! ten_of {
         ($text:expr) => {
             concat!($text, $text, $text, $text, $text, $text, $text, $text, $text, $text)
@@ -344,7 +343,7 @@ mod timer {
         begin.wrapping_sub(ticks())
     }
 
-    /// Ticks between two looks with nothing between them.
+    /// Ticks between two readings with nothing between them.
     #[inline(never)]
     pub(super) fn overhead() -> u32 {
         let begin = ticks();

@@ -1,7 +1,7 @@
-//! The engine of `proto-core` in the size of a board.
+//! The engine of `proto-core` with the capacities of a board.
 //!
-//! It is a type of its own so that its code is made here, with this crate's optimisation: that of the firmware is
-//! for size. Nothing is decided here; each method is the engine's.
+//! A type of its own, so that its code is generated in this crate, with its optimisation level: the firmware is
+//! compiled for the smallest size (`z`). Each method only calls the engine's.
 #![no_std]
 #![forbid(unsafe_code)]
 
@@ -20,28 +20,28 @@ pub const MAX_UPLINKS: usize = 2;
 pub const MAX_FIELDS: usize = 128;
 /// Exchanges with devices, over all ports.
 pub const MAX_EXCHANGES: usize = 32;
-/// Bytes of the ring of frames for a client that follows them: 25 ms of 960 sensor frames and 500 CAN frames a second.
+/// Capacity of the frame tap in bytes: 25 ms of 960 sensor frames and 500 CAN frames a second.
 pub const MAX_TAP: usize = 4096;
 /// Recipe links, and command, urgent commands, state and Modbus.
 pub const MAX_LINKS: usize = SizedEngine::MAX_LINKS;
 
-/// The engine itself: with all its methods, and made where it is used.
+/// The generic engine.
 pub type SizedEngine = AnyEngine<MAX_FIELD_PORTS, MAX_UPLINKS, MAX_FIELDS, MAX_TAP, MAX_EXCHANGES>;
 
-/// The engine in the size of a board. Its methods are those of [`proto_core::engine::Engine`].
+/// The engine with the capacities of a board. Its methods are those of [`proto_core::engine::Engine`].
 #[derive(Debug)]
 pub struct Engine(SizedEngine);
 
 impl Engine {
-    /// Without a configuration; all its bytes are zero.
+    /// An engine without a configuration; all zeros.
     pub const fn idle() -> Self {
         Self(SizedEngine::idle())
     }
 
-    /// Runs this configuration from now on.
+    /// Applies a configuration.
     ///
     /// # Errors
-    /// The engine refuses it, and is idle then.
+    /// The engine refuses it and is idle.
     #[inline]
     pub fn configure(&mut self, config: &GatewayConfig) -> Result<(), BuildError> {
         self.0.configure(config)
@@ -87,22 +87,22 @@ impl Engine {
         self.0.is_frame(link, datagram)
     }
 
-    /// How often the gateway itself slept.
+    /// Number of sleeps of the gateway.
     pub fn sleeps(&self) -> u32 {
         self.0.sleeps()
     }
 
-    /// Prepares the end of the engine: the safe values go out.
+    /// Prepares the end of the engine: sends the safe values.
     pub fn make_safe(&mut self) {
         self.0.make_safe();
     }
 
-    /// Whether the controller is known to have every safe value.
+    /// Whether the controller shows every safe value.
     pub fn is_safe(&self) -> bool {
         self.0.is_safe()
     }
 
-    /// The ring of frames.
+    /// The frame tap.
     pub fn tap(&mut self) -> &mut Tap<MAX_TAP> {
         self.0.tap()
     }

@@ -1,4 +1,4 @@
-//! Configurations: images of them, what is checked, what is decided.
+//! Configurations: images, checks, plans.
 
 use core::hint::black_box;
 

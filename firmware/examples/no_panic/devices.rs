@@ -41,7 +41,7 @@ fn device_encoding(encoding: Encoding) {
     if let Some(value) = encoding.fit(any(0.5), any(Overflow::Wrap)) {
         black_box(encoding.write(value, out_buf(&mut out)));
     }
-    // What fits in none of its kinds.
+    // A value outside the range of every encoding.
     black_box(encoding.write(any(f64::INFINITY), out_buf(&mut out)));
 }
 
@@ -94,7 +94,7 @@ fn device_framer(framer: &mut Framer, layout: &FrameLayout) {
     while let Some(found) = framer.next_frame(&mut chunk, any(9), |bytes| layout.probe(elements(), bytes)) {
         black_box(found);
     }
-    // A probe that keeps no promise.
+    // A checksum probe that returns arbitrary values.
     black_box(framer.next_frame(&mut chunk, any(9), |_| any(proto_core::device::Probe::No(1))));
     black_box(framer.held());
     black_box((framer.discard(), framer.stats()));

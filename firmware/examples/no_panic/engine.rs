@@ -14,12 +14,12 @@ use static_cell::ConstStaticCell;
 
 use crate::any;
 
-/// Stands in .bss: all its bytes are zero, which `.ci/run` looks at.
+/// All zeros: must be placed in .bss, which `.ci/run` checks.
 static ENGINE: ConstStaticCell<Engine> = ConstStaticCell::new(Engine::idle());
 
-/// One that can be listened to, with few exchanges.
+/// An engine with a tap and few exchanges.
 type EngineWithTap = AnyEngine<2, 1, 32, 2048, 4>;
-/// One that cannot have a conversation.
+/// An engine without exchanges.
 type PlainEngine = AnyEngine<2, 1, 32, 0, 0>;
 
 pub(crate) fn all() {

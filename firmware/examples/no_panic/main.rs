@@ -24,13 +24,13 @@ mod zeros;
 
 use core::hint::black_box;
 
-/// What a peer may send: neither the bytes nor how many there are is known to the compiler.
+/// Bytes of a peer; contents and length are unknown to the compiler.
 fn bytes() -> &'static [u8] {
     static BYTES: [u8; 2048] = [0; 2048];
     black_box(&BYTES[..])
 }
 
-/// A value of which only the type is known.
+/// A value unknown to the compiler.
 fn any<T>(value: T) -> T {
     black_box(value)
 }
@@ -64,20 +64,20 @@ fn exercise() {
     }
 }
 
-/// What is built: the environment variable `NO_PANIC` says it.
+/// Variant of the build, from the environment variable `NO_PANIC`.
 #[derive(Clone, Copy)]
 enum Variant {
     /// The proof: a panic does not link.
     Proof,
-    /// Only proto-core, whose stack is known: the others write texts, which goes through pointers.
+    /// Only proto-core, whose stack use is known; the others format text through function pointers.
     Core,
-    /// The same with an index that nobody checked, to see that the check can fail.
+    /// With an unchecked index, to show that the proof can fail.
     Provoked,
-    /// Panics link, so that it can be shown where they are.
+    /// Panics link, to show where they are.
     Shown,
-    /// The same, with what errors say of themselves: `core` prints it, and has panics of its own.
+    /// Also the `Display` of errors; `core`'s formatting contains panics.
     Words,
-    /// The same, with recipe-update: its signatures and hashes are a library's, which has panics of its own.
+    /// Also recipe-update; its library for signatures and hashes contains panics.
     Signed,
 }
 

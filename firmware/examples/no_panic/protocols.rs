@@ -45,7 +45,7 @@ fn modbus_client() {
     client.reset();
 }
 
-/// A register bank that takes and gives whatever the caller asks for.
+/// A register bank that accepts every address.
 pub(crate) struct Bank;
 
 impl RegisterBank for Bank {

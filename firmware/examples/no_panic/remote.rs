@@ -1,4 +1,4 @@
-//! The API of a gateway: what a client sends, in any order, and what it is answered.
+//! The API of a gateway: requests in any order, and replies.
 
 use core::fmt::Write;
 use core::hint::black_box;
@@ -25,7 +25,7 @@ use crate::{any, bytes};
 
 type Engine = proto_core::engine::Engine<2, 1, 32, 0, 4>;
 
-/// Takes any text, or refuses to.
+/// A writer that may fail at any time.
 struct Out;
 
 impl Write for Out {
@@ -58,7 +58,7 @@ pub(crate) fn all() {
     remote_metrics(black_box(gateway));
 }
 
-/// A text of which only the bytes are known to be UTF-8.
+/// A text unknown to the compiler.
 fn text() -> &'static str {
     str::from_utf8(bytes()).unwrap_or_default()
 }

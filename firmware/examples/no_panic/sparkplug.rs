@@ -1,4 +1,4 @@
-//! The edge node: what a broker and a time server send, settings as bytes, and what a gateway tells.
+//! The edge node: input from a broker and a time server, settings, samples.
 
 use core::hint::black_box;
 

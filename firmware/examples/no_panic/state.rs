@@ -1,4 +1,4 @@
-//! The state packet: out of a stream, as a view, as a value, into the image.
+//! The state packet: deframed, as a view, as a value, applied to the image.
 
 use core::hint::black_box;
 

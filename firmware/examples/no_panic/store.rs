@@ -1,4 +1,4 @@
-//! What a board keeps: flash that may hold anything.
+//! The store, on flash with arbitrary contents.
 
 use core::hint::black_box;
 
@@ -9,7 +9,7 @@ use recipe_store::{
 
 use crate::{any, bytes, out_buf};
 
-/// Flash of a size and contents that the compiler knows nothing about.
+/// Flash of unknown size and contents.
 pub(crate) struct Any;
 
 impl Flash for Any {
@@ -54,7 +54,7 @@ fn store_questions(store: &Store) {
     black_box(store.is_adopted(any(1), any(2)));
 }
 
-/// Which of two places counts, and the way from one to the other.
+/// The valid one of two places, and moves.
 #[inline(never)]
 fn store_move(store: &Store) {
     if let Ok(newest) = newest(&Any, &Any) {

@@ -1,4 +1,4 @@
-//! A firmware in two slots: headers, files and slots that may hold anything.
+//! Firmware updates: headers, files and slots with arbitrary contents.
 
 use core::fmt;
 use core::hint::black_box;

@@ -1,4 +1,4 @@
-//! What errors say of themselves.
+//! `Display` of errors.
 
 use core::fmt::{Display, Write};
 use core::hint::black_box;

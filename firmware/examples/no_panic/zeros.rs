@@ -1,5 +1,5 @@
-//! Configurations of several sizes as a board keeps them: statics that can change, are all zeros at first and
-//! take no flash. `.ci/run no-panic` looks where they lie and prints how much RAM they take.
+//! Configurations of several sizes as mutable statics that are all zeros and so take no flash. `.ci/run no-panic`
+//! checks their sections and prints their sizes.
 
 use core::cell::Cell;
 use core::hint::black_box;
@@ -10,10 +10,10 @@ use proto_core::config::GatewayConfig;
 /// One port, one recipe, 32 fields, 4 safe values.
 static CONFIG_SMALL: Mutex<Cell<GatewayConfig<1, 1, 32, 0, 4, 0>>> =
     Mutex::new(Cell::new(GatewayConfig::empty()));
-/// Two ports and a way up, a panel's commands.
+/// Two ports, a route to the controller, the commands of a panel.
 static CONFIG_MEDIUM: Mutex<Cell<GatewayConfig<3, 3, 128, 8, 16, 0>>> =
     Mutex::new(Cell::new(GatewayConfig::empty()));
-/// What a file can have.
+/// The maximum that a file can contain.
 static CONFIG_FULL: Mutex<Cell<GatewayConfig>> = Mutex::new(Cell::new(GatewayConfig::empty()));
 
 pub(crate) fn all() {

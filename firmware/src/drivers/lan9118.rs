@@ -33,7 +33,7 @@ pub struct Lan9118<R> {
     tx: [u8; BUFFER],
     /// Number of received frames with errors or too long.
     dropped: u32,
-    /// Whether the PHY has a link, once it was asked.
+    /// Link state of the PHY; `None` before the first read.
     link: Option<bool>,
 }
 
@@ -230,7 +230,7 @@ impl<R: Registers> Driver for Lan9118<R> {
 
     fn transmit(&mut self, cx: &mut Context<'_>) -> Option<Transmit<'_, R>> {
         if !self.has_room() {
-            // It empties by itself; no interrupt for that works on all controllers.
+            // The FIFO drains by itself; no interrupt for that works on all controllers.
             cx.waker().wake_by_ref();
             return None;
         }
@@ -239,8 +239,7 @@ impl<R: Registers> Driver for Lan9118<R> {
 
     fn link_state(&mut self, cx: &mut Context<'_>) -> LinkState {
         self.waker.register(cx.waker());
-        // The stack asks with each frame, and the PHY is far away: its registers are read when it says that something
-        // has changed.
+        // The stack polls the link with each frame; the slow PHY registers are only read after an interrupt of the PHY.
         if self.link.is_none() || self.regs.read(INT_STS) & INT_PHY != 0 {
             self.link = self.read_link().ok();
             self.enable_interrupts();

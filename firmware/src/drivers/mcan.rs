@@ -46,7 +46,7 @@ pub struct Mcan<R> {
     bitrate: u32,
     /// The state reported last.
     state: Cell<BusState>,
-    /// Frames were queued, and that they have left was not reported yet.
+    /// Frames were queued whose completion has not been reported.
     is_sending: Cell<bool>,
     lost: u32,
     /// Alternates which FIFO is read first.

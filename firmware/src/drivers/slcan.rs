@@ -9,7 +9,7 @@ use proto_core::wire::slcan::{Channel, MAX_LINE};
 use super::can_port::{BusOff, CanEvent, CanPort};
 use crate::clock::now;
 
-/// Answers and frames that wait for the line.
+/// Replies and frames queued for the line.
 const MAX_WAITING: usize = 512;
 /// Bytes per read.
 const CHUNK: usize = 64;
@@ -22,7 +22,7 @@ pub struct SlcanPort<D> {
     bitrate: u32,
     input: Vec<u8, CHUNK>,
     output: Vec<u8, MAX_WAITING>,
-    /// A frame was sent, which was not reported yet.
+    /// A frame was sent and not yet reported.
     is_sending: bool,
 }
 

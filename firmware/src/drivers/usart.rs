@@ -230,7 +230,7 @@ impl<R: Registers> Write for Usart<R> {
                     line.state.writer.register(cx.waker());
                     return Poll::Pending;
                 }
-                // The end of what was sent before must not be taken for the end of this.
+                // The end of an earlier transmission must not be taken for the end of this one.
                 line.regs.write(ICR, TX_COMPLETE);
                 let taken = buf.iter().take_while(|&&byte| line.state.waiting.push_back(byte).is_ok());
                 let len = taken.count();
@@ -241,8 +241,8 @@ impl<R: Registers> Write for Usart<R> {
         .await
     }
 
-    /// Waits for the end of the last stop bit. A line that does not take its bytes is given up by
-    /// whoever waits (`serial::run`); the next transmission begins behind what is left of this one.
+    /// Waits for the end of the last stop bit. The caller (`serial::run`) gives up on a line that does not accept its
+    /// bytes; the next transmission follows the rest of this one.
     async fn flush(&mut self) -> Result<(), Infallible> {
         poll_fn(|cx| {
             self.with(|line| {

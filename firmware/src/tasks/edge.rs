@@ -155,8 +155,8 @@ impl Edge {
     }
 
     /// Records that settings were stored for the next start.
-    pub fn keeps(&self, tells: bool) {
-        self.next.set(Some(tells));
+    pub fn set_next(&self, publishes: bool) {
+        self.next.set(Some(publishes));
     }
 }
 

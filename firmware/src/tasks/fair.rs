@@ -17,7 +17,7 @@ pub struct Fair<'a, D> {
 }
 
 impl<'a, D: Driver> Fair<'a, D> {
-    /// Limits `device`, and tells `gateway` if frames are left at the end of a turn.
+    /// Limits `device`; notifies `gateway` if frames are left at the end of a turn.
     pub fn new(device: D, gateway: &'a Gateway) -> Self {
         Self { device, gateway, left: FRAMES }
     }

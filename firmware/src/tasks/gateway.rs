@@ -99,7 +99,7 @@ impl Gateway {
         }
     }
 
-    /// Passes the ring of frames to `look`.
+    /// Passes the frame tap to `look`.
     pub fn tap<R>(&self, look: impl FnOnce(&mut Tap<MAX_TAP>) -> R) -> R {
         look(self.engine.borrow_mut().tap())
     }

@@ -1,9 +1,9 @@
 //! Checks that every task still runs; the watchdog is fed only then.
 //!
-//! A task may wait for a byte for ever, so it has a [`Pulse`]: where it waits for something that may never
-//! come, it waits through [`Pulse::idle`], which answers the check. A task that hangs anywhere else does not
-//! answer, is named in the log, and the watchdog is not fed. A task that never yields keeps the feeder from
-//! running, with the same effect; an interrupt gets its name from [`running`].
+//! A task may wait forever for a byte, so it has a [`Pulse`]: it waits for what may never come through [`Pulse::idle`],
+//! which answers the check. A task that hangs anywhere else does not answer, is named in the log, and the watchdog is
+//! not fed. A task that never yields keeps the feeder from running, with the same effect; an interrupt gets its name
+//! from [`running`].
 
 use core::cell::{Cell, RefCell};
 use core::fmt;
@@ -41,11 +41,11 @@ pub enum TaskName {
     Refused,
     /// A task of the board's own.
     Board(u8),
-    /// Changes the store.
+    /// The store task.
     Store,
     /// A connection of the console.
     Console(u8),
-    /// Looks at the button.
+    /// Polls the button.
     Button,
     /// The edge node.
     Edge,
@@ -244,7 +244,7 @@ enum Answer {
     Late,
 }
 
-/// Feeds a watchdog with this `period` for ever, four times per period while all tasks answer.
+/// Feeds a watchdog with this `period` forever, four times per period while all tasks answer.
 pub async fn run<const N: usize>(watch: &Watch<N>, period: Duration, mut feed: impl FnMut()) -> ! {
     let quarter = period / 4;
     loop {

@@ -54,7 +54,7 @@ pub enum Ended {
     Confirmed,
     /// Nobody confirmed it in time.
     NotConfirmed,
-    /// Somebody took it back.
+    /// It was rolled back.
     TakenBack,
     /// It did not run, or used up its starts.
     Failed,

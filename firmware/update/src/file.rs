@@ -45,7 +45,7 @@ pub enum FileError {
         /// The version found.
         found: u32,
     },
-    /// It is cut short, or something follows it.
+    /// It is truncated, or has trailing bytes.
     Length {
         /// Length according to the file, in bytes.
         said: u32,

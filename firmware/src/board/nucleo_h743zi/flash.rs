@@ -99,7 +99,7 @@ fn key() -> Option<[u8; 32]> {
         if !can_read(address) {
             return None;
         }
-        // SAFETY: readable flash, which nobody writes.
+        // SAFETY: readable flash that nothing writes.
         *part = unsafe { core::ptr::with_exposed_provenance::<Word>(address).read_volatile() };
     }
     bytes.strip_prefix(&KEY_MARK)?.first_chunk().copied()

@@ -59,8 +59,8 @@ impl Console {
                 warn!("another firmware is to run for {}", Text(&peer));
                 self.firmware(buf, Status::ACCEPTED)
             }
-            (Ok(_), StoreRequest::Edge { tells, restart, .. }) => {
-                self.edge_is_kept(buf, peer, tells, restart)
+            (Ok(_), StoreRequest::Edge { publishes, restart, .. }) => {
+                self.edge_stored(buf, peer, publishes, restart)
             }
             (Err(Failed::Firmware(why)), _) => {
                 warn!("{} refused to {}: {}", name(operation), Text(&peer), Text(&why));

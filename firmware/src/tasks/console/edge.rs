@@ -77,21 +77,21 @@ impl Console {
                 out.write_char('}')?;
             }
         }
-        if let Some(tells) = node.edge.next() {
-            write!(out, ",\"next\":\"{}\"", if tells { "other" } else { "off" })?;
+        if let Some(publishes) = node.edge.next() {
+            write!(out, ",\"next\":\"{}\"", if publishes { "other" } else { "off" })?;
         }
         out.write_char('}')
     }
 
     /// Reply after settings were stored.
-    pub(super) fn edge_is_kept(
+    pub(super) fn edge_stored(
         &self,
         buf: &mut [u8],
         peer: core::net::Ipv4Addr,
-        tells: bool,
+        publishes: bool,
         restart: bool,
     ) -> Reply {
-        self.node.edge.keeps(tells);
+        self.node.edge.set_next(publishes);
         warn!("{} has changed the settings of the edge node", Text(&peer));
         self.edge(buf, if restart { Status::ACCEPTED } else { Status::OK })
     }
@@ -112,7 +112,7 @@ pub(super) fn settings<'a>(
     };
     let Some((len, lock)) = request.image else { return Err(busy(buf)) };
     match lock.look(len, read) {
-        Ok(tells) => Ok((StoreRequest::Edge { len, tells, restart }, lock)),
+        Ok(publishes) => Ok((StoreRequest::Edge { len, publishes, restart }, lock)),
         Err(error) => Err(Reply::error(buf, Status::UNPROCESSABLE, error)),
     }
 }

@@ -1,6 +1,6 @@
 //! Server-sent events: state and values five times a second, and frames for a client that asks for them.
 //!
-//! A client that reads slowly gets fewer events and is told how many it lost; one that does not read is dropped.
+//! A slow client gets fewer events, with the number of lost ones; a client that does not read is dropped.
 
 use core::fmt::Write;
 

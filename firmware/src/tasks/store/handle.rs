@@ -65,7 +65,7 @@ pub enum StoreRequest {
         /// Their length in bytes.
         len: usize,
         /// Whether they enable publishing.
-        tells: bool,
+        publishes: bool,
         /// Whether the board restarts afterwards.
         restart: bool,
     },
