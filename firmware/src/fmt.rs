@@ -4,7 +4,7 @@
 //! Messages below the chosen level are not in the image: the level is chosen at build time by `DEFMT_LOG`, or
 //! by the features `log-off`, `log-error` and `log-warn`.
 //!
-//! Messages from [`info!`](crate::info) on are also kept as text ([`crate::journal`]).
+//! Messages from [`info!`](crate::info) on are also stored as text ([`crate::journal`]).
 //!
 //! Only `{}` with arguments after the text has the same meaning in both.
 

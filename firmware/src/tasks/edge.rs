@@ -219,7 +219,7 @@ impl Node {
             period: Duration::from_micros(document.sample.as_micros()),
             sample_at: Instant::now(),
             was_online: false,
-            told: None,
+            logged: None,
         };
         // Sample first, so that even the first birth has values and timestamps.
         driver.sample().await;
@@ -276,7 +276,7 @@ struct NodeDriver<'a> {
     period: Duration,
     sample_at: Instant,
     was_online: bool,
-    told: Option<Failure>,
+    logged: Option<Failure>,
 }
 
 impl NodeDriver<'_> {
@@ -376,11 +376,11 @@ impl NodeDriver<'_> {
         }));
         match failure {
             _ if is_online && !self.was_online => {
-                (self.was_online, self.told) = (true, None);
+                (self.was_online, self.logged) = (true, None);
                 info!("edge node: online at {}", document.host.as_str());
             }
-            Some(failure) if !is_online && (self.was_online || self.told != Some(failure)) => {
-                (self.was_online, self.told) = (false, Some(failure));
+            Some(failure) if !is_online && (self.was_online || self.logged != Some(failure)) => {
+                (self.was_online, self.logged) = (false, Some(failure));
                 warn!("edge node: {}; trying again", Text(&failure));
             }
             _ => {}

@@ -23,7 +23,7 @@ pub enum Side {
 pub struct Newest {
     /// The mounted store.
     pub store: Store,
-    /// Its place.
+    /// The valid place.
     pub side: Side,
     /// Whether it may be moved to the other place; not if that one was written by a newer program.
     pub may_move: bool,

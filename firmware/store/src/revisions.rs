@@ -76,7 +76,7 @@ impl Ended {
 /// A trial of a configuration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Trial {
-    /// Its number.
+    /// Number of the configuration.
     pub number: u32,
     /// Remaining starts.
     pub attempts: u8,
@@ -92,12 +92,12 @@ pub enum KeepError {
     Put(PutError),
     /// The configuration to be forgotten or replaced is marked.
     Needed {
-        /// Its number.
+        /// Number of the configuration.
         number: u32,
     },
     /// There is no such configuration.
     Unknown {
-        /// Its number.
+        /// Number of the configuration.
         number: u32,
     },
 }

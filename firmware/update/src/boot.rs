@@ -29,9 +29,9 @@ pub trait Machine {
 /// The firmware to run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Chosen {
-    /// Its slot.
+    /// The slot it is in.
     pub slot: Slot,
-    /// Its header.
+    /// The header of its slot.
     pub header: Header,
     /// Whether it is on trial.
     pub is_trial: bool,

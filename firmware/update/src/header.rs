@@ -170,7 +170,7 @@ pub enum HeaderError {
     },
     /// There is no such slot.
     Slot {
-        /// Its number.
+        /// The slot number found.
         found: u32,
     },
     /// The name of the board is invalid.
@@ -234,7 +234,7 @@ impl PublicKey {
         Self(Keypair::from(seed).public)
     }
 
-    /// Its bytes.
+    /// The 32 bytes of the key.
     pub fn bytes(&self) -> [u8; 32] {
         self.0.to_bytes()
     }

@@ -11,7 +11,7 @@ use crate::header::{BoardName, Formats, Header, Version};
 /// The firmware that receives an update.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Running {
-    /// Its board.
+    /// Board that it runs on.
     pub board: BoardName,
     /// The slot it runs in.
     pub slot: Slot,

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use rustix::event::{PollFd, PollFlags};
 
 /// Bytes buffered for a client that does not read; more are lost, as on a line.
-const KEPT: usize = 1 << 20;
+const MAX_UNSENT: usize = 1 << 20;
 
 /// A listening socket: `HOST:PORT`, or a path.
 #[derive(Debug)]
@@ -97,12 +97,12 @@ impl Client {
         bytes
     }
 
-    /// Whether a write would be kept.
+    /// Whether a write fits into the queue.
     pub(super) fn has_room(&self) -> bool {
-        self.unsent.len() < KEPT
+        self.unsent.len() < MAX_UNSENT
     }
 
-    /// Writes; what the socket does not accept now is kept.
+    /// Writes; bytes that the socket does not accept now are queued.
     pub(super) fn write(&mut self, bytes: &[u8]) {
         if self.has_room() {
             self.unsent.extend_from_slice(bytes);
@@ -110,7 +110,7 @@ impl Client {
         self.flush();
     }
 
-    /// Writes what was kept.
+    /// Writes queued bytes.
     pub(super) fn flush(&mut self) {
         while !self.unsent.is_empty() && !self.is_gone {
             match rustix::net::send(&self.fd, &self.unsent, rustix::net::SendFlags::NOSIGNAL) {

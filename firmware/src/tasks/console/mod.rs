@@ -67,11 +67,11 @@ pub struct Console {
 /// The edge node as seen by clients.
 #[derive(Clone, Copy)]
 pub struct NodeView {
-    /// Its state.
+    /// State of the edge node.
     pub edge: &'static Edge,
     /// Its settings, if there are any.
     pub document: Option<&'static Document>,
-    /// Its clock.
+    /// UTC, if known.
     pub clock: &'static WallClock,
 }
 

@@ -161,7 +161,7 @@ impl Console {
                 return Err(Reply::error(buf, Status::BAD_REQUEST, "revision must be a number"));
             }
         };
-        let revision = number.and_then(|number| store.look(|kept| kept.revision(number)).flatten());
+        let revision = number.and_then(|number| store.look(|revisions| revisions.revision(number)).flatten());
         let Some(revision) = revision.filter(|revision| *revision != NOTHING) else {
             return Err(Reply::error(buf, Status::NOT_FOUND, "there is no such revision"));
         };
@@ -226,11 +226,11 @@ fn write_revisions(
     changed: Option<u32>,
 ) -> fmt::Result {
     out.write_str("{\"kept\":[")?;
-    let kept = revisions.kept().iter().filter(|kept| **kept != NOTHING);
-    for (nth, kept) in kept.enumerate() {
+    let stored = revisions.kept().iter().filter(|revision| **revision != NOTHING);
+    for (nth, revision) in stored.enumerate() {
         let comma = if nth == 0 { "" } else { "," };
-        write!(out, "{comma}{{\"revision\":{},\"etag\":\"", kept.number)?;
-        write_etag(out, *kept)?;
+        write!(out, "{comma}{{\"revision\":{},\"etag\":\"", revision.number)?;
+        write_etag(out, *revision)?;
         out.write_str("\"}")?;
     }
     out.write_char(']')?;
