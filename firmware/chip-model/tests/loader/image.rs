@@ -14,7 +14,7 @@ pub(crate) const STACK: u32 = 0x2401_0000;
 /// What a program does.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum ProgramKind {
-    /// Says that it is there, and goes on for ever.
+    /// Leaves its mark and loops forever.
     Stay,
     /// Asks for a reset.
     Restart,

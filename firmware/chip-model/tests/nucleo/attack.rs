@@ -18,12 +18,12 @@ const EVERY: Picos = 25 * MILLI;
 const HELD: [Picos; 2] = [60 * MILLI, 6 * SECOND];
 /// How much later a cycle may be for all of this: the longest that a connection keeps the others waiting.
 const LATER: Picos = MILLI;
-/// A connection of somebody who means no good.
+/// A hostile connection.
 struct Hostile {
     handle: SocketHandle,
-    /// What it sends as soon as it can.
+    /// What it sends once connected.
     says: Option<Vec<u8>>,
-    /// It reads what comes.
+    /// Whether it reads.
     reads: bool,
     /// When it is reset.
     ends: Picos,
@@ -35,7 +35,7 @@ impl Hostile {
         let whole = |line: &str, fields: &str, body: &[u8]| browser.bytes(line, fields, body);
         let held = HELD[usize::from(nth % 128 >= 120)];
         let nonce = "0000000928a724da00000000c27868a9e87ad27a773140a5";
-        // In no order: one that is held would keep out the same ones each time.
+        // Mixed, so that a held connection does not always block the same ones.
         let kind = (nth as u32).wrapping_mul(0x9E37_79B9) >> 29;
         let (says, reads, held) = match kind {
             // Half a request, and silence.
@@ -50,7 +50,7 @@ impl Hostile {
             4 => (whole("GET /", "", b""), false, held),
             // No HTTP.
             5 => (vec![0xA5; 3000], true, held),
-            // A body that nobody wants, and that does not come.
+            // An announced body that never comes.
             6 => (
                 whole("PUT /api/v1/config", "Content-Type: application/octet-stream", &[0; 4000]),
                 false,
@@ -87,7 +87,7 @@ impl Hostile {
     }
 }
 
-/// Those who watch: two streams, one of them of frames, and somebody who loads the page again and again.
+/// Clients that watch: two streams, one of them of frames, and one that reloads the page.
 struct Watchers {
     streams: [SocketHandle; 2],
     /// And whether it has asked.
@@ -169,7 +169,7 @@ fn who_watches_or_attacks_the_console_costs_the_cell_no_frame_and_no_cycle() {
     );
     attacked.is_like(&alone, "attacked", LATER);
     assert!(bench.chip.resets.is_empty() && bench.chip.faults.is_empty());
-    // They were served, not only turned away by the network.
+    // They were served, not only refused by the network.
     for counter in [&console["requests"]["without_key"], &console["counters"]["incomplete"]] {
         assert!(counter.as_u64() > Some(3), "{console}");
     }

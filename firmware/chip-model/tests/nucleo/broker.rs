@@ -1,6 +1,5 @@
-//! A broker, a time server and a device that the test plays; the first two are at the controller's address. Bytes are
-//! read
-//! here by a reader that knows nothing of `recipe-sparkplug`.
+//! A broker, a time server and a device simulated by the test; the first two have the controller's address. Messages
+//! are parsed here independently of `recipe-sparkplug`.
 
 use recipe_chip_model::device::{MILLI, Picos};
 use recipe_chip_model::models::line::Format;
@@ -15,17 +14,17 @@ const FORMAT: Format = Format { baud: 115_200, odd_parity: None, stop_bits: 1 };
 /// How a broker behaves.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum BrokerMode {
-    /// As it should.
+    /// It follows the protocol.
     Well,
     /// It refuses CONNECT with this code.
     Refuses(u8),
-    /// It takes everything and says nothing.
+    /// It accepts everything and never replies.
     Silent,
-    /// It answers with bytes that are none of MQTT.
+    /// It replies with bytes that are not MQTT.
     Garbage,
-    /// It takes no connection.
+    /// It refuses connections.
     Gone,
-    /// It takes connections and reads nothing.
+    /// It accepts connections and reads nothing.
     Full,
 }
 
@@ -54,12 +53,12 @@ pub(crate) struct Broker {
     pub(crate) mood: BrokerMode,
     bytes: Vec<u8>,
     pub(crate) told: Vec<EdgeMessages>,
-    /// User, password and the number in the will, of each CONNECT.
+    /// User, password and bdSeq of the will of each CONNECT.
     pub(crate) connects: Vec<(String, String, u64)>,
     pub(crate) pings: usize,
-    /// What the time server says, in milliseconds since 1970; `None`: nothing.
+    /// Time of the server in milliseconds since 1970; `None`: it does not reply.
     pub(crate) utc_ms: Option<u64>,
-    /// What the device at the line sends every 17 ms; `None`: nothing.
+    /// What the device on the line sends every 17 ms; `None`: nothing.
     pub(crate) device: Option<u8>,
     device_at: Picos,
 }
@@ -81,7 +80,7 @@ impl Broker {
         }
     }
 
-    /// Ends the connection by a reset, as one that is killed.
+    /// Resets the connection, like a killed broker.
     pub(crate) fn kill(&mut self, bench: &mut Bench) {
         connection(bench, self.listening).abort();
         self.bytes.clear();

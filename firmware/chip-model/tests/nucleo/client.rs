@@ -1,4 +1,4 @@
-//! Clients of the board's console, whose TCP is the test's.
+//! Clients of the board's console, over the test's TCP.
 
 use recipe_api::key::Key;
 use recipe_chip_model::device::{MILLI, SECOND};
@@ -9,7 +9,7 @@ use smoltcp::wire::{IpAddress, IpEndpoint, Ipv4Address};
 
 use crate::Bench;
 
-/// Where the cells of these tests have their board.
+/// Address of the board in the cells of these tests.
 const BOARD: IpEndpoint = IpEndpoint { addr: IpAddress::Ipv4(Ipv4Address::new(192, 168, 12, 20)), port: 80 };
 /// What a browser announces at least.
 pub(crate) const WIDE: usize = 64 << 10;
@@ -31,7 +31,7 @@ pub(crate) fn read(bench: &mut Bench, handle: SocketHandle, most: usize, into: &
     into.extend_from_slice(&bytes[..count]);
 }
 
-/// A connection over which this was sent.
+/// Opens a connection and sends a request.
 #[track_caller]
 pub(crate) fn ask(bench: &mut Bench, request: &[u8], size: usize) -> SocketHandle {
     let handle = open(bench, size);
@@ -40,7 +40,7 @@ pub(crate) fn ask(bench: &mut Bench, request: &[u8], size: usize) -> SocketHandl
     handle
 }
 
-/// What is answered.
+/// The reply.
 #[track_caller]
 pub(crate) fn exchange(bench: &mut Bench, request: &[u8]) -> Response {
     let handle = open(bench, WIDE);
@@ -69,13 +69,13 @@ pub(crate) fn browser() -> http::Client {
     }
 }
 
-/// The bytes of a signed request.
+/// Bytes of a signed request.
 #[track_caller]
 pub(crate) fn signed(bench: &mut Bench, line: &str) -> Vec<u8> {
     signed_with(bench, line, "", b"")
 }
 
-/// The same with further fields and a body.
+/// Bytes of a signed request with more fields and a body.
 #[track_caller]
 pub(crate) fn signed_with(bench: &mut Bench, line: &str, more: &str, body: &[u8]) -> Vec<u8> {
     let browser = browser();
@@ -87,8 +87,7 @@ pub(crate) fn signed_with(bench: &mut Bench, line: &str, more: &str, body: &[u8]
     browser.bytes(line, &fields, body)
 }
 
-/// What a signed request is answered with. Somebody else may have tried wrong keys from the same address: then it waits
-/// as long as it is told to.
+/// The reply to a signed request. Waits as long as the board demands after wrong keys from the same address.
 #[track_caller]
 pub(crate) fn ask_signed(bench: &mut Bench, line: &str) -> Response {
     loop {

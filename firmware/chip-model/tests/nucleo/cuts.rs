@@ -27,7 +27,7 @@ const WORDS: usize = 3;
 const KINDS: [Torn; 3] = [Torn::Fault, Torn::Blank, Torn::Half];
 const FLASH: u32 = 0x0800_0000;
 
-/// What an operation belongs to.
+/// Stage of the update that an operation belongs to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum CutStage {
     /// The slot is erased.
@@ -111,7 +111,7 @@ impl Recorded {
     }
 }
 
-/// Says what was cut when a check fails.
+/// Prints what was cut if a check fails.
 struct PrintOnPanic(String);
 
 impl Drop for PrintOnPanic {
@@ -147,7 +147,7 @@ fn judge(bench: &mut Bench, recorded: &Recorded, nth: usize) {
     assert!(bench.chip.faults.is_empty() && bench.chip.resets.is_empty(), "{}", bench.history());
 }
 
-/// The update is there at last.
+/// The update is complete.
 fn finish(bench: &mut Bench) {
     if state(bench)["slot"] == "A" {
         let image = firmware(Slot::B);

@@ -128,7 +128,7 @@ fn a_plant_reads_the_board_from_birth_to_the_next_session() {
     for (wrong, status) in [(&b"RGWE\x01\x01"[..], 422), (b"", 422), (&[0; 4_000], 422)] {
         put(&mut bench, "PUT /api/v1/edge", wrong).must_be(status);
     }
-    // Kept, and nothing is opened before a restart.
+    // Stored; no connection is opened before a restart.
     put(&mut bench, "PUT /api/v1/edge", &settings()).must_be(200);
     assert_eq!(state(&mut bench), serde_json::json!({ "state": "off", "next": "other" }));
     let (mut bench, mut broker) = restarted(bench, &settings());
@@ -145,13 +145,13 @@ fn a_plant_reads_the_board_from_birth_to_the_next_session() {
     };
     assert_eq!(metric(&told, "Node Info/UTC").value, Some(0));
     metric(&told, "controller/RobotState/12");
-    // Once the time is known everything is born again.
+    // Once the time is known all births are repeated.
     let utc_ms = 1_790_000_000_000;
     broker.utc_ms = Some(utc_ms);
     let again = until_verb(&mut bench, &mut broker, birth + 1, "NBIRTH");
     assert_eq!(metric(&broker.told[again], "Node Info/UTC").value, Some(1));
 
-    // A device is born with its first frame, and its values are told when they change.
+    // A device's birth follows its first frame; its values are published when they change.
     broker.device = Some(9);
     let device = until_told(&mut bench, &mut broker, again, "a device's birth", |told| {
         told.topic == "spBv1.0/hall/DBIRTH/press/rs485-1"
@@ -165,7 +165,7 @@ fn a_plant_reads_the_board_from_birth_to_the_next_session() {
         told.topic == "spBv1.0/hall/DDATA/press/rs485-1" && told.metrics.iter().any(is_value)
     });
 
-    // A command is no way in, but for the request for births.
+    // Commands are ignored except the request for births.
     let from = broker.told.len();
     broker.publish(&mut bench, "spBv1.0/hall/NCMD/press", b"\x12\x13\x0a\x0dcontroller/x1\x20\x0b\x70\x01");
     broker.publish(&mut bench, "spBv1.0/hall/NCMD/press", REBIRTH);
@@ -183,7 +183,7 @@ fn a_plant_reads_the_board_from_birth_to_the_next_session() {
     until_verb(&mut bench, &mut broker, from, "NBIRTH");
     assert_eq!(broker.connects.last().map(|connect| connect.2), Some(1));
 
-    // Off again, from the next start on.
+    // Switched off from the next start on.
     put(&mut bench, "PUT /api/v1/edge", &OFF).must_be(200);
     assert_eq!(state(&mut bench)["next"], "off");
     let connects = broker.connects.len();
@@ -210,7 +210,7 @@ fn why_nothing_is_told_is_said_and_the_node_comes_back() {
         let document = until_state(&mut bench, &mut broker, why, |document| document["why"] == why);
         assert_eq!(document["state"], "offline", "{document}");
     }
-    // What changed meanwhile is told behind the births, with its own time.
+    // Changes meanwhile are published after the births, with their own timestamps.
     broker.device = Some(77);
     run(&mut bench, &mut broker, SECOND);
     let from = broker.told.len();
@@ -234,7 +234,7 @@ fn a_broker_that_dies_and_comes_back_costs_the_cell_no_frame_and_no_cycle() {
     let (mut bench, mut broker) = restarted(claimed(), &settings());
     until_verb(&mut bench, &mut broker, 0, "NBIRTH");
     let begin = bench.now();
-    // All moods, one after the other; a node that has failed waits two seconds at most before it tries again.
+    // All modes in turn; a failed node waits at most two seconds before it retries.
     let moods = [
         (0, BrokerMode::Well),
         (1_500, BrokerMode::Full),

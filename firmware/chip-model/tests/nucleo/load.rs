@@ -14,7 +14,7 @@ use crate::serial::word;
 const COUNTERS: [&str; 5] = ["frames_in", "skipped_cycles", "resync_bytes", "discarded_bytes", "timeouts"];
 const FORMAT: Format = Format { baud: 115_200, odd_parity: None, stop_bits: 1 };
 
-/// What a cell did in the time.
+/// What a cell did during the load.
 pub(crate) struct LoadReport {
     span: Picos,
     /// Of each bus: frames that left, and how much one was off its time at most.
@@ -24,8 +24,8 @@ pub(crate) struct LoadReport {
     instructions: u64,
 }
 
-/// Runs until frames that the test sends on the line from now on, every 8 ms, are in the middle between those of the board,
-/// which has the same line and begins one every 4 ms: they never meet, also if the board is a millisecond late.
+/// Aligns the test's frames, one every 8 ms, with the middle between those of the board, one every 4 ms on the same
+/// line, so that they never collide even if the board is a millisecond late.
 fn align(bench: &mut Bench) {
     let sent = &bench.chip.devices().usart2.line.sent;
     let last = sent.chunks_exact(7).next_back().expect("it sends every 4 ms")[0].start;

@@ -1,5 +1,5 @@
-//! The page for people, sent to clients whose TCP is the test's: quick ones, one that does not read, one that reads
-//! little by little. The cell goes on meanwhile, on its grid.
+//! The web page, sent over the test's TCP to fast clients, one that does not read, and one that reads slowly. The cell
+//! keeps its cycle meanwhile.
 
 use recipe_chip_model::device::{MILLI, Picos, SECOND};
 
@@ -9,7 +9,7 @@ use crate::cell::off_the_grid;
 use crate::client::{WIDE, ask, browser, connection, read};
 use crate::serial::ready;
 
-/// What takes less than the page has.
+/// A read smaller than the page.
 const NARROW: usize = 2 << 10;
 
 fn request() -> Vec<u8> {

@@ -96,7 +96,7 @@ impl Robot {
         self.sockets.add(socket)
     }
 
-    /// Adds a socket that somebody else listens with.
+    /// Adds a socket for another listener.
     pub(crate) fn add_server(&mut self) -> SocketHandle {
         let buffer = || tcp::SocketBuffer::new(vec![0; 2048]);
         self.sockets.add(tcp::Socket::new(buffer(), buffer()))
