@@ -16,7 +16,7 @@ use tokio::sync::Notify;
 
 use super::bind::{Device, Pace};
 use super::exchange::{Backlog, PortEvent, PortTx};
-use super::kept::{Held, HeldBus, Parked, ParkedBus};
+use super::handover::{HandoverBus, HandoverState, Held, HeldBus};
 use super::pty::Pty;
 use super::stream;
 use super::wire::{Full, NodeId, Pacing, Transmitted, Wire};
@@ -225,7 +225,7 @@ pub(super) struct CanPort {
     listener: Option<Rc<TcpListener>>,
     clients: Rc<Clients>,
     /// Another owner had it before, and something may wait in it.
-    is_kept: bool,
+    is_handed_over: bool,
     bitrate: u32,
     pacing: Pacing,
     tx: Rc<PortTx>,
@@ -238,7 +238,7 @@ impl CanPort {
         device: &Device,
         bitrate: u32,
         tx: Rc<PortTx>,
-        kept: Option<Parked>,
+        handover: Option<HandoverState>,
     ) -> io::Result<Self> {
         let (link, listen, pace) = match device {
             Device::SlcanPty { link, pace } => (Some(link), None, *pace),
@@ -248,10 +248,10 @@ impl CanPort {
                 return Err(io::Error::new(io::ErrorKind::InvalidInput, what));
             }
         };
-        let is_kept = kept.is_some();
-        let (listener, pty, clients) = match kept {
-            Some(Parked::Bus(ParkedBus { pty, listener, clients, .. })) => {
-                let pty = pty.map(|(pty, session)| Ok::<_, io::Error>((pty.unpark()?, session)));
+        let is_handed_over = handover.is_some();
+        let (listener, pty, clients) = match handover {
+            Some(HandoverState::Bus(HandoverBus { pty, listener, clients, .. })) => {
+                let pty = pty.map(|(pty, session)| Ok::<_, io::Error>((pty.attach()?, session)));
                 let client = |(stream, session)| {
                     let stream = TcpStream::from_std(stream)?;
                     Ok::<_, io::Error>(Rc::new(Client { stream, session: RefCell::new(session) }))
@@ -274,7 +274,7 @@ impl CanPort {
             Pace::AtOnce => Pacing::AtOnce,
             Pace::BitRate => Pacing::Bitrate(bitrate),
         };
-        Ok(Self { pty, listener, clients, is_kept, bitrate, pacing, tx, clock: Clock::real() })
+        Ok(Self { pty, listener, clients, is_handed_over, bitrate, pacing, tx, clock: Clock::real() })
     }
 
     /// If there are a listener and a terminal, the listener's address: the terminal's link is in the
@@ -298,8 +298,8 @@ impl CanPort {
     }
 
     pub(super) async fn run(self, mut events: impl FnMut(PortEvent<'_>)) -> io::Result<()> {
-        let Self { pty, listener, clients, is_kept, bitrate, pacing, tx, clock } = self;
-        if is_kept {
+        let Self { pty, listener, clients, is_handed_over, bitrate, pacing, tx, clock } = self;
+        if is_handed_over {
             tx.note_gap(now());
         }
         let bus = CanBus::new(pacing, Rc::clone(&tx), clock);

@@ -19,7 +19,7 @@ pub mod connect;
 pub mod exchange;
 pub mod fairness;
 pub mod files;
-pub mod kept;
+pub mod handover;
 pub mod log_limit;
 pub mod port;
 pub mod pty;

@@ -12,7 +12,7 @@ use proto_core::wire::can::CanId;
 use super::bind::Device;
 use super::can_bus::CanPort;
 use super::exchange::{PortEvent, PortTx};
-use super::kept::{Hold, Kept, Parked};
+use super::handover::{HandoverDevice, HandoverState, Hold};
 use super::serial::SerialPort;
 use super::socketcan::KernelCan;
 use crate::clock::Clock;
@@ -34,7 +34,7 @@ pub enum PortBus {
 pub struct Port {
     driver: Driver,
     device: Device,
-    is_kept: bool,
+    is_handed_over: bool,
     tx: Rc<PortTx>,
 }
 
@@ -54,37 +54,41 @@ impl Port {
         Self::open_or_adopt(device, bus, None).await
     }
 
-    /// The same, or takes over what another owner has left: clients stay connected, and what they have sent
-    /// meanwhile is dropped. What does not suit device and bus is closed first.
+    /// As [`Self::open`], but takes over the previous owner's device if it matches: clients stay connected, and what
+    /// they sent in between is dropped. Otherwise that device is closed first.
     ///
     /// # Errors
     /// As [`Self::open`].
-    pub async fn open_or_adopt(device: &Device, bus: PortBus, kept: Option<Kept>) -> io::Result<Self> {
+    pub async fn open_or_adopt(
+        device: &Device,
+        bus: PortBus,
+        handover: Option<HandoverDevice>,
+    ) -> io::Result<Self> {
         let tx = Rc::new(PortTx::default());
-        let kept = kept.filter(|kept| kept.device == *device).map(|kept| kept.what);
-        let kept = kept.filter(|what| bus.suits(what));
-        let is_kept = kept.is_some();
+        let handover = handover.filter(|handover| handover.device == *device).map(|handover| handover.what);
+        let handover = handover.filter(|what| bus.suits(what));
+        let is_handed_over = handover.is_some();
         let driver = match (bus, device) {
             (PortBus::Serial(settings), _) => {
-                Driver::Serial(SerialPort::open(device, settings, Rc::clone(&tx), kept).await?)
+                Driver::Serial(SerialPort::open(device, settings, Rc::clone(&tx), handover).await?)
             }
             (PortBus::Can { bitrate }, Device::SocketCan { interface }) => {
                 Driver::Kernel(KernelCan::open(interface, bitrate, Rc::clone(&tx))?)
             }
             (PortBus::Can { bitrate }, _) => {
-                Driver::Can(CanPort::open(device, bitrate, Rc::clone(&tx), kept).await?)
+                Driver::Can(CanPort::open(device, bitrate, Rc::clone(&tx), handover).await?)
             }
         };
-        Ok(Self { driver, device: device.clone(), is_kept, tx })
+        Ok(Self { driver, device: device.clone(), is_handed_over, tx })
     }
 
     /// Whether the device was taken over from another owner.
-    pub fn is_kept(&self) -> bool {
-        self.is_kept
+    pub fn is_handed_over(&self) -> bool {
+        self.is_handed_over
     }
 
-    /// What is needed to keep the device when the tasks of [`Self::run`] are gone; `None` if it is none that is
-    /// kept: nobody is connected to it, or it is opened again at no cost.
+    /// Allows the device to be handed over after the tasks of [`Self::run`] have ended; `None` if the device is not
+    /// handed over: it has no clients, or opening it again costs nothing.
     pub fn hold(&self) -> Option<Hold> {
         let held = match &self.driver {
             Driver::Serial(serial) => serial.held()?,
@@ -151,12 +155,12 @@ impl Port {
 }
 
 impl PortBus {
-    /// Whether a port of this bus can use what another owner has left. The line's settings may be others; the
-    /// channels of slcan clients are for one bit rate.
-    fn suits(self, what: &Parked) -> bool {
+    /// Whether a port of this bus can take over this device. Line settings may differ; the bit rate of slcan clients
+    /// may not.
+    fn suits(self, what: &HandoverState) -> bool {
         match (self, what) {
-            (Self::Serial(_), Parked::Pty(_) | Parked::Listen(..)) => true,
-            (Self::Can { bitrate }, Parked::Bus(bus)) => bus.bitrate == bitrate,
+            (Self::Serial(_), HandoverState::Pty(_) | HandoverState::Listen(..)) => true,
+            (Self::Can { bitrate }, HandoverState::Bus(bus)) => bus.bitrate == bitrate,
             _ => false,
         }
     }

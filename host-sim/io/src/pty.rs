@@ -31,9 +31,9 @@ pub struct Pty {
     unread: Cell<bool>,
 }
 
-/// A pseudoterminal outside of a runtime: open, with its link, and nobody reads it.
+/// An open pseudoterminal with its link, detached from any runtime.
 #[derive(Debug)]
-pub(crate) struct ParkedPty {
+pub(crate) struct HandoverPty {
     // Dropped first, as in a `Pty`.
     link: Symlink,
     master: OwnedFd,
@@ -41,9 +41,9 @@ pub(crate) struct ParkedPty {
     unread: bool,
 }
 
-impl ParkedPty {
-    /// Uses it in the current tokio runtime.
-    pub(crate) fn unpark(self) -> io::Result<Pty> {
+impl HandoverPty {
+    /// Registers it with the current tokio runtime.
+    pub(crate) fn attach(self) -> io::Result<Pty> {
         let Self { link, master, terminal, unread } = self;
         let master = register(master, Interest::READABLE)?;
         Ok(Pty { link, master, terminal: RefCell::new(Some(terminal)), unread: Cell::new(unread) })
@@ -51,13 +51,13 @@ impl ParkedPty {
 }
 
 impl Pty {
-    /// Takes it out of its runtime; its clients notice nothing. `None`, and it is closed, if one of them has
+    /// Detaches it from its runtime; clients notice nothing. Closes it and returns `None` if a client has
     /// opened the terminal exclusively at this moment.
-    pub(crate) fn park(self) -> Option<ParkedPty> {
+    pub(crate) fn detach(self) -> Option<HandoverPty> {
         self.reopen();
         let Self { link, master, terminal, unread } = self;
         let terminal = terminal.into_inner()?;
-        Some(ParkedPty { link, master: master.into_inner(), terminal, unread: unread.get() })
+        Some(HandoverPty { link, master: master.into_inner(), terminal, unread: unread.get() })
     }
 
     /// Opens a new pseudoterminal in raw mode, with a symbolic link to it at `link`, in the current tokio

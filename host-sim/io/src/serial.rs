@@ -17,7 +17,7 @@ use tracing::{debug, info, warn};
 
 use super::bind::{Device, HostPort, Pace};
 use super::exchange::{Backlog, PortEvent, PortTx};
-use super::kept::{Held, Parked};
+use super::handover::{HandoverState, Held};
 use super::pty::Pty;
 use super::stream::{self, ByteStream, accept};
 use crate::backoff::Backoff;
@@ -32,7 +32,7 @@ use crate::timer::now;
 pub(super) struct SerialPort {
     source: Source,
     /// Another owner had it before, and something may wait in it.
-    is_kept: bool,
+    is_handed_over: bool,
     settings: Rs485,
     tx: Rc<PortTx>,
     /// The clock of the line: when its last bit has left.
@@ -52,13 +52,13 @@ impl SerialPort {
         device: &Device,
         settings: Rs485,
         tx: Rc<PortTx>,
-        kept: Option<Parked>,
+        handover: Option<HandoverState>,
     ) -> io::Result<Self> {
-        let is_kept = kept.is_some();
+        let is_handed_over = handover.is_some();
         let source = match device {
             Device::Pty { link, pace } => {
-                let pty = match kept {
-                    Some(Parked::Pty(parked)) => parked.unpark()?,
+                let pty = match handover {
+                    Some(HandoverState::Pty(handover)) => handover.attach()?,
                     _ => Pty::open(link)?,
                 };
                 Source::Pty(Rc::new(pty), *pace)
@@ -71,8 +71,8 @@ impl SerialPort {
             }
             Device::Tcp { to } => Source::Connect(to.clone()),
             Device::TcpListen { listen } => {
-                let (listener, client) = match kept {
-                    Some(Parked::Listen(listener, client)) => {
+                let (listener, client) = match handover {
+                    Some(HandoverState::Listen(listener, client)) => {
                         let client = client.map(TcpStream::from_std).transpose()?;
                         (TcpListener::from_std(listener)?, client.map(Rc::new))
                     }
@@ -85,7 +85,7 @@ impl SerialPort {
                 return Err(io::Error::new(io::ErrorKind::InvalidInput, what));
             }
         };
-        Ok(Self { source, is_kept, settings, tx, clock: Clock::real() })
+        Ok(Self { source, is_handed_over, settings, tx, clock: Clock::real() })
     }
 
     pub(super) fn place(&self) -> String {
@@ -107,12 +107,12 @@ impl SerialPort {
     }
 
     pub(super) async fn run(self, mut events: impl FnMut(PortEvent<'_>)) -> io::Result<()> {
-        let Self { source, is_kept, settings, tx, clock } = self;
+        let Self { source, is_handed_over, settings, tx, clock } = self;
         let mut sender = Sender::new(settings, Rc::clone(&tx), clock)?;
         match source {
             Source::Pty(pty, pace) => {
                 sender.paced = pace == Pace::BitRate;
-                if is_kept {
+                if is_handed_over {
                     drain(&*pty, &tx).await?;
                 }
                 sender.up(&mut events);
@@ -159,10 +159,10 @@ impl SerialPort {
                 }
             }
             Source::Listen(listener, client) => {
-                let mut kept = client.borrow().clone();
+                let mut resumed = client.borrow().clone();
                 let mut known = tx.sleeps();
                 loop {
-                    let (stream, backlog) = match kept.take() {
+                    let (stream, backlog) = match resumed.take() {
                         Some(stream) => match drain(&*stream, &tx).await {
                             Ok(()) => (stream, Backlog::new(&tx)),
                             Err(error) => {

@@ -41,7 +41,7 @@ use recipe_doctor::PortRecord;
 use recipe_io::bind::Bind;
 use recipe_io::exchange::{PortEvent, PortTx};
 use recipe_io::fairness;
-use recipe_io::kept::Shelf;
+use recipe_io::handover::Handover;
 use recipe_io::port::Port;
 use recipe_io::realtime::{self, Scheduling};
 use recipe_io::timer::{Timer, now};
@@ -464,8 +464,8 @@ pub fn run(config: GatewayConfig, options: RunOptions) -> Result<(), StartError>
     let teller = options.sparkplug.clone().map(Teller::start).transpose()?;
     let glimpse = teller.as_ref().map(Teller::glimpse);
     let observers = Observers { glimpse, ..Observers::of(&options) };
-    let (binds, shelf) = (options.binds.clone(), Shelf::default());
-    let handle = spawn(config, binds, options.scheduling, observers, shelf, &Place::alone())?;
+    let (binds, handover) = (options.binds.clone(), Handover::default());
+    let handle = spawn(config, binds, options.scheduling, observers, handover, &Place::alone())?;
     host::foreground(Box::new(handle), &options)
 }
 
@@ -499,17 +499,16 @@ pub fn start(config: GatewayConfig, binds: Vec<Bind>) -> Result<Handle, StartErr
 /// The reason why it could not start; nothing is left behind then.
 pub fn start_watched(config: GatewayConfig, binds: Vec<Bind>, watch: &Watch) -> Result<Handle, StartError> {
     let observers = Observers { watch: watch.clone(), ..Observers::default() };
-    spawn(config, binds, Scheduling::Ordinary, observers, Shelf::default(), &Place::alone())
+    spawn(config, binds, Scheduling::Ordinary, observers, Handover::default(), &Place::alone())
 }
 
-/// Starts the gateway at a place, with those who look at it. Devices that another one has left are on the shelf, and this
-/// one leaves its own there.
+/// Starts the gateway at a place. It takes over the devices in `handover`, and leaves its own there when it ends.
 pub(crate) fn spawn(
     config: GatewayConfig,
     binds: Vec<Bind>,
     scheduling: Scheduling,
     observers: Observers,
-    shelf: Shelf,
+    handover: Handover,
     place: &Place,
 ) -> Result<Handle, StartError> {
     let watch = observers.watch.clone();
@@ -522,7 +521,7 @@ pub(crate) fn spawn(
     };
     let glimpse = observers.glimpse.as_ref().map(|glimpse| glimpse.open(&config));
     let handle = host::start(place, "gateway", async move |at_end| {
-        let devices = Devices { binds: &binds, left: Some((shelf, at_end)) };
+        let devices = Devices { binds: &binds, handover: Some((handover, at_end)) };
         let mut gateway = Gateway::open(&config, devices, Voice::Full, &observers).await?;
         gateway.window = observers.window;
         gateway.glimpse = glimpse;

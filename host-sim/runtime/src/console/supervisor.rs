@@ -16,7 +16,7 @@ use proto_core::config::GatewayConfig;
 use proto_core::time::{Duration, Instant};
 use recipe_api::revisions::{Ended, Output, Refused, Result as Done, Revision, Revisions};
 use recipe_io::bind::Bind;
-use recipe_io::kept::Shelf;
+use recipe_io::handover::Handover;
 use recipe_io::realtime::Scheduling;
 use recipe_io::timer::now;
 use serde_json::{Value, json};
@@ -174,7 +174,7 @@ impl Supervised {
             state: console.state.clone(),
             binds: options.binds.clone(),
             scheduling: options.scheduling,
-            shelf: Shelf::default(),
+            handover: Handover::default(),
             place,
             observers: Observers { glimpse, ..Observers::of(options) },
             put: None,
@@ -264,8 +264,8 @@ struct Supervisor {
     state: Option<PathBuf>,
     binds: Vec<Bind>,
     scheduling: Scheduling,
-    /// Devices on the way from one gateway to the next.
-    shelf: Shelf,
+    /// Open devices between one gateway and the next.
+    handover: Handover,
     /// Where each gateway runs.
     place: Place,
     /// Who looks at each gateway, but for the console.
@@ -435,7 +435,7 @@ impl Supervisor {
         let copy = (*config).clone();
         let binds = self.binds_of(number, &config);
         let handle =
-            gateway::spawn(copy, binds, self.scheduling, observers, self.shelf.clone(), &self.place)?;
+            gateway::spawn(copy, binds, self.scheduling, observers, self.handover.clone(), &self.place)?;
         self.running = Some(Replaceable { number, handle, window, config });
         Ok(())
     }

@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use proto_core::config::GatewayConfig;
 use proto_core::time::Duration;
-use recipe_io::kept::Shelf;
+use recipe_io::handover::Handover;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use serde_json::{Map, Value, json};
 use tracing::{error_span, warn};
@@ -70,7 +70,7 @@ fn start(cell: Cell, place: Place) -> Result<Box<dyn Running>, StartError> {
         return Ok(Box::new(Supervised::start(file, &options, console, None, place)?));
     }
     let observers = Observers::of(&options);
-    let handle = spawn(*config, options.binds, options.scheduling, observers, Shelf::default(), &place)?;
+    let handle = spawn(*config, options.binds, options.scheduling, observers, Handover::default(), &place)?;
     Ok(Box::new(handle))
 }
 

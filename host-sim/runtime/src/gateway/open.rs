@@ -22,7 +22,7 @@ use crate::host::AtEnd;
 use crate::link::Endpoint;
 use recipe_capture::{Cell as Watched, Epoch};
 use recipe_io::bind::Bind;
-use recipe_io::kept::{Kept, Shelf};
+use recipe_io::handover::{Handover, HandoverDevice};
 use recipe_io::port::{Port, PortBus};
 use recipe_io::tcp_options;
 use recipe_io::timer::now;
@@ -30,27 +30,27 @@ use recipe_io::timer::now;
 /// What ports are bound to.
 pub(super) struct Devices<'a> {
     pub(super) binds: &'a [Bind],
-    /// What another gateway has left, and where this one leaves its own; `None` if it closes them.
-    pub(super) left: Option<(Shelf, &'a AtEnd)>,
+    /// Devices of the previous gateway, and where this one puts its own; `None` if it closes them.
+    pub(super) handover: Option<(Handover, &'a AtEnd)>,
 }
 
 impl<'a> Devices<'a> {
     /// Devices that belong to one gateway only.
     pub(super) fn own(binds: &'a [Bind]) -> Self {
-        Self { binds, left: None }
+        Self { binds, handover: None }
     }
 
-    /// Opens a port's device, or takes over what another gateway has left of it.
+    /// Opens a port's device, or takes it over from the previous gateway.
     async fn open(&self, port: &PortConfig) -> Result<Port, StartError> {
-        let kept = self.left.as_ref().and_then(|(shelf, _)| shelf.take(&port.name));
-        let device = open_port(port, self.binds, kept).await?;
-        if let Some((shelf, at_end)) = &self.left
+        let taken = self.handover.as_ref().and_then(|(handover, _)| handover.take(&port.name));
+        let device = open_port(port, self.binds, taken).await?;
+        if let Some((handover, at_end)) = &self.handover
             && let Some(hold) = device.hold()
         {
-            let (shelf, name) = (shelf.clone(), port.name.to_string());
+            let (handover, name) = (handover.clone(), port.name.to_string());
             at_end.add(move || {
-                if let Some(kept) = hold.release() {
-                    shelf.put(&name, kept);
+                if let Some(device) = hold.release() {
+                    handover.put(&name, device);
                 }
             });
         }
@@ -160,7 +160,11 @@ fn encoded(config: &GatewayConfig) -> Result<Vec<u8>, StartError> {
     Ok(bytes)
 }
 
-async fn open_port(port: &PortConfig, binds: &[Bind], kept: Option<Kept>) -> Result<Port, StartError> {
+async fn open_port(
+    port: &PortConfig,
+    binds: &[Bind],
+    handover: Option<HandoverDevice>,
+) -> Result<Port, StartError> {
     let name = port.name.as_str();
     let bus = match port.bus {
         Bus::Rs485(settings) => PortBus::Serial(settings),
@@ -179,10 +183,10 @@ async fn open_port(port: &PortConfig, binds: &[Bind], kept: Option<Kept>) -> Res
             "port {name} needs exactly one device: --bind {name}=DEVICE, such as {examples}"
         )));
     };
-    let opened = Port::open_or_adopt(&bind.device, bus, kept).await;
+    let opened = Port::open_or_adopt(&bind.device, bus, handover).await;
     let device =
         opened.map_err(|error| StartError::new(format!("--bind {name}={}: {error}", bind.device)))?;
-    if device.is_kept() {
+    if device.is_handed_over() {
         info!(port = name, "the device stays open; its clients stay connected");
     }
     Ok(device)

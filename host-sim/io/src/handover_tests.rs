@@ -14,18 +14,18 @@ use crate::test_kit::{Client, Running, Seen, run, serial};
 use crate::timer::now;
 
 /// Ends the tasks of a port and keeps its device.
-async fn keep(port: Running, hold: Hold) -> Kept {
+async fn hand_over(port: Running, hold: Hold) -> HandoverDevice {
     drop(port);
     for _ in 0..10 {
         yield_now().await;
     }
-    hold.release().expect("it is not kept")
+    hold.release().expect("it is not handed over")
 }
 
-async fn open(bind: &str, bus: PortBus, kept: Option<Kept>) -> (Running, Hold) {
-    let is_kept = kept.is_some();
-    let port = Port::open_or_adopt(&bind.parse().unwrap(), bus, kept).await.unwrap();
-    assert_eq!(port.is_kept(), is_kept);
+async fn open(bind: &str, bus: PortBus, handover: Option<HandoverDevice>) -> (Running, Hold) {
+    let is_handed_over = handover.is_some();
+    let port = Port::open_or_adopt(&bind.parse().unwrap(), bus, handover).await.unwrap();
+    assert_eq!(port.is_handed_over(), is_handed_over);
     let hold = port.hold().unwrap();
     (Running::of(port), hold)
 }
@@ -40,10 +40,10 @@ fn what_was_sent_between_two_owners_of_a_terminal_is_dropped() {
         let mut client = Client::open(&link);
         client.0.write_all(b"first").unwrap();
         assert_eq!(port.bytes(5).await, b"first");
-        let kept = keep(port, hold).await;
+        let handover = hand_over(port, hold).await;
         client.0.write_all(&[0xA5; 3_000]).unwrap();
         let start = now();
-        let (port, _) = open(&bind, serial(9_600), Some(kept)).await;
+        let (port, _) = open(&bind, serial(9_600), Some(handover)).await;
         let up = port.expect(Seen::Up).await;
         assert!(up.saturating_since(start) >= STALE);
         assert_eq!(port.tx.counters().dropped, 3_000);
@@ -64,9 +64,9 @@ fn a_client_that_has_gone_between_two_owners_makes_room() {
         let place = port.place.clone();
         let client = TcpStream::connect(&place).await.unwrap();
         port.expect(Seen::Up).await;
-        let kept = keep(port, hold).await;
+        let handover = hand_over(port, hold).await;
         drop(client);
-        let (port, _) = open(bind, serial(115_200), Some(kept)).await;
+        let (port, _) = open(bind, serial(115_200), Some(handover)).await;
         assert_eq!(port.place, place);
         let mut client = TcpStream::connect(&place).await.unwrap();
         port.expect(Seen::Up).await;
@@ -86,9 +86,9 @@ fn a_command_that_is_cut_by_the_change_becomes_no_other_frame() {
         client.write_all(b"O\rt1230\rt1232AA").await.unwrap();
         let empty = |id| Seen::Frame(CanFrame::new(CanId::Standard(id), &[]).unwrap());
         port.expect(empty(0x123)).await;
-        let kept = keep(port, hold).await;
+        let handover = hand_over(port, hold).await;
         client.write_all(b"BB\rt1241CC\rt1252DD").await.unwrap();
-        let (port, _) = open(&bind, bus, Some(kept)).await;
+        let (port, _) = open(&bind, bus, Some(handover)).await;
         port.expect(Seen::Up).await;
         // The channel is open still, and the first frame that comes is one that was sent from now on.
         tokio::time::sleep(std::time::Duration::from_millis(3 * STALE.as_millis())).await;

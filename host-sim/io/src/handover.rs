@@ -1,8 +1,8 @@
-//! Devices between two owners: a gateway that is replaced leaves its pseudoterminals and listening sockets to the next
-//! one, so that no client is hung up.
+//! Handover of open devices: a gateway that is replaced passes its pseudoterminals and listening sockets to its
+//! successor, so that clients stay connected.
 //!
-//! In: what the tasks of a port used, once they are gone. Out: the same, for a port of the same name with the same
-//! `--bind` and the same kind of bus, in another runtime. What waits in a device meanwhile is dropped by its next owner.
+//! In: what the tasks of a port used, after they have ended. Out: the same device in another runtime, for a port with
+//! the same name, `--bind` and kind of bus. The new owner drops input that arrived in between.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -14,50 +14,50 @@ use tokio::net::{TcpListener, TcpStream};
 use crate::bind::Device;
 use crate::can_bus::{Clients, Session};
 use crate::exchange::PortTx;
-use crate::pty::{ParkedPty, Pty};
+use crate::pty::{HandoverPty, Pty};
 
-/// Devices without an owner, by the names of their ports; a clone is the same shelf. Dropping the last one closes them.
+/// Open devices without an owner, by port name. Clones share them; dropping the last clone closes them.
 #[derive(Debug, Default, Clone)]
-pub struct Shelf(Arc<Mutex<BTreeMap<String, Kept>>>);
+pub struct Handover(Arc<Mutex<BTreeMap<String, HandoverDevice>>>);
 
-impl Shelf {
-    /// Keeps a device for the next owner of this port.
-    pub fn put(&self, port: &str, kept: Kept) {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).insert(port.to_owned(), kept);
+impl Handover {
+    /// Stores the device of a port for its next owner.
+    pub fn put(&self, port: &str, device: HandoverDevice) {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).insert(port.to_owned(), device);
     }
 
-    /// The device of this port, if there is one.
-    pub fn take(&self, port: &str) -> Option<Kept> {
+    /// Removes and returns the device of a port.
+    pub fn take(&self, port: &str) -> Option<HandoverDevice> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).remove(port)
     }
 }
 
-/// An open device that no task uses. Dropping it closes it.
+/// An open device that no task uses; closed when dropped.
 #[derive(Debug)]
-pub struct Kept {
+pub struct HandoverDevice {
     pub(crate) device: Device,
-    pub(crate) what: Parked,
+    pub(crate) what: HandoverState,
 }
 
-/// What is open.
+/// The open descriptors of a device.
 #[derive(Debug)]
-pub(crate) enum Parked {
-    Pty(ParkedPty),
+pub(crate) enum HandoverState {
+    Pty(HandoverPty),
     Listen(std::net::TcpListener, Option<std::net::TcpStream>),
-    Bus(ParkedBus),
+    Bus(HandoverBus),
 }
 
-/// A CAN bus in user space without its frames: the ends that clients are at.
+/// The clients' side of a CAN bus in user space, without queued frames.
 #[derive(Debug)]
-pub(crate) struct ParkedBus {
-    /// Bit/s: the clients' channels are for a bus of this rate.
+pub(crate) struct HandoverBus {
+    /// Bit/s of the bus, which the clients' channels must match.
     pub(crate) bitrate: u32,
-    pub(crate) pty: Option<(ParkedPty, Session)>,
+    pub(crate) pty: Option<(HandoverPty, Session)>,
     pub(crate) listener: Option<std::net::TcpListener>,
     pub(crate) clients: Vec<(std::net::TcpStream, Session)>,
 }
 
-/// What the tasks of a port use. They may be gone without a word; then it can be kept.
+/// Shares the device of a running port, to release it after the port's tasks were dropped.
 #[derive(Debug)]
 pub struct Hold {
     pub(crate) device: Device,
@@ -81,21 +81,21 @@ pub(crate) struct HeldBus {
 }
 
 impl Hold {
-    /// The device, to be kept. `None` if it has failed, or if a task still uses it.
-    pub fn release(self) -> Option<Kept> {
+    /// Returns the device; `None` if it has failed or a task still uses it.
+    pub fn release(self) -> Option<HandoverDevice> {
         if self.tx.has_failed.get() {
             return None;
         }
         let what = match self.held {
-            Held::Pty(pty) => Parked::Pty(parked(pty)?),
+            Held::Pty(pty) => HandoverState::Pty(detach(pty)?),
             Held::Listen(listener, client) => {
                 let client = Rc::into_inner(client)?.into_inner();
                 let client = client.and_then(Rc::into_inner).and_then(|stream| stream.into_std().ok());
-                Parked::Listen(Rc::into_inner(listener)?.into_std().ok()?, client)
+                HandoverState::Listen(Rc::into_inner(listener)?.into_std().ok()?, client)
             }
             Held::Bus(HeldBus { bitrate, pty, listener, clients }) => {
                 let pty = match pty {
-                    Some((pty, session)) => Some((parked(pty)?, Rc::into_inner(session)?.into_inner())),
+                    Some((pty, session)) => Some((detach(pty)?, Rc::into_inner(session)?.into_inner())),
                     None => None,
                 };
                 let listener = match listener {
@@ -107,17 +107,17 @@ impl Hold {
                     let stream = client.stream.into_std().ok()?;
                     Some((stream, client.session.into_inner()))
                 });
-                Parked::Bus(ParkedBus { bitrate, pty, listener, clients: clients.collect() })
+                HandoverState::Bus(HandoverBus { bitrate, pty, listener, clients: clients.collect() })
             }
         };
-        Some(Kept { device: self.device, what })
+        Some(HandoverDevice { device: self.device, what })
     }
 }
 
-fn parked(pty: Rc<Pty>) -> Option<ParkedPty> {
-    Rc::into_inner(pty)?.park()
+fn detach(pty: Rc<Pty>) -> Option<HandoverPty> {
+    Rc::into_inner(pty)?.detach()
 }
 
 #[cfg(test)]
-#[path = "kept_tests.rs"]
+#[path = "handover_tests.rs"]
 mod tests;
