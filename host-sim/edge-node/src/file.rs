@@ -13,7 +13,7 @@ use crate::broker::Broker;
 
 /// What a Sparkplug file asks for; everything that can be wrong with it has been checked.
 #[derive(Debug, Clone)]
-pub struct Telling {
+pub struct PublisherConfig {
     /// The broker.
     pub broker: Broker,
     /// The node's names.
@@ -27,7 +27,7 @@ pub struct Telling {
     file: SparkplugFile,
 }
 
-impl Telling {
+impl PublisherConfig {
     /// Reads a Sparkplug file, and the files that it names.
     ///
     /// # Errors
@@ -166,7 +166,7 @@ mod tests {
             let toml =
                 format!("[broker]\naddress = \"b\"\n{more}\n[node]\ngroup = \"hall\"\nname = \"press\"\n");
             std::fs::write(&path, toml).unwrap();
-            Telling::load(&path).map(|telling| telling.broker.address())
+            PublisherConfig::load(&path).map(|config| config.broker.address())
         };
         assert_eq!(load("plain = true"), Ok("b:1883".into()));
         let of_a_board = load("plain = true\n[time]\nserver = \"10.0.0.1\"");

@@ -4,7 +4,6 @@
 //! outputs are carried out before anything else is read. So only one call of the engine is between the last
 //! byte of a field frame and the request to the controller.
 
-pub mod cells;
 mod doctor;
 mod open;
 mod shown;
@@ -24,16 +23,13 @@ use tokio::task::JoinSet;
 use tracing::{info, trace, warn};
 
 use doctor::Doctor;
-pub(crate) use doctor::Told;
 pub use doctor::listen;
-pub(crate) use doctor::{look_at_states, unexplained};
 use open::Devices;
 
-use super::console::window::{MAX_SAFE, Window};
-use super::console::{ConfigFile, ConsoleOptions, Supervised};
 use super::host::{self, Handle, Shell};
 use super::link::{self, Endpoint, LinkControl, LinkEvent};
-use super::telling::{Glimpse, Teller};
+use super::publisher::{Publisher, SnapshotWatch};
+use super::snapshot::{Engine, MAX_SAFE, SnapshotSlot};
 use super::worker::Place;
 use super::{RunOptions, StartError};
 use recipe_capture::{Decoder, Watch};
@@ -46,10 +42,7 @@ use recipe_io::port::Port;
 use recipe_io::realtime::{self, Scheduling};
 use recipe_io::timer::{Timer, now};
 use shown::Shown;
-use tapping::{TAP, Tapping};
-
-/// The engine with room for a tap.
-pub(crate) type Engine = proto_core::engine::Engine<8, 4, 512, TAP>;
+use tapping::Tapping;
 
 /// Who looks at a gateway.
 #[derive(Debug, Clone, Default)]
@@ -59,9 +52,9 @@ pub(crate) struct Observers {
     /// What frames mean, for them.
     pub decoder: Arc<Decoder>,
     /// A console.
-    pub window: Option<Arc<Window>>,
+    pub slot: Option<Arc<SnapshotSlot>>,
     /// An edge node.
-    pub glimpse: Option<Glimpse>,
+    pub snapshot_watch: Option<SnapshotWatch>,
     /// Whoever reads the log or the statistics, where findings are told.
     pub readers: bool,
 }
@@ -72,8 +65,8 @@ impl Observers {
         Self {
             watch: options.watch.clone(),
             decoder: Arc::clone(&options.decoder),
-            window: None,
-            glimpse: None,
+            slot: None,
+            snapshot_watch: None,
             readers,
         }
     }
@@ -85,9 +78,9 @@ struct Gateway {
     ports: Vec<(PortId, Port)>,
     links: Vec<(LinkId, LinkKind, Endpoint)>,
     ready: Value,
-    window: Option<Arc<Window>>,
+    slot: Option<Arc<SnapshotSlot>>,
     /// That of an edge node.
-    glimpse: Option<Arc<Window>>,
+    publisher_slot: Option<Arc<SnapshotSlot>>,
     /// Who looks at it once a second, if somebody does.
     doctor: Option<Doctor>,
 }
@@ -127,19 +120,19 @@ struct Core {
 
 impl Gateway {
     async fn drive(self) -> Result<(), StartError> {
-        let Self { core: shared, ports, links, window, glimpse, doctor, .. } = self;
+        let Self { core: shared, ports, links, slot, publisher_slot, doctor, .. } = self;
         let mut tasks = JoinSet::new();
-        if let Some(window) = window {
+        if let Some(slot) = slot {
             let core = Rc::clone(&shared);
-            tasks.spawn_local(async move { core.show(&window).await });
+            tasks.spawn_local(async move { core.show(&slot).await });
             if doctor.is_none() {
                 let core = Rc::clone(&shared);
                 tasks.spawn_local(async move { core.keep_notes().await });
             }
         }
-        if let Some(glimpse) = glimpse {
+        if let Some(publisher_slot) = publisher_slot {
             let core = Rc::clone(&shared);
-            tasks.spawn_local(async move { core.show(&glimpse).await });
+            tasks.spawn_local(async move { core.show(&publisher_slot).await });
         }
         for (id, port) in ports {
             let core = Rc::clone(&shared);
@@ -214,25 +207,25 @@ impl Core {
         }
     }
 
-    /// Fills a window when somebody asks, and brings the safe values out when it wants to end this gateway.
-    async fn show(&self, window: &Window) -> Result<(), StartError> {
+    /// Fills a slot when somebody asks, and brings the safe values out when it wants to end this gateway.
+    async fn show(&self, slot: &SnapshotSlot) -> Result<(), StartError> {
         loop {
             tokio::select! {
-                () = window.wanted.notified() => window.fill(|shot| {
-                    shot.engine.clone_from(&self.engine.borrow());
-                    shot.at = now();
-                    shot.running = shot.at.saturating_since(self.started);
-                    shot.keep_records(&self.records.borrow());
-                    shot.links.clear();
-                    shot.links.extend(self.engine.borrow().links().map(|info| self.facts_of(info.id)));
-                    shot.devices = Default::default();
+                () = slot.wanted.notified() => slot.fill(|snapshot| {
+                    snapshot.engine.clone_from(&self.engine.borrow());
+                    snapshot.at = now();
+                    snapshot.running = snapshot.at.saturating_since(self.started);
+                    snapshot.keep_records(&self.records.borrow());
+                    snapshot.links.clear();
+                    snapshot.links.extend(self.engine.borrow().links().map(|info| self.facts_of(info.id)));
+                    snapshot.devices = Default::default();
                     for (port, (_, tx)) in &self.ports {
-                        if let Some(counters) = shot.devices.get_mut(usize::from(port.0)) {
+                        if let Some(counters) = snapshot.devices.get_mut(usize::from(port.0)) {
                             *counters = Some(tx.counters());
                         }
                     }
                 }),
-                () = window.ending.notified() => {
+                () = slot.ending.notified() => {
                     self.is_ending.set(true);
                     self.engine.borrow_mut().make_safe();
                     self.tapping.borrow_mut().make_safe(now());
@@ -245,7 +238,7 @@ impl Core {
                     if tokio::time::timeout(MAX_SAFE, is_safe).await.is_err() {
                         warn!("the controller does not show all safe values; ending all the same");
                     }
-                    window.is_safe();
+                    slot.is_safe();
                 }
             }
         }
@@ -461,27 +454,12 @@ fn lift(outer: &mut Value, key: &str) {
 /// # Errors
 /// The reason why it could not start; nothing is left behind then.
 pub fn run(config: GatewayConfig, options: RunOptions) -> Result<(), StartError> {
-    let teller = options.sparkplug.clone().map(Teller::start).transpose()?;
-    let glimpse = teller.as_ref().map(Teller::glimpse);
-    let observers = Observers { glimpse, ..Observers::of(&options) };
+    let publisher = options.sparkplug.clone().map(Publisher::start).transpose()?;
+    let snapshot_watch = publisher.as_ref().map(Publisher::snapshot_watch);
+    let observers = Observers { snapshot_watch, ..Observers::of(&options) };
     let (binds, handover) = (options.binds.clone(), Handover::default());
     let handle = spawn(config, binds, options.scheduling, observers, handover, &Place::alone())?;
     host::foreground(Box::new(handle), &options)
-}
-
-/// Same, with a console that can give it another configuration.
-///
-/// # Errors
-/// The reason why it could not start; nothing is left behind then.
-pub fn run_with_console(
-    file: ConfigFile,
-    console: &ConsoleOptions,
-    options: &RunOptions,
-) -> Result<(), StartError> {
-    let teller = options.sparkplug.clone().map(Teller::start).transpose()?;
-    let glimpse = teller.as_ref().map(Teller::glimpse);
-    let supervised = Supervised::start(file, options, console, glimpse, Place::alone())?;
-    host::foreground(Box::new(supervised), options)
 }
 
 /// Starts the gateway on a thread of its own; dropping the handle ends it.
@@ -512,20 +490,20 @@ pub(crate) fn spawn(
     place: &Place,
 ) -> Result<Handle, StartError> {
     let watch = observers.watch.clone();
-    let (doctor, told) = match observers.readers {
+    let (doctor, texts) = match observers.readers {
         true => {
-            let (doctor, told) = doctor::start(config.clone(), &binds, place.span.clone())?;
-            (Some(doctor), Some(told))
+            let (doctor, texts) = doctor::start(config.clone(), &binds, place.span.clone())?;
+            (Some(doctor), Some(texts))
         }
         false => (None, None),
     };
-    let glimpse = observers.glimpse.as_ref().map(|glimpse| glimpse.open(&config));
+    let publisher_slot = observers.snapshot_watch.as_ref().map(|watch| watch.open(&config));
     let handle = host::start(place, "gateway", async move |at_end| {
         let devices = Devices { binds: &binds, handover: Some((handover, at_end)) };
         let mut gateway = Gateway::open(&config, devices, Voice::Full, &observers).await?;
-        gateway.window = observers.window;
-        gateway.glimpse = glimpse;
-        if doctor.is_some() || gateway.window.is_some() {
+        gateway.slot = observers.slot;
+        gateway.publisher_slot = publisher_slot;
+        if doctor.is_some() || gateway.slot.is_some() {
             gateway.core.keep_records(&config, &binds);
         }
         gateway.doctor = doctor;
@@ -534,7 +512,7 @@ pub(crate) fn spawn(
         info!(%scheduling, "the gateway is running");
         Ok(gateway)
     })?;
-    Ok(handle.with_watch(watch).with_findings(told))
+    Ok(handle.with_watch(watch).with_findings(texts))
 }
 
 /// How often is looked whether the safe values have arrived.

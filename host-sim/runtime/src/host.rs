@@ -5,7 +5,6 @@
 //! way its tasks end with it.
 
 use std::cell::RefCell;
-use std::io;
 use std::pin::Pin;
 use std::rc::Rc;
 use std::sync::mpsc as blocking;
@@ -14,19 +13,18 @@ use std::thread::JoinHandle;
 use recipe_capture::Watch;
 use recipe_io::fairness;
 use serde_json::Value;
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::mpsc;
 use tokio::task::{LocalSet, spawn_local};
 use tracing::warn;
 
 use super::service::Service;
 use super::{RunOptions, Signals, StartError};
-use crate::gateway::Told;
+use crate::client::{RuntimeClient, RuntimeRequest};
+use crate::findings::FindingTexts;
 use crate::out::print_stderr;
 use crate::stdout::{Failure, Stdout};
-use crate::worker::{Place, Shared};
-
-/// Stack size: an engine is built by value, and unoptimised code has several copies of it on the stack.
-pub(super) const STACK: usize = 16 << 20;
+pub(super) use crate::worker::STACK;
+use crate::worker::{Place, Shared, no_runtime, panicked, runtime};
 
 /// A gateway or a controller that runs on one thread until it is dropped.
 pub(super) trait Shell: 'static {
@@ -44,9 +42,9 @@ pub(super) trait Shell: 'static {
 #[derive(Debug)]
 pub struct Handle {
     ready: Value,
-    requests: mpsc::UnboundedSender<Request>,
+    requests: mpsc::UnboundedSender<RuntimeRequest>,
     watch: Watch,
-    findings: Option<Told>,
+    findings: Option<FindingTexts>,
     home: Option<Home>,
 }
 
@@ -66,45 +64,11 @@ pub(crate) trait Running {
     /// One line of statistics; `None` if there is none at the moment.
     fn stats(&self) -> Option<Value>;
     /// Ask the threads that move the data; none if one of them is missing at the moment.
-    fn askers(&self) -> Vec<Asker>;
+    fn clients(&self) -> Vec<RuntimeClient>;
     /// Whether it has ended by itself.
     fn has_ended(&self) -> bool;
     /// Ends it and waits for it. If it had ended by itself, the reason is the error.
     fn shutdown(self: Box<Self>) -> Result<(), StartError>;
-}
-
-/// Asks a shell, from any thread.
-#[derive(Debug, Clone)]
-pub(crate) struct Asker {
-    requests: mpsc::UnboundedSender<Request>,
-    /// What is found by another thread than the one that is asked.
-    findings: Option<Told>,
-}
-
-impl Asker {
-    /// One line of statistics; `None` if the shell has ended.
-    pub(crate) fn stats(&self) -> Option<Value> {
-        let (answer, stats) = blocking::channel();
-        self.requests.send(Request::Stats(answer)).ok()?;
-        let mut stats = stats.recv().ok()?;
-        if let Some(findings) = &self.findings {
-            stats["findings"] = findings.words();
-        }
-        Some(stats)
-    }
-
-    /// Waits until it answers; false if it has ended.
-    pub(crate) async fn answers(&self) -> bool {
-        let (answer, answered) = oneshot::channel();
-        self.requests.send(Request::Ping(answer)).is_ok() && answered.await.is_ok()
-    }
-
-    /// One whose questions come out at the other end.
-    #[cfg(test)]
-    pub(super) fn channel() -> (Self, mpsc::UnboundedReceiver<Request>) {
-        let (requests, inbox) = mpsc::unbounded_channel();
-        (Self { requests, findings: None }, inbox)
-    }
 }
 
 /// What the thread of a shell does at its end, after all tasks are gone. A clone is the same.
@@ -122,14 +86,6 @@ impl AtEnd {
     fn run(self) {
         self.0.take().into_iter().for_each(|act| act());
     }
-}
-
-#[derive(Debug)]
-pub(super) enum Request {
-    Stats(blocking::Sender<Value>),
-    /// Whether the thread works.
-    Ping(oneshot::Sender<()>),
-    Shutdown,
 }
 
 /// Opens a shell and waits until everything is listening.
@@ -184,20 +140,11 @@ fn alone<S: Shell>(
     thread.map_err(|error| StartError::new(format!("cannot start a thread: {error}")))
 }
 
-/// The runtime of a thread.
-pub(super) fn runtime() -> Result<tokio::runtime::Runtime, StartError> {
-    tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(no_runtime)
-}
-
-fn no_runtime(error: io::Error) -> StartError {
-    StartError::new(format!("cannot start the runtime: {error}"))
-}
-
 /// A shell that is to be opened.
 struct Opening<S> {
     open: Open<S>,
     opened: blocking::Sender<Result<Value, StartError>>,
-    inbox: mpsc::UnboundedReceiver<Request>,
+    inbox: mpsc::UnboundedReceiver<RuntimeRequest>,
 }
 
 /// Opens a shell. It is called through a pointer, and so is its future: what it needs on the stack, with room for an
@@ -240,16 +187,16 @@ impl<S: Shell> Opening<S> {
 }
 
 /// Answers requests until one asks for the end.
-async fn serve(mut inbox: mpsc::UnboundedReceiver<Request>, stats: impl Fn() -> Value) {
+async fn serve(mut inbox: mpsc::UnboundedReceiver<RuntimeRequest>, stats: impl Fn() -> Value) {
     while let Some(request) = inbox.recv().await {
         match request {
-            Request::Stats(answer) => {
+            RuntimeRequest::Stats(answer) => {
                 let _ = answer.send(stats());
             }
-            Request::Ping(answer) => {
+            RuntimeRequest::Ping(answer) => {
                 let _ = answer.send(());
             }
-            Request::Shutdown => return,
+            RuntimeRequest::Shutdown => return,
         }
     }
 }
@@ -267,11 +214,11 @@ impl Handle {
 
     /// One line of statistics; `None` if the shell has ended.
     pub fn stats(&self) -> Option<Value> {
-        self.asker().stats()
+        self.client().stats()
     }
 
-    pub(crate) fn asker(&self) -> Asker {
-        Asker { requests: self.requests.clone(), findings: self.findings.clone() }
+    pub(crate) fn client(&self) -> RuntimeClient {
+        RuntimeClient { requests: self.requests.clone(), findings: self.findings.clone() }
     }
 
     /// What is seen at the gateway's ports and links, for any number of subscribers; a controller tells
@@ -288,7 +235,7 @@ impl Handle {
     }
 
     /// What another thread finds belongs to the statistics.
-    pub(super) fn with_findings(self, findings: Option<Told>) -> Self {
+    pub(super) fn with_findings(self, findings: Option<FindingTexts>) -> Self {
         let mut handle = self;
         handle.findings = findings;
         handle
@@ -308,7 +255,7 @@ impl Handle {
     }
 
     fn end(&mut self) -> Result<(), StartError> {
-        let _ = self.requests.send(Request::Shutdown);
+        let _ = self.requests.send(RuntimeRequest::Shutdown);
         self.home.take().map_or(Ok(()), Home::ended)
     }
 }
@@ -322,8 +269,8 @@ impl Running for Handle {
         self.stats()
     }
 
-    fn askers(&self) -> Vec<Asker> {
-        vec![self.asker()]
+    fn clients(&self) -> Vec<RuntimeClient> {
+        vec![self.client()]
     }
 
     fn has_ended(&self) -> bool {
@@ -358,11 +305,6 @@ impl Home {
     }
 }
 
-/// A thread or a shell panicked.
-pub(super) fn panicked() -> StartError {
-    StartError::new("a thread panicked").after_start()
-}
-
 /// Prints `ready` and statistics, and ends on a signal.
 pub(super) fn foreground(handle: Box<dyn Running>, options: &RunOptions) -> Result<(), StartError> {
     let runtime = runtime()?;
@@ -370,7 +312,7 @@ pub(super) fn foreground(handle: Box<dyn Running>, options: &RunOptions) -> Resu
         .map_err(|error| StartError::new(format!("cannot start the thread for statistics: {error}")))?;
     let result = runtime.block_on(async {
         // Signals are handled before `ready` is printed.
-        let refused = |error: io::Error| StartError::new(format!("signals: {error}"));
+        let refused = |error: std::io::Error| StartError::new(format!("signals: {error}"));
         let mut signals = Signals::catch().map_err(refused)?;
         let ready = options.ready.as_ref().map(|file| file.write(handle.ready())).transpose()?;
         let line = format!("ready {}", handle.ready());
@@ -384,7 +326,7 @@ pub(super) fn foreground(handle: Box<dyn Running>, options: &RunOptions) -> Resu
         let mut ticks = options.stats.map(tokio::time::interval);
         let mut check = tokio::time::interval(CHECK_INTERVAL);
         let result = {
-            let mut alive = std::pin::pin!(service.keep_alive(|| handle.askers()));
+            let mut alive = std::pin::pin!(service.keep_alive(|| handle.clients()));
             loop {
                 tokio::select! {
                     _ = signals.next() => break Ok(()),

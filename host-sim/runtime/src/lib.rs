@@ -4,20 +4,24 @@
 //! data to the state machine, and carries out its outputs. It does not know protocols. The simulated controller's
 //! Modbus connections have a thread beside it, which does the same for them.
 
+pub mod cells;
+mod client;
 pub mod console;
 pub mod controller;
 mod events_file;
+mod findings;
 pub mod gateway;
 mod host;
 mod link;
 pub mod log;
 pub mod out;
+mod publisher;
 mod ready;
 mod service;
 mod signals;
+mod snapshot;
 mod stdout;
 mod tcp;
-mod telling;
 mod udp;
 mod worker;
 
@@ -31,7 +35,7 @@ pub use ready::ReadyFile;
 pub use signals::Signals;
 
 use recipe_capture::{Decoder, Watch};
-pub use recipe_edge_node::file::Telling;
+pub use recipe_edge_node::file::PublisherConfig;
 use recipe_io::bind::Bind;
 pub use recipe_io::realtime::Scheduling;
 
@@ -49,7 +53,7 @@ pub struct RunOptions {
     /// The console.
     pub console: Option<console::ConsoleOptions>,
     /// Where and how a gateway tells what it knows.
-    pub sparkplug: Option<Telling>,
+    pub sparkplug: Option<PublisherConfig>,
     /// What is seen of a gateway, for who has subscribed.
     pub watch: Watch,
     /// The frames of its file by name, for who has subscribed. A gateway with a console has those of what it runs.

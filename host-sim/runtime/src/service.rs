@@ -10,7 +10,7 @@ use std::time::Duration;
 use sd_notify::NotifyState;
 use tracing::warn;
 
-use super::host::Asker;
+use super::client::RuntimeClient;
 
 /// The service manager, from this process's environment.
 pub(super) struct Service {
@@ -34,11 +34,11 @@ impl Service {
     }
 
     /// Says again and again that the run works, as long as each of its threads answers. Never returns.
-    pub(super) async fn keep_alive(&self, threads: impl Fn() -> Vec<Asker>) {
+    pub(super) async fn keep_alive(&self, threads: impl Fn() -> Vec<RuntimeClient>) {
         self.each_beat(threads, || tell(&[NotifyState::Watchdog])).await;
     }
 
-    async fn each_beat(&self, threads: impl Fn() -> Vec<Asker>, say: impl Fn()) {
+    async fn each_beat(&self, threads: impl Fn() -> Vec<RuntimeClient>, say: impl Fn()) {
         let Some(patience) = self.patience else { return std::future::pending().await };
         let mut beat = tokio::time::interval(patience / BEATS);
         beat.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
@@ -69,15 +69,15 @@ fn tell(news: &[NotifyState<'_>]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::host::Request;
+    use crate::client::RuntimeRequest;
     use std::cell::Cell;
 
     #[tokio::test(start_paused = true)]
     async fn a_thread_that_does_not_answer_is_not_said_to_work() {
-        let (thread, mut inbox) = Asker::channel();
-        let (works, mut other) = Asker::channel();
+        let (thread, mut inbox) = RuntimeClient::channel();
+        let (works, mut other) = RuntimeClient::channel();
         let always_works = async {
-            while let Some(Request::Ping(answer)) = other.recv().await {
+            while let Some(RuntimeRequest::Ping(answer)) = other.recv().await {
                 let _ = answer.send(());
             }
         };
@@ -85,7 +85,7 @@ mod tests {
         let said = Cell::new(0);
         let works_for_a_while = async {
             let mut held = Vec::new();
-            while let Some(Request::Ping(answer)) = inbox.recv().await {
+            while let Some(RuntimeRequest::Ping(answer)) = inbox.recv().await {
                 if held.is_empty() && said.get() < 4 {
                     let _ = answer.send(());
                 } else {
@@ -105,7 +105,7 @@ mod tests {
 
     #[tokio::test(start_paused = true)]
     async fn without_a_watchdog_nothing_is_asked() {
-        let (thread, mut inbox) = Asker::channel();
+        let (thread, mut inbox) = RuntimeClient::channel();
         let service = Service { patience: None };
         tokio::select! {
             () = service.keep_alive(|| vec![thread.clone()]) => unreachable!("it goes on"),

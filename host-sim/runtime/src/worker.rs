@@ -1,6 +1,7 @@
 //! A thread that several shells share: what has become ready for one of them is found together with the rest, so that
 //! all of them sleep less often than each one alone.
 
+use std::io;
 use std::pin::Pin;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
@@ -12,7 +13,23 @@ use tokio::task::{LocalSet, spawn_local};
 use tracing::{Instrument, Span};
 
 use crate::StartError;
-use crate::host::{STACK, panicked, runtime};
+
+/// Stack size: an engine is built by value, and unoptimised code has several copies of it on the stack.
+pub(super) const STACK: usize = 16 << 20;
+
+/// A thread or a shell panicked.
+pub(super) fn panicked() -> StartError {
+    StartError::new("a thread panicked").after_start()
+}
+
+/// The runtime of a thread.
+pub(super) fn runtime() -> Result<tokio::runtime::Runtime, StartError> {
+    tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(no_runtime)
+}
+
+pub(super) fn no_runtime(error: io::Error) -> StartError {
+    StartError::new(format!("cannot start the runtime: {error}"))
+}
 
 /// Where a shell runs.
 #[derive(Debug, Clone)]

@@ -9,8 +9,8 @@ use super::check;
 use super::run::Run;
 use recipe_capture::Watch;
 use recipe_io::bind::Bind;
+use recipe_runtime::cells::Cell;
 use recipe_runtime::console::{ConfigFile, ConsoleOptions};
-use recipe_runtime::gateway::cells::Cell;
 use recipe_runtime::log::Log;
 use recipe_runtime::{RunOptions, StartError};
 

@@ -17,7 +17,7 @@ use recipe_runtime::console::{self, ConfigFile, ConsoleOptions};
 use recipe_runtime::controller::{ControllerOptions, MAX_FACTOR, MIN_FACTOR, Pace};
 use recipe_runtime::log::Log;
 use recipe_runtime::out::print_stderr;
-use recipe_runtime::{self as shell, EventsFile, ReadyFile, RunOptions, Scheduling, StartError, Telling};
+use recipe_runtime::{EventsFile, PublisherConfig, ReadyFile, RunOptions, Scheduling, StartError};
 
 /// Arguments of `controller` and `gateway`.
 #[derive(Debug, Args)]
@@ -110,7 +110,7 @@ impl GatewayRun {
                 }
                 return match cells::prepare(&files, run, log) {
                     Ok((cells, options)) => {
-                        finished(shell::gateway::cells::run(cells, cells::threads(threads), &options))
+                        finished(recipe_runtime::cells::run(cells, cells::threads(threads), &options))
                     }
                     Err(error) => finished(Err(error)),
                 };
@@ -121,7 +121,7 @@ impl GatewayRun {
         }
         let overrides = run.overrides.set.clone();
         let loaded = check::load_gateway(&path, &overrides);
-        let sparkplug = match sparkplug.as_deref().map(Telling::load).transpose() {
+        let sparkplug = match sparkplug.as_deref().map(PublisherConfig::load).transpose() {
             Ok(sparkplug) => sparkplug,
             Err(error) => return wrong(error),
         };
@@ -145,8 +145,8 @@ impl GatewayRun {
                 };
                 let result = match &options.console {
                     Some(console) => ConfigFile::read(&path, overrides)
-                        .and_then(|file| shell::gateway::run_with_console(file, console, &options)),
-                    None => shell::gateway::run(*config, options),
+                        .and_then(|file| recipe_runtime::console::run_gateway(file, console, &options)),
+                    None => recipe_runtime::gateway::run(*config, options),
                 };
                 watching.finish();
                 finished(result)
@@ -183,7 +183,7 @@ impl ControllerRun {
         });
         match (self.options(log), loaded) {
             (Ok(options), Ok((config, timeline))) => {
-                finished(shell::controller::run(config, ControllerOptions { timeline, ..options }))
+                finished(recipe_runtime::controller::run(config, ControllerOptions { timeline, ..options }))
             }
             (_, Err(error)) => wrong(error),
             (Err(error), _) => finished(Err(error)),

@@ -15,7 +15,7 @@ use serde_json::Value;
 use super::device::{FieldStream, PATIENCE};
 use recipe_config::file::{self, Text};
 use recipe_io::bind::Bind;
-use recipe_runtime::{self as shell, Handle};
+use recipe_runtime::Handle;
 
 /// An example file, embedded.
 #[derive(Clone, Copy)]
@@ -38,7 +38,7 @@ impl Robot {
         set.extend_from_slice(overrides);
         let config = file::parse_controller(Text { name: example.name, toml: example.toml }, &set);
         let config = config.map_err(io::Error::other)?;
-        shell::controller::start(config, parse_binds(binds)?).map(Self).map_err(io::Error::other)
+        recipe_runtime::controller::start(config, parse_binds(binds)?).map(Self).map_err(io::Error::other)
     }
 
     /// The address called `name` in the ready line.
@@ -97,7 +97,7 @@ impl Gateway {
         }
         let config = file::parse_gateway(Text { name: example.name, toml: example.toml }, &set);
         let config = config.map_err(io::Error::other)?;
-        shell::gateway::start(*config, parse_binds(binds)?).map(Self).map_err(io::Error::other)
+        recipe_runtime::gateway::start(*config, parse_binds(binds)?).map(Self).map_err(io::Error::other)
     }
 
     pub(super) fn address(&self, name: &str) -> io::Result<SocketAddr> {

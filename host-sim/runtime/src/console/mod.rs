@@ -14,7 +14,6 @@ mod snapshots;
 mod store;
 mod stream;
 mod supervisor;
-pub(crate) mod window;
 
 use std::cell::{Cell, RefCell};
 use std::net::{SocketAddr, TcpListener};
@@ -34,9 +33,12 @@ use serde_json::{Value, json};
 use tokio::sync::Notify;
 use tracing::{Span, info};
 
-use crate::StartError;
-use crate::host::{Asker, Handle, Running};
+use crate::client::RuntimeClient;
+use crate::host::{self, Handle, Running};
 use crate::log::Log;
+use crate::publisher::Publisher;
+use crate::worker::Place;
+use crate::{RunOptions, StartError};
 pub use key_file::read_key;
 use snapshots::Snapshots;
 pub use supervisor::ConfigFile;
@@ -93,7 +95,7 @@ pub(crate) enum Source {
     /// A gateway that can be given another configuration.
     Gateway { shared: Arc<supervisor::Shared>, commands: blocking::Sender<supervisor::Command>, watch: Watch },
     /// A simulated controller, and the address of its control socket.
-    Controller { asker: Asker, control: SocketAddr },
+    Controller { client: RuntimeClient, control: SocketAddr },
 }
 
 impl Source {
@@ -173,6 +175,21 @@ impl Drop for Console {
     }
 }
 
+/// Runs a gateway with a console, which can replace its configuration, until Ctrl-C, SIGTERM or SIGHUP.
+///
+/// # Errors
+/// The reason why it could not start; nothing is left behind then.
+pub fn run_gateway(
+    file: ConfigFile,
+    console: &ConsoleOptions,
+    options: &RunOptions,
+) -> Result<(), StartError> {
+    let publisher = options.sparkplug.clone().map(Publisher::start).transpose()?;
+    let snapshot_watch = publisher.as_ref().map(Publisher::snapshot_watch);
+    let supervised = Supervised::start(file, options, console, snapshot_watch, Place::alone())?;
+    host::foreground(Box::new(supervised), options)
+}
+
 /// A simulated controller with a console.
 #[derive(Debug)]
 pub(crate) struct Consoled {
@@ -187,7 +204,7 @@ impl Consoled {
     pub(crate) fn start(bound: Bound, handle: Handle, log: Option<Log>) -> Result<Self, StartError> {
         let control = handle.place("control").parse();
         let control = control.map_err(|error| StartError::new(format!("control socket: {error}")))?;
-        let console = Console::start(bound, Source::Controller { asker: handle.asker(), control }, log)?;
+        let console = Console::start(bound, Source::Controller { client: handle.client(), control }, log)?;
         let mut ready = handle.ready().clone();
         ready["console"] = json!(console.address());
         Ok(Self { ready, console: Some(console), handle })
@@ -203,8 +220,8 @@ impl Running for Consoled {
         self.handle.stats()
     }
 
-    fn askers(&self) -> Vec<Asker> {
-        vec![self.handle.asker()]
+    fn clients(&self) -> Vec<RuntimeClient> {
+        vec![self.handle.client()]
     }
 
     fn has_ended(&self) -> bool {

@@ -16,15 +16,15 @@ use recipe_io::timer::now;
 use serde_json::Value;
 
 use super::Source;
-use super::window::{Shot, Window};
-use crate::gateway::{look_at_states, unexplained};
+use crate::findings::{look_at_states, unexplained};
+use crate::snapshot::{GatewaySnapshot, SnapshotSlot};
 
 /// The newest snapshot.
 #[derive(Default)]
 pub(super) struct Snapshots {
     newest: RefCell<Option<Rc<Snapshot>>>,
     /// Room that the next copy is made in.
-    room: RefCell<Option<Box<Shot>>>,
+    buffer: RefCell<Option<Box<GatewaySnapshot>>>,
     /// Those who ask at the same time get the same copy.
     turn: tokio::sync::Mutex<()>,
     /// The controller's states after a command had failed at that instant, if they could be seen.
@@ -41,7 +41,7 @@ pub(super) struct Snapshot {
 }
 
 enum Taken {
-    Gateway(Box<Shot>, Arc<GatewayConfig>),
+    Gateway(Box<GatewaySnapshot>, Arc<GatewayConfig>),
     Controller(Value),
 }
 
@@ -56,12 +56,12 @@ impl Snapshots {
         }
         let what = match source {
             Source::Gateway { shared, .. } => {
-                let (window, config) = shared.running()?;
-                Taken::Gateway(self.copy(&window).await?, config)
+                let (slot, config) = shared.running()?;
+                Taken::Gateway(self.copy(&slot).await?, config)
             }
-            Source::Controller { asker, .. } => {
-                let asker = asker.clone();
-                Taken::Controller(tokio::task::spawn_blocking(move || asker.stats()).await.ok()??)
+            Source::Controller { client, .. } => {
+                let client = client.clone();
+                Taken::Controller(tokio::task::spawn_blocking(move || client.stats()).await.ok()??)
             }
         };
         let snapshot = Rc::new(Snapshot {
@@ -72,9 +72,9 @@ impl Snapshots {
             metrics: OnceCell::new(),
         });
         let before = self.newest.replace(Some(Rc::clone(&snapshot)));
-        // Its room is used again, if no stream is still reading.
-        if let Some(Snapshot { what: Taken::Gateway(shot, _), .. }) = before.and_then(Rc::into_inner) {
-            self.room.replace(Some(shot));
+        // Its buffer is used again, if no stream is still reading.
+        if let Some(Snapshot { what: Taken::Gateway(snapshot, _), .. }) = before.and_then(Rc::into_inner) {
+            self.buffer.replace(Some(snapshot));
         }
         Some(snapshot)
     }
@@ -94,12 +94,12 @@ impl Snapshots {
         states
     }
 
-    async fn copy(&self, window: &Arc<Window>) -> Option<Box<Shot>> {
-        let room = self.room.take().unwrap_or_else(Shot::empty);
-        match window.look(room).await {
-            Ok(shot) => Some(shot),
-            Err(room) => {
-                self.room.replace(room);
+    async fn copy(&self, slot: &Arc<SnapshotSlot>) -> Option<Box<GatewaySnapshot>> {
+        let buffer = self.buffer.take().unwrap_or_else(GatewaySnapshot::empty);
+        match slot.look(buffer).await {
+            Ok(snapshot) => Some(snapshot),
+            Err(buffer) => {
+                self.buffer.replace(buffer);
                 None
             }
         }
@@ -111,56 +111,57 @@ impl Snapshot {
     pub(super) fn status(&self) -> Rc<str> {
         let make = || match &self.what {
             Taken::Controller(stats) => stats.to_string(),
-            Taken::Gateway(shot, _) => status_of(shot),
+            Taken::Gateway(snapshot, _) => status_of(snapshot),
         };
         Rc::clone(self.status.get_or_init(|| make().into()))
     }
 
     /// The document `values`.
     pub(super) fn values(&self) -> Option<Rc<str>> {
-        let Taken::Gateway(shot, _) = &self.what else { return None };
-        let make =
-            || written(|text| Pieces::of(Document::Values).write_all(shot.engine.status(shot.at), text));
+        let Taken::Gateway(snapshot, _) = &self.what else { return None };
+        let make = || {
+            written(|text| Pieces::of(Document::Values).write_all(snapshot.engine.status(snapshot.at), text))
+        };
         Some(Rc::clone(self.values.get_or_init(|| make().into())))
     }
 
     /// The metrics.
     pub(super) fn metrics(&self) -> Option<Rc<str>> {
-        let Taken::Gateway(shot, _) = &self.what else { return None };
-        let make = || written(|text| Families::new().write_all(shot.engine.status(shot.at), text));
+        let Taken::Gateway(snapshot, _) = &self.what else { return None };
+        let make = || written(|text| Families::new().write_all(snapshot.engine.status(snapshot.at), text));
         Some(Rc::clone(self.metrics.get_or_init(|| make().into())))
     }
 
     /// Since when a command has failed for which nobody saw the controller's states.
     pub(super) fn unexplained(&self) -> Option<Instant> {
-        let Taken::Gateway(shot, _) = &self.what else { return None };
-        unexplained(shot.engine.status(shot.at))
+        let Taken::Gateway(snapshot, _) = &self.what else { return None };
+        unexplained(snapshot.engine.status(snapshot.at))
     }
 
     /// What is wrong. `looked` are the controller's states, if somebody else than the engine has looked.
     pub(super) fn findings(&self, looked: Option<States>) -> Option<Vec<Finding>> {
-        let Taken::Gateway(shot, config) = &self.what else { return None };
+        let Taken::Gateway(snapshot, config) = &self.what else { return None };
         Some(examine(&Case {
             config: config.view(),
-            status: shot.engine.status(shot.at).into(),
-            ports: shot.records(),
-            links: &shot.links,
-            running: shot.running,
+            status: snapshot.engine.status(snapshot.at).into(),
+            ports: snapshot.records(),
+            links: &snapshot.links,
+            running: snapshot.running,
             looked,
         }))
     }
 }
 
 /// The document `status`, with the counters of the devices, which the engine does not know.
-fn status_of(shot: &Shot) -> String {
-    let status = shot.engine.status(shot.at);
+fn status_of(snapshot: &GatewaySnapshot) -> String {
+    let status = snapshot.engine.status(snapshot.at);
     written(|text| {
         let _ = Pieces::of(Document::Status).write_all(status, text);
         text.pop();
         text.push_str(",\"devices\":{");
         let mut separator = "";
         for port in status.ports() {
-            if let Some(counters) = shot.devices.get(usize::from(port.id.0)).and_then(Option::as_ref) {
+            if let Some(counters) = snapshot.devices.get(usize::from(port.id.0)).and_then(Option::as_ref) {
                 text.push_str(separator);
                 let _ = json::write_text(text, port.name);
                 text.push(':');
@@ -172,7 +173,7 @@ fn status_of(shot: &Shot) -> String {
     })
 }
 
-/// The text that is written; a `String` has room for everything.
+/// The text that is written; a `String` has buffer for everything.
 fn written<R>(write: impl FnOnce(&mut String) -> R) -> String {
     let mut text = String::new();
     let _ = write(&mut text);

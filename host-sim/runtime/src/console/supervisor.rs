@@ -25,11 +25,12 @@ use tracing::{error, info, warn};
 
 use super::check::{self, Prepared};
 use super::store::{Entry, Store, digest};
-use super::window::Window;
 use super::{Bound, Console, ConsoleOptions, Source};
+use crate::client::RuntimeClient;
 use crate::gateway::{self, Observers};
-use crate::host::{Asker, Handle, Running};
-use crate::telling::Glimpse;
+use crate::host::{Handle, Running};
+use crate::publisher::SnapshotWatch;
+use crate::snapshot::SnapshotSlot;
 use crate::worker::Place;
 use crate::{RunOptions, StartError};
 
@@ -110,8 +111,8 @@ pub(crate) struct View {
     pub(super) overrides: Vec<String>,
     /// What runs.
     pub(super) config: Option<Arc<GatewayConfig>>,
-    asker: Option<Asker>,
-    window: Option<Arc<Window>>,
+    client: Option<RuntimeClient>,
+    slot: Option<Arc<SnapshotSlot>>,
 }
 
 impl View {
@@ -131,10 +132,10 @@ impl Shared {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The gateway that runs: its window, and its configuration.
-    pub(super) fn running(&self) -> Option<(Arc<Window>, Arc<GatewayConfig>)> {
+    /// The gateway that runs: its slot, and its configuration.
+    pub(super) fn running(&self) -> Option<(Arc<SnapshotSlot>, Arc<GatewayConfig>)> {
         let view = self.view();
-        view.window.clone().zip(view.config.clone())
+        view.slot.clone().zip(view.config.clone())
     }
 }
 
@@ -155,7 +156,7 @@ impl Supervised {
         file: ConfigFile,
         options: &RunOptions,
         console: &ConsoleOptions,
-        glimpse: Option<Glimpse>,
+        snapshot_watch: Option<SnapshotWatch>,
         place: Place,
     ) -> Result<Self, StartError> {
         let bound = console.bind()?;
@@ -176,7 +177,7 @@ impl Supervised {
             scheduling: options.scheduling,
             handover: Handover::default(),
             place,
-            observers: Observers { glimpse, ..Observers::of(options) },
+            observers: Observers { snapshot_watch, ..Observers::of(options) },
             put: None,
             failure: None,
         };
@@ -229,12 +230,12 @@ impl Running for Supervised {
     }
 
     fn stats(&self) -> Option<Value> {
-        let asker = self.shared.view().asker.clone();
-        asker?.stats()
+        let client = self.shared.view().client.clone();
+        client?.stats()
     }
 
-    fn askers(&self) -> Vec<Asker> {
-        self.shared.view().asker.clone().into_iter().collect()
+    fn clients(&self) -> Vec<RuntimeClient> {
+        self.shared.view().client.clone().into_iter().collect()
     }
 
     fn has_ended(&self) -> bool {
@@ -251,7 +252,7 @@ struct Replaceable {
     /// The number of its revision.
     number: u32,
     handle: Handle,
-    window: Arc<Window>,
+    slot: Arc<SnapshotSlot>,
     config: Arc<GatewayConfig>,
 }
 
@@ -419,24 +420,24 @@ impl Supervisor {
 
     /// Brings the safe values out and ends what runs.
     fn stop(&mut self) {
-        let Some(Replaceable { handle, window, .. }) = self.running.take() else { return };
+        let Some(Replaceable { handle, slot, .. }) = self.running.take() else { return };
         // From here on nothing runs.
         self.show();
-        window.make_safe();
+        slot.make_safe();
         if let Err(error) = handle.shutdown() {
             warn!(%error, "the gateway had ended by itself");
         }
     }
 
     fn start(&mut self, number: u32, prepared: Prepared) -> Result<(), StartError> {
-        let window = Arc::new(Window::new());
+        let slot = Arc::new(SnapshotSlot::new());
         let Prepared { config, decoder } = prepared;
-        let observers = Observers { window: Some(Arc::clone(&window)), decoder, ..self.observers.clone() };
+        let observers = Observers { slot: Some(Arc::clone(&slot)), decoder, ..self.observers.clone() };
         let copy = (*config).clone();
         let binds = self.binds_of(number, &config);
         let handle =
             gateway::spawn(copy, binds, self.scheduling, observers, self.handover.clone(), &self.place)?;
-        self.running = Some(Replaceable { number, handle, window, config });
+        self.running = Some(Replaceable { number, handle, slot, config });
         Ok(())
     }
 
@@ -460,8 +461,8 @@ impl Supervisor {
         view.failure = self.failure.clone();
         view.overrides = self.overrides.clone();
         let running = self.running.as_ref();
-        view.asker = running.map(|running| running.handle.asker());
-        view.window = running.map(|running| Arc::clone(&running.window));
+        view.client = running.map(|running| running.handle.client());
+        view.slot = running.map(|running| Arc::clone(&running.slot));
         view.config = running.map(|running| Arc::clone(&running.config));
         view.ready = running.map_or(Value::Null, |running| running.handle.ready().clone());
     }

@@ -1,59 +1,43 @@
 //! Findings of a running gateway, and of one that only listens.
 //!
 //! A running gateway is looked at once a second, if somebody reads what is found. The gateway's thread
-//! copies the engine and the records into a room; another thread looks at them, logs, and gives the room
+//! copies the engine and the records into a buffer; another thread looks at them, logs, and gives the buffer
 //! back. While it has not, nothing is copied.
 //!
 //! A gateway that only listens gives nothing to the controller, and nothing to the field unless it is to
-//! ask: [`super::Voice`] is the one gate that every output passes. Its engine is told of no link but the
+//! ask: [`super::Voice`] is the one gate that every output passes. Its engine is texts of no link but the
 //! state stream, on which it never sends, so it has nothing to say either.
 
-use std::net::{TcpStream, ToSocketAddrs};
 use std::rc::Rc;
 use std::sync::mpsc::{Receiver, Sender, SyncSender, TryRecvError, channel, sync_channel};
-use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration as StdDuration;
 
-use proto_core::config::{ControllerLink, GatewayConfig};
-use proto_core::engine::{LinkId, PortId, ReplyCode, Status};
+use proto_core::config::GatewayConfig;
+use proto_core::engine::{LinkId, PortId};
 use proto_core::time::{Duration, Instant};
-use proto_core::wire::dialect::Dialect;
-use proto_core::wire::state::{StateStream, States};
+use proto_core::wire::state::States;
 use recipe_doctor::{Case, Change, Finding, LinkFacts, PortRecord, Watch, examine, has_commands};
-use serde_json::{Value, json};
+use serde_json::Value;
 use tracing::{Span, info};
 
 use super::open::Devices;
-use super::{Core, Engine, Gateway, Observers, Voice};
+use super::{Core, Gateway, Observers, Voice};
+use crate::findings::{FindingTexts, look_at_states, unexplained};
 use crate::host::{self, Shell};
+use crate::snapshot::Engine;
 use crate::worker::Place;
 use crate::{Signals, StartError};
 use recipe_io::bind::Bind;
 use recipe_io::timer::now;
 
-/// The words of the newest findings of a gateway that is looked at.
-#[derive(Debug, Clone, Default)]
-pub(crate) struct Told(Arc<Mutex<Vec<String>>>);
-
-impl Told {
-    pub(crate) fn words(&self) -> Value {
-        json!(*self.0.lock().unwrap_or_else(PoisonError::into_inner))
-    }
-
-    fn replace(&self, findings: &[Finding]) {
-        let words = findings.iter().map(Finding::to_string).collect();
-        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = words;
-    }
-}
-
 /// The thread that looks, as the gateway's thread sees it.
 pub(super) struct Doctor {
-    rooms: Receiver<Box<Snapshot>>,
-    filled: SyncSender<Box<Snapshot>>,
+    buffers: Receiver<Box<DoctorSnapshot>>,
+    filled: SyncSender<Box<DoctorSnapshot>>,
 }
 
 /// A gateway at one instant.
-pub(super) struct Snapshot {
+pub(super) struct DoctorSnapshot {
     at: Instant,
     running: Duration,
     engine: Box<Engine>,
@@ -61,9 +45,9 @@ pub(super) struct Snapshot {
     links: Vec<LinkFacts>,
 }
 
-impl Snapshot {
-    /// Room for a copy of a gateway with these records.
-    fn room(ports: Vec<PortRecord>) -> Box<Self> {
+impl DoctorSnapshot {
+    /// A buffer for a copy of a gateway with these records.
+    fn buffer(ports: Vec<PortRecord>) -> Box<Self> {
         let engine = Box::new(Engine::idle());
         let links = Vec::with_capacity(Engine::MAX_LINKS);
         Box::new(Self { at: Instant::ZERO, running: Duration::ZERO, engine, ports, links })
@@ -79,13 +63,6 @@ impl Snapshot {
             looked,
         })
     }
-}
-
-/// Since when a command has failed for which nobody saw the controller's states.
-pub(crate) fn unexplained(status: Status<'_>) -> Option<Instant> {
-    let failed = status.ports().filter(|port| port.reply == ReplyCode::Fail);
-    let failed = failed.filter_map(|port| port.last_failed);
-    failed.filter(|failed| failed.controller.is_none()).map(|failed| failed.at).max()
 }
 
 impl Core {
@@ -107,8 +84,8 @@ impl Core {
     }
 
     /// Copies everything that findings are made of.
-    fn copy_to(&self, room: &mut Snapshot, at: Instant) {
-        let Snapshot { at: taken, running, engine, ports, links } = room;
+    fn copy_to(&self, buffer: &mut DoctorSnapshot, at: Instant) {
+        let DoctorSnapshot { at: taken, running, engine, ports, links } = buffer;
         (*taken, *running) = (at, at.saturating_since(self.started));
         engine.clone_from(&self.engine.borrow());
         ports.clone_from(&self.records.borrow());
@@ -144,36 +121,40 @@ impl Core {
             ticks.tick().await;
             let at = now();
             self.note(at);
-            let mut room = match doctor.rooms.try_recv() {
-                Ok(room) => room,
+            let mut buffer = match doctor.buffers.try_recv() {
+                Ok(buffer) => buffer,
                 // A busy machine has looked at the one before not yet.
                 Err(TryRecvError::Empty) => continue,
                 Err(TryRecvError::Disconnected) => return std::future::pending().await,
             };
-            self.copy_to(&mut room, at);
-            // There is one room, so there is place for it.
-            let _ = doctor.filled.try_send(room);
+            self.copy_to(&mut buffer, at);
+            // There is one buffer, so there is place for it.
+            let _ = doctor.filled.try_send(buffer);
         }
     }
 }
 
 /// Starts the thread that looks at snapshots and logs what begins and ends.
-pub(super) fn start(config: GatewayConfig, binds: &[Bind], span: Span) -> Result<(Doctor, Told), StartError> {
+pub(super) fn start(
+    config: GatewayConfig,
+    binds: &[Bind],
+    span: Span,
+) -> Result<(Doctor, FindingTexts), StartError> {
     let (filled, inbox) = sync_channel(1);
-    let (empty, rooms) = sync_channel(1);
-    let room = Snapshot::room(records(&config, binds));
-    let told = Told::default();
-    let own = told.clone();
+    let (empty, buffers) = sync_channel(1);
+    let buffer = DoctorSnapshot::buffer(records(&config, binds));
+    let texts = FindingTexts::default();
+    let own = texts.clone();
     let thread = std::thread::Builder::new().name("doctor".to_owned());
     thread
         .spawn(move || {
             // The gateway's thread is there until both ends of this one are.
-            let _ = empty.send(room);
+            let _ = empty.send(buffer);
             let _of = span.entered();
             log_changes(&config, &inbox, &empty, &own);
         })
         .map_err(|error| StartError::new(format!("cannot start a thread: {error}")))?;
-    Ok((Doctor { rooms, filled }, told))
+    Ok((Doctor { buffers, filled }, texts))
 }
 
 /// An empty record of each port.
@@ -189,9 +170,9 @@ fn records(config: &GatewayConfig, binds: &[Bind]) -> Vec<PortRecord> {
 
 fn log_changes(
     config: &GatewayConfig,
-    inbox: &Receiver<Box<Snapshot>>,
-    empty: &SyncSender<Box<Snapshot>>,
-    told: &Told,
+    inbox: &Receiver<Box<DoctorSnapshot>>,
+    empty: &SyncSender<Box<DoctorSnapshot>>,
+    texts: &FindingTexts,
 ) {
     let mut watch = Watch::new();
     let mut looked: Option<(Instant, Option<States>)> = None;
@@ -210,29 +191,10 @@ fn log_changes(
                 Change::Ends { place, cause } => info!("{place}: over: {}", cause.name().replace('_', " ")),
             }
         }
-        told.replace(&findings);
+        texts.replace(&findings);
         // Nobody takes it if the gateway has ended.
         let _ = empty.try_send(snapshot);
     }
-}
-
-/// The controller's states: one packet of its state stream. Nothing is sent to it.
-pub(crate) fn look_at_states(controller: &ControllerLink) -> Option<States> {
-    let dialect = Dialect::named(&controller.dialect)?;
-    let place = (controller.address.as_str(), controller.state_port).to_socket_addrs().ok()?.next()?;
-    let mut connection = TcpStream::connect_timeout(&place, MAX_LOOK).ok()?;
-    connection.set_read_timeout(Some(MAX_LOOK)).ok()?;
-    let (mut stream, mut chunk) = (StateStream::new(), [0; 2048]);
-    for _ in 0..MAX_READS {
-        let len = std::io::Read::read(&mut connection, &mut chunk).ok().filter(|len| *len > 0)?;
-        let mut rest = &chunk[..len];
-        while let Some(packet) = stream.next_packet(&mut rest) {
-            if let Ok(view) = packet {
-                return Some(view.states(&dialect));
-            }
-        }
-    }
-    None
 }
 
 /// What a gateway with this configuration would find, from listening for `time`.
@@ -293,7 +255,7 @@ impl Shell for Listener {
         }
         let at = now();
         core.note(at);
-        let mut snapshot = Snapshot::room(Vec::new());
+        let mut snapshot = DoctorSnapshot::buffer(Vec::new());
         core.copy_to(&mut snapshot, at);
         let has_states = snapshot.engine.status(snapshot.at).controller().is_some();
         let looked = match !has_states && has_commands(self.config.view()) {
@@ -308,7 +270,3 @@ impl Shell for Listener {
 
 /// Interval at which a gateway is looked at.
 const LOOK: StdDuration = StdDuration::from_secs(1);
-/// How long a connection and a packet of the state stream may take.
-const MAX_LOOK: StdDuration = StdDuration::from_secs(1);
-/// More reads than a few packets need.
-const MAX_READS: usize = 16;

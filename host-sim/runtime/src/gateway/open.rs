@@ -16,10 +16,11 @@ use tokio::sync::Notify;
 use tracing::info;
 
 use super::tapping::Tapping;
-use super::{Core, Engine, Gateway, Observers, Voice};
+use super::{Core, Gateway, Observers, Voice};
 use crate::StartError;
 use crate::host::AtEnd;
 use crate::link::Endpoint;
+use crate::snapshot::Engine;
 use recipe_capture::{Cell as Watched, Epoch};
 use recipe_io::bind::Bind;
 use recipe_io::handover::{Handover, HandoverDevice};
@@ -131,8 +132,8 @@ impl Gateway {
             ports,
             links,
             ready: json!({ "ports": places }),
-            window: None,
-            glimpse: None,
+            slot: None,
+            publisher_slot: None,
             doctor: None,
         })
     }

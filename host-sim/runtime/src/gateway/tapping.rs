@@ -1,7 +1,7 @@
 //! What goes over ports and links, for whoever watches (`recipe_capture::Watch`).
 //!
 //! In, on the gateway's thread: the engine's tap, and each call of the engine. They are written to a ring of bytes,
-//! which never waits and never allocates: what has no room is lost and counted. While nobody watches, a call costs
+//! which never waits and never allocates: what has no buffer is lost and counted. While nobody watches, a call costs
 //! one relaxed load. Out, on an ordinary thread: owned records for the subscribers.
 
 use std::io;
@@ -9,6 +9,7 @@ use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use crate::snapshot::TAP;
 use proto_core::engine::{
     Engine, Input, LinkId, MAX_TAPPED, Output, PortId, Rejection, Tap, TapDirection, TapPlace, TapRecord,
     TapVerdict,
@@ -18,9 +19,6 @@ use proto_core::time::Instant;
 use proto_core::wire::can::CanId;
 use recipe_capture::{Cell, Frame, Record, Watch, What};
 use rtrb::{Consumer, Producer, RingBuffer};
-
-/// Bytes of the engine's tap: more than one call of the engine fills. It is emptied after each.
-pub(super) const TAP: usize = 64 << 10;
 
 /// Bytes of the ring between the threads, more than a second of busy ports. Its pages are not there until they
 /// are used.
@@ -128,8 +126,8 @@ impl Tapping {
 
     #[cold]
     fn drain(&mut self, tap: &mut Tap<TAP>) {
-        let mut room = [0; MAX_TAPPED];
-        while let Some(record) = tap.next(&mut room) {
+        let mut buffer = [0; MAX_TAPPED];
+        while let Some(record) = tap.next(&mut buffer) {
             self.lost[0] = self.lost[0].saturating_add(record.lost);
             self.frame(&record);
             self.push(FRAME);

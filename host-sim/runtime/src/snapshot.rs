@@ -7,7 +7,6 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::Duration as StdDuration;
 
-use crate::gateway::Engine;
 use proto_core::config::MAX_PORTS;
 use proto_core::engine::PortId;
 use proto_core::time::{Duration, Instant};
@@ -15,10 +14,16 @@ use recipe_doctor::{LinkFacts, PortRecord};
 use recipe_io::exchange::DeviceCounters;
 use tokio::sync::Notify;
 
+/// The gateway's engine, with a tap.
+pub(crate) type Engine = proto_core::engine::Engine<8, 4, 512, TAP>;
+
+/// Bytes of the engine's tap. It is drained after each call, which fills less than this.
+pub(crate) const TAP: usize = 64 << 10;
+
 /// Between the thread of an engine and the console's.
 #[derive(Debug)]
-pub(crate) struct Window {
-    shot: Mutex<Option<Box<Shot>>>,
+pub(crate) struct SnapshotSlot {
+    snapshot: Mutex<Option<Box<GatewaySnapshot>>>,
     is_filled: AtomicBool,
     pub(crate) wanted: Notify,
     filled: Notify,
@@ -28,7 +33,7 @@ pub(crate) struct Window {
 
 /// A gateway at one instant.
 #[derive(Debug, Clone)]
-pub(crate) struct Shot {
+pub(crate) struct GatewaySnapshot {
     /// The engine. Nothing is ever done with it but to look.
     pub(crate) engine: Box<Engine>,
     /// The instant.
@@ -44,8 +49,8 @@ pub(crate) struct Shot {
     pub(crate) running: Duration,
 }
 
-impl Shot {
-    /// Room for a copy of any engine.
+impl GatewaySnapshot {
+    /// A buffer for a copy of any engine.
     pub(crate) fn empty() -> Box<Self> {
         Box::new(Self {
             engine: Box::new(Engine::idle()),
@@ -60,23 +65,23 @@ impl Shot {
 
     /// Copies what came in at each port into the memory that is there.
     pub(crate) fn keep_records(&mut self, records: &[PortRecord]) {
-        for (room, record) in self.records.iter_mut().zip(records) {
-            room.clone_from(record);
+        for (buffer, record) in self.records.iter_mut().zip(records) {
+            buffer.clone_from(record);
         }
         self.ports = records.len();
     }
 
     /// What came in at each port lately.
-    pub(super) fn records(&self) -> &[PortRecord] {
+    pub(crate) fn records(&self) -> &[PortRecord] {
         self.records.get(..self.ports).unwrap_or(&self.records)
     }
 }
 
-impl Window {
+impl SnapshotSlot {
     /// Without a copy.
     pub(crate) fn new() -> Self {
         Self {
-            shot: Mutex::new(None),
+            snapshot: Mutex::new(None),
             is_filled: AtomicBool::new(false),
             wanted: Notify::new(),
             filled: Notify::new(),
@@ -85,25 +90,28 @@ impl Window {
         }
     }
 
-    /// The engine's thread: fills the room, if there is some that nobody uses at the moment.
-    pub(crate) fn fill(&self, fill: impl FnOnce(&mut Shot)) {
-        if let Ok(mut shot) = self.shot.try_lock()
-            && let Some(shot) = shot.as_mut()
+    /// The engine's thread: fills the buffer, if there is some that nobody uses at the moment.
+    pub(crate) fn fill(&self, fill: impl FnOnce(&mut GatewaySnapshot)) {
+        if let Ok(mut snapshot) = self.snapshot.try_lock()
+            && let Some(snapshot) = snapshot.as_mut()
         {
-            fill(shot);
+            fill(snapshot);
             self.is_filled.store(true, Relaxed);
         }
         self.filled.notify_one();
     }
 
-    /// The console's thread: a copy in this room, or the room if there is none in time.
-    pub(crate) async fn look(&self, room: Box<Shot>) -> Result<Box<Shot>, Option<Box<Shot>>> {
-        let put = |room: Option<Box<Shot>>| {
-            let mut shot = self.shot.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-            std::mem::replace(&mut *shot, room)
+    /// The console's thread: a copy in this buffer, or the buffer if there is none in time.
+    pub(crate) async fn look(
+        &self,
+        buffer: Box<GatewaySnapshot>,
+    ) -> Result<Box<GatewaySnapshot>, Option<Box<GatewaySnapshot>>> {
+        let put = |buffer: Option<Box<GatewaySnapshot>>| {
+            let mut snapshot = self.snapshot.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+            std::mem::replace(&mut *snapshot, buffer)
         };
         self.is_filled.store(false, Relaxed);
-        drop(put(Some(room)));
+        drop(put(Some(buffer)));
         self.wanted.notify_one();
         let _ = tokio::time::timeout(MAX_WAIT, async {
             while !self.is_filled.load(Relaxed) {
@@ -111,16 +119,16 @@ impl Window {
             }
         })
         .await;
-        let shot = put(None);
-        match (shot, self.is_filled.load(Relaxed)) {
-            (Some(shot), true) => Ok(shot),
-            (shot, _) => Err(shot),
+        let snapshot = put(None);
+        match (snapshot, self.is_filled.load(Relaxed)) {
+            (Some(snapshot), true) => Ok(snapshot),
+            (snapshot, _) => Err(snapshot),
         }
     }
 
     /// The supervisor's thread: brings the safe values out, and waits until the controller has them, as far
     /// as it shows them. From then on the engine is to be ended.
-    pub(super) fn make_safe(&self) {
+    pub(crate) fn make_safe(&self) {
         let (sender, receiver) = std::sync::mpsc::channel();
         *self.safe.lock().unwrap_or_else(std::sync::PoisonError::into_inner) = Some(sender);
         self.ending.notify_one();

@@ -13,9 +13,10 @@ use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use serde_json::{Map, Value, json};
 use tracing::{error_span, warn};
 
-use super::{Observers, spawn};
+use crate::client::RuntimeClient;
 use crate::console::{ConfigFile, Supervised};
-use crate::host::{self, Asker, Running};
+use crate::gateway::{Observers, spawn};
+use crate::host::{self, Running};
 use crate::worker::{Begin, Place, Worker};
 use crate::{RunOptions, StartError};
 
@@ -97,11 +98,11 @@ impl Running for Cells {
         Some(by_name(stats))
     }
 
-    fn askers(&self) -> Vec<Asker> {
-        let askers: Vec<_> = self.cells.iter().map(|(_, run)| run.askers()).collect();
-        match askers.iter().any(Vec::is_empty) {
+    fn clients(&self) -> Vec<RuntimeClient> {
+        let clients: Vec<_> = self.cells.iter().map(|(_, run)| run.clients()).collect();
+        match clients.iter().any(Vec::is_empty) {
             true => Vec::new(),
-            false => askers.concat(),
+            false => clients.concat(),
         }
     }
 

@@ -1,7 +1,7 @@
-//! Telling a broker what a gateway knows: the edge node of a gateway (docs/fleet.md).
+//! PublisherConfig a broker what a gateway knows: the edge node of a gateway (docs/fleet.md).
 //!
 //! It runs on an ordinary thread of its own. Of the thread that runs the engine it only asks for copies, through a
-//! window as the console does, and never lets it wait. Another configuration is another node with a new session.
+//! slot as the console does, and never lets it wait. Another configuration is another node with a new session.
 
 use std::io;
 use std::sync::Arc;
@@ -11,7 +11,7 @@ use std::time::Duration;
 use proto_core::config::GatewayConfig;
 use proto_core::time::Instant;
 use recipe_edge_node::drive::{Listener, Sampled, Sampler, drive};
-use recipe_edge_node::file::{Telling, read_bd_seq, write_bd_seq};
+use recipe_edge_node::file::{PublisherConfig, read_bd_seq, write_bd_seq};
 use recipe_io::random::random;
 use recipe_io::timer::now;
 use recipe_sparkplug::gateway::GatewayCatalog;
@@ -21,42 +21,43 @@ use tokio::sync::watch;
 use tracing::{info, warn};
 
 use crate::StartError;
-use crate::console::window::{Shot, Window};
+use crate::snapshot::{GatewaySnapshot, SnapshotSlot};
 
 /// The gateway that runs, for the edge node.
 #[derive(Debug, Clone)]
-pub(crate) struct Glimpse(watch::Sender<Option<Seen>>);
+pub(crate) struct SnapshotWatch(watch::Sender<Option<RunningGateway>>);
 
 /// A gateway that can be looked at.
 #[derive(Debug, Clone)]
-struct Seen {
-    window: Arc<Window>,
+struct RunningGateway {
+    slot: Arc<SnapshotSlot>,
     config: Arc<GatewayConfig>,
 }
 
-impl Glimpse {
-    /// A window of a gateway that begins now, in place of the one before.
-    pub(crate) fn open(&self, config: &GatewayConfig) -> Arc<Window> {
-        let window = Arc::new(Window::new());
-        self.0.send_replace(Some(Seen { window: Arc::clone(&window), config: Arc::new(config.clone()) }));
-        window
+impl SnapshotWatch {
+    /// A slot of a gateway that begins now, in place of the one before.
+    pub(crate) fn open(&self, config: &GatewayConfig) -> Arc<SnapshotSlot> {
+        let slot = Arc::new(SnapshotSlot::new());
+        self.0
+            .send_replace(Some(RunningGateway { slot: Arc::clone(&slot), config: Arc::new(config.clone()) }));
+        slot
     }
 }
 
 /// An edge node that tells until it is dropped.
 #[derive(Debug)]
-pub(crate) struct Teller {
-    glimpse: Glimpse,
+pub(crate) struct Publisher {
+    snapshot_watch: SnapshotWatch,
     end: watch::Sender<bool>,
     thread: Option<JoinHandle<()>>,
 }
 
-impl Teller {
+impl Publisher {
     /// Starts the thread. It waits for a gateway.
-    pub(crate) fn start(telling: Telling) -> Result<Self, StartError> {
+    pub(crate) fn start(publishing: PublisherConfig) -> Result<Self, StartError> {
         let refused = |error: io::Error| StartError::new(format!("--sparkplug: {error}"));
         let seed = random().map_err(refused)?;
-        let (glimpse, seen) = watch::channel(None);
+        let (snapshot_watch, running) = watch::channel(None);
         let (end, ended) = watch::channel(false);
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(refused)?;
         let thread = std::thread::Builder::new().name("sparkplug".to_owned()).stack_size(STACK);
@@ -66,7 +67,7 @@ impl Teller {
             runtime.block_on(async {
                 let mut late = ended.clone();
                 tokio::select! {
-                    () = tell(&telling, seen, ended, u64::from_le_bytes(seed)) => {}
+                    () = publish(&publishing, running, ended, u64::from_le_bytes(seed)) => {}
                     // A broker that takes nothing does not hold up the end.
                     () = async {
                         let _ = late.wait_for(|is_ending| *is_ending).await;
@@ -77,16 +78,20 @@ impl Teller {
             // A name that is still being looked up is not waited for.
             runtime.shutdown_background();
         });
-        Ok(Self { glimpse: Glimpse(glimpse), end, thread: Some(thread.map_err(refused)?) })
+        Ok(Self {
+            snapshot_watch: SnapshotWatch(snapshot_watch),
+            end,
+            thread: Some(thread.map_err(refused)?),
+        })
     }
 
     /// Where gateways are shown to it.
-    pub(crate) fn glimpse(&self) -> Glimpse {
-        self.glimpse.clone()
+    pub(crate) fn snapshot_watch(&self) -> SnapshotWatch {
+        self.snapshot_watch.clone()
     }
 }
 
-impl Drop for Teller {
+impl Drop for Publisher {
     fn drop(&mut self) {
         let _ = self.end.send(true);
         if let Some(thread) = self.thread.take() {
@@ -96,34 +101,35 @@ impl Drop for Teller {
 }
 
 /// One node after the other, as long as there are gateways.
-async fn tell(
-    telling: &Telling,
-    mut seen: watch::Receiver<Option<Seen>>,
+async fn publish(
+    publishing: &PublisherConfig,
+    mut running: watch::Receiver<Option<RunningGateway>>,
     mut end: watch::Receiver<bool>,
     seed: u64,
 ) {
-    let mut bd_seq = telling.bd_seq.as_deref().and_then(|path| read_bd_seq(path).ok().flatten());
+    let mut bd_seq = publishing.bd_seq.as_deref().and_then(|path| read_bd_seq(path).ok().flatten());
     loop {
         let gateway = tokio::select! {
-            gateway = seen.wait_for(Option::is_some) => gateway.ok().and_then(|gateway| gateway.clone()),
+            gateway = running.wait_for(Option::is_some) => gateway.ok().and_then(|gateway| gateway.clone()),
             _ = end.wait_for(|is_ending| *is_ending) => return,
         };
-        seen.mark_unchanged();
-        let Some(Seen { window, config }) = gateway else { return };
-        let mut shots = Shots { window, seen: seen.clone(), room: Some(Shot::empty()) };
-        let made = match shots.look().await {
-            Some(shot) => {
-                let status = shot.engine.status(shot.at);
+        running.mark_unchanged();
+        let Some(RunningGateway { slot, config }) = gateway else { return };
+        let mut reader =
+            SnapshotReader { slot, running: running.clone(), buffer: Some(GatewaySnapshot::empty()) };
+        let made = match reader.look().await {
+            Some(snapshot) => {
+                let status = snapshot.engine.status(snapshot.at);
                 let catalog =
-                    GatewayCatalog::new(config.view(), status, telling.rates(), env!("CARGO_PKG_VERSION"));
-                let catalog: Result<Box<Catalog<'_>>, _> = catalog.map(Box::new);
+                    GatewayCatalog::new(config.view(), status, publishing.rates(), env!("CARGO_PKG_VERSION"));
+                let catalog: Result<Box<NodeCatalog<'_>>, _> = catalog.map(Box::new);
                 catalog.map_err(|_| format!("more than {METRICS} metrics")).and_then(|catalog| {
-                    let node = EdgeNode::new(telling.settings.clone(), &*catalog, bd_seq, seed);
-                    let node: Box<Node> = Box::new(node.map_err(|error| format!("{error:?}"))?);
+                    let node = EdgeNode::new(publishing.settings.clone(), &*catalog, bd_seq, seed);
+                    let node: Box<GatewayNode> = Box::new(node.map_err(|error| format!("{error:?}"))?);
                     Ok((catalog, node))
                 })
             }
-            None if seen.has_changed().is_ok_and(|has_changed| has_changed) => continue,
+            None if running.has_changed().is_ok_and(|has_changed| has_changed) => continue,
             None => Err("it does not answer".to_owned()),
         };
         let (catalog, mut node) = match made {
@@ -131,15 +137,23 @@ async fn tell(
             Err(why) => {
                 warn!(why, "this gateway is not told of");
                 tokio::select! {
-                    _ = seen.changed() => continue,
+                    _ = running.changed() => continue,
                     _ = end.wait_for(|is_ending| *is_ending) => return,
                 }
             }
         };
-        let mut source = Source { shots, catalog: &catalog, started: now() };
-        let mut listener = Told { telling };
-        drive(&mut node, &*catalog, &telling.broker, telling.sample, &mut source, &mut listener, end.clone())
-            .await;
+        let mut sampler = GatewaySampler { reader, catalog: &catalog, started: now() };
+        let mut listener = LogListener { publishing };
+        drive(
+            &mut node,
+            &*catalog,
+            &publishing.broker,
+            publishing.sample,
+            &mut sampler,
+            &mut listener,
+            end.clone(),
+        )
+        .await;
         bd_seq = node.bd_seq();
         if *end.borrow() {
             return;
@@ -148,68 +162,68 @@ async fn tell(
 }
 
 /// Copies of one gateway.
-struct Shots {
-    window: Arc<Window>,
-    seen: watch::Receiver<Option<Seen>>,
+struct SnapshotReader {
+    slot: Arc<SnapshotSlot>,
+    running: watch::Receiver<Option<RunningGateway>>,
     /// What the next copy is made in.
-    room: Option<Box<Shot>>,
+    buffer: Option<Box<GatewaySnapshot>>,
 }
 
-impl Shots {
-    async fn look(&mut self) -> Option<&Shot> {
-        let room = self.room.take().unwrap_or_else(Shot::empty);
-        match self.window.look(room).await {
-            Ok(shot) => Some(&**self.room.insert(shot)),
-            Err(room) => {
-                self.room = room;
+impl SnapshotReader {
+    async fn look(&mut self) -> Option<&GatewaySnapshot> {
+        let buffer = self.buffer.take().unwrap_or_else(GatewaySnapshot::empty);
+        match self.slot.look(buffer).await {
+            Ok(snapshot) => Some(&**self.buffer.insert(snapshot)),
+            Err(buffer) => {
+                self.buffer = buffer;
                 None
             }
         }
     }
 }
 
-struct Source<'c> {
-    shots: Shots,
-    catalog: &'c Catalog<'c>,
+struct GatewaySampler<'c> {
+    reader: SnapshotReader,
+    catalog: &'c NodeCatalog<'c>,
     started: Instant,
 }
 
-impl Sampler for Source<'_> {
+impl Sampler for GatewaySampler<'_> {
     async fn sample(&mut self, node: &Counters, values: &mut [Option<Value>]) -> Sampled {
-        if self.shots.seen.has_changed().unwrap_or(true) {
+        if self.reader.running.has_changed().unwrap_or(true) {
             return Sampled::Changed;
         }
-        let Some(shot) = self.shots.look().await else { return Sampled::Nothing };
+        let Some(snapshot) = self.reader.look().await else { return Sampled::Nothing };
         let uptime = now().saturating_since(self.started);
-        Sampled::Alive(self.catalog.sample(shot.engine.status(shot.at), uptime, node, values))
+        Sampled::Alive(self.catalog.sample(snapshot.engine.status(snapshot.at), uptime, node, values))
     }
 }
 
-struct Told<'t> {
-    telling: &'t Telling,
+struct LogListener<'t> {
+    publishing: &'t PublisherConfig,
 }
 
-impl Listener for Told<'_> {
+impl Listener for LogListener<'_> {
     fn keep(&mut self, bd_seq: u8) {
-        let Some(path) = &self.telling.bd_seq else { return };
+        let Some(path) = &self.publishing.bd_seq else { return };
         if let Err(error) = write_bd_seq(path, bd_seq) {
             warn!(%error, path = %path.display(), "cannot keep the number of the session");
         }
     }
 
     fn online(&mut self) {
-        info!(broker = self.telling.broker.address(), "the edge node is online");
+        info!(broker = self.publishing.broker.address(), "the edge node is online");
     }
 
     fn failed(&mut self, failure: Failure, error: Option<&io::Error>) {
-        let broker = self.telling.broker.address();
+        let broker = self.publishing.broker.address();
         let error = error.map(ToString::to_string);
         warn!(broker, why = %failure, error, "no session with the broker; trying again");
     }
 }
 
-type Catalog<'c> = GatewayCatalog<'c, METRICS>;
-type Node = EdgeNode<METRICS, HISTORY>;
+type NodeCatalog<'c> = GatewayCatalog<'c, METRICS>;
+type GatewayNode = EdgeNode<METRICS, HISTORY>;
 
 /// Room for metrics: more than a configuration can have.
 const METRICS: usize = 1_024;
