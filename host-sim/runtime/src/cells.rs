@@ -1,7 +1,7 @@
-//! Several gateways in one process, on as few threads as are asked for.
+//! Several gateways in one process, on a given number of threads.
 //!
-//! Each one has its own engine, devices, connections and console, and none knows of the others. They share the
-//! threads, because a gateway sleeps several times in 4 ms, and a sleep costs more than what is done in between.
+//! Each has its own engine, devices, connections and console, and knows nothing of the others. They share threads
+//! because a gateway sleeps several times in 4 ms, and sleeping costs more than the work in between.
 
 use std::num::NonZeroUsize;
 use std::sync::Arc;
@@ -25,16 +25,16 @@ use crate::{RunOptions, StartError};
 pub struct Cell {
     /// What `ready`, the statistics and the log call it; different from all others.
     pub name: String,
-    /// Its configuration.
+    /// The gateway's configuration.
     pub config: Box<GatewayConfig>,
     /// The file it comes from, which a console needs.
     pub file: ConfigFile,
-    /// Its own options: devices, console. Those of the foreground have no effect.
+    /// Options of this gateway alone: devices, console. Those of the foreground have no effect.
     pub options: RunOptions,
 }
 
-/// Runs the gateways of several cells until Ctrl-C, SIGTERM or SIGHUP, on so many threads. None of them does anything
-/// before all are listening; if one of them ends by itself, all end.
+/// Runs the gateways of several cells on `threads` threads until Ctrl-C, SIGTERM or SIGHUP. None starts before all are
+/// listening; if one ends by itself, all end.
 ///
 /// # Errors
 /// The reason why one of them could not start, with its name; nothing is left behind then.
@@ -53,14 +53,14 @@ pub fn run(cells: Vec<Cell>, threads: NonZeroUsize, options: &RunOptions) -> Res
         let run = start(cell, place).map_err(|error| error.of(&name))?;
         started.push((name, run));
     }
-    // Their cells hold them.
+    // The cells keep their workers alive.
     drop(workers);
     // Everything listens.
     let _ = begins.send(true);
     host::foreground(Box::new(Cells::new(started)), options)
 }
 
-/// The cells' cycles begin one after the other within the usual one, so that they do not wait for each other each time.
+/// The usual cycle. Cells start staggered within it, so that they do not contend in each cycle.
 const CYCLE: Duration = Duration::from_millis(4);
 
 fn start(cell: Cell, place: Place) -> Result<Box<dyn Running>, StartError> {
@@ -123,7 +123,7 @@ fn by_name(cells: impl Iterator<Item = (String, Value)>) -> Value {
     json!({ "cells": Map::from_iter(cells) })
 }
 
-/// A cell has more than ten files open, and a process of a login may have 1024, unless it asks for more.
+/// Raises the soft limit of open files, usually 1024: a cell needs more than ten.
 fn raise_file_limit() {
     let limit = getrlimit(Resource::Nofile);
     let raised = Rlimit { current: limit.maximum, ..limit };

@@ -16,7 +16,7 @@ pub(crate) struct RuntimeClient {
 }
 
 impl RuntimeClient {
-    /// One line of statistics; `None` if the shell has ended.
+    /// One line of statistics; `None` if the runtime has ended.
     pub(crate) fn stats(&self) -> Option<Value> {
         let (answer, stats) = blocking::channel();
         self.requests.send(RuntimeRequest::Stats(answer)).ok()?;

@@ -27,14 +27,14 @@ impl FindingTexts {
     }
 }
 
-/// Since when a command has failed for which nobody saw the controller's states.
+/// When the newest command failed whose cause the state stream did not show.
 pub(crate) fn unexplained(status: Status<'_>) -> Option<Instant> {
     let failed = status.ports().filter(|port| port.reply == ReplyCode::Fail);
     let failed = failed.filter_map(|port| port.last_failed);
     failed.filter(|failed| failed.controller.is_none()).map(|failed| failed.at).max()
 }
 
-/// The controller's states: one packet of its state stream. Nothing is sent to it.
+/// Reads the controller's states from one packet of its state stream. Sends nothing.
 pub(crate) fn look_at_states(controller: &ControllerLink) -> Option<States> {
     let dialect = Dialect::named(&controller.dialect)?;
     let place = (controller.address.as_str(), controller.state_port).to_socket_addrs().ok()?.next()?;

@@ -1,8 +1,8 @@
 //! The gateway's engine on real sockets and devices.
 //!
-//! The engine, devices and sockets are on one thread. Input of a device or socket is reported to the engine at once, and the
-//! outputs are carried out before anything else is read. So only one call of the engine is between the last
-//! byte of a field frame and the request to the controller.
+//! The engine, devices and sockets share one thread. Input is reported to the engine at once, and its outputs are
+//! executed before anything else is read, so a single call of the engine lies between the last byte of a field frame and
+//! the request to the controller.
 
 mod doctor;
 mod open;
@@ -44,18 +44,18 @@ use recipe_io::timer::{Timer, now};
 use shown::Shown;
 use tapping::Tapping;
 
-/// Who looks at a gateway.
+/// Observers of a gateway.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Observers {
     /// Captures and recordings.
     pub watch: Watch,
-    /// What frames mean, for them.
+    /// Decodes frames for them.
     pub decoder: Arc<Decoder>,
-    /// A console.
+    /// The console.
     pub slot: Option<Arc<SnapshotSlot>>,
-    /// An edge node.
+    /// The edge node.
     pub snapshot_watch: Option<SnapshotWatch>,
-    /// Whoever reads the log or the statistics, where findings are told.
+    /// Whether the log or the statistics are read, which report findings.
     pub readers: bool,
 }
 
@@ -79,21 +79,21 @@ struct Gateway {
     links: Vec<(LinkId, LinkKind, Endpoint)>,
     ready: Value,
     slot: Option<Arc<SnapshotSlot>>,
-    /// That of an edge node.
+    /// The edge node's.
     publisher_slot: Option<Arc<SnapshotSlot>>,
-    /// Who looks at it once a second, if somebody does.
+    /// Examines the gateway once a second.
     doctor: Option<Doctor>,
 }
 
-/// What the gateway may send.
+/// Which outputs of the engine are executed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Voice {
-    /// Everything.
-    Full,
-    /// Nothing, neither to the controller nor to the field.
-    Silent,
-    /// Nothing to the controller; to the field, what ports with exchanges send.
-    Asking,
+enum TxPolicy {
+    /// All of them.
+    All,
+    /// None that send, neither to the controller nor to the field.
+    None,
+    /// Those of ports with exchanges; nothing to the controller.
+    Exchanges,
 }
 
 /// Shared by all tasks of the gateway.
@@ -103,18 +103,18 @@ struct Core {
     ports: BTreeMap<PortId, (String, Rc<PortTx>)>,
     links: BTreeMap<LinkId, Rc<LinkControl>>,
     deadline: Cell<Instant>,
-    /// The engine's count of sleeps at the last call.
+    /// The engine's sleep count after the last call.
     sleeps: Cell<u32>,
-    /// Links that were told of as missing.
+    /// Links that were logged as down.
     unreachable: RefCell<BTreeSet<LinkId>>,
     deadline_moved: Notify,
-    /// Another gateway takes its place: its devices are not listened to any more.
+    /// The gateway is being replaced: input of its devices is ignored.
     is_ending: Cell<bool>,
-    voice: Voice,
+    tx_policy: TxPolicy,
     /// Ports with exchanges.
-    asks: BTreeSet<PortId>,
+    exchange_ports: BTreeSet<PortId>,
     started: Instant,
-    /// What came in at each port lately.
+    /// Recent input of each port.
     records: RefCell<Vec<PortRecord>>,
 }
 
@@ -207,7 +207,7 @@ impl Core {
         }
     }
 
-    /// Fills a slot when somebody asks, and brings the safe values out when it wants to end this gateway.
+    /// Fills a snapshot slot on request, and sends the safe values when the gateway is to end.
     async fn show(&self, slot: &SnapshotSlot) -> Result<(), StartError> {
         loop {
             tokio::select! {
@@ -248,7 +248,7 @@ impl Core {
         if self.is_ending.get() && event != PortEvent::Sent {
             return;
         }
-        // The engine first: what comes of it is on its way before anything is noted.
+        // The engine first: its outputs are sent before anything is recorded.
         match event {
             PortEvent::Up => self.input(Input::PortUp { port }),
             PortEvent::Down => self.input(Input::PortDown { port }),
@@ -274,11 +274,11 @@ impl Core {
     fn link_event(&self, link: LinkId, event: LinkEvent<'_>) {
         match event {
             LinkEvent::Up => {
-                self.tell_link(link, true);
+                self.log_link(link, true);
                 self.input(Input::LinkUp { link });
             }
             LinkEvent::Down => {
-                self.tell_link(link, false);
+                self.log_link(link, false);
                 self.input(Input::LinkDown { link });
             }
             LinkEvent::Bytes(bytes) => self.input(Input::LinkBytes { link, bytes }),
@@ -287,10 +287,9 @@ impl Core {
         }
     }
 
-    /// Tells once when a connection to the controller is missing, and when it is back. What the
-    /// controller opens by itself may take days, and some controllers take no second connection for
-    /// urgent commands.
-    fn tell_link(&self, id: LinkId, is_up: bool) {
+    /// Logs once when a connection goes down, and when it is back. Not for links that the controller opens, which may
+    /// take days, nor for urgent commands: some controllers accept no second connection.
+    fn log_link(&self, id: LinkId, is_up: bool) {
         if id == LinkId::URGENT {
             return;
         }
@@ -317,7 +316,7 @@ impl Core {
         }
     }
 
-    /// Reports one input and carries out all outputs.
+    /// Reports one input and executes all outputs.
     fn input(&self, input: Input<'_>) {
         let at = now();
         trace!(input = %Shown(&input), "in");
@@ -360,30 +359,30 @@ impl Core {
         }
     }
 
-    /// Whether an output may be carried out: the one gate for a gateway that only listens.
+    /// Whether an output may be executed. A gateway that only listens sends nothing that this does not allow.
     fn may(&self, output: &Output<'_>) -> bool {
-        match (self.voice, output) {
-            (Voice::Full, _) => true,
-            (Voice::Asking, Output::PortSend { port, .. } | Output::PortSendCan { port, .. }) => {
-                self.asks.contains(port)
+        match (self.tx_policy, output) {
+            (TxPolicy::All, _) => true,
+            (TxPolicy::Exchanges, Output::PortSend { port, .. } | Output::PortSendCan { port, .. }) => {
+                self.exchange_ports.contains(port)
             }
-            (Voice::Asking, Output::LinkSend { link, .. }) => self.asks_over(*link),
+            (TxPolicy::Exchanges, Output::LinkSend { link, .. }) => self.is_exchange_link(*link),
             (_, &Output::LinkOpen { link, .. }) => self.may_open(link),
             (_, Output::LinkClose { .. }) => true,
             _ => false,
         }
     }
 
-    /// Whether a link may be opened. A gateway that only listens reads the state stream, on which nothing
-    /// is ever sent; one that asks also has the connections to devices.
+    /// Whether a link may be opened. A gateway that only listens opens the state stream, on which nothing is ever sent;
+    /// with exchanges it also opens the connections to devices.
     fn may_open(&self, link: LinkId) -> bool {
-        let asks = self.voice == Voice::Asking && self.asks_over(link);
-        self.voice == Voice::Full || link == LinkId::STATE || asks
+        let may_exchange = self.tx_policy == TxPolicy::Exchanges && self.is_exchange_link(link);
+        self.tx_policy == TxPolicy::All || link == LinkId::STATE || may_exchange
     }
 
-    /// Whether a link is the connection to devices that are asked.
-    fn asks_over(&self, link: LinkId) -> bool {
-        link.port().is_some_and(|port| self.asks.contains(&port))
+    /// Whether a link connects to devices with exchanges.
+    fn is_exchange_link(&self, link: LinkId) -> bool {
+        link.port().is_some_and(|port| self.exchange_ports.contains(&port))
     }
 
     fn with_port(&self, id: PortId, act: impl FnOnce(&PortTx)) {
@@ -448,8 +447,8 @@ fn lift(outer: &mut Value, key: &str) {
     }
 }
 
-/// Runs the gateway until Ctrl-C, SIGTERM or SIGHUP. Everything that it tells [`RunOptions::watch`] has been
-/// given when this returns.
+/// Runs the gateway until Ctrl-C, SIGTERM or SIGHUP. All records for [`RunOptions::watch`] are delivered when this
+/// returns.
 ///
 /// # Errors
 /// The reason why it could not start; nothing is left behind then.
@@ -470,8 +469,7 @@ pub fn start(config: GatewayConfig, binds: Vec<Bind>) -> Result<Handle, StartErr
     start_watched(config, binds, &Watch::new())
 }
 
-/// Same as [`start`], for whoever has subscribed to `watch`, which tells of several gateways one after the
-/// other if it is given again.
+/// As [`start`], with records for the subscribers of `watch`, which can be reused for the next gateway.
 ///
 /// # Errors
 /// The reason why it could not start; nothing is left behind then.
@@ -500,14 +498,14 @@ pub(crate) fn spawn(
     let publisher_slot = observers.snapshot_watch.as_ref().map(|watch| watch.open(&config));
     let handle = host::start(place, "gateway", async move |at_end| {
         let devices = Devices { binds: &binds, handover: Some((handover, at_end)) };
-        let mut gateway = Gateway::open(&config, devices, Voice::Full, &observers).await?;
+        let mut gateway = Gateway::open(&config, devices, TxPolicy::All, &observers).await?;
         gateway.slot = observers.slot;
         gateway.publisher_slot = publisher_slot;
         if doctor.is_some() || gateway.slot.is_some() {
             gateway.core.keep_records(&config, &binds);
         }
         gateway.doctor = doctor;
-        // Not as an argument of the log, which is not evaluated unless it is printed.
+        // Not inside `info!`, which evaluates its arguments only if the line is printed.
         let scheduling = realtime::apply(scheduling);
         info!(%scheduling, "the gateway is running");
         Ok(gateway)
@@ -515,7 +513,7 @@ pub(crate) fn spawn(
     Ok(handle.with_watch(watch).with_findings(texts))
 }
 
-/// How often is looked whether the safe values have arrived.
+/// Interval at which safe values are checked for.
 const SAFE_CHECK: std::time::Duration = std::time::Duration::from_millis(5);
 
 #[cfg(test)]

@@ -1,7 +1,7 @@
-//! PublisherConfig a broker what a gateway knows: the edge node of a gateway (docs/fleet.md).
+//! Publishes the state of a gateway to a Sparkplug broker: the gateway's edge node (docs/fleet.md).
 //!
-//! It runs on an ordinary thread of its own. Of the thread that runs the engine it only asks for copies, through a
-//! slot as the console does, and never lets it wait. Another configuration is another node with a new session.
+//! It has an ordinary thread, which takes snapshots through a slot as the console does, and never blocks the gateway's
+//! thread. Another configuration is another node with a new session.
 
 use std::io;
 use std::sync::Arc;
@@ -23,11 +23,11 @@ use tracing::{info, warn};
 use crate::StartError;
 use crate::snapshot::{GatewaySnapshot, SnapshotSlot};
 
-/// The gateway that runs, for the edge node.
+/// The snapshot slot of the running gateway, for the publisher.
 #[derive(Debug, Clone)]
 pub(crate) struct SnapshotWatch(watch::Sender<Option<RunningGateway>>);
 
-/// A gateway that can be looked at.
+/// A gateway that snapshots can be taken of.
 #[derive(Debug, Clone)]
 struct RunningGateway {
     slot: Arc<SnapshotSlot>,
@@ -35,7 +35,7 @@ struct RunningGateway {
 }
 
 impl SnapshotWatch {
-    /// A slot of a gateway that begins now, in place of the one before.
+    /// A slot for a gateway that starts now; replaces the previous gateway's.
     pub(crate) fn open(&self, config: &GatewayConfig) -> Arc<SnapshotSlot> {
         let slot = Arc::new(SnapshotSlot::new());
         self.0
@@ -44,7 +44,7 @@ impl SnapshotWatch {
     }
 }
 
-/// An edge node that tells until it is dropped.
+/// An edge node that publishes until it is dropped.
 #[derive(Debug)]
 pub(crate) struct Publisher {
     snapshot_watch: SnapshotWatch,
@@ -62,20 +62,20 @@ impl Publisher {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(refused)?;
         let thread = std::thread::Builder::new().name("sparkplug".to_owned()).stack_size(STACK);
         let thread = thread.spawn(move || {
-            // Where the gateway's thread has no better right, it still goes first.
+            // The gateway's thread goes first even without real-time priority.
             let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), NICENESS);
             runtime.block_on(async {
                 let mut late = ended.clone();
                 tokio::select! {
                     () = publish(&publishing, running, ended, u64::from_le_bytes(seed)) => {}
-                    // A broker that takes nothing does not hold up the end.
+                    // A broker that does not read must not delay the shutdown.
                     () = async {
                         let _ = late.wait_for(|is_ending| *is_ending).await;
                         tokio::time::sleep(LAST_WORDS).await;
                     } => warn!("the broker did not take the node's death in time"),
                 }
             });
-            // A name that is still being looked up is not waited for.
+            // Without waiting for a pending name lookup.
             runtime.shutdown_background();
         });
         Ok(Self {
@@ -85,7 +85,7 @@ impl Publisher {
         })
     }
 
-    /// Where gateways are shown to it.
+    /// Where gateways register their snapshot slots.
     pub(crate) fn snapshot_watch(&self) -> SnapshotWatch {
         self.snapshot_watch.clone()
     }
@@ -100,7 +100,7 @@ impl Drop for Publisher {
     }
 }
 
-/// One node after the other, as long as there are gateways.
+/// Runs one node for each gateway, one after the other.
 async fn publish(
     publishing: &PublisherConfig,
     mut running: watch::Receiver<Option<RunningGateway>>,
@@ -161,11 +161,11 @@ async fn publish(
     }
 }
 
-/// Copies of one gateway.
+/// Takes snapshots of one gateway.
 struct SnapshotReader {
     slot: Arc<SnapshotSlot>,
     running: watch::Receiver<Option<RunningGateway>>,
-    /// What the next copy is made in.
+    /// The buffer of the next snapshot.
     buffer: Option<Box<GatewaySnapshot>>,
 }
 
@@ -225,13 +225,13 @@ impl Listener for LogListener<'_> {
 type NodeCatalog<'c> = GatewayCatalog<'c, METRICS>;
 type GatewayNode = EdgeNode<METRICS, HISTORY>;
 
-/// Room for metrics: more than a configuration can have.
+/// Capacity for metrics: more than a configuration can have.
 const METRICS: usize = 1_024;
-/// Room for values while nobody listens.
+/// Capacity for values while the broker is unreachable.
 const HISTORY: usize = 8_192;
-/// Nodes and engines are built by value, and unoptimised code has several copies of them on the stack.
+/// Stack size: nodes and engines are built by value, with several copies on the stack in unoptimised code.
 const STACK: usize = 32 << 20;
-/// How far the thread stands back behind others.
+/// Nice value of the publisher's thread.
 const NICENESS: i32 = 10;
-/// How long the death of the node may take.
+/// Time for publishing the node's death at shutdown.
 const LAST_WORDS: Duration = Duration::from_secs(3);

@@ -1,7 +1,7 @@
-//! Copies of a running engine for the console's thread.
+//! Snapshots of a running gateway for other threads.
 //!
-//! The console lays out memory and asks; the engine's thread copies itself into it and goes on. It never waits
-//! for the console: if the memory is in use at that moment, it is not filled.
+//! A reader provides a buffer and requests a snapshot; the gateway's thread copies the engine into it. That thread never
+//! waits for a reader: if the buffer is locked at that moment, it is not filled.
 
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
@@ -20,7 +20,7 @@ pub(crate) type Engine = proto_core::engine::Engine<8, 4, 512, TAP>;
 /// Bytes of the engine's tap. It is drained after each call, which fills less than this.
 pub(crate) const TAP: usize = 64 << 10;
 
-/// Between the thread of an engine and the console's.
+/// One snapshot at a time, between the gateway's thread and a reader's.
 #[derive(Debug)]
 pub(crate) struct SnapshotSlot {
     snapshot: Mutex<Option<Box<GatewaySnapshot>>>,
@@ -34,16 +34,15 @@ pub(crate) struct SnapshotSlot {
 /// A gateway at one instant.
 #[derive(Debug, Clone)]
 pub(crate) struct GatewaySnapshot {
-    /// The engine. Nothing is ever done with it but to look.
+    /// A copy of the engine, only for reading.
     pub(crate) engine: Box<Engine>,
-    /// The instant.
     pub(crate) at: Instant,
-    /// The counters of the devices, by the port's number.
+    /// Device counters by port number.
     pub(crate) devices: [Option<DeviceCounters>; MAX_PORTS],
-    /// What came in at each port lately; the first `ports` of them.
+    /// Recent input of each port; the first `ports` entries are valid.
     records: Vec<PortRecord>,
     ports: usize,
-    /// What is known of the links to the controller.
+    /// Facts about the links that the engine does not know.
     pub(crate) links: Vec<LinkFacts>,
     /// How long the gateway has been running.
     pub(crate) running: Duration,
@@ -63,7 +62,7 @@ impl GatewaySnapshot {
         })
     }
 
-    /// Copies what came in at each port into the memory that is there.
+    /// Copies the port records without allocating.
     pub(crate) fn keep_records(&mut self, records: &[PortRecord]) {
         for (buffer, record) in self.records.iter_mut().zip(records) {
             buffer.clone_from(record);
@@ -71,14 +70,14 @@ impl GatewaySnapshot {
         self.ports = records.len();
     }
 
-    /// What came in at each port lately.
+    /// Recent input of each port.
     pub(crate) fn records(&self) -> &[PortRecord] {
         self.records.get(..self.ports).unwrap_or(&self.records)
     }
 }
 
 impl SnapshotSlot {
-    /// Without a copy.
+    /// An empty slot.
     pub(crate) fn new() -> Self {
         Self {
             snapshot: Mutex::new(None),
@@ -90,7 +89,7 @@ impl SnapshotSlot {
         }
     }
 
-    /// The engine's thread: fills the buffer, if there is some that nobody uses at the moment.
+    /// Gateway's thread: fills the buffer, if there is one and it is not locked.
     pub(crate) fn fill(&self, fill: impl FnOnce(&mut GatewaySnapshot)) {
         if let Ok(mut snapshot) = self.snapshot.try_lock()
             && let Some(snapshot) = snapshot.as_mut()
@@ -101,7 +100,7 @@ impl SnapshotSlot {
         self.filled.notify_one();
     }
 
-    /// The console's thread: a copy in this buffer, or the buffer if there is none in time.
+    /// Reader's thread: requests a snapshot in this buffer; returns the buffer unfilled if it takes too long.
     pub(crate) async fn look(
         &self,
         buffer: Box<GatewaySnapshot>,
@@ -126,17 +125,17 @@ impl SnapshotSlot {
         }
     }
 
-    /// The supervisor's thread: brings the safe values out, and waits until the controller has them, as far
-    /// as it shows them. From then on the engine is to be ended.
+    /// Supervisor's thread: has the safe values sent, and waits until the controller shows them, as far as it does. The
+    /// gateway must be ended after this.
     pub(crate) fn make_safe(&self) {
         let (sender, receiver) = std::sync::mpsc::channel();
         *self.safe.lock().unwrap_or_else(std::sync::PoisonError::into_inner) = Some(sender);
         self.ending.notify_one();
-        // The engine's thread limits the time itself; it may have ended.
+        // The gateway's thread limits the time itself, but may have ended.
         let _ = receiver.recv_timeout(2 * MAX_SAFE);
     }
 
-    /// The engine's thread: the safe values are out, or it took too long.
+    /// Gateway's thread: the safe values were sent, or it took too long.
     pub(crate) fn is_safe(&self) {
         if let Ok(mut safe) = self.safe.lock()
             && let Some(sender) = safe.take()
@@ -146,7 +145,8 @@ impl SnapshotSlot {
     }
 }
 
-/// How long the console waits for a copy.
+/// How long a reader waits for a snapshot.
 const MAX_WAIT: StdDuration = StdDuration::from_millis(500);
-/// How long safe values may take: so long they are repeated where nothing shows them (proto-core/docs/engine.md section 6).
+/// Time for safe values to arrive: as long as they are repeated where nothing shows them
+/// (proto-core/docs/engine.md section 6).
 pub(crate) const MAX_SAFE: StdDuration = StdDuration::from_secs(1);

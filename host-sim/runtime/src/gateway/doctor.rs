@@ -1,12 +1,12 @@
 //! Findings of a running gateway, and of one that only listens.
 //!
-//! A running gateway is looked at once a second, if somebody reads what is found. The gateway's thread
-//! copies the engine and the records into a buffer; another thread looks at them, logs, and gives the buffer
-//! back. While it has not, nothing is copied.
+//! A running gateway is examined once a second, if its findings are read. The gateway's thread copies the engine and the
+//! port records into a buffer; another thread examines the copy, logs changes, and returns the buffer. Until then nothing
+//! is copied.
 //!
-//! A gateway that only listens gives nothing to the controller, and nothing to the field unless it is to
-//! ask: [`super::Voice`] is the one gate that every output passes. Its engine is texts of no link but the
-//! state stream, on which it never sends, so it has nothing to say either.
+//! A gateway that only listens sends nothing to the controller, and nothing to the field except exchanges if these are
+//! enabled: every output passes [`super::TxPolicy`]. Its engine sees no link but the state stream, on which it never
+//! sends.
 
 use std::rc::Rc;
 use std::sync::mpsc::{Receiver, Sender, SyncSender, TryRecvError, channel, sync_channel};
@@ -21,7 +21,7 @@ use serde_json::Value;
 use tracing::{Span, info};
 
 use super::open::Devices;
-use super::{Core, Gateway, Observers, Voice};
+use super::{Core, Gateway, Observers, TxPolicy};
 use crate::findings::{FindingTexts, look_at_states, unexplained};
 use crate::host::{self, Shell};
 use crate::snapshot::Engine;
@@ -30,7 +30,7 @@ use crate::{Signals, StartError};
 use recipe_io::bind::Bind;
 use recipe_io::timer::now;
 
-/// The thread that looks, as the gateway's thread sees it.
+/// The gateway's end of the channels to the examining thread.
 pub(super) struct Doctor {
     buffers: Receiver<Box<DoctorSnapshot>>,
     filled: SyncSender<Box<DoctorSnapshot>>,
@@ -66,12 +66,12 @@ impl DoctorSnapshot {
 }
 
 impl Core {
-    /// Begins to keep what comes in at each port.
+    /// Starts to record the input of each port.
     pub(super) fn keep_records(&self, config: &GatewayConfig, binds: &[Bind]) {
         self.records.replace(records(config, binds));
     }
 
-    /// Notes the counters of this instant.
+    /// Records the counters of this instant.
     fn note(&self, at: Instant) {
         let engine = self.engine.borrow();
         let mut records = self.records.borrow_mut();
@@ -83,7 +83,7 @@ impl Core {
         }
     }
 
-    /// Copies everything that findings are made of.
+    /// Copies everything that findings are derived from.
     fn copy_to(&self, buffer: &mut DoctorSnapshot, at: Instant) {
         let DoctorSnapshot { at: taken, running, engine, ports, links } = buffer;
         (*taken, *running) = (at, at.saturating_since(self.started));
@@ -103,7 +103,7 @@ impl Core {
         }
     }
 
-    /// Notes the counters once a second. Never returns.
+    /// Records the counters once a second. Never returns.
     pub(super) async fn keep_notes(&self) -> Result<(), StartError> {
         let mut ticks = tokio::time::interval(LOOK);
         ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
@@ -113,7 +113,7 @@ impl Core {
         }
     }
 
-    /// Has the gateway looked at once a second.
+    /// Passes a snapshot to the doctor's thread once a second.
     pub(super) async fn be_watched(&self, doctor: Doctor) -> Result<(), StartError> {
         let mut ticks = tokio::time::interval(LOOK);
         ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
@@ -123,18 +123,18 @@ impl Core {
             self.note(at);
             let mut buffer = match doctor.buffers.try_recv() {
                 Ok(buffer) => buffer,
-                // A busy machine has looked at the one before not yet.
+                // The previous snapshot is still being examined.
                 Err(TryRecvError::Empty) => continue,
                 Err(TryRecvError::Disconnected) => return std::future::pending().await,
             };
             self.copy_to(&mut buffer, at);
-            // There is one buffer, so there is place for it.
+            // There is only one buffer, so the channel has space.
             let _ = doctor.filled.try_send(buffer);
         }
     }
 }
 
-/// Starts the thread that looks at snapshots and logs what begins and ends.
+/// Starts the thread that examines snapshots and logs findings that appear or disappear.
 pub(super) fn start(
     config: GatewayConfig,
     binds: &[Bind],
@@ -148,7 +148,7 @@ pub(super) fn start(
     let thread = std::thread::Builder::new().name("doctor".to_owned());
     thread
         .spawn(move || {
-            // The gateway's thread is there until both ends of this one are.
+            // Cannot fail: the gateway holds the receiver until this thread has started.
             let _ = empty.send(buffer);
             let _of = span.entered();
             log_changes(&config, &inbox, &empty, &own);
@@ -192,16 +192,16 @@ fn log_changes(
             }
         }
         texts.replace(&findings);
-        // Nobody takes it if the gateway has ended.
+        // Fails only if the gateway has ended.
         let _ = empty.try_send(snapshot);
     }
 }
 
-/// What a gateway with this configuration would find, from listening for `time`.
+/// Findings of a gateway with this configuration after listening for `time`.
 ///
-/// Nothing is sent to the controller: its ports are connected to and closed, only its state stream is
-/// read. Nothing is sent to the field, unless `ask`: then ports with exchanges send what their file says.
-/// A signal that ends programs ends the listening early.
+/// Nothing is sent to the controller: connections are opened and closed, and only the state stream is read. Nothing is
+/// sent to the field, unless `ask` is set: then ports with exchanges send theirs. SIGINT, SIGTERM and SIGHUP end the
+/// listening early.
 ///
 /// # Errors
 /// The reason why it could not start; nothing is left behind then.
@@ -212,13 +212,13 @@ pub fn listen(
     ask: bool,
 ) -> Result<Vec<Finding>, StartError> {
     let (sender, findings) = channel();
-    let voice = if ask { Voice::Asking } else { Voice::Silent };
+    let tx_policy = if ask { TxPolicy::Exchanges } else { TxPolicy::None };
     let handle = host::start(&Place::alone(), "doctor", async move |_| {
-        let gateway = Gateway::open(&config, Devices::own(&binds), voice, &Observers::default()).await?;
+        let gateway = Gateway::open(&config, Devices::own(&binds), tx_policy, &Observers::default()).await?;
         gateway.core.keep_records(&config, &binds);
         Ok(Listener { gateway, config, time, sender })
     })?;
-    // It is dropped at the end of the run.
+    // The sender is dropped at the end of the run.
     let findings = findings.recv().ok();
     let ended = handle.shutdown();
     match findings {
@@ -262,11 +262,11 @@ impl Shell for Listener {
             true => look_at_states(&self.config.controller),
             false => None,
         };
-        // Nobody listens if the caller is gone.
+        // Fails only if the caller has ended.
         let _ = self.sender.send(snapshot.findings(&self.config, looked));
         Ok(())
     }
 }
 
-/// Interval at which a gateway is looked at.
+/// Interval at which a gateway is examined.
 const LOOK: StdDuration = StdDuration::from_secs(1);

@@ -1,4 +1,4 @@
-//! Opening the gateway's devices, listening sockets and what is told to whoever watches.
+//! Opens the gateway's devices, listening sockets and tap.
 
 use std::cell::{Cell, RefCell};
 use std::collections::BTreeSet;
@@ -16,7 +16,7 @@ use tokio::sync::Notify;
 use tracing::info;
 
 use super::tapping::Tapping;
-use super::{Core, Gateway, Observers, Voice};
+use super::{Core, Gateway, Observers, TxPolicy};
 use crate::StartError;
 use crate::host::AtEnd;
 use crate::link::Endpoint;
@@ -64,12 +64,12 @@ impl Gateway {
     pub(super) async fn open(
         config: &GatewayConfig,
         devices: Devices<'_>,
-        voice: Voice,
+        tx_policy: TxPolicy,
         observers: &Observers,
     ) -> Result<Self, StartError> {
         let engine: Box<Engine> =
             Box::new(Engine::new(config).map_err(|error| StartError::new(error.to_string()))?);
-        // Those of Modbus TCP have links.
+        // Modbus TCP ports have links instead.
         let has_device = |port: &PortConfig| !matches!(port.bus, Bus::ModbusTcp { .. });
         let field = || config.view().field_ports().map(|(_, port, _)| port).filter(|port| has_device(port));
         if let Some(bind) =
@@ -79,10 +79,10 @@ impl Gateway {
             let message = format!("--bind {bind}: there is no such port; there are {}", names.join(", "));
             return Err(StartError::new(message));
         }
-        let (mut ports, mut asks) = (Vec::new(), BTreeSet::new());
+        let (mut ports, mut exchange_ports) = (Vec::new(), BTreeSet::new());
         for (index, port, recipe) in config.view().field_ports() {
             if recipe.exchanges.len > 0 {
-                asks.insert(PortId(index));
+                exchange_ports.insert(PortId(index));
             }
             if !has_device(port) {
                 continue;
@@ -122,8 +122,8 @@ impl Gateway {
             unreachable: RefCell::default(),
             deadline_moved: Notify::new(),
             is_ending: Cell::new(false),
-            voice,
-            asks,
+            tx_policy,
+            exchange_ports,
             started: now(),
             records: RefCell::default(),
         });
@@ -139,7 +139,7 @@ impl Gateway {
     }
 }
 
-/// Begins to tell whoever watches.
+/// Starts to record for subscribers.
 fn begin_tapping(
     config: &GatewayConfig,
     engine: &Engine,
@@ -147,7 +147,7 @@ fn begin_tapping(
 ) -> Result<Tapping, StartError> {
     let at = now();
     let cell = Watched::new(config, engine, Epoch { at, wall: SystemTime::now() }, Arc::clone(decoder));
-    // Only a recording begins with it: a long configuration has none.
+    // Only recordings start with the image; a long configuration has none.
     let image = watch.wanted().passes.then(|| encoded(config)).transpose()?;
     Tapping::begin(watch, cell, at, image.as_deref())
         .map_err(|error| StartError::new(format!("cannot start a thread: {error}")))
