@@ -16,8 +16,8 @@ use tracing::{error_span, warn};
 use crate::client::RuntimeClient;
 use crate::console::{ConfigFile, Supervised};
 use crate::gateway::{Observers, spawn};
-use crate::host::{self, Running};
-use crate::worker::{Begin, Place, Worker};
+use crate::host::{self, ForegroundRun};
+use crate::worker::{Begin, RuntimePlace, Worker};
 use crate::{RunOptions, StartError};
 
 /// A cell of a process that serves several.
@@ -48,7 +48,7 @@ pub fn run(cells: Vec<Cell>, threads: NonZeroUsize, options: &RunOptions) -> Res
     for ((nth, cell), worker) in (0..).zip(cells).zip(workers.iter().cycle()) {
         let span = error_span!("cell", name = cell.name);
         let begin = begin.and_later(Duration::from_micros(nth * CYCLE.as_micros() / count));
-        let place = Place::among(Arc::clone(worker), begin, span);
+        let place = RuntimePlace::among(Arc::clone(worker), begin, span);
         let name = cell.name.clone();
         let run = start(cell, place).map_err(|error| error.of(&name))?;
         started.push((name, run));
@@ -63,7 +63,7 @@ pub fn run(cells: Vec<Cell>, threads: NonZeroUsize, options: &RunOptions) -> Res
 /// The usual cycle. Cells start staggered within it, so that they do not contend in each cycle.
 const CYCLE: Duration = Duration::from_millis(4);
 
-fn start(cell: Cell, place: Place) -> Result<Box<dyn Running>, StartError> {
+fn start(cell: Cell, place: RuntimePlace) -> Result<Box<dyn ForegroundRun>, StartError> {
     let Cell { config, file, options, .. } = cell;
     // For threads that are started here.
     let _of = place.span.clone().entered();
@@ -78,17 +78,17 @@ fn start(cell: Cell, place: Place) -> Result<Box<dyn Running>, StartError> {
 /// The gateways of all cells, by their names.
 struct Cells {
     ready: Value,
-    cells: Vec<(String, Box<dyn Running>)>,
+    cells: Vec<(String, Box<dyn ForegroundRun>)>,
 }
 
 impl Cells {
-    fn new(cells: Vec<(String, Box<dyn Running>)>) -> Self {
+    fn new(cells: Vec<(String, Box<dyn ForegroundRun>)>) -> Self {
         let ready = cells.iter().map(|(name, run)| (name.clone(), run.ready().clone()));
         Self { ready: by_name(ready), cells }
     }
 }
 
-impl Running for Cells {
+impl ForegroundRun for Cells {
     fn ready(&self) -> &Value {
         &self.ready
     }

@@ -26,10 +26,10 @@ use tokio::task::JoinSet;
 use tracing::{error, info, warn};
 
 use super::console::{ConsoleOptions, Consoled};
-use super::events_file::Writer;
-use super::host::{self, Handle, Shell};
+use super::events_file::EventsWriter;
+use super::host::{self, Handle, Runtime};
 use super::tcp::{Accepted, Connection};
-use super::worker::Place;
+use super::worker::RuntimePlace;
 use super::{EventsFile, RunOptions, StartError};
 use control::ControlClient;
 use modbus::Modbus;
@@ -98,7 +98,7 @@ pub fn start_with(config: SimConfig, options: ControllerOptions) -> Result<Handl
 }
 
 fn spawn(config: SimConfig, options: ControllerOptions) -> Result<Handle, StartError> {
-    host::start(&Place::alone(), "controller", async move |_| {
+    host::start(&RuntimePlace::alone(), "controller", async move |_| {
         let scheduling = match options.pace {
             // It would look for input with priority over the clients that it waits for.
             Pace::Stepped => Scheduling::Ordinary,
@@ -119,7 +119,7 @@ struct Running {
     ready: Value,
 }
 
-impl Shell for Running {
+impl Runtime for Running {
     fn ready(&self) -> Value {
         self.ready.clone()
     }
@@ -179,7 +179,7 @@ struct ControllerShell {
     is_playing: Cell<bool>,
     /// Number of the newest event that was told.
     told: Cell<u64>,
-    events_file: Option<Writer>,
+    events_file: Option<EventsWriter>,
     control_clients: RefCell<Vec<Rc<ControlClient>>>,
     refused_control_clients: Cell<usize>,
     ended: Notify,

@@ -62,7 +62,7 @@ impl EventsFile {
     }
 
     /// Creates the file, or empties it, and starts to write.
-    pub(super) fn create(&self) -> Result<Writer, StartError> {
+    pub(super) fn create(&self) -> Result<EventsWriter, StartError> {
         self.check()?;
         let mut file = File::create(&self.path).map_err(|error| self.refused(error))?;
         let (lines, inbox) = sync_channel::<String>(MAX_WAITING);
@@ -85,7 +85,7 @@ impl EventsFile {
             }
         });
         let thread = thread.map_err(|error| self.refused(error))?;
-        Ok(Writer { lines: Some(lines), lost: Cell::new(0), thread: Some(thread) })
+        Ok(EventsWriter { lines: Some(lines), lost: Cell::new(0), thread: Some(thread) })
     }
 
     fn refused(&self, why: impl std::fmt::Display) -> StartError {
@@ -95,13 +95,13 @@ impl EventsFile {
 
 /// Writes events. When it is dropped, everything that waits is written first.
 #[derive(Debug)]
-pub(super) struct Writer {
+pub(super) struct EventsWriter {
     lines: Option<SyncSender<String>>,
     lost: Cell<u64>,
     thread: Option<JoinHandle<()>>,
 }
 
-impl Writer {
+impl EventsWriter {
     /// Writes a line.
     pub(super) fn write(&self, line: &str) {
         let Some(lines) = &self.lines else { return };
@@ -114,7 +114,7 @@ impl Writer {
     }
 }
 
-impl Drop for Writer {
+impl Drop for EventsWriter {
     fn drop(&mut self) {
         self.lines = None;
         if let Some(thread) = self.thread.take() {

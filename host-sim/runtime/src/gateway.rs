@@ -26,11 +26,11 @@ use doctor::Doctor;
 pub use doctor::listen;
 use open::Devices;
 
-use super::host::{self, Handle, Shell};
-use super::link::{self, Endpoint, LinkControl, LinkEvent};
+use super::host::{self, Handle, Runtime};
+use super::link::{self, LinkControl, LinkEndpoint, LinkEvent};
 use super::publisher::{Publisher, SnapshotWatch};
 use super::snapshot::{Engine, MAX_SAFE, SnapshotSlot};
-use super::worker::Place;
+use super::worker::RuntimePlace;
 use super::{RunOptions, StartError};
 use recipe_capture::{Decoder, Watch};
 use recipe_doctor::PortRecord;
@@ -41,7 +41,7 @@ use recipe_io::handover::Handover;
 use recipe_io::port::Port;
 use recipe_io::realtime::{self, Scheduling};
 use recipe_io::timer::{Timer, now};
-use shown::Shown;
+use shown::TraceText;
 use tapping::Tapping;
 
 /// Observers of a gateway.
@@ -76,7 +76,7 @@ impl Observers {
 struct Gateway {
     core: Rc<Core>,
     ports: Vec<(PortId, Port)>,
-    links: Vec<(LinkId, LinkKind, Endpoint)>,
+    links: Vec<(LinkId, LinkKind, LinkEndpoint)>,
     ready: Value,
     slot: Option<Arc<SnapshotSlot>>,
     /// The edge node's.
@@ -171,7 +171,7 @@ impl Gateway {
     }
 }
 
-impl Shell for Gateway {
+impl Runtime for Gateway {
     fn ready(&self) -> Value {
         self.ready.clone()
     }
@@ -319,7 +319,7 @@ impl Core {
     /// Reports one input and executes all outputs.
     fn input(&self, input: Input<'_>) {
         let at = now();
-        trace!(input = %Shown(&input), "in");
+        trace!(input = %TraceText(&input), "in");
         let mut engine = self.engine.borrow_mut();
         let mut tapping = self.tapping.borrow_mut();
         tapping.before(engine.tap(), at, input);
@@ -343,7 +343,7 @@ impl Core {
                     }
                     return;
                 }
-                _ => trace!(output = %Shown(&output), "out"),
+                _ => trace!(output = %TraceText(&output), "out"),
             }
             if !self.may(&output) {
                 continue;
@@ -457,7 +457,7 @@ pub fn run(config: GatewayConfig, options: RunOptions) -> Result<(), StartError>
     let snapshot_watch = publisher.as_ref().map(Publisher::snapshot_watch);
     let observers = Observers { snapshot_watch, ..Observers::of(&options) };
     let (binds, handover) = (options.binds.clone(), Handover::default());
-    let handle = spawn(config, binds, options.scheduling, observers, handover, &Place::alone())?;
+    let handle = spawn(config, binds, options.scheduling, observers, handover, &RuntimePlace::alone())?;
     host::foreground(Box::new(handle), &options)
 }
 
@@ -475,7 +475,7 @@ pub fn start(config: GatewayConfig, binds: Vec<Bind>) -> Result<Handle, StartErr
 /// The reason why it could not start; nothing is left behind then.
 pub fn start_watched(config: GatewayConfig, binds: Vec<Bind>, watch: &Watch) -> Result<Handle, StartError> {
     let observers = Observers { watch: watch.clone(), ..Observers::default() };
-    spawn(config, binds, Scheduling::Ordinary, observers, Handover::default(), &Place::alone())
+    spawn(config, binds, Scheduling::Ordinary, observers, Handover::default(), &RuntimePlace::alone())
 }
 
 /// Starts the gateway at a place. It takes over the devices in `handover`, and leaves its own there when it ends.
@@ -485,7 +485,7 @@ pub(crate) fn spawn(
     scheduling: Scheduling,
     observers: Observers,
     handover: Handover,
-    place: &Place,
+    place: &RuntimePlace,
 ) -> Result<Handle, StartError> {
     let watch = observers.watch.clone();
     let (doctor, texts) = match observers.readers {

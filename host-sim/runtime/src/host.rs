@@ -1,7 +1,7 @@
-//! What every shell needs: a thread with a runtime, a handle, and in the foreground the `ready` line,
+//! What every runtime needs: a thread with a runtime, a handle, and in the foreground the `ready` line,
 //! statistics and a clean end.
 //!
-//! A shell has a thread of its own with a runtime, or shares a [`Worker`] with others and has a [`LocalSet`] there. Either
+//! A runtime has a thread of its own with a runtime, or shares a [`Worker`] with others and has a [`LocalSet`] there. Either
 //! way its tasks end with it.
 
 use std::cell::RefCell;
@@ -22,22 +22,22 @@ use super::{RunOptions, Signals, StartError};
 use crate::client::{RuntimeClient, RuntimeRequest};
 use crate::findings::FindingTexts;
 use crate::out::print_stderr;
-use crate::stdout::{Failure, Stdout};
+use crate::stdout::{Stdout, StdoutFailure};
 pub(super) use crate::worker::STACK;
-use crate::worker::{Place, Shared, no_runtime, panicked, runtime};
+use crate::worker::{RuntimePlace, SharedRuntime, no_runtime, panicked, runtime};
 
 /// A gateway or a controller that runs on one thread until it is dropped.
-pub(super) trait Shell: 'static {
+pub(super) trait Runtime: 'static {
     /// The addresses and paths for the `ready` line, by name.
     fn ready(&self) -> Value;
-    /// A function that returns one line of statistics while the shell runs.
+    /// A function that returns one line of statistics while the runtime runs.
     fn stats(&self) -> impl Fn() -> Value + 'static;
     /// Runs where tasks can be spawned that stay on this thread; returns only if something fails permanently, or after a
     /// shutdown command.
     fn run(self) -> impl Future<Output = Result<(), StartError>>;
 }
 
-/// A shell that runs on a thread of its own or a shared one. Dropping it ends the shell and waits until its sockets
+/// A runtime that runs on a thread of its own or a shared one. Dropping it ends the runtime and waits until its sockets
 /// are closed and its links removed.
 #[derive(Debug)]
 pub struct Handle {
@@ -48,17 +48,17 @@ pub struct Handle {
     home: Option<Home>,
 }
 
-/// Where a shell runs.
+/// Where a runtime runs.
 #[derive(Debug)]
 enum Home {
     /// On a thread of its own.
     Alone(JoinHandle<Result<(), StartError>>),
     /// Among others.
-    Among(Shared),
+    Among(SharedRuntime),
 }
 
 /// Something that runs and can be asked, in the foreground.
-pub(crate) trait Running {
+pub(crate) trait ForegroundRun {
     /// The actual addresses and paths.
     fn ready(&self) -> &Value;
     /// One line of statistics; `None` if there is none at the moment.
@@ -71,7 +71,7 @@ pub(crate) trait Running {
     fn shutdown(self: Box<Self>) -> Result<(), StartError>;
 }
 
-/// What the thread of a shell does at its end, after all tasks are gone. A clone is the same.
+/// What the thread of a runtime does at its end, after all tasks are gone. A clone is the same.
 #[derive(Default, Clone)]
 pub(super) struct AtEnd(Rc<RefCell<Vec<Act>>>);
 
@@ -88,9 +88,9 @@ impl AtEnd {
     }
 }
 
-/// Opens a shell and waits until everything is listening.
-pub(super) fn start<S: Shell>(
-    place: &Place,
+/// Opens a runtime and waits until everything is listening.
+pub(super) fn start<S: Runtime>(
+    place: &RuntimePlace,
     name: &str,
     open: impl AsyncFnOnce(&AtEnd) -> Result<S, StartError> + Send + 'static,
 ) -> Result<Handle, StartError> {
@@ -122,7 +122,7 @@ pub(super) fn start<S: Shell>(
     }
 }
 
-fn alone<S: Shell>(
+fn alone<S: Runtime>(
     name: &str,
     opening: Opening<S>,
 ) -> Result<JoinHandle<Result<(), StartError>>, StartError> {
@@ -140,19 +140,19 @@ fn alone<S: Shell>(
     thread.map_err(|error| StartError::new(format!("cannot start a thread: {error}")))
 }
 
-/// A shell that is to be opened.
+/// A runtime that is to be opened.
 struct Opening<S> {
     open: Open<S>,
     opened: blocking::Sender<Result<Value, StartError>>,
     inbox: mpsc::UnboundedReceiver<RuntimeRequest>,
 }
 
-/// Opens a shell. It is called through a pointer, and so is its future: what it needs on the stack, with room for an
-/// engine and a configuration, would else be touched at every wake of the shell.
+/// Opens a runtime. It is called through a pointer, and so is its future: what it needs on the stack, with room for an
+/// engine and a configuration, would else be touched at every wake of the runtime.
 type Open<S> =
     Box<dyn for<'a> FnOnce(&'a AtEnd) -> Pin<Box<dyn Future<Output = Result<S, StartError>> + 'a>> + Send>;
 
-impl<S: Shell> Opening<S> {
+impl<S: Runtime> Opening<S> {
     /// The same as [`Self::run`], in a task of its own: what is run around the tasks is polled at each wake of any of
     /// them.
     async fn run_as_task(
@@ -166,18 +166,18 @@ impl<S: Shell> Opening<S> {
     /// Opens it, and runs it when it may begin.
     async fn run(self, at_end: AtEnd, begin: impl Future<Output = ()>) -> Result<(), StartError> {
         let Self { open, opened, inbox } = self;
-        let shell = match open(&at_end).await {
-            Ok(shell) => shell,
+        let runtime = match open(&at_end).await {
+            Ok(runtime) => runtime,
             Err(error) => {
                 let _ = opened.send(Err(error));
                 return Ok(());
             }
         };
-        let stats = shell.stats();
-        let _ = opened.send(Ok(shell.ready()));
+        let stats = runtime.stats();
+        let _ = opened.send(Ok(runtime.ready()));
         let run = async {
             begin.await;
-            shell.run().await.map_err(StartError::after_start)
+            runtime.run().await.map_err(StartError::after_start)
         };
         tokio::select! {
             ended = run => ended,
@@ -212,7 +212,7 @@ impl Handle {
         self.ready.pointer(&format!("/{name}")).and_then(Value::as_str).unwrap_or("")
     }
 
-    /// One line of statistics; `None` if the shell has ended.
+    /// One line of statistics; `None` if the runtime has ended.
     pub fn stats(&self) -> Option<Value> {
         self.client().stats()
     }
@@ -228,7 +228,7 @@ impl Handle {
     }
 
     pub(super) fn with_watch(self, watch: Watch) -> Self {
-        // Not by an update: a handle ends its shell when it is dropped.
+        // Not by an update: a handle ends its runtime when it is dropped.
         let mut handle = self;
         handle.watch = watch;
         handle
@@ -241,12 +241,12 @@ impl Handle {
         handle
     }
 
-    /// Whether the shell has ended by itself.
+    /// Whether the runtime has ended by itself.
     pub fn has_ended(&self) -> bool {
         self.home.as_ref().is_none_or(Home::has_ended)
     }
 
-    /// Ends the shell and waits for it.
+    /// Ends the runtime and waits for it.
     ///
     /// # Errors
     /// If it had ended by itself, the reason.
@@ -260,7 +260,7 @@ impl Handle {
     }
 }
 
-impl Running for Handle {
+impl ForegroundRun for Handle {
     fn ready(&self) -> &Value {
         self.ready()
     }
@@ -306,7 +306,7 @@ impl Home {
 }
 
 /// Prints `ready` and statistics, and ends on a signal.
-pub(super) fn foreground(handle: Box<dyn Running>, options: &RunOptions) -> Result<(), StartError> {
+pub(super) fn foreground(handle: Box<dyn ForegroundRun>, options: &RunOptions) -> Result<(), StartError> {
     let runtime = runtime()?;
     let mut stdout = Stdout::start()
         .map_err(|error| StartError::new(format!("cannot start the thread for statistics: {error}")))?;
@@ -338,16 +338,16 @@ pub(super) fn foreground(handle: Box<dyn Running>, options: &RunOptions) -> Resu
                         }
                     }
                     Some(failure) = stdout.failures.recv() => match failure {
-                        Failure::Closed if options.stats.is_some() => {
+                        StdoutFailure::Closed if options.stats.is_some() => {
                             print_stderr("stdout was closed; ended, because nobody reads the statistics");
                             break Ok(());
                         }
                         // Nothing more would be printed.
-                        Failure::Closed => {}
-                        Failure::NotReady(error) => {
+                        StdoutFailure::Closed => {}
+                        StdoutFailure::NotReady(error) => {
                             break Err(StartError::new(format!("stdout: {error}")).after_start());
                         }
-                        Failure::Lost(error) => warn!(%error, "cannot write statistics to stdout"),
+                        StdoutFailure::Lost(error) => warn!(%error, "cannot write statistics to stdout"),
                     },
                     _ = check.tick() => {
                         if handle.has_ended() {
@@ -365,7 +365,7 @@ pub(super) fn foreground(handle: Box<dyn Running>, options: &RunOptions) -> Resu
     result
 }
 
-/// Interval at which the foreground checks that the shell still runs.
+/// Interval at which the foreground checks that the runtime still runs.
 const CHECK_INTERVAL: std::time::Duration = std::time::Duration::from_millis(100);
 
 async fn tick(ticks: &mut Option<tokio::time::Interval>) {

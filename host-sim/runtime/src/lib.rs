@@ -1,6 +1,6 @@
-//! The tokio shells, which connect the engine and the simulated controller to sockets, devices and the clock.
+//! The tokio runtimes, which connect the engine and the simulated controller to sockets, devices and the clock.
 //!
-//! A shell is one thread with a current-thread runtime. It owns all its sockets and devices, reports received
+//! A runtime is one thread with a current-thread runtime. It owns all its sockets and devices, reports received
 //! data to the state machine, and carries out its outputs. It does not know protocols. The simulated controller's
 //! Modbus connections have a thread beside it, which does the same for them.
 

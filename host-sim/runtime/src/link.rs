@@ -26,11 +26,11 @@ use recipe_io::fairness::yield_fairly;
 use recipe_io::log_limit::LogLimit;
 use recipe_io::timer::now;
 
-use outbox::{Outbox, Way};
+use outbox::{DirectSocket, Outbox};
 
 /// The other end of a link.
 #[derive(Debug)]
-pub(super) enum Endpoint {
+pub(super) enum LinkEndpoint {
     /// The controller's TCP server.
     Tcp { host: String, port: u16 },
     /// The controller's UDP server.
@@ -56,7 +56,7 @@ pub(super) enum LinkEvent<'a> {
 /// The engine's side of a link. It never waits.
 #[derive(Debug, Default)]
 pub(super) struct LinkControl {
-    session: Cell<Session>,
+    session: Cell<LinkSession>,
     outbox: RefCell<Outbox>,
     /// Bytes handed over in this session.
     handed: Cell<u64>,
@@ -69,9 +69,9 @@ pub(super) struct LinkControl {
 
 /// Counts openings and closings: odd while the link should be open.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-struct Session(u64);
+struct LinkSession(u64);
 
-impl Session {
+impl LinkSession {
     const FIRST: Self = Self(1);
 
     const fn is_open(self) -> bool {
@@ -154,14 +154,14 @@ impl LinkControl {
     }
 
     fn next_session(&self) {
-        self.session.set(Session(self.session.get().0 + 1));
+        self.session.set(LinkSession(self.session.get().0 + 1));
         self.outbox.take();
         self.handed.set(0);
         self.changed.notify_one();
     }
 
     /// Waits until the link should be open, and returns the session.
-    async fn opened(&self) -> Session {
+    async fn opened(&self) -> LinkSession {
         loop {
             let session = self.session.get();
             if session.is_open() {
@@ -171,20 +171,20 @@ impl LinkControl {
         }
     }
 
-    fn is_over(&self, session: Session) -> bool {
+    fn is_over(&self, session: LinkSession) -> bool {
         self.session.get() != session
     }
 
     /// Waits until this session is over. It consumes notifications, so nothing else may wait for them.
-    async fn over(&self, session: Session) {
+    async fn over(&self, session: LinkSession) {
         while !self.is_over(session) {
             self.changed.notified().await;
         }
     }
 
     /// Lets [`Self::send`] write to a socket of this session, until what is returned is dropped.
-    fn lend(&self, way: Way) -> Lent<'_> {
-        self.outbox.borrow_mut().open(way);
+    fn lend(&self, socket: DirectSocket) -> Lent<'_> {
+        self.outbox.borrow_mut().open(socket);
         Lent(self)
     }
 
@@ -215,7 +215,7 @@ impl Drop for Lent<'_> {
 }
 
 /// The context of a link's task.
-struct Link<'a> {
+struct LinkTask<'a> {
     name: &'a str,
     control: &'a LinkControl,
 }
@@ -224,12 +224,12 @@ struct Link<'a> {
 /// controller's client.
 pub(super) async fn run(
     name: &str,
-    endpoint: &Endpoint,
+    endpoint: &LinkEndpoint,
     control: &LinkControl,
     is_frame: impl Fn(&[u8]) -> bool,
     mut events: impl FnMut(LinkEvent<'_>),
 ) {
-    let link = Link { name, control };
+    let link = LinkTask { name, control };
     let mut events = |event: LinkEvent<'_>| {
         if let LinkEvent::Bytes(_) = event {
             control.heard();
@@ -239,12 +239,12 @@ pub(super) async fn run(
     loop {
         let session = control.opened().await;
         let result = match endpoint {
-            Endpoint::Tcp { host, port } => link.connect_tcp(session, host, *port, &mut events).await,
-            Endpoint::TcpListen { listener, controller } => {
+            LinkEndpoint::Tcp { host, port } => link.connect_tcp(session, host, *port, &mut events).await,
+            LinkEndpoint::TcpListen { listener, controller } => {
                 link.accept_tcp(session, listener, controller, &mut events).await
             }
-            Endpoint::Udp { host, port } => link.connect_udp(session, host, *port, &mut events).await,
-            Endpoint::UdpListen { socket, controller } => {
+            LinkEndpoint::Udp { host, port } => link.connect_udp(session, host, *port, &mut events).await,
+            LinkEndpoint::UdpListen { socket, controller } => {
                 link.await_udp(session, socket, controller, &is_frame, &mut events).await
             }
         };
@@ -267,24 +267,26 @@ pub(super) async fn run(
 /// its client. Returns when that is known.
 pub(super) async fn probe(
     name: &str,
-    endpoint: &Endpoint,
+    endpoint: &LinkEndpoint,
     control: &LinkControl,
     is_frame: impl Fn(&[u8]) -> bool,
 ) {
-    let link = Link { name, control };
+    let link = LinkTask { name, control };
     let result = match endpoint {
-        Endpoint::Tcp { host, port } => {
+        LinkEndpoint::Tcp { host, port } => {
             let connected = tokio::time::timeout(MAX_CONNECT, connect((host.as_str(), *port))).await;
             match connected {
                 Ok(connected) => connected.map(|_| Reach::Reached),
                 Err(_) => Ok(Reach::NoAnswer),
             }
         }
-        Endpoint::Udp { host, port } => {
+        LinkEndpoint::Udp { host, port } => {
             tokio::net::lookup_host((host.as_str(), *port)).await.map(|_| Reach::Untried)
         }
-        Endpoint::TcpListen { listener, controller } => link.await_client(listener, controller).await,
-        Endpoint::UdpListen { socket, controller } => link.await_frame(socket, controller, is_frame).await,
+        LinkEndpoint::TcpListen { listener, controller } => link.await_client(listener, controller).await,
+        LinkEndpoint::UdpListen { socket, controller } => {
+            link.await_frame(socket, controller, is_frame).await
+        }
     };
     let reach = result.unwrap_or_else(|error| reach_of(&error));
     control.reach.replace(Some((Instant::now() + REACH_STAYS, reach)));
@@ -301,10 +303,10 @@ fn reach_of(error: &io::Error) -> Reach {
     }
 }
 
-impl Link<'_> {
+impl LinkTask<'_> {
     /// Waits until the controller's client connects.
     async fn await_client(&self, listener: &TcpListener, controller: &str) -> io::Result<Reach> {
-        let (known, _) = self.look_up(Session::FIRST, controller).await?;
+        let (known, _) = self.look_up(LinkSession::FIRST, controller).await?;
         loop {
             let (_, peer) = listener.accept().await?;
             if self.control.is_controller(self.name, &known, peer) {
@@ -321,7 +323,7 @@ impl Link<'_> {
         controller: &str,
         is_frame: impl Fn(&[u8]) -> bool,
     ) -> io::Result<Reach> {
-        let (known, _) = self.look_up(Session::FIRST, controller).await?;
+        let (known, _) = self.look_up(LinkSession::FIRST, controller).await?;
         let mut datagram = [0; 2_048];
         loop {
             let (len, peer) = socket.recv_from(&mut datagram).await?;
@@ -335,7 +337,7 @@ impl Link<'_> {
     /// The result of `opening`; `None` if the session is over, even if both happen together.
     async fn while_open<T>(
         &self,
-        session: Session,
+        session: LinkSession,
         opening: impl Future<Output = io::Result<T>>,
     ) -> io::Result<Option<T>> {
         let opened = tokio::select! {
@@ -347,11 +349,11 @@ impl Link<'_> {
 
     /// The controller's addresses, and whether data at a listening socket may be from before this session. In
     /// the first session it is not: the gateway has just started.
-    async fn look_up(&self, session: Session, controller: &str) -> io::Result<(Vec<IpAddr>, bool)> {
+    async fn look_up(&self, session: LinkSession, controller: &str) -> io::Result<(Vec<IpAddr>, bool)> {
         let began = Instant::now();
         let found = tokio::net::lookup_host((controller, 0)).await?;
         let known = found.map(|address| address.ip().to_canonical()).collect();
-        Ok((known, session != Session::FIRST || began.elapsed() >= MAX_LOOKUP))
+        Ok((known, session != LinkSession::FIRST || began.elapsed() >= MAX_LOOKUP))
     }
 }
 

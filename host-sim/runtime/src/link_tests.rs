@@ -33,7 +33,7 @@ pub(super) struct Log {
 }
 
 impl Running {
-    pub(super) fn start(endpoint: Endpoint) -> Self {
+    pub(super) fn start(endpoint: LinkEndpoint) -> Self {
         let (control, seen) = (Rc::new(LinkControl::default()), Rc::new(Log::default()));
         let (own, log) = (Rc::clone(&control), Rc::clone(&seen));
         let task = spawn_local(async move {
@@ -97,18 +97,18 @@ pub(super) fn inside(test: impl AsyncFnOnce()) {
     });
 }
 
-pub(super) fn tcp_listen(listener: TcpListener) -> Endpoint {
-    Endpoint::TcpListen { listener, controller: "127.0.0.1".to_owned() }
+pub(super) fn tcp_listen(listener: TcpListener) -> LinkEndpoint {
+    LinkEndpoint::TcpListen { listener, controller: "127.0.0.1".to_owned() }
 }
 
-fn udp_listen(socket: UdpSocket) -> Endpoint {
-    Endpoint::UdpListen { socket, controller: "127.0.0.1".to_owned() }
+fn udp_listen(socket: UdpSocket) -> LinkEndpoint {
+    LinkEndpoint::UdpListen { socket, controller: "127.0.0.1".to_owned() }
 }
 
-pub(super) async fn server() -> (TcpListener, Endpoint) {
+pub(super) async fn server() -> (TcpListener, LinkEndpoint) {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let at = listener.local_addr().unwrap();
-    (listener, Endpoint::Tcp { host: at.ip().to_string(), port: at.port() })
+    (listener, LinkEndpoint::Tcp { host: at.ip().to_string(), port: at.port() })
 }
 
 /// A TCP link that is up, its server, and the server's side of the connection.
@@ -205,7 +205,7 @@ fn a_peer_that_reads_nothing_does_not_prevent_the_close() {
         small.bind("127.0.0.1:0".parse().unwrap()).unwrap();
         let listener = small.listen(4).unwrap();
         let at = listener.local_addr().unwrap();
-        let link = Running::start(Endpoint::Tcp { host: at.ip().to_string(), port: at.port() });
+        let link = Running::start(LinkEndpoint::Tcp { host: at.ip().to_string(), port: at.port() });
         link.control.open();
         let (mut deaf, _) = listener.accept().await.unwrap();
         link.expect(Seen::Up).await;
@@ -255,7 +255,7 @@ fn a_udp_link_is_down_if_the_peer_is_unreachable() {
     inside(async || {
         let peer = UdpSocket::bind("127.0.0.1:0").await.unwrap();
         let at = peer.local_addr().unwrap();
-        let link = Running::start(Endpoint::Udp { host: at.ip().to_string(), port: at.port() });
+        let link = Running::start(LinkEndpoint::Udp { host: at.ip().to_string(), port: at.port() });
         link.control.open();
         link.expect(Seen::Up).await;
         link.control.send(b"frame");
@@ -277,7 +277,7 @@ fn a_udp_link_is_down_if_that_is_found_when_something_is_handed_over() {
     inside(async || {
         let peer = UdpSocket::bind("127.0.0.1:0").await.unwrap();
         let at = peer.local_addr().unwrap();
-        let link = Running::start(Endpoint::Udp { host: at.ip().to_string(), port: at.port() });
+        let link = Running::start(LinkEndpoint::Udp { host: at.ip().to_string(), port: at.port() });
         link.control.open();
         link.expect(Seen::Up).await;
         // The task has a socket to lend.
@@ -433,14 +433,14 @@ fn a_program_on_this_host_may_replace_the_controller() {
         for address in ["127.0.0.1:0", "[::1]:0"] {
             let Ok(listener) = TcpListener::bind(address).await else { continue };
             let at = listener.local_addr().unwrap();
-            let link = Running::start(Endpoint::TcpListen { listener, controller: elsewhere() });
+            let link = Running::start(LinkEndpoint::TcpListen { listener, controller: elsewhere() });
             link.control.open();
             let _peer = TcpStream::connect(at).await.unwrap();
             link.expect(Seen::Up).await;
         }
         let socket = UdpSocket::bind("127.0.0.1:0").await.unwrap();
         let at = socket.local_addr().unwrap();
-        let link = Running::start(Endpoint::UdpListen { socket, controller: elsewhere() });
+        let link = Running::start(LinkEndpoint::UdpListen { socket, controller: elsewhere() });
         link.control.open();
         let peer = UdpSocket::bind("127.0.0.1:0").await.unwrap();
         peer.send_to(b"here", at).await.unwrap();

@@ -10,21 +10,21 @@ use std::time::Duration;
 
 /// The log. Clones are of the same log.
 #[derive(Debug, Clone)]
-pub struct Log(Arc<Lines>);
+pub struct Log(Arc<LogLines>);
 
 /// Waits when it is dropped until waiting lines are written, if that takes less than half a second.
 #[derive(Debug)]
 pub struct LastWrite(Log);
 
 #[derive(Debug, Default)]
-struct Lines {
-    waiting: Mutex<Waiting>,
+struct LogLines {
+    waiting: Mutex<WaitingLines>,
     changed: Condvar,
     newest: Mutex<Newest>,
 }
 
 #[derive(Debug, Default)]
-struct Waiting {
+struct WaitingLines {
     bytes: Vec<u8>,
     lost: u64,
     /// The thread is writing lines that it has taken.
@@ -35,7 +35,7 @@ impl Log {
     /// A log that is written to `out` by a thread of its own. Without the thread nothing is logged; the program
     /// still works.
     pub fn start(mut out: impl Write + Send + 'static) -> Self {
-        let lines = Arc::new(Lines::default());
+        let lines = Arc::new(LogLines::default());
         let own = Arc::clone(&lines);
         let _ = std::thread::Builder::new().name("log".to_owned()).spawn(move || {
             loop {
@@ -79,12 +79,12 @@ impl Drop for LastWrite {
     fn drop(&mut self) {
         let lines = &*self.0.0;
         let waiting = locked(&lines.waiting);
-        let busy = |waiting: &mut Waiting| waiting.writing || !waiting.bytes.is_empty();
+        let busy = |waiting: &mut WaitingLines| waiting.writing || !waiting.bytes.is_empty();
         drop(lines.changed.wait_timeout_while(waiting, LAST_WRITE, busy));
     }
 }
 
-impl Lines {
+impl LogLines {
     fn put(&self, line: &[u8]) {
         let mut waiting = locked(&self.waiting);
         if waiting.bytes.len() + line.len() > MAX_WAITING {
@@ -101,7 +101,7 @@ impl Lines {
 
     /// Waits for lines and takes them.
     fn take(&self) -> Vec<u8> {
-        let none = |waiting: &mut Waiting| waiting.bytes.is_empty();
+        let none = |waiting: &mut WaitingLines| waiting.bytes.is_empty();
         let waited = self.changed.wait_while(locked(&self.waiting), none);
         let mut waiting = waited.unwrap_or_else(PoisonError::into_inner);
         waiting.writing = true;

@@ -36,17 +36,17 @@ impl ReadyFile {
     }
 
     /// Writes the file. Dropping the result removes it.
-    pub(super) fn write(&self, ready: &Value) -> Result<Written, StartError> {
+    pub(super) fn write(&self, ready: &Value) -> Result<WrittenReadyFile, StartError> {
         let is_free = self.is_free()?;
         let text = format!("{ready}\n");
-        let written = || -> io::Result<Written> {
+        let written = || -> io::Result<WrittenReadyFile> {
             fs::create_dir_all(self.folder())?;
             let (beside, file) = Beside::file(&self.path, text.as_bytes())?;
             match is_free {
                 true => beside.put_new(&self.path)?,
                 false => beside.replace(&self.path)?,
             }
-            Ok(Written { path: self.path.clone(), text: text.clone(), file })
+            Ok(WrittenReadyFile { path: self.path.clone(), text: text.clone(), file })
         };
         written().map_err(|error| self.refused(error))
     }
@@ -83,14 +83,14 @@ impl ReadyFile {
 
 /// A written ready file. Dropping it removes the file, unless that was changed.
 #[derive(Debug)]
-pub(super) struct Written {
+pub(super) struct WrittenReadyFile {
     path: PathBuf,
     text: String,
     /// As long as it is open, no other file gets its inode number.
     file: fs::File,
 }
 
-impl Drop for Written {
+impl Drop for WrittenReadyFile {
     fn drop(&mut self) {
         let own = self.file.metadata().map(|own| Identity::of(&own));
         let there = fs::symlink_metadata(&self.path).map(|there| (Identity::of(&there), there.len()));

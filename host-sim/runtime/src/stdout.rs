@@ -12,14 +12,14 @@ use crate::out::is_broken_pipe;
 /// are not read or cannot be written are lost and counted.
 pub(super) struct Stdout {
     waiting: blocking::SyncSender<String>,
-    pub(super) failures: mpsc::UnboundedReceiver<Failure>,
+    pub(super) failures: mpsc::UnboundedReceiver<StdoutFailure>,
     /// Closed when everything has been written.
     written: blocking::Receiver<()>,
     lost: Arc<AtomicU64>,
 }
 
 /// Why a line was not written; reported once until a line is written again.
-pub(super) enum Failure {
+pub(super) enum StdoutFailure {
     /// The reader has closed stdout.
     Closed,
     /// It was the first line, `ready`.
@@ -46,9 +46,9 @@ impl Stdout {
                 count.fetch_add(1, Relaxed);
                 if !std::mem::replace(&mut failing, true) {
                     let _ = report.send(match nth {
-                        _ if is_broken_pipe(&error) => Failure::Closed,
-                        0 => Failure::NotReady(error),
-                        _ => Failure::Lost(error),
+                        _ if is_broken_pipe(&error) => StdoutFailure::Closed,
+                        0 => StdoutFailure::NotReady(error),
+                        _ => StdoutFailure::Lost(error),
                     });
                 }
             }

@@ -1,4 +1,4 @@
-//! A thread that several shells share: what has become ready for one of them is found together with the rest, so that
+//! A thread that several runtimes share: what has become ready for one of them is found together with the rest, so that
 //! all of them sleep less often than each one alone.
 
 use std::io;
@@ -17,7 +17,7 @@ use crate::StartError;
 /// Stack size: an engine is built by value, and unoptimised code has several copies of it on the stack.
 pub(super) const STACK: usize = 16 << 20;
 
-/// A thread or a shell panicked.
+/// A thread or a runtime panicked.
 pub(super) fn panicked() -> StartError {
     StartError::new("a thread panicked").after_start()
 }
@@ -31,15 +31,15 @@ pub(super) fn no_runtime(error: io::Error) -> StartError {
     StartError::new(format!("cannot start the runtime: {error}"))
 }
 
-/// Where a shell runs.
+/// Where a runtime runs.
 #[derive(Debug, Clone)]
-pub(crate) struct Place {
+pub(crate) struct RuntimePlace {
     /// What the log calls it.
     pub(crate) span: Span,
     shared: Option<(Arc<Worker>, Begin)>,
 }
 
-impl Place {
+impl RuntimePlace {
     /// On a thread of its own.
     pub(crate) fn alone() -> Self {
         Self { span: Span::none(), shared: None }
@@ -55,7 +55,7 @@ impl Place {
     }
 }
 
-/// When shells may run that have been opened.
+/// When runtimes may run that have been opened.
 #[derive(Debug, Clone)]
 pub(crate) struct Begin {
     begins: watch::Receiver<bool>,
@@ -90,7 +90,7 @@ impl Begin {
 
 type Job = Box<dyn FnOnce() -> Pin<Box<dyn Future<Output = ()>>> + Send>;
 
-/// A thread on which any number of shells run. It ends with the last of them, when nobody has it any more.
+/// A thread on which any number of runtimes run. It ends with the last of them, when nobody has it any more.
 #[derive(Debug)]
 pub(crate) struct Worker {
     jobs: Option<mpsc::UnboundedSender<Job>>,
@@ -114,21 +114,21 @@ impl Worker {
         Ok(Arc::new(Self { jobs: Some(jobs), thread: Some(thread) }))
     }
 
-    /// Runs a shell on it.
+    /// Runs a runtime on it.
     pub(super) fn run<F>(
         self: Arc<Self>,
         span: Span,
-        shell: impl FnOnce() -> F + Send + 'static,
-    ) -> Result<Shared, StartError>
+        runtime: impl FnOnce() -> F + Send + 'static,
+    ) -> Result<SharedRuntime, StartError>
     where
         F: Future<Output = Result<(), StartError>> + 'static,
     {
-        let end = Arc::<End>::default();
-        let outcome = Outcome(Arc::clone(&end));
+        let end = Arc::<RuntimeEnd>::default();
+        let outcome = EndGuard(Arc::clone(&end));
         let job: Job = Box::new(move || {
             Box::pin(
                 async move {
-                    let ended = shell().await;
+                    let ended = runtime().await;
                     outcome.is(ended);
                 }
                 .instrument(span),
@@ -136,7 +136,7 @@ impl Worker {
         });
         let sent = self.jobs.as_ref().is_some_and(|jobs| jobs.send(job).is_ok());
         match sent {
-            true => Ok(Shared { end, _worker: self }),
+            true => Ok(SharedRuntime { end, _worker: self }),
             false => Err(panicked()),
         }
     }
@@ -146,21 +146,21 @@ impl Drop for Worker {
     fn drop(&mut self) {
         self.jobs = None;
         if let Some(thread) = self.thread.take() {
-            // A panic of a shell is its own outcome.
+            // A panic of a runtime is its own outcome.
             let _ = thread.join();
         }
     }
 }
 
-/// A shell on a worker.
+/// A runtime on a worker.
 #[derive(Debug)]
-pub(super) struct Shared {
-    end: Arc<End>,
-    /// Held as long as the shell runs.
+pub(super) struct SharedRuntime {
+    end: Arc<RuntimeEnd>,
+    /// Held as long as the runtime runs.
     _worker: Arc<Worker>,
 }
 
-impl Shared {
+impl SharedRuntime {
     pub(super) fn has_ended(&self) -> bool {
         self.end.result().is_some()
     }
@@ -177,14 +177,14 @@ impl Shared {
     }
 }
 
-/// How a shell ended, once it has.
+/// How a runtime ended, once it has.
 #[derive(Debug, Default)]
-struct End {
+struct RuntimeEnd {
     result: Mutex<Option<Result<(), StartError>>>,
     ended: Condvar,
 }
 
-impl End {
+impl RuntimeEnd {
     fn result(&self) -> MutexGuard<'_, Option<Result<(), StartError>>> {
         self.result.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -195,16 +195,16 @@ impl End {
     }
 }
 
-/// Tells the end of a shell, even if that panics.
-struct Outcome(Arc<End>);
+/// Tells the end of a runtime, even if that panics.
+struct EndGuard(Arc<RuntimeEnd>);
 
-impl Outcome {
+impl EndGuard {
     fn is(self, result: Result<(), StartError>) {
         self.0.set(result);
     }
 }
 
-impl Drop for Outcome {
+impl Drop for EndGuard {
     fn drop(&mut self) {
         self.0.set(Err(panicked()));
     }
@@ -213,17 +213,17 @@ impl Drop for Outcome {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::host::{self, Handle, Shell};
+    use crate::host::{self, Handle, Runtime};
     use serde_json::{Value, json};
     use std::sync::mpsc::{Receiver, Sender, channel};
 
     /// Tells when it runs, and then does nothing, or panics.
-    struct Told {
+    struct TestRuntime {
         runs: Sender<()>,
         panics: bool,
     }
 
-    impl Shell for Told {
+    impl Runtime for TestRuntime {
         fn ready(&self) -> Value {
             Value::Null
         }
@@ -241,8 +241,8 @@ mod tests {
 
     fn opened(worker: &Arc<Worker>, begin: &Begin, panics: bool) -> (Handle, Receiver<()>) {
         let (runs, has_run) = channel();
-        let place = Place::among(Arc::clone(worker), begin.clone(), Span::none());
-        let handle = host::start(&place, "told", async move |_| Ok(Told { runs, panics })).unwrap();
+        let place = RuntimePlace::among(Arc::clone(worker), begin.clone(), Span::none());
+        let handle = host::start(&place, "told", async move |_| Ok(TestRuntime { runs, panics })).unwrap();
         (handle, has_run)
     }
 
@@ -285,8 +285,9 @@ mod tests {
     fn one_that_does_not_open_says_why() {
         let worker = Worker::start("test").unwrap();
         let (_begins, begin) = Begin::channel();
-        let place = Place::among(worker, begin, Span::none());
-        let refused = host::start(&place, "told", async |_| Err::<Told, _>(StartError::new("no device")));
+        let place = RuntimePlace::among(worker, begin, Span::none());
+        let refused =
+            host::start(&place, "told", async |_| Err::<TestRuntime, _>(StartError::new("no device")));
         assert_eq!(refused.unwrap_err().to_string(), "no device");
     }
 }

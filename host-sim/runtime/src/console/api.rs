@@ -15,41 +15,41 @@ use serde_json::{Value, json};
 use tokio::sync::oneshot;
 use tracing::{info, warn};
 
-use super::http::{Reply, Request};
+use super::http::{HttpReply, HttpRequest};
 use super::reading::host_name;
-use super::supervisor::{Command, Failed, View, What, left_of};
-use super::{Server, Source, check, pendant};
+use super::supervisor::{ActionError, SupervisorAction, SupervisorCommand, SupervisorView, left_of};
+use super::{ConsoleServer, ConsoleSource, check, pendant};
 
-impl Server {
+impl ConsoleServer {
     /// Carries out a request.
-    pub(super) async fn carry_out(&self, request: Request<'_>) -> Reply {
+    pub(super) async fn carry_out(&self, request: HttpRequest<'_>) -> HttpReply {
         match (request.admitted.operation, &self.source) {
-            (Operation::Page, _) => Reply::page(request.head.if_none_match),
+            (Operation::Page, _) => HttpReply::page(request.head.if_none_match),
             (Operation::Nonce, _) => {
                 let nonce = self.guard.borrow_mut().nonce(now());
                 let age = MAX_AGE.as_millis() / 1_000;
-                Reply::json(
+                HttpReply::json(
                     Status::OK,
                     &json!({ "nonce": nonce.as_str(), "scheme": SCHEME, "max_age_s": age }),
                 )
             }
             (Operation::Check, _) => match std::str::from_utf8(&request.body) {
                 Ok(toml) => match request.head.query("image") {
-                    None => Reply::json(Status::OK, &check::report(toml)),
+                    None => HttpReply::json(Status::OK, &check::report(toml)),
                     Some("1") => image(toml),
-                    Some(_) => Reply::error(Status::BAD_REQUEST, "image is out of range; allowed: 1"),
+                    Some(_) => HttpReply::error(Status::BAD_REQUEST, "image is out of range; allowed: 1"),
                 },
-                Err(error) => Reply::error(Status::BAD_REQUEST, &format!("not UTF-8: {error}")),
+                Err(error) => HttpReply::error(Status::BAD_REQUEST, &format!("not UTF-8: {error}")),
             },
-            (Operation::Config, Source::Gateway { shared, .. }) => config(&shared.view(), &request),
-            (Operation::Revisions, Source::Gateway { shared, .. }) => {
-                Reply::json(Status::OK, &revisions(&shared.view()))
+            (Operation::Config, ConsoleSource::Gateway { shared, .. }) => config(&shared.view(), &request),
+            (Operation::Revisions, ConsoleSource::Gateway { shared, .. }) => {
+                HttpReply::json(Status::OK, &revisions(&shared.view()))
             }
-            (Operation::Pendant, Source::Controller { control, .. }) => {
+            (Operation::Pendant, ConsoleSource::Controller { control, .. }) => {
                 info!(peer = %request.peer, body = %String::from_utf8_lossy(&request.body), "pendant");
                 pendant::operate(*control, &request.body).await
             }
-            (Operation::Identify, Source::Gateway { .. }) => self.identify(&request),
+            (Operation::Identify, ConsoleSource::Gateway { .. }) => self.identify(&request),
             (
                 Operation::Update
                 | Operation::PutUpdate
@@ -57,11 +57,11 @@ impl Server {
                 | Operation::ConfirmUpdate
                 | Operation::EndUpdate,
                 _,
-            ) => Reply::error(
+            ) => HttpReply::error(
                 Status::NOT_IMPLEMENTED,
                 "this gateway is a program; it is updated as a package, as it was installed",
             ),
-            (Operation::Edge | Operation::PutEdge, _) => Reply::error(
+            (Operation::Edge | Operation::PutEdge, _) => HttpReply::error(
                 Status::NOT_IMPLEMENTED,
                 "this gateway is a program; its edge node is given with --sparkplug, and its log says how it does",
             ),
@@ -70,31 +70,31 @@ impl Server {
                 | Operation::Apply
                 | Operation::Confirm
                 | Operation::Rollback),
-                Source::Gateway { .. },
+                ConsoleSource::Gateway { .. },
             ) => self.change(operation, request).await,
             (operation, _) => self.read(operation, &request.head).await,
         }
     }
 
     /// Tells a person beside several machines which one this is.
-    fn identify(&self, request: &Request<'_>) -> Reply {
+    fn identify(&self, request: &HttpRequest<'_>) -> HttpReply {
         let IdentifyArguments { s } = match arguments(&request.body) {
             Ok(arguments) => arguments,
             Err(reply) => return reply,
         };
         if !IDENTIFY.contains(&s) {
             let text = format!("s is out of range; allowed: {}..={}", IDENTIFY.start(), IDENTIFY.end());
-            return Reply::error(Status::BAD_REQUEST, &text);
+            return HttpReply::error(Status::BAD_REQUEST, &text);
         }
         let name = host_name().unwrap_or_default();
         let peer = request.peer.ip().to_canonical();
         warn!(%peer, name, console = %self.address, "this is the gateway that somebody looks for");
-        Reply::json(Status::OK, &json!({}))
+        HttpReply::json(Status::OK, &json!({}))
     }
 
     /// Requests that change the configuration, or what runs.
-    async fn change(&self, operation: Operation, request: Request<'_>) -> Reply {
-        let Source::Gateway { shared, commands, .. } = &self.source else { return nothing_runs() };
+    async fn change(&self, operation: Operation, request: HttpRequest<'_>) -> HttpReply {
+        let ConsoleSource::Gateway { shared, commands, .. } = &self.source else { return nothing_runs() };
         let what = match operation {
             Operation::PutConfig => {
                 // The view must not be held while a text is read and an engine is built of it.
@@ -105,25 +105,26 @@ impl Server {
                 }
             }
             Operation::Apply => match arguments::<ApplyArguments>(&request.body) {
-                Ok(ApplyArguments { confirm_s, revision }) => {
-                    What::Apply { number: revision, trial: Duration::from_millis((confirm_s * 1e3) as u64) }
-                }
+                Ok(ApplyArguments { confirm_s, revision }) => SupervisorAction::Apply {
+                    number: revision,
+                    trial: Duration::from_millis((confirm_s * 1e3) as u64),
+                },
                 Err(reply) => return reply,
             },
             Operation::Confirm | Operation::Rollback => match arguments::<NoArguments>(&request.body) {
-                Ok(NoArguments {}) if operation == Operation::Confirm => What::Confirm,
-                Ok(NoArguments {}) => What::RollBack,
+                Ok(NoArguments {}) if operation == Operation::Confirm => SupervisorAction::Confirm,
+                Ok(NoArguments {}) => SupervisorAction::RollBack,
                 Err(reply) => return reply,
             },
-            _ => return Reply::error(Status::NOT_FOUND, "there is no such path"),
+            _ => return HttpReply::error(Status::NOT_FOUND, "there is no such path"),
         };
         let (answer, answered) = oneshot::channel();
         let peer = request.peer.ip().to_canonical();
-        let done = match commands.send(Command { peer, what, answer }) {
+        let done = match commands.send(SupervisorCommand { peer, what, answer }) {
             Ok(()) => answered.await.ok(),
             Err(_) => None,
         };
-        let done = done.unwrap_or_else(|| Err(Failed::Tried("the gateway is ending".to_owned())));
+        let done = done.unwrap_or_else(|| Err(ActionError::Tried("the gateway is ending".to_owned())));
         let view = shared.view();
         match done {
             Ok(revision) => {
@@ -132,20 +133,20 @@ impl Server {
                 let status = if operation == Operation::PutConfig { Status::CREATED } else { Status::OK };
                 let mut shown = revisions(&view);
                 shown["revision"] = json!(revision);
-                let reply = Reply::json(status, &shown);
+                let reply = HttpReply::json(status, &shown);
                 match view.revisions.as_ref().and_then(|revisions| revisions.revision(revision)) {
                     Some(revision) => reply.with("ETag", etag(revision)),
                     None => reply,
                 }
             }
-            Err(Failed::Refused(refused)) => {
+            Err(ActionError::Refused(refused)) => {
                 warn!(%peer, what = name(operation), ?refused, "refused to a client of the console");
                 refusal(refused)
             }
-            Err(Failed::Tried(why)) => {
+            Err(ActionError::Tried(why)) => {
                 let mut shown = revisions(&view);
                 shown["error"] = json!(why);
-                Reply::json(
+                HttpReply::json(
                     if operation == Operation::Apply { Status::CONFLICT } else { Status::INTERNAL },
                     &shown,
                 )
@@ -155,36 +156,40 @@ impl Server {
 }
 
 /// The image of a text for a board, or its first mistake.
-fn image(toml: &str) -> Reply {
+fn image(toml: &str) -> HttpReply {
     match check::image(toml) {
-        Ok(bytes) => Reply::image(bytes),
-        Err(mistake) => Reply::json(Status::UNPROCESSABLE, &Value::Object(mistake.json())),
+        Ok(bytes) => HttpReply::image(bytes),
+        Err(mistake) => HttpReply::json(Status::UNPROCESSABLE, &Value::Object(mistake.json())),
     }
 }
 
 /// The text of the configuration that runs, or of the one that was asked for.
-fn config(view: &View, request: &Request<'_>) -> Reply {
+fn config(view: &SupervisorView, request: &HttpRequest<'_>) -> HttpReply {
     let Some(revisions) = &view.revisions else { return nothing_runs() };
     let number = match request.head.query("revision").map(str::parse) {
         None => revisions.running().unwrap_or(revisions.live()),
         Some(Ok(number)) => number,
-        Some(Err(_)) => return Reply::error(Status::BAD_REQUEST, "revision must be a number"),
+        Some(Err(_)) => return HttpReply::error(Status::BAD_REQUEST, "revision must be a number"),
     };
     match (revisions.revision(number), view.texts.get(&number)) {
         (Some(revision), _) if request.head.if_none_match == Some(etag(revision).as_str()) => {
-            let reply =
-                Reply { status: Status::NOT_MODIFIED, kind: Kind::Toml, body: "".into(), fields: Vec::new() };
+            let reply = HttpReply {
+                status: Status::NOT_MODIFIED,
+                kind: Kind::Toml,
+                body: "".into(),
+                fields: Vec::new(),
+            };
             reply.with("ETag", etag(revision))
         }
         (Some(revision), Some(text)) => {
-            Reply::text(Kind::Toml, Rc::from(&**text)).with("ETag", etag(revision))
+            HttpReply::text(Kind::Toml, Rc::from(&**text)).with("ETag", etag(revision))
         }
         _ => refusal(Refused::Unknown),
     }
 }
 
 /// The revisions, and what happens to them.
-pub(super) fn revisions(view: &View) -> Value {
+pub(super) fn revisions(view: &SupervisorView) -> Value {
     let Some(revisions) = &view.revisions else { return json!({ "kept": [] }) };
     let kept: Vec<_> = view
         .entries
@@ -245,32 +250,33 @@ fn default_identify() -> u32 {
 const IDENTIFY: RangeInclusive<u32> = 1..=600;
 
 /// The arguments in a body; none at all is an empty object.
-fn arguments<T: serde::de::DeserializeOwned>(body: &[u8]) -> Result<T, Reply> {
+fn arguments<T: serde::de::DeserializeOwned>(body: &[u8]) -> Result<T, HttpReply> {
     let body = if body.is_empty() { b"{}" } else { body };
     // Else an array would be taken for the values of an object.
     let object = serde_json::from_slice(body).map(Value::Object);
     object
         .and_then(serde_json::from_value)
-        .map_err(|error| Reply::error(Status::BAD_REQUEST, &error.to_string()))
+        .map_err(|error| HttpReply::error(Status::BAD_REQUEST, &error.to_string()))
 }
 
 /// A configuration to store: refused here if it could not run.
-fn put(request: &Request<'_>, overrides: &[String]) -> Result<What, Reply> {
+fn put(request: &HttpRequest<'_>, overrides: &[String]) -> Result<SupervisorAction, HttpReply> {
     let Some(base) = request.head.if_match else {
         let text = "If-Match is needed: the ETag of the revision that this one was made from";
-        return Err(Reply::error(Status::PRECONDITION_REQUIRED, text));
+        return Err(HttpReply::error(Status::PRECONDITION_REQUIRED, text));
     };
     let Some(base) = parse_etag(base) else {
-        return Err(Reply::error(
+        return Err(HttpReply::error(
             Status::PRECONDITION_FAILED,
             "If-Match must be one ETag, such as \"3-0badcafe\"",
         ));
     };
     let toml = String::from_utf8(request.body.clone());
-    let toml = toml.map_err(|error| Reply::error(Status::UNPROCESSABLE, &format!("not UTF-8: {error}")))?;
+    let toml =
+        toml.map_err(|error| HttpReply::error(Status::UNPROCESSABLE, &format!("not UTF-8: {error}")))?;
     match check::gateway(check::NAME, &toml, overrides) {
-        Ok(_) => Ok(What::Put { base, toml }),
-        Err(mistake) => Err(Reply::json(Status::UNPROCESSABLE, &Value::Object(mistake.json()))),
+        Ok(_) => Ok(SupervisorAction::Put { base, toml }),
+        Err(mistake) => Err(HttpReply::json(Status::UNPROCESSABLE, &Value::Object(mistake.json()))),
     }
 }
 
@@ -284,7 +290,7 @@ fn parse_etag(text: &str) -> Option<Revision> {
     (etag(revision) == text).then_some(revision)
 }
 
-fn refusal(refused: Refused) -> Reply {
+fn refusal(refused: Refused) -> HttpReply {
     let (status, text) = match refused {
         Refused::Busy => (Status::CONFLICT, "something else is being done; try again".to_owned()),
         Refused::OnTrial => {
@@ -293,7 +299,7 @@ fn refusal(refused: Refused) -> Reply {
         Refused::NotOnTrial => (Status::CONFLICT, "no revision is on trial".to_owned()),
         Refused::Changed(base) => {
             let text = format!("the configuration was changed meanwhile; the newest is {}", etag(base));
-            return Reply::error(Status::PRECONDITION_FAILED, &text).with("ETag", etag(base));
+            return HttpReply::error(Status::PRECONDITION_FAILED, &text).with("ETag", etag(base));
         }
         Refused::NothingWaits => (Status::CONFLICT, "no stored revision waits; name one".to_owned()),
         Refused::Unknown => (Status::NOT_FOUND, "there is no such revision".to_owned()),
@@ -306,11 +312,11 @@ fn refusal(refused: Refused) -> Reply {
         Refused::NoPrevious => (Status::CONFLICT, "no other revision was live before".to_owned()),
         other => (Status::CONFLICT, format!("refused: {other:?}")),
     };
-    Reply::error(status, &text)
+    HttpReply::error(status, &text)
 }
 
-pub(super) fn nothing_runs() -> Reply {
-    Reply::error(Status::UNAVAILABLE, "nothing runs at the moment; try again")
+pub(super) fn nothing_runs() -> HttpReply {
+    HttpReply::error(Status::UNAVAILABLE, "nothing runs at the moment; try again")
 }
 
 /// For the log.

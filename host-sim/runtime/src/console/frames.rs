@@ -1,4 +1,4 @@
-//! Frames by name for a stream, and as a capture.
+//! FrameEvents by name for a stream, and as a capture.
 //!
 //! In: records of the gateway's watch, which are queued for each client. Out: the data of an event `frames`, or
 //! the blocks of a capture. What a client does not take in time is missed, for it alone, and told.
@@ -13,15 +13,15 @@ use recipe_capture::pcapng::{Pcapng, Scope};
 use recipe_capture::{Arrived, Cell, Frame, Interest, Next, Record, Subscription, Watch, What};
 use serde_json::{Value, json};
 
-/// Frames for one stream.
+/// FrameEvents for one stream.
 #[derive(Debug)]
-pub(super) struct Frames {
+pub(super) struct FrameEvents {
     subscription: Subscription,
     port: Option<String>,
     cell: Option<Arc<Cell>>,
 }
 
-impl Frames {
+impl FrameEvents {
     /// Those from now on, of this port or of all.
     pub(super) fn of(watch: &Watch, port: Option<String>) -> Self {
         Self { subscription: subscribe(watch), port, cell: None }
@@ -89,12 +89,12 @@ impl Frames {
 }
 
 /// A capture for one client.
-pub(super) struct Capture {
+pub(super) struct CaptureStream {
     subscription: Subscription,
     capture: Pcapng,
 }
 
-impl Capture {
+impl CaptureStream {
     /// What comes from now on at this port, or at all.
     pub(super) fn of(watch: &Watch, port: Option<String>) -> Self {
         Self { subscription: subscribe(watch), capture: Pcapng::new(Scope { port, links: false }) }
@@ -118,7 +118,7 @@ fn subscribe(watch: &Watch) -> Subscription {
 
 /// Records that wait for a client: more than a second of busy ports.
 const ROOM: usize = 4_096;
-/// Frames of one event.
+/// FrameEvents of one event.
 const AT_ONCE: usize = 256;
 /// Bytes of a capture that are made at once.
 const MAX_BLOCKS: usize = 64 << 10;

@@ -18,20 +18,20 @@ use tokio::task::spawn_local;
 use tokio::time::{Instant, timeout, timeout_at};
 use tracing::{debug, warn};
 
-use super::{Server, stream};
+use super::{ConsoleServer, stream};
 
 /// A response with its body.
 #[derive(Debug)]
-pub(super) struct Reply {
+pub(super) struct HttpReply {
     pub(super) status: Status,
     pub(super) kind: Kind,
-    pub(super) body: Body,
+    pub(super) body: ReplyBody,
     pub(super) fields: Vec<(&'static str, String)>,
 }
 
 /// What a response carries.
 #[derive(Debug)]
-pub(super) enum Body {
+pub(super) enum ReplyBody {
     /// A text.
     Text(Rc<str>),
     /// Part of the program.
@@ -40,7 +40,7 @@ pub(super) enum Body {
     Made(Vec<u8>),
 }
 
-impl Body {
+impl ReplyBody {
     fn as_bytes(&self) -> &[u8] {
         match self {
             Self::Text(text) => text.as_bytes(),
@@ -50,28 +50,28 @@ impl Body {
     }
 }
 
-impl<T: Into<Rc<str>>> From<T> for Body {
+impl<T: Into<Rc<str>>> From<T> for ReplyBody {
     fn from(text: T) -> Self {
         Self::Text(text.into())
     }
 }
 
-impl Reply {
+impl HttpReply {
     /// A document that was made before.
     pub(super) fn text(kind: Kind, body: Rc<str>) -> Self {
-        Self { status: Status::OK, kind, body: Body::Text(body), fields: Vec::new() }
+        Self { status: Status::OK, kind, body: ReplyBody::Text(body), fields: Vec::new() }
     }
 
     /// The page for people, unless the client has it.
     pub(super) fn page(if_none_match: Option<&str>) -> Self {
         let status = PAGE.status(if_none_match);
-        let body = Body::Bytes(if status == Status::OK { PAGE.bytes } else { &[] });
+        let body = ReplyBody::Bytes(if status == Status::OK { PAGE.bytes } else { &[] });
         Self { status, kind: Kind::Page, body, fields: Vec::new() }
     }
 
     /// A configuration image.
     pub(super) fn image(bytes: Vec<u8>) -> Self {
-        Self { status: Status::OK, kind: Kind::Image, body: Body::Made(bytes), fields: Vec::new() }
+        Self { status: Status::OK, kind: Kind::Image, body: ReplyBody::Made(bytes), fields: Vec::new() }
     }
 
     /// A JSON value.
@@ -90,7 +90,7 @@ impl Reply {
     }
 }
 
-impl From<Refusal> for Reply {
+impl From<Refusal> for HttpReply {
     fn from(refusal: Refusal) -> Self {
         let reply = Self::error(refusal.status, refusal.text);
         let reply = match refusal.allow {
@@ -105,14 +105,14 @@ impl From<Refusal> for Reply {
 }
 
 /// A request with what belongs to it.
-pub(super) struct Request<'a> {
+pub(super) struct HttpRequest<'a> {
     pub(super) head: Head<'a>,
     pub(super) admitted: Admitted,
     pub(super) body: Vec<u8>,
     pub(super) peer: SocketAddr,
 }
 
-impl Server {
+impl ConsoleServer {
     /// Accepts connections for ever.
     pub(super) async fn accept(self: Rc<Self>, listener: TcpListener) {
         tcp_options::limit_buffers(&listener);
@@ -133,7 +133,7 @@ impl Server {
         if self.connections.get() >= MAX_CONNECTIONS {
             self.count(|counters| counters.turned_away += 1);
             // Without waiting for anything: there may be thousands.
-            let reply = Reply::error(Status::UNAVAILABLE, "too many connections; try again");
+            let reply = HttpReply::error(Status::UNAVAILABLE, "too many connections; try again");
             let _ = stream.try_write(&bytes_of(&reply));
             return;
         }
@@ -189,7 +189,7 @@ impl Server {
         let (head, admitted) = match admitted {
             Ok(admitted) => admitted,
             Err(refusal) => {
-                let mut reply = Reply::from(refusal);
+                let mut reply = HttpReply::from(refusal);
                 if refusal.status == Status::UNAUTHORIZED {
                     let nonce = self.guard.borrow_mut().nonce(now());
                     let scheme = if site.is_loopback() { ", Bearer" } else { "" };
@@ -208,10 +208,10 @@ impl Server {
             hash.update(&body);
             if !admitted.is_body(&hash.finish()) {
                 let text = "the body is not the one that was signed";
-                return self.answer(&mut stream, &Reply::error(Status::UNAUTHORIZED, text), false).await;
+                return self.answer(&mut stream, &HttpReply::error(Status::UNAUTHORIZED, text), false).await;
             }
         }
-        let mut reply = self.carry_out(Request { head, admitted, body, peer }).await;
+        let mut reply = self.carry_out(HttpRequest { head, admitted, body, peer }).await;
         if admitted.is_signed() {
             reply = reply.with("Next-Nonce", self.guard.borrow_mut().nonce(now()));
         }
@@ -253,7 +253,7 @@ impl Server {
         Ok(Some(body))
     }
 
-    async fn answer(&self, stream: &mut TcpStream, reply: &Reply, is_head: bool) -> io::Result<()> {
+    async fn answer(&self, stream: &mut TcpStream, reply: &HttpReply, is_head: bool) -> io::Result<()> {
         let mut bytes = bytes_of(reply);
         if is_head {
             bytes.truncate(bytes.len() - reply.body.as_bytes().len());
@@ -270,7 +270,7 @@ impl Server {
 }
 
 /// A whole response.
-pub(super) fn bytes_of(reply: &Reply) -> Vec<u8> {
+pub(super) fn bytes_of(reply: &HttpReply) -> Vec<u8> {
     let body = reply.body.as_bytes();
     let mut bytes = head_of(reply, Length::Bytes(body.len() as u64)).into_bytes();
     bytes.extend_from_slice(body);
@@ -278,7 +278,7 @@ pub(super) fn bytes_of(reply: &Reply) -> Vec<u8> {
 }
 
 /// The text of a head.
-pub(super) fn head_of(reply: &Reply, length: Length) -> String {
+pub(super) fn head_of(reply: &HttpReply, length: Length) -> String {
     let fields: Vec<(&str, &dyn std::fmt::Display)> =
         reply.fields.iter().map(|(name, value)| (*name, value as &dyn std::fmt::Display)).collect();
     let mut text = String::new();

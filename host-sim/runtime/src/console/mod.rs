@@ -34,10 +34,10 @@ use tokio::sync::Notify;
 use tracing::{Span, info};
 
 use crate::client::RuntimeClient;
-use crate::host::{self, Handle, Running};
+use crate::host::{self, ForegroundRun, Handle};
 use crate::log::Log;
 use crate::publisher::Publisher;
-use crate::worker::Place;
+use crate::worker::RuntimePlace;
 use crate::{RunOptions, StartError};
 pub use key_file::read_key;
 use snapshots::Snapshots;
@@ -89,16 +89,20 @@ impl ConsoleOptions {
     }
 }
 
-/// What a console serves.
+/// SupervisorAction a console serves.
 #[derive(Debug)]
-pub(crate) enum Source {
+pub(crate) enum ConsoleSource {
     /// A gateway that can be given another configuration.
-    Gateway { shared: Arc<supervisor::Shared>, commands: blocking::Sender<supervisor::Command>, watch: Watch },
+    Gateway {
+        shared: Arc<supervisor::SharedView>,
+        commands: blocking::Sender<supervisor::SupervisorCommand>,
+        watch: Watch,
+    },
     /// A simulated controller, and the address of its control socket.
     Controller { client: RuntimeClient, control: SocketAddr },
 }
 
-impl Source {
+impl ConsoleSource {
     fn served(&self) -> Served {
         match self {
             Self::Gateway { .. } => Served::Gateway,
@@ -117,7 +121,7 @@ pub(crate) struct Console {
 
 impl Console {
     /// Serves a socket on a thread of its own.
-    pub(crate) fn start(bound: Bound, source: Source, log: Option<Log>) -> Result<Self, StartError> {
+    pub(crate) fn start(bound: Bound, source: ConsoleSource, log: Option<Log>) -> Result<Self, StartError> {
         let refused = |error: std::io::Error| StartError::new(format!("console: {error}"));
         let Bound { listener, address, key, peer } = bound;
         let end = Arc::new(Notify::new());
@@ -133,7 +137,7 @@ impl Console {
             let _of = span.entered();
             // Where the gateway's thread has no better right, it still goes first.
             let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), NICENESS);
-            let server = Rc::new(Server {
+            let server = Rc::new(ConsoleServer {
                 address,
                 peer,
                 source,
@@ -186,7 +190,7 @@ pub fn run_gateway(
 ) -> Result<(), StartError> {
     let publisher = options.sparkplug.clone().map(Publisher::start).transpose()?;
     let snapshot_watch = publisher.as_ref().map(Publisher::snapshot_watch);
-    let supervised = Supervised::start(file, options, console, snapshot_watch, Place::alone())?;
+    let supervised = Supervised::start(file, options, console, snapshot_watch, RuntimePlace::alone())?;
     host::foreground(Box::new(supervised), options)
 }
 
@@ -204,14 +208,15 @@ impl Consoled {
     pub(crate) fn start(bound: Bound, handle: Handle, log: Option<Log>) -> Result<Self, StartError> {
         let control = handle.place("control").parse();
         let control = control.map_err(|error| StartError::new(format!("control socket: {error}")))?;
-        let console = Console::start(bound, Source::Controller { client: handle.client(), control }, log)?;
+        let console =
+            Console::start(bound, ConsoleSource::Controller { client: handle.client(), control }, log)?;
         let mut ready = handle.ready().clone();
         ready["console"] = json!(console.address());
         Ok(Self { ready, console: Some(console), handle })
     }
 }
 
-impl Running for Consoled {
+impl ForegroundRun for Consoled {
     fn ready(&self) -> &Value {
         &self.ready
     }
@@ -235,10 +240,10 @@ impl Running for Consoled {
 }
 
 /// Everything that the connections share.
-struct Server {
+struct ConsoleServer {
     address: SocketAddr,
     peer: Option<u16>,
-    source: Source,
+    source: ConsoleSource,
     guard: RefCell<Guard>,
     snapshots: Snapshots,
     connections: Cell<usize>,
@@ -266,7 +271,7 @@ struct ServerCounters {
     lost_frames: u64,
 }
 
-impl Server {
+impl ConsoleServer {
     fn count(&self, change: impl FnOnce(&mut ServerCounters)) {
         let mut counters = self.counters.get();
         change(&mut counters);

@@ -10,29 +10,30 @@ use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
 use tokio::net::TcpStream;
 use tokio::time::timeout;
 
-use super::http::Reply;
+use super::http::HttpReply;
 
 /// Carries out the operation in a body.
-pub(super) async fn operate(control: SocketAddr, body: &[u8]) -> Reply {
+pub(super) async fn operate(control: SocketAddr, body: &[u8]) -> HttpReply {
     let request = match serde_json::from_slice::<Map<String, Value>>(body) {
         Ok(request) => request,
-        Err(error) => return Reply::error(Status::BAD_REQUEST, &format!("not a JSON object: {error}")),
+        Err(error) => return HttpReply::error(Status::BAD_REQUEST, &format!("not a JSON object: {error}")),
     };
     if request.get("do").is_some_and(|what| what == "follow") {
         let text = "events are followed at the control socket; see GET /api/v1/stream for the state";
-        return Reply::error(Status::BAD_REQUEST, text);
+        return HttpReply::error(Status::BAD_REQUEST, text);
     }
     let line = Value::Object(request).to_string() + "\n";
     match timeout(MAX_TIME, ask(control, &line)).await {
         Ok(Ok(answer)) => {
             let is_done = serde_json::from_str::<Value>(&answer).is_ok_and(|answer| answer["ok"] == true);
             let status = if is_done { Status::OK } else { Status::UNPROCESSABLE };
-            Reply { status, kind: Kind::Json, body: answer.trim_end().into(), fields: Vec::new() }
+            HttpReply { status, kind: Kind::Json, body: answer.trim_end().into(), fields: Vec::new() }
         }
-        Ok(Err(error)) => Reply::error(Status::UNAVAILABLE, &format!("control socket: {error}")),
-        Err(_) => {
-            Reply::error(Status::UNAVAILABLE, "the operation takes longer than 30 s; use the control socket")
-        }
+        Ok(Err(error)) => HttpReply::error(Status::UNAVAILABLE, &format!("control socket: {error}")),
+        Err(_) => HttpReply::error(
+            Status::UNAVAILABLE,
+            "the operation takes longer than 30 s; use the control socket",
+        ),
     }
 }
 

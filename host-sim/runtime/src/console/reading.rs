@@ -16,33 +16,33 @@ use recipe_io::timer::now;
 use serde_json::{Map, Value, json};
 
 use super::api::{nothing_runs, revisions};
-use super::http::Reply;
+use super::http::HttpReply;
 use super::snapshots::Snapshot;
-use super::{Server, Source, check};
+use super::{ConsoleServer, ConsoleSource, check};
 use crate::log::MAX_NEWEST;
 
-impl Server {
+impl ConsoleServer {
     /// Answers what only looks.
-    pub(super) async fn read(&self, operation: Operation, head: &Head<'_>) -> Reply {
+    pub(super) async fn read(&self, operation: Operation, head: &Head<'_>) -> HttpReply {
         match operation {
-            Operation::Info => Reply::json(Status::OK, &self.info()),
+            Operation::Info => HttpReply::json(Status::OK, &self.info()),
             Operation::Log => self.log(head),
-            Operation::Bundle => Reply::json(Status::OK, &self.bundle().await),
-            Operation::Schema => Reply::json(Status::OK, &recipe_config::schema(FileKind::Gateway)),
+            Operation::Bundle => HttpReply::json(Status::OK, &self.bundle().await),
+            Operation::Schema => HttpReply::json(Status::OK, &recipe_config::schema(FileKind::Gateway)),
             Operation::ExportDbc | Operation::ExportLua | Operation::ExportMap => {
                 self.export(operation, head).unwrap_or_else(|refused| refused)
             }
             _ => {
                 let Some(snapshot) = self.snapshots.newest(&self.source).await else { return nothing_runs() };
                 match operation {
-                    Operation::Status => Reply::text(Kind::Json, snapshot.status()),
+                    Operation::Status => HttpReply::text(Kind::Json, snapshot.status()),
                     Operation::Values => text(Kind::Json, snapshot.values()),
                     Operation::Metrics => text(Kind::Metrics, snapshot.metrics()),
                     Operation::Doctor => match self.findings(&snapshot).await {
-                        Some(findings) => Reply::json(Status::OK, &json!({ "findings": findings })),
+                        Some(findings) => HttpReply::json(Status::OK, &json!({ "findings": findings })),
                         None => nothing_runs(),
                     },
-                    _ => Reply::error(Status::NOT_FOUND, "there is no such path"),
+                    _ => HttpReply::error(Status::NOT_FOUND, "there is no such path"),
                 }
             }
         }
@@ -73,7 +73,7 @@ impl Server {
         if let Some(port) = self.peer {
             info["peer_port"] = json!(port);
         }
-        if let Source::Gateway { shared, .. } = &self.source {
+        if let ConsoleSource::Gateway { shared, .. } = &self.source {
             let view = shared.view();
             info["places"] = view.ready.clone();
             let running = view.revisions.as_ref().and_then(|revisions| revisions.running());
@@ -85,24 +85,24 @@ impl Server {
     }
 
     /// The newest lines of the log.
-    fn log(&self, head: &Head<'_>) -> Reply {
+    fn log(&self, head: &Head<'_>) -> HttpReply {
         let count = match head.query("lines").map(str::parse) {
             None => MAX_NEWEST,
             Some(Ok(count)) if (1..=MAX_NEWEST).contains(&count) => count,
             Some(_) => {
                 let text = format!("lines is out of range; allowed: 1..={MAX_NEWEST}");
-                return Reply::error(Status::BAD_REQUEST, &text);
+                return HttpReply::error(Status::BAD_REQUEST, &text);
             }
         };
         let text: String = self.log_lines(count).iter().flat_map(|line| [line, "\n"]).collect();
-        Reply::text(Kind::Text, text.into())
+        HttpReply::text(Kind::Text, text.into())
     }
 
     fn log_lines(&self, count: usize) -> Vec<String> {
         self.log.as_ref().map_or_else(Vec::new, |log| log.newest(count))
     }
 
-    /// What is wrong, in words; `None` while nothing runs.
+    /// SupervisorAction is wrong, in words; `None` while nothing runs.
     async fn findings(&self, snapshot: &Snapshot) -> Option<Value> {
         let looked = match snapshot.unexplained() {
             Some(failed) => self.snapshots.look_at_controller(failed, snapshot).await,
@@ -111,7 +111,7 @@ impl Server {
         snapshot.findings(looked).map(|findings| json!(findings))
     }
 
-    /// Everything that can be read, for somebody who is to help. What is not known is absent.
+    /// Everything that can be read, for somebody who is to help. SupervisorAction is not known is absent.
     async fn bundle(&self) -> Value {
         let mut bundle = Map::new();
         let mut put = |name: &str, value: Option<Value>| {
@@ -127,7 +127,7 @@ impl Server {
             put("metrics", snapshot.metrics().map(|text| json!(&*text)));
             put("doctor", self.findings(&snapshot).await);
         }
-        if let Source::Gateway { shared, .. } = &self.source {
+        if let ConsoleSource::Gateway { shared, .. } = &self.source {
             let view = shared.view();
             put("revisions", Some(revisions(&view)));
             put("config", view.running_text().map(|text| json!(&*text)));
@@ -136,14 +136,15 @@ impl Server {
         Value::Object(bundle)
     }
 
-    /// What other tools read, of the configuration that runs.
-    fn export(&self, operation: Operation, head: &Head<'_>) -> Result<Reply, Reply> {
-        let Source::Gateway { shared, .. } = &self.source else { return Err(nothing_runs()) };
+    /// SupervisorAction other tools read, of the configuration that runs.
+    fn export(&self, operation: Operation, head: &Head<'_>) -> Result<HttpReply, HttpReply> {
+        let ConsoleSource::Gateway { shared, .. } = &self.source else { return Err(nothing_runs()) };
         let (toml, overrides) = {
             let view = shared.view();
             (view.running_text().ok_or_else(nothing_runs)?, view.overrides.clone())
         };
-        let wrong = |error: &dyn std::fmt::Display| Reply::error(Status::UNPROCESSABLE, &error.to_string());
+        let wrong =
+            |error: &dyn std::fmt::Display| HttpReply::error(Status::UNPROCESSABLE, &error.to_string());
         let model = Model::parse(Text { name: check::NAME, toml: &toml }, &overrides);
         let model = model.map_err(|error| wrong(&error))?;
         let text = match operation {
@@ -151,7 +152,7 @@ impl Server {
                 let port = port_of(head)?;
                 dbc::dbc(&model, port.as_deref()).map_err(|error| match &error {
                     DbcError::NoPort { .. } | DbcError::NoCan => {
-                        Reply::error(Status::NOT_FOUND, &error.to_string())
+                        HttpReply::error(Status::NOT_FOUND, &error.to_string())
                     }
                     DbcError::SharedId { id, ports: [one, other] } => wrong(&format_args!(
                         "ports {one} and {other} have different frames with id {id:#X}; choose one with ?port=NAME"
@@ -162,33 +163,34 @@ impl Server {
             Operation::ExportLua => lua::lua(&model).map_err(|error| wrong(&error))?,
             _ => map::map(&model, map::Style::Markdown),
         };
-        Ok(Reply::text(Kind::Text, text.into()))
+        Ok(HttpReply::text(Kind::Text, text.into()))
     }
 
     /// The field port that an argument names, if there is one.
-    pub(super) fn field_port(&self, head: &Head<'_>) -> Result<Option<String>, Reply> {
+    pub(super) fn field_port(&self, head: &Head<'_>) -> Result<Option<String>, HttpReply> {
         let Some(port) = port_of(head)? else { return Ok(None) };
-        let Source::Gateway { shared, .. } = &self.source else { return Err(nothing_runs()) };
+        let ConsoleSource::Gateway { shared, .. } = &self.source else { return Err(nothing_runs()) };
         let config: Arc<GatewayConfig> = shared.view().config.clone().ok_or_else(nothing_runs)?;
         let names: Vec<_> = config.view().field_ports().map(|(_, port, _)| port.name.as_str()).collect();
         match names.contains(&&*port) {
             true => Ok(Some(port.into_owned())),
             false => {
                 let text = format!("there is no field port {port:?}; there are {}", names.join(", "));
-                Err(Reply::error(Status::NOT_FOUND, &text))
+                Err(HttpReply::error(Status::NOT_FOUND, &text))
             }
         }
     }
 }
 
-fn text(kind: Kind, text: Option<Rc<str>>) -> Reply {
-    text.map_or_else(nothing_runs, |text| Reply::text(kind, text))
+fn text(kind: Kind, text: Option<Rc<str>>) -> HttpReply {
+    text.map_or_else(nothing_runs, |text| HttpReply::text(kind, text))
 }
 
 /// The argument `port`. Names may have any character, so it is the one that is decoded.
-fn port_of<'a>(head: &Head<'a>) -> Result<Option<Cow<'a, str>>, Reply> {
+fn port_of<'a>(head: &Head<'a>) -> Result<Option<Cow<'a, str>>, HttpReply> {
     let Some(port) = head.query("port") else { return Ok(None) };
-    let decoded = decoded(port).ok_or_else(|| Reply::error(Status::BAD_REQUEST, "port is not well encoded"));
+    let decoded =
+        decoded(port).ok_or_else(|| HttpReply::error(Status::BAD_REQUEST, "port is not well encoded"));
     decoded.map(Some)
 }
 
@@ -214,7 +216,7 @@ fn decoded(text: &str) -> Option<Cow<'_, str>> {
     String::from_utf8(bytes).ok().map(Cow::Owned)
 }
 
-/// What the machine is called.
+/// SupervisorAction the machine is called.
 pub(super) fn host_name() -> Option<String> {
     let name = std::fs::read_to_string("/proc/sys/kernel/hostname").ok()?;
     Some(name.trim().to_owned()).filter(|name| !name.is_empty())

@@ -1,4 +1,4 @@
-//! What readers are shown: one copy of the engine for all of them, at most ten times a second.
+//! SupervisorAction readers are shown: one copy of the engine for all of them, at most ten times a second.
 
 use std::cell::{Cell, OnceCell, RefCell};
 use std::rc::Rc;
@@ -15,7 +15,7 @@ use recipe_doctor::{Case, Finding, examine};
 use recipe_io::timer::now;
 use serde_json::Value;
 
-use super::Source;
+use super::ConsoleSource;
 use crate::findings::{look_at_states, unexplained};
 use crate::snapshot::{GatewaySnapshot, SnapshotSlot};
 
@@ -34,20 +34,20 @@ pub(super) struct Snapshots {
 /// State, counters and values at one instant. Each text is made when somebody wants it, and once.
 pub(super) struct Snapshot {
     taken: Instant,
-    what: Taken,
+    what: SnapshotContent,
     status: OnceCell<Rc<str>>,
     values: OnceCell<Rc<str>>,
     metrics: OnceCell<Rc<str>>,
 }
 
-enum Taken {
+enum SnapshotContent {
     Gateway(Box<GatewaySnapshot>, Arc<GatewayConfig>),
     Controller(Value),
 }
 
 impl Snapshots {
     /// A snapshot that is young enough; `None` while nothing runs.
-    pub(super) async fn newest(&self, source: &Source) -> Option<Rc<Snapshot>> {
+    pub(super) async fn newest(&self, source: &ConsoleSource) -> Option<Rc<Snapshot>> {
         let _turn = self.turn.lock().await;
         if let Some(newest) = self.newest.borrow().as_ref()
             && now().saturating_since(newest.taken) < MAX_AGE
@@ -55,13 +55,13 @@ impl Snapshots {
             return Some(Rc::clone(newest));
         }
         let what = match source {
-            Source::Gateway { shared, .. } => {
+            ConsoleSource::Gateway { shared, .. } => {
                 let (slot, config) = shared.running()?;
-                Taken::Gateway(self.copy(&slot).await?, config)
+                SnapshotContent::Gateway(self.copy(&slot).await?, config)
             }
-            Source::Controller { client, .. } => {
+            ConsoleSource::Controller { client, .. } => {
                 let client = client.clone();
-                Taken::Controller(tokio::task::spawn_blocking(move || client.stats()).await.ok()??)
+                SnapshotContent::Controller(tokio::task::spawn_blocking(move || client.stats()).await.ok()??)
             }
         };
         let snapshot = Rc::new(Snapshot {
@@ -73,7 +73,9 @@ impl Snapshots {
         });
         let before = self.newest.replace(Some(Rc::clone(&snapshot)));
         // Its buffer is used again, if no stream is still reading.
-        if let Some(Snapshot { what: Taken::Gateway(snapshot, _), .. }) = before.and_then(Rc::into_inner) {
+        if let Some(Snapshot { what: SnapshotContent::Gateway(snapshot, _), .. }) =
+            before.and_then(Rc::into_inner)
+        {
             self.buffer.replace(Some(snapshot));
         }
         Some(snapshot)
@@ -81,7 +83,7 @@ impl Snapshots {
 
     /// The controller's states, looked at once for each command that failed; `None` if they do not show in time.
     pub(super) async fn look_at_controller(&self, failed: Instant, snapshot: &Snapshot) -> Option<States> {
-        let Taken::Gateway(_, config) = &snapshot.what else { return None };
+        let SnapshotContent::Gateway(_, config) = &snapshot.what else { return None };
         if let Some((at, states)) = self.looked.get()
             && at >= failed
         {
@@ -110,15 +112,15 @@ impl Snapshot {
     /// The document `status`.
     pub(super) fn status(&self) -> Rc<str> {
         let make = || match &self.what {
-            Taken::Controller(stats) => stats.to_string(),
-            Taken::Gateway(snapshot, _) => status_of(snapshot),
+            SnapshotContent::Controller(stats) => stats.to_string(),
+            SnapshotContent::Gateway(snapshot, _) => status_of(snapshot),
         };
         Rc::clone(self.status.get_or_init(|| make().into()))
     }
 
     /// The document `values`.
     pub(super) fn values(&self) -> Option<Rc<str>> {
-        let Taken::Gateway(snapshot, _) = &self.what else { return None };
+        let SnapshotContent::Gateway(snapshot, _) = &self.what else { return None };
         let make = || {
             written(|text| Pieces::of(Document::Values).write_all(snapshot.engine.status(snapshot.at), text))
         };
@@ -127,20 +129,20 @@ impl Snapshot {
 
     /// The metrics.
     pub(super) fn metrics(&self) -> Option<Rc<str>> {
-        let Taken::Gateway(snapshot, _) = &self.what else { return None };
+        let SnapshotContent::Gateway(snapshot, _) = &self.what else { return None };
         let make = || written(|text| Families::new().write_all(snapshot.engine.status(snapshot.at), text));
         Some(Rc::clone(self.metrics.get_or_init(|| make().into())))
     }
 
     /// Since when a command has failed for which nobody saw the controller's states.
     pub(super) fn unexplained(&self) -> Option<Instant> {
-        let Taken::Gateway(snapshot, _) = &self.what else { return None };
+        let SnapshotContent::Gateway(snapshot, _) = &self.what else { return None };
         unexplained(snapshot.engine.status(snapshot.at))
     }
 
-    /// What is wrong. `looked` are the controller's states, if somebody else than the engine has looked.
+    /// SupervisorAction is wrong. `looked` are the controller's states, if somebody else than the engine has looked.
     pub(super) fn findings(&self, looked: Option<States>) -> Option<Vec<Finding>> {
-        let Taken::Gateway(snapshot, config) = &self.what else { return None };
+        let SnapshotContent::Gateway(snapshot, config) = &self.what else { return None };
         Some(examine(&Case {
             config: config.view(),
             status: snapshot.engine.status(snapshot.at).into(),

@@ -21,8 +21,8 @@ use crate::StartError;
 
 /// The revisions with their texts.
 #[derive(Debug)]
-pub(super) struct Store {
-    folder: Option<Folder>,
+pub(super) struct RevisionStore {
+    folder: Option<StoreFolder>,
     index: Index,
     texts: BTreeMap<u32, Arc<str>>,
     /// The revision of the file that the process was started with, and the one it replaces; not written yet.
@@ -30,7 +30,7 @@ pub(super) struct Store {
 }
 
 #[derive(Debug)]
-struct Folder {
+struct StoreFolder {
     path: PathBuf,
     /// Locked: one process uses a folder.
     _lock: File,
@@ -44,12 +44,12 @@ struct Index {
     previous: Option<u32>,
     /// Hash of the file that the process was started with when the live one became so.
     file: String,
-    kept: Vec<Entry>,
+    kept: Vec<RevisionEntry>,
 }
 
-/// What is known about a revision.
+/// SupervisorAction is known about a revision.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub(super) struct Entry {
+pub(super) struct RevisionEntry {
     /// Its number.
     pub(super) number: u32,
     /// When it was stored, in seconds since 1970.
@@ -58,7 +58,7 @@ pub(super) struct Entry {
     pub(super) from: String,
 }
 
-impl Store {
+impl RevisionStore {
     /// The store of a folder, or of this process alone. If the file that the process was started with is
     /// another one than before, a person has changed it: then it becomes the newest revision, and live.
     pub(super) fn open(path: Option<&Path>, file: (&str, &str)) -> Result<Self, StartError> {
@@ -72,7 +72,7 @@ impl Store {
                 io::ErrorKind::WouldBlock => refused(&"another process uses this folder"),
                 _ => refused(&error),
             })?;
-            store.folder = Some(Folder { path: path.to_owned(), _lock: lock });
+            store.folder = Some(StoreFolder { path: path.to_owned(), _lock: lock });
             store.read().map_err(|error| refused(&error))?;
         }
         let (name, text) = file;
@@ -112,8 +112,8 @@ impl Store {
         Revisions::new(Stored { kept, live: self.index.live, previous: self.index.previous })
     }
 
-    /// What is known about each, the oldest first.
-    pub(super) fn entries(&self) -> &[Entry] {
+    /// SupervisorAction is known about each, the oldest first.
+    pub(super) fn entries(&self) -> &[RevisionEntry] {
         &self.index.kept
     }
 
@@ -157,7 +157,7 @@ impl Store {
         index.kept.retain(|entry| Some(entry.number) != forget);
         let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
         let stored_at = since.map_or(0, |since| since.as_secs());
-        index.kept.push(Entry { number, stored_at, from: from.to_owned() });
+        index.kept.push(RevisionEntry { number, stored_at, from: from.to_owned() });
         index
     }
 
@@ -171,7 +171,7 @@ impl Store {
         if let Some(forget) = forget {
             self.texts.remove(&forget);
             if let Some(folder) = &self.folder {
-                // What is left behind is removed at the next start.
+                // SupervisorAction is left behind is removed at the next start.
                 let _ = fs::remove_file(folder.path.join(name(forget)));
             }
         }
@@ -228,7 +228,7 @@ impl Store {
     }
 }
 
-impl Folder {
+impl StoreFolder {
     /// Replaces a file in one step that a power cut does not divide.
     fn replace(&self, name: &str, bytes: &[u8]) -> io::Result<()> {
         let place = self.path.join(name);

@@ -3,13 +3,13 @@
 use super::*;
 use recipe_test_kit::names;
 
-fn open(folder: &Path, text: &str) -> Store {
-    let mut store = Store::open(Some(folder), ("cell.toml", text)).unwrap();
+fn open(folder: &Path, text: &str) -> RevisionStore {
+    let mut store = RevisionStore::open(Some(folder), ("cell.toml", text)).unwrap();
     store.has_started().unwrap();
     store
 }
 
-fn live(store: &Store) -> &str {
+fn live(store: &RevisionStore) -> &str {
     store.text(store.index.live).unwrap()
 }
 
@@ -74,7 +74,7 @@ fn a_file_that_did_not_start_takes_nobodys_place() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     drop(open(folder, "one"));
-    let store = Store::open(Some(folder), ("cell.toml", "two")).unwrap();
+    let store = RevisionStore::open(Some(folder), ("cell.toml", "two")).unwrap();
     assert_eq!(live(&store), "two");
     drop(store);
     let store = open(folder, "one");
@@ -86,7 +86,7 @@ fn a_folder_is_for_one_process_and_must_make_sense() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     let store = open(folder, "one");
-    let error = Store::open(Some(folder), ("cell.toml", "one")).unwrap_err().to_string();
+    let error = RevisionStore::open(Some(folder), ("cell.toml", "one")).unwrap_err().to_string();
     assert!(error.contains("another process uses this folder"), "{error}");
     drop(store);
     let index = fs::read_to_string(folder.join(INDEX)).unwrap();
@@ -105,14 +105,14 @@ fn a_folder_is_for_one_process_and_must_make_sense() {
         ),
     ] {
         fs::write(folder.join(INDEX), text).unwrap();
-        let error = Store::open(Some(folder), ("cell.toml", "one")).unwrap_err().to_string();
+        let error = RevisionStore::open(Some(folder), ("cell.toml", "one")).unwrap_err().to_string();
         assert!(error.contains(expected), "{error}");
     }
 }
 
 #[test]
 fn without_a_folder_it_is_in_memory() {
-    let mut store = Store::open(None, ("cell.toml", "one")).unwrap();
+    let mut store = RevisionStore::open(None, ("cell.toml", "one")).unwrap();
     store.keep(2, "two", "127.0.0.1", None).unwrap();
     store.mark(2, 1).unwrap();
     assert_eq!(live(&store), "two");
@@ -169,7 +169,7 @@ fn any_index_is_refused_in_one_line_or_makes_sense() {
             fs::write(folder.join(name(number)), number.to_string()).unwrap();
         }
         // The file is the same as before, or a person has changed it.
-        match Store::open(Some(folder), ("cell.toml", ["one", "new"][below(2)])) {
+        match RevisionStore::open(Some(folder), ("cell.toml", ["one", "new"][below(2)])) {
             Ok(store) => {
                 let revisions = store.revisions().expect("it makes sense");
                 assert_eq!(revisions.live(), store.index.live, "{text}");

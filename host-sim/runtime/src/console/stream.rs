@@ -18,25 +18,25 @@ use tokio::net::TcpStream;
 use tokio::net::tcp::OwnedWriteHalf;
 use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
 
-use super::frames::{Capture, Frames};
-use super::http::{MAX_TIME, Reply, bytes_of, head_of};
-use super::{Server, Source};
+use super::frames::{CaptureStream, FrameEvents};
+use super::http::{HttpReply, MAX_TIME, bytes_of, head_of};
+use super::{ConsoleServer, ConsoleSource};
 
 /// What goes on.
 enum Endless {
-    Events(Option<Frames>),
-    Capture(Box<Capture>),
+    Events(Option<FrameEvents>),
+    Capture(Box<CaptureStream>),
 }
 
 /// Serves a stream until its client leaves or does not read.
 pub(super) async fn serve(
-    server: &Rc<Server>,
+    server: &Rc<ConsoleServer>,
     mut stream: TcpStream,
     operation: Operation,
     head: &Head<'_>,
 ) -> io::Result<()> {
     let endless = if server.streams.get() >= MAX_STREAMS {
-        Err(Reply::error(Status::UNAVAILABLE, "too many streams; poll /api/v1/status instead"))
+        Err(HttpReply::error(Status::UNAVAILABLE, "too many streams; poll /api/v1/status instead"))
     } else {
         endless(server, operation, head)
     };
@@ -52,36 +52,38 @@ pub(super) async fn serve(
 }
 
 /// What was asked for.
-fn endless(server: &Server, operation: Operation, head: &Head<'_>) -> Result<Endless, Reply> {
+fn endless(server: &ConsoleServer, operation: Operation, head: &Head<'_>) -> Result<Endless, HttpReply> {
     let watch = || match &server.source {
-        Source::Gateway { watch, .. } => Ok::<&Watch, Reply>(watch),
-        Source::Controller { .. } => Err(Reply::error(Status::BAD_REQUEST, "only a gateway has frames")),
+        ConsoleSource::Gateway { watch, .. } => Ok::<&Watch, HttpReply>(watch),
+        ConsoleSource::Controller { .. } => {
+            Err(HttpReply::error(Status::BAD_REQUEST, "only a gateway has frames"))
+        }
     };
     if operation == Operation::Capture {
         let port = server.field_port(head)?;
-        return Ok(Endless::Capture(Box::new(Capture::of(watch()?, port))));
+        return Ok(Endless::Capture(Box::new(CaptureStream::of(watch()?, port))));
     }
     match (head.query("frames"), head.query("port")) {
         (Some("1"), _) => {
             let watch = watch()?;
-            Ok(Endless::Events(Some(Frames::of(watch, server.field_port(head)?))))
+            Ok(Endless::Events(Some(FrameEvents::of(watch, server.field_port(head)?))))
         }
         (None | Some("0"), None) => Ok(Endless::Events(None)),
         (None | Some("0"), Some(_)) => {
-            Err(Reply::error(Status::BAD_REQUEST, "port is for frames; add frames=1"))
+            Err(HttpReply::error(Status::BAD_REQUEST, "port is for frames; add frames=1"))
         }
-        (Some(_), _) => Err(Reply::error(Status::BAD_REQUEST, "frames must be 0 or 1")),
+        (Some(_), _) => Err(HttpReply::error(Status::BAD_REQUEST, "frames must be 0 or 1")),
     }
 }
 
-async fn follow(server: &Rc<Server>, stream: TcpStream, endless: Endless) -> io::Result<()> {
+async fn follow(server: &Rc<ConsoleServer>, stream: TcpStream, endless: Endless) -> io::Result<()> {
     let kind = match &endless {
         Endless::Events(_) => Kind::Events,
         Endless::Capture(_) => Kind::Capture,
     };
     // Waiting events become old: about a second of them is enough.
     let _ = sockopt::set_socket_send_buffer_size(&stream, SEND_BUFFER);
-    let reply = Reply { status: Status::OK, kind, body: "".into(), fields: Vec::new() };
+    let reply = HttpReply { status: Status::OK, kind, body: "".into(), fields: Vec::new() };
     let (mut read, mut write) = stream.into_split();
     let send = async {
         put(server, &mut write, head_of(&reply, Length::Endless).as_bytes()).await?;
@@ -102,7 +104,11 @@ async fn follow(server: &Rc<Server>, stream: TcpStream, endless: Endless) -> io:
 }
 
 /// Events until the client does not read.
-async fn events(server: &Server, write: &mut OwnedWriteHalf, mut frames: Option<Frames>) -> io::Result<()> {
+async fn events(
+    server: &ConsoleServer,
+    write: &mut OwnedWriteHalf,
+    mut frames: Option<FrameEvents>,
+) -> io::Result<()> {
     let mut ticks = interval(PERIOD);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Skip);
     let mut frame_ticks = interval(FRAME_PERIOD);
@@ -119,7 +125,7 @@ async fn events(server: &Server, write: &mut OwnedWriteHalf, mut frames: Option<
             }
             _ = frame_ticks.tick(), if frames.is_some() => {
                 let mut text = String::new();
-                if let Some((data, lost)) = frames.as_mut().and_then(Frames::event) {
+                if let Some((data, lost)) = frames.as_mut().and_then(FrameEvents::event) {
                     server.count(|counters| counters.lost_frames += lost);
                     text = format!("event: frames\ndata: {data}\n\n");
                 }
@@ -131,7 +137,7 @@ async fn events(server: &Server, write: &mut OwnedWriteHalf, mut frames: Option<
 }
 
 /// State and values, and how many of them were left out before.
-async fn states(server: &Server, lost: u64) -> String {
+async fn states(server: &ConsoleServer, lost: u64) -> String {
     let mut text = String::new();
     if lost > 0 {
         server.count(|counters| counters.lost_events += lost);
@@ -151,7 +157,11 @@ async fn states(server: &Server, lost: u64) -> String {
 }
 
 /// The blocks of a capture until the client does not read.
-async fn blocks(server: &Server, write: &mut OwnedWriteHalf, mut capture: Capture) -> io::Result<()> {
+async fn blocks(
+    server: &ConsoleServer,
+    write: &mut OwnedWriteHalf,
+    mut capture: CaptureStream,
+) -> io::Result<()> {
     let mut ticks = interval(FRAME_PERIOD);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Skip);
     loop {
@@ -160,7 +170,7 @@ async fn blocks(server: &Server, write: &mut OwnedWriteHalf, mut capture: Captur
     }
 }
 
-async fn put(server: &Server, write: &mut OwnedWriteHalf, bytes: &[u8]) -> io::Result<()> {
+async fn put(server: &ConsoleServer, write: &mut OwnedWriteHalf, bytes: &[u8]) -> io::Result<()> {
     timeout(MAX_TIME, write.write_all(bytes)).await.unwrap_or_else(|_| {
         server.count(|counters| counters.slow_readers += 1);
         Err(io::ErrorKind::TimedOut.into())

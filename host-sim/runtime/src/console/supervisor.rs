@@ -1,6 +1,6 @@
 //! The gateway's configurations: runs one, tries another, returns to the one before.
 //!
-//! In: commands of the console. Out: gateways that are started and ended, files, and a view for readers. What
+//! In: commands of the console. Out: gateways that are started and ended, files, and a view for readers. SupervisorAction
 //! happens when is decided in `recipe_api::revisions`; here it is carried out, on a thread of its own,
 //! since starting and ending a gateway takes its time.
 
@@ -24,14 +24,14 @@ use tokio::sync::oneshot;
 use tracing::{error, info, warn};
 
 use super::check::{self, Prepared};
-use super::store::{Entry, Store, digest};
-use super::{Bound, Console, ConsoleOptions, Source};
+use super::store::{RevisionEntry, RevisionStore, digest};
+use super::{Bound, Console, ConsoleOptions, ConsoleSource};
 use crate::client::RuntimeClient;
 use crate::gateway::{self, Observers};
-use crate::host::{Handle, Running};
+use crate::host::{ForegroundRun, Handle};
 use crate::publisher::SnapshotWatch;
 use crate::snapshot::SnapshotSlot;
-use crate::worker::Place;
+use crate::worker::RuntimePlace;
 use crate::{RunOptions, StartError};
 
 /// The configuration that a gateway was started with.
@@ -59,20 +59,20 @@ impl ConfigFile {
     }
 }
 
-/// What somebody asks for.
+/// SupervisorAction somebody asks for.
 #[derive(Debug)]
-pub(crate) struct Command {
+pub(crate) struct SupervisorCommand {
     /// Who.
     pub(super) peer: IpAddr,
-    /// What.
-    pub(super) what: What,
+    /// SupervisorAction.
+    pub(super) what: SupervisorAction,
     /// Gets the number of the revision.
-    pub(super) answer: oneshot::Sender<Result<u32, Failed>>,
+    pub(super) answer: oneshot::Sender<Result<u32, ActionError>>,
 }
 
-/// What somebody asks for.
+/// SupervisorAction somebody asks for.
 #[derive(Debug)]
-pub(super) enum What {
+pub(super) enum SupervisorAction {
     /// Keep a text that was made from a revision.
     Put { base: Revision, toml: String },
     /// Run one on trial.
@@ -87,20 +87,20 @@ pub(super) enum What {
 
 /// Why nothing was done.
 #[derive(Debug)]
-pub(super) enum Failed {
+pub(super) enum ActionError {
     /// It is refused.
     Refused(Refused),
     /// It was tried.
     Tried(String),
 }
 
-/// What readers see.
+/// SupervisorAction readers see.
 #[derive(Debug, Default)]
-pub(crate) struct View {
+pub(crate) struct SupervisorView {
     /// The revisions.
     pub(super) revisions: Option<Revisions>,
-    /// What is known about each, the oldest first.
-    pub(super) entries: Vec<Entry>,
+    /// SupervisorAction is known about each, the oldest first.
+    pub(super) entries: Vec<RevisionEntry>,
     /// Their texts.
     pub(super) texts: BTreeMap<u32, Arc<str>>,
     /// The addresses of what runs, as in the line `ready`.
@@ -109,13 +109,13 @@ pub(crate) struct View {
     pub(super) failure: Option<String>,
     /// Overrides, which apply to every revision.
     pub(super) overrides: Vec<String>,
-    /// What runs.
+    /// SupervisorAction runs.
     pub(super) config: Option<Arc<GatewayConfig>>,
     client: Option<RuntimeClient>,
     slot: Option<Arc<SnapshotSlot>>,
 }
 
-impl View {
+impl SupervisorView {
     /// The text of the configuration that runs.
     pub(super) fn running_text(&self) -> Option<Arc<str>> {
         self.config.as_ref()?;
@@ -125,10 +125,10 @@ impl View {
 
 /// Between the supervisor and its readers.
 #[derive(Debug, Default)]
-pub(crate) struct Shared(Mutex<View>);
+pub(crate) struct SharedView(Mutex<SupervisorView>);
 
-impl Shared {
-    pub(super) fn view(&self) -> MutexGuard<'_, View> {
+impl SharedView {
+    pub(super) fn view(&self) -> MutexGuard<'_, SupervisorView> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -143,8 +143,8 @@ impl Shared {
 #[derive(Debug)]
 pub(crate) struct Supervised {
     ready: Value,
-    shared: Arc<Shared>,
-    commands: blocking::Sender<Command>,
+    shared: Arc<SharedView>,
+    commands: blocking::Sender<SupervisorCommand>,
     thread: Option<JoinHandle<Result<(), StartError>>>,
     /// Ended first, so that nobody is answered any more.
     console: Option<Console>,
@@ -157,14 +157,14 @@ impl Supervised {
         options: &RunOptions,
         console: &ConsoleOptions,
         snapshot_watch: Option<SnapshotWatch>,
-        place: Place,
+        place: RuntimePlace,
     ) -> Result<Self, StartError> {
         let bound = console.bind()?;
-        let store = Store::open(console.state.as_deref(), (&file.name, &file.toml))?;
+        let store = RevisionStore::open(console.state.as_deref(), (&file.name, &file.toml))?;
         let Some(revisions) = store.revisions() else {
             return Err(StartError::new("--console-state: the revisions make no sense"));
         };
-        let shared = Arc::<Shared>::default();
+        let shared = Arc::<SharedView>::default();
         let (commands, inbox) = blocking::channel();
         let supervisor = Supervisor {
             store,
@@ -200,7 +200,7 @@ impl Supervised {
 
     fn serve(&mut self, bound: Bound, options: &RunOptions) -> Result<(), StartError> {
         let (shared, commands) = (Arc::clone(&self.shared), self.commands.clone());
-        let source = Source::Gateway { shared, commands, watch: options.watch.clone() };
+        let source = ConsoleSource::Gateway { shared, commands, watch: options.watch.clone() };
         let console = Console::start(bound, source, options.log.clone())?;
         self.ready = self.shared.view().ready.clone();
         self.ready["console"] = json!(console.address());
@@ -212,7 +212,7 @@ impl Supervised {
         self.console = None;
         let (answer, _) = oneshot::channel();
         let peer = IpAddr::V4(std::net::Ipv4Addr::LOCALHOST);
-        let _ = self.commands.send(Command { peer, what: What::Shutdown, answer });
+        let _ = self.commands.send(SupervisorCommand { peer, what: SupervisorAction::Shutdown, answer });
         let Some(thread) = self.thread.take() else { return Ok(()) };
         thread.join().unwrap_or_else(|_| Err(StartError::new("a thread panicked").after_start()))
     }
@@ -224,7 +224,7 @@ impl Drop for Supervised {
     }
 }
 
-impl Running for Supervised {
+impl ForegroundRun for Supervised {
     fn ready(&self) -> &Value {
         &self.ready
     }
@@ -257,10 +257,10 @@ struct Replaceable {
 }
 
 struct Supervisor {
-    store: Store,
+    store: RevisionStore,
     revisions: Revisions,
     running: Option<Replaceable>,
-    shared: Arc<Shared>,
+    shared: Arc<SharedView>,
     overrides: Vec<String>,
     state: Option<PathBuf>,
     binds: Vec<Bind>,
@@ -268,7 +268,7 @@ struct Supervisor {
     /// Open devices between one gateway and the next.
     handover: Handover,
     /// Where each gateway runs.
-    place: Place,
+    place: RuntimePlace,
     /// Who looks at each gateway, but for the console.
     observers: Observers,
     /// The text that is to be kept, and who sent it.
@@ -280,7 +280,7 @@ impl Supervisor {
     fn run(
         mut self,
         opened: &blocking::Sender<Result<(), StartError>>,
-        inbox: &blocking::Receiver<Command>,
+        inbox: &blocking::Receiver<SupervisorCommand>,
     ) -> Result<(), StartError> {
         let live = self.revisions.live();
         if let Some(folder) = &self.state {
@@ -297,7 +297,8 @@ impl Supervisor {
         loop {
             self.drain();
             match inbox.recv_timeout(LOOK_INTERVAL) {
-                Ok(Command { what: What::Shutdown, .. }) | Err(RecvTimeoutError::Disconnected) => {
+                Ok(SupervisorCommand { what: SupervisorAction::Shutdown, .. })
+                | Err(RecvTimeoutError::Disconnected) => {
                     return self.running.take().map_or(Ok(()), |running| running.handle.shutdown());
                 }
                 Ok(command) => self.carry_out(command),
@@ -309,7 +310,7 @@ impl Supervisor {
         }
     }
 
-    /// The gateway has ended by itself. What was live ends the process, as it does without a console.
+    /// The gateway has ended by itself. SupervisorAction was live ends the process, as it does without a console.
     fn has_ended(&mut self) -> Result<(), StartError> {
         let Some(running) = self.running.take() else { return Ok(()) };
         let ended = running.handle.shutdown();
@@ -321,23 +322,23 @@ impl Supervisor {
         Ok(())
     }
 
-    fn carry_out(&mut self, command: Command) {
-        let Command { peer, what, answer } = command;
+    fn carry_out(&mut self, command: SupervisorCommand) {
+        let SupervisorCommand { peer, what, answer } = command;
         let at = now();
         let done = match what {
-            What::Put { base, toml } => {
+            SupervisorAction::Put { base, toml } => {
                 let put = self.revisions.put(base, digest(&toml));
                 self.put = Some((toml, peer.to_string()));
                 put
             }
-            What::Apply { number, trial } => self.revisions.apply(number, trial),
-            What::Confirm => self.revisions.confirm(at),
-            What::RollBack => self.revisions.roll_back(),
-            What::Shutdown => return,
+            SupervisorAction::Apply { number, trial } => self.revisions.apply(number, trial),
+            SupervisorAction::Confirm => self.revisions.confirm(at),
+            SupervisorAction::RollBack => self.revisions.roll_back(),
+            SupervisorAction::Shutdown => return,
         };
         let result = match done {
-            Ok(number) => self.drain().map_or(Ok(number), |failed| Err(Failed::Tried(failed))),
-            Err(refused) => Err(Failed::Refused(refused)),
+            Ok(number) => self.drain().map_or(Ok(number), |failed| Err(ActionError::Tried(failed))),
+            Err(refused) => Err(ActionError::Refused(refused)),
         };
         let _ = answer.send(result);
     }
@@ -400,7 +401,7 @@ impl Supervisor {
         kept.is_ok()
     }
 
-    /// Runs a revision instead of what runs. What is wrong with it shows before anything is stopped.
+    /// Runs a revision instead of what runs. SupervisorAction is wrong with it shows before anything is stopped.
     fn replace_by(&mut self, number: u32) -> Result<(), StartError> {
         if self.running.as_ref().is_some_and(|running| running.number == number) {
             // The one that was to take its place could not be prepared.

@@ -9,7 +9,7 @@ use tokio::task::{LocalSet, yield_now};
 
 use super::*;
 use crate::controller::{ControllerOptions, ControllerShell, Running};
-use crate::host::Shell;
+use crate::host::Runtime;
 use recipe_config::file::{Text, parse_controller};
 use recipe_controller::operations::Operation;
 use recipe_test_kit::{PATIENCE, SERVERS};

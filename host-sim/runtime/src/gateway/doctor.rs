@@ -23,9 +23,9 @@ use tracing::{Span, info};
 use super::open::Devices;
 use super::{Core, Gateway, Observers, TxPolicy};
 use crate::findings::{FindingTexts, look_at_states, unexplained};
-use crate::host::{self, Shell};
+use crate::host::{self, Runtime};
 use crate::snapshot::Engine;
-use crate::worker::Place;
+use crate::worker::RuntimePlace;
 use crate::{Signals, StartError};
 use recipe_io::bind::Bind;
 use recipe_io::timer::now;
@@ -213,7 +213,7 @@ pub fn listen(
 ) -> Result<Vec<Finding>, StartError> {
     let (sender, findings) = channel();
     let tx_policy = if ask { TxPolicy::Exchanges } else { TxPolicy::None };
-    let handle = host::start(&Place::alone(), "doctor", async move |_| {
+    let handle = host::start(&RuntimePlace::alone(), "doctor", async move |_| {
         let gateway = Gateway::open(&config, Devices::own(&binds), tx_policy, &Observers::default()).await?;
         gateway.core.keep_records(&config, &binds);
         Ok(Listener { gateway, config, time, sender })
@@ -235,7 +235,7 @@ struct Listener {
     sender: Sender<Vec<Finding>>,
 }
 
-impl Shell for Listener {
+impl Runtime for Listener {
     fn ready(&self) -> Value {
         self.gateway.ready.clone()
     }

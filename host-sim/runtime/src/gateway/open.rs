@@ -19,7 +19,7 @@ use super::tapping::Tapping;
 use super::{Core, Gateway, Observers, TxPolicy};
 use crate::StartError;
 use crate::host::AtEnd;
-use crate::link::Endpoint;
+use crate::link::LinkEndpoint;
 use crate::snapshot::Engine;
 use recipe_capture::{Cell as Watched, Epoch};
 use recipe_io::bind::Bind;
@@ -193,7 +193,7 @@ async fn open_port(
     Ok(device)
 }
 
-async fn open_endpoint(to: To<'_>) -> Result<Endpoint, StartError> {
+async fn open_endpoint(to: To<'_>) -> Result<LinkEndpoint, StartError> {
     if to.host.is_empty() {
         let message = "controller.address is needed: the controller's address or host name";
         return Err(StartError::new(message));
@@ -201,22 +201,22 @@ async fn open_endpoint(to: To<'_>) -> Result<Endpoint, StartError> {
     let host = to.host.to_owned();
     let refused = |address, error| StartError::new(format!("cannot listen on {address}: {error}"));
     Ok(match to.transport {
-        Transport::Tcp { port } => Endpoint::Tcp { host, port },
-        Transport::Udp { port } => Endpoint::Udp { host, port },
+        Transport::Tcp { port } => LinkEndpoint::Tcp { host, port },
+        Transport::Udp { port } => LinkEndpoint::Udp { host, port },
         Transport::TcpListen { local } => {
             let listener = TcpListener::bind(local).await.map_err(|error| refused(local, error))?;
             tcp_options::limit_buffers(&listener);
-            Endpoint::TcpListen { listener, controller: host }
+            LinkEndpoint::TcpListen { listener, controller: host }
         }
         Transport::UdpListen { local } => {
             let socket = UdpSocket::bind(local).await.map_err(|error| refused(local, error))?;
-            Endpoint::UdpListen { socket, controller: host }
+            LinkEndpoint::UdpListen { socket, controller: host }
         }
         other => return Err(StartError::new(format!("unknown kind of link: {other:?}"))),
     })
 }
 
-impl Endpoint {
+impl LinkEndpoint {
     /// The address of a listening link.
     fn place(&self) -> String {
         let address = match self {

@@ -8,31 +8,31 @@ use proto_core::wire::can::{CanFrame, CanId};
 use recipe_doctor::Hex;
 
 /// An input or output for a trace.
-pub(super) struct Shown<T>(pub(super) T);
+pub(super) struct TraceText<T>(pub(super) T);
 
-impl fmt::Display for Shown<&Input<'_>> {
+impl fmt::Display for TraceText<&Input<'_>> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.0 {
             Input::PortBytes { port, bytes } => write!(f, "port {}: {}", port.0, Hex(bytes)),
-            Input::PortCan { port, frame } => write!(f, "port {}: {}", port.0, Shown(frame)),
+            Input::PortCan { port, frame } => write!(f, "port {}: {}", port.0, TraceText(frame)),
             Input::LinkBytes { link, bytes } => write!(f, "link {}: {}", link.0, Hex(bytes)),
             other => write!(f, "{other:?}"),
         }
     }
 }
 
-impl fmt::Display for Shown<&Output<'_>> {
+impl fmt::Display for TraceText<&Output<'_>> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.0 {
             Output::PortSend { port, bytes } => write!(f, "port {}: {}", port.0, Hex(bytes)),
-            Output::PortSendCan { port, frame } => write!(f, "port {}: {}", port.0, Shown(frame)),
+            Output::PortSendCan { port, frame } => write!(f, "port {}: {}", port.0, TraceText(frame)),
             Output::LinkSend { link, bytes } => write!(f, "link {}: {}", link.0, Hex(bytes)),
             other => write!(f, "{other:?}"),
         }
     }
 }
 
-impl fmt::Display for Shown<&CanFrame> {
+impl fmt::Display for TraceText<&CanFrame> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.0.id() {
             CanId::Standard(id) => write!(f, "{id:03X}#")?,
@@ -54,13 +54,13 @@ mod tests {
     fn bytes_and_frames_are_shown_as_decode_takes_them() {
         let port = PortId(1);
         let input = Input::PortBytes { port, bytes: &[0x48, 0xAA, 0] };
-        assert_eq!(Shown(&input).to_string(), "port 1: 48 AA 00");
+        assert_eq!(TraceText(&input).to_string(), "port 1: 48 AA 00");
         let frame = CanFrame::new(CanId::Standard(2), &[0xEF, 0x54]).unwrap();
-        assert_eq!(Shown(&Input::PortCan { port, frame }).to_string(), "port 1: 002#EF54");
+        assert_eq!(TraceText(&Input::PortCan { port, frame }).to_string(), "port 1: 002#EF54");
         let frame = CanFrame::remote(CanId::Extended(0x1234), 0).unwrap();
-        assert_eq!(Shown(&Output::PortSendCan { port, frame }).to_string(), "port 1: 00001234#R");
+        assert_eq!(TraceText(&Output::PortSendCan { port, frame }).to_string(), "port 1: 00001234#R");
         let output = Output::LinkSend { link: LinkId::STATE, bytes: &[10] };
-        assert_eq!(Shown(&output).to_string(), "link 1: 0A");
-        assert_eq!(Shown(&Input::Tick).to_string(), "Tick");
+        assert_eq!(TraceText(&output).to_string(), "link 1: 0A");
+        assert_eq!(TraceText(&Input::Tick).to_string(), "Tick");
     }
 }

@@ -50,7 +50,7 @@ impl Tapping {
     pub(super) fn begin(watch: &Watch, cell: Cell, at: Instant, image: Option<&[u8]>) -> io::Result<Self> {
         let (ring, consumer) = RingBuffer::new(RING);
         let began = Record { at, lost: 0, what: What::Began(Arc::new(cell)) };
-        let reader = Reader { watch: watch.clone(), ring: consumer, message: Vec::new() };
+        let reader = RingReader { watch: watch.clone(), ring: consumer, message: Vec::new() };
         let reader = std::thread::Builder::new().name("watch".to_owned()).spawn(move || reader.run(began))?;
         let mut tapping = Self {
             watch: watch.clone(),
@@ -209,13 +209,13 @@ impl Drop for Tapping {
 }
 
 /// The other side of the ring, on a thread of its own.
-struct Reader {
+struct RingReader {
     watch: Watch,
     ring: Consumer<u8>,
     message: Vec<u8>,
 }
 
-impl Reader {
+impl RingReader {
     fn run(mut self, began: Record) {
         self.watch.read_here();
         self.watch.give(began);

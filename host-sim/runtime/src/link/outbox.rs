@@ -1,4 +1,4 @@
-//! What a link has to send, and a short way to its socket.
+//! What a link has to send, and a short socket to its socket.
 //!
 //! Between a field frame and its request should be as little as possible: a task that is woken and looks at all it waits
 //! for takes longer than the engine. So what is handed over goes to the socket at once. The link's task has the rest of
@@ -14,13 +14,13 @@ use rustix::net::{SendFlags, send, sendto};
 
 /// A socket of its own descriptor, because a task has the other one.
 #[derive(Debug)]
-pub(super) struct Way {
+pub(super) struct DirectSocket {
     socket: OwnedFd,
     /// The receiver of datagrams, if the socket is not connected.
     peer: Option<SocketAddr>,
 }
 
-impl Way {
+impl DirectSocket {
     /// To `peer`, or to where the socket is connected.
     pub(super) fn new(socket: &impl AsFd, peer: Option<SocketAddr>) -> io::Result<Self> {
         Ok(Self { socket: rustix::io::fcntl_dupfd_cloexec(socket, 0)?, peer })
@@ -41,7 +41,7 @@ pub(super) struct Outbox {
     /// The first one is what is left of a transmission that the system has taken a part of.
     queue: VecDeque<Vec<u8>>,
     /// `None` if the session has no socket yet.
-    way: Option<Way>,
+    socket: Option<DirectSocket>,
     /// The system has accepted a transmission, and that is not reported yet.
     is_sent: bool,
     failed: Option<Errno>,
@@ -52,19 +52,19 @@ const MAX_QUEUED: usize = 8;
 
 impl Outbox {
     /// Transmissions may go to this socket at once.
-    pub(super) fn open(&mut self, way: Way) {
-        self.way = Some(way);
+    pub(super) fn open(&mut self, socket: DirectSocket) {
+        self.socket = Some(socket);
     }
 
     /// They may not any more.
     pub(super) fn close(&mut self) {
-        self.way = None;
+        self.socket = None;
     }
 
     /// Datagrams go to this peer from now on.
     pub(super) fn answer(&mut self, peer: SocketAddr) {
-        if let Some(way) = &mut self.way {
-            way.peer = Some(peer);
+        if let Some(socket) = &mut self.socket {
+            socket.peer = Some(peer);
         }
     }
 
@@ -73,9 +73,9 @@ impl Outbox {
         let mut rest = bytes;
         if self.queue.is_empty()
             && self.failed.is_none()
-            && let Some(way) = &self.way
+            && let Some(socket) = &self.socket
         {
-            match way.send(bytes) {
+            match socket.send(bytes) {
                 Ok(len) => rest = bytes.get(len..).unwrap_or_default(),
                 Err(Errno::AGAIN | Errno::INTR) => {}
                 // A socket tells an error once. The task that ends the session has to know it.

@@ -16,44 +16,44 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::time::{Instant, sleep};
 use tracing::info;
 
-use super::outbox::Way;
-use super::{Lent, Link, LinkEvent, Refusals, Session};
+use super::outbox::DirectSocket;
+use super::{Lent, LinkEvent, LinkSession, LinkTask, Refusals};
 use recipe_io::connect::connect;
 use recipe_io::fairness::yield_fairly;
 use recipe_io::tcp_options;
 
-impl Link<'_> {
+impl LinkTask<'_> {
     /// Connects to the controller's server.
     pub(super) async fn connect_tcp(
         &self,
-        session: Session,
+        session: LinkSession,
         host: &str,
         port: u16,
         events: &mut impl FnMut(LinkEvent<'_>),
     ) -> io::Result<()> {
         let Some(mut stream) = self.while_open(session, connect((host, port))).await? else { return Ok(()) };
-        let (connection, reader) = Connection::new(self, session, &mut stream)?;
+        let (connection, reader) = LinkConnection::new(self, session, &mut stream)?;
         connection.carry(reader, None, events).await
     }
 
     /// Accepts the next connection of the controller's client.
     pub(super) async fn accept_tcp(
         &self,
-        session: Session,
+        session: LinkSession,
         listener: &TcpListener,
         controller: &str,
         events: &mut impl FnMut(LinkEvent<'_>),
     ) -> io::Result<()> {
         let accepted = self.while_open(session, self.accept(session, listener, controller)).await?;
         let Some((mut stream, known)) = accepted else { return Ok(()) };
-        let (connection, reader) = Connection::new(self, session, &mut stream)?;
+        let (connection, reader) = LinkConnection::new(self, session, &mut stream)?;
         connection.carry(reader, Some((listener, &known)), events).await
     }
 
     /// The next connection of the controller, and the controller's addresses.
     async fn accept(
         &self,
-        session: Session,
+        session: LinkSession,
         listener: &TcpListener,
         controller: &str,
     ) -> io::Result<(TcpStream, Vec<IpAddr>)> {
@@ -113,21 +113,21 @@ impl Link<'_> {
 }
 
 /// A connection of one session.
-struct Connection<'a> {
-    link: &'a Link<'a>,
-    session: Session,
+struct LinkConnection<'a> {
+    link: &'a LinkTask<'a>,
+    session: LinkSession,
     writer: WriteHalf<'a>,
     /// For what is handed over while this task does something else.
     _lent: Lent<'a>,
     /// Number of bytes that the peer is known to have acknowledged.
     acked: u64,
-    watch: Watch,
+    watch: AckWatch,
     reads: u64,
 }
 
 /// How acknowledgements are looked for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Watch {
+enum AckWatch {
     /// Not at all, and the system has no time limit either.
     Off,
     /// Some are missing: they are polled.
@@ -137,17 +137,17 @@ enum Watch {
     Quiet,
 }
 
-impl<'a> Connection<'a> {
+impl<'a> LinkConnection<'a> {
     fn new(
-        link: &'a Link<'a>,
-        session: Session,
+        link: &'a LinkTask<'a>,
+        session: LinkSession,
         stream: &'a mut TcpStream,
     ) -> io::Result<(Self, ReadHalf<'a>)> {
         tcp_options::reset_on_close(stream)?;
         tcp_options::enable_keepalive(stream);
-        let lent = link.control.lend(Way::new(stream, None)?);
+        let lent = link.control.lend(DirectSocket::new(stream, None)?);
         let (reader, writer) = stream.split();
-        let own = Self { link, session, writer, _lent: lent, acked: 0, watch: Watch::Off, reads: 0 };
+        let own = Self { link, session, writer, _lent: lent, acked: 0, watch: AckWatch::Off, reads: 0 };
         Ok((own, reader))
     }
 
@@ -169,15 +169,15 @@ impl<'a> Connection<'a> {
                 break;
             }
             match (self.watch, self.is_outstanding()) {
-                (Watch::Off | Watch::Quiet, true) => {
-                    if self.watch == Watch::Off {
+                (AckWatch::Off | AckWatch::Quiet, true) => {
+                    if self.watch == AckWatch::Off {
                         tcp_options::set_user_timeout(self.writer.as_ref(), USER_TIMEOUT);
                     }
-                    self.watch = Watch::Missing;
+                    self.watch = AckWatch::Missing;
                     poll.as_mut().reset(Instant::now() + ACK_POLL);
                 }
-                (Watch::Missing, false) => {
-                    self.watch = Watch::Quiet;
+                (AckWatch::Missing, false) => {
+                    self.watch = AckWatch::Quiet;
                     poll.as_mut().reset(Instant::now() + QUIET);
                 }
                 _ => {}
@@ -189,11 +189,11 @@ impl<'a> Connection<'a> {
                 },
                 ready = self.writer.writable(), if self.link.control.waiting() > 0 => ready?,
                 () = changed.notified() => {}
-                () = &mut poll, if self.watch != Watch::Off => if self.watch == Watch::Missing {
+                () = &mut poll, if self.watch != AckWatch::Off => if self.watch == AckWatch::Missing {
                     self.poll_acked(events)?;
                     poll.as_mut().reset(Instant::now() + ACK_POLL);
                 } else {
-                    self.watch = Watch::Off;
+                    self.watch = AckWatch::Off;
                     tcp_options::clear_user_timeout(self.writer.as_ref());
                 },
                 () = &mut refusing => {}

@@ -10,7 +10,7 @@ use tokio::sync::Notify;
 use tokio::task::yield_now;
 
 use super::super::tests::{Running, Seen, connected, inside, tcp_listen};
-use super::super::{Endpoint, LinkControl, Refusals};
+use super::super::{LinkControl, LinkEndpoint, Refusals};
 use super::*;
 
 /// A link that is up, and its peer, which has a small receive buffer.
@@ -20,7 +20,7 @@ async fn pair() -> (Running, TcpListener, TcpStream) {
     socket.bind("127.0.0.1:0".parse().unwrap()).unwrap();
     let listener = socket.listen(4).unwrap();
     let at = listener.local_addr().unwrap();
-    let link = Running::start(Endpoint::Tcp { host: at.ip().to_string(), port: at.port() });
+    let link = Running::start(LinkEndpoint::Tcp { host: at.ip().to_string(), port: at.port() });
     link.control.open();
     let (peer, _) = listener.accept().await.unwrap();
     link.expect(Seen::Up).await;
@@ -203,8 +203,8 @@ fn the_systems_time_limit_stays_between_transmissions_and_goes_in_silence() {
         let limit = || sockopt::tcp_user_timeout(&socket).unwrap();
         let control = LinkControl::default();
         control.open();
-        let link = Link { name: "link", control: &control };
-        let (connection, reader) = Connection::new(&link, control.session.get(), &mut stream).unwrap();
+        let link = LinkTask { name: "link", control: &control };
+        let (connection, reader) = LinkConnection::new(&link, control.session.get(), &mut stream).unwrap();
         let answered = Notify::new();
         let mut events = |event: LinkEvent<'_>| {
             if let LinkEvent::Bytes(_) = event {
@@ -280,7 +280,7 @@ fn a_connection_made_during_the_close_is_not_used_by_the_next_session() {
     inside(async || {
         let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
         let at = listener.local_addr().unwrap();
-        let link = Running::start(Endpoint::Tcp { host: at.ip().to_string(), port: at.port() });
+        let link = Running::start(LinkEndpoint::Tcp { host: at.ip().to_string(), port: at.port() });
         for round in 0..40_u8 {
             link.control.open();
             yield_now().await;

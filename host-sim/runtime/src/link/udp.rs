@@ -8,15 +8,15 @@ use rustix::net::RecvFlags;
 use tokio::net::UdpSocket;
 use tracing::info;
 
-use super::outbox::Way;
-use super::{Link, LinkEvent, Session};
+use super::outbox::DirectSocket;
+use super::{LinkEvent, LinkSession, LinkTask};
 use recipe_io::fairness::yield_fairly;
 
-impl Link<'_> {
+impl LinkTask<'_> {
     /// Opens a socket for this session, connected to the controller's server.
     pub(super) async fn connect_udp(
         &self,
-        session: Session,
+        session: LinkSession,
         host: &str,
         port: u16,
         events: &mut impl FnMut(LinkEvent<'_>),
@@ -29,7 +29,7 @@ impl Link<'_> {
     /// Waits for the controller's client, and sends to the address that it sends from.
     pub(super) async fn await_udp(
         &self,
-        session: Session,
+        session: LinkSession,
         socket: &UdpSocket,
         controller: &str,
         is_frame: &dyn Fn(&[u8]) -> bool,
@@ -42,7 +42,7 @@ impl Link<'_> {
         if !self.control.is_over(session) {
             events(LinkEvent::Bytes(&datagram));
         }
-        let client = Client { peer, known, is_frame };
+        let client = UdpPeer { peer, known, is_frame };
         self.pump(session, socket, Some(client), events).await
     }
 
@@ -50,7 +50,7 @@ impl Link<'_> {
     /// datagram.
     async fn first_datagram(
         &self,
-        session: Session,
+        session: LinkSession,
         socket: &UdpSocket,
         controller: &str,
     ) -> io::Result<(SocketAddr, Vec<IpAddr>, Vec<u8>)> {
@@ -73,12 +73,12 @@ impl Link<'_> {
     /// Moves datagrams in both directions until an error, or the end of the session.
     async fn pump(
         &self,
-        session: Session,
+        session: LinkSession,
         socket: &UdpSocket,
-        mut client: Option<Client<'_>>,
+        mut client: Option<UdpPeer<'_>>,
         events: &mut impl FnMut(LinkEvent<'_>),
     ) -> io::Result<()> {
-        let _lent = self.control.lend(Way::new(socket, client.as_ref().map(|client| client.peer))?);
+        let _lent = self.control.lend(DirectSocket::new(socket, client.as_ref().map(|client| client.peer))?);
         let mut datagram = vec![0; MAX_DATAGRAM];
         let mut reads = 0_u64;
         while !self.control.is_over(session) {
@@ -121,7 +121,7 @@ impl Link<'_> {
 }
 
 /// The controller's client of a listening socket.
-struct Client<'a> {
+struct UdpPeer<'a> {
     /// The sender of the newest frame, which gets the answers. Other datagrams do not change it.
     peer: SocketAddr,
     known: Vec<IpAddr>,
