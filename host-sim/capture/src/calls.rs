@@ -24,7 +24,7 @@ pub(crate) enum Then {
 
 /// How the file ended.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) enum End {
+pub(crate) enum RecordingEnd {
     Whole,
     /// Within a record, or where nothing can be read.
     Cut,
@@ -36,8 +36,8 @@ pub(crate) enum End {
 ///
 /// # Errors
 /// That of `take`.
-pub(crate) fn each<E>(mut file: File, take: &mut Take<'_, E>) -> Result<End, E> {
-    let Ok(len) = file.metadata().map(|found| found.len()) else { return Ok(End::Cut) };
+pub(crate) fn each<E>(mut file: File, take: &mut Take<'_, E>) -> Result<RecordingEnd, E> {
+    let Ok(len) = file.metadata().map(|found| found.len()) else { return Ok(RecordingEnd::Cut) };
     // The file of a killed process has no end. A damaged one may name a length that no memory has.
     let options = LinearReaderOptions::default()
         .with_skip_end_magic(true)
@@ -47,15 +47,15 @@ pub(crate) fn each<E>(mut file: File, take: &mut Take<'_, E>) -> Result<End, E> 
     let mut channels = Channels::default();
     loop {
         match reader.next_event() {
-            None => return Ok(End::Whole),
-            Some(Err(_)) => return Ok(End::Cut),
+            None => return Ok(RecordingEnd::Whole),
+            Some(Err(_)) => return Ok(RecordingEnd::Cut),
             Some(Ok(LinearReadEvent::ReadRequest(wanted))) => {
-                let Ok(read) = file.read(reader.insert(wanted)) else { return Ok(End::Cut) };
+                let Ok(read) = file.read(reader.insert(wanted)) else { return Ok(RecordingEnd::Cut) };
                 reader.notify_read(read);
             }
             Some(Ok(LinearReadEvent::Record { opcode, data })) => {
                 match channels.record(opcode, data, take)? {
-                    End::Whole => {}
+                    RecordingEnd::Whole => {}
                     end => return Ok(end),
                 }
             }
@@ -69,12 +69,12 @@ struct Channels(BTreeSet<u16>);
 
 impl Channels {
     /// A record, which may have others in it.
-    fn record<E>(&mut self, opcode: u8, data: &[u8], take: &mut Take<'_, E>) -> Result<End, E> {
+    fn record<E>(&mut self, opcode: u8, data: &[u8], take: &mut Take<'_, E>) -> Result<RecordingEnd, E> {
         if !matches!(opcode, op::CHANNEL | op::MESSAGE | op::CHUNK) {
-            return Ok(End::Whole);
+            return Ok(RecordingEnd::Whole);
         }
         match parse_record(opcode, data) {
-            Err::<_, McapError>(_) => return Ok(End::Cut),
+            Err::<_, McapError>(_) => return Ok(RecordingEnd::Cut),
             Ok(Record::Channel(channel)) => {
                 if channel.topic == ENGINE {
                     self.0.insert(channel.id);
@@ -84,34 +84,34 @@ impl Channels {
             }
             Ok(Record::Message { header, data }) if self.0.contains(&header.channel_id) => {
                 if let Then::Stop = take(header.sequence, &data)? {
-                    return Ok(End::Stopped);
+                    return Ok(RecordingEnd::Stopped);
                 }
             }
             // A recording has no compressed ones.
             Ok(Record::Chunk { header, data }) if header.compression.is_empty() => {
                 return self.chunk(&data, take);
             }
-            Ok(Record::Chunk { .. }) => return Ok(End::Cut),
+            Ok(Record::Chunk { .. }) => return Ok(RecordingEnd::Cut),
             Ok(_) => {}
         }
-        Ok(End::Whole)
+        Ok(RecordingEnd::Whole)
     }
 
-    fn chunk<E>(&mut self, mut rest: &[u8], take: &mut Take<'_, E>) -> Result<End, E> {
+    fn chunk<E>(&mut self, mut rest: &[u8], take: &mut Take<'_, E>) -> Result<RecordingEnd, E> {
         while let Some((opcode, behind)) = rest.split_first() {
-            let Some((len, behind)) = behind.split_first_chunk() else { return Ok(End::Cut) };
+            let Some((len, behind)) = behind.split_first_chunk() else { return Ok(RecordingEnd::Cut) };
             let len = usize::try_from(u64::from_le_bytes(*len)).unwrap_or(usize::MAX);
-            let Some((data, behind)) = behind.split_at_checked(len) else { return Ok(End::Cut) };
+            let Some((data, behind)) = behind.split_at_checked(len) else { return Ok(RecordingEnd::Cut) };
             rest = behind;
             // None is in another one.
             if *opcode == op::CHUNK {
-                return Ok(End::Cut);
+                return Ok(RecordingEnd::Cut);
             }
             match self.record(*opcode, data, take)? {
-                End::Whole => {}
+                RecordingEnd::Whole => {}
                 end => return Ok(end),
             }
         }
-        Ok(End::Whole)
+        Ok(RecordingEnd::Whole)
     }
 }

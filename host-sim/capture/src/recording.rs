@@ -27,7 +27,7 @@ use tracing::{info, warn};
 
 use crate::record::{Cell, Frame, Record, What, rejection};
 use crate::watch::{Arrived, Interest, Next, Subscription, Watch};
-use part::Part;
+use part::RecordingPart;
 
 pub(crate) use folder::run_of;
 pub use folder::{Folder, run_name};
@@ -101,7 +101,7 @@ struct Recorder {
     options: RecordOptions,
     cell: Option<Arc<Cell>>,
     run: Option<String>,
-    part: Option<Part>,
+    part: Option<RecordingPart>,
     parts: u32,
     /// Calls of the engine so far, those that were lost included.
     passes: u32,
@@ -127,7 +127,7 @@ impl Recorder {
                     return Ok(());
                 }
                 flush_at = Deadline::now() + FLUSH_INTERVAL;
-                self.part.as_mut().map_or(Ok(()), Part::flush)
+                self.part.as_mut().map_or(Ok(()), RecordingPart::flush)
             });
             if let Err(error) = result {
                 self.failed(&error);
@@ -158,7 +158,7 @@ impl Recorder {
             self.run.get_or_insert_with(|| run_name(cell.epoch.wall));
             self.cell = Some(Arc::clone(cell));
             // A channel has one schema in a file.
-            return self.part.take().map_or(Ok(()), Part::finish);
+            return self.part.take().map_or(Ok(()), RecordingPart::finish);
         }
         let sequence = match what {
             What::Pass(_) => {
@@ -199,7 +199,7 @@ impl Recorder {
         let Some(run) = self.run.clone() else { return Ok(false) };
         self.folder.make_room(self.options.budget.saturating_sub(self.options.file))?;
         let path = self.folder.part(&run, self.parts + 1);
-        self.part = Some(Part::create(&path, &run, self.parts + 1)?);
+        self.part = Some(RecordingPart::create(&path, &run, self.parts + 1)?);
         self.parts += 1;
         self.retry_at = None;
         if std::mem::take(&mut self.is_failing) {
@@ -209,7 +209,7 @@ impl Recorder {
     }
 }
 
-fn write_frame(part: &mut Part, cell: &Cell, time: u64, frame: &Frame) -> io::Result<()> {
+fn write_frame(part: &mut RecordingPart, cell: &Cell, time: u64, frame: &Frame) -> io::Result<()> {
     // What goes over links is in the calls of the engine.
     let TapPlace::Port(port) = frame.place else { return Ok(()) };
     let Some(port) = cell.port(port) else { return Ok(()) };

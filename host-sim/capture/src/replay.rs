@@ -15,7 +15,7 @@ use proto_core::engine::{Engine, Input, OUTPUT_BUFFER, Output};
 use proto_core::record::{Entry, MAGIC, totals};
 use proto_core::time::Instant;
 
-use crate::calls::{self, End, Then};
+use crate::calls::{self, RecordingEnd, Then};
 use crate::recording::{Folder, run_of};
 
 /// Why a recording cannot be replayed at all.
@@ -181,8 +181,8 @@ impl Runner<'_> {
             self.entries(bytes)?;
             Ok(if self.report.stopped.is_some() { Then::Stop } else { Then::GoOn })
         })?;
-        self.report.is_cut |= end == End::Cut;
-        Ok(end != End::Stopped)
+        self.report.is_cut |= end == RecordingEnd::Cut;
+        Ok(end != RecordingEnd::Stopped)
     }
 
     fn finish(self, path: &Path) -> Result<Report, ReplayError> {

@@ -19,13 +19,13 @@ use crate::watch::Watch;
 pub(crate) const FILE: &str = "rs485-system.toml";
 
 /// A gateway that tells a watch what it does.
-pub(crate) struct Run {
+pub(crate) struct TestRun {
     pub(crate) engine: Box<Engine>,
     pub(crate) watch: Watch,
     pub(crate) at: Instant,
 }
 
-impl Run {
+impl TestRun {
     /// The engine begins.
     pub(crate) fn begin(watch: &Watch) -> Self {
         Self::begin_with(watch, &std::fs::read_to_string(example(FILE)).unwrap())

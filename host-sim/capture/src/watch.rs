@@ -43,17 +43,17 @@ impl Interest {
 
 /// A gateway as it can be watched. Clones are of the same gateway; it may be started more than once.
 #[derive(Debug, Clone, Default)]
-pub struct Watch(Arc<Shared>);
+pub struct Watch(Arc<WatchState>);
 
 #[derive(Debug, Default)]
-struct Shared {
+struct WatchState {
     /// What any subscriber wants: the bits of [`Interest`].
     wanted: AtomicU8,
-    state: Mutex<State>,
+    state: Mutex<Wanted>,
 }
 
 #[derive(Debug, Default)]
-struct State {
+struct Wanted {
     queues: Vec<Arc<Queue>>,
     /// The newest [`What::Began`], for those who subscribe later.
     began: Option<Arc<Record>>,
@@ -103,7 +103,7 @@ pub enum Next {
 #[derive(Debug)]
 pub struct Subscription {
     queue: Arc<Queue>,
-    shared: Arc<Shared>,
+    shared: Arc<WatchState>,
 }
 
 impl Watch {
@@ -166,8 +166,8 @@ impl Watch {
     }
 }
 
-impl Shared {
-    fn note_wanted(&self, state: &State) {
+impl WatchState {
+    fn note_wanted(&self, state: &Wanted) {
         let wanted = state.queues.iter().fold(0, |wanted, queue| wanted | queue.interest.bits());
         self.wanted.store(wanted, Ordering::Relaxed);
     }

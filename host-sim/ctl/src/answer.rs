@@ -3,21 +3,21 @@
 use serde_json::Value;
 
 use crate::failure::Verdict;
-use crate::table::{Cell, View};
+use crate::table::{TableCell, TableView};
 
 /// The outcome of a command at one gateway.
 #[derive(Debug, Clone)]
 pub struct Answer {
     pub(crate) document: Value,
-    pub(crate) text: Text,
+    pub(crate) text: AnswerText,
     /// What a table of several gateways shows of it: headings and cells.
-    pub(crate) row: Vec<(&'static str, Cell)>,
+    pub(crate) row: Vec<(&'static str, TableCell)>,
     pub(crate) verdict: Verdict,
 }
 
-/// Text for people.
+/// AnswerText for people.
 #[derive(Debug, Clone)]
-pub(crate) enum Text {
+pub(crate) enum AnswerText {
     /// Made by this program.
     Made(String),
     /// A document of the gateway that is text itself, such as a configuration.
@@ -27,11 +27,11 @@ pub(crate) enum Text {
 impl Answer {
     /// An answer without trouble.
     pub(crate) fn new(document: Value, text: String) -> Self {
-        Self { document, text: Text::Made(text), row: Vec::new(), verdict: Verdict::Well }
+        Self { document, text: AnswerText::Made(text), row: Vec::new(), verdict: Verdict::Well }
     }
 
     #[must_use]
-    pub(crate) fn with_row(self, row: Vec<(&'static str, Cell)>) -> Self {
+    pub(crate) fn with_row(self, row: Vec<(&'static str, TableCell)>) -> Self {
         Self { row, ..self }
     }
 
@@ -51,11 +51,11 @@ impl Answer {
     }
 
     /// As text. A document of the gateway goes to a file or pipe as it is.
-    pub fn text(&self, view: View) -> String {
+    pub fn text(&self, view: TableView) -> String {
         match &self.text {
-            Text::Made(text) => text.clone(),
-            Text::Document(text) if view.is_terminal => crate::shown::lines(text).into_owned(),
-            Text::Document(text) => text.clone(),
+            AnswerText::Made(text) => text.clone(),
+            AnswerText::Document(text) if view.is_terminal => crate::shown::lines(text).into_owned(),
+            AnswerText::Document(text) => text.clone(),
         }
     }
 }

@@ -13,12 +13,12 @@ use recipe_config::board::Board;
 use recipe_config::file::{self, FileError};
 use serde_json::{Value, json};
 
-use crate::answer::{Answer, Text};
-use crate::client::{Body, Call, Client};
+use crate::answer::{Answer, AnswerText};
+use crate::client::{Call, Client, RequestBody};
 use crate::failure::{Failure, Verdict};
 use crate::reading::{ended_words, revisions_of};
 use crate::shown;
-use crate::table::Cell;
+use crate::table::TableCell;
 
 /// A configuration that can run, as a host and as a board take it.
 #[derive(Debug, Clone)]
@@ -105,14 +105,14 @@ fn image_of(config: &GatewayConfig) -> Result<Vec<u8>, String> {
 
 /// What takes a configuration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Role {
+pub(crate) enum ServerRole {
     /// A gateway on a host.
     Host,
     /// A board.
     Board,
 }
 
-impl Role {
+impl ServerRole {
     /// What a gateway says that it is.
     pub(crate) fn of(client: &Client) -> Result<Self, Failure> {
         match client.json("info")?["role"].as_str() {
@@ -179,9 +179,9 @@ impl Stored {
 /// If it is refused or not reached.
 pub fn config(client: &Client, revision: Option<u32>) -> Result<Answer, Failure> {
     let stored = stored(client, revision)?;
-    let len = Cell::number(stored.bytes().len());
+    let len = TableCell::number(stored.bytes().len());
     let (document, text) = match stored {
-        Stored::Toml(toml) => (json!({ "toml": toml }), Text::Document(toml)),
+        Stored::Toml(toml) => (json!({ "toml": toml }), AnswerText::Document(toml)),
         Stored::Image(bytes) => {
             let text = match Stored::Image(bytes.clone()).read() {
                 Ok(config) => format!(
@@ -195,7 +195,7 @@ pub fn config(client: &Client, revision: Option<u32>) -> Result<Answer, Failure>
                 }
             };
             let hex: String = bytes.iter().map(|byte| format!("{byte:02x}")).collect();
-            (json!({ "image": hex }), Text::Made(text))
+            (json!({ "image": hex }), AnswerText::Made(text))
         }
     };
     Ok(Answer { document, text, row: vec![("bytes", len)], verdict: Verdict::Well })
@@ -215,9 +215,9 @@ pub struct Trial {
 /// # Errors
 /// If it is refused or not reached.
 pub fn push(client: &Client, configuration: &Configuration, trial: Option<Trial>) -> Result<Answer, Failure> {
-    let body = match Role::of(client)? {
-        Role::Host => Body::Toml(configuration.toml.as_deref().map_err(Failure::wrong)?),
-        Role::Board => Body::Image(configuration.image.as_deref().map_err(Failure::wrong)?),
+    let body = match ServerRole::of(client)? {
+        ServerRole::Host => RequestBody::Toml(configuration.toml.as_deref().map_err(Failure::wrong)?),
+        ServerRole::Board => RequestBody::Image(configuration.image.as_deref().map_err(Failure::wrong)?),
     };
     // What it is based on is what is there now: a person pushes a whole file.
     let base = client.json("revisions")?;
@@ -234,7 +234,7 @@ pub fn push(client: &Client, configuration: &Configuration, trial: Option<Trial>
         return apply(client, trial);
     }
     let text = format!("revision {revision} is stored and waits; `apply` puts it on trial\n");
-    let row = vec![("revision", Cell::number(revision)), ("is", "waiting".into())];
+    let row = vec![("revision", TableCell::number(revision)), ("is", "waiting".into())];
     Ok(Answer::new(document, text).with_row(row))
 }
 
@@ -278,7 +278,7 @@ pub fn apply(client: &Client, trial: Trial) -> Result<Answer, Failure> {
         "revision {revision} runs on trial; it is taken back in {left:.0} s unless it is confirmed: \
          `confirm` keeps it, `rollback` takes it back at once\n"
     );
-    let row = vec![("revision", Cell::number(revision)), ("is", "on trial".into())];
+    let row = vec![("revision", TableCell::number(revision)), ("is", "on trial".into())];
     Ok(Answer::new(document, text).with_row(row))
 }
 
@@ -330,7 +330,7 @@ pub fn confirm(client: &Client) -> Result<Answer, Failure> {
     let reply = client.accepted(client.call(&Call::post("confirm", &json!({})))?)?;
     let document = client.document(&reply)?;
     let live = document["live"].as_u64().unwrap_or_default();
-    let row = vec![("revision", Cell::number(live)), ("is", "live".into())];
+    let row = vec![("revision", TableCell::number(live)), ("is", "live".into())];
     Ok(Answer::new(document, format!("revision {live} is live\n")).with_row(row))
 }
 
@@ -365,8 +365,9 @@ pub fn rollback(client: &Client, without: WithoutTrial) -> Result<Answer, Failur
         true => document,
         false => until(client, &is_there, &mut |_| false, revision)?,
     };
-    let row = vec![("revision", Cell::number(revision)), ("is", "live".into())];
-    let text = revisions_of(document.clone()).text(crate::table::View { width: None, is_terminal: false });
+    let row = vec![("revision", TableCell::number(revision)), ("is", "live".into())];
+    let text =
+        revisions_of(document.clone()).text(crate::table::TableView { width: None, is_terminal: false });
     Ok(Answer::new(document, format!("revision {revision} runs and is live\n\n{text}")).with_row(row))
 }
 

@@ -14,7 +14,7 @@ use serde_json::Value;
 
 use crate::address::Address;
 use crate::failure::Failure;
-use crate::http::{Event, Exchange, NoReply, Reply, Request, Stream, words};
+use crate::http::{HttpExchange, HttpReply, HttpRequest, NoReply, ServerEvent, Stream, words};
 use crate::shown;
 use crate::stop::Stop;
 
@@ -36,14 +36,14 @@ pub struct Client {
 
 /// What is sent with a request.
 #[derive(Debug, Clone, Copy)]
-pub(crate) enum Body<'a> {
+pub(crate) enum RequestBody<'a> {
     None,
     Json(&'a Value),
     Toml(&'a str),
     Image(&'a [u8]),
 }
 
-impl Body<'_> {
+impl RequestBody<'_> {
     fn bytes(&self) -> Vec<u8> {
         match self {
             Self::None => Vec::new(),
@@ -69,7 +69,7 @@ pub(crate) struct Call<'a> {
     pub(crate) method: &'static str,
     /// Behind [`API`], with its query.
     pub(crate) path: &'a str,
-    pub(crate) body: Body<'a>,
+    pub(crate) body: RequestBody<'a>,
     pub(crate) if_match: Option<&'a str>,
     /// Time in addition to that of every request: the gateway is replaced meanwhile.
     pub(crate) more_time: Duration,
@@ -77,11 +77,17 @@ pub(crate) struct Call<'a> {
 
 impl<'a> Call<'a> {
     pub(crate) const fn get(path: &'a str) -> Self {
-        Self { method: "GET", path, body: Body::None, if_match: None, more_time: Duration::ZERO }
+        Self { method: "GET", path, body: RequestBody::None, if_match: None, more_time: Duration::ZERO }
     }
 
     pub(crate) const fn post(path: &'a str, body: &'a Value) -> Self {
-        Self { method: "POST", path, body: Body::Json(body), if_match: None, more_time: Duration::ZERO }
+        Self {
+            method: "POST",
+            path,
+            body: RequestBody::Json(body),
+            if_match: None,
+            more_time: Duration::ZERO,
+        }
     }
 }
 
@@ -145,13 +151,13 @@ impl Client {
     }
 
     /// An answer to a plain read.
-    pub(crate) fn get(&self, path: &str) -> Result<Reply, Failure> {
+    pub(crate) fn get(&self, path: &str) -> Result<HttpReply, Failure> {
         let reply = self.call(&Call::get(path))?;
         self.accepted(reply)
     }
 
     /// The answer if it is none of a refusal.
-    pub(crate) fn accepted(&self, reply: Reply) -> Result<Reply, Failure> {
+    pub(crate) fn accepted(&self, reply: HttpReply) -> Result<HttpReply, Failure> {
         match reply.status() {
             200..=299 => Ok(reply),
             _ => Err(self.refusal(&reply)),
@@ -159,13 +165,13 @@ impl Client {
     }
 
     /// A body as JSON.
-    pub(crate) fn document(&self, reply: &Reply) -> Result<Value, Failure> {
+    pub(crate) fn document(&self, reply: &HttpReply) -> Result<Value, Failure> {
         serde_json::from_slice(&reply.body)
             .map_err(|_| self.refused("the answer is no JSON; is this a gateway?"))
     }
 
     /// A body as text.
-    pub(crate) fn text(&self, reply: Reply) -> Result<String, Failure> {
+    pub(crate) fn text(&self, reply: HttpReply) -> Result<String, Failure> {
         String::from_utf8(reply.body).map_err(|_| self.refused("the answer is no text; is this a gateway?"))
     }
 
@@ -174,12 +180,12 @@ impl Client {
         self.opened(self.open(path)?)
     }
 
-    fn open(&self, path: &str) -> Result<Exchange, Failure> {
+    fn open(&self, path: &str) -> Result<HttpExchange, Failure> {
         let call = Call::get(path);
         self.asked_again(&call, || self.exchange(&call))
     }
 
-    fn opened(&self, exchange: Exchange) -> Result<Events<'_>, Failure> {
+    fn opened(&self, exchange: HttpExchange) -> Result<Events<'_>, Failure> {
         if !(200..=299).contains(&exchange.status()) {
             let reply = exchange.finish().map_err(|error| self.no_reply(error))?;
             return Err(self.refusal(&reply));
@@ -198,7 +204,7 @@ impl Client {
     }
 
     /// Makes a request; any answer is one.
-    pub(crate) fn call(&self, call: &Call<'_>) -> Result<Reply, Failure> {
+    pub(crate) fn call(&self, call: &Call<'_>) -> Result<HttpReply, Failure> {
         self.asked_again(call, || Ok(self.exchange(call)?.finish()?))
     }
 
@@ -224,7 +230,7 @@ impl Client {
         }
     }
 
-    fn exchange(&self, call: &Call<'_>) -> Result<Exchange, Missed> {
+    fn exchange(&self, call: &Call<'_>) -> Result<HttpExchange, Missed> {
         let nonce = self.nonce.take();
         let is_kept = nonce.is_some();
         let nonce = match nonce {
@@ -257,7 +263,7 @@ impl Client {
         nonce.ok_or_else(|| self.refused("its nonce is none; is this a gateway?"))
     }
 
-    fn send(&self, call: &Call<'_>, nonce: Option<&str>) -> Result<Exchange, Missed> {
+    fn send(&self, call: &Call<'_>, nonce: Option<&str>) -> Result<HttpExchange, Missed> {
         let target = format!("{API}{}", call.path);
         let body = call.body.bytes();
         let mut fields = Vec::new();
@@ -276,7 +282,7 @@ impl Client {
             fields.push(("If-Match", etag.to_owned()));
         }
         let host = self.host.as_ref().map(Address::to_string);
-        let request = Request {
+        let request = HttpRequest {
             method: call.method,
             host: host.as_deref(),
             target: &target,
@@ -291,7 +297,7 @@ impl Client {
             }
             let mut may_be_full = false;
             for &place in &self.places {
-                match Exchange::start(place, &request, timeout, &self.stop) {
+                match HttpExchange::start(place, &request, timeout, &self.stop) {
                     // Nothing was sent, so another address of the name may be tried.
                     Err(NoReply::Unreached(error)) => {
                         may_be_full |= error.kind() == ErrorKind::ConnectionRefused && !is_here(place);
@@ -317,7 +323,7 @@ impl Client {
     }
 
     /// A refusal in words. A configuration that is wrong is a wrong file.
-    pub(crate) fn refusal(&self, reply: &Reply) -> Failure {
+    pub(crate) fn refusal(&self, reply: &HttpReply) -> Failure {
         let document: Value = serde_json::from_slice(&reply.body).unwrap_or_default();
         let status = reply.status();
         let said = match document["error"].as_str() {
@@ -393,7 +399,7 @@ pub(crate) struct Events<'a> {
 
 impl Events<'_> {
     /// The next event; `None` once the command shall end.
-    pub(crate) fn next(&mut self) -> Result<Option<Event>, Failure> {
+    pub(crate) fn next(&mut self) -> Result<Option<ServerEvent>, Failure> {
         match self.stream.event() {
             Ok(Some(event)) => Ok(Some(event)),
             Ok(None) => Err(self.client.refused("the gateway has ended the stream")),

@@ -19,7 +19,7 @@ use crate::client::Client;
 use crate::failure::Failure;
 use crate::frames::FramesDocument;
 use crate::shown;
-use crate::table::{Cell, Look, paint};
+use crate::table::{Look, TableCell, paint};
 
 /// `doctor`. Listens for `time` if the gateway does not say by itself what is wrong.
 ///
@@ -71,7 +71,7 @@ fn answer(findings: Vec<Value>) -> Answer {
     let found = if words.is_empty() { "nothing".to_owned() } else { words.join(", ") };
     let look = if is_well { Look::Well } else { Look::Wrong };
     let first = findings.first().and_then(|finding| finding["text"].as_str()).unwrap_or_default();
-    let row = vec![("found", Cell::of(found).look(look)), ("first", first.into())];
+    let row = vec![("found", TableCell::of(found).look(look)), ("first", first.into())];
     Answer::new(json!({ "findings": findings }), text).with_row(row).with_verdict(is_well)
 }
 

@@ -5,9 +5,9 @@ use std::time::{Duration, Instant};
 use serde_json::Value;
 
 use crate::answer::Answer;
-use crate::client::{Body, Call, Client};
+use crate::client::{Call, Client, RequestBody};
 use crate::failure::Failure;
-use crate::table::{Cell, facts};
+use crate::table::{TableCell, facts};
 
 /// When settings that are kept take effect.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -35,7 +35,7 @@ pub fn set(client: &Client, settings: &[u8], from: From) -> Result<Answer, Failu
         From::NextStart => ("edge", Duration::ZERO),
         From::Now => ("edge?restart=yes", RESTARTING),
     };
-    let call = Call { method: "PUT", path, body: Body::Image(settings), if_match: None, more_time };
+    let call = Call { method: "PUT", path, body: RequestBody::Image(settings), if_match: None, more_time };
     let document = client.document(&client.accepted(client.call(&call)?)?)?;
     match from {
         From::NextStart => Ok(answer(document)),
@@ -71,9 +71,9 @@ fn is_trying(document: &Value) -> bool {
 }
 
 fn answer(document: Value) -> Answer {
-    let word = |key: &str| document[key].as_str().map(Cell::of);
+    let word = |key: &str| document[key].as_str().map(TableCell::of);
     let count = |key: &str| document["counters"][key].as_u64();
-    let mut rows: Vec<(&'static str, Cell)> = Vec::new();
+    let mut rows: Vec<(&'static str, TableCell)> = Vec::new();
     rows.extend(word("state").map(|state| ("edge node", state)));
     rows.extend(word("why").map(|why| ("why", why)));
     rows.extend(word("broker").map(|broker| ("broker", broker)));
@@ -81,10 +81,10 @@ fn answer(document: Value) -> Answer {
     rows.extend(word("node").map(|node| ("name", node)));
     rows.extend(document["utc"].as_bool().map(|utc| ("UTC", if utc { "known" } else { "unknown" }.into())));
     rows.extend(word("time_server").map(|server| ("time server", server)));
-    rows.extend(document["bd_seq"].as_u64().map(|number| ("session", Cell::number(number))));
-    rows.extend(document["metrics"].as_u64().map(|count| ("metrics", Cell::number(count))));
+    rows.extend(document["bd_seq"].as_u64().map(|number| ("session", TableCell::number(number))));
+    rows.extend(document["metrics"].as_u64().map(|count| ("metrics", TableCell::number(count))));
     for (name, key) in [("messages", "data"), ("births", "births"), ("values lost", "lost")] {
-        rows.extend(count(key).map(|count| (name, Cell::number(count))));
+        rows.extend(count(key).map(|count| (name, TableCell::number(count))));
     }
     match document["next"].as_str() {
         Some("off") => rows.push(("next start", "it tells nothing".into())),

@@ -16,7 +16,7 @@ use serde_json::json;
 use crate::answer::Answer;
 use crate::failure::Failure;
 use crate::signing_key;
-use crate::table::{Cell, Look, Table, View, facts};
+use crate::table::{Look, TableCell, TableView, TextTable, facts};
 
 /// What an update is made of.
 #[derive(Debug, Clone)]
@@ -174,10 +174,10 @@ impl Update {
     ///
     /// # Errors
     /// The public key cannot be read.
-    pub fn inspect(&self, public: Option<&Path>, view: View) -> Result<Answer, Failure> {
+    pub fn inspect(&self, public: Option<&Path>, view: TableView) -> Result<Answer, Failure> {
         let key = public.map(signing_key::read_public).transpose()?;
         let links = self.links();
-        let mut table = Table::new(&["slot", "address", "bytes", "SHA-512", "contents", "signature"]);
+        let mut table = TextTable::new(&["slot", "address", "bytes", "SHA-512", "contents", "signature"]);
         let (mut is_well, mut rows) = (true, Vec::new());
         for link in &links {
             let contents = link.check();
@@ -204,7 +204,7 @@ impl Update {
             table.row([
                 slot.into(),
                 address.unwrap_or_else(|| "?".to_owned()).into(),
-                Cell::number(link.header.length()),
+                TableCell::number(link.header.length()),
                 digits[..16].into(),
                 looked(contents, "whole"),
                 looked(signature.to_owned(), "of this key"),
@@ -255,11 +255,11 @@ pub fn public_of(path: &Path) -> Result<PublicKey, Failure> {
     signing_key::read(path).map(|seed| PublicKey::of_seed(&seed.0))
 }
 
-fn looked(text: String, well: &str) -> Cell {
+fn looked(text: String, well: &str) -> TableCell {
     let look = match text.as_str() {
         "not checked" => Look::Doubtful,
         text if text == well => Look::Well,
         _ => Look::Wrong,
     };
-    Cell::of(text).look(look)
+    TableCell::of(text).look(look)
 }

@@ -18,7 +18,7 @@ use crate::client::Client;
 use crate::failure::{Failure, Verdict};
 use crate::key_file;
 use crate::stop::Stop;
-use crate::table::{Cell, Look, Table, View};
+use crate::table::{Look, TableCell, TableView, TextTable};
 
 /// Gateways that are asked at a time.
 pub const MAX_AT_ONCE: usize = 16;
@@ -87,10 +87,10 @@ pub struct Rollout {
 
 /// What became of a command at each gateway of an inventory.
 #[derive(Debug)]
-pub struct Outcomes(Vec<(String, Outcome)>);
+pub struct Outcomes(Vec<(String, MemberOutcome)>);
 
 #[derive(Debug)]
-enum Outcome {
+enum MemberOutcome {
     Answered(Box<Answer>),
     Failed(Failure),
     /// One before has failed, or somebody pressed Ctrl-C.
@@ -111,10 +111,10 @@ pub fn ask(
     for members in members.chunks(batch) {
         let is_over = stop.is_asked() || has_failed && rollout.is_some_and(|rollout| rollout.stop_on_failure);
         let found = match is_over {
-            true => members.iter().map(|_| Outcome::NotBegun).collect(),
+            true => members.iter().map(|_| MemberOutcome::NotBegun).collect(),
             false => ask_batch(members, timeout, stop, work),
         };
-        has_failed |= found.iter().any(|outcome| !matches!(outcome, Outcome::Answered(_)));
+        has_failed |= found.iter().any(|outcome| !matches!(outcome, MemberOutcome::Answered(_)));
         outcomes.extend(members.iter().map(|member| member.name.clone()).zip(found));
     }
     Outcomes(outcomes)
@@ -125,9 +125,10 @@ fn ask_batch(
     timeout: Duration,
     stop: &Stop,
     work: &(dyn Fn(&Client) -> Result<Answer, Failure> + Sync),
-) -> Vec<Outcome> {
+) -> Vec<MemberOutcome> {
     let next = AtomicUsize::new(0);
-    let found: Vec<Mutex<Outcome>> = members.iter().map(|_| Mutex::new(Outcome::NotBegun)).collect();
+    let found: Vec<Mutex<MemberOutcome>> =
+        members.iter().map(|_| Mutex::new(MemberOutcome::NotBegun)).collect();
     std::thread::scope(|scope| {
         for _ in 0..members.len().min(MAX_AT_ONCE) {
             scope.spawn(|| {
@@ -137,15 +138,16 @@ fn ask_batch(
                 {
                     let answer = member.client(timeout, stop.clone()).and_then(|client| work(&client));
                     let outcome = match answer {
-                        Ok(answer) => Outcome::Answered(Box::new(answer)),
-                        Err(failure) => Outcome::Failed(failure),
+                        Ok(answer) => MemberOutcome::Answered(Box::new(answer)),
+                        Err(failure) => MemberOutcome::Failed(failure),
                     };
                     *place.lock().unwrap_or_else(std::sync::PoisonError::into_inner) = outcome;
                 }
             });
         }
     });
-    let taken = |place: Mutex<Outcome>| place.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner);
+    let taken =
+        |place: Mutex<MemberOutcome>| place.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner);
     found.into_iter().map(taken).collect()
 }
 
@@ -155,47 +157,49 @@ impl Outcomes {
     /// # Errors
     /// If one has failed.
     pub fn verdict(&self) -> Result<Verdict, Failure> {
-        let failed = self.0.iter().filter(|(_, outcome)| !matches!(outcome, Outcome::Answered(_)));
+        let failed = self.0.iter().filter(|(_, outcome)| !matches!(outcome, MemberOutcome::Answered(_)));
         let names: Vec<_> = failed.map(|(name, _)| name.as_str()).collect();
         if !names.is_empty() {
             let (count, all) = (names.len(), self.0.len());
             return Err(Failure::refused(format!("{count} of {all} gateways failed: {}", names.join(", "))));
         }
-        let is_well = |(_, outcome): &(String, Outcome)| match outcome {
-            Outcome::Answered(answer) => answer.verdict() == Verdict::Well,
+        let is_well = |(_, outcome): &(String, MemberOutcome)| match outcome {
+            MemberOutcome::Answered(answer) => answer.verdict() == Verdict::Well,
             _ => false,
         };
         Ok(if self.0.iter().all(is_well) { Verdict::Well } else { Verdict::Trouble })
     }
 
     /// A table with a row for each.
-    pub fn table(&self, view: View) -> String {
+    pub fn table(&self, view: TableView) -> String {
         let headings: Vec<&str> = self
             .0
             .iter()
             .find_map(|(_, outcome)| match outcome {
-                Outcome::Answered(answer) => Some(answer.row.iter().map(|(name, _)| *name).collect()),
+                MemberOutcome::Answered(answer) => Some(answer.row.iter().map(|(name, _)| *name).collect()),
                 _ => None,
             })
             .unwrap_or_default();
-        let has_failures = self.0.iter().any(|(_, outcome)| !matches!(outcome, Outcome::Answered(_)));
+        let has_failures = self.0.iter().any(|(_, outcome)| !matches!(outcome, MemberOutcome::Answered(_)));
         let mut all = vec!["gateway"];
         all.extend(&headings);
         if has_failures {
             all.push("failure");
         }
-        let mut table = Table::new(&all);
+        let mut table = TextTable::new(&all);
         for (name, outcome) in &self.0 {
-            let mut cells = vec![Cell::of(name)];
+            let mut cells = vec![TableCell::of(name)];
             match outcome {
-                Outcome::Answered(answer) => cells.extend(answer.row.iter().map(|(_, cell)| cell.clone())),
+                MemberOutcome::Answered(answer) => {
+                    cells.extend(answer.row.iter().map(|(_, cell)| cell.clone()))
+                }
                 other => {
-                    cells.extend(headings.iter().map(|_| Cell::default()));
+                    cells.extend(headings.iter().map(|_| TableCell::default()));
                     let why = match other {
-                        Outcome::Failed(failure) => failure.message(),
+                        MemberOutcome::Failed(failure) => failure.message(),
                         _ => "not begun",
                     };
-                    cells.push(Cell::of(why).look(Look::Wrong));
+                    cells.push(TableCell::of(why).look(Look::Wrong));
                 }
             }
             table.row(cells);
@@ -204,13 +208,13 @@ impl Outcomes {
     }
 
     /// The whole answers, one below the other.
-    pub fn sections(&self, view: View) -> String {
+    pub fn sections(&self, view: TableView) -> String {
         let mut text = String::new();
         for (name, outcome) in &self.0 {
             let body = match outcome {
-                Outcome::Answered(answer) => answer.text(view),
-                Outcome::Failed(failure) => format!("{}\n", failure.message()),
-                Outcome::NotBegun => "not begun\n".into(),
+                MemberOutcome::Answered(answer) => answer.text(view),
+                MemberOutcome::Failed(failure) => format!("{}\n", failure.message()),
+                MemberOutcome::NotBegun => "not begun\n".into(),
             };
             text += &format!("== {}\n{body}\n", crate::shown::line(name));
         }
@@ -219,10 +223,10 @@ impl Outcomes {
 
     /// One document for all, on one line.
     pub fn json(&self) -> String {
-        let entry = |outcome: &Outcome| match outcome {
-            Outcome::Answered(answer) => json!({ "ok": true, "answer": answer.document }),
-            Outcome::Failed(failure) => json!({ "ok": false, "error": failure.message() }),
-            Outcome::NotBegun => json!({ "ok": false, "error": "not begun" }),
+        let entry = |outcome: &MemberOutcome| match outcome {
+            MemberOutcome::Answered(answer) => json!({ "ok": true, "answer": answer.document }),
+            MemberOutcome::Failed(failure) => json!({ "ok": false, "error": failure.message() }),
+            MemberOutcome::NotBegun => json!({ "ok": false, "error": "not begun" }),
         };
         let all: Map<String, Value> =
             self.0.iter().map(|(name, outcome)| (name.clone(), entry(outcome))).collect();

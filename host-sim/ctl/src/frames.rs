@@ -147,7 +147,7 @@ impl FrameDocument {
                 };
                 bytes.iter().fold(digits + "#", |text, byte| text + &format!("{byte:02X}"))
             }
-            None => recipe_doctor::Hex(&bytes).to_string(),
+            None => recipe_doctor::HexBytes(&bytes).to_string(),
         }
     }
 }

@@ -48,6 +48,6 @@ pub use fleet::{MAX_AT_ONCE, Member, Outcomes, Rollout, ask, members};
 pub use reading::{info, log, metrics, revisions, status, values};
 pub use recipe_update::Slot;
 pub use stop::Stop;
-pub use table::View;
+pub use table::TableView;
 pub use trace::{Names, trace};
 pub use watch::{Watched, clear, watch};

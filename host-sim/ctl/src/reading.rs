@@ -2,10 +2,10 @@
 
 use serde_json::{Value, json};
 
-use crate::answer::{Answer, Text};
+use crate::answer::{Answer, AnswerText};
 use crate::client::Client;
 use crate::failure::{Failure, Verdict};
-use crate::table::{Cell, Look, Table, View, facts};
+use crate::table::{Look, TableCell, TableView, TextTable, facts};
 
 /// `info`.
 ///
@@ -13,13 +13,13 @@ use crate::table::{Cell, Look, Table, View, facts};
 /// If it is refused or not reached.
 pub fn info(client: &Client) -> Result<Answer, Failure> {
     let document = client.json("info")?;
-    let word = |key: &str| document[key].as_str().map(Cell::of);
-    let mut rows: Vec<(&'static str, Cell)> = Vec::new();
+    let word = |key: &str| document[key].as_str().map(TableCell::of);
+    let mut rows: Vec<(&'static str, TableCell)> = Vec::new();
     rows.extend(word("name").map(|name| ("name", name)));
     rows.extend(word("role").map(|role| ("role", role)));
     rows.extend(word("version").map(|version| ("version", version)));
     rows.extend(document["uptime_s"].as_u64().map(|up| ("running for", time(up).into())));
-    rows.extend(document["revision"].as_u64().map(|number| ("revision", Cell::of(number.to_string()))));
+    rows.extend(document["revision"].as_u64().map(|number| ("revision", TableCell::of(number.to_string()))));
     let has = (document["has"]["rs485"].as_u64(), document["has"]["can"].as_u64());
     if let (Some(lines), Some(buses)) = has {
         rows.push(("has", format!("{lines} RS-485 ports, {buses} CAN ports").into()));
@@ -29,7 +29,7 @@ pub fn info(client: &Client) -> Result<Answer, Failure> {
     let mut ports: Vec<_> = places["ports"].as_object().into_iter().flatten().collect();
     ports.extend(document["ports"].as_object().into_iter().flatten());
     let mut text = facts(rows);
-    let mut table = Table::new(&["port", "place"]);
+    let mut table = TextTable::new(&["port", "place"]);
     for (name, place) in ports {
         table.row([name.as_str().into(), place.as_str().unwrap_or_default().into()]);
     }
@@ -45,16 +45,16 @@ pub fn info(client: &Client) -> Result<Answer, Failure> {
         ("role", cell("role")),
         ("version", cell("version")),
         ("running for", up.into()),
-        ("revision", Cell::number(revision)),
+        ("revision", TableCell::number(revision)),
     ];
     Ok(Answer::new(document.clone(), text).with_row(row))
 }
 
 /// Whether it takes changes, in words.
-fn changes(info: &Value) -> Cell {
+fn changes(info: &Value) -> TableCell {
     match (info["claimed"].as_bool(), info["claim_left_s"].as_f64(), info["can_be_changed"].as_bool()) {
         (Some(false), Some(left), _) => format!("it takes a key for {left:.0} s more").into(),
-        (Some(false), None, _) => Cell::of("none: it has no key; claim it").look(Look::Doubtful),
+        (Some(false), None, _) => TableCell::of("none: it has no key; claim it").look(Look::Doubtful),
         (Some(true), ..) | (None, _, Some(true)) => "with its key".into(),
         _ => "none: it has no key".into(),
     }
@@ -64,18 +64,18 @@ fn changes(info: &Value) -> Cell {
 ///
 /// # Errors
 /// If it is refused or not reached.
-pub fn status(client: &Client, view: View) -> Result<Answer, Failure> {
+pub fn status(client: &Client, view: TableView) -> Result<Answer, Failure> {
     Ok(status_of(client.json("status")?, view))
 }
 
 /// The status of this document.
-pub(crate) fn status_of(document: Value, view: View) -> Answer {
+pub(crate) fn status_of(document: Value, view: TableView) -> Answer {
     let health = document["health"].as_str().unwrap_or_default();
     // A simulated controller has none.
     let is_well = health.is_empty() || health == "running";
     let controller = controller(&document["controller"]);
     let look = if is_well { Look::Well } else { Look::Wrong };
-    let known = [("health", Cell::of(health).look(look)), ("controller", Cell::of(&controller))];
+    let known = [("health", TableCell::of(health).look(look)), ("controller", TableCell::of(&controller))];
     let mut text = facts(known.into_iter().filter(|(_, cell)| !cell.is_empty()));
     for table in [ports(&document), links(&document), latencies(&document)] {
         if !table.is_empty() {
@@ -89,10 +89,10 @@ pub(crate) fn status_of(document: Value, view: View) -> Answer {
         let all = document[key].as_object();
         let well = all.into_iter().flatten().filter(|(_, one)| good(one)).count();
         let look = if all.is_some_and(|all| all.len() == well) { Look::Plain } else { Look::Wrong };
-        Cell::of(format!("{well}/{}", all.map_or(0, serde_json::Map::len))).look(look)
+        TableCell::of(format!("{well}/{}", all.map_or(0, serde_json::Map::len))).look(look)
     };
     let row = vec![
-        ("health", Cell::of(health).look(look)),
+        ("health", TableCell::of(health).look(look)),
         ("ports", count("ports", &|port| port["state"] == "working")),
         ("links", count("links", &|link| is_up(link))),
         ("controller", controller.into()),
@@ -111,9 +111,9 @@ fn controller(controller: &Value) -> String {
     known.join(", ")
 }
 
-fn ports(document: &Value) -> Table {
+fn ports(document: &Value) -> TextTable {
     let headings = ["port", "state", "age", "in", "rejected", "out", "lost cycles", "last rejection"];
-    let mut table = Table::new(&headings);
+    let mut table = TextTable::new(&headings);
     for (name, port) in document["ports"].as_object().into_iter().flatten() {
         let counters = &port["counters"];
         // Those for other nodes of a CAN bus are none of ours, and a rejected field is no frame.
@@ -152,22 +152,22 @@ fn ports(document: &Value) -> Table {
         };
         table.row([
             name.as_str().into(),
-            Cell::of(state).look(look),
-            Cell::number(port["age_ms"].as_u64().map(millis).unwrap_or_default()),
+            TableCell::of(state).look(look),
+            TableCell::number(port["age_ms"].as_u64().map(millis).unwrap_or_default()),
             count(&counters["frames_in"]),
-            Cell::number(shown).look(if rejected + skipped > 0 { Look::Doubtful } else { Look::Plain }),
+            TableCell::number(shown).look(if rejected + skipped > 0 { Look::Doubtful } else { Look::Plain }),
             count(&counters["frames_out"]),
-            Cell::number(lost),
+            TableCell::number(lost),
             last.into(),
         ]);
     }
     table
 }
 
-fn links(document: &Value) -> Table {
-    let mut table = Table::new(&["link", "state", "connects", "sent", "received", "timeouts", "refused"]);
+fn links(document: &Value) -> TextTable {
+    let mut table = TextTable::new(&["link", "state", "connects", "sent", "received", "timeouts", "refused"]);
     for (name, link) in document["links"].as_object().into_iter().flatten() {
-        let state = Cell::of(link["state"].as_str().unwrap_or_default());
+        let state = TableCell::of(link["state"].as_str().unwrap_or_default());
         let counters = &link["counters"];
         table.row([
             name.as_str().into(),
@@ -182,8 +182,8 @@ fn links(document: &Value) -> Table {
     table
 }
 
-fn latencies(document: &Value) -> Table {
-    let mut table = Table::new(&["latency", "count", "median", "99 %", "longest"]);
+fn latencies(document: &Value) -> TextTable {
+    let mut table = TextTable::new(&["latency", "count", "median", "99 %", "longest"]);
     let names = [
         ("handed_over", "field frame to hand-over"),
         ("arrived", "field frame to arrival"),
@@ -193,7 +193,7 @@ fn latencies(document: &Value) -> Table {
     for (key, name) in names {
         let histogram = &document["latency"][key];
         if histogram["count"].as_u64().is_some_and(|count| count > 0) {
-            let time = |key: &str| Cell::number(histogram[key].as_u64().map(micros).unwrap_or_default());
+            let time = |key: &str| TableCell::number(histogram[key].as_u64().map(micros).unwrap_or_default());
             table.row([
                 name.into(),
                 count(&histogram["count"]),
@@ -210,12 +210,12 @@ fn latencies(document: &Value) -> Table {
 ///
 /// # Errors
 /// If it is refused or not reached.
-pub fn values(client: &Client, filters: &[String], view: View) -> Result<Answer, Failure> {
+pub fn values(client: &Client, filters: &[String], view: TableView) -> Result<Answer, Failure> {
     Ok(values_of(client.json("values")?, filters, view))
 }
 
 /// The variables of this document.
-pub(crate) fn values_of(mut document: Value, filters: &[String], view: View) -> Answer {
+pub(crate) fn values_of(mut document: Value, filters: &[String], view: TableView) -> Answer {
     let filters: Vec<_> = filters.iter().map(|filter| filter.to_lowercase()).collect();
     if let Some(values) = document.get_mut("values").and_then(Value::as_object_mut)
         && !filters.is_empty()
@@ -225,12 +225,12 @@ pub(crate) fn values_of(mut document: Value, filters: &[String], view: View) -> 
             filters.iter().any(|filter| name.contains(filter))
         });
     }
-    let mut table = Table::new(&["variable", "value", "age", "owner"]);
+    let mut table = TextTable::new(&["variable", "value", "age", "owner"]);
     for (name, known) in document["values"].as_object().into_iter().flatten() {
         table.row([
             name.as_str().into(),
-            Cell::number(number(&known["value"])),
-            Cell::number(known["age_ms"].as_u64().map(millis).unwrap_or_default()),
+            TableCell::number(number(&known["value"])),
+            TableCell::number(known["age_ms"].as_u64().map(millis).unwrap_or_default()),
             known["owner"].as_str().unwrap_or_default().into(),
         ]);
     }
@@ -239,7 +239,7 @@ pub(crate) fn values_of(mut document: Value, filters: &[String], view: View) -> 
         0 => "no variable is known\n".to_owned(),
         _ => table.show(view),
     };
-    Answer::new(document, text).with_row(vec![("known variables", Cell::number(known))])
+    Answer::new(document, text).with_row(vec![("known variables", TableCell::number(known))])
 }
 
 /// `metrics`.
@@ -259,7 +259,7 @@ pub fn log(client: &Client, lines: u32) -> Result<Answer, Failure> {
     let text = client.text(client.get(&format!("log?lines={lines}"))?)?;
     let lines: Vec<_> = text.lines().map(str::to_owned).collect();
     let row = vec![
-        ("lines", Cell::number(lines.len())),
+        ("lines", TableCell::number(lines.len())),
         ("newest", lines.last().cloned().unwrap_or_default().into()),
     ];
     let answer = text_answer("log", text);
@@ -269,8 +269,8 @@ pub fn log(client: &Client, lines: u32) -> Result<Answer, Failure> {
 fn text_answer(key: &str, text: String) -> Answer {
     Answer {
         document: json!({ key: text }),
-        row: vec![("bytes", Cell::number(text.len()))],
-        text: Text::Document(text),
+        row: vec![("bytes", TableCell::number(text.len()))],
+        text: AnswerText::Document(text),
         verdict: Verdict::Well,
     }
 }
@@ -287,7 +287,7 @@ pub fn revisions(client: &Client) -> Result<Answer, Failure> {
 pub(crate) fn revisions_of(document: Value) -> Answer {
     let number = |key: &str| document[key].as_u64();
     let trial = document["trial"]["revision"].as_u64();
-    let mut table = Table::new(&["revision", "is", "from", "stored"]);
+    let mut table = TextTable::new(&["revision", "is", "from", "stored"]);
     for entry in document["kept"].as_array().into_iter().flatten() {
         let Some(revision) = entry["revision"].as_u64() else { continue };
         let marks = [
@@ -304,7 +304,7 @@ pub(crate) fn revisions_of(document: Value) -> Answer {
             other => other.to_string(),
         });
         table.row([
-            Cell::number(revision),
+            TableCell::number(revision),
             marks.join(", ").into(),
             from.into(),
             stored(&entry["stored_at"]).into(),
@@ -324,13 +324,14 @@ pub(crate) fn revisions_of(document: Value) -> Answer {
     if let Some(failure) = document["failure"].as_str() {
         text += &format!("{}\n", crate::shown::line(failure));
     }
-    let cell = |value: Option<u64>| Cell::number(value.map(|value| value.to_string()).unwrap_or_default());
+    let cell =
+        |value: Option<u64>| TableCell::number(value.map(|value| value.to_string()).unwrap_or_default());
     let row = vec![
         ("running", cell(number("running"))),
         ("live", cell(number("live"))),
         ("on trial", cell(trial)),
         ("waiting", cell(number("waiting"))),
-        ("kept", Cell::number(document["kept"].as_array().map_or(0, Vec::len))),
+        ("kept", TableCell::number(document["kept"].as_array().map_or(0, Vec::len))),
     ];
     Answer::new(document, text).with_row(row)
 }
@@ -370,8 +371,8 @@ fn utc(seconds: u64) -> String {
     format!("{:04}-{month:02}-{date:02} {hour:02}:{minute:02}:{second:02} UTC", year + era * 400 + carry)
 }
 
-fn count(value: &Value) -> Cell {
-    Cell::number(value.as_u64().map(|count| count.to_string()).unwrap_or_default())
+fn count(value: &Value) -> TableCell {
+    TableCell::number(value.as_u64().map(|count| count.to_string()).unwrap_or_default())
 }
 
 /// A number as people read it.
@@ -410,7 +411,7 @@ fn time(seconds: u64) -> String {
     }
 }
 
-const ANY_WIDTH: View = View { width: None, is_terminal: false };
+const ANY_WIDTH: TableView = TableView { width: None, is_terminal: false };
 
 #[cfg(test)]
 mod tests {
@@ -431,7 +432,7 @@ mod tests {
 
     #[test]
     fn documents_of_any_shape_are_shown() {
-        let view = View { width: Some(80), is_terminal: true };
+        let view = TableView { width: Some(80), is_terminal: true };
         for document in [
             json!(null),
             json!([]),

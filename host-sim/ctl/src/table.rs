@@ -10,7 +10,7 @@ use crate::shown;
 
 /// How text is laid out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct View {
+pub struct TableView {
     /// Places in a line; `None` if lines may have any length.
     pub width: Option<usize>,
     /// Whether what is watched replaces what was there before.
@@ -29,14 +29,14 @@ pub(crate) enum Look {
 
 /// A cell.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Cell {
+pub(crate) struct TableCell {
     text: String,
     look: Look,
     /// At the right end of its column, as numbers are.
     is_number: bool,
 }
 
-impl Cell {
+impl TableCell {
     pub(crate) fn of(text: impl AsRef<str>) -> Self {
         Self { text: shown::line(text.as_ref()).into_owned(), ..Self::default() }
     }
@@ -55,13 +55,13 @@ impl Cell {
     }
 }
 
-impl From<&str> for Cell {
+impl From<&str> for TableCell {
     fn from(text: &str) -> Self {
         Self::of(text)
     }
 }
 
-impl From<String> for Cell {
+impl From<String> for TableCell {
     fn from(text: String) -> Self {
         Self::of(text)
     }
@@ -69,16 +69,16 @@ impl From<String> for Cell {
 
 /// Rows below a line of headings.
 #[derive(Debug, Clone)]
-pub(crate) struct Table {
-    rows: Vec<Vec<Cell>>,
+pub(crate) struct TextTable {
+    rows: Vec<Vec<TableCell>>,
 }
 
-impl Table {
+impl TextTable {
     pub(crate) fn new(headings: &[&str]) -> Self {
         Self { rows: vec![headings.iter().map(|&heading| heading.into()).collect()] }
     }
 
-    pub(crate) fn row(&mut self, cells: impl IntoIterator<Item = Cell>) {
+    pub(crate) fn row(&mut self, cells: impl IntoIterator<Item = TableCell>) {
         self.rows.push(cells.into_iter().collect());
     }
 
@@ -88,7 +88,7 @@ impl Table {
     }
 
     /// The lines. What has no room in the last column is cut.
-    pub(crate) fn show(&self, view: View) -> String {
+    pub(crate) fn show(&self, view: TableView) -> String {
         let columns = self.rows.iter().map(Vec::len).max().unwrap_or(0);
         let width = |column: usize| {
             self.rows.iter().filter_map(|row| row.get(column)).map(|cell| shown::width(&cell.text)).max()
@@ -130,7 +130,7 @@ impl Table {
 }
 
 /// Lines `name  value`.
-pub(crate) fn facts(rows: impl IntoIterator<Item = (&'static str, Cell)>) -> String {
+pub(crate) fn facts(rows: impl IntoIterator<Item = (&'static str, TableCell)>) -> String {
     let rows: Vec<_> = rows.into_iter().collect();
     let width = rows.iter().map(|(name, _)| name.len()).max().unwrap_or(0);
     let mut text = String::new();
@@ -173,10 +173,10 @@ mod tests {
 
     #[test]
     fn columns_are_aligned_and_the_last_one_is_cut() {
-        let mut table = Table::new(&["port", "frames", "state"]);
-        table.row(["力觉".into(), Cell::number(1_234), Cell::of("working").look(Look::Well)]);
-        table.row([Cell::of("rs485-1\u{1b}"), Cell::number(7), "no frame since 12:00".into()]);
-        let text = table.show(View { width: Some(40), is_terminal: true });
+        let mut table = TextTable::new(&["port", "frames", "state"]);
+        table.row(["力觉".into(), TableCell::number(1_234), TableCell::of("working").look(Look::Well)]);
+        table.row([TableCell::of("rs485-1\u{1b}"), TableCell::number(7), "no frame since 12:00".into()]);
+        let text = table.show(TableView { width: Some(40), is_terminal: true });
         let lines: Vec<_> = text.lines().collect();
         assert_eq!(lines[0], "port           frames  state");
         assert_eq!(lines[1], "力觉             1234  \u{1b}[32mworking\u{1b}[0m");

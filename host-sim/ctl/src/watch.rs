@@ -8,7 +8,7 @@ use crate::answer::Answer;
 use crate::client::Client;
 use crate::failure::Failure;
 use crate::reading::{status_of, values_of};
-use crate::table::View;
+use crate::table::TableView;
 
 /// What is watched.
 #[derive(Debug, Clone)]
@@ -28,7 +28,7 @@ pub fn watch(
     client: &Client,
     what: &Watched,
     json: bool,
-    view: View,
+    view: TableView,
     out: &mut dyn Write,
 ) -> Result<(), Failure> {
     let mut events = client.stream("stream")?;
@@ -51,7 +51,7 @@ pub fn watch(
     Ok(())
 }
 
-fn print(answer: &Answer, json: bool, view: View, out: &mut dyn Write) -> Result<(), Failure> {
+fn print(answer: &Answer, json: bool, view: TableView, out: &mut dyn Write) -> Result<(), Failure> {
     if json {
         out.write_all(answer.json().as_bytes())?;
     } else if view.is_terminal {
@@ -69,7 +69,7 @@ fn print(answer: &Answer, json: bool, view: View, out: &mut dyn Write) -> Result
 ///
 /// # Errors
 /// If nothing more can be printed.
-pub fn clear(view: View, out: &mut dyn Write) -> Result<(), Failure> {
+pub fn clear(view: TableView, out: &mut dyn Write) -> Result<(), Failure> {
     if view.is_terminal {
         write!(out, "\x1b[2J")?;
     }

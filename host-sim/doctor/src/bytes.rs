@@ -4,9 +4,9 @@ use std::fmt;
 
 /// Bytes in hexadecimal, such as `48 AA`, as `host-sim decode` takes them.
 #[derive(Debug, Clone, Copy)]
-pub struct Hex<'a>(pub &'a [u8]);
+pub struct HexBytes<'a>(pub &'a [u8]);
 
-impl fmt::Display for Hex<'_> {
+impl fmt::Display for HexBytes<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         for (nth, byte) in self.0.iter().enumerate() {
             let space = if nth == 0 { "" } else { " " };
@@ -16,7 +16,7 @@ impl fmt::Display for Hex<'_> {
     }
 }
 
-/// The bytes of [`Hex`], with spaces or without; `None` if the text is anything else.
+/// The bytes of [`HexBytes`], with spaces or without; `None` if the text is anything else.
 pub(crate) fn from_hex(text: &str) -> Option<Vec<u8>> {
     let digits: Option<Vec<u8>> =
         text.chars().filter(|c| *c != ' ').map(|c| c.to_digit(16).map(|digit| digit as u8)).collect();

@@ -6,11 +6,11 @@ use proto_core::sysvar::Direction;
 use proto_core::wire::can::CanId;
 
 use crate::finding::{Cause, Finding, Severity};
-use crate::port::Seen;
+use crate::port::PortCase;
 use crate::record::SeenId;
 
 /// Looks at the bus and at what came on it.
-pub(crate) fn examine(seen: &Seen<'_>, state: BusState, findings: &mut Vec<Finding>) {
+pub(crate) fn examine(seen: &PortCase<'_>, state: BusState, findings: &mut Vec<Finding>) {
     match state {
         BusState::BusOff => {
             findings.push(bus(seen, Cause::BusOff, "the CAN controller is bus-off"));
@@ -59,7 +59,7 @@ pub(crate) fn examine(seen: &Seen<'_>, state: BusState, findings: &mut Vec<Findi
     }
 }
 
-fn bus(seen: &Seen<'_>, cause: Cause, what: &str) -> Finding {
+fn bus(seen: &PortCase<'_>, cause: Cause, what: &str) -> Finding {
     let bitrate = bitrate(seen);
     seen.found(Severity::Fault, cause, [
         what.into(),
@@ -71,7 +71,7 @@ fn bus(seen: &Seen<'_>, cause: Cause, what: &str) -> Finding {
     ])
 }
 
-fn bitrate(seen: &Seen<'_>) -> u32 {
+fn bitrate(seen: &PortCase<'_>) -> u32 {
     match seen.port.bus {
         Bus::Can { bitrate } => bitrate,
         _ => 0,
@@ -85,7 +85,7 @@ fn words(ids: &[CanId]) -> String {
 }
 
 /// Ids that nobody knows, the most frequent first.
-fn ids(seen: &Seen<'_>, mut foreign: Vec<&SeenId>, recipe_ids: &[CanId]) -> Finding {
+fn ids(seen: &PortCase<'_>, mut foreign: Vec<&SeenId>, recipe_ids: &[CanId]) -> Finding {
     foreign.sort_by_key(|one| std::cmp::Reverse(one.count()));
     let shown: Vec<_> =
         foreign.iter().take(4).map(|one| format!("id {} seen {} times", one.id, one.count())).collect();
@@ -114,7 +114,7 @@ fn other_kind<'a>(foreign: &[&'a SeenId], recipe_ids: &[CanId]) -> Option<(&'a S
 }
 
 /// Frames of the right id and another length.
-fn length(seen: &Seen<'_>, recipe_ids: &[CanId]) -> Option<Finding> {
+fn length(seen: &PortCase<'_>, recipe_ids: &[CanId]) -> Option<Finding> {
     let one = seen.record.ids().iter().find(|one| recipe_ids.contains(&one.id))?;
     let Parts::Can { input, .. } = &seen.recipe.parts else { return None };
     let frame = input.iter().find(|frame| frame.id == one.id)?;
@@ -137,7 +137,7 @@ fn length(seen: &Seen<'_>, recipe_ids: &[CanId]) -> Option<Finding> {
     ))
 }
 
-fn nothing(seen: &Seen<'_>, recipe_ids: &[CanId]) -> Finding {
+fn nothing(seen: &PortCase<'_>, recipe_ids: &[CanId]) -> Finding {
     let severity = if seen.status.age.is_some() { Severity::Fault } else { Severity::Warning };
     let seconds = seen.status.age.unwrap_or(seen.case.running).as_millis() / 1000;
     if seen.record.fd_frames > 0 {

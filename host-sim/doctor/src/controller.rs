@@ -7,7 +7,7 @@ use proto_core::time::Duration;
 use proto_core::wire::state::{OperationMode, ProgramState, RobotState, SafetyState, States};
 
 use crate::Case;
-use crate::finding::{Cause, Finding, Place, Severity, finding};
+use crate::finding::{Cause, Finding, FindingPlace, Severity, finding};
 use crate::given::is_command;
 use crate::record::PortRecord;
 use crate::state::Port;
@@ -25,7 +25,7 @@ pub(crate) fn examine(case: &Case<'_>, findings: &mut Vec<Finding>) {
     if let Some(states) = states
         && let Some((cause, seen, likely, remedy)) = refusal(&states)
     {
-        let place = Place::Controller;
+        let place = FindingPlace::Controller;
         let expected = "remote or automatic mode, powered and enabled: the file has commands";
         findings.push(finding((Severity::Warning, &place, cause), seen, expected, likely, remedy));
     }
@@ -43,7 +43,7 @@ pub fn has_commands(config: ConfigView<'_>) -> bool {
 
 /// The newest command of a port, if something became of it that was not meant.
 fn command(case: &Case<'_>, port: &Port) -> Option<Finding> {
-    let place = Place::Port(port.name.clone());
+    let place = FindingPlace::Port(port.name.clone());
     let given = port.command.clone().unwrap_or_else(|| "a command".to_owned());
     let found = |severity, cause, [seen, expected, likely, remedy]: [String; 4]| {
         Some(finding((severity, &place, cause), seen, expected, likely, remedy))
@@ -107,7 +107,7 @@ fn command(case: &Case<'_>, port: &Port) -> Option<Finding> {
     }
 }
 
-fn failed(case: &Case<'_>, port: &Port, place: &Place) -> Option<Finding> {
+fn failed(case: &Case<'_>, port: &Port, place: &FindingPlace) -> Option<Finding> {
     let last = port.failed.as_ref().filter(|last| last.age < TOLD_FOR)?;
     let (command, age) = (last.command.as_str(), ago(last.age));
     let word = Request::parse(command.as_bytes()).map_or(command, |request| request.keyword().word());

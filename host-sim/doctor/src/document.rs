@@ -19,7 +19,7 @@ use serde::de::IntoDeserializer;
 use serde::de::value::{Error, StrDeserializer};
 
 use crate::bytes::from_hex;
-use crate::state::{Failed, Link, OtherText, Peer, Port, Rejected, State, Withheld};
+use crate::state::{FailedCommand, Link, OtherText, Peer, Port, Rejected, State, Withheld};
 
 /// The document `status`.
 #[derive(Debug, Clone, Deserialize)]
@@ -224,7 +224,7 @@ impl PortDocument {
                 value: last.value,
                 age: Duration::from_millis(last.age_ms),
             }),
-            failed: self.last_failed.as_ref().map(|failed| Failed {
+            failed: self.last_failed.as_ref().map(|failed| FailedCommand {
                 command: failed.command.clone(),
                 age: Duration::from_millis(failed.age_ms),
                 controller: failed.controller.as_ref().map(ControllerDocument::states),

@@ -31,7 +31,7 @@ impl Severity {
 
 /// What a finding is about.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Place {
+pub enum FindingPlace {
     /// The field port of this name.
     Port(String),
     /// The link of this name.
@@ -40,7 +40,7 @@ pub enum Place {
     Controller,
 }
 
-impl fmt::Display for Place {
+impl fmt::Display for FindingPlace {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Port(name) => write!(f, "port {name}"),
@@ -184,7 +184,7 @@ pub struct Finding {
     /// How much it matters.
     pub severity: Severity,
     /// What it is about.
-    pub place: Place,
+    pub place: FindingPlace,
     /// The likely cause, for programs.
     pub cause: Cause,
     /// What is seen, such as `175 bytes, 0 frames; first seen AA 48`.
@@ -210,9 +210,9 @@ impl fmt::Display for Finding {
 impl Serialize for Finding {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let (kind, name) = match &self.place {
-            Place::Port(name) => ("port", name.as_str()),
-            Place::Link(name) => ("link", name.as_str()),
-            Place::Controller => ("controller", ""),
+            FindingPlace::Port(name) => ("port", name.as_str()),
+            FindingPlace::Link(name) => ("link", name.as_str()),
+            FindingPlace::Controller => ("controller", ""),
         };
         let mut map = serializer.serialize_map(None)?;
         map.serialize_entry("severity", self.severity.name())?;
@@ -232,7 +232,7 @@ impl Serialize for Finding {
 
 /// Makes a finding.
 pub(crate) fn finding(
-    (severity, place, cause): (Severity, &Place, Cause),
+    (severity, place, cause): (Severity, &FindingPlace, Cause),
     seen: impl Into<String>,
     expected: impl Into<String>,
     likely: impl Into<String>,

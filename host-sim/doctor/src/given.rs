@@ -7,11 +7,11 @@ use proto_core::sysvar::Direction;
 use crate::bytes::count;
 use crate::controller::{TOLD_FOR, ago};
 use crate::finding::{Cause, Finding, Severity};
-use crate::port::Seen;
+use crate::port::PortCase;
 use crate::state::Withheld;
 
 /// Looks at a port whose device gives commands.
-pub(crate) fn examine(seen: &Seen<'_>, findings: &mut Vec<Finding>) {
+pub(crate) fn examine(seen: &PortCase<'_>, findings: &mut Vec<Finding>) {
     if !gives_commands(seen.case.config, seen.recipe) {
         return;
     }
@@ -35,7 +35,7 @@ pub(crate) fn is_command(field: &FieldSpec) -> bool {
 }
 
 /// A value that should have been a command, and picked none.
-fn no_command(seen: &Seen<'_>, withheld: &Withheld) -> Option<Finding> {
+fn no_command(seen: &PortCase<'_>, withheld: &Withheld) -> Option<Finding> {
     let &Withheld { why, value, age, .. } = withheld;
     // A command since then shows that the device is understood.
     let given = seen.record.newest_command().map(|at| seen.case.status.at.saturating_since(at));
@@ -71,7 +71,7 @@ fn no_command(seen: &Seen<'_>, withheld: &Withheld) -> Option<Finding> {
 }
 
 /// Input that was discarded because the gateway itself slept.
-fn slept(seen: &Seen<'_>) -> Option<Finding> {
+fn slept(seen: &PortCase<'_>) -> Option<Finding> {
     let last = seen.status.rejection.as_ref();
     let last = last.filter(|last| last.why == Rejection::Asleep && last.age < TOLD_FOR);
     let counted = seen.counters.asleep as usize;

@@ -30,10 +30,10 @@ use proto_core::config::ConfigView;
 use proto_core::time::Duration;
 use proto_core::wire::state::States;
 
-pub use bytes::Hex;
+pub use bytes::HexBytes;
 pub use controller::has_commands;
 pub use document::StatusDocument;
-pub use finding::{Cause, FILE, Finding, Place, Severity};
+pub use finding::{Cause, FILE, Finding, FindingPlace, Severity};
 pub use record::{KEPT, LinkFacts, PortRecord, Reach, WINDOW};
 pub use state::State;
 pub use watch::{Change, Watch};

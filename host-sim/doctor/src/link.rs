@@ -4,7 +4,7 @@ use proto_core::config::Parts;
 use proto_core::engine::{LinkKind, Transport};
 
 use crate::Case;
-use crate::finding::{Cause, Finding, Place, Severity, finding};
+use crate::finding::{Cause, Finding, FindingPlace, Severity, finding};
 use crate::record::{LinkFacts, Reach};
 use crate::state;
 
@@ -16,21 +16,21 @@ pub(crate) fn examine(case: &Case<'_>, findings: &mut Vec<Finding>) {
             continue;
         }
         let facts = case.links.iter().find(|facts| facts.link == info.id);
-        let place = Place::Link(info.name.clone());
-        let link = Link { case, info, facts, place };
+        let place = FindingPlace::Link(info.name.clone());
+        let link = LinkCase { case, info, facts, place };
         findings.extend(link.finding());
         findings.extend(link.strangers());
     }
 }
 
-struct Link<'a> {
+struct LinkCase<'a> {
     case: &'a Case<'a>,
     info: &'a state::Link,
     facts: Option<&'a LinkFacts>,
-    place: Place,
+    place: FindingPlace,
 }
 
-impl Link<'_> {
+impl LinkCase<'_> {
     fn found(
         &self,
         severity: Severity,

@@ -5,13 +5,13 @@ use proto_core::device::{Algorithm, ByteOrder};
 use proto_core::modbus::Exception;
 use proto_core::schedule::Presence;
 
-use crate::bytes::{Hex, count};
+use crate::bytes::{HexBytes, count};
 use crate::finding::{Cause, Finding, Severity};
-use crate::port::Seen;
+use crate::port::PortCase;
 use crate::state::Peer;
 
 /// Looks at each peer.
-pub(crate) fn examine(seen: &Seen<'_>, findings: &mut Vec<Finding>) {
+pub(crate) fn examine(seen: &PortCase<'_>, findings: &mut Vec<Finding>) {
     let exchanges = seen.case.config.exchanges_of(seen.recipe);
     let is_served =
         exchanges.iter().any(|exchange| matches!(exchange.transaction, Transaction::Served { .. }));
@@ -37,7 +37,7 @@ fn name(peer: Peer, is_modbus: bool) -> String {
     format!("{word} {}", peer.number)
 }
 
-fn silent(seen: &Seen<'_>, peer: Peer, is_modbus: bool) -> Finding {
+fn silent(seen: &PortCase<'_>, peer: Peer, is_modbus: bool) -> Finding {
     let who = name(peer, is_modbus);
     let asked =
         format!("{who} asked {} times, {} good replies", peer.counters.requests, peer.counters.replies);
@@ -64,7 +64,11 @@ fn silent(seen: &Seen<'_>, peer: Peer, is_modbus: bool) -> Finding {
             return fault(
                 Cause::PeerOther,
                 [
-                    format!("{asked}; a right frame of slave {} is heard: {}", frame[0], Hex(shown(frame))),
+                    format!(
+                        "{asked}; a right frame of slave {} is heard: {}",
+                        frame[0],
+                        HexBytes(shown(frame))
+                    ),
                     expected,
                     "The slave has another address".into(),
                     format!(
@@ -97,7 +101,7 @@ fn silent(seen: &Seen<'_>, peer: Peer, is_modbus: bool) -> Finding {
                 format!(
                     "{asked}; {} heard: {}",
                     count(seen.counters.bytes_in as usize, "byte"),
-                    Hex(shown(&bytes))
+                    HexBytes(shown(&bytes))
                 ),
                 expected,
                 "Something answers, and no reply is right: baud rate, parity, address or protocol".into(),
@@ -117,7 +121,7 @@ fn silent(seen: &Seen<'_>, peer: Peer, is_modbus: bool) -> Finding {
     )
 }
 
-fn noise(seen: &Seen<'_>, peer: Peer) -> Finding {
+fn noise(seen: &PortCase<'_>, peer: Peer) -> Finding {
     seen.found(
         Severity::Fault,
         Cause::ChecksumWrong,
@@ -133,7 +137,7 @@ fn noise(seen: &Seen<'_>, peer: Peer) -> Finding {
     )
 }
 
-fn refuses(seen: &Seen<'_>, peer: Peer, is_modbus: bool) -> Finding {
+fn refuses(seen: &PortCase<'_>, peer: Peer, is_modbus: bool) -> Finding {
     let why = match (is_modbus, peer.counters.refusal) {
         (true, code) if code > 0 => format!(": {} (code {code})", Exception::from_code(code)),
         _ => String::new(),
@@ -157,7 +161,7 @@ fn refuses(seen: &Seen<'_>, peer: Peer, is_modbus: bool) -> Finding {
 }
 
 /// The gateway is the slave.
-fn served(seen: &Seen<'_>, exchanges: &[Exchange], findings: &mut Vec<Finding>) {
+fn served(seen: &PortCase<'_>, exchanges: &[Exchange], findings: &mut Vec<Finding>) {
     let Some(own) = exchanges.first().map(|exchange| exchange.peer) else { return };
     if seen.counters.frames_in > 0 || !seen.is_silent() {
         return;
@@ -169,7 +173,7 @@ fn served(seen: &Seen<'_>, exchanges: &[Exchange], findings: &mut Vec<Finding>) 
             Severity::Fault,
             Cause::PeerOther,
             [
-                format!("requests to slave {}: {}", frame[0], Hex(shown(frame))),
+                format!("requests to slave {}: {}", frame[0], HexBytes(shown(frame))),
                 format!("requests to slave {own}"),
                 "The master asks another address".into(),
                 format!("Let the master ask slave {own}, or write slave = {} in the recipe", frame[0]),

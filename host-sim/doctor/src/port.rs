@@ -4,9 +4,9 @@ use proto_core::config::{Bus, Parity, Port, Recipe};
 use proto_core::engine::{FieldBus, PortCounters, PortId, PortState, Rejection};
 use proto_core::recipe::model::Mode;
 
-use crate::bytes::{Hex, count, list};
+use crate::bytes::{HexBytes, count, list};
 use crate::controller::{TOLD_FOR, ago};
-use crate::finding::{Cause, FILE, Finding, Place, Severity, finding};
+use crate::finding::{Cause, FILE, Finding, FindingPlace, Severity, finding};
 use crate::record::{PortRecord, WINDOW};
 use crate::shape::Shape;
 use crate::state;
@@ -20,11 +20,11 @@ pub(crate) fn examine(case: &Case<'_>, findings: &mut Vec<Finding>) {
         let Some((_, port, recipe)) = found else { continue };
         let empty = PortRecord::new(status.id);
         let record = case.ports.iter().find(|record| record.port == status.id).unwrap_or(&empty);
-        let seen = Seen {
+        let seen = PortCase {
             case,
             port,
             recipe,
-            place: Place::Port(status.name.clone()),
+            place: FindingPlace::Port(status.name.clone()),
             counters: since(&status.counters, &record.counters_before(case.status.at)),
             record,
             status,
@@ -34,11 +34,11 @@ pub(crate) fn examine(case: &Case<'_>, findings: &mut Vec<Finding>) {
 }
 
 /// A port and what was seen of it in the window.
-pub(crate) struct Seen<'a> {
+pub(crate) struct PortCase<'a> {
     pub(crate) case: &'a Case<'a>,
     pub(crate) port: &'a Port,
     pub(crate) recipe: &'a Recipe,
-    pub(crate) place: Place,
+    pub(crate) place: FindingPlace,
     pub(crate) status: &'a state::Port,
     pub(crate) record: &'a PortRecord,
     /// Counted within the window.
@@ -59,7 +59,7 @@ fn since(now: &PortCounters, before: &PortCounters) -> PortCounters {
     counters
 }
 
-impl Seen<'_> {
+impl PortCase<'_> {
     fn examine(&self, findings: &mut Vec<Finding>) {
         if self.status.state == PortState::Gone {
             findings.push(self.gone());
@@ -164,7 +164,7 @@ impl Seen<'_> {
         };
         let expected = match shape.head {
             [] => "frames".to_owned(),
-            head => format!("frames that begin with {}", Hex(head)),
+            head => format!("frames that begin with {}", HexBytes(head)),
         };
         self.found(
             severity,
@@ -187,7 +187,7 @@ impl Seen<'_> {
             Severity::Warning,
             Cause::NoInput,
             [
-                format!("{}; first seen {}", self.came(), Hex(first(&bytes))),
+                format!("{}; first seen {}", self.came(), HexBytes(first(&bytes))),
                 "nothing: the recipe has no input part".into(),
                 "The device sends, and nobody listens".into(),
                 "Add [recipe.input] to the recipe, or assign another recipe to the port".into(),
@@ -251,8 +251,8 @@ impl Seen<'_> {
             return Some(self.bad_value(shape, bytes, format!("{values} frames rejected")));
         }
         if self.are_many(counters.rejected_fields) {
-            let told = format!("{} fields of frames rejected", counters.rejected_fields);
-            return Some(self.bad_value(shape, bytes, told));
+            let text = format!("{} fields of frames rejected", counters.rejected_fields);
+            return Some(self.bad_value(shape, bytes, text));
         }
         None
     }
@@ -287,7 +287,7 @@ impl Seen<'_> {
             name if name.chars().all(|c| c.is_ascii_alphanumeric() || "-_.".contains(c)) => name.to_owned(),
             name => format!("{name:?}"),
         };
-        let command = format!("host-sim decode {FILE} --recipe {name} --part input {}", Hex(&frame));
+        let command = format!("host-sim decode {FILE} --recipe {name} --part input {}", HexBytes(&frame));
         self.found(
             Severity::Fault,
             Cause::BadValue,
@@ -316,8 +316,8 @@ impl Seen<'_> {
         });
         let (seen, expected) = match differs {
             Some((constant, seen)) => (
-                format!("{} in byte {}", Hex(seen), constant.at + 1),
-                format!("{} there", Hex(&constant.bytes)),
+                format!("{} in byte {}", HexBytes(seen), constant.at + 1),
+                format!("{} there", HexBytes(&constant.bytes)),
             ),
             None => ("another constant".into(), "that of the recipe".into()),
         };
@@ -368,7 +368,7 @@ impl Seen<'_> {
         }
         let fault = |cause, words| Some(self.found(Severity::Fault, cause, words));
         let came = self.came();
-        let hex = |bytes: &[u8]| Hex(bytes).to_string();
+        let hex = |bytes: &[u8]| HexBytes(bytes).to_string();
         let whole = shape.len.map_or(String::new(), |len| format!("frames of {len} bytes, "));
         let Some(fit) = stream::fit(shape, bytes) else { return self.broken_off(shape) };
         match fit {
@@ -450,9 +450,9 @@ impl Seen<'_> {
         };
         let expected = match shape.tail {
             [] => format!("frames of {whole} bytes without a pause"),
-            tail => format!("frames of {whole} bytes without a pause, which end with {}", Hex(tail)),
+            tail => format!("frames of {whole} bytes without a pause, which end with {}", HexBytes(tail)),
         };
-        let (age, bytes) = (ago(last.age), Hex(first(&last.bytes)));
+        let (age, bytes) = (ago(last.age), HexBytes(first(&last.bytes)));
         Some(self.found(
             Severity::Warning,
             Cause::BrokenOff,
@@ -499,10 +499,10 @@ impl Seen<'_> {
             "Bytes arrive, no head: baud rate or parity, or another protocol"
         };
         [
-            format!("{came}; first seen {}; {high} % of the bytes above 7F", Hex(first(bytes))),
+            format!("{came}; first seen {}; {high} % of the bytes above 7F", HexBytes(first(bytes))),
             match shape.head {
-                [] => format!("the tail {}", Hex(shape.tail)),
-                head => format!("the head {}", Hex(head)),
+                [] => format!("the tail {}", HexBytes(shape.tail)),
+                head => format!("the head {}", HexBytes(head)),
             },
             likely.into(),
             format!("Compare baud rate, parity and stop bits with the device's; the port has {settings}"),
@@ -539,7 +539,7 @@ fn first(bytes: &[u8]) -> &[u8] {
     &bytes[..bytes.len().min(SHOWN)]
 }
 
-/// Number of bytes that are shown.
+/// NumberField of bytes that are shown.
 const SHOWN: usize = 12;
 /// Silence that is worth a word.
 const NOTHING_FOR: proto_core::time::Duration = proto_core::time::Duration::from_secs(3);

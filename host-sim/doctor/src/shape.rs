@@ -17,7 +17,7 @@ pub(crate) struct Shape<'c> {
     /// What tells frames apart, if their fields do not.
     pub(crate) boundary: Boundary,
     pub(crate) escape: Option<Escape>,
-    pub(crate) floats: Vec<Number>,
+    pub(crate) floats: Vec<NumberField>,
     pub(crate) constants: Vec<Constant>,
     /// The frame of a device, with its fields; `None` for a recipe as the controller has it.
     pub(crate) device: Option<(DeviceFrame, &'c [FieldSpec], Carrier)>,
@@ -25,7 +25,7 @@ pub(crate) struct Shape<'c> {
 
 /// A number at a fixed place.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Number {
+pub(crate) struct NumberField {
     pub(crate) at: usize,
     pub(crate) size: usize,
     pub(crate) order: ByteOrder,
@@ -74,7 +74,7 @@ impl<'c> Shape<'c> {
 
     fn add_number(&mut self, at: usize, ty: ScalarType, order: ByteOrder) {
         if matches!(ty, ScalarType::Float | ScalarType::Double) {
-            self.floats.push(Number { at, size: ty.size(), order });
+            self.floats.push(NumberField { at, size: ty.size(), order });
         }
     }
 

@@ -27,14 +27,14 @@ pub(crate) struct Port {
     pub(crate) bus: FieldBus,
     pub(crate) state: PortState,
     pub(crate) age: Option<Duration>,
-    /// Number of its input frames that are overdue or have never come.
+    /// NumberField of its input frames that are overdue or have never come.
     pub(crate) overdue: usize,
     pub(crate) reply: ReplyCode,
     /// The newest command that one of its values picked, such as `run(pick.jspf)`.
     pub(crate) command: Option<String>,
     /// The newest value that gave no command.
     pub(crate) not_given: Option<Withheld>,
-    pub(crate) failed: Option<Failed>,
+    pub(crate) failed: Option<FailedCommand>,
     pub(crate) rejection: Option<Rejected>,
     pub(crate) counters: PortCounters,
     pub(crate) peers: Vec<Peer>,
@@ -54,7 +54,7 @@ pub(crate) struct Withheld {
 
 /// A command that the controller replied to with a failure.
 #[derive(Debug, Clone)]
-pub(crate) struct Failed {
+pub(crate) struct FailedCommand {
     pub(crate) command: String,
     /// How long ago the reply came.
     pub(crate) age: Duration,
@@ -126,7 +126,7 @@ impl From<Status<'_>> for State {
                 value: last.value,
                 age: at.saturating_since(last.at),
             }),
-            failed: port.last_failed.map(|failed| Failed {
+            failed: port.last_failed.map(|failed| FailedCommand {
                 command: failed.command.to_string(),
                 age: at.saturating_since(failed.at),
                 controller: failed.controller.map(|controller| controller.states),

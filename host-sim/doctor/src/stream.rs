@@ -1,7 +1,7 @@
 //! The nearest fit of bytes to the frame that was expected: head, tail, length, byte order.
 
 use crate::bytes::{is_at, most, places};
-use crate::shape::{Number, Shape};
+use crate::shape::{NumberField, Shape};
 use proto_core::device::ByteOrder;
 
 /// How bytes differ from the frames that were expected.
@@ -173,7 +173,7 @@ pub(crate) fn other_order(shape: &Shape<'_>, frames: &[&[u8]]) -> Option<(f64, f
     (all >= MIN_VALUES && swapped == all && read * 4 <= all).then_some(example).flatten()
 }
 
-/// Number of values other than zero that are needed to tell.
+/// NumberField of values other than zero that are needed to tell.
 const MIN_VALUES: usize = 6;
 
 /// A number that something measures.
@@ -182,7 +182,7 @@ fn is_sensible(value: f64) -> bool {
 }
 
 /// A float as the recipe reads it, and with its bytes reversed.
-fn values(number: &Number, frame: &[u8]) -> Option<(f64, f64)> {
+fn values(number: &NumberField, frame: &[u8]) -> Option<(f64, f64)> {
     let bytes = frame.get(number.at..number.at + number.size)?;
     // Little and big, or the two orders of words: what is other than the one is the other.
     let (mut own, mut other) = (bytes.to_vec(), bytes.to_vec());

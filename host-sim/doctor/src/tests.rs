@@ -157,7 +157,7 @@ impl Bench {
     /// The findings about ports.
     fn of_ports(&self) -> Vec<Finding> {
         let mut findings = self.findings();
-        findings.retain(|finding| matches!(finding.place, Place::Port(_)));
+        findings.retain(|finding| matches!(finding.place, FindingPlace::Port(_)));
         findings
     }
 
@@ -442,7 +442,7 @@ fn a_value_that_does_not_fit_is_named() {
     let mut summed = frame(400.0, 1.0);
     let sum = summed[..10].iter().fold(0, |sum: u8, byte| sum.wrapping_add(*byte));
     summed.insert(10, sum);
-    let command = format!("--part input {}.", Hex(&summed));
+    let command = format!("--part input {}.", HexBytes(&summed));
     says(&device, &summed, &[range, &command]);
 }
 
@@ -541,7 +541,7 @@ fn links_that_are_not_reached() {
     let mut bench = Bench::example("rs485-user.toml");
     bench.up(LinkId::MODBUS);
     bench.pass(100);
-    assert!(bench.findings().iter().all(|finding| finding.place != Place::Link("modbus".into())));
+    assert!(bench.findings().iter().all(|finding| finding.place != FindingPlace::Link("modbus".into())));
 }
 
 #[test]

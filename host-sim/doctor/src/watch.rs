@@ -2,12 +2,12 @@
 
 use proto_core::time::{Duration, Instant};
 
-use crate::finding::{Cause, Finding, Place};
+use crate::finding::{Cause, Finding, FindingPlace};
 
 /// A finding is told when it was there twice in a row, and its end when it was gone for this long.
 const GONE_FOR: Duration = Duration::from_secs(5);
 /// The same place and cause are told again after this at the earliest.
-const TOLD_AGAIN: Duration = Duration::from_secs(60);
+const REPORT_AGAIN: Duration = Duration::from_secs(60);
 /// More kinds of findings than a gateway has.
 const MAX_KNOWN: usize = 256;
 
@@ -19,7 +19,7 @@ pub enum Change {
     /// It is over.
     Ends {
         /// What it was about.
-        place: Place,
+        place: FindingPlace,
         /// Its cause.
         cause: Cause,
     },
@@ -33,12 +33,12 @@ pub struct Watch {
 
 #[derive(Debug)]
 struct Known {
-    place: Place,
+    place: FindingPlace,
     cause: Cause,
     first_at: Instant,
     newest_at: Instant,
-    told_at: Option<Instant>,
-    is_told: bool,
+    reported_at: Option<Instant>,
+    is_reported: bool,
 }
 
 impl Watch {
@@ -59,8 +59,8 @@ impl Watch {
                         cause: finding.cause,
                         first_at: now,
                         newest_at: now,
-                        told_at: None,
-                        is_told: false,
+                        reported_at: None,
+                        is_reported: false,
                     });
                 }
                 continue;
@@ -69,19 +69,19 @@ impl Watch {
                 known.first_at = now;
             }
             known.newest_at = now;
-            let may_tell = known.told_at.is_none_or(|at| now.saturating_since(at) >= TOLD_AGAIN);
-            if !known.is_told && known.first_at < now && may_tell {
-                (known.is_told, known.told_at) = (true, Some(now));
+            let may_report = known.reported_at.is_none_or(|at| now.saturating_since(at) >= REPORT_AGAIN);
+            if !known.is_reported && known.first_at < now && may_report {
+                (known.is_reported, known.reported_at) = (true, Some(now));
                 changes.push(Change::Begins(finding.clone()));
             }
         }
         for known in &mut self.known {
-            if known.is_told && now.saturating_since(known.newest_at) >= GONE_FOR {
-                known.is_told = false;
+            if known.is_reported && now.saturating_since(known.newest_at) >= GONE_FOR {
+                known.is_reported = false;
                 changes.push(Change::Ends { place: known.place.clone(), cause: known.cause });
             }
         }
-        self.known.retain(|known| now.saturating_since(known.newest_at) < TOLD_AGAIN);
+        self.known.retain(|known| now.saturating_since(known.newest_at) < REPORT_AGAIN);
         changes
     }
 }

@@ -22,9 +22,9 @@ pub struct Broker {
 }
 
 /// A connection, with or without TLS.
-pub(crate) trait Connection: AsyncRead + AsyncWrite + Unpin {}
+pub(crate) trait BrokerConnection: AsyncRead + AsyncWrite + Unpin {}
 
-impl<T: AsyncRead + AsyncWrite + Unpin> Connection for T {}
+impl<T: AsyncRead + AsyncWrite + Unpin> BrokerConnection for T {}
 
 impl Broker {
     /// A broker that is spoken to without TLS.
@@ -64,7 +64,7 @@ impl Broker {
     }
 
     /// Connects.
-    pub(crate) async fn connect(&self) -> io::Result<Box<dyn Connection>> {
+    pub(crate) async fn connect(&self) -> io::Result<Box<dyn BrokerConnection>> {
         let (host, port) = (self.host.clone(), self.port);
         let resolve = move || (host.as_str(), port).to_socket_addrs();
         let addresses: Vec<_> =
@@ -79,7 +79,7 @@ impl Broker {
 }
 
 /// Ends a connection so that what was sent arrives: a socket that is closed while it has something to read is reset.
-pub(crate) async fn close(mut stream: Box<dyn Connection>) {
+pub(crate) async fn close(mut stream: Box<dyn BrokerConnection>) {
     let _ = tokio::time::timeout(CLOSE_TIME, async {
         stream.shutdown().await?;
         let mut rest = [0; 256];

@@ -12,7 +12,7 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::sync::watch;
 use tokio::time::{Instant as TokioInstant, MissedTickBehavior, interval, sleep_until, timeout};
 
-use crate::broker::{Broker, Connection, close};
+use crate::broker::{Broker, BrokerConnection, close};
 
 /// Where values come from.
 pub trait Sampler {
@@ -62,7 +62,7 @@ pub async fn drive<const METRICS: usize, const HISTORY: usize>(
     // Births have values and dates from the first one on.
     samples.take(node, catalog, sampler).await;
     ticks.tick().await;
-    let mut driver = Driver { stream: None, error: None, was_online: false, told: None };
+    let mut driver = SessionDriver { stream: None, error: None, was_online: false, logged: None };
     let (mut buf, mut rx) = (vec![0; BUFFER], vec![0; BUFFER]);
     loop {
         let (is_opening, until) = driver.drain(node, catalog, &mut buf, listener).await;
@@ -159,15 +159,15 @@ impl Samples {
     }
 }
 
-struct Driver {
-    stream: Option<Box<dyn Connection>>,
+struct SessionDriver {
+    stream: Option<Box<dyn BrokerConnection>>,
     /// Why there is no connection.
     error: Option<io::Error>,
     was_online: bool,
-    told: Option<Failure>,
+    logged: Option<Failure>,
 }
 
-impl Driver {
+impl SessionDriver {
     /// Does what the node asks for until it waits. Returns whether a connection is to be made, and until when it
     /// waits.
     async fn drain<const METRICS: usize, const HISTORY: usize>(
@@ -212,11 +212,11 @@ impl Driver {
         }
         match (node.is_online(), node.failure()) {
             (true, _) if !self.was_online => {
-                (self.was_online, self.told) = (true, None);
+                (self.was_online, self.logged) = (true, None);
                 listener.online();
             }
-            (false, Some(failure)) if self.was_online || self.told != Some(failure) => {
-                (self.was_online, self.told) = (false, Some(failure));
+            (false, Some(failure)) if self.was_online || self.logged != Some(failure) => {
+                (self.was_online, self.logged) = (false, Some(failure));
                 listener.failed(failure, self.error.as_ref());
             }
             _ => {}

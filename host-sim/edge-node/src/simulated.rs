@@ -57,9 +57,9 @@ pub struct Totals {
 }
 
 /// A node's memory, without its connection.
-pub const NODE_BYTES: usize = size_of::<Node>();
+pub const NODE_BYTES: usize = size_of::<SimulatedNode>();
 
-type Node = EdgeNode<METRICS, 64>;
+type SimulatedNode = EdgeNode<METRICS, 64>;
 
 impl Fleet {
     /// Runs the nodes, and calls `each_second` with what they have done so far.
@@ -78,17 +78,18 @@ impl Fleet {
                 let mut settings = Settings::new(self.group.clone(), name);
                 settings.login.clone_from(&self.login);
                 let seed = (nth as u64).wrapping_add(1).wrapping_mul(0x9E37_79B9_7F4A_7C15);
-                let node = EdgeNode::new(settings, &Cell, None, seed);
-                let mut node: Box<Node> =
+                let node = EdgeNode::new(settings, &SimulatedCatalog, None, seed);
+                let mut node: Box<SimulatedNode> =
                     Box::new(node.map_err(|error| io::Error::other(format!("{error:?}")))?);
                 let (broker, period, ended) = (self.broker.clone(), self.period, ended.clone());
-                let mut sampler = Source { random: seed, step: 0, nth, all: Rc::clone(&all) };
+                let mut sampler = SimulatedSampler { random: seed, step: 0, nth, all: Rc::clone(&all) };
                 let mut listener = Watched { nth, all: Rc::clone(&all) };
                 tasks.spawn_local(async move {
                     // Not all at the same instant.
                     let offset = period.mul_f64((seed % 1_000) as f64 / 1_000.0);
                     tokio::time::sleep(offset).await;
-                    drive(&mut node, &Cell, &broker, period, &mut sampler, &mut listener, ended).await;
+                    drive(&mut node, &SimulatedCatalog, &broker, period, &mut sampler, &mut listener, ended)
+                        .await;
                     sampler.note(node.counters());
                 });
             }
@@ -125,14 +126,14 @@ impl Fleet {
 
 type All = Rc<RefCell<Vec<(Counters, bool)>>>;
 
-struct Source {
+struct SimulatedSampler {
     random: u64,
     step: u64,
     nth: usize,
     all: All,
 }
 
-impl Source {
+impl SimulatedSampler {
     fn note(&self, counters: Counters) {
         if let Some((known, _)) = self.all.borrow_mut().get_mut(self.nth) {
             *known = counters;
@@ -140,7 +141,7 @@ impl Source {
     }
 }
 
-impl Sampler for Source {
+impl Sampler for SimulatedSampler {
     async fn sample(&mut self, node: &Counters, values: &mut [Option<Value>]) -> Sampled {
         self.note(*node);
         self.step += 1;
@@ -151,12 +152,12 @@ impl Sampler for Source {
             let is_new = value.is_none() || self.random >> 62 == 0;
             let number = (self.random >> 33) as u32;
             *value = match kind(place) {
-                Kind::Uptime => Some(Value::UInt64(self.step)),
-                Kind::Alive => Some(Value::Boolean(true)),
-                Kind::Word => Some(Value::Word("working")),
-                Kind::Count if is_new => Some(Value::UInt32(number)),
-                Kind::Float if is_new => Some(Value::Float(number as f32 / 1_000.0)),
-                Kind::Count | Kind::Float => continue,
+                MetricKind::Uptime => Some(Value::UInt64(self.step)),
+                MetricKind::Alive => Some(Value::Boolean(true)),
+                MetricKind::Word => Some(Value::Word("working")),
+                MetricKind::Count if is_new => Some(Value::UInt32(number)),
+                MetricKind::Float if is_new => Some(Value::Float(number as f32 / 1_000.0)),
+                MetricKind::Count | MetricKind::Float => continue,
             };
         }
         Sampled::Alive(0b11)
@@ -189,10 +190,10 @@ impl Listener for Watched {
 }
 
 /// The metrics of a cell's gateway.
-struct Cell;
+struct SimulatedCatalog;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Kind {
+enum MetricKind {
     Uptime,
     Alive,
     Word,
@@ -213,17 +214,17 @@ fn place_in(place: usize) -> (Owner, usize) {
     }
 }
 
-fn kind(place: usize) -> Kind {
+fn kind(place: usize) -> MetricKind {
     match place_in(place) {
-        (Owner::Node, 0) => Kind::Uptime,
-        (Owner::Node, 1 | 2) => Kind::Alive,
-        (Owner::Node, 3..=5) | (Owner::Device(_), 0) => Kind::Word,
-        (Owner::Device(_), 1..=3) => Kind::Count,
-        _ => Kind::Float,
+        (Owner::Node, 0) => MetricKind::Uptime,
+        (Owner::Node, 1 | 2) => MetricKind::Alive,
+        (Owner::Node, 3..=5) | (Owner::Device(_), 0) => MetricKind::Word,
+        (Owner::Device(_), 1..=3) => MetricKind::Count,
+        _ => MetricKind::Float,
     }
 }
 
-impl Catalog for Cell {
+impl Catalog for SimulatedCatalog {
     fn devices(&self) -> usize {
         2
     }
@@ -242,12 +243,12 @@ impl Catalog for Cell {
     fn metric(&self, place: usize) -> Option<Metric<'_>> {
         let (owner, nth) = place_in(place);
         let (data_type, folder) = match kind(place) {
-            Kind::Uptime => (DataType::UInt64, "Node Info/Uptime"),
-            Kind::Alive => (DataType::Boolean, "port/alive"),
-            Kind::Word => (DataType::String, "state"),
-            Kind::Count => (DataType::UInt32, "frames"),
-            Kind::Float if owner == Owner::Node => (DataType::Float, "controller/RobotState"),
-            Kind::Float => (DataType::Float, "FloatInputReg"),
+            MetricKind::Uptime => (DataType::UInt64, "Node Info/Uptime"),
+            MetricKind::Alive => (DataType::Boolean, "port/alive"),
+            MetricKind::Word => (DataType::String, "state"),
+            MetricKind::Count => (DataType::UInt32, "frames"),
+            MetricKind::Float if owner == Owner::Node => (DataType::Float, "controller/RobotState"),
+            MetricKind::Float => (DataType::Float, "FloatInputReg"),
         };
         let name = heapless::String::try_from(format!("{folder}/{nth}").as_str()).ok()?;
         Some(Metric { name, data_type, unit: "", range: None, description: "simulated" })

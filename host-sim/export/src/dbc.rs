@@ -95,7 +95,7 @@ pub fn dbc(model: &Model, port: Option<&str>) -> Result<Dbc, DbcError> {
         ([], _) => return Err(DbcError::NoCan),
         _ => {}
     }
-    let mut writer = Writer::new(model.owner);
+    let mut writer = DbcWriter::new(model.owner);
     for message in messages(model, &ports)?.values() {
         writer.message(message)?;
     }
@@ -103,20 +103,20 @@ pub fn dbc(model: &Model, port: Option<&str>) -> Result<Dbc, DbcError> {
 }
 
 /// All frames with one id.
-struct Message<'m> {
+struct DbcMessage<'m> {
     id: CanId,
     recipe: &'m str,
     port: &'m Port,
     formats: Vec<&'m Format>,
 }
 
-fn messages<'m>(model: &'m Model, ports: &[&'m Port]) -> Result<BTreeMap<u32, Message<'m>>, DbcError> {
-    let mut messages: BTreeMap<u32, Message<'m>> = BTreeMap::new();
+fn messages<'m>(model: &'m Model, ports: &[&'m Port]) -> Result<BTreeMap<u32, DbcMessage<'m>>, DbcError> {
+    let mut messages: BTreeMap<u32, DbcMessage<'m>> = BTreeMap::new();
     for port in ports {
         let Some(recipe) = model.recipe_of(port) else { continue };
         for format in recipe.formats.iter().filter(|format| !format.is_remote) {
             let Some(id) = format.id else { continue };
-            let new = || Message { id, recipe: &recipe.name, port, formats: Vec::new() };
+            let new = || DbcMessage { id, recipe: &recipe.name, port, formats: Vec::new() };
             let message = messages.entry(number(id)).or_insert_with(new);
             if message.port.name == port.name {
                 message.formats.push(format);
@@ -137,7 +137,7 @@ fn number(id: CanId) -> u32 {
     }
 }
 
-struct Writer {
+struct DbcWriter {
     owner: &'static str,
     nodes: Names,
     message_names: Names,
@@ -153,7 +153,7 @@ struct Writer {
 
 /// Where and how a signal is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Shape {
+struct SignalShape {
     start: usize,
     bits: usize,
     order: ByteOrder,
@@ -162,7 +162,7 @@ struct Shape {
     value_type: u8,
 }
 
-impl Writer {
+impl DbcWriter {
     fn new(owner: Owner) -> Self {
         Self {
             owner: match owner {
@@ -186,8 +186,8 @@ impl Writer {
         self.nodes.add(&format!("{}-device", port.name))
     }
 
-    fn message(&mut self, message: &Message<'_>) -> Result<(), DbcError> {
-        let Message { id, recipe, port, formats } = message;
+    fn message(&mut self, message: &DbcMessage<'_>) -> Result<(), DbcError> {
+        let DbcMessage { id, recipe, port, formats } = message;
         let device = self.device(port)?;
         let (id, shown) = (number(*id), number(*id) & 0x1FFF_FFFF);
         let name = self.message_names.add(&format!("{recipe}-{shown:03X}"))?;
@@ -266,14 +266,14 @@ impl Writer {
         format: &Format,
         tag: &str,
         below: Option<(&str, u64)>,
-        skipped: &[Shape],
+        skipped: &[SignalShape],
     ) -> Result<(), DbcError> {
         for (field, element) in format.named_values() {
             let Some(shape) = shape(field, element) else {
                 self.notes.push(format!("{} has no place that a signal can have", field.name()));
                 continue;
             };
-            if skipped.contains(&Shape { signed: false, ..shape }) {
+            if skipped.contains(&SignalShape { signed: false, ..shape }) {
                 continue;
             }
             let (mut name, mut tag, mut below) = (field.name().to_owned(), tag, below);
@@ -307,12 +307,12 @@ impl Writer {
         Ok(())
     }
 
-    fn signal(&mut self, scope: &Scope, name: &str, tag: &str, shape: Shape) {
+    fn signal(&mut self, scope: &Scope, name: &str, tag: &str, shape: SignalShape) {
         self.signal_with(scope, name, tag, shape, "");
     }
 
-    fn signal_with(&mut self, scope: &Scope, name: &str, tag: &str, shape: Shape, unit: &str) {
-        let Shape { start, bits, order, signed, value_type } = shape;
+    fn signal_with(&mut self, scope: &Scope, name: &str, tag: &str, shape: SignalShape, unit: &str) {
+        let SignalShape { start, bits, order, signed, value_type } = shape;
         let order = if order == ByteOrder::Big { 0 } else { 1 };
         let sign = if signed { '-' } else { '+' };
         let receiver = &scope.receiver;
@@ -384,11 +384,11 @@ enum Several {
 }
 
 fn in_several(formats: &[&Format]) -> BTreeMap<String, Several> {
-    let mut shapes: BTreeMap<String, Vec<Option<Shape>>> = BTreeMap::new();
+    let mut shapes: BTreeMap<String, Vec<Option<SignalShape>>> = BTreeMap::new();
     for (field, element) in formats.iter().flat_map(|format| format.named_values()) {
         shapes.entry(field.name().to_owned()).or_default().push(shape(field, element));
     }
-    let kind = |shapes: &[Option<Shape>]| {
+    let kind = |shapes: &[Option<SignalShape>]| {
         let is_same = shapes.len() == formats.len() && shapes.iter().all(|shape| *shape == shapes[0]);
         if is_same { Several::Same } else { Several::Different }
     };
@@ -407,12 +407,12 @@ fn period(format: &Format, port: &Port) -> Option<Duration> {
 }
 
 /// Where the bits of a field are; `None` if that is not the same in all frames.
-fn shape(field: &Field, element: &Element) -> Option<Shape> {
+fn shape(field: &Field, element: &Element) -> Option<SignalShape> {
     let (at, len) = (field.place.at?, field.place.len?);
-    let whole = Shape { start: 0, bits: 8 * len, order: ByteOrder::Big, signed: false, value_type: 0 };
+    let whole = SignalShape { start: 0, bits: 8 * len, order: ByteOrder::Big, signed: false, value_type: 0 };
     let Some(encoding) = element.encoding() else {
         // Characters, the first is the highest byte.
-        return Some(Shape { start: 8 * at + 7, ..whole }).filter(|shape| shape.bits <= 64);
+        return Some(SignalShape { start: 8 * at + 7, ..whole }).filter(|shape| shape.bits <= 64);
     };
     let order = if len == 1 { ByteOrder::Little } else { encoding.order };
     let (first, bits, signed, value_type) = match encoding.kind {
@@ -424,7 +424,7 @@ fn shape(field: &Field, element: &Element) -> Option<Shape> {
         }
         Kind::Scalar(_) | Kind::Uint24 | Kind::Bcd { .. } => (0, 8 * len, false, 0),
         // Digits are read from left to right.
-        _ => return Some(Shape { start: 8 * at + 7, ..whole }).filter(|shape| shape.bits <= 64),
+        _ => return Some(SignalShape { start: 8 * at + 7, ..whole }).filter(|shape| shape.bits <= 64),
     };
     let start = match order {
         ByteOrder::Big => {
@@ -434,18 +434,18 @@ fn shape(field: &Field, element: &Element) -> Option<Shape> {
         }
         _ => 8 * at + first,
     };
-    Some(Shape { start, bits, order, signed, value_type })
+    Some(SignalShape { start, bits, order, signed, value_type })
 }
 
 /// A number whose words are swapped as two signals, which a DBC can say; anything else as it is.
-fn halves(shape: Shape) -> Vec<(&'static str, Shape)> {
+fn halves(shape: SignalShape) -> Vec<(&'static str, SignalShape)> {
     if !shape.order.swaps_words() {
         return vec![("", shape)];
     }
     let at = shape.start / 8;
     let half = |word: usize, order| {
         let start = 8 * (at + 2 * word) + if order == ByteOrder::Big { 7 } else { 0 };
-        Shape { start, bits: 16, order, signed: false, value_type: 0 }
+        SignalShape { start, bits: 16, order, signed: false, value_type: 0 }
     };
     let words = (shape.bits + shape.start % 8).div_ceil(16);
     let order = if shape.order == ByteOrder::BigSwapped { ByteOrder::Big } else { ByteOrder::Little };

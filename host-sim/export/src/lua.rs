@@ -20,7 +20,7 @@ use crate::uses::{describe_use, unit_of};
 /// # Errors
 /// [`Collision`] of two names of one recipe.
 pub fn lua(model: &Model) -> Result<String, Collision> {
-    let mut writer = Writer::default();
+    let mut writer = LuaWriter::default();
     let mut of_recipe: Vec<Vec<usize>> = Vec::new();
     let mut recipes = Names::default();
     for recipe in &model.recipes {
@@ -65,7 +65,7 @@ pub fn lua(model: &Model) -> Result<String, Collision> {
 }
 
 #[derive(Default)]
-struct Writer {
+struct LuaWriter {
     proto_fields: String,
     proto_count: usize,
     /// What each abbreviation is, and its index.
@@ -74,7 +74,7 @@ struct Writer {
     count: usize,
 }
 
-impl Writer {
+impl LuaWriter {
     fn format(&mut self, recipe: &str, mangled: &str, format: &Format) {
         let (shortest, longest) = format.frame.layout.lengths();
         let id = match format.id {

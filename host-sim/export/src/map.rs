@@ -24,11 +24,11 @@ pub enum Style {
 const HEADINGS: [&str; 10] =
     ["variable", "Modbus", "unit", "written by", "port", "recipe", "frame", "bytes", "field", "conversion"];
 
-type Row = [String; 10];
+type MapRow = [String; 10];
 
 /// The table.
 pub fn map(model: &Model, style: Style) -> String {
-    let mut rows: Vec<(usize, Row)> = Vec::new();
+    let mut rows: Vec<(usize, MapRow)> = Vec::new();
     for port in &model.ports {
         let Some(recipe) = model.recipe_of(port) else { continue };
         for format in &recipe.formats {
@@ -61,7 +61,7 @@ pub fn map(model: &Model, style: Style) -> String {
 }
 
 fn add_field(
-    rows: &mut Vec<(usize, Row)>,
+    rows: &mut Vec<(usize, MapRow)>,
     owner: Owner,
     port: &Port,
     recipe: &str,
@@ -104,7 +104,7 @@ fn writer(owner: Owner, direction: Direction) -> String {
     .into()
 }
 
-fn row(var: Option<SysVar>, rest: [&str; 7]) -> Row {
+fn row(var: Option<SysVar>, rest: [&str; 7]) -> MapRow {
     let name = var.map(|var| var.to_string()).unwrap_or_default();
     let place = var.and_then(SysVar::modbus).map(show_modbus).unwrap_or_default();
     let unit = var.map_or("", unit_of).to_owned();
@@ -160,7 +160,7 @@ fn show_element(element: &Element) -> String {
     }
 }
 
-fn markdown<'r>(rows: impl Iterator<Item = &'r Row>) -> String {
+fn markdown<'r>(rows: impl Iterator<Item = &'r MapRow>) -> String {
     let line = |cells: &[String]| {
         let cells: Vec<_> = cells.iter().map(|cell| cell.replace('|', "\\|")).collect();
         format!("| {} |\n", cells.join(" | "))
@@ -171,7 +171,7 @@ fn markdown<'r>(rows: impl Iterator<Item = &'r Row>) -> String {
     text
 }
 
-fn csv<'r>(rows: impl Iterator<Item = &'r Row>) -> String {
+fn csv<'r>(rows: impl Iterator<Item = &'r MapRow>) -> String {
     let cell = |cell: &String| {
         if cell.contains([',', '"', '\n', '\r']) {
             format!("\"{}\"", cell.replace('"', "\"\""))

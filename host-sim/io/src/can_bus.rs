@@ -22,17 +22,17 @@ use super::stream;
 use super::wire::{Full, NodeId, Pacing, Transmitted, Wire};
 use crate::clock::Clock;
 use crate::timer::now;
-pub(crate) use clients::{Client, Clients, Session};
+pub(crate) use clients::{Clients, SlcanClient, SlcanSession};
 use clients::{serve, serve_all};
 
 /// A bus; a clone is the same bus.
 #[derive(Debug, Clone)]
 pub struct CanBus {
-    shared: Rc<Shared>,
+    shared: Rc<BusState>,
 }
 
 #[derive(Debug)]
-struct Shared {
+struct BusState {
     wire: RefCell<Wire>,
     nodes: RefCell<Vec<Rc<NodeState>>>,
     deadline_moved: Notify,
@@ -67,7 +67,7 @@ impl CanBus {
     pub fn new(pacing: Pacing, tx: Rc<PortTx>, clock: Clock) -> Self {
         let wire = RefCell::new(Wire::new(pacing));
         let (nodes, deadline_moved) = (RefCell::default(), Notify::new());
-        Self { shared: Rc::new(Shared { wire, nodes, deadline_moved, clock, tx }) }
+        Self { shared: Rc::new(BusState { wire, nodes, deadline_moved, clock, tx }) }
     }
 
     fn now(&self) -> Instant {
@@ -75,7 +75,7 @@ impl CanBus {
     }
 
     /// Adds a node that receives all frames.
-    pub fn join(&self) -> Node {
+    pub fn join(&self) -> BusNode {
         let state = Rc::new(NodeState {
             id: self.shared.wire.borrow_mut().join(),
             queue: RefCell::default(),
@@ -86,7 +86,7 @@ impl CanBus {
             sent_wake: Notify::new(),
         });
         self.shared.nodes.borrow_mut().push(Rc::clone(&state));
-        Node { bus: self.clone(), state }
+        BusNode { bus: self.clone(), state }
     }
 
     /// Advances the bus with the clock until dropped.
@@ -139,12 +139,12 @@ impl CanBus {
 
 /// A node of a bus. Dropping it removes it from the bus and drops its waiting frames.
 #[derive(Debug)]
-pub struct Node {
+pub struct BusNode {
     bus: CanBus,
     state: Rc<NodeState>,
 }
 
-impl Node {
+impl BusNode {
     /// Queues a frame for transmission.
     ///
     /// # Errors
@@ -211,7 +211,7 @@ impl Node {
     }
 }
 
-impl Drop for Node {
+impl Drop for BusNode {
     fn drop(&mut self) {
         self.bus.shared.wire.borrow_mut().leave(self.state.id);
         self.bus.shared.nodes.borrow_mut().retain(|node| !Rc::ptr_eq(node, &self.state));
@@ -221,7 +221,7 @@ impl Drop for Node {
 /// A CAN port of the configuration, on a bus of its own that slcan clients connect to.
 #[derive(Debug)]
 pub(super) struct CanPort {
-    pty: Option<(Rc<Pty>, Rc<RefCell<Session>>)>,
+    pty: Option<(Rc<Pty>, Rc<RefCell<SlcanSession>>)>,
     listener: Option<Rc<TcpListener>>,
     clients: Rc<Clients>,
     /// Another owner had it before, and something may wait in it.
@@ -254,7 +254,7 @@ impl CanPort {
                 let pty = pty.map(|(pty, session)| Ok::<_, io::Error>((pty.attach()?, session)));
                 let client = |(stream, session)| {
                     let stream = TcpStream::from_std(stream)?;
-                    Ok::<_, io::Error>(Rc::new(Client { stream, session: RefCell::new(session) }))
+                    Ok::<_, io::Error>(Rc::new(SlcanClient { stream, session: RefCell::new(session) }))
                 };
                 let clients = clients.into_iter().map(client).collect::<io::Result<_>>()?;
                 (listener.map(TcpListener::from_std).transpose()?, pty.transpose()?, clients)
@@ -265,7 +265,7 @@ impl CanPort {
                     None => None,
                 };
                 let pty = link.map(|link| Pty::open(link)).transpose()?;
-                (listener, pty.map(|pty| (pty, Session::new(bitrate))), Vec::new())
+                (listener, pty.map(|pty| (pty, SlcanSession::new(bitrate))), Vec::new())
             }
         };
         let pty = pty.map(|(pty, session)| (Rc::new(pty), Rc::new(RefCell::new(session))));
@@ -328,7 +328,7 @@ impl CanPort {
 }
 
 /// The port's own node.
-async fn port_node(node: &Node, tx: &PortTx, events: &mut impl FnMut(PortEvent<'_>)) {
+async fn port_node(node: &BusNode, tx: &PortTx, events: &mut impl FnMut(PortEvent<'_>)) {
     loop {
         tokio::select! {
             (_, frame) = node.recv() => {
@@ -354,7 +354,7 @@ async fn port_node(node: &Node, tx: &PortTx, events: &mut impl FnMut(PortEvent<'
 }
 
 /// Queues as many of the port's frames as its node takes.
-fn hand_over(node: &Node, tx: &PortTx) {
+fn hand_over(node: &BusNode, tx: &PortTx) {
     while !node.is_full() {
         let Some(frame) = tx.frames.borrow_mut().pop_front() else { return };
         // It cannot fail: there is room.

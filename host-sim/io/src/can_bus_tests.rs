@@ -44,7 +44,7 @@ fn bus(pacing: Pacing) -> CanBus {
 }
 
 /// The next frame received at a node.
-fn received(node: &Node) -> Option<CanFrame> {
+fn received(node: &BusNode) -> Option<CanFrame> {
     node.try_recv().map(|(_, frame)| frame)
 }
 

@@ -27,10 +27,10 @@ pub enum Pace {
 
 /// A clock. For a current-thread runtime.
 #[derive(Debug, Clone)]
-pub struct Clock(Rc<Kind>);
+pub struct Clock(Rc<ClockKind>);
 
 #[derive(Debug)]
-enum Kind {
+enum ClockKind {
     Real,
     Scaled(Scale),
     Stepped(Stepped),
@@ -60,12 +60,12 @@ impl Clock {
     /// A clock of this pace. A stepped one starts at [`STEPPED_START`], the others at the machine's time.
     pub fn new(pace: Pace) -> Self {
         Self(Rc::new(match pace {
-            Pace::Real => Kind::Real,
+            Pace::Real => ClockKind::Real,
             Pace::Factor(factor) => {
-                Kind::Scaled(Scale { since: timer::now(), factor: factor.clamp(MIN_FACTOR, MAX_FACTOR) })
+                ClockKind::Scaled(Scale { since: timer::now(), factor: factor.clamp(MIN_FACTOR, MAX_FACTOR) })
             }
             Pace::Stepped => {
-                Kind::Stepped(Stepped { now: Cell::new(STEPPED_START), alarms: RefCell::default() })
+                ClockKind::Stepped(Stepped { now: Cell::new(STEPPED_START), alarms: RefCell::default() })
             }
         }))
     }
@@ -78,29 +78,29 @@ impl Clock {
     /// The time.
     pub fn now(&self) -> Instant {
         match &*self.0 {
-            Kind::Real => timer::now(),
-            Kind::Scaled(scale) => scale.shown_at(timer::now()),
-            Kind::Stepped(stepped) => stepped.now.get(),
+            ClockKind::Real => timer::now(),
+            ClockKind::Scaled(scale) => scale.shown_at(timer::now()),
+            ClockKind::Stepped(stepped) => stepped.now.get(),
         }
     }
 
     /// Whether it moves only by [`Self::step_to`].
     pub fn is_stepped(&self) -> bool {
-        matches!(&*self.0, Kind::Stepped(_))
+        matches!(&*self.0, ClockKind::Stepped(_))
     }
 
     /// Its time, for any thread; `None` if it is stepped.
     pub fn time(&self) -> Option<Time> {
         match &*self.0 {
-            Kind::Real => Some(Time(None)),
-            Kind::Scaled(scale) => Some(Time(Some(*scale))),
-            Kind::Stepped(_) => None,
+            ClockKind::Real => Some(Time(None)),
+            ClockKind::Scaled(scale) => Some(Time(Some(*scale))),
+            ClockKind::Stepped(_) => None,
         }
     }
 
     /// Whether it shows another time than the machine.
     pub fn runs_apart(&self) -> bool {
-        !matches!(&*self.0, Kind::Real)
+        !matches!(&*self.0, ClockKind::Real)
     }
 
     /// The earliest deadline of a stepped clock's alarms that is later than now; [`Instant::NEVER`] if there
@@ -115,7 +115,7 @@ impl Clock {
     }
 
     fn deadlines(&self, counts: impl Fn(Instant, Instant) -> bool) -> Instant {
-        let Kind::Stepped(stepped) = &*self.0 else { return Instant::NEVER };
+        let ClockKind::Stepped(stepped) = &*self.0 else { return Instant::NEVER };
         let (alarms, now) = (stepped.alarms.borrow(), stepped.now.get());
         let deadlines = alarms.iter().map(|alarm| alarm.armed.get());
         deadlines.filter(|&deadline| counts(deadline, now)).min().unwrap_or(Instant::NEVER)
@@ -124,7 +124,7 @@ impl Clock {
     /// Moves a stepped clock to this instant, and wakes the alarms that are due then. Never backwards, and
     /// without effect on a clock that runs by itself.
     pub fn step_to(&self, instant: Instant) {
-        let Kind::Stepped(stepped) = &*self.0 else { return };
+        let ClockKind::Stepped(stepped) = &*self.0 else { return };
         stepped.now.set(instant.max(stepped.now.get()));
         for alarm in stepped.alarms.borrow().iter().filter(|alarm| alarm.armed.get() <= stepped.now.get()) {
             alarm.due.notify_one();
@@ -137,8 +137,8 @@ impl Clock {
     /// As [`Timer::new`].
     pub fn alarm(&self) -> io::Result<Alarm> {
         let waits = match &*self.0 {
-            Kind::Real | Kind::Scaled(_) => Waits::Timer(Timer::new()?),
-            Kind::Stepped(stepped) => {
+            ClockKind::Real | ClockKind::Scaled(_) => Waits::Timer(Timer::new()?),
+            ClockKind::Stepped(stepped) => {
                 let alarm = Rc::new(SteppedAlarm { armed: Cell::new(Instant::NEVER), due: Notify::new() });
                 stepped.alarms.borrow_mut().push(Rc::clone(&alarm));
                 Waits::Stepped(alarm)
@@ -200,7 +200,7 @@ impl Alarm {
     pub fn arm(&self, deadline: Instant) -> io::Result<()> {
         self.armed.set(deadline);
         match (&self.waits, &*self.clock.0) {
-            (Waits::Timer(timer), Kind::Scaled(scale)) => timer.arm(scale.real(deadline)),
+            (Waits::Timer(timer), ClockKind::Scaled(scale)) => timer.arm(scale.real(deadline)),
             (Waits::Timer(timer), _) => timer.arm(deadline),
             (Waits::Stepped(alarm), _) => {
                 alarm.armed.set(deadline);
@@ -244,7 +244,7 @@ impl Alarm {
 
 impl Drop for Alarm {
     fn drop(&mut self) {
-        if let (Waits::Stepped(own), Kind::Stepped(stepped)) = (&self.waits, &*self.clock.0) {
+        if let (Waits::Stepped(own), ClockKind::Stepped(stepped)) = (&self.waits, &*self.clock.0) {
             stepped.alarms.borrow_mut().retain(|alarm| !Rc::ptr_eq(alarm, own));
         }
     }
@@ -307,7 +307,7 @@ mod tests {
         run(async {
             for factor in [0.5, 1.0, 50.0] {
                 let clock = Clock::new(Pace::Factor(factor));
-                let Kind::Scaled(scale) = *clock.0 else { panic!() };
+                let ClockKind::Scaled(scale) = *clock.0 else { panic!() };
                 let alarm = clock.alarm().unwrap();
                 let deadline = clock.now() + Duration::from_micros((10_000.0 * factor) as u64);
                 alarm.arm(deadline).unwrap();

@@ -25,7 +25,7 @@ thread_local! {
 /// before this returns, and only one of the tasks that wait here continues each time. So a deadline waits for
 /// one busy task at most, however many there are.
 pub async fn yield_fairly() {
-    let _waiting = Waiting::new();
+    let _waiting = WaitingTask::new();
     let turn = TURN.with(Rc::clone);
     let _permit = turn.acquire().await;
     yield_now().await;
@@ -95,16 +95,16 @@ pub fn is_anyone_busy() -> bool {
     WAITING.get() > 0
 }
 
-struct Waiting;
+struct WaitingTask;
 
-impl Waiting {
+impl WaitingTask {
     fn new() -> Self {
         WAITING.set(WAITING.get() + 1);
         Self
     }
 }
 
-impl Drop for Waiting {
+impl Drop for WaitingTask {
     fn drop(&mut self) {
         WAITING.set(WAITING.get() - 1);
     }

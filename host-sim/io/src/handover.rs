@@ -12,7 +12,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use tokio::net::{TcpListener, TcpStream};
 
 use crate::bind::Device;
-use crate::can_bus::{Clients, Session};
+use crate::can_bus::{Clients, SlcanSession};
 use crate::exchange::PortTx;
 use crate::pty::{HandoverPty, Pty};
 
@@ -52,9 +52,9 @@ pub(crate) enum HandoverState {
 pub(crate) struct HandoverBus {
     /// Bit/s of the bus, which the clients' channels must match.
     pub(crate) bitrate: u32,
-    pub(crate) pty: Option<(HandoverPty, Session)>,
+    pub(crate) pty: Option<(HandoverPty, SlcanSession)>,
     pub(crate) listener: Option<std::net::TcpListener>,
-    pub(crate) clients: Vec<(std::net::TcpStream, Session)>,
+    pub(crate) clients: Vec<(std::net::TcpStream, SlcanSession)>,
 }
 
 /// Shares the device of a running port, to release it after the port's tasks were dropped.
@@ -75,7 +75,7 @@ pub(crate) enum Held {
 #[derive(Debug)]
 pub(crate) struct HeldBus {
     pub(crate) bitrate: u32,
-    pub(crate) pty: Option<(Rc<Pty>, Rc<RefCell<Session>>)>,
+    pub(crate) pty: Option<(Rc<Pty>, Rc<RefCell<SlcanSession>>)>,
     pub(crate) listener: Option<Rc<TcpListener>>,
     pub(crate) clients: Rc<Clients>,
 }

@@ -32,14 +32,14 @@ pub enum PortBus {
 /// A port whose device is open.
 #[derive(Debug)]
 pub struct Port {
-    driver: Driver,
+    driver: PortDriver,
     device: Device,
     is_handed_over: bool,
     tx: Rc<PortTx>,
 }
 
 #[derive(Debug)]
-enum Driver {
+enum PortDriver {
     Serial(SerialPort),
     Can(CanPort),
     Kernel(KernelCan),
@@ -70,13 +70,13 @@ impl Port {
         let is_handed_over = handover.is_some();
         let driver = match (bus, device) {
             (PortBus::Serial(settings), _) => {
-                Driver::Serial(SerialPort::open(device, settings, Rc::clone(&tx), handover).await?)
+                PortDriver::Serial(SerialPort::open(device, settings, Rc::clone(&tx), handover).await?)
             }
             (PortBus::Can { bitrate }, Device::SocketCan { interface }) => {
-                Driver::Kernel(KernelCan::open(interface, bitrate, Rc::clone(&tx))?)
+                PortDriver::Kernel(KernelCan::open(interface, bitrate, Rc::clone(&tx))?)
             }
             (PortBus::Can { bitrate }, _) => {
-                Driver::Can(CanPort::open(device, bitrate, Rc::clone(&tx), handover).await?)
+                PortDriver::Can(CanPort::open(device, bitrate, Rc::clone(&tx), handover).await?)
             }
         };
         Ok(Self { driver, device: device.clone(), is_handed_over, tx })
@@ -91,9 +91,9 @@ impl Port {
     /// handed over: it has no clients, or opening it again costs nothing.
     pub fn hold(&self) -> Option<Hold> {
         let held = match &self.driver {
-            Driver::Serial(serial) => serial.held()?,
-            Driver::Can(can) => can.held(),
-            Driver::Kernel(_) => return None,
+            PortDriver::Serial(serial) => serial.held()?,
+            PortDriver::Can(can) => can.held(),
+            PortDriver::Kernel(_) => return None,
         };
         Some(Hold { device: self.device.clone(), held, tx: Rc::clone(&self.tx) })
     }
@@ -102,16 +102,16 @@ impl Port {
     /// interface.
     pub fn place(&self) -> String {
         match &self.driver {
-            Driver::Serial(serial) => serial.place(),
-            Driver::Can(can) => can.place(),
-            Driver::Kernel(can) => can.place(),
+            PortDriver::Serial(serial) => serial.place(),
+            PortDriver::Can(can) => can.place(),
+            PortDriver::Kernel(can) => can.place(),
         }
     }
 
     /// Sets the CAN ids that are used in either direction. A CAN interface of the kernel then reports no
     /// others; other devices report all frames, and so does an interface before this call.
     pub fn listen_to(&mut self, ids: Vec<CanId>) {
-        if let Driver::Kernel(can) = &mut self.driver {
+        if let PortDriver::Kernel(can) = &mut self.driver {
             can.listen_to(ids);
         }
     }
@@ -121,16 +121,16 @@ impl Port {
     #[must_use]
     pub fn on_clock(mut self, clock: &Clock) -> Self {
         match &mut self.driver {
-            Driver::Serial(serial) => serial.clock = clock.clone(),
-            Driver::Can(can) => can.clock = clock.clone(),
-            Driver::Kernel(_) => {}
+            PortDriver::Serial(serial) => serial.clock = clock.clone(),
+            PortDriver::Can(can) => can.clock = clock.clone(),
+            PortDriver::Kernel(_) => {}
         }
         self
     }
 
     /// Whether the kernel says when something has left, not the clock of [`Self::on_clock`].
     pub fn is_kernel_can(&self) -> bool {
-        matches!(self.driver, Driver::Kernel(_))
+        matches!(self.driver, PortDriver::Kernel(_))
     }
 
     /// The handle to send with.
@@ -145,9 +145,9 @@ impl Port {
     pub async fn run(self, events: impl FnMut(PortEvent<'_>)) -> io::Result<()> {
         let tx = Rc::clone(&self.tx);
         let ended = match self.driver {
-            Driver::Serial(serial) => serial.run(events).await,
-            Driver::Can(can) => can.run(events).await,
-            Driver::Kernel(can) => can.run(events).await,
+            PortDriver::Serial(serial) => serial.run(events).await,
+            PortDriver::Can(can) => can.run(events).await,
+            PortDriver::Kernel(can) => can.run(events).await,
         };
         tx.has_failed.set(true);
         ended

@@ -30,7 +30,7 @@ use crate::timer::now;
 /// A serial port's device.
 #[derive(Debug)]
 pub(super) struct SerialPort {
-    source: Source,
+    source: SerialSource,
     /// Another owner had it before, and something may wait in it.
     is_handed_over: bool,
     settings: Rs485,
@@ -40,7 +40,7 @@ pub(super) struct SerialPort {
 }
 
 #[derive(Debug)]
-enum Source {
+enum SerialSource {
     Pty(Rc<Pty>, Pace),
     Serial(String, SerialStream),
     Connect(HostPort),
@@ -61,15 +61,15 @@ impl SerialPort {
                     Some(HandoverState::Pty(handover)) => handover.attach()?,
                     _ => Pty::open(link)?,
                 };
-                Source::Pty(Rc::new(pty), *pace)
+                SerialSource::Pty(Rc::new(pty), *pace)
             }
             Device::Serial { path } => {
                 let path = path.display().to_string();
                 let stream = open_serial(&path, settings)
                     .map_err(|error| io::Error::new(error.kind(), format!("{path}: {error}")))?;
-                Source::Serial(path, stream)
+                SerialSource::Serial(path, stream)
             }
-            Device::Tcp { to } => Source::Connect(to.clone()),
+            Device::Tcp { to } => SerialSource::Connect(to.clone()),
             Device::TcpListen { listen } => {
                 let (listener, client) = match handover {
                     Some(HandoverState::Listen(listener, client)) => {
@@ -78,7 +78,7 @@ impl SerialPort {
                     }
                     _ => (stream::listen(listen).await?, None),
                 };
-                Source::Listen(Rc::new(listener), Rc::new(RefCell::new(client)))
+                SerialSource::Listen(Rc::new(listener), Rc::new(RefCell::new(client)))
             }
             Device::SocketCan { .. } | Device::SlcanPty { .. } | Device::SlcanTcp { .. } => {
                 let what = format!("`{device}` is a CAN device; the port is a serial line");
@@ -90,19 +90,21 @@ impl SerialPort {
 
     pub(super) fn place(&self) -> String {
         match &self.source {
-            Source::Pty(pty, _) => pty.link().display().to_string(),
-            Source::Serial(path, _) => path.clone(),
-            Source::Connect(to) => to.to_string(),
-            Source::Listen(listener, _) => stream::address_of(listener),
+            SerialSource::Pty(pty, _) => pty.link().display().to_string(),
+            SerialSource::Serial(path, _) => path.clone(),
+            SerialSource::Connect(to) => to.to_string(),
+            SerialSource::Listen(listener, _) => stream::address_of(listener),
         }
     }
 
     /// What clients are connected to.
     pub(super) fn held(&self) -> Option<Held> {
         match &self.source {
-            Source::Pty(pty, _) => Some(Held::Pty(Rc::clone(pty))),
-            Source::Listen(listener, client) => Some(Held::Listen(Rc::clone(listener), Rc::clone(client))),
-            Source::Serial(..) | Source::Connect(_) => None,
+            SerialSource::Pty(pty, _) => Some(Held::Pty(Rc::clone(pty))),
+            SerialSource::Listen(listener, client) => {
+                Some(Held::Listen(Rc::clone(listener), Rc::clone(client)))
+            }
+            SerialSource::Serial(..) | SerialSource::Connect(_) => None,
         }
     }
 
@@ -110,7 +112,7 @@ impl SerialPort {
         let Self { source, is_handed_over, settings, tx, clock } = self;
         let mut sender = Sender::new(settings, Rc::clone(&tx), clock)?;
         match source {
-            Source::Pty(pty, pace) => {
+            SerialSource::Pty(pty, pace) => {
                 sender.paced = pace == Pace::BitRate;
                 if is_handed_over {
                     drain(&*pty, &tx).await?;
@@ -119,7 +121,7 @@ impl SerialPort {
                 let backlog = Backlog::new(&tx);
                 Err(pump(&*pty, &mut sender, backlog, &mut events).await)
             }
-            Source::Serial(path, stream) => {
+            SerialSource::Serial(path, stream) => {
                 let mut stream = Some(stream);
                 let mut backoff = Backoff::new(StdDuration::from_millis(100), StdDuration::from_secs(2));
                 loop {
@@ -138,7 +140,7 @@ impl SerialPort {
                     sender.down(&mut events);
                 }
             }
-            Source::Connect(to) => {
+            SerialSource::Connect(to) => {
                 let mut backoff = Backoff::new(StdDuration::from_millis(20), StdDuration::from_secs(2));
                 loop {
                     let known = tx.sleeps();
@@ -158,7 +160,7 @@ impl SerialPort {
                     backoff.wait().await;
                 }
             }
-            Source::Listen(listener, client) => {
+            SerialSource::Listen(listener, client) => {
                 let mut resumed = client.borrow().clone();
                 let mut known = tx.sleeps();
                 loop {

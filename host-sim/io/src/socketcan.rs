@@ -24,7 +24,7 @@ use tracing::{debug, info, warn};
 
 use self::error_frame::StateChange;
 use self::interface::Interface;
-use self::message::{Content, Message};
+use self::message::{CanMessage, Content};
 use super::exchange::{Backlog, DeviceCounters, PortEvent, PortTx};
 use crate::backoff::Backoff;
 use crate::fairness::yield_fairly;
@@ -238,7 +238,7 @@ impl<'a> Attached<'a> {
         Ok(())
     }
 
-    fn take(&mut self, message: Message, events: &mut impl FnMut(PortEvent<'_>)) -> io::Result<()> {
+    fn take(&mut self, message: CanMessage, events: &mut impl FnMut(PortEvent<'_>)) -> io::Result<()> {
         let tx = &self.port.tx;
         match message.content {
             Content::Frame(_) if message.is_own => {

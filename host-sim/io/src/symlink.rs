@@ -121,7 +121,7 @@ impl Lock {
                 Ok(()) => {}
                 Err(rustix::io::Errno::WOULDBLOCK) => {
                     let _ = read(&mut file, &mut text);
-                    return Err(in_use(Record::parse(&text)));
+                    return Err(in_use(LinkRecord::parse(&text)));
                 }
                 Err(error) => return Err(named(&path, &error.into())),
             }
@@ -131,7 +131,7 @@ impl Lock {
                 continue;
             }
             let is_text = read(&mut file, &mut text).is_ok();
-            let record = Record::parse(&text);
+            let record = LinkRecord::parse(&text);
             if !is_text || (record.is_none() && !text.is_empty()) {
                 let what = "the lock of the link cannot be created: another file is there; give another path";
                 return Err(named(&path, &io::Error::new(io::ErrorKind::AlreadyExists, what)));
@@ -144,7 +144,7 @@ impl Lock {
     /// Records the identity of the link before it is moved to its place, so that there is never an unknown
     /// one.
     fn record(&mut self, made: Made) -> io::Result<()> {
-        let record = Record { process: std::process::id(), made };
+        let record = LinkRecord { process: std::process::id(), made };
         self.file.rewind()?;
         self.file.set_len(0)?;
         self.file.write_all(record.to_line().as_bytes())
@@ -162,12 +162,12 @@ fn named(path: &Path, error: &io::Error) -> io::Error {
     io::Error::new(error.kind(), format!("{}: {error}", path.display()))
 }
 
-fn in_use(holder: Option<Record>) -> io::Error {
+fn in_use(holder: Option<LinkRecord>) -> io::Error {
     let message = match holder {
-        Some(Record { process, .. }) if process == std::process::id() => {
+        Some(LinkRecord { process, .. }) if process == std::process::id() => {
             "another port uses this path; give each port its own path".to_owned()
         }
-        Some(Record { process, .. }) => {
+        Some(LinkRecord { process, .. }) => {
             format!("another run of host-sim uses this path, process {process}; end it or give another path")
         }
         None => "another run of host-sim uses this path; end it or give another path".to_owned(),
@@ -177,12 +177,12 @@ fn in_use(holder: Option<Record>) -> io::Error {
 
 /// The content of a lock's file: the holder, and the link that it created.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Record {
+struct LinkRecord {
     process: u32,
     made: Made,
 }
 
-impl Record {
+impl LinkRecord {
     fn to_line(self) -> String {
         let Self { process, made: Made { inode, seconds, nanos } } = self;
         format!("{WORD} {process} {inode} {seconds} {nanos}\n")
@@ -345,8 +345,8 @@ mod tests {
 
     #[test]
     fn records_are_read_as_they_were_written() {
-        let record = Record { process: 7, made: Made { inode: 8, seconds: -9, nanos: 10 } };
-        assert_eq!(Record::parse(&record.to_line()), Some(record));
+        let record = LinkRecord { process: 7, made: Made { inode: 8, seconds: -9, nanos: 10 } };
+        assert_eq!(LinkRecord::parse(&record.to_line()), Some(record));
         for other in [
             "",
             "\n",
@@ -355,7 +355,7 @@ mod tests {
             "other 7 8 9 10\n",
             "host-sim 7 8 9 x\n",
         ] {
-            assert_eq!(Record::parse(other), None, "{other:?}");
+            assert_eq!(LinkRecord::parse(other), None, "{other:?}");
         }
     }
 }

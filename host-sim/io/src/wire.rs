@@ -41,7 +41,7 @@ pub struct Full;
 #[derive(Debug)]
 pub struct Wire {
     pacing: Pacing,
-    nodes: BTreeMap<NodeId, VecDeque<Waiting>>,
+    nodes: BTreeMap<NodeId, VecDeque<QueuedFrame>>,
     joined: u64,
     in_progress: Option<InProgress>,
     /// The end of the last frame.
@@ -49,7 +49,7 @@ pub struct Wire {
 }
 
 #[derive(Debug, Clone, Copy)]
-struct Waiting {
+struct QueuedFrame {
     since: Instant,
     frame: CanFrame,
 }
@@ -57,7 +57,7 @@ struct Waiting {
 #[derive(Debug, Clone, Copy)]
 struct InProgress {
     from: NodeId,
-    what: Waiting,
+    what: QueuedFrame,
     start: Instant,
     end: Instant,
 }
@@ -104,7 +104,7 @@ impl Wire {
     /// See [`Full`].
     pub fn send(&mut self, now: Instant, node: NodeId, frame: CanFrame) -> Result<(), Full> {
         let queue = self.nodes.get_mut(&node).filter(|queue| queue.len() < MAX_QUEUED).ok_or(Full)?;
-        queue.push_back(Waiting { since: now, frame });
+        queue.push_back(QueuedFrame { since: now, frame });
         match self.in_progress {
             None => self.arbitrate(),
             // Still within the first bit of that frame, so this one takes part in the arbitration.
@@ -175,7 +175,7 @@ pub fn arbitration_field(frame: &CanFrame) -> u32 {
 
 /// Length of a frame in bits, with stuff bits and the three bits of intermission.
 pub fn frame_bits(frame: &CanFrame) -> u32 {
-    let mut bits = Bits::default();
+    let mut bits = BitCounter::default();
     let field = arbitration_field(frame);
     bits.push(0, 1);
     match frame.id() {
@@ -197,14 +197,14 @@ pub fn frame_bits(frame: &CanFrame) -> u32 {
 
 /// Counts bits with stuffing: after five equal bits, an opposite one is inserted.
 #[derive(Debug, Default)]
-struct Bits {
+struct BitCounter {
     count: u32,
     crc: u16,
     last: u32,
     run: u32,
 }
 
-impl Bits {
+impl BitCounter {
     fn push(&mut self, value: u32, width: u32) {
         for place in (0..width).rev() {
             let bit = value >> place & 1;

@@ -173,7 +173,7 @@ fn without_pacing_nothing_waits() {
 fn bits_of_known_frames() {
     // 34 zeros with their CRC: a stuff bit after every fifth.
     assert_eq!(frame_bits(&standard(0, &[])), 47 + 6);
-    let mut bits = Bits::default();
+    let mut bits = BitCounter::default();
     for byte in *b"123456789" {
         bits.push(u32::from(byte), 8);
     }

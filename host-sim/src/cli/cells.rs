@@ -24,7 +24,7 @@ pub(super) fn prepare(files: &[PathBuf], run: Run, log: Log) -> Result<(Vec<Cell
     let overrides = run.overrides().to_vec();
     // Even if a file is wrong, a ready file of a killed run is removed.
     let options = run.options(log);
-    let names = Names::of(files)?;
+    let names = CellNames::of(files)?;
     let overrides = names.shares(overrides.iter().map(|text| names.split("--set", text)))?;
     let mut read = Vec::with_capacity(files.len());
     for ((path, name), overrides) in files.iter().zip(&names.0).zip(overrides) {
@@ -49,9 +49,9 @@ pub(super) fn prepare(files: &[PathBuf], run: Run, log: Log) -> Result<(Vec<Cell
 }
 
 /// The names of all cells.
-struct Names(Vec<String>);
+struct CellNames(Vec<String>);
 
-impl Names {
+impl CellNames {
     fn of(files: &[PathBuf]) -> Result<Self, StartError> {
         let mut names: Vec<String> = Vec::with_capacity(files.len());
         for path in files {
@@ -126,9 +126,9 @@ fn console_of(console: &ConsoleOptions, nth: usize, name: &str) -> Result<Consol
 mod tests {
     use super::*;
 
-    fn names(files: &[&str]) -> Result<Names, String> {
+    fn names(files: &[&str]) -> Result<CellNames, String> {
         let files: Vec<_> = files.iter().map(PathBuf::from).collect();
-        Names::of(&files).map_err(|error| error.to_string())
+        CellNames::of(&files).map_err(|error| error.to_string())
     }
 
     #[test]

@@ -17,7 +17,7 @@ use recipe_config::file::{self, Config, FileError};
 use recipe_controller::{BuildError, Controller};
 
 use super::Overrides;
-use report::{Message, Refusal, Report};
+use report::{CheckReport, MessageReport, Refusal};
 
 /// Arguments of `check`.
 #[derive(Debug, Args)]
@@ -32,7 +32,7 @@ pub(super) struct CheckArgs {
     board: Option<Board>,
     /// CAN ports of the file that are on one bus
     #[arg(long, value_name = "PORT,PORT", value_parser = names)]
-    same_bus: Vec<Names>,
+    same_bus: Vec<PortNames>,
     /// Also print what the file means now and did not mean in this version
     #[arg(long, value_name = "VERSION")]
     since: Option<Version>,
@@ -47,15 +47,15 @@ enum Version {
     V0_2,
 }
 
-/// Names with commas between them.
+/// PortNames with commas between them.
 #[derive(Debug, Clone)]
-struct Names(Vec<String>);
+struct PortNames(Vec<String>);
 
-fn names(text: &str) -> Result<Names, String> {
+fn names(text: &str) -> Result<PortNames, String> {
     let names: Vec<_> = text.split(',').map(|name| name.trim().to_owned()).collect();
     match names.len() {
         0 | 1 => Err("write two ports or more, such as can-1,can-2".into()),
-        _ => Ok(Names(names)),
+        _ => Ok(PortNames(names)),
     }
 }
 
@@ -66,12 +66,12 @@ pub(super) fn run(args: &CheckArgs, out: &mut dyn Write) -> Result<(), Wrong> {
     match report(args) {
         Ok(report) if args.json => print(out, json(&report)),
         Ok(report) => print(out, report.show()),
-        Err(Refused::File(error)) if args.json => {
+        Err(CheckError::File(error)) if args.json => {
             print(out, json(&Refusal::new(error)))?;
             Err(Wrong::Printed)
         }
-        Err(Refused::File(error)) => Err(Wrong::Said(error.to_string())),
-        Err(Refused::Argument(message)) => Err(Wrong::Said(message)),
+        Err(CheckError::File(error)) => Err(Wrong::Said(error.to_string())),
+        Err(CheckError::Argument(message)) => Err(Wrong::Said(message)),
     }
 }
 
@@ -83,12 +83,12 @@ pub(super) enum Wrong {
     Printed,
 }
 
-enum Refused {
+enum CheckError {
     File(FileError),
     Argument(String),
 }
 
-impl From<FileError> for Refused {
+impl From<FileError> for CheckError {
     fn from(error: FileError) -> Self {
         Self::File(error)
     }
@@ -99,7 +99,7 @@ fn json(value: &impl serde::Serialize) -> String {
     serde_json::to_string_pretty(value).map_or_else(|error| error.to_string(), |text| text + "\n")
 }
 
-fn report(args: &CheckArgs) -> Result<Report, Refused> {
+fn report(args: &CheckArgs) -> Result<CheckReport, CheckError> {
     let (path, overrides) = (&args.file, &args.overrides.set);
     let name = path.display().to_string();
     let config = file::load(path, overrides)?;
@@ -110,7 +110,7 @@ fn report(args: &CheckArgs) -> Result<Report, Refused> {
             check_board(path, overrides, config, args.board)?;
             let frames = file::load_frames(path, overrides)?;
             let shared: Vec<_> = args.same_bus.iter().map(|names| names.0.clone()).collect();
-            let (buses, troubles) = bus::loads(config, &recipes, &shared).map_err(Refused::Argument)?;
+            let (buses, troubles) = bus::loads(config, &recipes, &shared).map_err(CheckError::Argument)?;
             let mut report = fill::gateway(name, config, &recipes, &frames);
             report.buses = buses;
             report.changes = args.since.map(|Version::V0_2| {
@@ -128,15 +128,15 @@ fn report(args: &CheckArgs) -> Result<Report, Refused> {
             (report, placed)
         }
         Config::Controller(_) if !args.same_bus.is_empty() => {
-            return Err(Refused::Argument("--same-bus is for gateway files".into()));
+            return Err(CheckError::Argument("--same-bus is for gateway files".into()));
         }
         Config::Controller(_) if args.since.is_some() => {
-            return Err(Refused::Argument(
+            return Err(CheckError::Argument(
                 "--since is for gateway files; of others nothing has changed".into(),
             ));
         }
         Config::Controller(_) if args.board.is_some() => {
-            return Err(Refused::Argument("--board is for gateway files".into()));
+            return Err(CheckError::Argument("--board is for gateway files".into()));
         }
         Config::Controller(config) => {
             check_build(path, overrides, config)?;
@@ -155,10 +155,10 @@ fn report(args: &CheckArgs) -> Result<Report, Refused> {
 }
 
 /// Sentences with the places of their keys.
-fn messages(path: &Path, overrides: &[String], placed: &[fill::Placed]) -> Vec<Message> {
+fn messages(path: &Path, overrides: &[String], placed: &[fill::Placed]) -> Vec<MessageReport> {
     let message = |(key, said): &fill::Placed| {
         let key: Vec<&str> = key.iter().map(String::as_str).collect();
-        Message::from(file::error_at(path, overrides, &key, said))
+        MessageReport::from(file::error_at(path, overrides, &key, said))
     };
     placed.iter().map(message).collect()
 }

@@ -16,7 +16,7 @@ use super::convert::device::DevicePart;
 
 /// A compiled part.
 #[derive(Debug)]
-pub(super) struct Part {
+pub(super) struct CompiledPart {
     pub(super) layout: Layout,
     /// One for a stream part, one per id for a CAN part.
     pub(super) frames: Vec<FrameFields>,
@@ -51,7 +51,7 @@ pub(super) struct NamedField {
     pub(super) spec: Option<FieldSpec>,
 }
 
-impl Part {
+impl CompiledPart {
     /// Chooses the recipe called `name`, or the only one, and its part, or the only one.
     pub(super) fn choose(
         recipes: &[AnyRecipe],

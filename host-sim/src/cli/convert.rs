@@ -12,11 +12,11 @@ use proto_core::recipe::{CanReject, Deframer, StreamLayout, datagram};
 use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::Scalar;
 
-use super::codec::{FrameFields, Layout, NamedField, Part};
+use super::codec::{CompiledPart, FrameFields, Layout, NamedField};
 use super::scale;
 use super::text::{self, CanLine, Prefix};
 
-type Outcome = Result<(), String>;
+type CliResult = Result<(), String>;
 
 /// Parses a CAN id: decimal, or hexadecimal with `0x`.
 pub(super) fn parse_id(text: &str) -> Result<u32, String> {
@@ -28,18 +28,23 @@ pub(super) fn parse_id(text: &str) -> Result<u32, String> {
 }
 
 /// Writes the frame with these values.
-pub(super) fn encode_values(part: &Part, id: Option<u32>, values: &[String], out: &mut dyn Write) -> Outcome {
+pub(super) fn encode_values(
+    part: &CompiledPart,
+    id: Option<u32>,
+    values: &[String],
+    out: &mut dyn Write,
+) -> CliResult {
     let wanted = id.map(Wanted::Number);
     write_line(out, &encode(part, wanted, &Prefix::default(), values)?)
 }
 
 /// Writes a frame for each line that `decode` printed, or for each line of values.
 pub(super) fn encode_lines(
-    part: &Part,
+    part: &CompiledPart,
     id: Option<u32>,
     input: impl BufRead,
     out: &mut dyn Write,
-) -> Outcome {
+) -> CliResult {
     for (number, line) in numbered(input) {
         let at = |message| format!("line {number}: {message}");
         let line = line.map_err(|error| at(error.to_string()))?;
@@ -61,11 +66,11 @@ pub(super) fn encode_lines(
 
 /// Writes the values of every frame in `input`; counts other input in `notes`.
 pub(super) fn decode_lines(
-    part: &Part,
+    part: &CompiledPart,
     input: impl BufRead,
     out: &mut dyn Write,
     notes: &mut dyn Write,
-) -> Outcome {
+) -> CliResult {
     let frames = match &part.layout {
         Layout::Stream(layout) => decode_stream(part, layout, input, out, notes)?,
         Layout::Datagram(layout) => decode_datagrams(part, layout, input, out, notes)?,
@@ -82,7 +87,12 @@ enum Wanted {
     Exactly(CanId),
 }
 
-fn encode(part: &Part, wanted: Option<Wanted>, prefix: &Prefix, values: &[String]) -> Result<String, String> {
+fn encode(
+    part: &CompiledPart,
+    wanted: Option<Wanted>,
+    prefix: &Prefix,
+    values: &[String],
+) -> Result<String, String> {
     match &part.layout {
         Layout::Stream(layout) | Layout::Datagram(layout) => {
             let Some(frame) = part.frames.first() else { return Err("no fields".into()) };
@@ -104,7 +114,7 @@ fn encode(part: &Part, wanted: Option<Wanted>, prefix: &Prefix, values: &[String
     }
 }
 
-fn find_frame(part: &Part, wanted: Option<Wanted>) -> Result<usize, String> {
+fn find_frame(part: &CompiledPart, wanted: Option<Wanted>) -> Result<usize, String> {
     let ids = || part.frames.iter().filter_map(|frame| frame.id);
     let known = || ids().map(text::show_id).collect::<Vec<_>>().join(", ");
     let number = |id| match id {
@@ -163,7 +173,7 @@ fn scalars(frame: &FrameFields, tokens: &[String]) -> Result<Vec<Scalar>, String
 }
 
 fn decode_stream(
-    part: &Part,
+    part: &CompiledPart,
     layout: &StreamLayout,
     input: impl BufRead,
     out: &mut dyn Write,
@@ -196,7 +206,7 @@ fn decode_stream(
 
 /// One line is one datagram.
 fn decode_datagrams(
-    part: &Part,
+    part: &CompiledPart,
     layout: &StreamLayout,
     input: impl BufRead,
     out: &mut dyn Write,
@@ -221,13 +231,13 @@ fn decode_datagrams(
 }
 
 fn show_stream(
-    part: &Part,
+    part: &CompiledPart,
     layout: &StreamLayout,
     payload: &[u8],
     line: usize,
     out: &mut dyn Write,
     notes: &mut dyn Write,
-) -> Outcome {
+) -> CliResult {
     if let Err(error) = layout.check(payload) {
         note(notes, &format!("line {line}: a receiver rejects this frame: {error}"));
     }
@@ -241,7 +251,7 @@ fn show_stream(
 }
 
 fn decode_can(
-    part: &Part,
+    part: &CompiledPart,
     input: impl BufRead,
     out: &mut dyn Write,
     notes: &mut dyn Write,
@@ -270,7 +280,12 @@ fn decode_can(
     Ok(frames)
 }
 
-fn show_can(part: &Part, frame: &CanFrame, line: usize, notes: &mut dyn Write) -> Result<String, String> {
+fn show_can(
+    part: &CompiledPart,
+    frame: &CanFrame,
+    line: usize,
+    notes: &mut dyn Write,
+) -> Result<String, String> {
     let layout = match &part.layout {
         Layout::Can(layout) => layout,
         Layout::Device(device) => return device.decode_can(frame, line, notes),
@@ -321,7 +336,7 @@ fn numbered<R: BufRead>(input: R) -> impl Iterator<Item = (usize, std::io::Resul
     (1..).zip(input.lines())
 }
 
-fn write_line(out: &mut dyn Write, line: &str) -> Outcome {
+fn write_line(out: &mut dyn Write, line: &str) -> CliResult {
     writeln!(out, "{line}").map_err(|error| error.to_string())
 }
 

@@ -14,7 +14,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::Args;
-use recipe_ctl::{Address, Client, Failure, Member, Stop, Verdict, View, key_file};
+use recipe_ctl::{Address, Client, Failure, Member, Stop, TableView, Verdict, key_file};
 use recipe_runtime::Signals;
 use recipe_runtime::out::print_stderr;
 
@@ -22,7 +22,7 @@ use super::run::parse_time;
 use super::{Out, Printed, wrong};
 use act::Act;
 pub(super) use help::EXAMPLES;
-use work::Work;
+use work::CtlWork;
 
 /// Arguments of `ctl`.
 #[derive(Debug, Args)]
@@ -72,8 +72,8 @@ impl CtlArgs {
         let run = Run { json: self.json, view: view(), timeout: self.timeout };
         // Mistakes in files and arguments come before those of the connection.
         let work = match self.act.prepare(self.inventory.is_some())? {
-            Work::Alone(alone) => return alone(run, out),
-            Work::Through(through) => {
+            CtlWork::Alone(alone) => return alone(run, out),
+            CtlWork::Through(through) => {
                 let (members, stop) = (self.members()?, Stop::new());
                 end_on_signals(&stop, Some(updating::ENDING))?;
                 return through(&members, &stop, run, out);
@@ -88,12 +88,12 @@ impl CtlArgs {
             }
             (Whom::One(make), work) => {
                 // A plain question ends at once, as any program does.
-                if matches!(work, Work::Follow(_)) {
+                if matches!(work, CtlWork::Follow(_)) {
                     end_on_signals(&stop, None)?;
                 }
                 work::at_one(work, &make(stop)?, run, out)
             }
-            (Whom::Many(members), Work::Ask(ask, many)) => {
+            (Whom::Many(members), CtlWork::Query(ask, many)) => {
                 end_on_signals(&stop, None)?;
                 work::at_many((&ask, many), &members, rollout, &stop, run, out)
             }
@@ -160,16 +160,16 @@ enum Whom {
 #[derive(Debug, Clone, Copy)]
 struct Run {
     json: bool,
-    view: View,
+    view: TableView,
     timeout: Duration,
 }
 
 /// The terminal that stdout is.
-fn view() -> View {
+fn view() -> TableView {
     let is_terminal = io::stdout().is_terminal();
     let size = is_terminal.then(|| rustix::termios::tcgetwinsize(io::stdout()).ok()).flatten();
     let width = size.map(|size| usize::from(size.ws_col)).filter(|width| *width > 0);
-    View { width, is_terminal }
+    TableView { width, is_terminal }
 }
 
 /// From now on a signal asks the command to end, which is told in these words; a second one ends it at once.

@@ -9,7 +9,7 @@ use proto_core::time::Duration;
 use recipe_config::{DeviceRecipe, ExchangeKind, NamedExchange, function_name};
 use serde::Serialize;
 
-use super::frame::{self, Row};
+use super::frame::{self, FrameRow};
 use super::text;
 
 /// One exchange, or one block of a slave.
@@ -56,7 +56,7 @@ struct FrameReport {
     #[serde(skip_serializing_if = "Option::is_none")]
     bytes: Option<usize>,
     remote: bool,
-    rows: Vec<Row>,
+    rows: Vec<FrameRow>,
 }
 
 /// All exchanges of a port's recipe.

@@ -11,18 +11,18 @@ use recipe_config::FileKind;
 use recipe_export::{Model, dbc, lua, map};
 use recipe_runtime::out::print_stderr;
 
-use super::output::Written;
-use super::{Outcome, Overrides};
+use super::output::OutputFile;
+use super::{CliResult, Overrides};
 
 /// Arguments of `export`.
 #[derive(Debug, Args)]
 pub(super) struct ExportArgs {
     #[command(subcommand)]
-    what: What,
+    what: ExportCommand,
 }
 
 #[derive(Debug, Subcommand)]
-enum What {
+enum ExportCommand {
     /// A CAN database (DBC) of the file's CAN ports
     #[command(after_help = DBC_EXAMPLES)]
     Dbc(DbcArgs),
@@ -37,12 +37,12 @@ enum What {
     Schema {
         /// The kind of file
         #[arg(default_value = "gateway")]
-        kind: Kind,
+        kind: ExportKind,
     },
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
-enum Kind {
+enum ExportKind {
     Gateway,
     Controller,
 }
@@ -130,30 +130,30 @@ Examples:
 An editor with tombi or taplo takes it from the first line of a file:
   #:schema ./gateway.schema.json";
 
-pub(super) fn run(args: &ExportArgs, out: &mut dyn Write) -> Outcome {
+pub(super) fn run(args: &ExportArgs, out: &mut dyn Write) -> CliResult {
     match &args.what {
-        What::Dbc(DbcArgs { file, port }) => {
+        ExportCommand::Dbc(DbcArgs { file, port }) => {
             let made = dbc::dbc(&file.model()?, port.as_deref()).map_err(|error| file.wrong(error))?;
             for note in &made.notes {
                 print_stderr(format_args!("{}: {note}", file.file.display()));
             }
             file.write(&made.text, out)
         }
-        What::Lua(file) => {
+        ExportCommand::Lua(file) => {
             let text = lua::lua(&file.model()?).map_err(|error| file.wrong(error))?;
             file.write(&text, out)
         }
-        What::Map(MapArgs { file, format }) => {
+        ExportCommand::Map(MapArgs { file, format }) => {
             let style = match format {
                 MapFormat::Markdown => map::Style::Markdown,
                 MapFormat::Csv => map::Style::Csv,
             };
             file.write(&map::map(&file.model()?, style), out)
         }
-        What::Schema { kind } => {
+        ExportCommand::Schema { kind } => {
             let kind = match kind {
-                Kind::Gateway => FileKind::Gateway,
-                Kind::Controller => FileKind::Controller,
+                ExportKind::Gateway => FileKind::Gateway,
+                ExportKind::Controller => FileKind::Controller,
             };
             writeln!(out, "{:#}", recipe_config::schema(kind)).map_err(|error| error.to_string())
         }
@@ -169,12 +169,12 @@ impl FileArgs {
         format!("{}: {error}", self.file.display())
     }
 
-    fn write(&self, text: &str, out: &mut dyn Write) -> Outcome {
+    fn write(&self, text: &str, out: &mut dyn Write) -> CliResult {
         let Some(path) = &self.output else {
             return out.write_all(text.as_bytes()).map_err(|error| error.to_string());
         };
         let name = path.display();
-        let written = Written { bytes: text.as_bytes(), name: "it", made_from: Some(&self.file) };
+        let written = OutputFile { bytes: text.as_bytes(), name: "it", made_from: Some(&self.file) };
         written.put(path, || Ok(self.force), "").map_err(|error| format!("{name}: {error}"))?;
         writeln!(out, "{name}: {} bytes", text.len()).map_err(|error| error.to_string())
     }

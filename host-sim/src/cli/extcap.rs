@@ -112,7 +112,8 @@ fn capture(ready: Option<&Path>, port: Option<&str>, fifo: &Path) -> Result<(), 
         query.unwrap_or_default()
     );
     stream.write_all(request.as_bytes()).map_err(refused)?;
-    let mut body = Body::read_head(BufReader::new(stream.try_clone().map_err(refused)?)).map_err(refused)?;
+    let mut body =
+        ChunkedBody::read_head(BufReader::new(stream.try_clone().map_err(refused)?)).map_err(refused)?;
     // Frames may be rare.
     stream.set_read_timeout(None).map_err(refused)?;
     let mut pipe = File::options()
@@ -156,14 +157,14 @@ fn quoted(name: &str) -> String {
 }
 
 /// The body of an answer of HTTP/1.1.
-struct Body<R> {
+struct ChunkedBody<R> {
     from: R,
     /// Bytes that are left of a chunk; `None` if the body ends with the connection.
     chunk: Option<u64>,
     has_ended: bool,
 }
 
-impl<R: BufRead> Body<R> {
+impl<R: BufRead> ChunkedBody<R> {
     /// Reads the head; an answer other than 200 is an error.
     fn read_head(mut from: R) -> io::Result<Self> {
         let status = line(&mut from)?;
@@ -183,7 +184,7 @@ impl<R: BufRead> Body<R> {
     }
 }
 
-impl<R: BufRead> Read for Body<R> {
+impl<R: BufRead> Read for ChunkedBody<R> {
     fn read(&mut self, bytes: &mut [u8]) -> io::Result<usize> {
         if self.has_ended || bytes.is_empty() {
             return Ok(0);
@@ -234,7 +235,7 @@ mod tests {
 
     fn body(answer: &str) -> io::Result<Vec<u8>> {
         let mut bytes = Vec::new();
-        Body::read_head(answer.as_bytes())?.read_to_end(&mut bytes)?;
+        ChunkedBody::read_head(answer.as_bytes())?.read_to_end(&mut bytes)?;
         Ok(bytes)
     }
 

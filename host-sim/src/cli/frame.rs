@@ -15,7 +15,7 @@ use super::{scale, text};
 
 /// One line of the picture.
 #[derive(Debug, Serialize)]
-pub(super) struct Row {
+pub(super) struct FrameRow {
     /// `0`, `0..1`, `2..` for a length that varies, or `then` behind that.
     bytes: String,
     name: String,
@@ -28,19 +28,19 @@ pub(super) struct Picture {
     /// What tells frames apart, if the fields do not.
     #[serde(skip_serializing_if = "Option::is_none")]
     ends: Option<&'static str>,
-    frames: Vec<Frame>,
+    frames: Vec<FrameTable>,
 }
 
 /// One frame.
 #[derive(Debug, Serialize)]
-struct Frame {
+struct FrameTable {
     #[serde(skip_serializing_if = "Option::is_none")]
     id: Option<String>,
-    rows: Vec<Row>,
+    rows: Vec<FrameRow>,
 }
 
 /// The rows of a frame of a Modbus line as it is over TCP: a header in front, and no checksum at the end.
-pub(super) fn over_tcp(mut rows: Vec<Row>) -> Vec<Row> {
+pub(super) fn over_tcp(mut rows: Vec<FrameRow>) -> Vec<FrameRow> {
     // Without the unit id, which is the address of the slave.
     const HEADER: usize = HEADER_LEN - 1;
     rows.pop();
@@ -51,7 +51,7 @@ pub(super) fn over_tcp(mut rows: Vec<Row>) -> Vec<Row> {
         }
     }
     let is = "transaction id, 0 and length, 2 bytes each".to_owned();
-    rows.insert(0, Row { bytes: format!("0..{}", HEADER - 1), name: "header".to_owned(), is });
+    rows.insert(0, FrameRow { bytes: format!("0..{}", HEADER - 1), name: "header".to_owned(), is });
     rows
 }
 
@@ -65,7 +65,7 @@ pub(super) fn picture(recipe: &DeviceRecipe, part: Direction) -> Picture {
         FrameEnds { boundary: Boundary::Silence, .. } => Some("between silences of the line"),
         FrameEnds { boundary: Boundary::Fields, .. } => None,
     };
-    let frame = |frame: &NamedFrame| Frame {
+    let frame = |frame: &NamedFrame| FrameTable {
         id: frame.id.map(text::show_id),
         rows: rows(frame, recipe.carrier, part),
     };
@@ -87,21 +87,23 @@ impl Picture {
 }
 
 /// Aligned lines.
-pub(super) fn show_rows(rows: &[Row]) -> String {
-    let width =
-        |column: fn(&Row) -> &String| rows.iter().map(|row| column(row).chars().count()).max().unwrap_or(0);
+pub(super) fn show_rows(rows: &[FrameRow]) -> String {
+    let width = |column: fn(&FrameRow) -> &String| {
+        rows.iter().map(|row| column(row).chars().count()).max().unwrap_or(0)
+    };
     let (places, names) = (width(|row| &row.bytes), width(|row| &row.name));
-    let show = |Row { bytes, name, is }: &Row| format!("    {bytes:places$}  {name:names$}  {is}\n");
+    let show =
+        |FrameRow { bytes, name, is }: &FrameRow| format!("    {bytes:places$}  {name:names$}  {is}\n");
     rows.iter().map(show).collect()
 }
 
 /// A line for each run of bytes of one frame.
-pub(super) fn rows(frame: &NamedFrame, carrier: Carrier, part: Direction) -> Vec<Row> {
+pub(super) fn rows(frame: &NamedFrame, carrier: Carrier, part: Direction) -> Vec<FrameRow> {
     // Cannot fail: reading the file laid out the same frames.
     frame.lay_out(carrier, part).map_or_else(|_| Vec::new(), |laid_out| laid_out_rows(frame, &laid_out, part))
 }
 
-fn laid_out_rows(frame: &NamedFrame, laid_out: &DeviceFrame, part: Direction) -> Vec<Row> {
+fn laid_out_rows(frame: &NamedFrame, laid_out: &DeviceFrame, part: Direction) -> Vec<FrameRow> {
     let mut places = Vec::new();
     laid_out.layout.parts(&laid_out.elements, |_, place| places.push(place));
     // Head, fields with the checksum among them, tail: as below.
@@ -109,7 +111,7 @@ fn laid_out_rows(frame: &NamedFrame, laid_out: &DeviceFrame, part: Direction) ->
     let mut rows = Vec::new();
     let mut add = |place: Option<Place>, name: &str, what: String| {
         let bytes = place.map(show_place).unwrap_or_default();
-        rows.push(Row { bytes, name: name.to_owned(), is: what });
+        rows.push(FrameRow { bytes, name: name.to_owned(), is: what });
     };
     if !frame.head.is_empty() {
         add(places.next(), "head", text::hex(&frame.head));

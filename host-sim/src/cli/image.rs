@@ -8,8 +8,8 @@ use clap::Args;
 use proto_core::config::image;
 use recipe_config::board::Board;
 
-use super::output::Written;
-use super::{Outcome, Overrides, check};
+use super::output::OutputFile;
+use super::{CliResult, Overrides, check};
 
 /// Arguments of `image`.
 #[derive(Debug, Args)]
@@ -29,7 +29,7 @@ pub(super) struct ImageArgs {
     overrides: Overrides,
 }
 
-pub(super) fn run(args: &ImageArgs, out: &mut dyn Write) -> Outcome {
+pub(super) fn run(args: &ImageArgs, out: &mut dyn Write) -> CliResult {
     let config = check::load_gateway(&args.file, &args.overrides.set).map_err(|error| error.to_string())?;
     check::check_board(&args.file, &args.overrides.set, &config, args.board)
         .map_err(|error| error.to_string())?;
@@ -45,7 +45,7 @@ pub(super) fn run(args: &ImageArgs, out: &mut dyn Write) -> Outcome {
 
 /// Writes the image unless that would replace another file.
 fn write(args: &ImageArgs, bytes: &[u8]) -> io::Result<()> {
-    let image = Written { bytes, name: "the image", made_from: Some(&args.file) };
+    let image = OutputFile { bytes, name: "the image", made_from: Some(&args.file) };
     let may_be_replaced = || Ok(args.force || is_image(&args.output)?);
     image.put(&args.output, may_be_replaced, " and is not an image")
 }

@@ -395,14 +395,14 @@ fn not_run(error: &clap::Error) -> ExitCode {
 }
 
 /// The error is a message for the user, with exit code 2.
-type Outcome = Result<(), String>;
+type CliResult = Result<(), String>;
 
 fn wrong(message: impl std::fmt::Display) -> ExitCode {
     print_stderr(message);
     ExitCode::from(2)
 }
 
-fn encode(args: &EncodeArgs, out: &mut dyn Write) -> Outcome {
+fn encode(args: &EncodeArgs, out: &mut dyn Write) -> CliResult {
     let part = args.which.part()?;
     if args.values.is_empty() && !(args.which.is_of_exchange() && part.is_constant()) {
         convert::encode_lines(&part, args.id, io::stdin().lock(), out)
@@ -411,7 +411,7 @@ fn encode(args: &EncodeArgs, out: &mut dyn Write) -> Outcome {
     }
 }
 
-fn decode(args: &DecodeArgs, out: &mut dyn Write) -> Outcome {
+fn decode(args: &DecodeArgs, out: &mut dyn Write) -> CliResult {
     let part = args.which.part()?;
     let mut notes = io::stderr().lock();
     if !args.frames.is_empty() {
@@ -433,7 +433,7 @@ impl Which {
         is_exchange || self.exchange.is_some()
     }
 
-    fn part(&self) -> Result<codec::Part, String> {
+    fn part(&self) -> Result<codec::CompiledPart, String> {
         let recipes =
             file::load_recipes(&self.file, &self.overrides.set).map_err(|error| error.to_string())?;
         let recipe = self.recipe.as_deref();
@@ -442,12 +442,12 @@ impl Which {
                 Err("an exchange has no input and output; choose one with --part: request, reply, pending, refusal"
                     .into())
             }
-            (Some(Chosen::Part(part)), None) => codec::Part::choose(&recipes, recipe, Some(part)),
-            (None, None) => codec::Part::choose(&recipes, recipe, None),
+            (Some(Chosen::Part(part)), None) => codec::CompiledPart::choose(&recipes, recipe, Some(part)),
+            (None, None) => codec::CompiledPart::choose(&recipes, recipe, None),
             (Some(Chosen::Exchange(part)), number) => {
-                codec::Part::choose_exchange(&recipes, recipe, number, Some(part))
+                codec::CompiledPart::choose_exchange(&recipes, recipe, number, Some(part))
             }
-            (None, number) => codec::Part::choose_exchange(&recipes, recipe, number, None),
+            (None, number) => codec::CompiledPart::choose_exchange(&recipes, recipe, number, None),
         };
         let mut part = part.map_err(|message: String| format!("{}: {message}", self.file.display()))?;
         part.bind(&file::load_frames(&self.file, &self.overrides.set).map_err(|error| error.to_string())?);

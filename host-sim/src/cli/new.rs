@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
-use super::Outcome;
+use super::CliResult;
 use recipe_io::files::Beside;
 use templates::{ALL, Template};
 
@@ -34,7 +34,7 @@ Examples:
 The file says how the device is wired and set, where its protocol is published,
 and has worked bytes of its frames. Set `controller.address` in it.";
 
-pub(super) fn run(args: &NewArgs, out: &mut dyn Write) -> Outcome {
+pub(super) fn run(args: &NewArgs, out: &mut dyn Write) -> CliResult {
     let Some(name) = &args.device else { return list(out) };
     let template = ALL.iter().find(|template| template.name == name).ok_or_else(|| unknown(name))?;
     let Some(path) = &args.output else {
@@ -47,7 +47,7 @@ pub(super) fn run(args: &NewArgs, out: &mut dyn Write) -> Outcome {
         .map_err(|error| error.to_string())
 }
 
-fn list(out: &mut dyn Write) -> Outcome {
+fn list(out: &mut dyn Write) -> CliResult {
     let width = ALL.iter().map(|template| template.name.len()).max().unwrap_or(0);
     for template in ALL {
         writeln!(out, "{:width$}  {}", template.name, template.title()).map_err(|error| error.to_string())?;

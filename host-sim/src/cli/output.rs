@@ -8,7 +8,7 @@ use std::path::Path;
 use recipe_io::files::{Beside, Identity};
 
 /// What a command writes.
-pub(super) struct Written<'a> {
+pub(super) struct OutputFile<'a> {
     /// The bytes.
     pub bytes: &'a [u8],
     /// In messages: "the image" or "it".
@@ -17,7 +17,7 @@ pub(super) struct Written<'a> {
     pub made_from: Option<&'a Path>,
 }
 
-impl Written<'_> {
+impl OutputFile<'_> {
     /// Writes it to a new file, a pipe or a device, or in place of a file that `may_be_replaced`; `kept` says
     /// what such a file is otherwise.
     pub(super) fn put(

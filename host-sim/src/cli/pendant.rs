@@ -56,7 +56,7 @@ pub(super) struct PendantArgs {
 
 /// Why it did not work.
 #[derive(Debug)]
-enum Failure {
+enum PendantError {
     /// The controller refused.
     Refused(String),
     /// An argument is wrong, or nobody is there.
@@ -65,7 +65,7 @@ enum Failure {
     Printing,
 }
 
-impl From<io::Error> for Failure {
+impl From<io::Error> for PendantError {
     fn from(_: io::Error) -> Self {
         Self::Printing
     }
@@ -75,21 +75,21 @@ pub(super) fn run(args: PendantArgs) -> ExitCode {
     let mut out = Out::new(io::stdout());
     let done = args.run(&mut out);
     out.finish(|printed| match (printed, done) {
-        (Printed::Whole, Err(Failure::Refused(message))) => {
+        (Printed::Whole, Err(PendantError::Refused(message))) => {
             print_stderr(message);
             ExitCode::FAILURE
         }
-        (Printed::Whole, Err(Failure::Wrong(message))) => wrong(message),
+        (Printed::Whole, Err(PendantError::Wrong(message))) => wrong(message),
         _ => ExitCode::SUCCESS,
     })
 }
 
 impl PendantArgs {
-    fn run(self, out: &mut dyn Write) -> Result<(), Failure> {
+    fn run(self, out: &mut dyn Write) -> Result<(), PendantError> {
         // Mistakes in arguments come before those of the connection.
-        let request = self.act.request().map_err(Failure::Wrong)?;
-        let address = self.address().map_err(Failure::Wrong)?;
-        let mut socket = Socket::connect(&address).map_err(Failure::Wrong)?;
+        let request = self.act.request().map_err(PendantError::Wrong)?;
+        let address = self.address().map_err(PendantError::Wrong)?;
+        let mut socket = Socket::connect(&address).map_err(PendantError::Wrong)?;
         match &self.act {
             Act::State { watch: Some(interval) } => {
                 let is_terminal = io::stdout().is_terminal();
@@ -107,7 +107,7 @@ impl PendantArgs {
             Act::Events { follow: true, .. } => {
                 self.answer(&mut socket, &request)?;
                 loop {
-                    let line = socket.line().map_err(Failure::Wrong)?;
+                    let line = socket.line().map_err(PendantError::Wrong)?;
                     if self.json {
                         writeln!(out, "{line}")?;
                     } else if let Some(lost) = line.get("lost") {
@@ -126,15 +126,15 @@ impl PendantArgs {
     }
 
     /// The answer to a request that is carried out.
-    fn answer(&self, socket: &mut Socket, request: &Value) -> Result<Value, Failure> {
-        let answer = socket.ask(request).map_err(Failure::Wrong)?;
+    fn answer(&self, socket: &mut Socket, request: &Value) -> Result<Value, PendantError> {
+        let answer = socket.ask(request).map_err(PendantError::Wrong)?;
         match answer["ok"].as_bool() {
             Some(true) => Ok(answer),
-            _ => Err(Failure::Refused(answer["error"].as_str().unwrap_or("refused").to_owned())),
+            _ => Err(PendantError::Refused(answer["error"].as_str().unwrap_or("refused").to_owned())),
         }
     }
 
-    fn show(&self, answer: &Value, out: &mut dyn Write) -> Result<(), Failure> {
+    fn show(&self, answer: &Value, out: &mut dyn Write) -> Result<(), PendantError> {
         if self.json {
             writeln!(out, "{answer}")?;
             return Ok(());

@@ -9,7 +9,7 @@ const STATE_STREAM: &str = "<- controller: state stream, 10 a second";
 
 /// The way up or the source of variables of a port.
 #[derive(Debug, Serialize)]
-pub(super) struct Way {
+pub(super) struct VarRoute {
     port: String,
     /// Neighbours together: `WordInputReg[1..4]`, `BitInputReg[3].0,1`; or what else goes this way.
     what: String,
@@ -18,7 +18,7 @@ pub(super) struct Way {
 }
 
 /// The ways and sources of all field ports' variables, one for each run of neighbours.
-pub(super) fn ways(config: &GatewayConfig) -> Vec<Way> {
+pub(super) fn ways(config: &GatewayConfig) -> Vec<VarRoute> {
     // Cannot fail for a valid configuration.
     let Ok(plan) = Plan::new(config) else { return Vec::new() };
     let mut lines: Vec<(String, String, String)> = Vec::new();
@@ -81,16 +81,17 @@ pub(super) fn ways(config: &GatewayConfig) -> Vec<Way> {
             lines.push((port.name.to_string(), what, from));
         }
     }
-    lines.into_iter().map(|(port, what, way)| Way { port, what, way }).collect()
+    lines.into_iter().map(|(port, what, way)| VarRoute { port, what, way }).collect()
 }
 
 /// The ways as text.
-pub(super) fn show(ways: &[Way]) -> String {
+pub(super) fn show(ways: &[VarRoute]) -> String {
     let mut report = String::from("\nways\n");
-    let width =
-        |column: fn(&Way) -> &String| ways.iter().map(|way| column(way).chars().count()).max().unwrap_or(0);
+    let width = |column: fn(&VarRoute) -> &String| {
+        ways.iter().map(|way| column(way).chars().count()).max().unwrap_or(0)
+    };
     let (ports, variables) = (width(|way| &way.port), width(|way| &way.what));
-    for Way { port, what, way } in ways {
+    for VarRoute { port, what, way } in ways {
         report += &format!("  {port:ports$}  {what:variables$}  {way}\n");
     }
     if ways.is_empty() {

@@ -20,9 +20,9 @@ pub(super) fn of_input(spec: &FieldSpec, to: &InputBinding, behind: &[FieldSpec]
         return format!("{formula}, wraps");
     }
     // What these let pass is told behind it.
-    let is_told =
+    let is_outside_shown =
         |rule: &FieldSpec| matches!(rule, FieldSpec::InputRule(InputRule::Int16) | FieldSpec::Mapped(_));
-    match spec.fitting().filter(|_| !behind.iter().any(is_told)) {
+    match spec.fitting().filter(|_| !behind.iter().any(is_outside_shown)) {
         Some(fitting) => format!("{formula}, if in {}", range(&fitting)),
         None => formula,
     }

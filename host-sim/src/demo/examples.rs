@@ -8,7 +8,7 @@ use serde_json::json;
 
 use super::cell::{Example, Gateway, Robot, serial};
 use super::device::{Adapter, Datagrams, FieldStream};
-use super::folder::Folder;
+use super::folder::TempFolder;
 use super::show::Show;
 
 const HEAD: [u8; 2] = [0xFF, 0xFF];
@@ -40,7 +40,7 @@ macro_rules! example {
     };
 }
 
-pub(super) fn run_all(show: &mut Show, folder: &Folder) {
+pub(super) fn run_all(show: &mut Show, folder: &TempFolder) {
     show.heading("1  RS-485, user-defined: a program receives three bytes and answers");
     show.judge("on the controller's own port", |show| rs485_user(show, folder));
     show.judge("through the gateway: the bytes go to word registers", |show| {
@@ -86,7 +86,7 @@ fn three_bytes<S: io::Read + io::Write + std::os::fd::AsFd>(
     same(&answer, &ANSWER)
 }
 
-fn rs485_user(show: &Show, folder: &Folder) -> io::Result<()> {
+fn rs485_user(show: &Show, folder: &TempFolder) -> io::Result<()> {
     let path = folder.path("rs485");
     let robot = folder.fill(|| {
         Robot::start(example!("rs485-user-controller"), &[], &[bind("rs485", "pty", path.display())])
@@ -99,7 +99,7 @@ fn rs485_user(show: &Show, folder: &Folder) -> io::Result<()> {
     Ok(())
 }
 
-fn rs485_user_gateway(show: &Show, folder: &Folder) -> io::Result<()> {
+fn rs485_user_gateway(show: &Show, folder: &TempFolder) -> io::Result<()> {
     let path = folder.path("gateway-rs485");
     let robot = Robot::start(example!("udp-server-controller"), &[], &[])?;
     let binds = [bind("rs485-1", "pty", path.display())];
@@ -131,14 +131,14 @@ fn pose_and_do1<S: io::Read + io::Write + std::os::fd::AsFd>(
     do1(show, robot, false)
 }
 
-fn rs485_system(show: &Show, folder: &Folder) -> io::Result<()> {
+fn rs485_system(show: &Show, folder: &TempFolder) -> io::Result<()> {
     let path = folder.path("rs485");
     let binds = [bind("rs485", "pty", path.display())];
     let robot = folder.fill(|| Robot::start(example!("rs485-system-controller"), &[], &binds))?;
     pose_and_do1(show, &mut serial(&path)?, &pose_of(4), &robot)
 }
 
-fn rs485_system_gateway(show: &Show, folder: &Folder) -> io::Result<()> {
+fn rs485_system_gateway(show: &Show, folder: &TempFolder) -> io::Result<()> {
     let path = folder.path("gateway-rs485");
     let robot = Robot::start(example!("udp-server-controller"), &[], &[])?;
     let binds = [bind("rs485-1", "pty", path.display())];
@@ -221,7 +221,7 @@ fn udp_server(show: &Show) -> io::Result<()> {
     do1(show, &robot, true)
 }
 
-fn udp_server_gateway(show: &Show, folder: &Folder) -> io::Result<()> {
+fn udp_server_gateway(show: &Show, folder: &TempFolder) -> io::Result<()> {
     let path = folder.path("gateway-rs485");
     let robot = Robot::start(example!("udp-server-controller"), &[], &[])?;
     let overrides = [format!("controller.recipe_link.udp={}", robot.address("udp2011")?.port())];
@@ -251,7 +251,7 @@ fn clients(show: &Show) -> io::Result<()> {
     do1(show, &robot, true)
 }
 
-fn client_gateway(show: &Show, folder: &Folder) -> io::Result<()> {
+fn client_gateway(show: &Show, folder: &TempFolder) -> io::Result<()> {
     let path = folder.path("gateway-rs485");
     let binds = [bind("rs485-1", "pty", path.display())];
     let overrides = [format!("port.up.listen={LOOPBACK}")];

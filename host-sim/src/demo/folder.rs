@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// A temporary folder, removed with its content when it is dropped.
 #[derive(Debug)]
-pub(super) struct Folder(Arc<Owned>);
+pub(super) struct TempFolder(Arc<Owned>);
 
 /// Removes the folder earlier.
 #[derive(Debug)]
@@ -20,7 +20,7 @@ struct Owned {
     making: Mutex<()>,
 }
 
-impl Folder {
+impl TempFolder {
     /// Makes a folder in the system's folder for temporary files.
     pub(super) fn new() -> io::Result<Self> {
         Self::within(&std::env::temp_dir())
@@ -53,7 +53,7 @@ impl Folder {
     }
 }
 
-impl Drop for Folder {
+impl Drop for TempFolder {
     fn drop(&mut self) {
         let _making = self.0.lock();
         self.0.remove();
@@ -98,7 +98,8 @@ mod tests {
         let names = || std::fs::read_dir(among.path()).unwrap().count();
         let left = format!("host-sim-demo-{}-0", std::process::id());
         std::fs::create_dir(among.path().join(left)).unwrap();
-        let (first, second) = (Folder::within(among.path()).unwrap(), Folder::within(among.path()).unwrap());
+        let (first, second) =
+            (TempFolder::within(among.path()).unwrap(), TempFolder::within(among.path()).unwrap());
         std::fs::write(first.path("line"), "").unwrap();
         assert_eq!(names(), 3);
         let _remover = first.remover();

@@ -18,7 +18,7 @@ use recipe_runtime::Signals;
 use recipe_runtime::out::print_stderr;
 use serde_json::Value;
 
-use super::folder::Folder;
+use super::folder::TempFolder;
 
 /// Runs the cell until a signal comes or a process ends; the pages are served at this address and the next port.
 pub fn run_living(gateway: SocketAddr) -> ExitCode {
@@ -37,13 +37,13 @@ fn live(address: SocketAddr) -> io::Result<ExitCode> {
         let _inside = runtime.enter();
         Signals::catch()?
     };
-    let folder = Folder::new()?;
+    let folder = TempFolder::new()?;
     let key = write_files(&folder)?;
     // Whatever comes first ends the cell.
     let (ended, end) = mpsc::channel();
     let on_signal = ended.clone();
     thread::Builder::new().name("signals".to_owned()).spawn(move || {
-        let _ = on_signal.send(Ended::Signal(runtime.block_on(signals.next())));
+        let _ = on_signal.send(DemoEnd::Signal(runtime.block_on(signals.next())));
     })?;
 
     let (address, next) = two_ports(address)?;
@@ -73,12 +73,12 @@ fn live(address: SocketAddr) -> io::Result<ExitCode> {
         folder.path("").display(),
     );
 
-    let what = end.recv().unwrap_or(Ended::Signal(0));
+    let what = end.recv().unwrap_or(DemoEnd::Signal(0));
     gateway.end();
     robot.end();
     Ok(match what {
-        Ended::Signal(number) => ExitCode::from(u8::try_from(128 + number).unwrap_or(1)),
-        Ended::Process(name) => {
+        DemoEnd::Signal(number) => ExitCode::from(u8::try_from(128 + number).unwrap_or(1)),
+        DemoEnd::Process(name) => {
             print_stderr(format_args!("the {name} has ended"));
             ExitCode::FAILURE
         }
@@ -96,7 +96,7 @@ fn two_ports(address: SocketAddr) -> io::Result<(SocketAddr, SocketAddr)> {
 }
 
 /// Why the cell ends.
-enum Ended {
+enum DemoEnd {
     /// A signal with this number.
     Signal(i32),
     /// A process that should go on.
@@ -104,7 +104,7 @@ enum Ended {
 }
 
 /// Writes the files of the cell; returns the key.
-fn write_files(folder: &Folder) -> io::Result<String> {
+fn write_files(folder: &TempFolder) -> io::Result<String> {
     let key: String = random::<16>()?.iter().map(|byte| format!("{byte:02x}")).collect();
     fs::write(folder.path("robot.toml"), include_str!("living/robot.toml"))?;
     fs::write(folder.path("cell.toml"), include_str!("living/cell.toml"))?;
@@ -114,7 +114,7 @@ fn write_files(folder: &Folder) -> io::Result<String> {
     Ok(key)
 }
 
-fn controller_arguments(folder: &Folder, console: (SocketAddr, u16)) -> Vec<String> {
+fn controller_arguments(folder: &TempFolder, console: (SocketAddr, u16)) -> Vec<String> {
     let mut arguments = vec!["controller".to_owned(), "-c".to_owned(), text(folder, "robot.toml")];
     for server in ["command", "state", "modbus", "udp2011"] {
         arguments.extend(["--set".to_owned(), format!("listen.{server}=0")]);
@@ -123,7 +123,11 @@ fn controller_arguments(folder: &Folder, console: (SocketAddr, u16)) -> Vec<Stri
     arguments
 }
 
-fn gateway_arguments(folder: &Folder, console: (SocketAddr, u16), robot: &Value) -> io::Result<Vec<String>> {
+fn gateway_arguments(
+    folder: &TempFolder,
+    console: (SocketAddr, u16),
+    robot: &Value,
+) -> io::Result<Vec<String>> {
     let mut arguments = vec!["gateway".to_owned(), "-c".to_owned(), text(folder, "cell.toml")];
     for server in ["command", "state", "modbus", "udp2011"] {
         let address: Option<SocketAddr> = robot[server].as_str().and_then(|address| address.parse().ok());
@@ -143,7 +147,7 @@ fn gateway_arguments(folder: &Folder, console: (SocketAddr, u16), robot: &Value)
 }
 
 /// The address of its own console, and the port of the other one.
-fn console_arguments(folder: &Folder, (address, peer): (SocketAddr, u16)) -> Vec<String> {
+fn console_arguments(folder: &TempFolder, (address, peer): (SocketAddr, u16)) -> Vec<String> {
     let arguments = [
         ["--console".to_owned(), address.to_string()],
         ["--console-key".to_owned(), text(folder, "key")],
@@ -152,7 +156,7 @@ fn console_arguments(folder: &Folder, (address, peer): (SocketAddr, u16)) -> Vec
     arguments.concat()
 }
 
-fn text(folder: &Folder, name: &str) -> String {
+fn text(folder: &TempFolder, name: &str) -> String {
     folder.path(name).display().to_string()
 }
 
@@ -165,10 +169,10 @@ struct Process {
 impl Process {
     /// Starts one and waits until it is ready.
     fn start(
-        folder: &Folder,
+        folder: &TempFolder,
         arguments: &[String],
         name: &'static str,
-        ended: &mpsc::Sender<Ended>,
+        ended: &mpsc::Sender<DemoEnd>,
     ) -> io::Result<Self> {
         let program = std::env::current_exe()?;
         let mut child = folder.fill(|| {
@@ -193,7 +197,7 @@ impl Process {
         // The end of its output is the end of the process.
         thread::Builder::new().name(name.to_owned()).spawn(move || {
             for _ in lines {}
-            let _ = ended.send(Ended::Process(name));
+            let _ = ended.send(DemoEnd::Process(name));
         })?;
         Ok(Self { child, ready })
     }
@@ -217,7 +221,7 @@ impl Drop for Process {
 
 /// Starts the devices: threads that end with the process. A device whose line is gone, as while another
 /// configuration is started, opens it again.
-fn start_devices(folder: &Folder, ready: &Value) -> io::Result<()> {
+fn start_devices(folder: &TempFolder, ready: &Value) -> io::Result<()> {
     let (force, panel) = (folder.path("force"), folder.path("panel"));
     let hand = ready["ports"]["hand"].as_str().unwrap_or("").to_owned();
     device("force sensor", move || force_sensor(&force))?;

@@ -14,7 +14,7 @@ use std::io;
 use std::process::ExitCode;
 use std::time::Instant;
 
-use folder::Folder;
+use folder::TempFolder;
 pub use living::run_living;
 use recipe_runtime::Signals;
 use recipe_runtime::out::print_stderr;
@@ -38,13 +38,13 @@ pub fn run() -> ExitCode {
 }
 
 /// The folder for the devices. Ctrl-C and other signals remove it; everything else ends with the process.
-fn prepare() -> io::Result<Folder> {
+fn prepare() -> io::Result<TempFolder> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let mut signals = {
         let _inside = runtime.enter();
         Signals::catch()?
     };
-    let folder = Folder::new()?;
+    let folder = TempFolder::new()?;
     let remover = folder.remover();
     std::thread::Builder::new().name("signals".to_owned()).spawn(move || {
         let signal = runtime.block_on(signals.next());

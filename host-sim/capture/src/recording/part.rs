@@ -17,8 +17,8 @@ use super::{ENGINE, ENGINE_ENCODING};
 /// Bytes of a chunk; one that is not whole is lost when the process is killed.
 pub(super) const CHUNK: u64 = 256 << 10;
 
-/// One file. It is readable up to the last [`Part::flush`] whatever happens.
-pub(super) struct Part {
+/// One file. It is readable up to the last [`RecordingPart::flush`] whatever happens.
+pub(super) struct RecordingPart {
     writer: Writer<NoSeek<Counted>>,
     /// Bytes that were written, and the file.
     written: Arc<AtomicU64>,
@@ -47,7 +47,7 @@ impl Write for Counted {
     }
 }
 
-impl Part {
+impl RecordingPart {
     pub(super) fn create(path: &Path, run: &str, part: u32) -> io::Result<Self> {
         let file = File::create_new(path)?;
         let written = Arc::new(AtomicU64::new(0));

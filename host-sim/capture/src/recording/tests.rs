@@ -8,7 +8,7 @@ use recipe_test_kit::{example, until};
 
 use super::*;
 use crate::replay::{Report, Stopped, replay};
-use crate::test_run::{FILE, Run, config};
+use crate::test_run::{FILE, TestRun, config};
 
 fn start(folder: &Path, watch: &Watch, budget: u64) -> Recording {
     let options = RecordOptions { folder: folder.to_owned(), budget, file: MIN_FILE };
@@ -30,7 +30,7 @@ fn a_run_is_recorded_by_name_and_replayed_to_the_end() {
     let folder = tempfile::tempdir().unwrap();
     let watch = Watch::new();
     let recording = start(folder.path(), &watch, 1 << 30);
-    let mut run = Run::begin(&watch);
+    let mut run = TestRun::begin(&watch);
     for value in [1, 2, 3] {
         run.frame(value);
     }
@@ -59,7 +59,7 @@ fn each_configuration_of_a_run_has_its_own_values() {
     let toml = fs::read_to_string(example(FILE)).unwrap();
     let other = toml.replace("DigitalOutputCommand[1]", "DigitalOutputCommand[2]");
     for toml in [toml, other] {
-        let mut run = Run::begin_with(&watch, &toml);
+        let mut run = TestRun::begin_with(&watch, &toml);
         run.frame(7);
         run.end();
     }
@@ -79,7 +79,7 @@ fn the_plain_recording_is_the_one_of_the_core() {
     let folder = tempfile::tempdir().unwrap();
     let watch = Watch::new();
     let recording = start(folder.path(), &watch, 1 << 30);
-    let mut run = Run::begin(&watch);
+    let mut run = TestRun::begin(&watch);
     run.frame(1);
     run.end();
     watch.close();
@@ -114,7 +114,7 @@ fn a_full_folder_loses_its_oldest_files_and_what_is_left_says_that_the_start_is_
     let watch = Watch::new();
     let budget = 3 * MIN_FILE;
     let recording = start(folder.path(), &watch, budget);
-    let mut run = Run::begin(&watch);
+    let mut run = TestRun::begin(&watch);
     let mut most = 0;
     until("the first file to go", || {
         (0..2_000).for_each(|nth| run.frame(nth as u8));
@@ -140,7 +140,7 @@ fn lost_calls_are_a_gap_that_replay_finds() {
     let folder = tempfile::tempdir().unwrap();
     let watch = Watch::new();
     let recording = start(folder.path(), &watch, 1 << 30);
-    let mut run = Run::begin(&watch);
+    let mut run = TestRun::begin(&watch);
     run.frame(1);
     run.pass(1);
     run.input(Input::Tick, 4);
@@ -157,7 +157,7 @@ fn what_a_killed_process_leaves_is_readable() {
     let folder = tempfile::tempdir().unwrap();
     let watch = Watch::new();
     let recording = start(folder.path(), &watch, 1 << 30);
-    let mut run = Run::begin(&watch);
+    let mut run = TestRun::begin(&watch);
     run.frame(1);
     // It is on its way to the disk after a second, without an end.
     let path = until("a chunk in the file", || {
@@ -188,7 +188,7 @@ fn a_failure_is_over_when_the_disk_is_back() {
     let recording = start(&place, &watch, 1 << 30);
     // Nothing can be made in a folder that is gone.
     fs::remove_dir(&place).unwrap();
-    let mut run = Run::begin(&watch);
+    let mut run = TestRun::begin(&watch);
     until("a failure", || {
         run.frame(1);
         (recording.failures() > 0).then_some(())

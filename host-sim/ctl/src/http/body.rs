@@ -6,10 +6,10 @@ use super::head::Framing;
 
 /// Takes a body out of the bytes of a connection.
 #[derive(Debug)]
-pub(crate) struct Unframer(State);
+pub(crate) struct Unframer(BodyState);
 
 #[derive(Debug, Clone, PartialEq, Eq)]
-enum State {
+enum BodyState {
     Length(u64),
     Close,
     /// The line before a chunk, as far as it has come.
@@ -29,43 +29,43 @@ pub(crate) struct BrokenBody;
 impl Unframer {
     pub(crate) fn new(framing: Framing) -> Self {
         Self(match framing {
-            Framing::Length(0) => State::Ended,
-            Framing::Length(length) => State::Length(length),
-            Framing::Chunked => State::Size(Vec::new()),
-            Framing::Close => State::Close,
+            Framing::Length(0) => BodyState::Ended,
+            Framing::Length(length) => BodyState::Length(length),
+            Framing::Chunked => BodyState::Size(Vec::new()),
+            Framing::Close => BodyState::Close,
         })
     }
 
     /// Whether all of it has come.
     pub(crate) fn has_ended(&self) -> bool {
-        self.0 == State::Ended
+        self.0 == BodyState::Ended
     }
 
     /// Whether it may end here because the connection was closed.
     pub(crate) fn may_end(&self) -> bool {
-        matches!(self.0, State::Ended | State::Close)
+        matches!(self.0, BodyState::Ended | BodyState::Close)
     }
 
     /// Appends what `bytes` have of the body to `out`. What comes behind its end is not looked at.
     pub(crate) fn push(&mut self, mut bytes: &[u8], out: &mut Vec<u8>) -> Result<(), BrokenBody> {
         while !bytes.is_empty() {
             match &mut self.0 {
-                State::Ended => return Ok(()),
-                State::Close => {
+                BodyState::Ended => return Ok(()),
+                BodyState::Close => {
                     out.extend_from_slice(bytes);
                     return Ok(());
                 }
-                State::Length(left) | State::Chunk(left) => {
+                BodyState::Length(left) | BodyState::Chunk(left) => {
                     let len = usize::try_from(*left).unwrap_or(usize::MAX).min(bytes.len());
                     out.extend_from_slice(&bytes[..len]);
                     bytes = &bytes[len..];
                     *left -= len as u64;
                     if *left == 0 {
-                        let is_chunk = matches!(self.0, State::Chunk(_));
-                        self.0 = if is_chunk { State::ChunkEnd(Vec::new()) } else { State::Ended };
+                        let is_chunk = matches!(self.0, BodyState::Chunk(_));
+                        self.0 = if is_chunk { BodyState::ChunkEnd(Vec::new()) } else { BodyState::Ended };
                     }
                 }
-                State::Size(line) => {
+                BodyState::Size(line) => {
                     let end = bytes.iter().position(|byte| *byte == b'\n');
                     let taken = end.map_or(bytes.len(), |end| end + 1);
                     if line.len() + taken > MAX_LINE {
@@ -75,31 +75,31 @@ impl Unframer {
                     bytes = &bytes[taken..];
                     if end.is_some() {
                         self.0 = match size(line).ok_or(BrokenBody)? {
-                            0 => State::Trailer(0, 0),
-                            size => State::Chunk(size),
+                            0 => BodyState::Trailer(0, 0),
+                            size => BodyState::Chunk(size),
                         };
                     }
                 }
-                State::ChunkEnd(seen) => {
+                BodyState::ChunkEnd(seen) => {
                     seen.push(bytes[0]);
                     bytes = &bytes[1..];
                     match &seen[..] {
                         b"\r" => {}
-                        b"\r\n" => self.0 = State::Size(Vec::new()),
+                        b"\r\n" => self.0 = BodyState::Size(Vec::new()),
                         _ => return Err(BrokenBody),
                     }
                 }
-                State::Trailer(line, all) => {
+                BodyState::Trailer(line, all) => {
                     let byte = bytes[0];
                     bytes = &bytes[1..];
                     *all += 1;
                     match byte {
-                        b'\n' if *line == 0 => self.0 = State::Ended,
+                        b'\n' if *line == 0 => self.0 = BodyState::Ended,
                         b'\n' => *line = 0,
                         b'\r' => {}
                         _ => *line += 1,
                     }
-                    if matches!(self.0, State::Trailer(_, all) if all > MAX_TRAILER) {
+                    if matches!(self.0, BodyState::Trailer(_, all) if all > MAX_TRAILER) {
                         return Err(BrokenBody);
                     }
                 }

@@ -4,7 +4,7 @@
 
 /// An event with its data.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Event {
+pub(crate) struct ServerEvent {
     pub(crate) name: String,
     pub(crate) data: String,
 }
@@ -30,7 +30,7 @@ pub(crate) struct BrokenStream;
 
 impl Events {
     /// Takes bytes, and appends the events that end in them.
-    pub(crate) fn push(&mut self, bytes: &[u8], events: &mut Vec<Event>) -> Result<(), BrokenStream> {
+    pub(crate) fn push(&mut self, bytes: &[u8], events: &mut Vec<ServerEvent>) -> Result<(), BrokenStream> {
         for &byte in bytes {
             let after_cr = std::mem::replace(&mut self.after_cr, byte == b'\r');
             match byte {
@@ -48,13 +48,13 @@ impl Events {
         Ok(())
     }
 
-    fn end_line(&mut self, events: &mut Vec<Event>) -> Result<(), BrokenStream> {
+    fn end_line(&mut self, events: &mut Vec<ServerEvent>) -> Result<(), BrokenStream> {
         let line = std::mem::take(&mut self.line);
         if line.is_empty() {
             let name = std::mem::take(&mut self.name);
             self.len = 0;
             if let Some(data) = self.data.take() {
-                events.push(Event { name, data });
+                events.push(ServerEvent { name, data });
             }
             return Ok(());
         }

@@ -12,7 +12,7 @@ const MAX_FIELDS: usize = 100;
 
 /// A status and the fields behind it.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Head {
+pub(crate) struct HttpHead {
     pub(crate) status: u16,
     fields: Vec<(String, String)>,
 }
@@ -49,7 +49,7 @@ impl fmt::Display for HeadError {
     }
 }
 
-impl Head {
+impl HttpHead {
     /// The head at the front of `bytes`, and its length.
     pub(crate) fn parse(bytes: &[u8]) -> Result<(Self, usize), HeadError> {
         if !b"HTTP/1.".starts_with(&bytes[..bytes.len().min(7)]) {
@@ -135,9 +135,9 @@ mod tests {
     fn a_head_is_found_wherever_it_is_cut() {
         let text = b"HTTP/1.1 200 OK\r\nContent-Length: 3\r\nNext-Nonce:\tab \r\n\r\nxyz";
         for cut in 0..text.len() - 3 {
-            assert_eq!(Head::parse(&text[..cut]).unwrap_err(), HeadError::Incomplete, "{cut}");
+            assert_eq!(HttpHead::parse(&text[..cut]).unwrap_err(), HeadError::Incomplete, "{cut}");
         }
-        let (head, len) = Head::parse(text).unwrap();
+        let (head, len) = HttpHead::parse(text).unwrap();
         assert_eq!((head.status, &text[len..]), (200, &b"xyz"[..]));
         assert_eq!(head.field("next-nonce"), Some("ab"));
         assert_eq!(head.framing(), Ok(Framing::Length(3)));
@@ -145,7 +145,7 @@ mod tests {
 
     #[track_caller]
     fn framing(fields: &str) -> Result<Framing, HeadError> {
-        Head::parse(format!("HTTP/1.1 200 OK\r\n{fields}\r\n").as_bytes())?.0.framing()
+        HttpHead::parse(format!("HTTP/1.1 200 OK\r\n{fields}\r\n").as_bytes())?.0.framing()
     }
 
     #[test]
@@ -174,9 +174,9 @@ mod tests {
         for wrong in
             ["SSH-2.0-x\r\n", "HTTP/2 200 OK\r\n\r\n", "HTTP/1.1 2x0 OK\r\n\r\n", "HTTP/1.1 200OK\r\n\r\n"]
         {
-            assert_eq!(Head::parse(wrong.as_bytes()).unwrap_err(), HeadError::Malformed, "{wrong:?}");
+            assert_eq!(HttpHead::parse(wrong.as_bytes()).unwrap_err(), HeadError::Malformed, "{wrong:?}");
         }
         let endless = [b"HTTP/1.1 200 OK\r\na: ".as_slice(), &[b'x'; MAX_HEAD]].concat();
-        assert_eq!(Head::parse(&endless).unwrap_err(), HeadError::TooLong);
+        assert_eq!(HttpHead::parse(&endless).unwrap_err(), HeadError::TooLong);
     }
 }

@@ -18,9 +18,9 @@ use std::time::{Duration, Instant};
 use crate::stop::{LOOK, Stop};
 use body::Unframer;
 use events::Events;
-use head::{Head, HeadError, MAX_HEAD};
+use head::{HeadError, HttpHead, MAX_HEAD};
 
-pub(crate) use events::Event;
+pub(crate) use events::ServerEvent;
 
 /// Maximum length of a body that is read as a whole.
 const MAX_BODY: usize = 1 << 20;
@@ -30,7 +30,7 @@ const MAX_ANNOUNCED: usize = 8;
 
 /// What is asked.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Request<'a> {
+pub(crate) struct HttpRequest<'a> {
     pub(crate) method: &'static str,
     /// The address that the server knows itself by; `None` if it is that of the connection.
     pub(crate) host: Option<&'a str>,
@@ -43,12 +43,12 @@ pub(crate) struct Request<'a> {
 
 /// An answer.
 #[derive(Debug, Clone)]
-pub(crate) struct Reply {
-    head: Head,
+pub(crate) struct HttpReply {
+    head: HttpHead,
     pub(crate) body: Vec<u8>,
 }
 
-impl Reply {
+impl HttpReply {
     pub(crate) fn status(&self) -> u16 {
         self.head.status
     }
@@ -74,22 +74,22 @@ pub(crate) enum NoReply {
 
 /// A connection that a request was sent on.
 #[derive(Debug)]
-pub(crate) struct Exchange {
+pub(crate) struct HttpExchange {
     stream: TcpStream,
     /// The end of the time for the head, and for a body that is read as a whole.
     deadline: Instant,
     timeout: Duration,
     /// Bytes behind the head.
     rest: Vec<u8>,
-    head: Head,
+    head: HttpHead,
     stop: Stop,
 }
 
-impl Exchange {
+impl HttpExchange {
     /// Sends a request and reads the head of its answer, within `timeout`.
     pub(crate) fn start(
         place: SocketAddr,
-        request: &Request<'_>,
+        request: &HttpRequest<'_>,
         timeout: Duration,
         stop: &Stop,
     ) -> Result<Self, NoReply> {
@@ -103,7 +103,7 @@ impl Exchange {
         let mut bytes = Vec::new();
         let mut announced = 0;
         let mut exchange = |bytes: &mut Vec<u8>| loop {
-            match Head::parse(bytes) {
+            match HttpHead::parse(bytes) {
                 // It announces the real one.
                 Ok((head, len)) if head.status < 200 && announced < MAX_ANNOUNCED => {
                     announced += 1;
@@ -140,7 +140,7 @@ impl Exchange {
     }
 
     /// Reads the whole body, within the time of the request.
-    pub(crate) fn finish(mut self) -> Result<Reply, NoReply> {
+    pub(crate) fn finish(mut self) -> Result<HttpReply, NoReply> {
         let (mut unframer, mut body) = (self.unframer()?, Vec::new());
         let too_long = || NoReply::Broken(format!("the answer is longer than {MAX_BODY} bytes"));
         let broken = |_| NoReply::Broken("the answer's body is malformed".into());
@@ -151,12 +151,12 @@ impl Exchange {
                 return Err(too_long());
             }
             if unframer.has_ended() {
-                return Ok(Reply { head: self.head, body });
+                return Ok(HttpReply { head: self.head, body });
             }
             bytes.clear();
             if receive(&mut self.stream, &mut bytes, self.deadline, &self.stop)? == 0 {
                 return match unframer.may_end() {
-                    true => Ok(Reply { head: self.head, body }),
+                    true => Ok(HttpReply { head: self.head, body }),
                     false => Err(NoReply::Broken("the answer ends early".into())),
                 };
             }
@@ -179,12 +179,12 @@ impl Exchange {
 /// A body that goes on.
 #[derive(Debug)]
 pub(crate) struct Stream {
-    exchange: Exchange,
+    exchange: HttpExchange,
     unframer: Unframer,
     events: Events,
     rest: Vec<u8>,
     /// Events that have come, the newest first.
-    found: Vec<Event>,
+    found: Vec<ServerEvent>,
 }
 
 impl Stream {
@@ -214,7 +214,7 @@ impl Stream {
     }
 
     /// The next event; `None` at the end of the stream.
-    pub(crate) fn event(&mut self) -> Result<Option<Event>, NoReply> {
+    pub(crate) fn event(&mut self) -> Result<Option<ServerEvent>, NoReply> {
         loop {
             if let Some(event) = self.found.pop() {
                 return Ok(Some(event));
@@ -274,7 +274,7 @@ pub(crate) fn words(error: &io::Error) -> String {
     }
 }
 
-fn text_of(place: SocketAddr, request: &Request<'_>) -> Vec<u8> {
+fn text_of(place: SocketAddr, request: &HttpRequest<'_>) -> Vec<u8> {
     // The address, not the name: a gateway has no name of its own, and answers only for what it is.
     let host = match (request.host, place) {
         (Some(host), _) => host.to_owned(),

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use super::{Board, Seen, State};
+use super::{BoardInfo, BoardState, RolloutBoard};
 use crate::client::Client;
 use crate::failure::Failure;
 use crate::firmware::Update;
@@ -57,20 +57,20 @@ impl Real<'_> {
     }
 }
 
-impl Board for Real<'_> {
-    fn inspect(&self) -> Result<Seen, Failure> {
+impl RolloutBoard for Real<'_> {
+    fn inspect(&self) -> Result<BoardInfo, Failure> {
         let client = self.client()?;
         let firmware = Firmware::of(&client)?;
         let state = match (firmware.is_of(self.update), &firmware.trial) {
-            (true, Some(_)) => State::OnTrial,
-            (false, Some(_)) => State::OtherOnTrial,
-            (true, None) => State::Confirmed,
+            (true, Some(_)) => BoardState::OnTrial,
+            (false, Some(_)) => BoardState::OtherOnTrial,
+            (true, None) => BoardState::Confirmed,
             (false, None) => {
                 fitting(&client, &firmware, self.update)?;
-                State::Other
+                BoardState::Other
             }
         };
-        Ok(Seen { version: firmware.version, state })
+        Ok(BoardInfo { version: firmware.version, state })
     }
 
     fn health(&self) -> Result<Health, Failure> {

@@ -1,6 +1,6 @@
 //! A firmware for many boards: batch by batch, each board judged by its health before and after.
 //!
-//! In: boards behind [`Board`], a [`Plan`]. Out: a [`Report`] with what became of each board, and steps as they are
+//! In: boards behind [`RolloutBoard`], a [`RolloutPlan`]. Out: a [`RolloutReport`] with what became of each board, and steps as they are
 //! done. Knows no network and no clock: a board waits for itself. Keeps no state: the boards say what they run, so the
 //! same rollout, begun again, goes on where the one before has ended.
 
@@ -18,15 +18,15 @@ use crate::stop::Stop;
 use crate::update::Health;
 
 pub use board::{Real, real_boards, version_of};
-pub use report::Report;
+pub use report::RolloutReport;
 
 /// One board of a rollout. Each step returns once it is done, or has failed for good.
-pub trait Board: Sync {
+pub trait RolloutBoard: Sync {
     /// What it runs.
     ///
     /// # Errors
     /// It is not reached, or is no board that takes this firmware.
-    fn inspect(&self) -> Result<Seen, Failure>;
+    fn inspect(&self) -> Result<BoardInfo, Failure>;
     /// How it does.
     ///
     /// # Errors
@@ -60,16 +60,16 @@ pub trait Board: Sync {
 
 /// What a board runs, compared with the firmware of the rollout.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Seen {
+pub struct BoardInfo {
     /// The version that runs.
     pub version: String,
     /// What is to be done about it.
-    pub state: State,
+    pub state: BoardState,
 }
 
 /// How far a board is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum State {
+pub enum BoardState {
     /// It runs another firmware.
     Other,
     /// It runs this one on trial.
@@ -82,7 +82,7 @@ pub enum State {
 
 /// How a rollout goes through the boards.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Plan {
+pub struct RolloutPlan {
     /// So many at a time, at most [`MAX_AT_ONCE`] of them side by side; the next ones begin once these have ended.
     pub batch: usize,
     /// Begin no further batch once a board has failed.
@@ -95,7 +95,7 @@ pub struct Plan {
 
 /// What became of a board.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Outcome {
+pub enum BoardOutcome {
     /// Nothing was done, because a board has failed or somebody has asked to end.
     NotBegun,
     /// It has run this firmware before.
@@ -105,7 +105,7 @@ pub enum Outcome {
     /// A step has failed.
     Failed {
         /// The step.
-        step: Step,
+        step: RolloutStep,
         /// The reason.
         why: String,
         /// What the board runs now.
@@ -128,7 +128,7 @@ pub enum Left {
 
 /// A step of a board.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Step {
+pub enum RolloutStep {
     /// It is asked what it runs.
     Inspect,
     /// The firmware is sent.
@@ -143,7 +143,7 @@ pub enum Step {
 
 /// A board and what became of it.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Entry {
+pub struct RolloutEntry {
     /// Its name.
     pub name: String,
     /// The version that ran before, if it has said.
@@ -153,54 +153,54 @@ pub struct Entry {
     /// How it did last.
     pub after: Option<Health>,
     /// What became of it.
-    pub outcome: Outcome,
+    pub outcome: BoardOutcome,
 }
 
 /// Something that has happened.
 #[derive(Debug, Clone, Copy)]
-pub enum Told<'a> {
+pub enum RolloutEvent<'a> {
     /// A step of a board begins.
-    Step(&'a str, Step),
+    Step(&'a str, RolloutStep),
     /// A board has ended.
-    Ended(&'a Entry),
+    Ended(&'a RolloutEntry),
     /// A batch has ended; this is the report so far.
-    Batch(&'a Report),
+    Batch(&'a RolloutReport),
 }
 
 /// Takes the firmware of this version to all boards. Once `stop` is asked, boards that have begun are brought to their
 /// end and no further one begins.
-pub fn roll_out<B: Board>(
+pub fn roll_out<B: RolloutBoard>(
     version: &str,
     boards: &[(String, B)],
-    plan: Plan,
+    plan: RolloutPlan,
     stop: &Stop,
-    told: &(dyn Fn(Told<'_>) + Sync),
-) -> Report {
-    let mut report = Report::before(version, boards.iter().map(|(name, _)| name.as_str()));
+    notify: &(dyn Fn(RolloutEvent<'_>) + Sync),
+) -> RolloutReport {
+    let mut report = RolloutReport::before(version, boards.iter().map(|(name, _)| name.as_str()));
     let size = plan.batch.max(1);
     for (boards, nth) in boards.chunks(size).zip(0..) {
         if stop.is_asked() || plan.stop_on_failure && report.failed().next().is_some() {
             break;
         }
-        let ended = run_batch(boards, plan, stop, told);
+        let ended = run_batch(boards, plan, stop, notify);
         for (entry, ended) in report.entries.iter_mut().skip(nth * size).zip(ended) {
             *entry = ended;
         }
         report.was_stopped |= stop.is_asked();
-        told(Told::Batch(&report));
+        notify(RolloutEvent::Batch(&report));
     }
     report.was_stopped |= stop.is_asked();
     report
 }
 
-fn run_batch<B: Board>(
+fn run_batch<B: RolloutBoard>(
     boards: &[(String, B)],
-    plan: Plan,
+    plan: RolloutPlan,
     stop: &Stop,
-    told: &(dyn Fn(Told<'_>) + Sync),
-) -> Vec<Entry> {
+    notify: &(dyn Fn(RolloutEvent<'_>) + Sync),
+) -> Vec<RolloutEntry> {
     let next = AtomicUsize::new(0);
-    let entries: Vec<_> = boards.iter().map(|(name, _)| Mutex::new(Entry::new(name))).collect();
+    let entries: Vec<_> = boards.iter().map(|(name, _)| Mutex::new(RolloutEntry::new(name))).collect();
     std::thread::scope(|scope| {
         for _ in 0..boards.len().min(MAX_AT_ONCE) {
             scope.spawn(|| {
@@ -208,9 +208,9 @@ fn run_batch<B: Board>(
                     && let nth = next.fetch_add(1, Relaxed)
                     && let (Some((name, board)), Some(place)) = (boards.get(nth), entries.get(nth))
                 {
-                    let mut entry = Entry::new(name);
-                    entry.outcome = run_board(board, plan, &mut entry, told);
-                    told(Told::Ended(&entry));
+                    let mut entry = RolloutEntry::new(name);
+                    entry.outcome = run_board(board, plan, &mut entry, notify);
+                    notify(RolloutEvent::Ended(&entry));
                     *place.lock().unwrap_or_else(PoisonError::into_inner) = entry;
                 }
             });
@@ -219,51 +219,51 @@ fn run_batch<B: Board>(
     entries.into_iter().map(|entry| entry.into_inner().unwrap_or_else(PoisonError::into_inner)).collect()
 }
 
-fn run_board<B: Board>(
+fn run_board<B: RolloutBoard>(
     board: &B,
-    plan: Plan,
-    entry: &mut Entry,
-    told: &(dyn Fn(Told<'_>) + Sync),
-) -> Outcome {
+    plan: RolloutPlan,
+    entry: &mut RolloutEntry,
+    notify: &(dyn Fn(RolloutEvent<'_>) + Sync),
+) -> BoardOutcome {
     let name = entry.name.clone();
-    let begins = |step| told(Told::Step(&name, step));
-    begins(Step::Inspect);
+    let begins = |step| notify(RolloutEvent::Step(&name, step));
+    begins(RolloutStep::Inspect);
     let seen = match board.inspect() {
         Ok(seen) => seen,
-        Err(failure) => return failed(Step::Inspect, &failure, Left::Unknown),
+        Err(failure) => return failed(RolloutStep::Inspect, &failure, Left::Unknown),
     };
     entry.was = Some(seen.version);
     match seen.state {
-        State::Confirmed => {
+        BoardState::Confirmed => {
             entry.after = board.health().ok();
-            return Outcome::Already;
+            return BoardOutcome::Already;
         }
-        State::OtherOnTrial => {
+        BoardState::OtherOnTrial => {
             let why = Failure::refused("another firmware is on trial; confirm it or take it back first");
-            return failed(Step::Inspect, &why, Left::Unknown);
+            return failed(RolloutStep::Inspect, &why, Left::Unknown);
         }
         // A rollout before has ended there; how the board did before is not known any more.
-        State::OnTrial => {}
-        State::Other => {
+        BoardState::OnTrial => {}
+        BoardState::Other => {
             entry.before = match board.health() {
                 Ok(health) => Some(health),
-                Err(failure) => return failed(Step::Inspect, &failure, Left::Before),
+                Err(failure) => return failed(RolloutStep::Inspect, &failure, Left::Before),
             };
-            begins(Step::Push);
+            begins(RolloutStep::Push);
             if let Err(failure) = board.push() {
-                return failed(Step::Push, &failure, Left::Before);
+                return failed(RolloutStep::Push, &failure, Left::Before);
             }
-            begins(Step::Begin);
+            begins(RolloutStep::Begin);
             if let Err(failure) = board.begin() {
                 match left(board) {
                     // It took longer than somebody has waited.
                     Left::OnTrial | Left::New => {}
-                    left => return failed(Step::Begin, &failure, left),
+                    left => return failed(RolloutStep::Begin, &failure, left),
                 }
             }
         }
     }
-    begins(Step::Health);
+    begins(RolloutStep::Health);
     if let Err(why) = recover(board, plan, entry) {
         let failure = Failure::refused(why);
         // What it confirmed itself stays: nothing is on trial that could be taken back.
@@ -271,24 +271,24 @@ fn run_board<B: Board>(
             Ok(()) => Left::Before,
             Err(_) => left(board),
         };
-        return failed(Step::Health, &failure, left);
+        return failed(RolloutStep::Health, &failure, left);
     }
-    begins(Step::Confirm);
+    begins(RolloutStep::Confirm);
     let refused = board.confirm().err();
     // Also right if the board has confirmed itself meanwhile.
     match (board.inspect(), refused) {
-        (Ok(Seen { state: State::Confirmed, .. }), _) => Outcome::Updated,
-        (seen, Some(failure)) => failed(Step::Confirm, &failure, left_of(seen)),
-        (Err(failure), None) => failed(Step::Confirm, &failure, Left::Unknown),
+        (Ok(BoardInfo { state: BoardState::Confirmed, .. }), _) => BoardOutcome::Updated,
+        (seen, Some(failure)) => failed(RolloutStep::Confirm, &failure, left_of(seen)),
+        (Err(failure), None) => failed(RolloutStep::Confirm, &failure, Left::Unknown),
         (seen, None) => {
             let why = Failure::refused("it was confirmed, and does not run this firmware for good");
-            failed(Step::Confirm, &why, left_of(seen))
+            failed(RolloutStep::Confirm, &why, left_of(seen))
         }
     }
 }
 
 /// Waits until a board does as well as before, for a while without a break.
-fn recover<B: Board>(board: &B, plan: Plan, entry: &mut Entry) -> Result<(), String> {
+fn recover<B: RolloutBoard>(board: &B, plan: RolloutPlan, entry: &mut RolloutEntry) -> Result<(), String> {
     let begun = board.now();
     let mut well_since = None;
     loop {
@@ -321,30 +321,30 @@ fn words(health: &Health) -> String {
     format!("{word}, {links_up} links up, {ports_working} ports working")
 }
 
-fn failed(step: Step, failure: &Failure, left: Left) -> Outcome {
-    Outcome::Failed { step, why: failure.message().to_owned(), left }
+fn failed(step: RolloutStep, failure: &Failure, left: Left) -> BoardOutcome {
+    BoardOutcome::Failed { step, why: failure.message().to_owned(), left }
 }
 
-fn left<B: Board>(board: &B) -> Left {
+fn left<B: RolloutBoard>(board: &B) -> Left {
     left_of(board.inspect())
 }
 
-fn left_of(seen: Result<Seen, Failure>) -> Left {
+fn left_of(seen: Result<BoardInfo, Failure>) -> Left {
     match seen.map(|seen| seen.state) {
-        Ok(State::Other) => Left::Before,
-        Ok(State::OnTrial) => Left::OnTrial,
-        Ok(State::Confirmed) => Left::New,
-        Ok(State::OtherOnTrial) | Err(_) => Left::Unknown,
+        Ok(BoardState::Other) => Left::Before,
+        Ok(BoardState::OnTrial) => Left::OnTrial,
+        Ok(BoardState::Confirmed) => Left::New,
+        Ok(BoardState::OtherOnTrial) | Err(_) => Left::Unknown,
     }
 }
 
-impl Entry {
+impl RolloutEntry {
     fn new(name: &str) -> Self {
-        Self { name: name.to_owned(), was: None, before: None, after: None, outcome: Outcome::NotBegun }
+        Self { name: name.to_owned(), was: None, before: None, after: None, outcome: BoardOutcome::NotBegun }
     }
 }
 
-impl Step {
+impl RolloutStep {
     /// In a document.
     pub const fn name(self) -> &'static str {
         match self {
@@ -357,7 +357,7 @@ impl Step {
     }
 }
 
-impl fmt::Display for Step {
+impl fmt::Display for RolloutStep {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Inspect => "is asked what it runs",

@@ -4,52 +4,57 @@ use std::collections::BTreeMap;
 
 use serde_json::{Value, json};
 
-use super::{Entry, Left, Outcome, words};
+use super::{BoardOutcome, Left, RolloutEntry, words};
 use crate::failure::{Failure, Verdict};
-use crate::table::{Cell, Look, Table, View};
+use crate::table::{Look, TableCell, TableView, TextTable};
 use crate::update::Health;
 
 /// What became of a rollout.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Report {
+pub struct RolloutReport {
     /// The version of the firmware.
     pub version: String,
     /// The boards in the order of the inventory.
-    pub entries: Vec<Entry>,
+    pub entries: Vec<RolloutEntry>,
     /// Somebody has asked to end.
     pub was_stopped: bool,
 }
 
-impl Report {
+impl RolloutReport {
     /// That of a rollout that has not begun.
     pub fn before<'a>(version: &str, names: impl Iterator<Item = &'a str>) -> Self {
-        Self { version: version.to_owned(), entries: names.map(Entry::new).collect(), was_stopped: false }
+        Self {
+            version: version.to_owned(),
+            entries: names.map(RolloutEntry::new).collect(),
+            was_stopped: false,
+        }
     }
 
     /// A line of what became of one board.
-    pub fn line(entry: &Entry) -> String {
+    pub fn line(entry: &RolloutEntry) -> String {
         format!("{}: {}", crate::shown::line(&entry.name), crate::shown::line(&entry.outcome.words().0))
     }
 
     /// The boards that have failed.
-    pub fn failed(&self) -> impl Iterator<Item = &Entry> {
-        self.entries.iter().filter(|entry| matches!(entry.outcome, Outcome::Failed { .. }))
+    pub fn failed(&self) -> impl Iterator<Item = &RolloutEntry> {
+        self.entries.iter().filter(|entry| matches!(entry.outcome, BoardOutcome::Failed { .. }))
     }
 
     /// A table with a row for each board.
-    pub fn table(&self, view: View) -> String {
-        let health =
-            |health: &Option<Health>| health.as_ref().map_or(Cell::of(""), |health| Cell::of(words(health)));
-        let mut table = Table::new(&["gateway", "was", "before", "after", "outcome"]);
+    pub fn table(&self, view: TableView) -> String {
+        let health = |health: &Option<Health>| {
+            health.as_ref().map_or(TableCell::of(""), |health| TableCell::of(words(health)))
+        };
+        let mut table = TextTable::new(&["gateway", "was", "before", "after", "outcome"]);
         for entry in &self.entries {
-            let was = Cell::of(entry.was.as_deref().unwrap_or_default());
+            let was = TableCell::of(entry.was.as_deref().unwrap_or_default());
             let (words, look) = entry.outcome.words();
             table.row([
-                Cell::of(&entry.name),
+                TableCell::of(&entry.name),
                 was,
                 health(&entry.before),
                 health(&entry.after),
-                Cell::of(words).look(look),
+                TableCell::of(words).look(look),
             ]);
         }
         table.show(view)
@@ -65,7 +70,8 @@ impl Report {
             self.entries.len(),
             self.version
         );
-        let left: Vec<_> = self.entries.iter().filter(|entry| entry.outcome == Outcome::NotBegun).collect();
+        let left: Vec<_> =
+            self.entries.iter().filter(|entry| entry.outcome == BoardOutcome::NotBegun).collect();
         if let Some(first) = left.first() {
             let why = if self.was_stopped { "ended" } else { "stopped by the failure" };
             let name = crate::shown::line(&first.name);
@@ -85,7 +91,7 @@ impl Report {
             }
             None => Value::Null,
         };
-        let entry = |entry: &Entry| {
+        let entry = |entry: &RolloutEntry| {
             let mut document = json!({
                 "gateway": entry.name,
                 "outcome": entry.outcome.name(),
@@ -93,7 +99,7 @@ impl Report {
                 "before": health(&entry.before),
                 "after": health(&entry.after),
             });
-            if let Outcome::Failed { step, why, left } = &entry.outcome {
+            if let BoardOutcome::Failed { step, why, left } = &entry.outcome {
                 document["step"] = step.name().into();
                 document["error"] = why.as_str().into();
                 document["left"] = left.name().into();
@@ -117,7 +123,8 @@ impl Report {
     /// # Errors
     /// The summary if one does not.
     pub fn verdict(&self) -> Result<Verdict, Failure> {
-        let is_there = |entry: &Entry| matches!(entry.outcome, Outcome::Updated | Outcome::Already);
+        let is_there =
+            |entry: &RolloutEntry| matches!(entry.outcome, BoardOutcome::Updated | BoardOutcome::Already);
         match self.entries.iter().all(is_there) {
             true => Ok(Verdict::Well),
             false => Err(Failure::refused(self.summary())),
@@ -125,7 +132,7 @@ impl Report {
     }
 }
 
-impl Outcome {
+impl BoardOutcome {
     /// In a document.
     pub const fn name(&self) -> &'static str {
         match self {

@@ -31,7 +31,7 @@ pub fn update(
     client: &Client,
     file: &Update,
     plan: Plan,
-    told: &mut dyn FnMut(&str),
+    notify: &mut dyn FnMut(&str),
 ) -> Result<Answer, Failure> {
     let board = Firmware::of(client)?;
     if board.is_of(file) && board.is_build_of(file) == Some(true) && board.trial.is_none() {
@@ -40,13 +40,13 @@ pub fn update(
     }
     let link = fitting(client, &board, file)?;
     let (now, new, slot) = (&board.version, link.header.version(), link.header.slot());
-    told(&format!("{now} runs on this {}; {new} goes into slot {slot:?}", board.board));
+    notify(&format!("{now} runs on this {}; {new} goes into slot {slot:?}", board.board));
     let mut shown = String::new();
     let mut progress = |step: Progress| {
         let line = step.words();
         // A line says something new.
         if line != shown {
-            told(&line);
+            notify(&line);
             shown = line;
         }
     };
@@ -134,8 +134,8 @@ pub fn confirmed(client: &Client) -> Result<Answer, Failure> {
 ///
 /// # Errors
 /// It is refused, or the board does not come back in time.
-pub fn taken_back(client: &Client, told: &mut dyn FnMut(&str)) -> Result<Answer, Failure> {
-    let firmware = take_back(client, &mut |step| told(&step.words()))?;
+pub fn taken_back(client: &Client, notify: &mut dyn FnMut(&str)) -> Result<Answer, Failure> {
+    let firmware = take_back(client, &mut |step| notify(&step.words()))?;
     let text = firmware.text();
     Ok(answer(firmware, text))
 }

@@ -7,10 +7,10 @@ use recipe_update::Link;
 use serde_json::{Value, json};
 
 use super::{Downgrade, Firmware, Trial};
-use crate::client::{Body, Call, Client};
+use crate::client::{Call, Client, RequestBody};
 use crate::failure::Failure;
 use crate::firmware::Update;
-use crate::http::Reply;
+use crate::http::HttpReply;
 
 /// What is told while a firmware is sent and tried.
 #[derive(Debug, Clone, PartialEq)]
@@ -89,7 +89,7 @@ pub fn push(
     client: &Client,
     link: &Link<'_>,
     downgrade: Downgrade,
-    told: &mut dyn FnMut(Progress),
+    progress: &mut dyn FnMut(Progress),
 ) -> Result<Firmware, Failure> {
     let length = (link.header_bytes.len() + link.image.len()) as u64;
     let mut lost: Option<Instant> = None;
@@ -124,14 +124,14 @@ pub fn push(
             }
             "receiving" => {
                 next = Some(incoming.received);
-                told(Progress::Sent { received: incoming.received, length });
+                progress(Progress::Sent { received: incoming.received, length });
                 if client.stop().is_asked() {
                     return Err(client.refused("ended; the same command goes on where this one has"));
                 }
                 continue;
             }
-            "erasing" => told(Progress::Erasing),
-            _ => told(Progress::Checking),
+            "erasing" => progress(Progress::Erasing),
+            _ => progress(Progress::Checking),
         }
         if client.stop().wait(AGAIN) {
             return Err(client.refused("ended; the same command goes on where this one has"));
@@ -140,7 +140,7 @@ pub fn push(
 }
 
 /// Sends the piece of a firmware that begins there.
-fn put(client: &Client, link: &Link<'_>, offset: u64, downgrade: Downgrade) -> Result<Reply, Failure> {
+fn put(client: &Client, link: &Link<'_>, offset: u64, downgrade: Downgrade) -> Result<HttpReply, Failure> {
     let header = link.header_bytes.len();
     let at = usize::try_from(offset).unwrap_or(usize::MAX);
     let piece = match at.checked_sub(header) {
@@ -152,12 +152,13 @@ fn put(client: &Client, link: &Link<'_>, offset: u64, downgrade: Downgrade) -> R
     };
     let path = format!("update?offset={offset}{}", more(downgrade, '&'));
     let more_time = Duration::ZERO;
-    let call = Call { method: "PUT", path: &path, body: Body::Image(piece), if_match: None, more_time };
+    let call =
+        Call { method: "PUT", path: &path, body: RequestBody::Image(piece), if_match: None, more_time };
     client.call(&call)
 }
 
 /// The document of an answer.
-fn answered(client: &Client, reply: Reply) -> Result<Firmware, Failure> {
+fn answered(client: &Client, reply: HttpReply) -> Result<Firmware, Failure> {
     Firmware::read(client, client.document(&client.accepted(reply)?)?)
 }
 
@@ -169,12 +170,12 @@ pub fn begin_trial(
     client: &Client,
     confirm_s: u32,
     downgrade: Downgrade,
-    told: &mut dyn FnMut(Progress),
+    progress: &mut dyn FnMut(Progress),
 ) -> Result<Firmware, Failure> {
     let before = Firmware::of(client)?;
     let path = format!("update/try{}", more(downgrade, '?'));
     post(client, &path, &json!({ "confirm_s": confirm_s }))?;
-    told(Progress::Restarting);
+    progress(Progress::Restarting);
     // The trial ends by itself after that, and restarts take their time.
     let there = |now: &Firmware| now.trial.is_some();
     let failed = |now: &Firmware| {
@@ -191,7 +192,7 @@ pub fn begin_trial(
 ///
 /// # Errors
 /// The trial has ended otherwise.
-pub fn wait_confirmed(client: &Client, told: &mut dyn FnMut(Progress)) -> Result<Firmware, Failure> {
+pub fn wait_confirmed(client: &Client, progress: &mut dyn FnMut(Progress)) -> Result<Firmware, Failure> {
     let mut seen = Firmware::of(client)?;
     let slot = seen.slot;
     loop {
@@ -205,7 +206,7 @@ pub fn wait_confirmed(client: &Client, told: &mut dyn FnMut(Progress)) -> Result
             };
         };
         let left = trial.left_s.max(0.0);
-        told(Progress::OnTrial(trial));
+        progress(Progress::OnTrial(trial));
         if client.stop().wait(AGAIN) {
             return Err(client.refused("ended during the trial; `ctl update --confirm` or `--back` ends it"));
         }
@@ -229,9 +230,9 @@ pub fn confirm(client: &Client) -> Result<Firmware, Failure> {
 ///
 /// # Errors
 /// It is refused, or the board does not come back in time.
-pub fn take_back(client: &Client, told: &mut dyn FnMut(Progress)) -> Result<Firmware, Failure> {
+pub fn take_back(client: &Client, progress: &mut dyn FnMut(Progress)) -> Result<Firmware, Failure> {
     let slot = post(client, "update/back", &json!({}))?.slot;
-    told(Progress::Restarting);
+    progress(Progress::Restarting);
     back(client, RESTARTING, &|now| now.slot != slot && now.trial.is_none(), &|_| false)
 }
 

@@ -2,9 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
-use recipe_ctl::{Failure, Firmware, Slot, Update, Verdict, View, sign, signing_key};
+use recipe_ctl::{Failure, Firmware, Slot, TableView, Update, Verdict, sign, signing_key};
 
-const VIEW: View = View { width: None, is_terminal: false };
+const VIEW: TableView = TableView { width: None, is_terminal: false };
 
 /// An ELF file of an Arm core with these segments.
 fn elf(segments: &[(u32, Vec<u8>)]) -> Vec<u8> {

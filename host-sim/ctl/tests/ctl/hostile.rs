@@ -144,7 +144,7 @@ fn names_never_reach_a_terminal_as_they_came() {
         _ => document(403, "", &json!({ "error": nasty })),
     });
     let client = server.client(false);
-    let terminal = recipe_ctl::View { width: Some(80), is_terminal: true };
+    let terminal = recipe_ctl::TableView { width: Some(80), is_terminal: true };
     for answer in [
         recipe_ctl::info(&client),
         recipe_ctl::status(&client, terminal),

@@ -4,20 +4,23 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering::SeqCst};
 use std::time::Duration;
 
-use recipe_ctl::rollout::{Board, Left, Outcome, Plan, Report, Seen, State, Step, Told, roll_out};
+use recipe_ctl::rollout::{
+    BoardInfo, BoardOutcome, BoardState, Left, RolloutBoard, RolloutEvent, RolloutPlan, RolloutReport,
+    RolloutStep, roll_out,
+};
 use recipe_ctl::update::Health;
-use recipe_ctl::{Failure, MAX_AT_ONCE, Stop, Verdict, View};
+use recipe_ctl::{Failure, MAX_AT_ONCE, Stop, TableView, Verdict};
 
 const OLD: &str = "0.2.0";
 const NEW: &str = "0.3.0";
 const TRIAL: Duration = Duration::from_secs(300);
-const PLAN: Plan = Plan {
+const PLAN: RolloutPlan = RolloutPlan {
     batch: 4,
     stop_on_failure: false,
     patience: Duration::from_secs(120),
     settled: Duration::from_secs(10),
 };
-const WIDE: View = View { width: None, is_terminal: false };
+const WIDE: TableView = TableView { width: None, is_terminal: false };
 
 /// What goes wrong with a board.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -134,16 +137,16 @@ impl Inside {
     }
 }
 
-impl Board for Sim {
-    fn inspect(&self) -> Result<Seen, Failure> {
+impl RolloutBoard for Sim {
+    fn inspect(&self) -> Result<BoardInfo, Failure> {
         self.after(1, |inside| {
             let (version, state) = match inside.trial {
-                Some((_, NEW)) => (NEW, State::OnTrial),
-                Some((_, other)) => (other, State::OtherOnTrial),
-                None if inside.good == NEW => (NEW, State::Confirmed),
-                None => (inside.good, State::Other),
+                Some((_, NEW)) => (NEW, BoardState::OnTrial),
+                Some((_, other)) => (other, BoardState::OtherOnTrial),
+                None if inside.good == NEW => (NEW, BoardState::Confirmed),
+                None => (inside.good, BoardState::Other),
             };
-            Ok(Seen { version: version.into(), state })
+            Ok(BoardInfo { version: version.into(), state })
         })
     }
 
@@ -227,21 +230,26 @@ fn plant(faults: impl IntoIterator<Item = Fault>) -> Vec<(String, Sim)> {
 }
 
 /// Carries out a rollout and checks what holds for each.
-fn rolled_out(boards: &[(String, Sim)], plan: Plan, stop: &Stop) -> Report {
+fn rolled_out(boards: &[(String, Sim)], plan: RolloutPlan, stop: &Stop) -> RolloutReport {
     rolled_out_until(boards, plan, stop, usize::MAX)
 }
 
 /// Same; somebody asks to end at the begin of this step, counted over all boards.
-fn rolled_out_until(boards: &[(String, Sim)], plan: Plan, stop: &Stop, ends_at: usize) -> Report {
+fn rolled_out_until(
+    boards: &[(String, Sim)],
+    plan: RolloutPlan,
+    stop: &Stop,
+    ends_at: usize,
+) -> RolloutReport {
     let steps = AtomicUsize::new(0);
     let log = Mutex::new(Vec::new());
-    let report = roll_out(NEW, boards, plan, stop, &|told| {
-        match told {
-            Told::Step(_, Step::Inspect) => log.lock().unwrap().push(true),
-            Told::Ended(_) => log.lock().unwrap().push(false),
-            Told::Step(..) | Told::Batch(_) => {}
+    let report = roll_out(NEW, boards, plan, stop, &|event| {
+        match event {
+            RolloutEvent::Step(_, RolloutStep::Inspect) => log.lock().unwrap().push(true),
+            RolloutEvent::Ended(_) => log.lock().unwrap().push(false),
+            RolloutEvent::Step(..) | RolloutEvent::Batch(_) => {}
         }
-        if matches!(told, Told::Step(..)) && steps.fetch_add(1, SeqCst) + 1 == ends_at {
+        if matches!(event, RolloutEvent::Step(..)) && steps.fetch_add(1, SeqCst) + 1 == ends_at {
             stop.ask();
         }
     });
@@ -256,19 +264,19 @@ fn rolled_out_until(boards: &[(String, Sim)], plan: Plan, stop: &Stop, ends_at: 
         }
     }
     assert_eq!(begun, ended, "a board in hand is brought to its end");
-    let not_begun = report.entries.iter().filter(|entry| entry.outcome == Outcome::NotBegun).count();
+    let not_begun = report.entries.iter().filter(|entry| entry.outcome == BoardOutcome::NotBegun).count();
     assert_eq!(begun, boards.len() - not_begun);
     assert_eq!(report.entries.len(), boards.len());
     for (entry, (name, board)) in report.entries.iter().zip(boards) {
         assert_eq!(entry.name, *name);
         let runs = board.runs();
         match &entry.outcome {
-            Outcome::NotBegun => assert_eq!((board.pushes(), board.time()), (0, Duration::ZERO)),
-            Outcome::Already | Outcome::Updated => assert_eq!(runs, (NEW, false), "{entry:?}"),
-            Outcome::Failed { left: Left::Before, .. } => assert_eq!(runs, (OLD, false), "{entry:?}"),
-            Outcome::Failed { left: Left::OnTrial, .. } => assert_eq!(runs, (NEW, true), "{entry:?}"),
-            Outcome::Failed { left: Left::New, .. } => assert_eq!(runs, (NEW, false), "{entry:?}"),
-            Outcome::Failed { left: Left::Unknown, .. } => {}
+            BoardOutcome::NotBegun => assert_eq!((board.pushes(), board.time()), (0, Duration::ZERO)),
+            BoardOutcome::Already | BoardOutcome::Updated => assert_eq!(runs, (NEW, false), "{entry:?}"),
+            BoardOutcome::Failed { left: Left::Before, .. } => assert_eq!(runs, (OLD, false), "{entry:?}"),
+            BoardOutcome::Failed { left: Left::OnTrial, .. } => assert_eq!(runs, (NEW, true), "{entry:?}"),
+            BoardOutcome::Failed { left: Left::New, .. } => assert_eq!(runs, (NEW, false), "{entry:?}"),
+            BoardOutcome::Failed { left: Left::Unknown, .. } => {}
         }
         // Each board has its end while its trial lasts.
         assert!(board.time() < Duration::from_secs(60) + TRIAL, "{entry:?}");
@@ -289,7 +297,7 @@ fn each_fault_has_its_words_and_leaves_a_known_firmware() {
 fn a_plant_of_healthy_boards_is_updated_and_the_second_run_does_nothing() {
     for count in [1, 10, 100] {
         let boards = plant(vec![Fault::None; count]);
-        for outcome in [Outcome::Updated, Outcome::Already] {
+        for outcome in [BoardOutcome::Updated, BoardOutcome::Already] {
             let report = rolled_out(&boards, PLAN, &Stop::new());
             assert!(report.entries.iter().all(|entry| entry.outcome == outcome), "{report:?}");
             assert_eq!(report.verdict(), Ok(Verdict::Well));
@@ -300,12 +308,12 @@ fn a_plant_of_healthy_boards_is_updated_and_the_second_run_does_nothing() {
 
 #[test]
 fn a_failure_at_any_step_stops_what_follows_and_a_rerun_goes_on() {
-    let plan = Plan { batch: 10, stop_on_failure: true, ..PLAN };
+    let plan = RolloutPlan { batch: 10, stop_on_failure: true, ..PLAN };
     for fault in FAULTS {
         let mut boards = plant((0..100).map(|nth| if nth == 37 { fault } else { Fault::None }));
         let report = rolled_out(&boards, plan, &Stop::new());
         let is_failure = report.failed().next().is_some();
-        let begun = report.entries.iter().filter(|entry| entry.outcome != Outcome::NotBegun).count();
+        let begun = report.entries.iter().filter(|entry| entry.outcome != BoardOutcome::NotBegun).count();
         assert_eq!(begun, if is_failure { 40 } else { 100 }, "{fault:?}: {}", report.summary());
         boards[37].1.mend();
         let before: Vec<_> = boards.iter().map(|(_, board)| board.pushes()).collect();
@@ -319,7 +327,7 @@ fn a_failure_at_any_step_stops_what_follows_and_a_rerun_goes_on() {
 }
 
 /// Boards that have been through a rollout before have their time behind them.
-fn rolled_out_again(boards: &[(String, Sim)], plan: Plan) -> Report {
+fn rolled_out_again(boards: &[(String, Sim)], plan: RolloutPlan) -> RolloutReport {
     roll_out(NEW, boards, plan, &Stop::new(), &|_| {})
 }
 
@@ -336,7 +344,7 @@ fn whatever_fails_anywhere_each_board_ends_on_one_whole_firmware() {
         let faults: Vec<_> = (0..100)
             .map(|_| if random(4) == 0 { FAULTS[random(FAULTS.len())] } else { Fault::None })
             .collect();
-        let plan = Plan { batch: 1 + random(25), stop_on_failure: random(3) == 0, ..PLAN };
+        let plan = RolloutPlan { batch: 1 + random(25), stop_on_failure: random(3) == 0, ..PLAN };
         let mut boards = plant(faults);
         let ends_at = if random(2) == 0 { 1 + random(400) } else { usize::MAX };
         let report = rolled_out_until(&boards, plan, &Stop::new(), ends_at);
@@ -350,13 +358,13 @@ fn whatever_fails_anywhere_each_board_ends_on_one_whole_firmware() {
 #[test]
 fn who_asks_to_end_waits_for_the_boards_in_hand_and_is_told_where_to_go_on() {
     for ends_at in 1..=30 {
-        let plan = Plan { batch: 3, ..PLAN };
+        let plan = RolloutPlan { batch: 3, ..PLAN };
         let boards = plant([Fault::None; 10]);
         let report = rolled_out_until(&boards, plan, &Stop::new(), ends_at);
-        let updated = report.entries.iter().filter(|entry| entry.outcome == Outcome::Updated).count();
+        let updated = report.entries.iter().filter(|entry| entry.outcome == BoardOutcome::Updated).count();
         assert_eq!(report.failed().count(), 0);
         assert!(report.was_stopped && updated < 10, "{}", report.summary());
-        let next = report.entries.iter().find(|entry| entry.outcome == Outcome::NotBegun).unwrap();
+        let next = report.entries.iter().find(|entry| entry.outcome == BoardOutcome::NotBegun).unwrap();
         assert!(report.summary().contains(&format!("from {} on; the same command", next.name)));
         assert_eq!(rolled_out_again(&boards, plan).verdict(), Ok(Verdict::Well));
         assert!(boards.iter().all(|(_, board)| board.pushes() == 1));
@@ -366,8 +374,8 @@ fn who_asks_to_end_waits_for_the_boards_in_hand_and_is_told_where_to_go_on() {
 #[test]
 fn who_asks_to_end_does_not_wait_for_a_large_batch() {
     let boards = plant([Fault::None; 100]);
-    let report = rolled_out_until(&boards, Plan { batch: 100, ..PLAN }, &Stop::new(), 1);
-    let begun = report.entries.iter().filter(|entry| entry.outcome != Outcome::NotBegun).count();
+    let report = rolled_out_until(&boards, RolloutPlan { batch: 100, ..PLAN }, &Stop::new(), 1);
+    let begun = report.entries.iter().filter(|entry| entry.outcome != BoardOutcome::NotBegun).count();
     assert!((1..=MAX_AT_ONCE).contains(&begun), "{begun}");
 }
 
@@ -379,7 +387,7 @@ fn a_trial_that_a_rollout_before_has_left_is_brought_to_its_end() {
         board.push().unwrap();
         board.begin().unwrap();
         let report = rolled_out_again(&boards, PLAN);
-        assert_eq!(report.entries[0].outcome == Outcome::Updated, good, "{report:?}");
+        assert_eq!(report.entries[0].outcome == BoardOutcome::Updated, good, "{report:?}");
         assert_eq!(board.runs(), if good { (NEW, false) } else { (OLD, false) });
         assert_eq!(board.pushes(), 1);
     }
@@ -390,7 +398,7 @@ fn the_trial_of_another_firmware_is_left_alone() {
     let boards = plant([Fault::None]);
     boards[0].1.inside.lock().unwrap().trial = Some((Duration::ZERO, "0.2.9"));
     let report = rolled_out_again(&boards, PLAN);
-    let Outcome::Failed { step: Step::Inspect, why, .. } = &report.entries[0].outcome else {
+    let BoardOutcome::Failed { step: RolloutStep::Inspect, why, .. } = &report.entries[0].outcome else {
         panic!("{report:?}")
     };
     assert_eq!(why, "another firmware is on trial; confirm it or take it back first");

@@ -7,12 +7,12 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use recipe_api::key::{BodyHash, Hex, Key, Signed};
-use recipe_ctl::{Client, Stop, View};
+use recipe_ctl::{Client, Stop, TableView};
 use serde_json::Value;
 use tempfile::TempDir;
 
 pub(crate) const KEY: &str = "00112233445566778899aabbccddeeff";
-pub(crate) const WIDE: View = View { width: None, is_terminal: false };
+pub(crate) const WIDE: TableView = TableView { width: None, is_terminal: false };
 
 /// A request as it came.
 #[derive(Debug, Clone)]

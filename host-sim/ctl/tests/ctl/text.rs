@@ -1,7 +1,7 @@
 //! What people see.
 
 use proto_core::engine::PortCounters;
-use recipe_ctl::{Failure, Verdict, View};
+use recipe_ctl::{Failure, TableView, Verdict};
 use serde_json::json;
 
 use crate::server::*;
@@ -76,7 +76,7 @@ fn what_is_read_is_laid_out_in_tables() {
     let status = recipe_ctl::status(&client, WIDE).unwrap();
     assert_eq!(status.verdict(), Verdict::Trouble);
     insta::assert_snapshot!("status", plain(status.text(WIDE)));
-    let narrow = View { width: Some(90), is_terminal: true };
+    let narrow = TableView { width: Some(90), is_terminal: true };
     let text = plain(recipe_ctl::status(&client, narrow).unwrap().text(narrow));
     assert!(text.lines().all(|line| line.chars().count() <= 90), "{text}");
     insta::assert_snapshot!("values", recipe_ctl::values(&client, &[], WIDE).unwrap().text(WIDE));

@@ -3,7 +3,9 @@
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use recipe_ctl::rollout::{Left, Outcome, Plan, Report, Step, real_boards, roll_out, version_of};
+use recipe_ctl::rollout::{
+    BoardOutcome, Left, RolloutPlan, RolloutReport, RolloutStep, real_boards, roll_out, version_of,
+};
 use recipe_ctl::update::Downgrade;
 use recipe_ctl::{Stop, Update};
 use serde_json::{Value, json};
@@ -12,8 +14,12 @@ use crate::firmware::Folder;
 use crate::server::*;
 
 const PATIENT: Duration = Duration::from_secs(20);
-const PLAN: Plan =
-    Plan { batch: 2, stop_on_failure: false, patience: Duration::from_secs(2), settled: Duration::ZERO };
+const PLAN: RolloutPlan = RolloutPlan {
+    batch: 2,
+    stop_on_failure: false,
+    patience: Duration::from_secs(2),
+    settled: Duration::ZERO,
+};
 
 /// How a board does while the new firmware is on trial.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -145,7 +151,7 @@ fn said(kind: Kind, inside: &Inside) -> Value {
     said
 }
 
-fn rolled_out(boards: &[Board], update: &Update) -> Report {
+fn rolled_out(boards: &[Board], update: &Update) -> RolloutReport {
     let folder = tempfile::tempdir().unwrap();
     key_file(&folder, "the.key");
     let entry = |(nth, board): (usize, &Board)| {
@@ -165,14 +171,16 @@ fn boards_of_an_inventory_are_updated_and_one_that_does_worse_is_taken_back() {
     let boards = [Kind::Well, Kind::Worse, Kind::Program, Kind::Breaks].map(Board::start);
     let report = rolled_out(&boards, &update);
     let outcomes: Vec<_> = report.entries.iter().map(|entry| &entry.outcome).collect();
-    assert_eq!(outcomes[0], &Outcome::Updated);
-    let Outcome::Failed { step: Step::Health, why, left: Left::Before } = outcomes[1] else {
+    assert_eq!(outcomes[0], &BoardOutcome::Updated);
+    let BoardOutcome::Failed { step: RolloutStep::Health, why, left: Left::Before } = outcomes[1] else {
         panic!("{report:?}")
     };
     assert_eq!(why, "it does worse than before");
-    let Outcome::Failed { step: Step::Inspect, why, .. } = outcomes[2] else { panic!("{report:?}") };
+    let BoardOutcome::Failed { step: RolloutStep::Inspect, why, .. } = outcomes[2] else {
+        panic!("{report:?}")
+    };
     assert!(why.contains("this gateway is a program"), "{why}");
-    assert_eq!(outcomes[3], &Outcome::Updated);
+    assert_eq!(outcomes[3], &BoardOutcome::Updated);
     let (before, after) = (report.entries[1].before.as_ref(), report.entries[1].after.as_ref());
     assert_eq!(before.zip(after).map(|(before, after)| (before.links_up, after.links_up)), Some((1, 0)));
 
@@ -188,8 +196,8 @@ fn boards_of_an_inventory_are_updated_and_one_that_does_worse_is_taken_back() {
     // Again: who runs it is only asked.
     let sent = boards[0].count("PUT") + boards[0].count("POST");
     let report = rolled_out(&boards, &update);
-    assert_eq!(report.entries[0].outcome, Outcome::Already);
-    assert_eq!(report.entries[3].outcome, Outcome::Already);
+    assert_eq!(report.entries[0].outcome, BoardOutcome::Already);
+    assert_eq!(report.entries[3].outcome, BoardOutcome::Already);
     assert_eq!(boards[0].count("PUT") + boards[0].count("POST"), sent);
 }
 
@@ -198,10 +206,10 @@ fn another_build_of_the_same_version_is_sent_and_the_same_one_is_not() {
     let folder = Folder::new();
     let update = folder.update();
     let boards = [Kind::Rebuilt].map(Board::start);
-    assert_eq!(rolled_out(&boards, &update).entries[0].outcome, Outcome::Updated);
+    assert_eq!(rolled_out(&boards, &update).entries[0].outcome, BoardOutcome::Updated);
     let sent = boards[0].count("PUT");
     assert!(sent > 0);
-    assert_eq!(rolled_out(&boards, &update).entries[0].outcome, Outcome::Already);
+    assert_eq!(rolled_out(&boards, &update).entries[0].outcome, BoardOutcome::Already);
     assert_eq!(boards[0].count("PUT"), sent);
 }
 
@@ -213,7 +221,7 @@ fn a_firmware_that_does_not_run_is_told_each_time() {
     let boards = [Kind::Fails].map(Board::start);
     for _ in 0..2 {
         let report = rolled_out(&boards, &update);
-        let Outcome::Failed { step: Step::Begin, why, .. } = &report.entries[0].outcome else {
+        let BoardOutcome::Failed { step: RolloutStep::Begin, why, .. } = &report.entries[0].outcome else {
             panic!("{report:?}")
         };
         assert!(why.contains("the firmware did not run"), "{why}");
@@ -230,7 +238,7 @@ fn a_firmware_for_another_board_is_not_sent() {
     });
     let board = Board { server: board, inside: Arc::default() };
     let report = rolled_out(std::slice::from_ref(&board), &update);
-    let Outcome::Failed { step: Step::Inspect, why, .. } = &report.entries[0].outcome else {
+    let BoardOutcome::Failed { step: RolloutStep::Inspect, why, .. } = &report.entries[0].outcome else {
         panic!("{report:?}")
     };
     assert!(why.contains("this is a other-board; the firmware is for the board nucleo-h743zi"), "{why}");

@@ -163,5 +163,5 @@ fn a_controller_that_would_refuse_is_told_before_a_command() {
     bench.states(|packet| packet.operation_mode = 0);
     bench.says_also(Cause::Manual, &["controller: the controller is in manual mode"]);
     bench.states(|_| ());
-    assert!(bench.findings().iter().all(|finding| finding.place != Place::Controller));
+    assert!(bench.findings().iter().all(|finding| finding.place != FindingPlace::Controller));
 }

@@ -4,34 +4,36 @@ use std::collections::BTreeSet;
 
 use proto_core::device::Element;
 
-use super::{Shape, shape};
+use super::{SignalShape, shape};
 use crate::model::Format;
 
 /// The constant that tells frames apart, or two of them together.
 #[derive(Debug, Clone)]
 pub(super) struct Multiplex {
-    pub(super) first: Key,
-    pub(super) second: Option<Key>,
+    pub(super) first: MultiplexKey,
+    pub(super) second: Option<MultiplexKey>,
     first_values: Vec<u64>,
 }
 
 /// A constant that all the frames have at the same place.
 #[derive(Debug, Clone)]
-pub(super) struct Key {
+pub(super) struct MultiplexKey {
     pub(super) name: String,
-    pub(super) shape: Shape,
+    pub(super) shape: SignalShape,
 }
 
 impl Multiplex {
     /// What tells these frames apart; `None` if it is only one, or nothing does.
     pub(super) fn of(formats: &[&Format]) -> Option<Self> {
         let (first_format, others) = formats.split_first().filter(|(_, others)| !others.is_empty())?;
-        let everywhere = |key: &Key| others.iter().all(|format| value_of(format, key.shape).is_some());
-        let keys: Vec<Key> = constants(first_format).map(|(key, _)| key).filter(everywhere).collect();
+        let everywhere =
+            |key: &MultiplexKey| others.iter().all(|format| value_of(format, key.shape).is_some());
+        let keys: Vec<MultiplexKey> =
+            constants(first_format).map(|(key, _)| key).filter(everywhere).collect();
         let all_differ = |values: Vec<Option<(u64, u64)>>| {
             values.iter().all(Option::is_some) && values.iter().collect::<BTreeSet<_>>().len() == values.len()
         };
-        let pair = |one: &Key, other: &Key, format: &Format| {
+        let pair = |one: &MultiplexKey, other: &MultiplexKey, format: &Format| {
             Some((value_of(format, one.shape)?, value_of(format, other.shape)?))
         };
         let alone =
@@ -39,7 +41,7 @@ impl Multiplex {
         let found = alone.map(|key| (key.clone(), None)).or_else(|| {
             let pairs = keys.iter().flat_map(|one| keys.iter().map(move |other| (one, other)));
             let mut pairs = pairs.filter(|(one, other)| one.shape != other.shape);
-            let differs = |one: &Key, other: &Key| {
+            let differs = |one: &MultiplexKey, other: &MultiplexKey| {
                 all_differ(formats.iter().map(|format| pair(one, other, format)).collect())
             };
             pairs
@@ -67,7 +69,7 @@ impl Multiplex {
 }
 
 /// The integers that are the same in every such frame.
-fn constants(format: &Format) -> impl Iterator<Item = (Key, u64)> {
+fn constants(format: &Format) -> impl Iterator<Item = (MultiplexKey, u64)> {
     format.fields.iter().filter_map(|field| {
         let element = format.frame.elements.get(field.element?)?;
         if matches!(element, Element::Padding { .. } | Element::Text(_)) {
@@ -81,10 +83,13 @@ fn constants(format: &Format) -> impl Iterator<Item = (Key, u64)> {
         };
         // Of a negative number its bits.
         let mask = u64::MAX >> 64_usize.saturating_sub(shape.bits).min(63);
-        Some((Key { name, shape: Shape { signed: false, ..shape } }, field.constant()? as u64 & mask))
+        Some((
+            MultiplexKey { name, shape: SignalShape { signed: false, ..shape } },
+            field.constant()? as u64 & mask,
+        ))
     })
 }
 
-fn value_of(format: &Format, wanted: Shape) -> Option<u64> {
+fn value_of(format: &Format, wanted: SignalShape) -> Option<u64> {
     constants(format).find(|(key, _)| key.shape == wanted).map(|(_, value)| value)
 }

@@ -13,24 +13,24 @@ use tracing::{info, warn};
 
 use super::super::exchange::{Backlog, PortTx};
 use super::super::stream::{self, ByteStream, accept};
-use super::{CanBus, Node};
+use super::{BusNode, CanBus};
 use crate::fairness::{arrival_time, yield_fairly};
 use crate::tcp_options;
 use crate::timer::now;
 
 /// An slcan client on TCP.
 #[derive(Debug)]
-pub(crate) struct Client {
+pub(crate) struct SlcanClient {
     pub(crate) stream: TcpStream,
-    pub(crate) session: RefCell<Session>,
+    pub(crate) session: RefCell<SlcanSession>,
 }
 
 /// The slcan clients on TCP.
-pub(crate) type Clients = RefCell<Vec<Rc<Client>>>;
+pub(crate) type Clients = RefCell<Vec<Rc<SlcanClient>>>;
 
 /// What a client and the bus have said to each other, as far as it matters for what comes next.
 #[derive(Debug)]
-pub(crate) struct Session {
+pub(crate) struct SlcanSession {
     channel: Channel,
     /// What the client has not taken yet.
     out: Vec<u8>,
@@ -38,7 +38,7 @@ pub(crate) struct Session {
     rest: Vec<u8>,
 }
 
-impl Session {
+impl SlcanSession {
     pub(super) fn new(bitrate: u32) -> Self {
         Self { channel: Channel::new(bitrate), out: Vec::new(), rest: Vec::new() }
     }
@@ -80,7 +80,7 @@ pub(super) async fn serve_all(
                 }
                 info!(%peer, "slcan client connected");
                 tcp_options::enable_keepalive(&stream);
-                let client = Rc::new(Client { stream, session: RefCell::new(Session::new(bitrate)) });
+                let client = Rc::new(SlcanClient { stream, session: RefCell::new(SlcanSession::new(bitrate)) });
                 clients.borrow_mut().push(Rc::clone(&client));
                 tasks.spawn_local(serve_client(client, Rc::clone(clients), bus.join(), Rc::clone(tx), backlog));
             }
@@ -91,9 +91,9 @@ pub(super) async fn serve_all(
 
 /// Serves a client on TCP until it has gone.
 async fn serve_client(
-    client: Rc<Client>,
+    client: Rc<SlcanClient>,
     clients: Rc<Clients>,
-    node: Node,
+    node: BusNode,
     tx: Rc<PortTx>,
     backlog: Backlog,
 ) {
@@ -112,15 +112,15 @@ async fn serve_client(
 /// Serves one client until its connection fails.
 pub(super) async fn serve<D: ByteStream>(
     io: &D,
-    session: &RefCell<Session>,
-    node: &Node,
+    session: &RefCell<SlcanSession>,
+    node: &BusNode,
     tx: &PortTx,
     mut backlog: Backlog,
 ) -> io::Error {
     node.set_receiving(false);
     {
         // What a client that was taken over had sent before, and what its channel was.
-        let Session { channel, out, rest } = &mut *session.borrow_mut();
+        let SlcanSession { channel, out, rest } = &mut *session.borrow_mut();
         let (rest, mut unread) = (std::mem::take(rest), 0..rest.len());
         execute_commands(channel, node, Some(tx), &rest, &mut unread, out);
     }
@@ -154,7 +154,7 @@ pub(super) async fn serve<D: ByteStream>(
             }
             _ = node.sent(), if !unread.is_empty() => Ok(()),
             (at, frame) = node.recv(), if room => {
-                let Session { channel, out, .. } = &mut *session.borrow_mut();
+                let SlcanSession { channel, out, .. } = &mut *session.borrow_mut();
                 let mut next = Some((at, frame));
                 while let Some((at, frame)) = next {
                     out.extend(channel.deliver(&frame, at.as_micros() / 1_000).iter().flatten());
@@ -176,7 +176,7 @@ pub(super) async fn serve<D: ByteStream>(
             () = tokio::time::sleep(CLIENT_POLL), if io.may_hold_unread() => Ok(()),
         };
         let done = {
-            let Session { channel, out, rest } = &mut *session.borrow_mut();
+            let SlcanSession { channel, out, rest } = &mut *session.borrow_mut();
             execute_commands(channel, node, is_old.then_some(tx), &buf, &mut unread, out);
             rest.clear();
             rest.extend_from_slice(buf.get(unread.clone()).unwrap_or_default());
@@ -203,7 +203,7 @@ pub(super) async fn serve<D: ByteStream>(
 /// counted.
 fn execute_commands(
     channel: &mut Channel,
-    node: &Node,
+    node: &BusNode,
     old: Option<&PortTx>,
     buf: &[u8],
     unread: &mut Range<usize>,

@@ -11,7 +11,7 @@ use socketcan::CanErrorFrame;
 
 /// A received message.
 #[derive(Debug)]
-pub(super) struct Message {
+pub(super) struct CanMessage {
     pub(super) content: Content,
     /// The echo of an own frame, which was sent.
     pub(super) is_own: bool,
@@ -35,7 +35,7 @@ pub(super) enum Content {
 ///
 /// # Errors
 /// `WouldBlock` if there is none; otherwise the error of the interface.
-pub(super) fn receive(socket: BorrowedFd<'_>) -> io::Result<Message> {
+pub(super) fn receive(socket: BorrowedFd<'_>) -> io::Result<CanMessage> {
     let mut bytes = [0_u8; libc::CANFD_MTU];
     let mut part = libc::iovec { iov_base: bytes.as_mut_ptr().cast(), iov_len: size_of_val(&bytes) };
     // SAFETY: a `msghdr` consists of pointers and numbers, for which zero is valid.
@@ -45,7 +45,7 @@ pub(super) fn receive(socket: BorrowedFd<'_>) -> io::Result<Message> {
     // SAFETY: the header points to `bytes`, with their length; both outlive the call.
     let count = unsafe { libc::recvmsg(socket.as_raw_fd(), &raw mut header, libc::MSG_DONTWAIT) };
     let count = usize::try_from(count).map_err(|_| io::Error::last_os_error())?;
-    Ok(Message {
+    Ok(CanMessage {
         content: match count {
             libc::CAN_MTU => classic(&bytes),
             libc::CANFD_MTU => Content::Fd,

@@ -5,7 +5,7 @@ use std::fmt;
 
 use proto_core::engine::{Input, Output};
 use proto_core::wire::can::{CanFrame, CanId};
-use recipe_doctor::Hex;
+use recipe_doctor::HexBytes;
 
 /// An input or output for a trace.
 pub(super) struct TraceText<T>(pub(super) T);
@@ -13,9 +13,9 @@ pub(super) struct TraceText<T>(pub(super) T);
 impl fmt::Display for TraceText<&Input<'_>> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.0 {
-            Input::PortBytes { port, bytes } => write!(f, "port {}: {}", port.0, Hex(bytes)),
+            Input::PortBytes { port, bytes } => write!(f, "port {}: {}", port.0, HexBytes(bytes)),
             Input::PortCan { port, frame } => write!(f, "port {}: {}", port.0, TraceText(frame)),
-            Input::LinkBytes { link, bytes } => write!(f, "link {}: {}", link.0, Hex(bytes)),
+            Input::LinkBytes { link, bytes } => write!(f, "link {}: {}", link.0, HexBytes(bytes)),
             other => write!(f, "{other:?}"),
         }
     }
@@ -24,9 +24,9 @@ impl fmt::Display for TraceText<&Input<'_>> {
 impl fmt::Display for TraceText<&Output<'_>> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.0 {
-            Output::PortSend { port, bytes } => write!(f, "port {}: {}", port.0, Hex(bytes)),
+            Output::PortSend { port, bytes } => write!(f, "port {}: {}", port.0, HexBytes(bytes)),
             Output::PortSendCan { port, frame } => write!(f, "port {}: {}", port.0, TraceText(frame)),
-            Output::LinkSend { link, bytes } => write!(f, "link {}: {}", link.0, Hex(bytes)),
+            Output::LinkSend { link, bytes } => write!(f, "link {}: {}", link.0, HexBytes(bytes)),
             other => write!(f, "{other:?}"),
         }
     }

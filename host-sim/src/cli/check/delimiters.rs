@@ -14,7 +14,7 @@ const EVERYDAY: [f64; 14] =
     [0.0, 1.0, -1.0, 2.0, 10.0, 100.0, 255.0, 256.0, 1000.0, 65_535.0, 0.5, -2.0, -10.0, -100.0];
 
 /// A part with delimiters.
-struct Part<'r> {
+struct DelimitedPart<'r> {
     name: &'static str,
     head: &'r [u8],
     tail: &'r [u8],
@@ -39,7 +39,7 @@ pub(super) fn dangers(recipe: &AnyRecipe) -> Vec<(&'static str, String)> {
         AnyRecipe::Plain(recipe) => plain_parts(recipe),
         AnyRecipe::Device(recipe) => device_parts(recipe),
     };
-    let said = |part: &Part<'_>| -> Vec<_> {
+    let said = |part: &DelimitedPart<'_>| -> Vec<_> {
         part.dangers()
             .into_iter()
             .map(|danger| (part.name, format!("recipe {:?}, {}: {danger}", recipe.name(), part.name)))
@@ -50,7 +50,7 @@ pub(super) fn dangers(recipe: &AnyRecipe) -> Vec<(&'static str, String)> {
 
 const PARTS: [(&str, Direction); 2] = [("input", Direction::Input), ("output", Direction::Output)];
 
-fn plain_parts(recipe: &SimRecipe) -> Vec<Part<'_>> {
+fn plain_parts(recipe: &SimRecipe) -> Vec<DelimitedPart<'_>> {
     let SimParts::Stream { input, output } = &recipe.parts else { return Vec::new() };
     let parts = PARTS.iter().zip([input, output]);
     parts
@@ -60,12 +60,18 @@ fn plain_parts(recipe: &SimRecipe) -> Vec<Part<'_>> {
                 .fields
                 .iter()
                 .map(|field| (field.name.clone(), Bytes::Number(Encoding::scalar(field.field.ty()))));
-            Some(Part { name, head: &part.head, tail: &part.tail, fields: fields.collect(), by_tail: false })
+            Some(DelimitedPart {
+                name,
+                head: &part.head,
+                tail: &part.tail,
+                fields: fields.collect(),
+                by_tail: false,
+            })
         })
         .collect()
 }
 
-fn device_parts(recipe: &DeviceRecipe) -> Vec<Part<'_>> {
+fn device_parts(recipe: &DeviceRecipe) -> Vec<DelimitedPart<'_>> {
     let mut parts = Vec::new();
     for (name, direction) in PARTS {
         let by_tail = match recipe.ends(direction) {
@@ -80,7 +86,7 @@ fn device_parts(recipe: &DeviceRecipe) -> Vec<Part<'_>> {
             }
             let own = frame.fields.iter().filter(|field| !field.repeats && !is_shared(&field.spec));
             let fields = own.map(|field| (field.name.clone(), bytes_of(&field.spec))).collect();
-            parts.push(Part { name, head: &frame.head, tail: &frame.tail, fields, by_tail });
+            parts.push(DelimitedPart { name, head: &frame.head, tail: &frame.tail, fields, by_tail });
         }
     }
     parts
@@ -118,7 +124,7 @@ fn written(encoding: &Encoding, value: f64) -> Option<Vec<u8>> {
     Some(bytes)
 }
 
-impl Part<'_> {
+impl DelimitedPart<'_> {
     fn dangers(&self) -> Vec<String> {
         let (head, tail) = (self.head, self.tail);
         let mut dangers = Vec::new();

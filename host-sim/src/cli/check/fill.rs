@@ -13,7 +13,9 @@ use recipe_config::{
 
 use super::super::values::Times;
 use super::super::{exchange_report, frame, plan, text, values};
-use super::report::{self, Part, PendantLink, PendantPart, PendantRecipe, Report, Servers, name_of};
+use super::report::{
+    self, CheckReport, PartReport, PendantLink, PendantPart, PendantRecipe, Servers, name_of,
+};
 
 /// A key as a path, and a sentence.
 pub(super) type Placed = (Vec<String>, String);
@@ -24,7 +26,7 @@ pub(super) fn gateway(
     config: &GatewayConfig,
     recipes: &[AnyRecipe],
     frames: &[Option<DeviceRecipe>],
-) -> Report {
+) -> CheckReport {
     let link = &config.controller;
     let controller = Servers {
         address: link.address.to_string(),
@@ -43,7 +45,7 @@ pub(super) fn gateway(
         let of = frames.get(usize::from(port.recipe)).and_then(Option::as_ref);
         gateway_port(config, port, recipes.get(usize::from(port.recipe)), of)
     });
-    Report {
+    CheckReport {
         ok: true,
         file,
         kind: "gateway",
@@ -65,7 +67,7 @@ fn gateway_port(
     port: &Port,
     recipe: Option<&AnyRecipe>,
     frames: Option<&DeviceRecipe>,
-) -> report::Port {
+) -> report::PortReport {
     let bus = match &port.bus {
         Bus::Rs485(line) => report::Bus::of_line(line),
         Bus::ModbusTcp { host, port } => report::Bus::ModbusTcp { host: host.to_string(), tcp_port: *port },
@@ -75,14 +77,14 @@ fn gateway_port(
     };
     // On a field port input comes from the devices, on a listening port from the controller.
     let parts = [Direction::Input, Direction::Output].into_iter().filter_map(|part| {
-        let mut shown = Part::new(part, config.view().budget(port, part)?, port.cycle);
+        let mut shown = PartReport::new(part, config.view().budget(port, part)?, port.cycle);
         shown.picture = frames.map(|recipe| frame::picture(recipe, part));
         shown.least_bytes =
             frames.and_then(|recipe| shortest(recipe, part)).filter(|least| *least < shown.bytes);
         Some(shown)
     });
     let is_tcp = matches!(port.bus, Bus::ModbusTcp { .. });
-    report::Port {
+    report::PortReport {
         name: port.name.to_string(),
         bus,
         recipe: Some(recipe.map_or("", |recipe| recipe.name()).to_owned()),
@@ -160,7 +162,7 @@ pub(super) fn warnings(config: &GatewayConfig) -> Vec<Placed> {
 }
 
 /// The report on a controller file, without its warnings.
-pub(super) fn controller(file: String, config: &SimConfig) -> Report {
+pub(super) fn controller(file: String, config: &SimConfig) -> CheckReport {
     let listen = &config.listen;
     let controller = Servers {
         address: listen.address.to_string(),
@@ -170,7 +172,7 @@ pub(super) fn controller(file: String, config: &SimConfig) -> Report {
         modbus: listen.modbus,
         udp: Some(listen.udp2011),
     };
-    Report {
+    CheckReport {
         ok: true,
         file,
         kind: "controller",
@@ -187,7 +189,7 @@ pub(super) fn controller(file: String, config: &SimConfig) -> Report {
     }
 }
 
-fn controller_port(config: &SimConfig, port: &SimPort) -> report::Port {
+fn controller_port(config: &SimConfig, port: &SimPort) -> report::PortReport {
     let bus = match &port.bus {
         SimBus::Rs485(line) => report::Bus::of_line(line),
         SimBus::Can { bitrate } => report::Bus::Can { bitrate: *bitrate },
@@ -198,12 +200,12 @@ fn controller_port(config: &SimConfig, port: &SimPort) -> report::Port {
     let recipe = port.recipe.and_then(|index| config.recipes.get(index));
     let parts = [Direction::Input, Direction::Output].into_iter().filter_map(|part| {
         let budget = sim_budget(port, recipe?, part)?;
-        let mut shown = Part::new(part, budget, port.cycle);
+        let mut shown = PartReport::new(part, budget, port.cycle);
         let is_cyclic = part == Direction::Output && recipe?.mode == Mode::Realtime;
         shown.shortest = Some(budget.time).filter(|time| is_cyclic && *time > port.cycle);
         Some(shown)
     });
-    report::Port {
+    report::PortReport {
         name: port.name.clone(),
         bus,
         recipe: recipe.map(|recipe| recipe.name.clone()),
@@ -220,7 +222,7 @@ fn controller_port(config: &SimConfig, port: &SimPort) -> report::Port {
 }
 
 /// The same of a controller file.
-pub(super) fn controller_warnings(report: &Report) -> Vec<Placed> {
+pub(super) fn controller_warnings(report: &CheckReport) -> Vec<Placed> {
     let slow = report.ports.iter().flat_map(|port| port.parts.iter().map(move |part| (port, part)));
     slow.filter_map(|(port, part)| {
         let place = ["port", &port.name, "cycle_ms"].map(str::to_owned).to_vec();
@@ -234,14 +236,14 @@ pub(super) fn controller_warnings(report: &Report) -> Vec<Placed> {
     .collect()
 }
 
-fn functions(functions: &Functions) -> Vec<report::Function> {
-    let inputs = functions.inputs.iter().map(|input| report::Function {
+fn functions(functions: &Functions) -> Vec<report::FunctionReport> {
+    let inputs = functions.inputs.iter().map(|input| report::FunctionReport {
         item: input.item.to_string(),
         function: Function::ALL.iter().find(|known| known.1 == input.function).map_or("", |known| known.0),
         program: functions.start.clone().filter(|_| input.function == Function::Start),
         is_input: true,
     });
-    let outputs = functions.outputs.iter().map(|output| report::Function {
+    let outputs = functions.outputs.iter().map(|output| report::FunctionReport {
         item: output.item.to_string(),
         function: ShownState::ALL.iter().find(|known| known.1 == output.state).map_or("", |known| known.0),
         program: None,

@@ -10,13 +10,13 @@ use serde::Serialize;
 
 use super::super::exchange_report::ExchangeReport;
 use super::super::frame::Picture;
-use super::super::plan::{self, Way};
+use super::super::plan::{self, VarRoute};
 use super::super::values::{self, Picks, Times};
 use super::bus::{self, Load};
 
 /// The report on a file that is right.
 #[derive(Debug, Serialize)]
-pub(super) struct Report {
+pub(super) struct CheckReport {
     pub(super) ok: bool,
     pub(super) file: String,
     /// `gateway` or `controller`.
@@ -25,9 +25,9 @@ pub(super) struct Report {
     pub(super) controller: Servers,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) network: Option<Network>,
-    pub(super) ports: Vec<Port>,
+    pub(super) ports: Vec<PortReport>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(super) ways: Option<Vec<Way>>,
+    pub(super) ways: Option<Vec<VarRoute>>,
     pub(super) buses: Vec<Load>,
     /// What to set on the pendant, of a gateway's links.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -35,14 +35,14 @@ pub(super) struct Report {
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub(super) programs: Vec<String>,
     #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub(super) functions: Vec<Function>,
-    pub(super) warnings: Vec<Message>,
+    pub(super) functions: Vec<FunctionReport>,
+    pub(super) warnings: Vec<MessageReport>,
     /// What means something else than in the version that was asked about.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(super) changes: Option<Vec<Message>>,
+    pub(super) changes: Option<Vec<MessageReport>>,
 }
 
-/// Addresses and ports of the controller. Port 0 is any free one.
+/// Addresses and ports of the controller. PortReport 0 is any free one.
 #[derive(Debug, Serialize)]
 pub(super) struct Servers {
     pub(super) address: String,
@@ -67,7 +67,7 @@ pub(super) struct Network {
 
 /// A port of either kind of file.
 #[derive(Debug, Serialize)]
-pub(super) struct Port {
+pub(super) struct PortReport {
     pub(super) name: String,
     #[serde(flatten)]
     pub(super) bus: Bus,
@@ -75,7 +75,7 @@ pub(super) struct Port {
     pub(super) recipe: Option<String>,
     #[serde(serialize_with = "millis")]
     pub(super) cycle_ms: Duration,
-    pub(super) parts: Vec<Part>,
+    pub(super) parts: Vec<PartReport>,
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub(super) exchanges: Vec<ExchangeReport>,
     /// What all exchanges with a period take of the line.
@@ -130,7 +130,7 @@ pub(super) enum Bus {
 
 /// A part of a port's recipe.
 #[derive(Debug, Serialize)]
-pub(super) struct Part {
+pub(super) struct PartReport {
     /// `input` or `output`.
     pub(super) part: &'static str,
     pub(super) frames: usize,
@@ -193,7 +193,7 @@ pub(super) struct PendantPart {
 
 /// A functional input or output of a controller.
 #[derive(Debug, Serialize)]
-pub(super) struct Function {
+pub(super) struct FunctionReport {
     /// The input or output.
     pub(super) item: String,
     /// What it triggers, or shows.
@@ -205,7 +205,7 @@ pub(super) struct Function {
 
 /// A mistake or a warning, with its place.
 #[derive(Debug, Serialize)]
-pub(super) struct Message {
+pub(super) struct MessageReport {
     #[serde(skip_serializing_if = "Option::is_none")]
     file: Option<String>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -219,7 +219,7 @@ pub(super) struct Message {
     pub(super) message: String,
 }
 
-impl From<FileError> for Message {
+impl From<FileError> for MessageReport {
     fn from(error: FileError) -> Self {
         let FileError { source, key, message } = error;
         let (file, place, set) = match source {
@@ -236,7 +236,7 @@ impl From<FileError> for Message {
 #[derive(Debug, Serialize)]
 pub(super) struct Refusal {
     pub(super) ok: bool,
-    pub(super) errors: Vec<Message>,
+    pub(super) errors: Vec<MessageReport>,
 }
 
 impl Refusal {
@@ -290,7 +290,7 @@ impl Bus {
     }
 }
 
-impl Part {
+impl PartReport {
     pub(super) fn new(part: Direction, budget: PartBudget, cycle: Duration) -> Self {
         let micros = budget.time.as_micros();
         let is_input = part == Direction::Input;
@@ -338,7 +338,7 @@ pub(super) fn name_of(part: Direction) -> &'static str {
     }
 }
 
-impl Port {
+impl PortReport {
     fn show(&self, is_gateway: bool) -> String {
         let recipe = match &self.recipe {
             Some(recipe) if is_gateway => format!(", recipe {recipe}"),
@@ -348,7 +348,7 @@ impl Port {
         if self.recipe.is_none() {
             report += "  no recipe: idle\n";
         }
-        report.extend(self.parts.iter().map(Part::show));
+        report.extend(self.parts.iter().map(PartReport::show));
         report.extend(self.exchanges.iter().map(ExchangeReport::show));
         if let Some(percent) = self.exchanges_percent {
             let what = if matches!(self.bus, Bus::Can { .. }) { "bus" } else { "line" };
@@ -394,7 +394,7 @@ fn decimal(bytes: &[u8]) -> String {
     bytes.iter().map(u8::to_string).collect::<Vec<_>>().join(" ")
 }
 
-impl Report {
+impl CheckReport {
     /// As text.
     pub(super) fn show(&self) -> String {
         let is_gateway = self.kind == "gateway";
@@ -461,8 +461,8 @@ fn show_links(links: &[PendantLink]) -> String {
 }
 
 /// What functional inputs do and functional outputs show.
-fn show_functions(functions: &[Function]) -> String {
-    let show = |Function { item, function, program, is_input }: &Function| match is_input {
+fn show_functions(functions: &[FunctionReport]) -> String {
+    let show = |FunctionReport { item, function, program, is_input }: &FunctionReport| match is_input {
         true => {
             let program = program.as_ref().map_or(String::new(), |program| format!(" {program}"));
             format!("  {item} -> {function}{program}\n")

@@ -31,7 +31,7 @@ pub(in super::super) struct DevicePart {
 struct Format {
     id: Option<CanId>,
     frame: DeviceFrame,
-    values: Vec<Value>,
+    values: Vec<FieldValue>,
     tail: Vec<u8>,
     /// Its ends are known from outside.
     is_whole: bool,
@@ -41,7 +41,7 @@ struct Format {
 
 /// What tells a frame from others.
 #[derive(Debug, Clone, Copy, Default)]
-struct Told {
+struct FormatFlags {
     /// Its ends are known from outside.
     is_whole: bool,
     /// Its constants: there are others with its id.
@@ -50,7 +50,7 @@ struct Told {
 
 /// A field with a value.
 #[derive(Debug)]
-struct Value {
+struct FieldValue {
     name: String,
     kind: ValueKind,
     /// What a gateway does with it, each use of its bytes.
@@ -78,7 +78,7 @@ enum Given {
 }
 
 /// What a field of a frame is, as it is shown.
-struct Seen {
+struct DecodedFrame {
     shown: String,
     is_finite: bool,
     /// Of a number that the frame has.
@@ -92,7 +92,12 @@ impl DevicePart {
         let part = recipe.part(direction);
         let format = |named: &NamedFrame| {
             let same_id = part.iter().filter(|other| other.id.is_some() && other.id == named.id).count();
-            Format::new(named, recipe.carrier, direction, Told { is_whole, is_multiplexed: same_id > 1 })
+            Format::new(
+                named,
+                recipe.carrier,
+                direction,
+                FormatFlags { is_whole, is_multiplexed: same_id > 1 },
+            )
         };
         let formats = part.iter().map(format).collect::<Result<_, _>>()?;
         Ok(Self { direction, ends, formats })
@@ -115,7 +120,7 @@ impl DevicePart {
             _ => Direction::Input,
         };
         let carrier = if named.id.is_some() { Carrier::Can } else { Carrier::Stream };
-        let format = Format::new(named, carrier, direction, Told::default())?;
+        let format = Format::new(named, carrier, direction, FormatFlags::default())?;
         Ok(Self { direction, ends: FrameEnds::default(), formats: vec![format] })
     }
 
@@ -166,8 +171,8 @@ impl DevicePart {
         let effort = format.frame.layout.lengths().1 + format.frame.elements.len();
         let mut framer = Framer::new();
         let mut frames = 0;
-        // Bytes of frames with a wrong checksum, which are told of: all of them, and those that are held.
-        let (mut told, mut held) = (0, 0);
+        // Bytes of frames with a wrong checksum, which are reported of: all of them, and those that are held.
+        let (mut reported, mut held) = (0, 0);
         for (number, line) in lines {
             let at = |message| format!("line {number}: {message}");
             let line = line.map_err(|error| at(error.to_string()))?;
@@ -188,14 +193,14 @@ impl DevicePart {
                         note(notes, &at(format!("{}: other constants, so not this frame", text::hex(frame))));
                     }
                     Found::Wrong(frame) => {
-                        told += frame.len();
+                        reported += frame.len();
                         held = frame.len() - 1;
                         note(notes, &at(format!("{}: {}", text::hex(frame), format.wrong_checksum(frame))));
                     }
                 }
             }
         }
-        let skipped = (framer.stats().skipped_bytes as usize).saturating_sub(told);
+        let skipped = (framer.stats().skipped_bytes as usize).saturating_sub(reported);
         if skipped > 0 {
             note(notes, &format!("{skipped} bytes skipped outside of frames"));
         }
@@ -285,7 +290,7 @@ impl DevicePart {
         if self.direction != Direction::Input {
             return;
         }
-        let why = |(value, seen): (&Value, Seen)| {
+        let why = |(value, seen): (&FieldValue, DecodedFrame)| {
             let refused = |uses: &Vec<FieldSpec>| scale::refused_field(uses, &value.name, seen.value?);
             match seen.is_finite {
                 false => Some(format!("{} is not finite", value.name)),
@@ -304,8 +309,8 @@ fn uses(field: &DeviceField) -> Vec<FieldSpec> {
 }
 
 /// The fields with a value, each once.
-fn values_of(named: &NamedFrame, is_multiplexed: bool) -> Vec<Value> {
-    let mut values: Vec<Value> = Vec::new();
+fn values_of(named: &NamedFrame, is_multiplexed: bool) -> Vec<FieldValue> {
+    let mut values: Vec<FieldValue> = Vec::new();
     let elements = named.fields.iter().filter_map(|field| Some((field, field.spec.element()?)));
     for (nth, (field, element)) in elements.enumerate() {
         let constant = match field.spec {
@@ -329,7 +334,7 @@ fn values_of(named: &NamedFrame, is_multiplexed: bool) -> Vec<Value> {
                 let is_fixed = is_multiplexed && constant.is_some();
                 let name = field.name.clone();
                 let specs = vec![uses(field)];
-                values.push(Value { name, kind, specs, elements: vec![nth], constant, is_fixed });
+                values.push(FieldValue { name, kind, specs, elements: vec![nth], constant, is_fixed });
             }
         }
     }
@@ -341,7 +346,7 @@ impl Format {
         named: &NamedFrame,
         carrier: Carrier,
         direction: Direction,
-        Told { is_whole, is_multiplexed }: Told,
+        FormatFlags { is_whole, is_multiplexed }: FormatFlags,
     ) -> Result<Self, String> {
         // Cannot fail for the frames of files: reading the file laid them out.
         let frame = named.lay_out(carrier, direction).map_err(|error| error.to_string())?;
@@ -388,7 +393,7 @@ impl Format {
     }
 
     /// The values of a frame, each once.
-    fn values(&self, frame: &[u8]) -> Result<Vec<Seen>, String> {
+    fn values(&self, frame: &[u8]) -> Result<Vec<DecodedFrame>, String> {
         let DeviceFrame { layout, elements } = &self.frame;
         let mut all: Vec<_> = layout.values(elements, frame).collect();
         for value in &self.values {
@@ -402,15 +407,15 @@ impl Format {
                 *read = encoding.read(&turned).map(Some);
             }
         }
-        let value = |value: &Value| {
+        let value = |value: &FieldValue| {
             let nth = value.elements.first().copied().unwrap_or(usize::MAX);
             match (&value.kind, all.get(nth)) {
                 (ValueKind::Text, _) => {
                     let text = layout.text(elements, frame, nth);
                     let text = text.ok_or_else(|| format!("{}: no text", value.name))?;
-                    Ok(Seen { shown: text::show_text(text), is_finite: true, value: None })
+                    Ok(DecodedFrame { shown: text::show_text(text), is_finite: true, value: None })
                 }
-                (ValueKind::Number(_), Some(Ok(Some(scalar)))) => Ok(Seen {
+                (ValueKind::Number(_), Some(Ok(Some(scalar)))) => Ok(DecodedFrame {
                     shown: text::show_scalar(*scalar).to_string(),
                     is_finite: scalar.is_finite(),
                     value: Some(*scalar),
@@ -418,7 +423,7 @@ impl Format {
                 // The probe has compared it.
                 (_, Some(Ok(None))) if value.is_fixed => {
                     let constant = value.constant.unwrap_or(f64::NAN);
-                    Ok(Seen {
+                    Ok(DecodedFrame {
                         shown: text::show_scalar(Scalar::Double(constant)).to_string(),
                         is_finite: true,
                         value: None,
@@ -503,7 +508,7 @@ impl Format {
                 Some((name, shown)) => (Some(name), shown),
                 None => (None, token.as_str()),
             };
-            let is_meant = |(value, given): (&Value, &Option<Given>)| {
+            let is_meant = |(value, given): (&FieldValue, &Option<Given>)| {
                 given.is_none() && name.map_or(value.constant.is_none(), |name| name == value.name)
             };
             let place = self.values.iter().zip(&all).position(is_meant).ok_or_else(|| {
@@ -527,7 +532,7 @@ impl Format {
             }
             all[place] = Some(given);
         }
-        let constant = |value: &Value| value.constant.map(Given::Number);
+        let constant = |value: &FieldValue| value.constant.map(Given::Number);
         let all =
             self.values.iter().zip(&all).map(|(value, given)| given.clone().or_else(|| constant(value)));
         let missing: Vec<_> =

@@ -10,14 +10,14 @@ use super::super::codec::ExchangePart;
 use super::tests::{decoded, encoded, from_values};
 use super::*;
 
-fn example_part(file: &str, recipe: Option<&str>, part: Direction) -> Part {
-    Part::choose(&load_recipes(&example(file), &[]).unwrap(), recipe, Some(part)).unwrap()
+fn example_part(file: &str, recipe: Option<&str>, part: Direction) -> CompiledPart {
+    CompiledPart::choose(&load_recipes(&example(file), &[]).unwrap(), recipe, Some(part)).unwrap()
 }
 
 /// A frame of an exchange of an example, which has one recipe.
-fn exchange_part(file: &str, number: usize, part: ExchangePart) -> Part {
+fn exchange_part(file: &str, number: usize, part: ExchangePart) -> CompiledPart {
     let recipes = load_recipes(&example(file), &[]).unwrap();
-    Part::choose_exchange(&recipes, None, Some(number), Some(part)).unwrap()
+    CompiledPart::choose_exchange(&recipes, None, Some(number), Some(part)).unwrap()
 }
 
 const REPLY: &str = "09 17 06 F9 00 00 DC D0 1E 4E 11";
@@ -111,7 +111,7 @@ fn frames_of_exchanges_are_whole() {
         assert_eq!(part.is_constant(), !needs_values, "{values}");
     }
     let recipes = load_recipes(&example("modbus-line.toml"), &[]).unwrap();
-    let refused = |number, part| Part::choose_exchange(&recipes, None, number, part).unwrap_err();
+    let refused = |number, part| CompiledPart::choose_exchange(&recipes, None, number, part).unwrap_err();
     assert_eq!(refused(Some(13), Some(ExchangePart::Reply)), "the exchange has no reply; there are request");
     assert_eq!(refused(Some(14), None), "there is no exchange 14 in recipe \"line\"; allowed: 1..=13");
     assert_eq!(refused(Some(0), None), "there is no exchange 0 in recipe \"line\"; allowed: 1..=13");
@@ -123,7 +123,7 @@ fn frames_of_exchanges_are_whole() {
         refused(Some(1), None),
         "the exchange has several frames; choose one with --part: request, reply, refusal"
     );
-    assert_eq!(Part::choose(&recipes, None, None).unwrap_err(), refused(None, None));
+    assert_eq!(CompiledPart::choose(&recipes, None, None).unwrap_err(), refused(None, None));
 }
 
 /// The fenced blocks of a part of docs/configuration.md, and its text.
@@ -162,7 +162,7 @@ fn the_worked_bytes_of_conversations_are_right() {
         let toml = format!("[controller]\naddress = \"a\"\n{recipe}{blocks}");
         let recipes = parse_recipes(Text { name: title, toml: &toml }, &[]).unwrap();
         for &(number, part, values) in frames {
-            let part = Part::choose_exchange(&recipes, None, Some(number), Some(part)).unwrap();
+            let part = CompiledPart::choose_exchange(&recipes, None, Some(number), Some(part)).unwrap();
             let values: Vec<_> = values.split_whitespace().collect();
             let bytes = from_values(&part, None, &values).unwrap();
             assert!(text.contains(&format!("`{bytes}`")), "{title}, {number}: {bytes}");
@@ -247,7 +247,7 @@ fields = [
 }
 
 /// The input part of a stream recipe, with these keys.
-fn input_part(keys: &str) -> Part {
+fn input_part(keys: &str) -> CompiledPart {
     let toml = format!(
         r#"
 [controller]
@@ -261,11 +261,11 @@ mode = "user"
 "#
     );
     let recipes = parse_recipes(Text { name: "test.toml", toml: &toml }, &[]).unwrap();
-    Part::choose(&recipes, None, None).unwrap()
+    CompiledPart::choose(&recipes, None, None).unwrap()
 }
 
 /// One with these keys, and with a text `code` behind other fields.
-fn text_part(keys: &str, fields: &str) -> Part {
+fn text_part(keys: &str, fields: &str) -> CompiledPart {
     let code = "{ name = \"code\", type = \"text\", to = \"WordInputReg[1..4]\" }";
     input_part(&format!("{keys}\nfields = [{fields}{code}]"))
 }
@@ -356,7 +356,7 @@ proptest! {
         binary in any::<[u8; 20]>(), text in "[ +-][0-9]{2}[.0-9][0-9][0-9a-fA-F]{3}",
     ) {
         let recipes = parse_recipes(Text { name: "any.toml", toml: ANY }, &[]).unwrap();
-        let part = Part::choose(&recipes, None, None).unwrap();
+        let part = CompiledPart::choose(&recipes, None, None).unwrap();
         let mut frame = [&[0x48, 0xAA], &binary[..10], &[0x12, 0x34], &binary[12..], text.as_bytes()].concat();
         let mut crc = [0; 2];
         ByteOrder::Big.write(u64::from(Algorithm::named("crc16-xmodem").unwrap().of([&frame[2..]])), &mut crc);
@@ -424,7 +424,7 @@ fields = [{ name = "first", type = "byte", equals = 9 }, { name = "celsius", typ
 #[test]
 fn frames_with_one_id_are_shown_and_made_by_their_constant() {
     let recipes = parse_recipes(Text { name: "battery.toml", toml: BATTERY }, &[]).unwrap();
-    let part = Part::choose(&recipes, None, Some(Direction::Input)).unwrap();
+    let part = CompiledPart::choose(&recipes, None, Some(Direction::Input)).unwrap();
     let lines = "200#030A00\n200#0937\n200#010B00\n";
     let values = "id=0x200 first=3 volt=10\nid=0x200 first=9 celsius=55\nid=0x200 first=1 volt=11\n";
     assert_eq!(decoded(&part, lines), (values.into(), String::new()));

@@ -38,25 +38,25 @@ id = 0x7FF
 fields = [{ name = "d", type = "double" }]
 "#;
 
-fn part(toml: &str, part: Direction) -> Part {
+fn part(toml: &str, part: Direction) -> CompiledPart {
     let recipes = parse_recipes(Text { name: "test.toml", toml }, &[]).unwrap();
-    Part::choose(&recipes, None, Some(part)).unwrap()
+    CompiledPart::choose(&recipes, None, Some(part)).unwrap()
 }
 
 /// The output of `decode`, and its notes.
-pub(super) fn decoded(part: &Part, input: &str) -> (String, String) {
+pub(super) fn decoded(part: &CompiledPart, input: &str) -> (String, String) {
     let (mut out, mut notes) = (Vec::new(), Vec::new());
     decode_lines(part, input.as_bytes(), &mut out, &mut notes).unwrap();
     (String::from_utf8(out).unwrap(), String::from_utf8(notes).unwrap())
 }
 
-pub(super) fn encoded(part: &Part, input: &str) -> Result<String, String> {
+pub(super) fn encoded(part: &CompiledPart, input: &str) -> Result<String, String> {
     let mut out = Vec::new();
     encode_lines(part, None, input.as_bytes(), &mut out)?;
     Ok(String::from_utf8(out).unwrap())
 }
 
-pub(super) fn from_values(part: &Part, id: Option<u32>, values: &[&str]) -> Result<String, String> {
+pub(super) fn from_values(part: &CompiledPart, id: Option<u32>, values: &[&str]) -> Result<String, String> {
     let values: Vec<String> = values.iter().map(|&value| value.to_owned()).collect();
     let mut out = Vec::new();
     encode_values(part, id, &values, &mut out)?;
@@ -121,8 +121,9 @@ fn frames_are_found_wherever_lines_and_garbage_cut_them() {
 fn what_is_not_hex_or_not_can_names_its_line() {
     let stream = part(STREAM, Direction::Input);
     let (mut out, mut notes) = (Vec::new(), Vec::new());
-    let mut refused =
-        |part: &Part, log: &str| decode_lines(part, log.as_bytes(), &mut out, &mut notes).unwrap_err();
+    let mut refused = |part: &CompiledPart, log: &str| {
+        decode_lines(part, log.as_bytes(), &mut out, &mut notes).unwrap_err()
+    };
     assert_eq!(refused(&stream, "FF\nF"), "line 2: \"F\" is not hexadecimal with two digits for each byte");
     assert_eq!(refused(&stream, "FF GG"), "line 1: \"GG\" is not hexadecimal with two digits for each byte");
     assert_eq!(refused(&stream, "FF é"), "line 1: \"é\" is not hexadecimal with two digits for each byte");

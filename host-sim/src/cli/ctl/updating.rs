@@ -5,7 +5,7 @@ use std::path::Path;
 use std::sync::Mutex;
 use std::time::Duration;
 
-use recipe_ctl::rollout::{self, Board, Plan, Report, Told};
+use recipe_ctl::rollout::{self, RolloutBoard, RolloutEvent, RolloutPlan, RolloutReport};
 use recipe_ctl::update::Downgrade;
 use recipe_ctl::{Failure, Member, Rollout, Stop, Update, Verdict};
 use recipe_runtime::out::print_stderr;
@@ -52,19 +52,21 @@ impl Updating<'_> {
     }
 
     /// All boards, and the report in its file.
-    fn through<B: Board>(
+    fn through<B: RolloutBoard>(
         &self,
         version: &str,
         boards: &[(String, B)],
         stop: &Stop,
-    ) -> Result<Report, Failure> {
+    ) -> Result<RolloutReport, Failure> {
         // A report that cannot be written is a mistake that is told before anything is done.
-        self.keep(&Report::before(version, boards.iter().map(|(name, _)| name.as_str())))?;
+        self.keep(&RolloutReport::before(version, boards.iter().map(|(name, _)| name.as_str())))?;
         let unkept = Mutex::new(None);
-        let report = rollout::roll_out(version, boards, self.plan(), stop, &|told| match told {
-            Told::Step(name, step) => print_stderr(format_args!("{}: {step}", recipe_ctl::shown::line(name))),
-            Told::Ended(entry) => print_stderr(Report::line(entry)),
-            Told::Batch(report) => {
+        let report = rollout::roll_out(version, boards, self.plan(), stop, &|event| match event {
+            RolloutEvent::Step(name, step) => {
+                print_stderr(format_args!("{}: {step}", recipe_ctl::shown::line(name)))
+            }
+            RolloutEvent::Ended(entry) => print_stderr(RolloutReport::line(entry)),
+            RolloutEvent::Batch(report) => {
                 *unkept.lock().unwrap_or_else(std::sync::PoisonError::into_inner) = self.keep(report).err();
             }
         });
@@ -74,13 +76,13 @@ impl Updating<'_> {
         Ok(report)
     }
 
-    fn keep(&self, report: &Report) -> Result<(), Failure> {
+    fn keep(&self, report: &RolloutReport) -> Result<(), Failure> {
         let Some(path) = self.report else { return Ok(()) };
         write(path, format!("{:#}\n", report.document()).as_bytes(), true)
     }
 
-    fn plan(&self) -> Plan {
-        Plan {
+    fn plan(&self) -> RolloutPlan {
+        RolloutPlan {
             batch: self.rollout.batch,
             stop_on_failure: self.rollout.stop_on_failure,
             // The other half of the trial is for its restart, and for taking it back.

@@ -12,10 +12,10 @@ use recipe_runtime::out::print_stderr;
 use super::Run;
 use super::act::Act;
 use super::updating::Updating;
-use crate::cli::output::Written;
+use crate::cli::output::OutputFile;
 
 /// What a gateway answers.
-type Ask<'a> = Box<dyn Fn(&Client, Run) -> Result<Answer, Failure> + Sync + 'a>;
+type QueryFn<'a> = Box<dyn Fn(&Client, Run) -> Result<Answer, Failure> + Sync + 'a>;
 /// What prints by itself.
 type Follow<'a> = Box<dyn Fn(&Client, Run, &mut dyn Write) -> Result<Verdict, Failure> + 'a>;
 
@@ -26,11 +26,11 @@ type Through<'a> = Box<dyn Fn(&[Member], &Stop, Run, &mut dyn Write) -> Result<V
 type Alone<'a> = Box<dyn FnOnce(Run, &mut dyn Write) -> Result<Verdict, Failure> + 'a>;
 
 /// A command whose files have been read.
-pub(super) enum Work<'a> {
+pub(super) enum CtlWork<'a> {
     /// It needs no gateway.
     Alone(Alone<'a>),
     /// Each gateway has an answer.
-    Ask(Ask<'a>, Many),
+    Query(QueryFn<'a>, Many),
     /// It is for one gateway.
     Follow(Follow<'a>),
     /// It is for an inventory, also of one gateway.
@@ -48,28 +48,28 @@ pub(super) enum Many {
 
 impl Act {
     /// Reads the files of the command, which is for an inventory or for one gateway.
-    pub(super) fn prepare(&self, is_for_inventory: bool) -> Result<Work<'_>, Failure> {
+    pub(super) fn prepare(&self, is_for_inventory: bool) -> Result<CtlWork<'_>, Failure> {
         Ok(match self {
             Self::Info => rows(|client, _| recipe_ctl::info(client)),
             Self::Status { watch: false } => rows(|client, run| recipe_ctl::status(client, run.view)),
             Self::Status { watch: true } => {
-                Work::Follow(Box::new(|client, run, out| watch(client, &Watched::Status, run, out)))
+                CtlWork::Follow(Box::new(|client, run, out| watch(client, &Watched::Status, run, out)))
             }
             Self::Values { watch: false, filter } => {
                 sections(move |client, run| recipe_ctl::values(client, filter, run.view))
             }
             Self::Values { watch: true, filter } => {
                 let watched = Watched::Values(filter.clone());
-                Work::Follow(Box::new(move |client, run, out| watch(client, &watched, run, out)))
+                CtlWork::Follow(Box::new(move |client, run, out| watch(client, &watched, run, out)))
             }
             Self::Trace { port, file } => {
                 let names = file.as_deref().map(Names::read).transpose()?;
-                Work::Follow(Box::new(move |client, run, out| {
+                CtlWork::Follow(Box::new(move |client, run, out| {
                     recipe_ctl::trace(client, port.as_deref(), names.as_ref(), run.json, out)?;
                     Ok(Verdict::Well)
                 }))
             }
-            Self::Capture { file, port, time } => Work::Follow(Box::new(move |client, run, out| {
+            Self::Capture { file, port, time } => CtlWork::Follow(Box::new(move |client, run, out| {
                 run.print(&recipe_ctl::capture(client, file, port.as_deref(), *time)?, out)
             })),
             Self::Doctor { time } => rows(move |client, _| recipe_ctl::doctor(client, *time)),
@@ -79,14 +79,14 @@ impl Act {
                 sections(move |client, _| recipe_ctl::config(client, *revision))
             }
             Self::Config { revision, output: Some(path), force } => {
-                Work::Follow(Box::new(move |client, _, out| {
+                CtlWork::Follow(Box::new(move |client, _, out| {
                     let stored = recipe_ctl::stored(client, *revision)?;
                     write(path, stored.bytes(), *force)?;
                     writeln!(out, "{}: {} bytes", path.display(), stored.bytes().len())?;
                     Ok(Verdict::Well)
                 }))
             }
-            Self::Bundle { file, force } => Work::Follow(Box::new(move |client, run, out| {
+            Self::Bundle { file, force } => CtlWork::Follow(Box::new(move |client, run, out| {
                 let document = recipe_ctl::bundle(client)?;
                 let text = format!("{document:#}\n");
                 write(file, text.as_bytes(), *force)?;
@@ -107,9 +107,11 @@ impl Act {
                 let without = if *previous { WithoutTrial::Previous } else { WithoutTrial::Refuse };
                 rows(move |client, _| recipe_ctl::rollback(client, without))
             }
-            Self::Update { file: None, back: true, .. } => Work::Follow(Box::new(move |client, run, out| {
-                run.print(&update::taken_back(client, &mut |line| print_stderr(line))?, out)
-            })),
+            Self::Update { file: None, back: true, .. } => {
+                CtlWork::Follow(Box::new(move |client, run, out| {
+                    run.print(&update::taken_back(client, &mut |line| print_stderr(line))?, out)
+                }))
+            }
             Self::Update { file: None, confirm: true, .. } => rows(|client, _| update::confirmed(client)),
             Self::Update { file: None, .. } => rows(|client, _| update::shown(client)),
             Self::Update {
@@ -129,7 +131,7 @@ impl Act {
                     rollout: many.rollout(),
                     report: report.as_deref(),
                 };
-                Work::Through(Box::new(move |members, stop, run, out| {
+                CtlWork::Through(Box::new(move |members, stop, run, out| {
                     updating.roll_out(members, stop, run, out)
                 }))
             }
@@ -150,7 +152,7 @@ impl Act {
                 let file = Update::read(file)?;
                 let trial_s = try_it.then_some(confirm_s.unwrap_or(TRIAL_S));
                 let plan = update::Plan { trial_s, confirm: *confirm, downgrade: allowed(*downgrade) };
-                Work::Follow(Box::new(move |client, run, out| {
+                CtlWork::Follow(Box::new(move |client, run, out| {
                     run.print(&update::update(client, &file, plan, &mut |line| print_stderr(line))?, out)
                 }))
             }
@@ -172,15 +174,15 @@ impl Act {
                 rows(move |client, _| edge::set(client, &settings, from))
             }
             Self::Identify { seconds } => rows(move |client, _| recipe_ctl::identify(client, *seconds)),
-            Self::Claim { file } => Work::Follow(Box::new(move |client, run, out| {
+            Self::Claim { file } => CtlWork::Follow(Box::new(move |client, run, out| {
                 run.print(&recipe_ctl::claim(client, file, &mut |line| print_stderr(line))?, out)
             })),
-            Self::Keygen { file, signing: false } => Work::Alone(Box::new(move |_, out| {
+            Self::Keygen { file, signing: false } => CtlWork::Alone(Box::new(move |_, out| {
                 key_file::make(file)?;
                 writeln!(out, "{}: a new key, for its owner alone", file.display())?;
                 Ok(Verdict::Well)
             })),
-            Self::Keygen { file, signing: true } => Work::Alone(Box::new(move |_, out| {
+            Self::Keygen { file, signing: true } => CtlWork::Alone(Box::new(move |_, out| {
                 let (public, public_file) = signing_key::make(file)?;
                 writeln!(out, "{}: a new key to sign with, for its owner alone", file.display())?;
                 writeln!(out, "{}: its public key, for loaders: {public}", public_file.display())?;
@@ -196,7 +198,7 @@ impl Act {
                     reads: *reads,
                     writes: *writes,
                 };
-                Work::Alone(Box::new(move |_, out| {
+                CtlWork::Alone(Box::new(move |_, out| {
                     let bytes = recipe_ctl::sign(&firmware)?;
                     write(output, &bytes, *force)?;
                     let public = recipe_ctl::public_of(signing_key)?;
@@ -204,11 +206,13 @@ impl Act {
                     Ok(Verdict::Well)
                 }))
             }
-            Self::Inspect { file, public_key, slot: None, .. } => Work::Alone(Box::new(move |run, out| {
-                run.print(&Update::read(file)?.inspect(public_key.as_deref(), run.view)?, out)
-            })),
+            Self::Inspect { file, public_key, slot: None, .. } => {
+                CtlWork::Alone(Box::new(move |run, out| {
+                    run.print(&Update::read(file)?.inspect(public_key.as_deref(), run.view)?, out)
+                }))
+            }
             Self::Inspect { file, public_key, slot: Some(slot), output, force } => {
-                Work::Alone(Box::new(move |run, out| {
+                CtlWork::Alone(Box::new(move |run, out| {
                     let update = Update::read(file)?;
                     let answer = update.inspect(public_key.as_deref(), run.view)?;
                     if answer.verdict() != Verdict::Well {
@@ -238,12 +242,12 @@ fn allowed(downgrade: bool) -> update::Downgrade {
     }
 }
 
-fn rows<'a>(ask: impl Fn(&Client, Run) -> Result<Answer, Failure> + Sync + 'a) -> Work<'a> {
-    Work::Ask(Box::new(ask), Many::Rows)
+fn rows<'a>(query: impl Fn(&Client, Run) -> Result<Answer, Failure> + Sync + 'a) -> CtlWork<'a> {
+    CtlWork::Query(Box::new(query), Many::Rows)
 }
 
-fn sections<'a>(ask: impl Fn(&Client, Run) -> Result<Answer, Failure> + Sync + 'a) -> Work<'a> {
-    Work::Ask(Box::new(ask), Many::Sections)
+fn sections<'a>(query: impl Fn(&Client, Run) -> Result<Answer, Failure> + Sync + 'a) -> CtlWork<'a> {
+    CtlWork::Query(Box::new(query), Many::Sections)
 }
 
 fn watch(client: &Client, what: &Watched, run: Run, out: &mut dyn Write) -> Result<Verdict, Failure> {
@@ -255,7 +259,7 @@ fn watch(client: &Client, what: &Watched, run: Run, out: &mut dyn Write) -> Resu
 }
 
 pub(super) fn write(path: &Path, bytes: &[u8], force: bool) -> Result<(), Failure> {
-    let written = Written { bytes, name: "it", made_from: None };
+    let written = OutputFile { bytes, name: "it", made_from: None };
     written
         .put(path, || Ok(force), "")
         .map_err(|error| Failure::wrong(format!("{}: {error}", path.display())))
@@ -271,29 +275,29 @@ impl Run {
 
 /// Asks one gateway.
 pub(super) fn at_one(
-    work: Work<'_>,
+    work: CtlWork<'_>,
     client: &Client,
     run: Run,
     out: &mut dyn Write,
 ) -> Result<Verdict, Failure> {
     match work {
-        Work::Alone(alone) => alone(run, out),
-        Work::Ask(ask, _) => run.print(&ask(client, run)?, out),
-        Work::Follow(follow) => follow(client, run, out),
-        Work::Through(_) => Err(Failure::wrong("this command is for an inventory")),
+        CtlWork::Alone(alone) => alone(run, out),
+        CtlWork::Query(query, _) => run.print(&query(client, run)?, out),
+        CtlWork::Follow(follow) => follow(client, run, out),
+        CtlWork::Through(_) => Err(Failure::wrong("this command is for an inventory")),
     }
 }
 
 /// Asks many gateways.
 pub(super) fn at_many(
-    (ask, many): (&Ask<'_>, Many),
+    (query, many): (&QueryFn<'_>, Many),
     members: &[Member],
     rollout: Option<Rollout>,
     stop: &Stop,
     run: Run,
     out: &mut dyn Write,
 ) -> Result<Verdict, Failure> {
-    let outcomes = recipe_ctl::ask(members, rollout, run.timeout, stop, &|client| ask(client, run));
+    let outcomes = recipe_ctl::ask(members, rollout, run.timeout, stop, &|client| query(client, run));
     let text = match many {
         _ if run.json => outcomes.json(),
         Many::Rows => outcomes.table(run.view),
