@@ -15,7 +15,7 @@ pub struct Answer {
     pub(crate) verdict: Verdict,
 }
 
-/// AnswerText for people.
+/// Text for people.
 #[derive(Debug, Clone)]
 pub(crate) enum AnswerText {
     /// Made by this program.

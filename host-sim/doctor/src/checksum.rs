@@ -65,7 +65,7 @@ fn words(name: &str, order: ByteOrder, range: &str, len: usize) -> String {
     format!("{name}{order}{range}")
 }
 
-/// NumberField of frames that are right with this checksum.
+/// Number of frames that are right with this checksum.
 fn count(sum: &Checksum, shape: &Shape<'_>, fields: &[FieldSpec], carrier: Carrier, bytes: &[u8]) -> usize {
     let replaced: Vec<FieldSpec> = fields
         .iter()

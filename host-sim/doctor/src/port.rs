@@ -539,7 +539,7 @@ fn first(bytes: &[u8]) -> &[u8] {
     &bytes[..bytes.len().min(SHOWN)]
 }
 
-/// NumberField of bytes that are shown.
+/// Number of bytes that are shown.
 const SHOWN: usize = 12;
 /// Silence that is worth a word.
 const NOTHING_FOR: proto_core::time::Duration = proto_core::time::Duration::from_secs(3);

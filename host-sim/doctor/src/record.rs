@@ -8,7 +8,7 @@ use proto_core::engine::{LinkId, PortCounters, PortId};
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::can::{CanFrame, CanId};
 
-/// NumberField of newest bytes of a port that are kept.
+/// Number of newest bytes of a port that are kept.
 pub const KEPT: usize = 1024;
 /// Maximum number of ids of a CAN bus that are counted; further ones are left out.
 const MAX_IDS: usize = 64;

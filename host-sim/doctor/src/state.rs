@@ -27,7 +27,7 @@ pub(crate) struct Port {
     pub(crate) bus: FieldBus,
     pub(crate) state: PortState,
     pub(crate) age: Option<Duration>,
-    /// NumberField of its input frames that are overdue or have never come.
+    /// Number of its input frames that are overdue or have never come.
     pub(crate) overdue: usize,
     pub(crate) reply: ReplyCode,
     /// The newest command that one of its values picked, such as `run(pick.jspf)`.

@@ -173,7 +173,7 @@ pub(crate) fn other_order(shape: &Shape<'_>, frames: &[&[u8]]) -> Option<(f64, f
     (all >= MIN_VALUES && swapped == all && read * 4 <= all).then_some(example).flatten()
 }
 
-/// NumberField of values other than zero that are needed to tell.
+/// Number of values other than zero that are needed to tell.
 const MIN_VALUES: usize = 6;
 
 /// A number that something measures.

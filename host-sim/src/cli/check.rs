@@ -47,7 +47,7 @@ enum Version {
     V0_2,
 }
 
-/// PortNames with commas between them.
+/// Names with commas between them.
 #[derive(Debug, Clone)]
 struct PortNames(Vec<String>);
 

@@ -1,4 +1,4 @@
-//! FrameEvents by name for a stream, and as a capture.
+//! Frames by name for a stream, and as a capture.
 //!
 //! In: records of the gateway's watch, which are queued for each client. Out: the data of an event `frames`, or
 //! the blocks of a capture. What a client does not take in time is missed, for it alone, and told.
@@ -13,7 +13,7 @@ use recipe_capture::pcapng::{Pcapng, Scope};
 use recipe_capture::{Arrived, Cell, Frame, Interest, Next, Record, Subscription, Watch, What};
 use serde_json::{Value, json};
 
-/// FrameEvents for one stream.
+/// Frames for one stream.
 #[derive(Debug)]
 pub(super) struct FrameEvents {
     subscription: Subscription,
@@ -118,7 +118,7 @@ fn subscribe(watch: &Watch) -> Subscription {
 
 /// Records that wait for a client: more than a second of busy ports.
 const ROOM: usize = 4_096;
-/// FrameEvents of one event.
+/// Frames of one event.
 const AT_ONCE: usize = 256;
 /// Bytes of a capture that are made at once.
 const MAX_BLOCKS: usize = 64 << 10;

@@ -89,7 +89,7 @@ impl ConsoleOptions {
     }
 }
 
-/// SupervisorAction a console serves.
+/// What a console serves.
 #[derive(Debug)]
 pub(crate) enum ConsoleSource {
     /// A gateway that can be given another configuration.

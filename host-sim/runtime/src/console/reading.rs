@@ -102,7 +102,7 @@ impl ConsoleServer {
         self.log.as_ref().map_or_else(Vec::new, |log| log.newest(count))
     }
 
-    /// SupervisorAction is wrong, in words; `None` while nothing runs.
+    /// What is wrong, in words; `None` while nothing runs.
     async fn findings(&self, snapshot: &Snapshot) -> Option<Value> {
         let looked = match snapshot.unexplained() {
             Some(failed) => self.snapshots.look_at_controller(failed, snapshot).await,
@@ -111,7 +111,7 @@ impl ConsoleServer {
         snapshot.findings(looked).map(|findings| json!(findings))
     }
 
-    /// Everything that can be read, for somebody who is to help. SupervisorAction is not known is absent.
+    /// Everything that can be read, for somebody who is to help. What is not known is absent.
     async fn bundle(&self) -> Value {
         let mut bundle = Map::new();
         let mut put = |name: &str, value: Option<Value>| {
@@ -136,7 +136,7 @@ impl ConsoleServer {
         Value::Object(bundle)
     }
 
-    /// SupervisorAction other tools read, of the configuration that runs.
+    /// What other tools read, of the configuration that runs.
     fn export(&self, operation: Operation, head: &Head<'_>) -> Result<HttpReply, HttpReply> {
         let ConsoleSource::Gateway { shared, .. } = &self.source else { return Err(nothing_runs()) };
         let (toml, overrides) = {
@@ -216,7 +216,7 @@ fn decoded(text: &str) -> Option<Cow<'_, str>> {
     String::from_utf8(bytes).ok().map(Cow::Owned)
 }
 
-/// SupervisorAction the machine is called.
+/// What the machine is called.
 pub(super) fn host_name() -> Option<String> {
     let name = std::fs::read_to_string("/proc/sys/kernel/hostname").ok()?;
     Some(name.trim().to_owned()).filter(|name| !name.is_empty())

@@ -1,4 +1,4 @@
-//! SupervisorAction readers are shown: one copy of the engine for all of them, at most ten times a second.
+//! What readers are shown: one copy of the engine for all of them, at most ten times a second.
 
 use std::cell::{Cell, OnceCell, RefCell};
 use std::rc::Rc;
@@ -140,7 +140,7 @@ impl Snapshot {
         unexplained(snapshot.engine.status(snapshot.at))
     }
 
-    /// SupervisorAction is wrong. `looked` are the controller's states, if somebody else than the engine has looked.
+    /// What is wrong. `looked` are the controller's states, if somebody else than the engine has looked.
     pub(super) fn findings(&self, looked: Option<States>) -> Option<Vec<Finding>> {
         let SnapshotContent::Gateway(snapshot, config) = &self.what else { return None };
         Some(examine(&Case {

@@ -47,7 +47,7 @@ struct Index {
     kept: Vec<RevisionEntry>,
 }
 
-/// SupervisorAction is known about a revision.
+/// What is known about a revision.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(super) struct RevisionEntry {
     /// Its number.
@@ -112,7 +112,7 @@ impl RevisionStore {
         Revisions::new(Stored { kept, live: self.index.live, previous: self.index.previous })
     }
 
-    /// SupervisorAction is known about each, the oldest first.
+    /// What is known about each, the oldest first.
     pub(super) fn entries(&self) -> &[RevisionEntry] {
         &self.index.kept
     }
@@ -171,7 +171,7 @@ impl RevisionStore {
         if let Some(forget) = forget {
             self.texts.remove(&forget);
             if let Some(folder) = &self.folder {
-                // SupervisorAction is left behind is removed at the next start.
+                // What is left behind is removed at the next start.
                 let _ = fs::remove_file(folder.path.join(name(forget)));
             }
         }

@@ -1,6 +1,6 @@
 //! The gateway's configurations: runs one, tries another, returns to the one before.
 //!
-//! In: commands of the console. Out: gateways that are started and ended, files, and a view for readers. SupervisorAction
+//! In: commands of the console. Out: gateways that are started and ended, files, and a view for readers. What
 //! happens when is decided in `recipe_api::revisions`; here it is carried out, on a thread of its own,
 //! since starting and ending a gateway takes its time.
 
@@ -59,18 +59,18 @@ impl ConfigFile {
     }
 }
 
-/// SupervisorAction somebody asks for.
+/// What somebody asks for.
 #[derive(Debug)]
 pub(crate) struct SupervisorCommand {
     /// Who.
     pub(super) peer: IpAddr,
-    /// SupervisorAction.
+    /// What.
     pub(super) what: SupervisorAction,
     /// Gets the number of the revision.
     pub(super) answer: oneshot::Sender<Result<u32, ActionError>>,
 }
 
-/// SupervisorAction somebody asks for.
+/// What somebody asks for.
 #[derive(Debug)]
 pub(super) enum SupervisorAction {
     /// Keep a text that was made from a revision.
@@ -94,12 +94,12 @@ pub(super) enum ActionError {
     Tried(String),
 }
 
-/// SupervisorAction readers see.
+/// What readers see.
 #[derive(Debug, Default)]
 pub(crate) struct SupervisorView {
     /// The revisions.
     pub(super) revisions: Option<Revisions>,
-    /// SupervisorAction is known about each, the oldest first.
+    /// What is known about each, the oldest first.
     pub(super) entries: Vec<RevisionEntry>,
     /// Their texts.
     pub(super) texts: BTreeMap<u32, Arc<str>>,
@@ -109,7 +109,7 @@ pub(crate) struct SupervisorView {
     pub(super) failure: Option<String>,
     /// Overrides, which apply to every revision.
     pub(super) overrides: Vec<String>,
-    /// SupervisorAction runs.
+    /// What runs.
     pub(super) config: Option<Arc<GatewayConfig>>,
     client: Option<RuntimeClient>,
     slot: Option<Arc<SnapshotSlot>>,
@@ -310,7 +310,7 @@ impl Supervisor {
         }
     }
 
-    /// The gateway has ended by itself. SupervisorAction was live ends the process, as it does without a console.
+    /// The gateway has ended by itself. What was live ends the process, as it does without a console.
     fn has_ended(&mut self) -> Result<(), StartError> {
         let Some(running) = self.running.take() else { return Ok(()) };
         let ended = running.handle.shutdown();
@@ -401,7 +401,7 @@ impl Supervisor {
         kept.is_ok()
     }
 
-    /// Runs a revision instead of what runs. SupervisorAction is wrong with it shows before anything is stopped.
+    /// Runs a revision instead of what runs. What is wrong with it shows before anything is stopped.
     fn replace_by(&mut self, number: u32) -> Result<(), StartError> {
         if self.running.as_ref().is_some_and(|running| running.number == number) {
             // The one that was to take its place could not be prepared.

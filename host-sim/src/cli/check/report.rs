@@ -42,7 +42,7 @@ pub(super) struct CheckReport {
     pub(super) changes: Option<Vec<MessageReport>>,
 }
 
-/// Addresses and ports of the controller. PortReport 0 is any free one.
+/// Addresses and ports of the controller. Port 0 is any free one.
 #[derive(Debug, Serialize)]
 pub(super) struct Servers {
     pub(super) address: String,
