@@ -1,6 +1,6 @@
 //! Captures and recordings of what goes over the gateway's ports and links.
 //!
-//! In: records of frames and of the engine's passes, which the gateway's shell gives to a [`Watch`]. Out: captures
+//! In: records of frames and of the engine's passes, which the gateway runtime gives to a [`Watch`]. Out: captures
 //! for Wireshark ([`pcapng`]), recordings of a whole run ([`recording`]), and the run again in virtual time
 //! ([`replay`]). Nothing here runs on the gateway's thread, and nothing delays it.
 

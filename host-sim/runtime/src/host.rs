@@ -1,8 +1,6 @@
-//! What every runtime needs: a thread with a runtime, a handle, and in the foreground the `ready` line,
-//! statistics and a clean end.
+//! Starts and ends runtimes, and runs them in the foreground with `ready` line, statistics and a clean shutdown.
 //!
-//! A runtime has a thread of its own with a runtime, or shares a [`Worker`] with others and has a [`LocalSet`] there. Either
-//! way its tasks end with it.
+//! A runtime has a thread of its own, or a [`LocalSet`] on a shared [`Worker`]. Either way its tasks end with it.
 
 use std::cell::RefCell;
 use std::pin::Pin;
@@ -32,8 +30,7 @@ pub(super) trait Runtime: 'static {
     fn ready(&self) -> Value;
     /// A function that returns one line of statistics while the runtime runs.
     fn stats(&self) -> impl Fn() -> Value + 'static;
-    /// Runs where tasks can be spawned that stay on this thread; returns only if something fails permanently, or after a
-    /// shutdown command.
+    /// Runs in a context that allows `spawn_local`; returns only on permanent failure or after a shutdown command.
     fn run(self) -> impl Future<Output = Result<(), StartError>>;
 }
 
@@ -51,34 +48,34 @@ pub struct Handle {
 /// Where a runtime runs.
 #[derive(Debug)]
 enum Home {
-    /// On a thread of its own.
+    /// On its own thread.
     Alone(JoinHandle<Result<(), StartError>>),
-    /// Among others.
+    /// On a shared worker.
     Among(SharedRuntime),
 }
 
-/// Something that runs and can be asked, in the foreground.
+/// What the foreground runs: one or several runtimes, with or without a console.
 pub(crate) trait ForegroundRun {
     /// The actual addresses and paths.
     fn ready(&self) -> &Value;
     /// One line of statistics; `None` if there is none at the moment.
     fn stats(&self) -> Option<Value>;
-    /// Ask the threads that move the data; none if one of them is missing at the moment.
+    /// Clients of all threads that move data; empty if one of them does not run at the moment.
     fn clients(&self) -> Vec<RuntimeClient>;
     /// Whether it has ended by itself.
     fn has_ended(&self) -> bool;
-    /// Ends it and waits for it. If it had ended by itself, the reason is the error.
+    /// Ends it and waits until it has ended. If it had ended by itself, returns the reason as the error.
     fn shutdown(self: Box<Self>) -> Result<(), StartError>;
 }
 
-/// What the thread of a runtime does at its end, after all tasks are gone. A clone is the same.
+/// Actions of a runtime's thread after its tasks were dropped. Clones share the list.
 #[derive(Default, Clone)]
 pub(super) struct AtEnd(Rc<RefCell<Vec<Act>>>);
 
 type Act = Box<dyn FnOnce()>;
 
 impl AtEnd {
-    /// Adds something to do. What fails to open ends too.
+    /// Adds an action. It also runs if opening fails.
     pub(super) fn add(&self, act: impl FnOnce() + 'static) {
         self.0.borrow_mut().push(Box::new(act));
     }
@@ -113,11 +110,11 @@ pub(super) fn start<S: Runtime>(
             Ok(Handle { ready, requests, watch: Watch::new(), findings: None, home: Some(home) })
         }
         Ok(Err(error)) => {
-            // Whoever tries again finds nothing open.
+            // Wait until everything is closed, so that another attempt can succeed.
             let _ = home.ended();
             Err(error)
         }
-        // The thread ended before it sent a result; its own result says why.
+        // The thread ended without a result; its own return value has the reason.
         Err(_) => Err(home.ended().err().unwrap_or_else(|| StartError::new(format!("{name} ended")))),
     }
 }
@@ -132,7 +129,7 @@ fn alone<S: Runtime>(
         let runtime = runtime.map_err(no_runtime)?;
         let at_end = AtEnd::default();
         let ended = runtime.block_on(opening.run_as_task(&at_end, std::future::ready(())));
-        // With it go its tasks.
+        // Drops the tasks.
         drop(runtime);
         at_end.run();
         ended
@@ -140,21 +137,20 @@ fn alone<S: Runtime>(
     thread.map_err(|error| StartError::new(format!("cannot start a thread: {error}")))
 }
 
-/// A runtime that is to be opened.
+/// A runtime to be opened.
 struct Opening<S> {
     open: Open<S>,
     opened: blocking::Sender<Result<Value, StartError>>,
     inbox: mpsc::UnboundedReceiver<RuntimeRequest>,
 }
 
-/// Opens a runtime. It is called through a pointer, and so is its future: what it needs on the stack, with room for an
-/// engine and a configuration, would else be touched at every wake of the runtime.
+/// Opens a runtime. Function and future are boxed: their large stack frame, with an engine and a configuration, would
+/// otherwise be touched on each wake of the runtime.
 type Open<S> =
     Box<dyn for<'a> FnOnce(&'a AtEnd) -> Pin<Box<dyn Future<Output = Result<S, StartError>> + 'a>> + Send>;
 
 impl<S: Runtime> Opening<S> {
-    /// The same as [`Self::run`], in a task of its own: what is run around the tasks is polled at each wake of any of
-    /// them.
+    /// As [`Self::run`], but as a task: the main future would be polled on each wake of any task.
     async fn run_as_task(
         self,
         at_end: &AtEnd,
@@ -163,7 +159,7 @@ impl<S: Runtime> Opening<S> {
         spawn_local(self.run(at_end.clone(), begin)).await.unwrap_or_else(|_| Err(panicked()))
     }
 
-    /// Opens it, and runs it when it may begin.
+    /// Opens the runtime, and runs it once `begin` is ready.
     async fn run(self, at_end: AtEnd, begin: impl Future<Output = ()>) -> Result<(), StartError> {
         let Self { open, opened, inbox } = self;
         let runtime = match open(&at_end).await {
@@ -186,7 +182,7 @@ impl<S: Runtime> Opening<S> {
     }
 }
 
-/// Answers requests until one asks for the end.
+/// Answers requests until shutdown.
 async fn serve(mut inbox: mpsc::UnboundedReceiver<RuntimeRequest>, stats: impl Fn() -> Value) {
     while let Some(request) = inbox.recv().await {
         match request {
@@ -221,20 +217,19 @@ impl Handle {
         RuntimeClient { requests: self.requests.clone(), findings: self.findings.clone() }
     }
 
-    /// What is seen at the gateway's ports and links, for any number of subscribers; a controller tells
-    /// nothing.
+    /// Frames and calls of the gateway, for any number of subscribers; a controller has none.
     pub fn watch(&self) -> &Watch {
         &self.watch
     }
 
     pub(super) fn with_watch(self, watch: Watch) -> Self {
-        // Not by an update: a handle ends its runtime when it is dropped.
+        // No struct update syntax: `Handle` implements `Drop`.
         let mut handle = self;
         handle.watch = watch;
         handle
     }
 
-    /// What another thread finds belongs to the statistics.
+    /// Adds the findings to the statistics.
     pub(super) fn with_findings(self, findings: Option<FindingTexts>) -> Self {
         let mut handle = self;
         handle.findings = findings;
@@ -296,7 +291,7 @@ impl Home {
         }
     }
 
-    /// Waits for its end.
+    /// Waits until it has ended.
     fn ended(self) -> Result<(), StartError> {
         match self {
             Self::Alone(thread) => thread.join().unwrap_or_else(|_| Err(panicked())),
@@ -342,7 +337,7 @@ pub(super) fn foreground(handle: Box<dyn ForegroundRun>, options: &RunOptions) -
                             print_stderr("stdout was closed; ended, because nobody reads the statistics");
                             break Ok(());
                         }
-                        // Nothing more would be printed.
+                        // Nothing else is printed to stdout.
                         StdoutFailure::Closed => {}
                         StdoutFailure::NotReady(error) => {
                             break Err(StartError::new(format!("stdout: {error}")).after_start());

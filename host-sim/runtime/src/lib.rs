@@ -1,7 +1,7 @@
-//! The tokio runtimes, which connect the engine and the simulated controller to sockets, devices and the clock.
+//! The runtimes, which connect the engine and the simulated controller to sockets, devices and the clock.
 //!
-//! A runtime is one thread with a current-thread runtime. It owns all its sockets and devices, reports received
-//! data to the state machine, and carries out its outputs. It does not know protocols. The simulated controller's
+//! A runtime is one thread with a current-thread tokio runtime. It owns its sockets and devices, reports received data to
+//! the state machine, and executes its outputs. It does not know protocols. The simulated controller's
 //! Modbus connections have a thread beside it, which does the same for them.
 
 pub mod cells;
@@ -52,11 +52,11 @@ pub struct RunOptions {
     pub scheduling: Scheduling,
     /// The console.
     pub console: Option<console::ConsoleOptions>,
-    /// Where and how a gateway tells what it knows.
+    /// The Sparkplug broker that a gateway publishes to.
     pub sparkplug: Option<PublisherConfig>,
-    /// What is seen of a gateway, for who has subscribed.
+    /// A gateway's frames and engine calls, for subscribers.
     pub watch: Watch,
-    /// The frames of its file by name, for who has subscribed. A gateway with a console has those of what it runs.
+    /// Decodes frames of the configuration file for subscribers. A gateway with a console uses its running revision.
     pub decoder: Arc<Decoder>,
     /// The log, whose newest lines a console shows.
     pub log: Option<log::Log>,
@@ -64,7 +64,7 @@ pub struct RunOptions {
     pub stdout_is_taken: bool,
 }
 
-/// Why a run could not start or continue: one message. Nothing is left behind.
+/// Why a run could not start or continue, as one message. Everything that was opened is closed.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct StartError {
     message: String,
@@ -77,13 +77,13 @@ impl StartError {
         Self { message: message.into(), had_started: false }
     }
 
-    /// The same error, of a run that had started.
+    /// Marks the error as one of a run that had started.
     #[must_use]
     pub fn after_start(self) -> Self {
         Self { had_started: true, ..self }
     }
 
-    /// The same error, of one of several cells.
+    /// Prefixes the message with the name of a cell.
     #[must_use]
     pub(crate) fn of(self, cell: &str) -> Self {
         Self { message: format!("{cell}: {}", self.message), ..self }

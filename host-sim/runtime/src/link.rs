@@ -47,9 +47,9 @@ pub(super) enum LinkEvent<'a> {
     Up,
     Down,
     Bytes(&'a [u8]),
-    /// The system has accepted everything handed over.
+    /// The kernel has accepted everything sent so far.
     Sent,
-    /// So many of the bytes handed over since the link came up are not acknowledged.
+    /// Number of bytes sent since the link came up that are not acknowledged.
     Acked(u32),
 }
 
@@ -58,8 +58,8 @@ pub(super) enum LinkEvent<'a> {
 pub(super) struct LinkControl {
     session: Cell<LinkSession>,
     outbox: RefCell<Outbox>,
-    /// Bytes handed over in this session.
-    handed: Cell<u64>,
+    /// Bytes sent in this session.
+    sent: Cell<u64>,
     changed: Notify,
     refusals: Cell<Refusals>,
     log_limit: LogLimit,
@@ -101,21 +101,20 @@ impl LinkControl {
         }
     }
 
-    /// Hands bytes over: to the system at once, if it takes them. The link's task reports that it has, and sends what is
-    /// left.
+    /// Sends bytes at once if the kernel accepts them. The link's task reports that, and sends the rest.
     pub(super) fn send(&self, bytes: &[u8]) {
         if self.outbox.borrow_mut().take(bytes) {
-            self.handed.set(self.handed.get() + bytes.len() as u64);
+            self.sent.set(self.sent.get() + bytes.len() as u64);
         }
         self.changed.notify_one();
     }
 
-    /// Counters of what was not accepted.
+    /// Counters of refused connections and datagrams.
     pub(super) fn refusals(&self) -> Refusals {
         self.refusals.get()
     }
 
-    /// How an attempt of the last seconds to reach the controller ended.
+    /// The result of a recent attempt to reach the controller.
     pub(super) fn reach(&self) -> Option<Reach> {
         let reach = self.reach.borrow();
         reach.as_ref().filter(|(at, _)| at.elapsed() < REACH_COUNTS).map(|(_, reach)| reach.clone())
@@ -125,7 +124,7 @@ impl LinkControl {
         self.reach.replace(Some((Instant::now(), reach)));
     }
 
-    /// Something came, so the controller is reached.
+    /// Data has arrived, so the controller is reachable.
     fn heard(&self) {
         if self.reach.borrow().is_some() {
             self.reach.replace(None);
@@ -156,7 +155,7 @@ impl LinkControl {
     fn next_session(&self) {
         self.session.set(LinkSession(self.session.get().0 + 1));
         self.outbox.take();
-        self.handed.set(0);
+        self.sent.set(0);
         self.changed.notify_one();
     }
 
@@ -182,7 +181,7 @@ impl LinkControl {
         }
     }
 
-    /// Lets [`Self::send`] write to a socket of this session, until what is returned is dropped.
+    /// Lets [`Self::send`] write to a socket of this session until the guard is dropped.
     fn lend(&self, socket: DirectSocket) -> Lent<'_> {
         self.outbox.borrow_mut().open(socket);
         Lent(self)
@@ -193,8 +192,7 @@ impl LinkControl {
         self.outbox.borrow_mut().answer(peer);
     }
 
-    /// Sends what waits, as far as `write` takes it, and returns whether it has become true that everything handed over is
-    /// sent.
+    /// Sends queued bytes as far as `write` accepts them. Returns true once each time everything has been sent.
     fn flush(&self, write: impl FnMut(&[u8]) -> io::Result<usize>) -> io::Result<bool> {
         self.outbox.borrow_mut().flush(write)
     }
@@ -263,8 +261,7 @@ pub(super) async fn run(
     }
 }
 
-/// Tries whether the controller is there, without giving it anything: connects and closes, or waits for
-/// its client. Returns when that is known.
+/// Checks whether the controller is reachable without sending anything: connects and closes, or waits for its client.
 pub(super) async fn probe(
     name: &str,
     endpoint: &LinkEndpoint,
@@ -292,7 +289,7 @@ pub(super) async fn probe(
     control.reach.replace(Some((Instant::now() + REACH_STAYS, reach)));
 }
 
-/// What an error says of the other end.
+/// What an error says about the peer.
 fn reach_of(error: &io::Error) -> Reach {
     match error.kind() {
         io::ErrorKind::ConnectionRefused => Reach::Refused,

@@ -207,18 +207,18 @@ fn a_peer_that_reads_nothing_does_not_prevent_the_close() {
         let at = listener.local_addr().unwrap();
         let link = Running::start(LinkEndpoint::Tcp { host: at.ip().to_string(), port: at.port() });
         link.control.open();
-        let (mut deaf, _) = listener.accept().await.unwrap();
+        let (mut idle_peer, _) = listener.accept().await.unwrap();
         link.expect(Seen::Up).await;
         // More than any buffer holds, so this is never sent.
         link.control.send(&vec![0; 64 << 20]);
-        deaf.read_exact(&mut [0]).await.unwrap();
+        idle_peer.read_exact(&mut [0]).await.unwrap();
         link.control.close();
         link.control.open();
         let (_fresh, _) = listener.accept().await.unwrap();
         link.expect(Seen::Up).await;
         assert!(link.is_silent());
         // It never gets what it has not read by now, which would be old.
-        let ended = deaf.read_to_end(&mut Vec::new()).await;
+        let ended = idle_peer.read_to_end(&mut Vec::new()).await;
         assert_eq!(ended.unwrap_err().kind(), io::ErrorKind::ConnectionReset);
     });
 }

@@ -62,7 +62,7 @@ impl Log {
 
     /// The newest lines, the oldest first: at most `count`, and at most [`MAX_NEWEST`]. Colours are left out.
     pub fn newest(&self, count: usize) -> Vec<String> {
-        // What the thread cannot write, because nobody reads stderr, is newer.
+        // Lines that the thread cannot write, because stderr is not read, are newer.
         let stuck = {
             let waiting = locked(&self.0.waiting);
             let from = waiting.bytes.len().saturating_sub(MAX_STUCK);

@@ -1,4 +1,4 @@
-//! What a run tells the service manager that started it: that it is ready, that it works, that it ends.
+//! Notifications to the service manager: ready, alive, stopping.
 //!
 //! systemd gives a service of `Type=notify` a socket in `NOTIFY_SOCKET`, and one with `WatchdogSec=` the time
 //! within which it must say that it works in `WATCHDOG_USEC`. It says so only when the threads that move the
@@ -44,7 +44,7 @@ impl Service {
         beat.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         loop {
             beat.tick().await;
-            // While a configuration is replaced there is none.
+            // Empty while a configuration is being replaced.
             let threads = threads();
             let mut works = !threads.is_empty();
             for thread in threads {
@@ -57,7 +57,7 @@ impl Service {
     }
 }
 
-/// Times that the service manager is told while it is patient.
+/// Notifications per watchdog timeout.
 const BEATS: u32 = 3;
 
 fn tell(news: &[NotifyState<'_>]) {

@@ -243,7 +243,7 @@ impl Connection {
     }
 }
 
-/// Maximum number of bytes per read, whose requests are carried out before other tasks run: the longest
+/// Maximum number of bytes per read, whose requests are executed before other tasks run: the longest
 /// Modbus request.
 pub(super) const CHUNK: usize = 260;
 /// Maximum number of bytes that wait for a peer; more than the answers to the requests of one read.

@@ -1,5 +1,5 @@
-//! A thread that several runtimes share: what has become ready for one of them is found together with the rest, so that
-//! all of them sleep less often than each one alone.
+//! A thread shared by several runtimes: one wake-up serves all of them, so they sleep less often than on threads of their
+//! own.
 
 use std::io;
 use std::pin::Pin;
@@ -34,18 +34,18 @@ pub(super) fn no_runtime(error: io::Error) -> StartError {
 /// Where a runtime runs.
 #[derive(Debug, Clone)]
 pub(crate) struct RuntimePlace {
-    /// What the log calls it.
+    /// The span of its log lines.
     pub(crate) span: Span,
     shared: Option<(Arc<Worker>, Begin)>,
 }
 
 impl RuntimePlace {
-    /// On a thread of its own.
+    /// On its own thread.
     pub(crate) fn alone() -> Self {
         Self { span: Span::none(), shared: None }
     }
 
-    /// On a thread with others. It is opened at once, and runs when all others have been.
+    /// On a shared thread. It is opened at once, and runs after `begin`.
     pub(crate) const fn among(worker: Arc<Worker>, begin: Begin, span: Span) -> Self {
         Self { span, shared: Some((worker, begin)) }
     }
@@ -55,7 +55,7 @@ impl RuntimePlace {
     }
 }
 
-/// When runtimes may run that have been opened.
+/// The moment at which opened runtimes start to run.
 #[derive(Debug, Clone)]
 pub(crate) struct Begin {
     begins: watch::Receiver<bool>,
@@ -63,13 +63,13 @@ pub(crate) struct Begin {
 }
 
 impl Begin {
-    /// It begins when `true` is sent. If the sender is gone before, it never does.
+    /// Begins when `true` is sent; never if the sender is dropped before.
     pub(crate) fn channel() -> (watch::Sender<bool>, Self) {
         let (begins, begin) = watch::channel(false);
         (begins, Self { begins: begin, after: Duration::ZERO })
     }
 
-    /// The same, and so much later.
+    /// The same moment plus `after`.
     pub(crate) fn and_later(&self, after: Duration) -> Self {
         Self { begins: self.begins.clone(), after }
     }
@@ -82,7 +82,7 @@ impl Begin {
             && let Ok(timer) = Timer::new()
             && timer.arm(now() + self.after).is_ok()
         {
-            // Without the timer it begins at once.
+            // If the timer fails, it begins at once.
             let _ = timer.expired().await;
         }
     }
@@ -90,7 +90,7 @@ impl Begin {
 
 type Job = Box<dyn FnOnce() -> Pin<Box<dyn Future<Output = ()>>> + Send>;
 
-/// A thread on which any number of runtimes run. It ends with the last of them, when nobody has it any more.
+/// A thread for any number of runtimes. It ends when the last reference is dropped.
 #[derive(Debug)]
 pub(crate) struct Worker {
     jobs: Option<mpsc::UnboundedSender<Job>>,
@@ -101,7 +101,7 @@ impl Worker {
     /// Starts a thread.
     pub(crate) fn start(name: &str) -> Result<Arc<Self>, StartError> {
         let (jobs, mut inbox) = mpsc::unbounded_channel::<Job>();
-        // Here, where an error can be told.
+        // Built here, where an error can be returned.
         let runtime = runtime()?;
         let thread = std::thread::Builder::new().name(name.to_owned()).stack_size(STACK).spawn(move || {
             LocalSet::new().block_on(&runtime, async {
@@ -146,7 +146,7 @@ impl Drop for Worker {
     fn drop(&mut self) {
         self.jobs = None;
         if let Some(thread) = self.thread.take() {
-            // A panic of a runtime is its own outcome.
+            // A panic of a runtime is reported by its `EndGuard`.
             let _ = thread.join();
         }
     }
@@ -156,7 +156,7 @@ impl Drop for Worker {
 #[derive(Debug)]
 pub(super) struct SharedRuntime {
     end: Arc<RuntimeEnd>,
-    /// Held as long as the runtime runs.
+    /// Keeps the worker alive while the runtime runs.
     _worker: Arc<Worker>,
 }
 
@@ -177,7 +177,7 @@ impl SharedRuntime {
     }
 }
 
-/// How a runtime ended, once it has.
+/// The result of a runtime, once it has ended.
 #[derive(Debug, Default)]
 struct RuntimeEnd {
     result: Mutex<Option<Result<(), StartError>>>,
@@ -195,7 +195,7 @@ impl RuntimeEnd {
     }
 }
 
-/// Tells the end of a runtime, even if that panics.
+/// Reports the end of a runtime, even if it panics.
 struct EndGuard(Arc<RuntimeEnd>);
 
 impl EndGuard {
@@ -217,7 +217,7 @@ mod tests {
     use serde_json::{Value, json};
     use std::sync::mpsc::{Receiver, Sender, channel};
 
-    /// Tells when it runs, and then does nothing, or panics.
+    /// Reports that it runs, then waits forever or panics.
     struct TestRuntime {
         runs: Sender<()>,
         panics: bool,

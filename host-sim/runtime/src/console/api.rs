@@ -21,8 +21,8 @@ use super::supervisor::{ActionError, SupervisorAction, SupervisorCommand, Superv
 use super::{ConsoleServer, ConsoleSource, check, pendant};
 
 impl ConsoleServer {
-    /// Carries out a request.
-    pub(super) async fn carry_out(&self, request: HttpRequest<'_>) -> HttpReply {
+    /// Executes a request.
+    pub(super) async fn execute(&self, request: HttpRequest<'_>) -> HttpReply {
         match (request.admitted.operation, &self.source) {
             (Operation::Page, _) => HttpReply::page(request.head.if_none_match),
             (Operation::Nonce, _) => {
@@ -97,7 +97,7 @@ impl ConsoleServer {
         let ConsoleSource::Gateway { shared, commands, .. } = &self.source else { return nothing_runs() };
         let what = match operation {
             Operation::PutConfig => {
-                // The view must not be held while a text is read and an engine is built of it.
+                // The view must not stay locked while the text is parsed and an engine is built.
                 let overrides = shared.view().overrides.clone();
                 match put(&request, &overrides) {
                     Ok(what) => what,
@@ -128,7 +128,7 @@ impl ConsoleServer {
         let view = shared.view();
         match done {
             Ok(revision) => {
-                // At the level that is shown if nobody asks for another: a person has to see it.
+                // `warn` is shown by default: a person has to see it.
                 warn!(%peer, revision, what = name(operation), "done for a client of the console");
                 let status = if operation == Operation::PutConfig { Status::CREATED } else { Status::OK };
                 let mut shown = revisions(&view);
@@ -252,7 +252,7 @@ const IDENTIFY: RangeInclusive<u32> = 1..=600;
 /// The arguments in a body; none at all is an empty object.
 fn arguments<T: serde::de::DeserializeOwned>(body: &[u8]) -> Result<T, HttpReply> {
     let body = if body.is_empty() { b"{}" } else { body };
-    // Else an array would be taken for the values of an object.
+    // `from_slice::<T>` would accept an array as the fields of a struct.
     let object = serde_json::from_slice(body).map(Value::Object);
     object
         .and_then(serde_json::from_value)

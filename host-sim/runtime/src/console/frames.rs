@@ -1,7 +1,7 @@
 //! Frames by name for a stream, and as a capture.
 //!
-//! In: records of the gateway's watch, which are queued for each client. Out: the data of an event `frames`, or
-//! the blocks of a capture. What a client does not take in time is missed, for it alone, and told.
+//! In: records of the gateway's watch, queued for each client. Out: the data of an event `frames`, or the blocks of a
+//! capture. Records that a client does not read in time are dropped for this client and counted.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -113,11 +113,11 @@ impl CaptureStream {
 }
 
 fn subscribe(watch: &Watch) -> Subscription {
-    watch.subscribe(Interest { frames: true, passes: false }, ROOM)
+    watch.subscribe(Interest { frames: true, passes: false }, QUEUE)
 }
 
 /// Records that wait for a client: more than a second of busy ports.
-const ROOM: usize = 4_096;
+const QUEUE: usize = 4_096;
 /// Frames of one event.
 const AT_ONCE: usize = 256;
 /// Bytes of a capture that are made at once.

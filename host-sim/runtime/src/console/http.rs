@@ -211,7 +211,7 @@ impl ConsoleServer {
                 return self.answer(&mut stream, &HttpReply::error(Status::UNAUTHORIZED, text), false).await;
             }
         }
-        let mut reply = self.carry_out(HttpRequest { head, admitted, body, peer }).await;
+        let mut reply = self.execute(HttpRequest { head, admitted, body, peer }).await;
         if admitted.is_signed() {
             reply = reply.with("Next-Nonce", self.guard.borrow_mut().nonce(now()));
         }

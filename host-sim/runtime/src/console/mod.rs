@@ -1,7 +1,7 @@
 //! The console's server: the API of docs/api.md over HTTP, for the gateway and the simulated controller.
 //!
-//! It runs on an ordinary thread of its own. Of the thread that runs the engine it only asks for copies
-//! (its window), at most ten times a second for all readers together, and never lets it wait.
+//! It runs on an ordinary thread. It takes snapshots of the gateway at most ten times a second for all clients together,
+//! and never blocks the gateway's thread.
 
 mod api;
 mod check;
@@ -47,7 +47,7 @@ pub(crate) use supervisor::Supervised;
 /// Stack of a thread that builds engines, which is done by value.
 const STACK: usize = 16 << 20;
 
-/// How far the console's thread stands back behind others.
+/// Nice value of the console's thread.
 const NICENESS: i32 = 10;
 
 /// Options of a console.
@@ -135,7 +135,7 @@ impl Console {
         let span = Span::current();
         let serve = move || {
             let _of = span.entered();
-            // Where the gateway's thread has no better right, it still goes first.
+            // The gateway's thread goes first even without real-time priority.
             let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), NICENESS);
             let server = Rc::new(ConsoleServer {
                 address,
@@ -198,7 +198,7 @@ pub fn run_gateway(
 #[derive(Debug)]
 pub(crate) struct Consoled {
     ready: Value,
-    /// Ended first, so that nobody is answered any more.
+    /// Ended first, so that no more requests are answered.
     console: Option<Console>,
     handle: Handle,
 }

@@ -12,7 +12,7 @@ use tokio::time::timeout;
 
 use super::http::HttpReply;
 
-/// Carries out the operation in a body.
+/// Executes the operation in a body.
 pub(super) async fn operate(control: SocketAddr, body: &[u8]) -> HttpReply {
     let request = match serde_json::from_slice::<Map<String, Value>>(body) {
         Ok(request) => request,

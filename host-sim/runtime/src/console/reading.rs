@@ -22,7 +22,7 @@ use super::{ConsoleServer, ConsoleSource, check};
 use crate::log::MAX_NEWEST;
 
 impl ConsoleServer {
-    /// Answers what only looks.
+    /// Answers requests that only read.
     pub(super) async fn read(&self, operation: Operation, head: &Head<'_>) -> HttpReply {
         match operation {
             Operation::Info => HttpReply::json(Status::OK, &self.info()),
@@ -102,7 +102,7 @@ impl ConsoleServer {
         self.log.as_ref().map_or_else(Vec::new, |log| log.newest(count))
     }
 
-    /// What is wrong, in words; `None` while nothing runs.
+    /// Findings; `None` while no gateway runs.
     async fn findings(&self, snapshot: &Snapshot) -> Option<Value> {
         let looked = match snapshot.unexplained() {
             Some(failed) => self.snapshots.look_at_controller(failed, snapshot).await,
@@ -111,7 +111,7 @@ impl ConsoleServer {
         snapshot.findings(looked).map(|findings| json!(findings))
     }
 
-    /// Everything that can be read, for somebody who is to help. What is not known is absent.
+    /// All readable documents, for support. Unknown ones are absent.
     async fn bundle(&self) -> Value {
         let mut bundle = Map::new();
         let mut put = |name: &str, value: Option<Value>| {
@@ -136,7 +136,7 @@ impl ConsoleServer {
         Value::Object(bundle)
     }
 
-    /// What other tools read, of the configuration that runs.
+    /// Exports of the running configuration for other tools.
     fn export(&self, operation: Operation, head: &Head<'_>) -> Result<HttpReply, HttpReply> {
         let ConsoleSource::Gateway { shared, .. } = &self.source else { return Err(nothing_runs()) };
         let (toml, overrides) = {
@@ -216,7 +216,7 @@ fn decoded(text: &str) -> Option<Cow<'_, str>> {
     String::from_utf8(bytes).ok().map(Cow::Owned)
 }
 
-/// What the machine is called.
+/// The machine's host name.
 pub(super) fn host_name() -> Option<String> {
     let name = std::fs::read_to_string("/proc/sys/kernel/hostname").ok()?;
     Some(name.trim().to_owned()).filter(|name| !name.is_empty())

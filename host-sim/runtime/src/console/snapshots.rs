@@ -1,4 +1,4 @@
-//! What readers are shown: one copy of the engine for all of them, at most ten times a second.
+//! Snapshots for readers, shared by all of them and taken at most ten times a second.
 
 use std::cell::{Cell, OnceCell, RefCell};
 use std::rc::Rc;
@@ -23,15 +23,15 @@ use crate::snapshot::{GatewaySnapshot, SnapshotSlot};
 #[derive(Default)]
 pub(super) struct Snapshots {
     newest: RefCell<Option<Rc<Snapshot>>>,
-    /// Room that the next copy is made in.
+    /// The buffer of the next snapshot.
     buffer: RefCell<Option<Box<GatewaySnapshot>>>,
-    /// Those who ask at the same time get the same copy.
-    turn: tokio::sync::Mutex<()>,
-    /// The controller's states after a command had failed at that instant, if they could be seen.
+    /// Concurrent readers get the same snapshot.
+    refresh: tokio::sync::Mutex<()>,
+    /// The controller's states after a command failed at that instant, if they could be read.
     looked: Cell<Option<(Instant, Option<States>)>>,
 }
 
-/// State, counters and values at one instant. Each text is made when somebody wants it, and once.
+/// State, counters and values at one instant. Each text is built once, on first use.
 pub(super) struct Snapshot {
     taken: Instant,
     what: SnapshotContent,
@@ -48,7 +48,7 @@ enum SnapshotContent {
 impl Snapshots {
     /// A snapshot that is young enough; `None` while nothing runs.
     pub(super) async fn newest(&self, source: &ConsoleSource) -> Option<Rc<Snapshot>> {
-        let _turn = self.turn.lock().await;
+        let _refresh = self.refresh.lock().await;
         if let Some(newest) = self.newest.borrow().as_ref()
             && now().saturating_since(newest.taken) < MAX_AGE
         {
@@ -72,7 +72,7 @@ impl Snapshots {
             metrics: OnceCell::new(),
         });
         let before = self.newest.replace(Some(Rc::clone(&snapshot)));
-        // Its buffer is used again, if no stream is still reading.
+        // Reuse its buffer, unless a stream is still reading.
         if let Some(Snapshot { what: SnapshotContent::Gateway(snapshot, _), .. }) =
             before.and_then(Rc::into_inner)
         {
@@ -81,7 +81,7 @@ impl Snapshots {
         Some(snapshot)
     }
 
-    /// The controller's states, looked at once for each command that failed; `None` if they do not show in time.
+    /// The controller's states, read once for each failed command; `None` on timeout.
     pub(super) async fn look_at_controller(&self, failed: Instant, snapshot: &Snapshot) -> Option<States> {
         let SnapshotContent::Gateway(_, config) = &snapshot.what else { return None };
         if let Some((at, states)) = self.looked.get()
@@ -134,13 +134,13 @@ impl Snapshot {
         Some(Rc::clone(self.metrics.get_or_init(|| make().into())))
     }
 
-    /// Since when a command has failed for which nobody saw the controller's states.
+    /// When the newest command failed whose cause the state stream did not show.
     pub(super) fn unexplained(&self) -> Option<Instant> {
         let SnapshotContent::Gateway(snapshot, _) = &self.what else { return None };
         unexplained(snapshot.engine.status(snapshot.at))
     }
 
-    /// What is wrong. `looked` are the controller's states, if somebody else than the engine has looked.
+    /// Findings. `looked` are the controller's states, if they were read outside the engine.
     pub(super) fn findings(&self, looked: Option<States>) -> Option<Vec<Finding>> {
         let SnapshotContent::Gateway(snapshot, config) = &self.what else { return None };
         Some(examine(&Case {
@@ -182,7 +182,7 @@ fn written<R>(write: impl FnOnce(&mut String) -> R) -> String {
     text
 }
 
-/// How long the controller's states are waited for.
+/// Timeout for reading the controller's states.
 const MAX_LOOK: StdDuration = StdDuration::from_secs(3);
-/// The age at which a snapshot is replaced if somebody asks.
+/// Maximum age of a snapshot that is reused.
 const MAX_AGE: Duration = Duration::from_millis(100);

@@ -47,14 +47,13 @@ struct Index {
     kept: Vec<RevisionEntry>,
 }
 
-/// What is known about a revision.
+/// Metadata of a revision.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(super) struct RevisionEntry {
-    /// Its number.
     pub(super) number: u32,
     /// When it was stored, in seconds since 1970.
     pub(super) stored_at: u64,
-    /// Who stored it: an address, or the name of a file.
+    /// Its origin: the address of a client, or the name of a file.
     pub(super) from: String,
 }
 
@@ -94,8 +93,8 @@ impl RevisionStore {
         Ok(store)
     }
 
-    /// Writes the revision of the file that the process was started with. It has proved to run: one that does
-    /// not takes nobody's place.
+    /// Writes the revision of the file that the process was started with, now that it has started: a revision that does
+    /// not start replaces none.
     pub(super) fn has_started(&mut self) -> Result<(), StartError> {
         let Some((number, forget)) = self.started_with.take() else { return Ok(()) };
         let text = self.texts.get(&number).cloned().unwrap_or_default();
@@ -112,7 +111,7 @@ impl RevisionStore {
         Revisions::new(Stored { kept, live: self.index.live, previous: self.index.previous })
     }
 
-    /// What is known about each, the oldest first.
+    /// Metadata of the revisions, the oldest first.
     pub(super) fn entries(&self) -> &[RevisionEntry] {
         &self.index.kept
     }
@@ -122,7 +121,7 @@ impl RevisionStore {
         self.texts.get(&number)
     }
 
-    /// All texts.
+    /// Texts by revision number.
     pub(super) fn texts(&self) -> &BTreeMap<u32, Arc<str>> {
         &self.texts
     }
@@ -131,7 +130,7 @@ impl RevisionStore {
         Some(Revision { number, digest: digest(self.text(number)?) })
     }
 
-    /// Keeps a text.
+    /// Stores a text as a revision.
     pub(super) fn keep(
         &mut self,
         number: u32,
@@ -171,7 +170,7 @@ impl RevisionStore {
         if let Some(forget) = forget {
             self.texts.remove(&forget);
             if let Some(folder) = &self.folder {
-                // What is left behind is removed at the next start.
+                // A file that remains is removed at the next start.
                 let _ = fs::remove_file(folder.path.join(name(forget)));
             }
         }

@@ -1,8 +1,7 @@
-//! Answers that go on: server-sent events with state and values five times a second and, for whoever asks,
-//! frames by name; and captures.
+//! Endless responses: server-sent events with state and values five times a second, and frames by name on request; and
+//! captures.
 //!
-//! A client that reads slowly gets fewer events and is told how many it lost; one that does not read is
-//! dropped.
+//! A client that reads slowly gets fewer events, with the number of lost ones; one that does not read is disconnected.
 
 use std::io;
 use std::rc::Rc;
@@ -22,7 +21,7 @@ use super::frames::{CaptureStream, FrameEvents};
 use super::http::{HttpReply, MAX_TIME, bytes_of, head_of};
 use super::{ConsoleServer, ConsoleSource};
 
-/// What goes on.
+/// An endless response.
 enum Endless {
     Events(Option<FrameEvents>),
     Capture(Box<CaptureStream>),
@@ -51,7 +50,7 @@ pub(super) async fn serve(
     }
 }
 
-/// What was asked for.
+/// The stream for a request.
 fn endless(server: &ConsoleServer, operation: Operation, head: &Head<'_>) -> Result<Endless, HttpReply> {
     let watch = || match &server.source {
         ConsoleSource::Gateway { watch, .. } => Ok::<&Watch, HttpReply>(watch),
@@ -93,7 +92,7 @@ async fn follow(server: &Rc<ConsoleServer>, stream: TcpStream, endless: Endless)
         }
     };
     let gone = async {
-        // It has nothing more to say; what it says all the same is not looked at.
+        // Further input is ignored.
         let mut chunk = [0; 256];
         while read.read(&mut chunk).await.is_ok_and(|count| count > 0) {}
     };

@@ -59,47 +59,49 @@ impl ConfigFile {
     }
 }
 
-/// What somebody asks for.
+/// A request of a client.
 #[derive(Debug)]
 pub(crate) struct SupervisorCommand {
-    /// Who.
     pub(super) peer: IpAddr,
-    /// What.
     pub(super) what: SupervisorAction,
     /// Gets the number of the revision.
     pub(super) answer: oneshot::Sender<Result<u32, ActionError>>,
 }
 
-/// What somebody asks for.
+/// A request of a client.
 #[derive(Debug)]
 pub(super) enum SupervisorAction {
-    /// Keep a text that was made from a revision.
-    Put { base: Revision, toml: String },
+    /// Store a text that was derived from revision `base`.
+    Put {
+        base: Revision,
+        toml: String,
+    },
     /// Run one on trial.
-    Apply { number: Option<u32>, trial: Duration },
-    /// Keep what is on trial.
+    Apply {
+        number: Option<u32>,
+        trial: Duration,
+    },
+    /// Confirm the revision on trial.
     Confirm,
-    /// Return.
+    /// Return to the previous revision.
     RollBack,
-    /// End.
     Shutdown,
 }
 
-/// Why nothing was done.
+/// Why a request failed.
 #[derive(Debug)]
 pub(super) enum ActionError {
-    /// It is refused.
     Refused(Refused),
-    /// It was tried.
+    /// An attempt failed, for this reason.
     Tried(String),
 }
 
-/// What readers see.
+/// The supervisor's state, for readers.
 #[derive(Debug, Default)]
 pub(crate) struct SupervisorView {
     /// The revisions.
     pub(super) revisions: Option<Revisions>,
-    /// What is known about each, the oldest first.
+    /// Their metadata, the oldest first.
     pub(super) entries: Vec<RevisionEntry>,
     /// Their texts.
     pub(super) texts: BTreeMap<u32, Arc<str>>,
@@ -109,7 +111,7 @@ pub(crate) struct SupervisorView {
     pub(super) failure: Option<String>,
     /// Overrides, which apply to every revision.
     pub(super) overrides: Vec<String>,
-    /// What runs.
+    /// The running configuration.
     pub(super) config: Option<Arc<GatewayConfig>>,
     client: Option<RuntimeClient>,
     slot: Option<Arc<SnapshotSlot>>,
@@ -123,7 +125,7 @@ impl SupervisorView {
     }
 }
 
-/// Between the supervisor and its readers.
+/// The view that the supervisor shares with its readers.
 #[derive(Debug, Default)]
 pub(crate) struct SharedView(Mutex<SupervisorView>);
 
@@ -132,7 +134,7 @@ impl SharedView {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The gateway that runs: its slot, and its configuration.
+    /// Snapshot slot and configuration of the running gateway.
     pub(super) fn running(&self) -> Option<(Arc<SnapshotSlot>, Arc<GatewayConfig>)> {
         let view = self.view();
         view.slot.clone().zip(view.config.clone())
@@ -146,7 +148,7 @@ pub(crate) struct Supervised {
     shared: Arc<SharedView>,
     commands: blocking::Sender<SupervisorCommand>,
     thread: Option<JoinHandle<Result<(), StartError>>>,
-    /// Ended first, so that nobody is answered any more.
+    /// Ended first, so that no more requests are answered.
     console: Option<Console>,
 }
 
@@ -247,7 +249,7 @@ impl ForegroundRun for Supervised {
     }
 }
 
-/// A gateway that another one may take the place of.
+/// A running gateway that can be replaced.
 struct Replaceable {
     /// The number of its revision.
     number: u32,
@@ -269,9 +271,9 @@ struct Supervisor {
     handover: Handover,
     /// Where each gateway runs.
     place: RuntimePlace,
-    /// Who looks at each gateway, but for the console.
+    /// Observers of each gateway except the console.
     observers: Observers,
-    /// The text that is to be kept, and who sent it.
+    /// The text to be stored, and its sender.
     put: Option<(String, String)>,
     failure: Option<String>,
 }
@@ -301,7 +303,7 @@ impl Supervisor {
                 | Err(RecvTimeoutError::Disconnected) => {
                     return self.running.take().map_or(Ok(()), |running| running.handle.shutdown());
                 }
-                Ok(command) => self.carry_out(command),
+                Ok(command) => self.execute(command),
                 Err(RecvTimeoutError::Timeout) => {}
             }
             if self.running.as_ref().is_some_and(|running| running.handle.has_ended()) {
@@ -322,7 +324,7 @@ impl Supervisor {
         Ok(())
     }
 
-    fn carry_out(&mut self, command: SupervisorCommand) {
+    fn execute(&mut self, command: SupervisorCommand) {
         let SupervisorCommand { peer, what, answer } = command;
         let at = now();
         let done = match what {
@@ -343,7 +345,7 @@ impl Supervisor {
         let _ = answer.send(result);
     }
 
-    /// Does what the machine asks for. Returns why something failed.
+    /// Executes the outputs of the state machine. Returns the reason if one failed.
     fn drain(&mut self) -> Option<String> {
         let (mut failed, mut is_changed) = (None, false);
         loop {
@@ -419,10 +421,10 @@ impl Supervisor {
             .map_err(|mistake| StartError::new(format!("{name}: {mistake}")))
     }
 
-    /// Brings the safe values out and ends what runs.
+    /// Sends the safe values and ends the running gateway.
     fn stop(&mut self) {
         let Some(Replaceable { handle, slot, .. }) = self.running.take() else { return };
-        // From here on nothing runs.
+        // From here on no gateway runs.
         self.show();
         slot.make_safe();
         if let Err(error) = handle.shutdown() {
@@ -442,7 +444,7 @@ impl Supervisor {
         Ok(())
     }
 
-    /// The devices of the ports that a revision has. Those of other ports are kept for when they come.
+    /// The binds of the ports that a revision has. The others are kept for later revisions.
     fn binds_of(&self, number: u32, config: &GatewayConfig) -> Vec<Bind> {
         let has =
             |bind: &&Bind| config.view().field_ports().any(|(_, port, _)| port.name == bind.port.as_str());
@@ -453,7 +455,7 @@ impl Supervisor {
         used.into_iter().cloned().collect()
     }
 
-    /// Shows readers how it is now.
+    /// Updates the readers' view.
     fn show(&self) {
         let mut view = self.shared.view();
         view.revisions = Some(self.revisions.clone());
@@ -469,10 +471,10 @@ impl Supervisor {
     }
 }
 
-/// How often is looked for the end of a trial, and of a gateway.
+/// Poll interval for the end of a trial or gateway.
 const LOOK_INTERVAL: StdDuration = StdDuration::from_millis(100);
 
-/// The trial that is running: its revision and what is left of it.
+/// The revision on trial, and the remaining seconds.
 pub(super) fn left_of(trial: Option<(u32, Instant)>) -> Option<(u32, f64)> {
     let (number, until) = trial?;
     Some((number, until.saturating_since(now()).as_millis() as f64 / 1_000.0))

@@ -1,8 +1,8 @@
-//! What goes over ports and links, for whoever watches (`recipe_capture::Watch`).
+//! Records of port and link traffic for subscribers of `recipe_capture::Watch`.
 //!
-//! In, on the gateway's thread: the engine's tap, and each call of the engine. They are written to a ring of bytes,
-//! which never waits and never allocates: what has no buffer is lost and counted. While nobody watches, a call costs
-//! one relaxed load. Out, on an ordinary thread: owned records for the subscribers.
+//! In, on the gateway's thread: the engine's tap and calls. They are written to a byte ring without waiting or
+//! allocating; what does not fit is dropped and counted. Without subscribers a call costs one relaxed load. Out, on an
+//! ordinary thread: owned records.
 
 use std::io;
 use std::sync::Arc;
@@ -25,7 +25,7 @@ use rtrb::{Consumer, Producer, RingBuffer};
 const RING: usize = 8 << 20;
 /// Longest message: the passes of an engine are far shorter, its configuration too.
 const MAX_MESSAGE: usize = 128 << 10;
-/// How long the reader sleeps when the ring is empty. The gateway does not wake it: that would be a system call.
+/// Poll interval of the reader when the ring is empty. The gateway does not wake it, which would be a system call.
 const READ_INTERVAL: Duration = Duration::from_millis(2);
 
 /// The gateway's side.
@@ -33,20 +33,20 @@ const READ_INTERVAL: Duration = Duration::from_millis(2);
 pub(super) struct Tapping {
     watch: Watch,
     ring: Producer<u8>,
-    /// The message that is being made.
+    /// The message being built.
     message: Vec<u8>,
-    /// The pass that is being recorded has more bytes than a message may have.
+    /// The message being built exceeds its maximum length.
     is_too_long: bool,
     /// Passes are recorded from the start of the engine on.
     records_passes: bool,
-    /// Lost since the newest that was kept: frames, passes.
+    /// Lost since the last successful push: frames, passes.
     lost: [u32; 2],
     reader: Option<JoinHandle<()>>,
 }
 
 impl Tapping {
-    /// Begins to tell of a gateway, which must not have been called yet. Passes are recorded if there is an
-    /// image, with which a recording begins.
+    /// Starts to record a gateway whose engine was not called yet. Passes are recorded if there is an image, which is the
+    /// first entry of a recording.
     pub(super) fn begin(watch: &Watch, cell: Cell, at: Instant, image: Option<&[u8]>) -> io::Result<Self> {
         let (ring, consumer) = RingBuffer::new(RING);
         let began = Record { at, lost: 0, what: What::Began(Arc::new(cell)) };
@@ -83,7 +83,7 @@ impl Tapping {
         }
     }
 
-    /// The engine is told to prepare its end.
+    /// Records a call of the engine's `make_safe`.
     pub(super) fn make_safe(&mut self, at: Instant) {
         if self.records_passes {
             self.head(PASS, at);
@@ -100,7 +100,7 @@ impl Tapping {
         }
     }
 
-    /// Behind the call.
+    /// After the call.
     #[inline]
     pub(super) fn behind(&mut self, tap: &mut Tap<TAP>) {
         if self.records_passes {
@@ -184,7 +184,7 @@ impl Tapping {
         }
     }
 
-    /// Hands the message over, or loses it.
+    /// Pushes the message to the ring, or drops and counts it.
     fn push(&mut self, kind: u8) {
         let len = u32::try_from(self.message.len()).unwrap_or(0);
         if let Some(place) = self.message.first_chunk_mut() {
@@ -198,7 +198,7 @@ impl Tapping {
 
 impl Drop for Tapping {
     fn drop(&mut self) {
-        // The reader sees that the ring was abandoned, and takes what is in it.
+        // The reader drains the ring once it is abandoned.
         let (ring, _) = RingBuffer::new(0);
         self.ring = ring;
         if let Some(reader) = self.reader.take() {
@@ -220,7 +220,7 @@ impl RingReader {
         self.watch.read_here();
         self.watch.give(began);
         loop {
-            // In this order: what is abandoned gets nothing more.
+            // Checked before draining: an abandoned ring gets no more messages.
             let is_abandoned = self.ring.is_abandoned();
             while let Some(record) = self.next() {
                 self.watch.give(record);

@@ -1,8 +1,7 @@
-//! What a link has to send, and a short socket to its socket.
+//! A link's send queue, with direct access to its socket.
 //!
-//! Between a field frame and its request should be as little as possible: a task that is woken and looks at all it waits
-//! for takes longer than the engine. So what is handed over goes to the socket at once. The link's task has the rest of
-//! the work: it reports what was sent, and sends what the system did not take.
+//! Bytes are written to the socket at once, because waking the link's task takes longer than the engine needs for a field
+//! frame. The task does the rest: it reports completed transmissions, and sends what the kernel did not accept.
 
 use std::collections::VecDeque;
 use std::io;
@@ -12,7 +11,7 @@ use std::os::fd::{AsFd, OwnedFd};
 use rustix::io::Errno;
 use rustix::net::{SendFlags, send, sendto};
 
-/// A socket of its own descriptor, because a task has the other one.
+/// A duplicate of the socket's descriptor; the link's task owns the original.
 #[derive(Debug)]
 pub(super) struct DirectSocket {
     socket: OwnedFd,
@@ -21,7 +20,7 @@ pub(super) struct DirectSocket {
 }
 
 impl DirectSocket {
-    /// To `peer`, or to where the socket is connected.
+    /// Sends to `peer`, or to the connected peer if `None`.
     pub(super) fn new(socket: &impl AsFd, peer: Option<SocketAddr>) -> io::Result<Self> {
         Ok(Self { socket: rustix::io::fcntl_dupfd_cloexec(socket, 0)?, peer })
     }
@@ -35,14 +34,14 @@ impl DirectSocket {
     }
 }
 
-/// Transmissions that were handed over and that the system has not accepted.
+/// Transmissions that the kernel has not accepted yet.
 #[derive(Debug, Default)]
 pub(super) struct Outbox {
-    /// The first one is what is left of a transmission that the system has taken a part of.
+    /// The first entry may be the rest of a partly accepted transmission.
     queue: VecDeque<Vec<u8>>,
     /// `None` if the session has no socket yet.
     socket: Option<DirectSocket>,
-    /// The system has accepted a transmission, and that is not reported yet.
+    /// A transmission was accepted and not yet reported.
     is_sent: bool,
     failed: Option<Errno>,
 }
@@ -51,12 +50,12 @@ pub(super) struct Outbox {
 const MAX_QUEUED: usize = 8;
 
 impl Outbox {
-    /// Transmissions may go to this socket at once.
+    /// Enables direct writes to this socket.
     pub(super) fn open(&mut self, socket: DirectSocket) {
         self.socket = Some(socket);
     }
 
-    /// They may not any more.
+    /// Disables direct writes.
     pub(super) fn close(&mut self) {
         self.socket = None;
     }
@@ -68,7 +67,7 @@ impl Outbox {
         }
     }
 
-    /// Takes a transmission; false if too many wait.
+    /// Accepts a transmission; false if too many are queued.
     pub(super) fn take(&mut self, bytes: &[u8]) -> bool {
         let mut rest = bytes;
         if self.queue.is_empty()
@@ -78,7 +77,7 @@ impl Outbox {
             match socket.send(bytes) {
                 Ok(len) => rest = bytes.get(len..).unwrap_or_default(),
                 Err(Errno::AGAIN | Errno::INTR) => {}
-                // A socket tells an error once. The task that ends the session has to know it.
+                // A socket reports an error only once; keep it for the task, which ends the session.
                 Err(error) => self.failed = Some(error),
             }
         }
@@ -93,10 +92,10 @@ impl Outbox {
         has_room
     }
 
-    /// Writes what waits. True if now nothing does, and something was accepted since this was last said.
+    /// Writes queued bytes. True if the queue is empty and something was accepted since this last returned true.
     ///
     /// # Errors
-    /// That of `write`, or of an earlier transmission; it is not an error if the system takes nothing at the moment.
+    /// That of `write` or of an earlier transmission, except `WouldBlock`.
     pub(super) fn flush(&mut self, mut write: impl FnMut(&[u8]) -> io::Result<usize>) -> io::Result<bool> {
         if let Some(error) = self.failed.take() {
             return Err(error.into());

@@ -100,7 +100,7 @@ impl LinkTask<'_> {
     async fn refuse_others(&self, others: Option<(&TcpListener, &[IpAddr])>) {
         let Some((listener, known)) = others else { return std::future::pending().await };
         loop {
-            // It is closed at once, so a failure matters to nobody.
+            // It is closed at once, so failures are ignored.
             let (stream, peer) = tcp_options::accept(listener, |_| {}).await;
             drop(stream);
             if self.control.is_controller(self.name, known, peer) {
@@ -117,7 +117,7 @@ struct LinkConnection<'a> {
     link: &'a LinkTask<'a>,
     session: LinkSession,
     writer: WriteHalf<'a>,
-    /// For what is handed over while this task does something else.
+    /// Allows direct writes while this task waits.
     _lent: Lent<'a>,
     /// Number of bytes that the peer is known to have acknowledged.
     acked: u64,
@@ -125,7 +125,7 @@ struct LinkConnection<'a> {
     reads: u64,
 }
 
-/// How acknowledgements are looked for.
+/// How acknowledgements are monitored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum AckWatch {
     /// Not at all, and the system has no time limit either.
@@ -230,9 +230,9 @@ impl<'a> LinkConnection<'a> {
         Ok(())
     }
 
-    /// Whether anything handed over is not known to be acknowledged.
+    /// Whether sent bytes are not known to be acknowledged.
     fn is_outstanding(&self) -> bool {
-        self.link.control.handed.get() != self.acked
+        self.link.control.sent.get() != self.acked
     }
 
     /// Reports acknowledgements, if there are new ones.
@@ -242,7 +242,7 @@ impl<'a> LinkConnection<'a> {
         }
         let control = self.link.control;
         let left = tcp_options::unacknowledged(self.writer.as_ref())? + control.waiting();
-        let acked = control.handed.get().saturating_sub(left as u64);
+        let acked = control.sent.get().saturating_sub(left as u64);
         if acked != self.acked {
             self.acked = acked;
             events(LinkEvent::Acked(u32::try_from(left).unwrap_or(u32::MAX)));

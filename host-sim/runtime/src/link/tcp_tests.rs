@@ -1,4 +1,4 @@
-//! Acknowledgement of bytes that were handed over, with peers whose buffers are too small for them.
+//! Acknowledgement of bytes that were sent, with peers whose buffers are too small for them.
 
 use std::io::Read;
 use std::os::fd::AsFd;
@@ -31,7 +31,7 @@ const PIECE: usize = 1_024;
 const PIECES: u8 = 16;
 const ALL: usize = PIECE * PIECES as usize;
 
-/// Hands over more than fits the peer's buffer, and less than fits ours.
+/// Sends more than fits the peer's buffer, and less than fits ours.
 async fn fill(link: &Running) {
     for piece in 1..=PIECES {
         link.control.send(&[piece; PIECE]);
