@@ -28,11 +28,11 @@ pub(crate) enum RecordingEnd {
     Whole,
     /// Within a record, or where nothing can be read.
     Cut,
-    /// As it was told.
+    /// The visitor returned `Stop`.
     Stopped,
 }
 
-/// Hands over each call with its number.
+/// Visits each call with its number.
 ///
 /// # Errors
 /// That of `take`.

@@ -172,7 +172,7 @@ mod tests {
     use super::*;
     use crate::record::{Cell, CellPort, Epoch, Frame, Record, What};
 
-    fn told(watch: &Watch, frames: u64) {
+    fn deliver(watch: &Watch, frames: u64) {
         let port = CellPort { id: PortId(0), name: "line".into(), is_can: false, bit_rate: 0 };
         let epoch = Epoch { at: Instant::from_micros(0), wall: SystemTime::UNIX_EPOCH };
         let cell = Arc::new(Cell { ports: vec![port], links: Vec::new(), decoder: Arc::default(), epoch });
@@ -197,7 +197,7 @@ mod tests {
         for _ in 0..2 {
             let watch = Watch::new();
             let capture = CaptureFile::start(&watch, Scope::default(), Target::Path(path.clone())).unwrap();
-            told(&watch, 10);
+            deliver(&watch, 10);
             watch.close();
             capture.finish();
             assert_eq!(fs::read(&path).unwrap()[..4], MAGIC);
@@ -217,10 +217,10 @@ mod tests {
         let watch = Watch::new();
         let full = Target::Path("/dev/full".into());
         let capture = CaptureFile::start(&watch, Scope::default(), full).unwrap();
-        told(&watch, 10);
+        deliver(&watch, 10);
         capture.finish();
         // Nobody is interested any more, so nothing costs anything.
         assert_eq!(watch.wanted(), Interest::default());
-        told(&watch, 10);
+        deliver(&watch, 10);
     }
 }

@@ -15,7 +15,7 @@ use crate::decode::Decoder;
 pub struct Record {
     /// When, on the engine's clock.
     pub at: Instant,
-    /// Number of records of the same kind that were lost before this one, for all who watch.
+    /// Number of records of the same kind that were lost before this one, for all subscribers.
     pub lost: u32,
     /// What was seen.
     pub what: What,
@@ -24,7 +24,7 @@ pub struct Record {
 /// What was seen.
 #[derive(Debug, Clone)]
 pub enum What {
-    /// An engine begins, with these ports and links. Everybody who watches gets it first.
+    /// An engine starts, with these ports and links. Each subscriber gets this record first.
     Began(Arc<Cell>),
     /// A frame, bytes or a datagram.
     Frame(Frame),

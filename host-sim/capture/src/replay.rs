@@ -56,12 +56,12 @@ impl fmt::Display for ReplayError {
 
 impl std::error::Error for ReplayError {}
 
-/// What came of a replay.
+/// The result of a replay.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Report {
     /// Engines that began.
     pub starts: u64,
-    /// Inputs handed to them.
+    /// Inputs passed to them.
     pub inputs: u64,
     /// Outputs that were compared.
     pub outputs: u64,

@@ -57,7 +57,7 @@ struct Wanted {
     queues: Vec<Arc<Queue>>,
     /// The newest [`What::Began`], for those who subscribe later.
     began: Option<Arc<Record>>,
-    /// The thread that reads the ring, to be woken when somebody subscribes.
+    /// The thread that reads the ring, woken by a new subscription.
     reader: Option<Thread>,
     is_closed: bool,
 }
@@ -66,7 +66,7 @@ struct Wanted {
 #[derive(Debug)]
 struct Queue {
     interest: Interest,
-    room: usize,
+    capacity: usize,
     inner: Mutex<Inner>,
     arrived: Condvar,
 }
@@ -88,7 +88,7 @@ pub struct Arrived {
     pub missed: u64,
 }
 
-/// What a subscriber gets.
+/// The next item of a subscription.
 #[derive(Debug, Clone)]
 pub enum Next {
     /// A record.
@@ -112,10 +112,14 @@ impl Watch {
         Self::default()
     }
 
-    /// Subscribes. At most `room` records wait to be taken, 1 at least; further ones are missed.
-    pub fn subscribe(&self, interest: Interest, room: usize) -> Subscription {
-        let queue =
-            Arc::new(Queue { interest, room: room.max(1), inner: Mutex::default(), arrived: Condvar::new() });
+    /// Subscribes. At most `capacity` records wait to be taken, 1 at least; further ones are missed.
+    pub fn subscribe(&self, interest: Interest, capacity: usize) -> Subscription {
+        let queue = Arc::new(Queue {
+            interest,
+            capacity: capacity.max(1),
+            inner: Mutex::default(),
+            arrived: Condvar::new(),
+        });
         let mut state = locked(&self.0.state);
         if let Some(began) = &state.began {
             queue.give(began);
@@ -138,12 +142,12 @@ impl Watch {
         Interest::of_bits(self.0.wanted.load(Ordering::Relaxed))
     }
 
-    /// Makes this thread the one that is woken when somebody subscribes.
+    /// Registers the current thread to be woken by a new subscription.
     pub fn read_here(&self) {
         locked(&self.0.state).reader = Some(std::thread::current());
     }
 
-    /// Gives a record to all who want it.
+    /// Delivers a record to all interested subscribers.
     pub fn give(&self, record: Record) {
         let record = Arc::new(record);
         let mut state = locked(&self.0.state);
@@ -179,7 +183,7 @@ impl Queue {
             return;
         }
         let mut inner = locked(&self.inner);
-        if inner.waiting.len() >= self.room {
+        if inner.waiting.len() >= self.capacity {
             inner.missed += 1;
             return;
         }

@@ -89,7 +89,7 @@ impl Configuration {
     }
 }
 
-/// Whether an address is that of whoever uses it.
+/// Whether an address is a loopback address.
 fn is_this_machine(address: &str) -> bool {
     address == "localhost" || address.parse::<IpAddr>().is_ok_and(|ip| ip.to_canonical().is_loopback())
 }
@@ -392,7 +392,7 @@ fn no_trial(revisions: &Value) -> String {
     text
 }
 
-/// `identify`: a host writes a line, a board lets its lamp blink.
+/// `identify`: a host writes a line, a board blinks its LED.
 ///
 /// # Errors
 /// If it is refused or not reached.

@@ -48,7 +48,7 @@ pub fn claim(client: &Client, file: &Path, tell: &mut dyn FnMut(&str)) -> Result
     wait(client, &info, &shown_name, tell)?;
     let reply = client.call(&Call::post("claim", &json!({ "key": digits })))?;
     client.accepted(reply)?;
-    // It writes the key before it answers, and from then on nothing is told without it.
+    // The board stores the key before it replies; from then on all requests need it.
     owner.json("status")?;
     Ok(done(client, file, "it is claimed"))
 }
@@ -92,7 +92,7 @@ fn wait(client: &Client, info: &Value, name: &str, tell: &mut dyn FnMut(&str)) -
     }
 }
 
-/// How long somebody may take to reach the button.
+/// Time to press the button.
 const WINDOW: Duration = Duration::from_secs(60);
 /// A key that is sent later than this before the end of the board's own minute might come too late.
 const MIN_LEFT_S: f64 = 1.0;

@@ -21,7 +21,7 @@ use crate::stop::Stop;
 /// The beginning of every path.
 const API: &str = "/api/v1/";
 
-/// A gateway, and how it is talked to. One thread uses it at a time.
+/// A client of a gateway, for one thread at a time.
 #[derive(Debug)]
 pub struct Client {
     address: Address,
@@ -34,7 +34,7 @@ pub struct Client {
     nonce: RefCell<Option<String>>,
 }
 
-/// What is sent with a request.
+/// The body of a request.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum RequestBody<'a> {
     None,
@@ -95,7 +95,7 @@ impl Client {
     /// A client of the gateway at this address. A request and its answer take at most `timeout`.
     ///
     /// # Errors
-    /// If the address is a name that nobody knows.
+    /// If the host name cannot be resolved.
     pub fn new(address: Address, key: Option<Key>, timeout: Duration, stop: Stop) -> Result<Self, Failure> {
         let places = address.resolve().map_err(|error| Failure::Refused(format!("{address}: {error}")))?;
         Ok(Self { address, places, host: None, key, timeout, stop, nonce: RefCell::new(None) })
@@ -120,7 +120,7 @@ impl Client {
         Self { key: Some(key), ..self.until(self.stop.clone()) }
     }
 
-    /// Its address, as it was given.
+    /// The gateway's address as given.
     pub fn address(&self) -> &Address {
         &self.address
     }
@@ -156,7 +156,7 @@ impl Client {
         self.accepted(reply)
     }
 
-    /// The answer if it is none of a refusal.
+    /// Returns the reply unless it is an error.
     pub(crate) fn accepted(&self, reply: HttpReply) -> Result<HttpReply, Failure> {
         match reply.status() {
             200..=299 => Ok(reply),

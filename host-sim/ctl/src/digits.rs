@@ -13,7 +13,7 @@ use crate::failure::Failure;
 /// More than a key and its line end.
 pub(crate) const MAX_FILE: u64 = 100;
 
-/// The digits of a key that is its owner's alone. What is wrong with them is told without them: a mistyped key is
+/// The digits of a private key. Error messages do not repeat them: a mistyped key is
 /// almost one.
 pub(crate) fn read(path: &Path) -> Result<String, Failure> {
     let mut text = read_private(path, MAX_FILE).map_err(|error| wrong(path, &error))?;

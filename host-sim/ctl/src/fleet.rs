@@ -23,7 +23,7 @@ use crate::table::{Look, TableCell, TableView, TextTable};
 /// Gateways that are asked at a time.
 pub const MAX_AT_ONCE: usize = 16;
 
-/// One gateway of an inventory, with what is needed to ask it.
+/// One gateway of an inventory, with its address and key.
 #[derive(Debug, Clone)]
 pub struct Member {
     name: String,
@@ -41,7 +41,7 @@ impl Member {
     /// A client of it.
     ///
     /// # Errors
-    /// If its address is a name that nobody knows.
+    /// If its host name cannot be resolved.
     pub fn client(&self, timeout: Duration, stop: Stop) -> Result<Client, Failure> {
         let client = Client::new(self.address.clone(), self.key.clone(), timeout, stop)?;
         Ok(client.known_as(self.host.clone()))

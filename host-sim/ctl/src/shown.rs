@@ -45,7 +45,7 @@ fn replaced(
     let mut out = String::with_capacity(text.len() + 16);
     for c in text.chars() {
         if is_replaced(c) {
-            // A `String` has room for everything.
+            // Writing to a `String` cannot fail.
             let _ = replace(c, &mut out);
         } else {
             out.push(c);

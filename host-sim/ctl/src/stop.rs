@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
-/// Tells a command that goes on that it shall end.
+/// Requests the end of a running command.
 #[derive(Debug, Clone, Default)]
 pub struct Stop {
     asked: Arc<AtomicBool>,
@@ -12,7 +12,7 @@ pub struct Stop {
 }
 
 impl Stop {
-    /// Nobody has asked yet.
+    /// Without a request.
     pub fn new() -> Self {
         Self::default()
     }
@@ -23,7 +23,7 @@ impl Stop {
         Self { asked: Arc::clone(&self.asked), at: Instant::now().checked_add(time) }
     }
 
-    /// Asks all clones to end.
+    /// Requests the end on all clones.
     pub fn ask(&self) {
         self.asked.store(true, Relaxed);
     }
@@ -33,7 +33,7 @@ impl Stop {
         self.was_interrupted() || self.at.is_some_and(|at| Instant::now() >= at)
     }
 
-    /// Whether it shall end because somebody has asked, not because the time is over.
+    /// Whether the end was requested, as opposed to timed out.
     pub fn was_interrupted(&self) -> bool {
         self.asked.load(Relaxed)
     }

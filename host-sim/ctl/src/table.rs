@@ -87,7 +87,7 @@ impl TextTable {
         self.rows.len() <= 1
     }
 
-    /// The lines. What has no room in the last column is cut.
+    /// The lines. The last column is truncated to fit.
     pub(crate) fn show(&self, view: TableView) -> String {
         let columns = self.rows.iter().map(Vec::len).max().unwrap_or(0);
         let width = |column: usize| {
@@ -109,9 +109,9 @@ impl TextTable {
                     line.push_str("  ");
                     used += 2;
                 }
-                let room = view.width.map_or(usize::MAX, |width| width.saturating_sub(used));
+                let left = view.width.map_or(usize::MAX, |width| width.saturating_sub(used));
                 let is_last = nth + 1 == row.len();
-                let words = if is_last { cut(&cell.text, room) } else { cell.text.clone() };
+                let words = if is_last { cut(&cell.text, left) } else { cell.text.clone() };
                 let pad = " ".repeat(widths[nth].saturating_sub(shown::width(&words)));
                 let painted = paint(&words, cell.look);
                 // Writing to a `String` never fails.
@@ -152,14 +152,14 @@ pub(crate) fn paint(text: &str, look: Look) -> String {
     format!("{style}{text}{style:#}")
 }
 
-/// The beginning of a text that has no room.
-fn cut(text: &str, room: usize) -> String {
-    if shown::width(text) <= room {
+/// Truncates a text to `width` columns.
+fn cut(text: &str, width: usize) -> String {
+    if shown::width(text) <= width {
         return text.to_owned();
     }
     let mut short = String::new();
     for c in text.chars() {
-        if shown::width(&short) + shown::width(c.encode_utf8(&mut [0; 4])) + 1 > room {
+        if shown::width(&short) + shown::width(c.encode_utf8(&mut [0; 4])) + 1 > width {
             break;
         }
         short.push(c);

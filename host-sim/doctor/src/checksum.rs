@@ -19,7 +19,7 @@ pub(crate) fn right_one(shape: &Shape<'_>, bytes: &[u8]) -> Option<String> {
     let mut best: Option<(usize, String)> = None;
     for name in Algorithm::names() {
         let Some(algorithm) = Algorithm::named(name) else { continue };
-        // Another length is another frame: what the length says is told elsewhere.
+        // Another length is another frame, which has a finding of its own.
         if algorithm.len() != own.algorithm.len() {
             continue;
         }

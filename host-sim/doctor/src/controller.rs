@@ -118,7 +118,7 @@ fn failed(case: &Case<'_>, port: &Port, place: &FindingPlace) -> Option<Finding>
     };
     let fault = |cause, seen, likely: &str, remedy: &str| found(Severity::Fault, cause, seen, likely, remedy);
     let Some(states) = then else {
-        // Which of the two it was, nobody can see.
+        // The two cases cannot be distinguished.
         if matches!(word, "stop" | "pause") {
             return found(
                 Severity::Note,
@@ -203,7 +203,7 @@ pub(crate) fn ago(age: Duration) -> String {
     format!(" {} s ago", age.as_millis() / 1000)
 }
 
-/// How long a command that came to nothing is told of: somebody has seen it, or nobody will.
+/// How long a failed command is reported.
 pub(crate) const TOLD_FOR: Duration = Duration::from_secs(60);
 
 fn mode(mode: OperationMode) -> &'static str {

@@ -41,7 +41,7 @@ pub use watch::{Change, Watch};
 /// Everything that findings are made of.
 #[derive(Debug, Clone)]
 pub struct Case<'a> {
-    /// What the gateway was told to do.
+    /// The gateway's configuration.
     pub config: ConfigView<'a>,
     /// What it says of itself.
     pub status: State,

@@ -14,7 +14,7 @@ pub const KEPT: usize = 1024;
 const MAX_IDS: usize = 64;
 /// Counters of earlier instants that are kept: those of a window, noted twice a second.
 const NOTES: usize = 16;
-/// Room for the name of a device.
+/// Capacity for the name of a device.
 const DEVICE: usize = 128;
 /// Findings are about this much time before now.
 pub const WINDOW: Duration = Duration::from_secs(5);
@@ -171,9 +171,9 @@ pub struct LinkFacts {
 pub enum Reach {
     /// A connection was made, or a datagram came.
     Reached,
-    /// The machine answered that nobody listens there.
+    /// The connection was refused.
     Refused,
-    /// Nobody answered.
+    /// There was no answer.
     NoAnswer,
     /// The name is not known.
     NoSuchHost,

@@ -4,9 +4,9 @@ use proto_core::time::{Duration, Instant};
 
 use crate::finding::{Cause, Finding, FindingPlace};
 
-/// A finding is told when it was there twice in a row, and its end when it was gone for this long.
+/// A finding is reported once it was found twice in a row, and its end once it was absent for this long.
 const GONE_FOR: Duration = Duration::from_secs(5);
-/// The same place and cause are told again after this at the earliest.
+/// Minimum time between two reports of the same place and cause.
 const REPORT_AGAIN: Duration = Duration::from_secs(60);
 /// More kinds of findings than a gateway has.
 const MAX_KNOWN: usize = 256;

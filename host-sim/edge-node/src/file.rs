@@ -11,7 +11,7 @@ use recipe_sparkplug::topic::Id;
 
 use crate::broker::Broker;
 
-/// What a Sparkplug file asks for; everything that can be wrong with it has been checked.
+/// The validated contents of a Sparkplug file.
 #[derive(Debug, Clone)]
 pub struct PublisherConfig {
     /// The broker.
@@ -58,7 +58,7 @@ impl PublisherConfig {
         Ok(Self { broker, settings, sample, bd_seq: file.bd_seq.clone(), rules: rules.collect(), file })
     }
 
-    /// How often what is told.
+    /// Publishing rates.
     pub fn rates(&self) -> Rates<'_> {
         Rates {
             min_interval: self.file.interval,

@@ -48,9 +48,9 @@ pub struct Totals {
     pub rebirths: u64,
     /// Messages of data.
     pub data: u64,
-    /// Values that were told late.
+    /// Values that were published late.
     pub historical: u64,
-    /// Values that were never told.
+    /// Values that were never published.
     pub lost: u64,
     /// Sessions and attempts that failed.
     pub failures: u64,

@@ -1,7 +1,7 @@
 //! `--bind NAME=DEVICE`: the device that a configured port is bound to.
 //!
 //! In: text. Out: a [`Bind`], or one error message. Opens nothing and does not know the configuration: the
-//! shells check that the port exists and can have such a device.
+//! runtimes check that the port exists and can have such a device.
 
 use std::fmt;
 use std::path::PathBuf;

@@ -357,7 +357,7 @@ async fn port_node(node: &BusNode, tx: &PortTx, events: &mut impl FnMut(PortEven
 fn hand_over(node: &BusNode, tx: &PortTx) {
     while !node.is_full() {
         let Some(frame) = tx.frames.borrow_mut().pop_front() else { return };
-        // It cannot fail: there is room.
+        // Cannot fail: the queue has space.
         let _ = node.send(node.bus.now(), frame);
     }
 }

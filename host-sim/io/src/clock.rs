@@ -1,5 +1,5 @@
 //! The clock of a state machine: the machine's own time, the same faster or slower, or one that moves only
-//! when it is told to.
+//! on command.
 //!
 //! All clones of a [`Clock`] show the same time. An [`Alarm`] waits for an instant of its clock, as a
 //! [`Timer`] does for one of the machine's.

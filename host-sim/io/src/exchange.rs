@@ -29,7 +29,7 @@ pub enum PortEvent<'a> {
     /// The error state of a CAN controller; reported after each [`PortEvent::Up`], if it is known, and when
     /// it changes.
     Bus(BusState),
-    /// Everything handed over has left.
+    /// Everything sent so far has left.
     Sent,
 }
 
@@ -46,7 +46,7 @@ pub struct PortTx {
     stale_until: Cell<Instant>,
     /// How often the process slept.
     sleeps: Cell<u32>,
-    /// The device does not work any more and is not kept.
+    /// The device has failed and is not handed over.
     pub(super) has_failed: Cell<bool>,
     pub(super) slept: Notify,
     pub(super) looked: Notify,
@@ -85,7 +85,7 @@ impl PortTx {
         self.stale_until.get() != Instant::ZERO && now() < self.stale_until.get()
     }
 
-    /// Hands bytes over to a serial port.
+    /// Sends bytes on a serial port.
     pub fn send(&self, bytes: &[u8]) {
         let mut queue = self.bytes.borrow_mut();
         if queue.len() + bytes.len() > MAX_QUEUED_BYTES {
@@ -96,7 +96,7 @@ impl PortTx {
         self.wake.notify_one();
     }
 
-    /// Hands a frame over to a CAN port.
+    /// Sends a frame on a CAN port.
     pub fn send_frame(&self, frame: CanFrame) {
         let mut queue = self.frames.borrow_mut();
         if queue.len() == MAX_QUEUED_FRAMES {

@@ -1,4 +1,4 @@
-//! Fair scheduling of the tasks on a shell's thread: a peer that sends without end must delay neither the
+//! Fair scheduling of the tasks on a runtime's thread: a peer that sends without end must delay neither the
 //! others nor the engine's deadlines.
 
 use std::cell::Cell;
@@ -45,7 +45,7 @@ pub async fn give_way() {
     .await;
 }
 
-/// What was ready of two.
+/// Which of two futures were ready.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Either<L, R> {
     /// The left one.
@@ -54,12 +54,12 @@ pub enum Either<L, R> {
     Right(R),
 }
 
-/// Which of two is asked first, and wins if both are ready.
+/// Which of two futures is polled first, and wins if both are ready.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Order {
-    /// The left one.
+    /// Polls the left one first.
     LeftFirst,
-    /// The right one.
+    /// Polls the right one first.
     RightFirst,
 }
 

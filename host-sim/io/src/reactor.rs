@@ -6,7 +6,7 @@ use std::os::fd::OwnedFd;
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
-/// Registers a non-blocking descriptor with the current runtime's reactor, to be told when it is ready for `interest`.
+/// Registers a non-blocking descriptor with the current runtime's reactor for `interest`.
 ///
 /// # Errors
 /// If the reactor refuses it, as it does a regular file.

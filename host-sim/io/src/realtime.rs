@@ -3,7 +3,7 @@
 use std::fmt;
 use std::io;
 
-/// The scheduling a thread asks for.
+/// The scheduling requested for a thread.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Scheduling {
     /// As any other thread.
@@ -17,7 +17,7 @@ pub enum Scheduling {
 /// The scheduling a thread got.
 #[derive(Debug)]
 pub enum Scheduled {
-    /// Not asked for.
+    /// Not requested.
     Ordinary,
     /// SCHED_FIFO.
     Fifo,

@@ -283,7 +283,7 @@ async fn pump<D: ByteStream>(
 enum Other {
     /// The process slept.
     Slept,
-    /// Received bytes are asked for.
+    /// Received bytes are requested from the driver.
     Looked,
     /// There is something to send.
     HandedOver,
@@ -431,12 +431,12 @@ impl Sender {
     fn down(&mut self, events: &mut impl FnMut(PortEvent<'_>)) {
         self.sending = false;
         self.blocked = false;
-        // Disarming cannot fail. A deadline that nobody waits for would keep a stepped clock from moving.
+        // Disarming cannot fail. A stale deadline would keep a stepped clock from moving.
         let _ = self.timer.arm(Instant::NEVER);
         events(PortEvent::Down);
     }
 
-    /// Starts a transmission of everything handed over so far.
+    /// Starts a transmission of everything queued so far.
     fn begin(&mut self, device: &impl ByteStream, events: &mut impl FnMut(PortEvent<'_>)) -> io::Result<()> {
         self.bytes.clear();
         self.bytes.append(&mut self.tx.bytes.borrow_mut());
@@ -528,7 +528,7 @@ const BACKLOG_CHUNK: usize = 16 * 1_024;
 const DRAIN_LOOK: StdDuration = StdDuration::from_millis(10);
 /// Maximum number of reads after a sleep before other tasks run.
 const MAX_BACKLOG_READS: usize = 64;
-/// What is sent over TCP arrives within this time, or is dropped with its connection: an event has at most so long.
+/// Bytes sent over TCP arrive within this time or are dropped with their connection.
 const DELIVERY: StdDuration = StdDuration::from_secs(1);
 /// Paced bytes closer together than this are written together, as if from a UART's FIFO.
 const MIN_WRITE_INTERVAL: Duration = Duration::from_micros(500);

@@ -207,7 +207,7 @@ impl<'a> Attached<'a> {
         }
     }
 
-    /// Reads a batch of what waits in the socket.
+    /// Reads a batch of waiting frames from the socket.
     fn receive_some(&mut self, events: &mut impl FnMut(PortEvent<'_>)) -> io::Result<MoreData> {
         for _ in 0..BATCH {
             match message::receive(self.socket.as_fd()) {
@@ -329,7 +329,7 @@ impl<'a> Attached<'a> {
         self.in_flight > 0 || self.refused_since.is_some()
     }
 
-    /// Hands frames of the queue over to the kernel, in order, until it refuses one.
+    /// Sends queued frames in order until the kernel refuses one.
     fn send(&mut self, events: &mut impl FnMut(PortEvent<'_>)) -> io::Result<()> {
         if self.is_off() {
             self.drop_queue();

@@ -23,7 +23,7 @@ use crate::timer::now;
 pub(super) trait ByteStream {
     /// Whether bytes that cannot be written at once are lost, as on a line, instead of waiting.
     const LOSSY: bool;
-    /// Whether the system may pass on received bytes late, unless they are asked for.
+    /// Whether the kernel may deliver received bytes late unless they are requested.
     const LATE: bool = false;
 
     /// Waits for bytes. Cancel safe.

@@ -16,7 +16,7 @@ pub fn limit_buffers(listener: &TcpListener) {
     let _ = sockopt::set_socket_send_buffer_size(listener, BUFFER);
 }
 
-/// Accepts one connection. Errors of the system, such as too few descriptors, are told to `failed` and waited out.
+/// Accepts one connection. System errors, such as too few descriptors, are reported to `failed` and retried.
 pub async fn accept(listener: &TcpListener, mut failed: impl FnMut(&io::Error)) -> (TcpStream, SocketAddr) {
     loop {
         match listener.accept().await {

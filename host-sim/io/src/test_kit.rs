@@ -128,7 +128,7 @@ pub(super) fn serial(baud: u32) -> PortBus {
     })
 }
 
-/// Runs a test with a directory of its own, in a runtime like that of the shells.
+/// Runs a test with a directory of its own, in a tokio runtime as production code has it.
 pub(super) fn run(test: impl AsyncFnOnce(&Path)) {
     let dir = tempfile::tempdir().unwrap();
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();

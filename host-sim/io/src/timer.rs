@@ -78,7 +78,7 @@ impl Timer {
         loop {
             let mut ready = self.fd.readable().await?;
             if now() >= self.armed.get() {
-                // The expirations are not read: to arm it sets their number back, and the reactor is told of each once.
+                // Expirations are not read: arming resets their count, and the reactor is notified of each once.
                 ready.clear_ready();
                 self.armed.set(Instant::NEVER);
                 return Ok(());

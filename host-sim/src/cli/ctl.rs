@@ -172,7 +172,7 @@ fn view() -> TableView {
     TableView { width, is_terminal }
 }
 
-/// From now on a signal asks the command to end, which is told in these words; a second one ends it at once.
+/// From now on a signal requests the end of the command and prints this text; a second one ends it at once.
 fn end_on_signals(stop: &Stop, words: Option<&'static str>) -> Result<(), Failure> {
     let refused = |error: io::Error| Failure::refused(format!("signals: {error}"));
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(refused)?;

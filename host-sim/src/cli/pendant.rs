@@ -125,7 +125,7 @@ impl PendantArgs {
         }
     }
 
-    /// The answer to a request that is carried out.
+    /// The answer to a request that is executed.
     fn answer(&self, socket: &mut Socket, request: &Value) -> Result<Value, PendantError> {
         let answer = socket.ask(request).map_err(PendantError::Wrong)?;
         match answer["ok"].as_bool() {

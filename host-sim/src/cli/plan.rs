@@ -1,4 +1,4 @@
-//! The way up or the source of each variable, as `check` prints it.
+//! The route or source of each variable, as `check` prints it.
 
 use proto_core::config::{Bus, FieldSpec, GatewayConfig, InputBinding, LinkSource, OutputBinding, SendOn};
 use proto_core::engine::{LinkId, Plan, PortId, Route, Source};
@@ -7,7 +7,7 @@ use serde::Serialize;
 
 const STATE_STREAM: &str = "<- controller: state stream, 10 a second";
 
-/// The way up or the source of variables of a port.
+/// The route or source of variables of a port.
 #[derive(Debug, Serialize)]
 pub(super) struct VarRoute {
     port: String,

@@ -19,7 +19,7 @@ pub(super) fn of_input(spec: &FieldSpec, to: &InputBinding, behind: &[FieldSpec]
     if matches!(spec, FieldSpec::DeviceInput { overflow: Overflow::Wrap, .. }) {
         return format!("{formula}, wraps");
     }
-    // What these let pass is told behind it.
+    // Values that these let pass are shown after it.
     let is_outside_shown =
         |rule: &FieldSpec| matches!(rule, FieldSpec::InputRule(InputRule::Int16) | FieldSpec::Mapped(_));
     match spec.fitting().filter(|_| !behind.iter().any(is_outside_shown)) {

@@ -49,7 +49,7 @@ fn prepare() -> io::Result<TempFolder> {
     std::thread::Builder::new().name("signals".to_owned()).spawn(move || {
         let signal = runtime.block_on(signals.next());
         print_stderr("interrupted");
-        // The exit code as shells have it.
+        // The exit code as a command line shell reports it.
         remover.remove_and_exit(128 + signal)
     })?;
     Ok(folder)

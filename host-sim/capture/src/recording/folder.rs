@@ -1,4 +1,4 @@
-//! The folder of recordings: which files are ours, and how much room they take.
+//! The folder of recordings: which files are ours, and how much space they take.
 
 use std::fs;
 use std::io;

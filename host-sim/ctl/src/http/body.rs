@@ -46,7 +46,7 @@ impl Unframer {
         matches!(self.0, BodyState::Ended | BodyState::Close)
     }
 
-    /// Appends what `bytes` have of the body to `out`. What comes behind its end is not looked at.
+    /// Appends the part of the body in `bytes` to `out`. Bytes after its end are ignored.
     pub(crate) fn push(&mut self, mut bytes: &[u8], out: &mut Vec<u8>) -> Result<(), BrokenBody> {
         while !bytes.is_empty() {
             match &mut self.0 {
@@ -109,7 +109,7 @@ impl Unframer {
     }
 }
 
-/// The length of the chunk behind this line.
+/// The length of the chunk after this line.
 fn size(line: &[u8]) -> Option<u64> {
     let line = std::str::from_utf8(line).ok()?.strip_suffix("\r\n")?;
     let digits = line.split(';').next()?.trim_end_matches([' ', '\t']);
@@ -120,7 +120,7 @@ fn size(line: &[u8]) -> Option<u64> {
 
 /// Maximum length of the line before a chunk.
 const MAX_LINE: usize = 256;
-/// Maximum length of all lines behind the last chunk.
+/// Maximum length of all trailer lines.
 const MAX_TRAILER: usize = 4_096;
 
 #[cfg(test)]

@@ -24,7 +24,7 @@ pub(crate) enum Framing {
     Length(u64),
     /// It comes in chunks.
     Chunked,
-    /// It goes on until the connection is closed.
+    /// Until the connection is closed.
     Close,
 }
 

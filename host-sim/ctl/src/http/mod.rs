@@ -28,7 +28,7 @@ const MAX_BODY: usize = 1 << 20;
 /// Maximum number of heads before the real one.
 const MAX_ANNOUNCED: usize = 8;
 
-/// What is asked.
+/// A request.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct HttpRequest<'a> {
     pub(crate) method: &'static str,
@@ -112,7 +112,7 @@ impl HttpExchange {
                 Err(HeadError::Incomplete) => match receive(&mut stream, bytes, deadline, stop)? {
                     0 if bytes.is_empty() => {
                         return Err(match &sent {
-                            // The system tells a reset once: whoever writes first hears of it.
+                            // A reset is reported once, to the first read or write.
                             Err(error) if is_reset(error) => {
                                 NoReply::Reset(format!("no answer: {}", words(error)))
                             }
@@ -176,7 +176,7 @@ impl HttpExchange {
     }
 }
 
-/// A body that goes on.
+/// A body that is read as a stream.
 #[derive(Debug)]
 pub(crate) struct Stream {
     exchange: HttpExchange,

@@ -42,7 +42,7 @@ pub trait RolloutBoard: Sync {
     /// # Errors
     /// It is refused, or the board does not come back with it.
     fn begin(&self) -> Result<(), Failure>;
-    /// Keeps what is on trial.
+    /// Confirms the firmware on trial.
     ///
     /// # Errors
     /// It is refused, or the board not reached.
@@ -74,7 +74,7 @@ pub enum BoardState {
     Other,
     /// It runs this one on trial.
     OnTrial,
-    /// It runs another one on trial, which is somebody else's business.
+    /// It has another firmware on trial, from someone else.
     OtherOnTrial,
     /// It runs this one, confirmed.
     Confirmed,
@@ -96,7 +96,7 @@ pub struct RolloutPlan {
 /// What became of a board.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum BoardOutcome {
-    /// Nothing was done, because a board has failed or somebody has asked to end.
+    /// Not started: another board has failed, or the end was requested.
     NotBegun,
     /// It has run this firmware before.
     Already,

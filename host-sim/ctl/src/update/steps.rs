@@ -12,7 +12,7 @@ use crate::failure::Failure;
 use crate::firmware::Update;
 use crate::http::HttpReply;
 
-/// What is told while a firmware is sent and tried.
+/// Progress of sending and trying a firmware.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Progress {
     /// The slot is being erased.
@@ -179,7 +179,7 @@ pub fn begin_trial(
     // The trial ends by itself after that, and restarts take their time.
     let there = |now: &Firmware| now.trial.is_some();
     let failed = |now: &Firmware| {
-        // Two trials of one slot may end alike. What was received is told until the restart.
+        // Two trials of one slot may end alike. The board reports the received bytes until the restart.
         let has_restarted = before.incoming.is_some() && now.incoming.is_none();
         let tried = now.last.as_ref().map(|(slot, _)| *slot);
         let is_of_this_trial = now.last != before.last || has_restarted && tried != now.slot;

@@ -28,13 +28,13 @@ pub(crate) struct SlcanClient {
 /// The slcan clients on TCP.
 pub(crate) type Clients = RefCell<Vec<Rc<SlcanClient>>>;
 
-/// What a client and the bus have said to each other, as far as it matters for what comes next.
+/// The slcan state of a client.
 #[derive(Debug)]
 pub(crate) struct SlcanSession {
     channel: Channel,
     /// What the client has not taken yet.
     out: Vec<u8>,
-    /// What came from it and waits for room on the bus.
+    /// Received frames that wait for space on the bus.
     rest: Vec<u8>,
 }
 
@@ -218,7 +218,7 @@ fn execute_commands(
             out.extend_from_slice(reaction.answer);
             match (reaction.frame, old) {
                 (Some(_), Some(tx)) => tx.count(|counters| counters.dropped += 1),
-                // It cannot fail: there is room.
+                // Cannot fail: the queue has space.
                 (Some(frame), None) => drop(node.send(arrived, frame)),
                 (None, _) => {}
             }

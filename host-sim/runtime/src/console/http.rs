@@ -282,7 +282,7 @@ pub(super) fn head_of(reply: &HttpReply, length: Length) -> String {
     let fields: Vec<(&str, &dyn std::fmt::Display)> =
         reply.fields.iter().map(|(name, value)| (*name, value as &dyn std::fmt::Display)).collect();
     let mut text = String::new();
-    // A `String` has room for everything.
+    // Writing to a `String` cannot fail.
     let _ = match reply.kind {
         Kind::Page => PAGE.write_head(reply.status, &mut text),
         kind => Response::new(reply.status, kind, length).with(&fields).write(&mut text),

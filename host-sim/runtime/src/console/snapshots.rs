@@ -175,7 +175,7 @@ fn status_of(snapshot: &GatewaySnapshot) -> String {
     })
 }
 
-/// The text that is written; a `String` has buffer for everything.
+/// The written text; writing to a `String` cannot fail.
 fn written<R>(write: impl FnOnce(&mut String) -> R) -> String {
     let mut text = String::new();
     let _ = write(&mut text);

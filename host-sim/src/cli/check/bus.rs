@@ -232,7 +232,7 @@ fn wrong(config: &GatewayConfig, ports: &[&Port], load: &Load) -> Vec<Trouble> {
 }
 
 /// Ids that collide, within a port and, if the ports are on one bus, between them. What ports that are on one bus
-/// both send is told with it.
+/// both send is reported with it.
 fn collisions(config: &GatewayConfig, groups: &[Vec<&Port>]) -> Vec<Trouble> {
     let ports: Vec<(usize, &Port)> =
         (0..).zip(groups).flat_map(|(group, ports)| ports.iter().map(move |port| (group, *port))).collect();

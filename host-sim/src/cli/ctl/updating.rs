@@ -1,4 +1,4 @@
-//! `ctl update FILE` with an inventory: the rollout of a firmware, told as it goes, with its report.
+//! `ctl update FILE` with an inventory: the rollout of a firmware, with progress lines and a report.
 
 use std::io::Write;
 use std::path::Path;
@@ -58,7 +58,7 @@ impl Updating<'_> {
         boards: &[(String, B)],
         stop: &Stop,
     ) -> Result<RolloutReport, Failure> {
-        // A report that cannot be written is a mistake that is told before anything is done.
+        // Check that the report can be written before anything is done.
         self.keep(&RolloutReport::before(version, boards.iter().map(|(name, _)| name.as_str())))?;
         let unkept = Mutex::new(None);
         let report = rollout::roll_out(version, boards, self.plan(), stop, &|event| match event {
@@ -92,7 +92,7 @@ impl Updating<'_> {
     }
 }
 
-/// What somebody reads who has asked to end.
+/// Printed when the end is requested.
 pub(super) const ENDING: &str = "ends once the boards in hand have; a second time ends at once, and a board on trial confirms itself \
      or goes back";
 /// As long as a board takes to confirm itself.

@@ -14,26 +14,26 @@ use super::act::Act;
 use super::updating::Updating;
 use crate::cli::output::OutputFile;
 
-/// What a gateway answers.
+/// A request to one gateway.
 type QueryFn<'a> = Box<dyn Fn(&Client, Run) -> Result<Answer, Failure> + Sync + 'a>;
-/// What prints by itself.
+/// A command that prints as it runs.
 type Follow<'a> = Box<dyn Fn(&Client, Run, &mut dyn Write) -> Result<Verdict, Failure> + 'a>;
 
-/// What goes through an inventory by rules of its own.
+/// A command that iterates over an inventory itself.
 type Through<'a> = Box<dyn Fn(&[Member], &Stop, Run, &mut dyn Write) -> Result<Verdict, Failure> + 'a>;
 
-/// What is done here, once.
+/// A command without a gateway.
 type Alone<'a> = Box<dyn FnOnce(Run, &mut dyn Write) -> Result<Verdict, Failure> + 'a>;
 
 /// A command whose files have been read.
 pub(super) enum CtlWork<'a> {
-    /// It needs no gateway.
+    /// Needs no gateway.
     Alone(Alone<'a>),
-    /// Each gateway has an answer.
+    /// One request to each gateway.
     Query(QueryFn<'a>, Many),
-    /// It is for one gateway.
+    /// For one gateway.
     Follow(Follow<'a>),
-    /// It is for an inventory, also of one gateway.
+    /// For an inventory, even of one gateway.
     Through(Through<'a>),
 }
 
