@@ -286,13 +286,6 @@ impl Controller {
         }
     }
 
-    /// Whether nothing has happened since [`Self::poll_output`] returned [`ControllerOutput::Sleep`] except that
-    /// Modbus clients have read: its deadline still holds, and so does whatever was looked at. May be false without
-    /// need.
-    pub fn is_at_rest(&self, now: Instant) -> bool {
-        self.quiet.lasts(now)
-    }
-
     /// The registers, inputs and outputs.
     pub fn registers(&self) -> &Registers {
         &self.registers

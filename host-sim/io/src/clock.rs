@@ -89,15 +89,6 @@ impl Clock {
         matches!(&*self.0, ClockKind::Stepped(_))
     }
 
-    /// Its time, for any thread; `None` if it is stepped.
-    pub fn time(&self) -> Option<Time> {
-        match &*self.0 {
-            ClockKind::Real => Some(Time(None)),
-            ClockKind::Scaled(scale) => Some(Time(Some(*scale))),
-            ClockKind::Stepped(_) => None,
-        }
-    }
-
     /// Whether it shows another time than the machine.
     pub fn runs_apart(&self) -> bool {
         !matches!(&*self.0, ClockKind::Real)
@@ -145,20 +136,6 @@ impl Clock {
             }
         };
         Ok(Alarm { clock: self.clone(), armed: Cell::new(Instant::NEVER), waits })
-    }
-}
-
-/// The time of a clock that runs by itself.
-#[derive(Debug, Clone, Copy)]
-pub struct Time(Option<Scale>);
-
-impl Time {
-    /// The same as [`Clock::now`] of its clock.
-    pub fn now(self) -> Instant {
-        match self.0 {
-            None => timer::now(),
-            Some(scale) => scale.shown_at(timer::now()),
-        }
     }
 }
 
@@ -313,8 +290,6 @@ mod tests {
                 alarm.arm(deadline).unwrap();
                 alarm.expired().await.unwrap();
                 assert!(clock.now() >= deadline);
-                let (before, time, after) = (clock.now(), clock.time().unwrap().now(), clock.now());
-                assert!((before..=after).contains(&time));
                 let real = scale.real(deadline).saturating_since(scale.since).as_micros();
                 assert!((10_000..11_000).contains(&real) || real > 11_000 && factor < 1.0, "{real}");
                 assert!(scale.shown_at(scale.real(deadline)) + Duration::from_micros(1) >= deadline);

@@ -1,8 +1,6 @@
 //! The simulated controller on real sockets and devices.
 
 mod control;
-mod modbus;
-mod model;
 mod open;
 mod outward;
 mod playing;
@@ -15,7 +13,6 @@ use std::cell::{Cell, RefCell};
 use std::collections::{BTreeMap, VecDeque};
 use std::net::SocketAddr;
 use std::rc::Rc;
-use std::sync::Arc;
 
 use proto_core::engine::BusState;
 use proto_core::time::{Duration, Instant};
@@ -32,12 +29,10 @@ use super::tcp::{Accepted, Connection};
 use super::worker::RuntimePlace;
 use super::{EventsFile, RunOptions, StartError};
 use control::ControlClient;
-use modbus::Modbus;
-use model::Shared;
 use recipe_config::SimConfig;
 use recipe_controller::operations::Operation;
 use recipe_controller::timeline::Timeline;
-use recipe_controller::{ConnId, ControllerInput, ControllerOutput, Link};
+use recipe_controller::{ConnId, Controller, ControllerInput, ControllerOutput, Link};
 use recipe_io::bind::Bind;
 use recipe_io::clock::{Alarm, Clock};
 pub use recipe_io::clock::{MAX_FACTOR, MIN_FACTOR, Pace};
@@ -146,10 +141,7 @@ impl Runtime for Running {
 
 /// The controller, with its sockets and devices.
 struct ControllerShell {
-    controller: Arc<Shared>,
-    /// The Modbus connections have a thread of their own, except with a stepped clock, which has to know when none of
-    /// them has anything to do.
-    modbus: Option<Modbus>,
+    controller: RefCell<Controller>,
     connections: RefCell<BTreeMap<ConnId, Client>>,
     next_connection: Cell<u64>,
     udp: UdpSocket,
@@ -183,6 +175,7 @@ struct ControllerShell {
     control_clients: RefCell<Vec<Rc<ControlClient>>>,
     refused_control_clients: Cell<usize>,
     ended: Notify,
+    counters: Cell<ShellCounters>,
     refusal_log: LogLimit,
     log_limit: LogLimit,
 }
@@ -265,19 +258,11 @@ impl ControllerShell {
         }
     }
 
-    /// Carries out what the thread of the Modbus connections has left to do.
-    async fn follow_modbus(self: Rc<Self>) {
-        loop {
-            self.controller.changed().await;
-            self.drain(self.clock.now());
-        }
-    }
-
     /// Reports an event to the controller and carries out its outputs.
     fn input(&self, input: ControllerInput<'_>) {
         let now = self.clock.now();
         self.note_activity();
-        self.controller.lock().handle(now, input);
+        self.controller.borrow_mut().handle(now, input);
         self.drain(now);
     }
 
@@ -285,9 +270,9 @@ impl ControllerShell {
     fn operate(&self, operation: &Operation) -> Result<Value, String> {
         let now = self.clock.now();
         self.note_activity();
-        let done = self.controller.lock().operate(now, operation);
+        let done = self.controller.borrow_mut().operate(now, operation);
         self.drain(now);
-        done
+        done.map_err(|refused| refused.to_string())
     }
 
     fn note_activity(&self) {
@@ -300,7 +285,7 @@ impl ControllerShell {
             return;
         }
         let until = loop {
-            let output = self.controller.lock().poll_output(now);
+            let output = self.controller.borrow_mut().poll_output(now);
             if let ControllerOutput::Sleep { until } = output {
                 let Some(report) = self.reports.borrow_mut().pop_front() else { break until };
                 let input = match report {
@@ -308,7 +293,7 @@ impl ControllerShell {
                     Report::Unreachable(peer) => ControllerInput::Udp2011Unreachable { peer },
                     Report::Dropped(link, conn) => closed(link, conn),
                 };
-                self.controller.lock().handle(now, input);
+                self.controller.borrow_mut().handle(now, input);
             } else {
                 self.carry_out(output);
             }
@@ -320,14 +305,6 @@ impl ControllerShell {
         self.play();
         self.check_waits();
         self.tell_events();
-        self.watch();
-    }
-
-    /// Notes whether anybody has to hear of each change. Called before the changes that count are looked for.
-    fn watch(&self) {
-        let is_watched =
-            !self.waits.borrow().is_empty() || self.timeline.borrow().is_some() || self.tells_anybody();
-        self.controller.lock().watch(is_watched);
     }
 
     fn carry_out(&self, output: ControllerOutput) {
@@ -418,7 +395,9 @@ impl ControllerShell {
     }
 
     fn count(&self, change: impl FnOnce(&mut ShellCounters)) {
-        self.controller.count(change);
+        let mut counters = self.counters.get();
+        change(&mut counters);
+        self.counters.set(counters);
     }
 }
 

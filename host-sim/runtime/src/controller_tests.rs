@@ -120,12 +120,12 @@ fn a_state_client_that_reads_nothing_for_two_seconds_is_dropped_and_others_lose_
         };
         let patient = blocked_at + STATE_TIMEOUT - Duration::from_micros(1);
         shell.send_state(&packet, patient);
-        assert_eq!(shell.controller.counters().slow_clients, 0);
-        assert!(shell.controller.counters().skipped_state_packets > 0);
+        assert_eq!(shell.counters.get().slow_clients, 0);
+        assert!(shell.counters.get().skipped_state_packets > 0);
         shell.send_state(&packet, blocked_at + STATE_TIMEOUT);
         shell.drain(now());
-        assert_eq!(shell.controller.counters().slow_clients, 1);
-        assert_eq!(shell.controller.lock().counters().state.open, 1);
+        assert_eq!(shell.counters.get().slow_clients, 1);
+        assert_eq!(shell.controller.borrow().counters().state.open, 1);
         assert_eq!(shell.connections.borrow().len(), 1);
         for _ in 0..3 {
             good.read_exact(&mut whole).await.unwrap();
@@ -202,7 +202,7 @@ fn of_too_many_closed_connections_that_still_send_the_oldest_is_aborted() {
             shell.carry_out(ControllerOutput::Close { conn });
         }
         assert_eq!(shell.lingering.borrow().len(), MAX_LINGERING);
-        assert_eq!(shell.controller.counters().cut_answers, 3);
+        assert_eq!(shell.counters.get().cut_answers, 3);
         assert!(shell.connections.borrow().is_empty());
         // The others end when their peers close.
         drop(peers);

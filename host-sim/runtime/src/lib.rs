@@ -1,8 +1,7 @@
 //! The runtimes, which connect the engine and the simulated controller to sockets, devices and the clock.
 //!
-//! A runtime is one thread with a current-thread tokio runtime. It owns its sockets and devices, reports received data to
-//! the state machine, and executes its outputs. It does not know protocols. The simulated controller's
-//! Modbus connections have a thread beside it, which does the same for them.
+//! A runtime is one thread with a current-thread tokio runtime. It owns all its sockets and devices, reports received
+//! data to the state machine, and executes its outputs. It does not know protocols.
 
 pub mod cells;
 mod client;

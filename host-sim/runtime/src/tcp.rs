@@ -245,8 +245,8 @@ impl Connection {
 
 /// Maximum number of bytes per read, whose requests are executed before other tasks run: the longest
 /// Modbus request.
-pub(super) const CHUNK: usize = 260;
+const CHUNK: usize = 260;
 /// Maximum number of bytes that wait for a peer; more than the answers to the requests of one read.
-pub(super) const MAX_UNSENT: usize = 64 * 1_024;
+const MAX_UNSENT: usize = 64 * 1_024;
 /// How long a closed connection may take to send the rest.
-pub(super) const LINGER: std::time::Duration = std::time::Duration::from_secs(2);
+const LINGER: std::time::Duration = std::time::Duration::from_secs(2);

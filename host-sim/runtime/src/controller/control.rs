@@ -74,14 +74,9 @@ impl ControlClient {
         self.blocked_since.get()
     }
 
-    /// Whether it follows events.
-    pub(super) fn follows(&self) -> bool {
-        self.follows.borrow().is_some()
-    }
-
     /// Makes it write the events that it follows.
     pub(super) fn tell(&self) {
-        if self.follows() {
+        if self.follows.borrow().is_some() {
             self.wake.notify_one();
         }
     }
@@ -211,10 +206,8 @@ impl ControllerShell {
         match operation {
             Operation::Follow { kinds } => {
                 check_kinds(&kinds).map_err(|error| error.to_string())?;
-                let next = self.controller.lock().newest_event() + 1;
+                let next = self.controller.borrow().newest_event() + 1;
                 *client.follows.borrow_mut() = Some(Follow { kinds, next });
-                // Events since `next` are told below, also those that nobody watched.
-                self.watch();
                 Ok(Value::Null)
             }
             Operation::Advance { seconds } => self.advance_clock(seconds).await.map(|()| Value::Null),
@@ -226,7 +219,7 @@ impl ControllerShell {
     }
 
     fn answer(&self, id: Option<Value>, done: Result<Value, String>) -> Answer {
-        let time_s = self.controller.lock().time_s(self.clock.now());
+        let time_s = self.controller.borrow().time_s(self.clock.now());
         let (ok, result, error) = match done {
             Ok(result) => (true, Some(result), None),
             Err(error) => (false, None, Some(error)),
@@ -238,7 +231,7 @@ impl ControllerShell {
     fn push_events(&self, client: &ControlClient) {
         let mut follows = client.follows.borrow_mut();
         let Some(follow) = follows.as_mut() else { return };
-        let controller = self.controller.lock();
+        let controller = self.controller.borrow();
         let dropped = controller.dropped_events();
         if dropped >= follow.next {
             let kept = controller.events_since(follow.next).take_while(|event| event.number <= dropped);

@@ -9,8 +9,6 @@ use tokio::net::{TcpListener, UdpSocket};
 use tokio::sync::Notify;
 use tokio::task::JoinSet;
 
-use super::modbus::Modbus;
-use super::model::Shared;
 use super::{ControllerOptions, ControllerShell, Outward, Running};
 use crate::{EventsFile, StartError, udp};
 use recipe_config::{SimBus, SimConfig, SimParts};
@@ -66,10 +64,6 @@ impl Running {
         let alarm =
             || clock.alarm().map_err(|error| StartError::new(format!("cannot create a timer: {error}")));
         let (timer, timeline_alarm) = (alarm()?, alarm()?);
-        let controller = Shared::new(controller)
-            .map_err(|error| StartError::new(format!("cannot share the controller: {error}")))?;
-        let modbus_thread = clock.time().map(|time| Modbus::start(&controller, time, options.run.scheduling));
-        let modbus_thread = modbus_thread.transpose()?;
         // The last that can fail: an earlier run's file is kept if this one cannot start.
         let events_file = options.events.as_ref().map(EventsFile::create).transpose()?;
         let ready = json!({
@@ -81,8 +75,7 @@ impl Running {
             "ports": places,
         });
         let shell = Rc::new(ControllerShell {
-            controller,
-            modbus: modbus_thread,
+            controller: RefCell::new(controller),
             connections: RefCell::default(),
             next_connection: Cell::new(0),
             udp,
@@ -106,6 +99,7 @@ impl Running {
             control_clients: RefCell::default(),
             refused_control_clients: Cell::new(0),
             ended: Notify::new(),
+            counters: Cell::default(),
             refusal_log: LogLimit::default(),
             log_limit: LogLimit::default(),
         });
@@ -115,7 +109,6 @@ impl Running {
         tasks.spawn_local(Rc::clone(&shell).serve(Link::Modbus, modbus));
         tasks.spawn_local(Rc::clone(&shell).serve_udp());
         tasks.spawn_local(Rc::clone(&shell).serve_control(control));
-        tasks.spawn_local(Rc::clone(&shell).follow_modbus());
         tasks.spawn_local(Rc::clone(&shell).keep_time());
         tasks.spawn_local(Rc::clone(&shell).keep_timeline());
         if shell.clock.is_stepped() {

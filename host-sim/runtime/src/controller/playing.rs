@@ -18,7 +18,7 @@ impl ControllerShell {
         let deadline = loop {
             let now = self.clock.now();
             let next = self.timeline.borrow_mut().as_mut().and_then(|timeline| {
-                timeline.observe(now, &self.controller.lock());
+                timeline.observe(now, &self.controller.borrow());
                 timeline.due(now)
             });
             let Some((step, operation)) = next else {
@@ -26,7 +26,7 @@ impl ControllerShell {
             };
             if let Err(error) = self.operate(&operation) {
                 warn!(step, %error, "a step of the timeline was refused");
-                self.controller.lock().note_refused(now, &operation, &error);
+                self.controller.borrow_mut().note_refused(self.clock.now(), &operation, &error);
             }
         };
         self.is_playing.set(false);

@@ -44,10 +44,6 @@ impl ControllerShell {
             Link::Command | Link::Modbus => tcp_options::set_user_timeout(&stream, ANSWER_TIMEOUT),
         }
         tcp_options::enable_keepalive(&stream);
-        if link == Link::Modbus && self.modbus.is_some() {
-            self.hand_over(conn, stream, peer);
-            return;
-        }
         let (connection, read) = Connection::split(stream);
         let client = Client { link, connection: Rc::clone(&connection), subscribed: false };
         self.connections.borrow_mut().insert(conn, client);
@@ -62,7 +58,9 @@ impl ControllerShell {
             client.subscribed = link == Link::State;
         }
         if connection.is_closed() {
-            self.note_refusal(link, peer);
+            if let Some(more) = self.refusal_log.allow(now()) {
+                warn!(?link, %peer, more, "refused");
+            }
             return;
         }
         info!(?link, %peer, conn = conn.0, "connected");
@@ -89,25 +87,6 @@ impl ControllerShell {
                 shell.input(closed(link, conn));
             }
         });
-    }
-
-    /// Lets the other thread have a Modbus connection, unless the controller refuses it.
-    fn hand_over(&self, conn: ConnId, stream: TcpStream, peer: SocketAddr) {
-        let stream = match stream.into_std() {
-            Ok(stream) => stream,
-            Err(error) => return debug!(%peer, %error, "cannot be handed over"),
-        };
-        self.controller.lock().expect_modbus(conn);
-        self.input(ControllerInput::ModbusOpened { conn, from: peer.ip().to_canonical() });
-        if !self.controller.lock().open_modbus(conn, stream, peer) {
-            self.note_refusal(Link::Modbus, peer);
-        }
-    }
-
-    fn note_refusal(&self, link: Link, peer: SocketAddr) {
-        if let Some(more) = self.refusal_log.allow(now()) {
-            warn!(?link, %peer, more, "refused");
-        }
     }
 
     /// Receives the datagrams of port 2011, and the errors of datagrams that were sent.
@@ -155,3 +134,7 @@ const STATE_BUFFER: usize = 16 * 1_024;
 const ANSWER_TIMEOUT: StdDuration = StdDuration::from_secs(30);
 /// Number of datagrams before other tasks run.
 pub(super) const DATAGRAMS_AT_ONCE: u64 = 16;
+
+#[cfg(test)]
+#[path = "servers_tests.rs"]
+mod tests;

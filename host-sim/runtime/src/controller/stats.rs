@@ -9,7 +9,7 @@ use super::{ControllerShell, Outward};
 impl ControllerShell {
     /// One line of statistics.
     pub(super) fn stats(&self) -> Value {
-        let controller = self.controller.lock();
+        let controller = self.controller.borrow();
         let machine = controller.machine();
         let registers: serde_json::Map<_, _> = SysVar::all()
             .map(|var| (var, controller.registers().var(var)))
@@ -26,7 +26,7 @@ impl ControllerShell {
                 }
             }
             stats.insert("time_us".to_owned(), json!(self.clock.now().as_micros()));
-            stats.insert("connections".to_owned(), json!(self.controller.counters()));
+            stats.insert("connections".to_owned(), json!(self.counters.get()));
             stats.insert("mode".to_owned(), json!(machine.mode().code()));
             stats.insert("robot".to_owned(), json!(machine.robot().code()));
             stats.insert("program_state".to_owned(), json!(machine.program().code()));

@@ -42,8 +42,8 @@ impl ControllerShell {
     /// Waits until the condition holds; a stepped clock moves meanwhile.
     pub(super) async fn wait_for(&self, condition: Condition, timeout_s: f64) -> Result<(), String> {
         let until = self.clock.now() + time("timeout_s", timeout_s).map_err(|refused| refused.0)?;
-        let since = self.controller.lock().newest_event() + 1;
-        let holds = self.controller.lock().holds(&condition, since);
+        let since = self.controller.borrow().newest_event() + 1;
+        let holds = self.controller.borrow().holds(&condition, since);
         match holds.map_err(|error| error.to_string())? {
             true if !self.clock.is_stepped() => Ok(()),
             _ => self.await_turn(until, timeout_s, Some((condition, since))).await,
@@ -59,7 +59,6 @@ impl ControllerShell {
         let alarm = self.clock.alarm().map_err(|error| format!("cannot create a timer: {error}"))?;
         let (answer, mut answered) = oneshot::channel();
         self.waits.borrow_mut().push(Waiting { until, timeout_s, condition, held: false, answer });
-        self.watch();
         self.check_waits();
         let over = || Err("the controller ends".to_owned());
         if self.clock.is_stepped() {
@@ -81,7 +80,7 @@ impl ControllerShell {
         if self.waits.borrow().is_empty() {
             return;
         }
-        let controller = self.controller.lock();
+        let controller = self.controller.borrow();
         let mut any = false;
         for waiting in self.waits.borrow_mut().iter_mut().filter(|waiting| !waiting.held) {
             let condition = waiting.condition.as_ref();
@@ -103,7 +102,7 @@ impl ControllerShell {
         for waiting in waits.extract_if(.., |waiting| waiting.held || waiting.until <= now) {
             let answer = match &waiting.condition {
                 Some((condition, since)) if !waiting.held => {
-                    let unmet = self.controller.lock().unmet(condition, *since).join("; ");
+                    let unmet = self.controller.borrow().unmet(condition, *since).join("; ");
                     Err(format!("not within {} s: {unmet}", waiting.timeout_s))
                 }
                 _ => Ok(()),

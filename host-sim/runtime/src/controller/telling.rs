@@ -6,19 +6,12 @@ use super::ControllerShell;
 use recipe_controller::Happened;
 
 impl ControllerShell {
-    /// Whether events are told to anybody: in the log, in the file or to a client that follows.
-    pub(super) fn tells_anybody(&self) -> bool {
-        enabled!(target: "controller", Level::INFO)
-            || self.events_file.is_some()
-            || self.control_clients.borrow().iter().any(|client| client.follows())
-    }
-
     /// Tells the events since the last call.
     pub(super) fn tell_events(&self) {
         for client in self.control_clients.borrow().iter() {
             client.tell();
         }
-        let controller = self.controller.lock();
+        let controller = self.controller.borrow();
         let newest = controller.newest_event();
         let told = self.told.replace(newest);
         if newest == told {
