@@ -109,7 +109,7 @@ fn spawn(config: SimConfig, options: ControllerOptions) -> Result<Handle, StartE
 
 /// A controller whose tasks have been created.
 struct Running {
-    shell: Rc<ControllerShell>,
+    runtime: Rc<ControllerRuntime>,
     tasks: JoinSet<()>,
     ready: Value,
 }
@@ -120,14 +120,14 @@ impl Runtime for Running {
     }
 
     fn stats(&self) -> impl Fn() -> Value + 'static {
-        let shell = Rc::clone(&self.shell);
-        move || shell.stats()
+        let runtime = Rc::clone(&self.runtime);
+        move || runtime.stats()
     }
 
     async fn run(mut self) -> Result<(), StartError> {
         loop {
             tokio::select! {
-                () = self.shell.ended.notified() => {
+                () = self.runtime.ended.notified() => {
                     info!("shut down");
                     return Ok(());
                 }
@@ -140,7 +140,7 @@ impl Runtime for Running {
 }
 
 /// The controller, with its sockets and devices.
-struct ControllerShell {
+struct ControllerRuntime {
     controller: RefCell<Controller>,
     connections: RefCell<BTreeMap<ConnId, Client>>,
     next_connection: Cell<u64>,
@@ -175,7 +175,7 @@ struct ControllerShell {
     control_clients: RefCell<Vec<Rc<ControlClient>>>,
     refused_control_clients: Cell<usize>,
     ended: Notify,
-    counters: Cell<ShellCounters>,
+    counters: Cell<RuntimeCounters>,
     refusal_log: LogLimit,
     log_limit: LogLimit,
 }
@@ -192,7 +192,7 @@ struct Client {
 enum Outward {
     /// A serial or CAN device.
     Device(Rc<PortTx>),
-    /// The UDP server; its socket is in [`ControllerShell`].
+    /// The UDP server; its socket is in [`ControllerRuntime`].
     UdpServer,
     /// A TCP client, while it is connected.
     Tcp(RefCell<Option<Rc<Connection>>>),
@@ -207,9 +207,9 @@ enum Report {
     Dropped(Link, ConnId),
 }
 
-/// Counters of the shell itself.
+/// Counters of the runtime itself.
 #[derive(Debug, Clone, Copy, Default, serde::Serialize)]
-struct ShellCounters {
+struct RuntimeCounters {
     /// Connections closed because the peer did not read.
     slow_clients: u64,
     /// State packets not sent to a connection because the one before was still waiting.
@@ -222,7 +222,7 @@ struct ShellCounters {
     accept_failures: u64,
 }
 
-impl ControllerShell {
+impl ControllerRuntime {
     /// Runs a port's device and reports its events to the controller.
     async fn drive(self: Rc<Self>, port: usize, device: Port) {
         let is_kernel_can = device.is_kernel_can();
@@ -394,7 +394,7 @@ impl ControllerShell {
         }
     }
 
-    fn count(&self, change: impl FnOnce(&mut ShellCounters)) {
+    fn count(&self, change: impl FnOnce(&mut RuntimeCounters)) {
         let mut counters = self.counters.get();
         change(&mut counters);
         self.counters.set(counters);

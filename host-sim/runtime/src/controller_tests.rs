@@ -1,4 +1,4 @@
-//! The simulated controller on real sockets: what the shell adds to the state machine, and what it refuses.
+//! The simulated controller on real sockets: what the runtime adds to the state machine, and what it refuses.
 
 use std::io::{Read, Write};
 use std::net::{TcpListener as StdListener, TcpStream as StdStream, UdpSocket as StdUdp};
@@ -60,14 +60,14 @@ fn is_closed(stream: &mut StdStream) -> bool {
 }
 
 /// Runs a test in the controller's own runtime, with access to its state.
-fn inside(config: SimConfig, test: impl AsyncFnOnce(&Rc<ControllerShell>, &Value)) {
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-    LocalSet::new().block_on(&runtime, async {
+fn inside(config: SimConfig, test: impl AsyncFnOnce(&Rc<ControllerRuntime>, &Value)) {
+    let executor = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    LocalSet::new().block_on(&executor, async {
         let running = Running::open(config, ControllerOptions::default()).await.unwrap();
-        let (shell, ready) = (Rc::clone(&running.shell), running.ready.clone());
+        let (runtime, ready) = (Rc::clone(&running.runtime), running.ready.clone());
         tokio::select! {
             ended = running.run() => panic!("{ended:?}"),
-            () = test(&shell, &ready) => {}
+            () = test(&runtime, &ready) => {}
             () = tokio::time::sleep(PATIENCE) => panic!("the test hangs"),
         }
     });
@@ -100,7 +100,7 @@ fn the_two_example_ports_of_the_controller_answer() {
 
 #[test]
 fn a_state_client_that_reads_nothing_for_two_seconds_is_dropped_and_others_lose_nothing() {
-    inside(example("udp-server-controller.toml", &[]), async |shell, ready| {
+    inside(example("udp-server-controller.toml", &[]), async |runtime, ready| {
         let at: SocketAddr = ready["state"].as_str().unwrap().parse().unwrap();
         let slow = TcpSocket::new_v4().unwrap();
         slow.set_recv_buffer_size(4_096).unwrap();
@@ -112,21 +112,21 @@ fn a_state_client_that_reads_nothing_for_two_seconds_is_dropped_and_others_lose_
         let blocked_at = loop {
             good.read_exact(&mut whole).await.unwrap();
             let slow =
-                shell.connections.borrow().values().find_map(|client| client.connection.blocked_since());
+                runtime.connections.borrow().values().find_map(|client| client.connection.blocked_since());
             if let Some(since) = slow {
                 break since;
             }
-            shell.send_state(&packet, now());
+            runtime.send_state(&packet, now());
         };
         let patient = blocked_at + STATE_TIMEOUT - Duration::from_micros(1);
-        shell.send_state(&packet, patient);
-        assert_eq!(shell.counters.get().slow_clients, 0);
-        assert!(shell.counters.get().skipped_state_packets > 0);
-        shell.send_state(&packet, blocked_at + STATE_TIMEOUT);
-        shell.drain(now());
-        assert_eq!(shell.counters.get().slow_clients, 1);
-        assert_eq!(shell.controller.borrow().counters().state.open, 1);
-        assert_eq!(shell.connections.borrow().len(), 1);
+        runtime.send_state(&packet, patient);
+        assert_eq!(runtime.counters.get().slow_clients, 0);
+        assert!(runtime.counters.get().skipped_state_packets > 0);
+        runtime.send_state(&packet, blocked_at + STATE_TIMEOUT);
+        runtime.drain(now());
+        assert_eq!(runtime.counters.get().slow_clients, 1);
+        assert_eq!(runtime.controller.borrow().counters().state.open, 1);
+        assert_eq!(runtime.connections.borrow().len(), 1);
         for _ in 0..3 {
             good.read_exact(&mut whole).await.unwrap();
         }
@@ -183,7 +183,7 @@ fn a_client_that_does_not_read_answers_is_not_read_and_loses_nothing() {
 
 #[test]
 fn of_too_many_closed_connections_that_still_send_the_oldest_is_aborted() {
-    inside(example("udp-server-controller.toml", &[]), async |shell, ready| {
+    inside(example("udp-server-controller.toml", &[]), async |runtime, ready| {
         let at: SocketAddr = ready["command"].as_str().unwrap().parse().unwrap();
         let mut peers = Vec::new();
         for _ in 0..MAX_LINGERING + 3 {
@@ -191,22 +191,22 @@ fn of_too_many_closed_connections_that_still_send_the_oldest_is_aborted() {
             peer.set_recv_buffer_size(4_096).unwrap();
             peers.push(peer.connect(at).await.unwrap());
         }
-        while shell.connections.borrow().len() < peers.len() {
+        while runtime.connections.borrow().len() < peers.len() {
             tokio::task::yield_now().await;
         }
-        let conns: Vec<_> = shell.connections.borrow().keys().copied().collect();
+        let conns: Vec<_> = runtime.connections.borrow().keys().copied().collect();
         for &conn in &conns {
             // Unread answers, until some wait in this process.
-            let connection = Rc::clone(&shell.connections.borrow()[&conn].connection);
+            let connection = Rc::clone(&runtime.connections.borrow()[&conn].connection);
             while connection.send(&[0; 4_096]) == Accepted::All {}
-            shell.carry_out(ControllerOutput::Close { conn });
+            runtime.carry_out(ControllerOutput::Close { conn });
         }
-        assert_eq!(shell.lingering.borrow().len(), MAX_LINGERING);
-        assert_eq!(shell.counters.get().cut_answers, 3);
-        assert!(shell.connections.borrow().is_empty());
+        assert_eq!(runtime.lingering.borrow().len(), MAX_LINGERING);
+        assert_eq!(runtime.counters.get().cut_answers, 3);
+        assert!(runtime.connections.borrow().is_empty());
         // The others end when their peers close.
         drop(peers);
-        while !shell.lingering.borrow().is_empty() {
+        while !runtime.lingering.borrow().is_empty() {
             tokio::task::yield_now().await;
         }
     });

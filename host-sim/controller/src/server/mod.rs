@@ -1,7 +1,7 @@
 //! The controller's TCP servers and its UDP server (docs/simulated-controller.md section 5).
 //!
 //! The number of connections is bounded; one more is closed at once and counted. An answer is handed over as
-//! a whole; the shell sends it as fast as the connection takes it.
+//! a whole; the runtime sends it as fast as the connection takes it.
 
 mod commands;
 mod room;

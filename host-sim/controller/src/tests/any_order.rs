@@ -222,7 +222,7 @@ fn act(cell: &mut TestController, step: Step) {
                 }
             }
         }
-        // As a shell that the system has not let run.
+        // As a runtime that the system has not let run.
         Step::Late(micros) => cell.now += Duration::from_micros(micros),
         Step::Read(nth, address, count) => {
             let request = [0, 7, 0, 0, 0, 6, 1, 3, 0, address, 0, count];

@@ -34,7 +34,7 @@ use recipe_config::{
     SimStreamPart,
 };
 
-/// A shell may keep it in a task of any runtime.
+/// The runtime may keep it in any task.
 const _: fn() = || {
     fn is_send<T: Send>() {}
     is_send::<Controller>();

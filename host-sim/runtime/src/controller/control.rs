@@ -18,7 +18,7 @@ use tokio::sync::Notify;
 use tokio::task::spawn_local;
 use tracing::{debug, warn};
 
-use super::ControllerShell;
+use super::ControllerRuntime;
 use recipe_controller::Event;
 use recipe_controller::operations::{Operation, check_kinds};
 use recipe_io::fairness::yield_fairly;
@@ -93,7 +93,7 @@ impl ControlClient {
     }
 }
 
-impl ControllerShell {
+impl ControllerRuntime {
     /// Accepts the clients of the control socket.
     pub(super) async fn serve_control(self: Rc<Self>, listener: TcpListener) {
         loop {

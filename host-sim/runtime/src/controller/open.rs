@@ -9,7 +9,7 @@ use tokio::net::{TcpListener, UdpSocket};
 use tokio::sync::Notify;
 use tokio::task::JoinSet;
 
-use super::{ControllerOptions, ControllerShell, Outward, Running};
+use super::{ControllerOptions, ControllerRuntime, Outward, Running};
 use crate::{EventsFile, StartError, udp};
 use recipe_config::{SimBus, SimConfig, SimParts};
 use recipe_controller::{Controller, ControllerInput, Link};
@@ -74,7 +74,7 @@ impl Running {
             "control": control_at,
             "ports": places,
         });
-        let shell = Rc::new(ControllerShell {
+        let runtime = Rc::new(ControllerRuntime {
             controller: RefCell::new(controller),
             connections: RefCell::default(),
             next_connection: Cell::new(0),
@@ -104,27 +104,27 @@ impl Running {
             log_limit: LogLimit::default(),
         });
         let mut tasks = JoinSet::new();
-        tasks.spawn_local(Rc::clone(&shell).serve(Link::Command, command));
-        tasks.spawn_local(Rc::clone(&shell).serve(Link::State, state));
-        tasks.spawn_local(Rc::clone(&shell).serve(Link::Modbus, modbus));
-        tasks.spawn_local(Rc::clone(&shell).serve_udp());
-        tasks.spawn_local(Rc::clone(&shell).serve_control(control));
-        tasks.spawn_local(Rc::clone(&shell).keep_time());
-        tasks.spawn_local(Rc::clone(&shell).keep_timeline());
-        if shell.clock.is_stepped() {
-            tasks.spawn_local(Rc::clone(&shell).keep_stepping());
+        tasks.spawn_local(Rc::clone(&runtime).serve(Link::Command, command));
+        tasks.spawn_local(Rc::clone(&runtime).serve(Link::State, state));
+        tasks.spawn_local(Rc::clone(&runtime).serve(Link::Modbus, modbus));
+        tasks.spawn_local(Rc::clone(&runtime).serve_udp());
+        tasks.spawn_local(Rc::clone(&runtime).serve_control(control));
+        tasks.spawn_local(Rc::clone(&runtime).keep_time());
+        tasks.spawn_local(Rc::clone(&runtime).keep_timeline());
+        if runtime.clock.is_stepped() {
+            tasks.spawn_local(Rc::clone(&runtime).keep_stepping());
         }
         for (index, (port, device)) in config.ports.into_iter().zip(devices).enumerate() {
-            let shell = Rc::clone(&shell);
+            let runtime = Rc::clone(&runtime);
             match (port.bus, device) {
-                (_, Some(device)) => drop(tasks.spawn_local(shell.drive(index, device))),
-                (SimBus::TcpClient { to }, _) => drop(tasks.spawn_local(shell.connect_out(index, to))),
-                (SimBus::UdpClient { to }, _) => drop(tasks.spawn_local(shell.send_out(index, to))),
+                (_, Some(device)) => drop(tasks.spawn_local(runtime.drive(index, device))),
+                (SimBus::TcpClient { to }, _) => drop(tasks.spawn_local(runtime.connect_out(index, to))),
+                (SimBus::UdpClient { to }, _) => drop(tasks.spawn_local(runtime.send_out(index, to))),
                 _ => {}
             }
         }
-        shell.input(ControllerInput::Tick);
-        Ok(Self { shell, tasks, ready })
+        runtime.input(ControllerInput::Tick);
+        Ok(Self { runtime, tasks, ready })
     }
 }
 

@@ -8,7 +8,7 @@ use tokio::net::UdpSocket;
 use tracing::{debug, info};
 
 use super::servers::DATAGRAMS_AT_ONCE;
-use super::{ControllerShell, Outward, Report};
+use super::{ControllerRuntime, Outward, Report};
 use crate::tcp::{Accepted, Connection, Event};
 use recipe_controller::ControllerInput;
 use recipe_io::backoff::Backoff;
@@ -16,7 +16,7 @@ use recipe_io::connect::connect;
 use recipe_io::fairness::yield_fairly;
 use recipe_io::tcp_options;
 
-impl ControllerShell {
+impl ControllerRuntime {
     /// Sends on a port. Data that the socket accepts at once counts as sent.
     pub(super) fn send_port(&self, port: usize, bytes: &[u8]) {
         let sent = match self.ports.get(port) {
@@ -113,10 +113,10 @@ async fn connected(to: &str) -> io::Result<UdpSocket> {
     Err(last)
 }
 
-fn send_datagram(shell: &ControllerShell, socket: &UdpSocket, bytes: &[u8]) {
+fn send_datagram(runtime: &ControllerRuntime, socket: &UdpSocket, bytes: &[u8]) {
     // One call fails with the error of an earlier datagram.
     if socket.try_send(bytes).or_else(|_| socket.try_send(bytes)).is_err() {
-        shell.count(|counters| counters.dropped_datagrams += 1);
+        runtime.count(|counters| counters.dropped_datagrams += 1);
     }
 }
 

@@ -5,10 +5,10 @@ use std::rc::Rc;
 use proto_core::time::Instant;
 use tracing::{error, warn};
 
-use super::ControllerShell;
+use super::ControllerRuntime;
 use recipe_controller::ControllerInput;
 
-impl ControllerShell {
+impl ControllerRuntime {
     /// Does the steps that are due, after each change of the controller.
     pub(super) fn play(&self) {
         // A step that is being done changes the controller too.

@@ -10,7 +10,7 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::task::spawn_local;
 use tracing::{debug, info, warn};
 
-use super::{Client, ControllerShell, Report, closed};
+use super::{Client, ControllerRuntime, Report, closed};
 use crate::tcp::{Connection, Event};
 use crate::udp;
 use recipe_controller::{ConnId, ControllerInput, Link};
@@ -18,7 +18,7 @@ use recipe_io::fairness::yield_fairly;
 use recipe_io::tcp_options;
 use recipe_io::timer::now;
 
-impl ControllerShell {
+impl ControllerRuntime {
     /// Accepts the connections of one TCP server.
     pub(super) async fn serve(self: Rc<Self>, link: Link, listener: TcpListener) {
         tcp_options::limit_buffers(&listener);
@@ -64,7 +64,7 @@ impl ControllerShell {
             return;
         }
         info!(?link, %peer, conn = conn.0, "connected");
-        let shell = Rc::clone(self);
+        let runtime = Rc::clone(self);
         spawn_local(async move {
             let ended = connection.run(read, |event| {
                 // After a close, nothing more is reported.
@@ -72,19 +72,19 @@ impl ControllerShell {
                     && !connection.is_closed()
                 {
                     match link {
-                        Link::Command => shell.input(ControllerInput::CommandBytes { conn, bytes }),
-                        Link::Modbus => shell.input(ControllerInput::ModbusBytes { conn, bytes }),
+                        Link::Command => runtime.input(ControllerInput::CommandBytes { conn, bytes }),
+                        Link::Modbus => runtime.input(ControllerInput::ModbusBytes { conn, bytes }),
                         // Port 2001 reads nothing.
                         Link::State => {}
                     }
                 }
             });
             let ended = ended.await;
-            shell.lingering.borrow_mut().retain(|other| !Rc::ptr_eq(other, &connection));
+            runtime.lingering.borrow_mut().retain(|other| !Rc::ptr_eq(other, &connection));
             debug!(?link, %peer, conn = conn.0, ?ended, "disconnected");
-            let known = shell.connections.borrow_mut().remove(&conn).is_some();
+            let known = runtime.connections.borrow_mut().remove(&conn).is_some();
             if known {
-                shell.input(closed(link, conn));
+                runtime.input(closed(link, conn));
             }
         });
     }

@@ -16,18 +16,18 @@ use recipe_controller::operations::Operation;
 use recipe_test_kit::{PATIENCE, SERVERS};
 
 /// Runs a test beside a controller, with its Modbus address.
-fn beside(test: impl AsyncFnOnce(&Rc<ControllerShell>, SocketAddr)) {
+fn beside(test: impl AsyncFnOnce(&Rc<ControllerRuntime>, SocketAddr)) {
     let free = SERVERS.map(|server| format!("listen.{server}=0"));
     // Without a port, which would have deadlines of its own.
     let config = parse_controller(Text { name: "controller", toml: "" }, &free).unwrap();
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-    LocalSet::new().block_on(&runtime, async {
+    let executor = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    LocalSet::new().block_on(&executor, async {
         let running = Running::open(config, ControllerOptions::default()).await.unwrap();
-        let (shell, ready) = (Rc::clone(&running.shell), running.ready.clone());
+        let (runtime, ready) = (Rc::clone(&running.runtime), running.ready.clone());
         let at = ready["modbus"].as_str().unwrap().parse().unwrap();
         tokio::select! {
             ended = running.run() => panic!("{ended:?}"),
-            () = test(&shell, at) => {}
+            () = test(&runtime, at) => {}
             () = tokio::time::sleep(PATIENCE) => panic!("the test hangs"),
         }
     });
@@ -67,7 +67,7 @@ fn write_coil(transaction: u8, is_on: bool) -> [u8; 12] {
 
 #[test]
 fn who_waits_hears_of_it_when_a_client_writes() {
-    beside(async |shell, at| {
+    beside(async |runtime, at| {
         let mut client = connect(at);
         let Operation::Wait { until, .. } =
             operation(json!({ "do": "wait", "until": { "event": { "event": "write", "by": "modbus" } } }))
@@ -81,16 +81,16 @@ fn who_waits_hears_of_it_when_a_client_writes() {
             assert_eq!(read(&mut client, 12).await, write_coil(1, true));
         };
         // Nothing else happens at the controller.
-        let (held, ()) = tokio::join!(shell.wait_for(until, PATIENCE.as_secs_f64() / 2.0), write);
+        let (held, ()) = tokio::join!(runtime.wait_for(until, PATIENCE.as_secs_f64() / 2.0), write);
         held.unwrap();
     });
 }
 
 #[test]
 fn a_deadline_that_a_request_brings_is_kept() {
-    beside(async |shell, at| {
+    beside(async |runtime, at| {
         let mut client = connect(at);
-        shell
+        runtime
             .operate(&operation(
                 json!({ "do": "fault", "server": "modbus", "kind": "delay", "seconds": 0.05 }),
             ))
@@ -103,18 +103,18 @@ fn a_deadline_that_a_request_brings_is_kept() {
 
 #[test]
 fn answers_that_were_delayed_come_before_those_of_later_requests() {
-    beside(async |shell, at| {
+    beside(async |runtime, at| {
         let mut client = connect(at);
-        shell
+        runtime
             .operate(&operation(
                 json!({ "do": "fault", "server": "modbus", "kind": "delay", "seconds": 0.1 }),
             ))
             .unwrap();
         client.write_all(&write_coil(1, true)).unwrap();
-        while shell.controller.borrow().counters().modbus.requests == 0 {
+        while runtime.controller.borrow().counters().modbus.requests == 0 {
             yield_now().await;
         }
-        shell.operate(&operation(json!({ "do": "heal", "server": "modbus" }))).unwrap();
+        runtime.operate(&operation(json!({ "do": "heal", "server": "modbus" }))).unwrap();
         client.write_all(&write_coil(2, false)).unwrap();
         let answers = read(&mut client, 24).await;
         assert_eq!(answers, [write_coil(1, true), write_coil(2, false)].concat());
@@ -123,7 +123,7 @@ fn answers_that_were_delayed_come_before_those_of_later_requests() {
 
 #[test]
 fn of_too_many_closed_connections_that_still_send_the_oldest_is_cut() {
-    beside(async |shell, at| {
+    beside(async |runtime, at| {
         // The server limits the buffers of connections as soon as it runs.
         yield_now().await;
         let mut peers = Vec::new();
@@ -138,19 +138,19 @@ fn of_too_many_closed_connections_that_still_send_the_oldest_is_cut() {
             peer.writable().await.unwrap();
             peer.try_write(&requests).unwrap();
         }
-        let requests = || shell.controller.borrow().counters().modbus.requests;
+        let requests = || runtime.controller.borrow().counters().modbus.requests;
         let mut before = 0;
         while before == 0 || before != requests() {
             before = requests();
             tokio::time::sleep(std::time::Duration::from_millis(100)).await;
         }
         let close = operation(json!({ "do": "fault", "server": "modbus", "kind": "disconnect" }));
-        shell.operate(&close).unwrap();
-        while shell.counters.get().cut_answers < 3 {
+        runtime.operate(&close).unwrap();
+        while runtime.counters.get().cut_answers < 3 {
             yield_now().await;
         }
-        assert_eq!(shell.counters.get().cut_answers, 3);
-        assert_eq!(shell.controller.borrow().counters().modbus.open, 0);
+        assert_eq!(runtime.counters.get().cut_answers, 3);
+        assert_eq!(runtime.controller.borrow().counters().modbus.open, 0);
     });
 }
 

@@ -4,9 +4,9 @@ use proto_core::sysvar::SysVar;
 use proto_core::wire::scalar::Scalar;
 use serde_json::{Value, json};
 
-use super::{ControllerShell, Outward};
+use super::{ControllerRuntime, Outward};
 
-impl ControllerShell {
+impl ControllerRuntime {
     /// One line of statistics.
     pub(super) fn stats(&self) -> Value {
         let controller = self.controller.borrow();

@@ -11,7 +11,7 @@ use tokio::sync::oneshot;
 use tokio::task::yield_now;
 use tracing::warn;
 
-use super::{ControllerShell, Outward};
+use super::{ControllerRuntime, Outward};
 use recipe_controller::Condition;
 use recipe_controller::operations::time;
 use recipe_io::fairness::is_anyone_busy;
@@ -29,7 +29,7 @@ pub(super) struct Waiting {
     answer: oneshot::Sender<Result<(), String>>,
 }
 
-impl ControllerShell {
+impl ControllerRuntime {
     /// Moves a stepped clock by this time; returns when it is there and everything is handled.
     pub(super) async fn advance_clock(&self, seconds: f64) -> Result<(), String> {
         if !self.clock.is_stepped() {

@@ -2,10 +2,10 @@
 
 use tracing::{Level, enabled, info, trace};
 
-use super::ControllerShell;
+use super::ControllerRuntime;
 use recipe_controller::Happened;
 
-impl ControllerShell {
+impl ControllerRuntime {
     /// Tells the events since the last call.
     pub(super) fn tell_events(&self) {
         for client in self.control_clients.borrow().iter() {
