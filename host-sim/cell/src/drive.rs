@@ -137,7 +137,7 @@ impl Cell {
         #[cfg(test)]
         let forged = self.forged_input(&input);
         #[cfg(test)]
-        let given = super::tamper::instead(&input, forged.as_deref());
+        let given = super::corruption::instead(&input, forged.as_deref());
         #[cfg(not(test))]
         let given = input;
         self.engine.handle(now, given);

@@ -28,11 +28,14 @@
 mod access;
 mod can;
 mod connection;
+#[cfg(test)]
+mod corruption;
 mod device;
 mod drive;
 mod due;
 mod faults;
 mod field;
+mod floats;
 mod injector;
 mod judge;
 mod line;
@@ -44,10 +47,7 @@ mod rng;
 mod rtu;
 mod sleep;
 pub mod soak;
-mod spoil;
 mod survey;
-#[cfg(test)]
-mod tamper;
 mod tcp;
 mod tcp_device;
 mod trace;
@@ -177,7 +177,7 @@ pub struct Cell {
     judge: Option<Box<judge::Judge>>,
     /// Changes the engine's inputs and outputs, so that the gateway breaks its promises.
     #[cfg(test)]
-    tamper: Option<tamper::Tamper>,
+    corruption: Option<corruption::Corruption>,
     /// What the controller has sent on the connection of [`Cell::send_command`].
     reply: Vec<u8>,
     /// Number of bytes that are missing at the start of the next state packet.
@@ -247,7 +247,7 @@ impl Cell {
             oracle: None,
             judge: None,
             #[cfg(test)]
-            tamper: None,
+            corruption: None,
             reply: Vec::new(),
             state_bytes_lost: 0,
         };

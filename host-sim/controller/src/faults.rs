@@ -9,11 +9,11 @@ use proto_core::wire::state::{LEN, OperationMode};
 use serde::{Deserialize, Serialize};
 
 use super::build::{mode, start_values};
+use super::corrupted::{Corrupted, NoSuchFloat};
 use super::events::Happened;
 use super::machine::{Machine, SafetyHold};
 use super::random::Random;
 use super::registers::SetError;
-use super::spoiled::{NoSuchFloat, Spoiled};
 use super::{Controller, ControllerOutput, RecipeError};
 pub use recipe_config::CommandClients;
 use recipe_config::InitialTarget;
@@ -56,7 +56,7 @@ pub(super) struct Faults {
     random: Random,
     /// Additional time of transitions that commands begin.
     transitions: Duration,
-    spoiled: Spoiled,
+    corrupted: Corrupted,
 }
 
 impl Faults {
@@ -89,8 +89,8 @@ impl Faults {
         self.exception
     }
 
-    pub(super) fn spoiled(&self) -> &Spoiled {
-        &self.spoiled
+    pub(super) fn corrupted(&self) -> &Corrupted {
+        &self.corrupted
     }
 
     pub(super) fn is_garbage(&self, link: Link) -> bool {
@@ -102,7 +102,7 @@ impl Faults {
     }
 
     /// Replaces what is sent by random bytes, if the fault demands it.
-    pub(super) fn spoil_bytes(&mut self, link: Link, bytes: &mut [u8]) {
+    pub(super) fn corrupt_bytes(&mut self, link: Link, bytes: &mut [u8]) {
         if self.is_garbage(link) {
             self.random.fill(bytes);
         }
@@ -228,18 +228,18 @@ impl Controller {
     ///
     /// # Errors
     /// [`NoSuchFloat`] if there is no such item; nothing changed.
-    pub fn spoil(&mut self, name: &str, instead: f32) -> Result<(), NoSuchFloat> {
+    pub fn corrupt(&mut self, name: &str, instead: f32) -> Result<(), NoSuchFloat> {
         self.quiet.ends();
-        self.faults.spoiled.spoil(name, instead)
+        self.faults.corrupted.corrupt(name, instead)
     }
 
-    /// Ends [`Self::spoil`] for the item.
+    /// Ends [`Self::corrupt`] for the item.
     ///
     /// # Errors
     /// [`NoSuchFloat`] if there is no such item.
     pub fn heal(&mut self, name: &str) -> Result<(), NoSuchFloat> {
         self.quiet.ends();
-        self.faults.spoiled.heal(name)
+        self.faults.corrupted.heal(name)
     }
 
     /// Drops everything that the port sends from now on. `port` is its index in the configuration.

@@ -31,7 +31,7 @@ impl std::error::Error for ItemError {}
 impl Controller {
     /// An item's value: a system variable, an input or output, a state such as `running`, or an item of the
     /// state packet such as `drive_error[2]` (proto-core/docs/wire/state.md section 2), as the packet shows it
-    /// without [`Self::spoil`]. A bit and a state are 0 or 1.
+    /// without [`Self::corrupt`]. A bit and a state are 0 or 1.
     ///
     /// # Errors
     /// [`ItemError`] if there is no such item.

@@ -17,6 +17,7 @@
 
 mod build;
 mod condition;
+mod corrupted;
 mod counters;
 mod events;
 mod faults;
@@ -35,7 +36,6 @@ mod run;
 mod runs;
 mod server;
 mod snapshot;
-mod spoiled;
 mod test_controller;
 pub mod timeline;
 mod unmet;
@@ -71,7 +71,7 @@ pub use runs::{Outcome, Run};
 pub use server::{MAX_COMMAND_CONNECTIONS, MAX_MODBUS_CONNECTIONS, MAX_ORDERS, MAX_STATE_CONNECTIONS};
 use server::{Requested, Server};
 
-pub use spoiled::NoSuchFloat;
+pub use corrupted::NoSuchFloat;
 pub use test_controller::{Out, TestController};
 
 /// The simulated controller (docs/simulated-controller.md).

@@ -390,8 +390,8 @@ impl Controller {
     }
 
     fn poll_ports(&mut self, now: Instant) {
-        let spoiled = self.faults.spoiled().image(self.registers.image());
-        let image = spoiled.as_ref().unwrap_or(self.registers.image());
+        let corrupted = self.faults.corrupted().image(self.registers.image());
+        let image = corrupted.as_ref().unwrap_or(self.registers.image());
         for (nth, port) in self.ports.iter_mut().enumerate() {
             let outgoing = port.poll(now, image);
             if outgoing.is_empty() {
@@ -416,9 +416,9 @@ impl Controller {
         }
         self.counters.missed_state_packets += missed;
         let mut bytes = self.registers.packet(self.dialect.global_speed);
-        self.faults.spoiled().put_in_packet(&mut bytes);
+        self.faults.corrupted().put_in_packet(&mut bytes);
         self.faults.freeze_packet(&mut bytes);
-        self.faults.spoil_bytes(Link::State, &mut bytes[..]);
+        self.faults.corrupt_bytes(Link::State, &mut bytes[..]);
         if self.faults.mutes(Link::State) {
             self.counters.state.muted += 1;
             return;

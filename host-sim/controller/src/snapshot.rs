@@ -87,7 +87,7 @@ impl Controller {
                 shown.push(json!({ "port": port.name(), "kind": "mute" }));
             }
         }
-        for (item, value) in faults.spoiled().items() {
+        for (item, value) in faults.corrupted().items() {
             let value = if value.is_finite() {
                 json!(value)
             } else if value.is_nan() {

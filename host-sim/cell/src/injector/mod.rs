@@ -245,7 +245,7 @@ impl FaultInjector {
             FaultKind::Unreadable => {
                 let var = pick(rng, cell.floats().into_iter())?;
                 let value = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY][rng.below(3) as usize];
-                cell.spoil(var, value);
+                cell.corrupt_float(var, value);
                 Some(Repair::Variable(var))
             }
             FaultKind::Noise => {

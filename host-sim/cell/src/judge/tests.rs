@@ -7,24 +7,24 @@ use proto_core::config::{Bus, Echo};
 use proto_core::engine::{Input, LinkId, Output, PortId};
 use proto_core::time::{Duration, Instant};
 
+use crate::corruption::{Forged, Inward, Outward};
 use crate::soak::{Level, Scenario, Soak};
-use crate::tamper::{Forged, Inward, Outward};
 use crate::{Cell, Invariant};
 
 const PORT: PortId = PortId(0);
 const MS: fn(u64) -> Duration = Duration::from_millis;
 
 /// Runs of three minutes until the judge finds something; returns what, and after how many virtual minutes.
-fn found(name: &str, runs: u64, tamper: impl Fn(&mut Cell)) -> Option<(Invariant, u64)> {
+fn found(name: &str, runs: u64, corruption: impl Fn(&mut Cell)) -> Option<(Invariant, u64)> {
     let scenario = Scenario::named(name).unwrap().unwrap();
-    found_in(&scenario, runs, tamper)
+    found_in(&scenario, runs, corruption)
 }
 
-fn found_in(scenario: &Scenario, runs: u64, tamper: impl Fn(&mut Cell)) -> Option<(Invariant, u64)> {
+fn found_in(scenario: &Scenario, runs: u64, corruption: impl Fn(&mut Cell)) -> Option<(Invariant, u64)> {
     let mut before = Duration::ZERO;
     for seed in 0..runs {
         let mut soak = Soak::new(scenario, seed, Level::Harsh).unwrap();
-        tamper(soak.cell_mut());
+        corruption(soak.cell_mut());
         soak.run_to(Duration::from_secs(180));
         before = before + soak.elapsed();
         if let Some(found) = soak.cell().violation() {
@@ -37,8 +37,8 @@ fn found_in(scenario: &Scenario, runs: u64, tamper: impl Fn(&mut Cell)) -> Optio
 }
 
 #[track_caller]
-fn finds(name: &str, invariant: Invariant, tamper: impl Fn(&mut Cell)) {
-    let found = found(name, 20, tamper);
+fn finds(name: &str, invariant: Invariant, corruption: impl Fn(&mut Cell)) {
+    let found = found(name, 20, corruption);
     assert_eq!(found.map(|(found, _)| found), Some(invariant));
 }
 
@@ -67,7 +67,7 @@ fn resends(cell: &mut Cell, begin: &'static [u8]) {
             _ => None,
         }
     });
-    cell.tamper(None, Some(outward));
+    cell.corrupt(None, Some(outward));
 }
 
 /// A request that begins like this is sent so much later.
@@ -84,7 +84,7 @@ fn delays(cell: &mut Cell, begin: &'static [u8], by: Duration) {
         }
         _ => None,
     });
-    cell.tamper(None, Some(outward));
+    cell.corrupt(None, Some(outward));
 }
 
 const MOVE: &[u8] = &[9, 16, 1, 0x10];
@@ -118,7 +118,7 @@ fn an_event_with_the_values_of_the_one_before() {
             }
             _ => None,
         });
-        cell.tamper(None, Some(outward));
+        cell.corrupt(None, Some(outward));
     });
 }
 
@@ -142,7 +142,7 @@ fn a_rise_that_nobody_saw() {
             }
             _ => None,
         });
-        cell.tamper(Some(inward), None);
+        cell.corrupt(Some(inward), None);
     });
 }
 
@@ -175,7 +175,7 @@ fn repeats_when_a_reply_is_lost(cell: &mut Cell, begin: &'static [u8]) {
             _ => None,
         }
     });
-    cell.tamper(None, Some(outward));
+    cell.corrupt(None, Some(outward));
 }
 
 #[test]
@@ -195,7 +195,7 @@ fn a_late_reply_that_is_taken_for_another() {
             }
             _ => None,
         });
-        cell.tamper(Some(inward), None);
+        cell.corrupt(Some(inward), None);
     });
 }
 
@@ -231,7 +231,7 @@ fn resends_on_connections(cell: &mut Cell, begin: &'static [u8]) {
         }
         _ => None,
     });
-    cell.tamper(None, Some(outward));
+    cell.corrupt(None, Some(outward));
 }
 
 #[test]
@@ -261,7 +261,7 @@ fn a_reply_to_another_transaction_that_is_taken() {
             }
             _ => None,
         });
-        cell.tamper(Some(inward), Some(outward));
+        cell.corrupt(Some(inward), Some(outward));
     });
 }
 
@@ -273,6 +273,6 @@ fn a_gateway_that_does_not_connect_again() {
             Output::LinkOpen { link: LINK, .. } if now > Instant::from_millis(1_060_000) => Some(Vec::new()),
             _ => None,
         });
-        cell.tamper(None, Some(outward));
+        cell.corrupt(None, Some(outward));
     });
 }

@@ -7,9 +7,9 @@ use proto_core::time::{Duration, Instant};
 use super::tests::{CELL, DEVICE, cell, coils, frame, is_rest, modbus};
 use super::upward::Carried;
 use super::*;
+use crate::corruption::{Forged, Outward};
 use crate::network::Sender;
 use crate::soak::Scenario;
-use crate::tamper::{Forged, Outward};
 use crate::{Cell, LineId, PeriodicSender, Way};
 use recipe_test_kit::toml;
 
@@ -125,7 +125,7 @@ fn good_ones_are_not_accused() {
 #[test]
 fn a_value_that_the_network_delivers_when_it_is_old() {
     let (mut cell, line) = ready(CELL, &frame(1));
-    cell.tamper(None, never_closes(LinkId::MODBUS));
+    cell.corrupt(None, never_closes(LinkId::MODBUS));
     cell.cut_way(LinkId::MODBUS, Way::Up);
     cell.send(line, &frame(2));
     cell.run_ms(1_000);
@@ -139,7 +139,7 @@ fn a_value_that_the_network_delivers_when_it_is_old() {
 #[test]
 fn a_command_that_the_network_delivers_when_it_is_old() {
     let (mut cell, line) = ready(&panel_cell(), &panel(0, 1));
-    cell.tamper(None, never_closes(LinkId::COMMAND));
+    cell.corrupt(None, never_closes(LinkId::COMMAND));
     cell.cut_way(LinkId::COMMAND, Way::Up);
     cell.send(line, &panel(1, 1));
     cell.run_ms(1_200);
@@ -169,7 +169,7 @@ fn a_stop_that_is_kept_back() {
     let (mut cell, line) = ready(&panel_cell(), &panel(0, 1));
     let stop =
         |output: &Output<'_>| matches!(output, Output::LinkSend { bytes, .. } if bytes.starts_with(b"stop"));
-    cell.tamper(None, outward(move |_, _, output| stop(output).then(Vec::new)));
+    cell.corrupt(None, outward(move |_, _, output| stop(output).then(Vec::new)));
     for _ in 0..30 {
         cell.send(line, &panel(9, 1));
         cell.run_ms(50);
@@ -225,10 +225,10 @@ fn a_frame_with_a_value_that_cannot_be_read() {
     let (mut cell, line) = ready(CELL, &frame(1));
     cell.run_ms(100);
     let shown = cell.line(line).take_heard().pop().unwrap().1;
-    cell.spoil(SysVar::parse("FloatOutputReg[1]").unwrap(), f32::NAN);
+    cell.corrupt_float(SysVar::parse("FloatOutputReg[1]").unwrap(), f32::NAN);
     cell.run_ms(200);
     assert_eq!(cell.violation(), None, "it shows nothing");
-    cell.tamper(
+    cell.corrupt(
         None,
         outward(move |now, input, output| {
             let on_grid = now.as_micros() % 20_000 == 0 && matches!(input, Input::Tick);
@@ -243,13 +243,13 @@ fn a_frame_with_a_value_that_cannot_be_read() {
 fn a_value_that_cannot_be_read_is_written_back() {
     let float = |value: f32| [&[1], &value.to_le_bytes()[..]].concat();
     let (mut cell, line) = ready(NEIGHBOUR, &float(1.5));
-    cell.spoil(SysVar::parse("FloatInputReg[2]").unwrap(), f32::INFINITY);
+    cell.corrupt_float(SysVar::parse("FloatInputReg[2]").unwrap(), f32::INFINITY);
     cell.run_ms(300);
     let sent = cell.link(LinkId::RECIPE_UDP).counters.sent;
     cell.send(line, &float(2.5));
     cell.run_ms(50);
     assert_eq!((cell.link(LinkId::RECIPE_UDP).counters.sent, cell.violation()), (sent, None));
-    cell.tamper(
+    cell.corrupt(
         None,
         outward(|_, input, output| {
             let bytes = [&[1], &3.5_f32.to_le_bytes()[..], &[0; 4]].concat();
@@ -267,7 +267,7 @@ fn a_value_of_our_own_that_is_older_than_promised() {
     let (mut cell, _) = ready(&panel_cell(), &panel(0, 1));
     cell.run_ms(500);
     assert_eq!(cell.violation(), None);
-    cell.tamper(
+    cell.corrupt(
         None,
         outward(|now, input, output| {
             let on_grid = now.as_micros() % 20_000 == 0 && matches!(input, Input::Tick);
@@ -285,7 +285,7 @@ fn a_timeout_of_a_device_that_was_not_silent() {
     cell.run_ms(200);
     cell.stall_gateway(Duration::from_millis(300));
     let wakes = cell.now() + Duration::from_millis(300);
-    cell.tamper(
+    cell.corrupt(
         None,
         outward(move |now, input, output| {
             let answered = matches!(input, Input::LinkBytes { link: LinkId::MODBUS, .. }) && is_rest(output);
@@ -304,7 +304,7 @@ fn a_value_that_waited_while_the_gateway_slept() {
     cell.stall_gateway(Duration::from_millis(700));
     cell.run_ms(100);
     cell.send(line, &[0xFF, 0xFF, 0x40, 0, 0, 0xEE, 0xEE]);
-    cell.tamper(
+    cell.corrupt(
         None,
         outward(|_, input, output| {
             let is_up = matches!(input, Input::LinkUp { link: LinkId::MODBUS });
@@ -321,7 +321,7 @@ fn a_command_that_waited_while_the_gateway_slept() {
     cell.stall_gateway(Duration::from_millis(700));
     cell.run_ms(100);
     cell.send(line, &panel(2, 1));
-    cell.tamper(
+    cell.corrupt(
         None,
         outward(|_, input, output| {
             let is_up = matches!(input, Input::LinkUp { link: LinkId::COMMAND });
@@ -383,7 +383,7 @@ fn a_held_value_from_before_the_controller_began_anew() {
 #[test]
 fn a_command_that_comes_behind_the_stop_that_overtook_it() {
     let (mut cell, line) = ready(&panel_cell(), &panel(0, 1));
-    cell.tamper(None, never_closes(LinkId::COMMAND));
+    cell.corrupt(None, never_closes(LinkId::COMMAND));
     cell.cut_way(LinkId::COMMAND, Way::Up);
     cell.send(line, &panel(1, 1));
     cell.run_ms(100);

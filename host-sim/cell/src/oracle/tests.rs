@@ -9,8 +9,8 @@ use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 
 use super::*;
+use crate::corruption::{Forged, Inward, Outward};
 use crate::soak::Scenario;
-use crate::tamper::{Forged, Inward, Outward};
 use crate::{Cell, PeriodicSender};
 use recipe_config::SimConfig;
 use recipe_test_kit::toml;
@@ -91,7 +91,7 @@ fn run(mut cell: Cell) -> Option<Violation> {
 
 #[track_caller]
 fn caught(mut cell: Cell, inward: Option<Inward>, outward: Option<Outward>) -> Invariant {
-    cell.tamper(inward, outward);
+    cell.corrupt(inward, outward);
     match run(cell) {
         Some(violation) => violation.invariant,
         None => panic!("nothing was noticed"),
@@ -146,7 +146,7 @@ fn a_zero_before_the_first_frame() {
 fn a_write_repeated_after_a_reconnect() {
     let newest = Rc::new(RefCell::new(None));
     let mut cell = cell(CELL);
-    cell.tamper(
+    cell.corrupt(
         None,
         Some(Box::new(move |_, input, output| {
             if let Some(write) = write_of(output) {
@@ -239,7 +239,7 @@ fn a_write_that_is_forgotten() {
 fn an_edge_left_out() {
     let mut cell = cell(CELL);
     // Of three frames in one piece the engine sees the second one's bits in the first one as well.
-    cell.tamper(
+    cell.corrupt(
         Some(Box::new(|_, input| match *input {
             Input::PortBytes { bytes, .. } if bytes.len() == 21 => {
                 let mut bytes = bytes.to_vec();
@@ -309,7 +309,7 @@ fn a_gateway_that_does_not_stop_when_its_sources_are_stale() {
     cell.refuse(LinkId::STATE);
     cell.reset(LinkId::STATE);
     let began = cell.now();
-    cell.tamper(
+    cell.corrupt(
         None,
         Some(Box::new(move |now, input, output| {
             let late = now.saturating_since(began) > Duration::from_millis(500);
@@ -360,7 +360,7 @@ fn a_command_sent_twice() {
     });
     // The second frame differs from the first: that picks a command.
     let mut cell = cell(ORDERS);
-    cell.tamper(None, Some(outward));
+    cell.corrupt(None, Some(outward));
     cell.run_ms(600);
     let line = cell.line_of("device");
     for order in [0, 1] {

@@ -37,7 +37,7 @@ pub struct Fault {
     pub bytes: Option<usize>,
     /// For `spoil`: a number, or `nan`, `inf`, `-inf`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub value: Option<Spoil>,
+    pub value: Option<CorruptedValue>,
 }
 
 /// The kinds of faults.
@@ -61,7 +61,8 @@ pub enum Kind {
     /// One state packet ends early.
     Cut,
     /// Another number is sent in place of an item's.
-    Spoil,
+    #[serde(rename = "spoil")]
+    Corrupt,
 }
 
 impl Kind {
@@ -75,7 +76,7 @@ impl Kind {
             Self::Exception => "exception",
             Self::Freeze => "freeze",
             Self::Cut => "cut",
-            Self::Spoil => "spoil",
+            Self::Corrupt => "spoil",
         }
     }
 }
@@ -83,7 +84,7 @@ impl Kind {
 /// What is sent in place of an item's value.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(untagged, expecting = "a number, \"nan\", \"inf\" or \"-inf\"")]
-pub enum Spoil {
+pub enum CorruptedValue {
     /// A number.
     Number(f32),
     /// None.
@@ -104,7 +105,7 @@ pub enum NoNumber {
     NegInf,
 }
 
-impl Spoil {
+impl CorruptedValue {
     fn value(self) -> f32 {
         match self {
             Self::Number(number) => number,
@@ -133,9 +134,9 @@ impl Controller {
                 }
                 Ok(())
             }
-            (None, None, Some(item), None, Some(Kind::Spoil)) => {
+            (None, None, Some(item), None, Some(Kind::Corrupt)) => {
                 let Some(value) = fault.value else { return refused("value is missing") };
-                self.spoil(item, value.value()).map_err(|error| Refused(error.to_string()))
+                self.corrupt(item, value.value()).map_err(|error| Refused(error.to_string()))
             }
             (None, None, Some(_), None, _) => refused("kind: an item can only spoil"),
             (None, None, None, Some(seconds), None) => {
@@ -209,7 +210,7 @@ fn check_arguments(fault: &Fault) -> Result<(), Refused> {
         ("seconds", fault.seconds.is_some(), Kind::Delay),
         ("code", fault.code.is_some(), Kind::Exception),
         ("bytes", fault.bytes.is_some(), Kind::Cut),
-        ("value", fault.value.is_some(), Kind::Spoil),
+        ("value", fault.value.is_some(), Kind::Corrupt),
     ];
     for (name, is_given, kind) in given {
         if is_given && fault.kind != Some(kind) {

@@ -19,7 +19,7 @@ use super::events::KINDS;
 use super::faults::Link;
 use super::machine::SafetyHold;
 pub(crate) use carry_out::number;
-pub use fault::{Fault, Kind, NoNumber, Spoil};
+pub use fault::{CorruptedValue, Fault, Kind, NoNumber};
 
 /// An operation. In JSON its name is the value of `do`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

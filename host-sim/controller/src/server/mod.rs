@@ -240,7 +240,7 @@ impl Controller {
     }
 
     fn send(&mut self, now: Instant, link: Link, conn: ConnId, mut bytes: Vec<u8>) -> Sent {
-        self.faults.spoil_bytes(link, &mut bytes);
+        self.faults.corrupt_bytes(link, &mut bytes);
         let counters = self.counters.of(link);
         if self.faults.mutes(link) {
             counters.muted += 1;

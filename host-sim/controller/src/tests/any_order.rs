@@ -204,7 +204,7 @@ fn act(cell: &mut TestController, step: Step) {
                     _ => CommandClients::DropFirst,
                 }),
                 16 => c.delay_transitions(Duration::from_millis(u64::from(nth) * 30)),
-                17 if nth > 128 => drop(c.spoil("RobotState[8]", f32::NAN)),
+                17 if nth > 128 => drop(c.corrupt("RobotState[8]", f32::NAN)),
                 17 => drop(c.heal("RobotState[8]")),
                 18 => c.restart_cleared(now),
                 19 | 20 => {

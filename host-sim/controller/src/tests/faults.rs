@@ -213,7 +213,7 @@ fn floats_can_be_sent_with_other_values() {
     let odd = f32::from_bits(0xFFC1_2345);
     assert!(odd.is_nan());
     let c = &mut cell.controller;
-    c.spoil("FloatOutputReg[1]", 7.0).unwrap();
+    c.corrupt("FloatOutputReg[1]", 7.0).unwrap();
     let all = [
         ("__RobotState_8", odd),
         ("FloatOutputReg[1]", f32::INFINITY),
@@ -223,7 +223,7 @@ fn floats_can_be_sent_with_other_values() {
         ("RobotState[26]", f32::NAN),
     ];
     for (name, instead) in all {
-        c.spoil(name, instead).unwrap();
+        c.corrupt(name, instead).unwrap();
     }
     cell.sent.clear();
     cell.run_ms(100);
@@ -268,7 +268,7 @@ fn floats_can_be_sent_with_other_values() {
         "robot_state",
         "x",
     ] {
-        let error = cell.controller.spoil(wrong, 1.0).unwrap_err();
+        let error = cell.controller.corrupt(wrong, 1.0).unwrap_err();
         assert_eq!(error, NoSuchFloat(wrong.to_owned()));
         assert!(cell.controller.heal(wrong).is_err());
     }

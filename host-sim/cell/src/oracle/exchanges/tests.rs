@@ -9,9 +9,9 @@ use proto_core::time::{Duration, Instant};
 use super::super::tests::{cell, is_rest};
 use super::super::upward::Carried;
 use super::super::{Invariant, Oracle, copied_inputs};
+use crate::corruption::{Forged, Outward};
 use crate::due::Due;
 use crate::rtu::sealed;
-use crate::tamper::{Forged, Outward};
 use crate::{Cell, Device, Done, PeriodicSender, SlaveDone, Violation};
 use recipe_config::InitialTarget;
 use recipe_controller::ControllerInput;
@@ -212,7 +212,7 @@ fn run(
     bend: impl FnMut(Instant, &mut Duration, &mut Vec<Done>) + 'static,
 ) -> Cell {
     let mut cell = cell(toml);
-    cell.tamper(None, outward);
+    cell.corrupt(None, outward);
     let line = cell.line_of("device");
     cell.attach(line, Honest::new(bend));
     for nth in 1..=10 {
@@ -297,7 +297,7 @@ fn a_repetition_that_is_held_back() {
         let is_repeated = std::mem::replace(&mut newest, bytes.to_vec()) == *bytes;
         is_repeated.then(Vec::new)
     });
-    cell.tamper(None, Some(outward));
+    cell.corrupt(None, Some(outward));
     let line = cell.line_of("device");
     cell.attach(line, Honest::new(|_, _, _| ()));
     cell.run_ms(1_500);
@@ -476,7 +476,7 @@ fn a_request_with_another_value() {
 /// A master that reads and writes by turns for two seconds.
 fn asked_by_a_master(outward: Option<Outward>) -> Cell {
     let mut cell = cell(SERVED);
-    cell.tamper(None, outward);
+    cell.corrupt(None, outward);
     cell.set_value("WordOutputReg[1]", 7.0);
     let line = cell.line_of("device");
     let start = cell.now() + MS(500);

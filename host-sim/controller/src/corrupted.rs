@@ -9,7 +9,7 @@ use recipe_config::{AnalogInput, InitialTarget};
 
 /// The items, and the values that are sent instead.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Spoiled(Vec<Instead>);
+pub(super) struct Corrupted(Vec<Instead>);
 
 #[derive(Debug, Clone)]
 struct Instead {
@@ -43,9 +43,9 @@ impl std::fmt::Display for NoSuchFloat {
 
 impl std::error::Error for NoSuchFloat {}
 
-impl Spoiled {
+impl Corrupted {
     /// Sends `instead` for the item of this name from now on.
-    pub(super) fn spoil(&mut self, name: &str, instead: f32) -> Result<(), NoSuchFloat> {
+    pub(super) fn corrupt(&mut self, name: &str, instead: f32) -> Result<(), NoSuchFloat> {
         let item = find(name)?;
         self.0.retain(|other| other.item != item);
         self.0.push(Instead { name: name.to_owned(), item, value: instead });

@@ -9,10 +9,10 @@ use super::{Cell, Entry, What};
 
 impl Cell {
     /// The controller sends `value` for this variable from now on, whatever its register has.
-    pub fn spoil(&mut self, var: SysVar, value: f32) {
+    pub fn corrupt_float(&mut self, var: SysVar, value: f32) {
         self.trace.add(self.now, What::Fault, Entry::CONTROLLER, &value.to_le_bytes());
         // A variable that is no float is left as it is.
-        let _ = self.controller_mut().spoil(&var.to_string(), value);
+        let _ = self.controller_mut().corrupt(&var.to_string(), value);
         self.disturb(None);
     }
 

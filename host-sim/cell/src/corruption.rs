@@ -20,14 +20,14 @@ pub(super) type Inward = Box<dyn FnMut(Instant, &Input<'_>) -> Option<Vec<u8>>>;
 pub(super) type Outward = Box<dyn FnMut(Instant, &Input<'_>, &Output<'_>) -> Option<Vec<Forged>>>;
 
 /// The changes to inputs and outputs.
-pub(super) struct Tamper {
+pub(super) struct Corruption {
     pub inward: Inward,
     pub outward: Outward,
 }
 
-impl std::fmt::Debug for Tamper {
+impl std::fmt::Debug for Corruption {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str("Tamper")
+        f.write_str("Corruption")
     }
 }
 
@@ -45,8 +45,8 @@ impl Forged {
 
 impl Cell {
     /// Changes inputs and outputs from now on.
-    pub(super) fn tamper(&mut self, inward: Option<Inward>, outward: Option<Outward>) {
-        self.tamper = Some(Tamper {
+    pub(super) fn corrupt(&mut self, inward: Option<Inward>, outward: Option<Outward>) {
+        self.corruption = Some(Corruption {
             inward: inward.unwrap_or_else(|| Box::new(|_, _| None)),
             outward: outward.unwrap_or_else(|| Box::new(|_, _, _| None)),
         });
@@ -54,12 +54,12 @@ impl Cell {
 
     pub(super) fn forged_input(&mut self, input: &Input<'_>) -> Option<Vec<u8>> {
         let now = self.now;
-        self.tamper.as_mut().and_then(|tamper| (tamper.inward)(now, input))
+        self.corruption.as_mut().and_then(|corruption| (corruption.inward)(now, input))
     }
 
     pub(super) fn forged_outputs(&mut self, input: &Input<'_>, output: &Output<'_>) -> Option<Vec<Forged>> {
         let now = self.now;
-        self.tamper.as_mut().and_then(|tamper| (tamper.outward)(now, input, output))
+        self.corruption.as_mut().and_then(|corruption| (corruption.outward)(now, input, output))
     }
 }
 
