@@ -118,7 +118,7 @@ impl Cell {
             Input::LinkUp { link } => self.trace.add(now, What::LinkUp, link.0.into(), &[]),
             Input::LinkDown { link } => {
                 self.trace.add(now, What::LinkDown, link.0.into(), &[]);
-                self.device_link_disturbed(link);
+                self.device_link_changed(link);
             }
             Input::LinkBytes { link, bytes } => {
                 self.trace.add(now, What::LinkReceived, link.0.into(), bytes);
@@ -201,7 +201,7 @@ impl Cell {
             }
             Output::LinkClose { link } => {
                 self.trace.add(now, What::LinkClose, link.0.into(), &[]);
-                self.device_link_disturbed(link);
+                self.device_link_changed(link);
                 self.close(link);
             }
             Output::LinkSend { link, bytes } => {

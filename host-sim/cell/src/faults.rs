@@ -133,7 +133,7 @@ impl Cell {
     fn note(&mut self, link: LinkId) {
         self.trace.add(self.now, What::Fault, link.0.into(), &[]);
         self.device_link_fault(link);
-        self.disturb(Some(link));
+        self.note_fault(Some(link));
     }
 
     fn connection(&mut self, link: LinkId) -> Option<&mut Connection> {

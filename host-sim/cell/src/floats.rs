@@ -13,14 +13,14 @@ impl Cell {
         self.trace.add(self.now, What::Fault, Entry::CONTROLLER, &value.to_le_bytes());
         // A variable that is no float is left as it is.
         let _ = self.controller_mut().corrupt(&var.to_string(), value);
-        self.disturb(None);
+        self.note_fault(None);
     }
 
     /// It sends the register's value again.
     pub fn heal(&mut self, var: SysVar) {
         self.trace.add(self.now, What::Fault, Entry::CONTROLLER, &[]);
         let _ = self.controller_mut().heal(&var.to_string());
-        self.disturb(None);
+        self.note_fault(None);
     }
 
     /// The floats that the gateway's configuration names.

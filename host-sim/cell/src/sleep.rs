@@ -70,7 +70,7 @@ impl Cell {
             return;
         }
         let Some(Waiting { ports, links, .. }) = self.asleep.take() else { return };
-        self.disturb(None);
+        self.note_fault(None);
         if let Some(judge) = &mut self.judge {
             judge.gateway_wakes(self.now);
         }

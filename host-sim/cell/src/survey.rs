@@ -16,20 +16,20 @@ impl Cell {
     /// [`Self::server_fault_ends`] as often.
     pub fn server_fault_begins(&mut self, server: Link) {
         self.server_faults[server as usize] += 1;
-        self.disturb(None);
+        self.note_fault(None);
     }
 
     /// Announces that the fault has ended.
     pub fn server_fault_ends(&mut self, server: Link) {
         let server_faults = &mut self.server_faults[server as usize];
         *server_faults = server_faults.saturating_sub(1);
-        self.disturb(None);
+        self.note_fault(None);
     }
 
     /// A fault began or ended, on one link or on all.
-    pub(super) fn disturb(&mut self, link: Option<LinkId>) {
+    pub(super) fn note_fault(&mut self, link: Option<LinkId>) {
         if let Some(oracle) = &mut self.oracle {
-            oracle.disturbed(link, self.now);
+            oracle.note_fault(link, self.now);
         }
     }
 

@@ -214,18 +214,18 @@ impl Cell {
         if let Some(device) = self.servers.get_mut(&link) {
             device.missed_since = None;
         }
-        self.device_link_disturbed(link);
+        self.device_link_changed(link);
     }
 
     /// Something happens to a link: the judge is told if it is a device's.
-    pub(super) fn device_link_disturbed(&mut self, link: LinkId) {
+    pub(super) fn device_link_changed(&mut self, link: LinkId) {
         if let Some(judge) = self.judge.as_mut().filter(|_| self.servers.contains_key(&link)) {
-            judge.disturbed(self.now);
+            judge.note_fault(self.now);
         }
     }
 
     /// Whether a connection to a device is not what it should be.
-    pub(super) fn is_device_disturbed(&self) -> bool {
+    pub(super) fn is_device_faulty(&self) -> bool {
         self.servers.keys().filter_map(|link| self.gates.get(link)).any(|gate| !self.is_sound(gate))
     }
 

@@ -3,7 +3,7 @@
 //! In: what each device did and when, as it decoded the requests by itself; the controller's registers whenever they
 //! change, and which of them it has served to whom. Out: violations. Knows neither the engine nor what the
 //! configuration became: what a cell promises is written down in [`Rules`] by hand. Of the gateway it knows when it
-//! starts and when it is not called, and of the line when it was disturbed, because both are nobody's fault.
+//! starts and when it is not called, and of the line when it had a fault, because neither is the device's doing.
 
 mod axis;
 mod conveyor;
@@ -96,7 +96,7 @@ pub(crate) struct Judge {
     /// How often it may be started.
     starts: u32,
     began: Instant,
-    /// When a reply that is no echo last left in time on an undisturbed line.
+    /// When a reply that is no echo last left in time on a line without fault.
     replied: Option<Instant>,
     /// What it was told to keep, and when it was refused last with which code.
     kept: Option<u32>,
@@ -108,7 +108,7 @@ pub(crate) struct Judge {
     trouble: Instant,
     /// When a reply last left in time.
     in_time: Instant,
-    is_disturbed: bool,
+    is_faulty: bool,
     outcomes: BTreeMap<&'static str, u64>,
     counted: BTreeMap<&'static str, u32>,
     checks: BTreeMap<Invariant, u64>,
@@ -158,7 +158,7 @@ impl Judge {
             calm_since: now,
             trouble: now,
             in_time: now,
-            is_disturbed: false,
+            is_faulty: false,
             outcomes: BTreeMap::new(),
             counted: BTreeMap::new(),
             checks: BTreeMap::new(),
@@ -200,11 +200,11 @@ impl Judge {
     /// The gateway's port is there, or there again.
     pub(crate) fn port_begins(&mut self, now: Instant) {
         (self.starts, self.began, self.replied) = (1, now, None);
-        self.disturbed(now);
+        self.note_fault(now);
     }
 
-    /// The line, or the gateway's port, is disturbed at this instant.
-    pub(crate) fn disturbed(&mut self, now: Instant) {
+    /// The line, or the gateway's port, has a fault at this instant.
+    pub(crate) fn note_fault(&mut self, now: Instant) {
         (self.calm_since, self.trouble) = (now, now);
     }
 
@@ -307,11 +307,11 @@ impl Judge {
             }
             Act::PowerOff => {
                 (self.is_on, self.kept) = (false, None);
-                self.disturbed(now);
+                self.note_fault(now);
             }
             Act::PowerOn => {
                 self.is_on = true;
-                self.disturbed(now);
+                self.note_fault(now);
             }
         }
     }
@@ -415,20 +415,20 @@ impl Judge {
         if self.is_away(now) {
             self.starts = 1;
         }
-        // Of a disturbed line nobody knows whether it arrives.
-        if tells && !self.is_disturbed {
+        // On a faulty line it may be lost.
+        if tells && !self.is_faulty {
             self.replied = Some(now);
         }
     }
 
-    /// Called at intervals. `is_disturbed`: the line has noise or is cut, or the gateway is not called.
-    pub(crate) fn survey(&mut self, is_disturbed: bool, now: Instant) {
+    /// Called at intervals. `is_faulty`: the line has noise or is cut, or the gateway is not called.
+    pub(crate) fn survey(&mut self, is_faulty: bool, now: Instant) {
         if self.violation.is_some() {
             return;
         }
-        self.is_disturbed = is_disturbed;
-        if is_disturbed {
-            self.disturbed(now);
+        self.is_faulty = is_faulty;
+        if is_faulty {
+            self.note_fault(now);
         }
         if let Some(stop) = &mut self.stop {
             stop.known = stop.known.or_else(|| self.robot.taken(stop.conn, stop.at));
@@ -508,7 +508,7 @@ impl Cell {
     /// The judge looks at the line, and takes the gateway's counters.
     pub(crate) fn survey_device(&mut self) {
         let is_asleep = self.is_asleep();
-        let is_disturbed = is_asleep || self.is_line_disturbed();
+        let is_faulty = is_asleep || self.is_line_faulty();
         let missed = self.misses_device_for();
         self.count_outcomes();
         let now = self.now;
@@ -516,15 +516,15 @@ impl Cell {
             if is_asleep {
                 judge.not_called(now);
             }
-            judge.survey(is_disturbed, now);
+            judge.survey(is_faulty, now);
             judge.connects(missed, now);
         }
     }
 
-    fn is_line_disturbed(&self) -> bool {
+    fn is_line_faulty(&self) -> bool {
         self.lines.iter().any(|line| line.noise_ppm > 0 || !line.connected || !line.is_plugged)
             || self.buses.iter().any(|bus| bus.loss_ppm > 0 || !bus.connected || bus.is_off)
-            || self.is_device_disturbed()
+            || self.is_device_faulty()
     }
 
     /// Before the gateway restarts, and at intervals.

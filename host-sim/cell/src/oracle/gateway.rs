@@ -65,7 +65,7 @@ impl Oracle {
                 watch.down.sent();
             }
             watch.exchanges.abandon(port.exchanges.as_ref(), now);
-            watch.exchanges.disturbed_at = now + DISCARD_AFTER_SLEEP;
+            watch.exchanges.fault_at = now + DISCARD_AFTER_SLEEP;
         }
         self.discards_until = Some(now + DISCARD_AFTER_SLEEP);
     }

@@ -187,7 +187,7 @@ fn a_command_that_the_controller_does_not_understand() {
     let (mut cell, _) = ready(&panel_cell(), &panel(0, 1));
     cell.run_ms(1_000);
     let (mut oracle, now) = (cell.oracle.take().unwrap(), cell.now());
-    oracle.disturbed(Some(LinkId::URGENT), now);
+    oracle.note_fault(Some(LinkId::URGENT), now);
     oracle.not_understood(LinkId::URGENT, now);
     assert_eq!(oracle.violation(), None, "it may have come in pieces");
     oracle.not_understood(LinkId::COMMAND, now);
@@ -213,11 +213,11 @@ fn a_safe_value_that_is_not_there() {
     let arrives = |oracle: &mut Oracle| oracle.robot.applied(&inputs, &without, now);
     assert_eq!(judged(&arrives, &mut cell), Some(Invariant::SafeArrives));
     assert_eq!(judged(&|_| (), &mut cell), None, "somebody else has written it");
-    let disturbed = |oracle: &mut Oracle| {
+    let faulted = |oracle: &mut Oracle| {
         arrives(oracle);
-        oracle.disturbed(None, now);
+        oracle.note_fault(None, now);
     };
-    assert_eq!(judged(&disturbed, &mut cell), None, "it may be on its way");
+    assert_eq!(judged(&faulted, &mut cell), None, "it may be on its way");
 }
 
 #[test]

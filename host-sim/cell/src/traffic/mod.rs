@@ -178,7 +178,7 @@ impl Cell {
                     Way::Up => self.controller_bytes(id, link, peer, &bytes),
                     Way::Down => self.engine_input(Input::LinkBytes { link, bytes: &bytes }),
                 }
-                self.device_link_disturbed(link);
+                self.device_link_changed(link);
                 self.reset_conn(id);
                 return;
             }

@@ -49,10 +49,10 @@ const FOUR_PORTS: &str = "four ports";
 /// All cells: without faults, with faults, and one for arithmetic.
 pub(crate) fn all() -> Vec<Recorded> {
     let names = || EXAMPLES.iter().map(|example| example.0).chain([FOUR_PORTS]);
-    let undisturbed = names().map(|name| Recorded { name: name.to_owned(), record: without_faults });
-    let disturbed = names().map(|name| Recorded { name: format!("{name} with faults"), record: with_faults });
+    let without = names().map(|name| Recorded { name: name.to_owned(), record: without_faults });
+    let with = names().map(|name| Recorded { name: format!("{name} with faults"), record: with_faults });
     let arithmetic = Recorded { name: "arithmetic".to_owned(), record: |_| arithmetic::record() };
-    undisturbed.chain(disturbed).chain([arithmetic]).collect()
+    without.chain(with).chain([arithmetic]).collect()
 }
 
 fn without_faults(name: &str) -> Vec<u8> {

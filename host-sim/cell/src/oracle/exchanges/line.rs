@@ -38,7 +38,7 @@ pub(in crate::oracle) struct ExchangesWatch {
     /// When the port came up.
     pub began: Instant,
     /// When something last went wrong: a slave that was up failed, or the gateway did not run.
-    pub disturbed_at: Instant,
+    pub fault_at: Instant,
 }
 
 /// A request on its way.
@@ -168,7 +168,7 @@ impl ExchangesWatch {
             }
         }
         self.has_echo = known(exchanges.echo);
-        (self.began, self.disturbed_at) = (now, now);
+        (self.began, self.fault_at) = (now, now);
     }
 
     /// What has begun is not continued.
@@ -606,7 +606,7 @@ impl ExchangesWatch {
         flight.was_wrong |= flight.is_wrong;
         let slave = self.slaves.entry(spec.slave).or_default();
         if slave.presence != Presence::Down {
-            self.disturbed_at = self.disturbed_at.max(now);
+            self.fault_at = self.fault_at.max(now);
         }
         let retries = if spec.kind == Kind::State { spec.retries } else { spec.event_retries };
         if slave.presence == Presence::Up && flight.repeated < retries {
@@ -694,7 +694,7 @@ impl ExchangesWatch {
         now: Instant,
     ) -> Result<u64, Wrong> {
         let mut checked = 0;
-        let free = self.free_at.max(heard + port.turnaround).max(self.disturbed_at);
+        let free = self.free_at.max(heard + port.turnaround).max(self.fault_at);
         for ((nth, row), watch) in exchanges.rows.iter().enumerate().zip(&self.rows) {
             let (Some(every), Some(asked), true) = (row.every, watch.asked, row.is_always_ready()) else {
                 continue;
@@ -715,7 +715,7 @@ impl ExchangesWatch {
                 let what = format!("{}: its period has ended, and the line is free for {idle}", name(row));
                 return Err((Invariant::Periods, what));
             }
-            let from = asked.max(self.disturbed_at).max(ready);
+            let from = asked.max(self.fault_at).max(ready);
             let waits = now.saturating_since(from);
             if waits > every.saturating_mul(2) + exchanges.all_costs + stalled(from) {
                 let what = format!("{}: not asked for {waits}", name(&exchanges.rows[nth]));
@@ -758,7 +758,7 @@ impl ExchangesWatch {
         let (slave, watch) = (self.slaves.get(&number)?, &self.rows[row]);
         let is_up = slave.presence == Presence::Up && slave.failing.is_none();
         let is_taken = !watch.is_refused && !watch.is_unconfirmed && watch.failures == 0;
-        let since = slave.since.max(self.disturbed_at).max(watch.blocked_until).max(slave.opened);
+        let since = slave.since.max(self.fault_at).max(watch.blocked_until).max(slave.opened);
         let since = since.max(slave.started);
         (is_up && is_taken && !self.is_opening(exchanges, number, slave)).then_some(since.max(self.began))
     }

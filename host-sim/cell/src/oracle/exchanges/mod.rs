@@ -349,7 +349,7 @@ impl Oracle {
             let Some(exchanges) = &port.exchanges else { continue };
             let (robot, watch) = (&self.robot, &mut self.ports[nth]);
             if self.discards_until.is_some() || !watch.down.is_usable() || robot.is_stalled(now) {
-                watch.exchanges.disturbed_at = watch.exchanges.disturbed_at.max(now);
+                watch.exchanges.fault_at = watch.exchanges.fault_at.max(now);
                 continue;
             }
             let stalled = |since| robot.stalled_since(since, now);

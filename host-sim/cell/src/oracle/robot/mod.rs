@@ -149,11 +149,11 @@ impl Robot {
     pub(super) fn restarted(&mut self, now: Instant) {
         self.forget_all(now);
         self.senders.clear();
-        self.disturbed(now);
+        self.reset_soundness(now);
     }
 
     /// No path has worked for longer than since now.
-    fn disturbed(&mut self, now: Instant) {
+    fn reset_soundness(&mut self, now: Instant) {
         self.sound.values_mut().chain(self.served.values_mut()).for_each(|since| *since = now);
     }
 
@@ -385,13 +385,13 @@ impl Oracle {
     }
 
     /// A fault began or ended on a path, or on all of them.
-    pub(crate) fn disturbed(&mut self, link: Option<LinkId>, now: Instant) {
+    pub(crate) fn note_fault(&mut self, link: Option<LinkId>, now: Instant) {
         match link {
             Some(link) => {
                 self.robot.sound.remove(&link);
                 self.robot.served.remove(&link);
             }
-            None => self.robot.disturbed(now),
+            None => self.robot.reset_soundness(now),
         }
     }
 
@@ -401,7 +401,7 @@ impl Oracle {
         self.robot.foreign_writes.clear();
         self.robot.started_at = Some(now);
         self.robot.all_sound_since = None;
-        self.robot.disturbed(now);
+        self.robot.reset_soundness(now);
     }
 
     /// The gateway is not called from now until `until`.
@@ -413,7 +413,7 @@ impl Oracle {
             Some((_, to)) if *to >= now => *to = until,
             _ => stalls.push_back((now, until)),
         }
-        self.robot.disturbed(now);
+        self.robot.reset_soundness(now);
     }
 
     /// A datagram arrives at a port where the gateway listens.
