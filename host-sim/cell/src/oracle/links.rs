@@ -24,7 +24,7 @@ impl Oracle {
                         up.received(var, raw, now);
                     }
                 });
-                self.up.doubt_by_witnesses(&self.spec, now);
+                self.up.revoke_by_witnesses(&self.spec, now);
                 if !refused.is_empty() {
                     self.refused.extend(refused);
                     self.rewrite_at = self.rewrite_at.min(now + REFUSED_PAUSE);
@@ -96,7 +96,7 @@ impl Oracle {
             }
             self.up.received(var, raw, now);
         }
-        self.up.doubt_by_witnesses(&self.spec, now);
+        self.up.revoke_by_witnesses(&self.spec, now);
         self.values_changed(now);
     }
 

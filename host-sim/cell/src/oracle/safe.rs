@@ -17,7 +17,7 @@ const NEW: Duration = Duration::from_secs(1);
 /// A value that the controller shows earlier may be from before the safe value arrived.
 const SHOWN_AFTER: Duration = Duration::from_millis(200);
 /// For this long after a confirmation, another value revokes it. Later, another master wrote it.
-const DOUBT: Duration = Duration::from_secs(3);
+const REVOCABLE: Duration = Duration::from_secs(3);
 
 impl Upward {
     /// Queues safe values again whose write failed, if they are still current.
@@ -42,21 +42,21 @@ impl Upward {
         for var in &safe {
             self.known[var.ordinal()].unconfirmed = true;
         }
-        self.doubted_at = now;
+        self.unconfirmed_at = now;
         self.write_again(spec, safe);
     }
 
     /// A frame was sent on a recipe link: schedules the repetition of unconfirmed safe values.
     pub(super) fn sent_frame(&mut self, spec: &Spec, link: LinkId, now: Instant) {
         let rewrite_at = self.rewrite_at[usize::from(link.0)];
-        let is_soon = rewrite_at == Instant::NEVER || self.is_new_doubt(now);
-        if is_soon && !self.in_doubt(spec, link).is_empty() {
+        let is_soon = rewrite_at == Instant::NEVER || self.is_newly_unconfirmed(now);
+        if is_soon && !self.unconfirmed(spec, link).is_empty() {
             self.rewrite_at[usize::from(link.0)] = rewrite_at.min(now + SOON);
         }
     }
 
-    fn is_new_doubt(&self, now: Instant) -> bool {
-        now.saturating_since(self.doubted_at) < NEW
+    fn is_newly_unconfirmed(&self, now: Instant) -> bool {
+        now.saturating_since(self.unconfirmed_at) < NEW
     }
 
     /// Queues the safe values that are to be repeated now.
@@ -68,35 +68,36 @@ impl Upward {
             }
             self.rewrite_at[place] = Instant::NEVER;
             self.confirm_by_witnesses(spec, now);
-            let doubted = self.in_doubt(spec, link.id);
-            if doubted.is_empty() || !self.is_up(link.id) {
+            let unconfirmed = self.unconfirmed(spec, link.id);
+            if unconfirmed.is_empty() || !self.is_up(link.id) {
                 continue;
             }
-            let soon = self.is_new_doubt(now) || doubted.iter().any(|var| spec.can_be_shown(*var));
+            let soon =
+                self.is_newly_unconfirmed(now) || unconfirmed.iter().any(|var| spec.can_be_shown(*var));
             self.rewrite_at[place] = now + if soon { SOON } else { SLOWLY };
-            self.write_again(spec, doubted);
+            self.write_again(spec, unconfirmed);
         }
     }
 
-    fn in_doubt(&self, spec: &Spec, link: LinkId) -> Vec<SysVar> {
-        let is_in_doubt = |var: &SysVar| {
+    fn unconfirmed(&self, spec: &Spec, link: LinkId) -> Vec<SysVar> {
+        let is_unconfirmed = |var: &SysVar| {
             let way = spec.owned[var.ordinal()].map(|owned| owned.way);
             way == Some(link) && self.known(*var).unconfirmed
         };
-        spec.safe_vars.iter().copied().filter(is_in_doubt).collect()
+        spec.safe_vars.iter().copied().filter(is_unconfirmed).collect()
     }
 
     /// Whether what the controller shows now can confirm a safe value.
     pub(super) fn may_confirm(&self, now: Instant) -> bool {
-        now >= self.doubted_at + SHOWN_AFTER
+        now >= self.unconfirmed_at + SHOWN_AFTER
     }
 
     /// Confirms the safe values that the packet shows. Soon after a confirmation, another value revokes
     /// it.
     pub(super) fn compare_safe(&mut self, spec: &Spec, packet: &[u8], now: Instant) {
         let may_confirm = self.may_confirm(now);
-        let may_doubt = self.confirmed_at.is_some_and(|at| now < at + DOUBT);
-        let mut doubted = Vec::new();
+        let may_revoke = self.confirmed_at.is_some_and(|at| now < at + REVOCABLE);
+        let mut revoked = Vec::new();
         for &var in &spec.safe_vars {
             let Some(owned) = spec.owned[var.ordinal()] else { continue };
             let Some(safe) = owned.safe.filter(|_| self.known(var).safe) else { continue };
@@ -108,22 +109,22 @@ impl Upward {
                 in_packet(var, packet).map(|raw| as_number(var, raw)) == Some(as_number(var, safe));
             match self.known(var).unconfirmed {
                 true if is_there && may_confirm => self.confirm(var, by_recipe, now),
-                false if !is_there && may_doubt && by_recipe => doubted.push(var),
+                false if !is_there && may_revoke && by_recipe => revoked.push(var),
                 _ => {}
             }
         }
-        for var in &doubted {
+        for var in &revoked {
             self.known[var.ordinal()].unconfirmed = true;
         }
-        self.write_again(spec, doubted);
+        self.write_again(spec, revoked);
     }
 
     /// Revokes confirmations of safe values whose witness just arrived with another value, soon after.
-    pub(super) fn doubt_by_witnesses(&mut self, spec: &Spec, now: Instant) {
-        if self.confirmed_at.is_none_or(|at| now >= at + DOUBT) {
+    pub(super) fn revoke_by_witnesses(&mut self, spec: &Spec, now: Instant) {
+        if self.confirmed_at.is_none_or(|at| now >= at + REVOCABLE) {
             return;
         }
-        let mut doubted = Vec::new();
+        let mut revoked = Vec::new();
         for &var in &spec.safe_vars {
             let Some(owned) = spec.owned[var.ordinal()] else { continue };
             let shown = spec.witness[var.ordinal()].map(|witness| self.known(witness));
@@ -132,13 +133,13 @@ impl Upward {
                 shown.is_some_and(|(raw, at)| at == now && owned.safe.is_some_and(|safe| safe[0] != raw[0]));
             let known = self.known(var);
             if is_other && known.safe && !known.unconfirmed && spec.link(owned.way).is_some() {
-                doubted.push(var);
+                revoked.push(var);
             }
         }
-        for var in &doubted {
+        for var in &revoked {
             self.known[var.ordinal()].unconfirmed = true;
         }
-        self.write_again(spec, doubted);
+        self.write_again(spec, revoked);
     }
 
     fn confirm(&mut self, var: SysVar, by_recipe: bool, now: Instant) {
@@ -153,7 +154,7 @@ impl Upward {
         if !self.may_confirm(now) {
             return;
         }
-        let since = self.doubted_at + SHOWN_AFTER;
+        let since = self.unconfirmed_at + SHOWN_AFTER;
         for &var in &spec.safe_vars {
             let safe = spec.owned[var.ordinal()].and_then(|owned| owned.safe);
             let shown = spec.witness[var.ordinal()].and_then(|witness| self.known(witness).value);

@@ -125,8 +125,8 @@ pub(super) struct Upward {
     pub era: u64,
     /// When a frame was last handed over on each recipe link's present connection, and in which era.
     pub handed_over: [Option<(Instant, u64)>; 16],
-    /// When a safe value was last in doubt.
-    pub doubted_at: Instant,
+    /// When a safe value last became unconfirmed.
+    pub unconfirmed_at: Instant,
     /// When a safe value of a recipe link was last confirmed.
     pub confirmed_at: Option<Instant>,
     /// When each recipe link repeats safe values.
@@ -155,7 +155,7 @@ impl Upward {
             heard_at: None,
             era: 0,
             handed_over: [None; 16],
-            doubted_at: Instant::ZERO,
+            unconfirmed_at: Instant::ZERO,
             confirmed_at: None,
             rewrite_at: [Instant::NEVER; 16],
             next_overdue: Instant::NEVER,
@@ -309,7 +309,7 @@ impl Upward {
             known.safe = true;
             known.safe_at = now;
             known.unconfirmed = true;
-            self.doubted_at = now;
+            self.unconfirmed_at = now;
         } else {
             let waited = known.waiting.len() as u32;
             known.waiting.clear();
