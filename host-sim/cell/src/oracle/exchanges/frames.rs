@@ -41,7 +41,7 @@ impl Seen {
         }
     }
 
-    /// The same of an exchange that is not awaited.
+    /// The same of an exchange that is not pending.
     pub(super) fn late(self, row: usize) -> Self {
         match self {
             Self::Reply(len) | Self::Refusal(len) => Self::Late(len, row),

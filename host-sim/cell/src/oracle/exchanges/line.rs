@@ -92,7 +92,7 @@ struct RowWatch {
     request: Option<Vec<u8>>,
     /// How many replies to earlier transmissions may still come, and until when.
     outstanding: (u8, Instant),
-    /// Until when one of its replies, or one like it, has been awaited.
+    /// Until when one of its replies, or one like it, has been pending.
     blocked_until: Instant,
     was_answered: bool,
     is_missed: bool,
@@ -397,12 +397,12 @@ impl ExchangesWatch {
         }
     }
 
-    /// Whether a reply is awaited to a request that has left.
+    /// Whether a reply to a request that has left is pending.
     pub(in crate::oracle) fn waits(&self) -> bool {
         self.flight.as_ref().is_some_and(|flight| flight.sent.is_some())
     }
 
-    /// The exchanges whose replies may come although they are not awaited, each with its newest request.
+    /// The exchanges whose replies may come although none is pending, each with its newest request.
     fn late_rows(&self, now: Instant) -> impl Iterator<Item = (usize, &RowWatch)> {
         let own = self.flight.as_ref().map(|flight| flight.row);
         let rows = self.rows.iter().enumerate();
@@ -442,8 +442,8 @@ impl ExchangesWatch {
         }
     }
 
-    /// The exchange that a reply is awaited to, and the request.
-    pub(super) fn awaits<'t>(&self, exchanges: &'t ExchangesSpec) -> Option<(&'t RowSpec, &[u8])> {
+    /// The exchange whose reply is pending, and its request.
+    pub(super) fn pending<'t>(&self, exchanges: &'t ExchangesSpec) -> Option<(&'t RowSpec, &[u8])> {
         self.flight.as_ref().map(|flight| (&exchanges.rows[flight.row], &flight.request[..]))
     }
 

@@ -84,7 +84,7 @@ impl Oracle {
                 Seen::Refusal(len) => {
                     let refusal = watch.line.take_front(len);
                     let is_modbus =
-                        watch.exchanges.awaits(exchanges).is_some_and(|(row, _)| row.frames.is_none());
+                        watch.exchanges.pending(exchanges).is_some_and(|(row, _)| row.frames.is_none());
                     let ended = Ended::refused(refusal.get(2).copied().unwrap_or(0), is_modbus);
                     self.answered(nth, &refusal, ended, now);
                 }
@@ -113,11 +113,11 @@ impl Oracle {
         let is_it = |own: &super::spec::Frame| {
             own.id == Some(frame.id()) && look(own, frame.data()) == Look::Frame(frame.data().len())
         };
-        let awaited = watch.exchanges.awaits(exchanges);
-        let frames = awaited.and_then(|(row, _)| row.frames.as_ref());
+        let pending = watch.exchanges.pending(exchanges);
+        let frames = pending.and_then(|(row, _)| row.frames.as_ref());
         let is_reply = frames.and_then(|frames| frames.reply.as_ref()).is_some_and(is_it);
         let is_refusal = frames.and_then(|frames| frames.refusal.as_ref()).is_some_and(is_it)
-            || awaited.is_some_and(|(row, request)| row.is_abort(request, frame.id(), frame.data()));
+            || pending.is_some_and(|(row, request)| row.is_abort(request, frame.id(), frame.data()));
         let is_answer = |row: &RowSpec| {
             let frames = row.frames.as_ref().filter(|frames| frames.is_asked);
             frames.is_some_and(|frames| frames.reply.iter().chain(&frames.refusal).any(is_it))

@@ -85,10 +85,10 @@ pub(in crate::oracle) enum Kind {
     State,
 }
 
-/// What bytes are while a reply is awaited.
+/// What bytes are while a reply is pending.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::oracle) enum Seen {
-    /// Not the beginning of what is awaited.
+    /// Not the beginning of what is expected.
     No,
     /// Perhaps its beginning; whether all constants so far are its own.
     Begins {
