@@ -38,7 +38,7 @@ impl Cell {
             self.show_controller();
         }
         if let Some(due) = self.queue.pop_due(self.now) {
-            self.carry_out(due);
+            self.execute(due);
             return;
         }
         self.poll_devices();
@@ -151,21 +151,21 @@ impl Cell {
             #[cfg(test)]
             if let Some(forged) = self.forged_outputs(&input, &output) {
                 for forged in &forged {
-                    self.hand_over(forged.as_output());
+                    self.execute_output(forged.as_output());
                 }
                 if !matches!(output, Output::Sleep { .. }) {
                     continue;
                 }
             }
-            if !self.hand_over(output) {
+            if !self.execute_output(output) {
                 break;
             }
         }
         self.buffer = Some(buf);
     }
 
-    /// Carries out the engine's output; false if it was `Sleep`.
-    fn hand_over(&mut self, output: Output<'_>) -> bool {
+    /// Executes the engine's output; false if it was `Sleep`.
+    fn execute_output(&mut self, output: Output<'_>) -> bool {
         let now = self.now;
         if let Some(recorder) = &mut self.recorder {
             recorder.output(output);
@@ -294,7 +294,7 @@ impl Cell {
         }
     }
 
-    pub(super) fn carry_out(&mut self, due: Due) {
+    pub(super) fn execute(&mut self, due: Due) {
         let Some(due) = self.keep_for_later(due) else { return };
         match due {
             Due::LinkUp { link, generation } => {

@@ -148,7 +148,7 @@ pub struct Cell {
     controller_is_seen: bool,
     /// The earliest deadline of all devices.
     devices_wake: Instant,
-    /// For what the engine hands over; `None` while it is used.
+    /// For what the engine sends; `None` while it is used.
     buffer: Option<Box<[u8; OUTPUT_BUFFER]>>,
     now: Instant,
     queue: Queue<Due>,
@@ -173,7 +173,7 @@ pub struct Cell {
     recorder: Option<Recorder>,
     /// The model that checks everything; `None` before [`Cell::watch`].
     oracle: Option<Box<Oracle>>,
-    /// Judges what the device carries out, in a cell of its own.
+    /// Judges what the device executes, in a cell of its own.
     judge: Option<Box<judge::Judge>>,
     /// Changes the engine's inputs and outputs, so that the gateway breaks its promises.
     #[cfg(test)]

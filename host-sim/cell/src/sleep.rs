@@ -3,7 +3,7 @@
 //!
 //! Bounds: 4 KiB per line, 256 frames per bus, 256 datagrams per link; more is lost. Connections lose
 //! nothing: data stays with the sender. The kernel still sends, acknowledges and retransmits what was
-//! handed over before.
+//! sent before.
 
 use proto_core::engine::{BusState, Input, LinkId, PortId};
 use proto_core::time::Duration;
@@ -99,7 +99,7 @@ impl Cell {
 
     fn report_link_events(&mut self, waiting: Vec<Due>) {
         for due in waiting {
-            self.carry_out(due);
+            self.execute(due);
         }
         let conns: Vec<u64> = self.gates.values().filter_map(|gate| gate.conn).collect();
         for conn in conns {

@@ -1,7 +1,7 @@
 //! One direction of a TCP connection: data arrives once and in order, or not at all; data lost in
 //! the network is sent again after growing waits.
 //!
-//! In: what the sender hands over, and whether the path is cut. Out: when something arrives or is
+//! In: what the sender sends, and whether the path is cut. Out: when something arrives or is
 //! retransmitted. Does not model windows or congestion: after a loss everything waits for the next
 //! retransmission, as in a real stack while nothing is acknowledged.
 
@@ -23,7 +23,7 @@ pub(super) struct Pipe {
     pub dead: bool,
     /// The connection is reset after this many more bytes have arrived.
     pub reset_after: Option<usize>,
-    /// Number of bytes that were handed over.
+    /// Number of bytes that were sent.
     pub sent: u64,
     /// Number of these that have arrived.
     pub arrived: u64,

@@ -142,7 +142,7 @@ pub enum Happened {
         /// `modbus`, `program`, `control` or a port's name.
         by: String,
     },
-    /// An operation was carried out.
+    /// An operation was executed.
     Operation {
         /// The operation, as it was given.
         #[serde(flatten)]

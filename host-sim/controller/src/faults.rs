@@ -156,7 +156,7 @@ impl Faults {
 
 /// Faults of the connection to the controller.
 impl Controller {
-    /// Drops all answers of the server from now on; requests are still carried out.
+    /// Drops all answers of the server from now on; requests are still executed.
     pub fn mute(&mut self, link: Link) {
         self.quiet.ends();
         self.faults.muted[link as usize] = true;

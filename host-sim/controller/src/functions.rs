@@ -2,7 +2,7 @@
 //! section 7).
 //!
 //! An input's rising edge does what its command on port 2000 would do, and nobody is answered. Several edges at
-//! one instant are carried out in the order of [`Function::ALL`].
+//! one instant are executed in the order of [`Function::ALL`].
 
 use proto_core::command::Action;
 use proto_core::time::Instant;
@@ -13,8 +13,8 @@ use super::Controller;
 use super::machine::{ErrorId, Machine};
 
 impl Controller {
-    /// Carries out the functions of the inputs that have risen.
-    pub(super) fn carry_out_functions(&mut self, now: Instant) {
+    /// Executes the functions of the inputs that have risen.
+    pub(super) fn execute_functions(&mut self, now: Instant) {
         let Some(risen) = self.registers.take_risen() else { return };
         let inputs = &self.config.functions.inputs;
         let due: Vec<FunctionInput> = Function::ALL
@@ -24,14 +24,14 @@ impl Controller {
             .copied()
             .collect();
         for FunctionInput { item, function } in due {
-            if self.carry_out_function(now, function).is_err() {
+            if self.execute_function(now, function).is_err() {
                 self.name_input(item);
             }
             self.settle(now);
         }
     }
 
-    fn carry_out_function(&mut self, now: Instant, function: Function) -> Result<(), ErrorId> {
+    fn execute_function(&mut self, now: Instant, function: Function) -> Result<(), ErrorId> {
         let action = match function {
             Function::Start => {
                 let program = self.config.functions.start.clone().unwrap_or_default();

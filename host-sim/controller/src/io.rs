@@ -102,7 +102,7 @@ pub enum ControllerInput<'a> {
         /// The frame.
         frame: CanFrame,
     },
-    /// Everything handed over to the port was sent.
+    /// Everything given to the port has left.
     PortSent {
         /// The port.
         port: usize,
@@ -111,7 +111,7 @@ pub enum ControllerInput<'a> {
     Tick,
 }
 
-/// A task for the caller. The enum is exhaustive because the caller must carry out all of them.
+/// A task for the caller. The enum is exhaustive because the caller must execute all of them.
 #[derive(Debug, Clone, PartialEq)]
 pub enum ControllerOutput {
     /// Send bytes on a TCP connection.
@@ -121,7 +121,7 @@ pub enum ControllerOutput {
         /// The bytes.
         bytes: Vec<u8>,
     },
-    /// Close a TCP connection after everything handed over for it was sent. Report nothing more about it.
+    /// Close a TCP connection after everything for it has left. Report nothing more about it.
     Close {
         /// The connection.
         conn: ConnId,

@@ -61,7 +61,7 @@ impl Controller {
             self.settle(now);
         }
         self.settle(now);
-        self.carry_out_functions(now);
+        self.execute_functions(now);
         self.refresh(now);
         if self.running.is_some() {
             self.drive_program(now);
@@ -98,7 +98,7 @@ impl Controller {
         Ok(transition)
     }
 
-    /// Carries out the effect of a state change.
+    /// Executes the effect of a state change.
     pub(super) fn apply(&mut self, now: Instant, effect: Effect) {
         match effect {
             Effect::None => {}

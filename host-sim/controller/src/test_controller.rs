@@ -260,7 +260,7 @@ impl TestController {
         }
     }
 
-    /// Carries out an operation, given as JSON (docs/control.md section 2), and returns its result.
+    /// Executes an operation, given as JSON (docs/control.md section 2), and returns its result.
     ///
     /// # Errors
     /// [`Refused`]: why it was refused; nothing changed.
@@ -286,7 +286,7 @@ impl TestController {
         self.drain();
     }
 
-    /// Carries out all outputs and returns when to call again.
+    /// Executes all outputs and returns when to call again.
     pub(crate) fn drain(&mut self) -> Instant {
         loop {
             match self.controller.poll_output(self.now) {

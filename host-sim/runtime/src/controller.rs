@@ -258,7 +258,7 @@ impl ControllerRuntime {
         }
     }
 
-    /// Reports an event to the controller and carries out its outputs.
+    /// Reports an event to the controller and executes its outputs.
     fn input(&self, input: ControllerInput<'_>) {
         let now = self.clock.now();
         self.note_activity();
@@ -266,7 +266,7 @@ impl ControllerRuntime {
         self.drain(now);
     }
 
-    /// Carries out an operation, with its outputs.
+    /// Executes an operation, with its outputs.
     fn operate(&self, operation: &Operation) -> Result<Value, String> {
         let now = self.clock.now();
         self.note_activity();
@@ -280,7 +280,7 @@ impl ControllerRuntime {
     }
 
     fn drain(&self, now: Instant) {
-        // An output can cause a report; it must wait until the outputs before it are carried out.
+        // An output can cause a report; it must wait until the outputs before it are executed.
         if self.busy.replace(true) {
             return;
         }
@@ -295,7 +295,7 @@ impl ControllerRuntime {
                 };
                 self.controller.borrow_mut().handle(now, input);
             } else {
-                self.carry_out(output);
+                self.execute(output);
             }
         };
         self.busy.set(false);
@@ -307,7 +307,7 @@ impl ControllerRuntime {
         self.tell_events();
     }
 
-    fn carry_out(&self, output: ControllerOutput) {
+    fn execute(&self, output: ControllerOutput) {
         match output {
             ControllerOutput::Send { conn, bytes } => self.send(conn, &bytes),
             ControllerOutput::Close { conn } => {

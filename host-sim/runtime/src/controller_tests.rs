@@ -199,7 +199,7 @@ fn of_too_many_closed_connections_that_still_send_the_oldest_is_aborted() {
             // Unread answers, until some wait in this process.
             let connection = Rc::clone(&runtime.connections.borrow()[&conn].connection);
             while connection.send(&[0; 4_096]) == Accepted::All {}
-            runtime.carry_out(ControllerOutput::Close { conn });
+            runtime.execute(ControllerOutput::Close { conn });
         }
         assert_eq!(runtime.lingering.borrow().len(), MAX_LINGERING);
         assert_eq!(runtime.counters.get().cut_answers, 3);

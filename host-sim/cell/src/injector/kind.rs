@@ -25,7 +25,7 @@ pub enum FaultKind {
     Cable,
     /// Another program sends datagrams to a port where the gateway listens.
     Stranger,
-    /// A server carries out requests but does not answer.
+    /// A server executes requests but does not answer.
     Mute,
     /// A server's answers are late.
     SlowAnswers,

@@ -1,4 +1,4 @@
-//! What devices carried out, judged by two logs: the device's own, and the robot's (docs/cell.md section 5).
+//! What devices executed, judged by two logs: the device's own, and the robot's (docs/cell.md section 5).
 //!
 //! In: what each device did and when, as it decoded the requests by itself; the controller's registers whenever they
 //! change, and which of them it has served to whom. Out: violations. Knows neither the engine nor what the
@@ -39,7 +39,7 @@ use rules::{MOVE_BIT, STOP_BIT, Source};
 pub enum Act {
     /// It received a whole request of its own: an order, or a question.
     Heard(Option<Order>),
-    /// It carried out an order with these values.
+    /// It executed an order with these values.
     Did(Order, Vec<u32>),
     /// It refused an order with a code.
     Refused(Order, u8),
@@ -88,9 +88,9 @@ pub(crate) struct Judge {
     held: Vec<VecDeque<(Instant, u16)>>,
     /// What the robot's registers had of them when they were looked at.
     shown: Vec<Option<u16>>,
-    /// The events that were carried out, by the instant of the rise.
+    /// The events that were executed, by the instant of the rise.
     moved: VecDeque<Moved>,
-    /// A stop that is to be carried out.
+    /// A stop that is to be executed.
     stop: Option<Pending>,
     stop_heard: Option<Instant>,
     /// How often it may be started.
@@ -115,7 +115,7 @@ pub(crate) struct Judge {
     violation: Option<Violation>,
 }
 
-/// An event that was carried out.
+/// An event that was executed.
 #[derive(Debug, Clone, Copy)]
 struct Moved {
     at: Instant,
@@ -123,7 +123,7 @@ struct Moved {
     from: Instant,
     /// When a good reply to it left.
     replied: Option<Instant>,
-    /// The step behind it was carried out.
+    /// The step behind it was executed.
     stepped: bool,
 }
 
@@ -339,7 +339,7 @@ impl Judge {
         ))
     }
 
-    /// The device carries out an event: the bit must have risen, just now, for no other.
+    /// The device executes an event: the bit must have risen, just now, for no other.
     fn moves(&mut self, values: &[u32], now: Instant) -> Result<(), String> {
         let rules = &self.rules;
         let found = self.robot.rise_for(rules, values, self.stop_heard, now)?;
@@ -493,7 +493,7 @@ impl Judge {
 }
 
 impl Cell {
-    /// Judges from now on what the device of a cell carries out, by its own log and the robot's. Time stops after the
+    /// Judges from now on what the device of a cell executes, by its own log and the robot's. Time stops after the
     /// first violation. Call it before time advances.
     pub(crate) fn judge_device(&mut self, rules: Rules) {
         self.judge = Some(Box::new(Judge::new(rules, self.now)));
@@ -644,7 +644,7 @@ pub(crate) fn bits() -> (SysVar, u8, u8) {
 /// What was held longer ago is not needed.
 const REMEMBERED: Duration = Duration::from_secs(10);
 const MOVES: usize = 16;
-/// A request is at its device so long after it was handed over, at most.
+/// A request is at its device so long after it was sent, at most.
 const ON_THE_LINE: Duration = Duration::from_millis(100);
 /// A longer stall of the gateway is sleep, after which nothing goes on.
 const STALL: Duration = Duration::from_millis(500);

@@ -12,7 +12,7 @@ use super::rules::{MOVE_BIT, Rules, STOP_BIT, Source, var};
 pub(super) struct Robot {
     bits: SysVar,
     first_coil: u16,
-    /// When the bit that asks for a motion rose, and whether that was carried out.
+    /// When the bit that asks for a motion rose, and whether that was executed.
     rises: VecDeque<(Instant, bool)>,
     was_on: bool,
     words: Vec<Word>,
@@ -61,7 +61,7 @@ struct Conn {
     open: Vec<usize>,
 }
 
-/// The rise that an order was carried out for.
+/// The rise that an order was executed for.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Rise {
     /// When the controller answered with it.
@@ -101,7 +101,7 @@ impl Robot {
         }
     }
 
-    /// How long what was handed over since then may have waited in the transport: a gateway that is not called takes
+    /// How long what was sent since then may have waited in the transport: a gateway that is not called takes
     /// nothing back.
     pub(super) fn transport(&self, rules: &Rules, since: Instant) -> Duration {
         if self.not_called >= since { rules.transport } else { Duration::ZERO }
@@ -220,7 +220,7 @@ impl Robot {
         reading?.taken
     }
 
-    /// The rise that an order with these values, carried out now, is of. It is used up. Of several that it may be, it is
+    /// The rise that an order with these values, executed now, is of. It is used up. Of several that it may be, it is
     /// the first before which the device had heard of each stop; it did so `heard` last.
     pub(super) fn rise_for(
         &mut self,
@@ -234,7 +234,7 @@ impl Robot {
         let mut why = "it was carried out, and the bit was not read rising".to_owned();
         for nth in 0..self.readings.len() {
             let on = self.readings[nth];
-            // What the gateway handed over before it started anew may still be on the line.
+            // What the gateway sent before it started anew may still be on the line.
             let is_of_before = on.answered < self.started && now > self.started + super::ON_THE_LINE;
             if !on.moves || is_of_before {
                 continue;

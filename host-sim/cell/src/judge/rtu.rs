@@ -46,12 +46,12 @@ impl Slave {
     }
 }
 
-/// What a device with these places answers to a request, which is carried out.
+/// What a device with these places answers to a request, which is executed.
 pub(super) fn answer(machine: &mut Machine, places: &[Place], pdu: &[u8]) -> Vec<u8> {
-    carry_out(machine, places, pdu).unwrap_or_else(|code| vec![pdu[0] | 0x80, code])
+    execute(machine, places, pdu).unwrap_or_else(|code| vec![pdu[0] | 0x80, code])
 }
 
-fn carry_out(machine: &mut Machine, places: &[Place], pdu: &[u8]) -> Result<Vec<u8>, u8> {
+fn execute(machine: &mut Machine, places: &[Place], pdu: &[u8]) -> Result<Vec<u8>, u8> {
     let word = |at: usize| pdu.get(at..at + 2).map(|two| u16::from_be_bytes([two[0], two[1]]));
     let (function, Some(address), Some(second)) = (pdu[0], word(1), word(3)) else { return Err(3) };
     let count = if matches!(function, 5 | 6) { 1 } else { second };

@@ -31,7 +31,7 @@ pub(crate) struct Rules {
     pub stale_after: Duration,
     /// What was away for so long has started.
     pub absent: Duration,
-    /// How long what was handed over may wait in the transport of a gateway that is not called.
+    /// How long what was sent may wait in the transport of a gateway that is not called.
     pub transport: Duration,
     /// The most that each variable may be, for the program; beyond it nothing is sent.
     pub limits: Vec<(SysVar, u16)>,

@@ -37,7 +37,7 @@ impl Units {
         Self { machine, units, came, is_open: false, leaving, not_before: Instant::ZERO }
     }
 
-    /// Carries out a request, which has the length that its header says.
+    /// Executes a request, which has the length that its header says.
     fn handle(&mut self, frame: &[u8], now: Instant) {
         let (id, pdu) = (frame[6], &frame[7..]);
         let Some(unit) = self.units.iter().find(|unit| unit.id == id) else {

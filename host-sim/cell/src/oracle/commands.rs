@@ -30,7 +30,7 @@ pub(super) struct Command {
     pub picked: Instant,
     /// For an urgent one: since when it is no longer requested, or since when it waits again.
     since: Instant,
-    /// When it was handed over, of one that is unanswered.
+    /// When it was sent, of one that is unanswered.
     sent: Instant,
 }
 

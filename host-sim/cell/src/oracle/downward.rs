@@ -70,7 +70,7 @@ impl Downward {
         self.is_up && !self.is_bus_off
     }
 
-    /// Whether what was handed over has not left, or the line is somebody else's.
+    /// Whether what was sent has not left, or the line is somebody else's.
     pub(super) fn is_busy(&self) -> bool {
         self.in_flight
     }
@@ -125,7 +125,7 @@ impl Downward {
         self.in_flight = false;
     }
 
-    /// The gateway slept: due frames are dropped, frames that were handed over stay in flight.
+    /// The gateway slept: due frames are dropped, frames that were sent stay in flight.
     pub(super) fn slept(&mut self) {
         let in_flight = self.in_flight;
         self.reset();
@@ -178,7 +178,7 @@ impl Downward {
         })
     }
 
-    /// A request of so many bytes was handed over.
+    /// A request of so many bytes was sent.
     pub(super) fn asked(&mut self, len: usize) {
         self.frames_out = self.frames_out.wrapping_add(1);
         self.bytes_out = self.bytes_out.wrapping_add(len as u32);
@@ -186,7 +186,7 @@ impl Downward {
         self.in_flight = true;
     }
 
-    /// Checks a frame that the engine hands over; `id` is that of a CAN frame.
+    /// Checks a frame that the engine sends; `id` is that of a CAN frame.
     pub(super) fn check(
         &mut self,
         spec: &Spec,

@@ -13,7 +13,7 @@ use super::upward::Wrong;
 use super::wire::Safe;
 use super::{Invariant, LinkWatch, Oracle, PortWatch, place};
 
-/// What a field port hands over.
+/// What a field port sends.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Leaving<'a> {
     /// Of a CAN frame.

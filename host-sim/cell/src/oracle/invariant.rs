@@ -17,7 +17,7 @@ pub enum Invariant {
     NoReplay,
     /// The edges of bits are written in order, or counted.
     Edges,
-    /// A waiting value is handed over as soon as its link is free.
+    /// A waiting value is sent as soon as its link is free.
     Delivered,
     /// Every frame on the wire is applied or counted: all counters agree with the model's.
     Counted,
@@ -73,11 +73,11 @@ pub enum Invariant {
     Periods,
     /// A slave that answers soon has the controller's values.
     Told,
-    /// A device carries out an event at most once for a rise, in time, with the robot's values since the rise.
+    /// A device executes an event at most once for a rise, in time, with the robot's values since the rise.
     EventsOnce,
     /// A stop comes before every event, and soon.
     StopsFirst,
-    /// What a device is told at its start is carried out once for each start.
+    /// What a device is told at its start is executed once for each start.
     StartsOnce,
     /// What the robot is shown of a device was so, not long ago.
     DeviceValues,

@@ -145,7 +145,7 @@ impl Oracle {
         self.looks_at_write();
         self.checks[Invariant::Edges as usize] += u64::from(var.is_bits());
         let carried = self.up.wrote(&self.spec, link, var, raw, now)?;
-        self.robot.hands_over(var, raw, carried);
+        self.robot.note_sent(var, raw, carried);
         Ok(())
     }
 
@@ -154,7 +154,7 @@ impl Oracle {
         self.checks[Invariant::Edges as usize] += 1;
         let (carried, safe) = self.up.wrote_bits(&self.spec, coils, now)?;
         for carried in carried {
-            self.robot.hands_over(coils.var, [coils.on, 0, 0, 0], carried);
+            self.robot.note_sent(coils.var, [coils.on, 0, 0, 0], carried);
         }
         Ok(safe)
     }
@@ -208,7 +208,7 @@ impl Oracle {
                 self.checks[Invariant::InTime as usize] += 1;
                 let carried = self.up.carried(&self.spec, link_spec, (var, raw), now)?;
                 wanted |= is_ours && self.up.known(var).safe;
-                self.robot.hands_over(var, raw, carried);
+                self.robot.note_sent(var, raw, carried);
             }
         }
         if !wanted {

@@ -66,7 +66,7 @@ struct LinkWatch {
     line: LineWatch,
     stream: stream::Stream,
     busy: bool,
-    /// Number of bytes handed over since the link came up, in total and up to the end of each
+    /// Number of bytes sent since the link came up, in total and up to the end of each
     /// unacknowledged transmission.
     total: u64,
     unacked: VecDeque<u64>,
@@ -77,7 +77,7 @@ impl LinkWatch {
         !self.busy && self.unacked.len() < MAX_UNACKED
     }
 
-    fn hands_over(&mut self, bytes: &[u8]) {
+    fn note_sent(&mut self, bytes: &[u8]) {
         self.total += bytes.len() as u64;
         self.unacked.push_back(self.total);
     }
@@ -237,7 +237,7 @@ impl Oracle {
         if has_slept {
             self.commands.slept(now);
             self.robot.forget_all(now);
-            // A master's request that waited is not carried out: nobody knows how old it is.
+            // A master's request that waited is not executed: nobody knows how old it is.
             for watch in &mut self.ports {
                 watch.line.discarded += watch.served.discard();
             }
@@ -336,10 +336,10 @@ impl Oracle {
             Output::LinkClose { link } => self.link_lost(link, now),
             Output::LinkSend { link, bytes } => {
                 self.traffic[place(link)].0 += 1;
-                // Values handed over to a lost connection never leave: start with none.
+                // Values sent to a lost connection never leave: start with none.
                 self.robot.hands_over_nothing();
                 if self.spec.link(link).is_some_and(|link| !link.is_datagram) {
-                    self.links[place(link)].hands_over(bytes);
+                    self.links[place(link)].note_sent(bytes);
                 }
                 let result = self.link_send(link, bytes, now);
                 self.judge(now, &[], result);

@@ -374,7 +374,7 @@ fn a_held_value_from_before_the_controller_began_anew() {
     let held = Carried::Held { accepted: cell.now() - Duration::from_secs(4) };
     let mut oracle = cell.oracle.take().unwrap();
     let now = cell.now();
-    oracle.robot.hands_over(SysVar::parse("ForceEnd[1]").unwrap(), 7.5_f32.to_le_bytes(), held);
+    oracle.robot.note_sent(SysVar::parse("ForceEnd[1]").unwrap(), 7.5_f32.to_le_bytes(), held);
     oracle.sent(7, LinkId::of_port(PortId(0)), b"frame", Duration::ZERO, now);
     oracle.delivered(7, 5, Duration::ZERO, now);
     assert_eq!(oracle.violation().map(|broken| broken.invariant), Some(Invariant::NoReplay));

@@ -109,7 +109,7 @@ pub(super) struct LinkSpec {
     pub output: Option<Frame>,
     /// Variables in its frames up are read back while their owners are overdue.
     pub reads_back: bool,
-    /// How long what is handed over may be in flight. After that, unacknowledged data is given up with its
+    /// How long what is sent may be in flight. After that, unacknowledged data is given up with its
     /// connection. Datagrams do not wait.
     pub not_after: Duration,
 }

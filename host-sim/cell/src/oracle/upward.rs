@@ -51,7 +51,7 @@ pub(super) struct Known {
     pub unreadable: bool,
     /// It has its safe value, and the controller is not known to have it.
     pub unconfirmed: bool,
-    /// Its owner became overdue before the last value was handed over.
+    /// Its owner became overdue before the last value was sent.
     pub unsent: bool,
     /// Values that waited while the gateway slept; `None` once a frame has come since.
     pub slept: Option<Vec<Raw>>,
@@ -77,7 +77,7 @@ impl Known {
     }
 }
 
-/// The origin of a value that was handed over.
+/// The origin of a value that was sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Carried {
     /// It is a safe value.
@@ -85,7 +85,7 @@ pub(super) enum Carried {
     /// The controller holds it already, as far as is known, since the last frame of its overdue owner.
     Held { accepted: Instant },
     /// It came at this time, in its owner's frame or from the state stream, and may have this age when it
-    /// is handed over.
+    /// is sent.
     Of { arrived: Instant, timeout: Duration },
 }
 
@@ -123,7 +123,7 @@ pub(super) struct Upward {
     /// When data came that the controller sends steadily, and how often after a gap.
     heard_at: Option<Instant>,
     pub era: u64,
-    /// When a frame was last handed over on each recipe link's present connection, and in which era.
+    /// When a frame was last sent on each recipe link's present connection, and in which era.
     pub handed_over: [Option<(Instant, u64)>; 16],
     /// When a safe value last became unconfirmed.
     pub unconfirmed_at: Instant,
@@ -493,7 +493,7 @@ impl Upward {
         }
     }
 
-    /// When a frame was last handed over to a controller that has not restarted since, as far as is known.
+    /// When a frame was last sent to a controller that has not restarted since, as far as is known.
     fn handed_over(&self, link: &LinkSpec, now: Instant) -> Option<Instant> {
         let (at, era) = self.handed_over[usize::from(link.id.0)]?;
         let is_there = !link.is_datagram || era == self.era && !is_gap(self.heard_at, now);

@@ -197,7 +197,7 @@ impl Batch {
             if run >= self.share_runs().end {
                 return;
             }
-            self.carry_out(run);
+            self.execute(run);
         }
     }
 
@@ -228,7 +228,7 @@ impl Batch {
         total
     }
 
-    fn carry_out(&self, run: usize) {
+    fn execute(&self, run: usize) {
         let seed = self.seed_of(run);
         let Some(scenario) = Self::scenario_of(&self.scenarios, seed) else { return };
         let length = self.between(run..run + 1);

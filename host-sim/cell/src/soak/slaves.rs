@@ -90,7 +90,7 @@ impl Slaves {
         (!slaves.is_empty()).then_some(Self { rng, slaves, leaving: Vec::new(), done: Vec::new() })
     }
 
-    /// Lets a slave carry out what it was asked.
+    /// Lets a slave execute what it was asked.
     fn answer(&mut self, nth: usize, now: Instant) {
         let rng = &mut self.rng;
         let others: Vec<u8> = self.slaves.iter().map(|slave| slave.address).collect();

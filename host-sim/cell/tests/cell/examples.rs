@@ -272,7 +272,7 @@ fn a_station_starts_programs_and_reads_the_reply_code() {
     assert_eq!((link.sent, link.received, link.refused, link.timeouts), (3, 3, 1, 0));
     let link = cell.link(LinkId::URGENT).counters;
     assert_eq!((link.sent, link.received, link.refused, link.timeouts), (1, 1, 0, 0), "stopping never waits");
-    // Without the controller an order is refused at once, and not carried out later.
+    // Without the controller an order is refused at once, and not executed later.
     cell.refuse(LinkId::COMMAND);
     cell.reset(LinkId::COMMAND);
     assert_eq!(send_command(&mut cell, &order(1, 1)).0, code(ReplyCode::NotSent));

@@ -382,7 +382,7 @@ fn a_can_bus_that_loses_goes_off_and_carries_strangers() {
     assert_eq!(cell.value("DO[1]"), 1.0);
     let counters = *cell.port("can-1");
     assert_eq!((counters.rejected_id, counters.rejected_length, counters.rejected_remote), (2, 2, 1));
-    // Bus-off: nothing is handed over; afterwards the cycles go on.
+    // Bus-off: nothing is sent; afterwards the cycles go on.
     cell.bus_off(bus);
     cell.bus(bus).take_heard();
     cell.run_ms(400);

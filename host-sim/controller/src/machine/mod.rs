@@ -254,7 +254,7 @@ impl Machine {
         [robot, program, safety].into_iter().flatten().min()
     }
 
-    /// Carries out the next due state change. Call it until it returns `None`.
+    /// Executes the next due state change. Call it until it returns `None`.
     pub fn poll(&mut self, now: Instant) -> Option<Effect> {
         if let Safety::Recovering { until } = self.safety
             && now >= until

@@ -4,7 +4,7 @@
 //! In: an [`Operation`], as JSON by serde. Out: its result as JSON, or why it was refused; a refused operation
 //! has changed nothing. The way it came in is its caller's.
 
-mod carry_out;
+mod execute;
 mod fault;
 
 use std::collections::BTreeMap;
@@ -18,7 +18,7 @@ use super::condition::Condition;
 use super::events::KINDS;
 use super::faults::Link;
 use super::machine::SafetyHold;
-pub(crate) use carry_out::number;
+pub(crate) use execute::number;
 pub use fault::{CorruptedValue, Fault, Kind, NoNumber};
 
 /// An operation. In JSON its name is the value of `do`.

@@ -183,7 +183,7 @@ impl Port {
         }
     }
 
-    /// Everything handed over was sent.
+    /// Everything given to the port has left.
     pub(super) fn sent(&mut self) {
         if self.transmitter == Transmitter::Sending {
             self.transmitter = Transmitter::Idle;

@@ -1,4 +1,4 @@
-//! Port 2000: the commands of a connection are carried out one after the other, and answered when they are
+//! Port 2000: the commands of a connection are executed one after the other, and answered when they are
 //! done (proto-core/docs/wire/command.md section 8, D25).
 //!
 //! A command that begins a transition is answered at its end. Until then further commands of the connection
@@ -27,7 +27,7 @@ pub(super) struct Session {
     /// Commands that wait until the one before is answered.
     waiting: VecDeque<(Command, Text)>,
     pending: Option<Pending>,
-    /// The command that is being carried out.
+    /// The command that is being executed.
     current: Text,
 }
 
@@ -57,7 +57,7 @@ enum Command {
 /// The next step of a connection.
 enum Step {
     Answer(Action, Progress),
-    CarryOut(Command),
+    Execute(Command),
 }
 
 impl From<ServerEvent<'_>> for Command {
@@ -100,7 +100,7 @@ impl Controller {
         }
     }
 
-    /// Carries out commands that silence has completed.
+    /// Executes commands that silence has completed.
     pub(super) fn poll_commands(&mut self, now: Instant) {
         let due = |session: &Session| session.parser.deadline().is_some_and(|deadline| now >= deadline);
         let sessions = self.server.command.iter();
@@ -136,13 +136,13 @@ impl Controller {
         self.settle(now);
     }
 
-    /// Answers commands whose transitions have ended, and carries out those that waited. To be called after
+    /// Answers commands whose transitions have ended, and executes those that waited. To be called after
     /// every change of the state machines.
     pub(crate) fn settle(&mut self, now: Instant) {
         self.note_states(now);
         while let Some((conn, step)) = self.next_step(now) {
             match step {
-                Step::CarryOut(command) => self.carry_out(now, conn, command),
+                Step::Execute(command) => self.execute(now, conn, command),
                 Step::Answer(action, progress) => {
                     let outcome = match progress {
                         Progress::Done => Outcome::Success,
@@ -178,11 +178,11 @@ impl Controller {
         free.find_map(|(&conn, session)| {
             let (command, text) = session.waiting.pop_front()?;
             session.current = text;
-            Some((conn, Step::CarryOut(command)))
+            Some((conn, Step::Execute(command)))
         })
     }
 
-    fn carry_out(&mut self, now: Instant, conn: ConnId, command: Command) {
+    fn execute(&mut self, now: Instant, conn: ConnId, command: Command) {
         match command {
             Command::Run { program, speed } => {
                 let outcome = match self.run(now, Some(conn), &program, speed) {

@@ -1,6 +1,6 @@
 //! The controller's TCP servers and its UDP server (docs/simulated-controller.md section 5).
 //!
-//! The number of connections is bounded; one more is closed at once and counted. An answer is handed over as
+//! The number of connections is bounded; one more is closed at once and counted. An answer is sent as
 //! a whole; the runtime sends it as fast as the connection takes it.
 
 mod commands;

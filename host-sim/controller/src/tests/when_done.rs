@@ -243,7 +243,7 @@ fn the_number_of_waiting_commands_is_bounded() {
     assert_eq!(cell.closed, []);
     cell.run_ms(300);
     assert_eq!(got(&mut cell, a), format!("poweron success{}", "1".repeat(MAX_ORDERS)));
-    // One more, in one piece with the rest: the waiting commands are not carried out.
+    // One more, in one piece with the rest: the waiting commands are not executed.
     let mut bytes = b"poweroff\nenable\n".to_vec();
     bytes.extend(b"isprogfinish\n".repeat(MAX_ORDERS));
     cell.input(ControllerInput::CommandBytes { conn: a, bytes: &bytes });

@@ -1,6 +1,6 @@
 //! The control socket (docs/control.md section 1): JSON lines, and what each asks for.
 //!
-//! Requests of one client are carried out in order. A client that does not read its answers is not read; one
+//! Requests of one client are executed in order. A client that does not read its answers is not read; one
 //! that follows events and does not read loses those that the controller no longer keeps.
 
 use std::cell::{Cell, RefCell};
@@ -140,7 +140,7 @@ impl ControllerRuntime {
         let mut read = BufReader::new(read);
         let reading = async {
             if !client.has_ended.get() {
-                self.carry_out_lines(client, &mut read).await?;
+                self.execute_lines(client, &mut read).await?;
             }
             client.has_ended.set(true);
             client.wake.notify_one();
@@ -161,7 +161,7 @@ impl ControllerRuntime {
         Ok(())
     }
 
-    async fn carry_out_lines(
+    async fn execute_lines(
         &self,
         client: &ControlClient,
         read: &mut BufReader<OwnedReadHalf>,

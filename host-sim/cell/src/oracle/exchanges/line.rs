@@ -18,7 +18,7 @@ use crate::oracle::upward::Wrong;
 #[derive(Debug, Clone, Default)]
 pub(in crate::oracle) struct ExchangesWatch {
     flight: Option<Flight>,
-    /// A request that was handed over has not left.
+    /// A request that was sent has not left.
     leaving: bool,
     /// The newest request has failed, and may be repeated.
     repeat: Option<Flight>,
@@ -46,7 +46,7 @@ pub(in crate::oracle) struct ExchangesWatch {
 pub(in crate::oracle) struct Flight {
     pub row: usize,
     pub request: Vec<u8>,
-    /// When the first of its repetitions was handed over.
+    /// When the first of its repetitions was sent.
     pub began: Instant,
     /// Until when its event may be sent.
     expires: Option<Instant>,
@@ -114,9 +114,9 @@ pub(super) enum Ended {
     Good,
     /// For good.
     Refused,
-    /// It has not carried it out.
+    /// It has not executed it.
     Busy,
-    /// It may have carried it out.
+    /// It may have executed it.
     Unclear,
 }
 
@@ -236,8 +236,8 @@ impl ExchangesWatch {
         }
     }
 
-    /// A request was handed over: checks that it may be sent now.
-    pub(super) fn hands_over(
+    /// A request was sent: checks that it may be sent now.
+    pub(super) fn note_sent(
         &mut self,
         port: &PortSpec,
         exchanges: &ExchangesSpec,
@@ -547,7 +547,7 @@ impl ExchangesWatch {
             Ended::Busy | Ended::Unclear => watch.waits_longer(spec.timeout, now),
         }
         if ended == Ended::Busy {
-            // It was not carried out, so it may be sent again.
+            // It was not executed, so it may be sent again.
             watch.starts |= spec.kind == Kind::Start;
             watch.risen = watch.risen.or(flight.expires);
         }
@@ -752,7 +752,7 @@ impl ExchangesWatch {
             || exchanges.rows_of(number).any(starts)
     }
 
-    /// Since when the exchange could be carried out without any failure on the line; `None` if it cannot.
+    /// Since when the exchange could be executed without any failure on the line; `None` if it cannot.
     pub(super) fn could_ask(&self, exchanges: &ExchangesSpec, row: usize) -> Option<Instant> {
         let number = exchanges.rows[row].slave;
         let (slave, watch) = (self.slaves.get(&number)?, &self.rows[row]);

@@ -215,7 +215,7 @@ impl Oracle {
         look_at_opening(&mut watch.exchanges, port, |row| {
             Downward::may_show_all(port, &self.up, row.shown(), now).is_ok()
         });
-        watch.exchanges.hands_over(port, exchanges, (row, bytes), line, now)?;
+        watch.exchanges.note_sent(port, exchanges, (row, bytes), line, now)?;
         let asked = &exchanges.rows[row];
         // What an event says was decided when it happened.
         if let Some(request) = asked.request.as_ref().filter(|_| asked.kind != Kind::Event) {
@@ -231,7 +231,7 @@ impl Oracle {
         Ok(())
     }
 
-    /// What was handed over has left.
+    /// What was sent has left.
     pub(super) fn port_sent(&mut self, nth: usize, now: Instant) {
         let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
         watch.down.sent();

@@ -159,11 +159,11 @@ impl Oracle {
         for (at, frame) in (1..).zip(&burst.frames) {
             let pdu = &frame[1..frame.len() - 2];
             match frame[0] {
-                0 if matches!(pdu[0], 5 | 6 | 15 | 16 | 22) => drop(self.carry_out(nth, pdu, now)),
+                0 if matches!(pdu[0], 5 | 6 | 15 | 16 | 22) => drop(self.execute(nth, pdu, now)),
                 address if address == own => {
                     // Behind an earlier request, its master no longer waits.
                     if at == burst.frames.len() && burst.rest.is_empty() && !too_many {
-                        reply = Some((pdu[0], self.carry_out(nth, pdu, now)));
+                        reply = Some((pdu[0], self.execute(nth, pdu, now)));
                     }
                 }
                 _ => others += 1,
@@ -183,8 +183,8 @@ impl Oracle {
         });
     }
 
-    /// Carries out a request; returns what answers it.
-    fn carry_out(&mut self, nth: usize, pdu: &[u8], now: Instant) -> Result<Vec<u8>, Exception> {
+    /// Executes a request; returns what answers it.
+    fn execute(&mut self, nth: usize, pdu: &[u8], now: Instant) -> Result<Vec<u8>, Exception> {
         let function = pdu[0];
         let word = |at: usize| Some(u16::from_be_bytes([*pdu.get(at)?, *pdu.get(at + 1)?]));
         let (table, most) = match function {

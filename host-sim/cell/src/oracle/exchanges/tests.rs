@@ -405,7 +405,7 @@ fn arrives(value: u8, age: Duration) -> Option<Invariant> {
     oracle.slave_did(0, SlaveDone { slave: 2, what }, held);
     let (var, now) = (SysVar::parse("WordInputReg[1]").unwrap(), held + age);
     let carried = Carried::Of { arrived: now, timeout: MS(1_000) };
-    oracle.robot.hands_over(var, [value, 0, 0, 0], carried);
+    oracle.robot.note_sent(var, [value, 0, 0, 0], carried);
     let write = [0, 0, 0, 0, 0, 9, 1, 16, 0, 128, 0, 1, 2, 0, value];
     oracle.sent(7, LinkId::MODBUS, &write, Duration::ZERO, now);
     let inputs = copied_inputs(cell.controller().registers().image());

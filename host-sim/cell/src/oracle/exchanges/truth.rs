@@ -45,7 +45,7 @@ struct Told {
 #[derive(Debug, Clone, Default)]
 struct LineTruth {
     answers: VecDeque<Answer>,
-    /// Requests of the gateway that write, and which slaves have carried them out.
+    /// Requests of the gateway that write, and which slaves have executed them.
     requests: VecDeque<(Instant, usize, Vec<u16>, BTreeSet<u8>)>,
     /// The newest request of each exchange that a device took, of frames of its own.
     took: BTreeMap<usize, Vec<u8>>,
@@ -236,7 +236,7 @@ impl Truth {
         }
     }
 
-    /// A slave has carried out a write of one of these exchanges: the gateway must have asked for it just
+    /// A slave has executed a write of one of these exchanges: the gateway must have asked for it just
     /// now, with values that the controller had together, and not long ago.
     fn wrote(
         &mut self,
@@ -513,7 +513,7 @@ fn come_together(spec: &Spec, row: &RowSpec) -> bool {
     })
 }
 
-/// A request is carried out within this time after it was handed over.
+/// A request is executed within this time after it was sent.
 const ON_THE_LINE: Duration = Duration::from_millis(250);
 /// A poll is given up after this time.
 const POLLED: Duration = Duration::from_millis(500);

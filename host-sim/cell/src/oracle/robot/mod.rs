@@ -30,7 +30,7 @@ pub(crate) struct Path {
     pub conn: Option<u64>,
     /// Data that is sent on it arrives.
     pub is_sound: bool,
-    /// The server there carries out and answers requests.
+    /// The server there executes and answers requests.
     pub is_served: bool,
 }
 
@@ -111,7 +111,7 @@ impl Robot {
         self.command = None;
     }
 
-    pub(super) fn hands_over(&mut self, var: SysVar, raw: Raw, carried: Carried) {
+    pub(super) fn note_sent(&mut self, var: SysVar, raw: Raw, carried: Carried) {
         self.values.push((var, raw, carried));
     }
 
@@ -442,14 +442,14 @@ impl Oracle {
     }
 }
 
-/// How long data handed over to a link may be in flight.
+/// How long data sent to a link may be in flight.
 fn not_after(spec: &Spec, link: LinkId) -> Duration {
     spec.link(link).map_or(Duration::from_millis(500), |link| link.not_after)
 }
 
 /// A command arrives within this time after it was picked.
 const COMMAND_TTL: Duration = Duration::from_secs(1);
-/// An urgent command is handed over within 1 s after the device last requested it, and acknowledged within
+/// An urgent command is sent within 1 s after the device last requested it, and acknowledged within
 /// another.
 const URGENT_TTL: Duration = Duration::from_secs(2);
 /// Parts of a transmission that is split into segments arrive at least a microsecond apart.

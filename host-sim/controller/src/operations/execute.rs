@@ -1,4 +1,4 @@
-//! Carrying out operations.
+//! Executing operations.
 
 use std::collections::BTreeMap;
 
@@ -11,7 +11,7 @@ use crate::Controller;
 use crate::program::{self, Script};
 
 impl Controller {
-    /// Carries out an operation. Call [`Self::poll_output`] until it returns
+    /// Executes an operation. Call [`Self::poll_output`] until it returns
     /// [`ControllerOutput::Sleep`](crate::ControllerOutput::Sleep) after it. `now` must not be earlier than in
     /// the last call.
     ///
@@ -25,7 +25,7 @@ impl Controller {
         }
         self.advance(now);
         let before = (!operation.is_reading()).then(|| self.recorder.before(&self.registers)).flatten();
-        let result = self.carry_out_operation(now, operation)?;
+        let result = self.execute_operation(now, operation)?;
         if !operation.is_reading() {
             self.operation_done(now, operation);
             if !matches!(operation, Operation::Restart { .. }) {
@@ -36,7 +36,7 @@ impl Controller {
         Ok(result)
     }
 
-    fn carry_out_operation(&mut self, now: Instant, operation: &Operation) -> Done {
+    fn execute_operation(&mut self, now: Instant, operation: &Operation) -> Done {
         match operation {
             Operation::State {} => return Ok(self.state(now)),
             Operation::Get { items } => return self.get_items(items),
