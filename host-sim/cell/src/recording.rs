@@ -16,10 +16,10 @@ pub(super) struct Recorder {
 impl Recorder {
     /// A recording of an engine with this configuration.
     pub(super) fn new(config: &GatewayConfig) -> Self {
-        let mut room = vec![0; image::MAX_IMAGE];
-        let len = image::encode(config, &mut room).expect("there is room for every configuration");
-        room.truncate(len);
-        let mut recorder = Self { image: room, bytes: MAGIC.to_vec() };
+        let mut buffer = vec![0; image::MAX_IMAGE];
+        let len = image::encode(config, &mut buffer).expect("the buffer fits every configuration");
+        buffer.truncate(len);
+        let mut recorder = Self { image: buffer, bytes: MAGIC.to_vec() };
         recorder.start();
         recorder
     }

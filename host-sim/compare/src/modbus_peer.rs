@@ -87,8 +87,8 @@ fn answer(socket: &mut TcpStream, waiting: &mut Vec<u8>, mut written: impl FnMut
     {
         let len = HEAD + usize::from(u16::from_be_bytes([rest[4], rest[5]]));
         let Some(request) = rest.get(..len) else { break };
-        let mut room = [0; ANSWER];
-        let (answer, value) = reply(request, &mut room);
+        let mut buffer = [0; ANSWER];
+        let (answer, value) = reply(request, &mut buffer);
         if let Some(value) = value {
             written(value);
         }
@@ -102,18 +102,18 @@ fn answer(socket: &mut TcpStream, waiting: &mut Vec<u8>, mut written: impl FnMut
 }
 
 /// The answer, and the first value of what writes registers.
-fn reply<'r>(request: &[u8], room: &'r mut [u8; ANSWER]) -> (&'r [u8], Option<u16>) {
+fn reply<'r>(request: &[u8], buffer: &'r mut [u8; ANSWER]) -> (&'r [u8], Option<u16>) {
     let word = |at: usize| u16::from_be_bytes([request[at], request[at + 1]]);
-    room[..8].copy_from_slice(&request[..8]);
+    buffer[..8].copy_from_slice(&request[..8]);
     let (len, value) = match request[7] {
         // Coils and registers: all are 0.
         function @ 1..=4 => {
             let bytes = if function < 3 { word(10).div_ceil(8) } else { 2 * word(10) };
-            room[8] = bytes as u8;
+            buffer[8] = bytes as u8;
             (9 + usize::from(bytes), None)
         }
         function @ (5 | 6 | 15 | 16) => {
-            room[8..12].copy_from_slice(&request[8..12]);
+            buffer[8..12].copy_from_slice(&request[8..12]);
             let value = match function {
                 6 => Some(word(10)),
                 16 => Some(word(13)),
@@ -123,6 +123,6 @@ fn reply<'r>(request: &[u8], room: &'r mut [u8; ANSWER]) -> (&'r [u8], Option<u1
         }
         function => panic!("function {function} is not expected"),
     };
-    room[4..6].copy_from_slice(&((len - HEAD) as u16).to_be_bytes());
-    (&room[..len], value)
+    buffer[4..6].copy_from_slice(&((len - HEAD) as u16).to_be_bytes());
+    (&buffer[..len], value)
 }

@@ -37,7 +37,7 @@ pub(super) enum Content {
     /// Numbers that sometimes pick commands.
     Commands { ty: ScalarType, values: Vec<i64> },
     /// A text, which is made of a random number; the frame's layout says how it ends.
-    Text { width: TextWidth, ignored: Vec<Vec<u8>>, room: usize },
+    Text { width: TextWidth, ignored: Vec<Vec<u8>>, capacity: usize },
 }
 
 impl Template {
@@ -153,7 +153,7 @@ fn content(config: &GatewayConfig, field: &FieldSpec) -> Content {
         FieldSpec::TextInput { text, to, ignored, .. } => Content::Text {
             width: text.width,
             ignored: ignored.iter().map(<[u8]>::to_vec).collect(),
-            room: to.map_or(8, |words| 2 * usize::from(words.count)),
+            capacity: to.map_or(8, |words| 2 * usize::from(words.count)),
         },
         FieldSpec::Fixed { .. }
         | FieldSpec::Padding { .. }
@@ -169,15 +169,15 @@ fn content(config: &GatewayConfig, field: &FieldSpec) -> Content {
 impl Content {
     /// The text of this number: mostly as long as there is room for, some longer, some empty.
     fn text(&self, number: u32) -> Vec<u8> {
-        let Self::Text { width, ignored, room } = self else { return Vec::new() };
+        let Self::Text { width, ignored, capacity } = self else { return Vec::new() };
         let (kind, number) = (number % 16, number / 16);
         if kind < 2 && !ignored.is_empty() {
             return ignored[number as usize % ignored.len()].clone();
         }
         let most = match width {
             TextWidth::Fixed(width) => usize::from(*width),
-            _ if kind == 2 => room + 2,
-            _ => *room,
+            _ if kind == 2 => capacity + 2,
+            _ => *capacity,
         };
         let len = number as usize % (most + 1);
         let letter = |nth: usize| b'A' + ((number >> (nth % 8)) as usize + nth) as u8 % 26;

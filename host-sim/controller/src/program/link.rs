@@ -174,12 +174,12 @@ impl Link {
             return Ok(());
         }
         self.weigh_in.store(WEIGH_EVERY, Relaxed);
-        let mut room = MAX_WEIGHT;
+        let mut budget = MAX_WEIGHT;
         for (_, _, value) in scope.iter_raw() {
-            room = room.saturating_sub(weight(value, room));
+            budget = budget.saturating_sub(weight(value, budget));
         }
-        self.charge.store(1 + ((MAX_WEIGHT - room) / ITEMS_AN_OPERATION) as u64, Relaxed);
-        if room > 0 {
+        self.charge.store(1 + ((MAX_WEIGHT - budget) / ITEMS_AN_OPERATION) as u64, Relaxed);
+        if budget > 0 {
             return Ok(());
         }
         let token = Dynamic::from(format!("more than {MAX_WEIGHT} items in the variables"));
@@ -189,9 +189,9 @@ impl Link {
     fn show(&self, scope: &Scope<'_>) {
         let called = self.called.lock().unwrap_or_else(PoisonError::into_inner).last().cloned();
         let mut variables = self.variables.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut room = MAX_SHOWN;
+        let mut budget = MAX_SHOWN;
         for (name, _, value) in scope.iter_raw() {
-            let value = shown(value, &mut room);
+            let value = shown(value, &mut budget);
             let name = called.as_ref().map_or_else(|| name.to_owned(), |script| format!("{script}: {name}"));
             if variables.len() < MAX_SHOWN || variables.contains_key(&name) {
                 variables.insert(name, value);
@@ -250,19 +250,22 @@ fn is_abort(error: &EvalAltResult) -> bool {
     }
 }
 
-/// The value for statistics, with at most `room` items.
-fn shown(value: &Dynamic, room: &mut usize) -> serde_json::Value {
+/// The value for statistics, with at most `budget` items.
+fn shown(value: &Dynamic, budget: &mut usize) -> serde_json::Value {
     use serde_json::Value;
-    if *room == 0 {
+    if *budget == 0 {
         return Value::String("...".to_owned());
     }
-    *room -= 1;
+    *budget -= 1;
     if let Some(items) = value.read_lock::<Array>() {
-        return Value::Array(items.iter().map_while(|item| (*room > 0).then(|| shown(item, room))).collect());
+        return Value::Array(
+            items.iter().map_while(|item| (*budget > 0).then(|| shown(item, budget))).collect(),
+        );
     }
     if let Some(map) = value.read_lock::<rhai::Map>() {
-        let items =
-            map.iter().map_while(|(name, item)| (*room > 0).then(|| (name.to_string(), shown(item, room))));
+        let items = map
+            .iter()
+            .map_while(|(name, item)| (*budget > 0).then(|| (name.to_string(), shown(item, budget))));
         return Value::Object(items.collect());
     }
     if let Ok(whole) = value.as_int() {

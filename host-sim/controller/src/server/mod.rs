@@ -4,7 +4,7 @@
 //! a whole; the runtime sends it as fast as the connection takes it.
 
 mod commands;
-mod room;
+mod displacement;
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::net::{IpAddr, SocketAddr};
@@ -20,7 +20,7 @@ use super::registers::Registers;
 use super::{ConnId, Controller, ControllerOutput, Counters, ServerCounters};
 pub use commands::MAX_ORDERS;
 use commands::Session;
-use room::Places;
+use displacement::Places;
 
 /// Maximum number of clients of port 2000.
 pub const MAX_COMMAND_CONNECTIONS: usize = 32;
@@ -86,7 +86,7 @@ impl Counters {
 
 impl Controller {
     pub(super) fn opened(&mut self, now: Instant, link: Link, conn: ConnId, from: IpAddr) {
-        if self.faults.refuses(link) || !self.make_room(now, link, from) {
+        if self.faults.refuses(link) || !self.displace(now, link, from) {
             self.counters.of(link).refused += 1;
             self.outputs.push_back(ControllerOutput::Close { conn });
             return;
@@ -123,7 +123,7 @@ impl Controller {
     }
 
     /// Whether one more client is accepted. Another one may be disconnected for it.
-    fn make_room(&mut self, now: Instant, link: Link, from: IpAddr) -> bool {
+    fn displace(&mut self, now: Instant, link: Link, from: IpAddr) -> bool {
         let open = self.server.open(link);
         match (link, self.faults.command_clients()) {
             (Link::Command, CommandClients::RefuseSecond) => return open == 0,

@@ -2,6 +2,7 @@
 
 mod any_order;
 mod commands;
+mod displacement;
 mod examples;
 mod faults;
 mod functions;
@@ -11,7 +12,6 @@ mod operations;
 mod packet;
 mod ports;
 mod programs;
-mod room;
 mod safety;
 mod scripts;
 mod slices;

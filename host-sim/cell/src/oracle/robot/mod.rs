@@ -78,7 +78,7 @@ pub(super) struct Robot {
     /// Content of the transmission that the engine is handing over.
     values: Vec<(SysVar, Raw, Carried)>,
     command: Option<InFlightCommand>,
-    /// Room for values that is used again.
+    /// Buffers for values, reused.
     spare: Vec<Vec<(SysVar, Raw, Carried)>>,
     in_flight: BTreeMap<u64, InFlight>,
     /// The newest datagrams; the first one has this number.
