@@ -28,7 +28,7 @@ pub(super) struct Connection {
     pub peer: Peer,
     pub up: Pipe,
     pub down: Pipe,
-    /// The controller has been told of the connection.
+    /// The controller knows of the connection.
     pub accepted: bool,
     /// The controller has closed its end.
     pub closing: bool,
@@ -41,7 +41,7 @@ pub(super) struct Connection {
     /// The gateway's transport will check for a timeout: [`super::due::Due::UserTimeout`] is queued.
     pub is_watched: bool,
     /// What is in a device's log once so many bytes have arrived, and when the last of them left.
-    pub told: VecDeque<(u64, Instant, Act)>,
+    pub acts: VecDeque<(u64, Instant, Act)>,
 }
 
 impl Connection {
@@ -57,7 +57,7 @@ impl Connection {
             forgotten: false,
             owes_ack: false,
             is_watched: false,
-            told: VecDeque::new(),
+            acts: VecDeque::new(),
         }
     }
 

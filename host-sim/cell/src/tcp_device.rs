@@ -142,7 +142,7 @@ impl Cell {
                 let (Some(id), now) = (conn, self.now) else { return };
                 self.send_item(id, Way::Down, Item::Bytes(bytes));
                 if let (Some(conn), Some(act)) = (self.conns.get_mut(&id), act) {
-                    conn.told.push_back((conn.down.sent, now, act));
+                    conn.acts.push_back((conn.down.sent, now, act));
                 }
             }
             Served::Close => {
@@ -182,12 +182,12 @@ impl Cell {
     }
 
     /// The gateway takes bytes off a device's connection: replies have arrived.
-    pub(super) fn device_told(&mut self, id: u64) {
+    pub(super) fn report_acts(&mut self, id: u64) {
         let now = self.now;
         let Some(conn) = self.conns.get_mut(&id) else { return };
         let link = conn.link;
         let mut acts = Vec::new();
-        while let Some((_, left, act)) = conn.told.pop_front_if(|(upto, ..)| *upto <= conn.down.arrived) {
+        while let Some((_, left, act)) = conn.acts.pop_front_if(|(upto, ..)| *upto <= conn.down.arrived) {
             acts.push((left, act));
         }
         if acts.is_empty() {

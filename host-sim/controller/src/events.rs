@@ -251,7 +251,7 @@ pub(super) struct Recorder {
     now: Instant,
 }
 
-/// The states that were last told.
+/// The states that were last reported.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Shown {
     robot: RobotState,

@@ -1,13 +1,13 @@
 //! The simulated controller on real sockets and devices.
 
 mod control;
+mod events;
 mod open;
 mod outward;
 mod playing;
 mod servers;
 mod stats;
 mod stepping;
-mod telling;
 
 use std::cell::{Cell, RefCell};
 use std::collections::{BTreeMap, VecDeque};
@@ -169,8 +169,8 @@ struct ControllerRuntime {
     timeline_alarm: Alarm,
     /// A step of the timeline is being done.
     is_playing: Cell<bool>,
-    /// Number of the newest event that was told.
-    told: Cell<u64>,
+    /// Number of the newest event that was reported.
+    reported: Cell<u64>,
     events_file: Option<EventsWriter>,
     control_clients: RefCell<Vec<Rc<ControlClient>>>,
     refused_control_clients: Cell<usize>,
@@ -304,7 +304,7 @@ impl ControllerRuntime {
         }
         self.play();
         self.check_waits();
-        self.tell_events();
+        self.report_events();
     }
 
     fn execute(&self, output: ControllerOutput) {

@@ -21,5 +21,5 @@ pub(super) fn device(rng: Rng, start: Instant) -> Units {
 }
 
 const UNITS: [Unit; 2] =
-    [Unit { id: 1, is_told: true, places: &PLACES }, Unit { id: 255, is_told: false, places: &RACK }];
+    [Unit { id: 1, is_logged: true, places: &PLACES }, Unit { id: 255, is_logged: false, places: &RACK }];
 const RACK: [Place; 1] = [Place { function: 4, address: 0x10, count: 1, is: What::Value(2) }];

@@ -14,7 +14,7 @@ use crate::{Rng, SlaveDone};
 pub(super) struct Unit {
     pub id: u8,
     /// Its replies are in the log: orders go to this one.
-    pub is_told: bool,
+    pub is_logged: bool,
     pub places: &'static [Place],
 }
 
@@ -45,15 +45,15 @@ impl Units {
             return self.leave(frame, vec![pdu[0] | 0x80, 0x0A], false, now);
         };
         let reply = answer(&mut self.machine, unit.places, pdu);
-        self.leave(frame, reply, unit.is_told, now);
+        self.leave(frame, reply, unit.is_logged, now);
     }
 
-    /// A reply leaves, as the mood is. `is_told`: it is in the log.
-    fn leave(&mut self, request: &[u8], pdu: Vec<u8>, is_told: bool, now: Instant) {
+    /// A reply leaves, as the mood is. `is_logged`: it is in the log.
+    fn leave(&mut self, request: &[u8], pdu: Vec<u8>, is_logged: bool, now: Instant) {
         let fate = self.machine.fate();
         let at = (now + fate.delay).max(self.not_before);
         if fate.is_lost || fate.is_wrong {
-            if is_told {
+            if is_logged {
                 self.machine.lose_reply(true);
             }
             if fate.is_wrong {
@@ -63,11 +63,11 @@ impl Units {
             return;
         }
         let reply = framed(&request[..4], request[6], &pdu);
-        self.leave_whole(reply, is_told, fate, at);
+        self.leave_whole(reply, is_logged, fate, at);
     }
 
     /// A good reply leaves; one in eight in two parts.
-    fn leave_whole(&mut self, mut reply: Vec<u8>, is_told: bool, fate: Fate, mut at: Instant) {
+    fn leave_whole(&mut self, mut reply: Vec<u8>, is_logged: bool, fate: Fate, mut at: Instant) {
         let rng = &mut self.machine.rng;
         let mut in_time = fate.in_time;
         if self.leaving.is_empty() && rng.below(8) == 0 {
@@ -77,7 +77,7 @@ impl Units {
             (reply, self.not_before, in_time) = (rest, at, false);
         }
         // Modbus TCP has no echo.
-        let act = is_told.then(|| self.machine.replied(true, true, in_time));
+        let act = is_logged.then(|| self.machine.replied(true, true, in_time));
         self.leaving.push((at, Served::Bytes(reply, act)));
     }
 }

@@ -72,12 +72,12 @@ pub enum Invariant {
     /// The slaves of a line are asked as often as their periods say, and looked for while they are silent.
     Periods,
     /// A slave that answers soon has the controller's values.
-    Told,
+    Updated,
     /// A device executes an event at most once for a rise, in time, with the robot's values since the rise.
     EventsOnce,
     /// A stop comes before every event, and soon.
     StopsFirst,
-    /// What a device is told at its start is executed once for each start.
+    /// What a device is sent at its start is executed once for each start.
     StartsOnce,
     /// What the robot is shown of a device was so, not long ago.
     DeviceValues,
@@ -123,7 +123,7 @@ impl Invariant {
         Self::Held,
         Self::Carried,
         Self::Periods,
-        Self::Told,
+        Self::Updated,
         Self::EventsOnce,
         Self::StopsFirst,
         Self::StartsOnce,
@@ -168,7 +168,7 @@ impl Invariant {
             Self::Held => "held-by-slave",
             Self::Carried => "slave-is-told-right",
             Self::Periods => "periods-are-kept",
-            Self::Told => "slave-is-told",
+            Self::Updated => "slave-is-told",
             Self::EventsOnce => "events-once",
             Self::StopsFirst => "stops-first",
             Self::StartsOnce => "starts-once",

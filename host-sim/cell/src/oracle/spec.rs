@@ -187,10 +187,10 @@ impl Spec {
                         safe.value.encode(&mut raw);
                         raw
                     });
-                    let is_told = |field: &FieldSpec| {
+                    let shows_validity = |field: &FieldSpec| {
                         *field == FieldSpec::InputRule(InputRule::ValidTo { var, bit: None })
                     };
-                    let safe = safe.or_else(|| part.fields.iter().any(is_told).then(Raw::default));
+                    let safe = safe.or_else(|| part.fields.iter().any(shows_validity).then(Raw::default));
                     owned[var.ordinal()] = Some(Owned { port: nth, frame, way, safe });
                 }
             }

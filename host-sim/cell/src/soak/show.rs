@@ -149,12 +149,12 @@ mod tests {
     #[test]
     fn requests_and_answers_are_told_in_numbers() {
         let adu = |pdu: &[u8]| [&[0, 7, 0, 0, 0, pdu.len() as u8 + 1, 1], pdu].concat();
-        let told = |pdu: &[u8]| request(&adu(pdu));
-        assert_eq!(told(&[1, 0, 192, 0, 8]).as_deref(), Some("#7: read 8 coils from 192"));
-        assert_eq!(told(&[5, 0, 192, 0xFF, 0]).as_deref(), Some("#7: coil 192 = 1"));
-        assert_eq!(told(&[15, 0, 192, 0, 3, 1, 5]).as_deref(), Some("#7: coils from 192 = 1 0 1"));
+        let text = |pdu: &[u8]| request(&adu(pdu));
+        assert_eq!(text(&[1, 0, 192, 0, 8]).as_deref(), Some("#7: read 8 coils from 192"));
+        assert_eq!(text(&[5, 0, 192, 0xFF, 0]).as_deref(), Some("#7: coil 192 = 1"));
+        assert_eq!(text(&[15, 0, 192, 0, 3, 1, 5]).as_deref(), Some("#7: coils from 192 = 1 0 1"));
         let words = [16, 0, 8, 0, 2, 4, 0, 1, 1, 0];
-        assert_eq!(told(&words).as_deref(), Some("#7: registers from 8 = 1 256"));
+        assert_eq!(text(&words).as_deref(), Some("#7: registers from 8 = 1 256"));
         assert_eq!(request(&adu(&words)[..10]), None, "a piece");
         assert_eq!(answer(&adu(&[0x8F, 4])).as_deref(), Some("#7: exception 04"));
         assert_eq!(answer(&adu(&[15, 0, 192, 0, 3])).as_deref(), Some("#7: done"));

@@ -190,7 +190,7 @@ impl Cell {
             // The gateway resets its end, and never closes it.
             (Arrived::Item(Item::Closed), Way::Up) => {}
             (Arrived::Item(Item::Bytes(bytes)), Way::Down) => {
-                self.device_told(id);
+                self.report_acts(id);
                 self.engine_input(Input::LinkBytes { link, bytes: &bytes });
             }
             (Arrived::Item(Item::Opened), Way::Down) => {

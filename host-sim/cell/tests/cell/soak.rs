@@ -109,7 +109,7 @@ fn devices_that_are_asked_are_judged_at_what_they_have_and_at_the_robot() {
         assert!(looked_at(Invariant::Held) > 3_000, "{report:?}");
         assert!(looked_at(Invariant::Carried) > 200, "{report:?}");
         assert!(looked_at(Invariant::Periods) > 5_000, "{report:?}");
-        assert!(level == Level::Harsh || looked_at(Invariant::Told) > 10, "{report:?}");
+        assert!(level == Level::Harsh || looked_at(Invariant::Updated) > 10, "{report:?}");
         let (_, received, sent) = report.ports[0];
         assert!(received > 1_000 && sent > 1_000, "{report:?}");
     }
@@ -138,7 +138,7 @@ fn bits_of_shared_registers_are_judged() {
         let report = soak.report();
         assert_eq!(report.violation, None);
         assert!(report.checks[&Invariant::Carried] > 200, "{report:?}");
-        assert!(level == Level::Harsh || report.checks[&Invariant::Told] > 10, "{report:?}");
+        assert!(level == Level::Harsh || report.checks[&Invariant::Updated] > 10, "{report:?}");
     }
 }
 

@@ -348,7 +348,7 @@ const POWER_OFF: Duration = Duration::from_millis(200);
 const ENABLE: Duration = Duration::from_millis(200);
 const DISABLE: Duration = Duration::from_millis(100);
 const SHUT_DOWN: Duration = Duration::from_millis(100);
-/// Maximum number of errors that wait to be told.
+/// Maximum number of errors that wait to be reported.
 const MAX_NEW_ERRORS: usize = 64;
 /// Minimum duration of a pause and a stop; an arm in motion makes it longer.
 const PAUSE: Duration = Duration::from_millis(20);

@@ -3,6 +3,7 @@
 mod any_order;
 mod commands;
 mod displacement;
+
 mod examples;
 mod faults;
 mod functions;

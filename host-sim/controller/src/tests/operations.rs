@@ -172,9 +172,9 @@ fn errors_are_raised_and_cleared() {
     does(&mut cell, json!({ "do": "clear_error" }));
     assert_eq!(state(&cell)["error"], Value::Null);
     assert_eq!(cell.controller.registers().status().error, 0);
-    let told = events(&cell, 1, &["error", "error_cleared"]);
+    let found = events(&cell, 1, &["error", "error_cleared"]);
     let error = json!({ "event": "error", "code": 0x4711, "text": "drive 3: too hot" });
-    assert_eq!(told, [error, json!({ "event": "error_cleared" })]);
+    assert_eq!(found, [error, json!({ "event": "error_cleared" })]);
     assert!(refusal(&mut cell, &json!({ "do": "raise_error", "code": 0 })).contains("no error"));
 }
 
@@ -186,9 +186,9 @@ fn the_key_decides_who_starts_programs() {
     assert_eq!(cell.ask(c, "run(wait.jspf)"), "run fail");
     does(&mut cell, json!({ "do": "run", "program": "wait.jspf", "speed_percent": 25 }));
     assert_eq!(state(&cell)["speed_percent"], 25.0);
-    let told = events(&cell, 1, &["mode", "speed"]);
-    assert_eq!(told[0], json!({ "event": "mode", "mode": "manual", "was": "remote" }));
-    assert_eq!(told[1], json!({ "event": "speed", "percent": 25.0, "was": 100.0 }));
+    let found = events(&cell, 1, &["mode", "speed"]);
+    assert_eq!(found[0], json!({ "event": "mode", "mode": "manual", "was": "remote" }));
+    assert_eq!(found[1], json!({ "event": "speed", "percent": 25.0, "was": 100.0 }));
 }
 
 #[test]

@@ -64,7 +64,7 @@ struct Answer {
 
 #[derive(Serialize)]
 #[serde(rename_all = "snake_case")]
-enum Told<'a> {
+enum Notice<'a> {
     Event(&'a Event),
     Lost(u64),
 }
@@ -75,7 +75,7 @@ impl ControlClient {
     }
 
     /// Makes it write the events that it follows.
-    pub(super) fn tell(&self) {
+    pub(super) fn notify(&self) {
         if self.follows.borrow().is_some() {
             self.wake.notify_one();
         }
@@ -194,7 +194,7 @@ impl ControllerRuntime {
                 Ok(operation) => self.perform(client, operation).await,
                 Err(error) => Err(error.to_string()),
             };
-            // Events that occurred before are told before.
+            // Events that occurred before go first.
             self.push_events(client);
             client.push(&self.answer(id, done));
             self.note_activity();
@@ -235,7 +235,7 @@ impl ControllerRuntime {
         let dropped = controller.dropped_events();
         if dropped >= follow.next {
             let kept = controller.events_since(follow.next).take_while(|event| event.number <= dropped);
-            client.push(&Told::Lost(dropped + 1 - follow.next - kept.count() as u64));
+            client.push(&Notice::Lost(dropped + 1 - follow.next - kept.count() as u64));
         }
         for event in controller.events_since(follow.next) {
             if client.out.borrow().len() > MAX_UNREAD {
@@ -243,7 +243,7 @@ impl ControllerRuntime {
             }
             follow.next = event.number + 1;
             if follow.kinds.is_empty() || follow.kinds.iter().any(|kind| kind == event.what.kind()) {
-                client.push(&Told::Event(event));
+                client.push(&Notice::Event(event));
             }
         }
     }
@@ -308,7 +308,7 @@ async fn next_line(read: &mut BufReader<OwnedReadHalf>, line: &mut Vec<u8>) -> i
     }
 }
 
-/// Maximum number of clients, and of those that are told so.
+/// Maximum number of clients, and of those that get this error.
 pub(super) const MAX_CLIENTS: usize = 16;
 /// Maximum length of a request, in bytes.
 pub(super) const MAX_LINE: usize = 1 << 20;

@@ -94,7 +94,7 @@ impl Running {
             timeline: RefCell::new(options.timeline),
             timeline_alarm,
             is_playing: Cell::new(false),
-            told: Cell::new(0),
+            reported: Cell::new(0),
             events_file,
             control_clients: RefCell::default(),
             refused_control_clients: Cell::new(0),

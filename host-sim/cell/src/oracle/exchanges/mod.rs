@@ -342,7 +342,7 @@ impl Oracle {
         self.truth.sees_controller(image, now);
     }
 
-    /// Checks periods, and what slaves must have been told. Called at intervals.
+    /// Checks periods, and what slaves must have been sent. Called at intervals.
     pub(super) fn survey_exchanges(&mut self, now: Instant) {
         for nth in 0..self.ports.len() {
             let port = &self.spec.ports[nth];
@@ -363,9 +363,9 @@ impl Oracle {
             self.checks[Invariant::Periods as usize] += *result.as_ref().unwrap_or(&1);
             let all = robot.all_sound_since();
             for (row, exchange) in exchanges.rows.iter().enumerate() {
-                let is_told = exchange.on_change || exchange.every.is_some();
+                let is_kept = exchange.on_change || exchange.every.is_some();
                 let (true, Some(all), Some(could)) =
-                    (is_told, all, watch.exchanges.could_ask(exchanges, row))
+                    (is_kept, all, watch.exchanges.could_ask(exchanges, row))
                 else {
                     continue;
                 };
@@ -373,9 +373,9 @@ impl Oracle {
                 if now.saturating_since(all.max(could)) <= settle {
                     continue;
                 }
-                let Some(told) = self.truth.is_told(nth, exchange, now - settle) else { continue };
-                self.checks[Invariant::Told as usize] += 1;
-                result = result.and_then(|checked| told.map(|()| checked));
+                let Some(updated) = self.truth.is_up_to_date(nth, exchange, now - settle) else { continue };
+                self.checks[Invariant::Updated as usize] += 1;
+                result = result.and_then(|checked| updated.map(|()| checked));
             }
             self.judge(now, &[], result.map(drop));
         }

@@ -24,16 +24,16 @@ use crate::{Done, SlaveDone};
 #[derive(Debug, Clone, Default)]
 pub(in crate::oracle) struct Truth {
     lines: BTreeMap<usize, LineTruth>,
-    /// The variables that slaves are told, by ordinal.
-    told: Vec<Told>,
+    /// The variables that slaves are sent, by ordinal.
+    histories: Vec<History>,
     /// The part of the controller's image that has them, when it was last looked at.
     seen: Vec<u8>,
     seen_from: usize,
 }
 
-/// A variable that slaves are told.
+/// The values that a variable had which slaves are sent.
 #[derive(Debug, Clone)]
-struct Told {
+struct History {
     var: SysVar,
     /// Its place in the controller's image.
     place: Range<usize>,
@@ -74,23 +74,23 @@ impl Truth {
             .iter()
             .filter_map(|port| port.exchanges.as_ref())
             .flat_map(|exchanges| &exchanges.rows);
-        let mut told: Vec<SysVar> = rows.flat_map(RowSpec::shown).collect();
-        told.sort_by_key(|var| var.ordinal());
-        told.dedup();
-        let told: Vec<Told> = told
+        let mut vars: Vec<SysVar> = rows.flat_map(RowSpec::shown).collect();
+        vars.sort_by_key(|var| var.ordinal());
+        vars.dedup();
+        let histories: Vec<History> = vars
             .into_iter()
             .map(|var| {
                 let at = var.image_offset();
-                Told { var, place: at..at + var.size(), had: VecDeque::new() }
+                History { var, place: at..at + var.size(), had: VecDeque::new() }
             })
             .collect();
-        let seen_from = told.iter().map(|told| told.place.start).min().unwrap_or_default();
-        Self { lines: BTreeMap::new(), told, seen: Vec::new(), seen_from }
+        let seen_from = histories.iter().map(|history| history.place.start).min().unwrap_or_default();
+        Self { lines: BTreeMap::new(), histories, seen: Vec::new(), seen_from }
     }
 
     /// Whether the controller's registers are needed.
     pub(in crate::oracle) fn wants_controller(&self) -> bool {
-        !self.told.is_empty()
+        !self.histories.is_empty()
     }
 
     /// The controller's variables as they are now.
@@ -99,10 +99,10 @@ impl Truth {
         if !self.seen.is_empty() && image[self.seen_from..].starts_with(&self.seen) {
             return;
         }
-        let end = self.told.iter().map(|told| told.place.end).max().unwrap_or(self.seen_from);
+        let end = self.histories.iter().map(|history| history.place.end).max().unwrap_or(self.seen_from);
         self.seen.clear();
         self.seen.extend_from_slice(&image[self.seen_from..end]);
-        for Told { place, had, .. } in &mut self.told {
+        for History { place, had, .. } in &mut self.histories {
             let mut raw = Raw::default();
             raw[..place.len()].copy_from_slice(&image[place.clone()]);
             if had.back().is_none_or(|newest| newest.1 != raw) {
@@ -113,7 +113,7 @@ impl Truth {
 
     /// Forgets values that the controller had too long ago.
     pub(in crate::oracle) fn forget_old(&mut self, now: Instant) {
-        for Told { had, .. } in &mut self.told {
+        for History { had, .. } in &mut self.histories {
             while had.len() > 1 && now.saturating_since(had[1].0) > REMEMBERED {
                 had.pop_front();
             }
@@ -122,8 +122,8 @@ impl Truth {
 
     /// The values that the controller had.
     pub(super) fn had(&self, var: SysVar) -> Option<&VecDeque<(Instant, Raw)>> {
-        let nth = self.told.binary_search_by_key(&var.ordinal(), |told| told.var.ordinal());
-        nth.ok().map(|nth| &self.told[nth].had).filter(|had| !had.is_empty())
+        let nth = self.histories.binary_search_by_key(&var.ordinal(), |history| history.var.ordinal());
+        nth.ok().map(|nth| &self.histories[nth].had).filter(|had| !had.is_empty())
     }
 
     pub(in crate::oracle) fn garbled(&mut self, port: usize, now: Instant) {
@@ -388,7 +388,12 @@ impl Truth {
 
     /// Checks that a slave has the controller's values, if they have been the same since before `since`.
     /// `None` if they have not, or nobody can know.
-    pub(super) fn is_told(&self, port: usize, row: &RowSpec, since: Instant) -> Option<Result<(), Wrong>> {
+    pub(super) fn is_up_to_date(
+        &self,
+        port: usize,
+        row: &RowSpec,
+        since: Instant,
+    ) -> Option<Result<(), Wrong>> {
         let line = self.lines.get(&port)?;
         if line.forgot.contains(&row.slave) || row.shown().next().is_none() {
             return None;
@@ -397,7 +402,7 @@ impl Truth {
             (None, _) => line.written(row)?,
             (Some(_), Some(request)) => request.clone(),
             (Some(_), None) if row.at_start || row.every.is_some() => {
-                return Some(Err((Invariant::Told, format!("{}: it was never told", name(row)))));
+                return Some(Err((Invariant::Updated, format!("{}: it was never told", name(row)))));
             }
             (Some(_), None) => return None,
         };
@@ -414,7 +419,7 @@ impl Truth {
                     Some(format!("{}: {var} is {}, but the slave has {place:?}", name(row), show(var, raw)));
             }
         }
-        Some(wrong.map_or(Ok(()), |what| Err((Invariant::Told, what))))
+        Some(wrong.map_or(Ok(()), |what| Err((Invariant::Updated, what))))
     }
 
     /// Size of what is kept.
@@ -423,7 +428,7 @@ impl Truth {
             line.answers.len() + line.requests.len() + line.held.values().map(VecDeque::len).sum::<usize>()
         };
         self.lines.values().map(of_line).sum::<usize>()
-            + self.told.iter().map(|told| told.had.len()).sum::<usize>()
+            + self.histories.iter().map(|history| history.had.len()).sum::<usize>()
     }
 }
 

@@ -1,4 +1,4 @@
-//! Telling what happens: in the log, in the events file and to the clients that follow.
+//! Events: to the log, to the events file and to the clients that follow them.
 
 use tracing::{Level, enabled, info, trace};
 
@@ -6,22 +6,22 @@ use super::ControllerRuntime;
 use recipe_controller::Happened;
 
 impl ControllerRuntime {
-    /// Tells the events since the last call.
-    pub(super) fn tell_events(&self) {
+    /// Reports the events since the last call.
+    pub(super) fn report_events(&self) {
         for client in self.control_clients.borrow().iter() {
-            client.tell();
+            client.notify();
         }
         let controller = self.controller.borrow();
         let newest = controller.newest_event();
-        let told = self.told.replace(newest);
-        if newest == told {
+        let reported = self.reported.replace(newest);
+        if newest == reported {
             return;
         }
         let in_words = enabled!(target: "controller", Level::INFO);
         if !in_words && self.events_file.is_none() {
             return;
         }
-        for event in controller.events_since(told + 1) {
+        for event in controller.events_since(reported + 1) {
             if let Some(file) = &self.events_file
                 && let Ok(line) = serde_json::to_string(event)
             {
