@@ -2,7 +2,7 @@
 
 use super::*;
 
-/// Buttons on inputs of every kind, lamps on outputs of every kind.
+/// Buttons on inputs of every kind, LEDs on outputs of every kind.
 const CELL: &str = r#"
 [robot]
 power = "on"
@@ -15,8 +15,8 @@ name = "work.jspf"
 script = "loop { wait_ms(10); }"
 "#;
 
-/// The same lamps as coils.
-const LAMPS: [(u8, &str); 7] = [
+/// The same LEDs as coils.
+const LEDS: [(u8, &str); 7] = [
     (168, "powered"),
     (169, "enabled"),
     (175, "running"),
@@ -26,10 +26,10 @@ const LAMPS: [(u8, &str); 7] = [
     (31, "remote"),
 ];
 
-/// The lamps that are on, over Modbus and in the state stream, which must be the same.
+/// The LEDs that are on, over Modbus and in the state stream, which must be the same.
 #[track_caller]
-fn lamps(cell: &mut TestController) -> Vec<&'static str> {
-    let on: Vec<_> = LAMPS.iter().filter(|lamp| cell.coil(lamp.0)).map(|lamp| lamp.1).collect();
+fn leds(cell: &mut TestController) -> Vec<&'static str> {
+    let on: Vec<_> = LEDS.iter().filter(|led| cell.coil(led.0)).map(|led| led.1).collect();
     let state = cell.state_client();
     cell.run_ms(100);
     let packet = cell.packets.last().unwrap().1;
@@ -39,7 +39,7 @@ fn lamps(cell: &mut TestController) -> Vec<&'static str> {
         168.. => io[usize::from(address - 168)],
         _ => registers[usize::from(address - 16)],
     };
-    let streamed: Vec<_> = LAMPS.iter().filter(|lamp| shown(lamp.0) == 1).map(|lamp| lamp.1).collect();
+    let streamed: Vec<_> = LEDS.iter().filter(|led| shown(led.0) == 1).map(|led| led.1).collect();
     assert_eq!(on, streamed);
     on
 }
@@ -55,26 +55,26 @@ fn press(cell: &mut TestController, name: &str) {
 fn inputs_trigger_functions_and_outputs_show_states() {
     let mut cell = TestController::from_toml(CELL).unwrap();
     let c = cell.command_client();
-    assert_eq!(lamps(&mut cell), ["powered", "remote"]);
+    assert_eq!(leds(&mut cell), ["powered", "remote"]);
     press(&mut cell, "ToolButton[1]");
-    assert_eq!(lamps(&mut cell), ["powered", "enabled", "remote"]);
+    assert_eq!(leds(&mut cell), ["powered", "enabled", "remote"]);
     press(&mut cell, "FDI[1]");
     assert_eq!(cell.controller.program_name(), Some("work.jspf"));
-    assert_eq!(lamps(&mut cell), ["powered", "enabled", "running", "remote"]);
+    assert_eq!(leds(&mut cell), ["powered", "enabled", "running", "remote"]);
     // Registers are written over Modbus: coils 0 and 15.
     let m = cell.modbus_client();
     assert_eq!(cell.modbus(m, &[5, 0, 0, 0xFF, 0]), [5, 0, 0, 0xFF, 0]);
     cell.run_ms(100);
-    assert_eq!(lamps(&mut cell), ["powered", "enabled", "paused", "remote"]);
+    assert_eq!(leds(&mut cell), ["powered", "enabled", "paused", "remote"]);
     cell.modbus(m, &[5, 0, 15, 0xFF, 0]);
-    assert_eq!(lamps(&mut cell), ["powered", "enabled", "running", "remote"]);
+    assert_eq!(leds(&mut cell), ["powered", "enabled", "running", "remote"]);
     press(&mut cell, "FDI[2]");
-    assert_eq!(lamps(&mut cell), ["powered", "enabled", "remote"]);
+    assert_eq!(leds(&mut cell), ["powered", "enabled", "remote"]);
     cell.controller.set_mode(proto_core::wire::state::OperationMode::Manual);
     press(&mut cell, "ToolButton[2]");
-    assert_eq!(lamps(&mut cell), ["powered"]);
+    assert_eq!(leds(&mut cell), ["powered"]);
     assert_eq!(cell.order(c, "poweroff"), "poweroff success");
-    assert_eq!(lamps(&mut cell), [""; 0]);
+    assert_eq!(leds(&mut cell), [""; 0]);
 }
 
 #[test]
@@ -135,7 +135,7 @@ fn a_reset_clears_a_stop_and_the_error() {
     let c = cell.command_client();
     cell.controller.emergency_stop(cell.now);
     cell.run_ms(200);
-    assert_eq!(lamps(&mut cell), ["powered", "error", "emergency_stop", "remote"]);
+    assert_eq!(leds(&mut cell), ["powered", "error", "emergency_stop", "remote"]);
     press(&mut cell, "ToolButton[1]");
     assert_eq!(cell.ask(c, "getlasterror"), "2001:ToolButton[1]: enable: a safety stop is active\n");
     cell.set_value("FDI[8]", 1.0);
@@ -144,7 +144,7 @@ fn a_reset_clears_a_stop_and_the_error() {
     assert_eq!(cell.ask(c, "state"), "5:0:6:2", "it recovers");
     assert_eq!(cell.ask(c, "getlasterror"), "0:no error\n");
     cell.run_ms(200);
-    assert_eq!(lamps(&mut cell), ["powered", "remote"]);
+    assert_eq!(leds(&mut cell), ["powered", "remote"]);
     assert_eq!(cell.packets.last().unwrap().1.error_code, 0);
     press(&mut cell, "ToolButton[1]");
     assert_eq!(cell.ask(c, "state"), "6:0:5:2");
@@ -154,7 +154,7 @@ fn a_reset_clears_a_stop_and_the_error() {
     cell.run_ms(100);
     press(&mut cell, "FDI[8]");
     cell.run_ms(200);
-    assert_eq!(lamps(&mut cell), ["powered", "enabled", "paused", "remote"]);
+    assert_eq!(leds(&mut cell), ["powered", "enabled", "paused", "remote"]);
     assert_eq!(cell.ask(c, "resume"), "resume success");
 }
 
@@ -172,14 +172,14 @@ fn a_refused_function_is_an_error_with_its_input() {
         press(&mut cell, input);
         assert_eq!(cell.ask(c, "getlasterror"), error);
     }
-    assert_eq!(lamps(&mut cell), ["powered", "remote"], "a refused function is no error of the robot");
+    assert_eq!(leds(&mut cell), ["powered", "remote"], "a refused function is no error of the robot");
     // Several at one instant: what stops comes first.
     let mut cell = TestController::from_toml(&CELL.replace("\"on\"", "\"enabled\"")).unwrap();
     for input in ["FDI[1]", "ToolButton[2]"] {
         cell.set_value(input, 1.0);
     }
     cell.run_ms(200);
-    assert_eq!(lamps(&mut cell), ["powered", "remote"]);
+    assert_eq!(leds(&mut cell), ["powered", "remote"]);
     let error = cell.controller.machine().error().unwrap().message.clone();
     assert_eq!(error, "FDI[1]: run: the robot is not enabled");
 }
@@ -221,7 +221,7 @@ fn an_output_that_shows_a_state_is_written_by_nothing_else() {
     // Lost registers do not lose the states.
     cell.controller.restart_cleared(cell.now);
     cell.run_ms(1_000);
-    assert_eq!(lamps(&mut cell), ["remote"]);
+    assert_eq!(leds(&mut cell), ["remote"]);
 }
 
 #[test]
@@ -267,5 +267,5 @@ fn without_functions_the_same_bits_are_registers_only() {
         press(&mut cell, name);
     }
     assert_eq!((cell.controller.program_name(), cell.controller.machine().error()), (None, None));
-    assert_eq!(lamps(&mut cell), [""; 0]);
+    assert_eq!(leds(&mut cell), [""; 0]);
 }
