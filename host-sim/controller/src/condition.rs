@@ -8,8 +8,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 use serde_json::{Map, Value};
 
 use super::Controller;
-use super::events::{KINDS, snake};
-use super::operations::{Mode, Number, Refused};
+use super::common::{KINDS, Mode, Number, Refused, snake};
 
 /// What is waited for: everything that it names.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]

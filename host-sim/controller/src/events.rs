@@ -12,7 +12,7 @@ use proto_core::wire::state::{OperationMode, ProgramState, RobotState, SafetySta
 use serde::Serialize;
 use serde_json::Value;
 
-use super::faults::Link;
+use super::common::{Link, snake};
 use super::operations::Operation;
 use super::registers::Registers;
 use super::runs::Run;
@@ -183,28 +183,6 @@ impl Happened {
         }
     }
 }
-
-/// All kinds of events.
-pub const KINDS: [&str; 18] = [
-    "started",
-    "connected",
-    "disconnected",
-    "command",
-    "reply",
-    "robot",
-    "program_state",
-    "safety",
-    "mode",
-    "speed",
-    "program_started",
-    "program_ended",
-    "log",
-    "error",
-    "error_cleared",
-    "write",
-    "operation",
-    "refused",
-];
 
 /// What happened, in words.
 impl std::fmt::Display for Happened {
@@ -470,18 +448,6 @@ fn bit_name(var: SysVar, bit: u8) -> Option<String> {
         ("DigitalOutputCommand", 3) => format!("ToolDO[{nth}]"),
         _ => format!("{var}.{bit}"),
     })
-}
-
-/// `PowerOff` as `power_off`.
-pub(super) fn snake(name: &str) -> String {
-    let mut text = String::new();
-    for (nth, letter) in name.chars().enumerate() {
-        if letter.is_ascii_uppercase() && nth > 0 {
-            text.push('_');
-        }
-        text.push(letter.to_ascii_lowercase());
-    }
-    text
 }
 
 /// Number of events that [`Controller::record_events`] keeps, of writes and of all others each.

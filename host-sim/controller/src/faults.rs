@@ -6,9 +6,9 @@ use proto_core::modbus::Exception;
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::dialect::Dialect;
 use proto_core::wire::state::{LEN, OperationMode};
-use serde::{Deserialize, Serialize};
 
 use super::build::{mode, start_values};
+use super::common::Link;
 use super::corrupted::{Corrupted, NoSuchFloat};
 use super::events::Happened;
 use super::machine::{Machine, SafetyHold};
@@ -17,28 +17,6 @@ use super::registers::SetError;
 use super::{Controller, ControllerOutput, RecipeError};
 pub use recipe_config::CommandClients;
 use recipe_config::InitialTarget;
-
-/// One of the controller's TCP servers.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Link {
-    /// Port 2000.
-    Command,
-    /// Port 2001.
-    State,
-    /// Modbus.
-    Modbus,
-}
-
-impl std::fmt::Display for Link {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(match self {
-            Self::Command => "command",
-            Self::State => "state",
-            Self::Modbus => "modbus",
-        })
-    }
-}
 
 /// The present faults.
 #[derive(Debug, Clone, Default)]

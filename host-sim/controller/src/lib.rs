@@ -16,6 +16,7 @@
 //! functions of inputs in `functions`, items by their names in `items`, and faults for tests in `faults`.
 
 mod build;
+mod common;
 mod condition;
 mod corrupted;
 mod counters;
@@ -48,12 +49,13 @@ use proto_core::wire::dialect::Dialect;
 
 pub use build::BuildError;
 use build::{check_functions, mode, start_values};
+pub use common::{KINDS, Link};
 pub use condition::Condition;
 pub use counters::{Counters, ServerCounters};
 use events::Recorder;
-pub use events::{Event, Happened, KINDS, MAX_EVENTS};
+pub use events::{Event, Happened, MAX_EVENTS};
+pub use faults::CommandClients;
 use faults::Faults;
-pub use faults::{CommandClients, Link};
 pub use io::{ConnId, ControllerInput, ControllerOutput};
 pub use items::ItemError;
 use machine::Machine;

@@ -4,8 +4,8 @@ use proto_core::command::Action;
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::dialect::{FinishNotice, Motion};
 
+use super::common::Link;
 use super::events::Happened;
-use super::faults::Link;
 use super::machine::{Effect, ErrorId, Transition};
 use super::motion::Braking;
 use super::ports::{Handed, Listening, Outgoing};

@@ -4,8 +4,7 @@ use proto_core::time::Instant;
 use serde_json::{Map, Value, json};
 
 use super::Controller;
-use super::events::snake;
-use super::faults::Link;
+use super::common::{Link, snake};
 
 impl Controller {
     /// The state, the newest run, the arm, faults, ports and clients.

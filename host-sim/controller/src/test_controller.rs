@@ -12,7 +12,7 @@ use recipe_config::SimConfig;
 use recipe_config::file::{Text, parse_controller};
 use serde_json::Value;
 
-use super::faults::Link;
+use super::common::Link;
 use super::operations::{Operation, Refused};
 use super::{BuildError, ConnId, Controller, ControllerInput, ControllerOutput};
 

@@ -4,9 +4,8 @@ use proto_core::modbus::server::RegisterBank;
 use serde_json::{Value, json};
 
 use super::Controller;
+use super::common::{number, snake};
 use super::condition::Condition;
-use super::events::snake;
-use super::operations::number;
 
 impl Controller {
     /// What does not hold of the condition, and what is the case instead, such as `DO[1] is 0, not 1`. An

@@ -8,6 +8,7 @@ use serde_json::{Map, Value, json};
 
 use super::{AfterRestart, Done, Number, Operation, Refused, check_kinds, refused};
 use crate::Controller;
+use crate::common::number;
 use crate::program::{self, Script};
 
 impl Controller {
@@ -254,12 +255,6 @@ impl Controller {
         }
         Ok(())
     }
-}
-
-/// A whole number without a fraction, as registers and bits are.
-pub(crate) fn number(value: f64) -> Value {
-    let is_whole = value.fract() == 0.0 && value.abs() < 9e15;
-    if is_whole { json!(value as i64) } else { json!(value) }
 }
 
 /// Maximum length of a program's name.

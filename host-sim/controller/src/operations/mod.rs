@@ -10,15 +10,13 @@ mod fault;
 use std::collections::BTreeMap;
 
 use proto_core::time::Duration;
-use proto_core::wire::state::OperationMode;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
+use super::common::{KINDS, Link};
+pub use super::common::{Mode, Number, Refused};
 use super::condition::Condition;
-use super::events::KINDS;
-use super::faults::Link;
 use super::machine::SafetyHold;
-pub(crate) use execute::number;
 pub use fault::{CorruptedValue, Fault, Kind, NoNumber};
 
 /// An operation. In JSON its name is the value of `do`.
@@ -182,48 +180,6 @@ pub enum Operation {
     },
 }
 
-/// The value of an item: a number, or a bit as a bool.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(untagged, expecting = "a number, true or false")]
-pub enum Number {
-    /// A bit.
-    Bit(bool),
-    /// A number.
-    Number(f64),
-}
-
-impl Number {
-    /// As a number.
-    pub fn value(self) -> f64 {
-        match self {
-            Self::Bit(on) => f64::from(u8::from(on)),
-            Self::Number(number) => number,
-        }
-    }
-}
-
-/// The operation mode.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Mode {
-    /// From the pendant.
-    Manual,
-    /// Programs started on the pendant.
-    Auto,
-    /// Commands from port 2000.
-    Remote,
-}
-
-impl From<Mode> for OperationMode {
-    fn from(mode: Mode) -> Self {
-        match mode {
-            Mode::Manual => Self::Manual,
-            Mode::Auto => Self::Auto,
-            Mode::Remote => Self::Remote,
-        }
-    }
-}
-
 /// The registers after a restart.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -234,18 +190,6 @@ pub enum AfterRestart {
     /// 0.
     Cleared,
 }
-
-/// Why an operation was refused: one line. Nothing has changed.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Refused(pub String);
-
-impl std::fmt::Display for Refused {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(&self.0)
-    }
-}
-
-impl std::error::Error for Refused {}
 
 type Done = Result<Value, Refused>;
 

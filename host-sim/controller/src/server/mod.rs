@@ -14,8 +14,9 @@ use proto_core::modbus::server::{RegisterBank, Server as ModbusServer};
 use proto_core::modbus::{Coils, Exception, Registers as Words};
 use proto_core::time::Instant;
 
+use super::common::Link;
 use super::events::{Before, Recorder};
-use super::faults::{CommandClients, Link};
+use super::faults::CommandClients;
 use super::registers::Registers;
 use super::{ConnId, Controller, ControllerOutput, Counters, ServerCounters};
 pub use commands::MAX_ORDERS;

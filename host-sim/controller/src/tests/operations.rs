@@ -483,7 +483,7 @@ fn names_of_states_are_those_of_the_wire() {
     use proto_core::wire::state::{ProgramState, RobotState, SafetyState};
     let all = |name: fn(u8) -> &'static str| {
         let names = (0..=255).map(name).filter(|name| *name != "Unknown");
-        names.map(crate::events::snake).collect::<std::collections::BTreeSet<_>>()
+        names.map(crate::common::snake).collect::<std::collections::BTreeSet<_>>()
     };
     let known = |key: &str, names: std::collections::BTreeSet<String>| {
         for name in names {
