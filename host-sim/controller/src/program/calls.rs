@@ -7,13 +7,13 @@ use proto_core::wire::can::CanId;
 use proto_core::wire::scalar::Scalar;
 use rhai::{Array, Dynamic, Engine, FLOAT, INT, NativeCallContext};
 
-use super::link::{Link, Outcome};
+use super::link::{Outcome, ScriptLink};
 use super::script::CALL_PROGRAM;
 use super::text::one_line;
 use super::{Answer, Call};
 
 /// Registers all of them.
-pub(super) fn register(engine: &mut Engine, link: &Arc<Link>) {
+pub(super) fn register(engine: &mut Engine, link: &Arc<ScriptLink>) {
     register_ports(engine, link);
     register_items(engine, link);
     register_moves(engine, link);
@@ -21,7 +21,7 @@ pub(super) fn register(engine: &mut Engine, link: &Arc<Link>) {
     register_log(engine, link);
 }
 
-fn register_ports(engine: &mut Engine, link: &Arc<Link>) {
+fn register_ports(engine: &mut Engine, link: &Arc<ScriptLink>) {
     let l = Arc::clone(link);
     engine.register_fn("comm_recv", move |port: &str| -> Outcome<Array> {
         l.call(Call::Receive { port: port.to_owned(), limit: None }).map(frame)
@@ -43,7 +43,7 @@ fn register_ports(engine: &mut Engine, link: &Arc<Link>) {
     });
 }
 
-fn register_items(engine: &mut Engine, link: &Arc<Link>) {
+fn register_items(engine: &mut Engine, link: &Arc<ScriptLink>) {
     let l = Arc::clone(link);
     engine.register_fn("get", move |name: &str| -> Outcome<Dynamic> {
         Ok(match l.call(Call::Get { name: name.to_owned() })? {
@@ -59,7 +59,7 @@ fn register_items(engine: &mut Engine, link: &Arc<Link>) {
     });
 }
 
-fn register_moves(engine: &mut Engine, link: &Arc<Link>) {
+fn register_moves(engine: &mut Engine, link: &Arc<ScriptLink>) {
     let l = Arc::clone(link);
     engine.register_fn("movej", move |target: Array, speed: Dynamic| -> Outcome<()> {
         let target = six("movej", "joint positions", &target)?;
@@ -72,7 +72,7 @@ fn register_moves(engine: &mut Engine, link: &Arc<Link>) {
     });
 }
 
-fn register_flow(engine: &mut Engine, link: &Arc<Link>) {
+fn register_flow(engine: &mut Engine, link: &Arc<ScriptLink>) {
     let l = Arc::clone(link);
     engine.register_fn("wait_ms", move |time: Dynamic| -> Outcome<()> {
         l.call(Call::Wait(span("wait_ms", number(&time)?, "ms", 1.0e3)?)).map(|_| ())
@@ -88,7 +88,7 @@ fn register_flow(engine: &mut Engine, link: &Arc<Link>) {
     engine.register_fn("timestamp", || -> Outcome<()> { Err("timestamp: programs have no clock".into()) });
 }
 
-fn register_log(engine: &mut Engine, link: &Arc<Link>) {
+fn register_log(engine: &mut Engine, link: &Arc<ScriptLink>) {
     let l = Arc::clone(link);
     engine.register_fn("log", move |value: Dynamic| -> Outcome<()> {
         l.call(Call::Log(one_line(&value.to_string()))).map(|_| ())
@@ -98,7 +98,7 @@ fn register_log(engine: &mut Engine, link: &Arc<Link>) {
     engine.register_fn("log", move |value: FLOAT| -> Outcome<()> {
         l.call(Call::Log(Dynamic::from(value).to_string())).map(|_| ())
     });
-    // `print` and `debug` cannot fail: see `Link::over`.
+    // `print` and `debug` cannot fail: see `ScriptLink::over`.
     let l = Arc::clone(link);
     engine.on_print(move |text| {
         let _ = l.call(Call::Log(one_line(text)));

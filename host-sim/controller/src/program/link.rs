@@ -22,7 +22,7 @@ pub(super) struct Stamped {
 }
 
 /// The thread's end of both channels.
-pub(super) struct Link {
+pub(super) struct ScriptLink {
     events: SyncSender<Progress>,
     answers: Mutex<Receiver<Stamped>>,
     variables: Arc<Mutex<Variables>>,
@@ -48,7 +48,7 @@ pub(super) struct Link {
 pub(super) type Outcome<T> = Result<T, Box<EvalAltResult>>;
 
 /// Runs the script to its end and reports how it ended.
-pub(super) fn run(link: Link, script: &Script) {
+pub(super) fn run(link: ScriptLink, script: &Script) {
     let link = Arc::new(link);
     let mut engine = script::engine();
     watch(&mut engine, &link);
@@ -65,7 +65,7 @@ pub(super) fn run(link: Link, script: &Script) {
     let _ = link.events.send(Progress::Ended(end));
 }
 
-impl Link {
+impl ScriptLink {
     pub(super) fn new(
         events: SyncSender<Progress>,
         answers: Receiver<Stamped>,
@@ -201,7 +201,7 @@ impl Link {
 }
 
 /// Registers the bounds on work, and the publication of variables.
-fn watch(engine: &mut Engine, link: &Arc<Link>) {
+fn watch(engine: &mut Engine, link: &Arc<ScriptLink>) {
     let l = Arc::clone(link);
     // Called for each operation.
     engine.on_progress(move |_| {

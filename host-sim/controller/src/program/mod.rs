@@ -162,7 +162,8 @@ impl Program {
         let (answers, answers_end) = sync_channel(0);
         let (events_end, events) = sync_channel(0);
         let variables = Arc::new(Mutex::new(Variables::new()));
-        let link = link::Link::new(events_end, answers_end, Arc::clone(&variables), scripts.to_vec(), now);
+        let link =
+            link::ScriptLink::new(events_end, answers_end, Arc::clone(&variables), scripts.to_vec(), now);
         let own = script.clone();
         let thread = std::thread::Builder::new()
             .name(format!("program {}", script.name()))

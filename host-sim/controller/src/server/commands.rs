@@ -55,7 +55,7 @@ enum Command {
 }
 
 /// The next step of a connection.
-enum Step {
+enum Next {
     Answer(Action, Progress),
     Execute(Command),
 }
@@ -142,8 +142,8 @@ impl Controller {
         self.note_states(now);
         while let Some((conn, step)) = self.next_step(now) {
             match step {
-                Step::Execute(command) => self.execute(now, conn, command),
-                Step::Answer(action, progress) => {
+                Next::Execute(command) => self.execute(now, conn, command),
+                Next::Answer(action, progress) => {
                     let outcome = match progress {
                         Progress::Done => Outcome::Success,
                         Progress::Superseded => {
@@ -165,20 +165,20 @@ impl Controller {
     }
 
     /// Ended transitions come first: a further command would supersede them.
-    fn next_step(&mut self, now: Instant) -> Option<(ConnId, Step)> {
+    fn next_step(&mut self, now: Instant) -> Option<(ConnId, Next)> {
         for (&conn, session) in &mut self.server.command {
             let Some(Pending { transition, until }) = session.pending else { continue };
             let progress = self.machine.progress(transition);
             if progress != Progress::InProgress || now >= until {
                 session.pending = None;
-                return Some((conn, Step::Answer(transition.action(), progress)));
+                return Some((conn, Next::Answer(transition.action(), progress)));
             }
         }
         let mut free = self.server.command.iter_mut().filter(|(_, session)| session.pending.is_none());
         free.find_map(|(&conn, session)| {
             let (command, text) = session.waiting.pop_front()?;
             session.current = text;
-            Some((conn, Step::Execute(command)))
+            Some((conn, Next::Execute(command)))
         })
     }
 
