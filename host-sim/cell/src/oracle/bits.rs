@@ -1,29 +1,19 @@
 //! Bits with owners (proto-core/docs/engine.md section 5): the bits that one input frame writes in one byte
 //! wait together, and are written by Modbus as coils.
 //!
-//! Bytes that a recipe link carries or that an output part shows have no model: [`unmodelled`].
+//! Bytes that a recipe link carries or that an output part shows have no model: [`super::unmodelled`].
 
 use std::collections::VecDeque;
 
-use proto_core::config::GatewayConfig;
 use proto_core::engine::LinkId;
 use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 
 use super::Invariant;
 use super::field::Accepted;
-use super::spec::{Frame, LinkSpec, PortSpec, Spec};
-use super::upward::{Alone, Carried, EDGES, Upward, Wrong};
-
-/// The bits that one input frame writes in one byte.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Share {
-    pub port: usize,
-    pub frame: usize,
-    pub var: SysVar,
-    pub mask: u8,
-    pub safe: Option<u8>,
-}
+use super::invariant::Wrong;
+use super::spec::Spec;
+use super::upward::{Alone, Carried, EDGES, Upward};
 
 /// Bits of one byte.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -46,52 +36,6 @@ pub(super) struct Waits {
     safe_at: Instant,
     /// A field of it was rejected in the newest frame.
     pub alone: Option<Alone>,
-}
-
-/// The shares of all field ports, in the order of their first fields.
-pub(super) fn shares(config: &GatewayConfig, ports: &[PortSpec]) -> Vec<Share> {
-    let mut shares: Vec<Share> = Vec::new();
-    for (port, spec) in ports.iter().enumerate().filter(|(_, port)| port.is_field) {
-        for (frame, part) in spec.inputs.iter().enumerate() {
-            for bit in part.fields.iter().filter_map(|field| field.bit()) {
-                let own = 1 << bit.bit;
-                let is_it =
-                    |share: &&mut Share| (share.port, share.frame, share.var) == (port, frame, bit.var);
-                match shares.iter_mut().find(is_it) {
-                    Some(share) => share.mask |= own,
-                    None => shares.push(Share { port, frame, var: bit.var, mask: own, safe: None }),
-                }
-            }
-        }
-        let safe = config.ports[port].on_timeout.of(&config.safe_values);
-        for share in shares.iter_mut().filter(|share| share.port == port) {
-            let of = |safe: &&proto_core::config::SafeValue| !safe.is_whole() && safe.var == share.var;
-            let values = safe.iter().filter(of).map(|safe| (safe.mask, safe.value.as_f64() as u8));
-            let (mask, on) = values.fold((0, 0), |all, one| (all.0 | one.0, all.1 | one.1));
-            share.safe = (mask & share.mask == share.mask).then_some(on & share.mask);
-        }
-    }
-    shares
-}
-
-/// Why the bits of a configuration cannot be judged, if they cannot.
-pub(super) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
-    let spec = Spec::new(config);
-    if let Some(reason) = super::exchanges::spec::ambiguous(&spec.ports) {
-        return Some(reason);
-    }
-    let carries = |link: &LinkSpec, var| link.input.as_ref().is_some_and(|up: &Frame| up.has(var));
-    let is_odd = |share: &Share| {
-        let safe = config.ports[share.port].on_timeout.of(&config.safe_values);
-        let some_are_safe = safe.iter().any(|safe| safe.var == share.var && safe.mask & share.mask != 0);
-        spec.links.iter().any(|link| carries(link, share.var))
-            || spec.origin[share.var.ordinal()].is_some()
-            || some_are_safe && share.safe.is_none()
-    };
-    spec.shares.iter().any(is_odd).then_some(
-        "a soak cannot judge bits with owners in a byte that a recipe link carries or an output part shows, \
-         nor safe values for only some of a frame's bits",
-    )
 }
 
 impl Upward {

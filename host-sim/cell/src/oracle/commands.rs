@@ -9,8 +9,8 @@ use proto_core::time::{Duration, Instant};
 
 use super::Invariant;
 use super::field::Accepted;
+use super::invariant::Wrong;
 use super::spec::Spec;
-use super::upward::Wrong;
 
 /// Maximum number of waiting commands.
 const QUEUE: usize = 8;

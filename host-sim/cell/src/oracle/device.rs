@@ -5,7 +5,7 @@
 
 use std::ops::Range;
 
-use proto_core::config::{Bus, FieldSpec, GatewayConfig, InputRule, Limits, OutputBinding, Outside};
+use proto_core::config::{FieldSpec, InputRule, Limits, OutputBinding, Outside};
 use proto_core::device::{Algorithm, ByteOrder, Checksum, Crc, Encoding, Kind, Overflow, TextWidth, Width};
 use proto_core::wire::scalar::ScalarType;
 
@@ -129,6 +129,51 @@ impl DeviceSpec {
     }
 }
 
+/// How many bytes a field has.
+pub(super) enum Size {
+    Fixed(usize),
+    /// Up to this byte, which stands behind it, and at most so many.
+    Until(u8, usize),
+    /// All that the others leave.
+    Rest,
+}
+
+pub(super) fn size(field: &FieldSpec) -> Size {
+    let of_encoding = |encoding: &Encoding| match encoding.kind {
+        Kind::Decimal(digits) => of_width(digits.width),
+        Kind::Hex(width) => of_width(width),
+        _ => Size::Fixed(length(encoding)),
+    };
+    match field {
+        FieldSpec::TextInput { text, .. } | FieldSpec::TextOutput { text, .. } => match text.width {
+            TextWidth::Fixed(width) => Size::Fixed(width.into()),
+            TextWidth::Until(end) => Size::Until(end, MAX_TEXT),
+            TextWidth::Rest => Size::Rest,
+        },
+        FieldSpec::UserInput { ty, .. } | FieldSpec::UserOutput { ty, .. } => Size::Fixed(ty.size()),
+        FieldSpec::DeviceInput { encoding, .. }
+        | FieldSpec::DeviceOutput { encoding, .. }
+        | FieldSpec::Fixed { encoding, .. } => of_encoding(encoding),
+        FieldSpec::Padding { len, .. } => Size::Fixed((*len).into()),
+        FieldSpec::Checksum(sum) => Size::Fixed(sum_bytes(sum)),
+        FieldSpec::Length(length) => of_encoding(&length.encoding),
+        FieldSpec::System(var) => Size::Fixed(var.size()),
+        FieldSpec::Limits(_) | FieldSpec::Mapped(_) | FieldSpec::InputRule(_) => Size::Fixed(0),
+    }
+}
+
+fn of_width(width: Width) -> Size {
+    match width {
+        Width::Fixed(width) => Size::Fixed(width.into()),
+        Width::Until(end) => Size::Until(end, MAX_DIGITS),
+    }
+}
+
+/// Whether a field has not the same length in every frame, or says how long the frame is.
+pub(super) fn varies(field: &FieldSpec) -> bool {
+    matches!(field, FieldSpec::Length(_)) || !matches!(size(field), Size::Fixed(_))
+}
+
 /// What bytes of a line are, seen as this frame.
 pub(super) fn look(frame: &Frame, bytes: &[u8]) -> Look {
     if frame.varies {
@@ -224,20 +269,6 @@ fn crc_of(crc: &Crc, bytes: impl Iterator<Item = u8>) -> u32 {
     let register = register as u32;
     let result = if crc.refout { register.reverse_bits() >> (32 - width) } else { register };
     result ^ crc.xorout
-}
-
-/// Why a configuration cannot be judged, if it cannot.
-pub(crate) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
-    if config.ports.iter().any(|port| matches!(port.bus, Bus::ModbusTcp { .. })) {
-        return Some("a soak cannot judge ports of Modbus TCP");
-    }
-    if let Some(reason) = super::exchanges::spec::unmodelled(config) {
-        return Some(reason);
-    }
-    if let Some(reason) = varying::unmodelled(config) {
-        return Some(reason);
-    }
-    super::bits::unmodelled(config)
 }
 
 /// The number that a field sends for one of its source, by what stands behind the field; `None` if nothing is
@@ -503,6 +534,11 @@ pub(super) fn range(encoding: &Encoding) -> (f64, f64) {
         other => panic!("{other:?} has no model"),
     }
 }
+
+/// Maximum length of a text up to a delimiter.
+pub(super) const MAX_TEXT: usize = 128;
+/// Maximum number of digits up to a delimiter.
+const MAX_DIGITS: usize = 16;
 
 #[cfg(test)]
 mod tests {

@@ -11,8 +11,9 @@ use proto_core::wire::scalar::ScalarType;
 use super::Invariant;
 use super::device;
 use super::field::as_number;
+use super::invariant::Wrong;
 use super::spec::{Frame, Origin, PortSpec, Spec};
-use super::upward::{Upward, Wrong};
+use super::upward::Upward;
 use super::varying;
 
 /// The model of one port's transmissions.

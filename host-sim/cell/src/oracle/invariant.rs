@@ -87,6 +87,9 @@ pub enum Invariant {
     NoPanic,
 }
 
+/// A violated invariant, and a description.
+pub(super) type Wrong = (Invariant, String);
+
 impl Invariant {
     /// All of them.
     pub const ALL: [Self; 40] = [

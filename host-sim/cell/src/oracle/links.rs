@@ -8,8 +8,9 @@ use proto_core::time::{Duration, Instant};
 
 use super::bits::Coils;
 use super::field::Cut;
+use super::invariant::Wrong;
 use super::spec::{Frame, Origin, Owned, Raw};
-use super::upward::{Wrong, is_gap};
+use super::upward::is_gap;
 use super::wire::{Asked, Safe};
 use super::{Invariant, Oracle, place};
 

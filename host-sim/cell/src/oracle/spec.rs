@@ -14,15 +14,23 @@ use proto_core::time::Duration;
 use proto_core::wire::can::CanId;
 
 use super::Invariant;
-use super::bits::{self, Share};
-use super::device::DeviceSpec;
+use super::device::{DeviceSpec, varies};
 use super::exchanges::served::ServedSpec;
 use super::exchanges::spec::ExchangesSpec;
-use super::upward::Wrong;
-use super::varying;
+use super::invariant::Wrong;
 
 /// A value as on the wire; unused bytes are 0.
 pub(super) type Raw = [u8; 4];
+
+/// The bits that one input frame writes in one byte.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Share {
+    pub port: usize,
+    pub frame: usize,
+    pub var: SysVar,
+    pub mask: u8,
+    pub safe: Option<u8>,
+}
 
 /// A variable's owner and way up.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -248,7 +256,7 @@ impl Spec {
             witness[input.ordinal()] = is_there.then_some(output);
         }
         Self {
-            shares: bits::shares(config, &ports),
+            shares: shares(config, &ports),
             ports,
             links,
             owned,
@@ -358,7 +366,7 @@ pub(super) fn frame(head: &[u8], tail: &[u8], id: Option<CanId>, fields: &[Field
 
 /// A frame of a device's recipe, also one that a plain recipe could have.
 pub(super) fn device_frame(head: &[u8], tail: &[u8], id: Option<CanId>, fields: &[FieldSpec]) -> Frame {
-    let varies = fields.iter().any(varying::varies);
+    let varies = fields.iter().any(varies);
     let device = if varies { DeviceSpec::default() } else { DeviceSpec::new(head.len(), fields) };
     Frame { payload: device.len, device: Some(device), varies, ..any_frame(head, tail, id, fields) }
 }
@@ -462,4 +470,30 @@ fn is_one_frame(ports: &[PortSpec], owned: &[Option<Owned>; COUNT], link: &LinkS
             brought && (safe.iter().all(|safe| *safe) || safe.iter().all(|safe| !safe))
         })
     })
+}
+
+/// The shares of all field ports, in the order of their first fields.
+fn shares(config: &GatewayConfig, ports: &[PortSpec]) -> Vec<Share> {
+    let mut shares: Vec<Share> = Vec::new();
+    for (port, spec) in ports.iter().enumerate().filter(|(_, port)| port.is_field) {
+        for (frame, part) in spec.inputs.iter().enumerate() {
+            for bit in part.fields.iter().filter_map(|field| field.bit()) {
+                let own = 1 << bit.bit;
+                let is_it =
+                    |share: &&mut Share| (share.port, share.frame, share.var) == (port, frame, bit.var);
+                match shares.iter_mut().find(is_it) {
+                    Some(share) => share.mask |= own,
+                    None => shares.push(Share { port, frame, var: bit.var, mask: own, safe: None }),
+                }
+            }
+        }
+        let safe = config.ports[port].on_timeout.of(&config.safe_values);
+        for share in shares.iter_mut().filter(|share| share.port == port) {
+            let of = |safe: &&proto_core::config::SafeValue| !safe.is_whole() && safe.var == share.var;
+            let values = safe.iter().filter(of).map(|safe| (safe.mask, safe.value.as_f64() as u8));
+            let (mask, on) = values.fold((0, 0), |all, one| (all.0 | one.0, all.1 | one.1));
+            share.safe = (mask & share.mask == share.mask).then_some(on & share.mask);
+        }
+    }
+    shares
 }

@@ -11,6 +11,7 @@ use proto_core::wire::scalar::ScalarType;
 use super::Invariant;
 use super::bits::Waits;
 use super::field::{Accepted, show};
+use super::invariant::Wrong;
 use super::spec::{LinkSpec, Origin, Owned, Raw, Spec};
 
 /// Maximum number of values per port that wait behind the next ones.
@@ -97,9 +98,6 @@ pub(super) struct Counted {
     pub undelivered: u32,
     pub timeouts: u32,
 }
-
-/// A violated invariant, and a description.
-pub(super) type Wrong = (Invariant, String);
 
 /// The values of all variables, and their progress.
 #[derive(Debug, Clone)]

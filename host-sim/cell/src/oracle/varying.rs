@@ -6,11 +6,11 @@
 
 use std::ops::Range;
 
-use proto_core::config::{FieldSpec, GatewayConfig, Parts, Transaction, Words};
-use proto_core::device::{Boundary, ByteOrder, Counts, Encoding, Kind, Text, TextWidth, Width};
+use proto_core::config::{FieldSpec, Words};
+use proto_core::device::{Boundary, ByteOrder, Counts, Text, TextWidth};
 use proto_core::sysvar::SysVar;
 
-use super::device::{DeviceSpec, Look, Seen, length, read, sum_bytes};
+use super::device::{DeviceSpec, Look, MAX_TEXT, Seen, Size, read, size};
 use super::field::{LineWatch, Verdict};
 use super::spec::{Frame, PortSpec, Raw};
 
@@ -21,51 +21,6 @@ pub(super) enum Unlike {
     Length,
     /// Something else in them is another frame's.
     Content,
-}
-
-/// How many bytes a field has.
-enum Size {
-    Fixed(usize),
-    /// Up to this byte, which stands behind it, and at most so many.
-    Until(u8, usize),
-    /// All that the others leave.
-    Rest,
-}
-
-/// Whether a field has not the same length in every frame, or says how long the frame is.
-pub(super) fn varies(field: &FieldSpec) -> bool {
-    matches!(field, FieldSpec::Length(_)) || !matches!(size(field), Size::Fixed(_))
-}
-
-fn size(field: &FieldSpec) -> Size {
-    let of_encoding = |encoding: &Encoding| match encoding.kind {
-        Kind::Decimal(digits) => of_width(digits.width),
-        Kind::Hex(width) => of_width(width),
-        _ => Size::Fixed(length(encoding)),
-    };
-    match field {
-        FieldSpec::TextInput { text, .. } | FieldSpec::TextOutput { text, .. } => match text.width {
-            TextWidth::Fixed(width) => Size::Fixed(width.into()),
-            TextWidth::Until(end) => Size::Until(end, MAX_TEXT),
-            TextWidth::Rest => Size::Rest,
-        },
-        FieldSpec::UserInput { ty, .. } | FieldSpec::UserOutput { ty, .. } => Size::Fixed(ty.size()),
-        FieldSpec::DeviceInput { encoding, .. }
-        | FieldSpec::DeviceOutput { encoding, .. }
-        | FieldSpec::Fixed { encoding, .. } => of_encoding(encoding),
-        FieldSpec::Padding { len, .. } => Size::Fixed((*len).into()),
-        FieldSpec::Checksum(sum) => Size::Fixed(sum_bytes(sum)),
-        FieldSpec::Length(length) => of_encoding(&length.encoding),
-        FieldSpec::System(var) => Size::Fixed(var.size()),
-        FieldSpec::Limits(_) | FieldSpec::Mapped(_) | FieldSpec::InputRule(_) => Size::Fixed(0),
-    }
-}
-
-fn of_width(width: Width) -> Size {
-    match width {
-        Width::Fixed(width) => Size::Fixed(width.into()),
-        Width::Until(end) => Size::Until(end, MAX_DIGITS),
-    }
 }
 
 fn is_shared(field: &FieldSpec) -> bool {
@@ -361,50 +316,5 @@ impl LineWatch {
     }
 }
 
-/// Why such frames of a configuration cannot be judged, if they cannot.
-pub(super) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
-    let is_text = |field: &FieldSpec| {
-        matches!(field, FieldSpec::TextInput { .. } | FieldSpec::TextOutput { .. }) || varies(field)
-    };
-    let asked = config.exchanges.iter().flat_map(|exchange| match exchange.transaction {
-        Transaction::Rtu { written, read, .. } | Transaction::Served { written, read, .. } => {
-            vec![written, read]
-        }
-        Transaction::Frames { .. } => Vec::new(),
-    });
-    let asked = asked.chain(config.frames.iter().map(|frame| frame.fields));
-    let on_can = config.recipes.iter().flat_map(|recipe| match &recipe.parts {
-        Parts::Can { input, output } => input.iter().chain(output).map(|frame| frame.fields).collect(),
-        Parts::Stream { .. } => Vec::new(),
-    });
-    if asked.chain(on_can).any(|span| span.of(&config.fields).iter().any(is_text)) {
-        return Some("a soak judges texts and frames of varying length only in the parts of a stream");
-    }
-    let is_sent = |field: &FieldSpec| matches!(field, FieldSpec::DeviceOutput { .. }) && varies(field);
-    if config.fields.iter().any(is_sent) {
-        return Some("a soak cannot judge sent digits of varying length");
-    }
-    for recipe in &config.recipes {
-        let Parts::Stream { input, output } = &recipe.parts else { continue };
-        if [input, output].into_iter().flatten().any(|part| part.escape.is_some()) {
-            return Some("a soak cannot judge escape bytes");
-        }
-        let Some(part) = input.as_ref().filter(|part| part.framing == Boundary::Fields) else { continue };
-        let fields = part.fields.of(&config.fields);
-        let has_sum = fields.iter().any(|field| matches!(field, FieldSpec::Checksum(_)));
-        let first = fields.iter().find(|field| varies(field));
-        let is_led = matches!(first, None | Some(FieldSpec::Length(_)));
-        if !is_led || first.is_some() && (!has_sum || part.head.is_empty() || !part.tail.is_empty()) {
-            return Some(
-                "a soak judges a searched frame of varying length only with a head, a length in front of what \
-                 varies, a checksum and no tail",
-            );
-        }
-    }
-    None
-}
-
-const MAX_TEXT: usize = 128;
-const MAX_DIGITS: usize = 16;
 /// No frame is longer.
 const LONGEST: usize = 512;

@@ -8,8 +8,8 @@ use proto_core::time::{Duration, Instant};
 
 use super::Invariant;
 use super::bits::Coils;
+use super::invariant::Wrong;
 use super::spec::{Raw, Spec};
-use super::upward::Wrong;
 
 /// A request without an answer is given up after this.
 const ANSWER: Duration = Duration::from_millis(500);

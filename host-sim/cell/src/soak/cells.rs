@@ -8,7 +8,7 @@ use proto_core::config::GatewayConfig;
 use recipe_config::SimConfig;
 use recipe_config::file::{self, FileError, Text};
 
-use crate::oracle::device::unmodelled;
+use crate::oracle::unmodelled::unmodelled;
 
 /// A gateway and a controller.
 #[derive(Debug, Clone)]

@@ -11,8 +11,8 @@ use proto_core::time::{Duration, Instant};
 
 use super::spec::{ExchangesSpec, Kind, RowSpec, Seen};
 use crate::oracle::Invariant;
+use crate::oracle::invariant::Wrong;
 use crate::oracle::spec::PortSpec;
-use crate::oracle::upward::Wrong;
 
 /// The model of one line.
 #[derive(Debug, Clone, Default)]

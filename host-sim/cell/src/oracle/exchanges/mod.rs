@@ -18,8 +18,9 @@ use super::device::{Look, look};
 use super::downward::Downward;
 use super::field::{Accepted, Verdict};
 use super::gateway::Leaving;
+use super::invariant::Wrong;
 use super::spec::{Frame, PortSpec};
-use super::upward::{Upward, Wrong};
+use super::upward::Upward;
 use super::{Invariant, Oracle};
 use crate::SlaveDone;
 

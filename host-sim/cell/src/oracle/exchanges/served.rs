@@ -6,17 +6,16 @@
 
 use std::collections::BTreeMap;
 
-use proto_core::config::{FieldSpec, GatewayConfig, OutputBinding, Recipe, Rs485, Transaction};
+use proto_core::config::{FieldSpec, GatewayConfig, Recipe, Rs485, Transaction};
 use proto_core::modbus::rtu::Table;
 use proto_core::sysvar::SysVar;
 use proto_core::time::Instant;
 
-use crate::oracle::device::is_written_by_model;
 use crate::oracle::downward::Downward;
 use crate::oracle::field::Verdict;
 use crate::oracle::gateway::Leaving;
+use crate::oracle::invariant::Wrong;
 use crate::oracle::spec::{Frame, device_frame};
-use crate::oracle::upward::Wrong;
 use crate::oracle::{Invariant, Oracle};
 use crate::rtu::{is_right, sealed};
 
@@ -341,25 +340,6 @@ impl Oracle {
         }
         Ok(())
     }
-}
-
-/// Why the blocks of a configuration cannot be judged, if they cannot.
-pub(super) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
-    let served = config.exchanges.iter().filter_map(|exchange| match exchange.transaction {
-        Transaction::Served { read, written, .. } => Some([read, written]),
-        _ => None,
-    });
-    let mut fields = served.flatten().flat_map(|span| span.of(&config.fields));
-    let is_odd = |field: &FieldSpec| match *field {
-        FieldSpec::Fixed { .. } => true,
-        FieldSpec::DeviceOutput { encoding, from, .. } => {
-            !is_written_by_model(&encoding) || matches!(from, OutputBinding::Reply)
-        }
-        _ => false,
-    };
-    fields
-        .any(is_odd)
-        .then_some("a soak cannot judge constants, digits and reply codes in the blocks of a slave")
 }
 
 /// What was between two silences: frames with a right CRC, and what follows the last of them.

@@ -4,8 +4,7 @@
 //! Written from these pages, independent of the engine's exchanges.
 
 use proto_core::config::{
-    Bus, ConfigView, Echo, Exchange, FieldSpec, GatewayConfig, OutputBinding, Outside, Port, Recipe, Rs485,
-    Transaction,
+    Echo, Exchange, FieldSpec, GatewayConfig, OutputBinding, Port, Recipe, Rs485, Transaction,
 };
 use proto_core::modbus::rtu::Operation;
 use proto_core::sysvar::SysVar;
@@ -71,7 +70,7 @@ pub(in crate::oracle) struct RowSpec {
     /// The data of its request, or a request of the device's own.
     pub request: Option<Frame>,
     /// Bytes before the data.
-    head: Vec<u8>,
+    pub head: Vec<u8>,
 }
 
 /// Why an exchange is asked.
@@ -469,110 +468,6 @@ impl RowSpec {
             Some(frame) => Seen::Wrong(frame.len()),
         }
     }
-}
-
-/// Why the exchanges of a configuration cannot be judged, if they cannot.
-pub(in crate::oracle) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
-    if let Some(reason) = super::served::unmodelled(config) {
-        return Some(reason);
-    }
-    let serves = |port: &&Port| {
-        let exchanges = config.view().exchanges_of(recipe_of(config.view(), port));
-        exchanges.iter().any(|exchange| matches!(exchange.transaction, Transaction::Served { .. }))
-    };
-    let has_echo = |port: &Port| matches!(&port.bus, Bus::Rs485(line) if line.echo == Echo::Yes);
-    if config.ports.iter().filter(serves).any(has_echo) {
-        return Some("a soak cannot judge a gateway that is a slave on a line that echoes");
-    }
-    let requests = config.exchanges.iter().filter_map(|exchange| match exchange.transaction {
-        Transaction::Rtu { written, .. } => Some(written),
-        Transaction::Frames { request, .. } => {
-            config.frames.get(usize::from(request?)).map(|frame| frame.fields)
-        }
-        _ => None,
-    });
-    let may_refuse = |field: &FieldSpec| match field {
-        FieldSpec::Limits(limits) => limits.outside == Outside::Refuse,
-        FieldSpec::Mapped(_) => true,
-        _ => false,
-    };
-    let is_dialogue = |exchange: &Exchange| {
-        let is_mixed = exchange.when.rising.is_some()
-            && (exchange.when.every.is_some() || exchange.when.change || exchange.when.start);
-        exchange.stop
-            || exchange.follow.is_some()
-            || is_mixed
-            || exchange.outcome.variables().next().is_some()
-    };
-    let is_step = |recipe: &Recipe| {
-        let exchanges = config.view().exchanges_of(recipe);
-        exchanges.iter().enumerate().any(|(nth, own)| {
-            let is_same = |other: &Exchange| (other.peer, other.when.rising) == (own.peer, own.when.rising);
-            own.when.rising.is_some() && exchanges[..nth].iter().any(is_same)
-        })
-    };
-    let has_values = |exchange: &Exchange| match exchange.transaction {
-        Transaction::Frames { refusal: Some(refusal), .. } => {
-            let fields = config.frames.get(usize::from(refusal)).map(|frame| frame.fields.of(&config.fields));
-            fields.is_some_and(|fields| fields.iter().any(FieldSpec::has_value))
-        }
-        _ => false,
-    };
-    let is_more = |exchange: &Exchange| {
-        exchange.pending.is_some() || exchange.restarted.is_some() || has_values(exchange)
-    };
-    if config.exchanges.iter().any(is_more) {
-        return Some(
-            "a soak cannot judge pending answers, values in refusals and numbers that tell of a restart",
-        );
-    }
-    if config.exchanges.iter().any(is_dialogue) || config.recipes.iter().any(is_step) {
-        return Some(
-            "a soak cannot judge stops, dialogues, outcomes and events that are states as well of other cells \
-             than its own",
-        );
-    }
-    if requests.flat_map(|span| span.of(&config.fields)).any(may_refuse) {
-        return Some("a soak cannot judge requests with values that are not sent");
-    }
-    let asks = |port: &&Port| !config.view().exchanges_of(recipe_of(config.view(), port)).is_empty();
-    let answers = |port: &Port| recipe_of(config.view(), port).send == proto_core::config::SendOn::Frame;
-    if config.ports.iter().filter(asks).any(answers) {
-        return Some("a soak cannot judge exchanges beside an output part that is sent for each frame");
-    }
-    None
-}
-
-/// The same, of what only the laid out requests show.
-pub(in crate::oracle) fn ambiguous(ports: &[PortSpec]) -> Option<&'static str> {
-    let is_twice = |port: &PortSpec| {
-        let rows = port.exchanges.iter().flat_map(|exchanges| &exchanges.rows);
-        let requests: Vec<&RowSpec> =
-            rows.filter(|row| row.frames.as_ref().is_none_or(|it| it.is_asked)).collect();
-        let is_same = |one: &RowSpec, other: &RowSpec| match (&one.frames, &other.frames) {
-            (Some(one), Some(other)) if one.remote.is_some() || other.remote.is_some() => {
-                one.remote == other.remote
-            }
-            (Some(_), Some(_)) => match (&one.request, &other.request) {
-                (Some(one), Some(other)) => device::can_be_the_same(one, other),
-                _ => false,
-            },
-            _ => one.head == other.head,
-        };
-        let is_output = |row: &RowSpec| {
-            let own = row.request.as_ref().filter(|_| row.frames.is_some());
-            own.is_some_and(|own| port.outputs.iter().any(|output| device::can_be_the_same(own, output)))
-        };
-        requests
-            .iter()
-            .enumerate()
-            .any(|(nth, row)| is_output(row) || requests[..nth].iter().any(|other| is_same(row, other)))
-    };
-    ports.iter().any(is_twice).then_some("a soak cannot judge two exchanges of a port with the same request")
-}
-
-fn recipe_of<'c>(config: ConfigView<'c>, port: &Port) -> &'c Recipe {
-    &config.recipes[usize::from(port.recipe)]
 }
 
 /// After a request to all slaves, nothing is sent for this long.

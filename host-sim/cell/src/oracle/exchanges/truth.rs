@@ -16,8 +16,8 @@ use super::spec::{ExchangesSpec, Kind, RowSpec};
 use crate::oracle::Invariant;
 use crate::oracle::device::{self, Look};
 use crate::oracle::field::{LineWatch, Verdict, as_number, show};
+use crate::oracle::invariant::Wrong;
 use crate::oracle::spec::{Origin, PortSpec, Raw, Spec};
-use crate::oracle::upward::Wrong;
 use crate::{Done, SlaveDone};
 
 /// Slaves and controller.

@@ -16,8 +16,9 @@ use due::SAFE_ARRIVES;
 
 use super::commands::Command;
 use super::field::show;
+use super::invariant::Wrong;
 use super::spec::{Raw, Spec};
-use super::upward::{Carried, Wrong};
+use super::upward::Carried;
 use super::{Invariant, Oracle};
 use crate::network::Sender;
 use crate::tcp::USER_TIMEOUT;
