@@ -10,7 +10,7 @@ use serde_json::{Map, Value};
 use super::Controller;
 use super::common::{KINDS, Mode, Number, Refused, snake};
 
-/// What is waited for: everything that it names.
+/// A condition to wait for: all keys given must hold.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Condition {
@@ -52,7 +52,7 @@ impl Condition {
     /// Whether it can ever hold, but for the names of items, which [`Controller::holds`] knows.
     ///
     /// # Errors
-    /// What it names wrongly.
+    /// Checks the names in it.
     pub fn check(&self) -> Result<(), Refused> {
         let known = |key: &str, name: &Option<String>, names: &[&str]| match name {
             Some(name) if !names.contains(&name.as_str()) => {

@@ -212,7 +212,7 @@ impl std::fmt::Display for Happened {
     }
 }
 
-/// What was recorded.
+/// The recorded events.
 #[derive(Debug, Default)]
 pub(super) struct Recorder {
     on: bool,
@@ -337,7 +337,7 @@ impl Controller {
         });
     }
 
-    /// Tells of an operation that nobody gets an answer to, and that was refused.
+    /// Records a refused operation that has no caller to answer, such as a step of a timeline.
     pub fn note_refused(&mut self, now: Instant, operation: &Operation, error: &str) {
         self.quiet.ends();
         self.happened(now, || Happened::Refused {

@@ -1,7 +1,7 @@
 //! Functions of functional inputs, and states on functional outputs (D27, docs/simulated-controller.md
 //! section 7).
 //!
-//! An input's rising edge does what its command on port 2000 would do, and nobody is answered. Several edges at
+//! An input's rising edge does what its command on port 2000 would do, without an answer. Several edges at
 //! one instant are executed in the order of [`Function::ALL`].
 
 use proto_core::command::Action;

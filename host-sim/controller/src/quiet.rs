@@ -1,19 +1,17 @@
-//! When the controller need not be looked at: nothing changes it until an input or a deadline comes.
+//! When [`Controller::advance`] can be skipped: nothing changes until the next input or deadline.
 //!
-//! Most calls are Modbus requests that only read, at a controller that does nothing meanwhile. [`Controller::advance`]
-//! would find nothing before and after each of them.
+//! Most calls are Modbus requests that only read from an idle controller, where it would find nothing to do.
 
 use proto_core::time::Instant;
 
 use super::Controller;
 
-/// How long [`Controller::advance`] finds nothing, unless something else changes the controller: whatever does has to
-/// call [`Self::ends`].
+/// Until when [`Controller::advance`] finds nothing. Every other change of the controller must call [`Self::ends`].
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Quiet {
     /// Not included.
     until: Instant,
-    /// What [`Controller::deadline`] is meanwhile.
+    /// The value of [`Controller::deadline`] until then.
     deadline: Instant,
     /// False in a test that compares the controller with one that always looks.
     #[cfg(test)]

@@ -1,4 +1,4 @@
-//! What is the case instead of a condition, in words: for whoever has waited in vain.
+//! Why a condition does not hold, in words, for waits that time out.
 
 use proto_core::modbus::server::RegisterBank;
 use serde_json::{Value, json};
@@ -8,7 +8,7 @@ use super::common::{number, snake};
 use super::condition::Condition;
 
 impl Controller {
-    /// What does not hold of the condition, and what is the case instead, such as `DO[1] is 0, not 1`. An
+    /// The parts of the condition that do not hold, each with the actual value, such as `DO[1] is 0, not 1`. An
     /// event counts if its number is `since` or later.
     pub fn unmet(&self, condition: &Condition, since: u64) -> Vec<String> {
         let Ok(Value::Object(wanted)) = serde_json::to_value(condition) else { return Vec::new() };

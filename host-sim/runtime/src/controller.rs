@@ -155,9 +155,9 @@ struct ControllerRuntime {
     /// The controller's clock. Log limits and timeouts of sockets are in the machine's time.
     clock: Clock,
     timer: Alarm,
-    /// Who waits for an instant or a condition.
+    /// Clients that wait for an instant or a condition.
     waits: RefCell<Vec<Waiting>>,
-    /// Somebody waits now.
+    /// Signalled when a wait begins.
     moved: Notify,
     /// The ports that are CAN interfaces of the kernel.
     kernel_can: Vec<usize>,
@@ -167,7 +167,7 @@ struct ControllerRuntime {
     activity: Cell<u64>,
     timeline: RefCell<Option<Timeline>>,
     timeline_alarm: Alarm,
-    /// A step of the timeline is being done.
+    /// A step of the timeline is being executed.
     is_playing: Cell<bool>,
     /// Number of the newest event that was reported.
     reported: Cell<u64>,

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::{Refused, refused, time};
 use crate::{Controller, Link};
 
-/// A fault, with what it is on.
+/// A fault and its target.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Fault {
@@ -52,7 +52,7 @@ pub enum Kind {
     Refuse,
     /// All connections are closed, once.
     Disconnect,
-    /// Random bytes are sent in place of what is right.
+    /// Random bytes are sent in place of the right ones.
     Garbage,
     /// Every Modbus request is answered with an exception.
     Exception,

@@ -79,9 +79,9 @@ pub enum Operation {
         /// Why it does not watch; `None`: it does again.
         safety: Option<SafetyHold>,
     },
-    /// Somebody enters or leaves a zone of reduced speed.
+    /// A person enters or leaves a zone of reduced speed.
     Reduced {
-        /// Whether somebody is in it.
+        /// Whether a person is in it.
         on: bool,
     },
     /// Shows an error.

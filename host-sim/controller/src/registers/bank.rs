@@ -129,7 +129,7 @@ impl Registers {
 }
 
 impl Registers {
-    /// Clients have read. What they read again and again is kept as they read it, until it changes.
+    /// Counts a read. After several without a change, the encoded registers are cached until the next one.
     pub(crate) fn were_read(&mut self) {
         if self.shown.is_worth_keeping() {
             self.shown.keep(MAP.words.map(|word| self.word(word).to_be_bytes()));

@@ -44,5 +44,5 @@ impl ShownWords {
     }
 }
 
-/// Number of reads after which registers that have not changed meanwhile are kept.
+/// Number of reads without a change after which the encoded registers are cached.
 const READS: u8 = 4;

@@ -31,7 +31,7 @@ pub(super) struct Session {
     current: Text,
 }
 
-/// A command's text, for events; `None` while nobody records them.
+/// A command's text, for events; `None` while events are not recorded.
 type Text = Option<String>;
 
 /// A command that is answered at the end of its transition.

@@ -36,9 +36,9 @@ pub(super) struct ControlClient {
     follows: RefCell<Option<Follow>>,
     /// Whether it makes no more requests.
     has_ended: Cell<bool>,
-    /// For the task's writing half: there is something to write.
+    /// Wakes the task's writing half.
     wake: Notify,
-    /// For its reading half: something was written.
+    /// Wakes its reading half after a write.
     written: Notify,
 }
 
@@ -133,7 +133,7 @@ impl ControllerRuntime {
         });
     }
 
-    /// Talks with a client until it leaves.
+    /// Serves a client until it leaves.
     async fn read_lines(&self, stream: TcpStream, client: &ControlClient) -> io::Result<()> {
         tcp_options::enable_keepalive(&stream);
         let (read, mut write) = stream.into_split();

@@ -1,4 +1,4 @@
-//! The controller's clock: who waits for what, and how a stepped clock moves.
+//! The controller's clock: waits, and how a stepped clock moves.
 //!
 //! A stepped clock moves while somebody waits: from one deadline to the next. At each instant it stands until
 //! everything that was sent has left and everything that has arrived is handled, so that a run depends on what
@@ -17,7 +17,7 @@ use recipe_controller::operations::time;
 use recipe_io::fairness::is_anyone_busy;
 use recipe_io::timer;
 
-/// Somebody who waits for an instant or a condition.
+/// A client that waits for an instant or a condition.
 #[derive(Debug)]
 pub(super) struct Waiting {
     until: Instant,
@@ -75,7 +75,7 @@ impl ControllerRuntime {
         answered.await.unwrap_or_else(|_| over())
     }
 
-    /// Notes which conditions hold now. While the clock runs by itself, who waits for them is answered.
+    /// Notes which conditions hold now and, unless the clock is stepped, answers their waits.
     pub(super) fn check_waits(&self) {
         if self.waits.borrow().is_empty() {
             return;
@@ -94,7 +94,7 @@ impl ControllerRuntime {
         }
     }
 
-    /// Answers everybody whose condition has held or whose time is over.
+    /// Answers waits whose condition has held or whose time is over.
     fn answer_waits(&self) {
         let now = self.clock.now();
         let mut waits = self.waits.borrow_mut();
@@ -107,12 +107,12 @@ impl ControllerRuntime {
                 }
                 _ => Ok(()),
             };
-            // Fails if nobody waits any more.
+            // Fails if the client has left.
             let _ = waiting.answer.send(answer);
         }
     }
 
-    /// Moves a stepped clock as long as somebody waits.
+    /// Moves a stepped clock while there are waits.
     pub(super) async fn keep_stepping(self: Rc<Self>) {
         loop {
             if self.waits.borrow().is_empty() {
