@@ -111,12 +111,12 @@ pub fn negative_numbers(recipes: &[Option<DeviceRecipe>]) -> Vec<(Vec<String>, S
 
 fn of_field(recipe: &str, field: &DeviceField) -> Option<String> {
     let var = field.spec.rejects_negative().filter(|_| !field.has_offset)?;
-    let is_told = field.sendable.iter().any(|rule| match rule {
+    let has_rule = field.sendable.iter().any(|rule| match rule {
         FieldSpec::InputRule(InputRule::Int16) | FieldSpec::Mapped(_) => true,
         FieldSpec::Limits(limits) => limits.low >= 0.0,
         _ => false,
     });
-    if is_told {
+    if has_rule {
         return None;
     }
     let (least, most) = var.ty().range();

@@ -48,7 +48,7 @@ fn answer(findings: Vec<Value>) -> Answer {
         let look = match severity.as_str() {
             "fault" => Look::Wrong,
             "note" => Look::Plain,
-            _ => Look::Doubtful,
+            _ => Look::Warning,
         };
         let place = [word("place"), word("name")].join(" ");
         text += &format!("{}: {}: {}\n", paint(&severity, look), place.trim_end(), word("seen"));

@@ -257,7 +257,7 @@ pub fn public_of(path: &Path) -> Result<PublicKey, Failure> {
 
 fn looked(text: String, well: &str) -> TableCell {
     let look = match text.as_str() {
-        "not checked" => Look::Doubtful,
+        "not checked" => Look::Warning,
         text if text == well => Look::Well,
         _ => Look::Wrong,
     };

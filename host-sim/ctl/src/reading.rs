@@ -54,7 +54,7 @@ pub fn info(client: &Client) -> Result<Answer, Failure> {
 fn changes(info: &Value) -> TableCell {
     match (info["claimed"].as_bool(), info["claim_left_s"].as_f64(), info["can_be_changed"].as_bool()) {
         (Some(false), Some(left), _) => format!("it takes a key for {left:.0} s more").into(),
-        (Some(false), None, _) => TableCell::of("none: it has no key; claim it").look(Look::Doubtful),
+        (Some(false), None, _) => TableCell::of("none: it has no key; claim it").look(Look::Warning),
         (Some(true), ..) | (None, _, Some(true)) => "with its key".into(),
         _ => "none: it has no key".into(),
     }
@@ -155,7 +155,7 @@ fn ports(document: &Value) -> TextTable {
             TableCell::of(state).look(look),
             TableCell::number(port["age_ms"].as_u64().map(millis).unwrap_or_default()),
             count(&counters["frames_in"]),
-            TableCell::number(shown).look(if rejected + skipped > 0 { Look::Doubtful } else { Look::Plain }),
+            TableCell::number(shown).look(if rejected + skipped > 0 { Look::Warning } else { Look::Plain }),
             count(&counters["frames_out"]),
             TableCell::number(lost),
             last.into(),

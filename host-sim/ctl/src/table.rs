@@ -24,7 +24,7 @@ pub(crate) enum Look {
     Plain,
     Well,
     Wrong,
-    Doubtful,
+    Warning,
 }
 
 /// A cell.
@@ -146,7 +146,7 @@ pub(crate) fn paint(text: &str, look: Look) -> String {
         Look::Plain => return text.to_owned(),
         Look::Well => AnsiColor::Green,
         Look::Wrong => AnsiColor::Red,
-        Look::Doubtful => AnsiColor::Yellow,
+        Look::Warning => AnsiColor::Yellow,
     };
     let style = Style::new().fg_color(Some(colour.into()));
     format!("{style}{text}{style:#}")

@@ -52,7 +52,7 @@ fn command(case: &Case<'_>, port: &Port) -> Option<Finding> {
         ReplyCode::Fail => failed(case, port, &place),
         ReplyCode::Pending | ReplyCode::Other => {
             let others = case.status.links.iter().filter_map(|link| link.other_text.as_ref());
-            let mut others = others.filter(|other| other.age < TOLD_FOR);
+            let mut others = others.filter(|other| other.age < REPORTED_FOR);
             let other = others.find(|other| other.command == port.command && other.command.is_some())?;
             found(
                 Severity::Fault,
@@ -70,7 +70,7 @@ fn command(case: &Case<'_>, port: &Port) -> Option<Finding> {
             let record = case.ports.iter().find(|record| record.port == port.id);
             let given_at = record.and_then(PortRecord::newest_command);
             let age = given_at.map(|at| case.status.at.saturating_since(at));
-            if age.is_some_and(|age| age >= TOLD_FOR) {
+            if age.is_some_and(|age| age >= REPORTED_FOR) {
                 return None;
             }
             let when = age.map_or_else(String::new, |age| format!(", given{}", ago(age)));
@@ -87,7 +87,7 @@ fn command(case: &Case<'_>, port: &Port) -> Option<Finding> {
         }
         ReplyCode::NotSent => {
             let (why, age) = match &port.not_given {
-                Some(last) if last.age >= TOLD_FOR => return None,
+                Some(last) if last.age >= REPORTED_FOR => return None,
                 Some(last) => (last.text.as_str(), ago(last.age)),
                 None => ("the link or its room was lacking", String::new()),
             };
@@ -108,7 +108,7 @@ fn command(case: &Case<'_>, port: &Port) -> Option<Finding> {
 }
 
 fn failed(case: &Case<'_>, port: &Port, place: &FindingPlace) -> Option<Finding> {
-    let last = port.failed.as_ref().filter(|last| last.age < TOLD_FOR)?;
+    let last = port.failed.as_ref().filter(|last| last.age < REPORTED_FOR)?;
     let (command, age) = (last.command.as_str(), ago(last.age));
     let word = Request::parse(command.as_bytes()).map_or(command, |request| request.keyword().word());
     let then = last.controller.or(case.looked);
@@ -204,7 +204,7 @@ pub(crate) fn ago(age: Duration) -> String {
 }
 
 /// How long a failed command is reported.
-pub(crate) const TOLD_FOR: Duration = Duration::from_secs(60);
+pub(crate) const REPORTED_FOR: Duration = Duration::from_secs(60);
 
 fn mode(mode: OperationMode) -> &'static str {
     match mode {

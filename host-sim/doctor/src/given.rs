@@ -5,7 +5,7 @@ use proto_core::engine::{DropReason, Rejection};
 use proto_core::sysvar::Direction;
 
 use crate::bytes::count;
-use crate::controller::{TOLD_FOR, ago};
+use crate::controller::{REPORTED_FOR, ago};
 use crate::finding::{Cause, Finding, Severity};
 use crate::port::PortCase;
 use crate::state::Withheld;
@@ -39,7 +39,7 @@ fn no_command(seen: &PortCase<'_>, withheld: &Withheld) -> Option<Finding> {
     let &Withheld { why, value, age, .. } = withheld;
     // A command since then shows that the device is understood.
     let given = seen.record.newest_command().map(|at| seen.case.status.at.saturating_since(at));
-    if age >= TOLD_FOR || given.is_some_and(|given| given <= age) {
+    if age >= REPORTED_FOR || given.is_some_and(|given| given <= age) {
         return None;
     }
     let (value, age) = (format!("value {value}"), ago(age));
@@ -73,7 +73,7 @@ fn no_command(seen: &PortCase<'_>, withheld: &Withheld) -> Option<Finding> {
 /// Input that was discarded because the gateway itself slept.
 fn slept(seen: &PortCase<'_>) -> Option<Finding> {
     let last = seen.status.rejection.as_ref();
-    let last = last.filter(|last| last.why == Rejection::Asleep && last.age < TOLD_FOR);
+    let last = last.filter(|last| last.why == Rejection::Asleep && last.age < REPORTED_FOR);
     let counted = seen.counters.asleep as usize;
     if last.is_none() && counted == 0 {
         return None;

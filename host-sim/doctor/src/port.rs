@@ -5,7 +5,7 @@ use proto_core::engine::{FieldBus, PortCounters, PortId, PortState, Rejection};
 use proto_core::recipe::model::Mode;
 
 use crate::bytes::{HexBytes, count, list};
-use crate::controller::{TOLD_FOR, ago};
+use crate::controller::{REPORTED_FOR, ago};
 use crate::finding::{Cause, FILE, Finding, FindingPlace, Severity, finding};
 use crate::record::{PortRecord, WINDOW};
 use crate::shape::Shape;
@@ -438,7 +438,7 @@ impl PortCase<'_> {
     /// A piece of a frame, and nothing since.
     fn broken_off(&self, shape: &Shape<'_>) -> Option<Finding> {
         let last = self.status.rejection.as_ref();
-        let last = last.filter(|last| last.why == Rejection::Partial && last.age < TOLD_FOR)?;
+        let last = last.filter(|last| last.why == Rejection::Partial && last.age < REPORTED_FOR)?;
         if self.status.age.is_some_and(|age| age < last.age) {
             // The device goes on.
             return None;

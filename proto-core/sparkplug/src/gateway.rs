@@ -59,7 +59,7 @@ pub struct GatewayCatalog<'c, const METRICS: usize> {
     version: &'static str,
     ports: Vec<Port, MAX_PORTS>,
     links: Vec<Name, MAX_LINKS>,
-    items: Vec<Told, METRICS>,
+    items: Vec<MetricItem, METRICS>,
     /// Where the items of the node and of each port begin, and where the last ones end.
     starts: Vec<usize, { MAX_PORTS + 2 }>,
 }
@@ -68,7 +68,7 @@ type Name = String<MAX_ID>;
 
 /// What is told, and the number of the rule for it.
 #[derive(Debug, Clone, Copy)]
-struct Told {
+struct MetricItem {
     item: Item,
     /// [`NO_RULE`] if there is none.
     rule: u8,
@@ -291,7 +291,7 @@ impl<'c, const METRICS: usize> GatewayCatalog<'c, METRICS> {
             }
             _ => NO_RULE,
         };
-        self.items.push(Told { item, rule }).map_err(|_| NoRoom)
+        self.items.push(MetricItem { item, rule }).map_err(|_| NoRoom)
     }
 
     /// Adds what the present owner does not have yet.
@@ -385,7 +385,7 @@ impl<const METRICS: usize> Catalog for GatewayCatalog<'_, METRICS> {
 
     fn report(&self, place: usize) -> Report {
         let usual = Report { dead_band: 0.0, min_interval: self.rates.min_interval };
-        let Some(Told { item, rule }) = self.items.get(place).copied() else { return usual };
+        let Some(MetricItem { item, rule }) = self.items.get(place).copied() else { return usual };
         if matches!(item, Item::Uptime | Item::FramesIn | Item::FramesOut | Item::Rejected | Item::Timeouts) {
             return Report { min_interval: self.rates.counter_interval, ..usual };
         }

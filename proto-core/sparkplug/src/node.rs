@@ -77,8 +77,8 @@ struct Slot {
     is_pending: bool,
     current: Option<Value>,
     /// The last one told, and when it was sampled.
-    told: Option<Value>,
-    told_at: Option<Instant>,
+    published: Option<Value>,
+    published_at: Option<Instant>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -219,7 +219,8 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         }
         for place in 0..end {
             let data_type = catalog.metric(place).ok_or(NodeError::Metric { place })?.data_type;
-            let slot = Slot { data_type, is_pending: false, current: None, told: None, told_at: None };
+            let slot =
+                Slot { data_type, is_pending: false, current: None, published: None, published_at: None };
             let _ = self.slots.push(slot);
         }
         self.settings.clone_from(settings);
@@ -250,7 +251,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
             Input::Time { utc_ms } => {
                 let is_new = self.clock.set(now, utc_ms);
                 // What was told before has no date.
-                self.is_rebirth_wanted |= is_new && self.is_told();
+                self.is_rebirth_wanted |= is_new && self.publishes();
             }
             Input::End => self.is_ending = true,
         }
@@ -286,13 +287,13 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         self.bd_seq
     }
 
-    /// Whether what changes is told and not kept.
-    const fn is_told(&self) -> bool {
+    /// Whether changes are published and not stored.
+    const fn publishes(&self) -> bool {
         matches!(self.phase, Phase::Birth(_) | Phase::Online)
     }
 
     fn sample(&mut self, now: Instant, values: &[Option<Value>], alive: u32, catalog: &impl Catalog) {
-        let is_told = self.is_told();
+        let publishes = self.publishes();
         (self.sampled_at, self.alive) = (now, alive);
         for (index, owner) in (0..).zip(owners(MAX_DEVICES)) {
             let (Some(&start), Some(&end)) =
@@ -309,14 +310,15 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
                 let value = values.get(usize::from(place)).copied().flatten().and_then(Value::known);
                 slot.current = value.filter(|value| value.data_type() == slot.data_type);
                 let report = catalog.report(place.into());
-                let is_due = slot.told_at.is_none_or(|at| now.saturating_since(at) >= report.min_interval);
+                let is_due =
+                    slot.published_at.is_none_or(|at| now.saturating_since(at) >= report.min_interval);
                 slot.is_pending = is_alive && is_due && slot.is_changed(report.dead_band);
-                if slot.is_pending && !is_told {
+                if slot.is_pending && !publishes {
                     // The first value is no change.
-                    let is_change = slot.told_at.is_some();
+                    let is_change = slot.published_at.is_some();
                     slot.tell(now);
                     if is_change {
-                        self.history.push(Past { place, value: slot.told, at: now });
+                        self.history.push(Past { place, value: slot.published, at: now });
                     }
                 }
             }
@@ -384,7 +386,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
             (Event::Pong, _) => self.pong_until = None,
             (Event::Command(asked), _) => {
                 counters.refused = counters.refused.saturating_add(asked.others);
-                self.is_rebirth_wanted |= asked.is_rebirth && self.is_told();
+                self.is_rebirth_wanted |= asked.is_rebirth && self.publishes();
             }
             (Event::Host(state), _) => {
                 // An older statement may come late.
@@ -462,7 +464,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
 
 impl Slot {
     fn is_changed(&self, dead_band: f64) -> bool {
-        match (self.current, self.told) {
+        match (self.current, self.published) {
             (Some(current), Some(told)) => current.differs(told, dead_band),
             (current, told) => current.is_some() != told.is_some(),
         }
@@ -470,7 +472,7 @@ impl Slot {
 
     /// Its value was told, of this instant.
     fn tell(&mut self, at: Instant) {
-        (self.told, self.told_at, self.is_pending) = (self.current, Some(at), false);
+        (self.published, self.published_at, self.is_pending) = (self.current, Some(at), false);
     }
 }
 

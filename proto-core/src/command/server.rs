@@ -163,8 +163,8 @@ impl CommandServer {
         if is_bare_keyword(text) {
             return Some(self.keyword_gap);
         }
-        let awaited = may_become_command(self.text()) || (self.ended_by_gap && text == b"(");
-        Some(if awaited { self.beginning_gap } else { self.drop_gap })
+        let may_go_on = may_become_command(self.text()) || (self.ended_by_gap && text == b"(");
+        Some(if may_go_on { self.beginning_gap } else { self.drop_gap })
     }
 
     fn text(&self) -> &[u8] {

@@ -135,8 +135,8 @@ impl<'c> ConfigView<'c> {
             told.filter_map(move |(exchange, one)| {
                 let mut peers = (0..).zip(all).filter(|(_, other)| other.peer == one.peer);
                 let is_asked = peers.clone().any(|(_, other)| other.when.every.is_some());
-                let is_told = |other: &Exchange| other.when.start || other.when.change;
-                let first = peers.find(|(_, other)| is_told(other)).map(|(nth, _)| nth);
+                let is_sent = |other: &Exchange| other.when.start || other.when.change;
+                let first = peers.find(|(_, other)| is_sent(other)).map(|(nth, _)| nth);
                 let is_first = first == Some(exchange);
                 (is_first && !is_asked).then_some(Warning::NeverLookedFor {
                     recipe,

@@ -94,7 +94,7 @@ impl ConfigView<'_> {
                 (Transaction::Frames { .. }, Transaction::Frames { reply: other, .. }) => {
                     let Some(other) = frame(other) else { return true };
                     let mut answers = own.frames(Direction::Input).filter_map(|nth| frame(Some(nth)));
-                    answers.any(|own| core::ptr::eq(own, other) || !own.is_told_from(other, self))
+                    answers.any(|own| core::ptr::eq(own, other) || !own.is_distinct_from(other, self))
                 }
                 _ => false,
             }

@@ -75,7 +75,7 @@ impl Constants {
 
 impl FrameSpec {
     /// Whether no bytes are both this frame and the other one, as frames from a device.
-    pub(crate) fn is_told_from(&self, other: &Self, config: ConfigView<'_>) -> bool {
+    pub(crate) fn is_distinct_from(&self, other: &Self, config: ConfigView<'_>) -> bool {
         if self.id != other.id {
             return true;
         }

@@ -241,7 +241,7 @@ impl<'c> ConfigView<'c> {
                     _ => *owner = Some(index),
                 }
             }
-            for (place, var) in self.told_by(index, port, recipe) {
+            for (place, var) in self.status_variables(index, port, recipe) {
                 match owners.get_mut(var.ordinal()) {
                     Some(Some(other)) if *other == index => return fail(place, Kind::HealthTwice { var }),
                     Some(Some(other)) => return fail(place, Kind::OwnedTwice { var, other: *other }),
@@ -289,7 +289,7 @@ impl<'c> ConfigView<'c> {
             }
         }
         for (port, port_config, recipe) in self.field_ports() {
-            for (place, var) in self.told_by(port, port_config, recipe) {
+            for (place, var) in self.status_variables(port, port_config, recipe) {
                 if var.modbus().is_none() && !self.carried(Direction::Input, var) {
                     return fail(place, Kind::NoRoute { var, port });
                 }

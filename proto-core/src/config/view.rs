@@ -100,12 +100,12 @@ impl<'c> ConfigView<'c> {
     /// The input variables that a field port owns: those that its frames write, and those of its
     /// health.
     pub fn owned_by(self, port: &'c Port, recipe: &'c Recipe) -> impl Iterator<Item = SysVar> + 'c {
-        self.written_by(recipe).chain(self.told_by(0, port, recipe).map(|(_, var)| var))
+        self.written_by(recipe).chain(self.status_variables(0, port, recipe).map(|(_, var)| var))
     }
 
     /// The input variables that tell the robot something about the port with this index: its health, and what became of
     /// events. Each with its place.
-    pub(crate) fn told_by(
+    pub(crate) fn status_variables(
         self,
         index: u8,
         port: &'c Port,
@@ -135,7 +135,7 @@ impl<'c> ConfigView<'c> {
     pub(super) fn is_owned(self, var: SysVar) -> bool {
         self.field_ports().any(|(_, port, recipe)| {
             self.carries(recipe, Direction::Input, var)
-                || self.told_by(0, port, recipe).any(|(_, own)| own == var)
+                || self.status_variables(0, port, recipe).any(|(_, own)| own == var)
         })
     }
 }

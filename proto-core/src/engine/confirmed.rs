@@ -73,7 +73,7 @@ impl<const PORTS: usize> Store<PORTS> {
     /// Whether the controller can have had this other value all along. Later another master has
     /// written it.
     pub(super) fn may_unconfirm(&self) -> bool {
-        self.now < self.confirmed_at + DOUBT
+        self.now < self.confirmed_at + CONFIRMED_FOR
     }
 
     /// Outputs that have just arrived show another value than the safe one.
@@ -158,7 +158,7 @@ impl<const PORTS: usize> Store<PORTS> {
 /// A value shown sooner than this may be older than the safe value.
 const SHOWN_AFTER: Duration = Duration::from_millis(200);
 /// A packet of the state stream may be this late: a stream that is silent for 2 s is reopened.
-const DOUBT: Duration = Duration::from_secs(3);
+const CONFIRMED_FOR: Duration = Duration::from_secs(3);
 
 /// After this long without a state packet or recipe frame the controller may have restarted.
 const AWAY_AFTER: Duration = Duration::from_millis(500);

@@ -51,7 +51,7 @@ pub(super) struct DeviceCodec {
     pub texts: Vec<TextBind, MAX_TEXTS>,
     /// Bytes outside whole frames that have been counted.
     pub skipped_bytes: u32,
-    /// The conversation, if the recipe has exchanges.
+    /// The line of the exchanges, if the recipe has any.
     pub line: Option<Line>,
 }
 

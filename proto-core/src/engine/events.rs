@@ -73,7 +73,7 @@ struct Reading {
 pub(super) enum Event {
     /// There is none.
     Over,
-    /// It happened at `at`, and newer values are awaited.
+    /// It happened at `at`, and newer values are pending.
     Risen { at: Instant, until: Instant },
     /// Its request is made, and it follows an exchange that is not done yet.
     Behind { len: u16, until: Instant },
@@ -83,9 +83,9 @@ pub(super) enum Event {
     Sent { len: u16, until: Instant },
 }
 
-/// What the robot is told of an exchange's events.
+/// What is reported to the robot of an exchange's events.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Told {
+pub(super) struct ReportedOutcome {
     pub outcome: Outcome,
     /// With which code the device refused it.
     pub code: u16,
@@ -260,7 +260,7 @@ impl Events<'_, '_> {
     fn open(&mut self, nth: usize, event: Event) {
         if let Some(item) = self.items.get_mut(nth) {
             item.event = event;
-            (item.told.outcome, item.told.code) = (Outcome::Open, 0);
+            (item.reported.outcome, item.reported.code) = (Outcome::Open, 0);
             item.is_news = true;
         }
     }
@@ -364,7 +364,7 @@ impl Events<'_, '_> {
             return self.end(nth, Outcome::Expired, code);
         }
         item.event = Event::Ready { len, until };
-        item.told.code = code;
+        item.reported.code = code;
         self.ready(nth);
         self.note_expiry();
     }
@@ -404,8 +404,8 @@ impl Events<'_, '_> {
             return;
         }
         item.event = Event::Over;
-        (item.told.outcome, item.told.code) = (outcome, code);
-        item.told.ended = item.told.ended.wrapping_add(1);
+        (item.reported.outcome, item.reported.code) = (outcome, code);
+        item.reported.ended = item.reported.ended.wrapping_add(1);
         item.is_news = true;
         self.line.turns(self.table, |turns| turns.set_event(nth, None));
         self.count(nth, outcome);
@@ -424,8 +424,8 @@ impl Events<'_, '_> {
             let Some(orphan) = self.items.iter().position(is_orphan) else { break };
             if let Some(item) = self.items.get_mut(orphan) {
                 item.event = Event::Over;
-                (item.told.outcome, item.told.code) = (Outcome::NotFollowed, 0);
-                item.told.ended = item.told.ended.wrapping_add(1);
+                (item.reported.outcome, item.reported.code) = (Outcome::NotFollowed, 0);
+                item.reported.ended = item.reported.ended.wrapping_add(1);
                 item.is_news = true;
             }
             self.count(orphan, Outcome::NotFollowed);
@@ -485,7 +485,7 @@ impl Events<'_, '_> {
         }
         for nth in 0..self.items.len() {
             if let Some(item) = self.items.get(nth).filter(|item| item.event.expires_at() <= self.now) {
-                let code = item.told.code;
+                let code = item.reported.code;
                 self.end(nth, Outcome::Expired, code);
             }
         }

@@ -1,4 +1,4 @@
-//! Conversations on field ports: requests out, replies in, and what happens without them.
+//! Exchanges on field ports: requests out, replies in, and what happens without them.
 //!
 //! In: bytes and CAN frames of ports whose recipe has exchanges, the time. Out: values in the store,
 //! and requests. Which exchange is next is the line's business ([`super::line`]); ports without
@@ -32,7 +32,7 @@ use crate::time::Instant;
 use crate::wire::can::{CanFrame, CanId};
 
 impl FieldPort {
-    /// The conversation, if the recipe has exchanges.
+    /// The line of the exchanges, if the recipe has any.
     pub(super) fn line(&self) -> Option<&Line> {
         match &self.codec {
             Codec::Device(device) => device.line.as_ref(),
@@ -51,7 +51,7 @@ impl FieldPort {
         matches!(&self.codec, Codec::Device(device) if device.reader.is_none())
     }
 
-    /// When its conversation has something to do without an input.
+    /// When its exchanges have something to do without an input.
     pub(super) fn exchange_deadline(&self) -> Instant {
         match self.line() {
             Some(line) if self.is_usable() => {
@@ -115,7 +115,7 @@ impl FieldPort {
             Frames::new((self.id, self.mode), &mut self.reply, &mut self.counters, bindings, store, commands);
         let first_frame = self.first_frame;
         loop {
-            let awaited = PendingReplies {
+            let pending = PendingReplies {
                 formats,
                 first_frame,
                 items,
@@ -126,16 +126,16 @@ impl FieldPort {
                 bindings,
                 now,
             };
-            let effort = awaited.all();
+            let effort = pending.all();
             let effort = effort
                 .map(|format| format.layout.lengths().1.saturating_add(usize::from(format.bindings.len)))
                 .fold(MAX_ADU, usize::saturating_add);
             let is_tcp = line.transactions.is_some();
-            let probe = |bytes: &[u8]| if is_tcp { modbus_tcp::probe(bytes) } else { awaited.probe(bytes) };
+            let probe = |bytes: &[u8]| if is_tcp { modbus_tcp::probe(bytes) } else { pending.probe(bytes) };
             let Some(found) = framer.next_frame(&mut left, effort, probe) else { break };
             let (frame, what) = match (found, &mut line.transactions) {
-                (Found::Frame(frame), None) => (frame, Ok(awaited.heard(frame))),
-                (Found::Frame(frame), Some(all)) => (frame, Ok(all.heard(&awaited, frame))),
+                (Found::Frame(frame), None) => (frame, Ok(pending.heard(frame))),
+                (Found::Frame(frame), Some(all)) => (frame, Ok(all.heard(&pending, frame))),
                 (Found::Other(frame), None) => (frame, Err(Rejection::OtherDevice)),
                 (Found::Other(frame), Some(all)) => {
                     // Nothing behind it can be read.
@@ -161,8 +161,8 @@ impl FieldPort {
                 learn_echo(line, &mut table, true, now);
                 continue;
             }
-            let expected = awaited.expected();
-            let (flight, times) = (awaited.flight, awaited.asked().map(|item| item.times));
+            let expected = pending.expected();
+            let (flight, times) = (pending.flight, pending.asked().map(|item| item.times));
             // Of a Modbus frame.
             let (data, code) = match is_tcp {
                 true => modbus_tcp::content(frame),
@@ -281,7 +281,7 @@ impl FieldPort {
         let flight = line.flight();
         let first_frame = self.first_frame;
         let (echo, has_echo) = (None, false);
-        let awaited = PendingReplies {
+        let pending = PendingReplies {
             formats,
             first_frame,
             items,
@@ -297,16 +297,16 @@ impl FieldPort {
             format.id == frame.id()
                 && matches!(format.layout.probe_whole(fields, frame.data()), Probe::Frame(_))
         };
-        let (answer, code) = match awaited.answer(is) {
+        let (answer, code) = match pending.answer(is) {
             Some(answer) => (Some(answer), 0),
-            None => match sdo_abort(&awaited, frame) {
+            None => match sdo_abort(&pending, frame) {
                 Some(code) => (Some(Heard::Refusal(None)), code),
                 None => (None, 0),
             },
         };
-        let times = awaited.asked().map(|item| item.times);
+        let times = pending.asked().map(|item| item.times);
         let mut told = None;
-        let (verdict, sign) = match awaited.told(answer, is, |_| false) {
+        let (verdict, sign) = match pending.classify(answer, is, |_| false) {
             Some(Heard::Reply(Some(reply))) => {
                 told = flight.map(|flight| (flight.exchange, frame.data()));
                 let slot = usize::from(reply.slot);
@@ -328,8 +328,8 @@ impl FieldPort {
             }
             Some(_) => (Err(Rejection::Late), Sign::Ambiguous),
             None => {
-                let answers = awaited.answers().map(|format| (None, format));
-                let unasked = awaited.unasked();
+                let answers = pending.answers().map(|format| (None, format));
+                let unasked = pending.unasked();
                 let all = answers.chain(unasked.map(|(format, slot, nth)| (Some((slot, nth)), format)));
                 let (place, format) = match judge_can(all, bindings, frame) {
                     Ok(found) => found,
@@ -411,7 +411,7 @@ impl FieldPort {
         let (items, mut table) = view.of(line);
         let times = |nth: u8| items.get(usize::from(nth)).map(|item| item.times);
         let flight = line.flight();
-        // A bus is free for others while a reply is awaited.
+        // A bus is free for others while a reply is pending.
         let is_pending = line.sent(times, &timing, now);
         if let Some(flight) = flight.filter(|_| !is_pending) {
             // Nobody says whether it was heard. What follows it is sent behind it.
@@ -449,7 +449,7 @@ impl FieldPort {
         if let Over::GivenUp(news) = over {
             events.note(nth, news);
         }
-        // A bus was not held while the reply was awaited: a frame of the cycle may be on its way.
+        // A bus was not held while the reply was pending: a frame of the cycle may be on its way.
         if !is_on_can {
             self.sender.sent();
         }
@@ -517,7 +517,7 @@ impl FieldPort {
         }
         line.begin(&mut table, now);
         line.looks = line.looks.map(|grid| crate::schedule::Grid::starting_at(now, grid.period()));
-        // Nobody has said that the port was gone, and its reply is not awaited any more.
+        // Nobody has said that the port was gone, and its reply is not pending any more.
         if was_waiting && !is_on_can {
             self.sender.sent();
         }
@@ -567,9 +567,9 @@ fn booted_peer(items: &[Item], table: &ExchangeTable<'_>, frame: &CanFrame) -> O
 }
 
 /// The code of an SDO abort, the low half, if the frame is one for the request on its way.
-fn sdo_abort(awaited: &PendingReplies<'_>, frame: &CanFrame) -> Option<u16> {
-    let multiplexer = awaited.flight?.sdo?;
-    let reply = awaited.asked()?.reply.as_ref()?;
+fn sdo_abort(pending: &PendingReplies<'_>, frame: &CanFrame) -> Option<u16> {
+    let multiplexer = pending.flight?.sdo?;
+    let reply = pending.asked()?.reply.as_ref()?;
     let &[0x80, a, b, c, low, high, _, _] = frame.data().first_chunk::<8>()? else { return None };
     (frame.id() == reply.format.id && [a, b, c] == multiplexer).then_some(u16::from_le_bytes([low, high]))
 }
@@ -849,7 +849,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 continue;
             }
             item.is_news = false;
-            let (to, state) = (item.outcome, item.told);
+            let (to, state) = (item.outcome, item.reported);
             let values =
                 [(to.to, state.outcome as u16), (to.code_to, state.code), (to.count_to, state.ended)];
             for (var, value) in values {

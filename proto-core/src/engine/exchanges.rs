@@ -8,7 +8,7 @@ use heapless::{Vec, VecView};
 use super::Engine;
 use super::build_error::{BuildError, one_too_many};
 use super::device_port::DeviceFormat;
-use super::events::{Event, Told, Trigger};
+use super::events::{Event, ReportedOutcome, Trigger};
 use super::line::{ExchangeTable, Line, PeerCounters, PeerState, Times};
 use super::modbus_tcp::Transactions;
 use super::turns::{Row, RowKind, RowTimes, Turn};
@@ -68,7 +68,7 @@ pub(super) struct Item {
     pub window: Duration,
     pub event: Event,
     /// What the robot is told of its events, in which variables, and whether that is new.
-    pub told: Told,
+    pub reported: ReportedOutcome,
     pub outcome: OutcomeTo,
     pub is_news: bool,
     /// The newest request, to tell a change.
@@ -322,7 +322,7 @@ impl Formats<'_> {
             follow: exchange.follow,
             window: Duration::ZERO,
             event: Event::Over,
-            told: Told::default(),
+            reported: ReportedOutcome::default(),
             outcome: exchange.outcome,
             is_news: exchange.outcome != OutcomeTo::NONE,
             digest: None,

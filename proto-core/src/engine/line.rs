@@ -93,7 +93,7 @@ pub(super) enum Phase {
     Repeat(Flight),
     /// A request has been handed over.
     Sending(Flight),
-    /// Its reply is awaited.
+    /// Its reply is pending.
     Waiting(Flight),
     /// It rests.
     Resting(Instant),
@@ -406,7 +406,7 @@ impl Line {
         self.echo = None;
     }
 
-    /// The peer is at it: its answer is awaited anew, as if the request had left now. Writes that stop do not wait for it.
+    /// The peer is at it: its answer is pending anew, as if the request had left now. Writes that stop do not wait for it.
     pub(super) fn heard_pending(&mut self, table: &ExchangeTable<'_>, timeout: Duration, now: Instant) {
         if let Phase::Sending(flight) | Phase::Waiting(flight) = &mut self.phase {
             (flight.is_pending, flight.is_wrong) = (true, false);

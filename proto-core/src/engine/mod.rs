@@ -377,7 +377,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[inline(never)]
     fn handle_frame(&mut self, found: Found, now: Instant, input: &Input<'_>) -> Handled {
         let Input::PortCan { port: id, ref frame } = *input else { return Handled::Poll };
-        // A frame is looked up when the engine is calm.
+        // A frame is looked up when the engine is idle.
         let was_asleep =
             if found == Found::NOT_LOOKED_UP { self.clock.is_asleep(now) } else { now < self.clock.beat_at };
         let now = self.begin(was_asleep, now);

@@ -54,15 +54,15 @@ impl Transactions {
     }
 
     /// What a frame is that [`probe`] has found; `None` if it answers no request.
-    pub(super) fn heard<'i>(&mut self, awaited: &PendingReplies<'i>, frame: &[u8]) -> Option<Heard<'i>> {
+    pub(super) fn heard<'i>(&mut self, pending: &PendingReplies<'i>, frame: &[u8]) -> Option<Heard<'i>> {
         let (&[t1, t0, ..], body) = frame.split_first_chunk::<PREFIX_LEN>()?;
         let id = u16::from_be_bytes([t1, t0]);
-        if id != self.newest || awaited.flight.is_none() {
+        if id != self.newest || pending.flight.is_none() {
             return self.take(id).map(|exchange| Heard::Late { exchange, is_pending: false });
         }
-        let is_good = awaited.expected()?.judge(body)?;
+        let is_good = pending.expected()?.judge(body)?;
         self.take(id);
-        if is_good { Some(Heard::Reply(awaited.asked()?.reply.as_ref())) } else { Some(Heard::Refusal(None)) }
+        if is_good { Some(Heard::Reply(pending.asked()?.reply.as_ref())) } else { Some(Heard::Refusal(None)) }
     }
 
     /// The exchange of a request without a reply; it has one now.

@@ -16,9 +16,9 @@ use crate::time::Instant;
 pub(super) enum Heard<'i> {
     /// The echo of the own request.
     Echo,
-    /// The awaited reply; the data of a Modbus frame, or the frame.
+    /// The pending reply; the data of a Modbus frame, or the frame.
     Reply(Option<&'i InputFormat>),
-    /// The awaited reply, or the echo of the own request.
+    /// The pending reply, or the echo of the own request.
     ReplyOrEcho,
     /// The device is at it; its answer follows.
     Pending(&'i OtherFormat),
@@ -54,12 +54,12 @@ impl<'i> PendingReplies<'i> {
         self.items.get(usize::from(self.flight?.exchange))
     }
 
-    /// The reply of a Modbus slave that is awaited.
+    /// The reply of a Modbus slave that is pending.
     pub(super) fn expected(&self) -> Option<Expected> {
         self.flight?.expected
     }
 
-    /// Nothing but the own echo is awaited.
+    /// Nothing but the own echo is pending.
     fn waits_for_echo(&self) -> bool {
         self.has_echo && self.echo.is_some()
     }
@@ -143,7 +143,7 @@ impl<'i> PendingReplies<'i> {
         let is_right = |expected: &Expected| {
             matches!(expected.probe(frame), rtu::Probe::Reply(_) | rtu::Probe::Refused(_))
         };
-        self.told(answer, is, |row| row.expected.as_ref().is_some_and(is_right)).or_else(|| {
+        self.classify(answer, is, |row| row.expected.as_ref().is_some_and(is_right)).or_else(|| {
             let (format, slot, nth) = self.unasked().find(|(format, ..)| is(format))?;
             Some(Heard::Unasked(format, slot, nth))
         })
@@ -151,7 +151,7 @@ impl<'i> PendingReplies<'i> {
 
     /// An answer, unless it may be a refusal of another request or its pending answer; else a late reply. Frames of a
     /// device's own are told by `is`, those of Modbus by `is_expected`.
-    pub(super) fn told(
+    pub(super) fn classify(
         &self,
         answer: Option<Heard<'i>>,
         is: impl Fn(&DeviceFormat) -> bool,

@@ -48,9 +48,9 @@ enum Of {
     Link(LinkId),
 }
 
-/// A value that the robot is told.
+/// A variable that shows the robot the health of a port.
 #[derive(Debug, Clone, Copy)]
-struct Told {
+struct HealthVariable {
     port: u8,
     value: PortValue,
     var: SysVar,
@@ -58,37 +58,44 @@ struct Told {
     last: Option<u32>,
 }
 
-/// What is shown and told of the ports' health.
+/// What is shown to devices and to the robot of the ports' health.
 #[derive(Debug, Clone)]
 pub(super) struct PortsHealth {
     shown: Vec<Shown, MAX_EXTRA>,
-    told: Vec<Told, MOST>,
-    /// Whether the robot is told anything: health, or what became of events.
-    is_told: bool,
+    variables: Vec<HealthVariable, MOST>,
+    /// Whether anything is reported to the robot: health, or what became of events.
+    is_reported: bool,
     /// The group of the variables.
     group: GroupId,
-    tell_at: Instant,
+    report_at: Instant,
     repeat_at: Instant,
 }
 
 impl PortsHealth {
     pub(super) const fn new() -> Self {
-        let (tell_at, repeat_at) = (Instant::ZERO, Instant::ZERO);
-        Self { shown: Vec::new(), told: Vec::new(), is_told: false, group: GroupId(0), tell_at, repeat_at }
+        let (report_at, repeat_at) = (Instant::ZERO, Instant::ZERO);
+        Self {
+            shown: Vec::new(),
+            variables: Vec::new(),
+            is_reported: false,
+            group: GroupId(0),
+            report_at,
+            repeat_at,
+        }
     }
 
     pub(super) fn clear(&mut self) {
         self.shown.clear();
-        self.told.clear();
-        self.is_told = false;
+        self.variables.clear();
+        self.is_reported = false;
         self.group = GroupId(0);
-        self.tell_at = Instant::ZERO;
+        self.report_at = Instant::ZERO;
         self.repeat_at = Instant::ZERO;
     }
 
-    /// Index of the port whose health the variable tells.
+    /// Index of the port whose health the variable shows.
     pub(super) fn owner(&self, var: SysVar) -> Option<u8> {
-        self.told.iter().find(|told| told.var == var).map(|told| told.port)
+        self.variables.iter().find(|own| own.var == var).map(|own| own.port)
     }
 }
 
@@ -103,8 +110,8 @@ fn id_of(link: LinkSource) -> LinkId {
     }
 }
 
-/// The value of a variable that tells a port's health.
-fn told_as(var: SysVar, value: PortValue, number: u32) -> Scalar {
+/// The value of a variable that shows a port's health.
+fn scalar_of(var: SysVar, value: PortValue, number: u32) -> Scalar {
     if value.is_count() {
         wrapping_count(var.ty(), number)
     } else {
@@ -199,10 +206,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     ) -> Result<(), BuildError> {
         for (nth, (_, port, _)) in (0..).zip(config.field_ports()) {
             let recipe = config.recipes.get(usize::from(port.recipe));
-            let vars = recipe.into_iter().flat_map(|recipe| config.told_by(nth, port, recipe));
+            let vars = recipe.into_iter().flat_map(|recipe| config.status_variables(nth, port, recipe));
             for (_, var) in vars {
-                if !self.health.is_told {
-                    self.health.is_told = true;
+                if !self.health.is_reported {
+                    self.health.is_reported = true;
                     self.health.group = groups.next().ok_or(one_too_many(Counted::Groups, MAX_GROUPS))?;
                     self.store.check_health_at(Instant::ZERO);
                 }
@@ -211,7 +218,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             }
             for (value, var) in port.health.iter() {
                 // There is room for every value of every port.
-                let _ = self.health.told.push(Told { port: nth, value, var, last: None });
+                let _ = self.health.variables.push(HealthVariable { port: nth, value, var, last: None });
             }
         }
         Ok(())
@@ -257,15 +264,15 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[cold]
     #[inline(never)]
     pub(super) fn check_health(&mut self, now: Instant) {
-        if self.health.is_told && now >= self.health.tell_at {
+        if self.health.is_reported && now >= self.health.report_at {
             self.tell_changes(now);
-            self.health.tell_at = now + CHECK_EVERY;
+            self.health.report_at = now + CHECK_EVERY;
         }
         self.show_health(now);
         let shows = self.ports.iter().filter(|port| port.sender.shows_health);
         let next = shows.map(|port| port.sender.next_cycle(now)).min().unwrap_or(Instant::NEVER);
-        let tell_at = if self.health.is_told { self.health.tell_at } else { Instant::NEVER };
-        self.store.check_health_at(next.min(tell_at));
+        let report_at = if self.health.is_reported { self.health.report_at } else { Instant::NEVER };
+        self.store.check_health_at(next.min(report_at));
     }
 
     /// Tells the robot what has changed, and now and then everything.
@@ -290,8 +297,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 
     fn tell_health(&mut self, is_asked: impl Fn(PortValue) -> bool, repeats: bool, now: Instant) {
         let mut news = InputSet::EMPTY;
-        for nth in 0..self.health.told.len() {
-            let Some(&Told { port, value, var, last }) = self.health.told.get(nth) else { break };
+        for nth in 0..self.health.variables.len() {
+            let Some(&HealthVariable { port, value, var, last }) = self.health.variables.get(nth) else {
+                break;
+            };
             if !is_asked(value) {
                 continue;
             }
@@ -300,10 +309,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 continue;
             }
             // The value has the variable's type.
-            let _ = self.store.image.set(var, told_as(var, value, number));
+            let _ = self.store.image.set(var, scalar_of(var, value, number));
             news.insert(var);
-            if let Some(told) = self.health.told.get_mut(nth) {
-                told.last = Some(number);
+            if let Some(own) = self.health.variables.get_mut(nth) {
+                own.last = Some(number);
             }
         }
         if !news.is_empty() {

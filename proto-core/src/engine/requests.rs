@@ -103,8 +103,8 @@ impl Maker<'_> {
                 item.is_owed = false;
                 item.digest = content;
             }
-            let told_by = (expected, sdo_of(item, request));
-            line.handed_over(table, flight, told_by, request, now);
+            let status_variables = (expected, sdo_of(item, request));
+            line.handed_over(table, flight, status_variables, request, now);
             let len = match &mut line.transactions {
                 Some(all) => all.begin(flight.exchange, len, out)?,
                 None => len,

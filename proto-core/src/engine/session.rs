@@ -38,7 +38,7 @@ pub(super) struct Session {
     pub supervisor: Supervisor,
     pub counters: LinkCounters,
     client: CommandClient,
-    /// The command whose reply is awaited, and a newer, urgent one that did not wait for it.
+    /// The command whose reply is pending, and a newer, urgent one that did not wait for it.
     pub in_flight: Option<Sent>,
     pub beside: Option<Sent>,
     /// The newest text that no command got as its reply.

@@ -318,7 +318,7 @@ impl Row {
         (self.event, self.expected) = (None, None);
         (self.wait, self.was_answered, self.is_missed) = (Wait::NONE, false, false);
         self.is_unconfirmed = false;
-        // Nobody knows how many: they are awaited until the end.
+        // Nobody knows how many: they are pending until the end.
         let count = if self.kind.is_answered { u8::MAX } else { 0 };
         (self.outstanding, self.outstanding_until) = (count, now + self.times.late);
         if let Some(grid) = &mut self.grid {
@@ -700,11 +700,11 @@ impl Turns<'_> {
         let rows = || self.rows.iter().filter(|row| row.peer == which && row.kind.is_answered);
         let was_answered = rows().any(|row| row.was_answered);
         // One that never was does not say anything while others were.
-        let telling = || rows().filter(|row| row.was_answered || !was_answered);
+        let deciding = || rows().filter(|row| row.was_answered || !was_answered);
         // Nor does one that is asked now and then while others have a period: they will tell.
-        let has_period = telling().any(|row| row.grid.is_some());
-        let telling = || telling().filter(|row| row.grid.is_some() || !has_period);
-        let (all, missed) = (telling().count(), telling().filter(|row| row.is_missed).count());
+        let has_period = deciding().any(|row| row.grid.is_some());
+        let deciding = || deciding().filter(|row| row.grid.is_some() || !has_period);
+        let (all, missed) = (deciding().count(), deciding().filter(|row| row.is_missed).count());
         missed >= all.min(2) && missed > 0
     }
 

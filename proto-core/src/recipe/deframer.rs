@@ -145,7 +145,7 @@ impl Deframer {
         }
     }
 
-    /// Takes all that an undisturbed frame needs: the ring is not wrapped, and the head is known to be right.
+    /// Takes all that an intact frame needs: the ring is not wrapped, and the head is known to be right.
     #[inline(always)]
     fn go_on(&mut self, layout: &StreamLayout, chunk: &mut &[u8]) -> Held {
         let (held, frame_len) = (self.pending(), layout.frame_len());

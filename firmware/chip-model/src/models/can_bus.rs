@@ -64,7 +64,7 @@ impl Frame {
             Attempt::Acknowledged => whole,
             // Up to the missing acknowledge, then an error frame and the intermission.
             Attempt::NotAcknowledged => whole - 11 + 14,
-            Attempt::Disturbed => 20 + 14,
+            Attempt::BitError => 20 + 14,
         }
     }
 }
@@ -77,7 +77,7 @@ pub enum Attempt {
     /// Not acknowledged.
     NotAcknowledged,
     /// Bit error.
-    Disturbed,
+    BitError,
 }
 
 /// A fault of the bus.
@@ -151,7 +151,7 @@ impl CanBus {
         Ok(match self.fault {
             BusFault::None if self.is_understood(bit) => Attempt::Acknowledged,
             BusFault::NoAcknowledge => Attempt::NotAcknowledged,
-            BusFault::None | BusFault::ShortCircuit => Attempt::Disturbed,
+            BusFault::None | BusFault::ShortCircuit => Attempt::BitError,
         })
     }
 

@@ -111,7 +111,7 @@ impl Fdcan {
             }
             // An error-passive node does not count missing acknowledges (ISO 11898-1).
             Attempt::NotAcknowledged if self.transmit_errors >= 128 => {}
-            Attempt::NotAcknowledged | Attempt::Disturbed => {
+            Attempt::NotAcknowledged | Attempt::BitError => {
                 self.update_errors(|can| can.transmit_errors += 8)
             }
         }

@@ -27,15 +27,15 @@ impl Console {
         let state = match node.edge.view() {
             View::Off => "off",
             View::Cannot(_) => "cannot",
-            View::Runs(telling) if telling.is_online => "online",
+            View::Runs(session) if session.is_online => "online",
             View::Runs(_) => "offline",
         };
         write!(out, "{{\"state\":\"{state}\"")?;
         match node.edge.view() {
             View::Off => {}
             View::Cannot(why) => write_why(out, &why)?,
-            View::Runs(telling) => {
-                if let Some(failure) = telling.failure {
+            View::Runs(session) => {
+                if let Some(failure) = session.failure {
                     write_why(out, &failure)?;
                 }
                 if let Some(document) = node.document {
@@ -52,11 +52,11 @@ impl Console {
                     }
                 }
                 write!(out, ",\"utc\":{}", node.clock.is_known())?;
-                if let Some(bd_seq) = telling.bd_seq {
+                if let Some(bd_seq) = session.bd_seq {
                     write!(out, ",\"bd_seq\":{bd_seq}")?;
                 }
-                write!(out, ",\"metrics\":{},\"counters\":{{", telling.metrics)?;
-                let counters = telling.counters;
+                write!(out, ",\"metrics\":{},\"counters\":{{", session.metrics)?;
+                let counters = session.counters;
                 let all = [
                     ("sessions", counters.sessions.into()),
                     ("births", counters.births.into()),

@@ -103,7 +103,7 @@ pub(crate) struct Judge {
     refused: Option<(Instant, u8)>,
     is_on: bool,
     /// When something last went wrong with the line or the device.
-    calm_since: Instant,
+    quiet_since: Instant,
     /// When that, or a reply to what it is to keep was missing, late or damaged; or no reply came in time.
     trouble: Instant,
     /// When a reply last left in time.
@@ -155,7 +155,7 @@ impl Judge {
             kept: None,
             refused: None,
             is_on: true,
-            calm_since: now,
+            quiet_since: now,
             trouble: now,
             in_time: now,
             is_faulty: false,
@@ -205,7 +205,7 @@ impl Judge {
 
     /// The line, or the gateway's port, has a fault at this instant.
     pub(crate) fn note_fault(&mut self, now: Instant) {
-        (self.calm_since, self.trouble) = (now, now);
+        (self.quiet_since, self.trouble) = (now, now);
     }
 
     /// The gateway is not called at this instant.
@@ -432,7 +432,7 @@ impl Judge {
         }
         if let Some(stop) = &mut self.stop {
             stop.known = stop.known.or_else(|| self.robot.taken(stop.conn, stop.at));
-            let since = stop.known.map(|known| known.max(self.calm_since));
+            let since = stop.known.map(|known| known.max(self.quiet_since));
             if let Some(since) = since.filter(|_| self.is_on) {
                 let waits = now.saturating_since(since);
                 let result = match waits > STOPS_WITHIN {

@@ -207,7 +207,7 @@ impl Oracle {
         self.begin_exchanges(nth, now);
     }
 
-    /// A conversation begins anew.
+    /// The exchanges begin anew.
     pub(super) fn begin_exchanges(&mut self, nth: usize, now: Instant) {
         let watch = &mut self.ports[nth];
         watch.line.discarded += watch.served.discard();

@@ -116,7 +116,7 @@ pub fn parse(text: Text<'_>, overrides: &[String]) -> Result<Config> {
     match kind_of(&document)? {
         Flavour::Gateway => gateway::read(&document).map(Config::Gateway),
         Flavour::Controller => {
-            let config = controller::read(&document).map_err(|error| told_kind(&document, error))?;
+            let config = controller::read(&document).map_err(|error| name_kind(&document, error))?;
             Ok(Config::Controller(Box::new(config)))
         }
     }
@@ -177,8 +177,8 @@ fn read_recipes(text: Text<'_>, overrides: &[String]) -> Result<Vec<FileRecipe>>
         Flavour::Gateway => &keys::top::GATEWAY,
         Flavour::Controller => &keys::top::CONTROLLER,
     };
-    let root = Reader::root(&document, keys).map_err(|error| told_kind(&document, error))?;
-    recipes::read_all(&root, flavour).map_err(|error| told_kind(&document, error))
+    let root = Reader::root(&document, keys).map_err(|error| name_kind(&document, error))?;
+    recipes::read_all(&root, flavour).map_err(|error| name_kind(&document, error))
 }
 
 /// A mistake found after the file was read, at the place of `key` (names; an item of an array by
@@ -233,7 +233,7 @@ fn has_own_section(document: &Document) -> bool {
 }
 
 /// A mistake in a file of which nothing but the missing `[controller]` says that it is a controller's.
-fn told_kind(document: &Document, mut error: FileError) -> FileError {
+fn name_kind(document: &Document, mut error: FileError) -> FileError {
     if document.root.get("controller").is_none() && !has_own_section(document) {
         error.message += " (without [controller] it is read as a controller file; a gateway file has that)";
     }

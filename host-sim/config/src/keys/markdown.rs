@@ -105,7 +105,7 @@ pub fn rows(keys: &[&[Key]]) -> String {
             Need::Bool(value) => format!("`{value}`"),
             Need::Absent(text) => text.to_owned(),
         };
-        let allowed = if key.is_told { String::new() } else { allowed(&key.shape) };
+        let allowed = if key.lists_allowed { String::new() } else { allowed(&key.shape) };
         let unit =
             if key.unit.is_empty() || allowed.is_empty() { String::new() } else { format!(" {}", key.unit) };
         let between = match (allowed.is_empty(), key.text.is_empty() || key.text.starts_with('(')) {

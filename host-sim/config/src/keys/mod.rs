@@ -36,7 +36,7 @@ pub struct Key {
     /// What it means, in the page's Markdown.
     pub text: &'static str,
     /// The text says what is allowed, so nothing has to be put before it.
-    pub is_told: bool,
+    pub lists_allowed: bool,
 }
 
 /// Whether a key may be left out.
@@ -236,7 +236,7 @@ impl Case {
 impl Key {
     pub(crate) const fn new(name: &'static str, shape: Shape) -> Self {
         let need = Need::Absent("none");
-        Self { name, shape, need, beside: &[], unit: "", text: "", is_told: false }
+        Self { name, shape, need, beside: &[], unit: "", text: "", lists_allowed: false }
     }
 
     pub(crate) const fn words(name: &'static str, words: Words) -> Self {
@@ -317,12 +317,12 @@ impl Key {
 
     /// Its meaning, behind what is allowed.
     pub(crate) const fn is(self, text: &'static str) -> Self {
-        Self { text, is_told: false, ..self }
+        Self { text, lists_allowed: false, ..self }
     }
 
     /// Its meaning, which says what is allowed.
     pub(crate) const fn tells(self, text: &'static str) -> Self {
-        Self { text, is_told: true, ..self }
+        Self { text, lists_allowed: true, ..self }
     }
 }
 

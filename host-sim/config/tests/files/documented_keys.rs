@@ -102,7 +102,7 @@ fn the_key_table_is_consistent() {
                 assert!(key.integers().contains(&value), "{name}: the default is not allowed");
                 assert!(key.limits().take(value as f64), "{name}: the default is not allowed");
             }
-            if let (true, Shape::Words(words)) = (key.is_told, key.shape) {
+            if let (true, Shape::Words(words)) = (key.lists_allowed, key.shape) {
                 let is_told = |word: &&str| {
                     key.text.contains(&format!("\"{word}\"")) || key.text.contains(&format!("`{word}`"))
                 };

@@ -145,7 +145,7 @@ impl BoardOutcome {
 
     pub(crate) fn words(&self) -> (String, Look) {
         match self {
-            Self::NotBegun => ("not begun".into(), Look::Doubtful),
+            Self::NotBegun => ("not begun".into(), Look::Warning),
             Self::Already => ("ran it already".into(), Look::Well),
             Self::Updated => ("updated".into(), Look::Well),
             Self::Failed { step, why, left } => {

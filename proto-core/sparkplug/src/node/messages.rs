@@ -312,7 +312,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
             name: Some(&metric.name),
             data_type: Some(slot.data_type),
             details: Details { unit: metric.unit, range: metric.range, description: metric.description },
-            ..data_metric(place, self.dates.sampled_ms, slot.told, false)
+            ..data_metric(place, self.dates.sampled_ms, slot.published, false)
         };
         payload::metric(out, &shown);
     }

@@ -1,4 +1,4 @@
-//! Frames that a wrong byte disturbed, or whose head came in pieces: what is held is looked at byte by byte, in a ring
+//! Frames with a wrong byte, or whose head came in pieces: what is held is looked at byte by byte, in a ring
 //! that may be wrapped (docs/wire/recipes.md section 4).
 //!
 //! In: a chunk, and what is held before it. Out: a frame in the ring, or less that is held. Does not know what follows

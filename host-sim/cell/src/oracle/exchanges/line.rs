@@ -1,4 +1,4 @@
-//! The conversation on one line or bus: the request on its way, its reply, and who is asked when
+//! The exchanges of one line or bus: the request on its way, its reply, and who is asked when
 //! (proto-core/docs/wire/modbus-rtu.md sections 4 and 5, docs/configuration.md section 4, "Conversations").
 //!
 //! It does not predict which request is next: it says which ones may be sent, which must not, and how
@@ -98,7 +98,7 @@ struct RowWatch {
     is_missed: bool,
     failures: u32,
     /// It is asked at this instant at the latest, as far as its own failures go.
-    calm_at: Instant,
+    retry_at: Instant,
     is_unconfirmed: bool,
     is_refused: bool,
     /// It may be sent at the start.
@@ -143,7 +143,7 @@ impl RowWatch {
 
     fn waits_longer(&mut self, timeout: Duration, now: Instant) {
         self.failures += 1;
-        self.calm_at = now + wait(timeout, self.failures);
+        self.retry_at = now + wait(timeout, self.failures);
     }
 }
 
@@ -543,7 +543,7 @@ impl ExchangesWatch {
             self.slaves.entry(spec.slave).or_default().opened = now;
         }
         match ended {
-            Ended::Good | Ended::Refused => (watch.failures, watch.calm_at) = (0, Instant::ZERO),
+            Ended::Good | Ended::Refused => (watch.failures, watch.retry_at) = (0, Instant::ZERO),
             Ended::Busy | Ended::Unclear => watch.waits_longer(spec.timeout, now),
         }
         if ended == Ended::Busy {
@@ -673,13 +673,13 @@ impl ExchangesWatch {
         let rows = exchanges.rows_of(number).filter(|(_, row)| row.is_answered());
         let rows: Vec<_> = rows.map(|(nth, row)| (row.every.is_some(), &self.rows[nth])).collect();
         let was_answered = rows.iter().any(|(_, row)| row.was_answered);
-        let mut telling = rows;
-        telling.retain(|(_, row)| row.was_answered || !was_answered);
-        if telling.iter().any(|(has_period, _)| *has_period) {
-            telling.retain(|(has_period, _)| *has_period);
+        let mut deciding = rows;
+        deciding.retain(|(_, row)| row.was_answered || !was_answered);
+        if deciding.iter().any(|(has_period, _)| *has_period) {
+            deciding.retain(|(has_period, _)| *has_period);
         }
-        let missed = telling.iter().filter(|(_, row)| row.is_missed).count();
-        missed > 0 && missed >= telling.len().min(2)
+        let missed = deciding.iter().filter(|(_, row)| row.is_missed).count();
+        missed > 0 && missed >= deciding.len().min(2)
     }
 
     /// Checks that the line has not been idle although a period has ended, that every period has its turn,
@@ -703,12 +703,12 @@ impl ExchangesWatch {
             // Nothing is known of a device that nobody expects an answer of.
             let is_mute = slave.presence == Presence::Unknown
                 && exchanges.rows_of(row.slave).all(|(_, row)| !row.is_answered());
-            let is_calm = slave.presence == Presence::Up && slave.failing.is_none();
-            if !is_calm && !is_mute || self.is_opening(exchanges, row.slave, slave) {
+            let is_healthy = slave.presence == Presence::Up && slave.failing.is_none();
+            if !is_healthy && !is_mute || self.is_opening(exchanges, row.slave, slave) {
                 continue;
             }
             checked += 1;
-            let ready = watch.blocked_until.max(watch.calm_at).max(slave.since).max(slave.opened);
+            let ready = watch.blocked_until.max(watch.retry_at).max(slave.since).max(slave.opened);
             let due = (asked + every).max(free).max(ready);
             let idle = now.saturating_since(due);
             if self.is_free() && !is_busy && idle > IDLE + stalled(due) {

@@ -1,4 +1,4 @@
-//! Conversations with the slaves of a Modbus RTU line and with devices that have frames of their own: what
+//! Exchanges with the slaves of a Modbus RTU line and with devices that have frames of their own: what
 //! the gateway asks and takes, and what devices and controller really had (docs/cell.md section 4).
 
 mod frames;

@@ -16,7 +16,7 @@ use crate::oracle::device::{self, look};
 use crate::oracle::spec::{Frame, PortSpec, device_frame};
 use crate::rtu::is_right;
 
-/// The conversation of a port.
+/// The exchanges of a port.
 #[derive(Debug, Clone)]
 pub(in crate::oracle) struct ExchangesSpec {
     pub rows: Vec<RowSpec>,
