@@ -234,7 +234,8 @@ pub(super) fn sum_bytes(sum: &Checksum) -> usize {
     let bytes = match sum.algorithm {
         Algorithm::Crc(crc) => usize::from(crc.width).div_ceil(8),
         Algorithm::Sum16 => 2,
-        _ => 1,
+        Algorithm::Sum8 | Algorithm::Xor8 | Algorithm::Lrc => 1,
+        other => panic!("{other:?} has no model"),
     };
     if sum.text { 2 * bytes } else { bytes }
 }
