@@ -29,7 +29,7 @@ use open::Devices;
 use super::host::{self, Handle, Runtime};
 use super::link::{self, LinkControl, LinkEndpoint, LinkEvent};
 use super::publisher::{Publisher, SnapshotWatch};
-use super::snapshot::{Engine, MAX_SAFE, SnapshotSlot};
+use super::snapshot::{Engine, GatewaySnapshot, MAX_SAFE, SnapshotSlot};
 use super::worker::RuntimePlace;
 use super::{RunOptions, StartError};
 use recipe_capture::{Decoder, Watch};
@@ -207,24 +207,27 @@ impl Core {
         }
     }
 
+    /// Copies the gateway of this instant.
+    fn copy_to(&self, snapshot: &mut GatewaySnapshot, at: Instant) {
+        snapshot.engine.clone_from(&self.engine.borrow());
+        snapshot.at = at;
+        snapshot.running = at.saturating_since(self.started);
+        snapshot.keep_records(&self.records.borrow());
+        snapshot.links.clear();
+        snapshot.links.extend(snapshot.engine.links().map(|info| self.facts_of(info.id)));
+        snapshot.devices = Default::default();
+        for (port, (_, tx)) in &self.ports {
+            if let Some(counters) = snapshot.devices.get_mut(usize::from(port.0)) {
+                *counters = Some(tx.counters());
+            }
+        }
+    }
+
     /// Fills a snapshot slot on request, and sends the safe values when the gateway is to end.
     async fn show(&self, slot: &SnapshotSlot) -> Result<(), StartError> {
         loop {
             tokio::select! {
-                () = slot.wanted.notified() => slot.fill(|snapshot| {
-                    snapshot.engine.clone_from(&self.engine.borrow());
-                    snapshot.at = now();
-                    snapshot.running = snapshot.at.saturating_since(self.started);
-                    snapshot.keep_records(&self.records.borrow());
-                    snapshot.links.clear();
-                    snapshot.links.extend(self.engine.borrow().links().map(|info| self.facts_of(info.id)));
-                    snapshot.devices = Default::default();
-                    for (port, (_, tx)) in &self.ports {
-                        if let Some(counters) = snapshot.devices.get_mut(usize::from(port.0)) {
-                            *counters = Some(tx.counters());
-                        }
-                    }
-                }),
+                () = slot.wanted.notified() => slot.fill(|snapshot| self.copy_to(snapshot, now())),
                 () = slot.ending.notified() => {
                     self.is_ending.set(true);
                     self.engine.borrow_mut().make_safe();
@@ -490,7 +493,7 @@ pub(crate) fn spawn(
     let watch = observers.watch.clone();
     let (doctor, texts) = match observers.readers {
         true => {
-            let (doctor, texts) = doctor::start(config.clone(), &binds, place.span.clone())?;
+            let (doctor, texts) = doctor::start(config.clone(), place.span.clone())?;
             (Some(doctor), Some(texts))
         }
         false => (None, None),

@@ -7,10 +7,11 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::Duration as StdDuration;
 
-use proto_core::config::MAX_PORTS;
+use proto_core::config::{GatewayConfig, MAX_PORTS};
 use proto_core::engine::PortId;
 use proto_core::time::{Duration, Instant};
-use recipe_doctor::{LinkFacts, PortRecord};
+use proto_core::wire::state::States;
+use recipe_doctor::{Case, Finding, LinkFacts, PortRecord, examine};
 use recipe_io::exchange::DeviceCounters;
 use tokio::sync::Notify;
 
@@ -70,9 +71,16 @@ impl GatewaySnapshot {
         self.ports = records.len();
     }
 
-    /// Recent input of each port.
-    pub(crate) fn records(&self) -> &[PortRecord] {
-        self.records.get(..self.ports).unwrap_or(&self.records)
+    /// Findings. `looked` are the controller's states, if they were read outside the engine.
+    pub(crate) fn findings(&self, config: &GatewayConfig, looked: Option<States>) -> Vec<Finding> {
+        examine(&Case {
+            config: config.view(),
+            status: self.engine.status(self.at).into(),
+            ports: self.records.get(..self.ports).unwrap_or(&self.records),
+            links: &self.links,
+            running: self.running,
+            looked,
+        })
     }
 }
 

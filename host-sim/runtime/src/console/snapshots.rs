@@ -11,7 +11,7 @@ use proto_core::wire::state::States;
 use recipe_api::documents::{Document, Pieces};
 use recipe_api::json;
 use recipe_api::metrics::Families;
-use recipe_doctor::{Case, Finding, examine};
+use recipe_doctor::Finding;
 use recipe_io::timer::now;
 use serde_json::Value;
 
@@ -143,14 +143,7 @@ impl Snapshot {
     /// Findings. `looked` are the controller's states, if they were read outside the engine.
     pub(super) fn findings(&self, looked: Option<States>) -> Option<Vec<Finding>> {
         let SnapshotContent::Gateway(snapshot, config) = &self.what else { return None };
-        Some(examine(&Case {
-            config: config.view(),
-            status: snapshot.engine.status(snapshot.at).into(),
-            ports: snapshot.records(),
-            links: &snapshot.links,
-            running: snapshot.running,
-            looked,
-        }))
+        Some(snapshot.findings(config, looked))
     }
 }
 

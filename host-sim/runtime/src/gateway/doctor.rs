@@ -14,9 +14,9 @@ use std::time::Duration as StdDuration;
 
 use proto_core::config::GatewayConfig;
 use proto_core::engine::{LinkId, PortId};
-use proto_core::time::{Duration, Instant};
+use proto_core::time::Instant;
 use proto_core::wire::state::States;
-use recipe_doctor::{Case, Change, Finding, LinkFacts, PortRecord, Watch, examine, has_commands};
+use recipe_doctor::{Change, Finding, LinkFacts, PortRecord, Watch, has_commands};
 use serde_json::Value;
 use tracing::{Span, info};
 
@@ -24,7 +24,7 @@ use super::open::Devices;
 use super::{Core, Gateway, Observers, TxPolicy};
 use crate::findings::{FindingTexts, look_at_states, unexplained};
 use crate::host::{self, Runtime};
-use crate::snapshot::Engine;
+use crate::snapshot::GatewaySnapshot;
 use crate::worker::RuntimePlace;
 use crate::{Signals, StartError};
 use recipe_io::bind::Bind;
@@ -32,37 +32,8 @@ use recipe_io::timer::now;
 
 /// The gateway's end of the channels to the examining thread.
 pub(super) struct Doctor {
-    buffers: Receiver<Box<DoctorSnapshot>>,
-    filled: SyncSender<Box<DoctorSnapshot>>,
-}
-
-/// A gateway at one instant.
-pub(super) struct DoctorSnapshot {
-    at: Instant,
-    running: Duration,
-    engine: Box<Engine>,
-    ports: Vec<PortRecord>,
-    links: Vec<LinkFacts>,
-}
-
-impl DoctorSnapshot {
-    /// A buffer for a copy of a gateway with these records.
-    fn buffer(ports: Vec<PortRecord>) -> Box<Self> {
-        let engine = Box::new(Engine::idle());
-        let links = Vec::with_capacity(Engine::MAX_LINKS);
-        Box::new(Self { at: Instant::ZERO, running: Duration::ZERO, engine, ports, links })
-    }
-
-    fn findings(&self, config: &GatewayConfig, looked: Option<States>) -> Vec<Finding> {
-        examine(&Case {
-            config: config.view(),
-            status: self.engine.status(self.at).into(),
-            ports: &self.ports,
-            links: &self.links,
-            running: self.running,
-            looked,
-        })
-    }
+    buffers: Receiver<Box<GatewaySnapshot>>,
+    filled: SyncSender<Box<GatewaySnapshot>>,
 }
 
 impl Core {
@@ -81,16 +52,6 @@ impl Core {
                 record.fd_frames = self.ports.get(&port.id).map_or(0, |(_, tx)| tx.counters().fd_frames);
             }
         }
-    }
-
-    /// Copies everything that findings are derived from.
-    fn copy_to(&self, buffer: &mut DoctorSnapshot, at: Instant) {
-        let DoctorSnapshot { at: taken, running, engine, ports, links } = buffer;
-        (*taken, *running) = (at, at.saturating_since(self.started));
-        engine.clone_from(&self.engine.borrow());
-        ports.clone_from(&self.records.borrow());
-        links.clear();
-        links.extend(engine.links().map(|info| self.facts_of(info.id)));
     }
 
     /// What is known of a link beyond the engine's status.
@@ -135,14 +96,10 @@ impl Core {
 }
 
 /// Starts the thread that examines snapshots and logs findings that appear or disappear.
-pub(super) fn start(
-    config: GatewayConfig,
-    binds: &[Bind],
-    span: Span,
-) -> Result<(Doctor, FindingTexts), StartError> {
+pub(super) fn start(config: GatewayConfig, span: Span) -> Result<(Doctor, FindingTexts), StartError> {
     let (filled, inbox) = sync_channel(1);
     let (empty, buffers) = sync_channel(1);
-    let buffer = DoctorSnapshot::buffer(records(&config, binds));
+    let buffer = GatewaySnapshot::empty();
     let texts = FindingTexts::default();
     let own = texts.clone();
     let thread = std::thread::Builder::new().name("doctor".to_owned());
@@ -170,8 +127,8 @@ fn records(config: &GatewayConfig, binds: &[Bind]) -> Vec<PortRecord> {
 
 fn log_changes(
     config: &GatewayConfig,
-    inbox: &Receiver<Box<DoctorSnapshot>>,
-    empty: &SyncSender<Box<DoctorSnapshot>>,
+    inbox: &Receiver<Box<GatewaySnapshot>>,
+    empty: &SyncSender<Box<GatewaySnapshot>>,
     texts: &FindingTexts,
 ) {
     let mut watch = Watch::new();
@@ -255,7 +212,7 @@ impl Runtime for Listener {
         }
         let at = now();
         core.note(at);
-        let mut snapshot = DoctorSnapshot::buffer(Vec::new());
+        let mut snapshot = GatewaySnapshot::empty();
         core.copy_to(&mut snapshot, at);
         let has_states = snapshot.engine.status(snapshot.at).controller().is_some();
         let looked = match !has_states && has_commands(self.config.view()) {
