@@ -4,7 +4,8 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::path::{Path, PathBuf};
+
+use recipe_test_kit::source::root;
 
 /// Pages by their path from the root, each with the numbers of its sections.
 type Pages = BTreeMap<String, Vec<String>>;
@@ -155,8 +156,4 @@ fn files() -> Vec<(String, String)> {
     files.retain(|(name, _)| !name.ends_with("tests/citations.rs"));
     files.sort();
     files
-}
-
-fn root() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap().to_path_buf()
 }

@@ -6,8 +6,9 @@
 //! another literal than the rest.
 
 use std::collections::BTreeMap;
-use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
+
+use recipe_test_kit::source::{Source, read, root};
 
 /// Folders of tests, and the folders of the programs that they run.
 const TESTS: [(&str, &[&str]); 7] = [
@@ -43,15 +44,16 @@ const LOOKUPS: [&str; 13] = [
 #[test]
 fn every_text_that_is_looked_for_is_logged() {
     let (mut seen, mut missing) = (0, Vec::new());
-    let mut folders: BTreeMap<&str, Vec<Source>> = BTreeMap::new();
+    let mut folders: BTreeMap<&str, Vec<LogSource>> = BTreeMap::new();
     for folder in TESTS.into_iter().flat_map(|(_, programs)| programs) {
         folders.entry(folder).or_insert_with(|| programs(folder));
     }
-    let panic = Source::new(PANIC);
+    let panic = LogSource::new(Source::new(PANIC));
     for (tests, programs) in TESTS {
         let programs = programs.iter().flat_map(|folder| &folders[folder]);
         let sources = Sources(programs.chain([&panic]).collect());
-        let files: Vec<(PathBuf, Source)> = read(&root().join(tests), |_| true);
+        let files = read(&root().join(tests), |_| true);
+        let files: Vec<_> = files.into_iter().map(|(path, source)| (path, LogSource::new(source))).collect();
         let constants: BTreeMap<String, String> =
             files.iter().flat_map(|(_, source)| source.constants()).collect();
         for (path, source) in &files {
@@ -69,7 +71,7 @@ fn every_text_that_is_looked_for_is_logged() {
 
 #[test]
 fn a_changed_text_is_noticed() {
-    let source = Source::new(
+    let source = LogSource::new(Source::new(
         r#"fn f() {
             warn!("port {}: {} bytes discarded; parity {}", name, count, parity); // "of a comment"
             let quote = ('"', b'\'', "the image is \
@@ -78,7 +80,7 @@ fn a_changed_text_is_noticed() {
         }
         #[cfg(test)]
         mod tests { const ONLY: &str = "in a test"; }"#,
-    );
+    ));
     let sources = Sources(vec![&source]);
     for text in [
         "bytes discarded",
@@ -106,7 +108,7 @@ fn a_changed_text_is_noticed() {
 
 #[test]
 fn lookups_are_read_however_they_are_written() {
-    let source = Source::new(
+    let source = LogSource::new(Source::new(
         r#"const ADDRESS: &str = "address 10.0.2.15";
         fn f() {
             board.until_log(board::ADDRESS);
@@ -114,14 +116,14 @@ fn lookups_are_read_however_they_are_written() {
             assert!(!log.contains("(") && !bench.has_logged("a)b"), "not looked for");
             assert_said(&log, &["one", "two"]);
         }"#,
-    );
+    ));
     let constants = source.constants().collect();
     let texts = source.lookups(&constants);
     assert_eq!(texts, ["address 10.0.2.15", "panic at {place:08X}, from 08", "a)b", "one", "two", "("]);
 }
 
 /// The programs that a test runs.
-struct Sources<'a>(Vec<&'a Source>);
+struct Sources<'a>(Vec<&'a LogSource>);
 
 impl Sources<'_> {
     /// Whether one of them can log a line with this text.
@@ -163,82 +165,22 @@ impl Sources<'_> {
 
 const LEVELS: [&str; 5] = ["trace!(", "debug!(", "info!(", "warn!(", "error!("];
 
-/// A source file without comments, its string literals apart.
-#[derive(Default)]
-struct Source {
-    /// With the number of each literal in its quotes.
-    code: String,
-    literals: Vec<String>,
-    /// The literals as [`general`] has them.
+/// A source, its literals also as [`general`] has them.
+struct LogSource {
+    source: Source,
     general: Vec<String>,
 }
 
-impl Source {
-    fn new(text: &str) -> Self {
-        let text = &text[..tests_beside(text)];
-        let mut source = Self::default();
-        let mut rest = text;
-        while let Some(c) = rest.chars().next() {
-            let is_word = source.code.ends_with(|c: char| c.is_alphanumeric() || c == '_');
-            if rest.starts_with("//") {
-                rest = &rest[rest.find('\n').unwrap_or(rest.len())..];
-            } else if let Some(behind) = rest.strip_prefix("r#\"").filter(|_| !is_word) {
-                let (literal, behind) = behind.split_once("\"#").unwrap_or((behind, ""));
-                source.push(literal.to_owned());
-                rest = behind;
-            } else if let Some(behind) = rest.strip_prefix('"') {
-                rest = source.read_literal(behind);
-            } else if let Some(behind) = rest.strip_prefix('\'') {
-                // A character, or a lifetime.
-                let len = match behind.as_bytes() {
-                    [b'\\', ..] => behind[2..].find('\'').map_or(0, |end| end + 3),
-                    _ => {
-                        behind.char_indices().nth(1).filter(|(_, c)| *c == '\'').map_or(0, |(end, _)| end + 1)
-                    }
-                };
-                rest = &behind[len..];
-            } else {
-                source.code.push(c);
-                rest = &rest[c.len_utf8()..];
-            }
-        }
-        source.general = source.literals.iter().map(|literal| general(literal)).collect();
-        source
-    }
-
-    fn push(&mut self, literal: String) {
-        self.code += &format!("\"{}\"", self.literals.len());
-        self.literals.push(literal);
-    }
-
-    /// Reads a literal behind its first quote; returns what is behind its last.
-    fn read_literal<'a>(&mut self, text: &'a str) -> &'a str {
-        let (mut literal, mut rest) = (String::new(), text);
-        loop {
-            let mut chars = rest.chars();
-            match chars.next() {
-                None | Some('"') => break rest = chars.as_str(),
-                Some('\\') => match chars.next() {
-                    Some('\n') => rest = chars.as_str().trim_start(),
-                    escaped => {
-                        literal.extend(escaped.filter(|c| "\"\\'".contains(*c)));
-                        rest = chars.as_str();
-                    }
-                },
-                Some(c) => {
-                    literal.push(c);
-                    rest = chars.as_str();
-                }
-            }
-        }
-        self.push(literal);
-        rest
+impl LogSource {
+    fn new(source: Source) -> Self {
+        let general = source.literals.iter().map(|literal| general(literal)).collect();
+        Self { source, general }
     }
 
     /// What stands between the parentheses of each such call.
     fn arguments<'a>(&'a self, call: &'a str) -> impl Iterator<Item = &'a str> {
-        self.code.match_indices(call).map(|(at, _)| {
-            let rest = &self.code[at + call.len()..];
+        self.source.code.match_indices(call).map(|(at, _)| {
+            let rest = &self.source.code[at + call.len()..];
             let mut depth = 1;
             let end = rest.find(|c| {
                 depth += i32::from(c == '(') - i32::from(c == ')');
@@ -253,7 +195,9 @@ impl Source {
         let mut texts = Vec::new();
         for arguments in LOOKUPS.iter().flat_map(|call| self.arguments(call)) {
             let literals = arguments.split('"').skip(1).step_by(2);
-            texts.extend(literals.map(|number| self.literals[number.parse::<usize>().unwrap()].clone()));
+            texts.extend(
+                literals.map(|number| self.source.literals[number.parse::<usize>().unwrap()].clone()),
+            );
             let words = arguments.split(|c: char| !c.is_alphanumeric() && c != '_');
             texts.extend(words.filter_map(|word| constants.get(word).cloned()));
         }
@@ -262,10 +206,11 @@ impl Source {
 
     /// Each `const NAME: &str`.
     fn constants(&self) -> impl Iterator<Item = (String, String)> {
-        self.code.match_indices("const ").filter_map(|(at, word)| {
-            let (name, rest) = self.code[at + word.len()..].split_once(": &str = \"")?;
+        self.source.code.match_indices("const ").filter_map(|(at, word)| {
+            let (name, rest) = self.source.code[at + word.len()..].split_once(": &str = \"")?;
             let number: usize = rest.split('"').next()?.parse().ok()?;
-            (!name.contains(char::is_whitespace)).then(|| (name.to_owned(), self.literals[number].clone()))
+            (!name.contains(char::is_whitespace))
+                .then(|| (name.to_owned(), self.source.literals[number].clone()))
         })
     }
 }
@@ -299,47 +244,11 @@ fn general(text: &str) -> String {
     general
 }
 
-/// Where the tests of a file begin that are beside its code, at its end.
-fn tests_beside(text: &str) -> usize {
-    let is_module = |rest: &str| {
-        let line = rest.trim_start().lines().next().unwrap_or("");
-        line.starts_with("mod ") && line.contains('{')
-    };
-    let attributes = text.match_indices("#[cfg(test)]");
-    let mut modules = attributes.filter(|(at, attribute)| is_module(&text[at + attribute.len()..]));
-    modules.next().map_or(text.len(), |(at, _)| at)
-}
-
 /// The programs in a folder.
-fn programs(folder: &str) -> Vec<Source> {
+fn programs(folder: &str) -> Vec<LogSource> {
     let is_program = |path: &Path| {
         let path = path.to_string_lossy();
         !["/tests", "/test-kit", "/test_", "/fuzz"].iter().any(|part| path.contains(part))
     };
-    read(&root().join(folder), is_program).into_iter().map(|(_, source)| source).collect()
-}
-
-/// Every Rust file of a folder that is wanted.
-fn read(folder: &Path, is_wanted: impl Fn(&Path) -> bool) -> Vec<(PathBuf, Source)> {
-    let (mut files, mut folders) = (Vec::new(), vec![folder.to_path_buf()]);
-    while let Some(folder) = folders.pop() {
-        for entry in fs::read_dir(&folder).unwrap() {
-            let path = entry.unwrap().path();
-            if !is_wanted(&path) {
-                continue;
-            }
-            if path.is_dir() {
-                folders.push(path);
-            } else if path.extension().is_some_and(|end| end == "rs") {
-                let source = Source::new(&fs::read_to_string(&path).unwrap());
-                files.push((path, source));
-            }
-        }
-    }
-    files.sort_by(|(one, _), (other, _)| one.cmp(other));
-    files
-}
-
-fn root() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap().to_path_buf()
+    read(&root().join(folder), is_program).into_iter().map(|(_, source)| LogSource::new(source)).collect()
 }

@@ -1,4 +1,4 @@
-//! Helpers that the tests of host-sim's crates share: processes, waiting, files, configurations.
+//! Helpers that the tests of host-sim's crates share: processes, waiting, files, configurations, sources.
 //!
 //! A helper panics if what the test needs does not happen. None of them depends on the simulated controller,
 //! on cells or on the shell, so that every crate can use them.
@@ -10,6 +10,7 @@ pub mod http;
 pub mod latency;
 mod process;
 pub mod qemu;
+pub mod source;
 pub mod toml;
 
 use std::path::{Path, PathBuf};

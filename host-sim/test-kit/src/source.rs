@@ -1,0 +1,119 @@
+//! Rust sources, for tests that look at the code.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+/// The folder of the repository.
+///
+/// # Panics
+/// Never: this crate is inside.
+pub fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).unwrap().to_path_buf()
+}
+
+/// A Rust source without comments and tests beside its code, its string literals apart.
+#[derive(Debug, Default)]
+pub struct Source {
+    /// The code, with the number of each literal in its quotes.
+    pub code: String,
+    /// The literals, by their numbers.
+    pub literals: Vec<String>,
+}
+
+impl Source {
+    /// The source of a file with this text.
+    pub fn new(text: &str) -> Self {
+        let text = &text[..tests_beside(text)];
+        let mut source = Self::default();
+        let mut rest = text;
+        while let Some(c) = rest.chars().next() {
+            let is_word = source.code.ends_with(|c: char| c.is_alphanumeric() || c == '_');
+            if rest.starts_with("//") {
+                rest = &rest[rest.find('\n').unwrap_or(rest.len())..];
+            } else if let Some(behind) = rest.strip_prefix("r#\"").filter(|_| !is_word) {
+                let (literal, behind) = behind.split_once("\"#").unwrap_or((behind, ""));
+                source.push(literal.to_owned());
+                rest = behind;
+            } else if let Some(behind) = rest.strip_prefix('"') {
+                rest = source.read_literal(behind);
+            } else if let Some(behind) = rest.strip_prefix('\'') {
+                // A character, or a lifetime.
+                let len = match behind.as_bytes() {
+                    [b'\\', ..] => behind[2..].find('\'').map_or(0, |end| end + 3),
+                    _ => {
+                        behind.char_indices().nth(1).filter(|(_, c)| *c == '\'').map_or(0, |(end, _)| end + 1)
+                    }
+                };
+                rest = &behind[len..];
+            } else {
+                source.code.push(c);
+                rest = &rest[c.len_utf8()..];
+            }
+        }
+        source
+    }
+
+    fn push(&mut self, literal: String) {
+        self.code += &format!("\"{}\"", self.literals.len());
+        self.literals.push(literal);
+    }
+
+    /// Reads a literal behind its first quote; returns what is behind its last.
+    fn read_literal<'a>(&mut self, text: &'a str) -> &'a str {
+        let (mut literal, mut rest) = (String::new(), text);
+        loop {
+            let mut chars = rest.chars();
+            match chars.next() {
+                None | Some('"') => break rest = chars.as_str(),
+                Some('\\') => match chars.next() {
+                    Some('\n') => rest = chars.as_str().trim_start(),
+                    escaped => {
+                        literal.extend(escaped.filter(|c| "\"\\'".contains(*c)));
+                        rest = chars.as_str();
+                    }
+                },
+                Some(c) => {
+                    literal.push(c);
+                    rest = chars.as_str();
+                }
+            }
+        }
+        self.push(literal);
+        rest
+    }
+}
+
+/// Every Rust file of a folder whose path, and that of each folder above it, is wanted.
+///
+/// # Panics
+/// If something cannot be read.
+pub fn read(folder: &Path, is_wanted: impl Fn(&Path) -> bool) -> Vec<(PathBuf, Source)> {
+    let (mut files, mut folders) = (Vec::new(), vec![folder.to_path_buf()]);
+    while let Some(folder) = folders.pop() {
+        for entry in fs::read_dir(&folder).unwrap() {
+            let path = entry.unwrap().path();
+            if !is_wanted(&path) {
+                continue;
+            }
+            if path.is_dir() {
+                folders.push(path);
+            } else if path.extension().is_some_and(|end| end == "rs") {
+                let source = Source::new(&fs::read_to_string(&path).unwrap());
+                files.push((path, source));
+            }
+        }
+    }
+    files.sort_by(|(one, _), (other, _)| one.cmp(other));
+    files
+}
+
+/// Where the tests of a file begin that are beside its code, at its end.
+fn tests_beside(text: &str) -> usize {
+    let is_module = |rest: &str| {
+        let line = rest.trim_start().lines().next().unwrap_or("");
+        line.starts_with("mod ") && line.contains('{')
+    };
+    let attributes = text.match_indices("#[cfg(test)]");
+    let mut modules = attributes.filter(|(at, attribute)| is_module(&text[at + attribute.len()..]));
+    modules.next().map_or(text.len(), |(at, _)| at)
+}
