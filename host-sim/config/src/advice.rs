@@ -97,10 +97,10 @@ const ORDERS: [&str; 6] = ["control", "command", "cmd", "start", "trigger", "ena
 pub fn negative_numbers(recipes: &[Option<DeviceRecipe>]) -> Vec<(Vec<String>, String)> {
     let advice = |recipe: &DeviceRecipe| {
         let parts = recipe.input.iter().map(|frame| &frame.fields);
-        let transaction = |frame: &Option<NamedFrame>| frame.as_ref().map(|frame| frame.fields.clone());
+        let fields_of = |frame: &Option<NamedFrame>| frame.as_ref().map(|frame| frame.fields.clone());
         let exchanged = recipe.exchanges.iter().flat_map(|exchange| {
             let NamedExchange { request, reply, pending, refusal, .. } = exchange;
-            [request, reply, pending, refusal].map(transaction).into_iter().flatten()
+            [request, reply, pending, refusal].map(fields_of).into_iter().flatten()
         });
         let fields = parts.cloned().chain(exchanged).flatten();
         let told = fields.filter_map(|field| of_field(&recipe.name, &field));

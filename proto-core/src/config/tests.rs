@@ -309,7 +309,7 @@ fn add_exchanges(config: &mut GatewayConfig) {
         ExchangeBuilder::served(5, Table::HoldingRegisters, 0, &sent),
         ExchangeBuilder::served(5, Table::HoldingRegisters, 1, &job),
     ];
-    let transaction = [ExchangeBuilder::request(ExchangeFrame::stream(&[2], &[3], &sent))
+    let frames = [ExchangeBuilder::request(ExchangeFrame::stream(&[2], &[3], &sent))
         .reply(ExchangeFrame::stream(&[2], &[3], &answer))
         .refusal(ExchangeFrame::stream(&[], &[], &byte))
         .peer(3)
@@ -319,7 +319,7 @@ fn add_exchanges(config: &mut GatewayConfig) {
         .reply(ExchangeFrame::can(id, &state))
         .every(time)
         .pause(time)];
-    for (name, asks) in [("master", &master[..]), ("slave", &slave), ("talk", &transaction)] {
+    for (name, asks) in [("master", &master[..]), ("slave", &slave), ("talk", &frames)] {
         config.add_recipe(&Recipe::user(name).exchanges(asks)).unwrap();
         config.add_port(&Port::modbus_rtu(name, name).echo(Echo::Yes)).unwrap();
     }

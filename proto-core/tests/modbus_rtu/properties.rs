@@ -19,8 +19,8 @@ fn framed(address: u8, pdu: &[u8]) -> Vec<u8> {
 /// The PDU of a request, with 0x5A for each byte that is written.
 fn request() -> impl Strategy<Value = Vec<u8>> {
     (0..10_usize, 0..60_u16, 1..=40_u16, 1..=40_u16).prop_map(|(which, address, count, writes)| {
+        let (coil_bytes, register_bytes) = (usize::from(count.div_ceil(8)), usize::from(count) * 2);
         let (address, count) = (address.to_be_bytes(), count.to_be_bytes());
-        let coil_bytes = u16::from_be_bytes(count).div_ceil(8) as usize;
         let data = |len: usize| [vec![len as u8], vec![0x5A; len]].concat();
         let function = [1, 2, 3, 4, 5, 6, 15, 16, 22, 23][which];
         let head = [&[function][..], &address].concat();
@@ -29,7 +29,7 @@ fn request() -> impl Strategy<Value = Vec<u8>> {
             5 => [head, vec![0, 0]].concat(),
             6 => [head, vec![0x5A; 2]].concat(),
             15 => [head, count.to_vec(), data(coil_bytes)].concat(),
-            16 => [head, count.to_vec(), data(usize::from(u16::from_be_bytes(count)) * 2)].concat(),
+            16 => [head, count.to_vec(), data(register_bytes)].concat(),
             22 => {
                 let mask = writes.wrapping_mul(0x1357);
                 let bits = 0x5A5A & mask;
