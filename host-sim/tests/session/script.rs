@@ -85,7 +85,11 @@ impl Session<'_> {
         assert!(shown.contains("running, on trial") && shown.contains("taken back in"), "{shown}");
         assert_eq!(ctl.done(&["confirm"]), format!("revision {} is live\n", self.live));
         self.is_running();
-        assert_eq!(ctl.json(&["values", "DigitalOut"])["values"]["DigitalOutputCommand[1]"]["value"], 5);
+        // It runs before its first frame has come.
+        until("the new gateway has the device's value", || {
+            let shown = ctl.json(&["values", "DigitalOut"]);
+            (shown["values"]["DigitalOutputCommand[1]"]["value"] == 5).then_some(())
+        });
     }
 
     /// What goes on until somebody presses Ctrl-C ends well then.
