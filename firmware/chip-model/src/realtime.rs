@@ -146,6 +146,8 @@ const COALESCE: Picos = MILLI / 4;
 const LONGEST: Picos = 100 * MILLI;
 /// A larger lag counts as late.
 const LATE: Picos = 10 * MILLI;
+/// A lag that is reported when it first reaches each multiple of this.
+const HELD_UP: Picos = 250 * MILLI;
 
 impl Runner {
     /// Opens the sockets and starts QEMU, which may not be ready yet.
@@ -241,6 +243,10 @@ impl Runner {
         let behind = self.pace.now().saturating_sub(self.chip.now());
         if behind > LATE {
             self.figures.late += wall.saturating_sub(self.figures.wall);
+        }
+        // A test that fails meanwhile has the machine to blame.
+        if behind / HELD_UP > self.figures.most_behind / HELD_UP {
+            eprintln!("the chip is {:.3} s behind real time", behind as f64 / SECOND as f64);
         }
         self.figures.most_behind = self.figures.most_behind.max(behind);
         self.figures.wall = wall;

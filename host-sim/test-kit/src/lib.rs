@@ -20,7 +20,7 @@ pub use host_sim::{Binary, HostSim, SERVERS, command, free_servers};
 pub use process::{Process, ended};
 
 /// The timeout of every wait, far longer than a busy machine needs.
-pub const PATIENCE: Duration = Duration::from_secs(20);
+pub const PATIENCE: Duration = Duration::from_secs(120);
 
 /// Calls `look` repeatedly until it returns something.
 ///

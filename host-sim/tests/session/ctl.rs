@@ -21,7 +21,7 @@ pub(crate) struct Ctl {
 }
 
 /// For a machine that other programs keep busy.
-pub(crate) const TIMEOUT: &str = "10s";
+pub(crate) const TIMEOUT: &str = "60s";
 
 /// What a command printed.
 #[derive(Debug)]

@@ -80,7 +80,7 @@ impl Board for Nucleo {
     }
 
     fn short_trial_s(&self) -> u32 {
-        15
+        30
     }
 }
 

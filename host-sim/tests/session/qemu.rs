@@ -106,7 +106,7 @@ impl Board for Qemu {
     }
 
     fn short_trial_s(&self) -> u32 {
-        8
+        30
     }
 }
 
