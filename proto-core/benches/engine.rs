@@ -16,14 +16,15 @@ use proto_core::time::{Duration, Instant};
 use proto_core::wire::can::{CanFrame, CanId};
 use rig::{Cell, MS};
 
-/// The whole way of a field frame, design limit.
-const PASS: u64 = 3_000;
-/// The same byte by byte, most of which come to nothing.
-const BYTES: u64 = 3_500;
+/// Whole passes may take 1.3 times as long as the engine that had a fast path for each of them.
+const MODBUS: u64 = 1_614 * 13 / 10;
+const UDP: u64 = 945 * 13 / 10;
+const BYTES: u64 = 3_375 * 13 / 10;
+const CAN: u64 = 1_511 * 13 / 10;
+const STATE: u64 = 764 * 13 / 10;
 /// What is for another node.
 const FOREIGN: u64 = 200;
-/// A state packet, whole and in segments.
-const STATE: u64 = 900;
+/// A state packet in segments.
 const SEGMENTS: u64 = 1_700;
 
 type Pass = fn(&mut Bench);
@@ -34,11 +35,11 @@ const NO_CYCLE: Duration = Duration::from_secs(3_600);
 /// Name, limit and work.
 const WORKS: [(&str, Option<u64>, Pass); 13] = [
     ("field frame, bare", None, Bench::bare),
-    ("field frame to Modbus request, answer", Some(PASS), Bench::modbus),
+    ("field frame to Modbus request, answer", Some(MODBUS), Bench::modbus),
     ("field frame to two requests, answers", None, Bench::modbus_twice),
-    ("field frame to recipe frame over UDP", Some(PASS), Bench::udp),
+    ("field frame to recipe frame over UDP", Some(UDP), Bench::udp),
     ("field frame byte by byte to UDP", Some(BYTES), Bench::udp_bytes),
-    ("CAN frame applied", None, Bench::can),
+    ("CAN frame applied", Some(CAN), Bench::can),
     ("state packet", Some(STATE), Bench::state),
     ("state packet of a starting controller", None, Bench::state_of_starting),
     ("idle tick", None, Bench::idle),

@@ -156,8 +156,8 @@ impl FieldPort {
     /// at; then it was not taken.
     #[inline(always)]
     pub(super) fn hold_byte(&mut self, byte: u8, now: Instant) -> bool {
-        let Codec::Stream { deframer, .. } = &mut self.codec else { return false };
-        if !deframer.hold_byte(byte) {
+        let Codec::Stream { input: Some(layout), deframer, .. } = &mut self.codec else { return false };
+        if deframer.pending() < layout.head().len() || !deframer.hold(layout, &[byte]) {
             return false;
         }
         bump(&mut self.counters.bytes_in);
@@ -408,13 +408,10 @@ impl FieldPort {
             }
             _ => return,
         };
-        let (first, second) = deframer.held();
-        if !first.is_empty() {
-            tap.record(|| came(self.id, now, Err(Rejection::Partial), None, [first, second, &[]]));
-            keep(&mut self.last_rejection, Rejection::Partial, None, first, now);
-            if let Some(last) = &mut self.last_rejection {
-                last.append(now, second.len(), second);
-            }
+        let held = deframer.held();
+        if !held.is_empty() {
+            tap.record(|| came(self.id, now, Err(Rejection::Partial), None, [held, &[], &[]]));
+            keep(&mut self.last_rejection, Rejection::Partial, None, held, now);
         }
         let dropped = deframer.discard();
         add(&mut self.counters.discarded_bytes, dropped);

@@ -15,8 +15,8 @@ use crate::wire::scalar::Scalar;
 #[derive(Debug, Clone)]
 pub struct StreamLayout {
     rules: Rules,
-    head: Head,
-    tail: Tail,
+    pub(super) head: Head,
+    pub(super) tail: Tail,
     frame_len: u16,
     payload_len: u16,
     whole: Step,
@@ -162,22 +162,12 @@ impl StreamLayout {
         }
     }
 
-    pub(super) const fn head_word(&self) -> &Head {
-        &self.head
-    }
-
-    pub(super) const fn tail_word(&self) -> &Tail {
-        &self.tail
-    }
-
     /// The fields' bytes of a whole frame; `None` only if it is shorter than one.
-    #[inline]
     pub(super) fn payload_of<'f>(&self, frame: &'f [u8]) -> Option<&'f [u8]> {
         frame.get(self.head.len()..)?.get(..self.payload_len())
     }
 
     /// Writes head and tail; the payload's place is returned and must be filled.
-    #[inline]
     fn delimited<'o>(&self, out: &'o mut [u8]) -> Result<&'o mut [u8], NoSpace> {
         let no_space = NoSpace { needed: self.frame_len(), available: out.len() };
         let frame = out.get_mut(..self.frame_len()).ok_or(no_space)?;
