@@ -20,7 +20,7 @@ use crate::config::{Name, Span};
 use crate::recipe::Deframer;
 use crate::recipe::StreamLayout;
 use crate::recipe::model::Mode;
-use crate::recipe::{CanLayout, CanReject, Found};
+use crate::recipe::{CanLayout, CanReject};
 use crate::time::{Duration, Instant};
 use crate::wire::can::{CanFrame, CanId};
 
@@ -152,19 +152,6 @@ impl FieldPort {
         Some(if had_begun { Instant::NEVER } else { self.partial_until() })
     }
 
-    /// Takes a byte that continues the frame whose head was seen, and is not its last. `false` if it has to be looked
-    /// at; then it was not taken.
-    #[inline(always)]
-    pub(super) fn hold_byte(&mut self, byte: u8, now: Instant) -> bool {
-        let Codec::Stream { input: Some(layout), deframer, .. } = &mut self.codec else { return false };
-        if deframer.pending() < layout.head().len() || !deframer.hold(layout, &[byte]) {
-            return false;
-        }
-        bump(&mut self.counters.bytes_in);
-        self.line.heard = now;
-        true
-    }
-
     /// Reads the frames in `rest`; stops after the first accepted one if the image is to be checked
     /// after each frame.
     pub(super) fn frames<const PORTS: usize, const TAP: usize>(
@@ -224,10 +211,10 @@ impl FieldPort {
         keep(&mut self.last_rejection, Rejection::NoInput, None, bytes, now);
     }
 
-    /// A frame from the bus, and what [`Self::find_can`] has found.
+    /// A frame from the bus.
     pub(super) fn can<const PORTS: usize, const TAP: usize>(
         &mut self,
-        (frame, found): (&CanFrame, Found),
+        frame: &CanFrame,
         bindings: &[InputBind],
         store: &mut Store<PORTS>,
         commands: Option<&mut CommandLink>,
@@ -235,7 +222,7 @@ impl FieldPort {
     ) -> Accepted {
         let now = store.now;
         let mut accepted = Accepted::default();
-        let verdict = self.take_can((frame, found), bindings, store, commands, &mut accepted);
+        let verdict = self.take_can(frame, bindings, store, commands, &mut accepted);
         tap.record(|| came(self.id, now, verdict, Some(frame.id()), [frame.data(), &[], &[]]));
         if verdict.is_ok() || verdict.is_err_and(|why| self.is_news(why, now)) {
             keep_why(&mut self.last_rejection, verdict, store, Some(frame.id()), frame.data());
@@ -256,18 +243,12 @@ impl FieldPort {
         why != Rejection::ForeignId || self.last_rejection.as_ref().is_none_or(may_be_meant)
     }
 
-    /// The recipe's frame with the id of this one; `None` if the port has no CAN recipe, or one without input.
-    #[inline(always)]
-    pub(super) fn find_can(&self, frame: &CanFrame) -> Option<Found> {
-        let Codec::Can { input: Some(layout), .. } = &self.codec else { return None };
-        Some(layout.find(frame))
-    }
-
     /// Counts a frame of an id that the recipe does not have, which is for another node of the bus. `false` if it is
     /// worth keeping; then it was not counted.
     #[inline(always)]
     pub(super) fn passes_by(&mut self, frame: &CanFrame, now: Instant) -> bool {
-        if frame.is_remote() || self.is_news(Rejection::ForeignId, now) {
+        let Codec::Can { input: Some(layout), .. } = &self.codec else { return false };
+        if layout.has(frame) || frame.is_remote() || self.is_news(Rejection::ForeignId, now) {
             return false;
         }
         add(&mut self.counters.bytes_in, frame.len());
@@ -278,7 +259,7 @@ impl FieldPort {
     #[inline(always)]
     fn take_can<const PORTS: usize>(
         &mut self,
-        (frame, found): (&CanFrame, Found),
+        frame: &CanFrame,
         bindings: &[InputBind],
         store: &mut Store<PORTS>,
         commands: Option<&mut CommandLink>,
@@ -294,7 +275,7 @@ impl FieldPort {
             bump(&mut self.counters.rejected_no_input);
             return Err(Rejection::NoInput);
         };
-        let index = layout.accept_found(frame, found);
+        let index = layout.accept_frame(frame);
         let (Ok(index), Some(frame_layout)) = (index, index.ok().and_then(|nth| layout.frame(nth))) else {
             let (counter, why) = match index {
                 Err(CanReject::Remote { .. }) => (&mut self.counters.rejected_remote, Rejection::Remote),

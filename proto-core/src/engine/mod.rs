@@ -32,7 +32,6 @@ mod events;
 mod exchange;
 mod exchanges;
 mod failed;
-mod fast_path;
 mod field_output;
 mod field_port;
 mod flight;
@@ -96,7 +95,6 @@ use heapless::Vec;
 use clock::{Clock, Dirty};
 use counters::add;
 use exchanges::Exchanges;
-use fast_path::SHORT;
 use field_output::Downward;
 use field_port::{FieldPort, find_port};
 use frames::Accepted;
@@ -107,11 +105,13 @@ use user::Bindings;
 
 use crate::config::{MAX_EXCHANGES, MAX_SAFE_VALUES};
 use crate::link::LinkAction;
-use crate::recipe::Found;
 use crate::recipe::model::MAX_STREAM_FRAME;
 use crate::time::Instant;
 use crate::wire::can::CanFrame;
 use crate::wire::state::LEN;
+
+/// Bytes that a driver may report before a frame is complete. More are likely to have its end.
+const SHORT: usize = 16;
 
 /// Size of the buffer for [`Engine::poll_output`]: the longest stream frame; every request to the
 /// controller is shorter.
@@ -165,27 +165,23 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     ///
     /// The answer spares a driver [`Self::poll_output`] where nothing comes of an input; it may be ignored.
     pub fn handle(&mut self, now: Instant, input: Input<'_>) -> Handled {
-        // Most bytes of a busy line continue a frame and do not end it: nothing comes of them.
-        if let Input::PortBytes { port, bytes: &[byte] } = input
-            && self.clock.is_idle(now)
-            && let Some(port) = find_port(&mut self.ports, port)
-            && port.hold_byte(byte, now)
-        {
-            self.clock.now = now;
-            return Handled::Asleep;
-        }
-        self.handle_other(now, &input)
+        let handled = match input {
+            _ if !self.clock.is_idle(now) => None,
+            Input::PortBytes { port, bytes } => self.hold(port, bytes, now),
+            _ => self.handle_idle(now, &input),
+        };
+        handled.unwrap_or_else(|| self.handle_awake(now, &input))
     }
 
-    // Apart, so that those do not pay for its registers. By reference, because it would be copied.
+    // Out of line to keep its stack frame off the fast path.
     #[inline(never)]
-    fn handle_any(&mut self, now: Instant, input: &Input<'_>) -> Handled {
+    fn handle_awake(&mut self, now: Instant, input: &Input<'_>) -> Handled {
         let was_asleep = self.clock.is_asleep(now);
         let now = self.begin(was_asleep, now);
         // Any input may set an earlier deadline; one that becomes later is noticed in time.
         match *input {
-            // They have functions of their own.
-            Input::PortBytes { .. } | Input::PortCan { .. } => {}
+            Input::PortBytes { port, bytes } => self.port_bytes(port, bytes, now),
+            Input::PortCan { port, ref frame } => self.port_can(port, frame, now),
             Input::PortSent { port } => self.port_sent(port),
             // A port is there while its connection is.
             Input::PortUp { port } | Input::PortDown { port } if self.has_connection(port) => {}
@@ -202,6 +198,59 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.end(was_asleep)
     }
 
+    /// The fast path for bytes that begin or continue a frame and do not end it, which are most calls of a driver that
+    /// reports each byte: they set at most the time at which silence ends it. `None` if they have to be looked at; then
+    /// nothing was taken.
+    // A frame byte by byte to UDP takes 10141 instructions without it, 4846 out of line, and 4212 inline.
+    #[inline(always)]
+    fn hold(&mut self, port: PortId, bytes: &[u8], now: Instant) -> Option<Handled> {
+        if bytes.len() > SHORT {
+            return None;
+        }
+        let deadline = find_port(&mut self.ports, port)?.hold(bytes, now)?;
+        self.clock.now = now;
+        self.clock.partial_at = self.clock.partial_at.min(deadline);
+        if deadline < self.clock.idle_until {
+            self.clock.idle_until = Instant::ZERO;
+            return Some(Handled::Poll);
+        }
+        Some(Handled::Asleep)
+    }
+
+    /// The fast path for other inputs of which nothing comes while the engine sleeps and no deadline has come: frames for
+    /// other nodes, which are most of a busy CAN bus, pieces of a state packet, and transmissions that are over before
+    /// something else is to be sent. `None` if the input has to be handled; then nothing was changed.
+    // A frame to UDP takes 1257 instructions without it, and 1034 with it.
+    #[inline(never)]
+    fn handle_idle(&mut self, now: Instant, input: &Input<'_>) -> Option<Handled> {
+        let mut handled = Handled::Asleep;
+        match *input {
+            Input::PortCan { port, ref frame } if !self.tap.is_listening() => {
+                find_port(&mut self.ports, port)?.passes_by(frame, now).then_some(())?;
+            }
+            Input::LinkBytes { link: LinkId::STATE, bytes } if !self.tap.is_listening() => {
+                self.links.state.first_mut()?.hold(bytes, now).then_some(())?;
+            }
+            // An engine without ports may have missed a beat.
+            Input::PortSent { .. } | Input::LinkSent { .. } if now >= self.clock.beat_at => return None,
+            Input::PortSent { port } if !self.exchanges.is_used() => {
+                find_port(&mut self.ports, port)?.sender.sent_before_next().then_some(())?;
+            }
+            Input::LinkSent { link } => {
+                let until = self.clock.idle_until;
+                let deadline = self.links.sent_before_next(link, &self.store.outbox, until)?;
+                self.clock.timer_at = self.clock.timer_at.min(deadline);
+            }
+            Input::Tick => {
+                self.announce_anew();
+                handled = Handled::Poll;
+            }
+            _ => return None,
+        }
+        self.clock.now = now;
+        Some(handled)
+    }
+
     /// The next output for the driver. Call it again until it is [`Output::Sleep`]. Nothing is sent
     /// between a deadline and the [`Input::Tick`] that lets it pass.
     ///
@@ -216,14 +265,6 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             debug_assert!(self.all_are_silent(&mut buf[..], now), "a sleeping engine has an output");
             return Output::Sleep { until: self.clock.idle_until };
         }
-        match self.clock.dirty {
-            Dirty::ARMED => self.poll_any(now, buf),
-            _ => self.poll_work(now, buf),
-        }
-    }
-
-    #[inline(never)]
-    fn poll_any<'b>(&mut self, now: Instant, buf: &'b mut [u8; OUTPUT_BUFFER]) -> Output<'b> {
         if self.clock.is_quiet(now) {
             return self.sleep();
         }
@@ -314,24 +355,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             && !(self.exchanges.is_used() && self.next_request(out, now).is_some())
     }
 
-    // Each input has its own function, so that no other pays for the registers it needs. The two that bring frames begin
-    // and end by themselves.
-    #[inline(never)]
-    fn handle_bytes(&mut self, now: Instant, input: &Input<'_>) -> Handled {
-        let Input::PortBytes { port: id, bytes } = *input else { return Handled::Poll };
-        let was_asleep = self.clock.is_asleep(now);
-        let now = self.begin(was_asleep, now);
-        // If it was asleep, they could not be held.
-        let is_held = !was_asleep && bytes.len() <= SHORT && self.hold(id, bytes, now);
-        let is_taken = is_held || self.exchanges.is_used() && self.exchange_bytes(id, bytes, now);
-        if !is_taken {
-            self.port_bytes(id, bytes, now);
-        }
-        self.end(was_asleep)
-    }
-
-    #[inline(always)]
     fn port_bytes(&mut self, id: PortId, bytes: &[u8], now: Instant) {
+        // After a sleep their age is unknown.
+        if !self.clock.has_slept && self.hold(id, bytes, now).is_some() {
+            return;
+        }
+        if self.exchanges.is_used() && self.exchange_bytes(id, bytes, now) {
+            return;
+        }
         let (mut rest, mut is_first) = (bytes, true);
         loop {
             let (store, command) = (&mut self.store, self.links.command.first_mut());
@@ -374,27 +405,16 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.after_field(id, &accepted, now);
     }
 
-    #[inline(never)]
-    fn handle_frame(&mut self, found: Found, now: Instant, input: &Input<'_>) -> Handled {
-        let Input::PortCan { port: id, ref frame } = *input else { return Handled::Poll };
-        // A frame is looked up when the engine is idle.
-        let was_asleep =
-            if found == Found::NOT_LOOKED_UP { self.clock.is_asleep(now) } else { now < self.clock.beat_at };
-        let now = self.begin(was_asleep, now);
-        if !(self.exchanges.is_used() && self.exchange_can(id, frame, now)) {
-            self.port_can(id, frame, found, now);
+    fn port_can(&mut self, id: PortId, frame: &CanFrame, now: Instant) {
+        if self.exchanges.is_used() && self.exchange_can(id, frame, now) {
+            return;
         }
-        self.end(was_asleep)
-    }
-
-    #[inline(always)]
-    fn port_can(&mut self, id: PortId, frame: &CanFrame, found: Found, now: Instant) {
         let (store, command) = (&mut self.store, self.links.command.first_mut());
         let Some(port) = find_port(&mut self.ports, id) else { return };
         if self.clock.has_slept {
             return port.discard(frame.data(), Some(frame.id()), &mut self.tap, now);
         }
-        let accepted = port.can((frame, found), &self.bindings.inputs, store, command, &mut self.tap);
+        let accepted = port.can(frame, &self.bindings.inputs, store, command, &mut self.tap);
         if accepted.frames == 0 {
             // Most are for other nodes of the bus.
             return;
@@ -405,19 +425,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.after_frame(id, &accepted, now);
     }
 
-    #[inline(never)]
     fn port_sent(&mut self, id: PortId) {
+        self.change_port(id, |port| port.sender.sent());
         if self.exchanges.is_used() {
-            return self.sent_beside_exchanges(id);
+            self.exchange_sent(id);
         }
-        self.change_port(id, |port| port.sender.sent());
-    }
-
-    #[cold]
-    #[inline(never)]
-    fn sent_beside_exchanges(&mut self, id: PortId) {
-        self.change_port(id, |port| port.sender.sent());
-        self.exchange_sent(id);
     }
 
     #[cold]

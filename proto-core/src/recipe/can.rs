@@ -53,19 +53,6 @@ pub struct CanLayout {
     pool: Pool,
 }
 
-/// The index of the part's frame that has an id.
-// One word: an option would be two, and no longer fit beside an instant into the registers of a call.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Found(usize);
-
-/// Beyond the indices of all frames.
-impl Found {
-    /// No frame has the id.
-    pub(crate) const NONE: Self = Self(usize::MAX);
-    /// Nobody has looked.
-    pub(crate) const NOT_LOOKED_UP: Self = Self(usize::MAX - 1);
-}
-
 /// One frame of a [`CanLayout`].
 #[derive(Debug, Clone, Copy)]
 pub struct CanFrameLayout<'a> {
@@ -113,40 +100,23 @@ impl CanLayout {
     /// [`CanReject`]: another id, a remote frame, or another length.
     pub fn accept(&self, frame: &impl Frame) -> Result<usize, CanReject> {
         let key = CanKey::of(frame.id().into());
-        self.accept_parts(key, frame.is_remote_frame(), frame.data().len(), || self.index_of(key))
+        self.accept_parts(key, frame.is_remote_frame(), frame.data().len())
     }
 
     /// The same for a frame whose id was checked when it was made, and is not checked again.
     ///
     /// # Errors
     /// [`CanReject`]: another id, a remote frame, or another length.
-    #[inline]
     pub fn accept_frame(&self, frame: &CanFrame) -> Result<usize, CanReject> {
-        self.accept_found(frame, Found::NOT_LOOKED_UP)
+        self.accept_parts(frame.key(), frame.is_remote(), frame.len())
     }
 
-    /// The same for a frame whose id may have been looked up with [`Self::find`].
-    #[inline]
-    pub(crate) fn accept_found(&self, frame: &CanFrame, found: Found) -> Result<usize, CanReject> {
-        let key = frame.key();
-        debug_assert!(found == Found::NOT_LOOKED_UP || found == self.find(frame), "of another frame");
-        let find = || if found == Found::NOT_LOOKED_UP { self.index_of(key) } else { Some(found.0) };
-        self.accept_parts(key, frame.is_remote(), frame.len(), find)
-    }
-
-    #[inline(always)]
-    fn accept_parts(
-        &self,
-        key: CanKey,
-        is_remote: bool,
-        got: usize,
-        find: impl FnOnce() -> Option<usize>,
-    ) -> Result<usize, CanReject> {
+    fn accept_parts(&self, key: CanKey, is_remote: bool, got: usize) -> Result<usize, CanReject> {
         if is_remote {
             return Err(CanReject::Remote { id: key.id() });
         }
         let unknown = || CanReject::UnknownId { id: key.id() };
-        let index = find().ok_or_else(unknown)?;
+        let index = self.index_of(key).ok_or_else(unknown)?;
         let share = self.shares.get(index).ok_or_else(unknown)?;
         let expected = share.whole.len();
         if got != expected {
@@ -159,10 +129,9 @@ impl CanLayout {
         Ok(index)
     }
 
-    /// The part's frame with the id of this one, for [`Self::accept_found`].
-    #[inline]
-    pub(crate) fn find(&self, frame: &CanFrame) -> Found {
-        self.index_of(frame.key()).map_or(Found::NONE, Found)
+    /// Whether the part has a frame with the id of this one.
+    pub(crate) fn has(&self, frame: &CanFrame) -> bool {
+        self.index_of(frame.key()).is_some()
     }
 
     /// The frame with this index in the part.

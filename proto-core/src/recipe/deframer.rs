@@ -193,10 +193,21 @@ impl Deframer {
         }
         count_visits(bytes.len());
         let place = self.end();
-        let Some(free) = self.buffer.get_mut(place..place.saturating_add(bytes.len())) else { return };
-        match bytes.len() {
-            0..=runs::MAX_RUN => runs::copy(free, bytes),
-            _ => free.copy_from_slice(bytes),
+        match *bytes {
+            // Many drivers report each byte.
+            [byte] => {
+                let Some(free) = self.buffer.get_mut(place) else { return };
+                *free = byte;
+            }
+            _ => {
+                let Some(free) = self.buffer.get_mut(place..place.saturating_add(bytes.len())) else {
+                    return;
+                };
+                match bytes.len() {
+                    ..=runs::MAX_RUN => runs::copy(free, bytes),
+                    _ => free.copy_from_slice(bytes),
+                }
+            }
         }
         self.len = self.len.wrapping_add(bytes.len() as u16);
     }

@@ -8,7 +8,7 @@ use crate::wire::runs;
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Head {
     word: [u8; MAX_DELIMITER],
-    mask: u64,
+    mask: [u8; MAX_DELIMITER],
     len: u8,
 }
 
@@ -16,7 +16,7 @@ pub(super) struct Head {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Tail {
     word: [u8; MAX_DELIMITER],
-    mask: u64,
+    mask: [u8; MAX_DELIMITER],
     len: u8,
 }
 
@@ -25,7 +25,8 @@ impl Head {
     pub(super) fn new(head: &[u8]) -> Option<Self> {
         let mut word = [0; MAX_DELIMITER];
         word.get_mut(..head.len())?.copy_from_slice(head);
-        let mask = !u64::MAX.checked_shl(8 * head.len() as u32).unwrap_or(0);
+        let mut mask = [0; MAX_DELIMITER];
+        mask.get_mut(..head.len())?.fill(0xFF);
         Some(Self { word, mask, len: head.len() as u8 })
     }
 
@@ -55,7 +56,7 @@ impl Head {
                 front
             }
         };
-        (u64::from_le_bytes(front) ^ u64::from_le_bytes(self.word)) & self.mask == 0
+        agree(front, self.word, self.mask)
     }
 }
 
@@ -64,7 +65,8 @@ impl Tail {
     pub(super) fn new(tail: &[u8]) -> Option<Self> {
         let mut word = [0; MAX_DELIMITER];
         word.get_mut(MAX_DELIMITER.checked_sub(tail.len())?..)?.copy_from_slice(tail);
-        let mask = !u64::MAX.checked_shr(8 * tail.len() as u32).unwrap_or(0);
+        let mut mask = [0; MAX_DELIMITER];
+        mask.get_mut(MAX_DELIMITER.checked_sub(tail.len())?..)?.fill(0xFF);
         Some(Self { word, mask, len: tail.len() as u8 })
     }
 
@@ -94,6 +96,10 @@ impl Tail {
                 back
             }
         };
-        (u64::from_le_bytes(back) ^ u64::from_le_bytes(self.word)) & self.mask == 0
+        agree(back, self.word, self.mask)
     }
+}
+
+fn agree(a: [u8; MAX_DELIMITER], b: [u8; MAX_DELIMITER], mask: [u8; MAX_DELIMITER]) -> bool {
+    (u64::from_ne_bytes(a) ^ u64::from_ne_bytes(b)) & u64::from_ne_bytes(mask) == 0
 }

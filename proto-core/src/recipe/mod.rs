@@ -17,7 +17,6 @@ mod fields;
 pub mod model;
 mod stream;
 
-pub(crate) use can::Found;
 pub use can::{CanFrameLayout, CanLayout, CanReject};
 pub use deframer::{Deframer, DeframerStats, datagram};
 pub use error::{DatagramError, EncodeError, FieldPlace, NoSpace, PartError, ValueError};
