@@ -11,7 +11,7 @@ use proto_core::sysvar::Direction;
 use proto_core::wire::can::CanId;
 use proto_core::wire::scalar::{Scalar, ScalarType};
 use recipe_export::names::mangle;
-use recipe_export::{Format, Model, PortBus, describe_use, unit_of};
+use recipe_export::{BusModel, Format, Model, describe_use, unit_of};
 use serde_json::{Map, Value, json};
 
 use crate::record::Frame;
@@ -69,7 +69,7 @@ impl Decoder {
                 });
             PortTopics {
                 name: port.name.clone(),
-                is_modbus_tcp: matches!(port.bus, PortBus::ModbusTcp),
+                is_modbus_tcp: matches!(port.bus, BusModel::ModbusTcp),
                 topics: topics.collect(),
             }
         });

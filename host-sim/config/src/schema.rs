@@ -6,7 +6,7 @@
 
 use serde_json::{Map, Value, json};
 
-use crate::keys::{Case, Key, Limits, Need, Rule, Shape, Table, Text, When, plain, top};
+use crate::keys::{Case, Key, KeyTable, Limits, Need, Rule, Shape, TextKind, When, plain, top};
 use proto_core::sysvar::SysVar;
 
 /// Which of the two kinds of files.
@@ -74,7 +74,7 @@ impl Schema {
     }
 
     /// A table by its name; it is made once.
-    fn defined(&mut self, table: &Table) -> Value {
+    fn defined(&mut self, table: &KeyTable) -> Value {
         let name = table.name.replace(' ', "-");
         if !self.definitions.contains_key(&name) {
             let object = self.object(table);
@@ -99,7 +99,7 @@ impl Schema {
         value
     }
 
-    fn object(&mut self, table: &Table) -> Map<String, Value> {
+    fn object(&mut self, table: &KeyTable) -> Map<String, Value> {
         let mut object = Map::new();
         object.insert("type".into(), json!("object"));
         object.insert("additionalProperties".into(), json!(false));
@@ -136,7 +136,7 @@ impl Schema {
     }
 
     /// The cases, each behind those before it.
-    fn cases(&mut self, table: &Table, cases: &[Case], all: &Map<String, Value>) -> Option<Value> {
+    fn cases(&mut self, table: &KeyTable, cases: &[Case], all: &Map<String, Value>) -> Option<Value> {
         let (case, rest) = cases.split_first()?;
         let mut own = Map::new();
         for key in case.keys() {
@@ -255,7 +255,7 @@ fn describe(key: &Key) -> String {
     }
 }
 
-fn of_text(text: Text) -> Value {
+fn of_text(text: TextKind) -> Value {
     let pattern = |pattern: &str| json!({ "type": "string", "pattern": pattern });
     let mut groups: Vec<&str> = Vec::new();
     for var in SysVar::all() {
@@ -268,20 +268,20 @@ fn of_text(text: Text) -> Value {
     let groups = groups.join("|");
     let var = format!("({groups})\\[[0-9]+\\]|__({groups})_[0-9]+");
     match text {
-        Text::Any => json!({ "type": "string" }),
-        Text::Length(least, usize::MAX) => json!({ "type": "string", "minLength": least }),
+        TextKind::Any => json!({ "type": "string" }),
+        TextKind::Length(least, usize::MAX) => json!({ "type": "string", "minLength": least }),
         // Bytes, of which a character can have several; the reader counts them.
-        Text::Length(least, most) => json!({ "type": "string", "minLength": least, "maxLength": most }),
-        Text::Name => {
+        TextKind::Length(least, most) => json!({ "type": "string", "minLength": least, "maxLength": most }),
+        TextKind::Name => {
             json!({ "type": "string", "minLength": 1, "maxLength": 32, "pattern": "^[^ \"=\\t\\r\\n]+$" })
         }
-        Text::Variable => pattern(&format!("^({var})$")),
-        Text::VariableOrBit => pattern(&format!("^({var})(\\.[0-9]+)?$")),
-        Text::Variables => pattern(&format!("^({var}|({groups})\\[[0-9]+\\.\\.[0-9]+\\])$")),
-        Text::Source => pattern(&format!(
+        TextKind::Variable => pattern(&format!("^({var})$")),
+        TextKind::VariableOrBit => pattern(&format!("^({var})(\\.[0-9]+)?$")),
+        TextKind::Variables => pattern(&format!("^({var}|({groups})\\[[0-9]+\\.\\.[0-9]+\\])$")),
+        TextKind::Source => pattern(&format!(
             "^(({var})(\\.[0-9]+)?|counter|reply|controller\\..+|port\\..+|link\\..+\\.up)$"
         )),
-        Text::Pattern(own) => pattern(own),
+        TextKind::Pattern(own) => pattern(own),
     }
 }
 

@@ -14,13 +14,13 @@ pub(super) struct Corrupted(Vec<Instead>);
 #[derive(Debug, Clone)]
 struct Instead {
     name: String,
-    item: Item,
+    item: SentItem,
     value: f32,
 }
 
 /// Where an item is sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Item {
+struct SentItem {
     /// Its offset in the process image, and so in recipes' frames.
     image: Option<usize>,
     /// Its offset in the state packet.
@@ -78,7 +78,7 @@ impl Corrupted {
         self.put(packet, |item| item.packet);
     }
 
-    fn put(&self, bytes: &mut [u8], place: impl Fn(Item) -> Option<usize>) {
+    fn put(&self, bytes: &mut [u8], place: impl Fn(SentItem) -> Option<usize>) {
         for instead in &self.0 {
             let bytes = place(instead.item).and_then(|offset| bytes.get_mut(offset..offset + 4));
             if let Some(bytes) = bytes {
@@ -89,7 +89,7 @@ impl Corrupted {
 }
 
 /// A system variable, an analog input, or `FIELD[N]` of the packet with N from 1.
-fn find(name: &str) -> Result<Item, NoSuchFloat> {
+fn find(name: &str) -> Result<SentItem, NoSuchFloat> {
     let wrong = || NoSuchFloat(name.to_owned());
     match name.parse() {
         Ok(InitialTarget::Var(var)) if var.ty() == ScalarType::Float => return Ok(variable(var)),
@@ -108,13 +108,13 @@ fn find(name: &str) -> Result<Item, NoSuchFloat> {
     item.ok_or_else(wrong)
 }
 
-fn variable(var: SysVar) -> Item {
+fn variable(var: SysVar) -> SentItem {
     let packet = var.stream().map(|place| usize::from(place.offset));
-    Item { image: Some(var.image_offset()), packet }
+    SentItem { image: Some(var.image_offset()), packet }
 }
 
-fn in_packet(field: &str, index: usize) -> Option<Item> {
+fn in_packet(field: &str, index: usize) -> Option<SentItem> {
     let field = FIELDS.iter().find(|place| place.name == field && place.ty == ScalarType::Float)?;
     let nth = index.checked_sub(1).filter(|&nth| nth < usize::from(field.count))?;
-    Some(Item { image: None, packet: Some(usize::from(field.offset) + 4 * nth) })
+    Some(SentItem { image: None, packet: Some(usize::from(field.offset) + 4 * nth) })
 }

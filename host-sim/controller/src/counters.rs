@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::ports::PortCounters;
+use super::ports::RecipePortCounters;
 
 /// Counters of one of the TCP servers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
@@ -31,7 +31,7 @@ pub struct ServerCounters {
 
 /// All counters since the controller was created.
 #[derive(Debug, Clone, PartialEq, Eq, Default, serde::Serialize)]
-pub struct Counters {
+pub struct ControllerCounters {
     /// Port 2000.
     pub command: ServerCounters,
     /// Port 2001.
@@ -39,7 +39,7 @@ pub struct Counters {
     /// Modbus.
     pub modbus: ServerCounters,
     /// Recipe ports by name.
-    pub ports: BTreeMap<String, PortCounters>,
+    pub ports: BTreeMap<String, RecipePortCounters>,
     /// Datagrams at the UDP server while no port uses it.
     pub stray_datagrams: u64,
     /// Programs started.

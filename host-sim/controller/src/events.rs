@@ -20,7 +20,7 @@ use super::{ConnId, Controller};
 
 /// One event.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Event {
+pub struct ControllerEvent {
     /// 1, 2, 3, ...
     #[serde(rename = "n")]
     pub number: u64,
@@ -219,19 +219,19 @@ pub(super) struct Recorder {
     /// Maximum number of kept events, of writes and of all others each.
     max: usize,
     next: u64,
-    kept: VecDeque<Event>,
+    kept: VecDeque<ControllerEvent>,
     /// Writes are kept apart, so that a fast recipe does not displace everything else.
-    writes: VecDeque<Event>,
+    writes: VecDeque<ControllerEvent>,
     /// Number of the newest event that was dropped.
     dropped: u64,
-    shown: Option<Shown>,
+    shown: Option<ReportedStates>,
     /// The time of the newest call.
     now: Instant,
 }
 
 /// The states that were last reported.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Shown {
+struct ReportedStates {
     robot: RobotState,
     program: ProgramState,
     safety: SafetyState,
@@ -266,7 +266,7 @@ impl Recorder {
         {
             self.dropped = self.dropped.max(oldest.number);
         }
-        kept.push_back(Event { number: self.next, time_s, what });
+        kept.push_back(ControllerEvent { number: self.next, time_s, what });
     }
 
     /// The values before a write; `None` while nothing is recorded.
@@ -289,8 +289,9 @@ impl Controller {
     }
 
     /// The kept events with this number or a later one, oldest first.
-    pub fn events_since(&self, number: u64) -> impl Iterator<Item = &Event> {
-        let from = |events: &'_ VecDeque<Event>| events.partition_point(|event| event.number < number);
+    pub fn events_since(&self, number: u64) -> impl Iterator<Item = &ControllerEvent> {
+        let from =
+            |events: &'_ VecDeque<ControllerEvent>| events.partition_point(|event| event.number < number);
         let (others, writes) = (&self.recorder.kept, &self.recorder.writes);
         let mut others = others.range(from(others)..).peekable();
         let mut writes = writes.range(from(writes)..).peekable();
@@ -353,7 +354,7 @@ impl Controller {
             return;
         }
         let machine = &self.machine;
-        let shown = Shown {
+        let shown = ReportedStates {
             robot: machine.robot(),
             program: machine.program(),
             safety: machine.safety(),

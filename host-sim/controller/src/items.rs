@@ -7,7 +7,7 @@ use proto_core::wire::scalar::Scalar;
 use recipe_config::{InitialTarget, ShownState, TargetError};
 
 use super::Controller;
-use super::program::Answer;
+use super::program::CallReply;
 use super::registers::PacketItem;
 
 /// An item of this name cannot be read, or cannot have this value.
@@ -42,8 +42,8 @@ impl Controller {
             return Ok(item.read(&self.registers.packet(self.dialect.global_speed)));
         }
         match self.read_item(name) {
-            Ok(Answer::Bit(on)) => Ok(f64::from(u8::from(on))),
-            Ok(Answer::Value(value)) => Ok(value.as_f64()),
+            Ok(CallReply::Bit(on)) => Ok(f64::from(u8::from(on))),
+            Ok(CallReply::Value(value)) => Ok(value.as_f64()),
             Ok(_) => Ok(0.0),
             Err(reason) => Err(ItemError {
                 name: name.to_owned(),
@@ -99,12 +99,12 @@ impl Controller {
     ///
     /// # Errors
     /// The name, and what is wrong with it.
-    pub(super) fn read_item(&self, name: &str) -> Result<Answer, String> {
+    pub(super) fn read_item(&self, name: &str) -> Result<CallReply, String> {
         match name.parse() {
-            Ok(InitialTarget::Var(var)) => Ok(Answer::Value(self.registers.var(var))),
-            Ok(InitialTarget::Bit { group, index }) => Ok(Answer::Bit(self.registers.bit(group, index))),
-            Ok(target @ InitialTarget::VarBit(_)) => Ok(Answer::Bit(self.registers.value(target) != 0.0)),
-            Ok(target) => Ok(Answer::Value(Scalar::Double(self.registers.value(target)))),
+            Ok(InitialTarget::Var(var)) => Ok(CallReply::Value(self.registers.var(var))),
+            Ok(InitialTarget::Bit { group, index }) => Ok(CallReply::Bit(self.registers.bit(group, index))),
+            Ok(target @ InitialTarget::VarBit(_)) => Ok(CallReply::Bit(self.registers.value(target) != 0.0)),
+            Ok(target) => Ok(CallReply::Value(Scalar::Double(self.registers.value(target)))),
             Err(error @ TargetError::Variable(_)) => self.read_state(name).map_err(|own| match own {
                 StateValueError::Unknown => {
                     let states: Vec<_> = ShownState::ALL.iter().map(|state| state.0).collect();
@@ -119,18 +119,18 @@ impl Controller {
         }
     }
 
-    fn read_state(&self, name: &str) -> Result<Answer, StateValueError> {
+    fn read_state(&self, name: &str) -> Result<CallReply, StateValueError> {
         if let Some(state) = ShownState::named(name) {
-            return Ok(Answer::Bit(self.machine.is_in(state)));
+            return Ok(CallReply::Bit(self.machine.is_in(state)));
         }
         let value = StateValue::parse(name)?;
         if value == StateValue::SPEED {
-            return Ok(Answer::Value(Scalar::Double(self.machine.speed_percent().into())));
+            return Ok(CallReply::Value(Scalar::Double(self.machine.speed_percent().into())));
         }
         // Rows other than the speed are the same in every dialect.
         let (offset, ty) = value.place(&Dialect::V2_3)?;
         let packet = self.registers.packet(None);
         let bytes = packet.get(usize::from(offset)..).unwrap_or(&[]);
-        Ok(Answer::Value(Scalar::decode(ty, bytes).unwrap_or(Scalar::Byte(0))))
+        Ok(CallReply::Value(Scalar::decode(ty, bytes).unwrap_or(Scalar::Byte(0))))
     }
 }

@@ -51,25 +51,25 @@ pub use build::BuildError;
 use build::{check_functions, mode, start_values};
 pub use common::{KINDS, Link};
 pub use condition::Condition;
-pub use counters::{Counters, ServerCounters};
+pub use counters::{ControllerCounters, ServerCounters};
 use events::Recorder;
-pub use events::{Event, Happened, MAX_EVENTS};
+pub use events::{ControllerEvent, Happened, MAX_EVENTS};
 pub use faults::CommandClients;
 use faults::Faults;
 pub use io::{ConnId, ControllerInput, ControllerOutput};
 pub use items::ItemError;
 use machine::Machine;
 use motion::Arm;
-use ports::Port;
-pub use ports::{MAX_INBOX, MAX_UDP_CLIENTS, PortCounters, RecipeError};
+use ports::RecipePort;
+pub use ports::{MAX_INBOX, MAX_UDP_CLIENTS, RecipeError, RecipePortCounters};
 use program::{Script, Variables};
 use quiet::Quiet;
 use random::Random;
 use recipe_config::{Power, SimConfig};
 use registers::Registers;
-use run::Running;
+use run::RunningProgram;
 use runs::Runs;
-pub use runs::{Outcome, Run};
+pub use runs::{Run, RunOutcome};
 pub use server::{MAX_COMMAND_CONNECTIONS, MAX_MODBUS_CONNECTIONS, MAX_ORDERS, MAX_STATE_CONNECTIONS};
 use server::{Requested, Server};
 
@@ -87,11 +87,11 @@ pub struct Controller {
     arm: Arm,
     /// When the arm's state was last copied to the registers.
     arm_shown: Option<Instant>,
-    running: Option<Running>,
+    running: Option<RunningProgram>,
     /// The variables of the newest program, after its end.
     variables: Variables,
     log: VecDeque<String>,
-    ports: Vec<Port>,
+    ports: Vec<RecipePort>,
     server: Server,
     state_grid: Grid,
     /// The origin of all grids: the first instant of a call.
@@ -102,7 +102,7 @@ pub struct Controller {
     faults: Faults,
     recorder: Recorder,
     runs: Runs,
-    counters: Counters,
+    counters: ControllerCounters,
     outputs: VecDeque<ControllerOutput>,
     quiet: Quiet,
     /// After `shutdown()` on port 2000.
@@ -120,8 +120,9 @@ impl Controller {
         let mut ports = Vec::new();
         for port in &config.ports {
             let name = || port.name.clone();
-            let port = Port::new(config, port).map_err(|error| BuildError::Port { port: name(), error })?;
-            if port.is_udp_server() && ports.iter().any(Port::is_udp_server) {
+            let port =
+                RecipePort::new(config, port).map_err(|error| BuildError::Port { port: name(), error })?;
+            if port.is_udp_server() && ports.iter().any(RecipePort::is_udp_server) {
                 return Err(BuildError::SecondUdpServer { port: name() });
             }
             ports.push(port);
@@ -154,7 +155,7 @@ impl Controller {
             faults: Faults::new(config.robot.command_clients),
             recorder: Recorder::default(),
             runs: Runs::default(),
-            counters: Counters::default(),
+            counters: ControllerCounters::default(),
             outputs: VecDeque::new(),
             quiet: Quiet::default(),
             is_shut_down: false,
@@ -168,7 +169,7 @@ impl Controller {
         let mut random = Random::seeded(seed);
         self.faults.seed(random.next());
         self.state_phase = Duration::from_micros(random.below(STATE_PERIOD.as_micros()));
-        let phase = |port: &Port| Duration::from_micros(random.below(port.cycle().as_micros()));
+        let phase = |port: &RecipePort| Duration::from_micros(random.below(port.cycle().as_micros()));
         self.phases = self.ports.iter().map(phase).collect();
     }
 
@@ -259,10 +260,10 @@ impl Controller {
         match *input {
             ControllerInput::ModbusBytes { .. } => Some("modbus"),
             ControllerInput::Udp2011 { .. } => {
-                self.ports.iter().find(|port| port.is_udp_server()).map(Port::name)
+                self.ports.iter().find(|port| port.is_udp_server()).map(RecipePort::name)
             }
             ControllerInput::PortBytes { port, .. } | ControllerInput::PortCan { port, .. } => {
-                self.ports.get(port).map(Port::name)
+                self.ports.get(port).map(RecipePort::name)
             }
             _ => None,
         }
@@ -300,12 +301,12 @@ impl Controller {
 
     /// The variables of the running program, or of the newest one.
     pub fn program_variables(&self) -> Variables {
-        self.running.as_ref().map_or_else(|| self.variables.clone(), Running::variables)
+        self.running.as_ref().map_or_else(|| self.variables.clone(), RunningProgram::variables)
     }
 
     /// The name of the program that runs or is paused; `None` if there is none.
     pub fn program_name(&self) -> Option<&str> {
-        self.running.as_ref().map(Running::name)
+        self.running.as_ref().map(RunningProgram::name)
     }
 
     /// The newest [`MAX_LOG`] lines that programs have logged, oldest first.
@@ -314,9 +315,9 @@ impl Controller {
     }
 
     /// All counters since [`Self::new`].
-    pub fn counters(&self) -> Counters {
+    pub fn counters(&self) -> ControllerCounters {
         let ports = self.ports.iter().map(|port| (port.name().to_owned(), port.counters()));
-        let mut counters = Counters { ports: ports.collect(), ..self.counters.clone() };
+        let mut counters = ControllerCounters { ports: ports.collect(), ..self.counters.clone() };
         counters.command.open = self.server.open(Link::Command);
         counters.state.open = self.server.open(Link::State);
         counters.modbus.open = self.server.open(Link::Modbus);

@@ -8,14 +8,14 @@ use super::common::Link;
 use super::events::Happened;
 use super::machine::{Effect, ErrorId, Transition};
 use super::motion::Braking;
-use super::ports::{Handed, Listening, Outgoing};
-use super::program::{Answer, Call, End, Program, Progress, Script, Variables, shortened};
-use super::registers::Status;
+use super::ports::{Handed, Listening, PortData};
+use super::program::{Call, CallReply, End, Program, Progress, Script, Variables, shortened};
+use super::registers::MachineCodes;
 use super::{ConnId, Controller, ControllerOutput, MAX_LOG};
 
 /// The program that has not ended.
 #[derive(Debug)]
-pub(super) struct Running {
+pub(super) struct RunningProgram {
     program: Program,
     activity: Activity,
     started_by: Option<ConnId>,
@@ -43,7 +43,7 @@ enum Activity {
     },
 }
 
-impl Running {
+impl RunningProgram {
     pub(super) fn name(&self) -> &str {
         self.program.name()
     }
@@ -120,7 +120,7 @@ impl Controller {
             }
             Effect::Abort(braking) => {
                 if let Some(running) = &mut self.running {
-                    running.program.answer(now, Answer::Abort);
+                    running.program.answer(now, CallReply::Abort);
                     running.activity = Activity::None;
                 }
                 self.slow_down(now, braking);
@@ -155,7 +155,7 @@ impl Controller {
         }
         match Program::start_with(script, &self.scripts, now) {
             Ok(program) => {
-                self.running = Some(Running { program, activity: Activity::None, started_by });
+                self.running = Some(RunningProgram { program, activity: Activity::None, started_by });
                 self.machine.program_started();
                 self.counters.programs_started += 1;
                 let run = self.runs.begin(self.time_s(now));
@@ -191,7 +191,7 @@ impl Controller {
     /// Writes the state of the arm and the state machines to the registers.
     fn refresh(&mut self, now: Instant) {
         let machine = &self.machine;
-        self.registers.show_status(Status {
+        self.registers.show_status(MachineCodes {
             mode: machine.mode().code(),
             mode_register: self.dialect.mode_to_register(machine.mode(), Motion::Real),
             robot: self.dialect.robot_code(machine.robot()),
@@ -264,19 +264,19 @@ impl Controller {
     }
 
     /// The answer to a call; `None` if it has none yet.
-    fn serve(&mut self, now: Instant, call: &Call) -> Option<Answer> {
+    fn serve(&mut self, now: Instant, call: &Call) -> Option<CallReply> {
         let activity = self.running.as_ref().map_or(Activity::None, |running| running.activity);
         match call {
             Call::Receive { port, limit } => {
                 let port = match self.port_named(port) {
                     Ok(nth) => self.ports.get_mut(nth)?,
-                    Err(message) => return Some(Answer::Error(message)),
+                    Err(message) => return Some(CallReply::Error(message)),
                 };
                 if let Err(message) = port.check_receive() {
-                    return Some(Answer::Error(message));
+                    return Some(CallReply::Error(message));
                 }
                 match (port.next_received(), limit) {
-                    (Some(frame), _) => Some(Answer::Frame { id: frame.id, values: frame.values }),
+                    (Some(frame), _) => Some(CallReply::Frame { id: frame.id, values: frame.values }),
                     (None, Some(limit)) => self.wait(now, activity, *limit),
                     (None, None) => None,
                 }
@@ -285,11 +285,11 @@ impl Controller {
                 if let Activity::Sending { port } = activity {
                     let port = self.ports.get(port)?;
                     // A port that goes down drops its frame.
-                    return (!port.is_busy()).then(|| Answer::Bit(port.is_up()));
+                    return (!port.is_busy()).then(|| CallReply::Bit(port.is_up()));
                 }
                 let nth = match self.port_named(port) {
                     Ok(nth) => nth,
-                    Err(message) => return Some(Answer::Error(message)),
+                    Err(message) => return Some(CallReply::Error(message)),
                 };
                 let port = self.ports.get_mut(nth)?;
                 if port.is_busy() {
@@ -298,27 +298,27 @@ impl Controller {
                 }
                 match port.send(*id, values) {
                     Ok(Handed::Over) => self.begin_activity(Activity::Sending { port: nth }),
-                    Ok(Handed::NotReady) => Some(Answer::Bit(false)),
-                    Err(message) => Some(Answer::Error(message)),
+                    Ok(Handed::NotReady) => Some(CallReply::Bit(false)),
+                    Err(message) => Some(CallReply::Error(message)),
                 }
             }
-            Call::Get { name } => Some(self.read_item(name).unwrap_or_else(Answer::Error)),
+            Call::Get { name } => Some(self.read_item(name).unwrap_or_else(CallReply::Error)),
             Call::Set { name, value } => Some(match name.parse() {
                 Ok(target) => {
                     let before = self.recorder.before(&self.registers);
                     let result = self.registers.set_by_program(target, *value);
                     self.note_writes(now, before, "program");
                     match result {
-                        Ok(()) => Answer::Done,
-                        Err(error) => Answer::Error(error.to_string()),
+                        Ok(()) => CallReply::Done,
+                        Err(error) => CallReply::Error(error.to_string()),
                     }
                 }
-                Err(error) => Answer::Error(format!("{name}: {error}")),
+                Err(error) => CallReply::Error(format!("{name}: {error}")),
             }),
             Call::MoveJ { .. } | Call::MoveL { .. } => {
                 if activity != Activity::Moving {
                     if let Err(message) = self.start_move(now, call) {
-                        return Some(Answer::Error(message));
+                        return Some(CallReply::Error(message));
                     }
                     self.begin_activity(Activity::Moving);
                 }
@@ -327,12 +327,12 @@ impl Controller {
                 }
                 self.refresh(now);
                 self.arm.settle(now);
-                Some(Answer::Done)
+                Some(CallReply::Done)
             }
             Call::Wait(time) => self.wait(now, activity, *time),
             Call::GiveWay { until } => {
                 if now >= *until {
-                    Some(Answer::Done)
+                    Some(CallReply::Done)
                 } else {
                     self.begin_activity(Activity::GivingWay { until: *until })
                 }
@@ -345,18 +345,18 @@ impl Controller {
                     self.log.pop_front();
                 }
                 self.log.push_back(line.clone());
-                Some(Answer::Done)
+                Some(CallReply::Done)
             }
         }
     }
 
     /// Waits for this time since the call was first handled.
-    fn wait(&mut self, now: Instant, activity: Activity, time: Duration) -> Option<Answer> {
+    fn wait(&mut self, now: Instant, activity: Activity, time: Duration) -> Option<CallReply> {
         let until = match activity {
             Activity::Waiting { until } => until,
             _ => now + time,
         };
-        if now >= until { Some(Answer::Done) } else { self.begin_activity(Activity::Waiting { until }) }
+        if now >= until { Some(CallReply::Done) } else { self.begin_activity(Activity::Waiting { until }) }
     }
 
     /// Starts the move of a call.
@@ -375,7 +375,7 @@ impl Controller {
     }
 
     /// Notes what the call waits for, and returns no answer.
-    fn begin_activity(&mut self, activity: Activity) -> Option<Answer> {
+    fn begin_activity(&mut self, activity: Activity) -> Option<CallReply> {
         if let Some(running) = &mut self.running {
             running.activity = activity;
         }
@@ -402,9 +402,9 @@ impl Controller {
                 continue;
             }
             self.outputs.extend(outgoing.into_iter().map(|outgoing| match outgoing {
-                Outgoing::Bytes(bytes) => ControllerOutput::PortSend { port: nth, bytes },
-                Outgoing::Can(frame) => ControllerOutput::PortSendCan { port: nth, frame },
-                Outgoing::Datagram { peer, bytes } => ControllerOutput::UdpSend { peer, bytes },
+                PortData::Bytes(bytes) => ControllerOutput::PortSend { port: nth, bytes },
+                PortData::Can(frame) => ControllerOutput::PortSendCan { port: nth, frame },
+                PortData::Datagram { peer, bytes } => ControllerOutput::UdpSend { peer, bytes },
             }));
         }
     }

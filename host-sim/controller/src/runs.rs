@@ -14,7 +14,7 @@ pub struct Run {
     /// The program's name.
     pub program: String,
     /// How it ended.
-    pub outcome: Outcome,
+    pub outcome: RunOutcome,
     /// Why it failed, or what has stopped it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reason: Option<String>,
@@ -33,7 +33,7 @@ pub struct Run {
 /// How a program ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Outcome {
+pub enum RunOutcome {
     /// It reached its end.
     Finished,
     /// An error that it did not catch.
@@ -47,15 +47,15 @@ impl std::fmt::Display for Run {
         let Self { run, program, .. } = self;
         let seconds = self.ended_s - self.started_s;
         match self.outcome {
-            Outcome::Finished => write!(f, "run {run} of {program} has finished after {seconds:.3} s"),
-            Outcome::Failed => {
+            RunOutcome::Finished => write!(f, "run {run} of {program} has finished after {seconds:.3} s"),
+            RunOutcome::Failed => {
                 write!(f, "run {run} of {program} has failed: {}", self.reason.as_deref().unwrap_or("?"))?;
                 match (self.line, self.column) {
                     (Some(line), Some(column)) => write!(f, " (line {line}, column {column})"),
                     _ => Ok(()),
                 }
             }
-            Outcome::Stopped => {
+            RunOutcome::Stopped => {
                 write!(f, "run {run} of {program} was stopped: {}", self.reason.as_deref().unwrap_or("?"))
             }
         }
@@ -90,9 +90,9 @@ impl Runs {
             _ => None,
         };
         let (outcome, reason, place) = match (failure, end) {
-            (Some((reason, place)), _) => (Outcome::Failed, Some(reason), place),
-            (None, Some(End::Finished)) => (Outcome::Finished, None, None),
-            (None, _) => (Outcome::Stopped, Some(self.cause.unwrap_or("stop").to_owned()), None),
+            (Some((reason, place)), _) => (RunOutcome::Failed, Some(reason), place),
+            (None, Some(End::Finished)) => (RunOutcome::Finished, None, None),
+            (None, _) => (RunOutcome::Stopped, Some(self.cause.unwrap_or("stop").to_owned()), None),
         };
         let run = Run {
             run: self.started,

@@ -17,15 +17,15 @@ use super::operations::Operation;
 /// returns `None`, and again at [`Self::deadline`].
 #[derive(Debug, Clone)]
 pub struct Timeline {
-    steps: Vec<Step>,
+    steps: Vec<TimelineStep>,
     /// The first instant of a call.
     began: Option<Instant>,
 }
 
 /// A step of a timeline.
 #[derive(Debug, Clone)]
-struct Step {
-    trigger: Trigger,
+struct TimelineStep {
+    trigger: StepTrigger,
     operation: Operation,
     /// When it is to be done, earliest first.
     due: VecDeque<Instant>,
@@ -34,7 +34,7 @@ struct Step {
 }
 
 #[derive(Debug, Clone)]
-enum Trigger {
+enum StepTrigger {
     At(Duration),
     When {
         condition: Box<Condition>,
@@ -55,11 +55,11 @@ impl Timeline {
         let began = *self.began.get_or_insert(now);
         for step in &mut self.steps {
             match &mut step.trigger {
-                Trigger::At(time) => {
+                StepTrigger::At(time) => {
                     step.due.push_back(began + *time);
-                    step.trigger = Trigger::Over;
+                    step.trigger = StepTrigger::Over;
                 }
-                Trigger::When { condition, after, repeat, held, since } => {
+                StepTrigger::When { condition, after, repeat, held, since } => {
                     // A wrong condition was refused when the file was read.
                     let holds = controller.holds(condition, *since) == Ok(true);
                     if !std::mem::replace(held, holds) && holds {
@@ -73,11 +73,11 @@ impl Timeline {
                             (*since, *held) = (controller.newest_event() + 1, false);
                         }
                         if !*repeat {
-                            step.trigger = Trigger::Over;
+                            step.trigger = StepTrigger::Over;
                         }
                     }
                 }
-                Trigger::Over => {}
+                StepTrigger::Over => {}
             }
         }
     }

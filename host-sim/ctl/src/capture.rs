@@ -16,7 +16,7 @@ use recipe_capture::{CaptureFile, Cell, Epoch, Record, Target, Watch, What, repl
 
 use crate::answer::Answer;
 use crate::changing::stored;
-use crate::client::{Client, Events};
+use crate::client::{Client, EventStream};
 use crate::failure::Failure;
 use crate::frames::FramesDocument;
 use crate::trace::{has_port, is_plain, path};
@@ -57,7 +57,7 @@ pub fn capture(
 }
 
 /// Writes the blocks of a capture as they come; what it was, in words.
-fn from_host(mut events: Events<'_>, path: &Path) -> Result<String, Failure> {
+fn from_host(mut events: EventStream<'_>, path: &Path) -> Result<String, Failure> {
     let refused = |error: std::io::Error| Failure::wrong(format!("{}: {error}", path.display()));
     replaceable(path).map_err(refused)?;
     let mut file = File::create(path).map_err(refused)?;

@@ -203,7 +203,7 @@ pub fn config(client: &Client, revision: Option<u32>) -> Result<Answer, Failure>
 
 /// How a stored revision is put on trial.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Trial {
+pub struct TrialOptions {
     /// Seconds until it is taken back unless it is confirmed.
     pub confirm_s: f64,
     /// Another one than the stored one that waits.
@@ -214,7 +214,11 @@ pub struct Trial {
 ///
 /// # Errors
 /// If it is refused or not reached.
-pub fn push(client: &Client, configuration: &Configuration, trial: Option<Trial>) -> Result<Answer, Failure> {
+pub fn push(
+    client: &Client,
+    configuration: &Configuration,
+    trial: Option<TrialOptions>,
+) -> Result<Answer, Failure> {
     let body = match ServerRole::of(client)? {
         ServerRole::Host => RequestBody::Toml(configuration.toml.as_deref().map_err(Failure::wrong)?),
         ServerRole::Board => RequestBody::Image(configuration.image.as_deref().map_err(Failure::wrong)?),
@@ -247,7 +251,7 @@ fn is_etag(text: &str) -> bool {
 ///
 /// # Errors
 /// If it is refused, not reached, or the revision does not start.
-pub fn apply(client: &Client, trial: Trial) -> Result<Answer, Failure> {
+pub fn apply(client: &Client, trial: TrialOptions) -> Result<Answer, Failure> {
     let mut arguments = json!({ "confirm_s": trial.confirm_s });
     if let Some(revision) = trial.revision {
         arguments["revision"] = revision.into();

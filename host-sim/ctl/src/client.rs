@@ -176,7 +176,7 @@ impl Client {
     }
 
     /// Opens a stream.
-    pub(crate) fn stream(&self, path: &str) -> Result<Events<'_>, Failure> {
+    pub(crate) fn stream(&self, path: &str) -> Result<EventStream<'_>, Failure> {
         self.opened(self.open(path)?)
     }
 
@@ -185,17 +185,17 @@ impl Client {
         self.asked_again(&call, || self.exchange(&call))
     }
 
-    fn opened(&self, exchange: HttpExchange) -> Result<Events<'_>, Failure> {
+    fn opened(&self, exchange: HttpExchange) -> Result<EventStream<'_>, Failure> {
         if !(200..=299).contains(&exchange.status()) {
             let reply = exchange.finish().map_err(|error| self.no_reply(error))?;
             return Err(self.refusal(&reply));
         }
         let stream = exchange.stream().map_err(|error| self.no_reply(error))?;
-        Ok(Events { client: self, stream })
+        Ok(EventStream { client: self, stream })
     }
 
     /// Opens a stream that this server may not have: `None` if there is no such path.
-    pub(crate) fn stream_if_there(&self, path: &str) -> Result<Option<Events<'_>>, Failure> {
+    pub(crate) fn stream_if_there(&self, path: &str) -> Result<Option<EventStream<'_>>, Failure> {
         let exchange = self.open(path)?;
         if exchange.status() == 404 {
             return Ok(None);
@@ -392,12 +392,12 @@ const AGAIN: Duration = Duration::from_millis(200);
 
 /// The events of a gateway.
 #[derive(Debug)]
-pub(crate) struct Events<'a> {
+pub(crate) struct EventStream<'a> {
     client: &'a Client,
     stream: Stream,
 }
 
-impl Events<'_> {
+impl EventStream<'_> {
     /// The next event; `None` once the command shall end.
     pub(crate) fn next(&mut self) -> Result<Option<ServerEvent>, Failure> {
         match self.stream.event() {

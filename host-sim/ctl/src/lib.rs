@@ -37,7 +37,8 @@ pub use answer::Answer;
 pub use bundle::{bundle, bundled};
 pub use capture::capture;
 pub use changing::{
-    Configuration, Stored, Trial, WithoutTrial, apply, config, confirm, identify, push, rollback, stored,
+    Configuration, Stored, TrialOptions, WithoutTrial, apply, config, confirm, identify, push, rollback,
+    stored,
 };
 pub use claim::claim;
 pub use client::Client;

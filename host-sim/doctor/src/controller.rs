@@ -10,7 +10,7 @@ use crate::Case;
 use crate::finding::{Cause, Finding, FindingPlace, Severity, finding};
 use crate::given::is_command;
 use crate::record::PortRecord;
-use crate::state::Port;
+use crate::state::ObservedPort;
 
 /// Looks at the newest command of each port, and at the controller.
 pub(crate) fn examine(case: &Case<'_>, findings: &mut Vec<Finding>) {
@@ -42,7 +42,7 @@ pub fn has_commands(config: ConfigView<'_>) -> bool {
 }
 
 /// The newest command of a port, if something became of it that was not meant.
-fn command(case: &Case<'_>, port: &Port) -> Option<Finding> {
+fn command(case: &Case<'_>, port: &ObservedPort) -> Option<Finding> {
     let place = FindingPlace::Port(port.name.clone());
     let given = port.command.clone().unwrap_or_else(|| "a command".to_owned());
     let found = |severity, cause, [seen, expected, likely, remedy]: [String; 4]| {
@@ -107,7 +107,7 @@ fn command(case: &Case<'_>, port: &Port) -> Option<Finding> {
     }
 }
 
-fn failed(case: &Case<'_>, port: &Port, place: &FindingPlace) -> Option<Finding> {
+fn failed(case: &Case<'_>, port: &ObservedPort, place: &FindingPlace) -> Option<Finding> {
     let last = port.failed.as_ref().filter(|last| last.age < REPORTED_FOR)?;
     let (command, age) = (last.command.as_str(), ago(last.age));
     let word = Request::parse(command.as_bytes()).map_or(command, |request| request.keyword().word());

@@ -19,7 +19,7 @@ use serde::de::IntoDeserializer;
 use serde::de::value::{Error, StrDeserializer};
 
 use crate::bytes::from_hex;
-use crate::state::{FailedCommand, Link, OtherText, Peer, Port, Rejected, State, Withheld};
+use crate::state::{FailedCommand, ObservedLink, ObservedPort, OtherText, Peer, Rejected, State, Withheld};
 
 /// The document `status`.
 #[derive(Debug, Clone, Deserialize)]
@@ -160,7 +160,7 @@ impl StatusDocument {
         let links = engine.links().filter_map(|info| {
             let shown = self.links.get(info.name)?;
             let is_up = matches!(shown.state.as_str(), "up" | "shared");
-            Some(Link {
+            Some(ObservedLink {
                 id: info.id,
                 name: info.name.to_owned(),
                 kind: info.kind,
@@ -187,7 +187,7 @@ impl StatusDocument {
 }
 
 impl PortDocument {
-    fn port(&self, id: PortId, name: &str, bus: &Bus) -> Port {
+    fn port(&self, id: PortId, name: &str, bus: &Bus) -> ObservedPort {
         let bus_state = self.bus_state.as_deref();
         let states = [BusState::Active, BusState::Warning, BusState::Passive, BusState::BusOff];
         let state = states.into_iter().find(|state| Some(state.name()) == bus_state);
@@ -209,7 +209,7 @@ impl PortDocument {
         });
         let mut peers: Vec<_> = peers.collect();
         peers.sort_by_key(|peer| peer.number);
-        Port {
+        ObservedPort {
             id,
             name: name.to_owned(),
             bus,

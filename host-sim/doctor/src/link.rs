@@ -25,7 +25,7 @@ pub(crate) fn examine(case: &Case<'_>, findings: &mut Vec<Finding>) {
 
 struct LinkCase<'a> {
     case: &'a Case<'a>,
-    info: &'a state::Link,
+    info: &'a state::ObservedLink,
     facts: Option<&'a LinkFacts>,
     place: FindingPlace,
 }

@@ -13,15 +13,15 @@ use proto_core::wire::state::States;
 #[derive(Debug, Clone)]
 pub struct State {
     pub(crate) at: Instant,
-    pub(crate) ports: Vec<Port>,
-    pub(crate) links: Vec<Link>,
+    pub(crate) ports: Vec<ObservedPort>,
+    pub(crate) links: Vec<ObservedLink>,
     /// The controller's states in the newest state packet.
     pub(crate) controller: Option<States>,
 }
 
 /// A field port.
 #[derive(Debug, Clone)]
-pub(crate) struct Port {
+pub(crate) struct ObservedPort {
     pub(crate) id: PortId,
     pub(crate) name: String,
     pub(crate) bus: FieldBus,
@@ -83,7 +83,7 @@ pub(crate) struct Peer {
 
 /// A link to the controller.
 #[derive(Debug, Clone)]
-pub(crate) struct Link {
+pub(crate) struct ObservedLink {
     pub(crate) id: LinkId,
     pub(crate) name: String,
     pub(crate) kind: LinkKind,
@@ -111,7 +111,7 @@ pub(crate) struct OtherText {
 impl From<Status<'_>> for State {
     fn from(status: Status<'_>) -> Self {
         let at = status.at();
-        let ports = status.ports().map(|port| Port {
+        let ports = status.ports().map(|port| ObservedPort {
             id: port.id,
             name: port.name.to_owned(),
             bus: port.bus,
@@ -143,7 +143,7 @@ impl From<Status<'_>> for State {
                 .map(|peer| Peer { number: peer.number, presence: peer.presence, counters: peer.counters })
                 .collect(),
         });
-        let links = status.links().map(|link| Link {
+        let links = status.links().map(|link| ObservedLink {
             id: link.id,
             name: link.name.to_owned(),
             kind: link.kind,

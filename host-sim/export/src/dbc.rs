@@ -15,7 +15,7 @@ use proto_core::time::Duration;
 use proto_core::wire::can::CanId;
 use proto_core::wire::scalar::ScalarType;
 
-use crate::model::{Field, Format, Model, Owner, Port, PortBus};
+use crate::model::{BusModel, Format, FrameField, Model, Owner, PortModel};
 use crate::names::{Collision, Names};
 use crate::uses::{describe_use, unit_of};
 use multiplex::Multiplex;
@@ -82,9 +82,9 @@ impl From<Collision> for DbcError {
 /// # Errors
 /// [`DbcError`].
 pub fn dbc(model: &Model, port: Option<&str>) -> Result<Dbc, DbcError> {
-    let can = || model.ports.iter().filter(|port| matches!(port.bus, PortBus::Can { .. }));
+    let can = || model.ports.iter().filter(|port| matches!(port.bus, BusModel::Can { .. }));
     let known = || can().map(|port| port.name.clone()).collect::<Vec<_>>();
-    let ports: Vec<&Port> = match port {
+    let ports: Vec<&PortModel> = match port {
         Some(name) => can().filter(|port| port.name == name).collect(),
         None => can().collect(),
     };
@@ -106,11 +106,14 @@ pub fn dbc(model: &Model, port: Option<&str>) -> Result<Dbc, DbcError> {
 struct DbcMessage<'m> {
     id: CanId,
     recipe: &'m str,
-    port: &'m Port,
+    port: &'m PortModel,
     formats: Vec<&'m Format>,
 }
 
-fn messages<'m>(model: &'m Model, ports: &[&'m Port]) -> Result<BTreeMap<u32, DbcMessage<'m>>, DbcError> {
+fn messages<'m>(
+    model: &'m Model,
+    ports: &[&'m PortModel],
+) -> Result<BTreeMap<u32, DbcMessage<'m>>, DbcError> {
     let mut messages: BTreeMap<u32, DbcMessage<'m>> = BTreeMap::new();
     for port in ports {
         let Some(recipe) = model.recipe_of(port) else { continue };
@@ -182,7 +185,7 @@ impl DbcWriter {
     }
 
     /// The node at the other end of a port.
-    fn device(&mut self, port: &Port) -> Result<String, Collision> {
+    fn device(&mut self, port: &PortModel) -> Result<String, Collision> {
         self.nodes.add(&format!("{}-device", port.name))
     }
 
@@ -324,7 +327,7 @@ impl DbcWriter {
     }
 
     /// Comment and names of values.
-    fn describe(&mut self, id: u32, name: &str, field: &Field, element: &Element, half: &str) {
+    fn describe(&mut self, id: u32, name: &str, field: &FrameField, element: &Element, half: &str) {
         let mut words = Vec::new();
         if name != field.name() {
             words.push(format!("field {}", field.name()));
@@ -344,7 +347,7 @@ impl DbcWriter {
         }
     }
 
-    fn finish(mut self, ports: &[&Port]) -> Dbc {
+    fn finish(mut self, ports: &[&PortModel]) -> Dbc {
         let devices: Vec<_> = ports.iter().filter_map(|port| self.device(port).ok()).collect();
         let text = format!(
             "VERSION \"\"\n\nNS_ :\n\tCM_\n\tBA_DEF_\n\tBA_\n\tVAL_\n\tBA_DEF_DEF_\n\tSIG_VALTYPE_\n\tSG_MUL_VAL_\n\nBS_:\n\n\
@@ -397,7 +400,7 @@ fn in_several(formats: &[&Format]) -> BTreeMap<String, Several> {
 }
 
 /// How often a frame is sent.
-fn period(format: &Format, port: &Port) -> Option<Duration> {
+fn period(format: &Format, port: &PortModel) -> Option<Duration> {
     use crate::model::Role;
     match format.role {
         Role::Output => port.period,
@@ -407,7 +410,7 @@ fn period(format: &Format, port: &Port) -> Option<Duration> {
 }
 
 /// Where the bits of a field are; `None` if that is not the same in all frames.
-fn shape(field: &Field, element: &Element) -> Option<SignalShape> {
+fn shape(field: &FrameField, element: &Element) -> Option<SignalShape> {
     let (at, len) = (field.place.at?, field.place.len?);
     let whole = SignalShape { start: 0, bits: 8 * len, order: ByteOrder::Big, signed: false, value_type: 0 };
     let Some(encoding) = element.encoding() else {

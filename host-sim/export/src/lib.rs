@@ -13,5 +13,5 @@ mod model;
 pub mod names;
 mod uses;
 
-pub use model::{Field, Format, Model, Owner, Port, PortBus, Recipe, Role};
+pub use model::{BusModel, Format, FrameField, Model, Owner, PortModel, Recipe, Role};
 pub use uses::{describe_use, unit_of};

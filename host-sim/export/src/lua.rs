@@ -11,7 +11,7 @@ use proto_core::sysvar::Direction;
 use proto_core::wire::can::CanId;
 use proto_core::wire::scalar::ScalarType;
 
-use crate::model::{Field, Format, Model, PortBus};
+use crate::model::{BusModel, Format, FrameField, Model};
 use crate::names::{Collision, Names, mangle};
 use crate::uses::{describe_use, unit_of};
 
@@ -39,7 +39,7 @@ pub fn lua(model: &Model) -> Result<String, Collision> {
     let mut all = Vec::new();
     for port in &model.ports {
         let indexes = port.recipe.and_then(|recipe| of_recipe.get(recipe)).cloned().unwrap_or_default();
-        let can = matches!(port.bus, PortBus::Can { .. });
+        let can = matches!(port.bus, BusModel::Can { .. });
         text +=
             &format!("  [{}] = {{ can = {can}, formats = {{ {} }} }},\n", quoted(&port.name), list(&indexes));
         all.extend(indexes);
@@ -101,7 +101,7 @@ impl LuaWriter {
         self.count += 1;
     }
 
-    fn field(&mut self, prefix: &str, format: &Format, field: &Field, behind: usize) -> String {
+    fn field(&mut self, prefix: &str, format: &Format, field: &FrameField, behind: usize) -> String {
         let Some(element) = field.element.and_then(|nth| format.frame.elements.get(nth)) else {
             return format!("kind = \"checksum\", len = {}", field.place.len.unwrap_or(0));
         };
@@ -145,7 +145,7 @@ impl LuaWriter {
     }
 
     /// The index of the field's `ProtoField`. Frames of one part may have fields with the same name.
-    fn proto_field(&mut self, prefix: &str, format: &Format, field: &Field, ty: &str) -> usize {
+    fn proto_field(&mut self, prefix: &str, format: &Format, field: &FrameField, ty: &str) -> usize {
         let unit = field.system.map_or("", unit_of);
         let label =
             if unit.is_empty() { field.name().to_owned() } else { format!("{} [{unit}]", field.name()) };
@@ -207,8 +207,8 @@ fn width_of(element: &Element) -> Wide {
 }
 
 /// The number of bytes of these fields, which do not vary behind a text that takes the rest.
-fn behind(fields: &[Field]) -> usize {
-    let is_shared = |field: &&Field| {
+fn behind(fields: &[FrameField]) -> usize {
+    let is_shared = |field: &&FrameField| {
         field
             .field
             .spec

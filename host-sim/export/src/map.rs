@@ -9,7 +9,7 @@ use proto_core::device::{Bits, ByteOrder, Digits, Element, Kind, Place, Text, Te
 use proto_core::sysvar::{Direction, ModbusPlace, SysVar};
 use proto_core::wire::can::CanId;
 
-use crate::model::{Field, Format, Model, Owner, Port};
+use crate::model::{Format, FrameField, Model, Owner, PortModel};
 use crate::uses::{describe_use, unit_of};
 
 /// How the table is written.
@@ -63,10 +63,10 @@ pub fn map(model: &Model, style: Style) -> String {
 fn add_field(
     rows: &mut Vec<(usize, MapRow)>,
     owner: Owner,
-    port: &Port,
+    port: &PortModel,
     recipe: &str,
     format: &Format,
-    field: &Field,
+    field: &FrameField,
 ) {
     if matches!(field.field.spec, FieldSpec::Padding { .. } | FieldSpec::Checksum(_))
         || field.name().is_empty()

@@ -23,7 +23,7 @@ pub struct Model {
     /// Whose file it is.
     pub owner: Owner,
     /// Every port, in file order.
-    pub ports: Vec<Port>,
+    pub ports: Vec<PortModel>,
     /// Every recipe, in file order.
     pub recipes: Vec<Recipe>,
 }
@@ -39,11 +39,11 @@ pub enum Owner {
 
 /// A port.
 #[derive(Debug, Clone)]
-pub struct Port {
+pub struct PortModel {
     /// Its name.
     pub name: String,
     /// What it is connected to.
-    pub bus: PortBus,
+    pub bus: BusModel,
     /// Index of its recipe; `None` if it is idle.
     pub recipe: Option<usize>,
     /// How often the output part is sent, if time alone tells when.
@@ -57,7 +57,7 @@ pub struct Port {
 
 /// The bus of a port.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum PortBus {
+pub enum BusModel {
     /// A serial line.
     Serial {
         /// Bit/s.
@@ -132,14 +132,14 @@ pub struct Format {
     /// Bytes at the beginning and at the end.
     pub delimiters: (Vec<u8>, Vec<u8>),
     /// Its fields, and the checksum among them.
-    pub fields: Vec<Field>,
+    pub fields: Vec<FrameField>,
     /// Its layout.
     pub frame: DeviceFrame,
 }
 
 /// A field of a frame.
 #[derive(Debug, Clone)]
-pub struct Field {
+pub struct FrameField {
     /// As the file has it.
     pub field: DeviceField,
     /// The system variable that a field of a realtime recipe is.
@@ -150,7 +150,7 @@ pub struct Field {
     pub element: Option<usize>,
 }
 
-impl Field {
+impl FrameField {
     /// Its name, empty for what needs none.
     pub fn name(&self) -> &str {
         &self.field.name
@@ -209,7 +209,7 @@ impl Model {
     }
 
     /// The recipe of a port.
-    pub fn recipe_of(&self, port: &Port) -> Option<&Recipe> {
+    pub fn recipe_of(&self, port: &PortModel) -> Option<&Recipe> {
         self.recipes.get(port.recipe?)
     }
 }
@@ -238,17 +238,17 @@ impl Format {
     }
 }
 
-fn gateway_ports(config: &GatewayConfig) -> Vec<Port> {
+fn gateway_ports(config: &GatewayConfig) -> Vec<PortModel> {
     let port = |port: &proto_core::config::Port| {
         let recipe = config.recipes.get(usize::from(port.recipe));
         let by_time = recipe.is_some_and(|recipe| recipe.send == SendOn::Period);
-        Port {
+        PortModel {
             name: port.name.to_string(),
             bus: match port.bus {
-                Bus::Rs485(line) => PortBus::Serial { baud: line.baud },
-                Bus::Can { bitrate } => PortBus::Can { bitrate },
-                Bus::ModbusTcp { .. } => PortBus::ModbusTcp,
-                Bus::TcpListen { .. } | Bus::UdpListen { .. } => PortBus::Network,
+                Bus::Rs485(line) => BusModel::Serial { baud: line.baud },
+                Bus::Can { bitrate } => BusModel::Can { bitrate },
+                Bus::ModbusTcp { .. } => BusModel::ModbusTcp,
+                Bus::TcpListen { .. } | Bus::UdpListen { .. } => BusModel::Network,
             },
             recipe: Some(usize::from(port.recipe)),
             period: by_time.then_some(port.cycle),
@@ -270,16 +270,16 @@ fn safe_value(safe: &SafeValue) -> Vec<(String, SysVar, String)> {
     bits.map(|bit| (format!("{var}.{bit}"), var, (on >> bit & 1).to_string())).collect()
 }
 
-fn controller_ports(config: &SimConfig) -> Vec<Port> {
+fn controller_ports(config: &SimConfig) -> Vec<PortModel> {
     let port = |port: &recipe_config::SimPort| {
         let recipe = port.recipe.and_then(|index| config.recipes.get(index));
         let by_time = recipe.is_some_and(|recipe| recipe.mode == model::Mode::Realtime);
-        Port {
+        PortModel {
             name: port.name.clone(),
             bus: match port.bus {
-                SimBus::Rs485(line) => PortBus::Serial { baud: line.baud },
-                SimBus::Can { bitrate } => PortBus::Can { bitrate },
-                _ => PortBus::Network,
+                SimBus::Rs485(line) => BusModel::Serial { baud: line.baud },
+                SimBus::Can { bitrate } => BusModel::Can { bitrate },
+                _ => BusModel::Network,
             },
             recipe: port.recipe,
             period: by_time.then_some(port.cycle),
@@ -400,7 +400,7 @@ impl Format {
         let fields = frame.fields.iter().zip(places).map(|(field, place)| {
             let is_element = field.spec.element().is_some();
             let element = if is_element { element.next() } else { None };
-            Field { field: field.clone(), system: None, place, element }
+            FrameField { field: field.clone(), system: None, place, element }
         });
         Ok(Self {
             role,
@@ -416,7 +416,7 @@ impl Format {
     }
 
     /// The fields that have a value and a name, each once, with the element that has it.
-    pub fn named_values(&self) -> impl Iterator<Item = (&Field, &Element)> {
+    pub fn named_values(&self) -> impl Iterator<Item = (&FrameField, &Element)> {
         self.fields.iter().filter(|field| !field.field.repeats && !field.name().is_empty()).filter_map(
             |field| {
                 let element = self.frame.elements.get(field.element?)?;

@@ -3,10 +3,10 @@
 use proto_core::config::{FieldSpec, InputBinding, OutputBinding};
 use proto_core::sysvar::SysVar;
 
-use crate::model::Field;
+use crate::model::FrameField;
 
 /// What becomes of a field's value, or what it shows; empty if nothing does.
-pub fn describe_use(field: &Field) -> String {
+pub fn describe_use(field: &FrameField) -> String {
     let spec = &field.field.spec;
     if let Some(var) = field.system {
         return var.to_string();

@@ -49,13 +49,13 @@ struct NodeState {
     wake: Notify,
     is_receiving: Cell<bool>,
     dropped: Cell<u64>,
-    sent: Cell<Sent>,
+    sent: Cell<SentFrames>,
     sent_wake: Notify,
 }
 
 /// Transmissions of a node since the last report.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Sent {
+pub struct SentFrames {
     /// Frames.
     pub frames: u64,
     /// Their data bytes.
@@ -116,8 +116,9 @@ impl CanBus {
             let Some(Transmitted { from, frame, at }) = transmitted else { return };
             for node in self.shared.nodes.borrow().iter() {
                 if node.id == from {
-                    let Sent { frames, bytes } = node.sent.get();
-                    node.sent.set(Sent { frames: frames + 1, bytes: bytes + frame.data().len() as u64 });
+                    let SentFrames { frames, bytes } = node.sent.get();
+                    node.sent
+                        .set(SentFrames { frames: frames + 1, bytes: bytes + frame.data().len() as u64 });
                     node.sent_wake.notify_one();
                     continue;
                 }
@@ -172,7 +173,7 @@ impl BusNode {
     }
 
     /// Waits until frames of this node have been transmitted, and returns their number. Cancel safe.
-    pub async fn sent(&self) -> Sent {
+    pub async fn sent(&self) -> SentFrames {
         loop {
             let sent = self.state.sent.take();
             if sent.frames > 0 {

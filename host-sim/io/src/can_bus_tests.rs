@@ -8,21 +8,21 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
 use super::super::exchange::STALE;
-use super::super::port::{Port, PortBus};
-use super::super::test_kit::{Client, Running, Seen, run};
+use super::super::port::{BusSettings, OpenPort};
+use super::super::test_kit::{PortTask, Seen, TerminalClient, run};
 use super::super::wire::{MAX_QUEUED, frame_bits};
 use super::clients::MAX_CLIENTS;
 use super::*;
 
 const START: Instant = Instant::from_micros(1_000);
-const BUS: PortBus = PortBus::Can { bitrate: 500_000 };
+const BUS: BusSettings = BusSettings::Can { bitrate: 500_000 };
 
 fn frame(id: u16, data: &[u8]) -> CanFrame {
     CanFrame::new(CanId::Standard(id), data).unwrap()
 }
 
 /// An slcan client on TCP that opened its channel.
-async fn client(port: &Running) -> TcpStream {
+async fn client(port: &PortTask) -> TcpStream {
     let mut stream = TcpStream::connect(&port.place).await.unwrap();
     exchange(&mut stream, b"C\rS6\r\rO\rO\r", b"\r\r\r\r").await;
     stream
@@ -92,7 +92,7 @@ fn no_frame_is_received_before_its_end() {
 #[test]
 fn clients_on_tcp_and_the_port_are_one_bus() {
     run(async |_| {
-        let port = Running::start("slcan-tcp:127.0.0.1:0", BUS).await;
+        let port = PortTask::start("slcan-tcp:127.0.0.1:0", BUS).await;
         port.expect(Seen::Up).await;
         let mut one = client(&port).await;
         let mut two = client(&port).await;
@@ -121,11 +121,11 @@ fn clients_on_tcp_and_the_port_are_one_bus() {
 fn a_client_on_a_terminal_joins_too() {
     run(async |dir| {
         let link = dir.join("can").display().to_string();
-        let port = Running::start(&format!("slcan-pty:{link}"), BUS).await;
+        let port = PortTask::start(&format!("slcan-pty:{link}"), BUS).await;
         assert_eq!(port.place, link);
         port.expect(Seen::Up).await;
         for round in 0..3 {
-            let mut client = Client::open(&link);
+            let mut client = TerminalClient::open(&link);
             client.0.write_all(b"C\rS6\r\rO\rO\r").unwrap();
             assert_eq!(client.read_exact(4).await, b"\r\r\r\r");
             client.0.write_all(b"t0012AB0").unwrap();
@@ -144,7 +144,7 @@ fn a_client_on_a_terminal_joins_too() {
 #[test]
 fn a_client_that_does_not_read_loses_frames_and_others_do_not() {
     run(async |_| {
-        let port = Running::start("slcan-tcp-unpaced:127.0.0.1:0", BUS).await;
+        let port = PortTask::start("slcan-tcp-unpaced:127.0.0.1:0", BUS).await;
         port.expect(Seen::Up).await;
         let _slow = client(&port).await;
         let mut busy = client(&port).await;
@@ -183,13 +183,13 @@ async fn received_ids(stream: &mut TcpStream, count: usize) -> Vec<u16> {
 #[test]
 fn bursts_of_two_clients_and_the_port_are_arbitrated_and_take_their_time() {
     run(async |dir| {
-        let bus = PortBus::Can { bitrate: 10_000 };
+        let bus = BusSettings::Can { bitrate: 10_000 };
         let link = dir.join("can").display().to_string();
-        let port = Running::start(&format!("slcan-tcp:127.0.0.1:0,{link}"), bus).await;
+        let port = PortTask::start(&format!("slcan-tcp:127.0.0.1:0,{link}"), bus).await;
         port.expect(Seen::Up).await;
         let mut watcher = TcpStream::connect(&port.place).await.unwrap();
         let mut one = TcpStream::connect(&port.place).await.unwrap();
-        let mut two = Client::open(&link);
+        let mut two = TerminalClient::open(&link);
         exchange(&mut watcher, b"O\r", b"\r").await;
         exchange(&mut one, b"O\r", b"\r").await;
         two.0.write_all(b"O\r").unwrap();
@@ -222,7 +222,7 @@ fn bursts_of_two_clients_and_the_port_are_arbitrated_and_take_their_time() {
 #[test]
 fn a_burst_longer_than_the_queue_waits_in_its_connection_and_nothing_is_lost() {
     run(async |_| {
-        let port = Running::start("slcan-tcp:127.0.0.1:0", PortBus::Can { bitrate: 1_000_000 }).await;
+        let port = PortTask::start("slcan-tcp:127.0.0.1:0", BusSettings::Can { bitrate: 1_000_000 }).await;
         port.expect(Seen::Up).await;
         let mut one = TcpStream::connect(&port.place).await.unwrap();
         let count = 5 * MAX_QUEUED as u16;
@@ -241,7 +241,7 @@ fn a_burst_longer_than_the_queue_waits_in_its_connection_and_nothing_is_lost() {
 #[test]
 fn a_client_that_reads_loses_nothing_of_an_unpaced_burst() {
     run(async |_| {
-        let port = Running::start("slcan-tcp-unpaced:127.0.0.1:0", BUS).await;
+        let port = PortTask::start("slcan-tcp-unpaced:127.0.0.1:0", BUS).await;
         let (mut one, mut two) = (client(&port).await, client(&port).await);
         one.write_all(&b"t0010\r".repeat(2_000)).await.unwrap();
         assert_eq!(received_ids(&mut two, 2_000).await, [1; 2_000]);
@@ -253,7 +253,7 @@ fn a_client_that_reads_loses_nothing_of_an_unpaced_burst() {
 #[test]
 fn what_waited_in_a_connection_that_waited_itself_is_dropped() {
     run(async |_| {
-        let port = Running::start("slcan-tcp:127.0.0.1:0", BUS).await;
+        let port = PortTask::start("slcan-tcp:127.0.0.1:0", BUS).await;
         port.expect(Seen::Up).await;
         for _ in 0..4 {
             let mut client = std::net::TcpStream::connect(&port.place).unwrap();
@@ -281,7 +281,7 @@ fn what_waited_in_a_connection_that_waited_itself_is_dropped() {
 #[test]
 fn more_clients_than_the_maximum_are_refused() {
     run(async |_| {
-        let port = Running::start("slcan-tcp:127.0.0.1:0", BUS).await;
+        let port = PortTask::start("slcan-tcp:127.0.0.1:0", BUS).await;
         let mut clients = Vec::new();
         for _ in 0..MAX_CLIENTS {
             clients.push(client(&port).await);
@@ -298,7 +298,7 @@ fn more_clients_than_the_maximum_are_refused() {
 fn an_unsuitable_device_is_refused_by_name() {
     run(async |_| {
         let refused =
-            async |device: &str| Port::open(&device.parse().unwrap(), BUS).await.unwrap_err().to_string();
+            async |device: &str| OpenPort::open(&device.parse().unwrap(), BUS).await.unwrap_err().to_string();
         assert!(refused("pty:x").await.contains("is a serial device"));
         // With and without CAN interfaces on this machine.
         let why = refused("socketcan:no-such-can").await;

@@ -9,12 +9,12 @@ use tokio::task::yield_now;
 
 use super::*;
 use crate::exchange::STALE;
-use crate::port::{Port, PortBus};
-use crate::test_kit::{Client, Running, Seen, run, serial};
+use crate::port::{BusSettings, OpenPort};
+use crate::test_kit::{PortTask, Seen, TerminalClient, run, serial};
 use crate::timer::now;
 
 /// Ends the tasks of a port and keeps its device.
-async fn hand_over(port: Running, hold: Hold) -> HandoverDevice {
+async fn hand_over(port: PortTask, hold: Hold) -> HandoverDevice {
     drop(port);
     for _ in 0..10 {
         yield_now().await;
@@ -22,12 +22,12 @@ async fn hand_over(port: Running, hold: Hold) -> HandoverDevice {
     hold.release().expect("it is not handed over")
 }
 
-async fn open(bind: &str, bus: PortBus, handover: Option<HandoverDevice>) -> (Running, Hold) {
+async fn open(bind: &str, bus: BusSettings, handover: Option<HandoverDevice>) -> (PortTask, Hold) {
     let is_handed_over = handover.is_some();
-    let port = Port::open_or_adopt(&bind.parse().unwrap(), bus, handover).await.unwrap();
+    let port = OpenPort::open_or_adopt(&bind.parse().unwrap(), bus, handover).await.unwrap();
     assert_eq!(port.is_handed_over(), is_handed_over);
     let hold = port.hold().unwrap();
-    (Running::of(port), hold)
+    (PortTask::of(port), hold)
 }
 
 #[test]
@@ -37,7 +37,7 @@ fn what_was_sent_between_two_owners_of_a_terminal_is_dropped() {
         let bind = format!("pty:{link}");
         let (port, hold) = open(&bind, serial(115_200), None).await;
         port.expect(Seen::Up).await;
-        let mut client = Client::open(&link);
+        let mut client = TerminalClient::open(&link);
         client.0.write_all(b"first").unwrap();
         assert_eq!(port.bytes(5).await, b"first");
         let handover = hand_over(port, hold).await;
@@ -78,7 +78,7 @@ fn a_client_that_has_gone_between_two_owners_makes_room() {
 #[test]
 fn a_command_that_is_cut_by_the_change_becomes_no_other_frame() {
     run(async |dir| {
-        let bus = PortBus::Can { bitrate: 500_000 };
+        let bus = BusSettings::Can { bitrate: 500_000 };
         let bind = format!("slcan-tcp-unpaced:127.0.0.1:0,{}", dir.join("can").display());
         let (port, hold) = open(&bind, bus, None).await;
         port.expect(Seen::Up).await;
@@ -111,7 +111,7 @@ fn nothing_is_kept_that_a_task_still_uses() {
         let (port, hold) = open(&bind, serial(115_200), None).await;
         port.expect(Seen::Up).await;
         assert!(hold.release().is_none());
-        let serial_device = Port::open(&"tcp:127.0.0.1:1".parse().unwrap(), serial(9_600)).await.unwrap();
+        let serial_device = OpenPort::open(&"tcp:127.0.0.1:1".parse().unwrap(), serial(9_600)).await.unwrap();
         assert!(serial_device.hold().is_none(), "nobody is connected to it");
     });
 }

@@ -19,7 +19,7 @@ use crate::clock::Clock;
 
 /// A port's bus and its settings, from the configuration.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum PortBus {
+pub enum BusSettings {
     /// A serial line.
     Serial(Rs485),
     /// A CAN bus of this bit rate.
@@ -31,7 +31,7 @@ pub enum PortBus {
 
 /// A port whose device is open.
 #[derive(Debug)]
-pub struct Port {
+pub struct OpenPort {
     driver: PortDriver,
     device: Device,
     is_handed_over: bool,
@@ -45,12 +45,12 @@ enum PortDriver {
     Kernel(KernelCan),
 }
 
-impl Port {
+impl OpenPort {
     /// Opens the device in the current tokio runtime, which must be a current-thread one.
     ///
     /// # Errors
     /// If the device does not suit the bus, does not exist, or cannot be opened.
-    pub async fn open(device: &Device, bus: PortBus) -> io::Result<Self> {
+    pub async fn open(device: &Device, bus: BusSettings) -> io::Result<Self> {
         Self::open_or_adopt(device, bus, None).await
     }
 
@@ -61,7 +61,7 @@ impl Port {
     /// As [`Self::open`].
     pub async fn open_or_adopt(
         device: &Device,
-        bus: PortBus,
+        bus: BusSettings,
         handover: Option<HandoverDevice>,
     ) -> io::Result<Self> {
         let tx = Rc::new(PortTx::default());
@@ -69,13 +69,13 @@ impl Port {
         let handover = handover.filter(|what| bus.suits(what));
         let is_handed_over = handover.is_some();
         let driver = match (bus, device) {
-            (PortBus::Serial(settings), _) => {
+            (BusSettings::Serial(settings), _) => {
                 PortDriver::Serial(SerialPort::open(device, settings, Rc::clone(&tx), handover).await?)
             }
-            (PortBus::Can { bitrate }, Device::SocketCan { interface }) => {
+            (BusSettings::Can { bitrate }, Device::SocketCan { interface }) => {
                 PortDriver::Kernel(KernelCan::open(interface, bitrate, Rc::clone(&tx))?)
             }
-            (PortBus::Can { bitrate }, _) => {
+            (BusSettings::Can { bitrate }, _) => {
                 PortDriver::Can(CanPort::open(device, bitrate, Rc::clone(&tx), handover).await?)
             }
         };
@@ -154,7 +154,7 @@ impl Port {
     }
 }
 
-impl PortBus {
+impl BusSettings {
     /// Whether a port of this bus can take over this device. Line settings may differ; the bit rate of slcan clients
     /// may not.
     fn suits(self, what: &HandoverState) -> bool {

@@ -6,13 +6,13 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
 use super::super::exchange::STALE;
-use super::super::port::{Port, PortBus};
-use super::super::test_kit::{Client, Running, Seen, is_gone, run, serial};
+use super::super::port::{BusSettings, OpenPort};
+use super::super::test_kit::{PortTask, Seen, TerminalClient, is_gone, run, serial};
 use super::*;
 
 #[test]
 fn a_byte_takes_its_start_data_parity_and_stop_bits() {
-    let PortBus::Serial(mut settings) = serial(115_200) else { unreachable!() };
+    let BusSettings::Serial(mut settings) = serial(115_200) else { unreachable!() };
     let micros = |settings: Rs485| settings.time_on_line(28).as_micros();
     assert_eq!(micros(settings), 2_431);
     settings.parity = Parity::Even;
@@ -29,10 +29,10 @@ fn a_byte_takes_its_start_data_parity_and_stop_bits() {
 fn a_pty_carries_both_ways_and_reports_sent_when_the_line_would_be_free() {
     run(async |dir| {
         let link = dir.join("rs485").display().to_string();
-        let port = Running::start(&format!("pty:{link}"), serial(9_600)).await;
+        let port = PortTask::start(&format!("pty:{link}"), serial(9_600)).await;
         assert_eq!(port.place, link);
         port.expect(Seen::Up).await;
-        let mut client = Client::open(&link);
+        let mut client = TerminalClient::open(&link);
         client.0.write_all(&[0xFF, 0xFF, 1, 2, 3, 0xEE, 0xEE]).unwrap();
         assert_eq!(port.bytes(7).await, [0xFF, 0xFF, 1, 2, 3, 0xEE, 0xEE]);
         let start = now();
@@ -53,9 +53,9 @@ fn a_pty_carries_both_ways_and_reports_sent_when_the_line_would_be_free() {
 fn a_paced_pty_shows_no_byte_before_its_time() {
     run(async |dir| {
         let link = dir.join("rs485").display().to_string();
-        let port = Running::start(&format!("pty-paced:{link}"), serial(9_600)).await;
+        let port = PortTask::start(&format!("pty-paced:{link}"), serial(9_600)).await;
         port.expect(Seen::Up).await;
-        let mut client = Client::open(&link);
+        let mut client = TerminalClient::open(&link);
         let start = now();
         port.tx.send(&[0x55; 24]);
         let mut seen = 0;
@@ -73,18 +73,18 @@ fn a_paced_pty_shows_no_byte_before_its_time() {
 fn bytes_without_a_client_are_counted_and_the_next_client_gets_only_new_ones() {
     run(async |dir| {
         let link = dir.join("rs485").display().to_string();
-        let port = Running::start(&format!("pty:{link}"), serial(115_200)).await;
+        let port = PortTask::start(&format!("pty:{link}"), serial(115_200)).await;
         port.expect(Seen::Up).await;
         port.tx.send(b"lost");
         port.expect(Seen::Sent).await;
         assert_eq!(port.tx.counters().unheard, 4);
-        let first = Client::open(&link);
+        let first = TerminalClient::open(&link);
         port.tx.send(b"unread");
         port.expect(Seen::Sent).await;
         drop(first);
         port.tx.send(b"lost too");
         port.expect(Seen::Sent).await;
-        let mut second = Client::open(&link);
+        let mut second = TerminalClient::open(&link);
         port.tx.send(b"new");
         assert_eq!(second.read_exact(3).await, b"new");
         assert_eq!(port.tx.counters().unheard, 12);
@@ -95,9 +95,9 @@ fn bytes_without_a_client_are_counted_and_the_next_client_gets_only_new_ones() {
 fn a_client_that_does_not_read_loses_bytes_and_blocks_nothing() {
     run(async |dir| {
         let link = dir.join("rs485").display().to_string();
-        let port = Running::start(&format!("pty:{link}"), serial(4_000_000)).await;
+        let port = PortTask::start(&format!("pty:{link}"), serial(4_000_000)).await;
         port.expect(Seen::Up).await;
-        let _client = Client::open(&link);
+        let _client = TerminalClient::open(&link);
         let mut sent = 0;
         while port.tx.counters().dropped == 0 {
             port.tx.send(&[0; 4_000]);
@@ -114,9 +114,9 @@ fn a_client_that_does_not_read_loses_bytes_and_blocks_nothing() {
 fn two_transmissions_follow_each_other_and_too_much_is_dropped() {
     run(async |dir| {
         let link = dir.join("rs485").display().to_string();
-        let port = Running::start(&format!("pty:{link}"), serial(1_000_000)).await;
+        let port = PortTask::start(&format!("pty:{link}"), serial(1_000_000)).await;
         port.expect(Seen::Up).await;
-        let mut client = Client::open(&link);
+        let mut client = TerminalClient::open(&link);
         port.tx.send(b"one");
         assert_eq!(client.read_exact(3).await, b"one");
         port.tx.send(b"two");
@@ -132,11 +132,11 @@ fn a_serial_device_is_opened_with_any_rate_and_parity() {
     run(async |dir| {
         // A pseudoterminal replaces the device.
         let link = dir.join("device").display().to_string();
-        let device = Running::start(&format!("pty:{link}"), serial(460_800)).await;
+        let device = PortTask::start(&format!("pty:{link}"), serial(460_800)).await;
         device.expect(Seen::Up).await;
-        let PortBus::Serial(settings) = serial(460_800) else { unreachable!() };
-        let even = PortBus::Serial(Rs485 { parity: Parity::Even, ..settings });
-        let port = Running::start(&format!("serial:{link}"), even).await;
+        let BusSettings::Serial(settings) = serial(460_800) else { unreachable!() };
+        let even = BusSettings::Serial(Rs485 { parity: Parity::Even, ..settings });
+        let port = PortTask::start(&format!("serial:{link}"), even).await;
         port.expect(Seen::Up).await;
         device.tx.send(b"to the port");
         assert_eq!(port.bytes(11).await, b"to the port");
@@ -151,13 +151,13 @@ fn a_serial_device_is_opened_with_any_rate_and_parity() {
 fn a_serial_device_that_vanishes_is_opened_again() {
     run(async |dir| {
         let link = dir.join("device").display().to_string();
-        let device = Running::start(&format!("pty:{link}"), serial(115_200)).await;
-        let port = Running::start(&format!("serial:{link}"), serial(115_200)).await;
+        let device = PortTask::start(&format!("pty:{link}"), serial(115_200)).await;
+        let port = PortTask::start(&format!("serial:{link}"), serial(115_200)).await;
         port.expect(Seen::Up).await;
         drop(device);
         port.expect(Seen::Down).await;
         port.tx.send(b"into the void");
-        let device = Running::start(&format!("pty:{link}"), serial(115_200)).await;
+        let device = PortTask::start(&format!("pty:{link}"), serial(115_200)).await;
         device.expect(Seen::Up).await;
         port.expect(Seen::Up).await;
         port.tx.send(b"back");
@@ -173,7 +173,7 @@ fn a_tcp_port_connects_when_its_server_appears_and_again_after_a_loss() {
         let listener = TcpListener::bind("127.0.0.78:0").await.unwrap();
         let at = listener.local_addr().unwrap();
         drop(listener);
-        let port = Running::start(&format!("tcp:{at}"), serial(115_200)).await;
+        let port = PortTask::start(&format!("tcp:{at}"), serial(115_200)).await;
         assert_eq!(port.place, at.to_string());
         let listener = TcpListener::bind(at).await.unwrap();
         for _ in 0..2 {
@@ -199,7 +199,7 @@ fn what_a_server_does_not_take_in_time_is_dropped_with_its_connection() {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         tcp_options::limit_buffers(&listener);
         let at = listener.local_addr().unwrap();
-        let port = Running::start(&format!("tcp:{at}"), serial(4_000_000)).await;
+        let port = PortTask::start(&format!("tcp:{at}"), serial(4_000_000)).await;
         // It acknowledges what it has room for, and reads nothing.
         let (mut server, _) = listener.accept().await.unwrap();
         port.expect(Seen::Up).await;
@@ -228,7 +228,7 @@ fn what_a_server_does_not_take_in_time_is_dropped_with_its_connection() {
 #[test]
 fn a_listening_port_has_one_client_at_a_time() {
     run(async |_| {
-        let port = Running::start("tcp:127.0.0.1:0", serial(115_200)).await;
+        let port = PortTask::start("tcp:127.0.0.1:0", serial(115_200)).await;
         let mut first = TcpStream::connect(&port.place).await.unwrap();
         port.expect(Seen::Up).await;
         let mut second = TcpStream::connect(&port.place).await.unwrap();
@@ -251,7 +251,7 @@ fn a_listening_port_has_one_client_at_a_time() {
 fn an_unsuitable_device_is_refused_by_name() {
     run(async |dir| {
         let refused = async |device: &str| {
-            Port::open(&device.parse().unwrap(), serial(115_200)).await.unwrap_err().to_string()
+            OpenPort::open(&device.parse().unwrap(), serial(115_200)).await.unwrap_err().to_string()
         };
         assert!(refused("slcan-tcp:127.0.0.1:0").await.contains("is a CAN device"));
         let missing = dir.join("ttyUSB9").display().to_string();
@@ -267,7 +267,7 @@ const OLD: &[u8] = b"old old old old";
 
 /// What waited while the process slept is not handed over by a task that runs only when the engine accepts input
 /// again; what is sent later is.
-async fn old_bytes_are_dropped(port: &Running, mut write: impl FnMut(&[u8])) {
+async fn old_bytes_are_dropped(port: &PortTask, mut write: impl FnMut(&[u8])) {
     for _ in 0..MANY_ROUNDS {
         write(OLD);
         port.tx.note_sleep(now());
@@ -288,7 +288,7 @@ async fn old_bytes_are_dropped(port: &Running, mut write: impl FnMut(&[u8])) {
 }
 
 /// After a sleep in which nothing came the first bytes are handed over, however late they come.
-async fn bytes_after_an_empty_sleep_are_taken(port: &Running, mut write: impl FnMut(&[u8])) {
+async fn bytes_after_an_empty_sleep_are_taken(port: &PortTask, mut write: impl FnMut(&[u8])) {
     port.tx.note_sleep(now());
     tokio::time::sleep(StdDuration::from_millis(2 * STALE.as_millis())).await;
     write(b"a button");
@@ -300,9 +300,9 @@ async fn bytes_after_an_empty_sleep_are_taken(port: &Running, mut write: impl Fn
 fn what_waited_on_a_terminal_is_dropped_by_a_task_that_runs_late() {
     run(async |dir| {
         let link = dir.join("rs485").display().to_string();
-        let port = Running::start(&format!("pty:{link}"), serial(115_200)).await;
+        let port = PortTask::start(&format!("pty:{link}"), serial(115_200)).await;
         port.expect(Seen::Up).await;
-        let mut client = Client::open(&link);
+        let mut client = TerminalClient::open(&link);
         bytes_after_an_empty_sleep_are_taken(&port, |bytes| client.0.write_all(bytes).unwrap()).await;
         old_bytes_are_dropped(&port, |bytes| client.0.write_all(bytes).unwrap()).await;
     });
@@ -311,7 +311,7 @@ fn what_waited_on_a_terminal_is_dropped_by_a_task_that_runs_late() {
 #[test]
 fn what_waited_in_a_connection_is_dropped_by_a_task_that_runs_late() {
     run(async |_| {
-        let port = Running::start("tcp-listen:127.0.0.1:0", serial(115_200)).await;
+        let port = PortTask::start("tcp-listen:127.0.0.1:0", serial(115_200)).await;
         let mut client = std::net::TcpStream::connect(&port.place).unwrap();
         port.expect(Seen::Up).await;
         bytes_after_an_empty_sleep_are_taken(&port, |bytes| client.write_all(bytes).unwrap()).await;
@@ -325,7 +325,7 @@ fn what_waited_in_a_connection_is_dropped_by_a_task_that_runs_late() {
 #[test]
 fn what_waited_in_a_connection_that_waited_itself_is_dropped() {
     run(async |_| {
-        let port = Running::start("tcp-listen:127.0.0.1:0", serial(115_200)).await;
+        let port = PortTask::start("tcp-listen:127.0.0.1:0", serial(115_200)).await;
         tokio::task::yield_now().await;
         for _ in 0..MANY_ROUNDS {
             let mut client = std::net::TcpStream::connect(&port.place).unwrap();

@@ -16,7 +16,7 @@ use tokio::sync::Notify;
 use tokio::task::{JoinHandle, LocalSet};
 
 use super::exchange::{PortEvent, PortTx};
-use super::port::{Port, PortBus};
+use super::port::{BusSettings, OpenPort};
 use crate::timer::now;
 
 /// A device's event.
@@ -36,20 +36,20 @@ struct Log {
 }
 
 /// A port that runs as a local task. Its events wait until a test takes them.
-pub(super) struct Running {
+pub(super) struct PortTask {
     pub(super) place: String,
     pub(super) tx: Rc<PortTx>,
     log: Rc<Log>,
     task: JoinHandle<()>,
 }
 
-impl Running {
-    pub(super) async fn start(bind: &str, bus: PortBus) -> Self {
-        Self::of(Port::open(&bind.parse().unwrap(), bus).await.unwrap())
+impl PortTask {
+    pub(super) async fn start(bind: &str, bus: BusSettings) -> Self {
+        Self::of(OpenPort::open(&bind.parse().unwrap(), bus).await.unwrap())
     }
 
     /// Runs a port that is open.
-    pub(super) fn of(port: Port) -> Self {
+    pub(super) fn of(port: OpenPort) -> Self {
         let (place, tx) = (port.place(), port.tx());
         let log = Rc::new(Log::default());
         let sink = Rc::clone(&log);
@@ -110,15 +110,15 @@ impl Running {
     }
 }
 
-impl Drop for Running {
+impl Drop for PortTask {
     fn drop(&mut self) {
         self.task.abort();
     }
 }
 
 /// A line with 8 data bits, no parity, and an idle gap of 50 ms.
-pub(super) fn serial(baud: u32) -> PortBus {
-    PortBus::Serial(Rs485 {
+pub(super) fn serial(baud: u32) -> BusSettings {
+    BusSettings::Serial(Rs485 {
         baud,
         parity: Parity::None,
         stop_bits: 1,
@@ -140,9 +140,9 @@ pub(super) fn run(test: impl AsyncFnOnce(&Path)) {
 }
 
 /// A program with the terminal open.
-pub(super) struct Client(pub(super) File);
+pub(super) struct TerminalClient(pub(super) File);
 
-impl Client {
+impl TerminalClient {
     pub(super) fn open(link: &str) -> Self {
         let flags = i32::try_from((OFlags::NOCTTY | OFlags::NONBLOCK).bits()).unwrap();
         Self(OpenOptions::new().read(true).write(true).custom_flags(flags).open(link).unwrap())

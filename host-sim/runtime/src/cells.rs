@@ -18,7 +18,7 @@ use crate::console::{ConfigFile, Supervised};
 use crate::gateway::{Observers, spawn};
 use crate::host::{self, ForegroundRun};
 use crate::worker::{Begin, RuntimePlace, Worker};
-use crate::{RunOptions, StartError};
+use crate::{RunError, RunOptions};
 
 /// A cell of a process that serves several.
 #[derive(Debug)]
@@ -38,7 +38,7 @@ pub struct Cell {
 ///
 /// # Errors
 /// The reason why one of them could not start, with its name; nothing is left behind then.
-pub fn run(cells: Vec<Cell>, threads: NonZeroUsize, options: &RunOptions) -> Result<(), StartError> {
+pub fn run(cells: Vec<Cell>, threads: NonZeroUsize, options: &RunOptions) -> Result<(), RunError> {
     raise_file_limit();
     let workers: Vec<_> =
         (0..threads.get().min(cells.len())).map(|_| Worker::start("gateways")).collect::<Result<_, _>>()?;
@@ -63,7 +63,7 @@ pub fn run(cells: Vec<Cell>, threads: NonZeroUsize, options: &RunOptions) -> Res
 /// The usual cycle. Cells start staggered within it, so that they do not contend in each cycle.
 const CYCLE: Duration = Duration::from_millis(4);
 
-fn start(cell: Cell, place: RuntimePlace) -> Result<Box<dyn ForegroundRun>, StartError> {
+fn start(cell: Cell, place: RuntimePlace) -> Result<Box<dyn ForegroundRun>, RunError> {
     let Cell { config, file, options, .. } = cell;
     // For threads that are started here.
     let _of = place.span.clone().entered();
@@ -110,7 +110,7 @@ impl ForegroundRun for Cells {
         self.cells.iter().any(|(_, run)| run.has_ended())
     }
 
-    fn shutdown(self: Box<Self>) -> Result<(), StartError> {
+    fn shutdown(self: Box<Self>) -> Result<(), RunError> {
         let mut result = Ok(());
         for (name, run) in self.cells {
             result = result.and(run.shutdown().map_err(|error| error.of(&name)));

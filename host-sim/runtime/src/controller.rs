@@ -27,7 +27,7 @@ use super::events_file::EventsWriter;
 use super::host::{self, Handle, Runtime};
 use super::tcp::{Accepted, Connection};
 use super::worker::RuntimePlace;
-use super::{EventsFile, RunOptions, StartError};
+use super::{EventsFile, RunError, RunOptions};
 use control::ControlClient;
 use recipe_config::SimConfig;
 use recipe_controller::operations::Operation;
@@ -38,10 +38,10 @@ use recipe_io::clock::{Alarm, Clock};
 pub use recipe_io::clock::{MAX_FACTOR, MIN_FACTOR, Pace};
 use recipe_io::exchange::{PortEvent, PortTx};
 use recipe_io::log_limit::LogLimit;
-use recipe_io::port::Port;
+use recipe_io::port::OpenPort;
 use recipe_io::realtime::{self, Scheduling};
 use recipe_io::timer::now;
-use stepping::Waiting;
+use stepping::WaitingClient;
 
 /// Options of a controller's run beside its file.
 #[derive(Debug, Clone, Default)]
@@ -62,7 +62,7 @@ pub struct ControllerOptions {
 ///
 /// # Errors
 /// The reason why it could not start; nothing is left behind then.
-pub fn run(config: SimConfig, options: ControllerOptions) -> Result<(), StartError> {
+pub fn run(config: SimConfig, options: ControllerOptions) -> Result<(), RunError> {
     let run = options.run.clone();
     let bound = run.console.as_ref().map(ConsoleOptions::bind).transpose()?;
     let handle = spawn(config, options)?;
@@ -77,7 +77,7 @@ pub fn run(config: SimConfig, options: ControllerOptions) -> Result<(), StartErr
 ///
 /// # Errors
 /// The reason why it could not start; nothing is left behind then.
-pub fn start(config: SimConfig, binds: Vec<Bind>) -> Result<Handle, StartError> {
+pub fn start(config: SimConfig, binds: Vec<Bind>) -> Result<Handle, RunError> {
     start_with(
         config,
         ControllerOptions { run: RunOptions { binds, ..RunOptions::default() }, ..Default::default() },
@@ -88,18 +88,18 @@ pub fn start(config: SimConfig, binds: Vec<Bind>) -> Result<Handle, StartError> 
 ///
 /// # Errors
 /// The reason why it could not start; nothing is left behind then.
-pub fn start_with(config: SimConfig, options: ControllerOptions) -> Result<Handle, StartError> {
+pub fn start_with(config: SimConfig, options: ControllerOptions) -> Result<Handle, RunError> {
     spawn(config, options)
 }
 
-fn spawn(config: SimConfig, options: ControllerOptions) -> Result<Handle, StartError> {
+fn spawn(config: SimConfig, options: ControllerOptions) -> Result<Handle, RunError> {
     host::start(&RuntimePlace::alone(), "controller", async move |_| {
         let scheduling = match options.pace {
             // It would look for input with priority over the clients that it waits for.
             Pace::Stepped => Scheduling::Ordinary,
             Pace::Real | Pace::Factor(_) => options.run.scheduling,
         };
-        let running = Running::open(config, options).await?;
+        let running = RunningController::open(config, options).await?;
         // Not as an argument of the log, which is not evaluated unless it is printed.
         let scheduling = realtime::apply(scheduling);
         info!(%scheduling, "the simulated controller is running");
@@ -108,13 +108,13 @@ fn spawn(config: SimConfig, options: ControllerOptions) -> Result<Handle, StartE
 }
 
 /// A controller whose tasks have been created.
-struct Running {
+struct RunningController {
     runtime: Rc<ControllerRuntime>,
     tasks: JoinSet<()>,
     ready: Value,
 }
 
-impl Runtime for Running {
+impl Runtime for RunningController {
     fn ready(&self) -> Value {
         self.ready.clone()
     }
@@ -124,7 +124,7 @@ impl Runtime for Running {
         move || runtime.stats()
     }
 
-    async fn run(mut self) -> Result<(), StartError> {
+    async fn run(mut self) -> Result<(), RunError> {
         loop {
             tokio::select! {
                 () = self.runtime.ended.notified() => {
@@ -132,7 +132,7 @@ impl Runtime for Running {
                     return Ok(());
                 }
                 Some(task) = self.tasks.join_next() => task.map_err(|error| {
-                    StartError::new(format!("a task of the simulated controller ended: {error}"))
+                    RunError::new(format!("a task of the simulated controller ended: {error}"))
                 })?,
             }
         }
@@ -142,13 +142,13 @@ impl Runtime for Running {
 /// The controller, with its sockets and devices.
 struct ControllerRuntime {
     controller: RefCell<Controller>,
-    connections: RefCell<BTreeMap<ConnId, Client>>,
+    connections: RefCell<BTreeMap<ConnId, ServerClient>>,
     next_connection: Cell<u64>,
     udp: UdpSocket,
     ports: Vec<Outward>,
     port_names: Vec<String>,
     /// Results of outputs, reported to the controller after the outputs before them.
-    reports: RefCell<VecDeque<Report>>,
+    reports: RefCell<VecDeque<TaskReport>>,
     /// Closed connections that are still sending.
     lingering: RefCell<VecDeque<Rc<Connection>>>,
     busy: Cell<bool>,
@@ -156,7 +156,7 @@ struct ControllerRuntime {
     clock: Clock,
     timer: Alarm,
     /// Clients that wait for an instant or a condition.
-    waits: RefCell<Vec<Waiting>>,
+    waits: RefCell<Vec<WaitingClient>>,
     /// Signalled when a wait begins.
     moved: Notify,
     /// The ports that are CAN interfaces of the kernel.
@@ -180,7 +180,7 @@ struct ControllerRuntime {
     log_limit: LogLimit,
 }
 
-struct Client {
+struct ServerClient {
     link: Link,
     connection: Rc<Connection>,
     /// Whether it gets state packets: a client of port 2001 that the controller has accepted.
@@ -201,7 +201,7 @@ enum Outward {
 }
 
 #[derive(Debug, Clone, Copy)]
-enum Report {
+enum TaskReport {
     PortSent(usize),
     Unreachable(SocketAddr),
     Dropped(Link, ConnId),
@@ -224,7 +224,7 @@ struct RuntimeCounters {
 
 impl ControllerRuntime {
     /// Runs a port's device and reports its events to the controller.
-    async fn drive(self: Rc<Self>, port: usize, device: Port) {
+    async fn drive(self: Rc<Self>, port: usize, device: OpenPort) {
         let is_kernel_can = device.is_kernel_can();
         let ended = device.run(|event| {
             if is_kernel_can && !matches!(event, PortEvent::Frame { .. }) {
@@ -289,9 +289,9 @@ impl ControllerRuntime {
             if let ControllerOutput::Sleep { until } = output {
                 let Some(report) = self.reports.borrow_mut().pop_front() else { break until };
                 let input = match report {
-                    Report::PortSent(port) => ControllerInput::PortSent { port },
-                    Report::Unreachable(peer) => ControllerInput::Udp2011Unreachable { peer },
-                    Report::Dropped(link, conn) => closed(link, conn),
+                    TaskReport::PortSent(port) => ControllerInput::PortSent { port },
+                    TaskReport::Unreachable(peer) => ControllerInput::Udp2011Unreachable { peer },
+                    TaskReport::Dropped(link, conn) => closed(link, conn),
                 };
                 self.controller.borrow_mut().handle(now, input);
             } else {
@@ -383,14 +383,14 @@ impl ControllerRuntime {
         }
     }
 
-    fn give_up(&self, connections: &mut BTreeMap<ConnId, Client>, conn: ConnId) {
+    fn give_up(&self, connections: &mut BTreeMap<ConnId, ServerClient>, conn: ConnId) {
         if let Some(client) = connections.remove(&conn) {
             client.connection.abort();
             if let Some(more) = self.log_limit.allow(now()) {
                 warn!(link = ?client.link, conn = conn.0, more, "disconnected: does not read what is sent");
             }
             self.count(|counters| counters.slow_clients += 1);
-            self.reports.borrow_mut().push_back(Report::Dropped(client.link, conn));
+            self.reports.borrow_mut().push_back(TaskReport::Dropped(client.link, conn));
         }
     }
 

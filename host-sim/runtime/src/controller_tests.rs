@@ -63,7 +63,7 @@ fn is_closed(stream: &mut StdStream) -> bool {
 fn inside(config: SimConfig, test: impl AsyncFnOnce(&Rc<ControllerRuntime>, &Value)) {
     let executor = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
     LocalSet::new().block_on(&executor, async {
-        let running = Running::open(config, ControllerOptions::default()).await.unwrap();
+        let running = RunningController::open(config, ControllerOptions::default()).await.unwrap();
         let (runtime, ready) = (Rc::clone(&running.runtime), running.ready.clone());
         tokio::select! {
             ended = running.run() => panic!("{ended:?}"),

@@ -14,7 +14,7 @@ use std::thread::JoinHandle;
 use serde_json::Value;
 use tracing::warn;
 
-use super::StartError;
+use super::RunError;
 
 /// The path of an events file.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -27,13 +27,13 @@ impl EventsFile {
     ///
     /// # Errors
     /// If another kind of file is there.
-    pub fn at(path: PathBuf) -> Result<Self, StartError> {
+    pub fn at(path: PathBuf) -> Result<Self, RunError> {
         let file = Self { path };
         file.check()?;
         Ok(file)
     }
 
-    fn check(&self) -> Result<(), StartError> {
+    fn check(&self) -> Result<(), RunError> {
         if self.path.as_os_str() == "-" {
             return Err(self.refused("stdout is for `ready` and the counters; give the name of a file"));
         }
@@ -62,7 +62,7 @@ impl EventsFile {
     }
 
     /// Creates the file, or empties it, and starts to write.
-    pub(super) fn create(&self) -> Result<EventsWriter, StartError> {
+    pub(super) fn create(&self) -> Result<EventsWriter, RunError> {
         self.check()?;
         let mut file = File::create(&self.path).map_err(|error| self.refused(error))?;
         let (lines, inbox) = sync_channel::<String>(MAX_WAITING);
@@ -88,8 +88,8 @@ impl EventsFile {
         Ok(EventsWriter { lines: Some(lines), lost: Cell::new(0), thread: Some(thread) })
     }
 
-    fn refused(&self, why: impl std::fmt::Display) -> StartError {
-        StartError::new(format!("--events {}: {why}", self.path.display()))
+    fn refused(&self, why: impl std::fmt::Display) -> RunError {
+        RunError::new(format!("--events {}: {why}", self.path.display()))
     }
 }
 

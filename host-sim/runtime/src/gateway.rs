@@ -29,16 +29,16 @@ use open::Devices;
 use super::host::{self, Handle, Runtime};
 use super::link::{self, LinkControl, LinkEndpoint, LinkEvent};
 use super::publisher::{Publisher, SnapshotWatch};
-use super::snapshot::{Engine, GatewaySnapshot, MAX_SAFE, SnapshotSlot};
+use super::snapshot::{GatewayEngine, GatewaySnapshot, MAX_SAFE, SnapshotSlot};
 use super::worker::RuntimePlace;
-use super::{RunOptions, StartError};
+use super::{RunError, RunOptions};
 use recipe_capture::{Decoder, Watch};
 use recipe_doctor::PortRecord;
 use recipe_io::bind::Bind;
 use recipe_io::exchange::{PortEvent, PortTx};
 use recipe_io::fairness;
 use recipe_io::handover::Handover;
-use recipe_io::port::Port;
+use recipe_io::port::OpenPort;
 use recipe_io::realtime::{self, Scheduling};
 use recipe_io::timer::{Timer, now};
 use shown::TraceText;
@@ -73,9 +73,9 @@ impl Observers {
 }
 
 /// A gateway with its ports and links, before it runs.
-struct Gateway {
+struct PreparedGateway {
     core: Rc<Core>,
-    ports: Vec<(PortId, Port)>,
+    ports: Vec<(PortId, OpenPort)>,
     links: Vec<(LinkId, LinkKind, LinkEndpoint)>,
     ready: Value,
     slot: Option<Arc<SnapshotSlot>>,
@@ -98,7 +98,7 @@ enum TxPolicy {
 
 /// Shared by all tasks of the gateway.
 struct Core {
-    engine: RefCell<Box<Engine>>,
+    engine: RefCell<Box<GatewayEngine>>,
     tapping: RefCell<Tapping>,
     ports: BTreeMap<PortId, (String, Rc<PortTx>)>,
     links: BTreeMap<LinkId, Rc<LinkControl>>,
@@ -118,8 +118,8 @@ struct Core {
     records: RefCell<Vec<PortRecord>>,
 }
 
-impl Gateway {
-    async fn drive(self) -> Result<(), StartError> {
+impl PreparedGateway {
+    async fn drive(self) -> Result<(), RunError> {
         let Self { core: shared, ports, links, slot, publisher_slot, doctor, .. } = self;
         let mut tasks = JoinSet::new();
         if let Some(slot) = slot {
@@ -139,7 +139,7 @@ impl Gateway {
             tasks.spawn_local(async move {
                 let name = core.ports.get(&id).map_or("", |(name, _)| name).to_owned();
                 let result = port.run(|event| core.port_event(id, event)).await;
-                result.map_err(|error| StartError::new(format!("port {name}: {error}")))
+                result.map_err(|error| RunError::new(format!("port {name}: {error}")))
             });
         }
         for (id, kind, endpoint) in links {
@@ -164,14 +164,14 @@ impl Gateway {
         while let Some(ended) = tasks.join_next().await {
             match ended {
                 Ok(done) => done?,
-                Err(error) => return Err(StartError::new(format!("a task ended: {error}"))),
+                Err(error) => return Err(RunError::new(format!("a task ended: {error}"))),
             }
         }
         Ok(())
     }
 }
 
-impl Runtime for Gateway {
+impl Runtime for PreparedGateway {
     fn ready(&self) -> Value {
         self.ready.clone()
     }
@@ -181,15 +181,15 @@ impl Runtime for Gateway {
         move || core.stats()
     }
 
-    async fn run(self) -> Result<(), StartError> {
+    async fn run(self) -> Result<(), RunError> {
         self.drive().await
     }
 }
 
 impl Core {
     /// Calls the engine at its deadlines.
-    async fn keep_time(&self) -> Result<(), StartError> {
-        let clock = |error| StartError::new(format!("timerfd: {error}"));
+    async fn keep_time(&self) -> Result<(), RunError> {
+        let clock = |error| RunError::new(format!("timerfd: {error}"));
         let timer = Timer::new().map_err(clock)?;
         self.input(Input::Tick);
         loop {
@@ -224,7 +224,7 @@ impl Core {
     }
 
     /// Fills a snapshot slot on request, and sends the safe values when the gateway is to end.
-    async fn show(&self, slot: &SnapshotSlot) -> Result<(), StartError> {
+    async fn show(&self, slot: &SnapshotSlot) -> Result<(), RunError> {
         loop {
             tokio::select! {
                 () = slot.wanted.notified() => slot.fill(|snapshot| self.copy_to(snapshot, now())),
@@ -455,7 +455,7 @@ fn lift(outer: &mut Value, key: &str) {
 ///
 /// # Errors
 /// The reason why it could not start; nothing is left behind then.
-pub fn run(config: GatewayConfig, options: RunOptions) -> Result<(), StartError> {
+pub fn run(config: GatewayConfig, options: RunOptions) -> Result<(), RunError> {
     let publisher = options.sparkplug.clone().map(Publisher::start).transpose()?;
     let snapshot_watch = publisher.as_ref().map(Publisher::snapshot_watch);
     let observers = Observers { snapshot_watch, ..Observers::of(&options) };
@@ -468,7 +468,7 @@ pub fn run(config: GatewayConfig, options: RunOptions) -> Result<(), StartError>
 ///
 /// # Errors
 /// The reason why it could not start; nothing is left behind then.
-pub fn start(config: GatewayConfig, binds: Vec<Bind>) -> Result<Handle, StartError> {
+pub fn start(config: GatewayConfig, binds: Vec<Bind>) -> Result<Handle, RunError> {
     start_watched(config, binds, &Watch::new())
 }
 
@@ -476,7 +476,7 @@ pub fn start(config: GatewayConfig, binds: Vec<Bind>) -> Result<Handle, StartErr
 ///
 /// # Errors
 /// The reason why it could not start; nothing is left behind then.
-pub fn start_watched(config: GatewayConfig, binds: Vec<Bind>, watch: &Watch) -> Result<Handle, StartError> {
+pub fn start_watched(config: GatewayConfig, binds: Vec<Bind>, watch: &Watch) -> Result<Handle, RunError> {
     let observers = Observers { watch: watch.clone(), ..Observers::default() };
     spawn(config, binds, Scheduling::Ordinary, observers, Handover::default(), &RuntimePlace::alone())
 }
@@ -489,7 +489,7 @@ pub(crate) fn spawn(
     observers: Observers,
     handover: Handover,
     place: &RuntimePlace,
-) -> Result<Handle, StartError> {
+) -> Result<Handle, RunError> {
     let watch = observers.watch.clone();
     let (doctor, texts) = match observers.readers {
         true => {
@@ -501,7 +501,7 @@ pub(crate) fn spawn(
     let publisher_slot = observers.snapshot_watch.as_ref().map(|watch| watch.open(&config));
     let handle = host::start(place, "gateway", async move |at_end| {
         let devices = Devices { binds: &binds, handover: Some((handover, at_end)) };
-        let mut gateway = Gateway::open(&config, devices, TxPolicy::All, &observers).await?;
+        let mut gateway = PreparedGateway::open(&config, devices, TxPolicy::All, &observers).await?;
         gateway.slot = observers.slot;
         gateway.publisher_slot = publisher_slot;
         if doctor.is_some() || gateway.slot.is_some() {

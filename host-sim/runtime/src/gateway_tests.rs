@@ -67,9 +67,10 @@ impl Cell {
         let binds = binds.map(|bind| bind.parse().unwrap());
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         LocalSet::new().block_on(&runtime, async {
-            let gateway = Gateway::open(&config, Devices::own(&binds), TxPolicy::All, &Observers::default())
-                .await
-                .unwrap();
+            let gateway =
+                PreparedGateway::open(&config, Devices::own(&binds), TxPolicy::All, &Observers::default())
+                    .await
+                    .unwrap();
             let cell = Self { core: Rc::clone(&gateway.core), places: gateway.ready["ports"].clone() };
             let running = spawn_local(gateway.drive());
             let limit = StdDuration::from_secs(60);
@@ -308,7 +309,7 @@ fn reported_late(pieces: &[&[u8]]) -> PortCounters {
         ["line=tcp-listen:127.0.0.1:0", "can=slcan-tcp:127.0.0.1:0"].map(|bind| bind.parse().unwrap());
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
     LocalSet::new().block_on(&runtime, async move {
-        let core = Gateway::open(&config, Devices::own(&binds), TxPolicy::All, &Observers::default())
+        let core = PreparedGateway::open(&config, Devices::own(&binds), TxPolicy::All, &Observers::default())
             .await
             .unwrap()
             .core;

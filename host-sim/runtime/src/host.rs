@@ -16,7 +16,7 @@ use tokio::task::{LocalSet, spawn_local};
 use tracing::warn;
 
 use super::service::Service;
-use super::{RunOptions, Signals, StartError};
+use super::{RunError, RunOptions, Signals};
 use crate::client::{RuntimeClient, RuntimeRequest};
 use crate::findings::FindingTexts;
 use crate::out::print_stderr;
@@ -31,7 +31,7 @@ pub(super) trait Runtime: 'static {
     /// A function that returns one line of statistics while the runtime runs.
     fn stats(&self) -> impl Fn() -> Value + 'static;
     /// Runs in a context that allows `spawn_local`; returns only on permanent failure or after a shutdown command.
-    fn run(self) -> impl Future<Output = Result<(), StartError>>;
+    fn run(self) -> impl Future<Output = Result<(), RunError>>;
 }
 
 /// A runtime that runs on a thread of its own or a shared one. Dropping it ends the runtime and waits until its sockets
@@ -49,7 +49,7 @@ pub struct Handle {
 #[derive(Debug)]
 enum Home {
     /// On its own thread.
-    Alone(JoinHandle<Result<(), StartError>>),
+    Alone(JoinHandle<Result<(), RunError>>),
     /// On a shared worker.
     Among(SharedRuntime),
 }
@@ -65,7 +65,7 @@ pub(crate) trait ForegroundRun {
     /// Whether it has ended by itself.
     fn has_ended(&self) -> bool;
     /// Ends it and waits until it has ended. If it had ended by itself, returns the reason as the error.
-    fn shutdown(self: Box<Self>) -> Result<(), StartError>;
+    fn shutdown(self: Box<Self>) -> Result<(), RunError>;
 }
 
 /// Actions of a runtime's thread after its tasks were dropped. Clones share the list.
@@ -89,8 +89,8 @@ impl AtEnd {
 pub(super) fn start<S: Runtime>(
     place: &RuntimePlace,
     name: &str,
-    open: impl AsyncFnOnce(&AtEnd) -> Result<S, StartError> + Send + 'static,
-) -> Result<Handle, StartError> {
+    open: impl AsyncFnOnce(&AtEnd) -> Result<S, RunError> + Send + 'static,
+) -> Result<Handle, RunError> {
     let (requests, inbox) = mpsc::unbounded_channel();
     let (opened, outcome) = blocking::channel();
     let open = Box::new(open);
@@ -115,14 +115,11 @@ pub(super) fn start<S: Runtime>(
             Err(error)
         }
         // The thread ended without a result; its own return value has the reason.
-        Err(_) => Err(home.ended().err().unwrap_or_else(|| StartError::new(format!("{name} ended")))),
+        Err(_) => Err(home.ended().err().unwrap_or_else(|| RunError::new(format!("{name} ended")))),
     }
 }
 
-fn alone<S: Runtime>(
-    name: &str,
-    opening: Opening<S>,
-) -> Result<JoinHandle<Result<(), StartError>>, StartError> {
+fn alone<S: Runtime>(name: &str, opening: Opening<S>) -> Result<JoinHandle<Result<(), RunError>>, RunError> {
     let thread = std::thread::Builder::new().name(name.to_owned()).stack_size(STACK).spawn(move || {
         let runtime =
             tokio::runtime::Builder::new_current_thread().enable_all().build_local(Default::default());
@@ -134,20 +131,20 @@ fn alone<S: Runtime>(
         at_end.run();
         ended
     });
-    thread.map_err(|error| StartError::new(format!("cannot start a thread: {error}")))
+    thread.map_err(|error| RunError::new(format!("cannot start a thread: {error}")))
 }
 
 /// A runtime to be opened.
 struct Opening<S> {
     open: Open<S>,
-    opened: blocking::Sender<Result<Value, StartError>>,
+    opened: blocking::Sender<Result<Value, RunError>>,
     inbox: mpsc::UnboundedReceiver<RuntimeRequest>,
 }
 
 /// Opens a runtime. Function and future are boxed: their large stack frame, with an engine and a configuration, would
 /// otherwise be touched on each wake of the runtime.
 type Open<S> =
-    Box<dyn for<'a> FnOnce(&'a AtEnd) -> Pin<Box<dyn Future<Output = Result<S, StartError>> + 'a>> + Send>;
+    Box<dyn for<'a> FnOnce(&'a AtEnd) -> Pin<Box<dyn Future<Output = Result<S, RunError>> + 'a>> + Send>;
 
 impl<S: Runtime> Opening<S> {
     /// As [`Self::run`], but as a task: the main future would be polled on each wake of any task.
@@ -155,12 +152,12 @@ impl<S: Runtime> Opening<S> {
         self,
         at_end: &AtEnd,
         begin: impl Future<Output = ()> + 'static,
-    ) -> Result<(), StartError> {
+    ) -> Result<(), RunError> {
         spawn_local(self.run(at_end.clone(), begin)).await.unwrap_or_else(|_| Err(panicked()))
     }
 
     /// Opens the runtime, and runs it once `begin` is ready.
-    async fn run(self, at_end: AtEnd, begin: impl Future<Output = ()>) -> Result<(), StartError> {
+    async fn run(self, at_end: AtEnd, begin: impl Future<Output = ()>) -> Result<(), RunError> {
         let Self { open, opened, inbox } = self;
         let runtime = match open(&at_end).await {
             Ok(runtime) => runtime,
@@ -173,7 +170,7 @@ impl<S: Runtime> Opening<S> {
         let _ = opened.send(Ok(runtime.ready()));
         let run = async {
             begin.await;
-            runtime.run().await.map_err(StartError::after_start)
+            runtime.run().await.map_err(RunError::after_start)
         };
         tokio::select! {
             ended = run => ended,
@@ -245,11 +242,11 @@ impl Handle {
     ///
     /// # Errors
     /// If it had ended by itself, the reason.
-    pub fn shutdown(mut self) -> Result<(), StartError> {
+    pub fn shutdown(mut self) -> Result<(), RunError> {
         self.end()
     }
 
-    fn end(&mut self) -> Result<(), StartError> {
+    fn end(&mut self) -> Result<(), RunError> {
         let _ = self.requests.send(RuntimeRequest::Shutdown);
         self.home.take().map_or(Ok(()), Home::ended)
     }
@@ -272,7 +269,7 @@ impl ForegroundRun for Handle {
         self.has_ended()
     }
 
-    fn shutdown(self: Box<Self>) -> Result<(), StartError> {
+    fn shutdown(self: Box<Self>) -> Result<(), RunError> {
         Self::shutdown(*self)
     }
 }
@@ -292,7 +289,7 @@ impl Home {
     }
 
     /// Waits until it has ended.
-    fn ended(self) -> Result<(), StartError> {
+    fn ended(self) -> Result<(), RunError> {
         match self {
             Self::Alone(thread) => thread.join().unwrap_or_else(|_| Err(panicked())),
             Self::Among(shared) => shared.ended(),
@@ -301,13 +298,13 @@ impl Home {
 }
 
 /// Prints `ready` and statistics, and ends on a signal.
-pub(super) fn foreground(handle: Box<dyn ForegroundRun>, options: &RunOptions) -> Result<(), StartError> {
+pub(super) fn foreground(handle: Box<dyn ForegroundRun>, options: &RunOptions) -> Result<(), RunError> {
     let runtime = runtime()?;
     let mut stdout = Stdout::start()
-        .map_err(|error| StartError::new(format!("cannot start the thread for statistics: {error}")))?;
+        .map_err(|error| RunError::new(format!("cannot start the thread for statistics: {error}")))?;
     let result = runtime.block_on(async {
         // Signals are handled before `ready` is printed.
-        let refused = |error: std::io::Error| StartError::new(format!("signals: {error}"));
+        let refused = |error: std::io::Error| RunError::new(format!("signals: {error}"));
         let mut signals = Signals::catch().map_err(refused)?;
         let ready = options.ready.as_ref().map(|file| file.write(handle.ready())).transpose()?;
         let line = format!("ready {}", handle.ready());
@@ -340,7 +337,7 @@ pub(super) fn foreground(handle: Box<dyn ForegroundRun>, options: &RunOptions) -
                         // Nothing else is printed to stdout.
                         StdoutFailure::Closed => {}
                         StdoutFailure::NotReady(error) => {
-                            break Err(StartError::new(format!("stdout: {error}")).after_start());
+                            break Err(RunError::new(format!("stdout: {error}")).after_start());
                         }
                         StdoutFailure::Lost(error) => warn!(%error, "cannot write statistics to stdout"),
                     },

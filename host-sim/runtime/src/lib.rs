@@ -65,12 +65,12 @@ pub struct RunOptions {
 
 /// Why a run could not start or continue, as one message. Everything that was opened is closed.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct StartError {
+pub struct RunError {
     message: String,
     had_started: bool,
 }
 
-impl StartError {
+impl RunError {
     /// The run could not start.
     pub fn new(message: impl Into<String>) -> Self {
         Self { message: message.into(), had_started: false }
@@ -94,10 +94,10 @@ impl StartError {
     }
 }
 
-impl fmt::Display for StartError {
+impl fmt::Display for RunError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(&self.message)
     }
 }
 
-impl std::error::Error for StartError {}
+impl std::error::Error for RunError {}

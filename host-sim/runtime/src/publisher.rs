@@ -20,7 +20,7 @@ use recipe_sparkplug::value::Value;
 use tokio::sync::watch;
 use tracing::{info, warn};
 
-use crate::StartError;
+use crate::RunError;
 use crate::snapshot::{GatewaySnapshot, SnapshotSlot};
 
 /// The snapshot slot of the running gateway, for the publisher.
@@ -54,8 +54,8 @@ pub(crate) struct Publisher {
 
 impl Publisher {
     /// Starts the thread. It waits for a gateway.
-    pub(crate) fn start(publishing: PublisherConfig) -> Result<Self, StartError> {
-        let refused = |error: io::Error| StartError::new(format!("--sparkplug: {error}"));
+    pub(crate) fn start(publishing: PublisherConfig) -> Result<Self, RunError> {
+        let refused = |error: io::Error| RunError::new(format!("--sparkplug: {error}"));
         let seed = random().map_err(refused)?;
         let (snapshot_watch, running) = watch::channel(None);
         let (end, ended) = watch::channel(false);

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 
-use super::StartError;
+use super::RunError;
 use recipe_io::files::{Beside, Identity};
 
 /// The path of a ready file.
@@ -23,7 +23,7 @@ impl ReadyFile {
     ///
     /// # Errors
     /// If another kind of file is there, or it could not be written.
-    pub fn at(path: PathBuf) -> Result<Self, StartError> {
+    pub fn at(path: PathBuf) -> Result<Self, RunError> {
         let file = Self { path };
         if !file.is_free()? {
             fs::remove_file(&file.path).map_err(|error| file.refused(error))?;
@@ -36,7 +36,7 @@ impl ReadyFile {
     }
 
     /// Writes the file. Dropping the result removes it.
-    pub(super) fn write(&self, ready: &Value) -> Result<WrittenReadyFile, StartError> {
+    pub(super) fn write(&self, ready: &Value) -> Result<WrittenReadyFile, RunError> {
         let is_free = self.is_free()?;
         let text = format!("{ready}\n");
         let written = || -> io::Result<WrittenReadyFile> {
@@ -52,7 +52,7 @@ impl ReadyFile {
     }
 
     /// Whether the path is free; `false` for a ready file of an earlier run, an error for anything else.
-    fn is_free(&self) -> Result<bool, StartError> {
+    fn is_free(&self) -> Result<bool, RunError> {
         let refused = |message: &str| Err(self.refused(message));
         if self.path.file_name().is_none() || self.path.as_os_str().as_encoded_bytes().ends_with(b"/") {
             return refused(FOLDER);
@@ -76,8 +76,8 @@ impl ReadyFile {
         }
     }
 
-    fn refused(&self, why: impl std::fmt::Display) -> StartError {
-        StartError::new(format!("--ready {}: {why}", self.path.display()))
+    fn refused(&self, why: impl std::fmt::Display) -> RunError {
+        RunError::new(format!("--ready {}: {why}", self.path.display()))
     }
 }
 

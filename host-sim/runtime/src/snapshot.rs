@@ -16,7 +16,7 @@ use recipe_io::exchange::DeviceCounters;
 use tokio::sync::Notify;
 
 /// The gateway's engine, with a tap.
-pub(crate) type Engine = proto_core::engine::Engine<8, 4, 512, TAP>;
+pub(crate) type GatewayEngine = proto_core::engine::Engine<8, 4, 512, TAP>;
 
 /// Bytes of the engine's tap. It is drained after each call, which fills less than this.
 pub(crate) const TAP: usize = 64 << 10;
@@ -36,7 +36,7 @@ pub(crate) struct SnapshotSlot {
 #[derive(Debug, Clone)]
 pub(crate) struct GatewaySnapshot {
     /// A copy of the engine, only for reading.
-    pub(crate) engine: Box<Engine>,
+    pub(crate) engine: Box<GatewayEngine>,
     pub(crate) at: Instant,
     /// Device counters by port number.
     pub(crate) devices: [Option<DeviceCounters>; MAX_PORTS],
@@ -53,7 +53,7 @@ impl GatewaySnapshot {
     /// A buffer for a copy of any engine.
     pub(crate) fn empty() -> Box<Self> {
         Box::new(Self {
-            engine: Box::new(Engine::idle()),
+            engine: Box::new(GatewayEngine::idle()),
             at: Instant::ZERO,
             devices: [None; MAX_PORTS],
             records: (0..MAX_PORTS).map(|_| PortRecord::new(PortId(0))).collect(),

@@ -22,14 +22,14 @@ pub(super) struct Connection {
     write: OwnedWriteHalf,
     out: RefCell<Vec<u8>>,
     blocked_since: Cell<Option<Instant>>,
-    end: Cell<End>,
+    end: Cell<ConnectionEnd>,
     /// Waker of the task in [`Connection::run`]. There is only one, so this is cheaper than a
     /// [`tokio::sync::Notify`].
     runner: RefCell<Option<Waker>>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum End {
+enum ConnectionEnd {
     /// Open.
     Open,
     /// Close when everything was sent.
@@ -43,7 +43,7 @@ enum End {
 pub(super) enum Accepted {
     /// The socket accepted all bytes.
     All,
-    /// Some wait; [`Event::Drained`] reports when they were sent.
+    /// Some wait; [`ConnectionEvent::Drained`] reports when they were sent.
     Later,
     /// The connection has failed, or too many bytes wait.
     Failed,
@@ -51,7 +51,7 @@ pub(super) enum Accepted {
 
 /// An event of a connection.
 #[derive(Debug)]
-pub(super) enum Event<'a> {
+pub(super) enum ConnectionEvent<'a> {
     /// Bytes arrived.
     Bytes(&'a [u8]),
     /// No bytes wait any more.
@@ -66,7 +66,7 @@ impl Connection {
             write,
             out: RefCell::default(),
             blocked_since: Cell::new(None),
-            end: Cell::new(End::Open),
+            end: Cell::new(ConnectionEnd::Open),
             runner: RefCell::default(),
         };
         (Rc::new(connection), read)
@@ -74,7 +74,7 @@ impl Connection {
 
     /// Sends bytes; at most [`MAX_UNSENT`] wait.
     pub(super) fn send(&self, bytes: &[u8]) -> Accepted {
-        if self.end.get() != End::Open {
+        if self.end.get() != ConnectionEnd::Open {
             return Accepted::Failed;
         }
         let mut out = self.out.borrow_mut();
@@ -111,15 +111,15 @@ impl Connection {
 
     /// Closes when everything was sent, but after [`LINGER`] at the latest.
     pub(super) fn close(&self) {
-        if self.end.get() == End::Open {
-            self.end.set(End::Flush);
+        if self.end.get() == ConnectionEnd::Open {
+            self.end.set(ConnectionEnd::Flush);
             self.wake();
         }
     }
 
     /// Closes at once.
     pub(super) fn abort(&self) {
-        self.end.set(End::Abort);
+        self.end.set(ConnectionEnd::Abort);
         self.wake();
     }
 
@@ -130,7 +130,7 @@ impl Connection {
 
     /// Whether it was closed by this side.
     pub(super) fn is_closed(&self) -> bool {
-        self.end.get() != End::Open
+        self.end.get() != ConnectionEnd::Open
     }
 
     /// Reads and sends until either side closes. While bytes wait, nothing is read: a client that does not
@@ -138,14 +138,14 @@ impl Connection {
     pub(super) async fn run(
         &self,
         mut read: OwnedReadHalf,
-        mut event: impl FnMut(Event<'_>),
+        mut event: impl FnMut(ConnectionEvent<'_>),
     ) -> io::Result<()> {
         let mut buf = [0; CHUNK];
         loop {
             match self.end.get() {
-                End::Open => {}
-                End::Abort => return Ok(()),
-                End::Flush => return self.linger().await,
+                ConnectionEnd::Open => {}
+                ConnectionEnd::Abort => return Ok(()),
+                ConnectionEnd::Flush => return self.linger().await,
             }
             if self.out.borrow().is_empty() {
                 match poll_fn(|cx| self.poll_received(cx, &mut read, &mut buf)).await {
@@ -153,7 +153,7 @@ impl Connection {
                     Some(received) => match received? {
                         0 => return Ok(()),
                         count => {
-                            event(Event::Bytes(&buf[..count]));
+                            event(ConnectionEvent::Bytes(&buf[..count]));
                             if count == CHUNK {
                                 yield_fairly().await;
                             }
@@ -164,7 +164,7 @@ impl Connection {
                 poll_fn(|cx| self.poll_room(cx)).await?;
                 self.flush()?;
                 if self.out.borrow().is_empty() {
-                    event(Event::Drained);
+                    event(ConnectionEvent::Drained);
                 }
             }
         }

@@ -12,23 +12,23 @@ use tokio::sync::{mpsc, watch};
 use tokio::task::{LocalSet, spawn_local};
 use tracing::{Instrument, Span};
 
-use crate::StartError;
+use crate::RunError;
 
 /// Stack size: an engine is built by value, and unoptimised code has several copies of it on the stack.
 pub(super) const STACK: usize = 16 << 20;
 
 /// A thread or a runtime panicked.
-pub(super) fn panicked() -> StartError {
-    StartError::new("a thread panicked").after_start()
+pub(super) fn panicked() -> RunError {
+    RunError::new("a thread panicked").after_start()
 }
 
 /// The runtime of a thread.
-pub(super) fn runtime() -> Result<tokio::runtime::Runtime, StartError> {
+pub(super) fn runtime() -> Result<tokio::runtime::Runtime, RunError> {
     tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(no_runtime)
 }
 
-pub(super) fn no_runtime(error: io::Error) -> StartError {
-    StartError::new(format!("cannot start the runtime: {error}"))
+pub(super) fn no_runtime(error: io::Error) -> RunError {
+    RunError::new(format!("cannot start the runtime: {error}"))
 }
 
 /// Where a runtime runs.
@@ -99,7 +99,7 @@ pub(crate) struct Worker {
 
 impl Worker {
     /// Starts a thread.
-    pub(crate) fn start(name: &str) -> Result<Arc<Self>, StartError> {
+    pub(crate) fn start(name: &str) -> Result<Arc<Self>, RunError> {
         let (jobs, mut inbox) = mpsc::unbounded_channel::<Job>();
         // Built here, where an error can be returned.
         let runtime = runtime()?;
@@ -110,7 +110,7 @@ impl Worker {
                 }
             });
         });
-        let thread = thread.map_err(|error| StartError::new(format!("cannot start a thread: {error}")))?;
+        let thread = thread.map_err(|error| RunError::new(format!("cannot start a thread: {error}")))?;
         Ok(Arc::new(Self { jobs: Some(jobs), thread: Some(thread) }))
     }
 
@@ -119,9 +119,9 @@ impl Worker {
         self: Arc<Self>,
         span: Span,
         runtime: impl FnOnce() -> F + Send + 'static,
-    ) -> Result<SharedRuntime, StartError>
+    ) -> Result<SharedRuntime, RunError>
     where
-        F: Future<Output = Result<(), StartError>> + 'static,
+        F: Future<Output = Result<(), RunError>> + 'static,
     {
         let end = Arc::<RuntimeEnd>::default();
         let outcome = EndGuard(Arc::clone(&end));
@@ -166,7 +166,7 @@ impl SharedRuntime {
     }
 
     /// Waits for its end.
-    pub(super) fn ended(self) -> Result<(), StartError> {
+    pub(super) fn ended(self) -> Result<(), RunError> {
         let result = self.end.result();
         let mut result = self
             .end
@@ -180,16 +180,16 @@ impl SharedRuntime {
 /// The result of a runtime, once it has ended.
 #[derive(Debug, Default)]
 struct RuntimeEnd {
-    result: Mutex<Option<Result<(), StartError>>>,
+    result: Mutex<Option<Result<(), RunError>>>,
     ended: Condvar,
 }
 
 impl RuntimeEnd {
-    fn result(&self) -> MutexGuard<'_, Option<Result<(), StartError>>> {
+    fn result(&self) -> MutexGuard<'_, Option<Result<(), RunError>>> {
         self.result.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn set(&self, result: Result<(), StartError>) {
+    fn set(&self, result: Result<(), RunError>) {
         self.result().get_or_insert(result);
         self.ended.notify_all();
     }
@@ -199,7 +199,7 @@ impl RuntimeEnd {
 struct EndGuard(Arc<RuntimeEnd>);
 
 impl EndGuard {
-    fn is(self, result: Result<(), StartError>) {
+    fn is(self, result: Result<(), RunError>) {
         self.0.set(result);
     }
 }
@@ -232,7 +232,7 @@ mod tests {
             || json!("alive")
         }
 
-        async fn run(self) -> Result<(), StartError> {
+        async fn run(self) -> Result<(), RunError> {
             let _ = self.runs.send(());
             assert!(!self.panics, "as it was told to");
             std::future::pending().await
@@ -287,7 +287,7 @@ mod tests {
         let (_begins, begin) = Begin::channel();
         let place = RuntimePlace::among(worker, begin, Span::none());
         let refused =
-            host::start(&place, "told", async |_| Err::<TestRuntime, _>(StartError::new("no device")));
+            host::start(&place, "told", async |_| Err::<TestRuntime, _>(RunError::new("no device")));
         assert_eq!(refused.unwrap_err().to_string(), "no device");
     }
 }

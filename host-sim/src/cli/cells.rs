@@ -6,13 +6,13 @@ use std::path::PathBuf;
 use std::thread::available_parallelism;
 
 use super::check;
-use super::run::Run;
+use super::run::RunArgs;
 use recipe_capture::Watch;
 use recipe_io::bind::Bind;
 use recipe_runtime::cells::Cell;
 use recipe_runtime::console::{ConfigFile, ConsoleOptions};
 use recipe_runtime::log::Log;
-use recipe_runtime::{RunOptions, StartError};
+use recipe_runtime::{RunError, RunOptions};
 
 /// The number of threads: one for each processor, if it is not said.
 pub(super) fn threads(asked: Option<NonZeroUsize>) -> NonZeroUsize {
@@ -20,7 +20,11 @@ pub(super) fn threads(asked: Option<NonZeroUsize>) -> NonZeroUsize {
 }
 
 /// Reads the files, and gives each cell what is meant for it. Also returns the options of the whole run.
-pub(super) fn prepare(files: &[PathBuf], run: Run, log: Log) -> Result<(Vec<Cell>, RunOptions), StartError> {
+pub(super) fn prepare(
+    files: &[PathBuf],
+    run: RunArgs,
+    log: Log,
+) -> Result<(Vec<Cell>, RunOptions), RunError> {
     let overrides = run.overrides().to_vec();
     // Even if a file is wrong, a ready file of a killed run is removed.
     let options = run.options(log);
@@ -29,7 +33,7 @@ pub(super) fn prepare(files: &[PathBuf], run: Run, log: Log) -> Result<(Vec<Cell
     let mut read = Vec::with_capacity(files.len());
     for ((path, name), overrides) in files.iter().zip(&names.0).zip(overrides) {
         let config = check::load_gateway(path, &overrides)
-            .map_err(|error| StartError::new(format!("{name}: {error}")))?;
+            .map_err(|error| RunError::new(format!("{name}: {error}")))?;
         read.push((config, ConfigFile::read(path, overrides)?));
     }
     let options = options?;
@@ -52,15 +56,15 @@ pub(super) fn prepare(files: &[PathBuf], run: Run, log: Log) -> Result<(Vec<Cell
 struct CellNames(Vec<String>);
 
 impl CellNames {
-    fn of(files: &[PathBuf]) -> Result<Self, StartError> {
+    fn of(files: &[PathBuf]) -> Result<Self, RunError> {
         let mut names: Vec<String> = Vec::with_capacity(files.len());
         for path in files {
             let Some(name) = path.file_stem() else {
-                return Err(StartError::new(format!("-c {}: not the name of a file", path.display())));
+                return Err(RunError::new(format!("-c {}: not the name of a file", path.display())));
             };
             let name = name.to_string_lossy().into_owned();
             if names.contains(&name) {
-                return Err(StartError::new(format!(
+                return Err(RunError::new(format!(
                     "-c {}: another cell is called {name} too; a cell is called like its file, so give it another name",
                     path.display()
                 )));
@@ -71,18 +75,18 @@ impl CellNames {
     }
 
     /// The number of the cell that an option is for, and the option without the name.
-    fn split(&self, option: &str, text: &str) -> Result<(usize, String), StartError> {
+    fn split(&self, option: &str, text: &str) -> Result<(usize, String), RunError> {
         let key = text.split('=').next().unwrap_or(text);
         let Some((cell, _)) = key.split_once('/') else {
             let first = self.0.first().map_or("", |name| name);
-            return Err(StartError::new(format!(
+            return Err(RunError::new(format!(
                 "{option} {text}: for which cell? Write the cell before it, such as {first}/{text}; there are {}",
                 self.0.join(", ")
             )));
         };
         match self.0.iter().position(|name| name == cell) {
             Some(nth) => Ok((nth, text[cell.len() + 1..].to_owned())),
-            None => Err(StartError::new(format!(
+            None => Err(RunError::new(format!(
                 "{option} {text}: there is no cell {cell}; there are {}",
                 self.0.join(", ")
             ))),
@@ -92,8 +96,8 @@ impl CellNames {
     /// What each cell has of them.
     fn shares<T>(
         &self,
-        all: impl Iterator<Item = Result<(usize, T), StartError>>,
-    ) -> Result<Vec<Vec<T>>, StartError> {
+        all: impl Iterator<Item = Result<(usize, T), RunError>>,
+    ) -> Result<Vec<Vec<T>>, RunError> {
         let mut shares: Vec<Vec<T>> = self.0.iter().map(|_| Vec::new()).collect();
         for one in all {
             let (nth, one) = one?;
@@ -104,17 +108,17 @@ impl CellNames {
 }
 
 /// The console of a cell: the first one's is at the port that was asked for, the others' are at the next ones.
-fn console_of(console: &ConsoleOptions, nth: usize, name: &str) -> Result<ConsoleOptions, StartError> {
+fn console_of(console: &ConsoleOptions, nth: usize, name: &str) -> Result<ConsoleOptions, RunError> {
     let ConsoleOptions { address, state, .. } = console;
     if console.peer.is_some() {
-        return Err(StartError::new("--console-peer is for one cell; run a gateway of its own for it"));
+        return Err(RunError::new("--console-peer is for one cell; run a gateway of its own for it"));
     }
     let port = match address.port() {
         0 => Some(0),
         first => u16::try_from(nth).ok().and_then(|nth| first.checked_add(nth)),
     };
     let Some(port) = port else {
-        return Err(StartError::new(format!(
+        return Err(RunError::new(format!(
             "--console {address}: there are not as many ports behind it as cells"
         )));
     };

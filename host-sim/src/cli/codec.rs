@@ -19,7 +19,7 @@ use super::convert::device::DevicePart;
 pub(super) struct CompiledPart {
     pub(super) layout: Layout,
     /// One for a stream part, one per id for a CAN part.
-    pub(super) frames: Vec<FrameFields>,
+    pub(super) frames: Vec<FrameValues>,
     /// The recipe and the part of it, for a recipe as the controller has it.
     plain: Option<(String, Direction)>,
 }
@@ -37,7 +37,7 @@ pub(super) enum Layout {
 
 /// The fields of one frame.
 #[derive(Debug)]
-pub(super) struct FrameFields {
+pub(super) struct FrameValues {
     pub(super) id: Option<CanId>,
     pub(super) fields: Vec<NamedField>,
 }
@@ -135,7 +135,7 @@ impl CompiledPart {
     }
 
     fn of_device(device: DevicePart) -> Self {
-        let frames = device.ids().map(|id| FrameFields { id, fields: Vec::new() }).collect();
+        let frames = device.ids().map(|id| FrameValues { id, fields: Vec::new() }).collect();
         Self { layout: Layout::Device(Box::new(device)), frames, plain: None }
     }
 
@@ -171,14 +171,14 @@ impl CompiledPart {
                 } else {
                     Layout::Stream(Box::new(compile(Framing::Bytes).map_err(refused)?))
                 };
-                let frames = vec![FrameFields::new(None, &part.fields)];
+                let frames = vec![FrameValues::new(None, &part.fields)];
                 Ok(Self { layout, frames, plain: Some((recipe.name.clone(), direction)) })
             }
             SimParts::Can { input, output } => {
                 let frames = if direction == Direction::Input { input } else { output };
                 let entries = frames.iter().map(|frame| (frame.id, fields(&frame.fields)));
                 let layout = CanLayout::new(rules, entries).map_err(refused)?;
-                let frames = frames.iter().map(|frame| FrameFields::new(Some(frame.id), &frame.fields));
+                let frames = frames.iter().map(|frame| FrameValues::new(Some(frame.id), &frame.fields));
                 let plain = Some((recipe.name.clone(), direction));
                 Ok(Self { layout: Layout::Can(Box::new(layout)), frames: frames.collect(), plain })
             }
@@ -263,7 +263,7 @@ fn has_part(recipe: &SimRecipe, part: Direction) -> bool {
     }
 }
 
-impl FrameFields {
+impl FrameValues {
     fn new(id: Option<CanId>, fields: &[SimField]) -> Self {
         let named = |field: &SimField| NamedField {
             name: field.name.clone(),

@@ -12,7 +12,7 @@ use proto_core::recipe::{CanReject, Deframer, StreamLayout, datagram};
 use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::Scalar;
 
-use super::codec::{CompiledPart, FrameFields, Layout, NamedField};
+use super::codec::{CompiledPart, FrameValues, Layout, NamedField};
 use super::scale;
 use super::text::{self, CanLine, Prefix};
 
@@ -131,7 +131,7 @@ fn find_frame(part: &CompiledPart, wanted: Option<Wanted>) -> Result<usize, Stri
 }
 
 /// Parses values in field order or as `NAME=VALUE`; a field's unit may follow its value.
-fn scalars(frame: &FrameFields, tokens: &[String]) -> Result<Vec<Scalar>, String> {
+fn scalars(frame: &FrameValues, tokens: &[String]) -> Result<Vec<Scalar>, String> {
     let mut values: Vec<Option<Scalar>> = vec![None; frame.fields.len()];
     let mut newest: Option<&NamedField> = None;
     for token in tokens {
@@ -312,7 +312,7 @@ fn show_can(
 
 /// Says if a gateway rejects the frame for a value that does not fit its variable.
 fn note_refused(
-    frame: &FrameFields,
+    frame: &FrameValues,
     values: impl Iterator<Item = Scalar>,
     line: usize,
     notes: &mut dyn Write,
@@ -324,7 +324,7 @@ fn note_refused(
     }
 }
 
-fn show_values(frame: &FrameFields, values: impl Iterator<Item = Scalar>) -> String {
+fn show_values(frame: &FrameValues, values: impl Iterator<Item = Scalar>) -> String {
     let shown = frame.fields.iter().zip(values).map(|(field, value)| {
         let unit = if field.unit.is_empty() { String::new() } else { format!(" {}", field.unit) };
         format!("{}={}{unit}", field.name, text::show_scalar(value))

@@ -69,7 +69,7 @@ pub(super) fn run(args: CtlArgs) -> ExitCode {
 
 impl CtlArgs {
     fn run(&self, out: &mut dyn Write) -> Result<Verdict, Failure> {
-        let run = Run { json: self.json, view: view(), timeout: self.timeout };
+        let run = RequestOptions { json: self.json, view: view(), timeout: self.timeout };
         // Mistakes in files and arguments come before those of the connection.
         let work = match self.act.prepare(self.inventory.is_some())? {
             CtlWork::Alone(alone) => return alone(run, out),
@@ -158,7 +158,7 @@ enum Whom {
 
 /// How a command prints, and how long a request may take.
 #[derive(Debug, Clone, Copy)]
-struct Run {
+struct RequestOptions {
     json: bool,
     view: TableView,
     timeout: Duration,

@@ -8,7 +8,7 @@ use recipe_capture::pcapng::Scope;
 use recipe_capture::recording::{MIN_FILE, RecordOptions, Recording};
 use recipe_capture::{CaptureFile, Decoder, Target, Watch};
 use recipe_export::Model;
-use recipe_runtime::StartError;
+use recipe_runtime::RunError;
 
 /// Arguments of captures and recordings.
 #[derive(Debug, Args)]
@@ -54,34 +54,34 @@ impl WatchArgs {
     }
 
     /// What the frames of a file are called, if somebody asks.
-    pub(super) fn decoder(&self, file: &Path, overrides: &[String]) -> Result<Arc<Decoder>, StartError> {
+    pub(super) fn decoder(&self, file: &Path, overrides: &[String]) -> Result<Arc<Decoder>, RunError> {
         if self.record.is_none() {
             return Ok(Arc::default());
         }
-        let model = Model::load(file, overrides).map_err(|error| StartError::new(error.to_string()))?;
+        let model = Model::load(file, overrides).map_err(|error| RunError::new(error.to_string()))?;
         Ok(Arc::new(Decoder::new(&model)))
     }
 
     /// Begins what was asked for.
-    pub(super) fn start(&self, watch: &Watch) -> Result<Watching, StartError> {
+    pub(super) fn start(&self, watch: &Watch) -> Result<Watching, RunError> {
         let mut watching = Watching { watch: watch.clone(), capture: None, recording: None };
         if let Some(folder) = &self.record {
             let (budget, file_size) = (self.record_budget, self.record_file);
             if file_size < MIN_FILE || budget < 2 * file_size {
-                return Err(StartError::new(format!(
+                return Err(RunError::new(format!(
                     "--record-file {file_size} and --record-budget {budget}: a file has {MIN_FILE} bytes at least, \
                      and the budget is twice that of a file at least"
                 )));
             }
             let options = RecordOptions { folder: folder.clone(), budget, file: file_size };
             let recording = Recording::start(watch, options);
-            let refused = |error| StartError::new(format!("--record {}: {error}", folder.display()));
+            let refused = |error| RunError::new(format!("--record {}: {error}", folder.display()));
             watching.recording = Some(recording.map_err(refused)?);
         }
         if let Some(path) = &self.capture {
             let target = if self.takes_stdout() { Target::Stdout } else { Target::Path(path.clone()) };
             let scope = Scope { port: None, links: self.capture_links };
-            let refused = |error| StartError::new(format!("--capture {}: {error}", path.display()));
+            let refused = |error| RunError::new(format!("--capture {}: {error}", path.display()));
             watching.capture = Some(CaptureFile::start(watch, scope, target).map_err(refused)?);
         }
         Ok(watching)

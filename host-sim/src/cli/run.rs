@@ -17,11 +17,11 @@ use recipe_runtime::console::{self, ConfigFile, ConsoleOptions};
 use recipe_runtime::controller::{ControllerOptions, MAX_FACTOR, MIN_FACTOR, Pace};
 use recipe_runtime::log::Log;
 use recipe_runtime::out::print_stderr;
-use recipe_runtime::{EventsFile, PublisherConfig, ReadyFile, RunOptions, Scheduling, StartError};
+use recipe_runtime::{EventsFile, PublisherConfig, ReadyFile, RunError, RunOptions, Scheduling};
 
 /// Arguments of `controller` and `gateway`.
 #[derive(Debug, Args)]
-pub(super) struct Run {
+pub(super) struct RunArgs {
     #[command(flatten)]
     overrides: Overrides,
     /// Bind a port to a device: pty:PATH, pty-paced:PATH, serial:/dev/ttyUSB0, tcp:HOST:PORT,
@@ -66,7 +66,7 @@ pub(super) struct GatewayRun {
     #[arg(long, value_name = "N")]
     threads: Option<NonZeroUsize>,
     #[command(flatten)]
-    run: Run,
+    run: RunArgs,
     #[command(flatten)]
     watch: WatchArgs,
     /// Tell a broker what this gateway knows: Sparkplug B over MQTT, by this file (docs/fleet.md). Nothing can be
@@ -82,7 +82,7 @@ pub(super) struct ControllerRun {
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
     #[command(flatten)]
-    run: Run,
+    run: RunArgs,
     /// How the controller's clock runs: real; factor=N, so many times as fast as the machine's, such as 20 or
     /// 0.5; stepped, only by `advance` and `wait` at the control socket
     #[arg(long, value_name = "real|stepped|factor=N", default_value = "real", value_parser = parse_pace)]
@@ -157,13 +157,13 @@ impl GatewayRun {
     }
 }
 
-impl Run {
+impl RunArgs {
     /// What overrides keys of the file.
     pub(super) fn overrides(&self) -> &[String] {
         &self.overrides.set
     }
 
-    pub(super) fn options(self, log: Log) -> Result<RunOptions, StartError> {
+    pub(super) fn options(self, log: Log) -> Result<RunOptions, RunError> {
         let ready = self.ready.map(ReadyFile::at).transpose()?;
         let scheduling = if self.no_realtime { Scheduling::Ordinary } else { Scheduling::FifoIfAllowed };
         let key = self.console_key.as_deref().map(console::read_key).transpose()?;
@@ -190,10 +190,10 @@ impl ControllerRun {
         }
     }
 
-    fn options(self, log: Log) -> Result<ControllerOptions, StartError> {
+    fn options(self, log: Log) -> Result<ControllerOptions, RunError> {
         let Self { run, time: pace, seed, events, .. } = self;
         if run.console_state.is_some() {
-            return Err(StartError::new("--console-state: a simulated controller keeps no revisions"));
+            return Err(RunError::new("--console-state: a simulated controller keeps no revisions"));
         }
         let events = events.map(EventsFile::at).transpose()?;
         Ok(ControllerOptions { run: run.options(log)?, pace, seed, events, timeline: None })
@@ -206,7 +206,7 @@ fn read_timeline(path: &Path, config: &SimConfig) -> Result<Timeline, String> {
     Timeline::parse(&name, &text, config).map_err(|error| error.to_string())
 }
 
-fn finished(result: Result<(), StartError>) -> ExitCode {
+fn finished(result: Result<(), RunError>) -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {

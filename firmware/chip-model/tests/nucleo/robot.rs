@@ -8,7 +8,7 @@ use proto_core::time::Instant;
 use recipe_chip_model::device::{MICRO, Picos};
 use recipe_chip_model::models::ethernet::Ethernet;
 use recipe_config::SimConfig;
-use recipe_controller::{ConnId, Controller, ControllerInput, ControllerOutput, Counters};
+use recipe_controller::{ConnId, Controller, ControllerCounters, ControllerInput, ControllerOutput};
 use smoltcp::iface::{Config, Interface, SocketHandle, SocketSet};
 use smoltcp::phy::{Device, DeviceCapabilities, Medium, RxToken, TxToken};
 use smoltcp::socket::{tcp, udp};
@@ -129,7 +129,7 @@ impl Robot {
         &self.controller
     }
 
-    pub(crate) fn counters(&self) -> Counters {
+    pub(crate) fn counters(&self) -> ControllerCounters {
         self.controller.counters()
     }
 

@@ -7,7 +7,7 @@ use proto_core::sysvar::{SysVar, VarBit};
 use super::commands::{self, FileCommands};
 use super::encoding::refuse;
 use super::names::meant_variable;
-use super::reader::{Item, Reader, Result, Spot};
+use super::reader::{Result, Spot, TableReader, TableValue};
 use super::sources;
 use crate::keys::field::COUNTER_TABLE;
 
@@ -67,11 +67,11 @@ pub(crate) const ON_STALES: [(&str, OnStale); 2] = [("hold", OnStale::Hold), ("s
 /// The words of `overflow`.
 pub(crate) const OVERFLOWS: [(&str, Overflow); 1] = [("wrap", Overflow::Wrap)];
 
-pub(super) fn read_on_stale(item: &Item<'_>) -> Result<OnStale> {
+pub(super) fn read_on_stale(item: &TableValue<'_>) -> Result<OnStale> {
     item.choice(&ON_STALES)
 }
 
-pub(super) fn read_sending(part: &Reader<'_>) -> Result<Sending> {
+pub(super) fn read_sending(part: &TableReader<'_>) -> Result<Sending> {
     let mut sending = Sending::default();
     if let Some(item) = part.optional("on_stale") {
         sending.on_stale = read_on_stale(&item)?;
@@ -83,7 +83,7 @@ pub(super) fn read_sending(part: &Reader<'_>) -> Result<Sending> {
     Ok(sending)
 }
 
-fn read_send(item: &Item<'_>) -> Result<SendOn> {
+fn read_send(item: &TableValue<'_>) -> Result<SendOn> {
     let text = item.string()?;
     match text {
         "period" => return Ok(SendOn::Period),
@@ -96,7 +96,7 @@ fn read_send(item: &Item<'_>) -> Result<SendOn> {
 }
 
 /// `rising:BitOutputReg[3].0`; `others` are allowed too.
-pub(super) fn read_rising(item: &Item<'_>, text: &str, others: &str) -> Result<(SysVar, u8)> {
+pub(super) fn read_rising(item: &TableValue<'_>, text: &str, others: &str) -> Result<(SysVar, u8)> {
     let Some(place) = text.strip_prefix("rising:") else {
         return Err(
             item.error(format!("{text:?} is unknown; allowed: {others}, \"rising:BitOutputReg[3].0\""))
@@ -114,7 +114,7 @@ pub(super) fn read_rising(item: &Item<'_>, text: &str, others: &str) -> Result<(
 }
 
 /// The bindings of an input field: `to`, `commands`, or both.
-pub(super) fn read_input(field: &Reader<'_>) -> Result<(FileInput, Option<FileInput>)> {
+pub(super) fn read_input(field: &TableReader<'_>) -> Result<(FileInput, Option<FileInput>)> {
     let (to, commands) = (field.optional("to"), field.optional("commands"));
     if to.is_none() {
         refuse(field, &["scale", "offset"], "allowed only together with to")?;
@@ -132,7 +132,7 @@ pub(super) fn read_input(field: &Reader<'_>) -> Result<(FileInput, Option<FileIn
 }
 
 /// A variable, or one bit of it.
-fn read_to(field: &Reader<'_>, to: &Item<'_>) -> Result<FileInput> {
+fn read_to(field: &TableReader<'_>, to: &TableValue<'_>) -> Result<FileInput> {
     let name = to.string()?;
     if let Some(bit) = VarBit::parse(name) {
         refuse(
@@ -150,7 +150,7 @@ fn read_to(field: &Reader<'_>, to: &Item<'_>) -> Result<FileInput> {
 }
 
 /// `counter = true` or `counter = { max = 14 }`: the number behind which the counter is 0 again.
-pub(super) fn read_counter(field: &Reader<'_>, encoding: &Encoding) -> Result<Option<u32>> {
+pub(super) fn read_counter(field: &TableReader<'_>, encoding: &Encoding) -> Result<Option<u32>> {
     let Some(item) = field.optional("counter") else { return Ok(None) };
     let (low, high) = encoding.range();
     if !encoding.is_integer() || low != 0.0 {
@@ -167,7 +167,7 @@ pub(super) fn read_counter(field: &Reader<'_>, encoding: &Encoding) -> Result<Op
     max.integer(1..=i64::from(high)).map(Some)
 }
 
-pub(super) fn read_output(field: &Reader<'_>) -> Result<FileOutput> {
+pub(super) fn read_output(field: &TableReader<'_>) -> Result<FileOutput> {
     let (from, value) = (field.optional("from"), field.optional("value"));
     let binding = match (from, value) {
         (None, None) => {
@@ -209,12 +209,12 @@ pub(super) fn read_output(field: &Reader<'_>) -> Result<FileOutput> {
     Ok(FileOutput::Bound(binding))
 }
 
-pub(super) fn read_var(item: &Item<'_>) -> Result<SysVar> {
+pub(super) fn read_var(item: &TableValue<'_>) -> Result<SysVar> {
     let name = item.string()?;
     SysVar::parse(name).map_err(|error| item.error(format!("{name:?}: {error}{}", meant_variable(name))))
 }
 
-fn read_scale(field: &Reader<'_>) -> Result<(f32, f32)> {
+fn read_scale(field: &TableReader<'_>) -> Result<(f32, f32)> {
     let read = |key, default| match field.optional(key) {
         Some(item) => {
             let value = item.number()? as f32;

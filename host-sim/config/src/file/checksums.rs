@@ -7,7 +7,7 @@ use proto_core::recipe::model::MAX_STREAM_FRAME;
 
 use super::encoding::refuse;
 use super::names::meant_checksum;
-use super::reader::{Item, Reader, Result};
+use super::reader::{Result, TableReader, TableValue};
 use super::recipes::{FileField, FileFieldKind};
 use crate::keys::device;
 
@@ -20,7 +20,7 @@ pub(crate) const CHECKSUM_FORMS: [(&str, bool); 2] = [("bytes", false), ("hex", 
 pub(crate) const DATA_ID_PLACES: [(&str, bool); 2] = [("start", false), ("end", true)];
 
 /// Reads the checksum of a frame and puts it at its place among the fields.
-pub(super) fn read_checksum(frame: &Reader<'_>, head: usize, fields: &mut Vec<FileField>) -> Result<()> {
+pub(super) fn read_checksum(frame: &TableReader<'_>, head: usize, fields: &mut Vec<FileField>) -> Result<()> {
     let Some(item) = frame.optional("checksum") else { return Ok(()) };
     if item.as_string().is_some() {
         return Err(item.error("expected a table, such as { kind = \"crc16-modbus\" }, found a string"));
@@ -44,7 +44,7 @@ pub(super) fn read_checksum(frame: &Reader<'_>, head: usize, fields: &mut Vec<Fi
 }
 
 /// `data_id = 0x1234`, low byte first, or a list of bytes.
-fn read_data_id(table: &Reader<'_>) -> Result<DataId> {
+fn read_data_id(table: &TableReader<'_>) -> Result<DataId> {
     let Some(item) = table.optional("data_id") else {
         refuse(table, &["data_id_at"], "allowed only together with data_id")?;
         return Ok(DataId::NONE);
@@ -70,7 +70,7 @@ fn read_data_id(table: &Reader<'_>) -> Result<DataId> {
 /// Data ids of profiles 2 and 22 of AUTOSAR's end-to-end protection: one for each number of the counter.
 const LIST_OF_IDS: usize = 16;
 
-fn read_algorithm(table: &Reader<'_>) -> Result<Algorithm> {
+fn read_algorithm(table: &TableReader<'_>) -> Result<Algorithm> {
     let kind = table.required("kind", "the algorithm, such as \"crc16-modbus\"")?;
     let name = kind.string()?;
     if name != "crc" {
@@ -101,7 +101,7 @@ fn read_algorithm(table: &Reader<'_>) -> Result<Algorithm> {
 }
 
 /// `"1.."` or `"1..7"`: the first byte and the last one.
-fn read_covered(item: &Item<'_>) -> Result<(u16, Option<u16>)> {
+fn read_covered(item: &TableValue<'_>) -> Result<(u16, Option<u16>)> {
     let text = item.string()?;
     let number = |text: &str| text.parse::<u16>().ok().filter(|&at| usize::from(at) < MAX_STREAM_FRAME);
     let range = text.split_once("..").and_then(|(first, last)| {
@@ -119,7 +119,7 @@ fn read_covered(item: &Item<'_>) -> Result<(u16, Option<u16>)> {
 }
 
 /// The number of fields before the byte that `item` names.
-fn find_place(item: &Item<'_>, head: usize, fields: &[FileField]) -> Result<usize> {
+fn find_place(item: &TableValue<'_>, head: usize, fields: &[FileField]) -> Result<usize> {
     let at: usize = item.integer(device::AT.integers())?;
     // Places between two fields; behind one of varying length no byte has a number.
     let mut places = Vec::new();

@@ -9,8 +9,8 @@ use proto_core::sysvar::Direction;
 
 use super::device::{bind, binding_keys, read_constant};
 use super::encoding::refuse;
-use super::reader::{Item, Reader, Result, Spot};
-use super::recipes::{FileField, FileFieldKind, Written};
+use super::reader::{Result, Spot, TableReader, TableValue};
+use super::recipes::{FileField, FileFieldKind, WrittenField};
 use crate::keys::field::{self, PAD_COILS};
 
 /// Coils, as they are read.
@@ -25,7 +25,7 @@ struct Packer {
 }
 
 /// The fields of a list, and the number of coils.
-pub(super) fn read(list: &Item<'_>, direction: Direction) -> Result<(Vec<FileField>, usize)> {
+pub(super) fn read(list: &TableValue<'_>, direction: Direction) -> Result<(Vec<FileField>, usize)> {
     let mut packer = Packer { fields: Vec::new(), count: 0, bytes: 0, padded: None };
     for item in list.array("of coils, such as [{ name = \"ready\", to = \"WordInputReg[1]\" }]")? {
         packer.read(&item.any_table()?, direction)?;
@@ -36,7 +36,7 @@ pub(super) fn read(list: &Item<'_>, direction: Direction) -> Result<(Vec<FileFie
 }
 
 impl Packer {
-    fn read(&mut self, table: &Reader<'_>, direction: Direction) -> Result<()> {
+    fn read(&mut self, table: &TableReader<'_>, direction: Direction) -> Result<()> {
         if let Some(pad) = table.optional("pad") {
             table.check_keys(&[field::COIL_PADDING], " in padding of coils, which are sent as 0")?;
             self.count += pad.integer::<usize>(PAD_COILS.integers())?;
@@ -59,7 +59,7 @@ impl Packer {
         match table.optional("equals") {
             Some(equals) => push(read_constant(table, &equals, encoding)?, None),
             None => {
-                let written = Written { encoding, overflow: Overflow::Usual };
+                let written = WrittenField { encoding, overflow: Overflow::Usual };
                 bind(table, direction, written, push)?;
             }
         }

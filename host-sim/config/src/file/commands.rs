@@ -5,7 +5,7 @@
 
 use proto_core::config::CommandWhen;
 
-use super::reader::{Item, Reader, Result, Spot};
+use super::reader::{Result, Spot, TableReader, TableValue};
 use crate::device::FieldCommands;
 use crate::keys::field::{IDLE, WHEN};
 
@@ -50,7 +50,7 @@ const BIT_KEYS: [(&str, BitKey); 3] =
     [("rising", BitKey::Rising), ("falling", BitKey::Falling), ("level", BitKey::Level)];
 
 /// Reads the commands of a field.
-pub(super) fn read(field: &Reader<'_>, commands: &Item<'_>) -> Result<FileCommands> {
+pub(super) fn read(field: &TableReader<'_>, commands: &TableValue<'_>) -> Result<FileCommands> {
     let table = commands.any_table()?;
     let keys: Vec<_> = table.entries().filter_map(|(key, ..)| bit_key(key)).collect();
     if keys.is_empty() {
@@ -59,7 +59,11 @@ pub(super) fn read(field: &Reader<'_>, commands: &Item<'_>) -> Result<FileComman
     read_bit(field, &table, &keys)
 }
 
-fn read_values(field: &Reader<'_>, commands: &Item<'_>, table: &Reader<'_>) -> Result<FileCommands> {
+fn read_values(
+    field: &TableReader<'_>,
+    commands: &TableValue<'_>,
+    table: &TableReader<'_>,
+) -> Result<FileCommands> {
     let mut entries = table.entries().map(read_command).collect::<Result<Vec<_>>>()?;
     if entries.is_empty() {
         return Err(commands.error("no commands; write for example { 1 = \"run(pick.jspf,50)\" }"));
@@ -79,7 +83,7 @@ fn read_values(field: &Reader<'_>, commands: &Item<'_>, table: &Reader<'_>) -> R
 }
 
 /// Commands for the edges or the level of one bit.
-fn read_bit(field: &Reader<'_>, table: &Reader<'_>, keys: &[BitKey]) -> Result<FileCommands> {
+fn read_bit(field: &TableReader<'_>, table: &TableReader<'_>, keys: &[BitKey]) -> Result<FileCommands> {
     let is_level = keys.contains(&BitKey::Level);
     let mut entries = Vec::new();
     for (key, key_spot, item) in table.entries() {
@@ -118,7 +122,7 @@ fn read_bit(field: &Reader<'_>, table: &Reader<'_>, keys: &[BitKey]) -> Result<F
 }
 
 /// `base`, if the field's base survives silence.
-fn keeps_base<'a>(field: &Reader<'a>) -> Result<Option<Item<'a>>> {
+fn keeps_base<'a>(field: &TableReader<'a>) -> Result<Option<TableValue<'a>>> {
     let Some(item) = field.optional("base") else { return Ok(None) };
     let keeps = item.choice(&BASES)?;
     Ok(keeps.then_some(item))
@@ -129,7 +133,7 @@ fn bit_key(key: &str) -> Option<BitKey> {
 }
 
 /// `bits = 3`, `bits = "3..3"`, or a coil, which has no type; what else is wrong with it, its own reader says.
-fn has_one_bit(field: &Reader<'_>) -> bool {
+fn has_one_bit(field: &TableReader<'_>) -> bool {
     let Some(item) = field.optional("bits") else { return field.optional("type").is_none() };
     match item.as_string() {
         None => true,
@@ -137,7 +141,7 @@ fn has_one_bit(field: &Reader<'_>) -> bool {
     }
 }
 
-fn read_command((key, key_spot, item): (&str, Spot, Item<'_>)) -> Result<FileCommand> {
+fn read_command((key, key_spot, item): (&str, Spot, TableValue<'_>)) -> Result<FileCommand> {
     let Some((first, last)) = read_range(key) else {
         return Err(item.at(key_spot).error(format!(
             "{key:?} is not an integer; the keys of commands are values of the field, such as 1, or ranges of them, \
@@ -163,7 +167,7 @@ fn read_value(text: &str) -> Option<i64> {
     .ok()
 }
 
-fn read_text(item: &Item<'_>) -> Result<String> {
+fn read_text(item: &TableValue<'_>) -> Result<String> {
     match item.string()? {
         "" => Err(item.error("the command is empty")),
         text => match misspelled(text) {
@@ -189,15 +193,15 @@ fn misspelled(text: &str) -> Option<String> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::document::Document;
+    use super::super::document::SourceTree;
     use super::*;
 
     /// The entries, when they act, or the message, of a field with these keys.
     type Entries = Vec<(i64, i64, String)>;
 
     fn field(text: &str) -> std::result::Result<(Entries, CommandWhen), String> {
-        let document = Document::parse("field.toml", text, &[]).unwrap();
-        let field = Reader::root(&document, &crate::keys::field::INPUT).unwrap();
+        let document = SourceTree::parse("field.toml", text, &[]).unwrap();
+        let field = TableReader::root(&document, &crate::keys::field::INPUT).unwrap();
         let commands = field.optional("commands").unwrap();
         let read = read(&field, &commands).map_err(|error| error.to_string())?;
         let entries = read.entries.into_iter().map(|entry| (entry.first, entry.last, entry.text));

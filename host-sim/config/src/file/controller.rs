@@ -5,11 +5,11 @@ use std::net::IpAddr;
 use proto_core::recipe::model::{Framing, Mode};
 use proto_core::wire::scalar::Scalar;
 
-use super::document::Document;
+use super::document::SourceTree;
 use super::functions;
 use super::lines::{read_bitrate, read_cycle, read_line};
 use super::network::check_ipv4;
-use super::reader::{Item, Reader, Result, Spot};
+use super::reader::{Result, Spot, TableReader, TableValue};
 use super::recipes::{self, FileRecipe, Flavour};
 use crate::TargetError;
 use crate::functions::Functions;
@@ -21,8 +21,8 @@ use crate::sim::{
 };
 
 /// Reads the whole file and checks it.
-pub(super) fn read(document: &Document) -> Result<SimConfig> {
-    let root = Reader::root(document, &keys::top::CONTROLLER)?;
+pub(super) fn read(document: &SourceTree) -> Result<SimConfig> {
+    let root = TableReader::root(document, &keys::top::CONTROLLER)?;
     let recipes = recipes::read_all(&root, Flavour::Controller)?;
     let programs = read_programs(&root)?;
     let functions = functions::read(&root, &programs)?;
@@ -37,7 +37,7 @@ pub(super) fn read(document: &Document) -> Result<SimConfig> {
     })
 }
 
-fn read_listen(root: &Reader<'_>) -> Result<Listen> {
+fn read_listen(root: &TableReader<'_>) -> Result<Listen> {
     let mut listen = Listen::default();
     let Some(item) = root.optional("listen") else { return Ok(listen) };
     let table = item.table(&keys::controller::LISTEN)?;
@@ -86,7 +86,7 @@ pub(crate) const COMMAND_CLIENTS: [(&str, CommandClients); 3] = [
     ("newest", CommandClients::DropFirst),
 ];
 
-fn read_robot(root: &Reader<'_>) -> Result<Robot> {
+fn read_robot(root: &TableReader<'_>) -> Result<Robot> {
     let mut robot = Robot::default();
     let Some(item) = root.optional("robot") else { return Ok(robot) };
     let table = item.table(&keys::controller::ROBOT)?;
@@ -99,7 +99,7 @@ fn read_robot(root: &Reader<'_>) -> Result<Robot> {
     Ok(robot)
 }
 
-fn read_initial(root: &Reader<'_>, functions: &Functions) -> Result<Vec<Initial>> {
+fn read_initial(root: &TableReader<'_>, functions: &Functions) -> Result<Vec<Initial>> {
     let mut initial: Vec<Initial> = Vec::new();
     let Some(item) = root.optional("initial") else { return Ok(initial) };
     for (name, key_spot, item) in item.any_table()?.entries() {
@@ -117,7 +117,7 @@ fn read_initial(root: &Reader<'_>, functions: &Functions) -> Result<Vec<Initial>
     Ok(initial)
 }
 
-fn read_value(target: InitialTarget, item: &Item<'_>) -> Result<f64> {
+fn read_value(target: InitialTarget, item: &TableValue<'_>) -> Result<f64> {
     match target {
         InitialTarget::Bit { .. } | InitialTarget::VarBit(_) => {
             item.bit().map(|bit| f64::from(u8::from(bit)))
@@ -163,7 +163,7 @@ pub(crate) const BUSES: [(&str, BusKind); 5] = [
     ("udp-client", BusKind::UdpClient),
 ];
 
-fn read_ports(root: &Reader<'_>, recipes: &[FileRecipe]) -> Result<Vec<SimPort>> {
+fn read_ports(root: &TableReader<'_>, recipes: &[FileRecipe]) -> Result<Vec<SimPort>> {
     let mut ports: Vec<SimPort> = Vec::new();
     let tables = root.any_tables("port")?;
     tables.iter().try_for_each(|table| table.check(&keys::controller::PORT))?;
@@ -185,7 +185,7 @@ fn read_ports(root: &Reader<'_>, recipes: &[FileRecipe]) -> Result<Vec<SimPort>>
     Ok(ports)
 }
 
-fn read_port(table: &Reader<'_>, recipes: &[FileRecipe]) -> Result<(SimPort, Spot)> {
+fn read_port(table: &TableReader<'_>, recipes: &[FileRecipe]) -> Result<(SimPort, Spot)> {
     let (name, name_spot) = recipes::read_name(table)?;
     let kind = table.required("bus", "rs485, can, udp-server, tcp-client or udp-client")?.choice(&BUSES)?;
     let bus = match kind {
@@ -229,7 +229,7 @@ fn check_recipe(kind: BusKind, recipe: &FileRecipe) -> std::result::Result<(), S
     }
 }
 
-fn read_to(table: &Reader<'_>) -> Result<String> {
+fn read_to(table: &TableReader<'_>) -> Result<String> {
     let item = table.required("to", "HOST:PORT to connect to, such as \"127.0.0.1:50000\"")?;
     let text = item.string()?;
     let port = text.rsplit_once(':').and_then(|(host, port)| {
@@ -246,7 +246,7 @@ fn read_to(table: &Reader<'_>) -> Result<String> {
     }
 }
 
-fn read_programs(root: &Reader<'_>) -> Result<Vec<SimProgram>> {
+fn read_programs(root: &TableReader<'_>) -> Result<Vec<SimProgram>> {
     let mut programs: Vec<SimProgram> = Vec::new();
     let tables = root.any_tables("program")?;
     tables.iter().try_for_each(|table| table.check(&keys::controller::PROGRAM))?;

@@ -11,11 +11,11 @@ use proto_core::sysvar::Direction;
 use proto_core::wire::scalar::ScalarType;
 
 use super::bindings::{self, FileInput, FileOutput, OVERFLOWS};
-use super::encoding::{self, OpenNumber, Order, refuse};
+use super::encoding::{self, FieldOrder, OpenNumber, refuse};
 use super::exchanges::FileExchange;
 use super::framings;
-use super::reader::{Item, Reader, Result, Spot};
-use super::recipes::{FileField, FileFieldKind, FileFrame, FilePart, FileRecipe, Flavour, Written};
+use super::reader::{Result, Spot, TableReader, TableValue};
+use super::recipes::{FileField, FileFieldKind, FileFrame, FilePart, FileRecipe, Flavour, WrittenField};
 use super::{input_rules, rtu_frames, sendable};
 use crate::device::{DeviceField, DeviceRecipe, ExchangeKind, FrameEnds, NamedExchange, NamedFrame};
 use crate::keys::field::{self, FILL, OVERFLOW, PAD};
@@ -73,18 +73,18 @@ fn why_plain(mode: Mode, flavour: Flavour) -> Option<&'static str> {
 
 /// The keys of a stream part or a CAN frame, beside those of any recipe; refuses them where there
 /// are none.
-pub(super) fn frame_keys(table: &Reader<'_>, mode: Mode, flavour: Flavour) -> Result<&'static [Key]> {
+pub(super) fn frame_keys(table: &TableReader<'_>, mode: Mode, flavour: Flavour) -> Result<&'static [Key]> {
     own_keys(OF_FRAME, table, mode, flavour)
 }
 
 /// The same for a stream part.
-pub(super) fn stream_keys(table: &Reader<'_>, mode: Mode, flavour: Flavour) -> Result<&'static [Key]> {
+pub(super) fn stream_keys(table: &TableReader<'_>, mode: Mode, flavour: Flavour) -> Result<&'static [Key]> {
     own_keys(OF_STREAM, table, mode, flavour)
 }
 
 fn own_keys(
     keys: &'static [Key],
-    table: &Reader<'_>,
+    table: &TableReader<'_>,
     mode: Mode,
     flavour: Flavour,
 ) -> Result<&'static [Key]> {
@@ -95,7 +95,7 @@ fn own_keys(
 }
 
 /// Refuses the keys of a frame in a CAN part, which has several frames.
-pub(super) fn refuse_in_can_part(part: &Reader<'_>, mode: Mode, flavour: Flavour) -> Result<()> {
+pub(super) fn refuse_in_can_part(part: &TableReader<'_>, mode: Mode, flavour: Flavour) -> Result<()> {
     stream_keys(part, mode, flavour)?;
     refuse(part, &framings::PART_KEYS, "a CAN bus tells frames apart itself")?;
     refuse(
@@ -109,23 +109,23 @@ pub(super) fn refuse_in_can_part(part: &Reader<'_>, mode: Mode, flavour: Flavour
 pub(super) struct FieldReader {
     direction: Direction,
     flavour: Flavour,
-    order: Order,
+    order: FieldOrder,
     open: Option<OpenNumber>,
 }
 
 impl FieldReader {
-    pub(super) fn new(frame: &Reader<'_>, rules: Rules, flavour: Flavour) -> Result<Self> {
-        Ok(Self { direction: rules.direction, flavour, order: Order::read(frame)?, open: None })
+    pub(super) fn new(frame: &TableReader<'_>, rules: Rules, flavour: Flavour) -> Result<Self> {
+        Ok(Self { direction: rules.direction, flavour, order: FieldOrder::read(frame)?, open: None })
     }
 
     /// Fields in registers of Modbus.
-    pub(super) fn of_registers(exchange: &Reader<'_>, direction: Direction) -> Result<Self> {
-        let order = Order::of_registers(exchange)?;
+    pub(super) fn of_registers(exchange: &TableReader<'_>, direction: Direction) -> Result<Self> {
+        let order = FieldOrder::of_registers(exchange)?;
         Ok(Self { direction, flavour: Flavour::Gateway, order, open: None })
     }
 
     /// Reads one field of a user recipe, which can be several items of the frame.
-    pub(super) fn read(&mut self, item: &Item<'_>, fields: &mut Vec<FileField>) -> Result<()> {
+    pub(super) fn read(&mut self, item: &TableValue<'_>, fields: &mut Vec<FileField>) -> Result<()> {
         let table = item.any_table()?;
         let mut push = |kind| fields.push(FileField { spot: item.spot.clone(), kind });
         let when = match self.direction {
@@ -187,9 +187,9 @@ impl FieldReader {
     }
 
     /// A field of a controller's recipe.
-    fn read_plain(&self, table: &Reader<'_>) -> Result<FileFieldKind> {
+    fn read_plain(&self, table: &TableReader<'_>) -> Result<FileFieldKind> {
         let name = read_name(table)?;
-        let written = Written::plain(encoding::read_plain_type(table)?);
+        let written = WrittenField::plain(encoding::read_plain_type(table)?);
         Ok(match self.direction {
             Direction::Input => {
                 let to = FileInput::Unused;
@@ -204,7 +204,7 @@ impl FieldReader {
     /// A field with a name and a value.
     fn read_value(
         &mut self,
-        table: &Reader<'_>,
+        table: &TableReader<'_>,
         push: impl FnMut(FileFieldKind, Option<Spot>),
     ) -> Result<()> {
         let encoding = encoding::read(table, self.order, &mut self.open)?;
@@ -216,12 +216,12 @@ impl FieldReader {
             refuse(table, &["overflow"], &format!("allowed only together with {key}"))?;
         }
         let overflow = table.word(&OVERFLOW, &OVERFLOWS)?.unwrap_or(Overflow::Usual);
-        bind(table, self.direction, Written { encoding, overflow }, push)
+        bind(table, self.direction, WrittenField { encoding, overflow }, push)
     }
 }
 
 /// The keys of what a value is for; refuses those of the other direction.
-pub(super) fn binding_keys(table: &Reader<'_>, direction: Direction) -> Result<&'static [Key]> {
+pub(super) fn binding_keys(table: &TableReader<'_>, direction: Direction) -> Result<&'static [Key]> {
     match direction {
         Direction::Input => {
             refuse(table, &["value"], "an input field has equals = 9 for a constant")?;
@@ -234,7 +234,7 @@ pub(super) fn binding_keys(table: &Reader<'_>, direction: Direction) -> Result<&
     }
 }
 
-fn refuse_bindings(table: &Reader<'_>) -> Result<()> {
+fn refuse_bindings(table: &TableReader<'_>) -> Result<()> {
     let bindings = [
         "to",
         "commands",
@@ -260,8 +260,8 @@ fn refuse_bindings(table: &Reader<'_>) -> Result<()> {
 
 /// An integer that must match.
 pub(super) fn read_constant(
-    table: &Reader<'_>,
-    equals: &Item<'_>,
+    table: &TableReader<'_>,
+    equals: &TableValue<'_>,
     encoding: Encoding,
 ) -> Result<FileFieldKind> {
     refuse_bindings(table)?;
@@ -276,9 +276,9 @@ pub(super) fn read_constant(
 
 /// A field with its binding, or two if its bytes are used twice.
 pub(super) fn bind(
-    table: &Reader<'_>,
+    table: &TableReader<'_>,
     direction: Direction,
-    written: Written,
+    written: WrittenField,
     mut push: impl FnMut(FileFieldKind, Option<Spot>),
 ) -> Result<()> {
     let encoding = written.encoding;
@@ -322,8 +322,10 @@ pub(super) fn bind(
             let uses = [Some(first).filter(|_| is_used), counter, second];
             for (nth, to) in uses.into_iter().flatten().enumerate() {
                 let again = nth > 0;
-                let shared =
-                    Written { encoding: Encoding { shared: true, ..encoding }, overflow: Overflow::Usual };
+                let shared = WrittenField {
+                    encoding: Encoding { shared: true, ..encoding },
+                    overflow: Overflow::Usual,
+                };
                 let written = if again { shared } else { written };
                 let (name, restarted) = (name.clone(), restarted.take());
                 push(FileFieldKind::UserInput { name, written, to, again, restarted }, None);
@@ -337,11 +339,11 @@ pub(super) fn bind(
     Ok(())
 }
 
-pub(super) fn read_name(table: &Reader<'_>) -> Result<String> {
+pub(super) fn read_name(table: &TableReader<'_>) -> Result<String> {
     Ok(table.required("name", "give the field a name")?.string()?.to_owned())
 }
 
-fn read_text<'a>(item: &Item<'a>) -> Result<impl Iterator<Item = u8> + use<'a>> {
+fn read_text<'a>(item: &TableValue<'a>) -> Result<impl Iterator<Item = u8> + use<'a>> {
     let text = item.string()?;
     if text.is_empty() {
         return Err(item.error("a text of no bytes; write at least one character"));
@@ -366,7 +368,7 @@ impl FilePart {
     /// Checks the part of a recipe with a device's own frames.
     pub(super) fn check_device(
         &self,
-        document: &Reader<'_>,
+        document: &TableReader<'_>,
         carrier: Carrier,
         part: Direction,
     ) -> Result<()> {

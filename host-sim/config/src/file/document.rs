@@ -10,11 +10,11 @@ use super::error::{FileError, Source};
 use super::names::did_you_mean;
 
 /// The tree, and the texts that it was read from.
-pub(super) struct Document {
+pub(super) struct SourceTree {
     name: String,
     text: String,
     overrides: Vec<String>,
-    pub(super) root: Table,
+    pub(super) root: TreeTable,
 }
 
 /// The place where something was written.
@@ -28,24 +28,24 @@ pub(super) enum At {
 
 /// A value with its place.
 #[derive(Debug, Clone)]
-pub(super) struct Node {
+pub(super) struct TreeNode {
     pub(super) at: At,
-    pub(super) value: Value,
+    pub(super) value: TreeValue,
 }
 
 #[derive(Debug, Clone)]
-pub(super) enum Value {
+pub(super) enum TreeValue {
     Str(String),
     /// A 64-bit integer of TOML, or the text of one that does not fit.
     Int(Result<i64, String>),
     Float(f64),
     Bool(bool),
     Datetime,
-    Array(Vec<Node>),
-    Table(Table),
+    Array(Vec<TreeNode>),
+    Table(TreeTable),
 }
 
-impl Value {
+impl TreeValue {
     /// With an article, for messages.
     pub(super) fn kind(&self) -> &'static str {
         match self {
@@ -62,31 +62,31 @@ impl Value {
 
 /// Entries in file order.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Table {
-    pub(super) entries: Vec<Entry>,
+pub(super) struct TreeTable {
+    pub(super) entries: Vec<TreeEntry>,
 }
 
 #[derive(Debug, Clone)]
-pub(super) struct Entry {
+pub(super) struct TreeEntry {
     pub(super) key: String,
     pub(super) at: At,
-    pub(super) node: Node,
+    pub(super) node: TreeNode,
 }
 
-impl Table {
-    pub(super) fn get(&self, key: &str) -> Option<&Entry> {
+impl TreeTable {
+    pub(super) fn get(&self, key: &str) -> Option<&TreeEntry> {
         self.entries.iter().find(|entry| entry.key == key)
     }
 }
 
-impl Document {
+impl SourceTree {
     /// Reads `text`, called `name` in messages, and applies the overrides.
     pub(super) fn parse(name: &str, text: &str, overrides: &[String]) -> Result<Self, FileError> {
         let mut document = Self {
             name: name.to_owned(),
             text: text.to_owned(),
             overrides: overrides.to_vec(),
-            root: Table::default(),
+            root: TreeTable::default(),
         };
         match DeTable::parse(text) {
             Ok(table) => document.root = convert_table(table.get_ref(), &At::File),
@@ -130,8 +130,8 @@ impl Document {
         let mut node = &self.root.get(first)?.node;
         while let Some((key, after)) = rest.split_first() {
             let next = match &node.value {
-                Value::Table(table) => table.get(key).map(|entry| &entry.node),
-                Value::Array(items) => {
+                TreeValue::Table(table) => table.get(key).map(|entry| &entry.node),
+                TreeValue::Array(items) => {
                     let named = items.iter().find(|item| name_of(item).is_some_and(|name| name == *key));
                     let number = || key.parse::<usize>().ok()?.checked_sub(1);
                     named.or_else(|| items.get(number()?))
@@ -167,42 +167,42 @@ impl Document {
     }
 }
 
-fn convert_table(table: &DeTable<'_>, at: &dyn Fn(usize) -> At) -> Table {
+fn convert_table(table: &DeTable<'_>, at: &dyn Fn(usize) -> At) -> TreeTable {
     let mut entries: Vec<_> = table.iter().collect();
     entries.sort_by_key(|(key, _)| key.span().start);
     let entry = |(key, node): (&Spanned<_>, &Spanned<DeValue<'_>>)| {
         let name: &std::borrow::Cow<'_, str> = key.get_ref();
-        Entry { key: name.to_string(), at: at(key.span().start), node: convert(node, at) }
+        TreeEntry { key: name.to_string(), at: at(key.span().start), node: convert(node, at) }
     };
-    Table { entries: entries.into_iter().map(entry).collect() }
+    TreeTable { entries: entries.into_iter().map(entry).collect() }
 }
 
-fn convert(node: &Spanned<DeValue<'_>>, at: &dyn Fn(usize) -> At) -> Node {
+fn convert(node: &Spanned<DeValue<'_>>, at: &dyn Fn(usize) -> At) -> TreeNode {
     let value = match node.get_ref() {
-        DeValue::String(text) => Value::Str(text.to_string()),
-        DeValue::Integer(number) => {
-            Value::Int(i64::from_str_radix(number.as_str(), number.radix()).map_err(|_| number.to_string()))
-        }
+        DeValue::String(text) => TreeValue::Str(text.to_string()),
+        DeValue::Integer(number) => TreeValue::Int(
+            i64::from_str_radix(number.as_str(), number.radix()).map_err(|_| number.to_string()),
+        ),
         // TOML's floats are Rust's, apart from underscores, which the parser has removed.
-        DeValue::Float(number) => Value::Float(number.as_str().parse().unwrap_or(f64::NAN)),
-        DeValue::Boolean(value) => Value::Bool(*value),
-        DeValue::Datetime(_) => Value::Datetime,
-        DeValue::Array(items) => Value::Array(items.iter().map(|item| convert(item, at)).collect()),
-        DeValue::Table(table) => Value::Table(convert_table(table, at)),
+        DeValue::Float(number) => TreeValue::Float(number.as_str().parse().unwrap_or(f64::NAN)),
+        DeValue::Boolean(value) => TreeValue::Bool(*value),
+        DeValue::Datetime(_) => TreeValue::Datetime,
+        DeValue::Array(items) => TreeValue::Array(items.iter().map(|item| convert(item, at)).collect()),
+        DeValue::Table(table) => TreeValue::Table(convert_table(table, at)),
     };
-    Node { at: at(node.span().start), value }
+    TreeNode { at: at(node.span().start), value }
 }
 
 /// The value of an override: TOML if it looks like TOML, else the text itself, so that
 /// `controller.address=10.0.0.2` needs no quotes, which a shell would remove.
-fn parse_value(text: &str, at: At) -> Result<Node, String> {
+fn parse_value(text: &str, at: At) -> Result<TreeNode, String> {
     match DeValue::parse(text) {
         Ok(value) => Ok(convert(&value, &|_| at)),
         Err(error) if text.starts_with(['[', '{', '"', '\'']) => {
             let hint = hexadecimal(text, error.span().map(|span| span.start));
             Err(format!("invalid TOML value: {}{hint}", one_line(error.message())))
         }
-        Err(_) => Ok(Node { at, value: Value::Str(text.to_owned()) }),
+        Err(_) => Ok(TreeNode { at, value: TreeValue::Str(text.to_owned()) }),
     }
 }
 
@@ -245,24 +245,25 @@ fn split_path(key: &str) -> Option<Vec<String>> {
     (!quoted && path.iter().all(|name| !name.is_empty())).then_some(path)
 }
 
-fn insert(table: &mut Table, path: &[String], node: Node, at: At) -> Result<(), String> {
+fn insert(table: &mut TreeTable, path: &[String], node: TreeNode, at: At) -> Result<(), String> {
     let Some((key, rest)) = path.split_first() else { return Ok(()) };
     let place = match table.entries.iter().position(|entry| entry.key == *key) {
         Some(place) => place,
         None => {
-            let value = if rest.is_empty() { node.value.clone() } else { Value::Table(Table::default()) };
-            table.entries.push(Entry { key: key.clone(), at, node: Node { at, value } });
+            let value =
+                if rest.is_empty() { node.value.clone() } else { TreeValue::Table(TreeTable::default()) };
+            table.entries.push(TreeEntry { key: key.clone(), at, node: TreeNode { at, value } });
             table.entries.len() - 1
         }
     };
     let entry = &mut table.entries[place];
     if rest.is_empty() {
-        *entry = Entry { key: key.clone(), at, node };
+        *entry = TreeEntry { key: key.clone(), at, node };
         return Ok(());
     }
     match &mut entry.node.value {
-        Value::Table(inner) => insert(inner, rest, node, at),
-        Value::Array(items) => insert_into_item(key, items, rest, node, at),
+        TreeValue::Table(inner) => insert(inner, rest, node, at),
+        TreeValue::Array(items) => insert_into_item(key, items, rest, node, at),
         other => Err(format!("{key} is {} and has no keys", other.kind())),
     }
 }
@@ -270,9 +271,9 @@ fn insert(table: &mut Table, path: &[String], node: Node, at: At) -> Result<(), 
 /// Items of an array of tables are selected by their `name`, or by their number, counted from 1.
 fn insert_into_item(
     key: &str,
-    items: &mut [Node],
+    items: &mut [TreeNode],
     path: &[String],
-    node: Node,
+    node: TreeNode,
     at: At,
 ) -> Result<(), String> {
     let Some((wanted, rest)) = path.split_first() else { return Ok(()) };
@@ -295,15 +296,15 @@ fn insert_into_item(
             *item = node;
             Ok(())
         }
-        (Node { value: Value::Table(table), .. }, rest) => insert(table, rest, node, at),
-        (Node { value, .. }, _) => Err(format!("{key} {wanted} is {} and has no keys", value.kind())),
+        (TreeNode { value: TreeValue::Table(table), .. }, rest) => insert(table, rest, node, at),
+        (TreeNode { value, .. }, _) => Err(format!("{key} {wanted} is {} and has no keys", value.kind())),
     }
 }
 
-fn name_of(item: &Node) -> Option<&str> {
+fn name_of(item: &TreeNode) -> Option<&str> {
     match &item.value {
-        Value::Table(table) => match &table.get("name")?.node.value {
-            Value::Str(name) => Some(name),
+        TreeValue::Table(table) => match &table.get("name")?.node.value {
+            TreeValue::Str(name) => Some(name),
             _ => None,
         },
         _ => None,

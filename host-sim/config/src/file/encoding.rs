@@ -6,7 +6,7 @@ use proto_core::device::{Bits, ByteOrder, Digits, Encoding, Kind, MAX_DIGITS, Wi
 use proto_core::wire::scalar::ScalarType;
 
 use super::names::meant_type;
-use super::reader::{Item, Reader, Result};
+use super::reader::{Result, TableReader, TableValue};
 use crate::keys::device::{ENDIAN, WORD_ORDER};
 use crate::keys::field::{DECIMALS, SIGNED};
 
@@ -43,14 +43,14 @@ pub(crate) const WORD_ORDERS: [(&str, bool); 2] = [("high-first", false), ("low-
 
 /// The byte order that a part or a field asks for.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Order {
+pub(super) struct FieldOrder {
     is_big: Option<bool>,
     low_word_first: Option<bool>,
 }
 
-impl Order {
+impl FieldOrder {
     /// The keys `endian` and `word_order` of a part or a field.
-    pub(super) fn read(table: &Reader<'_>) -> Result<Self> {
+    pub(super) fn read(table: &TableReader<'_>) -> Result<Self> {
         Ok(Self {
             is_big: table.word(&ENDIAN, &ORDERS)?,
             low_word_first: table.word(&WORD_ORDER, &WORD_ORDERS)?,
@@ -58,7 +58,7 @@ impl Order {
     }
 
     /// The order of fields in registers of Modbus, whose bytes are big-endian.
-    pub(super) fn of_registers(exchange: &Reader<'_>) -> Result<Self> {
+    pub(super) fn of_registers(exchange: &TableReader<'_>) -> Result<Self> {
         Ok(Self { is_big: Some(true), ..Self::read(exchange)? })
     }
 
@@ -86,7 +86,7 @@ pub(super) struct OpenNumber {
 }
 
 /// The type of a field that any recipe can have.
-pub(super) fn read_plain_type(field: &Reader<'_>) -> Result<ScalarType> {
+pub(super) fn read_plain_type(field: &TableReader<'_>) -> Result<ScalarType> {
     let item = read_type_item(field)?;
     if let Some((name, _)) = OWN_TYPES.iter().find(|(name, _)| item.as_string() == Some(name)) {
         return Err(
@@ -97,25 +97,29 @@ pub(super) fn read_plain_type(field: &Reader<'_>) -> Result<ScalarType> {
     choose(&item, &types)
 }
 
-fn read_type(field: &Reader<'_>) -> Result<Type> {
+fn read_type(field: &TableReader<'_>) -> Result<Type> {
     let scalars = ScalarType::ALL.into_iter().map(|ty| (ty.name(), Type::Scalar(ty)));
     choose(&read_type_item(field)?, &scalars.chain(OWN_TYPES).collect::<Vec<_>>())
 }
 
-fn choose<T: Clone>(item: &Item<'_>, types: &[(&str, T)]) -> Result<T> {
+fn choose<T: Clone>(item: &TableValue<'_>, types: &[(&str, T)]) -> Result<T> {
     item.choice_or(types, |text| {
         let names: Vec<_> = types.iter().map(|(name, _)| *name).collect();
         meant_type(text, &names)
     })
 }
 
-fn read_type_item<'a>(field: &Reader<'a>) -> Result<Item<'a>> {
+fn read_type_item<'a>(field: &TableReader<'a>) -> Result<TableValue<'a>> {
     field.required("type", "byte, char, word, short, dword, int, float or double")
 }
 
 /// How a field is written. `open` is the number of bits that the field before belongs to, then that
 /// of this field.
-pub(super) fn read(field: &Reader<'_>, part: Order, open: &mut Option<OpenNumber>) -> Result<Encoding> {
+pub(super) fn read(
+    field: &TableReader<'_>,
+    part: FieldOrder,
+    open: &mut Option<OpenNumber>,
+) -> Result<Encoding> {
     let ty = read_type(field)?;
     let before = open.take();
     if let Some(item) = field.optional("bits") {
@@ -148,7 +152,7 @@ fn places(bits: &Bits, order: ByteOrder) -> u64 {
     u64::from_le_bytes(bytes)
 }
 
-fn read_kind(field: &Reader<'_>, ty: Type) -> Result<Kind> {
+fn read_kind(field: &TableReader<'_>, ty: Type) -> Result<Kind> {
     if let Type::Wide(_) = ty {
         return Err(field.error("a number of more than 4 bytes has no value as a whole; give the field bits"));
     }
@@ -197,7 +201,12 @@ fn read_kind(field: &Reader<'_>, ty: Type) -> Result<Kind> {
 }
 
 /// `width` or `until`, of a field of digits.
-fn read_width(field: &Reader<'_>, most: i64, ends: impl Fn(char) -> bool, digits: &str) -> Result<Width> {
+fn read_width(
+    field: &TableReader<'_>,
+    most: i64,
+    ends: impl Fn(char) -> bool,
+    digits: &str,
+) -> Result<Width> {
     match (field.optional("width"), field.optional("until")) {
         (Some(width), None) => Ok(Width::Fixed(width.integer(1..=most)?)),
         (None, Some(until)) => {
@@ -223,7 +232,7 @@ fn read_width(field: &Reader<'_>, most: i64, ends: impl Fn(char) -> bool, digits
 }
 
 /// `bits = 3` or `bits = "4..7"`, of an unsigned number.
-fn read_bits(field: &Reader<'_>, item: &Item<'_>, ty: Type) -> Result<Bits> {
+fn read_bits(field: &TableReader<'_>, item: &TableValue<'_>, ty: Type) -> Result<Bits> {
     let bytes = match ty {
         Type::Scalar(ty @ (ScalarType::Byte | ScalarType::Word | ScalarType::Dword)) => ty.size() as u8,
         Type::Uint24 => 3,
@@ -261,8 +270,8 @@ fn read_bits(field: &Reader<'_>, item: &Item<'_>, ty: Type) -> Result<Bits> {
 }
 
 /// The byte order of a field of `len` bytes; `None` for digits.
-fn read_order(field: &Reader<'_>, part: Order, len: Option<usize>) -> Result<ByteOrder> {
-    let own = Order::read(field)?;
+fn read_order(field: &TableReader<'_>, part: FieldOrder, len: Option<usize>) -> Result<ByteOrder> {
+    let own = FieldOrder::read(field)?;
     if len.is_none_or(|len| len == 1) {
         refuse(
             field,
@@ -277,7 +286,7 @@ fn read_order(field: &Reader<'_>, part: Order, len: Option<usize>) -> Result<Byt
 }
 
 /// Refuses the first of `keys` that the table has.
-pub(super) fn refuse(table: &Reader<'_>, keys: &[&str], why: &str) -> Result<()> {
+pub(super) fn refuse(table: &TableReader<'_>, keys: &[&str], why: &str) -> Result<()> {
     match keys.iter().find_map(|key| table.optional(key)) {
         Some(item) => Err(item.error(why)),
         None => Ok(()),

@@ -15,7 +15,7 @@ use proto_core::wire::can::CanId;
 use super::bindings::{self, FileInput, Sending};
 use super::encoding::refuse;
 use super::order::FrameOrder;
-use super::reader::{Item, Reader, Result, Spot};
+use super::reader::{Result, Spot, TableReader, TableValue};
 use super::recipes::{self, FileField, FileFieldKind, FileFrame, FilePart, Flavour};
 use crate::device::ExchangeKind;
 use crate::keys::exchange;
@@ -74,7 +74,7 @@ const TIMING_KEYS: [&str; 11] = [
 ];
 
 /// The exchanges of a stream or CAN recipe.
-pub(super) fn read_all(recipe: &Reader<'_>, mode: Mode, is_can: bool) -> Result<Vec<FileExchange>> {
+pub(super) fn read_all(recipe: &TableReader<'_>, mode: Mode, is_can: bool) -> Result<Vec<FileExchange>> {
     let tables = recipe.any_tables("exchange")?;
     if let Some(item) = recipe.optional("exchange").filter(|_| mode != Mode::User) {
         let first = tables.first().map(|table| table.error(ExchangeError::NeedsUser));
@@ -85,7 +85,7 @@ pub(super) fn read_all(recipe: &Reader<'_>, mode: Mode, is_can: bool) -> Result<
 }
 
 /// The names of exchanges, `None` for those without one.
-pub(super) fn names(tables: &[Reader<'_>]) -> Result<Vec<Option<String>>> {
+pub(super) fn names(tables: &[TableReader<'_>]) -> Result<Vec<Option<String>>> {
     let mut names: Vec<Option<String>> = Vec::new();
     for table in tables {
         let Some(item) = table.optional(exchange::NAME.name) else {
@@ -104,7 +104,7 @@ pub(super) fn names(tables: &[Reader<'_>]) -> Result<Vec<Option<String>>> {
     Ok(names)
 }
 
-fn read(table: &Reader<'_>, is_can: bool, names: &[Option<String>]) -> Result<FileExchange> {
+fn read(table: &TableReader<'_>, is_can: bool, names: &[Option<String>]) -> Result<FileExchange> {
     table.check(if is_can { &exchange::OF_CAN } else { &exchange::OF_STREAM })?;
     let peer = table.integer_or(&exchange::PEER)?;
     let frame = |key, direction| {
@@ -168,7 +168,7 @@ fn read(table: &Reader<'_>, is_can: bool, names: &[Option<String>]) -> Result<Fi
 }
 
 /// When the values of a reply are overdue.
-pub(super) fn read_overdue(table: &Reader<'_>, key: &str) -> Result<Option<Duration>> {
+pub(super) fn read_overdue(table: &TableReader<'_>, key: &str) -> Result<Option<Duration>> {
     let own = table.optional(key);
     let Some(item) = table.optional(exchange::EXPECT.name) else {
         return own.map(|own| own.time(&exchange::OVERDUE)).transpose();
@@ -183,7 +183,7 @@ pub(super) fn read_overdue(table: &Reader<'_>, key: &str) -> Result<Option<Durat
 }
 
 /// The places of all keys of an exchange; that of the exchange for keys that it does not have.
-pub(super) fn spots(table: &Reader<'_>, own: &[(&str, ExchangeKey)]) -> Vec<(ExchangeKey, Spot)> {
+pub(super) fn spots(table: &TableReader<'_>, own: &[(&str, ExchangeKey)]) -> Vec<(ExchangeKey, Spot)> {
     let timing = [
         ("every_ms", ExchangeKey::Every),
         ("on", ExchangeKey::Rising),
@@ -203,7 +203,7 @@ pub(super) fn spots(table: &Reader<'_>, own: &[(&str, ExchangeKey)]) -> Vec<(Exc
 
 /// The field of a reply that tells of a restart; its place is added to `spots`.
 pub(super) fn restarted(
-    table: &Reader<'_>,
+    table: &TableReader<'_>,
     reply: Option<&FilePart>,
     spots: &mut Vec<(ExchangeKey, Spot)>,
 ) -> Result<Option<Restarted>> {
@@ -222,7 +222,7 @@ pub(super) fn restarted(
 }
 
 /// Elsewhere nothing tells of a restart.
-pub(super) fn refuse_restarted(table: &Reader<'_>, part: Option<&FilePart>) -> Result<()> {
+pub(super) fn refuse_restarted(table: &TableReader<'_>, part: Option<&FilePart>) -> Result<()> {
     let fields = part.into_iter().flat_map(|part| part.frames.iter().flat_map(|frame| &frame.fields));
     match fields.filter_map(FileField::restarted).next() {
         Some((spot, _)) => Err(spot.error(table.document, ExchangeError::RestartedNothing)),
@@ -231,7 +231,12 @@ pub(super) fn refuse_restarted(table: &Reader<'_>, part: Option<&FilePart>) -> R
 }
 
 /// A request, a reply, a pending answer or a refusal, and whether it is a remote frame.
-fn read_frame(item: &Item<'_>, key: &str, direction: Direction, is_can: bool) -> Result<(FilePart, bool)> {
+fn read_frame(
+    item: &TableValue<'_>,
+    key: &str,
+    direction: Direction,
+    is_can: bool,
+) -> Result<(FilePart, bool)> {
     let table = item.any_table()?;
     let is_request = direction == Direction::Output;
     let recipe = if is_can { "a CAN recipe" } else { "a stream recipe" };
@@ -267,7 +272,7 @@ fn read_frame(item: &Item<'_>, key: &str, direction: Direction, is_can: bool) ->
 }
 
 /// A pending answer or a refusal has values, and nothing else.
-fn check_refusal(table: &Reader<'_>, part: &FilePart) -> Result<()> {
+fn check_refusal(table: &TableReader<'_>, part: &FilePart) -> Result<()> {
     refuse_restarted(table, Some(part))?;
     let is_other = |field: &&FileField| {
         let FileFieldKind::UserInput { to, .. } = &field.kind else { return false };
@@ -281,7 +286,7 @@ fn check_refusal(table: &Reader<'_>, part: &FilePart) -> Result<()> {
 
 impl FilePart {
     /// A part, or the frame of an exchange, still without anything but its place.
-    pub(super) fn new(table: &Reader<'_>) -> Self {
+    pub(super) fn new(table: &TableReader<'_>) -> Self {
         Self {
             spot: table.spot.clone(),
             head: Vec::new(),
@@ -336,7 +341,7 @@ impl AskTiming {
     };
 
     /// `names` are those of all exchanges of the recipe.
-    pub(super) fn read(table: &Reader<'_>, names: &[Option<String>]) -> Result<Self> {
+    pub(super) fn read(table: &TableReader<'_>, names: &[Option<String>]) -> Result<Self> {
         let mut when = Triggers { every: table.time(&exchange::EVERY)?, ..Triggers::NEVER };
         if let Some(on) = table.optional("on") {
             let list = on.array("such as [\"start\", \"change\"]")?;
@@ -361,7 +366,7 @@ impl AskTiming {
     }
 
     /// Refuses a request that is never sent.
-    pub(super) fn check_asked(&self, table: &Reader<'_>) -> Result<()> {
+    pub(super) fn check_asked(&self, table: &TableReader<'_>) -> Result<()> {
         if self.when.is_never() && self.follow.is_none() {
             Err(table.error(ExchangeError::Never))
         } else {
@@ -371,7 +376,7 @@ impl AskTiming {
 }
 
 /// The number of the exchange with a name.
-fn read_follow(item: &Item<'_>, names: &[Option<String>]) -> Result<u8> {
+fn read_follow(item: &TableValue<'_>, names: &[Option<String>]) -> Result<u8> {
     let name = item.string()?;
     let nth = names.iter().position(|other| other.as_deref() == Some(name));
     nth.and_then(|nth| u8::try_from(nth).ok()).ok_or_else(|| {
@@ -385,7 +390,7 @@ fn read_follow(item: &Item<'_>, names: &[Option<String>]) -> Result<u8> {
 }
 
 /// The variables that tell what became of events.
-fn read_outcome(item: &Item<'_>) -> Result<OutcomeTo> {
+fn read_outcome(item: &TableValue<'_>) -> Result<OutcomeTo> {
     let table = item.table(&exchange::OUTCOME_TABLE)?;
     let variable = |key| -> Result<Option<SysVar>> {
         let Some(item) = table.optional(key) else { return Ok(None) };
@@ -403,7 +408,7 @@ fn read_outcome(item: &Item<'_>) -> Result<OutcomeTo> {
 }
 
 /// One entry of `on`.
-fn read_on(item: &Item<'_>, when: &mut Triggers) -> Result<()> {
+fn read_on(item: &TableValue<'_>, when: &mut Triggers) -> Result<()> {
     let text = item.string()?;
     let flag =
         match text {

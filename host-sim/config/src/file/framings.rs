@@ -10,7 +10,7 @@ use proto_core::sysvar::{Direction, SysVar, VarRange};
 
 use super::encoding::refuse;
 use super::names::meant_variable;
-use super::reader::{Item, Reader, Result};
+use super::reader::{Result, TableReader, TableValue};
 use crate::keys::device::{ESCAPE, FRAMING};
 use crate::keys::field::{COUNTS as COUNTS_KEY, PLUS, TEXT_IN, TEXT_ORDER, TEXT_OUT, TEXT_WIDTH};
 
@@ -35,7 +35,7 @@ pub(crate) const COUNTS: [(&str, Counts); 3] =
     [("rest", Counts::Rest), ("frame", Counts::Frame), ("fields", Counts::Fields)];
 
 /// `framing` and `escape` of a stream part.
-pub(super) fn read_part(part: &Reader<'_>) -> Result<(Boundary, Option<Escape>)> {
+pub(super) fn read_part(part: &TableReader<'_>) -> Result<(Boundary, Option<Escape>)> {
     let framing = part.word(&FRAMING, &FRAMINGS)?;
     let escape = part.word(&ESCAPE, &ESCAPES)?;
     if let (Some(_), Some(item)) = (escape, part.optional("framing")) {
@@ -48,7 +48,7 @@ pub(super) fn read_part(part: &Reader<'_>) -> Result<(Boundary, Option<Escape>)>
 }
 
 /// A field with `type = "text"`.
-pub(super) fn read_text(field: &Reader<'_>, direction: Direction) -> Result<FieldSpec> {
+pub(super) fn read_text(field: &TableReader<'_>, direction: Direction) -> Result<FieldSpec> {
     let keys = if direction == Direction::Input { TEXT_IN } else { TEXT_OUT };
     field.check_keys(&[keys], " in a text")?;
     let width = match (field.optional("width"), field.optional("until")) {
@@ -86,7 +86,7 @@ pub(super) fn read_text(field: &Reader<'_>, direction: Direction) -> Result<Fiel
 }
 
 /// `ignore = ["NOREAD"]`: texts that a field of this width can have.
-fn read_ignored(item: &Item<'_>, width: TextWidth) -> Result<Ignored> {
+fn read_ignored(item: &TableValue<'_>, width: TextWidth) -> Result<Ignored> {
     let items = item.array("of texts, such as [\"NOREAD\"]")?;
     let mut texts = Vec::new();
     for item in &items {
@@ -114,7 +114,7 @@ fn read_ignored(item: &Item<'_>, width: TextWidth) -> Result<Ignored> {
 }
 
 /// A field with `length = true`, which is written like this.
-pub(super) fn read_length(field: &Reader<'_>, encoding: Encoding) -> Result<FieldSpec> {
+pub(super) fn read_length(field: &TableReader<'_>, encoding: Encoding) -> Result<FieldSpec> {
     let item = field.required("length", "true, for the field that tells the frame's length")?;
     if !item.bool()? {
         return Err(item.error("allowed: true; a field without it is a value"));
@@ -127,7 +127,7 @@ pub(super) fn read_length(field: &Reader<'_>, encoding: Encoding) -> Result<Fiel
     Ok(FieldSpec::Length(Length { encoding, counts, plus }))
 }
 
-fn one_character(item: &Item<'_>) -> Result<u8> {
+fn one_character(item: &TableValue<'_>) -> Result<u8> {
     let text = item.string()?;
     let mut characters = text.chars();
     match (characters.next(), characters.next()) {
@@ -136,12 +136,12 @@ fn one_character(item: &Item<'_>) -> Result<u8> {
     }
 }
 
-fn read_var(item: &Item<'_>) -> Result<SysVar> {
+fn read_var(item: &TableValue<'_>) -> Result<SysVar> {
     let name = item.string()?;
     SysVar::parse(name).map_err(|error| item.error(format!("{name:?}: {error}{}", meant_variable(name))))
 }
 
-fn read_words(item: &Item<'_>, order: ByteOrder) -> Result<Words> {
+fn read_words(item: &TableValue<'_>, order: ByteOrder) -> Result<Words> {
     let name = item.string()?;
     let range = VarRange::parse(name)
         .map_err(|error| item.error(format!("{name:?}: {error}{}", meant_variable(name))))?;

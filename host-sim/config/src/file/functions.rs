@@ -1,6 +1,6 @@
 //! `[functions]` of a controller file (D27).
 
-use super::reader::{Reader, Result};
+use super::reader::{Result, TableReader};
 use crate::functions::{
     FUNCTION_INPUTS, FUNCTION_OUTPUTS, Function, FunctionInput, FunctionOutput, Functions, ShownState,
 };
@@ -8,7 +8,7 @@ use crate::keys;
 use crate::sim::{InitialTarget, SimProgram};
 use crate::target::TargetError;
 
-pub(super) fn read(root: &Reader<'_>, programs: &[SimProgram]) -> Result<Functions> {
+pub(super) fn read(root: &TableReader<'_>, programs: &[SimProgram]) -> Result<Functions> {
     let Some(item) = root.optional("functions") else { return Ok(Functions::default()) };
     let table = item.table(&keys::controller::FUNCTIONS)?;
     let inputs = read_table(&table, "inputs", &INPUTS, &Function::ALL)?;
@@ -50,7 +50,7 @@ const OUTPUTS: Items =
 
 /// A table from items to `choices`, in file order.
 fn read_table<T: Clone>(
-    functions: &Reader<'_>,
+    functions: &TableReader<'_>,
     key: &str,
     items: &Items,
     choices: &[(&str, T)],

@@ -18,11 +18,11 @@ use proto_core::wire::scalar::Scalar;
 
 use super::bindings::FileInput;
 use super::commands::FileCommand;
-use super::document::{At, Document};
+use super::document::{At, SourceTree};
 use super::lines::{key_name, read_bitrate, read_cycle, read_line, read_rtu_line};
 use super::names::meant_variable;
 use super::network::{self, check_ipv4};
-use super::reader::{Item, Reader, Result, Spot};
+use super::reader::{Result, Spot, TableReader, TableValue};
 use super::recipes::{self, FileField, FileRecipe, Flavour, RecipeKind};
 use super::sources;
 use crate::keys;
@@ -32,8 +32,8 @@ use crate::keys::gateway::{
 };
 
 /// Reads the whole file and checks it.
-pub(super) fn read(document: &Document) -> Result<Box<GatewayConfig>> {
-    let root = Reader::root(document, &keys::top::GATEWAY)?;
+pub(super) fn read(document: &SourceTree) -> Result<Box<GatewayConfig>> {
+    let root = TableReader::root(document, &keys::top::GATEWAY)?;
     let recipes = recipes::read_all(&root, Flavour::Gateway)?;
     let mut builder = Builder::new(&root, &recipes)?;
     let ports = root.any_tables("port")?;
@@ -105,7 +105,7 @@ impl BusKind {
 
 /// The configuration read so far, with the place of everything in it.
 struct Builder<'a> {
-    document: &'a Document,
+    document: &'a SourceTree,
     config: Box<GatewayConfig>,
     spots: HashMap<Place, Spot>,
     /// The names of all ports, also of those that have not been read yet.
@@ -113,7 +113,7 @@ struct Builder<'a> {
 }
 
 impl<'a> Builder<'a> {
-    fn new(root: &Reader<'a>, recipes: &[FileRecipe]) -> Result<Self> {
+    fn new(root: &TableReader<'a>, recipes: &[FileRecipe]) -> Result<Self> {
         let table = root
             .required(
                 "controller",
@@ -271,7 +271,7 @@ impl<'a> Builder<'a> {
         })
     }
 
-    fn add_port(&mut self, table: &Reader<'a>, recipes: &[FileRecipe]) -> Result<()> {
+    fn add_port(&mut self, table: &TableReader<'a>, recipes: &[FileRecipe]) -> Result<()> {
         let (name, _) = recipes::read_name(table)?;
         let kind = table
             .required(
@@ -321,7 +321,7 @@ impl<'a> Builder<'a> {
         Ok(())
     }
 
-    fn add_safe_values(&mut self, table: &Reader<'a>) -> Result<Span> {
+    fn add_safe_values(&mut self, table: &TableReader<'a>) -> Result<Span> {
         let start = self.config.safe_values.len() as u16;
         let Some(item) = table.optional("on_timeout") else { return Ok(Span { start, len: 0 }) };
         if !item.is_table() {
@@ -359,7 +359,7 @@ impl<'a> Builder<'a> {
         &self,
         bit: std::result::Result<VarBit, ParseError>,
         key_spot: &Spot,
-        item: &Item<'_>,
+        item: &TableValue<'_>,
     ) -> Result<SafeValue> {
         let bit = bit.map_err(|error| self.error(key_spot, error))?;
         check_bit(bit).map_err(|kind| self.error(key_spot, self.config.view().describe_kind(kind)))?;
@@ -400,7 +400,7 @@ const PORT_PLACES: [PortKey; 17] = [
     PortKey::Refresh,
 ];
 
-fn read_controller(table: &Reader<'_>, recipes: &[FileRecipe]) -> Result<ControllerLink> {
+fn read_controller(table: &TableReader<'_>, recipes: &[FileRecipe]) -> Result<ControllerLink> {
     let address = table.required("address", "the controller's IP address or host name")?;
     let mut link = ControllerLink::default();
     link.address = read_address(&address)?;
@@ -447,14 +447,14 @@ fn read_controller(table: &Reader<'_>, recipes: &[FileRecipe]) -> Result<Control
     Ok(link)
 }
 
-fn read_address(item: &Item<'_>) -> Result<heapless::String<MAX_ADDRESS>> {
+fn read_address(item: &TableValue<'_>) -> Result<heapless::String<MAX_ADDRESS>> {
     let text = item.string()?;
     check_address(text).map_err(|kind| item.error(format!("{text:?} is {kind}")))?;
     check_ipv4(text).map_err(|message| item.error(message))?;
     Ok(bounded(text))
 }
 
-fn read_echo(item: &Item<'_>) -> Result<Echo> {
+fn read_echo(item: &TableValue<'_>) -> Result<Echo> {
     let word = item.as_string().and_then(|text| ECHOES.iter().find(|(word, _)| *word == text));
     match (item.as_bool(), word) {
         (Some(true), _) => Ok(Echo::Yes),
@@ -467,7 +467,7 @@ fn read_echo(item: &Item<'_>) -> Result<Echo> {
     }
 }
 
-fn read_bus(table: &Reader<'_>, kind: BusKind) -> Result<Bus> {
+fn read_bus(table: &TableReader<'_>, kind: BusKind) -> Result<Bus> {
     let listen = || -> Result<heapless::String<MAX_LISTEN>> {
         let item = table.required("listen", "an IP address and a port, such as \"0.0.0.0:50000\"")?;
         heapless::String::try_from(item.string()?)
@@ -490,7 +490,7 @@ fn read_bus(table: &Reader<'_>, kind: BusKind) -> Result<Bus> {
 }
 
 /// Where the devices of Modbus TCP are: a host, and perhaps a port.
-fn read_modbus_tcp(table: &Reader<'_>) -> Result<Bus> {
+fn read_modbus_tcp(table: &TableReader<'_>) -> Result<Bus> {
     let item = table.required("to", "the device's IP address or host name, such as \"192.168.1.50\"")?;
     let text = item.string()?;
     let wrong = || item.error(format!("{text:?} is not HOST or HOST:PORT, such as \"192.168.1.50:502\""));

@@ -10,8 +10,8 @@ use proto_core::wire::scalar::ScalarType;
 use super::bindings::{FileInput, read_var};
 use super::encoding::refuse;
 use super::names::meant_variable;
-use super::reader::{Item, Reader, Result, Spot};
-use super::recipes::Written;
+use super::reader::{Result, Spot, TableReader, TableValue};
+use super::recipes::WrittenField;
 use super::sendable::{add_entry, read_limits};
 use crate::keys::field::{AS, POINT, RESTARTED};
 
@@ -24,8 +24,12 @@ pub(crate) const POINTS: [(&str, Option<InputRule>); 2] = [(".", None), (",", So
 pub(super) const KEYS: [&str; 8] = ["as", "min", "max", "outside", "map", "no_value", "valid_to", "point"];
 
 /// What stands behind an input field, with the places of their keys.
-pub(super) fn read(table: &Reader<'_>, written: Written, to: &FileInput) -> Result<Vec<(Spot, FieldSpec)>> {
-    let Written { encoding, overflow } = written;
+pub(super) fn read(
+    table: &TableReader<'_>,
+    written: WrittenField,
+    to: &FileInput,
+) -> Result<Vec<(Spot, FieldSpec)>> {
+    let WrittenField { encoding, overflow } = written;
     let var = match *to {
         FileInput::Variable { var, .. } => var,
         FileInput::Bit(_) => {
@@ -39,7 +43,7 @@ pub(super) fn read(table: &Reader<'_>, written: Written, to: &FileInput) -> Resu
         refuse(table, &["as", "min", "max", "outside", "map"], why)?;
     }
     let mut rules = Vec::new();
-    let rule = |item: &Item<'_>, rule| (item.spot.clone(), FieldSpec::InputRule(rule));
+    let rule = |item: &TableValue<'_>, rule| (item.spot.clone(), FieldSpec::InputRule(rule));
     if let Some(item) = table.optional("point") {
         if !matches!(encoding.kind, Kind::Decimal(_)) {
             return Err(item.error("only decimal has a point"));
@@ -79,13 +83,13 @@ pub(super) fn read(table: &Reader<'_>, written: Written, to: &FileInput) -> Resu
 }
 
 /// The number that tells that the device has restarted.
-pub(super) fn read_restarted(table: &Reader<'_>, encoding: &Encoding) -> Result<Option<(Spot, f64)>> {
+pub(super) fn read_restarted(table: &TableReader<'_>, encoding: &Encoding) -> Result<Option<(Spot, f64)>> {
     let Some(item) = table.optional(RESTARTED.name) else { return Ok(None) };
     Ok(Some((item.spot.clone(), read_number(&item, encoding)?)))
 }
 
 /// A number that the field can have.
-fn read_number(item: &Item<'_>, encoding: &Encoding) -> Result<f64> {
+fn read_number(item: &TableValue<'_>, encoding: &Encoding) -> Result<f64> {
     let number = item.number()?;
     let (low, high) = encoding.range();
     if !(low..=high).contains(&number) {
@@ -97,7 +101,12 @@ fn read_number(item: &Item<'_>, encoding: &Encoding) -> Result<f64> {
     Ok(number)
 }
 
-fn read_map(map: &Item<'_>, var: SysVar, is_int16: bool, rules: &mut Vec<(Spot, FieldSpec)>) -> Result<()> {
+fn read_map(
+    map: &TableValue<'_>,
+    var: SysVar,
+    is_int16: bool,
+    rules: &mut Vec<(Spot, FieldSpec)>,
+) -> Result<()> {
     let (mut entries, mut otherwise): (Vec<(Spot, MapEntry)>, _) = (Vec::new(), None);
     for (key, key_spot, item) in map.any_table()?.entries() {
         let sent = item.number()?;
@@ -123,7 +132,7 @@ fn read_map(map: &Item<'_>, var: SysVar, is_int16: bool, rules: &mut Vec<(Spot, 
     Ok(())
 }
 
-fn read_no_value(item: &Item<'_>, encoding: &Encoding) -> Result<InputRule> {
+fn read_no_value(item: &TableValue<'_>, encoding: &Encoding) -> Result<InputRule> {
     let Some(text) = item.as_string() else {
         return read_number(item, encoding).map(InputRule::NoNumber);
     };
@@ -137,7 +146,7 @@ fn read_no_value(item: &Item<'_>, encoding: &Encoding) -> Result<InputRule> {
     })
 }
 
-fn read_valid_to(item: &Item<'_>) -> Result<InputRule> {
+fn read_valid_to(item: &TableValue<'_>) -> Result<InputRule> {
     let name = item.string()?;
     if let Some(bit) = VarBit::parse(name) {
         let VarBit { var, bit } =
@@ -154,7 +163,7 @@ fn read_valid_to(item: &Item<'_>) -> Result<InputRule> {
     }
 }
 
-fn input(item: &Item<'_>, var: SysVar) -> Result<()> {
+fn input(item: &TableValue<'_>, var: SysVar) -> Result<()> {
     match var.direction() {
         Direction::Input => Ok(()),
         Direction::Output => {

@@ -5,9 +5,9 @@
 
 use std::path::{Path, PathBuf};
 
-use super::document::Document;
+use super::document::SourceTree;
 use super::error::FileError;
-use super::reader::{Item, Reader, Result};
+use super::reader::{Result, TableReader, TableValue};
 use super::{Text, with_text};
 use crate::keys::inventory::{ADDRESS, FILE, GATEWAY, HOST, KEY, NAME};
 
@@ -51,8 +51,8 @@ pub fn parse_inventory(
     text: Text<'_>,
     check: impl Fn(&str) -> std::result::Result<(), String>,
 ) -> Result<Vec<Listed>> {
-    let document = Document::parse(text.name, text.toml, &[])?;
-    let root = Reader::root(&document, &FILE)?;
+    let document = SourceTree::parse(text.name, text.toml, &[])?;
+    let root = TableReader::root(&document, &FILE)?;
     let tables = root.any_tables("gateway")?;
     if tables.is_empty() {
         return Err(document.whole_file_error("no gateway; write [[gateway]] with name and address"));
@@ -84,7 +84,7 @@ pub fn parse_inventory(
 }
 
 /// A text with at least one character and at most so many bytes.
-pub(super) fn text_of(item: &Item<'_>, max: usize) -> std::result::Result<String, FileError> {
+pub(super) fn text_of(item: &TableValue<'_>, max: usize) -> std::result::Result<String, FileError> {
     let text = item.string()?;
     match text.len() {
         0 => Err(item.error("empty")),

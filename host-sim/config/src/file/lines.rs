@@ -3,7 +3,7 @@
 use proto_core::config::{ConfigErrorKind, Parity, PortKey, Rs485, check_bitrate, check_cycle};
 use proto_core::time::Duration;
 
-use super::reader::{Reader, Result};
+use super::reader::{Result, TableReader};
 use crate::keys::gateway::{BAUD, BITRATE, CYCLE, IDLE_GAP, PARITY, STOP_BITS, TURNAROUND};
 
 /// The words of `parity`.
@@ -11,19 +11,19 @@ pub(crate) const PARITIES: [(&str, Parity); 3] =
     [("none", Parity::None), ("even", Parity::Even), ("odd", Parity::Odd)];
 
 /// The settings of a serial line, within their ranges.
-pub(super) fn read_line(port: &Reader<'_>) -> Result<Rs485> {
+pub(super) fn read_line(port: &TableReader<'_>) -> Result<Rs485> {
     let mut line = read_characters(port)?;
     (line.idle_gap, line.turnaround) = (port.time_or(&IDLE_GAP)?, port.time_or(&TURNAROUND)?);
     read_times(port, line)
 }
 
 /// The same of a line of Modbus RTU, which has the standard's silences by default.
-pub(super) fn read_rtu_line(port: &Reader<'_>, is_master: bool) -> Result<Rs485> {
+pub(super) fn read_rtu_line(port: &TableReader<'_>, is_master: bool) -> Result<Rs485> {
     let line = read_characters(port)?;
     read_times(port, if is_master { line.with_rtu_turnaround() } else { line.with_rtu_silence() })
 }
 
-fn read_characters(port: &Reader<'_>) -> Result<Rs485> {
+fn read_characters(port: &TableReader<'_>) -> Result<Rs485> {
     Ok(Rs485 {
         baud: port.integer_or(&BAUD)?,
         parity: port.word_or(&PARITY, &PARITIES)?,
@@ -32,20 +32,20 @@ fn read_characters(port: &Reader<'_>) -> Result<Rs485> {
     })
 }
 
-fn read_times(port: &Reader<'_>, mut line: Rs485) -> Result<Rs485> {
+fn read_times(port: &TableReader<'_>, mut line: Rs485) -> Result<Rs485> {
     line.idle_gap = port.time(&IDLE_GAP)?.unwrap_or(line.idle_gap);
     line.turnaround = port.time(&TURNAROUND)?.unwrap_or(line.turnaround);
     line.check().map_err(|(key, kind)| refused(port, key, kind))?;
     Ok(line)
 }
 
-pub(super) fn read_bitrate(port: &Reader<'_>) -> Result<u32> {
+pub(super) fn read_bitrate(port: &TableReader<'_>) -> Result<u32> {
     let bitrate = port.integer_or(&BITRATE)?;
     check_bitrate(bitrate).map_err(|kind| refused(port, PortKey::Bitrate, kind))?;
     Ok(bitrate)
 }
 
-pub(super) fn read_cycle(port: &Reader<'_>) -> Result<Duration> {
+pub(super) fn read_cycle(port: &TableReader<'_>) -> Result<Duration> {
     let cycle = port.time_or(&CYCLE)?;
     check_cycle(cycle).map_err(|kind| refused(port, PortKey::Cycle, kind))?;
     Ok(cycle)
@@ -75,7 +75,7 @@ pub(super) fn key_name(key: PortKey) -> &'static str {
     }
 }
 
-fn refused(port: &Reader<'_>, key: PortKey, kind: ConfigErrorKind) -> super::FileError {
+fn refused(port: &TableReader<'_>, key: PortKey, kind: ConfigErrorKind) -> super::FileError {
     match port.optional(key_name(key)) {
         Some(item) => item.error(kind),
         None => port.error(kind),

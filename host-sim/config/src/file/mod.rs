@@ -44,8 +44,8 @@ pub use sparkplug::{ReportRule, SparkplugFile, load_sparkplug, parse_sparkplug};
 use super::device::{AnyRecipe, DeviceRecipe};
 use super::keys;
 use super::sim::SimConfig;
-use document::Document;
-use reader::{Item, Reader, Result};
+use document::SourceTree;
+use reader::{Result, TableReader, TableValue};
 use recipes::{FileRecipe, Flavour};
 
 /// A file of either kind.
@@ -112,7 +112,7 @@ pub fn load_frames(path: &Path, overrides: &[String]) -> Result<Vec<Option<Devic
 /// # Errors
 /// The first mistake, with its place.
 pub fn parse(text: Text<'_>, overrides: &[String]) -> Result<Config> {
-    let document = Document::parse(text.name, text.toml, overrides)?;
+    let document = SourceTree::parse(text.name, text.toml, overrides)?;
     match kind_of(&document)? {
         Flavour::Gateway => gateway::read(&document).map(Config::Gateway),
         Flavour::Controller => {
@@ -127,7 +127,7 @@ pub fn parse(text: Text<'_>, overrides: &[String]) -> Result<Config> {
 /// # Errors
 /// The first mistake, with its place.
 pub fn parse_gateway(text: Text<'_>, overrides: &[String]) -> Result<Box<GatewayConfig>> {
-    let document = Document::parse(text.name, text.toml, overrides)?;
+    let document = SourceTree::parse(text.name, text.toml, overrides)?;
     if let Ok(Flavour::Controller) = kind_of(&document)
         && has_own_section(&document)
     {
@@ -143,7 +143,7 @@ pub fn parse_gateway(text: Text<'_>, overrides: &[String]) -> Result<Box<Gateway
 /// # Errors
 /// The first mistake, with its place.
 pub fn parse_controller(text: Text<'_>, overrides: &[String]) -> Result<SimConfig> {
-    let document = Document::parse(text.name, text.toml, overrides)?;
+    let document = SourceTree::parse(text.name, text.toml, overrides)?;
     if let Ok(Flavour::Gateway) = kind_of(&document) {
         return Err(document.whole_file_error(
             "this is a gateway file, not a controller file; run it with host-sim gateway -c FILE",
@@ -171,13 +171,13 @@ pub fn parse_frames(text: Text<'_>, overrides: &[String]) -> Result<Vec<Option<D
 }
 
 fn read_recipes(text: Text<'_>, overrides: &[String]) -> Result<Vec<FileRecipe>> {
-    let document = Document::parse(text.name, text.toml, overrides)?;
+    let document = SourceTree::parse(text.name, text.toml, overrides)?;
     let flavour = kind_of(&document)?;
     let keys = match flavour {
         Flavour::Gateway => &keys::top::GATEWAY,
         Flavour::Controller => &keys::top::CONTROLLER,
     };
-    let root = Reader::root(&document, keys).map_err(|error| name_kind(&document, error))?;
+    let root = TableReader::root(&document, keys).map_err(|error| name_kind(&document, error))?;
     recipes::read_all(&root, flavour).map_err(|error| name_kind(&document, error))
 }
 
@@ -190,7 +190,7 @@ pub fn error_at(path: &Path, overrides: &[String], key: &[&str], message: impl T
 /// Same as [`error_at`], in a text.
 pub fn error_in(text: Text<'_>, overrides: &[String], key: &[&str], message: impl ToString) -> FileError {
     let message = message.to_string();
-    match Document::parse(text.name, text.toml, overrides) {
+    match SourceTree::parse(text.name, text.toml, overrides) {
         Ok(document) => match document.find(key) {
             Some(at) => document.error(at, &key.join("."), message.as_str()),
             None => document.whole_file_error(format!("{}: {message}", key.join("."))),
@@ -216,7 +216,7 @@ pub fn with_text<T>(path: &Path, read: impl FnOnce(Text<'_>) -> Result<T>) -> Re
 }
 
 /// A gateway file has a `[controller]`. A controller file has not, and may leave out all sections of its own.
-fn kind_of(document: &Document) -> Result<Flavour> {
+fn kind_of(document: &SourceTree) -> Result<Flavour> {
     match (document.root.get("controller").is_some(), has_own_section(document)) {
         (true, false) => Ok(Flavour::Gateway),
         (false, _) => Ok(Flavour::Controller),
@@ -228,19 +228,19 @@ fn kind_of(document: &Document) -> Result<Flavour> {
 }
 
 /// Whether it has a section that only controller files have.
-fn has_own_section(document: &Document) -> bool {
+fn has_own_section(document: &SourceTree) -> bool {
     ["listen", "robot", "initial", "program"].iter().any(|key| document.root.get(key).is_some())
 }
 
 /// A mistake in a file of which nothing but the missing `[controller]` says that it is a controller's.
-fn name_kind(document: &Document, mut error: FileError) -> FileError {
+fn name_kind(document: &SourceTree, mut error: FileError) -> FileError {
     if document.root.get("controller").is_none() && !has_own_section(document) {
         error.message += " (without [controller] it is read as a controller file; a gateway file has that)";
     }
     error
 }
 
-fn known_dialect<'a>(item: &Item<'_>, name: &'a str) -> Result<&'a str> {
+fn known_dialect<'a>(item: &TableValue<'_>, name: &'a str) -> Result<&'a str> {
     match Dialect::named(name) {
         Some(_) => Ok(name),
         None => {

@@ -6,14 +6,14 @@
 
 use proto_core::config::{DeviceFrame, ExchangeError, ExchangeKey, register_bits};
 use proto_core::device::Carrier;
-use proto_core::modbus::rtu::{self, BROADCAST, Operation};
+use proto_core::modbus::rtu::{BROADCAST, Operation, Table};
 use proto_core::sysvar::Direction;
 
 use super::coils;
 use super::device::FieldReader;
 use super::encoding::refuse;
 use super::exchanges::{self, AskTiming, FileExchange};
-use super::reader::{Item, Reader, Result};
+use super::reader::{Result, TableReader, TableValue};
 use super::recipes::{FileField, FileFrame, FilePart};
 use crate::device::ExchangeKind;
 use crate::keys::{self, exchange};
@@ -53,27 +53,6 @@ pub fn function_name(operation: &Operation) -> &'static str {
     FUNCTIONS.iter().find(|(_, known, _)| *known == code).map_or("", |(name, ..)| name)
 }
 
-/// What a block of a slave holds.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Table {
-    Coils,
-    DiscreteInputs,
-    HoldingRegisters,
-    InputRegisters,
-}
-
-impl Table {
-    /// As the protocol has it.
-    fn on_line(self) -> rtu::Table {
-        match self {
-            Self::Coils => rtu::Table::Coils,
-            Self::DiscreteInputs => rtu::Table::DiscreteInputs,
-            Self::HoldingRegisters => rtu::Table::HoldingRegisters,
-            Self::InputRegisters => rtu::Table::InputRegisters,
-        }
-    }
-}
-
 /// The words of `table`.
 pub(crate) const TABLES: [(&str, Table); 4] = [
     ("coils", Table::Coils),
@@ -83,7 +62,7 @@ pub(crate) const TABLES: [(&str, Table); 4] = [
 ];
 
 /// The exchanges of a master.
-pub(super) fn read_master(recipe: &Reader<'_>) -> Result<Vec<FileExchange>> {
+pub(super) fn read_master(recipe: &TableReader<'_>) -> Result<Vec<FileExchange>> {
     let exchanges = recipe.any_tables("exchange")?;
     if exchanges.is_empty() {
         return Err(recipe.error("a recipe of a Modbus master needs an exchange, [[recipe.exchange]]"));
@@ -93,7 +72,7 @@ pub(super) fn read_master(recipe: &Reader<'_>) -> Result<Vec<FileExchange>> {
 }
 
 /// The blocks of a slave.
-pub(super) fn read_slave(recipe: &Reader<'_>) -> Result<Vec<FileExchange>> {
+pub(super) fn read_slave(recipe: &TableReader<'_>) -> Result<Vec<FileExchange>> {
     let address =
         recipe.integer_needed(&keys::recipe::ADDRESS, "the gateway's own address on the line, 1..=247")?;
     let blocks = recipe.any_tables("block")?;
@@ -103,7 +82,7 @@ pub(super) fn read_slave(recipe: &Reader<'_>) -> Result<Vec<FileExchange>> {
     blocks.iter().map(|block| read_block(block, address)).collect()
 }
 
-fn read_exchange(table: &Reader<'_>, names: &[Option<String>]) -> Result<FileExchange> {
+fn read_exchange(table: &TableReader<'_>, names: &[Option<String>]) -> Result<FileExchange> {
     let all = keys::names(exchange::OF_MODBUS.keys());
     table.check_names(&all, exchange::OF_MODBUS.place, |_| false)?;
     let slave = table.required("slave", "the slave's address, 1..=247, or 0 to write to all of them")?;
@@ -192,7 +171,7 @@ fn read_exchange(table: &Reader<'_>, names: &[Option<String>]) -> Result<FileExc
     })
 }
 
-fn read_block(table: &Reader<'_>, peer: u8) -> Result<FileExchange> {
+fn read_block(table: &TableReader<'_>, peer: u8) -> Result<FileExchange> {
     table.check_names(&keys::names(exchange::BLOCK.keys()), exchange::BLOCK.place, |_| false)?;
     let holds = table.required("table", "coils, discrete-inputs, holding-registers or input-registers")?;
     let holds = holds.choice(&TABLES)?;
@@ -237,10 +216,10 @@ fn read_block(table: &Reader<'_>, peer: u8) -> Result<FileExchange> {
 }
 
 /// The address of the first register or coil. Manuals' numbers of six digits are no addresses.
-fn read_first(item: &Item<'_>, table: Table) -> Result<u16> {
+fn read_first(item: &TableValue<'_>, table: Table) -> Result<u16> {
     item.integer(exchange::ADDRESS.integers()).map_err(|mut error| {
         let number = item.as_integer().and_then(|number| u32::try_from(number).ok());
-        if let Some(address) = number.and_then(|number| table.on_line().address_of_number(number)) {
+        if let Some(address) = number.and_then(|number| table.address_of_number(number)) {
             error.message += &format!("; on the line, what a manual calls so has the address {address}");
         }
         error
@@ -248,7 +227,7 @@ fn read_first(item: &Item<'_>, table: Table) -> Result<u16> {
 }
 
 /// Who writes the block: a master, whose values go to the robot, or the gateway.
-fn direction_of(block: &Reader<'_>, holds: Table) -> Result<Direction> {
+fn direction_of(block: &TableReader<'_>, holds: Table) -> Result<Direction> {
     let list = block.required("fields", "the list of the block's fields")?;
     let mut found: Option<Direction> = None;
     for item in list.array("of fields")?.iter().filter(|item| item.is_table()) {
@@ -282,7 +261,7 @@ fn direction_of(block: &Reader<'_>, holds: Table) -> Result<Direction> {
 }
 
 /// By name or by number.
-fn read_function(table: &Reader<'_>) -> Result<Function> {
+fn read_function(table: &TableReader<'_>) -> Result<Function> {
     let item = table.required("function", "such as \"read-input-registers\", or its number, 4")?;
     let names = FUNCTIONS.map(|(name, _, function)| (name, function));
     if item.as_string().is_some() {
@@ -298,13 +277,13 @@ fn read_function(table: &Reader<'_>) -> Result<Function> {
 
 /// Fields, and the registers or coils that they are.
 struct List<'a> {
-    item: Item<'a>,
+    item: TableValue<'a>,
     part: FilePart,
     count: u16,
 }
 
 impl<'a> List<'a> {
-    fn read(table: &Reader<'a>, key: &str, direction: Direction, is_coils: bool) -> Result<Self> {
+    fn read(table: &TableReader<'a>, key: &str, direction: Direction, is_coils: bool) -> Result<Self> {
         let what = if is_coils { "the list of the coils" } else { "the list of the fields in the registers" };
         let item = table.required(key, what)?;
         let (fields, count) = match is_coils {
@@ -344,8 +323,8 @@ impl<'a> List<'a> {
 }
 
 fn read_registers(
-    table: &Reader<'_>,
-    list: &Item<'_>,
+    table: &TableReader<'_>,
+    list: &TableValue<'_>,
     direction: Direction,
 ) -> Result<(Vec<FileField>, usize)> {
     let mut reader = FieldReader::of_registers(table, direction)?;
@@ -363,7 +342,7 @@ fn read_registers(
 
 /// Counts and addresses that the function allows.
 fn check(
-    table: &Reader<'_>,
+    table: &TableReader<'_>,
     operation: &Operation,
     read: &Option<List<'_>>,
     write: &Option<List<'_>>,

@@ -4,9 +4,9 @@ use std::net::Ipv4Addr;
 
 use proto_core::config::Network;
 
-use super::reader::{Item, Reader, Result};
+use super::reader::{Result, TableReader, TableValue};
 
-pub(super) fn read(table: &Reader<'_>) -> Result<Network> {
+pub(super) fn read(table: &TableReader<'_>) -> Result<Network> {
     let item = table
         .required("address", "the board's IPv4 address and prefix length, such as \"192.168.12.20/24\"")?;
     let text = item.string()?;
@@ -34,7 +34,7 @@ pub(super) fn check_ipv4(text: &str) -> std::result::Result<(), String> {
     Ok(())
 }
 
-fn host(item: &Item<'_>) -> Result<Ipv4Addr> {
+fn host(item: &TableValue<'_>) -> Result<Ipv4Addr> {
     let text = item.string()?;
     text.parse().map_err(|_| item.error(format!("{text:?} is not an IPv4 address, such as \"192.168.12.1\"")))
 }

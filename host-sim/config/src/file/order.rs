@@ -4,7 +4,7 @@
 //! it is to follow. The gateway hands a whole cycle over at once, in this order.
 
 use super::names::did_you_mean;
-use super::reader::{Reader, Result, Spot};
+use super::reader::{Result, Spot, TableReader};
 use super::recipes::FileFrame;
 use crate::keys::Key;
 use crate::keys::recipe::{AFTER, FRAME_NAME};
@@ -20,7 +20,7 @@ pub(super) struct FrameOrder {
 }
 
 impl FrameOrder {
-    pub(super) fn read(frame: &Reader<'_>) -> Result<Self> {
+    pub(super) fn read(frame: &TableReader<'_>) -> Result<Self> {
         let read = |key: &Key| {
             let Some(item) = frame.optional(key.name) else { return Ok(None) };
             let name = item.string()?;

@@ -1,8 +1,8 @@
-//! Typed access to a [`Document`]: every error has the place and the whole key.
+//! Typed access to a [`SourceTree`]: every error has the place and the whole key.
 
 use std::ops::RangeInclusive;
 
-use super::document::{At, Document, Node, Table, Value};
+use super::document::{At, SourceTree, TreeNode, TreeTable, TreeValue};
 use super::error::FileError;
 use super::names::{did_you_mean, meant_key};
 use crate::keys::{self, Key, Need};
@@ -18,30 +18,30 @@ pub(super) struct Spot {
 }
 
 impl Spot {
-    pub(super) fn error(&self, document: &Document, message: impl ToString) -> FileError {
+    pub(super) fn error(&self, document: &SourceTree, message: impl ToString) -> FileError {
         document.error(self.at, &self.key, message.to_string())
     }
 }
 
 /// A table whose keys have been checked against those allowed.
 #[derive(Clone)]
-pub(super) struct Reader<'a> {
-    pub(super) document: &'a Document,
+pub(super) struct TableReader<'a> {
+    pub(super) document: &'a SourceTree,
     /// The table itself.
     pub(super) spot: Spot,
-    table: &'a Table,
+    table: &'a TreeTable,
 }
 
 /// One value.
 #[derive(Clone)]
-pub(super) struct Item<'a> {
-    document: &'a Document,
+pub(super) struct TableValue<'a> {
+    document: &'a SourceTree,
     pub(super) spot: Spot,
-    node: &'a Node,
+    node: &'a TreeNode,
 }
 
-impl<'a> Reader<'a> {
-    pub(super) fn root(document: &'a Document, table: &keys::Table) -> Result<Self> {
+impl<'a> TableReader<'a> {
+    pub(super) fn root(document: &'a SourceTree, table: &keys::KeyTable) -> Result<Self> {
         let spot = Spot { at: At::File(0), key: String::new() };
         let reader = Self { document, spot, table: &document.root };
         reader.check(table)?;
@@ -49,7 +49,7 @@ impl<'a> Reader<'a> {
     }
 
     /// Refuses a key that the table does not have, or not beside the word of the key that its cases depend on.
-    pub(super) fn check(&self, table: &keys::Table) -> Result<()> {
+    pub(super) fn check(&self, table: &keys::KeyTable) -> Result<()> {
         let by = table.by().and_then(|by| Some((by, self.optional(by)?.as_string()?)));
         match by {
             Some((by, word)) if is_word(table, by, word) => {
@@ -94,30 +94,30 @@ impl<'a> Reader<'a> {
     }
 
     /// The value of `key`, if it is present.
-    pub(super) fn optional(&self, key: &str) -> Option<Item<'a>> {
+    pub(super) fn optional(&self, key: &str) -> Option<TableValue<'a>> {
         let entry = self.table.get(key)?;
         // An array of tables has no place of its own; its values do.
         let spot = Spot { at: entry.node.at, key: self.path(key) };
-        Some(Item { document: self.document, spot, node: &entry.node })
+        Some(TableValue { document: self.document, spot, node: &entry.node })
     }
 
     /// The value of `key`, which must be present; `what` says what it should be.
-    pub(super) fn required(&self, key: &str, what: &str) -> Result<Item<'a>> {
+    pub(super) fn required(&self, key: &str, what: &str) -> Result<TableValue<'a>> {
         self.optional(key).ok_or_else(|| self.error(format!("{key} is missing; {what}")))
     }
 
     /// Every entry, in file order, with the place of its key.
-    pub(super) fn entries(&self) -> impl Iterator<Item = (&'a str, Spot, Item<'a>)> {
+    pub(super) fn entries(&self) -> impl Iterator<Item = (&'a str, Spot, TableValue<'a>)> {
         self.table.entries.iter().map(|entry| {
             let key = self.path(&entry.key);
             let spot = Spot { at: entry.node.at, key: key.clone() };
-            let item = Item { document: self.document, spot, node: &entry.node };
+            let item = TableValue { document: self.document, spot, node: &entry.node };
             (entry.key.as_str(), Spot { at: entry.at, key }, item)
         })
     }
 
     /// The tables of the array `key`, with any keys, each with its name or its number.
-    pub(super) fn any_tables(&self, key: &str) -> Result<Vec<Reader<'a>>> {
+    pub(super) fn any_tables(&self, key: &str) -> Result<Vec<TableReader<'a>>> {
         let Some(item) = self.optional(key) else { return Ok(Vec::new()) };
         let items = item.array(&format!("of tables, written [[{key}]]"))?;
         items.iter().map(|item| item.named_table(key, &self.spot.key)).collect()
@@ -189,7 +189,7 @@ impl<'a> Reader<'a> {
     }
 }
 
-impl<'a> Item<'a> {
+impl<'a> TableValue<'a> {
     pub(super) fn error(&self, message: impl ToString) -> FileError {
         self.spot.error(self.document, message)
     }
@@ -205,7 +205,7 @@ impl<'a> Item<'a> {
 
     pub(super) fn string(&self) -> Result<&'a str> {
         match &self.node.value {
-            Value::Str(text) => Ok(text),
+            TreeValue::Str(text) => Ok(text),
             _ => Err(self.wrong_kind("a string")),
         }
     }
@@ -213,14 +213,14 @@ impl<'a> Item<'a> {
     /// The string, if it is one.
     pub(super) fn as_string(&self) -> Option<&'a str> {
         match &self.node.value {
-            Value::Str(text) => Some(text),
+            TreeValue::Str(text) => Some(text),
             _ => None,
         }
     }
 
     pub(super) fn bool(&self) -> Result<bool> {
         match self.node.value {
-            Value::Bool(value) => Ok(value),
+            TreeValue::Bool(value) => Ok(value),
             _ => Err(self.wrong_kind("true or false")),
         }
     }
@@ -228,7 +228,7 @@ impl<'a> Item<'a> {
     /// The value as true or false, if it is a bool.
     pub(super) fn as_bool(&self) -> Option<bool> {
         match self.node.value {
-            Value::Bool(value) => Some(value),
+            TreeValue::Bool(value) => Some(value),
             _ => None,
         }
     }
@@ -236,7 +236,7 @@ impl<'a> Item<'a> {
     /// The integer, if it is one.
     pub(super) fn as_integer(&self) -> Option<i64> {
         match self.node.value {
-            Value::Int(Ok(value)) => Some(value),
+            TreeValue::Int(Ok(value)) => Some(value),
             _ => None,
         }
     }
@@ -258,12 +258,12 @@ impl<'a> Item<'a> {
             Err(self.error(format!("{shown} is out of range; allowed: {}..={}", range.start(), range.end())))
         };
         match &self.node.value {
-            Value::Int(Ok(value)) if range.contains(value) => match T::try_from(*value) {
+            TreeValue::Int(Ok(value)) if range.contains(value) => match T::try_from(*value) {
                 Ok(value) => Ok(value),
                 Err(_) => refused(&value.to_string()),
             },
-            Value::Int(Ok(value)) => refused(&value.to_string()),
-            Value::Int(Err(text)) => refused(text),
+            TreeValue::Int(Ok(value)) => refused(&value.to_string()),
+            TreeValue::Int(Err(text)) => refused(text),
             _ => Err(self.no_integer(&format!("{}..={}", range.start(), range.end()))),
         }
     }
@@ -280,10 +280,10 @@ impl<'a> Item<'a> {
     /// Any finite number.
     pub(super) fn number(&self) -> Result<f64> {
         match &self.node.value {
-            Value::Int(Ok(value)) => Ok(*value as f64),
-            Value::Int(Err(text)) => Err(self.error(format!("{text} is out of range"))),
-            Value::Float(value) if value.is_finite() => Ok(*value),
-            Value::Float(value) => Err(self.error(format!("expected a finite number, found {value}"))),
+            TreeValue::Int(Ok(value)) => Ok(*value as f64),
+            TreeValue::Int(Err(text)) => Err(self.error(format!("{text} is out of range"))),
+            TreeValue::Float(value) if value.is_finite() => Ok(*value),
+            TreeValue::Float(value) => Err(self.error(format!("expected a finite number, found {value}"))),
             _ => Err(self.wrong_kind("a number")),
         }
     }
@@ -297,8 +297,8 @@ impl<'a> Item<'a> {
         }
     }
 
-    pub(super) fn array(&self, hint: &str) -> Result<Vec<Item<'a>>> {
-        let Value::Array(items) = &self.node.value else {
+    pub(super) fn array(&self, hint: &str) -> Result<Vec<TableValue<'a>>> {
+        let TreeValue::Array(items) = &self.node.value else {
             return Err(self.wrong_kind(&format!("an array {hint}")));
         };
         Ok(items
@@ -306,42 +306,44 @@ impl<'a> Item<'a> {
             .enumerate()
             .map(|(index, node)| {
                 let spot = Spot { at: node.at, key: format!("{}[{}]", self.spot.key, index + 1) };
-                Item { document: self.document, spot, node }
+                TableValue { document: self.document, spot, node }
             })
             .collect())
     }
 
     pub(super) fn is_integer(&self) -> bool {
-        matches!(self.node.value, Value::Int(_))
+        matches!(self.node.value, TreeValue::Int(_))
     }
 
     pub(super) fn is_table(&self) -> bool {
-        matches!(self.node.value, Value::Table(_))
+        matches!(self.node.value, TreeValue::Table(_))
     }
 
     /// A table with the keys of its kind.
-    pub(super) fn table(&self, table: &keys::Table) -> Result<Reader<'a>> {
+    pub(super) fn table(&self, table: &keys::KeyTable) -> Result<TableReader<'a>> {
         let reader = self.any_table()?;
         reader.check(table)?;
         Ok(reader)
     }
 
     /// A table with any keys.
-    pub(super) fn any_table(&self) -> Result<Reader<'a>> {
+    pub(super) fn any_table(&self) -> Result<TableReader<'a>> {
         match &self.node.value {
-            Value::Table(table) => Ok(Reader { document: self.document, spot: self.spot.clone(), table }),
+            TreeValue::Table(table) => {
+                Ok(TableReader { document: self.document, spot: self.spot.clone(), table })
+            }
             _ => Err(self.wrong_kind("a table")),
         }
     }
 
     /// An item of an array of tables, called `KEY.NAME` if it has a name.
-    fn named_table(&self, key: &str, parent: &str) -> Result<Reader<'a>> {
-        let Value::Table(table) = &self.node.value else { return Err(self.wrong_kind("a table")) };
+    fn named_table(&self, key: &str, parent: &str) -> Result<TableReader<'a>> {
+        let TreeValue::Table(table) = &self.node.value else { return Err(self.wrong_kind("a table")) };
         let mut spot = self.spot.clone();
-        if let Some(Value::Str(name)) = table.get("name").map(|entry| &entry.node.value) {
+        if let Some(TreeValue::Str(name)) = table.get("name").map(|entry| &entry.node.value) {
             spot.key = join(parent, &format!("{key}.{}", if name.is_empty() { "\"\"" } else { name }));
         }
-        Ok(Reader { document: self.document, spot, table })
+        Ok(TableReader { document: self.document, spot, table })
     }
 
     /// One of several strings; says as well which of them was probably meant.
@@ -375,7 +377,7 @@ fn is_number(text: &str) -> bool {
 }
 
 /// Whether the key takes the word.
-fn is_word(table: &keys::Table, key: &str, word: &str) -> bool {
+fn is_word(table: &keys::KeyTable, key: &str, word: &str) -> bool {
     let words = table.common.iter().filter(|known| known.name == key).map(|known| known.shape);
     words.into_iter().any(|shape| matches!(shape, keys::Shape::Words(words) if words().contains(&word)))
 }

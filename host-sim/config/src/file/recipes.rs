@@ -21,7 +21,7 @@ use super::framings;
 use super::modbus;
 use super::names::{did_you_mean, meant_variable};
 use super::order::{self, FrameOrder, ORDER_KEYS};
-use super::reader::{Item, Reader, Result, Spot};
+use super::reader::{Result, Spot, TableReader, TableValue};
 use crate::device::AnyRecipe;
 use crate::keys;
 use crate::sim::{SimCanFrame, SimField, SimParts, SimRecipe, SimStreamPart};
@@ -109,7 +109,7 @@ pub(super) enum FileFieldKind {
     /// `again` marks a second use of the bytes of the field before.
     UserInput {
         name: String,
-        written: Written,
+        written: WrittenField,
         to: FileInput,
         again: bool,
         /// The number that tells that the device has restarted.
@@ -117,7 +117,7 @@ pub(super) enum FileFieldKind {
     },
     UserOutput {
         name: String,
-        written: Written,
+        written: WrittenField,
         from: FileOutput,
     },
     Fixed {
@@ -139,12 +139,12 @@ pub(super) enum FileFieldKind {
 
 /// How a field with a value is written.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Written {
+pub(super) struct WrittenField {
     pub(super) encoding: Encoding,
     pub(super) overflow: Overflow,
 }
 
-impl Written {
+impl WrittenField {
     pub(super) fn plain(ty: ScalarType) -> Self {
         Self { encoding: Encoding::scalar(ty), overflow: Overflow::Usual }
     }
@@ -176,7 +176,7 @@ impl FileField {
             FileFieldKind::System(var) => FieldSpec::System(*var),
             FileFieldKind::UserInput { written, to, .. } => {
                 let to = bind(to);
-                let Written { encoding, overflow } = *written;
+                let WrittenField { encoding, overflow } = *written;
                 match written.as_plain() {
                     Some(ty) => FieldSpec::UserInput { ty, to },
                     None => FieldSpec::DeviceInput { encoding, overflow, to },
@@ -188,7 +188,7 @@ impl FileField {
                     FileOutput::Bound(binding) | FileOutput::PortNamed { binding, .. } => *binding,
                     FileOutput::Program => OutputBinding::Constant(0.0),
                 };
-                let Written { encoding, overflow } = *written;
+                let WrittenField { encoding, overflow } = *written;
                 match written.as_plain() {
                     Some(ty) => FieldSpec::UserOutput { ty, from },
                     None => FieldSpec::DeviceOutput { encoding, overflow, from },
@@ -225,7 +225,7 @@ impl FileField {
 }
 
 /// Every recipe of a file, within the limits of any port.
-pub(super) fn read_all(root: &Reader<'_>, flavour: Flavour) -> Result<Vec<FileRecipe>> {
+pub(super) fn read_all(root: &TableReader<'_>, flavour: Flavour) -> Result<Vec<FileRecipe>> {
     let mut recipes: Vec<FileRecipe> = Vec::new();
     let tables = root.any_tables("recipe")?;
     tables.iter().try_for_each(|table| check_keys(table, flavour))?;
@@ -241,7 +241,7 @@ pub(super) fn read_all(root: &Reader<'_>, flavour: Flavour) -> Result<Vec<FileRe
 }
 
 /// The index of the recipe with the name in `item`.
-pub(super) fn find(recipes: &[FileRecipe], item: &Item<'_>) -> Result<usize> {
+pub(super) fn find(recipes: &[FileRecipe], item: &TableValue<'_>) -> Result<usize> {
     let name = item.string()?;
     recipes.iter().position(|recipe| recipe.name == name).ok_or_else(|| {
         let names: Vec<_> = recipes.iter().map(|recipe| format!("{:?}", recipe.name)).collect();
@@ -253,7 +253,7 @@ pub(super) fn find(recipes: &[FileRecipe], item: &Item<'_>) -> Result<usize> {
 }
 
 /// A name that `--bind NAME=DEVICE` and `--set` can carry, of at most 32 bytes.
-pub(super) fn read_name(table: &Reader<'_>) -> Result<(String, Spot)> {
+pub(super) fn read_name(table: &TableReader<'_>) -> Result<(String, Spot)> {
     let item = table.required("name", "the name that ports and tools refer to it by")?;
     let name = item.string()?;
     proto_core::config::check_name(name).map_err(|kind| item.error(kind))?;
@@ -261,7 +261,7 @@ pub(super) fn read_name(table: &Reader<'_>) -> Result<(String, Spot)> {
 }
 
 /// The keys of a recipe depend on its kind.
-fn check_keys(table: &Reader<'_>, flavour: Flavour) -> Result<()> {
+fn check_keys(table: &TableReader<'_>, flavour: Flavour) -> Result<()> {
     let given = table.optional("kind").and_then(|item| item.as_string());
     let kind = KINDS.iter().find(|(name, _)| Some(*name) == given).map(|(_, kind)| *kind);
     if flavour == Flavour::Controller {
@@ -284,7 +284,7 @@ fn check_keys(table: &Reader<'_>, flavour: Flavour) -> Result<()> {
     }
 }
 
-fn read_kind(table: &Reader<'_>, flavour: Flavour) -> Result<RecipeKind> {
+fn read_kind(table: &TableReader<'_>, flavour: Flavour) -> Result<RecipeKind> {
     if flavour == Flavour::Gateway {
         let item = table.required("kind", "\"stream\", \"can\", \"modbus-rtu\" or \"modbus-rtu-slave\"")?;
         return item.choice(&KINDS);
@@ -299,7 +299,7 @@ fn read_kind(table: &Reader<'_>, flavour: Flavour) -> Result<RecipeKind> {
 /// The words of `mode`.
 pub(crate) const MODES: [(&str, Mode); 2] = [("realtime", Mode::Realtime), ("user", Mode::User)];
 
-fn read_mode(table: &Reader<'_>, kind: RecipeKind) -> Result<Mode> {
+fn read_mode(table: &TableReader<'_>, kind: RecipeKind) -> Result<Mode> {
     if !kind.is_modbus() {
         let item =
             table.required("mode", "\"realtime\" (system variables) or \"user\" (fields of your own)")?;
@@ -312,7 +312,7 @@ fn read_mode(table: &Reader<'_>, kind: RecipeKind) -> Result<Mode> {
 }
 
 /// What all exchanges do while a value that they send is stale.
-fn read_on_stale(table: &Reader<'_>, has_output: bool, is_without: bool) -> Result<Option<OnStale>> {
+fn read_on_stale(table: &TableReader<'_>, has_output: bool, is_without: bool) -> Result<Option<OnStale>> {
     let Some(item) = table.optional("on_stale") else { return Ok(None) };
     if has_output {
         return Err(item.error("a recipe with an output part has on_stale there, also for its exchanges"));
@@ -323,7 +323,7 @@ fn read_on_stale(table: &Reader<'_>, has_output: bool, is_without: bool) -> Resu
     bindings::read_on_stale(&item).map(Some)
 }
 
-fn read(table: &Reader<'_>, flavour: Flavour) -> Result<FileRecipe> {
+fn read(table: &TableReader<'_>, flavour: Flavour) -> Result<FileRecipe> {
     let (name, name_spot) = read_name(table)?;
     let kind = read_kind(table, flavour)?;
     let mode = read_mode(table, kind)?;
@@ -366,7 +366,7 @@ fn read(table: &Reader<'_>, flavour: Flavour) -> Result<FileRecipe> {
     Ok(recipe)
 }
 
-fn read_part(item: &Item<'_>, rules: Rules, is_can: bool, flavour: Flavour) -> Result<FilePart> {
+fn read_part(item: &TableValue<'_>, rules: Rules, is_can: bool, flavour: Flavour) -> Result<FilePart> {
     let is_gateway_output = flavour == Flavour::Gateway && rules.direction == Direction::Output;
     let table = item.any_table()?;
     let own = if is_can { keys::recipe::CAN_PART.common } else { keys::recipe::REALTIME.common };
@@ -407,7 +407,7 @@ fn read_part(item: &Item<'_>, rules: Rules, is_can: bool, flavour: Flavour) -> R
 }
 
 /// 11 bits, or 29 with `extended = true`.
-pub(super) fn read_id(frame: &Reader<'_>, item: &Item<'_>) -> Result<CanId> {
+pub(super) fn read_id(frame: &TableReader<'_>, item: &TableValue<'_>) -> Result<CanId> {
     let is_extended = frame.flag(&keys::recipe::EXTENDED)?;
     let limit = if is_extended { "0x1FFFFFFF" } else { "0x7FF" };
     if !item.is_integer() {
@@ -428,7 +428,7 @@ pub(super) fn read_id(frame: &Reader<'_>, item: &Item<'_>) -> Result<CanId> {
     })
 }
 
-pub(super) fn read_bytes(table: &Reader<'_>, key: &str) -> Result<(Vec<u8>, Option<Spot>)> {
+pub(super) fn read_bytes(table: &TableReader<'_>, key: &str) -> Result<(Vec<u8>, Option<Spot>)> {
     let Some(item) = table.optional(key) else { return Ok((Vec::new(), None)) };
     let bytes = item
         .array("of bytes, such as [255, 255]")?
@@ -440,7 +440,7 @@ pub(super) fn read_bytes(table: &Reader<'_>, key: &str) -> Result<(Vec<u8>, Opti
 
 /// The fields of a stream part, or of one CAN frame, behind a head of so many bytes.
 pub(super) fn read_fields(
-    table: &Reader<'_>,
+    table: &TableReader<'_>,
     head: usize,
     rules: Rules,
     flavour: Flavour,

@@ -17,7 +17,7 @@ pub(super) fn frames(
     written: &[DeviceField],
     read: &[DeviceField],
 ) -> [Option<NamedFrame>; 3] {
-    let mut frame = Frame::new(slave, operation.function());
+    let mut frame = FrameBuilder::new(slave, operation.function());
     let request = frame.clone().request(operation, written).seal();
     if slave == BROADCAST {
         return [Some(request), None, None];
@@ -30,7 +30,7 @@ pub(super) fn frames(
         _ => frame.clone().data(operation.read_len(), read),
     };
     let refusal = {
-        frame = Frame::new(slave, operation.function() | 0x80);
+        frame = FrameBuilder::new(slave, operation.function() | 0x80);
         let spec = FieldSpec::UserInput { ty: ScalarType::Byte, to: InputBinding::Unused };
         frame.push("code", spec);
         frame
@@ -40,9 +40,9 @@ pub(super) fn frames(
 
 /// A frame under construction.
 #[derive(Clone)]
-struct Frame(Vec<DeviceField>);
+struct FrameBuilder(Vec<DeviceField>);
 
-impl Frame {
+impl FrameBuilder {
     fn new(slave: u8, function: u8) -> Self {
         let mut frame = Self(Vec::new());
         frame.byte("slave", slave);

@@ -8,8 +8,8 @@ use proto_core::device::{Encoding, Overflow};
 use super::bindings::FileOutput;
 use super::commands::read_range;
 use super::encoding::refuse;
-use super::reader::{Item, Reader, Result, Spot};
-use super::recipes::Written;
+use super::reader::{Result, Spot, TableReader, TableValue};
+use super::recipes::WrittenField;
 use crate::keys::field::OUTSIDE;
 
 /// The words of `outside`.
@@ -19,14 +19,14 @@ const KEYS: [&str; 4] = ["min", "max", "outside", "map"];
 
 /// What stands behind an output field, with the places of their keys.
 pub(super) fn read(
-    table: &Reader<'_>,
-    written: Written,
+    table: &TableReader<'_>,
+    written: WrittenField,
     from: &FileOutput,
 ) -> Result<Vec<(Spot, FieldSpec)>> {
     let (FileOutput::Bound(binding) | FileOutput::PortNamed { binding, .. }) = from else {
         return Ok(Vec::new());
     };
-    let Written { encoding, overflow } = written;
+    let WrittenField { encoding, overflow } = written;
     match *binding {
         OutputBinding::Constant(_) => {
             refuse(table, &KEYS, "allowed only together with from: a constant is what it is")?;
@@ -53,9 +53,9 @@ pub(super) fn read(
 
 /// The limits of a field, whose numbers `number` reads.
 pub(super) fn read_limits(
-    table: &Reader<'_>,
+    table: &TableReader<'_>,
     encoding: &Encoding,
-    number: impl Fn(&Item<'_>) -> Result<f64>,
+    number: impl Fn(&TableValue<'_>) -> Result<f64>,
 ) -> Result<Option<(Spot, FieldSpec)>> {
     let (min, max) = (table.optional("min"), table.optional("max"));
     let Some(first) = min.as_ref().or(max.as_ref()) else {
@@ -64,7 +64,7 @@ pub(super) fn read_limits(
     };
     let spot = first.spot.clone();
     let (lowest, highest) = encoding.range();
-    let read = |item: &Option<Item<'_>>, default| item.as_ref().map_or(Ok(default), &number);
+    let read = |item: &Option<TableValue<'_>>, default| item.as_ref().map_or(Ok(default), &number);
     let (low, high) = (read(&min, lowest)?, read(&max, highest)?);
     if let Some(max) = max.filter(|_| low > high) {
         return Err(max.error(format!("max {high} is below min {low}")));
@@ -73,7 +73,7 @@ pub(super) fn read_limits(
     Ok(Some((spot, FieldSpec::Limits(Limits { low, high, outside }))))
 }
 
-fn read_map(map: &Item<'_>, encoding: &Encoding) -> Result<Vec<(Spot, FieldSpec)>> {
+fn read_map(map: &TableValue<'_>, encoding: &Encoding) -> Result<Vec<(Spot, FieldSpec)>> {
     let mut entries: Vec<(Spot, MapEntry)> = Vec::new();
     for (key, key_spot, item) in map.any_table()?.entries() {
         let keys = "values of the source, such as 1, or ranges of them, such as \"1..100\"";
@@ -88,7 +88,7 @@ fn read_map(map: &Item<'_>, encoding: &Encoding) -> Result<Vec<(Spot, FieldSpec)
 /// Adds the entry of a map for the values that its key names, which no earlier entry has; `keys` says what keys are.
 pub(super) fn add_entry(
     entries: &mut Vec<(Spot, MapEntry)>,
-    (key, key_spot, item): (&str, Spot, &Item<'_>),
+    (key, key_spot, item): (&str, Spot, &TableValue<'_>),
     keys: &str,
     sent: impl FnOnce() -> Result<f64>,
 ) -> Result<()> {
@@ -109,7 +109,7 @@ pub(super) fn add_entry(
 }
 
 /// A number that the field can have.
-fn read_number(item: &Item<'_>, encoding: &Encoding) -> Result<f64> {
+fn read_number(item: &TableValue<'_>, encoding: &Encoding) -> Result<f64> {
     let number = item.number()?;
     check_sent(encoding, number).map_err(|kind| item.error(kind))?;
     Ok(number)

@@ -8,7 +8,7 @@ use proto_core::sysvar::SysVar;
 
 use super::bindings::FileOutput;
 use super::names::{did_you_mean, meant_variable};
-use super::reader::{Item, Result};
+use super::reader::{Result, TableValue};
 use crate::keys::gateway::HEALTH_TABLE;
 
 /// The values of port 2000, which the gateway asks only when a device picks the command.
@@ -20,7 +20,7 @@ pub(super) fn is_source(text: &str) -> bool {
 }
 
 /// Reads the source of an output field.
-pub(super) fn read(item: &Item<'_>, text: &str, scale: f32, offset: f32) -> Result<FileOutput> {
+pub(super) fn read(item: &TableValue<'_>, text: &str, scale: f32, offset: f32) -> Result<FileOutput> {
     if let Some(name) = text.strip_prefix("controller.") {
         if ASKED.contains(&name) {
             return Err(item.error(format!(
@@ -48,7 +48,12 @@ pub(super) fn read(item: &Item<'_>, text: &str, scale: f32, offset: f32) -> Resu
 }
 
 /// `link.modbus.up`, or of a listening port `link.NAME.up`.
-fn read_link(item: &Item<'_>, text: &str, rest: &str, (scale, offset): (f32, f32)) -> Result<FileOutput> {
+fn read_link(
+    item: &TableValue<'_>,
+    text: &str,
+    rest: &str,
+    (scale, offset): (f32, f32),
+) -> Result<FileOutput> {
     let Some((name, "up")) = rest.rsplit_once('.') else {
         return Err(
             item.error(format!("{text:?} is not known of a link; write for example \"link.modbus.up\""))
@@ -61,7 +66,7 @@ fn read_link(item: &Item<'_>, text: &str, rest: &str, (scale, offset): (f32, f32
     Ok(FileOutput::PortNamed { name: name.to_owned(), spot: item.spot.clone(), binding })
 }
 
-fn read_value(item: &Item<'_>, name: &str) -> Result<PortValue> {
+fn read_value(item: &TableValue<'_>, name: &str) -> Result<PortValue> {
     PortValue::named(name).ok_or_else(|| {
         let names = PortValue::NAMES.map(|(name, _)| name);
         let meant = did_you_mean(name, names.into_iter());
@@ -100,7 +105,7 @@ pub(super) fn of_port(
 }
 
 /// Reads the variables that tell a port's health.
-pub(super) fn read_health(item: &Item<'_>) -> Result<PortHealth> {
+pub(super) fn read_health(item: &TableValue<'_>) -> Result<PortHealth> {
     let table = item.table(&HEALTH_TABLE)?;
     let mut health = PortHealth::NONE;
     for (name, value) in PortValue::NAMES {

@@ -8,9 +8,9 @@ use std::path::{Path, PathBuf};
 use proto_core::sysvar::{Direction, VarRange};
 use proto_core::time::Duration;
 
-use super::document::Document;
+use super::document::SourceTree;
 use super::inventory::text_of;
-use super::reader::{Item, Reader, Result};
+use super::reader::{Result, TableReader, TableValue};
 use super::{Text, with_text};
 use crate::keys::Key;
 use crate::keys::sparkplug::{
@@ -91,15 +91,15 @@ pub fn parse_sparkplug(
     text: Text<'_>,
     check: impl Fn(&str) -> std::result::Result<(), String>,
 ) -> Result<SparkplugFile> {
-    let document = Document::parse(text.name, text.toml, &[])?;
-    let root = Reader::root(&document, &FILE)?;
+    let document = SourceTree::parse(text.name, text.toml, &[])?;
+    let root = TableReader::root(&document, &FILE)?;
     let broker = root.required("broker", "a table with address and ca")?.table(&BROKER)?;
     let node = root.required("node", "a table with group and name")?.table(&NODE)?;
     let report = root.optional("report").map(|item| item.table(&REPORT)).transpose()?;
-    let path = |table: &Reader<'_>, key: &Key| {
+    let path = |table: &TableReader<'_>, key: &Key| {
         table.optional(key.name).map(|item| text_of(&item, 4_096).map(PathBuf::from)).transpose()
     };
-    let name = |item: Item<'_>| {
+    let name = |item: TableValue<'_>| {
         let name = text_of(&item, 64)?;
         check(&name).map_err(|why| item.error(format!("{name:?}: {why}")))?;
         Ok(name)
@@ -188,13 +188,13 @@ fn default_of(key: &Key) -> f64 {
     }
 }
 
-fn variables(item: &Item<'_>) -> Result<VarRange> {
+fn variables(item: &TableValue<'_>) -> Result<VarRange> {
     let text = item.string()?;
     VarRange::parse(text).map_err(|error| item.error(error))
 }
 
 /// `HOST`, `HOST:PORT`, `ADDRESS`, `[ADDRESS]:PORT`.
-fn host_and_port(item: &Item<'_>, default: u16) -> Result<(String, u16)> {
+fn host_and_port(item: &TableValue<'_>, default: u16) -> Result<(String, u16)> {
     let text = text_of(item, 255)?;
     let refused = |why: &str| item.error(format!("{text:?} is {why}; write HOST or HOST:PORT"));
     let (host, port) = match text.strip_prefix('[').and_then(|rest| rest.split_once(']')) {

@@ -1,7 +1,7 @@
 //! The sections that only controller files have, and their `[[port]]`.
 
 use super::gateway::{BITRATE, CYCLE, DIALECT, LINE, NAME};
-use super::{Case, Key, Limits, Shape, Table, Text, When, words};
+use super::{Case, Key, KeyTable, Limits, Shape, TextKind, When, words};
 use crate::file::controller::{BUSES, COMMAND_CLIENTS, MODES, POWERS};
 use crate::functions::{Function, ShownState};
 
@@ -20,10 +20,10 @@ pub(crate) const CONTROL: Key = server(
 );
 
 /// `[listen]`.
-pub const LISTEN: Table = Table::of(
+pub const LISTEN: KeyTable = KeyTable::of(
     "listen",
     &[
-        Key::text_of("address", Text::Length(1, 64)).or_word("127.0.0.1").tells("IP address"),
+        Key::text_of("address", TextKind::Length(1, 64)).or_word("127.0.0.1").tells("IP address"),
         COMMAND,
         STATE,
         MODBUS,
@@ -42,13 +42,13 @@ pub(crate) const CLIENTS: Key = Key::words("command_clients", words!(COMMAND_CLI
 );
 
 /// `[robot]`.
-pub const ROBOT: Table = Table::of("robot", &[DIALECT, POWER, MODE, CLIENTS]);
+pub const ROBOT: KeyTable = KeyTable::of("robot", &[DIALECT, POWER, MODE, CLIENTS]);
 
 /// A value of `[initial]`.
 pub const INITIAL: Shape = Shape::Either(&[Shape::Number(Limits::Any), Shape::Bool]);
 
 /// `[functions]`.
-pub const FUNCTIONS: Table = Table::of("functions", &[
+pub const FUNCTIONS: KeyTable = KeyTable::of("functions", &[
     Key::new("inputs", Shape::Map(&Shape::Words(words!(Function::ALL)), 0)).tells(
         "`FDI[1..8]`, `ToolButton[1..2]` or a bit of `BitInputReg[1..2]`, such as `\"BitInputReg[1].0\" = \"stop\"`; \
          functions `\"start\"`, `\"stop\"`, `\"pause\"`, `\"resume\"`, `\"enable\"`, `\"disable\"`, `\"reset\"` \
@@ -59,7 +59,7 @@ pub const FUNCTIONS: Table = Table::of("functions", &[
          `\"enabled\"`, `\"running\"`, `\"paused\"`, `\"error\"`, `\"emergency_stop\"`, `\"remote\"`. Such an output \
          takes no initial value",
     ),
-    Key::text_of("start", Text::Any).tells(
+    Key::text_of("start", TextKind::Any).tells(
         "name of a program of this file; required with the function `\"start\"`, and only with it",
     ),
 ]);
@@ -69,13 +69,13 @@ pub const BUS: Key = Key::words("bus", words!(BUSES))
     .required()
     .tells("`\"rs485\"`, `\"can\"`, `\"udp-server\"` (one at most), `\"tcp-client\"`, `\"udp-client\"`");
 const RECIPE: Key =
-    Key::text_of("recipe", Text::Any).absent("none (idle)").tells("name of a recipe of this file");
-pub(crate) const TO: Key = Key::text_of("to", Text::Pattern("^.+:[0-9]+$"))
+    Key::text_of("recipe", TextKind::Any).absent("none (idle)").tells("name of a recipe of this file");
+pub(crate) const TO: Key = Key::text_of("to", TextKind::Pattern("^.+:[0-9]+$"))
     .required()
     .tells("`\"HOST:PORT\"` (`tcp-client`, `udp-client`)");
 
 /// `[[port]]` of a controller file.
-pub const PORT: Table = Table::of("port of a controller", &[NAME, BUS, RECIPE, CYCLE]).cases(&[
+pub const PORT: KeyTable = KeyTable::of("port of a controller", &[NAME, BUS, RECIPE, CYCLE]).cases(&[
     Case { when: &[When::Is("bus", &["rs485"], &[])], keys: &[LINE] },
     Case { when: &[When::Is("bus", &["can"], &[])], keys: &[&[BITRATE]] },
     Case { when: &[When::Is("bus", &["udp-server"], &[])], keys: &[] },
@@ -83,10 +83,12 @@ pub const PORT: Table = Table::of("port of a controller", &[NAME, BUS, RECIPE, C
 ]);
 
 /// `[[program]]`.
-pub const PROGRAM: Table = Table::of(
+pub const PROGRAM: KeyTable = KeyTable::of(
     "program",
     &[
-        Key::text_of("name", Text::Pattern("^[^,()\"\\r\\n]+$")).required().tells("the name in `run(NAME)`"),
-        Key::text_of("script", Text::Any).required().tells("Rhai"),
+        Key::text_of("name", TextKind::Pattern("^[^,()\"\\r\\n]+$"))
+            .required()
+            .tells("the name in `run(NAME)`"),
+        Key::text_of("script", TextKind::Any).required().tells("Rhai"),
     ],
 );

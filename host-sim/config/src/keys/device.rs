@@ -3,7 +3,7 @@
 use proto_core::device::{Algorithm, MAX_DATA_ID};
 use proto_core::recipe::model::MAX_STREAM_FRAME;
 
-use super::{Case, Key, Shape, Table, Text, When, words};
+use super::{Case, Key, KeyTable, Shape, TextKind, When, words};
 use crate::file::checksums::{CHECKSUM_FORMS, CHECKSUM_ORDERS, DATA_ID_PLACES};
 use crate::file::encoding::{ORDERS, WORD_ORDERS};
 use crate::file::framings::{ESCAPES, FRAMINGS};
@@ -40,7 +40,7 @@ pub const KIND: Key = Key::words("kind", || Algorithm::names().chain(["crc"]).co
      `sum16`, `xor8`, `lrc`; `crc` with its parameters",
 );
 /// The bytes that it covers.
-pub const OVER: Key = Key::text_of("over", Text::Pattern("^[0-9]+\\.\\.[0-9]*$")).or_word("0..").tells(
+pub const OVER: Key = Key::text_of("over", TextKind::Pattern("^[0-9]+\\.\\.[0-9]*$")).or_word("0..").tells(
     "the bytes that it covers: `\"1..7\"` with the last one, or `\"1..\"` up to the checksum. Byte 0 is the first of \
      the frame; the head counts",
 );
@@ -88,8 +88,8 @@ const fn number(name: &'static str) -> Key {
 }
 
 /// The table of a checksum.
-pub const CHECKSUM_TABLE: Table = Table::of("checksum", &[KIND, OVER, AT, ORDER, AS, DATA_ID, DATA_ID_AT])
-    .cases(&[Case {
+pub const CHECKSUM_TABLE: KeyTable =
+    KeyTable::of("checksum", &[KIND, OVER, AT, ORDER, AS, DATA_ID, DATA_ID_AT]).cases(&[Case {
         when: &[When::Is("kind", &["crc"], &[])],
         keys: &[&[WIDTH, POLY, INIT, XOROUT, REFIN, REFOUT]],
     }]);

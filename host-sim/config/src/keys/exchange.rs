@@ -2,7 +2,7 @@
 
 use super::device::WORD_ORDER_OF_REGISTERS;
 use super::recipe::{EXTENDED, HEAD, ID, INPUT_FIELDS, OF_FRAME, OUTPUT_FIELDS, TAIL};
-use super::{Case, HOUR_MS, Key, Limits, Need, Shape, Table, Text, When, field, words};
+use super::{Case, HOUR_MS, Key, KeyTable, Limits, Need, Shape, TextKind, When, field, words};
 use crate::file::modbus::{FUNCTIONS, TABLES};
 
 /// The device that is asked.
@@ -15,7 +15,7 @@ pub const EVERY: Key = Key::millis("every_ms", Limits::AboveZero(HOUR_MS)).is("a
 /// What triggers it.
 pub const ON: Key = Key::new(
     "on",
-    Shape::List(&Shape::Text(Text::Pattern("^(start|change|rising:.+)$")), 1, usize::MAX),
+    Shape::List(&Shape::Text(TextKind::Pattern("^(start|change|rising:.+)$")), 1, usize::MAX),
 )
 .tells(
     "`\"start\"`: asked at the start, and again when the device has started anew; `\"change\"`: when a value of the \
@@ -46,21 +46,22 @@ pub const STOP: Key = Key::bool("stop").tells(
      and is repeated until it is confirmed",
 );
 /// What other exchanges call it.
-pub const NAME: Key =
-    Key::text_of("name", Text::Length(1, 32)).absent("none").is("what `follow` of another exchange calls it");
+pub const NAME: Key = Key::text_of("name", TextKind::Length(1, 32))
+    .absent("none")
+    .is("what `follow` of another exchange calls it");
 /// The exchange before it.
-pub const FOLLOW: Key = Key::text_of("follow", Text::Length(1, 32)).absent("none").is(
+pub const FOLLOW: Key = Key::text_of("follow", TextKind::Length(1, 32)).absent("none").is(
     "the name of an exchange of the recipe: this one is sent after each good answer to that one, as an event",
 );
 /// Where the outcome of an event goes.
-pub const OUTCOME_TABLE: Table = Table::of(
+pub const OUTCOME_TABLE: KeyTable = KeyTable::of(
     "outcome",
     &[
-        Key::text_of("to", Text::Variable)
+        Key::text_of("to", TextKind::Variable)
             .is("becomes what the newest event came to, as a number; see below"),
-        Key::text_of("code_to", Text::Variable)
+        Key::text_of("code_to", TextKind::Variable)
             .is("becomes the code with which the device refused it, such as a Modbus exception, or 0"),
-        Key::text_of("count_to", Text::Variable).is("the number of events that have ended, wrapping"),
+        Key::text_of("count_to", TextKind::Variable).is("the number of events that have ended, wrapping"),
     ],
 );
 /// What the robot is told of events.
@@ -105,22 +106,22 @@ const TIMING_OF_FRAMES: &[Key] = &[
     OUTCOME.beside(ASKED),
 ];
 
-const fn request(table: &'static Table) -> Key {
+const fn request(table: &'static KeyTable) -> Key {
     Key::new("request", Shape::Table(table)).tells("the frame that asks. Needs `every_ms`, `on` or `follow`")
 }
 
-const fn reply(table: &'static Table) -> Key {
+const fn reply(table: &'static KeyTable) -> Key {
     Key::new("reply", Shape::Table(table))
         .tells("the frame that answers. Without a `request` it may come at any time")
 }
 
-const fn refusal(table: &'static Table) -> Key {
+const fn refusal(table: &'static KeyTable) -> Key {
     Key::new("refusal", Shape::Table(table))
         .beside(&["reply"])
         .tells("the frame with which the device refuses the request")
 }
 
-const fn pending(table: &'static Table) -> Key {
+const fn pending(table: &'static KeyTable) -> Key {
     Key::new("pending", Shape::Table(table)).beside(&["reply"]).tells(
         "the frame with which the device says that it is at it, and that its answer follows: the wait for it begins anew, up \
          to 16 times `timeout_ms` behind the request",
@@ -132,16 +133,17 @@ pub const REMOTE: Key = Key::bool("remote").tells("of a request on CAN: it has n
 // A remote request has none.
 const SENT_FIELDS: Key = Key { need: Need::Absent("none"), ..OUTPUT_FIELDS };
 
-pub(crate) const STREAM_REQUEST: Table = frame("stream request", &[HEAD, TAIL, OUTPUT_FIELDS]);
-pub(crate) const STREAM_REPLY: Table =
+pub(crate) const STREAM_REQUEST: KeyTable = frame("stream request", &[HEAD, TAIL, OUTPUT_FIELDS]);
+pub(crate) const STREAM_REPLY: KeyTable =
     frame("stream reply", &[HEAD, TAIL, INPUT_FIELDS, REPLY_TIMEOUT, EXPECT]);
-pub(crate) const CAN_REQUEST: Table = frame("CAN request", &[ID, EXTENDED, SENT_FIELDS, REMOTE]);
-pub(crate) const CAN_REPLY: Table = frame("CAN reply", &[ID, EXTENDED, INPUT_FIELDS, REPLY_TIMEOUT, EXPECT]);
-pub(crate) const STREAM_REFUSAL: Table = frame("stream refusal", &[HEAD, TAIL, INPUT_FIELDS]);
-pub(crate) const CAN_REFUSAL: Table = frame("CAN refusal", &[ID, EXTENDED, INPUT_FIELDS]);
+pub(crate) const CAN_REQUEST: KeyTable = frame("CAN request", &[ID, EXTENDED, SENT_FIELDS, REMOTE]);
+pub(crate) const CAN_REPLY: KeyTable =
+    frame("CAN reply", &[ID, EXTENDED, INPUT_FIELDS, REPLY_TIMEOUT, EXPECT]);
+pub(crate) const STREAM_REFUSAL: KeyTable = frame("stream refusal", &[HEAD, TAIL, INPUT_FIELDS]);
+pub(crate) const CAN_REFUSAL: KeyTable = frame("CAN refusal", &[ID, EXTENDED, INPUT_FIELDS]);
 
-const fn frame(name: &'static str, keys: &'static [Key]) -> Table {
-    Table::of(name, keys).cases(&[Case { when: &[], keys: &[OF_FRAME] }])
+const fn frame(name: &'static str, keys: &'static [Key]) -> KeyTable {
+    KeyTable::of(name, keys).cases(&[Case { when: &[], keys: &[OF_FRAME] }])
 }
 
 /// The frames of an exchange.
@@ -149,7 +151,7 @@ pub(crate) const FRAMES: &[Key] =
     &[request(&STREAM_REQUEST), reply(&STREAM_REPLY), pending(&STREAM_REFUSAL), refusal(&STREAM_REFUSAL)];
 
 /// An exchange of frames on a line.
-pub const OF_STREAM: Table = Table::of(
+pub const OF_STREAM: KeyTable = KeyTable::of(
     "exchange",
     &[
         PEER,
@@ -162,7 +164,7 @@ pub const OF_STREAM: Table = Table::of(
 .at(" of an exchange")
 .cases(&[Case { when: &[], keys: &[TIMING_OF_FRAMES] }]);
 /// An exchange of frames on CAN.
-pub const OF_CAN: Table = Table::of(
+pub const OF_CAN: KeyTable = KeyTable::of(
     "exchange on CAN",
     &[PEER, request(&CAN_REQUEST), reply(&CAN_REPLY), pending(&CAN_REFUSAL), refusal(&CAN_REFUSAL)],
 )
@@ -207,8 +209,8 @@ pub(crate) const READ: Key = read(&Shape::Table(&field::INPUT));
 pub(crate) const WRITE: Key = write(&Shape::Table(&field::OUTPUT));
 
 /// An exchange of Modbus.
-pub const OF_MODBUS: Table =
-    Table::of("exchange of Modbus", &[SLAVE, FUNCTION, ADDRESS]).at(" of an exchange of Modbus").cases(&[
+pub const OF_MODBUS: KeyTable =
+    KeyTable::of("exchange of Modbus", &[SLAVE, FUNCTION, ADDRESS]).at(" of an exchange of Modbus").cases(&[
         Case {
             when: &[When::Is("function", &["read-write-registers"], &[23])],
             keys: &[&[WRITE_ADDRESS, WORD_ORDER_OF_REGISTERS, READ, WRITE], TIMING, OF_REPLY],
@@ -248,8 +250,8 @@ const fn block_fields(item: &'static Shape) -> Key {
 const BLOCK_ADDRESS: Key = ADDRESS.is("the first register or coil");
 
 /// A block of a slave.
-pub const BLOCK: Table =
-    Table::of("block", &[TABLE, BLOCK_ADDRESS, WORD_ORDER_OF_REGISTERS]).at(" of a block").cases(&[
+pub const BLOCK: KeyTable =
+    KeyTable::of("block", &[TABLE, BLOCK_ADDRESS, WORD_ORDER_OF_REGISTERS]).at(" of a block").cases(&[
         Case { when: &[When::Is("table", &["holding-registers"], &[])], keys: &[&[BLOCK_FIELDS]] },
         Case {
             when: &[When::Is("table", &["input-registers"], &[])],

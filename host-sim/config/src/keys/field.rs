@@ -5,7 +5,7 @@ use proto_core::device::{MAX_DIGITS, MAX_IGNORED, MAX_TEXT};
 use proto_core::wire::scalar::ScalarType;
 
 use super::device::{ENDIAN, WORD_ORDER};
-use super::{Case, Key, Limits, Rule, Shape, Table, Text, When, words};
+use super::{Case, Key, KeyTable, Limits, Rule, Shape, TextKind, When, words};
 use crate::file::bindings::OVERFLOWS;
 use crate::file::commands::{BASES, WHENS};
 use crate::file::encoding::OWN_TYPES;
@@ -15,7 +15,7 @@ use crate::file::sendable::OUTSIDES;
 
 /// The name of a field.
 pub const NAME: Key =
-    Key::text_of("name", Text::Any).required().tells("its name in tools; a constant integer needs none");
+    Key::text_of("name", TextKind::Any).required().tells("its name in tools; a constant integer needs none");
 const NAME_IF_ANY: Key = Key { need: super::Need::Absent("none"), ..NAME };
 /// The type of a field.
 pub const TYPE: Key = Key::words("type", || {
@@ -35,7 +35,7 @@ const OWN_WORD_ORDER: Key = WORD_ORDER.absent("of the part").is("the order of it
 /// Some bits of a number.
 pub const BITS: Key = Key::new(
     "bits",
-    Shape::Either(&[Shape::Integer(0, 63), Shape::Text(Text::Pattern("^[0-9]+(\\.\\.[0-9]+)?$"))]),
+    Shape::Either(&[Shape::Integer(0, 63), Shape::Text(TextKind::Pattern("^[0-9]+(\\.\\.[0-9]+)?$"))]),
 )
 .absent("all")
 .tells(
@@ -54,7 +54,7 @@ pub const WIDTH: Key = Key::integer("width", 1, MAX_DIGITS as i64)
     .tells("bytes of `bcd`, 1..=4; characters of `decimal`, 1..=16, or of `hex`, 1..=8");
 const WIDTH_IF_ANY: Key = Key { need: super::Need::Absent("none"), ..WIDTH };
 /// What ends digits.
-pub const UNTIL: Key = Key::text_of("until", Text::Length(1, 1))
+pub const UNTIL: Key = Key::text_of("until", TextKind::Length(1, 1))
     .tells("`decimal` and `hex`: the character behind the field, instead of `width`");
 /// Digits behind the point.
 pub const DECIMALS: Key = Key::integer("decimals", 0, 9).or(0).is("of `decimal`: digits behind the point");
@@ -100,7 +100,7 @@ const MAP_IN: Key = MAP.beside(&["to"]).tells(
 /// What says that there is no value.
 pub const NO_VALUE: Key = Key::new(
     "no_value",
-    Shape::List(&Shape::Either(&[Shape::Number(Limits::Any), Shape::Text(Text::Length(1, NO_TEXT))]), 1, usize::MAX),
+    Shape::List(&Shape::Either(&[Shape::Number(Limits::Any), Shape::Text(TextKind::Length(1, NO_TEXT))]), 1, usize::MAX),
 )
 .beside(&["to"])
 .tells(
@@ -109,7 +109,7 @@ pub const NO_VALUE: Key = Key::new(
      (`fields_without_value`)",
 );
 /// What says whether there is one.
-pub const VALID_TO: Key = Key::text_of("valid_to", Text::VariableOrBit).beside(&["to"]).tells(
+pub const VALID_TO: Key = Key::text_of("valid_to", TextKind::VariableOrBit).beside(&["to"]).tells(
     "input: a bit or a word register that is 1 while the field's newest value was taken, and 0 when it was rejected, had \
      none, or is overdue",
 );
@@ -131,7 +131,7 @@ pub const EQUALS: Key = Key::integer("equals", i32::MIN as i64, u32::MAX as i64)
 pub(crate) const COUNTER_MAX: Key =
     Key::integer("max", 1, u32::MAX as i64).required().is("the highest number of the counter");
 /// `{ max = 14 }`.
-pub const COUNTER_TABLE: Table = Table::of("counter", &[COUNTER_MAX]);
+pub const COUNTER_TABLE: KeyTable = KeyTable::of("counter", &[COUNTER_MAX]);
 /// An alive counter.
 pub const COUNTER: Key =
     Key::new("counter", Shape::Either(&[Shape::Bool, Shape::Table(&COUNTER_TABLE)])).or_bool(false).tells(
@@ -140,7 +140,7 @@ pub const COUNTER: Key =
     );
 
 /// Where a value goes.
-pub const TO: Key = Key::text_of("to", Text::VariableOrBit)
+pub const TO: Key = Key::text_of("to", TextKind::VariableOrBit)
     .tells("input: a variable, such as `\"WordInputReg[1]\"`, or a bit, such as `\"BitInputReg[3].4\"`");
 /// Its factor.
 pub const SCALE: Key = Key::new("scale", Shape::Number(Limits::Any)).or(1);
@@ -151,14 +151,14 @@ pub(crate) const OFFSET_IN: Key = OFFSET.beside(&["to"]).tells("with `to` or `fr
 const SCALE_OUT: Key = Key { beside: &["from"], ..SCALE_IN };
 const OFFSET_OUT: Key = Key { beside: &["from"], ..OFFSET_IN };
 /// Where a value comes from.
-pub const FROM: Key =
-    Key::text_of("from", Text::Source).tells("output: a variable, a bit, or another of the sources below");
+pub const FROM: Key = Key::text_of("from", TextKind::Source)
+    .tells("output: a variable, a bit, or another of the sources below");
 /// A constant that is sent.
 pub const VALUE: Key = Key::new("value", Shape::Number(Limits::Any)).tells("output: a constant");
 
 /// What values pick.
 pub const COMMANDS: Key =
-    Key::new("commands", Shape::Map(&Shape::Text(Text::Length(1, MAX_COMMAND_TEXT)), 1))
+    Key::new("commands", Shape::Map(&Shape::Text(TextKind::Length(1, MAX_COMMAND_TEXT)), 1))
         .tells("input: commands by values, ranges of values, or `rising`, `falling` and `level`, as below");
 /// When a value acts.
 pub const WHEN: Key = Key::words("when", words!(WHENS)).or_word("change").beside(&["commands"]).tells(
@@ -186,7 +186,7 @@ pub(crate) const PAD_COILS: Key = Key { shape: Shape::Integer(1, 2000), ..PAD };
 pub const FILL: Key =
     Key::integer("fill", 0, 255).or(0).beside(&["pad"]).is("with `pad`: the bytes that are sent");
 /// Constant bytes.
-pub const TEXT: Key = Key::text_of("text", Text::Length(1, usize::MAX))
+pub const TEXT: Key = Key::text_of("text", TextKind::Length(1, usize::MAX))
     .tells("instead of a field, `{ text = \"ST,\" }`: constant bytes of ASCII");
 
 /// The width of a text.
@@ -195,13 +195,14 @@ pub const TEXT_WIDTH: Key = Key::integer("width", 1, MAX_TEXT as i64).is(
      end of the frame, but for what stands behind it. A frame that is searched needs a `length` before such a text",
 );
 /// What ends a text.
-pub const TEXT_UNTIL: Key = Key::text_of("until", Text::Length(1, 1)).tells("the character behind the text");
+pub const TEXT_UNTIL: Key =
+    Key::text_of("until", TextKind::Length(1, 1)).tells("the character behind the text");
 /// What fills a text.
-pub const TEXT_FILL: Key = Key::text_of("fill", Text::Length(1, 1)).beside(&["width"]).tells(
+pub const TEXT_FILL: Key = Key::text_of("fill", TextKind::Length(1, 1)).beside(&["width"]).tells(
     "with `width`: the character that stands behind a shorter text. It is taken off, and put there in an output",
 );
 /// The registers of a text.
-pub const TEXT_TO: Key = Key::text_of("to", Text::Variables).tells(
+pub const TEXT_TO: Key = Key::text_of("to", TextKind::Variables).tells(
     "`\"WordInputReg[1..8]\"`: the registers, two characters each, zeros behind the end. A longer text is rejected",
 );
 /// The order of characters in a register.
@@ -211,23 +212,23 @@ pub const TEXT_ORDER: Key = Key::words("order", words!(TEXT_ORDERS))
 const TEXT_ORDER_IN: Key = Key { beside: &["to"], ..TEXT_ORDER };
 /// Where its length goes.
 pub const LENGTH_TO: Key =
-    Key::text_of("length_to", Text::Variable).tells("becomes the number of characters");
+    Key::text_of("length_to", TextKind::Variable).tells("becomes the number of characters");
 /// What counts texts.
-pub const COUNT_TO: Key = Key::text_of("count_to", Text::Variable)
+pub const COUNT_TO: Key = Key::text_of("count_to", TextKind::Variable)
     .tells("the number of frames accepted on the port, wrapping: the same text twice is seen");
 /// Texts that say nothing.
 pub const IGNORE: Key =
-    Key::new("ignore", Shape::List(&Shape::Text(Text::Length(0, MAX_IGNORED - 1)), 0, usize::MAX)).tells(
+    Key::new("ignore", Shape::List(&Shape::Text(TextKind::Length(0, MAX_IGNORED - 1)), 0, usize::MAX)).tells(
         "`[\"NOREAD\", \"?\"]`: texts that say that nothing was read: such a frame shows that the device is there, \
          changes nothing and is counted (`ignored`). `\"\"` is a frame without a text, such as a lone CR LF. Together at most 13 characters; each text after the first takes \
          one more",
     );
 /// The registers that a text is sent from.
-pub const TEXT_FROM: Key = Key::text_of("from", Text::Variables)
+pub const TEXT_FROM: Key = Key::text_of("from", TextKind::Variables)
     .required()
     .tells("in an output: the registers, `\"WordOutputReg[1..8]\"`. A text that does not fit is not sent");
 /// Its length.
-pub const LENGTH_FROM: Key = Key::text_of("length_from", Text::Variable).tells(
+pub const LENGTH_FROM: Key = Key::text_of("length_from", TextKind::Variable).tells(
     "in an output: the register with the number of characters; without it the text ends before the first zero",
 );
 
@@ -312,10 +313,10 @@ const IS_VALUE: &[When] = &[When::Has(&["value"])];
 const TEXT_TYPED: &[When] = &[When::Is("type", &["text"], &[])];
 
 /// A field of a controller's recipe.
-pub const PLAIN: Table = Table::of("field of a controller", &[NAME, PLAIN_TYPE]);
+pub const PLAIN: KeyTable = KeyTable::of("field of a controller", &[NAME, PLAIN_TYPE]);
 
 /// A field that is received, or what stands in its place.
-pub const INPUT: Table = Table::of("input field", &[]).at(" in an input field").rules(RULES).cases(&[
+pub const INPUT: KeyTable = KeyTable::of("input field", &[]).at(" in an input field").rules(RULES).cases(&[
     Case { when: IS_PAD, keys: &[PADDING] },
     Case { when: TEXT_TYPED, keys: &[TEXT_IN] },
     Case { when: IS_LENGTH, keys: &[LENGTHS, WRITTEN] },
@@ -327,36 +328,38 @@ const VALUE_IN: &[Key] = &[TO, COMMANDS, WHEN, BASE, IDLE, SCALE_IN, OFFSET_IN, 
 const OVERFLOW_IN: Key = OVERFLOW.beside(&["to"]);
 
 /// A field that is sent, or what stands in its place.
-pub const OUTPUT: Table = Table::of("output field", &[]).at(" in an output field").rules(RULES).cases(&[
-    Case { when: IS_PAD, keys: &[PADDING] },
-    Case { when: TEXT_TYPED, keys: &[TEXT_OUT] },
-    Case { when: IS_LENGTH, keys: &[LENGTHS, WRITTEN] },
-    Case { when: IS_TEXT, keys: &[CONSTANT_TEXT] },
-    Case { when: IS_VALUE, keys: &[&[NAME_IF_ANY, TYPE], BOUND_OUT, &[OVERFLOW_OUT], WRITTEN] },
-    Case { when: &[], keys: &[NAMED, BOUND_OUT, &[OVERFLOW_OUT], WRITTEN] },
-]);
+pub const OUTPUT: KeyTable =
+    KeyTable::of("output field", &[]).at(" in an output field").rules(RULES).cases(&[
+        Case { when: IS_PAD, keys: &[PADDING] },
+        Case { when: TEXT_TYPED, keys: &[TEXT_OUT] },
+        Case { when: IS_LENGTH, keys: &[LENGTHS, WRITTEN] },
+        Case { when: IS_TEXT, keys: &[CONSTANT_TEXT] },
+        Case { when: IS_VALUE, keys: &[&[NAME_IF_ANY, TYPE], BOUND_OUT, &[OVERFLOW_OUT], WRITTEN] },
+        Case { when: &[], keys: &[NAMED, BOUND_OUT, &[OVERFLOW_OUT], WRITTEN] },
+    ]);
 const OVERFLOW_OUT: Key = OVERFLOW.beside(&["from"]);
 
 /// A coil that is received.
-pub const COIL_IN: Table = Table::of("coil that is read", &[]).at(" of a coil").cases(&[
+pub const COIL_IN: KeyTable = KeyTable::of("coil that is read", &[]).at(" of a coil").cases(&[
     Case { when: IS_PAD, keys: &[COIL_PADDING] },
     Case { when: IS_CONSTANT, keys: &[&[NAME_IF_ANY, EQUALS]] },
     Case { when: &[], keys: &[COIL, VALUE_IN, RULES_IN, &[RESTARTED]] },
 ]);
 
 /// A coil that is sent.
-pub const COIL_OUT: Table = Table::of("coil that is written", &[]).at(" of a coil").rules(RULES).cases(&[
-    Case { when: IS_PAD, keys: &[COIL_PADDING] },
-    Case { when: IS_VALUE, keys: &[&[NAME_IF_ANY], BOUND_OUT] },
-    Case { when: &[], keys: &[COIL, BOUND_OUT] },
-]);
+pub const COIL_OUT: KeyTable =
+    KeyTable::of("coil that is written", &[]).at(" of a coil").rules(RULES).cases(&[
+        Case { when: IS_PAD, keys: &[COIL_PADDING] },
+        Case { when: IS_VALUE, keys: &[&[NAME_IF_ANY], BOUND_OUT] },
+        Case { when: &[], keys: &[COIL, BOUND_OUT] },
+    ]);
 
 const GOES_UP: &[When] = &[When::Has(&["to", "commands", "equals", "length_to", "count_to"])];
 
 const COIL_GOES_UP: &[When] = &[When::Has(&["to", "commands"])];
 
 /// A field in a block that is read or written by its master.
-pub const IN_BLOCK: Table = Table::of("field of a block", &[]).rules(RULES).cases(&[
+pub const IN_BLOCK: KeyTable = KeyTable::of("field of a block", &[]).rules(RULES).cases(&[
     Case { when: IS_PAD, keys: &[PADDING] },
     Case { when: &[When::Is("type", &["text"], &[]), When::Has(&["from"])], keys: &[TEXT_OUT] },
     Case { when: TEXT_TYPED, keys: &[TEXT_IN] },
@@ -368,10 +371,11 @@ pub const IN_BLOCK: Table = Table::of("field of a block", &[]).rules(RULES).case
 ]);
 
 /// A coil in such a block.
-pub const COIL_IN_BLOCK: Table = Table::of("coil of a block", &[]).at(" of a coil").rules(RULES).cases(&[
-    Case { when: IS_PAD, keys: &[COIL_PADDING] },
-    Case { when: IS_CONSTANT, keys: &[&[NAME_IF_ANY, EQUALS]] },
-    Case { when: COIL_GOES_UP, keys: &[COIL, VALUE_IN, RULES_IN] },
-    Case { when: IS_VALUE, keys: &[&[NAME_IF_ANY], BOUND_OUT] },
-    Case { when: &[], keys: &[COIL, BOUND_OUT] },
-]);
+pub const COIL_IN_BLOCK: KeyTable =
+    KeyTable::of("coil of a block", &[]).at(" of a coil").rules(RULES).cases(&[
+        Case { when: IS_PAD, keys: &[COIL_PADDING] },
+        Case { when: IS_CONSTANT, keys: &[&[NAME_IF_ANY, EQUALS]] },
+        Case { when: COIL_GOES_UP, keys: &[COIL, VALUE_IN, RULES_IN] },
+        Case { when: IS_VALUE, keys: &[&[NAME_IF_ANY], BOUND_OUT] },
+        Case { when: &[], keys: &[COIL, BOUND_OUT] },
+    ]);

@@ -3,14 +3,14 @@
 use proto_core::config::{Bus, Echo, MAX_ADDRESS, MAX_LISTEN, PortValue};
 use proto_core::wire::dialect::Dialect;
 
-use super::{Case, HOUR_MS, Key, Limits, Shape, Table, Text, When, words};
+use super::{Case, HOUR_MS, Key, KeyTable, Limits, Shape, TextKind, When, words};
 use crate::file::{gateway::BUSES, lines::PARITIES};
 
 /// The controller's dialect.
 pub const DIALECT: Key = Key::words("dialect", || Dialect::NAMES.to_vec())
     .or_word("v2.3")
     .is("the dialect of the state stream and of Modbus");
-const ADDRESS: Key = Key::text_of("address", Text::Length(1, MAX_ADDRESS)).required().tells(
+const ADDRESS: Key = Key::text_of("address", TextKind::Length(1, MAX_ADDRESS)).required().tells(
     "IP address or host name; listening ports accept only this address and the host they are on. A name whose last \
      part is a number is no host name, so it must be an address",
 );
@@ -29,10 +29,10 @@ const fn server(name: &'static str, port: i64, text: &'static str) -> Key {
 }
 
 /// The controller's ports.
-pub const PORTS: Table = Table::of("ports", &[COMMAND, STATE, MODBUS, UDP2011]);
+pub const PORTS: KeyTable = KeyTable::of("ports", &[COMMAND, STATE, MODBUS, UDP2011]);
 
 /// The recipe of a link.
-pub const LINK_RECIPE: Key = Key::text_of("recipe", Text::Any)
+pub const LINK_RECIPE: Key = Key::text_of("recipe", TextKind::Any)
     .required()
     .tells("the realtime stream recipe that is set for the controller's UDP server");
 /// The port of a link.
@@ -40,10 +40,10 @@ pub const LINK_UDP: Key =
     Key::integer("udp", 1, 65_535).absent("that of `ports.udp2011`").is("the UDP server's port");
 
 /// The link to the controller's UDP server.
-pub const RECIPE_LINK: Table = Table::of("recipe link", &[LINK_UDP, LINK_RECIPE]);
+pub const RECIPE_LINK: KeyTable = KeyTable::of("recipe link", &[LINK_UDP, LINK_RECIPE]);
 
 /// `[controller]`.
-pub const CONTROLLER: Table = Table::of(
+pub const CONTROLLER: KeyTable = KeyTable::of(
     "controller",
     &[
         ADDRESS,
@@ -53,13 +53,13 @@ pub const CONTROLLER: Table = Table::of(
     ],
 );
 
-const IPV4: Text = Text::Pattern("^[0-9]+\\.[0-9]+\\.[0-9]+\\.[0-9]+$");
+const IPV4: TextKind = TextKind::Pattern("^[0-9]+\\.[0-9]+\\.[0-9]+\\.[0-9]+$");
 
 /// `[network]`.
-pub const NETWORK: Table = Table::of(
+pub const NETWORK: KeyTable = KeyTable::of(
     "network",
     &[
-        Key::text_of("address", Text::Pattern("^[0-9]+\\.[0-9]+\\.[0-9]+\\.[0-9]+/[0-9]+$"))
+        Key::text_of("address", TextKind::Pattern("^[0-9]+\\.[0-9]+\\.[0-9]+\\.[0-9]+/[0-9]+$"))
             .required()
             .tells("the board's IPv4 address and network prefix length, 1..=30: `\"192.168.12.20/24\"`"),
         Key::text_of("router", IPV4)
@@ -69,7 +69,7 @@ pub const NETWORK: Table = Table::of(
 );
 
 /// The name of a recipe or port.
-pub const NAME: Key = Key::text_of("name", Text::Name).required().tells(
+pub const NAME: Key = Key::text_of("name", TextKind::Name).required().tells(
     "1..=32 bytes without blanks, quotes, `=` and control characters; unique. `--bind` and `--set` use it",
 );
 /// What a port is.
@@ -80,7 +80,8 @@ pub const BUS: Key = Key::words("bus", words!(BUSES)).required().tells(
      connects to",
 );
 /// The recipe of a port.
-pub const RECIPE: Key = Key::text_of("recipe", Text::Any).required().tells("name of a recipe of this file");
+pub const RECIPE: Key =
+    Key::text_of("recipe", TextKind::Any).required().tells("name of a recipe of this file");
 /// The period of the output.
 pub const CYCLE: Key =
     Key::millis("cycle_ms", Limits::Within(4.0, HOUR_MS)).or(4).is("how often the output part is sent");
@@ -119,7 +120,7 @@ pub const REFRESH: Key = Key::millis("refresh_ms", Limits::AboveZero(HOUR_MS)).i
      powered later",
 );
 /// The variables of a port's health.
-pub const HEALTH_TABLE: Table = Table::of(
+pub const HEALTH_TABLE: KeyTable = KeyTable::of(
     "health",
     &[
         health(PortValue::NAMES[0].0, "1 while the device is there and no frame is overdue"),
@@ -136,7 +137,7 @@ pub const HEALTH: Key = Key::new("health", Shape::Table(&HEALTH_TABLE)).tells(
 );
 
 const fn health(name: &'static str, text: &'static str) -> Key {
-    Key::text_of(name, Text::Variable).is(text)
+    Key::text_of(name, TextKind::Variable).is(text)
 }
 
 /// Speed of a serial line.
@@ -173,12 +174,12 @@ pub const ABSENT: Key = Key::millis("absent_ms", Limits::AboveZero(HOUR_MS)).or(
 pub const BITRATE: Key =
     Key::integer("bitrate", 10_000, 1_000_000).unit("bit/s").or(Bus::BITRATE as i64).is("(`can`)");
 /// Where a listening port is.
-pub const LISTEN: Key = Key::text_of("listen", Text::Length(1, MAX_LISTEN))
+pub const LISTEN: Key = Key::text_of("listen", TextKind::Length(1, MAX_LISTEN))
     .required()
     .tells("IP address and port, such as `\"0.0.0.0:50000\"` (`tcp-listen`, `udp-listen`)");
 
 /// Where the devices of Modbus TCP are.
-pub const TO: Key = Key::text_of("to", Text::Any).required().tells(
+pub const TO: Key = Key::text_of("to", TextKind::Any).required().tells(
     "IP address or host name of the device, or of the gateway before it, with a TCP port if it is not 502: \
      `\"192.168.1.50\"`, `\"plc.cell:1502\"` (`modbus-tcp`)",
 );
@@ -189,7 +190,7 @@ pub(crate) const LINE: &[Key] = &[BAUD, PARITY, STOP_BITS, IDLE_GAP, TURNAROUND]
 pub(crate) const FIELD: &[Key] = &[ON_TIMEOUT, SAFE_AT_START, REFRESH, HEALTH, ABSENT];
 
 /// `[[port]]` of a gateway file.
-pub const PORT: Table = Table::of("port", &[NAME, BUS, RECIPE, CYCLE, TIMEOUT, STALE_AFTER]).cases(&[
+pub const PORT: KeyTable = KeyTable::of("port", &[NAME, BUS, RECIPE, CYCLE, TIMEOUT, STALE_AFTER]).cases(&[
     Case {
         when: &[When::Is("bus", &["rs485", "modbus-rtu", "modbus-rtu-slave"], &[])],
         keys: &[LINE, &[ECHO], FIELD],

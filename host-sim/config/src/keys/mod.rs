@@ -61,7 +61,7 @@ pub type Words = fn() -> Vec<&'static str>;
 #[derive(Debug, Clone, Copy)]
 pub enum Shape {
     /// A string.
-    Text(Text),
+    Text(TextKind),
     /// One of several strings.
     Words(Words),
     /// An integer from the first to the last.
@@ -77,7 +77,7 @@ pub enum Shape {
     /// A list, with at least and at most so many items.
     List(&'static Shape, usize, usize),
     /// A table.
-    Table(&'static Table),
+    Table(&'static KeyTable),
     /// A table with any keys, with at least so many, and values of this shape.
     Map(&'static Shape, usize),
     /// One of these, which differ in their type.
@@ -86,7 +86,7 @@ pub enum Shape {
 
 /// What a string is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Text {
+pub enum TextKind {
     /// Anything.
     Any,
     /// With at least so many and at most so many bytes.
@@ -140,7 +140,7 @@ impl fmt::Display for Limits {
 
 /// A table of a file.
 #[derive(Debug, Clone, Copy)]
-pub struct Table {
+pub struct KeyTable {
     /// Its name in the schema, unique.
     pub name: &'static str,
     /// What a message says behind an unknown key, such as ` of an exchange`.
@@ -182,7 +182,7 @@ pub enum Rule {
     NotBoth(&'static str, &'static str),
 }
 
-impl Table {
+impl KeyTable {
     /// A table with these keys and no cases.
     pub(crate) const fn of(name: &'static str, common: &'static [Key]) -> Self {
         Self { name, place: "", common, cases: &[], rules: &[] }
@@ -243,7 +243,7 @@ impl Key {
         Self::new(name, Shape::Words(words))
     }
 
-    pub(crate) const fn text_of(name: &'static str, text: Text) -> Self {
+    pub(crate) const fn text_of(name: &'static str, text: TextKind) -> Self {
         Self::new(name, Shape::Text(text))
     }
 
@@ -356,11 +356,11 @@ pub(crate) const HOUR_MS: f64 = 3_600_000.0;
 
 /// The tables at the top of the files.
 pub mod top {
-    use super::{Key, Shape, Table, controller, gateway, recipe};
+    use super::{Key, KeyTable, Shape, controller, gateway, recipe};
     use proto_core::config::{MAX_PORTS, MAX_RECIPES};
 
     /// A gateway file.
-    pub const GATEWAY: Table = Table::of(
+    pub const GATEWAY: KeyTable = KeyTable::of(
         "gateway file",
         &[
             Key::new("controller", Shape::Table(&gateway::CONTROLLER))
@@ -376,7 +376,7 @@ pub mod top {
     );
 
     /// A controller file.
-    pub const CONTROLLER: Table = Table::of(
+    pub const CONTROLLER: KeyTable = KeyTable::of(
         "controller file",
         &[
             Key::new("listen", Shape::Table(&controller::LISTEN)).is("where its servers are"),

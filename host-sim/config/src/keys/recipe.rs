@@ -4,7 +4,7 @@ use proto_core::recipe::model::{MAX_CAN_IDS, MAX_DELIMITER, MAX_FIELDS};
 
 use super::device::{CHECKSUM, ENDIAN, ESCAPE, FRAMING, WORD_ORDER};
 use super::gateway::NAME;
-use super::{Case, Key, Rule, Shape, Table, Text, When, exchange, field, words};
+use super::{Case, Key, KeyTable, Rule, Shape, TextKind, When, exchange, field, words};
 use crate::file::bindings::ON_STALES;
 use crate::file::recipes::{KINDS, MODES};
 
@@ -25,11 +25,11 @@ pub const MODE: Key = Key::words("mode", words!(MODES)).required().tells(
 const MODE_OF_ANY: Key = Key { need: super::Need::Absent("required"), ..MODE };
 const MODE_OF_MODBUS: Key = Key { shape: Shape::Words(|| vec!["user"]), ..MODE.or_word("user") };
 
-const fn input(table: &'static Table) -> Key {
+const fn input(table: &'static KeyTable) -> Key {
     Key::new("input", Shape::Table(table)).absent("absent").tells("user to robot")
 }
 
-const fn output(table: &'static Table) -> Key {
+const fn output(table: &'static KeyTable) -> Key {
     Key::new("output", Shape::Table(table))
         .absent("absent")
         .tells("robot to user; at least one of the two, or an exchange")
@@ -74,7 +74,7 @@ const fn delimiter(name: &'static str) -> Key {
 }
 
 /// The fields of a realtime recipe.
-pub const VARIABLES: Key = Key::new("fields", Shape::List(&Shape::Text(Text::Variables), 1, MAX_FIELDS))
+pub const VARIABLES: Key = Key::new("fields", Shape::List(&Shape::Text(TextKind::Variables), 1, MAX_FIELDS))
     .required()
     .tells("1..=128 fields; the whole frame at most 512 bytes, or 8 on CAN");
 
@@ -89,7 +89,7 @@ pub(crate) const OUTPUT_FIELDS: Key = fields(&Shape::Table(&field::OUTPUT));
 /// When an output part is sent.
 pub const SEND: Key = Key::new(
     "send",
-    Shape::Text(Text::Pattern("^(period|change|frame|rising:.+)$")),
+    Shape::Text(TextKind::Pattern("^(period|change|frame|rising:.+)$")),
 )
 .or_word("period")
 .tells(
@@ -106,11 +106,11 @@ pub const ID: Key = Key::integer("id", 0, 0x1FFF_FFFF)
 pub const EXTENDED: Key = Key::bool("extended").tells("29-bit ids, 0..=0x1FFFFFFF");
 
 /// The name of an output frame.
-pub const FRAME_NAME: Key = Key::text_of("name", Text::Name)
+pub const FRAME_NAME: Key = Key::text_of("name", TextKind::Name)
     .absent("none")
     .tells("of an output frame: its name for `after`, 1..=32 characters, unique in the part");
 /// The frame that goes before it.
-pub const AFTER: Key = Key::text_of("after", Text::Name).absent("order of the file").tells(
+pub const AFTER: Key = Key::text_of("after", TextKind::Name).absent("order of the file").tells(
     "of an output frame: the name of the frame of the same cycle behind which it is sent, such as a control word \
      behind the target that it starts",
 );
@@ -132,15 +132,16 @@ const fn always(keys: &'static [&'static [Key]]) -> Case {
 const PART_RULES: &[Rule] =
     &[Rule::NotBoth("framing", "escape"), Rule::Needs("framing", &["tail"], &["tail"])];
 
-pub(crate) const REALTIME: Table = Table::of("realtime stream part", &[HEAD, TAIL, VARIABLES]).at(STREAM);
-const REALTIME_OUT: Table =
-    Table::of("realtime stream output", &[HEAD, TAIL, VARIABLES, ON_STALE, SEND_PERIOD]).at(STREAM);
-const PLAIN: Table = Table::of("stream part of a controller", &[HEAD, TAIL, PLAIN_FIELDS]).at(STREAM);
-const USER_IN: Table = Table::of("stream input", &[HEAD, TAIL, INPUT_FIELDS])
+pub(crate) const REALTIME: KeyTable =
+    KeyTable::of("realtime stream part", &[HEAD, TAIL, VARIABLES]).at(STREAM);
+const REALTIME_OUT: KeyTable =
+    KeyTable::of("realtime stream output", &[HEAD, TAIL, VARIABLES, ON_STALE, SEND_PERIOD]).at(STREAM);
+const PLAIN: KeyTable = KeyTable::of("stream part of a controller", &[HEAD, TAIL, PLAIN_FIELDS]).at(STREAM);
+const USER_IN: KeyTable = KeyTable::of("stream input", &[HEAD, TAIL, INPUT_FIELDS])
     .at(STREAM)
     .cases(&[always(&[OF_STREAM])])
     .rules(PART_RULES);
-const USER_OUT: Table = Table::of("stream output", &[HEAD, TAIL, OUTPUT_FIELDS])
+const USER_OUT: KeyTable = KeyTable::of("stream output", &[HEAD, TAIL, OUTPUT_FIELDS])
     .at(STREAM)
     .cases(&[always(&[OF_STREAM, SENDING])])
     .rules(PART_RULES);
@@ -154,25 +155,26 @@ const fn frames(item: &'static Shape) -> Key {
 /// The frames of a CAN part.
 pub const FRAME: Key = frames(&Shape::Table(&CAN_IN));
 
-pub(crate) const CAN_REALTIME: Table = Table::of("realtime CAN frame", &[ID, EXTENDED, VARIABLES]);
-const CAN_PLAIN: Table = Table::of("CAN frame of a controller", &[ID, EXTENDED, PLAIN_FIELDS]);
-const CAN_IN: Table =
-    Table::of("CAN input frame", &[ID, EXTENDED, INPUT_FIELDS]).cases(&[always(&[OF_FRAME])]);
-const CAN_OUT: Table = Table::of("CAN output frame", &[ID, EXTENDED, FRAME_NAME, AFTER, OUTPUT_FIELDS])
+pub(crate) const CAN_REALTIME: KeyTable = KeyTable::of("realtime CAN frame", &[ID, EXTENDED, VARIABLES]);
+const CAN_PLAIN: KeyTable = KeyTable::of("CAN frame of a controller", &[ID, EXTENDED, PLAIN_FIELDS]);
+const CAN_IN: KeyTable =
+    KeyTable::of("CAN input frame", &[ID, EXTENDED, INPUT_FIELDS]).cases(&[always(&[OF_FRAME])]);
+const CAN_OUT: KeyTable = KeyTable::of("CAN output frame", &[ID, EXTENDED, FRAME_NAME, AFTER, OUTPUT_FIELDS])
     .cases(&[always(&[OF_FRAME])]);
 
-pub(crate) const CAN_PART: Table =
-    Table::of("realtime CAN part", &[frames(&Shape::Table(&CAN_REALTIME))]).at(CAN);
-const CAN_PART_OUT: Table =
-    Table::of("realtime CAN output", &[frames(&Shape::Table(&CAN_REALTIME)), ON_STALE, SEND_PERIOD]).at(CAN);
-const CAN_PART_PLAIN: Table =
-    Table::of("CAN part of a controller", &[frames(&Shape::Table(&CAN_PLAIN))]).at(CAN);
-const CAN_PART_IN: Table = Table::of("CAN input", &[FRAME]).at(CAN);
-const CAN_PART_USER_OUT: Table =
-    Table::of("CAN output", &[frames(&Shape::Table(&CAN_OUT)), ON_STALE, SEND]).at(CAN);
+pub(crate) const CAN_PART: KeyTable =
+    KeyTable::of("realtime CAN part", &[frames(&Shape::Table(&CAN_REALTIME))]).at(CAN);
+const CAN_PART_OUT: KeyTable =
+    KeyTable::of("realtime CAN output", &[frames(&Shape::Table(&CAN_REALTIME)), ON_STALE, SEND_PERIOD])
+        .at(CAN);
+const CAN_PART_PLAIN: KeyTable =
+    KeyTable::of("CAN part of a controller", &[frames(&Shape::Table(&CAN_PLAIN))]).at(CAN);
+const CAN_PART_IN: KeyTable = KeyTable::of("CAN input", &[FRAME]).at(CAN);
+const CAN_PART_USER_OUT: KeyTable =
+    KeyTable::of("CAN output", &[frames(&Shape::Table(&CAN_OUT)), ON_STALE, SEND]).at(CAN);
 
 /// `[[recipe]]` of a gateway file.
-pub const OF_GATEWAY: Table = Table::of("recipe", &[NAME, KIND, MODE_OF_ANY])
+pub const OF_GATEWAY: KeyTable = KeyTable::of("recipe", &[NAME, KIND, MODE_OF_ANY])
     .rules(&[Rule::Needs("kind", &["stream", "can"], &["mode"])])
     .cases(&[
         Case {
@@ -216,7 +218,7 @@ pub const OF_GATEWAY: Table = Table::of("recipe", &[NAME, KIND, MODE_OF_ANY])
     ]);
 
 /// `[[recipe]]` of a controller file.
-pub const OF_CONTROLLER: Table = Table::of("recipe of a controller", &[NAME, KIND_OF_CONTROLLER, MODE])
+pub const OF_CONTROLLER: KeyTable = KeyTable::of("recipe of a controller", &[NAME, KIND_OF_CONTROLLER, MODE])
     .cases(&[
         Case {
             when: &[When::Is("kind", &["stream"], &[]), When::Is("mode", &["realtime"], &[])],

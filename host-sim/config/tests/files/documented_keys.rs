@@ -3,7 +3,7 @@
 use std::collections::HashSet;
 use std::fs;
 
-use recipe_config::keys::{self, DOCUMENTED, Key, Need, Shape, Table, When};
+use recipe_config::keys::{self, DOCUMENTED, Key, KeyTable, Need, Shape, When};
 use recipe_test_kit::repository;
 
 #[test]
@@ -47,7 +47,7 @@ fn has_tables(page: &str, documented: &[(&str, &[&[Key]])]) {
 }
 
 /// Every table below this one, and itself, with a word for where it is.
-fn tables(table: &'static Table, all: &mut Vec<&'static Table>) {
+fn tables(table: &'static KeyTable, all: &mut Vec<&'static KeyTable>) {
     if all.iter().any(|known| known.name == table.name) {
         return;
     }
@@ -55,7 +55,7 @@ fn tables(table: &'static Table, all: &mut Vec<&'static Table>) {
     table.keys().for_each(|key| below(&key.shape, all));
 }
 
-fn below(shape: &'static Shape, all: &mut Vec<&'static Table>) {
+fn below(shape: &'static Shape, all: &mut Vec<&'static KeyTable>) {
     match shape {
         Shape::Table(table) => tables(table, all),
         Shape::List(item, ..) | Shape::Map(item, _) => below(item, all),
@@ -64,8 +64,8 @@ fn below(shape: &'static Shape, all: &mut Vec<&'static Table>) {
     }
 }
 
-fn all_tables() -> Vec<&'static Table> {
-    static TOPS: [Table; 2] = [keys::top::GATEWAY, keys::top::CONTROLLER];
+fn all_tables() -> Vec<&'static KeyTable> {
+    static TOPS: [KeyTable; 2] = [keys::top::GATEWAY, keys::top::CONTROLLER];
     let mut all = Vec::new();
     TOPS.iter().for_each(|top| tables(top, &mut all));
     all

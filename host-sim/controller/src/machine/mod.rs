@@ -21,7 +21,7 @@ pub use errors::{ErrorEntry, ErrorId};
 pub use safety::SafetyHold;
 use safety::Stop;
 use transition::Begun;
-pub use transition::{Progress, Transition};
+pub use transition::{Transition, TransitionProgress};
 
 /// The state machines.
 #[derive(Debug, Clone)]

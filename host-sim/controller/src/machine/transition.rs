@@ -27,7 +27,7 @@ impl Transition {
 
 /// The state of a [`Transition`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Progress {
+pub enum TransitionProgress {
     /// It is in progress.
     InProgress,
     /// It has reached the state that the command asked for.
@@ -39,7 +39,7 @@ pub enum Progress {
 impl Machine {
     /// The state of a transition. To be called after every change: once another transition has begun, this
     /// one counts as superseded, even if it was done.
-    pub fn progress(&self, transition: Transition) -> Progress {
+    pub fn progress(&self, transition: Transition) -> TransitionProgress {
         let program_rests = self.program == Program::Stopped;
         let done = match transition.action {
             Action::PowerOn => self.robot == Robot::Disabled,
@@ -57,9 +57,9 @@ impl Machine {
             _ => transition.begun.robot == self.begun.robot,
         };
         match (is_newest, done) {
-            (false, _) => Progress::Superseded,
-            (true, true) => Progress::Done,
-            (true, false) => Progress::InProgress,
+            (false, _) => TransitionProgress::Superseded,
+            (true, true) => TransitionProgress::Done,
+            (true, false) => TransitionProgress::InProgress,
         }
     }
 

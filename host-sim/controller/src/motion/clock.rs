@@ -19,7 +19,7 @@ pub(super) struct PathClock {
 
 /// Path time and its derivatives at one instant.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Reading {
+pub(super) struct PathTime {
     /// Seconds of path time.
     pub(super) position_s: f64,
     /// Path seconds per second.
@@ -48,17 +48,17 @@ impl PathClock {
         *self = Self { anchor: now, position_s: reading.position_s, rate: reading.rate, target, slope };
     }
 
-    pub(super) fn at(&self, now: Instant) -> Reading {
+    pub(super) fn at(&self, now: Instant) -> PathTime {
         let dt = now.saturating_since(self.anchor).as_micros() as f64 * 1e-6;
         let (ramp_s, slope) = self.ramp();
         // Instants are whole microseconds: closer than that, the ramp is over.
         if dt + 0.5e-6 < ramp_s {
             let position_s = self.position_s + self.rate * dt + 0.5 * slope * dt * dt;
-            return Reading { position_s, rate: self.rate + slope * dt, rate_change: slope };
+            return PathTime { position_s, rate: self.rate + slope * dt, rate_change: slope };
         }
         let after_ramp = self.after_ramp();
         let position_s = after_ramp + self.target * (dt - ramp_s);
-        Reading { position_s, rate: self.target, rate_change: 0.0 }
+        PathTime { position_s, rate: self.target, rate_change: 0.0 }
     }
 
     /// When the path time reaches `goal_s`; `None` if it never does.

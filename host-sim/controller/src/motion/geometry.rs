@@ -12,12 +12,12 @@ pub(super) const JOINTS: usize = 6;
 
 /// A position and an orientation.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Frame {
+pub struct Pose {
     rotation: [[f64; 3]; 3],
     origin: [f64; 3],
 }
 
-impl Frame {
+impl Pose {
     /// No translation, no rotation.
     pub const IDENTITY: Self =
         Self { rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], origin: [0.0; 3] };
@@ -97,10 +97,10 @@ impl Frame {
 pub(super) struct Twist(pub(super) [f64; 6]);
 
 impl Twist {
-    pub(super) fn of(q: &[f64; JOINTS], qd: &[f64; JOINTS], tool: &Frame) -> Self {
-        let tip = Frame::of_joints(q).then(tool).origin;
+    pub(super) fn of(q: &[f64; JOINTS], qd: &[f64; JOINTS], tool: &Pose) -> Self {
+        let tip = Pose::of_joints(q).then(tool).origin;
         let mut twist = [0.0; 6];
-        let mut frame = Frame::IDENTITY;
+        let mut frame = Pose::IDENTITY;
         for ((&angle, &speed), link) in q.iter().zip(qd).zip(&LINKS) {
             let axis = frame.rotation.map(|row| row[2]);
             let arm = [0, 1, 2].map(|nth| tip[nth] - frame.origin[nth]);
@@ -118,18 +118,18 @@ fn cross(a: &[f64; 3], b: &[f64; 3]) -> [f64; 3] {
 }
 
 /// Denavit-Hartenberg parameters of one link: rotation about Z, `d_m` along Z, `a_m` along X, twist about X.
-struct Link {
+struct DhParameters {
     d_m: f64,
     a_m: f64,
     /// Sine and cosine of the twist, which is 0 or ±90°.
     twist: (f64, f64),
 }
 
-impl Link {
-    fn at(&self, angle: f64) -> Frame {
+impl DhParameters {
+    fn at(&self, angle: f64) -> Pose {
         let (s, c) = libm::sincos(angle);
         let (st, ct) = self.twist;
-        Frame {
+        Pose {
             rotation: [[c, -s * ct, s * st], [s, c * ct, -c * st], [0.0, st, ct]],
             origin: [self.a_m * c, self.a_m * s, self.d_m],
         }
@@ -140,11 +140,11 @@ const UP: (f64, f64) = (1.0, 0.0);
 const STRAIGHT: (f64, f64) = (0.0, 1.0);
 const DOWN: (f64, f64) = (-1.0, 0.0);
 
-const LINKS: [Link; JOINTS] = [
-    Link { d_m: 0.145, a_m: 0.0, twist: UP },
-    Link { d_m: 0.0, a_m: -0.43, twist: STRAIGHT },
-    Link { d_m: 0.0, a_m: -0.365, twist: STRAIGHT },
-    Link { d_m: 0.125, a_m: 0.0, twist: UP },
-    Link { d_m: 0.11, a_m: 0.0, twist: DOWN },
-    Link { d_m: 0.1, a_m: 0.0, twist: STRAIGHT },
+const LINKS: [DhParameters; JOINTS] = [
+    DhParameters { d_m: 0.145, a_m: 0.0, twist: UP },
+    DhParameters { d_m: 0.0, a_m: -0.43, twist: STRAIGHT },
+    DhParameters { d_m: 0.0, a_m: -0.365, twist: STRAIGHT },
+    DhParameters { d_m: 0.125, a_m: 0.0, twist: UP },
+    DhParameters { d_m: 0.11, a_m: 0.0, twist: DOWN },
+    DhParameters { d_m: 0.1, a_m: 0.0, twist: STRAIGHT },
 ];

@@ -3,23 +3,23 @@
 //! The path is exact at every point: the inverse kinematics on the branch that the arm is on at the start. The
 //! samples only say which turn of a joint is meant, and whether the whole line can be followed.
 
-use super::geometry::{Branch, Frame, JOINTS, length};
+use super::geometry::{Branch, JOINTS, Pose, length};
 use super::{
     JOINT_RANGE_RAD, MAX_ACCEL_RAD_S2, MAX_SPEED_RAD_S, MoveError, PEAK_ACCELERATION, PEAK_SPEED, quintic,
 };
 
 /// The line, followed from rest to rest.
 #[derive(Debug, Clone)]
-pub(super) struct Line {
+pub(super) struct LinearPath {
     /// The TCP at the start.
-    from: Frame,
+    from: Pose,
     /// m, in the base frame.
     way: [f64; 3],
     /// Of the TCP at the start.
     axis: [f64; 3],
     angle: f64,
     /// From the TCP to the flange.
-    flange: Frame,
+    flange: Pose,
     branch: Branch,
     /// Joints at equal steps of the move's time.
     samples: Vec<[f64; JOINTS]>,
@@ -27,21 +27,21 @@ pub(super) struct Line {
     pub(super) length_s: f64,
 }
 
-impl Line {
+impl LinearPath {
     /// The line from the joints `from` to the TCP frame `to`.
     ///
     /// # Errors
     /// [`MoveError`] if it cannot be followed at this speed.
     pub(super) fn plan(
         from: &[f64; JOINTS],
-        to: &Frame,
-        tool: &Frame,
+        to: &Pose,
+        tool: &Pose,
         speed_m_s: f64,
     ) -> Result<Self, MoveError> {
         if speed_m_s.is_nan() || speed_m_s <= 0.0 || speed_m_s > MAX_SPEED_M_S {
             return Err(MoveError::LineSpeed { speed_m_s });
         }
-        let flange = Frame::of_joints(from);
+        let flange = Pose::of_joints(from);
         let tcp = flange.then(tool);
         let way = tcp.way_to(to);
         let (axis, angle) = tcp.turn_to(to);

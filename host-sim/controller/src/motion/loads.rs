@@ -1,7 +1,7 @@
 //! Forces that the arm's own weight and its payload cause: what a sensor at flange or base would show without
 //! contact.
 
-use super::geometry::{Frame, JOINTS};
+use super::geometry::{JOINTS, Pose};
 
 /// What the flange carries.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -25,12 +25,12 @@ impl Loads {
     /// At these joint positions (rad) and this linear acceleration of the TCP (m/s²), which stands for that of
     /// the payload. The inertia of the links is left out.
     pub fn of(joints: &[f64; JOINTS], acceleration: [f64; 3], payload: &Payload) -> Self {
-        let frames = Frame::along(joints);
+        let frames = Pose::along(joints);
         let flange = frames[JOINTS];
         let [ax, ay, az] = acceleration;
         let force = [-ax, -ay, -az - GRAVITY].map(|item| item * payload.mass_kg);
         let pull = flange.inverse().rotated(&force);
-        let place = Frame::at(payload.centre_m);
+        let place = Pose::at(payload.centre_m);
         let [x, y, z] = pull;
         let on_flange = place.wrench_in_parent([x, y, z, 0.0, 0.0, 0.0]);
         let mut base = flange.wrench_in_parent(on_flange);
@@ -60,7 +60,7 @@ mod tests {
         let payload = Payload { mass_kg: 2.0, centre_m: [0.0, 0.0, 0.1] };
         let joints = [0.3, -1.2, 1.9, 0.7, 1.5, -0.1];
         let loads = Loads::of(&joints, [0.0; 3], &payload);
-        let flange = Frame::along(&joints)[JOINTS];
+        let flange = Pose::along(&joints)[JOINTS];
         let [x, y, z, tx, ty, tz] = loads.flange;
         let down = flange.rotated(&[x, y, z]);
         assert!(down[0].abs() + down[1].abs() < 1e-9 && (down[2] + 19.62).abs() < 1e-9, "{loads:?}");

@@ -18,9 +18,9 @@ use std::f64::consts::{FRAC_PI_2, FRAC_PI_4};
 use proto_core::time::Instant;
 
 use clock::PathClock;
-pub use geometry::Frame;
+pub use geometry::Pose;
 use geometry::{JOINTS, Twist};
-use line::Line;
+use line::LinearPath;
 pub use line::MAX_SPEED_M_S;
 pub use loads::{Loads, Payload};
 
@@ -32,7 +32,7 @@ pub struct Arm {
     /// Joint travel of the present move, rad.
     travel: [f64; JOINTS],
     /// The present move, if it is a line; then there is no travel.
-    line: Option<Box<Line>>,
+    line: Option<Box<LinearPath>>,
     /// Duration of the present move at full rate, s; 0 if there is none.
     length_s: f64,
     clock: PathClock,
@@ -157,8 +157,8 @@ impl Arm {
     }
 
     /// Sets the pose offset so that the present pose is `pose`; `None` items stay.
-    pub fn calibrate(&mut self, pose: [Option<f64>; 6], tool: &Frame) {
-        let computed = Frame::of_joints(&self.origin).then(tool).pose();
+    pub fn calibrate(&mut self, pose: [Option<f64>; 6], tool: &Pose) {
+        let computed = Pose::of_joints(&self.origin).then(tool).pose();
         for ((offset, wanted), computed) in self.pose_offset.iter_mut().zip(pose).zip(computed) {
             if let Some(wanted) = wanted {
                 *offset = wanted - computed;
@@ -208,7 +208,7 @@ impl Arm {
         now: Instant,
         pose: [f64; 6],
         speed_m_s: f64,
-        tool: &Frame,
+        tool: &Pose,
         rate: f64,
     ) -> Result<(), MoveError> {
         if pose.iter().any(|item| !item.is_finite()) {
@@ -216,7 +216,7 @@ impl Arm {
         }
         let computed = std::array::from_fn(|nth| pose[nth] - self.pose_offset[nth]);
         let from = self.joints(now).0;
-        let line = Line::plan(&from, &Frame::from_pose(&computed), tool, speed_m_s)?;
+        let line = LinearPath::plan(&from, &Pose::from_pose(&computed), tool, speed_m_s)?;
         self.settle(now);
         self.length_s = line.length_s;
         self.line = Some(Box::new(line));
@@ -252,9 +252,9 @@ impl Arm {
     }
 
     /// The arm's state at `now`, with this tool and payload (kg).
-    pub fn observe(&self, now: Instant, tool: &Frame, payload_kg: f64) -> ArmState {
+    pub fn observe(&self, now: Instant, tool: &Pose, payload_kg: f64) -> ArmState {
         let (q, qd, qdd) = self.joints(now);
-        let flange = Frame::of_joints(&q).then(tool);
+        let flange = Pose::of_joints(&q).then(tool);
         let mut pose = flange.pose();
         for (item, offset) in pose.iter_mut().zip(&self.pose_offset) {
             *item += offset;

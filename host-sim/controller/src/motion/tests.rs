@@ -13,7 +13,7 @@ fn moving() -> Arm {
 }
 
 fn observe(arm: &Arm, now: Instant) -> ArmState {
-    arm.observe(now, &Frame::from_pose(&[0.0, 0.02, 0.1, 0.1, 0.0, 0.3]), 1.5)
+    arm.observe(now, &Pose::from_pose(&[0.0, 0.02, 0.1, 0.1, 0.0, 0.3]), 1.5)
 }
 
 #[test]
@@ -108,7 +108,7 @@ fn impossible_moves_change_nothing() {
 fn a_configured_start_pose_is_exact() {
     let wanted = [-0.543_689, 0.576_287, 1.232_353, -1.570_197, -0.607_912, -0.458_957_f32];
     let mut arm = Arm::at(HOME);
-    let tool = Frame::from_pose(&[0.0, 0.02, 0.1, 0.1, 0.0, 0.3]);
+    let tool = Pose::from_pose(&[0.0, 0.02, 0.1, 0.1, 0.0, 0.3]);
     arm.calibrate(wanted.map(|item| Some(f64::from(item))), &tool);
     assert_eq!(observe(&arm, ms(0)).pose, wanted);
 }
@@ -116,7 +116,7 @@ fn a_configured_start_pose_is_exact() {
 #[test]
 fn poses_survive_conversion_to_frames_and_back() {
     let pose = [0.1, -0.2, 0.3, -2.0, 0.7, 3.0];
-    for (there, back) in pose.iter().zip(Frame::from_pose(&pose).pose()) {
+    for (there, back) in pose.iter().zip(Pose::from_pose(&pose).pose()) {
         assert!((there - back).abs() < 1e-12, "{there} {back}");
     }
 }
@@ -126,7 +126,7 @@ const WORK: [f64; 6] = [0.3, -1.2, 1.9, 0.7, 1.5, -0.1];
 
 #[test]
 fn a_line_is_straight_and_as_fast_as_asked() {
-    let tool = Frame::from_pose(&[0.0, 0.02, 0.1, 0.1, 0.0, 0.3]);
+    let tool = Pose::from_pose(&[0.0, 0.02, 0.1, 0.1, 0.0, 0.3]);
     let mut arm = Arm::at(WORK);
     let begin = observe(&arm, ms(0)).pose.map(f64::from);
     let way = [0.15, -0.2, 0.1];
@@ -167,7 +167,7 @@ fn speeds_on_a_line_are_the_derivatives_of_its_positions() {
         target[0] += 0.2;
         target[2] -= 0.1;
         target[4] += 0.4;
-        let tool = Frame::from_pose(&[0.0, 0.02, 0.1, 0.1, 0.0, 0.3]);
+        let tool = Pose::from_pose(&[0.0, 0.02, 0.1, 0.1, 0.0, 0.3]);
         arm.move_along(ms(0), target, 0.3, &tool, 1.0).unwrap();
         if at > 400 {
             arm.set_rate(ms(400), 0.3, Braking::Normal);
@@ -186,7 +186,7 @@ fn speeds_on_a_line_are_the_derivatives_of_its_positions() {
 
 #[test]
 fn a_line_that_cannot_be_followed_is_refused() {
-    let tool = Frame::IDENTITY;
+    let tool = Pose::IDENTITY;
     let mut arm = Arm::at(WORK);
     let here = arm.observe(ms(0), &tool, 0.0).pose.map(f64::from);
     let to = |nth: usize, by: f64| {
@@ -225,8 +225,7 @@ fn a_line_that_cannot_be_followed_is_refused() {
     let turns: Vec<_> = [0.5, -0.5]
         .map(|by| {
             let flange = arm.observe(ms(0), &tool, 0.0).pose.map(f64::from);
-            let pose =
-                Frame::from_pose(&flange).then(&Frame::from_pose(&[0.0, 0.0, 0.0, 0.0, 0.0, by])).pose();
+            let pose = Pose::from_pose(&flange).then(&Pose::from_pose(&[0.0, 0.0, 0.0, 0.0, 0.0, by])).pose();
             arm.clone().move_along(ms(0), pose, 0.5, &tool, 1.0).err()
         })
         .into();

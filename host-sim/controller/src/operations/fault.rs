@@ -25,7 +25,7 @@ pub struct Fault {
     pub transitions: Option<f64>,
     /// What is wrong.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub kind: Option<Kind>,
+    pub kind: Option<FaultKind>,
     /// For `delay`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub seconds: Option<f64>,
@@ -42,8 +42,8 @@ pub struct Fault {
 
 /// The kinds of faults.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Kind {
+#[serde(rename = "Kind", rename_all = "snake_case")]
+pub enum FaultKind {
     /// Nothing is sent.
     Mute,
     /// Answers come later.
@@ -65,7 +65,7 @@ pub enum Kind {
     Corrupt,
 }
 
-impl Kind {
+impl FaultKind {
     const fn name(self) -> &'static str {
         match self {
             Self::Mute => "mute",
@@ -125,16 +125,16 @@ impl Controller {
             (None, Some(port), None, None, Some(kind)) => {
                 let nth = self.port_index(port)?;
                 match kind {
-                    Kind::Mute => self.mute_port(nth),
-                    Kind::Disconnect if self.ports.get(nth).is_some_and(|port| port.is_tcp_client()) => {
+                    FaultKind::Mute => self.mute_port(nth),
+                    FaultKind::Disconnect if self.ports.get(nth).is_some_and(|port| port.is_tcp_client()) => {
                         self.close_port(nth);
                     }
-                    Kind::Disconnect => return refused(format!("{port} is no TCP client: only mute")),
+                    FaultKind::Disconnect => return refused(format!("{port} is no TCP client: only mute")),
                     _ => return refused(format!("kind: a port can mute or disconnect, not {}", kind.name())),
                 }
                 Ok(())
             }
-            (None, None, Some(item), None, Some(Kind::Corrupt)) => {
+            (None, None, Some(item), None, Some(FaultKind::Corrupt)) => {
                 let Some(value) = fault.value else { return refused("value is missing") };
                 self.corrupt(item, value.value()).map_err(|error| Refused(error.to_string()))
             }
@@ -149,25 +149,25 @@ impl Controller {
         }
     }
 
-    fn begin_server_fault(&mut self, server: Link, kind: Kind, fault: &Fault) -> Result<(), Refused> {
+    fn begin_server_fault(&mut self, server: Link, kind: FaultKind, fault: &Fault) -> Result<(), Refused> {
         match (kind, server) {
-            (Kind::Mute, _) => self.mute(server),
-            (Kind::Refuse, _) => self.refuse(server),
-            (Kind::Disconnect, _) => self.disconnect(server),
-            (Kind::Garbage, _) => self.faults.set_garbage(server, true),
-            (Kind::Delay, Link::Command | Link::Modbus) => {
+            (FaultKind::Mute, _) => self.mute(server),
+            (FaultKind::Refuse, _) => self.refuse(server),
+            (FaultKind::Disconnect, _) => self.disconnect(server),
+            (FaultKind::Garbage, _) => self.faults.set_garbage(server, true),
+            (FaultKind::Delay, Link::Command | Link::Modbus) => {
                 let Some(seconds) = fault.seconds else { return refused("seconds are missing") };
                 self.delay_answers(server, time("seconds", seconds)?);
             }
-            (Kind::Exception, Link::Modbus) => {
+            (FaultKind::Exception, Link::Modbus) => {
                 let Some(code) = fault.code else { return refused("code is missing") };
                 let Some(exception) = (1..=11).contains(&code).then(|| Exception::from_code(code)) else {
                     return refused(format!("code: {code} is not within 1 to 11"));
                 };
                 self.answer_modbus_with(Some(exception));
             }
-            (Kind::Freeze, Link::State) => self.faults.freeze(true),
-            (Kind::Cut, Link::State) => {
+            (FaultKind::Freeze, Link::State) => self.faults.freeze(true),
+            (FaultKind::Cut, Link::State) => {
                 let Some(bytes) = fault.bytes else { return refused("bytes are missing") };
                 self.cut_next_state_packet(bytes);
             }
@@ -207,10 +207,10 @@ impl Controller {
 /// Arguments that do not belong to the kind are refused: they would be overlooked.
 fn check_arguments(fault: &Fault) -> Result<(), Refused> {
     let given = [
-        ("seconds", fault.seconds.is_some(), Kind::Delay),
-        ("code", fault.code.is_some(), Kind::Exception),
-        ("bytes", fault.bytes.is_some(), Kind::Cut),
-        ("value", fault.value.is_some(), Kind::Corrupt),
+        ("seconds", fault.seconds.is_some(), FaultKind::Delay),
+        ("code", fault.code.is_some(), FaultKind::Exception),
+        ("bytes", fault.bytes.is_some(), FaultKind::Cut),
+        ("value", fault.value.is_some(), FaultKind::Corrupt),
     ];
     for (name, is_given, kind) in given {
         if is_given && fault.kind != Some(kind) {

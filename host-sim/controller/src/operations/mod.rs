@@ -17,7 +17,7 @@ use super::common::{KINDS, Link};
 pub use super::common::{Mode, Number, Refused};
 use super::condition::Condition;
 use super::machine::SafetyHold;
-pub use fault::{CorruptedValue, Fault, Kind, NoNumber};
+pub use fault::{CorruptedValue, Fault, FaultKind, NoNumber};
 
 /// An operation. In JSON its name is the value of `do`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -2,7 +2,7 @@
 
 /// A recipe port's counters since the controller was created.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
-pub struct PortCounters {
+pub struct RecipePortCounters {
     /// Times the port came up.
     pub ups: u64,
     /// Bytes received; on CAN, data bytes.

@@ -22,21 +22,21 @@ use proto_core::time::{Duration, Instant};
 
 use clients::Clients;
 pub use clients::MAX_UDP_CLIENTS;
-pub use counters::PortCounters;
+pub use counters::RecipePortCounters;
 pub(crate) use receive::Listening;
 pub use receive::MAX_INBOX;
 use receive::Received;
-use recipe::Parts;
+use recipe::PartLayouts;
 pub use recipe::RecipeError;
 use recipe_config::{SimBus, SimConfig, SimPort};
-pub(crate) use send::{Handed, Outgoing};
+pub(crate) use send::{Handed, PortData};
 
 /// A recipe port.
 #[derive(Debug)]
-pub(super) struct Port {
+pub(super) struct RecipePort {
     name: String,
     medium: Medium,
-    recipe: Option<(Mode, Parts)>,
+    recipe: Option<(Mode, PartLayouts)>,
     up: bool,
     cycle: Duration,
     /// The cycles of a realtime output part, while the port is up.
@@ -45,7 +45,7 @@ pub(super) struct Port {
     deframer: Deframer,
     newest_byte: Instant,
     inbox: VecDeque<Received>,
-    counters: PortCounters,
+    counters: RecipePortCounters,
 }
 
 #[derive(Debug)]
@@ -63,12 +63,12 @@ enum Transmitter {
     /// The cycle's frame waits for a quiet line; it is encoded when it is sent.
     CycleDue,
     /// A program's frame waits for a quiet line.
-    Waiting(Outgoing),
+    Waiting(PortData),
     /// Until everything was sent.
     Sending,
 }
 
-impl Port {
+impl RecipePort {
     pub(super) fn new(config: &SimConfig, port: &SimPort) -> Result<Self, RecipeError> {
         let recipe = compile(config, port)?;
         let medium = match &port.bus {
@@ -93,7 +93,7 @@ impl Port {
             deframer: Deframer::new(),
             newest_byte: Instant::ZERO,
             inbox: VecDeque::new(),
-            counters: PortCounters::default(),
+            counters: RecipePortCounters::default(),
         })
     }
 
@@ -119,9 +119,9 @@ impl Port {
         &self.name
     }
 
-    pub(super) fn counters(&self) -> PortCounters {
+    pub(super) fn counters(&self) -> RecipePortCounters {
         let stats = self.deframer.stats();
-        PortCounters {
+        RecipePortCounters {
             skipped_bytes: stats.skipped_bytes,
             tail_mismatches: stats.tail_mismatches,
             discarded_bytes: stats.discarded_bytes,
@@ -191,10 +191,10 @@ impl Port {
     }
 }
 
-fn compile(config: &SimConfig, port: &SimPort) -> Result<Option<(Mode, Parts)>, RecipeError> {
+fn compile(config: &SimConfig, port: &SimPort) -> Result<Option<(Mode, PartLayouts)>, RecipeError> {
     let Some(index) = port.recipe else { return Ok(None) };
     let recipe = config.recipes.get(index).ok_or(RecipeError::NoSuchRecipe)?;
-    Ok(Some((recipe.mode, Parts::new(recipe, &port.bus)?)))
+    Ok(Some((recipe.mode, PartLayouts::new(recipe, &port.bus)?)))
 }
 
 /// The controller's shortest cycle.

@@ -10,8 +10,8 @@ use proto_core::time::{Duration, Instant};
 use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::Scalar;
 
-use super::recipe::Parts;
-use super::{Medium, Port, PortCounters, Transmitter};
+use super::recipe::PartLayouts;
+use super::{Medium, RecipePort, RecipePortCounters, Transmitter};
 use crate::registers::Registers;
 
 /// A frame of a user recipe, for a program.
@@ -21,7 +21,7 @@ pub(crate) struct Received {
     pub(crate) values: Vec<Scalar>,
 }
 
-impl Port {
+impl RecipePort {
     /// Handles bytes of the stream, or one datagram.
     pub(crate) fn receive(
         &mut self,
@@ -34,7 +34,7 @@ impl Port {
         if self.transmitter == Transmitter::Sending && matches!(self.medium, Medium::Rs485 { .. }) {
             self.counters.bytes_while_sending += bytes.len() as u64;
         }
-        let Some((mode, Parts::Stream { input: Some(layout), .. })) = &self.recipe else {
+        let Some((mode, PartLayouts::Stream { input: Some(layout), .. })) = &self.recipe else {
             self.counters.unexpected_bytes += bytes.len() as u64;
             return;
         };
@@ -102,7 +102,7 @@ impl Port {
     /// Handles a frame from the CAN bus.
     pub(crate) fn receive_can(&mut self, frame: &CanFrame, registers: &mut Registers, listening: Listening) {
         self.counters.bytes_in += frame.data().len() as u64;
-        let Some((mode, Parts::Can { input: Some(layout), .. })) = &self.recipe else {
+        let Some((mode, PartLayouts::Can { input: Some(layout), .. })) = &self.recipe else {
             self.counters.unknown_ids += 1;
             return;
         };
@@ -144,9 +144,10 @@ impl Port {
     /// Whether a program can receive from this port.
     pub(crate) fn check_receive(&self) -> Result<(), String> {
         match &self.recipe {
-            Some((Mode::User, Parts::Stream { input: Some(_), .. } | Parts::Can { input: Some(_), .. })) => {
-                Ok(())
-            }
+            Some((
+                Mode::User,
+                PartLayouts::Stream { input: Some(_), .. } | PartLayouts::Can { input: Some(_), .. },
+            )) => Ok(()),
             _ => Err(format!("{} has no user-defined recipe with an input part", self.name)),
         }
     }
@@ -165,7 +166,7 @@ struct Sink<'a> {
     listening: Listening,
     registers: &'a mut Registers,
     inbox: &'a mut VecDeque<Received>,
-    counters: &'a mut PortCounters,
+    counters: &'a mut RecipePortCounters,
 }
 
 impl Sink<'_> {

@@ -9,7 +9,7 @@ use recipe_config::{SimBus, SimCanFrame, SimField, SimParts, SimRecipe, SimStrea
 
 /// The layouts of a recipe's parts.
 #[derive(Debug, Clone)]
-pub(super) enum Parts {
+pub(super) enum PartLayouts {
     Stream { input: Option<Box<StreamLayout>>, output: Option<Box<StreamLayout>> },
     Can { input: Option<Box<CanLayout>>, output: Option<Box<CanLayout>> },
 }
@@ -47,7 +47,7 @@ impl std::fmt::Display for RecipeError {
 
 impl std::error::Error for RecipeError {}
 
-impl Parts {
+impl PartLayouts {
     /// Checks that `bus` can carry the recipe, and computes the layouts.
     pub(super) fn new(recipe: &SimRecipe, bus: &SimBus) -> Result<Self, RecipeError> {
         let framing = match bus {

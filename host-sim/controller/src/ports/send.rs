@@ -8,13 +8,13 @@ use proto_core::time::Instant;
 use proto_core::wire::can::CanFrame;
 use proto_core::wire::scalar::{Scalar, ScalarType};
 
-use super::recipe::{self, Parts};
-use super::{Medium, Port, Transmitter};
+use super::recipe::{self, PartLayouts};
+use super::{Medium, RecipePort, Transmitter};
 use std::net::SocketAddr;
 
 /// Data that a port sends.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) enum Outgoing {
+pub(crate) enum PortData {
     Bytes(Vec<u8>),
     Can(CanFrame),
     Datagram { peer: SocketAddr, bytes: Vec<u8> },
@@ -29,7 +29,7 @@ pub(crate) enum Handed {
     NotReady,
 }
 
-impl Port {
+impl RecipePort {
     /// Whether a program's frame was not yet sent.
     pub(crate) fn is_busy(&self) -> bool {
         self.transmitter != Transmitter::Idle
@@ -45,13 +45,13 @@ impl Port {
             return Err(format!("{name} has no user-defined recipe"));
         };
         let outgoing = match (parts, id) {
-            (Parts::Stream { output: Some(layout), .. }, None) => {
+            (PartLayouts::Stream { output: Some(layout), .. }, None) => {
                 let values = typed(name, values, layout.fields().map(|placed| placed.field.ty()))?;
                 let mut out = vec![0; layout.frame_len()];
                 layout.encode_values(&values, &mut out).map_err(|error| refused(name, error))?;
-                Outgoing::Bytes(out)
+                PortData::Bytes(out)
             }
-            (Parts::Can { output: Some(layout), .. }, id) => {
+            (PartLayouts::Can { output: Some(layout), .. }, id) => {
                 let index = match id {
                     Some(id) => recipe::frame_of(layout, id)
                         .ok_or_else(|| format!("{name}: id {id} is not in the recipe's output part"))?,
@@ -60,9 +60,9 @@ impl Port {
                 };
                 let part = layout.frame(index).ok_or_else(|| format!("{name}: no such frame"))?;
                 let values = typed(name, values, part.fields().map(|placed| placed.field.ty()))?;
-                Outgoing::Can(part.encode_values(&values).map_err(|error| refused(name, error))?)
+                PortData::Can(part.encode_values(&values).map_err(|error| refused(name, error))?)
             }
-            (Parts::Stream { output: Some(_), .. }, Some(_)) => {
+            (PartLayouts::Stream { output: Some(_), .. }, Some(_)) => {
                 return Err(format!("{name} carries a stream recipe: comm_send takes no frame id"));
             }
             _ => return Err(format!("{name}: the recipe has no output part")),
@@ -85,7 +85,7 @@ impl Port {
     }
 
     /// The frames that are due.
-    pub(crate) fn poll(&mut self, now: Instant, image: &[u8; IMAGE_BYTES]) -> Vec<Outgoing> {
+    pub(crate) fn poll(&mut self, now: Instant, image: &[u8; IMAGE_BYTES]) -> Vec<PortData> {
         if let Some(missed) = self.grid.as_mut().and_then(|grid| grid.due(now)) {
             self.counters.skipped_cycles += missed;
             match self.transmitter {
@@ -121,33 +121,33 @@ impl Port {
     }
 
     /// The frames of the output part with the present values.
-    fn cycle_frames(&self, image: &[u8; IMAGE_BYTES]) -> Vec<Outgoing> {
+    fn cycle_frames(&self, image: &[u8; IMAGE_BYTES]) -> Vec<PortData> {
         match &self.recipe {
-            Some((_, Parts::Stream { output: Some(layout), .. })) => {
+            Some((_, PartLayouts::Stream { output: Some(layout), .. })) => {
                 let mut out = [0; MAX_STREAM_FRAME];
                 let len = layout.encode(image, &mut out).unwrap_or(0);
                 let bytes = out.get(..len).unwrap_or(&[]);
                 match &self.medium {
                     Medium::UdpServer(clients) => clients
                         .iter()
-                        .map(|peer| Outgoing::Datagram { peer, bytes: bytes.to_vec() })
+                        .map(|peer| PortData::Datagram { peer, bytes: bytes.to_vec() })
                         .collect(),
-                    _ => vec![Outgoing::Bytes(bytes.to_vec())],
+                    _ => vec![PortData::Bytes(bytes.to_vec())],
                 }
             }
-            Some((_, Parts::Can { output: Some(layout), .. })) => {
-                layout.frames().map(|frame| Outgoing::Can(frame.encode(image))).collect()
+            Some((_, PartLayouts::Can { output: Some(layout), .. })) => {
+                layout.frames().map(|frame| PortData::Can(frame.encode(image))).collect()
             }
             _ => Vec::new(),
         }
     }
 
-    fn count_out(&mut self, frames: &[Outgoing]) {
+    fn count_out(&mut self, frames: &[PortData]) {
         self.counters.frames_out += frames.len() as u64;
         for frame in frames {
             self.counters.bytes_out += match frame {
-                Outgoing::Bytes(bytes) | Outgoing::Datagram { bytes, .. } => bytes.len(),
-                Outgoing::Can(frame) => frame.data().len(),
+                PortData::Bytes(bytes) | PortData::Datagram { bytes, .. } => bytes.len(),
+                PortData::Can(frame) => frame.data().len(),
             } as u64;
         }
     }

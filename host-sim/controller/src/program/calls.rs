@@ -7,10 +7,10 @@ use proto_core::wire::can::CanId;
 use proto_core::wire::scalar::Scalar;
 use rhai::{Array, Dynamic, Engine, FLOAT, INT, NativeCallContext};
 
-use super::link::{Outcome, ScriptLink};
+use super::link::{ScriptLink, ScriptResult};
 use super::script::CALL_PROGRAM;
 use super::text::one_line;
-use super::{Answer, Call};
+use super::{Call, CallReply};
 
 /// Registers all of them.
 pub(super) fn register(engine: &mut Engine, link: &Arc<ScriptLink>) {
@@ -23,21 +23,21 @@ pub(super) fn register(engine: &mut Engine, link: &Arc<ScriptLink>) {
 
 fn register_ports(engine: &mut Engine, link: &Arc<ScriptLink>) {
     let l = Arc::clone(link);
-    engine.register_fn("comm_recv", move |port: &str| -> Outcome<Array> {
+    engine.register_fn("comm_recv", move |port: &str| -> ScriptResult<Array> {
         l.call(Call::Receive { port: port.to_owned(), limit: None }).map(frame)
     });
     let l = Arc::clone(link);
-    engine.register_fn("comm_recv", move |port: &str, seconds: Dynamic| -> Outcome<Array> {
+    engine.register_fn("comm_recv", move |port: &str, seconds: Dynamic| -> ScriptResult<Array> {
         let limit = span("comm_recv", number(&seconds)?, "s", 1_000_000.0)?;
         l.call(Call::Receive { port: port.to_owned(), limit: Some(limit) }).map(frame)
     });
     let l = Arc::clone(link);
-    engine.register_fn("comm_send", move |port: &str, values: Array| -> Outcome<bool> {
+    engine.register_fn("comm_send", move |port: &str, values: Array| -> ScriptResult<bool> {
         let values = numbers(&values)?;
         l.call(Call::Send { port: port.to_owned(), id: None, values }).map(was_sent)
     });
     let l = Arc::clone(link);
-    engine.register_fn("comm_send", move |port: &str, id: INT, values: Array| -> Outcome<bool> {
+    engine.register_fn("comm_send", move |port: &str, id: INT, values: Array| -> ScriptResult<bool> {
         let values = numbers(&values)?;
         l.call(Call::Send { port: port.to_owned(), id: Some(id), values }).map(was_sent)
     });
@@ -45,15 +45,15 @@ fn register_ports(engine: &mut Engine, link: &Arc<ScriptLink>) {
 
 fn register_items(engine: &mut Engine, link: &Arc<ScriptLink>) {
     let l = Arc::clone(link);
-    engine.register_fn("get", move |name: &str| -> Outcome<Dynamic> {
+    engine.register_fn("get", move |name: &str| -> ScriptResult<Dynamic> {
         Ok(match l.call(Call::Get { name: name.to_owned() })? {
-            Answer::Value(value) => dynamic(value),
-            Answer::Bit(on) => Dynamic::from(on),
+            CallReply::Value(value) => dynamic(value),
+            CallReply::Bit(on) => Dynamic::from(on),
             _ => Dynamic::UNIT,
         })
     });
     let l = Arc::clone(link);
-    engine.register_fn("set", move |name: &str, value: Dynamic| -> Outcome<()> {
+    engine.register_fn("set", move |name: &str, value: Dynamic| -> ScriptResult<()> {
         let value = number(&value)?;
         l.call(Call::Set { name: name.to_owned(), value }).map(|_| ())
     });
@@ -61,12 +61,12 @@ fn register_items(engine: &mut Engine, link: &Arc<ScriptLink>) {
 
 fn register_moves(engine: &mut Engine, link: &Arc<ScriptLink>) {
     let l = Arc::clone(link);
-    engine.register_fn("movej", move |target: Array, speed: Dynamic| -> Outcome<()> {
+    engine.register_fn("movej", move |target: Array, speed: Dynamic| -> ScriptResult<()> {
         let target = six("movej", "joint positions", &target)?;
         l.call(Call::MoveJ { target, speed_rad_s: number(&speed)? }).map(|_| ())
     });
     let l = Arc::clone(link);
-    engine.register_fn("movel", move |target: Array, speed: Dynamic| -> Outcome<()> {
+    engine.register_fn("movel", move |target: Array, speed: Dynamic| -> ScriptResult<()> {
         let pose = six("movel", "values of a pose", &target)?;
         l.call(Call::MoveL { pose, speed_m_s: number(&speed)? }).map(|_| ())
     });
@@ -74,28 +74,29 @@ fn register_moves(engine: &mut Engine, link: &Arc<ScriptLink>) {
 
 fn register_flow(engine: &mut Engine, link: &Arc<ScriptLink>) {
     let l = Arc::clone(link);
-    engine.register_fn("wait_ms", move |time: Dynamic| -> Outcome<()> {
+    engine.register_fn("wait_ms", move |time: Dynamic| -> ScriptResult<()> {
         l.call(Call::Wait(span("wait_ms", number(&time)?, "ms", 1.0e3)?)).map(|_| ())
     });
     let l = Arc::clone(link);
-    engine.register_fn(CALL_PROGRAM, move |context: NativeCallContext<'_>, name: &str| -> Outcome<()> {
+    engine.register_fn(CALL_PROGRAM, move |context: NativeCallContext<'_>, name: &str| -> ScriptResult<()> {
         l.run_other(context.engine(), name)
     });
-    engine.register_fn("raise", |reason: Dynamic| -> Outcome<()> { Err(reason.to_string().into()) });
+    engine.register_fn("raise", |reason: Dynamic| -> ScriptResult<()> { Err(reason.to_string().into()) });
     // The interpreter's own functions would block the model, or read the machine's clock.
-    engine.register_fn("sleep", |_: INT| -> Outcome<()> { Err("sleep: use wait_ms".into()) });
-    engine.register_fn("sleep", |_: FLOAT| -> Outcome<()> { Err("sleep: use wait_ms".into()) });
-    engine.register_fn("timestamp", || -> Outcome<()> { Err("timestamp: programs have no clock".into()) });
+    engine.register_fn("sleep", |_: INT| -> ScriptResult<()> { Err("sleep: use wait_ms".into()) });
+    engine.register_fn("sleep", |_: FLOAT| -> ScriptResult<()> { Err("sleep: use wait_ms".into()) });
+    engine
+        .register_fn("timestamp", || -> ScriptResult<()> { Err("timestamp: programs have no clock".into()) });
 }
 
 fn register_log(engine: &mut Engine, link: &Arc<ScriptLink>) {
     let l = Arc::clone(link);
-    engine.register_fn("log", move |value: Dynamic| -> Outcome<()> {
+    engine.register_fn("log", move |value: Dynamic| -> ScriptResult<()> {
         l.call(Call::Log(one_line(&value.to_string()))).map(|_| ())
     });
     // The interpreter has a logarithm of this name, which would be the better match.
     let l = Arc::clone(link);
-    engine.register_fn("log", move |value: FLOAT| -> Outcome<()> {
+    engine.register_fn("log", move |value: FLOAT| -> ScriptResult<()> {
         l.call(Call::Log(Dynamic::from(value).to_string())).map(|_| ())
     });
     // `print` and `debug` cannot fail: see `ScriptLink::over`.
@@ -110,8 +111,8 @@ fn register_log(engine: &mut Engine, link: &Arc<ScriptLink>) {
 }
 
 /// What `comm_recv` returns: the list of the values, on CAN with the id first; an empty one if none came.
-fn frame(answer: Answer) -> Array {
-    let Answer::Frame { id, values } = answer else { return Array::new() };
+fn frame(answer: CallReply) -> Array {
+    let CallReply::Frame { id, values } = answer else { return Array::new() };
     let id = id.map(|id| match id {
         CanId::Standard(id) => Dynamic::from(INT::from(id)),
         CanId::Extended(id) => Dynamic::from(INT::from(id)),
@@ -120,12 +121,12 @@ fn frame(answer: Answer) -> Array {
 }
 
 /// What `comm_send` returns (D28).
-fn was_sent(answer: Answer) -> bool {
-    answer != Answer::Bit(false)
+fn was_sent(answer: CallReply) -> bool {
+    answer != CallReply::Bit(false)
 }
 
 /// A time in units of `unit_us` µs, at most 1e6 s.
-fn span(function: &str, value: f64, unit: &str, unit_us: f64) -> Outcome<Duration> {
+fn span(function: &str, value: f64, unit: &str, unit_us: f64) -> ScriptResult<Duration> {
     let most = MAX_WAIT_US / unit_us;
     if (0.0..=most).contains(&value) {
         return Ok(Duration::from_micros((value * unit_us).round() as u64));
@@ -133,13 +134,13 @@ fn span(function: &str, value: f64, unit: &str, unit_us: f64) -> Outcome<Duratio
     Err(format!("{function} takes 0 to {most} {unit}, not {value}").into())
 }
 
-fn six(function: &str, what: &str, values: &[Dynamic]) -> Outcome<[f64; 6]> {
+fn six(function: &str, what: &str, values: &[Dynamic]) -> ScriptResult<[f64; 6]> {
     let values = numbers(values)?;
     <[f64; 6]>::try_from(values.as_slice())
         .map_err(|_| format!("{function} takes 6 {what}, not {}", values.len()).into())
 }
 
-fn number(value: &Dynamic) -> Outcome<f64> {
+fn number(value: &Dynamic) -> ScriptResult<f64> {
     if let Ok(whole) = value.as_int() {
         return Ok(whole as f64);
     }
@@ -149,7 +150,7 @@ fn number(value: &Dynamic) -> Outcome<f64> {
     value.as_float().map_err(|_| format!("a number is needed here, not {value}").into())
 }
 
-fn numbers(values: &[Dynamic]) -> Outcome<Vec<f64>> {
+fn numbers(values: &[Dynamic]) -> ScriptResult<Vec<f64>> {
     values.iter().map(number).collect()
 }
 

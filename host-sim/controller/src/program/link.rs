@@ -10,7 +10,7 @@ use rhai::{ASTNode, Array, Dynamic, Engine, EvalAltResult, Expr, Position, Scope
 
 use super::text::described;
 use super::{
-    Answer, CALL_OPERATIONS, Call, End, MAX_NESTED, Progress, SLICE, SLICE_OPERATIONS, Script, Variables,
+    CALL_OPERATIONS, Call, CallReply, End, MAX_NESTED, Progress, SLICE, SLICE_OPERATIONS, Script, Variables,
     calls, script,
 };
 
@@ -18,7 +18,7 @@ use super::{
 #[derive(Debug)]
 pub(super) struct Stamped {
     pub(super) now: Instant,
-    pub(super) answer: Answer,
+    pub(super) answer: CallReply,
 }
 
 /// The thread's end of both channels.
@@ -45,7 +45,7 @@ pub(super) struct ScriptLink {
     over: AtomicBool,
 }
 
-pub(super) type Outcome<T> = Result<T, Box<EvalAltResult>>;
+pub(super) type ScriptResult<T> = Result<T, Box<EvalAltResult>>;
 
 /// Runs the script to its end and reports how it ended.
 pub(super) fn run(link: ScriptLink, script: &Script) {
@@ -89,7 +89,7 @@ impl ScriptLink {
     }
 
     /// Hands control to the model until it answers.
-    pub(super) fn call(&self, call: Call) -> Outcome<Answer> {
+    pub(super) fn call(&self, call: Call) -> ScriptResult<CallReply> {
         self.spend(CALL_OPERATIONS)?;
         let answer = self.exchange(call)?;
         self.stale.store(true, Relaxed);
@@ -97,7 +97,7 @@ impl ScriptLink {
     }
 
     /// Runs another script to its end, with variables of its own.
-    pub(super) fn run_other(&self, engine: &Engine, name: &str) -> Outcome<()> {
+    pub(super) fn run_other(&self, engine: &Engine, name: &str) -> ScriptResult<()> {
         self.spend(CALL_OPERATIONS)?;
         let Some(script) = script::named(&self.scripts, name) else {
             let names: Vec<_> = self.scripts.iter().map(Script::name).collect();
@@ -131,7 +131,7 @@ impl ScriptLink {
     }
 
     /// Counts operations. At the end of the slice the script waits for the next one.
-    fn spend(&self, operations: u64) -> Outcome<()> {
+    fn spend(&self, operations: u64) -> ScriptResult<()> {
         if self.spent.fetch_add(operations, Relaxed) + operations <= SLICE_OPERATIONS {
             return Ok(());
         }
@@ -139,7 +139,7 @@ impl ScriptLink {
         self.exchange(Call::GiveWay { until }).map(|_| ())
     }
 
-    fn exchange(&self, call: Call) -> Outcome<Answer> {
+    fn exchange(&self, call: Call) -> ScriptResult<CallReply> {
         if self.over.load(Relaxed) {
             return Err(terminated());
         }
@@ -152,11 +152,11 @@ impl ScriptLink {
             self.spent.store(0, Relaxed);
         }
         match answer {
-            Answer::Abort => {
+            CallReply::Abort => {
                 self.over.store(true, Relaxed);
                 Err(terminated())
             }
-            Answer::Error(message) => Err(message.into()),
+            CallReply::Error(message) => Err(message.into()),
             answer => Ok(answer),
         }
     }
@@ -169,7 +169,7 @@ impl ScriptLink {
 
     /// Ends a script whose variables are too large in total. The interpreter limits single values only, and
     /// does not check all limits when an item is added.
-    fn weigh(&self, scope: &Scope<'_>, place: Position) -> Outcome<()> {
+    fn weigh(&self, scope: &Scope<'_>, place: Position) -> ScriptResult<()> {
         if self.weigh_in.load(Relaxed) > 0 {
             return Ok(());
         }

@@ -41,11 +41,11 @@ pub enum Call {
     Receive {
         /// The port's name.
         port: String,
-        /// How long at most; then [`Answer::Done`] says that none came.
+        /// How long at most; then [`CallReply::Done`] says that none came.
         limit: Option<Duration>,
     },
-    /// Send a frame of the port's user recipe. [`Answer::Bit`] says whether the port was ready and has sent it;
-    /// [`Answer::Done`] is true.
+    /// Send a frame of the port's user recipe. [`CallReply::Bit`] says whether the port was ready and has sent it;
+    /// [`CallReply::Done`] is true.
     Send {
         /// The port's name.
         port: String,
@@ -93,7 +93,7 @@ pub enum Call {
 
 /// The model's answer to a [`Call`].
 #[derive(Debug, Clone, PartialEq)]
-pub enum Answer {
+pub enum CallReply {
     /// It is done.
     Done,
     /// A received frame; on CAN with its id.
@@ -192,7 +192,7 @@ impl Program {
     }
 
     /// Answers the pending call and runs the program up to the next one.
-    pub fn answer(&mut self, now: Instant, answer: Answer) {
+    pub fn answer(&mut self, now: Instant, answer: CallReply) {
         if matches!(self.progress, Progress::Ended(_)) {
             return;
         }

@@ -16,7 +16,7 @@ fn start_slices(text: &str) -> Program {
 /// Continues through its slices to the next call of a function.
 fn give_slices(program: &mut Program) {
     while let Progress::Calling(Call::GiveWay { until }) = *program.progress() {
-        program.answer(until, Answer::Done);
+        program.answer(until, CallReply::Done);
     }
 }
 
@@ -52,36 +52,36 @@ fn each_call_waits_for_its_answer() {
     assert_eq!(call(&program), Call::Receive { port: "rs485".to_owned(), limit: None });
     assert!(program.variables().is_empty());
     let values = vec![Scalar::Byte(1), Scalar::Char(-2), Scalar::Float(0.5)];
-    program.answer(NOW, Answer::Frame { id: None, values });
+    program.answer(NOW, CallReply::Frame { id: None, values });
     let sent = Call::Send { port: "rs485".to_owned(), id: None, values: vec![125.0, 125.0, 1.0] };
     assert_eq!(call(&program), sent);
     assert_eq!(serde_json::to_string(&program.variables()).unwrap(), r#"{"list1":[1,-2,0.5]}"#);
-    program.answer(NOW, Answer::Done);
+    program.answer(NOW, CallReply::Done);
     let sent = Call::Send { port: "can".to_owned(), id: Some(2), values: vec![1.0, -2.0, 0.5] };
     assert_eq!(call(&program), sent);
-    program.answer(NOW, Answer::Done);
+    program.answer(NOW, CallReply::Done);
     assert_eq!(call(&program), Call::Get { name: "RobotState[8]".to_owned() });
-    program.answer(NOW, Answer::Value(Scalar::Word(7)));
+    program.answer(NOW, CallReply::Value(Scalar::Word(7)));
     assert_eq!(call(&program), Call::Set { name: "WordOutputReg[1]".to_owned(), value: 7.0 });
-    program.answer(NOW, Answer::Done);
+    program.answer(NOW, CallReply::Done);
     let target = [0.0, 0.5, 0.0, 0.0, 0.0, 0.0];
     assert_eq!(call(&program), Call::MoveJ { target, speed_rad_s: 1.0 });
-    program.answer(NOW, Answer::Done);
+    program.answer(NOW, CallReply::Done);
     assert_eq!(call(&program), Call::Wait(Duration::from_micros(1_500)));
-    program.answer(NOW, Answer::Done);
+    program.answer(NOW, CallReply::Done);
     assert_eq!(call(&program), Call::Get { name: "DI[1]".to_owned() });
-    program.answer(NOW, Answer::Bit(true));
+    program.answer(NOW, CallReply::Bit(true));
     assert_eq!(call(&program), Call::Log("true".to_owned()));
-    program.answer(NOW, Answer::Done);
+    program.answer(NOW, CallReply::Done);
     assert_eq!(program.progress(), &Progress::Ended(End::Finished));
-    program.answer(NOW, Answer::Done);
+    program.answer(NOW, CallReply::Done);
 }
 
 #[test]
 fn a_received_can_frame_begins_with_its_id() {
     let mut program = start(r#"let list1 = comm_recv("can");"#);
     let values = vec![Scalar::Byte(1), Scalar::Byte(2), Scalar::Byte(3)];
-    program.answer(NOW, Answer::Frame { id: Some(CanId::Standard(1)), values });
+    program.answer(NOW, CallReply::Frame { id: Some(CanId::Standard(1)), values });
     assert_eq!(program.progress(), &Progress::Ended(End::Finished));
     assert_eq!(serde_json::to_string(&program.variables()).unwrap(), r#"{"list1":[1,1,2,3]}"#);
 }
@@ -90,10 +90,10 @@ fn a_received_can_frame_begins_with_its_id() {
 fn variables_are_published_while_a_loop_never_reads_them() {
     let mut program = start(r#"loop { let list1 = comm_recv("a"); comm_send("a", [125]); }"#);
     for nth in 0..3 {
-        program.answer(NOW, Answer::Frame { id: None, values: vec![Scalar::Byte(nth)] });
+        program.answer(NOW, CallReply::Frame { id: None, values: vec![Scalar::Byte(nth)] });
         assert!(matches!(call(&program), Call::Send { .. }));
         assert_eq!(program.variables()["list1"], serde_json::json!([nth]));
-        program.answer(NOW, Answer::Done);
+        program.answer(NOW, CallReply::Done);
     }
 }
 
@@ -103,7 +103,7 @@ fn variables_changed_before_a_call_are_published_during_it() {
         start("let n = [1]; let s = #{ a: \"x\", b: () }; n[0] = 9; wait_ms(1); n += 2; wait_ms(1);");
     assert_eq!(program.variables()["n"], serde_json::json!([9]));
     assert_eq!(program.variables()["s"], serde_json::json!({ "a": "x", "b": null }));
-    program.answer(NOW, Answer::Done);
+    program.answer(NOW, CallReply::Done);
     assert_eq!(program.variables()["n"], serde_json::json!([9, 2]));
 }
 
@@ -113,12 +113,12 @@ fn a_script_that_does_not_wait_is_cut_in_slices() {
     let mut program = start("let n = 0; loop { n += 1; }");
     for slice in 0..10 {
         assert_eq!(call(&program), Call::GiveWay { until: at(6 + slice) });
-        program.answer(at(6 + slice), Answer::Done);
+        program.answer(at(6 + slice), CallReply::Done);
     }
     // After a late slice the next one has its full length.
-    program.answer(at(100), Answer::Done);
+    program.answer(at(100), CallReply::Done);
     assert_eq!(call(&program), Call::GiveWay { until: at(101) });
-    program.answer(at(101), Answer::Abort);
+    program.answer(at(101), CallReply::Abort);
     assert_eq!(program.progress(), &Progress::Ended(End::Aborted));
 
     // Calls count too; a call that takes time begins a new slice.
@@ -126,13 +126,13 @@ fn a_script_that_does_not_wait_is_cut_in_slices() {
     let mut calls = 0;
     while call(&program) == Call::Wait(Duration::ZERO) {
         calls += 1;
-        program.answer(NOW, Answer::Done);
+        program.answer(NOW, CallReply::Done);
     }
     assert_eq!((calls, call(&program)), (9, Call::GiveWay { until: at(6) }));
     let mut program = start("loop { for i in 0..50 { let x = i; } wait_ms(1); }");
     for nth in 0..1_000 {
         assert_eq!(call(&program), Call::Wait(Duration::from_millis(1)), "{nth}");
-        program.answer(at(6 + nth), Answer::Done);
+        program.answer(at(6 + nth), CallReply::Done);
     }
 }
 
@@ -149,7 +149,7 @@ fn a_script_gets_as_far_in_a_slice_in_every_run() {
             if let Call::GiveWay { until } = call(&program) {
                 now = until;
             }
-            program.answer(now, Answer::Done);
+            program.answer(now, CallReply::Done);
         }
         (steps, program.variables())
     };
@@ -168,10 +168,10 @@ fn a_script_that_copies_much_does_less_in_a_slice() {
         );
         let mut program = start_slices(&text);
         let mut slices = 0;
-        program.answer(Instant::from_millis(60_000), Answer::Done);
+        program.answer(Instant::from_millis(60_000), CallReply::Done);
         while let Progress::Calling(Call::GiveWay { until }) = *program.progress() {
             slices += 1;
-            program.answer(until, Answer::Done);
+            program.answer(until, CallReply::Done);
         }
         assert_eq!(call(&program), Call::Log("2000".to_owned()));
         slices
@@ -214,7 +214,7 @@ fn errors_name_their_line_and_can_be_caught() {
     assert!(failure(&start("timestamp();")).contains("no clock"), "timestamp");
 
     let mut program = start("try { comm_send(\"a\", [1]); } catch (e) { log(e); }");
-    program.answer(NOW, Answer::Error("no such port".to_owned()));
+    program.answer(NOW, CallReply::Error("no such port".to_owned()));
     assert_eq!(call(&program), Call::Log("no such port".to_owned()));
 
     let broken = Script::compile("t", "let a = ;\n").unwrap_err();
@@ -225,7 +225,7 @@ fn errors_name_their_line_and_can_be_caught() {
 #[test]
 fn an_abort_cannot_be_caught() {
     let mut program = start("loop { try { wait_ms(10); } catch { log(\"caught\"); } }");
-    program.answer(NOW, Answer::Abort);
+    program.answer(NOW, CallReply::Abort);
     assert_eq!(program.progress(), &Progress::Ended(End::Aborted));
 }
 
@@ -233,7 +233,7 @@ fn an_abort_cannot_be_caught() {
 fn an_abort_during_a_print_ends_the_script_too() {
     let mut program = start("loop { print(\"x\"); }");
     assert_eq!(call(&program), Call::Log("x".to_owned()));
-    program.answer(NOW, Answer::Abort);
+    program.answer(NOW, CallReply::Abort);
     assert_eq!(program.progress(), &Progress::Ended(End::Aborted));
     drop(start("loop { print(\"x\"); }"));
 }

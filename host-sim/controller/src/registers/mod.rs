@@ -18,7 +18,7 @@ use std::sync::LazyLock;
 use proto_core::sysvar::{Direction, IMAGE_BYTES, SysVar, VarBit};
 use proto_core::wire::scalar::Scalar;
 
-use super::motion::{ArmState, Frame};
+use super::motion::{ArmState, Pose};
 use forced::Forced;
 pub(crate) use forced::PacketItem;
 use functional::Functional;
@@ -28,7 +28,7 @@ use recipe_config::{AnalogInput, BitGroup, InitialTarget};
 
 /// The codes of the state machines.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Status {
+pub struct MachineCodes {
     /// Operation mode, as in the state packet.
     pub mode: u8,
     /// Operation mode, as in holding register 0.
@@ -65,7 +65,7 @@ pub struct Registers {
     buttons: u8,
     arm: ArmState,
     target: ArmState,
-    status: Status,
+    status: MachineCodes,
     functional: Functional,
     forced: Forced,
     shown: ShownWords,
@@ -111,7 +111,7 @@ impl Default for Registers {
             buttons: 0,
             arm: ArmState::default(),
             target: ArmState::default(),
-            status: Status::default(),
+            status: MachineCodes::default(),
             functional: Functional::default(),
             forced: Forced::default(),
             shown: ShownWords::default(),
@@ -154,7 +154,7 @@ impl Registers {
     }
 
     /// The codes of the state machines.
-    pub fn status(&self) -> &Status {
+    pub fn status(&self) -> &MachineCodes {
         &self.status
     }
 
@@ -310,8 +310,8 @@ impl Registers {
     }
 
     /// The tool's frame, from `RobotState[20..25]`.
-    pub fn tool(&self) -> Frame {
-        Frame::from_pose(&self.vector(PLACES.tool).map(f64::from))
+    pub fn tool(&self) -> Pose {
+        Pose::from_pose(&self.vector(PLACES.tool).map(f64::from))
     }
 
     /// The payload, from `RobotState[26]`, in kg.
@@ -338,7 +338,7 @@ impl Registers {
     }
 
     /// Sets the codes of the state machines.
-    pub fn show_status(&mut self, status: Status) {
+    pub fn show_status(&mut self, status: MachineCodes) {
         if status != self.status {
             self.shown.forget();
             self.status = status;
@@ -373,7 +373,7 @@ impl Registers {
 }
 
 /// Offsets in the image, looked up once.
-struct Places {
+struct ImageOffsets {
     /// Of a command and of its status, and the valid bits.
     commanded: [(usize, usize, u8); 3],
     force_end: usize,
@@ -386,9 +386,9 @@ struct Places {
     functional_outputs: [usize; functional::OUTPUTS.len()],
 }
 
-static PLACES: LazyLock<Places> = LazyLock::new(|| {
+static PLACES: LazyLock<ImageOffsets> = LazyLock::new(|| {
     let offset = |group, index| named(group, index).map_or(0, SysVar::image_offset);
-    Places {
+    ImageOffsets {
         commanded: COMMANDED.map(|(command, status)| {
             let valid_bits = named("DigitalOutputCommand", command).map_or(0, SysVar::valid_bits);
             (offset("DigitalOutputCommand", command), offset("DigitalSignalStatus", status), valid_bits)

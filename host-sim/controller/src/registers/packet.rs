@@ -85,7 +85,7 @@ impl Registers {
 
     /// Writes every system variable that is in the packet.
     fn put_variables(&self, packet: &mut [u8; LEN]) {
-        for Place { image, packet: place } in SHOWN.iter() {
+        for PacketRange { image, packet: place } in SHOWN.iter() {
             let value = self.image.get(image.clone());
             let (Some(shown), Some(value)) = (packet.get_mut(place.clone()), value) else { continue };
             match value {
@@ -101,17 +101,20 @@ impl Registers {
 }
 
 /// Where a variable is.
-struct Place {
+struct PacketRange {
     image: Range<usize>,
     packet: Range<usize>,
 }
 
 /// The variables in the packet, looked up once.
-static SHOWN: LazyLock<Vec<Place>> = LazyLock::new(|| {
+static SHOWN: LazyLock<Vec<PacketRange>> = LazyLock::new(|| {
     let place = |var: SysVar| {
         let (shown, image) = (var.stream()?, var.image_offset());
         let offset = usize::from(shown.offset);
-        Some(Place { image: image..image + var.size(), packet: offset..offset + usize::from(shown.len) })
+        Some(PacketRange {
+            image: image..image + var.size(),
+            packet: offset..offset + usize::from(shown.len),
+        })
     };
     SysVar::all().filter_map(place).collect()
 });

@@ -16,7 +16,7 @@ use proto_core::wire::state::ProgramState;
 
 use super::Link;
 use crate::events::Happened;
-use crate::machine::{ErrorId, Progress, Transition};
+use crate::machine::{ErrorId, Transition, TransitionProgress};
 use crate::program;
 use crate::{ConnId, Controller, ControllerOutput};
 
@@ -25,14 +25,14 @@ use crate::{ConnId, Controller, ControllerOutput};
 pub(super) struct Session {
     parser: CommandServer,
     /// Commands that wait until the one before is answered.
-    waiting: VecDeque<(Command, Text)>,
+    waiting: VecDeque<(Command, EventText)>,
     pending: Option<Pending>,
     /// The command that is being executed.
-    current: Text,
+    current: EventText,
 }
 
 /// A command's text, for events; `None` while events are not recorded.
-type Text = Option<String>;
+type EventText = Option<String>;
 
 /// A command that is answered at the end of its transition.
 #[derive(Debug, Clone, Copy)]
@@ -56,7 +56,7 @@ enum Command {
 
 /// The next step of a connection.
 enum Next {
-    Answer(Action, Progress),
+    Answer(Action, TransitionProgress),
     Execute(Command),
 }
 
@@ -117,7 +117,7 @@ impl Controller {
         }
     }
 
-    fn queue(&mut self, now: Instant, conn: ConnId, command: Command, text: Text) {
+    fn queue(&mut self, now: Instant, conn: ConnId, command: Command, text: EventText) {
         self.counters.command.requests += 1;
         if let Some(text) = &text {
             self.happened(now, || Happened::Command { client: conn.0, text: text.clone() });
@@ -145,12 +145,12 @@ impl Controller {
                 Next::Execute(command) => self.execute(now, conn, command),
                 Next::Answer(action, progress) => {
                     let outcome = match progress {
-                        Progress::Done => Outcome::Success,
-                        Progress::Superseded => {
+                        TransitionProgress::Done => Outcome::Success,
+                        TransitionProgress::Superseded => {
                             self.machine.not_completed(action, "another operation began before it was done");
                             Outcome::Fail
                         }
-                        Progress::InProgress => {
+                        TransitionProgress::InProgress => {
                             let why = format!("not done after {} s", MAX_TRANSITION.as_millis() / 1_000);
                             self.machine.not_completed(action, &why);
                             Outcome::Fail
@@ -169,7 +169,7 @@ impl Controller {
         for (&conn, session) in &mut self.server.command {
             let Some(Pending { transition, until }) = session.pending else { continue };
             let progress = self.machine.progress(transition);
-            if progress != Progress::InProgress || now >= until {
+            if progress != TransitionProgress::InProgress || now >= until {
                 session.pending = None;
                 return Some((conn, Next::Answer(transition.action(), progress)));
             }

@@ -13,10 +13,10 @@ use super::{ConnId, Link};
 
 /// The clients of all servers.
 #[derive(Debug, Default)]
-pub(super) struct Places(BTreeMap<ConnId, Place>);
+pub(super) struct ClientActivities(BTreeMap<ConnId, ClientActivity>);
 
 #[derive(Debug, Clone, Copy)]
-struct Place {
+struct ClientActivity {
     link: Link,
     from: IpAddr,
     /// Whether it has sent a complete request.
@@ -25,9 +25,9 @@ struct Place {
     newest: Instant,
 }
 
-impl Places {
+impl ClientActivities {
     pub(super) fn opened(&mut self, now: Instant, link: Link, conn: ConnId, from: IpAddr) {
-        self.0.insert(conn, Place { link, from, has_asked: false, newest: now });
+        self.0.insert(conn, ClientActivity { link, from, has_asked: false, newest: now });
     }
 
     /// The client has sent a complete request, or was answered.

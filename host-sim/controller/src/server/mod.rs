@@ -18,10 +18,10 @@ use super::common::Link;
 use super::events::{Before, Recorder};
 use super::faults::CommandClients;
 use super::registers::Registers;
-use super::{ConnId, Controller, ControllerOutput, Counters, ServerCounters};
+use super::{ConnId, Controller, ControllerCounters, ControllerOutput, ServerCounters};
 pub use commands::MAX_ORDERS;
 use commands::Session;
-use displacement::Places;
+use displacement::ClientActivities;
 
 /// Maximum number of clients of port 2000.
 pub const MAX_COMMAND_CONNECTIONS: usize = 32;
@@ -39,7 +39,7 @@ pub(super) struct Server {
     state: BTreeSet<ConnId>,
     modbus: BTreeMap<ConnId, Box<ModbusServer>>,
     delayed: VecDeque<(Instant, ConnId, Vec<u8>)>,
-    places: Places,
+    places: ClientActivities,
 }
 
 impl Server {
@@ -75,7 +75,7 @@ impl Server {
     }
 }
 
-impl Counters {
+impl ControllerCounters {
     fn of(&mut self, link: Link) -> &mut ServerCounters {
         match link {
             Link::Command => &mut self.command,
@@ -174,7 +174,7 @@ impl Controller {
         let Some(session) = self.server.modbus.get_mut(&conn) else { return (None, Requested::Nothing) };
         let counters = &mut self.counters.modbus;
         counters.bytes_in += bytes.len() as u64;
-        let mut bank = Bank {
+        let mut bank = FaultyBank {
             registers: &mut self.registers,
             exception: self.faults.exception(),
             recorder: &self.recorder,
@@ -201,13 +201,17 @@ impl Controller {
             self.server.places.active(now, conn);
             self.registers.were_read();
         }
-        let sent = if answers.is_empty() { Sent::Now } else { self.send(now, Link::Modbus, conn, answers) };
+        let sent = if answers.is_empty() {
+            ResponseTiming::Now
+        } else {
+            self.send(now, Link::Modbus, conn, answers)
+        };
         if violated {
             self.counters.modbus.violations += 1;
             self.closed(now, Link::Modbus, conn);
             self.outputs.push_back(ControllerOutput::Close { conn });
         }
-        let changes = has_written || violated || sent == Sent::Later;
+        let changes = has_written || violated || sent == ResponseTiming::Later;
         (before, if changes { Requested::Changes } else { Requested::Nothing })
     }
 
@@ -240,12 +244,12 @@ impl Controller {
         self.close_clients(Link::State);
     }
 
-    fn send(&mut self, now: Instant, link: Link, conn: ConnId, mut bytes: Vec<u8>) -> Sent {
+    fn send(&mut self, now: Instant, link: Link, conn: ConnId, mut bytes: Vec<u8>) -> ResponseTiming {
         self.faults.corrupt_bytes(link, &mut bytes);
         let counters = self.counters.of(link);
         if self.faults.mutes(link) {
             counters.muted += 1;
-            return Sent::Never;
+            return ResponseTiming::Never;
         }
         counters.bytes_out += bytes.len() as u64;
         // Answers of a connection stay in order.
@@ -261,13 +265,13 @@ impl Controller {
                 }
                 _ => self.outputs.push_back(ControllerOutput::Send { conn, bytes }),
             }
-            Sent::Now
+            ResponseTiming::Now
         } else if self.server.delayed.len() < MAX_DELAYED {
             self.server.delayed.push_back((due, conn, bytes));
-            Sent::Later
+            ResponseTiming::Later
         } else {
             counters.muted += 1;
-            Sent::Never
+            ResponseTiming::Never
         }
     }
 }
@@ -282,14 +286,14 @@ pub(super) enum Requested {
 
 /// When an answer is sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Sent {
+enum ResponseTiming {
     Now,
     Later,
     Never,
 }
 
 /// The registers, or the exception that a fault demands.
-struct Bank<'a> {
+struct FaultyBank<'a> {
     registers: &'a mut Registers,
     exception: Option<Exception>,
     recorder: &'a Recorder,
@@ -298,7 +302,7 @@ struct Bank<'a> {
     has_written: bool,
 }
 
-impl Bank<'_> {
+impl FaultyBank<'_> {
     fn check(&self) -> Result<(), Exception> {
         self.exception.map_or(Ok(()), Err)
     }
@@ -311,7 +315,7 @@ impl Bank<'_> {
     }
 }
 
-impl RegisterBank for Bank<'_> {
+impl RegisterBank for FaultyBank<'_> {
     fn read_coils(&self, address: u16, count: u16, packed: &mut [u8]) -> Result<(), Exception> {
         self.check()?;
         self.registers.read_coils(address, count, packed)

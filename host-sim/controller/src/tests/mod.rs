@@ -106,7 +106,7 @@ impl TestController {
         answer[2] == 1
     }
 
-    pub(super) fn counters(&self, port: &str) -> PortCounters {
+    pub(super) fn counters(&self, port: &str) -> RecipePortCounters {
         self.controller.counters().ports[port]
     }
 }

@@ -97,7 +97,7 @@ fn a_program_tells_why_and_where_it_failed() {
     does(&mut cell, json!({ "do": "run", "program": "bad" }));
     cell.run_ms(10);
     let run = cell.controller.last_run().unwrap();
-    assert_eq!((run.outcome, run.line, run.column), (Outcome::Failed, Some(3), Some(3)));
+    assert_eq!((run.outcome, run.line, run.column), (RunOutcome::Failed, Some(3), Some(3)));
     assert!(run.reason.as_ref().unwrap().contains("no part"), "{run:?}");
     let run = state(&cell)["last_run"].clone();
     assert_eq!((&run["outcome"], &run["line"], &run["column"]), (&json!("failed"), &json!(3), &json!(3)));
@@ -121,7 +121,7 @@ fn what_has_stopped_a_program_is_told() {
         does(&mut cell, cause.clone());
         cell.run_ms(500);
         let run = cell.controller.last_run().unwrap();
-        assert_eq!((run.outcome, run.reason.as_deref()), (Outcome::Stopped, Some(reason)), "{cause}");
+        assert_eq!((run.outcome, run.reason.as_deref()), (RunOutcome::Stopped, Some(reason)), "{cause}");
         assert_eq!(events(&cell, 1, &["program_ended"]).len(), 1);
     }
     // A restart forgets it, and tells of it.

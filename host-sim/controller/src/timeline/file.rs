@@ -10,7 +10,7 @@ use serde_json::{Map, Value};
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
-use super::{Step, Timeline, Trigger};
+use super::{StepTrigger, Timeline, TimelineStep};
 use crate::Controller;
 use crate::condition::Condition;
 use crate::operations::{Operation, Refused, time};
@@ -26,8 +26,8 @@ impl Timeline {
             let message = error.message().split_whitespace().collect::<Vec<_>>().join(" ");
             file.error(error.span().map_or(0, |span| span.start), "", format!("invalid TOML: {message}"))
         })?;
-        let mut trial = Trial::new(config).map_err(|error| file.whole(error))?;
-        let (mut steps, mut tables) = (Vec::<Step>::new(), Vec::new());
+        let mut trial = TrialController::new(config).map_err(|error| file.whole(error))?;
+        let (mut steps, mut tables) = (Vec::<TimelineStep>::new(), Vec::new());
         for (key, value) in root.get_ref() {
             let DeValue::Array(items) = value.get_ref() else {
                 return Err(file.error(key.span().start, key.get_ref(), UNKNOWN));
@@ -58,7 +58,13 @@ struct File<'a> {
 }
 
 impl File<'_> {
-    fn step(&self, key: &str, at: usize, table: &DeTable<'_>, trial: &mut Trial) -> Result<Step, FileError> {
+    fn step(
+        &self,
+        key: &str,
+        at: usize,
+        table: &DeTable<'_>,
+        trial: &mut TrialController,
+    ) -> Result<TimelineStep, FileError> {
         let mut fields = Map::new();
         for (name, value) in table {
             let value = json(value)
@@ -88,7 +94,7 @@ impl File<'_> {
                         ));
                     }
                 }
-                Trigger::At(seconds("at_s", at_s)?)
+                StepTrigger::At(seconds("at_s", at_s)?)
             }
             (None, Some(when)) => {
                 let condition = Condition::deserialize(when).map_err(|error| Refused(error.to_string()));
@@ -100,7 +106,7 @@ impl File<'_> {
                     Some(other) => return Err(wrong("repeat", &format!("{other} is not true or false"))),
                 };
                 let after = after_s.map_or(Ok(Duration::ZERO), |after| seconds("after_s", after))?;
-                Trigger::When { condition: Box::new(condition), after, repeat, held: false, since: 0 }
+                StepTrigger::When { condition: Box::new(condition), after, repeat, held: false, since: 0 }
             }
             (Some(_), Some(_)) => return Err(wrong("when", "a step has either `at_s` or `when`, not both")),
             (None, None) => {
@@ -109,7 +115,7 @@ impl File<'_> {
         };
         let operation = Operation::from_json(fields).and_then(|operation| trial.check(operation));
         let operation = operation.map_err(|error| self.nearest(key, "do", table, &error))?;
-        Ok(Step { trigger, operation, due: VecDeque::new(), done: None })
+        Ok(TimelineStep { trigger, operation, due: VecDeque::new(), done: None })
     }
 
     /// An error at the key or the value that its message names first, or at `otherwise`.
@@ -147,11 +153,11 @@ impl File<'_> {
 }
 
 /// A controller of the same configuration, on which operations are tried that depend on no state.
-struct Trial {
+struct TrialController {
     controller: Controller,
 }
 
-impl Trial {
+impl TrialController {
     fn new(config: &SimConfig) -> Result<Self, String> {
         let controller = Controller::new(config).map_err(|error| error.to_string())?;
         Ok(Self { controller })

@@ -14,7 +14,7 @@ pub(crate) const MAX_EVENT: usize = 1 << 20;
 
 /// Finds the events of a stream.
 #[derive(Debug, Default)]
-pub(crate) struct Events {
+pub(crate) struct EventParser {
     line: Vec<u8>,
     /// The line before ended with CR: a LF belongs to its end.
     after_cr: bool,
@@ -28,7 +28,7 @@ pub(crate) struct Events {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct BrokenStream;
 
-impl Events {
+impl EventParser {
     /// Takes bytes, and appends the events that end in them.
     pub(crate) fn push(&mut self, bytes: &[u8], events: &mut Vec<ServerEvent>) -> Result<(), BrokenStream> {
         for &byte in bytes {
@@ -86,7 +86,7 @@ mod tests {
     fn events_are_the_same_however_the_stream_is_cut() {
         let stream = ": hello\nevent: status\ndata: {\"a\":1}\n\n:\n\nevent:values\r\ndata:{\r\ndata: }\r\nid: 3\r\n\r\nevent: none\n\ndata: x\r\r";
         for at_once in 1..=stream.len() {
-            let (mut events, mut found) = (Events::default(), Vec::new());
+            let (mut events, mut found) = (EventParser::default(), Vec::new());
             for piece in stream.as_bytes().chunks(at_once) {
                 events.push(piece, &mut found).unwrap();
             }
@@ -97,7 +97,7 @@ mod tests {
 
     #[test]
     fn an_endless_event_ends_the_stream_and_endless_comments_do_not() {
-        let mut events = Events::default();
+        let mut events = EventParser::default();
         let mut found = Vec::new();
         for _ in 0..MAX_EVENT / 1_000 * 3 {
             events.push(&[b":".as_slice(), &[b'x'; 1_000], b"\n\n"].concat(), &mut found).unwrap();
@@ -108,6 +108,6 @@ mod tests {
         let more = [b'x'; MAX_EVENT];
         assert_eq!(events.push(&more, &mut found), Err(BrokenStream));
         assert!(found.is_empty());
-        assert_eq!(Events::default().push(b"data: \xff\n", &mut found), Err(BrokenStream));
+        assert_eq!(EventParser::default().push(b"data: \xff\n", &mut found), Err(BrokenStream));
     }
 }

@@ -17,7 +17,7 @@ use std::time::{Duration, Instant};
 
 use crate::stop::{LOOK, Stop};
 use body::Unframer;
-use events::Events;
+use events::EventParser;
 use head::{HeadError, HttpHead, MAX_HEAD};
 
 pub(crate) use events::ServerEvent;
@@ -167,7 +167,7 @@ impl HttpExchange {
     pub(crate) fn stream(mut self) -> Result<Stream, NoReply> {
         let unframer = self.unframer()?;
         let rest = std::mem::take(&mut self.rest);
-        Ok(Stream { exchange: self, unframer, events: Events::default(), rest, found: Vec::new() })
+        Ok(Stream { exchange: self, unframer, events: EventParser::default(), rest, found: Vec::new() })
     }
 
     fn unframer(&self) -> Result<Unframer, NoReply> {
@@ -181,7 +181,7 @@ impl HttpExchange {
 pub(crate) struct Stream {
     exchange: HttpExchange,
     unframer: Unframer,
-    events: Events,
+    events: EventParser,
     rest: Vec<u8>,
     /// Events that have come, the newest first.
     found: Vec<ServerEvent>,

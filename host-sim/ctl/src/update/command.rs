@@ -4,8 +4,8 @@ use std::time::{Duration, Instant};
 
 use super::steps::{AGAIN, ended_words};
 use super::{
-    Downgrade, Firmware, Health, Incoming, Progress, Trial, begin_trial, confirm, fitting, health, push,
-    take_back,
+    Downgrade, Firmware, Health, Incoming, UpdateProgress, UpdateTrial, begin_trial, confirm, fitting,
+    health, push, take_back,
 };
 use crate::answer::Answer;
 use crate::client::Client;
@@ -42,7 +42,7 @@ pub fn update(
     let (now, new, slot) = (&board.version, link.header.version(), link.header.slot());
     notify(&format!("{now} runs on this {}; {new} goes into slot {slot:?}", board.board));
     let mut shown = String::new();
-    let mut progress = |step: Progress| {
+    let mut progress = |step: UpdateProgress| {
         let line = step.words();
         // A line says something new.
         if line != shown {
@@ -86,7 +86,7 @@ fn settled(
     before: &Health,
     is_to_last: bool,
     trial_s: u32,
-    progress: &mut dyn FnMut(Progress),
+    progress: &mut dyn FnMut(UpdateProgress),
 ) -> Result<(Firmware, Health), Failure> {
     let until = Instant::now() + Duration::from_secs(trial_s.into());
     loop {
@@ -103,7 +103,7 @@ fn settled(
         if is_over {
             return Ok((now, after));
         }
-        progress(Progress::OnTrial(trial));
+        progress(UpdateProgress::OnTrial(trial));
         if client.stop().wait(AGAIN) {
             return Err(client.refused("ended during the trial; `update --confirm` or `--back` ends it"));
         }
@@ -160,7 +160,7 @@ impl Firmware {
         if let Some(why) = &self.cannot {
             text += &format!("it takes no update: {why}\n");
         }
-        if let Some(Trial { left_s, waits_for }) = &self.trial {
+        if let Some(UpdateTrial { left_s, waits_for }) = &self.trial {
             text +=
                 &format!("on trial for {left_s:.0} s more; to confirm itself it waits for: {waits_for}\n");
         }

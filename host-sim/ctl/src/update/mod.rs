@@ -18,7 +18,7 @@ use crate::shown;
 
 pub use command::{Plan, confirmed, shown, taken_back, update};
 pub use health::{Health, health};
-pub use steps::{Progress, begin_trial, confirm, fitting, push, take_back, wait_confirmed};
+pub use steps::{UpdateProgress, begin_trial, confirm, fitting, push, take_back, wait_confirmed};
 
 /// What a board says of its firmware: the document `update`.
 #[derive(Debug, Clone, PartialEq)]
@@ -37,7 +37,7 @@ pub struct Firmware {
     /// The key that its loader takes firmware of.
     pub key: Option<PublicKey>,
     /// What runs is on trial.
-    pub trial: Option<Trial>,
+    pub trial: Option<UpdateTrial>,
     /// What is being received, or was.
     pub incoming: Option<Incoming>,
     /// The newest trial that has ended: its slot, and how.
@@ -48,7 +48,7 @@ pub struct Firmware {
 
 /// A firmware that runs on trial.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Trial {
+pub struct UpdateTrial {
     /// Seconds until it is taken back.
     pub left_s: f64,
     /// What is missing until it confirms itself.
@@ -107,7 +107,7 @@ impl Firmware {
             slot: slot(&document["slot"]),
             cannot: text(&document["cannot"]),
             key: document["key"].as_str().and_then(from_hex).and_then(|bytes| PublicKey::parse(&bytes)),
-            trial: trial.is_object().then(|| Trial {
+            trial: trial.is_object().then(|| UpdateTrial {
                 left_s: trial["left_s"].as_f64().unwrap_or_default(),
                 waits_for: text(&trial["waits_for"]).unwrap_or_default(),
             }),

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use recipe_update::Link;
 use serde_json::{Value, json};
 
-use super::{Downgrade, Firmware, Trial};
+use super::{Downgrade, Firmware, UpdateTrial};
 use crate::client::{Call, Client, RequestBody};
 use crate::failure::Failure;
 use crate::firmware::Update;
@@ -14,7 +14,7 @@ use crate::http::HttpReply;
 
 /// Progress of sending and trying a firmware.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Progress {
+pub enum UpdateProgress {
     /// The slot is being erased.
     Erasing,
     /// So many bytes of so many were taken.
@@ -29,10 +29,10 @@ pub enum Progress {
     /// The board restarts.
     Restarting,
     /// It runs the firmware on trial, which waits for this until it confirms itself.
-    OnTrial(Trial),
+    OnTrial(UpdateTrial),
 }
 
-impl Progress {
+impl UpdateProgress {
     /// A line for people.
     pub fn words(&self) -> String {
         match self {
@@ -44,7 +44,7 @@ impl Progress {
             }
             Self::Checking => "the board computes the hash".to_owned(),
             Self::Restarting => "the safe values are out; the board restarts".to_owned(),
-            Self::OnTrial(Trial { waits_for, .. }) => format!("on trial; it waits for: {waits_for}"),
+            Self::OnTrial(UpdateTrial { waits_for, .. }) => format!("on trial; it waits for: {waits_for}"),
         }
     }
 }
@@ -89,7 +89,7 @@ pub fn push(
     client: &Client,
     link: &Link<'_>,
     downgrade: Downgrade,
-    progress: &mut dyn FnMut(Progress),
+    progress: &mut dyn FnMut(UpdateProgress),
 ) -> Result<Firmware, Failure> {
     let length = (link.header_bytes.len() + link.image.len()) as u64;
     let mut lost: Option<Instant> = None;
@@ -124,14 +124,14 @@ pub fn push(
             }
             "receiving" => {
                 next = Some(incoming.received);
-                progress(Progress::Sent { received: incoming.received, length });
+                progress(UpdateProgress::Sent { received: incoming.received, length });
                 if client.stop().is_asked() {
                     return Err(client.refused("ended; the same command goes on where this one has"));
                 }
                 continue;
             }
-            "erasing" => progress(Progress::Erasing),
-            _ => progress(Progress::Checking),
+            "erasing" => progress(UpdateProgress::Erasing),
+            _ => progress(UpdateProgress::Checking),
         }
         if client.stop().wait(AGAIN) {
             return Err(client.refused("ended; the same command goes on where this one has"));
@@ -170,12 +170,12 @@ pub fn begin_trial(
     client: &Client,
     confirm_s: u32,
     downgrade: Downgrade,
-    progress: &mut dyn FnMut(Progress),
+    progress: &mut dyn FnMut(UpdateProgress),
 ) -> Result<Firmware, Failure> {
     let before = Firmware::of(client)?;
     let path = format!("update/try{}", more(downgrade, '?'));
     post(client, &path, &json!({ "confirm_s": confirm_s }))?;
-    progress(Progress::Restarting);
+    progress(UpdateProgress::Restarting);
     // The trial ends by itself after that, and restarts take their time.
     let there = |now: &Firmware| now.trial.is_some();
     let failed = |now: &Firmware| {
@@ -192,7 +192,10 @@ pub fn begin_trial(
 ///
 /// # Errors
 /// The trial has ended otherwise.
-pub fn wait_confirmed(client: &Client, progress: &mut dyn FnMut(Progress)) -> Result<Firmware, Failure> {
+pub fn wait_confirmed(
+    client: &Client,
+    progress: &mut dyn FnMut(UpdateProgress),
+) -> Result<Firmware, Failure> {
     let mut seen = Firmware::of(client)?;
     let slot = seen.slot;
     loop {
@@ -206,7 +209,7 @@ pub fn wait_confirmed(client: &Client, progress: &mut dyn FnMut(Progress)) -> Re
             };
         };
         let left = trial.left_s.max(0.0);
-        progress(Progress::OnTrial(trial));
+        progress(UpdateProgress::OnTrial(trial));
         if client.stop().wait(AGAIN) {
             return Err(client.refused("ended during the trial; `ctl update --confirm` or `--back` ends it"));
         }
@@ -230,9 +233,9 @@ pub fn confirm(client: &Client) -> Result<Firmware, Failure> {
 ///
 /// # Errors
 /// It is refused, or the board does not come back in time.
-pub fn take_back(client: &Client, progress: &mut dyn FnMut(Progress)) -> Result<Firmware, Failure> {
+pub fn take_back(client: &Client, progress: &mut dyn FnMut(UpdateProgress)) -> Result<Firmware, Failure> {
     let slot = post(client, "update/back", &json!({}))?.slot;
-    progress(Progress::Restarting);
+    progress(UpdateProgress::Restarting);
     back(client, RESTARTING, &|now| now.slot != slot && now.trial.is_none(), &|_| false)
 }
 

@@ -10,7 +10,7 @@ use proto_core::engine::{Engine, Input, OUTPUT_BUFFER, Output, PortId};
 use proto_core::time::{Duration as Span, Instant};
 use recipe_api::documents::{Document, Pieces};
 use recipe_config::file::{Text, parse_gateway};
-use recipe_ctl::{Configuration, Failure, Stored, Trial, Verdict};
+use recipe_ctl::{Configuration, Failure, Stored, TrialOptions, Verdict};
 use recipe_test_kit::example;
 use serde_json::{Value, json};
 
@@ -189,7 +189,7 @@ fn what_a_board_has_not_is_refused_before_anything_is_sent() {
 fn a_board_gets_an_image_and_is_waited_for() {
     let server = board();
     let configuration = Configuration::read(&example(FILE), &here(), None).unwrap();
-    let trial = Trial { confirm_s: 60.0, revision: None };
+    let trial = TrialOptions { confirm_s: 60.0, revision: None };
     let answer = recipe_ctl::push(&server.client(true), &configuration, Some(trial)).unwrap();
     let text = answer.text(WIDE);
     assert!(text.starts_with("revision 2 runs on trial; it is taken back in 60 s"), "{text}");
@@ -220,7 +220,7 @@ fn a_board_that_takes_a_revision_back_is_believed() {
             ok(&shown)
         }
     });
-    let trial = Trial { confirm_s: 60.0, revision: None };
+    let trial = TrialOptions { confirm_s: 60.0, revision: None };
     let error = recipe_ctl::apply(&server.client(true), trial).unwrap_err();
     assert!(error.message().ends_with("revision 2: it did not start: no room"), "{error:?}");
 }

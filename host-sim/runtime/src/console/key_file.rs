@@ -5,15 +5,15 @@ use std::path::Path;
 use recipe_api::key::Key;
 use recipe_io::files::read_private;
 
-use crate::StartError;
+use crate::RunError;
 
 /// Reads a key: 32 hexadecimal digits and a line end.
 ///
 /// # Errors
 /// If the file cannot be read, others may read it, or it holds anything else.
-pub fn read_key(path: &Path) -> Result<Key, StartError> {
+pub fn read_key(path: &Path) -> Result<Key, RunError> {
     let refused =
-        |why: &dyn std::fmt::Display| StartError::new(format!("--console-key {}: {why}", path.display()));
+        |why: &dyn std::fmt::Display| RunError::new(format!("--console-key {}: {why}", path.display()));
     let text = read_private(path, 100).map_err(|error| refused(&error))?;
     // The contents are not repeated: a mistyped key is almost one.
     Key::parse(text.trim_end()).ok_or_else(|| {

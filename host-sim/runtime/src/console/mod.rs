@@ -38,7 +38,7 @@ use crate::host::{self, ForegroundRun, Handle};
 use crate::log::Log;
 use crate::publisher::Publisher;
 use crate::worker::RuntimePlace;
-use crate::{RunOptions, StartError};
+use crate::{RunError, RunOptions};
 pub use key_file::read_key;
 use snapshots::Snapshots;
 pub use supervisor::ConfigFile;
@@ -74,9 +74,9 @@ pub(crate) struct Bound {
 
 impl ConsoleOptions {
     /// Opens the socket.
-    pub(crate) fn bind(&self) -> Result<Bound, StartError> {
+    pub(crate) fn bind(&self) -> Result<Bound, RunError> {
         let refused =
-            |why: &dyn std::fmt::Display| StartError::new(format!("--console {}: {why}", self.address));
+            |why: &dyn std::fmt::Display| RunError::new(format!("--console {}: {why}", self.address));
         if !self.address.ip().to_canonical().is_loopback() && self.key.is_none() {
             return Err(refused(&"other machines are served only with a key; add --console-key FILE"));
         }
@@ -121,8 +121,8 @@ pub(crate) struct Console {
 
 impl Console {
     /// Serves a socket on a thread of its own.
-    pub(crate) fn start(bound: Bound, source: ConsoleSource, log: Option<Log>) -> Result<Self, StartError> {
-        let refused = |error: std::io::Error| StartError::new(format!("console: {error}"));
+    pub(crate) fn start(bound: Bound, source: ConsoleSource, log: Option<Log>) -> Result<Self, RunError> {
+        let refused = |error: std::io::Error| RunError::new(format!("console: {error}"));
         let Bound { listener, address, key, peer } = bound;
         let end = Arc::new(Notify::new());
         let ended = Arc::clone(&end);
@@ -183,11 +183,7 @@ impl Drop for Console {
 ///
 /// # Errors
 /// The reason why it could not start; nothing is left behind then.
-pub fn run_gateway(
-    file: ConfigFile,
-    console: &ConsoleOptions,
-    options: &RunOptions,
-) -> Result<(), StartError> {
+pub fn run_gateway(file: ConfigFile, console: &ConsoleOptions, options: &RunOptions) -> Result<(), RunError> {
     let publisher = options.sparkplug.clone().map(Publisher::start).transpose()?;
     let snapshot_watch = publisher.as_ref().map(Publisher::snapshot_watch);
     let supervised = Supervised::start(file, options, console, snapshot_watch, RuntimePlace::alone())?;
@@ -205,9 +201,9 @@ pub(crate) struct Consoled {
 
 impl Consoled {
     /// Serves a console for a controller that runs.
-    pub(crate) fn start(bound: Bound, handle: Handle, log: Option<Log>) -> Result<Self, StartError> {
+    pub(crate) fn start(bound: Bound, handle: Handle, log: Option<Log>) -> Result<Self, RunError> {
         let control = handle.place("control").parse();
-        let control = control.map_err(|error| StartError::new(format!("control socket: {error}")))?;
+        let control = control.map_err(|error| RunError::new(format!("control socket: {error}")))?;
         let console =
             Console::start(bound, ConsoleSource::Controller { client: handle.client(), control }, log)?;
         let mut ready = handle.ready().clone();
@@ -233,7 +229,7 @@ impl ForegroundRun for Consoled {
         self.handle.has_ended()
     }
 
-    fn shutdown(mut self: Box<Self>) -> Result<(), StartError> {
+    fn shutdown(mut self: Box<Self>) -> Result<(), RunError> {
         self.console = None;
         self.handle.shutdown()
     }

@@ -17,7 +17,7 @@ use recipe_io::files::Beside;
 use rustix::fs::{FlockOperation, flock};
 use serde::{Deserialize, Serialize};
 
-use crate::StartError;
+use crate::RunError;
 
 /// The revisions with their texts.
 #[derive(Debug)]
@@ -60,12 +60,12 @@ pub(super) struct RevisionEntry {
 impl RevisionStore {
     /// The store of a folder, or of this process alone. If the file that the process was started with is
     /// another one than before, a person has changed it: then it becomes the newest revision, and live.
-    pub(super) fn open(path: Option<&Path>, file: (&str, &str)) -> Result<Self, StartError> {
+    pub(super) fn open(path: Option<&Path>, file: (&str, &str)) -> Result<Self, RunError> {
         let mut store =
             Self { folder: None, index: Index::default(), texts: BTreeMap::new(), started_with: None };
         if let Some(path) = path {
             let refused = |why: &dyn std::fmt::Display| {
-                StartError::new(format!("--console-state {}: {why}", path.display()))
+                RunError::new(format!("--console-state {}: {why}", path.display()))
             };
             let lock = lock(path).map_err(|error| match error.kind() {
                 io::ErrorKind::WouldBlock => refused(&"another process uses this folder"),
@@ -95,11 +95,11 @@ impl RevisionStore {
 
     /// Writes the revision of the file that the process was started with, now that it has started: a revision that does
     /// not start replaces none.
-    pub(super) fn has_started(&mut self) -> Result<(), StartError> {
+    pub(super) fn has_started(&mut self) -> Result<(), RunError> {
         let Some((number, forget)) = self.started_with.take() else { return Ok(()) };
         let text = self.texts.get(&number).cloned().unwrap_or_default();
         let written = self.put(number, &text, forget, self.index.clone());
-        written.map_err(|error| StartError::new(format!("--console-state: {error}")))
+        written.map_err(|error| RunError::new(format!("--console-state: {error}")))
     }
 
     /// The machine of these revisions.

@@ -32,7 +32,7 @@ use crate::host::{ForegroundRun, Handle};
 use crate::publisher::SnapshotWatch;
 use crate::snapshot::SnapshotSlot;
 use crate::worker::RuntimePlace;
-use crate::{RunOptions, StartError};
+use crate::{RunError, RunOptions};
 
 /// The configuration that a gateway was started with.
 #[derive(Debug, Clone)]
@@ -50,11 +50,11 @@ impl ConfigFile {
     ///
     /// # Errors
     /// If it cannot be read.
-    pub fn read(path: &Path, overrides: Vec<String>) -> Result<Self, StartError> {
+    pub fn read(path: &Path, overrides: Vec<String>) -> Result<Self, RunError> {
         let name = path.display().to_string();
         match std::fs::read_to_string(path) {
             Ok(toml) => Ok(Self { name, toml, overrides }),
-            Err(error) => Err(StartError::new(format!("{name}: cannot be read: {error}"))),
+            Err(error) => Err(RunError::new(format!("{name}: cannot be read: {error}"))),
         }
     }
 }
@@ -147,7 +147,7 @@ pub(crate) struct Supervised {
     ready: Value,
     shared: Arc<SharedView>,
     commands: blocking::Sender<SupervisorCommand>,
-    thread: Option<JoinHandle<Result<(), StartError>>>,
+    thread: Option<JoinHandle<Result<(), RunError>>>,
     /// Ended first, so that no more requests are answered.
     console: Option<Console>,
 }
@@ -160,11 +160,11 @@ impl Supervised {
         console: &ConsoleOptions,
         snapshot_watch: Option<SnapshotWatch>,
         place: RuntimePlace,
-    ) -> Result<Self, StartError> {
+    ) -> Result<Self, RunError> {
         let bound = console.bind()?;
         let store = RevisionStore::open(console.state.as_deref(), (&file.name, &file.toml))?;
         let Some(revisions) = store.revisions() else {
-            return Err(StartError::new("--console-state: the revisions make no sense"));
+            return Err(RunError::new("--console-state: the revisions make no sense"));
         };
         let shared = Arc::<SharedView>::default();
         let (commands, inbox) = blocking::channel();
@@ -189,18 +189,18 @@ impl Supervised {
             let _of = supervisor.place.span.clone().entered();
             supervisor.run(&opened, &inbox)
         });
-        let thread = thread.map_err(|error| StartError::new(format!("cannot start a thread: {error}")))?;
+        let thread = thread.map_err(|error| RunError::new(format!("cannot start a thread: {error}")))?;
         match outcome.recv() {
             Ok(Ok(())) => {}
             Ok(Err(error)) => return Err(error),
-            Err(_) => return Err(StartError::new("the supervisor ended")),
+            Err(_) => return Err(RunError::new("the supervisor ended")),
         }
         let mut running = Self { ready: Value::Null, shared, commands, thread: Some(thread), console: None };
         running.serve(bound, options)?;
         Ok(running)
     }
 
-    fn serve(&mut self, bound: Bound, options: &RunOptions) -> Result<(), StartError> {
+    fn serve(&mut self, bound: Bound, options: &RunOptions) -> Result<(), RunError> {
         let (shared, commands) = (Arc::clone(&self.shared), self.commands.clone());
         let source = ConsoleSource::Gateway { shared, commands, watch: options.watch.clone() };
         let console = Console::start(bound, source, options.log.clone())?;
@@ -210,13 +210,13 @@ impl Supervised {
         Ok(())
     }
 
-    fn end(&mut self) -> Result<(), StartError> {
+    fn end(&mut self) -> Result<(), RunError> {
         self.console = None;
         let (answer, _) = oneshot::channel();
         let peer = IpAddr::V4(std::net::Ipv4Addr::LOCALHOST);
         let _ = self.commands.send(SupervisorCommand { peer, what: SupervisorAction::Shutdown, answer });
         let Some(thread) = self.thread.take() else { return Ok(()) };
-        thread.join().unwrap_or_else(|_| Err(StartError::new("a thread panicked").after_start()))
+        thread.join().unwrap_or_else(|_| Err(RunError::new("a thread panicked").after_start()))
     }
 }
 
@@ -244,7 +244,7 @@ impl ForegroundRun for Supervised {
         self.thread.as_ref().is_none_or(JoinHandle::is_finished)
     }
 
-    fn shutdown(mut self: Box<Self>) -> Result<(), StartError> {
+    fn shutdown(mut self: Box<Self>) -> Result<(), RunError> {
         self.end()
     }
 }
@@ -281,9 +281,9 @@ struct Supervisor {
 impl Supervisor {
     fn run(
         mut self,
-        opened: &blocking::Sender<Result<(), StartError>>,
+        opened: &blocking::Sender<Result<(), RunError>>,
         inbox: &blocking::Receiver<SupervisorCommand>,
-    ) -> Result<(), StartError> {
+    ) -> Result<(), RunError> {
         let live = self.revisions.live();
         if let Some(folder) = &self.state {
             info!(revision = live, folder = %folder.display(), "running this revision");
@@ -313,7 +313,7 @@ impl Supervisor {
     }
 
     /// The gateway has ended by itself. What was live ends the process, as it does without a console.
-    fn has_ended(&mut self) -> Result<(), StartError> {
+    fn has_ended(&mut self) -> Result<(), RunError> {
         let Some(running) = self.running.take() else { return Ok(()) };
         let ended = running.handle.shutdown();
         let Some((number, _)) = self.revisions.trial() else { return ended };
@@ -404,7 +404,7 @@ impl Supervisor {
     }
 
     /// Runs a revision instead of what runs. What is wrong with it shows before anything is stopped.
-    fn replace_by(&mut self, number: u32) -> Result<(), StartError> {
+    fn replace_by(&mut self, number: u32) -> Result<(), RunError> {
         if self.running.as_ref().is_some_and(|running| running.number == number) {
             // The one that was to take its place could not be prepared.
             return Ok(());
@@ -414,11 +414,11 @@ impl Supervisor {
         self.start(number, prepared)
     }
 
-    fn prepare(&self, number: u32) -> Result<Prepared, StartError> {
+    fn prepare(&self, number: u32) -> Result<Prepared, RunError> {
         let text = self.store.text(number).map_or("", |text| text);
         let name = format!("revision {number}");
         check::prepare(&name, text, &self.overrides)
-            .map_err(|mistake| StartError::new(format!("{name}: {mistake}")))
+            .map_err(|mistake| RunError::new(format!("{name}: {mistake}")))
     }
 
     /// Sends the safe values and ends the running gateway.
@@ -432,7 +432,7 @@ impl Supervisor {
         }
     }
 
-    fn start(&mut self, number: u32, prepared: Prepared) -> Result<(), StartError> {
+    fn start(&mut self, number: u32, prepared: Prepared) -> Result<(), RunError> {
         let slot = Arc::new(SnapshotSlot::new());
         let Prepared { config, decoder } = prepared;
         let observers = Observers { slot: Some(Arc::clone(&slot)), decoder, ..self.observers.clone() };

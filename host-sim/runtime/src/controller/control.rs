@@ -19,7 +19,7 @@ use tokio::task::spawn_local;
 use tracing::{debug, warn};
 
 use super::ControllerRuntime;
-use recipe_controller::Event;
+use recipe_controller::ControllerEvent;
 use recipe_controller::operations::{Operation, check_kinds};
 use recipe_io::fairness::yield_fairly;
 use recipe_io::tcp_options;
@@ -51,7 +51,7 @@ struct Follow {
 }
 
 #[derive(Serialize)]
-struct Answer {
+struct ControlReply {
     #[serde(skip_serializing_if = "Option::is_none")]
     id: Option<Value>,
     ok: bool,
@@ -65,7 +65,7 @@ struct Answer {
 #[derive(Serialize)]
 #[serde(rename_all = "snake_case")]
 enum Notice<'a> {
-    Event(&'a Event),
+    Event(&'a ControllerEvent),
     Lost(u64),
 }
 
@@ -172,9 +172,9 @@ impl ControllerRuntime {
                 client.written.notified().await;
             }
             let request = match next_line(read, &mut line).await? {
-                Line::End => return Ok(()),
-                Line::TooLong => Err(format!("the line is longer than {MAX_LINE} bytes")),
-                Line::Whole => match serde_json::from_slice(&line) {
+                ControlLine::End => return Ok(()),
+                ControlLine::TooLong => Err(format!("the line is longer than {MAX_LINE} bytes")),
+                ControlLine::Whole => match serde_json::from_slice(&line) {
                     Ok(Value::Object(request)) => Ok(request),
                     Ok(_) => Err("not a JSON object".to_owned()),
                     Err(error) => Err(format!("not a JSON object: {error}")),
@@ -218,13 +218,13 @@ impl ControllerRuntime {
         }
     }
 
-    fn answer(&self, id: Option<Value>, done: Result<Value, String>) -> Answer {
+    fn answer(&self, id: Option<Value>, done: Result<Value, String>) -> ControlReply {
         let time_s = self.controller.borrow().time_s(self.clock.now());
         let (ok, result, error) = match done {
             Ok(result) => (true, Some(result), None),
             Err(error) => (false, None, Some(error)),
         };
-        Answer { id, ok, time_s, result, error }
+        ControlReply { id, ok, time_s, result, error }
     }
 
     /// Adds the events that a client follows to what waits for it, while there is room.
@@ -280,7 +280,7 @@ impl ControllerRuntime {
     }
 }
 
-enum Line {
+enum ControlLine {
     Whole,
     TooLong,
     /// There is none.
@@ -288,22 +288,22 @@ enum Line {
 }
 
 /// Reads a line without its end. The last one needs none.
-async fn next_line(read: &mut BufReader<OwnedReadHalf>, line: &mut Vec<u8>) -> io::Result<Line> {
+async fn next_line(read: &mut BufReader<OwnedReadHalf>, line: &mut Vec<u8>) -> io::Result<ControlLine> {
     line.clear();
     loop {
         let chunk = read.fill_buf().await?;
         let end = chunk.iter().position(|&byte| byte == b'\n');
         let count = end.unwrap_or(chunk.len());
         if line.len() + count > MAX_LINE {
-            return Ok(Line::TooLong);
+            return Ok(ControlLine::TooLong);
         }
         if count == 0 && end.is_none() {
-            return Ok(if line.is_empty() { Line::End } else { Line::Whole });
+            return Ok(if line.is_empty() { ControlLine::End } else { ControlLine::Whole });
         }
         line.extend_from_slice(chunk.get(..count).unwrap_or(chunk));
         read.consume(count + usize::from(end.is_some()));
         if end.is_some() {
-            return Ok(Line::Whole);
+            return Ok(ControlLine::Whole);
         }
     }
 }

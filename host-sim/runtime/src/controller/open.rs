@@ -9,18 +9,18 @@ use tokio::net::{TcpListener, UdpSocket};
 use tokio::sync::Notify;
 use tokio::task::JoinSet;
 
-use super::{ControllerOptions, ControllerRuntime, Outward, Running};
-use crate::{EventsFile, StartError, udp};
+use super::{ControllerOptions, ControllerRuntime, Outward, RunningController};
+use crate::{EventsFile, RunError, udp};
 use recipe_config::{SimBus, SimConfig, SimParts};
 use recipe_controller::{Controller, ControllerInput, Link};
 use recipe_io::bind::Bind;
 use recipe_io::clock::Clock;
 use recipe_io::log_limit::LogLimit;
-use recipe_io::port::{Port, PortBus};
+use recipe_io::port::{BusSettings, OpenPort};
 
-impl Running {
-    pub(super) async fn open(config: SimConfig, options: ControllerOptions) -> Result<Self, StartError> {
-        let mut controller = Controller::new(&config).map_err(|error| StartError::new(error.to_string()))?;
+impl RunningController {
+    pub(super) async fn open(config: SimConfig, options: ControllerOptions) -> Result<Self, RunError> {
+        let mut controller = Controller::new(&config).map_err(|error| RunError::new(error.to_string()))?;
         if let Some(seed) = options.seed {
             controller.seed(seed);
         }
@@ -59,10 +59,10 @@ impl Running {
             ports.push(outward);
             places.insert(port.name.clone(), json!(place));
         }
-        let is_kernel_can = |device: &Option<Port>| device.as_ref().is_some_and(Port::is_kernel_can);
+        let is_kernel_can = |device: &Option<OpenPort>| device.as_ref().is_some_and(OpenPort::is_kernel_can);
         let kernel_can = (0..devices.len()).filter(|&nth| is_kernel_can(&devices[nth])).collect();
         let alarm =
-            || clock.alarm().map_err(|error| StartError::new(format!("cannot create a timer: {error}")));
+            || clock.alarm().map_err(|error| RunError::new(format!("cannot create a timer: {error}")));
         let (timer, timeline_alarm) = (alarm()?, alarm()?);
         // The last that can fail: an earlier run's file is kept if this one cannot start.
         let events_file = options.events.as_ref().map(EventsFile::create).transpose()?;
@@ -133,9 +133,9 @@ async fn open_devices(
     config: &SimConfig,
     binds: &[Bind],
     clock: &Clock,
-) -> Result<Vec<Option<Port>>, StartError> {
+) -> Result<Vec<Option<OpenPort>>, RunError> {
     for (index, bind) in binds.iter().enumerate() {
-        let refused = |why: &str| Err(StartError::new(format!("--bind {bind}: {why}")));
+        let refused = |why: &str| Err(RunError::new(format!("--bind {bind}: {why}")));
         match config.ports.iter().find(|port| port.name == bind.port) {
             None => return refused(&format!("there is no such port; {}", bindable(config))),
             Some(port) if bus_of(&port.bus).is_none() => {
@@ -164,20 +164,22 @@ async fn open_devices(
     Ok(devices)
 }
 
-async fn open_device(name: &str, bus: PortBus, binds: &[Bind]) -> Result<Port, StartError> {
+async fn open_device(name: &str, bus: BusSettings, binds: &[Bind]) -> Result<OpenPort, RunError> {
     let Some(bind) = binds.iter().find(|bind| bind.port == name) else {
         let (kind, forms) = match bus {
-            PortBus::Serial(_) => {
+            BusSettings::Serial(_) => {
                 ("serial line", "pty:PATH, serial:PATH, tcp:HOST:PORT or tcp-listen:HOST:PORT")
             }
-            PortBus::Can { .. } => ("CAN bus", "socketcan:INTERFACE, slcan-pty:PATH or slcan-tcp:HOST:PORT"),
+            BusSettings::Can { .. } => {
+                ("CAN bus", "socketcan:INTERFACE, slcan-pty:PATH or slcan-tcp:HOST:PORT")
+            }
         };
-        return Err(StartError::new(format!(
+        return Err(RunError::new(format!(
             "port {name} is a {kind} without a device: add --bind {name}=DEVICE, where DEVICE is {forms}"
         )));
     };
-    let opened = Port::open(&bind.device, bus).await;
-    opened.map_err(|error| StartError::new(format!("--bind {bind}: {error}")))
+    let opened = OpenPort::open(&bind.device, bus).await;
+    opened.map_err(|error| RunError::new(format!("--bind {bind}: {error}")))
 }
 
 fn bindable(config: &SimConfig) -> String {
@@ -190,14 +192,14 @@ fn bindable(config: &SimConfig) -> String {
     }
 }
 
-fn not_listening(key: &str, address: SocketAddr, error: &std::io::Error) -> StartError {
-    StartError::new(format!("listen.{key}: {address}: {error}"))
+fn not_listening(key: &str, address: SocketAddr, error: &std::io::Error) -> RunError {
+    RunError::new(format!("listen.{key}: {address}: {error}"))
 }
 
-fn bus_of(bus: &SimBus) -> Option<PortBus> {
+fn bus_of(bus: &SimBus) -> Option<BusSettings> {
     match bus {
-        SimBus::Rs485(settings) => Some(PortBus::Serial(*settings)),
-        SimBus::Can { bitrate } => Some(PortBus::Can { bitrate: *bitrate }),
+        SimBus::Rs485(settings) => Some(BusSettings::Serial(*settings)),
+        SimBus::Can { bitrate } => Some(BusSettings::Can { bitrate: *bitrate }),
         SimBus::UdpServer | SimBus::TcpClient { .. } | SimBus::UdpClient { .. } => None,
     }
 }

@@ -8,8 +8,8 @@ use tokio::net::UdpSocket;
 use tracing::{debug, info};
 
 use super::servers::DATAGRAMS_AT_ONCE;
-use super::{ControllerRuntime, Outward, Report};
-use crate::tcp::{Accepted, Connection, Event};
+use super::{ControllerRuntime, Outward, TaskReport};
+use crate::tcp::{Accepted, Connection, ConnectionEvent};
 use recipe_controller::ControllerInput;
 use recipe_io::backoff::Backoff;
 use recipe_io::connect::connect;
@@ -37,7 +37,7 @@ impl ControllerRuntime {
             Some(Outward::UdpServer) | None => false,
         };
         if sent {
-            self.reports.borrow_mut().push_back(Report::PortSent(port));
+            self.reports.borrow_mut().push_back(TaskReport::PortSent(port));
         }
     }
 
@@ -55,8 +55,10 @@ impl ControllerRuntime {
                     *slot.borrow_mut() = Some(Rc::clone(&connection));
                     self.input(ControllerInput::PortUp { port });
                     let ended = connection.run(read, |event| match event {
-                        Event::Bytes(bytes) => self.input(ControllerInput::PortBytes { port, bytes }),
-                        Event::Drained => self.input(ControllerInput::PortSent { port }),
+                        ConnectionEvent::Bytes(bytes) => {
+                            self.input(ControllerInput::PortBytes { port, bytes })
+                        }
+                        ConnectionEvent::Drained => self.input(ControllerInput::PortSent { port }),
                     });
                     let ended = ended.await;
                     info!(%to, ?ended, "connection lost");

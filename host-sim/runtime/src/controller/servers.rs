@@ -10,8 +10,8 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::task::spawn_local;
 use tracing::{debug, info, warn};
 
-use super::{Client, ControllerRuntime, Report, closed};
-use crate::tcp::{Connection, Event};
+use super::{ControllerRuntime, ServerClient, TaskReport, closed};
+use crate::tcp::{Connection, ConnectionEvent};
 use crate::udp;
 use recipe_controller::{ConnId, ControllerInput, Link};
 use recipe_io::fairness::yield_fairly;
@@ -45,7 +45,7 @@ impl ControllerRuntime {
         }
         tcp_options::enable_keepalive(&stream);
         let (connection, read) = Connection::split(stream);
-        let client = Client { link, connection: Rc::clone(&connection), subscribed: false };
+        let client = ServerClient { link, connection: Rc::clone(&connection), subscribed: false };
         self.connections.borrow_mut().insert(conn, client);
         // An IPv4 client of an IPv6 listener.
         let from = peer.ip().to_canonical();
@@ -68,7 +68,7 @@ impl ControllerRuntime {
         spawn_local(async move {
             let ended = connection.run(read, |event| {
                 // After a close, nothing more is reported.
-                if let Event::Bytes(bytes) = event
+                if let ConnectionEvent::Bytes(bytes) = event
                     && !connection.is_closed()
                 {
                     match link {
@@ -117,10 +117,10 @@ impl ControllerRuntime {
                 Err(_) => {
                     let peers = udp::unreachable_peers(&self.udp);
                     if peers.contains(&peer) {
-                        self.reports.borrow_mut().extend(peers.into_iter().map(Report::Unreachable));
+                        self.reports.borrow_mut().extend(peers.into_iter().map(TaskReport::Unreachable));
                         return;
                     }
-                    self.reports.borrow_mut().extend(peers.into_iter().map(Report::Unreachable));
+                    self.reports.borrow_mut().extend(peers.into_iter().map(TaskReport::Unreachable));
                 }
             }
         }

@@ -9,7 +9,7 @@ use tokio::net::TcpSocket;
 use tokio::task::{LocalSet, yield_now};
 
 use super::*;
-use crate::controller::{ControllerOptions, MAX_LINGERING, Running};
+use crate::controller::{ControllerOptions, MAX_LINGERING, RunningController};
 use crate::host::Runtime;
 use recipe_config::file::{Text, parse_controller};
 use recipe_controller::operations::Operation;
@@ -22,7 +22,7 @@ fn beside(test: impl AsyncFnOnce(&Rc<ControllerRuntime>, SocketAddr)) {
     let config = parse_controller(Text { name: "controller", toml: "" }, &free).unwrap();
     let executor = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
     LocalSet::new().block_on(&executor, async {
-        let running = Running::open(config, ControllerOptions::default()).await.unwrap();
+        let running = RunningController::open(config, ControllerOptions::default()).await.unwrap();
         let (runtime, ready) = (Rc::clone(&running.runtime), running.ready.clone());
         let at = ready["modbus"].as_str().unwrap().parse().unwrap();
         tokio::select! {

@@ -19,7 +19,7 @@ use recipe_io::timer;
 
 /// A client that waits for an instant or a condition.
 #[derive(Debug)]
-pub(super) struct Waiting {
+pub(super) struct WaitingClient {
     until: Instant,
     timeout_s: f64,
     /// With the number of the first event that counts.
@@ -58,7 +58,7 @@ impl ControllerRuntime {
     ) -> Result<(), String> {
         let alarm = self.clock.alarm().map_err(|error| format!("cannot create a timer: {error}"))?;
         let (answer, mut answered) = oneshot::channel();
-        self.waits.borrow_mut().push(Waiting { until, timeout_s, condition, held: false, answer });
+        self.waits.borrow_mut().push(WaitingClient { until, timeout_s, condition, held: false, answer });
         self.check_waits();
         let over = || Err("the controller ends".to_owned());
         if self.clock.is_stepped() {

@@ -21,12 +21,12 @@ use serde_json::Value;
 use tracing::{Span, info};
 
 use super::open::Devices;
-use super::{Core, Gateway, Observers, TxPolicy};
+use super::{Core, Observers, PreparedGateway, TxPolicy};
 use crate::findings::{FindingTexts, look_at_states, unexplained};
 use crate::host::{self, Runtime};
 use crate::snapshot::GatewaySnapshot;
 use crate::worker::RuntimePlace;
-use crate::{Signals, StartError};
+use crate::{RunError, Signals};
 use recipe_io::bind::Bind;
 use recipe_io::timer::now;
 
@@ -65,7 +65,7 @@ impl Core {
     }
 
     /// Records the counters once a second. Never returns.
-    pub(super) async fn keep_notes(&self) -> Result<(), StartError> {
+    pub(super) async fn keep_notes(&self) -> Result<(), RunError> {
         let mut ticks = tokio::time::interval(LOOK);
         ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         loop {
@@ -75,7 +75,7 @@ impl Core {
     }
 
     /// Passes a snapshot to the doctor's thread once a second.
-    pub(super) async fn be_watched(&self, doctor: Doctor) -> Result<(), StartError> {
+    pub(super) async fn be_watched(&self, doctor: Doctor) -> Result<(), RunError> {
         let mut ticks = tokio::time::interval(LOOK);
         ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         loop {
@@ -96,7 +96,7 @@ impl Core {
 }
 
 /// Starts the thread that examines snapshots and logs findings that appear or disappear.
-pub(super) fn start(config: GatewayConfig, span: Span) -> Result<(Doctor, FindingTexts), StartError> {
+pub(super) fn start(config: GatewayConfig, span: Span) -> Result<(Doctor, FindingTexts), RunError> {
     let (filled, inbox) = sync_channel(1);
     let (empty, buffers) = sync_channel(1);
     let buffer = GatewaySnapshot::empty();
@@ -110,7 +110,7 @@ pub(super) fn start(config: GatewayConfig, span: Span) -> Result<(Doctor, Findin
             let _of = span.entered();
             log_changes(&config, &inbox, &empty, &own);
         })
-        .map_err(|error| StartError::new(format!("cannot start a thread: {error}")))?;
+        .map_err(|error| RunError::new(format!("cannot start a thread: {error}")))?;
     Ok((Doctor { buffers, filled }, texts))
 }
 
@@ -167,11 +167,12 @@ pub fn listen(
     binds: Vec<Bind>,
     time: StdDuration,
     ask: bool,
-) -> Result<Vec<Finding>, StartError> {
+) -> Result<Vec<Finding>, RunError> {
     let (sender, findings) = channel();
     let tx_policy = if ask { TxPolicy::Exchanges } else { TxPolicy::None };
     let handle = host::start(&RuntimePlace::alone(), "doctor", async move |_| {
-        let gateway = Gateway::open(&config, Devices::own(&binds), tx_policy, &Observers::default()).await?;
+        let gateway =
+            PreparedGateway::open(&config, Devices::own(&binds), tx_policy, &Observers::default()).await?;
         gateway.core.keep_records(&config, &binds);
         Ok(Listener { gateway, config, time, sender })
     })?;
@@ -180,13 +181,13 @@ pub fn listen(
     let ended = handle.shutdown();
     match findings {
         Some(findings) => Ok(findings),
-        None => Err(ended.err().unwrap_or_else(|| StartError::new("the doctor ended early").after_start())),
+        None => Err(ended.err().unwrap_or_else(|| RunError::new("the doctor ended early").after_start())),
     }
 }
 
 /// A gateway that listens for some time.
 struct Listener {
-    gateway: Gateway,
+    gateway: PreparedGateway,
     config: GatewayConfig,
     time: StdDuration,
     sender: Sender<Vec<Finding>>,
@@ -201,9 +202,9 @@ impl Runtime for Listener {
         || Value::Null
     }
 
-    async fn run(self) -> Result<(), StartError> {
+    async fn run(self) -> Result<(), RunError> {
         let core = Rc::clone(&self.gateway.core);
-        let mut signals = Signals::catch().map_err(|error| StartError::new(format!("signals: {error}")))?;
+        let mut signals = Signals::catch().map_err(|error| RunError::new(format!("signals: {error}")))?;
         tokio::select! {
             ended = self.gateway.drive() => ended?,
             ended = core.keep_notes() => ended?,

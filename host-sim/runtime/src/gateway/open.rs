@@ -16,15 +16,15 @@ use tokio::sync::Notify;
 use tracing::info;
 
 use super::tapping::Tapping;
-use super::{Core, Gateway, Observers, TxPolicy};
-use crate::StartError;
+use super::{Core, Observers, PreparedGateway, TxPolicy};
+use crate::RunError;
 use crate::host::AtEnd;
 use crate::link::LinkEndpoint;
-use crate::snapshot::Engine;
+use crate::snapshot::GatewayEngine;
 use recipe_capture::{Cell as Watched, Epoch};
 use recipe_io::bind::Bind;
 use recipe_io::handover::{Handover, HandoverDevice};
-use recipe_io::port::{Port, PortBus};
+use recipe_io::port::{BusSettings, OpenPort};
 use recipe_io::tcp_options;
 use recipe_io::timer::now;
 
@@ -42,7 +42,7 @@ impl<'a> Devices<'a> {
     }
 
     /// Opens a port's device, or takes it over from the previous gateway.
-    async fn open(&self, port: &PortConfig) -> Result<Port, StartError> {
+    async fn open(&self, port: &PortConfig) -> Result<OpenPort, RunError> {
         let taken = self.handover.as_ref().and_then(|(handover, _)| handover.take(&port.name));
         let device = open_port(port, self.binds, taken).await?;
         if let Some((handover, at_end)) = &self.handover
@@ -59,16 +59,16 @@ impl<'a> Devices<'a> {
     }
 }
 
-impl Gateway {
+impl PreparedGateway {
     /// Opens devices and listening sockets.
     pub(super) async fn open(
         config: &GatewayConfig,
         devices: Devices<'_>,
         tx_policy: TxPolicy,
         observers: &Observers,
-    ) -> Result<Self, StartError> {
-        let engine: Box<Engine> =
-            Box::new(Engine::new(config).map_err(|error| StartError::new(error.to_string()))?);
+    ) -> Result<Self, RunError> {
+        let engine: Box<GatewayEngine> =
+            Box::new(GatewayEngine::new(config).map_err(|error| RunError::new(error.to_string()))?);
         // Modbus TCP ports have links instead.
         let has_device = |port: &PortConfig| !matches!(port.bus, Bus::ModbusTcp { .. });
         let field = || config.view().field_ports().map(|(_, port, _)| port).filter(|port| has_device(port));
@@ -77,7 +77,7 @@ impl Gateway {
         {
             let names: Vec<_> = field().map(|port| port.name.as_str()).collect();
             let message = format!("--bind {bind}: there is no such port; there are {}", names.join(", "));
-            return Err(StartError::new(message));
+            return Err(RunError::new(message));
         }
         let (mut ports, mut exchange_ports) = (Vec::new(), BTreeSet::new());
         for (index, port, recipe) in config.view().field_ports() {
@@ -142,21 +142,21 @@ impl Gateway {
 /// Starts to record for subscribers.
 fn begin_tapping(
     config: &GatewayConfig,
-    engine: &Engine,
+    engine: &GatewayEngine,
     Observers { watch, decoder, .. }: &Observers,
-) -> Result<Tapping, StartError> {
+) -> Result<Tapping, RunError> {
     let at = now();
     let cell = Watched::new(config, engine, Epoch { at, wall: SystemTime::now() }, Arc::clone(decoder));
     // Only recordings start with the image; a long configuration has none.
     let image = watch.wanted().passes.then(|| encoded(config)).transpose()?;
     Tapping::begin(watch, cell, at, image.as_deref())
-        .map_err(|error| StartError::new(format!("cannot start a thread: {error}")))
+        .map_err(|error| RunError::new(format!("cannot start a thread: {error}")))
 }
 
 /// The configuration image.
-fn encoded(config: &GatewayConfig) -> Result<Vec<u8>, StartError> {
+fn encoded(config: &GatewayConfig) -> Result<Vec<u8>, RunError> {
     let mut bytes = vec![0; image::MAX_IMAGE];
-    let len = image::encode(config, &mut bytes).map_err(|error| StartError::new(error.to_string()))?;
+    let len = image::encode(config, &mut bytes).map_err(|error| RunError::new(error.to_string()))?;
     bytes.truncate(len);
     Ok(bytes)
 }
@@ -165,41 +165,40 @@ async fn open_port(
     port: &PortConfig,
     binds: &[Bind],
     handover: Option<HandoverDevice>,
-) -> Result<Port, StartError> {
+) -> Result<OpenPort, RunError> {
     let name = port.name.as_str();
     let bus = match port.bus {
-        Bus::Rs485(settings) => PortBus::Serial(settings),
-        Bus::Can { bitrate } => PortBus::Can { bitrate },
+        Bus::Rs485(settings) => BusSettings::Serial(settings),
+        Bus::Can { bitrate } => BusSettings::Can { bitrate },
         Bus::ModbusTcp { .. } | Bus::TcpListen { .. } | Bus::UdpListen { .. } => {
-            return Err(StartError::new(format!("port {name} is not a field port")));
+            return Err(RunError::new(format!("port {name} is not a field port")));
         }
     };
     let mut own = binds.iter().filter(|bind| bind.port == name);
     let (Some(bind), None) = (own.next(), own.next()) else {
         let examples = match bus {
-            PortBus::Serial(_) => "pty:PATH or serial:/dev/ttyUSB0",
-            PortBus::Can { .. } => "socketcan:can0, slcan-tcp:127.0.0.1:0 or slcan-pty:PATH",
+            BusSettings::Serial(_) => "pty:PATH or serial:/dev/ttyUSB0",
+            BusSettings::Can { .. } => "socketcan:can0, slcan-tcp:127.0.0.1:0 or slcan-pty:PATH",
         };
-        return Err(StartError::new(format!(
+        return Err(RunError::new(format!(
             "port {name} needs exactly one device: --bind {name}=DEVICE, such as {examples}"
         )));
     };
-    let opened = Port::open_or_adopt(&bind.device, bus, handover).await;
-    let device =
-        opened.map_err(|error| StartError::new(format!("--bind {name}={}: {error}", bind.device)))?;
+    let opened = OpenPort::open_or_adopt(&bind.device, bus, handover).await;
+    let device = opened.map_err(|error| RunError::new(format!("--bind {name}={}: {error}", bind.device)))?;
     if device.is_handed_over() {
         info!(port = name, "the device stays open; its clients stay connected");
     }
     Ok(device)
 }
 
-async fn open_endpoint(to: To<'_>) -> Result<LinkEndpoint, StartError> {
+async fn open_endpoint(to: To<'_>) -> Result<LinkEndpoint, RunError> {
     if to.host.is_empty() {
         let message = "controller.address is needed: the controller's address or host name";
-        return Err(StartError::new(message));
+        return Err(RunError::new(message));
     }
     let host = to.host.to_owned();
-    let refused = |address, error| StartError::new(format!("cannot listen on {address}: {error}"));
+    let refused = |address, error| RunError::new(format!("cannot listen on {address}: {error}"));
     Ok(match to.transport {
         Transport::Tcp { port } => LinkEndpoint::Tcp { host, port },
         Transport::Udp { port } => LinkEndpoint::Udp { host, port },
@@ -212,7 +211,7 @@ async fn open_endpoint(to: To<'_>) -> Result<LinkEndpoint, StartError> {
             let socket = UdpSocket::bind(local).await.map_err(|error| refused(local, error))?;
             LinkEndpoint::UdpListen { socket, controller: host }
         }
-        other => return Err(StartError::new(format!("unknown kind of link: {other:?}"))),
+        other => return Err(RunError::new(format!("unknown kind of link: {other:?}"))),
     })
 }
 

@@ -10,7 +10,7 @@ use recipe_ctl::update::Downgrade;
 use recipe_ctl::{Failure, Member, Rollout, Stop, Update, Verdict};
 use recipe_runtime::out::print_stderr;
 
-use super::Run;
+use super::RequestOptions;
 use super::work::write;
 
 /// A firmware for the boards of an inventory.
@@ -33,7 +33,7 @@ impl Updating<'_> {
         &self,
         members: &[Member],
         stop: &Stop,
-        run: Run,
+        run: RequestOptions,
         out: &mut dyn Write,
     ) -> Result<Verdict, Failure> {
         let boards = rollout::real_boards(members, &self.update, run.timeout, self.trial_s, self.downgrade)?;

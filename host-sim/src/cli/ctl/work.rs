@@ -4,26 +4,27 @@ use std::io::Write;
 use std::path::Path;
 
 use recipe_ctl::{
-    Answer, Client, Configuration, Failure, Firmware, Member, Names, Rollout, Stop, Trial, Update, Verdict,
-    Watched, WithoutTrial, edge, key_file, signing_key, update,
+    Answer, Client, Configuration, Failure, Firmware, Member, Names, Rollout, Stop, TrialOptions, Update,
+    Verdict, Watched, WithoutTrial, edge, key_file, signing_key, update,
 };
 use recipe_runtime::out::print_stderr;
 
-use super::Run;
+use super::RequestOptions;
 use super::act::Act;
 use super::updating::Updating;
 use crate::cli::output::OutputFile;
 
 /// A request to one gateway.
-type QueryFn<'a> = Box<dyn Fn(&Client, Run) -> Result<Answer, Failure> + Sync + 'a>;
+type QueryFn<'a> = Box<dyn Fn(&Client, RequestOptions) -> Result<Answer, Failure> + Sync + 'a>;
 /// A command that prints as it runs.
-type Follow<'a> = Box<dyn Fn(&Client, Run, &mut dyn Write) -> Result<Verdict, Failure> + 'a>;
+type Follow<'a> = Box<dyn Fn(&Client, RequestOptions, &mut dyn Write) -> Result<Verdict, Failure> + 'a>;
 
 /// A command that iterates over an inventory itself.
-type Through<'a> = Box<dyn Fn(&[Member], &Stop, Run, &mut dyn Write) -> Result<Verdict, Failure> + 'a>;
+type Through<'a> =
+    Box<dyn Fn(&[Member], &Stop, RequestOptions, &mut dyn Write) -> Result<Verdict, Failure> + 'a>;
 
 /// A command without a gateway.
-type Alone<'a> = Box<dyn FnOnce(Run, &mut dyn Write) -> Result<Verdict, Failure> + 'a>;
+type Alone<'a> = Box<dyn FnOnce(RequestOptions, &mut dyn Write) -> Result<Verdict, Failure> + 'a>;
 
 /// A command whose files have been read.
 pub(super) enum CtlWork<'a> {
@@ -94,12 +95,12 @@ impl Act {
             })),
             Self::Revisions => rows(|client, _| recipe_ctl::revisions(client)),
             Self::Push { file, apply, confirm_s, set, board, .. } => {
-                let trial = apply.then_some(Trial { confirm_s: *confirm_s, revision: None });
+                let trial = apply.then_some(TrialOptions { confirm_s: *confirm_s, revision: None });
                 let configuration = Configuration::read(file, set, *board)?;
                 rows(move |client, _| recipe_ctl::push(client, &configuration, trial))
             }
             Self::Apply { revision, confirm_s, .. } => {
-                let trial = Trial { confirm_s: *confirm_s, revision: *revision };
+                let trial = TrialOptions { confirm_s: *confirm_s, revision: *revision };
                 rows(move |client, _| recipe_ctl::apply(client, trial))
             }
             Self::Confirm { .. } => rows(|client, _| recipe_ctl::confirm(client)),
@@ -242,15 +243,22 @@ fn allowed(downgrade: bool) -> update::Downgrade {
     }
 }
 
-fn rows<'a>(query: impl Fn(&Client, Run) -> Result<Answer, Failure> + Sync + 'a) -> CtlWork<'a> {
+fn rows<'a>(query: impl Fn(&Client, RequestOptions) -> Result<Answer, Failure> + Sync + 'a) -> CtlWork<'a> {
     CtlWork::Query(Box::new(query), Many::Rows)
 }
 
-fn sections<'a>(query: impl Fn(&Client, Run) -> Result<Answer, Failure> + Sync + 'a) -> CtlWork<'a> {
+fn sections<'a>(
+    query: impl Fn(&Client, RequestOptions) -> Result<Answer, Failure> + Sync + 'a,
+) -> CtlWork<'a> {
     CtlWork::Query(Box::new(query), Many::Sections)
 }
 
-fn watch(client: &Client, what: &Watched, run: Run, out: &mut dyn Write) -> Result<Verdict, Failure> {
+fn watch(
+    client: &Client,
+    what: &Watched,
+    run: RequestOptions,
+    out: &mut dyn Write,
+) -> Result<Verdict, Failure> {
     if !run.json {
         recipe_ctl::clear(run.view, out)?;
     }
@@ -265,7 +273,7 @@ pub(super) fn write(path: &Path, bytes: &[u8], force: bool) -> Result<(), Failur
         .map_err(|error| Failure::wrong(format!("{}: {error}", path.display())))
 }
 
-impl Run {
+impl RequestOptions {
     fn print(self, answer: &Answer, out: &mut dyn Write) -> Result<Verdict, Failure> {
         let text = if self.json { answer.json() } else { answer.text(self.view) };
         out.write_all(text.as_bytes())?;
@@ -277,7 +285,7 @@ impl Run {
 pub(super) fn at_one(
     work: CtlWork<'_>,
     client: &Client,
-    run: Run,
+    run: RequestOptions,
     out: &mut dyn Write,
 ) -> Result<Verdict, Failure> {
     match work {
@@ -294,7 +302,7 @@ pub(super) fn at_many(
     members: &[Member],
     rollout: Option<Rollout>,
     stop: &Stop,
-    run: Run,
+    run: RequestOptions,
     out: &mut dyn Write,
 ) -> Result<Verdict, Failure> {
     let outcomes = recipe_ctl::ask(members, rollout, run.timeout, stop, &|client| query(client, run));

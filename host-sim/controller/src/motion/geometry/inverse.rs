@@ -3,7 +3,7 @@
 //! The arm has three parallel axes in the middle and a wrist whose last two axes cross the others at right
 //! angles, so each frame has up to eight exact solutions: [`Branch`] says which.
 
-use super::{Frame, JOINTS, LINKS, cross};
+use super::{JOINTS, LINKS, Pose, cross};
 
 /// Which of the solutions: shoulder, elbow and wrist are each one way round or the other.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -37,7 +37,7 @@ impl Branch {
     }
 }
 
-impl Frame {
+impl Pose {
     /// The joints, in rad and somewhere within a turn, with which the flange has this frame; `None` if the
     /// arm does not reach it, or if joint 5 is straight, which leaves joint 6 undefined.
     pub(in crate::motion) fn joints(&self, branch: Branch) -> Option<[f64; JOINTS]> {
@@ -142,11 +142,11 @@ mod tests {
                 angle = (angle * 7.13 + 1.7) % 6.0;
                 angle - 3.0
             });
-            let frame = Frame::of_joints(&q);
+            let frame = Pose::of_joints(&q);
             let solutions: Vec<_> = Branch::all().filter_map(|branch| frame.joints(branch)).collect();
             found += solutions.len();
             for solution in &solutions {
-                let back = Frame::of_joints(solution);
+                let back = Pose::of_joints(solution);
                 let apart = length(&frame.way_to(&back)) + frame.turn_to(&back).1;
                 assert!(apart < 1e-6, "{q:?} {solution:?}: {apart}");
             }
@@ -159,15 +159,15 @@ mod tests {
 
     #[test]
     fn frames_are_undone_and_moved() {
-        let a = Frame::from_pose(&[0.3, -0.2, 0.5, 0.4, -1.1, 2.0]);
+        let a = Pose::from_pose(&[0.3, -0.2, 0.5, 0.4, -1.1, 2.0]);
         for pose in [[0.1, 0.2, -0.3, 3.0, 0.2, 0.1], [0.1, 0.0, 0.0, std::f64::consts::PI, 0.0, 0.0]] {
-            let b = a.then(&Frame::from_pose(&pose));
+            let b = a.then(&Pose::from_pose(&pose));
             let (axis, angle) = a.turn_to(&b);
             let moved = a.moved(a.way_to(&b), &axis, angle);
             assert!(length(&moved.way_to(&b)) < 1e-12 && moved.turn_to(&b).1 < 1e-7, "{pose:?}");
         }
         let none = a.then(&a.inverse());
-        assert!(length(&none.way_to(&Frame::IDENTITY)) < 1e-12);
+        assert!(length(&none.way_to(&Pose::IDENTITY)) < 1e-12);
         assert_eq!(a.turn_to(&a).1, 0.0);
     }
 }
