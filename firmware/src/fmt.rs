@@ -71,16 +71,16 @@ macro_rules! log_at {
 
 /// Logs a value as the text that it displays, with both crates: for errors, whose texts exist once.
 #[derive(Debug, Clone, Copy)]
-pub struct Text<'a, T>(pub &'a T);
+pub struct DisplayText<'a, T>(pub &'a T);
 
-impl<T: fmt::Display> fmt::Display for Text<'_, T> {
+impl<T: fmt::Display> fmt::Display for DisplayText<'_, T> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         self.0.fmt(f)
     }
 }
 
 #[cfg(feature = "defmt")]
-impl<T: fmt::Display> defmt::Format for Text<'_, T> {
+impl<T: fmt::Display> defmt::Format for DisplayText<'_, T> {
     fn format(&self, f: defmt::Formatter<'_>) {
         defmt::Format::format(&defmt::Display2Format(self.0), f);
     }

@@ -13,7 +13,7 @@ use recipe_update::SlotFlash;
 
 use crate::drivers::can_port::CanPort;
 use crate::drivers::line::Line;
-use crate::stored::{Places, StoreFlash};
+use crate::stored::{StoreFlash, StorePlaces};
 use crate::update::Site;
 
 /// Numbers of field ports of a board.
@@ -108,7 +108,7 @@ pub trait Board {
 
     /// The flash of the store (docs/store.md); called once. `None` if the board has none: it then only runs the image
     /// above.
-    fn flash(&mut self) -> Option<Places<Self::Flash>>;
+    fn flash(&mut self) -> Option<StorePlaces<Self::Flash>>;
 
     /// The slots of the firmware (docs/update.md); called once.
     fn slots(&mut self) -> Site<Self::Slot>;

@@ -10,7 +10,7 @@ use embassy_executor::{SpawnError, SpawnToken, Spawner};
 use embassy_net::{Config, DhcpConfig, Ipv4Cidr, Runner, Stack, StackResources, StaticConfigV4};
 use embassy_net_driver::{Driver as _, HardwareAddress};
 use embassy_time::{Duration, Timer};
-use firmware::fmt::Text;
+use firmware::fmt::DisplayText;
 use firmware::identity;
 use firmware::platform::{self, FeedWatchdog as _, NoDevice, Ports, StatusLed as _};
 use firmware::stored::StoredConfig;
@@ -55,8 +55,8 @@ pub(crate) fn start(spawner: Spawner, mut board: Board) -> Tasks {
     info!("recipe gateway {}", env!("CARGO_PKG_VERSION"));
     let mut led = board.led();
     led.set(true);
-    static WATCH: StaticCell<Watch> = StaticCell::new();
-    let tasks = Tasks { spawner, watch: WATCH.init_with(Watch::new) };
+    static WATCH: StaticCell<BoardWatch> = StaticCell::new();
+    let tasks = Tasks { spawner, watch: WATCH.init_with(BoardWatch::new) };
     // First of all, so that the watchdog resets the board if anything later hangs.
     spawner.spawn(feeder(tasks.watch, board.watchdog()).expect("it is spawned once"));
     // Both are all zeros: placed in .bss, not built on the stack.
@@ -98,7 +98,7 @@ pub(crate) fn start(spawner: Spawner, mut board: Board) -> Tasks {
 fn open_store(board: &mut Board) -> Option<&'static mut StoredConfig<Flash>> {
     static STORED: StaticCell<StoredConfig<Flash>> = StaticCell::new();
     let places = board.flash()?;
-    let stored = StoredConfig::open(places).inspect_err(|error| error!("{}", Text(error))).ok()?;
+    let stored = StoredConfig::open(places).inspect_err(|error| error!("{}", DisplayText(error))).ok()?;
     Some(STORED.init(stored))
 }
 
@@ -130,7 +130,7 @@ fn make_edge(
         None | Some(Ok(false)) => return edge_setup,
         Some(Ok(true)) => {}
         Some(Err(error)) => {
-            error!("edge node: {}", Text(&error));
+            error!("edge node: {}", DisplayText(&error));
             edge.cannot(EdgeError::Settings(error));
             return edge_setup;
         }
@@ -143,7 +143,7 @@ fn make_edge(
     match made {
         Ok(node) => edge_setup.node = Some(NODE.init(node)),
         Err(why) => {
-            error!("edge node: {}", Text(&why));
+            error!("edge node: {}", DisplayText(&why));
             edge.cannot(why);
         }
     }
@@ -176,10 +176,10 @@ fn start_store_task(
 #[derive(Clone, Copy)]
 pub(crate) struct Tasks {
     spawner: Spawner,
-    watch: &'static Watch,
+    watch: &'static BoardWatch,
 }
 
-type Watch = watchdog::Watch<MAX_TASKS>;
+type BoardWatch = watchdog::TaskWatch<MAX_TASKS>;
 
 impl Tasks {
     /// Starts a task with its pulse.
@@ -387,7 +387,7 @@ fn network_config(own: Option<Network>, name: &str) -> Config {
 
 /// The only task without a pulse.
 #[embassy_executor::task]
-async fn feeder(watch: &'static Watch, mut dog: Watchdog) -> ! {
+async fn feeder(watch: &'static BoardWatch, mut dog: Watchdog) -> ! {
     watchdog::run(watch, WATCHDOG_PERIOD, || dog.feed()).await
 }
 
@@ -498,7 +498,7 @@ async fn address(pulse: &'static Pulse, stack: Stack<'static>) -> ! {
             pulse.idle(pin!(stack.wait_link_up())).await;
             pulse.idle(pin!(stack.wait_config_up())).await;
             if let Some(config) = stack.config_v4() {
-                info!("address {}", Text(&config.address));
+                info!("address {}", DisplayText(&config.address));
             }
             pulse.idle(pin!(stack.wait_config_down())).await;
             warn!("no address");
@@ -532,7 +532,7 @@ async fn refused(pulse: &'static Pulse, reason: CannotRun) -> ! {
     let what = if matches!(reason, CannotRun::Ethernet(_)) { "no controller" } else { "nothing runs" };
     let log = async {
         loop {
-            error!("{}: {}", what, Text(&reason));
+            error!("{}: {}", what, DisplayText(&reason));
             pulse.idle(pin!(Timer::after(REPEAT))).await;
         }
     };

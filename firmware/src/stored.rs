@@ -8,21 +8,21 @@ use core::fmt;
 use embassy_time::Duration;
 use heapless::Vec;
 use proto_core::config::image;
-use recipe_sparkplug::document::{Document, DocumentError};
+use recipe_sparkplug::document::{DocumentError, NodeDocument};
 use recipe_store::{
-    Adoption, Ended, Flash, Found, KeepError, MAX_REVISIONS, Marks, MountError, Newest, PutError, Revision,
-    Role, Side, SlotMarks, Store, Trial, WORD, newest,
+    Adoption, Flash, FoundRecord, KeepError, MAX_REVISIONS, Marks, MountError, Newest, PutError, Revision,
+    Role, Side, SlotMarks, Store, Trial, TrialEnd, WORD, newest,
 };
 
 /// Flash that can lend the bytes of a record.
 pub trait StoreFlash: Flash {
     /// The data of a record; `None` if it has been replaced.
-    fn bytes(&mut self, found: Found) -> Option<&[u8]>;
+    fn bytes(&mut self, found: FoundRecord) -> Option<&[u8]>;
 }
 
 /// The places that a board has for its store.
 #[derive(Debug)]
-pub struct Places<F> {
+pub struct StorePlaces<F> {
     /// The first place.
     pub first: F,
     /// The second one, if the board has slots for its firmware.
@@ -31,7 +31,7 @@ pub struct Places<F> {
     pub own: Side,
 }
 
-impl<F> Places<F> {
+impl<F> StorePlaces<F> {
     /// The only place of a board without slots.
     pub fn one(first: F) -> Self {
         Self { first, second: None, own: Side::First }
@@ -62,17 +62,17 @@ impl fmt::Display for RoleName {
     }
 }
 
-/// Text of an [`Ended`] in the log.
+/// Text of an [`TrialEnd`] in the log.
 #[derive(Debug, Clone, Copy)]
-pub struct EndedName(pub Ended);
+pub struct EndedName(pub TrialEnd);
 
 impl fmt::Display for EndedName {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self.0 {
-            Ended::Confirmed => "it was confirmed",
-            Ended::NotConfirmed => "nobody confirmed it in time",
-            Ended::TakenBack => "somebody took it back",
-            Ended::Failed => "it could not run, or none of its starts lasted",
+            TrialEnd::Confirmed => "it was confirmed",
+            TrialEnd::NotConfirmed => "nobody confirmed it in time",
+            TrialEnd::TakenBack => "somebody took it back",
+            TrialEnd::Failed => "it could not run, or none of its starts lasted",
         })
     }
 }
@@ -82,8 +82,8 @@ impl<F: StoreFlash> StoredConfig<F> {
     ///
     /// # Errors
     /// The flash is unsuitable, or a newer program wrote it.
-    pub fn open(places: Places<F>) -> Result<Self, MountError> {
-        let Places { first, second, own } = places;
+    pub fn open(places: StorePlaces<F>) -> Result<Self, MountError> {
+        let StorePlaces { first, second, own } = places;
         let Some(second) = second else {
             return Ok(Self { store: Store::mount(&first)?, flash: first, to: None });
         };
@@ -198,7 +198,7 @@ impl<F: StoreFlash> StoredConfig<F> {
     ///
     /// # Errors
     /// It cannot be written. Starts of a trial are counted, so it ends nevertheless.
-    pub async fn end_trial(&mut self, ended: Ended) -> Result<(), KeepError> {
+    pub async fn end_trial(&mut self, ended: TrialEnd) -> Result<(), KeepError> {
         let marks = self.store.marks();
         let last = marks.trial.map(|trial| (trial.number, ended)).or(marks.last);
         self.mark(Marks { trial: None, last, ..marks }).await
@@ -210,7 +210,7 @@ impl<F: StoreFlash> StoredConfig<F> {
     /// It cannot be written; the live configuration is unchanged.
     pub async fn make_live(&mut self, live: u32, previous: Option<u32>) -> Result<(), KeepError> {
         let marks = self.store.marks();
-        let last = marks.trial.map(|trial| (trial.number, Ended::Confirmed)).or(marks.last);
+        let last = marks.trial.map(|trial| (trial.number, TrialEnd::Confirmed)).or(marks.last);
         self.mark(Marks { live: Some(live), previous, trial: None, last }).await
     }
 
@@ -265,7 +265,7 @@ impl<F: StoreFlash> StoredConfig<F> {
 
     /// Decodes the settings of the edge node into `document`. Returns whether they enable publishing; `None` if there
     /// are none.
-    pub fn edge(&mut self, document: &mut Document) -> Option<Result<bool, DocumentError>> {
+    pub fn edge(&mut self, document: &mut NodeDocument) -> Option<Result<bool, DocumentError>> {
         let bytes = self.flash.bytes(self.store.edge()?)?;
         Some(document.decode(bytes))
     }

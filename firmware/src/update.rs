@@ -11,7 +11,7 @@ use proto_core::config::image;
 use recipe_store::SlotMarks;
 use recipe_update::{
     BoardName, Downgrade, Foreign, Formats, Gap, HEADER, Header, HeaderError, PublicKey, Receive,
-    ReceiveError, ReceiveStep, Running, Slot, SlotFlash, Version, header_of,
+    ReceiveError, ReceiveStep, RunningFirmware, Slot, SlotFlash, Version, header_of,
 };
 
 /// Slots of a board.
@@ -46,7 +46,7 @@ pub enum UpdateError {
     /// The piece at offset 0 is not exactly the header.
     Alone,
     /// The firmware may not be installed.
-    Rule(recipe_update::Refused),
+    Rule(recipe_update::UpdateRefused),
     /// The piece is not the next one.
     Gap {
         /// Offset of the next piece from the beginning of the header, in bytes.
@@ -74,7 +74,9 @@ impl UpdateError {
     /// Whether the request itself is wrong, not only its moment.
     pub fn is_wrong(&self) -> bool {
         match self {
-            Self::Rule(recipe_update::Refused::OnTrial | recipe_update::Refused::NotGood) => false,
+            Self::Rule(recipe_update::UpdateRefused::OnTrial | recipe_update::UpdateRefused::NotGood) => {
+                false
+            }
             Self::Header(_) | Self::Alone | Self::Rule(_) | Self::Failed(_) | Self::Foreign => true,
             _ => false,
         }
@@ -196,9 +198,9 @@ impl<S: SlotFlash> Updates<S> {
         self.other.as_ref()
     }
 
-    fn rule(&self, kept: Option<(u32, u32)>) -> Result<Running, UpdateError> {
+    fn rule(&self, kept: Option<(u32, u32)>) -> Result<RunningFirmware, UpdateError> {
         let slot = self.slots.as_ref().map_err(|why| UpdateError::Cannot(why))?.running;
-        Ok(Running { board: self.board, slot, version: VERSION, kept })
+        Ok(RunningFirmware { board: self.board, slot, version: VERSION, kept })
     }
 
     /// Accepts a piece. At `offset` 0 it is the header; the header of the firmware that is being received, or is
@@ -224,7 +226,7 @@ impl<S: SlotFlash> Updates<S> {
     fn begin(
         &mut self,
         bytes: &[u8],
-        running: &Running,
+        running: &RunningFirmware,
         marks: SlotMarks,
         downgrade: Downgrade,
     ) -> Result<(), UpdateError> {
@@ -439,7 +441,7 @@ pub struct FirmwareTrial {
 
 /// Result of checking a trial.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Verdict {
+pub enum TrialVerdict {
     /// The trial goes on.
     Waits(WaitsFor),
     /// All conditions have held long enough: confirm.
@@ -460,7 +462,7 @@ impl FirmwareTrial {
     }
 
     /// Checks the trial; to be called at least once a second.
-    pub fn look(&mut self, now: Instant, works: Works, is_reached: bool) -> Verdict {
+    pub fn look(&mut self, now: Instant, works: Works, is_reached: bool) -> TrialVerdict {
         let missing = if works.links < self.before.links {
             Some(WaitsFor::Controller)
         } else if works.ports < self.before.ports {
@@ -475,10 +477,10 @@ impl FirmwareTrial {
         }
         let is_well = missing.is_none() && now - *self.well_since.get_or_insert(now) >= LASTS;
         match missing {
-            _ if is_well => Verdict::Confirmed,
-            _ if now >= self.until => Verdict::Over,
-            Some(missing) => Verdict::Waits(missing),
-            None => Verdict::Waits(WaitsFor::Time),
+            _ if is_well => TrialVerdict::Confirmed,
+            _ if now >= self.until => TrialVerdict::Over,
+            Some(missing) => TrialVerdict::Waits(missing),
+            None => TrialVerdict::Waits(WaitsFor::Time),
         }
     }
 }

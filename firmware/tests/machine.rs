@@ -12,7 +12,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::time::{Duration, Instant};
 
 use embassy_futures::block_on;
-use recipe_store::{Ended, Flash, Geometry, Marks, Place, Store, Trial, WORD, Word};
+use recipe_store::{Flash, FlashWord, Geometry, Marks, Store, Trial, TrialEnd, WORD, Word};
 use recipe_test_kit::{qemu, until};
 
 /// A running machine, with the lines of its log.
@@ -384,7 +384,7 @@ struct MappedStore(PathBuf, Vec<u8>);
 const STORE_SECTOR: usize = 128 * 1024;
 
 impl MappedStore {
-    fn offset(place: Place) -> usize {
+    fn offset(place: FlashWord) -> usize {
         usize::from(place.sector) * STORE_SECTOR + usize::from(place.word) * WORD
     }
 
@@ -404,11 +404,11 @@ impl Flash for MappedStore {
         Geometry { sectors: 2, words: (STORE_SECTOR / WORD) as u16 }
     }
 
-    fn read(&self, place: Place) -> Word {
+    fn read(&self, place: FlashWord) -> Word {
         *self.1[Self::offset(place)..].first_chunk().unwrap()
     }
 
-    async fn write(&mut self, place: Place, word: &Word) {
+    async fn write(&mut self, place: FlashWord, word: &Word) {
         self.1[Self::offset(place)..][..WORD].copy_from_slice(word);
     }
 
@@ -447,7 +447,7 @@ fn the_store_keeps_what_runs_and_a_trial_ends() {
     drop(machine);
     assert_eq!(
         Store::mount(&MappedStore::read(&path)).unwrap().marks(),
-        Marks { trial: None, last: Some((2, Ended::NotConfirmed)), ..marks }
+        Marks { trial: None, last: Some((2, TrialEnd::NotConfirmed)), ..marks }
     );
 }
 

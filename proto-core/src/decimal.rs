@@ -18,14 +18,14 @@ pub(crate) enum Decimal {
 }
 
 /// A finite number above zero: `mantissa * 2^exponent`.
-struct Parts {
+struct BinaryFloat {
     mantissa: u64,
     exponent: i32,
     /// The next smaller number is only half as far away as the next larger one.
     is_closer_below: bool,
 }
 
-impl Parts {
+impl BinaryFloat {
     /// Of the bits without the sign, in a format with so many bits of the mantissa and of the exponent.
     fn of(bits: u64, mantissa_bits: u32, exponent_bits: u32) -> Self {
         let implied = 1_u64 << mantissa_bits;
@@ -45,9 +45,9 @@ impl fmt::Display for Decimal {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let (value, parts) = match *self {
             Self::Single(value) => {
-                (f64::from(value), Parts::of((value.to_bits() & !(1 << 31)).into(), 23, 8))
+                (f64::from(value), BinaryFloat::of((value.to_bits() & !(1 << 31)).into(), 23, 8))
             }
-            Self::Double(value) => (value, Parts::of(value.to_bits() & !(1 << 63), 52, 11)),
+            Self::Double(value) => (value, BinaryFloat::of(value.to_bits() & !(1 << 63), 52, 11)),
         };
         if value.is_nan() {
             return f.write_str("NaN");
@@ -64,7 +64,7 @@ impl fmt::Display for Decimal {
 }
 
 /// Writes the digits, with zeros or a point where they have to be.
-fn write_shortest(parts: &Parts, out: &mut impl Write) -> fmt::Result {
+fn write_shortest(parts: &BinaryFloat, out: &mut impl Write) -> fmt::Result {
     let is_even = parts.mantissa & 1 == 0;
     // All are numerators over `unit`: the number, and half of the way to its neighbours.
     let shift = parts.exponent.max(0) as u32;

@@ -110,7 +110,7 @@ impl serde::Serialize for Histogram {
     /// are absent without a sample.
     fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         #[derive(serde::Serialize)]
-        struct Shown<'a> {
+        struct SerializedHistogram<'a> {
             count: u64,
             #[serde(skip_serializing_if = "Option::is_none")]
             p50_us: Option<u64>,
@@ -122,7 +122,7 @@ impl serde::Serialize for Histogram {
             buckets: &'a [u32; BUCKETS],
         }
         let micros = |duration: Duration| duration.as_micros();
-        let shown = Shown {
+        let shown = SerializedHistogram {
             count: self.count(),
             p50_us: self.percentile(500).map(micros),
             p99_us: self.percentile(990).map(micros),

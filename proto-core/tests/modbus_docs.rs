@@ -1,8 +1,8 @@
 //! The tables of docs/wire/modbus.md say what the code's map says, line for line.
 
-use proto_core::modbus::map::{Access, Item, MAP, Space};
+use proto_core::modbus::map::{Access, MAP, MapRun, Space};
 
-fn row(item: &Item) -> String {
+fn row(item: &MapRun) -> String {
     let last = item.end() - 1;
     let addresses = if item.first == last { last.to_string() } else { format!("{}-{last}", item.first) };
     let access = match item.access {

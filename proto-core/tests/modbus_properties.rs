@@ -5,7 +5,7 @@ use proptest::collection::vec;
 use proptest::prelude::*;
 use proto_core::modbus::adu::MAX_ADU;
 use proto_core::modbus::client::{Client, ClientEvent};
-use proto_core::modbus::pdu::{EncodeError, Request, RequestHead, Response};
+use proto_core::modbus::pdu::{PduEncodeError, Request, RequestHead, Response};
 use proto_core::modbus::server::Server;
 use proto_core::modbus::{Coils, Registers};
 
@@ -103,7 +103,7 @@ proptest! {
             prop_assert!(out[len..].iter().all(|&byte| byte == 0xA5));
             for available in [0, 4, len - 1] {
                 let mut short = vec![0xA5; available];
-                let refused = EncodeError::NoSpace { needed: len, available };
+                let refused = PduEncodeError::NoSpace { needed: len, available };
                 prop_assert_eq!(request.encode(&mut short), Err(refused));
                 prop_assert!(short.iter().all(|&byte| byte == 0xA5));
             }

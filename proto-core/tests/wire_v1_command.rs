@@ -3,7 +3,7 @@
 //! Don't change me: controllers and clients in the field use these bytes. A change that needs
 //! another expectation here is a new dialect and gets its own column.
 
-use proto_core::command::{Action, Outcome, Percent, Reply, Request, StateCodes};
+use proto_core::command::{Action, ActionOutcome, Percent, Reply, Request, StateCodes};
 use proto_core::wire::dialect::Dialect;
 
 #[track_caller]
@@ -53,20 +53,20 @@ fn requests() {
 #[test]
 fn replies() {
     let did = |action, outcome| Reply::Did { action, outcome };
-    answered(Reply::Run(Outcome::Success), b"run start", b"run success\r\n");
-    answered(Reply::Run(Outcome::Fail), b"run fail", b"run fail\r\n");
+    answered(Reply::Run(ActionOutcome::Success), b"run start", b"run success\r\n");
+    answered(Reply::Run(ActionOutcome::Fail), b"run fail", b"run fail\r\n");
     answered(Reply::SpeedSet(Percent::new(50.0)), b"set success", b"set speed 50%\r\n");
     answered(Reply::SpeedSet(None), b"set success", b"set success\r\n");
     answered(Reply::SpeedRefused, b"set fail", b"set fail\r\n");
-    answered(did(Action::Stop, Outcome::Success), b"stop success", b"stop success\r\n");
-    answered(did(Action::Stop, Outcome::Fail), b"stop fail", b"stop fail\r\n");
-    answered(did(Action::Pause, Outcome::Success), b"pause success", b"pause success\r\n");
-    answered(did(Action::Resume, Outcome::Fail), b"resume fail", b"resume fail\r\n");
-    answered(did(Action::PowerOn, Outcome::Success), b"poweron success", b"poweron success\r\n");
-    answered(did(Action::PowerOff, Outcome::Fail), b"poweroff fail", b"poweroff fail\r\n");
-    answered(did(Action::Enable, Outcome::Success), b"enable success", b"enable success\r\n");
-    answered(did(Action::Disable, Outcome::Fail), b"disable fail", b"disable fail\r\n");
-    answered(did(Action::Shutdown, Outcome::Success), b"shutdown success", b"shutdown success\r\n");
+    answered(did(Action::Stop, ActionOutcome::Success), b"stop success", b"stop success\r\n");
+    answered(did(Action::Stop, ActionOutcome::Fail), b"stop fail", b"stop fail\r\n");
+    answered(did(Action::Pause, ActionOutcome::Success), b"pause success", b"pause success\r\n");
+    answered(did(Action::Resume, ActionOutcome::Fail), b"resume fail", b"resume fail\r\n");
+    answered(did(Action::PowerOn, ActionOutcome::Success), b"poweron success", b"poweron success\r\n");
+    answered(did(Action::PowerOff, ActionOutcome::Fail), b"poweroff fail", b"poweroff fail\r\n");
+    answered(did(Action::Enable, ActionOutcome::Success), b"enable success", b"enable success\r\n");
+    answered(did(Action::Disable, ActionOutcome::Fail), b"disable fail", b"disable fail\r\n");
+    answered(did(Action::Shutdown, ActionOutcome::Success), b"shutdown success", b"shutdown success\r\n");
     answered(Reply::Already(Action::PowerOn), b"already poweron", b"already poweron\r\n");
     answered(Reply::Already(Action::PowerOff), b"already poweroff", b"already poweroff\r\n");
     answered(Reply::Already(Action::Enable), b"already enable", b"already enable\r\n");

@@ -46,9 +46,9 @@ fn modbus_client() {
 }
 
 /// A register bank that accepts every address.
-pub(crate) struct Bank;
+pub(crate) struct AnyBank;
 
-impl RegisterBank for Bank {
+impl RegisterBank for AnyBank {
     fn read_coils(&self, _: u16, _: u16, packed: &mut [u8]) -> Result<(), Exception> {
         black_box(packed);
         any(Ok(()))
@@ -85,11 +85,11 @@ fn modbus_server() {
     let (mut server, mut out, mut pdu) = (Server::new(), [0; MAX_ADU], [0; MAX_PDU]);
     let server = black_box(&mut server);
     let mut chunk = bytes();
-    while let Some(answered) = server.receive(&mut chunk, &mut Bank, &mut out) {
+    while let Some(answered) = server.receive(&mut chunk, &mut AnyBank, &mut out) {
         let _ = black_box(answered);
     }
     server.reset();
-    black_box(answer(bytes(), &mut Bank, &mut pdu));
+    black_box(answer(bytes(), &mut AnyBank, &mut pdu));
 }
 
 #[inline(never)]

@@ -14,8 +14,8 @@ use recipe_api::guard::{Guard, Refusal, Site};
 use recipe_api::key::{BodyHash, Hash, Hex, Key, Signed, from_hex};
 use recipe_api::metrics::Families;
 use recipe_api::nonces::Nonces;
-use recipe_api::request::{Head, HeadBuffer};
-use recipe_api::response::{Kind, Length, Response, Status, write_chunk};
+use recipe_api::request::{HeadBuffer, HttpHead};
+use recipe_api::response::{ContentType, Length, Response, StatusCode, write_chunk};
 use recipe_api::revisions::{Result as Done, Revision, Revisions, Stored};
 use recipe_api::route::{self, BodyType, Served};
 use recipe_api::{json, revisions};
@@ -26,9 +26,9 @@ use crate::{any, bytes};
 type Engine = proto_core::engine::Engine<2, 1, 32, 0, 4>;
 
 /// A writer that may fail at any time.
-struct Out;
+struct FailingWriter;
 
-impl Write for Out {
+impl Write for FailingWriter {
     fn write_str(&mut self, text: &str) -> core::fmt::Result {
         black_box(text);
         any(Ok(()))
@@ -76,7 +76,7 @@ fn remote_push(buffer: &mut HeadBuffer) {
 }
 
 #[inline(never)]
-fn remote_head(buffer: &HeadBuffer) -> Option<Head<'_>> {
+fn remote_head(buffer: &HeadBuffer) -> Option<HttpHead<'_>> {
     match buffer.head() {
         Ok(head) => Some(head),
         Err(error) => {
@@ -87,7 +87,7 @@ fn remote_head(buffer: &HeadBuffer) -> Option<Head<'_>> {
 }
 
 #[inline(never)]
-fn remote_route(head: &Head<'_>) {
+fn remote_route(head: &HttpHead<'_>) {
     black_box((head.path(), head.host_name(), head.query(text()), head.method.name()));
     black_box(head.has_only(any(&[text(), text()][..])));
     for served in [Served::Gateway, Served::Controller, Served::Board] {
@@ -97,7 +97,7 @@ fn remote_route(head: &Head<'_>) {
 }
 
 #[inline(never)]
-fn remote_admit(guard: &mut Guard, head: &Head<'_>) {
+fn remote_admit(guard: &mut Guard, head: &HttpHead<'_>) {
     let names = [text(), text()];
     let site = Site { local: address(), peer: address(), names: any(&names[..]) };
     match guard.admit(any(Instant::ZERO), head, &site, any(Served::Gateway)) {
@@ -131,7 +131,7 @@ fn remote_key() {
     black_box((from_hex::<16>(text()), from_hex::<32>(text())));
     let mut hash = BodyHash::new();
     hash.update(bytes());
-    let _ = black_box(write!(Out, "{}", Hex(&hash.finish())));
+    let _ = black_box(write!(FailingWriter, "{}", Hex(&hash.finish())));
 }
 
 #[inline(never)]
@@ -178,19 +178,19 @@ fn remote_revisions() {
 
 #[inline(never)]
 fn remote_response() {
-    let (status, kind) = (any(Status::OK), any(Kind::Json));
+    let (status, kind) = (any(StatusCode::OK), any(ContentType::Json));
     let response = Response::new(status, kind, any(Length::Bytes(1))).with_policy(text());
     let fields: [(&str, &dyn core::fmt::Display); 1] = [(text(), &text())];
-    let _ = black_box(response.with(&fields).write(&mut Out));
-    let _ = black_box(write_chunk(&mut Out, text()));
-    let _ = black_box(json::write_text(&mut Out, text()));
+    let _ = black_box(response.with(&fields).write(&mut FailingWriter));
+    let _ = black_box(write_chunk(&mut FailingWriter, text()));
+    let _ = black_box(json::write_text(&mut FailingWriter, text()));
 }
 
 #[inline(never)]
 fn remote_documents(gateway: &Engine) {
     for document in [Document::Status, Document::Values] {
         let mut pieces = Pieces::of(any(document));
-        while let Ok(true) = pieces.write_next(gateway.status(any(Instant::ZERO)), &mut Out) {}
+        while let Ok(true) = pieces.write_next(gateway.status(any(Instant::ZERO)), &mut FailingWriter) {}
     }
     black_box(gateway.status(any(Instant::ZERO)).health().name());
 }
@@ -198,5 +198,5 @@ fn remote_documents(gateway: &Engine) {
 #[inline(never)]
 fn remote_metrics(gateway: &Engine) {
     let mut families = Families::new();
-    while let Ok(true) = families.write_next(gateway.status(any(Instant::ZERO)), &mut Out) {}
+    while let Ok(true) = families.write_next(gateway.status(any(Instant::ZERO)), &mut FailingWriter) {}
 }

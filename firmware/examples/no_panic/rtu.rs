@@ -7,7 +7,7 @@ use proto_core::modbus::rtu::{
 };
 use proto_core::time::{Duration, Instant};
 
-use crate::protocols::Bank;
+use crate::protocols::AnyBank;
 use crate::{any, bytes, out_buf};
 
 pub(crate) fn all() {
@@ -46,6 +46,6 @@ fn rtu_slave() {
     let Some(mut slave) = Slave::new(timing(), any(Echo::Absent), any(5)) else { return };
     let (slave, now, mut out) = (black_box(&mut slave), any(Instant::ZERO), [0; MAX_ADU]);
     slave.received(bytes(), now);
-    black_box(slave.poll(any(now), &mut Bank, &mut out));
+    black_box(slave.poll(any(now), &mut AnyBank, &mut out));
     black_box((slave.deadline(), slave.counters()));
 }

@@ -5,23 +5,23 @@ use core::hint::black_box;
 use proto_core::config::GatewayConfig;
 use proto_core::time::{Duration, Instant};
 use recipe_sparkplug::catalog::{Catalog as _, Owner};
-use recipe_sparkplug::document::Document;
+use recipe_sparkplug::document::NodeDocument;
 use recipe_sparkplug::gateway::{GatewayCatalog, Rates};
-use recipe_sparkplug::node::{Counters, EdgeNode, Input, MIN_BUFFER};
+use recipe_sparkplug::node::{EdgeNode, Input, MIN_BUFFER, NodeCounters};
 use recipe_sparkplug::sntp::Sntp;
 use recipe_sparkplug::value::Value;
 use static_cell::ConstStaticCell;
 
 use crate::{any, bytes, out_buf};
 
-type Engine = proto_core::engine::Engine<2, 1, 32, 0, 4>;
-type Catalog = GatewayCatalog<'static, 64>;
-type Node = EdgeNode<64, 16>;
+type SmallEngine = proto_core::engine::Engine<2, 1, 32, 0, 4>;
+type SmallCatalog = GatewayCatalog<'static, 64>;
+type SmallNode = EdgeNode<64, 16>;
 
 pub(crate) fn all() {
-    static DOCUMENT: ConstStaticCell<Document> = ConstStaticCell::new(Document::empty());
-    static NODE: ConstStaticCell<Node> = ConstStaticCell::new(Node::idle());
-    static ENGINE: ConstStaticCell<Engine> = ConstStaticCell::new(Engine::idle());
+    static DOCUMENT: ConstStaticCell<NodeDocument> = ConstStaticCell::new(NodeDocument::empty());
+    static NODE: ConstStaticCell<SmallNode> = ConstStaticCell::new(SmallNode::idle());
+    static ENGINE: ConstStaticCell<SmallEngine> = ConstStaticCell::new(SmallEngine::idle());
     static CONFIG: GatewayConfig = GatewayConfig::empty();
     sparkplug_time();
     let (Some(document), Some(node), Some(engine)) =
@@ -31,7 +31,7 @@ pub(crate) fn all() {
     };
     sparkplug_document(black_box(&mut *document));
     let _ = black_box(black_box(&mut *engine).configure(black_box(&CONFIG)));
-    let document: &'static Document = document;
+    let document: &'static NodeDocument = document;
     if let Some(catalog) = sparkplug_catalog(document, black_box(engine), &CONFIG) {
         sparkplug_sample(black_box(&catalog), black_box(engine));
         if node.configure(&document.settings, black_box(&catalog), any(None), any(1)).is_ok() {
@@ -49,7 +49,7 @@ fn sparkplug_time() {
 }
 
 #[inline(never)]
-fn sparkplug_document(document: &mut Document) {
+fn sparkplug_document(document: &mut NodeDocument) {
     let _ = black_box(document.decode(bytes()));
     let mut out = [0; 256];
     let _ = black_box(document.encode(out_buf(&mut out)));
@@ -57,24 +57,24 @@ fn sparkplug_document(document: &mut Document) {
 
 #[inline(never)]
 fn sparkplug_catalog(
-    document: &'static Document,
-    engine: &Engine,
+    document: &'static NodeDocument,
+    engine: &SmallEngine,
     config: &'static GatewayConfig,
-) -> Option<Catalog> {
+) -> Option<SmallCatalog> {
     let rates = Rates {
         min_interval: document.interval,
         counter_interval: document.counter_interval,
         rules: &document.rules,
         values: &document.values,
     };
-    Catalog::new(black_box(config).view(), engine.status(any(Instant::ZERO)), rates, "0").ok()
+    SmallCatalog::new(black_box(config).view(), engine.status(any(Instant::ZERO)), rates, "0").ok()
 }
 
 #[inline(never)]
-fn sparkplug_sample(catalog: &Catalog, engine: &Engine) {
+fn sparkplug_sample(catalog: &SmallCatalog, engine: &SmallEngine) {
     let mut values = [None; 64];
     let status = engine.status(any(Instant::ZERO));
-    let counters = any(Counters::NONE);
+    let counters = any(NodeCounters::NONE);
     let part = any(0)..any(64);
     catalog.sample_part(status, any(Duration::ZERO), &counters, part, black_box(&mut values[..]));
     black_box((values, catalog.alive(status), catalog.len()));
@@ -82,7 +82,7 @@ fn sparkplug_sample(catalog: &Catalog, engine: &Engine) {
 }
 
 #[inline(never)]
-fn sparkplug_node(node: &mut Node, catalog: &Catalog) {
+fn sparkplug_node(node: &mut SmallNode, catalog: &SmallCatalog) {
     let now = any(Instant::ZERO);
     let values: [Option<Value>; 64] = any([None; 64]);
     for input in [

@@ -3,8 +3,8 @@
 use core::hint::black_box;
 
 use recipe_store::{
-    Adoption, Flash, Geometry, Key, Marks, Place, Put, Slot, SlotMarks, SlotTrial, Step, Store, Trial, Word,
-    newest,
+    Adoption, Flash, FlashWord, Geometry, Marks, Put, PutStep, RecordKey, Slot, SlotMarks, SlotTrial, Store,
+    Trial, Word, newest,
 };
 
 use crate::{any, bytes, out_buf};
@@ -17,12 +17,12 @@ impl Flash for Any {
         any(Geometry { sectors: 2, words: 4096 })
     }
 
-    fn read(&self, place: Place) -> Word {
+    fn read(&self, place: FlashWord) -> Word {
         black_box(place);
         any([0; 32])
     }
 
-    async fn write(&mut self, place: Place, word: &Word) {
+    async fn write(&mut self, place: FlashWord, word: &Word) {
         black_box((place, word));
     }
 
@@ -47,7 +47,7 @@ fn store_mount() -> Option<Store> {
 #[inline(never)]
 fn store_questions(store: &Store) {
     let mut out = [0; 64];
-    black_box(store.get(&Any, any(Key::Image(3)), out_buf(&mut out)));
+    black_box(store.get(&Any, any(RecordKey::Image(3)), out_buf(&mut out)));
     black_box(store.image(&Any, any(7), out_buf(&mut out)));
     black_box((store.revisions(), store.revision(any(7)), store.marks(), store.at_start()));
     black_box((store.access_key(&Any), store.counter(any(1)), store.birth_sequence()));
@@ -61,7 +61,7 @@ fn store_move(store: &Store) {
         black_box((newest.store.slots(), newest.store.generation(), newest.side, newest.may_move));
     }
     let mut relocation = store.relocate();
-    while !matches!(black_box(relocation.next(&Any, &Any)), Step::End(_)) {}
+    while !matches!(black_box(relocation.next(&Any, &Any)), PutStep::End(_)) {}
     black_box(relocation.moved().is_some());
 }
 
@@ -71,7 +71,7 @@ fn store_changes(store: &mut Store) {
     let marks = any(Marks { live: Some(1), trial, ..Marks::default() });
     let _ = store.mark(marks).map(store_put);
     let _ = store.keep(any(1), any(2), bytes(), any(None)).map(store_put);
-    let _ = store.put(any(Key::Counter(1)), any(2), bytes()).map(store_put);
+    let _ = store.put(any(RecordKey::Counter(1)), any(2), bytes()).map(store_put);
     let _ = store.set_access_key(any(&[0; 16])).map(store_put);
     let _ = store.set_counter(any(1), any(2)).map(store_put);
     let on_trial = SlotTrial { slot: Slot::B, attempts: 3, confirm_s: 60, before: 0 };
@@ -85,5 +85,5 @@ fn store_changes(store: &mut Store) {
 
 #[inline(never)]
 fn store_put(mut put: Put<'_, '_>) {
-    while !matches!(black_box(put.next(&Any)), Step::End(_)) {}
+    while !matches!(black_box(put.next(&Any)), PutStep::End(_)) {}
 }

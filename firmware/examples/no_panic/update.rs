@@ -5,16 +5,16 @@ use core::hint::black_box;
 
 use recipe_store::Slot;
 use recipe_update::{
-    BoardName, Check, Downgrade, Formats, HEADER, Header, Machine, Parts, PublicKey, Receive, ReceiveStep,
-    Running, SlotFlash, SlotMarks, SlotTrial, UpdateFile, Version, begin_trial, choose, confirm, end_trial,
-    header_of, may_keep,
+    BoardName, Check, Downgrade, Formats, HEADER, Header, ImageFacts, Machine, PublicKey, Receive,
+    ReceiveStep, RunningFirmware, SlotFlash, SlotMarks, SlotTrial, UpdateFile, Version, begin_trial, choose,
+    confirm, end_trial, header_of, may_keep,
 };
 
 use crate::store::Any;
 use crate::{any, bytes};
 
 impl SlotFlash for Any {
-    fn whole(&self, place: recipe_store::Place) -> Option<recipe_store::Word> {
+    fn whole(&self, place: recipe_store::FlashWord) -> Option<recipe_store::Word> {
         black_box(place);
         any(Some([0; 32]))
     }
@@ -82,12 +82,12 @@ fn update_loader(board: &BoardName, key: &PublicKey) {
 fn update_marks() {
     let [now, slot] = [0_u8, 1].map(any);
     black_box((Slot::of_number(slot), begin_trial(marks(), any(Slot::B), any(60), now)));
-    black_box((confirm(marks(), any(Slot::B)), end_trial(marks(), any(recipe_update::Ended::Failed))));
+    black_box((confirm(marks(), any(Slot::B)), end_trial(marks(), any(recipe_update::TrialEnd::Failed))));
 }
 
 #[inline(never)]
 fn update_rules(header: &Header) {
-    let Parts { formats, .. } = *header.parts();
+    let ImageFacts { formats, .. } = *header.parts();
     black_box(may_keep(any(3), &formats, any(Some(&formats)), marks()));
 }
 
@@ -96,7 +96,8 @@ fn update_receive(header: Header, board: BoardName) {
     black_box(header_of(&Any, any(Slot::A), &board).is_ok());
     black_box(Check::contents(header).step(&Any, any(128)));
     black_box(Check::damage(header).step(&Any, any(128)));
-    let running = any(Running { board, slot: Slot::A, version: Version::new(0, 1, 0), kept: Some((1, 3)) });
+    let running =
+        any(RunningFirmware { board, slot: Slot::A, version: Version::new(0, 1, 0), kept: Some((1, 3)) });
     let begun = Receive::begin(header, &running, marks(), any(Downgrade::Allowed), &Any);
     let Ok(mut receive) = begun else { return };
     loop {

@@ -77,7 +77,7 @@ fn protocols() {
     say(any(LineError::Malformed));
     say(any(Exception::from_code(1)));
     say(any(adu::AduError::Length { received: 0 }));
-    say(any(pdu::EncodeError::Count { count: 0, max: 0 }));
+    say(any(pdu::PduEncodeError::Count { count: 0, max: 0 }));
     say(any(pdu::ResponseError::Length { received: 0, expected: 1 }));
     say(any(client::Violation::Unit { expected: 0, received: 1 }));
     say(any(client::StartError::Busy));

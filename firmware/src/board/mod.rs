@@ -9,10 +9,14 @@ mod stack;
 #[cfg(feature = "board-mps2-an500")]
 mod mps2_an500;
 #[cfg(feature = "board-mps2-an500")]
+pub(crate) use mps2_an500::Mps2An500 as Board;
+#[cfg(feature = "board-mps2-an500")]
 pub(crate) use mps2_an500::*;
 
 #[cfg(all(feature = "board-nucleo-h743zi", not(feature = "board-mps2-an500")))]
 mod nucleo_h743zi;
+#[cfg(all(feature = "board-nucleo-h743zi", not(feature = "board-mps2-an500")))]
+pub(crate) use nucleo_h743zi::NucleoH743zi as Board;
 #[cfg(all(feature = "board-nucleo-h743zi", not(feature = "board-mps2-an500")))]
 pub(crate) use nucleo_h743zi::*;
 

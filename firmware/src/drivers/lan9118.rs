@@ -1,6 +1,6 @@
 //! SMSC LAN9118 Ethernet controller as a driver of `embassy_net`.
 //!
-//! In: register accesses through [`Registers`], and a waker that the interrupt handler wakes. Out: Ethernet
+//! In: register accesses through [`Lan9118Registers`], and a waker that the interrupt handler wakes. Out: Ethernet
 //! frames. The only receive interrupt used is "status FIFO level", which means that a whole frame has
 //! arrived.
 
@@ -10,7 +10,7 @@ use embassy_net_driver::{Capabilities, Driver, HardwareAddress, LinkState, RxTok
 use embassy_sync::waitqueue::AtomicWaker;
 
 /// The controller's registers, 32 bits each.
-pub trait Registers {
+pub trait Lan9118Registers {
     /// Reads the register at `offset`.
     fn read(&self, offset: u16) -> u32;
     /// Writes the register at `offset`.
@@ -64,7 +64,7 @@ impl core::fmt::Display for Lan9118Error {
 
 impl core::error::Error for Lan9118Error {}
 
-impl<R: Registers> Lan9118<R> {
+impl<R: Lan9118Registers> Lan9118<R> {
     /// Resets and starts the controller, with its interrupts disabled.
     ///
     /// # Errors
@@ -194,12 +194,12 @@ impl<R: Registers> Lan9118<R> {
 }
 
 /// Polls a register with a limit.
-fn wait(regs: &impl Registers, offset: u16, done: impl Fn(u32) -> bool) -> Result<(), Lan9118Error> {
+fn wait(regs: &impl Lan9118Registers, offset: u16, done: impl Fn(u32) -> bool) -> Result<(), Lan9118Error> {
     let is_done = (0..MAX_POLLS).any(|_| done(regs.read(offset)));
     if is_done { Ok(()) } else { Err(Lan9118Error::Stuck { offset }) }
 }
 
-impl<R: Registers> Driver for Lan9118<R> {
+impl<R: Lan9118Registers> Driver for Lan9118<R> {
     type RxToken<'a>
         = Received<'a>
     where
@@ -276,7 +276,7 @@ pub struct Transmit<'a, R> {
     buffer: &'a mut [u8; BUFFER],
 }
 
-impl<R: Registers> TxToken for Transmit<'_, R> {
+impl<R: Lan9118Registers> TxToken for Transmit<'_, R> {
     fn consume<T, F: FnOnce(&mut [u8]) -> T>(self, len: usize, f: F) -> T {
         let len = len.min(MTU);
         let (frame, _) = self.buffer.split_at_mut(len);

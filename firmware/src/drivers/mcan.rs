@@ -1,6 +1,6 @@
 //! Bosch M_CAN (the FDCAN of an STM32H7) as a CAN port, for classic frames.
 //!
-//! In: accesses to its registers and its message RAM through [`Registers`], and calls of
+//! In: accesses to its registers and its message RAM through [`McanBlock`], and calls of
 //! [`Mcan::interrupt`]. Out: a [`CanPort`]. It knows no board and no pins.
 //!
 //! The message RAM has two receive FIFOs of 64 frames, so that none is lost within 3 ms at 1 Mbit/s, and a
@@ -28,7 +28,7 @@ pub use registers::MESSAGE_RAM_WORDS;
 pub use timing::{BitTiming, BitrateError};
 
 /// One M_CAN: its registers, and its share of the message RAM, 32 bits each.
-pub trait Registers {
+pub trait McanBlock {
     /// Reads the register at `offset`.
     fn read(&self, offset: u8) -> u32;
     /// Writes the register at `offset`.
@@ -77,7 +77,7 @@ impl core::fmt::Display for McanError {
 
 impl core::error::Error for McanError {}
 
-impl<R: Registers> Mcan<R> {
+impl<R: McanBlock> Mcan<R> {
     /// Configures the controller after its reset. `clock` is its kernel clock in Hz; `ram_offset` is the start of
     /// its part of the message RAM, in words. It joins the bus when its filters are set.
     ///
@@ -272,7 +272,7 @@ impl<R: Registers> Mcan<R> {
     }
 }
 
-impl<R: Registers> CanPort for Mcan<R> {
+impl<R: McanBlock> CanPort for Mcan<R> {
     type Frame = CanFrame;
 
     async fn receive(&mut self) -> CanEvent<CanFrame> {

@@ -1,6 +1,6 @@
 //! An STM32 USART (with FIFOs, as in the H7) as an RS-485 line.
 //!
-//! In: register accesses through [`Registers`], the line's settings, and calls of [`Usart::interrupt`].
+//! In: register accesses through [`UsartBlock`], the line's settings, and calls of [`Usart::interrupt`].
 //! Out: a [`Line`]. It knows no board and no pins.
 //!
 //! Interrupts are used instead of DMA, because each character with a parity or framing error has to be
@@ -23,7 +23,7 @@ use proto_core::config::{Parity, Rs485};
 use super::line::{Line, LineErrors};
 
 /// The registers of one USART, 32 bits each.
-pub trait Registers {
+pub trait UsartBlock {
     /// Reads the register at `offset`.
     fn read(&self, offset: u8) -> u32;
     /// Writes the register at `offset`.
@@ -75,7 +75,7 @@ pub struct Usart<R: 'static> {
     shared: &'static UsartShared,
 }
 
-impl<R: Registers> Usart<R> {
+impl<R: UsartBlock> Usart<R> {
     /// Starts the USART after its reset. `clock` is its kernel clock in Hz. From here on its interrupt handler
     /// has to call [`Usart::interrupt`].
     ///
@@ -134,7 +134,7 @@ struct UsartAccess<'a, R> {
     state: &'a mut UsartState,
 }
 
-impl<R: Registers> UsartAccess<'_, R> {
+impl<R: UsartBlock> UsartAccess<'_, R> {
     fn set(&self, register: u8, bits: u32) {
         self.regs.write(register, self.regs.read(register) | bits);
     }
@@ -195,11 +195,11 @@ impl<R: Registers> UsartAccess<'_, R> {
     }
 }
 
-impl<R: Registers> ErrorType for Usart<R> {
+impl<R: UsartBlock> ErrorType for Usart<R> {
     type Error = Infallible;
 }
 
-impl<R: Registers> Read for Usart<R> {
+impl<R: UsartBlock> Read for Usart<R> {
     async fn read(&mut self, buf: &mut [u8]) -> Result<usize, Infallible> {
         poll_fn(|cx| {
             self.with(|line| {
@@ -222,7 +222,7 @@ impl<R: Registers> Read for Usart<R> {
     }
 }
 
-impl<R: Registers> Write for Usart<R> {
+impl<R: UsartBlock> Write for Usart<R> {
     async fn write(&mut self, buf: &[u8]) -> Result<usize, Infallible> {
         poll_fn(|cx| {
             self.with(|line| {
@@ -259,7 +259,7 @@ impl<R: Registers> Write for Usart<R> {
     }
 }
 
-impl<R: Registers> Line for Usart<R> {
+impl<R: UsartBlock> Line for Usart<R> {
     fn errors(&self) -> LineErrors {
         self.with(|line| line.state.errors)
     }

@@ -1,6 +1,6 @@
 //! Chooses the configuration to run.
 
-use firmware::fmt::Text;
+use firmware::fmt::DisplayText;
 use firmware::platform::{self, Board as _, NoDevice};
 use firmware::stored::{self, EndedName, RoleName, StoredConfig};
 use firmware::tasks::gateway::Gateway;
@@ -74,24 +74,24 @@ pub(super) fn load(
     }
     let mut candidates = heapless::Vec::new();
     if let Err(error) = board.block_on(stored.candidates(&mut candidates)) {
-        error!("the store: {}", Text(&error));
+        error!("the store: {}", DisplayText(&error));
     }
     // A trial ends by a restart; log its result where it can be read.
     if let Some((number, ended)) = stored.store().marks().last {
-        info!("the last trial was of configuration {}: {}", number, Text(&EndedName(ended)));
+        info!("the last trial was of configuration {}: {}", number, DisplayText(&EndedName(ended)));
     }
     let mut is_first = true;
     for (revision, role) in candidates {
         let Some(image) = stored.image(revision) else { continue };
         match configure(image, gateway, config) {
             Ok(len) => {
-                info!("configuration {} of the store, {}", revision.number, Text(&RoleName(role)));
+                info!("configuration {} of the store, {}", revision.number, DisplayText(&RoleName(role)));
                 work.trial = stored::trial_time(role);
                 work.running = Some(revision.number);
                 return Ok(len);
             }
             Err(error) => {
-                error!("configuration {} of the store cannot run: {}", revision.number, Text(&error));
+                error!("configuration {} of the store cannot run: {}", revision.number, DisplayText(&error));
                 work.trial_failed |= matches!(role, Role::Trial { .. });
                 // More useful than "no image".
                 if core::mem::take(&mut is_first) {

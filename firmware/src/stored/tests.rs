@@ -2,7 +2,7 @@ use std::vec;
 use std::vec::Vec as List;
 
 use embassy_futures::block_on;
-use recipe_store::{BLANK, Geometry, Place, Put, Trial, Word};
+use recipe_store::{BLANK, FlashWord, Geometry, Put, Trial, Word};
 
 use super::*;
 
@@ -23,7 +23,7 @@ impl PlainFlash {
         Self { words: vec![BLANK; 2 * usize::from(WORDS)], bytes: List::new(), is_broken: false, writes: 0 }
     }
 
-    fn at(place: Place) -> usize {
+    fn at(place: FlashWord) -> usize {
         usize::from(place.sector) * usize::from(WORDS) + usize::from(place.word)
     }
 }
@@ -33,11 +33,11 @@ impl Flash for PlainFlash {
         Geometry { sectors: 2, words: WORDS }
     }
 
-    fn read(&self, place: Place) -> Word {
+    fn read(&self, place: FlashWord) -> Word {
         self.words[Self::at(place)]
     }
 
-    async fn write(&mut self, place: Place, word: &Word) {
+    async fn write(&mut self, place: FlashWord, word: &Word) {
         self.writes += 1;
         if !self.is_broken {
             self.words[Self::at(place)] = *word;
@@ -50,7 +50,7 @@ impl Flash for PlainFlash {
 }
 
 impl StoreFlash for PlainFlash {
-    fn bytes(&mut self, found: Found) -> Option<&[u8]> {
+    fn bytes(&mut self, found: FoundRecord) -> Option<&[u8]> {
         self.bytes = self.words[Self::at(found.data)..].as_flattened().get(..found.len)?.to_vec();
         Some(&self.bytes)
     }
@@ -58,7 +58,7 @@ impl StoreFlash for PlainFlash {
 
 impl StoredConfig<PlainFlash> {
     fn restart(&mut self) {
-        *self = StoredConfig::open(Places::one(self.flash.clone())).unwrap();
+        *self = StoredConfig::open(StorePlaces::one(self.flash.clone())).unwrap();
     }
 
     fn write(&mut self, put: impl FnOnce(&mut Store) -> Put<'_, 'static>) {
@@ -75,7 +75,7 @@ impl StoredConfig<PlainFlash> {
 }
 
 fn blank() -> StoredConfig<PlainFlash> {
-    StoredConfig::open(Places::one(PlainFlash::new())).unwrap()
+    StoredConfig::open(StorePlaces::one(PlainFlash::new())).unwrap()
 }
 
 #[test]
@@ -110,8 +110,8 @@ fn a_trial_is_counted_before_it_runs_and_can_be_ended() {
     assert_eq!(stored.start(), on_trial);
     assert_eq!(stored.store.marks().trial, Some(Trial { number: 2, attempts: 1, confirm_s: 60 }));
     let before = stored.flash.clone();
-    block_on(stored.end_trial(Ended::NotConfirmed)).unwrap();
-    assert_eq!(stored.store.marks().last, Some((2, Ended::NotConfirmed)));
+    block_on(stored.end_trial(TrialEnd::NotConfirmed)).unwrap();
+    assert_eq!(stored.store.marks().last, Some((2, TrialEnd::NotConfirmed)));
     assert_eq!(stored.start(), [(1, Role::Live)]);
     // Or it is not ended, but the board starts again and again.
     stored.flash = before;
@@ -129,10 +129,10 @@ fn what_is_confirmed_is_live_and_what_is_forgotten_has_no_end() {
     assert_eq!(stored.start(), [(2, Role::Trial { confirm_s: 60 }), (1, Role::Live)]);
     block_on(stored.make_live(2, Some(1))).unwrap();
     assert_eq!(stored.start(), [(2, Role::Live), (1, Role::Previous)]);
-    assert_eq!(stored.store.marks().last, Some((2, Ended::Confirmed)));
+    assert_eq!(stored.store.marks().last, Some((2, TrialEnd::Confirmed)));
     block_on(stored.keep(3, 3, b"third", None)).unwrap();
     block_on(stored.begin_trial(3, 60)).unwrap();
-    block_on(stored.end_trial(Ended::TakenBack)).unwrap();
+    block_on(stored.end_trial(TrialEnd::TakenBack)).unwrap();
     // In the place of 3, which the mark would name.
     block_on(stored.keep(4, 4, b"fourth", Some(3))).unwrap();
     assert_eq!(stored.store.marks().last, None);
@@ -176,8 +176,9 @@ fn a_store_in_the_bank_of_the_program_is_moved_once() {
     block_on(stored.keep(1, 1, &image(1), None)).unwrap();
     block_on(stored.make_live(1, None)).unwrap();
     let (first, second) = (stored.flash.clone(), PlainFlash::new());
-    let open =
-        |own| StoredConfig::open(Places { first: first.clone(), second: Some(second.clone()), own }).unwrap();
+    let open = |own| {
+        StoredConfig::open(StorePlaces { first: first.clone(), second: Some(second.clone()), own }).unwrap()
+    };
     assert!(!open(Side::First).is_to_be_moved());
     let mut moved = open(Side::Second);
     assert!(moved.is_to_be_moved());
@@ -189,7 +190,7 @@ fn a_store_in_the_bank_of_the_program_is_moved_once() {
     // The next start finds it there, and the firmware before moves it back.
     let second = moved.flash.clone();
     let again = |own| {
-        StoredConfig::open(Places { first: first.clone(), second: Some(second.clone()), own })
+        StoredConfig::open(StorePlaces { first: first.clone(), second: Some(second.clone()), own })
             .unwrap()
             .is_to_be_moved()
     };

@@ -16,10 +16,12 @@ use embassy_time::{Duration, Instant, Timer, with_timeout};
 use heapless::Vec;
 use proto_core::config::ConfigView;
 use proto_core::time::{Duration as Span, Instant as Time};
-pub use recipe_sparkplug::document::Document;
 use recipe_sparkplug::document::DocumentError;
+pub use recipe_sparkplug::document::NodeDocument;
 use recipe_sparkplug::gateway::{GatewayCatalog, Rates};
-use recipe_sparkplug::node::{Counters, EdgeNode, Failure, Input, MIN_BUFFER, NodeError, Output};
+use recipe_sparkplug::node::{
+    EdgeNode, Input, MIN_BUFFER, NodeCounters, NodeError, NodeOutput, SessionFailure,
+};
 use recipe_sparkplug::value::Value;
 
 use super::gateway::Gateway;
@@ -28,7 +30,7 @@ use super::store::StoreHandle;
 use super::time::WallClock;
 use super::watchdog::Pulse;
 use crate::clock::now;
-use crate::fmt::Text;
+use crate::fmt::DisplayText;
 use crate::{info, warn};
 
 /// Maximum number of metrics.
@@ -36,12 +38,12 @@ pub const METRICS: usize = 256;
 /// Capacity of the buffer for samples taken while offline.
 pub const HISTORY: usize = 192;
 
-type Catalog = GatewayCatalog<'static, METRICS>;
+type BoardCatalog = GatewayCatalog<'static, METRICS>;
 
 /// Memory of the node. All zeros, so it is placed in .bss.
 pub struct NodeMemory {
     /// The decoded settings.
-    pub document: Document,
+    pub document: NodeDocument,
     /// Everything else that the node needs.
     pub rest: NodeBuffers,
 }
@@ -60,7 +62,7 @@ pub struct NodeBuffers {
 impl NodeMemory {
     /// Empty: the settings have not been read.
     pub const ZEROED: Self = Self {
-        document: Document::empty(),
+        document: NodeDocument::empty(),
         rest: NodeBuffers {
             node: EdgeNode::idle(),
             values: Vec::new(),
@@ -117,13 +119,13 @@ pub struct EdgeStatus {
     /// Whether a session with the broker is established.
     pub is_online: bool,
     /// The last failure, if there is no session.
-    pub failure: Option<Failure>,
+    pub failure: Option<SessionFailure>,
     /// bdSeq of the session.
     pub bd_seq: Option<u8>,
     /// Number of metrics.
     pub metrics: usize,
     /// Counters since the start.
-    pub counters: Counters,
+    pub counters: NodeCounters,
 }
 
 /// Shared by the edge node and the console.
@@ -162,8 +164,8 @@ impl Edge {
 
 /// An edge node with its catalog and buffers.
 pub struct Node {
-    document: &'static Document,
-    catalog: Catalog,
+    document: &'static NodeDocument,
+    catalog: BoardCatalog,
     rest: &'static mut NodeBuffers,
 }
 
@@ -174,7 +176,7 @@ impl Node {
     /// # Errors
     /// See [`EdgeError`].
     pub fn make(
-        document: &'static Document,
+        document: &'static NodeDocument,
         rest: &'static mut NodeBuffers,
         gateway: &Gateway,
         config: ConfigView<'_>,
@@ -187,7 +189,8 @@ impl Node {
             rules: &document.rules,
             values: &document.values,
         };
-        let catalog = gateway.report(|status| Catalog::new(config, status, rates, env!("CARGO_PKG_VERSION")));
+        let catalog =
+            gateway.report(|status| BoardCatalog::new(config, status, rates, env!("CARGO_PKG_VERSION")));
         let catalog = catalog.map_err(|_| EdgeError::Metrics)?;
         rest.node.configure(&document.settings, &catalog, bd_seq, seed).map_err(EdgeError::Node)?;
         let _ = rest.values.resize(catalog.len(), None);
@@ -270,13 +273,13 @@ struct NodeDriver<'a> {
     store: &'a StoreHandle,
     edge: &'a Edge,
     clock: &'a WallClock,
-    catalog: &'a Catalog,
+    catalog: &'a BoardCatalog,
     node: &'a mut EdgeNode<METRICS, HISTORY>,
     values: &'a mut [Option<Value>],
     period: Duration,
     sample_at: Instant,
     was_online: bool,
-    logged: Option<Failure>,
+    logged: Option<SessionFailure>,
 }
 
 impl NodeDriver<'_> {
@@ -307,17 +310,17 @@ impl NodeDriver<'_> {
     async fn drain(&mut self, socket: &mut TcpSocket<'_>, piece: &mut [u8]) -> NodeStep {
         loop {
             let is_written = match self.node.poll_output(now(), self.catalog, piece) {
-                Output::Open => return NodeStep::Open,
-                Output::Sleep { until } => return NodeStep::Sleep { until },
-                Output::Busy => true,
-                Output::Keep { bd_seq } => {
+                NodeOutput::Open => return NodeStep::Open,
+                NodeOutput::Sleep { until } => return NodeStep::Sleep { until },
+                NodeOutput::Busy => true,
+                NodeOutput::Keep { bd_seq } => {
                     if !self.pulse.idle(pin!(self.store.keep_session(bd_seq))).await {
                         warn!("edge node: the number of the session cannot be kept");
                     }
                     true
                 }
-                Output::Send(bytes) => self.pulse.idle(pin!(write(socket, bytes))).await,
-                Output::Close => {
+                NodeOutput::Send(bytes) => self.pulse.idle(pin!(write(socket, bytes))).await,
+                NodeOutput::Close => {
                     socket.close();
                     let _ = self.pulse.idle(pin!(with_timeout(CLOSE_TIME, socket.flush()))).await;
                     reset(socket).await;
@@ -333,7 +336,7 @@ impl NodeDriver<'_> {
     }
 
     /// Connects to the broker; sampling continues meanwhile.
-    async fn open(&mut self, stack: Stack<'_>, document: &Document, socket: &mut TcpSocket<'_>) {
+    async fn open(&mut self, stack: Stack<'_>, document: &NodeDocument, socket: &mut TcpSocket<'_>) {
         let connected = {
             let connecting = async {
                 // Without an address every attempt would fail at once.
@@ -364,7 +367,7 @@ impl NodeDriver<'_> {
     }
 
     /// Publishes the status to the console and logs changes.
-    fn tell(&mut self, document: &Document) {
+    fn tell(&mut self, document: &NodeDocument) {
         let is_online = self.node.is_online();
         let failure = self.node.failure();
         self.edge.view.set(View::Runs(EdgeStatus {
@@ -381,7 +384,7 @@ impl NodeDriver<'_> {
             }
             Some(failure) if !is_online && (self.was_online || self.logged != Some(failure)) => {
                 (self.was_online, self.logged) = (false, Some(failure));
-                warn!("edge node: {}; trying again", Text(&failure));
+                warn!("edge node: {}; trying again", DisplayText(&failure));
             }
             _ => {}
         }

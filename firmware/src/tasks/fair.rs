@@ -77,7 +77,7 @@ mod tests {
     use embassy_net_driver::{RxToken, TxToken};
 
     use super::*;
-    use crate::tasks::test_clock::Clock;
+    use crate::tasks::test_clock::TestClock;
 
     /// Always has another frame, for another station.
     struct Endless<'a>(&'a Cell<u32>);
@@ -132,7 +132,7 @@ mod tests {
 
     #[test]
     fn a_flood_of_frames_lets_the_other_tasks_run() {
-        let _clock = Clock::take();
+        let _clock = TestClock::take();
         let gateway = Box::new(Gateway::idle());
         let taken = Cell::new(0);
         let mut resources = StackResources::<1>::new();

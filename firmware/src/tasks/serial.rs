@@ -17,7 +17,7 @@ use super::control::PortControl;
 use super::gateway::Gateway;
 use super::watchdog::Pulse;
 use crate::drivers::line::{Line, LineDirection, LineErrors};
-use crate::fmt::Text;
+use crate::fmt::DisplayText;
 use crate::warn;
 
 /// Runs the port forever.
@@ -78,7 +78,7 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, line: impl Line
         };
         // Only the first of consecutive failures is logged.
         if !is_failing {
-            warn!("port {}: {}", port.0, Text(&failed));
+            warn!("port {}: {}", port.0, DisplayText(&failed));
         }
         is_failing = true;
         task.report_waiting();

@@ -13,7 +13,7 @@ use embassy_futures::select::{Either4, select4};
 use embassy_time::{Duration, Instant, Timer};
 use heapless::Vec;
 use proto_core::time::Duration as Span;
-use recipe_api::revisions::{Ended, Output, Refused, Result as Done, Revision, Revisions, Stored};
+use recipe_api::revisions::{Ended, Refused, Result as Done, Revision, RevisionOutput, Revisions, Stored};
 use recipe_store::{KeepError, Store};
 use recipe_update::SlotFlash;
 
@@ -23,7 +23,7 @@ pub use handle::{Failed, FirmwareView, MAX_FAILURE, PART, StoreHandle, StoreLock
 use super::gateway::Gateway;
 use super::watchdog::Pulse;
 use crate::clock::now;
-use crate::fmt::Text;
+use crate::fmt::DisplayText;
 use crate::stored::{StoreFlash, StoredConfig};
 use crate::update::{self, Updates, Works};
 use crate::{error, info, warn};
@@ -55,7 +55,7 @@ pub async fn run<F: StoreFlash, S: SlotFlash>(
         info!("the store is moved out of the bank that the program runs from");
         let moved = pulse.idle(pin!(stored.move_home())).await;
         if let Err(error) = moved {
-            error!("the store stays where it is: {}", Text(&error));
+            error!("the store stays where it is: {}", DisplayText(&error));
         }
     }
     if let Some((digest, image)) = work.adopt {
@@ -65,13 +65,13 @@ pub async fn run<F: StoreFlash, S: SlotFlash>(
                 info!("the store has taken over the configuration");
                 running = stored.store().marks().live;
             }
-            Err(error) => error!("the store: {}", Text(&error)),
+            Err(error) => error!("the store: {}", DisplayText(&error)),
         }
     }
     if work.trial_failed {
-        let ended = pulse.idle(pin!(stored.end_trial(recipe_store::Ended::Failed))).await;
+        let ended = pulse.idle(pin!(stored.end_trial(recipe_store::TrialEnd::Failed))).await;
         if let Err(error) = ended {
-            error!("the store: {}", Text(&error));
+            error!("the store: {}", DisplayText(&error));
         }
     }
     let mut revisions = revisions_of(stored.store());
@@ -241,11 +241,11 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
     }
 
     /// The next output of the revisions.
-    fn next_output(&self) -> Output {
+    fn next_output(&self) -> RevisionOutput {
         let mut revisions = self.handle.revisions.borrow_mut();
         // Set while the store task runs.
         let Some(revisions) = revisions.as_mut() else {
-            return Output::Sleep { until: proto_core::time::Instant::NEVER };
+            return RevisionOutput::Sleep { until: proto_core::time::Instant::NEVER };
         };
         let before = revisions.last();
         let output = revisions.poll_output(now());
@@ -263,8 +263,8 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
         loop {
             let output = self.next_output();
             let (written, result) = match output {
-                Output::Sleep { until } => return DrainResult::Sleep { until },
-                Output::Store { revision: Revision { number, digest }, forget } => {
+                RevisionOutput::Sleep { until } => return DrainResult::Sleep { until },
+                RevisionOutput::Store { revision: Revision { number, digest }, forget } => {
                     let image = self.handle.image.borrow();
                     let image = image.get(..image_len).unwrap_or(&[]);
                     let written = self.stored.keep(number, digest, image, forget).await;
@@ -277,22 +277,22 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
                     let is_done = written.is_ok();
                     (written, Done::Stored(is_done))
                 }
-                Output::Mark { live, previous } => {
+                RevisionOutput::Mark { live, previous } => {
                     let written =
                         self.stored.make_live(live, (previous != NOTHING.number).then_some(previous)).await;
                     let is_done = written.is_ok();
                     (written, Done::Marked(is_done))
                 }
                 // The trial was not started; the same configuration still runs.
-                Output::Run { number } if self.is_running(number) => (Ok(()), Done::Started(true)),
-                Output::Run { number } => {
+                RevisionOutput::Run { number } if self.is_running(number) => (Ok(()), Done::Started(true)),
+                RevisionOutput::Run { number } => {
                     let (live, ended) = self.live_and_ended();
                     let written = match self.trial_s.take() {
                         Some(confirm_s) => self.stored.begin_trial(number, confirm_s).await,
                         None if number == live => {
                             // Starts of a trial are counted, so it ends even if this write fails.
                             if let Err(error) = self.stored.end_trial(ended).await {
-                                error!("the store: {}", Text(&error));
+                                error!("the store: {}", DisplayText(&error));
                             }
                             return DrainResult::Restart;
                         }
@@ -305,7 +305,7 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
                 }
             };
             if let Err(error) = written {
-                error!("the store: {}", Text(&error));
+                error!("the store: {}", DisplayText(&error));
                 failed.get_or_insert(error);
             }
             if let Some(revisions) = self.handle.revisions.borrow_mut().as_mut() {
@@ -319,13 +319,13 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
     }
 
     /// The live configuration, and how the last trial ended.
-    fn live_and_ended(&self) -> (u32, recipe_store::Ended) {
+    fn live_and_ended(&self) -> (u32, recipe_store::TrialEnd) {
         let revisions = self.handle.revisions.borrow();
         let revisions = revisions.as_ref();
         let ended = match revisions.and_then(Revisions::last) {
-            Some((_, Ended::NotConfirmed)) => recipe_store::Ended::NotConfirmed,
-            Some((_, Ended::TakenBack)) => recipe_store::Ended::TakenBack,
-            _ => recipe_store::Ended::Failed,
+            Some((_, Ended::NotConfirmed)) => recipe_store::TrialEnd::NotConfirmed,
+            Some((_, Ended::TakenBack)) => recipe_store::TrialEnd::TakenBack,
+            _ => recipe_store::TrialEnd::Failed,
         };
         (revisions.map_or(NOTHING.number, Revisions::live), ended)
     }
@@ -348,10 +348,10 @@ fn revisions_of(store: &Store) -> Option<Revisions> {
     let mut revisions = Revisions::new(stored)?;
     revisions.resume_last(marks.last.map(|(number, ended)| {
         let ended = match ended {
-            recipe_store::Ended::Confirmed => Ended::Confirmed,
-            recipe_store::Ended::NotConfirmed => Ended::NotConfirmed,
-            recipe_store::Ended::TakenBack => Ended::TakenBack,
-            recipe_store::Ended::Failed => Ended::Failed,
+            recipe_store::TrialEnd::Confirmed => Ended::Confirmed,
+            recipe_store::TrialEnd::NotConfirmed => Ended::NotConfirmed,
+            recipe_store::TrialEnd::TakenBack => Ended::TakenBack,
+            recipe_store::TrialEnd::Failed => Ended::Failed,
         };
         (number, ended)
     }));

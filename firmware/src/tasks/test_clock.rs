@@ -5,9 +5,9 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use embassy_time::{Duration, MockDriver};
 
 /// The only clock, for one test at a time; it starts at 0.
-pub(crate) struct Clock(#[allow(dead_code, reason = "held")] MutexGuard<'static, ()>);
+pub(crate) struct TestClock(#[allow(dead_code, reason = "held")] MutexGuard<'static, ()>);
 
-impl Clock {
+impl TestClock {
     /// Waits until no other test uses it.
     pub(crate) fn take() -> Self {
         static CLOCK: Mutex<()> = Mutex::new(());

@@ -13,20 +13,20 @@ use std::vec::Vec;
 pub(crate) struct Executor<'a> {
     tasks: Vec<(BoxedTask<'a>, Waker)>,
     woken: Arc<Mutex<Vec<usize>>>,
-    order: Order,
+    order: WakeOrder,
 }
 
 type BoxedTask<'a> = Pin<Box<dyn Future<Output = ()> + 'a>>;
 
 /// The order of the woken tasks, on which nothing may depend.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Order {
+pub(crate) enum WakeOrder {
     /// Embassy's order.
     LastFirst,
     FirstFirst,
 }
 
-impl Order {
+impl WakeOrder {
     pub(crate) const ALL: [Self; 2] = [Self::LastFirst, Self::FirstFirst];
 }
 
@@ -45,7 +45,7 @@ impl Wake for Task {
 }
 
 impl<'a> Executor<'a> {
-    pub(crate) fn new(order: Order) -> Self {
+    pub(crate) fn new(order: WakeOrder) -> Self {
         Self { tasks: Vec::new(), woken: Arc::default(), order }
     }
 
@@ -63,7 +63,7 @@ impl<'a> Executor<'a> {
     /// Runs each woken task once; returns whether there was one.
     pub(crate) fn round(&mut self) -> bool {
         let mut batch = core::mem::take(&mut *self.woken.lock().unwrap());
-        if self.order == Order::LastFirst {
+        if self.order == WakeOrder::LastFirst {
             batch.reverse();
         }
         for &index in &batch {

@@ -16,7 +16,7 @@ use recipe_sparkplug::sntp::{PACKET, Sntp};
 use super::link::resolve;
 use super::watchdog::Pulse;
 use crate::clock::now;
-use crate::fmt::Text;
+use crate::fmt::DisplayText;
 use crate::{info, warn};
 
 /// UTC, known after the first reply of a server.
@@ -97,7 +97,7 @@ pub async fn run(
                 }
                 Err(error) => {
                     if told.replace(error) != Some(error) {
-                        warn!("time server: {}", Text(&error));
+                        warn!("time server: {}", DisplayText(&error));
                     }
                     // Other hosts may send without limit.
                     if sntp.deadline() > at + LONG {

@@ -15,7 +15,7 @@ use embassy_sync::waitqueue::WakerRegistration;
 use embassy_time::{Duration, Timer};
 use proto_core::engine::{LinkKind, PortId};
 
-use crate::fmt::Text;
+use crate::fmt::DisplayText;
 use crate::{error, info};
 
 /// A task, by its name in the log.
@@ -193,12 +193,12 @@ impl Pulse {
 }
 
 /// The pulses of all tasks: at most `N`.
-pub struct Watch<const N: usize> {
+pub struct TaskWatch<const N: usize> {
     pulses: [Pulse; N],
     count: Cell<usize>,
 }
 
-impl<const N: usize> Watch<N> {
+impl<const N: usize> TaskWatch<N> {
     /// Without tasks.
     pub const fn new() -> Self {
         Self { pulses: [const { Pulse::new() }; N], count: Cell::new(0) }
@@ -214,14 +214,14 @@ impl<const N: usize> Watch<N> {
 
     /// Whether all have responded since the last round; then they are asked again. Each missing
     /// response is logged once, and once more when it comes.
-    fn round(&self, mut tell: impl FnMut(TaskName, Answer)) -> bool {
+    fn round(&self, mut tell: impl FnMut(TaskName, PulseFault)) -> bool {
         let registered = || self.pulses.iter().take(self.count.get());
         for pulse in registered() {
             let has_answered = pulse.has_answered.get();
             if pulse.is_suspect.replace(!has_answered) == has_answered
                 && let Some(name) = pulse.name.get()
             {
-                tell(name, if has_answered { Answer::Late } else { Answer::Missing });
+                tell(name, if has_answered { PulseFault::Late } else { PulseFault::Missing });
             }
         }
         let all = registered().all(|pulse| pulse.has_answered.get());
@@ -232,20 +232,20 @@ impl<const N: usize> Watch<N> {
     }
 }
 
-impl<const N: usize> Default for Watch<N> {
+impl<const N: usize> Default for TaskWatch<N> {
     fn default() -> Self {
         Self::new()
     }
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Answer {
+enum PulseFault {
     Missing,
     Late,
 }
 
 /// Feeds a watchdog with this `period` forever, four times per period while all tasks answer.
-pub async fn run<const N: usize>(watch: &Watch<N>, period: Duration, mut feed: impl FnMut()) -> ! {
+pub async fn run<const N: usize>(watch: &TaskWatch<N>, period: Duration, mut feed: impl FnMut()) -> ! {
     let quarter = period / 4;
     loop {
         Timer::after(quarter).await;
@@ -255,10 +255,12 @@ pub async fn run<const N: usize>(watch: &Watch<N>, period: Duration, mut feed: i
     }
 }
 
-fn log_answer(name: TaskName, answer: Answer) {
+fn log_answer(name: TaskName, answer: PulseFault) {
     match answer {
-        Answer::Missing => error!("task {} does not respond: the watchdog is not fed", Text(&name)),
-        Answer::Late => info!("task {} responds again", Text(&name)),
+        PulseFault::Missing => {
+            error!("task {} does not respond: the watchdog is not fed", DisplayText(&name))
+        }
+        PulseFault::Late => info!("task {} responds again", DisplayText(&name)),
     }
 }
 

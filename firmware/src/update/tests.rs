@@ -2,8 +2,8 @@ use std::vec;
 use std::vec::Vec;
 
 use embassy_futures::block_on;
-use recipe_store::{BLANK, Flash, Geometry, Place, SlotTrial, WORD, Word};
-use recipe_update::{Ended, Parts};
+use recipe_store::{BLANK, Flash, FlashWord, Geometry, SlotTrial, WORD, Word};
+use recipe_update::{ImageFacts, TrialEnd};
 
 use super::*;
 
@@ -21,7 +21,7 @@ struct Ram {
 }
 
 impl Ram {
-    fn at(place: Place) -> usize {
+    fn at(place: FlashWord) -> usize {
         usize::from(place.sector) * usize::from(WORDS) + usize::from(place.word)
     }
 }
@@ -31,11 +31,11 @@ impl Flash for Ram {
         Geometry { sectors: 3, words: WORDS }
     }
 
-    fn read(&self, place: Place) -> Word {
+    fn read(&self, place: FlashWord) -> Word {
         self.words[Self::at(place)]
     }
 
-    async fn write(&mut self, place: Place, word: &Word) {
+    async fn write(&mut self, place: FlashWord, word: &Word) {
         let at = Self::at(place);
         assert_eq!(self.words[at], BLANK, "written twice: {place:?}");
         if self.worn != Some(at) {
@@ -50,7 +50,7 @@ impl Flash for Ram {
 }
 
 impl SlotFlash for Ram {
-    fn whole(&self, place: Place) -> Option<Word> {
+    fn whole(&self, place: FlashWord) -> Option<Word> {
         Some(self.read(place))
     }
 }
@@ -71,7 +71,7 @@ fn image() -> Vec<u8> {
 }
 
 fn header(seed: &[u8; 32]) -> Header {
-    let parts = Parts {
+    let parts = ImageFacts {
         board: BoardName::parse("test").unwrap(),
         slot: Slot::B,
         version: VERSION,
@@ -167,9 +167,9 @@ fn what_is_wrong_is_refused_and_says_why() {
     let marks = SlotMarks { trial, ..GOOD_A };
     let head = header(&SEED).encode();
     let on_trial = block_on(updates.take(0, &head, None, marks, Downgrade::Refused));
-    assert_eq!(on_trial, Err(UpdateError::Rule(recipe_update::Refused::OnTrial)));
+    assert_eq!(on_trial, Err(UpdateError::Rule(recipe_update::UpdateRefused::OnTrial)));
     let kept = block_on(updates.take(0, &head, Some((FORMATS.oldest, 99)), GOOD_A, Downgrade::Refused));
-    assert!(matches!(kept, Err(UpdateError::Rule(recipe_update::Refused::Format { kept: 99, .. }))));
+    assert!(matches!(kept, Err(UpdateError::Rule(recipe_update::UpdateRefused::Format { kept: 99, .. }))));
     assert_eq!(updates.slots.as_ref().unwrap().free.erases, 0, "nothing was erased");
     assert_eq!(updates.ready(None, GOOD_A, Downgrade::Refused), Err(UpdateError::NotReady));
     // Changed on the way.
@@ -200,7 +200,7 @@ fn flash_that_keeps_nothing_is_noticed() {
     updates.slots.as_mut().unwrap().free.worn = Some(40);
     put(&mut updates, 0, &header(&SEED).encode()).unwrap();
     work(&mut updates);
-    let worn = UpdateError::Failed(ReceiveError::Worn(Place { sector: 0, word: 40 }));
+    let worn = UpdateError::Failed(ReceiveError::Worn(FlashWord { sector: 0, word: 40 }));
     assert_eq!(put(&mut updates, HEADER as u32, &image()), Err(worn));
     let received = stage(&updates).1;
     assert_eq!(put(&mut updates, received, &[1]), Err(worn));
@@ -221,7 +221,7 @@ fn during_a_trial_only_what_the_firmware_before_reads_is_kept() {
     work(&mut updates);
     send(&mut updates, 4_096).unwrap();
     let trial = Some(SlotTrial { slot: Slot::A, attempts: 1, confirm_s: 60, before: 0 });
-    let marks = SlotMarks { good: Some(Slot::B), trial, last: Some((Slot::A, Ended::Failed)) };
+    let marks = SlotMarks { good: Some(Slot::B), trial, last: Some((Slot::A, TrialEnd::Failed)) };
     assert_eq!(updates.may_keep(FORMATS.newest, marks), Ok(()));
     assert_eq!(updates.may_keep(FORMATS.newest + 1, marks), Err(UpdateError::Format(FORMATS.newest + 1)));
 }
@@ -233,16 +233,16 @@ fn a_trial_is_confirmed_once_all_is_as_before_for_ten_seconds() {
     assert_eq!(Works::of_code(before.code()), before);
     let mut trial = FirmwareTrial::new(at(0), 60, before);
     let none = Works::default();
-    assert_eq!(trial.look(at(1), none, true), Verdict::Waits(WaitsFor::Controller));
-    assert_eq!(trial.look(at(2), Works { ports: 0, ..before }, true), Verdict::Waits(WaitsFor::Ports));
-    assert_eq!(trial.look(at(3), before, false), Verdict::Waits(WaitsFor::Request));
-    assert_eq!(trial.look(at(4), before, true), Verdict::Waits(WaitsFor::Time));
-    assert_eq!(trial.look(at(13), before, true), Verdict::Waits(WaitsFor::Time));
+    assert_eq!(trial.look(at(1), none, true), TrialVerdict::Waits(WaitsFor::Controller));
+    assert_eq!(trial.look(at(2), Works { ports: 0, ..before }, true), TrialVerdict::Waits(WaitsFor::Ports));
+    assert_eq!(trial.look(at(3), before, false), TrialVerdict::Waits(WaitsFor::Request));
+    assert_eq!(trial.look(at(4), before, true), TrialVerdict::Waits(WaitsFor::Time));
+    assert_eq!(trial.look(at(13), before, true), TrialVerdict::Waits(WaitsFor::Time));
     // Once more from the beginning.
-    assert_eq!(trial.look(at(14), none, true), Verdict::Waits(WaitsFor::Controller));
-    assert_eq!(trial.look(at(15), before, true), Verdict::Waits(WaitsFor::Time));
-    assert_eq!(trial.look(at(25), Works { ports: 3, ..before }, true), Verdict::Confirmed);
+    assert_eq!(trial.look(at(14), none, true), TrialVerdict::Waits(WaitsFor::Controller));
+    assert_eq!(trial.look(at(15), before, true), TrialVerdict::Waits(WaitsFor::Time));
+    assert_eq!(trial.look(at(25), Works { ports: 3, ..before }, true), TrialVerdict::Confirmed);
     let mut trial = FirmwareTrial::new(at(0), 60, before);
-    assert_eq!(trial.look(at(59), none, true), Verdict::Waits(WaitsFor::Controller));
-    assert_eq!(trial.look(at(60), none, true), Verdict::Over);
+    assert_eq!(trial.look(at(59), none, true), TrialVerdict::Waits(WaitsFor::Controller));
+    assert_eq!(trial.look(at(60), none, true), TrialVerdict::Over);
 }

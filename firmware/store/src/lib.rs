@@ -71,11 +71,11 @@ mod values;
 
 use core::future::Future;
 
-pub use mount::{Found, MountError, Store};
-pub use put::{Put, PutError, Step};
-pub use record::{COUNTERS, Key, MAX_DATA, VERSION};
+pub use mount::{FoundRecord, MountError, Store};
+pub use put::{Put, PutError, PutStep};
+pub use record::{COUNTERS, MAX_DATA, RecordKey, VERSION};
 pub use relocate::{Move, Newest, Side, newest};
-pub use revisions::{Adoption, Ended, KeepError, MAX_REVISIONS, Marks, Revision, Role, Start, Trial};
+pub use revisions::{Adoption, KeepError, MAX_REVISIONS, Marks, Revision, Role, Start, Trial, TrialEnd};
 pub use slots::{Slot, SlotMarks, SlotTrial};
 
 /// Number of bytes of a [`Word`].
@@ -87,7 +87,7 @@ pub const BLANK: Word = [0xFF; WORD];
 
 /// A word of the flash.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Place {
+pub struct FlashWord {
     /// Index of the sector, from 0. Sectors need not be adjacent.
     pub sector: u8,
     /// Index of the word in the sector, from 0.
@@ -113,10 +113,10 @@ pub trait Flash {
 
     /// The bytes of a word; zeros if it cannot be read, because it was torn by a power cut. It never fails: an
     /// error at one word would make all others unreachable.
-    fn read(&self, place: Place) -> Word;
+    fn read(&self, place: FlashWord) -> Word;
 
     /// Writes a word that was not written since its sector was erased.
-    fn write(&mut self, place: Place, word: &Word) -> impl Future<Output = ()>;
+    fn write(&mut self, place: FlashWord, word: &Word) -> impl Future<Output = ()>;
 
     /// Erases a sector.
     fn erase(&mut self, sector: u8) -> impl Future<Output = ()>;

@@ -2,8 +2,8 @@
 
 use core::fmt;
 
-use crate::record::{Head, KEYS, Key, SectorHead, digest};
-use crate::{BLANK, Flash, Geometry, Place, WORD, Word};
+use crate::record::{KEYS, RecordHead, RecordKey, SectorHead, digest};
+use crate::{BLANK, Flash, FlashWord, Geometry, WORD, Word};
 
 /// The newest record of each key, and where the next record goes.
 #[derive(Debug, Clone)]
@@ -15,14 +15,14 @@ pub struct Store {
     pub(crate) end: u16,
     /// Sequence number of the next record.
     pub(crate) sequence: u32,
-    index: [Option<Found>; KEYS],
+    index: [Option<FoundRecord>; KEYS],
 }
 
 /// A record.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Found {
+pub struct FoundRecord {
     /// First word of the data, `len` bytes long. Valid until the next change of the store.
-    pub data: Place,
+    pub data: FlashWord,
     /// Length of the data in bytes.
     pub len: usize,
     /// Value stored in the head.
@@ -90,7 +90,7 @@ impl Store {
     fn begun_next(&self, flash: &impl Flash) -> Result<Option<(u8, u32)>, MountError> {
         let mut next: Option<(u8, u32)> = None;
         for sector in 0..self.geometry.sectors {
-            match SectorHead::parse(&flash.read(Place { sector, word: 0 })) {
+            match SectorHead::parse(&flash.read(FlashWord { sector, word: 0 })) {
                 Some(SectorHead::Known { sequence }) => {
                     let is_later = self.head.is_none_or(|(_, head)| sequence > head);
                     if is_later && next.is_none_or(|(_, next)| sequence < next) {
@@ -108,9 +108,9 @@ impl Store {
     fn walk(&mut self, flash: &impl Flash, sector: u8) -> u16 {
         let (mut word, mut end) = (1, 1);
         while word < self.geometry.words {
-            let place = Place { sector, word };
+            let place = FlashWord { sector, word };
             let bytes = flash.read(place);
-            let head = Head::parse(&bytes).filter(|head| self.has_room(word, head.extent()));
+            let head = RecordHead::parse(&bytes).filter(|head| self.has_room(word, head.extent()));
             if let Some(head) = head {
                 if is_whole(flash, place, &head) {
                     self.sequence = self.sequence.max(head.sequence.saturating_add(1));
@@ -138,10 +138,10 @@ impl Store {
     }
 
     /// Makes the record at this place the newest of its key.
-    pub(crate) fn enter(&mut self, Place { sector, word }: Place, head: &Head) {
+    pub(crate) fn enter(&mut self, FlashWord { sector, word }: FlashWord, head: &RecordHead) {
         if let Some(entry) = self.index.get_mut(usize::from(head.key)) {
-            *entry = Some(Found {
-                data: Place { sector, word: word.saturating_add(1) },
+            *entry = Some(FoundRecord {
+                data: FlashWord { sector, word: word.saturating_add(1) },
                 len: head.len as usize,
                 tag: head.tag,
                 sequence: head.sequence,
@@ -150,24 +150,24 @@ impl Store {
     }
 
     /// The newest record of the key with this code.
-    pub(crate) fn entry(&self, code: u8) -> Option<Found> {
+    pub(crate) fn entry(&self, code: u8) -> Option<FoundRecord> {
         self.index.get(usize::from(code)).copied().flatten()
     }
 
     /// The same record, copied to begin at this place.
-    pub(crate) fn moved(&mut self, code: u8, Place { sector, word }: Place) {
+    pub(crate) fn moved(&mut self, code: u8, FlashWord { sector, word }: FlashWord) {
         if let Some(Some(found)) = self.index.get_mut(usize::from(code)) {
-            found.data = Place { sector, word: word.saturating_add(1) };
+            found.data = FlashWord { sector, word: word.saturating_add(1) };
         }
     }
 
     /// The newest record of a key.
-    pub fn find(&self, key: Key) -> Option<Found> {
+    pub fn find(&self, key: RecordKey) -> Option<FoundRecord> {
         self.entry(key.code()?)
     }
 
     /// Copies its data to the beginning of `out`; `None` if there is no record or `out` is too short.
-    pub fn get<'o>(&self, flash: &impl Flash, key: Key, out: &'o mut [u8]) -> Option<&'o [u8]> {
+    pub fn get<'o>(&self, flash: &impl Flash, key: RecordKey, out: &'o mut [u8]) -> Option<&'o [u8]> {
         let found = self.find(key)?;
         let out = out.get_mut(..found.len)?;
         let mut place = found.data;
@@ -191,12 +191,12 @@ impl Store {
 }
 
 /// Whether data and end match the head.
-pub(crate) fn is_whole(flash: &impl Flash, Place { sector, word }: Place, head: &Head) -> bool {
+pub(crate) fn is_whole(flash: &impl Flash, FlashWord { sector, word }: FlashWord, head: &RecordHead) -> bool {
     let mut digest = digest();
     let end = word.saturating_add(head.extent()).saturating_sub(1);
     for word in word.saturating_add(1)..end {
-        digest.update(&flash.read(Place { sector, word }));
+        digest.update(&flash.read(FlashWord { sector, word }));
     }
-    let at_end: Word = flash.read(Place { sector, word: end });
+    let at_end: Word = flash.read(FlashWord { sector, word: end });
     at_end == head.word() && digest.finalize() == head.sum
 }

@@ -8,8 +8,8 @@
 use core::fmt;
 
 use crate::mount::is_whole;
-use crate::record::{Head, KEYS, MAX_DATA, SectorHead, part, sum};
-use crate::{BLANK, Flash, Found, Key, Place, Store, Word};
+use crate::record::{KEYS, MAX_DATA, RecordHead, SectorHead, part, sum};
+use crate::{BLANK, Flash, FlashWord, FoundRecord, RecordKey, Store, Word};
 
 /// A record being written. Dropped before its end, it leaves either the old or the new record. A flash operation that
 /// was begun must end before the next one.
@@ -24,7 +24,7 @@ pub struct Put<'s, 'd> {
 /// State of writing a record.
 #[derive(Debug)]
 pub(crate) struct Work {
-    head: Head,
+    head: RecordHead,
     phase: PutPhase,
     writing: WordWriter,
     /// Next free word of the sector that is the target of copying.
@@ -41,11 +41,11 @@ pub(crate) struct Work {
 
 /// The next step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Step {
+pub enum PutStep {
     /// Erase this sector.
     Erase(u8),
     /// Write a word.
-    Write(Place, Word),
+    Write(FlashWord, Word),
     /// The end. Until a put has ended without an error the old record is valid, afterwards the new one.
     End(Result<(), PutError>),
 }
@@ -110,8 +110,8 @@ enum PutPhase {
     },
     Copying {
         key: u8,
-        head: Head,
-        from: Found,
+        head: RecordHead,
+        from: FoundRecord,
     },
     Begin,
     Begun,
@@ -129,7 +129,7 @@ enum WordWriter {
 
 /// Result of one step of writing a record.
 enum WriteProgress {
-    Step(Step),
+    Step(PutStep),
     /// The record begins here.
     At(u16),
     Full,
@@ -139,15 +139,15 @@ enum WriteProgress {
 /// Source of a record's data.
 pub(crate) enum RecordSource<'d, F> {
     Bytes(&'d [u8]),
-    Flash(&'d F, Found),
+    Flash(&'d F, FoundRecord),
 }
 
 impl<F: Flash> RecordSource<'_, F> {
     fn part(&self, nth: u16) -> Word {
         match self {
             Self::Bytes(data) => part(data, nth),
-            Self::Flash(flash, Found { data: Place { sector, word }, .. }) => {
-                flash.read(Place { sector: *sector, word: word.saturating_add(nth) })
+            Self::Flash(flash, FoundRecord { data: FlashWord { sector, word }, .. }) => {
+                flash.read(FlashWord { sector: *sector, word: word.saturating_add(nth) })
             }
         }
     }
@@ -167,14 +167,14 @@ impl Store {
     ///
     /// # Errors
     /// It cannot be written; the previous value remains.
-    pub fn put<'d>(&mut self, key: Key, tag: u64, data: &'d [u8]) -> Result<Put<'_, 'd>, PutError> {
+    pub fn put<'d>(&mut self, key: RecordKey, tag: u64, data: &'d [u8]) -> Result<Put<'_, 'd>, PutError> {
         let code = key.code().ok_or(PutError::Key)?;
         let too_long = PutError::TooLong { len: data.len() };
         let len = u32::try_from(data.len()).map_err(|_| too_long)?;
         if data.len() > MAX_DATA {
             return Err(too_long);
         }
-        let head = Head { key: code, sequence: self.sequence, len, tag, sum: sum(data) };
+        let head = RecordHead { key: code, sequence: self.sequence, len, tag, sum: sum(data) };
         let work = self.begin(head)?;
         // Even if it fails: its words may later be read as a record.
         self.sequence = self.sequence.saturating_add(1);
@@ -182,7 +182,7 @@ impl Store {
     }
 
     /// Plans writing the record with this head, if there is space.
-    pub(crate) fn begin(&self, head: Head) -> Result<Work, PutError> {
+    pub(crate) fn begin(&self, head: RecordHead) -> Result<Work, PutError> {
         let (used, available) = self.used(head.extent());
         if used > available {
             return Err(PutError::Full { used, available });
@@ -201,8 +201,8 @@ impl Store {
 }
 
 impl Put<'_, '_> {
-    /// Returns the next step; called again when that is done, until [`Step::End`].
-    pub fn next<F: Flash>(&mut self, flash: &F) -> Step {
+    /// Returns the next step; called again when that is done, until [`PutStep::End`].
+    pub fn next<F: Flash>(&mut self, flash: &F) -> PutStep {
         self.work.next(self.store, &RecordSource::<F>::Bytes(self.data), flash)
     }
 
@@ -213,9 +213,9 @@ impl Put<'_, '_> {
     pub async fn execute(mut self, flash: &mut impl Flash) -> Result<(), PutError> {
         loop {
             match self.next(flash) {
-                Step::Erase(sector) => flash.erase(sector).await,
-                Step::Write(place, word) => flash.write(place, &word).await,
-                Step::End(result) => return result,
+                PutStep::Erase(sector) => flash.erase(sector).await,
+                PutStep::Write(place, word) => flash.write(place, &word).await,
+                PutStep::End(result) => return result,
             }
         }
     }
@@ -233,7 +233,7 @@ impl Work {
         store: &mut Store,
         source: &RecordSource<'_, impl Flash>,
         flash: &F,
-    ) -> Step {
+    ) -> PutStep {
         loop {
             match self.phase {
                 PutPhase::Place => self.find_place(store),
@@ -243,7 +243,7 @@ impl Work {
                         WriteProgress::Step(step) => return step,
                         WriteProgress::At(word) => {
                             if let Some((sector, _)) = store.head {
-                                store.enter(Place { sector, word }, &head);
+                                store.enter(FlashWord { sector, word }, &head);
                             }
                             self.phase = PutPhase::End(Ok(()));
                         }
@@ -253,7 +253,7 @@ impl Work {
                 }
                 PutPhase::Erase { tries } => {
                     self.phase = PutPhase::Erased { tries: tries.saturating_sub(1) };
-                    return Step::Erase(next_sector(store));
+                    return PutStep::Erase(next_sector(store));
                 }
                 PutPhase::Erased { tries } => {
                     let sector = next_sector(store);
@@ -281,12 +281,12 @@ impl Work {
                     }
                 }
                 PutPhase::Begin => {
-                    let place = Place { sector: next_sector(store), word: 0 };
+                    let place = FlashWord { sector: next_sector(store), word: 0 };
                     self.phase = PutPhase::Begun;
-                    return Step::Write(place, SectorHead::word(next_sequence(store)));
+                    return PutStep::Write(place, SectorHead::word(next_sequence(store)));
                 }
                 PutPhase::Begun => self.begun(store, flash),
-                PutPhase::End(result) => return Step::End(result),
+                PutPhase::End(result) => return PutStep::End(result),
             }
         }
     }
@@ -324,7 +324,7 @@ impl Work {
     /// Makes the new sector the current one if its head can be read.
     fn begun(&mut self, store: &mut Store, flash: &impl Flash) {
         let (sector, sequence) = (next_sector(store), next_sequence(store));
-        if flash.read(Place { sector, word: 0 }) != SectorHead::word(sequence) {
+        if flash.read(FlashWord { sector, word: 0 }) != SectorHead::word(sequence) {
             self.phase = PutPhase::End(Err(PutError::Sector(sector)));
             return;
         }
@@ -332,7 +332,7 @@ impl Work {
         store.end = self.fill;
         for (key, word) in (0..).zip(self.copies) {
             if word != 0 {
-                store.moved(key, Place { sector, word });
+                store.moved(key, FlashWord { sector, word });
             }
         }
         self.phase = PutPhase::Place;
@@ -343,7 +343,7 @@ impl Work {
         &mut self,
         store: &mut Store,
         flash: &impl Flash,
-        head: &Head,
+        head: &RecordHead,
         source: &RecordSource<'_, impl Flash>,
         into: PutTarget,
     ) -> WriteProgress {
@@ -360,11 +360,14 @@ impl Work {
                     }
                     self.set_end(store, into, free.saturating_add(1));
                     self.writing = WordWriter::CheckHead { at: free };
-                    return WriteProgress::Step(Step::Write(Place { sector, word: free }, head.word()));
+                    return WriteProgress::Step(PutStep::Write(
+                        FlashWord { sector, word: free },
+                        head.word(),
+                    ));
                 }
                 // Data only after a readable head, or it could be taken for records.
                 WordWriter::CheckHead { at } => {
-                    if flash.read(Place { sector, word: at }) == head.word() {
+                    if flash.read(FlashWord { sector, word: at }) == head.word() {
                         self.set_end(store, into, at.saturating_add(head.extent()));
                         self.writing = WordWriter::Data { at, nth: 0 };
                     } else if !self.again() {
@@ -372,16 +375,16 @@ impl Work {
                     }
                 }
                 WordWriter::Data { at, nth } => {
-                    let place = Place { sector, word: at.saturating_add(1).saturating_add(nth) };
+                    let place = FlashWord { sector, word: at.saturating_add(1).saturating_add(nth) };
                     if nth < head.extent().saturating_sub(2) {
                         self.writing = WordWriter::Data { at, nth: nth.saturating_add(1) };
-                        return WriteProgress::Step(Step::Write(place, source.part(nth)));
+                        return WriteProgress::Step(PutStep::Write(place, source.part(nth)));
                     }
                     self.writing = WordWriter::Check { at };
-                    return WriteProgress::Step(Step::Write(place, head.word()));
+                    return WriteProgress::Step(PutStep::Write(place, head.word()));
                 }
                 WordWriter::Check { at } => {
-                    let place = Place { sector, word: at };
+                    let place = FlashWord { sector, word: at };
                     if flash.read(place) == head.word() && is_whole(flash, place, head) {
                         return WriteProgress::At(at);
                     }
@@ -408,13 +411,13 @@ impl Work {
 
 /// Whether all words of a sector look blank.
 pub(crate) fn is_blank(flash: &impl Flash, sector: u8) -> bool {
-    (0..flash.geometry().words).all(|word| flash.read(Place { sector, word }) == BLANK)
+    (0..flash.geometry().words).all(|word| flash.read(FlashWord { sector, word }) == BLANK)
 }
 
 /// The head of a record.
-pub(crate) fn head_of(flash: &impl Flash, found: Found) -> Option<Head> {
-    let word = Place { word: found.data.word.saturating_sub(1), ..found.data };
-    Head::parse(&flash.read(word))
+pub(crate) fn head_of(flash: &impl Flash, found: FoundRecord) -> Option<RecordHead> {
+    let word = FlashWord { word: found.data.word.saturating_sub(1), ..found.data };
+    RecordHead::parse(&flash.read(word))
 }
 
 /// The next sector of the ring.

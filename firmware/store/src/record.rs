@@ -21,7 +21,7 @@ const RECORD_MAGIC: [u8; 4] = *b"RGSr";
 
 /// Key of a record. The newest record of a key replaces earlier ones.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Key {
+pub enum RecordKey {
     /// A configuration image, in one of eight places.
     Image(u8),
     /// Marks: which images are live, previous and on trial.
@@ -42,7 +42,7 @@ pub enum Key {
     Generation,
 }
 
-impl Key {
+impl RecordKey {
     /// Below [`KEYS`]; `None` if the number of the image or counter is too high.
     pub(crate) const fn code(self) -> Option<u8> {
         match self {
@@ -62,7 +62,7 @@ impl Key {
 
 /// The head of a record.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Head {
+pub(crate) struct RecordHead {
     /// Code of the key.
     pub(crate) key: u8,
     /// Higher than that of all records written before; a copy keeps it.
@@ -75,7 +75,7 @@ pub(crate) struct Head {
     pub(crate) sum: u32,
 }
 
-impl Head {
+impl RecordHead {
     /// The head in a word; `None` if it is not one.
     pub(crate) fn parse(word: &Word) -> Option<Self> {
         let (words, _) = word.as_chunks::<4>();

@@ -6,8 +6,8 @@
 
 use crate::mount::MountError;
 use crate::put::{RecordSource, Work, head_of, is_blank};
-use crate::record::{Head, KEYS, sum};
-use crate::{Flash, Found, Key, PutError, Step, Store};
+use crate::record::{KEYS, RecordHead, sum};
+use crate::{Flash, FoundRecord, PutError, PutStep, RecordKey, Store};
 
 /// One of two places.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -68,7 +68,7 @@ enum RelocatePhase {
     Key(u8),
     Copying {
         key: u8,
-        from: Found,
+        from: FoundRecord,
         work: Work,
     },
     Generation(Work),
@@ -78,7 +78,7 @@ enum RelocatePhase {
 impl Store {
     /// Write the number of moves.
     pub fn generation(&self) -> u64 {
-        self.find(Key::Generation).map_or(0, |found| found.tag)
+        self.find(RecordKey::Generation).map_or(0, |found| found.tag)
     }
 
     /// Begins a move to another place of the same size. Changes made to the store before the end of the move are lost.
@@ -89,14 +89,14 @@ impl Store {
 }
 
 impl Move<'_> {
-    /// Returns the next step for the new place; called again when that is done, until [`Step::End`].
-    pub fn next<F: Flash>(&mut self, from: &impl Flash, to: &F) -> Step {
+    /// Returns the next step for the new place; called again when that is done, until [`PutStep::End`].
+    pub fn next<F: Flash>(&mut self, from: &impl Flash, to: &F) -> PutStep {
         loop {
             match &mut self.phase {
                 RelocatePhase::Erase { sector, tries } => {
                     let (sector, tries) = (*sector, tries.saturating_sub(1));
                     self.phase = RelocatePhase::Erased { sector, tries };
-                    return Step::Erase(sector);
+                    return PutStep::Erase(sector);
                 }
                 RelocatePhase::Erased { sector, tries } => {
                     let (sector, tries) = (*sector, *tries);
@@ -121,39 +121,39 @@ impl Move<'_> {
                 }
                 RelocatePhase::Copying { key, from: found, work } => {
                     match work.next(&mut self.to, &RecordSource::Flash(from, *found), to) {
-                        Step::End(Ok(())) => self.phase = RelocatePhase::Key(key.saturating_add(1)),
-                        Step::End(Err(error)) => self.phase = RelocatePhase::End(Err(error)),
+                        PutStep::End(Ok(())) => self.phase = RelocatePhase::Key(key.saturating_add(1)),
+                        PutStep::End(Err(error)) => self.phase = RelocatePhase::End(Err(error)),
                         step => return step,
                     }
                 }
                 RelocatePhase::Generation(work) => {
                     match work.next(&mut self.to, &RecordSource::<F>::Bytes(&[]), to) {
-                        Step::End(result) => self.phase = RelocatePhase::End(result),
+                        PutStep::End(result) => self.phase = RelocatePhase::End(result),
                         step => return step,
                     }
                 }
-                RelocatePhase::End(result) => return Step::End(*result),
+                RelocatePhase::End(result) => return PutStep::End(*result),
             }
         }
     }
 
     /// The first record from this key on, or the number of the move behind all others.
     fn record(&mut self, from: &impl Flash, first: u8) -> Result<RelocatePhase, PutError> {
-        let is_copied = |key: &u8| Key::Generation.code() != Some(*key);
+        let is_copied = |key: &u8| RecordKey::Generation.code() != Some(*key);
         let found = (first..KEYS as u8).filter(is_copied).find_map(|key| Some((key, self.from.entry(key)?)));
         if let Some((key, found)) = found {
             // The record was valid at mount and has not changed.
             let head = head_of(from, found).ok_or(PutError::Worn)?;
             return Ok(RelocatePhase::Copying { key, from: found, work: self.to.begin(head)?.in_erased() });
         }
-        let key = Key::Generation.code().ok_or(PutError::Key)?;
+        let key = RecordKey::Generation.code().ok_or(PutError::Key)?;
         let tag = self.from.generation().saturating_add(1);
-        let head = Head { key, sequence: self.to.sequence, len: 0, tag, sum: sum(&[]) };
+        let head = RecordHead { key, sequence: self.to.sequence, len: 0, tag, sum: sum(&[]) };
         self.to.sequence = self.to.sequence.saturating_add(1);
         Ok(RelocatePhase::Generation(self.to.begin(head)?.in_erased()))
     }
 
-    /// The store in its new place, after [`Step::End`] without an error; `None` otherwise.
+    /// The store in its new place, after [`PutStep::End`] without an error; `None` otherwise.
     pub fn moved(self) -> Option<Store> {
         matches!(self.phase, RelocatePhase::End(Ok(()))).then_some(self.to)
     }
@@ -165,10 +165,10 @@ impl Move<'_> {
     pub async fn execute(mut self, from: &impl Flash, to: &mut impl Flash) -> Result<Store, PutError> {
         loop {
             match self.next(from, to) {
-                Step::Erase(sector) => to.erase(sector).await,
-                Step::Write(place, word) => to.write(place, &word).await,
-                Step::End(Ok(())) => return self.moved().ok_or(PutError::Worn),
-                Step::End(Err(error)) => return Err(error),
+                PutStep::Erase(sector) => to.erase(sector).await,
+                PutStep::Write(place, word) => to.write(place, &word).await,
+                PutStep::End(Ok(())) => return self.moved().ok_or(PutError::Worn),
+                PutStep::End(Err(error)) => return Err(error),
             }
         }
     }

@@ -2,7 +2,7 @@
 
 use core::fmt;
 
-use crate::{Flash, Key, Put, PutError, Store};
+use crate::{Flash, Put, PutError, RecordKey, Store};
 
 /// Maximum number of stored configurations.
 pub const MAX_REVISIONS: usize = 8;
@@ -21,8 +21,8 @@ pub struct Revision {
 
 impl Revision {
     /// The key of its image.
-    pub fn key(&self) -> Key {
-        Key::Image(self.slot)
+    pub fn key(&self) -> RecordKey {
+        RecordKey::Image(self.slot)
     }
 }
 
@@ -36,7 +36,7 @@ pub struct Marks {
     /// The one on trial.
     pub trial: Option<Trial>,
     /// Number of the configuration whose trial ended last, and how.
-    pub last: Option<(u32, Ended)>,
+    pub last: Option<(u32, TrialEnd)>,
 }
 
 impl Marks {
@@ -49,7 +49,7 @@ impl Marks {
 
 /// How a trial ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Ended {
+pub enum TrialEnd {
     /// It was confirmed.
     Confirmed,
     /// Nobody confirmed it in time.
@@ -60,7 +60,7 @@ pub enum Ended {
     Failed,
 }
 
-impl Ended {
+impl TrialEnd {
     const ALL: [Self; 4] = [Self::Confirmed, Self::NotConfirmed, Self::TakenBack, Self::Failed];
 
     /// Never 0.
@@ -170,7 +170,7 @@ impl Store {
 
     fn in_slot(&self, slot: u8) -> Option<Revision> {
         // An empty record without a number marks a forgotten image.
-        let found = self.find(Key::Image(slot)).filter(|found| found.len > 0 || found.tag != 0)?;
+        let found = self.find(RecordKey::Image(slot)).filter(|found| found.len > 0 || found.tag != 0)?;
         let [a, b, c, d, e, f, g, h] = found.tag.to_le_bytes();
         let number = u32::from_le_bytes([a, b, c, d]);
         let digest = u32::from_le_bytes([e, f, g, h]);
@@ -191,7 +191,7 @@ impl Store {
 
     /// Marks of the configurations.
     pub fn marks(&self) -> Marks {
-        let Some(found) = self.find(Key::Marks) else { return Marks::default() };
+        let Some(found) = self.find(RecordKey::Marks) else { return Marks::default() };
         let [live, previous, trial, attempts, low, high, last, ended] = found.tag.to_le_bytes();
         let number = |slot: u8| self.in_slot(slot).map(|revision| revision.number);
         let confirm_s = u16::from_le_bytes([low, high]);
@@ -199,7 +199,7 @@ impl Store {
             live: number(live),
             previous: number(previous),
             trial: number(trial).map(|number| Trial { number, attempts, confirm_s }),
-            last: number(last).zip(Ended::of_code(ended)),
+            last: number(last).zip(TrialEnd::of_code(ended)),
         }
     }
 
@@ -221,7 +221,7 @@ impl Store {
         let ended = marks.last.map_or(0, |(_, ended)| ended.code());
         let [low, high] = confirm_s.to_le_bytes();
         let tag = u64::from_le_bytes([live, previous, trial, attempts, low, high, ended_slot, ended]);
-        Ok(self.put(Key::Marks, tag, &[])?)
+        Ok(self.put(RecordKey::Marks, tag, &[])?)
     }
 
     /// Stores a configuration in the place of `forget`; if that is `None`, in a free place or that of the oldest
@@ -250,7 +250,7 @@ impl Store {
             None => free.or_else(oldest).ok_or(KeepError::Needed { number })?,
         };
         let tag = u64::from(digest) << 32 | u64::from(number);
-        Ok(self.put(Key::Image(slot), tag, image)?)
+        Ok(self.put(RecordKey::Image(slot), tag, image)?)
     }
 
     /// Forgets a configuration to free its space: `number`, or the oldest unmarked one. `None` if there is none.
@@ -267,7 +267,7 @@ impl Store {
             None => revisions.into_iter().find(|kept| !is_needed(kept.number)),
         };
         let Some(Revision { slot, .. }) = slot else { return Ok(None) };
-        Ok(Some(self.put(Key::Image(slot), 0, &[])?))
+        Ok(Some(self.put(RecordKey::Image(slot), 0, &[])?))
     }
 
     /// Candidates at a start: the configuration on trial while it has starts left, the live one, the previous one.
@@ -276,7 +276,7 @@ impl Store {
         let mut start = Start { marks: None, candidates: heapless::Vec::new() };
         if let Some(trial) = marks.trial {
             let left = trial.attempts.checked_sub(1);
-            let last = if left.is_some() { marks.last } else { Some((trial.number, Ended::Failed)) };
+            let last = if left.is_some() { marks.last } else { Some((trial.number, TrialEnd::Failed)) };
             let trial_left = left.map(|attempts| Trial { attempts, ..trial });
             start.marks = Some(Marks { trial: trial_left, last, ..marks });
             if let Some(revision) = self.revision(trial.number).filter(|_| left.is_some()) {
@@ -311,12 +311,12 @@ impl Store {
             let marks = Marks { live: Some(same), previous: marks.live, trial: None, last: marks.last };
             return Ok(Adoption::Write(self.mark(marks)?));
         }
-        Ok(Adoption::Write(self.put(Key::Adopted, adopted(digest, image.len()), &[])?))
+        Ok(Adoption::Write(self.put(RecordKey::Adopted, adopted(digest, image.len()), &[])?))
     }
 
     /// Whether this is the image that was adopted last.
     pub fn is_adopted(&self, digest: u32, len: usize) -> bool {
-        self.find(Key::Adopted).is_some_and(|found| found.tag == adopted(digest, len))
+        self.find(RecordKey::Adopted).is_some_and(|found| found.tag == adopted(digest, len))
     }
 }
 

@@ -1,7 +1,7 @@
 //! Slots: which of the two places of the firmware is good, and which one is on trial (docs/update.md).
 
-use crate::revisions::Ended;
-use crate::{Key, Put, PutError, Store};
+use crate::revisions::TrialEnd;
+use crate::{Put, PutError, RecordKey, Store};
 
 /// Place of a firmware. Each image is linked for one slot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -46,7 +46,7 @@ pub struct SlotMarks {
     /// The one on trial.
     pub trial: Option<SlotTrial>,
     /// The slot whose trial ended last, and how.
-    pub last: Option<(Slot, Ended)>,
+    pub last: Option<(Slot, TrialEnd)>,
 }
 
 /// A trial of a firmware.
@@ -65,13 +65,13 @@ pub struct SlotTrial {
 impl Store {
     /// Marks of the slots; empty if never written.
     pub fn slots(&self) -> SlotMarks {
-        let Some(found) = self.find(Key::Slots) else { return SlotMarks::default() };
+        let Some(found) = self.find(RecordKey::Slots) else { return SlotMarks::default() };
         let [good, trial, attempts, low, high, last, ended, before] = found.tag.to_le_bytes();
         let confirm_s = u16::from_le_bytes([low, high]);
         SlotMarks {
             good: Slot::of_number(good),
             trial: Slot::of_number(trial).map(|slot| SlotTrial { slot, attempts, confirm_s, before }),
-            last: Slot::of_number(last).zip(Ended::of_code(ended)),
+            last: Slot::of_number(last).zip(TrialEnd::of_code(ended)),
         }
     }
 
@@ -88,7 +88,7 @@ impl Store {
         let last = number(marks.last.map(|(slot, _)| slot));
         let ended = marks.last.map_or(0, |(_, ended)| ended.code());
         let tag = [number(marks.good), trial, attempts, low, high, last, ended, before];
-        self.put(Key::Slots, u64::from_le_bytes(tag), &[])
+        self.put(RecordKey::Slots, u64::from_le_bytes(tag), &[])
     }
 }
 

@@ -2,7 +2,7 @@
 
 use core::fmt;
 
-use recipe_store::{Ended, Slot, SlotMarks, SlotTrial};
+use recipe_store::{Slot, SlotMarks, SlotTrial, TrialEnd};
 
 use crate::SlotFlash;
 use crate::check::{BadImage, Check, header};
@@ -83,7 +83,7 @@ fn on_trial(
     key: &PublicKey,
 ) -> Option<Chosen> {
     let slot = trial.slot;
-    let failed = SlotMarks { trial: None, last: Some((slot, Ended::Failed)), ..*now };
+    let failed = SlotMarks { trial: None, last: Some((slot, TrialEnd::Failed)), ..*now };
     let Some(attempts) = trial.attempts.checked_sub(1) else {
         machine.passed_over(slot, &"it has used up its starts");
         machine.mark(failed);
@@ -138,12 +138,12 @@ pub fn begin_trial(marks: SlotMarks, slot: Slot, confirm_s: u16, before: u8) -> 
 /// The marks after the firmware in this slot was confirmed; `None` if it is not on trial.
 pub fn confirm(marks: SlotMarks, running: Slot) -> Option<SlotMarks> {
     marks.trial.filter(|trial| trial.slot == running)?;
-    Some(SlotMarks { good: Some(running), trial: None, last: Some((running, Ended::Confirmed)) })
+    Some(SlotMarks { good: Some(running), trial: None, last: Some((running, TrialEnd::Confirmed)) })
 }
 
 /// The marks after a trial has ended in another way: the next start runs the good slot. `None` if nothing is on
 /// trial.
-pub fn end_trial(marks: SlotMarks, ended: Ended) -> Option<SlotMarks> {
+pub fn end_trial(marks: SlotMarks, ended: TrialEnd) -> Option<SlotMarks> {
     let trial = marks.trial?;
     Some(SlotMarks { trial: None, last: Some((trial.slot, ended)), ..marks })
 }

@@ -3,7 +3,7 @@
 use core::fmt;
 
 use crc::Digest;
-use recipe_store::{Place, Slot, WORD};
+use recipe_store::{FlashWord, Slot, WORD};
 use salty::Sha512;
 
 use crate::header::{BoardName, CRC, Foreign, HEADER, Header, HeaderError, IMAGE_OFFSET};
@@ -27,7 +27,7 @@ pub enum BadImage {
         room: u32,
     },
     /// A word cannot be read.
-    Torn(Place),
+    Torn(FlashWord),
     /// A bit has changed since it was written.
     Crc,
     /// The image is not the one that was signed.
@@ -45,7 +45,7 @@ impl fmt::Display for BadImage {
             Self::Long { length, room } => {
                 write!(f, "the firmware has {length} bytes; the slot has room for {room}")
             }
-            Self::Torn(Place { sector, word }) => {
+            Self::Torn(FlashWord { sector, word }) => {
                 write!(f, "the firmware is damaged: word {word} of sector {sector} cannot be read")
             }
             Self::Crc => f.write_str("the firmware is damaged: its CRC differs"),
@@ -82,7 +82,7 @@ impl fmt::Debug for Check {
 pub fn header(flash: &impl SlotFlash, slot: Slot, board: &BoardName) -> Result<Header, BadImage> {
     let mut bytes = [0; HEADER];
     for (part, word) in bytes.as_chunks_mut::<WORD>().0.iter_mut().zip(0..) {
-        let at = Place { sector: 0, word };
+        let at = FlashWord { sector: 0, word };
         *part = flash.whole(at).ok_or(BadImage::Torn(at))?;
     }
     let header = Header::parse(&bytes).map_err(BadImage::Header)?;

@@ -8,7 +8,7 @@ use recipe_store::{Slot, WORD};
 use salty::Sha512;
 
 use crate::check::BadImage;
-use crate::header::{CRC, HEADER, Header, HeaderError, Parts};
+use crate::header::{CRC, HEADER, Header, HeaderError, ImageFacts};
 
 /// Number of bytes before the first link.
 pub const FILE_HEAD: usize = 16;
@@ -20,12 +20,12 @@ const LINKS: usize = Slot::ALL.len();
 /// An update, in the bytes of its file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct UpdateFile<'b> {
-    links: [Option<Link<'b>>; LINKS],
+    links: [Option<SlotImage<'b>>; LINKS],
 }
 
 /// The firmware linked for one slot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Link<'b> {
+pub struct SlotImage<'b> {
     /// What it is.
     pub header: Header,
     /// The header as it is in the file.
@@ -119,7 +119,7 @@ pub fn link_padding(length: usize) -> usize {
 
 impl<'b> UpdateFile<'b> {
     /// Reads a file. Its form is checked, and that the links are of one firmware; not their contents
-    /// ([`Link::check`]) nor their signatures ([`Header::verify`]).
+    /// ([`SlotImage::check`]) nor their signatures ([`Header::verify`]).
     ///
     /// # Errors
     /// The bytes are malformed.
@@ -141,8 +141,8 @@ impl<'b> UpdateFile<'b> {
         if !(1..=LINKS as u32).contains(&count) {
             return Err(FileError::Links { found: count });
         }
-        let mut links: [Option<Link<'b>>; LINKS] = [None; LINKS];
-        let mut first: Option<Parts> = None;
+        let mut links: [Option<SlotImage<'b>>; LINKS] = [None; LINKS];
+        let mut first: Option<ImageFacts> = None;
         for nth in 0..count {
             let link = u8::try_from(nth).unwrap_or(u8::MAX);
             let cut = HeaderError::NotAHeader { found: [0; 4] };
@@ -157,12 +157,12 @@ impl<'b> UpdateFile<'b> {
             if fill.iter().any(|byte| *byte != 0xFF) {
                 return Err(FileError::Image { slot });
             }
-            let parts = Parts { slot: Slot::A, ..*header.parts() };
+            let parts = ImageFacts { slot: Slot::A, ..*header.parts() };
             if *first.get_or_insert(parts) != parts {
                 return Err(FileError::Different);
             }
             let place = links.get_mut(usize::from(slot.number()));
-            if place.is_none_or(|place| place.replace(Link { header, header_bytes, image }).is_some()) {
+            if place.is_none_or(|place| place.replace(SlotImage { header, header_bytes, image }).is_some()) {
                 return Err(FileError::Twice { slot });
             }
             rest = behind;
@@ -174,17 +174,17 @@ impl<'b> UpdateFile<'b> {
     }
 
     /// The link for a slot.
-    pub fn link(&self, slot: Slot) -> Option<&Link<'b>> {
+    pub fn link(&self, slot: Slot) -> Option<&SlotImage<'b>> {
         self.links.get(usize::from(slot.number()))?.as_ref()
     }
 
     /// All links, in the order of the slots.
-    pub fn links(&self) -> impl Iterator<Item = &Link<'b>> {
+    pub fn links(&self) -> impl Iterator<Item = &SlotImage<'b>> {
         self.links.iter().flatten()
     }
 }
 
-impl Link<'_> {
+impl SlotImage<'_> {
     /// Compares the image with CRC and hash of the header.
     ///
     /// # Errors

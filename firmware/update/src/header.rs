@@ -121,7 +121,7 @@ impl Formats {
 
 /// Facts about an image that the image does not contain.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Parts {
+pub struct ImageFacts {
     /// The board it is for.
     pub board: BoardName,
     /// The slot it is linked for.
@@ -137,7 +137,7 @@ pub struct Parts {
 /// A header.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Header {
-    parts: Parts,
+    parts: ImageFacts,
     /// Length of the image in bytes; never 0.
     length: u32,
     /// CRC-32 of the image.
@@ -243,7 +243,7 @@ impl PublicKey {
 impl Header {
     /// Builds the header of an image, signed with the key of this seed; `None` if the image is empty or its length
     /// exceeds a `u32`.
-    pub fn sign(parts: Parts, image: &[u8], seed: &[u8; 32]) -> Option<Self> {
+    pub fn sign(parts: ImageFacts, image: &[u8], seed: &[u8; 32]) -> Option<Self> {
         let length = u32::try_from(image.len()).ok().filter(|length| *length > 0)?;
         let mut hash = Sha512::new();
         hash.update(image);
@@ -258,7 +258,7 @@ impl Header {
     /// # Errors
     /// The bytes are malformed.
     pub fn parse(bytes: &[u8; HEADER]) -> Result<Self, HeaderError> {
-        let mut fields = Fields(bytes);
+        let mut fields = HeaderReader(bytes);
         let signature = fields.take();
         let magic = fields.take();
         if magic != MAGIC {
@@ -282,7 +282,7 @@ impl Header {
         }
         let [major, minor, patch, 0] = numbers else { return Err(HeaderError::Reserved) };
         let of_number = u8::try_from(slot).ok().and_then(Slot::of_number);
-        let parts = Parts {
+        let parts = ImageFacts {
             board: BoardName::of_bytes(board).ok_or(HeaderError::Board)?,
             slot: of_number.ok_or(HeaderError::Slot { found: slot })?,
             version: Version { major, minor, patch },
@@ -297,7 +297,7 @@ impl Header {
 
     /// The bytes that are signed.
     pub fn signed(&self) -> [u8; SIGNED] {
-        let Parts { board, slot, version, formats, store } = self.parts;
+        let ImageFacts { board, slot, version, formats, store } = self.parts;
         let mut bytes = [0; SIGNED];
         let mut fields = bytes.iter_mut();
         let mut put = |part: &[u8]| fields.by_ref().zip(part).for_each(|(place, byte)| *place = *byte);
@@ -331,7 +331,7 @@ impl Header {
     }
 
     /// Facts about the image except length and hash.
-    pub fn parts(&self) -> &Parts {
+    pub fn parts(&self) -> &ImageFacts {
         &self.parts
     }
 
@@ -361,9 +361,9 @@ impl Header {
 }
 
 /// The rest of a header.
-struct Fields<'b>(&'b [u8]);
+struct HeaderReader<'b>(&'b [u8]);
 
-impl Fields<'_> {
+impl HeaderReader<'_> {
     fn take<const N: usize>(&mut self) -> [u8; N] {
         match self.0.split_first_chunk() {
             Some((field, rest)) => {
@@ -394,7 +394,7 @@ mod tests {
     fn header() -> Header {
         let formats = Formats::new(1, 3, 3).unwrap();
         let board = BoardName::parse("nucleo-h743zi").unwrap();
-        let parts = Parts { board, slot: Slot::A, version: Version::new(0, 3, 1), formats, store: 1 };
+        let parts = ImageFacts { board, slot: Slot::A, version: Version::new(0, 3, 1), formats, store: 1 };
         Header::sign(parts, b"an image", &SEED).unwrap()
     }
 
@@ -415,7 +415,7 @@ mod tests {
             pairs.map(|pair| u8::from_str_radix(pair, 16).unwrap()).collect()
         };
         let image: std::vec::Vec<u8> = (0..1_024).map(|at| at as u8).chain(*b"end").collect();
-        let parts = Parts { slot: Slot::B, version: Version::new(0, 3, 0), ..*header().parts() };
+        let parts = ImageFacts { slot: Slot::B, version: Version::new(0, 3, 0), ..*header().parts() };
         let header = Header::sign(parts, &image, &bytes(seed).try_into().unwrap()).unwrap();
         assert_eq!(header.encode()[..], bytes(&FIRST.concat())[..]);
         let key = "d75a980182b10ab7d54bfed3c964073a0ee172f3daa62325af021a68f707511a";

@@ -47,22 +47,23 @@ mod rules;
 
 pub use boot::{Chosen, Machine, STARTS, begin_trial, choose, confirm, end_trial};
 pub use check::{BadImage, Check, header as header_of};
-pub use file::{FILE_HEAD, FileError, Link, UpdateFile, file_head, link_padding};
+pub use file::{FILE_HEAD, FileError, SlotImage, UpdateFile, file_head, link_padding};
 pub use header::{
-    BoardName, Foreign, Formats, HEADER, Header, HeaderError, IMAGE_OFFSET, Parts, PublicKey, SIGNED, Version,
+    BoardName, Foreign, Formats, HEADER, Header, HeaderError, IMAGE_OFFSET, ImageFacts, PublicKey, SIGNED,
+    Version,
 };
 pub use layout::{BOARDS, Layout, MPS2_AN500, NUCLEO_H743ZI, NUCLEO_H743ZI_STORES, Stores};
 pub use receive::{Gap, Receive, ReceiveError, ReceiveStep};
-pub use recipe_store::{Ended, Side, Slot, SlotMarks, SlotTrial};
-pub use rules::{Downgrade, Refused, Running, may_keep};
+pub use recipe_store::{Side, Slot, SlotMarks, SlotTrial, TrialEnd};
+pub use rules::{Downgrade, RunningFirmware, UpdateRefused, may_keep};
 
-use recipe_store::{Flash, Place, Word};
+use recipe_store::{Flash, FlashWord, Word};
 
 /// The flash of a slot.
 pub trait SlotFlash: Flash {
     /// The bytes of a word; `None` if it cannot be read. [`Flash::read`] gives zeros, which may also be in an image:
     /// running such a word would be a fault.
-    fn whole(&self, place: Place) -> Option<Word>;
+    fn whole(&self, place: FlashWord) -> Option<Word>;
 }
 
 /// The word of a slot at which its image begins.
@@ -77,9 +78,9 @@ fn size(flash: &impl Flash) -> u32 {
 }
 
 /// The place of a word counted from the beginning of the slot; `None` behind its end.
-fn place(flash: &impl Flash, word: u32) -> Option<Place> {
+fn place(flash: &impl Flash, word: u32) -> Option<FlashWord> {
     let words = u32::from(flash.geometry().words);
     let sector = u8::try_from(word.checked_div(words)?).ok()?;
     let word = u16::try_from(word.checked_rem(words)?).ok()?;
-    (sector < flash.geometry().sectors).then_some(Place { sector, word })
+    (sector < flash.geometry().sectors).then_some(FlashWord { sector, word })
 }

@@ -6,11 +6,11 @@
 
 use core::fmt;
 
-use recipe_store::{Place, SlotMarks, WORD, Word};
+use recipe_store::{FlashWord, SlotMarks, WORD, Word};
 
 use crate::check::{BadImage, Check};
 use crate::header::{HEADER, Header, IMAGE_OFFSET};
-use crate::rules::{Downgrade, Refused, Running};
+use crate::rules::{Downgrade, RunningFirmware, UpdateRefused};
 use crate::{FIRST_WORD, SlotFlash, place};
 
 /// An update being received.
@@ -32,7 +32,7 @@ pub enum ReceiveStep {
     /// Erase this sector of the slot.
     Erase(u8),
     /// Write this word of the slot.
-    Write(Place, Word),
+    Write(FlashWord, Word),
     /// Supply bytes of the image from this offset on ([`Receive::take`]).
     Take {
         /// Number of bytes received so far.
@@ -49,7 +49,7 @@ pub enum ReceiveStep {
 #[non_exhaustive]
 pub enum ReceiveError {
     /// A word reads differently than it was written.
-    Worn(Place),
+    Worn(FlashWord),
     /// The received image is not the signed one.
     Bad(BadImage),
 }
@@ -57,7 +57,7 @@ pub enum ReceiveError {
 impl fmt::Display for ReceiveError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Worn(Place { sector, word }) => {
+            Self::Worn(FlashWord { sector, word }) => {
                 write!(f, "word {word} of sector {sector} does not keep what is written")
             }
             Self::Bad(bad) => bad.fmt(f),
@@ -92,7 +92,7 @@ enum ReceivePhase {
     },
     Fill,
     /// The collected word was written here.
-    Written(Place),
+    Written(FlashWord),
     Hash(Check),
     /// The word of the header of this index in [`ORDER`] is next.
     Header {
@@ -113,11 +113,11 @@ impl Receive {
     /// Why it may not be installed; nothing has changed.
     pub fn begin(
         header: Header,
-        running: &Running,
+        running: &RunningFirmware,
         marks: SlotMarks,
         downgrade: Downgrade,
         flash: &impl SlotFlash,
-    ) -> Result<Self, Refused> {
+    ) -> Result<Self, UpdateRefused> {
         running.accepts(&header, flash, marks, downgrade)?;
         let bytes = u32::from(flash.geometry().words).saturating_mul(WORD as u32);
         let sectors = header.length().saturating_add(IMAGE_OFFSET).div_ceil(bytes.max(1));
@@ -229,11 +229,11 @@ impl Receive {
     }
 
     /// The nth word of the header that is written; `None` behind the last.
-    fn header_word(&self, nth: usize) -> Option<(Place, Word)> {
+    fn header_word(&self, nth: usize) -> Option<(FlashWord, Word)> {
         let word = *ORDER.get(nth)?;
         let bytes = self.header.encode();
         let part = bytes.as_chunks::<WORD>().0.get(usize::from(word))?;
-        Some((Place { sector: 0, word }, *part))
+        Some((FlashWord { sector: 0, word }, *part))
     }
 }
 

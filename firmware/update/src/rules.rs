@@ -10,7 +10,7 @@ use crate::header::{BoardName, Formats, Header, Version};
 
 /// The firmware that receives an update.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Running {
+pub struct RunningFirmware {
     /// Board that it runs on.
     pub board: BoardName,
     /// The slot it runs in.
@@ -34,7 +34,7 @@ pub enum Downgrade {
 /// Why an update may not be installed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
-pub enum Refused {
+pub enum UpdateRefused {
     /// It cannot run in the free slot of this board.
     Bad(BadImage),
     /// It is older than the running firmware.
@@ -62,7 +62,7 @@ pub enum Refused {
     NotGood,
 }
 
-impl fmt::Display for Refused {
+impl fmt::Display for UpdateRefused {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Bad(bad) => bad.fmt(f),
@@ -87,9 +87,9 @@ impl fmt::Display for Refused {
     }
 }
 
-impl core::error::Error for Refused {}
+impl core::error::Error for UpdateRefused {}
 
-impl Running {
+impl RunningFirmware {
     /// Checks that an update may be written to the free slot.
     ///
     /// # Errors
@@ -100,30 +100,30 @@ impl Running {
         flash: &impl SlotFlash,
         marks: SlotMarks,
         downgrade: Downgrade,
-    ) -> Result<(), Refused> {
+    ) -> Result<(), UpdateRefused> {
         if marks.trial.is_some() {
-            return Err(Refused::OnTrial);
+            return Err(UpdateRefused::OnTrial);
         }
         if marks.good != Some(self.slot) {
-            return Err(Refused::NotGood);
+            return Err(UpdateRefused::NotGood);
         }
-        fits(header, flash, self.slot.other(), &self.board).map_err(Refused::Bad)?;
+        fits(header, flash, self.slot.other(), &self.board).map_err(UpdateRefused::Bad)?;
         let (offered, running) = (header.version(), self.version);
         if offered < running && downgrade == Downgrade::Refused {
-            return Err(Refused::Older { offered, running });
+            return Err(UpdateRefused::Older { offered, running });
         }
         // Even for a requested downgrade: without a configuration the buses would be silent.
         let reads = header.parts().formats;
         if let Some((oldest, newest)) = self.kept {
             for kept in [oldest, newest] {
                 if !reads.reads(kept) {
-                    return Err(Refused::Format { kept, reads });
+                    return Err(UpdateRefused::Format { kept, reads });
                 }
             }
         }
         let offered = header.parts().store;
         if offered != recipe_store::VERSION {
-            return Err(Refused::Store { offered });
+            return Err(UpdateRefused::Store { offered });
         }
         Ok(())
     }

@@ -8,8 +8,8 @@ use object::read::elf::{FileHeader, ProgramHeader};
 use proto_core::config::image;
 use recipe_api::key::Hex;
 use recipe_update::{
-    BoardName, Formats, HEADER, Header, IMAGE_OFFSET, Layout, Link, Parts, PublicKey, Slot, UpdateFile,
-    Version, file_head, link_padding,
+    BoardName, Formats, HEADER, Header, IMAGE_OFFSET, ImageFacts, Layout, PublicKey, Slot, SlotImage,
+    UpdateFile, Version, file_head, link_padding,
 };
 use serde_json::json;
 
@@ -64,7 +64,7 @@ pub fn sign(firmware: &Firmware) -> Result<Vec<u8>, Failure> {
             std::fs::read(path).map_err(|error| Failure::wrong(format!("{}: {error}", path.display())))?;
         let image = image_of(&bytes, layout, slot)
             .map_err(|why| Failure::wrong(format!("{}: {why}", path.display())))?;
-        let parts = Parts { board, slot, version, formats, store: recipe_store::VERSION };
+        let parts = ImageFacts { board, slot, version, formats, store: recipe_store::VERSION };
         let header = Header::sign(parts, &image, &seed.0)
             .ok_or_else(|| Failure::wrong(format!("{}: it is empty", path.display())))?;
         links.extend(header.encode());
@@ -147,7 +147,7 @@ impl Update {
     }
 
     /// What it has for each slot.
-    pub fn links(&self) -> Vec<Link<'_>> {
+    pub fn links(&self) -> Vec<SlotImage<'_>> {
         // It was read before.
         UpdateFile::parse(&self.bytes).map_or(Vec::new(), |file| file.links().copied().collect())
     }
@@ -210,10 +210,10 @@ impl Update {
                 looked(signature.to_owned(), "of this key"),
             ]);
         }
-        let Some(Link { header, .. }) = links.first() else {
+        let Some(SlotImage { header, .. }) = links.first() else {
             return Err(Failure::wrong("the file is empty"));
         };
-        let Parts { board, version, formats, store, .. } = header.parts();
+        let ImageFacts { board, version, formats, store, .. } = header.parts();
         let Formats { oldest, newest, written } = *formats;
         let mut text = facts([
             ("firmware", version.to_string().into()),
@@ -241,7 +241,7 @@ impl Update {
             .iter()
             .map(|link| format!("slot {:?} {} bytes", link.header.slot(), link.image.len() + HEADER))
             .collect();
-        let Some(Link { header, .. }) = links.first() else { return String::new() };
+        let Some(SlotImage { header, .. }) = links.first() else { return String::new() };
         let (version, board) = (header.version(), header.parts().board);
         format!("firmware {version} for {board}: {}; signed for {}", sizes.join(", "), Hex(&public.bytes()))
     }

@@ -9,7 +9,8 @@ use recipe_api::key::Hex;
 use recipe_ctl::update::{Downgrade, Plan, update};
 use recipe_ctl::{Client, Failure, Stop, Update, Verdict};
 use recipe_update::{
-    BoardName, FILE_HEAD, Formats, HEADER, Header, Parts, PublicKey, Slot, Version, file_head, link_padding,
+    BoardName, FILE_HEAD, Formats, HEADER, Header, ImageFacts, PublicKey, Slot, Version, file_head,
+    link_padding,
 };
 
 const SEED: [u8; 32] = [7; 32];
@@ -156,7 +157,7 @@ fn image() -> Vec<u8> {
 fn file(name: &str, seed: &[u8; 32]) -> Update {
     let mut links = Vec::new();
     for slot in Slot::ALL {
-        let parts = Parts {
+        let parts = ImageFacts {
             board: BoardName::parse(name).unwrap(),
             slot,
             version: Version::new(0, 3, 0),

@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use recipe_config::file::{SparkplugFile, load_sparkplug};
-use recipe_sparkplug::document::{Document, Host, MAX_DOCUMENT, MAX_HOST};
-use recipe_sparkplug::gateway::Rule;
+use recipe_sparkplug::document::{Host, MAX_DOCUMENT, MAX_HOST, NodeDocument};
+use recipe_sparkplug::gateway::PublishRule;
 use recipe_sparkplug::topic::Id;
 
 use crate::file::settings_of;
@@ -32,7 +32,7 @@ fn of(file: &SparkplugFile) -> Result<Vec<u8>, String> {
         Host::try_from(host)
             .map_err(|_| format!("{key}: {} bytes; allowed on a board: {MAX_HOST}", host.len()))
     };
-    let mut document = Document { settings: settings_of(file)?, ..Document::empty() };
+    let mut document = NodeDocument { settings: settings_of(file)?, ..NodeDocument::empty() };
     document.host = host("broker.address", &file.host)?;
     document.port = file.port;
     (document.sample, document.interval) = (file.sample, file.interval);
@@ -46,7 +46,7 @@ fn of(file: &SparkplugFile) -> Result<Vec<u8>, String> {
     document.rules = file
         .rules
         .iter()
-        .map(|rule| Rule { vars: rule.values, dead_band: rule.dead_band, min_interval: rule.interval })
+        .map(|rule| PublishRule { vars: rule.values, dead_band: rule.dead_band, min_interval: rule.interval })
         .collect();
     let mut bytes = vec![0; MAX_DOCUMENT];
     let written =
@@ -59,7 +59,7 @@ mod tests {
     use super::*;
     use std::os::unix::fs::PermissionsExt;
 
-    fn made(broker: &str, node: &str, rest: &str) -> Result<Document, String> {
+    fn made(broker: &str, node: &str, rest: &str) -> Result<NodeDocument, String> {
         let folder = tempfile::tempdir().unwrap();
         let login = folder.path().join("press.login");
         std::fs::write(&login, "press\ncold steel\n").unwrap();
@@ -67,7 +67,7 @@ mod tests {
         let path = folder.path().join("sparkplug.toml");
         let toml = format!("[broker]\n{broker}\n[node]\ngroup = \"hall\"\nname = \"press\"\n{node}\n{rest}");
         std::fs::write(&path, toml).unwrap();
-        let mut document = Document::empty();
+        let mut document = NodeDocument::empty();
         let tells = document.decode(&settings(&path)?).map_err(|error| error.to_string())?;
         assert!(tells);
         Ok(document)

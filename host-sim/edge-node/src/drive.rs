@@ -6,7 +6,7 @@ use std::time::{Duration, SystemTime};
 use proto_core::time::Instant;
 use recipe_io::timer::now;
 use recipe_sparkplug::catalog::Catalog;
-use recipe_sparkplug::node::{Counters, EdgeNode, Failure, Input, Output};
+use recipe_sparkplug::node::{EdgeNode, Input, NodeCounters, NodeOutput, SessionFailure};
 use recipe_sparkplug::value::Value;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::sync::watch;
@@ -17,7 +17,7 @@ use crate::broker::{Broker, BrokerConnection, close};
 /// Where values come from.
 pub trait Sampler {
     /// Puts the present values in their places.
-    fn sample(&mut self, node: &Counters, values: &mut [Option<Value>]) -> impl Future<Output = Sampled>;
+    fn sample(&mut self, node: &NodeCounters, values: &mut [Option<Value>]) -> impl Future<Output = Sampled>;
 }
 
 /// What a sample was.
@@ -38,7 +38,7 @@ pub trait Listener {
     /// Births were sent.
     fn online(&mut self);
     /// There is no session, because of this; an error of the connection says more.
-    fn failed(&mut self, failure: Failure, error: Option<&io::Error>);
+    fn failed(&mut self, failure: SessionFailure, error: Option<&io::Error>);
 }
 
 /// Drives a node until it has died, because `end` became true or the sampler ended it.
@@ -164,7 +164,7 @@ struct SessionDriver {
     /// Why there is no connection.
     error: Option<io::Error>,
     was_online: bool,
-    logged: Option<Failure>,
+    logged: Option<SessionFailure>,
 }
 
 impl SessionDriver {
@@ -180,11 +180,11 @@ impl SessionDriver {
         let mut is_opening = false;
         let until = loop {
             match node.poll_output(now(), catalog, buf) {
-                Output::Open => is_opening = true,
+                NodeOutput::Open => is_opening = true,
                 // A host measures a birth at once.
-                Output::Busy => {}
-                Output::Keep { bd_seq } => listener.keep(bd_seq),
-                Output::Send(bytes) => {
+                NodeOutput::Busy => {}
+                NodeOutput::Keep { bd_seq } => listener.keep(bd_seq),
+                NodeOutput::Send(bytes) => {
                     let Some(stream) = &mut self.stream else { continue };
                     let written = timeout(WRITE_TIME, stream.write_all(bytes)).await;
                     match written.unwrap_or_else(|_| Err(io::ErrorKind::TimedOut.into())) {
@@ -192,13 +192,13 @@ impl SessionDriver {
                         Err(error) => self.lost(node, catalog, Some(error)),
                     }
                 }
-                Output::Close => {
+                NodeOutput::Close => {
                     is_opening = false;
                     if let Some(stream) = self.stream.take() {
                         close(stream).await;
                     }
                 }
-                Output::Sleep { until } => break until,
+                NodeOutput::Sleep { until } => break until,
             }
         };
         if let Some(stream) = &mut self.stream

@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use recipe_config::file::{SparkplugFile, load_sparkplug};
 use recipe_io::files::{Beside, read_private};
-use recipe_sparkplug::gateway::{Rates, Rule};
-use recipe_sparkplug::node::{Settings, Text};
+use recipe_sparkplug::gateway::{PublishRule, Rates};
+use recipe_sparkplug::node::{Credential, Settings};
 use recipe_sparkplug::topic::Id;
 
 use crate::broker::Broker;
@@ -23,7 +23,7 @@ pub struct PublisherConfig {
     /// Where the number of the session is kept.
     pub bd_seq: Option<PathBuf>,
     /// Exceptions for variables.
-    rules: Vec<Rule>,
+    rules: Vec<PublishRule>,
     file: SparkplugFile,
 }
 
@@ -49,7 +49,7 @@ impl PublisherConfig {
             // A mistake shows before anything runs.
             read_bd_seq(kept).map_err(|why| of_file(format!("node.bd_seq: {why}")))?;
         }
-        let rules = file.rules.iter().map(|rule| Rule {
+        let rules = file.rules.iter().map(|rule| PublishRule {
             vars: rule.values,
             dead_band: rule.dead_band,
             min_interval: rule.interval,
@@ -75,7 +75,7 @@ pub(crate) fn settings_of(file: &SparkplugFile) -> Result<Settings, String> {
     let mut settings = Settings::new(id(&file.group)?, id(&file.node)?);
     settings.primary_host = file.primary_host.as_deref().map(id).transpose()?;
     settings.keep_alive = file.keep_alive;
-    if let Some(client_id) = file.client_id.as_deref().and_then(Text::new) {
+    if let Some(client_id) = file.client_id.as_deref().and_then(Credential::new) {
         settings.client_id = client_id;
     }
     let login = file.login.as_deref();
@@ -88,7 +88,7 @@ pub(crate) fn settings_of(file: &SparkplugFile) -> Result<Settings, String> {
 ///
 /// # Errors
 /// What is wrong with it; what is in it is not repeated.
-pub fn read_login(path: &Path) -> Result<(Text, Text), String> {
+pub fn read_login(path: &Path) -> Result<(Credential, Credential), String> {
     let refused = |why: &str| format!("{}: {why}", path.display());
     let text = read_private(path, 1_000).map_err(|error| refused(&error.to_string()))?;
     let mut lines = text.lines();
@@ -97,8 +97,8 @@ pub fn read_login(path: &Path) -> Result<(Text, Text), String> {
     else {
         return Err(refused("not two lines, user and password"));
     };
-    let user = std::str::from_utf8(user).ok().and_then(Text::new);
-    user.zip(Text::new(password)).ok_or_else(|| refused("a line is longer than 129 bytes"))
+    let user = std::str::from_utf8(user).ok().and_then(Credential::new);
+    user.zip(Credential::new(password)).ok_or_else(|| refused("a line is longer than 129 bytes"))
 }
 
 /// The number of the last session; `None` if there was none.

@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use proto_core::time::Duration as CoreDuration;
 use recipe_sparkplug::catalog::{Catalog, Metric, Owner, Report};
-use recipe_sparkplug::node::{Counters, EdgeNode, Failure, Settings, Text};
+use recipe_sparkplug::node::{Credential, EdgeNode, NodeCounters, SessionFailure, Settings};
 use recipe_sparkplug::topic::Id;
 use recipe_sparkplug::value::{DataType, Value};
 use tokio::sync::watch;
@@ -28,7 +28,7 @@ pub struct Fleet {
     /// Their group; the nodes are called `node-1` and so on.
     pub group: Id,
     /// User and password of all.
-    pub login: Option<(Text, Text)>,
+    pub login: Option<(Credential, Credential)>,
     /// How often each takes new values.
     pub period: Duration,
     /// How long.
@@ -71,7 +71,7 @@ impl Fleet {
         let local = LocalSet::new();
         local.block_on(&runtime, async {
             let (end, ended) = watch::channel(false);
-            let all = Rc::new(RefCell::new(vec![(Counters::default(), false); self.nodes]));
+            let all = Rc::new(RefCell::new(vec![(NodeCounters::default(), false); self.nodes]));
             let mut tasks = tokio::task::JoinSet::new();
             for nth in 0..self.nodes {
                 let name = Id::new(&format!("node-{}", nth + 1)).map_err(io::Error::other)?;
@@ -124,7 +124,7 @@ impl Fleet {
     }
 }
 
-type All = Rc<RefCell<Vec<(Counters, bool)>>>;
+type All = Rc<RefCell<Vec<(NodeCounters, bool)>>>;
 
 struct SimulatedSampler {
     random: u64,
@@ -134,7 +134,7 @@ struct SimulatedSampler {
 }
 
 impl SimulatedSampler {
-    fn note(&self, counters: Counters) {
+    fn note(&self, counters: NodeCounters) {
         if let Some((known, _)) = self.all.borrow_mut().get_mut(self.nth) {
             *known = counters;
         }
@@ -142,7 +142,7 @@ impl SimulatedSampler {
 }
 
 impl Sampler for SimulatedSampler {
-    async fn sample(&mut self, node: &Counters, values: &mut [Option<Value>]) -> Sampled {
+    async fn sample(&mut self, node: &NodeCounters, values: &mut [Option<Value>]) -> Sampled {
         self.note(*node);
         self.step += 1;
         for (place, value) in values.iter_mut().enumerate() {
@@ -184,7 +184,7 @@ impl Listener for Watched {
         self.show(true);
     }
 
-    fn failed(&mut self, _: Failure, _: Option<&io::Error>) {
+    fn failed(&mut self, _: SessionFailure, _: Option<&io::Error>) {
         self.show(false);
     }
 }

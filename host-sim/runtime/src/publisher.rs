@@ -15,7 +15,7 @@ use recipe_edge_node::file::{PublisherConfig, read_bd_seq, write_bd_seq};
 use recipe_io::random::random;
 use recipe_io::timer::now;
 use recipe_sparkplug::gateway::GatewayCatalog;
-use recipe_sparkplug::node::{Counters, EdgeNode, Failure};
+use recipe_sparkplug::node::{EdgeNode, NodeCounters, SessionFailure};
 use recipe_sparkplug::value::Value;
 use tokio::sync::watch;
 use tracing::{info, warn};
@@ -189,7 +189,7 @@ struct GatewaySampler<'c> {
 }
 
 impl Sampler for GatewaySampler<'_> {
-    async fn sample(&mut self, node: &Counters, values: &mut [Option<Value>]) -> Sampled {
+    async fn sample(&mut self, node: &NodeCounters, values: &mut [Option<Value>]) -> Sampled {
         if self.reader.running.has_changed().unwrap_or(true) {
             return Sampled::Changed;
         }
@@ -215,7 +215,7 @@ impl Listener for LogListener<'_> {
         info!(broker = self.publishing.broker.address(), "the edge node is online");
     }
 
-    fn failed(&mut self, failure: Failure, error: Option<&io::Error>) {
+    fn failed(&mut self, failure: SessionFailure, error: Option<&io::Error>) {
         let broker = self.publishing.broker.address();
         let error = error.map(ToString::to_string);
         warn!(broker, why = %failure, error, "no session with the broker; trying again");

@@ -7,14 +7,14 @@ use crate::request::{cut, trim};
 
 /// The value of an entry.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Value<'a> {
+pub enum ArgumentValue<'a> {
     /// A number, in thousandths; further digits are cut off.
     Thousandths(u64),
     /// A text.
     Text(&'a str),
 }
 
-impl Value<'_> {
+impl ArgumentValue<'_> {
     /// A whole number.
     pub fn whole(self) -> Option<u32> {
         match self {
@@ -28,7 +28,7 @@ impl Value<'_> {
 
 /// Calls `found` with each entry; a body without a byte has none. `false` if it is no such object, or if `found`
 /// refuses an entry.
-pub fn each<'a>(body: &'a [u8], mut found: impl FnMut(&'a str, Value<'a>) -> bool) -> bool {
+pub fn each<'a>(body: &'a [u8], mut found: impl FnMut(&'a str, ArgumentValue<'a>) -> bool) -> bool {
     let Ok(text) = core::str::from_utf8(body) else { return false };
     let text = blank_free(text);
     if text.is_empty() {
@@ -55,9 +55,9 @@ pub fn each<'a>(body: &'a [u8], mut found: impl FnMut(&'a str, Value<'a>) -> boo
     true
 }
 
-fn value(text: &str) -> Option<(Value<'_>, &str)> {
+fn value(text: &str) -> Option<(ArgumentValue<'_>, &str)> {
     if text.starts_with('"') {
-        return quoted(text).map(|(text, behind)| (Value::Text(text), behind));
+        return quoted(text).map(|(text, behind)| (ArgumentValue::Text(text), behind));
     }
     let end = text.bytes().position(|byte| !byte.is_ascii_digit() && byte != b'.').unwrap_or(text.len());
     let (number, behind) = text.split_at_checked(end)?;
@@ -74,7 +74,7 @@ fn value(text: &str) -> Option<(Value<'_>, &str)> {
     let thousandths = digits.fold(0_u64, |number, digit| {
         number.saturating_mul(10).saturating_add(u64::from(digit.saturating_sub(b'0')))
     });
-    Some((Value::Thousandths(thousandths), behind))
+    Some((ArgumentValue::Thousandths(thousandths), behind))
 }
 
 /// The text in quotes at the front, and what is behind it.
@@ -103,7 +103,7 @@ mod tests {
 
     use super::*;
 
-    fn read(body: &str) -> Option<Vec<(&str, Value<'_>)>> {
+    fn read(body: &str) -> Option<Vec<(&str, ArgumentValue<'_>)>> {
         let mut entries = Vec::new();
         each(body.as_bytes(), |key, value| {
             entries.push((key, value));
@@ -119,11 +119,14 @@ mod tests {
         let both = read("{\"confirm_s\": 60.5,\n\t\"revision\":3}\n").unwrap();
         assert_eq!(
             both,
-            [("confirm_s", Value::Thousandths(60_500)), ("revision", Value::Thousandths(3_000))]
+            [
+                ("confirm_s", ArgumentValue::Thousandths(60_500)),
+                ("revision", ArgumentValue::Thousandths(3_000))
+            ]
         );
         assert_eq!((both[0].1.whole(), both[1].1.whole()), (None, Some(3)));
-        assert_eq!(read(r#"{"key":"a, }:b"}"#), Some(std::vec![("key", Value::Text("a, }:b"))]));
-        assert_eq!(read(r#"{"s":0.0019}"#), Some(std::vec![("s", Value::Thousandths(1))]));
+        assert_eq!(read(r#"{"key":"a, }:b"}"#), Some(std::vec![("key", ArgumentValue::Text("a, }:b"))]));
+        assert_eq!(read(r#"{"s":0.0019}"#), Some(std::vec![("s", ArgumentValue::Thousandths(1))]));
     }
 
     #[test]
@@ -171,8 +174,8 @@ mod tests {
                 for (key, value) in entries {
                     match value {
                         // Of two with one name the other reader keeps the last.
-                        Value::Text(_) => prop_assert!(other.get(key).is_some()),
-                        Value::Thousandths(_) => prop_assert!(other.get(key).is_some()),
+                        ArgumentValue::Text(_) => prop_assert!(other.get(key).is_some()),
+                        ArgumentValue::Thousandths(_) => prop_assert!(other.get(key).is_some()),
                     }
                 }
                 prop_assert!(other.is_object());

@@ -29,11 +29,11 @@ pub enum Document {
 /// A document that is being written.
 #[derive(Debug, Clone)]
 pub struct Pieces {
-    next: Step,
+    next: DocumentStep,
 }
 
 #[derive(Debug, Clone, Copy)]
-enum Step {
+enum DocumentStep {
     Status,
     Port(usize),
     /// Of a port, by their places.
@@ -57,8 +57,8 @@ impl Pieces {
     /// The beginning of a document.
     pub const fn of(document: Document) -> Self {
         let next = match document {
-            Document::Status => Step::Status,
-            Document::Values => Step::Values,
+            Document::Status => DocumentStep::Status,
+            Document::Values => DocumentStep::Values,
         };
         Self { next }
     }
@@ -69,73 +69,73 @@ impl Pieces {
     /// If `out` has no room. The document cannot be continued then.
     pub fn write_next(&mut self, status: Status<'_>, out: &mut impl Write) -> Result<bool, JsonError> {
         self.next = match self.next {
-            Step::Status => {
+            DocumentStep::Status => {
                 let (time, sleeps) = (Whole(status.at().as_micros()), status.sleeps());
                 let health = status.health().name();
                 write!(out, "{{\"time_us\":{time},\"sleeps\":{sleeps},\"health\":\"{health}\",\"ports\":{{")?;
-                Step::Port(0)
+                DocumentStep::Port(0)
             }
-            Step::Port(nth) => match status.ports().nth(nth) {
+            DocumentStep::Port(nth) => match status.ports().nth(nth) {
                 Some(port) => {
                     let mut open = Open { out, is_end_held: false };
                     entry(&mut open, nth == 0, port.name, &port.without_peers())?;
                     match port.peers().next() {
                         Some(_) => {
                             out.write_str(",\"peers\":{")?;
-                            Step::Peer { port: nth, nth: 0 }
+                            DocumentStep::Peer { port: nth, nth: 0 }
                         }
                         None => {
                             out.write_char('}')?;
-                            Step::Port(nth.saturating_add(1))
+                            DocumentStep::Port(nth.saturating_add(1))
                         }
                     }
                 }
                 None => {
                     out.write_str("},\"links\":{")?;
-                    Step::Link(0)
+                    DocumentStep::Link(0)
                 }
             },
-            Step::Peer { port, nth } => {
+            DocumentStep::Peer { port, nth } => {
                 let peer = status.ports().nth(port).and_then(|port| port.peers().nth(nth));
                 match peer {
                     Some(peer) => {
                         entry(out, nth == 0, peer.number, &peer)?;
-                        Step::Peer { port, nth: nth.saturating_add(1) }
+                        DocumentStep::Peer { port, nth: nth.saturating_add(1) }
                     }
                     None => {
                         out.write_str("}}")?;
-                        Step::Port(port.saturating_add(1))
+                        DocumentStep::Port(port.saturating_add(1))
                     }
                 }
             }
-            Step::Link(nth) => match status.links().nth(nth) {
+            DocumentStep::Link(nth) => match status.links().nth(nth) {
                 Some(link) => {
                     entry(out, nth == 0, link.name, &link)?;
-                    Step::Link(nth.saturating_add(1))
+                    DocumentStep::Link(nth.saturating_add(1))
                 }
                 None => {
                     out.write_char('}')?;
-                    Step::Controller
+                    DocumentStep::Controller
                 }
             },
-            Step::Controller => {
+            DocumentStep::Controller => {
                 if let Some(controller) = status.controller() {
                     out.write_char(',')?;
                     entry(out, true, "controller", &controller)?;
                 }
-                Step::Latency
+                DocumentStep::Latency
             }
-            Step::Latency => {
+            DocumentStep::Latency => {
                 out.write_char(',')?;
                 entry(out, true, "latency", status.latency())?;
                 out.write_char('}')?;
-                Step::End
+                DocumentStep::End
             }
-            Step::Values => {
+            DocumentStep::Values => {
                 write!(out, "{{\"time_us\":{},\"values\":{{", Whole(status.at().as_micros()))?;
-                Step::ValuesFrom { from: 0, is_first: true }
+                DocumentStep::ValuesFrom { from: 0, is_first: true }
             }
-            Step::ValuesFrom { from, mut is_first } => {
+            DocumentStep::ValuesFrom { from, mut is_first } => {
                 let to = from.saturating_add(VALUES_AT_ONCE);
                 let here =
                     status.variables().filter(|known| (from..to).contains(&place(known.var, known.bit)));
@@ -144,14 +144,14 @@ impl Pieces {
                     is_first = false;
                 }
                 match to < PLACES {
-                    true => Step::ValuesFrom { from: to, is_first },
+                    true => DocumentStep::ValuesFrom { from: to, is_first },
                     false => {
                         out.write_str("}}")?;
-                        Step::End
+                        DocumentStep::End
                     }
                 }
             }
-            Step::End => return Ok(false),
+            DocumentStep::End => return Ok(false),
         };
         Ok(true)
     }

@@ -7,7 +7,7 @@ use serde::ser::{self, Impossible, Serialize, Serializer};
 /// Calls `found` with each field that is an unsigned number.
 pub(crate) fn each(counters: &impl Serialize, found: impl FnMut(&'static str, u64)) {
     // What has no such fields has none to report.
-    let _ = counters.serialize(Fields(found));
+    let _ = counters.serialize(FieldVisitor(found));
 }
 
 #[derive(Debug)]
@@ -27,9 +27,9 @@ impl ser::Error for NoFields {
     }
 }
 
-struct Fields<F>(F);
+struct FieldVisitor<F>(F);
 
-impl<F: FnMut(&'static str, u64)> ser::SerializeStruct for Fields<F> {
+impl<F: FnMut(&'static str, u64)> ser::SerializeStruct for FieldVisitor<F> {
     type Ok = ();
     type Error = NoFields;
 
@@ -38,7 +38,7 @@ impl<F: FnMut(&'static str, u64)> ser::SerializeStruct for Fields<F> {
         key: &'static str,
         value: &T,
     ) -> Result<(), NoFields> {
-        if let Ok(value) = value.serialize(Number) {
+        if let Ok(value) = value.serialize(UnsignedSerializer) {
             (self.0)(key, value);
         }
         Ok(())
@@ -50,7 +50,7 @@ impl<F: FnMut(&'static str, u64)> ser::SerializeStruct for Fields<F> {
 }
 
 /// Takes unsigned numbers alone.
-struct Number;
+struct UnsignedSerializer;
 
 macro_rules! refused {
     ($ok:ty: $($method:ident($($arg:ty),*)),* $(,)?) => {
@@ -103,8 +103,8 @@ macro_rules! serializer {
     };
 }
 
-impl Serializer for Number {
-    serializer!(Number, u64, Impossible<u64, NoFields>, {
+impl Serializer for UnsignedSerializer {
+    serializer!(UnsignedSerializer, u64, Impossible<u64, NoFields>, {
         fn serialize_u8(self, value: u8) -> Result<u64, NoFields> {
             Ok(value.into())
         }
@@ -127,8 +127,8 @@ impl Serializer for Number {
     });
 }
 
-impl<F: FnMut(&'static str, u64)> Serializer for Fields<F> {
-    serializer!(Fields<F>, (), Self, {
+impl<F: FnMut(&'static str, u64)> Serializer for FieldVisitor<F> {
+    serializer!(FieldVisitor<F>, (), Self, {
         fn serialize_u8(self, _: u8) -> Result<(), NoFields> {
             Err(NoFields)
         }
@@ -156,7 +156,7 @@ mod tests {
     use super::*;
 
     #[derive(serde::Serialize)]
-    struct Counters {
+    struct SampleCounters {
         first: u32,
         text: &'static str,
         second: u8,
@@ -165,7 +165,7 @@ mod tests {
     #[test]
     fn fields_come_in_order_and_only_numbers_count() {
         let mut found = std::vec::Vec::new();
-        each(&Counters { first: 7, text: "x", second: 8 }, |name, value| found.push((name, value)));
+        each(&SampleCounters { first: 7, text: "x", second: 8 }, |name, value| found.push((name, value)));
         assert_eq!(found, [("first", 7), ("second", 8)]);
         each(&7_u32, |_, _| panic!("a number has no fields"));
     }

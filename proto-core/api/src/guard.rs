@@ -12,9 +12,9 @@ use crate::address;
 use crate::attempts::Attempts;
 use crate::key::{self, Hash, Key, SCHEME, Signed};
 use crate::nonces::{NonceError, NonceText, Nonces};
-use crate::request::{Head, HeadError, Method, cut, trim};
-use crate::response::Status;
-use crate::route::{self, Access, BodyType, Operation, RouteError, Served};
+use crate::request::{HeadError, HttpHead, Method, cut, trim};
+use crate::response::StatusCode;
+use crate::route::{self, Access, ApiOperation, BodyType, RouteError, Served};
 
 /// Maximum length of a body in bytes.
 pub const MAX_BODY: u64 = 64 << 10;
@@ -30,13 +30,13 @@ pub struct Guard {
     secret: Hash,
     nonces: Nonces,
     attempts: Attempts,
-    counters: Counters,
+    counters: RequestCounters,
 }
 
 /// Counters of requests. They wrap.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
 #[non_exhaustive]
-pub struct Counters {
+pub struct RequestCounters {
     /// Requests that were carried out.
     pub admitted: u32,
     /// Requests that no endpoint takes: path, method, type or length.
@@ -89,7 +89,7 @@ impl Site<'_> {
 #[non_exhaustive]
 pub struct Admitted {
     /// What it asks for.
-    pub operation: Operation,
+    pub operation: ApiOperation,
     /// Only the head of the response is wanted.
     pub is_head: bool,
     /// Length of the body in bytes.
@@ -117,7 +117,7 @@ impl Admitted {
 #[non_exhaustive]
 pub struct Refusal {
     /// The status of the response.
-    pub status: Status,
+    pub status: StatusCode,
     /// For people.
     pub text: &'static str,
     /// `Allow`, with 405.
@@ -128,7 +128,7 @@ pub struct Refusal {
 
 impl Refusal {
     /// A refusal without further fields.
-    pub const fn new(status: Status, text: &'static str) -> Self {
+    pub const fn new(status: StatusCode, text: &'static str) -> Self {
         Self { status, text, allow: None, retry_after_s: None }
     }
 }
@@ -136,18 +136,18 @@ impl Refusal {
 impl From<HeadError> for Refusal {
     fn from(error: HeadError) -> Self {
         let (status, text) = match error {
-            HeadError::Incomplete => (Status::TIMEOUT, "the request did not arrive in time"),
+            HeadError::Incomplete => (StatusCode::TIMEOUT, "the request did not arrive in time"),
             HeadError::TooLong => {
-                (Status::HEAD_TOO_LARGE, "the head is too long; allowed: 2048 bytes, 32 fields")
+                (StatusCode::HEAD_TOO_LARGE, "the head is too long; allowed: 2048 bytes, 32 fields")
             }
-            HeadError::Malformed => (Status::BAD_REQUEST, "not a request of HTTP/1.1"),
-            HeadError::Version => (Status::VERSION, "only HTTP/1.1 is served"),
-            HeadError::NoHost => (Status::BAD_REQUEST, "Host is missing"),
-            HeadError::Repeated => (Status::BAD_REQUEST, "a field that may come once comes twice"),
+            HeadError::Malformed => (StatusCode::BAD_REQUEST, "not a request of HTTP/1.1"),
+            HeadError::Version => (StatusCode::VERSION, "only HTTP/1.1 is served"),
+            HeadError::NoHost => (StatusCode::BAD_REQUEST, "Host is missing"),
+            HeadError::Repeated => (StatusCode::BAD_REQUEST, "a field that may come once comes twice"),
             HeadError::NoLength => {
-                (Status::LENGTH_REQUIRED, "a body needs a Content-Length; no encoding is taken")
+                (StatusCode::LENGTH_REQUIRED, "a body needs a Content-Length; no encoding is taken")
             }
-            HeadError::Expectation => (Status::EXPECTATION_FAILED, "Expect may only be 100-continue"),
+            HeadError::Expectation => (StatusCode::EXPECTATION_FAILED, "Expect may only be 100-continue"),
         };
         Self::new(status, text)
     }
@@ -157,7 +157,13 @@ impl Guard {
     /// A guard with this key; without one nothing can be changed, and nothing is told over a network.
     /// `secret` is random, and another after each start.
     pub const fn new(key: Option<Key>, secret: Hash) -> Self {
-        Self { key, secret, nonces: Nonces::new(secret), attempts: Attempts::new(), counters: Counters::NONE }
+        Self {
+            key,
+            secret,
+            nonces: Nonces::new(secret),
+            attempts: Attempts::new(),
+            counters: RequestCounters::NONE,
+        }
     }
 
     /// Whether there is a key.
@@ -171,7 +177,7 @@ impl Guard {
     }
 
     /// Counters since the start.
-    pub const fn counters(&self) -> &Counters {
+    pub const fn counters(&self) -> &RequestCounters {
         &self.counters
     }
 
@@ -187,7 +193,7 @@ impl Guard {
     pub fn admit(
         &mut self,
         now: Instant,
-        head: &Head<'_>,
+        head: &HttpHead<'_>,
         site: &Site<'_>,
         served: Served,
     ) -> Result<Admitted, Refusal> {
@@ -212,32 +218,36 @@ impl Guard {
     fn decide(
         &mut self,
         now: Instant,
-        head: &Head<'_>,
+        head: &HttpHead<'_>,
         site: &Site<'_>,
         served: Served,
     ) -> Decision<Admitted> {
         if !site.is_host(head.host_name()) {
-            return refuse(Why::Host, Status::MISDIRECTED, "this server is not that host; use its address");
+            return refuse(
+                Why::Host,
+                StatusCode::MISDIRECTED,
+                "this server is not that host; use its address",
+            );
         }
         let route = match route::find(head, served) {
             Ok(route) => route,
             Err(RouteError::NotFound) => {
-                return refuse(Why::Unfit, Status::NOT_FOUND, "there is no such path");
+                return refuse(Why::Unfit, StatusCode::NOT_FOUND, "there is no such path");
             }
             Err(RouteError::Method(allow)) => {
-                let refusal = Refusal::new(Status::METHOD_NOT_ALLOWED, "this path has other methods");
+                let refusal = Refusal::new(StatusCode::METHOD_NOT_ALLOWED, "this path has other methods");
                 return Err((Why::Unfit, Refusal { allow: Some(allow), ..refusal }));
             }
         };
         if !head.has_only(route.operation.arguments()) {
             let text = "this path has no such argument, or it comes twice";
-            return refuse(Why::Unfit, Status::BAD_REQUEST, text);
+            return refuse(Why::Unfit, StatusCode::BAD_REQUEST, text);
         }
         let is_plain_read =
             matches!(head.method, Method::Get | Method::Head) && !route.operation.is_endless();
         if !is_plain_read && is_cross_site(head) {
             let text = "only pages of this server may do that";
-            return refuse(Why::CrossSite, Status::FORBIDDEN, text);
+            return refuse(Why::CrossSite, StatusCode::FORBIDDEN, text);
         }
         let (most, text) = match (route.body, served) {
             (BodyType::None, _) => (0, "the body is too long; allowed: none with GET"),
@@ -246,7 +256,7 @@ impl Guard {
             _ => (MAX_BODY, "the body is too long; allowed: 65536 bytes"),
         };
         if head.length > most {
-            return refuse(Why::Unfit, Status::TOO_LARGE, text);
+            return refuse(Why::Unfit, StatusCode::TOO_LARGE, text);
         }
         let is_fit = match head.content_type {
             Some(content_type) => route.body == BodyType::None || route.body.is(content_type),
@@ -259,13 +269,13 @@ impl Guard {
                 BodyType::Image => "Content-Type must be application/octet-stream",
                 _ => "Content-Type must be application/json",
             };
-            return refuse(Why::Unfit, Status::UNSUPPORTED_TYPE, text);
+            return refuse(Why::Unfit, StatusCode::UNSUPPORTED_TYPE, text);
         }
         let body = match route.access {
             Access::Open => None,
             // So that a person finds out that it can be claimed, and how.
             Access::Read
-                if served == Served::Board && self.key.is_none() && route.operation == Operation::Info =>
+                if served == Served::Board && self.key.is_none() && route.operation == ApiOperation::Info =>
             {
                 None
             }
@@ -285,7 +295,7 @@ impl Guard {
     fn authorize(
         &mut self,
         now: Instant,
-        head: &Head<'_>,
+        head: &HttpHead<'_>,
         site: &Site<'_>,
         served: Served,
     ) -> Decision<Option<Hash>> {
@@ -295,15 +305,15 @@ impl Guard {
                 Served::Board => "this board has no key: press its button, then POST claim within 60 s",
                 _ => "this server has no key: it can only be read, on its own machine",
             };
-            return refuse(Why::WithoutKey, Status::FORBIDDEN, text);
+            return refuse(Why::WithoutKey, StatusCode::FORBIDDEN, text);
         };
         if let Some(wait) = self.attempts.must_wait(now, peer) {
-            let refusal = Refusal::new(Status::TOO_MANY, "too many wrong keys; wait");
+            let refusal = Refusal::new(StatusCode::TOO_MANY, "too many wrong keys; wait");
             let retry_after_s = Some(wait.as_millis().div_ceil(1_000));
             return Err((Why::LockedOut, Refusal { retry_after_s, ..refusal }));
         }
         let Some(shown) = head.authorization else {
-            return refuse(Why::WithoutKey, Status::UNAUTHORIZED, "the key is needed");
+            return refuse(Why::WithoutKey, StatusCode::UNAUTHORIZED, "the key is needed");
         };
         let proof = match cut(shown, b' ') {
             // Over a network everybody could read it.
@@ -322,7 +332,7 @@ impl Guard {
                     true => "Authorization must be Bearer KEY, or a signature",
                     false => "Authorization must be a signature: over a network a key is never sent",
                 };
-                return refuse(Why::WithoutKey, Status::UNAUTHORIZED, text);
+                return refuse(Why::WithoutKey, StatusCode::UNAUTHORIZED, text);
             }
             Proof::Key(shown) => key.is(shown, &self.secret),
             Proof::Signature(signature) => {
@@ -333,7 +343,7 @@ impl Guard {
         };
         if !is_right {
             self.attempts.was_wrong(now, peer);
-            return refuse(Why::WrongKey, Status::UNAUTHORIZED, "wrong key");
+            return refuse(Why::WrongKey, StatusCode::UNAUTHORIZED, "wrong key");
         }
         let Proof::Signature(signature) = proof else { return Ok(None) };
         match self.nonces.check(now, signature.nonce) {
@@ -342,18 +352,18 @@ impl Guard {
                 Ok(key::from_hex(signature.body))
             }
             Err(NonceError::Used) => {
-                refuse(Why::Replayed, Status::UNAUTHORIZED, "this nonce was used; take a new one")
+                refuse(Why::Replayed, StatusCode::UNAUTHORIZED, "this nonce was used; take a new one")
             }
             Err(NonceError::Old | NonceError::Unknown) => refuse(
                 Why::Replayed,
-                Status::UNAUTHORIZED,
+                StatusCode::UNAUTHORIZED,
                 "this nonce is not valid any more; take a new one",
             ),
         }
     }
 }
 
-impl Counters {
+impl RequestCounters {
     const NONE: Self = Self {
         admitted: 0,
         unfit: 0,
@@ -380,12 +390,12 @@ enum Why {
 
 type Decision<T> = Result<T, (Why, Refusal)>;
 
-fn refuse<T>(why: Why, status: Status, text: &'static str) -> Decision<T> {
+fn refuse<T>(why: Why, status: StatusCode, text: &'static str) -> Decision<T> {
     Err((why, Refusal::new(status, text)))
 }
 
 /// Whether a browser says that the request comes from a page of another server.
-fn is_cross_site(head: &Head<'_>) -> bool {
+fn is_cross_site(head: &HttpHead<'_>) -> bool {
     let is_ours = |origin: &str| {
         let authority = origin.strip_prefix("http://").or_else(|| origin.strip_prefix("https://"));
         authority.is_some_and(|authority| authority.eq_ignore_ascii_case(head.host))

@@ -92,10 +92,13 @@ fn over_a_network_everything_is_signed() {
     assert!(!admitted.is_body(&body.finish()));
     // Once more.
     let refused = ask(&mut guard, at(1), &NETWORK, &request).unwrap_err();
-    assert_eq!((refused.status, refused.text), (Status::UNAUTHORIZED, "this nonce was used; take a new one"));
+    assert_eq!(
+        (refused.status, refused.text),
+        (StatusCode::UNAUTHORIZED, "this nonce was used; take a new one")
+    );
     // And too late.
     let request = signed(&mut guard, at(2), "POST", "/api/v1/confirm", b"");
-    assert_eq!(ask(&mut guard, at(33), &NETWORK, &request).unwrap_err().status, Status::UNAUTHORIZED);
+    assert_eq!(ask(&mut guard, at(33), &NETWORK, &request).unwrap_err().status, StatusCode::UNAUTHORIZED);
     assert_eq!(guard.counters().replayed, 2);
     assert_eq!(guard.counters().wrong_key, 0);
 }
@@ -111,14 +114,14 @@ fn a_signature_is_for_one_request() {
         assert_ne!(changed, request);
         assert_eq!(
             ask(&mut guard, at(0), &NETWORK, &changed).unwrap_err().status,
-            Status::UNAUTHORIZED,
+            StatusCode::UNAUTHORIZED,
             "{to}"
         );
     }
     // A nonce of another run, rightly signed.
     let other = Guard::new(Key::parse(KEY), [6; 32]).nonce(at(0));
     let foreign = with_nonce(&other, "POST", "/api/v1/confirm", b"");
-    assert_eq!(ask(&mut guard, at(0), &NETWORK, &foreign).unwrap_err().status, Status::UNAUTHORIZED);
+    assert_eq!(ask(&mut guard, at(0), &NETWORK, &foreign).unwrap_err().status, StatusCode::UNAUTHORIZED);
     assert!(ask(&mut guard, at(0), &NETWORK, &request).is_ok(), "wrong requests do not use the nonce up");
 }
 
@@ -129,11 +132,11 @@ fn five_wrong_keys_and_even_the_right_one_waits() {
         format!("POST /api/v1/confirm HTTP/1.1\nHost: localhost\nAuthorization: Bearer {}", "0".repeat(32));
     let right = wrong.replace(&"0".repeat(32), KEY);
     for _ in 0..5 {
-        assert_eq!(ask(&mut guard, at(0), &LOOPBACK, &wrong).unwrap_err().status, Status::UNAUTHORIZED);
+        assert_eq!(ask(&mut guard, at(0), &LOOPBACK, &wrong).unwrap_err().status, StatusCode::UNAUTHORIZED);
     }
     for request in [&wrong, &right] {
         let refused = ask(&mut guard, at(10), &LOOPBACK, request).unwrap_err();
-        assert_eq!((refused.status, refused.retry_after_s), (Status::TOO_MANY, Some(50)));
+        assert_eq!((refused.status, refused.retry_after_s), (StatusCode::TOO_MANY, Some(50)));
     }
     let read = "GET /api/v1/status HTTP/1.1\nHost: localhost";
     assert!(ask(&mut guard, at(10), &LOOPBACK, read).is_ok(), "who needs no key does not wait");

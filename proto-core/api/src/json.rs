@@ -331,7 +331,7 @@ impl<W: Write> ser::SerializeMap for Items<'_, W> {
 
     fn serialize_key<T: Serialize + ?Sized>(&mut self, key: &T) -> Result<(), JsonError> {
         self.comma()?;
-        key.serialize(Key(&mut *self.out))
+        key.serialize(JsonKey(&mut *self.out))
     }
 
     fn serialize_value<T: Serialize + ?Sized>(&mut self, value: &T) -> Result<(), JsonError> {
@@ -345,7 +345,7 @@ impl<W: Write> ser::SerializeMap for Items<'_, W> {
 }
 
 /// A key of an object, always in quotes.
-struct Key<'w, W>(&'w mut W);
+struct JsonKey<'w, W>(&'w mut W);
 
 macro_rules! keys {
     ($($method:ident: $type:ty),*) => {
@@ -365,7 +365,7 @@ macro_rules! no_keys {
 
 type Never = Impossible<(), JsonError>;
 
-impl<W: Write> Serializer for Key<'_, W> {
+impl<W: Write> Serializer for JsonKey<'_, W> {
     type Ok = ();
     type Error = JsonError;
     type SerializeSeq = Never;

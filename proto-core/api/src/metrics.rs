@@ -18,11 +18,11 @@ use crate::number::Whole;
 /// The families that are being written.
 #[derive(Debug, Clone)]
 pub struct Families {
-    next: Step,
+    next: MetricsStep,
 }
 
 #[derive(Debug, Clone, Copy)]
-enum Step {
+enum MetricsStep {
     Health,
     PortUp,
     PortAge,
@@ -46,7 +46,7 @@ impl Default for Families {
 impl Families {
     /// The first family is next.
     pub const fn new() -> Self {
-        Self { next: Step::Health }
+        Self { next: MetricsStep::Health }
     }
 
     /// Writes the next family, or a part of one, which may be empty; `false` if none is left and the text is complete.
@@ -55,23 +55,23 @@ impl Families {
     /// Those of `out`. The text cannot be continued then.
     pub fn write_next(&mut self, status: Status<'_>, out: &mut impl Write) -> Result<bool, fmt::Error> {
         self.next = match self.next {
-            Step::Health => {
+            MetricsStep::Health => {
                 let health = status.health().name();
                 out.write_str("# TYPE rgw_health stateset\n")?;
                 for name in ["running", "port-silent", "no-controller", "idle"] {
                     writeln!(out, "rgw_health{{rgw_health=\"{name}\"}} {}", u8::from(name == health))?;
                 }
-                Step::PortUp
+                MetricsStep::PortUp
             }
-            Step::PortUp => {
+            MetricsStep::PortUp => {
                 out.write_str("# TYPE rgw_port_working gauge\n")?;
                 for port in status.ports() {
                     let is_working = u8::from(port.state == PortState::Working);
                     writeln!(out, "rgw_port_working{{port=\"{}\"}} {is_working}", Label(port.name))?;
                 }
-                Step::PortAge
+                MetricsStep::PortAge
             }
-            Step::PortAge => {
+            MetricsStep::PortAge => {
                 out.write_str("# TYPE rgw_port_age_seconds gauge\n# UNIT rgw_port_age_seconds seconds\n")?;
                 for port in status.ports() {
                     if let Some(age) = port.age {
@@ -84,45 +84,45 @@ impl Families {
                     }
                 }
                 out.write_str("# TYPE rgw_port_rejected counter\n")?;
-                Step::Rejected(0)
+                MetricsStep::Rejected(0)
             }
-            Step::Rejected(nth) => match status.ports().nth(nth) {
+            MetricsStep::Rejected(nth) => match status.ports().nth(nth) {
                 Some(port) => {
                     rejected(&port, out)?;
-                    Step::Rejected(nth.saturating_add(1))
+                    MetricsStep::Rejected(nth.saturating_add(1))
                 }
-                None => Step::PortCounter(0),
+                None => MetricsStep::PortCounter(0),
             },
-            Step::PortCounter(nth) => {
+            MetricsStep::PortCounter(nth) => {
                 let ports = status.ports().map(|port| (port.name, port.counters));
                 match counter(out, "port", nth, ports)? {
-                    true => Step::PortCounter(nth.saturating_add(1)),
-                    false => Step::LinkUp,
+                    true => MetricsStep::PortCounter(nth.saturating_add(1)),
+                    false => MetricsStep::LinkUp,
                 }
             }
-            Step::LinkUp => {
+            MetricsStep::LinkUp => {
                 out.write_str("# TYPE rgw_link_up gauge\n")?;
                 for link in status.links() {
                     let is_up = u8::from(matches!(link.state, LinkState::Up { .. } | LinkState::Shared));
                     writeln!(out, "rgw_link_up{{link=\"{}\"}} {is_up}", Label(link.name))?;
                 }
-                Step::LinkHistory(0)
+                MetricsStep::LinkHistory(0)
             }
-            Step::LinkHistory(nth) => {
+            MetricsStep::LinkHistory(nth) => {
                 let links = status.links().map(|link| (link.name, link.history));
                 match counter(out, "link", nth, links)? {
-                    true => Step::LinkHistory(nth.saturating_add(1)),
-                    false => Step::LinkCounter(0),
+                    true => MetricsStep::LinkHistory(nth.saturating_add(1)),
+                    false => MetricsStep::LinkCounter(0),
                 }
             }
-            Step::LinkCounter(nth) => {
+            MetricsStep::LinkCounter(nth) => {
                 let links = status.links().map(|link| (link.name, link.counters));
                 match counter(out, "link", nth, links)? {
-                    true => Step::LinkCounter(nth.saturating_add(1)),
-                    false => Step::Latency(0),
+                    true => MetricsStep::LinkCounter(nth.saturating_add(1)),
+                    false => MetricsStep::Latency(0),
                 }
             }
-            Step::Latency(nth) => {
+            MetricsStep::Latency(nth) => {
                 let latency = status.latency();
                 let all = [
                     ("handed_over", &latency.handed_over),
@@ -133,16 +133,16 @@ impl Families {
                 match all.get(nth) {
                     Some((name, histogram)) => {
                         write_histogram(out, name, histogram)?;
-                        Step::Latency(nth.saturating_add(1))
+                        MetricsStep::Latency(nth.saturating_add(1))
                     }
-                    None => Step::Sleeps,
+                    None => MetricsStep::Sleeps,
                 }
             }
-            Step::Sleeps => {
+            MetricsStep::Sleeps => {
                 writeln!(out, "# TYPE rgw_sleeps counter\nrgw_sleeps_total {}\n# EOF", status.sleeps())?;
-                Step::End
+                MetricsStep::End
             }
-            Step::End => return Ok(false),
+            MetricsStep::End => return Ok(false),
         };
         Ok(true)
     }

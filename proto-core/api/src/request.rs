@@ -1,6 +1,6 @@
 //! The head of an HTTP/1.1 request: the request line and the header fields.
 //!
-//! In: received bytes, in pieces of any size. Out: a [`Head`], or why there is none. Does not know paths,
+//! In: received bytes, in pieces of any size. Out: a [`HttpHead`], or why there is none. Does not know paths,
 //! keys or bodies. A request is refused rather than guessed at: a field that matters may come once, lines end
 //! with CR LF, and a body has a `Content-Length`.
 
@@ -68,9 +68,9 @@ impl HeadBuffer {
     ///
     /// # Errors
     /// [`HeadError::Incomplete`] while more bytes are needed, or why the request is refused.
-    pub fn head(&self) -> Result<Head<'_>, HeadError> {
+    pub fn head(&self) -> Result<HttpHead<'_>, HeadError> {
         match (self.is_complete, self.bytes.get(..self.len)) {
-            (true, Some(head)) => Head::parse(head),
+            (true, Some(head)) => HttpHead::parse(head),
             _ if self.len == MAX_HEAD => Err(HeadError::TooLong),
             _ => Err(HeadError::Incomplete),
         }
@@ -113,7 +113,7 @@ impl Method {
 /// A request without its body.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
-pub struct Head<'a> {
+pub struct HttpHead<'a> {
     /// The method.
     pub method: Method,
     /// Path and query, as they were sent.
@@ -138,7 +138,7 @@ pub struct Head<'a> {
     pub expects_continue: bool,
 }
 
-/// Why there is no [`Head`].
+/// Why there is no [`HttpHead`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum HeadError {
@@ -160,7 +160,7 @@ pub enum HeadError {
     Expectation,
 }
 
-impl<'a> Head<'a> {
+impl<'a> HttpHead<'a> {
     fn parse(bytes: &'a [u8]) -> Result<Self, HeadError> {
         // Anything else could be read in two ways, or hide in a log.
         let is_text = |byte: &u8| matches!(byte, b' '..=b'~' | 0x80.. | b'\t' | b'\r' | b'\n');

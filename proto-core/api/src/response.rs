@@ -10,9 +10,9 @@ use crate::request::{cut, trim};
 
 /// A status code.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Status(pub u16);
+pub struct StatusCode(pub u16);
 
-impl Status {
+impl StatusCode {
     /// 200.
     pub const OK: Self = Self(200);
     /// 201: a configuration was stored.
@@ -99,7 +99,7 @@ impl Status {
 /// The type of a body.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
-pub enum Kind {
+pub enum ContentType {
     /// JSON.
     Json,
     /// A configuration.
@@ -118,7 +118,7 @@ pub enum Kind {
     Image,
 }
 
-impl Kind {
+impl ContentType {
     /// The media type.
     pub const fn name(self) -> &'static str {
         match self {
@@ -148,8 +148,8 @@ pub enum Length {
 /// The head of a response.
 #[derive(Clone, Copy)]
 pub struct Response<'a> {
-    status: Status,
-    kind: Kind,
+    status: StatusCode,
+    kind: ContentType,
     length: Length,
     policy: &'a str,
     fields: &'a [(&'a str, &'a dyn fmt::Display)],
@@ -157,7 +157,7 @@ pub struct Response<'a> {
 
 impl<'a> Response<'a> {
     /// A response without further fields.
-    pub const fn new(status: Status, kind: Kind, length: Length) -> Self {
+    pub const fn new(status: StatusCode, kind: ContentType, length: Length) -> Self {
         Self { status, kind, length, policy: NOTHING, fields: &[] }
     }
 
@@ -180,7 +180,7 @@ impl<'a> Response<'a> {
     pub fn write(&self, out: &mut impl Write) -> fmt::Result {
         write!(out, "HTTP/1.1 {} {}\r\n", self.status.0, self.status.reason())?;
         // What the client has already is not described again: its length is not that of this answer.
-        if self.status != Status::NOT_MODIFIED {
+        if self.status != StatusCode::NOT_MODIFIED {
             write!(out, "Content-Type: {}\r\n", self.kind.name())?;
             match self.length {
                 Length::Bytes(len) => write!(out, "Content-Length: {}\r\n", Whole(len))?,
@@ -192,7 +192,7 @@ impl<'a> Response<'a> {
         for (name, value) in self.fields {
             write!(out, "{name}: {value}\r\n")?;
         }
-        let keep = if self.kind == Kind::Page { "no-cache" } else { "no-store" };
+        let keep = if self.kind == ContentType::Page { "no-cache" } else { "no-store" };
         write!(out, "Cache-Control: {keep}\r\n")?;
         out.write_str(
             "X-Content-Type-Options: nosniff\r\nReferrer-Policy: no-referrer\r\n\
@@ -213,30 +213,30 @@ pub struct Page {
 }
 
 impl Page {
-    /// [`Status::OK`], or [`Status::NOT_MODIFIED`] if `If-None-Match` shows that the client has it: then nothing
+    /// [`StatusCode::OK`], or [`StatusCode::NOT_MODIFIED`] if `If-None-Match` shows that the client has it: then nothing
     /// follows the head.
-    pub fn status(&self, if_none_match: Option<&str>) -> Status {
+    pub fn status(&self, if_none_match: Option<&str>) -> StatusCode {
         let mut rest = if_none_match.unwrap_or("");
         while !rest.is_empty() {
             let (tag, behind) = cut(rest, b',').unwrap_or((rest, ""));
             let tag = trim(tag);
             if tag.strip_prefix("W/").unwrap_or(tag) == self.etag {
-                return Status::NOT_MODIFIED;
+                return StatusCode::NOT_MODIFIED;
             }
             rest = behind;
         }
-        Status::OK
+        StatusCode::OK
     }
 
     /// Writes the head of an answer with this status.
     ///
     /// # Errors
     /// Those of `out`, if it has no room.
-    pub fn write_head(&self, status: Status, out: &mut impl Write) -> fmt::Result {
+    pub fn write_head(&self, status: StatusCode, out: &mut impl Write) -> fmt::Result {
         let fields: [(&str, &dyn fmt::Display); 2] = [("ETag", &self.etag), ("Content-Encoding", &"gzip")];
         // Of a page that the client has, only which one it is.
-        let fields = if status == Status::NOT_MODIFIED { fields.get(..1) } else { fields.get(..) };
-        Response::new(status, Kind::Page, Length::Bytes(self.bytes.len() as u64))
+        let fields = if status == StatusCode::NOT_MODIFIED { fields.get(..1) } else { fields.get(..) };
+        Response::new(status, ContentType::Page, Length::Bytes(self.bytes.len() as u64))
             .with_policy(self.policy)
             .with(fields.unwrap_or(&[]))
             .write(out)
@@ -272,7 +272,7 @@ mod tests {
     fn a_head_has_one_empty_line_and_forbids_what_browsers_may_guess() {
         let mut head = String::new();
         let fields: [(&str, &dyn fmt::Display); 1] = [("Allow", &"GET, HEAD")];
-        Response::new(Status::METHOD_NOT_ALLOWED, Kind::Json, Length::Bytes(7))
+        Response::new(StatusCode::METHOD_NOT_ALLOWED, ContentType::Json, Length::Bytes(7))
             .with(&fields)
             .write(&mut head)
             .unwrap();
@@ -305,10 +305,10 @@ mod tests {
             (Some(",,"), 200),
             (Some(""), 200),
         ] {
-            assert_eq!(page.status(shown), Status(status), "{shown:?}");
+            assert_eq!(page.status(shown), StatusCode(status), "{shown:?}");
         }
         let mut head = String::new();
-        page.write_head(Status::OK, &mut head).unwrap();
+        page.write_head(StatusCode::OK, &mut head).unwrap();
         for field in [
             "Content-Type: text/html; charset=utf-8",
             "Content-Length: 6",
@@ -320,7 +320,7 @@ mod tests {
             assert!(head.contains(field), "{field}: {head}");
         }
         head.clear();
-        page.write_head(Status::NOT_MODIFIED, &mut head).unwrap();
+        page.write_head(StatusCode::NOT_MODIFIED, &mut head).unwrap();
         assert!(head.starts_with("HTTP/1.1 304 ") && head.contains("ETag: \"1234abcd\""), "{head}");
         assert!(!head.contains("Content-Length") && !head.contains("Content-Encoding"), "{head}");
     }

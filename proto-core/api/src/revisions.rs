@@ -9,7 +9,7 @@
 //! power or to the person who applied it, what runs in the end is something that was confirmed.
 //!
 //! The contract is that of the engine: change it, then call [`Revisions::poll_output`] until it returns
-//! [`Output::Sleep`]. Each other output is carried out, and its result is reported, before the next call.
+//! [`RevisionOutput::Sleep`]. Each other output is carried out, and its result is reported, before the next call.
 
 use heapless::Vec;
 use proto_core::time::{Duration, Instant};
@@ -48,7 +48,7 @@ pub struct Revisions {
     live: u32,
     previous: Option<u32>,
     waiting: Option<u32>,
-    phase: Phase,
+    phase: RevisionPhase,
     last: Option<(u32, Ended)>,
     /// The phase's output was not returned yet.
     is_due: bool,
@@ -56,7 +56,7 @@ pub struct Revisions {
 
 /// What is being done.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Phase {
+enum RevisionPhase {
     /// The live one runs.
     Live,
     /// One is being written.
@@ -104,7 +104,7 @@ impl Ended {
 
 /// What the driver has to do.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Output {
+pub enum RevisionOutput {
     /// Keep the configuration that was given with [`Revisions::put`], then remove `forget`. Report
     /// [`Result::Stored`].
     Store {
@@ -133,14 +133,14 @@ pub enum Output {
     },
 }
 
-/// What came of an [`Output`]; `true` if it was done, `false` if nothing was changed.
+/// What came of an [`RevisionOutput`]; `true` if it was done, `false` if nothing was changed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Result {
-    /// Of [`Output::Store`].
+    /// Of [`RevisionOutput::Store`].
     Stored(bool),
-    /// Of [`Output::Run`]; `false`: nothing runs now.
+    /// Of [`RevisionOutput::Run`]; `false`: nothing runs now.
     Started(bool),
-    /// Of [`Output::Mark`].
+    /// Of [`RevisionOutput::Mark`].
     Marked(bool),
     /// What ran on trial ended by itself.
     Ended,
@@ -183,7 +183,7 @@ impl Revisions {
             previous,
             kept,
             waiting: None,
-            phase: Phase::Live,
+            phase: RevisionPhase::Live,
             last: None,
             is_due: false,
         })
@@ -194,7 +194,7 @@ impl Revisions {
     pub fn resume_trial(&mut self, number: u32, until: Instant) -> bool {
         let is_other = number != self.live && self.revision(number).is_some();
         if is_other {
-            self.enter(Phase::Trial { number, until });
+            self.enter(RevisionPhase::Trial { number, until });
         }
         is_other
     }
@@ -234,10 +234,10 @@ impl Revisions {
     /// The one that runs; `None` while none does.
     pub fn running(&self) -> Option<u32> {
         match self.phase {
-            Phase::Live | Phase::Storing { .. } => Some(self.live),
-            Phase::Trial { number, .. } | Phase::Confirming { number, .. } | Phase::Marking { number } => {
-                Some(number)
-            }
+            RevisionPhase::Live | RevisionPhase::Storing { .. } => Some(self.live),
+            RevisionPhase::Trial { number, .. }
+            | RevisionPhase::Confirming { number, .. }
+            | RevisionPhase::Marking { number } => Some(number),
             _ => None,
         }
     }
@@ -245,7 +245,9 @@ impl Revisions {
     /// The one on trial, and the end of the trial.
     pub fn trial(&self) -> Option<(u32, Instant)> {
         match self.phase {
-            Phase::Trial { number, until } | Phase::Confirming { number, until } => Some((number, until)),
+            RevisionPhase::Trial { number, until } | RevisionPhase::Confirming { number, until } => {
+                Some((number, until))
+            }
             _ => None,
         }
     }
@@ -283,7 +285,7 @@ impl Revisions {
         let unneeded =
             self.kept.iter().map(|revision| revision.number).find(|&number| !needed.contains(&Some(number)));
         let forget = unneeded.filter(|_| self.kept.is_full());
-        self.enter(Phase::Storing { revision, forget });
+        self.enter(RevisionPhase::Storing { revision, forget });
         Ok(revision.number)
     }
 
@@ -306,7 +308,7 @@ impl Revisions {
         if self.waiting == Some(number) {
             self.waiting = None;
         }
-        self.enter(Phase::StartingTrial { number, trial });
+        self.enter(RevisionPhase::StartingTrial { number, trial });
         Ok(number)
     }
 
@@ -316,11 +318,11 @@ impl Revisions {
     /// Why it is not confirmed.
     pub fn confirm(&mut self, now: Instant) -> core::result::Result<u32, Refused> {
         match self.phase {
-            Phase::Trial { number, until } if now < until => {
-                self.enter(Phase::Confirming { number, until });
+            RevisionPhase::Trial { number, until } if now < until => {
+                self.enter(RevisionPhase::Confirming { number, until });
                 Ok(number)
             }
-            Phase::Live | Phase::Trial { .. } => Err(Refused::NotOnTrial),
+            RevisionPhase::Live | RevisionPhase::Trial { .. } => Err(Refused::NotOnTrial),
             _ => Err(Refused::Busy),
         }
     }
@@ -332,15 +334,15 @@ impl Revisions {
     /// Why it is not taken back.
     pub fn roll_back(&mut self) -> core::result::Result<u32, Refused> {
         match (self.phase, self.previous) {
-            (Phase::Trial { number, .. }, _) => {
+            (RevisionPhase::Trial { number, .. }, _) => {
                 self.end_trial(number, Ended::TakenBack);
                 Ok(self.live)
             }
-            (Phase::Live, Some(number)) => {
-                self.enter(Phase::Returning { number });
+            (RevisionPhase::Live, Some(number)) => {
+                self.enter(RevisionPhase::Returning { number });
                 Ok(number)
             }
-            (Phase::Live, None) => Err(Refused::NoPrevious),
+            (RevisionPhase::Live, None) => Err(Refused::NoPrevious),
             _ => Err(Refused::Busy),
         }
     }
@@ -351,89 +353,102 @@ impl Revisions {
             return;
         }
         match (self.phase, result) {
-            (Phase::Storing { revision, forget }, Result::Stored(is_done)) => {
+            (RevisionPhase::Storing { revision, forget }, Result::Stored(is_done)) => {
                 if is_done {
                     self.kept.retain(|kept| Some(kept.number) != forget);
                     // `forget` made room.
                     let _ = self.kept.push(revision);
                     self.waiting = Some(revision.number);
                 }
-                self.enter(Phase::Live);
+                self.enter(RevisionPhase::Live);
             }
-            (Phase::StartingTrial { number, trial }, Result::Started(true)) => {
-                self.enter(Phase::Trial { number, until: now + trial });
+            (RevisionPhase::StartingTrial { number, trial }, Result::Started(true)) => {
+                self.enter(RevisionPhase::Trial { number, until: now + trial });
             }
-            (Phase::StartingTrial { number, .. }, Result::Started(false))
-            | (Phase::Trial { number, .. }, Result::Ended) => {
+            (RevisionPhase::StartingTrial { number, .. }, Result::Started(false))
+            | (RevisionPhase::Trial { number, .. }, Result::Ended) => {
                 self.end_trial(number, Ended::Failed);
             }
-            (Phase::Confirming { number, .. }, Result::Marked(true)) => {
+            (RevisionPhase::Confirming { number, .. }, Result::Marked(true)) => {
                 self.last = Some((number, Ended::Confirmed));
                 (self.previous, self.live) = (Some(self.live), number);
-                self.enter(Phase::Live);
+                self.enter(RevisionPhase::Live);
             }
-            (Phase::Confirming { number, until }, Result::Marked(false)) => {
-                self.enter(Phase::Trial { number, until })
+            (RevisionPhase::Confirming { number, until }, Result::Marked(false)) => {
+                self.enter(RevisionPhase::Trial { number, until })
             }
-            (Phase::Returning { number }, Result::Started(true)) => self.enter(Phase::Marking { number }),
-            (Phase::Returning { number }, Result::Started(false)) => self.end_trial(number, Ended::Failed),
-            (Phase::Marking { number }, Result::Marked(true)) => {
+            (RevisionPhase::Returning { number }, Result::Started(true)) => {
+                self.enter(RevisionPhase::Marking { number })
+            }
+            (RevisionPhase::Returning { number }, Result::Started(false)) => {
+                self.end_trial(number, Ended::Failed)
+            }
+            (RevisionPhase::Marking { number }, Result::Marked(true)) => {
                 (self.previous, self.live) = (Some(self.live), number);
-                self.enter(Phase::Live);
+                self.enter(RevisionPhase::Live);
             }
             // What runs must be what runs after a restart.
-            (Phase::Marking { number }, Result::Marked(false)) => self.end_trial(number, Ended::Failed),
-            (Phase::StartingLive { .. }, Result::Started(true)) => self.enter(Phase::Live),
-            (Phase::StartingLive { wait }, Result::Started(false)) => {
-                self.enter(Phase::Down { until: now + wait, wait })
+            (RevisionPhase::Marking { number }, Result::Marked(false)) => {
+                self.end_trial(number, Ended::Failed)
+            }
+            (RevisionPhase::StartingLive { .. }, Result::Started(true)) => self.enter(RevisionPhase::Live),
+            (RevisionPhase::StartingLive { wait }, Result::Started(false)) => {
+                self.enter(RevisionPhase::Down { until: now + wait, wait })
             }
             _ => {}
         }
     }
 
-    /// The next thing for the driver to do. Call it again until it is [`Output::Sleep`].
-    pub fn poll_output(&mut self, now: Instant) -> Output {
+    /// The next thing for the driver to do. Call it again until it is [`RevisionOutput::Sleep`].
+    pub fn poll_output(&mut self, now: Instant) -> RevisionOutput {
         match self.phase {
-            Phase::Trial { number, until } if now >= until => self.end_trial(number, Ended::NotConfirmed),
-            Phase::Down { until, wait } if now >= until => {
-                self.enter(Phase::StartingLive { wait: wait.saturating_mul(2).min(RETRY.1) });
+            RevisionPhase::Trial { number, until } if now >= until => {
+                self.end_trial(number, Ended::NotConfirmed)
+            }
+            RevisionPhase::Down { until, wait } if now >= until => {
+                self.enter(RevisionPhase::StartingLive { wait: wait.saturating_mul(2).min(RETRY.1) });
             }
             _ => {}
         }
         let until = match self.phase {
-            Phase::Trial { until, .. } | Phase::Down { until, .. } => until,
+            RevisionPhase::Trial { until, .. } | RevisionPhase::Down { until, .. } => until,
             _ => Instant::NEVER,
         };
         if !core::mem::take(&mut self.is_due) {
-            return Output::Sleep { until };
+            return RevisionOutput::Sleep { until };
         }
         match self.phase {
-            Phase::Storing { revision, forget } => Output::Store { revision, forget },
-            Phase::StartingTrial { number, .. } | Phase::Returning { number } => Output::Run { number },
-            Phase::StartingLive { .. } => Output::Run { number: self.live },
-            Phase::Confirming { number, .. } | Phase::Marking { number } => {
-                Output::Mark { live: number, previous: self.live }
+            RevisionPhase::Storing { revision, forget } => RevisionOutput::Store { revision, forget },
+            RevisionPhase::StartingTrial { number, .. } | RevisionPhase::Returning { number } => {
+                RevisionOutput::Run { number }
             }
-            Phase::Live | Phase::Trial { .. } | Phase::Down { .. } => Output::Sleep { until },
+            RevisionPhase::StartingLive { .. } => RevisionOutput::Run { number: self.live },
+            RevisionPhase::Confirming { number, .. } | RevisionPhase::Marking { number } => {
+                RevisionOutput::Mark { live: number, previous: self.live }
+            }
+            RevisionPhase::Live | RevisionPhase::Trial { .. } | RevisionPhase::Down { .. } => {
+                RevisionOutput::Sleep { until }
+            }
         }
     }
 
     /// Whether something new may begin.
     fn must_rest(&self) -> core::result::Result<(), Refused> {
         match self.phase {
-            Phase::Live => Ok(()),
-            Phase::Trial { .. } | Phase::Confirming { .. } => Err(Refused::OnTrial),
+            RevisionPhase::Live => Ok(()),
+            RevisionPhase::Trial { .. } | RevisionPhase::Confirming { .. } => Err(Refused::OnTrial),
             _ => Err(Refused::Busy),
         }
     }
 
     fn end_trial(&mut self, number: u32, why: Ended) {
         self.last = Some((number, why));
-        self.enter(Phase::StartingLive { wait: RETRY.0 });
+        self.enter(RevisionPhase::StartingLive { wait: RETRY.0 });
     }
 
-    fn enter(&mut self, phase: Phase) {
+    fn enter(&mut self, phase: RevisionPhase) {
         self.phase = phase;
-        self.is_due = !matches!(phase, Phase::Live | Phase::Trial { .. } | Phase::Down { .. });
+        self.is_due =
+            !matches!(phase, RevisionPhase::Live | RevisionPhase::Trial { .. } | RevisionPhase::Down { .. });
     }
 }

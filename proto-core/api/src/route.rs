@@ -1,11 +1,11 @@
 //! The table of endpoints: which method and path is which operation, who serves it, and what it asks for.
 
-use crate::request::{Head, Method, cut, trim};
+use crate::request::{HttpHead, Method, cut, trim};
 
 /// What a request asks for (docs/api.md).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
-pub enum Operation {
+pub enum ApiOperation {
     /// The page for people.
     Page,
     /// Who and what this is.
@@ -72,7 +72,7 @@ pub enum Operation {
     PutEdge,
 }
 
-impl Operation {
+impl ApiOperation {
     /// Whether its answer goes on until the client leaves.
     pub const fn is_endless(self) -> bool {
         matches!(self, Self::Stream | Self::Capture)
@@ -156,7 +156,7 @@ pub struct Route {
     /// The method; [`Method::Get`] stands for `HEAD` too, but for answers that go on.
     pub method: Method,
     /// What is done.
-    pub operation: Operation,
+    pub operation: ApiOperation,
     /// What it needs.
     pub access: Access,
     /// What its body is.
@@ -167,47 +167,68 @@ pub struct Route {
 
 /// All endpoints.
 pub const ROUTES: &[Route] = &[
-    route("/", Method::Get, Operation::Page, Access::Open, BodyType::None, ALL),
-    route("/api/v1/info", Method::Get, Operation::Info, Access::Read, BodyType::None, ALL),
-    route("/api/v1/status", Method::Get, Operation::Status, Access::Read, BodyType::None, ALL),
-    route("/api/v1/values", Method::Get, Operation::Values, Access::Read, BodyType::None, GATEWAYS),
-    route("/api/v1/metrics", Method::Get, Operation::Metrics, Access::Read, BodyType::None, GATEWAYS),
-    route("/api/v1/config", Method::Get, Operation::Config, Access::Read, BodyType::None, GATEWAYS),
-    route("/api/v1/config", Method::Put, Operation::PutConfig, Access::Write, BodyType::Toml, GATEWAY),
-    route("/api/v1/config", Method::Put, Operation::PutConfig, Access::Write, BodyType::Image, BOARD),
-    route("/api/v1/revisions", Method::Get, Operation::Revisions, Access::Read, BodyType::None, GATEWAYS),
-    route("/api/v1/stream", Method::Get, Operation::Stream, Access::Read, BodyType::None, ALL),
-    route("/api/v1/capture.pcapng", Method::Get, Operation::Capture, Access::Read, BodyType::None, GATEWAY),
-    route("/api/v1/schema", Method::Get, Operation::Schema, Access::Read, BodyType::None, GATEWAY),
-    route("/api/v1/export/dbc", Method::Get, Operation::ExportDbc, Access::Read, BodyType::None, GATEWAY),
-    route("/api/v1/export/lua", Method::Get, Operation::ExportLua, Access::Read, BodyType::None, GATEWAY),
-    route("/api/v1/export/md", Method::Get, Operation::ExportMap, Access::Read, BodyType::None, GATEWAY),
-    route("/api/v1/doctor", Method::Get, Operation::Doctor, Access::Read, BodyType::None, GATEWAY),
-    route("/api/v1/log", Method::Get, Operation::Log, Access::Read, BodyType::None, ALL),
-    route("/api/v1/bundle", Method::Get, Operation::Bundle, Access::Read, BodyType::None, HOSTS),
-    route("/api/v1/nonce", Method::Get, Operation::Nonce, Access::Open, BodyType::None, ALL),
-    route("/api/v1/check", Method::Post, Operation::Check, Access::Read, BodyType::Toml, HOSTS),
-    route("/api/v1/apply", Method::Post, Operation::Apply, Access::Write, BodyType::Json, GATEWAYS),
-    route("/api/v1/confirm", Method::Post, Operation::Confirm, Access::Write, BodyType::Json, GATEWAYS),
-    route("/api/v1/rollback", Method::Post, Operation::Rollback, Access::Write, BodyType::Json, GATEWAYS),
-    route("/api/v1/identify", Method::Post, Operation::Identify, Access::Write, BodyType::Json, GATEWAYS),
-    route("/api/v1/pendant", Method::Post, Operation::Pendant, Access::Write, BodyType::Json, CONTROLLER),
-    route("/api/v1/update", Method::Get, Operation::Update, Access::Read, BodyType::None, GATEWAYS),
-    route("/api/v1/update", Method::Put, Operation::PutUpdate, Access::Write, BodyType::Image, GATEWAYS),
-    route("/api/v1/update/try", Method::Post, Operation::TryUpdate, Access::Write, BodyType::Json, GATEWAYS),
+    route("/", Method::Get, ApiOperation::Page, Access::Open, BodyType::None, ALL),
+    route("/api/v1/info", Method::Get, ApiOperation::Info, Access::Read, BodyType::None, ALL),
+    route("/api/v1/status", Method::Get, ApiOperation::Status, Access::Read, BodyType::None, ALL),
+    route("/api/v1/values", Method::Get, ApiOperation::Values, Access::Read, BodyType::None, GATEWAYS),
+    route("/api/v1/metrics", Method::Get, ApiOperation::Metrics, Access::Read, BodyType::None, GATEWAYS),
+    route("/api/v1/config", Method::Get, ApiOperation::Config, Access::Read, BodyType::None, GATEWAYS),
+    route("/api/v1/config", Method::Put, ApiOperation::PutConfig, Access::Write, BodyType::Toml, GATEWAY),
+    route("/api/v1/config", Method::Put, ApiOperation::PutConfig, Access::Write, BodyType::Image, BOARD),
+    route("/api/v1/revisions", Method::Get, ApiOperation::Revisions, Access::Read, BodyType::None, GATEWAYS),
+    route("/api/v1/stream", Method::Get, ApiOperation::Stream, Access::Read, BodyType::None, ALL),
     route(
-        "/api/v1/update/confirm",
+        "/api/v1/capture.pcapng",
+        Method::Get,
+        ApiOperation::Capture,
+        Access::Read,
+        BodyType::None,
+        GATEWAY,
+    ),
+    route("/api/v1/schema", Method::Get, ApiOperation::Schema, Access::Read, BodyType::None, GATEWAY),
+    route("/api/v1/export/dbc", Method::Get, ApiOperation::ExportDbc, Access::Read, BodyType::None, GATEWAY),
+    route("/api/v1/export/lua", Method::Get, ApiOperation::ExportLua, Access::Read, BodyType::None, GATEWAY),
+    route("/api/v1/export/md", Method::Get, ApiOperation::ExportMap, Access::Read, BodyType::None, GATEWAY),
+    route("/api/v1/doctor", Method::Get, ApiOperation::Doctor, Access::Read, BodyType::None, GATEWAY),
+    route("/api/v1/log", Method::Get, ApiOperation::Log, Access::Read, BodyType::None, ALL),
+    route("/api/v1/bundle", Method::Get, ApiOperation::Bundle, Access::Read, BodyType::None, HOSTS),
+    route("/api/v1/nonce", Method::Get, ApiOperation::Nonce, Access::Open, BodyType::None, ALL),
+    route("/api/v1/check", Method::Post, ApiOperation::Check, Access::Read, BodyType::Toml, HOSTS),
+    route("/api/v1/apply", Method::Post, ApiOperation::Apply, Access::Write, BodyType::Json, GATEWAYS),
+    route("/api/v1/confirm", Method::Post, ApiOperation::Confirm, Access::Write, BodyType::Json, GATEWAYS),
+    route("/api/v1/rollback", Method::Post, ApiOperation::Rollback, Access::Write, BodyType::Json, GATEWAYS),
+    route("/api/v1/identify", Method::Post, ApiOperation::Identify, Access::Write, BodyType::Json, GATEWAYS),
+    route("/api/v1/pendant", Method::Post, ApiOperation::Pendant, Access::Write, BodyType::Json, CONTROLLER),
+    route("/api/v1/update", Method::Get, ApiOperation::Update, Access::Read, BodyType::None, GATEWAYS),
+    route("/api/v1/update", Method::Put, ApiOperation::PutUpdate, Access::Write, BodyType::Image, GATEWAYS),
+    route(
+        "/api/v1/update/try",
         Method::Post,
-        Operation::ConfirmUpdate,
+        ApiOperation::TryUpdate,
         Access::Write,
         BodyType::Json,
         GATEWAYS,
     ),
-    route("/api/v1/update/back", Method::Post, Operation::EndUpdate, Access::Write, BodyType::Json, GATEWAYS),
-    route("/api/v1/edge", Method::Get, Operation::Edge, Access::Read, BodyType::None, GATEWAYS),
-    route("/api/v1/edge", Method::Put, Operation::PutEdge, Access::Write, BodyType::Image, GATEWAYS),
+    route(
+        "/api/v1/update/confirm",
+        Method::Post,
+        ApiOperation::ConfirmUpdate,
+        Access::Write,
+        BodyType::Json,
+        GATEWAYS,
+    ),
+    route(
+        "/api/v1/update/back",
+        Method::Post,
+        ApiOperation::EndUpdate,
+        Access::Write,
+        BodyType::Json,
+        GATEWAYS,
+    ),
+    route("/api/v1/edge", Method::Get, ApiOperation::Edge, Access::Read, BodyType::None, GATEWAYS),
+    route("/api/v1/edge", Method::Put, ApiOperation::PutEdge, Access::Write, BodyType::Image, GATEWAYS),
     // There is no key to be shown yet; the button stands for it.
-    route("/api/v1/claim", Method::Post, Operation::Claim, Access::Open, BodyType::Json, BOARD),
+    route("/api/v1/claim", Method::Post, ApiOperation::Claim, Access::Open, BodyType::Json, BOARD),
 ];
 
 const ALL: &[Served] = &[Served::Gateway, Served::Controller, Served::Board];
@@ -220,7 +241,7 @@ const BOARD: &[Served] = &[Served::Board];
 const fn route(
     path: &'static str,
     method: Method,
-    operation: Operation,
+    operation: ApiOperation,
     access: Access,
     body: BodyType,
     served: &'static [Served],
@@ -241,7 +262,7 @@ pub enum RouteError {
 ///
 /// # Errors
 /// If there is none.
-pub fn find(head: &Head<'_>, served: Served) -> Result<&'static Route, RouteError> {
+pub fn find(head: &HttpHead<'_>, served: Served) -> Result<&'static Route, RouteError> {
     let path = head.path();
     let here = || ROUTES.iter().filter(move |route| route.path == path && route.served.contains(&served));
     if let Some(route) = here().find(|route| route.takes(head.method)) {
@@ -279,7 +300,7 @@ mod tests {
     use std::string::String;
     use std::vec::Vec;
 
-    fn found(method: &str, path: &str, served: Served) -> Result<Operation, RouteError> {
+    fn found(method: &str, path: &str, served: Served) -> Result<ApiOperation, RouteError> {
         let mut buffer = HeadBuffer::new();
         buffer.push(format!("{method} {path} HTTP/1.1\r\nHost: a\r\n\r\n").as_bytes());
         find(&buffer.head().unwrap(), served).map(|route| route.operation)
@@ -326,9 +347,9 @@ mod tests {
     #[test]
     fn whatever_changes_something_is_no_get_and_needs_the_key() {
         for route in ROUTES {
-            let reads = route.method == Method::Get || route.operation == Operation::Check;
+            let reads = route.method == Method::Get || route.operation == ApiOperation::Check;
             // Without a key there is none to be shown.
-            let reads = reads || route.operation == Operation::Claim;
+            let reads = reads || route.operation == ApiOperation::Claim;
             assert_eq!(route.access == Access::Write, !reads, "{}", route.path);
             assert_eq!(route.body == BodyType::None, route.method == Method::Get, "{}", route.path);
         }

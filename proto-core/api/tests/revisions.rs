@@ -3,7 +3,9 @@
 
 use proptest::prelude::*;
 use proto_core::time::{Duration, Instant};
-use recipe_api::revisions::{Ended, MAX_REVISIONS, Output, Refused, Result, Revision, Revisions, Stored};
+use recipe_api::revisions::{
+    Ended, MAX_REVISIONS, Refused, Result, Revision, RevisionOutput, Revisions, Stored,
+};
 
 /// What may happen.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -115,7 +117,7 @@ impl World {
     fn drain(&mut self) {
         for _ in 0..20 {
             let output = self.machine.poll_output(self.now);
-            if let Output::Sleep { until } = output {
+            if let RevisionOutput::Sleep { until } = output {
                 assert!(until > self.now);
                 return;
             }
@@ -125,7 +127,7 @@ impl World {
             let is_done = self.fails != 1;
             self.fails = self.fails.saturating_sub(1);
             let result = match output {
-                Output::Store { revision, forget } => {
+                RevisionOutput::Store { revision, forget } => {
                     if is_done {
                         assert_ne!(forget, Some(self.store.live), "the live one is forgotten");
                         self.store.kept.retain(|kept| Some(kept.number) != forget);
@@ -133,12 +135,12 @@ impl World {
                     }
                     Result::Stored(is_done)
                 }
-                Output::Run { number } => {
+                RevisionOutput::Run { number } => {
                     assert!(self.has(number), "{number} is not kept");
                     self.runs = is_done.then_some(number);
                     Result::Started(is_done)
                 }
-                Output::Mark { live, previous } => {
+                RevisionOutput::Mark { live, previous } => {
                     assert_eq!(self.runs, Some(live), "what does not run is marked");
                     if is_done {
                         if self.asked == Some(live) {
@@ -148,7 +150,7 @@ impl World {
                     }
                     Result::Marked(is_done)
                 }
-                Output::Sleep { .. } => unreachable!(),
+                RevisionOutput::Sleep { .. } => unreachable!(),
             };
             self.machine.handle(self.now, result);
         }
@@ -282,9 +284,9 @@ fn what_does_not_start_is_taken_back_and_what_was_live_is_tried_again() {
     let mut failures = 0;
     for second in 0..60_u64 {
         world.now = Instant::ZERO + Duration::from_secs(second);
-        while let output @ Output::Run { .. } = world.machine.poll_output(world.now) {
+        while let output @ RevisionOutput::Run { .. } = world.machine.poll_output(world.now) {
             failures += 1;
-            assert!(failures == 1 || output == Output::Run { number: 1 });
+            assert!(failures == 1 || output == RevisionOutput::Run { number: 1 });
             world.machine.handle(world.now, Result::Started(false));
         }
         assert_eq!(world.machine.put(world.machine.base().unwrap(), 0), Err(Refused::Busy));

@@ -6,26 +6,26 @@ use proto_core::engine::LinkId;
 use proto_core::time::{Duration, Instant};
 
 use crate::controller::Controller;
-use crate::events::{Event, SOURCES, Source};
+use crate::events::{BoardEvent, InterruptSource, SOURCES};
 use crate::machine::say;
 
 /// What the device sends, and when, in microseconds: a frame in two pieces, another one, nothing more.
 const DEVICE: [(u64, &[u8]); 3] =
     [(12_000, &[0xFF, 0xFF, 0x01, 0xEE]), (12_100, &[0xEE]), (22_000, &[0xFF, 0xFF, 0x03, 0xEE, 0xEE])];
 
-pub(crate) struct Board {
+pub(crate) struct ModelBoard {
     now: Instant,
     /// What each source will have, and when.
-    queues: [Deque<(Instant, Event), 8>; SOURCES.len()],
+    queues: [Deque<(Instant, BoardEvent), 8>; SOURCES.len()],
     controller: Controller,
 }
 
-impl Board {
+impl ModelBoard {
     pub(crate) fn new() -> Self {
         let queues = SOURCES.map(|_| Deque::new());
         let mut board = Self { now: Instant::ZERO, queues, controller: Controller::new() };
         for (at, bytes) in DEVICE {
-            board.later(Source::LineReceived, at, Event::LineReceived(bytes));
+            board.later(InterruptSource::LineReceived, at, BoardEvent::LineReceived(bytes));
         }
         board
     }
@@ -35,7 +35,7 @@ impl Board {
     }
 
     /// What a source has by now; never waits.
-    pub(crate) fn receive(&mut self, source: Source) -> Option<Event> {
+    pub(crate) fn receive(&mut self, source: InterruptSource) -> Option<BoardEvent> {
         let queue = &mut self.queues[source as usize];
         queue.front().filter(|(at, _)| *at <= self.now)?;
         queue.pop_front().map(|(_, event)| event)
@@ -51,28 +51,28 @@ impl Board {
     pub(crate) fn port_send(&mut self, bytes: &[u8]) {
         say!("{:>6} us  to the device   {bytes:02X?}", self.now.as_micros());
         // 10 bits a byte at 115200 baud.
-        self.later(Source::LineSent, 87 * bytes.len() as u64, Event::LineSent);
+        self.later(InterruptSource::LineSent, 87 * bytes.len() as u64, BoardEvent::LineSent);
     }
 
     pub(crate) fn link_open(&mut self, link: LinkId) {
-        self.later(Source::Socket, 300, Event::LinkUp(link));
+        self.later(InterruptSource::Socket, 300, BoardEvent::LinkUp(link));
     }
 
     /// A reset: nothing more is heard of the connection.
     pub(crate) fn link_close(&mut self) {
-        self.queues[Source::Socket as usize].clear();
+        self.queues[InterruptSource::Socket as usize].clear();
     }
 
     pub(crate) fn link_send(&mut self, link: LinkId, request: &[u8]) {
         say!("{:>6} us  by Modbus       {request:02X?}", self.now.as_micros());
-        self.later(Source::Socket, 20, Event::LinkSent(link));
-        self.later(Source::Socket, 300, Event::LinkAcked(link));
+        self.later(InterruptSource::Socket, 20, BoardEvent::LinkSent(link));
+        self.later(InterruptSource::Socket, 300, BoardEvent::LinkAcked(link));
         if let Some(answer) = self.controller.answer(request) {
-            self.later(Source::Socket, 400, Event::LinkReceived(link, answer));
+            self.later(InterruptSource::Socket, 400, BoardEvent::LinkReceived(link, answer));
         }
     }
 
-    fn later(&mut self, source: Source, micros: u64, event: Event) {
+    fn later(&mut self, source: InterruptSource, micros: u64, event: BoardEvent) {
         let at = self.now + Duration::from_micros(micros);
         let _ = self.queues[source as usize].push_back((at, event));
     }

@@ -4,10 +4,10 @@ use proto_core::config::{ConfigError, GatewayConfig, OnStale, Port, Recipe};
 use proto_core::time::Duration;
 
 /// One port, one recipe, two fields, no commands, one safe value.
-pub(crate) type Config = GatewayConfig<1, 1, 2, 0, 1, 0>;
+pub(crate) type CellConfig = GatewayConfig<1, 1, 2, 0, 1, 0>;
 
 /// In place: a configuration does not pass over the stack.
-pub(crate) fn write(config: &mut Config) -> Result<(), ConfigError> {
+pub(crate) fn write(config: &mut CellConfig) -> Result<(), ConfigError> {
     config.set_controller("192.168.12.138")?;
     config.add_recipe(
         &Recipe::realtime("outputs")

@@ -11,16 +11,17 @@ pub(crate) const PORT: PortId = PortId(0);
 
 /// Where inputs come from: each is an interrupt on a real board.
 #[derive(Clone, Copy)]
-pub(crate) enum Source {
+pub(crate) enum InterruptSource {
     LineReceived,
     LineSent,
     Socket,
 }
 
-pub(crate) const SOURCES: [Source; 3] = [Source::LineReceived, Source::LineSent, Source::Socket];
+pub(crate) const SOURCES: [InterruptSource; 3] =
+    [InterruptSource::LineReceived, InterruptSource::LineSent, InterruptSource::Socket];
 
 /// Something that happened.
-pub(crate) enum Event {
+pub(crate) enum BoardEvent {
     LineReceived(&'static [u8]),
     LineSent,
     LinkUp(LinkId),
@@ -29,7 +30,7 @@ pub(crate) enum Event {
     LinkReceived(LinkId, Vec<u8, MAX_ANSWER>),
 }
 
-impl Event {
+impl BoardEvent {
     pub(crate) fn show(&self, now: Instant) {
         if let Self::LineReceived(bytes) = self {
             say!("{:>6} us  from the device {bytes:02X?}", now.as_micros());

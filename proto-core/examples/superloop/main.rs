@@ -14,22 +14,22 @@ use proto_core::engine::{Engine, Input, OUTPUT_BUFFER, Output};
 use proto_core::time::Instant;
 use static_cell::ConstStaticCell;
 
-use board::Board;
-use configuration::Config;
+use board::ModelBoard;
+use configuration::CellConfig;
 use events::{PORT, SOURCES};
 use machine::say;
 
 /// One field port, one recipe link, one user-defined field in each direction.
-type Gateway = Engine<1, 1, 1, 0, 0>;
+type CellEngine = Engine<1, 1, 1, 0, 0>;
 
 fn superloop() {
-    static GATEWAY: ConstStaticCell<Gateway> = ConstStaticCell::new(Gateway::idle());
+    static GATEWAY: ConstStaticCell<CellEngine> = ConstStaticCell::new(CellEngine::idle());
     let gateway = GATEWAY.take();
     if let Err(reason) = configure(gateway) {
         say!("nothing runs: {reason}");
         return;
     }
-    let mut board = Board::new();
+    let mut board = ModelBoard::new();
     let mut until = pass(gateway, &mut board, Input::PortUp { port: PORT });
     while board.now() < Instant::from_millis(60) {
         // What has arrived, each source once, so that none keeps the time from passing.
@@ -49,7 +49,7 @@ fn superloop() {
 }
 
 /// One change, then everything that follows from it; returns when the engine is to be called again.
-fn pass(gateway: &mut Gateway, board: &mut Board, input: Input<'_>) -> Instant {
+fn pass(gateway: &mut CellEngine, board: &mut ModelBoard, input: Input<'_>) -> Instant {
     let mut out = [0; OUTPUT_BUFFER];
     gateway.handle(board.now(), input);
     loop {
@@ -71,8 +71,8 @@ fn main() {
 
 /// Not inlined: what it needs of the stack is free again when the loop begins.
 #[inline(never)]
-fn configure(gateway: &mut Gateway) -> Result<(), &'static str> {
-    static CONFIG: ConstStaticCell<Config> = ConstStaticCell::new(Config::empty());
+fn configure(gateway: &mut CellEngine) -> Result<(), &'static str> {
+    static CONFIG: ConstStaticCell<CellConfig> = ConstStaticCell::new(CellConfig::empty());
     let config = CONFIG.take();
     configuration::write(config).map_err(|_| "the configuration is wrong")?;
     gateway.configure(&*config).map_err(|_| "the configuration is refused")

@@ -1,7 +1,7 @@
 //! Settings of a board's edge node, and datagrams of a time server, right, changed and cut.
 
 use proto_core::time::Instant;
-use recipe_sparkplug::document::{Document, MAX_DOCUMENT};
+use recipe_sparkplug::document::{MAX_DOCUMENT, NodeDocument};
 use recipe_sparkplug::sntp::{PACKET, Sntp};
 
 use crate::source::Source;
@@ -42,7 +42,7 @@ fn document(mut input: Source<'_>) {
             bytes.push(b'R');
         }
     }
-    let mut document = Document::empty();
+    let mut document = NodeDocument::empty();
     if document.decode(&bytes) == Ok(true) {
         let mut written = [0; MAX_DOCUMENT];
         assert_eq!(document.encode(&mut written), Ok(&bytes[..]));

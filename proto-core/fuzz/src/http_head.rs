@@ -1,6 +1,6 @@
 //! Heads of HTTP requests: fields right, repeated and broken, in pieces, against a reader of whole lines.
 
-use recipe_api::request::{Head, HeadBuffer, HeadError, MAX_HEAD, Method};
+use recipe_api::request::{HeadBuffer, HeadError, HttpHead, MAX_HEAD, Method};
 
 use crate::source::Source;
 
@@ -92,7 +92,7 @@ pub(crate) fn run(input: &[u8]) {
     compare(std::str::from_utf8(&bytes[..end]).ok(), read);
 }
 
-fn compare(text: Option<&str>, read: Result<Head<'_>, HeadError>) {
+fn compare(text: Option<&str>, read: Result<HttpHead<'_>, HeadError>) {
     let Some(text) = text else {
         // No field of ours may hold such bytes; another one may.
         return;

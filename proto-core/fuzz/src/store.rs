@@ -4,33 +4,33 @@
 use std::collections::BTreeMap;
 
 use recipe_store::{
-    Adoption, BLANK, Flash, Geometry, Key, MAX_DATA, Marks, MountError, Place, Put, Step, Store, Trial, WORD,
-    Word,
+    Adoption, BLANK, Flash, FlashWord, Geometry, MAX_DATA, Marks, MountError, Put, PutStep, RecordKey, Store,
+    Trial, WORD, Word,
 };
 
 use crate::image::crc32;
 use crate::source::Source;
 
 /// By their numbers on the flash.
-const KEYS: [Key; 18] = [
-    Key::Image(0),
-    Key::Image(1),
-    Key::Image(2),
-    Key::Image(3),
-    Key::Image(4),
-    Key::Image(5),
-    Key::Image(6),
-    Key::Image(7),
-    Key::Marks,
-    Key::Access,
-    Key::BirthSequence,
-    Key::Adopted,
-    Key::Counter(0),
-    Key::Counter(1),
-    Key::Counter(2),
-    Key::Edge,
-    Key::Slots,
-    Key::Generation,
+const KEYS: [RecordKey; 18] = [
+    RecordKey::Image(0),
+    RecordKey::Image(1),
+    RecordKey::Image(2),
+    RecordKey::Image(3),
+    RecordKey::Image(4),
+    RecordKey::Image(5),
+    RecordKey::Image(6),
+    RecordKey::Image(7),
+    RecordKey::Marks,
+    RecordKey::Access,
+    RecordKey::BirthSequence,
+    RecordKey::Adopted,
+    RecordKey::Counter(0),
+    RecordKey::Counter(1),
+    RecordKey::Counter(2),
+    RecordKey::Edge,
+    RecordKey::Slots,
+    RecordKey::Generation,
 ];
 
 /// Value and data of each key.
@@ -45,7 +45,7 @@ struct Nor {
 }
 
 impl Nor {
-    fn at(&self, place: Place) -> usize {
+    fn at(&self, place: FlashWord) -> usize {
         assert!(place.sector < self.geometry.sectors && place.word < self.geometry.words, "{place:?}");
         usize::from(place.sector) * usize::from(self.geometry.words) + usize::from(place.word)
     }
@@ -55,7 +55,7 @@ impl Nor {
         &self.words[usize::from(sector) * words..][..words]
     }
 
-    fn do_write(&mut self, place: Place, word: &Word) {
+    fn do_write(&mut self, place: FlashWord, word: &Word) {
         let at = self.at(place);
         assert_eq!(self.words[at], BLANK, "a word is written twice: {place:?}");
         self.writes += 1;
@@ -64,7 +64,7 @@ impl Nor {
     }
 
     fn do_erase(&mut self, sector: u8) {
-        let (at, words) = (self.at(Place { sector, word: 0 }), usize::from(self.geometry.words));
+        let (at, words) = (self.at(FlashWord { sector, word: 0 }), usize::from(self.geometry.words));
         self.words[at..at + words].fill(BLANK);
     }
 }
@@ -74,11 +74,11 @@ impl Flash for Nor {
         self.geometry
     }
 
-    fn read(&self, place: Place) -> Word {
+    fn read(&self, place: FlashWord) -> Word {
         self.words[self.at(place)]
     }
 
-    async fn write(&mut self, place: Place, word: &Word) {
+    async fn write(&mut self, place: FlashWord, word: &Word) {
         self.do_write(place, word);
     }
 
@@ -121,12 +121,12 @@ pub(crate) fn run(input: &[u8]) {
 fn fill(flash: &mut Nor, input: &mut Source<'_>) {
     let (kind, sector) = (input.u8(), input.u8() % flash.geometry.sectors);
     let word = u16::from(input.u8()) % flash.geometry.words;
-    let at = flash.at(Place { sector, word });
+    let at = flash.at(FlashWord { sector, word });
     match kind % 8 {
         0..=2 => {
             let version = if kind & 0x80 == 0 { 1_u32 } else { u32::from(input.u8()) };
             let parts = [*b"RGSs", version.to_le_bytes(), sequence(input).to_le_bytes()];
-            let at = flash.at(Place { sector, word: 0 });
+            let at = flash.at(FlashWord { sector, word: 0 });
             flash.words[at] = sealed(&parts.concat());
         }
         3..=5 => {
@@ -268,10 +268,10 @@ fn change(store: &mut Store, flash: &mut Nor, input: &mut Source<'_>, held: &Hel
                 trial.map(|number| Trial { number, attempts: input.u8() % 4, confirm_s: input.u16() });
             // Some name one whose trial has ended; a wrong number is refused like the others.
             let ways = [
-                recipe_store::Ended::Confirmed,
-                recipe_store::Ended::NotConfirmed,
-                recipe_store::Ended::TakenBack,
-                recipe_store::Ended::Failed,
+                recipe_store::TrialEnd::Confirmed,
+                recipe_store::TrialEnd::NotConfirmed,
+                recipe_store::TrialEnd::TakenBack,
+                recipe_store::TrialEnd::Failed,
             ];
             let last = match kind >> 3 & 1 {
                 1 => live.map(|number| (number, ways[usize::from(kind >> 4) % ways.len()])),
@@ -342,10 +342,10 @@ fn carry_out(mut put: Put<'_, '_>, flash: &mut Nor, cut: Option<u32>) -> Ended {
             return Ended::Cut;
         }
         match put.next(flash) {
-            Step::Erase(sector) => flash.do_erase(sector),
-            Step::Write(place, word) => flash.do_write(place, &word),
-            Step::End(Ok(())) => return Ended::Well,
-            Step::End(Err(_)) => return Ended::Badly,
+            PutStep::Erase(sector) => flash.do_erase(sector),
+            PutStep::Write(place, word) => flash.do_write(place, &word),
+            PutStep::End(Ok(())) => return Ended::Well,
+            PutStep::End(Err(_)) => return Ended::Badly,
         }
     }
     unreachable!("it is counted")

@@ -1,8 +1,8 @@
 //! Update files and headers of firmware: anything, right ones, and right ones changed (docs/update.md section 3).
 
 use recipe_update::{
-    BoardName, FILE_HEAD, Formats, HEADER, Header, Parts, PublicKey, Slot, UpdateFile, Version, file_head,
-    link_padding,
+    BoardName, FILE_HEAD, Formats, HEADER, Header, ImageFacts, PublicKey, Slot, UpdateFile, Version,
+    file_head, link_padding,
 };
 
 use crate::image::crc32;
@@ -48,7 +48,7 @@ fn file(input: &mut Source<'_>) -> Vec<u8> {
     for nth in 0..count {
         let slot = Slot::of_number(nth % 2).expect("there are two");
         let minor = if input.u8() == 0xFF { minor ^ 1 } else { minor };
-        let parts = Parts {
+        let parts = ImageFacts {
             board: BoardName::parse("nucleo-h743zi").expect("a name"),
             slot,
             version: Version::new(0, minor.into(), 1),

@@ -15,7 +15,7 @@ use std::{env, fs};
 
 mod version;
 
-type Failure = Box<dyn std::error::Error>;
+type AnyError = Box<dyn std::error::Error>;
 
 fn main() -> ExitCode {
     let arguments: Vec<String> = env::args().skip(1).collect();
@@ -38,7 +38,7 @@ fn main() -> ExitCode {
     }
 }
 
-fn items(json: &str) -> Result<BTreeSet<String>, Failure> {
+fn items(json: &str) -> Result<BTreeSet<String>, AnyError> {
     let builder = public_api::Builder::from_rustdoc_json(json);
     let api = builder.omit_blanket_impls(true).omit_auto_trait_impls(true).build()?;
     let items = api.items().map(ToString::to_string);
@@ -46,7 +46,7 @@ fn items(json: &str) -> Result<BTreeSet<String>, Failure> {
     Ok(items.filter(|item| !item.contains("proto_core::docs")).collect())
 }
 
-fn check(json: &str, release: &str) -> Result<(), Failure> {
+fn check(json: &str, release: &str) -> Result<(), AnyError> {
     let release = fs::read_to_string(release)?;
     let (version, released) = release.split_once('\n').ok_or("the release has no version")?;
     let now = items(json)?;
@@ -62,7 +62,7 @@ fn check(json: &str, release: &str) -> Result<(), Failure> {
     Err(format!("{current} promises what {version} had, and the items above are gone or changed").into())
 }
 
-fn header() -> Result<(), Failure> {
+fn header() -> Result<(), AnyError> {
     let capi = Path::new(env!("CARGO_MANIFEST_DIR")).join("../capi");
     let config = cbindgen::Config::from_file(capi.join("cbindgen.toml"))?;
     let bindings = cbindgen::Builder::new().with_config(config).with_crate(capi).generate()?;

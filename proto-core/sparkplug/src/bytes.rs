@@ -4,20 +4,20 @@
 
 /// A buffer that is being written.
 #[derive(Debug)]
-pub(crate) struct Out<'b> {
+pub(crate) struct ByteWriter<'b> {
     buf: &'b mut [u8],
     len: usize,
 }
 
-impl<'b> Out<'b> {
+impl<'b> ByteWriter<'b> {
     /// Writes from the beginning of the buffer on.
     pub(crate) fn new(buf: &'b mut [u8]) -> Self {
         Self { buf, len: 0 }
     }
 
     /// The number of bytes that `write` writes.
-    pub(crate) fn count(write: impl FnOnce(&mut Out<'_>)) -> usize {
-        let mut out = Out { buf: &mut [], len: 0 };
+    pub(crate) fn count(write: impl FnOnce(&mut ByteWriter<'_>)) -> usize {
+        let mut out = ByteWriter { buf: &mut [], len: 0 };
         write(&mut out);
         out.len
     }
@@ -55,13 +55,13 @@ mod tests {
     #[test]
     fn what_does_not_fit_is_counted_and_not_given() {
         let mut buf = [0xA5; 4];
-        let mut out = Out::new(&mut buf);
+        let mut out = ByteWriter::new(&mut buf);
         out.put(b"abc");
         assert_eq!((out.len(), out.finish()), (3, Some(&b"abc"[..])));
-        let mut out = Out::new(&mut buf);
+        let mut out = ByteWriter::new(&mut buf);
         out.put(b"abc");
         out.put(b"de");
         assert_eq!((out.len(), out.finish()), (5, None));
-        assert_eq!(Out::count(|out| out.put(&[0; 1000])), 1000);
+        assert_eq!(ByteWriter::count(|out| out.put(&[0; 1000])), 1000);
     }
 }

@@ -4,11 +4,11 @@ use proto_core::time::Instant;
 
 /// Milliseconds of UTC for instants.
 #[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct Clock {
+pub(crate) struct UtcClock {
     known: Option<(Instant, u64)>,
 }
 
-impl Clock {
+impl UtcClock {
     /// Nobody has told it yet.
     pub(crate) const fn unknown() -> Self {
         Self { known: None }
@@ -40,7 +40,7 @@ mod tests {
 
     #[test]
     fn instants_before_and_after_are_told() {
-        let mut clock = Clock::default();
+        let mut clock = UtcClock::default();
         let at = Instant::from_millis;
         assert_eq!((clock.is_known(), clock.at(at(5_000))), (false, 5_000));
         assert!(clock.set(at(5_000), 1_700_000_000_000));

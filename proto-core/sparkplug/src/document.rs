@@ -13,9 +13,9 @@ use heapless::{String, Vec};
 use proto_core::sysvar::{Direction, SysVar, VarRange};
 use proto_core::time::Duration;
 
-use crate::bytes::Out;
-use crate::gateway::Rule;
-use crate::node::{Settings, Text};
+use crate::bytes::ByteWriter;
+use crate::gateway::PublishRule;
+use crate::node::{Credential, Settings};
 use crate::topic::{Id, IdError};
 
 /// The most bytes of a document.
@@ -30,7 +30,7 @@ pub type Host = String<MAX_HOST>;
 
 /// What a board's edge node is to tell, and where.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Document {
+pub struct NodeDocument {
     /// The broker's name or IPv4 address.
     pub host: Host,
     /// Its TCP port.
@@ -48,7 +48,7 @@ pub struct Document {
     /// Variables of the controller that are told beside those that field ports send.
     pub values: Vec<VarRange, MAX_RULES>,
     /// Exceptions.
-    pub rules: Vec<Rule, MAX_RULES>,
+    pub rules: Vec<PublishRule, MAX_RULES>,
 }
 
 /// Why bytes are no document, or settings cannot be one.
@@ -88,7 +88,7 @@ pub enum DocumentError {
     },
 }
 
-impl Document {
+impl NodeDocument {
     /// Settings that are not known yet; all bytes are zero.
     pub const fn empty() -> Self {
         Self {
@@ -171,7 +171,7 @@ impl Document {
                 return Err(wrong("a dead band"));
             }
             let min_interval = from.flag("a rule")?.then(|| from.time("a rule's interval")).transpose()?;
-            self.rules.push(Rule { vars, dead_band, min_interval }).map_err(|_| wrong("the rules"))?;
+            self.rules.push(PublishRule { vars, dead_band, min_interval }).map_err(|_| wrong("the rules"))?;
         }
         Ok(())
     }
@@ -181,7 +181,7 @@ impl Document {
     /// # Errors
     /// If a board would refuse it.
     pub fn encode<'b>(&self, buf: &'b mut [u8]) -> Result<&'b [u8], DocumentError> {
-        let mut out = Out::new(buf);
+        let mut out = ByteWriter::new(buf);
         begin(&mut out, true);
         text(&mut out, &self.host);
         out.put(&self.port.to_le_bytes());
@@ -232,22 +232,22 @@ impl Document {
 /// The document that says that nothing is told.
 pub const OFF: [u8; 6] = [b'R', b'G', b'W', b'E', VERSION, 0];
 
-fn begin(out: &mut Out<'_>, tells: bool) {
+fn begin(out: &mut ByteWriter<'_>, tells: bool) {
     out.put(&MAGIC);
     out.put(&[VERSION, tells.into()]);
 }
 
-fn text(out: &mut Out<'_>, text: &str) {
+fn text(out: &mut ByteWriter<'_>, text: &str) {
     // The longest text of all has fewer; a longer one would be refused by its reader.
     out.byte(u8::try_from(text.len()).unwrap_or(u8::MAX));
     out.put(text.as_bytes());
 }
 
-fn time(out: &mut Out<'_>, time: Duration) {
+fn time(out: &mut ByteWriter<'_>, time: Duration) {
     out.put(&u32::try_from(time.as_millis()).unwrap_or(u32::MAX).to_le_bytes());
 }
 
-fn range(out: &mut Out<'_>, range: VarRange) {
+fn range(out: &mut ByteWriter<'_>, range: VarRange) {
     let ordinal =
         |var: Option<SysVar>| var.and_then(|var| u8::try_from(var.ordinal()).ok()).unwrap_or(u8::MAX);
     out.put(&[ordinal(range.iter().next()), ordinal(range.iter().last())]);
@@ -285,12 +285,12 @@ impl<'a> From<'a> {
     }
 
     /// A text of MQTT, which may be empty.
-    fn text(&mut self, of: &'static str) -> Result<Text, DocumentError> {
+    fn text(&mut self, of: &'static str) -> Result<Credential, DocumentError> {
         let text = self.str(of)?;
-        Text::new(text).filter(|_| !text.contains('\0')).ok_or(DocumentError::Value { of })
+        Credential::new(text).filter(|_| !text.contains('\0')).ok_or(DocumentError::Value { of })
     }
 
-    fn known_text(&mut self, of: &'static str) -> Result<Text, DocumentError> {
+    fn known_text(&mut self, of: &'static str) -> Result<Credential, DocumentError> {
         self.text(of).and_then(|text| match text.as_str() {
             "" => Err(DocumentError::Value { of }),
             _ => Ok(text),

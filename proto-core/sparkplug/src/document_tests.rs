@@ -11,13 +11,13 @@ fn of(name: &str) -> VarRange {
 }
 
 /// A document with everything in it.
-pub(crate) fn full() -> Document {
+pub(crate) fn full() -> NodeDocument {
     let mut settings = Settings::new(id("hall 1"), id("press 4"));
-    settings.login = Some((Text::new("press").unwrap(), Text::new("cold steel").unwrap()));
+    settings.login = Some((Credential::new("press").unwrap(), Credential::new("cold steel").unwrap()));
     settings.primary_host = Some(id("scada"));
     settings.keep_alive = Duration::from_secs(65_535);
-    let rule = |name, dead_band, min_interval| Rule { vars: of(name), dead_band, min_interval };
-    Document {
+    let rule = |name, dead_band, min_interval| PublishRule { vars: of(name), dead_band, min_interval };
+    NodeDocument {
         host: Host::try_from("broker.plant-1.example").unwrap(),
         port: 1883,
         settings,
@@ -35,12 +35,12 @@ pub(crate) fn full() -> Document {
     }
 }
 
-fn bytes_of(document: &Document) -> Bytes<u8> {
+fn bytes_of(document: &NodeDocument) -> Bytes<u8> {
     document.encode(&mut [0xA5; MAX_DOCUMENT]).unwrap().to_vec()
 }
 
-fn read(bytes: &[u8]) -> Result<Option<Document>, DocumentError> {
-    let mut document = Document::empty();
+fn read(bytes: &[u8]) -> Result<Option<NodeDocument>, DocumentError> {
+    let mut document = NodeDocument::empty();
     document.decode(bytes).map(|tells| tells.then_some(document))
 }
 
@@ -86,7 +86,7 @@ fn cut_or_longer_bytes_are_refused() {
 #[test]
 fn the_longest_document_has_room() {
     let mut document = full();
-    let text = Text::new(&"x".repeat(crate::node::MAX_TEXT)).unwrap();
+    let text = Credential::new(&"x".repeat(crate::node::MAX_TEXT)).unwrap();
     let name = id(&"n".repeat(64));
     document.host = Host::try_from(&*"h".repeat(MAX_HOST)).unwrap();
     document.time_server = Some((document.host.clone(), 123));
@@ -95,14 +95,14 @@ fn the_longest_document_has_room() {
     (settings.client_id, settings.login) = (text.clone(), Some((text.clone(), text)));
     document.values = (0..MAX_RULES).map(|_| of("RobotState[1..6]")).collect();
     let interval = Some(Duration::from_secs(1));
-    let rule = Rule { vars: of("ForceEnd[1..6]"), dead_band: 0.5, min_interval: interval };
+    let rule = PublishRule { vars: of("ForceEnd[1..6]"), dead_band: 0.5, min_interval: interval };
     document.rules = (0..MAX_RULES).map(|_| rule).collect();
     assert_eq!(read(&bytes_of(&document)), Ok(Some(document)));
 }
 
 #[test]
 fn what_cannot_be_is_refused_with_its_place() {
-    let wrong = |change: &dyn Fn(&mut Document), of: &'static str| {
+    let wrong = |change: &dyn Fn(&mut NodeDocument), of: &'static str| {
         let mut document = full();
         change(&mut document);
         let mut buf = vec![0; MAX_DOCUMENT];
@@ -112,8 +112,8 @@ fn what_cannot_be_is_refused_with_its_place() {
     wrong(&|document| document.host = Host::try_from("a b").unwrap(), "the broker");
     wrong(&|document| document.host = Host::try_from("::1").unwrap(), "the broker");
     wrong(&|document| document.port = 0, "the port");
-    wrong(&|document| document.settings.client_id = Text::default(), "the client's name");
-    wrong(&|document| document.settings.client_id = Text::new("a\0").unwrap(), "the client's name");
+    wrong(&|document| document.settings.client_id = Credential::default(), "the client's name");
+    wrong(&|document| document.settings.client_id = Credential::new("a\0").unwrap(), "the client's name");
     wrong(&|document| document.settings.keep_alive = Duration::from_secs(4), "the keep-alive");
     wrong(&|document| document.sample = Duration::from_millis(99), "the sample's time");
     wrong(&|document| document.interval = Duration::from_millis(3_600_001), "the interval");

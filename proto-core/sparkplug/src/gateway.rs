@@ -15,7 +15,7 @@ use proto_core::time::Duration;
 use proto_core::wire::scalar::{Scalar, ScalarType};
 
 use crate::catalog::{Catalog, MAX_NAME, Metric, Owner, Report};
-use crate::node::Counters;
+use crate::node::NodeCounters;
 use crate::topic::MAX_ID;
 use crate::value::{DataType, Value};
 
@@ -36,14 +36,14 @@ pub struct Rates<'c> {
     /// Same, for counters and the time since the start, which always change.
     pub counter_interval: Duration,
     /// The last one that has a variable counts for it.
-    pub rules: &'c [Rule],
+    pub rules: &'c [PublishRule],
     /// Variables of the controller that are told though no port sends them.
     pub values: &'c [VarRange],
 }
 
 /// How some variables are told.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Rule {
+pub struct PublishRule {
     /// The variables.
     pub vars: VarRange,
     /// A number is told when it is further than this from the last one told.
@@ -57,33 +57,33 @@ pub struct Rule {
 pub struct GatewayCatalog<'c, const METRICS: usize> {
     rates: Rates<'c>,
     version: &'static str,
-    ports: Vec<Port, MAX_PORTS>,
-    links: Vec<Name, MAX_LINKS>,
+    ports: Vec<NodeDevice, MAX_PORTS>,
+    links: Vec<DeviceName, MAX_LINKS>,
     items: Vec<MetricItem, METRICS>,
     /// Where the items of the node and of each port begin, and where the last ones end.
     starts: Vec<usize, { MAX_PORTS + 2 }>,
 }
 
-type Name = String<MAX_ID>;
+type DeviceName = String<MAX_ID>;
 
 /// What is told, and the number of the rule for it.
 #[derive(Debug, Clone, Copy)]
 struct MetricItem {
-    item: Item,
+    item: MetricSource,
     /// [`NO_RULE`] if there is none.
     rule: u8,
 }
 
 #[derive(Debug, Clone)]
-struct Port {
+struct NodeDevice {
     /// Its index in the configuration.
     index: u8,
     /// Its name, as a part of a topic.
-    device: Name,
+    device: DeviceName,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Item {
+enum MetricSource {
     Version,
     Uptime,
     Condition,
@@ -132,20 +132,30 @@ impl<'c, const METRICS: usize> GatewayCatalog<'c, METRICS> {
             starts: Vec::new(),
         };
         for (index, port, _) in config.field_ports() {
-            catalog.ports.push(Port { index, device: part_of_topic(&port.name) }).map_err(|_| NoRoom)?;
+            catalog
+                .ports
+                .push(NodeDevice { index, device: part_of_topic(&port.name) })
+                .map_err(|_| NoRoom)?;
         }
         catalog.begin_owner()?;
-        for item in [Item::Version, Item::Uptime, Item::Condition, Item::Sleeps, Item::Lost, Item::Refused] {
+        for item in [
+            MetricSource::Version,
+            MetricSource::Uptime,
+            MetricSource::Condition,
+            MetricSource::Sleeps,
+            MetricSource::Lost,
+            MetricSource::Refused,
+        ] {
             catalog.add(item)?;
         }
         for nth in (0..).take(catalog.ports.len()) {
-            catalog.add(Item::Alive(nth))?;
+            catalog.add(MetricSource::Alive(nth))?;
         }
         for (nth, link) in (0..).zip(status.links()) {
             catalog.links.push(part_of_topic(link.name)).map_err(|_| NoRoom)?;
-            catalog.add(Item::Link(nth))?;
+            catalog.add(MetricSource::Link(nth))?;
         }
-        for item in [Item::Mode, Item::Robot, Item::Program, Item::Safety] {
+        for item in [MetricSource::Mode, MetricSource::Robot, MetricSource::Program, MetricSource::Safety] {
             catalog.add(item)?;
         }
         for var in SysVar::all().filter(|var| var.direction() == Direction::Output) {
@@ -155,19 +165,25 @@ impl<'c, const METRICS: usize> GatewayCatalog<'c, METRICS> {
             });
             let is_asked = || rates.values.iter().any(|vars| vars.iter().any(|asked| asked == var));
             if is_sent || is_asked() {
-                catalog.add(Item::Var(var))?;
+                catalog.add(MetricSource::Var(var))?;
             }
         }
         for (_, port, recipe) in config.field_ports() {
             catalog.begin_owner()?;
-            for item in [Item::State, Item::FramesIn, Item::FramesOut, Item::Rejected, Item::Timeouts] {
+            for item in [
+                MetricSource::State,
+                MetricSource::FramesIn,
+                MetricSource::FramesOut,
+                MetricSource::Rejected,
+                MetricSource::Timeouts,
+            ] {
                 catalog.add(item)?;
             }
             for var in config.owned_by(port, recipe) {
-                catalog.add_once(Item::Var(var))?;
+                catalog.add_once(MetricSource::Var(var))?;
             }
             for bit in config.bits_written_by(recipe) {
-                catalog.add_once(Item::Bit(bit.var, bit.bit))?;
+                catalog.add_once(MetricSource::Bit(bit.var, bit.bit))?;
             }
         }
         catalog.begin_owner()?;
@@ -180,7 +196,7 @@ impl<'c, const METRICS: usize> GatewayCatalog<'c, METRICS> {
         &self,
         status: Status<'_>,
         uptime: Duration,
-        node: &Counters,
+        node: &NodeCounters,
         values: &mut [Option<Value>],
     ) -> u32 {
         self.sample_part(status, uptime, node, 0..self.items.len(), values);
@@ -202,7 +218,7 @@ impl<'c, const METRICS: usize> GatewayCatalog<'c, METRICS> {
         &self,
         status: Status<'_>,
         uptime: Duration,
-        node: &Counters,
+        node: &NodeCounters,
         part: Range<usize>,
         values: &mut [Option<Value>],
     ) {
@@ -223,42 +239,45 @@ impl<'c, const METRICS: usize> GatewayCatalog<'c, METRICS> {
                 };
                 let item = told.item;
                 *value = match item {
-                    Item::Version => Some(Value::Word(self.version)),
-                    Item::Uptime => Some(Value::UInt64(uptime.as_millis() / 1_000)),
-                    Item::Condition => Some(Value::Word(status.health().name())),
-                    Item::Sleeps => Some(Value::UInt32(status.sleeps())),
-                    Item::Lost => Some(Value::UInt64(node.lost)),
-                    Item::Refused => Some(Value::UInt32(node.refused)),
-                    Item::Alive(nth) => {
+                    MetricSource::Version => Some(Value::Word(self.version)),
+                    MetricSource::Uptime => Some(Value::UInt64(uptime.as_millis() / 1_000)),
+                    MetricSource::Condition => Some(Value::Word(status.health().name())),
+                    MetricSource::Sleeps => Some(Value::UInt32(status.sleeps())),
+                    MetricSource::Lost => Some(Value::UInt64(node.lost)),
+                    MetricSource::Refused => Some(Value::UInt32(node.refused)),
+                    MetricSource::Alive(nth) => {
                         Some(Value::Boolean(alive.checked_shr(nth.into()).unwrap_or(0) & 1 != 0))
                     }
-                    Item::Link(nth) => status.links().nth(nth.into()).map(|link| {
+                    MetricSource::Link(nth) => status.links().nth(nth.into()).map(|link| {
                         // Another link carries the traffic of a shared one.
                         Value::Boolean(matches!(link.state, LinkState::Up { .. } | LinkState::Shared))
                     }),
-                    Item::Mode | Item::Robot | Item::Program | Item::Safety => state_of(status, item),
-                    Item::State => port.map(|port| Value::Word(port.state.name())),
-                    Item::FramesIn => port.map(|port| Value::UInt32(port.counters.frames_in)),
-                    Item::FramesOut => port.map(|port| Value::UInt32(port.counters.frames_out)),
-                    Item::Rejected => port.map(|port| Value::UInt32(port.counters.rejected())),
-                    Item::Timeouts => port.map(|port| Value::UInt32(port.counters.timeouts)),
-                    Item::Var(var) => {
+                    MetricSource::Mode
+                    | MetricSource::Robot
+                    | MetricSource::Program
+                    | MetricSource::Safety => state_of(status, item),
+                    MetricSource::State => port.map(|port| Value::Word(port.state.name())),
+                    MetricSource::FramesIn => port.map(|port| Value::UInt32(port.counters.frames_in)),
+                    MetricSource::FramesOut => port.map(|port| Value::UInt32(port.counters.frames_out)),
+                    MetricSource::Rejected => port.map(|port| Value::UInt32(port.counters.rejected())),
+                    MetricSource::Timeouts => port.map(|port| Value::UInt32(port.counters.timeouts)),
+                    MetricSource::Var(var) => {
                         let known = status.variable(var);
                         let is_of_now = |age| var.direction() == Direction::Input || age <= MAX_AGE;
                         known.filter(|known| is_of_now(known.age)).map(|known| value_of(known.value))
                     }
                     // Set below, if it is known.
-                    Item::Bit(..) => None,
+                    MetricSource::Bit(..) => None,
                 };
             }
         }
         let here = || self.items.iter().enumerate().take(part.end).skip(part.start);
-        if !here().any(|(_, told)| matches!(told.item, Item::Bit(..))) {
+        if !here().any(|(_, told)| matches!(told.item, MetricSource::Bit(..))) {
             return;
         }
         for known in status.bits() {
             let Some(bit) = known.bit else { continue };
-            let wanted = Item::Bit(known.var, bit);
+            let wanted = MetricSource::Bit(known.var, bit);
             for (place, _) in here().filter(|(_, told)| told.item == wanted) {
                 if let (Some(value), Scalar::Byte(byte)) = (values.get_mut(place), known.value) {
                     *value = Some(Value::Boolean(byte != 0));
@@ -281,9 +300,9 @@ impl<'c, const METRICS: usize> GatewayCatalog<'c, METRICS> {
         self.starts.push(self.items.len()).map_err(|_| NoRoom)
     }
 
-    fn add(&mut self, item: Item) -> Result<(), NoRoom> {
+    fn add(&mut self, item: MetricSource) -> Result<(), NoRoom> {
         let rule = match item {
-            Item::Var(var) => {
+            MetricSource::Var(var) => {
                 let mut rules = (0_u8..NO_RULE).zip(self.rates.rules);
                 let last =
                     rules.by_ref().filter(|(_, rule)| rule.vars.iter().any(|known| known == var)).last();
@@ -295,7 +314,7 @@ impl<'c, const METRICS: usize> GatewayCatalog<'c, METRICS> {
     }
 
     /// Adds what the present owner does not have yet.
-    fn add_once(&mut self, item: Item) -> Result<(), NoRoom> {
+    fn add_once(&mut self, item: MetricSource) -> Result<(), NoRoom> {
         let start = self.starts.last().copied().unwrap_or(0);
         match self.items.iter().skip(start).any(|known| known.item == item) {
             true => Ok(()),
@@ -337,34 +356,38 @@ impl<const METRICS: usize> Catalog for GatewayCatalog<'_, METRICS> {
         let text = |name, description| plain(name, DataType::String, "", description);
         let count = |name, description| plain(name, DataType::UInt32, "", description);
         Some(match item {
-            Item::Version => text("Node Info/Version", "version of the gateway's program"),
-            Item::Uptime => {
+            MetricSource::Version => text("Node Info/Version", "version of the gateway's program"),
+            MetricSource::Uptime => {
                 plain("Node Info/Uptime", DataType::UInt64, "s", "time since the program started")
             }
-            Item::Condition => text("gateway/health", "the worst present condition"),
-            Item::Sleeps => count("gateway/sleeps", "times that the gateway itself did not run"),
-            Item::Lost => plain("gateway/values_lost", DataType::UInt64, "", "values that were never told"),
-            Item::Refused => count("gateway/commands_refused", "writes by commands, which are never obeyed"),
-            Item::Alive(nth) => Metric {
+            MetricSource::Condition => text("gateway/health", "the worst present condition"),
+            MetricSource::Sleeps => count("gateway/sleeps", "times that the gateway itself did not run"),
+            MetricSource::Lost => {
+                plain("gateway/values_lost", DataType::UInt64, "", "values that were never told")
+            }
+            MetricSource::Refused => {
+                count("gateway/commands_refused", "writes by commands, which are never obeyed")
+            }
+            MetricSource::Alive(nth) => Metric {
                 name: joined(&["port/", self.device(nth.into()), "/alive"]),
                 ..plain("", DataType::Boolean, "", "the field port works")
             },
-            Item::Link(nth) => Metric {
+            MetricSource::Link(nth) => Metric {
                 name: joined(&["link/", self.links.get(usize::from(nth))?, "/up"]),
                 ..plain("", DataType::Boolean, "", "the link to the controller is up")
             },
-            Item::Mode => text("controller/mode", "operation mode of the controller"),
-            Item::Robot => text("controller/robot", "robot state of the controller"),
-            Item::Program => text("controller/program", "program state of the controller"),
-            Item::Safety => text("controller/safety", "safety state of the controller"),
-            Item::State => text("state", "health of the field port"),
-            Item::FramesIn => count("frames/in", "frames accepted"),
-            Item::FramesOut => count("frames/out", "frames sent"),
-            Item::Rejected => {
+            MetricSource::Mode => text("controller/mode", "operation mode of the controller"),
+            MetricSource::Robot => text("controller/robot", "robot state of the controller"),
+            MetricSource::Program => text("controller/program", "program state of the controller"),
+            MetricSource::Safety => text("controller/safety", "safety state of the controller"),
+            MetricSource::State => text("state", "health of the field port"),
+            MetricSource::FramesIn => count("frames/in", "frames accepted"),
+            MetricSource::FramesOut => count("frames/out", "frames sent"),
+            MetricSource::Rejected => {
                 count("frames/rejected", "frames rejected, without those for other nodes of a CAN bus")
             }
-            Item::Timeouts => count("frames/timeouts", "times that a frame became overdue"),
-            Item::Var(var) => {
+            MetricSource::Timeouts => count("frames/timeouts", "times that a frame became overdue"),
+            MetricSource::Var(var) => {
                 let folder = if is_nodes { "controller/" } else { "" };
                 let mut name = joined(&[folder, var.group(), "/"]);
                 push_number(&mut name, var.index());
@@ -373,7 +396,7 @@ impl<const METRICS: usize> Catalog for GatewayCatalog<'_, METRICS> {
                 let range = Some(var.ty().range()).filter(|_| !is_float);
                 Metric { name, data_type, unit: unit_of(var), range, description: var.span().interface }
             }
-            Item::Bit(var, bit) => {
+            MetricSource::Bit(var, bit) => {
                 let mut name = joined(&[var.group(), "/"]);
                 push_number(&mut name, var.index());
                 let _ = name.push('/');
@@ -386,7 +409,14 @@ impl<const METRICS: usize> Catalog for GatewayCatalog<'_, METRICS> {
     fn report(&self, place: usize) -> Report {
         let usual = Report { dead_band: 0.0, min_interval: self.rates.min_interval };
         let Some(MetricItem { item, rule }) = self.items.get(place).copied() else { return usual };
-        if matches!(item, Item::Uptime | Item::FramesIn | Item::FramesOut | Item::Rejected | Item::Timeouts) {
+        if matches!(
+            item,
+            MetricSource::Uptime
+                | MetricSource::FramesIn
+                | MetricSource::FramesOut
+                | MetricSource::Rejected
+                | MetricSource::Timeouts
+        ) {
             return Report { min_interval: self.rates.counter_interval, ..usual };
         }
         self.rates.rules.get(usize::from(rule)).map_or(usual, |rule| Report {
@@ -434,20 +464,20 @@ fn value_of(scalar: Scalar) -> Value {
     }
 }
 
-fn state_of(status: Status<'_>, item: Item) -> Option<Value> {
+fn state_of(status: Status<'_>, item: MetricSource) -> Option<Value> {
     let controller = status.controller().filter(|controller| controller.age <= MAX_AGE)?;
     let states = controller.states;
     Some(Value::Word(match item {
-        Item::Mode => states.mode.name(),
-        Item::Robot => states.robot.name(),
-        Item::Program => states.program.name(),
+        MetricSource::Mode => states.mode.name(),
+        MetricSource::Robot => states.robot.name(),
+        MetricSource::Program => states.program.name(),
         _ => states.safety.name(),
     }))
 }
 
 /// A name with `_` for what topics give a meaning.
-fn part_of_topic(name: &str) -> Name {
-    let mut part = Name::new();
+fn part_of_topic(name: &str) -> DeviceName {
+    let mut part = DeviceName::new();
     for character in name.chars() {
         let is_reserved = matches!(character, '+' | '/' | '#') || character.is_control();
         let _ = part.push(if is_reserved { '_' } else { character });

@@ -3,22 +3,22 @@
 //! In: what a packet is to hold, and bytes of the peer in any pieces. Out: packets. Subscriptions are at QoS 1 and
 //! publications at QoS 0, so nothing waits for an acknowledgement and QoS 2 is a mistake of the peer.
 
-use crate::bytes::Out;
+use crate::bytes::ByteWriter;
 
 /// Writes a packet: `body` is called twice.
-pub(crate) fn packet(out: &mut Out<'_>, kind: u8, body: impl Fn(&mut Out<'_>)) {
-    header(out, kind, Out::count(&body));
+pub(crate) fn packet(out: &mut ByteWriter<'_>, kind: u8, body: impl Fn(&mut ByteWriter<'_>)) {
+    header(out, kind, ByteWriter::count(&body));
     body(out);
 }
 
 /// The beginning of a packet with so many bytes behind it.
-pub(crate) fn header(out: &mut Out<'_>, kind: u8, len: usize) {
+pub(crate) fn header(out: &mut ByteWriter<'_>, kind: u8, len: usize) {
     out.byte(kind);
     crate::protobuf::varint(out, len as u64);
 }
 
 /// Text or bytes with their length before them.
-pub(crate) fn text(out: &mut Out<'_>, bytes: &[u8]) {
+pub(crate) fn text(out: &mut ByteWriter<'_>, bytes: &[u8]) {
     // What is longer is refused where it comes from; here it would only be cut.
     let len = u16::try_from(bytes.len()).unwrap_or(u16::MAX);
     out.put(&len.to_be_bytes());
@@ -26,8 +26,8 @@ pub(crate) fn text(out: &mut Out<'_>, bytes: &[u8]) {
 }
 
 /// Same, of a text that `write` writes; it is called twice.
-pub(crate) fn text_of(out: &mut Out<'_>, write: impl Fn(&mut Out<'_>)) {
-    let len = u16::try_from(Out::count(&write)).unwrap_or(u16::MAX);
+pub(crate) fn text_of(out: &mut ByteWriter<'_>, write: impl Fn(&mut ByteWriter<'_>)) {
+    let len = u16::try_from(ByteWriter::count(&write)).unwrap_or(u16::MAX);
     out.put(&len.to_be_bytes());
     write(out);
 }

@@ -108,7 +108,7 @@ fn lengths_have_as_few_bytes_as_they_need() {
         (MAX_BODY, &[0x30, 0xFF, 0xFF, 0xFF, 0x7F]),
     ] {
         let mut buf = [0xA5; 8];
-        let mut out = Out::new(&mut buf);
+        let mut out = ByteWriter::new(&mut buf);
         header(&mut out, PUBLISH, len);
         assert_eq!(out.finish(), Some(bytes));
     }

@@ -1,6 +1,6 @@
 //! The edge node: sessions, births, data, deaths.
 //!
-//! In: [`Input`]s with the present. Out: [`Output`]s. A session is one connection: CONNECT with the death as its will,
+//! In: [`Input`]s with the present. Out: [`NodeOutput`]s. A session is one connection: CONNECT with the death as its will,
 //! the subscription to commands, births of the node and of each device that is alive, then data by exception. What
 //! changes while there is no session is kept and told later, marked as historical.
 
@@ -14,16 +14,16 @@ use heapless::{Deque, Vec};
 use proto_core::time::{Duration, Instant};
 
 use crate::catalog::{Catalog, MAX_DEVICES, Owner};
-use crate::clock::Clock;
+use crate::clock::UtcClock;
 use crate::history::{History, Past};
 use crate::mqtt::{Inbox, Packet, ProtocolError};
 use crate::payload::{self, Asked, HostState};
 use crate::topic;
 use crate::value::{DataType, Value};
-pub use io::{Counters, Failure, Input, NodeError, Output};
+pub use io::{Input, NodeCounters, NodeError, NodeOutput, SessionFailure};
 use maybe::Maybe;
 pub use messages::MAX_METRIC;
-pub use settings::{MAX_TEXT, Settings, Text};
+pub use settings::{Credential, MAX_TEXT, Settings};
 
 /// The least length of the buffer for [`EdgeNode::poll_output`]. A longer one gives fewer and longer pieces.
 pub const MIN_BUFFER: usize = 768;
@@ -35,11 +35,11 @@ const MAX_PACKET: usize = 512;
 #[derive(Debug, Clone)]
 pub struct EdgeNode<const METRICS: usize, const HISTORY: usize> {
     settings: Settings,
-    slots: Vec<Slot, METRICS>,
+    slots: Vec<NodeMetric, METRICS>,
     /// Where the metrics of the node and of each device begin, and where the last ones end.
     starts: Vec<u16, { MAX_DEVICES + 2 }>,
     history: History<HISTORY>,
-    clock: Clock,
+    clock: UtcClock,
     /// When the values were sampled.
     sampled_at: Instant,
     /// The date of the birth that is on its way, and of the values that it tells.
@@ -48,7 +48,7 @@ pub struct EdgeNode<const METRICS: usize, const HISTORY: usize> {
     alive: u32,
     born: u32,
     device_births: [Option<Instant>; MAX_DEVICES],
-    phase: Phase,
+    phase: NodePhase,
     inbox: Inbox<MAX_PACKET>,
     /// Publications to acknowledge.
     acks: Deque<u16, 8>,
@@ -65,13 +65,13 @@ pub struct EdgeNode<const METRICS: usize, const HISTORY: usize> {
     online_since: Option<Instant>,
     attempts: u32,
     random: u64,
-    failure: Maybe<Failure>,
-    counters: Counters,
+    failure: Maybe<SessionFailure>,
+    counters: NodeCounters,
 }
 
 /// One metric.
 #[derive(Debug, Clone, Copy)]
-struct Slot {
+struct NodeMetric {
     data_type: DataType,
     /// To be told.
     is_pending: bool,
@@ -83,7 +83,7 @@ struct Slot {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]
-enum Phase {
+enum NodePhase {
     /// No connection until then. It is the first, so that a node that is not made yet is all zeros.
     Idle {
         until: Instant,
@@ -145,13 +145,13 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
             slots: Vec::new(),
             starts: Vec::new(),
             history: History::new(),
-            clock: Clock::unknown(),
+            clock: UtcClock::unknown(),
             sampled_at: Instant::ZERO,
             dates: Dates { now_ms: 0, sampled_ms: 0, is_utc: false },
             alive: 0,
             born: 0,
             device_births: [None; MAX_DEVICES],
-            phase: Phase::Idle { until: Instant::ZERO },
+            phase: NodePhase::Idle { until: Instant::ZERO },
             inbox: Inbox::new(),
             acks: Deque::new(),
             seq: 0,
@@ -167,11 +167,11 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
             attempts: 0,
             random: 0,
             failure: Maybe::Nothing,
-            counters: Counters::NONE,
+            counters: NodeCounters::NONE,
         }
     }
 
-    /// A node without a session. `bd_seq` is what [`Output::Keep`] gave before a restart; `seed` is another one
+    /// A node without a session. `bd_seq` is what [`NodeOutput::Keep`] gave before a restart; `seed` is another one
     /// for each node, so that they do not all come back at the same time.
     ///
     /// # Errors
@@ -219,8 +219,13 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         }
         for place in 0..end {
             let data_type = catalog.metric(place).ok_or(NodeError::Metric { place })?.data_type;
-            let slot =
-                Slot { data_type, is_pending: false, current: None, published: None, published_at: None };
+            let slot = NodeMetric {
+                data_type,
+                is_pending: false,
+                current: None,
+                published: None,
+                published_at: None,
+            };
             let _ = self.slots.push(slot);
         }
         self.settings.clone_from(settings);
@@ -232,17 +237,17 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
     pub fn handle(&mut self, now: Instant, input: Input<'_>, catalog: &impl Catalog) {
         match input {
             Input::Opened => {
-                if let Phase::Opening { .. } = self.phase {
+                if let NodePhase::Opening { .. } = self.phase {
                     self.bd_seq = Some(self.bd_seq.map_or(0, |last| last.wrapping_add(1)));
                     self.inbox.clear();
                     self.acks.clear();
                     (self.host, self.pong_until, self.ping_at) = (Maybe::Nothing, None, Instant::NEVER);
-                    self.phase = Phase::Keep;
+                    self.phase = NodePhase::Keep;
                 }
             }
             Input::Closed => {
-                if !matches!(self.phase, Phase::Idle { .. } | Phase::Ended) {
-                    self.note(Failure::Closed);
+                if !matches!(self.phase, NodePhase::Idle { .. } | NodePhase::Ended) {
+                    self.note(SessionFailure::Closed);
                     self.leave_session(now);
                 }
             }
@@ -258,28 +263,28 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
     }
 
     /// Counts since the node was made.
-    pub fn counters(&self) -> Counters {
-        Counters { lost: self.history.lost(), kept: self.history.len(), ..self.counters }
+    pub fn counters(&self) -> NodeCounters {
+        NodeCounters { lost: self.history.lost(), kept: self.history.len(), ..self.counters }
     }
 
     /// Why the last session or attempt failed; `None` while there is a session.
-    pub const fn failure(&self) -> Option<Failure> {
+    pub const fn failure(&self) -> Option<SessionFailure> {
         self.failure.get()
     }
 
     /// Whether the node and its devices were born and data is told.
     pub const fn is_online(&self) -> bool {
-        matches!(self.phase, Phase::Online)
+        matches!(self.phase, NodePhase::Online)
     }
 
     /// Whether there is a connection, as far as the driver has said.
     pub const fn is_connected(&self) -> bool {
-        !matches!(self.phase, Phase::Idle { .. } | Phase::Opening { .. } | Phase::Ended)
+        !matches!(self.phase, NodePhase::Idle { .. } | NodePhase::Opening { .. } | NodePhase::Ended)
     }
 
     /// Whether it has died as [`Input::End`] asked.
     pub const fn has_ended(&self) -> bool {
-        matches!(self.phase, Phase::Ended)
+        matches!(self.phase, NodePhase::Ended)
     }
 
     /// The number of the newest session; `None` before the first.
@@ -289,7 +294,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
 
     /// Whether changes are published and not stored.
     const fn publishes(&self) -> bool {
-        matches!(self.phase, Phase::Birth(_) | Phase::Online)
+        matches!(self.phase, NodePhase::Birth(_) | NodePhase::Online)
     }
 
     fn sample(&mut self, now: Instant, values: &[Option<Value>], alive: u32, catalog: &impl Catalog) {
@@ -339,12 +344,12 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
                         self.counters.unreadable = self.counters.unreadable.saturating_add(skipped);
                         break;
                     }
-                    Err(error) => return self.fail(Failure::Protocol(error)),
+                    Err(error) => return self.fail(SessionFailure::Protocol(error)),
                 };
                 let event = match packet {
-                    Packet::ConnAck { code } => Event::Accepted(code),
-                    Packet::SubAck { is_accepted } => Event::Subscribed(is_accepted),
-                    Packet::PingResp => Event::Pong,
+                    Packet::ConnAck { code } => PacketContent::Accepted(code),
+                    Packet::SubAck { is_accepted } => PacketContent::Subscribed(is_accepted),
+                    Packet::PingResp => PacketContent::Pong,
                     Packet::Publish { topic, payload, id } => {
                         if let Some(id) = id {
                             // The session ends before the server would send it again.
@@ -352,11 +357,13 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
                         }
                         let Settings { group, node, primary_host, .. } = &self.settings;
                         if topic::is_command(topic, group, node) {
-                            payload::command(payload).map_or(Event::Unreadable, Event::Command)
+                            payload::command(payload)
+                                .map_or(PacketContent::Unreadable, PacketContent::Command)
                         } else if primary_host.as_ref().is_some_and(|host| topic::is_state(topic, host)) {
-                            payload::host_state(payload).map_or(Event::Unreadable, Event::Host)
+                            payload::host_state(payload)
+                                .map_or(PacketContent::Unreadable, PacketContent::Host)
                         } else {
-                            Event::Unreadable
+                            PacketContent::Unreadable
                         }
                     }
                 };
@@ -364,44 +371,48 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
             }
             if taken == 0 {
                 // There is always room for a whole packet.
-                return self.fail(Failure::Broken);
+                return self.fail(SessionFailure::Broken);
             }
         }
     }
 
-    fn take(&mut self, now: Instant, event: Event) {
+    fn take(&mut self, now: Instant, event: PacketContent) {
         let counters = &mut self.counters;
         match (event, self.phase) {
-            (Event::Accepted(0), Phase::Connecting { .. }) => {
+            (PacketContent::Accepted(0), NodePhase::Connecting { .. }) => {
                 counters.sessions = counters.sessions.saturating_add(1);
                 self.ping_at = now + self.settings.ping_interval();
-                self.phase = Phase::Subscribe;
+                self.phase = NodePhase::Subscribe;
             }
-            (Event::Accepted(code @ 1..), Phase::Connecting { .. }) => self.fail(Failure::Refused { code }),
-            (Event::Subscribed(true), Phase::Subscribing { .. }) => {
-                self.phase = Phase::Waiting;
+            (PacketContent::Accepted(code @ 1..), NodePhase::Connecting { .. }) => {
+                self.fail(SessionFailure::Refused { code })
+            }
+            (PacketContent::Subscribed(true), NodePhase::Subscribing { .. }) => {
+                self.phase = NodePhase::Waiting;
                 self.look_for_host();
             }
-            (Event::Subscribed(false), Phase::Subscribing { .. }) => self.fail(Failure::SubscriptionRefused),
-            (Event::Pong, _) => self.pong_until = None,
-            (Event::Command(asked), _) => {
+            (PacketContent::Subscribed(false), NodePhase::Subscribing { .. }) => {
+                self.fail(SessionFailure::SubscriptionRefused)
+            }
+            (PacketContent::Pong, _) => self.pong_until = None,
+            (PacketContent::Command(asked), _) => {
                 counters.refused = counters.refused.saturating_add(asked.others);
                 self.is_rebirth_wanted |= asked.is_rebirth && self.publishes();
             }
-            (Event::Host(state), _) => {
+            (PacketContent::Host(state), _) => {
                 // An older statement may come late.
                 if self.host.get().is_none_or(|known| state.timestamp >= known.timestamp) {
                     self.host = Maybe::Just(state);
                     self.look_for_host();
                 }
             }
-            (Event::Unreadable, _) => counters.unreadable = counters.unreadable.saturating_add(1),
+            (PacketContent::Unreadable, _) => counters.unreadable = counters.unreadable.saturating_add(1),
             // An answer to something that was not asked.
-            (Event::Accepted(_), _) => {
-                self.fail(Failure::Protocol(ProtocolError::Unexpected { first: 0x20 }))
+            (PacketContent::Accepted(_), _) => {
+                self.fail(SessionFailure::Protocol(ProtocolError::Unexpected { first: 0x20 }))
             }
-            (Event::Subscribed(_), _) => {
-                self.fail(Failure::Protocol(ProtocolError::Unexpected { first: 0x90 }));
+            (PacketContent::Subscribed(_), _) => {
+                self.fail(SessionFailure::Protocol(ProtocolError::Unexpected { first: 0x90 }));
             }
         }
     }
@@ -413,8 +424,8 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
             (Some(_), host) => host.is_some_and(|host| host.is_online),
         };
         match self.phase {
-            Phase::Waiting if is_there => {
-                self.phase = Phase::Birth(Birth { owner: Owner::Node, stage: Stage::Begin });
+            NodePhase::Waiting if is_there => {
+                self.phase = NodePhase::Birth(Birth { owner: Owner::Node, stage: Stage::Begin });
             }
             // A packet that was begun is finished first.
             _ => {}
@@ -426,12 +437,12 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         self.host.get().is_some_and(|host| !host.is_online)
     }
 
-    fn note(&mut self, failure: Failure) {
+    fn note(&mut self, failure: SessionFailure) {
         self.failure = Maybe::Just(failure);
         self.counters.failures = self.counters.failures.saturating_add(1);
     }
 
-    fn fail(&mut self, failure: Failure) {
+    fn fail(&mut self, failure: SessionFailure) {
         self.note(failure);
         self.must_close = true;
     }
@@ -441,8 +452,8 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         let was_steady = self.online_since.take().is_some_and(|since| now.saturating_since(since) >= STEADY);
         self.attempts = if was_steady { 1 } else { self.attempts.saturating_add(1) };
         self.phase = match self.is_ending {
-            true => Phase::Ended,
-            false => Phase::Idle { until: now + self.pause() },
+            true => NodePhase::Ended,
+            false => NodePhase::Idle { until: now + self.pause() },
         };
         (self.born, self.is_rebirth_wanted, self.must_close) = (0, false, false);
         for slot in &mut self.slots {
@@ -462,7 +473,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
     }
 }
 
-impl Slot {
+impl NodeMetric {
     fn is_changed(&self, dead_band: f64) -> bool {
         match (self.current, self.published) {
             (Some(current), Some(told)) => current.differs(told, dead_band),
@@ -477,7 +488,7 @@ impl Slot {
 }
 
 /// What a packet says.
-enum Event {
+enum PacketContent {
     Accepted(u8),
     Subscribed(bool),
     Pong,

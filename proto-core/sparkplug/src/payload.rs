@@ -2,8 +2,8 @@
 //!
 //! Written is message `Payload` of `sparkplug_b.proto`; the numbers of fields are from there.
 
-use crate::bytes::Out;
-use crate::protobuf::{self, Field, Fields, Malformed};
+use crate::bytes::ByteWriter;
+use crate::protobuf::{self, Malformed, ProtobufField, ProtobufFields};
 use crate::value::{DataType, Value};
 
 /// What a birth says about a metric beside its name and type.
@@ -19,7 +19,7 @@ pub(crate) struct Details<'a> {
 
 /// One metric of a payload.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Shown<'a> {
+pub(crate) struct PayloadMetric<'a> {
     /// Its name, in births.
     pub name: Option<&'a str>,
     /// Its alias.
@@ -37,35 +37,35 @@ pub(crate) struct Shown<'a> {
 }
 
 /// The beginning of a payload.
-pub(crate) fn begin(out: &mut Out<'_>, timestamp: u64) {
+pub(crate) fn begin(out: &mut ByteWriter<'_>, timestamp: u64) {
     protobuf::number(out, 1, timestamp);
 }
 
 /// One metric.
-pub(crate) fn metric(out: &mut Out<'_>, shown: &Shown<'_>) {
+pub(crate) fn metric(out: &mut ByteWriter<'_>, shown: &PayloadMetric<'_>) {
     protobuf::message(out, 2, |out| body(out, shown));
 }
 
 /// The end of a payload with a sequence number.
-pub(crate) fn end(out: &mut Out<'_>, seq: u8) {
+pub(crate) fn end(out: &mut ByteWriter<'_>, seq: u8) {
     protobuf::number(out, 3, seq.into());
 }
 
 /// The payload of NDEATH.
-pub(crate) fn death(out: &mut Out<'_>, timestamp: u64, bd_seq: u8) {
+pub(crate) fn death(out: &mut ByteWriter<'_>, timestamp: u64, bd_seq: u8) {
     begin(out, timestamp);
     metric(out, &bd_seq_metric(timestamp, bd_seq));
 }
 
 /// The metric that ties births and deaths.
-pub(crate) fn bd_seq_metric(timestamp: u64, bd_seq: u8) -> Shown<'static> {
+pub(crate) fn bd_seq_metric(timestamp: u64, bd_seq: u8) -> PayloadMetric<'static> {
     let value = Value::Int64(bd_seq.into());
     plain("bdSeq", timestamp, value)
 }
 
 /// A metric of a birth that has no alias.
-pub(crate) fn plain(name: &'static str, timestamp: u64, value: Value) -> Shown<'static> {
-    Shown {
+pub(crate) fn plain(name: &'static str, timestamp: u64, value: Value) -> PayloadMetric<'static> {
+    PayloadMetric {
         name: Some(name),
         alias: None,
         timestamp,
@@ -76,7 +76,7 @@ pub(crate) fn plain(name: &'static str, timestamp: u64, value: Value) -> Shown<'
     }
 }
 
-fn body(out: &mut Out<'_>, shown: &Shown<'_>) {
+fn body(out: &mut ByteWriter<'_>, shown: &PayloadMetric<'_>) {
     if let Some(name) = shown.name {
         protobuf::bytes(out, 1, name.as_bytes());
     }
@@ -102,7 +102,7 @@ fn body(out: &mut Out<'_>, shown: &Shown<'_>) {
     }
 }
 
-fn write_value(out: &mut Out<'_>, value: Value) {
+fn write_value(out: &mut ByteWriter<'_>, value: Value) {
     match value {
         // As two's complement.
         Value::Int64(value) => protobuf::number(out, 11, value as u64),
@@ -118,7 +118,7 @@ fn write_value(out: &mut Out<'_>, value: Value) {
 }
 
 /// Message `PropertySet`: first all keys, then all values.
-fn properties(out: &mut Out<'_>, details: &Details<'_>) {
+fn properties(out: &mut ByteWriter<'_>, details: &Details<'_>) {
     let Details { unit, range, description } = *details;
     let texts = [("engUnit", unit), ("documentation", description)];
     let texts = texts.iter().filter(|(_, text)| !text.is_empty());
@@ -156,13 +156,13 @@ pub(crate) struct Asked {
 /// Reads the payload of NCMD.
 pub(crate) fn command(payload: &[u8]) -> Result<Asked, Malformed> {
     let mut asked = Asked::default();
-    for field in Fields::of(payload) {
-        let (2, Field::Bytes(metric)) = field? else { continue };
+    for field in ProtobufFields::of(payload) {
+        let (2, ProtobufField::Bytes(metric)) = field? else { continue };
         let (mut name, mut is_true) = (None, false);
-        for field in Fields::of(metric) {
+        for field in ProtobufFields::of(metric) {
             match field? {
-                (1, Field::Bytes(text)) => name = Some(text),
-                (14, Field::Number(value)) => is_true = value != 0,
+                (1, ProtobufField::Bytes(text)) => name = Some(text),
+                (14, ProtobufField::Number(value)) => is_true = value != 0,
                 _ => {}
             }
         }
@@ -230,9 +230,9 @@ mod tests {
     use super::*;
     use std::vec::Vec;
 
-    fn written(write: impl Fn(&mut Out<'_>)) -> Vec<u8> {
+    fn written(write: impl Fn(&mut ByteWriter<'_>)) -> Vec<u8> {
         let mut buf = [0xA5; 256];
-        let mut out = Out::new(&mut buf);
+        let mut out = ByteWriter::new(&mut buf);
         write(&mut out);
         out.finish().unwrap().to_vec()
     }
@@ -245,7 +245,7 @@ mod tests {
 
     #[test]
     fn an_unknown_value_is_null_and_has_none() {
-        let shown = Shown { value: None, alias: Some(300), ..plain("a", 2, Value::Float(0.0)) };
+        let shown = PayloadMetric { value: None, alias: Some(300), ..plain("a", 2, Value::Float(0.0)) };
         let bytes = written(|out| metric(out, &shown));
         assert_eq!(bytes, b"\x12\x0c\x0a\x01a\x10\xac\x02\x18\x02\x20\x09\x38\x01");
     }
@@ -254,7 +254,7 @@ mod tests {
     fn properties_have_as_many_keys_as_values() {
         let details = Details { unit: "rad", range: Some((-1.0, 1.0)), description: "joint" };
         let bytes = written(|out| properties(out, &details));
-        let fields: Vec<u64> = Fields::of(&bytes).map(|field| field.unwrap().0).collect();
+        let fields: Vec<u64> = ProtobufFields::of(&bytes).map(|field| field.unwrap().0).collect();
         assert_eq!(fields, [1, 1, 1, 1, 2, 2, 2, 2]);
     }
 

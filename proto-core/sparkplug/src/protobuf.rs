@@ -3,10 +3,10 @@
 //! In: fields. Out: bytes; and the fields of received bytes, one after the other. The reader is strict: a field
 //! that is cut off or has an unknown form ends it.
 
-use crate::bytes::Out;
+use crate::bytes::ByteWriter;
 
 /// Writes a number in groups of seven bits.
-pub(crate) fn varint(out: &mut Out<'_>, mut value: u64) {
+pub(crate) fn varint(out: &mut ByteWriter<'_>, mut value: u64) {
     while value > 0x7F {
         // Only the lowest seven bits count.
         out.byte((value & 0x7F) as u8 | 0x80);
@@ -15,45 +15,45 @@ pub(crate) fn varint(out: &mut Out<'_>, mut value: u64) {
     out.byte((value & 0x7F) as u8);
 }
 
-fn key(out: &mut Out<'_>, field: u8, form: u8) {
+fn key(out: &mut ByteWriter<'_>, field: u8, form: u8) {
     varint(out, u64::from(field) << 3 | u64::from(form));
 }
 
 /// A field with a whole number.
-pub(crate) fn number(out: &mut Out<'_>, field: u8, value: u64) {
+pub(crate) fn number(out: &mut ByteWriter<'_>, field: u8, value: u64) {
     key(out, field, VARINT);
     varint(out, value);
 }
 
 /// A field with a `float`.
-pub(crate) fn float(out: &mut Out<'_>, field: u8, value: f32) {
+pub(crate) fn float(out: &mut ByteWriter<'_>, field: u8, value: f32) {
     key(out, field, FIXED32);
     out.put(&value.to_le_bytes());
 }
 
 /// A field with a `double`.
-pub(crate) fn double(out: &mut Out<'_>, field: u8, value: f64) {
+pub(crate) fn double(out: &mut ByteWriter<'_>, field: u8, value: f64) {
     key(out, field, FIXED64);
     out.put(&value.to_le_bytes());
 }
 
 /// A field with text or bytes.
-pub(crate) fn bytes(out: &mut Out<'_>, field: u8, value: &[u8]) {
+pub(crate) fn bytes(out: &mut ByteWriter<'_>, field: u8, value: &[u8]) {
     key(out, field, LENGTH);
     varint(out, value.len() as u64);
     out.put(value);
 }
 
 /// A field with a message of its own, which `write` writes; it is called twice.
-pub(crate) fn message(out: &mut Out<'_>, field: u8, write: impl Fn(&mut Out<'_>)) {
+pub(crate) fn message(out: &mut ByteWriter<'_>, field: u8, write: impl Fn(&mut ByteWriter<'_>)) {
     key(out, field, LENGTH);
-    varint(out, Out::count(&write) as u64);
+    varint(out, ByteWriter::count(&write) as u64);
     write(out);
 }
 
 /// A value of a field.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Field<'a> {
+pub(crate) enum ProtobufField<'a> {
     /// A whole number.
     Number(u64),
     /// Four or eight bytes.
@@ -68,11 +68,11 @@ pub(crate) struct Malformed;
 
 /// The fields of a message, with their numbers. Ends after the first mistake.
 #[derive(Debug, Clone)]
-pub(crate) struct Fields<'a> {
+pub(crate) struct ProtobufFields<'a> {
     rest: &'a [u8],
 }
 
-impl<'a> Fields<'a> {
+impl<'a> ProtobufFields<'a> {
     pub(crate) const fn of(message: &'a [u8]) -> Self {
         Self { rest: message }
     }
@@ -101,15 +101,15 @@ impl<'a> Fields<'a> {
         Ok(taken)
     }
 
-    fn field(&mut self) -> Result<(u64, Field<'a>), Malformed> {
+    fn field(&mut self) -> Result<(u64, ProtobufField<'a>), Malformed> {
         let key = self.varint()?;
         let field = match (key & 7) as u8 {
-            VARINT => Field::Number(self.varint()?),
-            FIXED64 => self.take(8).map(|_| Field::Fixed)?,
-            FIXED32 => self.take(4).map(|_| Field::Fixed)?,
+            VARINT => ProtobufField::Number(self.varint()?),
+            FIXED64 => self.take(8).map(|_| ProtobufField::Fixed)?,
+            FIXED32 => self.take(4).map(|_| ProtobufField::Fixed)?,
             LENGTH => {
                 let len = usize::try_from(self.varint()?).map_err(|_| Malformed)?;
-                Field::Bytes(self.take(len)?)
+                ProtobufField::Bytes(self.take(len)?)
             }
             _ => return Err(Malformed),
         };
@@ -120,8 +120,8 @@ impl<'a> Fields<'a> {
     }
 }
 
-impl<'a> Iterator for Fields<'a> {
-    type Item = Result<(u64, Field<'a>), Malformed>;
+impl<'a> Iterator for ProtobufFields<'a> {
+    type Item = Result<(u64, ProtobufField<'a>), Malformed>;
 
     fn next(&mut self) -> Option<Self::Item> {
         if self.rest.is_empty() {
@@ -146,12 +146,12 @@ mod tests {
     use super::*;
     use std::vec::Vec;
 
-    fn written(write: impl Fn(&mut Out<'_>)) -> Vec<u8> {
+    fn written(write: impl Fn(&mut ByteWriter<'_>)) -> Vec<u8> {
         let mut buf = [0xA5; 64];
-        let mut out = Out::new(&mut buf);
+        let mut out = ByteWriter::new(&mut buf);
         write(&mut out);
         let bytes = out.finish().unwrap().to_vec();
-        assert_eq!(bytes.len(), Out::count(&write));
+        assert_eq!(bytes.len(), ByteWriter::count(&write));
         bytes
     }
 
@@ -173,9 +173,13 @@ mod tests {
             float(out, 12, 0.5);
             double(out, 13, 0.5);
         });
-        let fields: Result<Vec<_>, _> = Fields::of(&message).collect();
-        let expected =
-            [(1, Field::Number(u64::MAX)), (2, Field::Bytes(b"a")), (12, Field::Fixed), (13, Field::Fixed)];
+        let fields: Result<Vec<_>, _> = ProtobufFields::of(&message).collect();
+        let expected = [
+            (1, ProtobufField::Number(u64::MAX)),
+            (2, ProtobufField::Bytes(b"a")),
+            (12, ProtobufField::Fixed),
+            (13, ProtobufField::Fixed),
+        ];
         assert_eq!(fields.unwrap(), expected);
         for wrong in [
             &[0x08][..],
@@ -186,7 +190,7 @@ mod tests {
             &[0x08, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0x02],
             &[0x08, 0x80, 0x80, 0x80, 0x80, 0x80, 0x80, 0x80, 0x80, 0x80, 0x80, 0],
         ] {
-            let mut fields = Fields::of(wrong);
+            let mut fields = ProtobufFields::of(wrong);
             assert_eq!((fields.next(), fields.next()), (Some(Err(Malformed)), None), "{wrong:?}");
         }
     }

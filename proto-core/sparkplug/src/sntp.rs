@@ -21,12 +21,12 @@ pub struct Sntp {
     /// Requests without a reply that was of use, one after the other.
     failures: u8,
     random: u64,
-    counters: Counters,
+    counters: SntpCounters,
 }
 
 /// Counts since the start.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Counters {
+pub struct SntpCounters {
     /// Requests.
     pub requests: u32,
     /// Replies that told the time.
@@ -83,12 +83,12 @@ impl core::error::Error for ReplyError {}
 impl Sntp {
     /// A client that asks at once. `seed` is another one at each start.
     pub const fn new(seed: u64) -> Self {
-        let counters = Counters { requests: 0, replies: 0, refused: 0 };
+        let counters = SntpCounters { requests: 0, replies: 0, refused: 0 };
         Self { next: Instant::ZERO, asked: None, failures: 0, random: seed | 1, counters }
     }
 
     /// Counts since the start.
-    pub const fn counters(&self) -> Counters {
+    pub const fn counters(&self) -> SntpCounters {
         self.counters
     }
 

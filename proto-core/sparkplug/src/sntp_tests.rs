@@ -28,7 +28,7 @@ fn a_reply_tells_the_time_with_half_of_its_way() {
     assert_eq!(sntp.deadline(), at(140) + USUAL);
     // The same again answers nothing.
     assert_eq!(sntp.receive(at(141), &reply(&request, UTC_MS)), Err(ReplyError::Originate));
-    assert_eq!(sntp.counters(), Counters { requests: 1, replies: 1, refused: 1 });
+    assert_eq!(sntp.counters(), SntpCounters { requests: 1, replies: 1, refused: 1 });
 }
 
 #[test]

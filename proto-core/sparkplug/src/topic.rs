@@ -2,7 +2,7 @@
 
 use heapless::String;
 
-use crate::bytes::Out;
+use crate::bytes::ByteWriter;
 
 /// The longest name, in bytes.
 pub const MAX_ID: usize = 64;
@@ -83,7 +83,7 @@ pub(crate) enum Verb {
 }
 
 /// Writes the topic of a message of the node, or of its device.
-pub(crate) fn write(out: &mut Out<'_>, group: &Id, verb: Verb, node: &Id, device: Option<&str>) {
+pub(crate) fn write(out: &mut ByteWriter<'_>, group: &Id, verb: Verb, node: &Id, device: Option<&str>) {
     out.put(b"spBv1.0/");
     out.put(group.0.as_bytes());
     out.put(if device.is_some() { b"/D" } else { b"/N" });
@@ -107,7 +107,7 @@ pub(crate) fn is_command(topic: &str, group: &Id, node: &Id) -> bool {
 }
 
 /// Writes the topic of a host's state.
-pub(crate) fn write_state(out: &mut Out<'_>, host: &Id) {
+pub(crate) fn write_state(out: &mut ByteWriter<'_>, host: &Id) {
     out.put(STATE.as_bytes());
     out.put(host.0.as_bytes());
 }

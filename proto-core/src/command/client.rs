@@ -31,9 +31,9 @@ pub struct CommandClient {
     /// and its reply comes at its end.
     pub timeout: Duration,
     /// The older of the requests in flight.
-    waiting: Option<Waiting>,
+    waiting: Option<PendingRequest>,
     /// The urgent request that was sent without waiting for the other's reply.
-    beside: Option<Waiting>,
+    beside: Option<PendingRequest>,
     buffer: [u8; MAX_REPLY],
     len: usize,
     /// Bytes at the front that were returned; they are removed by the next call.
@@ -46,7 +46,7 @@ pub struct CommandClient {
 
 /// A request in flight.
 #[derive(Debug, Clone, Copy)]
-struct Waiting {
+struct PendingRequest {
     keyword: Keyword,
     /// When it was written.
     since: Instant,
@@ -218,8 +218,8 @@ impl CommandClient {
         Ok(len)
     }
 
-    fn written(&self, keyword: Keyword, now: Instant) -> Waiting {
-        Waiting { keyword, since: now, until: now + self.timeout, has_text: false }
+    fn written(&self, keyword: Keyword, now: Instant) -> PendingRequest {
+        PendingRequest { keyword, since: now, until: now + self.timeout, has_text: false }
     }
 
     /// Takes bytes from the front of `bytes` until an event is complete. `None` means that all of
@@ -272,7 +272,7 @@ impl CommandClient {
     }
 
     /// Reads the front of the buffer, which enough silence has followed or not.
-    fn scan(&mut self, silent: bool) -> Option<Found> {
+    fn scan(&mut self, silent: bool) -> Option<Scanned> {
         let blanks = self.received().iter().take_while(|&&byte| is_blank(byte)).count();
         self.drop_front(blanks);
         if self.dropping {
@@ -320,19 +320,19 @@ impl CommandClient {
         }
     }
 
-    fn judge(&self, len: usize, reply: &Reply<'_>) -> Found {
-        let answers = |waiting: Option<Waiting>| waiting.is_some_and(|w| reply.answers(w.keyword));
+    fn judge(&self, len: usize, reply: &Reply<'_>) -> Scanned {
+        let answers = |waiting: Option<PendingRequest>| waiting.is_some_and(|w| reply.answers(w.keyword));
         match reply {
-            Reply::ScriptFinish => Found::ScriptFinish { len },
-            _ if answers(self.waiting) => Found::Reply { len, beside: false },
-            _ if answers(self.beside) => Found::Reply { len, beside: true },
-            _ => Found::Unsolicited { len, beside: None },
+            Reply::ScriptFinish => Scanned::ScriptFinish { len },
+            _ if answers(self.waiting) => Scanned::Reply { len, beside: false },
+            _ if answers(self.beside) => Scanned::Reply { len, beside: true },
+            _ => Scanned::Unsolicited { len, beside: None },
         }
     }
 
     /// What the unknown text at the front is: a failure if it names a request and says so. Otherwise
     /// it may be the reply to the request that it names, or to the oldest that has had no text yet.
-    fn judge_words(&self, len: usize) -> Found {
+    fn judge_words(&self, len: usize) -> Scanned {
         let text = self.received().get(..len).unwrap_or(&[]);
         let requests = [(false, self.waiting), (true, self.beside)];
         // A text that was there before a request was written is not its reply.
@@ -342,12 +342,12 @@ impl CommandClient {
             Some((named_at(waiting.keyword, text)?, beside, waiting.keyword))
         });
         match named.min_by_key(|(at, ..)| *at) {
-            Some((_, beside, keyword)) if failure(keyword, text).is_some() => Found::Reply { len, beside },
-            Some((_, beside, _)) => Found::Unsolicited { len, beside: Some(beside) },
+            Some((_, beside, keyword)) if failure(keyword, text).is_some() => Scanned::Reply { len, beside },
+            Some((_, beside, _)) => Scanned::Unsolicited { len, beside: Some(beside) },
             None => {
                 let beside =
                     requests.clone().find(|(_, waiting)| !waiting.has_text).map(|(beside, _)| beside);
-                Found::Unsolicited { len, beside }
+                Scanned::Unsolicited { len, beside }
             }
         }
     }
@@ -390,13 +390,14 @@ impl CommandClient {
         }
     }
 
-    fn hand_out(&mut self, found: Found) -> ClientEvent<'_> {
-        let (Found::Reply { len, .. } | Found::ScriptFinish { len } | Found::Unsolicited { len, .. }) = found;
+    fn hand_out(&mut self, found: Scanned) -> ClientEvent<'_> {
+        let (Scanned::Reply { len, .. } | Scanned::ScriptFinish { len } | Scanned::Unsolicited { len, .. }) =
+            found;
         self.handed_out = len;
         let waiting = match found {
-            Found::Reply { beside: false, .. } => core::mem::replace(&mut self.waiting, self.beside.take()),
-            Found::Reply { beside: true, .. } => self.beside.take(),
-            Found::Unsolicited { beside: Some(beside), .. } => {
+            Scanned::Reply { beside: false, .. } => core::mem::replace(&mut self.waiting, self.beside.take()),
+            Scanned::Reply { beside: true, .. } => self.beside.take(),
+            Scanned::Unsolicited { beside: Some(beside), .. } => {
                 let request = if beside { &mut self.beside } else { &mut self.waiting };
                 if let Some(waiting) = request {
                     waiting.has_text = true;
@@ -408,9 +409,9 @@ impl CommandClient {
         let bytes = self.buffer.get(..self.len).unwrap_or(&[]);
         let text = bytes.get(..len).unwrap_or(&[]);
         match found {
-            Found::ScriptFinish { .. } => ClientEvent::ScriptFinish,
-            Found::Unsolicited { beside, .. } => ClientEvent::Unsolicited { text, beside },
-            Found::Reply { beside, .. } => {
+            Scanned::ScriptFinish { .. } => ClientEvent::ScriptFinish,
+            Scanned::Unsolicited { beside, .. } => ClientEvent::Unsolicited { text, beside },
+            Scanned::Reply { beside, .. } => {
                 match waiting.and_then(|waiting| Reply::parse(waiting.keyword, text)) {
                     Some(reply) => ClientEvent::Reply { beside, kind: reply.kind(), reply, text },
                     None => ClientEvent::Unsolicited { text, beside: None },
@@ -450,7 +451,7 @@ impl Default for CommandClient {
 }
 
 /// What [`CommandClient::scan`] found at the front of the buffer.
-enum Found {
+enum Scanned {
     Reply { len: usize, beside: bool },
     ScriptFinish { len: usize },
     Unsolicited { len: usize, beside: Option<bool> },

@@ -13,10 +13,10 @@ mod text;
 
 pub use client::{ClientEvent, CommandClient, MAX_REPLY, StartError};
 pub use percent::Percent;
-pub use reply::{Outcome, Reply, ReplyKind, StateCodes};
+pub use reply::{ActionOutcome, Reply, ReplyKind, StateCodes};
 pub use request::{Action, EncodeError, Keyword, ParseError, Request};
 pub use server::{CommandServer, ServerEvent, UnknownCommand};
-pub use text::NoSpace;
+pub use text::NoTextSpace;
 
 /// Longest command, in bytes, without its terminator (D5).
 pub const MAX_COMMAND: usize = 256;

@@ -5,7 +5,7 @@
 
 use core::fmt;
 
-use super::text::{Writer, trim_str};
+use super::text::{CountingWriter, trim_str};
 use crate::wire::ascii::split_once;
 
 /// A speed in percent, above 0 and at most 100.
@@ -37,7 +37,7 @@ impl Percent {
         all.find(is_same).unwrap_or_else(|| Decimal::round(self.0, MAX_DECIMALS))
     }
 
-    pub(super) fn write(self, writer: &mut Writer<'_>) {
+    pub(super) fn write(self, writer: &mut CountingWriter<'_>) {
         self.decimal().bytes().for_each(|byte| writer.push(&[byte]));
     }
 }

@@ -7,21 +7,21 @@ use core::fmt;
 
 use super::percent::Percent;
 use super::request::{Action, Keyword};
-use super::text::{NoSpace, Writer, is_terminator, trim};
+use super::text::{CountingWriter, NoTextSpace, is_terminator, trim};
 use crate::wire::dialect::{Dialect, RunReply, SpeedReply, Terminator};
 use crate::wire::state::{OperationMode, ProgramState, RobotState, SafetyState};
 
 /// The result of an action.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
-pub enum Outcome {
+pub enum ActionOutcome {
     /// Done, or started.
     Success,
     /// Refused.
     Fail,
 }
 
-impl Outcome {
+impl ActionOutcome {
     /// The word on the wire.
     pub const fn word(self) -> &'static str {
         match self {
@@ -36,7 +36,7 @@ impl Outcome {
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum Reply<'a> {
     /// To `run`: `run start` or `run success`, `run fail`.
-    Run(Outcome),
+    Run(ActionOutcome),
     /// To `speed`, done: `set success`, or `set speed 50%`. `None` if read from `set success`,
     /// which has no value; it is then written as `set success` in every dialect.
     SpeedSet(Option<Percent>),
@@ -47,7 +47,7 @@ pub enum Reply<'a> {
         /// The action.
         action: Action,
         /// The result.
-        outcome: Outcome,
+        outcome: ActionOutcome,
     },
     /// To an action of which nothing is left to do: `already poweron`. It is as good as done.
     Already(Action),
@@ -124,13 +124,13 @@ impl<'a> Reply<'a> {
     /// The kind of answer; [`ReplyKind::Value`] for the unsolicited text.
     pub const fn kind(&self) -> ReplyKind {
         match self {
-            Self::Run(Outcome::Success)
+            Self::Run(ActionOutcome::Success)
             | Self::SpeedSet(_)
-            | Self::Did { outcome: Outcome::Success, .. }
+            | Self::Did { outcome: ActionOutcome::Success, .. }
             | Self::Already(_) => ReplyKind::Success,
-            Self::Run(Outcome::Fail) | Self::SpeedRefused | Self::Did { outcome: Outcome::Fail, .. } => {
-                ReplyKind::Fail
-            }
+            Self::Run(ActionOutcome::Fail)
+            | Self::SpeedRefused
+            | Self::Did { outcome: ActionOutcome::Fail, .. } => ReplyKind::Fail,
             Self::UnknownCommand => ReplyKind::UnknownCommand,
             Self::State(_) | Self::ProgramFinished(_) | Self::LastError { .. } | Self::ScriptFinish => {
                 ReplyKind::Value
@@ -142,16 +142,16 @@ impl<'a> Reply<'a> {
     /// length. Control characters in an error's message become blanks.
     ///
     /// # Errors
-    /// [`NoSpace`] when `out` is too short.
-    pub fn encode(&self, dialect: &Dialect, out: &mut [u8]) -> Result<usize, NoSpace> {
-        let mut writer = Writer::new(out);
+    /// [`NoTextSpace`] when `out` is too short.
+    pub fn encode(&self, dialect: &Dialect, out: &mut [u8]) -> Result<usize, NoTextSpace> {
+        let mut writer = CountingWriter::new(out);
         let mut terminator = dialect.reply_terminator;
         match *self {
-            Self::Run(Outcome::Success) => writer.push_str(match dialect.run_reply {
+            Self::Run(ActionOutcome::Success) => writer.push_str(match dialect.run_reply {
                 RunReply::Start => RUN_START,
                 RunReply::Success => RUN_SUCCESS,
             }),
-            Self::Run(Outcome::Fail) => writer.push_str(RUN_FAIL),
+            Self::Run(ActionOutcome::Fail) => writer.push_str(RUN_FAIL),
             Self::SpeedSet(Some(percent)) if dialect.speed_reply == SpeedReply::Percent => {
                 writer.push_str(SET_SPEED);
                 percent.write(&mut writer);
@@ -242,10 +242,10 @@ pub(super) enum Match<'a> {
 /// Replies whose text does not depend on a value; none is the beginning of another.
 pub(super) fn match_fixed(bytes: &[u8]) -> Match<'static> {
     let texts = [
-        (RUN_START, Reply::Run(Outcome::Success)),
-        (RUN_SUCCESS, Reply::Run(Outcome::Success)),
-        (RUN_FAIL, Reply::Run(Outcome::Fail)),
-        (SCRIPT_ERROR, Reply::Run(Outcome::Fail)),
+        (RUN_START, Reply::Run(ActionOutcome::Success)),
+        (RUN_SUCCESS, Reply::Run(ActionOutcome::Success)),
+        (RUN_FAIL, Reply::Run(ActionOutcome::Fail)),
+        (SCRIPT_ERROR, Reply::Run(ActionOutcome::Fail)),
         (SET_SUCCESS, Reply::SpeedSet(None)),
         (SET_FAIL, Reply::SpeedRefused),
         (UNKNOWN_COMMAND, Reply::UnknownCommand),
@@ -260,7 +260,7 @@ pub(super) fn match_fixed(bytes: &[u8]) -> Match<'static> {
         }
     }
     for action in Action::ALL {
-        for outcome in [Outcome::Success, Outcome::Fail] {
+        for outcome in [ActionOutcome::Success, ActionOutcome::Fail] {
             let found = match front(bytes, action.word()) {
                 Front::Whole(rest) => match front(rest, " ") {
                     Front::Whole(rest) => front(rest, outcome.word()),
@@ -405,9 +405,9 @@ pub(super) fn failure<'a>(keyword: Keyword, text: &[u8]) -> Option<Reply<'a>> {
     named_at(keyword, text)?;
     words(text).find(|word| is_failure(word))?;
     match keyword {
-        Keyword::Run => Some(Reply::Run(Outcome::Fail)),
+        Keyword::Run => Some(Reply::Run(ActionOutcome::Fail)),
         Keyword::Speed => Some(Reply::SpeedRefused),
-        Keyword::Do(action) => Some(Reply::Did { action, outcome: Outcome::Fail }),
+        Keyword::Do(action) => Some(Reply::Did { action, outcome: ActionOutcome::Fail }),
         Keyword::State | Keyword::IsProgFinish | Keyword::GetLastError => None,
     }
 }

@@ -7,7 +7,7 @@ use core::fmt;
 
 use super::MAX_COMMAND;
 use super::percent::Percent;
-use super::text::{NoSpace, Writer, trim, trim_start, trim_str};
+use super::text::{CountingWriter, NoTextSpace, trim, trim_start, trim_str};
 use crate::wire::ascii::split_once;
 use crate::wire::dialect::{Dialect, Parentheses, Quotes};
 
@@ -217,7 +217,7 @@ impl core::error::Error for ParseError {}
 #[non_exhaustive]
 pub enum EncodeError {
     /// The buffer is too small.
-    NoSpace(NoSpace),
+    NoSpace(NoTextSpace),
     /// The command would be longer than [`MAX_COMMAND`].
     TooLong {
         /// Its length in bytes.
@@ -250,8 +250,8 @@ impl fmt::Display for EncodeError {
 
 impl core::error::Error for EncodeError {}
 
-impl From<NoSpace> for EncodeError {
-    fn from(error: NoSpace) -> Self {
+impl From<NoTextSpace> for EncodeError {
+    fn from(error: NoTextSpace) -> Self {
         Self::NoSpace(error)
     }
 }
@@ -320,7 +320,7 @@ impl<'a> Request<'a> {
     /// [`EncodeError`] if the request cannot be encoded, or `out` is too short.
     pub fn encode(&self, dialect: &Dialect, out: &mut [u8]) -> Result<usize, EncodeError> {
         let terminator = dialect.terminator.text();
-        let mut writer = Writer::new(out);
+        let mut writer = CountingWriter::new(out);
         writer.push_str(self.keyword().word());
         match *self {
             Self::Run { program, speed } => {

@@ -77,8 +77,8 @@ impl CommandServer {
             self.len = 0;
         }
         match self.step(now, bytes)? {
-            End::TooLong => Some(ServerEvent::Unknown(UnknownCommand::TooLong)),
-            End::Command => {
+            StepEnd::TooLong => Some(ServerEvent::Unknown(UnknownCommand::TooLong)),
+            StepEnd::Command => {
                 self.handed_out = true;
                 let text = trim(self.buffer.get(..self.len).unwrap_or(&[]));
                 Some(match Request::parse(text) {
@@ -105,11 +105,11 @@ impl CommandServer {
         *self = Self { keyword_gap, drop_gap, beginning_gap, ..Self::new() };
     }
 
-    fn step(&mut self, now: Instant, bytes: &mut &[u8]) -> Option<End> {
+    fn step(&mut self, now: Instant, bytes: &mut &[u8]) -> Option<StepEnd> {
         if self.deadline().is_some_and(|deadline| now >= deadline) {
             if !self.dropping {
                 self.ended_by_gap = is_bare_keyword(trim(self.text()));
-                return Some(End::Command);
+                return Some(StepEnd::Command);
             }
             self.dropping = false;
         }
@@ -130,7 +130,7 @@ impl CommandServer {
                 self.len = 0;
                 self.dropping = true;
                 self.ended_by_gap = false;
-                return Some(End::TooLong);
+                return Some(StepEnd::TooLong);
             };
             *place = byte;
             self.len = self.len.saturating_add(1);
@@ -146,9 +146,9 @@ impl CommandServer {
         None
     }
 
-    fn end(&mut self) -> End {
+    fn end(&mut self) -> StepEnd {
         self.ended_by_gap = false;
-        End::Command
+        StepEnd::Command
     }
 
     /// The silence that would end the text in the buffer.
@@ -179,7 +179,7 @@ impl Default for CommandServer {
 }
 
 /// Why [`CommandServer::step`] stopped.
-enum End {
+enum StepEnd {
     /// The buffer is a command.
     Command,
     /// The buffer overflowed.

@@ -6,28 +6,28 @@ use core::fmt;
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
-pub struct NoSpace {
+pub struct NoTextSpace {
     /// Number of bytes that the text needs.
     pub needed: usize,
     /// Number of bytes available.
     pub available: usize,
 }
 
-impl fmt::Display for NoSpace {
+impl fmt::Display for NoTextSpace {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "the text needs {} bytes; the buffer has {}", self.needed, self.available)
     }
 }
 
-impl core::error::Error for NoSpace {}
+impl core::error::Error for NoTextSpace {}
 
 /// Appends to a byte slice, and continues to count when the slice is full.
-pub(super) struct Writer<'a> {
+pub(super) struct CountingWriter<'a> {
     out: &'a mut [u8],
     len: usize,
 }
 
-impl<'a> Writer<'a> {
+impl<'a> CountingWriter<'a> {
     pub(super) fn new(out: &'a mut [u8]) -> Self {
         Self { out, len: 0 }
     }
@@ -64,9 +64,9 @@ impl<'a> Writer<'a> {
         self.len
     }
 
-    pub(super) fn finish(self) -> Result<usize, NoSpace> {
+    pub(super) fn finish(self) -> Result<usize, NoTextSpace> {
         let available = self.out.len();
-        if self.len <= available { Ok(self.len) } else { Err(NoSpace { needed: self.len, available }) }
+        if self.len <= available { Ok(self.len) } else { Err(NoTextSpace { needed: self.len, available }) }
     }
 }
 

@@ -7,7 +7,9 @@
 use heapless::{String, Vec};
 
 use super::add_exchange::FrameNumbers;
-use super::draft::{ControllerBuilder, Counts, PartFields, PortBuilder, PortBus, RecipeBuilder, Trigger};
+use super::draft::{
+    ControllerBuilder, DraftTrigger, ListDemand, PartFields, PortBuilder, PortBus, RecipeBuilder,
+};
 use super::error::{ConfigError, ConfigErrorKind as Kind, ControllerKey, Counted, Place, PortKey, RecipeKey};
 use super::exchange_builder::ExchangeBuilder;
 use super::fields::{CanFields, Does, Entries, Fields, InputField, OutputField, Sends, plain};
@@ -126,7 +128,7 @@ impl ConfigMut<'_> {
         let recipe = self.recipes.len() as u8;
         let at = |key| Place::Recipe { recipe, key };
         let name = name(from.name, at(RecipeKey::Name))?;
-        let Counts { fields, commands, exchanges, frames } = from.counts();
+        let ListDemand { fields, commands, exchanges, frames } = from.counts();
         for (what, needed, room) in [
             (Counted::Recipes, self.recipes.len().saturating_add(1), self.recipes.capacity()),
             (Counted::Fields, self.fields.len().saturating_add(fields), self.fields.capacity()),
@@ -162,8 +164,8 @@ impl ConfigMut<'_> {
             },
         };
         let send = match from.trigger {
-            Trigger::On(send) => send,
-            Trigger::Rising(var, bit) => {
+            DraftTrigger::On(send) => send,
+            DraftTrigger::Rising(var, bit) => {
                 let place = at(RecipeKey::Send);
                 let var = var.read().map_err(|error| ConfigError { place, kind: Kind::Variable(error) })?;
                 SendOn::Rising { var, bit }

@@ -180,8 +180,8 @@ impl ConfigMut<'_> {
         (recipe, part, number): (u8, Direction, u8),
         from: &Fields<'_>,
         is_of_coils: bool,
-    ) -> Result<(Span, u16), Refused> {
-        let span = self.fields_of_part(recipe, part, number, from).map_err(Refused::Placed)?;
+    ) -> Result<(Span, u16), RefusedExchange> {
+        let span = self.fields_of_part(recipe, part, number, from).map_err(RefusedExchange::Placed)?;
         let start = usize::from(span.start);
         if matches!(from, Fields::Specs(_)) && is_of_coils {
             // As in the configuration: packed already.
@@ -204,12 +204,12 @@ impl ConfigMut<'_> {
 }
 
 /// A mistake, with or without its place.
-enum Refused {
+enum RefusedExchange {
     Placed(ConfigError),
     Kind(Kind),
 }
 
-impl Refused {
+impl RefusedExchange {
     fn placed(self, at: impl FnOnce(Kind) -> ConfigError) -> ConfigError {
         match self {
             Self::Placed(error) => error,
@@ -296,7 +296,7 @@ fn bit_of(field: &FieldSpec) -> Option<u8> {
 }
 
 /// Packs coils, the first in the lowest bit; returns the number of fields that are left, and of coils.
-fn pack(fields: &mut [FieldSpec]) -> Result<(usize, u16), Refused> {
+fn pack(fields: &mut [FieldSpec]) -> Result<(usize, u16), RefusedExchange> {
     let (mut kept, mut count, mut bytes) = (0_usize, 0_usize, 0_usize);
     for nth in 0..fields.len() {
         let Some(&field) = fields.get(nth) else { break };
@@ -311,8 +311,8 @@ fn pack(fields: &mut [FieldSpec]) -> Result<(usize, u16), Refused> {
         let (byte, first) = (count / 8, (count % 8) as u8);
         put_padding(fields, &mut kept, &mut bytes, byte);
         let shared = bytes > byte;
-        let packed =
-            as_coil(field, first, shared).ok_or(Refused::Kind(Kind::Exchange(ExchangeError::NotCoils)))?;
+        let packed = as_coil(field, first, shared)
+            .ok_or(RefusedExchange::Kind(Kind::Exchange(ExchangeError::NotCoils)))?;
         // No more fields than there were: each one, or each padding, leaves at most one.
         put(fields, &mut kept, packed);
         (bytes, count) = (byte.saturating_add(1), count.saturating_add(1));

@@ -156,7 +156,7 @@ impl FieldSpec {
 
 /// One frame of a part, as the configuration has it.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct FrameFields<'c> {
+pub(crate) struct FrameView<'c> {
     /// 0 in a stream recipe, else the index of the CAN frame.
     pub(crate) nth: u8,
     pub(crate) carrier: Carrier,
@@ -170,7 +170,7 @@ impl<'c> ConfigView<'c> {
         self,
         recipe: &'c Recipe,
         part: Direction,
-    ) -> impl Iterator<Item = FrameFields<'c>> {
+    ) -> impl Iterator<Item = FrameView<'c>> {
         let is_can = matches!(recipe.parts, Parts::Can { .. });
         let stream = recipe.stream_part(part);
         let carrier = match stream {
@@ -179,7 +179,7 @@ impl<'c> ConfigView<'c> {
             _ => Carrier::Stream,
         };
         let delimiters = stream.map_or((&[][..], &[][..]), |part| (&*part.head, &*part.tail));
-        (0..).zip(recipe.part_frames(part)).map(move |(nth, span)| FrameFields {
+        (0..).zip(recipe.part_frames(part)).map(move |(nth, span)| FrameView {
             nth,
             carrier,
             delimiters,

@@ -65,13 +65,13 @@ pub struct RecipeBuilder<'a> {
     pub(super) input: PartFields<'a>,
     pub(super) output: PartFields<'a>,
     pub(super) on_stale: OnStale,
-    pub(super) trigger: Trigger<'a>,
+    pub(super) trigger: DraftTrigger<'a>,
     pub(super) exchanges: &'a [ExchangeBuilder<'a>],
 }
 
 /// What a recipe takes of the configuration's lists.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(super) struct Counts {
+pub(super) struct ListDemand {
     pub(super) fields: usize,
     pub(super) commands: usize,
     pub(super) exchanges: usize,
@@ -86,7 +86,7 @@ pub(super) enum PartFields<'a> {
 }
 
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum Trigger<'a> {
+pub(super) enum DraftTrigger<'a> {
     On(SendOn),
     Rising(Var<'a>, u8),
 }
@@ -138,7 +138,7 @@ impl Recipe {
 impl<'a> RecipeBuilder<'a> {
     const fn new(name: &'a str, mode: Mode) -> Self {
         let (input, output) = (PartFields::Absent, PartFields::Absent);
-        let (on_stale, trigger) = (OnStale::Hold, Trigger::On(SendOn::Period));
+        let (on_stale, trigger) = (OnStale::Hold, DraftTrigger::On(SendOn::Period));
         Self { name, mode, input, output, on_stale, trigger, exchanges: &[] }
     }
 
@@ -182,20 +182,20 @@ impl<'a> RecipeBuilder<'a> {
 
     /// What makes a port send the output part.
     pub const fn send(mut self, send: SendOn) -> Self {
-        self.trigger = Trigger::On(send);
+        self.trigger = DraftTrigger::On(send);
         self
     }
 
     /// The output part is sent when this bit, 0..=7, of a bit variable goes from 0 to 1.
     pub fn send_on_rising(mut self, var: impl Into<Var<'a>>, bit: u8) -> Self {
-        self.trigger = Trigger::Rising(var.into(), bit);
+        self.trigger = DraftTrigger::Rising(var.into(), bit);
         self
     }
 
     /// Number of fields, commands, exchanges and their frames.
-    pub(super) fn counts(&self) -> Counts {
+    pub(super) fn counts(&self) -> ListDemand {
         let frames = self.exchanges.iter().map(|ask| ask.frames().count()).fold(0, usize::saturating_add);
-        let mut counts = Counts { exchanges: self.exchanges.len(), frames, ..Counts::default() };
+        let mut counts = ListDemand { exchanges: self.exchanges.len(), frames, ..ListDemand::default() };
         let mut add = |fields: &Fields<'_>| {
             let (fields, commands) = fields.counts();
             counts.fields = counts.fields.saturating_add(fields);
@@ -483,7 +483,7 @@ impl PortBuilder<'_, ModbusTcp<'_>> {
 pub trait PortBus: sealed::Sealed {}
 
 /// A serial line as the bus of a [`PortBuilder`]: [`Rs485`], [`RtuLine`].
-pub trait SerialLine: sealed::Line {}
+pub trait SerialLine: sealed::SerialBus {}
 
 impl SerialLine for Rs485 {}
 impl SerialLine for RtuLine {}
@@ -524,18 +524,18 @@ pub(super) mod sealed {
     }
 
     /// Serial lines have settings.
-    pub trait Line {
+    pub trait SerialBus {
         /// The settings.
         fn line(&mut self) -> &mut Rs485;
     }
 
-    impl Line for Rs485 {
+    impl SerialBus for Rs485 {
         fn line(&mut self) -> &mut Rs485 {
             self
         }
     }
 
-    impl Line for RtuLine {
+    impl SerialBus for RtuLine {
         fn line(&mut self) -> &mut Rs485 {
             &mut self.line
         }

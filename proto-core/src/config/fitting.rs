@@ -21,7 +21,7 @@ pub struct Fitting {
 }
 
 /// An input field that writes a variable as a whole and does not wrap.
-struct Written {
+struct WrittenVariable {
     encoding: Encoding,
     var: SysVar,
     scale: f32,
@@ -29,14 +29,16 @@ struct Written {
 }
 
 impl FieldSpec {
-    fn written(&self) -> Option<Written> {
+    fn written(&self) -> Option<WrittenVariable> {
         let (encoding, to) = match *self {
             Self::UserInput { ty, to } => (Encoding::scalar(ty), to),
             Self::DeviceInput { encoding, overflow: Overflow::Usual, to } => (encoding, to),
             _ => return None,
         };
         match to {
-            InputBinding::Variable { var, scale, offset } => Some(Written { encoding, var, scale, offset }),
+            InputBinding::Variable { var, scale, offset } => {
+                Some(WrittenVariable { encoding, var, scale, offset })
+            }
             _ => None,
         }
     }
@@ -45,7 +47,7 @@ impl FieldSpec {
     /// or if it writes none. Of a float variable only huge numbers would not fit: `None`. What stands behind the field is
     /// not looked at.
     pub fn fitting(&self) -> Option<Fitting> {
-        let Written { encoding, var, scale, offset } = self.written()?;
+        let WrittenVariable { encoding, var, scale, offset } = self.written()?;
         let (low, high) = fitting_numbers(&encoding, (var, var.ty()), scale, offset)?;
         Some(Fitting { var, low, high })
     }
@@ -58,7 +60,7 @@ impl FieldSpec {
     /// The variable that takes no negative number of an input field that can have them: there is no
     /// offset, and no negative scale. `None` of another field.
     pub fn rejects_negative(&self) -> Option<SysVar> {
-        let Written { encoding, var, scale, offset } = self.written()?;
+        let WrittenVariable { encoding, var, scale, offset } = self.written()?;
         let is_signed = encoding.range().0 < 0.0;
         let is_unsigned = var.ty().range().0 >= 0.0;
         (is_signed && is_unsigned && scale > 0.0 && offset == 0.0).then_some(var)

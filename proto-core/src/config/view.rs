@@ -7,7 +7,7 @@ use heapless::VecView;
 
 use super::error::{ExchangeKey, Place, PortKey};
 use super::network::Network;
-use super::walk::{FrameFields, FrameVariables, Variables};
+use super::walk::{FrameFieldIter, FrameVariables, Variables};
 use super::{
     CommandEntry, ControllerLink, Exchange, FieldSpec, FrameSpec, OutputBinding, Port, Recipe, SafeValue,
 };
@@ -80,9 +80,9 @@ impl<'c> ConfigView<'c> {
         self.frame_fields(recipe, part)
     }
 
-    fn frame_fields(self, recipe: &'c Recipe, part: Direction) -> FrameFields<'c> {
+    fn frame_fields(self, recipe: &'c Recipe, part: Direction) -> FrameFieldIter<'c> {
         let frames = self.frames_of(recipe, part);
-        FrameFields { frames, pool: self.fields, fields: [].iter(), frame: 0, count: 0 }
+        FrameFieldIter { frames, pool: self.fields, fields: [].iter(), frame: 0, count: 0 }
     }
 
     /// The input variables that a field port writes as a whole.

@@ -76,7 +76,7 @@ impl<'c> Frames<'c> {
 
 /// The fields of these frames, each with the frame's number and its own.
 #[derive(Debug, Clone)]
-pub(super) struct FrameFields<'c> {
+pub(super) struct FrameFieldIter<'c> {
     pub(super) frames: Frames<'c>,
     pub(super) pool: &'c [FieldSpec],
     /// What is left of a frame.
@@ -85,7 +85,7 @@ pub(super) struct FrameFields<'c> {
     pub(super) count: u8,
 }
 
-impl<'c> Iterator for FrameFields<'c> {
+impl<'c> Iterator for FrameFieldIter<'c> {
     type Item = (u8, u8, &'c FieldSpec);
 
     fn next(&mut self) -> Option<Self::Item> {
@@ -104,7 +104,7 @@ impl<'c> Iterator for FrameFields<'c> {
 /// The variables of these fields.
 #[derive(Debug, Clone)]
 pub(super) struct FrameVariables<'c> {
-    pub(super) fields: FrameFields<'c>,
+    pub(super) fields: FrameFieldIter<'c>,
     /// What is left of a field.
     pub(super) variables: Variables,
 }

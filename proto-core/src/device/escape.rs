@@ -48,7 +48,7 @@ impl Escape {
             let byte = *out.get(at)?;
             *out.get_mut(from.saturating_add(at))? = byte;
         }
-        let mut writer = Writer { out, len: 0 };
+        let mut writer = EscapeWriter { out, len: 0 };
         match self {
             Self::Dle => {
                 writer.put(&[DLE, STX])?;
@@ -106,12 +106,12 @@ impl Escape {
     }
 }
 
-struct Writer<'a> {
+struct EscapeWriter<'a> {
     out: &'a mut [u8],
     len: usize,
 }
 
-impl Writer<'_> {
+impl EscapeWriter<'_> {
     fn put(&mut self, bytes: &[u8]) -> Option<()> {
         for &byte in bytes {
             *self.out.get_mut(self.len)? = byte;

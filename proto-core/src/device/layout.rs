@@ -20,7 +20,7 @@ use crate::sysvar::Direction;
 use crate::wire::can::MAX_CAN_DATA;
 use crate::wire::scalar::Scalar;
 use check::check_elements;
-use places::{Places, Unplaced};
+use places::{ElementPlaces, Unplaced};
 
 pub use check::LayoutError;
 pub use element::Element;
@@ -154,7 +154,7 @@ impl FrameLayout {
 
     /// The bytes of the whole frame if the fields of varying length have so many.
     fn length_with(&self, elements: &[Element], varying: impl Fn(&Element) -> usize) -> usize {
-        let mut places = Places::new(self, None);
+        let mut places = ElementPlaces::new(self, None);
         for element in elements {
             let further = usize::from(element.until().is_some() && !element.is_shared());
             let len = element.len().unwrap_or_else(|| varying(element));
@@ -196,7 +196,7 @@ impl FrameLayout {
         if let Some(missing @ 1..) = usize::from(self.shortest).checked_sub(bytes.len()) {
             return Probe::Partial(missing);
         }
-        let mut places = Places::new(self, end);
+        let mut places = ElementPlaces::new(self, end);
         let mut is_ours = true;
         for element in elements {
             let element = element.borrow();
@@ -251,7 +251,7 @@ impl FrameLayout {
     /// Whether all constants that `bytes` has completely are those of this frame, so that its beginning may
     /// be one of ours.
     pub(crate) fn agrees(&self, elements: impl IntoIterator<Item: Borrow<Element>>, bytes: &[u8]) -> bool {
-        let mut places = Places::new(self, None);
+        let mut places = ElementPlaces::new(self, None);
         for element in elements {
             let element = element.borrow();
             let Ok(place) = places.find(element, bytes) else { break };
@@ -281,7 +281,7 @@ impl FrameLayout {
         frame: &'f [u8],
     ) -> Option<(&'f [u8], Vec<u8, MAX_CHECKSUM>)> {
         let sum = self.checksum?;
-        let mut places = Places::new(self, Some(frame.len()));
+        let mut places = ElementPlaces::new(self, Some(frame.len()));
         for element in elements {
             places.find(element.borrow(), frame).ok()?;
         }
@@ -296,10 +296,10 @@ impl FrameLayout {
         elements: impl IntoIterator<Item: Borrow<Element>>,
         mut tell: impl FnMut(Part, Place),
     ) {
-        let mut places = Places::new(self, None);
+        let mut places = ElementPlaces::new(self, None);
         // Behind a field of varying length no byte has a number.
         let (mut is_numbered, mut shared_is_numbered) = (true, true);
-        let checksum = |places: &Places, is_numbered: bool| {
+        let checksum = |places: &ElementPlaces, is_numbered: bool| {
             let sum = self.checksum.filter(|_| usize::from(self.behind) == places.nth)?;
             Some(Place { at: is_numbered.then_some(places.checksum_at), len: Some(sum.len()) })
         };
@@ -334,7 +334,7 @@ impl FrameLayout {
         elements: impl IntoIterator<Item: Borrow<Element>>,
         frame: &[u8],
     ) -> impl Iterator<Item = Result<Option<Scalar>, Unreadable>> {
-        let mut places = Places::new(self, Some(frame.len()));
+        let mut places = ElementPlaces::new(self, Some(frame.len()));
         elements.into_iter().map(move |element| {
             let element = element.borrow();
             let place = places.find(element, frame).map_err(|_| Unreadable::Length)?;
@@ -354,7 +354,7 @@ impl FrameLayout {
         frame: &'a [u8],
         nth: usize,
     ) -> Option<&'a [u8]> {
-        let mut places = Places::new(self, Some(frame.len()));
+        let mut places = ElementPlaces::new(self, Some(frame.len()));
         for (at, element) in elements.into_iter().enumerate() {
             let place = places.find(element.borrow(), frame).ok()?;
             if at == nth {
@@ -371,7 +371,7 @@ impl FrameLayout {
         frame: &'a [u8],
         nth: usize,
     ) -> Option<&'a [u8]> {
-        let mut places = Places::new(self, Some(frame.len()));
+        let mut places = ElementPlaces::new(self, Some(frame.len()));
         for (at, element) in elements.into_iter().enumerate() {
             let element = element.borrow();
             let place = places.find(element, frame).ok()?;
@@ -405,7 +405,7 @@ impl FrameLayout {
         mut text: impl FnMut(usize, &mut [u8]) -> Option<usize>,
         out: &mut [u8],
     ) -> Option<usize> {
-        let mut places = Places::new(self, None);
+        let mut places = ElementPlaces::new(self, None);
         let mut length_at = None;
         put(out, 0, &self.head)?;
         for (nth, element) in elements.into_iter().enumerate() {

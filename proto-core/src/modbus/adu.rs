@@ -79,7 +79,7 @@ pub struct AduReader {
 
 /// A whole frame.
 #[derive(Clone, Copy)]
-pub(super) struct Frame<'a> {
+pub(super) struct AduFrame<'a> {
     pub(super) front: Front,
     /// What comes behind the function code.
     pub(super) data: &'a [u8],
@@ -111,7 +111,7 @@ impl AduReader {
     pub fn next_adu<'s, 'c: 's>(&'s mut self, chunk: &mut &'c [u8]) -> Option<Result<Adu<'s>, AduError>> {
         let received = *chunk;
         let (front, bytes) = match self.take(chunk) {
-            Some(Frame { front, .. }) => (front, received),
+            Some(AduFrame { front, .. }) => (front, received),
             None => match self.next_buffered(chunk)? {
                 Ok(front) => (front, &self.buffer[..]),
                 Err(error) => return Some(Err(error)),
@@ -135,12 +135,12 @@ impl AduReader {
     /// Takes a frame that lies whole at the front of `chunk`. `None`, with nothing taken, if
     /// [`Self::next_buffered`] has to look at what is there.
     #[inline]
-    pub(super) fn take<'c>(&self, chunk: &mut &'c [u8]) -> Option<Frame<'c>> {
+    pub(super) fn take<'c>(&self, chunk: &mut &'c [u8]) -> Option<AduFrame<'c>> {
         let (front, behind) = chunk.split_first_chunk().filter(|_| self.filled == 0)?;
         let front = Front::from_bytes(front);
         let (data, rest) = behind.split_at_checked(front.checked_data_len()?)?;
         *chunk = rest;
-        Some(Frame { front, data })
+        Some(AduFrame { front, data })
     }
 
     /// Takes what a frame in pieces needs, and returns the front of the one that is whole then; its data is

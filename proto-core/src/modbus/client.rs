@@ -6,10 +6,10 @@
 
 use core::fmt;
 
-use super::adu::{AduError, AduReader, FRONT_LEN, Frame, Front, HEADER_LEN};
+use super::adu::{AduError, AduFrame, AduReader, FRONT_LEN, Front, HEADER_LEN};
 use super::exception::Exception;
-use super::parts::{OPERANDS_LEN, Operands, Parts, copy_cleared};
-use super::pdu::{EncodeError, Request, RequestHead, Response, ResponseError};
+use super::parts::{OPERANDS_LEN, Operands, RequestParts, copy_cleared};
+use super::pdu::{PduEncodeError, Request, RequestHead, Response, ResponseError};
 
 /// The client's side of one connection.
 #[derive(Debug, Clone)]
@@ -88,7 +88,7 @@ pub enum StartError {
     /// Another request is in flight.
     Busy,
     /// The request cannot be encoded.
-    Encode(EncodeError),
+    Encode(PduEncodeError),
 }
 
 impl fmt::Display for StartError {
@@ -167,7 +167,13 @@ impl Client {
 
     /// Writes what a request's frame has before its data, and waits for the answer.
     #[inline]
-    fn begin(&mut self, parts: &Parts<'_>, heads: &mut [u8; HEADS_LEN], data_len: usize, answer_len: usize) {
+    fn begin(
+        &mut self,
+        parts: &RequestParts<'_>,
+        heads: &mut [u8; HEADS_LEN],
+        data_len: usize,
+        answer_len: usize,
+    ) {
         let newest = self.answer.next(parts.function);
         if let Some((front, rest)) = heads.split_first_chunk_mut() {
             *front = newest.carrying(data_len).to_bytes();
@@ -217,7 +223,7 @@ impl Client {
         let newest = self.answer.transaction();
         loop {
             let (front, in_chunk) = match self.reader.take(bytes) {
-                Some(Frame { front, data }) => (front, Some(data)),
+                Some(AduFrame { front, data }) => (front, Some(data)),
                 None => match self.reader.next_buffered(bytes)? {
                     Ok(front) => (front, None),
                     Err(error) => return Some(self.violated(bytes, Violation::Header(error))),
@@ -268,9 +274,9 @@ impl Client {
     }
 }
 
-fn no_space(parts: &Parts<'_>, available: usize) -> StartError {
+fn no_space(parts: &RequestParts<'_>, available: usize) -> StartError {
     let needed = parts.encoded_len().saturating_add(HEADER_LEN);
-    StartError::Encode(EncodeError::NoSpace { needed, available })
+    StartError::Encode(PduEncodeError::NoSpace { needed, available })
 }
 
 /// What a frame has before its data.

@@ -29,7 +29,7 @@ pub enum Access {
 
 /// A run of consecutive coils or registers of one kind.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Item {
+pub struct MapRun {
     /// Which address space.
     pub space: Space,
     /// First address.
@@ -50,9 +50,9 @@ pub const COILS: u16 = rows::end(Space::Coils);
 pub const HOLDING: u16 = rows::end(Space::Holding);
 
 /// The map in address order, coils first.
-pub static MAP: [Item; 27] = rows::ROWS;
+pub static MAP: [MapRun; 27] = rows::ROWS;
 
-impl Item {
+impl MapRun {
     /// The first address after the run.
     pub const fn end(&self) -> u16 {
         self.first.saturating_add(self.count)

@@ -2,7 +2,7 @@
 //!
 //! In: the fields of a request. Out: its bytes behind the function code. Does not know connections.
 
-use super::pdu::{EncodeError, RequestHead};
+use super::pdu::{PduEncodeError, RequestHead};
 use crate::wire::runs;
 
 /// What most PDUs have behind their function code: an address, and a count or value, as one number.
@@ -44,7 +44,7 @@ impl Operands {
 
 /// The contents of a request's PDU.
 #[derive(Clone, Copy)]
-pub(super) struct Parts<'a> {
+pub(super) struct RequestParts<'a> {
     pub(super) function: u8,
     pub(super) operands: Operands,
     /// Limit of the count, or [`NO_COUNT`].
@@ -55,7 +55,7 @@ pub(super) struct Parts<'a> {
     pub(super) answer_len: usize,
 }
 
-impl Parts<'_> {
+impl RequestParts<'_> {
     /// The parts of a request without data, whose answer has its operands.
     #[inline]
     pub(super) const fn new(function: u8, address: u16, count_or_value: u16, max: u16) -> Self {
@@ -71,9 +71,13 @@ impl Parts<'_> {
 
     /// Refuses a count that the function does not allow.
     #[inline]
-    pub(super) fn check_count(&self) -> Result<(), EncodeError> {
+    pub(super) fn check_count(&self) -> Result<(), PduEncodeError> {
         let (count, max) = (self.operands.count_or_value(), self.max);
-        if max == NO_COUNT || in_limit(count, max) { Ok(()) } else { Err(EncodeError::Count { count, max }) }
+        if max == NO_COUNT || in_limit(count, max) {
+            Ok(())
+        } else {
+            Err(PduEncodeError::Count { count, max })
+        }
     }
 
     /// Writes what comes behind the function code to `out`, which is [`Self::data_len`] bytes long.
@@ -96,10 +100,10 @@ impl Parts<'_> {
     }
 
     #[inline]
-    pub(super) fn encode(&self, out: &mut [u8]) -> Result<usize, EncodeError> {
+    pub(super) fn encode(&self, out: &mut [u8]) -> Result<usize, PduEncodeError> {
         self.check_count()?;
         let (needed, available) = (self.encoded_len(), out.len());
-        let no_space = EncodeError::NoSpace { needed, available };
+        let no_space = PduEncodeError::NoSpace { needed, available };
         let out = out.get_mut(..needed).ok_or(no_space)?;
         let (function, data) = out.split_first_mut().ok_or(no_space)?;
         *function = self.function;

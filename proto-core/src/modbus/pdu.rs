@@ -6,7 +6,7 @@ use core::fmt;
 
 pub use super::adu::MAX_PDU;
 use super::exception::Exception;
-use super::parts::{COIL_OFF, COIL_ON, NO_COUNT, Operands, Parts, coil_value, copy_cleared, in_limit};
+use super::parts::{COIL_OFF, COIL_ON, NO_COUNT, Operands, RequestParts, coil_value, copy_cleared, in_limit};
 pub use super::values::MAX_READ_COILS;
 use super::values::{Coils, Registers, packed_len};
 
@@ -147,7 +147,7 @@ pub struct RequestHead {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
-pub enum EncodeError {
+pub enum PduEncodeError {
     /// The buffer is too short; nothing was written.
     NoSpace {
         /// Number of bytes that the PDU or frame needs.
@@ -164,7 +164,7 @@ pub enum EncodeError {
     },
 }
 
-impl fmt::Display for EncodeError {
+impl fmt::Display for PduEncodeError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::NoSpace { needed, available } => {
@@ -175,7 +175,7 @@ impl fmt::Display for EncodeError {
     }
 }
 
-impl core::error::Error for EncodeError {}
+impl core::error::Error for PduEncodeError {}
 
 /// Why bytes are not an answer to the request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -298,19 +298,19 @@ impl<'a> Request<'a> {
     /// # Errors
     /// A count the function does not allow, or too little space; nothing is written then.
     #[inline]
-    pub fn encode(&self, out: &mut [u8]) -> Result<usize, EncodeError> {
+    pub fn encode(&self, out: &mut [u8]) -> Result<usize, PduEncodeError> {
         self.parts().encode(out)
     }
 
     #[inline]
-    pub(super) fn parts(&self) -> Parts<'a> {
-        let single = Parts::new;
+    pub(super) fn parts(&self) -> RequestParts<'a> {
+        let single = RequestParts::new;
         match *self {
-            Self::ReadCoils { address, count } => Parts {
+            Self::ReadCoils { address, count } => RequestParts {
                 answer_len: packed_len(count).wrapping_add(1),
                 ..single(function::READ_COILS, address, count, MAX_READ_COILS)
             },
-            Self::ReadHolding { address, count } => Parts {
+            Self::ReadHolding { address, count } => RequestParts {
                 answer_len: usize::from(count).wrapping_mul(2).wrapping_add(1),
                 ..single(function::READ_HOLDING, address, count, MAX_READ_REGISTERS)
             },
@@ -320,11 +320,11 @@ impl<'a> Request<'a> {
             Self::WriteRegister { address, value } => {
                 single(function::WRITE_REGISTER, address, value, NO_COUNT)
             }
-            Self::WriteCoils { address, coils } => Parts {
+            Self::WriteCoils { address, coils } => RequestParts {
                 data: Some((coils.packed(), coils.unused())),
                 ..single(function::WRITE_COILS, address, coils.count(), MAX_WRITE_COILS)
             },
-            Self::WriteRegisters { address, registers } => Parts {
+            Self::WriteRegisters { address, registers } => RequestParts {
                 data: Some((registers.as_be_bytes(), 0)),
                 ..single(function::WRITE_REGISTERS, address, registers.count(), MAX_WRITE_REGISTERS)
             },
@@ -426,9 +426,9 @@ impl<'a> Response<'a> {
     ///
     /// # Errors
     /// Too little space; nothing is written then.
-    pub fn encode(&self, out: &mut [u8]) -> Result<usize, EncodeError> {
+    pub fn encode(&self, out: &mut [u8]) -> Result<usize, PduEncodeError> {
         let (needed, available) = (self.encoded_len(), out.len());
-        let no_space = EncodeError::NoSpace { needed, available };
+        let no_space = PduEncodeError::NoSpace { needed, available };
         let out = out.get_mut(..needed).ok_or(no_space)?;
         let (function, address, count_or_value) = match *self {
             Self::Coils(coils) => {

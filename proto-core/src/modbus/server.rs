@@ -3,7 +3,7 @@
 //! In: a connection's bytes. Out: one answer for each request, from a [`RegisterBank`] that knows
 //! the map. Any unit id is answered and echoed (D10).
 
-use super::adu::{AduError, AduReader, FRONT_LEN, Frame, MAX_ADU, MAX_PDU};
+use super::adu::{AduError, AduFrame, AduReader, FRONT_LEN, MAX_ADU, MAX_PDU};
 use super::exception::Exception;
 use super::parts::{COIL_OFF, COIL_ON, OPERANDS_LEN, Operands, in_limit};
 use super::pdu::{
@@ -95,10 +95,10 @@ impl Server {
         bank: &mut B,
         out: &mut [u8; MAX_ADU],
     ) -> Option<Result<usize, AduError>> {
-        let Frame { front, data } = match self.reader.take(bytes) {
+        let AduFrame { front, data } = match self.reader.take(bytes) {
             Some(frame) => frame,
             None => match self.reader.next_buffered(bytes)? {
-                Ok(front) => Frame { front, data: self.reader.data(front) },
+                Ok(front) => AduFrame { front, data: self.reader.data(front) },
                 Err(error) => return Some(Err(error)),
             },
         };
@@ -130,7 +130,7 @@ pub fn answer<B: RegisterBank + ?Sized>(pdu: &[u8], bank: &mut B, out: &mut [u8;
     let Some((function, body)) = out.split_first_mut() else { return 0 };
     let Some(body) = body.first_chunk_mut() else { return 0 };
     let answer = match carry_out(asked, data, bank, body) {
-        Ok(data_len) => Answer { function: asked, data_len },
+        Ok(data_len) => ResponseStart { function: asked, data_len },
         Err(exception) => others(asked, data, exception, bank, body),
     };
     *function = answer.function;
@@ -138,13 +138,13 @@ pub fn answer<B: RegisterBank + ?Sized>(pdu: &[u8], bank: &mut B, out: &mut [u8;
 }
 
 /// What an answer begins with, and how many bytes come behind that.
-struct Answer {
+struct ResponseStart {
     function: u8,
     data_len: usize,
 }
 
 /// What comes behind a function code.
-type Body = [u8; MAX_PDU - 1];
+type ResponseBody = [u8; MAX_PDU - 1];
 
 /// Another function, or an exception.
 #[cold]
@@ -154,8 +154,8 @@ fn others<B: RegisterBank + ?Sized>(
     data: &[u8],
     exception: Exception,
     bank: &mut B,
-    out: &mut Body,
-) -> Answer {
+    out: &mut ResponseBody,
+) -> ResponseStart {
     let answer = match exception {
         Exception::IllegalFunction if function == function::MASK_WRITE_REGISTER => {
             write_masked(data, bank, out)
@@ -164,20 +164,20 @@ fn others<B: RegisterBank + ?Sized>(
         _ => Err(exception),
     };
     let exception = match answer {
-        Ok(data_len) => return Answer { function, data_len },
+        Ok(data_len) => return ResponseStart { function, data_len },
         Err(exception) => exception,
     };
     let [function, code] = exception_pdu(function, exception);
     let [first, ..] = out;
     *first = code;
-    Answer { function, data_len: 1 }
+    ResponseStart { function, data_len: 1 }
 }
 
 /// FC 22, which is answered by its data. Another length is none of this function.
 fn write_masked<B: RegisterBank + ?Sized>(
     data: &[u8],
     bank: &mut B,
-    out: &mut Body,
+    out: &mut ResponseBody,
 ) -> Result<usize, Exception> {
     let request: &[u8; 6] = data.try_into().map_err(|_| Exception::IllegalFunction)?;
     let [a1, a0, k1, k0, v1, v0] = *request;
@@ -192,7 +192,7 @@ fn read_inputs<B: RegisterBank + ?Sized>(
     function: u8,
     data: &[u8],
     bank: &B,
-    out: &mut Body,
+    out: &mut ResponseBody,
 ) -> Result<usize, Exception> {
     let Some((operands, more)) = data.split_first_chunk() else { return Err(Exception::IllegalFunction) };
     let operands = Operands::from_bytes(operands);
@@ -226,7 +226,7 @@ fn carry_out<B: RegisterBank + ?Sized>(
     function: u8,
     data: &[u8],
     bank: &mut B,
-    out: &mut Body,
+    out: &mut ResponseBody,
 ) -> Result<usize, Exception> {
     let Some((operands, more)) = data.split_first_chunk() else { return Err(refusal(function)) };
     let operands = Operands::from_bytes(operands);
@@ -284,7 +284,7 @@ fn write_one<B: RegisterBank + ?Sized>(
 /// Byte count and packed bits of an answer; returns how many bytes that is. `read` gets them cleared.
 #[inline]
 fn read_bits(
-    out: &mut Body,
+    out: &mut ResponseBody,
     count: u16,
     read: impl FnOnce(&mut [u8]) -> Result<(), Exception>,
 ) -> Result<usize, Exception> {
@@ -300,7 +300,7 @@ fn read_bits(
 /// The same for registers.
 #[inline]
 fn read_words(
-    out: &mut Body,
+    out: &mut ResponseBody,
     count: u16,
     read: impl FnOnce(&mut [[u8; 2]]) -> Result<(), Exception>,
 ) -> Result<usize, Exception> {
@@ -311,7 +311,7 @@ fn read_words(
 
 /// The byte count of a read's answer; returns the place for the data.
 #[inline]
-fn read_answer(out: &mut Body, len: usize) -> Result<&mut [u8], Exception> {
+fn read_answer(out: &mut ResponseBody, len: usize) -> Result<&mut [u8], Exception> {
     let (byte_count, data) = out.split_first_mut().ok_or(Exception::DeviceFailure)?;
     // At most 250 bytes by the limits of the count.
     *byte_count = len as u8;

@@ -3,7 +3,7 @@ use std::vec::Vec;
 
 use super::adu::{Adu, AduError, AduReader, MAX_ADU};
 use super::client::{Client, ClientEvent, StartError, Violation};
-use super::pdu::{EncodeError, MAX_PDU, Request, RequestHead, Response, ResponseError};
+use super::pdu::{MAX_PDU, PduEncodeError, Request, RequestHead, Response, ResponseError};
 use super::server::{RegisterBank, Server, answer};
 use super::{Coils, Exception, Registers};
 
@@ -359,12 +359,12 @@ fn a_request_that_cannot_be_sent_changes_nothing() {
     let mut client = Client::new(1);
     for available in 0..12 {
         let mut out = vec![0xA5; available];
-        let no_space = EncodeError::NoSpace { needed: 12, available };
+        let no_space = PduEncodeError::NoSpace { needed: 12, available };
         assert_eq!(client.start(READ_TWO, &mut out), Err(StartError::Encode(no_space)));
         assert!(out.iter().all(|&byte| byte == 0xA5) && !client.busy());
     }
     let too_many = Request::ReadCoils { address: 0, count: 2001 };
-    let refused = StartError::Encode(EncodeError::Count { count: 2001, max: 2000 });
+    let refused = StartError::Encode(PduEncodeError::Count { count: 2001, max: 2000 });
     assert_eq!(client.start(too_many, &mut [0; 260]), Err(refused));
     assert_eq!(started(&mut client, READ_TWO)[..2], [0, 1], "no transaction id was used up");
 }

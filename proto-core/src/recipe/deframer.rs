@@ -9,7 +9,7 @@
 
 use core::ops::Range;
 
-use super::delimiter::Head;
+use super::delimiter::FrameHead;
 use super::error::DatagramError;
 use super::model::MAX_STREAM_FRAME;
 use super::stream::StreamLayout;
@@ -225,7 +225,7 @@ impl Deframer {
 }
 
 /// Where the first bytes are that begin with the head, or may be its beginning; the length if there are none.
-fn position_of_head(head: &Head, bytes: &[u8]) -> usize {
+fn position_of_head(head: &FrameHead, bytes: &[u8]) -> usize {
     let mut at = 0;
     while let Some(rest) = bytes.get(at..)
         && !head.agrees(rest)

@@ -6,7 +6,7 @@ use crate::wire::runs;
 
 /// Up to 8 bytes at the front of a frame, zeros behind them.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Head {
+pub(super) struct FrameHead {
     word: [u8; MAX_DELIMITER],
     mask: [u8; MAX_DELIMITER],
     len: u8,
@@ -14,13 +14,13 @@ pub(super) struct Head {
 
 /// Up to 8 bytes at the end of a frame, zeros before them.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Tail {
+pub(super) struct FrameTail {
     word: [u8; MAX_DELIMITER],
     mask: [u8; MAX_DELIMITER],
     len: u8,
 }
 
-impl Head {
+impl FrameHead {
     /// `None` when there are more than 8 bytes.
     pub(super) fn new(head: &[u8]) -> Option<Self> {
         let mut word = [0; MAX_DELIMITER];
@@ -60,7 +60,7 @@ impl Head {
     }
 }
 
-impl Tail {
+impl FrameTail {
     /// `None` when there are more than 8 bytes.
     pub(super) fn new(tail: &[u8]) -> Option<Self> {
         let mut word = [0; MAX_DELIMITER];

@@ -52,24 +52,24 @@ impl Iterator for Values<'_> {
 #[derive(Debug, Clone)]
 pub(super) struct Pool {
     fields: Vec<Field, MAX_FIELDS>,
-    steps: Vec<Step, MAX_FIELDS>,
+    steps: Vec<FieldRun, MAX_FIELDS>,
 }
 
 /// At most [`runs::MAX_RUN`] payload bytes that are neighbours in the image too. The runs of a
 /// frame cover its payload in order, without gaps.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Step {
+pub(super) struct FieldRun {
     image: u16,
     len: u8,
-    kind: Kind,
+    kind: RunContent,
 }
 
 /// The content of a run: the bits that are not reserved if it is one byte with reserved bits, else
-/// [`Kind::FLOATS`] or [`Kind::PLAIN`]. One byte, because parts have up to 128 runs.
+/// [`RunContent::FLOATS`] or [`RunContent::PLAIN`]. One byte, because parts have up to 128 runs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Kind(u8);
+struct RunContent(u8);
 
-impl Kind {
+impl RunContent {
     /// Floats, which must be finite.
     const FLOATS: Self = Self(0);
     /// Anything that is valid whatever its bits are.
@@ -87,7 +87,7 @@ pub(super) struct FrameFields<'a> {
 /// One frame's runs, of which there are several, or none if its fields are user-defined.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Runs<'a> {
-    steps: &'a [Step],
+    steps: &'a [FieldRun],
     /// Bytes of the payload.
     len: usize,
 }
@@ -97,7 +97,7 @@ pub(super) struct Runs<'a> {
 pub(super) struct Share {
     pub(super) first_field: u8,
     pub(super) first_step: u8,
-    pub(super) whole: Step,
+    pub(super) whole: FieldRun,
 }
 
 impl Pool {
@@ -133,7 +133,7 @@ impl Pool {
                 if let (Direction::Input, Some(nth)) = (rules.direction, twice) {
                     return Err(PartError::DuplicateVariable { at, first: place_of(nth), var });
                 }
-                Some(Step::of(var))
+                Some(FieldRun::of(var))
             }
             (Field::User(_), Mode::User) => None,
             (_, mode) => return Err(PartError::WrongMode { at, mode }),
@@ -150,10 +150,14 @@ impl Pool {
 
     /// A frame of `len` bytes as one run: all of what was added since `first_step` was the next one. Most parts are;
     /// else the run is nowhere in the image.
-    pub(super) fn whole(&self, first_step: usize, len: usize) -> Step {
+    pub(super) fn whole(&self, first_step: usize, len: usize) -> FieldRun {
         match self.steps.get(first_step..) {
             Some([step]) => *step,
-            _ => Step { image: NOWHERE, len: u8::try_from(len).unwrap_or_default(), kind: Kind::PLAIN },
+            _ => FieldRun {
+                image: NOWHERE,
+                len: u8::try_from(len).unwrap_or_default(),
+                kind: RunContent::PLAIN,
+            },
         }
     }
 
@@ -168,19 +172,19 @@ impl Pool {
     }
 }
 
-impl Step {
+impl FieldRun {
     fn of(var: SysVar) -> Self {
         let kind = match var.ty() {
-            ScalarType::Float => Kind::FLOATS,
-            ScalarType::Byte => Kind(var.valid_bits()),
-            _ => Kind::PLAIN,
+            ScalarType::Float => RunContent::FLOATS,
+            ScalarType::Byte => RunContent(var.valid_bits()),
+            _ => RunContent::PLAIN,
         };
         Self { image: var.image_offset() as u16, len: var.size() as u8, kind }
     }
 
     fn joins(self, next: Self) -> bool {
         self.kind == next.kind
-            && matches!(self.kind, Kind::FLOATS | Kind::PLAIN)
+            && matches!(self.kind, RunContent::FLOATS | RunContent::PLAIN)
             && self.image.saturating_add(u16::from(self.len)) == next.image
             && usize::from(self.len.saturating_add(next.len)) <= runs::MAX_RUN
     }
@@ -280,7 +284,7 @@ impl<'a> FrameFields<'a> {
     }
 }
 
-impl Step {
+impl FieldRun {
     /// Bytes of the payload.
     #[inline]
     pub(super) const fn len(&self) -> usize {
@@ -308,7 +312,7 @@ impl Step {
 
     #[inline(always)]
     fn put_checked(&self, payload: &[u8], target: &mut [u8]) -> Option<Applied> {
-        if self.kind == Kind::FLOATS {
+        if self.kind == RunContent::FLOATS {
             return runs::copy_finite(target, payload).then_some(Applied { masked: 0 });
         }
         Some(Applied { masked: self.put(payload, target) })
@@ -329,7 +333,7 @@ impl Step {
     /// Whether the values of a run may be used.
     #[inline]
     fn accepts(&self, run: &[u8]) -> bool {
-        self.kind != Kind::FLOATS || runs::all_finite(run)
+        self.kind != RunContent::FLOATS || runs::all_finite(run)
     }
 
     /// Writes a run to its place in the image, and returns how many of its fields had reserved bits
@@ -342,11 +346,11 @@ impl Step {
     #[inline]
     fn put(&self, run: &[u8], target: &mut [u8]) -> u16 {
         match self.kind {
-            Kind::PLAIN | Kind::FLOATS => {
+            RunContent::PLAIN | RunContent::FLOATS => {
                 runs::copy(target, run);
                 0
             }
-            Kind(valid) => {
+            RunContent(valid) => {
                 let (Some(bits), Some(&received)) = (target.first_mut(), run.first()) else { return 0 };
                 *bits = received & valid;
                 u16::from(received & !valid != 0)

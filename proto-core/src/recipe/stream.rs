@@ -3,7 +3,7 @@
 //! In: payloads that [`Deframer`](super::Deframer) or [`datagram`](super::datagram) found, or the
 //! process image. Out: the other.
 
-use super::delimiter::{Head, Tail};
+use super::delimiter::{FrameHead, FrameTail};
 use super::error::{EncodeError, FieldPlace, NoSpace, PartError, ValueError};
 use super::fields::{Applied, FrameFields, PlacedField, Pool, Runs, Step, Values};
 use super::model::{Field, Framing, MAX_DELIMITER, MAX_STREAM_FRAME, Mode, Rules};
@@ -15,8 +15,8 @@ use crate::wire::scalar::Scalar;
 #[derive(Debug, Clone)]
 pub struct StreamLayout {
     rules: Rules,
-    pub(super) head: Head,
-    pub(super) tail: Tail,
+    pub(super) head: FrameHead,
+    pub(super) tail: FrameTail,
     frame_len: u16,
     payload_len: u16,
     whole: Step,
@@ -35,8 +35,8 @@ impl StreamLayout {
         fields: impl IntoIterator<Item = Field>,
         framing: Framing,
     ) -> Result<Self, PartError> {
-        let head = Head::new(head).ok_or(PartError::HeadTooLong { len: head.len() })?;
-        let tail = Tail::new(tail).ok_or(PartError::TailTooLong { len: tail.len() })?;
+        let head = FrameHead::new(head).ok_or(PartError::HeadTooLong { len: head.len() })?;
+        let tail = FrameTail::new(tail).ok_or(PartError::TailTooLong { len: tail.len() })?;
         match framing {
             Framing::Bytes if head.len() == 0 && tail.len() == 0 => return Err(PartError::NoDelimiter),
             Framing::Datagram if rules.mode == Mode::User => return Err(PartError::UserDatagram),

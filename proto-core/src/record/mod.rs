@@ -49,7 +49,7 @@ pub enum Entry<'a> {
 impl<'a> Entry<'a> {
     /// The entry that `bytes` begin with, and what follows it; `None` if they do not begin with one.
     pub fn parse(bytes: &'a [u8]) -> Option<(Self, &'a [u8])> {
-        let mut body = Reader(bytes);
+        let mut body = EntryReader(bytes);
         let entry = match body.byte()? {
             tag::START => Self::Start { image: body.bytes()? },
             tag::TOTALS => Self::Totals(body.bytes()?),
@@ -65,7 +65,7 @@ impl<'a> Entry<'a> {
 
     /// Writes the entry, in up to two pieces.
     pub fn encode(&self, mut write: impl FnMut(&[u8])) {
-        let mut head = Head::default();
+        let mut head = EntryHead::default();
         let tail = match *self {
             Self::Start { image } => head.tag(tag::START).len_of(image),
             Self::Totals(totals) => head.tag(tag::TOTALS).len_of(totals),
@@ -148,9 +148,9 @@ const MAX_ADDRESS: usize = 1 + 16 + 3;
 /// Everything of an entry but the bytes at its end: tag, two numbers of up to ten bytes, a port and
 /// a CAN frame at most.
 #[derive(Default)]
-struct Head(Vec<u8, 40>);
+struct EntryHead(Vec<u8, 40>);
 
-impl Head {
+impl EntryHead {
     fn tag(&mut self, tag: u8) -> &mut Self {
         self.byte(tag)
     }
@@ -257,9 +257,9 @@ impl Head {
     }
 }
 
-struct Reader<'a>(&'a [u8]);
+struct EntryReader<'a>(&'a [u8]);
 
-impl<'a> Reader<'a> {
+impl<'a> EntryReader<'a> {
     fn byte(&mut self) -> Option<u8> {
         let (byte, rest) = self.0.split_first()?;
         self.0 = rest;

@@ -69,7 +69,7 @@ pub struct SysVar(u8);
 
 /// Where a variable is.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Place {
+pub(crate) struct VarPlace {
     /// In the Modbus map.
     pub modbus: Option<ModbusPlace>,
     /// Number of variables from it to the last of its row.
@@ -186,7 +186,7 @@ impl SysVar {
 
     /// Its places, looked up once.
     #[inline]
-    pub(crate) fn place(self) -> Place {
+    pub(crate) fn place(self) -> VarPlace {
         let (span, nth, image_offset) = table::place_of(self.ordinal());
         // No address is near the end of 16 bits; a test looks at all of them.
         let modbus = span.modbus.map(|place| match place {
@@ -199,7 +199,7 @@ impl SysVar {
             }
         });
         let left_in_row = span.len().wrapping_sub(nth.into());
-        Place { modbus, left_in_row, image_offset }
+        VarPlace { modbus, left_in_row, image_offset }
     }
 
     #[inline]

@@ -5,7 +5,7 @@ use std::sync::OnceLock;
 use embassy_futures::block_on;
 use recipe_chip_model::device::{MILLI, Picos, SECOND};
 use recipe_chip_model::{Chip, Program};
-use recipe_store::{BLANK, Flash, Geometry, Place, Side, WORD, Word, newest};
+use recipe_store::{BLANK, Flash, FlashWord, Geometry, Side, WORD, Word, newest};
 use recipe_update::{
     IMAGE_OFFSET, NUCLEO_H743ZI as BOARD, NUCLEO_H743ZI_STORES as STORES, Slot, SlotMarks, SlotTrial,
 };
@@ -40,11 +40,11 @@ impl Flash for FlashCopy {
         Geometry { sectors: 2, words: WORDS }
     }
 
-    fn read(&self, Place { sector, word }: Place) -> Word {
+    fn read(&self, FlashWord { sector, word }: FlashWord) -> Word {
         self.0[usize::from(sector) * usize::from(WORDS) + usize::from(word)]
     }
 
-    async fn write(&mut self, Place { sector, word }: Place, new: &Word) {
+    async fn write(&mut self, FlashWord { sector, word }: FlashWord, new: &Word) {
         self.0[usize::from(sector) * usize::from(WORDS) + usize::from(word)] = *new;
     }
 

@@ -1,6 +1,8 @@
 //! Small programs for a slot, signed as a firmware is.
 
-use recipe_update::{BoardName, Formats, Header, IMAGE_OFFSET, NUCLEO_H743ZI as BOARD, Parts, Slot, Version};
+use recipe_update::{
+    BoardName, Formats, Header, IMAGE_OFFSET, ImageFacts, NUCLEO_H743ZI as BOARD, Slot, Version,
+};
 
 /// The private key of RFC 8032's third test. The loader of the tests is built for its public key.
 pub(crate) const SEED: [u8; 32] = [
@@ -92,6 +94,7 @@ impl Image {
 fn header(slot: Slot, bytes: &[u8], seed: &[u8; 32]) -> Header {
     let board = BoardName::parse(BOARD.board).expect("a name");
     let formats = Formats::new(1, 3, 3).expect("they fit");
-    let parts = Parts { board, slot, version: Version::new(0, 3, 0), formats, store: recipe_store::VERSION };
+    let parts =
+        ImageFacts { board, slot, version: Version::new(0, 3, 0), formats, store: recipe_store::VERSION };
     Header::sign(parts, bytes, seed).expect("it is not empty")
 }

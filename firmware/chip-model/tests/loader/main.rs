@@ -8,7 +8,7 @@ use bench::{GOOD_A, LoaderBench, mark_b};
 use image::{Image, ProgramKind};
 use recipe_chip_model::device::{MILLI, SECOND};
 use recipe_chip_model::models::flash::Torn;
-use recipe_update::{Ended, NUCLEO_H743ZI as BOARD, Slot, SlotMarks};
+use recipe_update::{NUCLEO_H743ZI as BOARD, Slot, SlotMarks, TrialEnd};
 
 #[test]
 #[ignore = "needs CHIP_UNICORN and CHIP_LOADER"]
@@ -50,7 +50,7 @@ fn a_firmware_that_restarts_or_hangs_on_trial_has_three_starts() {
         assert_eq!(bench.runs(), Slot::A);
         let ended = if does == ProgramKind::Hang { &bench.chip.resets } else { &bench.chip.restarts };
         assert_eq!(ended.len(), 3);
-        let last = Some((Slot::B, Ended::Failed));
+        let last = Some((Slot::B, TrialEnd::Failed));
         assert_eq!(bench.marks(), SlotMarks { good: Some(Slot::A), trial: None, last });
     }
 }
@@ -65,7 +65,7 @@ fn what_is_damaged_or_foreign_is_passed_over() {
     bench.put(Slot::B, &foreign);
     bench.mark(mark_b(3));
     assert_eq!(bench.runs(), Slot::A);
-    assert_eq!(bench.marks().last, Some((Slot::B, Ended::Failed)));
+    assert_eq!(bench.marks().last, Some((Slot::B, TrialEnd::Failed)));
     // A word of the good one cannot be read.
     bench.put(Slot::B, &Image::new(Slot::B, ProgramKind::Stay));
     bench.chip.tear(BOARD.slot(Slot::A) + 1024 + 20 * 32).expect("there is flash");

@@ -6,8 +6,8 @@
 use proto_core::sysvar::VarRange;
 use proto_core::time::Duration;
 use recipe_chip_model::device::{MICRO, MILLI, Picos, SECOND};
-use recipe_sparkplug::document::{Document, Host, MAX_DOCUMENT, OFF};
-use recipe_sparkplug::node::{Settings, Text};
+use recipe_sparkplug::document::{Host, MAX_DOCUMENT, NodeDocument, OFF};
+use recipe_sparkplug::node::{Credential, Settings};
 use recipe_sparkplug::topic::Id;
 use recipe_test_kit::http::Response;
 use serde_json::Value;
@@ -26,10 +26,10 @@ const REBIRTH: &[u8] = b"\x12\x1a\x0a\x14Node Control/Rebirth\x20\x0b\x70\x01";
 fn settings() -> Vec<u8> {
     let id = |name| Id::new(name).expect("a name");
     let mut settings = Settings::new(id("hall"), id("press"));
-    settings.login = Text::new("press").zip(Text::new("cold steel"));
+    settings.login = Credential::new("press").zip(Credential::new("cold steel"));
     settings.keep_alive = Duration::from_secs(5);
     let host = Host::try_from("192.168.12.10").expect("an address");
-    let mut document = Document { host: host.clone(), port: 1883, settings, ..Document::empty() };
+    let mut document = NodeDocument { host: host.clone(), port: 1883, settings, ..NodeDocument::empty() };
     document.time_server = Some((host, 123));
     let time = Duration::from_millis(100);
     (document.sample, document.interval, document.counter_interval) = (time, time, time);

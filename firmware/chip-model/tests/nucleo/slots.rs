@@ -8,7 +8,7 @@ use recipe_chip_model::device::{MILLI, SECOND};
 use recipe_config::SimConfig;
 use recipe_test_kit::http::Response;
 use recipe_update::{
-    BoardName, Formats, HEADER, Header, IMAGE_OFFSET, NUCLEO_H743ZI as BOARD, Parts, Slot, Version,
+    BoardName, Formats, HEADER, Header, IMAGE_OFFSET, ImageFacts, NUCLEO_H743ZI as BOARD, Slot, Version,
 };
 use serde_json::Value;
 
@@ -65,7 +65,7 @@ pub(crate) fn header(slot: Slot, image: &[u8], seed: &[u8; 32]) -> Header {
     let formats = Formats::new(image::OLDEST_VERSION, image::VERSION, image::VERSION).unwrap();
     let board = BoardName::parse(BOARD.board).unwrap();
     let version = Version::parse(env!("CARGO_PKG_VERSION")).unwrap();
-    let parts = Parts { board, slot, version, formats, store: recipe_store::VERSION };
+    let parts = ImageFacts { board, slot, version, formats, store: recipe_store::VERSION };
     Header::sign(parts, image, seed).unwrap()
 }
 

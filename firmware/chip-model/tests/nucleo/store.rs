@@ -5,7 +5,7 @@ use embassy_futures::block_on;
 use recipe_chip_model::CONFIG;
 use recipe_chip_model::device::{MILLI, SECOND};
 use recipe_chip_model::models::flash::Torn;
-use recipe_store::{BLANK, Flash, Geometry, Marks, Place, Store, Trial, WORD, Word};
+use recipe_store::{BLANK, Flash, FlashWord, Geometry, Marks, Store, Trial, WORD, Word};
 
 use crate::Bench;
 use crate::bench::image_of;
@@ -42,7 +42,7 @@ impl FlashCopy {
         }
     }
 
-    fn at(place: Place) -> usize {
+    fn at(place: FlashWord) -> usize {
         usize::from(place.sector) * usize::from(WORDS) + usize::from(place.word)
     }
 }
@@ -52,11 +52,11 @@ impl Flash for FlashCopy {
         Geometry { sectors: 2, words: WORDS }
     }
 
-    fn read(&self, place: Place) -> Word {
+    fn read(&self, place: FlashWord) -> Word {
         self.0[Self::at(place)]
     }
 
-    async fn write(&mut self, place: Place, word: &Word) {
+    async fn write(&mut self, place: FlashWord, word: &Word) {
         self.0[Self::at(place)] = *word;
     }
 
@@ -87,7 +87,7 @@ fn full_store(images: &[Vec<u8>], marks: Marks) -> FlashCopy {
     let mut flash = store_with(images, marks);
     let mut store = Store::mount(&flash).expect("it was written");
     let mut count = 0;
-    while flash.0[FlashCopy::at(Place { sector: 1, word: WORDS - 6 })] == BLANK {
+    while flash.0[FlashCopy::at(FlashWord { sector: 1, word: WORDS - 6 })] == BLANK {
         count += 1;
         block_on(store.set_counter(0, count).expect("there is room").execute(&mut flash))
             .expect("it is flash");

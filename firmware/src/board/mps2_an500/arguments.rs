@@ -14,9 +14,9 @@ pub(crate) fn argument<T>(nth: usize, look: impl FnOnce(&str) -> T) -> Option<T>
 
 /// The name of a file of the host.
 #[derive(Debug)]
-pub(crate) struct Name([u8; MAX_ARGUMENTS + 1]);
+pub(crate) struct FileName([u8; MAX_ARGUMENTS + 1]);
 
-impl Name {
+impl FileName {
     /// The name in an argument; `None` if there is none.
     pub(crate) fn argument(nth: usize) -> Option<Self> {
         let name = argument(nth, |path| {

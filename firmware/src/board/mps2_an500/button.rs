@@ -3,17 +3,17 @@
 use firmware::platform;
 use semihosting::fs::File;
 
-use super::arguments::Name;
+use super::arguments::FileName;
 
 /// The button.
 pub(crate) struct Button {
     /// `None` if no file is named: no button.
-    name: Option<Name>,
+    name: Option<FileName>,
 }
 
 impl Button {
     pub(super) fn new() -> Self {
-        Self { name: Name::argument(4) }
+        Self { name: FileName::argument(4) }
     }
 }
 

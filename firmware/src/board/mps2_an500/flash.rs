@@ -3,12 +3,12 @@
 
 use firmware::stored::StoreFlash;
 use firmware::update::{Site, Slots};
-use recipe_store::{Flash, Found, Geometry, MAX_DATA, Place, WORD, Word};
+use recipe_store::{Flash, FlashWord, FoundRecord, Geometry, MAX_DATA, WORD, Word};
 use recipe_update::{MPS2_AN500 as BOARD, Slot};
 use static_cell::ConstStaticCell;
 
 use super::super::slot::running;
-use super::arguments::Name;
+use super::arguments::FileName;
 use super::host_flash::HostFlash;
 
 /// The store: two sectors like those of the NUCLEO.
@@ -20,7 +20,7 @@ pub(crate) struct StoreFile {
 /// Opens or creates the store; called once.
 pub(super) fn store() -> Option<StoreFile> {
     static RECORD: ConstStaticCell<[u8; MAX_DATA]> = ConstStaticCell::new([0; MAX_DATA]);
-    let Some(flash) = HostFlash::open(&Name::argument(STORE)?, 0, STORE_SECTORS) else {
+    let Some(flash) = HostFlash::open(&FileName::argument(STORE)?, 0, STORE_SECTORS) else {
         firmware::error!("the file of the store cannot be opened");
         return None;
     };
@@ -35,7 +35,7 @@ pub(super) fn slots() -> Site<HostFlash> {
 fn opened() -> Result<Slots<HostFlash>, &'static str> {
     let running = running().ok_or("QEMU runs the program that it is given: there are no slots")?;
     let key = key().ok_or("there is no loader with a key at the beginning of the flash")?;
-    let name = Name::argument(SLOTS).ok_or("no file of the slots was named")?;
+    let name = FileName::argument(SLOTS).ok_or("no file of the slots was named")?;
     let open = |slot: Slot| {
         HostFlash::open(&name, BOARD.slot_offset(slot), BOARD.slot_sectors)
             .ok_or("the file of the slots cannot be opened")
@@ -55,11 +55,11 @@ impl Flash for StoreFile {
         self.flash.geometry()
     }
 
-    fn read(&self, place: Place) -> Word {
+    fn read(&self, place: FlashWord) -> Word {
         self.flash.read(place)
     }
 
-    async fn write(&mut self, place: Place, word: &Word) {
+    async fn write(&mut self, place: FlashWord, word: &Word) {
         self.flash.write(place, word).await;
     }
 
@@ -69,7 +69,7 @@ impl Flash for StoreFile {
 }
 
 impl StoreFlash for StoreFile {
-    fn bytes(&mut self, found: Found) -> Option<&[u8]> {
+    fn bytes(&mut self, found: FoundRecord) -> Option<&[u8]> {
         let mut place = found.data;
         let words = found.len.div_ceil(WORD);
         for nth in 0..words {

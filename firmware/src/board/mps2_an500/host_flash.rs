@@ -5,12 +5,12 @@
 use core::cell::RefCell;
 use core::fmt;
 
-use recipe_store::{BLANK, Flash, Geometry, Place, WORD, Word};
+use recipe_store::{BLANK, Flash, FlashWord, Geometry, WORD, Word};
 use recipe_update::SlotFlash;
 use semihosting::fs::File;
 use semihosting::io::{Read, Seek, SeekFrom, Write};
 
-use super::arguments::Name;
+use super::arguments::FileName;
 
 /// Words of a sector.
 const WORDS: u16 = 4096;
@@ -35,7 +35,7 @@ impl fmt::Debug for HostFlash {
 
 impl HostFlash {
     /// Opens `sectors` sectors of a file, which is created if it does not exist; `None` on failure.
-    pub(crate) fn open(name: &Name, start: u32, sectors: u8) -> Option<Self> {
+    pub(crate) fn open(name: &FileName, start: u32, sectors: u8) -> Option<Self> {
         let name = name.as_c_str();
         let opened = File::options().read(true).write(true).open(name);
         let file = opened
@@ -44,7 +44,7 @@ impl HostFlash {
         Some(Self { file: RefCell::new(file), start: start.into(), sectors, page: RefCell::new(None) })
     }
 
-    fn offset(&self, Place { sector, word }: Place) -> u64 {
+    fn offset(&self, FlashWord { sector, word }: FlashWord) -> u64 {
         self.start + (u64::from(sector) * u64::from(WORDS) + u64::from(word)) * WORD as u64
     }
 
@@ -86,7 +86,7 @@ impl Flash for HostFlash {
         Geometry { sectors: self.sectors, words: WORDS }
     }
 
-    fn read(&self, place: Place) -> Word {
+    fn read(&self, place: FlashWord) -> Word {
         let offset = self.offset(place);
         let inside = offset % (PAGE * WORD) as u64;
         let mut page = self.page.borrow_mut();
@@ -97,7 +97,7 @@ impl Flash for HostFlash {
         bytes.as_chunks().0.get(inside as usize / WORD).copied().unwrap_or(BLANK)
     }
 
-    async fn write(&mut self, place: Place, word: &Word) {
+    async fn write(&mut self, place: FlashWord, word: &Word) {
         // As in flash, writing only clears bits, so a second write is detected.
         let mut kept = self.read(place);
         kept.iter_mut().zip(word).for_each(|(kept, byte)| *kept &= byte);
@@ -107,13 +107,13 @@ impl Flash for HostFlash {
 
     async fn erase(&mut self, sector: u8) {
         for word in (0..WORDS).step_by(PAGE) {
-            let _ = self.write_at(self.offset(Place { sector, word }), &[0xFF; PAGE * WORD]);
+            let _ = self.write_at(self.offset(FlashWord { sector, word }), &[0xFF; PAGE * WORD]);
         }
     }
 }
 
 impl SlotFlash for HostFlash {
-    fn whole(&self, place: Place) -> Option<Word> {
+    fn whole(&self, place: FlashWord) -> Option<Word> {
         Some(self.read(place))
     }
 }

@@ -2,11 +2,11 @@
 
 use log::{LevelFilter, Log, Metadata, Record};
 
-struct Output;
+struct LogOutput;
 
-static OUTPUT: Output = Output;
+static OUTPUT: LogOutput = LogOutput;
 
-impl Log for Output {
+impl Log for LogOutput {
     fn enabled(&self, _: &Metadata<'_>) -> bool {
         true
     }

@@ -23,10 +23,10 @@ use cortex_m::interrupt::InterruptNumber;
 use cortex_m::peripheral::NVIC;
 use embassy_sync::waitqueue::AtomicWaker;
 use embassy_time::Duration;
-use firmware::drivers::lan9118::{Lan9118, Lan9118Error, Registers};
+use firmware::drivers::lan9118::{Lan9118, Lan9118Error, Lan9118Registers};
 use firmware::drivers::slcan::SlcanPort;
 use firmware::platform::{self, StatusLed};
-use firmware::stored::Places;
+use firmware::stored::StorePlaces;
 use firmware::update::Site;
 use proto_core::config::Rs485;
 use recipe_update::MPS2_AN500;
@@ -34,12 +34,12 @@ use recipe_update::MPS2_AN500;
 use watchdog::Watchdog;
 
 /// The numbers of the next devices to hand out.
-pub(crate) struct Board {
+pub(crate) struct Mps2An500 {
     serial: usize,
     can: usize,
 }
 
-impl platform::Board for Board {
+impl platform::Board for Mps2An500 {
     const NAME: &'static str = MPS2_AN500.board;
     const SERIAL_PORTS: usize = 2;
     const CAN_PORTS: usize = 1;
@@ -50,7 +50,7 @@ impl platform::Board for Board {
     type Can = SlcanPort<uart::Uart>;
     type Ethernet = Lan9118<LanRegisters>;
     type Watchdog = Watchdog;
-    type Led = Led;
+    type Led = FpgaLed;
     type Button = button::Button;
     type Flash = flash::StoreFile;
     type Slot = host_flash::HostFlash;
@@ -61,8 +61,8 @@ impl platform::Board for Board {
         storage::read()
     }
 
-    fn flash(&mut self) -> Option<Places<flash::StoreFile>> {
-        flash::store().map(Places::one)
+    fn flash(&mut self) -> Option<StorePlaces<flash::StoreFile>> {
+        flash::store().map(StorePlaces::one)
     }
 
     fn slots(&mut self) -> Site<host_flash::HostFlash> {
@@ -102,8 +102,8 @@ impl platform::Board for Board {
         Watchdog::start()
     }
 
-    fn led(&mut self) -> Led {
-        Led
+    fn led(&mut self) -> FpgaLed {
+        FpgaLed
     }
 
     fn seed(&mut self) -> u64 {
@@ -125,9 +125,9 @@ impl platform::Board for Board {
 
 /// LED 0 of the FPGA.
 #[derive(Debug)]
-pub(crate) struct Led;
+pub(crate) struct FpgaLed;
 
-impl StatusLed for Led {
+impl StatusLed for FpgaLed {
     fn set(&mut self, is_lit: bool) {
         registers::write(registers::FPGAIO, u32::from(is_lit));
     }
@@ -141,7 +141,7 @@ fn main() -> ! {
     log_output::start();
     time::start();
     executor::run(|spawner| {
-        let tasks = crate::start::start(spawner, Board { serial: 0, can: 0 });
+        let tasks = crate::start::start(spawner, Mps2An500 { serial: 0, can: 0 });
         fault_injection::start(&tasks);
     })
 }
@@ -181,7 +181,7 @@ unsafe fn HardFault(frame: &cortex_m_rt::ExceptionFrame) -> ! {
 #[derive(Debug)]
 pub(crate) struct LanRegisters;
 
-impl Registers for LanRegisters {
+impl Lan9118Registers for LanRegisters {
     fn read(&self, offset: u16) -> u32 {
         registers::read(registers::LAN9118 + u32::from(offset))
     }

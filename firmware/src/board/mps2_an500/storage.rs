@@ -9,7 +9,7 @@ use semihosting::fs::File;
 use semihosting::io::Read;
 use static_cell::ConstStaticCell;
 
-use super::arguments::{Name, argument};
+use super::arguments::{FileName, argument};
 
 /// Why there is no image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -36,7 +36,7 @@ impl fmt::Display for StorageError {
 /// Reads the image; called once.
 pub(super) fn read() -> Result<&'static [u8], StorageError> {
     static IMAGE: ConstStaticCell<[u8; MAX_IMAGE]> = ConstStaticCell::new([0; MAX_IMAGE]);
-    let name = Name::argument(1).ok_or(StorageError::NoName)?;
+    let name = FileName::argument(1).ok_or(StorageError::NoName)?;
     let mut file = File::open(name.as_c_str()).map_err(|_| StorageError::Unreadable)?;
     let image = IMAGE.take();
     let mut len = 0;

@@ -6,7 +6,7 @@ use embassy_stm32::pac::{FDCAN1, FDCANRAM};
 use embassy_stm32::peripherals::{PD0, PD1};
 use embassy_stm32::{Peri, peripherals, rcc};
 use embassy_sync::waitqueue::AtomicWaker;
-use firmware::drivers::mcan::{MESSAGE_RAM_WORDS, Mcan, McanError, Registers};
+use firmware::drivers::mcan::{MESSAGE_RAM_WORDS, Mcan, McanBlock, McanError};
 
 /// The CAN controller.
 pub(crate) type CanDevice = Mcan<CanRegisters>;
@@ -14,7 +14,7 @@ pub(crate) type CanDevice = Mcan<CanRegisters>;
 /// The registers of FDCAN1, and the message RAM, which FDCAN2 does not use.
 pub(crate) struct CanRegisters;
 
-impl Registers for CanRegisters {
+impl McanBlock for CanRegisters {
     fn read(&self, offset: u8) -> u32 {
         // SAFETY: the driver's offsets are registers of the controller, aligned.
         unsafe { FDCAN1.as_ptr().cast::<u8>().add(usize::from(offset)).cast::<u32>().read_volatile() }

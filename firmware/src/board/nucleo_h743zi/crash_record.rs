@@ -6,7 +6,7 @@ use core::sync::atomic::{AtomicU8, AtomicU32, Ordering};
 
 use cortex_m::peripheral::SCB;
 use cortex_m_rt::ExceptionFrame;
-use firmware::fmt::Text;
+use firmware::fmt::DisplayText;
 use firmware::identity::hash;
 use firmware::tasks::watchdog::running;
 use firmware::warn;
@@ -40,9 +40,9 @@ fn record() -> &'static Record {
 }
 
 /// Writes text, truncated at the capacity; holds its length.
-struct Writer(usize);
+struct CrashWriter(usize);
 
-impl Write for Writer {
+impl Write for CrashWriter {
     fn write_str(&mut self, text: &str) -> fmt::Result {
         for (place, byte) in record().text.iter().skip(self.0).zip(text.bytes()) {
             place.store(byte, Ordering::Relaxed);
@@ -52,7 +52,7 @@ impl Write for Writer {
     }
 }
 
-impl Writer {
+impl CrashWriter {
     /// Appends the running task and completes the record.
     fn end(mut self) {
         let _ = match running() {
@@ -73,7 +73,7 @@ pub(super) fn save_fault(frame: &ExceptionFrame) {
         let scb = &*SCB::PTR;
         (scb.cfsr.read(), scb.mmfar.read(), scb.bfar.read())
     };
-    let mut writer = Writer(0);
+    let mut writer = CrashWriter(0);
     // A panic ends in an undefined instruction, after its message was logged.
     let kind = if cause & UNDEFINED_INSTRUCTION != 0 { "panic at" } else { "fault at" };
     let _ = write!(writer, "{kind} {:08X}, from {:08X}, CFSR {cause:08X}", frame.pc(), frame.lr());
@@ -88,7 +88,7 @@ pub(super) fn save_fault(frame: &ExceptionFrame) {
 
 /// Saves which task was running when the watchdog was not fed.
 pub(super) fn save_hang() {
-    let mut writer = Writer(0);
+    let mut writer = CrashWriter(0);
     let _ = writer.write_str("the watchdog was not fed");
     writer.end();
 }
@@ -108,7 +108,7 @@ pub(super) fn log() {
     if sum(&bytes) == record().sum.load(Ordering::Relaxed)
         && let Some(Ok(text)) = bytes.get(..len).map(core::str::from_utf8)
     {
-        warn!("previous run: {}", Text(&text));
+        warn!("previous run: {}", DisplayText(&text));
     }
 }
 

@@ -17,7 +17,7 @@ use embassy_stm32::{Peri, interrupt};
 use embassy_time::{Duration, Instant, Timer};
 use static_cell::ConstStaticCell;
 
-use super::leds::Led;
+use super::leds::BoardLed;
 use firmware::platform::StatusLed;
 
 /// The Ethernet controller.
@@ -64,7 +64,12 @@ pub(super) struct EthernetParts {
 
 impl EthernetParts {
     /// Starts the controller. Takes half a second at most, if the PHY provides its clock but does not answer.
-    pub(super) fn start<I>(mut self, irqs: I, address: [u8; 6], led: Led) -> Result<Ethernet, EthernetError>
+    pub(super) fn start<I>(
+        mut self,
+        irqs: I,
+        address: [u8; 6],
+        led: BoardLed,
+    ) -> Result<Ethernet, EthernetError>
     where
         I: interrupt::typelevel::Binding<interrupt::typelevel::ETH, eth::InterruptHandler> + 'static,
     {
@@ -134,7 +139,7 @@ fn has_clock(ref_clk: Peri<'_, PA1>) -> bool {
 /// there is no link, instead of one that loses frames.
 pub(crate) struct Lan8742 {
     sma: Sma<'static, ETH_SMA>,
-    led: Led,
+    led: BoardLed,
     /// The link was up at the last poll.
     is_up: bool,
     /// Time of the next poll: it takes 0.1 ms, and the network stack asks with each frame.

@@ -12,9 +12,9 @@ use core::task::{Context, Poll, Waker};
 use embassy_stm32::pac::FLASH;
 use embassy_stm32::pac::flash::regs::{Ccr, Cr};
 use embassy_time::{Duration, Instant, Timer};
-use firmware::stored::{Places, StoreFlash};
+use firmware::stored::{StoreFlash, StorePlaces};
 use firmware::update::{Site, Slots};
-use recipe_store::{Found, Geometry, Place, Side, WORD, Word};
+use recipe_store::{FlashWord, FoundRecord, Geometry, Side, WORD, Word};
 use recipe_update::{NUCLEO_H743ZI as BOARD, NUCLEO_H743ZI_STORES as STORES, Slot, SlotFlash, Stores};
 
 use super::super::slot::running;
@@ -57,16 +57,16 @@ const _: () = assert!(BOARD.slot_sectors == 5);
 ///
 /// # Safety
 /// To be called once.
-pub(super) unsafe fn stores() -> Places<Area> {
+pub(super) unsafe fn stores() -> StorePlaces<Area> {
     let place = |side: Side| {
         let [first, second] = STORES.sectors(side);
         Area { sectors: [first, second, second, second, second], count: 2 }
     };
     let first = place(Side::First);
     match running() {
-        Some(slot) => Places { first, second: Some(place(Side::Second)), own: Stores::of(slot) },
+        Some(slot) => StorePlaces { first, second: Some(place(Side::Second)), own: Stores::of(slot) },
         // Without a loader, slot A may hold a firmware, but it does not run.
-        None => Places { first, second: None, own: Side::First },
+        None => StorePlaces { first, second: None, own: Side::First },
     }
 }
 
@@ -107,7 +107,7 @@ fn key() -> Option<[u8; 32]> {
 
 impl Area {
     /// Address of a word; that of the first sector if the sector does not exist.
-    fn address(&self, Place { sector, word }: Place) -> usize {
+    fn address(&self, FlashWord { sector, word }: FlashWord) -> usize {
         let [first, ..] = self.sectors;
         let start = self.sectors.get(usize::from(sector)).copied().unwrap_or(first);
         start as usize + WORD * usize::from(word)
@@ -147,7 +147,7 @@ async fn finish(bank: usize, wait: Wait) {
 }
 
 impl SlotFlash for Area {
-    fn whole(&self, place: Place) -> Option<Word> {
+    fn whole(&self, place: FlashWord) -> Option<Word> {
         let address = self.address(place);
         // SAFETY: a word of this area in flash, which is readable, and written by nobody else.
         can_read(address)
@@ -160,11 +160,11 @@ impl recipe_store::Flash for Area {
         Geometry { sectors: self.count, words: (BOARD.sector / WORD as u32) as u16 }
     }
 
-    fn read(&self, place: Place) -> Word {
+    fn read(&self, place: FlashWord) -> Word {
         self.whole(place).unwrap_or([0; WORD])
     }
 
-    async fn write(&mut self, place: Place, word: &Word) {
+    async fn write(&mut self, place: FlashWord, word: &Word) {
         let address = self.address(place);
         let (bank, _) = bank_and_sector(address);
         unlock(bank);
@@ -183,7 +183,7 @@ impl recipe_store::Flash for Area {
     }
 
     async fn erase(&mut self, sector: u8) {
-        let (bank, number) = bank_and_sector(self.address(Place { sector, word: 0 }));
+        let (bank, number) = bank_and_sector(self.address(FlashWord { sector, word: 0 }));
         unlock(bank);
         let mut control = Cr(0);
         control.set_psize(FASTEST);
@@ -198,7 +198,7 @@ impl recipe_store::Flash for Area {
 }
 
 impl StoreFlash for Area {
-    fn bytes(&mut self, found: Found) -> Option<&[u8]> {
+    fn bytes(&mut self, found: FoundRecord) -> Option<&[u8]> {
         let start = self.address(found.data);
         // SAFETY: the record lies in one sector. It is not changed while it is borrowed: writing takes `&mut self`.
         // All its words were read when the store was opened, or written and read back since.

@@ -9,9 +9,9 @@ use embassy_stm32::peripherals::{PB0, PB14, PE1};
 use firmware::platform::StatusLed;
 
 /// An LED.
-pub(crate) struct Led(Output<'static>);
+pub(crate) struct BoardLed(Output<'static>);
 
-impl StatusLed for Led {
+impl StatusLed for BoardLed {
     fn set(&mut self, is_lit: bool) {
         self.0.set_level(is_lit.into());
     }
@@ -19,8 +19,8 @@ impl StatusLed for Led {
 
 /// LEDs that are handed out.
 pub(super) struct Leds {
-    pub(super) status: Led,
-    pub(super) link: Led,
+    pub(super) status: BoardLed,
+    pub(super) link: BoardLed,
 }
 
 impl Leds {
@@ -32,8 +32,8 @@ impl Leds {
         // [`fault`] sets it through its registers.
         core::mem::forget(Output::new(red, Level::Low, Speed::Low));
         Self {
-            status: Led(Output::new(green, Level::Low, Speed::Low)),
-            link: Led(Output::new(yellow, Level::Low, Speed::Low)),
+            status: BoardLed(Output::new(green, Level::Low, Speed::Low)),
+            link: BoardLed(Output::new(yellow, Level::Low, Speed::Low)),
         }
     }
 }

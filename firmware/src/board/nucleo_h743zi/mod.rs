@@ -21,8 +21,8 @@ use defmt_rtt as _;
 use embassy_executor::Executor;
 use embassy_stm32::{bind_interrupts, eth};
 use embassy_time::Duration;
-use firmware::fmt::Text;
-use firmware::stored::Places;
+use firmware::fmt::DisplayText;
+use firmware::stored::StorePlaces;
 use firmware::update::Site;
 use firmware::{error, info, platform, warn};
 use panic_probe as _;
@@ -30,7 +30,7 @@ use proto_core::config::Rs485;
 use recipe_update::NUCLEO_H743ZI;
 use static_cell::StaticCell;
 
-use leds::Led;
+use leds::BoardLed;
 use watchdog::Watchdog;
 
 bind_interrupts!(struct Irqs {
@@ -43,19 +43,19 @@ bind_interrupts!(struct Irqs {
 defmt::timestamp!("{=u64:us}", embassy_time::Instant::now().as_micros());
 
 /// Devices that have not been handed out.
-pub(crate) struct Board {
+pub(crate) struct NucleoH743zi {
     serial: serial::Lines,
     can: Option<can::CanPins>,
     ethernet: Option<ethernet::EthernetParts>,
-    link: Option<Led>,
-    status: Option<Led>,
+    link: Option<BoardLed>,
+    status: Option<BoardLed>,
     watchdog: Option<Watchdog>,
-    stores: Option<Places<flash::Area>>,
+    stores: Option<StorePlaces<flash::Area>>,
     slots: Option<Site<flash::Area>>,
     button: Option<button::Button>,
 }
 
-impl platform::Board for Board {
+impl platform::Board for NucleoH743zi {
     const NAME: &'static str = NUCLEO_H743ZI.board;
     const SERIAL_PORTS: usize = 2;
     const CAN_PORTS: usize = 1;
@@ -65,7 +65,7 @@ impl platform::Board for Board {
     type Can = can::CanDevice;
     type Ethernet = ethernet::Ethernet;
     type Watchdog = Watchdog;
-    type Led = Led;
+    type Led = BoardLed;
     type Button = button::Button;
     type Flash = flash::Area;
     type Slot = flash::Area;
@@ -76,7 +76,7 @@ impl platform::Board for Board {
         storage::read()
     }
 
-    fn flash(&mut self) -> Option<Places<flash::Area>> {
+    fn flash(&mut self) -> Option<StorePlaces<flash::Area>> {
         self.stores.take()
     }
 
@@ -90,11 +90,11 @@ impl platform::Board for Board {
     }
 
     fn serial(&mut self, line: &Rs485) -> Option<Self::Serial> {
-        self.serial.next(line)?.inspect_err(|error| error!("{}", Text(error))).ok()
+        self.serial.next(line)?.inspect_err(|error| error!("{}", DisplayText(error))).ok()
     }
 
     fn can(&mut self, bitrate: u32) -> Option<Self::Can> {
-        can::start(self.can.take()?, bitrate).inspect_err(|error| error!("{}", Text(error))).ok()
+        can::start(self.can.take()?, bitrate).inspect_err(|error| error!("{}", DisplayText(error))).ok()
     }
 
     fn ethernet(&mut self) -> Result<Self::Ethernet, Self::EthernetError> {
@@ -108,7 +108,7 @@ impl platform::Board for Board {
         self.watchdog.take().expect("asked for once")
     }
 
-    fn led(&mut self) -> Led {
+    fn led(&mut self) -> BoardLed {
         self.status.take().expect("asked for once")
     }
 
@@ -147,7 +147,7 @@ fn main() -> ! {
     if let Some(core) = &mut core {
         watchdog::supervise(&mut core.SYST);
     }
-    let board = Board {
+    let board = NucleoH743zi {
         serial: serial::Lines::new(serial::UartPins {
             usart2: (p.PD5, p.PD6, p.PD4),
             uart7: (p.PE8, p.PE7, p.PE9),

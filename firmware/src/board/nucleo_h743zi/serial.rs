@@ -5,7 +5,7 @@ use embassy_stm32::interrupt::typelevel::{self, Handler, Interrupt};
 use embassy_stm32::pac::{UART7, USART2, usart};
 use embassy_stm32::peripherals::{PD4, PD5, PD6, PE7, PE8, PE9};
 use embassy_stm32::{Peri, peripherals, rcc};
-use firmware::drivers::usart::{BaudError, Registers, Usart, UsartShared};
+use firmware::drivers::usart::{BaudError, Usart, UsartBlock, UsartShared};
 use proto_core::config::Rs485;
 
 /// An RS-485 line.
@@ -15,7 +15,7 @@ pub(crate) type SerialDevice = Usart<UsartRegisters>;
 #[derive(Clone, Copy)]
 pub(crate) struct UsartRegisters(usart::Usart);
 
-impl Registers for UsartRegisters {
+impl UsartBlock for UsartRegisters {
     fn read(&self, offset: u8) -> u32 {
         // SAFETY: the driver's offsets are registers of the USART, aligned.
         unsafe { self.0.as_ptr().cast::<u8>().add(usize::from(offset)).cast::<u32>().read_volatile() }

@@ -42,7 +42,7 @@ impl Model {
 
 struct Registers(RefCell<Model>);
 
-impl super::Registers for Registers {
+impl super::Lan9118Registers for Registers {
     fn read(&self, offset: u16) -> u32 {
         let mut model = self.0.borrow_mut();
         match offset {
@@ -138,7 +138,7 @@ fn it_starts_with_the_address_of_the_eeprom() {
 #[test]
 fn another_chip_or_none_is_refused_in_bounded_time() {
     struct Nothing(u32);
-    impl super::Registers for Nothing {
+    impl super::Lan9118Registers for Nothing {
         fn read(&self, _: u16) -> u32 {
             self.0
         }

@@ -23,7 +23,7 @@ const OFFSET: u16 = 0x300;
 
 type Model = Rc<TestDevice<Fdcan>>;
 
-impl Registers for Model {
+impl McanBlock for Model {
     fn read(&self, offset: u8) -> u32 {
         TestDevice::read(self, offset.into())
     }
@@ -183,7 +183,7 @@ impl McanBench {
     }
 
     fn get(&self, register: u8) -> u32 {
-        Registers::read(&self.model, register)
+        McanBlock::read(&self.model, register)
     }
 
     /// The first word of a part of the message RAM, as the driver counts it.
@@ -477,7 +477,7 @@ fn the_interrupt_wakes_who_waits_and_falls_silent_whatever_happened() {
 #[test]
 fn no_controller_or_no_clock_is_refused() {
     struct Dead;
-    impl Registers for Dead {
+    impl McanBlock for Dead {
         fn read(&self, _: u8) -> u32 {
             0
         }

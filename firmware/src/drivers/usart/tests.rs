@@ -23,7 +23,7 @@ const CLOCK: u32 = 100_000_000;
 
 type Model = Rc<TestDevice<Chip>>;
 
-impl Registers for Model {
+impl UsartBlock for Model {
     fn read(&self, offset: u8) -> u32 {
         TestDevice::read(self, offset.into())
     }
@@ -81,7 +81,7 @@ impl UsartBench {
     }
 
     fn get(&self, register: u8) -> u32 {
-        Registers::read(&self.model, register)
+        UsartBlock::read(&self.model, register)
     }
 
     /// Direct access to the line.

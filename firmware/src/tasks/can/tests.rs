@@ -17,8 +17,8 @@ use proto_core::engine::PortCounters;
 use proto_core::wire::scalar::ScalarType;
 
 use super::*;
-use crate::tasks::test_clock::{Clock, advance};
-use crate::tasks::watchdog::{TaskName, Watch};
+use crate::tasks::test_clock::{TestClock, advance};
+use crate::tasks::watchdog::{TaskName, TaskWatch};
 
 const PORT: PortId = PortId(0);
 const BITRATE: u32 = 500_000;
@@ -165,16 +165,16 @@ struct Cell {
     controller: Rc<RefCell<Controller>>,
     engine: RunningPort,
     task: RunningPort,
-    _clock: Clock,
+    _clock: TestClock,
 }
 
 impl Cell {
     fn new() -> Self {
-        let clock = Clock::take();
+        let clock = TestClock::take();
         let gateway = Box::leak(Box::new(Gateway::idle()));
         gateway.configure(&config()).unwrap();
         let gateway: &'static Gateway = gateway;
-        let watch: &'static Watch<2> = Box::leak(Box::new(Watch::new()));
+        let watch: &'static TaskWatch<2> = Box::leak(Box::new(TaskWatch::new()));
         let pulses = [TaskName::Engine, TaskName::Can(PORT)].map(|name| watch.register(name).unwrap());
         let controller = Rc::new(RefCell::new(Controller {
             is_acknowledged: true,

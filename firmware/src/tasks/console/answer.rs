@@ -9,7 +9,7 @@ use recipe_api::guard::Refusal;
 use recipe_api::json;
 use recipe_api::key::SCHEME;
 use recipe_api::nonces::NonceText;
-use recipe_api::response::{Kind, LAST_CHUNK, Length, Response, Status};
+use recipe_api::response::{ContentType, LAST_CHUNK, Length, Response, StatusCode};
 use recipe_api::revisions::Revision;
 
 use super::MAX_TIME;
@@ -29,8 +29,8 @@ pub(super) enum SendError {
 /// await point costs flash.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Reply {
-    status: Status,
-    kind: Kind,
+    status: StatusCode,
+    kind: ContentType,
     etag: Option<Revision>,
     allow: Option<&'static str>,
     retry_after_s: Option<u64>,
@@ -42,8 +42,8 @@ impl Reply {
     /// A reply whose body is written by `write`.
     pub(super) fn new(
         buf: &mut [u8],
-        status: Status,
-        kind: Kind,
+        status: StatusCode,
+        kind: ContentType,
         write: impl FnOnce(&mut TextBuffer<'_>) -> fmt::Result,
     ) -> Self {
         let mut buf = TextBuffer::new(buf);
@@ -52,7 +52,7 @@ impl Reply {
     }
 
     /// A JSON object with the key `error`.
-    pub(super) fn error(buf: &mut [u8], status: Status, text: impl Display) -> Self {
+    pub(super) fn error(buf: &mut [u8], status: StatusCode, text: impl Display) -> Self {
         Self::refusing(buf, status, &text)
     }
 
@@ -61,8 +61,8 @@ impl Reply {
         Self { etag, ..self }
     }
 
-    fn refusing(buf: &mut [u8], status: Status, text: &dyn Display) -> Self {
-        Self::new(buf, status, Kind::Json, |out| {
+    fn refusing(buf: &mut [u8], status: StatusCode, text: &dyn Display) -> Self {
+        Self::new(buf, status, ContentType::Json, |out| {
             out.write_str("{\"error\":")?;
             json::write_text(out, text)?;
             out.write_char('}')
@@ -76,7 +76,7 @@ impl Reply {
 }
 
 /// Result of executing a request.
-pub(super) enum Outcome {
+pub(super) enum RequestOutcome {
     /// A reply that remains to be sent.
     Reply(Reply),
     /// The reply was sent.
@@ -137,11 +137,11 @@ impl Responder<'_, '_> {
     /// Sends the head of a reply whose body follows in pieces. Returns whether the body is wanted (not for HEAD).
     pub(super) async fn begin(
         &mut self,
-        kind: Kind,
+        kind: ContentType,
         length: Length,
         etag: Option<Revision>,
     ) -> Result<bool, SendError> {
-        let reply = Reply::new(self.buf, Status::OK, kind, |_| Ok(())).about(etag);
+        let reply = Reply::new(self.buf, StatusCode::OK, kind, |_| Ok(())).about(etag);
         let head = self.write_head(0, length, &reply).ok_or(SendError::TooLong)?;
         self.send_part(0, head, Instant::now() + MAX_TIME).await?;
         Ok(!self.is_head)
@@ -164,7 +164,7 @@ impl Responder<'_, '_> {
             let _ = fields.push(("Retry-After", seconds));
         }
         match (&challenge, &self.nonce) {
-            (Some(challenge), _) if reply.status == Status::UNAUTHORIZED => {
+            (Some(challenge), _) if reply.status == StatusCode::UNAUTHORIZED => {
                 let _ = fields.push(("WWW-Authenticate", challenge));
             }
             (_, Some(nonce)) => drop(fields.push(("Next-Nonce", nonce))),

@@ -1,9 +1,9 @@
 //! Arguments of operations that change something.
 
 use proto_core::time::Duration as Span;
-use recipe_api::arguments::{Value, each};
+use recipe_api::arguments::{ArgumentValue, each};
 use recipe_api::key::{KEY_LEN, Key, from_hex};
-use recipe_api::route::Operation;
+use recipe_api::route::ApiOperation;
 
 /// Arguments parsed from a body.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -25,12 +25,12 @@ pub(super) enum Arguments {
 impl Arguments {
     /// Parses a body.
     #[inline(never)]
-    pub(super) fn parse(operation: Operation, body: &[u8]) -> Self {
+    pub(super) fn parse(operation: ApiOperation, body: &[u8]) -> Self {
         match operation {
-            Operation::Apply => apply(body),
-            Operation::Claim => claim(body),
-            Operation::Identify => identify(body),
-            Operation::TryUpdate => try_update(body),
+            ApiOperation::Apply => apply(body),
+            ApiOperation::Claim => claim(body),
+            ApiOperation::Identify => identify(body),
+            ApiOperation::TryUpdate => try_update(body),
             _ if each(body, |_, _| false) => Self::None,
             _ => Self::Wrong("this operation takes no arguments"),
         }
@@ -40,7 +40,9 @@ impl Arguments {
 fn apply(body: &[u8]) -> Arguments {
     let (mut number, mut trial) = (None, None);
     let is_read = each(body, |name, value| match (name, value) {
-        ("confirm_s", Value::Thousandths(millis)) => trial.replace(Span::from_millis(millis)).is_none(),
+        ("confirm_s", ArgumentValue::Thousandths(millis)) => {
+            trial.replace(Span::from_millis(millis)).is_none()
+        }
         ("revision", value) => {
             let is_new = number.is_none();
             number = value.whole();
@@ -57,7 +59,7 @@ fn apply(body: &[u8]) -> Arguments {
 fn claim(body: &[u8]) -> Arguments {
     let mut key = None;
     let is_read = each(body, |name, value| match (name, value) {
-        ("key", Value::Text(text)) if Key::parse(text).is_some() => {
+        ("key", ArgumentValue::Text(text)) if Key::parse(text).is_some() => {
             key.replace(from_hex::<KEY_LEN>(text)).is_none()
         }
         _ => false,
@@ -108,23 +110,23 @@ const MAX_SECONDS: u32 = 600;
 mod tests {
     use super::*;
 
-    fn parse(operation: Operation, body: &str) -> Arguments {
+    fn parse(operation: ApiOperation, body: &str) -> Arguments {
         Arguments::parse(operation, body.as_bytes())
     }
 
     #[test]
     fn each_operation_has_its_own() {
         let default = Arguments::Apply { number: None, trial: Span::from_secs(60) };
-        assert_eq!(parse(Operation::Apply, ""), default);
-        assert_eq!(parse(Operation::Apply, "{}"), default);
+        assert_eq!(parse(ApiOperation::Apply, ""), default);
+        assert_eq!(parse(ApiOperation::Apply, "{}"), default);
         let both = Arguments::Apply { number: Some(3), trial: Span::from_millis(1_500) };
-        assert_eq!(parse(Operation::Apply, "{\"confirm_s\": 1.5, \"revision\": 3}"), both);
-        assert_eq!(parse(Operation::Confirm, "{}"), Arguments::None);
-        assert_eq!(parse(Operation::Identify, ""), Arguments::Seconds(10));
-        assert_eq!(parse(Operation::Identify, "{\"s\":600}"), Arguments::Seconds(600));
-        assert_eq!(parse(Operation::TryUpdate, ""), Arguments::Try(300));
-        assert_eq!(parse(Operation::TryUpdate, "{\"confirm_s\":60}"), Arguments::Try(60));
-        let key = parse(Operation::Claim, "{\"key\": \"000102030405060708090a0b0c0d0eFF\"}");
+        assert_eq!(parse(ApiOperation::Apply, "{\"confirm_s\": 1.5, \"revision\": 3}"), both);
+        assert_eq!(parse(ApiOperation::Confirm, "{}"), Arguments::None);
+        assert_eq!(parse(ApiOperation::Identify, ""), Arguments::Seconds(10));
+        assert_eq!(parse(ApiOperation::Identify, "{\"s\":600}"), Arguments::Seconds(600));
+        assert_eq!(parse(ApiOperation::TryUpdate, ""), Arguments::Try(300));
+        assert_eq!(parse(ApiOperation::TryUpdate, "{\"confirm_s\":60}"), Arguments::Try(60));
+        let key = parse(ApiOperation::Claim, "{\"key\": \"000102030405060708090a0b0c0d0eFF\"}");
         let bytes = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 255];
         assert_eq!(key, Arguments::Key(bytes));
     }
@@ -132,19 +134,19 @@ mod tests {
     #[test]
     fn what_is_unknown_or_comes_twice_is_refused() {
         for (operation, body) in [
-            (Operation::Apply, "{\"confirm\":1}"),
-            (Operation::Apply, "{\"confirm_s\":1,\"confirm_s\":2}"),
-            (Operation::Apply, "{\"revision\":1.5}"),
-            (Operation::Confirm, "{\"a\":1}"),
-            (Operation::Rollback, "x"),
-            (Operation::Identify, "{\"s\":0}"),
-            (Operation::Identify, "{\"s\":601}"),
-            (Operation::Identify, "{\"t\":1}"),
-            (Operation::TryUpdate, "{\"confirm_s\":59}"),
-            (Operation::TryUpdate, "{\"s\":60}"),
-            (Operation::Claim, ""),
-            (Operation::Claim, "{\"key\":\"00\"}"),
-            (Operation::Claim, "{\"key\":\"00000000000000000000000000000000\"}"),
+            (ApiOperation::Apply, "{\"confirm\":1}"),
+            (ApiOperation::Apply, "{\"confirm_s\":1,\"confirm_s\":2}"),
+            (ApiOperation::Apply, "{\"revision\":1.5}"),
+            (ApiOperation::Confirm, "{\"a\":1}"),
+            (ApiOperation::Rollback, "x"),
+            (ApiOperation::Identify, "{\"s\":0}"),
+            (ApiOperation::Identify, "{\"s\":601}"),
+            (ApiOperation::Identify, "{\"t\":1}"),
+            (ApiOperation::TryUpdate, "{\"confirm_s\":59}"),
+            (ApiOperation::TryUpdate, "{\"s\":60}"),
+            (ApiOperation::Claim, ""),
+            (ApiOperation::Claim, "{\"key\":\"00\"}"),
+            (ApiOperation::Claim, "{\"key\":\"00000000000000000000000000000000\"}"),
         ] {
             assert!(matches!(parse(operation, body), Arguments::Wrong(_)), "{operation:?} {body}");
         }

@@ -7,25 +7,25 @@ use embassy_time::{Duration, Instant};
 use proto_core::config::image::{self, Scan};
 use recipe_api::claim::{Claim, ClaimError};
 use recipe_api::key::{KEY_LEN, Key};
-use recipe_api::response::{Kind, Status};
+use recipe_api::response::{ContentType, StatusCode};
 use recipe_api::revisions::Refused;
-use recipe_api::route::Operation;
+use recipe_api::route::ApiOperation;
 use recipe_update::Downgrade;
 
 use super::answer::{Etag, Reply};
 use super::arguments::Arguments;
-use super::connection::Request;
+use super::connection::ConsoleRequest;
 use super::{Console, edge};
 use crate::clock::now;
-use crate::fmt::Text;
+use crate::fmt::DisplayText;
 use crate::tasks::store::{Failed, StoreLock, StoreRequest};
 use crate::warn;
 
 impl Console {
     /// Executes a change.
-    pub(super) async fn change<'a>(&'a self, buf: &mut [u8], request: Request<'a>) -> Reply {
-        let Request { operation, peer, .. } = request;
-        if operation == Operation::PutConfig
+    pub(super) async fn change<'a>(&'a self, buf: &mut [u8], request: ConsoleRequest<'a>) -> Reply {
+        let ConsoleRequest { operation, peer, .. } = request;
+        if operation == ApiOperation::PutConfig
             && let Some((len, lock)) = &request.image
             && let Some(refused) = self.look_through(buf, *len, lock).await
         {
@@ -39,44 +39,45 @@ impl Console {
         match (done, change) {
             (Ok(_), StoreRequest::Claim(key)) => {
                 self.is_claimed(Some(key));
-                warn!("claimed by {}", Text(&peer));
+                warn!("claimed by {}", DisplayText(&peer));
                 let name = &self.name;
-                Reply::new(buf, Status::OK, Kind::Json, |out| {
+                Reply::new(buf, StatusCode::OK, ContentType::Json, |out| {
                     write!(out, "{{\"name\":\"{name}\",\"claimed\":true}}")
                 })
             }
             (Err(_), StoreRequest::Claim(_)) => {
                 self.is_claimed(None);
-                Reply::error(buf, Status::INTERNAL, "the key cannot be kept")
+                Reply::error(buf, StatusCode::INTERNAL, "the key cannot be kept")
             }
             // Not logged: an update has many pieces.
-            (Ok(_), StoreRequest::Piece { .. }) => self.firmware(buf, Status::OK),
+            (Ok(_), StoreRequest::Piece { .. }) => self.firmware(buf, StatusCode::OK),
             (Ok(_), StoreRequest::ConfirmFirmware) => {
-                warn!("the firmware is confirmed for {}", Text(&peer));
-                self.firmware(buf, Status::OK)
+                warn!("the firmware is confirmed for {}", DisplayText(&peer));
+                self.firmware(buf, StatusCode::OK)
             }
             (Ok(_), StoreRequest::TryFirmware { .. } | StoreRequest::EndFirmware) => {
-                warn!("another firmware is to run for {}", Text(&peer));
-                self.firmware(buf, Status::ACCEPTED)
+                warn!("another firmware is to run for {}", DisplayText(&peer));
+                self.firmware(buf, StatusCode::ACCEPTED)
             }
             (Ok(_), StoreRequest::Edge { publishes, restart, .. }) => {
                 self.edge_stored(buf, peer, publishes, restart)
             }
             (Err(Failed::Firmware(why)), _) => {
-                warn!("{} refused to {}: {}", name(operation), Text(&peer), Text(&why));
-                let status = if why.is_wrong() { Status::UNPROCESSABLE } else { Status::CONFLICT };
+                warn!("{} refused to {}: {}", name(operation), DisplayText(&peer), DisplayText(&why));
+                let status = if why.is_wrong() { StatusCode::UNPROCESSABLE } else { StatusCode::CONFLICT };
                 Reply::error(buf, status, why)
             }
             (Ok(number), _) => {
-                warn!("{} for {}: revision {}", name(operation), Text(&peer), number);
-                let status = if operation == Operation::PutConfig { Status::CREATED } else { Status::OK };
+                warn!("{} for {}: revision {}", name(operation), DisplayText(&peer), number);
+                let status =
+                    if operation == ApiOperation::PutConfig { StatusCode::CREATED } else { StatusCode::OK };
                 self.revisions(buf, status, Some(number))
             }
             (Err(Failed::Refused(refused)), _) => {
-                warn!("{} refused to {}", name(operation), Text(&peer));
+                warn!("{} refused to {}", name(operation), DisplayText(&peer));
                 refuse(buf, refused)
             }
-            (Err(Failed::Store(why)), _) => Reply::error(buf, Status::INTERNAL, why),
+            (Err(Failed::Store(why)), _) => Reply::error(buf, StatusCode::INTERNAL, why),
         }
     }
 
@@ -87,11 +88,11 @@ impl Console {
             match lock.look(len, |bytes| scan.step(bytes)) {
                 Ok(true) => yield_now().await,
                 Ok(false) => break,
-                Err(error) => return Some(Reply::error(buf, Status::UNPROCESSABLE, error)),
+                Err(error) => return Some(Reply::error(buf, StatusCode::UNPROCESSABLE, error)),
             }
         }
         let missing = self.ports.have(scan.buses().iter()).err()?;
-        Some(Reply::error(buf, Status::UNPROCESSABLE, missing))
+        Some(Reply::error(buf, StatusCode::UNPROCESSABLE, missing))
     }
 
     /// The request for the store task, or the reply if there is none.
@@ -99,26 +100,34 @@ impl Console {
     fn prepare<'a>(
         &'a self,
         buf: &mut [u8],
-        request: Request<'a>,
+        request: ConsoleRequest<'a>,
     ) -> Result<(StoreRequest, StoreLock<'a>), Reply> {
         let change = match request.arguments {
-            Arguments::Wrong(text) => return Err(Reply::error(buf, Status::BAD_REQUEST, text)),
+            Arguments::Wrong(text) => return Err(Reply::error(buf, StatusCode::BAD_REQUEST, text)),
             Arguments::Seconds(seconds) => {
                 self.identify_until.set(Instant::now() + Duration::from_secs(seconds.into()));
-                warn!("{} looks for this board: its LED shows it for {} s", Text(&request.peer), seconds);
-                return Err(Reply::new(buf, Status::OK, Kind::Json, |out| out.write_str("{}")));
+                warn!(
+                    "{} looks for this board: its LED shows it for {} s",
+                    DisplayText(&request.peer),
+                    seconds
+                );
+                return Err(Reply::new(buf, StatusCode::OK, ContentType::Json, |out| out.write_str("{}")));
             }
             Arguments::Key(key) => return self.take_key(buf, key, &request),
             Arguments::Apply { number, trial } => StoreRequest::Apply { number, trial },
-            Arguments::None if request.operation == Operation::Confirm => StoreRequest::Confirm,
-            Arguments::None if request.operation == Operation::Rollback => StoreRequest::RollBack,
-            Arguments::None if request.operation == Operation::ConfirmUpdate => StoreRequest::ConfirmFirmware,
-            Arguments::None if request.operation == Operation::EndUpdate => StoreRequest::EndFirmware,
+            Arguments::None if request.operation == ApiOperation::Confirm => StoreRequest::Confirm,
+            Arguments::None if request.operation == ApiOperation::Rollback => StoreRequest::RollBack,
+            Arguments::None if request.operation == ApiOperation::ConfirmUpdate => {
+                StoreRequest::ConfirmFirmware
+            }
+            Arguments::None if request.operation == ApiOperation::EndUpdate => StoreRequest::EndFirmware,
             Arguments::Try(confirm_s) => {
                 StoreRequest::TryFirmware { confirm_s, downgrade: downgrade(buf, &request)? }
             }
-            Arguments::None if request.operation == Operation::PutUpdate => return put_piece(buf, request),
-            Arguments::None if request.operation == Operation::PutEdge => {
+            Arguments::None if request.operation == ApiOperation::PutUpdate => {
+                return put_piece(buf, request);
+            }
+            Arguments::None if request.operation == ApiOperation::PutEdge => {
                 return edge::settings(buf, request);
             }
             Arguments::None => return put(buf, request),
@@ -132,7 +141,7 @@ impl Console {
         &self,
         buf: &mut [u8],
         key: [u8; KEY_LEN],
-        request: &Request<'_>,
+        request: &ConsoleRequest<'_>,
     ) -> Result<(StoreRequest, StoreLock<'_>), Reply> {
         let Some(store) = self.store else { return Err(nothing_kept(buf)) };
         // Before the claim begins, which would otherwise have to be finished. While the store is being read no key is
@@ -146,12 +155,12 @@ impl Console {
         let (status, text) = match offered {
             Ok(()) => return Ok((StoreRequest::Claim(key), lock)),
             Err(ClaimError::NotPressed) => {
-                (Status::FORBIDDEN, "press the button of the board first; a key is taken for 60 s then")
+                (StatusCode::FORBIDDEN, "press the button of the board first; a key is taken for 60 s then")
             }
-            Err(ClaimError::Busy) => (Status::CONFLICT, "another key is being taken; try again"),
-            Err(ClaimError::Claimed) => (Status::FORBIDDEN, "this board has a key already"),
+            Err(ClaimError::Busy) => (StatusCode::CONFLICT, "another key is being taken; try again"),
+            Err(ClaimError::Claimed) => (StatusCode::FORBIDDEN, "this board has a key already"),
         };
-        warn!("claim refused to {}", Text(&request.peer));
+        warn!("claim refused to {}", DisplayText(&request.peer));
         Err(Reply::error(buf, status, text))
     }
 
@@ -167,32 +176,35 @@ impl Console {
 }
 
 /// Whether the request allows an older firmware.
-fn downgrade(buf: &mut [u8], request: &Request<'_>) -> Result<Downgrade, Reply> {
+fn downgrade(buf: &mut [u8], request: &ConsoleRequest<'_>) -> Result<Downgrade, Reply> {
     match request.head.query("downgrade") {
         None => Ok(Downgrade::Refused),
         Some("yes") => Ok(Downgrade::Allowed),
-        Some(_) => Err(Reply::error(buf, Status::BAD_REQUEST, "downgrade is out of range; allowed: yes")),
+        Some(_) => Err(Reply::error(buf, StatusCode::BAD_REQUEST, "downgrade is out of range; allowed: yes")),
     }
 }
 
-fn put_piece<'a>(buf: &mut [u8], request: Request<'a>) -> Result<(StoreRequest, StoreLock<'a>), Reply> {
+fn put_piece<'a>(
+    buf: &mut [u8],
+    request: ConsoleRequest<'a>,
+) -> Result<(StoreRequest, StoreLock<'a>), Reply> {
     let downgrade = downgrade(buf, &request)?;
     let Some((len, lock)) = request.image else { return Err(busy(buf)) };
     let Some(Ok(offset)) = request.head.query("offset").map(str::parse) else {
         let text = "offset must be a number: where the piece begins in header and image";
-        return Err(Reply::error(buf, Status::BAD_REQUEST, text));
+        return Err(Reply::error(buf, StatusCode::BAD_REQUEST, text));
     };
     Ok((StoreRequest::Piece { offset, len, downgrade }, lock))
 }
 
-fn put<'a>(buf: &mut [u8], request: Request<'a>) -> Result<(StoreRequest, StoreLock<'a>), Reply> {
+fn put<'a>(buf: &mut [u8], request: ConsoleRequest<'a>) -> Result<(StoreRequest, StoreLock<'a>), Reply> {
     let Some((len, lock)) = request.image else { return Err(busy(buf)) };
     let (status, text) = match request.head.if_match.map(Etag::parse) {
         None => {
             let text = "If-Match is needed: the ETag of the revision that this one was made from";
-            (Status::PRECONDITION_REQUIRED, text)
+            (StatusCode::PRECONDITION_REQUIRED, text)
         }
-        Some(None) => (Status::PRECONDITION_FAILED, "If-Match must be one ETag, such as \"3-0badcafe\""),
+        Some(None) => (StatusCode::PRECONDITION_FAILED, "If-Match must be one ETag, such as \"3-0badcafe\""),
         Some(Some(base)) => {
             // Trailing bytes would waste flash.
             let whole = lock.look(len, |bytes| Ok((image::intact(bytes)?, image::image_len(bytes)?)));
@@ -200,7 +212,7 @@ fn put<'a>(buf: &mut [u8], request: Request<'a>) -> Result<(StoreRequest, StoreL
                 Ok((digest, len)) => Ok((StoreRequest::Put { base, digest, len }, lock)),
                 Err(error) => {
                     let error: image::ImageError = error;
-                    Err(Reply::error(buf, Status::UNPROCESSABLE, error))
+                    Err(Reply::error(buf, StatusCode::UNPROCESSABLE, error))
                 }
             };
         }
@@ -212,39 +224,41 @@ fn refuse(buf: &mut [u8], refused: Refused) -> Reply {
     let (status, text) = match refused {
         Refused::Changed(base) => {
             let text = format_args!("the configuration was changed meanwhile; the newest is {}", Etag(base));
-            return Reply::error(buf, Status::PRECONDITION_FAILED, text).about(Some(base));
+            return Reply::error(buf, StatusCode::PRECONDITION_FAILED, text).about(Some(base));
         }
-        Refused::OnTrial => (Status::CONFLICT, "a revision is on trial; confirm it or roll it back first"),
-        Refused::NotOnTrial => (Status::CONFLICT, "no revision is on trial"),
-        Refused::NothingWaits => (Status::CONFLICT, "no stored revision waits; name one"),
-        Refused::Unknown => (Status::NOT_FOUND, "there is no such revision"),
-        Refused::Runs => (Status::CONFLICT, "it is live already"),
-        Refused::Trial => (Status::BAD_REQUEST, "confirm_s is out of range; allowed: 1..=3600"),
-        Refused::NoPrevious => (Status::CONFLICT, "no other revision was live before"),
+        Refused::OnTrial => {
+            (StatusCode::CONFLICT, "a revision is on trial; confirm it or roll it back first")
+        }
+        Refused::NotOnTrial => (StatusCode::CONFLICT, "no revision is on trial"),
+        Refused::NothingWaits => (StatusCode::CONFLICT, "no stored revision waits; name one"),
+        Refused::Unknown => (StatusCode::NOT_FOUND, "there is no such revision"),
+        Refused::Runs => (StatusCode::CONFLICT, "it is live already"),
+        Refused::Trial => (StatusCode::BAD_REQUEST, "confirm_s is out of range; allowed: 1..=3600"),
+        Refused::NoPrevious => (StatusCode::CONFLICT, "no other revision was live before"),
         _ => return busy(buf),
     };
     Reply::error(buf, status, text)
 }
 
 pub(super) fn busy(buf: &mut [u8]) -> Reply {
-    Reply::error(buf, Status::CONFLICT, "something else is being done; try again")
+    Reply::error(buf, StatusCode::CONFLICT, "something else is being done; try again")
 }
 
 pub(super) fn nothing_kept(buf: &mut [u8]) -> Reply {
-    Reply::error(buf, Status::UNAVAILABLE, "this board has no store, so it keeps nothing")
+    Reply::error(buf, StatusCode::UNAVAILABLE, "this board has no store, so it keeps nothing")
 }
 
 /// Name of the operation in the log.
-fn name(operation: Operation) -> &'static str {
+fn name(operation: ApiOperation) -> &'static str {
     match operation {
-        Operation::PutConfig => "store",
-        Operation::Apply => "apply",
-        Operation::Confirm => "confirm",
-        Operation::PutUpdate => "a piece of a firmware",
-        Operation::TryUpdate => "a trial of a firmware",
-        Operation::ConfirmUpdate => "the end of a firmware's trial",
-        Operation::EndUpdate => "a return to the firmware before",
-        Operation::PutEdge => "settings of the edge node",
+        ApiOperation::PutConfig => "store",
+        ApiOperation::Apply => "apply",
+        ApiOperation::Confirm => "confirm",
+        ApiOperation::PutUpdate => "a piece of a firmware",
+        ApiOperation::TryUpdate => "a trial of a firmware",
+        ApiOperation::ConfirmUpdate => "the end of a firmware's trial",
+        ApiOperation::EndUpdate => "a return to the firmware before",
+        ApiOperation::PutEdge => "settings of the edge node",
         _ => "roll back",
     }
 }

@@ -10,11 +10,11 @@ use embassy_net::{IpAddress, Stack};
 use embassy_time::{Duration, Instant, Timer, with_deadline, with_timeout};
 use recipe_api::guard::{Admitted, Site};
 use recipe_api::key::BodyHash;
-use recipe_api::request::{Head, HeadBuffer, HeadError, Method};
-use recipe_api::response::{CONTINUE, Status};
-use recipe_api::route::{Operation, Served};
+use recipe_api::request::{HeadBuffer, HeadError, HttpHead, Method};
+use recipe_api::response::{CONTINUE, StatusCode};
+use recipe_api::route::{ApiOperation, Served};
 
-use super::answer::{Outcome, Reply, Responder, SendError};
+use super::answer::{Reply, RequestOutcome, Responder, SendError};
 use super::arguments::Arguments;
 use super::change::{busy, nothing_kept};
 use super::{ConnectionPermit, Console, MAX_TIME, PORT};
@@ -44,9 +44,9 @@ impl<'a> ConnectionBuffers<'a> {
 }
 
 /// A parsed request.
-pub(super) struct Request<'a> {
-    pub(super) head: Head<'a>,
-    pub(super) operation: Operation,
+pub(super) struct ConsoleRequest<'a> {
+    pub(super) head: HttpHead<'a>,
+    pub(super) operation: ApiOperation,
     pub(super) arguments: Arguments,
     /// Length of the body in the image buffer of the store handle, and the lock on it.
     pub(super) image: Option<(usize, StoreLock<'a>)>,
@@ -109,15 +109,15 @@ impl Console {
         let reply = match self.admit(&mut responder, buffer) {
             Ok((admitted, mut request)) => {
                 match self.receive_body(&mut responder, &admitted, &mut request, rest, deadline).await? {
-                    Body::Whole => match self.execute(&mut responder, request).await? {
-                        Outcome::Sent => return Ok(()),
-                        Outcome::Reply(reply) => reply,
+                    BodyRead::Whole => match self.execute(&mut responder, request).await? {
+                        RequestOutcome::Sent => return Ok(()),
+                        RequestOutcome::Reply(reply) => reply,
                     },
-                    Body::Other => {
+                    BodyRead::Other => {
                         let text = "the body is not the one that was signed";
-                        Reply::error(responder.buf, Status::UNAUTHORIZED, text)
+                        Reply::error(responder.buf, StatusCode::UNAUTHORIZED, text)
                     }
-                    Body::Incomplete => return self.was_incomplete(&mut responder).await,
+                    BodyRead::Incomplete => return self.was_incomplete(&mut responder).await,
                 }
             }
             Err(reply) => reply,
@@ -163,7 +163,7 @@ impl Console {
         &'a self,
         responder: &mut Responder<'_, '_>,
         buffer: &'a HeadBuffer,
-    ) -> Result<(Admitted, Request<'a>), Reply> {
+    ) -> Result<(Admitted, ConsoleRequest<'a>), Reply> {
         let (local, peer) = match (responder.socket.local_endpoint(), responder.socket.remote_endpoint()) {
             (Some(local), Some(peer)) => (address(local.addr), address(peer.addr)),
             _ => (Ipv4Addr::UNSPECIFIED, Ipv4Addr::UNSPECIFIED),
@@ -175,7 +175,7 @@ impl Console {
             Err(error) => Err(error.into()),
         };
         let (head, admitted) = admitted.map_err(|refusal| {
-            if refusal.status == Status::UNAUTHORIZED {
+            if refusal.status == StatusCode::UNAUTHORIZED {
                 responder.nonce = Some(guard.nonce(now()));
             }
             Reply::refused(responder.buf, &refusal)
@@ -185,11 +185,11 @@ impl Console {
             responder.nonce = Some(guard.nonce(now()));
         }
         let operation = admitted.operation;
-        let mut request = Request { head, operation, arguments: Arguments::None, image: None, peer };
+        let mut request = ConsoleRequest { head, operation, arguments: Arguments::None, image: None, peer };
         if let Some(store) = self.store {
             store.note_reached();
         }
-        if matches!(operation, Operation::PutConfig | Operation::PutUpdate | Operation::PutEdge) {
+        if matches!(operation, ApiOperation::PutConfig | ApiOperation::PutUpdate | ApiOperation::PutEdge) {
             let Some(store) = self.store else { return Err(nothing_kept(responder.buf)) };
             let Some(lock) = store.take() else { return Err(busy(responder.buf)) };
             // The guard has checked the length.
@@ -203,10 +203,10 @@ impl Console {
         &self,
         responder: &mut Responder<'_, '_>,
         admitted: &Admitted,
-        request: &mut Request<'_>,
+        request: &mut ConsoleRequest<'_>,
         rest: Range<usize>,
         deadline: Instant,
-    ) -> Result<Body, SendError> {
+    ) -> Result<BodyRead, SendError> {
         let length = usize::try_from(admitted.length).unwrap_or(0);
         let mut hash = BodyHash::new();
         // Bytes behind the body are another request, which is ignored.
@@ -232,7 +232,7 @@ impl Console {
             let chunk = responder.buf.get_mut(from..from.saturating_add(left.min(CHUNK))).unwrap_or(&mut []);
             piece = match with_deadline(deadline, responder.socket.read(chunk)).await {
                 Ok(Ok(count @ 1..)) => count,
-                Err(_) => return Ok(Body::Incomplete),
+                Err(_) => return Ok(BodyRead::Incomplete),
                 Ok(_) => {
                     self.count(|counters| &mut counters.incomplete);
                     return Err(SendError::Gone);
@@ -242,18 +242,18 @@ impl Console {
             yield_now().await;
         }
         if admitted.is_signed() && !admitted.is_body(&hash.finish()) {
-            return Ok(Body::Other);
+            return Ok(BodyRead::Other);
         }
         if request.image.is_none() && request.head.method == Method::Post {
             let body = responder.buf.get(..length).unwrap_or(&[]);
             request.arguments = Arguments::parse(request.operation, body);
         }
-        Ok(Body::Whole)
+        Ok(BodyRead::Whole)
     }
 }
 
 /// Result of receiving a body.
-enum Body {
+enum BodyRead {
     Whole,
     /// Its hash differs from the signed one.
     Other,

@@ -5,9 +5,9 @@ use embassy_time::Instant;
 use proto_core::engine::Health;
 use recipe_api::documents::{Document, Pieces};
 use recipe_api::metrics::Families;
-use recipe_api::response::{Kind, Length, Status};
+use recipe_api::response::{ContentType, Length, StatusCode};
 
-use super::answer::{Outcome, Reply, Responder, SendError, TextBuffer};
+use super::answer::{Reply, RequestOutcome, Responder, SendError, TextBuffer};
 use super::{Console, MAX_ANSWER, MAX_TIME};
 
 /// Source of a document.
@@ -28,15 +28,15 @@ impl Console {
     pub(super) async fn document(
         &self,
         responder: &mut Responder<'_, '_>,
-        kind: Kind,
+        kind: ContentType,
         mut source: DocumentSource,
-    ) -> Result<Outcome, SendError> {
+    ) -> Result<RequestOutcome, SendError> {
         if self.is_idle() {
             let text = "nothing runs at the moment; try again";
-            return Ok(Outcome::Reply(Reply::error(responder.buf, Status::UNAVAILABLE, text)));
+            return Ok(RequestOutcome::Reply(Reply::error(responder.buf, StatusCode::UNAVAILABLE, text)));
         }
         if !responder.begin(kind, Length::Chunked, None).await? {
-            return Ok(Outcome::Sent);
+            return Ok(RequestOutcome::Sent);
         }
         let until = Instant::now() + MAX_ANSWER;
         while let Some(len) = self.piece(responder, &mut source)? {
@@ -44,7 +44,7 @@ impl Console {
             yield_now().await;
         }
         responder.last_chunk().await?;
-        Ok(Outcome::Sent)
+        Ok(RequestOutcome::Sent)
     }
 
     /// Writes the next piece into the buffer; returns its length. The engine is borrowed only here.

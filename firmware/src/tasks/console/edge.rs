@@ -3,14 +3,14 @@
 use core::fmt::{self, Write};
 
 use recipe_api::json;
-use recipe_api::response::{Kind, Status};
-use recipe_sparkplug::document::{Document, DocumentError};
+use recipe_api::response::{ContentType, StatusCode};
+use recipe_sparkplug::document::{DocumentError, NodeDocument};
 
 use super::Console;
 use super::answer::{Reply, TextBuffer};
 use super::change::busy;
-use super::connection::Request;
-use crate::fmt::Text;
+use super::connection::ConsoleRequest;
+use crate::fmt::DisplayText;
 use crate::tasks::edge::View;
 use crate::tasks::store::{StoreLock, StoreRequest};
 use crate::warn;
@@ -18,8 +18,8 @@ use crate::warn;
 impl Console {
     /// Reply with the document and this status.
     #[inline(never)]
-    pub(super) fn edge(&self, buf: &mut [u8], status: Status) -> Reply {
-        Reply::new(buf, status, Kind::Json, |out| self.write_edge(out))
+    pub(super) fn edge(&self, buf: &mut [u8], status: StatusCode) -> Reply {
+        Reply::new(buf, status, ContentType::Json, |out| self.write_edge(out))
     }
 
     fn write_edge(&self, out: &mut TextBuffer<'_>) -> fmt::Result {
@@ -92,8 +92,8 @@ impl Console {
         restart: bool,
     ) -> Reply {
         self.node.edge.set_next(publishes);
-        warn!("{} has changed the settings of the edge node", Text(&peer));
-        self.edge(buf, if restart { Status::ACCEPTED } else { Status::OK })
+        warn!("{} has changed the settings of the edge node", DisplayText(&peer));
+        self.edge(buf, if restart { StatusCode::ACCEPTED } else { StatusCode::OK })
     }
 }
 
@@ -101,26 +101,26 @@ impl Console {
 #[inline(never)]
 pub(super) fn settings<'a>(
     buf: &mut [u8],
-    request: Request<'a>,
+    request: ConsoleRequest<'a>,
 ) -> Result<(StoreRequest, StoreLock<'a>), Reply> {
     let restart = match request.head.query("restart") {
         None => false,
         Some("yes") => true,
         Some(_) => {
-            return Err(Reply::error(buf, Status::BAD_REQUEST, "restart is out of range; allowed: yes"));
+            return Err(Reply::error(buf, StatusCode::BAD_REQUEST, "restart is out of range; allowed: yes"));
         }
     };
     let Some((len, lock)) = request.image else { return Err(busy(buf)) };
     match lock.look(len, read) {
         Ok(publishes) => Ok((StoreRequest::Edge { len, publishes, restart }, lock)),
-        Err(error) => Err(Reply::error(buf, Status::UNPROCESSABLE, error)),
+        Err(error) => Err(Reply::error(buf, StatusCode::UNPROCESSABLE, error)),
     }
 }
 
 /// Not inlined, to free its stack frame before the request to the store task.
 #[inline(never)]
 fn read(bytes: &[u8]) -> Result<bool, DocumentError> {
-    Document::empty().decode(bytes)
+    NodeDocument::empty().decode(bytes)
 }
 
 fn write_why(out: &mut TextBuffer<'_>, why: &dyn fmt::Display) -> fmt::Result {

@@ -5,8 +5,8 @@ use core::fmt::{self, Write};
 use embassy_time::Instant;
 use recipe_api::json;
 use recipe_api::key::Hex;
-use recipe_api::response::{Kind, Status};
-use recipe_store::Ended;
+use recipe_api::response::{ContentType, StatusCode};
+use recipe_store::TrialEnd;
 use recipe_update::{Header, Slot};
 
 use super::Console;
@@ -18,12 +18,12 @@ use crate::update::{Incoming, UpdateStage, build_of, whole_length};
 impl Console {
     /// Reply with the document and this status.
     #[inline(never)]
-    pub(super) fn firmware(&self, buf: &mut [u8], status: Status) -> Reply {
+    pub(super) fn firmware(&self, buf: &mut [u8], status: StatusCode) -> Reply {
         if self.store.is_none() {
             return nothing_kept(buf);
         }
         match self.store.and_then(StoreHandle::firmware) {
-            Some(view) => Reply::new(buf, status, Kind::Json, |out| write(out, &view)),
+            Some(view) => Reply::new(buf, status, ContentType::Json, |out| write(out, &view)),
             // The store is being read or moved.
             None => busy(buf),
         }
@@ -82,10 +82,10 @@ fn write(out: &mut TextBuffer<'_>, view: &FirmwareView) -> fmt::Result {
     }
     if let Some((slot, ended)) = view.marks.last {
         let ended = match ended {
-            Ended::Confirmed => "confirmed",
-            Ended::NotConfirmed => "not_confirmed",
-            Ended::TakenBack => "taken_back",
-            Ended::Failed => "failed",
+            TrialEnd::Confirmed => "confirmed",
+            TrialEnd::NotConfirmed => "not_confirmed",
+            TrialEnd::TakenBack => "taken_back",
+            TrialEnd::Failed => "failed",
         };
         write!(out, ",\"last\":{{\"slot\":\"{}\",\"ended\":\"{ended}\"}}", letter(slot))?;
     }

@@ -25,7 +25,7 @@ use heapless::String;
 use recipe_api::claim::Claim;
 use recipe_api::guard::Guard;
 use recipe_api::key::Key;
-use recipe_sparkplug::document::Document;
+use recipe_sparkplug::document::NodeDocument;
 
 use super::edge::Edge;
 use super::gateway::Gateway;
@@ -56,7 +56,7 @@ pub struct Console {
     name: String<NAME>,
     guard: RefCell<Guard>,
     claim: Cell<Claim>,
-    counters: Cell<Counters>,
+    counters: Cell<ConnectionCounters>,
     connections: Cell<usize>,
     streams: Cell<usize>,
     /// The frame tap has a reader.
@@ -70,14 +70,14 @@ pub struct NodeView {
     /// State of the edge node.
     pub edge: &'static Edge,
     /// Its settings, if there are any.
-    pub document: Option<&'static Document>,
+    pub document: Option<&'static NodeDocument>,
     /// UTC, if known.
     pub clock: &'static WallClock,
 }
 
 /// Counters of connections. They wrap.
 #[derive(Debug, Clone, Copy, Default, serde::Serialize)]
-struct Counters {
+struct ConnectionCounters {
     /// Accepted connections.
     connections: u32,
     /// Streams refused because of [`STREAMS`].
@@ -148,7 +148,7 @@ impl Console {
         }
     }
 
-    fn count(&self, count: impl FnOnce(&mut Counters) -> &mut u32) {
+    fn count(&self, count: impl FnOnce(&mut ConnectionCounters) -> &mut u32) {
         let mut counters = self.counters.get();
         let counter = count(&mut counters);
         *counter = counter.wrapping_add(1);

@@ -11,14 +11,14 @@ use recipe_api::json;
 use recipe_api::key::SCHEME;
 use recipe_api::metrics::Families;
 use recipe_api::nonces::MAX_AGE;
-use recipe_api::response::{Kind, Length, Page, Status};
+use recipe_api::response::{ContentType, Length, Page, StatusCode};
 use recipe_api::revisions::{Revision, Revisions};
-use recipe_api::route::Operation;
+use recipe_api::route::ApiOperation;
 use serde::Serialize;
 
-use super::answer::{Etag, Outcome, Reply, Responder, SendError, TextBuffer};
+use super::answer::{Etag, Reply, RequestOutcome, Responder, SendError, TextBuffer};
 use super::change::{busy, nothing_kept};
-use super::connection::Request;
+use super::connection::ConsoleRequest;
 use super::documents::DocumentSource;
 use super::{Console, MAX_ANSWER, MAX_TIME};
 use crate::clock::now;
@@ -31,45 +31,49 @@ impl Console {
     pub(super) async fn execute<'a>(
         &'a self,
         responder: &mut Responder<'_, '_>,
-        request: Request<'a>,
-    ) -> Result<Outcome, SendError> {
+        request: ConsoleRequest<'a>,
+    ) -> Result<RequestOutcome, SendError> {
         let reply = match request.operation {
-            Operation::Info => self.info(responder.buf),
-            Operation::Nonce => self.nonce(responder.buf),
-            Operation::Revisions => self.revisions(responder.buf, Status::OK, None),
-            Operation::Edge => self.edge(responder.buf, Status::OK),
-            Operation::Update => self.firmware(responder.buf, Status::OK),
-            Operation::Status => {
-                return self.document(responder, Kind::Json, DocumentSource::of(Document::Status)).await;
-            }
-            Operation::Values => {
-                return self.document(responder, Kind::Json, DocumentSource::of(Document::Values)).await;
-            }
-            Operation::Metrics => {
+            ApiOperation::Info => self.info(responder.buf),
+            ApiOperation::Nonce => self.nonce(responder.buf),
+            ApiOperation::Revisions => self.revisions(responder.buf, StatusCode::OK, None),
+            ApiOperation::Edge => self.edge(responder.buf, StatusCode::OK),
+            ApiOperation::Update => self.firmware(responder.buf, StatusCode::OK),
+            ApiOperation::Status => {
                 return self
-                    .document(responder, Kind::Metrics, DocumentSource::Metrics(Families::new()))
+                    .document(responder, ContentType::Json, DocumentSource::of(Document::Status))
                     .await;
             }
-            Operation::Stream => return self.stream(responder, &request).await,
-            Operation::Log => return log(responder, &request).await,
-            Operation::Page => return page(responder, &request).await,
-            Operation::Config => return self.config(responder, &request).await,
+            ApiOperation::Values => {
+                return self
+                    .document(responder, ContentType::Json, DocumentSource::of(Document::Values))
+                    .await;
+            }
+            ApiOperation::Metrics => {
+                return self
+                    .document(responder, ContentType::Metrics, DocumentSource::Metrics(Families::new()))
+                    .await;
+            }
+            ApiOperation::Stream => return self.stream(responder, &request).await,
+            ApiOperation::Log => return log(responder, &request).await,
+            ApiOperation::Page => return page(responder, &request).await,
+            ApiOperation::Config => return self.config(responder, &request).await,
             _ => self.change(responder.buf, request).await,
         };
-        Ok(Outcome::Reply(reply))
+        Ok(RequestOutcome::Reply(reply))
     }
 
     fn nonce(&self, buf: &mut [u8]) -> Reply {
         let nonce = self.guard.borrow_mut().nonce(now());
         let age = MAX_AGE.as_millis() / 1_000;
-        Reply::new(buf, Status::OK, Kind::Json, |out| {
+        Reply::new(buf, StatusCode::OK, ContentType::Json, |out| {
             write!(out, "{{\"max_age_s\":{age},\"nonce\":\"{nonce}\",\"scheme\":\"{SCHEME}\"}}")
         })
     }
 
     #[inline(never)]
     fn info(&self, buf: &mut [u8]) -> Reply {
-        Reply::new(buf, Status::OK, Kind::Json, |out| {
+        Reply::new(buf, StatusCode::OK, ContentType::Json, |out| {
             let name = &self.name;
             let version = env!("CARGO_PKG_VERSION");
             write!(out, "{{\"role\":\"board\",\"name\":\"{name}\",\"version\":\"{version}\",\"api\":\"v1\"")?;
@@ -111,12 +115,12 @@ impl Console {
 
     /// The revisions and their state; `changed` is the subject of a change.
     #[inline(never)]
-    pub(super) fn revisions(&self, buf: &mut [u8], status: Status, changed: Option<u32>) -> Reply {
+    pub(super) fn revisions(&self, buf: &mut [u8], status: StatusCode, changed: Option<u32>) -> Reply {
         let Some(store) = self.store else { return nothing_kept(buf) };
         let reply = store.look(|revisions| {
             let etag = changed.and_then(|number| revisions.revision(number));
             let write = |out: &mut TextBuffer<'_>| write_revisions(out, store, revisions, changed);
-            Reply::new(buf, status, Kind::Json, write).about(etag)
+            Reply::new(buf, status, ContentType::Json, write).about(etag)
         });
         // The store is being read, or an image is being adopted.
         reply.unwrap_or_else(|| busy(buf))
@@ -126,14 +130,14 @@ impl Console {
     async fn config(
         &self,
         responder: &mut Responder<'_, '_>,
-        request: &Request<'_>,
-    ) -> Result<Outcome, SendError> {
+        request: &ConsoleRequest<'_>,
+    ) -> Result<RequestOutcome, SendError> {
         let (store, revision) = match self.requested_revision(responder.buf, request) {
             Ok(found) => found,
-            Err(reply) => return Ok(Outcome::Reply(reply)),
+            Err(reply) => return Ok(RequestOutcome::Reply(reply)),
         };
-        if !responder.begin(Kind::Image, Length::Chunked, Some(revision)).await? {
-            return Ok(Outcome::Sent);
+        if !responder.begin(ContentType::Image, Length::Chunked, Some(revision)).await? {
+            return Ok(RequestOutcome::Sent);
         }
         let mut offset = 0;
         loop {
@@ -142,7 +146,7 @@ impl Console {
             offset = offset.saturating_add(PART);
             if len < PART {
                 responder.last_chunk().await?;
-                return Ok(Outcome::Sent);
+                return Ok(RequestOutcome::Sent);
             }
             yield_now().await;
         }
@@ -151,22 +155,22 @@ impl Console {
     fn requested_revision(
         &self,
         buf: &mut [u8],
-        request: &Request<'_>,
+        request: &ConsoleRequest<'_>,
     ) -> Result<(&'static StoreHandle, Revision), Reply> {
         let Some(store) = self.store else { return Err(nothing_kept(buf)) };
         let number = match request.head.query("revision").map(str::parse) {
             None => store.running(),
             Some(Ok(number)) => Some(number),
             Some(Err(_)) => {
-                return Err(Reply::error(buf, Status::BAD_REQUEST, "revision must be a number"));
+                return Err(Reply::error(buf, StatusCode::BAD_REQUEST, "revision must be a number"));
             }
         };
         let revision = number.and_then(|number| store.look(|revisions| revisions.revision(number)).flatten());
         let Some(revision) = revision.filter(|revision| *revision != NOTHING) else {
-            return Err(Reply::error(buf, Status::NOT_FOUND, "there is no such revision"));
+            return Err(Reply::error(buf, StatusCode::NOT_FOUND, "there is no such revision"));
         };
         if request.head.if_none_match.and_then(Etag::parse) == Some(revision) {
-            let unchanged = Reply::new(buf, Status::NOT_MODIFIED, Kind::Image, |_| Ok(()));
+            let unchanged = Reply::new(buf, StatusCode::NOT_MODIFIED, ContentType::Image, |_| Ok(()));
             return Err(unchanged.about(Some(revision)));
         }
         Ok((store, revision))
@@ -174,17 +178,20 @@ impl Console {
 }
 
 /// Sends the newest lines of the log.
-async fn log(responder: &mut Responder<'_, '_>, request: &Request<'_>) -> Result<Outcome, SendError> {
+async fn log(
+    responder: &mut Responder<'_, '_>,
+    request: &ConsoleRequest<'_>,
+) -> Result<RequestOutcome, SendError> {
     let lines = match request.head.query("lines").map(str::parse) {
         None => MAX_LINES,
         Some(Ok(lines @ 1..=MAX_LINES)) => lines,
         Some(_) => {
             let text = "lines is out of range; allowed: 1..=256";
-            return Ok(Outcome::Reply(Reply::error(responder.buf, Status::BAD_REQUEST, text)));
+            return Ok(RequestOutcome::Reply(Reply::error(responder.buf, StatusCode::BAD_REQUEST, text)));
         }
     };
-    if !responder.begin(Kind::Text, Length::Chunked, None).await? {
-        return Ok(Outcome::Sent);
+    if !responder.begin(ContentType::Text, Length::Chunked, None).await? {
+        return Ok(RequestOutcome::Sent);
     }
     let mut place = journal::last(lines);
     // Lines added meanwhile are not sent.
@@ -198,24 +205,27 @@ async fn log(responder: &mut Responder<'_, '_>, request: &Request<'_>) -> Result
         yield_now().await;
     }
     responder.last_chunk().await?;
-    Ok(Outcome::Sent)
+    Ok(RequestOutcome::Sent)
 }
 
 /// Sends the web page, unless the client has it cached.
-async fn page(responder: &mut Responder<'_, '_>, request: &Request<'_>) -> Result<Outcome, SendError> {
+async fn page(
+    responder: &mut Responder<'_, '_>,
+    request: &ConsoleRequest<'_>,
+) -> Result<RequestOutcome, SendError> {
     let status = PAGE.status(request.head.if_none_match);
     let mut buf = TextBuffer::new(responder.buf);
     PAGE.write_head(status, &mut buf).map_err(|_| SendError::TooLong)?;
     let (head, until) = (buf.len, Instant::now() + MAX_ANSWER);
     responder.send_part(0, head, until.min(Instant::now() + MAX_TIME)).await?;
-    if responder.is_head || status != Status::OK {
-        return Ok(Outcome::Sent);
+    if responder.is_head || status != StatusCode::OK {
+        return Ok(RequestOutcome::Sent);
     }
     for piece in PAGE.bytes.chunks(PAGE_PIECE) {
         responder.send(piece, until.min(Instant::now() + MAX_TIME)).await?;
         yield_now().await;
     }
-    Ok(Outcome::Sent)
+    Ok(RequestOutcome::Sent)
 }
 
 /// Writes the document `revisions`.

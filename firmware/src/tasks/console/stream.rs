@@ -8,10 +8,10 @@ use embassy_futures::select::{Either, select};
 use embassy_futures::yield_now;
 use embassy_time::{Duration, Instant, Timer};
 use recipe_api::documents::Document;
-use recipe_api::response::{Kind, Length, Status};
+use recipe_api::response::{ContentType, Length, StatusCode};
 
-use super::answer::{Outcome, Reply, Responder, SendError, TextBuffer};
-use super::connection::Request;
+use super::answer::{Reply, RequestOutcome, Responder, SendError, TextBuffer};
+use super::connection::ConsoleRequest;
 use super::documents::DocumentSource;
 use super::{ConnectionPermit, Console, MAX_TIME, STREAMS};
 
@@ -20,12 +20,12 @@ impl Console {
     pub(super) async fn stream(
         &self,
         responder: &mut Responder<'_, '_>,
-        request: &Request<'_>,
-    ) -> Result<Outcome, SendError> {
+        request: &ConsoleRequest<'_>,
+    ) -> Result<RequestOutcome, SendError> {
         let Some(_one) = ConnectionPermit::of(&self.streams, STREAMS) else {
             self.count(|counters| &mut counters.turned_away);
             let text = "too many streams; poll /api/v1/status instead";
-            return Ok(Outcome::Reply(Reply::error(responder.buf, Status::UNAVAILABLE, text)));
+            return Ok(RequestOutcome::Reply(Reply::error(responder.buf, StatusCode::UNAVAILABLE, text)));
         };
         let port = request.head.query("port");
         let mut follower = None;
@@ -33,10 +33,10 @@ impl Console {
             follower = self.follow(port);
             if follower.is_none() {
                 let text = "another client follows the frames; a board has room for one";
-                return Ok(Outcome::Reply(Reply::error(responder.buf, Status::UNAVAILABLE, text)));
+                return Ok(RequestOutcome::Reply(Reply::error(responder.buf, StatusCode::UNAVAILABLE, text)));
             }
         }
-        responder.begin(Kind::Events, Length::Endless, None).await?;
+        responder.begin(ContentType::Events, Length::Endless, None).await?;
         let mut next = Instant::now();
         loop {
             if let Some(follower) = &mut follower {

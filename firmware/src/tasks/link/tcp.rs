@@ -76,7 +76,7 @@ impl LinkDriver<'_> {
     /// Moves bytes both ways, until the peer closes the connection, it fails, or the turn is over.
     async fn exchange(&self, turn: u32, socket: &mut TcpSocket<'_>, chunk: &mut [u8]) {
         let (reader, writer) = socket.split();
-        let outgoing = Outgoing { writer: RefCell::new(writer), held: Cell::new(0) };
+        let outgoing = UnsentData { writer: RefCell::new(writer), held: Cell::new(0) };
         // Reading is polled first, because after an error the acknowledgements are unknown.
         let reading = self.read(turn, reader, &outgoing, chunk);
         let writing = self.write(turn, &outgoing);
@@ -84,7 +84,7 @@ impl LinkDriver<'_> {
         self.pulse.idle(pin!(select3(reading, writing, looking))).await;
     }
 
-    async fn read(&self, turn: u32, mut reader: TcpReader<'_>, outgoing: &Outgoing<'_>, chunk: &mut [u8]) {
+    async fn read(&self, turn: u32, mut reader: TcpReader<'_>, outgoing: &UnsentData<'_>, chunk: &mut [u8]) {
         while let Ok(len) = reader.read(chunk).await {
             // A reply also acknowledges its request.
             let goes_on = self.report_acknowledged(turn, outgoing);
@@ -96,7 +96,7 @@ impl LinkDriver<'_> {
         }
     }
 
-    async fn write(&self, turn: u32, outgoing: &Outgoing<'_>) {
+    async fn write(&self, turn: u32, outgoing: &UnsentData<'_>) {
         while let Some(transmission) = self.control.next(turn).await {
             let mut rest = transmission.as_slice();
             while !rest.is_empty() {
@@ -114,7 +114,7 @@ impl LinkDriver<'_> {
     }
 
     /// Reports acknowledgements to the engine while something is unacknowledged.
-    async fn watch_acknowledgements(&self, turn: u32, outgoing: &Outgoing<'_>) {
+    async fn watch_acknowledgements(&self, turn: u32, outgoing: &UnsentData<'_>) {
         loop {
             // Needs no waker: data from the engine wakes this task.
             poll_fn(|_| if self.control.unacknowledged() > 0 { Poll::Ready(()) } else { Poll::Pending })
@@ -128,7 +128,7 @@ impl LinkDriver<'_> {
 
     /// Reports unacknowledged bytes to the engine if their number has changed; returns whether the
     /// turn goes on.
-    fn report_acknowledged(&self, turn: u32, outgoing: &Outgoing<'_>) -> bool {
+    fn report_acknowledged(&self, turn: u32, outgoing: &UnsentData<'_>) -> bool {
         if !self.control.is_turn(turn) {
             return false;
         }
@@ -140,13 +140,13 @@ impl LinkDriver<'_> {
 }
 
 /// Data on its way to the peer.
-struct Outgoing<'a> {
+struct UnsentData<'a> {
     writer: RefCell<TcpWriter<'a>>,
     /// Bytes that the socket has not accepted yet.
     held: Cell<usize>,
 }
 
-impl Outgoing<'_> {
+impl UnsentData<'_> {
     /// Waits until the socket accepts some of the bytes; `None` if it is closed. The writer is borrowed only
     /// while it is polled.
     async fn write(&self, bytes: &[u8]) -> Option<usize> {

@@ -29,8 +29,8 @@ use proto_core::sysvar::SysVar;
 use proto_core::time::Duration as CoreDuration;
 
 use super::*;
-use crate::tasks::test_clock::{Clock, advance};
-use crate::tasks::watchdog::{TaskName, Watch};
+use crate::tasks::test_clock::{TestClock, advance};
+use crate::tasks::watchdog::{TaskName, TaskWatch};
 
 const GATEWAY: u8 = 1;
 const CONTROLLER: u8 = 2;
@@ -323,12 +323,12 @@ fn gateway_port() -> IpEndpoint {
 
 /// Runs the controller and the other host beside the gateway's link, until they are done.
 fn among(config: &GatewayConfig, which: impl Fn(LinkKind) -> bool, act: impl AsyncFnOnce(Net<'_>)) {
-    let _clock = Clock::take();
+    let _clock = TestClock::take();
     let mut gateway = Box::new(Gateway::idle());
     gateway.configure(config).unwrap();
     let (link, kind) = gateway.links().find(|(_, kind)| which(*kind)).unwrap();
     let endpoint = Endpoint::of(config, kind);
-    let watch = Watch::<2>::new();
+    let watch = TaskWatch::<2>::new();
     let pulses = [TaskName::Engine, TaskName::Link(kind)].map(|name| watch.register(name).unwrap());
     let wire = Rc::new(Wire::new());
     let mut resources: [Resources; 3] = core::array::from_fn(|_| StackResources::new());

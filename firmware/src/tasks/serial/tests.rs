@@ -16,9 +16,9 @@ use proto_core::time::Duration as CoreDuration;
 use proto_core::wire::scalar::ScalarType;
 
 use super::*;
-use crate::tasks::test_clock::{Clock, advance};
-use crate::tasks::test_executor::{Executor, Order};
-use crate::tasks::watchdog::{TaskName, Watch};
+use crate::tasks::test_clock::{TestClock, advance};
+use crate::tasks::test_executor::{Executor, WakeOrder};
+use crate::tasks::watchdog::{TaskName, TaskWatch};
 
 const FRAME: [u8; 5] = [0xFF, 0xFF, 0x01, 0xEE, 0xEE];
 const PORT: PortId = PortId(0);
@@ -113,27 +113,27 @@ struct SerialBench {
     gateway: &'static Gateway,
     device: Rc<RefCell<ScriptedDevice>>,
     executor: Executor<'static>,
-    _clock: Clock,
+    _clock: TestClock,
 }
 
 impl SerialBench {
-    fn new(order: Order, send: SendOn, baud: u32) -> Self {
+    fn new(order: WakeOrder, send: SendOn, baud: u32) -> Self {
         let device = Rc::new(RefCell::new(ScriptedDevice::default()));
         Self::with_line(order, send, baud, Script(Rc::clone(&device)), device)
     }
 
     fn with_line(
-        order: Order,
+        order: WakeOrder,
         send: SendOn,
         baud: u32,
         line: impl Line + 'static,
         device: Rc<RefCell<ScriptedDevice>>,
     ) -> Self {
-        let clock = Clock::take();
+        let clock = TestClock::take();
         let gateway = Box::leak(Box::new(Gateway::idle()));
         gateway.configure(&config(send)).unwrap();
         let gateway: &'static Gateway = gateway;
-        let watch: &'static Watch<2> = Box::leak(Box::new(Watch::new()));
+        let watch: &'static TaskWatch<2> = Box::leak(Box::new(TaskWatch::new()));
         let pulses = [TaskName::Engine, TaskName::Serial(PORT)].map(|name| watch.register(name).unwrap());
         let mut executor = Executor::new(order);
         executor.spawn(gateway.keep_time(pulses[0]));
@@ -181,7 +181,7 @@ impl SerialBench {
 
 #[test]
 fn bytes_that_wait_for_a_busy_processor_do_not_make_a_silence() {
-    for order in Order::ALL {
+    for order in WakeOrder::ALL {
         let mut bench = SerialBench::new(order, SendOn::Period, BAUD);
         bench.arrive(FRAME[..3].iter().copied());
         bench.wait(Duration::from_millis(1));
@@ -199,7 +199,7 @@ fn bytes_that_wait_for_a_busy_processor_do_not_make_a_silence() {
 
 #[test]
 fn all_that_waits_in_a_device_is_heard_before_a_frame_is_overdue() {
-    for order in Order::ALL {
+    for order in WakeOrder::ALL {
         let mut bench = SerialBench::new(order, SendOn::Period, BAUD);
         bench.arrive(FRAME);
         bench.wait(Duration::from_millis(1));
@@ -216,7 +216,7 @@ fn all_that_waits_in_a_device_is_heard_before_a_frame_is_overdue() {
 
 #[test]
 fn what_a_device_has_woken_nobody_for_is_heard_before_a_frame_is_overdue() {
-    for order in Order::ALL {
+    for order in WakeOrder::ALL {
         let mut bench = SerialBench::new(order, SendOn::Period, BAUD);
         for round in 1..5 {
             // As long as less than a quarter of its FIFO is full.
@@ -230,7 +230,7 @@ fn what_a_device_has_woken_nobody_for_is_heard_before_a_frame_is_overdue() {
 
 #[test]
 fn what_waits_is_heard_before_anything_is_sent() {
-    for order in Order::ALL {
+    for order in WakeOrder::ALL {
         let mut bench = SerialBench::new(order, SendOn::Frame, BAUD);
         bench.wait(Duration::from_millis(1));
         // An answer is due after the first of them.
@@ -243,7 +243,7 @@ fn what_waits_is_heard_before_anything_is_sent() {
 
 #[test]
 fn what_waited_while_the_processor_was_stopped_is_not_heard_of_only_when_a_frame_has_left() {
-    for order in Order::ALL {
+    for order in WakeOrder::ALL {
         // At this baud rate a frame takes seconds.
         let mut bench = SerialBench::new(order, SendOn::Period, 10);
         bench.stick(true);
@@ -266,7 +266,7 @@ fn what_waited_while_the_processor_was_stopped_is_not_heard_of_only_when_a_frame
 
 #[test]
 fn a_line_that_takes_nothing_is_given_up_and_heard_all_the_same() {
-    for order in Order::ALL {
+    for order in WakeOrder::ALL {
         let mut bench = SerialBench::new(order, SendOn::Period, BAUD);
         bench.stick(true);
         bench.wait_until_it_sends();
@@ -337,7 +337,7 @@ impl Line for FloodAndScript {}
 
 #[test]
 fn a_line_that_never_falls_silent_keeps_neither_the_time_nor_what_is_to_be_sent() {
-    for order in Order::ALL {
+    for order in WakeOrder::ALL {
         let reads = Rc::new(Cell::new(0));
         let device = Rc::new(RefCell::new(ScriptedDevice::default()));
         let line = FloodAndScript(Script(Rc::clone(&device)), Rc::clone(&reads));
@@ -360,10 +360,10 @@ fn a_line_that_never_falls_silent_keeps_neither_the_time_nor_what_is_to_be_sent(
 
 #[test]
 fn a_line_that_never_falls_silent_does_not_starve_the_other_tasks() {
-    let _clock = Clock::take();
+    let _clock = TestClock::take();
     let mut gateway = Box::new(Gateway::idle());
     gateway.configure(&config(SendOn::Period)).unwrap();
-    let watch = Watch::<1>::new();
+    let watch = TaskWatch::<1>::new();
     let pulse = watch.register(TaskName::Serial(PortId(0))).unwrap();
     let reads = Cell::new(100);
     let mut task = pin!(run(&gateway, pulse, PortId(0), Flood(&reads), 115_200));
@@ -406,10 +406,10 @@ impl Line for Wrong<'_> {
 
 #[test]
 fn errors_are_looked_at_once_a_second_on_a_line_where_nothing_else_is_heard() {
-    let _clock = Clock::take();
+    let _clock = TestClock::take();
     let mut gateway = Box::new(Gateway::idle());
     gateway.configure(&config(SendOn::Period)).unwrap();
-    let watch = Watch::<1>::new();
+    let watch = TaskWatch::<1>::new();
     let pulse = watch.register(TaskName::Serial(PortId(0))).unwrap();
     let looks = Cell::new(0);
     let mut task = pin!(run(&gateway, pulse, PortId(0), Wrong(&looks), 115_200));

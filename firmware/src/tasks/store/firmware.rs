@@ -3,14 +3,14 @@
 use embassy_time::Instant;
 use proto_core::engine::PortState;
 use proto_core::link::LinkState;
-use recipe_store::{Ended, SlotMarks};
+use recipe_store::{SlotMarks, TrialEnd};
 use recipe_update::{SlotFlash, begin_trial, confirm, end_trial};
 
 use super::super::gateway::Gateway;
 use super::{Failed, FirmwareView, MAX_SAFE, StoreRequest, StoreTask};
-use crate::fmt::Text;
+use crate::fmt::DisplayText;
 use crate::stored::{StoreFlash, image_version};
-use crate::update::{UpdateError, Verdict, WaitsFor, Works};
+use crate::update::{TrialVerdict, UpdateError, WaitsFor, Works};
 use crate::{error, info, warn};
 
 /// State of the firmware's trial.
@@ -39,28 +39,28 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
     pub(super) async fn judge(&mut self, gateway: &Gateway) -> TrialState {
         let Some(trial) = &mut self.trial else { return TrialState::Settled };
         match trial.look(Instant::now(), works(gateway), self.handle.was_reached.get()) {
-            Verdict::Waits(waits_for) => TrialState::OnTrial(waits_for),
-            Verdict::Confirmed => match self.confirm_firmware().await {
+            TrialVerdict::Waits(waits_for) => TrialState::OnTrial(waits_for),
+            TrialVerdict::Confirmed => match self.confirm_firmware().await {
                 Ok(_) => TrialState::Settled,
                 // Retried at the next check until the trial expires.
                 Err(_) if self.trial.is_some_and(|trial| Instant::now() < trial.until()) => {
                     TrialState::OnTrial(WaitsFor::Time)
                 }
-                Err(_) => self.over(Ended::NotConfirmed).await,
+                Err(_) => self.over(TrialEnd::NotConfirmed).await,
             },
-            Verdict::Over => {
+            TrialVerdict::Over => {
                 warn!("the firmware was not confirmed in time: back to the one before");
-                self.over(Ended::NotConfirmed).await
+                self.over(TrialEnd::NotConfirmed).await
             }
         }
     }
 
-    async fn over(&mut self, ended: Ended) -> TrialState {
+    async fn over(&mut self, ended: TrialEnd) -> TrialState {
         // Starts of a trial are counted, so it ends even if this write fails.
         if let Some(marks) = end_trial(self.stored.slots(), ended)
             && let Err(error) = self.stored.mark_slots(marks).await
         {
-            error!("the store: {}", Text(&error));
+            error!("the store: {}", DisplayText(&error));
         }
         TrialState::Restart
     }
@@ -70,7 +70,7 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
         let marks = running.and_then(|running| confirm(self.stored.slots(), running));
         let marks = marks.ok_or(Failed::Firmware(UpdateError::NotOnTrial))?;
         self.stored.mark_slots(marks).await.map_err(|error| {
-            error!("the store: {}", Text(&error));
+            error!("the store: {}", DisplayText(&error));
             Failed::Store(error)
         })?;
         self.trial = None;
@@ -139,7 +139,7 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
             StoreRequest::ConfirmFirmware => Some((self.confirm_firmware().await, false)),
             StoreRequest::EndFirmware if self.trial.is_none() => refused(UpdateError::NotOnTrial),
             StoreRequest::EndFirmware => {
-                self.over(Ended::TakenBack).await;
+                self.over(TrialEnd::TakenBack).await;
                 Some((Ok(0), true))
             }
             StoreRequest::Apply { .. }

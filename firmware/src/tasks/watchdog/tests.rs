@@ -21,7 +21,7 @@ impl Wake for Wakes {
 }
 
 /// One round: whether the watchdog is fed, and what is logged.
-fn round<const N: usize>(watch: &Watch<N>) -> (bool, Vec<(TaskName, Answer)>) {
+fn round<const N: usize>(watch: &TaskWatch<N>) -> (bool, Vec<(TaskName, PulseFault)>) {
     let mut told = Vec::new();
     let fed = watch.round(|name, answer| told.push((name, answer)));
     (fed, told)
@@ -29,7 +29,7 @@ fn round<const N: usize>(watch: &Watch<N>) -> (bool, Vec<(TaskName, Answer)>) {
 
 #[test]
 fn fed_as_long_as_every_task_answers_and_the_one_that_does_not_is_named_once() {
-    let watch = Watch::<4>::new();
+    let watch = TaskWatch::<4>::new();
     let (engine, can) = (watch.register(ENGINE).unwrap(), watch.register(CAN).unwrap());
     let mut cx = Context::from_waker(Waker::noop());
     let (mut at_engine, mut at_can) = (pin!(pending::<()>()), pin!(pending::<()>()));
@@ -41,25 +41,25 @@ fn fed_as_long_as_every_task_answers_and_the_one_that_does_not_is_named_once() {
         assert_eq!(round(&watch), (true, Vec::new()));
     }
     assert!(engine.as_mut().poll(&mut cx).is_pending());
-    assert_eq!(round(&watch), (false, [(CAN, Answer::Missing)].into()));
+    assert_eq!(round(&watch), (false, [(CAN, PulseFault::Missing)].into()));
     for _ in 0..3 {
         assert!(engine.as_mut().poll(&mut cx).is_pending());
         assert_eq!(round(&watch), (false, Vec::new()));
     }
     assert!(can.as_mut().poll(&mut cx).is_pending());
-    assert_eq!(round(&watch), (true, [(CAN, Answer::Late)].into()));
+    assert_eq!(round(&watch), (true, [(CAN, PulseFault::Late)].into()));
 }
 
 #[test]
 fn a_task_that_never_began_starves_the_dog() {
-    let watch = Watch::<4>::new();
+    let watch = TaskWatch::<4>::new();
     watch.register(ENGINE).unwrap();
-    assert_eq!(round(&watch), (false, [(ENGINE, Answer::Missing)].into()));
+    assert_eq!(round(&watch), (false, [(ENGINE, PulseFault::Missing)].into()));
 }
 
 #[test]
 fn the_question_wakes_a_task_that_waits() {
-    let watch = Watch::<1>::new();
+    let watch = TaskWatch::<1>::new();
     let pulse = watch.register(ENGINE).unwrap();
     let wakes = Arc::new(Wakes::default());
     let waker = Waker::from(wakes.clone());
@@ -79,7 +79,7 @@ fn the_question_wakes_a_task_that_waits() {
 /// A task that always has something to do never waits, but has to answer.
 #[test]
 fn what_is_there_at_once_is_an_answer_too() {
-    let watch = Watch::<1>::new();
+    let watch = TaskWatch::<1>::new();
     let pulse = watch.register(ENGINE).unwrap();
     let mut value = pin!(ready(7));
     let mut cx = Context::from_waker(Waker::noop());
@@ -89,7 +89,7 @@ fn what_is_there_at_once_is_an_answer_too() {
 
 #[test]
 fn no_more_than_there_is_room_for_is_registered() {
-    let watch = Watch::<1>::new();
+    let watch = TaskWatch::<1>::new();
     assert!(watch.register(ENGINE).is_some());
     assert!(watch.register(CAN).is_none());
 }
@@ -116,7 +116,7 @@ fn the_task_that_has_the_processor_is_known_by_name() {
         TaskName::Refused,
         TaskName::Board(3),
     ];
-    let watch = Watch::<17>::new();
+    let watch = TaskWatch::<17>::new();
     let mut cx = Context::from_waker(Waker::noop());
     for name in names {
         let pulse = watch.register(name).unwrap();

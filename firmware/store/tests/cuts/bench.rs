@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::fmt;
 
 use embassy_futures::block_on;
-use recipe_store::{Ended, Geometry, Marks, Store, Trial};
+use recipe_store::{Geometry, Marks, Store, Trial, TrialEnd};
 
 use crate::model::{Nor, Torn};
 
@@ -76,10 +76,10 @@ pub(crate) fn life(changes: usize, lens: &[usize]) -> Vec<Change> {
             |attempts| Marks { live, previous, trial: Some(Trial { number, attempts, confirm_s: 60 }), last };
         all.extend([Change::Mark(trial(2)), Change::Mark(trial(1))]);
         if number % 3 == 0 {
-            last = Some((number, Ended::TakenBack));
+            last = Some((number, TrialEnd::TakenBack));
             all.push(Change::Mark(Marks { live, previous, trial: None, last }));
         } else {
-            (live, previous, last) = (Some(number), live, Some((number, Ended::Confirmed)));
+            (live, previous, last) = (Some(number), live, Some((number, TrialEnd::Confirmed)));
             all.push(Change::Mark(Marks { live, previous, trial: None, last }));
         }
         all.extend([Change::BirthSequence(number as u8), Change::Counter(number as u8 % 3, number.into())]);
@@ -128,7 +128,7 @@ impl StoreContents {
             images,
             marks: store.marks(),
             counters: std::array::from_fn(|number| store.counter(number as u8)),
-            edge: store.get(flash, recipe_store::Key::Edge, &mut buf).unwrap_or_default().to_vec(),
+            edge: store.get(flash, recipe_store::RecordKey::Edge, &mut buf).unwrap_or_default().to_vec(),
             birth: store.birth_sequence(),
             key: store.access_key(flash),
         }

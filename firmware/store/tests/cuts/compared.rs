@@ -7,7 +7,7 @@ use embassy_futures::block_on;
 use embedded_storage_async::nor_flash::{
     ErrorType, NorFlash, NorFlashError, NorFlashErrorKind, ReadNorFlash,
 };
-use recipe_store::{Flash as _, Geometry, Place, WORD};
+use recipe_store::{Flash as _, FlashWord, Geometry, WORD};
 use sequential_storage::cache::{Cache, Uncached};
 use sequential_storage::map::{MapConfig, MapStorage};
 
@@ -35,8 +35,8 @@ impl ErrorType for Adapter {
 const SECTORS: Geometry = Geometry { sectors: 3, words: 4096 };
 const SECTOR: usize = SECTORS.words as usize * WORD;
 
-fn place(at: usize) -> Place {
-    Place { sector: (at / SECTOR) as u8, word: (at % SECTOR / WORD) as u16 }
+fn place(at: usize) -> FlashWord {
+    FlashWord { sector: (at / SECTOR) as u8, word: (at % SECTOR / WORD) as u16 }
 }
 
 impl Adapter {

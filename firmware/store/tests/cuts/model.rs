@@ -1,7 +1,7 @@
 //! Flash as that of the STM32H743: words of 32 bytes with an error correction code, written once, and the power
 //! cut during any operation.
 
-use recipe_store::{BLANK, Flash, Geometry, Place, WORD, Word};
+use recipe_store::{BLANK, Flash, FlashWord, Geometry, WORD, Word};
 
 /// What a word is like whose writing or erasing was interrupted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -137,19 +137,19 @@ impl Nor {
         };
     }
 
-    fn at(&self, Place { sector, word }: Place) -> usize {
+    fn at(&self, FlashWord { sector, word }: FlashWord) -> usize {
         assert!(sector < self.geometry.sectors && word < self.geometry.words, "no such word");
         usize::from(sector) * usize::from(self.geometry.words) + usize::from(word)
     }
 
     /// A bit of a written word changes.
-    pub(crate) fn damage(&mut self, place: Place) {
+    pub(crate) fn damage(&mut self, place: FlashWord) {
         let at = self.at(place);
         self.words[at][7] ^= 0x10;
     }
 
     /// Reads as the chip does: `None` is a fault.
-    pub(crate) fn read_or_fault(&self, place: Place) -> Option<Word> {
+    pub(crate) fn read_or_fault(&self, place: FlashWord) -> Option<Word> {
         let at = self.at(place);
         match self.states[at] {
             WordState::Erased | WordState::LooksBlank => Some(BLANK),
@@ -158,7 +158,7 @@ impl Nor {
         }
     }
 
-    pub(crate) fn write_now(&mut self, place: Place, word: &Word) {
+    pub(crate) fn write_now(&mut self, place: FlashWord, word: &Word) {
         if self.is_off {
             return;
         }
@@ -189,7 +189,7 @@ impl Nor {
         self.erases += 1;
         let is_cut = self.is_cut();
         for word in 0..self.geometry.words {
-            let at = self.at(Place { sector, word });
+            let at = self.at(FlashWord { sector, word });
             match if is_cut { self.chance(4) } else { 0 } {
                 0 => self.states[at] = WordState::Erased,
                 1 => {}
@@ -204,11 +204,11 @@ impl Flash for Nor {
         self.geometry
     }
 
-    fn read(&self, place: Place) -> Word {
+    fn read(&self, place: FlashWord) -> Word {
         self.read_or_fault(place).unwrap_or([0; WORD])
     }
 
-    async fn write(&mut self, place: Place, word: &Word) {
+    async fn write(&mut self, place: FlashWord, word: &Word) {
         self.write_now(place, word);
     }
 

@@ -2,8 +2,8 @@
 
 use embassy_futures::block_on;
 use recipe_store::{
-    Ended, Flash as _, Geometry, Key, Marks, MountError, Newest, Place, Side, Slot, SlotMarks, SlotTrial,
-    Store, newest,
+    Flash as _, FlashWord, Geometry, Marks, MountError, Newest, RecordKey, Side, Slot, SlotMarks, SlotTrial,
+    Store, TrialEnd, newest,
 };
 
 use crate::bench::{Change, StoreContents, image, life};
@@ -33,7 +33,7 @@ fn marks(number: u32) -> SlotMarks {
     SlotMarks {
         good: Some(slot.other()),
         trial: (!number.is_multiple_of(3)).then_some(trial),
-        last: (!number.is_multiple_of(5)).then_some((slot, Ended::Failed)),
+        last: (!number.is_multiple_of(5)).then_some((slot, TrialEnd::Failed)),
     }
 }
 
@@ -205,7 +205,7 @@ fn a_place_of_a_newer_program_is_neither_used_nor_erased() {
     head[4] = 2;
     let check = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(&head[..28]);
     head[28..].copy_from_slice(&check.to_le_bytes());
-    board.places[1].write_now(Place { sector: 1, word: 0 }, &head);
+    board.places[1].write_now(FlashWord { sector: 1, word: 0 }, &head);
     let found = board.start();
     assert_eq!((found.side, found.may_move), (Side::First, false));
     let [first, second] = &board.places;
@@ -224,7 +224,7 @@ fn a_place_that_cannot_be_erased_leaves_the_store_where_it_was() {
     let error = block_on(found.store.relocate().execute(&from, &mut to)).unwrap_err();
     println!("{error}");
     let found = newest(&from, &to).unwrap();
-    assert_eq!((found.side, found.store.find(Key::Generation)), (Side::First, None));
+    assert_eq!((found.side, found.store.find(RecordKey::Generation)), (Side::First, None));
     assert_eq!(StoreContents::read(&found.store, &from), board.expected);
     assert_eq!(from.geometry(), SMALL);
 }

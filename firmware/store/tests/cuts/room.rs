@@ -2,7 +2,8 @@
 
 use embassy_futures::block_on;
 use recipe_store::{
-    Ended, Geometry, KeepError, Key, MAX_DATA, Marks, MountError, Place, PutError, Role, Store, Trial,
+    FlashWord, Geometry, KeepError, MAX_DATA, Marks, MountError, PutError, RecordKey, Role, Store, Trial,
+    TrialEnd,
 };
 
 use crate::bench::{Change, StoreBench, image};
@@ -102,11 +103,11 @@ fn what_does_not_fit_is_refused_before_anything_is_erased() {
     assert!(bench.attempt(&Change::Counter(1, 6)));
     assert_eq!((bench.store.counter(1), bench.flash.erases), (6, erases));
     assert_eq!(
-        bench.store.put(Key::Image(0), 0, &[0; MAX_DATA + 1]).unwrap_err(),
+        bench.store.put(RecordKey::Image(0), 0, &[0; MAX_DATA + 1]).unwrap_err(),
         PutError::TooLong { len: MAX_DATA + 1 }
     );
-    assert_eq!(bench.store.put(Key::Image(8), 0, &[]).unwrap_err(), PutError::Key);
-    assert_eq!(bench.store.put(Key::Counter(3), 0, &[]).unwrap_err(), PutError::Key);
+    assert_eq!(bench.store.put(RecordKey::Image(8), 0, &[]).unwrap_err(), PutError::Key);
+    assert_eq!(bench.store.put(RecordKey::Counter(3), 0, &[]).unwrap_err(), PutError::Key);
 }
 
 #[test]
@@ -152,7 +153,7 @@ fn a_trial_has_so_many_starts() {
     assert_eq!(run(&mut bench), with);
     assert_eq!(run(&mut bench), without);
     let marks = bench.store.marks();
-    assert_eq!((marks.trial, marks.last), (None, Some((3, Ended::Failed))));
+    assert_eq!((marks.trial, marks.last), (None, Some((3, TrialEnd::Failed))));
     assert_eq!(run(&mut bench), without);
 }
 
@@ -177,7 +178,7 @@ fn a_store_of_a_newer_program_is_left_alone() {
     head[4] = 2;
     let check = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(&head[..28]);
     head[28..].copy_from_slice(&check.to_le_bytes());
-    flash.write_now(Place { sector: 1, word: 0 }, &head);
+    flash.write_now(FlashWord { sector: 1, word: 0 }, &head);
     assert_eq!(Store::mount(&flash).unwrap_err(), MountError::Version { found: 2 });
     for geometry in [
         Geometry { sectors: 1, words: 100 },

@@ -5,10 +5,10 @@ use std::fmt;
 use std::rc::Rc;
 
 use embassy_futures::block_on;
-use recipe_store::{Flash, Geometry, Marks, Newest, Place, Side, SlotMarks, Word, newest};
+use recipe_store::{Flash, FlashWord, Geometry, Marks, Newest, Side, SlotMarks, Word, newest};
 use recipe_update::{
-    BoardName, Chosen, Downgrade, Formats, Header, Machine, Parts, PublicKey, Receive, ReceiveStep, Running,
-    Slot, SlotFlash, Stores, Version, begin_trial, choose, confirm, file_head, link_padding,
+    BoardName, Chosen, Downgrade, Formats, Header, ImageFacts, Machine, PublicKey, Receive, ReceiveStep,
+    RunningFirmware, Slot, SlotFlash, Stores, Version, begin_trial, choose, confirm, file_head, link_padding,
 };
 
 use crate::model::{Nor, Torn};
@@ -24,9 +24,9 @@ pub(crate) fn name() -> BoardName {
     BoardName::parse("nucleo-h743zi").unwrap()
 }
 
-pub(crate) fn parts(slot: Slot, version: Version) -> Parts {
+pub(crate) fn parts(slot: Slot, version: Version) -> ImageFacts {
     let formats = Formats::new(1, 3, 3).unwrap();
-    Parts { board: name(), slot, version, formats, store: recipe_store::VERSION }
+    ImageFacts { board: name(), slot, version, formats, store: recipe_store::VERSION }
 }
 
 /// An image that tells version, slot and place of each byte, with words of zeros and ones in it.
@@ -90,11 +90,11 @@ impl Flash for Part {
         self.nor.geometry()
     }
 
-    fn read(&self, place: Place) -> Word {
+    fn read(&self, place: FlashWord) -> Word {
         self.nor.read(place)
     }
 
-    async fn write(&mut self, place: Place, word: &Word) {
+    async fn write(&mut self, place: FlashWord, word: &Word) {
         self.operate(|nor| nor.write_now(place, word));
     }
 
@@ -104,7 +104,7 @@ impl Flash for Part {
 }
 
 impl SlotFlash for Part {
-    fn whole(&self, place: Place) -> Option<Word> {
+    fn whole(&self, place: FlashWord) -> Option<Word> {
         self.nor.read_or_fault(place)
     }
 }
@@ -168,7 +168,7 @@ impl SimulatedBoard {
         for (word, at) in bytes.as_chunks().0.iter().zip(0..) {
             // What is blank is not written.
             if *word != [0xFF; 32] {
-                part.nor.write_now(Place { sector: (at / words) as u8, word: at % words }, word);
+                part.nor.write_now(FlashWord { sector: (at / words) as u8, word: at % words }, word);
             }
         }
     }
@@ -227,7 +227,7 @@ impl SimulatedBoard {
         let part = &self.slots[usize::from(slot.number())];
         let words = u32::from(part.geometry().words);
         for (word, at) in image.chunks(32).zip(32..) {
-            let place = Place { sector: (at / words) as u8, word: (at % words) as u16 };
+            let place = FlashWord { sector: (at / words) as u8, word: (at % words) as u16 };
             let read = part.whole(place).expect("every word can be read");
             assert_eq!(word, &read[..word.len()], "{place:?}");
         }
@@ -257,10 +257,10 @@ impl SimulatedBoard {
     /// The running firmware receives this version for the other slot, in pieces; whether it is there.
     pub(crate) fn receive(
         &mut self,
-        running: &Running,
+        running: &RunningFirmware,
         header: Header,
         image: &[u8],
-    ) -> Result<bool, recipe_update::Refused> {
+    ) -> Result<bool, recipe_update::UpdateRefused> {
         let marks = self.marks();
         let part = &mut self.slots[usize::from(running.slot.other().number())];
         let mut receive = Receive::begin(header, running, marks, Downgrade::Refused, part)?;
@@ -284,8 +284,8 @@ impl SimulatedBoard {
         }
     }
 
-    pub(crate) fn running(slot: Slot, version: Version) -> Running {
-        Running { board: name(), slot, version, kept: Some((3, 3)) }
+    pub(crate) fn running(slot: Slot, version: Version) -> RunningFirmware {
+        RunningFirmware { board: name(), slot, version, kept: Some((3, 3)) }
     }
 
     /// Starts and works until this version was confirmed, or the power is off.

@@ -1,10 +1,10 @@
 //! What is refused before anything is erased, and what is found before the header is written.
 
 use embassy_futures::block_on;
-use recipe_store::{Flash as _, Place, Slot};
+use recipe_store::{Flash as _, FlashWord, Slot};
 use recipe_update::{
-    BadImage, BoardName, Downgrade, FileError, Formats, Gap, Header, Parts, Receive, ReceiveError,
-    ReceiveStep, Refused, Running, SlotMarks, UpdateFile, Version, begin_trial, may_keep,
+    BadImage, BoardName, Downgrade, FileError, Formats, Gap, Header, ImageFacts, Receive, ReceiveError,
+    ReceiveStep, RunningFirmware, SlotMarks, UpdateFile, UpdateRefused, Version, begin_trial, may_keep,
 };
 
 use crate::board::{SEED, SimulatedBoard, V1, file, image, parts};
@@ -13,18 +13,18 @@ use crate::{SMALL_SLOT, SMALL_STORE, V2, V3};
 
 const LEN: usize = 1_500;
 
-fn signed(parts: Parts, len: usize) -> Header {
+fn signed(parts: ImageFacts, len: usize) -> Header {
     Header::sign(parts, &image(parts.slot, parts.version, len), &SEED).unwrap()
 }
 
 #[track_caller]
 fn refusal(
-    parts: Parts,
+    parts: ImageFacts,
     len: usize,
-    running: &Running,
+    running: &RunningFirmware,
     marks: SlotMarks,
     downgrade: Downgrade,
-) -> Option<Refused> {
+) -> Option<UpdateRefused> {
     let board = SimulatedBoard::new(SMALL_SLOT, SMALL_STORE, Torn::Fault, LEN);
     Receive::begin(signed(parts, len), running, marks, downgrade, &board.slots[1]).err()
 }
@@ -37,14 +37,14 @@ fn updates_that_cannot_run_are_refused_before_anything_is_erased() {
     let right = parts(Slot::B, V3);
     assert_eq!(refused(right, LEN), None);
     assert_eq!(refused(parts(Slot::B, V2), LEN), None, "the same once more");
-    assert_eq!(refused(parts(Slot::A, V3), LEN), Some(Refused::Bad(BadImage::Slot)));
+    assert_eq!(refused(parts(Slot::A, V3), LEN), Some(UpdateRefused::Bad(BadImage::Slot)));
     let board = BoardName::parse("mps2-an500").unwrap();
-    assert_eq!(refused(Parts { board, ..right }, LEN), Some(Refused::Bad(BadImage::Board(board))));
+    assert_eq!(refused(ImageFacts { board, ..right }, LEN), Some(UpdateRefused::Bad(BadImage::Board(board))));
     let room = 2 * 64 * 32 - 1024;
     assert_eq!(refused(right, room as usize), None);
     let long = BadImage::Long { length: room + 1, room };
-    assert_eq!(refused(right, room as usize + 1), Some(Refused::Bad(long)));
-    assert_eq!(refused(Parts { store: 2, ..right }, LEN), Some(Refused::Store { offered: 2 }));
+    assert_eq!(refused(right, room as usize + 1), Some(UpdateRefused::Bad(long)));
+    assert_eq!(refused(ImageFacts { store: 2, ..right }, LEN), Some(UpdateRefused::Store { offered: 2 }));
 }
 
 #[test]
@@ -52,13 +52,16 @@ fn a_downgrade_has_to_be_asked_for() {
     let running = SimulatedBoard::running(Slot::A, V2);
     let good = SlotMarks { good: Some(Slot::A), ..SlotMarks::default() };
     let older = parts(Slot::B, V1);
-    let error = Refused::Older { offered: V1, running: V2 };
+    let error = UpdateRefused::Older { offered: V1, running: V2 };
     assert_eq!(refusal(older, LEN, &running, good, Downgrade::Refused), Some(error));
     assert_eq!(refusal(older, LEN, &running, good, Downgrade::Allowed), None);
     // It still has to read the configuration.
     let formats = Formats::new(1, 2, 2).unwrap();
-    let error = Refused::Format { kept: 3, reads: formats };
-    assert_eq!(refusal(Parts { formats, ..older }, LEN, &running, good, Downgrade::Allowed), Some(error));
+    let error = UpdateRefused::Format { kept: 3, reads: formats };
+    assert_eq!(
+        refusal(ImageFacts { formats, ..older }, LEN, &running, good, Downgrade::Allowed),
+        Some(error)
+    );
 }
 
 #[test]
@@ -66,14 +69,14 @@ fn an_update_reads_every_configuration_that_may_run() {
     let good = SlotMarks { good: Some(Slot::A), ..SlotMarks::default() };
     let refused = |kept, oldest, newest, written| {
         let formats = Formats::new(oldest, newest, written).unwrap();
-        let running = Running { kept, ..SimulatedBoard::running(Slot::A, V2) };
-        refusal(Parts { formats, ..parts(Slot::B, V3) }, LEN, &running, good, Downgrade::Refused)
+        let running = RunningFirmware { kept, ..SimulatedBoard::running(Slot::A, V2) };
+        refusal(ImageFacts { formats, ..parts(Slot::B, V3) }, LEN, &running, good, Downgrade::Refused)
     };
     assert_eq!(refused(Some((1, 3)), 1, 4, 4), None);
     assert_eq!(refused(None, 9, 9, 9), None, "a board without a configuration");
     for (kept, oldest, newest) in [((1, 3), 2, 4), ((3, 3), 4, 4), ((1, 4), 1, 3)] {
         assert!(
-            matches!(refused(Some(kept), oldest, newest, newest), Some(Refused::Format { .. })),
+            matches!(refused(Some(kept), oldest, newest, newest), Some(UpdateRefused::Format { .. })),
             "{kept:?}"
         );
     }
@@ -98,12 +101,12 @@ fn the_way_back_is_never_overwritten() {
     let running = SimulatedBoard::running(Slot::A, V2);
     let good = SlotMarks { good: Some(Slot::A), ..SlotMarks::default() };
     let refused = |marks| refusal(parts(Slot::B, V3), LEN, &running, marks, Downgrade::Refused);
-    assert_eq!(refused(begin_trial(good, Slot::B, 60, 0)), Some(Refused::OnTrial));
+    assert_eq!(refused(begin_trial(good, Slot::B, 60, 0)), Some(UpdateRefused::OnTrial));
     // The running one is on trial, and the other the good one.
     let marks = SlotMarks { good: Some(Slot::B), ..SlotMarks::default() };
-    assert_eq!(refused(begin_trial(marks, Slot::A, 60, 0)), Some(Refused::OnTrial));
-    assert_eq!(refused(marks), Some(Refused::NotGood));
-    assert_eq!(refused(SlotMarks::default()), Some(Refused::NotGood));
+    assert_eq!(refused(begin_trial(marks, Slot::A, 60, 0)), Some(UpdateRefused::OnTrial));
+    assert_eq!(refused(marks), Some(UpdateRefused::NotGood));
+    assert_eq!(refused(SlotMarks::default()), Some(UpdateRefused::NotGood));
 }
 
 /// Follows all steps with the bytes of this image; how it ended.
@@ -155,7 +158,7 @@ fn another_image_has_no_header() {
     changed[LEN - 1] ^= 1;
     assert_eq!(follow(&mut board, &mut receive, &changed), Err(ReceiveError::Bad(BadImage::Crc)));
     assert_eq!(receive.next(&board.slots[1]), ReceiveStep::End(Err(ReceiveError::Bad(BadImage::Crc))));
-    let header = (0..6).map(|word| board.slots[1].read(Place { sector: 0, word }));
+    let header = (0..6).map(|word| board.slots[1].read(FlashWord { sector: 0, word }));
     assert!(header.into_iter().all(|word| word == [0xFF; 32]));
 }
 

@@ -1,6 +1,6 @@
 //! What a loader passes over, and what it runs then.
 
-use recipe_store::{Ended, Place, Slot};
+use recipe_store::{FlashWord, Slot, TrialEnd};
 use recipe_update::{Chosen, Header, SlotMarks, begin_trial};
 
 use crate::board::{SEED, SimulatedBoard, V1, image, parts};
@@ -32,7 +32,7 @@ fn the_first_slot_that_verifies_becomes_the_good_one() {
 fn a_damaged_firmware_is_passed_over_for_the_other_one() {
     for damage in [0_u16, 2, 32, 50] {
         let mut board = both();
-        board.slots[0].nor.damage(Place { sector: 0, word: damage });
+        board.slots[0].nor.damage(FlashWord { sector: 0, word: damage });
         let chosen = board.try_start().unwrap();
         if damage == 0 {
             assert_eq!(chosen.slot, Slot::A, "the signature of the good one is not looked at");
@@ -43,7 +43,7 @@ fn a_damaged_firmware_is_passed_over_for_the_other_one() {
         assert!(board.told[0].contains(says), "{:?}", board.told);
         assert_eq!(board.marks().good, Some(Slot::B));
         // And both.
-        board.slots[1].nor.damage(Place { sector: 1, word: 2 });
+        board.slots[1].nor.damage(FlashWord { sector: 1, word: 2 });
         assert_eq!(board.try_start(), None);
         assert_eq!(board.told.len(), 2);
     }
@@ -53,7 +53,7 @@ fn a_damaged_firmware_is_passed_over_for_the_other_one() {
 fn a_word_of_zeros_that_cannot_be_read_is_damage() {
     let mut board = both();
     // Reading it gives zeros where there may be no faults, and running it is one.
-    let zeros = Place { sector: 0, word: 32 + 3 };
+    let zeros = FlashWord { sector: 0, word: 32 + 3 };
     assert_eq!(board.slots[0].nor.read_or_fault(zeros), Some([0; 32]));
     board.slots[0].nor.allow_rewrites();
     board.slots[0].nor.write_now(zeros, &[0; 32]);
@@ -71,9 +71,9 @@ fn a_foreign_firmware_never_runs() {
     let chosen = board.try_start().unwrap();
     assert_eq!((chosen.slot, chosen.is_trial), (Slot::A, false));
     assert_eq!(board.told, ["B: the firmware was not signed with the key of this board"]);
-    assert_eq!(board.marks().last, Some((Slot::B, Ended::Failed)));
+    assert_eq!(board.marks().last, Some((Slot::B, TrialEnd::Failed)));
     // Nor as the last resort.
-    board.slots[0].nor.damage(Place { sector: 0, word: 40 });
+    board.slots[0].nor.damage(FlashWord { sector: 0, word: 40 });
     assert_eq!(board.try_start(), None);
 }
 
@@ -96,7 +96,7 @@ fn a_firmware_of_another_slot_or_board_never_runs() {
     assert_eq!(board.try_start().unwrap().slot, Slot::A);
     assert_eq!(board.told, ["B: the firmware is linked for the other slot"]);
     let other = recipe_update::BoardName::parse("mps2-an500").unwrap();
-    let parts = recipe_update::Parts { board: other, ..parts(Slot::B, V2) };
+    let parts = recipe_update::ImageFacts { board: other, ..parts(Slot::B, V2) };
     board.put(Slot::B, &Header::sign(parts, &image_a, &SEED).unwrap(), &image_a);
     board.write_marks(begin_trial(board.marks(), Slot::B, 60, 0));
     assert_eq!(board.try_start().unwrap().slot, Slot::A);
@@ -112,7 +112,7 @@ fn without_a_store_the_first_slot_that_verifies_runs() {
     let check = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(&head[..28]);
     head[28..].copy_from_slice(&check.to_le_bytes());
     blank(&mut board);
-    board.stores.iter_mut().for_each(|part| part.nor.write_now(Place { sector: 0, word: 0 }, &head));
+    board.stores.iter_mut().for_each(|part| part.nor.write_now(FlashWord { sector: 0, word: 0 }, &head));
     let Chosen { slot, header, is_trial } = board.try_start().unwrap();
     assert_eq!((slot, header.version(), is_trial), (Slot::A, V1, false));
 }

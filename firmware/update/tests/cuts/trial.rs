@@ -1,6 +1,6 @@
 //! Trials that are not confirmed: the good firmware comes back, whatever is cut on the way.
 
-use recipe_store::{Ended, Slot};
+use recipe_store::{Slot, TrialEnd};
 use recipe_update::{STARTS, begin_trial, confirm, end_trial};
 
 use crate::board::{SimulatedBoard, V1};
@@ -28,7 +28,7 @@ fn a_firmware_that_never_confirms_has_so_many_starts() {
         let marks = board.marks();
         assert_eq!(
             (marks.good, marks.trial, marks.last),
-            (Some(Slot::A), None, Some((Slot::B, Ended::Failed)))
+            (Some(Slot::A), None, Some((Slot::B, TrialEnd::Failed)))
         );
     }
 }
@@ -69,11 +69,11 @@ fn a_trial_ends_when_somebody_says_so() {
     let mut board = on_trial(Torn::Fault);
     board.start();
     assert_eq!(confirm(board.marks(), Slot::A), None, "it does not run on trial");
-    let marks = end_trial(board.marks(), Ended::TakenBack).unwrap();
+    let marks = end_trial(board.marks(), TrialEnd::TakenBack).unwrap();
     assert!(board.write_marks(marks));
     assert_eq!(board.start().slot, Slot::A);
-    assert_eq!(board.marks().last, Some((Slot::B, Ended::TakenBack)));
-    assert_eq!((end_trial(board.marks(), Ended::Failed), confirm(board.marks(), Slot::B)), (None, None));
+    assert_eq!(board.marks().last, Some((Slot::B, TrialEnd::TakenBack)));
+    assert_eq!((end_trial(board.marks(), TrialEnd::Failed), confirm(board.marks(), Slot::B)), (None, None));
 }
 
 #[test]

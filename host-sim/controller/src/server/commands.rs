@@ -7,7 +7,7 @@
 use std::collections::VecDeque;
 
 use proto_core::command::{
-    Action, CommandServer, MAX_COMMAND, Outcome, Percent, Reply, Request, ServerEvent, StateCodes,
+    Action, ActionOutcome, CommandServer, MAX_COMMAND, Percent, Reply, Request, ServerEvent, StateCodes,
     UnknownCommand,
 };
 use proto_core::time::{Duration, Instant};
@@ -145,15 +145,15 @@ impl Controller {
                 Next::Execute(command) => self.execute(now, conn, command),
                 Next::Answer(action, progress) => {
                     let outcome = match progress {
-                        TransitionProgress::Done => Outcome::Success,
+                        TransitionProgress::Done => ActionOutcome::Success,
                         TransitionProgress::Superseded => {
                             self.machine.not_completed(action, "another operation began before it was done");
-                            Outcome::Fail
+                            ActionOutcome::Fail
                         }
                         TransitionProgress::InProgress => {
                             let why = format!("not done after {} s", MAX_TRANSITION.as_millis() / 1_000);
                             self.machine.not_completed(action, &why);
-                            Outcome::Fail
+                            ActionOutcome::Fail
                         }
                     };
                     self.server.places.active(now, conn);
@@ -186,8 +186,8 @@ impl Controller {
         match command {
             Command::Run { program, speed } => {
                 let outcome = match self.run(now, Some(conn), &program, speed) {
-                    Ok(()) => Outcome::Success,
-                    Err(_) => Outcome::Fail,
+                    Ok(()) => ActionOutcome::Success,
+                    Err(_) => ActionOutcome::Fail,
                 };
                 self.reply(now, conn, &Reply::Run(outcome));
             }
@@ -210,7 +210,7 @@ impl Controller {
                         session.pending = Some(Pending { transition, until: now + MAX_TRANSITION });
                     }
                 }
-                Err(_) => self.reply(now, conn, &Reply::Did { action, outcome: Outcome::Fail }),
+                Err(_) => self.reply(now, conn, &Reply::Did { action, outcome: ActionOutcome::Fail }),
             },
             Command::State => {
                 let machine = &self.machine;
@@ -269,8 +269,8 @@ impl Controller {
             reply,
             Reply::UnknownCommand
                 | Reply::SpeedRefused
-                | Reply::Run(Outcome::Fail)
-                | Reply::Did { outcome: Outcome::Fail, .. }
+                | Reply::Run(ActionOutcome::Fail)
+                | Reply::Did { outcome: ActionOutcome::Fail, .. }
         );
         self.counters.command.refusals += u64::from(refused);
         let mut out = [0; MAX_REPLY];

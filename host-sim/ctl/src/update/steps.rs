@@ -3,7 +3,7 @@
 
 use std::time::{Duration, Instant};
 
-use recipe_update::Link;
+use recipe_update::SlotImage;
 use serde_json::{Value, json};
 
 use super::{Downgrade, Firmware, UpdateTrial};
@@ -54,7 +54,7 @@ impl UpdateProgress {
 /// # Errors
 /// It takes none, or none of this file: another board, no link for its free slot, damaged, or signed with another key
 /// than its loader's.
-pub fn fitting<'u>(client: &Client, board: &Firmware, update: &'u Update) -> Result<Link<'u>, Failure> {
+pub fn fitting<'u>(client: &Client, board: &Firmware, update: &'u Update) -> Result<SlotImage<'u>, Failure> {
     if let Some(why) = &board.cannot {
         return Err(client.refused(why));
     }
@@ -87,7 +87,7 @@ pub fn fitting<'u>(client: &Client, board: &Firmware, update: &'u Update) -> Res
 /// It is refused, damaged on the way, or the board was not reached for a minute.
 pub fn push(
     client: &Client,
-    link: &Link<'_>,
+    link: &SlotImage<'_>,
     downgrade: Downgrade,
     progress: &mut dyn FnMut(UpdateProgress),
 ) -> Result<Firmware, Failure> {
@@ -140,7 +140,12 @@ pub fn push(
 }
 
 /// Sends the piece of a firmware that begins there.
-fn put(client: &Client, link: &Link<'_>, offset: u64, downgrade: Downgrade) -> Result<HttpReply, Failure> {
+fn put(
+    client: &Client,
+    link: &SlotImage<'_>,
+    offset: u64,
+    downgrade: Downgrade,
+) -> Result<HttpReply, Failure> {
     let header = link.header_bytes.len();
     let at = usize::try_from(offset).unwrap_or(usize::MAX);
     let piece = match at.checked_sub(header) {

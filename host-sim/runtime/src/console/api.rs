@@ -6,9 +6,9 @@ use std::rc::Rc;
 use proto_core::time::Duration;
 use recipe_api::key::SCHEME;
 use recipe_api::nonces::MAX_AGE;
-use recipe_api::response::{Kind, Status};
+use recipe_api::response::{ContentType, StatusCode};
 use recipe_api::revisions::{Refused, Revision, TRIAL};
-use recipe_api::route::Operation;
+use recipe_api::route::ApiOperation;
 use recipe_io::timer::now;
 use serde::Deserialize;
 use serde_json::{Value, json};
@@ -24,52 +24,52 @@ impl ConsoleServer {
     /// Executes a request.
     pub(super) async fn execute(&self, request: HttpRequest<'_>) -> HttpReply {
         match (request.admitted.operation, &self.source) {
-            (Operation::Page, _) => HttpReply::page(request.head.if_none_match),
-            (Operation::Nonce, _) => {
+            (ApiOperation::Page, _) => HttpReply::page(request.head.if_none_match),
+            (ApiOperation::Nonce, _) => {
                 let nonce = self.guard.borrow_mut().nonce(now());
                 let age = MAX_AGE.as_millis() / 1_000;
                 HttpReply::json(
-                    Status::OK,
+                    StatusCode::OK,
                     &json!({ "nonce": nonce.as_str(), "scheme": SCHEME, "max_age_s": age }),
                 )
             }
-            (Operation::Check, _) => match std::str::from_utf8(&request.body) {
+            (ApiOperation::Check, _) => match std::str::from_utf8(&request.body) {
                 Ok(toml) => match request.head.query("image") {
-                    None => HttpReply::json(Status::OK, &check::report(toml)),
+                    None => HttpReply::json(StatusCode::OK, &check::report(toml)),
                     Some("1") => image(toml),
-                    Some(_) => HttpReply::error(Status::BAD_REQUEST, "image is out of range; allowed: 1"),
+                    Some(_) => HttpReply::error(StatusCode::BAD_REQUEST, "image is out of range; allowed: 1"),
                 },
-                Err(error) => HttpReply::error(Status::BAD_REQUEST, &format!("not UTF-8: {error}")),
+                Err(error) => HttpReply::error(StatusCode::BAD_REQUEST, &format!("not UTF-8: {error}")),
             },
-            (Operation::Config, ConsoleSource::Gateway { shared, .. }) => config(&shared.view(), &request),
-            (Operation::Revisions, ConsoleSource::Gateway { shared, .. }) => {
-                HttpReply::json(Status::OK, &revisions(&shared.view()))
+            (ApiOperation::Config, ConsoleSource::Gateway { shared, .. }) => config(&shared.view(), &request),
+            (ApiOperation::Revisions, ConsoleSource::Gateway { shared, .. }) => {
+                HttpReply::json(StatusCode::OK, &revisions(&shared.view()))
             }
-            (Operation::Pendant, ConsoleSource::Controller { control, .. }) => {
+            (ApiOperation::Pendant, ConsoleSource::Controller { control, .. }) => {
                 info!(peer = %request.peer, body = %String::from_utf8_lossy(&request.body), "pendant");
                 pendant::operate(*control, &request.body).await
             }
-            (Operation::Identify, ConsoleSource::Gateway { .. }) => self.identify(&request),
+            (ApiOperation::Identify, ConsoleSource::Gateway { .. }) => self.identify(&request),
             (
-                Operation::Update
-                | Operation::PutUpdate
-                | Operation::TryUpdate
-                | Operation::ConfirmUpdate
-                | Operation::EndUpdate,
+                ApiOperation::Update
+                | ApiOperation::PutUpdate
+                | ApiOperation::TryUpdate
+                | ApiOperation::ConfirmUpdate
+                | ApiOperation::EndUpdate,
                 _,
             ) => HttpReply::error(
-                Status::NOT_IMPLEMENTED,
+                StatusCode::NOT_IMPLEMENTED,
                 "this gateway is a program; it is updated as a package, as it was installed",
             ),
-            (Operation::Edge | Operation::PutEdge, _) => HttpReply::error(
-                Status::NOT_IMPLEMENTED,
+            (ApiOperation::Edge | ApiOperation::PutEdge, _) => HttpReply::error(
+                StatusCode::NOT_IMPLEMENTED,
                 "this gateway is a program; its edge node is given with --sparkplug, and its log says how it does",
             ),
             (
-                operation @ (Operation::PutConfig
-                | Operation::Apply
-                | Operation::Confirm
-                | Operation::Rollback),
+                operation @ (ApiOperation::PutConfig
+                | ApiOperation::Apply
+                | ApiOperation::Confirm
+                | ApiOperation::Rollback),
                 ConsoleSource::Gateway { .. },
             ) => self.change(operation, request).await,
             (operation, _) => self.read(operation, &request.head).await,
@@ -84,19 +84,19 @@ impl ConsoleServer {
         };
         if !IDENTIFY.contains(&s) {
             let text = format!("s is out of range; allowed: {}..={}", IDENTIFY.start(), IDENTIFY.end());
-            return HttpReply::error(Status::BAD_REQUEST, &text);
+            return HttpReply::error(StatusCode::BAD_REQUEST, &text);
         }
         let name = host_name().unwrap_or_default();
         let peer = request.peer.ip().to_canonical();
         warn!(%peer, name, console = %self.address, "this is the gateway that somebody looks for");
-        HttpReply::json(Status::OK, &json!({}))
+        HttpReply::json(StatusCode::OK, &json!({}))
     }
 
     /// Requests that change the configuration, or what runs.
-    async fn change(&self, operation: Operation, request: HttpRequest<'_>) -> HttpReply {
+    async fn change(&self, operation: ApiOperation, request: HttpRequest<'_>) -> HttpReply {
         let ConsoleSource::Gateway { shared, commands, .. } = &self.source else { return nothing_runs() };
         let what = match operation {
-            Operation::PutConfig => {
+            ApiOperation::PutConfig => {
                 // The view must not stay locked while the text is parsed and an engine is built.
                 let overrides = shared.view().overrides.clone();
                 match put(&request, &overrides) {
@@ -104,19 +104,19 @@ impl ConsoleServer {
                     Err(reply) => return reply,
                 }
             }
-            Operation::Apply => match arguments::<ApplyArguments>(&request.body) {
+            ApiOperation::Apply => match arguments::<ApplyArguments>(&request.body) {
                 Ok(ApplyArguments { confirm_s, revision }) => SupervisorAction::Apply {
                     number: revision,
                     trial: Duration::from_millis((confirm_s * 1e3) as u64),
                 },
                 Err(reply) => return reply,
             },
-            Operation::Confirm | Operation::Rollback => match arguments::<NoArguments>(&request.body) {
-                Ok(NoArguments {}) if operation == Operation::Confirm => SupervisorAction::Confirm,
+            ApiOperation::Confirm | ApiOperation::Rollback => match arguments::<NoArguments>(&request.body) {
+                Ok(NoArguments {}) if operation == ApiOperation::Confirm => SupervisorAction::Confirm,
                 Ok(NoArguments {}) => SupervisorAction::RollBack,
                 Err(reply) => return reply,
             },
-            _ => return HttpReply::error(Status::NOT_FOUND, "there is no such path"),
+            _ => return HttpReply::error(StatusCode::NOT_FOUND, "there is no such path"),
         };
         let (answer, answered) = oneshot::channel();
         let peer = request.peer.ip().to_canonical();
@@ -130,7 +130,8 @@ impl ConsoleServer {
             Ok(revision) => {
                 // `warn` is shown by default: a person has to see it.
                 warn!(%peer, revision, what = name(operation), "done for a client of the console");
-                let status = if operation == Operation::PutConfig { Status::CREATED } else { Status::OK };
+                let status =
+                    if operation == ApiOperation::PutConfig { StatusCode::CREATED } else { StatusCode::OK };
                 let mut shown = revisions(&view);
                 shown["revision"] = json!(revision);
                 let reply = HttpReply::json(status, &shown);
@@ -147,7 +148,11 @@ impl ConsoleServer {
                 let mut shown = revisions(&view);
                 shown["error"] = json!(why);
                 HttpReply::json(
-                    if operation == Operation::Apply { Status::CONFLICT } else { Status::INTERNAL },
+                    if operation == ApiOperation::Apply {
+                        StatusCode::CONFLICT
+                    } else {
+                        StatusCode::INTERNAL
+                    },
                     &shown,
                 )
             }
@@ -159,7 +164,7 @@ impl ConsoleServer {
 fn image(toml: &str) -> HttpReply {
     match check::image(toml) {
         Ok(bytes) => HttpReply::image(bytes),
-        Err(mistake) => HttpReply::json(Status::UNPROCESSABLE, &Value::Object(mistake.json())),
+        Err(mistake) => HttpReply::json(StatusCode::UNPROCESSABLE, &Value::Object(mistake.json())),
     }
 }
 
@@ -169,20 +174,20 @@ fn config(view: &SupervisorView, request: &HttpRequest<'_>) -> HttpReply {
     let number = match request.head.query("revision").map(str::parse) {
         None => revisions.running().unwrap_or(revisions.live()),
         Some(Ok(number)) => number,
-        Some(Err(_)) => return HttpReply::error(Status::BAD_REQUEST, "revision must be a number"),
+        Some(Err(_)) => return HttpReply::error(StatusCode::BAD_REQUEST, "revision must be a number"),
     };
     match (revisions.revision(number), view.texts.get(&number)) {
         (Some(revision), _) if request.head.if_none_match == Some(etag(revision).as_str()) => {
             let reply = HttpReply {
-                status: Status::NOT_MODIFIED,
-                kind: Kind::Toml,
+                status: StatusCode::NOT_MODIFIED,
+                kind: ContentType::Toml,
                 body: "".into(),
                 fields: Vec::new(),
             };
             reply.with("ETag", etag(revision))
         }
         (Some(revision), Some(text)) => {
-            HttpReply::text(Kind::Toml, Rc::from(&**text)).with("ETag", etag(revision))
+            HttpReply::text(ContentType::Toml, Rc::from(&**text)).with("ETag", etag(revision))
         }
         _ => refusal(Refused::Unknown),
     }
@@ -256,27 +261,27 @@ fn arguments<T: serde::de::DeserializeOwned>(body: &[u8]) -> Result<T, HttpReply
     let object = serde_json::from_slice(body).map(Value::Object);
     object
         .and_then(serde_json::from_value)
-        .map_err(|error| HttpReply::error(Status::BAD_REQUEST, &error.to_string()))
+        .map_err(|error| HttpReply::error(StatusCode::BAD_REQUEST, &error.to_string()))
 }
 
 /// A configuration to store: refused here if it could not run.
 fn put(request: &HttpRequest<'_>, overrides: &[String]) -> Result<SupervisorAction, HttpReply> {
     let Some(base) = request.head.if_match else {
         let text = "If-Match is needed: the ETag of the revision that this one was made from";
-        return Err(HttpReply::error(Status::PRECONDITION_REQUIRED, text));
+        return Err(HttpReply::error(StatusCode::PRECONDITION_REQUIRED, text));
     };
     let Some(base) = parse_etag(base) else {
         return Err(HttpReply::error(
-            Status::PRECONDITION_FAILED,
+            StatusCode::PRECONDITION_FAILED,
             "If-Match must be one ETag, such as \"3-0badcafe\"",
         ));
     };
     let toml = String::from_utf8(request.body.clone());
     let toml =
-        toml.map_err(|error| HttpReply::error(Status::UNPROCESSABLE, &format!("not UTF-8: {error}")))?;
+        toml.map_err(|error| HttpReply::error(StatusCode::UNPROCESSABLE, &format!("not UTF-8: {error}")))?;
     match check::gateway(check::NAME, &toml, overrides) {
         Ok(_) => Ok(SupervisorAction::Put { base, toml }),
-        Err(mistake) => Err(HttpReply::json(Status::UNPROCESSABLE, &Value::Object(mistake.json()))),
+        Err(mistake) => Err(HttpReply::json(StatusCode::UNPROCESSABLE, &Value::Object(mistake.json()))),
     }
 }
 
@@ -292,40 +297,40 @@ fn parse_etag(text: &str) -> Option<Revision> {
 
 fn refusal(refused: Refused) -> HttpReply {
     let (status, text) = match refused {
-        Refused::Busy => (Status::CONFLICT, "something else is being done; try again".to_owned()),
+        Refused::Busy => (StatusCode::CONFLICT, "something else is being done; try again".to_owned()),
         Refused::OnTrial => {
-            (Status::CONFLICT, "a revision is on trial; confirm it or roll it back first".to_owned())
+            (StatusCode::CONFLICT, "a revision is on trial; confirm it or roll it back first".to_owned())
         }
-        Refused::NotOnTrial => (Status::CONFLICT, "no revision is on trial".to_owned()),
+        Refused::NotOnTrial => (StatusCode::CONFLICT, "no revision is on trial".to_owned()),
         Refused::Changed(base) => {
             let text = format!("the configuration was changed meanwhile; the newest is {}", etag(base));
-            return HttpReply::error(Status::PRECONDITION_FAILED, &text).with("ETag", etag(base));
+            return HttpReply::error(StatusCode::PRECONDITION_FAILED, &text).with("ETag", etag(base));
         }
-        Refused::NothingWaits => (Status::CONFLICT, "no stored revision waits; name one".to_owned()),
-        Refused::Unknown => (Status::NOT_FOUND, "there is no such revision".to_owned()),
-        Refused::Runs => (Status::CONFLICT, "it is live already".to_owned()),
+        Refused::NothingWaits => (StatusCode::CONFLICT, "no stored revision waits; name one".to_owned()),
+        Refused::Unknown => (StatusCode::NOT_FOUND, "there is no such revision".to_owned()),
+        Refused::Runs => (StatusCode::CONFLICT, "it is live already".to_owned()),
         Refused::Trial => {
             let seconds = |at: &Duration| at.as_millis() / 1_000;
             let (min, max) = (seconds(TRIAL.start()), seconds(TRIAL.end()));
-            (Status::BAD_REQUEST, format!("confirm_s is out of range; allowed: {min}..={max}"))
+            (StatusCode::BAD_REQUEST, format!("confirm_s is out of range; allowed: {min}..={max}"))
         }
-        Refused::NoPrevious => (Status::CONFLICT, "no other revision was live before".to_owned()),
-        other => (Status::CONFLICT, format!("refused: {other:?}")),
+        Refused::NoPrevious => (StatusCode::CONFLICT, "no other revision was live before".to_owned()),
+        other => (StatusCode::CONFLICT, format!("refused: {other:?}")),
     };
     HttpReply::error(status, &text)
 }
 
 pub(super) fn nothing_runs() -> HttpReply {
-    HttpReply::error(Status::UNAVAILABLE, "nothing runs at the moment; try again")
+    HttpReply::error(StatusCode::UNAVAILABLE, "nothing runs at the moment; try again")
 }
 
 /// For the log.
-fn name(operation: Operation) -> &'static str {
+fn name(operation: ApiOperation) -> &'static str {
     match operation {
-        Operation::PutConfig => "store",
-        Operation::Apply => "apply",
-        Operation::Confirm => "confirm",
-        Operation::Rollback => "roll back",
+        ApiOperation::PutConfig => "store",
+        ApiOperation::Apply => "apply",
+        ApiOperation::Confirm => "confirm",
+        ApiOperation::Rollback => "roll back",
         _ => "",
     }
 }

@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use recipe_api::guard::{Admitted, Refusal, Site};
 use recipe_api::key::{BodyHash, SCHEME};
-use recipe_api::request::{Head, HeadBuffer, HeadError};
-use recipe_api::response::{CONTINUE, Kind, Length, Page, Response, Status};
+use recipe_api::request::{HeadBuffer, HeadError, HttpHead};
+use recipe_api::response::{CONTINUE, ContentType, Length, Page, Response, StatusCode};
 use recipe_io::tcp_options;
 use recipe_io::timer::now;
 use serde_json::{Value, json};
@@ -23,8 +23,8 @@ use super::{ConsoleServer, stream};
 /// A response with its body.
 #[derive(Debug)]
 pub(super) struct HttpReply {
-    pub(super) status: Status,
-    pub(super) kind: Kind,
+    pub(super) status: StatusCode,
+    pub(super) kind: ContentType,
     pub(super) body: ReplyBody,
     pub(super) fields: Vec<(&'static str, String)>,
 }
@@ -58,29 +58,34 @@ impl<T: Into<Rc<str>>> From<T> for ReplyBody {
 
 impl HttpReply {
     /// A document that was made before.
-    pub(super) fn text(kind: Kind, body: Rc<str>) -> Self {
-        Self { status: Status::OK, kind, body: ReplyBody::Text(body), fields: Vec::new() }
+    pub(super) fn text(kind: ContentType, body: Rc<str>) -> Self {
+        Self { status: StatusCode::OK, kind, body: ReplyBody::Text(body), fields: Vec::new() }
     }
 
     /// The page for people, unless the client has it.
     pub(super) fn page(if_none_match: Option<&str>) -> Self {
         let status = PAGE.status(if_none_match);
-        let body = ReplyBody::Bytes(if status == Status::OK { PAGE.bytes } else { &[] });
-        Self { status, kind: Kind::Page, body, fields: Vec::new() }
+        let body = ReplyBody::Bytes(if status == StatusCode::OK { PAGE.bytes } else { &[] });
+        Self { status, kind: ContentType::Page, body, fields: Vec::new() }
     }
 
     /// A configuration image.
     pub(super) fn image(bytes: Vec<u8>) -> Self {
-        Self { status: Status::OK, kind: Kind::Image, body: ReplyBody::Made(bytes), fields: Vec::new() }
+        Self {
+            status: StatusCode::OK,
+            kind: ContentType::Image,
+            body: ReplyBody::Made(bytes),
+            fields: Vec::new(),
+        }
     }
 
     /// A JSON value.
-    pub(super) fn json(status: Status, value: &Value) -> Self {
-        Self { status, kind: Kind::Json, body: value.to_string().into(), fields: Vec::new() }
+    pub(super) fn json(status: StatusCode, value: &Value) -> Self {
+        Self { status, kind: ContentType::Json, body: value.to_string().into(), fields: Vec::new() }
     }
 
     /// An object with `error`.
-    pub(super) fn error(status: Status, text: &str) -> Self {
+    pub(super) fn error(status: StatusCode, text: &str) -> Self {
         Self::json(status, &json!({ "error": text }))
     }
 
@@ -106,7 +111,7 @@ impl From<Refusal> for HttpReply {
 
 /// A request with what belongs to it.
 pub(super) struct HttpRequest<'a> {
-    pub(super) head: Head<'a>,
+    pub(super) head: HttpHead<'a>,
     pub(super) admitted: Admitted,
     pub(super) body: Vec<u8>,
     pub(super) peer: SocketAddr,
@@ -133,7 +138,7 @@ impl ConsoleServer {
         if self.connections.get() >= MAX_CONNECTIONS {
             self.count(|counters| counters.turned_away += 1);
             // Without waiting for anything: there may be thousands.
-            let reply = HttpReply::error(Status::UNAVAILABLE, "too many connections; try again");
+            let reply = HttpReply::error(StatusCode::UNAVAILABLE, "too many connections; try again");
             let _ = stream.try_write(&bytes_of(&reply));
             return;
         }
@@ -190,7 +195,7 @@ impl ConsoleServer {
             Ok(admitted) => admitted,
             Err(refusal) => {
                 let mut reply = HttpReply::from(refusal);
-                if refusal.status == Status::UNAUTHORIZED {
+                if refusal.status == StatusCode::UNAUTHORIZED {
                     let nonce = self.guard.borrow_mut().nonce(now());
                     let scheme = if site.is_loopback() { ", Bearer" } else { "" };
                     reply = reply.with("WWW-Authenticate", format!("{SCHEME} nonce=\"{nonce}\"{scheme}"));
@@ -208,7 +213,9 @@ impl ConsoleServer {
             hash.update(&body);
             if !admitted.is_body(&hash.finish()) {
                 let text = "the body is not the one that was signed";
-                return self.answer(&mut stream, &HttpReply::error(Status::UNAUTHORIZED, text), false).await;
+                return self
+                    .answer(&mut stream, &HttpReply::error(StatusCode::UNAUTHORIZED, text), false)
+                    .await;
             }
         }
         let mut reply = self.execute(HttpRequest { head, admitted, body, peer }).await;
@@ -284,7 +291,7 @@ pub(super) fn head_of(reply: &HttpReply, length: Length) -> String {
     let mut text = String::new();
     // Writing to a `String` cannot fail.
     let _ = match reply.kind {
-        Kind::Page => PAGE.write_head(reply.status, &mut text),
+        ContentType::Page => PAGE.write_head(reply.status, &mut text),
         kind => Response::new(reply.status, kind, length).with(&fields).write(&mut text),
     };
     text

@@ -4,7 +4,7 @@ use std::io;
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use recipe_api::response::{Kind, Status};
+use recipe_api::response::{ContentType, StatusCode};
 use serde_json::{Map, Value};
 use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
 use tokio::net::TcpStream;
@@ -16,22 +16,24 @@ use super::http::HttpReply;
 pub(super) async fn operate(control: SocketAddr, body: &[u8]) -> HttpReply {
     let request = match serde_json::from_slice::<Map<String, Value>>(body) {
         Ok(request) => request,
-        Err(error) => return HttpReply::error(Status::BAD_REQUEST, &format!("not a JSON object: {error}")),
+        Err(error) => {
+            return HttpReply::error(StatusCode::BAD_REQUEST, &format!("not a JSON object: {error}"));
+        }
     };
     if request.get("do").is_some_and(|what| what == "follow") {
         let text = "events are followed at the control socket; see GET /api/v1/stream for the state";
-        return HttpReply::error(Status::BAD_REQUEST, text);
+        return HttpReply::error(StatusCode::BAD_REQUEST, text);
     }
     let line = Value::Object(request).to_string() + "\n";
     match timeout(MAX_TIME, ask(control, &line)).await {
         Ok(Ok(answer)) => {
             let is_done = serde_json::from_str::<Value>(&answer).is_ok_and(|answer| answer["ok"] == true);
-            let status = if is_done { Status::OK } else { Status::UNPROCESSABLE };
-            HttpReply { status, kind: Kind::Json, body: answer.trim_end().into(), fields: Vec::new() }
+            let status = if is_done { StatusCode::OK } else { StatusCode::UNPROCESSABLE };
+            HttpReply { status, kind: ContentType::Json, body: answer.trim_end().into(), fields: Vec::new() }
         }
-        Ok(Err(error)) => HttpReply::error(Status::UNAVAILABLE, &format!("control socket: {error}")),
+        Ok(Err(error)) => HttpReply::error(StatusCode::UNAVAILABLE, &format!("control socket: {error}")),
         Err(_) => HttpReply::error(
-            Status::UNAVAILABLE,
+            StatusCode::UNAVAILABLE,
             "the operation takes longer than 30 s; use the control socket",
         ),
     }

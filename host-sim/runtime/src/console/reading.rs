@@ -5,9 +5,9 @@ use std::rc::Rc;
 use std::sync::Arc;
 
 use proto_core::config::GatewayConfig;
-use recipe_api::request::Head;
-use recipe_api::response::{Kind, Status};
-use recipe_api::route::{Operation, Served};
+use recipe_api::request::HttpHead;
+use recipe_api::response::{ContentType, StatusCode};
+use recipe_api::route::{ApiOperation, Served};
 use recipe_config::FileKind;
 use recipe_config::file::Text;
 use recipe_export::dbc::{self, DbcError};
@@ -23,26 +23,28 @@ use crate::log::MAX_NEWEST;
 
 impl ConsoleServer {
     /// Answers requests that only read.
-    pub(super) async fn read(&self, operation: Operation, head: &Head<'_>) -> HttpReply {
+    pub(super) async fn read(&self, operation: ApiOperation, head: &HttpHead<'_>) -> HttpReply {
         match operation {
-            Operation::Info => HttpReply::json(Status::OK, &self.info()),
-            Operation::Log => self.log(head),
-            Operation::Bundle => HttpReply::json(Status::OK, &self.bundle().await),
-            Operation::Schema => HttpReply::json(Status::OK, &recipe_config::schema(FileKind::Gateway)),
-            Operation::ExportDbc | Operation::ExportLua | Operation::ExportMap => {
+            ApiOperation::Info => HttpReply::json(StatusCode::OK, &self.info()),
+            ApiOperation::Log => self.log(head),
+            ApiOperation::Bundle => HttpReply::json(StatusCode::OK, &self.bundle().await),
+            ApiOperation::Schema => {
+                HttpReply::json(StatusCode::OK, &recipe_config::schema(FileKind::Gateway))
+            }
+            ApiOperation::ExportDbc | ApiOperation::ExportLua | ApiOperation::ExportMap => {
                 self.export(operation, head).unwrap_or_else(|refused| refused)
             }
             _ => {
                 let Some(snapshot) = self.snapshots.newest(&self.source).await else { return nothing_runs() };
                 match operation {
-                    Operation::Status => HttpReply::text(Kind::Json, snapshot.status()),
-                    Operation::Values => text(Kind::Json, snapshot.values()),
-                    Operation::Metrics => text(Kind::Metrics, snapshot.metrics()),
-                    Operation::Doctor => match self.findings(&snapshot).await {
-                        Some(findings) => HttpReply::json(Status::OK, &json!({ "findings": findings })),
+                    ApiOperation::Status => HttpReply::text(ContentType::Json, snapshot.status()),
+                    ApiOperation::Values => text(ContentType::Json, snapshot.values()),
+                    ApiOperation::Metrics => text(ContentType::Metrics, snapshot.metrics()),
+                    ApiOperation::Doctor => match self.findings(&snapshot).await {
+                        Some(findings) => HttpReply::json(StatusCode::OK, &json!({ "findings": findings })),
                         None => nothing_runs(),
                     },
-                    _ => HttpReply::error(Status::NOT_FOUND, "there is no such path"),
+                    _ => HttpReply::error(StatusCode::NOT_FOUND, "there is no such path"),
                 }
             }
         }
@@ -85,17 +87,17 @@ impl ConsoleServer {
     }
 
     /// The newest lines of the log.
-    fn log(&self, head: &Head<'_>) -> HttpReply {
+    fn log(&self, head: &HttpHead<'_>) -> HttpReply {
         let count = match head.query("lines").map(str::parse) {
             None => MAX_NEWEST,
             Some(Ok(count)) if (1..=MAX_NEWEST).contains(&count) => count,
             Some(_) => {
                 let text = format!("lines is out of range; allowed: 1..={MAX_NEWEST}");
-                return HttpReply::error(Status::BAD_REQUEST, &text);
+                return HttpReply::error(StatusCode::BAD_REQUEST, &text);
             }
         };
         let text: String = self.log_lines(count).iter().flat_map(|line| [line, "\n"]).collect();
-        HttpReply::text(Kind::Text, text.into())
+        HttpReply::text(ContentType::Text, text.into())
     }
 
     fn log_lines(&self, count: usize) -> Vec<String> {
@@ -137,22 +139,22 @@ impl ConsoleServer {
     }
 
     /// Exports of the running configuration for other tools.
-    fn export(&self, operation: Operation, head: &Head<'_>) -> Result<HttpReply, HttpReply> {
+    fn export(&self, operation: ApiOperation, head: &HttpHead<'_>) -> Result<HttpReply, HttpReply> {
         let ConsoleSource::Gateway { shared, .. } = &self.source else { return Err(nothing_runs()) };
         let (toml, overrides) = {
             let view = shared.view();
             (view.running_text().ok_or_else(nothing_runs)?, view.overrides.clone())
         };
         let wrong =
-            |error: &dyn std::fmt::Display| HttpReply::error(Status::UNPROCESSABLE, &error.to_string());
+            |error: &dyn std::fmt::Display| HttpReply::error(StatusCode::UNPROCESSABLE, &error.to_string());
         let model = Model::parse(Text { name: check::NAME, toml: &toml }, &overrides);
         let model = model.map_err(|error| wrong(&error))?;
         let text = match operation {
-            Operation::ExportDbc => {
+            ApiOperation::ExportDbc => {
                 let port = port_of(head)?;
                 dbc::dbc(&model, port.as_deref()).map_err(|error| match &error {
                     DbcError::NoPort { .. } | DbcError::NoCan => {
-                        HttpReply::error(Status::NOT_FOUND, &error.to_string())
+                        HttpReply::error(StatusCode::NOT_FOUND, &error.to_string())
                     }
                     DbcError::SharedId { id, ports: [one, other] } => wrong(&format_args!(
                         "ports {one} and {other} have different frames with id {id:#X}; choose one with ?port=NAME"
@@ -160,14 +162,14 @@ impl ConsoleServer {
                     _ => wrong(&error),
                 })?.text
             }
-            Operation::ExportLua => lua::lua(&model).map_err(|error| wrong(&error))?,
+            ApiOperation::ExportLua => lua::lua(&model).map_err(|error| wrong(&error))?,
             _ => map::map(&model, map::Style::Markdown),
         };
-        Ok(HttpReply::text(Kind::Text, text.into()))
+        Ok(HttpReply::text(ContentType::Text, text.into()))
     }
 
     /// The field port that an argument names, if there is one.
-    pub(super) fn field_port(&self, head: &Head<'_>) -> Result<Option<String>, HttpReply> {
+    pub(super) fn field_port(&self, head: &HttpHead<'_>) -> Result<Option<String>, HttpReply> {
         let Some(port) = port_of(head)? else { return Ok(None) };
         let ConsoleSource::Gateway { shared, .. } = &self.source else { return Err(nothing_runs()) };
         let config: Arc<GatewayConfig> = shared.view().config.clone().ok_or_else(nothing_runs)?;
@@ -176,21 +178,21 @@ impl ConsoleServer {
             true => Ok(Some(port.into_owned())),
             false => {
                 let text = format!("there is no field port {port:?}; there are {}", names.join(", "));
-                Err(HttpReply::error(Status::NOT_FOUND, &text))
+                Err(HttpReply::error(StatusCode::NOT_FOUND, &text))
             }
         }
     }
 }
 
-fn text(kind: Kind, text: Option<Rc<str>>) -> HttpReply {
+fn text(kind: ContentType, text: Option<Rc<str>>) -> HttpReply {
     text.map_or_else(nothing_runs, |text| HttpReply::text(kind, text))
 }
 
 /// The argument `port`. Names may have any character, so it is the one that is decoded.
-fn port_of<'a>(head: &Head<'a>) -> Result<Option<Cow<'a, str>>, HttpReply> {
+fn port_of<'a>(head: &HttpHead<'a>) -> Result<Option<Cow<'a, str>>, HttpReply> {
     let Some(port) = head.query("port") else { return Ok(None) };
     let decoded =
-        decoded(port).ok_or_else(|| HttpReply::error(Status::BAD_REQUEST, "port is not well encoded"));
+        decoded(port).ok_or_else(|| HttpReply::error(StatusCode::BAD_REQUEST, "port is not well encoded"));
     decoded.map(Some)
 }
 

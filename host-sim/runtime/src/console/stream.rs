@@ -7,9 +7,9 @@ use std::io;
 use std::rc::Rc;
 use std::time::Duration;
 
-use recipe_api::request::Head;
-use recipe_api::response::{Kind, Length, Status};
-use recipe_api::route::Operation;
+use recipe_api::request::HttpHead;
+use recipe_api::response::{ContentType, Length, StatusCode};
+use recipe_api::route::ApiOperation;
 use recipe_capture::Watch;
 use rustix::net::sockopt;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -31,11 +31,11 @@ enum Endless {
 pub(super) async fn serve(
     server: &Rc<ConsoleServer>,
     mut stream: TcpStream,
-    operation: Operation,
-    head: &Head<'_>,
+    operation: ApiOperation,
+    head: &HttpHead<'_>,
 ) -> io::Result<()> {
     let endless = if server.streams.get() >= MAX_STREAMS {
-        Err(HttpReply::error(Status::UNAVAILABLE, "too many streams; poll /api/v1/status instead"))
+        Err(HttpReply::error(StatusCode::UNAVAILABLE, "too many streams; poll /api/v1/status instead"))
     } else {
         endless(server, operation, head)
     };
@@ -51,14 +51,18 @@ pub(super) async fn serve(
 }
 
 /// The stream for a request.
-fn endless(server: &ConsoleServer, operation: Operation, head: &Head<'_>) -> Result<Endless, HttpReply> {
+fn endless(
+    server: &ConsoleServer,
+    operation: ApiOperation,
+    head: &HttpHead<'_>,
+) -> Result<Endless, HttpReply> {
     let watch = || match &server.source {
         ConsoleSource::Gateway { watch, .. } => Ok::<&Watch, HttpReply>(watch),
         ConsoleSource::Controller { .. } => {
-            Err(HttpReply::error(Status::BAD_REQUEST, "only a gateway has frames"))
+            Err(HttpReply::error(StatusCode::BAD_REQUEST, "only a gateway has frames"))
         }
     };
-    if operation == Operation::Capture {
+    if operation == ApiOperation::Capture {
         let port = server.field_port(head)?;
         return Ok(Endless::Capture(Box::new(CaptureStream::of(watch()?, port))));
     }
@@ -69,20 +73,20 @@ fn endless(server: &ConsoleServer, operation: Operation, head: &Head<'_>) -> Res
         }
         (None | Some("0"), None) => Ok(Endless::Events(None)),
         (None | Some("0"), Some(_)) => {
-            Err(HttpReply::error(Status::BAD_REQUEST, "port is for frames; add frames=1"))
+            Err(HttpReply::error(StatusCode::BAD_REQUEST, "port is for frames; add frames=1"))
         }
-        (Some(_), _) => Err(HttpReply::error(Status::BAD_REQUEST, "frames must be 0 or 1")),
+        (Some(_), _) => Err(HttpReply::error(StatusCode::BAD_REQUEST, "frames must be 0 or 1")),
     }
 }
 
 async fn follow(server: &Rc<ConsoleServer>, stream: TcpStream, endless: Endless) -> io::Result<()> {
     let kind = match &endless {
-        Endless::Events(_) => Kind::Events,
-        Endless::Capture(_) => Kind::Capture,
+        Endless::Events(_) => ContentType::Events,
+        Endless::Capture(_) => ContentType::Capture,
     };
     // Waiting events become old: about a second of them is enough.
     let _ = sockopt::set_socket_send_buffer_size(&stream, SEND_BUFFER);
-    let reply = HttpReply { status: Status::OK, kind, body: "".into(), fields: Vec::new() };
+    let reply = HttpReply { status: StatusCode::OK, kind, body: "".into(), fields: Vec::new() };
     let (mut read, mut write) = stream.into_split();
     let send = async {
         put(server, &mut write, head_of(&reply, Length::Endless).as_bytes()).await?;

@@ -14,7 +14,7 @@ use std::time::Duration as StdDuration;
 
 use proto_core::config::GatewayConfig;
 use proto_core::time::{Duration, Instant};
-use recipe_api::revisions::{Ended, Output, Refused, Result as Done, Revision, Revisions};
+use recipe_api::revisions::{Ended, Refused, Result as Done, Revision, RevisionOutput, Revisions};
 use recipe_io::bind::Bind;
 use recipe_io::handover::Handover;
 use recipe_io::realtime::Scheduling;
@@ -360,11 +360,11 @@ impl Supervisor {
                 );
             }
             let result = match output {
-                Output::Sleep { .. } => break,
-                Output::Store { revision, forget } => {
+                RevisionOutput::Sleep { .. } => break,
+                RevisionOutput::Store { revision, forget } => {
                     Done::Stored(self.keep(revision.number, forget, &mut failed))
                 }
-                Output::Run { number } => {
+                RevisionOutput::Run { number } => {
                     let started = self.replace_by(number);
                     if let Err(error) = &started {
                         error!(revision = number, %error, "the revision does not start");
@@ -375,7 +375,7 @@ impl Supervisor {
                     }
                     Done::Started(started.is_ok())
                 }
-                Output::Mark { live, previous } => {
+                RevisionOutput::Mark { live, previous } => {
                     let marked = self.store.mark(live, previous);
                     if let Err(error) = &marked {
                         error!(revision = live, %error, "cannot mark the revision as live");

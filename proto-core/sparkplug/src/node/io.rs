@@ -34,7 +34,7 @@ pub enum Input<'a> {
 
 /// What is to be done.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Output<'b> {
+pub enum NodeOutput<'b> {
     /// Open a connection to the server, and report [`Input::Opened`] or [`Input::Closed`].
     Open,
     /// Keep this number where it survives a restart, before the next output is asked for.
@@ -93,7 +93,7 @@ pub enum NodeError {
 /// Why a session ended or did not begin.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
-pub enum Failure {
+pub enum SessionFailure {
     /// There was no connection, or it broke.
     Closed,
     /// The server did not answer in time.
@@ -113,7 +113,7 @@ pub enum Failure {
     Broken,
 }
 
-impl core::fmt::Display for Failure {
+impl core::fmt::Display for SessionFailure {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         f.write_str(match self {
             Self::Closed => "no connection",
@@ -129,12 +129,12 @@ impl core::fmt::Display for Failure {
     }
 }
 
-impl core::error::Error for Failure {}
+impl core::error::Error for SessionFailure {}
 
 /// Counts since the node was made.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[non_exhaustive]
-pub struct Counters {
+pub struct NodeCounters {
     /// Connections that the server accepted.
     pub sessions: u32,
     /// Births of the node.
@@ -159,7 +159,7 @@ pub struct Counters {
     pub left_out: u32,
 }
 
-impl Counters {
+impl NodeCounters {
     /// Before anything has happened.
     pub const NONE: Self = Self {
         sessions: 0,

@@ -1,10 +1,10 @@
 //! The messages of a node, as packets of MQTT.
 
 use super::{Birth, Dates, EdgeNode, Owner, Stage, has};
-use crate::bytes::Out;
+use crate::bytes::ByteWriter;
 use crate::catalog::Catalog;
 use crate::mqtt;
-use crate::payload::{self, Details, Shown};
+use crate::payload::{self, Details, PayloadMetric};
 use crate::topic::{self, Verb};
 use crate::value::Value;
 use proto_core::time::Instant;
@@ -13,7 +13,7 @@ use proto_core::time::Instant;
 pub const MAX_METRIC: usize = 512;
 
 /// What became of a piece of a birth.
-pub(super) enum Piece<'b> {
+pub(super) enum BirthPiece<'b> {
     /// There is none yet.
     Later,
     /// These bytes, and there is more.
@@ -27,7 +27,7 @@ pub(super) enum Piece<'b> {
 impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
     pub(super) fn write_connect<'b>(&self, now: Instant, buf: &'b mut [u8]) -> Option<&'b [u8]> {
         let settings = &self.settings;
-        let mut out = Out::new(buf);
+        let mut out = ByteWriter::new(buf);
         mqtt::packet(&mut out, mqtt::CONNECT, |out| {
             mqtt::text(out, b"MQTT");
             // Level 4; a clean session, and a will at QoS 1 that is not retained.
@@ -46,7 +46,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
     }
 
     pub(super) fn write_subscribe<'b>(&self, buf: &'b mut [u8]) -> Option<&'b [u8]> {
-        let mut out = Out::new(buf);
+        let mut out = ByteWriter::new(buf);
         mqtt::packet(&mut out, mqtt::SUBSCRIBE, |out| {
             out.put(&1_u16.to_be_bytes());
             mqtt::text_of(out, |out| self.write_topic(out, Verb::Command, None));
@@ -61,7 +61,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
 
     /// The death that the node publishes itself, before it disconnects.
     pub(super) fn write_death<'b>(&self, now: Instant, buf: &'b mut [u8]) -> Option<&'b [u8]> {
-        let mut out = Out::new(buf);
+        let mut out = ByteWriter::new(buf);
         mqtt::packet(&mut out, mqtt::PUBLISH, |out| {
             mqtt::text_of(out, |out| self.write_topic(out, Verb::Death, None));
             payload::death(out, self.clock.at(now), self.session());
@@ -78,7 +78,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         buf: &'b mut [u8],
     ) -> Option<&'b [u8]> {
         let seq = self.next_seq();
-        let mut out = Out::new(buf);
+        let mut out = ByteWriter::new(buf);
         mqtt::packet(&mut out, mqtt::PUBLISH, |out| {
             let device = Some(catalog.device(nth.into()));
             mqtt::text_of(out, |out| self.write_topic(out, Verb::Death, device));
@@ -95,37 +95,37 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         catalog: &impl Catalog,
         birth: &mut Birth,
         buf: &'b mut [u8],
-    ) -> Piece<'b> {
+    ) -> BirthPiece<'b> {
         let room = buf.len();
         let places = self.places(birth.owner);
         if birth.stage == Stage::Begin {
             self.begin_birth(now, birth.owner);
             birth.stage = Stage::Measure { next: places.start, len: 0 };
         }
-        let mut out = Out::new(buf);
+        let mut out = ByteWriter::new(buf);
         let is_first = matches!(birth.stage, Stage::Measure { .. });
         let (mut next, left) = match birth.stage {
-            Stage::Begin => return Piece::Broken,
+            Stage::Begin => return BirthPiece::Broken,
             Stage::Measure { next, len } => {
                 let end = next.saturating_add(MEASURED_AT_ONCE).min(places.end);
                 let measured = (next..end).map(|place| self.birth_metric_len(catalog, place));
                 let len = measured.fold(len, usize::saturating_add);
                 if end < places.end {
                     birth.stage = Stage::Measure { next: end, len };
-                    return Piece::Later;
+                    return BirthPiece::Later;
                 }
                 let device = device_name(catalog, birth.owner);
-                let head = |out: &mut Out<'_>| {
+                let head = |out: &mut ByteWriter<'_>| {
                     mqtt::text_of(out, |out| self.write_topic(out, Verb::Birth, device));
                     payload::begin(out, self.dates.now_ms);
                     if birth.owner == Owner::Node {
                         self.write_own_metrics(out);
                     }
                 };
-                let end = Out::count(|out| payload::end(out, self.seq));
-                let len = Out::count(head).saturating_add(len).saturating_add(end);
+                let end = ByteWriter::count(|out| payload::end(out, self.seq));
+                let len = ByteWriter::count(head).saturating_add(len).saturating_add(end);
                 if len > mqtt::MAX_BODY {
-                    return Piece::Broken;
+                    return BirthPiece::Broken;
                 }
                 mqtt::header(&mut out, mqtt::PUBLISH, len);
                 let before = out.len();
@@ -149,12 +149,14 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         if is_last {
             payload::end(&mut out, self.seq);
         }
-        let Some(left) = left.checked_sub(out.len().saturating_sub(before)) else { return Piece::Broken };
+        let Some(left) = left.checked_sub(out.len().saturating_sub(before)) else {
+            return BirthPiece::Broken;
+        };
         birth.stage = Stage::Metrics { next, left };
         match out.finish() {
-            Some(bytes) if is_last && left == 0 => Piece::Last(bytes),
-            Some(bytes) if !is_last && (is_first || !bytes.is_empty()) => Piece::Part(bytes),
-            _ => Piece::Broken,
+            Some(bytes) if is_last && left == 0 => BirthPiece::Last(bytes),
+            Some(bytes) if !is_last && (is_first || !bytes.is_empty()) => BirthPiece::Part(bytes),
+            _ => BirthPiece::Broken,
         }
     }
 
@@ -226,10 +228,10 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         catalog: &impl Catalog,
         owner: Owner,
         room: usize,
-        metrics: impl Iterator<Item = Shown<'m>>,
+        metrics: impl Iterator<Item = PayloadMetric<'m>>,
     ) -> usize {
         let device = device_name(catalog, owner);
-        let around = Out::count(|out| {
+        let around = ByteWriter::count(|out| {
             mqtt::header(out, mqtt::PUBLISH, room);
             mqtt::text_of(out, |out| self.write_topic(out, Verb::Data, device));
             payload::begin(out, self.clock.at(now));
@@ -237,7 +239,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         let mut left = room.saturating_sub(around).saturating_sub(MAX_END);
         let mut count = 0_usize;
         for shown in metrics {
-            match left.checked_sub(Out::count(|out| payload::metric(out, &shown))) {
+            match left.checked_sub(ByteWriter::count(|out| payload::metric(out, &shown))) {
                 Some(less) => (left, count) = (less, count.saturating_add(1)),
                 None => break,
             }
@@ -245,7 +247,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         count
     }
 
-    fn write_metrics<'b, 'm, I: Iterator<Item = Shown<'m>>>(
+    fn write_metrics<'b, 'm, I: Iterator<Item = PayloadMetric<'m>>>(
         &self,
         now: Instant,
         catalog: &impl Catalog,
@@ -254,7 +256,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         buf: &'b mut [u8],
     ) -> Option<&'b [u8]> {
         let device = device_name(catalog, owner);
-        let mut out = Out::new(buf);
+        let mut out = ByteWriter::new(buf);
         mqtt::packet(&mut out, mqtt::PUBLISH, |out| {
             mqtt::text_of(out, |out| self.write_topic(out, Verb::Data, device));
             payload::begin(out, self.clock.at(now));
@@ -291,7 +293,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
     }
 
     /// What a birth of the node has beside the catalog. Nobody may write by an alias, so there is none.
-    fn write_own_metrics(&self, out: &mut Out<'_>) {
+    fn write_own_metrics(&self, out: &mut ByteWriter<'_>) {
         let at = self.dates.sampled_ms;
         payload::metric(out, &payload::bd_seq_metric(at, self.session()));
         payload::metric(out, &payload::plain(payload::REBIRTH, at, Value::Boolean(false)));
@@ -300,15 +302,15 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
 
     /// 0 if the metric is left out.
     fn birth_metric_len(&self, catalog: &impl Catalog, place: usize) -> usize {
-        match Out::count(|out| self.write_birth_metric(out, catalog, place)) {
+        match ByteWriter::count(|out| self.write_birth_metric(out, catalog, place)) {
             len @ 0..=MAX_METRIC => len,
             _ => 0,
         }
     }
 
-    fn write_birth_metric(&self, out: &mut Out<'_>, catalog: &impl Catalog, place: usize) {
+    fn write_birth_metric(&self, out: &mut ByteWriter<'_>, catalog: &impl Catalog, place: usize) {
         let (Some(metric), Some(slot)) = (catalog.metric(place), self.slots.get(place)) else { return };
-        let shown = Shown {
+        let shown = PayloadMetric {
             name: Some(&metric.name),
             data_type: Some(slot.data_type),
             details: Details { unit: metric.unit, range: metric.range, description: metric.description },
@@ -317,7 +319,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         payload::metric(out, &shown);
     }
 
-    fn write_topic(&self, out: &mut Out<'_>, verb: Verb, device: Option<&str>) {
+    fn write_topic(&self, out: &mut ByteWriter<'_>, verb: Verb, device: Option<&str>) {
         topic::write(out, &self.settings.group, verb, &self.settings.node, device);
     }
 
@@ -342,10 +344,15 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
 }
 
 /// A metric as data has it. Aliases begin at 1: for some readers 0 is none.
-fn data_metric<'m>(place: usize, timestamp: u64, value: Option<Value>, is_historical: bool) -> Shown<'m> {
+fn data_metric<'m>(
+    place: usize,
+    timestamp: u64,
+    value: Option<Value>,
+    is_historical: bool,
+) -> PayloadMetric<'m> {
     let alias = Some((place as u64).saturating_add(1));
     let details = Details::default();
-    Shown { name: None, alias, timestamp, data_type: None, is_historical, value, details }
+    PayloadMetric { name: None, alias, timestamp, data_type: None, is_historical, value, details }
 }
 
 fn device_name(catalog: &impl Catalog, owner: Owner) -> Option<&str> {

@@ -2,76 +2,86 @@
 
 use proto_core::time::{Duration, Instant};
 
-use super::messages::Piece;
-use super::{Birth, EdgeNode, Failure, Maybe, Output, Owner, Phase, Stage, has, owners};
-use crate::bytes::Out;
+use super::messages::BirthPiece;
+use super::{Birth, EdgeNode, Maybe, NodeOutput, NodePhase, Owner, SessionFailure, Stage, has, owners};
+use crate::bytes::ByteWriter;
 use crate::catalog::Catalog;
 use crate::mqtt;
 
 impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
-    /// What is to be done next; asked for until it is [`Output::Sleep`]. `buf` has at least
+    /// What is to be done next; asked for until it is [`NodeOutput::Sleep`]. `buf` has at least
     /// [`MIN_BUFFER`](super::MIN_BUFFER) bytes.
-    pub fn poll_output<'b>(&mut self, now: Instant, catalog: &impl Catalog, buf: &'b mut [u8]) -> Output<'b> {
+    pub fn poll_output<'b>(
+        &mut self,
+        now: Instant,
+        catalog: &impl Catalog,
+        buf: &'b mut [u8],
+    ) -> NodeOutput<'b> {
         if self.must_close {
             return self.close(now);
         }
         match self.phase {
-            Phase::Ended => Output::Sleep { until: Instant::NEVER },
-            Phase::Idle { .. } if self.is_ending => {
-                self.phase = Phase::Ended;
-                Output::Sleep { until: Instant::NEVER }
+            NodePhase::Ended => NodeOutput::Sleep { until: Instant::NEVER },
+            NodePhase::Idle { .. } if self.is_ending => {
+                self.phase = NodePhase::Ended;
+                NodeOutput::Sleep { until: Instant::NEVER }
             }
-            Phase::Idle { until } if now < until => Output::Sleep { until },
-            Phase::Idle { .. } => {
-                self.phase = Phase::Opening { until: now + OPEN_TIME };
-                Output::Open
+            NodePhase::Idle { until } if now < until => NodeOutput::Sleep { until },
+            NodePhase::Idle { .. } => {
+                self.phase = NodePhase::Opening { until: now + OPEN_TIME };
+                NodeOutput::Open
             }
-            Phase::Opening { until } | Phase::Connecting { until } => {
+            NodePhase::Opening { until } | NodePhase::Connecting { until } => {
                 if self.is_ending {
                     return self.close(now);
                 }
                 self.wait_for_answer(now, until)
             }
-            Phase::Keep => {
-                self.phase = Phase::Connect;
-                Output::Keep { bd_seq: self.bd_seq.unwrap_or(0) }
+            NodePhase::Keep => {
+                self.phase = NodePhase::Connect;
+                NodeOutput::Keep { bd_seq: self.bd_seq.unwrap_or(0) }
             }
-            Phase::Connect => {
-                self.phase = Phase::Connecting { until: now + ANSWER_TIME };
+            NodePhase::Connect => {
+                self.phase = NodePhase::Connecting { until: now + ANSWER_TIME };
                 let packet = self.write_connect(now, buf);
                 self.send(now, packet)
             }
-            Phase::Birth(birth) => self.poll_birth(now, catalog, birth, buf),
-            Phase::Death => {
-                self.phase = Phase::Disconnect;
+            NodePhase::Birth(birth) => self.poll_birth(now, catalog, birth, buf),
+            NodePhase::Death => {
+                self.phase = NodePhase::Disconnect;
                 let packet = self.write_death(now, buf);
                 self.send(now, packet)
             }
-            Phase::Disconnect => {
+            NodePhase::Disconnect => {
                 self.must_close = true;
                 let packet = short(buf, mqtt::DISCONNECT, None);
                 self.send(now, packet)
             }
-            Phase::Subscribe | Phase::Subscribing { .. } | Phase::Waiting | Phase::Online => {
+            NodePhase::Subscribe | NodePhase::Subscribing { .. } | NodePhase::Waiting | NodePhase::Online => {
                 self.poll_session(now, catalog, buf)
             }
         }
     }
 
     /// What may come between two packets of a session.
-    fn poll_session<'b>(&mut self, now: Instant, catalog: &impl Catalog, buf: &'b mut [u8]) -> Output<'b> {
+    fn poll_session<'b>(
+        &mut self,
+        now: Instant,
+        catalog: &impl Catalog,
+        buf: &'b mut [u8],
+    ) -> NodeOutput<'b> {
         if self.is_ending {
-            self.phase = Phase::Death;
+            self.phase = NodePhase::Death;
             return self.poll_output(now, catalog, buf);
         }
-        if self.phase == Phase::Online && self.is_host_gone() {
-            self.note(Failure::HostOffline);
+        if self.phase == NodePhase::Online && self.is_host_gone() {
+            self.note(SessionFailure::HostOffline);
             let packet = self.write_death(now, buf);
-            self.phase = Phase::Disconnect;
+            self.phase = NodePhase::Disconnect;
             return self.send(now, packet);
         }
         if self.pong_until.is_some_and(|until| now >= until) {
-            self.note(Failure::Silent);
+            self.note(SessionFailure::Silent);
             return self.close(now);
         }
         if let Some(id) = self.acks.pop_front() {
@@ -86,14 +96,14 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         }
         let next = self.pong_until.unwrap_or(self.ping_at);
         match self.phase {
-            Phase::Subscribe => {
-                self.phase = Phase::Subscribing { until: now + ANSWER_TIME };
+            NodePhase::Subscribe => {
+                self.phase = NodePhase::Subscribing { until: now + ANSWER_TIME };
                 let packet = self.write_subscribe(buf);
                 self.send(now, packet)
             }
-            Phase::Subscribing { until } => self.wait_for_answer(now, until.min(next)),
-            Phase::Online => self.poll_online(now, catalog, buf, next),
-            _ => Output::Sleep { until: next },
+            NodePhase::Subscribing { until } => self.wait_for_answer(now, until.min(next)),
+            NodePhase::Online => self.poll_online(now, catalog, buf, next),
+            _ => NodeOutput::Sleep { until: next },
         }
     }
 
@@ -103,12 +113,12 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         catalog: &impl Catalog,
         buf: &'b mut [u8],
         next: Instant,
-    ) -> Output<'b> {
+    ) -> NodeOutput<'b> {
         if self.is_rebirth_wanted {
             let may_at = self.birth_at.map_or(Instant::ZERO, |at| at + BIRTH_PAUSE);
             // Nothing is told in the meantime.
             if now < may_at {
-                return Output::Sleep { until: may_at.min(next) };
+                return NodeOutput::Sleep { until: may_at.min(next) };
             }
             self.counters.rebirths = self.counters.rebirths.saturating_add(1);
             self.is_rebirth_wanted = false;
@@ -145,7 +155,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
                 let packet = self.write_data(now, catalog, owner, buf);
                 self.send(now, packet)
             }
-            None => Output::Sleep { until: next },
+            None => NodeOutput::Sleep { until: next },
         }
     }
 
@@ -156,7 +166,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         catalog: &impl Catalog,
         mut birth: Birth,
         buf: &'b mut [u8],
-    ) -> Output<'b> {
+    ) -> NodeOutput<'b> {
         let is_first = birth.stage == Stage::Begin;
         if is_first {
             match birth.owner {
@@ -173,31 +183,31 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
             }
         }
         match self.write_birth(now, catalog, &mut birth, buf) {
-            Piece::Later => {
-                self.phase = Phase::Birth(birth);
-                Output::Busy
+            BirthPiece::Later => {
+                self.phase = NodePhase::Birth(birth);
+                NodeOutput::Busy
             }
-            Piece::Part(bytes) => {
-                self.phase = Phase::Birth(birth);
-                Output::Send(bytes)
+            BirthPiece::Part(bytes) => {
+                self.phase = NodePhase::Birth(birth);
+                NodeOutput::Send(bytes)
             }
-            Piece::Last(bytes) => {
+            BirthPiece::Last(bytes) => {
                 // In the sequence of births all that are alive follow at once.
                 let next = (0_u8..).take(catalog.devices());
                 let next = next.filter(|nth| has(self.alive, *nth) && !has(self.born, *nth));
-                let is_sequence = self.phase != Phase::Online || birth.owner == Owner::Node;
+                let is_sequence = self.phase != NodePhase::Online || birth.owner == Owner::Node;
                 self.phase = match next.min().filter(|_| is_sequence && !self.is_interrupted()) {
-                    Some(nth) => Phase::Birth(Birth { owner: Owner::Device(nth), stage: Stage::Begin }),
-                    None => Phase::Online,
+                    Some(nth) => NodePhase::Birth(Birth { owner: Owner::Device(nth), stage: Stage::Begin }),
+                    None => NodePhase::Online,
                 };
-                if self.phase == Phase::Online {
+                if self.phase == NodePhase::Online {
                     self.online_since.get_or_insert(now);
                     self.failure = Maybe::Nothing;
                 }
-                Output::Send(bytes)
+                NodeOutput::Send(bytes)
             }
-            Piece::Broken => {
-                self.note(Failure::Broken);
+            BirthPiece::Broken => {
+                self.note(SessionFailure::Broken);
                 self.close(now)
             }
         }
@@ -226,25 +236,25 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         })
     }
 
-    fn wait_for_answer(&mut self, now: Instant, until: Instant) -> Output<'static> {
+    fn wait_for_answer(&mut self, now: Instant, until: Instant) -> NodeOutput<'static> {
         if now < until {
-            return Output::Sleep { until };
+            return NodeOutput::Sleep { until };
         }
-        self.note(Failure::Silent);
+        self.note(SessionFailure::Silent);
         self.close(now)
     }
 
-    fn close(&mut self, now: Instant) -> Output<'static> {
+    fn close(&mut self, now: Instant) -> NodeOutput<'static> {
         self.leave_session(now);
-        Output::Close
+        NodeOutput::Close
     }
 
     /// A packet that has no room is a mistake of the driver's.
-    fn send<'b>(&mut self, now: Instant, packet: Option<&'b [u8]>) -> Output<'b> {
+    fn send<'b>(&mut self, now: Instant, packet: Option<&'b [u8]>) -> NodeOutput<'b> {
         match packet {
-            Some(bytes) => Output::Send(bytes),
+            Some(bytes) => NodeOutput::Send(bytes),
             None => {
-                self.note(Failure::Broken);
+                self.note(SessionFailure::Broken);
                 self.close(now)
             }
         }
@@ -253,7 +263,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
 
 /// A packet without content, or with a number.
 fn short(buf: &mut [u8], kind: u8, id: Option<u16>) -> Option<&[u8]> {
-    let mut out = Out::new(buf);
+    let mut out = ByteWriter::new(buf);
     mqtt::packet(&mut out, kind, |out| {
         if let Some(id) = id {
             out.put(&id.to_be_bytes());

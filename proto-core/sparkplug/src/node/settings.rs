@@ -12,9 +12,9 @@ pub const MAX_TEXT: usize = 129;
 
 /// A name or a password. It is never printed.
 #[derive(Clone, PartialEq, Eq, Default)]
-pub struct Text(String<MAX_TEXT>);
+pub struct Credential(String<MAX_TEXT>);
 
-impl Text {
+impl Credential {
     /// A text; `None` if it is longer than [`MAX_TEXT`].
     pub fn new(text: &str) -> Option<Self> {
         String::try_from(text).ok().map(Self)
@@ -26,7 +26,7 @@ impl Text {
     }
 }
 
-impl fmt::Debug for Text {
+impl fmt::Debug for Credential {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str("Text(..)")
     }
@@ -43,9 +43,9 @@ pub struct Settings {
     /// The host application without which nothing is told; `None` if it is told in any case.
     pub primary_host: Option<Id>,
     /// Its name for the server, which no other client may have.
-    pub client_id: Text,
+    pub client_id: Credential,
     /// The user and the password.
-    pub login: Option<(Text, Text)>,
+    pub login: Option<(Credential, Credential)>,
     /// After one and a half times this without a packet the server says that the node is dead; whole seconds,
     /// 5 s to 18 h.
     pub keep_alive: Duration,
@@ -58,7 +58,7 @@ impl Settings {
             group: Id::empty(),
             node: Id::empty(),
             primary_host: None,
-            client_id: Text(String::new()),
+            client_id: Credential(String::new()),
             login: None,
             keep_alive: Duration::ZERO,
         }
@@ -72,7 +72,7 @@ impl Settings {
         let _ = client_id.push('/');
         let _ = client_id.push_str(node.as_str());
         let keep_alive = Duration::from_secs(30);
-        Self { group, node, primary_host: None, client_id: Text(client_id), login: None, keep_alive }
+        Self { group, node, primary_host: None, client_id: Credential(client_id), login: None, keep_alive }
     }
 
     /// The keep-alive as CONNECT has it: seconds.

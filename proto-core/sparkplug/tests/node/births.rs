@@ -81,7 +81,7 @@ fn long_births_come_in_pieces_of_the_buffer() {
 #[test]
 fn a_sample_in_the_middle_of_a_birth_changes_nothing_of_it() {
     use proto_core::time::Instant;
-    use recipe_sparkplug::node::{Input, Output};
+    use recipe_sparkplug::node::{Input, NodeOutput};
     let mut rig = Rig::new(settings(), Plant { more: 200, ..Plant::default() });
     rig.connect();
     rig.drain();
@@ -90,8 +90,8 @@ fn a_sample_in_the_middle_of_a_birth_changes_nothing_of_it() {
     let mut piece = [0; MIN_BUFFER];
     loop {
         match rig.node.poll_output(Instant::from_millis(1_000), &rig.plant, &mut piece) {
-            Output::Send(sent) => bytes.extend_from_slice(sent),
-            Output::Busy => {}
+            NodeOutput::Send(sent) => bytes.extend_from_slice(sent),
+            NodeOutput::Busy => {}
             _ => break,
         }
         // Unknown values are shorter, and so are dates before UTC was known.

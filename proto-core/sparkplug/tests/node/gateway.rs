@@ -7,8 +7,8 @@ use proto_core::engine::{
 use proto_core::sysvar::VarRange;
 use proto_core::time::{Duration, Instant};
 use recipe_sparkplug::catalog::{Catalog, Owner, Report};
-use recipe_sparkplug::gateway::{GatewayCatalog, NoRoom, Rates, Rule};
-use recipe_sparkplug::node::{Counters, EdgeNode};
+use recipe_sparkplug::gateway::{GatewayCatalog, NoRoom, PublishRule, Rates};
+use recipe_sparkplug::node::{EdgeNode, NodeCounters};
 use recipe_sparkplug::value::{DataType, Value};
 
 use crate::kit::settings;
@@ -102,7 +102,7 @@ fn samples_have_the_type_of_their_metric_and_nothing_invented() {
     let sample = |now| {
         let mut values = vec![Some(Value::Boolean(true)); catalog.len()];
         let alive =
-            catalog.sample(engine.status(now), Duration::from_secs(9), &Counters::default(), &mut values);
+            catalog.sample(engine.status(now), Duration::from_secs(9), &NodeCounters::default(), &mut values);
         let known: std::collections::BTreeMap<_, _> = names(&catalog)
             .into_iter()
             .zip(values)
@@ -134,7 +134,7 @@ fn parts_of_a_sample_are_the_whole() {
     let engine = engine(&config);
     let now = Instant::from_micros(2_000);
     let catalog = Small::new(config.view(), engine.status(now), RATES, "0.0.0").unwrap();
-    let (uptime, counters) = (Duration::from_secs(9), Counters::default());
+    let (uptime, counters) = (Duration::from_secs(9), NodeCounters::default());
     let mut whole = vec![None; catalog.len()];
     let alive = catalog.sample(engine.status(now), uptime, &counters, &mut whole);
     assert_eq!(catalog.alive(engine.status(now)), alive);
@@ -156,8 +156,8 @@ fn rules_count_for_their_variables_and_the_last_one_wins() {
     let vars = VarRange::parse("FloatInputReg[31..32]").unwrap();
     let second = VarRange::parse("FloatInputReg[32]").unwrap();
     let rules = [
-        Rule { vars, dead_band: 0.5, min_interval: Some(Duration::from_secs(2)) },
-        Rule { vars: second, dead_band: 0.1, min_interval: None },
+        PublishRule { vars, dead_band: 0.5, min_interval: Some(Duration::from_secs(2)) },
+        PublishRule { vars: second, dead_band: 0.1, min_interval: None },
     ];
     let values = ["RobotState[1..2]", "RobotState[11]"].map(|range| VarRange::parse(range).unwrap());
     let rates = Rates { rules: &rules, values: &values, ..RATES };

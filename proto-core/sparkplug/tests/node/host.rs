@@ -1,6 +1,6 @@
 //! A primary host: without it nothing is told.
 
-use recipe_sparkplug::node::{Failure, Settings};
+use recipe_sparkplug::node::{SessionFailure, Settings};
 use recipe_sparkplug::topic::Id;
 use recipe_sparkplug::value::Value;
 
@@ -78,7 +78,7 @@ fn when_it_goes_the_node_dies_and_keeps_what_changes() {
     let did = rig.drain();
     let [Did::Publish(death), Did::Disconnect, Did::Close] = &did[..] else { panic!("{did:?}") };
     assert_eq!((&*death.topic, death.values()), ("spBv1.0/hall/NDEATH/press", vec!["bdSeq=0".to_owned()]));
-    assert_eq!(rig.node.failure(), Some(Failure::HostOffline));
+    assert_eq!(rig.node.failure(), Some(SessionFailure::HostOffline));
     rig.connect();
     assert!(rig.subscribed().is_empty());
     rig.wait_ms(10);

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use proto_core::time::{Duration, Instant};
 use recipe_sparkplug::catalog::{Catalog, Metric, Owner, Report};
-use recipe_sparkplug::node::{EdgeNode, Input, Output, Settings, Text};
+use recipe_sparkplug::node::{Credential, EdgeNode, Input, NodeOutput, Settings};
 use recipe_sparkplug::topic::Id;
 use recipe_sparkplug::value::{DataType, Value};
 
@@ -146,8 +146,8 @@ pub(crate) fn settings() -> Settings {
     settings
 }
 
-pub(crate) fn text(text: &str) -> Text {
-    Text::new(text).unwrap()
+pub(crate) fn text(text: &str) -> Credential {
+    Credential::new(text).unwrap()
 }
 
 impl Rig {
@@ -268,21 +268,21 @@ impl Rig {
         for _ in 0..10_000 {
             let mut buf = vec![0xA5; self.buffer];
             match self.node.poll_output(self.now, &self.plant, &mut buf) {
-                Output::Sleep { until } => {
+                NodeOutput::Sleep { until } => {
                     assert!(self.received.is_empty(), "a packet that is not whole");
                     assert!(until > self.now, "sleeps until {until:?} at {:?}", self.now);
                     self.until = until;
                     return done;
                 }
-                Output::Open => done.push(Did::Open),
-                Output::Keep { bd_seq } => done.push(Did::Keep(bd_seq)),
-                Output::Close => {
+                NodeOutput::Open => done.push(Did::Open),
+                NodeOutput::Keep { bd_seq } => done.push(Did::Keep(bd_seq)),
+                NodeOutput::Close => {
                     self.received.clear();
                     done.push(Did::Close);
                 }
                 // Others run meanwhile.
-                Output::Busy => self.now += Duration::from_millis(1),
-                Output::Send(bytes) => {
+                NodeOutput::Busy => self.now += Duration::from_millis(1),
+                NodeOutput::Send(bytes) => {
                     self.pieces += 1;
                     self.received.extend_from_slice(bytes);
                     while let Some((first, body, len)) = packet(&self.received) {

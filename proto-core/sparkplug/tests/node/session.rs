@@ -1,7 +1,7 @@
 //! Connections, wills, deaths.
 
 use proto_core::time::Instant;
-use recipe_sparkplug::node::{EdgeNode, Failure, Input, NodeError};
+use recipe_sparkplug::node::{EdgeNode, Input, NodeError, SessionFailure};
 use recipe_sparkplug::topic::IdError;
 
 use crate::kit::{Did, Plant, Rig, UTC, settings, text, topics};
@@ -121,7 +121,7 @@ fn a_server_that_falls_silent_is_left() {
     assert_eq!(rig.drain(), []);
     rig.wait_ms(1);
     assert_eq!(rig.drain(), [Did::Close]);
-    assert_eq!(rig.node.failure(), Some(Failure::Silent));
+    assert_eq!(rig.node.failure(), Some(SessionFailure::Silent));
     rig.connect();
     rig.subscribed();
     assert_eq!(rig.node.failure(), None);
@@ -155,16 +155,16 @@ fn what_the_server_refuses_is_told() {
     rig.drain();
     rig.receive(&[0x20, 2, 0, 5]);
     assert_eq!(rig.drain(), [Did::Close]);
-    assert_eq!(rig.node.failure(), Some(Failure::Refused { code: 5 }));
+    assert_eq!(rig.node.failure(), Some(SessionFailure::Refused { code: 5 }));
     rig.connect();
     rig.drain();
     rig.receive(&[0x90, 3, 0, 1, 0x80]);
     assert_eq!(rig.drain(), [Did::Close]);
-    assert_eq!(rig.node.failure(), Some(Failure::SubscriptionRefused));
+    assert_eq!(rig.node.failure(), Some(SessionFailure::SubscriptionRefused));
     rig.connect();
     rig.receive(b"HTTP/1.1 400 Bad Request\r\n\r\n");
     assert_eq!(rig.drain(), [Did::Close]);
-    assert!(matches!(rig.node.failure(), Some(Failure::Protocol(_))));
+    assert!(matches!(rig.node.failure(), Some(SessionFailure::Protocol(_))));
     rig.connect();
     rig.drain();
     rig.receive(&[0x20, 2, 0, 0]);

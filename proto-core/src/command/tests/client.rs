@@ -7,7 +7,7 @@ use proptest::prelude::*;
 
 use super::at;
 use crate::command::{
-    Action, ClientEvent, CommandClient, EncodeError, Keyword, MAX_REPLY, Outcome, ParseError, Reply,
+    Action, ActionOutcome, ClientEvent, CommandClient, EncodeError, Keyword, MAX_REPLY, ParseError, Reply,
     StartError, StateCodes,
 };
 use crate::time::Instant;
@@ -124,7 +124,7 @@ fn replies_are_typed() {
     assert!(matches!(event, Some(ClientEvent::Reply { reply: Reply::State(c), .. }) if c == codes));
     let mut client = asking("pause");
     let event = client.receive(at(0), &mut &b"pause fail"[..]);
-    let fail = Reply::Did { action: Action::Pause, outcome: Outcome::Fail };
+    let fail = Reply::Did { action: Action::Pause, outcome: ActionOutcome::Fail };
     assert!(matches!(event, Some(ClientEvent::Reply { reply, .. }) if reply == fail));
 }
 

@@ -5,8 +5,8 @@ use std::prelude::rust_2024::*;
 use proptest::prelude::*;
 
 use crate::command::{
-    Action, EncodeError, Keyword, MAX_COMMAND, NoSpace, Outcome, ParseError, Percent, Reply, ReplyKind,
-    Request, StateCodes,
+    Action, ActionOutcome, EncodeError, Keyword, MAX_COMMAND, NoTextSpace, ParseError, Percent, Reply,
+    ReplyKind, Request, StateCodes,
 };
 use crate::wire::dialect::Dialect;
 
@@ -51,7 +51,7 @@ fn what_cannot_be_written_is_refused() {
     }
     let long = "a".repeat(MAX_COMMAND);
     assert_eq!(encode(&long, &mut out), Err(EncodeError::TooLong { len: MAX_COMMAND + 5 }));
-    let short = NoSpace { needed: 6, available: 5 };
+    let short = NoTextSpace { needed: 6, available: 5 };
     assert_eq!(encode("a", &mut out[..5]), Err(EncodeError::NoSpace(short)));
     assert_eq!(Request::Speed(None).encode(&Dialect::V2_3, &mut out), Err(EncodeError::NoSpeed));
 }
@@ -62,17 +62,17 @@ fn nothing_is_written_behind_the_end() {
     let len = Reply::UnknownCommand.encode(&Dialect::V2_6, &mut out).unwrap();
     assert_eq!(&out[..len], b"unknown command\r\n");
     assert!(out[len..].iter().all(|&byte| byte == 0xA5));
-    let needed = NoSpace { needed: 17, available: 16 };
+    let needed = NoTextSpace { needed: 17, available: 16 };
     assert_eq!(Reply::UnknownCommand.encode(&Dialect::V2_6, &mut out[..16]), Err(needed));
 }
 
 #[test]
 fn replies_are_read_in_both_dialects_forms() {
     use Keyword::{Do, GetLastError, IsProgFinish, Run, Speed, State};
-    let success = Some(Reply::Run(Outcome::Success));
+    let success = Some(Reply::Run(ActionOutcome::Success));
     assert_eq!(Reply::parse(Run, b"run start"), success);
     assert_eq!(Reply::parse(Run, b"run success\r\n"), success);
-    assert_eq!(Reply::parse(Run, b"run fail\n"), Some(Reply::Run(Outcome::Fail)));
+    assert_eq!(Reply::parse(Run, b"run fail\n"), Some(Reply::Run(ActionOutcome::Fail)));
     assert_eq!(Reply::parse(Speed, b"set success"), Some(Reply::SpeedSet(None)));
     assert_eq!(Reply::parse(Speed, b"set speed 50%\r\n"), Some(Reply::SpeedSet(percent(50.0))));
     assert_eq!(Reply::parse(Speed, b"set speed 0%"), None);
@@ -103,10 +103,10 @@ fn replies_are_read_in_both_dialects_forms() {
     assert_eq!(Reply::parse(Do(Action::Enable), b"already disable"), None);
     assert_eq!(Reply::parse(Do(Action::Enable), b"already"), None);
     assert_eq!(Reply::parse(Run, b"already run"), None, "it may be another program");
-    let fail = Reply::Did { action: Action::Enable, outcome: Outcome::Fail };
+    let fail = Reply::Did { action: Action::Enable, outcome: ActionOutcome::Fail };
     assert_eq!(Reply::parse(Do(Action::Enable), b"Error: cannot enable"), Some(fail));
     assert_eq!(Reply::parse(Do(Action::Enable), b"Error: cannot disable"), None);
-    assert_eq!(Reply::parse(Run, b"script error"), Some(Reply::Run(Outcome::Fail)));
+    assert_eq!(Reply::parse(Run, b"script error"), Some(Reply::Run(ActionOutcome::Fail)));
 }
 
 #[test]
@@ -146,7 +146,7 @@ proptest! {
         id: u32, message in "[!-~\u{e9}]([ -~]{0,60}[!-~])?", codes: [u8; 4], speed in 0.01f32..100.0,
     ) {
         let mut replies: Vec<(Keyword, Reply<'_>)> = Vec::new();
-        for outcome in [Outcome::Success, Outcome::Fail] {
+        for outcome in [ActionOutcome::Success, ActionOutcome::Fail] {
             replies.push((Keyword::Run, Reply::Run(outcome)));
             for action in Action::ALL {
                 replies.push((Keyword::Do(action), Reply::Did { action, outcome }));

@@ -22,14 +22,14 @@ pub(super) fn read_entries(
     config: &mut ConfigMut<'_>,
 ) -> Result<(), ImageError> {
     match list {
-        Counted::Ports => items::<Port, _>(rest, count, config.ports),
+        Counted::Ports => items::<PortV3, _>(rest, count, config.ports),
         Counted::Exchanges => items::<Exchange, _>(rest, count, config.exchanges),
         _ => v4::read_entries(list, count, rest, config),
     }
 }
 
 #[derive(Deserialize)]
-struct Port {
+struct PortV3 {
     name: Name,
     bus: Bus,
     recipe: u8,
@@ -42,9 +42,9 @@ struct Port {
     refresh: Option<Duration>,
 }
 
-impl From<Port> for config::Port {
-    fn from(old: Port) -> Self {
-        let Port {
+impl From<PortV3> for config::Port {
+    fn from(old: PortV3) -> Self {
+        let PortV3 {
             name,
             bus,
             recipe,

@@ -4,7 +4,7 @@ use core::fmt;
 
 use super::FrameLayout;
 use super::element::Element;
-use super::places::Places;
+use super::places::ElementPlaces;
 use crate::device::checksum::Algorithm;
 use crate::device::encoding::{Bits, Digits, Encoding, Kind, MAX_DIGITS, Width};
 use crate::device::text::{Length, MAX_TEXT};
@@ -161,7 +161,7 @@ impl FrameLayout {
         let mut begins = !is_searched || !self.head.is_empty() || self.checksum.is_some();
         let mut ends = !is_searched;
         let mut rest_from = None;
-        let mut places = Places::new(self, None);
+        let mut places = ElementPlaces::new(self, None);
         for (nth, element) in elements.iter().enumerate() {
             let nth = nth as u8;
             match element {
@@ -197,7 +197,7 @@ impl FrameLayout {
             return Err(LayoutError::Algorithm);
         }
         // Behind a field of varying length no byte has a number.
-        let mut places = Places::new(self, None);
+        let mut places = ElementPlaces::new(self, None);
         let mut numbered = None;
         for element in elements {
             let len = element.len();

@@ -5,7 +5,7 @@ use super::element::Element;
 use crate::device::text::{Counts, Length, MAX_TEXT};
 
 /// The places of elements, one after the other.
-pub(super) struct Places {
+pub(super) struct ElementPlaces {
     /// Where the next element begins.
     pub(super) at: usize,
     /// Where the newest element begins that shares its place with none before, and its length.
@@ -32,7 +32,7 @@ pub(super) enum Unplaced {
     No,
 }
 
-impl Places {
+impl ElementPlaces {
     pub(super) fn new(layout: &FrameLayout, end: Option<usize>) -> Self {
         let (behind, len) =
             layout.checksum.map_or((usize::MAX, 0), |sum| (usize::from(layout.behind), sum.len()));

@@ -6,10 +6,10 @@
     reason = "all of it runs in constants: an index out of range or an overflow fails the build"
 )]
 
-use super::{Access, Item, Space};
+use super::{Access, MapRun, Space};
 use crate::sysvar::{INPUT_COUNT, ModbusPlace, SPANS};
 
-pub(super) const ROWS: [Item; 27] = [
+pub(super) const ROWS: [MapRun; 27] = [
     variables("BitInputReg", 1, "functional bool registers, input"),
     variables("BitOutputReg", 1, "functional bool registers, output"),
     variables("BitInputReg", 3, "bool registers, input"),
@@ -39,7 +39,7 @@ pub(super) const ROWS: [Item; 27] = [
     other(Space::Holding, 112, 6, "TCP velocity, m/s and rad/s").scaled(10_000),
 ];
 
-impl Item {
+impl MapRun {
     /// More addresses than the variables have bits: the rest is reserved.
     const fn widened(self, count: u16) -> Self {
         Self { count, ..self }
@@ -54,12 +54,12 @@ impl Item {
     }
 }
 
-const fn other(space: Space, first: u16, count: u16, content: &'static str) -> Item {
-    Item { space, first, count, access: Access::ReadOnly, content, per_unit: 0 }
+const fn other(space: Space, first: u16, count: u16, content: &'static str) -> MapRun {
+    MapRun { space, first, count, access: Access::ReadOnly, content, per_unit: 0 }
 }
 
 /// The row of the variable table that begins with `group[index]`.
-const fn variables(group: &str, index: u8, content: &'static str) -> Item {
+const fn variables(group: &str, index: u8, content: &'static str) -> MapRun {
     let mut nth = 0;
     while !(SPANS[nth].first == index && same(SPANS[nth].group, group)) {
         nth += 1;
@@ -67,13 +67,13 @@ const fn variables(group: &str, index: u8, content: &'static str) -> Item {
     let (vars, access) = (SPANS[nth].len() as u16, access(nth));
     match SPANS[nth].modbus {
         Some(ModbusPlace::Coils { first, count }) => {
-            Item { space: Space::Coils, first, count: count * vars, access, content, per_unit: 0 }
+            MapRun { space: Space::Coils, first, count: count * vars, access, content, per_unit: 0 }
         }
         Some(ModbusPlace::Register { address }) => {
-            Item { space: Space::Holding, first: address, count: vars, access, content, per_unit: 0 }
+            MapRun { space: Space::Holding, first: address, count: vars, access, content, per_unit: 0 }
         }
         Some(ModbusPlace::Scaled { address, per_unit }) => {
-            Item { space: Space::Holding, first: address, count: vars, access, content, per_unit }
+            MapRun { space: Space::Holding, first: address, count: vars, access, content, per_unit }
         }
         None => panic!("the variable is not in the map"),
     }

@@ -5,7 +5,7 @@
 
 use core::fmt;
 
-use super::super::pdu::{EncodeError, MAX_PDU, function};
+use super::super::pdu::{MAX_PDU, PduEncodeError, function};
 use crate::device::Algorithm;
 
 /// Longest frame.
@@ -104,9 +104,9 @@ impl<'a> Adu<'a> {
     ///
     /// # Errors
     /// Too little space; nothing is written then.
-    pub fn encode(&self, out: &mut [u8]) -> Result<usize, EncodeError> {
+    pub fn encode(&self, out: &mut [u8]) -> Result<usize, PduEncodeError> {
         let (needed, available) = (self.encoded_len(), out.len());
-        let no_space = EncodeError::NoSpace { needed, available };
+        let no_space = PduEncodeError::NoSpace { needed, available };
         let (address, body) = out.get_mut(..needed).ok_or(no_space)?.split_first_mut().ok_or(no_space)?;
         *address = self.address;
         for (slot, &byte) in body.iter_mut().zip(self.pdu) {

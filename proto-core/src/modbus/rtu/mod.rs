@@ -18,7 +18,7 @@ pub use adu::{
 };
 pub use operation::{CountError, Operation, Table};
 pub(crate) use operation::{Expected, Probe, REFUSAL_LEN};
-pub use slave::{Counters, Slave};
+pub use slave::{Slave, SlaveStats};
 pub use timing::Timing;
 
 /// Most slaves that a master asks on one line.

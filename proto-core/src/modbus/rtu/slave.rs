@@ -31,7 +31,7 @@ pub struct Slave {
     sent: Option<(usize, [u8; CRC_LEN])>,
     /// Length of a reply that is kept in the buffer, and is sent later.
     kept: usize,
-    counters: Counters,
+    counters: SlaveStats,
 }
 
 /// Frames that came without a silence between them.
@@ -40,7 +40,7 @@ const BUFFER: usize = 2 * MAX_ADU;
 /// Counters of a slave since the start; they stop at their end.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
-pub struct Counters {
+pub struct SlaveStats {
     /// Requests that were answered, with those that were refused.
     pub answered: u32,
     /// Requests that were refused with an exception.
@@ -71,7 +71,7 @@ impl Slave {
             heard: Instant::ZERO,
             sent: None,
             kept: 0,
-            counters: Counters { answered: 0, refused: 0, broadcasts: 0, others: 0, late: 0, wrong: 0 },
+            counters: SlaveStats { answered: 0, refused: 0, broadcasts: 0, others: 0, late: 0, wrong: 0 },
         })
     }
 
@@ -155,7 +155,7 @@ impl Slave {
     }
 
     /// Counters since the start.
-    pub const fn counters(&self) -> Counters {
+    pub const fn counters(&self) -> SlaveStats {
         self.counters
     }
 
@@ -180,10 +180,10 @@ impl Slave {
             let echo = behind_echo(rest).or_else(|| behind_echo(inner?)?.checked_add(1));
             rest = echo.and_then(|echo| rest.get(echo..)).unwrap_or(rest);
         }
-        let mut reading = Reading { own: self.address, is_bare: false };
+        let mut reading = BurstReading { own: self.address, is_bare: false };
         if !self.overrun
             && let Some(inner) = without_stray(rest)
-            && let bare = (Reading { is_bare: true, ..reading })
+            && let bare = (BurstReading { is_bare: true, ..reading })
             && bare.explains(inner)
         {
             if bare.first_frame(rest).is_some() && reading.explains(rest) {
@@ -231,7 +231,7 @@ impl Slave {
 
 /// How the bytes of a burst are taken for frames.
 #[derive(Debug, Clone, Copy)]
-struct Reading {
+struct BurstReading {
     /// The address of the slave.
     own: u8,
     /// A byte before them was dropped, so a frame counts only with the length that its function and
@@ -239,7 +239,7 @@ struct Reading {
     is_bare: bool,
 }
 
-impl Reading {
+impl BurstReading {
     /// Whether `bytes` are frames and nothing else, but for a false byte behind them.
     fn explains(self, mut bytes: &[u8]) -> bool {
         while let Some((_, behind)) = self.first_frame(bytes) {

@@ -5,7 +5,7 @@ use super::adu::seal;
 use super::operation::{Expected, Probe};
 use super::*;
 use crate::modbus::Exception;
-use crate::modbus::pdu::EncodeError;
+use crate::modbus::pdu::PduEncodeError;
 use crate::time::Duration;
 
 /// The example of the standard's appendix on the CRC: slave 2, function 7.
@@ -23,7 +23,7 @@ fn the_crc_is_the_standards() {
     assert_eq!(Adu::parse(&swapped), Err(AduError::Checksum { expected: 0x1241, received: 0x4112 }));
     assert_eq!(Adu::parse(&frame[..3]), Err(AduError::Length { received: 3 }));
     assert_eq!(Adu::parse(&[0; 257]), Err(AduError::Length { received: 257 }));
-    let no_space = EncodeError::NoSpace { needed: 4, available: 3 };
+    let no_space = PduEncodeError::NoSpace { needed: 4, available: 3 };
     assert_eq!(Adu { address: 2, pdu: &[7] }.encode(&mut [0; 3]), Err(no_space));
 }
 

@@ -15,7 +15,7 @@ use crate::wire::can::{CanFrame, CanId, MAX_CAN_DATA};
 pub const MAX_LINE: usize = 30;
 
 /// A line with its CR.
-pub type Line = Vec<u8, { MAX_LINE + 1 }>;
+pub type SlcanLine = Vec<u8, { MAX_LINE + 1 }>;
 
 /// One client's channel to the bus.
 #[derive(Debug, Clone)]
@@ -99,7 +99,7 @@ impl Channel {
 
     /// The line that reports a frame on the bus at `millis` to the client; `None` while the channel
     /// is closed.
-    pub fn deliver(&self, frame: &CanFrame, millis: u64) -> Option<Line> {
+    pub fn deliver(&self, frame: &CanFrame, millis: u64) -> Option<SlcanLine> {
         let open = self.state != ChannelState::Closed;
         let stamp = u16::try_from(millis % TIMESTAMP_MODULUS).unwrap_or(0);
         open.then(|| encode(frame, self.timestamps.then_some(stamp)))
@@ -237,8 +237,8 @@ pub fn decode(line: &[u8]) -> Result<CanFrame, LineError> {
 }
 
 /// Writes a frame's line with its CR, and the time in milliseconds within a minute when given.
-pub fn encode(frame: &CanFrame, timestamp: Option<u16>) -> Line {
-    let mut line = Line::new();
+pub fn encode(frame: &CanFrame, timestamp: Option<u16>) -> SlcanLine {
+    let mut line = SlcanLine::new();
     let (kind, id, digits) = match frame.id() {
         CanId::Standard(id) => (if frame.is_remote() { b'r' } else { b't' }, u32::from(id), 3),
         CanId::Extended(id) => (if frame.is_remote() { b'R' } else { b'T' }, id, 8),
@@ -257,7 +257,7 @@ pub fn encode(frame: &CanFrame, timestamp: Option<u16>) -> Line {
     line
 }
 
-fn push_hex(line: &mut Line, value: u32, digits: u32) {
+fn push_hex(line: &mut SlcanLine, value: u32, digits: u32) {
     for place in (0..digits).rev() {
         let digit = value.unbounded_shr(place.saturating_mul(4)) & 0xF;
         let _ = char::from_digit(digit, 16).map(|digit| line.push(digit.to_ascii_uppercase() as u8));

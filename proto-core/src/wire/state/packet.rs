@@ -42,7 +42,7 @@ impl FieldPlace {
 }
 
 /// An item's type: its scalar type and its bytes, little-endian (D1).
-trait Item: Copy {
+trait StateItem: Copy {
     const TYPE: ScalarType;
     const ZERO: Self;
     fn read_all(items: &mut [Self], bytes: &[u8]);
@@ -51,7 +51,7 @@ trait Item: Copy {
 
 macro_rules! item {
     ($ty:ident, $scalar:ident, $size:literal) => {
-        impl Item for $ty {
+        impl StateItem for $ty {
             const TYPE: ScalarType = ScalarType::$scalar;
             const ZERO: Self = 0 as Self;
 
@@ -78,7 +78,7 @@ item!(u32, Dword, 4);
 item!(f32, Float, 4);
 
 /// A field's type: one item, or an array of them.
-trait Field: Sized {
+trait StateField: Sized {
     const TYPE: ScalarType;
     const COUNT: u16;
     const ZERO: Self;
@@ -86,7 +86,7 @@ trait Field: Sized {
     fn write(&self, out: &mut [u8]);
 }
 
-impl<T: Item> Field for T {
+impl<T: StateItem> StateField for T {
     const TYPE: ScalarType = T::TYPE;
     const COUNT: u16 = 1;
     const ZERO: Self = T::ZERO;
@@ -102,7 +102,7 @@ impl<T: Item> Field for T {
     }
 }
 
-impl<T: Item, const N: usize> Field for [T; N] {
+impl<T: StateItem, const N: usize> StateField for [T; N] {
     const TYPE: ScalarType = T::TYPE;
     const COUNT: u16 = N as u16;
     const ZERO: Self = [T::ZERO; N];
@@ -126,8 +126,8 @@ macro_rules! packet {
             $(FieldPlace {
                 name: stringify!($name),
                 offset: $offset,
-                ty: <$ty as Field>::TYPE,
-                count: <$ty as Field>::COUNT,
+                ty: <$ty as StateField>::TYPE,
+                count: <$ty as StateField>::COUNT,
                 content: $content,
             },)*
         ];
@@ -144,7 +144,7 @@ macro_rules! packet {
 
         impl StatePacket {
             /// All zero.
-            pub const ZERO: Self = Self { $($name: <$ty as Field>::ZERO,)* };
+            pub const ZERO: Self = Self { $($name: <$ty as StateField>::ZERO,)* };
 
             pub(super) fn fill(&mut self, bytes: &[u8; LEN]) {
                 $(self.$name.fill(bytes.get($offset..).unwrap_or(&[]));)*
@@ -159,7 +159,7 @@ macro_rules! packet {
             $(
                 $(#[$doc])*
                 pub fn $name(&self) -> $ty {
-                    let mut field = <$ty as Field>::ZERO;
+                    let mut field = <$ty as StateField>::ZERO;
                     field.fill(self.as_bytes().get($offset..).unwrap_or(&[]));
                     field
                 }

@@ -14,11 +14,11 @@ mod watchdog;
 
 use core::fmt;
 
-use recipe_store::{Place, WORD};
+use recipe_store::{FlashWord, WORD};
 pub(crate) use recipe_update::MPS2_AN500 as BOARD;
 use recipe_update::{Chosen, IMAGE_OFFSET, Slot, SlotFlash};
 
-use arguments::Name;
+use arguments::FileName;
 pub(crate) use host_flash::HostFlash as Area;
 
 /// Runs before anything is read.
@@ -33,7 +33,7 @@ pub(crate) fn start() {
 /// To be called once, as on the other board.
 pub(crate) unsafe fn slots() -> Option<[Area; 2]> {
     let open = |slot: Slot| {
-        let name = Name::argument(SLOTS)?;
+        let name = FileName::argument(SLOTS)?;
         Area::open(&name, BOARD.slot_offset(slot), BOARD.slot_sectors)
     };
     let opened = open(Slot::A).zip(open(Slot::B));
@@ -48,7 +48,7 @@ pub(crate) unsafe fn slots() -> Option<[Area; 2]> {
 /// # Safety
 /// To be called once, as on the other board.
 pub(crate) unsafe fn stores() -> Option<(Area, Option<Area>)> {
-    let store = Area::open(&Name::argument(STORE)?, 0, STORE_SECTORS)?;
+    let store = Area::open(&FileName::argument(STORE)?, 0, STORE_SECTORS)?;
     Some((store, None))
 }
 
@@ -70,7 +70,7 @@ pub(crate) fn load(chosen: &Chosen, slots: &[Area; 2]) -> Option<u32> {
     for nth in 0..chosen.header.length().div_ceil(WORD as u32) {
         let word = first.checked_add(nth)?;
         let sector = u8::try_from(word.checked_div(words)?).ok()?;
-        let place = Place { sector, word: u16::try_from(word.checked_rem(words)?).ok()? };
+        let place = FlashWord { sector, word: u16::try_from(word.checked_rem(words)?).ok()? };
         let bytes = slot.whole(place)?;
         let address = start.checked_add(nth.checked_mul(WORD as u32)?)?;
         // SAFETY: program RAM within the slot, as the header was checked to be for this slot. The loader lies before

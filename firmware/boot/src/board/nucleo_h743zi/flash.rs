@@ -6,7 +6,7 @@
 
 use core::sync::atomic::{Ordering, fence};
 
-use recipe_store::{Flash, Geometry, Place, Side, WORD, Word};
+use recipe_store::{Flash, FlashWord, Geometry, Side, WORD, Word};
 use recipe_update::{NUCLEO_H743ZI as BOARD, NUCLEO_H743ZI_STORES as STORES, Slot, SlotFlash};
 
 use super::readable::can_read;
@@ -37,7 +37,7 @@ impl Area {
     }
 
     /// Address of a word; that of the first sector if the sector does not exist.
-    fn address(&self, Place { sector, word }: Place) -> usize {
+    fn address(&self, FlashWord { sector, word }: FlashWord) -> usize {
         let [first, ..] = self.sectors;
         let start = self.sectors.get(usize::from(sector)).copied().unwrap_or(first);
         start as usize + WORD * usize::from(word)
@@ -47,7 +47,7 @@ impl Area {
 const _: () = assert!(BOARD.slot_sectors == 5);
 
 impl SlotFlash for Area {
-    fn whole(&self, place: Place) -> Option<Word> {
+    fn whole(&self, place: FlashWord) -> Option<Word> {
         let address = self.address(place);
         // SAFETY: a word of flash that was just found readable; nothing writes it meanwhile.
         can_read(address)
@@ -60,11 +60,11 @@ impl Flash for Area {
         Geometry { sectors: self.count, words: (BOARD.sector / WORD as u32) as u16 }
     }
 
-    fn read(&self, place: Place) -> Word {
+    fn read(&self, place: FlashWord) -> Word {
         self.whole(place).unwrap_or([0; WORD])
     }
 
-    async fn write(&mut self, place: Place, word: &Word) {
+    async fn write(&mut self, place: FlashWord, word: &Word) {
         let address = self.address(place);
         let bank = FlashBank::of(address);
         bank.unlock();
@@ -80,7 +80,7 @@ impl Flash for Area {
     }
 
     async fn erase(&mut self, sector: u8) {
-        let address = self.address(Place { sector, word: 0 });
+        let address = self.address(FlashWord { sector, word: 0 });
         let bank = FlashBank::of(address);
         let number = (address as u32 % BANK) / BOARD.sector;
         bank.unlock();

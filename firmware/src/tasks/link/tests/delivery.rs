@@ -249,7 +249,7 @@ fn urgent_commands_have_a_connection_of_their_own_to_the_command_port() {
 
 #[test]
 fn a_controller_that_takes_one_connection_is_no_fault() {
-    let _clock = Clock::take();
+    let _clock = TestClock::take();
     let mut gateway = Box::new(Gateway::idle());
     gateway.configure(&commanding()).unwrap();
     let wait = |gateway: &Gateway| {

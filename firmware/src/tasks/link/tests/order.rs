@@ -5,7 +5,7 @@ use embassy_sync::blocking_mutex::raw::NoopRawMutex;
 use embassy_sync::signal::Signal;
 
 use super::*;
-use crate::tasks::test_executor::{Executor, Order};
+use crate::tasks::test_executor::{Executor, WakeOrder};
 
 /// How long a controller's client may be silent (proto-core/docs/engine.md section 9).
 const SILENCE: Duration = Duration::from_secs(2);
@@ -35,15 +35,15 @@ impl Pair<'_> {
 
 #[test]
 fn bytes_that_wait_in_the_ethernet_controller_are_heard_before_silence_is_too_long() {
-    for order in Order::ALL {
-        let _clock = Clock::take();
+    for order in WakeOrder::ALL {
+        let _clock = TestClock::take();
         let config = config(tcp_listen(), FirstSpeaker::Frames);
         let mut gateway = Box::new(Gateway::idle());
         gateway.configure(&config).unwrap();
         let gateway = &*gateway;
         let (link, kind) = gateway.links().find(|(_, kind)| listens(*kind)).unwrap();
         let endpoint = Endpoint::of(&config, kind);
-        let watch = Watch::<2>::new();
+        let watch = TaskWatch::<2>::new();
         let pulses = [TaskName::Engine, TaskName::Link(kind)].map(|name| watch.register(name).unwrap());
         let wire = Rc::new(Wire::new());
         let mut resources: [Resources; 2] = core::array::from_fn(|_| StackResources::new());
