@@ -137,16 +137,24 @@ macro_rules! signed_numbers {
     };
 }
 
+/// What a serializer makes of everything that has elements.
+macro_rules! compounds {
+    ($type:ty) => {
+        type SerializeSeq = $type;
+        type SerializeTuple = $type;
+        type SerializeTupleStruct = $type;
+        type SerializeTupleVariant = $type;
+        type SerializeMap = $type;
+        type SerializeStruct = $type;
+        type SerializeStructVariant = $type;
+    };
+}
+
 impl<'w, W: Write> Serializer for Json<'w, W> {
     type Ok = ();
     type Error = JsonError;
-    type SerializeSeq = Items<'w, W>;
-    type SerializeTuple = Items<'w, W>;
-    type SerializeTupleStruct = Items<'w, W>;
-    type SerializeTupleVariant = Items<'w, W>;
-    type SerializeMap = Items<'w, W>;
-    type SerializeStruct = Items<'w, W>;
-    type SerializeStructVariant = Items<'w, W>;
+
+    compounds!(Items<'w, W>);
 
     whole_numbers!(serialize_u8: u8, serialize_u16: u16, serialize_u32: u32);
 
@@ -368,13 +376,8 @@ type Never = Impossible<(), JsonError>;
 impl<W: Write> Serializer for JsonKey<'_, W> {
     type Ok = ();
     type Error = JsonError;
-    type SerializeSeq = Never;
-    type SerializeTuple = Never;
-    type SerializeTupleStruct = Never;
-    type SerializeTupleVariant = Never;
-    type SerializeMap = Never;
-    type SerializeStruct = Never;
-    type SerializeStructVariant = Never;
+
+    compounds!(Never);
 
     keys!(
         serialize_i8: i8,
