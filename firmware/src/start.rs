@@ -205,9 +205,7 @@ struct Wiring {
 #[repr(u8)]
 enum Overlay {
     Configuration(GatewayConfig),
-    Links(
-        heapless::Vec<u8, { MAX_LINKS * LinkBuffers::SIZE + CONNECTIONS * console::ConnectionBuffers::SIZE }>,
-    ),
+    Links(heapless::Vec<u8, { LinkBuffers::ALL + CONNECTIONS * console::ConnectionBuffers::SIZE }>),
 }
 
 impl Overlay {

@@ -14,7 +14,8 @@ use embassy_time::{Duration, Timer, with_timeout};
 use heapless::Vec;
 use proto_core::config::GatewayConfig;
 use proto_core::engine::{
-    BuildError, Handled, Health, Input, LinkId, LinkKind, OUTPUT_BUFFER, Output, PortId, Status, Tap,
+    BuildError, Handled, Health, INPUT_BUFFER, Input, LinkId, LinkKind, OUTPUT_BUFFER, Output, PortId,
+    Status, Tap,
 };
 use proto_core::sysvar::Direction;
 use proto_core::time::Instant;
@@ -33,6 +34,8 @@ pub struct Gateway {
     ports: Vec<(PortId, PortControl), MAX_FIELD_PORTS>,
     links: Vec<(LinkId, LinkKind, LinkControl), MAX_LINKS>,
     output: RefCell<[u8; OUTPUT_BUFFER]>,
+    /// What a link's task has just received. One for all: it is reported before another task runs.
+    received: RefCell<[u8; INPUT_BUFFER]>,
     deadline: Cell<Instant>,
     deadline_moved: Notify,
     /// A task has yielded before it reported all pending input.
@@ -51,6 +54,7 @@ impl Gateway {
             ports: Vec::new(),
             links: Vec::new(),
             output: RefCell::new([0; OUTPUT_BUFFER]),
+            received: RefCell::new([0; INPUT_BUFFER]),
             deadline: Cell::new(Instant::ZERO),
             deadline_moved: Notify::new(),
             more_waits: Cell::new(false),
@@ -230,6 +234,11 @@ impl Gateway {
     /// Whether a datagram is a frame of the link.
     pub(crate) fn is_frame(&self, link: LinkId, datagram: &[u8]) -> bool {
         self.engine.borrow().is_frame(link, datagram)
+    }
+
+    /// The buffer for what a link receives. It is free again at each await.
+    pub(crate) fn received(&self) -> &RefCell<[u8; INPUT_BUFFER]> {
+        &self.received
     }
 
     pub(crate) fn port(&self, id: PortId) -> Option<&PortControl> {

@@ -17,11 +17,14 @@ use core::pin::pin;
 use embassy_net::dns::DnsQueryType;
 use embassy_net::{IpAddress, Stack};
 use heapless::String;
+use proto_core::command::MAX_COMMAND;
 use proto_core::config::{Bus, GatewayConfig, listen_address};
-use proto_core::engine::{INPUT_BUFFER, Input, LinkId, LinkKind};
+use proto_core::engine::{INPUT_BUFFER, Input, LinkId, LinkKind, OUTPUT_BUFFER};
+use proto_core::modbus::adu::MAX_ADU;
+use recipe_engine::MAX_UPLINKS;
 
 use super::control::LinkControl;
-use super::gateway::Gateway;
+use super::gateway::{Gateway, MAX_LINKS};
 use super::watchdog::Pulse;
 
 /// The remote end of a link.
@@ -93,23 +96,20 @@ impl Endpoint {
 pub struct LinkBuffers<'a> {
     rx: &'a mut [u8],
     tx: &'a mut [u8],
-    chunk: &'a mut [u8],
 }
 
 impl<'a> LinkBuffers<'a> {
-    /// Size in bytes.
-    pub const SIZE: usize = 6 * 1024;
+    /// Size of those of all links in bytes: each recipe link may be a connection for frames.
+    pub const ALL: usize = MAX_UPLINKS * (RX_FRAMES + TX_FRAMES) + (MAX_LINKS - MAX_UPLINKS) * (RX + TX);
 
-    /// Takes [`LinkBuffers::SIZE`] bytes from the front of `memory`; `None` if there are fewer.
+    /// Takes the buffers from the front of `memory`; `None` if it is too short.
     pub fn take(memory: &mut &'a mut [u8], endpoint: &Endpoint) -> Option<Self> {
-        let memory = memory.split_off_mut(..Self::SIZE)?;
-        let (rx, chunk) = match endpoint {
-            Endpoint::TcpListen { .. } => (RX_FRAMES, CHUNK_FRAMES),
-            Endpoint::Tcp { .. } | Endpoint::Udp { .. } | Endpoint::UdpListen { .. } => (RX, CHUNK),
+        let (rx, tx) = match endpoint {
+            Endpoint::TcpListen { .. } => (RX_FRAMES, TX_FRAMES),
+            Endpoint::Tcp { .. } => (RX, TX),
+            Endpoint::Udp { .. } | Endpoint::UdpListen { .. } => (RX, TX_DATAGRAM),
         };
-        let (rx, rest) = memory.split_at_mut_checked(rx)?;
-        let (chunk, tx) = rest.split_at_mut_checked(chunk)?;
-        Some(Self { rx, tx, chunk })
+        Some(Self { rx: memory.split_off_mut(..rx)?, tx: memory.split_off_mut(..tx)? })
     }
 }
 
@@ -183,14 +183,18 @@ pub(super) async fn resolve(stack: Stack<'_>, host: &str) -> Option<IpAddress> {
 
 /// Receive buffer: a state packet, but a receive window too small for a burst that overruns the Ethernet controller.
 const RX: usize = INPUT_BUFFER;
-/// Bytes handed to the engine at once: a state packet, and more than any frame, so that a datagram that is too
-/// long is noticed.
-const CHUNK: usize = INPUT_BUFFER;
-/// Receive buffer of a connection for recipe frames: two of the longest. The rest of the memory is the transmit
-/// buffer, so that a controller that acknowledges late does not slow the frames down: 64 frames of 72 bytes, as
-/// many as the engine sends, or 70 ms of frames of 256 bytes.
+/// Transmit buffer: the engine leaves at most two commands or one transaction unanswered; four of the longest, because
+/// one that is given up may still be unacknowledged.
+const TX: usize = 4 * 256;
+/// One datagram, the longest frame.
+const TX_DATAGRAM: usize = OUTPUT_BUFFER;
+/// Receive buffer of a connection for recipe frames: two of the longest.
 const RX_FRAMES: usize = 1024;
-const CHUNK_FRAMES: usize = 512;
+/// Transmit buffer of a connection for recipe frames, so that a controller that acknowledges late does not slow them
+/// down: 64 frames of 72 bytes, as many as the engine sends, or 70 ms of frames of 256 bytes.
+const TX_FRAMES: usize = 64 * 72;
+const _: () = assert!(TX >= 4 * MAX_COMMAND && TX >= 3 * MAX_ADU);
+const _: () = assert!(RX + TX_DATAGRAM <= RX_FRAMES + TX_FRAMES && RX + TX <= RX_FRAMES + TX_FRAMES);
 
 #[cfg(test)]
 mod tests;

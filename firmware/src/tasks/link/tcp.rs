@@ -35,7 +35,7 @@ impl LinkDriver<'_> {
         if let Either::Second(true) = opened
             && self.report(turn, Input::LinkUp { link: self.link })
         {
-            self.exchange(turn, &mut socket, buffers.chunk).await;
+            self.exchange(turn, &mut socket).await;
             // The peer closed the connection, or it failed.
             if self.control.is_turn(turn) {
                 socket.close();
@@ -74,21 +74,25 @@ impl LinkDriver<'_> {
     }
 
     /// Moves bytes both ways, until the peer closes the connection, it fails, or the turn is over.
-    async fn exchange(&self, turn: u32, socket: &mut TcpSocket<'_>, chunk: &mut [u8]) {
+    async fn exchange(&self, turn: u32, socket: &mut TcpSocket<'_>) {
         let (reader, writer) = socket.split();
         let outgoing = UnsentData { writer: RefCell::new(writer), held: Cell::new(0) };
         // Reading is polled first, because after an error the acknowledgements are unknown.
-        let reading = self.read(turn, reader, &outgoing, chunk);
+        let reading = self.read(turn, reader, &outgoing);
         let writing = self.write(turn, &outgoing);
         let looking = self.watch_acknowledgements(turn, &outgoing);
         self.pulse.idle(pin!(select3(reading, writing, looking))).await;
     }
 
-    async fn read(&self, turn: u32, mut reader: TcpReader<'_>, outgoing: &UnsentData<'_>, chunk: &mut [u8]) {
-        while let Ok(len) = reader.read(chunk).await {
+    async fn read(&self, turn: u32, mut reader: TcpReader<'_>, outgoing: &UnsentData<'_>) {
+        let received = self.gateway.received();
+        loop {
+            let reading = poll_fn(|cx| pin!(reader.read(received.borrow_mut().as_mut_slice())).poll(cx));
+            let Ok(len) = reading.await else { return };
             // A reply also acknowledges its request.
             let goes_on = self.report_acknowledged(turn, outgoing);
-            let bytes = chunk.get(..len).unwrap_or(&[]);
+            let received = received.borrow();
+            let bytes = received.get(..len).unwrap_or(&[]);
             if !goes_on || bytes.is_empty() || !self.report(turn, Input::LinkBytes { link: self.link, bytes })
             {
                 return;

@@ -336,7 +336,7 @@ fn among(config: &GatewayConfig, which: impl Fn(LinkKind) -> bool, act: impl Asy
     let (own, mut own_runner) = host(&wire, GATEWAY, of_gateway);
     let (controller, mut controller_runner) = host(&wire, CONTROLLER, of_controller);
     let (other_host, mut other_runner) = host(&wire, OTHER, of_other);
-    let mut memory = [0; LinkBuffers::SIZE];
+    let mut memory = [0; LinkBuffers::ALL];
     let buffers = LinkBuffers::take(&mut memory.as_mut_slice(), &endpoint).unwrap();
     let network = join3(own_runner.run(), controller_runner.run(), other_runner.run());
     let driven = join(gateway.keep_time(pulses[0]), run(&gateway, pulses[1], link, own, &endpoint, buffers));

@@ -1,6 +1,7 @@
 //! Datagrams of a link, both ways.
 
 use core::cell::Cell;
+use core::future::poll_fn;
 use core::pin::pin;
 
 use embassy_futures::select::{Either, Either3, select, select3};
@@ -45,7 +46,7 @@ impl LinkDriver<'_> {
         }
         loop {
             let over = async {
-                self.receive(turn, &socket, fixed, address, &peer, buffers.chunk).await;
+                self.receive(turn, &socket, fixed, address, &peer).await;
                 SocketEnd::End
             };
             let sending = self.send(turn, &socket, &peer);
@@ -73,13 +74,15 @@ impl LinkDriver<'_> {
         fixed: Option<IpEndpoint>,
         controller: IpAddress,
         peer: &Cell<Option<IpEndpoint>>,
-        chunk: &mut [u8],
     ) {
+        let received = self.gateway.received();
         loop {
-            // Datagrams longer than the chunk are dropped.
-            let Ok((len, from)) = socket.recv_from(chunk).await else { continue };
+            // Datagrams longer than the buffer are dropped.
+            let receiving = poll_fn(|cx| socket.poll_recv_from(received.borrow_mut().as_mut_slice(), cx));
+            let Ok((len, from)) = receiving.await else { continue };
             let from = from.endpoint;
-            let bytes = chunk.get(..len).unwrap_or(&[]);
+            let received = received.borrow();
+            let bytes = received.get(..len).unwrap_or(&[]);
             if !self.control.is_turn(turn) {
                 return;
             }

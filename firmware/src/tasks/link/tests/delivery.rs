@@ -10,7 +10,7 @@ use super::*;
 use crate::tasks::led::Condition;
 
 /// Of a connection for frames.
-const TX: usize = LinkBuffers::SIZE - RX_FRAMES - CHUNK_FRAMES;
+const TX: usize = TX_FRAMES;
 
 /// The controller's client, connected.
 async fn connected<'a>(net: &Net<'a>, rx: &'a mut [u8], tx: &'a mut [u8]) -> TcpSocket<'a> {

@@ -50,7 +50,7 @@ fn bytes_that_wait_in_the_ethernet_controller_are_heard_before_silence_is_too_lo
         let [of_gateway, of_controller] = &mut resources;
         let (own, mut own_runner) = host(&wire, GATEWAY, of_gateway);
         let (controller, mut controller_runner) = host(&wire, CONTROLLER, of_controller);
-        let mut memory = [0; LinkBuffers::SIZE];
+        let mut memory = [0; LinkBuffers::ALL];
         let buffers = LinkBuffers::take(&mut memory.as_mut_slice(), &endpoint).unwrap();
         let (mut rx, mut tx) = ([0; 256], [0; 256]);
         let speak = Signal::<NoopRawMutex, ()>::new();
