@@ -75,14 +75,19 @@ pub(crate) fn start(spawner: Spawner, mut board: Board) -> Tasks {
     let gateway: &'static Gateway = gateway;
     let edge_setup =
         make_edge(stored.as_deref_mut(), gateway, loaded.is_ok().then_some(&*config), board.seed());
+    // The configuration is not needed any more.
+    let mut memory = overlay.buffers();
+    let image = memory.split_off_mut(..MAX_IMAGE).and_then(|image| image.as_mut_array());
+    let image = image.expect("there is room for an image");
     let key = stored.as_ref().and_then(|stored| stored.access_key());
     let slots = board.slots();
-    let store = stored.and_then(|stored| start_store_task(&tasks, gateway, stored, slots, work, failure));
+    let store =
+        stored.and_then(|stored| start_store_task(&tasks, gateway, stored, image, slots, work, failure));
     let ran = loaded.and_then(|_| run_ports(&tasks, &mut board, gateway, &wiring));
     if ran.is_err() {
         wiring.links.clear();
     }
-    let connected = connect(&tasks, &mut board, gateway, store, key, &wiring, edge_setup, overlay.links());
+    let connected = connect(&tasks, &mut board, gateway, store, key, &wiring, edge_setup, memory);
     let console = connected.as_ref().ok().copied().flatten();
     let refused_why = ran.err().or(connected.err());
     let shown = LedSources { gateway: refused_why.is_none().then_some(gateway), console };
@@ -124,7 +129,7 @@ fn make_edge(
     let edge: &'static Edge = EDGE.init(Edge::off());
     let mut edge_setup =
         EdgeSetup { view: NodeView { edge, document: None, clock: CLOCK.take() }, node: None, seed };
-    let edge::NodeMemory { document, rest } = MEMORY.take();
+    let edge::NodeMemory { document, state } = MEMORY.take();
     let bd_seq = stored.as_ref().and_then(|stored| stored.store().birth_sequence());
     match stored.and_then(|stored| stored.edge(document)) {
         None | Some(Ok(false)) => return edge_setup,
@@ -139,7 +144,7 @@ fn make_edge(
     edge_setup.view.document = Some(document);
     let made = config
         .ok_or(EdgeError::NothingRuns)
-        .and_then(|config| edge::Node::make(document, rest, gateway, config.view(), bd_seq, seed));
+        .and_then(|config| edge::Node::make(document, state, gateway, config.view(), bd_seq, seed));
     match made {
         Ok(node) => edge_setup.node = Some(NODE.init(node)),
         Err(why) => {
@@ -156,15 +161,15 @@ fn start_store_task(
     tasks: &Tasks,
     gateway: &'static Gateway,
     stored: &'static mut StoredConfig<Flash>,
+    image: &'static mut [u8; MAX_IMAGE],
     slots: Site<BoardSlot>,
     work: store::StartWork<'static>,
     failure: Option<CannotRun>,
 ) -> Option<&'static StoreHandle> {
     static UPDATES: StaticCell<Updates<BoardSlot>> = StaticCell::new();
     let updates = UPDATES.init(Updates::new(slots)?);
-    static IMAGE: ConstStaticCell<[u8; MAX_IMAGE]> = ConstStaticCell::new([0; MAX_IMAGE]);
     static HANDLE: StaticCell<StoreHandle> = StaticCell::new();
-    let store: &'static StoreHandle = HANDLE.init_with(|| StoreHandle::new(IMAGE.take()));
+    let store: &'static StoreHandle = HANDLE.init_with(|| StoreHandle::new(image));
     if let Some(failure) = failure {
         store.failed(&failure);
     }
@@ -200,12 +205,12 @@ struct Wiring {
     network: Option<Network>,
 }
 
-/// Memory for the configuration during the start, and for the buffers of links and console afterwards.
+/// Memory for the configuration during the start, and for the buffers of the tasks afterwards.
 #[allow(clippy::large_enum_variant, reason = "both share one memory")]
 #[repr(u8)]
 enum Overlay {
     Configuration(GatewayConfig),
-    Links(heapless::Vec<u8, { LinkBuffers::ALL + CONNECTIONS * console::ConnectionBuffers::SIZE }>),
+    Buffers(heapless::Vec<u8, BUFFERS>),
 }
 
 impl Overlay {
@@ -215,18 +220,22 @@ impl Overlay {
     fn configuration(&mut self) -> &mut GatewayConfig {
         match self {
             Self::Configuration(config) => config,
-            Self::Links(_) => unreachable!("the links come last"),
+            Self::Buffers(_) => unreachable!("the buffers come last"),
         }
     }
 
-    /// The links' buffers, which replace the configuration.
-    fn links(&mut self) -> &mut [u8] {
-        *self = Self::Links(heapless::Vec::new());
-        let Self::Links(buffers) = self else { return &mut [] };
+    /// The tasks' buffers, which replace the configuration.
+    fn buffers(&mut self) -> &mut [u8] {
+        *self = Self::Buffers(heapless::Vec::new());
+        let Self::Buffers(buffers) = self else { return &mut [] };
         let _ = buffers.resize_default(buffers.capacity());
         buffers
     }
 }
+
+/// An image on its way to the store, and the sockets of links, edge node and console.
+const BUFFERS: usize =
+    MAX_IMAGE + LinkBuffers::ALL + edge::NodeBuffers::SIZE + CONNECTIONS * console::ConnectionBuffers::SIZE;
 
 #[inline(never)]
 fn wire(len: usize, gateway: &Gateway, config: &GatewayConfig, wiring: &mut Wiring) {
@@ -315,6 +324,7 @@ fn connect(
             controller_link(pulse, gateway, id, stack, endpoint, buffers)
         });
     }
+    let buffers = edge::NodeBuffers::take(&mut memory).expect("there is room for the edge node");
     let view = edge_setup.view;
     if let (Some(node), Some(store)) = (edge_setup.node, store) {
         if let Some(server) = view.document.and_then(|document| document.time_server.as_ref()) {
@@ -323,7 +333,7 @@ fn connect(
                 time_server(pulse, stack, host, port, view.clock, edge_setup.seed)
             });
         }
-        tasks.spawn(TaskName::Edge, |pulse| edge_node(pulse, gateway, stack, store, view, node));
+        tasks.spawn(TaskName::Edge, |pulse| edge_node(pulse, gateway, stack, store, view, node, buffers));
     }
     Ok(start_console(tasks, board, gateway, store, key, view, name, stack, memory))
 }
@@ -470,8 +480,9 @@ async fn edge_node(
     store: &'static StoreHandle,
     view: NodeView,
     node: &'static mut edge::Node,
+    buffers: edge::NodeBuffers<'static>,
 ) -> ! {
-    pulse.run(pin!(node.run(gateway, pulse, stack, store, view.edge, view.clock))).await
+    pulse.run(pin!(node.run(gateway, pulse, stack, store, view.edge, view.clock, buffers))).await
 }
 
 /// Queries a server for UTC.

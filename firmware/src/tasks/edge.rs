@@ -44,34 +44,43 @@ type BoardCatalog = GatewayCatalog<'static, METRICS>;
 pub struct NodeMemory {
     /// The decoded settings.
     pub document: NodeDocument,
-    /// Everything else that the node needs.
-    pub rest: NodeBuffers,
+    /// What the node publishes.
+    pub state: NodeState,
 }
 
-/// Memory of the node except its settings.
-pub struct NodeBuffers {
+/// The node, and the values for it.
+pub struct NodeState {
     node: EdgeNode<METRICS, HISTORY>,
     values: Vec<Option<Value>, METRICS>,
-    rx: [u8; RX],
-    tx: [u8; TX],
-    /// Buffers for one piece of output and of input.
-    piece: [u8; MIN_BUFFER],
-    read: [u8; READ],
 }
 
 impl NodeMemory {
     /// Empty: the settings have not been read.
-    pub const ZEROED: Self = Self {
-        document: NodeDocument::empty(),
-        rest: NodeBuffers {
-            node: EdgeNode::idle(),
-            values: Vec::new(),
-            rx: [0; RX],
-            tx: [0; TX],
-            piece: [0; MIN_BUFFER],
-            read: [0; READ],
-        },
-    };
+    pub const ZEROED: Self =
+        Self { document: NodeDocument::empty(), state: NodeState { node: EdgeNode::idle(), values: Vec::new() } };
+}
+
+/// Buffers of the node's socket.
+#[derive(Debug)]
+pub struct NodeBuffers<'a> {
+    rx: &'a mut [u8],
+    tx: &'a mut [u8],
+    /// For one piece of output or of input.
+    piece: &'a mut [u8],
+}
+
+impl<'a> NodeBuffers<'a> {
+    /// Size in bytes.
+    pub const SIZE: usize = RX + TX + MIN_BUFFER;
+
+    /// Takes [`NodeBuffers::SIZE`] bytes from the front of `memory`; `None` if there are fewer.
+    pub fn take(memory: &mut &'a mut [u8]) -> Option<Self> {
+        Some(Self {
+            rx: memory.split_off_mut(..RX)?,
+            tx: memory.split_off_mut(..TX)?,
+            piece: memory.split_off_mut(..MIN_BUFFER)?,
+        })
+    }
 }
 
 /// Why the edge node does not run although there are settings.
@@ -166,7 +175,7 @@ impl Edge {
 pub struct Node {
     document: &'static NodeDocument,
     catalog: BoardCatalog,
-    rest: &'static mut NodeBuffers,
+    state: &'static mut NodeState,
 }
 
 impl Node {
@@ -177,7 +186,7 @@ impl Node {
     /// See [`EdgeError`].
     pub fn make(
         document: &'static NodeDocument,
-        rest: &'static mut NodeBuffers,
+        state: &'static mut NodeState,
         gateway: &Gateway,
         config: ConfigView<'_>,
         bd_seq: Option<u8>,
@@ -192,12 +201,13 @@ impl Node {
         let catalog =
             gateway.report(|status| BoardCatalog::new(config, status, rates, env!("CARGO_PKG_VERSION")));
         let catalog = catalog.map_err(|_| EdgeError::Metrics)?;
-        rest.node.configure(&document.settings, &catalog, bd_seq, seed).map_err(EdgeError::Node)?;
-        let _ = rest.values.resize(catalog.len(), None);
-        Ok(Self { document, catalog, rest })
+        state.node.configure(&document.settings, &catalog, bd_seq, seed).map_err(EdgeError::Node)?;
+        let _ = state.values.resize(catalog.len(), None);
+        Ok(Self { document, catalog, state })
     }
 
     /// Runs the node forever.
+    #[allow(clippy::too_many_arguments, reason = "each is used once")]
     pub async fn run(
         &mut self,
         gateway: &Gateway,
@@ -206,8 +216,10 @@ impl Node {
         store: &StoreHandle,
         edge: &Edge,
         clock: &WallClock,
+        buffers: NodeBuffers<'_>,
     ) -> ! {
-        let Self { document, catalog, rest: NodeBuffers { node, values, rx, tx, piece, read } } = self;
+        let Self { document, catalog, state: NodeState { node, values } } = self;
+        let NodeBuffers { rx, tx, piece } = buffers;
         let mut socket = TcpSocket::new(stack, rx, tx);
         socket.set_timeout(Some(SILENT));
         let mut driver = NodeDriver {
@@ -239,14 +251,14 @@ impl Node {
             let is_connected = driver.node.is_connected();
             let reading = async {
                 match is_connected {
-                    true => socket.read(read).await,
+                    true => socket.read(piece.get_mut(..READ).unwrap_or(&mut [])).await,
                     false => core::future::pending().await,
                 }
             };
             let next = pulse.idle(pin!(select(reading, Timer::at(until)))).await;
             match next {
                 Either::First(Ok(count @ 1..)) => {
-                    let bytes = read.get(..count).unwrap_or(&[]);
+                    let bytes = piece.get(..count).unwrap_or(&[]);
                     driver.node.handle(now(), Input::Bytes(bytes), driver.catalog);
                 }
                 Either::First(_) => driver.lost(&mut socket).await,
