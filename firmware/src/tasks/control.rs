@@ -80,12 +80,9 @@ impl PortControl {
         self.has_slept.set(false);
     }
 
-    /// The next transmission.
-    pub(crate) async fn next_bytes(&self) -> Transmission {
-        loop {
-            if let Some(bytes) = self.take_bytes() {
-                return bytes;
-            }
+    /// Waits until there is a transmission.
+    pub(crate) async fn bytes_wait(&self) {
+        while self.bytes.borrow().is_none() {
             self.changed.notified().await;
         }
     }
@@ -124,6 +121,8 @@ pub(crate) struct LinkControl {
     /// Odd while the link is to be open; incremented by each opening and closing.
     turn: Cell<u32>,
     outbox: RefCell<Option<Transmission>>,
+    /// Bytes of the transmission in the outbox that the socket has accepted.
+    sent: Cell<usize>,
     /// Unacknowledged bytes of this turn, as last reported to the engine.
     unacknowledged: Cell<u32>,
     changed: Notify,
@@ -135,6 +134,7 @@ impl LinkControl {
         Self {
             turn: Cell::new(0),
             outbox: RefCell::new(None),
+            sent: Cell::new(0),
             unacknowledged: Cell::new(0),
             changed: Notify::new(),
             refused_peers: Cell::new(0),
@@ -171,6 +171,7 @@ impl LinkControl {
     pub(crate) fn put(&self, bytes: &[u8]) {
         self.unacknowledged.set(self.unacknowledged.get().saturating_add(bytes.len() as u32));
         *self.outbox.borrow_mut() = Transmission::from_slice(bytes).ok();
+        self.sent.set(0);
         self.changed.notify();
     }
 
@@ -186,10 +187,10 @@ impl LinkControl {
         self.unacknowledged.get()
     }
 
-    /// `left` is the number of bytes held by the task, besides those queued here. Returns the total for the engine if
-    /// it has changed.
+    /// `left` is the number of bytes that the socket has accepted, and the peer has not acknowledged. Returns the total
+    /// for the engine if it has changed.
     pub(crate) fn acknowledged(&self, left: usize) -> Option<u32> {
-        let waiting = self.outbox.borrow().as_ref().map_or(0, |bytes| bytes.len());
+        let waiting = self.rest(<[u8]>::len).unwrap_or(0);
         let left = left.saturating_add(waiting) as u32;
         (self.unacknowledged.replace(left) != left).then_some(left)
     }
@@ -212,17 +213,38 @@ impl LinkControl {
         }
     }
 
-    /// The next transmission; `None` when this turn is over.
-    pub(crate) async fn next(&self, turn: u32) -> Option<Transmission> {
+    /// Waits for the next transmission, which stays in the outbox while it is sent; false when this turn is over.
+    pub(crate) async fn next(&self, turn: u32) -> bool {
         loop {
             if !self.is_turn(turn) {
-                return None;
+                return false;
             }
-            if let Some(bytes) = self.outbox.borrow_mut().take() {
-                return Some(bytes);
+            if self.outbox.borrow().is_some() {
+                return true;
             }
             self.changed.notified().await;
         }
+    }
+
+    /// Passes what is left of the transmission to `look`; `None` if there is none.
+    pub(crate) fn rest<R>(&self, look: impl FnOnce(&[u8]) -> R) -> Option<R> {
+        let outbox = self.outbox.borrow();
+        Some(look(outbox.as_ref()?.get(self.sent.get()..).unwrap_or(&[])))
+    }
+
+    /// The socket has accepted so many bytes of the transmission; returns whether that was the rest of it.
+    pub(crate) fn accepted(&self, count: usize) -> bool {
+        self.sent.set(self.sent.get().saturating_add(count));
+        let is_all = self.rest(<[u8]>::is_empty).unwrap_or(true);
+        if is_all {
+            self.taken();
+        }
+        is_all
+    }
+
+    /// The transmission is in the socket, or dropped.
+    pub(crate) fn taken(&self) {
+        *self.outbox.borrow_mut() = None;
     }
 }
 
@@ -236,12 +258,14 @@ mod tests {
         link.open();
         link.put(&[0; 69]);
         assert_eq!((link.unacknowledged(), link.acknowledged(0)), (69, None));
-        // The task takes the transmission; its socket accepts half of it.
-        assert!(link.outbox.take().is_some());
-        assert_eq!((link.acknowledged(69), link.acknowledged(35)), (None, Some(35)));
+        // The socket accepts a part of the transmission, of which the peer acknowledges some, then the rest.
+        assert!(!link.accepted(34));
+        assert_eq!((link.acknowledged(34), link.acknowledged(0)), (None, Some(35)));
+        assert!(link.accepted(35));
+        assert_eq!(link.acknowledged(35), None);
         link.put(&[0; 100]);
         assert_eq!((link.unacknowledged(), link.acknowledged(0)), (135, Some(100)));
-        assert!(link.outbox.take().is_some());
+        assert!(link.accepted(100));
         assert_eq!((link.acknowledged(0), link.acknowledged(0)), (Some(0), None));
     }
 
@@ -250,8 +274,11 @@ mod tests {
         let link = LinkControl::new();
         link.open();
         link.put(&[0; 69]);
+        assert!(!link.accepted(34));
         link.close();
         link.open();
-        assert_eq!((link.unacknowledged(), link.acknowledged(0)), (0, None));
+        assert_eq!((link.unacknowledged(), link.acknowledged(0), link.rest(<[u8]>::len)), (0, None, None));
+        link.put(&[0; 3]);
+        assert_eq!(link.rest(<[u8]>::len), Some(3));
     }
 }

@@ -31,9 +31,9 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, line: impl Line
         let mut full_chunks = 0_usize;
         let failed = loop {
             let SerialTask { line, chunk, .. } = &mut task;
-            let next = select3(line.read(chunk), control.next_bytes(), Timer::at(errors.next_check));
+            let next = select3(line.read(chunk), control.bytes_wait(), Timer::at(errors.next_check));
             let next = pulse.idle(pin!(next)).await;
-            let frame = match next {
+            let may_send = match next {
                 Either3::First(Ok(len)) => {
                     task.report(len);
                     if Instant::now() >= errors.next_check {
@@ -48,19 +48,18 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, line: impl Line
                     }
                     // Lets other tasks run while the line is never silent.
                     yield_now().await;
-                    match control.take_bytes_if(may_send) {
-                        Some(frame) => frame,
-                        None => continue,
-                    }
+                    may_send
                 }
                 Either3::First(Err(error)) => break error.kind(),
-                Either3::Second(frame) => frame,
+                Either3::Second(()) => true,
                 Either3::Third(()) => {
                     // At a wrong baud rate errors are all that a line receives.
                     errors.log(port, task.line.errors());
                     continue;
                 }
             };
+            // One copy of it, which no await but that of sending holds.
+            let Some(frame) = control.take_bytes_if(may_send) else { continue };
             full_chunks = 0;
             task.line.drive(LineDirection::Send);
             let sent = with_timeout(send_timeout(frame.len(), baud), task.send(&frame));

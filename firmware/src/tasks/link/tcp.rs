@@ -1,6 +1,6 @@
 //! TCP connections of a link.
 
-use core::cell::{Cell, RefCell};
+use core::cell::RefCell;
 use core::future::{Future, poll_fn};
 use core::pin::pin;
 use core::task::Poll;
@@ -76,21 +76,21 @@ impl LinkDriver<'_> {
     /// Moves bytes both ways, until the peer closes the connection, it fails, or the turn is over.
     async fn exchange(&self, turn: u32, socket: &mut TcpSocket<'_>) {
         let (reader, writer) = socket.split();
-        let outgoing = UnsentData { writer: RefCell::new(writer), held: Cell::new(0) };
+        let writer = RefCell::new(writer);
         // Reading is polled first, because after an error the acknowledgements are unknown.
-        let reading = self.read(turn, reader, &outgoing);
-        let writing = self.write(turn, &outgoing);
-        let looking = self.watch_acknowledgements(turn, &outgoing);
+        let reading = self.read(turn, reader, &writer);
+        let writing = self.write(turn, &writer);
+        let looking = self.watch_acknowledgements(turn, &writer);
         self.pulse.idle(pin!(select3(reading, writing, looking))).await;
     }
 
-    async fn read(&self, turn: u32, mut reader: TcpReader<'_>, outgoing: &UnsentData<'_>) {
+    async fn read(&self, turn: u32, mut reader: TcpReader<'_>, writer: &RefCell<TcpWriter<'_>>) {
         let received = self.gateway.received();
         loop {
             let reading = poll_fn(|cx| pin!(reader.read(received.borrow_mut().as_mut_slice())).poll(cx));
             let Ok(len) = reading.await else { return };
             // A reply also acknowledges its request.
-            let goes_on = self.report_acknowledged(turn, outgoing);
+            let goes_on = self.report_acknowledged(turn, writer);
             let received = received.borrow();
             let bytes = received.get(..len).unwrap_or(&[]);
             if !goes_on || bytes.is_empty() || !self.report(turn, Input::LinkBytes { link: self.link, bytes })
@@ -100,31 +100,33 @@ impl LinkDriver<'_> {
         }
     }
 
-    async fn write(&self, turn: u32, outgoing: &UnsentData<'_>) {
-        while let Some(transmission) = self.control.next(turn).await {
-            let mut rest = transmission.as_slice();
-            while !rest.is_empty() {
-                outgoing.held.set(rest.len());
-                match select(self.control.over(turn), outgoing.write(rest)).await {
-                    Either::Second(Some(len @ 1..)) => rest = rest.get(len..).unwrap_or(&[]),
+    async fn write(&self, turn: u32, writer: &RefCell<TcpWriter<'_>>) {
+        while self.control.next(turn).await {
+            // Waits until the socket accepts some of the bytes. Neither the writer nor the outbox is borrowed longer
+            // than a poll.
+            let writing = poll_fn(|cx| {
+                let mut writer = writer.borrow_mut();
+                self.control.rest(|rest| pin!(writer.write(rest)).poll(cx)).unwrap_or(Poll::Ready(Ok(0)))
+            });
+            let is_all = self.control.accepted(0)
+                || match select(self.control.over(turn), writing).await {
+                    Either::Second(Ok(count @ 1..)) => self.control.accepted(count),
                     _ => return,
-                }
-            }
-            outgoing.held.set(0);
-            if !self.report(turn, Input::LinkSent { link: self.link }) {
+                };
+            if is_all && !self.report(turn, Input::LinkSent { link: self.link }) {
                 return;
             }
         }
     }
 
     /// Reports acknowledgements to the engine while something is unacknowledged.
-    async fn watch_acknowledgements(&self, turn: u32, outgoing: &UnsentData<'_>) {
+    async fn watch_acknowledgements(&self, turn: u32, writer: &RefCell<TcpWriter<'_>>) {
         loop {
             // Needs no waker: data from the engine wakes this task.
             poll_fn(|_| if self.control.unacknowledged() > 0 { Poll::Ready(()) } else { Poll::Pending })
                 .await;
             Timer::after(ACK_PERIOD).await;
-            if !self.report_acknowledged(turn, outgoing) {
+            if !self.report_acknowledged(turn, writer) {
                 return;
             }
         }
@@ -132,34 +134,14 @@ impl LinkDriver<'_> {
 
     /// Reports unacknowledged bytes to the engine if their number has changed; returns whether the
     /// turn goes on.
-    fn report_acknowledged(&self, turn: u32, outgoing: &UnsentData<'_>) -> bool {
+    fn report_acknowledged(&self, turn: u32, writer: &RefCell<TcpWriter<'_>>) -> bool {
         if !self.control.is_turn(turn) {
             return false;
         }
-        match self.control.acknowledged(outgoing.left()) {
+        match self.control.acknowledged(writer.borrow().send_queue()) {
             Some(left) => self.report(turn, Input::LinkAcked { link: self.link, left }),
             None => true,
         }
-    }
-}
-
-/// Data on its way to the peer.
-struct UnsentData<'a> {
-    writer: RefCell<TcpWriter<'a>>,
-    /// Bytes that the socket has not accepted yet.
-    held: Cell<usize>,
-}
-
-impl UnsentData<'_> {
-    /// Waits until the socket accepts some of the bytes; `None` if it is closed. The writer is borrowed only
-    /// while it is polled.
-    async fn write(&self, bytes: &[u8]) -> Option<usize> {
-        poll_fn(|cx| pin!(self.writer.borrow_mut().write(bytes)).poll(cx)).await.ok()
-    }
-
-    /// Bytes that the peer has not acknowledged.
-    fn left(&self) -> usize {
-        self.held.get().saturating_add(self.writer.borrow().send_queue())
     }
 }
 

@@ -3,6 +3,7 @@
 use core::cell::Cell;
 use core::future::poll_fn;
 use core::pin::pin;
+use core::task::Poll;
 
 use embassy_futures::select::{Either, Either3, select, select3};
 use embassy_net::udp::{PacketMetadata, UdpSocket};
@@ -110,11 +111,16 @@ impl LinkDriver<'_> {
     }
 
     async fn send(&self, turn: u32, socket: &UdpSocket<'_>, peer: &Cell<Option<IpEndpoint>>) -> SocketEnd {
-        while let Some(datagram) = self.control.next(turn).await {
+        while self.control.next(turn).await {
             if let Some(peer) = peer.get() {
-                if socket.send_to(&datagram, peer).await.is_err() {
+                let sending = poll_fn(|cx| {
+                    let sending = self.control.rest(|datagram| socket.poll_send_to(datagram, peer, cx));
+                    sending.unwrap_or(Poll::Ready(Ok(())))
+                });
+                if sending.await.is_err() {
                     return SocketEnd::End;
                 }
+                self.control.taken();
                 let left =
                     select3(self.control.over(turn), socket.wait_send_ready(), Timer::after(SEND_TIMEOUT));
                 match left.await {
@@ -123,6 +129,7 @@ impl LinkDriver<'_> {
                     Either3::Third(()) => return SocketEnd::Reopen,
                 }
             }
+            self.control.taken();
             if !self.report(turn, Input::LinkSent { link: self.link }) {
                 return SocketEnd::End;
             }
