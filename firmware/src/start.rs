@@ -129,7 +129,7 @@ fn make_edge(
     let edge: &'static Edge = EDGE.init(Edge::off());
     let mut edge_setup =
         EdgeSetup { view: NodeView { edge, document: None, clock: CLOCK.take() }, node: None, seed };
-    let edge::NodeMemory { document, state } = MEMORY.take();
+    let edge::NodeMemory { document, node } = MEMORY.take();
     let bd_seq = stored.as_ref().and_then(|stored| stored.store().birth_sequence());
     match stored.and_then(|stored| stored.edge(document)) {
         None | Some(Ok(false)) => return edge_setup,
@@ -144,7 +144,7 @@ fn make_edge(
     edge_setup.view.document = Some(document);
     let made = config
         .ok_or(EdgeError::NothingRuns)
-        .and_then(|config| edge::Node::make(document, state, gateway, config.view(), bd_seq, seed));
+        .and_then(|config| edge::Node::make(document, node, gateway, config.view(), bd_seq, seed));
     match made {
         Ok(node) => edge_setup.node = Some(NODE.init(node)),
         Err(why) => {

@@ -90,6 +90,8 @@ fn sparkplug_node(node: &mut SmallNode, catalog: &SmallCatalog) {
         Input::Closed,
         Input::Bytes(bytes()),
         Input::Sample { values: any(&values[..]), alive: any(1) },
+        Input::Values { first: any(1), values: any(&values[..]) },
+        Input::Sampled { alive: any(1) },
         Input::Time { utc_ms: any(1) },
         Input::End,
     ] {

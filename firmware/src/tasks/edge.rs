@@ -13,16 +13,12 @@ use embassy_futures::yield_now;
 use embassy_net::tcp::TcpSocket;
 use embassy_net::{IpEndpoint, Stack};
 use embassy_time::{Duration, Instant, Timer, with_timeout};
-use heapless::Vec;
 use proto_core::config::ConfigView;
 use proto_core::time::{Duration as Span, Instant as Time};
 use recipe_sparkplug::document::DocumentError;
 pub use recipe_sparkplug::document::NodeDocument;
 use recipe_sparkplug::gateway::{GatewayCatalog, Rates};
-use recipe_sparkplug::node::{
-    EdgeNode, Input, MIN_BUFFER, NodeCounters, NodeError, NodeOutput, SessionFailure,
-};
-use recipe_sparkplug::value::Value;
+use recipe_sparkplug::node::{NodeCounters, EdgeNode, SessionFailure, Input, MIN_BUFFER, NodeError, NodeOutput};
 
 use super::gateway::Gateway;
 use super::link::resolve;
@@ -44,20 +40,16 @@ type BoardCatalog = GatewayCatalog<'static, METRICS>;
 pub struct NodeMemory {
     /// The decoded settings.
     pub document: NodeDocument,
-    /// What the node publishes.
-    pub state: NodeState,
+    /// The state of the node.
+    pub node: NodeState,
 }
 
-/// The node, and the values for it.
-pub struct NodeState {
-    node: EdgeNode<METRICS, HISTORY>,
-    values: Vec<Option<Value>, METRICS>,
-}
+/// The node with room for [`METRICS`] and [`HISTORY`].
+type NodeState = EdgeNode<METRICS, HISTORY>;
 
 impl NodeMemory {
     /// Empty: the settings have not been read.
-    pub const ZEROED: Self =
-        Self { document: NodeDocument::empty(), state: NodeState { node: EdgeNode::idle(), values: Vec::new() } };
+    pub const ZEROED: Self = Self { document: NodeDocument::empty(), node: EdgeNode::idle() };
 }
 
 /// Buffers of the node's socket.
@@ -175,7 +167,7 @@ impl Edge {
 pub struct Node {
     document: &'static NodeDocument,
     catalog: BoardCatalog,
-    state: &'static mut NodeState,
+    node: &'static mut NodeState,
 }
 
 impl Node {
@@ -186,7 +178,7 @@ impl Node {
     /// See [`EdgeError`].
     pub fn make(
         document: &'static NodeDocument,
-        state: &'static mut NodeState,
+        node: &'static mut NodeState,
         gateway: &Gateway,
         config: ConfigView<'_>,
         bd_seq: Option<u8>,
@@ -201,9 +193,8 @@ impl Node {
         let catalog =
             gateway.report(|status| BoardCatalog::new(config, status, rates, env!("CARGO_PKG_VERSION")));
         let catalog = catalog.map_err(|_| EdgeError::Metrics)?;
-        state.node.configure(&document.settings, &catalog, bd_seq, seed).map_err(EdgeError::Node)?;
-        let _ = state.values.resize(catalog.len(), None);
-        Ok(Self { document, catalog, state })
+        node.configure(&document.settings, &catalog, bd_seq, seed).map_err(EdgeError::Node)?;
+        Ok(Self { document, catalog, node })
     }
 
     /// Runs the node forever.
@@ -218,7 +209,7 @@ impl Node {
         clock: &WallClock,
         buffers: NodeBuffers<'_>,
     ) -> ! {
-        let Self { document, catalog, state: NodeState { node, values } } = self;
+        let Self { document, catalog, node } = self;
         let NodeBuffers { rx, tx, piece } = buffers;
         let mut socket = TcpSocket::new(stack, rx, tx);
         socket.set_timeout(Some(SILENT));
@@ -230,7 +221,6 @@ impl Node {
             clock,
             catalog,
             node,
-            values,
             period: Duration::from_micros(document.sample.as_micros()),
             sample_at: Instant::now(),
             was_online: false,
@@ -286,8 +276,7 @@ struct NodeDriver<'a> {
     edge: &'a Edge,
     clock: &'a WallClock,
     catalog: &'a BoardCatalog,
-    node: &'a mut EdgeNode<METRICS, HISTORY>,
-    values: &'a mut [Option<Value>],
+    node: &'a mut NodeState,
     period: Duration,
     sample_at: Instant,
     was_online: bool,
@@ -301,13 +290,8 @@ impl NodeDriver<'_> {
         self.sample_at = Instant::now() + self.period;
         let uptime = Span::from_micros(Instant::now().as_micros());
         let counters = self.node.counters();
-        let mut start = 0_usize;
-        while start < self.values.len() {
-            let part = start..start.saturating_add(PLACES);
-            self.gateway.report(|status| {
-                self.catalog.sample_part(status, uptime, &counters, part.clone(), self.values);
-            });
-            start = part.end;
+        for first in (0..self.catalog.len()).step_by(PLACES) {
+            self.sample_part(first, uptime, &counters);
             self.pulse.idle(pin!(yield_now())).await;
         }
         let alive = self.gateway.report(|status| self.catalog.alive(status));
@@ -315,7 +299,17 @@ impl NodeDriver<'_> {
         if let Some(utc_ms) = self.clock.utc_ms(at) {
             self.node.handle(at, Input::Time { utc_ms }, self.catalog);
         }
-        self.node.handle(at, Input::Sample { values: self.values, alive }, self.catalog);
+        self.node.handle(at, Input::Sampled { alive }, self.catalog);
+    }
+
+    fn sample_part(&mut self, first: usize, uptime: Span, counters: &Counters) {
+        let mut values = [None; PLACES];
+        let end = first.saturating_add(PLACES).min(self.catalog.len());
+        self.gateway.report(|status| {
+            self.catalog.sample_part(status, uptime, counters, first..end, &mut values);
+        });
+        let values = values.get(..end.saturating_sub(first)).unwrap_or(&[]);
+        self.node.handle(now(), Input::Values { first, values }, self.catalog);
     }
 
     /// Executes the outputs of the node until it sleeps.
@@ -386,7 +380,7 @@ impl NodeDriver<'_> {
             is_online,
             failure,
             bd_seq: self.node.bd_seq(),
-            metrics: self.values.len(),
+            metrics: self.catalog.len(),
             counters: self.node.counters(),
         }));
         match failure {

@@ -213,7 +213,8 @@ impl<'c, const METRICS: usize> GatewayCatalog<'c, METRICS> {
         alive
     }
 
-    /// Same as [`Self::sample`] for some of the places, so that a driver can let others run in between.
+    /// Same as [`Self::sample`] for some of the places, so that a driver can let others run in between. `values` are
+    /// those of the part.
     pub fn sample_part(
         &self,
         status: Status<'_>,
@@ -234,7 +235,9 @@ impl<'c, const METRICS: usize> GatewayCatalog<'c, METRICS> {
             }
             let port = port.and_then(|port| status.ports().find(|status| status.id.0 == port.index));
             for place in places {
-                let (Some(told), Some(value)) = (self.items.get(place), values.get_mut(place)) else {
+                let (Some(told), Some(value)) =
+                    (self.items.get(place), values.get_mut(place.saturating_sub(part.start)))
+                else {
                     break;
                 };
                 let item = told.item;
@@ -279,7 +282,9 @@ impl<'c, const METRICS: usize> GatewayCatalog<'c, METRICS> {
             let Some(bit) = known.bit else { continue };
             let wanted = MetricSource::Bit(known.var, bit);
             for (place, _) in here().filter(|(_, told)| told.item == wanted) {
-                if let (Some(value), Scalar::Byte(byte)) = (values.get_mut(place), known.value) {
+                if let (Some(value), Scalar::Byte(byte)) =
+                    (values.get_mut(place.saturating_sub(part.start)), known.value)
+                {
                     *value = Some(Value::Boolean(byte != 0));
                 }
             }

@@ -1,19 +1,17 @@
 //! Values that could not be told when they were new: a bounded ring. When it is full the oldest goes, and is counted.
 
+use crate::value::{Stamp, Stored};
 use heapless::Deque;
-use proto_core::time::Instant;
-
-use crate::value::Value;
 
 /// A value of the past.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy)]
 pub(crate) struct Past {
     /// The place of its metric.
     pub place: u16,
-    /// `None` if it had become unknown.
-    pub value: Option<Value>,
+    /// It may have become unknown.
+    pub value: Stored,
     /// When.
-    pub at: Instant,
+    pub at: Stamp,
 }
 
 /// The ring.
@@ -78,7 +76,7 @@ mod tests {
     use std::vec::Vec;
 
     fn past(place: u16) -> Past {
-        Past { place, value: None, at: Instant::ZERO }
+        Past { place, value: Stored::Unknown, at: Stamp::NEVER }
     }
 
     fn places<const ROOM: usize>(history: &History<ROOM>) -> Vec<u16> {

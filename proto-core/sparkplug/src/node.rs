@@ -19,8 +19,8 @@ use crate::history::{History, Past};
 use crate::mqtt::{Inbox, Packet, ProtocolError};
 use crate::payload::{self, Asked, HostState};
 use crate::topic;
-use crate::value::{DataType, Value};
-pub use io::{Input, NodeCounters, NodeError, NodeOutput, SessionFailure};
+use crate::value::{DataType, Stamp, Stored, Value};
+pub use io::{NodeCounters, SessionFailure, Input, NodeError, NodeOutput};
 use maybe::Maybe;
 pub use messages::MAX_METRIC;
 pub use settings::{Credential, MAX_TEXT, Settings};
@@ -75,10 +75,10 @@ struct NodeMetric {
     data_type: DataType,
     /// To be told.
     is_pending: bool,
-    current: Option<Value>,
-    /// The last one told, and when it was sampled.
-    published: Option<Value>,
-    published_at: Option<Instant>,
+    current: Stored,
+    /// The last one told, and when it was sampled; never if none was.
+    published: Stored,
+    published_at: Stamp,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -219,14 +219,13 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         }
         for place in 0..end {
             let data_type = catalog.metric(place).ok_or(NodeError::Metric { place })?.data_type;
-            let slot = NodeMetric {
+            let _ = self.slots.push(NodeMetric {
                 data_type,
                 is_pending: false,
-                current: None,
-                published: None,
-                published_at: None,
-            };
-            let _ = self.slots.push(slot);
+                current: Stored::Unknown,
+                published: Stored::Unknown,
+                published_at: Stamp::NEVER,
+            });
         }
         self.settings.clone_from(settings);
         (self.bd_seq, self.random, self.ping_at) = (bd_seq, seed | 1, Instant::NEVER);
@@ -252,7 +251,13 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
                 }
             }
             Input::Bytes(bytes) => self.receive(now, bytes),
-            Input::Sample { values, alive } => self.sample(now, values, alive, catalog),
+            Input::Sample { values, alive } => {
+                self.slots.iter_mut().skip(values.len()).for_each(|slot| slot.current = Stored::Unknown);
+                self.take_values(0, values);
+                self.sampled(now, alive, catalog);
+            }
+            Input::Values { first, values } => self.take_values(first, values),
+            Input::Sampled { alive } => self.sampled(now, alive, catalog),
             Input::Time { utc_ms } => {
                 let is_new = self.clock.set(now, utc_ms);
                 // What was told before has no date.
@@ -297,7 +302,14 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         matches!(self.phase, NodePhase::Birth(_) | NodePhase::Online)
     }
 
-    fn sample(&mut self, now: Instant, values: &[Option<Value>], alive: u32, catalog: &impl Catalog) {
+    fn take_values(&mut self, first: usize, values: &[Option<Value>]) {
+        for (slot, value) in self.slots.iter_mut().skip(first).zip(values) {
+            let value = value.and_then(Value::known).filter(|value| value.data_type() == slot.data_type);
+            slot.current = Stored::of(value);
+        }
+    }
+
+    fn sampled(&mut self, now: Instant, alive: u32, catalog: &impl Catalog) {
         let publishes = self.publishes();
         (self.sampled_at, self.alive) = (now, alive);
         for (index, owner) in (0..).zip(owners(MAX_DEVICES)) {
@@ -312,18 +324,16 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
             };
             for place in start..end {
                 let Some(slot) = self.slots.get_mut(usize::from(place)) else { break };
-                let value = values.get(usize::from(place)).copied().flatten().and_then(Value::known);
-                slot.current = value.filter(|value| value.data_type() == slot.data_type);
                 let report = catalog.report(place.into());
-                let is_due =
-                    slot.published_at.is_none_or(|at| now.saturating_since(at) >= report.min_interval);
+                let at = slot.published_at();
+                let is_due = at.is_none_or(|at| now.saturating_since(at) >= report.min_interval);
                 slot.is_pending = is_alive && is_due && slot.is_changed(report.dead_band);
                 if slot.is_pending && !publishes {
                     // The first value is no change.
-                    let is_change = slot.published_at.is_some();
+                    let is_change = at.is_some();
                     slot.tell(now);
                     if is_change {
-                        self.history.push(Past { place, value: slot.published, at: now });
+                        self.history.push(Past { place, value: slot.published, at: slot.published_at });
                     }
                 }
             }
@@ -474,8 +484,20 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
 }
 
 impl NodeMetric {
+    fn current(&self) -> Option<Value> {
+        self.current.get(self.data_type)
+    }
+
+    fn published(&self) -> Option<Value> {
+        self.published.get(self.data_type)
+    }
+
+    fn published_at(&self) -> Option<Instant> {
+        Some(self.published_at.get()).filter(|at| *at != Instant::NEVER)
+    }
+
     fn is_changed(&self, dead_band: f64) -> bool {
-        match (self.current, self.published) {
+        match (self.current(), self.published()) {
             (Some(current), Some(told)) => current.differs(told, dead_band),
             (current, told) => current.is_some() != told.is_some(),
         }
@@ -483,7 +505,7 @@ impl NodeMetric {
 
     /// Its value was told, of this instant.
     fn tell(&mut self, at: Instant) {
-        (self.published, self.published_at, self.is_pending) = (self.current, Some(at), false);
+        (self.published, self.published_at, self.is_pending) = (self.current, Stamp::of(at), false);
     }
 }
 

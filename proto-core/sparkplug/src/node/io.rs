@@ -23,6 +23,18 @@ pub enum Input<'a> {
         /// The devices that work: bit n is device n.
         alive: u32,
     },
+    /// Values of the next sample, by the places from this one on; `None`: unknown.
+    Values {
+        /// The place of the first one.
+        first: usize,
+        /// The values.
+        values: &'a [Option<Value>],
+    },
+    /// All values were given by [`Input::Values`]: they are those of this instant.
+    Sampled {
+        /// The devices that work, as in [`Input::Sample`].
+        alive: u32,
+    },
     /// UTC at this instant.
     Time {
         /// Milliseconds since 1970.

@@ -172,7 +172,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         let at = self.clock.at(self.sampled_at);
         let shown = |place: usize| {
             let slot = self.slots.get(place).filter(|slot| slot.is_pending)?;
-            Some(data_metric(place, at, slot.current, false))
+            Some(data_metric(place, at, slot.current(), false))
         };
         let count = self.room_for(now, catalog, owner, buf.len(), places.clone().filter_map(shown));
         if count == 0 {
@@ -208,7 +208,11 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         let owner = owner_of(&self.starts, self.history.iter().next()?.place);
         let past = || {
             let of_owner = self.history.iter().take_while(|past| owner_of(&self.starts, past.place) == owner);
-            of_owner.map(|past| data_metric(past.place.into(), self.clock.at(past.at), past.value, true))
+            of_owner.map(|past| {
+                let place = usize::from(past.place);
+                let value = self.slots.get(place).and_then(|slot| past.value.get(slot.data_type));
+                data_metric(place, self.clock.at(past.at.get()), value, true)
+            })
         };
         let count = self.room_for(now, catalog, owner, buf.len(), past());
         if count == 0 {
@@ -314,7 +318,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
             name: Some(&metric.name),
             data_type: Some(slot.data_type),
             details: Details { unit: metric.unit, range: metric.range, description: metric.description },
-            ..data_metric(place, self.dates.sampled_ms, slot.published, false)
+            ..data_metric(place, self.dates.sampled_ms, slot.published(), false)
         };
         payload::metric(out, &shown);
     }

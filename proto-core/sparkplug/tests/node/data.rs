@@ -95,6 +95,27 @@ fn unknown_values_are_null_and_never_invented() {
 }
 
 #[test]
+fn a_sample_in_parts_is_told_when_it_is_whole() {
+    let mut rig = Rig::online();
+    rig.wait_ms(10);
+    rig.values[0] = Some(Value::Float(1.0));
+    rig.values[1] = Some(Value::Float(f32::NAN));
+    let values = rig.values.clone();
+    for (part, values) in values.chunks(2).enumerate() {
+        rig.handle(Input::Values { first: 2 * part, values });
+        assert_eq!(rig.drain(), []);
+    }
+    rig.handle(Input::Sampled { alive: rig.alive });
+    let in_parts = rig.messages();
+    let mut other = Rig::online();
+    other.wait_ms(10);
+    other.values = values;
+    other.sample();
+    assert_eq!(in_parts.iter().flat_map(|message| message.values()).collect::<Vec<_>>(), ["#1=1"]);
+    assert_eq!(in_parts, other.messages());
+}
+
+#[test]
 fn more_than_a_buffer_is_more_messages() {
     let mut rig = Rig::new(settings(), Plant { more: 150, ..Plant::default() });
     rig.buffer = 800;
