@@ -14,7 +14,7 @@ use recipe_api::guard::{Guard, Refusal, Site};
 use recipe_api::key::{BodyHash, Hash, Hex, Key, Signed, from_hex};
 use recipe_api::metrics::Families;
 use recipe_api::nonces::Nonces;
-use recipe_api::request::{HeadBuffer, HttpHead};
+use recipe_api::request::{HttpHead, HeadBuffer, MAX_HEAD};
 use recipe_api::response::{ContentType, Length, Response, StatusCode, write_chunk};
 use recipe_api::revisions::{Result as Done, Revision, Revisions, Stored};
 use recipe_api::route::{self, BodyType, Served};
@@ -36,7 +36,8 @@ impl Write for FailingWriter {
 }
 
 pub(crate) fn all() {
-    let mut buffer = HeadBuffer::new();
+    let mut memory = [0; MAX_HEAD];
+    let mut buffer = HeadBuffer::within(&mut memory);
     remote_push(black_box(&mut buffer));
     let mut guard = Guard::new(any(Some(Key::new([0; 16]))), any([0; 32]));
     let guard = black_box(&mut guard);
@@ -68,15 +69,12 @@ fn address() -> IpAddr {
 }
 
 #[inline(never)]
-fn remote_push(buffer: &mut HeadBuffer) {
+fn remote_push(buffer: &mut HeadBuffer<&mut [u8]>) {
     black_box((buffer.push(bytes()), buffer.is_empty()));
-    if any(false) {
-        buffer.clear();
-    }
 }
 
 #[inline(never)]
-fn remote_head(buffer: &HeadBuffer) -> Option<HttpHead<'_>> {
+fn remote_head<'h>(buffer: &'h HeadBuffer<&mut [u8]>) -> Option<HttpHead<'h>> {
     match buffer.head() {
         Ok(head) => Some(head),
         Err(error) => {

@@ -11,10 +11,10 @@ pub const MAX_HEAD: usize = 2048;
 /// Maximum number of header fields.
 pub const MAX_FIELDS: usize = 32;
 
-/// The bytes of a head, while they arrive.
+/// The bytes of a head, while they arrive, in memory of [`MAX_HEAD`] bytes.
 #[derive(Debug, Clone)]
-pub struct HeadBuffer {
-    bytes: [u8; MAX_HEAD],
+pub struct HeadBuffer<B = [u8; MAX_HEAD]> {
+    bytes: B,
     len: usize,
     /// The newest four bytes.
     tail: [u8; 4],
@@ -32,12 +32,17 @@ impl HeadBuffer {
     pub const fn new() -> Self {
         Self { bytes: [0; MAX_HEAD], len: 0, tail: [0; 4], is_complete: false }
     }
+}
 
-    /// Forgets everything, for the next connection.
-    pub fn clear(&mut self) {
-        *self = Self::new();
+impl<'b> HeadBuffer<&'b mut [u8]> {
+    /// Without a byte, in memory of the caller's. In less than [`MAX_HEAD`] bytes a head that is longer never becomes
+    /// complete.
+    pub const fn within(bytes: &'b mut [u8]) -> Self {
+        Self { bytes, len: 0, tail: [0; 4], is_complete: false }
     }
+}
 
+impl<B: AsRef<[u8]> + AsMut<[u8]>> HeadBuffer<B> {
     /// Whether nothing has arrived.
     pub const fn is_empty(&self) -> bool {
         self.len == 0
@@ -50,7 +55,7 @@ impl HeadBuffer {
             return 0;
         }
         let mut taken = 0_usize;
-        for (place, byte) in self.bytes.iter_mut().skip(self.len).zip(bytes) {
+        for (place, byte) in self.bytes.as_mut().iter_mut().take(MAX_HEAD).skip(self.len).zip(bytes) {
             *place = *byte;
             taken = taken.saturating_add(1);
             let [_, one, two, three] = self.tail;
@@ -69,7 +74,7 @@ impl HeadBuffer {
     /// # Errors
     /// [`HeadError::Incomplete`] while more bytes are needed, or why the request is refused.
     pub fn head(&self) -> Result<HttpHead<'_>, HeadError> {
-        match (self.is_complete, self.bytes.get(..self.len)) {
+        match (self.is_complete, self.bytes.as_ref().get(..self.len)) {
             (true, Some(head)) => HttpHead::parse(head),
             _ if self.len == MAX_HEAD => Err(HeadError::TooLong),
             _ => Err(HeadError::Incomplete),
@@ -414,6 +419,18 @@ mod tests {
         let mut buffer = HeadBuffer::new();
         buffer.push("GET / HTTP/1.1\r\nCookie: n=é\r\nHost: a\r\n\r\n".as_bytes());
         assert_eq!(buffer.head().map(|head| head.host), Ok("a"));
+    }
+
+    #[test]
+    fn a_head_may_be_in_other_memory_which_may_be_longer() {
+        let mut memory = [0xA5; MAX_HEAD + 4];
+        let mut buffer = HeadBuffer::within(&mut memory);
+        assert_eq!(buffer.push(b"GET /a HTTP/1.1\r\nHost: a\r\n\r\nrest"), 28);
+        assert_eq!(buffer.head().map(|head| (head.method, head.target)), Ok((Method::Get, "/a")));
+        let mut buffer = HeadBuffer::within(&mut memory);
+        assert_eq!(buffer.push(&[b'a'; MAX_HEAD + 4]), MAX_HEAD);
+        assert_eq!(buffer.head(), Err(HeadError::TooLong));
+        assert_eq!(memory[MAX_HEAD..], [0xA5; 4]);
     }
 
     #[test]

@@ -1,9 +1,52 @@
-//! Arguments of operations that change something.
+//! Arguments of operations: those of the head, and those of the body.
 
+use proto_core::engine::PortId;
 use proto_core::time::Duration as Span;
 use recipe_api::arguments::{ArgumentValue, each};
 use recipe_api::key::{KEY_LEN, Key, from_hex};
+use recipe_api::request::{HttpHead, Method};
+use recipe_api::response::StatusCode;
+use recipe_api::revisions::Revision;
 use recipe_api::route::ApiOperation;
+
+use super::answer::Etag;
+
+/// What a head says beside the operation. It is parsed at once, so that the memory of the head is free for the reply.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct HeadArguments {
+    pub(super) method: Method,
+    /// `revision`, `lines` or `offset`, of which an operation has one; `Some(None)`: no number.
+    pub(super) number: Option<Option<u32>>,
+    /// `downgrade` or `restart`; `Some(false)`: not `yes`.
+    pub(super) yes: Option<bool>,
+    /// Frames are wanted.
+    pub(super) frames: bool,
+    /// The port of the frames; `Some(None)`: there is no such port.
+    pub(super) port: Option<Option<PortId>>,
+    /// `If-Match`; `Some(None)`: not one ETag.
+    pub(super) if_match: Option<Option<Revision>>,
+    /// `If-None-Match`, if it is the ETag of a revision.
+    pub(super) if_none_match: Option<Revision>,
+    /// Status of the page, which depends on `If-None-Match`.
+    pub(super) page: Status,
+}
+
+impl HeadArguments {
+    /// `find` returns the port of a name.
+    pub(super) fn of(head: &Head<'_>, page: Status, find: impl FnOnce(&str) -> Option<PortId>) -> Self {
+        let first = |names: &[&str]| names.iter().find_map(|name| head.query(name));
+        Self {
+            method: head.method,
+            number: first(&["revision", "lines", "offset"]).map(|text| text.parse().ok()),
+            yes: first(&["downgrade", "restart"]).map(|text| text == "yes"),
+            frames: head.query("frames") == Some("1"),
+            port: head.query("port").map(find),
+            if_match: head.if_match.map(Etag::parse),
+            if_none_match: head.if_none_match.and_then(Etag::parse),
+            page,
+        }
+    }
+}
 
 /// Arguments parsed from a body.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -177,10 +177,10 @@ impl Console {
 
 /// Whether the request allows an older firmware.
 fn downgrade(buf: &mut [u8], request: &ConsoleRequest<'_>) -> Result<Downgrade, Reply> {
-    match request.head.query("downgrade") {
+    match request.head.yes {
         None => Ok(Downgrade::Refused),
-        Some("yes") => Ok(Downgrade::Allowed),
-        Some(_) => Err(Reply::error(buf, StatusCode::BAD_REQUEST, "downgrade is out of range; allowed: yes")),
+        Some(true) => Ok(Downgrade::Allowed),
+        Some(false) => Err(Reply::error(buf, StatusCode::BAD_REQUEST, "downgrade is out of range; allowed: yes")),
     }
 }
 
@@ -190,7 +190,7 @@ fn put_piece<'a>(
 ) -> Result<(StoreRequest, StoreLock<'a>), Reply> {
     let downgrade = downgrade(buf, &request)?;
     let Some((len, lock)) = request.image else { return Err(busy(buf)) };
-    let Some(Ok(offset)) = request.head.query("offset").map(str::parse) else {
+    let Some(Some(offset)) = request.head.number else {
         let text = "offset must be a number: where the piece begins in header and image";
         return Err(Reply::error(buf, StatusCode::BAD_REQUEST, text));
     };
@@ -199,7 +199,7 @@ fn put_piece<'a>(
 
 fn put<'a>(buf: &mut [u8], request: ConsoleRequest<'a>) -> Result<(StoreRequest, StoreLock<'a>), Reply> {
     let Some((len, lock)) = request.image else { return Err(busy(buf)) };
-    let (status, text) = match request.head.if_match.map(Etag::parse) {
+    let (status, text) = match request.head.if_match {
         None => {
             let text = "If-Match is needed: the ETag of the revision that this one was made from";
             (StatusCode::PRECONDITION_REQUIRED, text)

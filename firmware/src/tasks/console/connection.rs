@@ -8,15 +8,16 @@ use embassy_futures::yield_now;
 use embassy_net::tcp::TcpSocket;
 use embassy_net::{IpAddress, Stack};
 use embassy_time::{Duration, Instant, Timer, with_deadline, with_timeout};
-use recipe_api::guard::{Admitted, Site};
+use recipe_api::guard::{Admitted, Refusal, Site};
 use recipe_api::key::BodyHash;
-use recipe_api::request::{HeadBuffer, HeadError, HttpHead, Method};
+use recipe_api::request::{HttpHead, HeadBuffer, HeadError, MAX_HEAD, Method};
 use recipe_api::response::{CONTINUE, StatusCode};
 use recipe_api::route::{ApiOperation, Served};
 
-use super::answer::{Reply, RequestOutcome, Responder, SendError};
-use super::arguments::Arguments;
+use super::answer::{RequestOutcome, Reply, Responder, SendError};
+use super::arguments::{Arguments, HeadArguments};
 use super::change::{busy, nothing_kept};
+use super::read::PAGE;
 use super::{ConnectionPermit, Console, MAX_TIME, PORT};
 use crate::clock::now;
 use crate::tasks::store::StoreLock;
@@ -45,7 +46,7 @@ impl<'a> ConnectionBuffers<'a> {
 
 /// A parsed request.
 pub(super) struct ConsoleRequest<'a> {
-    pub(super) head: HttpHead<'a>,
+    pub(super) head: HeadArguments,
     pub(super) operation: ApiOperation,
     pub(super) arguments: Arguments,
     /// Length of the body in the image buffer of the store handle, and the lock on it.
@@ -57,7 +58,6 @@ impl Console {
     /// Serves connections with one socket, forever.
     pub async fn serve(&self, pulse: &Pulse, stack: Stack<'_>, buffers: ConnectionBuffers<'_>) -> ! {
         let ConnectionBuffers { rx, tx, buf } = buffers;
-        let mut head = HeadBuffer::new();
         loop {
             let mut socket = TcpSocket::new(stack, rx, tx);
             // A peer that never completes the handshake must not occupy the socket.
@@ -72,8 +72,7 @@ impl Console {
                 // No limit: the number of tasks is the limit.
                 let _one = ConnectionPermit::of(&self.connections, usize::MAX);
                 self.count(|counters| &mut counters.connections);
-                head.clear();
-                match self.connection(&mut socket, &mut head, buf).await {
+                match self.connection(&mut socket, buf).await {
                     Err(SendError::Slow) => self.count(|counters| &mut counters.slow_readers),
                     Err(SendError::TooLong) => self.count(|counters| &mut counters.cut_off),
                     Ok(()) => {
@@ -94,19 +93,14 @@ impl Console {
         }
     }
 
-    async fn connection<'a>(
-        &'a self,
-        socket: &mut TcpSocket<'_>,
-        buffer: &'a mut HeadBuffer,
-        buf: &mut [u8],
-    ) -> Result<(), SendError> {
+    async fn connection(&self, socket: &mut TcpSocket<'_>, buf: &mut [u8]) -> Result<(), SendError> {
         let mut responder = Responder { socket, buf, is_head: false, nonce: None };
         let deadline = Instant::now() + MAX_TIME;
-        let rest = match self.receive_head(&mut responder, buffer, deadline).await? {
-            Some(rest) => rest,
+        let (decided, rest) = match self.receive_head(&mut responder, deadline).await? {
+            Some(received) => received,
             None => return self.was_incomplete(&mut responder).await,
         };
-        let reply = match self.admit(&mut responder, buffer) {
+        let reply = match self.admit(&mut responder, decided) {
             Ok((admitted, mut request)) => {
                 match self.receive_body(&mut responder, &admitted, &mut request, rest, deadline).await? {
                     BodyRead::Whole => match self.execute(&mut responder, request).await? {
@@ -131,15 +125,19 @@ impl Console {
         responder.answer(&reply).await
     }
 
-    /// Waits for the head. Returns where the beginning of the body is in the buffer; `None` on timeout.
+    /// Waits for the head, in the buffer of the reply. Returns what comes of it, and where the beginning of the body is
+    /// in the buffer; `None` on timeout.
     async fn receive_head(
         &self,
         responder: &mut Responder<'_, '_>,
-        buffer: &mut HeadBuffer,
         deadline: Instant,
-    ) -> Result<Option<Range<usize>>, SendError> {
+    ) -> Result<Option<(Result<Decided, Refusal>, Range<usize>)>, SendError> {
+        let Some((head, chunk)) = responder.buf.split_at_mut_checked(MAX_HEAD) else {
+            return Err(SendError::TooLong);
+        };
+        let chunk = chunk.get_mut(..CHUNK).unwrap_or(&mut []);
+        let mut buffer = HeadBuffer::within(head);
         loop {
-            let chunk = responder.buf.get_mut(..CHUNK).unwrap_or(&mut []);
             let count = match with_deadline(deadline, responder.socket.read(chunk)).await {
                 Ok(Ok(count @ 1..)) => count,
                 // Browsers open connections that they may never use.
@@ -150,31 +148,42 @@ impl Console {
                     return Err(SendError::Gone);
                 }
             };
-            let taken = buffer.push(responder.buf.get(..count).unwrap_or(&[]));
-            if buffer.head() != Err(HeadError::Incomplete) {
-                return Ok(Some(taken..count));
+            let taken = buffer.push(chunk.get(..count).unwrap_or(&[]));
+            let head = buffer.head();
+            if head != Err(HeadError::Incomplete) {
+                let decided = self.decide(responder.socket, head);
+                let place = |of: usize| MAX_HEAD.saturating_add(of);
+                return Ok(Some((decided, place(taken)..place(count))));
             }
         }
     }
 
-    /// Admits or refuses a request by its head.
+    /// Decides about a request by its head.
     #[inline(never)]
-    fn admit<'a>(
-        &'a self,
-        responder: &mut Responder<'_, '_>,
-        buffer: &'a HeadBuffer,
-    ) -> Result<(Admitted, ConsoleRequest<'a>), Reply> {
-        let (local, peer) = match (responder.socket.local_endpoint(), responder.socket.remote_endpoint()) {
+    fn decide(&self, socket: &TcpSocket<'_>, head: Result<HttpHead<'_>, HeadError>) -> Result<Decided, Refusal> {
+        let (local, peer) = match (socket.local_endpoint(), socket.remote_endpoint()) {
             (Some(local), Some(peer)) => (address(local.addr), address(peer.addr)),
             _ => (Ipv4Addr::UNSPECIFIED, Ipv4Addr::UNSPECIFIED),
         };
         let site = Site { local: local.into(), peer: peer.into(), names: &[&self.name] };
-        let mut guard = self.guard.borrow_mut();
-        let admitted = match buffer.head() {
-            Ok(head) => guard.admit(now(), &head, &site, Served::Board).map(|admitted| (head, admitted)),
-            Err(error) => Err(error.into()),
+        let head = head?;
+        let admitted = self.guard.borrow_mut().admit(now(), &head, &site, Served::Board)?;
+        let port = |name: &str| {
+            self.gateway.report(|status| status.ports().find(|port| port.name == name).map(|port| port.id))
         };
-        let (head, admitted) = admitted.map_err(|refusal| {
+        let arguments = HeadArguments::of(&head, PAGE.status(head.if_none_match), port);
+        Ok(Decided { admitted, arguments, peer })
+    }
+
+    /// Prepares what an admitted request needs, or the reply to another one.
+    #[inline(never)]
+    fn admit(
+        &self,
+        responder: &mut Responder<'_, '_>,
+        decided: Result<Decided, Refusal>,
+    ) -> Result<(Admitted, ConsoleRequest<'_>), Reply> {
+        let mut guard = self.guard.borrow_mut();
+        let Decided { admitted, arguments: head, peer } = decided.map_err(|refusal| {
             if refusal.status == StatusCode::UNAUTHORIZED {
                 responder.nonce = Some(guard.nonce(now()));
             }
@@ -252,6 +261,13 @@ impl Console {
     }
 }
 
+/// An admitted request.
+struct Decided {
+    admitted: Admitted,
+    arguments: HeadArguments,
+    peer: Ipv4Addr,
+}
+
 /// Result of receiving a body.
 enum BodyRead {
     Whole,
@@ -271,8 +287,10 @@ fn address(address: IpAddress) -> Ipv4Addr {
 const RX: usize = 1024;
 /// Transmit buffer: unacknowledged data at a long round trip.
 const TX: usize = 1536;
-/// Buffer of a connection: the longest piece of a reply, or its head and a short body.
+/// Buffer of a connection: the longest piece of a reply, or its head and a short body. Before that, the head of the
+/// request and what is read of it at once.
 const BUFFER: usize = 3328;
+const _: () = assert!(BUFFER >= MAX_HEAD + CHUNK);
 /// Bytes per read; each chunk of an image is hashed in one go.
 const CHUNK: usize = 512;
 /// Time for a client to stop sending after its reply.

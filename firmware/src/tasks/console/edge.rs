@@ -103,10 +103,10 @@ pub(super) fn settings<'a>(
     buf: &mut [u8],
     request: ConsoleRequest<'a>,
 ) -> Result<(StoreRequest, StoreLock<'a>), Reply> {
-    let restart = match request.head.query("restart") {
+    let restart = match request.head.yes {
         None => false,
-        Some("yes") => true,
-        Some(_) => {
+        Some(true) => true,
+        Some(false) => {
             return Err(Reply::error(buf, StatusCode::BAD_REQUEST, "restart is out of range; allowed: yes"));
         }
     };

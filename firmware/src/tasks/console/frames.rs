@@ -2,7 +2,7 @@
 
 use core::fmt::{self, Write};
 
-use proto_core::engine::{TapDirection, TapPlace, TapRecord, TapVerdict};
+use proto_core::engine::{PortId, TapDirection, TapPlace, TapRecord, TapVerdict};
 use proto_core::wire::can::CanId;
 use recipe_api::json;
 use recipe_api::key::Hex;
@@ -13,15 +13,15 @@ use super::answer::TextBuffer;
 /// The only reader of the frame tap; released on drop.
 pub(super) struct Follower<'c> {
     console: &'c Console,
-    /// Restricts the frames to this port.
-    port: Option<&'c str>,
+    /// Restricts the frames to this port, or to none.
+    port: Option<Option<PortId>>,
     /// Records dropped because the queue was full, not yet reported.
     lost: u32,
 }
 
 impl Console {
     /// Starts reading the tap; `None` if there is a reader already, because there is one ring.
-    pub(super) fn follow<'c>(&'c self, port: Option<&'c str>) -> Option<Follower<'c>> {
+    pub(super) fn follow(&self, port: Option<Option<PortId>>) -> Option<Follower<'_>> {
         if self.is_followed.replace(true) {
             return None;
         }
@@ -49,7 +49,7 @@ impl Follower<'_> {
             let TapPlace::Port(id) = record.place else { continue };
             self.console.gateway.report(|status| {
                 let Some(port) = status.ports().find(|port| port.id == id) else { return Ok(()) };
-                if self.port.is_some_and(|only| only != port.name) {
+                if self.port.is_some_and(|only| only != Some(id)) {
                     return Ok(());
                 }
                 out.write_str(if count == 0 { "event: frames\ndata: {\"frames\":[" } else { "," })?;

@@ -16,7 +16,7 @@ use recipe_api::revisions::{Revision, Revisions};
 use recipe_api::route::ApiOperation;
 use serde::Serialize;
 
-use super::answer::{Etag, Reply, RequestOutcome, Responder, SendError, TextBuffer};
+use super::answer::{RequestOutcome, Reply, Responder, SendError, TextBuffer};
 use super::change::{busy, nothing_kept};
 use super::connection::ConsoleRequest;
 use super::documents::DocumentSource;
@@ -158,10 +158,10 @@ impl Console {
         request: &ConsoleRequest<'_>,
     ) -> Result<(&'static StoreHandle, Revision), Reply> {
         let Some(store) = self.store else { return Err(nothing_kept(buf)) };
-        let number = match request.head.query("revision").map(str::parse) {
+        let number = match request.head.number {
             None => store.running(),
-            Some(Ok(number)) => Some(number),
-            Some(Err(_)) => {
+            Some(Some(number)) => Some(number),
+            Some(None) => {
                 return Err(Reply::error(buf, StatusCode::BAD_REQUEST, "revision must be a number"));
             }
         };
@@ -169,7 +169,7 @@ impl Console {
         let Some(revision) = revision.filter(|revision| *revision != NOTHING) else {
             return Err(Reply::error(buf, StatusCode::NOT_FOUND, "there is no such revision"));
         };
-        if request.head.if_none_match.and_then(Etag::parse) == Some(revision) {
+        if request.head.if_none_match == Some(revision) {
             let unchanged = Reply::new(buf, StatusCode::NOT_MODIFIED, ContentType::Image, |_| Ok(()));
             return Err(unchanged.about(Some(revision)));
         }
@@ -178,13 +178,10 @@ impl Console {
 }
 
 /// Sends the newest lines of the log.
-async fn log(
-    responder: &mut Responder<'_, '_>,
-    request: &ConsoleRequest<'_>,
-) -> Result<RequestOutcome, SendError> {
-    let lines = match request.head.query("lines").map(str::parse) {
+async fn log(responder: &mut Responder<'_, '_>, request: &ConsoleRequest<'_>) -> Result<RequestOutcome, SendError> {
+    let lines = match request.head.number {
         None => MAX_LINES,
-        Some(Ok(lines @ 1..=MAX_LINES)) => lines,
+        Some(Some(lines @ 1..=MAX_LINES)) => lines,
         Some(_) => {
             let text = "lines is out of range; allowed: 1..=256";
             return Ok(RequestOutcome::Reply(Reply::error(responder.buf, StatusCode::BAD_REQUEST, text)));
@@ -193,7 +190,7 @@ async fn log(
     if !responder.begin(ContentType::Text, Length::Chunked, None).await? {
         return Ok(RequestOutcome::Sent);
     }
-    let mut place = journal::last(lines);
+    let mut place = journal::last(lines as usize);
     // Lines added meanwhile are not sent.
     for _ in 0..journal::CAPACITY.div_ceil(LOG_PIECE) {
         let (len, behind) = journal::read(place, responder.buf.get_mut(..LOG_PIECE).unwrap_or(&mut []));
@@ -209,11 +206,8 @@ async fn log(
 }
 
 /// Sends the web page, unless the client has it cached.
-async fn page(
-    responder: &mut Responder<'_, '_>,
-    request: &ConsoleRequest<'_>,
-) -> Result<RequestOutcome, SendError> {
-    let status = PAGE.status(request.head.if_none_match);
+async fn page(responder: &mut Responder<'_, '_>, request: &ConsoleRequest<'_>) -> Result<RequestOutcome, SendError> {
+    let status = request.head.page;
     let mut buf = TextBuffer::new(responder.buf);
     PAGE.write_head(status, &mut buf).map_err(|_| SendError::TooLong)?;
     let (head, until) = (buf.len, Instant::now() + MAX_ANSWER);
@@ -289,9 +283,9 @@ fn write_json(out: &mut TextBuffer<'_>, value: &impl Serialize) -> fmt::Result {
 }
 
 /// The web page.
-const PAGE: Page =
+pub(super) const PAGE: Page =
     Page { bytes: &recipe_console::PAGE, policy: recipe_console::POLICY, etag: recipe_console::ETAG };
 /// Bytes of it per write.
 const PAGE_PIECE: usize = 1024;
-const MAX_LINES: usize = 256;
+const MAX_LINES: u32 = 256;
 const LOG_PIECE: usize = 1024;

@@ -27,10 +27,9 @@ impl Console {
             let text = "too many streams; poll /api/v1/status instead";
             return Ok(RequestOutcome::Reply(Reply::error(responder.buf, StatusCode::UNAVAILABLE, text)));
         };
-        let port = request.head.query("port");
         let mut follower = None;
-        if request.head.query("frames") == Some("1") {
-            follower = self.follow(port);
+        if request.head.frames {
+            follower = self.follow(request.head.port);
             if follower.is_none() {
                 let text = "another client follows the frames; a board has room for one";
                 return Ok(RequestOutcome::Reply(Reply::error(responder.buf, StatusCode::UNAVAILABLE, text)));
