@@ -13,11 +13,17 @@ use super::notify::Notify;
 /// One transmission: the longest frame or request.
 pub(crate) type Transmission = Vec<u8, OUTPUT_BUFFER>;
 
+/// What waits to be sent on a port. One bus has bytes, another one frames.
+enum PortOutbox {
+    Empty,
+    Bytes(Transmission),
+    Frames(Deque<CanFrame, MAX_CAN_IDS>),
+}
+
 /// The engine's side of a field port.
 pub(crate) struct PortControl {
     ids: Vec<CanId, MAX_CAN_IDS>,
-    bytes: RefCell<Option<Transmission>>,
-    frames: RefCell<Deque<CanFrame, MAX_CAN_IDS>>,
+    outbox: RefCell<PortOutbox>,
     has_slept: Cell<bool>,
     changed: Notify,
 }
@@ -26,8 +32,7 @@ impl PortControl {
     pub(crate) const fn new() -> Self {
         Self {
             ids: Vec::new(),
-            bytes: RefCell::new(None),
-            frames: RefCell::new(Deque::new()),
+            outbox: RefCell::new(PortOutbox::Empty),
             has_slept: Cell::new(false),
             changed: Notify::new(),
         }
@@ -47,13 +52,20 @@ impl PortControl {
 
     /// Takes one transmission from the engine, which waits until it has left.
     pub(crate) fn put(&self, bytes: &[u8]) {
-        *self.bytes.borrow_mut() = Transmission::from_slice(bytes).ok();
+        let bytes = Transmission::from_slice(bytes);
+        *self.outbox.borrow_mut() = bytes.map_or(PortOutbox::Empty, PortOutbox::Bytes);
         self.changed.notify();
     }
 
     /// Queues a frame. The engine sends at most as many as fit.
     pub(crate) fn put_frame(&self, frame: CanFrame) {
-        let _ = self.frames.borrow_mut().push_back(frame);
+        let mut outbox = self.outbox.borrow_mut();
+        if !matches!(*outbox, PortOutbox::Frames(_)) {
+            *outbox = PortOutbox::Frames(Deque::new());
+        }
+        if let PortOutbox::Frames(frames) = &mut *outbox {
+            let _ = frames.push_back(frame);
+        }
         self.changed.notify();
     }
 
@@ -82,13 +94,20 @@ impl PortControl {
 
     /// Waits until there is a transmission.
     pub(crate) async fn bytes_wait(&self) {
-        while self.bytes.borrow().is_none() {
+        while !matches!(*self.outbox.borrow(), PortOutbox::Bytes(_)) {
             self.changed.notified().await;
         }
     }
 
     fn take_bytes(&self) -> Option<Transmission> {
-        self.bytes.borrow_mut().take()
+        let mut outbox = self.outbox.borrow_mut();
+        match core::mem::replace(&mut *outbox, PortOutbox::Empty) {
+            PortOutbox::Bytes(bytes) => Some(bytes),
+            other => {
+                *outbox = other;
+                None
+            }
+        }
     }
 
     /// The next transmission, if there is one and it may be sent now.
@@ -98,20 +117,22 @@ impl PortControl {
 
     /// Waits until there is a frame to send.
     pub(crate) async fn frame_waits(&self) {
-        while self.frames.borrow().is_empty() {
+        while !matches!(&*self.outbox.borrow(), PortOutbox::Frames(frames) if !frames.is_empty()) {
             self.changed.notified().await;
         }
     }
 
     /// The next frame to send, if there is one.
     pub(crate) fn next_frame(&self) -> Option<CanFrame> {
-        self.frames.borrow_mut().pop_front()
+        match &mut *self.outbox.borrow_mut() {
+            PortOutbox::Frames(frames) => frames.pop_front(),
+            PortOutbox::Empty | PortOutbox::Bytes(_) => None,
+        }
     }
 
     /// Drops all data to send: the device is gone.
     pub(crate) fn clear(&self) {
-        self.frames.borrow_mut().clear();
-        *self.bytes.borrow_mut() = None;
+        *self.outbox.borrow_mut() = PortOutbox::Empty;
     }
 }
 
