@@ -4,7 +4,7 @@ use core::fmt::Write;
 
 use embassy_futures::yield_now;
 use embassy_time::{Duration, Instant};
-use proto_core::config::image::{self, Scan};
+use proto_core::config::image;
 use recipe_api::claim::{Claim, ClaimError};
 use recipe_api::key::{KEY_LEN, Key};
 use recipe_api::response::{ContentType, StatusCode};
@@ -83,15 +83,15 @@ impl Console {
 
     /// Validates the image that was sent, in steps between which other tasks run. Returns the reply if it is invalid.
     async fn look_through(&self, buf: &mut [u8], len: usize, lock: &StoreLock<'_>) -> Option<Reply> {
-        let mut scan = Scan::new();
+        lock.begin_scan();
         loop {
-            match lock.look(len, |bytes| scan.step(bytes)) {
+            match lock.scan(len) {
                 Ok(true) => yield_now().await,
                 Ok(false) => break,
                 Err(error) => return Some(Reply::error(buf, StatusCode::UNPROCESSABLE, error)),
             }
         }
-        let missing = self.ports.have(scan.buses().iter()).err()?;
+        let missing = lock.buses(|buses| self.ports.have(buses.iter())).err()?;
         Some(Reply::error(buf, StatusCode::UNPROCESSABLE, missing))
     }
 

@@ -7,7 +7,8 @@ use embassy_sync::mutex::Mutex;
 use embassy_sync::signal::Signal;
 use embassy_time::Instant;
 use heapless::String;
-use proto_core::config::image::MAX_IMAGE;
+use proto_core::config::Bus;
+use proto_core::config::image::{ImageError, MAX_IMAGE, Scan};
 use proto_core::time::Duration as Span;
 use recipe_api::revisions::{Refused, Revision, Revisions};
 use recipe_store::{KeepError, SlotMarks};
@@ -119,6 +120,8 @@ pub struct StoreHandle {
     /// The lock is taken; there is one change at a time.
     pub(super) is_taken: Cell<bool>,
     pub(super) image: RefCell<&'static mut [u8; MAX_IMAGE]>,
+    /// How far the image was validated. One for all connections: only who holds the lock has an image.
+    scan: RefCell<Scan>,
     pub(super) requests: Signal<NoopRawMutex, StoreRequest>,
     pub(super) done: Signal<NoopRawMutex, Result<u32, Failed>>,
     pub(super) part_requests: Signal<NoopRawMutex, (u32, usize)>,
@@ -142,6 +145,7 @@ impl StoreHandle {
             failure: RefCell::new(String::new()),
             is_taken: Cell::new(false),
             image: RefCell::new(image),
+            scan: RefCell::new(Scan::new()),
             requests: Signal::new(),
             done: Signal::new(),
             part_requests: Signal::new(),
@@ -233,6 +237,24 @@ impl StoreLock<'_> {
     /// Passes the first `len` bytes of the image buffer to `look`.
     pub fn look<R>(&self, len: usize, look: impl FnOnce(&[u8]) -> R) -> R {
         look(self.handle.image.borrow().get(..len).unwrap_or(&[]))
+    }
+
+    /// Begins to validate the image buffer.
+    pub fn begin_scan(&self) {
+        *self.handle.scan.borrow_mut() = Scan::new();
+    }
+
+    /// Validates some more of the first `len` bytes of the image buffer. Returns whether there is more to do.
+    ///
+    /// # Errors
+    /// The image is invalid.
+    pub fn scan(&self, len: usize) -> Result<bool, ImageError> {
+        self.look(len, |bytes| self.handle.scan.borrow_mut().step(bytes))
+    }
+
+    /// Passes the buses of the image's ports to `look`, once all of it was validated.
+    pub fn buses<R>(&self, look: impl FnOnce(&[Bus]) -> R) -> R {
+        look(self.handle.scan.borrow().buses())
     }
 
     /// Sends the request and waits for its result. Returns the number of the revision.
