@@ -162,13 +162,21 @@ impl Move<'_> {
     ///
     /// # Errors
     /// Why the move failed; the old place remains valid.
-    pub async fn execute(mut self, from: &impl Flash, to: &mut impl Flash) -> Result<Store, PutError> {
-        loop {
-            match self.next(from, to) {
-                PutStep::Erase(sector) => to.erase(sector).await,
-                PutStep::Write(place, word) => to.write(place, &word).await,
-                PutStep::End(Ok(())) => return self.moved().ok_or(PutError::Worn),
-                PutStep::End(Err(error)) => return Err(error),
+    pub fn execute(
+        self,
+        from: &impl Flash,
+        to: &mut impl Flash,
+    ) -> impl Future<Output = Result<Store, PutError>> {
+        let mut relocation = self;
+        // The future of an async function would hold it twice.
+        async move {
+            loop {
+                match relocation.next(from, to) {
+                    PutStep::Erase(sector) => to.erase(sector).await,
+                    PutStep::Write(place, word) => to.write(place, &word).await,
+                    PutStep::End(Ok(())) => return relocation.moved().ok_or(PutError::Worn),
+                    PutStep::End(Err(error)) => return Err(error),
+                }
             }
         }
     }
