@@ -555,3 +555,5 @@ const REPEAT: Duration = Duration::from_secs(10);
 /// A task for each port, link and connection, and: engine, network, address, status, LED, refused, store, button,
 /// edge node, time, the board's own.
 const MAX_TASKS: usize = SERIAL_PORTS + CAN_PORTS + MAX_LINKS + CONNECTIONS + 11;
+// The queue of timers (`generic-queue-32`) has one for each of them, for the watchdog's own, and for the start.
+const _: () = assert!(MAX_TASKS + 2 <= 32);
