@@ -14,7 +14,7 @@ use recipe_api::guard::{Guard, Refusal, Site};
 use recipe_api::key::{BodyHash, Hash, Hex, Key, Signed, from_hex};
 use recipe_api::metrics::Families;
 use recipe_api::nonces::Nonces;
-use recipe_api::request::{HttpHead, HeadBuffer, MAX_HEAD};
+use recipe_api::request::{HeadBuffer, HttpHead, MAX_HEAD};
 use recipe_api::response::{ContentType, Length, Response, StatusCode, write_chunk};
 use recipe_api::revisions::{Result as Done, Revision, Revisions, Stored};
 use recipe_api::route::{self, BodyType, Served};

@@ -18,7 +18,9 @@ use proto_core::time::{Duration as Span, Instant as Time};
 use recipe_sparkplug::document::DocumentError;
 pub use recipe_sparkplug::document::NodeDocument;
 use recipe_sparkplug::gateway::{GatewayCatalog, Rates};
-use recipe_sparkplug::node::{NodeCounters, EdgeNode, SessionFailure, Input, MIN_BUFFER, NodeError, NodeOutput};
+use recipe_sparkplug::node::{
+    EdgeNode, Input, MIN_BUFFER, NodeCounters, NodeError, NodeOutput, SessionFailure,
+};
 
 use super::gateway::Gateway;
 use super::link::resolve;

@@ -20,7 +20,7 @@ use crate::mqtt::{Inbox, Packet, ProtocolError};
 use crate::payload::{self, Asked, HostState};
 use crate::topic;
 use crate::value::{DataType, Stamp, Stored, Value};
-pub use io::{NodeCounters, SessionFailure, Input, NodeError, NodeOutput};
+pub use io::{Input, NodeCounters, NodeError, NodeOutput, SessionFailure};
 use maybe::Maybe;
 pub use messages::MAX_METRIC;
 pub use settings::{Credential, MAX_TEXT, Settings};

@@ -5,7 +5,7 @@
 
 use super::delimiter::{FrameHead, FrameTail};
 use super::error::{EncodeError, FieldPlace, NoSpace, PartError, ValueError};
-use super::fields::{Applied, FrameFields, PlacedField, Pool, Runs, Step, Values};
+use super::fields::{Applied, FieldRun, FrameFields, PlacedField, Pool, Runs, Values};
 use super::model::{Field, Framing, MAX_DELIMITER, MAX_STREAM_FRAME, Mode, Rules};
 use crate::sysvar::IMAGE_BYTES;
 use crate::wire::runs;
@@ -19,7 +19,7 @@ pub struct StreamLayout {
     pub(super) tail: FrameTail,
     frame_len: u16,
     payload_len: u16,
-    whole: Step,
+    whole: FieldRun,
     pool: Pool,
 }
 

@@ -180,7 +180,9 @@ fn downgrade(buf: &mut [u8], request: &ConsoleRequest<'_>) -> Result<Downgrade, 
     match request.head.yes {
         None => Ok(Downgrade::Refused),
         Some(true) => Ok(Downgrade::Allowed),
-        Some(false) => Err(Reply::error(buf, StatusCode::BAD_REQUEST, "downgrade is out of range; allowed: yes")),
+        Some(false) => {
+            Err(Reply::error(buf, StatusCode::BAD_REQUEST, "downgrade is out of range; allowed: yes"))
+        }
     }
 }
 

@@ -10,11 +10,11 @@ use embassy_net::{IpAddress, Stack};
 use embassy_time::{Duration, Instant, Timer, with_deadline, with_timeout};
 use recipe_api::guard::{Admitted, Refusal, Site};
 use recipe_api::key::BodyHash;
-use recipe_api::request::{HttpHead, HeadBuffer, HeadError, MAX_HEAD, Method};
+use recipe_api::request::{HeadBuffer, HeadError, HttpHead, MAX_HEAD, Method};
 use recipe_api::response::{CONTINUE, StatusCode};
 use recipe_api::route::{ApiOperation, Served};
 
-use super::answer::{RequestOutcome, Reply, Responder, SendError};
+use super::answer::{Reply, RequestOutcome, Responder, SendError};
 use super::arguments::{Arguments, HeadArguments};
 use super::change::{busy, nothing_kept};
 use super::read::PAGE;
@@ -160,7 +160,11 @@ impl Console {
 
     /// Decides about a request by its head.
     #[inline(never)]
-    fn decide(&self, socket: &TcpSocket<'_>, head: Result<HttpHead<'_>, HeadError>) -> Result<Decided, Refusal> {
+    fn decide(
+        &self,
+        socket: &TcpSocket<'_>,
+        head: Result<HttpHead<'_>, HeadError>,
+    ) -> Result<Decided, Refusal> {
         let (local, peer) = match (socket.local_endpoint(), socket.remote_endpoint()) {
             (Some(local), Some(peer)) => (address(local.addr), address(peer.addr)),
             _ => (Ipv4Addr::UNSPECIFIED, Ipv4Addr::UNSPECIFIED),

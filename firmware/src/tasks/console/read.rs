@@ -16,7 +16,7 @@ use recipe_api::revisions::{Revision, Revisions};
 use recipe_api::route::ApiOperation;
 use serde::Serialize;
 
-use super::answer::{RequestOutcome, Reply, Responder, SendError, TextBuffer};
+use super::answer::{Reply, RequestOutcome, Responder, SendError, TextBuffer};
 use super::change::{busy, nothing_kept};
 use super::connection::ConsoleRequest;
 use super::documents::DocumentSource;
@@ -178,7 +178,10 @@ impl Console {
 }
 
 /// Sends the newest lines of the log.
-async fn log(responder: &mut Responder<'_, '_>, request: &ConsoleRequest<'_>) -> Result<RequestOutcome, SendError> {
+async fn log(
+    responder: &mut Responder<'_, '_>,
+    request: &ConsoleRequest<'_>,
+) -> Result<RequestOutcome, SendError> {
     let lines = match request.head.number {
         None => MAX_LINES,
         Some(Some(lines @ 1..=MAX_LINES)) => lines,
@@ -206,7 +209,10 @@ async fn log(responder: &mut Responder<'_, '_>, request: &ConsoleRequest<'_>) ->
 }
 
 /// Sends the web page, unless the client has it cached.
-async fn page(responder: &mut Responder<'_, '_>, request: &ConsoleRequest<'_>) -> Result<RequestOutcome, SendError> {
+async fn page(
+    responder: &mut Responder<'_, '_>,
+    request: &ConsoleRequest<'_>,
+) -> Result<RequestOutcome, SendError> {
     let status = request.head.page;
     let mut buf = TextBuffer::new(responder.buf);
     PAGE.write_head(status, &mut buf).map_err(|_| SendError::TooLong)?;
