@@ -95,7 +95,7 @@ impl PortChanges<'_> {
         let Bus::Rs485(line) = &self.port.bus else { return };
         let may_be_echo = |exchange: &Exchange| match exchange.transaction {
             Transaction::Rtu { operation, .. } => operation.is_repeated_by_reply(),
-            _ => true,
+            Transaction::Served { .. } | Transaction::Frames { .. } => true,
         };
         let concerned = |exchange: &Exchange| exchange.is_answered() && may_be_echo(exchange);
         if line.echo == Echo::Auto && self.exchanges.iter().any(concerned) {

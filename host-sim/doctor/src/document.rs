@@ -194,7 +194,7 @@ impl PortDocument {
         let bus = match bus {
             Bus::Can { .. } => FieldBus::Can { state: state.unwrap_or(BusState::Active) },
             Bus::ModbusTcp { .. } => FieldBus::ModbusTcp,
-            _ => FieldBus::Rs485,
+            Bus::Rs485(_) | Bus::TcpListen { .. } | Bus::UdpListen { .. } => FieldBus::Rs485,
         };
         let states = [PortState::Working, PortState::Silent, PortState::BusOff, PortState::Gone];
         let state = states.into_iter().find(|state| state.name() == self.state);

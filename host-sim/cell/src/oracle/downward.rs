@@ -411,7 +411,11 @@ impl Downward {
                 return true;
             }
             FieldSpec::TextOutput { .. } => return text_of(field, up).is_some_and(|text| text == bytes),
-            _ => return false,
+            // None of these is in the output part of a device's recipe.
+            FieldSpec::System(_)
+            | FieldSpec::UserInput { .. }
+            | FieldSpec::DeviceInput { .. }
+            | FieldSpec::TextInput { .. } => return false,
         };
         // Reply codes are not modelled.
         if from == OutputBinding::Reply {

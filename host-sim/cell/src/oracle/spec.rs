@@ -219,7 +219,7 @@ impl Spec {
         for port in &ports {
             let trigger = match port.send {
                 SendOn::Rising { var, .. } => Some(var),
-                _ => None,
+                SendOn::Period | SendOn::Change | SendOn::Frame => None,
             };
             for var in port.shown().chain(trigger) {
                 let from_link =
@@ -324,7 +324,18 @@ pub(super) fn written(field: &FieldSpec) -> impl Iterator<Item = SysVar> + use<>
         | FieldSpec::DeviceInput { to: InputBinding::Variable { var, .. }, .. } => (None, [Some(var), None]),
         FieldSpec::TextInput { to, length_to, count_to, .. } => (to, [length_to, count_to]),
         FieldSpec::InputRule(InputRule::ValidTo { var, bit: None }) => (None, [Some(var), None]),
-        _ => (None, [None, None]),
+        FieldSpec::UserInput { .. }
+        | FieldSpec::UserOutput { .. }
+        | FieldSpec::DeviceInput { .. }
+        | FieldSpec::DeviceOutput { .. }
+        | FieldSpec::Fixed { .. }
+        | FieldSpec::Padding { .. }
+        | FieldSpec::Checksum(_)
+        | FieldSpec::TextOutput { .. }
+        | FieldSpec::Length(_)
+        | FieldSpec::Limits(_)
+        | FieldSpec::Mapped(_)
+        | FieldSpec::InputRule(_) => (None, [None, None]),
     };
     words.into_iter().flat_map(Words::iter).chain(others.into_iter().flatten())
 }
@@ -335,10 +346,25 @@ pub(super) fn shown(field: &FieldSpec) -> impl Iterator<Item = SysVar> + use<> {
         FieldSpec::System(var) => (None, Some(var)),
         FieldSpec::UserOutput { from, .. } | FieldSpec::DeviceOutput { from, .. } => match from {
             OutputBinding::Variable { var, .. } | OutputBinding::Bit { var, .. } => (None, Some(var)),
-            _ => (None, None),
+            OutputBinding::Constant(_)
+            | OutputBinding::Counter
+            | OutputBinding::CounterTo { .. }
+            | OutputBinding::Reply
+            | OutputBinding::State { .. }
+            | OutputBinding::Port { .. }
+            | OutputBinding::Link { .. } => (None, None),
         },
         FieldSpec::TextOutput { from, length_from, .. } => (Some(from), length_from),
-        _ => (None, None),
+        FieldSpec::UserInput { .. }
+        | FieldSpec::DeviceInput { .. }
+        | FieldSpec::Fixed { .. }
+        | FieldSpec::Padding { .. }
+        | FieldSpec::Checksum(_)
+        | FieldSpec::TextInput { .. }
+        | FieldSpec::Length(_)
+        | FieldSpec::Limits(_)
+        | FieldSpec::Mapped(_)
+        | FieldSpec::InputRule(_) => (None, None),
     };
     words.into_iter().flat_map(Words::iter).chain(other)
 }
@@ -419,13 +445,15 @@ fn port_spec(config: &GatewayConfig, port: &proto_core::config::Port) -> PortSpe
             exchanges = ExchangesSpec::new(config, recipe, (port, None, Duration::ZERO), &mut inputs);
             (Duration::MAX, Duration::ZERO)
         }
-        _ => (Duration::MAX, Duration::ZERO),
+        Bus::TcpListen { .. } | Bus::UdpListen { .. } | Bus::ModbusTcp { .. } => {
+            (Duration::MAX, Duration::ZERO)
+        }
     };
     let outputs = frames(config, recipe, Direction::Output);
     let written: Vec<SysVar> = inputs.iter().flat_map(|frame| &frame.written).copied().collect();
     let trigger = match recipe.send {
         SendOn::Rising { var, .. } => Some(var),
-        _ => None,
+        SendOn::Period | SendOn::Change | SendOn::Frame => None,
     };
     PortSpec {
         written_bits: written.iter().copied().filter(|var| var.is_bits()).collect(),

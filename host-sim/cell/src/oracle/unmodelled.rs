@@ -26,7 +26,7 @@ pub(crate) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
 fn in_blocks(config: &GatewayConfig) -> Option<&'static str> {
     let served = config.exchanges.iter().filter_map(|exchange| match exchange.transaction {
         Transaction::Served { read, written, .. } => Some([read, written]),
-        _ => None,
+        Transaction::Rtu { .. } | Transaction::Frames { .. } => None,
     });
     let mut fields = served.flatten().flat_map(|span| span.of(&config.fields));
     let is_odd = |field: &FieldSpec| match *field {
@@ -34,7 +34,18 @@ fn in_blocks(config: &GatewayConfig) -> Option<&'static str> {
         FieldSpec::DeviceOutput { encoding, from, .. } => {
             !is_written_by_model(&encoding) || matches!(from, OutputBinding::Reply)
         }
-        _ => false,
+        FieldSpec::System(_)
+        | FieldSpec::UserInput { .. }
+        | FieldSpec::UserOutput { .. }
+        | FieldSpec::DeviceInput { .. }
+        | FieldSpec::Padding { .. }
+        | FieldSpec::Checksum(_)
+        | FieldSpec::TextInput { .. }
+        | FieldSpec::TextOutput { .. }
+        | FieldSpec::Length(_)
+        | FieldSpec::Limits(_)
+        | FieldSpec::Mapped(_)
+        | FieldSpec::InputRule(_) => false,
     };
     fields
         .any(is_odd)
@@ -56,12 +67,23 @@ fn in_exchanges(config: &GatewayConfig) -> Option<&'static str> {
         Transaction::Frames { request, .. } => {
             config.frames.get(usize::from(request?)).map(|frame| frame.fields)
         }
-        _ => None,
+        Transaction::Served { .. } => None,
     });
     let may_refuse = |field: &FieldSpec| match field {
         FieldSpec::Limits(limits) => limits.outside == Outside::Refuse,
         FieldSpec::Mapped(_) => true,
-        _ => false,
+        FieldSpec::System(_)
+        | FieldSpec::UserInput { .. }
+        | FieldSpec::UserOutput { .. }
+        | FieldSpec::DeviceInput { .. }
+        | FieldSpec::DeviceOutput { .. }
+        | FieldSpec::Fixed { .. }
+        | FieldSpec::Padding { .. }
+        | FieldSpec::Checksum(_)
+        | FieldSpec::TextInput { .. }
+        | FieldSpec::TextOutput { .. }
+        | FieldSpec::Length(_)
+        | FieldSpec::InputRule(_) => false,
     };
     let is_dialogue = |exchange: &Exchange| {
         let is_mixed = exchange.when.rising.is_some()
@@ -83,7 +105,9 @@ fn in_exchanges(config: &GatewayConfig) -> Option<&'static str> {
             let fields = config.frames.get(usize::from(refusal)).map(|frame| frame.fields.of(&config.fields));
             fields.is_some_and(|fields| fields.iter().any(FieldSpec::has_value))
         }
-        _ => false,
+        Transaction::Frames { refusal: None, .. } | Transaction::Rtu { .. } | Transaction::Served { .. } => {
+            false
+        }
     };
     let is_more = |exchange: &Exchange| {
         exchange.pending.is_some() || exchange.restarted.is_some() || has_values(exchange)

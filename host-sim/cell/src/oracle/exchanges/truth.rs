@@ -474,7 +474,13 @@ fn agrees(field: &FieldSpec, var: SysVar, raw: Raw, bytes: &[u8]) -> bool {
             as_number(var, raw) * f64::from(scale) + f64::from(offset)
         }
         OutputBinding::Bit { bit, .. } => f64::from(raw[0] >> bit & 1),
-        _ => return true,
+        OutputBinding::Constant(_)
+        | OutputBinding::Counter
+        | OutputBinding::CounterTo { .. }
+        | OutputBinding::Reply
+        | OutputBinding::State { .. }
+        | OutputBinding::Port { .. }
+        | OutputBinding::Link { .. } => return true,
     };
     device::read(&encoding, bytes) == Some(device::shown_as(&encoding, overflow, number))
 }
