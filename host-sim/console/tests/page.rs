@@ -5,6 +5,7 @@ use std::io::Read;
 
 use flate2::read::GzDecoder;
 use proto_core::sysvar::{Direction, SysVar};
+use proto_core::wire::dialect::Dialect;
 
 #[test]
 fn the_compressed_page_is_the_built_one() {
@@ -53,4 +54,13 @@ fn its_variables_are_those_of_the_core() {
         })
         .collect();
     assert_eq!(listed, known);
+}
+
+#[test]
+fn its_dialects_are_those_of_the_core() {
+    let source = fs::read_to_string("web/src/compile.ts").unwrap();
+    let (_, words) = source.split_once("controller.word(\"dialect\", [").unwrap();
+    let (words, _) = words.split_once(']').unwrap();
+    let listed: Vec<_> = words.split(", ").map(|word| word.trim_matches('"')).collect();
+    assert_eq!(listed, Dialect::NAMES);
 }
