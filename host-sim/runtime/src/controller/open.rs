@@ -4,14 +4,14 @@ use std::cell::{Cell, RefCell};
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::rc::Rc;
 
-use serde_json::json;
+use serde_json::{Map, Value, json};
 use tokio::net::{TcpListener, UdpSocket};
 use tokio::sync::Notify;
 use tokio::task::JoinSet;
 
 use super::{ControllerOptions, ControllerRuntime, Outward, RunningController};
 use crate::{EventsFile, RunError, udp};
-use recipe_config::{SimBus, SimConfig, SimParts};
+use recipe_config::{Listen, SimBus, SimConfig, SimParts};
 use recipe_controller::{Controller, ControllerInput, Link};
 use recipe_io::bind::Bind;
 use recipe_io::clock::Clock;
@@ -27,27 +27,9 @@ impl RunningController {
         controller.record_events();
         let clock = Clock::new(options.pace);
         let devices = open_devices(&config, &options.run.binds, &clock).await?;
-        let address = config.listen.address;
-        let listen = async |key: &str, address: IpAddr, port: u16| {
-            let listener = TcpListener::bind((address, port)).await;
-            let local = listener.and_then(|listener| Ok((listener.local_addr()?, listener)));
-            local.map_err(|error| not_listening(key, SocketAddr::new(address, port), &error))
-        };
-        let (command_at, command) = listen("command", address, config.listen.command).await?;
-        let (state_at, state) = listen("state", address, config.listen.state).await?;
-        let (modbus_at, modbus) = listen("modbus", address, config.listen.modbus).await?;
-        let loopback = IpAddr::V4(Ipv4Addr::LOCALHOST);
-        let (control_at, control) = listen("control", loopback, config.listen.control).await?;
-        let udp_wanted = SocketAddr::new(address, config.listen.udp2011);
-        let udp = UdpSocket::bind(udp_wanted).await;
-        let (udp, udp_at) = udp
-            .and_then(|udp| {
-                udp::keep_errors(&udp)?;
-                let at = udp.local_addr()?;
-                Ok((udp, at))
-            })
-            .map_err(|error| not_listening("udp2011", udp_wanted, &error))?;
-        let mut places = serde_json::Map::new();
+        let ControllerSockets { command, state, modbus, control, udp, udp_at, mut ready } =
+            ControllerSockets::open(&config.listen).await?;
+        let mut places = Map::new();
         let mut ports = Vec::new();
         for (port, device) in config.ports.iter().zip(&devices) {
             let (outward, place) = match (&port.bus, device) {
@@ -66,14 +48,7 @@ impl RunningController {
         let (timer, timeline_alarm) = (alarm()?, alarm()?);
         // The last that can fail: an earlier run's file is kept if this one cannot start.
         let events_file = options.events.as_ref().map(EventsFile::create).transpose()?;
-        let ready = json!({
-            "command": command_at,
-            "state": state_at,
-            "modbus": modbus_at,
-            "udp2011": udp_at,
-            "control": control_at,
-            "ports": places,
-        });
+        ready.insert("ports".to_owned(), json!(places));
         let runtime = Rc::new(ControllerRuntime {
             controller: RefCell::new(controller),
             connections: RefCell::default(),
@@ -124,7 +99,53 @@ impl RunningController {
             }
         }
         runtime.input(ControllerInput::Tick);
-        Ok(Self { runtime, tasks, ready })
+        Ok(Self { runtime, tasks, ready: Value::Object(ready) })
+    }
+}
+
+/// What the controller's clients connect and send to.
+struct ControllerSockets {
+    command: TcpListener,
+    state: TcpListener,
+    modbus: TcpListener,
+    control: TcpListener,
+    udp: UdpSocket,
+    udp_at: SocketAddr,
+    /// Their addresses, by their names in the file.
+    ready: Map<String, Value>,
+}
+
+impl ControllerSockets {
+    async fn open(wanted: &Listen) -> Result<Self, StartError> {
+        let address = wanted.address;
+        let listen = async |key: &str, address: IpAddr, port: u16| {
+            let listener = TcpListener::bind((address, port)).await;
+            let local = listener.and_then(|listener| Ok((listener.local_addr()?, listener)));
+            local.map_err(|error| not_listening(key, SocketAddr::new(address, port), &error))
+        };
+        let (command_at, command) = listen("command", address, wanted.command).await?;
+        let (state_at, state) = listen("state", address, wanted.state).await?;
+        let (modbus_at, modbus) = listen("modbus", address, wanted.modbus).await?;
+        let loopback = IpAddr::V4(Ipv4Addr::LOCALHOST);
+        let (control_at, control) = listen("control", loopback, wanted.control).await?;
+        let udp_wanted = SocketAddr::new(address, wanted.udp2011);
+        let udp = UdpSocket::bind(udp_wanted).await;
+        let (udp, udp_at) = udp
+            .and_then(|udp| {
+                udp::keep_errors(&udp)?;
+                let at = udp.local_addr()?;
+                Ok((udp, at))
+            })
+            .map_err(|error| not_listening("udp2011", udp_wanted, &error))?;
+        let places = [
+            ("command", command_at),
+            ("state", state_at),
+            ("modbus", modbus_at),
+            ("udp2011", udp_at),
+            ("control", control_at),
+        ];
+        let ready = places.map(|(name, at)| (name.to_owned(), json!(at))).into_iter().collect();
+        Ok(Self { command, state, modbus, control, udp, udp_at, ready })
     }
 }
 
