@@ -116,7 +116,7 @@ struct ControllerSockets {
 }
 
 impl ControllerSockets {
-    async fn open(wanted: &Listen) -> Result<Self, StartError> {
+    async fn open(wanted: &Listen) -> Result<Self, RunError> {
         let address = wanted.address;
         let listen = async |key: &str, address: IpAddr, port: u16| {
             let listener = TcpListener::bind((address, port)).await;

@@ -4,7 +4,7 @@ use std::io::Write;
 use std::path::Path;
 
 use recipe_ctl::{
-    Answer, Client, Configuration, Failure, Firmware, Member, Names, Rollout, Stop, TrialOptions, Update,
+    Answer, Client, Configuration, Failure, Firmware, Member, Names, Rollout, SlotName, Stop, TrialOptions, Update,
     Verdict, Watched, WithoutTrial, edge, key_file, signing_key, update,
 };
 use recipe_runtime::out::print_stderr;
@@ -79,20 +79,8 @@ impl Act {
             Self::Config { revision, output: None, .. } => {
                 sections(move |client, _| recipe_ctl::config(client, *revision))
             }
-            Self::Config { revision, output: Some(path), force } => {
-                CtlWork::Follow(Box::new(move |client, _, out| {
-                    let stored = recipe_ctl::stored(client, *revision)?;
-                    write(path, stored.bytes(), *force)?;
-                    writeln!(out, "{}: {} bytes", path.display(), stored.bytes().len())?;
-                    Ok(Verdict::Well)
-                }))
-            }
-            Self::Bundle { file, force } => CtlWork::Follow(Box::new(move |client, run, out| {
-                let document = recipe_ctl::bundle(client)?;
-                let text = format!("{document:#}\n");
-                write(file, text.as_bytes(), *force)?;
-                run.print(&recipe_ctl::bundled(&document, &file.display().to_string(), text.len()), out)
-            })),
+            Self::Config { revision, output: Some(path), force } => save_config(*revision, path, *force),
+            Self::Bundle { file, force } => save_bundle(file, *force),
             Self::Revisions => rows(|client, _| recipe_ctl::revisions(client)),
             Self::Push { file, apply, confirm_s, set, board, .. } => {
                 let trial = apply.then_some(TrialOptions { confirm_s: *confirm_s, revision: None });
@@ -124,18 +112,13 @@ impl Act {
                 report,
                 many,
                 ..
-            } if is_for_inventory => {
-                let updating = Updating {
-                    update: Update::read(file)?,
-                    trial_s: confirm_s.unwrap_or(TRIAL_S),
-                    downgrade: allowed(*downgrade),
-                    rollout: many.rollout(),
-                    report: report.as_deref(),
-                };
-                CtlWork::Through(Box::new(move |members, stop, run, out| {
-                    updating.roll_out(members, stop, run, out)
-                }))
-            }
+            } if is_for_inventory => roll_out(Updating {
+                update: Update::read(file)?,
+                trial_s: confirm_s.unwrap_or(TRIAL_S),
+                downgrade: allowed(*downgrade),
+                rollout: many.rollout(),
+                report: report.as_deref(),
+            }),
             Self::Update {
                 file: Some(file), try_it, confirm_s, confirm, downgrade, report, many, ..
             } => {
@@ -150,12 +133,8 @@ impl Act {
                          board is tried and confirmed",
                     ));
                 }
-                let file = Update::read(file)?;
                 let trial_s = try_it.then_some(confirm_s.unwrap_or(TRIAL_S));
-                let plan = update::Plan { trial_s, confirm: *confirm, downgrade: allowed(*downgrade) };
-                CtlWork::Follow(Box::new(move |client, run, out| {
-                    run.print(&update::update(client, &file, plan, &mut |line| print_stderr(line))?, out)
-                }))
+                update_one(file, update::Plan { trial_s, confirm: *confirm, downgrade: allowed(*downgrade) })?
             }
             Self::Edge { file: Some(_), .. } if is_for_inventory => {
                 return Err(Failure::wrong(
@@ -166,29 +145,12 @@ impl Act {
                 return Err(Failure::wrong("--restart is for a file or --off"));
             }
             Self::Edge { file: None, off: false, .. } => rows(|client, _| edge::shown(client)),
-            Self::Edge { file, restart, .. } => {
-                let settings = match file {
-                    Some(file) => recipe_edge_node::board::settings(file).map_err(Failure::wrong)?,
-                    None => recipe_sparkplug::document::OFF.to_vec(),
-                };
-                let from = if *restart { edge::From::Now } else { edge::From::NextStart };
-                rows(move |client, _| edge::set(client, &settings, from))
-            }
+            Self::Edge { file, restart, .. } => set_edge(file.as_deref(), *restart)?,
             Self::Identify { seconds } => rows(move |client, _| recipe_ctl::identify(client, *seconds)),
             Self::Claim { file } => CtlWork::Follow(Box::new(move |client, run, out| {
                 run.print(&recipe_ctl::claim(client, file, &mut |line| print_stderr(line))?, out)
             })),
-            Self::Keygen { file, signing: false } => CtlWork::Alone(Box::new(move |_, out| {
-                key_file::make(file)?;
-                writeln!(out, "{}: a new key, for its owner alone", file.display())?;
-                Ok(Verdict::Well)
-            })),
-            Self::Keygen { file, signing: true } => CtlWork::Alone(Box::new(move |_, out| {
-                let (public, public_file) = signing_key::make(file)?;
-                writeln!(out, "{}: a new key to sign with, for its owner alone", file.display())?;
-                writeln!(out, "{}: its public key, for loaders: {public}", public_file.display())?;
-                Ok(Verdict::Well)
-            })),
+            Self::Keygen { file, signing } => make_key(file, *signing),
             Self::Sign { signing_key, board, version, slot_a, slot_b, reads, writes, output, force } => {
                 let firmware = Firmware {
                     key: signing_key.clone(),
@@ -199,13 +161,7 @@ impl Act {
                     reads: *reads,
                     writes: *writes,
                 };
-                CtlWork::Alone(Box::new(move |_, out| {
-                    let bytes = recipe_ctl::sign(&firmware)?;
-                    write(output, &bytes, *force)?;
-                    let public = recipe_ctl::public_of(signing_key)?;
-                    writeln!(out, "{}: {}", output.display(), Update::of(bytes)?.summary(&public))?;
-                    Ok(Verdict::Well)
-                }))
+                sign(firmware, output, *force)
             }
             Self::Inspect { file, public_key, slot: None, .. } => {
                 CtlWork::Alone(Box::new(move |run, out| {
@@ -213,27 +169,102 @@ impl Act {
                 }))
             }
             Self::Inspect { file, public_key, slot: Some(slot), output, force } => {
-                CtlWork::Alone(Box::new(move |run, out| {
-                    let update = Update::read(file)?;
-                    let answer = update.inspect(public_key.as_deref(), run.view)?;
-                    if answer.verdict() != Verdict::Well {
-                        return run.print(&answer, out);
-                    }
-                    let (address, bytes) = update.flat(*slot)?;
-                    if let Some(output) = output {
-                        write(output, &bytes, *force)?;
-                        writeln!(
-                            out,
-                            "{}: {} bytes for address {address:08X}",
-                            output.display(),
-                            bytes.len()
-                        )?;
-                    }
-                    Ok(Verdict::Well)
-                }))
+                inspect_slot(file, public_key.as_deref(), *slot, output.as_deref(), *force)
             }
         })
     }
+}
+
+/// Writes a stored configuration to a file.
+fn save_config(revision: Option<u32>, path: &Path, force: bool) -> CtlWork<'_> {
+    CtlWork::Follow(Box::new(move |client, _, out| {
+        let stored = recipe_ctl::stored(client, revision)?;
+        write(path, stored.bytes(), force)?;
+        writeln!(out, "{}: {} bytes", path.display(), stored.bytes().len())?;
+        Ok(Verdict::Well)
+    }))
+}
+
+/// Writes all that a gateway says of itself to a file.
+fn save_bundle(file: &Path, force: bool) -> CtlWork<'_> {
+    CtlWork::Follow(Box::new(move |client, run, out| {
+        let document = recipe_ctl::bundle(client)?;
+        let text = format!("{document:#}\n");
+        write(file, text.as_bytes(), force)?;
+        run.print(&recipe_ctl::bundled(&document, &file.display().to_string(), text.len()), out)
+    }))
+}
+
+/// Updates the boards of an inventory.
+fn roll_out(updating: Updating<'_>) -> CtlWork<'_> {
+    CtlWork::Through(Box::new(move |members, stop, run, out| updating.roll_out(members, stop, run, out)))
+}
+
+/// Sends an update to one board, and tries it if the plan says so.
+fn update_one<'a>(file: &Path, plan: update::Plan) -> Result<CtlWork<'a>, Failure> {
+    let file = Update::read(file)?;
+    Ok(CtlWork::Follow(Box::new(move |client, run, out| {
+        run.print(&update::update(client, &file, plan, &mut |line| print_stderr(line))?, out)
+    })))
+}
+
+/// Gives a board the settings of its edge node; without a file it is switched off.
+fn set_edge<'a>(file: Option<&Path>, restart: bool) -> Result<CtlWork<'a>, Failure> {
+    let settings = match file {
+        Some(file) => recipe_edge_node::board::settings(file).map_err(Failure::wrong)?,
+        None => recipe_sparkplug::document::OFF.to_vec(),
+    };
+    let from = if restart { edge::From::Now } else { edge::From::NextStart };
+    Ok(rows(move |client, _| edge::set(client, &settings, from)))
+}
+
+/// Makes a key of the API, or one to sign firmware with.
+fn make_key(file: &Path, signing: bool) -> CtlWork<'_> {
+    CtlWork::Alone(Box::new(move |_, out| {
+        if signing {
+            let (public, public_file) = signing_key::make(file)?;
+            writeln!(out, "{}: a new key to sign with, for its owner alone", file.display())?;
+            writeln!(out, "{}: its public key, for loaders: {public}", public_file.display())?;
+        } else {
+            key_file::make(file)?;
+            writeln!(out, "{}: a new key, for its owner alone", file.display())?;
+        }
+        Ok(Verdict::Well)
+    }))
+}
+
+/// Writes a signed update.
+fn sign(firmware: Firmware, output: &Path, force: bool) -> CtlWork<'_> {
+    CtlWork::Alone(Box::new(move |_, out| {
+        let bytes = recipe_ctl::sign(&firmware)?;
+        write(output, &bytes, force)?;
+        let public = recipe_ctl::public_of(&firmware.key)?;
+        writeln!(out, "{}: {}", output.display(), Update::of(bytes)?.summary(&public))?;
+        Ok(Verdict::Well)
+    }))
+}
+
+/// Writes what a probe puts into a slot, if the update is good.
+fn inspect_slot<'a>(
+    file: &'a Path,
+    public_key: Option<&'a Path>,
+    slot: Slot,
+    output: Option<&'a Path>,
+    force: bool,
+) -> CtlWork<'a> {
+    CtlWork::Alone(Box::new(move |run, out| {
+        let update = Update::read(file)?;
+        let answer = update.inspect(public_key, run.view)?;
+        if answer.verdict() != Verdict::Well {
+            return run.print(&answer, out);
+        }
+        let (address, bytes) = update.flat(slot)?;
+        if let Some(output) = output {
+            write(output, &bytes, force)?;
+            writeln!(out, "{}: {} bytes for address {address:08X}", output.display(), bytes.len())?;
+        }
+        Ok(Verdict::Well)
+    }))
 }
 
 fn allowed(downgrade: bool) -> update::Downgrade {
