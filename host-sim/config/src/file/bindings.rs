@@ -1,66 +1,16 @@
 //! The bindings of fields and the triggers of output parts in a gateway file.
 
-use proto_core::config::{InputBinding, OnStale, OutputBinding, SendOn};
+use proto_core::config::{OnStale, OutputBinding, SendOn};
 use proto_core::device::{Encoding, Overflow};
 use proto_core::sysvar::{SysVar, VarBit};
 
-use super::commands::{self, FileCommands};
+use super::commands;
 use super::encoding::refuse;
+use super::model::{FileInput, FileOutput, Sending};
 use super::names::meant_variable;
-use super::reader::{Result, Spot, TableReader, TableValue};
+use super::reader::{Item, Reader, Result};
 use super::sources;
 use crate::keys::field::COUNTER_TABLE;
-
-/// The binding of an input field.
-pub(super) enum FileInput {
-    Unused,
-    Variable {
-        var: SysVar,
-        scale: f32,
-        offset: f32,
-        /// It is written in the file.
-        has_offset: bool,
-    },
-    Bit(VarBit),
-    Commands(FileCommands),
-    /// An alive counter, which goes from this number to 0.
-    Counter {
-        max: u32,
-    },
-}
-
-impl FileInput {
-    /// The binding, if it needs no table of commands.
-    pub(super) fn without_commands(&self) -> InputBinding {
-        match *self {
-            Self::Variable { var, scale, offset, .. } => InputBinding::Variable { var, scale, offset },
-            Self::Bit(VarBit { var, bit }) => InputBinding::Bit { var, bit },
-            Self::Counter { max } => InputBinding::Counter { max },
-            Self::Unused | Self::Commands(_) => InputBinding::Unused,
-        }
-    }
-}
-
-/// The source of an output field.
-pub(super) enum FileOutput {
-    /// A program of the controller sets it.
-    Program,
-    Bound(OutputBinding),
-    /// The health of a port with this name, which may stand behind the recipe.
-    PortNamed {
-        name: String,
-        spot: Spot,
-        binding: OutputBinding,
-    },
-}
-
-/// When an output part is sent.
-#[derive(Default)]
-pub(super) struct Sending {
-    pub(super) on_stale: OnStale,
-    pub(super) send: SendOn,
-    pub(super) send_spot: Option<Spot>,
-}
 
 /// The words of `on_stale`.
 pub(crate) const ON_STALES: [(&str, OnStale); 2] = [("hold", OnStale::Hold), ("stop", OnStale::Stop)];

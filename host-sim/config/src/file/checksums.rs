@@ -6,9 +6,9 @@ use proto_core::device::{Algorithm, ByteOrder, Checksum, Crc, DataId, Element, M
 use proto_core::recipe::model::MAX_STREAM_FRAME;
 
 use super::encoding::refuse;
+use super::model::{FileField, FileFieldKind};
 use super::names::meant_checksum;
-use super::reader::{Result, TableReader, TableValue};
-use super::recipes::{FileField, FileFieldKind};
+use super::reader::{Item, Reader, Result};
 use crate::keys::device;
 
 /// The words of `order` of a checksum.

@@ -10,12 +10,14 @@ use proto_core::recipe::model::{MAX_CAN_IDS, MAX_DELIMITER, Mode, Rules};
 use proto_core::sysvar::Direction;
 use proto_core::wire::scalar::ScalarType;
 
-use super::bindings::{self, FileInput, FileOutput, OVERFLOWS};
-use super::encoding::{self, FieldOrder, OpenNumber, refuse};
-use super::exchanges::FileExchange;
+use super::bindings::{self, OVERFLOWS};
+use super::encoding::{self, OpenNumber, Order, refuse};
 use super::framings;
-use super::reader::{Result, Spot, TableReader, TableValue};
-use super::recipes::{FileField, FileFieldKind, FileFrame, FilePart, FileRecipe, Flavour, WrittenField};
+use super::model::{
+    FileExchange, FileField, FileFieldKind, FileFrame, FileInput, FileOutput, FilePart, FileRecipe, Flavour,
+    Written,
+};
+use super::reader::{Item, Reader, Result, Spot};
 use super::{input_rules, rtu_frames, sendable};
 use crate::device::{DeviceField, DeviceRecipe, ExchangeKind, FrameEnds, NamedExchange, NamedFrame};
 use crate::keys::field::{self, FILL, OVERFLOW, PAD};
@@ -195,9 +197,7 @@ impl FieldReader {
                 let to = FileInput::Unused;
                 FileFieldKind::UserInput { name, written, to, again: false, restarted: None }
             }
-            Direction::Output => {
-                FileFieldKind::UserOutput { name, written, from: bindings::FileOutput::Program }
-            }
+            Direction::Output => FileFieldKind::UserOutput { name, written, from: FileOutput::Program },
         })
     }
 

@@ -12,51 +12,17 @@ use proto_core::sysvar::{Direction, SysVar, VarBit};
 use proto_core::time::Duration;
 use proto_core::wire::can::CanId;
 
-use super::bindings::{self, FileInput, Sending};
+use super::bindings;
 use super::encoding::refuse;
-use super::order::FrameOrder;
-use super::reader::{Result, Spot, TableReader, TableValue};
-use super::recipes::{self, FileField, FileFieldKind, FileFrame, FilePart, Flavour};
+use super::frames::{read_bytes, read_fields, read_id};
+use super::model::{
+    AskTiming, FileExchange, FileField, FileFieldKind, FileFrame, FileInput, FilePart, Flavour, FrameOrder,
+    Sending,
+};
+use super::reader::{Item, Reader, Result, Spot};
 use crate::device::ExchangeKind;
 use crate::keys::exchange;
 use crate::keys::recipe::OF_FRAME;
-
-/// One exchange, or one block of a slave.
-pub(super) struct FileExchange {
-    pub(super) spot: Spot,
-    /// The places of its keys, for later checks.
-    pub(super) spots: Vec<(ExchangeKey, Spot)>,
-    pub(super) peer: u8,
-    pub(super) kind: ExchangeKind,
-    /// What goes to the device. Of Modbus: its registers or coils only, without a frame around them.
-    pub(super) output: Option<FilePart>,
-    /// What comes from it.
-    pub(super) input: Option<FilePart>,
-    pub(super) pending: Option<FilePart>,
-    pub(super) refusal: Option<FilePart>,
-    /// Its frames are on a CAN bus.
-    pub(super) is_can: bool,
-    /// The request is a remote frame on CAN.
-    pub(super) remote: bool,
-    /// When the values of its reply are overdue.
-    pub(super) overdue: Option<Duration>,
-    /// What in its reply tells that the device has restarted.
-    pub(super) restarted: Option<Restarted>,
-    pub(super) timing: AskTiming,
-}
-
-/// When an exchange is asked, and how long it may take.
-pub(super) struct AskTiming {
-    pub(super) when: Triggers,
-    pub(super) timeout: Duration,
-    pub(super) retries: Option<u8>,
-    pub(super) pause: Duration,
-    pub(super) trigger: Option<Duration>,
-    pub(super) late: Option<Duration>,
-    pub(super) stop: bool,
-    pub(super) follow: Option<u8>,
-    pub(super) outcome: OutcomeTo,
-}
 
 /// The keys of [`AskTiming`].
 const TIMING_KEYS: [&str; 11] = [
@@ -254,10 +220,10 @@ fn read_frame(
     let mut frame = FileFrame::new(table.spot.clone());
     if is_can {
         let id = table.required("id", "the frame's CAN id")?;
-        (frame.id, frame.id_spot) = (recipes::read_id(&table, &id)?, id.spot);
+        (frame.id, frame.id_spot) = (read_id(&table, &id)?, id.spot);
     } else {
-        (part.head, part.head_spot) = recipes::read_bytes(&table, "head")?;
-        (part.tail, part.tail_spot) = recipes::read_bytes(&table, "tail")?;
+        (part.head, part.head_spot) = read_bytes(&table, "head")?;
+        (part.tail, part.tail_spot) = read_bytes(&table, "tail")?;
     }
     if table.flag(&exchange::REMOTE)? {
         refuse(&table, &["fields", "checksum", "endian", "word_order"], "a remote request has no data")?;
@@ -265,7 +231,7 @@ fn read_frame(
         return Ok((part, true));
     }
     let rules = Rules { mode: Mode::User, direction };
-    frame.fields = recipes::read_fields(&table, part.head.len(), rules, Flavour::Gateway)?;
+    frame.fields = read_fields(&table, part.head.len(), rules, Flavour::Gateway)?;
     part.frames.push(frame);
     part.check_device(&table, if is_can { Carrier::Can } else { Carrier::Stream }, direction)?;
     Ok((part, false))
@@ -415,7 +381,7 @@ fn read_on(item: &TableValue<'_>, when: &mut Triggers) -> Result<()> {
             "start" => &mut when.start,
             "change" => &mut when.change,
             _ => {
-                let (var, bit) = super::bindings::read_rising(item, text, "\"start\", \"change\"")?;
+                let (var, bit) = bindings::read_rising(item, text, "\"start\", \"change\"")?;
                 return match when.rising.replace((var, bit)) {
                     None => Ok(()),
                     Some((before, nth)) => Err(item

@@ -16,14 +16,14 @@ use proto_core::sysvar::{Direction, ParseError, SysVar, VarBit};
 use proto_core::wire::dialect::Dialect;
 use proto_core::wire::scalar::Scalar;
 
-use super::bindings::FileInput;
 use super::commands::FileCommand;
 use super::document::{At, SourceTree};
 use super::lines::{key_name, read_bitrate, read_cycle, read_line, read_rtu_line};
+use super::model::{FileField, FileInput, FileRecipe, Flavour, RecipeKind};
 use super::names::meant_variable;
 use super::network::{self, check_ipv4};
-use super::reader::{Result, Spot, TableReader, TableValue};
-use super::recipes::{self, FileField, FileRecipe, Flavour, RecipeKind};
+use super::reader::{Item, Reader, Result, Spot};
+use super::recipes;
 use super::sources;
 use crate::keys;
 use crate::keys::gateway::{

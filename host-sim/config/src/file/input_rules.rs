@@ -7,11 +7,11 @@ use proto_core::device::{Encoding, Kind, Overflow};
 use proto_core::sysvar::{Direction, SysVar, VarBit};
 use proto_core::wire::scalar::ScalarType;
 
-use super::bindings::{FileInput, read_var};
+use super::bindings::read_var;
 use super::encoding::refuse;
+use super::model::{FileInput, Written};
 use super::names::meant_variable;
-use super::reader::{Result, Spot, TableReader, TableValue};
-use super::recipes::WrittenField;
+use super::reader::{Item, Reader, Result, Spot};
 use super::sendable::{add_entry, read_limits};
 use crate::keys::field::{AS, POINT, RESTARTED};
 

@@ -13,6 +13,7 @@ mod document;
 pub(crate) mod encoding;
 mod error;
 mod exchanges;
+mod frames;
 pub(crate) mod framings;
 mod functions;
 pub(crate) mod gateway;
@@ -20,6 +21,7 @@ pub(crate) mod input_rules;
 mod inventory;
 pub(crate) mod lines;
 pub(crate) mod modbus;
+pub(crate) mod model;
 mod names;
 mod network;
 mod order;
@@ -44,9 +46,9 @@ pub use sparkplug::{ReportRule, SparkplugFile, load_sparkplug, parse_sparkplug};
 use super::device::{AnyRecipe, DeviceRecipe};
 use super::keys;
 use super::sim::SimConfig;
-use document::SourceTree;
-use reader::{Result, TableReader, TableValue};
-use recipes::{FileRecipe, Flavour};
+use document::Document;
+use model::{FileRecipe, Flavour};
+use reader::{Item, Reader, Result};
 
 /// A file of either kind.
 #[derive(Debug, Clone, PartialEq)]

@@ -12,9 +12,9 @@ use proto_core::sysvar::Direction;
 use super::coils;
 use super::device::FieldReader;
 use super::encoding::refuse;
-use super::exchanges::{self, AskTiming, FileExchange};
-use super::reader::{Result, TableReader, TableValue};
-use super::recipes::{FileField, FileFrame, FilePart};
+use super::exchanges;
+use super::model::{AskTiming, FileExchange, FileField, FileFrame, FilePart};
+use super::reader::{Item, Reader, Result};
 use crate::device::ExchangeKind;
 use crate::keys::{self, exchange};
 

@@ -3,21 +3,14 @@
 //! In: the frames as the file has them, with `name` and `after`. Out: the same frames, each behind the one that
 //! it is to follow. The gateway hands a whole cycle over at once, in this order.
 
+use super::model::{FileFrame, FrameOrder};
 use super::names::did_you_mean;
-use super::reader::{Result, Spot, TableReader};
-use super::recipes::FileFrame;
+use super::reader::{Reader, Result, Spot};
 use crate::keys::Key;
 use crate::keys::recipe::{AFTER, FRAME_NAME};
 
 /// The keys of [`FrameOrder`].
 pub(super) const ORDER_KEYS: &[Key] = &[FRAME_NAME, AFTER];
-
-/// What a frame is called, and which one goes before it.
-#[derive(Debug, Clone, Default)]
-pub(super) struct FrameOrder {
-    name: Option<(String, Spot)>,
-    after: Option<(String, Spot)>,
-}
 
 impl FrameOrder {
     pub(super) fn read(frame: &TableReader<'_>) -> Result<Self> {
@@ -28,14 +21,6 @@ impl FrameOrder {
             Ok(Some((name.to_owned(), item.spot)))
         };
         Ok(Self { name: read(&FRAME_NAME)?, after: read(&AFTER)? })
-    }
-
-    pub(super) fn name(&self) -> Option<&str> {
-        self.name.as_ref().map(|(name, _)| name.as_str())
-    }
-
-    pub(super) fn after(&self) -> Option<&str> {
-        self.after.as_ref().map(|(name, _)| name.as_str())
     }
 }
 

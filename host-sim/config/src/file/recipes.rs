@@ -2,227 +2,28 @@
 //!
 //! In: tables. Out: [`FileRecipe`], which keeps the places for later checks.
 
-use proto_core::config::{FieldSpec, InputBinding, OnStale, OutputBinding};
-use proto_core::device::{Boundary, Checksum, Encoding, Escape, Kind, Overflow};
+use proto_core::config::OnStale;
 use proto_core::recipe::CanLayout;
 use proto_core::recipe::PartError;
 use proto_core::recipe::StreamLayout;
-use proto_core::recipe::model::{Field, Framing, Mode, Rules};
-use proto_core::sysvar::{Direction, SysVar, VarRange};
+use proto_core::recipe::model::{Framing, Mode, Rules};
+use proto_core::sysvar::Direction;
 use proto_core::wire::can::CanId;
-use proto_core::wire::scalar::ScalarType;
 
-use super::bindings::{self, FileInput, FileOutput};
-use super::checksums;
-use super::device::{self, FieldReader};
+use super::bindings;
+use super::device;
 use super::encoding::refuse;
-use super::exchanges::{self, FileExchange};
+use super::exchanges;
+use super::frames::{read_bytes, read_fields, read_id};
 use super::framings;
 use super::modbus;
-use super::names::{did_you_mean, meant_variable};
-use super::order::{self, FrameOrder, ORDER_KEYS};
-use super::reader::{Result, Spot, TableReader, TableValue};
+use super::model::{FileField, FileFrame, FilePart, FileRecipe, Flavour, FrameOrder, KINDS, RecipeKind};
+use super::names::did_you_mean;
+use super::order::{self, ORDER_KEYS};
+use super::reader::{Item, Reader, Result, Spot};
 use crate::device::AnyRecipe;
 use crate::keys;
 use crate::sim::{SimCanFrame, SimField, SimParts, SimRecipe, SimStreamPart};
-
-/// The kind of file: only a gateway's recipes have bindings.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Flavour {
-    Gateway,
-    Controller,
-}
-
-pub(super) struct FileRecipe {
-    pub(super) spot: Spot,
-    pub(super) name: String,
-    pub(super) name_spot: Spot,
-    pub(super) mode: Mode,
-    pub(super) kind: RecipeKind,
-    pub(super) input: Option<FilePart>,
-    pub(super) output: Option<FilePart>,
-    /// What is asked of devices beside the parts, or all that a recipe of Modbus has.
-    pub(super) exchanges: Vec<FileExchange>,
-    /// What requests do while a value of them is stale, if there is no output part to say it.
-    pub(super) on_stale: Option<OnStale>,
-}
-
-/// What carries a recipe.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum RecipeKind {
-    Stream,
-    Can,
-    ModbusMaster,
-    ModbusSlave,
-}
-
-/// The words of `kind`.
-pub(crate) const KINDS: [(&str, RecipeKind); 4] = [
-    ("stream", RecipeKind::Stream),
-    ("can", RecipeKind::Can),
-    ("modbus-rtu", RecipeKind::ModbusMaster),
-    ("modbus-rtu-slave", RecipeKind::ModbusSlave),
-];
-
-impl RecipeKind {
-    /// As files have it.
-    pub(super) fn name(self) -> &'static str {
-        KINDS.iter().find(|(_, kind)| *kind == self).map_or("", |(name, _)| name)
-    }
-
-    pub(super) fn is_modbus(self) -> bool {
-        matches!(self, Self::ModbusMaster | Self::ModbusSlave)
-    }
-}
-
-pub(super) struct FilePart {
-    pub(super) spot: Spot,
-    pub(super) head: Vec<u8>,
-    pub(super) tail: Vec<u8>,
-    pub(super) head_spot: Option<Spot>,
-    pub(super) tail_spot: Option<Spot>,
-    /// One in a stream part, one for each id in a CAN part.
-    pub(super) frames: Vec<FileFrame>,
-    /// The gateway's keys of an output part.
-    pub(super) sending: bindings::Sending,
-    /// What tells the frames of a stream apart.
-    pub(super) framing: (Boundary, Option<Escape>),
-}
-
-pub(super) struct FileFrame {
-    pub(super) spot: Spot,
-    /// 0 in a stream part.
-    pub(super) id: CanId,
-    pub(super) id_spot: Spot,
-    pub(super) fields: Vec<FileField>,
-    /// Of an output frame on CAN.
-    pub(super) order: FrameOrder,
-}
-
-pub(super) struct FileField {
-    pub(super) spot: Spot,
-    pub(super) kind: FileFieldKind,
-}
-
-pub(super) enum FileFieldKind {
-    System(SysVar),
-    /// `again` marks a second use of the bytes of the field before.
-    UserInput {
-        name: String,
-        written: WrittenField,
-        to: FileInput,
-        again: bool,
-        /// The number that tells that the device has restarted.
-        restarted: Option<(Spot, f64)>,
-    },
-    UserOutput {
-        name: String,
-        written: WrittenField,
-        from: FileOutput,
-    },
-    Fixed {
-        name: Option<String>,
-        encoding: Encoding,
-        value: i64,
-    },
-    Padding {
-        len: u8,
-        fill: u8,
-    },
-    Checksum(Checksum),
-    /// What has no binding of a number: a text, or a length.
-    Device {
-        name: Option<String>,
-        spec: FieldSpec,
-    },
-}
-
-/// How a field with a value is written.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct WrittenField {
-    pub(super) encoding: Encoding,
-    pub(super) overflow: Overflow,
-}
-
-impl WrittenField {
-    pub(super) fn plain(ty: ScalarType) -> Self {
-        Self { encoding: Encoding::scalar(ty), overflow: Overflow::Usual }
-    }
-
-    /// The type, if the controller's recipes have such a field.
-    fn as_plain(self) -> Option<ScalarType> {
-        match self.encoding.kind {
-            Kind::Scalar(ty) if self == Self::plain(ty) => Some(ty),
-            _ => None,
-        }
-    }
-}
-
-impl FileField {
-    /// The field as the controller's recipes have it; `None` if only frames of devices have it.
-    fn field(&self) -> Option<Field> {
-        match self.kind {
-            FileFieldKind::System(var) => Some(Field::System(var)),
-            FileFieldKind::UserInput { written, .. } | FileFieldKind::UserOutput { written, .. } => {
-                written.as_plain().map(Field::User)
-            }
-            _ => None,
-        }
-    }
-
-    /// The field as the configuration has it; `bind` makes the binding of an input field.
-    pub(super) fn bound_spec(&self, bind: impl FnOnce(&FileInput) -> InputBinding) -> FieldSpec {
-        match &self.kind {
-            FileFieldKind::System(var) => FieldSpec::System(*var),
-            FileFieldKind::UserInput { written, to, .. } => {
-                let to = bind(to);
-                let WrittenField { encoding, overflow } = *written;
-                match written.as_plain() {
-                    Some(ty) => FieldSpec::UserInput { ty, to },
-                    None => FieldSpec::DeviceInput { encoding, overflow, to },
-                }
-            }
-            FileFieldKind::UserOutput { written, from, .. } => {
-                let from = match from {
-                    // Which port it is, is put in when all ports are known.
-                    FileOutput::Bound(binding) | FileOutput::PortNamed { binding, .. } => *binding,
-                    FileOutput::Program => OutputBinding::Constant(0.0),
-                };
-                let WrittenField { encoding, overflow } = *written;
-                match written.as_plain() {
-                    Some(ty) => FieldSpec::UserOutput { ty, from },
-                    None => FieldSpec::DeviceOutput { encoding, overflow, from },
-                }
-            }
-            &FileFieldKind::Fixed { encoding, value, .. } => FieldSpec::Fixed { encoding, value },
-            &FileFieldKind::Padding { len, fill } => FieldSpec::Padding { len, fill },
-            FileFieldKind::Checksum(sum) => FieldSpec::Checksum(*sum),
-            FileFieldKind::Device { spec, .. } => *spec,
-        }
-    }
-
-    /// The source of an output field that shows the health of a port with this name.
-    pub(super) fn port_named(&self) -> Option<(OutputBinding, &str, &Spot)> {
-        match &self.kind {
-            FileFieldKind::UserOutput { from: FileOutput::PortNamed { name, spot, binding }, .. } => {
-                Some((*binding, name, spot))
-            }
-            _ => None,
-        }
-    }
-
-    /// Its name; empty for what needs none.
-    pub(super) fn name(&self) -> String {
-        match &self.kind {
-            FileFieldKind::System(var) => var.to_string(),
-            FileFieldKind::UserInput { name, .. } | FileFieldKind::UserOutput { name, .. } => name.clone(),
-            FileFieldKind::Fixed { name, .. } | FileFieldKind::Device { name, .. } => {
-                name.clone().unwrap_or_default()
-            }
-            FileFieldKind::Padding { .. } | FileFieldKind::Checksum(_) => String::new(),
-        }
-    }
-}
 
 /// Every recipe of a file, within the limits of any port.
 pub(super) fn read_all(root: &TableReader<'_>, flavour: Flavour) -> Result<Vec<FileRecipe>> {
@@ -404,78 +205,6 @@ fn read_part(item: &TableValue<'_>, rules: Rules, is_can: bool, flavour: Flavour
     }
     exchanges::refuse_restarted(&table, Some(&part))?;
     Ok(part)
-}
-
-/// 11 bits, or 29 with `extended = true`.
-pub(super) fn read_id(frame: &TableReader<'_>, item: &TableValue<'_>) -> Result<CanId> {
-    let is_extended = frame.flag(&keys::recipe::EXTENDED)?;
-    let limit = if is_extended { "0x1FFFFFFF" } else { "0x7FF" };
-    if !item.is_integer() {
-        return Err(item.no_integer(&format!("0..={limit}")));
-    }
-    let number: i64 = item.integer(i64::MIN..=i64::MAX)?;
-    let standard = || u16::try_from(number).ok().map(CanId::Standard);
-    let extended = || u32::try_from(number).ok().map(CanId::Extended);
-    let id = if is_extended { extended() } else { standard() };
-    id.filter(|id| id.is_valid()).ok_or_else(|| {
-        let hint = if extended().is_some_and(CanId::is_valid) {
-            ", or 0..=0x1FFFFFFF with extended = true"
-        } else {
-            ""
-        };
-        let shown = if number < 0 { number.to_string() } else { format!("{number:#X}") };
-        item.error(format!("{shown} is out of range; allowed: 0..={limit}{hint}"))
-    })
-}
-
-pub(super) fn read_bytes(table: &TableReader<'_>, key: &str) -> Result<(Vec<u8>, Option<Spot>)> {
-    let Some(item) = table.optional(key) else { return Ok((Vec::new(), None)) };
-    let bytes = item
-        .array("of bytes, such as [255, 255]")?
-        .iter()
-        .map(|item| item.integer(0..=255))
-        .collect::<Result<_>>()?;
-    Ok((bytes, Some(item.spot)))
-}
-
-/// The fields of a stream part, or of one CAN frame, behind a head of so many bytes.
-pub(super) fn read_fields(
-    table: &TableReader<'_>,
-    head: usize,
-    rules: Rules,
-    flavour: Flavour,
-) -> Result<Vec<FileField>> {
-    let mut reader = FieldReader::new(table, rules, flavour)?;
-    let list = table.required("fields", "the list of the frame's fields")?;
-    let mut fields = Vec::new();
-    for item in list.array("of fields, such as [\"RobotState[8..13]\"]")? {
-        match (rules.mode, item.as_string()) {
-            (Mode::Realtime, Some(name)) => {
-                let range = VarRange::parse(name)
-                    .map_err(|error| item.error(format!("{name:?}: {error}{}", meant_variable(name))))?;
-                fields.extend(
-                    range
-                        .iter()
-                        .map(|var| FileField { spot: item.spot.clone(), kind: FileFieldKind::System(var) }),
-                );
-            }
-            (Mode::Realtime, None) => {
-                return Err(item.error(
-                    "the fields of a realtime recipe are names of system variables, such as \"RobotState[8]\"; \
-                     for fields of your own set mode = \"user\"",
-                ));
-            }
-            (Mode::User, Some(_)) => {
-                return Err(item.error(
-                    "the fields of a user recipe are tables, such as { name = \"grip\", type = \"byte\" }; \
-                     for system variables set mode = \"realtime\"",
-                ));
-            }
-            (Mode::User, None) => reader.read(&item, &mut fields)?,
-        }
-    }
-    checksums::read_checksum(table, head, &mut fields)?;
-    Ok(fields)
 }
 
 impl FilePart {

@@ -5,11 +5,10 @@
 use proto_core::config::{FieldSpec, Limits, MapEntry, OutputBinding, Outside, check_sent};
 use proto_core::device::{Encoding, Overflow};
 
-use super::bindings::FileOutput;
 use super::commands::read_range;
 use super::encoding::refuse;
-use super::reader::{Result, Spot, TableReader, TableValue};
-use super::recipes::WrittenField;
+use super::model::{FileOutput, Written};
+use super::reader::{Item, Reader, Result, Spot};
 use crate::keys::field::OUTSIDE;
 
 /// The words of `outside`.

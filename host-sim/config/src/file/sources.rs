@@ -6,7 +6,7 @@
 use proto_core::config::{LinkSource, OutputBinding, PortHealth, PortValue, StateValue};
 use proto_core::sysvar::SysVar;
 
-use super::bindings::FileOutput;
+use super::model::FileOutput;
 use super::names::{did_you_mean, meant_variable};
 use super::reader::{Result, TableValue};
 use crate::keys::gateway::HEALTH_TABLE;

@@ -6,7 +6,8 @@ use super::device::{CHECKSUM, ENDIAN, ESCAPE, FRAMING, WORD_ORDER};
 use super::gateway::NAME;
 use super::{Case, Key, KeyTable, Rule, Shape, TextKind, When, exchange, field, words};
 use crate::file::bindings::ON_STALES;
-use crate::file::recipes::{KINDS, MODES};
+use crate::file::model::KINDS;
+use crate::file::recipes::MODES;
 
 const ANY: usize = usize::MAX;
 

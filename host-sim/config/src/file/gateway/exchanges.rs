@@ -3,8 +3,7 @@
 use proto_core::config::{Exchange, FrameSpec, MAX_EXCHANGES, Place, Span, Transaction};
 use proto_core::sysvar::Direction;
 
-use super::super::exchanges::FileExchange;
-use super::super::recipes::{FilePart, FileRecipe};
+use super::super::model::{FileExchange, FilePart, FileRecipe};
 use super::{Builder, Result, delimiter};
 use crate::device::ExchangeKind;
 
