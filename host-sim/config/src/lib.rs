@@ -26,11 +26,11 @@ pub use functions::{
 };
 pub use schema::{FileKind, schema};
 pub use sim::{
-    AnalogInput, BitGroup, CommandClients, Initial, InitialTarget, Listen, Power, Robot, RobotMode, SimBus,
-    SimCanFrame, SimConfig, SimField, SimParts, SimPort, SimProgram, SimRecipe, SimStreamPart,
+    CommandClients, Initial, Listen, Power, Robot, RobotMode, SimBus, SimCanFrame, SimConfig, SimField,
+    SimParts, SimPort, SimProgram, SimRecipe, SimStreamPart,
 };
 pub use since::changes_since_0_2;
-pub use target::TargetError;
+pub use target::{AnalogInput, BitGroup, InitialTarget, TargetError};
 
 /// The example of README.md is a test.
 #[cfg(doctest)]

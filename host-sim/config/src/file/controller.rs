@@ -17,9 +17,9 @@ use crate::functions::Functions;
 use crate::keys;
 use crate::keys::controller::{CLIENTS, COMMAND, CONTROL, MODBUS, MODE, POWER, STATE, UDP2011};
 use crate::sim::{
-    CommandClients, Initial, InitialTarget, Listen, Power, Robot, RobotMode, SimBus, SimConfig, SimPort,
-    SimProgram,
+    CommandClients, Initial, Listen, Power, Robot, RobotMode, SimBus, SimConfig, SimPort, SimProgram,
 };
+use crate::target::InitialTarget;
 
 /// Reads the whole file and checks it.
 pub(super) fn read(document: &SourceTree) -> Result<SimConfig> {

@@ -5,8 +5,8 @@ use crate::functions::{
     FUNCTION_INPUTS, FUNCTION_OUTPUTS, Function, FunctionInput, FunctionOutput, Functions, ShownState,
 };
 use crate::keys;
-use crate::sim::{InitialTarget, SimProgram};
-use crate::target::TargetError;
+use crate::sim::SimProgram;
+use crate::target::{InitialTarget, TargetError};
 
 pub(super) fn read(root: &TableReader<'_>, programs: &[SimProgram]) -> Result<Functions> {
     let Some(item) = root.optional("functions") else { return Ok(Functions::default()) };
