@@ -245,7 +245,7 @@ impl ConfigMut<'_> {
             }
             Fields::Specs(fields) => fields.iter().for_each(|&field| self.push_field(field)),
         }
-        Ok(span(start, self.fields.len()))
+        Ok(Span::between(start, self.fields.len()))
     }
 
     /// There is room: checked when the recipe was begun.
@@ -288,7 +288,7 @@ impl ConfigMut<'_> {
         if let Some(value) = idle {
             let _ = self.commands.push(CommandEntry::new(value, String::new()));
         }
-        Ok(span(start, self.commands.len()))
+        Ok(Span::between(start, self.commands.len()))
     }
 
     /// As [`GatewayConfig::add_port`].
@@ -339,7 +339,7 @@ impl ConfigMut<'_> {
             SafeValues::Values(values) => self.add_safe_values(values.iter().map(|&value| Ok(value))),
         };
         added.inspect_err(|_| self.safe_values.truncate(values))?;
-        port.on_timeout = span(values, self.safe_values.len());
+        port.on_timeout = Span::between(values, self.safe_values.len());
         // There is room: checked above.
         let _ = self.ports.push(port);
         Ok(index)
@@ -410,10 +410,4 @@ fn safe_bit(bit: VarBit, value: f64) -> Result<SafeValue, Kind> {
 
 fn name(given: &str, place: Place) -> Result<Name, ConfigError> {
     check_name(given).and_then(|()| text(given)).map_err(|kind| ConfigError { place, kind })
-}
-
-/// The range between two lengths of a list. Lists are shorter than `u16::MAX`; the check of the
-/// counts refuses others.
-pub(super) fn span(start: usize, end: usize) -> Span {
-    Span { start: start as u16, len: end.saturating_sub(start) as u16 }
 }

@@ -83,7 +83,7 @@ impl ConfigMut<'_> {
             };
             let _ = self.exchanges.push(exchange.repeated(retries));
         }
-        Ok(super::add::span(start, self.exchanges.len()))
+        Ok(Span::between(start, self.exchanges.len()))
     }
 
     fn transaction(

@@ -136,6 +136,11 @@ impl Span {
         let start = usize::from(self.start);
         pool.get(start..start.saturating_add(usize::from(self.len))).unwrap_or(&[])
     }
+
+    /// The range between two lengths of a list. Lists are shorter than `u16::MAX`; the check of the counts refuses others.
+    pub(super) fn between(start: usize, end: usize) -> Self {
+        Self { start: start as u16, len: end.saturating_sub(start) as u16 }
+    }
 }
 
 /// One field, and what the gateway does with it.
