@@ -14,6 +14,7 @@ use serde_json::Value;
 
 use super::common::{Link, snake};
 use super::operations::Operation;
+use super::program::End;
 use super::registers::Registers;
 use super::runs::Run;
 use super::{ConnId, Controller};
@@ -322,6 +323,13 @@ impl Controller {
             let time_s = self.time_s(now);
             self.recorder.keep(time_s, what());
         }
+    }
+
+    /// How the running program ends, if it is ended now.
+    pub(super) fn run_over(&mut self, now: Instant, program: &str, end: Option<&End>) {
+        let time_s = self.time_s(now);
+        let run = self.runs.end(program, end, time_s);
+        self.happened(now, || Happened::ProgramEnded(run));
     }
 
     pub(super) fn client_event(&mut self, now: Instant, link: Link, conn: ConnId, came: bool) {

@@ -1,6 +1,5 @@
 //! How programs ended (docs/control.md section 3).
 
-use proto_core::time::Instant;
 use serde::Serialize;
 
 use super::Controller;
@@ -122,13 +121,6 @@ impl Controller {
     /// Number of programs that were started so far.
     pub fn runs(&self) -> u64 {
         self.runs.started
-    }
-
-    /// How the running program ends, if it is ended now.
-    pub(super) fn run_over(&mut self, now: Instant, program: &str, end: Option<&End>) {
-        let time_s = self.time_s(now);
-        let run = self.runs.end(program, end, time_s);
-        self.happened(now, || super::Happened::ProgramEnded(run));
     }
 }
 
