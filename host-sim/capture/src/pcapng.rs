@@ -18,7 +18,8 @@ use pcap_file::{DataLink, Endianness};
 use proto_core::engine::{Rejection, TapDirection, TapPlace, TapVerdict};
 use proto_core::wire::can::CanId;
 
-use crate::record::{Cell, Frame, Record, What, rejection};
+use crate::frame::Frame;
+use crate::record::{Cell, Record, What, rejection};
 use crate::watch::Arrived;
 
 /// The first bytes of every pcapng file.
