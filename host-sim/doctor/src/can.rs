@@ -6,7 +6,7 @@ use proto_core::sysvar::Direction;
 use proto_core::wire::can::CanId;
 
 use crate::finding::{Cause, Finding, Severity};
-use crate::port::PortCase;
+use crate::port_case::PortCase;
 use crate::record::SeenId;
 
 /// Looks at the bus and at what came on it.

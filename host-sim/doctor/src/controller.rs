@@ -3,12 +3,11 @@
 use proto_core::command::Request;
 use proto_core::config::ConfigView;
 use proto_core::engine::ReplyCode;
-use proto_core::time::Duration;
 use proto_core::wire::state::{OperationMode, ProgramState, RobotState, SafetyState, States};
 
 use crate::Case;
+use crate::command::{REPORTED_FOR, ago, is_command};
 use crate::finding::{Cause, Finding, FindingPlace, Severity, finding};
-use crate::given::is_command;
 use crate::record::PortRecord;
 use crate::state::ObservedPort;
 
@@ -197,14 +196,6 @@ fn is_so_already(word: &str, states: &States) -> Option<&'static str> {
         _ => None,
     }
 }
-
-/// ` 12 s ago`, behind what was then.
-pub(crate) fn ago(age: Duration) -> String {
-    format!(" {} s ago", age.as_millis() / 1000)
-}
-
-/// How long a failed command is reported.
-pub(crate) const REPORTED_FOR: Duration = Duration::from_secs(60);
 
 fn mode(mode: OperationMode) -> &'static str {
     match mode {

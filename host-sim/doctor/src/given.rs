@@ -1,13 +1,13 @@
 //! Findings about values that gave no command, and about presses that may be among discarded input.
 
-use proto_core::config::{ConfigView, FieldSpec, InputBinding, Recipe};
+use proto_core::config::{ConfigView, Recipe};
 use proto_core::engine::{DropReason, Rejection};
 use proto_core::sysvar::Direction;
 
 use crate::bytes::count;
-use crate::controller::{REPORTED_FOR, ago};
+use crate::command::{REPORTED_FOR, ago, is_command};
 use crate::finding::{Cause, Finding, Severity};
-use crate::port::PortCase;
+use crate::port_case::PortCase;
 use crate::state::Withheld;
 
 /// Looks at a port whose device gives commands.
@@ -22,16 +22,6 @@ pub(crate) fn examine(seen: &PortCase<'_>, findings: &mut Vec<Finding>) {
 /// Whether a value of the recipe can pick a command.
 fn gives_commands(config: ConfigView<'_>, recipe: &Recipe) -> bool {
     config.fields_of(recipe, Direction::Input).any(|(_, _, field)| is_command(field))
-}
-
-/// Whether a value of the field can pick a command.
-pub(crate) fn is_command(field: &FieldSpec) -> bool {
-    match field {
-        FieldSpec::UserInput { to, .. } | FieldSpec::DeviceInput { to, .. } => {
-            matches!(to, InputBinding::Commands { .. })
-        }
-        _ => false,
-    }
 }
 
 /// A value that should have been a command, and picked none.

@@ -12,6 +12,7 @@
 mod bytes;
 mod can;
 mod checksum;
+mod command;
 mod controller;
 mod document;
 mod finding;
@@ -19,6 +20,7 @@ mod given;
 mod link;
 mod peers;
 mod port;
+mod port_case;
 mod record;
 mod shape;
 mod state;

@@ -7,7 +7,7 @@ use proto_core::schedule::Presence;
 
 use crate::bytes::{HexBytes, count};
 use crate::finding::{Cause, Finding, Severity};
-use crate::port::PortCase;
+use crate::port_case::PortCase;
 use crate::state::Peer;
 
 /// Looks at each peer.

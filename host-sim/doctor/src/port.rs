@@ -1,15 +1,15 @@
 //! Findings about field ports: what comes in, and why it is no frame.
 
-use proto_core::config::{Bus, Parity, Port, Recipe};
+use proto_core::config::{Bus, Parity};
 use proto_core::engine::{FieldBus, PortCounters, PortId, PortState, Rejection};
 use proto_core::recipe::model::Mode;
 
 use crate::bytes::{HexBytes, count, list};
-use crate::controller::{REPORTED_FOR, ago};
-use crate::finding::{Cause, FILE, Finding, FindingPlace, Severity, finding};
+use crate::command::{REPORTED_FOR, ago};
+use crate::finding::{Cause, FILE, Finding, FindingPlace, Severity};
+use crate::port_case::PortCase;
 use crate::record::{PortRecord, WINDOW};
 use crate::shape::Shape;
-use crate::state;
 use crate::stream::{self, Fit};
 use crate::{Case, can, checksum, given, peers, value};
 
@@ -31,18 +31,6 @@ pub(crate) fn examine(case: &Case<'_>, findings: &mut Vec<Finding>) {
         };
         seen.examine(findings);
     }
-}
-
-/// A port and what was seen of it in the window.
-pub(crate) struct PortCase<'a> {
-    pub(crate) case: &'a Case<'a>,
-    pub(crate) port: &'a Port,
-    pub(crate) recipe: &'a Recipe,
-    pub(crate) place: FindingPlace,
-    pub(crate) status: &'a state::ObservedPort,
-    pub(crate) record: &'a PortRecord,
-    /// Counted within the window.
-    pub(crate) counters: PortCounters,
 }
 
 /// What was counted between two instants, of the counters that tell something.
@@ -72,16 +60,6 @@ impl PortCase<'_> {
         }
         peers::examine(self, findings);
         given::examine(self, findings);
-    }
-
-    /// Makes a finding about the port.
-    pub(crate) fn found(
-        &self,
-        severity: Severity,
-        cause: Cause,
-        [seen, expected, likely, remedy]: [String; 4],
-    ) -> Finding {
-        finding((severity, &self.place, cause), seen, expected, likely, remedy)
     }
 
     fn gone(&self) -> Finding {
