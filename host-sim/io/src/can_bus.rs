@@ -16,8 +16,7 @@ use tokio::sync::Notify;
 
 use super::bind::{Device, Pace};
 use super::exchange::{Backlog, PortEvent, PortTx};
-use super::handover::{HandoverBus, HandoverState, Held, HeldBus};
-use super::pty::Pty;
+use super::pty::{HandoverPty, Pty};
 use super::stream;
 use super::wire::{Full, NodeId, Pacing, Transmitted, Wire};
 use crate::clock::Clock;
@@ -234,12 +233,31 @@ pub(super) struct CanPort {
     pub(super) clock: Clock,
 }
 
+/// The clients' side of a CAN bus in user space, without queued frames.
+#[derive(Debug)]
+pub(crate) struct HandoverBus {
+    /// Bit/s of the bus, which the clients' channels must match.
+    pub(crate) bitrate: u32,
+    pub(crate) pty: Option<(HandoverPty, SlcanSession)>,
+    pub(crate) listener: Option<std::net::TcpListener>,
+    pub(crate) clients: Vec<(std::net::TcpStream, SlcanSession)>,
+}
+
+/// The same of a bus whose tasks still run.
+#[derive(Debug)]
+pub(crate) struct HeldBus {
+    pub(crate) bitrate: u32,
+    pub(crate) pty: Option<(Rc<Pty>, Rc<RefCell<SlcanSession>>)>,
+    pub(crate) listener: Option<Rc<TcpListener>>,
+    pub(crate) clients: Rc<Clients>,
+}
+
 impl CanPort {
     pub(super) async fn open(
         device: &Device,
         bitrate: u32,
         tx: Rc<PortTx>,
-        handover: Option<HandoverState>,
+        handover: Option<HandoverBus>,
     ) -> io::Result<Self> {
         let (link, listen, pace) = match device {
             Device::SlcanPty { link, pace } => (Some(link), None, *pace),
@@ -251,7 +269,7 @@ impl CanPort {
         };
         let is_handed_over = handover.is_some();
         let (listener, pty, clients) = match handover {
-            Some(HandoverState::Bus(HandoverBus { pty, listener, clients, .. })) => {
+            Some(HandoverBus { pty, listener, clients, .. }) => {
                 let pty = pty.map(|(pty, session)| Ok::<_, io::Error>((pty.attach()?, session)));
                 let client = |(stream, session)| {
                     let stream = TcpStream::from_std(stream)?;
@@ -260,7 +278,7 @@ impl CanPort {
                 let clients = clients.into_iter().map(client).collect::<io::Result<_>>()?;
                 (listener.map(TcpListener::from_std).transpose()?, pty.transpose()?, clients)
             }
-            _ => {
+            None => {
                 let listener = match listen {
                     Some(at) => Some(stream::listen(at).await?),
                     None => None,
@@ -289,13 +307,13 @@ impl CanPort {
     }
 
     /// What clients are connected to.
-    pub(super) fn held(&self) -> Held {
-        Held::Bus(HeldBus {
+    pub(super) fn held(&self) -> HeldBus {
+        HeldBus {
             bitrate: self.bitrate,
             pty: self.pty.clone(),
             listener: self.listener.clone(),
             clients: Rc::clone(&self.clients),
-        })
+        }
     }
 
     pub(super) async fn run(self, mut events: impl FnMut(PortEvent<'_>)) -> io::Result<()> {

@@ -12,7 +12,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use tokio::net::{TcpListener, TcpStream};
 
 use crate::bind::Device;
-use crate::can_bus::{Clients, SlcanSession};
+use crate::can_bus::{HandoverBus, HeldBus};
 use crate::exchange::PortTx;
 use crate::pty::{HandoverPty, Pty};
 
@@ -47,16 +47,6 @@ pub(crate) enum HandoverState {
     Bus(HandoverBus),
 }
 
-/// The clients' side of a CAN bus in user space, without queued frames.
-#[derive(Debug)]
-pub(crate) struct HandoverBus {
-    /// Bit/s of the bus, which the clients' channels must match.
-    pub(crate) bitrate: u32,
-    pub(crate) pty: Option<(HandoverPty, SlcanSession)>,
-    pub(crate) listener: Option<std::net::TcpListener>,
-    pub(crate) clients: Vec<(std::net::TcpStream, SlcanSession)>,
-}
-
 /// Shares the device of a running port, to release it after the port's tasks were dropped.
 #[derive(Debug)]
 pub struct Hold {
@@ -70,14 +60,6 @@ pub(crate) enum Held {
     Pty(Rc<Pty>),
     Listen(Rc<TcpListener>, Rc<RefCell<Option<Rc<TcpStream>>>>),
     Bus(HeldBus),
-}
-
-#[derive(Debug)]
-pub(crate) struct HeldBus {
-    pub(crate) bitrate: u32,
-    pub(crate) pty: Option<(Rc<Pty>, Rc<RefCell<SlcanSession>>)>,
-    pub(crate) listener: Option<Rc<TcpListener>>,
-    pub(crate) clients: Rc<Clients>,
 }
 
 impl Hold {

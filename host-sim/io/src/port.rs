@@ -12,7 +12,7 @@ use proto_core::wire::can::CanId;
 use super::bind::Device;
 use super::can_bus::CanPort;
 use super::exchange::{PortEvent, PortTx};
-use super::handover::{HandoverDevice, HandoverState, Hold};
+use super::handover::{HandoverDevice, HandoverState, Held, Hold};
 use super::serial::SerialPort;
 use super::socketcan::KernelCan;
 use crate::clock::Clock;
@@ -75,7 +75,11 @@ impl OpenPort {
             (BusSettings::Can { bitrate }, Device::SocketCan { interface }) => {
                 PortDriver::Kernel(KernelCan::open(interface, bitrate, Rc::clone(&tx))?)
             }
-            (BusSettings::Can { bitrate }, _) => {
+            (PortBus::Can { bitrate }, _) => {
+                let handover = match handover {
+                    Some(HandoverState::Bus(bus)) => Some(bus),
+                    _ => None,
+                };
                 PortDriver::Can(CanPort::open(device, bitrate, Rc::clone(&tx), handover).await?)
             }
         };
@@ -92,7 +96,7 @@ impl OpenPort {
     pub fn hold(&self) -> Option<Hold> {
         let held = match &self.driver {
             PortDriver::Serial(serial) => serial.held()?,
-            PortDriver::Can(can) => can.held(),
+            PortDriver::Can(can) => Held::Bus(can.held()),
             PortDriver::Kernel(_) => return None,
         };
         Some(Hold { device: self.device.clone(), held, tx: Rc::clone(&self.tx) })
