@@ -15,9 +15,10 @@ use serde_json::{Value, json};
 use tokio::sync::oneshot;
 use tracing::{info, warn};
 
-use super::http::{HttpReply, HttpRequest};
-use super::reading::host_name;
-use super::supervisor::{ActionError, SupervisorAction, SupervisorCommand, SupervisorView, left_of};
+use super::http::HttpRequest;
+use super::reading::{etag, host_name, nothing_runs, revisions};
+use super::reply::HttpReply;
+use super::supervisor::{ActionError, SupervisorAction, SupervisorCommand, SupervisorView};
 use super::{ConsoleServer, ConsoleSource, check, pendant};
 
 impl ConsoleServer {
@@ -193,37 +194,6 @@ fn config(view: &SupervisorView, request: &HttpRequest<'_>) -> HttpReply {
     }
 }
 
-/// The revisions, and what happens to them.
-pub(super) fn revisions(view: &SupervisorView) -> Value {
-    let Some(revisions) = &view.revisions else { return json!({ "kept": [] }) };
-    let kept: Vec<_> = view
-        .entries
-        .iter()
-        .map(|entry| {
-            let etag = revisions.revision(entry.number).map(etag);
-            json!({ "revision": entry.number, "etag": etag, "stored_at": entry.stored_at, "from": entry.from })
-        })
-        .collect();
-    let mut shown = json!({ "live": revisions.live(), "kept": kept });
-    let mut show = |key: &str, value: Option<Value>| {
-        if let Some(value) = value {
-            shown[key] = value;
-        }
-    };
-    show("running", revisions.running().map(Value::from));
-    show("previous", revisions.previous().map(Value::from));
-    show("waiting", revisions.waiting().map(Value::from));
-    let trial = left_of(revisions.trial());
-    show("trial", trial.map(|(number, left_s)| json!({ "revision": number, "left_s": left_s })));
-    show("base", revisions.base().map(|base| Value::from(etag(base))));
-    show(
-        "last",
-        revisions.last().map(|(number, ended)| json!({ "revision": number, "ended": ended.name() })),
-    );
-    show("failure", view.failure.clone().map(Value::from));
-    shown
-}
-
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct ApplyArguments {
@@ -285,10 +255,6 @@ fn put(request: &HttpRequest<'_>, overrides: &[String]) -> Result<SupervisorActi
     }
 }
 
-fn etag(revision: Revision) -> String {
-    format!("\"{}-{:08x}\"", revision.number, revision.digest)
-}
-
 fn parse_etag(text: &str) -> Option<Revision> {
     let (number, digest) = text.strip_prefix('"')?.strip_suffix('"')?.split_once('-')?;
     let revision = Revision { number: number.parse().ok()?, digest: u32::from_str_radix(digest, 16).ok()? };
@@ -318,10 +284,6 @@ fn refusal(refused: Refused) -> HttpReply {
         other => (StatusCode::CONFLICT, format!("refused: {other:?}")),
     };
     HttpReply::error(status, &text)
-}
-
-pub(super) fn nothing_runs() -> HttpReply {
-    HttpReply::error(StatusCode::UNAVAILABLE, "nothing runs at the moment; try again")
 }
 
 /// For the log.

@@ -10,6 +10,7 @@ mod http;
 mod key_file;
 mod pendant;
 mod reading;
+mod reply;
 mod snapshots;
 mod store;
 mod stream;

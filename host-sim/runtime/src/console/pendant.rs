@@ -10,7 +10,7 @@ use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
 use tokio::net::TcpStream;
 use tokio::time::timeout;
 
-use super::http::HttpReply;
+use super::reply::HttpReply;
 
 /// Executes the operation in a body.
 pub(super) async fn operate(control: SocketAddr, body: &[u8]) -> HttpReply {

@@ -5,9 +5,10 @@ use std::rc::Rc;
 use std::sync::Arc;
 
 use proto_core::config::GatewayConfig;
-use recipe_api::request::HttpHead;
-use recipe_api::response::{ContentType, StatusCode};
-use recipe_api::route::{ApiOperation, Served};
+use recipe_api::request::Head;
+use recipe_api::response::{Kind, Status};
+use recipe_api::revisions::Revision;
+use recipe_api::route::{Operation, Served};
 use recipe_config::FileKind;
 use recipe_config::file::Text;
 use recipe_export::dbc::{self, DbcError};
@@ -15,9 +16,9 @@ use recipe_export::{Model, lua, map};
 use recipe_io::timer::now;
 use serde_json::{Map, Value, json};
 
-use super::api::{nothing_runs, revisions};
-use super::http::HttpReply;
+use super::reply::HttpReply;
 use super::snapshots::Snapshot;
+use super::supervisor::{SupervisorView, left_of};
 use super::{ConsoleServer, ConsoleSource, check};
 use crate::log::MAX_NEWEST;
 
@@ -216,6 +217,45 @@ fn decoded(text: &str) -> Option<Cow<'_, str>> {
         });
     }
     String::from_utf8(bytes).ok().map(Cow::Owned)
+}
+
+/// The revisions, and what happens to them.
+pub(super) fn revisions(view: &SupervisorView) -> Value {
+    let Some(revisions) = &view.revisions else { return json!({ "kept": [] }) };
+    let kept: Vec<_> = view
+        .entries
+        .iter()
+        .map(|entry| {
+            let etag = revisions.revision(entry.number).map(etag);
+            json!({ "revision": entry.number, "etag": etag, "stored_at": entry.stored_at, "from": entry.from })
+        })
+        .collect();
+    let mut shown = json!({ "live": revisions.live(), "kept": kept });
+    let mut show = |key: &str, value: Option<Value>| {
+        if let Some(value) = value {
+            shown[key] = value;
+        }
+    };
+    show("running", revisions.running().map(Value::from));
+    show("previous", revisions.previous().map(Value::from));
+    show("waiting", revisions.waiting().map(Value::from));
+    let trial = left_of(revisions.trial());
+    show("trial", trial.map(|(number, left_s)| json!({ "revision": number, "left_s": left_s })));
+    show("base", revisions.base().map(|base| Value::from(etag(base))));
+    show(
+        "last",
+        revisions.last().map(|(number, ended)| json!({ "revision": number, "ended": ended.name() })),
+    );
+    show("failure", view.failure.clone().map(Value::from));
+    shown
+}
+
+pub(super) fn nothing_runs() -> HttpReply {
+    HttpReply::error(Status::UNAVAILABLE, "nothing runs at the moment; try again")
+}
+
+pub(super) fn etag(revision: Revision) -> String {
+    format!("\"{}-{:08x}\"", revision.number, revision.digest)
 }
 
 /// The machine's host name.

@@ -18,7 +18,7 @@ use tokio::net::tcp::OwnedWriteHalf;
 use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
 
 use super::frames::{CaptureStream, FrameEvents};
-use super::http::{HttpReply, MAX_TIME, bytes_of, head_of};
+use super::reply::{HttpReply, MAX_TIME, bytes_of, head_of};
 use super::{ConsoleServer, ConsoleSource};
 
 /// An endless response.

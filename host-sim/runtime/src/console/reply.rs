@@ -1,0 +1,119 @@
+//! Responses: a status, a body and fields, and their bytes.
+
+use std::rc::Rc;
+use std::time::Duration;
+
+use recipe_api::guard::Refusal;
+use recipe_api::response::{Kind, Length, Page, Response, Status};
+use serde_json::{Value, json};
+
+/// A response with its body.
+#[derive(Debug)]
+pub(super) struct HttpReply {
+    pub(super) status: Status,
+    pub(super) kind: Kind,
+    pub(super) body: ReplyBody,
+    pub(super) fields: Vec<(&'static str, String)>,
+}
+
+/// What a response carries.
+#[derive(Debug)]
+pub(super) enum ReplyBody {
+    /// A text.
+    Text(Rc<str>),
+    /// Part of the program.
+    Bytes(&'static [u8]),
+    /// Made for this request.
+    Made(Vec<u8>),
+}
+
+impl ReplyBody {
+    pub(super) fn as_bytes(&self) -> &[u8] {
+        match self {
+            Self::Text(text) => text.as_bytes(),
+            Self::Bytes(bytes) => bytes,
+            Self::Made(bytes) => bytes,
+        }
+    }
+}
+
+impl<T: Into<Rc<str>>> From<T> for ReplyBody {
+    fn from(text: T) -> Self {
+        Self::Text(text.into())
+    }
+}
+
+impl HttpReply {
+    /// A document that was made before.
+    pub(super) fn text(kind: Kind, body: Rc<str>) -> Self {
+        Self { status: Status::OK, kind, body: ReplyBody::Text(body), fields: Vec::new() }
+    }
+
+    /// The page for people, unless the client has it.
+    pub(super) fn page(if_none_match: Option<&str>) -> Self {
+        let status = PAGE.status(if_none_match);
+        let body = ReplyBody::Bytes(if status == Status::OK { PAGE.bytes } else { &[] });
+        Self { status, kind: Kind::Page, body, fields: Vec::new() }
+    }
+
+    /// A configuration image.
+    pub(super) fn image(bytes: Vec<u8>) -> Self {
+        Self { status: Status::OK, kind: Kind::Image, body: ReplyBody::Made(bytes), fields: Vec::new() }
+    }
+
+    /// A JSON value.
+    pub(super) fn json(status: Status, value: &Value) -> Self {
+        Self { status, kind: Kind::Json, body: value.to_string().into(), fields: Vec::new() }
+    }
+
+    /// An object with `error`.
+    pub(super) fn error(status: Status, text: &str) -> Self {
+        Self::json(status, &json!({ "error": text }))
+    }
+
+    pub(super) fn with(mut self, name: &'static str, value: impl ToString) -> Self {
+        self.fields.push((name, value.to_string()));
+        self
+    }
+}
+
+impl From<Refusal> for HttpReply {
+    fn from(refusal: Refusal) -> Self {
+        let reply = Self::error(refusal.status, refusal.text);
+        let reply = match refusal.allow {
+            Some(allow) => reply.with("Allow", allow),
+            None => reply,
+        };
+        match refusal.retry_after_s {
+            Some(seconds) => reply.with("Retry-After", seconds),
+            None => reply,
+        }
+    }
+}
+
+/// A whole response.
+pub(super) fn bytes_of(reply: &HttpReply) -> Vec<u8> {
+    let body = reply.body.as_bytes();
+    let mut bytes = head_of(reply, Length::Bytes(body.len() as u64)).into_bytes();
+    bytes.extend_from_slice(body);
+    bytes
+}
+
+/// The text of a head.
+pub(super) fn head_of(reply: &HttpReply, length: Length) -> String {
+    let fields: Vec<(&str, &dyn std::fmt::Display)> =
+        reply.fields.iter().map(|(name, value)| (*name, value as &dyn std::fmt::Display)).collect();
+    let mut text = String::new();
+    // Writing to a `String` cannot fail.
+    let _ = match reply.kind {
+        Kind::Page => PAGE.write_head(reply.status, &mut text),
+        kind => Response::new(reply.status, kind, length).with(&fields).write(&mut text),
+    };
+    text
+}
+
+/// The page for people.
+const PAGE: Page =
+    Page { bytes: &recipe_console::PAGE, policy: recipe_console::POLICY, etag: recipe_console::ETAG };
+/// How long a request may take to arrive, and a response to be read.
+pub(super) const MAX_TIME: Duration = Duration::from_secs(5);
