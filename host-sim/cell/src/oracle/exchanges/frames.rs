@@ -6,7 +6,6 @@
 use proto_core::config::{FrameSpec, GatewayConfig};
 use proto_core::wire::can::CanId;
 
-use super::spec::Seen;
 use crate::oracle::device::{Look, look};
 use crate::oracle::spec::{Frame, device_frame};
 
@@ -28,6 +27,33 @@ impl FramesSpec {
         let refusal = self.refusal.as_ref().map_or(Look::No, |refusal| look(refusal, bytes));
         Seen::of(reply, Seen::Reply).or(Seen::of(refusal, Seen::Refusal))
     }
+}
+
+/// What bytes are while a reply is pending.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(in crate::oracle) enum Seen {
+    /// Not the beginning of what is expected.
+    No,
+    /// Perhaps its beginning; whether all constants so far are its own.
+    Begins {
+        is_ours: bool,
+    },
+    /// The request itself.
+    Echo(usize),
+    Reply(usize),
+    Refusal(usize),
+    /// The reply, or the request itself.
+    ReplyOrEcho(usize),
+    /// A reply to an earlier request of another exchange: its length, and which exchange.
+    Late(usize, usize),
+    /// A refusal of one of several requests.
+    Ambiguous(usize),
+    /// A frame that comes unasked: its length, and which input frame of the port it is.
+    Unasked(usize, usize),
+    /// A frame of another device.
+    Other(usize),
+    /// It would be the reply, but its checksum is wrong.
+    Wrong(usize),
 }
 
 impl Seen {

@@ -9,7 +9,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use proto_core::config::Echo;
 use proto_core::time::{Duration, Instant};
 
-use super::spec::{ExchangesSpec, Kind, RowSpec, Seen};
+use super::frames::Seen;
+use super::spec::{ExchangesSpec, Kind, RowSpec};
 use crate::oracle::Invariant;
 use crate::oracle::invariant::Wrong;
 use crate::oracle::spec::PortSpec;

@@ -12,8 +12,9 @@ pub(super) mod truth;
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::can::CanFrame;
 
+use self::frames::Seen;
 use self::line::{Ended, ExchangesWatch};
-use self::spec::{ExchangesSpec, Kind, RowSpec, Seen};
+use self::spec::{ExchangesSpec, Kind, RowSpec};
 use super::device::{Look, look};
 use super::downward::Downward;
 use super::field::{Accepted, Verdict};

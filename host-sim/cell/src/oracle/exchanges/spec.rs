@@ -11,7 +11,7 @@ use proto_core::sysvar::SysVar;
 use proto_core::time::Duration;
 use proto_core::wire::can::CanId;
 
-use super::frames::{FramesSpec, frame_of};
+use super::frames::{FramesSpec, Seen, frame_of};
 use crate::oracle::device::{self, look};
 use crate::oracle::spec::{Frame, PortSpec, device_frame};
 use crate::rtu::is_right;
@@ -82,33 +82,6 @@ pub(in crate::oracle) enum Kind {
     Start,
     /// Something is to be known, or to be as the controller has it.
     State,
-}
-
-/// What bytes are while a reply is pending.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(in crate::oracle) enum Seen {
-    /// Not the beginning of what is expected.
-    No,
-    /// Perhaps its beginning; whether all constants so far are its own.
-    Begins {
-        is_ours: bool,
-    },
-    /// The request itself.
-    Echo(usize),
-    Reply(usize),
-    Refusal(usize),
-    /// The reply, or the request itself.
-    ReplyOrEcho(usize),
-    /// A reply to an earlier request of another exchange: its length, and which exchange.
-    Late(usize, usize),
-    /// A refusal of one of several requests.
-    Ambiguous(usize),
-    /// A frame that comes unasked: its length, and which input frame of the port it is.
-    Unasked(usize, usize),
-    /// A frame of another device.
-    Other(usize),
-    /// It would be the reply, but its checksum is wrong.
-    Wrong(usize),
 }
 
 impl ExchangesSpec {
