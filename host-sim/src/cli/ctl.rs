@@ -9,7 +9,7 @@ mod updating;
 mod work;
 
 use std::io::{self, IsTerminal, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
 
@@ -18,6 +18,7 @@ use recipe_ctl::{Address, Client, Failure, Member, Stop, TableView, Verdict, key
 use recipe_runtime::Signals;
 use recipe_runtime::out::print_stderr;
 
+use super::output::OutputFile;
 use super::run::parse_time;
 use super::{Out, Printed, wrong};
 use act::Act;
@@ -190,4 +191,12 @@ fn end_on_signals(stop: &Stop, words: Option<&'static str>) -> Result<(), Failur
         std::process::exit(128 + number);
     };
     thread.spawn(watching).map(|_| ()).map_err(refused)
+}
+
+/// Writes an output file.
+fn write(path: &Path, bytes: &[u8], force: bool) -> Result<(), Failure> {
+    let written = OutputFile { bytes, name: "it", made_from: None };
+    written
+        .put(path, || Ok(force), "")
+        .map_err(|error| Failure::wrong(format!("{}: {error}", path.display())))
 }

@@ -9,10 +9,9 @@ use recipe_ctl::{
 };
 use recipe_runtime::out::print_stderr;
 
-use super::RequestOptions;
 use super::act::Act;
 use super::updating::Updating;
-use crate::cli::output::OutputFile;
+use super::{Run, write};
 
 /// A request to one gateway.
 type QueryFn<'a> = Box<dyn Fn(&Client, RequestOptions) -> Result<Answer, Failure> + Sync + 'a>;
@@ -297,14 +296,7 @@ fn watch(
     Ok(Verdict::Well)
 }
 
-pub(super) fn write(path: &Path, bytes: &[u8], force: bool) -> Result<(), Failure> {
-    let written = OutputFile { bytes, name: "it", made_from: None };
-    written
-        .put(path, || Ok(force), "")
-        .map_err(|error| Failure::wrong(format!("{}: {error}", path.display())))
-}
-
-impl RequestOptions {
+impl Run {
     fn print(self, answer: &Answer, out: &mut dyn Write) -> Result<Verdict, Failure> {
         let text = if self.json { answer.json() } else { answer.text(self.view) };
         out.write_all(text.as_bytes())?;
