@@ -253,6 +253,14 @@ impl Etag {
     }
 }
 
+pub(super) fn busy(buf: &mut [u8]) -> Reply {
+    Reply::error(buf, Status::CONFLICT, "something else is being done; try again")
+}
+
+pub(super) fn nothing_kept(buf: &mut [u8]) -> Reply {
+    Reply::error(buf, Status::UNAVAILABLE, "this board has no store, so it keeps nothing")
+}
+
 #[cfg(test)]
 mod tests {
     use std::string::ToString;

@@ -12,9 +12,9 @@ use recipe_api::revisions::Refused;
 use recipe_api::route::ApiOperation;
 use recipe_update::Downgrade;
 
-use super::answer::{Etag, Reply};
+use super::answer::{Etag, Reply, busy, nothing_kept};
 use super::arguments::Arguments;
-use super::connection::ConsoleRequest;
+use super::request::ConsoleRequest;
 use super::{Console, edge};
 use crate::clock::now;
 use crate::fmt::DisplayText;
@@ -240,14 +240,6 @@ fn refuse(buf: &mut [u8], refused: Refused) -> Reply {
         _ => return busy(buf),
     };
     Reply::error(buf, status, text)
-}
-
-pub(super) fn busy(buf: &mut [u8]) -> Reply {
-    Reply::error(buf, StatusCode::CONFLICT, "something else is being done; try again")
-}
-
-pub(super) fn nothing_kept(buf: &mut [u8]) -> Reply {
-    Reply::error(buf, StatusCode::UNAVAILABLE, "this board has no store, so it keeps nothing")
 }
 
 /// Name of the operation in the log.

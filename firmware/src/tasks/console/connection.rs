@@ -10,17 +10,15 @@ use embassy_net::{IpAddress, Stack};
 use embassy_time::{Duration, Instant, Timer, with_deadline, with_timeout};
 use recipe_api::guard::{Admitted, Refusal, Site};
 use recipe_api::key::BodyHash;
-use recipe_api::request::{HeadBuffer, HeadError, HttpHead, MAX_HEAD, Method};
+use recipe_api::request::{HeadBuffer, HeadError, Method};
 use recipe_api::response::{CONTINUE, StatusCode};
 use recipe_api::route::{ApiOperation, Served};
 
-use super::answer::{Reply, RequestOutcome, Responder, SendError};
-use super::arguments::{Arguments, HeadArguments};
-use super::change::{busy, nothing_kept};
-use super::read::PAGE;
+use super::answer::{RequestOutcome, Reply, Responder, SendError, busy, nothing_kept};
+use super::arguments::Arguments;
+use super::request::ConsoleRequest;
 use super::{ConnectionPermit, Console, MAX_TIME, PORT};
 use crate::clock::now;
-use crate::tasks::store::StoreLock;
 use crate::tasks::watchdog::Pulse;
 
 /// Buffers of a connection.
@@ -42,16 +40,6 @@ impl<'a> ConnectionBuffers<'a> {
         let (tx, buf) = rest.split_at_mut_checked(TX)?;
         Some(Self { rx, tx, buf })
     }
-}
-
-/// A parsed request.
-pub(super) struct ConsoleRequest<'a> {
-    pub(super) head: HeadArguments,
-    pub(super) operation: ApiOperation,
-    pub(super) arguments: Arguments,
-    /// Length of the body in the image buffer of the store handle, and the lock on it.
-    pub(super) image: Option<(usize, StoreLock<'a>)>,
-    pub(super) peer: Ipv4Addr,
 }
 
 impl Console {

@@ -7,10 +7,9 @@ use recipe_api::response::{ContentType, StatusCode};
 use recipe_sparkplug::document::{DocumentError, NodeDocument};
 
 use super::Console;
-use super::answer::{Reply, TextBuffer};
-use super::change::busy;
-use super::connection::ConsoleRequest;
-use crate::fmt::DisplayText;
+use super::answer::{Reply, TextBuffer, busy};
+use super::request::ConsoleRequest;
+use crate::fmt::Text;
 use crate::tasks::edge::View;
 use crate::tasks::store::{StoreLock, StoreRequest};
 use crate::warn;

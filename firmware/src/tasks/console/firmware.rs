@@ -10,8 +10,7 @@ use recipe_store::TrialEnd;
 use recipe_update::{Header, Slot};
 
 use super::Console;
-use super::answer::{Reply, TextBuffer};
-use super::change::{busy, nothing_kept};
+use super::answer::{Reply, TextBuffer, busy, nothing_kept};
 use crate::tasks::store::{FirmwareView, StoreHandle};
 use crate::update::{Incoming, UpdateStage, build_of, whole_length};
 

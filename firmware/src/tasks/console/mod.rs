@@ -15,6 +15,7 @@ mod edge;
 mod firmware;
 mod frames;
 mod read;
+mod request;
 mod stream;
 
 use core::cell::{Cell, RefCell};

@@ -16,10 +16,9 @@ use recipe_api::revisions::{Revision, Revisions};
 use recipe_api::route::ApiOperation;
 use serde::Serialize;
 
-use super::answer::{Reply, RequestOutcome, Responder, SendError, TextBuffer};
-use super::change::{busy, nothing_kept};
-use super::connection::ConsoleRequest;
+use super::answer::{Etag, RequestOutcome, Reply, Responder, SendError, TextBuffer, busy, nothing_kept};
 use super::documents::DocumentSource;
+use super::request::Request;
 use super::{Console, MAX_ANSWER, MAX_TIME};
 use crate::clock::now;
 use crate::journal;
