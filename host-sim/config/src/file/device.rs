@@ -21,7 +21,7 @@ use super::reader::{Item, Reader, Result, Spot};
 use super::{input_rules, rtu_frames, sendable};
 use crate::device::{DeviceField, DeviceRecipe, ExchangeKind, FrameEnds, NamedExchange, NamedFrame};
 use crate::keys::field::{self, FILL, OVERFLOW, PAD};
-use crate::keys::recipe::{OF_FRAME, OF_STREAM};
+use crate::keys::frame::{OF_FRAME, OF_STREAM};
 use crate::keys::{Key, names};
 
 /// The keys of a field or what stands in its place, which no controller's recipe has.

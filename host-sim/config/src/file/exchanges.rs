@@ -22,7 +22,7 @@ use super::model::{
 use super::reader::{Item, Reader, Result, Spot};
 use crate::device::ExchangeKind;
 use crate::keys::exchange;
-use crate::keys::recipe::OF_FRAME;
+use crate::keys::frame::OF_FRAME;
 
 /// The keys of [`AskTiming`].
 const TIMING_KEYS: [&str; 11] = [

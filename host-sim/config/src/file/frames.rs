@@ -15,7 +15,7 @@ use crate::keys;
 
 /// 11 bits, or 29 with `extended = true`.
 pub(super) fn read_id(frame: &Reader<'_>, item: &Item<'_>) -> Result<CanId> {
-    let is_extended = frame.flag(&keys::recipe::EXTENDED)?;
+    let is_extended = frame.flag(&keys::frame::EXTENDED)?;
     let limit = if is_extended { "0x1FFFFFFF" } else { "0x7FF" };
     if !item.is_integer() {
         return Err(item.no_integer(&format!("0..={limit}")));

@@ -7,7 +7,7 @@ use super::model::{FileFrame, FrameOrder};
 use super::names::did_you_mean;
 use super::reader::{Reader, Result, Spot};
 use crate::keys::Key;
-use crate::keys::recipe::{AFTER, FRAME_NAME};
+use crate::keys::frame::{AFTER, FRAME_NAME};
 
 /// The keys of [`FrameOrder`].
 pub(super) const ORDER_KEYS: &[Key] = &[FRAME_NAME, AFTER];

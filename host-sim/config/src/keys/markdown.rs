@@ -2,7 +2,7 @@
 //!
 //! In: keys. Out: lines of Markdown, which a test compares with the page.
 
-use super::{Key, Limits, Need, Shape, controller, device, exchange, field, gateway, recipe};
+use super::{Key, Limits, Need, Shape, controller, device, exchange, field, frame, gateway, recipe};
 
 /// The tables of the page, by the name that stands before them there.
 pub const DOCUMENTED: &[(&str, &[&[Key]])] = &[
@@ -38,8 +38,8 @@ pub const DOCUMENTED: &[(&str, &[&[Key]])] = &[
     ("received values", &[field::RULES_IN]),
     ("commands", &[&[field::WHEN, field::BASE, field::IDLE]]),
     ("output", &[&[recipe::SEND, recipe::ON_STALE]]),
-    ("order of frames", &[&[recipe::FRAME_NAME, recipe::AFTER]]),
-    ("device frame", &[recipe::OF_FRAME]),
+    ("order of frames", &[&[frame::FRAME_NAME, frame::AFTER]]),
+    ("device frame", &[frame::OF_FRAME]),
     (
         "device field",
         &[

@@ -8,6 +8,7 @@ pub mod controller;
 pub mod device;
 pub mod exchange;
 pub mod field;
+pub mod frame;
 pub mod gateway;
 pub mod inventory;
 mod markdown;

@@ -1,10 +1,13 @@
 //! `[[recipe]]` of both kinds of files, and its parts.
 
-use proto_core::recipe::model::{MAX_CAN_IDS, MAX_DELIMITER, MAX_FIELDS};
+use proto_core::recipe::model::MAX_CAN_IDS;
 
-use super::device::{CHECKSUM, ENDIAN, ESCAPE, FRAMING, WORD_ORDER};
+use super::frame::{
+    AFTER, EXTENDED, FRAME_NAME, HEAD, ID, INPUT_FIELDS, OF_FRAME, OF_STREAM, OUTPUT_FIELDS, PLAIN_FIELDS,
+    TAIL, VARIABLES,
+};
 use super::gateway::NAME;
-use super::{Case, Key, KeyTable, Rule, Shape, TextKind, When, exchange, field, words};
+use super::{Case, Key, Rule, Shape, Table, Text, When, exchange, words};
 use crate::file::bindings::ON_STALES;
 use crate::file::model::KINDS;
 use crate::file::recipes::MODES;
@@ -62,31 +65,6 @@ pub const BLOCK: Key = Key::new("block", Shape::List(&Shape::Table(&exchange::BL
     .required()
     .tells("of `kind = \"modbus-rtu-slave\"`: `[[recipe.block]]` (section 4)");
 
-/// Bytes before the fields.
-pub const HEAD: Key = delimiter("head");
-/// Bytes behind them.
-pub const TAIL: Key = delimiter("tail");
-
-const fn delimiter(name: &'static str) -> Key {
-    Key::new(name, Shape::Bytes(0, MAX_DELIMITER)).absent("`[]`").tells(
-        "0..=8 bytes; on RS-485 and TCP at least one byte in head or tail, unless a checksum or a constant tells where \
-         a frame begins (section 4)",
-    )
-}
-
-/// The fields of a realtime recipe.
-pub const VARIABLES: Key = Key::new("fields", Shape::List(&Shape::Text(TextKind::Variables), 1, MAX_FIELDS))
-    .required()
-    .tells("1..=128 fields; the whole frame at most 512 bytes, or 8 on CAN");
-
-const fn fields(item: &'static Shape) -> Key {
-    Key { shape: Shape::List(item, 0, ANY), ..VARIABLES }
-}
-
-const PLAIN_FIELDS: Key = fields(&Shape::Table(&field::PLAIN));
-pub(crate) const INPUT_FIELDS: Key = fields(&Shape::Table(&field::INPUT));
-pub(crate) const OUTPUT_FIELDS: Key = fields(&Shape::Table(&field::OUTPUT));
-
 /// When an output part is sent.
 pub const SEND: Key = Key::new(
     "send",
@@ -99,27 +77,6 @@ pub const SEND: Key = Key::new(
 );
 const SEND_PERIOD: Key = Key { shape: Shape::Words(|| vec!["period"]), ..SEND };
 
-/// The id of a CAN frame.
-pub const ID: Key = Key::integer("id", 0, 0x1FFF_FFFF)
-    .required()
-    .tells("0..=0x7FF, or 0..=0x1FFFFFFF with `extended`; unique in the part, but see section 4");
-/// Whether it has 29 bits.
-pub const EXTENDED: Key = Key::bool("extended").tells("29-bit ids, 0..=0x1FFFFFFF");
-
-/// The name of an output frame.
-pub const FRAME_NAME: Key = Key::text_of("name", TextKind::Name)
-    .absent("none")
-    .tells("of an output frame: its name for `after`, 1..=32 characters, unique in the part");
-/// The frame that goes before it.
-pub const AFTER: Key = Key::text_of("after", TextKind::Name).absent("order of the file").tells(
-    "of an output frame: the name of the frame of the same cycle behind which it is sent, such as a control word \
-     behind the target that it starts",
-);
-
-/// The device's keys of a stream part.
-pub(crate) const OF_STREAM: &[Key] = &[ENDIAN, WORD_ORDER, CHECKSUM, FRAMING, ESCAPE];
-/// Those of a CAN frame, and of a frame of an exchange.
-pub(crate) const OF_FRAME: &[Key] = &[ENDIAN, WORD_ORDER, CHECKSUM];
 /// How an output part is sent.
 pub(crate) const SENDING: &[Key] = &[ON_STALE, SEND];
 
