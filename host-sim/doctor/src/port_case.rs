@@ -13,7 +13,7 @@ pub(crate) struct PortCase<'a> {
     pub(crate) port: &'a Port,
     pub(crate) recipe: &'a Recipe,
     pub(crate) place: FindingPlace,
-    pub(crate) status: &'a state::Port,
+    pub(crate) status: &'a state::ObservedPort,
     pub(crate) record: &'a PortRecord,
     /// Counted within the window.
     pub(crate) counters: PortCounters,

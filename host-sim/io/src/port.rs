@@ -75,7 +75,7 @@ impl OpenPort {
             (BusSettings::Can { bitrate }, Device::SocketCan { interface }) => {
                 PortDriver::Kernel(KernelCan::open(interface, bitrate, Rc::clone(&tx))?)
             }
-            (PortBus::Can { bitrate }, _) => {
+            (BusSettings::Can { bitrate }, _) => {
                 let handover = match handover {
                     Some(HandoverState::Bus(bus)) => Some(bus),
                     _ => None,

@@ -14,7 +14,7 @@ use recipe_api::request::{HeadBuffer, HeadError, Method};
 use recipe_api::response::{CONTINUE, StatusCode};
 use recipe_api::route::{ApiOperation, Served};
 
-use super::answer::{RequestOutcome, Reply, Responder, SendError, busy, nothing_kept};
+use super::answer::{Reply, RequestOutcome, Responder, SendError, busy, nothing_kept};
 use super::arguments::Arguments;
 use super::request::ConsoleRequest;
 use super::{ConnectionPermit, Console, MAX_TIME, PORT};

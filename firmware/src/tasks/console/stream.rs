@@ -10,7 +10,7 @@ use embassy_time::{Duration, Instant, Timer};
 use recipe_api::documents::Document;
 use recipe_api::response::{ContentType, Length, StatusCode};
 
-use super::answer::{RequestOutcome, Reply, Responder, SendError, TextBuffer};
+use super::answer::{Reply, RequestOutcome, Responder, SendError, TextBuffer};
 use super::documents::DocumentSource;
 use super::request::Request;
 use super::{ConnectionPermit, Console, MAX_TIME, STREAMS};

@@ -8,7 +8,7 @@ use super::commands;
 use super::encoding::refuse;
 use super::model::{FileInput, FileOutput, Sending};
 use super::names::meant_variable;
-use super::reader::{Item, Reader, Result};
+use super::reader::{Result, TableReader, TableValue};
 use super::sources;
 use crate::keys::field::COUNTER_TABLE;
 

@@ -8,7 +8,7 @@ use proto_core::recipe::model::MAX_STREAM_FRAME;
 use super::encoding::refuse;
 use super::model::{FileField, FileFieldKind};
 use super::names::meant_checksum;
-use super::reader::{Item, Reader, Result};
+use super::reader::{Result, TableReader, TableValue};
 use crate::keys::device;
 
 /// The words of `order` of a checksum.

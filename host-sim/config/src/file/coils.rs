@@ -9,8 +9,8 @@ use proto_core::sysvar::Direction;
 
 use super::device::{bind, binding_keys, read_constant};
 use super::encoding::refuse;
-use super::model::{FileField, FileFieldKind, Written};
-use super::reader::{Item, Reader, Result, Spot};
+use super::model::{FileField, FileFieldKind, WrittenField};
+use super::reader::{Result, Spot, TableReader, TableValue};
 use crate::keys::field::{self, PAD_COILS};
 
 /// Coils, as they are read.

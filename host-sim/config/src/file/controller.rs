@@ -10,7 +10,7 @@ use super::functions;
 use super::lines::{read_bitrate, read_cycle, read_line};
 use super::model::{FileRecipe, Flavour};
 use super::network::check_ipv4;
-use super::reader::{Item, Reader, Result, Spot};
+use super::reader::{Result, Spot, TableReader, TableValue};
 use super::recipes;
 use crate::TargetError;
 use crate::functions::Functions;

@@ -11,13 +11,13 @@ use proto_core::sysvar::Direction;
 use proto_core::wire::scalar::ScalarType;
 
 use super::bindings::{self, OVERFLOWS};
-use super::encoding::{self, OpenNumber, Order, refuse};
+use super::encoding::{self, FieldOrder, OpenNumber, refuse};
 use super::framings;
 use super::model::{
     FileExchange, FileField, FileFieldKind, FileFrame, FileInput, FileOutput, FilePart, FileRecipe, Flavour,
-    Written,
+    WrittenField,
 };
-use super::reader::{Item, Reader, Result, Spot};
+use super::reader::{Result, Spot, TableReader, TableValue};
 use super::{input_rules, rtu_frames, sendable};
 use crate::device::{DeviceField, DeviceRecipe, ExchangeKind, FrameEnds, NamedExchange, NamedFrame};
 use crate::keys::field::{self, FILL, OVERFLOW, PAD};

@@ -19,7 +19,7 @@ use super::model::{
     AskTiming, FileExchange, FileField, FileFieldKind, FileFrame, FileInput, FilePart, Flavour, FrameOrder,
     Sending,
 };
-use super::reader::{Item, Reader, Result, Spot};
+use super::reader::{Result, Spot, TableReader, TableValue};
 use crate::device::ExchangeKind;
 use crate::keys::exchange;
 use crate::keys::frame::OF_FRAME;

@@ -10,11 +10,11 @@ use super::checksums;
 use super::device::FieldReader;
 use super::model::{FileField, FileFieldKind, Flavour};
 use super::names::meant_variable;
-use super::reader::{Item, Reader, Result, Spot};
+use super::reader::{Result, Spot, TableReader, TableValue};
 use crate::keys;
 
 /// 11 bits, or 29 with `extended = true`.
-pub(super) fn read_id(frame: &Reader<'_>, item: &Item<'_>) -> Result<CanId> {
+pub(super) fn read_id(frame: &TableReader<'_>, item: &TableValue<'_>) -> Result<CanId> {
     let is_extended = frame.flag(&keys::frame::EXTENDED)?;
     let limit = if is_extended { "0x1FFFFFFF" } else { "0x7FF" };
     if !item.is_integer() {
@@ -35,7 +35,7 @@ pub(super) fn read_id(frame: &Reader<'_>, item: &Item<'_>) -> Result<CanId> {
     })
 }
 
-pub(super) fn read_bytes(table: &Reader<'_>, key: &str) -> Result<(Vec<u8>, Option<Spot>)> {
+pub(super) fn read_bytes(table: &TableReader<'_>, key: &str) -> Result<(Vec<u8>, Option<Spot>)> {
     let Some(item) = table.optional(key) else { return Ok((Vec::new(), None)) };
     let bytes = item
         .array("of bytes, such as [255, 255]")?
@@ -47,7 +47,7 @@ pub(super) fn read_bytes(table: &Reader<'_>, key: &str) -> Result<(Vec<u8>, Opti
 
 /// The fields of a stream part, or of one CAN frame, behind a head of so many bytes.
 pub(super) fn read_fields(
-    table: &Reader<'_>,
+    table: &TableReader<'_>,
     head: usize,
     rules: Rules,
     flavour: Flavour,

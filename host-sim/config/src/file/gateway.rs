@@ -22,7 +22,7 @@ use super::lines::{key_name, read_bitrate, read_cycle, read_line, read_rtu_line}
 use super::model::{FileField, FileInput, FileRecipe, Flavour, RecipeKind};
 use super::names::meant_variable;
 use super::network::{self, check_ipv4};
-use super::reader::{Item, Reader, Result, Spot};
+use super::reader::{Result, Spot, TableReader, TableValue};
 use super::recipes;
 use super::sources;
 use crate::keys;

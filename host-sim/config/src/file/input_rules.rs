@@ -9,9 +9,9 @@ use proto_core::wire::scalar::ScalarType;
 
 use super::bindings::read_var;
 use super::encoding::refuse;
-use super::model::{FileInput, Written};
+use super::model::{FileInput, WrittenField};
 use super::names::meant_variable;
-use super::reader::{Item, Reader, Result, Spot};
+use super::reader::{Result, Spot, TableReader, TableValue};
 use super::sendable::{add_entry, read_limits};
 use crate::keys::field::{AS, POINT, RESTARTED};
 

@@ -46,9 +46,9 @@ pub use sparkplug::{ReportRule, SparkplugFile, load_sparkplug, parse_sparkplug};
 use super::device::{AnyRecipe, DeviceRecipe};
 use super::keys;
 use super::sim::SimConfig;
-use document::Document;
+use document::SourceTree;
 use model::{FileRecipe, Flavour};
-use reader::{Item, Reader, Result};
+use reader::{Result, TableReader, TableValue};
 
 /// A file of either kind.
 #[derive(Debug, Clone, PartialEq)]

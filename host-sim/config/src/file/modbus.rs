@@ -14,7 +14,7 @@ use super::device::FieldReader;
 use super::encoding::refuse;
 use super::exchanges;
 use super::model::{AskTiming, FileExchange, FileField, FileFrame, FilePart};
-use super::reader::{Item, Reader, Result};
+use super::reader::{Result, TableReader, TableValue};
 use crate::device::ExchangeKind;
 use crate::keys::{self, exchange};
 

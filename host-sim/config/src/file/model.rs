@@ -99,7 +99,7 @@ pub(super) enum FileFieldKind {
     /// `again` marks a second use of the bytes of the field before.
     UserInput {
         name: String,
-        written: Written,
+        written: WrittenField,
         to: FileInput,
         again: bool,
         /// The number that tells that the device has restarted.
@@ -107,7 +107,7 @@ pub(super) enum FileFieldKind {
     },
     UserOutput {
         name: String,
-        written: Written,
+        written: WrittenField,
         from: FileOutput,
     },
     Fixed {
@@ -129,12 +129,12 @@ pub(super) enum FileFieldKind {
 
 /// How a field with a value is written.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Written {
+pub(super) struct WrittenField {
     pub(super) encoding: Encoding,
     pub(super) overflow: Overflow,
 }
 
-impl Written {
+impl WrittenField {
     pub(super) fn plain(ty: ScalarType) -> Self {
         Self { encoding: Encoding::scalar(ty), overflow: Overflow::Usual }
     }
@@ -166,7 +166,7 @@ impl FileField {
             FileFieldKind::System(var) => FieldSpec::System(*var),
             FileFieldKind::UserInput { written, to, .. } => {
                 let to = bind(to);
-                let Written { encoding, overflow } = *written;
+                let WrittenField { encoding, overflow } = *written;
                 match written.as_plain() {
                     Some(ty) => FieldSpec::UserInput { ty, to },
                     None => FieldSpec::DeviceInput { encoding, overflow, to },
@@ -178,7 +178,7 @@ impl FileField {
                     FileOutput::Bound(binding) | FileOutput::PortNamed { binding, .. } => *binding,
                     FileOutput::Program => OutputBinding::Constant(0.0),
                 };
-                let Written { encoding, overflow } = *written;
+                let WrittenField { encoding, overflow } = *written;
                 match written.as_plain() {
                     Some(ty) => FieldSpec::UserOutput { ty, from },
                     None => FieldSpec::DeviceOutput { encoding, overflow, from },

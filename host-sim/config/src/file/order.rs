@@ -5,7 +5,7 @@
 
 use super::model::{FileFrame, FrameOrder};
 use super::names::did_you_mean;
-use super::reader::{Reader, Result, Spot};
+use super::reader::{Result, Spot, TableReader};
 use crate::keys::Key;
 use crate::keys::frame::{AFTER, FRAME_NAME};
 

@@ -20,7 +20,7 @@ use super::modbus;
 use super::model::{FileField, FileFrame, FilePart, FileRecipe, Flavour, FrameOrder, KINDS, RecipeKind};
 use super::names::did_you_mean;
 use super::order::{self, ORDER_KEYS};
-use super::reader::{Item, Reader, Result, Spot};
+use super::reader::{Result, Spot, TableReader, TableValue};
 use crate::device::AnyRecipe;
 use crate::keys;
 use crate::sim::{SimCanFrame, SimField, SimParts, SimRecipe, SimStreamPart};

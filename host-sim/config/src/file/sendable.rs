@@ -7,8 +7,8 @@ use proto_core::device::{Encoding, Overflow};
 
 use super::commands::read_range;
 use super::encoding::refuse;
-use super::model::{FileOutput, Written};
-use super::reader::{Item, Reader, Result, Spot};
+use super::model::{FileOutput, WrittenField};
+use super::reader::{Result, Spot, TableReader, TableValue};
 use crate::keys::field::OUTSIDE;
 
 /// The words of `outside`.

@@ -2,7 +2,7 @@
 
 use super::device::WORD_ORDER_OF_REGISTERS;
 use super::frame::{EXTENDED, HEAD, ID, INPUT_FIELDS, OF_FRAME, OUTPUT_FIELDS, TAIL};
-use super::{Case, HOUR_MS, Key, Limits, Need, Shape, Table, Text, When, field, words};
+use super::{Case, HOUR_MS, Key, KeyTable, Limits, Need, Shape, TextKind, When, field, words};
 use crate::file::modbus::{FUNCTIONS, TABLES};
 
 /// The device that is asked.

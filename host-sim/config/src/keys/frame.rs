@@ -3,7 +3,7 @@
 use proto_core::recipe::model::{MAX_DELIMITER, MAX_FIELDS};
 
 use super::device::{CHECKSUM, ENDIAN, ESCAPE, FRAMING, WORD_ORDER};
-use super::{Key, Shape, Text, field};
+use super::{Key, Shape, TextKind, field};
 
 /// Bytes before the fields.
 pub const HEAD: Key = delimiter("head");
@@ -18,7 +18,7 @@ const fn delimiter(name: &'static str) -> Key {
 }
 
 /// The fields of a realtime recipe.
-pub const VARIABLES: Key = Key::new("fields", Shape::List(&Shape::Text(Text::Variables), 1, MAX_FIELDS))
+pub const VARIABLES: Key = Key::new("fields", Shape::List(&Shape::Text(TextKind::Variables), 1, MAX_FIELDS))
     .required()
     .tells("1..=128 fields; the whole frame at most 512 bytes, or 8 on CAN");
 
@@ -38,11 +38,11 @@ pub const ID: Key = Key::integer("id", 0, 0x1FFF_FFFF)
 pub const EXTENDED: Key = Key::bool("extended").tells("29-bit ids, 0..=0x1FFFFFFF");
 
 /// The name of an output frame.
-pub const FRAME_NAME: Key = Key::text_of("name", Text::Name)
+pub const FRAME_NAME: Key = Key::text_of("name", TextKind::Name)
     .absent("none")
     .tells("of an output frame: its name for `after`, 1..=32 characters, unique in the part");
 /// The frame that goes before it.
-pub const AFTER: Key = Key::text_of("after", Text::Name).absent("order of the file").tells(
+pub const AFTER: Key = Key::text_of("after", TextKind::Name).absent("order of the file").tells(
     "of an output frame: the name of the frame of the same cycle behind which it is sent, such as a control word \
      behind the target that it starts",
 );

@@ -7,7 +7,7 @@ use super::frame::{
     TAIL, VARIABLES,
 };
 use super::gateway::NAME;
-use super::{Case, Key, Rule, Shape, Table, Text, When, exchange, words};
+use super::{Case, Key, KeyTable, Rule, Shape, TextKind, When, exchange, words};
 use crate::file::bindings::ON_STALES;
 use crate::file::model::KINDS;
 use crate::file::recipes::MODES;

@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use recipe_api::guard::{Admitted, Refusal, Site};
 use recipe_api::key::{BodyHash, SCHEME};
-use recipe_api::request::{Head, HeadBuffer, HeadError};
-use recipe_api::response::{CONTINUE, Status};
+use recipe_api::request::{HeadBuffer, HeadError, HttpHead};
+use recipe_api::response::{CONTINUE, StatusCode};
 use recipe_io::tcp_options;
 use recipe_io::timer::now;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};

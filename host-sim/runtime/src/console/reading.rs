@@ -5,10 +5,10 @@ use std::rc::Rc;
 use std::sync::Arc;
 
 use proto_core::config::GatewayConfig;
-use recipe_api::request::Head;
-use recipe_api::response::{Kind, Status};
+use recipe_api::request::HttpHead;
+use recipe_api::response::{ContentType, StatusCode};
 use recipe_api::revisions::Revision;
-use recipe_api::route::{Operation, Served};
+use recipe_api::route::{ApiOperation, Served};
 use recipe_config::FileKind;
 use recipe_config::file::Text;
 use recipe_export::dbc::{self, DbcError};
@@ -251,7 +251,7 @@ pub(super) fn revisions(view: &SupervisorView) -> Value {
 }
 
 pub(super) fn nothing_runs() -> HttpReply {
-    HttpReply::error(Status::UNAVAILABLE, "nothing runs at the moment; try again")
+    HttpReply::error(StatusCode::UNAVAILABLE, "nothing runs at the moment; try again")
 }
 
 pub(super) fn etag(revision: Revision) -> String {

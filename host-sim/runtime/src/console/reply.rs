@@ -4,14 +4,14 @@ use std::rc::Rc;
 use std::time::Duration;
 
 use recipe_api::guard::Refusal;
-use recipe_api::response::{Kind, Length, Page, Response, Status};
+use recipe_api::response::{ContentType, Length, Page, Response, StatusCode};
 use serde_json::{Value, json};
 
 /// A response with its body.
 #[derive(Debug)]
 pub(super) struct HttpReply {
-    pub(super) status: Status,
-    pub(super) kind: Kind,
+    pub(super) status: StatusCode,
+    pub(super) kind: ContentType,
     pub(super) body: ReplyBody,
     pub(super) fields: Vec<(&'static str, String)>,
 }
@@ -45,29 +45,34 @@ impl<T: Into<Rc<str>>> From<T> for ReplyBody {
 
 impl HttpReply {
     /// A document that was made before.
-    pub(super) fn text(kind: Kind, body: Rc<str>) -> Self {
-        Self { status: Status::OK, kind, body: ReplyBody::Text(body), fields: Vec::new() }
+    pub(super) fn text(kind: ContentType, body: Rc<str>) -> Self {
+        Self { status: StatusCode::OK, kind, body: ReplyBody::Text(body), fields: Vec::new() }
     }
 
     /// The page for people, unless the client has it.
     pub(super) fn page(if_none_match: Option<&str>) -> Self {
         let status = PAGE.status(if_none_match);
-        let body = ReplyBody::Bytes(if status == Status::OK { PAGE.bytes } else { &[] });
-        Self { status, kind: Kind::Page, body, fields: Vec::new() }
+        let body = ReplyBody::Bytes(if status == StatusCode::OK { PAGE.bytes } else { &[] });
+        Self { status, kind: ContentType::Page, body, fields: Vec::new() }
     }
 
     /// A configuration image.
     pub(super) fn image(bytes: Vec<u8>) -> Self {
-        Self { status: Status::OK, kind: Kind::Image, body: ReplyBody::Made(bytes), fields: Vec::new() }
+        Self {
+            status: StatusCode::OK,
+            kind: ContentType::Image,
+            body: ReplyBody::Made(bytes),
+            fields: Vec::new(),
+        }
     }
 
     /// A JSON value.
-    pub(super) fn json(status: Status, value: &Value) -> Self {
-        Self { status, kind: Kind::Json, body: value.to_string().into(), fields: Vec::new() }
+    pub(super) fn json(status: StatusCode, value: &Value) -> Self {
+        Self { status, kind: ContentType::Json, body: value.to_string().into(), fields: Vec::new() }
     }
 
     /// An object with `error`.
-    pub(super) fn error(status: Status, text: &str) -> Self {
+    pub(super) fn error(status: StatusCode, text: &str) -> Self {
         Self::json(status, &json!({ "error": text }))
     }
 
@@ -106,7 +111,7 @@ pub(super) fn head_of(reply: &HttpReply, length: Length) -> String {
     let mut text = String::new();
     // Writing to a `String` cannot fail.
     let _ = match reply.kind {
-        Kind::Page => PAGE.write_head(reply.status, &mut text),
+        ContentType::Page => PAGE.write_head(reply.status, &mut text),
         kind => Response::new(reply.status, kind, length).with(&fields).write(&mut text),
     };
     text

@@ -10,7 +10,7 @@ use recipe_ctl::update::Downgrade;
 use recipe_ctl::{Failure, Member, Rollout, Stop, Update, Verdict};
 use recipe_runtime::out::print_stderr;
 
-use super::{Run, write};
+use super::{RequestOptions, write};
 
 /// A firmware for the boards of an inventory.
 #[derive(Debug)]

@@ -4,14 +4,14 @@ use std::io::Write;
 use std::path::Path;
 
 use recipe_ctl::{
-    Answer, Client, Configuration, Failure, Firmware, Member, Names, Rollout, SlotName, Stop, TrialOptions, Update,
-    Verdict, Watched, WithoutTrial, edge, key_file, signing_key, update,
+    Answer, Client, Configuration, Failure, Firmware, Member, Names, Rollout, Slot, Stop, TrialOptions,
+    Update, Verdict, Watched, WithoutTrial, edge, key_file, signing_key, update,
 };
 use recipe_runtime::out::print_stderr;
 
 use super::act::Act;
 use super::updating::Updating;
-use super::{Run, write};
+use super::{RequestOptions, write};
 
 /// A request to one gateway.
 type QueryFn<'a> = Box<dyn Fn(&Client, RequestOptions) -> Result<Answer, Failure> + Sync + 'a>;
@@ -296,7 +296,7 @@ fn watch(
     Ok(Verdict::Well)
 }
 
-impl Run {
+impl RequestOptions {
     fn print(self, answer: &Answer, out: &mut dyn Write) -> Result<Verdict, Failure> {
         let text = if self.json { answer.json() } else { answer.text(self.view) };
         out.write_all(text.as_bytes())?;
