@@ -140,7 +140,7 @@ fn make_edge(
             return edge_setup;
         }
     }
-    let document: &'static edge::Document = document;
+    let document: &'static edge::NodeDocument = document;
     edge_setup.view.document = Some(document);
     let made = config
         .ok_or(EdgeError::NothingRuns)

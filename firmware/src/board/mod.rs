@@ -1,6 +1,6 @@
 //! The boards. Only they know pins, clocks and interrupts.
 //!
-//! A board defines `Board`, which implements [`firmware::platform::Board`], and `main`, which creates it and
+//! A board's module has a type that implements [`firmware::platform::Board`], here `Board`, and `main`, which creates it and
 //! starts the tasks.
 
 mod slot;
@@ -10,15 +10,11 @@ mod stack;
 mod mps2_an500;
 #[cfg(feature = "board-mps2-an500")]
 pub(crate) use mps2_an500::Mps2An500 as Board;
-#[cfg(feature = "board-mps2-an500")]
-pub(crate) use mps2_an500::*;
 
 #[cfg(all(feature = "board-nucleo-h743zi", not(feature = "board-mps2-an500")))]
 mod nucleo_h743zi;
 #[cfg(all(feature = "board-nucleo-h743zi", not(feature = "board-mps2-an500")))]
 pub(crate) use nucleo_h743zi::NucleoH743zi as Board;
-#[cfg(all(feature = "board-nucleo-h743zi", not(feature = "board-mps2-an500")))]
-pub(crate) use nucleo_h743zi::*;
 
 #[cfg(all(feature = "board-mps2-an500", feature = "board-nucleo-h743zi"))]
 compile_error!("two boards: --no-default-features --features board-mps2-an500");

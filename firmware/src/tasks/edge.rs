@@ -304,7 +304,7 @@ impl NodeDriver<'_> {
         self.node.handle(at, Input::Sampled { alive }, self.catalog);
     }
 
-    fn sample_part(&mut self, first: usize, uptime: Span, counters: &Counters) {
+    fn sample_part(&mut self, first: usize, uptime: Span, counters: &NodeCounters) {
         let mut values = [None; PLACES];
         let end = first.saturating_add(PLACES).min(self.catalog.len());
         self.gateway.report(|status| {

@@ -254,11 +254,11 @@ impl Etag {
 }
 
 pub(super) fn busy(buf: &mut [u8]) -> Reply {
-    Reply::error(buf, Status::CONFLICT, "something else is being done; try again")
+    Reply::error(buf, StatusCode::CONFLICT, "something else is being done; try again")
 }
 
 pub(super) fn nothing_kept(buf: &mut [u8]) -> Reply {
-    Reply::error(buf, Status::UNAVAILABLE, "this board has no store, so it keeps nothing")
+    Reply::error(buf, StatusCode::UNAVAILABLE, "this board has no store, so it keeps nothing")
 }
 
 #[cfg(test)]

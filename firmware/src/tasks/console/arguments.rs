@@ -28,12 +28,16 @@ pub(super) struct HeadArguments {
     /// `If-None-Match`, if it is the ETag of a revision.
     pub(super) if_none_match: Option<Revision>,
     /// Status of the page, which depends on `If-None-Match`.
-    pub(super) page: Status,
+    pub(super) page: StatusCode,
 }
 
 impl HeadArguments {
     /// `find` returns the port of a name.
-    pub(super) fn of(head: &Head<'_>, page: Status, find: impl FnOnce(&str) -> Option<PortId>) -> Self {
+    pub(super) fn of(
+        head: &HttpHead<'_>,
+        page: StatusCode,
+        find: impl FnOnce(&str) -> Option<PortId>,
+    ) -> Self {
         let first = |names: &[&str]| names.iter().find_map(|name| head.query(name));
         Self {
             method: head.method,

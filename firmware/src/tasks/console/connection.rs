@@ -10,12 +10,13 @@ use embassy_net::{IpAddress, Stack};
 use embassy_time::{Duration, Instant, Timer, with_deadline, with_timeout};
 use recipe_api::guard::{Admitted, Refusal, Site};
 use recipe_api::key::BodyHash;
-use recipe_api::request::{HeadBuffer, HeadError, Method};
+use recipe_api::request::{HeadBuffer, HeadError, HttpHead, MAX_HEAD, Method};
 use recipe_api::response::{CONTINUE, StatusCode};
 use recipe_api::route::{ApiOperation, Served};
 
 use super::answer::{Reply, RequestOutcome, Responder, SendError, busy, nothing_kept};
-use super::arguments::Arguments;
+use super::arguments::{Arguments, HeadArguments};
+use super::read::PAGE;
 use super::request::ConsoleRequest;
 use super::{ConnectionPermit, Console, MAX_TIME, PORT};
 use crate::clock::now;

@@ -16,9 +16,9 @@ use recipe_api::revisions::{Revision, Revisions};
 use recipe_api::route::ApiOperation;
 use serde::Serialize;
 
-use super::answer::{Etag, Reply, RequestOutcome, Responder, SendError, TextBuffer, busy, nothing_kept};
+use super::answer::{Reply, RequestOutcome, Responder, SendError, TextBuffer, busy, nothing_kept};
 use super::documents::DocumentSource;
-use super::request::Request;
+use super::request::ConsoleRequest;
 use super::{Console, MAX_ANSWER, MAX_TIME};
 use crate::clock::now;
 use crate::journal;

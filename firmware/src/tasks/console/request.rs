@@ -2,16 +2,15 @@
 
 use core::net::Ipv4Addr;
 
-use recipe_api::request::Head;
-use recipe_api::route::Operation;
+use recipe_api::route::ApiOperation;
 
-use super::arguments::Arguments;
+use super::arguments::{Arguments, HeadArguments};
 use crate::tasks::store::StoreLock;
 
 /// A parsed request.
-pub(super) struct Request<'a> {
-    pub(super) head: Head<'a>,
-    pub(super) operation: Operation,
+pub(super) struct ConsoleRequest<'a> {
+    pub(super) head: HeadArguments,
+    pub(super) operation: ApiOperation,
     pub(super) arguments: Arguments,
     /// Length of the body in the image buffer of the store handle, and the lock on it.
     pub(super) image: Option<(usize, StoreLock<'a>)>,

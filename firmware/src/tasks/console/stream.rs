@@ -12,7 +12,7 @@ use recipe_api::response::{ContentType, Length, StatusCode};
 
 use super::answer::{Reply, RequestOutcome, Responder, SendError, TextBuffer};
 use super::documents::DocumentSource;
-use super::request::Request;
+use super::request::ConsoleRequest;
 use super::{ConnectionPermit, Console, MAX_TIME, STREAMS};
 
 impl Console {
