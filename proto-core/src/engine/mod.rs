@@ -201,7 +201,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     /// The fast path for bytes that begin or continue a frame and do not end it, which are most calls of a driver that
     /// reports each byte: they set at most the time at which silence ends it. `None` if they have to be looked at; then
     /// nothing was taken.
-    // A frame byte by byte to UDP takes 10141 instructions without it, 4846 out of line, and 4212 inline.
+    // A frame byte by byte to UDP takes 10141 instructions without it, 5033 out of line, and 4247 inline.
     #[inline(always)]
     fn hold(&mut self, port: PortId, bytes: &[u8], now: Instant) -> Option<Handled> {
         if bytes.len() > SHORT {

