@@ -40,17 +40,23 @@ PARTS = [
     (
         "which input, of which port",
         "#8ecae6",
-        ["mod.rs:handle", "short_way.rs:handle_other", "mod.rs:port_bytes", "mod.rs:port_can", "field_port.rs:can"],
+        [
+            "mod.rs:handle",
+            "mod.rs:handle_idle",
+            "mod.rs:handle_awake",
+            "mod.rs:port_bytes",
+            "mod.rs:port_can",
+            "field_port.rs:can",
+        ],
     ),
     (
         "is it a frame of the recipe",
         "#ffc857",
         [
-            "field_port.rs:hold_byte",
             "field_port.rs:hold",
             "deframer.rs:next_frame",
-            "can.rs:find",
-            "can.rs:accept_found",
+            "can.rs:has",
+            "can.rs:accept_frame",
         ],
     ),
     ("its values into the image", "#90be6d", ["frames.rs:take"]),
@@ -59,7 +65,7 @@ PARTS = [
     ("which link may send", "#84c5b1", ["mod.rs:poll_output", "mod.rs:poll_work", "links.rs:next_upward"]),
     ("what it sends, and its latency", "#f6ad6b", ["modbus_link.rs:write", "uplink.rs:send"]),
     ("the bytes of that", "#a8b6ff", ["client.rs:start", "values.rs:from_little_endian", "stream.rs:encode"]),
-    ("until when to sleep", "#e3d26f", ["mod.rs:poll_any"]),
+    ("until when to sleep", "#e3d26f", ["clock.rs:sleep"]),
 ]
 
 

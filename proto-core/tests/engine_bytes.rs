@@ -1,8 +1,8 @@
-//! Bytes one by one, as a UART brings them, are what they are in chunks: a byte that completes nothing is taken on a
-//! short way, and nobody can tell which way one went.
+//! Bytes one by one, as a UART brings them, are what they are in chunks: a byte that completes nothing takes the fast
+//! path, and nobody can tell whether one did.
 //!
 //! Three engines hear the same line. `Swift` hears each byte. `Plain` does too, but before each one it is told something
-//! that it ignores, after which nothing is on the short way. `Chunked` hears at once what came at once, cut where a
+//! that it ignores, after which nothing takes the fast path. `Chunked` hears at once what came at once, cut where a
 //! frame ended. Whatever they hand over, and when, is compared; and where frames end is what D19 says, read literally.
 
 mod reference;
