@@ -39,24 +39,22 @@ fn gripper(case: &Case) {
     let status = gateway.until_bytes_in("gripper", 8 * REPLY.len() as u64);
     assert_eq!(status.frames_in, 0, "{status:?}");
     assert_eq!(robot.variable("WordInputReg[4]"), 0.0, "a damaged position reached the robot");
-    // One that comes late is not taken: the device answers until one was in time.
+    // One that comes late is not taken, and values end with their time: the device answers until all are there.
+    let values = [
+        ("WordInputReg[1]", 3.0),
+        ("WordInputReg[2]", 3.0),
+        ("WordInputReg[3]", 0.0),
+        ("WordInputReg[4]", 208.0),
+        ("WordInputReg[5]", 300.0),
+    ];
     let mut good = 0;
     until("a good reply in time", || {
         device.forget();
         device.until(&REQUEST);
         device.send(&REPLY);
         good += 1;
-        (robot.variable("WordInputReg[4]") == 208.0).then_some(())
+        values.iter().all(|(name, value)| robot.variable(name) == *value).then_some(())
     });
-    let values = [
-        ("WordInputReg[1]", 3.0),
-        ("WordInputReg[2]", 3.0),
-        ("WordInputReg[3]", 0.0),
-        ("WordInputReg[5]", 300.0),
-    ];
-    for (name, value) in values {
-        robot.until(name, value);
-    }
     let taken = gateway.until_bytes_in("gripper", (8 + good) * REPLY.len() as u64).frames_in;
     assert!((1..=good).contains(&taken), "{taken} of {good}");
     // Another one keeps what was there.

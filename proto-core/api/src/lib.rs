@@ -10,8 +10,8 @@
 //! use proto_core::time::Instant;
 //! use recipe_api::guard::{Admitted, Guard, Site};
 //! use recipe_api::request::{HeadBuffer, HeadError};
-//! use recipe_api::response::{Kind, Length, Response, Status};
-//! use recipe_api::route::{Operation, Served};
+//! use recipe_api::response::{ContentType, Length, Response, StatusCode};
+//! use recipe_api::route::{ApiOperation, Served};
 //!
 //! # fn random() -> [u8; 32] { [7; 32] }
 //! # fn receive(to: &mut [u8]) -> usize {
@@ -38,9 +38,9 @@
 //! };
 //! let mut text = heapless::String::<512>::new();
 //! match admitted {
-//!     Ok(Admitted { operation: Operation::Info, .. }) => {
+//!     Ok(Admitted { operation: ApiOperation::Info, .. }) => {
 //!         let body = "{}";
-//!         Response::new(Status::OK, Kind::Json, Length::Bytes(body.len() as u64)).write(&mut text).unwrap();
+//!         Response::new(StatusCode::OK, ContentType::Json, Length::Bytes(body.len() as u64)).write(&mut text).unwrap();
 //!         send(&text);
 //!         send(body);
 //!     }
