@@ -28,14 +28,14 @@
 //! same bank is erased: [`newest`] finds the valid one, a [`Move`] changes the place.
 //!
 //! ```
-//! # use recipe_store::{Flash, Geometry, Place, Word};
+//! # use recipe_store::{Flash, FlashWord, Geometry, Word};
 //! # struct Ram(Vec<Word>);
 //! # const GEOMETRY: Geometry = Geometry { sectors: 3, words: 1024 };
-//! # impl Ram { fn at(place: Place) -> usize { usize::from(place.sector) * 1024 + usize::from(place.word) } }
+//! # impl Ram { fn at(place: FlashWord) -> usize { usize::from(place.sector) * 1024 + usize::from(place.word) } }
 //! # impl Flash for Ram {
 //! #     fn geometry(&self) -> Geometry { GEOMETRY }
-//! #     fn read(&self, place: Place) -> Word { self.0[Self::at(place)] }
-//! #     async fn write(&mut self, place: Place, word: &Word) { self.0[Self::at(place)] = *word; }
+//! #     fn read(&self, place: FlashWord) -> Word { self.0[Self::at(place)] }
+//! #     async fn write(&mut self, place: FlashWord, word: &Word) { self.0[Self::at(place)] = *word; }
 //! #     async fn erase(&mut self, sector: u8) {
 //! #         self.0[usize::from(sector) * 1024..][..1024].fill([0xFF; 32]);
 //! #     }

@@ -20,14 +20,14 @@
 //! else the good one. [`UpdateFile`] is what a host sends: the same firmware linked for each slot.
 //!
 //! ```
-//! use recipe_update::{BoardName, Formats, Header, Parts, PublicKey, Slot, Version};
+//! use recipe_update::{BoardName, Formats, Header, ImageFacts, PublicKey, Slot, Version};
 //!
 //! let image = [0x5A; 5_000];
 //! let formats = Formats::new(1, 3, 3).unwrap();
 //! let board = BoardName::parse("nucleo-h743zi").unwrap();
-//! let parts = Parts { board, slot: Slot::B, version: Version::new(0, 3, 0), formats, store: 1 };
+//! let facts = ImageFacts { board, slot: Slot::B, version: Version::new(0, 3, 0), formats, store: 1 };
 //! let seed = [7; 32];
-//! let header = Header::sign(parts, &image, &seed).unwrap();
+//! let header = Header::sign(facts, &image, &seed).unwrap();
 //! let read = Header::parse(&header.encode()).unwrap();
 //! assert_eq!((read, read.version().minor), (header, 3));
 //! assert!(read.verify(&PublicKey::of_seed(&seed)).is_ok());

@@ -12,7 +12,7 @@
 //! ```
 //! use proto_core::time::Instant;
 //! use recipe_sparkplug::catalog::{Catalog, MAX_NAME, Metric, Owner, Report};
-//! use recipe_sparkplug::node::{EdgeNode, Input, MIN_BUFFER, Output, Settings};
+//! use recipe_sparkplug::node::{EdgeNode, Input, MIN_BUFFER, NodeOutput, Settings};
 //! use recipe_sparkplug::topic::Id;
 //! use recipe_sparkplug::value::{DataType, Value};
 //!
@@ -46,16 +46,16 @@
 //! node.handle(now, Input::Sample { values: &[Some(Value::Float(21.5))], alive: 0 }, &Thermometer);
 //! let mut buf = [0; MIN_BUFFER];
 //! // The driver opens a connection, and reports it.
-//! assert_eq!(node.poll_output(now, &Thermometer, &mut buf), Output::Open);
+//! assert_eq!(node.poll_output(now, &Thermometer, &mut buf), NodeOutput::Open);
 //! node.handle(now, Input::Opened, &Thermometer);
 //! // It keeps this number over restarts, where it can.
-//! assert_eq!(node.poll_output(now, &Thermometer, &mut buf), Output::Keep { bd_seq: 0 });
+//! assert_eq!(node.poll_output(now, &Thermometer, &mut buf), NodeOutput::Keep { bd_seq: 0 });
 //! // From here on it sends what it is given, and reports what it receives.
-//! let Output::Send(connect) = node.poll_output(now, &Thermometer, &mut buf) else { unreachable!() };
+//! let NodeOutput::Send(connect) = node.poll_output(now, &Thermometer, &mut buf) else { unreachable!() };
 //! assert_eq!(&connect[4..8], b"MQTT");
-//! assert!(matches!(node.poll_output(now, &Thermometer, &mut buf), Output::Sleep { .. }));
+//! assert!(matches!(node.poll_output(now, &Thermometer, &mut buf), NodeOutput::Sleep { .. }));
 //! node.handle(now, Input::Bytes(b"\x20\x02\x00\x00"), &Thermometer);
-//! assert!(matches!(node.poll_output(now, &Thermometer, &mut buf), Output::Send(_)));
+//! assert!(matches!(node.poll_output(now, &Thermometer, &mut buf), NodeOutput::Send(_)));
 //! ```
 #![no_std]
 #![forbid(unsafe_code)]
