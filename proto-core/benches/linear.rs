@@ -18,7 +18,7 @@ use proto_core::sysvar::Direction;
 use proto_core::wire::scalar::ScalarType;
 
 /// Instructions that a byte may cost, at the worst.
-const MOST: f64 = 170.0;
+const MOST: f64 = 150.0;
 /// How much more a byte may cost on the longest line than on a shorter one.
 const GROWTH: f64 = 1.02;
 const LENGTHS: [u64; 3] = [1 << 14, 1 << 17, 1 << 20];

@@ -44,7 +44,7 @@ pub struct Deframer {
 impl DeframerStats {
     /// Whether what has the length of a frame, and begins with its head, is one; counts it.
     fn judge(&mut self, layout: &StreamLayout, frame: &[u8]) -> bool {
-        count_visits(layout.tail().len());
+        count_visits(layout.tail.len());
         let is_frame = layout.tail.ends(frame);
         let counter = if is_frame { &mut self.frames } else { &mut self.tail_mismatches };
         *counter = counter.wrapping_add(1);
@@ -102,7 +102,7 @@ impl Deframer {
             } else {
                 self.push(core::mem::take(chunk));
             }
-            if !is_head_known && !layout.head.agrees(self.held()) {
+            if !is_head_known && !agrees(&layout.head, self.held()) {
                 self.drop_front(position_of_head(&layout.head, self.held()));
             }
             if self.pending() == frame_len {
@@ -122,7 +122,7 @@ impl Deframer {
     #[inline]
     fn search<'c>(&mut self, layout: &StreamLayout, chunk: &mut &'c [u8]) -> Option<&'c [u8]> {
         while !chunk.is_empty() {
-            if !layout.head.agrees(chunk) {
+            if !agrees(&layout.head, chunk) {
                 let skipped = position_of_head(&layout.head, chunk);
                 self.skip(skipped);
                 *chunk = chunk.get(skipped..)?;
@@ -143,7 +143,7 @@ impl Deframer {
 
     /// Holds a chunk that neither completes a frame nor shows that none has begun. `false` if [`Self::next_frame`] has
     /// to look at it; then nothing was taken.
-    // A frame byte by byte through the engine takes 4846 instructions out of line, and 4247 inline.
+    // A frame byte by byte through the engine takes 4846 instructions out of line, and 4313 inline.
     #[inline(always)]
     pub(crate) fn hold(&mut self, layout: &StreamLayout, chunk: &[u8]) -> bool {
         let held = self.pending();
@@ -154,8 +154,28 @@ impl Deframer {
         if held.saturating_add(chunk.len()) >= layout.frame_len() || held < layout.head().len() && !begins() {
             return false;
         }
-        self.push(chunk);
+        match *chunk {
+            [byte] => self.push_byte(byte),
+            _ => self.push_short(chunk),
+        }
         !chunk.is_empty()
+    }
+
+    /// Holds a byte, as many drivers report them.
+    fn push_byte(&mut self, byte: u8) {
+        count_visits(1);
+        self.make_room(1);
+        let place = self.end();
+        if let Some(free) = self.buffer.get_mut(place) {
+            *free = byte;
+            self.len = self.len.wrapping_add(1);
+        }
+    }
+
+    // Inline, its copy costs each single byte: a frame byte by byte to UDP takes 4984 instructions then, 4313 so.
+    #[inline(never)]
+    fn push_short(&mut self, bytes: &[u8]) {
+        self.push(bytes);
     }
 
     /// The bytes of a possible frame that are held.
@@ -200,28 +220,22 @@ impl Deframer {
     /// Holds bytes, no more than a frame is short of.
     #[inline]
     fn push(&mut self, bytes: &[u8]) {
-        if self.end().saturating_add(bytes.len()) > self.buffer.len() {
-            self.move_to_front();
-        }
         count_visits(bytes.len());
+        self.make_room(bytes.len());
         let place = self.end();
-        match *bytes {
-            // Many drivers report each byte.
-            [byte] => {
-                let Some(free) = self.buffer.get_mut(place) else { return };
-                *free = byte;
-            }
-            _ => {
-                let Some(free) = self.buffer.get_mut(place..place.saturating_add(bytes.len())) else {
-                    return;
-                };
-                match bytes.len() {
-                    ..=runs::MAX_RUN => runs::copy(free, bytes),
-                    _ => free.copy_from_slice(bytes),
-                }
-            }
+        let Some(free) = self.buffer.get_mut(place..place.saturating_add(bytes.len())) else { return };
+        match bytes.len() {
+            ..=runs::MAX_RUN => runs::copy(free, bytes),
+            _ => free.copy_from_slice(bytes),
         }
         self.len = self.len.wrapping_add(bytes.len() as u16);
+    }
+
+    #[inline]
+    fn make_room(&mut self, bytes: usize) {
+        if self.end().saturating_add(bytes) > self.buffer.len() {
+            self.move_to_front();
+        }
     }
 
     fn move_to_front(&mut self) {
@@ -240,13 +254,17 @@ impl Deframer {
 fn position_of_head(head: &FrameHead, bytes: &[u8]) -> usize {
     let mut at = 0;
     while let Some(rest) = bytes.get(at..)
-        && !head.agrees(rest)
+        && !agrees(head, rest)
     {
-        count_visits(head.len());
         at = at.saturating_add(1);
     }
-    count_visits(head.len());
     at
+}
+
+/// Whether the bytes begin with the head, or are its beginning.
+fn agrees(head: &FrameHead, bytes: &[u8]) -> bool {
+    count_visits(head.len());
+    head.agrees(bytes)
 }
 
 /// The payload of a datagram that is exactly one frame.

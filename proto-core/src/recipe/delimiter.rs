@@ -8,6 +8,7 @@ use crate::wire::runs;
 #[derive(Debug, Clone, Copy)]
 pub(super) struct FrameHead {
     word: [u8; MAX_DELIMITER],
+    /// Ones where the head is.
     mask: [u8; MAX_DELIMITER],
     len: u8,
 }
@@ -16,6 +17,7 @@ pub(super) struct FrameHead {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct FrameTail {
     word: [u8; MAX_DELIMITER],
+    /// Ones where the tail is.
     mask: [u8; MAX_DELIMITER],
     len: u8,
 }
@@ -23,9 +25,8 @@ pub(super) struct FrameTail {
 impl FrameHead {
     /// `None` when there are more than 8 bytes.
     pub(super) fn new(head: &[u8]) -> Option<Self> {
-        let mut word = [0; MAX_DELIMITER];
+        let (mut word, mut mask) = ([0; MAX_DELIMITER], [0; MAX_DELIMITER]);
         word.get_mut(..head.len())?.copy_from_slice(head);
-        let mut mask = [0; MAX_DELIMITER];
         mask.get_mut(..head.len())?.fill(0xFF);
         Some(Self { word, mask, len: head.len() as u8 })
     }
@@ -63,10 +64,10 @@ impl FrameHead {
 impl FrameTail {
     /// `None` when there are more than 8 bytes.
     pub(super) fn new(tail: &[u8]) -> Option<Self> {
-        let mut word = [0; MAX_DELIMITER];
-        word.get_mut(MAX_DELIMITER.checked_sub(tail.len())?..)?.copy_from_slice(tail);
-        let mut mask = [0; MAX_DELIMITER];
-        mask.get_mut(MAX_DELIMITER.checked_sub(tail.len())?..)?.fill(0xFF);
+        let (mut word, mut mask) = ([0; MAX_DELIMITER], [0; MAX_DELIMITER]);
+        let unused = MAX_DELIMITER.checked_sub(tail.len())?;
+        word.get_mut(unused..)?.copy_from_slice(tail);
+        mask.get_mut(unused..)?.fill(0xFF);
         Some(Self { word, mask, len: tail.len() as u8 })
     }
 
@@ -100,6 +101,7 @@ impl FrameTail {
     }
 }
 
+/// Whether two words are the same where the mask has ones.
 fn agree(a: [u8; MAX_DELIMITER], b: [u8; MAX_DELIMITER], mask: [u8; MAX_DELIMITER]) -> bool {
     (u64::from_ne_bytes(a) ^ u64::from_ne_bytes(b)) & u64::from_ne_bytes(mask) == 0
 }
