@@ -13,7 +13,7 @@ mod bare;
 
 use core::hint::black_box;
 
-use firmware::tasks::gateway::Engine;
+use firmware::tasks::gateway::SizedEngine as Engine;
 use proto_core::config::image::{self, MAX_IMAGE};
 use proto_core::config::{GatewayConfig, Port};
 use proto_core::engine::{Handled, Input, LinkId, OUTPUT_BUFFER, Output, PortId};

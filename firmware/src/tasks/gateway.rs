@@ -14,13 +14,11 @@ use embassy_time::{Duration, Timer, with_timeout};
 use heapless::Vec;
 use proto_core::config::GatewayConfig;
 use proto_core::engine::{
-    BuildError, Handled, Health, INPUT_BUFFER, Input, LinkId, LinkKind, OUTPUT_BUFFER, Output, PortId,
-    Status, Tap,
+    BuildError, Engine, Handled, Health, INPUT_BUFFER, Input, LinkId, LinkKind, OUTPUT_BUFFER, Output,
+    PortId, Status, Tap,
 };
 use proto_core::sysvar::Direction;
 use proto_core::time::Instant;
-
-pub use recipe_engine::{Engine, MAX_FIELD_PORTS, MAX_LINKS, MAX_TAP, SizedEngine};
 
 use super::control::{LinkControl, PortControl};
 use super::led::Condition;
@@ -28,9 +26,25 @@ use super::notify::Notify;
 use super::watchdog::Pulse;
 use crate::clock::now;
 
+/// Number of field ports that a board can have.
+pub const MAX_FIELD_PORTS: usize = 4;
+/// Number of recipe links that a board can have.
+pub const MAX_UPLINKS: usize = 2;
+/// User-defined fields in one direction, over all ports.
+pub const MAX_FIELDS: usize = 128;
+/// Exchanges with devices, over all ports.
+pub const MAX_EXCHANGES: usize = 32;
+/// Capacity of the frame tap in bytes: 25 ms of 960 sensor frames and 500 CAN frames a second.
+pub const MAX_TAP: usize = 4096;
+/// Recipe links, and command, urgent commands, state and Modbus.
+pub const MAX_LINKS: usize = SizedEngine::MAX_LINKS;
+
+/// The engine with the capacities of a board.
+pub type SizedEngine = Engine<MAX_FIELD_PORTS, MAX_UPLINKS, MAX_FIELDS, MAX_TAP, MAX_EXCHANGES>;
+
 /// The engine and what every task shares with it.
 pub struct Gateway {
-    engine: RefCell<Engine>,
+    engine: RefCell<SizedEngine>,
     ports: Vec<(PortId, PortControl), MAX_FIELD_PORTS>,
     links: Vec<(LinkId, LinkKind, LinkControl), MAX_LINKS>,
     output: RefCell<[u8; OUTPUT_BUFFER]>,
@@ -50,7 +64,7 @@ impl Gateway {
     /// A gateway without a configuration.
     pub const fn idle() -> Self {
         Self {
-            engine: RefCell::new(Engine::idle()),
+            engine: RefCell::new(SizedEngine::idle()),
             ports: Vec::new(),
             links: Vec::new(),
             output: RefCell::new([0; OUTPUT_BUFFER]),
@@ -104,7 +118,7 @@ impl Gateway {
     }
 
     /// Passes the frame tap to `look`.
-    pub fn tap<R>(&self, look: impl FnOnce(&mut Tap<MAX_TAP>) -> R) -> R {
+    pub fn tap<R>(&self, look: impl FnOnce(&mut Tap) -> R) -> R {
         look(self.engine.borrow_mut().tap())
     }
 

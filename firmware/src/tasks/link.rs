@@ -21,10 +21,9 @@ use proto_core::command::MAX_COMMAND;
 use proto_core::config::{Bus, GatewayConfig, listen_address};
 use proto_core::engine::{INPUT_BUFFER, Input, LinkId, LinkKind, OUTPUT_BUFFER};
 use proto_core::modbus::adu::MAX_ADU;
-use recipe_engine::MAX_UPLINKS;
 
 use super::control::LinkControl;
-use super::gateway::{Gateway, MAX_LINKS};
+use super::gateway::{Gateway, MAX_LINKS, MAX_UPLINKS};
 use super::watchdog::Pulse;
 
 /// The remote end of a link.

@@ -11,7 +11,7 @@
 
 use heapless::Vec;
 
-use super::counters::{PortCounters, bump};
+use super::counters::{PortCounters, add, bump};
 use super::outbox::{EdgeQueue, Offer};
 use super::store::SafeBytes;
 use crate::image::{BitSet, GroupId, Image, InputSet};
@@ -343,20 +343,18 @@ impl Bits {
 
     /// The link of these bytes was lost: what waits is dropped, except safe values. `count` gets the
     /// number of values of a port.
-    pub(super) fn link_lost(
-        &mut self,
-        bytes: &InputSet,
-        queues: &mut [EdgeQueue],
-        mut count: impl FnMut(usize, usize),
-    ) {
+    pub(super) fn link_lost(&mut self, bytes: &InputSet, queues: &mut [EdgeQueue]) -> bool {
         self.reachable = self.reachable.minus(BitSet::all_of(bytes));
+        let mut has_lost = false;
         for (nth, share) in self.shares.iter().enumerate().filter(|(_, share)| bytes.contains(share.var)) {
-            let port = usize::from(share.port);
-            let queued = queues.get_mut(port).map_or(0, |queue| queue.drop_all(place(nth)));
             let waiting = share.bits().and(self.dirty).minus(self.safe);
             self.dirty = self.dirty.minus(waiting);
-            count(port, queued.saturating_add(usize::from(!waiting.is_empty())));
+            let Some(queue) = queues.get_mut(usize::from(share.port)) else { continue };
+            let dropped = queue.drop_all(place(nth)).saturating_add(usize::from(!waiting.is_empty()));
+            add(&mut queue.lost, dropped);
+            has_lost |= dropped > 0;
         }
+        has_lost
     }
 
     /// These safe values may not have arrived: they are written again, if they are still current.

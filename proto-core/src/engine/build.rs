@@ -4,10 +4,8 @@ use core::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use heapless::Vec;
 
-use super::Engine;
 use super::bits::MAX_SHARES;
 use super::build_error::{BuildError, one_too_many};
-use super::clock::Clock;
 use super::codecs::{can_codec, index_of, stream_codec, stream_layout};
 use super::command_link::CommandLink;
 use super::command_tables::{MAX_COMMAND_BYTES, MAX_COMMAND_FIELDS};
@@ -15,22 +13,20 @@ use super::counters::PortCounters;
 use super::counts::MAX_COUNTS;
 use super::device_link::DeviceLink;
 use super::device_port::DeviceCodec;
-use super::exchanges::{Exchanges, Places};
+use super::exchanges::Places;
 use super::field_port::{Codec, FieldPort};
 use super::io::{BusState, LinkId, LinkKind, PortId, ReplyCode, Transport};
 use super::line_timing::LineTiming;
-use super::links::Links;
 use super::modbus_link::{MAX_POLL_BLOCKS, ModbusLink};
 use super::outbox::EdgeQueue;
 use super::plan::{Plan, Route, Source, sent_by, shown_by, uplinks};
-use super::port_health::PortsHealth;
 use super::rules::{scale_word, words_of};
 use super::sender::Sender;
 use super::state_link::StateLink;
-use super::store::{InputFrame, MAX_INPUT_FRAMES, SafeBytes, Store};
-use super::tap::Tap;
+use super::store::{InputFrame, MAX_INPUT_FRAMES, SafeBytes};
 use super::uplink::{Uplink, UplinkSetup};
-use super::user::{Bindings, InputBind, InputTo, OutputBind, Sendable};
+use super::user::{InputBind, InputTo, OutputBind, Sendable};
+use super::view::EngineView;
 use crate::config::{
     Bus, ConfigView, Counted, FieldSpec, InputBinding, InputRule, MAX_SAFE_VALUES, MAX_SENDABLE, MIN_CYCLE,
     OutputBinding, Parts, Port, Recipe, SendOn, Span, listen_address,
@@ -54,89 +50,8 @@ impl Groups {
     }
 }
 
-impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize, const EXCHANGES: usize>
-    Engine<PORTS, UPLINKS, FIELDS, TAP, EXCHANGES>
-{
-    /// An engine without a configuration: no ports, no links, nothing to do.
-    ///
-    /// All its bytes are zero, so that a `static` one takes no flash, and no stack.
-    pub const fn idle() -> Self {
-        Self {
-            store: Store::new(),
-            ports: Vec::new(),
-            bindings: Bindings::new(),
-            safe_values: Vec::new(),
-            links: Links::new(),
-            health: PortsHealth::new(),
-            clock: Clock::START,
-            tap: Tap::new(),
-            exchanges: Exchanges::new(),
-        }
-    }
-
-    /// An engine that runs this configuration. All ports and links are down until the driver
-    /// reports otherwise.
-    ///
-    /// # Errors
-    /// [`BuildError`] says what is wrong with the configuration, or what there is no room for.
-    pub fn new<'c>(config: impl Into<ConfigView<'c>>) -> Result<Self, BuildError> {
-        let mut engine = Self::idle();
-        engine.configure(config)?;
-        Ok(engine)
-    }
-
-    /// Runs this configuration from now on, and forgets the previous one. The engine is built in
-    /// place: for boards whose stack is smaller than a few engines.
-    ///
-    /// # Errors
-    /// Same as [`Engine::new`]; the engine is idle then.
-    pub fn configure<'c>(&mut self, config: impl Into<ConfigView<'c>>) -> Result<(), BuildError> {
-        self.configure_from(config.into())
-    }
-
-    /// Not inlined, because a run loop would hold this stack for ever.
-    #[inline(never)]
-    fn configure_from(&mut self, config: ConfigView<'_>) -> Result<(), BuildError> {
-        self.clear();
-        let done = self.build(config);
-        if done.is_err() {
-            self.clear();
-        }
-        done
-    }
-
-    fn clear(&mut self) {
-        let Self {
-            store,
-            ports,
-            bindings,
-            safe_values,
-            links,
-            health,
-            clock,
-            exchanges,
-            // A tap that listens continues.
-            tap: _,
-        } = self;
-        exchanges.clear();
-        *store = Store::new();
-        ports.clear();
-        bindings.inputs.clear();
-        bindings.outputs.clear();
-        bindings.sendable.clear();
-        safe_values.clear();
-        let Links { host, command, state, modbus, recipes, devices } = links;
-        host.clear();
-        command.clear();
-        state.clear();
-        modbus.clear();
-        recipes.clear();
-        devices.clear();
-        health.clear();
-        *clock = Clock::START;
-    }
-
-    fn build(&mut self, config: ConfigView<'_>) -> Result<(), BuildError> {
+impl EngineView<'_> {
+    pub(super) fn build(&mut self, config: ConfigView<'_>) -> Result<(), BuildError> {
         config.validate().map_err(BuildError::Config)?;
         // One copy of the plan, where `map_err` would make two.
         let plan = match Plan::new(config) {
@@ -208,10 +123,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let texts = if commands == 0 { &[] } else { config.commands };
         let bytes = texts.iter().map(|entry| entry.text.len()).fold(0, usize::saturating_add);
         for (what, needed, room) in [
-            (Counted::FieldPorts, ports, PORTS),
+            (Counted::FieldPorts, ports, self.ports.capacity()),
             (Counted::InputFrames, frames, MAX_INPUT_FRAMES),
-            (Counted::RecipeLinks, uplinks(config).count().saturating_add(devices), UPLINKS),
-            (Counted::UserFields, inputs.max(outputs), FIELDS),
+            (
+                Counted::RecipeLinks,
+                uplinks(config).count().saturating_add(devices),
+                self.links.recipes.capacity(),
+            ),
+            (Counted::UserFields, inputs.max(outputs), self.bindings.inputs.capacity()),
             (Counted::CommandFields, commands, MAX_COMMAND_FIELDS),
             (Counted::CommandBytes, bytes, MAX_COMMAND_BYTES),
         ] {
@@ -279,7 +198,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 .map_err(|_| one_too_many(Counted::InputFrames, MAX_INPUT_FRAMES))?;
             whole.iter().for_each(|var| self.store.image.assign(var, group));
         }
-        let full = || one_too_many(Counted::UserFields, FIELDS);
+        let fields = self.bindings.inputs.capacity();
+        let full = || one_too_many(Counted::UserFields, fields);
         let mut next_rule = next_binding;
         let mut inputs = Span { start: self.bindings.inputs.len() as u16, len: 0 };
         for (frame, nth, field) in config.fields_of(recipe, Direction::Input) {
@@ -357,7 +277,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         if let Bus::ModbusTcp { host, port: tcp_port } = &port.bus {
             let link = DeviceLink::new(PortId(index), port.name.clone(), host.clone(), *tcp_port);
             let done = self.links.devices.push(link);
-            done.map_err(|_| one_too_many(Counted::RecipeLinks, UPLINKS))?;
+            done.map_err(|_| one_too_many(Counted::RecipeLinks, self.links.devices.capacity()))?;
         }
         let own = FieldPort {
             id: PortId(index),
@@ -378,13 +298,15 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             counters: PortCounters::default(),
             last_rejection: None,
         };
-        self.ports.push(own).map_err(|_| one_too_many(Counted::FieldPorts, PORTS))?;
-        self.store.edges.push(EdgeQueue::default()).map_err(|_| one_too_many(Counted::FieldPorts, PORTS))
+        let full = one_too_many(Counted::FieldPorts, self.ports.capacity());
+        self.ports.push(own).map_err(|_| full)?;
+        self.store.edges.push(EdgeQueue::default()).map_err(|_| full)
     }
 
     /// What stands behind the input fields of a port follows its bindings, in the order of the fields.
     #[inline(never)]
     fn add_rules(&mut self, config: ConfigView<'_>, port: &Port, recipe: &Recipe) -> Result<(), BuildError> {
+        let fields = self.bindings.inputs.capacity();
         let mut scale = None;
         for (_, _, field) in config.fields_of(recipe, Direction::Input) {
             if field.element().is_some() {
@@ -399,7 +321,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             let words = words_of(field);
             let first = scale.take_if(|_| field.is_of_field_before());
             for word in first.into_iter().chain(words) {
-                self.bindings.inputs.push(word).map_err(|_| one_too_many(Counted::UserFields, FIELDS))?;
+                self.bindings.inputs.push(word).map_err(|_| one_too_many(Counted::UserFields, fields))?;
             }
             // What tells whether a value was taken is 0 when its port is silent.
             let FieldSpec::InputRule(InputRule::ValidTo { var, bit }) = *field else { continue };
@@ -540,7 +462,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             group,
             patience,
         });
-        self.links.recipes.push(uplink).map_err(|_| one_too_many(Counted::RecipeLinks, UPLINKS))
+        let done = self.links.recipes.push(uplink);
+        done.map_err(|_| one_too_many(Counted::RecipeLinks, self.links.recipes.capacity()))
     }
 
     /// Variables of recipe links that no port sends come from the state stream.
@@ -601,7 +524,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 self.store.image.assign(var, group);
             }
         }
-        for ((_, _, recipe), port) in config.field_ports().zip(&mut self.ports) {
+        for ((_, _, recipe), port) in config.field_ports().zip(self.ports.iter_mut()) {
             for var in sent_by(config, recipe) {
                 let Some(group) = self.store.image.group(var) else { continue };
                 port.sender.sources.insert(group);
@@ -616,7 +539,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     fn assign_witnesses(&mut self) {
         let has_state = !self.links.state.is_empty();
         let image = &self.store.image;
-        for link in &mut self.links.recipes {
+        for link in self.links.recipes.iter_mut() {
             let is_shown = |var: &SysVar| {
                 has_state && var.stream().is_some()
                     || var.shown_by().is_some_and(|witness| image.group(witness).is_some())

@@ -3,12 +3,13 @@
 //! In: the instant of each call. Out: everything whose time has come, and when the engine has to be
 //! called again. Does not know what the deadlines are for.
 
-use super::Engine;
 use super::counters::{add, bump};
 use super::field_port::FieldPort;
 use super::io::{Handled, Output};
-use super::store::Overdue;
+use super::links::LinksView;
+use super::store::{Overdue, Store};
 use super::user::silence_commands;
+use super::view::EngineView;
 use crate::time::{Duration, Instant};
 
 /// If two calls of the engine are further apart than this, the gateway was asleep: stopped,
@@ -92,6 +93,55 @@ impl Clock {
     pub(super) fn is_quiet(&self, now: Instant) -> bool {
         self.dirty == Dirty::ARMED && now.max(self.now) < self.timer_at
     }
+
+    /// A tick came before anything was due: the engine sleeps on, as long as it may by now.
+    #[inline(always)]
+    pub(super) fn announce_anew(&mut self, has_ports: bool) {
+        let until = self.next_call(has_ports);
+        (self.announced, self.idle_until) = (until, until);
+    }
+
+    /// Something depends on the clock from `at` on. If it is due already, it is handled before the
+    /// engine sleeps, or at the tick that is late.
+    pub(super) fn arm(&mut self, at: Instant) {
+        if at > self.now {
+            self.timer_at = self.timer_at.min(at);
+        }
+    }
+
+    /// The next deadline or beat; the timer is right.
+    #[inline(always)]
+    fn next_call(&self, has_ports: bool) -> Instant {
+        if !has_ports {
+            return self.timer_at;
+        }
+        self.timer_at.min(self.partial_at).min(self.beat_at)
+    }
+
+    /// Until the next deadline or beat; the timer is right.
+    #[inline(always)]
+    pub(super) fn sleep<'b>(&mut self, has_ports: bool) -> Output<'b> {
+        let until = self.next_call(has_ports);
+        if until == Instant::NEVER {
+            return Output::Sleep { until };
+        }
+        let until = self.announced.min(until);
+        self.announced = until;
+        if self.dirty == Dirty::ARMED && self.now < until && !self.has_slept {
+            self.idle_until = until;
+        }
+        Output::Sleep { until }
+    }
+
+    /// `now`, but no earlier than the previous call, and no later than the clock's last instant.
+    pub(super) fn forward(&self, now: Instant) -> Instant {
+        if now < self.now || now > LAST { self.clamped(now) } else { now }
+    }
+
+    #[cold]
+    fn clamped(&self, now: Instant) -> Instant {
+        now.min(LAST).max(self.now)
+    }
 }
 
 /// What has to be asked: ports and links that may have an output, and the timer. One that had no output is not
@@ -143,9 +193,29 @@ impl Dirty {
     }
 }
 
-impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize, const EXCHANGES: usize>
-    Engine<PORTS, UPLINKS, FIELDS, TAP, EXCHANGES>
-{
+/// When the engine has something to do without an input, computed exactly: without partial frames, and of these.
+pub(super) fn deadlines(
+    clock: &Clock,
+    ports: &[FieldPort],
+    links: LinksView<'_>,
+    store: &Store,
+    has_exchanges: bool,
+) -> (Instant, Instant) {
+    let mut firm = links.deadline().min(store.deadline());
+    if clock.has_slept {
+        firm = firm.min(clock.slept_until);
+    }
+    let mut partial = Instant::NEVER;
+    for port in ports {
+        (firm, partial) = (firm.min(port.send_deadline()), partial.min(port.partial_until()));
+        if has_exchanges && !clock.has_slept {
+            firm = firm.min(port.exchange_deadline());
+        }
+    }
+    (firm, partial)
+}
+
+impl EngineView<'_> {
     /// The deadlines up to `now` pass.
     pub(super) fn tick(&mut self, now: Instant) {
         (self.clock.is_overdue, self.clock.announced) = (false, Instant::NEVER);
@@ -167,63 +237,16 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.ports.iter().map(FieldPort::partial_until).min().unwrap_or(Instant::NEVER)
     }
 
-    /// When the engine has something to do without an input, computed exactly. [`Output::Sleep`]
-    /// may be earlier, never later.
-    pub fn deadline(&self) -> Instant {
-        let (firm, partial) = self.deadlines();
-        firm.min(partial)
-    }
-
-    /// The same without partial frames, and of these.
-    fn deadlines(&self) -> (Instant, Instant) {
-        let (mut firm, mut partial) = (Instant::NEVER, Instant::NEVER);
-        for port in &self.ports {
-            (firm, partial) = (firm.min(port.send_deadline()), partial.min(port.partial_until()));
-        }
-        let hears_at = if self.clock.has_slept { self.clock.slept_until } else { Instant::NEVER };
-        let firm = firm.min(self.links.deadline()).min(self.store.deadline()).min(hears_at);
-        (if self.exchanges.is_used() { firm.min(self.exchange_deadline()) } else { firm }, partial)
-    }
-
     /// Nothing is to be done until the next deadline or beat.
     #[inline(always)]
     pub(super) fn poll_sleep<'b>(&mut self) -> Output<'b> {
         if !self.clock.dirty.has(Dirty::ARMED) {
             self.clock.dirty.add(Dirty::ARMED);
-            (self.clock.timer_at, self.clock.partial_at) = self.deadlines();
+            let (ports, links) = (&self.ports[..], self.links.view());
+            let deadlines = deadlines(self.clock, ports, links, self.store, self.exchanges.is_used());
+            (self.clock.timer_at, self.clock.partial_at) = deadlines;
         }
-        self.sleep()
-    }
-
-    /// A tick came before anything was due: the engine sleeps on, as long as it may by now.
-    #[inline(always)]
-    pub(super) fn announce_anew(&mut self) {
-        let until = self.next_call();
-        (self.clock.announced, self.clock.idle_until) = (until, until);
-    }
-
-    /// The next deadline or beat; the timer is right.
-    #[inline(always)]
-    fn next_call(&self) -> Instant {
-        if self.ports.is_empty() {
-            return self.clock.timer_at;
-        }
-        self.clock.timer_at.min(self.clock.partial_at).min(self.clock.beat_at)
-    }
-
-    /// Until the next deadline or beat; the timer is right.
-    #[inline(always)]
-    pub(super) fn sleep<'b>(&mut self) -> Output<'b> {
-        let until = self.next_call();
-        if until == Instant::NEVER {
-            return Output::Sleep { until };
-        }
-        let until = self.clock.announced.min(until);
-        self.clock.announced = until;
-        if self.clock.dirty == Dirty::ARMED && self.clock.now < until && !self.clock.has_slept {
-            self.clock.idle_until = until;
-        }
-        Output::Sleep { until }
+        self.clock.sleep(!self.ports.is_empty())
     }
 
     /// An input has come: the present. An engine that is asleep has nothing late, and no beat to look at.
@@ -256,7 +279,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     /// The present, and whether the gateway has slept until now.
     #[inline(never)]
     fn present(&mut self, now: Instant) -> Instant {
-        let now = self.forward(now);
+        let now = self.clock.forward(now);
         self.store.now = now;
         if now >= self.clock.beat_at {
             // A configured engine is called at every beat; before the first call nothing was late.
@@ -270,37 +293,24 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         now
     }
 
-    /// `now`, but no earlier than the previous call, and no later than the clock's last instant.
-    pub(super) fn forward(&self, now: Instant) -> Instant {
-        if now < self.clock.now || now > LAST { self.clamped(now) } else { now }
-    }
-
-    #[cold]
-    fn clamped(&self, now: Instant) -> Instant {
-        now.min(LAST).max(self.clock.now)
-    }
-
     /// The gateway itself slept: the age of everything that waits is unknown. Overdue safe values
     /// go first, no command is sent, and every connection is opened again.
     #[cold]
     fn wake(&mut self, now: Instant) {
         self.clock.sleeps = self.clock.sleeps.wrapping_add(1);
         // Before deadlines pass: one of them may be to open a link that has been down.
-        self.links.slept(&mut self.store);
+        self.links.slept(self.store);
         self.clock.has_slept = true;
         self.advance(now);
-        self.ports.iter_mut().for_each(|port| port.slept(&mut self.tap, now));
+        self.ports.iter_mut().for_each(|port| port.slept(self.tap, now));
         self.exchanges_slept();
         self.clock.slept_until = now + AFTER_SLEEP;
         self.arm(self.clock.slept_until);
     }
 
-    /// Something depends on the clock from `at` on. If it is due already, it is handled before the
-    /// engine sleeps, or at the tick that is late.
+    /// See [`Clock::arm`].
     pub(super) fn arm(&mut self, at: Instant) {
-        if at > self.clock.now {
-            self.clock.timer_at = self.clock.timer_at.min(at);
-        }
+        self.clock.arm(at);
     }
 
     /// The driver ticks once more at this instant.
@@ -316,8 +326,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.clock.dirty.remove(Dirty::ARMED);
         self.expire_frames(now);
         let mut is_ended = false;
-        for port in &mut self.ports {
-            is_ended |= port.advance(&mut self.tap, now);
+        for port in self.ports.iter_mut() {
+            is_ended |= port.advance(self.tap, now);
         }
         if is_ended {
             self.read_ended(now);
@@ -325,7 +335,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         if self.exchanges.is_used() {
             self.advance_exchange(now);
         }
-        self.links.advance(&mut self.store);
+        self.links.advance(self.store);
         if !self.links.devices.is_empty() {
             self.advance_connections(now);
         }
@@ -348,7 +358,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 
     fn expire_frames(&mut self, now: Instant) {
         let mut timed_out = false;
-        while let Some(overdue) = self.store.next_timeout(&self.safe_values) {
+        while let Some(overdue) = self.store.next_timeout(self.safe_values) {
             let (frame, dropped) = match overdue {
                 Overdue::Frame(frame, dropped) => (frame, dropped),
                 Overdue::Health => {
@@ -395,7 +405,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 
     #[inline(never)]
     fn drop_expired(&mut self) {
-        let ports = &mut self.ports;
+        let ports = &mut *self.ports;
         self.store.expire_waiting(|port, dropped| {
             if let Some(port) = ports.get_mut(port) {
                 add(&mut port.counters.values_expired, dropped);

@@ -9,7 +9,7 @@ use crate::image::{BitSet, InputSet};
 use crate::sysvar::SysVar;
 use crate::time::{Duration, Instant};
 
-impl<const PORTS: usize> Store<PORTS> {
+impl Store {
     /// Whether the controller is known to have all safe values.
     pub(super) fn is_safe(&self) -> bool {
         self.unconfirmed.is_empty() && self.bits.unconfirmed.is_empty()

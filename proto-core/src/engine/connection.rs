@@ -6,23 +6,23 @@ use crate::time::Instant;
 
 pub(super) trait Connection {
     /// The connection came up.
-    fn opened<const PORTS: usize>(&mut self, store: &mut Store<PORTS>);
+    fn opened(&mut self, store: &mut Store);
 
     /// The connection is gone, and with it what was under way.
-    fn lost<const PORTS: usize>(&mut self, store: &mut Store<PORTS>);
+    fn lost(&mut self, store: &mut Store);
 
     /// Bytes, or one datagram, from the controller. When the image is looked at after each frame, only
     /// the first frame is taken; the bytes behind it are left.
-    fn received<'b, const PORTS: usize>(&mut self, bytes: &'b [u8], store: &mut Store<PORTS>) -> &'b [u8];
+    fn received<'b>(&mut self, bytes: &'b [u8], store: &mut Store) -> &'b [u8];
 
     /// The transport took everything.
     fn sent(&mut self) {}
 
     /// The peer's transport has acknowledged all but `left` bytes.
-    fn acked<const PORTS: usize>(&mut self, _left: u32, _store: &mut Store<PORTS>) {}
+    fn acked(&mut self, _left: u32, _store: &mut Store) {}
 
     /// Looks at the clock, the supervisor apart.
-    fn advance<const PORTS: usize>(&mut self, _store: &mut Store<PORTS>) {}
+    fn advance(&mut self, _store: &mut Store) {}
 
     /// When it has something to do by itself, the supervisor apart.
     fn deadline(&self) -> Instant {

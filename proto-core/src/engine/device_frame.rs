@@ -43,7 +43,7 @@ struct Sorted {
     tells: bool,
 }
 
-impl<const PORTS: usize> Frames<'_, PORTS> {
+impl Frames<'_> {
     /// Applies a frame, and counts it in `accepted`.
     pub(super) fn take_device(
         &mut self,

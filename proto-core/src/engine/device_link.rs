@@ -5,13 +5,13 @@
 
 use heapless::String;
 
-use super::Engine;
 use super::clock::Dirty;
 use super::counters::{LinkCounters, add, bump};
 use super::events::Event;
 use super::field_port::find_port;
 use super::io::{LinkId, LinkKind, PortId, Transport};
 use super::turns::Cause;
+use super::view::EngineView;
 use crate::config::{MAX_ADDRESS, Name};
 use crate::link::{LinkTimings, Supervisor};
 use crate::time::{Duration, Instant};
@@ -86,9 +86,7 @@ impl DeviceLink {
     }
 }
 
-impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize, const EXCHANGES: usize>
-    Engine<PORTS, UPLINKS, FIELDS, TAP, EXCHANGES>
-{
+impl EngineView<'_> {
     /// The connection of a port of Modbus TCP, if the link is one.
     #[inline]
     pub(super) fn device_link(&mut self, id: LinkId) -> Option<&mut DeviceLink> {
@@ -149,7 +147,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         add(&mut link.counters.bytes_in, bytes.len());
         let port = link.port;
         self.exchange_bytes(port, bytes, now);
-        let line = find_port(&mut self.ports, port).and_then(|port| port.line_mut());
+        let line = find_port(self.ports, port).and_then(|port| port.line_mut());
         let is_lost = line.and_then(|line| line.transactions.as_ref()).is_some_and(|all| all.is_lost);
         if is_lost && let Some(link) = self.device_link(id) {
             bump(&mut link.counters.malformed);
@@ -163,7 +161,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         if self.links.devices.is_empty() {
             return false;
         }
-        let Some(port) = find_port(&mut self.ports, id) else { return false };
+        let Some(port) = find_port(self.ports, id) else { return false };
         let mut view = self.exchanges.view();
         let until = port.line().and_then(|line| {
             let flight = line.flight()?;
@@ -202,7 +200,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         for nth in 0..self.links.devices.len() {
             let Some(link) = self.links.devices.get(nth) else { break };
             let (id, is_up) = (link.port, link.supervisor.is_up());
-            let was_up = find_port(&mut self.ports, id).is_some_and(|port| port.is_up);
+            let was_up = find_port(self.ports, id).is_some_and(|port| port.is_up);
             match (was_up, is_up) {
                 (false, true) => self.port_up(id),
                 (true, false) => self.port_down(id, now),

@@ -191,13 +191,13 @@ impl DeviceCodec {
 impl FieldPort {
     /// Reads the frames in `rest`; see [`FieldPort::frames`].
     #[inline(never)]
-    pub(super) fn device_frames<const PORTS: usize, const TAP: usize>(
+    pub(super) fn device_frames(
         &mut self,
         rest: &mut &[u8],
         bindings: &[InputBind],
-        store: &mut Store<PORTS>,
+        store: &mut Store,
         commands: Option<&mut CommandLink>,
-        tap: &mut Tap<TAP>,
+        tap: &mut Tap,
     ) -> Accepted {
         let mut accepted = Accepted::default();
         let (now, usable, bytes) = (store.now, self.is_usable(), *rest);
@@ -257,7 +257,7 @@ impl FieldPort {
     }
 
     /// Counts what the search for frames has skipped, in these bytes or those held before.
-    pub(super) fn note_skipped<const TAP: usize>(&mut self, bytes: &[u8], tap: &mut Tap<TAP>, now: Instant) {
+    pub(super) fn note_skipped(&mut self, bytes: &[u8], tap: &mut Tap, now: Instant) {
         let Codec::Device(DeviceCodec { reader: Some(Reader::Search(framer)), skipped_bytes, .. }) =
             &mut self.codec
         else {
@@ -275,11 +275,11 @@ impl FieldPort {
 
     /// A frame from the bus; see [`FieldPort::can`].
     #[inline(never)]
-    pub(super) fn device_can<const PORTS: usize>(
+    pub(super) fn device_can(
         &mut self,
         frame: &CanFrame,
         bindings: &[InputBind],
-        store: &mut Store<PORTS>,
+        store: &mut Store,
         commands: Option<&mut CommandLink>,
         accepted: &mut Accepted,
     ) -> Result<(), Rejection> {

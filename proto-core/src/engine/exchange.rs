@@ -4,6 +4,7 @@
 //! and requests. Which exchange is next is the line's business ([`super::line`]); ports without
 //! exchanges do not come here.
 
+use super::OUTPUT_BUFFER;
 use super::clock::Dirty;
 use super::command_link::CommandLink;
 use super::counters::{PortCounters, add, bump};
@@ -11,6 +12,7 @@ use super::device_port::{DeviceCodec, DeviceFormat, elements, judge_can};
 use super::events::{Events, Outcome, Sources};
 use super::exchanges::{Asks, Item, OtherFormat, View};
 use super::field_output::Downward;
+use super::field_port::find_port;
 use super::field_port::{Codec, FieldPort, came, keep_why};
 use super::frames::{Accepted, Frames};
 use super::io::{LinkId, Output, PortId};
@@ -23,8 +25,8 @@ use super::store::Store;
 use super::tap::{Tap, TapPlace};
 use super::turns::{Cause, Ended, News};
 use super::user::{InputBind, Outputs, wrapping_count};
+use super::view::EngineView;
 use super::whole_port::{Reader, TextBind};
-use super::{Engine, OUTPUT_BUFFER, find_port};
 use crate::device::{Found, Probe};
 use crate::image::{GroupId, Image, InputSet};
 use crate::modbus::rtu::MAX_ADU;
@@ -86,13 +88,13 @@ impl FieldPort {
 
     /// Reads the frames in `rest`; stops after the first accepted one if the image is to be checked
     /// after each frame.
-    fn exchange_frames<const PORTS: usize, const TAP: usize>(
+    fn exchange_frames(
         &mut self,
         rest: &mut &[u8],
         bindings: &[InputBind],
-        store: &mut Store<PORTS>,
+        store: &mut Store,
         commands: Option<&mut CommandLink>,
-        tap: &mut Tap<TAP>,
+        tap: &mut Tap,
         mut view: View<'_>,
     ) -> Accepted {
         let mut accepted = Accepted::default();
@@ -251,11 +253,11 @@ impl FieldPort {
     }
 
     /// A frame from the bus.
-    fn exchange_frame<const PORTS: usize>(
+    fn exchange_frame(
         &mut self,
         frame: &CanFrame,
         bindings: &[InputBind],
-        store: &mut Store<PORTS>,
+        store: &mut Store,
         commands: Option<&mut CommandLink>,
         mut view: View<'_>,
         accepted: &mut Accepted,
@@ -644,8 +646,8 @@ fn goes_on(
 /// Takes the values of a pending answer or a refusal, if it has any.
 #[cold]
 #[inline(never)]
-fn take_other<const PORTS: usize>(
-    frames: &mut Frames<'_, PORTS>,
+fn take_other(
+    frames: &mut Frames<'_>,
     other: Option<&OtherFormat>,
     texts: &[TextBind],
     frame: &[u8],
@@ -728,9 +730,7 @@ fn signs(line: &mut Line, items: &mut [Item], table: &mut ExchangeTable<'_>, sig
     Events { items, table, line, now }.note(nth, news);
 }
 
-impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize, const EXCHANGES: usize>
-    Engine<PORTS, UPLINKS, FIELDS, TAP, EXCHANGES>
-{
+impl EngineView<'_> {
     /// The output of a request, with its record.
     #[cold]
     #[inline(never)]
@@ -760,12 +760,12 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[cold]
     #[inline(never)]
     pub(super) fn exchange_bytes(&mut self, id: PortId, bytes: &[u8], now: Instant) -> bool {
-        let Some(port) = find_port(&mut self.ports, id) else { return false };
+        let Some(port) = find_port(self.ports, id) else { return false };
         if port.line().is_none() {
             return false;
         }
         if self.clock.has_slept {
-            port.discard(bytes, None, &mut self.tap, now);
+            port.discard(bytes, None, self.tap, now);
             return true;
         }
         port.heard(bytes, now);
@@ -775,10 +775,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
         let mut rest = bytes;
         loop {
-            let (store, command) = (&mut self.store, self.links.command.first_mut());
-            let Some(port) = find_port(&mut self.ports, id) else { return true };
+            let (store, command) = (&mut *self.store, self.links.command.first_mut());
+            let Some(port) = find_port(self.ports, id) else { return true };
             let (inputs, view) = (&self.bindings.inputs, self.exchanges.view());
-            let accepted = port.exchange_frames(&mut rest, inputs, store, command, &mut self.tap, view);
+            let accepted = port.exchange_frames(&mut rest, inputs, store, command, self.tap, view);
             self.after_exchange(id);
             self.note_overdue();
             self.after_field(id, &accepted, now);
@@ -792,13 +792,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[cold]
     #[inline(never)]
     pub(super) fn exchange_can(&mut self, id: PortId, frame: &CanFrame, now: Instant) -> bool {
-        let (store, command) = (&mut self.store, self.links.command.first_mut());
-        let Some(port) = find_port(&mut self.ports, id) else { return false };
+        let (store, command) = (&mut *self.store, self.links.command.first_mut());
+        let Some(port) = find_port(self.ports, id) else { return false };
         if port.line().is_none() {
             return false;
         }
         if self.clock.has_slept {
-            port.discard(frame.data(), Some(frame.id()), &mut self.tap, now);
+            port.discard(frame.data(), Some(frame.id()), self.tap, now);
             return true;
         }
         let mut accepted = Accepted::default();
@@ -806,7 +806,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let verdict = port.exchange_frame(frame, inputs, store, command, view, &mut accepted);
         self.tap.record(|| came(id, now, verdict, Some(frame.id()), [frame.data(), &[], &[]]));
         if verdict.is_ok() || verdict.is_err_and(|why| port.is_news(why, now)) {
-            keep_why(&mut port.last_rejection, verdict, &mut self.store, Some(frame.id()), frame.data());
+            keep_why(&mut port.last_rejection, verdict, self.store, Some(frame.id()), frame.data());
         }
         self.after_exchange(id);
         self.note_overdue();
@@ -824,7 +824,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             if port.line().is_none() {
                 continue;
             }
-            let (id, links) = (port.id, &self.links);
+            let (id, links) = (port.id, self.links.view());
             let first_of_links = self.store.frames.len() as u8;
             let up_since = |group| links.up_since(group);
             let (image, view) = (&self.store.image, self.exchanges.view());
@@ -844,7 +844,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[inline(never)]
     pub(super) fn tell_outcomes(&mut self, repeats: bool) {
         let mut told = InputSet::EMPTY;
-        for item in self.exchanges.items_mut() {
+        for item in self.exchanges.items.iter_mut() {
             if !repeats && !item.is_news {
                 continue;
             }
@@ -869,7 +869,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     fn after_exchange(&mut self, id: PortId) {
         self.tell_outcomes(false);
         self.clock.dirty.add(Dirty::PORTS);
-        if let Some(port) = find_port(&mut self.ports, id) {
+        if let Some(port) = find_port(self.ports, id) {
             port.note_partial();
             // Each by itself: what is due already must not hide the other.
             let (deadlines, has_failed) =
@@ -892,7 +892,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[cold]
     #[inline(never)]
     pub(super) fn exchange_sent(&mut self, id: PortId) {
-        if let Some(port) = find_port(&mut self.ports, id) {
+        if let Some(port) = find_port(self.ports, id) {
             port.exchange_sent(self.exchanges.view(), self.clock.now);
             self.after_exchange(id);
         }
@@ -900,7 +900,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 
     /// The device is there.
     pub(super) fn exchanges_begin(&mut self, id: PortId) {
-        if let Some(port) = find_port(&mut self.ports, id) {
+        if let Some(port) = find_port(self.ports, id) {
             port.begin_exchange(self.exchanges.view(), self.clock.now);
             self.after_exchange(id);
         }
@@ -908,14 +908,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 
     /// The device is gone.
     pub(super) fn exchanges_end(&mut self, id: PortId) {
-        if let Some(port) = find_port(&mut self.ports, id) {
+        if let Some(port) = find_port(self.ports, id) {
             port.abandon_exchange(self.exchanges.view(), self.clock.now);
         }
     }
 
     /// The gateway slept.
     pub(super) fn exchanges_slept(&mut self) {
-        for port in &mut self.ports {
+        for port in self.ports.iter_mut() {
             port.abandon_exchange(self.exchanges.view(), self.clock.now);
         }
     }
@@ -936,24 +936,15 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     /// A master's request has ended.
     fn serve(&mut self, id: PortId, now: Instant) {
         self.show_health(now);
-        let (store, command) = (&mut self.store, self.links.command.first_mut());
-        let Some(port) = find_port(&mut self.ports, id) else { return };
+        let (store, command) = (&mut *self.store, self.links.command.first_mut());
+        let Some(port) = find_port(self.ports, id) else { return };
         if self.clock.has_slept {
-            return port.discard_partial(&mut self.tap, now);
+            return port.discard_partial(self.tap, now);
         }
         let bindings = (&self.bindings.inputs[..], self.bindings.outputs());
-        let accepted = port.serve(bindings, store, command, &mut self.tap, self.exchanges.view());
+        let accepted = port.serve(bindings, store, command, self.tap, self.exchanges.view());
         self.after_exchange(id);
         self.after_field(id, &accepted, now);
-    }
-
-    #[cold]
-    #[inline(never)]
-    pub(super) fn exchange_deadline(&self) -> Instant {
-        if self.clock.has_slept {
-            return Instant::NEVER;
-        }
-        self.ports.iter().map(FieldPort::exchange_deadline).min().unwrap_or(Instant::NEVER)
     }
 
     /// The next request of a port.
@@ -968,7 +959,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
         let mut first = Instant::NEVER;
         let mut found = None;
-        for port in &mut self.ports {
+        for port in self.ports.iter_mut() {
             if found.is_none()
                 && let Some(len) = port.next_reply(out, now)
             {

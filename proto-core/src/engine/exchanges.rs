@@ -3,9 +3,8 @@
 //! In: the exchanges of a configuration. Out: for each port with exchanges a [`Line`], and the frames
 //! that it sends and takes. One list for all ports, so that a port without exchanges takes no room.
 
-use heapless::{Vec, VecView};
+use heapless::VecView;
 
-use super::Engine;
 use super::build_error::{BuildError, one_too_many};
 use super::device_port::DeviceFormat;
 use super::events::{Event, ReportedOutcome, Trigger};
@@ -13,6 +12,7 @@ use super::line::{ExchangeTable, Line, PeerCounters, PeerState, Times};
 use super::modbus_tcp::Transactions;
 use super::turns::{Row, RowKind, RowTimes, Turn};
 use super::user::{InputBind, InputTo};
+use super::view::EngineView;
 use crate::config::{
     Bus, ConfigView, Counted, DeviceFrame, Echo, Exchange, FieldSpec, FrameSpec, OutcomeTo, Port, Recipe,
     Restarted, Span, Transaction, has_values,
@@ -25,13 +25,12 @@ use crate::time::{Duration, Instant};
 use crate::wire::can::CanId;
 
 /// The exchanges of all ports; ports name ranges of them.
-#[derive(Debug, Clone)]
-pub(super) struct Exchanges<const N: usize> {
-    items: Vec<Item, N>,
-    rows: Vec<Row, N>,
-    peers: Vec<PeerState, N>,
+pub(super) struct Exchanges<'e> {
+    pub items: &'e mut VecView<Item>,
+    pub rows: &'e mut VecView<Row>,
+    pub peers: &'e mut VecView<PeerState>,
     /// What masters have written, and the requests of events.
-    written: [Piece; N],
+    pub written: &'e mut [Piece],
 }
 
 /// Bytes of a block that a master writes, or of the request of an event; each takes as many pieces as it needs.
@@ -127,33 +126,15 @@ impl RestartSign {
     }
 }
 
-impl<const N: usize> Exchanges<N> {
-    pub(super) const fn new() -> Self {
-        Self { items: Vec::new(), rows: Vec::new(), peers: Vec::new(), written: [[0; _]; N] }
-    }
-
-    pub(super) fn clear(&mut self) {
-        self.items.clear();
-        self.rows.clear();
-        self.peers.clear();
-    }
-
+impl Exchanges<'_> {
     #[inline(always)]
     pub(super) fn is_used(&self) -> bool {
-        N > 0 && !self.items.is_empty()
+        !self.items.is_empty()
     }
 
     pub(super) fn view(&mut self) -> View<'_> {
         let Self { items, rows, peers, written } = self;
         View { items, rows, peers, written }
-    }
-
-    pub(super) fn peers(&self) -> &[PeerState] {
-        &self.peers
-    }
-
-    pub(super) fn items_mut(&mut self) -> &mut [Item] {
-        &mut self.items
     }
 }
 
@@ -379,9 +360,7 @@ impl Formats<'_> {
     }
 }
 
-impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize, const EXCHANGES: usize>
-    Engine<PORTS, UPLINKS, FIELDS, TAP, EXCHANGES>
-{
+impl EngineView<'_> {
     /// Adds the exchanges of a port, whose fields and input frames behind those of its parts are at
     /// these places.
     #[inline(never)]
@@ -392,13 +371,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         recipe: &Recipe,
         places: Places,
     ) -> Result<Line, BuildError> {
-        let full = || one_too_many(Counted::Exchanges, EXCHANGES);
+        let room = self.exchanges.written.len();
+        let full = || one_too_many(Counted::Exchanges, room);
         let exchanges = config.exchanges_of(recipe);
         let start = self.exchanges.items.len() as u16;
         let first_peer = self.exchanges.peers.len();
         let part_frames = |part| recipe.part_frames(part).count() as u8;
         let frames = [part_frames(Direction::Input), part_frames(Direction::Output)];
-        let refusals = self.bindings.inputs.as_mut_view();
+        let refusals = &mut *self.bindings.inputs;
         let mut formats = Formats { config, recipe: port.recipe, places, frames, refusals };
         // One that is asked at the start may have to wait for its values.
         let may_wait = |exchange: &Exchange| {
@@ -434,8 +414,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                     self.exchanges.items.iter().map(|item| item.pieces.start.saturating_add(item.pieces.len));
                 let used = ends.max().unwrap_or(0);
                 let len = kept.div_ceil(size_of::<Piece>());
-                if usize::from(used).saturating_add(len) > EXCHANGES {
-                    return Err(one_too_many(Counted::WrittenPieces, EXCHANGES));
+                if usize::from(used).saturating_add(len) > room {
+                    return Err(one_too_many(Counted::WrittenPieces, room));
                 }
                 item.pieces = Span { start: used, len: len as u16 };
             }

@@ -67,11 +67,11 @@ impl FieldPort {
     }
 
     /// The device is gone: nothing that has begun is continued later.
-    pub(super) fn down<const TAP: usize>(
+    pub(super) fn down(
         &mut self,
         bindings: &[InputBind],
         commands: Option<&mut CommandLink>,
-        tap: &mut Tap<TAP>,
+        tap: &mut Tap,
         now: Instant,
     ) {
         if self.is_up {
@@ -100,19 +100,13 @@ impl FieldPort {
     }
 
     /// The gateway itself slept: nothing that has begun is continued.
-    pub(super) fn slept<const TAP: usize>(&mut self, tap: &mut Tap<TAP>, now: Instant) {
+    pub(super) fn slept(&mut self, tap: &mut Tap, now: Instant) {
         self.sender.skip();
         self.discard_partial(tap, now);
     }
 
     /// Input that waited while the gateway itself slept is discarded, because its age is unknown.
-    pub(super) fn discard<const TAP: usize>(
-        &mut self,
-        bytes: &[u8],
-        can_id: Option<CanId>,
-        tap: &mut Tap<TAP>,
-        now: Instant,
-    ) {
+    pub(super) fn discard(&mut self, bytes: &[u8], can_id: Option<CanId>, tap: &mut Tap, now: Instant) {
         tap.record(|| came(self.id, now, Err(Rejection::Asleep), can_id, [bytes, &[], &[]]));
         keep(&mut self.last_rejection, Rejection::Asleep, can_id, bytes, now);
         add(&mut self.counters.bytes_in, bytes.len());
@@ -154,13 +148,13 @@ impl FieldPort {
 
     /// Reads the frames in `rest`; stops after the first accepted one if the image is to be checked
     /// after each frame.
-    pub(super) fn frames<const PORTS: usize, const TAP: usize>(
+    pub(super) fn frames(
         &mut self,
         rest: &mut &[u8],
         bindings: &[InputBind],
-        store: &mut Store<PORTS>,
+        store: &mut Store,
         commands: Option<&mut CommandLink>,
-        tap: &mut Tap<TAP>,
+        tap: &mut Tap,
     ) -> Accepted {
         let mut accepted = Accepted::default();
         let now = store.now;
@@ -205,20 +199,20 @@ impl FieldPort {
 
     /// Bytes for a port whose recipe has no input part.
     #[cold]
-    pub(super) fn not_asked_for<const TAP: usize>(&mut self, bytes: &[u8], tap: &mut Tap<TAP>, now: Instant) {
+    pub(super) fn not_asked_for(&mut self, bytes: &[u8], tap: &mut Tap, now: Instant) {
         bump(&mut self.counters.rejected_no_input);
         tap.record(|| came(self.id, now, Err(Rejection::NoInput), None, [bytes, &[], &[]]));
         keep(&mut self.last_rejection, Rejection::NoInput, None, bytes, now);
     }
 
     /// A frame from the bus.
-    pub(super) fn can<const PORTS: usize, const TAP: usize>(
+    pub(super) fn can(
         &mut self,
         frame: &CanFrame,
         bindings: &[InputBind],
-        store: &mut Store<PORTS>,
+        store: &mut Store,
         commands: Option<&mut CommandLink>,
-        tap: &mut Tap<TAP>,
+        tap: &mut Tap,
     ) -> Accepted {
         let now = store.now;
         let mut accepted = Accepted::default();
@@ -257,11 +251,11 @@ impl FieldPort {
     }
 
     #[inline(always)]
-    fn take_can<const PORTS: usize>(
+    fn take_can(
         &mut self,
         frame: &CanFrame,
         bindings: &[InputBind],
-        store: &mut Store<PORTS>,
+        store: &mut Store,
         commands: Option<&mut CommandLink>,
         accepted: &mut Accepted,
     ) -> Result<(), Rejection> {
@@ -307,7 +301,7 @@ impl FieldPort {
 
     /// Handles the clock: cycles and silence. Returns whether silence has ended a frame, which is
     /// still to be read with [`Self::frames`].
-    pub(super) fn advance<const TAP: usize>(&mut self, tap: &mut Tap<TAP>, now: Instant) -> bool {
+    pub(super) fn advance(&mut self, tap: &mut Tap, now: Instant) -> bool {
         let mut is_ended = false;
         if now >= self.partial_until() {
             is_ended = self.ends_by_silence();
@@ -374,7 +368,7 @@ impl FieldPort {
     }
 
     #[cold]
-    pub(super) fn discard_partial<const TAP: usize>(&mut self, tap: &mut Tap<TAP>, now: Instant) {
+    pub(super) fn discard_partial(&mut self, tap: &mut Tap, now: Instant) {
         let deframer = match &mut self.codec {
             Codec::Stream { deframer, .. } => deframer,
             Codec::Device(DeviceCodec { reader: Some(reader), .. }) => {
@@ -402,13 +396,7 @@ impl FieldPort {
     /// `skipped` bytes of a chunk, or of bytes held before it, belong to no frame. Without silence
     /// between, further ones belong to the same rejection.
     #[cold]
-    pub(super) fn no_frame<const TAP: usize>(
-        &mut self,
-        bytes: &[u8],
-        skipped: usize,
-        tap: &mut Tap<TAP>,
-        now: Instant,
-    ) {
+    pub(super) fn no_frame(&mut self, bytes: &[u8], skipped: usize, tap: &mut Tap, now: Instant) {
         tap.record(|| came(self.id, now, Err(Rejection::NoFrame), None, [bytes, &[], &[]]));
         match &mut self.last_rejection {
             Some(last) if last.goes_on(now, self.line.idle_gap) => last.append(now, skipped, bytes),
@@ -444,10 +432,10 @@ pub(super) fn keep(
 
 /// Keeps why a device's frame was rejected, or a field of it.
 #[inline]
-pub(super) fn keep_why<const PORTS: usize>(
+pub(super) fn keep_why(
     last: &mut Option<LastRejection>,
     verdict: Result<(), Rejection>,
-    store: &mut Store<PORTS>,
+    store: &mut Store,
     can_id: Option<CanId>,
     bytes: &[u8],
 ) {

@@ -25,17 +25,17 @@ pub(super) struct Accepted {
 }
 
 /// The context for applying a frame.
-pub(super) struct Frames<'a, const PORTS: usize> {
+pub(super) struct Frames<'a> {
     pub mode: Mode,
     pub bindings: &'a [InputBind],
     pub reply: &'a mut ReplyCode,
     pub counters: &'a mut PortCounters,
     pub port: PortId,
-    pub store: &'a mut Store<PORTS>,
+    pub store: &'a mut Store,
     pub commands: Option<&'a mut CommandLink>,
 }
 
-impl<'a, const PORTS: usize> Frames<'a, PORTS> {
+impl<'a> Frames<'a> {
     // The parts of a port one by one: its codec is in use meanwhile.
     #[inline(always)]
     pub(super) fn new(
@@ -43,14 +43,14 @@ impl<'a, const PORTS: usize> Frames<'a, PORTS> {
         reply: &'a mut ReplyCode,
         counters: &'a mut PortCounters,
         bindings: &'a [InputBind],
-        store: &'a mut Store<PORTS>,
+        store: &'a mut Store,
         commands: Option<&'a mut CommandLink>,
     ) -> Self {
         Self { mode, bindings, reply, counters, port, store, commands }
     }
 }
 
-impl<const PORTS: usize> Frames<'_, PORTS> {
+impl Frames<'_> {
     /// Counts a rejection, and is one.
     pub(super) fn rejected(&mut self, why: Rejection) -> Result<(), Rejection> {
         let counters = &mut *self.counters;
@@ -97,7 +97,7 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
     }
 
     #[inline(always)]
-    fn again(&mut self) -> Frames<'_, PORTS> {
+    fn again(&mut self) -> Frames<'_> {
         let commands = self.commands.as_deref_mut();
         Frames::new((self.port, self.mode), self.reply, self.counters, self.bindings, self.store, commands)
     }

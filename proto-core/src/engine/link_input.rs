@@ -3,20 +3,18 @@
 //! In: a link is up or down, bytes came on it, its transport took some. Out: values in the store, results of commands,
 //! and which ports and links may have an output now. Does not know what travels on a link.
 
-use super::Engine;
 use super::clock::Dirty;
 use super::io::LinkId;
+use super::view::EngineView;
 use crate::time::Instant;
 
-impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize, const EXCHANGES: usize>
-    Engine<PORTS, UPLINKS, FIELDS, TAP, EXCHANGES>
-{
+impl EngineView<'_> {
     #[cold]
     pub(super) fn link_up(&mut self, link: LinkId) {
         if self.device_link(link).is_some() {
             return self.device_up(link);
         }
-        self.links.up(link, &mut self.store);
+        self.links.up(link, self.store);
         self.arm_link(link);
     }
 
@@ -25,7 +23,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         if self.device_link(link).is_some() {
             return self.device_down(link);
         }
-        self.links.down(link, &mut self.store);
+        self.links.down(link, self.store);
         self.carry_results();
         self.arm_link(link);
     }
@@ -45,9 +43,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         if self.device_link(link).is_some() {
             return self.device_acked(link, left);
         }
-        self.links.acked(link, left, &mut self.store);
+        self.links.acked(link, left, self.store);
         self.clock.dirty.add(self.links.ask_of(link));
-        self.arm(self.links.deadline_of(link));
+        self.arm(self.links.view().deadline_of(link));
     }
 
     #[inline(never)]
@@ -60,7 +58,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         loop {
             if is_up {
                 let before = rest;
-                rest = self.links.received(link, rest, &mut self.store);
+                rest = self.links.received(link, rest, self.store);
                 let taken = before.get(..before.len().saturating_sub(rest.len())).unwrap_or(&[]);
                 self.tap.came(link, taken, now);
             }
@@ -80,6 +78,6 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     fn arm_link(&mut self, link: LinkId) {
         self.clock.dirty.add(Dirty::LINKS);
         self.clock.dirty.add(Dirty::ACTIONS);
-        self.arm(self.links.deadline_of(link));
+        self.arm(self.links.view().deadline_of(link));
     }
 }

@@ -3,7 +3,7 @@
 //! Three kinds of links are one connection each; [`Connection`] has their differences. The command
 //! link has two connections and decides for both.
 
-use heapless::{String, Vec};
+use heapless::{String, Vec, VecView};
 
 use super::clock::Dirty;
 use super::command_link::CommandLink;
@@ -13,7 +13,6 @@ use super::device_link::DeviceLink;
 use super::io::{Endpoint, LinkId, LinkKind, Transport};
 use super::modbus_link::ModbusLink;
 use super::other_text::OtherText;
-use super::outbox::Outbox;
 use super::state_link::StateLink;
 use super::store::Store;
 use super::uplink::Uplink;
@@ -50,7 +49,7 @@ pub struct LinkInfo<'a> {
 pub(super) type Maybe<T> = Vec<T, 1>;
 
 /// Maximum length of the controller's address or name.
-const MAX_HOST: usize = 64;
+pub(super) const MAX_HOST: usize = 64;
 
 /// Runs `$do` with the link `$id` as `$link`, if it is one of those with one connection.
 macro_rules! with_connection {
@@ -72,39 +71,100 @@ macro_rules! each_connection {
         if let Some($link) = $links.modbus.first_mut() {
             $do
         }
-        for $link in &mut $links.recipes {
+        for $link in $links.recipes.iter_mut() {
             $do
         }
     };
 }
 
 /// The links that the configuration needs.
-#[derive(Debug, Clone)]
-pub(super) struct Links<const UPLINKS: usize> {
+pub(super) struct Links<'e> {
     /// The controller's address or name.
-    pub host: String<MAX_HOST>,
-    pub command: Maybe<CommandLink>,
-    pub state: Maybe<StateLink>,
-    pub modbus: Maybe<ModbusLink>,
-    pub recipes: Vec<Uplink, UPLINKS>,
+    pub host: &'e mut String<MAX_HOST>,
+    pub command: &'e mut Maybe<CommandLink>,
+    pub state: &'e mut Maybe<StateLink>,
+    pub modbus: &'e mut Maybe<ModbusLink>,
+    pub recipes: &'e mut VecView<Uplink>,
     /// Together with the recipe links as many as those may be.
-    pub devices: Vec<DeviceLink, UPLINKS>,
+    pub devices: &'e mut VecView<DeviceLink>,
 }
 
 /// All links, read-only.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct LinksView<'a> {
-    host: &'a str,
+    pub host: &'a str,
     pub command: Option<&'a CommandLink>,
     pub state: Option<&'a StateLink>,
-    modbus: Option<&'a ModbusLink>,
-    recipes: &'a [Uplink],
-    devices: &'a [DeviceLink],
+    pub modbus: Option<&'a ModbusLink>,
+    pub recipes: &'a [Uplink],
+    pub devices: &'a [DeviceLink],
 }
 
 impl<'a> LinksView<'a> {
     pub(super) fn infos(self) -> impl Iterator<Item = LinkInfo<'a>> {
         (0..).map_while(move |nth| self.nth(nth))
+    }
+
+    /// Since when the connection is up over which the values of a group come; [`Instant::ZERO`] if there is none, or for
+    /// what does not come from the controller.
+    pub(super) fn up_since(self, group: GroupId) -> Instant {
+        let state = self.state.into_iter().filter(|link| link.group == group).map(|link| &link.supervisor);
+        let recipes =
+            self.recipes.iter().filter(|link| link.group == Some(group)).map(|link| &link.supervisor);
+        let modbus = self.modbus.into_iter().filter(|link| link.polls(group)).map(|link| &link.supervisor);
+        match state.chain(recipes).chain(modbus).next().map(Supervisor::state) {
+            Some(LinkState::Up { since }) => since,
+            _ => Instant::ZERO,
+        }
+    }
+
+    /// Whether a link is up.
+    pub(super) fn is_up(self, id: LinkId) -> bool {
+        let supervisor = match id {
+            LinkId::COMMAND => self.command.map(|link| &link.ordinary.supervisor),
+            LinkId::URGENT => self.command.and_then(|link| Some(&link.urgent.as_ref()?.supervisor)),
+            LinkId::STATE => self.state.map(|link| &link.supervisor),
+            LinkId::MODBUS => self.modbus.map(|link| &link.supervisor),
+            id => {
+                let device = self.devices.iter().find(|link| link.id() == id).map(|link| &link.supervisor);
+                device.or_else(|| self.recipes.iter().find(|link| link.id == id).map(|link| &link.supervisor))
+            }
+        };
+        supervisor.is_some_and(Supervisor::is_up)
+    }
+
+    /// When something happens without an input.
+    pub(super) fn deadline(self) -> Instant {
+        let mut first = self.find_deadline(LinkId::COMMAND);
+        first = first.min(self.find_deadline(LinkId::STATE)).min(self.find_deadline(LinkId::MODBUS));
+        for link in self.recipes {
+            first = first.min(link.deadline()).min(link.supervisor.deadline());
+        }
+        for link in self.devices {
+            first = first.min(link.deadline());
+        }
+        first
+    }
+
+    /// When something happens on one link without an input.
+    #[inline(never)]
+    pub(super) fn deadline_of(self, id: LinkId) -> Instant {
+        self.find_deadline(id)
+    }
+
+    #[inline(always)]
+    fn find_deadline(self, id: LinkId) -> Instant {
+        let of = |own: Instant, supervisor: &Supervisor| own.min(supervisor.deadline());
+        let deadline = match id {
+            LinkId::COMMAND | LinkId::URGENT => self.command.map(CommandLink::deadline),
+            LinkId::STATE => self.state.map(|link| link.supervisor.deadline()),
+            LinkId::MODBUS => self.modbus.map(|link| of(link.deadline(), &link.supervisor)),
+            _ => {
+                let link = self.recipes.iter().find(|link| link.id == id);
+                link.map(|link| of(link.deadline(), &link.supervisor))
+            }
+        };
+        deadline.unwrap_or(Instant::NEVER)
     }
 
     // Not a chain of iterators, which each use of it would have code of its own for.
@@ -169,66 +229,23 @@ impl<'a> LinksView<'a> {
     }
 }
 
-impl<const UPLINKS: usize> Links<UPLINKS> {
-    /// Since when the connection is up over which the values of a group come; [`Instant::ZERO`] if there is none, or for
-    /// what does not come from the controller.
-    pub(super) fn up_since(&self, group: GroupId) -> Instant {
-        let state = self.state.iter().filter(|link| link.group == group).map(|link| &link.supervisor);
-        let recipes =
-            self.recipes.iter().filter(|link| link.group == Some(group)).map(|link| &link.supervisor);
-        let modbus = self.modbus.iter().filter(|link| link.polls(group)).map(|link| &link.supervisor);
-        match state.chain(recipes).chain(modbus).next().map(Supervisor::state) {
-            Some(LinkState::Up { since }) => since,
-            _ => Instant::ZERO,
-        }
-    }
-
-    pub(super) const fn new() -> Self {
-        Self {
-            host: String::new(),
-            command: Vec::new(),
-            state: Vec::new(),
-            modbus: Vec::new(),
-            recipes: Vec::new(),
-            devices: Vec::new(),
-        }
-    }
-
+impl Links<'_> {
     pub(super) fn view(&self) -> LinksView<'_> {
         LinksView {
-            host: &self.host,
+            host: self.host,
             command: self.command.first(),
             state: self.state.first(),
             modbus: self.modbus.first(),
-            recipes: &self.recipes,
-            devices: &self.devices,
+            recipes: self.recipes,
+            devices: self.devices,
         }
-    }
-
-    pub(super) fn infos(&self) -> impl Iterator<Item = LinkInfo<'_>> + '_ {
-        self.view().infos()
-    }
-
-    /// Whether a link is up.
-    pub(super) fn is_up(&self, id: LinkId) -> bool {
-        let supervisor = match id {
-            LinkId::COMMAND => self.command.first().map(|link| &link.ordinary.supervisor),
-            LinkId::URGENT => self.command.first().and_then(|link| Some(&link.urgent.as_ref()?.supervisor)),
-            LinkId::STATE => self.state.first().map(|link| &link.supervisor),
-            LinkId::MODBUS => self.modbus.first().map(|link| &link.supervisor),
-            id => {
-                let device = self.devices.iter().find(|link| link.id() == id).map(|link| &link.supervisor);
-                device.or_else(|| self.recipes.iter().find(|link| link.id == id).map(|link| &link.supervisor))
-            }
-        };
-        supervisor.is_some_and(Supervisor::is_up)
     }
 
     /// Where a link of [`Self::infos`] goes; the host's name is written into `buf`.
     #[cold]
     #[inline(never)]
     pub(super) fn endpoint<'b>(&self, id: LinkId, buf: &'b mut [u8]) -> Endpoint<'b> {
-        let to = self.infos().find(|info| info.id == id).map(|info| info.endpoint);
+        let to = self.view().infos().find(|info| info.id == id).map(|info| info.endpoint);
         let to = to.unwrap_or(Endpoint::new(Transport::Tcp { port: 0 }, ""));
         let host = buf.get_mut(..to.host.len()).unwrap_or(&mut []);
         for (place, byte) in host.iter_mut().zip(to.host.bytes()) {
@@ -238,7 +255,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
     }
 
     /// Handles everything that depends on the clock.
-    pub(super) fn advance<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
+    pub(super) fn advance(&mut self, store: &mut Store) {
         let now = store.now;
         if let Some(link) = self.command.first_mut() {
             link.advance(now);
@@ -255,7 +272,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
 
     /// The gateway itself slept: the age of data on its connections is unknown, so all of them are
     /// opened again.
-    pub(super) fn slept<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
+    pub(super) fn slept(&mut self, store: &mut Store) {
         let now = store.now;
         if let Some(link) = self.command.first_mut() {
             link.slept(now);
@@ -268,7 +285,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
     }
 
     /// The driver reports that a link is usable.
-    pub(super) fn up<const PORTS: usize>(&mut self, id: LinkId, store: &mut Store<PORTS>) {
+    pub(super) fn up(&mut self, id: LinkId, store: &mut Store) {
         let now = store.now;
         if !store.safe.is_empty() {
             store.controller_was_away();
@@ -285,7 +302,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
     }
 
     /// The driver reports that a link is lost or could not be opened.
-    pub(super) fn down<const PORTS: usize>(&mut self, id: LinkId, store: &mut Store<PORTS>) {
+    pub(super) fn down(&mut self, id: LinkId, store: &mut Store) {
         let now = store.now;
         if let LinkId::COMMAND | LinkId::URGENT = id {
             self.command.iter_mut().for_each(|link| link.down(id, now));
@@ -316,8 +333,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
     }
 
     /// Notes the controller's states at commands that have just failed.
-    #[inline]
-    fn note_failed<const PORTS: usize>(&mut self, store: &Store<PORTS>) {
+    fn note_failed(&mut self, store: &Store) {
         if let Some(link) = self.command.first_mut()
             && link.failed.is_open
         {
@@ -328,12 +344,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
     }
 
     /// Reads the bytes; returns the rest if the image is to be checked first.
-    pub(super) fn received<'b, const PORTS: usize>(
-        &mut self,
-        id: LinkId,
-        bytes: &'b [u8],
-        store: &mut Store<PORTS>,
-    ) -> &'b [u8] {
+    pub(super) fn received<'b>(&mut self, id: LinkId, bytes: &'b [u8], store: &mut Store) -> &'b [u8] {
         if let LinkId::COMMAND | LinkId::URGENT = id {
             self.command.iter_mut().for_each(|link| link.received(id, bytes, store.now));
             self.note_failed(store);
@@ -346,7 +357,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
     pub(super) fn sent(&mut self, id: LinkId) -> Instant {
         if let LinkId::COMMAND | LinkId::URGENT = id {
             self.command.iter_mut().for_each(|link| link.sent(id));
-            return self.deadline_of(id);
+            return self.view().deadline_of(id);
         }
         let deadline = with_connection!(self, id, link => {
             link.sent();
@@ -355,30 +366,8 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         deadline.unwrap_or(Instant::NEVER)
     }
 
-    /// The same, if the link has nothing to send before `until`, nor has any other. Returns when it has; `None` if
-    /// somebody may have something, and then nothing was noted.
-    #[inline(always)]
-    pub(super) fn sent_before_next(
-        &mut self,
-        id: LinkId,
-        outbox: &Outbox,
-        until: Instant,
-    ) -> Option<Instant> {
-        if !self.command.is_empty() {
-            return None;
-        }
-        match id {
-            LinkId::STATE => None,
-            LinkId::MODBUS => self.modbus.first_mut()?.sent_before_answer(),
-            id => {
-                let link = self.recipes.iter_mut().find(|link| link.id == id)?;
-                link.sent_before_next(outbox, until)
-            }
-        }
-    }
-
     /// The peer's transport has acknowledged all but `left` bytes.
-    pub(super) fn acked<const PORTS: usize>(&mut self, id: LinkId, left: u32, store: &mut Store<PORTS>) {
+    pub(super) fn acked(&mut self, id: LinkId, left: u32, store: &mut Store) {
         if let LinkId::COMMAND | LinkId::URGENT = id {
             self.command.iter_mut().for_each(|link| link.acked(id, left));
             return;
@@ -390,10 +379,10 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
     /// other commands. With it, the earliest of the link's deadlines that may have come earlier. Links that have nothing
     /// to send until something else happens are no longer in `ask`.
     #[inline(always)]
-    pub(super) fn next_upward<const PORTS: usize>(
+    pub(super) fn next_upward(
         &mut self,
         ask: &mut Dirty,
-        store: &mut Store<PORTS>,
+        store: &mut Store,
         out: &mut [u8],
     ) -> Option<(LinkId, usize, Instant)> {
         if let Some(link) = self.command.first_mut()
@@ -404,7 +393,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         if ask.has(Dirty::RECIPES) {
             let state = self.state.first().map(|state| state.group);
             let mut left = self.recipes.len();
-            for link in &mut self.recipes {
+            for link in self.recipes.iter_mut() {
                 left = left.wrapping_sub(1);
                 if let Some(len) = link.next_frame(store, state, out) {
                     // It is busy now, and those before it had nothing.
@@ -470,7 +459,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         }
         let mut asked = self.ask_of(id);
         asked.add(Dirty::ACTIONS);
-        (asked, self.deadline_of(id))
+        (asked, self.view().deadline_of(id))
     }
 
     /// The same, and the links that write one of these variables, which wait.
@@ -514,39 +503,5 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
             let mut devices = self.devices.iter_mut();
             devices.find_map(|link| link.supervisor.take_action().map(|action| (link.id(), action)))
         })
-    }
-
-    /// When something happens without an input.
-    pub(super) fn deadline(&self) -> Instant {
-        let mut first = self.find_deadline(LinkId::COMMAND);
-        first = first.min(self.find_deadline(LinkId::STATE)).min(self.find_deadline(LinkId::MODBUS));
-        for link in &self.recipes {
-            first = first.min(link.deadline()).min(link.supervisor.deadline());
-        }
-        for link in &self.devices {
-            first = first.min(link.deadline());
-        }
-        first
-    }
-
-    /// When something happens on one link without an input.
-    #[inline(never)]
-    pub(super) fn deadline_of(&self, id: LinkId) -> Instant {
-        self.find_deadline(id)
-    }
-
-    #[inline(always)]
-    fn find_deadline(&self, id: LinkId) -> Instant {
-        let of = |own: Instant, supervisor: &Supervisor| own.min(supervisor.deadline());
-        let deadline = match id {
-            LinkId::COMMAND | LinkId::URGENT => self.command.first().map(CommandLink::deadline),
-            LinkId::STATE => self.state.first().map(|link| link.supervisor.deadline()),
-            LinkId::MODBUS => self.modbus.first().map(|link| of(link.deadline(), &link.supervisor)),
-            _ => {
-                let link = self.recipes.iter().find(|link| link.id == id);
-                link.map(|link| of(link.deadline(), &link.supervisor))
-            }
-        };
-        deadline.unwrap_or(Instant::NEVER)
     }
 }

@@ -186,11 +186,7 @@ impl ModbusLink {
     }
 
     /// The next request that may be sent.
-    pub(super) fn next_request<const PORTS: usize>(
-        &mut self,
-        store: &mut Store<PORTS>,
-        out: &mut [u8],
-    ) -> Option<usize> {
+    pub(super) fn next_request(&mut self, store: &mut Store, out: &mut [u8]) -> Option<usize> {
         let now = store.now;
         if !self.supervisor.is_up() || self.in_flight.is_some() || self.unsent {
             return None;
@@ -250,7 +246,7 @@ impl ModbusLink {
 
     /// Gives up the transaction in flight. It is not known whether a write was carried out; only
     /// safe values are written again.
-    fn abort<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
+    fn abort(&mut self, store: &mut Store) {
         self.client.abort();
         if let Some(InFlight { asked: Asked::Write { safe, .. }, .. }) = self.in_flight.take() {
             store.again(&safe);
@@ -263,7 +259,7 @@ impl ModbusLink {
     /// The controller has the safe bits of the write that it has answered.
     #[cold]
     #[inline(never)]
-    fn confirm_bits<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
+    fn confirm_bits(&mut self, store: &mut Store) {
         if let Some((var, bits)) = self.safe_bits.take() {
             store.confirm_bits(var, bits & store.bits.safe.byte(var));
         }
@@ -272,7 +268,7 @@ impl ModbusLink {
     /// What came is no Modbus: the connection is closed.
     #[cold]
     #[inline(never)]
-    fn violated<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
+    fn violated(&mut self, store: &mut Store) {
         bump(&mut self.counters.malformed);
         self.supervisor.give_up(store.now);
         self.lost(store);
@@ -295,7 +291,7 @@ impl ModbusLink {
         }
     }
 
-    fn write_refused_again<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
+    fn write_refused_again(&mut self, store: &mut Store) {
         store.again(&self.refused);
         store.bits_again(self.refused_bits);
         self.refused = InputSet::EMPTY;
@@ -324,7 +320,7 @@ impl ModbusLink {
 
     /// One request for the first pending variable and those that follow it without a gap.
     #[inline(never)]
-    fn write<const PORTS: usize>(&mut self, store: &mut Store<PORTS>, out: &mut [u8]) -> Option<usize> {
+    fn write(&mut self, store: &mut Store, out: &mut [u8]) -> Option<usize> {
         // Once more: a set that is handed over does not stay in registers.
         let mut pending = store.outbox.dirty().and(&self.writes);
         if store.bits.is_used {
@@ -344,7 +340,7 @@ impl ModbusLink {
     /// Where bits have owners: a request for some of them, or the whole variables whose turn it is.
     #[cold]
     #[inline(never)]
-    fn beside_bits<const PORTS: usize>(&mut self, store: &mut Store<PORTS>, out: &mut [u8]) -> Beside {
+    fn beside_bits(&mut self, store: &mut Store, out: &mut [u8]) -> Beside {
         let pending = store.outbox.dirty().and(&self.writes);
         match self.bits_turn(&pending, store) {
             Some(Turn::Bits(var, mask)) => Beside::Bits(self.write_bits(var, mask, store, out)),
@@ -360,7 +356,7 @@ impl ModbusLink {
     /// What waits beside a request counts as offered with it.
     #[cold]
     #[inline(never)]
-    fn offer_the_rest<const PORTS: usize>(&mut self, store: &Store<PORTS>) {
+    fn offer_the_rest(&mut self, store: &Store) {
         if !store.outbox.dirty().and(&self.writes).is_empty()
             && let Some(InFlight { asked: Asked::Write { born, .. }, .. }) = self.in_flight
         {
@@ -370,11 +366,11 @@ impl ModbusLink {
 
     /// One request for a variable and those that follow it without a gap.
     #[inline(always)]
-    fn write_whole<const PORTS: usize>(
+    fn write_whole(
         &mut self,
         first: SysVar,
         pending: &InputSet,
-        store: &mut Store<PORTS>,
+        store: &mut Store,
         out: &mut [u8],
     ) -> Option<usize> {
         let place = first.place();
@@ -431,7 +427,7 @@ impl ModbusLink {
     /// first run of waiting bits there.
     #[cold]
     #[inline(never)]
-    fn bits_turn<const PORTS: usize>(&self, pending: &InputSet, store: &Store<PORTS>) -> Option<Turn> {
+    fn bits_turn(&self, pending: &InputSet, store: &Store) -> Option<Turn> {
         let turn = |var: SysVar, from: u8| {
             if !store.bits.bytes.contains(var) {
                 return Some(Turn::Whole(var));
@@ -452,13 +448,7 @@ impl ModbusLink {
     /// One request for a run of bits that have owners.
     #[cold]
     #[inline(never)]
-    fn write_bits<const PORTS: usize>(
-        &mut self,
-        var: SysVar,
-        mask: u8,
-        store: &mut Store<PORTS>,
-        out: &mut [u8],
-    ) -> Option<usize> {
+    fn write_bits(&mut self, var: SysVar, mask: u8, store: &mut Store, out: &mut [u8]) -> Option<usize> {
         let (first, _) = place_of(var)?;
         let (from, count) = (mask.trailing_zeros(), mask.count_ones());
         let packed = [store.bits.next_bits(var).checked_shr(from)?];
@@ -480,13 +470,13 @@ impl ModbusLink {
 }
 
 impl Connection for ModbusLink {
-    fn opened<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
+    fn opened(&mut self, store: &mut Store) {
         self.timeouts_in_a_row = 0;
         self.flight.clear();
         store.link_up(&self.writes);
     }
 
-    fn lost<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
+    fn lost(&mut self, store: &mut Store) {
         self.abort(store);
         self.offered = Since::NONE;
         self.unsent = false;
@@ -497,7 +487,7 @@ impl Connection for ModbusLink {
     }
 
     #[inline(never)]
-    fn received<'b, const PORTS: usize>(&mut self, bytes: &'b [u8], store: &mut Store<PORTS>) -> &'b [u8] {
+    fn received<'b>(&mut self, bytes: &'b [u8], store: &mut Store) -> &'b [u8] {
         let now = store.now;
         let mut rest = bytes;
         while let Some(event) = self.client.receive(&mut rest) {
@@ -541,11 +531,11 @@ impl Connection for ModbusLink {
         self.unsent = false;
     }
 
-    fn acked<const PORTS: usize>(&mut self, left: u32, _store: &mut Store<PORTS>) {
+    fn acked(&mut self, left: u32, _store: &mut Store) {
         self.flight.acked(left, |_| ());
     }
 
-    fn advance<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
+    fn advance(&mut self, store: &mut Store) {
         let now = store.now;
         if now >= self.ask_again_at {
             self.write_refused_again(store);

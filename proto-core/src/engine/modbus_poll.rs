@@ -11,12 +11,7 @@ use crate::sysvar::{ModbusPlace, SysVar};
 use crate::wire::scalar::Scalar;
 
 /// Writes the answer to a poll into the image.
-pub(super) fn take_poll<const PORTS: usize>(
-    block: &Block,
-    polled: &[SysVar],
-    response: Response<'_>,
-    store: &mut Store<PORTS>,
-) {
+pub(super) fn take_poll(block: &Block, polled: &[SysVar], response: Response<'_>, store: &mut Store) {
     if store.bits.is_used {
         take_values_beside_bits(block, polled, response, store);
     } else {
@@ -32,12 +27,7 @@ pub(super) fn take_poll<const PORTS: usize>(
 /// The same where bits have owners.
 #[cold]
 #[inline(never)]
-fn take_values_beside_bits<const PORTS: usize>(
-    block: &Block,
-    polled: &[SysVar],
-    response: Response<'_>,
-    store: &mut Store<PORTS>,
-) {
+fn take_values_beside_bits(block: &Block, polled: &[SysVar], response: Response<'_>, store: &mut Store) {
     take_values(block, polled, response, |var, value| match value {
         Scalar::Byte(shown) if store.bits.bytes.contains(var) => store.show_bits(var, shown),
         value => _ = store.image.set(var, value),

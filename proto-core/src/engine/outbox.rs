@@ -31,7 +31,11 @@ struct BitSlot {
 
 /// The values of one port that wait behind the next ones.
 #[derive(Debug, Clone, Default)]
-pub(super) struct EdgeQueue(Vec<Edge, EDGE_QUEUE>);
+pub(super) struct EdgeQueue {
+    edges: Vec<Edge, EDGE_QUEUE>,
+    /// Number of the port's values that were dropped because a link was lost, until the port has counted them.
+    pub lost: u32,
+}
 
 /// What becomes of a value for which another one waits already.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -51,8 +55,8 @@ pub(super) enum Offer {
 impl EdgeQueue {
     /// A new value of a place whose next one waits.
     pub(super) fn offer(&mut self, place: u8, next: u8, value: u8, now: Instant) -> Offer {
-        let full = self.0.is_full();
-        match self.0.iter_mut().rev().find(|edge| edge.place == place) {
+        let full = self.edges.is_full();
+        match self.edges.iter_mut().rev().find(|edge| edge.place == place) {
             Some(newest) if newest.value == value => {
                 newest.at = now;
                 Offer::Queued
@@ -65,7 +69,7 @@ impl EdgeQueue {
             None if full => Offer::Lost { is_next: true },
             _ => {
                 // Cannot fail: it is not full.
-                let _ = self.0.push(Edge { place, value, at: now });
+                let _ = self.edges.push(Edge { place, value, at: now });
                 Offer::Queued
             }
         }
@@ -73,25 +77,25 @@ impl EdgeQueue {
 
     /// Takes the oldest value of a place.
     pub(super) fn next(&mut self, place: u8) -> Option<(u8, Instant)> {
-        let at = self.0.iter().position(|edge| edge.place == place)?;
-        let edge = self.0.remove(at);
+        let at = self.edges.iter().position(|edge| edge.place == place)?;
+        let edge = self.edges.remove(at);
         Some((edge.value, edge.at))
     }
 
     /// Drops all values of a place; returns their number.
     pub(super) fn drop_all(&mut self, place: u8) -> usize {
-        let before = self.0.len();
-        self.0.retain(|edge| edge.place != place);
-        before.saturating_sub(self.0.len())
+        let before = self.edges.len();
+        self.edges.retain(|edge| edge.place != place);
+        before.saturating_sub(self.edges.len())
     }
 
     /// Drops the values of a place that have waited for longer than `timeout`. Returns their number,
     /// and since when the oldest remaining one waits.
     pub(super) fn expire(&mut self, place: u8, timeout: Duration, now: Instant) -> (usize, Instant) {
-        let before = self.0.len();
-        self.0.retain(|edge| edge.place != place || now.saturating_since(edge.at) <= timeout);
-        let left = self.0.iter().filter(|edge| edge.place == place).map(|edge| edge.at).min();
-        (before.saturating_sub(self.0.len()), left.unwrap_or(Instant::NEVER))
+        let before = self.edges.len();
+        self.edges.retain(|edge| edge.place != place || now.saturating_since(edge.at) <= timeout);
+        let left = self.edges.iter().filter(|edge| edge.place == place).map(|edge| edge.at).min();
+        (before.saturating_sub(self.edges.len()), left.unwrap_or(Instant::NEVER))
     }
 }
 
@@ -148,9 +152,9 @@ impl Outbox {
             return;
         }
         // A value of this variable is already waiting: only a value that differs is an edge.
-        let full = queue.0.is_full();
+        let full = queue.edges.is_full();
         let place = var.ordinal() as u8;
-        match queue.0.iter_mut().rev().find(|edge| edge.place == place) {
+        match queue.edges.iter_mut().rev().find(|edge| edge.place == place) {
             Some(newest) if newest.value == value => newest.at = now,
             Some(newest) if full => {
                 *newest = Edge { place, value, at: now };
@@ -163,7 +167,7 @@ impl Outbox {
             }
             _ => {
                 // Cannot fail: it is not full.
-                let _ = queue.0.push(Edge { place, value, at: now });
+                let _ = queue.edges.push(Edge { place, value, at: now });
             }
         }
     }
@@ -177,7 +181,7 @@ impl Outbox {
     /// The owner is silent: the variable takes its safe value, which replaces everything that
     /// waits. `bits` is the safe value of a byte variable.
     pub(super) fn offer_safe(&mut self, queue: &mut EdgeQueue, var: SysVar, bits: u8, now: Instant) {
-        queue.0.retain(|edge| usize::from(edge.place) != var.ordinal());
+        queue.edges.retain(|edge| usize::from(edge.place) != var.ordinal());
         if let Some(slot) = self.bits.get_mut(var.ordinal()) {
             *slot = BitSlot { value: bits, at: now };
         }
@@ -191,12 +195,14 @@ impl Outbox {
 
     /// Drops everything that is to be written of these variables; returns how many values waited.
     pub(super) fn forget(&mut self, queue: &mut EdgeQueue, vars: &InputSet) -> usize {
-        let before = queue.0.len();
+        let before = queue.edges.len();
         // Outputs have the places behind the inputs, and are in no set.
-        queue.0.retain(|edge| !SysVar::from_ordinal(edge.place.into()).is_some_and(|var| vars.contains(var)));
+        queue
+            .edges
+            .retain(|edge| !SysVar::from_ordinal(edge.place.into()).is_some_and(|var| vars.contains(var)));
         let dropped = self.dirty.and(vars).iter().count();
         self.dirty = self.dirty.minus(vars);
-        before.saturating_sub(queue.0.len()).saturating_add(dropped)
+        before.saturating_sub(queue.edges.len()).saturating_add(dropped)
     }
 
     /// Drops values that have waited for longer than `timeout`. Returns their number, and since
@@ -208,10 +214,10 @@ impl Outbox {
         timeout: Duration,
         now: Instant,
     ) -> (usize, Instant) {
-        let before = queue.0.len();
-        queue.0.retain(|edge| now.saturating_since(edge.at) <= timeout);
-        let mut dropped = before.saturating_sub(queue.0.len());
-        let mut oldest = queue.0.iter().map(|edge| edge.at).min().unwrap_or(Instant::NEVER);
+        let before = queue.edges.len();
+        queue.edges.retain(|edge| now.saturating_since(edge.at) <= timeout);
+        let mut dropped = before.saturating_sub(queue.edges.len());
+        let mut oldest = queue.edges.iter().map(|edge| edge.at).min().unwrap_or(Instant::NEVER);
         let mut expired = InputSet::EMPTY;
         for var in self.dirty.and(vars).iter() {
             let Some(slot) = self.bits.get(var.ordinal()) else { break };
@@ -236,14 +242,14 @@ impl Outbox {
     /// For byte variables whose value was taken: the next value in the queue takes its place, if
     /// there is one.
     pub(super) fn next_edges(&mut self, queue: &mut EdgeQueue, bits: &InputSet) {
-        if queue.0.is_empty() {
+        if queue.edges.is_empty() {
             return;
         }
         for var in bits.iter() {
             let place = var.ordinal() as u8;
-            let next = queue.0.iter().position(|edge| edge.place == place);
+            let next = queue.edges.iter().position(|edge| edge.place == place);
             if let (Some(at), Some(slot)) = (next, self.bits.get_mut(var.ordinal())) {
-                let edge = queue.0.remove(at);
+                let edge = queue.edges.remove(at);
                 *slot = BitSlot { value: edge.value, at: edge.at };
                 self.dirty.insert(var);
             }

@@ -6,16 +6,18 @@
 
 use heapless::Vec;
 
-use super::Engine;
 use super::build::Groups;
 use super::build_error::{BuildError, one_too_many};
 use super::clock::Dirty;
+use super::field_port::FieldPort;
 use super::io::{LinkId, PortId, PortState};
+use super::line::PeerState;
 use super::state_link::Kept;
+use super::store::InputFrame;
 use super::user::wrapping_count;
+use super::view::EngineView;
 use crate::config::{ConfigView, Counted, LinkSource, MAX_PORTS, OutputBinding, PortValue};
 use crate::image::{GroupId, InputSet, MAX_EXTRA, MAX_GROUPS, saturate_to_field};
-use crate::link::LinkState;
 use crate::sysvar::SysVar;
 use crate::time::{Duration, Instant};
 use crate::wire::dialect::Dialect;
@@ -119,9 +121,19 @@ fn scalar_of(var: SysVar, value: PortValue, number: u32) -> Scalar {
     }
 }
 
-impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize, const EXCHANGES: usize>
-    Engine<PORTS, UPLINKS, FIELDS, TAP, EXCHANGES>
-{
+/// Health of the port with this index in the engine.
+pub(super) fn state_of(
+    index: usize,
+    port: &FieldPort,
+    frames: &[InputFrame],
+    peers: &[PeerState],
+) -> PortState {
+    let mut own = frames.iter().filter(|frame| usize::from(frame.port) == index);
+    let peers = port.line().map_or(&[][..], |line| line.peers.of(peers));
+    port.state(own.any(InputFrame::is_overdue) || peers.iter().any(PeerState::is_down))
+}
+
+impl EngineView<'_> {
     /// Gives values of the state packet and of the health of ports their places among the image's
     /// extra values.
     #[inline(never)]
@@ -227,7 +239,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     fn health_of(&self, index: u8, value: PortValue, now: Instant) -> u32 {
         let Some(port) = self.ports.get(usize::from(index)) else { return 0 };
         match value {
-            PortValue::Alive => u32::from(self.port_state(port.id) == Some(PortState::Working)),
+            PortValue::Alive => {
+                let state = state_of(usize::from(index), port, &self.store.frames, self.exchanges.peers);
+                u32::from(state == PortState::Working)
+            }
             PortValue::Frames => port.counters.frames_in,
             PortValue::Rejected => port.counters.rejected(),
             PortValue::Ignored => port.counters.ignored,
@@ -241,10 +256,6 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
     }
 
-    fn is_link_up(&self, id: LinkId) -> bool {
-        self.links.infos().any(|link| link.id == id && matches!(link.state, LinkState::Up { .. }))
-    }
-
     /// Sets the extra values that output fields show of the ports' health, and of links.
     #[cold]
     #[inline(never)]
@@ -253,7 +264,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             let Some(&Shown { of, extra }) = self.health.shown.get(nth) else { break };
             let number = match of {
                 Of::Port(port, value) => self.health_of(port, value, now),
-                Of::Link(link) => u32::from(self.is_link_up(link)),
+                Of::Link(link) => u32::from(self.links.view().is_up(link)),
             };
             self.store.image.receive_extra(extra, f64::from(number));
         }

@@ -26,18 +26,18 @@ use crate::time::Instant;
 const MAX_DATA: usize = 256;
 
 /// The blocks of a slave.
-struct Blocks<'a, const PORTS: usize> {
+struct Blocks<'a> {
     items: &'a mut [Item],
     written: &'a mut [Piece],
     texts: &'a [TextBind],
     outputs: Outputs<'a>,
     sender: &'a Sender,
-    frames: Frames<'a, PORTS>,
+    frames: Frames<'a>,
     accepted: &'a mut Accepted,
     now: Instant,
 }
 
-impl<const PORTS: usize> Blocks<'_, PORTS> {
+impl Blocks<'_> {
     /// The block of a table with this address, and the block's first address.
     fn block_at(&self, table: Table, at: u16) -> Result<(u16, &Item), Exception> {
         let mut found = self.items.iter().filter_map(|item| match item.asks {
@@ -133,7 +133,7 @@ impl<const PORTS: usize> Blocks<'_, PORTS> {
     }
 }
 
-impl<const PORTS: usize> RegisterBank for Blocks<'_, PORTS> {
+impl RegisterBank for Blocks<'_> {
     fn read_coils(&self, address: u16, count: u16, packed: &mut [u8]) -> Result<(), Exception> {
         self.coils(Table::Coils, address, count, packed)
     }
@@ -183,12 +183,12 @@ impl FieldPort {
 
     /// Carries out what a master asks; its reply is kept until the line is free.
     #[inline(never)]
-    pub(super) fn serve<const PORTS: usize, const TAP: usize>(
+    pub(super) fn serve(
         &mut self,
         (inputs, outputs): (&[InputBind], Outputs<'_>),
-        store: &mut Store<PORTS>,
+        store: &mut Store,
         commands: Option<&mut CommandLink>,
-        tap: &mut Tap<TAP>,
+        tap: &mut Tap,
         mut view: View<'_>,
     ) -> Accepted {
         let mut accepted = Accepted::default();

@@ -102,15 +102,15 @@ impl StateLink {
 }
 
 impl Connection for StateLink {
-    fn opened<const PORTS: usize>(&mut self, _store: &mut Store<PORTS>) {}
+    fn opened(&mut self, _store: &mut Store) {}
 
-    fn lost<const PORTS: usize>(&mut self, _store: &mut Store<PORTS>) {
+    fn lost(&mut self, _store: &mut Store) {
         // Half a packet is of no use.
         self.stream.reset();
     }
 
     #[inline(never)]
-    fn received<'b, const PORTS: usize>(&mut self, bytes: &'b [u8], store: &mut Store<PORTS>) -> &'b [u8] {
+    fn received<'b>(&mut self, bytes: &'b [u8], store: &mut Store) -> &'b [u8] {
         let mut rest = bytes;
         while let Some(packet) = self.stream.next_packet(&mut rest) {
             match packet {
@@ -202,7 +202,7 @@ fn take_each(run: &[SysVar], view: &StateView<'_>, image: &mut Image) -> usize {
 /// Reads back the bits that none of our ports has sent.
 #[cold]
 #[inline(never)]
-fn read_bits<const PORTS: usize>(view: &StateView<'_>, bytes: &InputSet, store: &mut Store<PORTS>) {
+fn read_bits(view: &StateView<'_>, bytes: &InputSet, store: &mut Store) {
     for var in bytes.iter() {
         if let Some(Scalar::Byte(shown)) = view.read_var(var) {
             store.show_bits(var, shown);
@@ -221,7 +221,7 @@ fn keep(kept: &[Kept], view: &StateView<'_>, image: &mut Image) -> usize {
 
 /// Confirms safe values that the controller shows. A value shown by an old packet, or overwritten
 /// by late data, loses its confirmation.
-fn compare_safe<const PORTS: usize>(view: &StateView<'_>, store: &mut Store<PORTS>) {
+fn compare_safe(view: &StateView<'_>, store: &mut Store) {
     let (may_confirm, may_unconfirm) = (store.may_confirm(), store.may_unconfirm());
     for var in store.safe.iter() {
         let Some(shown) = view.read_var(var) else { continue };

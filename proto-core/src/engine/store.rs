@@ -1,10 +1,10 @@
 //! The state that the ports and links of one engine share: the image, the outbox, and for each
 //! field frame when it is overdue.
 
-use heapless::Vec;
+use heapless::{Vec, VecView};
 
 use super::bits::{Bits, TimedOut};
-use super::counters::{PortCounters, bump};
+use super::counters::{PortCounters, add, bump};
 use super::counts::Counts;
 use super::latency::Latency;
 use super::outbox::{EdgeQueue, Outbox};
@@ -75,7 +75,7 @@ impl SafeBytes {
 }
 
 #[derive(Debug, Clone)]
-pub(super) struct Store<const PORTS: usize> {
+pub(super) struct Store<Q: ?Sized = VecView<EdgeQueue>> {
     pub latency: Latency,
     pub counts: Counts,
     /// The instant of this call of the engine.
@@ -85,8 +85,6 @@ pub(super) struct Store<const PORTS: usize> {
     pub watches_bits: bool,
     pub image: Image,
     pub outbox: Outbox,
-    /// One queue per field port.
-    pub edges: Vec<EdgeQueue, PORTS>,
     /// Their indices are the frames' groups in the image.
     pub frames: Vec<InputFrame, MAX_INPUT_FRAMES>,
     /// Variables with a value of their owner: received in time, or configured as safe.
@@ -119,8 +117,7 @@ pub(super) struct Store<const PORTS: usize> {
     pub health: InputSet,
     /// When they are checked again.
     health_at: Stamp,
-    /// Values dropped because a link was lost, per port.
-    lost: [u32; PORTS],
+    /// A queue has counted values that were lost with a link.
     has_lost: bool,
     /// No frame is overdue before this.
     pub(super) next_overdue: Stamp,
@@ -130,10 +127,12 @@ pub(super) struct Store<const PORTS: usize> {
     pub withheld: Withheld,
     /// The newest field of the frame that was taken last that was rejected, until its port has noted it.
     pub rejected_field: Vec<FieldRejection, 1>,
+    /// One queue per field port.
+    pub edges: Q,
 }
 
-impl<const PORTS: usize> Store<PORTS> {
-    pub(super) const fn new() -> Self {
+impl<Q> Store<Q> {
+    pub(super) const fn new(edges: Q) -> Self {
         Self {
             now: Instant::ZERO,
             watches_bits: false,
@@ -141,7 +140,6 @@ impl<const PORTS: usize> Store<PORTS> {
             counts: Counts::new(),
             image: Image::new(),
             outbox: Outbox::new(),
-            edges: Vec::new(),
             frames: Vec::new(),
             live: InputSet::EMPTY,
             safe: InputSet::EMPTY,
@@ -158,15 +156,17 @@ impl<const PORTS: usize> Store<PORTS> {
             bits: Bits::new(),
             health: InputSet::EMPTY,
             health_at: Stamp::NEVER,
-            lost: [0; PORTS],
             has_lost: false,
             next_overdue: Stamp::NEVER,
             next_expiry: Stamp::NEVER,
             withheld: Withheld::new(),
             rejected_field: Vec::new(),
+            edges,
         }
     }
+}
 
+impl Store {
     /// The values of an accepted frame are in the image: they are to be written. Returns those
     /// whose link is up.
     #[inline(always)]
@@ -506,7 +506,7 @@ impl<const PORTS: usize> Store<PORTS> {
         self.outbox.taken(vars);
         let bits = vars.and(&InputSet::BYTES);
         if !bits.is_empty() {
-            for queue in &mut self.edges {
+            for queue in self.edges.iter_mut() {
                 self.outbox.next_edges(queue, &bits);
             }
             if self.bits.is_used {
@@ -537,12 +537,10 @@ impl<const PORTS: usize> Store<PORTS> {
         self.settled = self.settled.minus(vars);
         for frame in &self.frames {
             let port = usize::from(frame.port);
-            let (Some(queue), Some(count)) = (self.edges.get_mut(port), self.lost.get_mut(port)) else {
-                continue;
-            };
+            let Some(queue) = self.edges.get_mut(port) else { continue };
             let whole = frame.set.and(vars).minus(&self.bits.bytes);
             let dropped = self.outbox.forget(queue, &whole.minus(&self.safe));
-            *count = count.saturating_add(dropped as u32);
+            add(&mut queue.lost, dropped);
             self.has_lost |= dropped > 0;
         }
         if self.withheld.is_used {
@@ -552,13 +550,7 @@ impl<const PORTS: usize> Store<PORTS> {
         if bytes.is_empty() {
             return;
         }
-        let (lost, has_lost) = (&mut self.lost, &mut self.has_lost);
-        self.bits.link_lost(&bytes, &mut self.edges, |port, dropped| {
-            if let Some(count) = lost.get_mut(port) {
-                *count = count.saturating_add(dropped as u32);
-                *has_lost |= dropped > 0;
-            }
-        });
+        self.has_lost |= self.bits.link_lost(&bytes, &mut self.edges);
         self.bits_changed();
     }
 
@@ -570,20 +562,17 @@ impl<const PORTS: usize> Store<PORTS> {
             let Some(port) = self.frames.get(usize::from(nth)).map(|frame| usize::from(frame.port)) else {
                 continue;
             };
-            let (Some(queue), Some(count)) = (self.edges.get_mut(port), self.lost.get_mut(port)) else {
-                continue;
-            };
+            let Some(queue) = self.edges.get_mut(port) else { continue };
             let whole = members(&self.image, group).and(vars);
             let dropped = self.outbox.forget(queue, &whole.minus(&self.safe));
-            *count = count.saturating_add(dropped as u32);
+            add(&mut queue.lost, dropped);
             self.has_lost |= dropped > 0;
         }
     }
 
-    /// Number of values per port that were dropped because their link was lost, since the last
-    /// call.
-    pub(super) fn take_lost(&mut self) -> Option<[u32; PORTS]> {
-        core::mem::take(&mut self.has_lost).then(|| core::mem::replace(&mut self.lost, [0; PORTS]))
+    /// Whether queues have counted values that were lost with a link, since the last call.
+    pub(super) fn take_has_lost(&mut self) -> bool {
+        core::mem::take(&mut self.has_lost)
     }
 }
 

@@ -66,10 +66,10 @@ pub struct TapRecord<'a> {
     pub lost: u32,
 }
 
-/// The ring. `Tap<N>` has `N` bytes; each record takes its contents and [`TAP_OVERHEAD`] bytes.
+/// The ring. `Tap<[u8; N]>` has `N` bytes; each record takes its contents and [`TAP_OVERHEAD`] bytes.
 /// Without room for one record it never listens.
 #[derive(Debug, Clone)]
-pub struct Tap<const N: usize> {
+pub struct Tap<R: ?Sized = [u8]> {
     is_listening: bool,
     /// Number of records lost since the newest that was kept.
     lost: u32,
@@ -77,7 +77,7 @@ pub struct Tap<const N: usize> {
     start: usize,
     /// Bytes in use.
     used: usize,
-    ring: [u8; N],
+    ring: R,
 }
 
 /// Number of bytes that a record takes in addition to its contents.
@@ -95,16 +95,25 @@ pub(super) struct Tapped<'a> {
     pub pieces: [&'a [u8]; 3],
 }
 
-impl<const N: usize> Tap<N> {
+impl<const N: usize> Tap<[u8; N]> {
     /// An empty ring that does not listen. All its bytes are 0.
     pub(super) const fn new() -> Self {
         Self { is_listening: false, lost: 0, start: 0, used: 0, ring: [0; N] }
     }
+}
 
+impl<R: ?Sized> Tap<R> {
+    /// Whether records are kept.
+    pub fn is_listening(&self) -> bool {
+        self.is_listening
+    }
+}
+
+impl Tap {
     /// Keeps a record if the tap listens.
     #[inline]
     pub(super) fn record<'a>(&mut self, what: impl FnOnce() -> Tapped<'a>) {
-        if N > TAP_OVERHEAD && self.is_listening {
+        if self.is_listening {
             self.keep(&what());
         }
     }
@@ -127,11 +136,6 @@ impl<const N: usize> Tap<N> {
     pub fn listen(&mut self, listen: bool) {
         self.is_listening = listen && self.ring.len() > TAP_OVERHEAD;
         (self.lost, self.start, self.used) = (0, 0, 0);
-    }
-
-    /// Whether records are kept.
-    pub fn is_listening(&self) -> bool {
-        self.is_listening
     }
 
     /// Removes and returns the oldest record. Its bytes are written to `room`, which should have
@@ -214,7 +218,7 @@ impl<const N: usize> Tap<N> {
 
     /// Appends bytes; there is room.
     fn push(&mut self, bytes: &[u8]) {
-        let end = wrapped(self.start.saturating_add(self.used), N);
+        let end = wrapped(self.start.saturating_add(self.used), self.ring.len());
         let (before, behind) = self.ring.split_at_mut_checked(end).unwrap_or((&mut [], &mut []));
         for (place, &byte) in behind.iter_mut().chain(before).zip(bytes) {
             *place = byte;
@@ -293,21 +297,21 @@ mod tests {
 
     #[test]
     fn whoever_does_not_listen_costs_nothing_and_gets_nothing() {
-        let mut tap = Tap::<256>::new();
+        let tap: &mut Tap = &mut Tap::<[u8; 256]>::new();
         tap.record(|| unreachable!("nobody listens"));
         assert_eq!(tap.next(&mut [0; 64]), None);
     }
 
     #[test]
     fn a_ring_without_room_never_listens() {
-        let mut tap = Tap::<0>::new();
+        let tap: &mut Tap = &mut Tap::<[u8; 0]>::new();
         tap.listen(true);
         assert!(!tap.is_listening());
     }
 
     #[test]
     fn every_kind_comes_out_as_it_went_in() {
-        let mut tap = Tap::<4096>::new();
+        let tap: &mut Tap = &mut Tap::<[u8; 4096]>::new();
         tap.listen(true);
         let places = [TapPlace::Port(PortId(0)), TapPlace::Port(PortId(7)), TapPlace::Link(LinkId::URGENT)];
         let ids = [
@@ -339,7 +343,7 @@ mod tests {
 
     #[test]
     fn what_finds_no_room_is_counted_and_the_rest_stays_whole_wherever_the_ring_wraps() {
-        let mut tap = Tap::<200>::new();
+        let tap: &mut Tap = &mut Tap::<[u8; 200]>::new();
         tap.listen(true);
         let mut room = [0; 64];
         let (mut told, mut taken, mut lost) = (0_u64, 0_u64, 0_u64);
@@ -363,7 +367,7 @@ mod tests {
 
     #[test]
     fn what_is_longer_than_a_record_or_the_room_is_cut_and_says_so() {
-        let mut tap = Tap::<4096>::new();
+        let tap: &mut Tap = &mut Tap::<[u8; 4096]>::new();
         tap.listen(true);
         let long = vec![7; 70_000];
         tap.record(|| tapped(1, &long));
@@ -378,7 +382,7 @@ mod tests {
 
     #[test]
     fn listening_anew_forgets_what_is_there() {
-        let mut tap = Tap::<256>::new();
+        let tap: &mut Tap = &mut Tap::<[u8; 256]>::new();
         tap.listen(true);
         tap.record(|| tapped(1, &[1]));
         tap.listen(true);

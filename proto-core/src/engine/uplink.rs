@@ -124,9 +124,9 @@ impl Uplink {
     }
 
     /// The next output: a frame with new values, or a greeting.
-    pub(super) fn next_frame<const PORTS: usize>(
+    pub(super) fn next_frame(
         &mut self,
-        store: &mut Store<PORTS>,
+        store: &mut Store,
         state: Option<GroupId>,
         out: &mut [u8],
     ) -> Option<usize> {
@@ -145,10 +145,10 @@ impl Uplink {
 
     /// The same, if there is something to send. Mostly there is not: so the check stays short.
     #[inline(never)]
-    fn send<const PORTS: usize>(
+    fn send(
         &mut self,
         wanted: bool,
-        store: &mut Store<PORTS>,
+        store: &mut Store,
         state: Option<GroupId>,
         out: &mut [u8],
     ) -> Option<usize> {
@@ -216,23 +216,14 @@ impl Uplink {
     /// Whether every variable of the frame has a value that its owner sent or that was just read
     /// back.
     #[inline(always)]
-    pub(super) fn is_ready<const PORTS: usize>(
-        &self,
-        store: &Store<PORTS>,
-        state: impl FnOnce() -> Option<GroupId>,
-    ) -> bool {
+    pub(super) fn is_ready(&self, store: &Store, state: impl FnOnce() -> Option<GroupId>) -> bool {
         let others = self.set.minus(&store.live);
         others.is_empty() || self.are_known(&others, store, state())
     }
 
     /// The same of those that have no value of their owner.
     #[inline(never)]
-    fn are_known<const PORTS: usize>(
-        &self,
-        others: &InputSet,
-        store: &Store<PORTS>,
-        state: Option<GroupId>,
-    ) -> bool {
+    fn are_known(&self, others: &InputSet, store: &Store, state: Option<GroupId>) -> bool {
         let read_back = state
             .and_then(|group| store.image.stamp_of(group))
             .is_some_and(|at| store.now.saturating_since(at) <= READ_BACK_MAX_AGE);
@@ -265,7 +256,7 @@ impl Uplink {
 }
 
 impl Connection for Uplink {
-    fn opened<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
+    fn opened(&mut self, store: &mut Store) {
         self.busy = false;
         self.handed_over = None;
         self.flight.clear();
@@ -274,7 +265,7 @@ impl Connection for Uplink {
         self.speak_at = self.greet_at;
     }
 
-    fn lost<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
+    fn lost(&mut self, store: &mut Store) {
         self.busy = false;
         self.offered = Since::NONE;
         self.flight.clear();
@@ -286,7 +277,7 @@ impl Connection for Uplink {
     }
 
     #[inline(never)]
-    fn received<'b, const PORTS: usize>(&mut self, bytes: &'b [u8], store: &mut Store<PORTS>) -> &'b [u8] {
+    fn received<'b>(&mut self, bytes: &'b [u8], store: &mut Store) -> &'b [u8] {
         let now = store.now;
         let (Some(layout), Some(group)) = (&self.output, self.group) else {
             bump(&mut self.counters.malformed);
@@ -338,12 +329,12 @@ impl Connection for Uplink {
         self.busy = false;
     }
 
-    fn acked<const PORTS: usize>(&mut self, left: u32, store: &mut Store<PORTS>) {
+    fn acked(&mut self, left: u32, store: &mut Store) {
         let now = store.now;
         self.flight.acked(left, |born| born.record(now, &mut store.latency.arrived));
     }
 
-    fn advance<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
+    fn advance(&mut self, store: &mut Store) {
         let now = store.now;
         if now >= self.flight.deadline() {
             bump(&mut self.counters.unacknowledged);
@@ -372,7 +363,7 @@ impl Connection for Uplink {
 }
 
 /// Whether a safe value has just become one that the controller is not known to have.
-fn is_new<const PORTS: usize>(store: &Store<PORTS>) -> bool {
+fn is_new(store: &Store) -> bool {
     store.now.saturating_since(store.unconfirmed_since) < REPEAT_FAST
 }
 
@@ -394,11 +385,7 @@ fn take_frame(layout: &StreamLayout, payload: &[u8], image: &mut Image) -> usize
 }
 
 /// The frame, with byte variables as they are written next, not as they were received last.
-fn encode<const PORTS: usize>(
-    layout: &StreamLayout,
-    store: &mut Store<PORTS>,
-    out: &mut [u8],
-) -> Option<usize> {
+fn encode(layout: &StreamLayout, store: &mut Store, out: &mut [u8]) -> Option<usize> {
     let waiting = store.outbox.dirty().and(&InputSet::BYTES);
     if waiting.is_empty() {
         return layout.encode(store.image.bytes(), out).ok();

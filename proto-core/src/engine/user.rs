@@ -1,6 +1,6 @@
 //! The compiled bindings of user-defined fields.
 
-use heapless::Vec;
+use heapless::{Vec, VecView};
 
 use super::command_link::CommandLink;
 use super::io::ReplyCode;
@@ -321,21 +321,16 @@ fn counted_to(count: u32, max: u32) -> u32 {
 }
 
 /// The bindings of all ports; ports name ranges of it.
-#[derive(Debug, Clone)]
-pub(super) struct Bindings<const FIELDS: usize> {
-    pub inputs: Vec<InputBind, FIELDS>,
-    pub outputs: Vec<OutputBind, FIELDS>,
+pub(super) struct Bindings<'e> {
+    pub inputs: &'e mut VecView<InputBind>,
+    pub outputs: &'e mut VecView<OutputBind>,
     /// What output fields may send.
-    pub sendable: Vec<Sendable, MAX_SENDABLE>,
+    pub sendable: &'e mut Vec<Sendable, MAX_SENDABLE>,
 }
 
-impl<const FIELDS: usize> Bindings<FIELDS> {
-    pub(super) const fn new() -> Self {
-        Self { inputs: Vec::new(), outputs: Vec::new(), sendable: Vec::new() }
-    }
-
+impl Bindings<'_> {
     pub(super) fn outputs(&self) -> Outputs<'_> {
-        Outputs { binds: &self.outputs, sendable: &self.sendable }
+        Outputs { binds: self.outputs, sendable: self.sendable }
     }
 
     /// The output field that was added last may send this; `None` if there is no room.

@@ -186,7 +186,7 @@ fn texts_in(
     })
 }
 
-impl<const PORTS: usize> Frames<'_, PORTS> {
+impl Frames<'_> {
     /// The texts of an input frame, each with its place among the frame's fields, and the text if there is room for it.
     pub(super) fn texts<'t>(
         &self,
@@ -287,13 +287,13 @@ impl FieldPort {
 
     /// Reads the frames in `rest`, or the one that silence has ended if it is empty.
     #[inline(never)]
-    pub(super) fn whole_frames<const PORTS: usize, const TAP: usize>(
+    pub(super) fn whole_frames(
         &mut self,
         rest: &mut &[u8],
         bindings: &[InputBind],
-        store: &mut Store<PORTS>,
+        store: &mut Store,
         commands: Option<&mut CommandLink>,
-        tap: &mut Tap<TAP>,
+        tap: &mut Tap,
     ) -> Accepted {
         let mut accepted = Accepted::default();
         let (now, usable, bytes) = (store.now, self.is_usable(), *rest);

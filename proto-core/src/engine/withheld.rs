@@ -171,7 +171,7 @@ pub(super) fn members(image: &Image, group: GroupId) -> InputSet {
     image.withheld().iter().filter(|&var| image.group(var) == Some(group)).collect()
 }
 
-impl<const PORTS: usize> Store<PORTS> {
+impl Store {
     /// These fields of a frame that is accepted are rejected: from now on they grow old on their own. Whether there is room;
     /// if not, nothing has changed.
     #[cold]

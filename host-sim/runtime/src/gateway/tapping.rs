@@ -71,7 +71,7 @@ impl Tapping {
 
     /// Before the engine is called.
     #[inline]
-    pub(super) fn before(&mut self, tap: &mut Tap<TAP>, at: Instant, input: Input<'_>) {
+    pub(super) fn before(&mut self, tap: &mut Tap, at: Instant, input: Input<'_>) {
         let wanted = self.watch.wanted();
         if wanted.frames != tap.is_listening() {
             tap.listen(wanted.frames);
@@ -102,7 +102,7 @@ impl Tapping {
 
     /// After the call.
     #[inline]
-    pub(super) fn behind(&mut self, tap: &mut Tap<TAP>) {
+    pub(super) fn behind(&mut self, tap: &mut Tap) {
         if self.records_passes {
             self.push(PASS);
         }
@@ -125,7 +125,7 @@ impl Tapping {
     }
 
     #[cold]
-    fn drain(&mut self, tap: &mut Tap<TAP>) {
+    fn drain(&mut self, tap: &mut Tap) {
         let mut buffer = [0; MAX_TAPPED];
         while let Some(record) = tap.next(&mut buffer) {
             self.lost[0] = self.lost[0].saturating_add(record.lost);
