@@ -44,16 +44,17 @@ PARTS = [
             "mod.rs:handle",
             "mod.rs:handle_idle",
             "mod.rs:handle_awake",
+            "mod.rs:poll_awake",
             "mod.rs:port_bytes",
             "mod.rs:port_can",
-            "field_port.rs:can",
+            "port.rs:can",
         ],
     ),
     (
         "is it a frame of the recipe",
         "#ffc857",
         [
-            "field_port.rs:hold",
+            "port.rs:hold",
             "deframer.rs:next_frame",
             "can.rs:has",
             "can.rs:accept_frame",
@@ -63,7 +64,7 @@ PARTS = [
     ("what is to be written, until when", "#f4978e", ["store.rs:accepted"]),
     ("which links write it", "#cdb4db", ["mod.rs:after_frame"]),
     ("which link may send", "#84c5b1", ["mod.rs:poll_output", "mod.rs:poll_work", "links.rs:next_upward"]),
-    ("what it sends, and its latency", "#f6ad6b", ["modbus_link.rs:write", "uplink.rs:send"]),
+    ("what it sends, and its latency", "#f6ad6b", ["modbus.rs:write", "recipe.rs:send"]),
     ("the bytes of that", "#a8b6ff", ["client.rs:start", "values.rs:from_little_endian", "stream.rs:encode"]),
     ("until when to sleep", "#e3d26f", ["clock.rs:sleep"]),
 ]

@@ -7,21 +7,21 @@
 
 use core::fmt;
 
-use super::bits::Bits;
 use super::counters::PortCounters;
-use super::dropped::DroppedCommand;
-use super::failed::FailedCommand;
-use super::field_port::{Codec, FieldPort};
+use super::field::bindings::InputBind;
+use super::field::health::PortsHealth;
+use super::field::line::{PeerCounters, PeerState};
+use super::field::port::{Codec, FieldPort};
+use super::field::rules::allowed;
+use super::field::whole::TextBind;
 use super::io::{BusState, LinkKind, PortId, PortState, ReplyCode};
 use super::latency::Latency;
-use super::line::{PeerCounters, PeerState};
-use super::links::{LinkInfo, LinksView};
-use super::port_health::PortsHealth;
+use super::link::dropped::DroppedCommand;
+use super::link::failed::FailedCommand;
+use super::link::links::{LinkInfo, LinksView};
 use super::rejection::{LastRejection, RejectedField};
-use super::rules::allowed;
-use super::store::InputFrame;
-use super::user::InputBind;
-use super::whole_port::TextBind;
+use super::values::bits::Bits;
+use super::values::store::InputFrame;
 use crate::config::{CommandText, Span};
 use crate::image::{GroupId, Image};
 use crate::link::LinkState;

@@ -20,10 +20,10 @@ use core::fmt;
 
 use serde::ser::{Serialize, SerializeMap, Serializer};
 
-use super::dropped::DroppedCommand;
-use super::failed::FailedCommand;
-use super::links::LinkInfo;
-use super::other_text::OtherText;
+use super::link::dropped::DroppedCommand;
+use super::link::failed::FailedCommand;
+use super::link::links::LinkInfo;
+use super::link::other_text::OtherText;
 use super::rejection::{LastRejection, RejectedField};
 use super::status::{ControllerStatus, FieldBus, PeerStatus, PortStatus, Status, VariableStatus};
 use crate::time::Instant;

@@ -1,0 +1,212 @@
+//! Time: what a call says about it, deadlines that pass, and sleep of the gateway itself.
+//!
+//! In: the instant of each call. Out: everything whose time has come, and when the engine has to be called again. Does not
+//! know what the deadlines are for.
+
+use super::EngineView;
+use crate::engine::clock::{AFTER_SLEEP, ASLEEP, Dirty, HEARTBEAT, deadlines};
+use crate::engine::counters::{add, bump};
+use crate::engine::field::bindings::silence_commands;
+use crate::engine::field::port::FieldPort;
+use crate::engine::io::{Handled, Output};
+use crate::engine::values::store::Overdue;
+use crate::time::{Duration, Instant};
+
+impl EngineView<'_> {
+    /// The deadlines up to `now` pass.
+    pub(crate) fn tick(&mut self, now: Instant) {
+        (self.clock.is_overdue, self.clock.announced) = (false, Instant::NEVER);
+        self.clock.has_slept &= now < self.clock.slept_until;
+        if now >= self.clock.timer_at || now >= self.clock.partial_at && self.ends_partial(now) {
+            self.advance(now);
+        }
+    }
+
+    /// Whether silence ends a partial frame; when it may, else.
+    #[inline(never)]
+    fn ends_partial(&mut self, now: Instant) -> bool {
+        self.clock.partial_at = self.partial_deadline();
+        now >= self.clock.partial_at
+    }
+
+    /// When silence ends a partial frame, the first of all ports.
+    fn partial_deadline(&self) -> Instant {
+        self.ports.iter().map(FieldPort::partial_until).min().unwrap_or(Instant::NEVER)
+    }
+
+    /// Nothing is to be done until the next deadline or beat.
+    #[inline(always)]
+    pub(crate) fn poll_sleep<'b>(&mut self) -> Output<'b> {
+        if !self.clock.dirty.has(Dirty::ARMED) {
+            self.clock.dirty.add(Dirty::ARMED);
+            let (ports, links) = (&self.ports[..], self.links.view());
+            let deadlines = deadlines(self.clock, ports, links, self.store, self.exchanges.is_used());
+            (self.clock.timer_at, self.clock.partial_at) = deadlines;
+        }
+        self.clock.sleep(!self.ports.is_empty())
+    }
+
+    /// An input has come: the present. An engine that is asleep has nothing late, and no beat to look at.
+    #[inline(always)]
+    pub(crate) fn begin(&mut self, was_asleep: bool, now: Instant) -> Instant {
+        self.clock.idle_until = Instant::ZERO;
+        if was_asleep {
+            debug_assert!(!self.clock.is_overdue && !self.clock.has_slept);
+            (self.clock.now, self.store.now) = (now, now);
+            return now;
+        }
+        let now = self.present(now);
+        self.clock.is_overdue = now >= self.clock.announced;
+        now
+    }
+
+    /// It has been handled: whether the engine was asleep, and has nothing to do before it wakes.
+    #[inline(always)]
+    pub(crate) fn end(&mut self, was_asleep: bool) -> Handled {
+        if was_asleep
+            && self.clock.dirty == Dirty::ARMED
+            && self.clock.timer_at.min(self.clock.partial_at) >= self.clock.announced
+        {
+            self.clock.idle_until = self.clock.announced;
+            return Handled::Asleep;
+        }
+        Handled::Poll
+    }
+
+    /// The present, and whether the gateway has slept until now.
+    #[inline(never)]
+    fn present(&mut self, now: Instant) -> Instant {
+        let now = self.clock.forward(now);
+        self.store.now = now;
+        if now >= self.clock.beat_at {
+            // A configured engine is called at every beat; before the first call nothing was late.
+            if self.clock.now != Instant::ZERO && now.saturating_since(self.clock.now) > ASLEEP {
+                self.wake(now);
+            }
+            self.clock.beat_at = now + HEARTBEAT;
+            self.clock.dirty.add(Dirty::ALL);
+        }
+        self.clock.now = now;
+        now
+    }
+
+    /// The gateway itself slept: the age of everything that waits is unknown. Overdue safe values
+    /// go first, no command is sent, and every connection is opened again.
+    #[cold]
+    fn wake(&mut self, now: Instant) {
+        self.clock.sleeps = self.clock.sleeps.wrapping_add(1);
+        // Before deadlines pass: one of them may be to open a link that has been down.
+        self.links.slept(self.store);
+        self.clock.has_slept = true;
+        self.advance(now);
+        self.ports.iter_mut().for_each(|port| port.slept(self.tap, now));
+        self.exchanges_slept();
+        self.clock.slept_until = now + AFTER_SLEEP;
+        self.arm(self.clock.slept_until);
+    }
+
+    /// See [`Clock::arm`].
+    pub(crate) fn arm(&mut self, at: Instant) {
+        self.clock.arm(at);
+    }
+
+    /// The driver ticks once more at this instant.
+    pub(crate) fn tick_again(&mut self) {
+        self.clock.timer_at = self.clock.timer_at.min(self.clock.now);
+    }
+
+    /// Handles everything that depends on the clock.
+    fn advance(&mut self, now: Instant) {
+        // At one instant the clock is checked once: what is done now is due later.
+        self.clock.timer_at = now + Duration::from_micros(1);
+        self.clock.dirty.add(Dirty::ALL);
+        self.clock.dirty.remove(Dirty::ARMED);
+        self.expire_frames(now);
+        let mut is_ended = false;
+        for port in self.ports.iter_mut() {
+            is_ended |= port.advance(self.tap, now);
+        }
+        if is_ended {
+            self.read_ended(now);
+        }
+        if self.exchanges.is_used() {
+            self.advance_exchange(now);
+        }
+        self.links.advance(self.store);
+        if !self.links.devices.is_empty() {
+            self.advance_connections(now);
+        }
+        self.carry_results();
+    }
+
+    /// Reads the frames that silence has ended, of all ports that have one.
+    #[cold]
+    #[inline(never)]
+    fn read_ended(&mut self, now: Instant) {
+        for index in 0..self.ports.len() {
+            if let Some(port) = self.ports.get(index)
+                && now >= port.partial_until()
+            {
+                let id = port.id;
+                self.port_silent(id, now);
+            }
+        }
+    }
+
+    fn expire_frames(&mut self, now: Instant) {
+        let mut timed_out = false;
+        while let Some(overdue) = self.store.next_timeout(self.safe_values) {
+            let (frame, dropped) = match overdue {
+                Overdue::Frame(frame, dropped) => (frame, dropped),
+                Overdue::Health => {
+                    self.check_health(now);
+                    continue;
+                }
+                Overdue::Fields(port, dropped) => {
+                    timed_out = true;
+                    if let Some(port) = self.ports.get_mut(usize::from(port)) {
+                        add(&mut port.counters.values_expired, dropped);
+                    }
+                    continue;
+                }
+                Overdue::Command(field) => {
+                    timed_out = true;
+                    if let Some(link) = self.links.command.first_mut() {
+                        link.silent(field, now);
+                    }
+                    continue;
+                }
+            };
+            timed_out = true;
+            if let Some(port) = self.ports.get_mut(usize::from(frame.port)) {
+                bump(&mut port.counters.timeouts);
+                add(&mut port.counters.values_expired, dropped);
+            }
+            silence_commands(frame.bindings.of(&self.bindings.inputs), self.links.command.first_mut(), now);
+        }
+        if timed_out {
+            self.drop_forgotten(now);
+            self.image_changed();
+            self.tell_alive(now);
+        }
+        self.expire_waiting();
+    }
+
+    /// Drops values that have waited too long.
+    #[inline(always)]
+    pub(crate) fn expire_waiting(&mut self) {
+        if self.store.may_expire() {
+            self.drop_expired();
+        }
+    }
+
+    #[inline(never)]
+    fn drop_expired(&mut self) {
+        let ports = &mut *self.ports;
+        self.store.expire_waiting(|port, dropped| {
+            if let Some(port) = ports.get_mut(port) {
+                add(&mut port.counters.values_expired, dropped);
+            }
+        });
+    }
+}

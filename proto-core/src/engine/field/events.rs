@@ -1,0 +1,502 @@
+//! Events of exchanges: a bit that rises, and the steps that follow one (docs/engine.md section 13).
+//!
+//! In: readings of the bits, how requests ended, the time. Out: requests that are made once, with the values of the
+//! rise, and what became of each. A write that stops a peer is no event; it cancels those of its peer.
+//!
+//! A rise needs a 0 that was read before it over the same connection, and that is not stale. Values that are read apart
+//! from the bit come from a read that was answered after the one that showed the rise.
+
+use super::exchanges::{Item, Piece};
+use super::line::{EventCounters, ExchangeTable, Line};
+use super::requests::Maker;
+use super::turns::{Ended, News, Turns};
+use crate::image::GroupId;
+use crate::modbus::rtu::MAX_ADU;
+use crate::recipe::model::MAX_STREAM_FRAME;
+use crate::sysvar::SysVar;
+use crate::time::{Duration, Instant};
+
+/// What became of an event, as the robot is told (docs/engine.md section 13).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize), serde(rename_all = "snake_case"))]
+#[repr(u8)]
+#[non_exhaustive]
+pub enum Outcome {
+    /// There was no event yet.
+    #[default]
+    None = 0,
+    /// It waits, or is on its way.
+    Open = 1,
+    /// The device confirmed it.
+    Done = 2,
+    /// The device refused it.
+    Refused = 3,
+    /// The device accepted it, and takes its time (Modbus exception 5).
+    Accepted = 4,
+    /// It was sent, and no answer tells what became of it.
+    Unknown = 5,
+    /// It could not be sent in time.
+    Expired = 6,
+    /// It was not sent: a value is outside its limits.
+    OutOfLimits = 7,
+    /// It was not sent: a value is unknown or stale.
+    NoValue = 8,
+    /// It was not sent: the device is away.
+    Away = 9,
+    /// It was not sent: the event before it was still open.
+    StillOpen = 10,
+    /// It was not sent: a write that stops the device came first.
+    Stopped = 11,
+    /// It was not sent: the step before it was not done.
+    NotFollowed = 12,
+}
+
+/// The bit that triggers an exchange.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Trigger {
+    pub var: SysVar,
+    pub bit: u8,
+    /// The newest reading.
+    last: Option<Reading>,
+}
+
+/// A reading of a bit.
+#[derive(Debug, Clone, Copy)]
+struct Reading {
+    on: bool,
+    at: Instant,
+}
+
+/// The event of an exchange.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Event {
+    /// There is none.
+    Over,
+    /// It happened at `at`, and newer values are pending.
+    Risen { at: Instant, until: Instant },
+    /// Its request is made, and it follows an exchange that is not done yet.
+    Behind { len: u16, until: Instant },
+    /// Its request is made.
+    Ready { len: u16, until: Instant },
+    /// It is on its way.
+    Sent { len: u16, until: Instant },
+}
+
+/// What is reported to the robot of an exchange's events.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct ReportedOutcome {
+    pub outcome: Outcome,
+    /// With which code the device refused it.
+    pub code: u16,
+    /// Events that have ended, wrapping.
+    pub ended: u16,
+}
+
+impl Trigger {
+    pub(crate) const fn new((var, bit): (SysVar, u8)) -> Self {
+        Self { var, bit, last: None }
+    }
+
+    /// The next reading is the first one.
+    pub(crate) const fn forget(&mut self) {
+        self.last = None;
+    }
+
+    /// Takes a reading over the connection that is up since then. Returns whether the bit has risen, for an event, and for
+    /// a write that stops, which does not need to know that it was 0.
+    fn read(&mut self, reading: Reading, up_since: Instant, stale_after: Duration) -> [bool; 2] {
+        let before = self.last.replace(reading);
+        if !reading.on {
+            return [false; 2];
+        }
+        // By its time: what an earlier connection brought may be looked at again while this one is up.
+        let before = before.filter(|before| before.at >= up_since);
+        let was_off =
+            before.is_some_and(|before| !before.on && reading.at.saturating_since(before.at) <= stale_after);
+        // What happened between two connections nobody knows.
+        [was_off, !before.is_some_and(|before| before.on)]
+    }
+}
+
+impl Event {
+    pub(crate) const fn is_over(self) -> bool {
+        matches!(self, Self::Over)
+    }
+
+    /// Whether it waits, and is not on its way.
+    pub(crate) const fn waits(self) -> bool {
+        matches!(self, Self::Risen { .. } | Self::Behind { .. } | Self::Ready { .. })
+    }
+
+    /// Until when it may be sent, while it waits.
+    pub(crate) const fn expires_at(self) -> Instant {
+        match self {
+            Self::Risen { until, .. } | Self::Behind { until, .. } | Self::Ready { until, .. } => until,
+            Self::Over | Self::Sent { .. } => Instant::NEVER,
+        }
+    }
+}
+
+impl EventCounters {
+    fn count(&mut self, outcome: Outcome) {
+        let counter = match outcome {
+            Outcome::None | Outcome::Open => return,
+            Outcome::Done => &mut self.done,
+            Outcome::Refused => &mut self.refused,
+            Outcome::Accepted => &mut self.accepted,
+            Outcome::Unknown => &mut self.unknown,
+            Outcome::Expired => &mut self.expired,
+            Outcome::OutOfLimits => &mut self.out_of_limits,
+            Outcome::NoValue => &mut self.no_value,
+            Outcome::Away => &mut self.away,
+            Outcome::StillOpen => &mut self.still_open,
+            Outcome::Stopped => &mut self.stopped,
+            Outcome::NotFollowed => &mut self.not_followed,
+        };
+        *counter = counter.wrapping_add(1);
+    }
+}
+
+/// What the values of requests are read from, as far as their age matters.
+pub(crate) struct Sources<C> {
+    /// Groups below this are frames of field ports.
+    pub first_of_links: u8,
+    /// Since when the connection is up over which a group's values come.
+    pub up_since: C,
+    pub stale_after: Duration,
+    /// Whether the device of the port is there.
+    pub is_usable: bool,
+}
+
+/// The events of one line.
+pub(crate) struct Events<'a, 't> {
+    pub items: &'a mut [Item],
+    pub table: &'a mut ExchangeTable<'t>,
+    pub line: &'a mut Line,
+    pub now: Instant,
+}
+
+impl Events<'_, '_> {
+    /// Values in the image have changed: looks at the bits, and makes the requests of events whose values are there.
+    pub(crate) fn image_changed(
+        &mut self,
+        maker: &Maker<'_>,
+        sources: &Sources<impl Fn(GroupId) -> Instant>,
+        kept: &mut [Piece],
+    ) {
+        for nth in 0..self.items.len() {
+            self.read_bit(nth, maker, sources);
+        }
+        for nth in 0..self.items.len() {
+            self.freeze(nth, maker, sources, kept);
+        }
+        self.note_expiry();
+    }
+
+    fn read_bit(&mut self, nth: usize, maker: &Maker<'_>, sources: &Sources<impl Fn(GroupId) -> Instant>) {
+        let Some(item) = self.items.get_mut(nth) else { return };
+        let Some(trigger) = &mut item.trigger else { return };
+        let Some(at) = maker.image.known_since(trigger.var) else { return trigger.forget() };
+        let on = maker.image.bit(trigger.var, trigger.bit) == 1.0;
+        let is_old = trigger.last.is_some_and(|last| last.at == at && last.on == on);
+        if is_old {
+            return;
+        }
+        let up_since = maker.image.group(trigger.var).map_or(Instant::ZERO, &sources.up_since);
+        let [rises, stops] = trigger.read(Reading { on, at }, up_since, sources.stale_after);
+        if item.stops {
+            // Also while the device is away: it is a state.
+            if stops {
+                self.stop(nth);
+            }
+        } else if rises {
+            self.rise(nth, at, sources.is_usable);
+        }
+    }
+
+    /// A write that stops its peer is wanted: it goes first, and what waits for the peer is cancelled.
+    pub(crate) fn stop(&mut self, nth: usize) {
+        self.line.request(self.table, nth, self.now);
+        self.line.yield_to_stops(self.table, self.now);
+        let Some(peer) = self.table.rows.get(nth).map(|row| row.peer) else { return };
+        for other in 0..self.items.len() {
+            let is_of_peer = self.table.rows.get(other).is_some_and(|row| row.peer == peer);
+            if is_of_peer && self.items.get(other).is_some_and(|item| item.event.waits()) {
+                self.end(other, Outcome::Stopped, 0);
+            }
+        }
+    }
+
+    /// The bit of an event has risen.
+    fn rise(&mut self, nth: usize, at: Instant, is_usable: bool) {
+        let Some(item) = self.items.get(nth) else { return };
+        if !item.event.is_over() {
+            // The one before goes on; only the counter tells of this one.
+            return self.count(nth, Outcome::StillOpen);
+        }
+        if item.follow.is_some() {
+            // The first step of the dialogue starts this one.
+            return;
+        }
+        let until = self.now + item.window;
+        self.open(nth, Event::Risen { at, until });
+        let Some(peer) = self.table.rows.get(nth).map(|row| row.peer) else { return };
+        let is_away = self.line.turns(self.table, |turns| turns.is_known_to_be_away(peer));
+        if is_away || !is_usable {
+            self.end(nth, Outcome::Away, 0);
+        } else if self.is_stopping(peer) {
+            self.end(nth, Outcome::Stopped, 0);
+        }
+    }
+
+    fn is_stopping(&mut self, peer: u8) -> bool {
+        let on_its_way =
+            self.line.occupied_by().and_then(|flight| self.table.rows.get(usize::from(flight.exchange)));
+        on_its_way.is_some_and(|row| row.stops() && row.peer == peer)
+            || self.line.turns(self.table, |turns: &mut Turns<'_>| turns.is_stopping(peer))
+    }
+
+    fn open(&mut self, nth: usize, event: Event) {
+        if let Some(item) = self.items.get_mut(nth) {
+            item.event = event;
+            (item.reported.outcome, item.reported.code) = (Outcome::Open, 0);
+            item.is_news = true;
+        }
+    }
+
+    /// Makes the request of an event whose values are there, and those of all steps that follow it.
+    fn freeze(
+        &mut self,
+        nth: usize,
+        maker: &Maker<'_>,
+        sources: &Sources<impl Fn(GroupId) -> Instant>,
+        kept: &mut [Piece],
+    ) {
+        let Some(Item { event: Event::Risen { at, until }, .. }) = self.items.get(nth) else { return };
+        let (at, until) = (*at, *until);
+        let bit_group = self
+            .items
+            .get(nth)
+            .and_then(|item| item.trigger)
+            .and_then(|trigger| maker.image.group(trigger.var));
+        let (mut steps, mut count) = ([nth as u8; MAX_STEPS], 1_usize);
+        // The steps behind it, the nearest first.
+        let mut done = 0_usize;
+        while let Some(&step) = steps.get(done).filter(|_| done < count) {
+            for (other, item) in (0..).zip(self.items.iter()) {
+                if item.follow == Some(step)
+                    && let Some(slot) = steps.get_mut(count)
+                {
+                    *slot = other;
+                    count = count.saturating_add(1);
+                }
+            }
+            done = done.saturating_add(1);
+        }
+        let steps = steps.get(..count).unwrap_or(&[]);
+        for &step in steps {
+            let Some(item) = self.items.get(usize::from(step)) else { continue };
+            let is_pending = |group: GroupId| {
+                group.0 >= sources.first_of_links
+                    && Some(group) != bit_group
+                    && maker.image.stamp_of(group).is_none_or(|stamp| stamp <= at)
+            };
+            if maker.groups_of(item).any(is_pending) {
+                return;
+            }
+        }
+        let mut request = [0; if MAX_STREAM_FRAME > MAX_ADU { MAX_STREAM_FRAME } else { MAX_ADU }];
+        for &step in steps {
+            let step = usize::from(step);
+            let Some(item) = self.items.get(step) else { continue };
+            let len = match maker.make_event(item, &mut request) {
+                Ok(len) => len,
+                Err(outcome) => return self.end(nth, outcome, 0),
+            };
+            let room =
+                kept.iter_mut().skip(usize::from(item.pieces.start)).take(usize::from(item.pieces.len));
+            room.flatten().zip(request.get(..len).unwrap_or(&[])).for_each(|(slot, &byte)| *slot = byte);
+            let len = len as u16;
+            if step == nth {
+                if let Some(item) = self.items.get_mut(step) {
+                    item.event = Event::Ready { len, until };
+                }
+            } else {
+                self.open(step, Event::Behind { len, until: Instant::NEVER });
+            }
+        }
+        self.ready(nth);
+    }
+
+    fn ready(&mut self, nth: usize) {
+        let now = self.now;
+        self.line.turns(self.table, |turns| turns.set_event(nth, Some(now)));
+        self.line.look(now);
+    }
+
+    /// An exchange was answered, or ended without an answer: its event has ended, or may be sent again; the step behind
+    /// it is sent, or is not.
+    pub(crate) fn ended(&mut self, nth: usize, is_event: bool, ended: Ended, code: u16) {
+        let outcome = match ended {
+            Ended::Good => Outcome::Done,
+            Ended::Refused => Outcome::Refused,
+            Ended::Accepted => Outcome::Accepted,
+            Ended::Unclear | Ended::Unconfirmed => Outcome::Unknown,
+            Ended::Busy if is_event => return self.busy(nth, code),
+            // It is asked again.
+            Ended::Busy => return,
+        };
+        if is_event {
+            self.end(nth, outcome, code);
+        }
+        if outcome == Outcome::Done {
+            self.follow(nth, is_event);
+        }
+        self.note_expiry();
+    }
+
+    /// The device has not done it, and may later.
+    fn busy(&mut self, nth: usize, code: u16) {
+        let Some(item) = self.items.get_mut(nth) else { return };
+        let Event::Sent { len, until } = item.event else { return };
+        if until <= self.now {
+            return self.end(nth, Outcome::Expired, code);
+        }
+        item.event = Event::Ready { len, until };
+        item.reported.code = code;
+        self.ready(nth);
+        self.note_expiry();
+    }
+
+    /// The steps behind an exchange that is done. Those behind an event were made with it, unless they have ended since,
+    /// such as by a stop.
+    fn follow(&mut self, nth: usize, is_event: bool) {
+        let peer = self.table.rows.get(nth).map(|row| row.peer);
+        let is_stopping = peer.is_some_and(|peer| self.is_stopping(peer));
+        for other in 0..self.items.len() {
+            let Some(item) = self.items.get_mut(other).filter(|item| item.follow == Some(nth as u8)) else {
+                continue;
+            };
+            let until = self.now + item.window;
+            match item.event {
+                Event::Behind { len, .. } => {
+                    item.event = Event::Ready { len, until };
+                    self.ready(other);
+                }
+                Event::Over if is_event => {}
+                // Its leader is no event: the step is one from now on.
+                Event::Over => {
+                    self.open(other, Event::Risen { at: Instant::ZERO, until });
+                    if is_stopping {
+                        self.end(other, Outcome::Stopped, 0);
+                    }
+                }
+                _ => self.count(other, Outcome::StillOpen),
+            }
+        }
+    }
+
+    /// An event has ended, and so have the steps behind it that wait, unless it was done.
+    pub(crate) fn end(&mut self, nth: usize, outcome: Outcome, code: u16) {
+        let Some(item) = self.items.get_mut(nth) else { return };
+        if item.event.is_over() {
+            return;
+        }
+        item.event = Event::Over;
+        (item.reported.outcome, item.reported.code) = (outcome, code);
+        item.reported.ended = item.reported.ended.wrapping_add(1);
+        item.is_news = true;
+        self.line.turns(self.table, |turns| turns.set_event(nth, None));
+        self.count(nth, outcome);
+        if outcome == Outcome::Done {
+            return;
+        }
+        // No recursion: a step has one leader, so each is ended once.
+        let mut left = self.items.len();
+        while left > 0 {
+            left = left.saturating_sub(1);
+            let is_orphan = |item: &Item| {
+                let leader = item.follow.and_then(|leader| self.items.get(usize::from(leader)));
+                matches!(item.event, Event::Behind { .. })
+                    && leader.is_some_and(|leader| leader.event.is_over())
+            };
+            let Some(orphan) = self.items.iter().position(is_orphan) else { break };
+            if let Some(item) = self.items.get_mut(orphan) {
+                item.event = Event::Over;
+                (item.reported.outcome, item.reported.code) = (Outcome::NotFollowed, 0);
+                item.reported.ended = item.reported.ended.wrapping_add(1);
+                item.is_news = true;
+            }
+            self.count(orphan, Outcome::NotFollowed);
+        }
+    }
+
+    /// The request of an event without a reply has left.
+    pub(crate) fn end_unanswered(&mut self, nth: usize) {
+        self.follow(nth, true);
+        self.end(nth, Outcome::Unknown, 0);
+        self.note_expiry();
+    }
+
+    /// What a failure or a sign of life means for the peer of an exchange.
+    pub(crate) fn note(&mut self, nth: usize, news: News) {
+        let Some(which) = self.table.rows.get(nth).map(|row| row.peer) else { return };
+        match news {
+            News::Nothing => {}
+            News::Away => self.end_waiting(Some(which), Outcome::Away),
+            News::Started => {
+                for (item, row) in self.items.iter_mut().zip(self.table.rows.iter()) {
+                    // What it said before says nothing any more.
+                    if let Some(sign) = item.restart.as_mut().filter(|_| row.peer == which) {
+                        sign.was_there = None;
+                    }
+                }
+                if let Some(peer) = self.table.peers.get_mut(usize::from(which)) {
+                    peer.counters.starts = peer.counters.starts.wrapping_add(1);
+                }
+            }
+        }
+    }
+
+    fn count(&mut self, nth: usize, outcome: Outcome) {
+        let Some(peer) = self.table.rows.get(nth).map(|row| usize::from(row.peer)) else { return };
+        if let Some(peer) = self.table.peers.get_mut(peer) {
+            peer.counters.events.count(outcome);
+        }
+    }
+
+    /// Ends all events of a peer that wait; of all peers with `None`.
+    pub(crate) fn end_waiting(&mut self, peer: Option<u8>, outcome: Outcome) {
+        for nth in 0..self.items.len() {
+            let is_of_peer =
+                self.table.rows.get(nth).is_some_and(|row| peer.is_none_or(|peer| row.peer == peer));
+            if is_of_peer && self.items.get(nth).is_some_and(|item| item.event.waits()) {
+                self.end(nth, outcome, 0);
+            }
+        }
+        self.note_expiry();
+    }
+
+    /// Events whose time is over are not sent any more.
+    pub(crate) fn expire(&mut self) {
+        if self.now < self.line.expires_at {
+            return;
+        }
+        for nth in 0..self.items.len() {
+            if let Some(item) = self.items.get(nth).filter(|item| item.event.expires_at() <= self.now) {
+                let code = item.reported.code;
+                self.end(nth, Outcome::Expired, code);
+            }
+        }
+        self.note_expiry();
+    }
+
+    fn note_expiry(&mut self) {
+        let expiries = self.items.iter().map(|item| item.event.expires_at());
+        self.line.expires_at = expiries.min().unwrap_or(Instant::NEVER);
+    }
+}
+
+/// The longest dialogue.
+const MAX_STEPS: usize = 16;

@@ -1,0 +1,726 @@
+//! Exchanges on field ports: requests out, replies in, and what happens without them.
+//!
+//! In: bytes and CAN frames of ports whose recipe has exchanges, the time. Out: values in the store,
+//! and requests. Which exchange is next is the line's business ([`super::line`]); ports without
+//! exchanges do not come here.
+
+use super::bindings::{InputBind, Outputs};
+use super::device::{DeviceCodec, DeviceFormat, elements, judge_can};
+use super::events::{Events, Outcome, Sources};
+use super::exchanges::{Asks, Item, OtherFormat, View};
+use super::frames::{Accepted, Frames};
+use super::line::{ExchangeTable, Flight, Line, Over, Phase, Times};
+use super::modbus_tcp;
+use super::output::Downward;
+use super::pending::{Heard, PendingReplies};
+use super::port::{Codec, FieldPort, came, keep_why};
+use super::requests::Maker;
+use super::turns::{Cause, Ended, News};
+use super::whole::{Reader, TextBind};
+use crate::device::{Found, Probe};
+use crate::engine::counters::{PortCounters, add, bump};
+use crate::engine::link::command::CommandLink;
+use crate::engine::rejection::Rejection;
+use crate::engine::tap::Tap;
+use crate::engine::values::store::Store;
+use crate::image::{GroupId, Image};
+use crate::modbus::rtu::MAX_ADU;
+use crate::time::Instant;
+use crate::wire::can::{CanFrame, CanId};
+
+impl FieldPort {
+    /// The line of the exchanges, if the recipe has any.
+    pub(crate) fn line(&self) -> Option<&Line> {
+        match &self.codec {
+            Codec::Device(device) => device.line.as_ref(),
+            _ => None,
+        }
+    }
+
+    pub(crate) fn line_mut(&mut self) -> Option<&mut Line> {
+        match &mut self.codec {
+            Codec::Device(device) => device.line.as_mut(),
+            _ => None,
+        }
+    }
+
+    fn is_on_can(&self) -> bool {
+        matches!(&self.codec, Codec::Device(device) if device.reader.is_none())
+    }
+
+    /// When its exchanges have something to do without an input.
+    pub(crate) fn exchange_deadline(&self) -> Instant {
+        match self.line() {
+            Some(line) if self.is_usable() => {
+                let deadline = line.deadline(&self.line);
+                // Until the line is free, there is only that to wait for.
+                let own = if self.sender.is_busy() && line.may_ask() { Instant::NEVER } else { deadline };
+                own.min(line.expires_at).min(self.slave_deadline()).min(self.reply_deadline())
+            }
+            _ => Instant::NEVER,
+        }
+    }
+
+    /// Whether the gateway is the slave of a line, which takes its bytes.
+    pub(crate) fn hears_master(&mut self, bytes: &[u8], now: Instant) -> bool {
+        let is_usable = self.is_usable();
+        let Codec::Device(DeviceCodec { reader: Some(Reader::Slave(slave)), .. }) = &mut self.codec else {
+            return false;
+        };
+        if is_usable {
+            slave.received(bytes, now);
+        } else {
+            // When the port is back, nobody waits for an answer any more.
+            add(&mut self.counters.discarded_bytes, bytes.len());
+        }
+        true
+    }
+
+    /// Whether a request has failed, and the tick that says so is still to come.
+    pub(crate) fn has_failed(&self, now: Instant) -> bool {
+        self.is_usable() && self.line().is_some_and(|line| line.failure(&self.line, now).is_some())
+    }
+
+    /// Reads the frames in `rest`; stops after the first accepted one if the image is to be checked
+    /// after each frame.
+    pub(crate) fn exchange_frames(
+        &mut self,
+        rest: &mut &[u8],
+        bindings: &[InputBind],
+        store: &mut Store,
+        commands: Option<&mut CommandLink>,
+        tap: &mut Tap,
+        mut view: View<'_>,
+    ) -> Accepted {
+        let mut accepted = Accepted::default();
+        let (now, usable, bytes) = (store.now, self.is_usable(), *rest);
+        let mut left = core::mem::take(rest);
+        let Codec::Device(DeviceCodec {
+            formats,
+            inputs,
+            texts,
+            reader: Some(Reader::Search(framer)),
+            line: Some(line),
+            ..
+        }) = &mut self.codec
+        else {
+            return accepted;
+        };
+        let formats = formats.get(..usize::from(*inputs)).unwrap_or(&[]);
+        let (items, mut table) = view.of(line);
+        let mut frames =
+            Frames::new((self.id, self.mode), &mut self.reply, &mut self.counters, bindings, store, commands);
+        let first_frame = self.first_frame;
+        loop {
+            let pending = PendingReplies {
+                formats,
+                first_frame,
+                items,
+                rows: table.rows,
+                flight: line.flight(),
+                echo: line.echo,
+                has_echo: line.has_echo == Some(true),
+                bindings,
+                now,
+            };
+            let effort = pending.all();
+            let effort = effort
+                .map(|format| format.layout.lengths().1.saturating_add(usize::from(format.bindings.len)))
+                .fold(MAX_ADU, usize::saturating_add);
+            let is_tcp = line.transactions.is_some();
+            let probe = |bytes: &[u8]| if is_tcp { modbus_tcp::probe(bytes) } else { pending.probe(bytes) };
+            let Some(found) = framer.next_frame(&mut left, effort, probe) else { break };
+            let (frame, what) = match (found, &mut line.transactions) {
+                (Found::Frame(frame), None) => (frame, Ok(pending.heard(frame))),
+                (Found::Frame(frame), Some(all)) => (frame, Ok(all.heard(&pending, frame))),
+                (Found::Other(frame), None) => (frame, Err(Rejection::OtherDevice)),
+                (Found::Other(frame), Some(all)) => {
+                    // Nothing behind it can be read.
+                    (all.is_lost, left) = (true, &[]);
+                    (frame, Err(Rejection::Malformed))
+                }
+                (Found::Wrong(frame), _) => {
+                    line.heard_wrong();
+                    (frame, Err(Rejection::Checksum))
+                }
+            };
+            let what = match what {
+                Ok(what) => what,
+                Err(why) => {
+                    let verdict = frames.rejected(why);
+                    tap.record(|| came(self.id, now, verdict, None, [frame, &[], &[]]));
+                    keep_why(&mut self.last_rejection, verdict, frames.store, None, frame);
+                    continue;
+                }
+            };
+            if let Some(Heard::Echo) = what {
+                line.echo = None;
+                learn_echo(line, &mut table, true, now);
+                continue;
+            }
+            let expected = pending.expected();
+            let (flight, times) = (pending.flight, pending.asked().map(|item| item.times));
+            // Of a Modbus frame.
+            let (data, code) = match is_tcp {
+                true => modbus_tcp::content(frame),
+                false => (frame.get(3..frame.len().saturating_sub(2)).unwrap_or(&[]), frame.get(2).copied()),
+            };
+            let before = accepted.frames;
+            // The exchange whose reply was taken, and its data.
+            let mut told = None;
+            let (verdict, sign) = match what {
+                Some(Heard::Reply(reply)) => {
+                    let verdict = match reply {
+                        Some(reply) => {
+                            let data = if expected.is_some() { data } else { frame };
+                            told = flight.map(|flight| (flight.exchange, data));
+                            let slot = usize::from(reply.slot);
+                            let verdict = frames.take_device(&reply.format, texts, data, slot, &mut accepted);
+                            // A transaction id tells to which of the requests it is the reply.
+                            if let Some(since) =
+                                flight.filter(|_| !is_tcp).and_then(|flight| flight.unanswered())
+                            {
+                                frames.store.was_asked(slot, since);
+                            }
+                            verdict
+                        }
+                        // A write was carried out.
+                        None => Ok(()),
+                    };
+                    (verdict, Sign::Answer(Ended::Good, 0))
+                }
+                Some(Heard::ReplyOrEcho) => (Ok(()), Sign::ReplyOrEcho),
+                Some(Heard::Pending(pending)) => {
+                    (take_other(&mut frames, Some(pending), texts, frame, &mut accepted), Sign::Pending)
+                }
+                Some(Heard::Refusal(refusal)) => {
+                    let code = expected.and(code).unwrap_or(0);
+                    (
+                        take_other(&mut frames, refusal, texts, frame, &mut accepted)
+                            .and(Err(Rejection::Refused)),
+                        Sign::Answer(refused_with(code, expected.is_some()), code.into()),
+                    )
+                }
+                Some(Heard::Late { exchange, is_pending }) => {
+                    (Err(Rejection::Late), Sign::Late { exchange, is_pending })
+                }
+                Some(Heard::Ambiguous) => (Err(Rejection::Late), Sign::Ambiguous),
+                Some(Heard::Unasked(format, slot, nth)) => {
+                    told = nth.map(|nth| (nth, frame));
+                    (frames.take_device(format, texts, frame, slot, &mut accepted), Sign::Unasked(nth))
+                }
+                None if is_tcp => (frames.rejected(Rejection::OtherDevice), Sign::Nothing),
+                Some(Heard::Echo) | None => (Err(Rejection::NoFrame), Sign::Nothing),
+            };
+            if let Some(told) = told.filter(|_| verdict.is_ok()) {
+                look_for_restart(line, items, &mut table, bindings, told, now);
+            }
+            match (sign, flight, times) {
+                (Sign::Pending, Some(flight), Some(times)) => {
+                    goes_on(line, items, &mut table, (flight, times), now);
+                }
+                (Sign::Answer(ended, code), Some(flight), Some(times)) => {
+                    // Of a repetition, two copies may be the replies to both requests.
+                    let is_sure = !flight.is_repetition() && !is_outstanding(&table, flight, now);
+                    if is_sure && (flight.may_be_echo || line.echo.is_some()) {
+                        learn_echo(line, &mut table, flight.may_be_echo, now);
+                    }
+                    if matches!(line.phase, Phase::Waiting(_)) {
+                        self.sender.sent();
+                    }
+                    answered(line, items, &mut table, frames.counters, (flight, times), (ended, code), now);
+                }
+                (Sign::ReplyOrEcho, ..) => line.heard_reply_or_echo(),
+                (sign, ..) => signs(line, items, &mut table, sign, now),
+            }
+            tap.record(|| came(self.id, now, verdict, None, [frame, &[], &[]]));
+            keep_why(&mut self.last_rejection, verdict, frames.store, None, frame);
+            // What is held can hold further frames, so only the rest of the chunk waits.
+            let may_change = verdict.is_ok() || accepted.frames != before;
+            if may_change && frames.store.watches_bits && !left.is_empty() {
+                break;
+            }
+        }
+        *rest = left;
+        self.note_skipped(bytes, tap, now);
+        self.sender.frames_accepted(accepted.frames, usable, &mut self.counters, now);
+        accepted
+    }
+
+    /// A frame from the bus.
+    pub(crate) fn exchange_frame(
+        &mut self,
+        frame: &CanFrame,
+        bindings: &[InputBind],
+        store: &mut Store,
+        commands: Option<&mut CommandLink>,
+        mut view: View<'_>,
+        accepted: &mut Accepted,
+    ) -> Result<(), Rejection> {
+        let (now, usable) = (store.now, self.is_usable());
+        add(&mut self.counters.bytes_in, frame.data().len());
+        let Codec::Device(DeviceCodec { formats, inputs, texts, line: Some(line), .. }) = &mut self.codec
+        else {
+            return Ok(());
+        };
+        let formats = formats.get(..usize::from(*inputs)).unwrap_or(&[]);
+        let (items, mut table) = view.of(line);
+        let mut frames =
+            Frames::new((self.id, self.mode), &mut self.reply, &mut self.counters, bindings, store, commands);
+        if frame.is_remote() {
+            return frames.rejected(Rejection::Remote);
+        }
+        if let Some(which) = booted_peer(items, &table, frame) {
+            let nth = table.rows.iter().position(|row| row.peer == which).unwrap_or(0);
+            line.turns(&mut table, |turns| turns.started(which, None, now));
+            has_restarted(line, items, &mut table, (nth, which), now);
+        }
+        let flight = line.flight();
+        let first_frame = self.first_frame;
+        let (echo, has_echo) = (None, false);
+        let pending = PendingReplies {
+            formats,
+            first_frame,
+            items,
+            rows: table.rows,
+            flight,
+            echo,
+            has_echo,
+            bindings,
+            now,
+        };
+        let is = |format: &DeviceFormat| {
+            let fields = elements(format.bindings.of(bindings));
+            format.id == frame.id()
+                && matches!(format.layout.probe_whole(fields, frame.data()), Probe::Frame(_))
+        };
+        let (answer, code) = match pending.answer(is) {
+            Some(answer) => (Some(answer), 0),
+            None => match sdo_abort(&pending, frame) {
+                Some(code) => (Some(Heard::Refusal(None)), code),
+                None => (None, 0),
+            },
+        };
+        let times = pending.asked().map(|item| item.times);
+        let mut told = None;
+        let (verdict, sign) = match pending.classify(answer, is, |_| false) {
+            Some(Heard::Reply(Some(reply))) => {
+                told = flight.map(|flight| (flight.exchange, frame.data()));
+                let slot = usize::from(reply.slot);
+                let verdict = frames.take_device(&reply.format, texts, frame.data(), slot, accepted);
+                if let Some(since) = flight.and_then(|flight| flight.unanswered()) {
+                    frames.store.was_asked(slot, since);
+                }
+                (verdict, Sign::Answer(Ended::Good, 0))
+            }
+            Some(Heard::Pending(pending)) => {
+                (take_other(&mut frames, Some(pending), texts, frame.data(), accepted), Sign::Pending)
+            }
+            Some(Heard::Refusal(refusal)) => (
+                take_other(&mut frames, refusal, texts, frame.data(), accepted).and(Err(Rejection::Refused)),
+                Sign::Answer(Ended::Refused, code),
+            ),
+            Some(Heard::Late { exchange, is_pending }) => {
+                (Err(Rejection::Late), Sign::Late { exchange, is_pending })
+            }
+            Some(_) => (Err(Rejection::Late), Sign::Ambiguous),
+            None => {
+                let answers = pending.answers().map(|format| (None, format));
+                let unasked = pending.unasked();
+                let all = answers.chain(unasked.map(|(format, slot, nth)| (Some((slot, nth)), format)));
+                let (place, format) = match judge_can(all, bindings, frame) {
+                    Ok(found) => found,
+                    Err(why) => return frames.rejected(why),
+                };
+                let (slot, nth) = place.unwrap_or((usize::MAX, None));
+                frames.take_device(format, texts, frame.data(), slot, accepted)?;
+                if let Some(nth) = nth {
+                    look_for_restart(line, items, &mut table, bindings, (nth, frame.data()), now);
+                }
+                signs(line, items, &mut table, Sign::Unasked(nth), now);
+                self.sender.frames_accepted(1, usable, &mut self.counters, now);
+                return Ok(());
+            }
+        };
+        if let Some(told) = told.filter(|_| verdict.is_ok()) {
+            look_for_restart(line, items, &mut table, bindings, told, now);
+        }
+        match (sign, flight, times) {
+            (Sign::Pending, Some(flight), Some(times)) => {
+                goes_on(line, items, &mut table, (flight, times), now);
+            }
+            (Sign::Answer(ended, code), Some(flight), Some(times)) => {
+                answered(line, items, &mut table, frames.counters, (flight, times), (ended, code), now);
+            }
+            (sign, ..) => signs(line, items, &mut table, sign, now),
+        }
+        verdict
+    }
+
+    /// The next request, if the line is free for one.
+    pub(crate) fn next_request(
+        &mut self,
+        image: &Image,
+        bindings: Outputs<'_>,
+        mut view: View<'_>,
+        out: &mut [u8],
+        now: Instant,
+    ) -> Option<Downward> {
+        if !self.is_usable() {
+            return None;
+        }
+        let is_busy = self.sender.is_busy() || now < self.line.quiet_at();
+        let Codec::Device(codec) = &mut self.codec else { return None };
+        // Apart from the rest of the codec, which makes the frames.
+        let mut line = codec.line.take()?;
+        let (items, mut table, kept) = view.served(&line);
+        let maker = Maker { image, bindings, codec, sender: &self.sender, reply: self.reply, now };
+        let request = maker.next(&mut line, (items, &mut table, kept), &mut self.counters, is_busy, out);
+        let is_on_can = codec.reader.is_none();
+        if let (Some(_), Some(Reader::Search(framer))) = (&request, &mut codec.reader)
+            && !line.hears_unasked
+            && line.transactions.is_none()
+        {
+            // What is held is too old to be the reply.
+            add(&mut self.counters.discarded_bytes, framer.discard());
+        }
+        codec.line = Some(line);
+        let (item, len) = request?;
+        self.note_partial();
+        self.sender.handed_over_beside();
+        self.counters.sent(len);
+        if !is_on_can {
+            return Some(Downward::Bytes(len));
+        }
+        let item = view_item(&mut view, self.line()?, item)?;
+        if let Asks::Remote { id, len } = item.asks {
+            return CanFrame::remote(id, len.into()).map(Downward::Can);
+        }
+        let frame = out.get(..len).unwrap_or(&[]);
+        let id = item.request.as_ref()?.id;
+        Some(Downward::Can(CanFrame::cut(id, frame)))
+    }
+
+    /// The request has left.
+    pub(crate) fn exchange_sent(&mut self, mut view: View<'_>, now: Instant) {
+        let (timing, is_on_can) = (self.line, self.is_on_can());
+        let Some(line) = self.line_mut() else { return };
+        let (items, mut table) = view.of(line);
+        let times = |nth: u8| items.get(usize::from(nth)).map(|item| item.times);
+        let flight = line.flight();
+        // A bus is free for others while a reply is pending.
+        let is_pending = line.sent(times, &timing, now);
+        if let Some(flight) = flight.filter(|_| !is_pending) {
+            // Nobody says whether it was heard. What follows it is sent behind it.
+            let nth = usize::from(flight.exchange);
+            let mut events = Events { items, table: &mut table, line, now };
+            if flight.cause == Cause::Event {
+                events.end_unanswered(nth);
+            }
+        }
+        if is_pending && !is_on_can {
+            self.sender.hold();
+        }
+    }
+
+    /// Pauses end, replies that have not come fail, and events expire.
+    pub(crate) fn advance_exchange(&mut self, mut view: View<'_>, now: Instant) {
+        let (timing, is_on_can) = (self.line, self.is_on_can());
+        let Some(line) = self.line_mut() else { return };
+        line.advance(now);
+        let (items, mut table) = view.of(line);
+        Events { items, table: &mut table, line, now }.expire();
+        let Some(failure) = line.failure(&timing, now) else { return };
+        let Some(times) = items.get(usize::from(failure.0.exchange)).map(|item| item.times) else { return };
+        let over = line.failed(&mut table, failure, times, now);
+        let (nth, is_event) = (usize::from(failure.0.exchange), failure.0.cause == Cause::Event);
+        let ended = match over {
+            Over::Repeated => None,
+            Over::GivenUp(_) => Some(Ended::Unclear),
+            Over::Unconfirmed => Some(Ended::Unconfirmed),
+        };
+        let mut events = Events { items, table: &mut table, line, now };
+        if let Some(ended) = ended {
+            events.ended(nth, is_event, ended, 0);
+        }
+        if let Over::GivenUp(news) = over {
+            events.note(nth, news);
+        }
+        // A bus was not held while the reply was pending: a frame of the cycle may be on its way.
+        if !is_on_can {
+            self.sender.sent();
+        }
+        if matches!(over, Over::GivenUp(_)) {
+            bump(&mut self.counters.unanswered);
+        }
+    }
+
+    pub(crate) fn abandon_exchange(&mut self, mut view: View<'_>, now: Instant) {
+        let is_on_can = self.is_on_can();
+        let Some(line) = self.line_mut() else { return };
+        let was_waiting = matches!(line.phase, Phase::Waiting(_));
+        let (items, mut table) = view.of(line);
+        let flight = line.abandon(&mut table, now);
+        for item in &mut *items {
+            if let Some(trigger) = &mut item.trigger {
+                trigger.forget();
+            }
+        }
+        let mut events = Events { items, table: &mut table, line, now };
+        if let Some(flight) = flight.filter(|flight| flight.cause == Cause::Event) {
+            events.end(usize::from(flight.exchange), Outcome::Unknown, 0);
+        }
+        events.end_waiting(None, Outcome::Away);
+        if was_waiting && !is_on_can {
+            self.sender.sent();
+        }
+    }
+
+    /// Values in the image have changed: looks at the bits that ask.
+    pub(crate) fn triggers(
+        &mut self,
+        image: &Image,
+        bindings: Outputs<'_>,
+        mut view: View<'_>,
+        (first_of_links, up_since): (u8, impl Fn(GroupId) -> Instant),
+        now: Instant,
+    ) {
+        let is_usable = self.is_usable();
+        let Codec::Device(codec) = &mut self.codec else { return };
+        let Some(mut line) = codec.line.take() else { return };
+        let (items, mut table, kept) = view.served(&line);
+        let stale_after = self.sender.stale_after();
+        let maker = Maker { image, bindings, codec, sender: &self.sender, reply: self.reply, now };
+        let sources = Sources { first_of_links, up_since, stale_after, is_usable };
+        let mut events = Events { items, table: &mut table, line: &mut line, now };
+        events.image_changed(&maker, &sources, kept);
+        codec.line = Some(line);
+    }
+
+    pub(crate) fn begin_exchange(&mut self, mut view: View<'_>, now: Instant) {
+        if let Codec::Device(DeviceCodec { reader: Some(Reader::Slave(slave)), .. }) = &mut self.codec {
+            // What came while the line was not there is too old to be answered.
+            add(&mut self.counters.discarded_bytes, slave.discard());
+        }
+        let is_on_can = self.is_on_can();
+        let Some(line) = self.line_mut() else { return };
+        let was_waiting = matches!(line.phase, Phase::Waiting(_));
+        let (items, mut table) = view.of(line);
+        for item in items {
+            (item.digest, item.is_owed) = (None, false);
+            if let Some(sign) = &mut item.restart {
+                sign.was_there = None;
+            }
+        }
+        line.begin(&mut table, now);
+        line.looks = line.looks.map(|grid| crate::schedule::Grid::starting_at(now, grid.period()));
+        // Nobody has said that the port was gone, and its reply is not pending any more.
+        if was_waiting && !is_on_can {
+            self.sender.sent();
+        }
+    }
+}
+
+fn view_item<'v>(view: &'v mut View<'_>, line: &Line, nth: u8) -> Option<&'v Item> {
+    view.of(line).0.get(usize::from(nth))
+}
+
+/// What a frame says of the exchanges.
+#[derive(Clone, Copy)]
+enum Sign {
+    Nothing,
+    /// The request on its way is answered, with the code of a refusal.
+    Answer(Ended, u16),
+    /// Its peer is at it.
+    Pending,
+    ReplyOrEcho,
+    /// A late reply to an earlier request of this exchange, or its pending answer.
+    Late {
+        exchange: u8,
+        is_pending: bool,
+    },
+    Ambiguous,
+    /// A frame that nobody asked for, of this exchange.
+    Unasked(Option<u8>),
+}
+
+/// What a refusal means; on Modbus its code tells (docs/wire/modbus-rtu.md section 4).
+const fn refused_with(code: u8, is_modbus: bool) -> Ended {
+    match code {
+        5 if is_modbus => Ended::Accepted,
+        6 if is_modbus => Ended::Busy,
+        4 | 8 | 10 | 11 if is_modbus => Ended::Unclear,
+        _ => Ended::Refused,
+    }
+}
+
+/// The peer whose CANopen node says that it has booted: its object dictionary is asked with SDO in one of the exchanges.
+fn booted_peer(items: &[Item], table: &ExchangeTable<'_>, frame: &CanFrame) -> Option<u8> {
+    let (CanId::Standard(id @ 0x701..=0x77F), [0]) = (frame.id(), frame.data()) else { return None };
+    let sdo = CanId::Standard(id.wrapping_sub(0x100));
+    let is_of_node = |item: &Item| item.request.as_ref().is_some_and(|request| request.id == sdo);
+    let nth = items.iter().position(is_of_node)?;
+    table.rows.get(nth).map(|row| row.peer)
+}
+
+/// The code of an SDO abort, the low half, if the frame is one for the request on its way.
+fn sdo_abort(pending: &PendingReplies<'_>, frame: &CanFrame) -> Option<u16> {
+    let multiplexer = pending.flight?.sdo?;
+    let reply = pending.asked()?.reply.as_ref()?;
+    let &[0x80, a, b, c, low, high, _, _] = frame.data().first_chunk::<8>()? else { return None };
+    (frame.id() == reply.format.id && [a, b, c] == multiplexer).then_some(u16::from_le_bytes([low, high]))
+}
+
+/// Whether a reply to an earlier request of the same exchange may still come.
+fn is_outstanding(table: &ExchangeTable<'_>, flight: Flight, now: Instant) -> bool {
+    table.rows.get(usize::from(flight.exchange)).is_some_and(|row| row.is_outstanding(now))
+}
+
+/// Own bytes are heard, or are not: what was not confirmed for that reason is, or is written again.
+fn learn_echo(line: &mut Line, table: &mut ExchangeTable<'_>, has_echo: bool, now: Instant) {
+    if !line.learn_echo(has_echo) {
+        return;
+    }
+    // The answer to the request on its way tells what became of that.
+    let own = line.flight().map(|flight| usize::from(flight.exchange));
+    for nth in (0..table.rows.len()).filter(|nth| Some(*nth) != own) {
+        let Some(row) = table.rows.get_mut(nth) else { break };
+        let was_unconfirmed = core::mem::take(&mut row.is_unconfirmed);
+        if was_unconfirmed && has_echo && row.is_state() {
+            line.request(table, nth, now);
+        }
+    }
+}
+
+/// The request on its way is answered: counts it at its port and peer, and tells the events.
+fn answered(
+    line: &mut Line,
+    items: &mut [Item],
+    table: &mut ExchangeTable<'_>,
+    counters: &mut PortCounters,
+    (flight, times): (Flight, Times),
+    (ended, code): (Ended, u16),
+    now: Instant,
+) {
+    let is_refused = ended != Ended::Good;
+    if is_refused {
+        bump(&mut counters.refused);
+    }
+    if let Some(peer) = table.peer_of(flight) {
+        if is_refused {
+            bump(&mut peer.counters.refused);
+            peer.counters.refusal = code as u8;
+        } else {
+            bump(&mut peer.counters.replies);
+        }
+    }
+    let (ended, news) = line.answered(table, flight, ended, times, now);
+    let nth = usize::from(flight.exchange);
+    let mut events = Events { items, table, line, now };
+    events.note(nth, news);
+    events.ended(nth, flight.cause == Cause::Event, ended, code);
+}
+
+/// The peer is at it, and there.
+#[cold]
+#[inline(never)]
+fn goes_on(
+    line: &mut Line,
+    items: &mut [Item],
+    table: &mut ExchangeTable<'_>,
+    (flight, times): (Flight, Times),
+    now: Instant,
+) {
+    line.heard_pending(table, times.timeout, now);
+    let nth = usize::from(flight.exchange);
+    let Some(which) = table.rows.get(nth).map(|row| row.peer) else { return };
+    let news = line.turns(table, |turns| turns.heard(which, Some(nth), now));
+    Events { items, table, line, now }.note(nth, news);
+}
+
+/// Takes the values of a pending answer or a refusal, if it has any.
+#[cold]
+#[inline(never)]
+fn take_other(
+    frames: &mut Frames<'_>,
+    other: Option<&OtherFormat>,
+    texts: &[TextBind],
+    frame: &[u8],
+    accepted: &mut Accepted,
+) -> Result<(), Rejection> {
+    match other.and_then(|other| Some((&other.format, usize::from(other.slot?)))) {
+        Some((format, slot)) => frames.take_device(format, texts, frame, slot, accepted),
+        None => Ok(()),
+    }
+}
+
+/// Looks in a reply that was taken for the number that tells that its peer has restarted: it has, if the reply before had
+/// another one there. What is asked at its start is asked again.
+#[cold]
+#[inline(never)]
+fn look_for_restart(
+    line: &mut Line,
+    items: &mut [Item],
+    table: &mut ExchangeTable<'_>,
+    bindings: &[InputBind],
+    (exchange, data): (u8, &[u8]),
+    now: Instant,
+) {
+    let nth = usize::from(exchange);
+    let Some(Item { restart: Some(sign), reply: Some(reply), .. }) = items.get_mut(nth) else { return };
+    let fields = elements(reply.format.bindings.of(bindings));
+    let found = reply.format.layout.values(fields, data).nth(usize::from(sign.element));
+    let Some(Ok(Some(value))) = found else { return };
+    let is_there = value.as_f64() == sign.value;
+    if sign.was_there.replace(is_there) != Some(false) || !is_there {
+        return;
+    }
+    let Some(which) = table.rows.get(nth).map(|row| row.peer) else { return };
+    let own = line.flight().map(|flight| usize::from(flight.exchange)).filter(|own| *own == nth);
+    line.turns(table, |turns| {
+        // What its failures say is one start with this.
+        if turns.heard(which, own, now) != News::Started {
+            turns.started(which, own, now);
+        }
+    });
+    has_restarted(line, items, table, (nth, which), now);
+}
+
+/// The peer of this exchange has said that it has restarted, and its turns know it.
+fn has_restarted(
+    line: &mut Line,
+    items: &mut [Item],
+    table: &mut ExchangeTable<'_>,
+    (nth, which): (usize, u8),
+    now: Instant,
+) {
+    line.look(now);
+    let mut events = Events { items, table, line, now };
+    events.note(nth, News::Started);
+    // What it was to do, it has forgotten.
+    events.end_waiting(Some(which), Outcome::Away);
+}
+
+/// A frame that is no answer to the request on its way is a sign of life of its peer.
+fn signs(line: &mut Line, items: &mut [Item], table: &mut ExchangeTable<'_>, sign: Sign, now: Instant) {
+    let nth = match (sign, line.flight()) {
+        (Sign::Late { exchange, .. }, _) | (Sign::Unasked(Some(exchange)), _) => usize::from(exchange),
+        (Sign::Ambiguous, Some(flight)) => usize::from(flight.exchange),
+        _ => return,
+    };
+    let Some(row) = table.rows.get_mut(nth) else { return };
+    let which = row.peer;
+    if matches!(sign, Sign::Late { is_pending: false, .. }) {
+        row.late_reply_came();
+    }
+    if !matches!(sign, Sign::Unasked(_))
+        && let Some(peer) = table.peers.get_mut(usize::from(which))
+    {
+        bump(&mut peer.counters.late_replies);
+    }
+    // The peer has carried out what its late reply is to.
+    let own = matches!(sign, Sign::Late { is_pending: false, .. }).then_some(nth);
+    let news = line.turns(table, |turns| turns.heard(which, own, now));
+    line.look(now);
+    Events { items, table, line, now }.note(nth, news);
+}

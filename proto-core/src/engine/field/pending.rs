@@ -1,0 +1,223 @@
+//! What may come on a port with exchanges, and what a frame that came is.
+//!
+//! In: the request on its way, those whose replies may still come, and the frames that come unasked. Out: the frame's
+//! part in it. Applies nothing.
+
+use super::bindings::InputBind;
+use super::device::{DeviceFormat, better, elements, probe};
+use super::exchanges::{Asks, InputFormat, Item, OtherFormat};
+use super::line::{Flight, OwnRequest};
+use super::turns::Row;
+use crate::device::Probe;
+use crate::modbus::rtu::{self, Expected, REFUSAL_LEN};
+use crate::time::Instant;
+
+/// What a received frame is.
+pub(crate) enum Heard<'i> {
+    /// The echo of the own request.
+    Echo,
+    /// The pending reply; the data of a Modbus frame, or the frame.
+    Reply(Option<&'i InputFormat>),
+    /// The pending reply, or the echo of the own request.
+    ReplyOrEcho,
+    /// The device is at it; its answer follows.
+    Pending(&'i OtherFormat),
+    /// The device refuses the request; with a frame of its own.
+    Refusal(Option<&'i OtherFormat>),
+    /// A reply to an earlier request of this exchange that came too late, or its pending answer.
+    Late { exchange: u8, is_pending: bool },
+    /// An answer to one of several requests; nothing tells which.
+    Ambiguous,
+    /// A frame that comes unasked, its place in the store, and its exchange if it is of one.
+    Unasked(&'i DeviceFormat, usize, Option<u8>),
+}
+
+/// What may come now.
+#[derive(Clone, Copy)]
+pub(crate) struct PendingReplies<'i> {
+    /// The frames of the recipe's part.
+    pub formats: &'i [DeviceFormat],
+    pub first_frame: u8,
+    pub items: &'i [Item],
+    pub rows: &'i [Row],
+    pub flight: Option<Flight>,
+    /// The echo of the request that comes, or may come, before its reply.
+    pub echo: Option<OwnRequest>,
+    /// Whether it comes for sure.
+    pub has_echo: bool,
+    pub bindings: &'i [InputBind],
+    pub now: Instant,
+}
+
+impl<'i> PendingReplies<'i> {
+    pub(crate) fn asked(&self) -> Option<&'i Item> {
+        self.items.get(usize::from(self.flight?.exchange))
+    }
+
+    /// The reply of a Modbus slave that is pending.
+    pub(crate) fn expected(&self) -> Option<Expected> {
+        self.flight?.expected
+    }
+
+    /// Nothing but the own echo is pending.
+    fn waits_for_echo(&self) -> bool {
+        self.has_echo && self.echo.is_some()
+    }
+
+    /// The answers that a device's own frames are.
+    pub(crate) fn answers(&self) -> impl Iterator<Item = &'i DeviceFormat> {
+        self.asked().filter(|_| !self.waits_for_echo()).into_iter().flat_map(answers_of)
+    }
+
+    /// The exchanges whose replies may still come, but for the one that is on its way.
+    fn outstanding(&self) -> impl Iterator<Item = (u8, &'i Row, &'i Item)> {
+        let (own, now) = (self.flight.map(|flight| flight.exchange), self.now);
+        let all = (0_u8..).zip(self.rows).zip(self.items).map(|((nth, row), item)| (nth, row, item));
+        all.filter(move |(nth, row, _)| Some(*nth) != own && row.is_outstanding(now))
+    }
+
+    pub(crate) fn unasked(&self) -> impl Iterator<Item = (&'i DeviceFormat, usize, Option<u8>)> {
+        let part =
+            (usize::from(self.first_frame)..).zip(self.formats).map(|(slot, format)| (format, slot, None));
+        let others = (0_u8..).zip(self.items).filter(|(_, item)| matches!(item.asks, Asks::Nothing));
+        let others = others.filter_map(|(nth, item)| Some((nth, item.reply.as_ref()?)));
+        part.chain(others.map(|(nth, reply)| (&reply.format, usize::from(reply.slot), Some(nth))))
+    }
+
+    /// What bytes of a line are.
+    pub(crate) fn probe(&self, bytes: &[u8]) -> Probe {
+        let mut best = match self.expected().filter(|_| !self.waits_for_echo()) {
+            Some(expected) => probe_reply(&expected, bytes),
+            None => Probe::No(1),
+        };
+        if let Some(echo) = &self.echo {
+            best = if self.has_echo { echo.probe(bytes) } else { better(best, echo.probe(bytes)) };
+        }
+        for (_, row, _) in self.outstanding() {
+            if let Some(expected) = &row.expected {
+                best = better(best, right_reply(expected, bytes));
+            }
+        }
+        for format in self.all() {
+            best = better(best, probe(format, self.bindings, bytes));
+        }
+        let Probe::Other(_) = best else { return best };
+        // One of ours may begin with what is a shorter frame by chance: a byte that is the same as that of
+        // the shorter one's checksum goes on with a right checksum.
+        let begun = |format: &DeviceFormat| match probe(format, self.bindings, bytes) {
+            Probe::Partial(missing) => {
+                let fields = elements(format.bindings.of(self.bindings));
+                format.layout.agrees(fields, bytes).then_some(missing)
+            }
+            _ => None,
+        };
+        self.all().filter_map(begun).min().map_or(best, Probe::Partial)
+    }
+
+    /// The frames that may come, but for those of Modbus.
+    pub(crate) fn all(&self) -> impl Iterator<Item = &'i DeviceFormat> {
+        let late = self.outstanding().flat_map(|(_, _, item)| answers_of(item));
+        self.answers().chain(self.unasked().map(|(format, ..)| format)).chain(late)
+    }
+
+    /// What a frame of a line is that [`Self::probe`] has found.
+    pub(crate) fn heard(&self, frame: &[u8]) -> Option<Heard<'i>> {
+        let is = |format: &DeviceFormat| matches!(probe(format, self.bindings, frame), Probe::Frame(len) if len == frame.len());
+        let is_echo = self.echo.is_some_and(|echo| echo.probe(frame) == Probe::Frame(frame.len()));
+        if is_echo && self.has_echo {
+            return Some(Heard::Echo);
+        }
+        let answer = self.expected().filter(|_| !self.waits_for_echo()).and_then(|expected| {
+            match expected.probe(frame) {
+                rtu::Probe::Reply(_) => Some(Heard::Reply(self.asked()?.reply.as_ref())),
+                rtu::Probe::Refused(_) => Some(Heard::Refusal(None)),
+                _ => None,
+            }
+        });
+        let answer = answer.or_else(|| self.answer(is));
+        match answer {
+            Some(Heard::Reply(_)) if is_echo => return Some(Heard::ReplyOrEcho),
+            None if is_echo => return Some(Heard::Echo),
+            _ => {}
+        }
+        let is_right = |expected: &Expected| {
+            matches!(expected.probe(frame), rtu::Probe::Reply(_) | rtu::Probe::Refused(_))
+        };
+        self.classify(answer, is, |row| row.expected.as_ref().is_some_and(is_right)).or_else(|| {
+            let (format, slot, nth) = self.unasked().find(|(format, ..)| is(format))?;
+            Some(Heard::Unasked(format, slot, nth))
+        })
+    }
+
+    /// An answer, unless it may be a refusal of another request or its pending answer; else a late reply. Frames of a
+    /// device's own are told by `is`, those of Modbus by `is_expected`.
+    pub(crate) fn classify(
+        &self,
+        answer: Option<Heard<'i>>,
+        is: impl Fn(&DeviceFormat) -> bool,
+        is_expected: impl Fn(&Row) -> bool,
+    ) -> Option<Heard<'i>> {
+        if let Some(Heard::Reply(_)) = answer {
+            return answer;
+        }
+        let late = self.outstanding().find_map(|(exchange, row, item)| {
+            let found = place_of(item, &is);
+            let is_pending = found == Some(1);
+            (found.is_some() || is_expected(row)).then_some(Heard::Late { exchange, is_pending })
+        });
+        match answer {
+            Some(answer) => Some(if late.is_some() { Heard::Ambiguous } else { answer }),
+            None => late,
+        }
+    }
+
+    pub(crate) fn answer(&self, is: impl Fn(&DeviceFormat) -> bool) -> Option<Heard<'i>> {
+        let item = self.asked().filter(|_| !self.waits_for_echo())?;
+        match place_of(item, &is)? {
+            0 => Some(Heard::Reply(item.reply.as_ref())),
+            1 => item.pending.as_ref().map(Heard::Pending),
+            _ => Some(Heard::Refusal(item.refusal.as_ref())),
+        }
+    }
+}
+
+/// Which of its answers a frame is, in their order.
+fn place_of(item: &Item, is: &impl Fn(&DeviceFormat) -> bool) -> Option<u8> {
+    (0..3).find(|nth| answer_of(item, *nth).is_some_and(is))
+}
+
+/// The answers of an exchange with frames of the device's own, in the order in which they are looked for: its reply, its
+/// pending answer, its refusal.
+pub(crate) fn answers_of(item: &Item) -> impl Iterator<Item = &DeviceFormat> {
+    (0..3_u8).filter_map(|nth| answer_of(item, nth))
+}
+
+#[inline(never)]
+fn answer_of(item: &Item, nth: u8) -> Option<&DeviceFormat> {
+    if !matches!(item.asks, Asks::Frame | Asks::Remote { .. }) {
+        return None;
+    }
+    match nth {
+        0 => item.reply.as_ref().map(|reply| &reply.format),
+        1 => item.pending.as_ref().map(|pending| &pending.format),
+        _ => item.refusal.as_ref().map(|refusal| &refusal.format),
+    }
+}
+
+fn probe_reply(expected: &Expected, bytes: &[u8]) -> Probe {
+    match expected.probe(bytes) {
+        rtu::Probe::No => Probe::No(1),
+        rtu::Probe::Partial => Probe::Partial(1),
+        rtu::Probe::Reply(len) => Probe::Frame(len),
+        rtu::Probe::Refused(_) => Probe::Frame(REFUSAL_LEN),
+        rtu::Probe::Wrong => Probe::Wrong(expected.len_of(bytes)),
+    }
+}
+
+/// A late reply; one with a wrong checksum is nothing.
+fn right_reply(expected: &Expected, bytes: &[u8]) -> Probe {
+    match probe_reply(expected, bytes) {
+        Probe::Wrong(_) => Probe::No(1),
+        probe => probe,
+    }
+}

@@ -1,0 +1,240 @@
+//! The state link: the 10 Hz stream of port 2001, for variables that no faster source has.
+
+use heapless::Vec;
+
+use super::connection::Connection;
+use crate::config::StateValue;
+use crate::engine::counters::{LinkCounters, add, bump};
+use crate::engine::io::Transport;
+use crate::engine::values::store::Store;
+use crate::image::{GroupId, Image, InputSet, MAX_EXTRA};
+use crate::link::{LinkTimings, Supervisor};
+use crate::sysvar::{COUNT, SysVar};
+use crate::time::{Duration, Instant};
+use crate::wire::dialect::Dialect;
+use crate::wire::runs::{MAX_RUN, all_finite, copy};
+use crate::wire::scalar::{Scalar, ScalarType};
+use crate::wire::state::{StateStream, StateView};
+
+/// A stream that is silent for this long is reopened: twenty packets are missing.
+const SILENCE: Duration = Duration::from_secs(2);
+/// Misaligned packets in a row that end the connection (D8).
+const MISALIGNED_IN_A_ROW: u32 = 3;
+
+#[derive(Debug, Clone)]
+pub(crate) struct StateLink {
+    pub supervisor: Supervisor,
+    pub counters: LinkCounters,
+    port: u16,
+    pub dialect: Dialect,
+    pub group: GroupId,
+    stream: StateStream,
+    /// Variables that come from here.
+    pub shown: Vec<SysVar, COUNT>,
+    /// Input variables whose present value is read back while no port sends them.
+    pub read_back: InputSet,
+    /// The same for variables of whose bits each has its owner.
+    read_back_bits: InputSet,
+    /// Codes of mode, robot, program and safety in the newest packet.
+    pub codes: [u8; 4],
+    /// Other values of the packet that ports show.
+    pub kept: Vec<Kept, MAX_EXTRA>,
+}
+
+/// A value of the packet that is kept among the image's extra values.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Kept {
+    pub value: StateValue,
+    /// Its place among the extra values.
+    pub extra: u8,
+    /// Its place in the packet.
+    pub offset: u16,
+    pub ty: ScalarType,
+}
+
+impl Kept {
+    /// The value in a packet; not a number if it cannot be read.
+    fn read(&self, view: &StateView<'_>) -> f64 {
+        let bytes = view.as_bytes().get(usize::from(self.offset)..).unwrap_or(&[]);
+        let bytes = bytes.get(..self.ty.size()).unwrap_or(&[]);
+        Scalar::decode(self.ty, bytes).map_or(f64::NAN, |value| value.as_f64())
+    }
+}
+
+impl StateLink {
+    pub(crate) fn new(port: u16, dialect: Dialect, group: GroupId, read_back: InputSet) -> Self {
+        Self {
+            supervisor: Supervisor::new(const { &LinkTimings::TCP.with_silence(SILENCE) }),
+            counters: LinkCounters::default(),
+            port,
+            dialect,
+            group,
+            stream: StateStream::new(),
+            shown: Vec::new(),
+            read_back,
+            read_back_bits: InputSet::EMPTY,
+            codes: [0; 4],
+            kept: Vec::new(),
+        }
+    }
+
+    /// These variables have bits with owners.
+    pub(crate) fn share(&mut self, bytes: &InputSet) {
+        self.read_back_bits = self.read_back.and(bytes);
+        self.read_back = self.read_back.minus(bytes);
+    }
+
+    pub(crate) fn transport(&self) -> Transport {
+        Transport::Tcp { port: self.port }
+    }
+
+    /// Takes bytes that do not complete a packet: what is heard only makes deadlines later. `false` if
+    /// [`Connection::received`] has to read them, or nothing of this connection counts; then nothing was taken.
+    #[inline]
+    pub(crate) fn hold(&mut self, bytes: &[u8], now: Instant) -> bool {
+        if !self.supervisor.is_up() || !self.stream.hold(bytes) {
+            return false;
+        }
+        self.supervisor.heard(now);
+        add(&mut self.counters.bytes_in, bytes.len());
+        true
+    }
+}
+
+impl Connection for StateLink {
+    fn opened(&mut self, _store: &mut Store) {}
+
+    fn lost(&mut self, _store: &mut Store) {
+        // Half a packet is of no use.
+        self.stream.reset();
+    }
+
+    #[inline(never)]
+    fn received<'b>(&mut self, bytes: &'b [u8], store: &mut Store) -> &'b [u8] {
+        let mut rest = bytes;
+        while let Some(packet) = self.stream.next_packet(&mut rest) {
+            match packet {
+                Ok(view) => {
+                    bump(&mut self.counters.received);
+                    self.codes = view.state_codes();
+                    let not_live = self.read_back.minus(&store.live);
+                    let mut left = &self.shown[..];
+                    while let Some((run, behind)) = next_run(left) {
+                        left = behind;
+                        if take_run(run, &view, &mut store.image).is_none() {
+                            add(&mut self.counters.unreadable, take_each(run, &view, &mut store.image));
+                        }
+                    }
+                    if !self.kept.is_empty() {
+                        add(&mut self.counters.unreadable, keep(&self.kept, &view, &mut store.image));
+                    }
+                    for var in not_live.iter() {
+                        if view.read_var(var).is_some_and(|value| store.image.set(var, value).is_ok()) {
+                            store.read_back.insert(var);
+                        } else {
+                            // It is unknown, so it must not be written back.
+                            store.read_back.remove(var);
+                            if store.image.is_readable(var) {
+                                bump(&mut self.counters.unreadable);
+                            }
+                        }
+                    }
+                    if store.bits.is_used {
+                        read_bits(&view, &self.read_back_bits, store);
+                    }
+                    if !store.safe.is_empty() {
+                        compare_safe(&view, store);
+                    }
+                    store.heard();
+                    store.image.stamp(self.group, store.now);
+                    if store.watches_bits {
+                        return rest;
+                    }
+                }
+                Err(_) => bump(&mut self.counters.malformed),
+            }
+            if self.stream.misaligned_in_a_row() >= MISALIGNED_IN_A_ROW {
+                self.supervisor.give_up(store.now);
+                self.lost(store);
+                return &[];
+            }
+        }
+        &[]
+    }
+}
+
+/// The first variables that follow each other in the table, and so in the packet and in the image; at most what is
+/// copied at once.
+#[inline]
+fn next_run(shown: &[SysVar]) -> Option<(&[SysVar], &[SysVar])> {
+    let first = shown.first()?;
+    let most = first.left_in_row().min(MAX_RUN.checked_div(first.size()).unwrap_or(1));
+    let places = first.ordinal()..;
+    let len = shown.iter().zip(places).take(most).take_while(|(var, place)| var.ordinal() == *place).count();
+    shown.split_at_checked(len.max(1))
+}
+
+/// Copies a run of words or floats. `None`, with nothing changed, if its variables have to be looked at one by one:
+/// bits, a value that is not finite, or one before it that was not.
+#[inline]
+fn take_run(run: &[SysVar], view: &StateView<'_>, image: &mut Image) -> Option<()> {
+    let first = run.first()?;
+    if first.is_bits() || image.has_unreadable() {
+        return None;
+    }
+    let len = run.len().saturating_mul(first.size());
+    let from = view.as_bytes().get(usize::from(first.stream()?.offset)..)?.get(..len)?;
+    if first.ty() == ScalarType::Float && !all_finite(from) {
+        return None;
+    }
+    copy(image.bytes_mut().get_mut(first.image_offset()..)?.get_mut(..len)?, from);
+    Some(())
+}
+
+/// Takes a run's variables one by one; returns how many cannot be read.
+#[inline(never)]
+fn take_each(run: &[SysVar], view: &StateView<'_>, image: &mut Image) -> usize {
+    let is_unreadable =
+        |var: &&SysVar| !view.read_var(**var).is_some_and(|value| image.receive(**var, value));
+    run.iter().filter(is_unreadable).count()
+}
+
+/// Reads back the bits that none of our ports has sent.
+#[cold]
+#[inline(never)]
+fn read_bits(view: &StateView<'_>, bytes: &InputSet, store: &mut Store) {
+    for var in bytes.iter() {
+        if let Some(Scalar::Byte(shown)) = view.read_var(var) {
+            store.show_bits(var, shown);
+            store.read_back.insert(var);
+        }
+    }
+}
+
+/// Keeps the packet's other values that ports show; returns how many are unreadable. On its own, so
+/// that a gateway without them does not pay for its registers.
+#[inline(never)]
+fn keep(kept: &[Kept], view: &StateView<'_>, image: &mut Image) -> usize {
+    let unreadable = kept.iter().filter(|kept| !image.receive_extra(kept.extra, kept.read(view)));
+    unreadable.count()
+}
+
+/// Confirms safe values that the controller shows. A value shown by an old packet, or overwritten
+/// by late data, loses its confirmation.
+fn compare_safe(view: &StateView<'_>, store: &mut Store) {
+    let (may_confirm, may_unconfirm) = (store.may_confirm(), store.may_unconfirm());
+    for var in store.safe.iter() {
+        let Some(shown) = view.read_var(var) else { continue };
+        if store.bits.bytes.contains(var) {
+            let Scalar::Byte(shown) = shown else { continue };
+            store.compare_bits(var, shown, may_confirm, may_unconfirm);
+            continue;
+        }
+        let is_there = shown == store.image.value(var);
+        match store.unconfirmed.contains(var) {
+            true if is_there && may_confirm => store.confirm(&InputSet::from_iter([var])),
+            false if !is_there && may_unconfirm => store.unconfirm(var),
+            _ => {}
+        }
+    }
+}

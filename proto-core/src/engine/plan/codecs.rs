@@ -1,0 +1,83 @@
+//! The layouts of a port's recipe, from the configuration. Those of devices' frames are made in
+//! `device_port`.
+
+use super::error::BuildError;
+use crate::config::{CanFramePart, ConfigView, FieldSpec, Recipe, StreamPart};
+use crate::engine::field::port::Codec;
+use crate::recipe::model::{Framing, Rules};
+use crate::recipe::{CanLayout, Deframer, StreamLayout};
+use crate::sysvar::Direction;
+
+/// The layouts of a stream recipe, in the place of the port's.
+#[inline(never)]
+pub(crate) fn stream_codec(
+    config: ConfigView<'_>,
+    index: u8,
+    recipe: &Recipe,
+    [input, output]: [&Option<StreamPart>; 2],
+    codec: &mut Codec,
+) -> Result<(), BuildError> {
+    let layout = |part: &Option<StreamPart>, direction| {
+        stream_layout(config, index, recipe, part.as_ref(), direction, Framing::Bytes)
+    };
+    *codec = Codec::Stream { input: None, output: None, deframer: Deframer::new() };
+    if let Codec::Stream { input: own_input, output: own_output, .. } = codec {
+        *own_input = layout(input, Direction::Input)?;
+        *own_output = layout(output, Direction::Output)?;
+    }
+    Ok(())
+}
+
+/// The layout of one part, if there is one.
+pub(crate) fn stream_layout(
+    config: ConfigView<'_>,
+    index: u8,
+    recipe: &Recipe,
+    part: Option<&StreamPart>,
+    direction: Direction,
+    framing: Framing,
+) -> Result<Option<StreamLayout>, BuildError> {
+    let Some(part) = part else { return Ok(None) };
+    let rules = Rules { mode: recipe.mode, direction };
+    let fields = part.fields.of(config.fields).iter().filter_map(FieldSpec::field);
+    // One copy of the layout, where `map` and `map_err` would make two.
+    match StreamLayout::new(rules, &part.head, &part.tail, fields, framing) {
+        Ok(layout) => Ok(Some(layout)),
+        Err(error) => Err(BuildError::Part { recipe: index, part: direction, error }),
+    }
+}
+
+/// The layouts of a CAN recipe, in the place of the port's.
+#[inline(never)]
+pub(crate) fn can_codec(
+    config: ConfigView<'_>,
+    index: u8,
+    recipe: &Recipe,
+    [input, output]: [&[CanFramePart]; 2],
+    codec: &mut Codec,
+) -> Result<(), BuildError> {
+    let layout = |frames: &[CanFramePart], direction| {
+        if frames.is_empty() {
+            return Ok(None);
+        }
+        let frames = frames.iter().map(|frame| {
+            let fields = frame.fields.of(config.fields).iter().filter_map(FieldSpec::field);
+            (frame.id, fields)
+        });
+        match CanLayout::new(Rules { mode: recipe.mode, direction }, frames) {
+            Ok(layout) => Ok(Some(layout)),
+            Err(error) => Err(BuildError::Part { recipe: index, part: direction, error }),
+        }
+    };
+    *codec = Codec::Can { input: None, output: None };
+    if let Codec::Can { input: own_input, output: own_output } = codec {
+        *own_input = layout(input, Direction::Input)?;
+        *own_output = layout(output, Direction::Output)?;
+    }
+    Ok(())
+}
+
+/// The index of a recipe.
+pub(crate) fn index_of(config: ConfigView<'_>, recipe: &Recipe) -> u8 {
+    (0..).zip(config.recipes).find(|(_, other)| other.name == recipe.name).map_or(0, |(index, _)| index)
+}

@@ -1,0 +1,332 @@
+//! The exchanges of a port, from the configuration.
+
+use super::error::{BuildError, one_too_many};
+use crate::config::{
+    Bus, ConfigView, Counted, DeviceFrame, Echo, Exchange, FieldSpec, FrameSpec, OutcomeTo, Port, Recipe,
+    Span, Transaction, has_values,
+};
+use crate::device::{Carrier, LayoutError};
+use crate::engine::dispatch::EngineView;
+use crate::engine::field::bindings::{InputBind, InputTo};
+use crate::engine::field::device::DeviceFormat;
+use crate::engine::field::events::{Event, ReportedOutcome, Trigger};
+use crate::engine::field::exchanges::{Asks, InputFormat, Item, OtherFormat, Piece, RestartSign};
+use crate::engine::field::line::{Line, PeerCounters, PeerState, Times};
+use crate::engine::field::modbus_tcp::Transactions;
+use crate::engine::field::turns::{Row, RowKind, RowTimes, Turn};
+use crate::modbus::rtu::{BROADCAST, Timing};
+use crate::schedule::Grid;
+use crate::sysvar::Direction;
+use crate::time::{Duration, Instant};
+use crate::wire::can::CanId;
+use heapless::VecView;
+
+/// Where the next fields are among the bindings of their direction, and the next input frame in the
+/// store.
+pub(crate) struct Places {
+    pub inputs: u16,
+    pub outputs: u16,
+    pub slot: u8,
+}
+
+/// Makes the formats of one recipe's exchanges.
+struct Formats<'c> {
+    config: ConfigView<'c>,
+    recipe: u8,
+    places: Places,
+    /// Frames of each direction so far, for messages.
+    frames: [u8; 2],
+    /// The bindings of all ports, which refusals are added to.
+    refusals: &'c mut VecView<InputBind>,
+}
+
+// A frame under construction takes some kilobytes of stack: one at a time, each in a function of its own.
+impl Formats<'_> {
+    fn format(
+        &mut self,
+        part: Direction,
+        frame: Result<DeviceFrame, LayoutError>,
+        id: Option<CanId>,
+    ) -> Result<DeviceFormat, BuildError> {
+        let (next, nth) = match (part, &mut self.frames) {
+            (Direction::Input, [nth, _]) => (&mut self.places.inputs, nth),
+            (Direction::Output, [_, nth]) => (&mut self.places.outputs, nth),
+        };
+        let frame =
+            frame.map_err(|error| BuildError::Layout { recipe: self.recipe, part, frame: *nth, error })?;
+        let bindings = Span { start: *next, len: frame.elements.len() as u16 };
+        *next = next.saturating_add(bindings.len);
+        *nth = nth.saturating_add(1);
+        Ok(DeviceFormat { layout: frame.layout, id: id.unwrap_or(CanId::Standard(0)), bindings })
+    }
+
+    fn input(
+        &mut self,
+        frame: Result<DeviceFrame, LayoutError>,
+        id: Option<CanId>,
+    ) -> Result<InputFormat, BuildError> {
+        let format = self.format(Direction::Input, frame, id)?;
+        let slot = self.places.slot;
+        self.places.slot = slot.saturating_add(1);
+        Ok(InputFormat { format, slot })
+    }
+
+    /// A pending answer or a refusal. The fields of one without values are behind those of the recipe.
+    fn other(
+        &mut self,
+        frame: Result<DeviceFrame, LayoutError>,
+        id: Option<CanId>,
+        has_values: bool,
+    ) -> Result<OtherFormat, BuildError> {
+        if has_values {
+            let InputFormat { format, slot } = self.input(frame, id)?;
+            return Ok(OtherFormat { format, slot: Some(slot) });
+        }
+        let (recipe, part, [frames, _]) = (self.recipe, Direction::Input, self.frames);
+        let frame = frame.map_err(|error| BuildError::Layout { recipe, part, frame: frames, error })?;
+        let len = frame.elements.len() as u16;
+        let bindings = Span { start: self.refusals.len() as u16, len };
+        for &element in &frame.elements {
+            let bind = InputBind::new(InputTo::Unused, element);
+            self.refusals
+                .push(bind)
+                .map_err(|_| one_too_many(Counted::UserFields, self.refusals.capacity()))?;
+        }
+        let format = DeviceFormat { layout: frame.layout, id: id.unwrap_or(CanId::Standard(0)), bindings };
+        Ok(OtherFormat { format, slot: None })
+    }
+
+    /// The data of Modbus registers or coils that are sent.
+    #[inline(never)]
+    fn data_out(&mut self, span: Span) -> Result<Option<DeviceFormat>, BuildError> {
+        let fields: &[FieldSpec] = span.of(self.config.fields);
+        if fields.is_empty() {
+            return Ok(None);
+        }
+        let part = Direction::Output;
+        self.format(part, DeviceFrame::new(Carrier::Whole, part, (&[], &[]), fields), None).map(Some)
+    }
+
+    /// The same for those that are received.
+    #[inline(never)]
+    fn data_in(&mut self, span: Span) -> Result<Option<InputFormat>, BuildError> {
+        let fields: &[FieldSpec] = span.of(self.config.fields);
+        if fields.is_empty() {
+            return Ok(None);
+        }
+        let frame = DeviceFrame::new(Carrier::Whole, Direction::Input, (&[], &[]), fields);
+        self.input(frame, None).map(Some)
+    }
+
+    #[inline(never)]
+    fn request_of(&mut self, spec: &FrameSpec) -> Result<DeviceFormat, BuildError> {
+        self.format(Direction::Output, spec.layout(self.config, Direction::Output), spec.id)
+    }
+
+    #[inline(never)]
+    fn reply_of(&mut self, spec: &FrameSpec) -> Result<InputFormat, BuildError> {
+        self.input(spec.layout(self.config, Direction::Input), spec.id)
+    }
+
+    #[inline(never)]
+    fn other_of(&mut self, spec: &FrameSpec) -> Result<OtherFormat, BuildError> {
+        let has_values = has_values(spec.fields.of(self.config.fields));
+        self.other(spec.layout(self.config, Direction::Input), spec.id, has_values)
+    }
+
+    /// Bytes of a reply to a remote request.
+    #[inline(never)]
+    fn longest_of(&self, spec: &FrameSpec) -> usize {
+        spec.layout(self.config, Direction::Input).map_or(0, |frame| frame.layout.lengths().1)
+    }
+
+    #[inline(never)]
+    fn item(&mut self, exchange: &Exchange) -> Result<Item, BuildError> {
+        let mut item = Item {
+            asks: Asks::Nothing,
+            request: None,
+            reply: None,
+            pending: None,
+            refusal: None,
+            restart: None,
+            times: Times {
+                timeout: exchange.timeout,
+                pause: exchange.pause,
+                retries: [exchange.retries, exchange.event_retries],
+                is_answered: true,
+            },
+            on_change: exchange.when.change,
+            trigger: exchange.when.rising.map(Trigger::new),
+            stops: exchange.stop,
+            follow: exchange.follow,
+            window: Duration::ZERO,
+            event: Event::Over,
+            reported: ReportedOutcome::default(),
+            outcome: exchange.outcome,
+            is_news: exchange.outcome != OutcomeTo::NONE,
+            digest: None,
+            is_owed: false,
+            pieces: Span::default(),
+            is_written: false,
+        };
+        match exchange.transaction {
+            Transaction::Rtu { operation, written, read } => {
+                item.asks = Asks::Rtu { slave: exchange.peer, operation };
+                item.times.is_answered = exchange.peer != BROADCAST;
+                if !item.times.is_answered {
+                    // The slaves carry it out, and nobody says when they have.
+                    item.times.pause = exchange.pause + Timing::TURNAROUND;
+                }
+                item.request = self.data_out(written)?;
+                item.reply = self.data_in(read)?;
+            }
+            Transaction::Served { operation, written, read } => {
+                let (table, address, count) = operation.place();
+                item.asks = Asks::Served { table, address, count };
+                item.request = self.data_out(read)?;
+                item.reply = self.data_in(written)?;
+            }
+            Transaction::Frames { request, reply, refusal } => {
+                let config = self.config;
+                let frame = |nth: Option<u8>| config.frames.get(usize::from(nth?));
+                if let Some(request) = frame(request) {
+                    item.asks = match request.id {
+                        Some(id) if request.remote => {
+                            let len = frame(reply).map_or(0, |reply| self.longest_of(reply));
+                            Asks::Remote { id, len: len as u8 }
+                        }
+                        _ => Asks::Frame,
+                    };
+                    if matches!(item.asks, Asks::Frame) {
+                        item.request = Some(self.request_of(request)?);
+                    }
+                }
+                if let Some(reply) = frame(reply) {
+                    item.reply = Some(self.reply_of(reply)?);
+                }
+                for (from, to) in [(exchange.pending, &mut item.pending), (refusal, &mut item.refusal)] {
+                    if let Some(spec) = frame(from) {
+                        *to = Some(self.other_of(spec)?);
+                    }
+                }
+                item.times.is_answered = item.reply.is_some();
+            }
+        }
+        let fields = exchange.fields(self.config.frames, Direction::Input).unwrap_or_default();
+        item.restart = exchange.restarted.and_then(|of| RestartSign::new(of, fields.of(self.config.fields)));
+        Ok(item)
+    }
+}
+
+impl EngineView<'_> {
+    /// Adds the exchanges of a port, whose fields and input frames behind those of its parts are at
+    /// these places.
+    #[inline(never)]
+    pub(crate) fn add_exchanges(
+        &mut self,
+        config: ConfigView<'_>,
+        port: &Port,
+        recipe: &Recipe,
+        places: Places,
+    ) -> Result<Line, BuildError> {
+        let room = self.exchanges.written.len();
+        let full = || one_too_many(Counted::Exchanges, room);
+        let exchanges = config.exchanges_of(recipe);
+        let start = self.exchanges.items.len() as u16;
+        let first_peer = self.exchanges.peers.len();
+        let part_frames = |part| recipe.part_frames(part).count() as u8;
+        let frames = [part_frames(Direction::Input), part_frames(Direction::Output)];
+        let refusals = &mut *self.bindings.inputs;
+        let mut formats = Formats { config, recipe: port.recipe, places, frames, refusals };
+        // One that is asked at the start may have to wait for its values.
+        let may_wait = |exchange: &Exchange| {
+            exchange.when.start && exchange.fields(config.frames, Direction::Output).is_some()
+        };
+        let looks = exchanges.iter().any(|exchange| exchange.when.change || may_wait(exchange));
+        let looks = looks.then(|| Grid::starting_at(Instant::ZERO, port.cycle));
+        let line_of = match &port.bus {
+            Bus::Rs485(line) => Some(line),
+            _ => None,
+        };
+        let is_tcp = matches!(port.bus, Bus::ModbusTcp { .. });
+        let mut hears_unasked = part_frames(Direction::Input) > 0;
+        self.store.watches_bits |= exchanges.iter().any(|exchange| exchange.when.rising.is_some());
+        for (nth, exchange) in exchanges.iter().enumerate() {
+            let mut item = formats.item(exchange)?;
+            item.window = exchange.trigger(port.timeout);
+            item.follow = item.follow.or_else(|| step_before(exchanges, nth));
+            let request_len = match (item.asks, &item.request) {
+                (Asks::Rtu { operation, .. }, _) => operation.request_len(),
+                (Asks::Remote { .. }, _) | (_, None) => 0,
+                (_, Some(request)) => request.layout.lengths().1,
+            };
+            let kept = match (item.asks, &item.reply) {
+                (Asks::Served { .. }, Some(block)) => block.format.layout.lengths().1,
+                (Asks::Served { .. }, None) => 0,
+                // Escape bytes double a frame at most; there are none beside exchanges.
+                _ if exchange.is_event() => request_len,
+                _ => 0,
+            };
+            if kept > 0 {
+                let ends =
+                    self.exchanges.items.iter().map(|item| item.pieces.start.saturating_add(item.pieces.len));
+                let used = ends.max().unwrap_or(0);
+                let len = kept.div_ceil(size_of::<Piece>());
+                if usize::from(used).saturating_add(len) > room {
+                    return Err(one_too_many(Counted::WrittenPieces, room));
+                }
+                item.pieces = Span { start: used, len: len as u16 };
+            }
+            hears_unasked |= matches!(item.asks, Asks::Nothing);
+            let own = self.exchanges.peers.get(first_peer..).unwrap_or(&[]);
+            let peer = match own.iter().position(|peer| peer.number == exchange.peer) {
+                Some(peer) => peer,
+                None => {
+                    let peer = own.len();
+                    let counters = PeerCounters::default();
+                    let new = PeerState { number: exchange.peer, counters, turn: Turn::new(port.absent) };
+                    self.exchanges.peers.push(new).map_err(|_| full())?;
+                    peer
+                }
+            };
+            let on_line = |len: usize| line_of.map_or(Duration::ZERO, |line| line.time_on_line(len));
+            let cost = on_line(request_len) + exchange.timeout + exchange.pause;
+            let kind = RowKind {
+                is_answered: exchange.is_answered(),
+                starts: exchange.when.start,
+                is_state: !exchange.is_start_event()
+                    && (!exchange.is_event()
+                        || exchange.when.every.is_some()
+                        || exchange.when.change
+                        || exchange.when.start),
+                stops: exchange.stop,
+            };
+            let every = exchange.when.every;
+            let times = RowTimes { every, cost, timeout: exchange.timeout, late: exchange.late() };
+            let mut row = Row::new(peer as u8, kind, times);
+            // A transaction id tells all replies apart.
+            row.alike = if is_tcp { 0 } else { config.waits_for(recipe, exchange) };
+            self.exchanges.rows.push(row).map_err(|_| full())?;
+            self.exchanges.items.push(item).map_err(|_| full())?;
+        }
+        let peers = self.exchanges.peers.len().saturating_sub(first_peer) as u16;
+        let mut line = Line::new(
+            Span { start, len: exchanges.len() as u16 },
+            Span { start: first_peer as u16, len: peers },
+            looks,
+            line_of.map_or(Echo::No, |line| line.echo),
+        );
+        line.hears_unasked = hears_unasked;
+        line.transactions = is_tcp.then(Transactions::new);
+        Ok(line)
+    }
+}
+
+/// The step before an exchange that is triggered by the same bit as an earlier one of its peer: they are one dialogue.
+fn step_before(exchanges: &[Exchange], nth: usize) -> Option<u8> {
+    let own = exchanges.get(nth).filter(|own| own.when.rising.is_some() && !own.stop)?;
+    let is_step =
+        |other: &Exchange| other.peer == own.peer && other.when.rising == own.when.rising && !other.stop;
+    let before = exchanges.iter().take(nth).rposition(is_step)?;
+    Some(before as u8)
+}

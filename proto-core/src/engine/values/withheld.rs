@@ -1,0 +1,242 @@
+//! Fields that are rejected while the rest of their frame is accepted (docs/engine.md section 11): each grows old on its
+//! own, from its own last accepted value.
+//!
+//! In: which fields of an accepted frame were taken and which were not. Out: which variables, shares of bits and command
+//! fields are overdue. The variables of a rejected field leave the set of their frame and return to it with their next
+//! accepted value, so that frames that are accepted as a whole do not come here. Fields that were rejected at the same
+//! time after the same frame share a group.
+
+use super::bits::Bits;
+use super::store::Store;
+use crate::engine::link::command_tables::MAX_COMMAND_FIELDS;
+use crate::image::{GroupId, Image, InputSet, MAX_GROUPS, WITHHELD_GROUPS};
+use crate::time::{Instant, Stamp};
+
+/// Number of groups that still have their time.
+const WAITING: usize = WITHHELD_GROUPS - 2;
+/// The group of fields whose time is over and that have lost their own group to others: as old as the oldest of them.
+const LONG_AGO: GroupId = group_of(WAITING);
+/// The same of fields that have never had a value.
+const UNKNOWN: GroupId = group_of(WAITING + 1);
+
+const fn group_of(nth: usize) -> GroupId {
+    GroupId(MAX_GROUPS.saturating_add(nth) as u8)
+}
+
+fn place_of(group: GroupId) -> Option<usize> {
+    usize::from(group.0).checked_sub(MAX_GROUPS)
+}
+
+/// Fields of one frame.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct FieldSet {
+    /// The variables that they write as a whole.
+    pub whole: InputSet,
+    /// The bytes of which they write bits.
+    pub bits: InputSet,
+    /// The command fields, by their index.
+    pub commands: u16,
+}
+
+const _: () = assert!(MAX_COMMAND_FIELDS <= 16);
+
+impl FieldSet {
+    pub(crate) fn is_empty(&self) -> bool {
+        self.whole.is_empty() && self.bits.is_empty() && self.commands == 0
+    }
+
+    pub(crate) fn insert_command(&mut self, field: u8) {
+        self.commands |= 1_u16.checked_shl(field.into()).unwrap_or(0);
+    }
+}
+
+/// All of them.
+#[derive(Debug, Clone)]
+pub(crate) struct Withheld {
+    /// When each group is overdue; [`Instant::NEVER`] after that.
+    overdue_at: [Stamp; WAITING],
+    /// The frame of each group, by its index in the store.
+    frames: [u8; WAITING],
+    /// Of each command field that is rejected, one more than the number of its group; of others 0.
+    commands: [u8; MAX_COMMAND_FIELDS],
+    /// Whether there is any.
+    pub is_used: bool,
+}
+
+impl Withheld {
+    pub(crate) const fn new() -> Self {
+        Self {
+            overdue_at: [Stamp::NEVER; WAITING],
+            frames: [0; WAITING],
+            commands: [0; MAX_COMMAND_FIELDS],
+            is_used: false,
+        }
+    }
+
+    /// When the first of them is overdue.
+    pub(crate) fn deadline(&self) -> Instant {
+        self.overdue_at.iter().map(|at| at.get()).min().unwrap_or(Instant::NEVER)
+    }
+
+    /// All that are not overdue yet are.
+    pub(crate) fn all_overdue(&mut self) {
+        let waiting = self.overdue_at.iter_mut().filter(|at| **at != Stamp::NEVER);
+        waiting.for_each(|at| *at = Stamp::at(Instant::ZERO));
+    }
+
+    /// The groups, each with its frame.
+    pub(crate) fn groups(&self) -> impl Iterator<Item = (GroupId, u8)> + use<> {
+        (0..).map(group_of).zip(self.frames)
+    }
+
+    /// The first group that is overdue, with its frame; it is not overdue any more.
+    pub(crate) fn next_overdue(&mut self, now: Instant) -> Option<(GroupId, u8)> {
+        let (nth, at) = self.overdue_at.iter_mut().enumerate().find(|(_, at)| at.get() <= now)?;
+        *at = Stamp::NEVER;
+        Some((group_of(nth), self.frames.get(nth).copied()?))
+    }
+
+    /// A command field of a group that is overdue; it is not withheld any more.
+    pub(crate) fn next_command(&mut self, now: Instant) -> Option<u8> {
+        let overdue_at = self.overdue_at;
+        let is_overdue = |group: u8| {
+            let nth = place_of(GroupId(group.checked_sub(1)?))?;
+            overdue_at.get(nth).filter(|at| at.get() <= now)
+        };
+        let (field, group) =
+            (0..).zip(&mut self.commands).find(|(_, group)| is_overdue(**group).is_some())?;
+        *group = 0;
+        Some(field)
+    }
+
+    fn command_groups(&self) -> impl Iterator<Item = GroupId> + '_ {
+        self.commands.iter().filter_map(|group| group.checked_sub(1)).map(GroupId)
+    }
+
+    /// The group for fields of this frame whose last value came at `since`; `None` if all are in use by fields that still
+    /// have their time.
+    fn group(
+        &mut self,
+        (frame, since): (u8, Option<Instant>),
+        overdue_at: Instant,
+        image: &mut Image,
+        bits: &mut Bits,
+    ) -> Option<GroupId> {
+        let mut used = [false; WAITING];
+        let in_use = image.withheld().iter().filter_map(|var| image.group(var)).chain(bits.withheld_groups());
+        for group in in_use.chain(self.command_groups()) {
+            if let Some(is_used) = place_of(group).and_then(|nth| used.get_mut(nth)) {
+                *is_used = true;
+            }
+        }
+        let overdue_at = Stamp::at(overdue_at);
+        let all = || (0..).map(group_of).zip(self.overdue_at).zip(self.frames).zip(used);
+        let same = all().find(|&(((group, at), of), is_used)| {
+            is_used && (at, of, image.stamp_of(group)) == (overdue_at, frame, since)
+        });
+        if let Some((((group, _), _), _)) = same {
+            return Some(group);
+        }
+        let free = all().find(|(_, is_used)| !is_used).map(|(((group, _), _), _)| group);
+        let group = match free {
+            Some(group) => group,
+            None => {
+                // Those whose time is over do not need to know when it began.
+                let over = all().filter(|(((_, at), _), _)| *at == Stamp::NEVER);
+                let over = over.map(|(((group, _), _), _)| (image.stamp_of(group), group));
+                let (stamp, group) = over.min_by_key(|(stamp, _)| stamp.unwrap_or(Instant::ZERO))?;
+                let bin = if stamp.is_some() { LONG_AGO } else { UNKNOWN };
+                if let Some(at) = stamp {
+                    let is_empty =
+                        members(image, bin).is_empty() && bits.withheld_groups().all(|own| own != bin);
+                    let before = image.stamp_of(bin).filter(|_| !is_empty);
+                    image.stamp(bin, before.map_or(at, |before| before.min(at)));
+                }
+                members(image, group).iter().for_each(|var| image.assign(var, bin));
+                bits.regroup(group, bin);
+                group
+            }
+        };
+        image.stamp(group, since.unwrap_or(Instant::NEVER));
+        let nth = place_of(group)?;
+        if let (Some(at), Some(of)) = (self.overdue_at.get_mut(nth), self.frames.get_mut(nth)) {
+            (*at, *of) = (overdue_at, frame);
+        }
+        Some(group)
+    }
+}
+
+/// The variables of a group.
+pub(crate) fn members(image: &Image, group: GroupId) -> InputSet {
+    image.withheld().iter().filter(|&var| image.group(var) == Some(group)).collect()
+}
+
+impl Store {
+    /// These fields of a frame that is accepted are rejected: from now on they grow old on their own. Whether there is room;
+    /// if not, nothing has changed.
+    #[cold]
+    #[inline(never)]
+    pub(crate) fn withhold(&mut self, nth: usize, rejected: &FieldSet) -> bool {
+        let now = self.now;
+        let Some(frame) = self.frames.get_mut(nth) else { return false };
+        let id = nth as u8;
+        let since = self.image.stamp_of(GroupId(id));
+        let overdue_at = match since {
+            Some(at) if frame.overdue_at != Instant::NEVER => at + frame.timeout,
+            // It was overdue together with its frame.
+            Some(_) => Instant::NEVER,
+            None if frame.overdue_at == Instant::ZERO => Instant::ZERO,
+            // It has never had a value; this is the first frame that should have brought one.
+            None => now + frame.timeout,
+        };
+        let whole = rejected.whole.and(&frame.set).minus(&self.bits.bytes);
+        let has_bits = self.bits.has_unwithheld(id, &rejected.bits);
+        // A command field without a value has no base that it could lose.
+        let has_commands = since.is_some() && overdue_at != Instant::NEVER;
+        let is_command = move |(field, group): &(u32, &mut u8)| {
+            has_commands && **group == 0 && rejected.commands.checked_shr(*field).unwrap_or(0) & 1 == 1
+        };
+        let has_commands = (0..).zip(&mut self.withheld.commands).any(|command| is_command(&command));
+        if !whole.is_empty() || has_bits || has_commands {
+            let group = self.withheld.group((id, since), overdue_at, &mut self.image, &mut self.bits);
+            let Some(group) = group else { return false };
+            frame.set = frame.set.minus(&whole);
+            whole.iter().for_each(|var| self.image.withhold(var, group));
+            self.bits.withhold(id, &rejected.bits, group);
+            let commands = (0..).zip(&mut self.withheld.commands).filter(is_command);
+            commands.for_each(|(_, own)| *own = group.0.saturating_add(1));
+            self.next_overdue.or_earlier(overdue_at);
+        }
+        self.withheld.is_used = true;
+        true
+    }
+
+    /// These fields of a frame are accepted, perhaps again: they have its age.
+    #[cold]
+    #[inline(never)]
+    pub(crate) fn readmit(&mut self, nth: usize, taken: &FieldSet) {
+        let Some(frame) = self.frames.get_mut(nth) else { return };
+        let id = nth as u8;
+        for var in taken.whole.and(&self.image.withheld()).iter() {
+            frame.set.insert(var);
+            self.image.readmit(var, GroupId(id));
+        }
+        self.bits.readmit(id, &taken.bits);
+        for (field, group) in (0..).zip(&mut self.withheld.commands) {
+            if taken.commands.checked_shr(field).unwrap_or(0) & 1 == 1 {
+                *group = 0;
+            }
+        }
+        for nth in 0..WAITING {
+            let group = group_of(nth);
+            let is_empty = members(&self.image, group).is_empty()
+                && self.bits.withheld_groups().chain(self.withheld.command_groups()).all(|own| own != group);
+            if let Some(at) = self.withheld.overdue_at.get_mut(nth).filter(|_| is_empty) {
+                *at = Stamp::NEVER;
+            }
+        }
+        self.withheld.is_used = !self.image.withheld().is_empty()
+            || self.bits.withheld_groups().next().is_some()
+            || self.withheld.command_groups().next().is_some();
+    }
+}
