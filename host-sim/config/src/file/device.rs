@@ -20,43 +20,9 @@ use super::model::{
 use super::reader::{Result, Spot, TableReader, TableValue};
 use super::{input_rules, rtu_frames, sendable};
 use crate::device::{DeviceField, DeviceRecipe, ExchangeKind, FrameEnds, NamedExchange, NamedFrame};
-use crate::keys::field::{self, FILL, OVERFLOW, PAD};
+use crate::keys::field::{self, EQUALS, FILL, OVERFLOW, PAD};
 use crate::keys::frame::{OF_FRAME, OF_STREAM};
 use crate::keys::{Key, names};
-
-/// The keys of a field or what stands in its place, which no controller's recipe has.
-const OWN_KEYS: [&str; 30] = [
-    "equals",
-    "overflow",
-    "counter",
-    "pad",
-    "fill",
-    "text",
-    "length_to",
-    "count_to",
-    "length_from",
-    "order",
-    "ignore",
-    "length",
-    "counts",
-    "plus",
-    "endian",
-    "word_order",
-    "bits",
-    "signed",
-    "new",
-    "width",
-    "until",
-    "decimals",
-    "min",
-    "max",
-    "outside",
-    "map",
-    "as",
-    "no_value",
-    "valid_to",
-    "point",
-];
 
 /// Why recipes of this kind have no frames of devices; `None` if they may.
 fn why_plain(mode: Mode, flavour: Flavour) -> Option<&'static str> {
@@ -135,7 +101,7 @@ impl FieldReader {
             Direction::Output => " in an output field",
         };
         if let Some(why) = why_plain(Mode::User, self.flavour) {
-            refuse(&table, &OWN_KEYS, why)?;
+            refuse(&table, &names(field::OWN.iter().copied().flatten()), why)?;
             table.check_keys(&[field::PLAIN.common], when)?;
             push(self.read_plain(&table)?);
             return Ok(());
@@ -235,26 +201,7 @@ pub(super) fn binding_keys(table: &TableReader<'_>, direction: Direction) -> Res
 }
 
 fn refuse_bindings(table: &TableReader<'_>) -> Result<()> {
-    let bindings = [
-        "to",
-        "commands",
-        "when",
-        "base",
-        "idle",
-        "scale",
-        "offset",
-        "overflow",
-        "counter",
-        "min",
-        "max",
-        "outside",
-        "map",
-        "as",
-        "no_value",
-        "valid_to",
-        "point",
-        "restarted",
-    ];
+    let bindings = names(field::BOUND_IN.iter().chain([&OVERFLOW]).filter(|key| key.name != EQUALS.name));
     refuse(table, &bindings, "a field with equals is a constant and has nothing else")
 }
 

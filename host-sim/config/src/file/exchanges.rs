@@ -21,23 +21,8 @@ use super::model::{
 };
 use super::reader::{Result, Spot, TableReader, TableValue};
 use crate::device::ExchangeKind;
-use crate::keys::exchange;
 use crate::keys::frame::OF_FRAME;
-
-/// The keys of [`AskTiming`].
-const TIMING_KEYS: [&str; 11] = [
-    "every_ms",
-    "on",
-    "timeout_ms",
-    "retries",
-    "pause_ms",
-    "trigger_ms",
-    "late_ms",
-    "stop",
-    "name",
-    "follow",
-    "outcome",
-];
+use crate::keys::{self, exchange};
 
 /// The exchanges of a stream or CAN recipe.
 pub(super) fn read_all(recipe: &TableReader<'_>, mode: Mode, is_can: bool) -> Result<Vec<FileExchange>> {
@@ -85,7 +70,11 @@ fn read(table: &TableReader<'_>, is_can: bool, names: &[Option<String>]) -> Resu
         (None, _, Some((part, _))) | (_, None, Some((part, _))) => {
             return Err(part.spot.error(table.document, ExchangeError::LoneRefusal));
         }
-        (None, ..) => refuse(table, &TIMING_KEYS, "there is no request to send; allowed: reply, peer")?,
+        (None, ..) => refuse(
+            table,
+            &keys::names(exchange::TIMING.iter()),
+            "there is no request to send; allowed: reply, peer",
+        )?,
         (Some(_), None, _) => {
             refuse(table, &["timeout_ms", "retries", "late_ms", "stop"], "there is no reply to wait for")?;
         }

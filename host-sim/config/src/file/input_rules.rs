@@ -13,15 +13,13 @@ use super::model::{FileInput, WrittenField};
 use super::names::meant_variable;
 use super::reader::{Result, Spot, TableReader, TableValue};
 use super::sendable::{add_entry, read_limits};
-use crate::keys::field::{AS, POINT, RESTARTED};
+use crate::keys::field::{AS, POINT, RESTARTED, RULES_IN};
+use crate::keys::names;
 
 /// The words of `as`.
 pub(crate) const AS_WORDS: [(&str, InputRule); 1] = [("int16", InputRule::Int16)];
 /// The words of `point`.
 pub(crate) const POINTS: [(&str, Option<InputRule>); 2] = [(".", None), (",", Some(InputRule::Comma))];
-
-/// All of these keys.
-pub(super) const KEYS: [&str; 8] = ["as", "min", "max", "outside", "map", "no_value", "valid_to", "point"];
 
 /// What stands behind an input field, with the places of their keys.
 pub(super) fn read(
@@ -34,9 +32,12 @@ pub(super) fn read(
         FileInput::Variable { var, .. } => var,
         FileInput::Bit(_) => {
             let why = "not allowed for a bit: it is off for 0 and on for any other value";
-            return refuse(table, &KEYS, why).map(|()| Vec::new());
+            return refuse(table, &names(RULES_IN.iter()), why).map(|()| Vec::new());
         }
-        _ => return refuse(table, &KEYS, "allowed only together with to").map(|()| Vec::new()),
+        _ => {
+            return refuse(table, &names(RULES_IN.iter()), "allowed only together with to")
+                .map(|()| Vec::new());
+        }
     };
     if overflow == Overflow::Wrap {
         let why = "not allowed together with overflow = \"wrap\", which takes any number";
