@@ -9,7 +9,7 @@ use super::exchange::{Exchange, FrameSpec, Transaction, has_values};
 use super::exchange_builder::{ExchangeBuilder, ExchangeFrame, TransactionDraft, of_block};
 use super::fields::{Fields, Var};
 use super::view::ConfigMut;
-use super::{Delimiter, ExchangeError, FieldSpec, OutcomeTo, Span, Triggers};
+use super::{Delimiter, ExchangeError, FieldSpec, OutcomeTo, Span};
 use crate::device::{Bits, ByteOrder, Encoding, Kind as EncodingKind, Overflow};
 use crate::modbus::rtu::{Operation, Table};
 use crate::recipe::model::MAX_DELIMITER;
@@ -45,43 +45,13 @@ impl ConfigMut<'_> {
         for (nth, ask) in asks.iter().enumerate() {
             let at = |key| Place::Exchange { recipe, exchange: nth as u8, key };
             let (transaction, pending) = self.transaction(recipe, ask, &at, &mut frames)?;
-            let mut when = Triggers { rising: None, ..ask.when };
+            let variable = |key| move |error| ConfigError { place: at(key), kind: Kind::Variable(error) };
+            let mut exchange = Exchange { transaction, pending, ..ask.exchange };
             if let Some((var, bit)) = ask.rising {
-                let place = at(ExchangeKey::Rising);
-                let var = var.read().map_err(|error| ConfigError { place, kind: Kind::Variable(error) })?;
-                when.rising = Some((var, bit));
+                exchange.when.rising = Some((var.read().map_err(variable(ExchangeKey::Rising))?, bit));
             }
-            let ExchangeBuilder {
-                peer,
-                timeout,
-                retries,
-                pause,
-                trigger,
-                late,
-                stop,
-                follow,
-                overdue,
-                restarted,
-                ..
-            } = *ask;
-            let outcome = outcome(&ask.outcome).map_err(|error| ConfigError {
-                place: at(ExchangeKey::Outcome),
-                kind: Kind::Variable(error),
-            })?;
-            let exchange = Exchange {
-                timeout,
-                pause,
-                trigger,
-                late,
-                stop,
-                follow,
-                overdue,
-                outcome,
-                pending,
-                restarted,
-                ..Exchange::new(peer, transaction, when)
-            };
-            let _ = self.exchanges.push(exchange.repeated(retries));
+            exchange.outcome = outcome(&ask.outcome).map_err(variable(ExchangeKey::Outcome))?;
+            let _ = self.exchanges.push(exchange.repeated(ask.retries));
         }
         Ok(Span::between(start, self.exchanges.len()))
     }

@@ -4,7 +4,7 @@
 //! is that of the file (docs/configuration.md). [`Recipe::user`](super::Recipe::user) takes them with
 //! [`RecipeBuilder::exchanges`](super::RecipeBuilder::exchanges).
 
-use super::exchange::{DEFAULT_REPLY_TIMEOUT, Restarted, Triggers};
+use super::exchange::{Exchange, Restarted, Transaction, Triggers};
 use super::fields::{Fields, InputField, OutputField, Var};
 use crate::device::Encoding;
 use crate::modbus::rtu::{Operation, Table};
@@ -52,21 +52,13 @@ use crate::wire::scalar::ScalarType;
 /// ```
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ExchangeBuilder<'a> {
-    pub(super) peer: u8,
+    /// As in the configuration, still without what the fields below decide.
+    pub(super) exchange: Exchange,
     pub(super) transaction: TransactionDraft<'a>,
-    pub(super) when: Triggers,
-    pub(super) rising: Option<(Var<'a>, u8)>,
-    pub(super) timeout: Duration,
     pub(super) retries: Option<u8>,
-    pub(super) pause: Duration,
-    pub(super) trigger: Option<Duration>,
-    pub(super) late: Option<Duration>,
-    pub(super) stop: bool,
-    pub(super) follow: Option<u8>,
-    pub(super) overdue: Option<Duration>,
+    pub(super) rising: Option<(Var<'a>, u8)>,
     pub(super) outcome: [Option<Var<'a>>; 3],
     pub(super) pending: Option<ExchangeFrame<'a>>,
-    pub(super) restarted: Option<Restarted>,
 }
 
 /// Operations have counts of 0 here.
@@ -209,24 +201,9 @@ impl<'a> ExchangeBuilder<'a> {
     }
 
     const fn new(peer: u8, transaction: TransactionDraft<'a>) -> Self {
-        let (when, timeout, pause) = (Triggers::NEVER, DEFAULT_REPLY_TIMEOUT, Duration::ZERO);
-        Self {
-            peer,
-            transaction,
-            when,
-            rising: None,
-            timeout,
-            retries: None,
-            pause,
-            trigger: None,
-            late: None,
-            stop: false,
-            follow: None,
-            overdue: None,
-            outcome: [None; 3],
-            pending: None,
-            restarted: None,
-        }
+        let none = Transaction::Frames { request: None, reply: None, refusal: None };
+        let exchange = Exchange::new(peer, none, Triggers::NEVER);
+        Self { exchange, transaction, retries: None, rising: None, outcome: [None; 3], pending: None }
     }
 
     /// What answers the request. No effect on Modbus, whose replies are known.
@@ -256,31 +233,31 @@ impl<'a> ExchangeBuilder<'a> {
     /// The device has restarted when this field of the reply, counted from 0 without padding and texts, becomes `value`:
     /// what is asked at its start is asked again.
     pub const fn restarted(mut self, field: u8, value: f64) -> Self {
-        self.restarted = Some(Restarted { field, value });
+        self.exchange.restarted = Some(Restarted { field, value });
         self
     }
 
     /// The device of an exchange with frames of its own; exchanges of one device share its presence.
     pub const fn peer(mut self, peer: u8) -> Self {
-        self.peer = peer;
+        self.exchange.peer = peer;
         self
     }
 
     /// Asked with this period, up to an hour.
     pub const fn every(mut self, period: Duration) -> Self {
-        self.when.every = Some(period);
+        self.exchange.when.every = Some(period);
         self
     }
 
     /// Asked at the start, and again when the device has started anew.
     pub const fn at_start(mut self) -> Self {
-        self.when.start = true;
+        self.exchange.when.start = true;
         self
     }
 
     /// Asked when a value of the request has changed.
     pub const fn on_change(mut self) -> Self {
-        self.when.change = true;
+        self.exchange.when.change = true;
         self
     }
 
@@ -292,7 +269,7 @@ impl<'a> ExchangeBuilder<'a> {
 
     /// How long the reply may take, from the end of the request to its own end; 100 ms by default.
     pub const fn timeout(mut self, timeout: Duration) -> Self {
-        self.timeout = timeout;
+        self.exchange.timeout = timeout;
         self
     }
 
@@ -305,33 +282,33 @@ impl<'a> ExchangeBuilder<'a> {
 
     /// How long after an event it may be sent, up to 10 s; by default the timeout of the port, at most 1 s.
     pub const fn trigger(mut self, trigger: Duration) -> Self {
-        self.trigger = Some(trigger);
+        self.exchange.trigger = Some(trigger);
         self
     }
 
     /// How long after its request a reply may come; by default three timeouts, at least 1 s. Until then nothing is asked
     /// of the device whose reply could be taken for it.
     pub const fn late(mut self, late: Duration) -> Self {
-        self.late = Some(late);
+        self.exchange.late = Some(late);
         self
     }
 
     /// It stops its device: it goes first, cancels the device's events, and is repeated until it is confirmed.
     pub const fn stops(mut self) -> Self {
-        self.stop = true;
+        self.exchange.stop = true;
         self
     }
 
     /// Sent after the good answer of this exchange of the recipe, counted from 0.
     pub const fn follows(mut self, exchange: u8) -> Self {
-        self.follow = Some(exchange);
+        self.exchange.follow = Some(exchange);
         self
     }
 
     /// When the values of the reply are overdue; [`Port::NEVER`](super::Port::NEVER) for a reply that comes only when
     /// something happens. By default the timeout of the port.
     pub const fn overdue(mut self, overdue: Duration) -> Self {
-        self.overdue = Some(overdue);
+        self.exchange.overdue = Some(overdue);
         self
     }
 
@@ -356,7 +333,7 @@ impl<'a> ExchangeBuilder<'a> {
 
     /// How long the line rests after it, up to 10 s; not at all by default.
     pub const fn pause(mut self, pause: Duration) -> Self {
-        self.pause = pause;
+        self.exchange.pause = pause;
         self
     }
 
