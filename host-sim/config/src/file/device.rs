@@ -461,7 +461,8 @@ impl FileRecipe {
     }
 
     fn named_exchange(&self, exchange: &FileExchange) -> NamedExchange {
-        let FileExchange { peer, kind, output, input, pending, refusal, remote, .. } = exchange;
+        let FileExchange { settings, kind, output, input, pending, refusal, remote, .. } = exchange;
+        let peer = settings.peer;
         let frame = |part: &Option<FilePart>| {
             part.as_ref().and_then(|part| Some(self.named_frame(part, part.frames.first()?)))
         };
@@ -469,14 +470,14 @@ impl FileRecipe {
         let [request, reply, refusal] = match kind {
             ExchangeKind::Frames => [frame(output), frame(input), frame(refusal)],
             ExchangeKind::Master(operation) => {
-                rtu_frames::frames(*peer, operation, &fields(output), &fields(input))
+                rtu_frames::frames(peer, operation, &fields(output), &fields(input))
             }
             ExchangeKind::Slave(operation) => {
-                rtu_frames::frames(*peer, operation, &fields(input), &fields(output))
+                rtu_frames::frames(peer, operation, &fields(input), &fields(output))
             }
         };
         let pending = frame(pending);
-        NamedExchange { peer: *peer, kind: *kind, request, reply, pending, refusal, remote: *remote }
+        NamedExchange { peer, kind: *kind, request, reply, pending, refusal, remote: *remote }
     }
 }
 

@@ -3,9 +3,7 @@
 //! In: the tables of a gateway file's recipe. Out: [`FileExchange`]s, whose frames were laid out. The
 //! frames here are a device's own; those of Modbus are in `modbus`.
 
-use proto_core::config::{
-    DEFAULT_REPLY_TIMEOUT, ExchangeError, ExchangeKey, OutcomeTo, Port, Restarted, Triggers,
-};
+use proto_core::config::{Exchange, ExchangeError, ExchangeKey, OutcomeTo, Port, Restarted, Triggers};
 use proto_core::device::{Boundary, Carrier, Element};
 use proto_core::recipe::model::{Mode, Rules};
 use proto_core::sysvar::{Direction, SysVar, VarBit};
@@ -16,8 +14,7 @@ use super::bindings;
 use super::encoding::refuse;
 use super::frames::{read_bytes, read_fields, read_id};
 use super::model::{
-    AskTiming, FileExchange, FileField, FileFieldKind, FileFrame, FileInput, FilePart, Flavour, FrameOrder,
-    Sending,
+    FileExchange, FileField, FileFieldKind, FileFrame, FileInput, FilePart, Flavour, FrameOrder, Sending,
 };
 use super::reader::{Result, Spot, TableReader, TableValue};
 use crate::device::ExchangeKind;
@@ -80,13 +77,12 @@ fn read(table: &TableReader<'_>, is_can: bool, names: &[Option<String>]) -> Resu
         }
         _ => {}
     }
-    let timing = AskTiming::read(table, names)?;
-    let overdue = match table.optional("reply") {
-        Some(reply) => read_overdue(&reply.any_table()?, "timeout_ms")?,
-        None => None,
-    };
+    let (mut settings, retries) = read_settings(table, peer, names)?;
+    if let Some(reply) = table.optional("reply") {
+        settings.overdue = read_overdue(&reply.any_table()?, "timeout_ms")?;
+    }
     if request.is_some() {
-        timing.check_asked(table)?;
+        check_asked(table, &settings)?;
     }
     for (part, _) in [&pending, &refusal].into_iter().flatten() {
         check_refusal(table, part)?;
@@ -101,24 +97,21 @@ fn read(table: &TableReader<'_>, is_can: bool, names: &[Option<String>]) -> Resu
             ("refusal", ExchangeKey::Refusal),
         ],
     );
-    let restarted = restarted(table, reply.as_ref().map(|(part, _)| part), &mut spots)?;
+    settings.restarted = restarted(table, reply.as_ref().map(|(part, _)| part), &mut spots)?;
     let remote = request.as_ref().is_some_and(|(_, remote)| *remote);
     let [output, input, pending, refusal] = [request, reply, pending, refusal].map(|frame| Some(frame?.0));
-    let kind = ExchangeKind::Frames;
     Ok(FileExchange {
         spot: table.spot.clone(),
         spots,
-        peer,
-        kind,
+        settings,
+        retries,
+        kind: ExchangeKind::Frames,
         output,
         input,
         pending,
         refusal,
         is_can,
         remote,
-        overdue,
-        restarted,
-        timing,
     })
 }
 
@@ -281,53 +274,38 @@ impl FileFrame {
     }
 }
 
-impl AskTiming {
-    /// Of what is never asked.
-    pub(super) const NEVER: Self = Self {
-        when: Triggers::NEVER,
-        timeout: DEFAULT_REPLY_TIMEOUT,
-        retries: None,
-        pause: Duration::ZERO,
-        trigger: None,
-        late: None,
-        stop: false,
-        follow: None,
-        outcome: OutcomeTo::NONE,
-    };
-
-    /// `names` are those of all exchanges of the recipe.
-    pub(super) fn read(table: &TableReader<'_>, names: &[Option<String>]) -> Result<Self> {
-        let mut when = Triggers { every: table.time(&exchange::EVERY)?, ..Triggers::NEVER };
-        if let Some(on) = table.optional("on") {
-            let list = on.array("such as [\"start\", \"change\"]")?;
-            if list.is_empty() {
-                return Err(
-                    on.error("an empty list; allowed: \"start\", \"change\", \"rising:BitOutputReg[3].0\"")
-                );
-            }
-            list.iter().try_for_each(|item| read_on(item, &mut when))?;
+/// When an exchange is asked, how long it may take, and how often it is repeated; `names` are those of all exchanges of
+/// the recipe.
+pub(super) fn read_settings(
+    table: &TableReader<'_>,
+    peer: u8,
+    names: &[Option<String>],
+) -> Result<(Exchange, Option<u8>)> {
+    let mut settings = FileExchange::never(peer);
+    settings.when.every = table.time(&exchange::EVERY)?;
+    if let Some(on) = table.optional("on") {
+        let list = on.array("such as [\"start\", \"change\"]")?;
+        if list.is_empty() {
+            return Err(
+                on.error("an empty list; allowed: \"start\", \"change\", \"rising:BitOutputReg[3].0\"")
+            );
         }
-        Ok(Self {
-            when,
-            timeout: table.time_or(&exchange::TIMEOUT)?,
-            retries: table.integer(&exchange::RETRIES)?,
-            pause: table.time_or(&exchange::PAUSE)?,
-            trigger: table.time(&exchange::TRIGGER)?,
-            late: table.time(&exchange::LATE)?,
-            stop: table.flag(&exchange::STOP)?,
-            follow: table.optional("follow").map(|item| read_follow(&item, names)).transpose()?,
-            outcome: table.optional("outcome").map_or(Ok(OutcomeTo::NONE), |item| read_outcome(&item))?,
-        })
+        list.iter().try_for_each(|item| read_on(item, &mut settings.when))?;
     }
+    settings.timeout = table.time_or(&exchange::TIMEOUT)?;
+    let retries = table.integer(&exchange::RETRIES)?;
+    settings.pause = table.time_or(&exchange::PAUSE)?;
+    settings.trigger = table.time(&exchange::TRIGGER)?;
+    settings.late = table.time(&exchange::LATE)?;
+    settings.stop = table.flag(&exchange::STOP)?;
+    settings.follow = table.optional("follow").map(|item| read_follow(&item, names)).transpose()?;
+    settings.outcome = table.optional("outcome").map_or(Ok(OutcomeTo::NONE), |item| read_outcome(&item))?;
+    Ok((settings, retries))
+}
 
-    /// Refuses a request that is never sent.
-    pub(super) fn check_asked(&self, table: &TableReader<'_>) -> Result<()> {
-        if self.when.is_never() && self.follow.is_none() {
-            Err(table.error(ExchangeError::Never))
-        } else {
-            Ok(())
-        }
-    }
+/// Refuses a request that is never sent.
+pub(super) fn check_asked(table: &TableReader<'_>, settings: &Exchange) -> Result<()> {
+    if settings.is_never() { Err(table.error(ExchangeError::Never)) } else { Ok(()) }
 }
 
 /// The number of the exchange with a name.

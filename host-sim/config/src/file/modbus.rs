@@ -13,7 +13,7 @@ use super::coils;
 use super::device::FieldReader;
 use super::encoding::refuse;
 use super::exchanges;
-use super::model::{AskTiming, FileExchange, FileField, FileFrame, FilePart};
+use super::model::{FileExchange, FileField, FileFrame, FilePart};
 use super::reader::{Result, TableReader, TableValue};
 use crate::device::ExchangeKind;
 use crate::keys::{self, exchange};
@@ -145,19 +145,20 @@ fn read_exchange(table: &TableReader<'_>, names: &[Option<String>]) -> Result<Fi
     }
     let operation = function.operation((first, count(&read)), (write_first, count(&write)), mask);
     check(table, &operation, &read, &write)?;
-    let timing = AskTiming::read(table, names)?;
+    let (mut settings, retries) = exchanges::read_settings(table, peer, names)?;
     if !function.reads() {
         refuse(table, &["expect", "overdue_ms"], "this function writes only; its reply has no values")?;
     }
-    let overdue = exchanges::read_overdue(table, "overdue_ms")?;
-    timing.check_asked(table)?;
+    settings.overdue = exchanges::read_overdue(table, "overdue_ms")?;
+    exchanges::check_asked(table, &settings)?;
     let mut spots =
         exchanges::spots(table, &[("slave", ExchangeKey::Peer), ("address", ExchangeKey::Registers)]);
-    let restarted = exchanges::restarted(table, read.as_ref().map(|list| &list.part), &mut spots)?;
+    settings.restarted = exchanges::restarted(table, read.as_ref().map(|list| &list.part), &mut spots)?;
     Ok(FileExchange {
         spot: table.spot.clone(),
         spots,
-        peer,
+        settings,
+        retries,
         kind: ExchangeKind::Master(operation),
         output: write.map(|list| list.part),
         input: read.map(|list| list.part),
@@ -165,9 +166,6 @@ fn read_exchange(table: &TableReader<'_>, names: &[Option<String>]) -> Result<Fi
         refusal: None,
         is_can: false,
         remote: false,
-        overdue,
-        restarted,
-        timing,
     })
 }
 
@@ -201,7 +199,8 @@ fn read_block(table: &TableReader<'_>, peer: u8) -> Result<FileExchange> {
     Ok(FileExchange {
         spot: table.spot.clone(),
         spots: exchanges::spots(table, &[("address", ExchangeKey::Registers)]),
-        peer,
+        settings: FileExchange::never(peer),
+        retries: None,
         kind: ExchangeKind::Slave(operation),
         output,
         input,
@@ -209,9 +208,6 @@ fn read_block(table: &TableReader<'_>, peer: u8) -> Result<FileExchange> {
         refusal: None,
         is_can: false,
         remote: false,
-        overdue: None,
-        restarted: None,
-        timing: AskTiming::NEVER,
     })
 }
 

@@ -3,12 +3,11 @@
 //! It knows neither the keys nor how they are read.
 
 use proto_core::config::{
-    ExchangeKey, FieldSpec, InputBinding, OnStale, OutcomeTo, OutputBinding, Restarted, SendOn, Triggers,
+    Exchange, ExchangeKey, FieldSpec, InputBinding, OnStale, OutputBinding, SendOn, Transaction, Triggers,
 };
 use proto_core::device::{Boundary, Checksum, Encoding, Escape, Kind, Overflow};
 use proto_core::recipe::model::{Field, Mode};
 use proto_core::sysvar::{SysVar, VarBit};
-use proto_core::time::Duration;
 use proto_core::wire::can::CanId;
 use proto_core::wire::scalar::ScalarType;
 
@@ -219,7 +218,9 @@ pub(super) struct FileExchange {
     pub(super) spot: Spot,
     /// The places of its keys, for later checks.
     pub(super) spots: Vec<(ExchangeKey, Spot)>,
-    pub(super) peer: u8,
+    /// As in the configuration, but for its frames and repetitions.
+    pub(super) settings: Exchange,
+    pub(super) retries: Option<u8>,
     pub(super) kind: ExchangeKind,
     /// What goes to the device. Of Modbus: its registers or coils only, without a frame around them.
     pub(super) output: Option<FilePart>,
@@ -231,24 +232,17 @@ pub(super) struct FileExchange {
     pub(super) is_can: bool,
     /// The request is a remote frame on CAN.
     pub(super) remote: bool,
-    /// When the values of its reply are overdue.
-    pub(super) overdue: Option<Duration>,
-    /// What in its reply tells that the device has restarted.
-    pub(super) restarted: Option<Restarted>,
-    pub(super) timing: AskTiming,
 }
 
-/// When an exchange is asked, and how long it may take.
-pub(super) struct AskTiming {
-    pub(super) when: Triggers,
-    pub(super) timeout: Duration,
-    pub(super) retries: Option<u8>,
-    pub(super) pause: Duration,
-    pub(super) trigger: Option<Duration>,
-    pub(super) late: Option<Duration>,
-    pub(super) stop: bool,
-    pub(super) follow: Option<u8>,
-    pub(super) outcome: OutcomeTo,
+impl FileExchange {
+    /// Settings of what is never asked.
+    pub(super) const fn never(peer: u8) -> Exchange {
+        Exchange::new(
+            peer,
+            Transaction::Frames { request: None, reply: None, refusal: None },
+            Triggers::NEVER,
+        )
+    }
 }
 
 /// The binding of an input field.

@@ -20,21 +20,8 @@ impl Builder<'_> {
                 self.spots.insert(place, spot.clone());
             }
             let (transaction, pending) = self.transaction(recipe, exchange, &mut numbers)?;
-            let timing = &exchange.timing;
-            let added = Exchange {
-                timeout: timing.timeout,
-                pause: timing.pause,
-                trigger: timing.trigger,
-                late: timing.late,
-                stop: timing.stop,
-                follow: timing.follow,
-                overdue: exchange.overdue,
-                outcome: timing.outcome,
-                pending,
-                restarted: exchange.restarted,
-                ..Exchange::new(exchange.peer, transaction, timing.when)
-            };
-            if self.config.exchanges.push(added.repeated(timing.retries)).is_err() {
+            let added = Exchange { transaction, pending, ..exchange.settings };
+            if self.config.exchanges.push(added.repeated(exchange.retries)).is_err() {
                 return Err(self.too_many(exchange));
             }
         }
