@@ -186,14 +186,16 @@ impl ConfigMut<'_> {
         part: Direction,
         from: &PartFields<'_>,
     ) -> Result<Option<StreamPart>, ConfigError> {
-        let PartFields::Stream { head, tail, fields } = from else { return Ok(None) };
+        let PartFields::Stream { head, tail, fields, ends } = from else { return Ok(None) };
         let place = Place::Part { recipe, part };
         let bytes = |bytes: &[u8]| {
             let too_long = Kind::TooLong { len: bytes.len(), longest: MAX_DELIMITER };
             Delimiter::from_slice(bytes).map_err(|_| ConfigError { place, kind: too_long })
         };
         let (head, tail) = (bytes(head)?, bytes(tail)?);
-        Ok(Some(StreamPart::new(head, tail, self.fields_of_part(recipe, part, 0, fields)?)))
+        let fields = self.fields_of_part(recipe, part, 0, fields)?;
+        let (framing, escape) = *ends;
+        Ok(Some(StreamPart { framing, escape, ..StreamPart::new(head, tail, fields) }))
     }
 
     fn can_part(

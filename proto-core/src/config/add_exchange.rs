@@ -98,6 +98,22 @@ impl ConfigMut<'_> {
                 let (written, read) = if part == Direction::Input { (span, none) } else { (none, span) };
                 Ok((Transaction::Served { operation, written, read }, None))
             }
+            &TransactionDraft::Packed { operation, is_served, written, read } => {
+                let (of_written, of_read) = match is_served {
+                    true => (Direction::Input, Direction::Output),
+                    false => (Direction::Output, Direction::Input),
+                };
+                let mut add = |fields: &[FieldSpec], part| match fields {
+                    [] => Ok(Span::default()),
+                    _ => self.fields_of_part(recipe, part, frames.next(part), &fields.into()),
+                };
+                let (written, read) = (add(written, of_written)?, add(read, of_read)?);
+                let transaction = match is_served {
+                    true => Transaction::Served { operation, written, read },
+                    false => Transaction::Rtu { operation, written, read },
+                };
+                Ok((transaction, None))
+            }
             TransactionDraft::Frames([request, reply, refusal]) => {
                 let all = [
                     (request, Direction::Output, ExchangeKey::Request),

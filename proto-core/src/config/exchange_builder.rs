@@ -4,7 +4,8 @@
 //! is that of the file (docs/configuration.md). [`Recipe::user`](super::Recipe::user) takes them with
 //! [`RecipeBuilder::exchanges`](super::RecipeBuilder::exchanges).
 
-use super::exchange::{Exchange, Restarted, Transaction, Triggers};
+use super::FieldSpec;
+use super::exchange::{Exchange, OutcomeTo, Restarted, Transaction, Triggers};
 use super::fields::{Fields, InputField, OutputField, Var};
 use crate::device::Encoding;
 use crate::modbus::rtu::{Operation, Table};
@@ -73,6 +74,13 @@ pub(super) enum TransactionDraft<'a> {
         table: Table,
         address: u16,
         fields: Fields<'a>,
+    },
+    /// As in the configuration, with counts.
+    Packed {
+        operation: Operation,
+        is_served: bool,
+        written: &'a [FieldSpec],
+        read: &'a [FieldSpec],
     },
     /// A request, a reply and a refusal.
     Frames([Option<ExchangeFrame<'a>>; 3]),
@@ -182,14 +190,35 @@ impl<'a> ExchangeBuilder<'a> {
         Self::new(own, TransactionDraft::Served { table, address, fields: fields.into() })
     }
 
+    /// Registers or coils as the configuration has them: with the counts of `operation`, and coils packed into bytes. Of
+    /// the gateway as a slave if `is_served`.
+    pub const fn packed(
+        peer: u8,
+        operation: Operation,
+        is_served: bool,
+        (written, read): (&'a [FieldSpec], &'a [FieldSpec]),
+    ) -> Self {
+        Self::new(peer, TransactionDraft::Packed { operation, is_served, written, read })
+    }
+
     /// A request of a device's own; of device 0, unless [`Self::peer`] says otherwise.
     pub fn request(request: ExchangeFrame<'a>) -> Self {
-        Self::new(0, TransactionDraft::Frames([Some(request), None, None]))
+        Self::frames(Some(request), None, None, None)
     }
 
     /// A frame that may come at any time.
     pub fn unasked(frame: ExchangeFrame<'a>) -> Self {
-        Self::new(0, TransactionDraft::Frames([None, Some(frame), None]))
+        Self::frames(None, Some(frame), None, None)
+    }
+
+    /// Frames of a device's own: a request, its reply, a pending answer and a refusal.
+    pub fn frames(
+        request: Option<ExchangeFrame<'a>>,
+        reply: Option<ExchangeFrame<'a>>,
+        pending: Option<ExchangeFrame<'a>>,
+        refusal: Option<ExchangeFrame<'a>>,
+    ) -> Self {
+        Self { pending, ..Self::new(0, TransactionDraft::Frames([request, reply, refusal])) }
     }
 
     fn read(slave: u8, operation: Operation, fields: &'a [InputField<'a>]) -> Self {
@@ -204,6 +233,13 @@ impl<'a> ExchangeBuilder<'a> {
         let none = Transaction::Frames { request: None, reply: None, refusal: None };
         let exchange = Exchange::new(peer, none, Triggers::NEVER);
         Self { exchange, transaction, retries: None, rising: None, outcome: [None; 3], pending: None }
+    }
+
+    /// Takes everything but the frames from an exchange, and the repetitions as [`Self::retries`] does.
+    pub fn settings(self, exchange: Exchange, retries: Option<u8>) -> Self {
+        let OutcomeTo { to, code_to, count_to } = exchange.outcome;
+        let outcome = [to, code_to, count_to].map(|var| var.map(Var::Var));
+        Self { exchange, retries, outcome, rising: None, ..self }
     }
 
     /// What answers the request. No effect on Modbus, whose replies are known.
@@ -339,26 +375,27 @@ impl<'a> ExchangeBuilder<'a> {
 
     /// Whether its frames are on a CAN bus.
     pub(super) fn is_can(&self) -> bool {
-        self.frames().any(|frame| frame.id.is_some())
+        self.all_frames().any(|frame| frame.id.is_some())
     }
 
     /// The frames of a device's own.
-    pub(super) fn frames(&self) -> impl Iterator<Item = &ExchangeFrame<'a>> {
+    pub(super) fn all_frames(&self) -> impl Iterator<Item = &ExchangeFrame<'a>> {
         let frames = match &self.transaction {
             TransactionDraft::Frames(frames) => &frames[..],
-            TransactionDraft::Rtu { .. } | TransactionDraft::Served { .. } => &[],
+            _ => &[],
         };
         frames.iter().chain([&self.pending]).flatten()
     }
 
     /// All lists of fields.
-    pub(super) fn fields(&self) -> impl Iterator<Item = &Fields<'a>> {
-        let own = match &self.transaction {
-            TransactionDraft::Rtu { written, read, .. } => [written.as_ref(), read.as_ref()],
+    pub(super) fn fields(&self) -> impl Iterator<Item = Fields<'a>> {
+        let own = match self.transaction {
+            TransactionDraft::Rtu { written, read, .. } => [written, read],
             TransactionDraft::Served { fields, .. } => [Some(fields), None],
+            TransactionDraft::Packed { written, read, .. } => [written, read].map(|specs| Some(specs.into())),
             TransactionDraft::Frames(_) => [None; 2],
         };
-        own.into_iter().flatten().chain(self.frames().map(|frame| &frame.fields))
+        own.into_iter().flatten().chain(self.all_frames().map(|frame| frame.fields))
     }
 }
 
