@@ -12,7 +12,7 @@ use super::draft::{
 };
 use super::error::{ConfigError, ConfigErrorKind as Kind, ControllerKey, Counted, Place, PortKey, RecipeKey};
 use super::exchange_builder::ExchangeBuilder;
-use super::fields::{CanFields, Does, Entries, Fields, InputField, OutputField, Sends, plain};
+use super::fields::{CanFields, Does, Entries, Fields, InputField, OutputField, Sends};
 use super::rules::{check_bit, check_name, check_room, text};
 use super::view::ConfigMut;
 use super::{
@@ -271,10 +271,7 @@ impl ConfigMut<'_> {
                     InputBinding::Commands { table: self.add_commands(entries, idle)?, when }
                 }
             };
-            Ok(match plain(encoding, overflow) {
-                Some(ty) => FieldSpec::UserInput { ty, to },
-                None => FieldSpec::DeviceInput { encoding, overflow, to },
-            })
+            Ok(FieldSpec::input(encoding, overflow, to))
         })
     }
 
@@ -389,10 +386,7 @@ fn output_spec(field: &OutputField<'_>) -> Result<FieldSpec, Kind> {
             }
             Sends::Link { link, scale, offset } => OutputBinding::Link { link, scale, offset },
         };
-        Ok(match plain(encoding, overflow) {
-            Some(ty) => FieldSpec::UserOutput { ty, from },
-            None => FieldSpec::DeviceOutput { encoding, overflow, from },
-        })
+        Ok(FieldSpec::output(encoding, overflow, from))
     })
 }
 

@@ -3,7 +3,9 @@
 //! In: the tables of a gateway file's recipe. Out: [`FileExchange`]s, whose frames were laid out. The
 //! frames here are a device's own; those of Modbus are in `modbus`.
 
-use proto_core::config::{Exchange, ExchangeError, ExchangeKey, OutcomeTo, Port, Restarted, Triggers};
+use proto_core::config::{
+    Exchange, ExchangeError, ExchangeKey, InputBinding, OutcomeTo, Port, Restarted, Triggers,
+};
 use proto_core::device::{Boundary, Carrier, Element};
 use proto_core::recipe::model::{Mode, Rules};
 use proto_core::sysvar::{Direction, SysVar, VarBit};
@@ -13,9 +15,7 @@ use proto_core::wire::can::CanId;
 use super::bindings;
 use super::encoding::refuse;
 use super::frames::{read_bytes, read_fields, read_id};
-use super::model::{
-    FileExchange, FileField, FileFieldKind, FileFrame, FileInput, FilePart, Flavour, FrameOrder, Sending,
-};
+use super::model::{FileExchange, FileField, FileFrame, FilePart, Flavour, FrameOrder, Sending};
 use super::reader::{Result, Spot, TableReader, TableValue};
 use crate::device::ExchangeKind;
 use crate::keys::frame::OF_FRAME;
@@ -160,7 +160,7 @@ pub(super) fn restarted(
         matches!(field.spec().element(), Some(Element::Value { .. } | Element::Fixed { .. }))
     };
     let numbers = reply.fields().iter().filter(has_number).enumerate();
-    let mut found = numbers.filter_map(|(nth, field)| Some((nth, field.restarted()?)));
+    let mut found = numbers.filter_map(|(nth, field)| Some((nth, field.restarted.as_ref()?)));
     let Some((nth, (spot, value))) = found.next() else { return Ok(None) };
     if let Some((_, (other, _))) = found.next() {
         return Err(other.error(table.document, "another field of the reply has restarted; one tells it"));
@@ -172,7 +172,7 @@ pub(super) fn restarted(
 /// Elsewhere nothing tells of a restart.
 pub(super) fn refuse_restarted(table: &TableReader<'_>, part: Option<&FilePart>) -> Result<()> {
     let fields = part.into_iter().flat_map(|part| part.frames.iter().flat_map(|frame| &frame.fields));
-    match fields.filter_map(FileField::restarted).next() {
+    match fields.filter_map(|field| field.restarted.as_ref()).next() {
         Some((spot, _)) => Err(spot.error(table.document, ExchangeError::RestartedNothing)),
         None => Ok(()),
     }
@@ -223,8 +223,8 @@ fn read_frame(
 fn check_refusal(table: &TableReader<'_>, part: &FilePart) -> Result<()> {
     refuse_restarted(table, Some(part))?;
     let is_other = |field: &&FileField| {
-        let FileFieldKind::UserInput { to, .. } = &field.kind else { return false };
-        matches!(to, FileInput::Commands(_) | FileInput::Counter { .. })
+        let is_counter = |to: InputBinding| matches!(to, InputBinding::Counter { .. });
+        field.named.commands.is_some() || field.spec().target().is_some_and(is_counter)
     };
     match part.fields().iter().find(is_other) {
         Some(field) => Err(field.spot.error(table.document, ExchangeError::RefusalValues)),
@@ -250,15 +250,6 @@ impl FilePart {
     /// The fields, if it is the frame of an exchange.
     pub(super) fn fields(&self) -> &[FileField] {
         self.frames.first().map_or(&[], |frame| &frame.fields)
-    }
-}
-
-impl FileField {
-    fn restarted(&self) -> Option<&(Spot, f64)> {
-        match &self.kind {
-            FileFieldKind::UserInput { restarted, .. } => restarted.as_ref(),
-            _ => None,
-        }
     }
 }
 

@@ -8,8 +8,8 @@ use proto_core::config::{
 use proto_core::recipe::model::Mode;
 use proto_core::sysvar::Direction;
 
-use super::super::commands::FileCommand;
-use super::super::model::{FileExchange, FileField, FileInput, FilePart, FileRecipe};
+use super::super::model::{FileExchange, FileField, FilePart, FileRecipe};
+use super::super::reader::Spot;
 use super::super::{FileError, sources};
 use super::{Assembly, Result};
 use crate::device::ExchangeKind;
@@ -93,35 +93,23 @@ impl Assembly<'_> {
     }
 
     fn field_spec(&mut self, field: &FileField) -> Result<FieldSpec> {
-        let mut added = Ok(());
-        let spec = field.bound_spec(|to| match to {
-            FileInput::Commands(commands) => {
-                let start = self.config.commands.len() as u16;
-                added = commands.entries.iter().try_for_each(|entry| self.add_command(entry));
-                let table = Span { start, len: commands.entries.len() as u16 };
-                InputBinding::Commands { table, when: commands.when }
+        let mut spec = field.spec();
+        if let (Some(commands), Some(to)) = (&field.named.commands, spec.target_mut()) {
+            let start = self.config.commands.len() as u16;
+            for (entry, spot) in commands.entries.iter().zip(&field.commands) {
+                self.add_command(entry, spot)?;
             }
-            _ => to.without_commands(),
-        });
-        added?;
-        match field.port_named() {
-            Some((binding, name, spot)) => {
-                let from = sources::of_port(binding, name, &self.port_names)
-                    .map_err(|message| self.error(spot, message))?;
-                Ok(match spec {
-                    FieldSpec::UserOutput { ty, .. } => FieldSpec::UserOutput { ty, from },
-                    FieldSpec::DeviceOutput { encoding, overflow, .. } => {
-                        FieldSpec::DeviceOutput { encoding, overflow, from }
-                    }
-                    other => other,
-                })
-            }
-            None => Ok(spec),
+            let table = Span { start, len: commands.entries.len() as u16 };
+            *to = InputBinding::Commands { table, when: commands.when };
         }
+        if let (Some(name), Some(spot), Some(from)) = (&field.named.of_port, &field.port, spec.source_mut()) {
+            *from = sources::of_port(*from, name, &self.port_names)
+                .map_err(|message| self.error(spot, message))?;
+        }
+        Ok(spec)
     }
 
-    fn add_command(&mut self, command: &FileCommand) -> Result<()> {
-        let FileCommand { spot, first, last, text } = command;
+    fn add_command(&mut self, (first, last, text): &(i64, i64, String), spot: &Spot) -> Result<()> {
         let Ok(bounded) = heapless::String::try_from(text.as_str()) else {
             let message = format!("the command has {} bytes; at most {MAX_COMMAND_TEXT}", text.len());
             return Err(self.error(spot, message));
