@@ -9,6 +9,7 @@ use proto_core::config::{
 };
 use proto_core::recipe::model::Framing;
 use proto_core::sysvar::VarBit;
+use proto_core::time::Duration;
 use proto_core::wire::dialect::Dialect;
 
 use super::FileError;
@@ -150,31 +151,17 @@ impl Assembly<'_> {
         }
         let bus = read_bus(table, kind)?;
         let item = table.required("recipe", "the name of a recipe of this file")?;
-        let recipe = recipes::find(recipes, &item)?;
-        if let Some(recipe) = recipes.get(recipe) {
-            kind.check_modbus(recipe).map_err(|message| item.error(message))?;
-        }
+        let recipe = &recipes[recipes::find(recipes, &item)?];
+        kind.check_modbus(recipe).map_err(|message| item.error(message))?;
         // The check of the whole configuration refuses kinds of recipes that the bus does not take.
-        let is_byte_stream = matches!(kind, BusKind::Rs485 | BusKind::TcpListen);
-        if let Some(recipe) = recipes.get(recipe).filter(|recipe| is_byte_stream && !recipe.is_can()) {
+        if matches!(kind, BusKind::Rs485 | BusKind::TcpListen) && !recipe.is_can() {
             recipe.check_framing(Framing::Bytes).map_err(|message| item.error(message))?;
         }
-        let of = recipes.get(recipe).map_or("", |recipe| &recipe.name);
-        let mut port = Port::on(&name, of, bus).cycle(read_cycle(table)?);
-        let timeout = table.optional("timeout_ms");
-        port =
-            port.timeout(match timeout.as_ref().and_then(|item| item.as_string().map(|word| (item, word))) {
-                Some((_, "never")) => Port::NEVER,
-                Some((item, _)) => {
-                    return Err(
-                        item.error("expected a number or \"never\", for a device that sends only events")
-                    );
-                }
-                None => table.time_or(&TIMEOUT)?,
-            });
-        port = port.stale_after(table.time_or(&STALE_AFTER)?);
+        let mut port = Port::on(&name, &recipe.name, bus).cycle(read_cycle(table)?);
+        port = port.timeout(read_timeout(table)?).stale_after(table.time_or(&STALE_AFTER)?);
         let safe = read_safe_values(table)?;
-        let values: Vec<_> = safe.iter().map(|(name, value, ..)| (*name, *value)).collect();
+        let values: Vec<_> =
+            safe.iter().map(|value| (value.name, value.number().unwrap_or(f64::NAN))).collect();
         port = port.safe(&values[..]);
         if table.flag(&SAFE_AT_START)? {
             port = port.safe_at_start();
@@ -186,49 +173,73 @@ impl Assembly<'_> {
         if let Some(item) = table.optional("health") {
             port = port.health(sources::read_health(&item)?);
         }
-        let before = self.config.safe_values.len();
-        self.safe_values.extend(safe.iter().map(|(.., item)| item.spot.clone()));
+        let first = self.config.safe_values.len();
+        self.safe_values.extend(safe.iter().map(|value| value.item.spot.clone()));
         self.config.add_port(&port).map(|_| ()).map_err(|error| {
             let entry = match (error.place, error.kind) {
                 (_, ConfigErrorKind::TooMany { what: Counted::SafeValues, .. }) => MAX_SAFE_VALUES,
                 (Place::SafeValue { entry }, _) => usize::from(entry),
                 _ => return self.refused(error),
             };
-            let Some((name, _, key, item)) = safe.get(entry - before) else { return self.refused(error) };
-            match error.kind {
-                ConfigErrorKind::TooMany { room, .. } => {
-                    self.error(key, format!("too many safe values; at most {room} on all ports together"))
-                }
-                ConfigErrorKind::Variable(wrong) if VarBit::parse(name).is_none() => {
-                    self.error(key, format!("{wrong}{}", meant_variable(name)))
-                }
-                ConfigErrorKind::Constant(wrong) => item.error(wrong),
-                kind => self.error(key, self.config.view().describe_kind(kind)),
-            }
+            safe.get(entry - first)
+                .map_or_else(|| self.refused(error), |value| self.refused_value(value, error.kind))
         })
+    }
+
+    fn refused_value(&self, value: &NamedValue<'_>, kind: ConfigErrorKind) -> FileError {
+        let NamedValue { name, key, item } = value;
+        match kind {
+            ConfigErrorKind::TooMany { room, .. } => {
+                self.error(key, format!("too many safe values; at most {room} on all ports together"))
+            }
+            ConfigErrorKind::Variable(wrong) if VarBit::parse(name).is_none() => {
+                self.error(key, format!("{wrong}{}", meant_variable(name)))
+            }
+            ConfigErrorKind::Constant(_) | ConfigErrorKind::NotInField { .. } => {
+                value.number().err().unwrap_or_else(|| item.error(kind))
+            }
+            _ => self.error(key, self.config.view().describe_kind(kind)),
+        }
     }
 }
 
-/// The safe values of a port: name and value, with the place of the name, and the item.
-fn read_safe_values<'a>(table: &TableReader<'a>) -> Result<Vec<(&'a str, f64, Spot, TableValue<'a>)>> {
-    let Some(item) = table.optional("on_timeout") else { return Ok(Vec::new()) };
-    if !item.is_table() {
-        return match item.as_string() {
-            Some("hold") => Ok(Vec::new()),
-            _ => Err(item.error(
-                "allowed: \"hold\", or a table of safe values such as { \"DigitalOutputCommand[1]\" = 0 }",
-            )),
-        };
+/// A safe value of a port.
+struct NamedValue<'a> {
+    name: &'a str,
+    key: Spot,
+    item: TableValue<'a>,
+}
+
+impl NamedValue<'_> {
+    fn number(&self) -> Result<f64> {
+        match VarBit::parse(self.name) {
+            Some(_) => self.item.bit().map(|bit| f64::from(u8::from(bit))),
+            None => self.item.number(),
+        }
     }
-    let table = item.any_table()?;
-    let entries = table.entries().map(|(name, key, item)| {
-        let value = match VarBit::parse(name) {
-            Some(_) => f64::from(u8::from(item.bit()?)),
-            None => item.number()?,
-        };
-        Ok((name, value, key, item))
-    });
-    entries.collect()
+}
+
+fn read_safe_values<'a>(table: &TableReader<'a>) -> Result<Vec<NamedValue<'a>>> {
+    let Some(item) = table.optional("on_timeout") else { return Ok(Vec::new()) };
+    if item.is_table() {
+        let values = item.any_table()?;
+        return Ok(values.entries().map(|(name, key, item)| NamedValue { name, key, item }).collect());
+    }
+    match item.as_string() {
+        Some("hold") => Ok(Vec::new()),
+        _ => Err(item.error(
+            "allowed: \"hold\", or a table of safe values such as { \"DigitalOutputCommand[1]\" = 0 }",
+        )),
+    }
+}
+
+fn read_timeout(table: &TableReader<'_>) -> Result<Duration> {
+    let Some(item) = table.optional("timeout_ms") else { return table.time_or(&TIMEOUT) };
+    match item.as_string() {
+        Some("never") => Ok(Port::NEVER),
+        Some(_) => Err(item.error("expected a number or \"never\", for a device that sends only events")),
+        None => item.time(&TIMEOUT),
+    }
 }
 
 fn read_controller(root: &TableReader<'_>, recipes: &[FileRecipe]) -> Result<ControllerLink> {
