@@ -6,7 +6,7 @@
 use super::device::register_bits;
 use super::error::{ConfigError, ConfigErrorKind as Kind, ExchangeKey, Place};
 use super::exchange::{Exchange, FrameSpec, Transaction, has_values};
-use super::exchange_builder::{ExchangeBuilder, ExchangeFrame, TransactionDraft, of_block};
+use super::exchange_builder::{ExchangeBuilder, ExchangeFrame, TransactionDraft};
 use super::fields::{Fields, Var};
 use super::view::ConfigMut;
 use super::{Delimiter, ExchangeError, FieldSpec, OutcomeTo, Span};
@@ -76,10 +76,8 @@ impl ConfigMut<'_> {
                 };
                 let (written, write_count) = add(written, Direction::Output)?;
                 let (read, read_count) = add(read, Direction::Input)?;
-                let mut operation = with_counts(*operation, read_count, write_count);
-                if let Operation::MaskWriteRegister { mask, .. } = &mut operation {
-                    *mask = register_bits(written.of(self.fields));
-                }
+                let mask = register_bits(written.of(self.fields));
+                let operation = with_counts(*operation, read_count, write_count, mask);
                 Ok((Transaction::Rtu { operation, written, read }, None))
             }
             &TransactionDraft::Served { table, address, fields } => {
@@ -93,7 +91,7 @@ impl ConfigMut<'_> {
                 let at = (recipe, part, frames.next(part));
                 let (span, count) =
                     self.data(at, &fields, is_of_coils).map_err(|error| error.placed(refused))?;
-                let operation = with_counts(of_block(table, address, part), count, count);
+                let operation = Operation::of_block(table, part, address, count);
                 let none = Span::default();
                 let (written, read) = if part == Direction::Input { (span, none) } else { (none, span) };
                 Ok((Transaction::Served { operation, written, read }, None))
@@ -210,30 +208,14 @@ fn outcome(from: &[Option<Var<'_>>; 3]) -> Result<OutcomeTo, ParseError> {
     Ok(OutcomeTo { to: read(to)?, code_to: read(code_to)?, count_to: read(count_to)? })
 }
 
-fn with_counts(operation: Operation, read: u16, written: u16) -> Operation {
-    match operation {
-        Operation::ReadCoils { address, .. } => Operation::ReadCoils { address, count: read },
-        Operation::ReadDiscreteInputs { address, .. } => {
-            Operation::ReadDiscreteInputs { address, count: read }
-        }
-        Operation::ReadHoldingRegisters { address, .. } => {
-            Operation::ReadHoldingRegisters { address, count: read }
-        }
-        Operation::ReadInputRegisters { address, .. } => {
-            Operation::ReadInputRegisters { address, count: read }
-        }
-        Operation::WriteCoils { address, .. } => Operation::WriteCoils { address, count: written },
-        Operation::WriteRegisters { address, .. } => Operation::WriteRegisters { address, count: written },
-        Operation::ReadWriteRegisters { read_address, write_address, .. } => Operation::ReadWriteRegisters {
-            read_address,
-            read_count: read,
-            write_address,
-            write_count: written,
-        },
-        Operation::WriteCoil { .. }
-        | Operation::WriteRegister { .. }
-        | Operation::MaskWriteRegister { .. } => operation,
-    }
+fn with_counts(operation: Operation, read: u16, written: u16, mask: u16) -> Operation {
+    let (_, address, _) = operation.place();
+    let write_address = match operation {
+        Operation::ReadWriteRegisters { write_address, .. } => write_address,
+        _ => address,
+    };
+    let (read, written) = ((address, read), (write_address, written));
+    Operation::of_function(operation.function(), read, written, mask).unwrap_or(operation)
 }
 
 /// The usual order becomes that of registers.

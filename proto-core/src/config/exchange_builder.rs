@@ -9,7 +9,6 @@ use super::exchange::{Exchange, OutcomeTo, Restarted, Transaction, Triggers};
 use super::fields::{Fields, InputField, OutputField, Var};
 use crate::device::Encoding;
 use crate::modbus::rtu::{Operation, Table};
-use crate::sysvar::Direction;
 use crate::time::Duration;
 use crate::wire::can::CanId;
 use crate::wire::scalar::ScalarType;
@@ -396,18 +395,5 @@ impl<'a> ExchangeBuilder<'a> {
             TransactionDraft::Frames(_) => [None; 2],
         };
         own.into_iter().flatten().chain(self.all_frames().map(|frame| frame.fields))
-    }
-}
-
-/// The operation that reads or writes all of a block; its count is 0 here.
-pub(super) fn of_block(table: Table, address: u16, fields: Direction) -> Operation {
-    let count = 0;
-    match (table, fields) {
-        (Table::Coils, Direction::Input) => Operation::WriteCoils { address, count },
-        (Table::Coils, Direction::Output) => Operation::ReadCoils { address, count },
-        (Table::DiscreteInputs, _) => Operation::ReadDiscreteInputs { address, count },
-        (Table::HoldingRegisters, Direction::Input) => Operation::WriteRegisters { address, count },
-        (Table::HoldingRegisters, Direction::Output) => Operation::ReadHoldingRegisters { address, count },
-        (Table::InputRegisters, _) => Operation::ReadInputRegisters { address, count },
     }
 }
