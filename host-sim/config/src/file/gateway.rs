@@ -5,7 +5,7 @@ mod places;
 
 use proto_core::config::{
     Bus, ConfigError, ConfigErrorKind, ControllerLink, Counted, Echo, GatewayConfig, MAX_ADDRESS, MAX_LISTEN,
-    MAX_PORTS, MAX_SAFE_VALUES, Place, Port, RecipeLink, check_address,
+    MAX_PORTS, MAX_SAFE_VALUES, Place, Port, RecipeLink, Rs485, check_address,
 };
 use proto_core::recipe::model::Framing;
 use proto_core::sysvar::VarBit;
@@ -14,7 +14,7 @@ use proto_core::wire::dialect::Dialect;
 
 use super::FileError;
 use super::document::{At, SourceTree};
-use super::lines::{read_bitrate, read_cycle, read_line, read_rtu_line};
+use super::lines::read_line;
 use super::model::{FileRecipe, Flavour, RecipeKind};
 use super::names::meant_variable;
 use super::network::{self, check_ipv4};
@@ -23,8 +23,8 @@ use super::recipes;
 use super::sources;
 use crate::keys;
 use crate::keys::gateway::{
-    ABSENT, COMMAND, ECHO, ECHOES, LINK_UDP, MODBUS, REFRESH, SAFE_AT_START, STALE_AFTER, STATE, TIMEOUT,
-    UDP2011,
+    ABSENT, BITRATE, COMMAND, CYCLE, ECHO, ECHOES, LINK_UDP, MODBUS, REFRESH, SAFE_AT_START, STALE_AFTER,
+    STATE, TIMEOUT, UDP2011,
 };
 
 /// Reads the whole file and checks it.
@@ -157,7 +157,7 @@ impl Assembly<'_> {
         if matches!(kind, BusKind::Rs485 | BusKind::TcpListen) && !recipe.is_can() {
             recipe.check_framing(Framing::Bytes).map_err(|message| item.error(message))?;
         }
-        let mut port = Port::on(&name, &recipe.name, bus).cycle(read_cycle(table)?);
+        let mut port = Port::on(&name, &recipe.name, bus).cycle(table.time_or(&CYCLE)?);
         port = port.timeout(read_timeout(table)?).stale_after(table.time_or(&STALE_AFTER)?);
         let safe = read_safe_values(table)?;
         let values: Vec<_> =
@@ -324,14 +324,15 @@ fn read_bus(table: &TableReader<'_>, kind: BusKind) -> Result<Bus> {
     Ok(match kind {
         BusKind::Rs485 | BusKind::ModbusMaster | BusKind::ModbusSlave => {
             let mut line = match kind {
-                BusKind::Rs485 => read_line(table)?,
-                _ => read_rtu_line(table, kind == BusKind::ModbusMaster)?,
+                BusKind::ModbusMaster => read_line(table, Rs485::with_rtu_turnaround)?,
+                BusKind::ModbusSlave => read_line(table, Rs485::with_rtu_silence)?,
+                _ => read_line(table, |line| line)?,
             };
             line.echo = table.optional(ECHO.name).map_or(Ok(Echo::Auto), |item| read_echo(&item))?;
             Bus::Rs485(line)
         }
         BusKind::ModbusTcp => read_modbus_tcp(table)?,
-        BusKind::Can => Bus::Can { bitrate: read_bitrate(table)? },
+        BusKind::Can => Bus::Can { bitrate: table.integer_or(&BITRATE)? },
         BusKind::TcpListen => Bus::TcpListen { listen: listen()? },
         BusKind::UdpListen => Bus::UdpListen { listen: listen()? },
     })

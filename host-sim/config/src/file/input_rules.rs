@@ -2,7 +2,7 @@
 //!
 //! In: the field's table, its encoding, its variable. Out: what stands behind the field in the configuration.
 
-use proto_core::config::{FieldSpec, InputBinding, InputRule, MapEntry, NO_TEXT, NoText};
+use proto_core::config::{FieldSpec, InputBinding, InputRule, MapEntry, NO_TEXT, NoText, check_read};
 use proto_core::device::{Encoding, Kind, Overflow};
 use proto_core::sysvar::{Direction, SysVar, VarBit};
 use proto_core::wire::scalar::ScalarType;
@@ -92,13 +92,7 @@ pub(super) fn read_restarted(table: &TableReader<'_>, encoding: &Encoding) -> Re
 /// A number that the field can have.
 fn read_number(item: &TableValue<'_>, encoding: &Encoding) -> Result<f64> {
     let number = item.number()?;
-    let (low, high) = encoding.range();
-    if !(low..=high).contains(&number) {
-        return Err(item.error(format!("the field cannot be {number}; allowed: {low}..={high}")));
-    }
-    if encoding.reads_integers() && number.fract() != 0.0 {
-        return Err(item.error(format!("{number} has a fraction; this field has integers only")));
-    }
+    check_read(encoding, number).map_err(|kind| item.error(kind))?;
     Ok(number)
 }
 
