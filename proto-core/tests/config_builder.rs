@@ -3,7 +3,9 @@
 use std::net::Ipv4Addr;
 
 use proto_core::config::*;
-use proto_core::device::{Algorithm, Bits, ByteOrder, Checksum, Digits, Encoding, Kind, Overflow, Width};
+use proto_core::device::{
+    Algorithm, Bits, Boundary, ByteOrder, Checksum, Digits, Encoding, Escape, Kind, Overflow, Width,
+};
 use proto_core::sysvar::{Direction, ParseError, SysVar};
 use proto_core::time::Duration;
 use proto_core::wire::can::CanId;
@@ -498,4 +500,33 @@ fn larger_configurations_than_a_file_can_be_are_refused() {
     let error = ConfigError { place: Place::Whole, kind };
     assert_eq!(config.validate(), Err(error));
     assert_eq!(error.to_string(), "configuration: 9 ports; there is room for 8");
+}
+
+#[test]
+fn frames_of_a_stream_may_end_with_their_tail_or_stand_between_escape_bytes() {
+    let fields = [InputField::variable(ScalarType::Byte, "WordInputReg[1]")];
+    let recipe = Recipe::user("scanner").stream_input(&[], &[13, 10], &fields);
+    let framings = [
+        (Boundary::Fields, None),
+        (Boundary::Tail, None),
+        (Boundary::Silence, None),
+        (Boundary::Fields, Some(Escape::Slip)),
+    ];
+    for (boundary, escape) in framings {
+        let recipe = recipe.framing(Direction::Input, boundary, escape).framing(
+            Direction::Output,
+            Boundary::Tail,
+            None,
+        );
+        let bus = Bus::Rs485(Rs485::DEFAULT);
+        let config: GatewayConfig = GatewayConfig::builder()
+            .controller("10.0.0.2")
+            .recipe(recipe)
+            .port(Port::on("line", "scanner", bus.clone()))
+            .build()
+            .unwrap();
+        let Parts::Stream { input: Some(part), output: None } = &config.recipes[0].parts else { panic!() };
+        assert_eq!((part.framing, part.escape), (boundary, escape));
+        assert_eq!(config.ports[0].bus, bus);
+    }
 }

@@ -480,3 +480,25 @@ fn a_port_of_modbus_tcp_takes_what_a_master_asks() {
         "{error}"
     );
 }
+
+#[test]
+fn exchanges_of_a_configuration_make_it_again() {
+    let coils =
+        [OutputField::variable(Coil, "WordOutputReg[1]"), OutputField::variable(Coil, "WordOutputReg[2]")];
+    let (register, value) = (register(), value());
+    let config = with(&[
+        ExchangeBuilder::read_write_registers(9, (1, &register), (8, &value)).every(ms(100)).late(ms(7_000)),
+        ExchangeBuilder::write_coils(5, 3, &coils).on_rising("BitOutputReg[3]", 1).outcome("WordInputReg[2]"),
+        ExchangeBuilder::write_register(5, 4, &value)
+            .follows(1)
+            .trigger(ms(500))
+            .outcome_count("WordInputReg[3]"),
+    ]);
+    let config = config.unwrap();
+    let again = config.exchanges.iter().map(|one| {
+        let Transaction::Rtu { operation, written, read } = one.transaction else { panic!("of a master") };
+        let fields = (written.of(&config.fields), read.of(&config.fields));
+        ExchangeBuilder::packed(one.peer, operation, false, fields).settings(*one, None)
+    });
+    assert_eq!(with(&again.collect::<Vec<_>>()), Ok(config.clone()));
+}

@@ -12,7 +12,7 @@ use super::draft::{
 };
 use super::error::{ConfigError, ConfigErrorKind as Kind, ControllerKey, Counted, Place, PortKey, RecipeKey};
 use super::exchange_builder::ExchangeBuilder;
-use super::fields::{CanFields, Does, Entries, Fields, InputField, OutputField, Sends, plain};
+use super::fields::{CanFields, Does, Entries, Fields, InputField, OutputField, Sends};
 use super::rules::{check_bit, check_name, check_room, text};
 use super::view::ConfigMut;
 use super::{
@@ -186,14 +186,16 @@ impl ConfigMut<'_> {
         part: Direction,
         from: &PartFields<'_>,
     ) -> Result<Option<StreamPart>, ConfigError> {
-        let PartFields::Stream { head, tail, fields } = from else { return Ok(None) };
+        let PartFields::Stream { head, tail, fields, ends } = from else { return Ok(None) };
         let place = Place::Part { recipe, part };
         let bytes = |bytes: &[u8]| {
             let too_long = Kind::TooLong { len: bytes.len(), longest: MAX_DELIMITER };
             Delimiter::from_slice(bytes).map_err(|_| ConfigError { place, kind: too_long })
         };
         let (head, tail) = (bytes(head)?, bytes(tail)?);
-        Ok(Some(StreamPart::new(head, tail, self.fields_of_part(recipe, part, 0, fields)?)))
+        let fields = self.fields_of_part(recipe, part, 0, fields)?;
+        let (framing, escape) = *ends;
+        Ok(Some(StreamPart { framing, escape, ..StreamPart::new(head, tail, fields) }))
     }
 
     fn can_part(
@@ -269,10 +271,7 @@ impl ConfigMut<'_> {
                     InputBinding::Commands { table: self.add_commands(entries, idle)?, when }
                 }
             };
-            Ok(match plain(encoding, overflow) {
-                Some(ty) => FieldSpec::UserInput { ty, to },
-                None => FieldSpec::DeviceInput { encoding, overflow, to },
-            })
+            Ok(FieldSpec::input(encoding, overflow, to))
         })
     }
 
@@ -387,10 +386,7 @@ fn output_spec(field: &OutputField<'_>) -> Result<FieldSpec, Kind> {
             }
             Sends::Link { link, scale, offset } => OutputBinding::Link { link, scale, offset },
         };
-        Ok(match plain(encoding, overflow) {
-            Some(ty) => FieldSpec::UserOutput { ty, from },
-            None => FieldSpec::DeviceOutput { encoding, overflow, from },
-        })
+        Ok(FieldSpec::output(encoding, overflow, from))
     })
 }
 

@@ -6,10 +6,10 @@
 use super::device::register_bits;
 use super::error::{ConfigError, ConfigErrorKind as Kind, ExchangeKey, Place};
 use super::exchange::{Exchange, FrameSpec, Transaction, has_values};
-use super::exchange_builder::{ExchangeBuilder, ExchangeFrame, TransactionDraft, of_block};
+use super::exchange_builder::{ExchangeBuilder, ExchangeFrame, TransactionDraft};
 use super::fields::{Fields, Var};
 use super::view::ConfigMut;
-use super::{Delimiter, ExchangeError, FieldSpec, OutcomeTo, Span, Triggers};
+use super::{Delimiter, ExchangeError, FieldSpec, OutcomeTo, Span};
 use crate::device::{Bits, ByteOrder, Encoding, Kind as EncodingKind, Overflow};
 use crate::modbus::rtu::{Operation, Table};
 use crate::recipe::model::MAX_DELIMITER;
@@ -45,43 +45,13 @@ impl ConfigMut<'_> {
         for (nth, ask) in asks.iter().enumerate() {
             let at = |key| Place::Exchange { recipe, exchange: nth as u8, key };
             let (transaction, pending) = self.transaction(recipe, ask, &at, &mut frames)?;
-            let mut when = Triggers { rising: None, ..ask.when };
+            let variable = |key| move |error| ConfigError { place: at(key), kind: Kind::Variable(error) };
+            let mut exchange = Exchange { transaction, pending, ..ask.exchange };
             if let Some((var, bit)) = ask.rising {
-                let place = at(ExchangeKey::Rising);
-                let var = var.read().map_err(|error| ConfigError { place, kind: Kind::Variable(error) })?;
-                when.rising = Some((var, bit));
+                exchange.when.rising = Some((var.read().map_err(variable(ExchangeKey::Rising))?, bit));
             }
-            let ExchangeBuilder {
-                peer,
-                timeout,
-                retries,
-                pause,
-                trigger,
-                late,
-                stop,
-                follow,
-                overdue,
-                restarted,
-                ..
-            } = *ask;
-            let outcome = outcome(&ask.outcome).map_err(|error| ConfigError {
-                place: at(ExchangeKey::Outcome),
-                kind: Kind::Variable(error),
-            })?;
-            let exchange = Exchange {
-                timeout,
-                pause,
-                trigger,
-                late,
-                stop,
-                follow,
-                overdue,
-                outcome,
-                pending,
-                restarted,
-                ..Exchange::new(peer, transaction, when)
-            };
-            let _ = self.exchanges.push(exchange.repeated(retries));
+            exchange.outcome = outcome(&ask.outcome).map_err(variable(ExchangeKey::Outcome))?;
+            let _ = self.exchanges.push(exchange.repeated(ask.retries));
         }
         Ok(Span::between(start, self.exchanges.len()))
     }
@@ -106,10 +76,8 @@ impl ConfigMut<'_> {
                 };
                 let (written, write_count) = add(written, Direction::Output)?;
                 let (read, read_count) = add(read, Direction::Input)?;
-                let mut operation = with_counts(*operation, read_count, write_count);
-                if let Operation::MaskWriteRegister { mask, .. } = &mut operation {
-                    *mask = register_bits(written.of(self.fields));
-                }
+                let mask = register_bits(written.of(self.fields));
+                let operation = with_counts(*operation, read_count, write_count, mask);
                 Ok((Transaction::Rtu { operation, written, read }, None))
             }
             &TransactionDraft::Served { table, address, fields } => {
@@ -123,10 +91,26 @@ impl ConfigMut<'_> {
                 let at = (recipe, part, frames.next(part));
                 let (span, count) =
                     self.data(at, &fields, is_of_coils).map_err(|error| error.placed(refused))?;
-                let operation = with_counts(of_block(table, address, part), count, count);
+                let operation = Operation::of_block(table, part, address, count);
                 let none = Span::default();
                 let (written, read) = if part == Direction::Input { (span, none) } else { (none, span) };
                 Ok((Transaction::Served { operation, written, read }, None))
+            }
+            &TransactionDraft::Packed { operation, is_served, written, read } => {
+                let (of_written, of_read) = match is_served {
+                    true => (Direction::Input, Direction::Output),
+                    false => (Direction::Output, Direction::Input),
+                };
+                let mut add = |fields: &[FieldSpec], part| match fields {
+                    [] => Ok(Span::default()),
+                    _ => self.fields_of_part(recipe, part, frames.next(part), &fields.into()),
+                };
+                let (written, read) = (add(written, of_written)?, add(read, of_read)?);
+                let transaction = match is_served {
+                    true => Transaction::Served { operation, written, read },
+                    false => Transaction::Rtu { operation, written, read },
+                };
+                Ok((transaction, None))
             }
             TransactionDraft::Frames([request, reply, refusal]) => {
                 let all = [
@@ -224,30 +208,14 @@ fn outcome(from: &[Option<Var<'_>>; 3]) -> Result<OutcomeTo, ParseError> {
     Ok(OutcomeTo { to: read(to)?, code_to: read(code_to)?, count_to: read(count_to)? })
 }
 
-fn with_counts(operation: Operation, read: u16, written: u16) -> Operation {
-    match operation {
-        Operation::ReadCoils { address, .. } => Operation::ReadCoils { address, count: read },
-        Operation::ReadDiscreteInputs { address, .. } => {
-            Operation::ReadDiscreteInputs { address, count: read }
-        }
-        Operation::ReadHoldingRegisters { address, .. } => {
-            Operation::ReadHoldingRegisters { address, count: read }
-        }
-        Operation::ReadInputRegisters { address, .. } => {
-            Operation::ReadInputRegisters { address, count: read }
-        }
-        Operation::WriteCoils { address, .. } => Operation::WriteCoils { address, count: written },
-        Operation::WriteRegisters { address, .. } => Operation::WriteRegisters { address, count: written },
-        Operation::ReadWriteRegisters { read_address, write_address, .. } => Operation::ReadWriteRegisters {
-            read_address,
-            read_count: read,
-            write_address,
-            write_count: written,
-        },
-        Operation::WriteCoil { .. }
-        | Operation::WriteRegister { .. }
-        | Operation::MaskWriteRegister { .. } => operation,
-    }
+fn with_counts(operation: Operation, read: u16, written: u16, mask: u16) -> Operation {
+    let (_, address, _) = operation.place();
+    let write_address = match operation {
+        Operation::ReadWriteRegisters { write_address, .. } => write_address,
+        _ => address,
+    };
+    let (read, written) = ((address, read), (write_address, written));
+    Operation::of_function(operation.function(), read, written, mask).unwrap_or(operation)
 }
 
 /// The usual order becomes that of registers.

@@ -5,7 +5,7 @@ use core::fmt;
 use super::device::register_bits;
 use super::error::{ConfigErrorKind as Kind, ExchangeKey as Key, Place};
 use super::exchange::{Exchange, FrameSpec, Transaction};
-use super::input_rule::check_read;
+use super::input_rule::check_number_read;
 use super::rules::{Check, MAX_TIME, check_pool, check_time, fail};
 use super::{
     Bus, ConfigView, Constants, DeviceFrame, FieldSpec, InputBinding, Parts, Port, PortHealth, Recipe, Span,
@@ -20,9 +20,9 @@ use crate::time::Duration;
 use crate::wire::can::CanId;
 
 /// The longest pause after an exchange.
-const MAX_PAUSE: Duration = Duration::from_secs(10);
+pub const MAX_PAUSE: Duration = Duration::from_secs(10);
 /// The longest time in which an event may be sent.
-const LONGEST_TRIGGER: Duration = Duration::from_secs(10);
+pub const LONGEST_TRIGGER: Duration = Duration::from_secs(10);
 
 /// Why an exchange is refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -582,7 +582,9 @@ impl<'a> ExchangeCheck<'a> {
             _ => return refuse(ExchangeError::RestartedNothing),
         };
         match restarted.place(fields) {
-            Some((_, encoding)) => check_read(self.at(nth, Key::Restarted), &encoding, restarted.value),
+            Some((_, encoding)) => {
+                check_number_read(self.at(nth, Key::Restarted), &encoding, restarted.value)
+            }
             None => refuse(ExchangeError::RestartedField { field: restarted.field }),
         }
     }

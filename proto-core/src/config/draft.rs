@@ -9,8 +9,9 @@ use super::exchange_builder::ExchangeBuilder;
 use super::fields::{CanFields, Fields, Var};
 use super::rules::text;
 use super::{Bus, Echo, OnStale, Parity, Port, PortHealth, Recipe, Rs485, SafeValue, SendOn};
+use crate::device::{Boundary, Escape};
 use crate::recipe::model::Mode;
-use crate::sysvar::SysVar;
+use crate::sysvar::{Direction, SysVar};
 use crate::time::Duration;
 
 /// The controller's address, ports and dialect; an address converts by `into()`.
@@ -81,8 +82,14 @@ pub(super) struct ListDemand {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum PartFields<'a> {
     Absent,
-    Stream { head: &'a [u8], tail: &'a [u8], fields: Fields<'a> },
+    Stream { head: &'a [u8], tail: &'a [u8], fields: Fields<'a>, ends: (Boundary, Option<Escape>) },
     Can(&'a [CanFields<'a>]),
+}
+
+impl<'a> PartFields<'a> {
+    const fn stream(head: &'a [u8], tail: &'a [u8], fields: Fields<'a>) -> Self {
+        Self::Stream { head, tail, fields, ends: (Boundary::Fields, None) }
+    }
 }
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -145,13 +152,23 @@ impl<'a> RecipeBuilder<'a> {
     /// The input part (user to robot) as a stream: head, tail, at most 8 bytes each, and the
     /// fields.
     pub fn stream_input(mut self, head: &'a [u8], tail: &'a [u8], fields: impl Into<Fields<'a>>) -> Self {
-        self.input = PartFields::Stream { head, tail, fields: fields.into() };
+        self.input = PartFields::stream(head, tail, fields.into());
         self
     }
 
     /// The output part (robot to user) as a stream.
     pub fn stream_output(mut self, head: &'a [u8], tail: &'a [u8], fields: impl Into<Fields<'a>>) -> Self {
-        self.output = PartFields::Stream { head, tail, fields: fields.into() };
+        self.output = PartFields::stream(head, tail, fields.into());
+        self
+    }
+
+    /// What tells the frames of a stream part apart, if it is not their fields; of a user-defined recipe. No effect on
+    /// other parts.
+    pub fn framing(mut self, part: Direction, boundary: Boundary, escape: Option<Escape>) -> Self {
+        let part = if part == Direction::Input { &mut self.input } else { &mut self.output };
+        if let PartFields::Stream { ends, .. } = part {
+            *ends = (boundary, escape);
+        }
         self
     }
 
@@ -194,14 +211,14 @@ impl<'a> RecipeBuilder<'a> {
 
     /// Number of fields, commands, exchanges and their frames.
     pub(super) fn counts(&self) -> ListDemand {
-        let frames = self.exchanges.iter().map(|ask| ask.frames().count()).fold(0, usize::saturating_add);
+        let frames = self.exchanges.iter().map(|ask| ask.all_frames().count()).fold(0, usize::saturating_add);
         let mut counts = ListDemand { exchanges: self.exchanges.len(), frames, ..ListDemand::default() };
         let mut add = |fields: &Fields<'_>| {
             let (fields, commands) = fields.counts();
             counts.fields = counts.fields.saturating_add(fields);
             counts.commands = counts.commands.saturating_add(commands);
         };
-        self.exchanges.iter().flat_map(ExchangeBuilder::fields).for_each(&mut add);
+        self.exchanges.iter().flat_map(ExchangeBuilder::fields).for_each(|fields| add(&fields));
         for part in [&self.input, &self.output] {
             match part {
                 PartFields::Absent => {}
@@ -305,6 +322,11 @@ macro_rules! safe_values_from {
 safe_values_from! { (&'a str, f64) => Names, (SysVar, f64) => Vars, SafeValue => Values }
 
 impl Port {
+    /// A port on a bus as the configuration has it.
+    pub const fn on<'a>(name: &'a str, recipe: &'a str, bus: Bus) -> PortBuilder<'a, Bus> {
+        PortBuilder::new(name, recipe, bus)
+    }
+
     /// A half-duplex serial line; by default 115 200 baud, no parity, 1 stop bit.
     pub fn rs485<'a>(name: &'a str, recipe: &'a str) -> PortBuilder<'a, Rs485> {
         PortBuilder::new(name, recipe, Rs485::default())
@@ -479,7 +501,7 @@ impl PortBuilder<'_, ModbusTcp<'_>> {
     }
 }
 
-/// The bus of a [`PortBuilder`]: [`Rs485`], [`RtuLine`], [`ModbusTcp`], [`Can`], [`Listen`].
+/// The bus of a [`PortBuilder`]: [`Bus`], [`Rs485`], [`RtuLine`], [`ModbusTcp`], [`Can`], [`Listen`].
 pub trait PortBus: sealed::Sealed {}
 
 /// A serial line as the bus of a [`PortBuilder`]: [`Rs485`], [`RtuLine`].
@@ -487,6 +509,7 @@ pub trait SerialLine: sealed::SerialBus {}
 
 impl SerialLine for Rs485 {}
 impl SerialLine for RtuLine {}
+impl PortBus for Bus {}
 impl PortBus for Rs485 {}
 impl PortBus for RtuLine {}
 impl PortBus for ModbusTcp<'_> {}
@@ -503,6 +526,12 @@ pub(super) mod sealed {
         /// # Errors
         /// What is wrong with it: an address that is too long.
         fn bus(&self) -> Result<Bus, Kind>;
+    }
+
+    impl Sealed for Bus {
+        fn bus(&self) -> Result<Bus, Kind> {
+            Ok(self.clone())
+        }
     }
 
     impl Sealed for Rs485 {

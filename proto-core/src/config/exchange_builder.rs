@@ -4,11 +4,11 @@
 //! is that of the file (docs/configuration.md). [`Recipe::user`](super::Recipe::user) takes them with
 //! [`RecipeBuilder::exchanges`](super::RecipeBuilder::exchanges).
 
-use super::exchange::{DEFAULT_REPLY_TIMEOUT, Restarted, Triggers};
+use super::FieldSpec;
+use super::exchange::{Exchange, OutcomeTo, Restarted, Transaction, Triggers};
 use super::fields::{Fields, InputField, OutputField, Var};
 use crate::device::Encoding;
 use crate::modbus::rtu::{Operation, Table};
-use crate::sysvar::Direction;
 use crate::time::Duration;
 use crate::wire::can::CanId;
 use crate::wire::scalar::ScalarType;
@@ -52,21 +52,13 @@ use crate::wire::scalar::ScalarType;
 /// ```
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ExchangeBuilder<'a> {
-    pub(super) peer: u8,
+    /// As in the configuration, still without what the fields below decide.
+    pub(super) exchange: Exchange,
     pub(super) transaction: TransactionDraft<'a>,
-    pub(super) when: Triggers,
-    pub(super) rising: Option<(Var<'a>, u8)>,
-    pub(super) timeout: Duration,
     pub(super) retries: Option<u8>,
-    pub(super) pause: Duration,
-    pub(super) trigger: Option<Duration>,
-    pub(super) late: Option<Duration>,
-    pub(super) stop: bool,
-    pub(super) follow: Option<u8>,
-    pub(super) overdue: Option<Duration>,
+    pub(super) rising: Option<(Var<'a>, u8)>,
     pub(super) outcome: [Option<Var<'a>>; 3],
     pub(super) pending: Option<ExchangeFrame<'a>>,
-    pub(super) restarted: Option<Restarted>,
 }
 
 /// Operations have counts of 0 here.
@@ -81,6 +73,13 @@ pub(super) enum TransactionDraft<'a> {
         table: Table,
         address: u16,
         fields: Fields<'a>,
+    },
+    /// As in the configuration, with counts.
+    Packed {
+        operation: Operation,
+        is_served: bool,
+        written: &'a [FieldSpec],
+        read: &'a [FieldSpec],
     },
     /// A request, a reply and a refusal.
     Frames([Option<ExchangeFrame<'a>>; 3]),
@@ -190,14 +189,35 @@ impl<'a> ExchangeBuilder<'a> {
         Self::new(own, TransactionDraft::Served { table, address, fields: fields.into() })
     }
 
+    /// Registers or coils as the configuration has them: with the counts of `operation`, and coils packed into bytes. Of
+    /// the gateway as a slave if `is_served`.
+    pub const fn packed(
+        peer: u8,
+        operation: Operation,
+        is_served: bool,
+        (written, read): (&'a [FieldSpec], &'a [FieldSpec]),
+    ) -> Self {
+        Self::new(peer, TransactionDraft::Packed { operation, is_served, written, read })
+    }
+
     /// A request of a device's own; of device 0, unless [`Self::peer`] says otherwise.
     pub fn request(request: ExchangeFrame<'a>) -> Self {
-        Self::new(0, TransactionDraft::Frames([Some(request), None, None]))
+        Self::frames(Some(request), None, None, None)
     }
 
     /// A frame that may come at any time.
     pub fn unasked(frame: ExchangeFrame<'a>) -> Self {
-        Self::new(0, TransactionDraft::Frames([None, Some(frame), None]))
+        Self::frames(None, Some(frame), None, None)
+    }
+
+    /// Frames of a device's own: a request, its reply, a pending answer and a refusal.
+    pub fn frames(
+        request: Option<ExchangeFrame<'a>>,
+        reply: Option<ExchangeFrame<'a>>,
+        pending: Option<ExchangeFrame<'a>>,
+        refusal: Option<ExchangeFrame<'a>>,
+    ) -> Self {
+        Self { pending, ..Self::new(0, TransactionDraft::Frames([request, reply, refusal])) }
     }
 
     fn read(slave: u8, operation: Operation, fields: &'a [InputField<'a>]) -> Self {
@@ -209,24 +229,16 @@ impl<'a> ExchangeBuilder<'a> {
     }
 
     const fn new(peer: u8, transaction: TransactionDraft<'a>) -> Self {
-        let (when, timeout, pause) = (Triggers::NEVER, DEFAULT_REPLY_TIMEOUT, Duration::ZERO);
-        Self {
-            peer,
-            transaction,
-            when,
-            rising: None,
-            timeout,
-            retries: None,
-            pause,
-            trigger: None,
-            late: None,
-            stop: false,
-            follow: None,
-            overdue: None,
-            outcome: [None; 3],
-            pending: None,
-            restarted: None,
-        }
+        let none = Transaction::Frames { request: None, reply: None, refusal: None };
+        let exchange = Exchange::new(peer, none, Triggers::NEVER);
+        Self { exchange, transaction, retries: None, rising: None, outcome: [None; 3], pending: None }
+    }
+
+    /// Takes everything but the frames from an exchange, and the repetitions as [`Self::retries`] does.
+    pub fn settings(self, exchange: Exchange, retries: Option<u8>) -> Self {
+        let OutcomeTo { to, code_to, count_to } = exchange.outcome;
+        let outcome = [to, code_to, count_to].map(|var| var.map(Var::Var));
+        Self { exchange, retries, outcome, rising: None, ..self }
     }
 
     /// What answers the request. No effect on Modbus, whose replies are known.
@@ -256,31 +268,31 @@ impl<'a> ExchangeBuilder<'a> {
     /// The device has restarted when this field of the reply, counted from 0 without padding and texts, becomes `value`:
     /// what is asked at its start is asked again.
     pub const fn restarted(mut self, field: u8, value: f64) -> Self {
-        self.restarted = Some(Restarted { field, value });
+        self.exchange.restarted = Some(Restarted { field, value });
         self
     }
 
     /// The device of an exchange with frames of its own; exchanges of one device share its presence.
     pub const fn peer(mut self, peer: u8) -> Self {
-        self.peer = peer;
+        self.exchange.peer = peer;
         self
     }
 
     /// Asked with this period, up to an hour.
     pub const fn every(mut self, period: Duration) -> Self {
-        self.when.every = Some(period);
+        self.exchange.when.every = Some(period);
         self
     }
 
     /// Asked at the start, and again when the device has started anew.
     pub const fn at_start(mut self) -> Self {
-        self.when.start = true;
+        self.exchange.when.start = true;
         self
     }
 
     /// Asked when a value of the request has changed.
     pub const fn on_change(mut self) -> Self {
-        self.when.change = true;
+        self.exchange.when.change = true;
         self
     }
 
@@ -292,7 +304,7 @@ impl<'a> ExchangeBuilder<'a> {
 
     /// How long the reply may take, from the end of the request to its own end; 100 ms by default.
     pub const fn timeout(mut self, timeout: Duration) -> Self {
-        self.timeout = timeout;
+        self.exchange.timeout = timeout;
         self
     }
 
@@ -305,33 +317,33 @@ impl<'a> ExchangeBuilder<'a> {
 
     /// How long after an event it may be sent, up to 10 s; by default the timeout of the port, at most 1 s.
     pub const fn trigger(mut self, trigger: Duration) -> Self {
-        self.trigger = Some(trigger);
+        self.exchange.trigger = Some(trigger);
         self
     }
 
     /// How long after its request a reply may come; by default three timeouts, at least 1 s. Until then nothing is asked
     /// of the device whose reply could be taken for it.
     pub const fn late(mut self, late: Duration) -> Self {
-        self.late = Some(late);
+        self.exchange.late = Some(late);
         self
     }
 
     /// It stops its device: it goes first, cancels the device's events, and is repeated until it is confirmed.
     pub const fn stops(mut self) -> Self {
-        self.stop = true;
+        self.exchange.stop = true;
         self
     }
 
     /// Sent after the good answer of this exchange of the recipe, counted from 0.
     pub const fn follows(mut self, exchange: u8) -> Self {
-        self.follow = Some(exchange);
+        self.exchange.follow = Some(exchange);
         self
     }
 
     /// When the values of the reply are overdue; [`Port::NEVER`](super::Port::NEVER) for a reply that comes only when
     /// something happens. By default the timeout of the port.
     pub const fn overdue(mut self, overdue: Duration) -> Self {
-        self.overdue = Some(overdue);
+        self.exchange.overdue = Some(overdue);
         self
     }
 
@@ -356,44 +368,32 @@ impl<'a> ExchangeBuilder<'a> {
 
     /// How long the line rests after it, up to 10 s; not at all by default.
     pub const fn pause(mut self, pause: Duration) -> Self {
-        self.pause = pause;
+        self.exchange.pause = pause;
         self
     }
 
     /// Whether its frames are on a CAN bus.
     pub(super) fn is_can(&self) -> bool {
-        self.frames().any(|frame| frame.id.is_some())
+        self.all_frames().any(|frame| frame.id.is_some())
     }
 
     /// The frames of a device's own.
-    pub(super) fn frames(&self) -> impl Iterator<Item = &ExchangeFrame<'a>> {
+    pub(super) fn all_frames(&self) -> impl Iterator<Item = &ExchangeFrame<'a>> {
         let frames = match &self.transaction {
             TransactionDraft::Frames(frames) => &frames[..],
-            TransactionDraft::Rtu { .. } | TransactionDraft::Served { .. } => &[],
+            _ => &[],
         };
         frames.iter().chain([&self.pending]).flatten()
     }
 
     /// All lists of fields.
-    pub(super) fn fields(&self) -> impl Iterator<Item = &Fields<'a>> {
-        let own = match &self.transaction {
-            TransactionDraft::Rtu { written, read, .. } => [written.as_ref(), read.as_ref()],
+    pub(super) fn fields(&self) -> impl Iterator<Item = Fields<'a>> {
+        let own = match self.transaction {
+            TransactionDraft::Rtu { written, read, .. } => [written, read],
             TransactionDraft::Served { fields, .. } => [Some(fields), None],
+            TransactionDraft::Packed { written, read, .. } => [written, read].map(|specs| Some(specs.into())),
             TransactionDraft::Frames(_) => [None; 2],
         };
-        own.into_iter().flatten().chain(self.frames().map(|frame| &frame.fields))
-    }
-}
-
-/// The operation that reads or writes all of a block; its count is 0 here.
-pub(super) fn of_block(table: Table, address: u16, fields: Direction) -> Operation {
-    let count = 0;
-    match (table, fields) {
-        (Table::Coils, Direction::Input) => Operation::WriteCoils { address, count },
-        (Table::Coils, Direction::Output) => Operation::ReadCoils { address, count },
-        (Table::DiscreteInputs, _) => Operation::ReadDiscreteInputs { address, count },
-        (Table::HoldingRegisters, Direction::Input) => Operation::WriteRegisters { address, count },
-        (Table::HoldingRegisters, Direction::Output) => Operation::ReadHoldingRegisters { address, count },
-        (Table::InputRegisters, _) => Operation::ReadInputRegisters { address, count },
+        own.into_iter().flatten().chain(self.all_frames().map(|frame| frame.fields))
     }
 }

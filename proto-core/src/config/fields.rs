@@ -5,7 +5,10 @@
 //! the names.
 
 use super::error::ConfigErrorKind as Kind;
-use super::{CommandWhen, FieldSpec, Limits, LinkSource, MapEntry, Outside, PortValue, StateValue};
+use super::{
+    CommandWhen, FieldSpec, InputBinding, Limits, LinkSource, MapEntry, OutputBinding, Outside, PortValue,
+    StateValue,
+};
 use crate::device::{Algorithm, Checksum, Encoding, Kind as EncodingKind, Overflow};
 use crate::sysvar::{ParseError, SysVar, VarRange};
 use crate::wire::can::CanId;
@@ -162,12 +165,30 @@ impl OnWire<'_> {
 }
 
 /// The type of a value that recipes of the controller can have too.
-pub(super) fn plain(encoding: Encoding, overflow: Overflow) -> Option<ScalarType> {
+fn plain(encoding: Encoding, overflow: Overflow) -> Option<ScalarType> {
     match encoding.kind {
         EncodingKind::Scalar(ty) if encoding == Encoding::scalar(ty) && overflow == Overflow::Usual => {
             Some(ty)
         }
         _ => None,
+    }
+}
+
+impl FieldSpec {
+    /// A field of an input part; a device's only if the controller's recipes can have no such field.
+    pub fn input(encoding: Encoding, overflow: Overflow, to: InputBinding) -> Self {
+        match plain(encoding, overflow) {
+            Some(ty) => Self::UserInput { ty, to },
+            None => Self::DeviceInput { encoding, overflow, to },
+        }
+    }
+
+    /// A field of an output part; a device's only if the controller's recipes can have no such field.
+    pub fn output(encoding: Encoding, overflow: Overflow, from: OutputBinding) -> Self {
+        match plain(encoding, overflow) {
+            Some(ty) => Self::UserOutput { ty, from },
+            None => Self::DeviceOutput { encoding, overflow, from },
+        }
     }
 }
 

@@ -120,8 +120,8 @@ impl<'c> BehindInput<'c> {
                     return fail(place, Kind::LimitsAndMap);
                 }
                 self.has_limits = true;
-                check_read(place, &own.encoding, limits.low)?;
-                check_read(place, &own.encoding, limits.high)?;
+                check_number_read(place, &own.encoding, limits.low)?;
+                check_number_read(place, &own.encoding, limits.high)?;
                 check_order(place, &limits)
             }
             FieldSpec::Mapped(entry) => self.entry(place, entry),
@@ -203,7 +203,7 @@ impl<'c> BehindInput<'c> {
                 if code.is_nan() && is_float {
                     return Ok(());
                 }
-                check_read(place, &own.encoding, code)
+                check_number_read(place, &own.encoding, code)
             }
             InputRule::NoText(_) => {
                 let is_digits = own.encoding.is_digits();
@@ -236,13 +236,20 @@ impl<'c> BehindInput<'c> {
 }
 
 /// Checks that a number can be read from a field.
-pub(super) fn check_read(place: Place, encoding: &Encoding, value: f64) -> Check {
+///
+/// # Errors
+/// [`ConfigErrorKind::NotInField`](Kind::NotInField) or [`ConfigErrorKind::FractionOfInteger`](Kind::FractionOfInteger).
+pub fn check_read(encoding: &Encoding, value: f64) -> Result<(), Kind> {
     let (low, high) = encoding.range();
     if !(low..=high).contains(&value) {
-        return fail(place, Kind::NotInField { value, low, high });
+        return Err(Kind::NotInField { value, low, high });
     }
     let is_possible = !encoding.reads_integers() || crate::image::round(value) == value;
-    if is_possible { Ok(()) } else { fail(place, Kind::FractionOfInteger { value }) }
+    if is_possible { Ok(()) } else { Err(Kind::FractionOfInteger { value }) }
+}
+
+pub(super) fn check_number_read(place: Place, encoding: &Encoding, value: f64) -> Check {
+    check_read(encoding, value).map_err(|kind| ConfigError { place, kind })
 }
 
 /// A field that writes a variable as a whole.

@@ -42,7 +42,7 @@ mod walk;
 
 pub use budget::{PartBudget, Warning, can_frame_time};
 pub use builder::ConfigBuilder;
-pub use check_exchange::ExchangeError;
+pub use check_exchange::{ExchangeError, LONGEST_TRIGGER, MAX_PAUSE};
 pub use command_text::CommandText;
 pub(crate) use command_text::{fill_in, placeholders};
 pub use device::{DeviceFrame, register_bits};
@@ -62,18 +62,17 @@ pub use exchange_builder::{Coil, ExchangeBuilder, ExchangeFrame};
 pub use fields::{CanFields, Fields, InputField, OutputField, Sum, Var};
 pub use fitting::Fitting;
 pub(crate) use fitting::fitting_numbers;
-pub use input_rule::{InputRule, NO_TEXT, NoText};
+pub use input_rule::{InputRule, NO_TEXT, NoText, check_read};
 pub use line_budget::ExchangeBudget;
 pub use listen::listen_address;
 pub use multiplexing::Constants;
 pub use network::{BoardAddress, Network};
-pub(crate) use port::MIN_CYCLE;
-pub use port::{Bus, Echo, Parity, Port, Rs485};
+pub use port::{Bus, Echo, MIN_CYCLE, Parity, Port, Rs485};
 pub use recipe::{
     CanFramePart, CommandEntry, CommandWhen, FieldSpec, InputBinding, MAX_COMMAND_TEXT, OnStale,
     OutputBinding, Parts, Recipe, SendOn, Span, StreamPart, Words,
 };
-pub use rules::{check_address, check_bit, check_bitrate, check_cycle, check_name};
+pub use rules::{MAX_LINE_TIME, MAX_TIME, check_address, check_bit, check_bitrate, check_cycle, check_name};
 pub use safe_value::SafeValue;
 pub use sendable::{Limits, MAX_SENDABLE, MapEntry, Outside, check_sent};
 pub use source::{LinkSource, PortHealth, PortValue, StateValue, StateValueError};

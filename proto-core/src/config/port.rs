@@ -2,6 +2,8 @@
 //!
 //! Plain data: nothing here has been checked.
 
+use core::ops::RangeInclusive;
+
 use heapless::String;
 
 use super::{MAX_ADDRESS, MAX_LISTEN, Name, PortHealth, Span};
@@ -43,6 +45,12 @@ impl Port {
     /// hundred years, so that instants behind it can still be told from no instant at all.
     pub const NEVER: Duration = Duration::from_secs(100 * 365 * 86_400);
 
+    /// The default of [`Self::timeout`].
+    pub const TIMEOUT: Duration = Duration::from_millis(100);
+
+    /// The default of [`Self::stale_after`].
+    pub const STALE_AFTER: Duration = Duration::from_millis(500);
+
     /// The default of [`Self::absent`].
     pub const ABSENT: Duration = Duration::from_secs(3);
 
@@ -54,9 +62,9 @@ impl Port {
             bus,
             recipe,
             cycle: MIN_CYCLE,
-            timeout: Duration::from_millis(100),
+            timeout: Self::TIMEOUT,
             on_timeout: Span { start: 0, len: 0 },
-            stale_after: Duration::from_millis(500),
+            stale_after: Self::STALE_AFTER,
             health: PortHealth::NONE,
             safe_at_start: false,
             refresh: None,
@@ -98,6 +106,8 @@ pub enum Bus {
 impl Bus {
     /// Default bit rate of a CAN bus, in bit/s.
     pub const BITRATE: u32 = 500_000;
+    /// The bit rates that a CAN bus can have.
+    pub const BITRATES: RangeInclusive<u32> = 10_000..=1_000_000;
     /// Default TCP port of Modbus.
     pub const MODBUS_TCP: u16 = 502;
 
@@ -154,18 +164,25 @@ impl Default for Rs485 {
     /// The defaults of a file: 115 200 bit/s, no parity, 1 stop bit, an idle gap of 50 ms, a
     /// turnaround of 100 µs, an echo that is learned.
     fn default() -> Self {
-        Self {
-            baud: 115_200,
-            parity: Parity::None,
-            stop_bits: 1,
-            idle_gap: Duration::from_millis(50),
-            turnaround: Duration::from_micros(100),
-            echo: Echo::Auto,
-        }
+        Self::DEFAULT
     }
 }
 
 impl Rs485 {
+    /// The speeds that a line can have, in bit/s.
+    pub const BAUD: RangeInclusive<u32> = 1_200..=4_000_000;
+    /// The stop bits that it can have.
+    pub const STOP_BITS: RangeInclusive<u8> = 1..=2;
+    /// Its default.
+    pub const DEFAULT: Self = Self {
+        baud: 115_200,
+        parity: Parity::None,
+        stop_bits: 1,
+        idle_gap: Duration::from_millis(50),
+        turnaround: Duration::from_micros(100),
+        echo: Echo::Auto,
+    };
+
     /// The same with the silence of Modbus RTU as turnaround: 3.5 characters, or 1750 µs above
     /// 19 200 bit/s (docs/wire/modbus-rtu.md section 2). For a master, which knows how long a reply
     /// is: the idle gap stays, because systems and adapters deliver a reply in pieces.
@@ -197,4 +214,4 @@ pub enum Parity {
 }
 
 /// The shortest cycle, of the controller and of a port.
-pub(crate) const MIN_CYCLE: Duration = Duration::from_millis(4);
+pub const MIN_CYCLE: Duration = Duration::from_millis(4);

@@ -267,7 +267,7 @@ impl Words {
 
 impl FieldSpec {
     /// The field as the controller's recipes have it; `None` if only frames of devices have it.
-    pub(crate) fn field(&self) -> Option<Field> {
+    pub fn field(&self) -> Option<Field> {
         match *self {
             Self::System(var) => Some(Field::System(var)),
             Self::UserInput { ty, .. } | Self::UserOutput { ty, .. } => Some(Field::User(ty)),
@@ -291,6 +291,30 @@ impl FieldSpec {
     pub fn source(&self) -> Option<OutputBinding> {
         match *self {
             Self::UserOutput { from, .. } | Self::DeviceOutput { from, .. } => Some(from),
+            _ => None,
+        }
+    }
+
+    /// The same, to change it.
+    pub fn source_mut(&mut self) -> Option<&mut OutputBinding> {
+        match self {
+            Self::UserOutput { from, .. } | Self::DeviceOutput { from, .. } => Some(from),
+            _ => None,
+        }
+    }
+
+    /// What is done with the value of a user-defined input field.
+    pub fn target(&self) -> Option<InputBinding> {
+        match *self {
+            Self::UserInput { to, .. } | Self::DeviceInput { to, .. } => Some(to),
+            _ => None,
+        }
+    }
+
+    /// The same, to change it.
+    pub fn target_mut(&mut self) -> Option<&mut InputBinding> {
+        match self {
+            Self::UserInput { to, .. } | Self::DeviceInput { to, .. } => Some(to),
             _ => None,
         }
     }

@@ -8,14 +8,14 @@ use heapless::String;
 use super::error::{ConfigError, ConfigErrorKind as Kind, Counted, Place, PortKey};
 use super::listen::ipv6;
 use super::port::MIN_CYCLE;
-use super::{MAX_ADDRESS, MAX_NAME, Name, Rs485, Span};
+use super::{Bus, MAX_ADDRESS, MAX_NAME, Name, Rs485, Span};
 use crate::sysvar::{COUNT, SysVar, VarBit};
 use crate::time::Duration;
 
 /// The longest cycle, timeout or staleness that a configuration may have.
-pub(crate) const MAX_TIME: Duration = Duration::from_secs(3_600);
+pub const MAX_TIME: Duration = Duration::from_secs(3_600);
 /// The longest idle gap and turnaround of a serial line.
-pub(crate) const MAX_LINE_TIME: Duration = Duration::from_secs(1);
+pub const MAX_LINE_TIME: Duration = Duration::from_secs(1);
 
 pub(super) type Check = Result<(), ConfigError>;
 
@@ -25,10 +25,10 @@ impl Rs485 {
     /// # Errors
     /// The key and what is wrong with it.
     pub fn check(&self) -> Result<(), (PortKey, Kind)> {
-        if !(1_200..=4_000_000).contains(&self.baud) {
+        if !Self::BAUD.contains(&self.baud) {
             return Err((PortKey::Baud, Kind::BaudOutOfRange { baud: self.baud }));
         }
-        if !(1..=2).contains(&self.stop_bits) {
+        if !Self::STOP_BITS.contains(&self.stop_bits) {
             return Err((PortKey::StopBits, Kind::StopBits { stop_bits: self.stop_bits }));
         }
         if self.idle_gap == Duration::ZERO {
@@ -61,7 +61,7 @@ pub fn check_bit(bit: VarBit) -> Result<u8, Kind> {
 /// # Errors
 /// [`ConfigErrorKind::BitrateOutOfRange`](Kind::BitrateOutOfRange).
 pub fn check_bitrate(bitrate: u32) -> Result<(), Kind> {
-    if (10_000..=1_000_000).contains(&bitrate) { Ok(()) } else { Err(Kind::BitrateOutOfRange { bitrate }) }
+    if Bus::BITRATES.contains(&bitrate) { Ok(()) } else { Err(Kind::BitrateOutOfRange { bitrate }) }
 }
 
 /// Checks the cycle of a port: from 4 ms, the controller's fastest, to an hour.

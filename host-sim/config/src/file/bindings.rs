@@ -1,15 +1,15 @@
 //! The bindings of fields and the triggers of output parts in a gateway file.
 
-use proto_core::config::{OnStale, OutputBinding, SendOn};
+use proto_core::config::{InputBinding, OnStale, OutputBinding, SendOn};
 use proto_core::device::{Encoding, Overflow};
 use proto_core::sysvar::{SysVar, VarBit};
 
-use super::commands;
+use super::commands::{self, FileCommands};
 use super::encoding::refuse;
-use super::model::{FileInput, FileOutput, Sending};
+use super::model::Sending;
 use super::names::meant_variable;
 use super::reader::{Result, TableReader, TableValue};
-use super::sources;
+use super::sources::{self, FileSource};
 use crate::keys::field::COUNTER_TABLE;
 
 /// The words of `on_stale`.
@@ -64,7 +64,7 @@ pub(super) fn read_rising(item: &TableValue<'_>, text: &str, others: &str) -> Re
 }
 
 /// The bindings of an input field: `to`, `commands`, or both.
-pub(super) fn read_input(field: &TableReader<'_>) -> Result<(FileInput, Option<FileInput>)> {
+pub(super) fn read_input(field: &TableReader<'_>) -> Result<(Option<InputBinding>, Option<FileCommands>)> {
     let (to, commands) = (field.optional("to"), field.optional("commands"));
     if to.is_none() {
         refuse(field, &["scale", "offset"], "allowed only together with to")?;
@@ -73,16 +73,11 @@ pub(super) fn read_input(field: &TableReader<'_>) -> Result<(FileInput, Option<F
         refuse(field, &["when", "base", "idle"], "allowed only together with commands")?;
     }
     let to = to.map(|to| read_to(field, &to)).transpose()?;
-    let commands = commands.map(|item| commands::read(field, &item).map(FileInput::Commands)).transpose()?;
-    Ok(match (to, commands) {
-        (Some(to), commands) => (to, commands),
-        (None, Some(commands)) => (commands, None),
-        (None, None) => (FileInput::Unused, None),
-    })
+    Ok((to, commands.map(|item| commands::read(field, &item)).transpose()?))
 }
 
 /// A variable, or one bit of it.
-fn read_to(field: &TableReader<'_>, to: &TableValue<'_>) -> Result<FileInput> {
+fn read_to(field: &TableReader<'_>, to: &TableValue<'_>) -> Result<InputBinding> {
     let name = to.string()?;
     if let Some(bit) = VarBit::parse(name) {
         refuse(
@@ -90,13 +85,12 @@ fn read_to(field: &TableReader<'_>, to: &TableValue<'_>) -> Result<FileInput> {
             &["scale", "offset"],
             "not allowed for a bit: it is off for 0 and on for any other value",
         )?;
-        return bit
-            .map(FileInput::Bit)
-            .map_err(|error| to.error(format!("{name:?}: {error}{}", meant_variable(name))));
+        let VarBit { var, bit } =
+            bit.map_err(|error| to.error(format!("{name:?}: {error}{}", meant_variable(name))))?;
+        return Ok(InputBinding::Bit { var, bit });
     }
     let (scale, offset) = read_scale(field)?;
-    let has_offset = field.optional("offset").is_some();
-    Ok(FileInput::Variable { var: read_var(to)?, scale, offset, has_offset })
+    Ok(InputBinding::Variable { var: read_var(to)?, scale, offset })
 }
 
 /// `counter = true` or `counter = { max = 14 }`: the number behind which the counter is 0 again.
@@ -117,7 +111,7 @@ pub(super) fn read_counter(field: &TableReader<'_>, encoding: &Encoding) -> Resu
     max.integer(1..=i64::from(high)).map(Some)
 }
 
-pub(super) fn read_output(field: &TableReader<'_>) -> Result<FileOutput> {
+pub(super) fn read_output(field: &TableReader<'_>) -> Result<FileSource> {
     let (from, value) = (field.optional("from"), field.optional("value"));
     let binding = match (from, value) {
         (None, None) => {
@@ -140,7 +134,7 @@ pub(super) fn read_output(field: &TableReader<'_>) -> Result<FileOutput> {
                     refuse(field, &["scale", "offset"], "not allowed for a bit: it is 0 or 1")?;
                     let VarBit { var, bit } = bit
                         .map_err(|error| from.error(format!("{name:?}: {error}{}", meant_variable(name))))?;
-                    return Ok(FileOutput::Bound(OutputBinding::Bit { var, bit }));
+                    return Ok((OutputBinding::Bit { var, bit }, None));
                 }
                 None => {
                     let (scale, offset) = read_scale(field)?;
@@ -156,7 +150,7 @@ pub(super) fn read_output(field: &TableReader<'_>) -> Result<FileOutput> {
             "allowed only together with from = a variable or another value that it can scale",
         )?;
     }
-    Ok(FileOutput::Bound(binding))
+    Ok((binding, None))
 }
 
 pub(super) fn read_var(item: &TableValue<'_>) -> Result<SysVar> {

@@ -2,11 +2,12 @@
 //!
 //! In: its table, and the fields of the frame so far. Out: a checksum among the fields, at its place.
 
+use proto_core::config::FieldSpec;
 use proto_core::device::{Algorithm, ByteOrder, Checksum, Crc, DataId, Element, MAX_DATA_ID, TextWidth};
 use proto_core::recipe::model::MAX_STREAM_FRAME;
 
 use super::encoding::refuse;
-use super::model::{FileField, FileFieldKind};
+use super::model::FileField;
 use super::names::meant_checksum;
 use super::reader::{Result, TableReader, TableValue};
 use crate::keys::device;
@@ -39,7 +40,7 @@ pub(super) fn read_checksum(frame: &TableReader<'_>, head: usize, fields: &mut V
         Some(item) => find_place(&item, head, fields)?,
         None => fields.len(),
     };
-    fields.insert(nth, FileField { spot: item.spot.clone(), kind: FileFieldKind::Checksum(sum) });
+    fields.insert(nth, FileField::new(item.spot, String::new(), FieldSpec::Checksum(sum)));
     Ok(())
 }
 

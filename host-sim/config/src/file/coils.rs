@@ -4,12 +4,13 @@
 //! In: the list of fields of an exchange or a block of Modbus. Out: [`FileField`]s that share bytes,
 //! and how many coils they are.
 
+use proto_core::config::FieldSpec;
 use proto_core::device::{Bits, ByteOrder, Encoding, Kind, Overflow};
 use proto_core::sysvar::Direction;
 
 use super::device::{bind, binding_keys, read_constant};
 use super::encoding::refuse;
-use super::model::{FileField, FileFieldKind, WrittenField};
+use super::model::FileField;
 use super::reader::{Result, Spot, TableReader, TableValue};
 use crate::keys::field::{self, PAD_COILS};
 
@@ -52,16 +53,9 @@ impl Packer {
         let shared = self.bytes > byte;
         let encoding = Encoding { kind, order: ByteOrder::Little, shared };
         (self.bytes, self.count) = (byte + 1, self.count + 1);
-        let spot = &table.spot;
-        let mut push = |kind, own: Option<Spot>| {
-            self.fields.push(FileField { spot: own.unwrap_or_else(|| spot.clone()), kind });
-        };
         match table.optional("equals") {
-            Some(equals) => push(read_constant(table, &equals, encoding)?, None),
-            None => {
-                let written = WrittenField { encoding, overflow: Overflow::Usual };
-                bind(table, direction, written, push)?;
-            }
+            Some(equals) => self.fields.push(read_constant(table, &table.spot, &equals, encoding)?),
+            None => bind(table, direction, (encoding, Overflow::Usual), &table.spot, &mut self.fields)?,
         }
         Ok(())
     }
@@ -71,8 +65,8 @@ impl Packer {
         while self.bytes < bytes {
             let len = (bytes - self.bytes).min(usize::from(u8::MAX));
             if let Some(spot) = self.padded.clone() {
-                let kind = FileFieldKind::Padding { len: len as u8, fill: 0 };
-                self.fields.push(FileField { spot, kind });
+                let spec = FieldSpec::Padding { len: len as u8, fill: 0 };
+                self.fields.push(FileField::new(spot, String::new(), spec));
             }
             self.bytes += len;
         }

@@ -15,27 +15,15 @@ pub(crate) const WHENS: [(&str, CommandWhen); 2] =
 /// The words of `base`, and whether the base is kept.
 pub(crate) const BASES: [(&str, bool); 2] = [("reset", false), ("keep", true)];
 
-/// What the values of a field pick, and when.
-pub(super) struct FileCommands {
-    pub(super) entries: Vec<FileCommand>,
-    pub(super) when: CommandWhen,
-}
+/// What the values of a field pick, and when, with the places of the entries.
+pub(super) type FileCommands = (FieldCommands, Vec<Spot>);
 
-impl FileCommands {
-    /// The same without places, for tools that show them.
-    pub(super) fn named(&self) -> FieldCommands {
-        let entries = self.entries.iter().map(|entry| (entry.first, entry.last, entry.text.clone()));
-        FieldCommands { when: self.when, entries: entries.collect() }
-    }
-}
+/// First and last value, the command, and its place; an empty command for values that pick nothing.
+type FileCommand = ((i64, i64, String), Spot);
 
-/// What a range of values picks.
-pub(super) struct FileCommand {
-    pub(super) spot: Spot,
-    pub(super) first: i64,
-    pub(super) last: i64,
-    /// Empty for values that pick nothing.
-    pub(super) text: String,
+fn with_places(when: CommandWhen, entries: Vec<FileCommand>) -> FileCommands {
+    let (entries, spots) = entries.into_iter().unzip();
+    (FieldCommands { when, entries }, spots)
 }
 
 /// An edge or a level of a field with one bit, instead of a value.
@@ -77,9 +65,9 @@ fn read_values(
     }
     if let Some(item) = field.optional("idle") {
         let value = item.integer(IDLE.integers())?;
-        entries.push(FileCommand { spot: item.spot, first: value, last: value, text: String::new() });
+        entries.push(((value, value, String::new()), item.spot));
     }
-    Ok(FileCommands { entries, when })
+    Ok(with_places(when, entries))
 }
 
 /// Commands for the edges or the level of one bit.
@@ -99,7 +87,7 @@ fn read_bit(field: &TableReader<'_>, table: &TableReader<'_>, keys: &[BitKey]) -
             Some(BitKey::Rising | BitKey::Level) => 1,
             Some(BitKey::Falling) => 0,
         };
-        entries.push(FileCommand { first: value, last: value, text: read_text(&item)?, spot: item.spot });
+        entries.push(((value, value, read_text(&item)?), item.spot));
     }
     for key in ["when", "idle"] {
         if let Some(item) = field.optional(key) {
@@ -116,9 +104,9 @@ fn read_bit(field: &TableReader<'_>, table: &TableReader<'_>, keys: &[BitKey]) -
     };
     if keys == [BitKey::Falling] {
         // At rest the bit is set.
-        entries.push(FileCommand { spot: table.spot.clone(), first: 1, last: 1, text: String::new() });
+        entries.push(((1, 1, String::new()), table.spot.clone()));
     }
-    Ok(FileCommands { entries, when })
+    Ok(with_places(when, entries))
 }
 
 /// `base`, if the field's base survives silence.
@@ -148,7 +136,7 @@ fn read_command((key, key_spot, item): (&str, Spot, TableValue<'_>)) -> Result<F
              such as \"1..100\""
         )));
     };
-    Ok(FileCommand { first, last, text: read_text(&item)?, spot: item.spot })
+    Ok(((first, last, read_text(&item)?), item.spot))
 }
 
 /// A value such as `1`, or a range such as `1..100`.
@@ -204,8 +192,7 @@ mod tests {
         let field = TableReader::root(&document, &crate::keys::field::INPUT).unwrap();
         let commands = field.optional("commands").unwrap();
         let read = read(&field, &commands).map_err(|error| error.to_string())?;
-        let entries = read.entries.into_iter().map(|entry| (entry.first, entry.last, entry.text));
-        Ok((entries.collect(), read.when))
+        Ok((read.0.entries, read.0.when))
     }
 
     #[test]

@@ -7,7 +7,7 @@ use proto_core::wire::scalar::Scalar;
 
 use super::document::SourceTree;
 use super::functions;
-use super::lines::{read_bitrate, read_cycle, read_line};
+use super::lines::read_line;
 use super::model::{FileRecipe, Flavour};
 use super::network::check_ipv4;
 use super::reader::{Result, Spot, TableReader, TableValue};
@@ -16,6 +16,7 @@ use crate::TargetError;
 use crate::functions::Functions;
 use crate::keys;
 use crate::keys::controller::{CLIENTS, COMMAND, CONTROL, MODBUS, MODE, POWER, STATE, UDP2011};
+use crate::keys::gateway::{BITRATE, CYCLE};
 use crate::sim::{
     CommandClients, Initial, Listen, Power, Robot, RobotMode, SimBus, SimConfig, SimPort, SimProgram,
 };
@@ -190,8 +191,8 @@ fn read_port(table: &TableReader<'_>, recipes: &[FileRecipe]) -> Result<(SimPort
     let (name, name_spot) = recipes::read_name(table)?;
     let kind = table.required("bus", "rs485, can, udp-server, tcp-client or udp-client")?.choice(&BUSES)?;
     let bus = match kind {
-        BusKind::Rs485 => SimBus::Rs485(read_line(table)?),
-        BusKind::Can => SimBus::Can { bitrate: read_bitrate(table)? },
+        BusKind::Rs485 => SimBus::Rs485(read_line(table, |line| line)?),
+        BusKind::Can => SimBus::Can { bitrate: table.integer_or(&BITRATE)? },
         BusKind::UdpServer => SimBus::UdpServer,
         BusKind::TcpClient => SimBus::TcpClient { to: read_to(table)? },
         BusKind::UdpClient => SimBus::UdpClient { to: read_to(table)? },
@@ -206,7 +207,7 @@ fn read_port(table: &TableReader<'_>, recipes: &[FileRecipe]) -> Result<(SimPort
         }
         None => None,
     };
-    Ok((SimPort { name, bus, recipe, cycle: read_cycle(table)? }, name_spot))
+    Ok((SimPort { name, bus, recipe, cycle: table.time_or(&CYCLE)? }, name_spot))
 }
 
 /// Which port takes which recipe (D16, D18).

@@ -3,7 +3,7 @@
 //! In: the tables of a part and of its fields. Out: [`FileField`]s, and frames that were laid out.
 //! The controller's own recipes have none of these keys, and are refused them with the reason.
 
-use proto_core::config::{Constants, DeviceFrame, FieldSpec, OutputBinding};
+use proto_core::config::{Constants, DeviceFrame, FieldSpec, InputBinding, OutputBinding};
 use proto_core::device::{Boundary, Carrier, Encoding, LayoutError, Overflow};
 use proto_core::recipe::PartError;
 use proto_core::recipe::model::{MAX_CAN_IDS, MAX_DELIMITER, Mode, Rules};
@@ -13,50 +13,13 @@ use proto_core::wire::scalar::ScalarType;
 use super::bindings::{self, OVERFLOWS};
 use super::encoding::{self, FieldOrder, OpenNumber, refuse};
 use super::framings;
-use super::model::{
-    FileExchange, FileField, FileFieldKind, FileFrame, FileInput, FileOutput, FilePart, FileRecipe, Flavour,
-    WrittenField,
-};
+use super::model::{FileExchange, FileField, FileFrame, FilePart, FileRecipe, Flavour};
 use super::reader::{Result, Spot, TableReader, TableValue};
 use super::{input_rules, rtu_frames, sendable};
 use crate::device::{DeviceField, DeviceRecipe, ExchangeKind, FrameEnds, NamedExchange, NamedFrame};
-use crate::keys::field::{self, FILL, OVERFLOW, PAD};
+use crate::keys::field::{self, EQUALS, FILL, OVERFLOW, PAD};
 use crate::keys::frame::{OF_FRAME, OF_STREAM};
 use crate::keys::{Key, names};
-
-/// The keys of a field or what stands in its place, which no controller's recipe has.
-const OWN_KEYS: [&str; 30] = [
-    "equals",
-    "overflow",
-    "counter",
-    "pad",
-    "fill",
-    "text",
-    "length_to",
-    "count_to",
-    "length_from",
-    "order",
-    "ignore",
-    "length",
-    "counts",
-    "plus",
-    "endian",
-    "word_order",
-    "bits",
-    "signed",
-    "new",
-    "width",
-    "until",
-    "decimals",
-    "min",
-    "max",
-    "outside",
-    "map",
-    "as",
-    "no_value",
-    "valid_to",
-    "point",
-];
 
 /// Why recipes of this kind have no frames of devices; `None` if they may.
 fn why_plain(mode: Mode, flavour: Flavour) -> Option<&'static str> {
@@ -129,36 +92,34 @@ impl FieldReader {
     /// Reads one field of a user recipe, which can be several items of the frame.
     pub(super) fn read(&mut self, item: &TableValue<'_>, fields: &mut Vec<FileField>) -> Result<()> {
         let table = item.any_table()?;
-        let mut push = |kind| fields.push(FileField { spot: item.spot.clone(), kind });
+        let mut push = |name, spec| fields.push(FileField::new(item.spot.clone(), name, spec));
         let when = match self.direction {
             Direction::Input => " in an input field",
             Direction::Output => " in an output field",
         };
         if let Some(why) = why_plain(Mode::User, self.flavour) {
-            refuse(&table, &OWN_KEYS, why)?;
+            refuse(&table, &names(field::OWN.iter().copied().flatten()), why)?;
             table.check_keys(&[field::PLAIN.common], when)?;
-            push(self.read_plain(&table)?);
+            push(read_name(&table)?, self.read_plain(&table)?);
             return Ok(());
         }
         if let Some(pad) = table.optional("pad") {
             table.check_keys(&[field::PADDING], " in padding")?;
             let fill = table.integer_or(&FILL)?;
             self.open = None;
-            push(FileFieldKind::Padding { len: pad.integer(PAD.integers())?, fill });
+            push(String::new(), FieldSpec::Padding { len: pad.integer(PAD.integers())?, fill });
             return Ok(());
         }
         if table.optional("type").and_then(|item| item.as_string()) == Some("text") {
             self.open = None;
-            let name = table.optional("name").map(|item| item.string().map(str::to_owned)).transpose()?;
-            push(FileFieldKind::Device { name, spec: framings::read_text(&table, self.direction)? });
+            push(read_name_if_any(&table)?, framings::read_text(&table, self.direction)?);
             return Ok(());
         }
         refuse(&table, &framings::TEXT_KEYS, "allowed only together with type = \"text\"")?;
         if table.optional("length").is_some() {
             table.check_keys(&[field::LENGTHS, field::WRITTEN], " in a length")?;
             let encoding = encoding::read(&table, self.order, &mut self.open)?;
-            let name = table.optional("name").map(|item| item.string().map(str::to_owned)).transpose()?;
-            push(FileFieldKind::Device { name, spec: framings::read_length(&table, encoding)? });
+            push(read_name_if_any(&table)?, framings::read_length(&table, encoding)?);
             return Ok(());
         }
         refuse(&table, &framings::LENGTH_KEYS, "allowed only together with length = true")?;
@@ -168,7 +129,7 @@ impl FieldReader {
             self.open = None;
             for byte in read_text(&text)? {
                 let encoding = Encoding::scalar(ScalarType::Byte);
-                push(FileFieldKind::Fixed { name: None, encoding, value: i64::from(byte) });
+                push(String::new(), FieldSpec::Fixed { encoding, value: i64::from(byte) });
             }
             return Ok(());
         }
@@ -178,26 +139,19 @@ impl FieldReader {
             Some(equals) => {
                 refuse_bindings(&table)?;
                 let encoding = encoding::read(&table, self.order, &mut self.open)?;
-                push(read_constant(&table, &equals, encoding)?);
+                fields.push(read_constant(&table, &item.spot, &equals, encoding)?);
             }
-            None => self.read_value(&table, |kind, own| {
-                let spot = own.unwrap_or_else(|| item.spot.clone());
-                fields.push(FileField { spot, kind });
-            })?,
+            None => self.read_value(&table, &item.spot, fields)?,
         }
         Ok(())
     }
 
-    /// A field of a controller's recipe.
-    fn read_plain(&self, table: &TableReader<'_>) -> Result<FileFieldKind> {
-        let name = read_name(table)?;
-        let written = WrittenField::plain(encoding::read_plain_type(table)?);
+    /// A field of a controller's recipe, whose programs use its value.
+    fn read_plain(&self, table: &TableReader<'_>) -> Result<FieldSpec> {
+        let ty = encoding::read_plain_type(table)?;
         Ok(match self.direction {
-            Direction::Input => {
-                let to = FileInput::Unused;
-                FileFieldKind::UserInput { name, written, to, again: false, restarted: None }
-            }
-            Direction::Output => FileFieldKind::UserOutput { name, written, from: FileOutput::Program },
+            Direction::Input => FieldSpec::UserInput { ty, to: InputBinding::Unused },
+            Direction::Output => FieldSpec::UserOutput { ty, from: OutputBinding::Constant(0.0) },
         })
     }
 
@@ -205,7 +159,8 @@ impl FieldReader {
     fn read_value(
         &mut self,
         table: &TableReader<'_>,
-        push: impl FnMut(FileFieldKind, Option<Spot>),
+        spot: &Spot,
+        fields: &mut Vec<FileField>,
     ) -> Result<()> {
         let encoding = encoding::read(table, self.order, &mut self.open)?;
         let key = match self.direction {
@@ -216,7 +171,7 @@ impl FieldReader {
             refuse(table, &["overflow"], &format!("allowed only together with {key}"))?;
         }
         let overflow = table.word(&OVERFLOW, &OVERFLOWS)?.unwrap_or(Overflow::Usual);
-        bind(table, self.direction, WrittenField { encoding, overflow }, push)
+        bind(table, self.direction, (encoding, overflow), spot, fields)
     }
 }
 
@@ -235,112 +190,117 @@ pub(super) fn binding_keys(table: &TableReader<'_>, direction: Direction) -> Res
 }
 
 fn refuse_bindings(table: &TableReader<'_>) -> Result<()> {
-    let bindings = [
-        "to",
-        "commands",
-        "when",
-        "base",
-        "idle",
-        "scale",
-        "offset",
-        "overflow",
-        "counter",
-        "min",
-        "max",
-        "outside",
-        "map",
-        "as",
-        "no_value",
-        "valid_to",
-        "point",
-        "restarted",
-    ];
+    let bindings = names(field::BOUND_IN.iter().chain([&OVERFLOW]).filter(|key| key.name != EQUALS.name));
     refuse(table, &bindings, "a field with equals is a constant and has nothing else")
 }
 
 /// An integer that must match.
 pub(super) fn read_constant(
     table: &TableReader<'_>,
+    spot: &Spot,
     equals: &TableValue<'_>,
     encoding: Encoding,
-) -> Result<FileFieldKind> {
+) -> Result<FileField> {
     refuse_bindings(table)?;
-    let name = table.optional("name").map(|item| item.string().map(str::to_owned)).transpose()?;
+    let name = read_name_if_any(table)?;
     if !encoding.is_integer() {
         return Err(equals.error("only integers can be constants; this field may have a fraction"));
     }
     let (low, high) = encoding.range();
     let value = equals.integer(low as i64..=high as i64)?;
-    Ok(FileFieldKind::Fixed { name, encoding, value })
+    Ok(FileField::new(spot.clone(), name, FieldSpec::Fixed { encoding, value }))
 }
 
 /// A field with its binding, or two if its bytes are used twice.
 pub(super) fn bind(
     table: &TableReader<'_>,
     direction: Direction,
-    written: WrittenField,
-    mut push: impl FnMut(FileFieldKind, Option<Spot>),
+    written: (Encoding, Overflow),
+    spot: &Spot,
+    fields: &mut Vec<FileField>,
 ) -> Result<()> {
-    let encoding = written.encoding;
     match direction {
-        Direction::Output => {
-            let mut from = bindings::read_output(table)?;
-            match bindings::read_counter(table, &encoding)? {
-                Some(max) if matches!(from, FileOutput::Bound(OutputBinding::Counter)) => {
-                    from = FileOutput::Bound(OutputBinding::CounterTo { max });
-                }
-                Some(_) => refuse(table, &["counter"], "allowed only together with from = \"counter\"")?,
-                None => {}
-            }
-            if let Some(item) = table.optional("value").filter(|_| encoding.is_integer())
-                && item.number()?.fract() != 0.0
-            {
-                let value = item.number()?;
-                return Err(item.error(format!("{value} has a fraction; this field has integers only")));
-            }
-            let sendable = sendable::read(table, written, &from)?;
-            if let Some(item) = table.optional("value").filter(|_| table.optional("name").is_none()) {
-                if !encoding.is_integer() {
-                    return Err(item.error("a constant that may have a fraction needs a name"));
-                }
-                let value = item.number()? as i64;
-                push(FileFieldKind::Fixed { name: None, encoding, value }, None);
-                return Ok(());
-            }
-            push(FileFieldKind::UserOutput { name: read_name(table)?, written, from }, None);
-            for (spot, spec) in sendable {
-                push(FileFieldKind::Device { name: None, spec }, Some(spot));
-            }
+        Direction::Output => bind_output(table, written, spot, fields),
+        Direction::Input => bind_input(table, written, spot, fields),
+    }
+}
+
+fn bind_output(
+    table: &TableReader<'_>,
+    (encoding, overflow): (Encoding, Overflow),
+    spot: &Spot,
+    fields: &mut Vec<FileField>,
+) -> Result<()> {
+    let (mut from, port) = bindings::read_output(table)?;
+    match bindings::read_counter(table, &encoding)? {
+        Some(max) if matches!(from, OutputBinding::Counter) => from = OutputBinding::CounterTo { max },
+        Some(_) => refuse(table, &["counter"], "allowed only together with from = \"counter\"")?,
+        None => {}
+    }
+    if let Some(item) = table.optional("value").filter(|_| encoding.is_integer())
+        && item.number()?.fract() != 0.0
+    {
+        let value = item.number()?;
+        return Err(item.error(format!("{value} has a fraction; this field has integers only")));
+    }
+    let sendable = sendable::read(table, encoding, overflow, from)?;
+    if let Some(item) = table.optional("value").filter(|_| table.optional("name").is_none()) {
+        if !encoding.is_integer() {
+            return Err(item.error("a constant that may have a fraction needs a name"));
         }
-        Direction::Input => {
-            let name = read_name(table)?;
-            let (first, second) = bindings::read_input(table)?;
-            let counter = bindings::read_counter(table, &encoding)?.map(|max| FileInput::Counter { max });
-            let rules = input_rules::read(table, written, &first)?;
-            let mut restarted = input_rules::read_restarted(table, &encoding)?;
-            let is_used = counter.is_none() || !matches!(first, FileInput::Unused);
-            let uses = [Some(first).filter(|_| is_used), counter, second];
-            for (nth, to) in uses.into_iter().flatten().enumerate() {
-                let again = nth > 0;
-                let shared = WrittenField {
-                    encoding: Encoding { shared: true, ..encoding },
-                    overflow: Overflow::Usual,
-                };
-                let written = if again { shared } else { written };
-                let (name, restarted) = (name.clone(), restarted.take());
-                push(FileFieldKind::UserInput { name, written, to, again, restarted }, None);
-                // Those of the variable, which is the first.
-                for (spot, spec) in rules.iter().filter(|_| !again) {
-                    push(FileFieldKind::Device { name: None, spec: *spec }, Some(spot.clone()));
-                }
-            }
+        let value = item.number()? as i64;
+        fields.push(FileField::new(spot.clone(), String::new(), FieldSpec::Fixed { encoding, value }));
+        return Ok(());
+    }
+    let spec = FieldSpec::output(encoding, overflow, from);
+    let mut field = FileField::new(spot.clone(), read_name(table)?, spec);
+    (field.named.of_port, field.port) = port.unzip();
+    fields.push(field);
+    fields.extend(sendable);
+    Ok(())
+}
+
+fn bind_input(
+    table: &TableReader<'_>,
+    (encoding, overflow): (Encoding, Overflow),
+    spot: &Spot,
+    fields: &mut Vec<FileField>,
+) -> Result<()> {
+    let name = read_name(table)?;
+    let (to, mut commands) = bindings::read_input(table)?;
+    let counter = bindings::read_counter(table, &encoding)?.map(|max| InputBinding::Counter { max });
+    let mut rules = input_rules::read(table, encoding, overflow, to)?;
+    let mut restarted = input_rules::read_restarted(table, &encoding)?;
+    let picks = commands.is_some().then_some(InputBinding::Unused);
+    // Commands come first where no variable does.
+    let uses = if to.is_some() { [to, counter, picks] } else { [picks, counter, None] };
+    let uses: Vec<_> = uses.into_iter().flatten().collect();
+    let uses = if uses.is_empty() { vec![InputBinding::Unused] } else { uses };
+    for (nth, to) in uses.into_iter().enumerate() {
+        let spec = match nth {
+            0 => FieldSpec::input(encoding, overflow, to),
+            _ => FieldSpec::input(Encoding { shared: true, ..encoding }, Overflow::Usual, to),
+        };
+        let mut field = FileField::new(spot.clone(), name.clone(), spec);
+        (field.named.repeats, field.restarted) = (nth > 0, restarted.take());
+        field.named.has_offset =
+            matches!(to, InputBinding::Variable { .. }) && table.optional("offset").is_some();
+        if let Some((commands, spots)) = commands.take_if(|_| to == InputBinding::Unused) {
+            (field.named.commands, field.commands) = (Some(commands), spots);
         }
+        fields.push(field);
+        // Those of the variable, which is the first.
+        fields.append(&mut rules);
     }
     Ok(())
 }
 
 pub(super) fn read_name(table: &TableReader<'_>) -> Result<String> {
     Ok(table.required("name", "give the field a name")?.string()?.to_owned())
+}
+
+fn read_name_if_any(table: &TableReader<'_>) -> Result<String> {
+    table.optional("name").map_or(Ok(String::new()), |item| item.string().map(str::to_owned))
 }
 
 fn read_text<'a>(item: &TableValue<'a>) -> Result<impl Iterator<Item = u8> + use<'a>> {
@@ -413,7 +373,7 @@ impl FilePart {
             _ => None,
         };
         let is_element = |field: &&FileField| field.spec().element().is_some();
-        let is_checksum = |field: &&FileField| matches!(field.kind, FileFieldKind::Checksum(_));
+        let is_checksum = |field: &&FileField| matches!(field.spec(), FieldSpec::Checksum(_));
         let field = match error.element() {
             Some(element) => frame.fields.iter().filter(is_element).nth(usize::from(element)),
             None if error.is_of_checksum() => frame.fields.iter().find(is_checksum),
@@ -497,7 +457,7 @@ impl FileRecipe {
 
     fn named_frame(&self, part: &FilePart, frame: &FileFrame) -> NamedFrame {
         let mut fields: Vec<DeviceField> = Vec::new();
-        for named in frame.fields.iter().map(FileField::named) {
+        for named in frame.fields.iter().map(|field| field.named.clone()) {
             match fields.last_mut().filter(|_| named.spec.is_of_field_before()) {
                 Some(field) => field.sendable.push(named.spec),
                 None => fields.push(named),
@@ -514,7 +474,8 @@ impl FileRecipe {
     }
 
     fn named_exchange(&self, exchange: &FileExchange) -> NamedExchange {
-        let FileExchange { peer, kind, output, input, pending, refusal, remote, .. } = exchange;
+        let FileExchange { settings, kind, output, input, pending, refusal, remote, .. } = exchange;
+        let peer = settings.peer;
         let frame = |part: &Option<FilePart>| {
             part.as_ref().and_then(|part| Some(self.named_frame(part, part.frames.first()?)))
         };
@@ -522,34 +483,13 @@ impl FileRecipe {
         let [request, reply, refusal] = match kind {
             ExchangeKind::Frames => [frame(output), frame(input), frame(refusal)],
             ExchangeKind::Master(operation) => {
-                rtu_frames::frames(*peer, operation, &fields(output), &fields(input))
+                rtu_frames::frames(peer, operation, &fields(output), &fields(input))
             }
             ExchangeKind::Slave(operation) => {
-                rtu_frames::frames(*peer, operation, &fields(input), &fields(output))
+                rtu_frames::frames(peer, operation, &fields(input), &fields(output))
             }
         };
         let pending = frame(pending);
-        NamedExchange { peer: *peer, kind: *kind, request, reply, pending, refusal, remote: *remote }
-    }
-}
-
-impl FileField {
-    fn named(&self) -> DeviceField {
-        let repeats = matches!(self.kind, FileFieldKind::UserInput { again: true, .. });
-        let commands = match &self.kind {
-            FileFieldKind::UserInput { to: FileInput::Commands(commands), .. } => Some(commands.named()),
-            _ => None,
-        };
-        let of_port = self.port_named().map(|(_, name, _)| name.to_owned());
-        let has_offset = matches!(
-            self.kind,
-            FileFieldKind::UserInput { to: FileInput::Variable { has_offset: true, .. }, .. }
-        );
-        DeviceField { repeats, commands, has_offset, of_port, ..DeviceField::new(self.name(), self.spec()) }
-    }
-
-    /// What the field is, without a table of commands.
-    pub(super) fn spec(&self) -> FieldSpec {
-        self.bound_spec(|to| to.without_commands())
+        NamedExchange { peer, kind: *kind, request, reply, pending, refusal, remote: *remote }
     }
 }

@@ -4,7 +4,7 @@
 //! frames here are a device's own; those of Modbus are in `modbus`.
 
 use proto_core::config::{
-    DEFAULT_REPLY_TIMEOUT, ExchangeError, ExchangeKey, OutcomeTo, Port, Restarted, Triggers,
+    Exchange, ExchangeError, ExchangeKey, InputBinding, OutcomeTo, Port, Restarted, Triggers,
 };
 use proto_core::device::{Boundary, Carrier, Element};
 use proto_core::recipe::model::{Mode, Rules};
@@ -15,29 +15,11 @@ use proto_core::wire::can::CanId;
 use super::bindings;
 use super::encoding::refuse;
 use super::frames::{read_bytes, read_fields, read_id};
-use super::model::{
-    AskTiming, FileExchange, FileField, FileFieldKind, FileFrame, FileInput, FilePart, Flavour, FrameOrder,
-    Sending,
-};
+use super::model::{FileExchange, FileField, FileFrame, FilePart, Flavour, FrameOrder, Sending};
 use super::reader::{Result, Spot, TableReader, TableValue};
 use crate::device::ExchangeKind;
-use crate::keys::exchange;
 use crate::keys::frame::OF_FRAME;
-
-/// The keys of [`AskTiming`].
-const TIMING_KEYS: [&str; 11] = [
-    "every_ms",
-    "on",
-    "timeout_ms",
-    "retries",
-    "pause_ms",
-    "trigger_ms",
-    "late_ms",
-    "stop",
-    "name",
-    "follow",
-    "outcome",
-];
+use crate::keys::{self, exchange};
 
 /// The exchanges of a stream or CAN recipe.
 pub(super) fn read_all(recipe: &TableReader<'_>, mode: Mode, is_can: bool) -> Result<Vec<FileExchange>> {
@@ -85,19 +67,22 @@ fn read(table: &TableReader<'_>, is_can: bool, names: &[Option<String>]) -> Resu
         (None, _, Some((part, _))) | (_, None, Some((part, _))) => {
             return Err(part.spot.error(table.document, ExchangeError::LoneRefusal));
         }
-        (None, ..) => refuse(table, &TIMING_KEYS, "there is no request to send; allowed: reply, peer")?,
+        (None, ..) => refuse(
+            table,
+            &keys::names(exchange::TIMING.iter()),
+            "there is no request to send; allowed: reply, peer",
+        )?,
         (Some(_), None, _) => {
             refuse(table, &["timeout_ms", "retries", "late_ms", "stop"], "there is no reply to wait for")?;
         }
         _ => {}
     }
-    let timing = AskTiming::read(table, names)?;
-    let overdue = match table.optional("reply") {
-        Some(reply) => read_overdue(&reply.any_table()?, "timeout_ms")?,
-        None => None,
-    };
+    let (mut settings, retries) = read_settings(table, peer, names)?;
+    if let Some(reply) = table.optional("reply") {
+        settings.overdue = read_overdue(&reply.any_table()?, "timeout_ms")?;
+    }
     if request.is_some() {
-        timing.check_asked(table)?;
+        check_asked(table, &settings)?;
     }
     for (part, _) in [&pending, &refusal].into_iter().flatten() {
         check_refusal(table, part)?;
@@ -112,24 +97,21 @@ fn read(table: &TableReader<'_>, is_can: bool, names: &[Option<String>]) -> Resu
             ("refusal", ExchangeKey::Refusal),
         ],
     );
-    let restarted = restarted(table, reply.as_ref().map(|(part, _)| part), &mut spots)?;
+    settings.restarted = restarted(table, reply.as_ref().map(|(part, _)| part), &mut spots)?;
     let remote = request.as_ref().is_some_and(|(_, remote)| *remote);
     let [output, input, pending, refusal] = [request, reply, pending, refusal].map(|frame| Some(frame?.0));
-    let kind = ExchangeKind::Frames;
     Ok(FileExchange {
         spot: table.spot.clone(),
         spots,
-        peer,
-        kind,
+        settings,
+        retries,
+        kind: ExchangeKind::Frames,
         output,
         input,
         pending,
         refusal,
         is_can,
         remote,
-        overdue,
-        restarted,
-        timing,
     })
 }
 
@@ -178,7 +160,7 @@ pub(super) fn restarted(
         matches!(field.spec().element(), Some(Element::Value { .. } | Element::Fixed { .. }))
     };
     let numbers = reply.fields().iter().filter(has_number).enumerate();
-    let mut found = numbers.filter_map(|(nth, field)| Some((nth, field.restarted()?)));
+    let mut found = numbers.filter_map(|(nth, field)| Some((nth, field.restarted.as_ref()?)));
     let Some((nth, (spot, value))) = found.next() else { return Ok(None) };
     if let Some((_, (other, _))) = found.next() {
         return Err(other.error(table.document, "another field of the reply has restarted; one tells it"));
@@ -190,7 +172,7 @@ pub(super) fn restarted(
 /// Elsewhere nothing tells of a restart.
 pub(super) fn refuse_restarted(table: &TableReader<'_>, part: Option<&FilePart>) -> Result<()> {
     let fields = part.into_iter().flat_map(|part| part.frames.iter().flat_map(|frame| &frame.fields));
-    match fields.filter_map(FileField::restarted).next() {
+    match fields.filter_map(|field| field.restarted.as_ref()).next() {
         Some((spot, _)) => Err(spot.error(table.document, ExchangeError::RestartedNothing)),
         None => Ok(()),
     }
@@ -241,8 +223,8 @@ fn read_frame(
 fn check_refusal(table: &TableReader<'_>, part: &FilePart) -> Result<()> {
     refuse_restarted(table, Some(part))?;
     let is_other = |field: &&FileField| {
-        let FileFieldKind::UserInput { to, .. } = &field.kind else { return false };
-        matches!(to, FileInput::Commands(_) | FileInput::Counter { .. })
+        let is_counter = |to: InputBinding| matches!(to, InputBinding::Counter { .. });
+        field.named.commands.is_some() || field.spec().target().is_some_and(is_counter)
     };
     match part.fields().iter().find(is_other) {
         Some(field) => Err(field.spot.error(table.document, ExchangeError::RefusalValues)),
@@ -271,15 +253,6 @@ impl FilePart {
     }
 }
 
-impl FileField {
-    fn restarted(&self) -> Option<&(Spot, f64)> {
-        match &self.kind {
-            FileFieldKind::UserInput { restarted, .. } => restarted.as_ref(),
-            _ => None,
-        }
-    }
-}
-
 impl FileFrame {
     fn new(spot: Spot) -> Self {
         let (id, order) = (CanId::Standard(0), FrameOrder::default());
@@ -292,53 +265,38 @@ impl FileFrame {
     }
 }
 
-impl AskTiming {
-    /// Of what is never asked.
-    pub(super) const NEVER: Self = Self {
-        when: Triggers::NEVER,
-        timeout: DEFAULT_REPLY_TIMEOUT,
-        retries: None,
-        pause: Duration::ZERO,
-        trigger: None,
-        late: None,
-        stop: false,
-        follow: None,
-        outcome: OutcomeTo::NONE,
-    };
-
-    /// `names` are those of all exchanges of the recipe.
-    pub(super) fn read(table: &TableReader<'_>, names: &[Option<String>]) -> Result<Self> {
-        let mut when = Triggers { every: table.time(&exchange::EVERY)?, ..Triggers::NEVER };
-        if let Some(on) = table.optional("on") {
-            let list = on.array("such as [\"start\", \"change\"]")?;
-            if list.is_empty() {
-                return Err(
-                    on.error("an empty list; allowed: \"start\", \"change\", \"rising:BitOutputReg[3].0\"")
-                );
-            }
-            list.iter().try_for_each(|item| read_on(item, &mut when))?;
+/// When an exchange is asked, how long it may take, and how often it is repeated; `names` are those of all exchanges of
+/// the recipe.
+pub(super) fn read_settings(
+    table: &TableReader<'_>,
+    peer: u8,
+    names: &[Option<String>],
+) -> Result<(Exchange, Option<u8>)> {
+    let mut settings = FileExchange::never(peer);
+    settings.when.every = table.time(&exchange::EVERY)?;
+    if let Some(on) = table.optional("on") {
+        let list = on.array("such as [\"start\", \"change\"]")?;
+        if list.is_empty() {
+            return Err(
+                on.error("an empty list; allowed: \"start\", \"change\", \"rising:BitOutputReg[3].0\"")
+            );
         }
-        Ok(Self {
-            when,
-            timeout: table.time_or(&exchange::TIMEOUT)?,
-            retries: table.integer(&exchange::RETRIES)?,
-            pause: table.time_or(&exchange::PAUSE)?,
-            trigger: table.time(&exchange::TRIGGER)?,
-            late: table.time(&exchange::LATE)?,
-            stop: table.flag(&exchange::STOP)?,
-            follow: table.optional("follow").map(|item| read_follow(&item, names)).transpose()?,
-            outcome: table.optional("outcome").map_or(Ok(OutcomeTo::NONE), |item| read_outcome(&item))?,
-        })
+        list.iter().try_for_each(|item| read_on(item, &mut settings.when))?;
     }
+    settings.timeout = table.time_or(&exchange::TIMEOUT)?;
+    let retries = table.integer(&exchange::RETRIES)?;
+    settings.pause = table.time_or(&exchange::PAUSE)?;
+    settings.trigger = table.time(&exchange::TRIGGER)?;
+    settings.late = table.time(&exchange::LATE)?;
+    settings.stop = table.flag(&exchange::STOP)?;
+    settings.follow = table.optional("follow").map(|item| read_follow(&item, names)).transpose()?;
+    settings.outcome = table.optional("outcome").map_or(Ok(OutcomeTo::NONE), |item| read_outcome(&item))?;
+    Ok((settings, retries))
+}
 
-    /// Refuses a request that is never sent.
-    pub(super) fn check_asked(&self, table: &TableReader<'_>) -> Result<()> {
-        if self.when.is_never() && self.follow.is_none() {
-            Err(table.error(ExchangeError::Never))
-        } else {
-            Ok(())
-        }
-    }
+/// Refuses a request that is never sent.
+pub(super) fn check_asked(table: &TableReader<'_>, settings: &Exchange) -> Result<()> {
+    if settings.is_never() { Err(table.error(ExchangeError::Never)) } else { Ok(()) }
 }
 
 /// The number of the exchange with a name.

@@ -2,13 +2,14 @@
 //!
 //! In: tables. Out: ids, bytes and [`FileField`]s.
 
+use proto_core::config::FieldSpec;
 use proto_core::recipe::model::{Mode, Rules};
 use proto_core::sysvar::VarRange;
 use proto_core::wire::can::CanId;
 
 use super::checksums;
 use super::device::FieldReader;
-use super::model::{FileField, FileFieldKind, Flavour};
+use super::model::{FileField, Flavour};
 use super::names::meant_variable;
 use super::reader::{Result, Spot, TableReader, TableValue};
 use crate::keys;
@@ -61,9 +62,9 @@ pub(super) fn read_fields(
                 let range = VarRange::parse(name)
                     .map_err(|error| item.error(format!("{name:?}: {error}{}", meant_variable(name))))?;
                 fields.extend(
-                    range
-                        .iter()
-                        .map(|var| FileField { spot: item.spot.clone(), kind: FileFieldKind::System(var) }),
+                    range.iter().map(|var| {
+                        FileField::new(item.spot.clone(), var.to_string(), FieldSpec::System(var))
+                    }),
                 );
             }
             (Mode::Realtime, None) => {

@@ -2,48 +2,49 @@
 //!
 //! In: the field's table, its encoding, its variable. Out: what stands behind the field in the configuration.
 
-use proto_core::config::{FieldSpec, InputRule, MapEntry, NO_TEXT, NoText};
+use proto_core::config::{FieldSpec, InputBinding, InputRule, MapEntry, NO_TEXT, NoText, check_read};
 use proto_core::device::{Encoding, Kind, Overflow};
 use proto_core::sysvar::{Direction, SysVar, VarBit};
 use proto_core::wire::scalar::ScalarType;
 
 use super::bindings::read_var;
 use super::encoding::refuse;
-use super::model::{FileInput, WrittenField};
+use super::model::FileField;
 use super::names::meant_variable;
 use super::reader::{Result, Spot, TableReader, TableValue};
-use super::sendable::{add_entry, read_limits};
-use crate::keys::field::{AS, POINT, RESTARTED};
+use super::sendable::{add_entry, behind, read_limits};
+use crate::keys::field::{AS, POINT, RESTARTED, RULES_IN};
+use crate::keys::names;
 
 /// The words of `as`.
 pub(crate) const AS_WORDS: [(&str, InputRule); 1] = [("int16", InputRule::Int16)];
 /// The words of `point`.
 pub(crate) const POINTS: [(&str, Option<InputRule>); 2] = [(".", None), (",", Some(InputRule::Comma))];
 
-/// All of these keys.
-pub(super) const KEYS: [&str; 8] = ["as", "min", "max", "outside", "map", "no_value", "valid_to", "point"];
-
 /// What stands behind an input field, with the places of their keys.
 pub(super) fn read(
     table: &TableReader<'_>,
-    written: WrittenField,
-    to: &FileInput,
-) -> Result<Vec<(Spot, FieldSpec)>> {
-    let WrittenField { encoding, overflow } = written;
-    let var = match *to {
-        FileInput::Variable { var, .. } => var,
-        FileInput::Bit(_) => {
+    encoding: Encoding,
+    overflow: Overflow,
+    to: Option<InputBinding>,
+) -> Result<Vec<FileField>> {
+    let var = match to {
+        Some(InputBinding::Variable { var, .. }) => var,
+        Some(InputBinding::Bit { .. }) => {
             let why = "not allowed for a bit: it is off for 0 and on for any other value";
-            return refuse(table, &KEYS, why).map(|()| Vec::new());
+            return refuse(table, &names(RULES_IN.iter()), why).map(|()| Vec::new());
         }
-        _ => return refuse(table, &KEYS, "allowed only together with to").map(|()| Vec::new()),
+        _ => {
+            return refuse(table, &names(RULES_IN.iter()), "allowed only together with to")
+                .map(|()| Vec::new());
+        }
     };
     if overflow == Overflow::Wrap {
         let why = "not allowed together with overflow = \"wrap\", which takes any number";
         refuse(table, &["as", "min", "max", "outside", "map"], why)?;
     }
     let mut rules = Vec::new();
-    let rule = |item: &TableValue<'_>, rule| (item.spot.clone(), FieldSpec::InputRule(rule));
+    let rule = |item: &TableValue<'_>, rule| behind(item.spot.clone(), FieldSpec::InputRule(rule));
     if let Some(item) = table.optional("point") {
         if !matches!(encoding.kind, Kind::Decimal(_)) {
             return Err(item.error("only decimal has a point"));
@@ -91,22 +92,11 @@ pub(super) fn read_restarted(table: &TableReader<'_>, encoding: &Encoding) -> Re
 /// A number that the field can have.
 fn read_number(item: &TableValue<'_>, encoding: &Encoding) -> Result<f64> {
     let number = item.number()?;
-    let (low, high) = encoding.range();
-    if !(low..=high).contains(&number) {
-        return Err(item.error(format!("the field cannot be {number}; allowed: {low}..={high}")));
-    }
-    if encoding.reads_integers() && number.fract() != 0.0 {
-        return Err(item.error(format!("{number} has a fraction; this field has integers only")));
-    }
+    check_read(encoding, number).map_err(|kind| item.error(kind))?;
     Ok(number)
 }
 
-fn read_map(
-    map: &TableValue<'_>,
-    var: SysVar,
-    is_int16: bool,
-    rules: &mut Vec<(Spot, FieldSpec)>,
-) -> Result<()> {
+fn read_map(map: &TableValue<'_>, var: SysVar, is_int16: bool, rules: &mut Vec<FileField>) -> Result<()> {
     let (mut entries, mut otherwise): (Vec<(Spot, MapEntry)>, _) = (Vec::new(), None);
     for (key, key_spot, item) in map.any_table()?.entries() {
         let sent = item.number()?;
@@ -119,7 +109,7 @@ fn read_map(
             return Err(item.error(format!("{var} cannot be {sent}; allowed: {low}..={high}")));
         }
         if key == "else" {
-            otherwise = Some((item.spot.clone(), FieldSpec::InputRule(InputRule::Else(sent))));
+            otherwise = Some(behind(item.spot.clone(), FieldSpec::InputRule(InputRule::Else(sent))));
             continue;
         }
         let keys = "values of the field, such as 1, ranges of them, such as \"1..100\", or else";
@@ -128,7 +118,8 @@ fn read_map(
     if entries.is_empty() {
         return Err(map.error("no entries; write for example { 0 = 1, \"1..7\" = 2, else = 9 }"));
     }
-    rules.extend(entries.into_iter().map(|(spot, entry)| (spot, FieldSpec::Mapped(entry))).chain(otherwise));
+    let entries = entries.into_iter().map(|(spot, entry)| behind(spot, FieldSpec::Mapped(entry)));
+    rules.extend(entries.chain(otherwise));
     Ok(())
 }
 

@@ -13,44 +13,29 @@ use super::coils;
 use super::device::FieldReader;
 use super::encoding::refuse;
 use super::exchanges;
-use super::model::{AskTiming, FileExchange, FileField, FileFrame, FilePart};
+use super::model::{FileExchange, FileField, FileFrame, FilePart};
 use super::reader::{Result, TableReader, TableValue};
 use crate::device::ExchangeKind;
 use crate::keys::{self, exchange};
 
-/// A function that reads or writes one table.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Function {
-    ReadCoils,
-    ReadDiscreteInputs,
-    ReadHoldingRegisters,
-    ReadInputRegisters,
-    WriteCoil,
-    WriteRegister,
-    WriteCoils,
-    WriteRegisters,
-    ReadWriteRegisters,
-    MaskWriteRegister,
-}
-
-/// The names, the numbers and the functions of `function`.
-pub(crate) const FUNCTIONS: [(&str, i64, Function); 10] = [
-    ("read-coils", 1, Function::ReadCoils),
-    ("read-discrete-inputs", 2, Function::ReadDiscreteInputs),
-    ("read-holding-registers", 3, Function::ReadHoldingRegisters),
-    ("read-input-registers", 4, Function::ReadInputRegisters),
-    ("write-coil", 5, Function::WriteCoil),
-    ("write-register", 6, Function::WriteRegister),
-    ("write-coils", 15, Function::WriteCoils),
-    ("write-registers", 16, Function::WriteRegisters),
-    ("mask-write-register", 22, Function::MaskWriteRegister),
-    ("read-write-registers", 23, Function::ReadWriteRegisters),
+/// The names and the numbers of `function`.
+pub(crate) const FUNCTIONS: [(&str, u8); 10] = [
+    ("read-coils", 1),
+    ("read-discrete-inputs", 2),
+    ("read-holding-registers", 3),
+    ("read-input-registers", 4),
+    ("write-coil", 5),
+    ("write-register", 6),
+    ("write-coils", 15),
+    ("write-registers", 16),
+    ("mask-write-register", 22),
+    ("read-write-registers", 23),
 ];
 
 /// The name of a function of Modbus, such as `read-coils` for 1.
 pub fn function_name(operation: &Operation) -> &'static str {
-    let code = i64::from(operation.function());
-    FUNCTIONS.iter().find(|(_, known, _)| *known == code).map_or("", |(name, ..)| name)
+    let code = operation.function();
+    FUNCTIONS.iter().find(|(_, known)| *known == code).map_or("", |(name, _)| name)
 }
 
 /// The words of `table`.
@@ -87,29 +72,32 @@ fn read_exchange(table: &TableReader<'_>, names: &[Option<String>]) -> Result<Fi
     table.check_names(&all, exchange::OF_MODBUS.place, |_| false)?;
     let slave = table.required("slave", "the slave's address, 1..=247, or 0 to write to all of them")?;
     let function = read_function(table)?;
-    if !function.reads() {
+    let (holds, ..) = function.place();
+    let (reads, writes) = (function.reads(), function.written_len() > 0);
+    if !reads {
         refuse(table, &["read"], "this function writes only; its fields are in write")?;
     }
-    if !function.writes() {
+    if !writes {
         refuse(table, &["write"], "this function reads only; its fields are in read")?;
     }
-    if function != Function::ReadWriteRegisters {
+    let is_both = reads && writes;
+    if !is_both {
         refuse(table, &["write_address"], "allowed only for read-write-registers, which has two addresses")?;
     }
-    let address = |key, what| read_first(&table.required(key, what)?, function.table());
+    let address = |key, what| read_first(&table.required(key, what)?, holds);
     let first = address("address", "the first register or coil, counted from 0 as on the line")?;
-    let write_first = match function {
-        Function::ReadWriteRegisters => address("write_address", "the first register that is written")?,
-        _ => first,
+    let write_first = match is_both {
+        true => address("write_address", "the first register that is written")?,
+        false => first,
     };
     let list = |key, direction, is_used: bool| match is_used {
-        true => List::read(table, key, direction, function.of_coils()).map(Some),
+        true => List::read(table, key, direction, is_of_coils(holds)).map(Some),
         false => Ok(None),
     };
-    let read = list("read", Direction::Input, function.reads())?;
-    let write = list("write", Direction::Output, function.writes())?;
+    let read = list("read", Direction::Input, reads)?;
+    let write = list("write", Direction::Output, writes)?;
     let peer = slave.integer(exchange::SLAVE.integers())?;
-    if peer == BROADCAST && function.reads() {
+    if peer == BROADCAST && reads {
         return Err(slave.error(ExchangeError::BroadcastRead));
     }
     if peer == BROADCAST {
@@ -120,9 +108,10 @@ fn read_exchange(table: &TableReader<'_>, names: &[Option<String>]) -> Result<Fi
         )?;
     }
     let count = |list: &Option<List<'_>>| list.as_ref().map_or(0, |list| list.count);
-    if matches!(function, Function::WriteCoil | Function::WriteRegister) && count(&write) != 1 {
-        let (one, several) = match function {
-            Function::WriteCoil => ("one coil", "write-coils"),
+    if matches!(function, Operation::WriteCoil { .. } | Operation::WriteRegister { .. }) && count(&write) != 1
+    {
+        let (one, several) = match holds {
+            Table::Coils => ("one coil", "write-coils"),
             _ => ("one register", "write-registers"),
         };
         return Err(table.required("write", "")?.error(format!(
@@ -131,7 +120,7 @@ fn read_exchange(table: &TableReader<'_>, names: &[Option<String>]) -> Result<Fi
         )));
     }
     let mask = write.as_ref().map_or(0, List::bits);
-    if function == Function::MaskWriteRegister {
+    if matches!(function, Operation::MaskWriteRegister { .. }) {
         let list = table.required("write", "")?;
         if count(&write) != 1 {
             return Err(list.error(format!(
@@ -143,21 +132,24 @@ fn read_exchange(table: &TableReader<'_>, names: &[Option<String>]) -> Result<Fi
             return Err(list.error(ExchangeError::Mask));
         }
     }
-    let operation = function.operation((first, count(&read)), (write_first, count(&write)), mask);
+    let (read_place, write_place) = ((first, count(&read)), (write_first, count(&write)));
+    let operation =
+        Operation::of_function(function.function(), read_place, write_place, mask).unwrap_or(function);
     check(table, &operation, &read, &write)?;
-    let timing = AskTiming::read(table, names)?;
-    if !function.reads() {
+    let (mut settings, retries) = exchanges::read_settings(table, peer, names)?;
+    if !reads {
         refuse(table, &["expect", "overdue_ms"], "this function writes only; its reply has no values")?;
     }
-    let overdue = exchanges::read_overdue(table, "overdue_ms")?;
-    timing.check_asked(table)?;
+    settings.overdue = exchanges::read_overdue(table, "overdue_ms")?;
+    exchanges::check_asked(table, &settings)?;
     let mut spots =
         exchanges::spots(table, &[("slave", ExchangeKey::Peer), ("address", ExchangeKey::Registers)]);
-    let restarted = exchanges::restarted(table, read.as_ref().map(|list| &list.part), &mut spots)?;
+    settings.restarted = exchanges::restarted(table, read.as_ref().map(|list| &list.part), &mut spots)?;
     Ok(FileExchange {
         spot: table.spot.clone(),
         spots,
-        peer,
+        settings,
+        retries,
         kind: ExchangeKind::Master(operation),
         output: write.map(|list| list.part),
         input: read.map(|list| list.part),
@@ -165,9 +157,6 @@ fn read_exchange(table: &TableReader<'_>, names: &[Option<String>]) -> Result<Fi
         refusal: None,
         is_can: false,
         remote: false,
-        overdue,
-        restarted,
-        timing,
     })
 }
 
@@ -178,18 +167,8 @@ fn read_block(table: &TableReader<'_>, peer: u8) -> Result<FileExchange> {
     let first = table.required("address", "the first register or coil, counted from 0 as on the line")?;
     let first = read_first(&first, holds)?;
     let direction = direction_of(table, holds)?;
-    let is_coils = matches!(holds, Table::Coils | Table::DiscreteInputs);
-    let list = List::read(table, "fields", direction, is_coils)?;
-    let count = list.count;
-    let function = match (holds, direction) {
-        (Table::Coils, Direction::Input) => Function::WriteCoils,
-        (Table::Coils, Direction::Output) => Function::ReadCoils,
-        (Table::DiscreteInputs, _) => Function::ReadDiscreteInputs,
-        (Table::HoldingRegisters, Direction::Input) => Function::WriteRegisters,
-        (Table::HoldingRegisters, Direction::Output) => Function::ReadHoldingRegisters,
-        (Table::InputRegisters, _) => Function::ReadInputRegisters,
-    };
-    let operation = function.operation((first, count), (first, count), 0);
+    let list = List::read(table, "fields", direction, is_of_coils(holds))?;
+    let operation = Operation::of_block(holds, direction, first, list.count);
     let list = Some(list);
     match direction {
         Direction::Input => check(table, &operation, &None, &list)?,
@@ -201,7 +180,8 @@ fn read_block(table: &TableReader<'_>, peer: u8) -> Result<FileExchange> {
     Ok(FileExchange {
         spot: table.spot.clone(),
         spots: exchanges::spots(table, &[("address", ExchangeKey::Registers)]),
-        peer,
+        settings: FileExchange::never(peer),
+        retries: None,
         kind: ExchangeKind::Slave(operation),
         output,
         input,
@@ -209,9 +189,6 @@ fn read_block(table: &TableReader<'_>, peer: u8) -> Result<FileExchange> {
         refusal: None,
         is_can: false,
         remote: false,
-        overdue: None,
-        restarted: None,
-        timing: AskTiming::NEVER,
     })
 }
 
@@ -260,19 +237,22 @@ fn direction_of(block: &TableReader<'_>, holds: Table) -> Result<Direction> {
     }))
 }
 
-/// By name or by number.
-fn read_function(table: &TableReader<'_>) -> Result<Function> {
+/// By name or by number, with counts of 1.
+fn read_function(table: &TableReader<'_>) -> Result<Operation> {
     let item = table.required("function", "such as \"read-input-registers\", or its number, 4")?;
-    let names = FUNCTIONS.map(|(name, _, function)| (name, function));
-    if item.as_string().is_some() {
-        return item.choice(&names);
-    }
-    let Some(number) = item.as_integer() else { return item.choice(&names) };
-    let known = FUNCTIONS.iter().find(|(_, code, _)| *code == number);
-    known.map(|(.., function)| *function).ok_or_else(|| {
-        let codes: Vec<_> = FUNCTIONS.iter().map(|(name, code, _)| format!("{code} ({name})")).collect();
+    let number = match item.as_integer() {
+        None => i64::from(item.choice(&FUNCTIONS)?),
+        Some(number) => number,
+    };
+    let known = u8::try_from(number).ok().and_then(|code| Operation::of_function(code, (0, 1), (0, 1), 0));
+    known.ok_or_else(|| {
+        let codes: Vec<_> = FUNCTIONS.iter().map(|(name, code)| format!("{code} ({name})")).collect();
         item.error(format!("function {number} is unknown; allowed: {}", codes.join(", ")))
     })
+}
+
+fn is_of_coils(table: Table) -> bool {
+    matches!(table, Table::Coils | Table::DiscreteInputs)
 }
 
 /// Fields, and the registers or coils that they are.
@@ -361,62 +341,4 @@ fn check(
         }
     }
     Ok(())
-}
-
-impl Function {
-    /// What it reads or writes.
-    fn table(self) -> Table {
-        match self {
-            Self::ReadCoils | Self::WriteCoil | Self::WriteCoils => Table::Coils,
-            Self::ReadDiscreteInputs => Table::DiscreteInputs,
-            Self::ReadInputRegisters => Table::InputRegisters,
-            Self::ReadHoldingRegisters
-            | Self::WriteRegister
-            | Self::WriteRegisters
-            | Self::MaskWriteRegister
-            | Self::ReadWriteRegisters => Table::HoldingRegisters,
-        }
-    }
-
-    fn of_coils(self) -> bool {
-        matches!(self, Self::ReadCoils | Self::ReadDiscreteInputs | Self::WriteCoil | Self::WriteCoils)
-    }
-
-    fn reads(self) -> bool {
-        !matches!(
-            self,
-            Self::WriteCoil
-                | Self::WriteRegister
-                | Self::WriteCoils
-                | Self::WriteRegisters
-                | Self::MaskWriteRegister
-        )
-    }
-
-    fn writes(self) -> bool {
-        !self.reads() || self == Self::ReadWriteRegisters
-    }
-
-    /// With addresses and counts, and the bits that are written of one register.
-    fn operation(self, read: (u16, u16), write: (u16, u16), mask: u16) -> Operation {
-        let ((address, count), (write_address, write_count)) =
-            if self.reads() { (read, write) } else { (write, write) };
-        match self {
-            Self::ReadCoils => Operation::ReadCoils { address, count },
-            Self::ReadDiscreteInputs => Operation::ReadDiscreteInputs { address, count },
-            Self::ReadHoldingRegisters => Operation::ReadHoldingRegisters { address, count },
-            Self::ReadInputRegisters => Operation::ReadInputRegisters { address, count },
-            Self::WriteCoil => Operation::WriteCoil { address },
-            Self::WriteRegister => Operation::WriteRegister { address },
-            Self::WriteCoils => Operation::WriteCoils { address, count },
-            Self::WriteRegisters => Operation::WriteRegisters { address, count },
-            Self::MaskWriteRegister => Operation::MaskWriteRegister { address, mask },
-            Self::ReadWriteRegisters => Operation::ReadWriteRegisters {
-                read_address: address,
-                read_count: count,
-                write_address,
-                write_count,
-            },
-        }
-    }
 }

@@ -210,7 +210,9 @@ fn read_part(item: &TableValue<'_>, rules: Rules, is_can: bool, flavour: Flavour
 impl FilePart {
     /// Checks that the part fits this framing.
     fn check(&self, rules: Rules, is_can: bool, framing: Framing) -> std::result::Result<(), PartError> {
-        let fields = |frame: &FileFrame| frame.fields.iter().filter_map(FileField::field).collect::<Vec<_>>();
+        let fields = |frame: &FileFrame| {
+            frame.fields.iter().filter_map(|field| field.spec().field()).collect::<Vec<_>>()
+        };
         if is_can {
             CanLayout::new(rules, self.frames.iter().map(|frame| (frame.id, fields(frame)))).map(|_| ())
         } else {
@@ -275,7 +277,9 @@ impl FileRecipe {
     /// The recipe with the names of its fields, without bindings; frames of devices are not in it.
     pub(super) fn to_sim(&self) -> SimRecipe {
         let fields = |frame: &FileFrame| {
-            let named = |field: &FileField| Some(SimField { name: field.name(), field: field.field()? });
+            let named = |field: &FileField| {
+                Some(SimField { name: field.named.name.clone(), field: field.spec().field()? })
+            };
             frame.fields.iter().filter_map(named).collect()
         };
         let stream = |part: &Option<FilePart>| {

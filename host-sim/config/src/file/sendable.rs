@@ -7,7 +7,7 @@ use proto_core::device::{Encoding, Overflow};
 
 use super::commands::read_range;
 use super::encoding::refuse;
-use super::model::{FileOutput, WrittenField};
+use super::model::FileField;
 use super::reader::{Result, Spot, TableReader, TableValue};
 use crate::keys::field::OUTSIDE;
 
@@ -19,14 +19,11 @@ const KEYS: [&str; 4] = ["min", "max", "outside", "map"];
 /// What stands behind an output field, with the places of their keys.
 pub(super) fn read(
     table: &TableReader<'_>,
-    written: WrittenField,
-    from: &FileOutput,
-) -> Result<Vec<(Spot, FieldSpec)>> {
-    let (FileOutput::Bound(binding) | FileOutput::PortNamed { binding, .. }) = from else {
-        return Ok(Vec::new());
-    };
-    let WrittenField { encoding, overflow } = written;
-    match *binding {
+    encoding: Encoding,
+    overflow: Overflow,
+    from: OutputBinding,
+) -> Result<Vec<FileField>> {
+    match from {
         OutputBinding::Constant(_) => {
             refuse(table, &KEYS, "allowed only together with from: a constant is what it is")?;
         }
@@ -50,12 +47,17 @@ pub(super) fn read(
     Ok(limits.into_iter().collect())
 }
 
+/// What says something of the field before it.
+pub(super) fn behind(spot: Spot, spec: FieldSpec) -> FileField {
+    FileField::new(spot, String::new(), spec)
+}
+
 /// The limits of a field, whose numbers `number` reads.
 pub(super) fn read_limits(
     table: &TableReader<'_>,
     encoding: &Encoding,
     number: impl Fn(&TableValue<'_>) -> Result<f64>,
-) -> Result<Option<(Spot, FieldSpec)>> {
+) -> Result<Option<FileField>> {
     let (min, max) = (table.optional("min"), table.optional("max"));
     let Some(first) = min.as_ref().or(max.as_ref()) else {
         refuse(table, &["outside"], "allowed only together with min or max")?;
@@ -69,10 +71,10 @@ pub(super) fn read_limits(
         return Err(max.error(format!("max {high} is below min {low}")));
     }
     let outside = table.word_or(&OUTSIDE, &OUTSIDES)?;
-    Ok(Some((spot, FieldSpec::Limits(Limits { low, high, outside }))))
+    Ok(Some(behind(spot, FieldSpec::Limits(Limits { low, high, outside }))))
 }
 
-fn read_map(map: &TableValue<'_>, encoding: &Encoding) -> Result<Vec<(Spot, FieldSpec)>> {
+fn read_map(map: &TableValue<'_>, encoding: &Encoding) -> Result<Vec<FileField>> {
     let mut entries: Vec<(Spot, MapEntry)> = Vec::new();
     for (key, key_spot, item) in map.any_table()?.entries() {
         let keys = "values of the source, such as 1, or ranges of them, such as \"1..100\"";
@@ -81,7 +83,7 @@ fn read_map(map: &TableValue<'_>, encoding: &Encoding) -> Result<Vec<(Spot, Fiel
     if entries.is_empty() {
         return Err(map.error("no entries; write for example { 0 = 1, \"1..7\" = 2 }"));
     }
-    Ok(entries.into_iter().map(|(spot, entry)| (spot, FieldSpec::Mapped(entry))).collect())
+    Ok(entries.into_iter().map(|(spot, entry)| behind(spot, FieldSpec::Mapped(entry))).collect())
 }
 
 /// Adds the entry of a map for the values that its key names, which no earlier entry has; `keys` says what keys are.

@@ -6,13 +6,15 @@
 use proto_core::config::{LinkSource, OutputBinding, PortHealth, PortValue, StateValue};
 use proto_core::sysvar::SysVar;
 
-use super::model::FileOutput;
 use super::names::{did_you_mean, meant_variable};
-use super::reader::{Result, TableValue};
+use super::reader::{Result, Spot, TableValue};
 use crate::keys::gateway::HEALTH_TABLE;
 
 /// The values of port 2000, which the gateway asks only when a device picks the command.
 const ASKED: [&str; 3] = ["last_error", "state", "isprogfinish"];
+
+/// A source, and the name and the place of the port that it is of, which may stand behind the recipe.
+pub(super) type FileSource = (OutputBinding, Option<(String, Spot)>);
 
 /// Whether the text names such a source.
 pub(super) fn is_source(text: &str) -> bool {
@@ -20,7 +22,7 @@ pub(super) fn is_source(text: &str) -> bool {
 }
 
 /// Reads the source of an output field.
-pub(super) fn read(item: &TableValue<'_>, text: &str, scale: f32, offset: f32) -> Result<FileOutput> {
+pub(super) fn read(item: &TableValue<'_>, text: &str, scale: f32, offset: f32) -> Result<FileSource> {
     if let Some(name) = text.strip_prefix("controller.") {
         if ASKED.contains(&name) {
             return Err(item.error(format!(
@@ -29,7 +31,7 @@ pub(super) fn read(item: &TableValue<'_>, text: &str, scale: f32, offset: f32) -
             )));
         }
         let value = StateValue::parse(name).map_err(|error| item.error(format!("{text:?}: {error}")))?;
-        return Ok(FileOutput::Bound(OutputBinding::State { value, scale, offset }));
+        return Ok((OutputBinding::State { value, scale, offset }, None));
     }
     if let Some(rest) = text.strip_prefix("link.") {
         return read_link(item, text, rest, (scale, offset));
@@ -41,10 +43,7 @@ pub(super) fn read(item: &TableValue<'_>, text: &str, scale: f32, offset: f32) -
     };
     let value = read_value(item, value)?;
     let binding = OutputBinding::Port { port: None, value, scale, offset };
-    Ok(match name {
-        Some(name) => FileOutput::PortNamed { name: name.to_owned(), spot: item.spot.clone(), binding },
-        None => FileOutput::Bound(binding),
-    })
+    Ok((binding, name.map(|name| (name.to_owned(), item.spot.clone()))))
 }
 
 /// `link.modbus.up`, or of a listening port `link.NAME.up`.
@@ -53,17 +52,17 @@ fn read_link(
     text: &str,
     rest: &str,
     (scale, offset): (f32, f32),
-) -> Result<FileOutput> {
+) -> Result<FileSource> {
     let Some((name, "up")) = rest.rsplit_once('.') else {
         return Err(
             item.error(format!("{text:?} is not known of a link; write for example \"link.modbus.up\""))
         );
     };
     if let Some(link) = LinkSource::named(name) {
-        return Ok(FileOutput::Bound(OutputBinding::Link { link, scale, offset }));
+        return Ok((OutputBinding::Link { link, scale, offset }, None));
     }
     let binding = OutputBinding::Link { link: LinkSource::Listening(0), scale, offset };
-    Ok(FileOutput::PortNamed { name: name.to_owned(), spot: item.spot.clone(), binding })
+    Ok((binding, Some((name.to_owned(), item.spot.clone()))))
 }
 
 fn read_value(item: &TableValue<'_>, name: &str) -> Result<PortValue> {

@@ -1,8 +1,10 @@
 //! `[[recipe.exchange]]` and `[[recipe.block]]`.
 
+use proto_core::config::{DEFAULT_REPLY_TIMEOUT, LONGEST_TRIGGER, MAX_PAUSE};
+
 use super::device::WORD_ORDER_OF_REGISTERS;
 use super::frame::{EXTENDED, HEAD, ID, INPUT_FIELDS, OF_FRAME, OUTPUT_FIELDS, TAIL};
-use super::{Case, HOUR_MS, Key, KeyTable, Limits, Need, Shape, TextKind, When, field, words};
+use super::{Case, HOUR_MS, Key, KeyTable, Limits, Need, Shape, TextKind, When, field, ms, words};
 use crate::file::modbus::{FUNCTIONS, TABLES};
 
 /// The device that is asked.
@@ -24,7 +26,7 @@ pub const ON: Key = Key::new(
 );
 /// How long a reply may take.
 pub const TIMEOUT: Key = Key::millis("timeout_ms", Limits::AboveZero(HOUR_MS))
-    .or(100)
+    .or_time(DEFAULT_REPLY_TIMEOUT)
     .is("from the end of the request to the end of the reply");
 /// How often a request is repeated.
 pub const RETRIES: Key = Key::integer("retries", 0, 255).absent("1; of an event 0").is(
@@ -32,7 +34,7 @@ pub const RETRIES: Key = Key::integer("retries", 0, 255).absent("1; of an event 
      carried out twice by a device when it is repeated",
 );
 /// How long after an event it may be sent.
-pub const TRIGGER: Key = Key::millis("trigger_ms", Limits::AboveZero(10_000.0))
+pub const TRIGGER: Key = Key::millis("trigger_ms", Limits::AboveZero(ms(LONGEST_TRIGGER)))
     .absent("`timeout_ms` of the port, at most 1000")
     .is("how long after an event its request may still be sent");
 /// How late a reply may come.
@@ -84,7 +86,7 @@ const REPLY_TIMEOUT: Key = Key::millis("timeout_ms", Limits::AboveZero(HOUR_MS))
 pub(crate) const EXPECTATIONS: [(&str, ()); 1] = [("event", ())];
 /// The rest behind it.
 pub const PAUSE: Key =
-    Key::millis("pause_ms", Limits::Within(0.0, 10_000.0)).or(0).is("how long the line rests after it");
+    Key::millis("pause_ms", Limits::Within(0.0, ms(MAX_PAUSE))).or(0).is("how long the line rests after it");
 pub(crate) const TIMING: &[Key] =
     &[EVERY, ON, TIMEOUT, RETRIES, PAUSE, TRIGGER, LATE, STOP, NAME, FOLLOW, OUTCOME];
 /// Of a reply in a device's own frames, beside those of its frame.

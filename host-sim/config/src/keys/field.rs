@@ -284,6 +284,16 @@ pub(crate) const LENGTHS: &[Key] = &[NAME_IF_ANY, TYPE, LENGTH, COUNTS, PLUS];
 /// A field with a value.
 pub(crate) const NAMED: &[Key] = &[NAME, TYPE];
 const CONSTANT: &[Key] = &[NAME_IF_ANY, TYPE, EQUALS];
+/// What only frames of devices have.
+pub(crate) const OWN: &[&[Key]] = &[
+    &[EQUALS, OVERFLOW, COUNTER],
+    PADDING,
+    CONSTANT_TEXT,
+    &[LENGTH_TO, COUNT_TO, LENGTH_FROM, TEXT_ORDER, IGNORE],
+    &[LENGTH, COUNTS, PLUS],
+    WRITTEN,
+    RULES_IN,
+];
 /// A coil with a value.
 pub(crate) const COIL: &[Key] = &[NAME];
 

@@ -1,9 +1,11 @@
 //! `[controller]`, `[network]` and `[[port]]` of gateway files.
 
-use proto_core::config::{Bus, Echo, MAX_ADDRESS, MAX_LISTEN, PortValue};
+use proto_core::config::{
+    Bus, Echo, MAX_ADDRESS, MAX_LINE_TIME, MAX_LISTEN, MIN_CYCLE, Port, PortValue, Rs485,
+};
 use proto_core::wire::dialect::Dialect;
 
-use super::{Case, HOUR_MS, Key, KeyTable, Limits, Shape, TextKind, When, words};
+use super::{Case, HOUR_MS, Key, KeyTable, Limits, Shape, TextKind, When, ms, words};
 use crate::file::{gateway::BUSES, lines::PARITIES};
 
 /// The controller's dialect.
@@ -83,18 +85,19 @@ pub const BUS: Key = Key::words("bus", words!(BUSES)).required().tells(
 pub const RECIPE: Key =
     Key::text_of("recipe", TextKind::Any).required().tells("name of a recipe of this file");
 /// The period of the output.
-pub const CYCLE: Key =
-    Key::millis("cycle_ms", Limits::Within(4.0, HOUR_MS)).or(4).is("how often the output part is sent");
+pub const CYCLE: Key = Key::millis("cycle_ms", Limits::Within(ms(MIN_CYCLE), HOUR_MS))
+    .or_time(MIN_CYCLE)
+    .is("how often the output part is sent");
 /// When inputs are overdue.
 pub const TIMEOUT: Key =
     Key::new("timeout_ms", Shape::Either(&[Shape::Number(Limits::AboveZero(HOUR_MS)), Shape::Words(|| vec!["never"])]))
         .unit("ms")
-        .or(100)
+        .or_time(Port::TIMEOUT)
         .is("after this time without a valid frame the port's inputs take their safe values. `\"never\"`: for devices \
              that send only events, as scanners do; see below");
 /// When outputs are stale.
 pub const STALE_AFTER: Key = Key::millis("stale_after_ms", Limits::AboveZero(HOUR_MS))
-    .or(500)
+    .or_time(Port::STALE_AFTER)
     .is("an output with an older source is stale");
 /// What inputs become.
 pub const ON_TIMEOUT: Key = Key::new(
@@ -141,19 +144,25 @@ const fn health(name: &'static str, text: &'static str) -> Key {
 }
 
 /// Speed of a serial line.
-pub const BAUD: Key = Key::integer("baud", 1_200, 4_000_000).unit("bit/s").or(115_200).is("(`rs485`)");
+pub const BAUD: Key = Key::integer("baud", *Rs485::BAUD.start() as i64, *Rs485::BAUD.end() as i64)
+    .unit("bit/s")
+    .or(Rs485::DEFAULT.baud as i64)
+    .is("(`rs485`)");
 /// Parity.
 pub const PARITY: Key = Key::words("parity", words!(PARITIES)).or_word("none").is("(`rs485`)");
 /// Stop bits.
-pub const STOP_BITS: Key = Key::integer("stop_bits", 1, 2).or(1).is("(`rs485`)");
+pub const STOP_BITS: Key =
+    Key::integer("stop_bits", *Rs485::STOP_BITS.start() as i64, *Rs485::STOP_BITS.end() as i64)
+        .or(Rs485::DEFAULT.stop_bits as i64)
+        .is("(`rs485`)");
 /// The silence that drops a partial frame.
-pub const IDLE_GAP: Key = Key::millis("idle_gap_ms", Limits::AboveZero(1000.0)).or(50).is(
+pub const IDLE_GAP: Key = Key::millis("idle_gap_ms", Limits::AboveZero(ms(MAX_LINE_TIME))).or_time(Rs485::DEFAULT.idle_gap).is(
     "a partial frame is dropped after this silence (`rs485`). Of a Modbus slave it ends each request, and the default \
      is 3.5 characters, or 1.75 above 19200 bit/s",
 );
 /// The silence before sending.
 pub const TURNAROUND: Key =
-    Key::new("turnaround_us", Shape::Number(Limits::Within(0.0, 1_000_000.0))).unit("µs").or(100).is(
+    Key::new("turnaround_us", Shape::Number(Limits::Within(0.0, MAX_LINE_TIME.as_micros() as f64))).unit("µs").or(Rs485::DEFAULT.turnaround.as_micros() as i64).is(
         "silence before the port sends (`rs485`). On lines of Modbus the default is 3.5 characters, or 1750 above \
          19200 bit/s",
     );
@@ -166,13 +175,15 @@ pub const ECHO: Key = Key::new("echo", Shape::Either(&[Shape::Bool, Shape::Words
 /// The words of `echo`.
 pub(crate) const ECHOES: [(&str, Echo); 1] = [("auto", Echo::Auto)];
 /// When a device has started anew.
-pub const ABSENT: Key = Key::millis("absent_ms", Limits::AboveZero(HOUR_MS)).or(3_000).is(
+pub const ABSENT: Key = Key::millis("absent_ms", Limits::AboveZero(HOUR_MS)).or_time(Port::ABSENT).is(
     "a device of the recipe's exchanges that answered nothing for this long has started anew when it answers again: what \
      is asked at its start is asked",
 );
 /// Speed of a CAN bus.
-pub const BITRATE: Key =
-    Key::integer("bitrate", 10_000, 1_000_000).unit("bit/s").or(Bus::BITRATE as i64).is("(`can`)");
+pub const BITRATE: Key = Key::integer("bitrate", *Bus::BITRATES.start() as i64, *Bus::BITRATES.end() as i64)
+    .unit("bit/s")
+    .or(Bus::BITRATE as i64)
+    .is("(`can`)");
 /// Where a listening port is.
 pub const LISTEN: Key = Key::text_of("listen", TextKind::Length(1, MAX_LISTEN))
     .required()

@@ -17,6 +17,7 @@ pub mod sparkplug;
 
 use std::fmt;
 
+use proto_core::config::MAX_TIME;
 use proto_core::time::Duration;
 
 pub use markdown::{DOCUMENTED, plain, rows};
@@ -295,6 +296,11 @@ impl Key {
         Self { need: Need::Integer(value), ..self }
     }
 
+    /// A default of a key in ms.
+    pub(crate) const fn or_time(self, time: Duration) -> Self {
+        self.or(time.as_millis() as i64)
+    }
+
     pub(crate) const fn or_word(self, word: &'static str) -> Self {
         Self { need: Need::Word(word), ..self }
     }
@@ -352,8 +358,13 @@ pub(crate) fn time(key: &Key, value: f64) -> Duration {
     Duration::from_micros((value * micros).round() as u64)
 }
 
-/// An hour, in ms.
-pub(crate) const HOUR_MS: f64 = 3_600_000.0;
+/// A time in ms.
+pub(crate) const fn ms(time: Duration) -> f64 {
+    time.as_micros() as f64 / 1000.0
+}
+
+/// The longest time of most keys, in ms.
+pub(crate) const HOUR_MS: f64 = ms(MAX_TIME);
 
 /// The tables at the top of the files.
 pub mod top {

@@ -12,6 +12,7 @@ use super::super::pdu::{
 };
 use super::super::values::{last_mask, packed_len};
 use super::adu::{BROADCAST, MAX_ADU, is_right, seal};
+use crate::sysvar::Direction;
 
 /// A function with its addresses and counts, and without values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -123,6 +124,41 @@ pub enum Table {
 }
 
 impl Operation {
+    /// The operation of a function, with address and count of what it reads, then of what it writes, and with the bits
+    /// that FC 22 writes; `None` for another function.
+    pub const fn of_function(code: u8, read: (u16, u16), written: (u16, u16), mask: u16) -> Option<Self> {
+        let ((read_address, read_count), (write_address, write_count)) = (read, written);
+        let (address, count) = read;
+        Some(match code {
+            function::READ_COILS => Self::ReadCoils { address, count },
+            function::READ_DISCRETE => Self::ReadDiscreteInputs { address, count },
+            function::READ_HOLDING => Self::ReadHoldingRegisters { address, count },
+            function::READ_INPUT => Self::ReadInputRegisters { address, count },
+            function::WRITE_COIL => Self::WriteCoil { address: write_address },
+            function::WRITE_REGISTER => Self::WriteRegister { address: write_address },
+            function::WRITE_COILS => Self::WriteCoils { address: write_address, count: write_count },
+            function::WRITE_REGISTERS => Self::WriteRegisters { address: write_address, count: write_count },
+            function::READ_WRITE_REGISTERS => {
+                Self::ReadWriteRegisters { read_address, read_count, write_address, write_count }
+            }
+            function::MASK_WRITE_REGISTER => Self::MaskWriteRegister { address: write_address, mask },
+            _ => return None,
+        })
+    }
+
+    /// The operation on all of a block of the gateway as a slave: a master writes its fields, if they are an input part,
+    /// and reads them otherwise.
+    pub const fn of_block(table: Table, fields: Direction, address: u16, count: u16) -> Self {
+        match (table, fields) {
+            (Table::Coils, Direction::Input) => Self::WriteCoils { address, count },
+            (Table::Coils, Direction::Output) => Self::ReadCoils { address, count },
+            (Table::DiscreteInputs, _) => Self::ReadDiscreteInputs { address, count },
+            (Table::HoldingRegisters, Direction::Input) => Self::WriteRegisters { address, count },
+            (Table::HoldingRegisters, Direction::Output) => Self::ReadHoldingRegisters { address, count },
+            (Table::InputRegisters, _) => Self::ReadInputRegisters { address, count },
+        }
+    }
+
     /// The function code.
     pub const fn function(&self) -> u8 {
         match self {

@@ -6,6 +6,7 @@ use super::operation::{Expected, Probe};
 use super::*;
 use crate::modbus::Exception;
 use crate::modbus::pdu::PduEncodeError;
+use crate::sysvar::Direction;
 use crate::time::Duration;
 
 /// The example of the standard's appendix on the CRC: slave 2, function 7.
@@ -226,5 +227,20 @@ fn the_largest_frames_fit() {
         let data = vec![0x55; operation.written_len()];
         assert_eq!(request(&operation, 1, &data).len(), operation.request_len());
         assert!(operation.request_len() <= MAX_ADU && operation.reply_len() <= MAX_ADU);
+    }
+}
+
+#[test]
+fn an_operation_is_made_from_its_function_or_its_block() {
+    let made = |code: &u8| Operation::of_function(*code, (1, 2), (3, 4), 5).map(|one| one.function());
+    let known: Vec<u8> = (0..=255).filter(|code| made(code) == Some(*code)).collect();
+    assert_eq!(known, [1, 2, 3, 4, 5, 6, 15, 16, 22, 23]);
+    assert!((0..=255).all(|code| made(&code).is_none_or(|function| function == code)));
+    for table in [Table::Coils, Table::DiscreteInputs, Table::HoldingRegisters, Table::InputRegisters] {
+        let output = Operation::of_block(table, Direction::Output, 7, 3);
+        assert!(output.place() == (table, 7, 3) && output.reads());
+        let is_writable = matches!(table, Table::Coils | Table::HoldingRegisters);
+        let input = Operation::of_block(table, Direction::Input, 7, 3);
+        assert!(input.place() == (table, 7, 3) && input.reads() != is_writable);
     }
 }
