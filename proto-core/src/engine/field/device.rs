@@ -16,7 +16,7 @@ use crate::config::{CanFramePart, ConfigView, Counted, DeviceFrame, Parts, Recip
 use crate::device::{Cutter, Element, Escape, Found, FrameLayout, Framer, Probe};
 use crate::engine::counters::bump;
 use crate::engine::link::command::CommandLink;
-use crate::engine::plan::routes::error::{BuildError, one_too_many};
+use crate::engine::plan::error::{BuildError, one_too_many};
 use crate::engine::rejection::Rejection;
 use crate::engine::tap::Tap;
 use crate::engine::values::store::Store;
