@@ -25,7 +25,7 @@ use crate::connect::connect;
 use crate::fairness::{Either, Order, either, give_way, yield_fairly};
 use crate::tcp_options;
 use crate::timer::now;
-use crate::tty::SerialDevice;
+use crate::tty::Tty;
 
 /// A serial port's device.
 #[derive(Debug)]
@@ -42,7 +42,7 @@ pub(super) struct SerialPort {
 #[derive(Debug)]
 enum SerialSource {
     Pty(Rc<Pty>, Pace),
-    Serial(String, SerialDevice),
+    Serial(String, Tty),
     Connect(HostPort),
     Listen(Rc<TcpListener>, Rc<RefCell<Option<Rc<TcpStream>>>>),
 }
@@ -65,7 +65,7 @@ impl SerialPort {
             }
             Device::Serial { path } => {
                 let path = path.display().to_string();
-                let device = SerialDevice::open(&path, settings)
+                let device = Tty::open(&path, settings)
                     .map_err(|error| io::Error::new(error.kind(), format!("{path}: {error}")))?;
                 SerialSource::Serial(path, device)
             }
@@ -125,7 +125,7 @@ impl SerialPort {
                 let mut opened = Some(device);
                 let mut backoff = Backoff::new(StdDuration::from_millis(100), StdDuration::from_secs(2));
                 loop {
-                    let device = match opened.take().map_or_else(|| SerialDevice::open(&path, settings), Ok) {
+                    let device = match opened.take().map_or_else(|| Tty::open(&path, settings), Ok) {
                         Ok(device) => device,
                         Err(error) => {
                             debug!(%path, %error, "cannot open the device");

@@ -13,7 +13,7 @@ use super::exchange::PortTx;
 use super::pty::Pty;
 use crate::tcp_options;
 use crate::timer::now;
-use crate::tty::SerialDevice;
+use crate::tty::Tty;
 
 /// A connected device or client: what differs between the three kinds.
 pub(super) trait ByteStream {
@@ -88,7 +88,7 @@ impl ByteStream for Pty {
     }
 }
 
-impl ByteStream for SerialDevice {
+impl ByteStream for Tty {
     const LOSSY: bool = false;
 
     async fn receive(&self, buf: &mut [u8]) -> io::Result<usize> {

@@ -21,11 +21,11 @@ use crate::tcp_options::unacknowledged;
 
 /// An open serial device.
 #[derive(Debug)]
-pub(crate) struct SerialDevice {
+pub(crate) struct Tty {
     fd: AsyncFd<OwnedFd>,
 }
 
-impl SerialDevice {
+impl Tty {
     /// Opens it in the current tokio runtime.
     ///
     /// # Errors
@@ -133,7 +133,7 @@ impl SerialDevice {
     }
 }
 
-impl Drop for SerialDevice {
+impl Drop for Tty {
     fn drop(&mut self) {
         // Or a terminal that others have open would stay locked.
         let _ = ioctl_tiocnxcl(&self.fd);
@@ -155,7 +155,7 @@ mod tests {
             let path = dir.join("device").display().to_string();
             let _line = PortTask::start(&format!("pty:{path}"), serial(9_600)).await;
             let BusSettings::Serial(settings) = serial(250_001) else { unreachable!() };
-            let device = SerialDevice::open(&path, Rs485 { stop_bits: 2, ..settings }).unwrap();
+            let device = Tty::open(&path, Rs485 { stop_bits: 2, ..settings }).unwrap();
             let termios = tcgetattr(&device.fd).unwrap();
             assert_eq!((termios.input_speed(), termios.output_speed()), (250_001, 250_001));
             assert_eq!(termios.input_modes, InputModes::IGNPAR);
@@ -167,10 +167,10 @@ mod tests {
             assert_eq!(termios.control_modes & format, ControlModes::CS8 | ControlModes::CSTOPB);
             assert!(termios.control_modes.contains(ControlModes::CREAD | ControlModes::CLOCAL));
             // Root passes the first lock, and not the second.
-            let error = SerialDevice::open(&path, settings).unwrap_err();
+            let error = Tty::open(&path, settings).unwrap_err();
             assert!(matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::ResourceBusy), "{error}");
             drop(device);
-            SerialDevice::open(&path, settings).unwrap();
+            Tty::open(&path, settings).unwrap();
         });
     }
 }
