@@ -66,7 +66,7 @@ impl Ports {
 ///
 /// It exists when clocks, memory, the log and the watchdog are running. The methods that hand out devices
 /// are called during the start, before any device is used; `ethernet` is called last, so that the field buses
-/// run without a PHY.
+/// run without a PHY. What they return has a type of the board's own, because a task cannot be generic.
 pub trait Board {
     /// Name of the board in firmware headers.
     const NAME: &'static str;
@@ -78,40 +78,20 @@ pub trait Board {
     /// answer.
     const WATCHDOG_PERIOD: Duration;
 
-    /// An RS-485 line.
-    type Serial: Line + 'static;
-    /// A CAN bus.
-    type Can: CanPort + 'static;
-    /// The Ethernet controller with its PHY.
-    type Ethernet: Driver + 'static;
-    /// The watchdog.
-    type Watchdog: FeedWatchdog;
-    /// The status LED.
-    type Led: StatusLed;
-    /// The button that lets the board take a key.
-    type Button: Button + 'static;
-    /// The flash of the store.
-    type Flash: StoreFlash + 'static;
-    /// The flash of the slot that the program does not run in.
-    type Slot: SlotFlash + 'static;
-    /// Why there is no configuration image.
-    type StorageError: Debug + Display + Copy;
-    /// Why there is no Ethernet.
-    type EthernetError: Debug + Display + Copy;
-
     /// The configuration image written to the board by a probe or a file, which is adopted into the store. Trailing
     /// bytes are ignored.
     ///
     /// # Errors
     /// There is none, or it cannot be read. A configuration from the store then runs.
-    fn configuration(&mut self) -> Result<&'static [u8], Self::StorageError>;
+    fn configuration(&mut self) -> Result<&'static [u8], impl Debug + Display + Copy>;
 
     /// The flash of the store (docs/store.md); called once. `None` if the board has none: it then only runs the image
     /// above.
-    fn flash(&mut self) -> Option<StorePlaces<Self::Flash>>;
+    fn flash(&mut self) -> Option<StorePlaces<impl StoreFlash + 'static>>;
 
-    /// The slots of the firmware (docs/update.md); called once.
-    fn slots(&mut self) -> Site<Self::Slot>;
+    /// The slots of the firmware (docs/update.md), with the flash of the one that the program does not run in; called
+    /// once.
+    fn slots(&mut self) -> Site<impl SlotFlash + 'static>;
 
     /// Waits for the flash during the start, when no task runs yet. A sector may take two seconds, so the watchdog
     /// is fed meanwhile; each operation of the flash has a time limit.
@@ -119,22 +99,22 @@ pub trait Board {
 
     /// The next RS-485 line, with these settings; `None` if there is none left, or if it does not support the
     /// settings, which it logs.
-    fn serial(&mut self, line: &Rs485) -> Option<Self::Serial>;
+    fn serial(&mut self, line: &Rs485) -> Option<impl Line + 'static>;
 
     /// The next CAN bus, with this bit rate; `None` as for [`Self::serial`].
-    fn can(&mut self, bitrate: u32) -> Option<Self::Can>;
+    fn can(&mut self, bitrate: u32) -> Option<impl CanPort + 'static>;
 
-    /// The Ethernet controller.
+    /// The Ethernet controller with its PHY.
     ///
     /// # Errors
     /// It does not work. The field ports then run without a controller.
-    fn ethernet(&mut self) -> Result<Self::Ethernet, Self::EthernetError>;
+    fn ethernet(&mut self) -> Result<impl Driver + 'static, impl Debug + Display + Copy>;
 
     /// The watchdog; called once, before all others.
-    fn watchdog(&mut self) -> Self::Watchdog;
+    fn watchdog(&mut self) -> impl FeedWatchdog;
 
     /// The status LED; called once.
-    fn led(&mut self) -> Self::Led;
+    fn led(&mut self) -> impl StatusLed;
 
     /// A seed for local port numbers, different at each start.
     fn seed(&mut self) -> u64;
@@ -143,8 +123,8 @@ pub trait Board {
     /// clock and the chip's serial number are no such sources.
     fn random(&mut self) -> Option<[u8; 32]>;
 
-    /// The button; called once.
-    fn button(&mut self) -> Self::Button;
+    /// The button that lets the board take a key; called once.
+    fn button(&mut self) -> impl Button + 'static;
 
     /// Highest stack use so far, in bytes.
     fn stack_used(&self) -> usize;

@@ -31,19 +31,12 @@ use proto_core::config::{Bus, GatewayConfig, Network};
 use proto_core::engine::{LinkId, LinkKind, PortId};
 use static_cell::{ConstStaticCell, StaticCell};
 
-use crate::board::Board;
+use crate::board::{
+    Board, BoardLed, CanDevice, Ethernet, SerialDevice, SlotArea, StoreArea, UserButton, Watchdog,
+};
 use configuration::{CannotRun, load};
 use firmware::platform::Board as _;
 
-// The devices of the chosen board.
-type SerialDevice = <Board as platform::Board>::Serial;
-type CanDevice = <Board as platform::Board>::Can;
-type Ethernet = <Board as platform::Board>::Ethernet;
-type Watchdog = <Board as platform::Board>::Watchdog;
-type Led = <Board as platform::Board>::Led;
-type Flash = <Board as platform::Board>::Flash;
-type BoardSlot = <Board as platform::Board>::Slot;
-type BoardButton = <Board as platform::Board>::Button;
 const SERIAL_PORTS: usize = <Board as platform::Board>::SERIAL_PORTS;
 const CAN_PORTS: usize = <Board as platform::Board>::CAN_PORTS;
 const PORTS: Ports = Ports { lines: SERIAL_PORTS, buses: CAN_PORTS };
@@ -100,8 +93,8 @@ pub(crate) fn start(spawner: Spawner, mut board: Board) -> Tasks {
 
 /// Reads the store; `None` if there is none, or if a newer program wrote it.
 #[inline(never)]
-fn open_store(board: &mut Board) -> Option<&'static mut StoredConfig<Flash>> {
-    static STORED: StaticCell<StoredConfig<Flash>> = StaticCell::new();
+fn open_store(board: &mut Board) -> Option<&'static mut StoredConfig<StoreArea>> {
+    static STORED: StaticCell<StoredConfig<StoreArea>> = StaticCell::new();
     let places = board.flash()?;
     let stored = StoredConfig::open(places).inspect_err(|error| error!("{}", DisplayText(error))).ok()?;
     Some(STORED.init(stored))
@@ -117,7 +110,7 @@ struct EdgeSetup {
 /// Creates the edge node for the running configuration, which is in memory only during the start.
 #[inline(never)]
 fn make_edge(
-    stored: Option<&mut StoredConfig<Flash>>,
+    stored: Option<&mut StoredConfig<StoreArea>>,
     gateway: &Gateway,
     config: Option<&GatewayConfig>,
     seed: u64,
@@ -160,13 +153,13 @@ fn make_edge(
 fn start_store_task(
     tasks: &Tasks,
     gateway: &'static Gateway,
-    stored: &'static mut StoredConfig<Flash>,
+    stored: &'static mut StoredConfig<StoreArea>,
     image: &'static mut [u8; MAX_IMAGE],
-    slots: Site<BoardSlot>,
+    slots: Site<SlotArea>,
     work: store::StartWork<'static>,
     failure: Option<CannotRun>,
 ) -> Option<&'static StoreHandle> {
-    static UPDATES: StaticCell<Updates<BoardSlot>> = StaticCell::new();
+    static UPDATES: StaticCell<Updates<SlotArea>> = StaticCell::new();
     let updates = UPDATES.init(Updates::new(slots)?);
     static HANDLE: StaticCell<StoreHandle> = StaticCell::new();
     let store: &'static StoreHandle = HANDLE.init_with(|| StoreHandle::new(image));
@@ -448,7 +441,7 @@ struct LedSources {
 }
 
 #[embassy_executor::task]
-async fn status_led(pulse: &'static Pulse, shown: LedSources, mut led: Led) -> ! {
+async fn status_led(pulse: &'static Pulse, shown: LedSources, mut led: BoardLed) -> ! {
     let condition = || match shown.console {
         Some(console) if console.is_identifying() => Condition::Identify,
         _ => shown.gateway.map_or(Condition::Refused, Gateway::condition),
@@ -467,7 +460,7 @@ async fn connection(
 }
 
 #[embassy_executor::task]
-async fn watch_button(pulse: &'static Pulse, console: &'static Console, button: BoardButton) -> ! {
+async fn watch_button(pulse: &'static Pulse, console: &'static Console, button: UserButton) -> ! {
     pulse.run(pin!(console.watch(pulse, button))).await
 }
 
@@ -527,8 +520,8 @@ async fn store_task(
     pulse: &'static Pulse,
     gateway: &'static Gateway,
     store: &'static StoreHandle,
-    stored: &'static mut StoredConfig<Flash>,
-    updates: &'static mut Updates<BoardSlot>,
+    stored: &'static mut StoredConfig<StoreArea>,
+    updates: &'static mut Updates<SlotArea>,
     work: store::StartWork<'static>,
 ) -> ! {
     pulse.run(pin!(store::run(gateway, pulse, store, stored, updates, work))).await;

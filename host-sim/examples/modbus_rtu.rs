@@ -21,7 +21,7 @@ const TIMING: Timing = Timing::new(19_200, 11).with_silence(Duration::from_milli
 
 fn main() -> io::Result<()> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
-    let line = Line::open()?;
+    let line = Pipe::open()?;
     match &arguments.iter().map(String::as_str).collect::<Vec<_>>()[..] {
         [address] => {
             let address = address.parse().ok().and_then(|address| Slave::new(TIMING, Echo::Absent, address));
@@ -32,13 +32,13 @@ fn main() -> io::Result<()> {
 }
 
 /// What comes in pieces of any size, and where it goes.
-struct Line {
+struct Pipe {
     received: Receiver<Vec<u8>>,
     out: File,
     start: time::Instant,
 }
 
-impl Line {
+impl Pipe {
     fn open() -> io::Result<Self> {
         let (sender, received) = mpsc::channel();
         thread::spawn(move || {
@@ -67,7 +67,7 @@ impl Line {
     }
 }
 
-fn slave(mut line: Line, mut slave: Slave) -> io::Result<()> {
+fn slave(mut line: Pipe, mut slave: Slave) -> io::Result<()> {
     let mut bank = Bank { coils: [false; 100], words: [0; 100] };
     let mut out = [0; MAX_ADU];
     eprintln!("ready");

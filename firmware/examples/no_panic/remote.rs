@@ -23,7 +23,7 @@ use static_cell::ConstStaticCell;
 
 use crate::{any, bytes};
 
-type Engine = proto_core::engine::Engine<2, 1, 32, 0, 4>;
+type SmallEngine = proto_core::engine::Engine<2, 1, 32, 0, 4>;
 
 /// A writer that may fail at any time.
 struct FailingWriter;
@@ -51,7 +51,7 @@ pub(crate) fn all() {
     remote_claim();
     remote_revisions();
     remote_response();
-    static ENGINE: ConstStaticCell<Engine> = ConstStaticCell::new(Engine::idle());
+    static ENGINE: ConstStaticCell<SmallEngine> = ConstStaticCell::new(SmallEngine::idle());
     static CONFIG: GatewayConfig = GatewayConfig::empty();
     let Some(gateway) = ENGINE.try_take() else { return };
     let _ = black_box(black_box(&mut *gateway).configure(black_box(&CONFIG)));
@@ -185,7 +185,7 @@ fn remote_response() {
 }
 
 #[inline(never)]
-fn remote_documents(gateway: &Engine) {
+fn remote_documents(gateway: &SmallEngine) {
     for document in [Document::Status, Document::Values] {
         let mut pieces = Pieces::of(any(document));
         while let Ok(true) = pieces.write_next(gateway.status(any(Instant::ZERO)), &mut FailingWriter) {}
@@ -194,7 +194,7 @@ fn remote_documents(gateway: &Engine) {
 }
 
 #[inline(never)]
-fn remote_metrics(gateway: &Engine) {
+fn remote_metrics(gateway: &SmallEngine) {
     let mut families = Families::new();
     while let Ok(true) = families.write_next(gateway.status(any(Instant::ZERO)), &mut FailingWriter) {}
 }

@@ -1,7 +1,7 @@
 //! Chooses the configuration to run.
 
 use firmware::fmt::DisplayText;
-use firmware::platform::{self, Board as _, NoDevice};
+use firmware::platform::{Board as _, NoDevice};
 use firmware::stored::{self, EndedName, RoleName, StoredConfig};
 use firmware::tasks::gateway::Gateway;
 use firmware::tasks::store;
@@ -9,19 +9,19 @@ use firmware::{error, info};
 use proto_core::config::{GatewayConfig, image};
 use recipe_store::Role;
 
-use super::{Flash, PORTS};
-use crate::board::Board;
+use super::PORTS;
+use crate::board::{Board, EthernetError, StorageError, StoreArea};
 
 /// Why no configuration runs.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum CannotRun {
-    Storage(<Board as platform::Board>::StorageError),
+    Storage(StorageError),
     Image(image::ImageError),
     Build(proto_core::engine::BuildError),
     NoDevice(NoDevice),
     /// The store has no configuration, and there is no image outside it.
     Empty,
-    Ethernet(<Board as platform::Board>::EthernetError),
+    Ethernet(EthernetError),
 }
 
 impl core::fmt::Display for CannotRun {
@@ -48,7 +48,7 @@ impl core::fmt::Display for CannotRun {
 #[inline(never)]
 pub(super) fn load(
     board: &mut Board,
-    stored: Option<&mut StoredConfig<Flash>>,
+    stored: Option<&mut StoredConfig<StoreArea>>,
     gateway: &mut Gateway,
     config: &mut GatewayConfig,
     work: &mut store::StartWork<'static>,

@@ -4,17 +4,8 @@
 //! (`LINKTYPE_CAN_SOCKETCAN`); what goes over a serial line or a link to the controller is `LINKTYPE_USER0`, which
 //! the plugin of `host-sim export lua` shows. The comment of a packet says why it was rejected.
 
-use std::borrow::Cow;
 use std::sync::Arc;
-use std::time::Duration;
 
-use pcap_file::pcapng::blocks::enhanced_packet::{EnhancedPacketBlock, EnhancedPacketOption};
-use pcap_file::pcapng::blocks::interface_description::{
-    InterfaceDescriptionBlock, InterfaceDescriptionOption,
-};
-use pcap_file::pcapng::blocks::section_header::{SectionHeaderBlock, SectionHeaderOption};
-use pcap_file::pcapng::{PcapNgBlock, PcapNgWriter};
-use pcap_file::{DataLink, Endianness};
 use proto_core::engine::{Rejection, TapDirection, TapPlace, TapVerdict};
 use proto_core::wire::can::CanId;
 
@@ -35,35 +26,29 @@ pub struct Scope {
 }
 
 /// Writes the blocks of one capture.
+#[derive(Debug)]
 pub struct Pcapng {
     scope: Scope,
-    writer: PcapNgWriter<Vec<u8>>,
+    /// Written, and not yet taken.
+    bytes: Vec<u8>,
     /// Name and link type of each interface so far.
-    interfaces: Vec<(String, DataLink)>,
+    interfaces: Vec<(String, u16)>,
     cell: Option<Arc<Cell>>,
-}
-
-impl std::fmt::Debug for Pcapng {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { scope, interfaces, .. } = self;
-        f.debug_struct("Pcapng").field("scope", scope).field("interfaces", interfaces).finish_non_exhaustive()
-    }
 }
 
 impl Pcapng {
     /// A capture of this.
-    ///
-    /// # Panics
-    /// Never: nothing fails that is written to memory.
     pub fn new(scope: Scope) -> Self {
-        let section = SectionHeaderBlock {
-            endianness: Endianness::Little,
-            options: vec![SectionHeaderOption::UserApplication(Cow::Borrowed("recipe gateway"))],
-            ..SectionHeaderBlock::default()
-        };
-        let writer = PcapNgWriter::with_section_header(Vec::new(), section);
-        let writer = writer.unwrap_or_else(|error| unreachable!("written to memory: {error}"));
-        Self { scope, writer, interfaces: Vec::new(), cell: None }
+        let mut new = Self { scope, bytes: Vec::new(), interfaces: Vec::new(), cell: None };
+        let mut section = Block::new(u32::from_le_bytes(MAGIC));
+        // The magic tells the byte order. Then version 1.0, and a length that is not known.
+        section.put(&0x1A2B_3C4D_u32.to_le_bytes());
+        section.put(&1_u16.to_le_bytes());
+        section.put(&0_u16.to_le_bytes());
+        section.put(&u64::MAX.to_le_bytes());
+        section.option(SECTION_APPLICATION, b"recipe gateway");
+        section.end(&mut new.bytes);
+        new
     }
 
     /// The blocks for a record, with those before it that are needed; often empty.
@@ -82,7 +67,7 @@ impl Pcapng {
             }
             What::Pass(_) => {}
         }
-        std::mem::take(self.writer.get_mut())
+        std::mem::take(&mut self.bytes)
     }
 
     /// Describes the interfaces before any packet, so that all of them are seen at once.
@@ -103,22 +88,26 @@ impl Pcapng {
                 if self.scope.port.as_ref().is_some_and(|only| *only != port.name) {
                     return None;
                 }
-                let link_type = if port.is_can { DataLink::CAN_SOCKETCAN } else { DataLink::USER0 };
+                let link_type = if port.is_can { LINKTYPE_CAN_SOCKETCAN } else { LINKTYPE_USER0 };
                 (port.name.clone(), link_type, port.bit_rate)
             }
-            TapPlace::Link(id) if self.scope.links => {
-                (format!("link {}", cell.link(id)?), DataLink::USER0, 0)
-            }
+            TapPlace::Link(id) if self.scope.links => (format!("link {}", cell.link(id)?), LINKTYPE_USER0, 0),
             TapPlace::Link(_) => return None,
         };
         let known = self.interfaces.iter().position(|known| *known == (name.clone(), link_type));
         let index = known.unwrap_or_else(|| {
-            let mut options = vec![InterfaceDescriptionOption::IfName(Cow::Owned(name.clone()))];
-            options.push(InterfaceDescriptionOption::IfTsResol(9));
+            let mut block = Block::new(INTERFACE);
+            block.put(&link_type.to_le_bytes());
+            block.put(&[0; 2]);
+            // No limit of packets.
+            block.put(&0_u32.to_le_bytes());
+            block.option(INTERFACE_NAME, name.as_bytes());
+            // Times are in nanoseconds.
+            block.option(INTERFACE_RESOLUTION, &[9]);
             if bit_rate > 0 {
-                options.push(InterfaceDescriptionOption::IfSpeed(bit_rate.into()));
+                block.option(INTERFACE_SPEED, &u64::from(bit_rate).to_le_bytes());
             }
-            self.add(InterfaceDescriptionBlock { linktype: link_type, snaplen: 0, options });
+            block.end(&mut self.bytes);
             self.interfaces.push((name, link_type));
             self.interfaces.len() - 1
         });
@@ -126,32 +115,86 @@ impl Pcapng {
     }
 
     fn packet(&mut self, cell: &Cell, unix_nanos: u64, frame: &Frame, lost: u64) {
-        let Some(interface_id) = self.interface(cell, frame.place) else { return };
+        let Some(interface) = self.interface(cell, frame.place) else { return };
         let (data, header) = match frame.can_id {
             Some(id) => (socketcan(id, frame), SOCKETCAN_HEADER),
             None => (frame.bytes.to_vec(), 0),
         };
+        let original_len = u32::try_from(frame.len + header).unwrap_or(u32::MAX);
+        let mut block = Block::new(PACKET);
+        block.put(&interface.to_le_bytes());
+        block.put(&((unix_nanos >> 32) as u32).to_le_bytes());
+        block.put(&(unix_nanos as u32).to_le_bytes());
+        block.put(&(data.len() as u32).to_le_bytes());
+        block.put(&original_len.to_le_bytes());
+        block.put(&data);
+        block.pad();
         // 1: received, 2: sent.
-        let direction = if frame.direction == TapDirection::In { 1 } else { 2 };
-        let mut options = vec![EnhancedPacketOption::Flags(direction)];
+        let direction: u32 = if frame.direction == TapDirection::In { 1 } else { 2 };
+        block.option(PACKET_FLAGS, &direction.to_le_bytes());
         if lost > 0 {
-            options.push(EnhancedPacketOption::DropCount(lost));
+            block.option(PACKET_DROP_COUNT, &lost.to_le_bytes());
         }
         if let Some(why) = rejection(frame) {
-            options.push(EnhancedPacketOption::Comment(Cow::Owned(format!("rejected: {why}"))));
+            block.option(COMMENT, format!("rejected: {why}").as_bytes());
         }
-        self.add(EnhancedPacketBlock {
-            interface_id,
-            timestamp: Duration::from_nanos(unix_nanos),
-            original_len: u32::try_from(frame.len + header).unwrap_or(u32::MAX),
-            data: Cow::Owned(data),
-            options,
-        });
+        block.end(&mut self.bytes);
+    }
+}
+
+// Numbers of pcapng: blocks, options and link types.
+const INTERFACE: u32 = 1;
+const PACKET: u32 = 6;
+const COMMENT: u16 = 1;
+const SECTION_APPLICATION: u16 = 4;
+const INTERFACE_NAME: u16 = 2;
+const INTERFACE_SPEED: u16 = 8;
+const INTERFACE_RESOLUTION: u16 = 9;
+const PACKET_FLAGS: u16 = 2;
+const PACKET_DROP_COUNT: u16 = 4;
+const LINKTYPE_USER0: u16 = 147;
+const LINKTYPE_CAN_SOCKETCAN: u16 = 227;
+
+/// A block: its type, its length before and behind what it holds, all little-endian and in units of four bytes.
+struct Block {
+    bytes: Vec<u8>,
+    /// An option was written, so their end has to be.
+    has_options: bool,
+}
+
+impl Block {
+    fn new(kind: u32) -> Self {
+        let mut bytes = kind.to_le_bytes().to_vec();
+        bytes.extend([0; 4]);
+        Self { bytes, has_options: false }
     }
 
-    fn add<'a>(&mut self, block: impl PcapNgBlock<'a>) {
-        // Fails only for a packet of an interface that was not described, which cannot be.
-        let _ = self.writer.write_pcapng_block(block);
+    fn put(&mut self, bytes: &[u8]) {
+        self.bytes.extend_from_slice(bytes);
+    }
+
+    fn pad(&mut self) {
+        self.bytes.resize(self.bytes.len().next_multiple_of(4), 0);
+    }
+
+    /// Adds an option of at most 65535 bytes; a longer one is left out.
+    fn option(&mut self, code: u16, value: &[u8]) {
+        let Ok(len) = u16::try_from(value.len()) else { return };
+        self.put(&code.to_le_bytes());
+        self.put(&len.to_le_bytes());
+        self.put(value);
+        self.pad();
+        self.has_options = true;
+    }
+
+    fn end(mut self, out: &mut Vec<u8>) {
+        if self.has_options {
+            self.put(&[0; 4]);
+        }
+        let len = (self.bytes.len() + 4) as u32;
+        self.put(&len.to_le_bytes());
+        self.bytes[4..8].copy_from_slice(&len.to_le_bytes());
+        out.extend(self.bytes);
     }
 }
 

@@ -2,9 +2,9 @@
 //!
 //! ```text
 //! cargo build --release -p host-sim
-//! cargo run --release -p recipe-compare-host -- servers     # the controller's Modbus server, and others
-//! cargo run --release -p recipe-compare-host -- relay       # the gateway, and a relay in C
-//! cargo run --release -p recipe-compare-host -- cells       # how many cells of 4 ms one machine carries
+//! cargo run --release --manifest-path host-sim/compare/Cargo.toml -- servers     # the controller's Modbus server, and others
+//! cargo run --release --manifest-path host-sim/compare/Cargo.toml -- relay       # the gateway, and a relay in C
+//! cargo run --release --manifest-path host-sim/compare/Cargo.toml -- cells       # how many cells of 4 ms one machine carries
 //! ```
 //!
 //! Rounds of both sides take turns, so that other load of the machine affects both: quote ratios. The figures are in

@@ -34,4 +34,5 @@ pub mod tcp_options;
 #[cfg(test)]
 mod test_kit;
 pub mod timer;
+mod tty;
 pub mod wire;

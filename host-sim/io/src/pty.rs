@@ -315,7 +315,7 @@ mod tests {
             let pty = Pty::open(link).unwrap();
             for round in 0..50_u8 {
                 let mut peer = client(link);
-                // An exclusive client, as tokio-serial is, does not lock us out.
+                // An exclusive client, as a `Tty` is, does not lock us out.
                 rustix::termios::ioctl_tiocexcl(&peer).unwrap();
                 assert!(pty.has_client());
                 peer.write_all(&[round]).unwrap();

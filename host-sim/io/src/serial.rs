@@ -8,11 +8,10 @@ use std::io;
 use std::rc::Rc;
 use std::time::Duration as StdDuration;
 
-use proto_core::config::{Parity, Rs485};
+use proto_core::config::Rs485;
 use proto_core::time::{Duration, Instant};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::task::yield_now;
-use tokio_serial::{SerialPortBuilderExt, SerialStream};
 use tracing::{debug, info, warn};
 
 use super::bind::{Device, HostPort, Pace};
@@ -26,6 +25,7 @@ use crate::connect::connect;
 use crate::fairness::{Either, Order, either, give_way, yield_fairly};
 use crate::tcp_options;
 use crate::timer::now;
+use crate::tty::Tty;
 
 /// A serial port's device.
 #[derive(Debug)]
@@ -42,7 +42,7 @@ pub(super) struct SerialPort {
 #[derive(Debug)]
 enum SerialSource {
     Pty(Rc<Pty>, Pace),
-    Serial(String, SerialStream),
+    Serial(String, Tty),
     Connect(HostPort),
     Listen(Rc<TcpListener>, Rc<RefCell<Option<Rc<TcpStream>>>>),
 }
@@ -65,9 +65,9 @@ impl SerialPort {
             }
             Device::Serial { path } => {
                 let path = path.display().to_string();
-                let stream = open_serial(&path, settings)
+                let device = Tty::open(&path, settings)
                     .map_err(|error| io::Error::new(error.kind(), format!("{path}: {error}")))?;
-                SerialSource::Serial(path, stream)
+                SerialSource::Serial(path, device)
             }
             Device::Tcp { to } => SerialSource::Connect(to.clone()),
             Device::TcpListen { listen } => {
@@ -121,12 +121,12 @@ impl SerialPort {
                 let backlog = Backlog::new(&tx);
                 Err(pump(&*pty, &mut sender, backlog, &mut events).await)
             }
-            SerialSource::Serial(path, stream) => {
-                let mut stream = Some(stream);
+            SerialSource::Serial(path, device) => {
+                let mut opened = Some(device);
                 let mut backoff = Backoff::new(StdDuration::from_millis(100), StdDuration::from_secs(2));
                 loop {
-                    let device = match stream.take().map_or_else(|| open_serial(&path, settings), Ok) {
-                        Ok(device) => RefCell::new(device),
+                    let device = match opened.take().map_or_else(|| Tty::open(&path, settings), Ok) {
+                        Ok(device) => device,
                         Err(error) => {
                             debug!(%path, %error, "cannot open the device");
                             backoff.wait().await;
@@ -207,26 +207,6 @@ async fn refuse_all(listener: &TcpListener, tx: &PortTx) {
             warn!(%peer, more, "refused: the line already has a client");
         }
         yield_fairly().await;
-    }
-}
-
-fn open_serial(path: &str, settings: Rs485) -> io::Result<SerialStream> {
-    let parity = match settings.parity {
-        Parity::None => tokio_serial::Parity::None,
-        Parity::Even => tokio_serial::Parity::Even,
-        Parity::Odd => tokio_serial::Parity::Odd,
-    };
-    let stop_bits =
-        if settings.stop_bits == 2 { tokio_serial::StopBits::Two } else { tokio_serial::StopBits::One };
-    let builder = tokio_serial::new(path, settings.baud).stop_bits(stop_bits);
-    match builder.clone().parity(parity).open_native_async() {
-        // A pseudoterminal has no parity bit; some systems refuse one instead of ignoring it.
-        Err(_) if settings.parity != Parity::None => {
-            let stream = builder.open_native_async()?;
-            warn!(path, "the device does not support parity; used without");
-            Ok(stream)
-        }
-        opened => Ok(opened?),
     }
 }
 

@@ -2,6 +2,7 @@
 
 use std::io::Write;
 
+use proto_core::config::Parity;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 

@@ -1,16 +1,11 @@
 //! The byte stream of a serial port or an slcan client: a pseudoterminal, a serial device or a TCP
 //! connection; and how TCP clients are accepted.
 
-use std::cell::RefCell;
-use std::future::poll_fn;
 use std::io;
-use std::pin::Pin;
 use std::time::Duration as StdDuration;
 
 use rustix::io::ioctl_fionread;
-use tokio::io::{AsyncRead, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
-use tokio_serial::{ClearBuffer, SerialPort, SerialStream};
 use tracing::warn;
 
 use super::bind::HostPort;
@@ -18,6 +13,7 @@ use super::exchange::PortTx;
 use super::pty::Pty;
 use crate::tcp_options;
 use crate::timer::now;
+use crate::tty::Tty;
 
 /// A connected device or client: what differs between the three kinds.
 pub(super) trait ByteStream {
@@ -92,17 +88,14 @@ impl ByteStream for Pty {
     }
 }
 
-impl ByteStream for RefCell<SerialStream> {
+impl ByteStream for Tty {
     const LOSSY: bool = false;
 
     async fn receive(&self, buf: &mut [u8]) -> io::Result<usize> {
-        // The stream's own `readable` and `try_read` never clear the readiness.
-        let mut buf = ReadBuf::new(buf);
-        poll_fn(|cx| Pin::new(&mut *self.borrow_mut()).poll_read(cx, &mut buf)).await?;
-        Ok(buf.filled().len())
+        Self::receive(self, buf).await
     }
     fn try_read(&self, buf: &mut [u8]) -> io::Result<usize> {
-        self.borrow_mut().try_read(buf)
+        Self::try_read(self, buf)
     }
     async fn writable(&self) -> io::Result<()> {
         // A frame usually fits the system's buffer; if not, the buffer empties at the baud rate.
@@ -110,16 +103,16 @@ impl ByteStream for RefCell<SerialStream> {
         Ok(())
     }
     fn try_write(&self, bytes: &[u8]) -> io::Result<usize> {
-        self.borrow_mut().try_write(bytes)
+        Self::try_write(self, bytes)
     }
     fn has_unread(&self) -> bool {
-        !matches!(self.borrow().bytes_to_read(), Ok(0))
+        Self::has_unread(self)
     }
     fn discard_unread(&self) {
-        let _ = self.borrow().clear(ClearBuffer::Input);
+        Self::discard_unread(self);
     }
     fn is_draining(&self) -> bool {
-        self.borrow().bytes_to_write().is_ok_and(|left| left > 0)
+        Self::is_draining(self)
     }
 }
 

@@ -73,15 +73,15 @@ pub fn reset_on_close(stream: &TcpStream) -> io::Result<()> {
     stream.set_zero_linger()
 }
 
-/// Number of written bytes that the peer has not acknowledged (SIOCOUTQ).
+/// Number of written bytes that the peer has not acknowledged (SIOCOUTQ); of a terminal, that have not left (TIOCOUTQ).
 ///
 /// # Errors
 /// If the system does not know.
-pub fn unacknowledged(stream: &TcpStream) -> io::Result<usize> {
+pub fn unacknowledged(stream: impl AsFd) -> io::Result<usize> {
     let mut count: libc::c_int = 0;
-    // SAFETY: the descriptor is open while `stream` is borrowed; the call writes one int to `count`, which
+    // SAFETY: the descriptor is open while it is borrowed; the call writes one int to `count`, which
     // outlives it.
-    let done = unsafe { libc::ioctl(stream.as_raw_fd(), libc::TIOCOUTQ, &raw mut count) };
+    let done = unsafe { libc::ioctl(stream.as_fd().as_raw_fd(), libc::TIOCOUTQ, &raw mut count) };
     if done < 0 {
         return Err(io::Error::last_os_error());
     }

@@ -24,7 +24,7 @@ pub struct Config(pub(crate) GatewayConfig<6, 6, 256, 32, 32, { crate::gateway::
 /// The bus of a port.
 #[repr(u8)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Kind {
+pub enum PortKind {
     /// A half-duplex serial line.
     Rs485 = 0,
     /// A CAN bus.
@@ -54,7 +54,7 @@ pub enum LineParity {
 #[derive(Debug, Clone, Copy)]
 pub struct PortSettings {
     /// Its bus.
-    pub kind: Kind,
+    pub kind: PortKind,
     /// Parity of a serial line.
     pub parity: LineParity,
     /// Stop bits of a serial line, 1 or 2; 0 on other buses.
@@ -162,7 +162,7 @@ pub unsafe extern "C" fn rgw_config_port(
         let other = |kind| PortSettings { kind, parity: LineParity::None, stop_bits: 0, bit_rate: 0 };
         let found = match &port.bus {
             Bus::Rs485(line) => PortSettings {
-                kind: Kind::Rs485,
+                kind: PortKind::Rs485,
                 parity: match line.parity {
                     Parity::None => LineParity::None,
                     Parity::Even => LineParity::Even,
@@ -171,10 +171,10 @@ pub unsafe extern "C" fn rgw_config_port(
                 stop_bits: line.stop_bits,
                 bit_rate: line.baud,
             },
-            Bus::Can { bitrate } => PortSettings { bit_rate: *bitrate, ..other(Kind::Can) },
-            Bus::ModbusTcp { .. } => other(Kind::ModbusTcp),
-            Bus::TcpListen { .. } => other(Kind::TcpListen),
-            Bus::UdpListen { .. } => other(Kind::UdpListen),
+            Bus::Can { bitrate } => PortSettings { bit_rate: *bitrate, ..other(PortKind::Can) },
+            Bus::ModbusTcp { .. } => other(PortKind::ModbusTcp),
+            Bus::TcpListen { .. } => other(PortKind::TcpListen),
+            Bus::UdpListen { .. } => other(PortKind::UdpListen),
         };
         // SAFETY: as promised by the caller.
         unsafe { give(settings, found) }

@@ -2,7 +2,7 @@
 //! instructions by valgrind:
 //!
 //! ```text
-//! cargo run --release -p recipe-compare -- instructions
+//! cargo run --release --manifest-path proto-core/compare/Cargo.toml -- instructions
 //! ```
 //!
 //! `CANTOOLS=PROGRAM` names cantools, if it is not in `PATH`; `cc` builds what it writes. Each must find all frames, and the same newest values. It fails when proto-core takes more than half of what another library

@@ -1,4 +1,4 @@
-//! Targets on stable Rust, in `cargo test`: everything that is kept, then a fixed number of inputs
+//! Targets on stable Rust, in `cargo fuzz-inputs`: everything that is kept, then a fixed number of inputs
 //! made of it by chance, always the same ones.
 
 use std::ffi::OsString;
@@ -16,7 +16,7 @@ pub struct Target {
     pub run: fn(&[u8]),
     /// Inputs to begin with: the vectors of `docs/wire`, and what once was a bug.
     pub seeds: fn() -> Vec<Vec<u8>>,
-    /// Inputs by chance in `cargo test`, unless `FUZZ_RUNS` says otherwise.
+    /// Inputs by chance in `cargo fuzz-inputs`, unless `FUZZ_RUNS` says otherwise.
     pub runs: usize,
     /// Longest input made by chance, in bytes.
     pub longest: usize,

@@ -4,7 +4,7 @@
 //! In: bytes. They are read as a short program: a recipe, operations, received bytes and where they
 //! are cut. Each target runs it on the code and on a slow, obvious reference written from `docs/wire`,
 //! and panics where they differ or where a call did more work than it may. The same functions run in
-//! `cargo test` and, guided by coverage, under libFuzzer.
+//! `cargo fuzz-inputs` and, guided by coverage, under libFuzzer.
 
 pub mod harness;
 pub mod source;

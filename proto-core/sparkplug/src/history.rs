@@ -1,6 +1,6 @@
 //! Values that could not be told when they were new: a bounded ring. When it is full the oldest goes, and is counted.
 
-use crate::value::{Stamp, Stored};
+use crate::value::{Stamp, StoredValue};
 use heapless::Deque;
 
 /// A value of the past.
@@ -9,7 +9,7 @@ pub(crate) struct Past {
     /// The place of its metric.
     pub place: u16,
     /// It may have become unknown.
-    pub value: Stored,
+    pub value: StoredValue,
     /// When.
     pub at: Stamp,
 }
@@ -76,7 +76,7 @@ mod tests {
     use std::vec::Vec;
 
     fn past(place: u16) -> Past {
-        Past { place, value: Stored::Unknown, at: Stamp::NEVER }
+        Past { place, value: StoredValue::Unknown, at: Stamp::NEVER }
     }
 
     fn places<const ROOM: usize>(history: &History<ROOM>) -> Vec<u16> {

@@ -19,7 +19,7 @@ use crate::history::{History, Past};
 use crate::mqtt::{Inbox, Packet, ProtocolError};
 use crate::payload::{self, Asked, HostState};
 use crate::topic;
-use crate::value::{DataType, Stamp, Stored, Value};
+use crate::value::{DataType, Stamp, StoredValue, Value};
 pub use io::{Input, NodeCounters, NodeError, NodeOutput, SessionFailure};
 use maybe::Maybe;
 pub use messages::MAX_METRIC;
@@ -75,9 +75,9 @@ struct NodeMetric {
     data_type: DataType,
     /// To be told.
     is_pending: bool,
-    current: Stored,
+    current: StoredValue,
     /// The last one told, and when it was sampled; never if none was.
-    published: Stored,
+    published: StoredValue,
     published_at: Stamp,
 }
 
@@ -222,8 +222,8 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
             let _ = self.slots.push(NodeMetric {
                 data_type,
                 is_pending: false,
-                current: Stored::Unknown,
-                published: Stored::Unknown,
+                current: StoredValue::Unknown,
+                published: StoredValue::Unknown,
                 published_at: Stamp::NEVER,
             });
         }
@@ -252,7 +252,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
             }
             Input::Bytes(bytes) => self.receive(now, bytes),
             Input::Sample { values, alive } => {
-                self.slots.iter_mut().skip(values.len()).for_each(|slot| slot.current = Stored::Unknown);
+                self.slots.iter_mut().skip(values.len()).for_each(|slot| slot.current = StoredValue::Unknown);
                 self.take_values(0, values);
                 self.sampled(now, alive, catalog);
             }
@@ -305,7 +305,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
     fn take_values(&mut self, first: usize, values: &[Option<Value>]) {
         for (slot, value) in self.slots.iter_mut().skip(first).zip(values) {
             let value = value.and_then(Value::known).filter(|value| value.data_type() == slot.data_type);
-            slot.current = Stored::of(value);
+            slot.current = StoredValue::of(value);
         }
     }
 

@@ -98,14 +98,14 @@ impl Value {
 
 /// A value that may be unknown, next to its type. Takes less memory than an `Option<Value>`, of which a node has many.
 #[derive(Debug, Clone, Copy)]
-pub(crate) enum Stored {
+pub(crate) enum StoredValue {
     Unknown,
     /// Of a number: the low half first.
     Bits([u32; 2]),
     Word(&'static str),
 }
 
-impl Stored {
+impl StoredValue {
     pub(crate) fn of(value: Option<Value>) -> Self {
         let bits = match value {
             None => return Self::Unknown,
@@ -190,8 +190,8 @@ mod tests {
             Value::Word("working"),
         ];
         for value in values {
-            assert_eq!(Stored::of(Some(value)).get(value.data_type()), Some(value));
-            assert_eq!(Stored::of(None).get(value.data_type()), None);
+            assert_eq!(StoredValue::of(Some(value)).get(value.data_type()), Some(value));
+            assert_eq!(StoredValue::of(None).get(value.data_type()), None);
         }
         for at in [Instant::ZERO, Instant::from_micros(1 << 40 | 7), Instant::NEVER] {
             assert_eq!(Stamp::of(at).get(), at);

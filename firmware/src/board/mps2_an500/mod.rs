@@ -23,7 +23,7 @@ use cortex_m::interrupt::InterruptNumber;
 use cortex_m::peripheral::NVIC;
 use embassy_sync::waitqueue::AtomicWaker;
 use embassy_time::Duration;
-use firmware::drivers::lan9118::{Lan9118, Lan9118Error, Lan9118Registers};
+use firmware::drivers::lan9118::{Lan9118, Lan9118Registers};
 use firmware::drivers::slcan::SlcanPort;
 use firmware::platform::{self, StatusLed};
 use firmware::stored::StorePlaces;
@@ -31,7 +31,19 @@ use firmware::update::Site;
 use proto_core::config::Rs485;
 use recipe_update::MPS2_AN500;
 
-use watchdog::Watchdog;
+// The devices, by the names that tasks have for them.
+pub(crate) use FpgaLed as BoardLed;
+pub(crate) use button::UserButton;
+pub(crate) use firmware::drivers::lan9118::Lan9118Error as EthernetError;
+pub(crate) use flash::StoreFile as StoreArea;
+pub(crate) use host_flash::HostFlash as SlotArea;
+pub(crate) use storage::StorageError;
+pub(crate) use uart::Uart as SerialDevice;
+pub(crate) use watchdog::Watchdog;
+
+/// CAN is slcan on a UART here.
+pub(crate) type CanDevice = SlcanPort<uart::Uart>;
+pub(crate) type Ethernet = Lan9118<LanRegisters>;
 
 /// The numbers of the next devices to hand out.
 pub(crate) struct Mps2An500 {
@@ -39,25 +51,14 @@ pub(crate) struct Mps2An500 {
     can: usize,
 }
 
+#[expect(refining_impl_trait, reason = "tasks name the types, because a task cannot be generic")]
 impl platform::Board for Mps2An500 {
     const NAME: &'static str = MPS2_AN500.board;
     const SERIAL_PORTS: usize = 2;
     const CAN_PORTS: usize = 1;
     const WATCHDOG_PERIOD: Duration = watchdog::PERIOD;
 
-    type Serial = uart::Uart;
-    /// CAN is slcan on a UART here.
-    type Can = SlcanPort<uart::Uart>;
-    type Ethernet = Lan9118<LanRegisters>;
-    type Watchdog = Watchdog;
-    type Led = FpgaLed;
-    type Button = button::Button;
-    type Flash = flash::StoreFile;
-    type Slot = host_flash::HostFlash;
-    type StorageError = storage::StorageError;
-    type EthernetError = Lan9118Error;
-
-    fn configuration(&mut self) -> Result<&'static [u8], Self::StorageError> {
+    fn configuration(&mut self) -> Result<&'static [u8], StorageError> {
         storage::read()
     }
 
@@ -75,7 +76,7 @@ impl platform::Board for Mps2An500 {
     }
 
     /// Baud rate and format are not emulated.
-    fn serial(&mut self, _: &Rs485) -> Option<Self::Serial> {
+    fn serial(&mut self, _: &Rs485) -> Option<SerialDevice> {
         let port = self.serial;
         (port < Self::SERIAL_PORTS).then(|| {
             self.serial += 1;
@@ -83,7 +84,7 @@ impl platform::Board for Mps2An500 {
         })
     }
 
-    fn can(&mut self, bitrate: u32) -> Option<Self::Can> {
+    fn can(&mut self, bitrate: u32) -> Option<CanDevice> {
         let port = self.can;
         (port < Self::CAN_PORTS).then(|| {
             self.can += 1;
@@ -91,7 +92,7 @@ impl platform::Board for Mps2An500 {
         })
     }
 
-    fn ethernet(&mut self) -> Result<Self::Ethernet, Lan9118Error> {
+    fn ethernet(&mut self) -> Result<Ethernet, EthernetError> {
         let driver = Lan9118::start(LanRegisters, &LAN_WAKER)?;
         Irq::LAN9118.enable();
         Ok(driver)
@@ -114,8 +115,8 @@ impl platform::Board for Mps2An500 {
         storage::random()
     }
 
-    fn button(&mut self) -> button::Button {
-        button::Button::new()
+    fn button(&mut self) -> UserButton {
+        UserButton::new()
     }
 
     fn stack_used(&self) -> usize {

@@ -6,16 +6,16 @@ use embassy_stm32::peripherals::PC13;
 use firmware::platform;
 
 /// The button.
-pub(crate) struct Button(Input<'static>);
+pub(crate) struct UserButton(Input<'static>);
 
-impl Button {
+impl UserButton {
     pub(super) fn new(pin: Peri<'static, PC13>) -> Self {
         // Additional pull-down: reads low even if the board's own resistor is missing.
         Self(Input::new(pin, Pull::Down))
     }
 }
 
-impl platform::Button for Button {
+impl platform::Button for UserButton {
     fn is_pressed(&mut self) -> bool {
         self.0.is_high()
     }

@@ -30,8 +30,15 @@ use proto_core::config::Rs485;
 use recipe_update::NUCLEO_H743ZI;
 use static_cell::StaticCell;
 
-use leds::BoardLed;
-use watchdog::Watchdog;
+// The devices, by the names that tasks have for them.
+pub(crate) use button::UserButton;
+pub(crate) use can::CanDevice;
+pub(crate) use ethernet::{Ethernet, EthernetError};
+pub(crate) use flash::{Area as StoreArea, Area as SlotArea};
+pub(crate) use leds::BoardLed;
+pub(crate) use serial::SerialDevice;
+pub(crate) use storage::StorageError;
+pub(crate) use watchdog::Watchdog;
 
 bind_interrupts!(struct Irqs {
     USART2 => serial::Usart2Interrupt;
@@ -52,27 +59,17 @@ pub(crate) struct NucleoH743zi {
     watchdog: Option<Watchdog>,
     stores: Option<StorePlaces<flash::Area>>,
     slots: Option<Site<flash::Area>>,
-    button: Option<button::Button>,
+    button: Option<UserButton>,
 }
 
+#[expect(refining_impl_trait, reason = "tasks name the types, because a task cannot be generic")]
 impl platform::Board for NucleoH743zi {
     const NAME: &'static str = NUCLEO_H743ZI.board;
     const SERIAL_PORTS: usize = 2;
     const CAN_PORTS: usize = 1;
     const WATCHDOG_PERIOD: Duration = watchdog::PERIOD;
 
-    type Serial = serial::SerialDevice;
-    type Can = can::CanDevice;
-    type Ethernet = ethernet::Ethernet;
-    type Watchdog = Watchdog;
-    type Led = BoardLed;
-    type Button = button::Button;
-    type Flash = flash::Area;
-    type Slot = flash::Area;
-    type StorageError = storage::StorageError;
-    type EthernetError = ethernet::EthernetError;
-
-    fn configuration(&mut self) -> Result<&'static [u8], Self::StorageError> {
+    fn configuration(&mut self) -> Result<&'static [u8], StorageError> {
         storage::read()
     }
 
@@ -89,17 +86,16 @@ impl platform::Board for NucleoH743zi {
         flash::block_on(operation, watchdog::feed_during_start)
     }
 
-    fn serial(&mut self, line: &Rs485) -> Option<Self::Serial> {
+    fn serial(&mut self, line: &Rs485) -> Option<SerialDevice> {
         self.serial.next(line)?.inspect_err(|error| error!("{}", DisplayText(error))).ok()
     }
 
-    fn can(&mut self, bitrate: u32) -> Option<Self::Can> {
+    fn can(&mut self, bitrate: u32) -> Option<CanDevice> {
         can::start(self.can.take()?, bitrate).inspect_err(|error| error!("{}", DisplayText(error))).ok()
     }
 
-    fn ethernet(&mut self) -> Result<Self::Ethernet, Self::EthernetError> {
-        let (parts, led) =
-            self.ethernet.take().zip(self.link.take()).ok_or(ethernet::EthernetError::Taken)?;
+    fn ethernet(&mut self) -> Result<Ethernet, EthernetError> {
+        let (parts, led) = self.ethernet.take().zip(self.link.take()).ok_or(EthernetError::Taken)?;
         parts.start(Irqs, identity::ethernet_address(), led)
     }
 
@@ -120,7 +116,7 @@ impl platform::Board for NucleoH743zi {
         identity::random()
     }
 
-    fn button(&mut self) -> button::Button {
+    fn button(&mut self) -> UserButton {
         self.button.take().expect("asked for once")
     }
 
@@ -173,7 +169,7 @@ fn main() -> ! {
         stores: Some(unsafe { flash::stores() }),
         // SAFETY: the only call; slots and stores do not overlap (a test of the layout).
         slots: Some(unsafe { flash::slots() }),
-        button: Some(button::Button::new(p.PC13)),
+        button: Some(UserButton::new(p.PC13)),
     };
     static EXECUTOR: StaticCell<Executor> = StaticCell::new();
     EXECUTOR.init(Executor::new()).run(|spawner| {

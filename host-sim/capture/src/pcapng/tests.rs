@@ -1,8 +1,8 @@
-//! Captures as another reader sees them: the one of the crate pcap-file.
+//! What captures hold, by a reader of its own, and their bytes, which were once those of the crate pcap-file. Wireshark
+//! reads them in `.ci/run foreign`.
 
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
-use pcap_file::pcapng::{Block, PcapNgReader};
 use proto_core::engine::{LinkId, PortId};
 use proto_core::time::Instant;
 
@@ -36,46 +36,73 @@ fn frame(place: TapPlace, verdict: TapVerdict, can_id: Option<CanId>) -> What {
 #[derive(Debug, PartialEq)]
 struct Packet {
     interface: String,
-    nanos: u128,
+    nanos: u64,
     data: Vec<u8>,
     comment: Option<String>,
     flags: u32,
     drops: u64,
 }
 
+fn word(bytes: &[u8], at: usize) -> u32 {
+    u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap())
+}
+
+/// Type and body of every block.
+fn blocks(mut bytes: &[u8]) -> Vec<(u32, &[u8])> {
+    let mut blocks = Vec::new();
+    while !bytes.is_empty() {
+        let len = word(bytes, 4) as usize;
+        assert_eq!((len % 4, word(bytes, len - 4) as usize), (0, len));
+        blocks.push((word(bytes, 0), &bytes[8..len - 4]));
+        bytes = &bytes[len..];
+    }
+    blocks
+}
+
+/// Number and value of every option, up to their end.
+fn options(mut bytes: &[u8]) -> Vec<(u16, &[u8])> {
+    let mut options = Vec::new();
+    loop {
+        let (code, len) = (word(bytes, 0) as u16, (word(bytes, 0) >> 16) as usize);
+        if code == 0 {
+            assert_eq!(bytes, [0; 4], "nothing behind the end");
+            return options;
+        }
+        options.push((code, &bytes[4..4 + len]));
+        bytes = &bytes[4 + len.next_multiple_of(4)..];
+    }
+}
+
 fn packets(bytes: &[u8]) -> Vec<Packet> {
-    let mut reader = PcapNgReader::new(bytes).unwrap();
+    let text = |bytes: &[u8]| String::from_utf8(bytes.to_vec()).unwrap();
     let mut names = Vec::new();
     let mut packets = Vec::new();
-    while let Some(block) = reader.next_block() {
-        match block.unwrap() {
-            Block::InterfaceDescription(interface) => {
-                for option in &interface.options {
-                    if let InterfaceDescriptionOption::IfName(name) = option {
-                        names.push(name.to_string());
-                    }
+    for (kind, body) in blocks(bytes) {
+        if kind == INTERFACE {
+            let options = options(&body[8..]);
+            names.extend(
+                options.iter().filter(|(code, _)| *code == INTERFACE_NAME).map(|(_, name)| text(name)),
+            );
+        }
+        if kind == PACKET {
+            let len = word(body, 12) as usize;
+            let (mut comment, mut flags, mut drops) = (None, 0, 0);
+            for (code, value) in options(&body[20 + len.next_multiple_of(4)..]) {
+                match code {
+                    COMMENT => comment = Some(text(value)),
+                    PACKET_FLAGS => flags = word(value, 0),
+                    PACKET_DROP_COUNT => drops = u64::from_le_bytes(value.try_into().unwrap()),
+                    _ => {}
                 }
             }
-            Block::EnhancedPacket(packet) => {
-                let (mut comment, mut flags, mut drops) = (None, 0, 0);
-                for option in &packet.options {
-                    match option {
-                        EnhancedPacketOption::Comment(text) => comment = Some(text.to_string()),
-                        EnhancedPacketOption::Flags(value) => flags = *value,
-                        EnhancedPacketOption::DropCount(count) => drops = *count,
-                        _ => {}
-                    }
-                }
-                packets.push(Packet {
-                    interface: names[packet.interface_id as usize].clone(),
-                    nanos: packet.timestamp.as_nanos(),
-                    data: packet.data.to_vec(),
-                    comment,
-                    flags,
-                    drops,
-                });
-            }
-            _ => {}
+            packets.push(Packet {
+                interface: names[word(body, 0) as usize].clone(),
+                nanos: u64::from(word(body, 4)) << 32 | u64::from(word(body, 8)),
+                data: body[20..20 + len].to_vec(),
+                comment,
+                flags,
+                drops,
+            });
         }
     }
     packets
@@ -95,6 +122,7 @@ fn packets_have_their_port_time_direction_and_verdict() {
     let remote = TapVerdict::Rejected(Rejection::Remote);
     bytes.extend(capture.blocks(&arrived(10, frame(port(1), remote, Some(CanId::Standard(0x123))))));
     assert_eq!(bytes[..4], MAGIC);
+    assert_eq!(bytes.escape_ascii().to_string(), WRITTEN.escape_ascii().to_string());
     let packets = packets(&bytes);
     let first = Packet {
         interface: "rs485-1".into(),
@@ -131,3 +159,25 @@ fn the_capture_goes_on_when_the_gateway_is_started_anew() {
     bytes.extend(capture.blocks(&arrived(2, frame(TapPlace::Port(PortId(0)), TapVerdict::Taken, None))));
     assert_eq!(packets(&bytes)[0].interface, "b");
 }
+
+const WRITTEN: &[u8] = b"\
+    \x0A\x0D\x0D\x0A4\0\0\0M<+\x1A\x01\0\0\0\xFF\xFF\xFF\xFF\xFF\xFF\xFF\xFF\x04\0\x0E\0\
+    recipe gateway\0\0\0\0\0\x004\0\0\0\
+    \x01\0\0\x008\0\0\0\x93\0\0\0\0\0\0\0\x02\0\x07\0rs485-1\0\x09\0\x01\0\x09\0\0\0\x08\0\
+    \x08\0\0\xC2\x01\0\0\0\0\0\0\0\0\x008\0\0\0\
+    \x01\0\0\x004\0\0\0\xE3\0\0\0\0\0\0\0\x02\0\x04\0hand\x09\0\x01\0\x09\0\0\0\x08\0\x08\
+    \0\0\xC2\x01\0\0\0\0\0\0\0\0\x004\0\0\0\
+    \x01\0\0\x000\0\0\0\x93\0\0\0\0\0\0\0\x02\0\x0B\0link modbus\0\x09\0\x01\0\x09\0\0\0\0\
+    \0\0\x000\0\0\0\
+    \x06\0\0\0\\\0\0\0\0\0\0\0\x01\0\0\0X\x0D\x06*\x03\0\0\0\x03\0\0\0\x01\x02\x03\0\x02\
+    \0\x04\0\x01\0\0\0\x04\0\x08\0\x05\0\0\0\0\0\0\0\x01\0\x1A\0rejected: a wrong checks\
+    um\0\0\0\0\0\0\\\0\0\0\
+    \x06\0\0\0D\0\0\0\x01\0\0\0\x01\0\0\0@\x11\x06*\x0B\0\0\0\x0B\0\0\0\x80\x01\0\0\x03\
+    \0\0\0\x01\x02\x03\0\x02\0\x04\0\x01\0\0\0\x04\0\x08\0\x05\0\0\0\0\0\0\0\0\0\0\0D\0\
+    \0\0\
+    \x06\0\0\0<\0\0\0\x02\0\0\0\x01\0\0\0(\x15\x06*\x03\0\0\0\x03\0\0\0\x01\x02\x03\0\
+    \x02\0\x04\0\x01\0\0\0\x04\0\x08\0\x05\0\0\0\0\0\0\0\0\0\0\0<\0\0\0\
+    \x06\0\0\0`\0\0\0\x01\0\0\0\x01\0\0\0\x10\x19\x06*\x0B\0\0\0\x0B\0\0\0@\0\x01#\x03\0\
+    \0\0\x01\x02\x03\0\x02\0\x04\0\x01\0\0\0\x04\0\x08\0\x05\0\0\0\0\0\0\0\x01\0\x18\0re\
+    jected: a remote frame\0\0\0\0`\0\0\0\
+";

@@ -15,7 +15,6 @@ mod frame_order;
 mod framing_files;
 mod golden_images;
 mod input_rule_files;
-mod schema_files;
 mod sendable_files;
 mod since;
 mod tcp_files;

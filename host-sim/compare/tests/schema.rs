@@ -1,5 +1,5 @@
-//! The schema takes every good file, and refuses no file that the reader takes. What only the reader refuses is
-//! listed, with the reason.
+//! The schema of configuration files, by a validator that others wrote: it takes every good file, and refuses no file
+//! that the reader takes. What only the reader refuses is listed, with the reason.
 
 use jsonschema::Validator;
 use recipe_config::file::{Config, Text, parse};
