@@ -52,7 +52,7 @@ use heapless::{String, Vec};
 use clock::{Clock, deadlines};
 use dispatch::{EngineView, hold};
 use field::bindings::{Bindings, InputBind, OutputBind, Sendable};
-use field::exchanges::{Exchanges, Item, Piece};
+use field::exchanges::{ExchangeItem, Exchanges, Piece};
 use field::health::{PortsHealth, state_of};
 use field::line::PeerState;
 use field::port::{FieldPort, find_port};
@@ -114,7 +114,7 @@ pub struct Engine<
     sendable: Vec<Sendable, MAX_SENDABLE>,
     safe_values: Vec<SafeBytes, MAX_SAFE_VALUES>,
     health: PortsHealth,
-    exchanges: Vec<Item, EXCHANGES>,
+    exchanges: Vec<ExchangeItem, EXCHANGES>,
     rows: Vec<Row, EXCHANGES>,
     peers: Vec<PeerState, EXCHANGES>,
     written: [Piece; EXCHANGES],

@@ -43,9 +43,9 @@ impl<K: Serialize, V: Serialize, I: Iterator<Item = (K, V)>, F: Fn() -> I> Seria
 }
 
 /// A value as the text that it displays.
-struct Text<T>(T);
+struct AsText<T>(T);
 
-impl<T: fmt::Display> Serialize for Text<T> {
+impl<T: fmt::Display> Serialize for AsText<T> {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         serializer.collect_str(&self.0)
     }
@@ -89,7 +89,7 @@ impl Serialize for Field {
         map.serialize_entry("frame", &field.frame)?;
         map.serialize_entry("field", &field.field)?;
         if let Some(var) = field.var {
-            map.serialize_entry("to", &Text(var))?;
+            map.serialize_entry("to", &AsText(var))?;
         }
         if let Some(value) = field.value.filter(|value| value.is_finite()) {
             map.serialize_entry("value", &Number(value))?;
@@ -112,13 +112,13 @@ impl Serialize for Rejected<'_> {
         map.serialize_entry("text", rejection.why.text())?;
         map.serialize_entry("age_ms", &at.saturating_since(rejection.at).as_millis())?;
         if let Some(id) = rejection.can_id {
-            map.serialize_entry("can_id", &Text(id))?;
+            map.serialize_entry("can_id", &AsText(id))?;
         }
         map.serialize_entry("len", &rejection.len)?;
         if let Some(field) = field {
             map.serialize_entry("field", &Field(field))?;
         }
-        map.serialize_entry("bytes", &Text(Hex(rejection.bytes())))?;
+        map.serialize_entry("bytes", &AsText(Hex(rejection.bytes())))?;
         map.end()
     }
 }
@@ -133,7 +133,7 @@ impl Serialize for Status<'_> {
         if let Some(controller) = self.controller() {
             map.serialize_entry("controller", &controller)?;
         }
-        map.serialize_entry("values", &Map(|| self.variables().map(|known| (Text(known.name()), known))))?;
+        map.serialize_entry("values", &Map(|| self.variables().map(|known| (AsText(known.name()), known))))?;
         map.serialize_entry("latency", self.latency())?;
         map.end()
     }
@@ -162,7 +162,7 @@ impl Serialize for PortStatus<'_> {
         map.serialize_entry("overdue", &port.overdue)?;
         map.serialize_entry("reply", port.reply.name())?;
         if let Some(command) = port.command {
-            map.serialize_entry("command", &Text(command))?;
+            map.serialize_entry("command", &AsText(command))?;
         }
         if let Some(last) = port.last_dropped {
             map.serialize_entry("last_not_given", &At(last, at))?;
@@ -209,7 +209,7 @@ impl Serialize for At<&FailedCommand<'_>> {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let &Self(failed, at) = self;
         let mut map = serializer.serialize_map(None)?;
-        map.serialize_entry("command", &Text(failed.command))?;
+        map.serialize_entry("command", &AsText(failed.command))?;
         map.serialize_entry("age_ms", &at.saturating_since(failed.at).as_millis())?;
         if let Some(controller) = &failed.controller {
             map.serialize_entry("controller", controller)?;
@@ -239,7 +239,7 @@ impl Serialize for At<&OtherText<'_>> {
         map.serialize_entry("text", other.text)?;
         map.serialize_entry("age_ms", &at.saturating_since(other.at).as_millis())?;
         if let Some(command) = other.command {
-            map.serialize_entry("command", &Text(command))?;
+            map.serialize_entry("command", &AsText(command))?;
         }
         map.end()
     }

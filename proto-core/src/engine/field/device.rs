@@ -6,7 +6,7 @@
 use heapless::Vec;
 
 use super::bindings::{InputBind, Outputs};
-use super::frames::{Accepted, Frames};
+use super::frames::{Accepted, FrameContext};
 use super::line::Line;
 use super::output::Downward;
 use super::port::{Codec, FieldPort, came, keep_why};
@@ -222,7 +222,7 @@ impl FieldPort {
         };
         let Some((formats, texts, framer)) = framer else { return accepted };
         let (reply, counters) = (&mut self.reply, &mut self.counters);
-        let mut frames = Frames::new((self.id, self.mode), reply, counters, bindings, store, commands);
+        let mut frames = FrameContext::new((self.id, self.mode), reply, counters, bindings, store, commands);
         let effort = formats
             .iter()
             .map(|format| format.layout.lengths().1.saturating_add(usize::from(format.bindings.len)));
@@ -286,7 +286,7 @@ impl FieldPort {
         let (now, usable) = (store.now, self.is_usable());
         let Codec::Device(device) = &self.codec else { return Ok(()) };
         let (reply, counters) = (&mut self.reply, &mut self.counters);
-        let mut frames = Frames::new((self.id, self.mode), reply, counters, bindings, store, commands);
+        let mut frames = FrameContext::new((self.id, self.mode), reply, counters, bindings, store, commands);
         if device.inputs == 0 {
             frames.rejected(Rejection::NoInput)?;
         }

@@ -6,7 +6,7 @@
 
 use super::bindings::{InputBind, InputTo, Written};
 use super::device::{DeviceFormat, elements};
-use super::frames::{Accepted, Frames};
+use super::frames::{Accepted, FrameContext};
 use super::rules::{Rules, Taken};
 use super::whole::TextBind;
 use crate::device::{Encoding, Overflow, Unreadable};
@@ -43,7 +43,7 @@ struct Sorted {
     tells: bool,
 }
 
-impl Frames<'_> {
+impl FrameContext<'_> {
     /// Applies a frame, and counts it in `accepted`.
     pub(crate) fn take_device(
         &mut self,

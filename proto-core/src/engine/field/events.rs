@@ -6,7 +6,7 @@
 //! A rise needs a 0 that was read before it over the same connection, and that is not stale. Values that are read apart
 //! from the bit come from a read that was answered after the one that showed the rise.
 
-use super::exchanges::{Item, Piece};
+use super::exchanges::{ExchangeItem, Piece};
 use super::line::{EventCounters, ExchangeTable, Line};
 use super::requests::Maker;
 use super::turns::{Ended, News, Turns};
@@ -171,7 +171,7 @@ pub(crate) struct Sources<C> {
 
 /// The events of one line.
 pub(crate) struct Events<'a, 't> {
-    pub items: &'a mut [Item],
+    pub items: &'a mut [ExchangeItem],
     pub table: &'a mut ExchangeTable<'t>,
     pub line: &'a mut Line,
     pub now: Instant,
@@ -273,7 +273,9 @@ impl Events<'_, '_> {
         sources: &Sources<impl Fn(GroupId) -> Instant>,
         kept: &mut [Piece],
     ) {
-        let Some(Item { event: Event::Risen { at, until }, .. }) = self.items.get(nth) else { return };
+        let Some(ExchangeItem { event: Event::Risen { at, until }, .. }) = self.items.get(nth) else {
+            return;
+        };
         let (at, until) = (*at, *until);
         let bit_group = self
             .items
@@ -416,7 +418,7 @@ impl Events<'_, '_> {
         let mut left = self.items.len();
         while left > 0 {
             left = left.saturating_sub(1);
-            let is_orphan = |item: &Item| {
+            let is_orphan = |item: &ExchangeItem| {
                 let leader = item.follow.and_then(|leader| self.items.get(usize::from(leader)));
                 matches!(item.event, Event::Behind { .. })
                     && leader.is_some_and(|leader| leader.event.is_over())

@@ -7,8 +7,8 @@
 use super::bindings::{InputBind, Outputs};
 use super::device::{DeviceCodec, DeviceFormat, elements, judge_can};
 use super::events::{Events, Outcome, Sources};
-use super::exchanges::{Asks, Item, OtherFormat, View};
-use super::frames::{Accepted, Frames};
+use super::exchanges::{Asks, ExchangeItem, OtherFormat, View};
+use super::frames::{Accepted, FrameContext};
 use super::line::{ExchangeTable, Flight, Line, Over, Phase, Times};
 use super::modbus_tcp;
 use super::output::Downward;
@@ -108,8 +108,14 @@ impl FieldPort {
         };
         let formats = formats.get(..usize::from(*inputs)).unwrap_or(&[]);
         let (items, mut table) = view.of(line);
-        let mut frames =
-            Frames::new((self.id, self.mode), &mut self.reply, &mut self.counters, bindings, store, commands);
+        let mut frames = FrameContext::new(
+            (self.id, self.mode),
+            &mut self.reply,
+            &mut self.counters,
+            bindings,
+            store,
+            commands,
+        );
         let first_frame = self.first_frame;
         loop {
             let pending = PendingReplies {
@@ -265,8 +271,14 @@ impl FieldPort {
         };
         let formats = formats.get(..usize::from(*inputs)).unwrap_or(&[]);
         let (items, mut table) = view.of(line);
-        let mut frames =
-            Frames::new((self.id, self.mode), &mut self.reply, &mut self.counters, bindings, store, commands);
+        let mut frames = FrameContext::new(
+            (self.id, self.mode),
+            &mut self.reply,
+            &mut self.counters,
+            bindings,
+            store,
+            commands,
+        );
         if frame.is_remote() {
             return frames.rejected(Rejection::Remote);
         }
@@ -521,7 +533,7 @@ impl FieldPort {
     }
 }
 
-fn view_item<'v>(view: &'v mut View<'_>, line: &Line, nth: u8) -> Option<&'v Item> {
+fn view_item<'v>(view: &'v mut View<'_>, line: &Line, nth: u8) -> Option<&'v ExchangeItem> {
     view.of(line).0.get(usize::from(nth))
 }
 
@@ -555,10 +567,10 @@ const fn refused_with(code: u8, is_modbus: bool) -> Ended {
 }
 
 /// The peer whose CANopen node says that it has booted: its object dictionary is asked with SDO in one of the exchanges.
-fn booted_peer(items: &[Item], table: &ExchangeTable<'_>, frame: &CanFrame) -> Option<u8> {
+fn booted_peer(items: &[ExchangeItem], table: &ExchangeTable<'_>, frame: &CanFrame) -> Option<u8> {
     let (CanId::Standard(id @ 0x701..=0x77F), [0]) = (frame.id(), frame.data()) else { return None };
     let sdo = CanId::Standard(id.wrapping_sub(0x100));
-    let is_of_node = |item: &Item| item.request.as_ref().is_some_and(|request| request.id == sdo);
+    let is_of_node = |item: &ExchangeItem| item.request.as_ref().is_some_and(|request| request.id == sdo);
     let nth = items.iter().position(is_of_node)?;
     table.rows.get(nth).map(|row| row.peer)
 }
@@ -595,7 +607,7 @@ fn learn_echo(line: &mut Line, table: &mut ExchangeTable<'_>, has_echo: bool, no
 /// The request on its way is answered: counts it at its port and peer, and tells the events.
 fn answered(
     line: &mut Line,
-    items: &mut [Item],
+    items: &mut [ExchangeItem],
     table: &mut ExchangeTable<'_>,
     counters: &mut PortCounters,
     (flight, times): (Flight, Times),
@@ -626,7 +638,7 @@ fn answered(
 #[inline(never)]
 fn goes_on(
     line: &mut Line,
-    items: &mut [Item],
+    items: &mut [ExchangeItem],
     table: &mut ExchangeTable<'_>,
     (flight, times): (Flight, Times),
     now: Instant,
@@ -642,7 +654,7 @@ fn goes_on(
 #[cold]
 #[inline(never)]
 fn take_other(
-    frames: &mut Frames<'_>,
+    frames: &mut FrameContext<'_>,
     other: Option<&OtherFormat>,
     texts: &[TextBind],
     frame: &[u8],
@@ -660,14 +672,16 @@ fn take_other(
 #[inline(never)]
 fn look_for_restart(
     line: &mut Line,
-    items: &mut [Item],
+    items: &mut [ExchangeItem],
     table: &mut ExchangeTable<'_>,
     bindings: &[InputBind],
     (exchange, data): (u8, &[u8]),
     now: Instant,
 ) {
     let nth = usize::from(exchange);
-    let Some(Item { restart: Some(sign), reply: Some(reply), .. }) = items.get_mut(nth) else { return };
+    let Some(ExchangeItem { restart: Some(sign), reply: Some(reply), .. }) = items.get_mut(nth) else {
+        return;
+    };
     let fields = elements(reply.format.bindings.of(bindings));
     let found = reply.format.layout.values(fields, data).nth(usize::from(sign.element));
     let Some(Ok(Some(value))) = found else { return };
@@ -689,7 +703,7 @@ fn look_for_restart(
 /// The peer of this exchange has said that it has restarted, and its turns know it.
 fn has_restarted(
     line: &mut Line,
-    items: &mut [Item],
+    items: &mut [ExchangeItem],
     table: &mut ExchangeTable<'_>,
     (nth, which): (usize, u8),
     now: Instant,
@@ -702,7 +716,13 @@ fn has_restarted(
 }
 
 /// A frame that is no answer to the request on its way is a sign of life of its peer.
-fn signs(line: &mut Line, items: &mut [Item], table: &mut ExchangeTable<'_>, sign: Sign, now: Instant) {
+fn signs(
+    line: &mut Line,
+    items: &mut [ExchangeItem],
+    table: &mut ExchangeTable<'_>,
+    sign: Sign,
+    now: Instant,
+) {
     let nth = match (sign, line.flight()) {
         (Sign::Late { exchange, .. }, _) | (Sign::Unasked(Some(exchange)), _) => usize::from(exchange),
         (Sign::Ambiguous, Some(flight)) => usize::from(flight.exchange),

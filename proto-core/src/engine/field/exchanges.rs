@@ -16,7 +16,7 @@ use crate::wire::can::CanId;
 
 /// The exchanges of all ports; ports name ranges of them.
 pub(crate) struct Exchanges<'e> {
-    pub items: &'e mut VecView<Item>,
+    pub items: &'e mut VecView<ExchangeItem>,
     pub rows: &'e mut VecView<Row>,
     pub peers: &'e mut VecView<PeerState>,
     /// What masters have written, and the requests of events.
@@ -28,7 +28,7 @@ pub(crate) type Piece = [u8; 32];
 
 /// The same, of any size.
 pub(crate) struct View<'a> {
-    items: &'a mut [Item],
+    items: &'a mut [ExchangeItem],
     rows: &'a mut [Row],
     peers: &'a mut [PeerState],
     written: &'a mut [Piece],
@@ -36,7 +36,7 @@ pub(crate) struct View<'a> {
 
 /// What is asked, and what answers.
 #[derive(Debug, Clone)]
-pub(crate) struct Item {
+pub(crate) struct ExchangeItem {
     pub asks: Asks,
     pub request: Option<DeviceFormat>,
     pub reply: Option<InputFormat>,
@@ -130,13 +130,13 @@ impl Exchanges<'_> {
 
 impl View<'_> {
     /// The exchanges of a port.
-    pub(crate) fn of(&mut self, line: &Line) -> (&mut [Item], ExchangeTable<'_>) {
+    pub(crate) fn of(&mut self, line: &Line) -> (&mut [ExchangeItem], ExchangeTable<'_>) {
         let (items, table, _) = self.served(line);
         (items, table)
     }
 
     /// The same, and what masters have written on all ports.
-    pub(crate) fn served(&mut self, line: &Line) -> (&mut [Item], ExchangeTable<'_>, &mut [Piece]) {
+    pub(crate) fn served(&mut self, line: &Line) -> (&mut [ExchangeItem], ExchangeTable<'_>, &mut [Piece]) {
         let range = |span: Span| {
             let start = usize::from(span.start);
             start..start.saturating_add(usize::from(span.len))

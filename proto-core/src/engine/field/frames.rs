@@ -25,7 +25,7 @@ pub(crate) struct Accepted {
 }
 
 /// The context for applying a frame.
-pub(crate) struct Frames<'a> {
+pub(crate) struct FrameContext<'a> {
     pub mode: Mode,
     pub bindings: &'a [InputBind],
     pub reply: &'a mut ReplyCode,
@@ -35,7 +35,7 @@ pub(crate) struct Frames<'a> {
     pub commands: Option<&'a mut CommandLink>,
 }
 
-impl<'a> Frames<'a> {
+impl<'a> FrameContext<'a> {
     // The parts of a port one by one: its codec is in use meanwhile.
     #[inline(always)]
     pub(crate) fn new(
@@ -50,7 +50,7 @@ impl<'a> Frames<'a> {
     }
 }
 
-impl Frames<'_> {
+impl FrameContext<'_> {
     /// Counts a rejection, and is one.
     pub(crate) fn rejected(&mut self, why: Rejection) -> Result<(), Rejection> {
         let counters = &mut *self.counters;
@@ -97,9 +97,16 @@ impl Frames<'_> {
     }
 
     #[inline(always)]
-    fn again(&mut self) -> Frames<'_> {
+    fn again(&mut self) -> FrameContext<'_> {
         let commands = self.commands.as_deref_mut();
-        Frames::new((self.port, self.mode), self.reply, self.counters, self.bindings, self.store, commands)
+        FrameContext::new(
+            (self.port, self.mode),
+            self.reply,
+            self.counters,
+            self.bindings,
+            self.store,
+            commands,
+        )
     }
 
     /// Applies the values of a user-defined frame, all or none.

@@ -5,7 +5,7 @@
 
 use super::bindings::InputBind;
 use super::device::{DeviceFormat, better, elements, probe};
-use super::exchanges::{Asks, InputFormat, Item, OtherFormat};
+use super::exchanges::{Asks, ExchangeItem, InputFormat, OtherFormat};
 use super::line::{Flight, OwnRequest};
 use super::turns::Row;
 use crate::device::Probe;
@@ -38,7 +38,7 @@ pub(crate) struct PendingReplies<'i> {
     /// The frames of the recipe's part.
     pub formats: &'i [DeviceFormat],
     pub first_frame: u8,
-    pub items: &'i [Item],
+    pub items: &'i [ExchangeItem],
     pub rows: &'i [Row],
     pub flight: Option<Flight>,
     /// The echo of the request that comes, or may come, before its reply.
@@ -50,7 +50,7 @@ pub(crate) struct PendingReplies<'i> {
 }
 
 impl<'i> PendingReplies<'i> {
-    pub(crate) fn asked(&self) -> Option<&'i Item> {
+    pub(crate) fn asked(&self) -> Option<&'i ExchangeItem> {
         self.items.get(usize::from(self.flight?.exchange))
     }
 
@@ -70,7 +70,7 @@ impl<'i> PendingReplies<'i> {
     }
 
     /// The exchanges whose replies may still come, but for the one that is on its way.
-    fn outstanding(&self) -> impl Iterator<Item = (u8, &'i Row, &'i Item)> {
+    fn outstanding(&self) -> impl Iterator<Item = (u8, &'i Row, &'i ExchangeItem)> {
         let (own, now) = (self.flight.map(|flight| flight.exchange), self.now);
         let all = (0_u8..).zip(self.rows).zip(self.items).map(|((nth, row), item)| (nth, row, item));
         all.filter(move |(nth, row, _)| Some(*nth) != own && row.is_outstanding(now))
@@ -182,18 +182,18 @@ impl<'i> PendingReplies<'i> {
 }
 
 /// Which of its answers a frame is, in their order.
-fn place_of(item: &Item, is: &impl Fn(&DeviceFormat) -> bool) -> Option<u8> {
+fn place_of(item: &ExchangeItem, is: &impl Fn(&DeviceFormat) -> bool) -> Option<u8> {
     (0..3).find(|nth| answer_of(item, *nth).is_some_and(is))
 }
 
 /// The answers of an exchange with frames of the device's own, in the order in which they are looked for: its reply, its
 /// pending answer, its refusal.
-pub(crate) fn answers_of(item: &Item) -> impl Iterator<Item = &DeviceFormat> {
+pub(crate) fn answers_of(item: &ExchangeItem) -> impl Iterator<Item = &DeviceFormat> {
     (0..3_u8).filter_map(|nth| answer_of(item, nth))
 }
 
 #[inline(never)]
-fn answer_of(item: &Item, nth: u8) -> Option<&DeviceFormat> {
+fn answer_of(item: &ExchangeItem, nth: u8) -> Option<&DeviceFormat> {
     if !matches!(item.asks, Asks::Frame | Asks::Remote { .. }) {
         return None;
     }

@@ -5,7 +5,7 @@
 
 use super::bindings::{InputBind, forget_commands};
 use super::device::DeviceCodec;
-use super::frames::{Accepted, Frames};
+use super::frames::{Accepted, FrameContext};
 use super::line_timing::LineTiming;
 use super::sender::Sender;
 use crate::config::{Name, Span};
@@ -173,7 +173,7 @@ impl FieldPort {
             return accepted;
         };
         let (reply, counters) = (&mut self.reply, &mut self.counters);
-        let mut frames = Frames::new((self.id, self.mode), reply, counters, bindings, store, commands);
+        let mut frames = FrameContext::new((self.id, self.mode), reply, counters, bindings, store, commands);
         let mut left = bytes;
         while let Some(payload) = deframer.next_frame(layout, &mut left) {
             let verdict = frames.take(layout, payload, usize::from(self.first_frame), &mut accepted);
@@ -282,7 +282,7 @@ impl FieldPort {
             return Err(why);
         };
         let (reply, counters) = (&mut self.reply, &mut self.counters);
-        let mut frames = Frames::new((self.id, self.mode), reply, counters, bindings, store, commands);
+        let mut frames = FrameContext::new((self.id, self.mode), reply, counters, bindings, store, commands);
         let slot = usize::from(self.first_frame).saturating_add(index);
         frames.take(&frame_layout, frame.data(), slot, accepted)?;
         self.sender.frames_accepted(1, usable, &mut self.counters, now);

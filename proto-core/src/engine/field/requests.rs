@@ -6,7 +6,7 @@
 use super::bindings::{OutputBind, Outputs};
 use super::device::DeviceCodec;
 use super::events::{Event, Outcome};
-use super::exchanges::{Asks, Item, Piece};
+use super::exchanges::{Asks, ExchangeItem, Piece};
 use super::line::{ExchangeTable, Failure, Line};
 use super::sender::{DIGEST_SEED, Sender, digest};
 use super::turns::Cause;
@@ -36,7 +36,7 @@ impl Maker<'_> {
     pub(crate) fn next(
         &self,
         line: &mut Line,
-        (items, table, kept): (&mut [Item], &mut ExchangeTable<'_>, &[Piece]),
+        (items, table, kept): (&mut [ExchangeItem], &mut ExchangeTable<'_>, &[Piece]),
         counters: &mut PortCounters,
         is_busy: bool,
         out: &mut [u8],
@@ -115,7 +115,7 @@ impl Maker<'_> {
     }
 
     /// Whether a value of the request has changed, or it waited for its values.
-    fn is_wanted(&self, item: &mut Item, out: &mut [u8]) -> bool {
+    fn is_wanted(&self, item: &mut ExchangeItem, out: &mut [u8]) -> bool {
         let mut is_wanted = item.is_owed && self.make(item, out).is_some();
         item.is_owed &= !is_wanted;
         if item.on_change
@@ -128,17 +128,17 @@ impl Maker<'_> {
     }
 
     /// What a request says now, but for a counter of frames: that changes with each.
-    fn content(&self, item: &Item, out: &mut [u8]) -> Option<u64> {
+    fn content(&self, item: &ExchangeItem, out: &mut [u8]) -> Option<u64> {
         let len = self.make_counted(item, 0, out).ok()?;
         Some(digest(DIGEST_SEED, out.get(..len).unwrap_or(&[])))
     }
 
-    fn fields(&self, item: &Item) -> &[OutputBind] {
+    fn fields(&self, item: &ExchangeItem) -> &[OutputBind] {
         item.request.as_ref().map_or(&[], |format| format.bindings.of(self.bindings.binds))
     }
 
     /// The groups of the variables whose values are in the request.
-    pub(crate) fn groups_of(&self, item: &Item) -> impl Iterator<Item = GroupId> {
+    pub(crate) fn groups_of(&self, item: &ExchangeItem) -> impl Iterator<Item = GroupId> {
         self.fields(item).iter().filter_map(|field| match field.from {
             OutputBinding::Variable { var, .. } | OutputBinding::Bit { var, .. } => self.image.group(var),
             _ => None,
@@ -146,12 +146,12 @@ impl Maker<'_> {
     }
 
     /// Writes the request of an event to the front of `out`, or says why it has none.
-    pub(crate) fn make_event(&self, item: &Item, out: &mut [u8]) -> Result<usize, Outcome> {
+    pub(crate) fn make_event(&self, item: &ExchangeItem, out: &mut [u8]) -> Result<usize, Outcome> {
         self.make_counted(item, self.sender.frames_sent, out)
     }
 
     /// The same, with this number of frames before it.
-    fn make_counted(&self, item: &Item, frames_sent: u32, out: &mut [u8]) -> Result<usize, Outcome> {
+    fn make_counted(&self, item: &ExchangeItem, frames_sent: u32, out: &mut [u8]) -> Result<usize, Outcome> {
         if !self.fields(item).iter().all(|field| may_send(self.sender, self.image, field, self.now)) {
             return Err(Outcome::NoValue);
         }
@@ -159,11 +159,11 @@ impl Maker<'_> {
     }
 
     /// Writes a request to the front of `out`; `None` if a value of it is unknown or stale.
-    fn make(&self, item: &Item, out: &mut [u8]) -> Option<usize> {
+    fn make(&self, item: &ExchangeItem, out: &mut [u8]) -> Option<usize> {
         self.make_event(item, out).ok()
     }
 
-    fn encode(&self, item: &Item, frames_sent: u32, out: &mut [u8]) -> Option<usize> {
+    fn encode(&self, item: &ExchangeItem, frames_sent: u32, out: &mut [u8]) -> Option<usize> {
         let (texts, reply) = (&self.codec.texts, self.reply);
         let outgoing = Outgoing { image: self.image, bindings: self.bindings, texts, frames_sent, reply };
         match (item.asks, &item.request) {
@@ -180,13 +180,13 @@ impl Maker<'_> {
 }
 
 /// The request of an event as it was made.
-fn copy(item: &Item, kept: &[Piece], len: usize, out: &mut [u8]) {
+fn copy(item: &ExchangeItem, kept: &[Piece], len: usize, out: &mut [u8]) {
     let kept = item.pieces.of(kept).iter().flatten().take(len);
     out.iter_mut().zip(kept).for_each(|(slot, &byte)| *slot = byte);
 }
 
 /// Index and subindex of an SDO request, with its command in front.
-fn sdo_of(item: &Item, request: &[u8]) -> Option<[u8; 3]> {
+fn sdo_of(item: &ExchangeItem, request: &[u8]) -> Option<[u8; 3]> {
     let (request_id, reply_id) = (item.request.as_ref()?.id, item.reply.as_ref()?.format.id);
     let (CanId::Standard(request_id @ 0x601..=0x67F), CanId::Standard(reply_id)) = (request_id, reply_id)
     else {

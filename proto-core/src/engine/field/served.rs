@@ -6,8 +6,8 @@
 
 use super::bindings::{InputBind, Outputs};
 use super::device::DeviceCodec;
-use super::exchanges::{Asks, InputFormat, Item, Piece, View};
-use super::frames::{Accepted, Frames};
+use super::exchanges::{Asks, ExchangeItem, InputFormat, Piece, View};
+use super::frames::{Accepted, FrameContext};
 use super::port::{Codec, FieldPort, came, keep};
 use super::requests::may_send;
 use super::sender::Sender;
@@ -27,19 +27,19 @@ const MAX_DATA: usize = 256;
 
 /// The blocks of a slave.
 struct Blocks<'a> {
-    items: &'a mut [Item],
+    items: &'a mut [ExchangeItem],
     written: &'a mut [Piece],
     texts: &'a [TextBind],
     outputs: Outputs<'a>,
     sender: &'a Sender,
-    frames: Frames<'a>,
+    frames: FrameContext<'a>,
     accepted: &'a mut Accepted,
     now: Instant,
 }
 
 impl Blocks<'_> {
     /// The block of a table with this address, and the block's first address.
-    fn block_at(&self, table: Table, at: u16) -> Result<(u16, &Item), Exception> {
+    fn block_at(&self, table: Table, at: u16) -> Result<(u16, &ExchangeItem), Exception> {
         let mut found = self.items.iter().filter_map(|item| match item.asks {
             Asks::Served { table: own, address, count } if own == table => {
                 at.checked_sub(address).is_some_and(|nth| nth < count).then_some((address, item))
@@ -49,7 +49,7 @@ impl Blocks<'_> {
         found.next().ok_or(Exception::IllegalDataAddress)
     }
 
-    fn data<'o>(&self, item: &Item, out: &'o mut [u8; MAX_DATA]) -> Result<&'o [u8], Exception> {
+    fn data<'o>(&self, item: &ExchangeItem, out: &'o mut [u8; MAX_DATA]) -> Result<&'o [u8], Exception> {
         let Some(format) = &item.request else { return self.kept(item, out) };
         let fields = format.bindings.of(self.outputs.binds);
         let image = &self.frames.store.image;
@@ -63,7 +63,7 @@ impl Blocks<'_> {
     }
 
     /// What a master has written.
-    fn kept<'o>(&self, item: &Item, out: &'o mut [u8; MAX_DATA]) -> Result<&'o [u8], Exception> {
+    fn kept<'o>(&self, item: &ExchangeItem, out: &'o mut [u8; MAX_DATA]) -> Result<&'o [u8], Exception> {
         let block = item.reply.as_ref().filter(|_| item.is_written).ok_or(Exception::DeviceFailure)?;
         let kept = item.pieces.of(self.written).iter().flatten();
         out.iter_mut().zip(kept).for_each(|(slot, &byte)| *slot = byte);
@@ -120,7 +120,8 @@ impl Blocks<'_> {
     fn write(&mut self, table: Table, address: u16, count: u16, data: &[u8]) -> Result<(), Exception> {
         let is_it = |asks: Asks| matches!(asks, Asks::Served { table: own, address: at, count: len } if (own, at, len) == (table, address, count));
         let item = self.items.iter_mut().find(|item| item.reply.is_some() && is_it(item.asks));
-        let Some(Item { reply: Some(InputFormat { format, slot }), pieces, is_written, .. }) = item else {
+        let Some(ExchangeItem { reply: Some(InputFormat { format, slot }), pieces, is_written, .. }) = item
+        else {
             return Err(Exception::IllegalDataAddress);
         };
         self.frames
@@ -200,8 +201,14 @@ impl FieldPort {
             return accepted;
         };
         let (items, table, written) = view.served(line);
-        let frames =
-            Frames::new((self.id, self.mode), &mut self.reply, &mut self.counters, inputs, store, commands);
+        let frames = FrameContext::new(
+            (self.id, self.mode),
+            &mut self.reply,
+            &mut self.counters,
+            inputs,
+            store,
+            commands,
+        );
         let sender = &self.sender;
         let mut blocks =
             Blocks { items, written, texts, outputs, sender, frames, accepted: &mut accepted, now };

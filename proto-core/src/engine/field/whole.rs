@@ -8,7 +8,7 @@ use heapless::Vec;
 
 use super::bindings::{InputBind, OutputBind, Outputs, number_of};
 use super::device::{DeviceCodec, DeviceFormat, elements};
-use super::frames::{Accepted, Frames};
+use super::frames::{Accepted, FrameContext};
 use super::port::{Codec, FieldPort, came, keep_why};
 use crate::config::{ConfigView, FieldSpec, Span, Words};
 use crate::device::{ByteOrder, Cutter, Escape, FrameLayout, Framer, Ignored, Piece, Probe};
@@ -186,7 +186,7 @@ fn texts_in(
     })
 }
 
-impl Frames<'_> {
+impl FrameContext<'_> {
     /// The texts of an input frame, each with its place among the frame's fields, and the text if there is room for it.
     pub(crate) fn texts<'t>(
         &self,
@@ -324,7 +324,7 @@ impl FieldPort {
         let formats = formats.get(..usize::from(*inputs)).unwrap_or(&[]);
         let tail = formats.first().map_or(&[][..], |format| format.layout.tail());
         let (reply, counters) = (&mut self.reply, &mut self.counters);
-        let mut frames = Frames::new((self.id, self.mode), reply, counters, bindings, store, commands);
+        let mut frames = FrameContext::new((self.id, self.mode), reply, counters, bindings, store, commands);
         let mut left = core::mem::take(rest);
         if !bytes.is_empty() {
             *heard = now;

@@ -10,7 +10,7 @@ use crate::engine::dispatch::EngineView;
 use crate::engine::field::bindings::{InputBind, InputTo};
 use crate::engine::field::device::DeviceFormat;
 use crate::engine::field::events::{Event, ReportedOutcome, Trigger};
-use crate::engine::field::exchanges::{Asks, InputFormat, Item, OtherFormat, Piece, RestartSign};
+use crate::engine::field::exchanges::{Asks, ExchangeItem, InputFormat, OtherFormat, Piece, RestartSign};
 use crate::engine::field::line::{Line, PeerCounters, PeerState, Times};
 use crate::engine::field::modbus_tcp::Transactions;
 use crate::engine::field::turns::{Row, RowKind, RowTimes, Turn};
@@ -141,8 +141,8 @@ impl Formats<'_> {
     }
 
     #[inline(never)]
-    fn item(&mut self, exchange: &Exchange) -> Result<Item, BuildError> {
-        let mut item = Item {
+    fn item(&mut self, exchange: &Exchange) -> Result<ExchangeItem, BuildError> {
+        let mut item = ExchangeItem {
             asks: Asks::Nothing,
             request: None,
             reply: None,
