@@ -19,7 +19,7 @@ use proto_core::wire::scalar::Scalar;
 use super::commands::FileCommand;
 use super::document::{At, SourceTree};
 use super::lines::{key_name, read_bitrate, read_cycle, read_line, read_rtu_line};
-use super::model::{FileField, FileInput, FileRecipe, Flavour, RecipeKind};
+use super::model::{FileField, FileInput, FileRecipe, Flavour};
 use super::names::meant_variable;
 use super::network::{self, check_ipv4};
 use super::reader::{Result, Spot, TableReader, TableValue};
@@ -27,9 +27,10 @@ use super::recipes;
 use super::sources;
 use crate::keys;
 use crate::keys::gateway::{
-    ABSENT, COMMAND, ECHO, ECHOES, LINK_UDP, MODBUS, REFRESH, SAFE_AT_START, STALE_AFTER, STATE, TIMEOUT,
-    UDP2011,
+    ABSENT, BUSES, BusKind, COMMAND, ECHO, ECHOES, LINK_UDP, MODBUS, REFRESH, SAFE_AT_START, STALE_AFTER,
+    STATE, TIMEOUT, UDP2011,
 };
+use crate::keys::recipe::RecipeKind;
 
 /// Reads the whole file and checks it.
 pub(super) fn read(document: &SourceTree) -> Result<Box<GatewayConfig>> {
@@ -50,35 +51,7 @@ pub(super) fn read(document: &SourceTree) -> Result<Box<GatewayConfig>> {
     builder.finish()
 }
 
-/// What a port of a gateway is.
-#[derive(Clone, Copy, PartialEq, Eq)]
-pub(crate) enum BusKind {
-    Rs485,
-    ModbusMaster,
-    ModbusSlave,
-    ModbusTcp,
-    Can,
-    TcpListen,
-    UdpListen,
-}
-
-/// The words of `bus`.
-pub(crate) const BUSES: [(&str, BusKind); 7] = [
-    ("rs485", BusKind::Rs485),
-    ("modbus-rtu", BusKind::ModbusMaster),
-    ("modbus-rtu-slave", BusKind::ModbusSlave),
-    ("modbus-tcp", BusKind::ModbusTcp),
-    ("can", BusKind::Can),
-    ("tcp-listen", BusKind::TcpListen),
-    ("udp-listen", BusKind::UdpListen),
-];
-
 impl BusKind {
-    /// As files have it.
-    fn name(self) -> &'static str {
-        BUSES.iter().find(|(_, bus)| *bus == self).map_or("", |(name, _)| name)
-    }
-
     /// A recipe of Modbus and its line go together.
     fn check_modbus(self, recipe: &FileRecipe) -> std::result::Result<(), String> {
         let wanted = match self {

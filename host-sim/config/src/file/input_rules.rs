@@ -13,12 +13,7 @@ use super::model::{FileInput, WrittenField};
 use super::names::meant_variable;
 use super::reader::{Result, Spot, TableReader, TableValue};
 use super::sendable::{add_entry, read_limits};
-use crate::keys::field::{AS, POINT, RESTARTED};
-
-/// The words of `as`.
-pub(crate) const AS_WORDS: [(&str, InputRule); 1] = [("int16", InputRule::Int16)];
-/// The words of `point`.
-pub(crate) const POINTS: [(&str, Option<InputRule>); 2] = [(".", None), (",", Some(InputRule::Comma))];
+use crate::keys::field::{AS, AS_WORDS, POINT, POINTS, RESTARTED};
 
 /// All of these keys.
 pub(super) const KEYS: [&str; 8] = ["as", "min", "max", "outside", "map", "no_value", "valid_to", "point"];

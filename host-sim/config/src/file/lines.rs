@@ -1,14 +1,10 @@
 //! The keys that ports have in both kinds of files.
 
-use proto_core::config::{ConfigErrorKind, Parity, PortKey, Rs485, check_bitrate, check_cycle};
+use proto_core::config::{ConfigErrorKind, PortKey, Rs485, check_bitrate, check_cycle};
 use proto_core::time::Duration;
 
 use super::reader::{Result, TableReader};
-use crate::keys::gateway::{BAUD, BITRATE, CYCLE, IDLE_GAP, PARITY, STOP_BITS, TURNAROUND};
-
-/// The words of `parity`.
-pub(crate) const PARITIES: [(&str, Parity); 3] =
-    [("none", Parity::None), ("even", Parity::Even), ("odd", Parity::Odd)];
+use crate::keys::gateway::{BAUD, BITRATE, CYCLE, IDLE_GAP, PARITIES, PARITY, STOP_BITS, TURNAROUND};
 
 /// The settings of a serial line, within their ranges.
 pub(super) fn read_line(port: &TableReader<'_>) -> Result<Rs485> {

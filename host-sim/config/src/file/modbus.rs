@@ -16,50 +16,14 @@ use super::exchanges;
 use super::model::{AskTiming, FileExchange, FileField, FileFrame, FilePart};
 use super::reader::{Result, TableReader, TableValue};
 use crate::device::ExchangeKind;
+use crate::keys::exchange::{FUNCTIONS, Function, TABLES};
 use crate::keys::{self, exchange};
-
-/// A function that reads or writes one table.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Function {
-    ReadCoils,
-    ReadDiscreteInputs,
-    ReadHoldingRegisters,
-    ReadInputRegisters,
-    WriteCoil,
-    WriteRegister,
-    WriteCoils,
-    WriteRegisters,
-    ReadWriteRegisters,
-    MaskWriteRegister,
-}
-
-/// The names, the numbers and the functions of `function`.
-pub(crate) const FUNCTIONS: [(&str, i64, Function); 10] = [
-    ("read-coils", 1, Function::ReadCoils),
-    ("read-discrete-inputs", 2, Function::ReadDiscreteInputs),
-    ("read-holding-registers", 3, Function::ReadHoldingRegisters),
-    ("read-input-registers", 4, Function::ReadInputRegisters),
-    ("write-coil", 5, Function::WriteCoil),
-    ("write-register", 6, Function::WriteRegister),
-    ("write-coils", 15, Function::WriteCoils),
-    ("write-registers", 16, Function::WriteRegisters),
-    ("mask-write-register", 22, Function::MaskWriteRegister),
-    ("read-write-registers", 23, Function::ReadWriteRegisters),
-];
 
 /// The name of a function of Modbus, such as `read-coils` for 1.
 pub fn function_name(operation: &Operation) -> &'static str {
     let code = i64::from(operation.function());
     FUNCTIONS.iter().find(|(_, known, _)| *known == code).map_or("", |(name, ..)| name)
 }
-
-/// The words of `table`.
-pub(crate) const TABLES: [(&str, Table); 4] = [
-    ("coils", Table::Coils),
-    ("discrete-inputs", Table::DiscreteInputs),
-    ("holding-registers", Table::HoldingRegisters),
-    ("input-registers", Table::InputRegisters),
-];
 
 /// The exchanges of a master.
 pub(super) fn read_master(recipe: &TableReader<'_>) -> Result<Vec<FileExchange>> {

@@ -1,9 +1,10 @@
 //! `[[recipe.exchange]]` and `[[recipe.block]]`.
 
+use proto_core::modbus::rtu::Table;
+
 use super::device::WORD_ORDER_OF_REGISTERS;
 use super::frame::{EXTENDED, HEAD, ID, INPUT_FIELDS, OF_FRAME, OUTPUT_FIELDS, TAIL};
 use super::{Case, HOUR_MS, Key, KeyTable, Limits, Need, Shape, TextKind, When, field, words};
-use crate::file::modbus::{FUNCTIONS, TABLES};
 
 /// The device that is asked.
 pub const PEER: Key = Key::integer("peer", 0, 255).or(0).is(
@@ -176,6 +177,34 @@ pub const SLAVE: Key = Key::integer("slave", 0, 255)
     .required()
     .tells("1..=247; 0 writes to all slaves, and nobody answers. After it nothing is sent for 100 ms. Over Modbus TCP the unit \
      id, 1..=255");
+/// A function that reads or writes one table.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Function {
+    ReadCoils,
+    ReadDiscreteInputs,
+    ReadHoldingRegisters,
+    ReadInputRegisters,
+    WriteCoil,
+    WriteRegister,
+    WriteCoils,
+    WriteRegisters,
+    ReadWriteRegisters,
+    MaskWriteRegister,
+}
+
+/// The names, the numbers and the functions of `function`.
+pub(crate) const FUNCTIONS: [(&str, i64, Function); 10] = [
+    ("read-coils", 1, Function::ReadCoils),
+    ("read-discrete-inputs", 2, Function::ReadDiscreteInputs),
+    ("read-holding-registers", 3, Function::ReadHoldingRegisters),
+    ("read-input-registers", 4, Function::ReadInputRegisters),
+    ("write-coil", 5, Function::WriteCoil),
+    ("write-register", 6, Function::WriteRegister),
+    ("write-coils", 15, Function::WriteCoils),
+    ("write-registers", 16, Function::WriteRegisters),
+    ("mask-write-register", 22, Function::MaskWriteRegister),
+    ("read-write-registers", 23, Function::ReadWriteRegisters),
+];
 /// What is asked of it.
 pub const FUNCTION: Key = Key::new(
     "function",
@@ -237,6 +266,13 @@ pub const OF_MODBUS: KeyTable =
         },
     ]);
 
+/// The words of `table`.
+pub(crate) const TABLES: [(&str, Table); 4] = [
+    ("coils", Table::Coils),
+    ("discrete-inputs", Table::DiscreteInputs),
+    ("holding-registers", Table::HoldingRegisters),
+    ("input-registers", Table::InputRegisters),
+];
 /// What a block holds.
 pub const TABLE: Key = Key::words("table", words!(TABLES)).required();
 pub(crate) const BLOCK_FIELDS: Key = block_fields(&Shape::Table(&field::IN_BLOCK));
