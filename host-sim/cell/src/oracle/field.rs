@@ -1,6 +1,8 @@
 //! The frames in the bytes that a field port received, and their values: a plain implementation of
 //! proto-core/docs/wire/recipes.md sections 4, 6 and 7.
 
+mod cut;
+
 use std::collections::BTreeMap;
 use std::ops::Range;
 
@@ -12,10 +14,11 @@ use proto_core::time::Instant;
 use proto_core::wire::can::CanFrame;
 use proto_core::wire::scalar::{Scalar, ScalarType};
 
-use super::bits::Coils;
 use super::device::{self, DeviceSpec, Look, Read, Seen};
-use super::spec::{Frame, PortSpec, Raw};
-use super::varying::{self, CutWatch};
+use super::frame::{Frame, Raw, written};
+use super::spec::PortSpec;
+use super::varying;
+use cut::CutWatch;
 
 /// Whether a frame is accepted.
 #[derive(Debug, Clone, PartialEq)]
@@ -60,6 +63,14 @@ pub(super) struct Accepted {
     pub without: Box<Without>,
     /// When it was asked for first, if an earlier request had no reply in time: its values may be as old as that.
     pub asked: Option<Instant>,
+}
+
+/// Bits of one byte.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Coils {
+    pub var: SysVar,
+    pub mask: u8,
+    pub on: u8,
 }
 
 /// Why a field of a device's frame is rejected, or for a counter the frame.
@@ -246,7 +257,7 @@ impl LineWatch {
     fn cut_device(&mut self, frame: &Frame) -> Vec<Verdict> {
         let mut found = Vec::new();
         while !self.held.is_empty() {
-            match device::look(frame, &self.held) {
+            match varying::look(frame, &self.held) {
                 Look::Begins { .. } => break,
                 Look::No => self.drop_one(),
                 Look::Wrong(len) => {
@@ -472,7 +483,7 @@ fn judge_device(frame: &Frame, nth: usize, whole: &[u8], counts: &Counts) -> Ver
         let FieldSpec::TextInput { to, length_to, count_to, .. } = *field else { continue };
         let registers = to.map(|words| varying::registers(words, text));
         if let Some(None) = registers {
-            accepted.without.vars.extend(super::spec::written(field));
+            accepted.without.vars.extend(written(field));
             accepted.without.reject(Unfit::OutOfRange);
             continue;
         }

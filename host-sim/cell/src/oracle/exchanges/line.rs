@@ -9,11 +9,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use proto_core::config::Echo;
 use proto_core::time::{Duration, Instant};
 
-use super::frames::Seen;
-use super::spec::{ExchangesSpec, Kind, RowSpec};
 use crate::oracle::Invariant;
 use crate::oracle::invariant::Wrong;
 use crate::oracle::spec::PortSpec;
+use crate::oracle::spec::exchanges::{ExchangesSpec, Kind, RowSpec};
+use crate::oracle::spec::frames::Seen;
 
 /// The model of one line.
 #[derive(Debug, Clone, Default)]
