@@ -121,60 +121,9 @@ impl Driver {
         }
         let id = input.u8();
         let (port, link) = (PortId(id % 9), LinkId(id % LINKS as u8));
-        let p = usize::from(port.0);
-        let l = usize::from(link.0);
         match op % 16 {
-            1 => {
-                self.ports[p].up = true;
-                self.said[p].awaits = None;
-                self.handle(Input::PortUp { port });
-            }
-            2 => {
-                self.ports[p] = Port::default();
-                self.said[p].awaits = None;
-                self.handle(Input::PortDown { port });
-            }
-            3 if !self.honest || self.ports[p].sending > 0 => {
-                self.ports[p].sending = 0;
-                self.reply_may_come(p);
-                self.handle(Input::PortSent { port });
-            }
-            4 => {
-                let state = [BusState::Active, BusState::Warning, BusState::Passive, BusState::BusOff]
-                    [usize::from(op >> 6)];
-                if state == BusState::BusOff {
-                    // What was handed over is lost with it.
-                    self.ports[p].sending = 0;
-                    self.said[p].awaits = None;
-                }
-                self.handle(Input::PortBus { port, state });
-            }
-            5 if !self.honest || self.links[l].opening => {
-                self.links[l].opening = false;
-                self.links[l].up = true;
-                self.handle(Input::LinkUp { link });
-            }
-            6 if !self.honest || self.links[l].up && !self.links[l].datagram => {
-                let left = match pass {
-                    0..8 => 0,
-                    8 if !self.honest => u32::MAX,
-                    _ => self.links[l].unacknowledged / 8 * (pass as u32 - 7),
-                };
-                self.links[l].unacknowledged = left;
-                self.handle(Input::LinkAcked { link, left });
-            }
-            7 if !self.honest || self.links[l].opening || self.links[l].up => {
-                self.links[l] = Link { datagram: self.links[l].datagram, ..Link::default() };
-                self.closed(link);
-                self.handle(Input::LinkDown { link });
-            }
-            8 if !self.honest || self.links[l].sending => {
-                self.links[l].sending = false;
-                if let Some(nth) = self.device_behind(link) {
-                    self.reply_may_come(nth);
-                }
-                self.handle(Input::LinkSent { link });
-            }
+            1..=4 => self.port_event(port, op),
+            5..=8 => self.link_event(link, op),
             9 | 10 => self.field_frame(port, input, op),
             11 => {
                 let bytes = input.take(pass as usize + 1).to_vec();
@@ -206,6 +155,73 @@ impl Driver {
                 let mut answer = vec![0, id, 0, 0, 0, len + 3, 1, function, len];
                 answer.resize(9 + usize::from(len), op);
                 self.link_bytes(LinkId::MODBUS, &answer);
+            }
+            _ => self.handle(Input::Tick),
+        }
+    }
+
+    /// Something happens to a port.
+    fn port_event(&mut self, port: PortId, op: u8) {
+        let p = usize::from(port.0);
+        match op % 16 {
+            1 => {
+                self.ports[p].up = true;
+                self.said[p].awaits = None;
+                self.handle(Input::PortUp { port });
+            }
+            2 => {
+                self.ports[p] = Port::default();
+                self.said[p].awaits = None;
+                self.handle(Input::PortDown { port });
+            }
+            3 if !self.honest || self.ports[p].sending > 0 => {
+                self.ports[p].sending = 0;
+                self.reply_may_come(p);
+                self.handle(Input::PortSent { port });
+            }
+            4 => {
+                let state = [BusState::Active, BusState::Warning, BusState::Passive, BusState::BusOff]
+                    [usize::from(op >> 6)];
+                if state == BusState::BusOff {
+                    // What was handed over is lost with it.
+                    self.ports[p].sending = 0;
+                    self.said[p].awaits = None;
+                }
+                self.handle(Input::PortBus { port, state });
+            }
+            _ => self.handle(Input::Tick),
+        }
+    }
+
+    /// Something happens to a link.
+    fn link_event(&mut self, link: LinkId, op: u8) {
+        let (l, pass) = (usize::from(link.0), op >> 4);
+        match op % 16 {
+            5 if !self.honest || self.links[l].opening => {
+                self.links[l].opening = false;
+                self.links[l].up = true;
+                self.handle(Input::LinkUp { link });
+            }
+            6 if !self.honest || self.links[l].up && !self.links[l].datagram => {
+                let left = match pass {
+                    0..8 => 0,
+                    8 if !self.honest => u32::MAX,
+                    _ => self.links[l].unacknowledged / 8 * (u32::from(pass) - 7),
+                };
+                self.links[l].unacknowledged = left;
+                self.handle(Input::LinkAcked { link, left });
+            }
+            7 if !self.honest || self.links[l].opening || self.links[l].up => {
+                self.links[l] = Link { datagram: self.links[l].datagram, ..Link::default() };
+                self.closed(link);
+                self.handle(Input::LinkDown { link });
+            }
+            8 if !self.honest || self.links[l].sending => {
+                self.links[l].sending = false;
+                if let Some(nth) = self.device_behind(link) {
+                    self.reply_may_come(nth);
+                }
+                self.handle(Input::LinkSent { link });
             }
             _ => self.handle(Input::Tick),
         }

@@ -149,40 +149,8 @@ impl Entry {
 impl Spec {
     pub(super) fn new(config: &GatewayConfig) -> Self {
         let ports: Vec<PortSpec> = config.ports.iter().map(|port| port_spec(config, port)).collect();
-        let mut links: Vec<LinkSpec> = Vec::new();
-        if let Some(own) = config.controller.recipe_link {
-            let recipe = &config.recipes[usize::from(own.recipe)];
-            links.push(link_spec(config, LinkId::RECIPE_UDP, recipe, true));
-        }
-        for (nth, port) in config.ports.iter().enumerate() {
-            let recipe = &config.recipes[usize::from(port.recipe)];
-            let id = LinkId::of_port(PortId(nth as u8));
-            match port.bus {
-                Bus::TcpListen { .. } => links.push(link_spec(config, id, recipe, false)),
-                Bus::UdpListen { .. } => links.push(link_spec(config, id, recipe, true)),
-                Bus::Rs485(_) | Bus::Can { .. } | Bus::ModbusTcp { .. } => {}
-            }
-        }
-        let mut owned = [None; COUNT];
-        for (nth, port) in ports.iter().enumerate().filter(|(_, port)| port.is_field) {
-            for (frame, part) in port.inputs.iter().enumerate() {
-                for &var in &part.written {
-                    let carries = |link: &&LinkSpec| link.input.as_ref().is_some_and(|up| up.has(var));
-                    let way = links.iter().find(carries).map_or(LinkId::MODBUS, |link| link.id);
-                    let safe = config.ports[nth].on_timeout.of(&config.safe_values);
-                    let safe = safe.iter().find(|safe| safe.var == var).map(|safe| {
-                        let mut raw = Raw::default();
-                        safe.value.encode(&mut raw);
-                        raw
-                    });
-                    let shows_validity = |field: &FieldSpec| {
-                        *field == FieldSpec::InputRule(InputRule::ValidTo { var, bit: None })
-                    };
-                    let safe = safe.or_else(|| part.fields.iter().any(shows_validity).then(Raw::default));
-                    owned[var.ordinal()] = Some(Owned { port: nth, frame, way, safe });
-                }
-            }
-        }
+        let mut links = links(config);
+        let owned = owners(config, &ports, &links);
         let mut read_back = [false; COUNT];
         for link in &mut links {
             if !link.is_datagram {
@@ -226,15 +194,7 @@ impl Spec {
         let is_safe = |var: &SysVar| owned[var.ordinal()].is_some_and(|owned: Owned| owned.safe.is_some());
         let safe_vars = SysVar::all().filter(is_safe).collect();
         let has_triggers = ports.iter().any(|port| matches!(port.send, SendOn::Rising { .. }));
-        let brings = |link: &LinkSpec, var| link.output.as_ref().is_some_and(|down| down.shows(var));
-        let mut witness = [None; COUNT];
-        for nth in 1..=3 {
-            let both = [format!("DigitalOutputCommand[{nth}]"), format!("DigitalSignalStatus[{}]", nth + 3)];
-            let [Ok(input), Ok(output)] = both.map(|name| SysVar::parse(&name)) else { continue };
-            let is_there =
-                origin[output.ordinal()].is_some() || links.iter().any(|link| brings(link, output));
-            witness[input.ordinal()] = is_there.then_some(output);
-        }
+        let witness = witnesses(&links, &origin);
         Self {
             shares: shares(config, &ports),
             ports,
@@ -349,6 +309,62 @@ fn port_spec(config: &GatewayConfig, port: &proto_core::config::Port) -> PortSpe
         exchanges,
         served,
     }
+}
+
+/// The recipe links, that of the UDP server first.
+fn links(config: &GatewayConfig) -> Vec<LinkSpec> {
+    let mut links: Vec<LinkSpec> = Vec::new();
+    if let Some(own) = config.controller.recipe_link {
+        let recipe = &config.recipes[usize::from(own.recipe)];
+        links.push(link_spec(config, LinkId::RECIPE_UDP, recipe, true));
+    }
+    for (nth, port) in config.ports.iter().enumerate() {
+        let recipe = &config.recipes[usize::from(port.recipe)];
+        let id = LinkId::of_port(PortId(nth as u8));
+        match port.bus {
+            Bus::TcpListen { .. } => links.push(link_spec(config, id, recipe, false)),
+            Bus::UdpListen { .. } => links.push(link_spec(config, id, recipe, true)),
+            Bus::Rs485(_) | Bus::Can { .. } | Bus::ModbusTcp { .. } => {}
+        }
+    }
+    links
+}
+
+/// The owners of variables.
+fn owners(config: &GatewayConfig, ports: &[PortSpec], links: &[LinkSpec]) -> [Option<Owned>; COUNT] {
+    let mut owned = [None; COUNT];
+    for (nth, port) in ports.iter().enumerate().filter(|(_, port)| port.is_field) {
+        for (frame, part) in port.inputs.iter().enumerate() {
+            for &var in &part.written {
+                let carries = |link: &&LinkSpec| link.input.as_ref().is_some_and(|up| up.has(var));
+                let way = links.iter().find(carries).map_or(LinkId::MODBUS, |link| link.id);
+                let safe = config.ports[nth].on_timeout.of(&config.safe_values);
+                let safe = safe.iter().find(|safe| safe.var == var).map(|safe| {
+                    let mut raw = Raw::default();
+                    safe.value.encode(&mut raw);
+                    raw
+                });
+                let shows_validity =
+                    |field: &FieldSpec| *field == FieldSpec::InputRule(InputRule::ValidTo { var, bit: None });
+                let safe = safe.or_else(|| part.fields.iter().any(shows_validity).then(Raw::default));
+                owned[var.ordinal()] = Some(Owned { port: nth, frame, way, safe });
+            }
+        }
+    }
+    owned
+}
+
+/// The outputs that show an input's value at the controller.
+fn witnesses(links: &[LinkSpec], origin: &[Option<Origin>; COUNT]) -> [Option<SysVar>; COUNT] {
+    let brings = |link: &LinkSpec, var| link.output.as_ref().is_some_and(|down| down.shows(var));
+    let mut witness = [None; COUNT];
+    for nth in 1..=3 {
+        let both = [format!("DigitalOutputCommand[{nth}]"), format!("DigitalSignalStatus[{}]", nth + 3)];
+        let [Ok(input), Ok(output)] = both.map(|name| SysVar::parse(&name)) else { continue };
+        let is_there = origin[output.ordinal()].is_some() || links.iter().any(|link| brings(link, output));
+        witness[input.ordinal()] = is_there.then_some(output);
+    }
+    witness
 }
 
 fn link_spec(config: &GatewayConfig, id: LinkId, recipe: &Recipe, is_datagram: bool) -> LinkSpec {
