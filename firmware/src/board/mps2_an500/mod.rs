@@ -21,6 +21,7 @@ use core::future::Future;
 
 use cortex_m::interrupt::InterruptNumber;
 use cortex_m::peripheral::NVIC;
+use embassy_executor::Spawner;
 use embassy_sync::waitqueue::AtomicWaker;
 use embassy_time::Duration;
 use firmware::drivers::lan9118::{Lan9118, Lan9118Error, Lan9118Registers};
@@ -31,6 +32,7 @@ use firmware::update::Site;
 use proto_core::config::Rs485;
 use recipe_update::MPS2_AN500;
 
+use super::Tasks;
 use watchdog::Watchdog;
 
 /// The numbers of the next devices to hand out.
@@ -133,15 +135,15 @@ impl StatusLed for FpgaLed {
     }
 }
 
-#[cortex_m_rt::entry]
-fn main() -> ! {
+/// Starts the board, and runs the tasks that `start` makes with it.
+pub(crate) fn run<const N: usize>(start: impl FnOnce(Spawner, Mps2An500) -> Tasks<N>) -> ! {
     super::stack::guard();
     super::stack::paint();
     console::start();
     log_output::start();
     time::start();
     executor::run(|spawner| {
-        let tasks = crate::start::start(spawner, Mps2An500 { serial: 0, can: 0 });
+        let tasks = start(spawner, Mps2An500 { serial: 0, can: 0 });
         fault_injection::start(&tasks);
     })
 }

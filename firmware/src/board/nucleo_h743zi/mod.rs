@@ -18,7 +18,7 @@ use core::future::Future;
 
 use cortex_m::peripheral::Peripherals as Core;
 use defmt_rtt as _;
-use embassy_executor::Executor;
+use embassy_executor::{Executor, Spawner};
 use embassy_stm32::{bind_interrupts, eth};
 use embassy_time::Duration;
 use firmware::fmt::DisplayText;
@@ -30,6 +30,7 @@ use proto_core::config::Rs485;
 use recipe_update::NUCLEO_H743ZI;
 use static_cell::StaticCell;
 
+use super::Tasks;
 use leds::BoardLed;
 use watchdog::Watchdog;
 
@@ -129,8 +130,11 @@ impl platform::Board for NucleoH743zi {
     }
 }
 
-#[cortex_m_rt::entry]
-fn main() -> ! {
+/// Starts the board, and runs the tasks that `start` makes with it.
+///
+/// # Panics
+/// If it was called before.
+pub(crate) fn run<const N: usize>(start: impl FnOnce(Spawner, NucleoH743zi) -> Tasks<N>) -> ! {
     super::stack::guard();
     super::stack::paint();
     clocks::errata();
@@ -169,7 +173,7 @@ fn main() -> ! {
         link: Some(leds.link),
         status: Some(leds.status),
         watchdog: Some(watchdog),
-        // SAFETY: the only call; `main` runs once.
+        // SAFETY: the only call; a second one of this function has ended in `embassy_stm32::init`.
         stores: Some(unsafe { flash::stores() }),
         // SAFETY: the only call; slots and stores do not overlap (a test of the layout).
         slots: Some(unsafe { flash::slots() }),
@@ -177,7 +181,7 @@ fn main() -> ! {
     };
     static EXECUTOR: StaticCell<Executor> = StaticCell::new();
     EXECUTOR.init(Executor::new()).run(|spawner| {
-        crate::start::start(spawner, board);
+        start(spawner, board);
     })
 }
 
