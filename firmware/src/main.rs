@@ -6,6 +6,12 @@ mod board;
 #[cfg(target_os = "none")]
 mod start;
 
+#[cfg(target_os = "none")]
+#[cortex_m_rt::entry]
+fn main() -> ! {
+    board::run(start::start)
+}
+
 #[cfg(not(target_os = "none"))]
 fn main() {
     eprintln!("This is firmware: build it with `cargo firmware` or `cargo firmware-qemu`.");

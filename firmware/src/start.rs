@@ -6,7 +6,7 @@ mod configuration;
 
 use core::pin::pin;
 
-use embassy_executor::{SpawnError, SpawnToken, Spawner};
+use embassy_executor::Spawner;
 use embassy_net::{Config, DhcpConfig, Ipv4Cidr, Runner, Stack, StackResources, StaticConfigV4};
 use embassy_net_driver::{Driver as _, HardwareAddress};
 use embassy_time::{Duration, Timer};
@@ -22,7 +22,7 @@ use firmware::tasks::led::Condition;
 use firmware::tasks::link::{Endpoint, LinkBuffers};
 use firmware::tasks::store::{self, StoreHandle};
 use firmware::tasks::time::{self, WallClock};
-use firmware::tasks::watchdog::{Pulse, TaskName};
+use firmware::tasks::watchdog::{Pulse, TaskName, TaskWatch};
 use firmware::tasks::{can, led, link, serial, watchdog};
 use firmware::update::{Site, Updates};
 use firmware::{error, info, warn};
@@ -32,7 +32,7 @@ use proto_core::engine::{LinkId, LinkKind, PortId};
 use static_cell::{ConstStaticCell, StaticCell};
 
 use crate::board::{
-    Board, BoardLed, CanDevice, Ethernet, SerialDevice, SlotArea, StoreArea, UserButton, Watchdog,
+    self, Board, BoardLed, CanDevice, Ethernet, SerialDevice, SlotArea, StoreArea, UserButton, Watchdog,
 };
 use configuration::{CannotRun, load};
 use firmware::platform::Board as _;
@@ -48,10 +48,10 @@ pub(crate) fn start(spawner: Spawner, mut board: Board) -> Tasks {
     info!("recipe gateway {}", env!("CARGO_PKG_VERSION"));
     let mut led = board.led();
     led.set(true);
-    static WATCH: StaticCell<BoardWatch> = StaticCell::new();
-    let tasks = Tasks { spawner, watch: WATCH.init_with(BoardWatch::new) };
+    static WATCH: StaticCell<TaskWatch<MAX_TASKS>> = StaticCell::new();
+    let tasks = Tasks::new(spawner, WATCH.init_with(TaskWatch::new));
     // First of all, so that the watchdog resets the board if anything later hangs.
-    spawner.spawn(feeder(tasks.watch, board.watchdog()).expect("it is spawned once"));
+    spawner.spawn(feeder(tasks.watch(), board.watchdog()).expect("it is spawned once"));
     // Both are all zeros: placed in .bss, not built on the stack.
     static GATEWAY: ConstStaticCell<Gateway> = ConstStaticCell::new(Gateway::idle());
     static OVERLAY: ConstStaticCell<Overlay> = ConstStaticCell::new(Overlay::ZEROED);
@@ -170,26 +170,7 @@ fn start_store_task(
     Some(store)
 }
 
-/// Starts tasks and registers them with the watchdog.
-#[derive(Clone, Copy)]
-pub(crate) struct Tasks {
-    spawner: Spawner,
-    watch: &'static BoardWatch,
-}
-
-type BoardWatch = watchdog::TaskWatch<MAX_TASKS>;
-
-impl Tasks {
-    /// Starts a task with its pulse.
-    pub(crate) fn spawn<S>(
-        &self,
-        name: TaskName,
-        task: impl FnOnce(&'static Pulse) -> Result<SpawnToken<S>, SpawnError>,
-    ) {
-        let pulse = self.watch.register(name).expect("MAX_TASKS is large enough");
-        self.spawner.spawn(task(pulse).expect("its pool is large enough"));
-    }
-}
+type Tasks = board::Tasks<MAX_TASKS>;
 
 /// The parts of the configuration that the tasks need.
 struct Wiring {
@@ -388,7 +369,7 @@ fn network_config(own: Option<Network>, name: &str) -> Config {
 
 /// The only task without a pulse.
 #[embassy_executor::task]
-async fn feeder(watch: &'static BoardWatch, mut dog: Watchdog) -> ! {
+async fn feeder(watch: &'static TaskWatch<MAX_TASKS>, mut dog: Watchdog) -> ! {
     watchdog::run(watch, WATCHDOG_PERIOD, || dog.feed()).await
 }
 

@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use proto_core::engine::LinkId;
 use proto_core::time::Instant;
 
-use super::judge::Act;
+use super::device::Act;
 use super::network::Way;
 use super::tcp::Pipe;
 use recipe_controller::Link;

@@ -2,8 +2,6 @@
 
 use proto_core::time::{Duration, Instant};
 
-use crate::judge::Act;
-
 /// A device: `M` is `Vec<u8>` on an RS-485 line and a CAN frame on a bus.
 ///
 /// Returned messages are sent in order, each as soon as the device's previous one has left.
@@ -52,6 +50,51 @@ pub trait Server {
 
     /// What it did since the last call, in order.
     fn take_done(&mut self) -> Vec<SlaveDone>;
+}
+
+/// What a device did, as its own log has it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Act {
+    /// It received a whole request of its own: an order, or a question.
+    Heard(Option<Order>),
+    /// It executed an order with these values.
+    Did(Order, Vec<u32>),
+    /// It refused an order with a code.
+    Refused(Order, u8),
+    /// A reply left, or did not although it should.
+    Replied {
+        /// The order that it is a reply to, if it is one.
+        order: Option<Order>,
+        /// It is not the same as the request, so nobody takes it for an echo.
+        tells: bool,
+        /// It left as it should be.
+        is_whole: bool,
+        /// And it was at the gateway in time for sure.
+        in_time: bool,
+    },
+    /// Something arrived of it that is no reply to what it was asked: whether it is heard by that, nobody knows.
+    Garbled,
+    /// The value of this number is this from now on.
+    Holds(usize, u16),
+    /// It lost its power, and with it what it was told.
+    PowerOff,
+    /// It is there again.
+    PowerOn,
+}
+
+/// What a device can be ordered to do.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Order {
+    /// To move: an event.
+    Move,
+    /// The second step of a dialogue that began with [`Self::Move`].
+    Step,
+    /// To stop.
+    Stop,
+    /// What it is told at its start, and what moves it: homing, a mode.
+    Start,
+    /// A value that it keeps.
+    Keep,
 }
 
 /// What a TCP server does.

@@ -62,9 +62,9 @@ use proto_core::engine::{BuildError as EngineError, Engine, LinkId, OUTPUT_BUFFE
 use proto_core::time::{Duration, Instant};
 
 pub use can::{BusCounters, CanBus};
-pub use device::{Device, Done, PeriodicSender, Responder, Served, Server, SlaveDone};
+pub use device::{Act, Device, Done, Order, PeriodicSender, Responder, Served, Server, SlaveDone};
 pub use injector::{FaultInjector, FaultKind};
-pub use judge::{Act, Kind, OUTCOMES, Order};
+pub use judge::{Kind, OUTCOMES};
 pub use line::{Chunking, Line, LineCounters, MAX_HEARD, Wiring};
 pub use network::{Network, Way};
 pub use oracle::{Invariant, Violation};

@@ -7,9 +7,8 @@ use proto_core::time::{Duration, Instant};
 
 use super::Cell;
 use super::connection::Peer;
-use super::device::{Done, Served, Server};
+use super::device::{Act, Done, Served, Server};
 use super::due::Due;
-use super::judge::Act;
 use super::network::{ConnectPolicy, Gate, Item, Way};
 
 /// The device of a link.

@@ -3,7 +3,8 @@
 //! In: hex bytes or candump lines; or the lines that `decode` prints, which `encode` turns into the same
 //! bytes again. Out: the other form.
 
-pub(super) mod device;
+pub(super) mod codec;
+mod device;
 
 use std::collections::BTreeMap;
 use std::io::{BufRead, Write};
@@ -12,9 +13,9 @@ use proto_core::recipe::{CanReject, Deframer, StreamLayout, datagram};
 use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::Scalar;
 
-use super::codec::{CompiledPart, FrameValues, Layout, NamedField};
 use super::scale;
 use super::text::{self, CanLine, Prefix};
+use codec::{CompiledPart, FrameValues, Layout, NamedField};
 
 type CliResult = Result<(), String>;
 

@@ -4,9 +4,7 @@
 //! written, 2 if a file or an argument cannot be used (nothing was started then). A reader that closes the
 //! pipe is no failure.
 
-mod cells;
 mod check;
-mod codec;
 mod convert;
 mod ctl;
 mod doctor;
@@ -38,7 +36,7 @@ use std::process::ExitCode;
 use clap::{Args, CommandFactory, Parser, Subcommand, ValueEnum};
 use proto_core::sysvar::Direction;
 
-use codec::ExchangePart;
+use convert::codec::{CompiledPart, ExchangePart};
 use recipe_config::file;
 use recipe_runtime::out::{Out, Printed, print_stderr};
 
@@ -433,7 +431,7 @@ impl Which {
         is_exchange || self.exchange.is_some()
     }
 
-    fn part(&self) -> Result<codec::CompiledPart, String> {
+    fn part(&self) -> Result<CompiledPart, String> {
         let recipes =
             file::load_recipes(&self.file, &self.overrides.set).map_err(|error| error.to_string())?;
         let recipe = self.recipe.as_deref();
@@ -442,12 +440,12 @@ impl Which {
                 Err("an exchange has no input and output; choose one with --part: request, reply, pending, refusal"
                     .into())
             }
-            (Some(Chosen::Part(part)), None) => codec::CompiledPart::choose(&recipes, recipe, Some(part)),
-            (None, None) => codec::CompiledPart::choose(&recipes, recipe, None),
+            (Some(Chosen::Part(part)), None) => CompiledPart::choose(&recipes, recipe, Some(part)),
+            (None, None) => CompiledPart::choose(&recipes, recipe, None),
             (Some(Chosen::Exchange(part)), number) => {
-                codec::CompiledPart::choose_exchange(&recipes, recipe, number, Some(part))
+                CompiledPart::choose_exchange(&recipes, recipe, number, Some(part))
             }
-            (None, number) => codec::CompiledPart::choose_exchange(&recipes, recipe, number, None),
+            (None, number) => CompiledPart::choose_exchange(&recipes, recipe, number, None),
         };
         let mut part = part.map_err(|message: String| format!("{}: {message}", self.file.display()))?;
         part.bind(&file::load_frames(&self.file, &self.overrides.set).map_err(|error| error.to_string())?);

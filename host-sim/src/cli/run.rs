@@ -1,5 +1,7 @@
 //! `host-sim controller` and `host-sim gateway`: options, and the way from a file to a run.
 
+mod cells;
+
 use std::net::SocketAddr;
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
@@ -9,7 +11,7 @@ use std::time::Duration;
 use clap::Args;
 
 use super::record::WatchArgs;
-use super::{Overrides, cells, check, wrong};
+use super::{Overrides, check, wrong};
 use recipe_config::SimConfig;
 use recipe_controller::timeline::Timeline;
 use recipe_io::bind::Bind;
@@ -158,12 +160,7 @@ impl GatewayRun {
 }
 
 impl RunArgs {
-    /// What overrides keys of the file.
-    pub(super) fn overrides(&self) -> &[String] {
-        &self.overrides.set
-    }
-
-    pub(super) fn options(self, log: Log) -> Result<RunOptions, RunError> {
+    fn options(self, log: Log) -> Result<RunOptions, RunError> {
         let ready = self.ready.map(ReadyFile::at).transpose()?;
         let scheduling = if self.no_realtime { Scheduling::Ordinary } else { Scheduling::FifoIfAllowed };
         let key = self.console_key.as_deref().map(console::read_key).transpose()?;

@@ -14,6 +14,9 @@
 // `rgw_gateway_configure` has returned.
 #define RGW_CONFIG_SIZE 22528
 
+// Maximum number of exchanges with devices of all ports together.
+#define RGW_MAX_EXCHANGES 16
+
 // Field ports that a gateway has room for.
 #define RGW_MAX_PORTS 4
 
@@ -22,9 +25,6 @@
 
 // User-defined fields on all ports together that a gateway has room for, in each direction.
 #define RGW_MAX_FIELDS 128
-
-// Maximum number of exchanges with devices of all ports together.
-#define RGW_MAX_EXCHANGES 16
 
 // Memory for a gateway, in bytes: enough on every machine.
 #define RGW_GATEWAY_SIZE 61440

@@ -16,10 +16,13 @@ const _: () = assert!(RGW_IMAGE_VERSION == image::VERSION);
 pub const RGW_CONFIG_SIZE: usize = 22_528;
 const _: () = assert!(size_of::<Config>() <= RGW_CONFIG_SIZE);
 
+/// Maximum number of exchanges with devices of all ports together.
+pub const RGW_MAX_EXCHANGES: usize = 16;
+
 /// A configuration in the caller's memory: at most 6 ports, 6 recipes with 256 fields together, 32
 /// commands, 32 safe values and 16 exchanges.
 #[derive(Debug)]
-pub struct Config(pub(crate) GatewayConfig<6, 6, 256, 32, 32, { crate::gateway::RGW_MAX_EXCHANGES }>);
+pub struct Config(pub(crate) GatewayConfig<6, 6, 256, 32, 32, RGW_MAX_EXCHANGES>);
 
 /// The bus of a port.
 #[repr(u8)]

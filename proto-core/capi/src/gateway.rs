@@ -4,6 +4,7 @@ use core::ffi::c_void;
 
 use proto_core::engine::Engine;
 
+use crate::config::RGW_MAX_EXCHANGES;
 use crate::memory::{give, place, shared, unique};
 use crate::{Config, RGW_ABI_VERSION, Status};
 
@@ -13,9 +14,6 @@ pub const RGW_MAX_PORTS: usize = 4;
 pub const RGW_MAX_RECIPE_LINKS: usize = 2;
 /// User-defined fields on all ports together that a gateway has room for, in each direction.
 pub const RGW_MAX_FIELDS: usize = 128;
-
-/// Maximum number of exchanges with devices of all ports together.
-pub const RGW_MAX_EXCHANGES: usize = 16;
 
 /// Memory for a gateway, in bytes: enough on every machine.
 pub const RGW_GATEWAY_SIZE: usize = 61_440;

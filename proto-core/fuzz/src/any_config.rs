@@ -9,7 +9,7 @@ use proto_core::time::Duration;
 use proto_core::wire::can::CanId;
 use proto_core::wire::scalar::ScalarType;
 
-use crate::any_device;
+use crate::any_device::{self, var};
 use crate::rig::Cell;
 use crate::source::Source;
 
@@ -53,26 +53,6 @@ fn commands(cell: &mut Cell) -> proto_core::config::Span {
         (4, "pause"),
         (5, "poweroff"),
     ])
-}
-
-pub(crate) fn var(input: &mut Source<'_>, direction: Direction) -> SysVar {
-    // Those of which there are many, and those with edges, alike.
-    let groups: &[&str] = match direction {
-        Direction::Input => {
-            &["DigitalOutputCommand", "BitInputReg", "WordInputReg", "FloatInputReg", "ForceEnd", "ForceBase"]
-        }
-        Direction::Output => &[
-            "DigitalSignalStatus",
-            "RobotState",
-            "BitOutputReg",
-            "WordOutputReg",
-            "FloatOutputReg",
-            "RobotState",
-        ],
-    };
-    let group = input.one_of(groups);
-    let vars: Vec<SysVar> = SysVar::all().filter(|var| var.group() == group).collect();
-    input.one_of(&vars)
 }
 
 fn fields(

@@ -11,7 +11,6 @@ use proto_core::device::{
     Algorithm, Bits, Boundary, ByteOrder, Checksum, Counts, Encoding, Escape, Ignored, Kind, Length,
     Overflow, Text, TextWidth,
 };
-use proto_core::engine::{LinkId, PortId};
 use proto_core::modbus::rtu::{Operation, Table};
 use proto_core::recipe::model::Mode;
 use proto_core::sysvar::{Direction, SysVar};
@@ -19,13 +18,33 @@ use proto_core::time::Duration;
 use proto_core::wire::can::CanId;
 use proto_core::wire::scalar::ScalarType;
 
-use crate::any_config::{self, var};
 use crate::rig::Cell;
-use crate::source::{Random, Source};
+use crate::source::Source;
 
 /// Heads of frames, and the first bytes of requests.
 const HEADS: [&[u8]; 4] = [b"\x02", b":R", b"", b"\xAA\x55"];
 const TAILS: [&[u8]; 4] = [b"\r\n", b"", b"\x03", b"\n"];
+
+/// A variable of any kind.
+pub(crate) fn var(input: &mut Source<'_>, direction: Direction) -> SysVar {
+    // Those of which there are many, and those with edges, alike.
+    let groups: &[&str] = match direction {
+        Direction::Input => {
+            &["DigitalOutputCommand", "BitInputReg", "WordInputReg", "FloatInputReg", "ForceEnd", "ForceBase"]
+        }
+        Direction::Output => &[
+            "DigitalSignalStatus",
+            "RobotState",
+            "BitOutputReg",
+            "WordOutputReg",
+            "FloatOutputReg",
+            "RobotState",
+        ],
+    };
+    let group = input.one_of(groups);
+    let vars: Vec<SysVar> = SysVar::all().filter(|var| var.group() == group).collect();
+    input.one_of(&vars)
+}
 
 /// A recipe of a device; `None` when there is no room for it.
 pub(crate) fn recipe(cell: &mut Cell, input: &mut Source<'_>, table: Span) -> Option<()> {
@@ -492,53 +511,4 @@ pub(crate) fn line(cell: &mut Cell, input: &mut Source<'_>) {
     // These need safe values, and a part that is sent on change.
     port.safe_at_start = kind & 0x70 == 0x70;
     port.refresh = (kind & 0xF0 == 0x80).then_some(Duration::from_millis(100));
-}
-
-/// Each kind of recipe several times, with a conversation on its port.
-pub(crate) fn seeds() -> Vec<Vec<u8>> {
-    let mut random = Random::new(7);
-    let mut seeds = Vec::new();
-    // The last is a master over a connection.
-    for (which, is_tcp) in (0..8).map(|which| (which, false)).chain([(5, true)]) {
-        let mut found = 0;
-        for _ in 0..2_000 {
-            // One recipe with devices, of this kind.
-            let mut input = vec![0x80, 1, which | (random.number() as u8) << 3];
-            input.extend((0..120).map(|_| random.number() as u8));
-            let mut source = Source::new(&input);
-            let Some(config) = any_config::config(&mut source) else { continue };
-            if config.validate().is_err()
-                || config.recipes.iter().all(|recipe| recipe.exchanges.len == 0) && which > 2
-            {
-                continue;
-            }
-            if matches!(config.ports[0].bus, Bus::ModbusTcp { .. }) != is_tcp {
-                continue;
-            }
-            let used = input.len() - source.rest().len();
-            input.truncate(used);
-            // Honest, and the port is there, or its link.
-            let link = LinkId::of_port(PortId(0)).0;
-            input.extend(if is_tcp { [0, 5, link] } else { [0, 1, 0] });
-            let left = if is_tcp { [8, link] } else { [3, 0] };
-            for _ in 0..20 {
-                let [ask, answer, value] = [(); 3].map(|()| random.number() as u8);
-                input.extend(left);
-                input.extend([
-                    ask & 0xF0 | 9,
-                    0,
-                    answer,
-                    value,
-                    [0x10, 0x20, 0x40, 0x60][usize::from(ask & 3)],
-                ]);
-            }
-            seeds.push(input);
-            found += 1;
-            if found == 6 {
-                break;
-            }
-        }
-        assert!(found > 0, "no right recipe of kind {which}, over TCP: {is_tcp}");
-    }
-    seeds
 }

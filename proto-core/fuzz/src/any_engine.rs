@@ -1,15 +1,14 @@
 //! Any configuration, any inputs of a driver that keeps the contract (docs/driver.md)
 //! or does not: the engine keeps its side of it, and does no more for one input than it may.
 
-use proto_core::config::{FieldSpec, GatewayConfig, Parts, image};
+use proto_core::config::{Bus, FieldSpec, GatewayConfig, Parts, image};
 use proto_core::engine::{BusState, Engine, Handled, Input, LinkId, LinkKind, OUTPUT_BUFFER, Output, PortId};
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::can::CanFrame;
 
 use crate::any_config::config;
-use crate::any_device;
 use crate::any_frames::{self, Said};
-use crate::source::{Source, cut};
+use crate::source::{Random, Source, cut};
 
 /// Inputs of one run.
 const MOST: usize = 200;
@@ -122,60 +121,9 @@ impl Driver {
         }
         let id = input.u8();
         let (port, link) = (PortId(id % 9), LinkId(id % LINKS as u8));
-        let p = usize::from(port.0);
-        let l = usize::from(link.0);
         match op % 16 {
-            1 => {
-                self.ports[p].up = true;
-                self.said[p].awaits = None;
-                self.handle(Input::PortUp { port });
-            }
-            2 => {
-                self.ports[p] = Port::default();
-                self.said[p].awaits = None;
-                self.handle(Input::PortDown { port });
-            }
-            3 if !self.honest || self.ports[p].sending > 0 => {
-                self.ports[p].sending = 0;
-                self.reply_may_come(p);
-                self.handle(Input::PortSent { port });
-            }
-            4 => {
-                let state = [BusState::Active, BusState::Warning, BusState::Passive, BusState::BusOff]
-                    [usize::from(op >> 6)];
-                if state == BusState::BusOff {
-                    // What was handed over is lost with it.
-                    self.ports[p].sending = 0;
-                    self.said[p].awaits = None;
-                }
-                self.handle(Input::PortBus { port, state });
-            }
-            5 if !self.honest || self.links[l].opening => {
-                self.links[l].opening = false;
-                self.links[l].up = true;
-                self.handle(Input::LinkUp { link });
-            }
-            6 if !self.honest || self.links[l].up && !self.links[l].datagram => {
-                let left = match pass {
-                    0..8 => 0,
-                    8 if !self.honest => u32::MAX,
-                    _ => self.links[l].unacknowledged / 8 * (pass as u32 - 7),
-                };
-                self.links[l].unacknowledged = left;
-                self.handle(Input::LinkAcked { link, left });
-            }
-            7 if !self.honest || self.links[l].opening || self.links[l].up => {
-                self.links[l] = Link { datagram: self.links[l].datagram, ..Link::default() };
-                self.closed(link);
-                self.handle(Input::LinkDown { link });
-            }
-            8 if !self.honest || self.links[l].sending => {
-                self.links[l].sending = false;
-                if let Some(nth) = self.device_behind(link) {
-                    self.reply_may_come(nth);
-                }
-                self.handle(Input::LinkSent { link });
-            }
+            1..=4 => self.port_event(port, op),
+            5..=8 => self.link_event(link, op),
             9 | 10 => self.field_frame(port, input, op),
             11 => {
                 let bytes = input.take(pass as usize + 1).to_vec();
@@ -207,6 +155,73 @@ impl Driver {
                 let mut answer = vec![0, id, 0, 0, 0, len + 3, 1, function, len];
                 answer.resize(9 + usize::from(len), op);
                 self.link_bytes(LinkId::MODBUS, &answer);
+            }
+            _ => self.handle(Input::Tick),
+        }
+    }
+
+    /// Something happens to a port.
+    fn port_event(&mut self, port: PortId, op: u8) {
+        let p = usize::from(port.0);
+        match op % 16 {
+            1 => {
+                self.ports[p].up = true;
+                self.said[p].awaits = None;
+                self.handle(Input::PortUp { port });
+            }
+            2 => {
+                self.ports[p] = Port::default();
+                self.said[p].awaits = None;
+                self.handle(Input::PortDown { port });
+            }
+            3 if !self.honest || self.ports[p].sending > 0 => {
+                self.ports[p].sending = 0;
+                self.reply_may_come(p);
+                self.handle(Input::PortSent { port });
+            }
+            4 => {
+                let state = [BusState::Active, BusState::Warning, BusState::Passive, BusState::BusOff]
+                    [usize::from(op >> 6)];
+                if state == BusState::BusOff {
+                    // What was handed over is lost with it.
+                    self.ports[p].sending = 0;
+                    self.said[p].awaits = None;
+                }
+                self.handle(Input::PortBus { port, state });
+            }
+            _ => self.handle(Input::Tick),
+        }
+    }
+
+    /// Something happens to a link.
+    fn link_event(&mut self, link: LinkId, op: u8) {
+        let (l, pass) = (usize::from(link.0), op >> 4);
+        match op % 16 {
+            5 if !self.honest || self.links[l].opening => {
+                self.links[l].opening = false;
+                self.links[l].up = true;
+                self.handle(Input::LinkUp { link });
+            }
+            6 if !self.honest || self.links[l].up && !self.links[l].datagram => {
+                let left = match pass {
+                    0..8 => 0,
+                    8 if !self.honest => u32::MAX,
+                    _ => self.links[l].unacknowledged / 8 * (u32::from(pass) - 7),
+                };
+                self.links[l].unacknowledged = left;
+                self.handle(Input::LinkAcked { link, left });
+            }
+            7 if !self.honest || self.links[l].opening || self.links[l].up => {
+                self.links[l] = Link { datagram: self.links[l].datagram, ..Link::default() };
+                self.closed(link);
+                self.handle(Input::LinkDown { link });
+            }
+            8 if !self.honest || self.links[l].sending => {
+                self.links[l].sending = false;
+                if let Some(nth) = self.device_behind(link) {
+                    self.reply_may_come(nth);
+                }
+                self.handle(Input::LinkSent { link });
             }
             _ => self.handle(Input::Tick),
         }
@@ -506,6 +521,55 @@ pub(crate) fn seeds() -> Vec<Vec<u8>> {
     all.extend([0x80, 0, 0, 0, 1, 4, 2, 0, 3, 0, 4]);
     all.extend(life(5));
     seeds.push(all);
-    seeds.extend(any_device::seeds());
+    seeds.extend(device_seeds());
+    seeds
+}
+
+/// Each kind of recipe several times, with a conversation on its port.
+fn device_seeds() -> Vec<Vec<u8>> {
+    let mut random = Random::new(7);
+    let mut seeds = Vec::new();
+    // The last is a master over a connection.
+    for (which, is_tcp) in (0..8).map(|which| (which, false)).chain([(5, true)]) {
+        let mut found = 0;
+        for _ in 0..2_000 {
+            // One recipe with devices, of this kind.
+            let mut input = vec![0x80, 1, which | (random.number() as u8) << 3];
+            input.extend((0..120).map(|_| random.number() as u8));
+            let mut source = Source::new(&input);
+            let Some(config) = config(&mut source) else { continue };
+            if config.validate().is_err()
+                || config.recipes.iter().all(|recipe| recipe.exchanges.len == 0) && which > 2
+            {
+                continue;
+            }
+            if matches!(config.ports[0].bus, Bus::ModbusTcp { .. }) != is_tcp {
+                continue;
+            }
+            let used = input.len() - source.rest().len();
+            input.truncate(used);
+            // Honest, and the port is there, or its link.
+            let link = LinkId::of_port(PortId(0)).0;
+            input.extend(if is_tcp { [0, 5, link] } else { [0, 1, 0] });
+            let left = if is_tcp { [8, link] } else { [3, 0] };
+            for _ in 0..20 {
+                let [ask, answer, value] = [(); 3].map(|()| random.number() as u8);
+                input.extend(left);
+                input.extend([
+                    ask & 0xF0 | 9,
+                    0,
+                    answer,
+                    value,
+                    [0x10, 0x20, 0x40, 0x60][usize::from(ask & 3)],
+                ]);
+            }
+            seeds.push(input);
+            found += 1;
+            if found == 6 {
+                break;
+            }
+        }
+        assert!(found > 0, "no right recipe of kind {which}, over TCP: {is_tcp}");
+    }
     seeds
 }

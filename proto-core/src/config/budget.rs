@@ -5,9 +5,8 @@
 
 use core::fmt;
 
-use super::{
-    Bus, ConfigView, Echo, Exchange, FieldSpec, Parity, Parts, Port, Recipe, Rs485, Span, Transaction,
-};
+use super::describe::{PortName, RecipeName, one_based};
+use super::{Bus, ConfigView, Echo, Exchange, FieldSpec, Parity, Parts, Port, Rs485, Span, Transaction};
 use crate::modbus::rtu::{self, Slave, Timing};
 use crate::sysvar::{Direction, SysVar};
 use crate::time::Duration;
@@ -299,58 +298,86 @@ struct DescribedWarning<'a> {
 
 impl fmt::Display for DescribedWarning<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let recipe_name =
-            |index| self.config.recipes.get(usize::from(index)).map_or("", |recipe: &Recipe| &recipe.name);
-        let port_name = |index: u8| self.config.ports.get(usize::from(index)).map_or("", |port| &port.name);
-        match self.warning {
-            Warning::LineFull { port, percent } => write!(
-                f,
-                "port {:?}: the exchanges with a period take {percent} % of the line's time, so they are asked less \
-                 often",
-                port_name(port)
-            ),
-            Warning::AskedRarely { port, timeout, every } => write!(
-                f,
-                "port {:?}: an exchange is asked every {every}, but the timeout is {timeout}, so its values are \
-                 overdue until the next reply",
-                port_name(port)
-            ),
-            Warning::DoesNotFit { port, cycle, shortest } => {
-                let name = port_name(port);
-                write!(
-                    f,
-                    "port {name:?}: the output does not fit a cycle of {cycle}; the shortest possible is {shortest}, \
-                     so it is sent back to back and cycles are skipped"
-                )
+        let config = self.config;
+        let exchange = match self.warning {
+            Warning::LineFull { port, .. }
+            | Warning::AskedRarely { port, .. }
+            | Warning::DoesNotFit { port, .. }
+            | Warning::ForgetsBase { port, .. }
+            | Warning::ShortTimeout { port, .. }
+            | Warning::EchoUnknown { port } => {
+                PortName(Some(config), port).fmt(f)?;
+                None
             }
-            Warning::ManualAddress { recipe, exchange, number, address } => {
-                let (name, nth) = (recipe_name(recipe), u16::from(exchange).saturating_add(1));
-                let exchange = match self.config.is_slave(recipe) {
-                    true => "block",
-                    false => "exchange",
-                };
+            Warning::SlowReply { port, exchange, .. } => {
+                PortName(Some(config), port).fmt(f)?;
+                Some(("exchange", exchange))
+            }
+            Warning::StopOnEdge { recipe, .. }
+            | Warning::NeverLookedFor { recipe, .. }
+            | Warning::ReadBack { recipe, .. }
+            | Warning::Unused { recipe } => {
+                RecipeName(Some(config), recipe).fmt(f)?;
+                None
+            }
+            Warning::ManualAddress { recipe, exchange, .. }
+            | Warning::RepeatedEvent { recipe, exchange }
+            | Warning::NoStop { recipe, exchange, .. } => {
+                RecipeName(Some(config), recipe).fmt(f)?;
+                Some((if config.is_slave(recipe) { "block" } else { "exchange" }, exchange))
+            }
+        };
+        if let Some((what, nth)) = exchange {
+            write!(f, ", {what} {}", one_based(nth))?;
+        }
+        let is_clause = matches!(self.warning, Warning::ReadBack { .. } | Warning::Unused { .. });
+        f.write_str(if is_clause { " " } else { ": " })?;
+        self.fmt_text(f)
+    }
+}
+
+impl DescribedWarning<'_> {
+    /// What may not do what was intended, behind the place.
+    fn fmt_text(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.warning {
+            Warning::LineFull { percent, .. } => write!(
+                f,
+                "the exchanges with a period take {percent} % of the line's time, so they are asked less \
+                 often"
+            ),
+            Warning::AskedRarely { timeout, every, .. } => write!(
+                f,
+                "an exchange is asked every {every}, but the timeout is {timeout}, so its values are \
+                 overdue until the next reply"
+            ),
+            Warning::DoesNotFit { cycle, shortest, .. } => write!(
+                f,
+                "the output does not fit a cycle of {cycle}; the shortest possible is {shortest}, so it \
+                 is sent back to back and cycles are skipped"
+            ),
+            Warning::ManualAddress { number, address, .. } => {
                 write!(
                     f,
-                    "recipe {name:?}, {exchange} {nth}: {number} looks like the number of a manual that counts from \
-                     {}; if it is, write {address}, the address on the line",
+                    "{number} looks like the number of a manual that counts from {}; if it is, write \
+                     {address}, the address on the line",
                     u32::from(number).saturating_sub(u32::from(address))
                 )
             }
-            Warning::StopOnEdge { recipe, entry } => {
+            Warning::StopOnEdge { entry, .. } => {
                 let command = self.config.commands.get(usize::from(entry));
                 let text = command.map_or("", |command| command.text.as_str());
                 write!(
                     f,
-                    "recipe {:?}: {text:?} is given only when its bit changes, so a button that is held at the start \
-                     or after a silence stops nothing; commands = {{ level = {text:?} }} stops as long as the bit is 1",
-                    recipe_name(recipe)
+                    "{text:?} is given only when its bit changes, so a button that is held at the start or \
+                     after a silence stops nothing; commands = {{ level = {text:?} }} stops as long as the \
+                     bit is 1"
                 )
             }
-            Warning::ForgetsBase { port, timeout } => write!(
+            Warning::ForgetsBase { timeout, .. } => write!(
                 f,
-                "port {:?}: after {timeout} without a frame, the next value picks no command; for a device that \
-                 sends less often set a longer timeout_ms, for one that sends only changes base = \"keep\" as well",
-                port_name(port)
+                "after {timeout} without a frame, the next value picks no command; for a device that sends \
+                 less often set a longer timeout_ms, for one that sends only changes base = \"keep\" as \
+                 well"
             ),
             Warning::NeverLookedFor { recipe, exchange, peer } => {
                 let of = self.config.recipes.get(usize::from(recipe));
@@ -361,51 +388,39 @@ impl fmt::Display for DescribedWarning<'_> {
                 };
                 write!(
                     f,
-                    "recipe {:?}: no exchange with {device} {peer} has a period, so nobody notices that it was without \
-                     power, and what it was told is not told again; write every_ms in one of them, such as 500",
-                    recipe_name(recipe)
+                    "no exchange with {device} {peer} has a period, so nobody notices that it was without \
+                     power, and what it was told is not told again; write every_ms in one of them, such as \
+                     500"
                 )
             }
-            Warning::ShortTimeout { port, timeout, time } => write!(
+            Warning::ShortTimeout { timeout, time, .. } => write!(
                 f,
-                "port {:?}: a frame takes {time} on the line, but the timeout is {timeout}, so one lost frame or a \
-                 short pause makes the port silent; write two periods of the device or more in timeout_ms",
-                port_name(port)
+                "a frame takes {time} on the line, but the timeout is {timeout}, so one lost frame or a \
+                 short pause makes the port silent; write two periods of the device or more in timeout_ms"
             ),
-            Warning::RepeatedEvent { recipe, exchange } => write!(
-                f,
-                "recipe {:?}, exchange {}: an event is repeated if its reply is lost, so the device may carry it out \
-                 twice; retries = 0 does not repeat it",
-                recipe_name(recipe),
-                exchange.saturating_add(1)
+            Warning::RepeatedEvent { .. } => f.write_str(
+                "an event is repeated if its reply is lost, so the device may carry it out twice; retries = \
+                 0 does not repeat it",
             ),
-            Warning::NoStop { recipe, exchange, peer } => write!(
+            Warning::NoStop { peer, .. } => write!(
                 f,
-                "recipe {:?}, exchange {}: a bit triggers a write to device {peer}, and no exchange with stop = true \
-                 stops it; if it moves something, add one",
-                recipe_name(recipe),
-                exchange.saturating_add(1)
+                "a bit triggers a write to device {peer}, and no exchange with stop = true stops it; if it \
+                 moves something, add one"
             ),
-            Warning::EchoUnknown { port } => write!(
-                f,
-                "port {:?}: each reply equals its request, so nothing tells it from an echo, and no write is \
+            Warning::EchoUnknown { .. } => f.write_str(
+                "each reply equals its request, so nothing tells it from an echo, and no write is \
                  confirmed; write echo = false, or true if the adapter hears itself",
-                port_name(port)
             ),
-            Warning::SlowReply { port, exchange, time, timeout } => write!(
+            Warning::SlowReply { time, timeout, .. } => write!(
                 f,
-                "port {:?}, exchange {}: the reply takes {time} on the line, and timeout_ms is {timeout}, so it is \
-                 always too late",
-                port_name(port),
-                exchange.saturating_add(1)
+                "the reply takes {time} on the line, and timeout_ms is {timeout}, so it is always too late"
             ),
-            Warning::ReadBack { recipe, var } => write!(
+            Warning::ReadBack { var, .. } => write!(
                 f,
-                "recipe {:?} carries {var}, which no port writes: it is read back from the controller and sent on, \
-                 so a change made by somebody else can be undone for 100 ms",
-                recipe_name(recipe)
+                "carries {var}, which no port writes: it is read back from the controller and sent on, so a \
+                 change made by somebody else can be undone for 100 ms"
             ),
-            Warning::Unused { recipe } => write!(f, "recipe {:?} is not used", recipe_name(recipe)),
+            Warning::Unused { .. } => f.write_str("is not used"),
         }
     }
 }

@@ -1,257 +1,23 @@
 //! The checks that concern the exchanges of one recipe.
 
-use core::fmt;
-
+use super::check_limits::check_number_read;
 use super::device::register_bits;
-use super::error::{ConfigErrorKind as Kind, ExchangeKey as Key, Place};
+use super::error::{ConfigErrorKind as Kind, ExchangeError, ExchangeKey as Key, Place};
 use super::exchange::{Exchange, FrameSpec, Transaction};
-use super::input_rule::check_number_read;
-use super::rules::{Check, MAX_TIME, check_pool, check_time, fail};
+use super::rules::{Check, LONGEST_TRIGGER, MAX_TIME, check_pool, check_time, check_trigger, fail};
 use super::{
     Bus, ConfigView, Constants, DeviceFrame, FieldSpec, InputBinding, Parts, Port, PortHealth, Recipe, Span,
     StreamPart, has_values,
 };
 use crate::device::{Carrier, LayoutError};
-use crate::modbus::rtu::{BROADCAST, CountError, MAX_ADDRESS, MAX_SLAVES, Operation};
+use crate::modbus::rtu::{BROADCAST, MAX_ADDRESS, MAX_SLAVES, Operation};
 use crate::recipe::PartError;
 use crate::recipe::model::{MAX_CAN_IDS, Mode};
-use crate::sysvar::{Direction, SysVar};
+use crate::sysvar::Direction;
 use crate::time::Duration;
-use crate::wire::can::CanId;
 
 /// The longest pause after an exchange.
 pub const MAX_PAUSE: Duration = Duration::from_secs(10);
-/// The longest time in which an event may be sent.
-pub const LONGEST_TRIGGER: Duration = Duration::from_secs(10);
-
-/// Why an exchange is refused.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[non_exhaustive]
-pub enum ExchangeError {
-    /// The recipe is realtime.
-    NeedsUser,
-    /// Modbus master, Modbus slave and frames of a device's own are mixed in one recipe.
-    Mixed,
-    /// What tells the frames of a part apart is not their fields: replies could not be found.
-    CutParts,
-    /// A recipe of Modbus has parts.
-    PartsBesideModbus,
-    /// A frame for a line in a CAN recipe, or one with an id in a stream recipe.
-    WrongBus,
-    /// The slave's address.
-    Slave {
-        /// The address.
-        address: u8,
-    },
-    /// The address of the gateway as a slave.
-    OwnAddress {
-        /// The address.
-        address: u8,
-    },
-    /// Blocks of one slave with different addresses.
-    OtherAddress,
-    /// Registers or coils behind the last one.
-    BeyondLast {
-        /// The first of them.
-        address: u16,
-        /// How many there are.
-        count: u16,
-    },
-    /// A broadcast that reads: nobody would answer.
-    BroadcastRead,
-    /// A write to all slaves over Modbus TCP, which has no broadcast.
-    BroadcastOverTcp,
-    /// A field of coils that is not one bit.
-    NotCoils,
-    /// More slaves or other peers than one port can have.
-    TooManyPeers,
-    /// The count of registers or coils.
-    Count(CountError),
-    /// The fields do not fill their registers or coils.
-    Fields {
-        /// The bytes of the registers or coils.
-        needed: usize,
-        /// The bytes of the fields.
-        found: usize,
-    },
-    /// The fields have no fixed length.
-    Varying,
-    /// The fields are not the bits that the mask names, or are none, or all of the register.
-    Mask,
-    /// An operation that a slave does not serve.
-    NotServed,
-    /// Registers or coils that another block has.
-    Overlap,
-    /// Neither request nor reply.
-    Nothing,
-    /// A pending answer or a refusal without a request and its reply.
-    LoneRefusal,
-    /// A request that is never sent.
-    Never,
-    /// A reply that comes unasked has a time at which it is asked.
-    Unasked,
-    /// A remote request with fields.
-    RemoteFields,
-    /// A remote frame that the gateway would receive.
-    RemoteReply,
-    /// A pending answer or a refusal with commands or an alive counter.
-    RefusalValues,
-    /// A pending answer or a refusal whose frames are all taken for an answer that is looked for first.
-    Hidden,
-    /// A pending answer that may have the bytes of its request, as an echo has.
-    PendingEcho,
-    /// Nothing is asked at the start of the peer, so its restart means nothing; or there is no reply.
-    RestartedNothing,
-    /// The field that tells of a restart is none with a number in the reply.
-    RestartedField {
-        /// The field, counted from 0.
-        field: u8,
-    },
-    /// A frame with the id of another one that can come at the same time, and no constant that tells
-    /// them apart.
-    Indistinguishable {
-        /// Their id.
-        id: CanId,
-    },
-    /// More CAN ids of received frames than one port can have.
-    TooManyIds,
-    /// The time in which an event may be sent.
-    Trigger {
-        /// The time.
-        time: Duration,
-    },
-    /// A time or outcome of events of an exchange that no event asks.
-    NoEvent,
-    /// A write that stops its peer and that nothing confirms.
-    StopNeedsReply,
-    /// An exchange that follows itself, or one that the recipe does not have.
-    FollowsNothing {
-        /// The exchange that it names, counted from 0.
-        follow: u8,
-    },
-    /// An exchange that follows one without a reply.
-    FollowsUnanswered,
-    /// An exchange that follows another and has a rising bit of its own, or stops its peer.
-    FollowsAndRises,
-    /// Exchanges that follow each other in a circle.
-    FollowsCircle,
-    /// A variable that cannot tell what became of an event.
-    NotForOutcome {
-        /// The variable.
-        var: SysVar,
-    },
-}
-
-impl fmt::Display for ExchangeError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::NeedsUser => f.write_str("exchanges need mode = \"user\""),
-            Self::Mixed => {
-                f.write_str("a recipe has exchanges of one kind: Modbus master, Modbus slave, or frames")
-            }
-            Self::CutParts => f.write_str(
-                "beside exchanges a part has framing = \"fields\" and no escape; replies could not be found",
-            ),
-            Self::PartsBesideModbus => {
-                f.write_str("a recipe of Modbus has exchanges only, no input and output part")
-            }
-            Self::WrongBus => {
-                f.write_str("frames of a CAN recipe have an id, those of a stream recipe have none")
-            }
-            Self::Slave { address } => {
-                write!(
-                    f,
-                    "slave {address} is out of range; allowed: 1..={MAX_ADDRESS}, or 0 to write to all of them"
-                )
-            }
-            Self::OwnAddress { address } => {
-                write!(f, "address {address} is out of range; allowed: 1..={MAX_ADDRESS}")
-            }
-            Self::OtherAddress => f.write_str("the blocks of a slave have one address"),
-            Self::BeyondLast { address, count } => {
-                let last = u32::from(*address).saturating_add(u32::from(*count)).saturating_sub(1);
-                write!(f, "{address} to {last} are out of range; the last register or coil is 65535")
-            }
-            Self::BroadcastRead => {
-                f.write_str("slave 0 is all of them, which cannot be read; allowed: writes")
-            }
-            Self::BroadcastOverTcp => {
-                f.write_str("slave 0 is all of them, which Modbus TCP does not have; allowed: 1..=255")
-            }
-            Self::NotCoils => f.write_str("the fields of coils are one bit each; their type is Coil"),
-            Self::TooManyPeers => {
-                write!(f, "one slave or other peer too many; allowed: up to {MAX_SLAVES} on a port")
-            }
-            Self::Count(error) => error.fmt(f),
-            Self::Fields { needed, found } => {
-                write!(f, "the fields have {found} bytes, the registers or coils {needed}; pad fills them up")
-            }
-            Self::Mask => f.write_str(
-                "the fields are some bits of the register, not all; those are written with write-register",
-            ),
-            Self::Varying => f.write_str("fields in registers have a fixed length; give the text a width"),
-            Self::NotServed => {
-                f.write_str("a block has holding registers, input registers, coils or discrete inputs")
-            }
-            Self::Overlap => f.write_str("an earlier block has some of these registers or coils"),
-            Self::Nothing => f.write_str("an exchange needs a request, a reply or both"),
-            Self::LoneRefusal => f.write_str("a pending answer or a refusal answers a request that has a reply"),
-            Self::Never => f.write_str("it would never be asked; set every_ms, on or follow"),
-            Self::Unasked => f.write_str("there is no request to send; remove every_ms and on"),
-            Self::RemoteFields => f.write_str("a remote request has no fields"),
-            Self::RemoteReply => f.write_str("only a request can be remote"),
-            Self::Indistinguishable { id } => write!(
-                f,
-                "another frame that can come at the same time has id {id}, too, and nothing tells the two apart; give \
-                 both a constant at the same place, with another value"
-            ),
-            Self::RefusalValues => {
-                f.write_str("the fields of a pending answer and of a refusal have no commands and no counter")
-            }
-            Self::Hidden => f.write_str(
-                "every such frame is another answer as well, which is looked for first (reply, pending, refusal) or is \
-                 shorter; give that one a constant that this one does not have",
-            ),
-            Self::PendingEcho => f.write_str(
-                "it may have the bytes of its request, as an echo has; give it another constant",
-            ),
-            Self::RestartedNothing => f.write_str(
-                "allowed in the reply of an exchange, if one of its device has \"start\" in on, which is asked again",
-            ),
-            Self::RestartedField { field } => {
-                write!(f, "field {} of the reply is no number", u16::from(*field).saturating_add(1))
-            }
-            Self::Trigger { time } => {
-                write!(f, "{time} is out of range; allowed: above 0, at most {LONGEST_TRIGGER}")
-            }
-            Self::NoEvent => f.write_str(
-                "allowed only for an event: an exchange with a rising bit in on, or with follow, and without stop",
-            ),
-            Self::StopNeedsReply => {
-                f.write_str("a write that stops is repeated until it is confirmed; it needs a reply")
-            }
-            Self::FollowsNothing { .. } => {
-                f.write_str("an exchange follows another one of its recipe, not itself")
-            },
-            Self::FollowsUnanswered => {
-                f.write_str("the exchange that it follows has no reply, so nothing tells that it was done")
-            }
-            Self::FollowsAndRises => f.write_str(
-                "an exchange that follows another has no rising bit of its own in on, and no stop",
-            ),
-            Self::FollowsCircle => {
-                f.write_str("the exchanges follow each other in a circle, so nothing begins it; remove one follow")
-            }
-            Self::NotForOutcome { var } => {
-                write!(f, "{var} cannot tell what became of an event; allowed: WordInputReg, FloatInputReg")
-            }
-            Self::TooManyIds => {
-                write!(f, "more than {MAX_CAN_IDS} ids of received frames; a CAN port has no room for more")
-            }
-        }
-    }
-}
-
 /// The exchanges of one recipe under check.
 pub(super) struct ExchangeCheck<'a> {
     pub config: ConfigView<'a>,
@@ -304,7 +70,7 @@ impl<'a> ExchangeCheck<'a> {
                 return fail(self.at(nth, Key::Pause), kind);
             }
             if let Some((var, bit)) = exchange.when.rising {
-                super::check_recipe::check_trigger(self.at(nth, Key::Rising), var, bit)?;
+                check_trigger(self.at(nth, Key::Rising), var, bit)?;
             }
             self.check_event(nth, exchange)?;
             self.check_restarted(nth, exchange)?;

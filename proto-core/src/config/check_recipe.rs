@@ -2,11 +2,10 @@
 //! trigger.
 
 use super::check_exchange::ExchangeCheck;
+use super::check_limits::{Behind, BehindInput};
 use super::device::field_of;
 use super::error::{ConfigError, ConfigErrorKind as Kind, Place, RecipeKey};
-use super::input_rule::BehindInput;
-use super::rules::{Check, check_bit, check_new_name, check_pool, fail, is_marked, mark};
-use super::sendable::Behind;
+use super::rules::{Check, check_bit, check_new_name, check_pool, check_trigger, fail, is_marked, mark};
 use super::{
     CanFramePart, CommandEntry, ConfigView, Constants, DeviceFrame, FieldSpec, InputBinding, LinkSource,
     MAX_COMMAND_TEXT, OutputBinding, Parts, Recipe, SendOn, Span, Words, placeholders,
@@ -386,15 +385,6 @@ impl<'a> RecipeCheck<'a> {
             SendOn::Rising { var, bit } => check_trigger(place, var, bit),
         }
     }
-}
-
-/// A bit that triggers.
-pub(super) fn check_trigger(place: Place, var: SysVar, bit: u8) -> Check {
-    if !var.is_bits() {
-        return fail(place, Kind::NotBits { var });
-    }
-    let is_there = 1_u8.checked_shl(bit.into()).is_some_and(|mask| var.valid_bits() & mask != 0);
-    if is_there { Ok(()) } else { fail(place, Kind::NoSuchBit { var, bit }) }
 }
 
 /// The numbers that a field can have.

@@ -3,13 +3,15 @@
 use core::net::Ipv4Addr;
 
 pub use super::keys::{ControllerKey, ExchangeKey, NetworkKey, PortKey, RecipeKey};
-use super::{ExchangeError, LinkSource, Network, StateValueError};
+use super::{LinkSource, Network, StateValueError};
 use crate::command::ParseError;
 use crate::device::LayoutError;
+use crate::modbus::rtu::CountError;
 use crate::recipe::PartError;
 use crate::recipe::model::Mode;
 use crate::sysvar::{Direction, ParseError as VarError, SysVar, VarBit};
 use crate::time::Duration;
+use crate::wire::can::CanId;
 use crate::wire::scalar::{ScalarError, ScalarType};
 
 /// The first mistake that [`ConfigView::validate`](super::ConfigView::validate) found.
@@ -622,4 +624,122 @@ pub enum ConfigErrorKind {
     NoSafeValues,
     /// Only a recipe that is sent on change is refreshed.
     OnlyChangesRefresh,
+}
+
+/// Why an exchange is refused.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum ExchangeError {
+    /// The recipe is realtime.
+    NeedsUser,
+    /// Modbus master, Modbus slave and frames of a device's own are mixed in one recipe.
+    Mixed,
+    /// What tells the frames of a part apart is not their fields: replies could not be found.
+    CutParts,
+    /// A recipe of Modbus has parts.
+    PartsBesideModbus,
+    /// A frame for a line in a CAN recipe, or one with an id in a stream recipe.
+    WrongBus,
+    /// The slave's address.
+    Slave {
+        /// The address.
+        address: u8,
+    },
+    /// The address of the gateway as a slave.
+    OwnAddress {
+        /// The address.
+        address: u8,
+    },
+    /// Blocks of one slave with different addresses.
+    OtherAddress,
+    /// Registers or coils behind the last one.
+    BeyondLast {
+        /// The first of them.
+        address: u16,
+        /// How many there are.
+        count: u16,
+    },
+    /// A broadcast that reads: nobody would answer.
+    BroadcastRead,
+    /// A write to all slaves over Modbus TCP, which has no broadcast.
+    BroadcastOverTcp,
+    /// A field of coils that is not one bit.
+    NotCoils,
+    /// More slaves or other peers than one port can have.
+    TooManyPeers,
+    /// The count of registers or coils.
+    Count(CountError),
+    /// The fields do not fill their registers or coils.
+    Fields {
+        /// The bytes of the registers or coils.
+        needed: usize,
+        /// The bytes of the fields.
+        found: usize,
+    },
+    /// The fields have no fixed length.
+    Varying,
+    /// The fields are not the bits that the mask names, or are none, or all of the register.
+    Mask,
+    /// An operation that a slave does not serve.
+    NotServed,
+    /// Registers or coils that another block has.
+    Overlap,
+    /// Neither request nor reply.
+    Nothing,
+    /// A pending answer or a refusal without a request and its reply.
+    LoneRefusal,
+    /// A request that is never sent.
+    Never,
+    /// A reply that comes unasked has a time at which it is asked.
+    Unasked,
+    /// A remote request with fields.
+    RemoteFields,
+    /// A remote frame that the gateway would receive.
+    RemoteReply,
+    /// A pending answer or a refusal with commands or an alive counter.
+    RefusalValues,
+    /// A pending answer or a refusal whose frames are all taken for an answer that is looked for first.
+    Hidden,
+    /// A pending answer that may have the bytes of its request, as an echo has.
+    PendingEcho,
+    /// Nothing is asked at the start of the peer, so its restart means nothing; or there is no reply.
+    RestartedNothing,
+    /// The field that tells of a restart is none with a number in the reply.
+    RestartedField {
+        /// The field, counted from 0.
+        field: u8,
+    },
+    /// A frame with the id of another one that can come at the same time, and no constant that tells
+    /// them apart.
+    Indistinguishable {
+        /// Their id.
+        id: CanId,
+    },
+    /// More CAN ids of received frames than one port can have.
+    TooManyIds,
+    /// The time in which an event may be sent.
+    Trigger {
+        /// The time.
+        time: Duration,
+    },
+    /// A time or outcome of events of an exchange that no event asks.
+    NoEvent,
+    /// A write that stops its peer and that nothing confirms.
+    StopNeedsReply,
+    /// An exchange that follows itself, or one that the recipe does not have.
+    FollowsNothing {
+        /// The exchange that it names, counted from 0.
+        follow: u8,
+    },
+    /// An exchange that follows one without a reply.
+    FollowsUnanswered,
+    /// An exchange that follows another and has a rising bit of its own, or stops its peer.
+    FollowsAndRises,
+    /// Exchanges that follow each other in a circle.
+    FollowsCircle,
+    /// A variable that cannot tell what became of an event.
+    NotForOutcome {
+        /// The variable.
+        var: SysVar,
+    },
 }

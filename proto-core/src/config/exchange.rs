@@ -3,8 +3,7 @@
 //! Plain data: nothing here has been checked. A recipe has a range of the configuration's exchanges
 //! beside its parts; their frames are ranges of the same list of fields.
 
-use super::walk::Frames;
-use super::{ConfigView, Delimiter, FieldSpec, Recipe, Span};
+use super::{Delimiter, FieldSpec, Span};
 use crate::device::{Element, Encoding};
 use crate::modbus::rtu::Operation;
 use crate::sysvar::{Direction, SysVar};
@@ -309,25 +308,4 @@ impl Exchange {
 /// Whether a frame from a device has values.
 pub(crate) fn has_values(fields: &[FieldSpec]) -> bool {
     fields.iter().any(FieldSpec::has_value)
-}
-
-impl<'c> ConfigView<'c> {
-    /// The exchanges of a recipe.
-    pub fn exchanges_of(self, recipe: &Recipe) -> &'c [Exchange] {
-        recipe.exchanges.of(self.exchanges)
-    }
-
-    /// The ranges of the fields of one part of `recipe`, with the frame's number: 0 in a stream, else
-    /// that of the CAN frame, and behind these the frames of the exchanges, counted on.
-    pub(crate) fn frames_of(self, recipe: &'c Recipe, part: Direction) -> Frames<'c> {
-        let exchanges = self.exchanges_of(recipe).iter();
-        let (frames, pool) = (self.frames, self.fields);
-        let (of, others) = (None, [None; 2]);
-        Frames { parts: recipe.part_frames(part), exchanges, of, others, frames, pool, part, count: 0 }
-    }
-
-    /// Whether frames come from the device (input), or go to it (output).
-    pub(crate) fn has_frames(self, recipe: &'c Recipe, part: Direction) -> bool {
-        self.frames_of(recipe, part).next().is_some()
-    }
 }

@@ -12,6 +12,7 @@ mod advice;
 mod budget;
 mod builder;
 mod check_exchange;
+mod check_limits;
 mod check_recipe;
 mod command_text;
 mod describe;
@@ -24,8 +25,8 @@ mod fields;
 mod fitting;
 #[cfg(feature = "image")]
 pub mod image;
-mod input_rule;
 mod keys;
+mod limits;
 mod line_budget;
 mod listen;
 mod multiplexing;
@@ -34,7 +35,6 @@ mod port;
 mod recipe;
 mod rules;
 mod safe_value;
-mod sendable;
 mod source;
 mod validate;
 mod view;
@@ -42,7 +42,8 @@ mod walk;
 
 pub use budget::{PartBudget, Warning, can_frame_time};
 pub use builder::ConfigBuilder;
-pub use check_exchange::{ExchangeError, LONGEST_TRIGGER, MAX_PAUSE};
+pub use check_exchange::MAX_PAUSE;
+pub use check_limits::{check_read, check_sent};
 pub use command_text::CommandText;
 pub(crate) use command_text::{fill_in, placeholders};
 pub use device::{DeviceFrame, register_bits};
@@ -51,7 +52,8 @@ pub use draft::{
     SerialLine,
 };
 pub use error::{
-    ConfigError, ConfigErrorKind, ControllerKey, Counted, ExchangeKey, NetworkKey, Place, PortKey, RecipeKey,
+    ConfigError, ConfigErrorKind, ControllerKey, Counted, ExchangeError, ExchangeKey, NetworkKey, Place,
+    PortKey, RecipeKey,
 };
 pub(crate) use exchange::has_values;
 pub use exchange::{
@@ -62,7 +64,7 @@ pub use exchange_builder::{Coil, ExchangeBuilder, ExchangeFrame};
 pub use fields::{CanFields, Fields, InputField, OutputField, Sum, Var};
 pub use fitting::Fitting;
 pub(crate) use fitting::fitting_numbers;
-pub use input_rule::{InputRule, NO_TEXT, NoText, check_read};
+pub use limits::{InputRule, Limits, MAX_SENDABLE, MapEntry, NO_TEXT, NoText, Outside};
 pub use line_budget::ExchangeBudget;
 pub use listen::listen_address;
 pub use multiplexing::Constants;
@@ -72,9 +74,11 @@ pub use recipe::{
     CanFramePart, CommandEntry, CommandWhen, FieldSpec, InputBinding, MAX_COMMAND_TEXT, OnStale,
     OutputBinding, Parts, Recipe, SendOn, Span, StreamPart, Words,
 };
-pub use rules::{MAX_LINE_TIME, MAX_TIME, check_address, check_bit, check_bitrate, check_cycle, check_name};
+pub use rules::{
+    LONGEST_TRIGGER, MAX_LINE_TIME, MAX_TIME, check_address, check_bit, check_bitrate, check_cycle,
+    check_name,
+};
 pub use safe_value::SafeValue;
-pub use sendable::{Limits, MAX_SENDABLE, MapEntry, Outside, check_sent};
 pub use source::{LinkSource, PortHealth, PortValue, StateValue, StateValueError};
 pub(crate) use view::ConfigMut;
 pub use view::ConfigView;

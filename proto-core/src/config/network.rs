@@ -2,8 +2,6 @@
 
 use core::net::Ipv4Addr;
 
-use super::error::{ConfigErrorKind as Kind, NetworkKey};
-
 /// A static IPv4 address and its network. A host ignores it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
@@ -49,7 +47,7 @@ impl From<Option<Network>> for BoardAddress {
 
 impl Network {
     /// Whether an address is in the board's own network.
-    fn contains(&self, other: Ipv4Addr) -> bool {
+    pub(super) fn contains(&self, other: Ipv4Addr) -> bool {
         (self.address.to_bits() ^ other.to_bits()) & self.mask() == 0
     }
 
@@ -58,49 +56,9 @@ impl Network {
     }
 
     /// Whether the address can be that of a host in this network.
-    fn is_host(&self, address: Ipv4Addr) -> bool {
+    pub(super) fn is_host(&self, address: Ipv4Addr) -> bool {
         let host = address.to_bits() & !self.mask();
         is_unicast(address) && self.contains(address) && host != 0 && host != !self.mask()
-    }
-
-    /// Checks the network; `controller` is an address or a name.
-    pub(super) fn check(&self, controller: &str) -> Result<(), (NetworkKey, Kind)> {
-        if !(1..=30).contains(&self.prefix) {
-            return Err((NetworkKey::Address, Kind::Prefix { prefix: self.prefix }));
-        }
-        let network = *self;
-        if !self.is_host(self.address) {
-            return Err((NetworkKey::Address, Kind::NoHostAddress { address: self.address, network }));
-        }
-        if let Some(router) = self.router {
-            if !self.is_host(router) {
-                return Err((NetworkKey::Router, Kind::NoHostAddress { address: router, network }));
-            }
-            self.check_other(NetworkKey::Router, router)?;
-        }
-        let is_reachable = |address| self.contains(address) || self.router.is_some();
-        if let Some(dns) = self.dns {
-            if !is_unicast(dns) {
-                return Err((NetworkKey::Dns, Kind::NoHostAddress { address: dns, network }));
-            }
-            self.check_other(NetworkKey::Dns, dns)?;
-            if !is_reachable(dns) {
-                return Err((NetworkKey::Dns, Kind::NeedsRouter { address: dns, network }));
-            }
-        }
-        match controller.parse::<Ipv4Addr>() {
-            Ok(address) if !is_reachable(address) => {
-                Err((NetworkKey::Address, Kind::NeedsRouter { address, network }))
-            }
-            Err(_) if self.dns.is_none() && !controller.is_empty() => {
-                Err((NetworkKey::Address, Kind::NeedsDns))
-            }
-            _ => Ok(()),
-        }
-    }
-
-    fn check_other(&self, key: NetworkKey, address: Ipv4Addr) -> Result<(), (NetworkKey, Kind)> {
-        if address == self.address { Err((key, Kind::OwnAddress)) } else { Ok(()) }
     }
 }
 
@@ -111,7 +69,7 @@ impl core::fmt::Display for Network {
     }
 }
 
-fn is_unicast(address: Ipv4Addr) -> bool {
+pub(super) fn is_unicast(address: Ipv4Addr) -> bool {
     !(address.is_unspecified()
         || address.is_loopback()
         || address.is_multicast()

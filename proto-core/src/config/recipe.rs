@@ -3,9 +3,10 @@
 //! Plain data: nothing here has been checked. Fields and commands are ranges of the configuration's
 //! lists.
 
+use core::slice::Iter;
+
 use heapless::{String, Vec};
 
-use super::walk::{PartFrames, Variables};
 use super::{Delimiter, InputRule, Limits, LinkSource, MapEntry, Name, PortValue, StateValue};
 use crate::device::{Boundary, ByteOrder, Checksum, Encoding, Escape, Ignored, Length, Overflow, Text};
 use crate::recipe::model::{Field, MAX_CAN_IDS, Mode};
@@ -118,6 +119,22 @@ pub struct CanFramePart {
     pub id: CanId,
     /// The fields, at most 8 bytes together.
     pub fields: Span,
+}
+
+/// The field ranges of one part: one for a stream part, one for each CAN frame.
+#[derive(Debug, Clone)]
+pub(crate) struct PartFrames<'c> {
+    pub(super) stream: Option<Span>,
+    pub(super) can: Iter<'c, CanFramePart>,
+}
+
+impl Iterator for PartFrames<'_> {
+    type Item = Span;
+
+    fn next(&mut self) -> Option<Span> {
+        let can = self.can.next().map(|frame| frame.fields);
+        can.or_else(|| self.stream.take())
+    }
 }
 
 /// A range of one of the pools of [`GatewayConfig`](super::GatewayConfig).
@@ -275,6 +292,11 @@ impl FieldSpec {
         }
     }
 
+    /// Whether it only says what the field before it may send, or what becomes of its value.
+    pub const fn is_of_field_before(&self) -> bool {
+        matches!(self, Self::Limits(_) | Self::Mapped(_) | Self::InputRule(_))
+    }
+
     /// The bit that the field is bound to.
     pub const fn bit(&self) -> Option<VarBit> {
         match *self {
@@ -361,6 +383,36 @@ impl FieldSpec {
             Self::TextInput { .. } | Self::TextOutput { .. } => self.variables().any(|bound| bound == var),
             _ => self.variable() == Some(var),
         }
+    }
+}
+
+/// The variables of a field: words that follow each other, then single ones.
+#[derive(Debug, Clone)]
+pub(super) struct Variables {
+    /// Ordinals of the words that are left: the first, and the first behind them.
+    pub(super) words: (usize, usize),
+    pub(super) others: [Option<SysVar>; 2],
+}
+
+impl Variables {
+    /// None at all.
+    pub(super) const NONE: Self = Self { words: (0, 0), others: [None; 2] };
+}
+
+impl Iterator for Variables {
+    type Item = SysVar;
+
+    fn next(&mut self) -> Option<SysVar> {
+        let (next, end) = &mut self.words;
+        while next < end {
+            let word = SysVar::from_ordinal(*next);
+            *next = next.saturating_add(1);
+            if word.is_some() {
+                return word;
+            }
+        }
+        let [first, second] = &mut self.others;
+        first.take().or_else(|| second.take())
     }
 }
 

@@ -3,17 +3,22 @@
 //! In: a name, a number, a range. Out: nothing, or what is wrong with it. The reader of files and
 //! [`ConfigView::validate`](super::ConfigView::validate) use the same functions.
 
+use core::net::Ipv4Addr;
+
 use heapless::String;
 
-use super::error::{ConfigError, ConfigErrorKind as Kind, Counted, Place, PortKey};
+use super::error::{ConfigError, ConfigErrorKind as Kind, Counted, NetworkKey, Place, PortKey};
 use super::listen::ipv6;
+use super::network::is_unicast;
 use super::port::MIN_CYCLE;
-use super::{Bus, MAX_ADDRESS, MAX_NAME, Name, Rs485, Span};
+use super::{Bus, MAX_ADDRESS, MAX_NAME, Name, Network, Rs485, Span};
 use crate::sysvar::{COUNT, SysVar, VarBit};
 use crate::time::Duration;
 
 /// The longest cycle, timeout or staleness that a configuration may have.
 pub const MAX_TIME: Duration = Duration::from_secs(3_600);
+/// The longest time in which an event may be sent.
+pub const LONGEST_TRIGGER: Duration = Duration::from_secs(10);
 /// The longest idle gap and turnaround of a serial line.
 pub const MAX_LINE_TIME: Duration = Duration::from_secs(1);
 
@@ -43,6 +48,48 @@ impl Rs485 {
     }
 }
 
+impl Network {
+    /// Checks the network; `controller` is an address or a name.
+    pub(super) fn check(&self, controller: &str) -> Result<(), (NetworkKey, Kind)> {
+        if !(1..=30).contains(&self.prefix) {
+            return Err((NetworkKey::Address, Kind::Prefix { prefix: self.prefix }));
+        }
+        let network = *self;
+        if !self.is_host(self.address) {
+            return Err((NetworkKey::Address, Kind::NoHostAddress { address: self.address, network }));
+        }
+        if let Some(router) = self.router {
+            if !self.is_host(router) {
+                return Err((NetworkKey::Router, Kind::NoHostAddress { address: router, network }));
+            }
+            self.check_other(NetworkKey::Router, router)?;
+        }
+        let is_reachable = |address| self.contains(address) || self.router.is_some();
+        if let Some(dns) = self.dns {
+            if !is_unicast(dns) {
+                return Err((NetworkKey::Dns, Kind::NoHostAddress { address: dns, network }));
+            }
+            self.check_other(NetworkKey::Dns, dns)?;
+            if !is_reachable(dns) {
+                return Err((NetworkKey::Dns, Kind::NeedsRouter { address: dns, network }));
+            }
+        }
+        match controller.parse::<Ipv4Addr>() {
+            Ok(address) if !is_reachable(address) => {
+                Err((NetworkKey::Address, Kind::NeedsRouter { address, network }))
+            }
+            Err(_) if self.dns.is_none() && !controller.is_empty() => {
+                Err((NetworkKey::Address, Kind::NeedsDns))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    fn check_other(&self, key: NetworkKey, address: Ipv4Addr) -> Result<(), (NetworkKey, Kind)> {
+        if address == self.address { Err((key, Kind::OwnAddress)) } else { Ok(()) }
+    }
+}
+
 /// Checks that the variable has the bit; returns the bit in the variable's byte.
 ///
 /// # Errors
@@ -54,6 +101,15 @@ pub fn check_bit(bit: VarBit) -> Result<u8, Kind> {
         None if var.is_bits() => Err(Kind::NoSuchBit { var, bit: nth }),
         None => Err(Kind::HasNoBits { var }),
     }
+}
+
+/// A bit that triggers.
+pub(super) fn check_trigger(place: Place, var: SysVar, bit: u8) -> Check {
+    if !var.is_bits() {
+        return fail(place, Kind::NotBits { var });
+    }
+    let is_there = 1_u8.checked_shl(bit.into()).is_some_and(|mask| var.valid_bits() & mask != 0);
+    if is_there { Ok(()) } else { fail(place, Kind::NoSuchBit { var, bit }) }
 }
 
 /// Checks that a CAN bus can run at `bitrate` bit/s (D21).

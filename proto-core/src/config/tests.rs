@@ -465,3 +465,22 @@ fn a_board_its_router_and_its_name_server_have_addresses_of_hosts() {
     let refused = checked("192.168.12.138", |network| network.dns = Some(network.address));
     assert_eq!(refused, Err((NetworkKey::Dns, ConfigErrorKind::OwnAddress)));
 }
+
+#[test]
+fn every_kind_of_error_has_a_text() {
+    let (kinds, texts) = (include_str!("error.rs"), include_str!("describe.rs"));
+    for (name, path) in [("ConfigErrorKind", "Kind"), ("ExchangeError", "Self")] {
+        let (_, of_enum) = kinds.split_once(&std::format!("pub enum {name} {{")).unwrap();
+        let (variants, _) = of_enum.split_once("\n}").unwrap();
+        let lines = variants.lines().filter_map(|line| line.strip_prefix("    "));
+        let names: std::vec::Vec<_> = lines
+            .filter(|line| line.starts_with(char::is_uppercase))
+            .filter_map(|line| line.split([' ', '(', ',']).next())
+            .collect();
+        assert!(names.len() > 30, "{name}");
+        for variant in names {
+            let arm = std::format!("{path}::{variant} ");
+            assert!(texts.contains(&arm) || texts.contains(&arm.replace(' ', "(")), "{name}::{variant}");
+        }
+    }
+}

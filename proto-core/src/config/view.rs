@@ -5,13 +5,8 @@
 
 use heapless::VecView;
 
-use super::error::{ExchangeKey, Place, PortKey};
 use super::network::Network;
-use super::walk::{FrameFieldIter, FrameVariables, Variables};
-use super::{
-    CommandEntry, ControllerLink, Exchange, FieldSpec, FrameSpec, OutputBinding, Port, Recipe, SafeValue,
-};
-use crate::sysvar::{Direction, SysVar, VarBit};
+use super::{CommandEntry, ControllerLink, Exchange, FieldSpec, FrameSpec, Port, Recipe, SafeValue};
 
 /// A configuration of any size, borrowed; [`GatewayConfig`](super::GatewayConfig) describes the
 /// fields.
@@ -68,75 +63,6 @@ impl<'c> ConfigView<'c> {
             .zip(self.ports)
             .filter(|(_, port)| port.bus.is_field())
             .filter_map(|(index, port)| Some((index, port, self.recipes.get(usize::from(port.recipe))?)))
-    }
-
-    /// The fields of one part of `recipe`, with the number of the frame (see
-    /// `frames_of`) and the index of the field in it.
-    pub fn fields_of(
-        self,
-        recipe: &'c Recipe,
-        part: Direction,
-    ) -> impl Iterator<Item = (u8, u8, &'c FieldSpec)> {
-        self.frame_fields(recipe, part)
-    }
-
-    fn frame_fields(self, recipe: &'c Recipe, part: Direction) -> FrameFieldIter<'c> {
-        let frames = self.frames_of(recipe, part);
-        FrameFieldIter { frames, pool: self.fields, fields: [].iter(), frame: 0, count: 0 }
-    }
-
-    /// The input variables that a field port writes as a whole.
-    pub fn written_by(self, recipe: &'c Recipe) -> impl Iterator<Item = SysVar> + 'c {
-        let fields = self.frame_fields(recipe, Direction::Input);
-        FrameVariables { fields, variables: Variables::NONE }
-    }
-
-    /// Whether a field of one part of `recipe` is bound to the variable.
-    pub(crate) fn carries(self, recipe: &'c Recipe, part: Direction, var: SysVar) -> bool {
-        let mut frames = self.frames_of(recipe, part);
-        frames.any(|(_, span)| span.of(self.fields).iter().any(|field| field.is_bound_to(var)))
-    }
-
-    /// The input variables that a field port owns: those that its frames write, and those of its
-    /// health.
-    pub fn owned_by(self, port: &'c Port, recipe: &'c Recipe) -> impl Iterator<Item = SysVar> + 'c {
-        self.written_by(recipe).chain(self.status_variables(0, port, recipe).map(|(_, var)| var))
-    }
-
-    /// The input variables that tell the robot something about the port with this index: its health, and what became of
-    /// events. Each with its place.
-    pub(crate) fn status_variables(
-        self,
-        index: u8,
-        port: &'c Port,
-        recipe: &'c Recipe,
-    ) -> impl Iterator<Item = (Place, SysVar)> + 'c {
-        let health = Place::Port { port: index, key: PortKey::Health };
-        let outcomes = (0..).zip(self.exchanges_of(recipe)).flat_map(move |(exchange, of)| {
-            let place = Place::Exchange { recipe: port.recipe, exchange, key: ExchangeKey::Outcome };
-            of.outcome.variables().map(move |var| (place, var))
-        });
-        port.health.iter().map(move |(_, var)| (health, var)).chain(outcomes)
-    }
-
-    /// Whether the output part of a field port shows a value of the controller's state packet.
-    pub(crate) fn shows_state(self) -> bool {
-        let shows = |field: &FieldSpec| matches!(field.source(), Some(OutputBinding::State { .. }));
-        self.field_ports()
-            .any(|(_, _, recipe)| self.fields_of(recipe, Direction::Output).any(|(_, _, field)| shows(field)))
-    }
-
-    /// The bits that a field port writes one by one.
-    pub fn bits_written_by(self, recipe: &'c Recipe) -> impl Iterator<Item = VarBit> + 'c {
-        self.fields_of(recipe, Direction::Input).filter_map(|(_, _, field)| field.bit())
-    }
-
-    /// Whether a field port writes the variable.
-    pub(super) fn is_owned(self, var: SysVar) -> bool {
-        self.field_ports().any(|(_, port, recipe)| {
-            self.carries(recipe, Direction::Input, var)
-                || self.status_variables(0, port, recipe).any(|(_, own)| own == var)
-        })
     }
 }
 

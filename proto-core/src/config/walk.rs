@@ -1,42 +1,28 @@
-//! Walks over the frames of a recipe, their fields and their variables.
+//! Walks over the frames of a recipe, their fields and their variables, and what a walk answers.
 //!
 //! They are written out: the checks, the plan and the engine walk many times when they start, and a
 //! chain of adapters asks each of its parts at every step, also those that only devices have.
 
 use core::slice::Iter;
 
-use super::{CanFramePart, Exchange, FieldSpec, FrameSpec, Span};
-use crate::sysvar::{Direction, SysVar};
-
-/// The field ranges of one part: one for a stream part, one for each CAN frame.
-#[derive(Debug, Clone)]
-pub(crate) struct PartFrames<'c> {
-    pub(super) stream: Option<Span>,
-    pub(super) can: Iter<'c, CanFramePart>,
-}
-
-impl Iterator for PartFrames<'_> {
-    type Item = Span;
-
-    fn next(&mut self) -> Option<Span> {
-        let can = self.can.next().map(|frame| frame.fields);
-        can.or_else(|| self.stream.take())
-    }
-}
+use super::error::{ExchangeKey, Place, PortKey};
+use super::recipe::{PartFrames, Variables};
+use super::{ConfigView, Exchange, FieldSpec, FrameSpec, OutputBinding, Port, Recipe, Span};
+use crate::sysvar::{Direction, SysVar, VarBit};
 
 /// The same and those of the frames of exchanges behind them, counted.
 #[derive(Debug, Clone)]
 pub(crate) struct Frames<'c> {
-    pub(super) parts: PartFrames<'c>,
-    pub(super) exchanges: Iter<'c, Exchange>,
+    parts: PartFrames<'c>,
+    exchanges: Iter<'c, Exchange>,
     /// The exchange that the newest frame is of, and whether the frame is its reply; `None` if it is of a part.
-    pub(super) of: Option<(&'c Exchange, bool)>,
+    of: Option<(&'c Exchange, bool)>,
     /// What is left of that exchange: its pending answer and its refusal.
-    pub(super) others: [Option<Span>; 2],
-    pub(super) frames: &'c [FrameSpec],
-    pub(super) pool: &'c [FieldSpec],
-    pub(super) part: Direction,
-    pub(super) count: u8,
+    others: [Option<Span>; 2],
+    frames: &'c [FrameSpec],
+    pool: &'c [FieldSpec],
+    part: Direction,
+    count: u8,
 }
 
 impl Iterator for Frames<'_> {
@@ -77,12 +63,12 @@ impl<'c> Frames<'c> {
 /// The fields of these frames, each with the frame's number and its own.
 #[derive(Debug, Clone)]
 pub(super) struct FrameFieldIter<'c> {
-    pub(super) frames: Frames<'c>,
-    pub(super) pool: &'c [FieldSpec],
+    frames: Frames<'c>,
+    pool: &'c [FieldSpec],
     /// What is left of a frame.
-    pub(super) fields: Iter<'c, FieldSpec>,
-    pub(super) frame: u8,
-    pub(super) count: u8,
+    fields: Iter<'c, FieldSpec>,
+    frame: u8,
+    count: u8,
 }
 
 impl<'c> Iterator for FrameFieldIter<'c> {
@@ -104,9 +90,9 @@ impl<'c> Iterator for FrameFieldIter<'c> {
 /// The variables of these fields.
 #[derive(Debug, Clone)]
 pub(super) struct FrameVariables<'c> {
-    pub(super) fields: FrameFieldIter<'c>,
+    fields: FrameFieldIter<'c>,
     /// What is left of a field.
-    pub(super) variables: Variables,
+    variables: Variables,
 }
 
 impl Iterator for FrameVariables<'_> {
@@ -123,32 +109,92 @@ impl Iterator for FrameVariables<'_> {
     }
 }
 
-/// The variables of a field: words that follow each other, then single ones.
-#[derive(Debug, Clone)]
-pub(super) struct Variables {
-    /// Ordinals of the words that are left: the first, and the first behind them.
-    pub(super) words: (usize, usize),
-    pub(super) others: [Option<SysVar>; 2],
-}
+impl<'c> ConfigView<'c> {
+    /// The exchanges of a recipe.
+    pub fn exchanges_of(self, recipe: &Recipe) -> &'c [Exchange] {
+        recipe.exchanges.of(self.exchanges)
+    }
 
-impl Variables {
-    /// None at all.
-    pub(super) const NONE: Self = Self { words: (0, 0), others: [None; 2] };
-}
+    /// The ranges of the fields of one part of `recipe`, with the frame's number: 0 in a stream, else
+    /// that of the CAN frame, and behind these the frames of the exchanges, counted on.
+    pub(crate) fn frames_of(self, recipe: &'c Recipe, part: Direction) -> Frames<'c> {
+        let exchanges = self.exchanges_of(recipe).iter();
+        let (frames, pool) = (self.frames, self.fields);
+        let (of, others) = (None, [None; 2]);
+        Frames { parts: recipe.part_frames(part), exchanges, of, others, frames, pool, part, count: 0 }
+    }
 
-impl Iterator for Variables {
-    type Item = SysVar;
+    /// Whether frames come from the device (input), or go to it (output).
+    pub(crate) fn has_frames(self, recipe: &'c Recipe, part: Direction) -> bool {
+        self.frames_of(recipe, part).next().is_some()
+    }
 
-    fn next(&mut self) -> Option<SysVar> {
-        let (next, end) = &mut self.words;
-        while next < end {
-            let word = SysVar::from_ordinal(*next);
-            *next = next.saturating_add(1);
-            if word.is_some() {
-                return word;
-            }
-        }
-        let [first, second] = &mut self.others;
-        first.take().or_else(|| second.take())
+    /// The fields of one part of `recipe`, with the number of the frame (see
+    /// `frames_of`) and the index of the field in it.
+    pub fn fields_of(
+        self,
+        recipe: &'c Recipe,
+        part: Direction,
+    ) -> impl Iterator<Item = (u8, u8, &'c FieldSpec)> {
+        self.frame_fields(recipe, part)
+    }
+
+    fn frame_fields(self, recipe: &'c Recipe, part: Direction) -> FrameFieldIter<'c> {
+        let frames = self.frames_of(recipe, part);
+        FrameFieldIter { frames, pool: self.fields, fields: [].iter(), frame: 0, count: 0 }
+    }
+
+    /// The input variables that a field port writes as a whole.
+    pub fn written_by(self, recipe: &'c Recipe) -> impl Iterator<Item = SysVar> + 'c {
+        let fields = self.frame_fields(recipe, Direction::Input);
+        FrameVariables { fields, variables: Variables::NONE }
+    }
+
+    /// Whether a field of one part of `recipe` is bound to the variable.
+    pub(crate) fn carries(self, recipe: &'c Recipe, part: Direction, var: SysVar) -> bool {
+        let mut frames = self.frames_of(recipe, part);
+        frames.any(|(_, span)| span.of(self.fields).iter().any(|field| field.is_bound_to(var)))
+    }
+
+    /// The input variables that a field port owns: those that its frames write, and those of its
+    /// health.
+    pub fn owned_by(self, port: &'c Port, recipe: &'c Recipe) -> impl Iterator<Item = SysVar> + 'c {
+        self.written_by(recipe).chain(self.status_variables(0, port, recipe).map(|(_, var)| var))
+    }
+
+    /// The input variables that tell the robot something about the port with this index: its health, and what became of
+    /// events. Each with its place.
+    pub(crate) fn status_variables(
+        self,
+        index: u8,
+        port: &'c Port,
+        recipe: &'c Recipe,
+    ) -> impl Iterator<Item = (Place, SysVar)> + 'c {
+        let health = Place::Port { port: index, key: PortKey::Health };
+        let outcomes = (0..).zip(self.exchanges_of(recipe)).flat_map(move |(exchange, of)| {
+            let place = Place::Exchange { recipe: port.recipe, exchange, key: ExchangeKey::Outcome };
+            of.outcome.variables().map(move |var| (place, var))
+        });
+        port.health.iter().map(move |(_, var)| (health, var)).chain(outcomes)
+    }
+
+    /// Whether the output part of a field port shows a value of the controller's state packet.
+    pub(crate) fn shows_state(self) -> bool {
+        let shows = |field: &FieldSpec| matches!(field.source(), Some(OutputBinding::State { .. }));
+        self.field_ports()
+            .any(|(_, _, recipe)| self.fields_of(recipe, Direction::Output).any(|(_, _, field)| shows(field)))
+    }
+
+    /// The bits that a field port writes one by one.
+    pub fn bits_written_by(self, recipe: &'c Recipe) -> impl Iterator<Item = VarBit> + 'c {
+        self.fields_of(recipe, Direction::Input).filter_map(|(_, _, field)| field.bit())
+    }
+
+    /// Whether a field port writes the variable.
+    pub(super) fn is_owned(self, var: SysVar) -> bool {
+        self.field_ports().any(|(_, port, recipe)| {
+            self.carries(recipe, Direction::Input, var)
+                || self.status_variables(0, port, recipe).any(|(_, own)| own == var)
+        })
     }
 }

@@ -2,8 +2,55 @@
 //!
 //! In: the fields of a request. Out: its bytes behind the function code. Does not know connections.
 
-use super::pdu::{PduEncodeError, RequestHead};
+use core::fmt;
+
 use crate::wire::runs;
+
+/// Function code, address, and count or value of a request; its response is checked against them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct RequestHead {
+    /// Function code.
+    pub function: u8,
+    /// First address.
+    pub address: u16,
+    /// The value as on the wire for FC 5 and 6, the count otherwise.
+    pub count_or_value: u16,
+}
+
+/// Why a request or response cannot be encoded.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[non_exhaustive]
+pub enum PduEncodeError {
+    /// The buffer is too short; nothing was written.
+    NoSpace {
+        /// Number of bytes that the PDU or frame needs.
+        needed: usize,
+        /// Number of bytes available.
+        available: usize,
+    },
+    /// A count of 0 or over the function's limit.
+    Count {
+        /// The count in the request.
+        count: u16,
+        /// The function's limit.
+        max: u16,
+    },
+}
+
+impl fmt::Display for PduEncodeError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::NoSpace { needed, available } => {
+                write!(f, "{needed} bytes are needed and {available} available")
+            }
+            Self::Count { count, max } => write!(f, "a count of {count} is outside 1..={max}"),
+        }
+    }
+}
+
+impl core::error::Error for PduEncodeError {}
 
 /// What most PDUs have behind their function code: an address, and a count or value, as one number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

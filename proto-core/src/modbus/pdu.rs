@@ -7,6 +7,7 @@ use core::fmt;
 pub use super::adu::MAX_PDU;
 use super::exception::Exception;
 use super::parts::{COIL_OFF, COIL_ON, NO_COUNT, Operands, RequestParts, coil_value, copy_cleared, in_limit};
+pub use super::parts::{PduEncodeError, RequestHead};
 pub use super::values::MAX_READ_COILS;
 use super::values::{Coils, Registers, packed_len};
 
@@ -130,52 +131,6 @@ pub enum Response<'a> {
         count: u16,
     },
 }
-
-/// Function code, address, and count or value of a request; its response is checked against them.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[cfg_attr(feature = "defmt", derive(defmt::Format))]
-pub struct RequestHead {
-    /// Function code.
-    pub function: u8,
-    /// First address.
-    pub address: u16,
-    /// The value as on the wire for FC 5 and 6, the count otherwise.
-    pub count_or_value: u16,
-}
-
-/// Why a request or response cannot be encoded.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[cfg_attr(feature = "defmt", derive(defmt::Format))]
-#[non_exhaustive]
-pub enum PduEncodeError {
-    /// The buffer is too short; nothing was written.
-    NoSpace {
-        /// Number of bytes that the PDU or frame needs.
-        needed: usize,
-        /// Number of bytes available.
-        available: usize,
-    },
-    /// A count of 0 or over the function's limit.
-    Count {
-        /// The count in the request.
-        count: u16,
-        /// The function's limit.
-        max: u16,
-    },
-}
-
-impl fmt::Display for PduEncodeError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::NoSpace { needed, available } => {
-                write!(f, "{needed} bytes are needed and {available} available")
-            }
-            Self::Count { count, max } => write!(f, "a count of {count} is outside 1..={max}"),
-        }
-    }
-}
-
-impl core::error::Error for PduEncodeError {}
 
 /// Why bytes are not an answer to the request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

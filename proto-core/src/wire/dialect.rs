@@ -4,7 +4,7 @@
 //! In: a version's name. Out: a [`Dialect`], a plain struct of choices. Nothing here looks at a
 //! connection: a dialect is configured, never guessed from the controller's answers.
 
-use super::state::codes::{OperationMode, ProgramState, RobotState, SafetyState, States};
+use super::codes::{OperationMode, ProgramState, RobotState, SafetyState, States};
 
 /// What ends a text on port 2000.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -5,6 +5,7 @@
 
 pub(crate) mod ascii;
 pub mod can;
+mod codes;
 pub mod dialect;
 pub(crate) mod runs;
 pub mod scalar;

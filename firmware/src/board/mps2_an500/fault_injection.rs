@@ -9,7 +9,7 @@ use embassy_time::{Duration, Timer};
 use firmware::tasks::watchdog::{Pulse, TaskName};
 
 use super::arguments::argument;
-use crate::start::Tasks;
+use crate::board::Tasks;
 
 #[derive(Debug, Clone, Copy)]
 enum InjectedFault {
@@ -25,7 +25,7 @@ enum InjectedFault {
 }
 
 /// Starts the requested fault.
-pub(super) fn start(tasks: &Tasks) {
+pub(super) fn start<const N: usize>(tasks: &Tasks<N>) {
     let asked = argument(2, |name| {
         Some(match name {
             "stall" => InjectedFault::Stall,

@@ -21,6 +21,7 @@ use core::future::Future;
 
 use cortex_m::interrupt::InterruptNumber;
 use cortex_m::peripheral::NVIC;
+use embassy_executor::Spawner;
 use embassy_sync::waitqueue::AtomicWaker;
 use embassy_time::Duration;
 use firmware::drivers::lan9118::{Lan9118, Lan9118Registers};
@@ -44,6 +45,7 @@ pub(crate) use watchdog::Watchdog;
 /// CAN is slcan on a UART here.
 pub(crate) type CanDevice = SlcanPort<uart::Uart>;
 pub(crate) type Ethernet = Lan9118<LanRegisters>;
+use super::Tasks;
 
 /// The numbers of the next devices to hand out.
 pub(crate) struct Mps2An500 {
@@ -134,15 +136,15 @@ impl StatusLed for FpgaLed {
     }
 }
 
-#[cortex_m_rt::entry]
-fn main() -> ! {
+/// Starts the board, and runs the tasks that `start` makes with it.
+pub(crate) fn run<const N: usize>(start: impl FnOnce(Spawner, Mps2An500) -> Tasks<N>) -> ! {
     super::stack::guard();
     super::stack::paint();
     console::start();
     log_output::start();
     time::start();
     executor::run(|spawner| {
-        let tasks = crate::start::start(spawner, Mps2An500 { serial: 0, can: 0 });
+        let tasks = start(spawner, Mps2An500 { serial: 0, can: 0 });
         fault_injection::start(&tasks);
     })
 }

@@ -18,7 +18,7 @@ use core::future::Future;
 
 use cortex_m::peripheral::Peripherals as Core;
 use defmt_rtt as _;
-use embassy_executor::Executor;
+use embassy_executor::{Executor, Spawner};
 use embassy_stm32::{bind_interrupts, eth};
 use embassy_time::Duration;
 use firmware::fmt::DisplayText;
@@ -31,6 +31,7 @@ use recipe_update::NUCLEO_H743ZI;
 use static_cell::StaticCell;
 
 // The devices, by the names that tasks have for them.
+use super::Tasks;
 pub(crate) use button::UserButton;
 pub(crate) use can::CanDevice;
 pub(crate) use ethernet::{Ethernet, EthernetError};
@@ -125,8 +126,11 @@ impl platform::Board for NucleoH743zi {
     }
 }
 
-#[cortex_m_rt::entry]
-fn main() -> ! {
+/// Starts the board, and runs the tasks that `start` makes with it.
+///
+/// # Panics
+/// If it was called before.
+pub(crate) fn run<const N: usize>(start: impl FnOnce(Spawner, NucleoH743zi) -> Tasks<N>) -> ! {
     super::stack::guard();
     super::stack::paint();
     clocks::errata();
@@ -165,7 +169,7 @@ fn main() -> ! {
         link: Some(leds.link),
         status: Some(leds.status),
         watchdog: Some(watchdog),
-        // SAFETY: the only call; `main` runs once.
+        // SAFETY: the only call; a second one of this function has ended in `embassy_stm32::init`.
         stores: Some(unsafe { flash::stores() }),
         // SAFETY: the only call; slots and stores do not overlap (a test of the layout).
         slots: Some(unsafe { flash::slots() }),
@@ -173,7 +177,7 @@ fn main() -> ! {
     };
     static EXECUTOR: StaticCell<Executor> = StaticCell::new();
     EXECUTOR.init(Executor::new()).run(|spawner| {
-        crate::start::start(spawner, board);
+        start(spawner, board);
     })
 }
 

@@ -136,151 +136,32 @@ impl FaultInjector {
         let rng = &mut self.rng;
         let server = [Link::Command, Link::State, Link::Modbus][rng.below(3) as usize];
         let way = if rng.below(2) == 0 { Way::Up } else { Way::Down };
-        let tcp: Vec<LinkId> = cell.tcp_links().collect();
-        let mut tcp = || pick(rng, tcp.iter().copied());
-        let mut lasts = None;
         let most = self.pause.saturating_mul(MAX_PAUSES);
+        let mut lasts = None;
         let repair = match kind {
-            FaultKind::Refused => {
-                let link = tcp()?;
-                cell.refuse(link);
-                cell.reset(link);
-                Some(Repair::Admit(link))
-            }
-            FaultKind::BlackHole => {
-                let link = tcp()?;
-                cell.black_hole(link);
-                cell.half_open(link);
-                Some(Repair::Admit(link))
-            }
-            FaultKind::Reset => {
-                cell.reset(tcp()?);
-                None
-            }
-            FaultKind::ResetMidPacket => {
-                let link = tcp()?;
-                cell.reset_after(link, way, rng.between(1, 2_000) as usize);
-                None
-            }
-            FaultKind::HalfOpen => {
-                cell.half_open(tcp()?);
-                None
-            }
-            FaultKind::Stall => {
-                let link = tcp()?;
-                cell.hold(link, way);
-                Some(Repair::Release(link))
-            }
-            FaultKind::Datagrams => {
-                let link = pick(rng, cell.datagram_links())?;
-                let network = cell.network(link);
-                network.loss_ppm = rng.between(0, 500_000) as u32;
-                network.duplicate_ppm = rng.between(0, 200_000) as u32;
-                network.jitter = rng.up_to(Duration::from_millis(20));
-                Some(Repair::Datagrams(link))
-            }
-            FaultKind::Burst => {
-                let link = pick(rng, cell.datagram_links())?;
-                lasts = Some(mostly_short(rng, Duration::from_millis(50), 6).min(Duration::from_secs(5)));
-                cut_ways(cell, link, rng.below(3))
-            }
-            FaultKind::Unacknowledged => {
-                let link = tcp()?;
-                lasts = Some(mostly_short(rng, Duration::from_millis(50), 6).min(Duration::from_secs(5)));
-                cut_ways(cell, link, rng.below(2))
-            }
-            FaultKind::Cable => {
-                let link = pick(rng, cell.link_ids()).filter(|_| rng.below(2) == 0);
-                lasts = Some(mostly_short(rng, Duration::from_millis(100), 7).min(Duration::from_secs(20)));
-                cables(cell, link).into_iter().for_each(|link| cell.cut_cable(link));
-                Some(Repair::Cable(link))
-            }
-            FaultKind::Stranger => {
-                let links: Vec<(LinkId, Option<usize>)> = cell.listening_for_datagrams();
-                let (link, frame) = pick(rng, links.into_iter())?;
-                // Never a frame's length: the gateway would answer its sender.
-                let len = Some(rng.below(64) as usize).filter(|len| Some(*len) != frame).unwrap_or(100);
-                let bytes = rng.bytes(len);
-                cell.stranger_sends(link, &bytes);
-                None
-            }
-            FaultKind::Mute => {
-                lasts = fault_length(rng, server);
-                cell.server_fault_begins(server);
-                cell.controller_mut().mute(server);
-                Some(Repair::Unmute(server))
-            }
-            FaultKind::SlowAnswers => {
-                lasts = fault_length(rng, server);
-                let delay = rng.up_to(lasts.unwrap_or(Duration::from_millis(1_500)));
-                cell.server_fault_begins(server);
-                cell.controller_mut().delay_answers(server, delay);
-                Some(Repair::Answers(server))
-            }
-            FaultKind::Exception => {
-                let exceptions =
-                    [Exception::DeviceFailure, Exception::DeviceBusy, Exception::IllegalDataAddress];
-                let exception = pick(rng, exceptions.into_iter());
-                cell.server_fault_begins(Link::Modbus);
-                cell.controller_mut().answer_modbus_with(exception);
-                Some(Repair::NoException)
-            }
-            FaultKind::OneClient => {
-                lasts = Some(mostly_short(rng, Duration::from_millis(500), 5));
-                let clients =
-                    [CommandClients::RefuseSecond, CommandClients::DropFirst][rng.below(2) as usize];
-                cell.controller_mut().command_clients(clients);
-                Some(Repair::ManyClients)
-            }
-            FaultKind::HalfStatePacket => {
-                let len = rng.between(0, 1_467) as usize;
-                cell.controller_mut().cut_next_state_packet(len);
-                None
-            }
-            FaultKind::StateBytesLost => {
-                cell.link_ids().find(|link| *link == LinkId::STATE)?;
-                cell.lose_state_bytes(rng.between(1, 1_467) as usize);
-                None
-            }
-            FaultKind::Unreadable => {
-                let var = pick(rng, cell.floats().into_iter())?;
-                let value = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY][rng.below(3) as usize];
-                cell.corrupt_float(var, value);
-                Some(Repair::Variable(var))
-            }
-            FaultKind::Noise => {
-                let line = pick(rng, cell.lines())?;
-                cell.line(line).noise_ppm = rng.between(100, 100_000) as u32;
-                Some(Repair::Quiet(line))
-            }
-            FaultKind::Garbage => {
-                let line = pick(rng, cell.lines())?;
-                let len = rng.between(1, 300) as usize;
-                let bytes = rng.bytes(len);
-                cell.send(line, &bytes);
-                None
-            }
-            FaultKind::Cut => match (pick(rng, cell.lines()), pick(rng, cell.buses())) {
-                (Some(line), bus) if bus.is_none() || rng.below(2) == 0 => {
-                    cell.cut(line);
-                    Some(Repair::Line(line))
-                }
-                (_, bus) => {
-                    let bus = bus?;
-                    cell.cut_bus(bus);
-                    Some(Repair::Bus(bus))
-                }
-            },
-            FaultKind::Unplugged => {
-                let line = pick(rng, cell.lines())?;
-                cell.unplug(line);
-                Some(Repair::PlugIn(line))
-            }
-            FaultKind::BusOff => {
-                let bus = pick(rng, cell.buses())?;
-                cell.bus_off(bus);
-                Some(Repair::BusOn(bus))
-            }
+            FaultKind::Refused
+            | FaultKind::BlackHole
+            | FaultKind::Reset
+            | FaultKind::ResetMidPacket
+            | FaultKind::HalfOpen
+            | FaultKind::Stall
+            | FaultKind::Datagrams
+            | FaultKind::Burst
+            | FaultKind::Unacknowledged
+            | FaultKind::Cable
+            | FaultKind::Stranger => link_fault(rng, cell, kind, way, &mut lasts)?,
+            FaultKind::Mute
+            | FaultKind::SlowAnswers
+            | FaultKind::Exception
+            | FaultKind::OneClient
+            | FaultKind::HalfStatePacket
+            | FaultKind::StateBytesLost
+            | FaultKind::Unreadable => server_fault(rng, cell, kind, server, &mut lasts)?,
+            FaultKind::Noise
+            | FaultKind::Garbage
+            | FaultKind::Cut
+            | FaultKind::Unplugged
+            | FaultKind::BusOff => field_fault(rng, cell, kind)?,
             FaultKind::ControllerRestart => {
                 cell.restart_controller();
                 None
@@ -326,6 +207,179 @@ impl FaultInjector {
         }
         Some(())
     }
+}
+
+/// A fault of a link: how it is repaired, if it is. `lasts` is for how long, if that is not usual.
+fn link_fault(
+    rng: &mut Rng,
+    cell: &mut Cell,
+    kind: FaultKind,
+    way: Way,
+    lasts: &mut Option<Duration>,
+) -> Option<Option<Repair>> {
+    let tcp: Vec<LinkId> = cell.tcp_links().collect();
+    let mut tcp = || pick(rng, tcp.iter().copied());
+    Some(match kind {
+        FaultKind::Refused => {
+            let link = tcp()?;
+            cell.refuse(link);
+            cell.reset(link);
+            Some(Repair::Admit(link))
+        }
+        FaultKind::BlackHole => {
+            let link = tcp()?;
+            cell.black_hole(link);
+            cell.half_open(link);
+            Some(Repair::Admit(link))
+        }
+        FaultKind::Reset => {
+            cell.reset(tcp()?);
+            None
+        }
+        FaultKind::ResetMidPacket => {
+            let link = tcp()?;
+            cell.reset_after(link, way, rng.between(1, 2_000) as usize);
+            None
+        }
+        FaultKind::HalfOpen => {
+            cell.half_open(tcp()?);
+            None
+        }
+        FaultKind::Stall => {
+            let link = tcp()?;
+            cell.hold(link, way);
+            Some(Repair::Release(link))
+        }
+        FaultKind::Datagrams => {
+            let link = pick(rng, cell.datagram_links())?;
+            let network = cell.network(link);
+            network.loss_ppm = rng.between(0, 500_000) as u32;
+            network.duplicate_ppm = rng.between(0, 200_000) as u32;
+            network.jitter = rng.up_to(Duration::from_millis(20));
+            Some(Repair::Datagrams(link))
+        }
+        FaultKind::Burst => {
+            let link = pick(rng, cell.datagram_links())?;
+            *lasts = Some(mostly_short(rng, Duration::from_millis(50), 6).min(Duration::from_secs(5)));
+            cut_ways(cell, link, rng.below(3))
+        }
+        FaultKind::Unacknowledged => {
+            let link = tcp()?;
+            *lasts = Some(mostly_short(rng, Duration::from_millis(50), 6).min(Duration::from_secs(5)));
+            cut_ways(cell, link, rng.below(2))
+        }
+        FaultKind::Cable => {
+            let link = pick(rng, cell.link_ids()).filter(|_| rng.below(2) == 0);
+            *lasts = Some(mostly_short(rng, Duration::from_millis(100), 7).min(Duration::from_secs(20)));
+            cables(cell, link).into_iter().for_each(|link| cell.cut_cable(link));
+            Some(Repair::Cable(link))
+        }
+        FaultKind::Stranger => {
+            let links: Vec<(LinkId, Option<usize>)> = cell.listening_for_datagrams();
+            let (link, frame) = pick(rng, links.into_iter())?;
+            // Never a frame's length: the gateway would answer its sender.
+            let len = Some(rng.below(64) as usize).filter(|len| Some(*len) != frame).unwrap_or(100);
+            let bytes = rng.bytes(len);
+            cell.stranger_sends(link, &bytes);
+            None
+        }
+        _ => return None,
+    })
+}
+
+/// A fault of one of the controller's servers, or of what it sends.
+fn server_fault(
+    rng: &mut Rng,
+    cell: &mut Cell,
+    kind: FaultKind,
+    server: Link,
+    lasts: &mut Option<Duration>,
+) -> Option<Option<Repair>> {
+    Some(match kind {
+        FaultKind::Mute => {
+            *lasts = fault_length(rng, server);
+            cell.server_fault_begins(server);
+            cell.controller_mut().mute(server);
+            Some(Repair::Unmute(server))
+        }
+        FaultKind::SlowAnswers => {
+            *lasts = fault_length(rng, server);
+            let delay = rng.up_to(lasts.unwrap_or(Duration::from_millis(1_500)));
+            cell.server_fault_begins(server);
+            cell.controller_mut().delay_answers(server, delay);
+            Some(Repair::Answers(server))
+        }
+        FaultKind::Exception => {
+            let exceptions = [Exception::DeviceFailure, Exception::DeviceBusy, Exception::IllegalDataAddress];
+            let exception = pick(rng, exceptions.into_iter());
+            cell.server_fault_begins(Link::Modbus);
+            cell.controller_mut().answer_modbus_with(exception);
+            Some(Repair::NoException)
+        }
+        FaultKind::OneClient => {
+            *lasts = Some(mostly_short(rng, Duration::from_millis(500), 5));
+            let clients = [CommandClients::RefuseSecond, CommandClients::DropFirst][rng.below(2) as usize];
+            cell.controller_mut().command_clients(clients);
+            Some(Repair::ManyClients)
+        }
+        FaultKind::HalfStatePacket => {
+            let len = rng.between(0, 1_467) as usize;
+            cell.controller_mut().cut_next_state_packet(len);
+            None
+        }
+        FaultKind::StateBytesLost => {
+            cell.link_ids().find(|link| *link == LinkId::STATE)?;
+            cell.lose_state_bytes(rng.between(1, 1_467) as usize);
+            None
+        }
+        FaultKind::Unreadable => {
+            let var = pick(rng, cell.floats().into_iter())?;
+            let value = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY][rng.below(3) as usize];
+            cell.corrupt_float(var, value);
+            Some(Repair::Variable(var))
+        }
+        _ => return None,
+    })
+}
+
+/// A fault on the field side.
+fn field_fault(rng: &mut Rng, cell: &mut Cell, kind: FaultKind) -> Option<Option<Repair>> {
+    Some(match kind {
+        FaultKind::Noise => {
+            let line = pick(rng, cell.lines())?;
+            cell.line(line).noise_ppm = rng.between(100, 100_000) as u32;
+            Some(Repair::Quiet(line))
+        }
+        FaultKind::Garbage => {
+            let line = pick(rng, cell.lines())?;
+            let len = rng.between(1, 300) as usize;
+            let bytes = rng.bytes(len);
+            cell.send(line, &bytes);
+            None
+        }
+        FaultKind::Cut => match (pick(rng, cell.lines()), pick(rng, cell.buses())) {
+            (Some(line), bus) if bus.is_none() || rng.below(2) == 0 => {
+                cell.cut(line);
+                Some(Repair::Line(line))
+            }
+            (_, bus) => {
+                let bus = bus?;
+                cell.cut_bus(bus);
+                Some(Repair::Bus(bus))
+            }
+        },
+        FaultKind::Unplugged => {
+            let line = pick(rng, cell.lines())?;
+            cell.unplug(line);
+            Some(Repair::PlugIn(line))
+        }
+        FaultKind::BusOff => {
+            let bus = pick(rng, cell.buses())?;
+            cell.bus_off(bus);
+            Some(Repair::BusOn(bus))
+        }
+        _ => return None,
+    })
 }
 
 fn apply(cell: &mut Cell, repair: Repair, networks: &BTreeMap<LinkId, Network>) {

@@ -2,11 +2,11 @@
 
 use proto_core::time::{Duration, Instant};
 
-use super::Order;
 use super::device::Machine;
 use super::rtu::{Place, Slave, What};
 use super::rules::{Rules, Source, word};
 use crate::Rng;
+use crate::device::Order;
 
 pub(super) fn rules() -> Rules {
     // The target is two registers, and the robot's one is below 65536.

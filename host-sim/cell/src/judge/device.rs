@@ -3,8 +3,8 @@
 use proto_core::time::{Duration, Instant};
 
 use super::mood::{Mood, Moods};
-use super::{Act, Order};
 use crate::Rng;
+use crate::device::{Act, Order};
 use crate::device::{Done, SlaveDone};
 
 /// A device without its protocol.

@@ -3,9 +3,9 @@
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::can::{CanFrame, CanId};
 
-use super::Order;
 use super::device::{Answer, Machine};
 use super::rules::{Rules, Source, word};
+use crate::device::Order;
 use crate::{Device, Rng, SlaveDone};
 
 pub(super) fn rules() -> Rules {

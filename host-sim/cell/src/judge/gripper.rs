@@ -4,9 +4,10 @@ use proto_core::time::{Duration, Instant};
 
 use super::device::Machine;
 use super::rtu::{Place, Slave, What};
+use super::rules;
 use super::rules::{Rules, Source, word};
-use super::{Order, rules};
 use crate::Rng;
+use crate::device::Order;
 
 pub(super) fn rules() -> Rules {
     let moves = vec![word("WordOutputReg[1]"), word("WordOutputReg[2]"), Source::Constant(1)];

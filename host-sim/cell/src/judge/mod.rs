@@ -30,54 +30,9 @@ use proto_core::time::{Duration, Instant};
 pub(crate) use program::Program;
 pub(crate) use rules::Rules;
 
-use crate::{Cell, Invariant, Rng, Violation};
+use crate::{Act, Cell, Invariant, Order, Rng, Violation};
 use robot::Robot;
 use rules::{MOVE_BIT, STOP_BIT, Source};
-
-/// What a device did, as its own log has it.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Act {
-    /// It received a whole request of its own: an order, or a question.
-    Heard(Option<Order>),
-    /// It executed an order with these values.
-    Did(Order, Vec<u32>),
-    /// It refused an order with a code.
-    Refused(Order, u8),
-    /// A reply left, or did not although it should.
-    Replied {
-        /// The order that it is a reply to, if it is one.
-        order: Option<Order>,
-        /// It is not the same as the request, so nobody takes it for an echo.
-        tells: bool,
-        /// It left as it should be.
-        is_whole: bool,
-        /// And it was at the gateway in time for sure.
-        in_time: bool,
-    },
-    /// Something arrived of it that is no reply to what it was asked: whether it is heard by that, nobody knows.
-    Garbled,
-    /// The value of this number is this from now on.
-    Holds(usize, u16),
-    /// It lost its power, and with it what it was told.
-    PowerOff,
-    /// It is there again.
-    PowerOn,
-}
-
-/// What a device can be ordered to do.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Order {
-    /// To move: an event.
-    Move,
-    /// The second step of a dialogue that began with [`Self::Move`].
-    Step,
-    /// To stop.
-    Stop,
-    /// What it is told at its start, and what moves it: homing, a mode.
-    Start,
-    /// A value that it keeps.
-    Keep,
-}
 
 /// Judges one cell.
 #[derive(Debug)]

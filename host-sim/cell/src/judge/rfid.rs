@@ -3,9 +3,9 @@
 
 use proto_core::time::{Duration, Instant};
 
-use super::Order;
 use super::device::{Answer, Machine};
 use super::rules::{Rules, word};
+use crate::device::Order;
 use crate::rtu::sealed;
 use crate::{Device, Rng, SlaveDone};
 

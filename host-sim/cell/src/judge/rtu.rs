@@ -2,8 +2,8 @@
 
 use proto_core::time::{Duration, Instant};
 
-use super::Order;
 use super::device::{Answer, Machine};
+use crate::device::Order;
 use crate::rtu::{is_right, sealed};
 use crate::{Device, SlaveDone};
 

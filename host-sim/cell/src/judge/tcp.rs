@@ -3,9 +3,9 @@
 
 use proto_core::time::{Duration, Instant};
 
-use super::Act;
 use super::device::{Fate, Machine};
 use super::rtu::{Place, answer};
+use crate::device::Act;
 use crate::device::{Served, Server};
 use crate::{Rng, SlaveDone};
 

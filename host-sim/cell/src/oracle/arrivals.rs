@@ -4,9 +4,8 @@ use proto_core::engine::LinkId;
 use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 
-use super::bits::Coils;
-use super::field::Cut;
-use super::spec::{Frame, Raw};
+use super::field::{Coils, Cut};
+use super::frame::{Frame, Raw};
 use super::wire::{Asked, Inputs};
 use super::{Invariant, Oracle};
 

@@ -1,5 +1,5 @@
 //! Frames of devices: a plain implementation of docs/configuration.md section 4, for frames whose fields
-//! always have the same length. What varies is laid out by [`varying`].
+//! always have the same length. What varies is laid out by `varying.rs`.
 //!
 //! Written from that page, independent of the engine's layouts and encodings.
 
@@ -8,9 +8,6 @@ use std::ops::Range;
 use proto_core::config::{FieldSpec, InputRule, Limits, OutputBinding, Outside};
 use proto_core::device::{Algorithm, ByteOrder, Checksum, Crc, Encoding, Kind, Overflow, TextWidth, Width};
 use proto_core::wire::scalar::ScalarType;
-
-use super::spec::Frame;
-use super::varying;
 
 /// The places of a frame's fields.
 #[derive(Debug, Clone, Default)]
@@ -100,7 +97,7 @@ impl DeviceSpec {
     }
 
     /// Whether the constants that the bytes have completely are those of the frame.
-    fn agrees(&self, fields: &[FieldSpec], bytes: &[u8]) -> bool {
+    pub(super) fn agrees(&self, fields: &[FieldSpec], bytes: &[u8]) -> bool {
         fields.iter().zip(&self.places).filter(|(_, place)| place.end <= bytes.len()).all(|(field, place)| {
             constant(field)
                 .is_none_or(|(encoding, value)| read(&encoding, &bytes[place.clone()]) == Some(value))
@@ -174,49 +171,8 @@ pub(super) fn varies(field: &FieldSpec) -> bool {
     matches!(field, FieldSpec::Length(_)) || !matches!(size(field), Size::Fixed(_))
 }
 
-/// What bytes of a line are, seen as this frame.
-pub(super) fn look(frame: &Frame, bytes: &[u8]) -> Look {
-    if frame.varies {
-        return varying::look(frame, bytes);
-    }
-    let seen = bytes.len().min(frame.head.len());
-    if bytes[..seen] != frame.head[..seen] {
-        return Look::No;
-    }
-    let Some(whole) = bytes.get(..frame.len()) else {
-        let is_ours = frame.device.as_ref().is_some_and(|device| device.agrees(&frame.fields, bytes));
-        return Look::Begins { is_ours };
-    };
-    let Some(device) = frame.device.as_ref().filter(|_| whole.ends_with(&frame.tail)) else {
-        return Look::No;
-    };
-    match device.see(&frame.fields, whole) {
-        Seen::Ours => Look::Frame(whole.len()),
-        Seen::Other => Look::Other(whole.len()),
-        Seen::WrongChecksum => Look::Wrong(whole.len()),
-        Seen::Nothing => Look::No,
-    }
-}
-
-/// Whether two frames of the same direction can have the same bytes, so that nobody could tell them apart.
-pub(super) fn can_be_the_same(one: &Frame, other: &Frame) -> bool {
-    let (Some(of_one), Some(of_other)) = (&one.device, &other.device) else { return false };
-    let constants = |frame: &'_ Frame, device: &'_ DeviceSpec| -> Vec<(Range<usize>, Encoding, u64)> {
-        let fields = frame.fields.iter().zip(&device.places);
-        let of = |(field, place): (&FieldSpec, &Range<usize>)| {
-            constant(field).map(|(encoding, value)| (place.clone(), encoding, value.to_bits()))
-        };
-        fields.filter_map(of).collect()
-    };
-    let others = constants(other, of_other);
-    let differ = constants(one, of_one).into_iter().any(|(place, encoding, value)| {
-        others.iter().any(|other| (&other.0, &other.1) == (&place, &encoding) && other.2 != value)
-    });
-    (one.id, &one.head, &one.tail, one.len()) == (other.id, &other.head, &other.tail, other.len()) && !differ
-}
-
 /// The encoding and the number of a field that is the same in every frame.
-fn constant(field: &FieldSpec) -> Option<(Encoding, f64)> {
+pub(super) fn constant(field: &FieldSpec) -> Option<(Encoding, f64)> {
     let (encoding, overflow, number) = match *field {
         FieldSpec::Fixed { encoding, value } => return Some((encoding, value as f64)),
         FieldSpec::UserOutput { ty, from: OutputBinding::Constant(number) } => {

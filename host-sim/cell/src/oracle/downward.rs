@@ -11,8 +11,9 @@ use proto_core::wire::scalar::ScalarType;
 use super::Invariant;
 use super::device;
 use super::field::as_number;
+use super::frame::{Frame, Raw};
 use super::invariant::Wrong;
-use super::spec::{Frame, Origin, PortSpec, Spec};
+use super::spec::{Origin, PortSpec, Spec};
 use super::upward::Upward;
 use super::varying;
 
@@ -455,7 +456,7 @@ impl Downward {
     }
 }
 
-fn raw_of(up: &Upward, var: SysVar) -> Option<super::spec::Raw> {
+fn raw_of(up: &Upward, var: SysVar) -> Option<Raw> {
     up.known(var).value.map(|value| value.0)
 }
 

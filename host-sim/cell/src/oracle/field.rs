@@ -1,6 +1,8 @@
 //! The frames in the bytes that a field port received, and their values: a plain implementation of
 //! proto-core/docs/wire/recipes.md sections 4, 6 and 7.
 
+mod cut;
+
 use std::collections::BTreeMap;
 use std::ops::Range;
 
@@ -12,10 +14,11 @@ use proto_core::time::Instant;
 use proto_core::wire::can::CanFrame;
 use proto_core::wire::scalar::{Scalar, ScalarType};
 
-use super::bits::Coils;
 use super::device::{self, DeviceSpec, Look, Read, Seen};
-use super::spec::{Frame, PortSpec, Raw};
-use super::varying::{self, CutWatch};
+use super::frame::{Frame, Raw, written};
+use super::spec::PortSpec;
+use super::varying;
+use cut::CutWatch;
 
 /// Whether a frame is accepted.
 #[derive(Debug, Clone, PartialEq)]
@@ -60,6 +63,55 @@ pub(super) struct Accepted {
     pub without: Box<Without>,
     /// When it was asked for first, if an earlier request had no reply in time: its values may be as old as that.
     pub asked: Option<Instant>,
+}
+
+impl Accepted {
+    /// Notes what tells whether a field's newest value was taken; returns whether anything does.
+    fn note_validity(&mut self, rules: &[FieldSpec], is_valid: bool) -> bool {
+        let number = f64::from(u8::from(is_valid));
+        for rule in rules {
+            match *rule {
+                FieldSpec::InputRule(InputRule::ValidTo { var, bit: Some(bit) }) => {
+                    self.bits.push(coil(var, bit, number));
+                }
+                FieldSpec::InputRule(InputRule::ValidTo { var, bit: None }) => {
+                    self.values.extend(bound(var, number).map(|raw| (var, raw)));
+                }
+                _ => continue,
+            }
+            return true;
+        }
+        false
+    }
+
+    /// Notes an alive counter.
+    fn count(
+        &mut self,
+        place: (usize, usize),
+        before: Option<u32>,
+        max: u32,
+        number: f64,
+    ) -> Result<(), Unfit> {
+        if number > f64::from(max) {
+            return Err(Unfit::OutOfRange);
+        }
+        let number = number as u32;
+        if before == Some(number) {
+            return Err(Unfit::Repeated);
+        }
+        let next = |before: u32| if before >= max { 0 } else { before + 1 };
+        self.jumps += u32::from(before.is_some_and(|before| next(before) != number));
+        self.counts.push((place, number));
+        Ok(())
+    }
+}
+
+/// Bits of one byte.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Coils {
+    pub var: SysVar,
+    pub mask: u8,
+    pub on: u8,
 }
 
 /// Why a field of a device's frame is rejected, or for a counter the frame.
@@ -246,7 +298,7 @@ impl LineWatch {
     fn cut_device(&mut self, frame: &Frame) -> Vec<Verdict> {
         let mut found = Vec::new();
         while !self.held.is_empty() {
-            match device::look(frame, &self.held) {
+            match varying::look(frame, &self.held) {
                 Look::Begins { .. } => break,
                 Look::No => self.drop_one(),
                 Look::Wrong(len) => {
@@ -374,47 +426,14 @@ fn judge_device(frame: &Frame, nth: usize, whole: &[u8], counts: &Counts) -> Ver
         };
         let rules = device::behind(&frame.fields, place_of);
         let bytes = &whole[place.clone()];
-        let number = match device::read_ruled(&encoding, bytes, rules) {
-            Read::Number(number) if number.is_finite() => Ok(number),
-            Read::Number(_) => Err(Some(Unfit::NotFinite)),
-            Read::Unreadable => Err(Some(Unfit::Unreadable)),
-            Read::NoValue => Err(None),
-        };
-        let valid = |is_valid: bool, accepted: &mut Accepted| {
-            for rule in rules {
-                match *rule {
-                    FieldSpec::InputRule(InputRule::ValidTo { var, bit: Some(bit) }) => {
-                        accepted.bits.push(coil(var, bit, f64::from(u8::from(is_valid))));
-                    }
-                    FieldSpec::InputRule(InputRule::ValidTo { var, bit: None }) => {
-                        accepted
-                            .values
-                            .extend(bound(var, f64::from(u8::from(is_valid))).map(|raw| (var, raw)));
-                    }
-                    _ => continue,
-                }
-                return true;
-            }
-            false
-        };
+        let number = number_in(&encoding, bytes, rules);
         match to {
             InputBinding::Variable { var, scale, offset } => {
                 let raw = number.and_then(|number| {
                     let number = device::taken_for(&encoding, number, (scale, offset), rules);
-                    let number = number.ok_or(Some(Unfit::OutOfRange))?;
-                    let is_int16 = rules.contains(&FieldSpec::InputRule(InputRule::Int16));
-                    let number = match overflow {
-                        Overflow::Wrap => device::shown_as(&Encoding::scalar(var.ty()), overflow, number),
-                        Overflow::Usual if is_int16 => match number.round() {
-                            number if !(-32_768.0..=32_767.0).contains(&number) => f64::NAN,
-                            number if number < 0.0 => number + 65_536.0,
-                            number => number,
-                        },
-                        Overflow::Usual => number,
-                    };
-                    bound(var, number).ok_or(Some(Unfit::OutOfRange))
+                    bound_by(var, number.ok_or(Some(Unfit::OutOfRange))?, overflow, rules)
                 });
-                tells |= valid(raw.is_ok(), &mut accepted);
+                tells |= accepted.note_validity(rules, raw.is_ok());
                 match raw {
                     Ok(raw) => accepted.values.push((var, raw)),
                     Err(why) => {
@@ -442,21 +461,11 @@ fn judge_device(frame: &Frame, nth: usize, whole: &[u8], counts: &Counts) -> Ver
             },
             InputBinding::Counter { max } => {
                 let before = counts.get(&(nth, at)).copied();
-                match number {
-                    Err(why) => wrong_count = wrong_count.or(why),
-                    Ok(number) if number > f64::from(max) => {
-                        wrong_count = wrong_count.or(Some(Unfit::OutOfRange));
-                    }
-                    Ok(number) if before == Some(number as u32) => {
-                        wrong_count = wrong_count.or(Some(Unfit::Repeated));
-                    }
-                    Ok(number) => {
-                        let number = number as u32;
-                        let next = |before: u32| if before >= max { 0 } else { before + 1 };
-                        accepted.jumps += u32::from(before.is_some_and(|before| next(before) != number));
-                        accepted.counts.push(((nth, at), number));
-                    }
-                }
+                let why = match number {
+                    Ok(number) => accepted.count((nth, at), before, max, number).err(),
+                    Err(why) => why,
+                };
+                wrong_count = wrong_count.or(why);
             }
             InputBinding::Unused => {
                 if let Err(why) = number {
@@ -472,7 +481,7 @@ fn judge_device(frame: &Frame, nth: usize, whole: &[u8], counts: &Counts) -> Ver
         let FieldSpec::TextInput { to, length_to, count_to, .. } = *field else { continue };
         let registers = to.map(|words| varying::registers(words, text));
         if let Some(None) = registers {
-            accepted.without.vars.extend(super::spec::written(field));
+            accepted.without.vars.extend(written(field));
             accepted.without.reject(Unfit::OutOfRange);
             continue;
         }
@@ -488,6 +497,31 @@ fn judge_device(frame: &Frame, nth: usize, whole: &[u8], counts: &Counts) -> Ver
         Some(why) if is_nothing && without.no_value == 0 && !tells => why.into(),
         _ => Verdict::Accepted(accepted),
     }
+}
+
+/// The number in the bytes of a field; why there is none, or nothing if the device says that it has none.
+fn number_in(encoding: &Encoding, bytes: &[u8], rules: &[FieldSpec]) -> Result<f64, Option<Unfit>> {
+    match device::read_ruled(encoding, bytes, rules) {
+        Read::Number(number) if number.is_finite() => Ok(number),
+        Read::Number(_) => Err(Some(Unfit::NotFinite)),
+        Read::Unreadable => Err(Some(Unfit::Unreadable)),
+        Read::NoValue => Err(None),
+    }
+}
+
+/// A number of a device as a value of a variable.
+fn bound_by(var: SysVar, number: f64, overflow: Overflow, rules: &[FieldSpec]) -> Result<Raw, Option<Unfit>> {
+    let is_int16 = rules.contains(&FieldSpec::InputRule(InputRule::Int16));
+    let number = match overflow {
+        Overflow::Wrap => device::shown_as(&Encoding::scalar(var.ty()), overflow, number),
+        Overflow::Usual if is_int16 => match number.round() {
+            number if !(-32_768.0..=32_767.0).contains(&number) => f64::NAN,
+            number if number < 0.0 => number + 65_536.0,
+            number => number,
+        },
+        Overflow::Usual => number,
+    };
+    bound(var, number).ok_or(Some(Unfit::OutOfRange))
 }
 
 /// The texts of an input frame, without what fills them up.

@@ -8,8 +8,8 @@ use proto_core::wire::can::{CanFrame, CanId};
 
 use super::counters::differ;
 use super::field::{self, LineWatch, Refused, Verdict};
+use super::frame::Raw;
 use super::invariant::Wrong;
-use super::spec::Raw;
 use super::wire::Safe;
 use super::{Invariant, LinkWatch, Oracle, PortWatch, place};
 

@@ -6,10 +6,10 @@ use proto_core::engine::LinkId;
 use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 
-use super::bits::Coils;
-use super::field::Cut;
+use super::field::{Coils, Cut};
+use super::frame::{Frame, Raw};
 use super::invariant::Wrong;
-use super::spec::{Frame, Origin, Owned, Raw};
+use super::spec::{Origin, Owned};
 use super::upward::is_gap;
 use super::wire::{Asked, Safe};
 use super::{Invariant, Oracle, place};

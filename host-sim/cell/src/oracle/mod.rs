@@ -10,13 +10,13 @@
 //! It reads nothing of the engine but the counters and the states of the links.
 
 mod arrivals;
-mod bits;
 mod commands;
 mod counters;
 mod device;
 mod downward;
 mod exchanges;
 mod field;
+mod frame;
 mod gateway;
 mod invariant;
 mod links;

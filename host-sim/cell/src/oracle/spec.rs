@@ -3,24 +3,22 @@
 //!
 //! Written from that page, independent of the engine's plan.
 
-use proto_core::config::{
-    Bus, FieldSpec, GatewayConfig, InputBinding, InputRule, OutputBinding, Parts, Recipe, SendOn, Words,
-};
+pub(super) mod exchanges;
+pub(super) mod frames;
+pub(super) mod served;
+
+use proto_core::config::{Bus, FieldSpec, GatewayConfig, InputRule, Parts, Recipe, SendOn};
 use proto_core::device::Boundary;
 use proto_core::engine::{LinkId, PortId};
 use proto_core::recipe::model::Mode;
 use proto_core::sysvar::{COUNT, Direction, ModbusPlace, SysVar};
 use proto_core::time::Duration;
-use proto_core::wire::can::CanId;
 
 use super::Invariant;
-use super::device::{DeviceSpec, varies};
-use super::exchanges::served::ServedSpec;
-use super::exchanges::spec::ExchangesSpec;
+use super::frame::{Frame, Raw, device_frame, frame};
 use super::invariant::Wrong;
-
-/// A value as on the wire; unused bytes are 0.
-pub(super) type Raw = [u8; 4];
+use exchanges::ExchangesSpec;
+use served::ServedSpec;
 
 /// The bits that one input frame writes in one byte.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -50,24 +48,6 @@ pub(super) enum Origin {
     Recipe,
     Modbus,
     State,
-}
-
-/// One frame on the field side or on a recipe link.
-#[derive(Debug, Clone, Default)]
-pub(super) struct Frame {
-    pub head: Vec<u8>,
-    pub tail: Vec<u8>,
-    pub id: Option<CanId>,
-    pub fields: Vec<FieldSpec>,
-    /// The variables that they write, and those that they show.
-    pub written: Vec<SysVar>,
-    pub shown: Vec<SysVar>,
-    /// Number of bytes of all fields, checksum included.
-    pub payload: usize,
-    /// The places of the fields in a device's own frame.
-    pub device: Option<DeviceSpec>,
-    /// The places of its fields are not the same in every frame.
-    pub varies: bool,
 }
 
 /// A field port.
@@ -169,40 +149,8 @@ impl Entry {
 impl Spec {
     pub(super) fn new(config: &GatewayConfig) -> Self {
         let ports: Vec<PortSpec> = config.ports.iter().map(|port| port_spec(config, port)).collect();
-        let mut links: Vec<LinkSpec> = Vec::new();
-        if let Some(own) = config.controller.recipe_link {
-            let recipe = &config.recipes[usize::from(own.recipe)];
-            links.push(link_spec(config, LinkId::RECIPE_UDP, recipe, true));
-        }
-        for (nth, port) in config.ports.iter().enumerate() {
-            let recipe = &config.recipes[usize::from(port.recipe)];
-            let id = LinkId::of_port(PortId(nth as u8));
-            match port.bus {
-                Bus::TcpListen { .. } => links.push(link_spec(config, id, recipe, false)),
-                Bus::UdpListen { .. } => links.push(link_spec(config, id, recipe, true)),
-                Bus::Rs485(_) | Bus::Can { .. } | Bus::ModbusTcp { .. } => {}
-            }
-        }
-        let mut owned = [None; COUNT];
-        for (nth, port) in ports.iter().enumerate().filter(|(_, port)| port.is_field) {
-            for (frame, part) in port.inputs.iter().enumerate() {
-                for &var in &part.written {
-                    let carries = |link: &&LinkSpec| link.input.as_ref().is_some_and(|up| up.has(var));
-                    let way = links.iter().find(carries).map_or(LinkId::MODBUS, |link| link.id);
-                    let safe = config.ports[nth].on_timeout.of(&config.safe_values);
-                    let safe = safe.iter().find(|safe| safe.var == var).map(|safe| {
-                        let mut raw = Raw::default();
-                        safe.value.encode(&mut raw);
-                        raw
-                    });
-                    let shows_validity = |field: &FieldSpec| {
-                        *field == FieldSpec::InputRule(InputRule::ValidTo { var, bit: None })
-                    };
-                    let safe = safe.or_else(|| part.fields.iter().any(shows_validity).then(Raw::default));
-                    owned[var.ordinal()] = Some(Owned { port: nth, frame, way, safe });
-                }
-            }
-        }
+        let mut links = links(config);
+        let owned = owners(config, &ports, &links);
         let mut read_back = [false; COUNT];
         for link in &mut links {
             if !link.is_datagram {
@@ -246,15 +194,7 @@ impl Spec {
         let is_safe = |var: &SysVar| owned[var.ordinal()].is_some_and(|owned: Owned| owned.safe.is_some());
         let safe_vars = SysVar::all().filter(is_safe).collect();
         let has_triggers = ports.iter().any(|port| matches!(port.send, SendOn::Rising { .. }));
-        let brings = |link: &LinkSpec, var| link.output.as_ref().is_some_and(|down| down.shows(var));
-        let mut witness = [None; COUNT];
-        for nth in 1..=3 {
-            let both = [format!("DigitalOutputCommand[{nth}]"), format!("DigitalSignalStatus[{}]", nth + 3)];
-            let [Ok(input), Ok(output)] = both.map(|name| SysVar::parse(&name)) else { continue };
-            let is_there =
-                origin[output.ordinal()].is_some() || links.iter().any(|link| brings(link, output));
-            witness[input.ordinal()] = is_there.then_some(output);
-        }
+        let witness = witnesses(&links, &origin);
         Self {
             shares: shares(config, &ports),
             ports,
@@ -296,117 +236,8 @@ impl Spec {
     }
 }
 
-impl Frame {
-    pub(super) fn len(&self) -> usize {
-        self.head.len() + self.payload + self.tail.len()
-    }
-
-    pub(super) fn has(&self, var: SysVar) -> bool {
-        self.written.contains(&var)
-    }
-
-    fn shows(&self, var: SysVar) -> bool {
-        self.shown.contains(&var)
-    }
-
-    /// The fields' bytes; `None` if head, tail or length differ.
-    pub(super) fn payload_of<'b>(&self, bytes: &'b [u8]) -> Option<&'b [u8]> {
-        let rest = bytes.strip_prefix(self.head.as_slice())?.strip_suffix(self.tail.as_slice())?;
-        (self.varies || rest.len() == self.payload).then_some(rest)
-    }
-}
-
-/// The variables that an input field writes: one, or those of a text.
-pub(super) fn written(field: &FieldSpec) -> impl Iterator<Item = SysVar> + use<> {
-    let (words, others) = match *field {
-        FieldSpec::System(var)
-        | FieldSpec::UserInput { to: InputBinding::Variable { var, .. }, .. }
-        | FieldSpec::DeviceInput { to: InputBinding::Variable { var, .. }, .. } => (None, [Some(var), None]),
-        FieldSpec::TextInput { to, length_to, count_to, .. } => (to, [length_to, count_to]),
-        FieldSpec::InputRule(InputRule::ValidTo { var, bit: None }) => (None, [Some(var), None]),
-        FieldSpec::UserInput { .. }
-        | FieldSpec::UserOutput { .. }
-        | FieldSpec::DeviceInput { .. }
-        | FieldSpec::DeviceOutput { .. }
-        | FieldSpec::Fixed { .. }
-        | FieldSpec::Padding { .. }
-        | FieldSpec::Checksum(_)
-        | FieldSpec::TextOutput { .. }
-        | FieldSpec::Length(_)
-        | FieldSpec::Limits(_)
-        | FieldSpec::Mapped(_)
-        | FieldSpec::InputRule(_) => (None, [None, None]),
-    };
-    words.into_iter().flat_map(Words::iter).chain(others.into_iter().flatten())
-}
-
-/// The variables that an output field shows.
-pub(super) fn shown(field: &FieldSpec) -> impl Iterator<Item = SysVar> + use<> {
-    let (words, other) = match *field {
-        FieldSpec::System(var) => (None, Some(var)),
-        FieldSpec::UserOutput { from, .. } | FieldSpec::DeviceOutput { from, .. } => match from {
-            OutputBinding::Variable { var, .. } | OutputBinding::Bit { var, .. } => (None, Some(var)),
-            OutputBinding::Constant(_)
-            | OutputBinding::Counter
-            | OutputBinding::CounterTo { .. }
-            | OutputBinding::Reply
-            | OutputBinding::State { .. }
-            | OutputBinding::Port { .. }
-            | OutputBinding::Link { .. } => (None, None),
-        },
-        FieldSpec::TextOutput { from, length_from, .. } => (Some(from), length_from),
-        FieldSpec::UserInput { .. }
-        | FieldSpec::DeviceInput { .. }
-        | FieldSpec::Fixed { .. }
-        | FieldSpec::Padding { .. }
-        | FieldSpec::Checksum(_)
-        | FieldSpec::TextInput { .. }
-        | FieldSpec::Length(_)
-        | FieldSpec::Limits(_)
-        | FieldSpec::Mapped(_)
-        | FieldSpec::InputRule(_) => (None, None),
-    };
-    words.into_iter().flat_map(Words::iter).chain(other)
-}
-
-/// The size of a plain recipe's field.
-pub(super) fn size(field: &FieldSpec) -> usize {
-    match field {
-        FieldSpec::System(var) => var.size(),
-        FieldSpec::UserInput { ty, .. } | FieldSpec::UserOutput { ty, .. } => ty.size(),
-        _ => 0,
-    }
-}
-
 fn by_modbus(var: SysVar) -> bool {
     matches!(var.modbus(), Some(ModbusPlace::Coils { .. } | ModbusPlace::Register { .. }))
-}
-
-pub(super) fn frame(head: &[u8], tail: &[u8], id: Option<CanId>, fields: &[FieldSpec]) -> Frame {
-    if fields.iter().any(FieldSpec::is_device) {
-        return device_frame(head, tail, id, fields);
-    }
-    let payload = fields.iter().map(size).sum();
-    Frame { payload, ..any_frame(head, tail, id, fields) }
-}
-
-/// A frame of a device's recipe, also one that a plain recipe could have.
-pub(super) fn device_frame(head: &[u8], tail: &[u8], id: Option<CanId>, fields: &[FieldSpec]) -> Frame {
-    let varies = fields.iter().any(varies);
-    let device = if varies { DeviceSpec::default() } else { DeviceSpec::new(head.len(), fields) };
-    Frame { payload: device.len, device: Some(device), varies, ..any_frame(head, tail, id, fields) }
-}
-
-fn any_frame(head: &[u8], tail: &[u8], id: Option<CanId>, fields: &[FieldSpec]) -> Frame {
-    Frame {
-        head: head.to_vec(),
-        tail: tail.to_vec(),
-        id,
-        fields: fields.to_vec(),
-        written: fields.iter().flat_map(written).collect(),
-        shown: fields.iter().flat_map(shown).collect(),
-        ..Frame::default()
-    }
 }
 
 fn frames(config: &GatewayConfig, recipe: &Recipe, direction: Direction) -> Vec<Frame> {
@@ -478,6 +309,62 @@ fn port_spec(config: &GatewayConfig, port: &proto_core::config::Port) -> PortSpe
         exchanges,
         served,
     }
+}
+
+/// The recipe links, that of the UDP server first.
+fn links(config: &GatewayConfig) -> Vec<LinkSpec> {
+    let mut links: Vec<LinkSpec> = Vec::new();
+    if let Some(own) = config.controller.recipe_link {
+        let recipe = &config.recipes[usize::from(own.recipe)];
+        links.push(link_spec(config, LinkId::RECIPE_UDP, recipe, true));
+    }
+    for (nth, port) in config.ports.iter().enumerate() {
+        let recipe = &config.recipes[usize::from(port.recipe)];
+        let id = LinkId::of_port(PortId(nth as u8));
+        match port.bus {
+            Bus::TcpListen { .. } => links.push(link_spec(config, id, recipe, false)),
+            Bus::UdpListen { .. } => links.push(link_spec(config, id, recipe, true)),
+            Bus::Rs485(_) | Bus::Can { .. } | Bus::ModbusTcp { .. } => {}
+        }
+    }
+    links
+}
+
+/// The owners of variables.
+fn owners(config: &GatewayConfig, ports: &[PortSpec], links: &[LinkSpec]) -> [Option<Owned>; COUNT] {
+    let mut owned = [None; COUNT];
+    for (nth, port) in ports.iter().enumerate().filter(|(_, port)| port.is_field) {
+        for (frame, part) in port.inputs.iter().enumerate() {
+            for &var in &part.written {
+                let carries = |link: &&LinkSpec| link.input.as_ref().is_some_and(|up| up.has(var));
+                let way = links.iter().find(carries).map_or(LinkId::MODBUS, |link| link.id);
+                let safe = config.ports[nth].on_timeout.of(&config.safe_values);
+                let safe = safe.iter().find(|safe| safe.var == var).map(|safe| {
+                    let mut raw = Raw::default();
+                    safe.value.encode(&mut raw);
+                    raw
+                });
+                let shows_validity =
+                    |field: &FieldSpec| *field == FieldSpec::InputRule(InputRule::ValidTo { var, bit: None });
+                let safe = safe.or_else(|| part.fields.iter().any(shows_validity).then(Raw::default));
+                owned[var.ordinal()] = Some(Owned { port: nth, frame, way, safe });
+            }
+        }
+    }
+    owned
+}
+
+/// The outputs that show an input's value at the controller.
+fn witnesses(links: &[LinkSpec], origin: &[Option<Origin>; COUNT]) -> [Option<SysVar>; COUNT] {
+    let brings = |link: &LinkSpec, var| link.output.as_ref().is_some_and(|down| down.shows(var));
+    let mut witness = [None; COUNT];
+    for nth in 1..=3 {
+        let both = [format!("DigitalOutputCommand[{nth}]"), format!("DigitalSignalStatus[{}]", nth + 3)];
+        let [Ok(input), Ok(output)] = both.map(|name| SysVar::parse(&name)) else { continue };
+        let is_there = origin[output.ordinal()].is_some() || links.iter().any(|link| brings(link, output));
+        witness[input.ordinal()] = is_there.then_some(output);
+    }
+    witness
 }
 
 fn link_spec(config: &GatewayConfig, id: LinkId, recipe: &Recipe, is_datagram: bool) -> LinkSpec {

@@ -424,7 +424,7 @@ fn a_port_needs_what_its_frames_show_and_the_bit_that_triggers_them() {
         let spec = Spec::new(&scenario.gateway);
         for port in &spec.ports {
             let fields = port.outputs.iter().flat_map(|frame| &frame.fields);
-            let mut expected: Vec<SysVar> = fields.flat_map(spec::shown).collect();
+            let mut expected: Vec<SysVar> = fields.flat_map(frame::shown).collect();
             if let SendOn::Rising { var, .. } = port.send {
                 expected.push(var);
                 triggers += 1;

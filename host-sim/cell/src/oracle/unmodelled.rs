@@ -6,9 +6,11 @@ use proto_core::config::{
 };
 use proto_core::device::Boundary;
 
-use super::device::{can_be_the_same, is_written_by_model, varies};
-use super::exchanges::spec::RowSpec;
-use super::spec::{Frame, LinkSpec, PortSpec, Share, Spec};
+use super::device::{is_written_by_model, varies};
+use super::frame::Frame;
+use super::spec::exchanges::RowSpec;
+use super::spec::{LinkSpec, PortSpec, Share, Spec};
+use super::varying::can_be_the_same;
 
 /// Why a configuration cannot be judged, if it cannot.
 pub(crate) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {

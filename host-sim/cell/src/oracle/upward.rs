@@ -1,6 +1,8 @@
 //! The values that are to be written to the controller, and the checks of each write
 //! (proto-core/docs/engine.md section 5).
 
+mod bits;
+
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use proto_core::engine::LinkId;
@@ -9,10 +11,11 @@ use proto_core::time::{Duration, Instant};
 use proto_core::wire::scalar::ScalarType;
 
 use super::Invariant;
-use super::bits::Waits;
 use super::field::{Accepted, show};
+use super::frame::Raw;
 use super::invariant::Wrong;
-use super::spec::{LinkSpec, Origin, Owned, Raw, Spec};
+use super::spec::{LinkSpec, Origin, Owned, Spec};
+use bits::Waits;
 
 /// Maximum number of values per port that wait behind the next ones.
 pub(super) const EDGES: usize = 16;

@@ -1,5 +1,5 @@
-//! Frames of varying length, the texts in them, and what cuts them: docs/configuration.md section 4, "Frames
-//! of varying length".
+//! What bytes are, seen as a frame; frames of varying length and the texts in them: docs/configuration.md section 4,
+//! "Frames of varying length".
 //!
 //! Written from that page, independent of the engine's layouts and cutters. In: a frame and bytes. Out: the
 //! places of the fields in these bytes, as of a frame whose fields always have the same length.
@@ -7,12 +7,11 @@
 use std::ops::Range;
 
 use proto_core::config::{FieldSpec, Words};
-use proto_core::device::{Boundary, ByteOrder, Counts, Text, TextWidth};
+use proto_core::device::{ByteOrder, Counts, Encoding, Text, TextWidth};
 use proto_core::sysvar::SysVar;
 
-use super::device::{DeviceSpec, Look, MAX_TEXT, Seen, Size, read, size};
-use super::field::{LineWatch, Verdict};
-use super::spec::{Frame, PortSpec, Raw};
+use super::device::{DeviceSpec, Look, MAX_TEXT, Seen, Size, constant, read, size};
+use super::frame::{Frame, Raw};
 
 /// Why whole bytes are no frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -128,8 +127,49 @@ pub(super) fn see(frame: &Frame, whole: &[u8]) -> Result<(DeviceSpec, Seen), Unl
     Ok((spec, seen))
 }
 
-/// What bytes of a line are, seen as such a frame that is searched: its length stands in front of what varies.
+/// What bytes of a line are, seen as this frame.
 pub(super) fn look(frame: &Frame, bytes: &[u8]) -> Look {
+    if frame.varies {
+        return look_varying(frame, bytes);
+    }
+    let seen = bytes.len().min(frame.head.len());
+    if bytes[..seen] != frame.head[..seen] {
+        return Look::No;
+    }
+    let Some(whole) = bytes.get(..frame.len()) else {
+        let is_ours = frame.device.as_ref().is_some_and(|device| device.agrees(&frame.fields, bytes));
+        return Look::Begins { is_ours };
+    };
+    let Some(device) = frame.device.as_ref().filter(|_| whole.ends_with(&frame.tail)) else {
+        return Look::No;
+    };
+    match device.see(&frame.fields, whole) {
+        Seen::Ours => Look::Frame(whole.len()),
+        Seen::Other => Look::Other(whole.len()),
+        Seen::WrongChecksum => Look::Wrong(whole.len()),
+        Seen::Nothing => Look::No,
+    }
+}
+
+/// Whether two frames of the same direction can have the same bytes, so that nobody could tell them apart.
+pub(super) fn can_be_the_same(one: &Frame, other: &Frame) -> bool {
+    let (Some(of_one), Some(of_other)) = (&one.device, &other.device) else { return false };
+    let constants = |frame: &'_ Frame, device: &'_ DeviceSpec| -> Vec<(Range<usize>, Encoding, u64)> {
+        let fields = frame.fields.iter().zip(&device.places);
+        let of = |(field, place): (&FieldSpec, &Range<usize>)| {
+            constant(field).map(|(encoding, value)| (place.clone(), encoding, value.to_bits()))
+        };
+        fields.filter_map(of).collect()
+    };
+    let others = constants(other, of_other);
+    let differ = constants(one, of_one).into_iter().any(|(place, encoding, value)| {
+        others.iter().any(|other| (&other.0, &other.1) == (&place, &encoding) && other.2 != value)
+    });
+    (one.id, &one.head, &one.tail, one.len()) == (other.id, &other.head, &other.tail, other.len()) && !differ
+}
+
+/// What bytes of a line are, seen as such a frame that is searched: its length stands in front of what varies.
+fn look_varying(frame: &Frame, bytes: &[u8]) -> Look {
     let seen = bytes.len().min(frame.head.len());
     let (shortest, longest) = lengths(frame);
     if bytes[..seen] != frame.head[..seen] {
@@ -215,106 +255,3 @@ pub(super) fn field_of(text: Text, characters: &[u8]) -> Option<Vec<u8>> {
     }
     (bytes.len() <= MAX_TEXT).then_some(bytes)
 }
-
-/// What came between two ends.
-pub(super) enum Piece {
-    Whole(Vec<u8>),
-    TooLong,
-    /// Its beginning is missing.
-    Cut,
-}
-
-/// Frames that end with a tail, or with silence.
-#[derive(Debug, Clone, Copy, Default)]
-pub(super) struct CutWatch {
-    /// Bytes before those that are held are missing.
-    is_cut: bool,
-    /// Bytes of a tail whose beginning may have been discarded: the newest eight.
-    before: [u8; 8],
-    before_len: usize,
-}
-
-impl LineWatch {
-    /// Bytes came on a line whose frames are cut; `late` says that there may have been silence before them.
-    /// Returns what has ended.
-    pub(super) fn cut_bytes(&mut self, cut: Boundary, tail: &[u8], bytes: &[u8], late: bool) -> Vec<Piece> {
-        let mut pieces = Vec::new();
-        if cut == Boundary::Silence && late && (!self.held.is_empty() || self.cut.is_cut) {
-            self.cut_off();
-        }
-        for &byte in bytes {
-            self.held.push(byte);
-            if cut == Boundary::Tail && self.ends_with(tail) {
-                pieces.push(self.cut_piece());
-            }
-        }
-        pieces
-    }
-
-    fn ends_with(&self, tail: &[u8]) -> bool {
-        let before = &self.cut.before[..self.cut.before_len];
-        [before, &self.held[..]].concat().ends_with(tail)
-    }
-
-    /// Whether silence has something to end.
-    pub(super) fn cut_has_begun(&self, cut: Boundary) -> bool {
-        !self.held.is_empty() || cut == Boundary::Silence && self.cut.is_cut
-    }
-
-    /// What is held has ended.
-    pub(super) fn cut_piece(&mut self) -> Piece {
-        let was_cut = std::mem::take(&mut self.cut).is_cut;
-        let bytes = std::mem::take(&mut self.held);
-        if was_cut {
-            self.discarded += bytes.len().min(LONGEST) as u64;
-            self.frame_bytes += bytes.len().saturating_sub(LONGEST) as u64;
-            return Piece::Cut;
-        }
-        self.frame_bytes += bytes.len() as u64;
-        if bytes.len() > LONGEST { Piece::TooLong } else { Piece::Whole(bytes) }
-    }
-
-    /// Silence, or bytes are missing: what comes up to the next end is dropped with what is held.
-    pub(super) fn cut_off(&mut self) {
-        let newest = self.held.iter().rev().take(8).rev().copied();
-        let before = self.cut.before[..self.cut.before_len].iter().copied();
-        let newest: Vec<u8> = before.chain(newest).collect();
-        let newest = &newest[newest.len().saturating_sub(8)..];
-        let was_cut = self.cut.is_cut || !self.held.is_empty();
-        self.cut = CutWatch { is_cut: was_cut, before: [0; 8], before_len: newest.len() };
-        self.cut.before[..newest.len()].copy_from_slice(newest);
-        self.discarded += self.held.len().min(LONGEST) as u64;
-        self.frame_bytes += self.held.len().saturating_sub(LONGEST) as u64;
-        self.held.clear();
-    }
-}
-
-impl LineWatch {
-    /// These bytes are lost: what they began cannot be trusted.
-    pub(super) fn lose(&mut self, port: &PortSpec, bytes: &[u8]) {
-        let Some(frame) = port.inputs.first().filter(|_| port.framing != Boundary::Fields) else { return };
-        let counted = (self.discarded, self.frame_bytes);
-        self.cut_bytes(port.framing, &frame.tail, bytes, false);
-        self.cut_off();
-        (self.discarded, self.frame_bytes) = counted;
-    }
-
-    /// What came between two ends is a frame as a whole, or rejected as a whole.
-    pub(super) fn judge_piece(&mut self, port: &PortSpec, piece: &Piece) -> Option<Verdict> {
-        let whole = match piece {
-            Piece::Whole(whole) => whole,
-            Piece::TooLong => return Some(Verdict::WrongLength),
-            Piece::Cut => return None,
-        };
-        let frame = port.inputs.first()?;
-        Some(match see(frame, whole) {
-            Ok((_, Seen::Ours)) => self.judge(frame, 0, whole),
-            Ok((_, Seen::Other | Seen::Nothing)) | Err(Unlike::Content) => Verdict::OtherDevice,
-            Ok((_, Seen::WrongChecksum)) => Verdict::WrongChecksum,
-            Err(Unlike::Length) => Verdict::WrongLength,
-        })
-    }
-}
-
-/// No frame is longer.
-const LONGEST: usize = 512;

@@ -7,9 +7,10 @@ use proto_core::sysvar::{COUNT, Direction, ModbusPlace, SysVar};
 use proto_core::time::{Duration, Instant};
 
 use super::Invariant;
-use super::bits::Coils;
+use super::field::Coils;
+use super::frame::Raw;
 use super::invariant::Wrong;
-use super::spec::{Raw, Spec};
+use super::spec::Spec;
 
 /// A request without an answer is given up after this.
 const ANSWER: Duration = Duration::from_millis(500);

@@ -1,7 +1,7 @@
 //! The bindings of fields and the triggers of output parts in a gateway file.
 
 use proto_core::config::{InputBinding, OnStale, OutputBinding, SendOn};
-use proto_core::device::{Encoding, Overflow};
+use proto_core::device::Encoding;
 use proto_core::sysvar::{SysVar, VarBit};
 
 use super::commands::{self, FileCommands};
@@ -11,11 +11,7 @@ use super::names::meant_variable;
 use super::reader::{Result, TableReader, TableValue};
 use super::sources::{self, FileSource};
 use crate::keys::field::COUNTER_TABLE;
-
-/// The words of `on_stale`.
-pub(crate) const ON_STALES: [(&str, OnStale); 2] = [("hold", OnStale::Hold), ("stop", OnStale::Stop)];
-/// The words of `overflow`.
-pub(crate) const OVERFLOWS: [(&str, Overflow); 1] = [("wrap", Overflow::Wrap)];
+use crate::keys::recipe::ON_STALES;
 
 pub(super) fn read_on_stale(item: &TableValue<'_>) -> Result<OnStale> {
     item.choice(&ON_STALES)

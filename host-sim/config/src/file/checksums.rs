@@ -3,22 +3,14 @@
 //! In: its table, and the fields of the frame so far. Out: a checksum among the fields, at its place.
 
 use proto_core::config::FieldSpec;
-use proto_core::device::{Algorithm, ByteOrder, Checksum, Crc, DataId, Element, MAX_DATA_ID, TextWidth};
+use proto_core::device::{Algorithm, Checksum, Crc, DataId, Element, MAX_DATA_ID, TextWidth};
 use proto_core::recipe::model::MAX_STREAM_FRAME;
 
 use super::encoding::refuse;
 use super::model::FileField;
 use super::names::meant_checksum;
 use super::reader::{Result, TableReader, TableValue};
-use crate::keys::device;
-
-/// The words of `order` of a checksum.
-pub(crate) const CHECKSUM_ORDERS: [(&str, ByteOrder); 2] =
-    [("little", ByteOrder::Little), ("big", ByteOrder::Big)];
-/// The words of `as`, and whether they are digits.
-pub(crate) const CHECKSUM_FORMS: [(&str, bool); 2] = [("bytes", false), ("hex", true)];
-/// The words of `data_id_at`, and whether the bytes are behind the frame's.
-pub(crate) const DATA_ID_PLACES: [(&str, bool); 2] = [("start", false), ("end", true)];
+use crate::keys::device::{self, CHECKSUM_FORMS, CHECKSUM_ORDERS, DATA_ID_PLACES};
 
 /// Reads the checksum of a frame and puts it at its place among the fields.
 pub(super) fn read_checksum(frame: &TableReader<'_>, head: usize, fields: &mut Vec<FileField>) -> Result<()> {

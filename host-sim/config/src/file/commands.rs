@@ -7,13 +7,7 @@ use proto_core::config::CommandWhen;
 
 use super::reader::{Result, Spot, TableReader, TableValue};
 use crate::device::FieldCommands;
-use crate::keys::field::{IDLE, WHEN};
-
-/// The words of `when`.
-pub(crate) const WHENS: [(&str, CommandWhen); 2] =
-    [("change", CommandWhen::Change), ("frame", CommandWhen::Frame)];
-/// The words of `base`, and whether the base is kept.
-pub(crate) const BASES: [(&str, bool); 2] = [("reset", false), ("keep", true)];
+use crate::keys::field::{BASES, IDLE, WHEN, WHENS};
 
 /// What the values of a field pick, and when, with the places of the entries.
 pub(super) type FileCommands = (FieldCommands, Vec<Spot>);

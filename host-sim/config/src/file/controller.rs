@@ -15,11 +15,12 @@ use super::recipes;
 use crate::TargetError;
 use crate::functions::Functions;
 use crate::keys;
-use crate::keys::controller::{CLIENTS, COMMAND, CONTROL, MODBUS, MODE, POWER, STATE, UDP2011};
-use crate::keys::gateway::{BITRATE, CYCLE};
-use crate::sim::{
-    CommandClients, Initial, Listen, Power, Robot, RobotMode, SimBus, SimConfig, SimPort, SimProgram,
+use crate::keys::controller::{
+    BUSES, BusKind, CLIENTS, COMMAND, COMMAND_CLIENTS, CONTROL, MODBUS, MODE, MODES, POWER, POWERS, STATE,
+    UDP2011,
 };
+use crate::keys::gateway::{BITRATE, CYCLE};
+use crate::sim::{Initial, Listen, Robot, SimBus, SimConfig, SimPort, SimProgram};
 use crate::target::InitialTarget;
 
 /// Reads the whole file and checks it.
@@ -72,21 +73,6 @@ fn read_listen(root: &TableReader<'_>) -> Result<Listen> {
     }
     Ok(listen)
 }
-
-/// The words of `power`.
-pub(crate) const POWERS: [(&str, Power); 4] =
-    [("boot", Power::Boot), ("off", Power::Off), ("on", Power::On), ("enabled", Power::Enabled)];
-
-/// The words of `mode` of the robot.
-pub(crate) const MODES: [(&str, RobotMode); 3] =
-    [("manual", RobotMode::Manual), ("auto", RobotMode::Auto), ("remote", RobotMode::Remote)];
-
-/// The words of `command_clients`.
-pub(crate) const COMMAND_CLIENTS: [(&str, CommandClients); 3] = [
-    ("many", CommandClients::Many),
-    ("one", CommandClients::RefuseSecond),
-    ("newest", CommandClients::DropFirst),
-];
 
 fn read_robot(root: &TableReader<'_>) -> Result<Robot> {
     let mut robot = Robot::default();
@@ -145,25 +131,6 @@ fn read_value(target: InitialTarget, item: &TableValue<'_>) -> Result<f64> {
         }
     }
 }
-
-/// What a port of a controller is.
-#[derive(Clone, Copy, PartialEq, Eq)]
-pub(crate) enum BusKind {
-    Rs485,
-    Can,
-    UdpServer,
-    TcpClient,
-    UdpClient,
-}
-
-/// The words of `bus`.
-pub(crate) const BUSES: [(&str, BusKind); 5] = [
-    ("rs485", BusKind::Rs485),
-    ("can", BusKind::Can),
-    ("udp-server", BusKind::UdpServer),
-    ("tcp-client", BusKind::TcpClient),
-    ("udp-client", BusKind::UdpClient),
-];
 
 fn read_ports(root: &TableReader<'_>, recipes: &[FileRecipe]) -> Result<Vec<SimPort>> {
     let mut ports: Vec<SimPort> = Vec::new();

@@ -10,14 +10,14 @@ use proto_core::recipe::model::{MAX_CAN_IDS, MAX_DELIMITER, Mode, Rules};
 use proto_core::sysvar::Direction;
 use proto_core::wire::scalar::ScalarType;
 
-use super::bindings::{self, OVERFLOWS};
+use super::bindings;
 use super::encoding::{self, FieldOrder, OpenNumber, refuse};
 use super::framings;
 use super::model::{FileExchange, FileField, FileFrame, FilePart, FileRecipe, Flavour};
 use super::reader::{Result, Spot, TableReader, TableValue};
 use super::{input_rules, rtu_frames, sendable};
 use crate::device::{DeviceField, DeviceRecipe, ExchangeKind, FrameEnds, NamedExchange, NamedFrame};
-use crate::keys::field::{self, EQUALS, FILL, OVERFLOW, PAD};
+use crate::keys::field::{self, EQUALS, FILL, OVERFLOW, OVERFLOWS, PAD};
 use crate::keys::frame::{OF_FRAME, OF_STREAM};
 use crate::keys::{Key, names};
 

@@ -7,39 +7,8 @@ use proto_core::wire::scalar::ScalarType;
 
 use super::names::meant_type;
 use super::reader::{Result, TableReader, TableValue};
-use crate::keys::device::{ENDIAN, WORD_ORDER};
-use crate::keys::field::{DECIMALS, SIGNED};
-
-/// The types of fields.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Type {
-    Scalar(ScalarType),
-    Uint24,
-    Int24,
-    Bcd,
-    Decimal,
-    Hex,
-    /// An unsigned number of so many bytes that is too wide for a value, but has bits.
-    Wide(u8),
-}
-
-/// The types that only a device's frames have.
-pub(crate) const OWN_TYPES: [(&str, Type); 9] = [
-    ("uint24", Type::Uint24),
-    ("int24", Type::Int24),
-    ("bcd", Type::Bcd),
-    ("decimal", Type::Decimal),
-    ("hex", Type::Hex),
-    ("uint40", Type::Wide(5)),
-    ("uint48", Type::Wide(6)),
-    ("uint56", Type::Wide(7)),
-    ("uint64", Type::Wide(8)),
-];
-
-/// The words of `endian`, and whether they are big-endian.
-pub(crate) const ORDERS: [(&str, bool); 2] = [("little", false), ("big", true)];
-/// The words of `word_order`, and whether the low word is first.
-pub(crate) const WORD_ORDERS: [(&str, bool); 2] = [("high-first", false), ("low-first", true)];
+use crate::keys::device::{ENDIAN, ORDERS, WORD_ORDER, WORD_ORDERS};
+use crate::keys::field::{DECIMALS, OWN_TYPES, SIGNED, Type};
 
 /// The byte order that a part or a field asks for.
 #[derive(Debug, Clone, Copy, Default)]

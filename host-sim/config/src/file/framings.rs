@@ -4,15 +4,15 @@
 
 use proto_core::config::{FieldSpec, Words};
 use proto_core::device::{
-    Boundary, ByteOrder, Counts, Encoding, Escape, Ignored, Length, MAX_IGNORED, Text, TextWidth,
+    Boundary, ByteOrder, Encoding, Escape, Ignored, Length, MAX_IGNORED, Text, TextWidth,
 };
 use proto_core::sysvar::{Direction, SysVar, VarRange};
 
 use super::encoding::refuse;
 use super::names::meant_variable;
 use super::reader::{Result, TableReader, TableValue};
-use crate::keys::device::{ESCAPE, FRAMING};
-use crate::keys::field::{COUNTS as COUNTS_KEY, PLUS, TEXT_IN, TEXT_ORDER, TEXT_OUT, TEXT_WIDTH};
+use crate::keys::device::{ESCAPE, ESCAPES, FRAMING, FRAMINGS};
+use crate::keys::field::{ALL_COUNTS, COUNTS, PLUS, TEXT_IN, TEXT_ORDER, TEXT_ORDERS, TEXT_OUT, TEXT_WIDTH};
 
 /// The keys of a stream part.
 pub(super) const PART_KEYS: [&str; 2] = ["framing", "escape"];
@@ -20,19 +20,6 @@ pub(super) const PART_KEYS: [&str; 2] = ["framing", "escape"];
 pub(super) const TEXT_KEYS: [&str; 5] = ["length_to", "count_to", "length_from", "order", "ignore"];
 /// Those of a length.
 pub(super) const LENGTH_KEYS: [&str; 3] = ["length", "counts", "plus"];
-
-/// The words of `framing`.
-pub(crate) const FRAMINGS: [(&str, Boundary); 3] =
-    [("fields", Boundary::Fields), ("tail", Boundary::Tail), ("silence", Boundary::Silence)];
-/// The words of `escape`.
-pub(crate) const ESCAPES: [(&str, Escape); 3] =
-    [("dle", Escape::Dle), ("slip", Escape::Slip), ("cobs", Escape::Cobs)];
-/// The words of `order` of a text.
-pub(crate) const TEXT_ORDERS: [(&str, ByteOrder); 2] =
-    [("high-first", ByteOrder::Big), ("low-first", ByteOrder::Little)];
-/// The words of `counts`.
-pub(crate) const COUNTS: [(&str, Counts); 3] =
-    [("rest", Counts::Rest), ("frame", Counts::Frame), ("fields", Counts::Fields)];
 
 /// `framing` and `escape` of a stream part.
 pub(super) fn read_part(part: &TableReader<'_>) -> Result<(Boundary, Option<Escape>)> {
@@ -122,7 +109,7 @@ pub(super) fn read_length(field: &TableReader<'_>, encoding: Encoding) -> Result
     if !encoding.is_integer() || encoding.size().is_none() {
         return Err(item.error("a length is an integer in a fixed number of bytes"));
     }
-    let counts = field.word_or(&COUNTS_KEY, &COUNTS)?;
+    let counts = field.word_or(&COUNTS, &ALL_COUNTS)?;
     let plus = field.integer_or(&PLUS)?;
     Ok(FieldSpec::Length(Length { encoding, counts, plus }))
 }

@@ -15,7 +15,7 @@ use proto_core::wire::dialect::Dialect;
 use super::FileError;
 use super::document::{At, SourceTree};
 use super::lines::read_line;
-use super::model::{FileRecipe, Flavour, RecipeKind};
+use super::model::{FileRecipe, Flavour};
 use super::names::meant_variable;
 use super::network::{self, check_ipv4};
 use super::reader::{Result, Spot, TableReader, TableValue};
@@ -23,9 +23,10 @@ use super::recipes;
 use super::sources;
 use crate::keys;
 use crate::keys::gateway::{
-    ABSENT, BITRATE, COMMAND, CYCLE, ECHO, ECHOES, LINK_UDP, MODBUS, REFRESH, SAFE_AT_START, STALE_AFTER,
-    STATE, TIMEOUT, UDP2011,
+    ABSENT, BITRATE, BUSES, BusKind, COMMAND, CYCLE, ECHO, ECHOES, LINK_UDP, MODBUS, REFRESH, SAFE_AT_START,
+    STALE_AFTER, STATE, TIMEOUT, UDP2011,
 };
+use crate::keys::recipe::RecipeKind;
 
 /// Reads the whole file and checks it.
 pub(super) fn read(document: &SourceTree) -> Result<Box<GatewayConfig>> {
@@ -57,35 +58,7 @@ pub(super) fn read(document: &SourceTree) -> Result<Box<GatewayConfig>> {
     }
 }
 
-/// What a port of a gateway is.
-#[derive(Clone, Copy, PartialEq, Eq)]
-pub(crate) enum BusKind {
-    Rs485,
-    ModbusMaster,
-    ModbusSlave,
-    ModbusTcp,
-    Can,
-    TcpListen,
-    UdpListen,
-}
-
-/// The words of `bus`.
-pub(crate) const BUSES: [(&str, BusKind); 7] = [
-    ("rs485", BusKind::Rs485),
-    ("modbus-rtu", BusKind::ModbusMaster),
-    ("modbus-rtu-slave", BusKind::ModbusSlave),
-    ("modbus-tcp", BusKind::ModbusTcp),
-    ("can", BusKind::Can),
-    ("tcp-listen", BusKind::TcpListen),
-    ("udp-listen", BusKind::UdpListen),
-];
-
 impl BusKind {
-    /// As files have it.
-    fn name(self) -> &'static str {
-        BUSES.iter().find(|(_, bus)| *bus == self).map_or("", |(name, _)| name)
-    }
-
     /// A recipe of Modbus and its line go together.
     fn check_modbus(self, recipe: &FileRecipe) -> std::result::Result<(), String> {
         let wanted = match self {

@@ -13,13 +13,8 @@ use super::model::FileField;
 use super::names::meant_variable;
 use super::reader::{Result, Spot, TableReader, TableValue};
 use super::sendable::{add_entry, behind, read_limits};
-use crate::keys::field::{AS, POINT, RESTARTED, RULES_IN};
+use crate::keys::field::{AS, AS_WORDS, POINT, POINTS, RESTARTED, RULES_IN};
 use crate::keys::names;
-
-/// The words of `as`.
-pub(crate) const AS_WORDS: [(&str, InputRule); 1] = [("int16", InputRule::Int16)];
-/// The words of `point`.
-pub(crate) const POINTS: [(&str, Option<InputRule>); 2] = [(".", None), (",", Some(InputRule::Comma))];
 
 /// What stands behind an input field, with the places of their keys.
 pub(super) fn read(

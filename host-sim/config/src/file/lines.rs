@@ -1,13 +1,9 @@
 //! The keys that ports have in both kinds of files.
 
-use proto_core::config::{Parity, PortKey, Rs485};
+use proto_core::config::{PortKey, Rs485};
 
 use super::reader::{Result, TableReader};
-use crate::keys::gateway::{BAUD, IDLE_GAP, PARITY, STOP_BITS, TURNAROUND};
-
-/// The words of `parity`.
-pub(crate) const PARITIES: [(&str, Parity); 3] =
-    [("none", Parity::None), ("even", Parity::Even), ("odd", Parity::Odd)];
+use crate::keys::gateway::{BAUD, IDLE_GAP, PARITIES, PARITY, STOP_BITS, TURNAROUND};
 
 /// The settings of a serial line, within their ranges; `usual` makes the default silences.
 pub(super) fn read_line(port: &TableReader<'_>, usual: fn(Rs485) -> Rs485) -> Result<Rs485> {

@@ -3,32 +3,32 @@
 //! In: a file and its `--set` overrides. Out: `GatewayConfig` or `SimConfig`. Every mistake is one
 //! [`FileError`]; the keys are those of docs/configuration.md.
 
-pub(crate) mod bindings;
-pub(crate) mod checksums;
+mod bindings;
+mod checksums;
 mod coils;
-pub(crate) mod commands;
-pub(crate) mod controller;
-pub(crate) mod device;
+mod commands;
+mod controller;
+mod device;
 mod document;
-pub(crate) mod encoding;
+mod encoding;
 mod error;
 mod exchanges;
 mod frames;
-pub(crate) mod framings;
+mod framings;
 mod functions;
-pub(crate) mod gateway;
-pub(crate) mod input_rules;
+mod gateway;
+mod input_rules;
 mod inventory;
-pub(crate) mod lines;
-pub(crate) mod modbus;
-pub(crate) mod model;
+mod lines;
+mod modbus;
+mod model;
 mod names;
 mod network;
 mod order;
 mod reader;
-pub(crate) mod recipes;
+mod recipes;
 mod rtu_frames;
-pub(crate) mod sendable;
+mod sendable;
 mod sources;
 mod sparkplug;
 

@@ -16,35 +16,14 @@ use super::exchanges;
 use super::model::{FileExchange, FileField, FileFrame, FilePart};
 use super::reader::{Result, TableReader, TableValue};
 use crate::device::ExchangeKind;
+use crate::keys::exchange::{FUNCTIONS, TABLES};
 use crate::keys::{self, exchange};
-
-/// The names and the numbers of `function`.
-pub(crate) const FUNCTIONS: [(&str, u8); 10] = [
-    ("read-coils", 1),
-    ("read-discrete-inputs", 2),
-    ("read-holding-registers", 3),
-    ("read-input-registers", 4),
-    ("write-coil", 5),
-    ("write-register", 6),
-    ("write-coils", 15),
-    ("write-registers", 16),
-    ("mask-write-register", 22),
-    ("read-write-registers", 23),
-];
 
 /// The name of a function of Modbus, such as `read-coils` for 1.
 pub fn function_name(operation: &Operation) -> &'static str {
     let code = operation.function();
     FUNCTIONS.iter().find(|(_, known)| *known == code).map_or("", |(name, _)| name)
 }
-
-/// The words of `table`.
-pub(crate) const TABLES: [(&str, Table); 4] = [
-    ("coils", Table::Coils),
-    ("discrete-inputs", Table::DiscreteInputs),
-    ("holding-registers", Table::HoldingRegisters),
-    ("input-registers", Table::InputRegisters),
-];
 
 /// The exchanges of a master.
 pub(super) fn read_master(recipe: &TableReader<'_>) -> Result<Vec<FileExchange>> {

@@ -9,6 +9,7 @@ use proto_core::wire::can::CanId;
 
 use super::reader::Spot;
 use crate::device::{DeviceField, ExchangeKind};
+use crate::keys::recipe::RecipeKind;
 
 /// The kind of file: only a gateway's recipes have bindings.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -29,34 +30,6 @@ pub(super) struct FileRecipe {
     pub(super) exchanges: Vec<FileExchange>,
     /// What requests do while a value of them is stale, if there is no output part to say it.
     pub(super) on_stale: Option<OnStale>,
-}
-
-/// What carries a recipe.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum RecipeKind {
-    Stream,
-    Can,
-    ModbusMaster,
-    ModbusSlave,
-}
-
-/// The words of `kind`.
-pub(crate) const KINDS: [(&str, RecipeKind); 4] = [
-    ("stream", RecipeKind::Stream),
-    ("can", RecipeKind::Can),
-    ("modbus-rtu", RecipeKind::ModbusMaster),
-    ("modbus-rtu-slave", RecipeKind::ModbusSlave),
-];
-
-impl RecipeKind {
-    /// As files have it.
-    pub(super) fn name(self) -> &'static str {
-        KINDS.iter().find(|(_, kind)| *kind == self).map_or("", |(name, _)| name)
-    }
-
-    pub(super) fn is_modbus(self) -> bool {
-        matches!(self, Self::ModbusMaster | Self::ModbusSlave)
-    }
 }
 
 pub(super) struct FilePart {

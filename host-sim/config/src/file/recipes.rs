@@ -17,12 +17,13 @@ use super::exchanges;
 use super::frames::{read_bytes, read_fields, read_id};
 use super::framings;
 use super::modbus;
-use super::model::{FileField, FileFrame, FilePart, FileRecipe, Flavour, FrameOrder, KINDS, RecipeKind};
+use super::model::{FileField, FileFrame, FilePart, FileRecipe, Flavour, FrameOrder};
 use super::names::did_you_mean;
 use super::order::{self, ORDER_KEYS};
 use super::reader::{Result, Spot, TableReader, TableValue};
 use crate::device::AnyRecipe;
 use crate::keys;
+use crate::keys::recipe::{KINDS, MODES, RecipeKind};
 use crate::sim::{SimCanFrame, SimField, SimParts, SimRecipe, SimStreamPart};
 
 /// Every recipe of a file, within the limits of any port.
@@ -96,9 +97,6 @@ fn read_kind(table: &TableReader<'_>, flavour: Flavour) -> Result<RecipeKind> {
     }
     item.choice(&KINDS[..2])
 }
-
-/// The words of `mode`.
-pub(crate) const MODES: [(&str, Mode); 2] = [("realtime", Mode::Realtime), ("user", Mode::User)];
 
 fn read_mode(table: &TableReader<'_>, kind: RecipeKind) -> Result<Mode> {
     if !kind.is_modbus() {

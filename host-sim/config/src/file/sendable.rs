@@ -2,17 +2,14 @@
 //!
 //! In: the field's table and its encoding. Out: what stands behind the field in the configuration.
 
-use proto_core::config::{FieldSpec, Limits, MapEntry, OutputBinding, Outside, check_sent};
+use proto_core::config::{FieldSpec, Limits, MapEntry, OutputBinding, check_sent};
 use proto_core::device::{Encoding, Overflow};
 
 use super::commands::read_range;
 use super::encoding::refuse;
 use super::model::FileField;
 use super::reader::{Result, Spot, TableReader, TableValue};
-use crate::keys::field::OUTSIDE;
-
-/// The words of `outside`.
-pub(crate) const OUTSIDES: [(&str, Outside); 2] = [("refuse", Outside::Refuse), ("clamp", Outside::Clamp)];
+use crate::keys::field::{OUTSIDE, OUTSIDES};
 
 const KEYS: [&str; 4] = ["min", "max", "outside", "map"];
 

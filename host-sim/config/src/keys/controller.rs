@@ -2,8 +2,8 @@
 
 use super::gateway::{BITRATE, CYCLE, DIALECT, LINE, NAME};
 use super::{Case, Key, KeyTable, Limits, Shape, TextKind, When, words};
-use crate::file::controller::{BUSES, COMMAND_CLIENTS, MODES, POWERS};
 use crate::functions::{Function, ShownState};
+use crate::sim::{CommandClients, Power, RobotMode};
 
 const fn server(name: &'static str, port: i64, text: &'static str) -> Key {
     Key::integer(name, 0, 65_535).or(port).is(text)
@@ -32,10 +32,22 @@ pub const LISTEN: KeyTable = KeyTable::of(
     ],
 );
 
+/// The words of `power`.
+pub(crate) const POWERS: [(&str, Power); 4] =
+    [("boot", Power::Boot), ("off", Power::Off), ("on", Power::On), ("enabled", Power::Enabled)];
 pub(crate) const POWER: Key = Key::words("power", words!(POWERS)).or_word("enabled").tells(
     "`\"off\"`, `\"on\"`, `\"enabled\"`; `\"boot\"`: the controller was just switched on, and boots to `\"off\"`",
 );
+/// The words of `mode` of the robot.
+pub(crate) const MODES: [(&str, RobotMode); 3] =
+    [("manual", RobotMode::Manual), ("auto", RobotMode::Auto), ("remote", RobotMode::Remote)];
 pub(crate) const MODE: Key = Key::words("mode", words!(MODES)).or_word("remote").is("the operation mode");
+/// The words of `command_clients`.
+pub(crate) const COMMAND_CLIENTS: [(&str, CommandClients); 3] = [
+    ("many", CommandClients::Many),
+    ("one", CommandClients::RefuseSecond),
+    ("newest", CommandClients::DropFirst),
+];
 pub(crate) const CLIENTS: Key = Key::words("command_clients", words!(COMMAND_CLIENTS)).or_word("many").tells(
     "how many clients port 2000 accepts: `\"many\"`; `\"one\"`: any further one is closed at once; `\"newest\"`: the \
      previous one is closed",
@@ -64,6 +76,24 @@ pub const FUNCTIONS: KeyTable = KeyTable::of("functions", &[
     ),
 ]);
 
+/// What a port of a controller is.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(crate) enum BusKind {
+    Rs485,
+    Can,
+    UdpServer,
+    TcpClient,
+    UdpClient,
+}
+
+/// The words of `bus`.
+pub(crate) const BUSES: [(&str, BusKind); 5] = [
+    ("rs485", BusKind::Rs485),
+    ("can", BusKind::Can),
+    ("udp-server", BusKind::UdpServer),
+    ("tcp-client", BusKind::TcpClient),
+    ("udp-client", BusKind::UdpClient),
+];
 /// What a port is.
 pub const BUS: Key = Key::words("bus", words!(BUSES))
     .required()

@@ -1,17 +1,18 @@
 //! Frames of devices: orders of bytes, what tells frames apart, checksums.
 
-use proto_core::device::{Algorithm, MAX_DATA_ID};
+use proto_core::device::{Algorithm, Boundary, ByteOrder, Escape, MAX_DATA_ID};
 use proto_core::recipe::model::MAX_STREAM_FRAME;
 
 use super::{Case, Key, KeyTable, Shape, TextKind, When, words};
-use crate::file::checksums::{CHECKSUM_FORMS, CHECKSUM_ORDERS, DATA_ID_PLACES};
-use crate::file::encoding::{ORDERS, WORD_ORDERS};
-use crate::file::framings::{ESCAPES, FRAMINGS};
 
+/// The words of `endian`, and whether they are big-endian.
+pub(crate) const ORDERS: [(&str, bool); 2] = [("little", false), ("big", true)];
 /// Order of bytes.
 pub const ENDIAN: Key = Key::words("endian", words!(ORDERS))
     .or_word("little")
     .tells("`\"little\"`, `\"big\"`: byte order of its fields");
+/// The words of `word_order`, and whether the low word is first.
+pub(crate) const WORD_ORDERS: [(&str, bool); 2] = [("high-first", false), ("low-first", true)];
 /// Order of words.
 pub const WORD_ORDER: Key = Key::words("word_order", words!(WORD_ORDERS))
     .absent("as `endian`")
@@ -20,12 +21,18 @@ pub const WORD_ORDER: Key = Key::words("word_order", words!(WORD_ORDERS))
 pub const WORD_ORDER_OF_REGISTERS: Key = WORD_ORDER.or_word("high-first");
 /// A checksum.
 pub const CHECKSUM: Key = Key::new("checksum", Shape::Table(&CHECKSUM_TABLE)).tells("see below");
+/// The words of `framing`.
+pub(crate) const FRAMINGS: [(&str, Boundary); 3] =
+    [("fields", Boundary::Fields), ("tail", Boundary::Tail), ("silence", Boundary::Silence)];
 /// What tells frames apart.
 pub const FRAMING: Key = Key::words("framing", words!(FRAMINGS)).or_word("fields").tells(
     "`\"fields\"`: head, constants, lengths and checksum, searched at each byte; `\"tail\"`: a frame is what came \
      between two tails, and is taken or rejected as a whole; `\"silence\"`: a frame is what came between two silences \
      of `idle_gap_ms`",
 );
+/// The words of `escape`.
+pub(crate) const ESCAPES: [(&str, Escape); 3] =
+    [("dle", Escape::Dle), ("slip", Escape::Slip), ("cobs", Escape::Cobs)];
 /// Escapes around frames.
 pub const ESCAPE: Key = Key::words("escape", words!(ESCAPES)).tells(
     "`\"dle\"`: DLE STX, the frame with each DLE doubled, DLE ETX; `\"slip\"`: RFC 1055; `\"cobs\"`: COBS with a zero \
@@ -48,6 +55,9 @@ pub const OVER: Key = Key::text_of("over", TextKind::Pattern("^[0-9]+\\.\\.[0-9]
 pub const AT: Key = Key::integer("at", 0, MAX_STREAM_FRAME as i64 - 1)
     .absent("behind the fields, before the tail")
     .is("the byte at which it stands, where a field begins or ends");
+/// The words of `order` of a checksum.
+pub(crate) const CHECKSUM_ORDERS: [(&str, ByteOrder); 2] =
+    [("little", ByteOrder::Little), ("big", ByteOrder::Big)];
 /// Its order of bytes.
 pub const ORDER: Key = Key::words("order", words!(CHECKSUM_ORDERS)).absent("of the standard").tells(
     "`\"little\"`: low byte first, `\"big\"`. A reflected CRC, such as that of Modbus, has its low byte first, any \
@@ -61,11 +71,15 @@ pub const DATA_ID: Key = Key::new(
 .tells(
     "bytes that it covers and that are not in the frame: `0x1234`, low byte first, or a list of 1 to 4 bytes",
 );
+/// The words of `data_id_at`, and whether the bytes are behind the frame's.
+pub(crate) const DATA_ID_PLACES: [(&str, bool); 2] = [("start", false), ("end", true)];
 /// Where they are.
 pub const DATA_ID_AT: Key = Key::words("data_id_at", words!(DATA_ID_PLACES))
     .or_word("start")
     .beside(&["data_id"])
     .tells("`\"start\"`: they are before the bytes of the frame, `\"end\"`: behind them");
+/// The words of `as`, and whether they are digits.
+pub(crate) const CHECKSUM_FORMS: [(&str, bool); 2] = [("bytes", false), ("hex", true)];
 /// How it is written.
 pub const AS: Key = Key::words("as", words!(CHECKSUM_FORMS))
     .or_word("bytes")

@@ -1,11 +1,11 @@
 //! `[[recipe.exchange]]` and `[[recipe.block]]`.
 
 use proto_core::config::{DEFAULT_REPLY_TIMEOUT, LONGEST_TRIGGER, MAX_PAUSE};
+use proto_core::modbus::rtu::Table;
 
 use super::device::WORD_ORDER_OF_REGISTERS;
 use super::frame::{EXTENDED, HEAD, ID, INPUT_FIELDS, OF_FRAME, OUTPUT_FIELDS, TAIL};
 use super::{Case, HOUR_MS, Key, KeyTable, Limits, Need, Shape, TextKind, When, field, ms, words};
-use crate::file::modbus::{FUNCTIONS, TABLES};
 
 /// The device that is asked.
 pub const PEER: Key = Key::integer("peer", 0, 255).or(0).is(
@@ -178,6 +178,19 @@ pub const SLAVE: Key = Key::integer("slave", 0, 255)
     .required()
     .tells("1..=247; 0 writes to all slaves, and nobody answers. After it nothing is sent for 100 ms. Over Modbus TCP the unit \
      id, 1..=255");
+/// The names and the numbers of `function`.
+pub(crate) const FUNCTIONS: [(&str, u8); 10] = [
+    ("read-coils", 1),
+    ("read-discrete-inputs", 2),
+    ("read-holding-registers", 3),
+    ("read-input-registers", 4),
+    ("write-coil", 5),
+    ("write-register", 6),
+    ("write-coils", 15),
+    ("write-registers", 16),
+    ("mask-write-register", 22),
+    ("read-write-registers", 23),
+];
 /// What is asked of it.
 pub const FUNCTION: Key = Key::new(
     "function",
@@ -239,6 +252,13 @@ pub const OF_MODBUS: KeyTable =
         },
     ]);
 
+/// The words of `table`.
+pub(crate) const TABLES: [(&str, Table); 4] = [
+    ("coils", Table::Coils),
+    ("discrete-inputs", Table::DiscreteInputs),
+    ("holding-registers", Table::HoldingRegisters),
+    ("input-registers", Table::InputRegisters),
+];
 /// What a block holds.
 pub const TABLE: Key = Key::words("table", words!(TABLES)).required();
 pub(crate) const BLOCK_FIELDS: Key = block_fields(&Shape::Table(&field::IN_BLOCK));

@@ -1,22 +1,41 @@
 //! The fields of user recipes, and what stands in their place.
 
-use proto_core::config::{MAX_COMMAND_TEXT, NO_TEXT};
-use proto_core::device::{MAX_DIGITS, MAX_IGNORED, MAX_TEXT};
+use proto_core::config::{CommandWhen, InputRule, MAX_COMMAND_TEXT, NO_TEXT, Outside};
+use proto_core::device::{ByteOrder, Counts, MAX_DIGITS, MAX_IGNORED, MAX_TEXT, Overflow};
 use proto_core::wire::scalar::ScalarType;
 
 use super::device::{ENDIAN, WORD_ORDER};
 use super::{Case, Key, KeyTable, Limits, Rule, Shape, TextKind, When, words};
-use crate::file::bindings::OVERFLOWS;
-use crate::file::commands::{BASES, WHENS};
-use crate::file::encoding::OWN_TYPES;
-use crate::file::framings::{COUNTS as ALL_COUNTS, TEXT_ORDERS};
-use crate::file::input_rules::{AS_WORDS, POINTS};
-use crate::file::sendable::OUTSIDES;
 
 /// The name of a field.
 pub const NAME: Key =
     Key::text_of("name", TextKind::Any).required().tells("its name in tools; a constant integer needs none");
 const NAME_IF_ANY: Key = Key { need: super::Need::Absent("none"), ..NAME };
+/// The types of fields.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Type {
+    Scalar(ScalarType),
+    Uint24,
+    Int24,
+    Bcd,
+    Decimal,
+    Hex,
+    /// An unsigned number of so many bytes that is too wide for a value, but has bits.
+    Wide(u8),
+}
+
+/// The types that only a device's frames have.
+pub(crate) const OWN_TYPES: [(&str, Type); 9] = [
+    ("uint24", Type::Uint24),
+    ("int24", Type::Int24),
+    ("bcd", Type::Bcd),
+    ("decimal", Type::Decimal),
+    ("hex", Type::Hex),
+    ("uint40", Type::Wide(5)),
+    ("uint48", Type::Wide(6)),
+    ("uint56", Type::Wide(7)),
+    ("uint64", Type::Wide(8)),
+];
 /// The type of a field.
 pub const TYPE: Key = Key::words("type", || {
     ScalarType::ALL.iter().map(|ty| ty.name()).chain(OWN_TYPES.iter().map(|ty| ty.0)).collect()
@@ -58,6 +77,8 @@ pub const UNTIL: Key = Key::text_of("until", TextKind::Length(1, 1))
     .tells("`decimal` and `hex`: the character behind the field, instead of `width`");
 /// Digits behind the point.
 pub const DECIMALS: Key = Key::integer("decimals", 0, 9).or(0).is("of `decimal`: digits behind the point");
+/// The words of `overflow`.
+pub(crate) const OVERFLOWS: [(&str, Overflow); 1] = [("wrap", Overflow::Wrap)];
 /// What happens to numbers that do not fit.
 pub const OVERFLOW: Key = Key::words("overflow", words!(OVERFLOWS)).absent("absent").tells(
     "`\"wrap\"`: what does not fit wraps, as a counter does, from the field to its variable or from the variable to \
@@ -71,6 +92,8 @@ pub const MIN: Key = Key::new("min", Shape::Number(Limits::Any))
 pub const MAX: Key = Key::new("max", Shape::Number(Limits::Any))
     .absent("of the field")
     .tells("output, with `from`: the highest number that is sent");
+/// The words of `outside`.
+pub(crate) const OUTSIDES: [(&str, Outside); 2] = [("refuse", Outside::Refuse), ("clamp", Outside::Clamp)];
 /// What becomes of others.
 pub const OUTSIDE: Key = Key::words("outside", words!(OUTSIDES)).or_word("refuse").tells(
     "with `min` or `max`, what becomes of a number below or above. `\"refuse\"`: the frame is not sent; `\"clamp\"`: \
@@ -81,6 +104,8 @@ pub const MAP: Key = Key::new("map", Shape::Map(&Shape::Number(Limits::Any), 1))
     "output, with `from`: what is sent for values of the source or ranges of them, such as `{ 0 = 1, \"1..7\" = 2 }`; \
      with another value the frame is not sent",
 );
+/// The words of `as`.
+pub(crate) const AS_WORDS: [(&str, InputRule); 1] = [("int16", InputRule::Int16)];
 /// How a variable has a number.
 pub const AS: Key = Key::words("as", words!(AS_WORDS)).beside(&["to"]).absent("absent").tells(
     "input, with a word register: `\"int16\"`: the register has -32768..=32767 in two's complement, as the program reads \
@@ -113,6 +138,8 @@ pub const VALID_TO: Key = Key::text_of("valid_to", TextKind::VariableOrBit).besi
     "input: a bit or a word register that is 1 while the field's newest value was taken, and 0 when it was rejected, had \
      none, or is overdue",
 );
+/// The words of `point`.
+pub(crate) const POINTS: [(&str, Option<InputRule>); 2] = [(".", None), (",", Some(InputRule::Comma))];
 /// The point of digits.
 pub const POINT: Key = Key::words("point", words!(POINTS))
     .or_word(".")
@@ -160,10 +187,15 @@ pub const VALUE: Key = Key::new("value", Shape::Number(Limits::Any)).tells("outp
 pub const COMMANDS: Key =
     Key::new("commands", Shape::Map(&Shape::Text(TextKind::Length(1, MAX_COMMAND_TEXT)), 1))
         .tells("input: commands by values, ranges of values, or `rising`, `falling` and `level`, as below");
+/// The words of `when`.
+pub(crate) const WHENS: [(&str, CommandWhen); 2] =
+    [("change", CommandWhen::Change), ("frame", CommandWhen::Frame)];
 /// When a value acts.
 pub const WHEN: Key = Key::words("when", words!(WHENS)).or_word("change").beside(&["commands"]).tells(
     "`\"change\"`: the value acts if it differs from the previous frame; `\"frame\"`: with every frame",
 );
+/// The words of `base`, and whether the base is kept.
+pub(crate) const BASES: [(&str, bool); 2] = [("reset", false), ("keep", true)];
 /// What silence does.
 pub const BASE: Key = Key::words("base", words!(BASES)).or_word("reset").beside(&["commands"]).tells(
     "what silence, an overdue frame, does with `when = \"change\"`. `\"reset\"`: the next value only sets the base, \
@@ -205,6 +237,9 @@ pub const TEXT_FILL: Key = Key::text_of("fill", TextKind::Length(1, 1)).beside(&
 pub const TEXT_TO: Key = Key::text_of("to", TextKind::Variables).tells(
     "`\"WordInputReg[1..8]\"`: the registers, two characters each, zeros behind the end. A longer text is rejected",
 );
+/// The words of `order` of a text.
+pub(crate) const TEXT_ORDERS: [(&str, ByteOrder); 2] =
+    [("high-first", ByteOrder::Big), ("low-first", ByteOrder::Little)];
 /// The order of characters in a register.
 pub const TEXT_ORDER: Key = Key::words("order", words!(TEXT_ORDERS))
     .or_word("high-first")
@@ -234,6 +269,9 @@ pub const LENGTH_FROM: Key = Key::text_of("length_from", TextKind::Variable).tel
 
 /// The length of a frame.
 pub const LENGTH: Key = Key::new("length", Shape::Bool).tells("`true`: the field is the length of the frame");
+/// The words of `counts`.
+pub(crate) const ALL_COUNTS: [(&str, Counts); 3] =
+    [("rest", Counts::Rest), ("frame", Counts::Frame), ("fields", Counts::Fields)];
 /// What it counts.
 pub const COUNTS: Key = Key::words("counts", words!(ALL_COUNTS)).or_word("rest").beside(&["length"]).tells(
     "`\"rest\"`: everything behind it, checksum and tail included; `\"frame\"`: the whole frame; `\"fields\"`: the \

@@ -1,12 +1,11 @@
 //! `[controller]`, `[network]` and `[[port]]` of gateway files.
 
 use proto_core::config::{
-    Bus, Echo, MAX_ADDRESS, MAX_LINE_TIME, MAX_LISTEN, MIN_CYCLE, Port, PortValue, Rs485,
+    Bus, Echo, MAX_ADDRESS, MAX_LINE_TIME, MAX_LISTEN, MIN_CYCLE, Parity, Port, PortValue, Rs485,
 };
 use proto_core::wire::dialect::Dialect;
 
 use super::{Case, HOUR_MS, Key, KeyTable, Limits, Shape, TextKind, When, ms, words};
-use crate::file::{gateway::BUSES, lines::PARITIES};
 
 /// The controller's dialect.
 pub const DIALECT: Key = Key::words("dialect", || Dialect::NAMES.to_vec())
@@ -74,6 +73,35 @@ pub const NETWORK: KeyTable = KeyTable::of(
 pub const NAME: Key = Key::text_of("name", TextKind::Name).required().tells(
     "1..=32 bytes without blanks, quotes, `=` and control characters; unique. `--bind` and `--set` use it",
 );
+/// What a port of a gateway is.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(crate) enum BusKind {
+    Rs485,
+    ModbusMaster,
+    ModbusSlave,
+    ModbusTcp,
+    Can,
+    TcpListen,
+    UdpListen,
+}
+
+/// The words of `bus`.
+pub(crate) const BUSES: [(&str, BusKind); 7] = [
+    ("rs485", BusKind::Rs485),
+    ("modbus-rtu", BusKind::ModbusMaster),
+    ("modbus-rtu-slave", BusKind::ModbusSlave),
+    ("modbus-tcp", BusKind::ModbusTcp),
+    ("can", BusKind::Can),
+    ("tcp-listen", BusKind::TcpListen),
+    ("udp-listen", BusKind::UdpListen),
+];
+
+impl BusKind {
+    /// As files have it.
+    pub(crate) fn name(self) -> &'static str {
+        BUSES.iter().find(|(_, bus)| *bus == self).map_or("", |(name, _)| name)
+    }
+}
 /// What a port is.
 pub const BUS: Key = Key::words("bus", words!(BUSES)).required().tells(
     "`\"rs485\"`, `\"can\"`: devices; `\"modbus-rtu\"`, `\"modbus-rtu-slave\"`: a serial line for a recipe of this \
@@ -148,6 +176,9 @@ pub const BAUD: Key = Key::integer("baud", *Rs485::BAUD.start() as i64, *Rs485::
     .unit("bit/s")
     .or(Rs485::DEFAULT.baud as i64)
     .is("(`rs485`)");
+/// The words of `parity`.
+pub(crate) const PARITIES: [(&str, Parity); 3] =
+    [("none", Parity::None), ("even", Parity::Even), ("odd", Parity::Odd)];
 /// Parity.
 pub const PARITY: Key = Key::words("parity", words!(PARITIES)).or_word("none").is("(`rs485`)");
 /// Stop bits.

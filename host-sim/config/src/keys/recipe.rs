@@ -1,6 +1,7 @@
 //! `[[recipe]]` of both kinds of files, and its parts.
 
-use proto_core::recipe::model::MAX_CAN_IDS;
+use proto_core::config::OnStale;
+use proto_core::recipe::model::{MAX_CAN_IDS, Mode};
 
 use super::frame::{
     AFTER, EXTENDED, FRAME_NAME, HEAD, ID, INPUT_FIELDS, OF_FRAME, OF_STREAM, OUTPUT_FIELDS, PLAIN_FIELDS,
@@ -8,18 +9,44 @@ use super::frame::{
 };
 use super::gateway::NAME;
 use super::{Case, Key, KeyTable, Rule, Shape, TextKind, When, exchange, words};
-use crate::file::bindings::ON_STALES;
-use crate::file::model::KINDS;
-use crate::file::recipes::MODES;
 
 const ANY: usize = usize::MAX;
 
+/// What carries a recipe.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum RecipeKind {
+    Stream,
+    Can,
+    ModbusMaster,
+    ModbusSlave,
+}
+
+/// The words of `kind`.
+pub(crate) const KINDS: [(&str, RecipeKind); 4] = [
+    ("stream", RecipeKind::Stream),
+    ("can", RecipeKind::Can),
+    ("modbus-rtu", RecipeKind::ModbusMaster),
+    ("modbus-rtu-slave", RecipeKind::ModbusSlave),
+];
+
+impl RecipeKind {
+    /// As files have it.
+    pub(crate) fn name(self) -> &'static str {
+        KINDS.iter().find(|(_, kind)| *kind == self).map_or("", |(name, _)| name)
+    }
+
+    pub(crate) fn is_modbus(self) -> bool {
+        matches!(self, Self::ModbusMaster | Self::ModbusSlave)
+    }
+}
 /// What carries a recipe of a gateway.
 pub const KIND: Key = Key::words("kind", words!(KINDS)).required().tells(
     "`\"stream\"`, `\"can\"`; in gateway files also `\"modbus-rtu\"` and `\"modbus-rtu-slave\"` (section 4)",
 );
 const KIND_OF_CONTROLLER: Key =
     Key { shape: Shape::Words(|| KINDS.iter().take(2).map(|kind| kind.0).collect()), ..KIND };
+/// The words of `mode`.
+pub(crate) const MODES: [(&str, Mode); 2] = [("realtime", Mode::Realtime), ("user", Mode::User)];
 /// Whether the controller or the user says what fields mean.
 pub const MODE: Key = Key::words("mode", words!(MODES)).required().tells(
     "`\"realtime\"`: fields are system variables; `\"user\"`: fields of your own. Of Modbus always `\"user\"`, and may \
@@ -49,6 +76,8 @@ const fn exchanges(item: &'static Shape, least: usize) -> Key {
 pub(crate) const PARTS: &[Key] =
     &[input(&USER_IN), output(&USER_OUT), exchanges(&Shape::Table(&exchange::OF_STREAM), 0)];
 
+/// The words of `on_stale`.
+pub(crate) const ON_STALES: [(&str, OnStale); 2] = [("hold", OnStale::Hold), ("stop", OnStale::Stop)];
 /// What is sent while a value is stale.
 pub const ON_STALE: Key = Key::words("on_stale", words!(ON_STALES))
     .or_word("hold")

@@ -162,7 +162,4 @@ fn dynamic(value: Scalar) -> Dynamic {
     }
 }
 
-/// Functions that call the model, by the names that they have in a compiled script.
-pub(super) const NAMES: [&str; 9] =
-    ["comm_recv", "comm_send", "get", "set", "movej", "movel", "wait_ms", CALL_PROGRAM, "log"];
 const MAX_WAIT_US: f64 = 1e12;

@@ -11,7 +11,7 @@ use rhai::{ASTNode, Array, Dynamic, Engine, EvalAltResult, Expr, Position, Scope
 use super::text::described;
 use super::{
     CALL_OPERATIONS, Call, CallReply, End, MAX_NESTED, Progress, SLICE, SLICE_OPERATIONS, Script, Variables,
-    calls, script,
+    script,
 };
 
 /// An answer with the model's time.
@@ -45,25 +45,11 @@ pub(super) struct ScriptLink {
     over: AtomicBool,
 }
 
-pub(super) type ScriptResult<T> = Result<T, Box<EvalAltResult>>;
+/// Functions that call the model, by the names that they have in a compiled script.
+const CALLS: [&str; 9] =
+    ["comm_recv", "comm_send", "get", "set", "movej", "movel", "wait_ms", script::CALL_PROGRAM, "log"];
 
-/// Runs the script to its end and reports how it ended.
-pub(super) fn run(link: ScriptLink, script: &Script) {
-    let link = Arc::new(link);
-    let mut engine = script::engine();
-    watch(&mut engine, &link);
-    calls::register(&mut engine, &link);
-    let mut scope = Scope::new();
-    let result = engine.run_ast_with_scope(&mut scope, &script.ast());
-    link.show(&scope);
-    let end = match result {
-        Ok(()) => End::Finished,
-        Err(error) if is_abort(&error) => End::Aborted,
-        Err(error) => End::Failed(described(*error)),
-    };
-    // Fails only if the model is gone.
-    let _ = link.events.send(Progress::Ended(end));
-}
+pub(super) type ScriptResult<T> = Result<T, Box<EvalAltResult>>;
 
 impl ScriptLink {
     pub(super) fn new(
@@ -86,6 +72,18 @@ impl ScriptLink {
             stale: AtomicBool::new(false),
             over: AtomicBool::new(false),
         }
+    }
+
+    /// Reports how the script ended.
+    pub(super) fn end(&self, scope: &Scope<'_>, result: ScriptResult<()>) {
+        self.show(scope);
+        let end = match result {
+            Ok(()) => End::Finished,
+            Err(error) if is_abort(&error) => End::Aborted,
+            Err(error) => End::Failed(described(*error)),
+        };
+        // Fails only if the model is gone.
+        let _ = self.events.send(Progress::Ended(end));
     }
 
     /// Hands control to the model until it answers.
@@ -201,7 +199,7 @@ impl ScriptLink {
 }
 
 /// Registers the bounds on work, and the publication of variables.
-fn watch(engine: &mut Engine, link: &Arc<ScriptLink>) {
+pub(super) fn watch(engine: &mut Engine, link: &Arc<ScriptLink>) {
     let l = Arc::clone(link);
     // Called for each operation.
     engine.on_progress(move |_| {
@@ -227,7 +225,7 @@ fn watch(engine: &mut Engine, link: &Arc<ScriptLink>) {
                     _ => "",
                 };
                 l.weigh(context.scope_mut(), place)?;
-                if l.stale.swap(false, Relaxed) || calls::NAMES.contains(&name) {
+                if l.stale.swap(false, Relaxed) || CALLS.contains(&name) {
                     l.show(context.scope_mut());
                 }
             }

@@ -26,6 +26,7 @@ use std::thread::JoinHandle;
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::can::CanId;
 use proto_core::wire::scalar::Scalar;
+use rhai::Scope;
 
 pub(super) use script::named;
 pub use script::{Script, ScriptError};
@@ -168,7 +169,7 @@ impl Program {
         let thread = std::thread::Builder::new()
             .name(format!("program {}", script.name()))
             .stack_size(STACK_BYTES)
-            .spawn(move || link::run(link, &own))?;
+            .spawn(move || run(link, &own))?;
         let mut program = Self {
             name: script.name().to_owned(),
             progress: Progress::Ended(End::Aborted),
@@ -225,6 +226,17 @@ impl Drop for Program {
             let _ = thread.join();
         }
     }
+}
+
+/// Runs the script to its end and reports how it ended.
+fn run(link: link::ScriptLink, script: &Script) {
+    let link = Arc::new(link);
+    let mut engine = script::engine();
+    link::watch(&mut engine, &link);
+    calls::register(&mut engine, &link);
+    let mut scope = Scope::new();
+    let result = engine.run_ast_with_scope(&mut scope, &script.ast());
+    link.end(&scope, result);
 }
 
 /// Duration of a slice, in the model's time.

@@ -86,7 +86,7 @@ struct DecodedFrame {
 }
 
 impl DevicePart {
-    pub(in super::super) fn new(recipe: &DeviceRecipe, direction: Direction) -> Result<Self, String> {
+    pub(super) fn new(recipe: &DeviceRecipe, direction: Direction) -> Result<Self, String> {
         let ends = recipe.ends(direction);
         let is_whole = ends != FrameEnds::default();
         let part = recipe.part(direction);
@@ -104,7 +104,7 @@ impl DevicePart {
     }
 
     /// One frame of an exchange.
-    pub(in super::super) fn of_exchange(
+    pub(super) fn of_exchange(
         exchange: &NamedExchange,
         named: &NamedFrame,
         is_request: bool,
@@ -125,12 +125,12 @@ impl DevicePart {
     }
 
     /// Whether it is one frame that has no value to be given.
-    pub(in super::super) fn is_constant(&self) -> bool {
+    pub(super) fn is_constant(&self) -> bool {
         let [format] = &self.formats[..] else { return false };
         format.values.iter().all(|value| value.constant.is_some())
     }
 
-    pub(in super::super) fn ids(&self) -> impl Iterator<Item = Option<CanId>> {
+    pub(super) fn ids(&self) -> impl Iterator<Item = Option<CanId>> {
         self.formats.iter().map(|format| format.id)
     }
 

@@ -6,7 +6,7 @@ use proto_core::sysvar::Direction;
 use recipe_config::file::{Text, load_recipes, parse_recipes};
 use recipe_test_kit::example;
 
-use super::super::codec::ExchangePart;
+use super::codec::ExchangePart;
 use super::tests::{decoded, encoded, from_values};
 use super::*;
 

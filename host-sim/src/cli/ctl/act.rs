@@ -138,30 +138,7 @@ pub(super) enum Act {
     },
     /// Give a board another firmware, or show which one runs
     #[command(after_help = help::UPDATE)]
-    Update {
-        /// The update, of `sign`; without it, what the board says
-        file: Option<PathBuf>,
-        /// Run it on trial
-        #[arg(long = "try", requires = "file")]
-        try_it: bool,
-        /// With --try or --inventory: seconds until it is taken back unless it was confirmed [default: 300]
-        #[arg(long, value_name = "S", value_parser = clap::value_parser!(u32).range(60..=3600), requires = "file")]
-        confirm_s: Option<u32>,
-        /// Keep what is on trial; with --try, once it does as well as the one before
-        #[arg(long, conflicts_with = "back")]
-        confirm: bool,
-        /// Take back what is on trial
-        #[arg(long, conflicts_with = "file")]
-        back: bool,
-        /// Take a firmware that is older than the one that runs
-        #[arg(long, requires = "file")]
-        downgrade: bool,
-        /// With --inventory: what became of each board, a JSON document; renewed after each batch
-        #[arg(long, value_name = "FILE", requires = "file")]
-        report: Option<PathBuf>,
-        #[command(flatten)]
-        many: Many,
-    },
+    Update(UpdateArgs),
     /// Let a board tell a broker what it knows, as an edge node of Sparkplug, or show how its node does
     #[command(after_help = help::EDGE)]
     Edge {
@@ -306,4 +283,31 @@ fn slot(text: &str) -> Result<Slot, String> {
         "b" | "B" => Ok(Slot::B),
         _ => Err("not a or b".into()),
     }
+}
+
+/// Arguments of `update`.
+#[derive(Debug, Args)]
+pub(super) struct UpdateArgs {
+    /// The update, of `sign`; without it, what the board says
+    pub(super) file: Option<PathBuf>,
+    /// Run it on trial
+    #[arg(long = "try", requires = "file")]
+    pub(super) try_it: bool,
+    /// With --try or --inventory: seconds until it is taken back unless it was confirmed [default: 300]
+    #[arg(long, value_name = "S", value_parser = clap::value_parser!(u32).range(60..=3600), requires = "file")]
+    pub(super) confirm_s: Option<u32>,
+    /// Keep what is on trial; with --try, once it does as well as the one before
+    #[arg(long, conflicts_with = "back")]
+    pub(super) confirm: bool,
+    /// Take back what is on trial
+    #[arg(long, conflicts_with = "file")]
+    pub(super) back: bool,
+    /// Take a firmware that is older than the one that runs
+    #[arg(long, requires = "file")]
+    pub(super) downgrade: bool,
+    /// With --inventory: what became of each board, a JSON document; renewed after each batch
+    #[arg(long, value_name = "FILE", requires = "file")]
+    pub(super) report: Option<PathBuf>,
+    #[command(flatten)]
+    pub(super) many: Many,
 }

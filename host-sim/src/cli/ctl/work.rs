@@ -9,7 +9,7 @@ use recipe_ctl::{
 };
 use recipe_runtime::out::print_stderr;
 
-use super::act::Act;
+use super::act::{Act, UpdateArgs};
 use super::updating::Updating;
 use super::{RequestOptions, write};
 
@@ -95,46 +95,7 @@ impl Act {
                 let without = if *previous { WithoutTrial::Previous } else { WithoutTrial::Refuse };
                 rows(move |client, _| recipe_ctl::rollback(client, without))
             }
-            Self::Update { file: None, back: true, .. } => {
-                CtlWork::Follow(Box::new(move |client, run, out| {
-                    run.print(&update::taken_back(client, &mut |line| print_stderr(line))?, out)
-                }))
-            }
-            Self::Update { file: None, confirm: true, .. } => rows(|client, _| update::confirmed(client)),
-            Self::Update { file: None, .. } => rows(|client, _| update::shown(client)),
-            Self::Update {
-                file: Some(file),
-                try_it: false,
-                confirm: false,
-                confirm_s,
-                downgrade,
-                report,
-                many,
-                ..
-            } if is_for_inventory => roll_out(Updating {
-                update: Update::read(file)?,
-                trial_s: confirm_s.unwrap_or(TRIAL_S),
-                downgrade: allowed(*downgrade),
-                rollout: many.rollout(),
-                report: report.as_deref(),
-            }),
-            Self::Update {
-                file: Some(file), try_it, confirm_s, confirm, downgrade, report, many, ..
-            } => {
-                if !*try_it && (*confirm || confirm_s.is_some()) {
-                    return Err(Failure::wrong(
-                        "--confirm and --confirm-s with a file need --try: what was never tried is not kept",
-                    ));
-                }
-                if many.is_said() || report.is_some() {
-                    return Err(Failure::wrong(
-                        "--batch, --stop-on-failure and --report are for --inventory FILE without --try, where every \
-                         board is tried and confirmed",
-                    ));
-                }
-                let trial_s = try_it.then_some(confirm_s.unwrap_or(TRIAL_S));
-                update_one(file, update::Plan { trial_s, confirm: *confirm, downgrade: allowed(*downgrade) })?
-            }
+            Self::Update(update) => update.prepare(is_for_inventory)?,
             Self::Edge { file: Some(_), .. } if is_for_inventory => {
                 return Err(Failure::wrong(
                     "a Sparkplug file names one node, and an inventory may have several gateways; give it with --to",
@@ -171,6 +132,43 @@ impl Act {
                 inspect_slot(file, public_key.as_deref(), *slot, output.as_deref(), *force)
             }
         })
+    }
+}
+
+impl UpdateArgs {
+    fn prepare(&self, is_for_inventory: bool) -> Result<CtlWork<'_>, Failure> {
+        let Some(file) = &self.file else {
+            return Ok(match self {
+                Self { back: true, .. } => CtlWork::Follow(Box::new(move |client, run, out| {
+                    run.print(&update::taken_back(client, &mut |line| print_stderr(line))?, out)
+                })),
+                Self { confirm: true, .. } => rows(|client, _| update::confirmed(client)),
+                _ => rows(|client, _| update::shown(client)),
+            });
+        };
+        let downgrade = allowed(self.downgrade);
+        if is_for_inventory && !self.try_it && !self.confirm {
+            return Ok(roll_out(Updating {
+                update: Update::read(file)?,
+                trial_s: self.confirm_s.unwrap_or(TRIAL_S),
+                downgrade,
+                rollout: self.many.rollout(),
+                report: self.report.as_deref(),
+            }));
+        }
+        if !self.try_it && (self.confirm || self.confirm_s.is_some()) {
+            return Err(Failure::wrong(
+                "--confirm and --confirm-s with a file need --try: what was never tried is not kept",
+            ));
+        }
+        if self.many.is_said() || self.report.is_some() {
+            return Err(Failure::wrong(
+                "--batch, --stop-on-failure and --report are for --inventory FILE without --try, where every board is \
+                 tried and confirmed",
+            ));
+        }
+        let trial_s = self.try_it.then_some(self.confirm_s.unwrap_or(TRIAL_S));
+        update_one(file, update::Plan { trial_s, confirm: self.confirm, downgrade })
     }
 }
 

@@ -6,14 +6,13 @@
 //! packet.
 
 mod alignment;
-pub(super) mod codes;
 mod packet;
 mod places;
 mod stream;
 mod view;
 
+pub use super::codes::{OperationMode, ProgramState, RobotState, SafetyState, States};
 pub use alignment::Misaligned;
-pub use codes::{OperationMode, ProgramState, RobotState, SafetyState, States};
 pub use packet::{Content, FIELDS, FieldPlace, StatePacket};
 pub use stream::{MAX_MISALIGNED, StateStream};
 pub use view::{LEN, StateError, StateView};

@@ -2,8 +2,8 @@
 
 use core::fmt;
 
-use super::codes::States;
 use crate::wire::dialect::Dialect;
+use crate::wire::state::States;
 
 /// Size of a state packet in bytes.
 pub const LEN: usize = 1468;

@@ -9,11 +9,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use proto_core::config::Echo;
 use proto_core::time::{Duration, Instant};
 
-use super::frames::Seen;
-use super::spec::{ExchangesSpec, Kind, RowSpec};
 use crate::oracle::Invariant;
 use crate::oracle::invariant::Wrong;
 use crate::oracle::spec::PortSpec;
+use crate::oracle::spec::exchanges::{ExchangesSpec, Kind, RowSpec};
+use crate::oracle::spec::frames::Seen;
 
 /// The model of one line.
 #[derive(Debug, Clone, Default)]
@@ -237,17 +237,16 @@ impl ExchangesWatch {
         }
     }
 
-    /// A request was sent: checks that it may be sent now.
-    pub(super) fn note_sent(
-        &mut self,
+    /// The line is free for a request, and no other one comes first.
+    fn check_turn(
+        &self,
         port: &PortSpec,
         exchanges: &ExchangesSpec,
-        (row, request): (usize, &[u8]),
+        row: usize,
         (heard, is_busy): (Instant, bool),
         now: Instant,
     ) -> Result<(), Wrong> {
-        let spec = &exchanges.rows[row];
-        let wrong = |what: &str| Err((Invariant::Line, format!("{}: {what}", name(spec))));
+        let wrong = |what: &str| Err((Invariant::Line, format!("{}: {what}", name(&exchanges.rows[row]))));
         if self.leaving || self.flight.is_some() || is_busy {
             return wrong("asked while another transmission is on its way");
         }
@@ -261,6 +260,50 @@ impl ExchangesWatch {
             let what = format!("asked before {} is repeated", name(&exchanges.rows[failed]));
             return wrong(&what);
         }
+        Ok(())
+    }
+
+    /// A slave that does not answer is only asked what it can answer, and rarely.
+    fn check_presence(
+        &mut self,
+        exchanges: &ExchangesSpec,
+        spec: &RowSpec,
+        is_first: bool,
+        now: Instant,
+    ) -> Result<(), Wrong> {
+        let slave = self.slaves.entry(spec.slave).or_default();
+        if slave.presence == Presence::Down && !spec.is_answered() {
+            let what = format!("{}: asked, and its slave does not answer", name(spec));
+            return Err((Invariant::Periods, what));
+        }
+        let not_before = slave
+            .failing
+            .map(|(_, newest)| newest + wait(exchanges.shortest(spec.slave), slave.failures).half());
+        if let Some(left) = not_before.filter(|_| slave.presence == Presence::Down && is_first)
+            && now < left
+        {
+            let what = format!(
+                "{}: asked {} before a slave that does not answer may be asked",
+                name(spec),
+                left.saturating_since(now)
+            );
+            return Err((Invariant::Periods, what));
+        }
+        Ok(())
+    }
+
+    /// A request was sent: checks that it may be sent now.
+    pub(super) fn note_sent(
+        &mut self,
+        port: &PortSpec,
+        exchanges: &ExchangesSpec,
+        (row, request): (usize, &[u8]),
+        (heard, is_busy): (Instant, bool),
+        now: Instant,
+    ) -> Result<(), Wrong> {
+        let spec = &exchanges.rows[row];
+        let wrong = |what: &str| Err((Invariant::Line, format!("{}: {what}", name(spec))));
+        self.check_turn(port, exchanges, row, (heard, is_busy), now)?;
         let repeated = self.repeat.take();
         let expires = match &repeated {
             Some(failed) => failed.expires,
@@ -292,25 +335,8 @@ impl ExchangesWatch {
                 format!("asked {left} before the replies to {} are over", name(&exchanges.rows[other]));
             return wrong(&what);
         }
-        let slave = self.slaves.entry(spec.slave).or_default();
-        if slave.presence == Presence::Down && !spec.is_answered() {
-            let what = format!("{}: asked, and its slave does not answer", name(spec));
-            return Err((Invariant::Periods, what));
-        }
-        let not_before = slave
-            .failing
-            .map(|(_, newest)| newest + wait(exchanges.shortest(spec.slave), slave.failures).half());
-        if let Some(left) = not_before.filter(|_| slave.presence == Presence::Down && repeated.is_none())
-            && now < left
-        {
-            let what = format!(
-                "{}: asked {} before a slave that does not answer may be asked",
-                name(spec),
-                left.saturating_since(now)
-            );
-            return Err((Invariant::Periods, what));
-        }
-        slave.asked = now;
+        self.check_presence(exchanges, spec, repeated.is_none(), now)?;
+        self.slaves.entry(spec.slave).or_default().asked = now;
         if let Some(first) = self.comes_first(exchanges, spec.slave, row) {
             let what =
                 format!("{}: asked before {}, which comes first", name(spec), name(&exchanges.rows[first]));

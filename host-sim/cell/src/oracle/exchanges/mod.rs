@@ -1,10 +1,8 @@
 //! Exchanges with the slaves of a Modbus RTU line and with devices that have frames of their own: what
 //! the gateway asks and takes, and what devices and controller really had (docs/cell.md section 4).
 
-mod frames;
 pub(super) mod line;
 pub(super) mod served;
-pub(super) mod spec;
 #[cfg(test)]
 mod tests;
 pub(super) mod truth;
@@ -12,16 +10,18 @@ pub(super) mod truth;
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::can::CanFrame;
 
-use self::frames::Seen;
 use self::line::{Ended, ExchangesWatch};
-use self::spec::{ExchangesSpec, Kind, RowSpec};
-use super::device::{Look, look};
+use super::device::Look;
 use super::downward::Downward;
 use super::field::{Accepted, Verdict};
+use super::frame::Frame;
 use super::gateway::Leaving;
 use super::invariant::Wrong;
-use super::spec::{Frame, PortSpec};
+use super::spec::PortSpec;
+use super::spec::exchanges::{ExchangesSpec, Kind, RowSpec};
+use super::spec::frames::Seen;
 use super::upward::Upward;
+use super::varying::look;
 use super::{Invariant, Oracle};
 use crate::SlaveDone;
 
@@ -112,7 +112,7 @@ impl Oracle {
             self.truth.started(nth, slave);
         }
         let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
-        let is_it = |own: &super::spec::Frame| {
+        let is_it = |own: &Frame| {
             own.id == Some(frame.id()) && look(own, frame.data()) == Look::Frame(frame.data().len())
         };
         let pending = watch.exchanges.pending(exchanges);

@@ -6,38 +6,16 @@
 
 use std::collections::BTreeMap;
 
-use proto_core::config::{FieldSpec, GatewayConfig, Recipe, Rs485, Transaction};
 use proto_core::modbus::rtu::Table;
-use proto_core::sysvar::SysVar;
 use proto_core::time::Instant;
 
 use crate::oracle::downward::Downward;
 use crate::oracle::field::Verdict;
 use crate::oracle::gateway::Leaving;
 use crate::oracle::invariant::Wrong;
-use crate::oracle::spec::{Frame, device_frame};
+use crate::oracle::spec::served::{Block, ServedSpec};
 use crate::oracle::{Invariant, Oracle};
 use crate::rtu::{is_right, sealed};
-
-/// The slave.
-#[derive(Debug, Clone)]
-pub(in crate::oracle) struct ServedSpec {
-    address: u8,
-    line: Rs485,
-    blocks: Vec<Block>,
-}
-
-/// Registers or coils.
-#[derive(Debug, Clone)]
-struct Block {
-    table: Table,
-    first: u16,
-    count: u16,
-    /// The input frame of the port that a master writes.
-    input: Option<usize>,
-    /// What a master reads.
-    output: Option<Frame>,
-}
 
 /// The model of one such port.
 #[derive(Debug, Clone, Default)]
@@ -60,45 +38,6 @@ const FUNCTION: Exception = Exception(1);
 const ADDRESS: Exception = Exception(2);
 const VALUE: Exception = Exception(3);
 const FAILURE: Exception = Exception(4);
-
-impl ServedSpec {
-    /// The blocks of a recipe, which are behind its other input frames; `None` without any.
-    pub(in crate::oracle) fn new(
-        config: &GatewayConfig,
-        recipe: &Recipe,
-        line: Rs485,
-        inputs: &mut Vec<Frame>,
-    ) -> Option<Self> {
-        let mut blocks = Vec::new();
-        let exchanges = config.view().exchanges_of(recipe);
-        for exchange in exchanges {
-            let Transaction::Served { operation, written, read } = exchange.transaction else { return None };
-            let (table, first, count) = operation.place();
-            let frame = |fields: &[FieldSpec]| device_frame(&[], &[], None, fields);
-            let mut block = Block { table, first, count, input: None, output: None };
-            if written.len > 0 {
-                block.input = Some(inputs.len());
-                inputs.push(frame(written.of(&config.fields)));
-            } else {
-                block.output = Some(frame(read.of(&config.fields)));
-            }
-            blocks.push(block);
-        }
-        let address = exchanges.first()?.peer;
-        Some(Self { address, line, blocks })
-    }
-
-    /// The variables that a master reads.
-    pub(in crate::oracle) fn shown(&self) -> impl Iterator<Item = SysVar> {
-        self.blocks.iter().filter_map(|block| block.output.as_ref()).flat_map(|out| out.shown.iter().copied())
-    }
-
-    /// The block with this register or coil.
-    fn block_at(&self, table: Table, at: u16) -> Option<(usize, &Block)> {
-        let has = |block: &Block| at.checked_sub(block.first).is_some_and(|nth| nth < block.count);
-        self.blocks.iter().enumerate().find(|(_, block)| block.table == table && has(block))
-    }
-}
 
 impl ServedWatch {
     fn received(&mut self, spec: &ServedSpec, bytes: &[u8], now: Instant) {

@@ -12,12 +12,14 @@ use proto_core::sysvar::{ModbusPlace, SysVar};
 use proto_core::time::{Duration, Instant};
 
 use super::line::{Flight, name};
-use super::spec::{ExchangesSpec, Kind, RowSpec};
 use crate::oracle::Invariant;
 use crate::oracle::device::{self, Look};
 use crate::oracle::field::{LineWatch, Verdict, as_number, show};
+use crate::oracle::frame::{Raw, shown, size};
 use crate::oracle::invariant::Wrong;
-use crate::oracle::spec::{Origin, PortSpec, Raw, Spec};
+use crate::oracle::spec::exchanges::{ExchangesSpec, Kind, RowSpec};
+use crate::oracle::spec::{Origin, PortSpec, Spec};
+use crate::oracle::varying::look;
 use crate::{Done, SlaveDone};
 
 /// Slaves and controller.
@@ -295,9 +297,7 @@ impl Truth {
         let from = asked - lag;
         let mut together = vec![(from, asked)];
         for field in fields(row) {
-            let (Some(var), Some(place)) =
-                (crate::oracle::spec::shown(field.0).next(), data.get(field.1.clone()))
-            else {
+            let (Some(var), Some(place)) = (shown(field.0).next(), data.get(field.1.clone())) else {
                 continue;
             };
             let spans = self.spans(var, asked, |raw| agrees(field.0, var, raw, place));
@@ -408,7 +408,7 @@ impl Truth {
         };
         let mut wrong = None;
         for (field, place) in fields(row) {
-            let Some(var) = crate::oracle::spec::shown(field).next() else { continue };
+            let Some(var) = shown(field).next() else { continue };
             let (at, raw) = *self.had(var)?.back()?;
             if at > since {
                 return None;
@@ -453,7 +453,7 @@ fn fields(row: &RowSpec) -> Vec<(&FieldSpec, std::ops::Range<usize>)> {
         None => {
             let mut at = 0;
             let places = request.fields.iter().map(|field| {
-                let len = crate::oracle::spec::size(field);
+                let len = size(field);
                 at += len;
                 at - len..at
             });
@@ -491,7 +491,7 @@ fn values_of(port: &PortSpec, row: &RowSpec, reply: &[u8]) -> Vec<(SysVar, Raw)>
     // Alive counters do not matter here: the device knows what it had.
     let (frame, mut apart) = (&port.inputs[nth], LineWatch::default());
     let verdict = match row.frames {
-        Some(_) if device::look(frame, reply) == Look::Frame(reply.len()) => apart.judge(frame, nth, reply),
+        Some(_) if look(frame, reply) == Look::Frame(reply.len()) => apart.judge(frame, nth, reply),
         // A refusal.
         Some(_) => return Vec::new(),
         None if reply[1] & 0x80 != 0 => return Vec::new(),

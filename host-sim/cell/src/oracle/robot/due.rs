@@ -7,8 +7,9 @@ use proto_core::time::{Duration, Instant};
 
 use super::{Path, Robot, StopRequest};
 use crate::oracle::field::show;
+use crate::oracle::frame::Raw;
 use crate::oracle::invariant::Wrong;
-use crate::oracle::spec::{Raw, Spec};
+use crate::oracle::spec::Spec;
 use crate::oracle::upward::Upward;
 use crate::oracle::{Invariant, Oracle};
 

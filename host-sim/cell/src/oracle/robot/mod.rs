@@ -16,8 +16,9 @@ use due::SAFE_ARRIVES;
 
 use super::commands::Command;
 use super::field::show;
+use super::frame::Raw;
 use super::invariant::Wrong;
-use super::spec::{Raw, Spec};
+use super::spec::Spec;
 use super::upward::Carried;
 use super::{Invariant, Oracle};
 use crate::network::Sender;

@@ -1,89 +1,165 @@
-//! What the value of an input field may be, and what becomes of it: `as`, limits, a table, "no value", `valid_to`.
+//! The checks of what stands behind a field: limits, tables of numbers, rules of input fields.
 //!
-//! All stand behind their field, as entries of their own, like the limits of output fields
-//! ([`Limits`](super::Limits), [`MapEntry`](super::MapEntry)): fields without them have no room for them, and frames have
-//! nothing in their place. They are for fields that write a variable as a whole.
+//! In: the fields of a frame, in order. Out: nothing, or what is wrong with one of them.
 
 use super::error::{ConfigError, ConfigErrorKind as Kind, Place};
 use super::rules::{Check, check_bit, fail};
-use super::sendable::{check_entry, check_order};
-use super::{FieldSpec, InputBinding, MapEntry};
-use crate::device::{Encoding, Kind as EncodingKind, Overflow};
-use crate::image::bind_to_variable;
+use super::{FieldSpec, InputBinding, InputRule, Limits, MapEntry, OutputBinding};
+use crate::device::{Digits, Encoding, Kind as EncodingKind, Overflow};
+use crate::image::{bind_to_variable, round};
 use crate::sysvar::{Direction, SysVar, VarBit};
 use crate::wire::scalar::{Scalar, ScalarType};
 
-/// Maximum number of characters of a text that says that there is no value.
-pub const NO_TEXT: usize = 8;
-
-/// A text that says that there is no value, such as `----`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
-pub struct NoText {
-    len: u8,
-    bytes: [u8; NO_TEXT],
+/// What stands behind an output field, while the fields of a frame are checked in order.
+#[derive(Default)]
+pub(super) struct Behind<'c> {
+    /// The output field, and all from it on.
+    field: Option<(Encoding, Overflow, OutputBinding, &'c [FieldSpec])>,
+    has_limits: bool,
+    /// Entries of its table so far.
+    entries: usize,
 }
 
-impl NoText {
-    /// A text of 1..=[`NO_TEXT`] printable ASCII characters, without spaces at its ends; `None` for another one.
-    pub fn new(text: &str) -> Option<Self> {
-        let text = text.as_bytes();
-        let is_fine = (1..=NO_TEXT).contains(&text.len()) && text.trim_ascii() == text;
-        if !is_fine || !text.iter().all(|byte| (b' '..=b'~').contains(byte)) {
-            return None;
-        }
-        let mut bytes = [0; NO_TEXT];
-        bytes.iter_mut().zip(text).for_each(|(slot, &byte)| *slot = byte);
-        Some(Self { len: text.len() as u8, bytes })
-    }
-
-    /// Its characters.
-    pub fn bytes(&self) -> &[u8] {
-        self.bytes.get(..usize::from(self.len)).unwrap_or(&[])
-    }
-}
-
-/// What becomes of the value of the input field before it.
-#[derive(Debug, Clone, Copy, PartialEq)]
-#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
-#[non_exhaustive]
-pub enum InputRule {
-    /// A word register has it in two's complement: -32768..=32767 after scale and offset.
-    Int16,
-    /// The variable becomes this for values that no [`MapEntry`] has; without it the field is rejected.
-    Else(f64),
-    /// This number says that there is no value.
-    NoNumber(f64),
-    /// This text says that there is no value, spaces around it aside; fields of digits only.
-    NoText(NoText),
-    /// The digits of a decimal field have a comma where others have a point.
-    Comma,
-    /// This variable, a word register or one bit, is 1 while the field's newest value was taken, and 0 when it was rejected,
-    /// had none, or is overdue.
-    ValidTo {
-        /// An input variable.
-        var: SysVar,
-        /// Bit 0..=7; `None` for a word register.
-        bit: Option<u8>,
-    },
-}
-
-impl InputRule {
-    /// The word register that tells whether a value was taken.
-    pub(super) const fn variable(self) -> Option<SysVar> {
-        match self {
-            Self::ValidTo { var, bit: None } => Some(var),
-            _ => None,
+impl<'c> Behind<'c> {
+    /// Looks at the first of these fields, the rest of a frame's.
+    pub(super) fn check(&mut self, place: Place, rest: &'c [FieldSpec]) -> Check {
+        let Some((field, _)) = rest.split_first() else { return Ok(()) };
+        match *field {
+            FieldSpec::Limits(limits) => {
+                let (encoding, from) = self.bound(place)?;
+                if self.has_limits || self.entries > 0 {
+                    return fail(place, Kind::LimitsAndMap);
+                }
+                if is_count(from) {
+                    return fail(place, Kind::LimitedCount);
+                }
+                self.has_limits = true;
+                check_limits(place, &encoding, &limits)
+            }
+            FieldSpec::Mapped(entry) => {
+                let (encoding, from) = self.bound(place)?;
+                if self.has_limits {
+                    return fail(place, Kind::LimitsAndMap);
+                }
+                if is_count(from) {
+                    return fail(place, Kind::LimitedCount);
+                }
+                if is_scaled(from) {
+                    return fail(place, Kind::ScaledMap);
+                }
+                let before = self.field.map_or(&[][..], |(.., all)| all);
+                let before = before.get(1..).unwrap_or(&[]).iter().take(self.entries);
+                self.entries = self.entries.saturating_add(1);
+                check_entry(place, Some(&encoding), &entry, before)
+            }
+            FieldSpec::UserOutput { ty, from } => {
+                self.begin(Some((Encoding::scalar(ty), Overflow::Usual, from, rest)));
+                Ok(())
+            }
+            FieldSpec::DeviceOutput { encoding, overflow, from } => {
+                self.begin(Some((encoding, overflow, from, rest)));
+                Ok(())
+            }
+            _ => {
+                self.begin(None);
+                Ok(())
+            }
         }
     }
 
-    /// The bit that does.
-    pub(super) const fn bit(self) -> Option<VarBit> {
-        match self {
-            Self::ValidTo { var, bit: Some(bit) } => Some(VarBit { var, bit }),
-            _ => None,
+    fn begin(&mut self, field: Option<(Encoding, Overflow, OutputBinding, &'c [FieldSpec])>) {
+        *self = Self { field, ..Self::default() };
+    }
+
+    /// The field that it stands behind.
+    fn bound(&self, place: Place) -> Result<(Encoding, OutputBinding), ConfigError> {
+        match self.field {
+            Some((_, Overflow::Wrap, ..)) => Err(ConfigError { place, kind: Kind::LimitsAndWrap }),
+            Some((_, _, OutputBinding::Constant(_), _)) | None => {
+                Err(ConfigError { place, kind: Kind::NothingToLimit })
+            }
+            Some((encoding, _, from, _)) => Ok((encoding, from)),
         }
     }
+}
+
+/// Counts wrap in their field.
+const fn is_count(from: OutputBinding) -> bool {
+    match from {
+        OutputBinding::Counter | OutputBinding::CounterTo { .. } => true,
+        OutputBinding::Port { value, .. } => value.is_count(),
+        _ => false,
+    }
+}
+
+fn is_scaled(from: OutputBinding) -> bool {
+    match from {
+        OutputBinding::Variable { scale, offset, .. }
+        | OutputBinding::State { scale, offset, .. }
+        | OutputBinding::Port { scale, offset, .. }
+        | OutputBinding::Link { scale, offset, .. } => (scale, offset) != (1.0, 0.0),
+        _ => false,
+    }
+}
+
+fn check_limits(place: Place, encoding: &Encoding, limits: &Limits) -> Check {
+    check_number(place, encoding, limits.low)?;
+    check_number(place, encoding, limits.high)?;
+    check_order(place, limits)
+}
+
+fn check_order(place: Place, limits: &Limits) -> Check {
+    let Limits { low, high, .. } = *limits;
+    if low > high { fail(place, Kind::BackwardLimits { low, high }) } else { Ok(()) }
+}
+
+/// `encoding` is of the field that has the number of the entry, if one has.
+fn check_entry<'c>(
+    place: Place,
+    encoding: Option<&Encoding>,
+    entry: &MapEntry,
+    before: impl Iterator<Item = &'c FieldSpec>,
+) -> Check {
+    let &MapEntry { first, last, sent } = entry;
+    if first > last {
+        return fail(place, Kind::BackwardRange { first, last });
+    }
+    if let Some(encoding) = encoding {
+        check_number(place, encoding, sent)?;
+    }
+    let others = before.filter_map(|field| match field {
+        FieldSpec::Mapped(other) => Some(other),
+        _ => None,
+    });
+    let mut common = others.map(|other| (first.max(other.first), last.min(other.last)));
+    match common.find(|(first, last)| first <= last) {
+        Some((value, _)) => fail(place, Kind::MappedTwice { value }),
+        None => Ok(()),
+    }
+}
+
+/// Checks that a field can have a number as it is, so that it is sent unchanged.
+///
+/// # Errors
+/// [`ConfigErrorKind::NotInField`](Kind::NotInField), [`ConfigErrorKind::FractionOfInteger`](Kind::FractionOfInteger)
+/// or [`ConfigErrorKind::TooManyDecimals`](Kind::TooManyDecimals).
+pub fn check_sent(encoding: &Encoding, value: f64) -> Result<(), Kind> {
+    let (low, high) = encoding.range();
+    if !(low..=high).contains(&value) {
+        return Err(Kind::NotInField { value, low, high });
+    }
+    if encoding.is_integer() {
+        return if round(value) == value { Ok(()) } else { Err(Kind::FractionOfInteger { value }) };
+    }
+    let EncodingKind::Decimal(Digits { decimals, .. }) = encoding.kind else { return Ok(()) };
+    let unit = (0..decimals).fold(1.0, |unit, _| unit * 10.0);
+    let steps = value * unit;
+    let is_whole = (round(steps) - steps).abs() < 1e-6 * steps.abs().max(1.0);
+    if is_whole { Ok(()) } else { Err(Kind::TooManyDecimals { value, decimals }) }
+}
+
+fn check_number(place: Place, encoding: &Encoding, value: f64) -> Check {
+    check_sent(encoding, value).map_err(|kind| ConfigError { place, kind })
 }
 
 /// What stands behind an input field, while the fields of a frame are checked in order.
@@ -165,7 +241,7 @@ impl<'c> BehindInput<'c> {
             true => (-32_768.0..=32_767.0).contains(&number),
             false => bind_to_variable(own.var, Scalar::Double(number), 1.0, 0.0).is_some(),
         };
-        let is_whole = own.var.ty() == ScalarType::Float || crate::image::round(number) == number;
+        let is_whole = own.var.ty() == ScalarType::Float || round(number) == number;
         if fits && is_whole {
             Ok(())
         } else {
@@ -244,7 +320,7 @@ pub fn check_read(encoding: &Encoding, value: f64) -> Result<(), Kind> {
     if !(low..=high).contains(&value) {
         return Err(Kind::NotInField { value, low, high });
     }
-    let is_possible = !encoding.reads_integers() || crate::image::round(value) == value;
+    let is_possible = !encoding.reads_integers() || round(value) == value;
     if is_possible { Ok(()) } else { Err(Kind::FractionOfInteger { value }) }
 }
 

@@ -12,20 +12,20 @@ use proto_core::wire::scalar::{Scalar, ScalarType};
 use recipe_config::{AnyRecipe, DeviceRecipe, NamedExchange, NamedFrame, SimField, SimParts, SimRecipe};
 use recipe_export::unit_of;
 
-use super::convert::device::DevicePart;
+use super::device::DevicePart;
 
 /// A compiled part.
 #[derive(Debug)]
-pub(super) struct CompiledPart {
-    pub(super) layout: Layout,
+pub(in super::super) struct CompiledPart {
+    pub(in super::super) layout: Layout,
     /// One for a stream part, one per id for a CAN part.
-    pub(super) frames: Vec<FrameValues>,
+    pub(in super::super) frames: Vec<FrameValues>,
     /// The recipe and the part of it, for a recipe as the controller has it.
     plain: Option<(String, Direction)>,
 }
 
 #[derive(Debug)]
-pub(super) enum Layout {
+pub(in super::super) enum Layout {
     /// Frames in a stream of bytes.
     Stream(Box<StreamLayout>),
     /// One frame per datagram, without head and tail.
@@ -37,23 +37,23 @@ pub(super) enum Layout {
 
 /// The fields of one frame.
 #[derive(Debug)]
-pub(super) struct FrameValues {
-    pub(super) id: Option<CanId>,
-    pub(super) fields: Vec<NamedField>,
+pub(in super::super) struct FrameValues {
+    pub(in super::super) id: Option<CanId>,
+    pub(in super::super) fields: Vec<NamedField>,
 }
 
 #[derive(Debug)]
-pub(super) struct NamedField {
-    pub(super) name: String,
-    pub(super) ty: ScalarType,
-    pub(super) unit: &'static str,
+pub(in super::super) struct NamedField {
+    pub(in super::super) name: String,
+    pub(in super::super) ty: ScalarType,
+    pub(in super::super) unit: &'static str,
     /// What a gateway does with its value, in a gateway file.
-    pub(super) spec: Option<FieldSpec>,
+    pub(in super::super) spec: Option<FieldSpec>,
 }
 
 impl CompiledPart {
     /// Chooses the recipe called `name`, or the only one, and its part, or the only one.
-    pub(super) fn choose(
+    pub(in super::super) fn choose(
         recipes: &[AnyRecipe],
         name: Option<&str>,
         part: Option<Direction>,
@@ -88,7 +88,7 @@ impl CompiledPart {
     }
 
     /// Chooses a frame of an exchange, or the only one.
-    pub(super) fn choose_exchange(
+    pub(in super::super) fn choose_exchange(
         recipes: &[AnyRecipe],
         name: Option<&str>,
         number: Option<usize>,
@@ -140,7 +140,7 @@ impl CompiledPart {
     }
 
     /// Notes what a gateway does with the values, of the same file's recipes as frames.
-    pub(super) fn bind(&mut self, recipes: &[Option<DeviceRecipe>]) {
+    pub(in super::super) fn bind(&mut self, recipes: &[Option<DeviceRecipe>]) {
         let Some((name, direction)) = &self.plain else { return };
         let Some(recipe) = recipes.iter().flatten().find(|recipe| recipe.name == *name) else { return };
         for (frame, bound) in self.frames.iter_mut().zip(recipe.part(*direction)) {
@@ -151,7 +151,7 @@ impl CompiledPart {
     }
 
     /// Whether its only frame is always the same, so that no values are needed.
-    pub(super) fn is_constant(&self) -> bool {
+    pub(in super::super) fn is_constant(&self) -> bool {
         matches!(&self.layout, Layout::Device(device) if device.is_constant())
     }
 
@@ -186,12 +186,16 @@ impl CompiledPart {
     }
 
     /// Whether frames are CAN frames.
-    pub(super) fn is_can(&self) -> bool {
+    pub(in super::super) fn is_can(&self) -> bool {
         self.frames.iter().any(|frame| frame.id.is_some())
     }
 
     /// The bytes of a stream frame or datagram.
-    pub(super) fn encode_stream(&self, layout: &StreamLayout, values: &[Scalar]) -> Result<Vec<u8>, String> {
+    pub(in super::super) fn encode_stream(
+        &self,
+        layout: &StreamLayout,
+        values: &[Scalar],
+    ) -> Result<Vec<u8>, String> {
         let mut bytes = vec![0; layout.frame_len()];
         match layout.encode_values(values, &mut bytes) {
             Ok(_) => Ok(bytes),
@@ -200,7 +204,7 @@ impl CompiledPart {
     }
 
     /// The CAN frame with this index.
-    pub(super) fn encode_can(
+    pub(in super::super) fn encode_can(
         &self,
         layout: &CanLayout,
         index: usize,
@@ -227,7 +231,7 @@ fn choose_recipe<'r>(recipes: &'r [AnyRecipe], name: Option<&str>) -> Result<&'r
 
 /// A frame of an exchange.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum ExchangePart {
+pub(in super::super) enum ExchangePart {
     Request,
     Reply,
     Pending,

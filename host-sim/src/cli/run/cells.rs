@@ -5,8 +5,8 @@ use std::num::NonZeroUsize;
 use std::path::PathBuf;
 use std::thread::available_parallelism;
 
-use super::check;
-use super::run::RunArgs;
+use super::RunArgs;
+use crate::cli::check;
 use recipe_capture::Watch;
 use recipe_io::bind::Bind;
 use recipe_runtime::cells::Cell;
@@ -25,7 +25,7 @@ pub(super) fn prepare(
     run: RunArgs,
     log: Log,
 ) -> Result<(Vec<Cell>, RunOptions), RunError> {
-    let overrides = run.overrides().to_vec();
+    let overrides = run.overrides.set.clone();
     // Even if a file is wrong, a ready file of a killed run is removed.
     let options = run.options(log);
     let names = CellNames::of(files)?;

@@ -6,8 +6,9 @@
 use proto_core::config::{FrameSpec, GatewayConfig};
 use proto_core::wire::can::CanId;
 
-use crate::oracle::device::{Look, look};
-use crate::oracle::spec::{Frame, device_frame};
+use crate::oracle::device::Look;
+use crate::oracle::frame::{Frame, device_frame};
+use crate::oracle::varying::look;
 
 /// The frames of one exchange, apart from its request.
 #[derive(Debug, Clone, Default)]
@@ -22,7 +23,7 @@ pub(in crate::oracle) struct FramesSpec {
 
 impl FramesSpec {
     /// What the bytes that came are, if they follow the request.
-    pub(super) fn see(&self, bytes: &[u8]) -> Seen {
+    pub(in crate::oracle) fn see(&self, bytes: &[u8]) -> Seen {
         let reply = self.reply.as_ref().map_or(Look::No, |reply| look(reply, bytes));
         let refusal = self.refusal.as_ref().map_or(Look::No, |refusal| look(refusal, bytes));
         Seen::of(reply, Seen::Reply).or(Seen::of(refusal, Seen::Refusal))
@@ -57,7 +58,7 @@ pub(in crate::oracle) enum Seen {
 }
 
 impl Seen {
-    pub(super) fn of(look: Look, whole: impl FnOnce(usize) -> Self) -> Self {
+    pub(in crate::oracle) fn of(look: Look, whole: impl FnOnce(usize) -> Self) -> Self {
         match look {
             Look::No => Self::No,
             Look::Begins { is_ours } => Self::Begins { is_ours },
@@ -68,7 +69,7 @@ impl Seen {
     }
 
     /// The same of an exchange that is not pending.
-    pub(super) fn late(self, row: usize) -> Self {
+    pub(in crate::oracle) fn late(self, row: usize) -> Self {
         match self {
             Self::Reply(len) | Self::Refusal(len) => Self::Late(len, row),
             other => other,
@@ -78,7 +79,7 @@ impl Seen {
     /// What bytes are that may be one of two frames: a frame is more than the beginning of one of ours, that
     /// is more than one of others, and that is more than the beginning of one of others or a wrong
     /// checksum. Of equals, the first.
-    pub(super) fn or(self, other: Self) -> Self {
+    pub(in crate::oracle) fn or(self, other: Self) -> Self {
         let rank = |seen: &Self| match seen {
             Self::No => 0,
             Self::Wrong(_) => 1,
@@ -98,7 +99,7 @@ impl Seen {
 }
 
 /// A frame of an exchange.
-pub(super) fn frame_of(config: &GatewayConfig, nth: u8) -> Option<(&FrameSpec, Frame)> {
+pub(in crate::oracle) fn frame_of(config: &GatewayConfig, nth: u8) -> Option<(&FrameSpec, Frame)> {
     let spec = config.frames.get(usize::from(nth))?;
     let fields = spec.fields.of(&config.fields);
     // A remote frame has none.

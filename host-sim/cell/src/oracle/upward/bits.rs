@@ -1,7 +1,7 @@
 //! Bits with owners (proto-core/docs/engine.md section 5): the bits that one input frame writes in one byte
 //! wait together, and are written by Modbus as coils.
 //!
-//! Bytes that a recipe link carries or that an output part shows have no model: [`super::unmodelled`].
+//! Bytes that a recipe link carries or that an output part shows have no model: `unmodelled.rs`.
 
 use std::collections::VecDeque;
 
@@ -9,23 +9,15 @@ use proto_core::engine::LinkId;
 use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 
-use super::Invariant;
-use super::field::Accepted;
-use super::invariant::Wrong;
-use super::spec::Spec;
-use super::upward::{Alone, Carried, EDGES, Upward};
-
-/// Bits of one byte.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Coils {
-    pub var: SysVar,
-    pub mask: u8,
-    pub on: u8,
-}
+use super::{Alone, Carried, EDGES, Upward};
+use crate::oracle::Invariant;
+use crate::oracle::field::{Accepted, Coils};
+use crate::oracle::invariant::Wrong;
+use crate::oracle::spec::Spec;
 
 /// The state of one share.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Waits {
+pub(in crate::oracle) struct Waits {
     /// Values to be written, the next one first, each with the time of its frame.
     waiting: VecDeque<(u8, Instant)>,
     /// The bits of the next one that were not written yet.
@@ -40,7 +32,13 @@ pub(super) struct Waits {
 
 impl Upward {
     /// Applies the bits of a frame; returns whether their link is down.
-    pub(super) fn bits_accepted(&mut self, spec: &Spec, nth: usize, frame: &Accepted, now: Instant) -> bool {
+    pub(in crate::oracle) fn bits_accepted(
+        &mut self,
+        spec: &Spec,
+        nth: usize,
+        frame: &Accepted,
+        now: Instant,
+    ) -> bool {
         let is_up = self.is_up(LinkId::MODBUS);
         let mut undelivered = false;
         for (place, share) in spec.shares.iter().enumerate() {
@@ -76,7 +74,7 @@ impl Upward {
     }
 
     /// A frame is overdue: its bits take their safe values, or hold.
-    pub(super) fn bits_silent(&mut self, spec: &Spec, nth: usize, frame: usize, now: Instant) {
+    pub(in crate::oracle) fn bits_silent(&mut self, spec: &Spec, nth: usize, frame: usize, now: Instant) {
         for (place, share) in spec.shares.iter().enumerate() {
             if (share.port, share.frame) == (nth, frame) && self.shares[place].alone.is_none() {
                 self.share_silent(spec, place, now);
@@ -85,7 +83,7 @@ impl Upward {
     }
 
     /// The same of one share.
-    pub(super) fn share_silent(&mut self, spec: &Spec, place: usize, now: Instant) {
+    pub(in crate::oracle) fn share_silent(&mut self, spec: &Spec, place: usize, now: Instant) {
         let (share, state) = (&spec.shares[place], &mut self.shares[place]);
         let waited = state.waiting.len() as u32;
         state.waiting.clear();
@@ -101,7 +99,13 @@ impl Upward {
     }
 
     /// Drops values of a port that waited too long.
-    pub(super) fn expire_bits(&mut self, spec: &Spec, nth: usize, timeout: Duration, now: Instant) {
+    pub(in crate::oracle) fn expire_bits(
+        &mut self,
+        spec: &Spec,
+        nth: usize,
+        timeout: Duration,
+        now: Instant,
+    ) {
         for (state, share) in self.shares.iter_mut().zip(&spec.shares) {
             if share.port != nth || state.safe {
                 continue;
@@ -119,7 +123,7 @@ impl Upward {
     }
 
     /// Modbus was lost: waiting values are dropped, except safe values.
-    pub(super) fn bits_lost(&mut self, spec: &Spec) {
+    pub(in crate::oracle) fn bits_lost(&mut self, spec: &Spec) {
         for (state, share) in self.shares.iter_mut().zip(&spec.shares).filter(|(state, _)| !state.safe) {
             self.counted[share.port].values_expired += state.waiting.len() as u32;
             state.waiting.clear();
@@ -127,7 +131,7 @@ impl Upward {
     }
 
     /// Queues safe bits again, if they are still current: each a share and its bits.
-    pub(super) fn bits_again(&mut self, spec: &Spec, bits: impl IntoIterator<Item = (usize, u8)>) {
+    pub(in crate::oracle) fn bits_again(&mut self, spec: &Spec, bits: impl IntoIterator<Item = (usize, u8)>) {
         for (place, mask) in bits {
             let state = &mut self.shares[place];
             let (true, Some(safe)) = (state.safe, spec.shares[place].safe) else { continue };
@@ -140,7 +144,7 @@ impl Upward {
     }
 
     /// Queues all safe bits again.
-    pub(super) fn all_bits_again(&mut self, spec: &Spec) {
+    pub(in crate::oracle) fn all_bits_again(&mut self, spec: &Spec) {
         let all: Vec<_> = spec.shares.iter().enumerate().map(|(place, share)| (place, share.mask)).collect();
         self.bits_again(spec, all);
     }
@@ -148,7 +152,7 @@ impl Upward {
     /// Checks a write of coils and takes their values from the queues; returns the origin of each share's part,
     /// and the safe bits among them.
     #[allow(clippy::type_complexity, reason = "two lists that belong together")]
-    pub(super) fn wrote_bits(
+    pub(in crate::oracle) fn wrote_bits(
         &mut self,
         spec: &Spec,
         coils: Coils,
@@ -200,13 +204,13 @@ impl Upward {
     }
 
     /// Number of the port's values of bits that wait behind others.
-    pub(super) fn queued_bits(&self, spec: &Spec, nth: usize) -> usize {
+    pub(in crate::oracle) fn queued_bits(&self, spec: &Spec, nth: usize) -> usize {
         let own = self.shares.iter().zip(&spec.shares).filter(|(_, share)| share.port == nth);
         own.map(|(state, _)| state.waiting.len().saturating_sub(1)).sum()
     }
 
     /// A byte with bits that wait.
-    pub(super) fn waiting_bits(&self, spec: &Spec) -> Option<SysVar> {
+    pub(in crate::oracle) fn waiting_bits(&self, spec: &Spec) -> Option<SysVar> {
         let mut shares = self.shares.iter().zip(&spec.shares);
         shares.find(|(state, _)| !state.waiting.is_empty()).map(|(_, share)| share.var)
     }

@@ -11,9 +11,11 @@ use proto_core::sysvar::SysVar;
 use proto_core::time::Duration;
 use proto_core::wire::can::CanId;
 
+use super::PortSpec;
 use super::frames::{FramesSpec, Seen, frame_of};
-use crate::oracle::device::{self, look};
-use crate::oracle::spec::{Frame, PortSpec, device_frame};
+use crate::oracle::device;
+use crate::oracle::frame::{Frame, device_frame};
+use crate::oracle::varying::{can_be_the_same, look};
 use crate::rtu::is_right;
 
 /// The exchanges of a port.
@@ -87,7 +89,7 @@ pub(in crate::oracle) enum Kind {
 impl ExchangesSpec {
     /// The device whose CANopen node says with this frame that it has booted: 0 with id 0x700 + node, of a node that is
     /// asked with SDO.
-    pub(super) fn booted(&self, id: CanId, data: &[u8]) -> Option<u8> {
+    pub(in crate::oracle) fn booted(&self, id: CanId, data: &[u8]) -> Option<u8> {
         let (CanId::Standard(id @ 0x701..=0x77F), [0]) = (id, data) else { return None };
         let asked = Some(CanId::Standard(0x600 + (id - 0x700)));
         let of_node = self.rows.iter().find(|row| row.request.as_ref().is_some_and(|own| own.id == asked));
@@ -158,7 +160,7 @@ impl ExchangesSpec {
     }
 
     /// The shortest timeout of the exchanges with a slave.
-    pub(super) fn shortest(&self, slave: u8) -> Duration {
+    pub(in crate::oracle) fn shortest(&self, slave: u8) -> Duration {
         self.rows_of(slave).map(|(_, row)| row.timeout).min().unwrap_or_default()
     }
 
@@ -182,14 +184,14 @@ impl ExchangesSpec {
     }
 
     /// What bytes of a line are that come unasked.
-    pub(super) fn see_unasked(&self, port: &PortSpec, bytes: &[u8]) -> Seen {
+    pub(in crate::oracle) fn see_unasked(&self, port: &PortSpec, bytes: &[u8]) -> Seen {
         self.unasked.iter().fold(Seen::No, |seen, &nth| {
             seen.or(Seen::of(look(&port.inputs[nth], bytes), |len| Seen::Unasked(len, nth)))
         })
     }
 
     /// The exchanges with a slave, by index.
-    pub(super) fn rows_of(&self, slave: u8) -> impl Iterator<Item = (usize, &RowSpec)> {
+    pub(in crate::oracle) fn rows_of(&self, slave: u8) -> impl Iterator<Item = (usize, &RowSpec)> {
         self.rows.iter().enumerate().filter(move |(_, row)| row.slave == slave)
     }
 }
@@ -231,7 +233,7 @@ impl RowSpec {
     }
 
     /// Whether a reply is expected.
-    pub(super) fn is_answered(&self) -> bool {
+    pub(in crate::oracle) fn is_answered(&self) -> bool {
         match &self.frames {
             Some(frames) => frames.is_asked && frames.reply.is_some(),
             None => self.slave != 0,
@@ -242,7 +244,7 @@ impl RowSpec {
     fn is_answered_like(&self, other: &Self) -> bool {
         match (&self.frames, &other.frames) {
             (Some(one), Some(other)) => match (&one.reply, &other.reply) {
-                (Some(one), Some(other)) => device::can_be_the_same(one, other),
+                (Some(one), Some(other)) => can_be_the_same(one, other),
                 _ => false,
             },
             _ => {
@@ -255,17 +257,17 @@ impl RowSpec {
     }
 
     /// How long nothing is sent behind a request that nobody answers, at least.
-    pub(super) fn rest(&self, turnaround: Duration) -> Duration {
+    pub(in crate::oracle) fn rest(&self, turnaround: Duration) -> Duration {
         if self.frames.is_some() { self.pause.max(turnaround) } else { self.pause + AFTER_BROADCAST }
     }
 
     /// Whether the device takes values or orders with the request.
-    pub(super) fn is_written(&self) -> bool {
+    pub(in crate::oracle) fn is_written(&self) -> bool {
         self.written.is_some() || self.request.is_some()
     }
 
     /// Whether the request can be made at any time: none of its values can be unknown.
-    pub(super) fn is_always_ready(&self) -> bool {
+    pub(in crate::oracle) fn is_always_ready(&self) -> bool {
         let request = self.request.iter().flat_map(|request| &request.fields);
         request.filter_map(FieldSpec::source).all(|source| {
             matches!(
@@ -310,7 +312,7 @@ impl RowSpec {
         }
     }
 
-    pub(super) fn is_coils(&self) -> bool {
+    pub(in crate::oracle) fn is_coils(&self) -> bool {
         matches!(self.function, 5 | 15)
     }
 
@@ -323,7 +325,7 @@ impl RowSpec {
         }
     }
 
-    pub(super) fn request_len(&self) -> usize {
+    pub(in crate::oracle) fn request_len(&self) -> usize {
         if self.frames.is_some() {
             return self.request.as_ref().map_or(0, Frame::len);
         }
@@ -353,7 +355,7 @@ impl RowSpec {
 
     /// The data of a request, as its fields have it: one coil in the lowest bit. Of a device's own frame,
     /// all of it.
-    pub(super) fn data_of(&self, request: &[u8]) -> Vec<u8> {
+    pub(in crate::oracle) fn data_of(&self, request: &[u8]) -> Vec<u8> {
         if self.frames.is_some() {
             return request.to_vec();
         }
@@ -362,7 +364,7 @@ impl RowSpec {
     }
 
     /// The data that registers or coils with these values are, or bytes.
-    pub(super) fn data_from(&self, values: &[u16]) -> Vec<u8> {
+    pub(in crate::oracle) fn data_from(&self, values: &[u16]) -> Vec<u8> {
         if self.frames.is_some() {
             return values.iter().map(|&byte| byte as u8).collect();
         }
@@ -374,7 +376,7 @@ impl RowSpec {
     }
 
     /// The registers or coils that a slave takes from this data; of a device's own frame, the bytes.
-    pub(super) fn values_of(&self, data: &[u8]) -> Vec<u16> {
+    pub(in crate::oracle) fn values_of(&self, data: &[u8]) -> Vec<u16> {
         if self.frames.is_some() {
             return data.iter().copied().map(u16::from).collect();
         }
@@ -391,7 +393,7 @@ impl RowSpec {
     }
 
     /// The same of a reply that comes too late, if `request` was the newest one; a wrong checksum is nothing.
-    pub(super) fn see_late(&self, request: Option<&[u8]>, bytes: &[u8]) -> Seen {
+    pub(in crate::oracle) fn see_late(&self, request: Option<&[u8]>, bytes: &[u8]) -> Seen {
         match (&self.frames, request) {
             (Some(_), _) => self.see(&[], bytes),
             (None, None) => Seen::No,
@@ -403,7 +405,7 @@ impl RowSpec {
     }
 
     /// Whether a frame on a bus is the abort of this SDO request, where the file has no other refusal.
-    pub(super) fn is_abort(&self, request: &[u8], id: CanId, frame: &[u8]) -> bool {
+    pub(in crate::oracle) fn is_abort(&self, request: &[u8], id: CanId, frame: &[u8]) -> bool {
         let Some(FramesSpec { reply: Some(reply), refusal: None, .. }) = &self.frames else { return false };
         let is_sdo = match (self.request.as_ref().and_then(|own| own.id), reply.id) {
             (Some(CanId::Standard(asked @ 0x601..=0x67F)), Some(CanId::Standard(own))) => asked == own + 0x80,
@@ -414,7 +416,7 @@ impl RowSpec {
     }
 
     /// What the bytes that came are, if they follow this request.
-    pub(super) fn see(&self, request: &[u8], bytes: &[u8]) -> Seen {
+    pub(in crate::oracle) fn see(&self, request: &[u8], bytes: &[u8]) -> Seen {
         if let Some(frames) = &self.frames {
             return frames.see(bytes);
         }
