@@ -25,7 +25,6 @@ pub const CAPACITY: usize = 4096;
 /// Maximum length of a line in bytes, with its end.
 pub const MAX_LINE: usize = 192;
 
-/// The lines.
 struct Ring {
     bytes: Deque<u8, CAPACITY>,
     /// Number of bytes that were dropped since the start; it wraps.

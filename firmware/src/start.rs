@@ -155,7 +155,6 @@ fn make_edge(
     edge_setup
 }
 
-/// Starts the store task.
 #[inline(never)]
 fn start_store_task(
     tasks: &Tasks,

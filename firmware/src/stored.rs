@@ -42,7 +42,6 @@ impl<F> StorePlaces<F> {
 #[derive(Debug)]
 pub struct StoredConfig<F> {
     store: Store,
-    /// Flash of the store.
     flash: F,
     /// Target of a move, if the store is in the wrong bank.
     to: Option<F>,

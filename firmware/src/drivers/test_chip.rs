@@ -24,7 +24,6 @@ impl<P: Peripheral> TestDevice<P> {
         Rc::new(Self { model: RefCell::new(model), now: Cell::new(0), clocks, functions })
     }
 
-    /// Virtual time.
     pub(crate) fn now(&self) -> Picos {
         self.now.get()
     }
@@ -75,7 +74,6 @@ impl<P: Peripheral> TestDevice<P> {
         due.is_some()
     }
 
-    /// Advances time.
     #[track_caller]
     pub(crate) fn pass(&self, span: Picos) {
         let end = self.now() + span;

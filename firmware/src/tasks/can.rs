@@ -40,14 +40,19 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, can: impl CanPo
 /// What the task waits for, besides frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum CanPhase {
-    /// Frames to send.
     Idle,
     /// Frames in the controller must be sent by then.
-    Sending { until: Instant },
+    Sending {
+        until: Instant,
+    },
     /// Bus-off: restart at that time.
-    Off { until: Instant },
+    Off {
+        until: Instant,
+    },
     /// The controller is recovering; on timeout, recovery is retried.
-    Recovering { until: Instant },
+    Recovering {
+        until: Instant,
+    },
 }
 
 struct CanTask<'a, C> {

@@ -87,7 +87,6 @@ impl PortControl {
         }
     }
 
-    /// Ignores earlier sleeps.
     pub(crate) fn clear_sleep(&self) {
         self.has_slept.set(false);
     }

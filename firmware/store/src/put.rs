@@ -33,7 +33,6 @@ pub(crate) struct Work {
     copies: [u16; KEYS],
     /// Remaining attempts to begin a sector.
     turns: u8,
-    /// Remaining rewrites.
     tries: u8,
     /// A sector that is blank is not erased again before it is begun.
     is_erased: bool,
@@ -95,7 +94,6 @@ impl core::error::Error for PutError {}
 
 #[derive(Debug, Clone, Copy)]
 enum PutPhase {
-    /// Find space.
     Place,
     Append,
     Erase {
@@ -156,7 +154,6 @@ impl<F: Flash> RecordSource<'_, F> {
 /// The sector that a record is written to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum PutTarget {
-    /// The current sector.
     Filled,
     /// The target of copying.
     Next,
@@ -414,7 +411,6 @@ pub(crate) fn is_blank(flash: &impl Flash, sector: u8) -> bool {
     (0..flash.geometry().words).all(|word| flash.read(FlashWord { sector, word }) == BLANK)
 }
 
-/// The head of a record.
 pub(crate) fn head_of(flash: &impl Flash, found: FoundRecord) -> Option<RecordHead> {
     let word = FlashWord { word: found.data.word.saturating_sub(1), ..found.data };
     RecordHead::parse(&flash.read(word))

@@ -27,7 +27,6 @@ pub(crate) struct TestRun {
 }
 
 impl TestRun {
-    /// The engine begins.
     pub(crate) fn begin(watch: &Watch) -> Self {
         Self::begin_with(watch, &std::fs::read_to_string(example(FILE)).unwrap())
     }
@@ -81,7 +80,6 @@ impl TestRun {
         self.watch.give(Record { at: self.at, lost, what: What::Pass(bytes.into()) });
     }
 
-    /// The engine ends.
     pub(crate) fn end(self) {
         let totals = totals(&*self.engine);
         self.entries(&[Entry::Totals(&totals)], 0);
@@ -100,7 +98,6 @@ fn encoded(entries: &[Entry<'_>]) -> Vec<u8> {
     bytes
 }
 
-/// What it runs.
 pub(crate) fn config() -> Box<GatewayConfig> {
     let text = std::fs::read_to_string(example(FILE)).unwrap();
     recipe_test_kit::toml::gateway(&text)

@@ -18,7 +18,6 @@ struct Instead {
     value: f32,
 }
 
-/// Where an item is sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct SentItem {
     /// Its offset in the process image, and so in recipes' frames.

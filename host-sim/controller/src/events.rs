@@ -213,7 +213,6 @@ impl std::fmt::Display for Happened {
     }
 }
 
-/// The recorded events.
 #[derive(Debug, Default)]
 pub(super) struct Recorder {
     on: bool,

@@ -18,7 +18,6 @@ use super::{Controller, ControllerOutput, RecipeError};
 pub use recipe_config::CommandClients;
 use recipe_config::InitialTarget;
 
-/// The present faults.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Faults {
     muted: [bool; 3],

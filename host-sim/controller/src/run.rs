@@ -359,7 +359,6 @@ impl Controller {
         if now >= until { Some(CallReply::Done) } else { self.begin_activity(Activity::Waiting { until }) }
     }
 
-    /// Starts the move of a call.
     fn start_move(&mut self, now: Instant, call: &Call) -> Result<(), String> {
         let rate = self.machine.rate();
         let (function, started) = match *call {

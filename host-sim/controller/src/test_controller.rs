@@ -324,5 +324,4 @@ impl TestController {
     }
 }
 
-/// The clients' address.
 pub(crate) const CLIENT_ADDRESS: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);

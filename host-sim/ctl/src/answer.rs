@@ -15,7 +15,6 @@ pub struct Answer {
     pub(crate) verdict: Verdict,
 }
 
-/// Text for people.
 #[derive(Debug, Clone)]
 pub(crate) enum AnswerText {
     /// Made by this program.

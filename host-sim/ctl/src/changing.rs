@@ -108,7 +108,6 @@ fn image_of(config: &GatewayConfig) -> Result<Vec<u8>, String> {
 pub(crate) enum ServerRole {
     /// A gateway on a host.
     Host,
-    /// A board.
     Board,
 }
 

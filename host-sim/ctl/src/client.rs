@@ -34,7 +34,6 @@ pub struct Client {
     nonce: RefCell<Option<String>>,
 }
 
-/// The body of a request.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum RequestBody<'a> {
     None,
@@ -134,7 +133,6 @@ impl Client {
         Failure::Refused(format!("{}: {}", self.address, shown::line(&why.to_string())))
     }
 
-    /// A document.
     pub(crate) fn json(&self, path: &str) -> Result<Value, Failure> {
         let reply = self.get(path)?;
         self.document(&reply)
@@ -175,7 +173,6 @@ impl Client {
         String::from_utf8(reply.body).map_err(|_| self.refused("the answer is no text; is this a gateway?"))
     }
 
-    /// Opens a stream.
     pub(crate) fn stream(&self, path: &str) -> Result<EventStream<'_>, Failure> {
         self.opened(self.open(path)?)
     }

@@ -24,7 +24,6 @@ pub(crate) struct FramesDocument {
     pub(crate) lost: u64,
 }
 
-/// A frame.
 #[derive(Debug, Clone, Deserialize)]
 pub(crate) struct FrameDocument {
     /// On the gateway's clock.
@@ -70,7 +69,6 @@ impl FrameDocument {
         rest.is_empty().then(|| pairs.iter().map(|[high, low]| high << 4 | low).collect())
     }
 
-    /// The id of a CAN frame.
     pub(crate) fn can_id(&self) -> Option<CanId> {
         let id = self.id?;
         match self.extended {

@@ -68,7 +68,6 @@ pub fn status(client: &Client, view: TableView) -> Result<Answer, Failure> {
     Ok(status_of(client.json("status")?, view))
 }
 
-/// The status of this document.
 pub(crate) fn status_of(document: Value, view: TableView) -> Answer {
     let health = document["health"].as_str().unwrap_or_default();
     // A simulated controller has none.
@@ -283,7 +282,6 @@ pub fn revisions(client: &Client) -> Result<Answer, Failure> {
     Ok(revisions_of(client.json("revisions")?))
 }
 
-/// The revisions of this document.
 pub(crate) fn revisions_of(document: Value) -> Answer {
     let number = |key: &str| document[key].as_u64();
     let trial = document["trial"]["revision"].as_u64();

@@ -40,7 +40,6 @@ pub(crate) fn read(path: &Path) -> Result<Seed, Failure> {
     })
 }
 
-/// Reads a public key.
 pub(crate) fn read_public(path: &Path) -> Result<PublicKey, Failure> {
     let mut text = String::new();
     let file = File::open(path).and_then(|file| file.take(MAX_FILE).read_to_string(&mut text));

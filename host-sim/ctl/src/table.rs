@@ -27,7 +27,6 @@ pub(crate) enum Look {
     Warning,
 }
 
-/// A cell.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct TableCell {
     text: String,

@@ -19,7 +19,6 @@ pub struct State {
     pub(crate) controller: Option<States>,
 }
 
-/// A field port.
 #[derive(Debug, Clone)]
 pub(crate) struct ObservedPort {
     pub(crate) id: PortId,

@@ -22,7 +22,6 @@ pub struct PublisherConfig {
     pub sample: Duration,
     /// Where the number of the session is kept.
     pub bd_seq: Option<PathBuf>,
-    /// Exceptions for variables.
     rules: Vec<PublishRule>,
     file: SparkplugFile,
 }

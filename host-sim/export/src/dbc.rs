@@ -154,7 +154,6 @@ struct DbcWriter {
     notes: Vec<String>,
 }
 
-/// Where and how a signal is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct SignalShape {
     start: usize,

@@ -281,7 +281,6 @@ async fn pump<D: ByteStream>(
 
 /// What a port waits for, other than bytes.
 enum Other {
-    /// The process slept.
     Slept,
     /// Received bytes are requested from the driver.
     Looked,

@@ -19,7 +19,6 @@ use super::exchange::{PortEvent, PortTx};
 use super::port::{BusSettings, OpenPort};
 use crate::timer::now;
 
-/// A device's event.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Seen {
     Up,

@@ -47,13 +47,10 @@ use tapping::Tapping;
 /// Observers of a gateway.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Observers {
-    /// Captures and recordings.
     pub watch: Watch,
     /// Decodes frames for them.
     pub decoder: Arc<Decoder>,
-    /// The console.
     pub slot: Option<Arc<SnapshotSlot>>,
-    /// The edge node.
     pub snapshot_watch: Option<SnapshotWatch>,
     /// Whether the log or the statistics are read, which report findings.
     pub readers: bool,
@@ -79,7 +76,6 @@ struct PreparedGateway {
     links: Vec<(LinkId, LinkKind, LinkEndpoint)>,
     ready: Value,
     slot: Option<Arc<SnapshotSlot>>,
-    /// The edge node's.
     publisher_slot: Option<Arc<SnapshotSlot>>,
     /// Examines the gateway once a second.
     doctor: Option<Doctor>,
@@ -88,7 +84,6 @@ struct PreparedGateway {
 /// Which outputs of the engine are executed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum TxPolicy {
-    /// All of them.
     All,
     /// None that send, neither to the controller nor to the field.
     None,
@@ -111,7 +106,6 @@ struct Core {
     /// The gateway is being replaced: input of its devices is ignored.
     is_ending: Cell<bool>,
     tx_policy: TxPolicy,
-    /// Ports with exchanges.
     exchange_ports: BTreeSet<PortId>,
     started: Instant,
     /// Recent input of each port.

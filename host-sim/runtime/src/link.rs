@@ -41,7 +41,6 @@ pub(super) enum LinkEndpoint {
     UdpListen { socket: UdpSocket, controller: String },
 }
 
-/// An event of a link.
 #[derive(Debug)]
 pub(super) enum LinkEvent<'a> {
     Up,

@@ -109,7 +109,6 @@ impl LogLines {
     }
 }
 
-/// The newest lines.
 #[derive(Debug, Clone, Default)]
 struct Newest {
     lines: VecDeque<String>,

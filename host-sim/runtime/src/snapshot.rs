@@ -85,7 +85,6 @@ impl GatewaySnapshot {
 }
 
 impl SnapshotSlot {
-    /// An empty slot.
     pub(crate) fn new() -> Self {
         Self {
             snapshot: Mutex::new(None),

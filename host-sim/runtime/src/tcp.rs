@@ -30,11 +30,9 @@ pub(super) struct Connection {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum ConnectionEnd {
-    /// Open.
     Open,
     /// Close when everything was sent.
     Flush,
-    /// Close now.
     Abort,
 }
 
@@ -49,7 +47,6 @@ pub(super) enum Accepted {
     Failed,
 }
 
-/// An event of a connection.
 #[derive(Debug)]
 pub(super) enum ConnectionEvent<'a> {
     /// Bytes arrived.

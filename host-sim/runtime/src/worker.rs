@@ -98,7 +98,6 @@ pub(crate) struct Worker {
 }
 
 impl Worker {
-    /// Starts a thread.
     pub(crate) fn start(name: &str) -> Result<Arc<Self>, RunError> {
         let (jobs, mut inbox) = mpsc::unbounded_channel::<Job>();
         // Built here, where an error can be returned.
@@ -152,7 +151,6 @@ impl Drop for Worker {
     }
 }
 
-/// A runtime on a worker.
 #[derive(Debug)]
 pub(super) struct SharedRuntime {
     end: Arc<RuntimeEnd>,

@@ -198,7 +198,6 @@ fn place(var: SysVar, bit: Option<u8>) -> usize {
     }
 }
 
-/// Number of places.
 const PLACES: usize = COUNT * 9;
 
 fn entry(

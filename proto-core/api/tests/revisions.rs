@@ -7,7 +7,6 @@ use recipe_api::revisions::{
     Ended, MAX_REVISIONS, Refused, Result, Revision, RevisionOutput, Revisions, Stored,
 };
 
-/// What may happen.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Event {
     Put,

@@ -10,11 +10,9 @@ pub(crate) struct Past {
     pub place: u16,
     /// It may have become unknown.
     pub value: Stored,
-    /// When.
     pub at: Stamp,
 }
 
-/// The ring.
 #[derive(Debug, Clone)]
 pub(crate) struct History<const ROOM: usize> {
     kept: Deque<Past, ROOM>,

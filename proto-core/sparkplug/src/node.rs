@@ -50,7 +50,6 @@ pub struct EdgeNode<const METRICS: usize, const HISTORY: usize> {
     device_births: [Option<Instant>; MAX_DEVICES],
     phase: NodePhase,
     inbox: Inbox<MAX_PACKET>,
-    /// Publications to acknowledge.
     acks: Deque<u16, 8>,
     seq: u8,
     bd_seq: Option<u8>,
@@ -69,11 +68,9 @@ pub struct EdgeNode<const METRICS: usize, const HISTORY: usize> {
     counters: NodeCounters,
 }
 
-/// One metric.
 #[derive(Debug, Clone, Copy)]
 struct NodeMetric {
     data_type: DataType,
-    /// To be told.
     is_pending: bool,
     current: Stored,
     /// The last one told, and when it was sampled; never if none was.

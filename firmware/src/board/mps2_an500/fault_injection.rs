@@ -18,7 +18,6 @@ enum InjectedFault {
     /// Never yields.
     Spin,
     Panic,
-    /// Endless recursion.
     Overflow,
     /// Reads an address without memory.
     Fault,

@@ -97,7 +97,6 @@ impl platform::Board for Mps2An500 {
         Ok(driver)
     }
 
-    /// Starts it.
     fn watchdog(&mut self) -> Watchdog {
         Watchdog::start()
     }
@@ -123,7 +122,6 @@ impl platform::Board for Mps2An500 {
     }
 }
 
-/// LED 0 of the FPGA.
 #[derive(Debug)]
 pub(crate) struct FpgaLed;
 

@@ -13,7 +13,6 @@ use firmware::warn;
 
 const MAX_TEXT: usize = 128;
 
-/// Undefined after power-on.
 #[unsafe(link_section = ".uninit.crash_record")]
 static RECORD: Record = Record {
     len: AtomicU32::new(0),

@@ -23,7 +23,6 @@ pub(super) const PERIOD: Duration = Duration::from_secs(4);
 pub(crate) struct Watchdog(IndependentWatchdog<'static, IWDG1>);
 
 impl Watchdog {
-    /// Starts it.
     pub(super) fn start() -> Self {
         // It stops while a debugger halts the core.
         DBGMCU.apb4fzr1().modify(|w| w.set_iwdg1(true));

@@ -231,7 +231,6 @@ impl Display for Challenge<'_> {
     }
 }
 
-/// The ETag of a revision.
 pub(super) struct Etag(pub(super) Revision);
 
 impl Display for Etag {
@@ -241,7 +240,6 @@ impl Display for Etag {
 }
 
 impl Etag {
-    /// The revision with this ETag.
     pub(super) fn parse(text: &str) -> Option<Revision> {
         let (number, digest) = text.strip_prefix('"')?.strip_suffix('"')?.split_once('-')?;
         let digest = u32::from_str_radix(digest, 16).ok()?;

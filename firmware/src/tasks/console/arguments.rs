@@ -19,7 +19,6 @@ pub(super) struct HeadArguments {
     pub(super) number: Option<Option<u32>>,
     /// `downgrade` or `restart`; `Some(false)`: not `yes`.
     pub(super) yes: Option<bool>,
-    /// Frames are wanted.
     pub(super) frames: bool,
     /// The port of the frames; `Some(None)`: there is no such port.
     pub(super) port: Option<Option<PortId>>,
@@ -57,8 +56,10 @@ impl HeadArguments {
 pub(super) enum Arguments {
     /// The operation takes no arguments.
     None,
-    /// Arguments of `apply`.
-    Apply { number: Option<u32>, trial: Span },
+    Apply {
+        number: Option<u32>,
+        trial: Span,
+    },
     /// The key of `claim`.
     Key([u8; KEY_LEN]),
     /// Duration of the trial of `update/try`, in seconds.
@@ -70,7 +71,6 @@ pub(super) enum Arguments {
 }
 
 impl Arguments {
-    /// Parses a body.
     #[inline(never)]
     pub(super) fn parse(operation: ApiOperation, body: &[u8]) -> Self {
         match operation {

@@ -22,7 +22,6 @@ use crate::tasks::store::{Failed, StoreLock, StoreRequest};
 use crate::warn;
 
 impl Console {
-    /// Executes a change.
     pub(super) async fn change<'a>(&'a self, buf: &mut [u8], request: ConsoleRequest<'a>) -> Reply {
         let ConsoleRequest { operation, peer, .. } = request;
         if operation == ApiOperation::PutConfig

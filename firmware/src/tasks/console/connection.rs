@@ -254,7 +254,6 @@ impl Console {
     }
 }
 
-/// An admitted request.
 struct Decided {
     admitted: Admitted,
     arguments: HeadArguments,

@@ -10,7 +10,6 @@ use recipe_api::response::{ContentType, Length, StatusCode};
 use super::answer::{Reply, RequestOutcome, Responder, SendError, TextBuffer};
 use super::{Console, MAX_ANSWER, MAX_TIME};
 
-/// Source of a document.
 #[derive(Debug, Clone)]
 pub(super) enum DocumentSource {
     Pieces(Pieces),

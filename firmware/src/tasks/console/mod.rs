@@ -79,7 +79,6 @@ pub struct NodeView {
 /// Counters of connections. They wrap.
 #[derive(Debug, Clone, Copy, Default, serde::Serialize)]
 struct ConnectionCounters {
-    /// Accepted connections.
     connections: u32,
     /// Streams refused because of [`STREAMS`].
     turned_away: u32,

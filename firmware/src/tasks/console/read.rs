@@ -26,7 +26,6 @@ use crate::platform::Ports;
 use crate::tasks::store::{NOTHING, PART, StoreHandle};
 
 impl Console {
-    /// Executes a request.
     pub(super) async fn execute<'a>(
         &'a self,
         responder: &mut Responder<'_, '_>,
@@ -287,7 +286,6 @@ fn write_json(out: &mut TextBuffer<'_>, value: &impl Serialize) -> fmt::Result {
     json::write(out, value).map_err(|_| fmt::Error)
 }
 
-/// The web page.
 pub(super) const PAGE: Page =
     Page { bytes: &recipe_console::PAGE, policy: recipe_console::POLICY, etag: recipe_console::ETAG };
 /// Bytes of it per write.

@@ -7,7 +7,6 @@ use recipe_api::route::ApiOperation;
 use super::arguments::{Arguments, HeadArguments};
 use crate::tasks::store::StoreLock;
 
-/// A parsed request.
 pub(super) struct ConsoleRequest<'a> {
     pub(super) head: HeadArguments,
     pub(super) operation: ApiOperation,

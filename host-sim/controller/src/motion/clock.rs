@@ -34,7 +34,6 @@ impl PathClock {
         Self { anchor: Instant::ZERO, position_s: 0.0, rate: 0.0, target: 0.0, slope: NORMAL_SLOPE }
     }
 
-    /// At 0, running from `now` on.
     pub(super) fn running(now: Instant, rate: f64) -> Self {
         Self { anchor: now, position_s: 0.0, rate, target: rate, slope: NORMAL_SLOPE }
     }

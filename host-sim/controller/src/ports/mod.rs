@@ -31,7 +31,6 @@ pub use recipe::RecipeError;
 use recipe_config::{SimBus, SimConfig, SimPort};
 pub(crate) use send::{Handed, PortData};
 
-/// A recipe port.
 #[derive(Debug)]
 pub(super) struct RecipePort {
     name: String,

@@ -42,7 +42,6 @@ struct Pending {
     until: Instant,
 }
 
-/// A complete command.
 #[derive(Debug, Clone, PartialEq)]
 enum Command {
     Run { program: String, speed: Option<Percent> },

@@ -31,7 +31,6 @@ pub(crate) enum Framing {
 /// Why bytes are no head.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum HeadError {
-    /// More is needed.
     Incomplete,
     /// It is longer than [`MAX_HEAD`].
     TooLong,

@@ -7,11 +7,9 @@ use socketcan::{CanErrorFrame, EmbeddedFrame};
 /// What an error frame says about the controller's state.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum StateChange {
-    /// The new state.
     State(BusState),
     /// The controller was restarted after bus-off.
     Restarted,
-    /// Nothing.
     Other,
 }
 

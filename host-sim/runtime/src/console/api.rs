@@ -22,7 +22,6 @@ use super::supervisor::{ActionError, SupervisorAction, SupervisorCommand, Superv
 use super::{ConsoleServer, ConsoleSource, check, pendant};
 
 impl ConsoleServer {
-    /// Executes a request.
     pub(super) async fn execute(&self, request: HttpRequest<'_>) -> HttpReply {
         match (request.admitted.operation, &self.source) {
             (ApiOperation::Page, _) => HttpReply::page(request.head.if_none_match),
@@ -286,7 +285,6 @@ fn refusal(refused: Refused) -> HttpReply {
     HttpReply::error(status, &text)
 }
 
-/// For the log.
 fn name(operation: ApiOperation) -> &'static str {
     match operation {
         ApiOperation::PutConfig => "store",

@@ -63,7 +63,6 @@ impl ConsoleServer {
         });
     }
 
-    /// Serves one request.
     async fn serve(self: &Rc<Self>, mut stream: TcpStream, peer: SocketAddr) -> io::Result<()> {
         stream.set_nodelay(true)?;
         let local = stream.local_addr()?;

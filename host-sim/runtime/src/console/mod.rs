@@ -74,7 +74,6 @@ pub(crate) struct Bound {
 }
 
 impl ConsoleOptions {
-    /// Opens the socket.
     pub(crate) fn bind(&self) -> Result<Bound, RunError> {
         let refused =
             |why: &dyn std::fmt::Display| RunError::new(format!("--console {}: {why}", self.address));
@@ -165,7 +164,6 @@ impl Console {
         Ok(Self { address, end, thread })
     }
 
-    /// Its address.
     pub(crate) fn address(&self) -> SocketAddr {
         self.address
     }
@@ -251,10 +249,8 @@ struct ConsoleServer {
     started: proto_core::time::Instant,
 }
 
-/// Counters of connections.
 #[derive(Debug, Clone, Copy, Default, serde::Serialize)]
 struct ServerCounters {
-    /// Connections.
     connections: u64,
     /// Connections turned away because there were too many.
     turned_away: u64,

@@ -19,7 +19,6 @@ pub(super) struct HttpReply {
 /// What a response carries.
 #[derive(Debug)]
 pub(super) enum ReplyBody {
-    /// A text.
     Text(Rc<str>),
     /// Part of the program.
     Bytes(&'static [u8]),
@@ -56,7 +55,6 @@ impl HttpReply {
         Self { status, kind: ContentType::Page, body, fields: Vec::new() }
     }
 
-    /// A configuration image.
     pub(super) fn image(bytes: Vec<u8>) -> Self {
         Self {
             status: StatusCode::OK,
@@ -66,7 +64,6 @@ impl HttpReply {
         }
     }
 
-    /// A JSON value.
     pub(super) fn json(status: StatusCode, value: &Value) -> Self {
         Self { status, kind: ContentType::Json, body: value.to_string().into(), fields: Vec::new() }
     }
@@ -96,7 +93,6 @@ impl From<Refusal> for HttpReply {
     }
 }
 
-/// A whole response.
 pub(super) fn bytes_of(reply: &HttpReply) -> Vec<u8> {
     let body = reply.body.as_bytes();
     let mut bytes = head_of(reply, Length::Bytes(body.len() as u64)).into_bytes();

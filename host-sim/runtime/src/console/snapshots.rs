@@ -19,7 +19,6 @@ use super::ConsoleSource;
 use crate::findings::{look_at_states, unexplained};
 use crate::snapshot::{GatewaySnapshot, SnapshotSlot};
 
-/// The newest snapshot.
 #[derive(Default)]
 pub(super) struct Snapshots {
     newest: RefCell<Option<Rc<Snapshot>>>,
@@ -127,7 +126,6 @@ impl Snapshot {
         Some(Rc::clone(self.values.get_or_init(|| make().into())))
     }
 
-    /// The metrics.
     pub(super) fn metrics(&self) -> Option<Rc<str>> {
         let SnapshotContent::Gateway(snapshot, _) = &self.what else { return None };
         let make = || written(|text| Families::new().write_all(snapshot.engine.status(snapshot.at), text));

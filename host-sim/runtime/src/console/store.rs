@@ -116,7 +116,6 @@ impl RevisionStore {
         &self.index.kept
     }
 
-    /// The text of a revision.
     pub(super) fn text(&self, number: u32) -> Option<&Arc<str>> {
         self.texts.get(&number)
     }
@@ -142,7 +141,6 @@ impl RevisionStore {
         self.put(number, text, forget, index)
     }
 
-    /// Marks a revision as live.
     pub(super) fn mark(&mut self, live: u32, previous: u32) -> io::Result<()> {
         let index = Index { live, previous: Some(previous), ..self.index.clone() };
         self.write_index(&index)?;

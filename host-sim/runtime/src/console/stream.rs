@@ -21,7 +21,6 @@ use super::frames::{CaptureStream, FrameEvents};
 use super::reply::{HttpReply, MAX_TIME, bytes_of, head_of};
 use super::{ConsoleServer, ConsoleSource};
 
-/// An endless response.
 enum Endless {
     Events(Option<FrameEvents>),
     Capture(Box<CaptureStream>),

@@ -99,11 +99,9 @@ pub(super) enum ActionError {
 /// The supervisor's state, for readers.
 #[derive(Debug, Default)]
 pub(crate) struct SupervisorView {
-    /// The revisions.
     pub(super) revisions: Option<Revisions>,
     /// Their metadata, the oldest first.
     pub(super) entries: Vec<RevisionEntry>,
-    /// Their texts.
     pub(super) texts: BTreeMap<u32, Arc<str>>,
     /// The addresses of what runs, as in the line `ready`.
     pub(super) ready: Value,
@@ -111,7 +109,6 @@ pub(crate) struct SupervisorView {
     pub(super) failure: Option<String>,
     /// Overrides, which apply to every revision.
     pub(super) overrides: Vec<String>,
-    /// The running configuration.
     pub(super) config: Option<Arc<GatewayConfig>>,
     client: Option<RuntimeClient>,
     slot: Option<Arc<SnapshotSlot>>,

@@ -283,7 +283,6 @@ impl ControllerRuntime {
 enum ControlLine {
     Whole,
     TooLong,
-    /// There is none.
     End,
 }
 

@@ -153,7 +153,6 @@ fn begin_tapping(
         .map_err(|error| RunError::new(format!("cannot start a thread: {error}")))
 }
 
-/// The configuration image.
 fn encoded(config: &GatewayConfig) -> Result<Vec<u8>, RunError> {
     let mut bytes = vec![0; image::MAX_IMAGE];
     let len = image::encode(config, &mut bytes).map_err(|error| RunError::new(error.to_string()))?;

@@ -28,7 +28,6 @@ const MAX_MESSAGE: usize = 128 << 10;
 /// Poll interval of the reader when the ring is empty. The gateway does not wake it, which would be a system call.
 const READ_INTERVAL: Duration = Duration::from_millis(2);
 
-/// The gateway's side.
 #[derive(Debug)]
 pub(super) struct Tapping {
     watch: Watch,
@@ -100,7 +99,6 @@ impl Tapping {
         }
     }
 
-    /// After the call.
     #[inline]
     pub(super) fn behind(&mut self, tap: &mut Tap<TAP>) {
         if self.records_passes {
@@ -278,7 +276,6 @@ fn parse(message: &[u8]) -> Option<Record> {
     Some(Record { at: Instant::from_micros(u64::from_le_bytes(*at)), lost: u32::from_le_bytes(*lost), what })
 }
 
-/// Kinds of messages.
 const FRAME: u8 = 0;
 const PASS: u8 = 1;
 

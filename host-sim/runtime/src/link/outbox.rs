@@ -55,7 +55,6 @@ impl Outbox {
         self.socket = Some(socket);
     }
 
-    /// Disables direct writes.
     pub(super) fn close(&mut self) {
         self.socket = None;
     }

@@ -10,7 +10,6 @@ pub(super) enum Maybe<T> {
 }
 
 impl<T: Copy> Maybe<T> {
-    /// What is in it.
     pub(super) const fn get(self) -> Option<T> {
         match self {
             Self::Nothing => None,

@@ -100,5 +100,4 @@ pub(crate) fn nothing_runs() -> ! {
 /// The arguments with the names of the files. The firmware has them too.
 const STORE: usize = 3;
 const SLOTS: usize = 5;
-/// Sectors of the store.
 const STORE_SECTORS: u8 = 2;
